@@ -1,0 +1,10 @@
+"""Published analytic models of the half-space BSSRDF, one per file; a model joins by one line in the list."""
+
+from analytic_models.standard_dipole import StandardDipole, StandardDipoleNormalized
+
+__all__ = ["MODELS"]
+
+MODELS = [
+    StandardDipole,
+    StandardDipoleNormalized,
+]

@@ -1,0 +1,52 @@
+"""Half-space subsurface scattering: path-traced, analytic and learnt BSSRDFs behind one definition.
+
+Conventions, kept by every part of the library:
+
+- Plane z = 0, outward normal +z, medium below. x_i is where light enters, x_o where it leaves.
+- w_i and w_o are unit vectors that both point away from the surface, outside; mu = cos(theta) = w.z.
+- L_o(x_o, w_o) = ∫_A ∫_2pi S(x_i, w_i; x_o, w_o) L_i(x_i, w_i) mu_i dw_i dA_i, hence S = dL_o / dPhi_i in 1/(mm² sr).
+  S contains both Fresnel transmittances; it contains no surface reflection and no cosine.
+- Reciprocity: S(x_i, w_i; x_o, w_o) = S(x_o, w_o; x_i, w_i). A model that violates it says so.
+- A query has five numbers: r = |x_o - x_i|, mu_i, phi_i, mu_o, phi_o; both azimuths are measured about +z from the
+  direction x_i -> x_o. S is unchanged under (phi_i, phi_o) -> (-phi_i, -phi_o).
+- Scaling: S(r; sigma_t) = sigma_t² S(sigma_t r; 1). Tracer, maps and networks work in mean free paths.
+- Orders: `single` is exactly one scattering event, `multiple` two or more, `total` their sum. For a pencil beam the
+  single order is a distribution, not a function; it is evaluated as its own line integral.
+- Reflectance: R(mu_i) = ∫∫ S mu_o dw_o dA_o, the fraction of incident flux that comes back out of the medium.
+- eta = n_inside / n_outside. albedo = sigma_s / sigma_t is the single-scattering albedo, never a colour.
+- Lengths are mm. Angles are radians.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from halfspace_sss import materials, measure
+    from halfspace_sss.interface import BSSRDF, bssrdf, models, register_model
+    from halfspace_sss.reflectance_curves import curves
+    from halfspace_sss.maps import make_maps
+    from halfspace_sss.medium import Medium
+    from halfspace_sss.tracer import trace
+
+_HOME = {
+    "BSSRDF": "interface", "Medium": "medium", "bssrdf": "interface", "curves": "reflectance_curves", "make_maps": "maps",
+    "models": "interface", "register_model": "interface", "trace": "tracer",
+}  # fmt: skip
+_SUBMODULES = ("materials", "measure")
+__all__ = ["BSSRDF", "Medium", "bssrdf", "curves", "make_maps", "materials", "measure", "models", "register_model", "trace"]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _SUBMODULES:
+        return importlib.import_module(f"halfspace_sss.{name}")
+    if name in _HOME:
+        return getattr(importlib.import_module(f"halfspace_sss.{_HOME[name]}"), name)
+    raise AttributeError(f"module 'halfspace_sss' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

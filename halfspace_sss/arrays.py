@@ -1,0 +1,203 @@
+"""One spelling of array mathematics for NumPy, torch and Dr.Jit.
+
+`library(*args)` returns the functions that belong to the arguments, so that a formula is written once:
+
+    lib = library(r)
+    return lib.exp(-r) / lib.maximum(r, 1e-9)
+
+The functions are those of NumPy (`where`, `minimum`, `expm1`, ...); Python numbers may stand for any
+array argument and never change its precision. Only what the models need is here.
+"""
+
+from __future__ import annotations
+
+import functools
+import operator
+from typing import Any
+
+import numpy as np
+
+__all__ = ["broadcast_query", "library"]
+
+
+class _NumpyLibrary:
+    """NumPy, and plain Python numbers."""
+
+    exp, expm1, log, sqrt = (staticmethod(f) for f in (np.exp, np.expm1, np.log, np.sqrt))
+    sin, cos, abs, where = (staticmethod(f) for f in (np.sin, np.cos, np.abs, np.where))
+    minimum, maximum, isfinite = (staticmethod(f) for f in (np.minimum, np.maximum, np.isfinite))
+    arctan2, floor = (staticmethod(f) for f in (np.arctan2, np.floor))
+
+    @staticmethod
+    def float64(x: Any) -> Any:
+        return np.asarray(x, dtype=np.float64)
+
+    @staticmethod
+    def like(value: Any, x: Any) -> Any:
+        return np.asarray(value, dtype=np.asarray(x).dtype)
+
+    @staticmethod
+    def constant(value: Any, x: Any) -> Any:
+        return np.asarray(value, dtype=np.asarray(x).dtype) if np.ndim(value) else float(value)
+
+    @staticmethod
+    def interval(edges: np.ndarray, x: Any) -> Any:
+        return np.searchsorted(edges, x, side="right") - 1
+
+    @staticmethod
+    def take(table: np.ndarray, index: Any, x: Any) -> Any:
+        return np.asarray(table, dtype=np.asarray(x).dtype)[index]
+
+    stack = staticmethod(functools.partial(np.stack, axis=-1))
+
+
+class _TorchLibrary:
+    """torch tensors on any device."""
+
+    def __init__(self) -> None:
+        import torch
+
+        self.torch = torch
+        for name in ("exp", "expm1", "log", "sqrt", "sin", "cos", "abs", "where", "isfinite", "floor"):
+            setattr(self, name, getattr(torch, name))
+
+    def _pair(self, a: Any, b: Any) -> tuple[Any, Any]:
+        like = a if isinstance(a, self.torch.Tensor) else b
+        return tuple(v if isinstance(v, self.torch.Tensor) else self.like(v, like) for v in (a, b))
+
+    def minimum(self, a: Any, b: Any) -> Any:
+        return self.torch.minimum(*self._pair(a, b))
+
+    def maximum(self, a: Any, b: Any) -> Any:
+        return self.torch.maximum(*self._pair(a, b))
+
+    def arctan2(self, a: Any, b: Any) -> Any:
+        return self.torch.arctan2(*self._pair(a, b))
+
+    def float64(self, x: Any) -> Any:
+        return x.to(self.torch.float64)
+
+    def like(self, value: Any, x: Any) -> Any:
+        return self.torch.as_tensor(value, device=x.device).to(x.dtype)
+
+    def constant(self, value: Any, x: Any) -> Any:
+        return self.like(value, x) if np.ndim(value) else float(value)
+
+    def interval(self, edges: np.ndarray, x: Any) -> Any:
+        edges = self.torch.as_tensor(edges, device=x.device)
+        return self.torch.searchsorted(edges, x.to(edges.dtype).contiguous(), right=True) - 1
+
+    def take(self, table: np.ndarray, index: Any, x: Any) -> Any:
+        return self.like(table, x)[index]
+
+    def stack(self, values: list) -> Any:
+        return self.torch.stack(values, dim=-1)
+
+
+class _DrJitLibrary:
+    """Dr.Jit arrays of any backend; one lane per query."""
+
+    def __init__(self) -> None:
+        import drjit as dr
+
+        self.dr = dr
+        for name in ("exp", "log", "sqrt", "sin", "cos", "abs", "minimum", "maximum", "isfinite", "floor"):
+            setattr(self, name, getattr(dr, name))
+        self.where, self.arctan2 = dr.select, dr.atan2
+
+    def expm1(self, x: Any) -> Any:
+        half = 0.5 * self.dr.maximum(x, -60.0)  # sinh overflows in float32 below
+        return 2 * self.dr.exp(half) * self.dr.sinh(half)
+
+    def float64(self, x: Any) -> Any:
+        return self.dr.float64_array_t(type(x))(x)
+
+    def like(self, value: Any, x: Any) -> Any:
+        return type(x)(value)
+
+    def constant(self, value: Any, x: Any) -> Any:
+        if np.ndim(value):
+            raise ValueError("a Dr.Jit query is answered by a medium of one channel: use medium.channel(k)")
+        return float(value)
+
+    def interval(self, edges: np.ndarray, x: Any) -> Any:
+        dr = self.dr
+        table = dr.float64_array_t(type(x))(edges)
+        x = self.float64(x)
+        upper = dr.binary_search(0, len(edges), lambda i: dr.gather(type(table), table, i) <= x)
+        return dr.int32_array_t(type(x))(upper) - 1
+
+    def take(self, table: np.ndarray, index: Any, x: Any) -> Any:
+        return self.dr.gather(type(x), type(x)(table), self.dr.uint32_array_t(type(x))(index))
+
+    def stack(self, values: list) -> Any:
+        raise ValueError("a Dr.Jit query is answered by a medium of one channel: use medium.channel(k)")
+
+
+_NUMPY = _NumpyLibrary()
+
+
+@functools.cache
+def _torch_library() -> _TorchLibrary:
+    return _TorchLibrary()
+
+
+@functools.cache
+def _drjit_library() -> _DrJitLibrary:
+    return _DrJitLibrary()
+
+
+def library(*args: Any) -> Any:
+    """The functions for the arguments: Dr.Jit if any is a Dr.Jit array, then torch, else NumPy.
+
+    Raises:
+        ValueError: torch and Dr.Jit arrays are mixed.
+    """
+    modules = {type(a).__module__.split(".")[0] for a in args}
+    if "torch" in modules and "drjit" in modules:
+        raise ValueError("torch and Dr.Jit arrays cannot be mixed in one query")
+    if "drjit" in modules:
+        return _drjit_library()
+    return _torch_library() if "torch" in modules else _NUMPY
+
+
+def _common_float(lib: Any, args: tuple) -> tuple:
+    """Arguments as floating-point arrays of one library and the widest precision among the arrays."""
+    if lib is _NUMPY:
+        arrays = [np.asarray(a) for a in args]
+        # Python numbers and integers are weak: they take the precision of the floating arrays around them
+        strong = [a.dtype for a, raw in zip(arrays, args) if not isinstance(raw, (int, float)) and a.dtype.kind == "f"]
+        dtype = np.result_type(np.float32, *strong) if strong else np.float64
+        return tuple(a.astype(dtype, copy=False) for a in arrays)
+    if isinstance(lib, _TorchLibrary):
+        torch = lib.torch
+        tensors = [a for a in args if isinstance(a, torch.Tensor)]
+        floats = [a.dtype for a in tensors if a.dtype.is_floating_point] or [torch.get_default_dtype()]
+        dtype = functools.reduce(torch.promote_types, floats)
+        return tuple(torch.as_tensor(a, device=tensors[0].device).to(dtype) for a in args)
+    dr = lib.dr
+    arrays = [a for a in args if dr.is_array_v(a)]
+    total = functools.reduce(operator.add, arrays)
+    kind = type(total) if dr.is_float_v(total) else dr.float32_array_t(type(total))
+    return tuple(kind(a) for a in args)
+
+
+def broadcast_query(*args: Any) -> tuple[Any, tuple]:
+    """The library of a query and its arguments as broadcast floating-point arrays of that library.
+
+    The precision is the widest among the array arguments; Python numbers follow it, and a query of
+    Python numbers only is answered in float64.
+
+    Raises:
+        ValueError: the shapes do not broadcast, or libraries are mixed.
+    """
+    lib = library(*args)
+    args = _common_float(lib, args)
+    if lib is _NUMPY:
+        return lib, tuple(np.broadcast_arrays(*args))
+    if isinstance(lib, _TorchLibrary):
+        try:
+            return lib, tuple(lib.torch.broadcast_tensors(*args))
+        except RuntimeError as error:
+            raise ValueError(f"query shapes do not broadcast: {error}") from error
+    return lib, args

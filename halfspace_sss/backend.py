@@ -1,0 +1,86 @@
+"""Which Dr.Jit backend runs: LLVM on a CPU, CUDA on a GPU; finds a usable LLVM before drjit is imported."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import os
+import sys
+from pathlib import Path
+from types import ModuleType
+
+__all__ = ["BACKENDS", "BackendError", "array_types", "prepare_llvm"]
+
+BACKENDS = ("llvm", "cuda")
+OLDEST_LLVM = 17  # 14 and 15 abort the process ("Cannot select: fminimum")
+
+
+class BackendError(RuntimeError):
+    """No usable Dr.Jit backend on this machine."""
+
+
+def _llvm_version(path: str) -> int | None:
+    """Major version of an LLVM library, None if it cannot be loaded."""
+    try:
+        library = ctypes.CDLL(path)
+        major, minor, patch = (ctypes.c_uint() for _ in range(3))
+        library.LLVMGetVersion(*(ctypes.byref(v) for v in (major, minor, patch)))
+    except (OSError, AttributeError):
+        return None
+    return major.value
+
+
+def _candidates() -> list[str]:
+    """LLVM libraries that came with pip, then those of the system, newest name first."""
+    patterns = ("libLLVM.so*", "libLLVM-*.so*", "libLLVM*.dylib", "LLVM-C.dll")
+    roots = [Path(sys.prefix) / "lib", Path("/usr/lib/x86_64-linux-gnu"), Path("/usr/lib/aarch64-linux-gnu"),
+             Path("/usr/lib64"), Path("/usr/lib"), Path("/usr/local/lib"), Path("/opt/homebrew/opt/llvm/lib")]  # fmt: skip
+    roots += sorted(Path("/usr/lib").glob("llvm-*/lib"), reverse=True)
+    return [str(p) for root in roots for pattern in patterns for p in sorted(root.glob(pattern), reverse=True)]
+
+
+@functools.cache
+def prepare_llvm() -> str:
+    """Point Dr.Jit at a usable LLVM and return its path; a path that the user set is kept.
+
+    Raises:
+        BackendError: none is found, or the one the user set is too old or cannot be loaded.
+    """
+    given = os.environ.get("DRJIT_LIBLLVM_PATH")
+    if given:
+        version = _llvm_version(given)
+        if version is None or version < OLDEST_LLVM:
+            found = "cannot be loaded" if version is None else f"is LLVM {version}"
+            raise BackendError(
+                f"DRJIT_LIBLLVM_PATH = {given} {found}; Dr.Jit needs LLVM {OLDEST_LLVM} or newer: "
+                "unset it, or `pip install karellen-llvm-core`"
+            )
+        return given
+    for path in _candidates():
+        version = _llvm_version(path)
+        if version is not None and version >= OLDEST_LLVM:
+            os.environ["DRJIT_LIBLLVM_PATH"] = path
+            return path
+    raise BackendError(
+        f"no LLVM library of version {OLDEST_LLVM} or newer was found: `pip install karellen-llvm-core` "
+        "(Linux x86-64), install your system's LLVM, or set DRJIT_LIBLLVM_PATH"
+    )
+
+
+@functools.cache
+def array_types(backend: str = "llvm") -> ModuleType:
+    """The module of Dr.Jit array types of a backend (`drjit.llvm` or `drjit.cuda`), ready to compute.
+
+    Raises:
+        ValueError: the name is not a backend.
+        BackendError: the backend cannot run on this machine.
+    """
+    if backend not in BACKENDS:
+        raise ValueError(f"backend must be one of {', '.join(BACKENDS)}, got {backend!r}")
+    if backend == "llvm":
+        prepare_llvm()
+    import drjit as dr
+
+    if not dr.has_backend(getattr(dr.JitBackend, backend.upper())):
+        raise BackendError(f"Dr.Jit's {backend} backend cannot run here")
+    return getattr(dr, backend)

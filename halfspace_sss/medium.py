@@ -1,0 +1,155 @@
+"""Homogeneous medium below the plane: coefficients in 1/mm and what derives from them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+__all__ = ["Medium"]
+
+
+def _check(name: str, value: np.ndarray, ok: np.ndarray, bound: str) -> None:
+    if not np.all(ok):
+        bad = np.atleast_1d(value)[~np.atleast_1d(ok)][0]
+        raise ValueError(f"{name} must be {bound}, got {bad!r}")
+
+
+def _number(name: str, value: object) -> np.ndarray:
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name} must be a number or a sequence of numbers, got {value!r}") from error
+    if array.ndim > 1:
+        raise ValueError(f"{name} must be a scalar or one value per channel, got shape {array.shape}")
+    return array
+
+
+@dataclass(frozen=True, eq=False)
+class Medium:
+    """A homogeneous participating medium with a smooth boundary.
+
+    Args:
+        sigma_s: scattering coefficient, 1/mm, scalar or one value per channel, >= 0.
+        sigma_a: absorption coefficient, 1/mm, scalar or one value per channel, >= 0.
+        g: mean cosine of the Henyey-Greenstein phase function, in (-1, 1), scalar or per channel.
+        eta: relative index n_inside / n_outside, one number > 0.
+
+    Everything else (`sigma_t`, `albedo`, `sigma_s_prime`, ...) derives from these four. Scalars stay
+    scalars; if any coefficient has one value per channel, all have.
+
+    Raises:
+        ValueError: a coefficient is outside its range, not finite, has mismatched channels, or
+            sigma_s + sigma_a = 0 (a mean free path would be infinite).
+    """
+
+    sigma_s: np.ndarray | float
+    sigma_a: np.ndarray | float
+    g: np.ndarray | float = 0.0
+    eta: float = 1.3
+
+    def __post_init__(self) -> None:
+        fields = {name: _number(name, getattr(self, name)) for name in ("sigma_s", "sigma_a", "g")}
+        eta = _number("eta", self.eta)
+        if eta.ndim:
+            raise ValueError(f"eta must be one number for all channels, got shape {eta.shape}")
+        _check("eta", eta, np.isfinite(eta) & (eta > 0), "finite and > 0")
+        for name in ("sigma_s", "sigma_a"):
+            value = fields[name]
+            _check(name, value, np.isfinite(value) & (value >= 0), "finite and >= 0 (1/mm)")
+        _check("g", fields["g"], np.abs(fields["g"]) < 1, "in the open interval (-1, 1)")
+        try:
+            shape = np.broadcast_shapes(*(value.shape for value in fields.values()))
+        except ValueError as error:
+            shapes = {name: value.shape for name, value in fields.items()}
+            raise ValueError(f"sigma_s, sigma_a and g must have the same number of channels, got {shapes}") from error
+        if shape == (0,):
+            raise ValueError("sigma_s must have at least one channel, got none")
+        for name, value in fields.items():
+            value = np.broadcast_to(value, shape)
+            object.__setattr__(self, name, value.copy() if shape else float(value))
+            if shape:
+                getattr(self, name).setflags(write=False)
+        object.__setattr__(self, "eta", float(eta))
+        sigma_t = np.asarray(self.sigma_t)
+        _check("sigma_t = sigma_s + sigma_a", sigma_t, np.isfinite(sigma_t) & (sigma_t > 0), "finite and > 0 (1/mm)")
+
+    @classmethod
+    def from_albedo(cls, albedo, sigma_t, g=0.0, eta=1.3) -> Medium:
+        """The medium with single-scattering albedo in [0, 1] and extinction sigma_t (1/mm).
+
+        sigma_s = albedo sigma_t, sigma_a = (1 - albedo) sigma_t.
+        """
+        albedo, sigma_t = _number("albedo", albedo), _number("sigma_t", sigma_t)
+        _check("albedo", albedo, (albedo >= 0) & (albedo <= 1), "in [0, 1]")
+        _check("sigma_t", sigma_t, np.isfinite(sigma_t) & (sigma_t > 0), "finite and > 0 (1/mm)")
+        return cls(albedo * sigma_t, (1 - albedo) * sigma_t, g, eta)
+
+    @classmethod
+    def from_reduced(cls, sigma_s_prime, sigma_a, g=0.0, eta=1.3) -> Medium:
+        """The medium whose reduced scattering is sigma_s_prime (1/mm): sigma_s = sigma_s_prime / (1 - g)."""
+        sigma_s_prime, g = _number("sigma_s_prime", sigma_s_prime), _number("g", g)
+        _check("sigma_s_prime", sigma_s_prime, np.isfinite(sigma_s_prime) & (sigma_s_prime >= 0), "finite and >= 0 (1/mm)")
+        _check("g", g, np.abs(g) < 1, "in the open interval (-1, 1)")
+        return cls(sigma_s_prime / (1 - g), sigma_a, g, eta)
+
+    @property
+    def n_channels(self) -> int | None:
+        """Number of channels, None for a scalar medium."""
+        return len(self.sigma_s) if np.ndim(self.sigma_s) else None
+
+    @property
+    def sigma_t(self):
+        """Extinction coefficient sigma_s + sigma_a, 1/mm."""
+        return self.sigma_s + self.sigma_a
+
+    @property
+    def mfp(self):
+        """Mean free path 1 / sigma_t, mm."""
+        return 1 / self.sigma_t
+
+    @property
+    def albedo(self):
+        """Single-scattering albedo sigma_s / sigma_t."""
+        return self.sigma_s / self.sigma_t
+
+    @property
+    def sigma_s_prime(self):
+        """Reduced scattering coefficient (1 - g) sigma_s, 1/mm."""
+        return (1 - self.g) * self.sigma_s
+
+    @property
+    def sigma_t_prime(self):
+        """Reduced extinction coefficient sigma_s_prime + sigma_a, 1/mm."""
+        return self.sigma_s_prime + self.sigma_a
+
+    @property
+    def albedo_prime(self):
+        """Reduced albedo sigma_s_prime / sigma_t_prime."""
+        return self.sigma_s_prime / self.sigma_t_prime
+
+    def scaled(self, factor: float) -> Medium:
+        """The same medium with both coefficients multiplied by `factor` > 0 (a dilution, or a change of unit)."""
+        factor = float(factor)
+        _check("factor", np.asarray(factor), np.asarray(np.isfinite(factor) and factor > 0), "finite and > 0")
+        return Medium(factor * self.sigma_s, factor * self.sigma_a, self.g, self.eta)
+
+    def in_mfp(self) -> Medium:
+        """The medium with lengths measured in its own mean free path (per channel): sigma_t = 1."""
+        return Medium(self.sigma_s / self.sigma_t, self.sigma_a / self.sigma_t, self.g, self.eta)
+
+    def channel(self, index: int) -> Medium:
+        """The scalar medium of one channel; a scalar medium has only channel 0."""
+        n = self.n_channels or 1
+        if not 0 <= index < n:
+            raise ValueError(f"channel must be in [0, {n - 1}], got {index}")
+        s, a, g = (np.atleast_1d(v)[index] for v in (self.sigma_s, self.sigma_a, self.g))
+        return Medium(float(s), float(a), float(g), self.eta)
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Medium):
+            return NotImplemented
+        return all(np.array_equal(getattr(self, n), getattr(other, n)) for n in ("sigma_s", "sigma_a", "g", "eta"))
+
+    def __hash__(self) -> int:
+        return hash(tuple(np.asarray(getattr(self, n)).tobytes() for n in ("sigma_s", "sigma_a", "g", "eta")))
