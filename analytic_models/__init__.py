@@ -1,5 +1,7 @@
 """Published analytic models of the half-space BSSRDF, one per file; a model joins by one line in the list."""
 
+from analytic_models.better_dipole import BetterDipole
+from analytic_models.directional_dipole import DirectionalDipole
 from analytic_models.standard_dipole import StandardDipole, StandardDipoleNormalized
 
 __all__ = ["MODELS"]
@@ -7,4 +9,6 @@ __all__ = ["MODELS"]
 MODELS = [
     StandardDipole,
     StandardDipoleNormalized,
+    BetterDipole,
+    DirectionalDipole,
 ]

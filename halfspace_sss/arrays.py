@@ -20,6 +20,16 @@ import numpy as np
 __all__ = ["broadcast_query", "library"]
 
 
+def _fold(f: Any, tables: tuple, state: tuple, x: Any) -> tuple:
+    """state = f(state, *row) for each row of the equally long 1-D `tables`, in order; x tells the array type.
+
+    A loop of array operations, one symbolic loop for Dr.Jit: kernels stay small however many rows there are.
+    """
+    for row in zip(*(table.tolist() for table in tables)):
+        state = f(state, *row)
+    return state
+
+
 class _NumpyLibrary:
     """NumPy, and plain Python numbers."""
 
@@ -49,6 +59,7 @@ class _NumpyLibrary:
         return np.asarray(table, dtype=np.asarray(x).dtype)[index]
 
     stack = staticmethod(functools.partial(np.stack, axis=-1))
+    fold = staticmethod(_fold)
 
 
 class _TorchLibrary:
@@ -82,6 +93,8 @@ class _TorchLibrary:
 
     def constant(self, value: Any, x: Any) -> Any:
         return self.like(value, x) if np.ndim(value) else float(value)
+
+    fold = staticmethod(_fold)
 
     def interval(self, edges: np.ndarray, x: Any) -> Any:
         edges = self.torch.as_tensor(edges, device=x.device)
@@ -129,6 +142,16 @@ class _DrJitLibrary:
 
     def take(self, table: np.ndarray, index: Any, x: Any) -> Any:
         return self.dr.gather(type(x), type(x)(table), self.dr.uint32_array_t(type(x))(index))
+
+    def fold(self, f: Any, tables: tuple, state: tuple, x: Any) -> tuple:
+        dr, kind = self.dr, type(x)
+        n, columns = len(tables[0]), [kind(table) for table in tables]
+        zero = dr.uint32_array_t(kind)(0)
+
+        def body(k: Any, *state: Any) -> tuple:
+            return k + 1, *f(state, *(dr.gather(kind, column, k) for column in columns))
+
+        return dr.while_loop((zero, *state), lambda k, *_: k < n, body, label="fold")[1:]
 
     def stack(self, values: list) -> Any:
         raise ValueError("a Dr.Jit query is answered by a medium of one channel: use medium.channel(k)")

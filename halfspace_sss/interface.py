@@ -50,6 +50,8 @@ class Query:
     mu_o: Any
     phi_o: Any
     eta: float
+    r_mm: Any = None
+    sigma_t: Any = None  # r = sigma_t r_mm, kept so that `in_float64` does not inherit the rounding of r
 
     @functools.cached_property
     def mu_i_in(self) -> Any:
@@ -79,7 +81,10 @@ class Query:
     def in_float64(self) -> Query:
         """The same query in float64, for formulas whose terms cancel."""
         f = self.lib.float64
-        return Query(self.lib, f(self.r), f(self.mu_i), f(self.phi_i), f(self.mu_o), f(self.phi_o), self.eta)
+        r = f(self.r) if self.r_mm is None else f(self.r_mm)
+        if self.r_mm is not None:
+            r = self.lib.constant(self.sigma_t, r) * r
+        return Query(self.lib, r, f(self.mu_i), f(self.phi_i), f(self.mu_o), f(self.phi_o), self.eta)
 
 
 class BSSRDF(abc.ABC):
@@ -130,7 +135,7 @@ class BSSRDF(abc.ABC):
         r, mu_i, phi_i, mu_o, phi_o = args
         sigma_t = lib.constant(self.medium.sigma_t, r)
         eta = self.medium.eta
-        q = Query(lib, sigma_t * r, mu_i, phi_i, mu_o, phi_o, eta)
+        q = Query(lib, sigma_t * r, mu_i, phi_i, mu_o, phi_o, eta, r, self.medium.sigma_t)
         G = lib.like(self.G(q), r) if lib is not library(0.0) else np.asarray(self.G(q), dtype=r.dtype)
         S = sigma_t * sigma_t * F_t(mu_i, eta) * F_t(mu_o, eta) * G
         return S[()] if isinstance(S, np.ndarray) else S
