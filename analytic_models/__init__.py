@@ -2,6 +2,9 @@
 
 from analytic_models.better_dipole import BetterDipole
 from analytic_models.directional_dipole import DirectionalDipole
+from analytic_models.forward_scattering_dipole import ForwardScatteringDipole
+from analytic_models.normalized_diffusion import NormalizedDiffusion
+from analytic_models.photon_beam_diffusion import PhotonBeamDiffusion
 from analytic_models.standard_dipole import StandardDipole, StandardDipoleNormalized
 
 __all__ = ["MODELS"]
@@ -11,4 +14,7 @@ MODELS = [
     StandardDipoleNormalized,
     BetterDipole,
     DirectionalDipole,
+    PhotonBeamDiffusion,
+    NormalizedDiffusion,
+    ForwardScatteringDipole,
 ]

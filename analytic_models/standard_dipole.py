@@ -36,7 +36,7 @@ class _Dipole:
 class StandardDipole(Separable):
     """Standard dipole as published, S = T_12 R_d(r) T_21 / pi.
 
-    R_d = albedo'/(4 pi) [z_r (1 + sigma_tr d_r) exp(-sigma_tr d_r)/d_r³ + z_v (1 + sigma_tr d_v) exp(-sigma_tr d_v)/d_v³],
+    R_d = albedo'/(4 pi) [k(z_r, d_r) + k(z_v, d_v)], k(z, d) = z (1 + sigma_tr d) exp(-sigma_tr d)/d³, d² = r² + z²,
     z_r = 1/sigma_t', z_v = z_r (1 + 4A/3), sigma_tr = sqrt(3 sigma_a sigma_t'), A from the published fit of F_dr.
 
     Left out: single scattering, any direction but through the Fresnel factors. The second Fresnel factor is not

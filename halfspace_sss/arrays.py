@@ -21,12 +21,12 @@ __all__ = ["broadcast_query", "library"]
 
 
 def _fold(f: Any, tables: tuple, state: tuple, x: Any) -> tuple:
-    """state = f(state, *row) for each row of the equally long 1-D `tables`, in order; x tells the array type.
+    """state = f(*state, *row) for each row of the equally long 1-D `tables`, in order; x tells the array type.
 
     A loop of array operations, one symbolic loop for Dr.Jit: kernels stay small however many rows there are.
     """
     for row in zip(*(table.tolist() for table in tables)):
-        state = f(state, *row)
+        state = f(*state, *row)
     return state
 
 
