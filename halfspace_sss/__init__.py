@@ -27,17 +27,34 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from halfspace_sss import materials, measure
     from halfspace_sss.interface import BSSRDF, bssrdf, models, register_model
-    from halfspace_sss.reflectance_curves import curves
     from halfspace_sss.maps import make_maps
     from halfspace_sss.medium import Medium
+    from halfspace_sss.reflectance_curves import curves
     from halfspace_sss.tracer import trace
 
 _HOME = {
-    "BSSRDF": "interface", "Medium": "medium", "bssrdf": "interface", "curves": "reflectance_curves", "make_maps": "maps",
-    "models": "interface", "register_model": "interface", "trace": "tracer",
-}  # fmt: skip
+    "BSSRDF": "interface",
+    "Medium": "medium",
+    "bssrdf": "interface",
+    "curves": "reflectance_curves",
+    "make_maps": "maps",
+    "models": "interface",
+    "register_model": "interface",
+    "trace": "tracer",
+}
 _SUBMODULES = ("materials", "measure")
-__all__ = ["BSSRDF", "Medium", "bssrdf", "curves", "make_maps", "materials", "measure", "models", "register_model", "trace"]
+__all__ = [
+    "BSSRDF",
+    "Medium",
+    "bssrdf",
+    "curves",
+    "make_maps",
+    "materials",
+    "measure",
+    "models",
+    "register_model",
+    "trace",
+]
 
 
 def __getattr__(name: str) -> Any:

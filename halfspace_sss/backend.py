@@ -33,8 +33,8 @@ def _llvm_version(path: str) -> int | None:
 def _candidates() -> list[str]:
     """LLVM libraries that came with pip, then those of the system, newest name first."""
     patterns = ("libLLVM.so*", "libLLVM-*.so*", "libLLVM*.dylib", "LLVM-C.dll")
-    roots = [Path(sys.prefix) / "lib", Path("/usr/lib/x86_64-linux-gnu"), Path("/usr/lib/aarch64-linux-gnu"),
-             Path("/usr/lib64"), Path("/usr/lib"), Path("/usr/local/lib"), Path("/opt/homebrew/opt/llvm/lib")]  # fmt: skip
+    system = ("/usr/lib/x86_64-linux-gnu", "/usr/lib/aarch64-linux-gnu", "/usr/lib64", "/usr/lib", "/usr/local/lib")
+    roots = [Path(sys.prefix) / "lib", *map(Path, system), Path("/opt/homebrew/opt/llvm/lib")]
     roots += sorted(Path("/usr/lib").glob("llvm-*/lib"), reverse=True)
     return [str(p) for root in roots for pattern in patterns for p in sorted(root.glob(pattern), reverse=True)]
 

@@ -89,7 +89,9 @@ class Medium:
     def from_reduced(cls, sigma_s_prime, sigma_a, g=0.0, eta=1.3) -> Medium:
         """The medium whose reduced scattering is sigma_s_prime (1/mm): sigma_s = sigma_s_prime / (1 - g)."""
         sigma_s_prime, g = _number("sigma_s_prime", sigma_s_prime), _number("g", g)
-        _check("sigma_s_prime", sigma_s_prime, np.isfinite(sigma_s_prime) & (sigma_s_prime >= 0), "finite and >= 0 (1/mm)")
+        _check(
+            "sigma_s_prime", sigma_s_prime, np.isfinite(sigma_s_prime) & (sigma_s_prime >= 0), "finite and >= 0 (1/mm)"
+        )
         _check("g", g, np.abs(g) < 1, "in the open interval (-1, 1)")
         return cls(sigma_s_prime / (1 - g), sigma_a, g, eta)
 

@@ -26,7 +26,9 @@ def eval_hg(cos_theta: Any, g: Any) -> Any:
     """
     lib = library(cos_theta, g)
     size = abs(g) if isinstance(g, (int, float)) else lib.abs(g)
-    aligned = lib.where(g >= 0, cos_theta, -cos_theta) if not isinstance(g, (int, float)) else math.copysign(1, g) * cos_theta
+    aligned = (
+        lib.where(g >= 0, cos_theta, -cos_theta) if not isinstance(g, (int, float)) else math.copysign(1, g) * cos_theta
+    )
     gap = lib.maximum((1 - size) * (1 - size) + 2 * size * (1 - aligned), 1e-30)
     return (1 - size) * (1 + size) / (4 * math.pi * gap * lib.sqrt(gap))
 

@@ -1,0 +1,33 @@
+"""Checks of arguments that several entry points share; each names the parameter, the bound and the value."""
+
+from __future__ import annotations
+
+import math
+import numbers
+from typing import Any
+
+from halfspace_sss.medium import Medium
+
+__all__ = ["check_count", "check_interval", "check_scalar_medium"]
+
+
+def check_scalar_medium(medium: Any) -> None:
+    if not isinstance(medium, Medium):
+        raise ValueError(f"medium must be a Medium, got {type(medium).__name__}")
+    if medium.n_channels is not None:
+        raise ValueError(f"medium must have one channel (take medium.channel(k)), got {medium.n_channels} channels")
+
+
+def check_count(name: str, value: Any, least: int) -> None:
+    if isinstance(value, bool) or not isinstance(value, numbers.Integral) or value < least:
+        raise ValueError(f"{name} must be a whole number >= {least}, got {value!r}")
+
+
+def check_interval(name: str, value: Any, low: float, high: float) -> None:
+    if (
+        isinstance(value, bool)
+        or not isinstance(value, numbers.Real)
+        or not math.isfinite(value)
+        or not low <= value <= high
+    ):
+        raise ValueError(f"{name} must be a number in [{low:g}, {high:g}], got {value!r}")

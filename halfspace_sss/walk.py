@@ -1,0 +1,206 @@
+"""The random walk in a half-space, as one symbolic Dr.Jit loop in mean free paths.
+
+Weights stand in for absorption (times albedo at each event) and for internal reflection (times F_r at the
+boundary), so a walk never leaves; what leaves is handed to tallies. Depth z grows downwards from the plane,
+light enters at the origin and travels towards +x ("forward").
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any, Protocol
+
+import numpy as np
+
+from halfspace_sss.fresnel import F_r
+from halfspace_sss.medium import Medium
+from halfspace_sss.phase import sample_hg
+
+__all__ = ["Boundary", "Scatter", "Tally", "WalkConstants", "pass_seed", "walk"]
+
+ROULETTE_WEIGHT, ROULETTE_BOOST = (
+    0.3,
+    3.0,
+)  # least variance x time over (0.75, 0, 1.3), (0.99, 0, 1.5), (0.999, 0.9, 1.3)
+LONG_PATH = 4096  # albedo 1 never absorbs: halve the survivors at each doubling of the number of events from here on
+
+
+@dataclass
+class Boundary:
+    """A walk that meets the surface from below: what leaves there."""
+
+    order: Any  # scattering events so far; 0 cannot occur
+    weight: Any  # leaving weight w (1 - F_r), 0 where nothing leaves
+    x: Any
+    y: Any
+    mu: Any  # internal cosine
+    length: Any  # path length inside, mean free paths
+
+
+@dataclass
+class Scatter:
+    """A scattering event, before the new direction is drawn."""
+
+    order: Any  # this event's number, from 1
+    weight: Any  # weight after the event (albedo included)
+    x: Any
+    y: Any
+    z: Any
+    dx: Any  # direction of arrival; dz > 0 points down
+    dy: Any
+    dz: Any
+    lane: Any
+    random: Any  # further uniform numbers: call it
+
+
+class Tally(Protocol):
+    """What is recorded. Per-lane sums live in `start`'s tuple of arrays; anything else is scattered to memory."""
+
+    def start(self, lanes: int) -> tuple:
+        """Per-lane sums at zero."""
+
+    def boundary(self, sums: tuple, event: Boundary) -> tuple:
+        """Sums after a meeting with the surface."""
+
+    def scatter(self, sums: tuple, event: Scatter) -> tuple:
+        """Sums after a scattering event."""
+
+
+@dataclass(frozen=True)
+class WalkConstants:
+    """The medium as opaque Dr.Jit numbers, so that one kernel serves all media; isotropic media have their own."""
+
+    albedo: Any
+    g: Any
+    isotropic: bool
+    eta: float
+
+    @classmethod
+    def of(cls, types: ModuleType, medium: Medium) -> WalkConstants:
+        import drjit as dr
+
+        albedo = dr.opaque(types.Float, medium.albedo)
+        return cls(albedo, dr.opaque(types.Float, medium.g), medium.g == 0, medium.eta)
+
+
+def pass_seed(seed: int, *indices: int) -> tuple[int, int]:
+    """State and stream of the generator of one pass; distinct indices give independent streams."""
+    state, stream = np.random.SeedSequence([seed, *indices]).generate_state(2, np.uint64)
+    return int(state), int(stream >> np.uint64(1))
+
+
+def _turn(dx: Any, dy: Any, dz: Any, cosine: Any, azimuth: Any) -> tuple[Any, Any, Any]:
+    """Direction at the given polar cosine and azimuth about (dx, dy, dz); frame of Duff et al. 2017."""
+    import drjit as dr
+
+    sin_a, cos_a = dr.sincos(azimuth)
+    sine = dr.sqrt(dr.maximum((1 - cosine) * (1 + cosine), 0.0))
+    sign = dr.select(dz < 0, type(dz)(-1), type(dz)(1))
+    a = -1 / (sign + dz)
+    b = dx * dy * a
+    u, v = sine * cos_a, sine * sin_a
+    nx = u * (1 + sign * dx * dx * a) + v * b + cosine * dx
+    ny = u * sign * b + v * (sign + dy * dy * a) + cosine * dy
+    nz = -u * sign * dx - v * dy + cosine * dz
+    shrink = 1.5 - 0.5 * (nx * nx + ny * ny + nz * nz)  # one Newton step: float32 drifts over thousands of turns
+    return nx * shrink, ny * shrink, nz * shrink
+
+
+def walk(
+    types: ModuleType,
+    medium: Medium,
+    mu_in: Any,
+    paths_per_lane: int,
+    seed: tuple[int, int],
+    tallies: Sequence[Tally],
+) -> tuple[tuple, Any]:
+    """Trace `paths_per_lane` walks one after another in each lane and return the tallies' sums and event counts.
+
+    A lane that ends a walk starts the next at once, so that lanes stay busy although walks differ in length.
+
+    Args:
+        types: Dr.Jit array module, from `backend.array_types`.
+        medium: scalar medium; only albedo, g and eta matter (lengths are mean free paths).
+        mu_in: internal cosine of the beam in each lane; walks start with weight 1, T_12 is left to the caller.
+        paths_per_lane: number of walks per lane.
+        seed: from `pass_seed`.
+        tallies: what to record.
+
+    Returns:
+        The sums of each tally, one entry per lane and summed over its walks, and scattering events per lane.
+    """
+    import drjit as dr
+
+    Float, UInt32 = types.Float, types.UInt32
+    lanes = dr.width(mu_in)
+    constants = WalkConstants.of(types, medium)
+    sin_in = dr.sqrt(dr.maximum((1 - mu_in) * (1 + mu_in), 0.0))
+    dr.eval(mu_in, sin_in)
+    last = dr.opaque(UInt32, paths_per_lane)
+    lane = dr.arange(UInt32, lanes)
+    zero = dr.zeros(Float, lanes)
+    count = dr.zeros(UInt32, lanes)
+    state = {
+        "rng": types.PCG32(lanes, initstate=seed[0], initseq=seed[1]),
+        "x": zero, "y": zero, "z": zero, "dx": sin_in, "dy": zero, "dz": mu_in, "length": zero,
+        "weight": zero + 1, "order": count, "path": count, "events": count,
+    }  # fmt: skip
+
+    def body(s: dict, sums: tuple) -> tuple[dict, tuple]:
+        return _step(s, sums, constants, (sin_in, mu_in), lane, tallies)
+
+    start = tuple(t.start(lanes) for t in tallies)
+    s, sums = dr.while_loop((state, start), lambda s, sums: s["path"] < last, body, mode="symbolic", label="walk")
+    dr.eval(sums, s["events"])
+    return sums, s["events"]
+
+
+def _step(s: dict, sums: tuple, m: WalkConstants, start: tuple, lane: Any, tallies: Sequence[Tally]) -> tuple:
+    """One free path, the boundary if it is met, one scattering event, roulette; ended walks begin anew."""
+    import drjit as dr
+
+    rng = s["rng"]
+    Float, UInt32 = type(s["z"]), type(s["order"])
+    x, y, z, dx, dy, dz = (s[k] for k in ("x", "y", "z", "dx", "dy", "dz"))
+    path = -dr.log(1 - rng.next_float32())
+    below = z + dz * path
+    crosses = below < 0
+    mu = dr.abs(dz)
+    F = F_r(mu, 1 / m.eta) if m.eta != 1 else Float(0)
+    leaving = dr.select(crosses, s["weight"] * (1 - F), 0.0)
+    t = z / dr.maximum(mu, 1e-12)
+    event = Boundary(s["order"], leaving, x + dx * t, y + dy * t, mu, s["length"] + t)
+    sums = tuple(tally.boundary(state, event) for tally, state in zip(tallies, sums))
+
+    # a reflected free path goes on downwards by what is left of it: the mirror image of the straight one
+    x, y, z, dz = x + dx * path, y + dy * path, dr.abs(below), dr.select(crosses, -dz, dz)
+    weight = dr.select(crosses, s["weight"] * F, s["weight"]) * m.albedo
+    order = s["order"] + 1
+    event = Scatter(order, weight, x, y, z, dx, dy, dz, lane, rng.next_float32)
+    sums = tuple(tally.scatter(state, event) for tally, state in zip(tallies, sums))
+
+    u, azimuth = rng.next_float32(), 2 * math.pi * rng.next_float32()
+    cosine = 1 - 2 * u if m.isotropic else sample_hg(u, m.g)
+    dx, dy, dz = _turn(dx, dy, dz, cosine, azimuth)
+
+    low = weight < ROULETTE_WEIGHT
+    survivor = ROULETTE_WEIGHT * ROULETTE_BOOST
+    survive = dr.minimum(weight / survivor, 1.0)
+    long = (order >= LONG_PATH) & ((order & (order - 1)) == 0)
+    survive = dr.select(low, survive, dr.select(long, 0.5, 1.0))
+    weight = dr.select(low, survivor, dr.select(long, 2 * weight, weight))
+    ends = rng.next_float32() >= survive
+
+    def renew(begin: Any, value: Any) -> Any:
+        return dr.select(ends, begin, value)
+
+    return {
+        "rng": rng, "x": renew(0.0, x), "y": renew(0.0, y), "z": renew(0.0, z),
+        "dx": renew(start[0], dx), "dy": renew(0.0, dy), "dz": renew(start[1], dz),
+        "length": renew(0.0, s["length"] + path), "weight": renew(1.0, weight),
+        "order": renew(UInt32(0), order), "path": s["path"] + dr.select(ends, UInt32(1), UInt32(0)),
+        "events": s["events"] + 1,
+    }, sums  # fmt: skip
