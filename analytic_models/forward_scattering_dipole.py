@@ -87,8 +87,9 @@ class ForwardScatteringDipole(BSSRDF):
     The integral runs in ln s on both sides of its maximum, which a scan finds, with Gauss-Legendre nodes clustered
     there by the measured width.
 
-    Left out: the unscattered beam; anything of g but sigma_s (1 - g). Valid for g -> 1, refuses g < 0. Does not conserve
-    energy. For r -> 0 under grazing light at eta = 1 it diverges: r is clamped at 1e-6 mean free paths. In float64.
+    Left out: the unscattered beam; anything of g but sigma_s (1 - g). Valid for g -> 1, refuses g < 0. Does not
+    conserve energy. For r -> 0 under grazing light at eta = 1 it diverges: r is clamped at 1e-6 mean free paths.
+    Evaluated in float64 whatever the precision of the query.
 
     Args:
         n_samples: quadrature nodes on each side, the knob between speed and accuracy.
@@ -171,7 +172,7 @@ class _Integrand:
         return self.lib.log(self.lib.maximum(scale, 1e-300)) + exponent
 
     def bounds(self) -> tuple[Any, Any]:
-        """Range of x outside which the integrand is below e^-40 of its peak, or below tau^-3/2 at 6e4 times the peak."""
+        """Range of x outside which the integrand is under e^-40 of its peak, or its power-law tail under 1e-7."""
         lib, r = self.lib, self.r
         # below 4e-3 (1 - along²/4) the exponent is under -700
         start = lib.maximum(r, 4e-3 * (1 - 0.25 * self.along * self.along))

@@ -51,7 +51,8 @@ class NormalizedDiffusion(Separable):
     eta = 1, g = 0 and normal incidence, and reciprocity holds as A does not depend on the direction.
 
     Left out: any direction but through the Fresnel factors; what the boundary does to the shape.
-    R ~ 1/r towards r = 0 (integrable): r is clamped at 1e-6 mean free paths. Valid for every albedo, r to about 10/sigma_t'.
+    R ~ 1/r towards r = 0 (integrable): r is clamped at 1e-6 mean free paths. Valid for every albedo and r to about
+    10/sigma_t'.
     """
 
     name = "normalized_diffusion"

@@ -21,8 +21,8 @@ class PhotonBeamDiffusion(BSSRDF):
     """Photon beam diffusion, S = T_12 R_ms T_21 / (4 pi C_phi(1/eta)): multiple scattering from sources along the beam.
 
     R_ms = ∫_0^∞ albedo'² sigma_t' exp(-sigma_t' t) kappa(t) [C_phi phi + C_E E] dt, with
-    phi = [exp(-sigma_tr d_r)/d_r - exp(-sigma_tr d_v)/d_v] / (4 pi D) and
-    E = [z (1 + sigma_tr d_r) exp(-sigma_tr d_r)/d_r³ + (z + 2 z_b) (1 + sigma_tr d_v) exp(-sigma_tr d_v)/d_v³] / (4 pi),
+    phi = [exp(-sigma_tr d_r)/d_r - exp(-sigma_tr d_v)/d_v] / (4 pi D), E = [k(z, d_r) + k(z + 2 z_b, d_v)] / (4 pi),
+    k(z, d) = z (1 + sigma_tr d) exp(-sigma_tr d)/d³,
     z = t mu', d_r the distance to x_i + t w_12, d_v² = d_r² + 4 z_b (z + z_b), z_b, D and sigma_tr as in the better
     dipole, kappa = 1 - exp(-2 sigma_t (d_r + t)) with the unreduced sigma_t.
 

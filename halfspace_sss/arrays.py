@@ -149,7 +149,7 @@ class _DrJitLibrary:
         zero = dr.uint32_array_t(kind)(0)
 
         def body(k: Any, *state: Any) -> tuple:
-            return k + 1, *f(state, *(dr.gather(kind, column, k) for column in columns))
+            return k + 1, *f(*state, *(dr.gather(kind, column, k) for column in columns))
 
         return dr.while_loop((zero, *state), lambda k, *_: k < n, body, label="fold")[1:]
 
