@@ -14,7 +14,7 @@ from halfspace_sss.medium import Medium
 
 __all__ = ["ForwardScatteringDipole", "Monopole"]
 
-R_MIN = 1e-6  # mean free paths
+R_MIN, MU_MIN = 1e-6, 1e-3  # mean free paths; refracted cosine
 VIRTUAL_SOURCES = ("classical", "grosjean", "directional")
 
 
@@ -88,8 +88,8 @@ class ForwardScatteringDipole(BSSRDF):
     there by the measured width.
 
     Left out: the unscattered beam; anything of g but sigma_s (1 - g). Valid for g -> 1, refuses g < 0. Does not
-    conserve energy. For r -> 0 under grazing light at eta = 1 it diverges: r is clamped at 1e-6 mean free paths.
-    Evaluated in float64 whatever the precision of the query.
+    conserve energy. Diverges for r -> 0 where entry and exit graze (eta <= 1): r is clamped at 1e-6 mean free paths,
+    the refracted cosines at 1e-3. Evaluated in float64 whatever the precision of the query.
 
     Args:
         n_samples: quadrature nodes on each side, the knob between speed and accuracy.
@@ -151,9 +151,10 @@ class _Integrand:
         self.lib, self.absorption, self.z_v = q.lib, absorption, z_v
         lib = q.lib
         self.r = p * lib.maximum(q.r, R_MIN)
-        self.mu_i, self.mu_o = q.mu_i_in, q.mu_o_in
-        self.along = q.sin_o * lib.cos(q.phi_o) - q.sin_i * lib.cos(q.phi_i)
-        side = q.sin_o * lib.sin(q.phi_o) - q.sin_i * lib.sin(q.phi_i)
+        self.mu_i, self.mu_o = lib.maximum(q.mu_i_in, MU_MIN), lib.maximum(q.mu_o_in, MU_MIN)
+        sin_i, sin_o = (lib.sqrt((1 - mu) * (1 + mu)) for mu in (self.mu_i, self.mu_o))
+        self.along = sin_o * lib.cos(q.phi_o) - sin_i * lib.cos(q.phi_i)
+        side = sin_o * lib.sin(q.phi_o) - sin_i * lib.sin(q.phi_i)
         self.across2 = side * side + (self.mu_o - self.mu_i) * (self.mu_o - self.mu_i)
 
     def _parts(self, x: Any) -> tuple[Any, Any]:
