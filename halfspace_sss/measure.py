@@ -199,7 +199,7 @@ def energy_table(
     Returns:
         One row per medium, channel, model and incidence: `reflectance` at the model's own orders, `total` with the
         single order added to models of "multiple", `limit` = T_12(mu_i) (diffuse: 1 - 2 C_1(1/eta)), `inside`, whether
-        total lies in [0, limit] to 1e-6, and `note`, why a model refuses the medium (its numbers are NaN then).
+        total lies in [0, limit] to 1e-6, and `note`, why a model refuses the medium (NaN, and None for `inside`).
     """
     import pandas
 
@@ -223,8 +223,9 @@ def _energy_rows(medium_name: str, medium: Medium, name: str, mu_i: Any, quadrat
         orders, note, R = "", str(error), np.full(n, np.nan)
     total = R + (single_scattering.reflectance(medium, mu_i) if orders == "multiple" else 0.0)
     limit = 1 - 2 * C_1(1 / medium.eta) if isinstance(mu_i, str) else float(F_t(np.float64(mu_i), medium.eta))
+    inside = [None if note else bool(-1e-6 <= t <= limit + 1e-6) for t in total]
     return [
         {"medium": medium_name, "channel": k, "model": name, "orders": orders, "mu_i": mu_i, "reflectance": R[k],
-         "total": total[k], "limit": limit, "inside": -1e-6 <= total[k] <= limit + 1e-6, "note": note}
+         "total": total[k], "limit": limit, "inside": inside[k], "note": note}
         for k in range(n)
     ]  # fmt: skip
