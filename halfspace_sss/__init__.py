@@ -22,6 +22,8 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from halfspace_sss.backend import prefer_bundled_llvm
+
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
@@ -31,6 +33,8 @@ if TYPE_CHECKING:
     from halfspace_sss.medium import Medium
     from halfspace_sss.reflectance_curves import curves
     from halfspace_sss.tracer import trace
+
+prefer_bundled_llvm()
 
 _HOME = {
     "BSSRDF": "interface",

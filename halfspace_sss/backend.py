@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 from types import ModuleType
 
-__all__ = ["BACKENDS", "BackendError", "array_types", "prepare_llvm"]
+__all__ = ["BACKENDS", "BackendError", "array_types", "prefer_bundled_llvm", "prepare_llvm"]
 
 BACKENDS = ("llvm", "cuda")
 OLDEST_LLVM = 17  # 14 and 15 abort the process ("Cannot select: fminimum")
@@ -39,13 +39,39 @@ def _candidates() -> list[str]:
     return [str(p) for root in roots for pattern in patterns for p in sorted(root.glob(pattern), reverse=True)]
 
 
+def prefer_bundled_llvm() -> None:
+    """Point Dr.Jit at the LLVM that pip installed, unless the user set one; called when the package is imported.
+
+    Dr.Jit looks for LLVM when it is imported itself, and an old one of the system would abort the process later.
+    """
+    bundled = sorted((Path(sys.prefix) / "lib").glob("libLLVM.so*"))
+    if bundled and "drjit" not in sys.modules:
+        os.environ.setdefault("DRJIT_LIBLLVM_PATH", str(bundled[0]))
+
+
+def _refuse_old_loaded_llvm() -> None:
+    """drjit may have been imported before this package, with whatever LLVM it found."""
+    import drjit as dr
+
+    version = dr.detail.llvm_version()
+    if version is None or version[0] < OLDEST_LLVM:
+        found = "no LLVM" if version is None else "LLVM " + ".".join(map(str, version))
+        raise BackendError(
+            f"drjit was imported before halfspace_sss and found {found}, but it needs {OLDEST_LLVM} or newer: "
+            "import halfspace_sss before drjit and mitsuba, or set DRJIT_LIBLLVM_PATH"
+        )
+
+
 @functools.cache
 def prepare_llvm() -> str:
     """Point Dr.Jit at a usable LLVM and return its path; a path that the user set is kept.
 
     Raises:
-        BackendError: none is found, or the one the user set is too old or cannot be loaded.
+        BackendError: none is found, the one the user set is too old or cannot be loaded, or drjit was imported
+            before with an old one.
     """
+    if "drjit" in sys.modules:
+        _refuse_old_loaded_llvm()
     given = os.environ.get("DRJIT_LIBLLVM_PATH")
     if given:
         version = _llvm_version(given)
