@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import Any
+
+import numpy as np
 
 from halfspace_sss import fresnel
 from halfspace_sss.medium import Medium
 
-__all__ = ["MOMENTS", "Boundary", "Grosjean", "safe_differences"]
+__all__ = ["MOMENTS", "Boundary", "Grosjean", "safe_differences", "unit_gauss"]
 
 MOMENTS = ("exact", "published")
 
@@ -37,6 +40,13 @@ class Boundary:
             return Boundary(fresnel.C_phi(eta), fresnel.C_E(eta), 4 * fresnel.C_phi(1 / eta))
         two_C_1, three_C_2 = fresnel.published_polynomial_2C_1, fresnel.published_polynomial_3C_2
         return Boundary((1 - two_C_1(eta)) / 4, (1 - three_C_2(eta)) / 2, 1 - two_C_1(1 / eta))
+
+
+@functools.cache
+def unit_gauss(n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes and weights of the Gauss-Legendre rule on [0, 1]."""
+    x, w = np.polynomial.legendre.leggauss(n)
+    return 0.5 * (x + 1), 0.5 * w
 
 
 class Grosjean:

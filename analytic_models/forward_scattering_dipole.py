@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from analytic_models._diffusion import unit_gauss
 from halfspace_sss.fresnel import boundary_A
 from halfspace_sss.interface import BSSRDF, Query
 from halfspace_sss.medium import Medium
@@ -128,8 +129,6 @@ class ForwardScatteringDipole(BSSRDF):
         lib, integrand = q.lib, _Integrand(q, *(q.constant(v) for v in (self._p, self._absorption, self._z_v)))
         start, end = integrand.bounds()
         peak, width = integrand.peak(start, end)
-        x, w = np.polynomial.legendre.leggauss(self.n_samples)
-        tables = (0.5 * (x + 1), 0.5 * w)
         total = 0 * peak
         for length, sign in ((peak - start, -1.0), (end - peak, 1.0)):
             ratio = lib.maximum(length, 0.0) / width
@@ -140,7 +139,7 @@ class ForwardScatteringDipole(BSSRDF):
                 jacobian = 0.5 * (e + 1 / e) * span * width
                 return (total + weight * jacobian * integrand.value(peak + sign * width * 0.5 * (e - 1 / e)),)
 
-            total = lib.fold(add, tables, (total,), peak)[0]
+            total = lib.fold(add, unit_gauss(self.n_samples), (total,), peak)[0]
         return q.constant(self._scale) * total
 
 

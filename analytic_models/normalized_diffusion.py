@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import Any
 
 import numpy as np
 
+from analytic_models._diffusion import unit_gauss
 from halfspace_sss.fresnel import C_1
 from halfspace_sss.interface import Query
 from halfspace_sss.medium import Medium
@@ -17,6 +19,18 @@ __all__ = ["NormalizedDiffusion", "matched_albedos"]
 R_MIN = 1e-6  # mean free paths
 
 
+@functools.cache
+def _nodes() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """1 - theta cot theta at the nodes in theta, the kernel with their weights for each mu, and the weights in mu."""
+    v, w = unit_gauss(200)
+    theta, w_theta = 0.5 * math.pi * v**4, 2 * math.pi * w * v**3  # nodes where the logarithm peaks, theta -> 0
+    mu, w_mu = unit_gauss(48)
+    mu = np.append(mu, 1.0)[:, None]
+    deficit = np.where(theta < 1e-3, theta**2 / 3, 1 - theta / np.tan(theta))
+    kernel = mu / (np.cos(theta) ** 2 + (mu * np.sin(theta)) ** 2) * w_theta / math.pi
+    return deficit, kernel, 2 * w_mu * mu[:-1, 0]
+
+
 def matched_albedos(albedo: float) -> tuple[float, float]:
     """Reflectance of an isotropic half-space without a boundary: under normal and under diffuse incidence.
 
@@ -24,20 +38,12 @@ def matched_albedos(albedo: float) -> tuple[float, float]:
     ln H(mu) = -(mu/pi) ∫_0^(pi/2) ln(1 - albedo theta cot theta) / (cos² theta + mu² sin² theta) dtheta.
     Source: Chandrasekhar 1960; both vanish with the albedo without loss of digits.
     """
-    x, w = np.polynomial.legendre.leggauss(200)
-    v = 0.5 * (x + 1)
-    theta, w_theta = 0.5 * math.pi * v**4, 0.5 * w * 2 * math.pi * v**3  # nodes where the logarithm peaks, theta -> 0
-    x, w_mu = np.polynomial.legendre.leggauss(48)
-    mu = np.append(0.5 * (x + 1), 1.0)
-    small = theta < 1e-3
-    one_minus = np.where(small, theta**2 / 3, 1 - theta / np.tan(theta))  # 1 - theta cot theta
+    deficit, kernel, w_mu = _nodes()
     # 1 - albedo theta cot theta, each form where it keeps its digits
-    log = np.log1p(-albedo * (1 - one_minus)) if albedo < 0.5 else np.log((1 - albedo) + albedo * one_minus)
-    kernel = mu[:, None] / (np.cos(theta) ** 2 + (mu[:, None] * np.sin(theta)) ** 2)
-    log_H = -(kernel * log * w_theta).sum(axis=1) / math.pi
+    log = np.log1p(-albedo * (1 - deficit)) if albedo < 0.5 else np.log((1 - albedo) + albedo * deficit)
     half_log = 0.5 * math.log1p(-albedo) if albedo < 1 else -math.inf
-    plane = -np.expm1(half_log + log_H)  # plane albedo at mu
-    return abs(float(plane[-1])), float(np.sum(w_mu * mu[:-1] * plane[:-1]))  # abs: -0 at albedo 0
+    plane = -np.expm1(half_log - kernel @ log)  # plane albedo at mu
+    return abs(float(plane[-1])), float(w_mu @ plane[:-1])  # abs: -0 at albedo 0
 
 
 class NormalizedDiffusion(Separable):

@@ -5,9 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numpy as np
-
-from analytic_models._diffusion import Boundary, Grosjean, safe_differences
+from analytic_models._diffusion import Boundary, Grosjean, safe_differences, unit_gauss
 from halfspace_sss.interface import BSSRDF, Query
 from halfspace_sss.medium import Medium
 
@@ -59,8 +57,13 @@ class PhotonBeamDiffusion(BSSRDF):
     def for_medium(self, medium: Medium) -> PhotonBeamDiffusion:
         return type(self)(medium, n_samples=self.n_samples, kappa=self.kappa, moments=self.moments)
 
+    @property
+    def strength(self) -> Any:
+        """Factor of the integral that does not vary along the beam, albedo'² sigma_t' / (4 pi), in 1/mfp."""
+        return self._c.albedo_prime**2 * self._c.sigma_t_prime / (4 * math.pi)
+
     def exitance(self, q: Query, t: Any, mu: Any, d_r: Any) -> Any:
-        """Integrand of R_ms times d_r, for the source at t (mfp) along a beam of refracted cosine mu."""
+        """Integrand of R_ms times d_r over `strength`, for the source at t (mfp) along a beam of cosine mu inside."""
         lib, c = q.lib, self._c
         sigma_tr, sigma_t_prime, z_b, D = (q.constant(v) for v in (c.sigma_tr, c.sigma_t_prime, c.z_b, c.D))
         z = t * mu
@@ -73,7 +76,7 @@ class PhotonBeamDiffusion(BSSRDF):
         exitance = exitance * lib.exp(-sigma_tr * d_r - sigma_t_prime * t)
         if self.kappa != "none":
             exitance = -lib.expm1(-q.constant(self._kappa_rate) * (d_r + t)) * exitance
-        return q.constant(c.albedo_prime**2 * c.sigma_t_prime / (4 * math.pi)) * exitance
+        return exitance
 
     def G(self, q: Query) -> Any:
         lib, c = q.lib, self._c
@@ -100,6 +103,5 @@ class PhotonBeamDiffusion(BSSRDF):
             d_r = r / (e * e) + gap * (2 * s * cosh)
             return (total + weight * self.exitance(q, t, mu, d_r),)
 
-        x, weights = np.polynomial.legendre.leggauss(self.n_samples)
-        R_ms = lib.fold(add, (0.5 * (x + 1), 0.5 * weights), (0 * (r + cosine),), r)[0]
-        return R_ms * span / (math.pi * self._boundary.N)
+        integral = lib.fold(add, unit_gauss(self.n_samples), (0 * (r + cosine),), r)[0]
+        return q.constant(self.strength / (math.pi * self._boundary.N)) * span * integral
