@@ -101,13 +101,15 @@ def brdf(medium: Medium, mu_i: Any, mu_o: Any, delta_phi: Any) -> Any:
 
 
 @functools.cache
-def _graded(n_panels: int, n_nodes: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Gauss nodes x, 1 - x and weights on [0, 1] in panels that halve towards both ends, for any end singularity."""
+def _graded(n_low: int, n_high: int, n_nodes: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Gauss nodes x, 1 - x and weights on [0, 1] in panels that halve n_low times towards 0, n_high times towards 1."""
     nodes, weights = np.polynomial.legendre.leggauss(n_nodes)
-    edges = np.concatenate([[0.0], 0.5 ** np.arange(n_panels, 0, -1)])
-    low = (edges[:-1, None] + np.diff(edges)[:, None] * 0.5 * (nodes + 1)).ravel()
-    w = (np.diff(edges)[:, None] * 0.5 * weights).ravel()
-    return np.concatenate([low, 1 - low[::-1]]), np.concatenate([1 - low, low[::-1]]), np.concatenate([w, w[::-1]])
+    edges = (np.concatenate([[0.0], 0.5 ** np.arange(n, 0, -1)]) for n in (n_low, n_high))
+    (x, w), (y, v) = (
+        ((e[:-1, None] + np.diff(e)[:, None] * 0.5 * (nodes + 1)).ravel(), np.outer(np.diff(e), 0.5 * weights).ravel())
+        for e in edges
+    )
+    return np.concatenate([x, 1 - y]), np.concatenate([1 - x, y]), np.concatenate([w, v])
 
 
 def _mean_hg(g: Any, mu: Any, sine: Any, nu: Any, nu_sine: Any) -> tuple[Any, Any]:
@@ -136,12 +138,12 @@ def _mean_hg(g: Any, mu: Any, sine: Any, nu: Any, nu_sine: Any) -> tuple[Any, An
 def _exit_moments(medium: Medium, mu_i: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """R, R <x> and R <r²> (per mean free path) for mu_i of shape (n, 1), scalar or channel medium; shape (n, channels).
 
-    Integrated over u, the cosine on the thinner side (external for eta >= 1, internal below), in which nothing has
-    the kink of the critical angle; the panels halve towards u = 0, 1 and the backward peak of the phase function.
+    Over u, the cosine on the thinner side (external for eta >= 1), which has no kink at the critical angle; the panels
+    halve towards u = 0, 1 and the backward peak of the phase function.
     """
     eta = medium.eta
     g, albedo = np.atleast_1d(medium.g), np.atleast_1d(medium.albedo)
-    x, _, w = _graded(20, 10)
+    x, _, w = _graded(20, 20, 10)
     peak = mu_i if eta >= 1 else mu_internal(mu_i, eta)
     u = np.concatenate([peak * x, peak + (1 - peak) * x], axis=1)[:, None, :]
     weight = np.concatenate([peak * w, (1 - peak) * w], axis=1)[:, None, :] * u / max(eta, 1.0) ** 2
@@ -163,7 +165,7 @@ def _cosines(medium: Medium, mu_i: Any) -> tuple[np.ndarray, np.ndarray | None]:
     if isinstance(mu_i, str):
         if mu_i != "diffuse":
             raise ValueError(f'mu_i must be cosines in [0, 1] or "diffuse", got {mu_i!r}')
-        x, _, w = _graded(12, 10)
+        x, _, w = _graded(12, 12, 10)
         return mu_external(x, min(medium.eta, 1.0)), 2 * min(medium.eta, 1.0) ** 2 * x * w
     mu = np.asarray(mu_i, dtype=np.float64)
     _check("mu_i", mu)
@@ -178,8 +180,7 @@ def reflectance(medium: Medium, mu_i: Any = 1.0) -> Any:
 
     Args:
         mu_i: external cosine of incidence, number or NumPy array in [0, 1], or "diffuse": uniform radiance from above.
-    The result has the shape of mu_i, with the channel axis last if the medium has channels; a number for a number.
-    Raises ValueError if mu_i is out of range.
+    The result has the shape of mu_i, and the channel axis last; a number for a number. ValueError if mu_i is out of range.
     Source: matched and isotropic (albedo/2) (1 - mu_i ln(1 + 1/mu_i)), Chandrasekhar 1960.
     """
     mu, weights = _cosines(medium, mu_i)
@@ -197,9 +198,8 @@ def moments(medium: Medium, mu_i: Any = 1.0) -> tuple[Any, Any]:
     """
     if isinstance(mu_i, str):
         raise ValueError(f"mu_i must be cosines in [0, 1], got {mu_i!r}")
-    mu, _ = _cosines(medium, mu_i)
+    mu, mfp = _cosines(medium, mu_i)[0], np.atleast_1d(medium.mfp)
     R, x, r2 = _exit_moments(medium, mu.reshape(-1, 1))
-    mfp = np.atleast_1d(medium.mfp)
     with np.errstate(invalid="ignore"):
         result = [(v / R).reshape(*mu.shape, -1) for v in (r2 * mfp**2, x * mfp)]
     return tuple(v if medium.n_channels is not None else v[..., 0][()] for v in result)
@@ -211,7 +211,7 @@ def exitance(medium: Medium, r: Any, mu_i: Any = 1.0, phi: Any = 0.0) -> Any:
     M = T_12 ∫ sigma_s exp(-sigma_t (t + d)) p T_21 cos(theta) / d² dt over the refracted beam, d the distance from the
     vertex to the point of exit; with the angle e between beam and exit ray as variable, b the distance of the point
     from the line of the beam: M = T_12 sigma_s/b ∫_0^e_max p(-cos e) T_21 cos(theta) exp(-sigma_t (t + d)) de, e_max
-    where total reflection starts. To 1e-8 relative. Goes as 1/r for r -> 0, inf at r = 0.
+    where total reflection starts. Goes as 1/r for r -> 0, inf at r = 0. To 1e-7 (r >= 1e-5 mfp).
 
     Args:
         medium: the medium, scalar or with channels (channel axis last in the result).
@@ -234,7 +234,7 @@ def exitance(medium: Medium, r: Any, mu_i: Any = 1.0, phi: Any = 0.0) -> Any:
     e_max = lib.arctan2(h, start - foot)
     g = lib.constant(medium.g, r)
     total = 0.0 * tau
-    for x, rest, w in zip(*(v.tolist() for v in _graded(14, 8))):
+    for x, rest, w in zip(*(v.tolist() for v in _graded(20, 26, 8))):
         sin_e = lib.maximum(lib.sin(e_max * rest), TINY)
         d = h / sin_e
         t = start + d_start * lib.sin(e_max * x) / sin_e
@@ -295,6 +295,6 @@ def contribution(medium: Medium, s: Any, mu_i: Any, mu_o: Any, delta_phi: Any) -
     a = lib.maximum(mu_internal(mu_i, eta), TINY)
     s_i = s * mu_internal(mu_o, eta) / a
     value = _throughput(lib, medium, mu_i, mu_o, delta_phi) * (mu_i / a) * lib.exp(-sigma_t * (s + s_i))
-    back = s_i * _sine(lib, mu_i, eta)
-    x = -s * _sine(lib, mu_o, eta) - back * lib.cos(delta_phi)
-    return Contribution(lib.constant(medium.sigma_s, s) * value, x, back * lib.sin(delta_phi))
+    forth, back = s * _sine(lib, mu_o, eta), s_i * _sine(lib, mu_i, eta)
+    x, y = -forth - back * lib.cos(delta_phi), back * lib.sin(delta_phi)
+    return Contribution(lib.constant(medium.sigma_s, s) * value, x, y)
