@@ -105,10 +105,6 @@ def test_beam_diffusion_differs_from_pbrt_only_by_its_choices(truths):
         R_ms = math.pi * Boundary.of(medium.eta).N * model.eval(numbers["r"], 1.0, 0.0, 1.0, 0.0)
         R_ms /= F_t(1.0, medium.eta) ** 2
         assert R_ms == pytest.approx(float(row["value"]), rel=2e-3 if numbers["r"] >= 1 else 0.05), row["id"]
-        # the unreduced kappa of the model rises faster along the beam: more light where g > 0, the same where g = 0
-        assert model.eval(numbers["r"], 1.0, 0.0, 1.0, 0.0) <= PhotonBeamDiffusion(medium).eval(
-            numbers["r"], 1.0, 0.0, 1.0, 0.0
-        )
 
 
 def test_forward_scattering_monopole_equals_the_authors_code(truths):
@@ -157,7 +153,6 @@ def test_better_dipole_has_its_closed_plane_integral(medium):
 def test_beam_diffusion_without_kappa_has_its_closed_plane_integral(medium, mu_i):
     """(albedo'²/2) [...] / (1 + mu' sigma_tr / sigma_t')."""
     model = PhotonBeamDiffusion(medium, kappa="none", n_samples=64)
-    model_N = Boundary.of(medium.eta).N
     bracket, ratio = modified_diffusion_bracket(medium)
     mu_in = math.sqrt(1 - (1 - mu_i**2) / medium.eta**2)
     expected = 0.5 * medium.albedo_prime**2 * bracket / (1 + mu_in * ratio)
@@ -165,7 +160,7 @@ def test_beam_diffusion_without_kappa_has_its_closed_plane_integral(medium, mu_i
 
     def ring(r: np.ndarray) -> np.ndarray:
         S = model.eval(r[:, None], mu_i, phi, 1.0, 0.0).mean(axis=1)
-        return math.pi * model_N * S / (F_t(mu_i, medium.eta) * F_t(1.0, medium.eta))
+        return math.pi * Boundary.of(medium.eta).N * S / (F_t(mu_i, medium.eta) * F_t(1.0, medium.eta))
 
     # the clamp at r = 1e-6 takes less than 1e-6 of a profile that grows as 1/r
     assert plane_integral(ring, 1 / medium.sigma_t_prime) == pytest.approx(expected, rel=2e-6)
@@ -258,11 +253,8 @@ def test_normalized_diffusion_has_its_cdf(medium):
 
 def test_normalized_diffusion_takes_the_exact_albedo_of_a_matched_half_space(truths):
     """Rows of the exact normal-incidence reflectance for eta = 1, g = 0."""
-    rows = [
-        row for row in truths
-        if row["kind"] == "exact" and row["quantity"] == "R_d" and row["geometry"] == "half-space"
-        and float(row["eta"]) == 1 and float(row["g"]) == 0 and row["mu_i"] in ("1", "1.0")
-    ]  # fmt: skip
+    rows = [row for row in truths if (row["kind"], row["quantity"], row["geometry"]) == ("exact", "R_d", "half-space")]
+    rows = [row for row in rows if (float(row["eta"]), float(row["g"])) == (1, 0) and row["mu_i"] in ("1", "1.0")]
     assert len(rows) >= 3
     for row in rows:
         assert matched_albedos(float(row["albedo"]))[0] == pytest.approx(float(row["value"]), rel=1e-6), row["id"]
