@@ -180,7 +180,7 @@ def reflectance(medium: Medium, mu_i: Any = 1.0) -> Any:
 
     Args:
         mu_i: external cosine of incidence, number or NumPy array in [0, 1], or "diffuse": uniform radiance from above.
-    The result has the shape of mu_i, and the channel axis last; a number for a number. ValueError if mu_i is out of range.
+    The shape is that of mu_i, channel axis last; a number for a number. ValueError if mu_i is not in [0, 1].
     Source: matched and isotropic (albedo/2) (1 - mu_i ln(1 + 1/mu_i)), Chandrasekhar 1960.
     """
     mu, weights = _cosines(medium, mu_i)
