@@ -1,0 +1,194 @@
+"""The registry: where materials come from, and finding one by name."""
+
+from __future__ import annotations
+
+import difflib
+import os
+from collections.abc import Iterable, Iterator
+from importlib import resources
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from halfspace_sss.materials.material import Material, key_of
+
+if TYPE_CHECKING:
+    import pandas
+
+__all__ = ["ENTRY_POINT_GROUP", "ENVIRONMENT_VARIABLE", "Registry", "load", "names", "register", "table"]
+
+ENVIRONMENT_VARIABLE = "HALFSPACE_SSS_MATERIALS"
+ENTRY_POINT_GROUP = "halfspace_sss.materials"
+
+
+class Registry:
+    """Materials by name, read on first use; an addition takes effect as a whole or not at all."""
+
+    def __init__(self) -> None:
+        self._materials: dict[str, Material] = {}
+        self._origins: dict[str, str] = {}
+        self._complete = False
+
+    def names(self) -> list[str]:
+        """Names of all materials, sorted."""
+        return sorted(material.name for material in self._all().values())
+
+    def load(self, name: str) -> Material:
+        """The material of that name, whatever its case and separators; ValueError with the nearest names if none."""
+        materials = self._all()
+        if not isinstance(name, str):
+            raise ValueError(f"material must be a name, got {name!r}")
+        if key_of(name) not in materials:
+            close = difflib.get_close_matches(key_of(name), materials, n=3)
+            near = ", ".join(repr(materials[key].name) for key in close)
+            hint = f"did you mean {near}?" if near else "see halfspace_sss.materials.names()"
+            raise ValueError(f"material must be one of the {len(materials)} registered, got {name!r}; {hint}")
+        return materials[key_of(name)]
+
+    def register(self, material_or_path: Material | str | os.PathLike) -> tuple[str, ...]:
+        """Add a material, or those of a TOML file or folder; returns their names."""
+        self._all()
+        if isinstance(material_or_path, Material):
+            found = [("register()", material_or_path)]
+        elif isinstance(material_or_path, (str, os.PathLike)):
+            found = list(_from_path(material_or_path))
+        else:
+            raise ValueError(f"material_or_path must be a Material or a path, got {material_or_path!r}")
+        if not found:
+            raise ValueError(f"material_or_path must hold at least one *.toml file, got {str(material_or_path)!r}")
+        self._add(found)
+        return tuple(material.name for _, material in found)
+
+    def _all(self) -> dict[str, Material]:
+        if not self._complete:
+            self._add(list(_installed()))
+            self._complete = True
+        return self._materials
+
+    def _add(self, found: Iterable[tuple[str, Material]]) -> None:
+        materials, origins = dict(self._materials), dict(self._origins)
+        for origin, material in found:
+            key = key_of(material.name)
+            if key in materials:
+                taken = f"{materials[key].name!r} of {origins[key]}"
+                raise ValueError(f"{origin}: key name must be new, got {material.name!r}, which is {taken}")
+            materials[key], origins[key] = material, origin
+        self._materials, self._origins = materials, origins
+
+
+def _installed() -> Iterator[tuple[str, Material]]:
+    from halfspace_sss.materials.files import parse
+
+    data = resources.files("halfspace_sss.materials").joinpath("data")
+    for file in sorted(data.iterdir(), key=lambda f: f.name):
+        if file.name.endswith(".toml"):
+            origin = f"halfspace_sss/materials/data/{file.name}"
+            for material in parse(file.read_text(encoding="utf-8"), origin):
+                yield origin, material
+    for entry in entry_points(group=ENTRY_POINT_GROUP):
+        yield from _from_entry_point(entry)
+    folder = _user_folder()
+    if folder.is_dir():
+        yield from _from_path(folder)
+    for path in os.environ.get(ENVIRONMENT_VARIABLE, "").split(os.pathsep):
+        if path:
+            if not Path(path).exists():
+                raise ValueError(f"{ENVIRONMENT_VARIABLE} must list existing folders or files, got {path!r}")
+            yield from _from_path(path)
+
+
+def _user_folder() -> Path:
+    variable, default = ("APPDATA", "AppData/Roaming") if os.name == "nt" else ("XDG_CONFIG_HOME", ".config")
+    return Path(os.environ.get(variable) or Path.home() / default) / "halfspace-sss" / "materials"
+
+
+def _from_path(path: str | os.PathLike) -> Iterator[tuple[str, Material]]:
+    from halfspace_sss.materials.files import read
+
+    path = Path(path)
+    for file in sorted(path.glob("*.toml")) if path.is_dir() else [path]:
+        for material in read(file):
+            yield str(file), material
+
+
+def _from_entry_point(entry: Any) -> Iterator[tuple[str, Material]]:
+    origin = f"entry point {entry.name!r} of group {ENTRY_POINT_GROUP}"
+    try:
+        offered = entry.load()
+    except Exception as error:  # a package of somebody else may fail in any way; its name must be in the message
+        raise ValueError(f"{origin}: must be importable, got {type(error).__name__}: {error}") from error
+    if isinstance(offered, (str, os.PathLike)):
+        yield from _from_path(offered)
+        return
+    if not isinstance(offered, Iterable):
+        raise ValueError(f"{origin}: must be a path or an iterable of Material, got {offered!r}")
+    for material in offered:
+        if not isinstance(material, Material):
+            raise ValueError(f"{origin}: must be a path or an iterable of Material, got an item {material!r}")
+        yield origin, material
+
+
+_registry = Registry()
+
+
+def names() -> list[str]:
+    """Names of all materials, sorted.
+
+    Raises:
+        ValueError: a material file of the user or of a package is refused.
+    """
+    return _registry.names()
+
+
+def load(name: str, *, dilution: float | None = None, g: Any = None) -> Material:
+    """The material of that name.
+
+    Args:
+        name: case and separators do not count: "Regular_Chocolate-Milk" is "regular chocolate milk".
+        dilution: volume fraction in water in (0, 1], for liquids and powders: sigma_s and sigma_a are multiplied by it,
+            g stays. `Material.published_dilution` is the one at which it was measured.
+        g: mean cosine in (-1, 1), where only sigma_s_prime was measured: sigma_s = sigma_s_prime / (1 - g).
+
+    Raises:
+        ValueError: no such material (the nearest names are given), or dilution or g is out of range or has no meaning
+            for this material.
+    """
+    material = _registry.load(name)
+    if g is not None:
+        material = material.with_g(g)
+    return material if dilution is None else material.diluted(dilution)
+
+
+def register(material_or_path: Material | str | os.PathLike) -> tuple[str, ...]:
+    """Add a `Material`, or all materials of a TOML file or folder, for this process; returns their names.
+
+    Raises:
+        ValueError: a file is refused (file, key, bound and value are named) or a name is taken; nothing is added then.
+    """
+    return _registry.register(material_or_path)
+
+
+def table() -> pandas.DataFrame:
+    """All materials as numbers, one row per material and channel.
+
+    Columns: material, set, channel ("" for a medium with one), sigma_s, sigma_a, sigma_t (1/mm), g, eta, albedo,
+    sigma_s_prime (1/mm), albedo_prime, source.
+
+    Raises:
+        ValueError: as `names`.
+    """
+    import pandas
+
+    rows = []
+    for name in _registry.names():
+        material = _registry.load(name)
+        medium = material.medium
+        for i, channel in enumerate(material.channels or ("",)):
+            row = {"material": name, "set": material.set, "channel": channel}
+            for column in ("sigma_s", "sigma_a", "sigma_t", "g", "eta", "albedo", "sigma_s_prime", "albedo_prime"):
+                value = np.atleast_1d(getattr(medium, column))
+                row[column] = float(value[i] if value.size > 1 else value[0])
+            rows.append({**row, "source": material.source})
+    return pandas.DataFrame(rows)
