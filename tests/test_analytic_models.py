@@ -223,7 +223,9 @@ def test_forward_scattering_dipole_converges_to_adaptive_quadrature(medium, n_sa
 
         low = math.log(p * r)
         steps = [quad(integrand, low + k, low + k + 1, epsabs=1e-30, epsrel=1e-9, limit=200)[0] for k in range(24)]
-        expected = p**2 / (4 * math.pi**2.5) * sum(steps) * F_t(mu_i, medium.eta) * F_t(mu_o, medium.eta)
+        expected = (
+            p**2 / (4 * math.pi**2.5 * medium.eta**2) * sum(steps) * F_t(mu_i, medium.eta) * F_t(mu_o, medium.eta)
+        )
         S = model.eval(r / medium.sigma_t, mu_i, phi_i, mu_o, phi_o) / medium.sigma_t**2
         assert pytest.approx(expected, rel=rel) == S, r
 
