@@ -113,6 +113,11 @@ def test_a_g_out_of_range_is_refused(g):
         load("marble", g=g)
 
 
+def test_a_g_for_another_number_of_channels_is_refused():
+    with pytest.raises(ValueError, match="g must be a number or have one value for each of"):
+        load("marble", g=[0.1, 0.2])
+
+
 @pytest.mark.parametrize("dilution", [0, -0.1, 1.1, float("nan"), float("inf"), "half", True])
 def test_a_dilution_out_of_range_is_refused(dilution):
     with pytest.raises(ValueError, match=re.escape(f"dilution must be a volume fraction in (0, 1], got {dilution!r}")):

@@ -125,7 +125,7 @@ def _problem(error: Any, raw: dict) -> str:
     if error["type"] == "missing":
         return f"{where}key {key} is required, got nothing"
     message = error["msg"][0].lower() + error["msg"][1:]
-    return f"{where}key {key}: {message}, got {error['input']!r:.80}"
+    return f"{where}key {key or '[[material]]'}: {message}, got {repr(error['input'])[:80]}"
 
 
 def _material(file: MaterialFile, entry: Entry) -> Material:

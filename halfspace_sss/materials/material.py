@@ -120,9 +120,9 @@ class Material:
         if not self.g_assumed:
             raise ValueError(f"g must be left out for {self.name!r}, whose g is {_plain(self.medium.g)}, got {g!r}")
         m = self.medium
-        medium = Medium.from_reduced(m.sigma_s_prime, m.sigma_a, g, m.eta)
-        if medium.n_channels != m.n_channels:
+        if np.shape(g) not in ((), np.shape(m.sigma_a)):
             raise ValueError(f"g must be a number or have one value for each of {self.channels!r}, got {g!r}")
+        medium = Medium.from_reduced(m.sigma_s_prime, m.sigma_a, g, m.eta)
         return replace(self, medium=medium, assumptions=(*self.assumptions, f"g = {_plain(g)} asked for"))
 
     def models(self) -> tuple[str, ...]:
