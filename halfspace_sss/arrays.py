@@ -89,7 +89,9 @@ class _TorchLibrary:
         return x.to(self.torch.float64)
 
     def like(self, value: Any, x: Any) -> Any:
-        return self.torch.as_tensor(value, device=x.device).to(x.dtype)
+        if isinstance(value, self.torch.Tensor):
+            return value.to(device=x.device, dtype=x.dtype)
+        return self.torch.as_tensor(value, dtype=x.dtype, device=x.device)
 
     def constant(self, value: Any, x: Any) -> Any:
         return self.like(value, x) if np.ndim(value) else float(value)
@@ -197,7 +199,7 @@ def _common_float(lib: Any, args: tuple) -> tuple:
         tensors = [a for a in args if isinstance(a, torch.Tensor)]
         floats = [a.dtype for a in tensors if a.dtype.is_floating_point] or [torch.get_default_dtype()]
         dtype = functools.reduce(torch.promote_types, floats)
-        return tuple(torch.as_tensor(a, device=tensors[0].device).to(dtype) for a in args)
+        return tuple(torch.as_tensor(a, dtype=dtype, device=tensors[0].device) for a in args)
     dr = lib.dr
     arrays = [a for a in args if dr.is_array_v(a)]
     total = functools.reduce(operator.add, arrays)
