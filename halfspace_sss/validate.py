@@ -39,6 +39,12 @@ class Comparison:
     seed: int
 
     @property
+    def reflected(self) -> float:
+        """The traced value without the surface reflection that R_total adds to it."""
+        truth = self.truth
+        return self.traced - (float(F_r(truth.mu_i, truth.medium.eta)) if truth.measure == "R_total" else 0.0)
+
+    @property
     def z(self) -> float:
         """Distance from the truth in units of the two errors together; inf if both are 0 and the values differ."""
         distance = self.traced - self.truth.value
@@ -174,7 +180,7 @@ def _group_seed(seed: int, first: Truth) -> int:
 
 def _compare(group: Sequence[Truth], seed: int, loosen: float) -> list[Comparison]:
     """Trace a group until its errors are small enough, each attempt with walks of its own."""
-    n = PILOT
+    n = int(PILOT / min(loosen, 4.0))
     if any(t.ring for t in group):
         n = max(n, int(RING_PATHS / loosen**2))
     for attempt in range(6):
@@ -244,9 +250,8 @@ def _excess(c: Comparison, loosen: float) -> float:
     if truth.measure == "ring":
         return 0.0
     if truth.measure in ("R_d", "R_total", "H"):
-        size = c.traced - (F_r(truth.mu_i, truth.medium.eta) if truth.measure == "R_total" else 0.0)
         bright = truth.medium.albedo >= 0.5
-        wanted = loosen * (REFLECTANCE_ERROR if bright else DIM_ERROR) * abs(size)
+        wanted = loosen * (REFLECTANCE_ERROR if bright else DIM_ERROR) * abs(c.reflected)
         wanted = wanted if bright else max(wanted, SHARE * truth.uncertainty)
     else:
         wanted = max(loosen * OTHER_ERROR * abs(c.traced), SHARE * truth.uncertainty)
