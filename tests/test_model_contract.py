@@ -168,7 +168,7 @@ def test_position_samples_follow_their_density(name, medium):
 
 
 def test_direction_samples_follow_their_density(name, medium):
-    model, n = halfspace_sss.bssrdf(name, medium), 100_000
+    model, n = halfspace_sss.bssrdf(name, medium), 400_000
     given = (0.7 / medium.sigma_t, 0.6, 0.4)
     sample = model.sample_direction(*given, tuple(np.random.default_rng(8).random((2, n))))
     np.testing.assert_allclose(sample.pdf, model.pdf_direction(sample.mu_i, sample.phi_i, *given), rtol=1e-9)
