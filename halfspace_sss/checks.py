@@ -8,7 +8,7 @@ from typing import Any
 
 from halfspace_sss.medium import Medium
 
-__all__ = ["check_count", "check_interval", "check_scalar_medium"]
+__all__ = ["check_count", "check_finite", "check_interval", "check_scalar_medium"]
 
 
 def check_scalar_medium(medium: Any) -> None:
@@ -31,3 +31,8 @@ def check_interval(name: str, value: Any, low: float, high: float) -> None:
         or not low <= value <= high
     ):
         raise ValueError(f"{name} must be a number in [{low:g}, {high:g}], got {value!r}")
+
+
+def check_finite(name: str, value: Any) -> None:
+    if isinstance(value, bool) or not isinstance(value, numbers.Real) or not math.isfinite(value):
+        raise ValueError(f"{name} must be a finite number, got {value!r}")

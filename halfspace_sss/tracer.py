@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from halfspace_sss.backend import array_types
-from halfspace_sss.checks import check_count, check_interval, check_scalar_medium
+from halfspace_sss.checks import check_count, check_finite, check_interval, check_scalar_medium
 from halfspace_sss.fresnel import F_t, mu_internal
 from halfspace_sss.medium import Medium
 from halfspace_sss.tallies import AngularTally, FluxTally, LineTally, MomentTally, RingTally
@@ -142,7 +142,7 @@ def trace(
         mu_i: cosine of incidence outside, [0, 1], or "diffuse" for uniform radiance from above.
         n_paths: number of walks, at least 256; rounded up to whole lanes.
         seed: results repeat for the same seed, backend and version.
-        directions: pairs (mu_o, delta_phi) for `angular_reflectance`; delta_phi = 0 is forward, the far side.
+        directions: pairs (mu_o, delta_phi) for `angular_reflectance`; delta_phi = 0 is forward, the far side; not for diffuse light.
         radii: edges in mm of the rings for `exitance`, ascending.
         backend: "llvm" or "cuda".
         relative_error: stop early, at a pass of up to 8.4 million walks, once the standard error of the total
@@ -160,7 +160,7 @@ def trace(
     if relative_error is not None:
         check_interval("relative_error", relative_error, 0.0, 1.0)
     edges = _checked_radii(radii, mu_i)
-    pairs = _checked_directions(directions)
+    pairs = _checked_directions(directions, mu_i)
     types, started = array_types(backend), time.perf_counter()
     lanes, per_lane, passes = launch_shape(n_paths)
     rows: list[np.ndarray] = []
@@ -220,14 +220,17 @@ def _checked_radii(radii: Sequence[float] | None, mu_i: float | str) -> np.ndarr
     return edges
 
 
-def _checked_directions(directions: Sequence[tuple[float, float]] | None) -> np.ndarray | None:
+def _checked_directions(directions: Sequence[tuple[float, float]] | None, mu_i: float | str) -> np.ndarray | None:
     if directions is None:
         return None
+    if mu_i == "diffuse":
+        raise ValueError("directions must be None for diffuse light, which has no forward direction, got directions")
     pairs = np.asarray(directions, dtype=np.float64)
     if pairs.ndim != 2 or pairs.shape[1] != 2 or len(pairs) == 0:
         raise ValueError(f"directions must be a list of pairs (mu_o, delta_phi), got shape {pairs.shape}")
-    for mu_o in pairs[:, 0]:
+    for mu_o, delta_phi in pairs:
         check_interval("mu_o", mu_o, 0.0, 1.0)
+        check_finite("delta_phi", delta_phi)
     return pairs
 
 
@@ -278,6 +281,8 @@ def trace_curve(
     check_scalar_medium(medium)
     check_interval("mu_i", mu_i, 0.0, 1.0)
     check_interval("mu_o", mu_o, 0.0, 1.0)
+    check_finite("delta_phi", delta_phi)
+    check_finite("line_phi", line_phi)
     check_interval("half_width", half_width, 1e-6, math.pi)
     check_count("n_paths", n_paths, 256)
     check_count("seed", seed, 0)

@@ -249,7 +249,7 @@ def _excess(c: Comparison, loosen: float) -> float:
     truth = c.truth
     if truth.measure == "ring":
         return 0.0
-    if truth.measure in ("R_d", "R_total", "H"):
+    if truth.measure in ("R_d", "R_total"):
         bright = truth.medium.albedo >= 0.5
         wanted = loosen * (REFLECTANCE_ERROR if bright else DIM_ERROR) * abs(c.reflected)
         wanted = wanted if bright else max(wanted, SHARE * truth.uncertainty)
