@@ -93,7 +93,16 @@ def write_results(result: Validation, folder: Path) -> None:
         "not_covered": [vars(n) for n in result.not_covered],
         "rows": records,
     }
-    write_atomically(folder / "validate.json", json.dumps(content, indent=1) + "\n")
+    write_atomically(folder / "validate.json", json.dumps(_strict(content), indent=1, allow_nan=False) + "\n")
+
+
+def _strict(value: Any) -> Any:
+    """The value with None in place of infinities and NaN, which JSON does not know."""
+    if isinstance(value, dict):
+        return {key: _strict(v) for key, v in value.items()}
+    if isinstance(value, list):
+        return [_strict(v) for v in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def validate_command(

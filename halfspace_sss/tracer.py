@@ -142,7 +142,8 @@ def trace(
         mu_i: cosine of incidence outside, [0, 1], or "diffuse" for uniform radiance from above.
         n_paths: number of walks, at least 256; rounded up to whole lanes.
         seed: results repeat for the same seed, backend and version.
-        directions: pairs (mu_o, delta_phi) for `angular_reflectance`; delta_phi = 0 is forward, the far side; not for diffuse light.
+        directions: pairs (mu_o, delta_phi) for `angular_reflectance`; delta_phi = 0 is forward, the far
+            side; not for diffuse light.
         radii: edges in mm of the rings for `exitance`, ascending.
         backend: "llvm" or "cuda".
         relative_error: stop early, at a pass of up to 8.4 million walks, once the standard error of the total

@@ -22,6 +22,7 @@ __all__ = ["Z_LIMIT", "Comparison", "Validation", "trace_order", "validate"]
 Z_LIMIT = 4.0
 PILOT, MOST_PATHS, RING_PATHS = 65536, 1_500_000_000, 64_000_000
 REFLECTANCE_ERROR, DIM_ERROR, OTHER_ERROR = 1e-3, 3e-3, 2e-3  # relative: albedo >= 0.5, below it, other quantities
+LEAST_CERTAIN = 0.2  # relative: beyond it a standard error rests on too few walks to be trusted
 SHARE = 0.3  # of the row's own uncertainty: a smaller error would not sharpen the test
 DIRECTION_COUNTS = (1, 2, 4, 8)  # kernels are compiled for these numbers of directions
 Progress = Callable[[int, int], None]
@@ -188,7 +189,7 @@ def _compare(group: Sequence[Truth], seed: int, loosen: float) -> list[Compariso
         excess = max(_excess(c, loosen) for c in results)
         if excess <= 1 or n >= MOST_PATHS:
             break
-        n = min(int(n * 1.3 * min(excess**2, 1e3)) + 1, MOST_PATHS)
+        n = min(int(n * 1.3 * min(excess**2, 300.0)) + 1, MOST_PATHS)
     return results
 
 
@@ -255,4 +256,6 @@ def _excess(c: Comparison, loosen: float) -> float:
         wanted = wanted if bright else max(wanted, SHARE * truth.uncertainty)
     else:
         wanted = max(loosen * OTHER_ERROR * abs(c.traced), SHARE * truth.uncertainty)
-    return c.standard_error / wanted if wanted > 0 else math.inf
+    if not c.reflected or not c.standard_error or not wanted:
+        return math.inf if truth.value else 0.0  # too few walks to see anything
+    return max(c.standard_error / wanted, c.standard_error / abs(c.reflected) / LEAST_CERTAIN)
