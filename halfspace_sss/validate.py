@@ -136,9 +136,9 @@ def validate(
 ) -> Validation:
     """Trace every row of the packaged table of half-space numbers and compare.
 
-    Rows of the same medium and incidence share one run. Walks are added until the standard error of a reflectance
-    is 0.1 % of it for albedo >= 0.5 and 0.3 % below, that of other quantities 0.2 % or 0.3 times the row's own
-    uncertainty; rings have as many walks as 64 million allow. `quick` asks for errors ten times as large.
+    Rows of the same medium and incidence share one run. Walks are added until the standard error is 0.1 % of a
+    reflectance for albedo >= 0.5; 0.3 % of it below, and 0.2 % of other quantities, or 0.3 times the row's own
+    uncertainty if that is more. Rings take what 64 million walks give. `quick` asks for errors ten times as large.
 
     Args:
         rows: which rows to take, all if None.
