@@ -27,11 +27,11 @@ def render(curves: CurveSet) -> dict[str, bytes]:
 def draw(curves: CurveSet) -> Figure:
     """One column for each direction of incidence: above S(r) with 2 standard errors, below S over path-traced S."""
     angles = curves.theta_i_deg
-    columns = min(len(angles), MOST_COLUMNS)
-    blocks = -(-len(angles) // columns)
+    blocks = -(-len(angles) // MOST_COLUMNS)
+    columns = -(-len(angles) // blocks)
     legend_rows = -(-len(curves.series) // 4)
     heights, width = [2.0, 1.15] * blocks, TEXT if columns > 2 else 0.5 * TEXT * max(columns, 1.3)
-    figure = Figure(figsize=(width, 3.0 * blocks + 0.45 + 0.17 * legend_rows), layout="constrained")
+    figure = Figure(figsize=(width, 3.0 * blocks + 0.6 + 0.17 * legend_rows), layout="constrained")
     figure.get_layout_engine().set(w_pad=0.015, h_pad=0.015, wspace=0.0, hspace=0.02)
     grid = figure.subplots(2 * blocks, columns, squeeze=False, sharex=True, sharey="row", height_ratios=heights)
     limits = _limits(curves)
@@ -46,6 +46,7 @@ def draw(curves: CurveSet) -> Figure:
             above.set_ylabel(r"$S$ [mm$^{-2}$ sr$^{-1}$]")
             below.set_ylabel("model / traced")
         below.set_xlabel(r"$r$ [mm]", labelpad=1)
+        below.tick_params(labelbottom=True)
     for spare in grid[2 * (blocks - 1) :, len(angles) - columns * (blocks - 1) :].flat:
         spare.set_visible(False)
     _legend(figure, curves, columns)
@@ -54,18 +55,18 @@ def draw(curves: CurveSet) -> Figure:
 
 
 def _title(theta: float, k: int) -> str:
-    return rf"({chr(97 + k)})  $\theta_i = {theta:g}^\circ$"
+    return rf"({chr(97 + k)})  $\theta_i$ = {theta:g}°"
 
 
 def _caption(curves: CurveSet) -> str:
     m = curves.medium
     name = f"{curves.title}: " if curves.title else ""
     line = {90.0: "perpendicular to the plane of incidence", 0.0: "in the forward direction"}
-    where = line.get(curves.line_deg, rf"at ${curves.line_deg:g}^\circ$ from the forward direction")
-    azimuth = rf", $\Delta\phi = {curves.delta_phi_deg:g}^\circ$" if curves.theta_o_deg and curves.delta_phi_deg else ""
+    where = line.get(curves.line_deg, f"at {curves.line_deg:g}° from the forward direction")
+    azimuth = rf", $\Delta\phi$ = {curves.delta_phi_deg:g}°" if curves.theta_o_deg and curves.delta_phi_deg else ""
     return (
         rf"{name}$\sigma_t = {m.sigma_t:.4g}$ mm$^{{-1}}$, $\alpha = {m.albedo:.4g}$, $g = {m.g:.3g}$, "
-        rf"$\eta = {m.eta:.4g}$;  $\theta_o = {curves.theta_o_deg:g}^\circ${azimuth};  line {where}"
+        rf"$\eta = {m.eta:.4g}$;  $\theta_o$ = {curves.theta_o_deg:g}°{azimuth};  line {where}"
     )
 
 
@@ -74,14 +75,14 @@ def _positive(values: np.ndarray) -> np.ndarray:
 
 
 def _limits(curves: CurveSet) -> tuple[float, float]:
-    """Powers of ten about the path-traced curves and, within two decades above, the models."""
+    """About the path-traced curves and, up to a factor of 30 above and 10 below, the models."""
     traced = np.concatenate([c.S[c.S > 3 * c.standard_error] for c in curves.curves if c.series == TRACED])
     if not traced.size:
         return 1e-6, 1.0
     every = np.concatenate([c.S for c in curves.curves])
     top = min(every.max(), 30 * traced.max())
     bottom = max(every[every > 0].min(), traced.min() / 10)
-    return 10 ** np.floor(np.log10(0.9 * bottom)), 2 * top
+    return 0.6 * bottom, 1.7 * top
 
 
 def _draw_radiance(ax: Axes, curves: CurveSet, theta: float) -> None:
@@ -129,14 +130,17 @@ def _legend(figure: Figure, curves: CurveSet, columns: int) -> None:
     for c in firsts:
         style = look(c.series)
         handles.append(Line2D([], [], color=style.color, ls=style.dash, label=_label(c)))
+    starred = any(c.orders == "total" for c in firsts)
     figure.legend(
+        title="* contains single scattering, of which the path-traced curve has none" if starred else None,
+        title_fontsize=7,
         handles=handles, loc="outside lower center", ncols=4 if columns > 2 else 2, frameon=False,
         handlelength=2.8, columnspacing=1.4, borderaxespad=0.1,
     )  # fmt: skip
 
 
 def _label(c: Curve) -> str:
-    """A star marks models that contain single scattering, which has no radiance on this line."""
+    """A star marks models that contain single scattering."""
     if c.series == TRACED:
         return r"Path traced ($\pm 2\,\sigma$)"
     return look(c.series).label + ("*" if c.orders == "total" else "")

@@ -140,8 +140,8 @@ class CurveSet:
 
         L1 = sum |S - S_t| A / sum S_t A and bias = sum (S - S_t) A / sum S_t A over the cells of a range, where S_t
         is path traced and A = r_out² - r_in² weights by energy; a cell belongs to the decade of its middle. `noise`
-        is the L1 that Monte Carlo noise alone gives, and `bias_standard_error` what it does to the bias. The row of
-        the path-traced series has L1 = noise. NaN where no light was traced.
+        is the L1 that Monte Carlo noise alone gives, and `bias_standard_error` what it does to the bias, with cells
+        taken as independent. The row of the path-traced series has L1 = noise. NaN where no light was traced.
         """
         import pandas
 

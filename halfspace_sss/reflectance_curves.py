@@ -96,7 +96,8 @@ def curves(
     theta_o_deg: float = 0.0,
     delta_phi_deg: float = 0.0,
     line_deg: float = 90.0,
-    r_range: tuple[float, float] | None = None,
+    r_min: float | None = None,
+    r_max: float | None = None,
     n_r: int = 36,
     half_width: float = 0.13,
     models: Sequence[str | BSSRDF] | None = None,
@@ -118,7 +119,7 @@ def curves(
         theta_o_deg, delta_phi_deg: angle of observation outside, [0, 90), and azimuth of w_o from the forward direction
             of the plane of incidence (0 = the far side), degrees.
         line_deg: azimuth of x_o - x_i from the forward direction, degrees; 90 is perpendicular.
-        r_range: smallest and largest r in mm; by default `default_range(medium)`.
+        r_min, r_max: smallest and largest r in mm; by default those of `default_range(medium)`.
         n_r: number of cells, 2 to 1000.
         half_width: half the angle of a cell, radians.
         models: names or models of this medium; by default all, less those that refuse the medium (see `notes`).
@@ -140,7 +141,7 @@ def curves(
     check_count("n_paths", n_paths, 256)
     check_count("seed", seed, 0)
     check_interval("half_width", half_width, 1e-6, math.pi)
-    low, high = _checked_range(default_range(medium) if r_range is None else r_range)
+    low, high = _checked_range(r_min, r_max, medium)
     theta_o, delta_phi, line_phi = (math.radians(a) for a in (theta_o_deg, delta_phi_deg, line_deg))
     line = _Line(theta_o, delta_phi, line_phi, half_width, np.geomspace(low, high, n_r + 1))
     _check_orders(orders, line, angles, medium.eta)
@@ -245,13 +246,13 @@ def _checked_angles(theta_i_deg: Sequence[float], theta_o: float, delta_phi: flo
     return [float(a) for a in angles]
 
 
-def _checked_range(r_range: tuple[float, float]) -> tuple[float, float]:
-    try:
-        low, high = (float(r) for r in r_range)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"r_range must be two lengths in mm, got {r_range!r}") from error
-    if not (0 < low < high < math.inf):
-        raise ValueError(f"r_range must be 0 < smallest < largest, finite, in mm, got {(low, high)!r}")
+def _checked_range(r_min: float | None, r_max: float | None, medium: Medium) -> tuple[float, float]:
+    for name, value in (("r_min", r_min), ("r_max", r_max)):
+        if value is not None:
+            check_interval(name, value, 1e-12, 1e12)
+    low, high = (end if given is None else float(given) for given, end in zip((r_min, r_max), default_range(medium)))
+    if not low < high:
+        raise ValueError(f"r_min must be < r_max = {high:g} mm, got {low!r}")
     return low, high
 
 

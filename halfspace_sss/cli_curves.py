@@ -1,0 +1,165 @@
+"""The command `halfspace-sss curves`: path-traced and modelled curves of a medium, a table of errors, files."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from halfspace_sss.curve_set import TRACED, CurveSet, check_folder
+
+if TYPE_CHECKING:
+    import pandas
+    from rich.table import Table
+
+    from halfspace_sss.medium import Medium
+
+__all__ = ["curves_command", "error_table", "numbers"]
+
+TABLE_WIDTH = 110  # where the output is no terminal
+FIG10 = {"sigma_t": 0.241, "albedo": 0.75, "g": 0.0, "eta": 1.3}
+
+
+def numbers(name: str, text: str) -> list[float]:
+    """Comma-separated numbers; ValueError with the name of the option."""
+    try:
+        return [float(part) for part in text.split(",")]
+    except ValueError:
+        raise ValueError(f"{name} must be numbers separated by commas, got {text!r}") from None
+
+
+def curves_command(
+    material: Annotated[str | None, typer.Argument(help="Name of a material; see `halfspace-sss materials`.")] = None,
+    channel: Annotated[str | None, typer.Option(help="Channel of the material, name or number [first].")] = None,
+    sigma_t: Annotated[float | None, typer.Option(help="Extinction, 1/mm [0.241].")] = None,
+    albedo: Annotated[float | None, typer.Option(help="Single-scattering albedo [0.75].")] = None,
+    g: Annotated[float | None, typer.Option(help="Mean cosine of the phase function [0].")] = None,
+    eta: Annotated[float | None, typer.Option(help="Index inside over outside [1.3].")] = None,
+    theta_i: Annotated[str, typer.Option(help="Angles of incidence, degrees.")] = "0,30,60,75",
+    theta_o: Annotated[float, typer.Option(help="Angle of observation, degrees.")] = 0.0,
+    delta_phi: Annotated[float, typer.Option(help="Azimuth of observation from forward, degrees.")] = 0.0,
+    line: Annotated[float, typer.Option(help="Azimuth of the line from forward, degrees.")] = 90.0,
+    r_min: Annotated[float | None, typer.Option(help="Smallest distance, mm [from the medium].")] = None,
+    r_max: Annotated[float | None, typer.Option(help="Largest distance, mm [from the medium].")] = None,
+    model: Annotated[list[str] | None, typer.Option(help="A model; repeat for more [all].")] = None,
+    orders: Annotated[str, typer.Option(help="multiple: reflectance at each model's orders; total: with single.")] = (
+        "multiple"
+    ),
+    paths: Annotated[int, typer.Option(help="Walks for each angle of incidence.")] = 64_000_000,
+    seed: Annotated[int, typer.Option(help="Seed of the tracer.")] = 0,
+    backend: Annotated[str, typer.Option(help="llvm or cuda.")] = "llvm",
+    out: Annotated[Path, typer.Option(help="Folder for the files; those of the same names are replaced.")] = Path(
+        "curves"
+    ),
+) -> None:
+    """Compare curves of S, path traced and by every model; without arguments the setting of Fig. 10."""
+    from halfspace_sss.reflectance_curves import curves
+
+    check_folder(out)
+    medium = _medium(material, {"sigma_t": sigma_t, "albedo": albedo, "g": g, "eta": eta})
+    with _Bar() as bar:
+        result = curves(
+            medium, channel=channel, theta_i_deg=numbers("theta_i", theta_i), theta_o_deg=theta_o,
+            delta_phi_deg=delta_phi, line_deg=line, r_min=r_min, r_max=r_max, models=model or None, orders=orders,
+            n_paths=paths, seed=seed, backend=backend, progress=bar.show,
+        )  # fmt: skip
+    _report(result, result.save(out))
+
+
+def _medium(material: str | None, given: dict[str, float | None]) -> Medium | str:
+    """A material by name, or the medium of Fig. 10 with the coefficients that were given."""
+    from halfspace_sss.medium import Medium
+
+    stated = {name: value for name, value in given.items() if value is not None}
+    if material is not None:
+        for name, value in stated.items():
+            raise ValueError(f"{name} must be left out for a named material, got {value!r} with {material!r}")
+        return material
+    return Medium.from_albedo(**{**FIG10, **stated}) if stated else "fig10"
+
+
+class _Bar:
+    """Progress with the time left, on stderr; appears with the first step, so that refused input leaves no trace."""
+
+    def __init__(self) -> None:
+        self._progress: Any = None
+
+    def __enter__(self) -> _Bar:
+        return self
+
+    def show(self, done: int, total: int) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+        if self._progress is None:
+            columns = (TextColumn("tracing"), BarColumn(), TimeElapsedColumn(), TextColumn("left"))
+            self._progress = Progress(*columns, TimeRemainingColumn(), console=Console(stderr=True))
+            self._progress.start()
+            self._task = self._progress.add_task("", total=total)
+        self._progress.update(self._task, completed=done, total=total)
+
+    def __exit__(self, *_: object) -> None:
+        if self._progress is not None:
+            self._progress.stop()
+
+
+def error_table(result: CurveSet) -> Table:
+    """Per cent of error by range of r, its bias over all, reflectance and its error, and speed, by direction."""
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table
+
+    errors = result.errors()
+    ranges = list(dict.fromkeys(zip(errors["r_from_mm"], errors["r_to_mm"])))
+    headings = [f"{low:g}–\n{high:g} mm" for low, high in ranges]
+    headings += ["bias\n(all)", "reflec-\ntance R", "R error\n%", "S per\nsecond"]
+    caption = "* contains single scattering, of which the path-traced curve has none; its R is compared at total."
+    table = Table(title=_heading(result), caption=caption, box=SIMPLE_HEAD, pad_edge=False, caption_justify="left")
+    table.add_column("series\nerror of S, %", overflow="fold")
+    for heading in headings:
+        table.add_column(heading, justify="right", overflow="fold")
+    for theta in result.theta_i_deg:
+        table.add_row(f"[bold]θi = {theta:g}°[/bold]")
+        for series in result.series:
+            rows = errors[(errors["theta_i_deg"] == theta) & (errors["series"] == series)]
+            table.add_row(*_table_row(rows, series), end_section=series == result.series[-1])
+    return table
+
+
+def _heading(result: CurveSet) -> str:
+    m = result.medium
+    name = f"{result.title}: " if result.title else ""
+    medium = f"sigma_t {m.sigma_t:.4g}/mm, albedo {m.albedo:.4g}, g {m.g:.3g}, eta {m.eta:.4g}"
+    return f"{name}{medium}; theta_o {result.theta_o_deg:g}°, line at {result.line_deg:g}°"
+
+
+def _table_row(rows: pandas.DataFrame, series: str) -> list[str]:
+    """Cells of one series: of the path-traced one, what noise does to each."""
+    first, traced = rows.iloc[0], series == TRACED
+    digits = "±{:.2g}" if traced else "{:.0f}"
+    cells = [digits.format(100 * L1) if L1 == L1 else "–" for L1 in rows["L1"]]
+    bias = 100 * first["bias_standard_error" if traced else "bias"]
+    R, R_t = first["reflectance"], first["reflectance_traced"]
+    spread, error = (100 * v / R_t if R_t > 0 else math.nan for v in (first["reflectance_standard_error"], R - R_t))
+    ends = ["–" if bias != bias else f"±{bias:.1g}" if traced else f"{bias:+.0f}", f"{R:.4f}"]
+    ends += ["–" if error != error else f"±{spread:.1g}" if traced else f"{error:+.1f}"]
+    star = "*" if "total" == rows["orders"].iloc[0] else ""
+    return [series + star, *cells, *ends, "" if traced else f"{first['evaluations_per_s']:.1e}"]
+
+
+def _report(result: CurveSet, files: list[Path]) -> None:
+    from rich.console import Console
+
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=TABLE_WIDTH)
+    console.print(error_table(result))
+    for note in result.notes:
+        console.print(note, highlight=False, markup=False)
+    if not any(file.suffix == ".pdf" for file in files):
+        console.print("no figure: it needs `pip install halfspace-sss[figures]`", highlight=False, markup=False)
+    walks = f"{result.n_paths:.3g} walks for each direction, {result.seconds:.0f} s"
+    console.print(f"{walks}; written:", highlight=False, markup=False)
+    for file in files:
+        console.print(f"  {file}", highlight=False, markup=False, soft_wrap=True)
