@@ -92,7 +92,7 @@ def _draw_radiance(ax: Axes, curves: CurveSet, theta: float) -> None:
         style = look(series)
         ax.plot(curves.r, _positive(curves.curve(series, theta).S), color=style.color, ls=style.dash, zorder=2)
     low, high = traced.S - 2 * traced.standard_error, traced.S + 2 * traced.standard_error
-    ax.fill_between(curves.r, _positive(low), _positive(high), color="0.72", lw=0, zorder=1)
+    ax.fill_between(curves.r, np.maximum(low, 1e-300), _positive(high), color="0.72", lw=0, zorder=1)
     ax.plot(curves.r, _positive(traced.S), "k-", lw=0.7, marker="o", ms=1.9, mew=0, zorder=3)
     _ticks(ax)
 
