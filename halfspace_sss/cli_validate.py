@@ -122,16 +122,11 @@ def validate_command(
         TimeRemainingColumn,
     )
 
-    try:
-        chosen = row_filter(rows)
-        columns = (TextColumn("tracing"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
-        with Progress(*columns, console=Console(stderr=True)) as bar:
-            task = bar.add_task("", total=None)
-            result = validate(
-                chosen, seed, quick, progress=lambda done, all_: bar.update(task, completed=done, total=all_)
-            )
-    except ValueError as error:
-        raise typer.BadParameter(str(error)) from error
+    chosen = row_filter(rows)
+    columns = (TextColumn("tracing"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True)) as bar:
+        task = bar.add_task("", total=None)
+        result = validate(chosen, seed, quick, progress=lambda done, all_: bar.update(task, completed=done, total=all_))
     if out is not None:
         write_results(result, out)
     _print(Console(), result)

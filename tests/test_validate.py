@@ -7,11 +7,11 @@ import json
 import math
 
 import pytest
-import typer
 from typer.testing import CliRunner
 
 from halfspace_sss import Medium, single_scattering, trace
-from halfspace_sss.cli_validate import row_filter, summary, validate_command
+from halfspace_sss.cli import app
+from halfspace_sss.cli_validate import row_filter, summary
 from halfspace_sss.truths import read_truths
 from halfspace_sss.validate import Comparison, trace_order, validate
 
@@ -26,9 +26,7 @@ def table(folder, line: str):
 
 
 def command(*arguments: str):
-    app = typer.Typer()
-    app.command()(validate_command)
-    return CliRunner().invoke(app, list(arguments))
+    return CliRunner().invoke(app, ["validate", *arguments])
 
 
 def test_every_row_is_covered_or_has_a_reason(truths):
