@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 __all__ = ["curves_command", "error_table", "numbers"]
 
-TABLE_WIDTH = 110  # where the output is no terminal
+TABLE_WIDTH = 130  # where the output is no terminal
 FIG10 = {"sigma_t": 0.241, "albedo": 0.75, "g": 0.0, "eta": 1.3}
 
 
@@ -47,7 +47,7 @@ def curves_command(
     orders: Annotated[str, typer.Option(help="multiple: reflectance at each model's orders; total: with single.")] = (
         "multiple"
     ),
-    paths: Annotated[int, typer.Option(help="Walks for each angle of incidence.")] = 64_000_000,
+    paths: Annotated[int | None, typer.Option(help="Walks for each angle of incidence [from the medium].")] = None,
     seed: Annotated[int, typer.Option(help="Seed of the tracer.")] = 0,
     backend: Annotated[str, typer.Option(help="llvm or cuda.")] = "llvm",
     out: Annotated[Path, typer.Option(help="Folder for the files; those of the same names are replaced.")] = Path(
@@ -81,7 +81,7 @@ def _medium(material: str | None, given: dict[str, float | None]) -> Medium | st
 
 
 class _Bar:
-    """Progress with the time left, on stderr; appears with the first step, so that refused input leaves no trace."""
+    """Progress with the time left, on stderr; appears when tracing begins, so that refused input leaves no trace."""
 
     def __init__(self) -> None:
         self._progress: Any = None
@@ -142,7 +142,7 @@ def _table_row(rows: pandas.DataFrame, series: str) -> list[str]:
     bias = 100 * first["bias_standard_error" if traced else "bias"]
     R, R_t = first["reflectance"], first["reflectance_traced"]
     spread, error = (100 * v / R_t if R_t > 0 else math.nan for v in (first["reflectance_standard_error"], R - R_t))
-    ends = ["–" if bias != bias else f"±{bias:.1g}" if traced else f"{bias:+.0f}", f"{R:.4f}"]
+    ends = ["–" if bias != bias else f"±{bias:.1g}" if traced else f"{round(bias):+d}", f"{R:.4f}"]
     ends += ["–" if error != error else f"±{spread:.1g}" if traced else f"{error:+.1f}"]
     star = "*" if "total" == rows["orders"].iloc[0] else ""
     return [series + star, *cells, *ends, "" if traced else f"{first['evaluations_per_s']:.1e}"]
@@ -159,7 +159,7 @@ def _report(result: CurveSet, files: list[Path]) -> None:
         console.print(note, highlight=False, markup=False)
     if not any(file.suffix == ".pdf" for file in files):
         console.print("no figure: it needs `pip install halfspace-sss[figures]`", highlight=False, markup=False)
-    walks = f"{result.n_paths:.3g} walks for each direction, {result.seconds:.0f} s"
+    walks = f"{result.n_paths:,} walks for each direction, {result.seconds:.0f} s"
     console.print(f"{walks}; written:", highlight=False, markup=False)
     for file in files:
         console.print(f"  {file}", highlight=False, markup=False, soft_wrap=True)

@@ -11,6 +11,7 @@ import numpy as np
 
 from halfspace_sss import materials, measure
 from halfspace_sss.checks import check_count, check_interval
+from halfspace_sss.curve_defaults import default_paths, default_range
 from halfspace_sss.curve_set import TRACED, Curve, CurveSet
 from halfspace_sss.fresnel import mu_internal
 from halfspace_sss.interface import BSSRDF, bssrdf
@@ -18,12 +19,11 @@ from halfspace_sss.interface import models as all_models
 from halfspace_sss.medium import Medium
 from halfspace_sss.tracer import CurveTrace, Trace, launch_shape, trace, trace_curve
 
-__all__ = ["FIG10_THETA_I", "curves", "default_range"]
+__all__ = ["FIG10_THETA_I", "curves"]
 
 FIG10_THETA_I = (0.0, 30.0, 60.0, 75.0)
 QUADRATURE = measure.Quadrature(per_decade=20, n_azimuth=12, n_mu=12)
 REFLECTANCE_PATHS = 4_000_000
-MOST_MFP = 100.0  # end of the default range where nothing is absorbed
 Progress = Callable[[int, int], None]  # steps done, steps in all
 
 
@@ -78,16 +78,6 @@ class _Line:
         return math.sqrt((1 - mu) * (1 + mu)) / max(mu, 1e-12)
 
 
-def default_range(medium: Medium) -> tuple[float, float]:
-    """Distances (mm) of a curve: 0.012 to 6 transport mean free paths, or to 4/sigma_tr if light gets farther.
-
-    sigma_tr = sqrt(3 sigma_a sigma_t'), at most 100 transport mean free paths; two digits. Fig. 10: 0.05 to 25 mm.
-    """
-    mfp, sigma_tr = 1 / medium.sigma_t_prime, math.sqrt(3 * medium.sigma_a * medium.sigma_t_prime)
-    far = max(6.025 * mfp, min(4 / max(sigma_tr, 1e-300), MOST_MFP * mfp))
-    return float(f"{0.01205 * mfp:.2g}"), float(f"{far:.2g}")
-
-
 def curves(
     medium: Medium | str = "fig10",
     *,
@@ -102,7 +92,7 @@ def curves(
     half_width: float = 0.13,
     models: Sequence[str | BSSRDF] | None = None,
     orders: str = "multiple",
-    n_paths: int = 64_000_000,
+    n_paths: int | None = None,
     seed: int = 0,
     backend: str = "llvm",
     progress: Progress | None = None,
@@ -126,7 +116,7 @@ def curves(
         orders: "multiple" compares reflectances at the orders that each model contains; "total" adds the exact single
             order to models that leave it out. The curve is the same, since the single order has no radiance off the
             line where the two refracted rays meet; on that line "total" is refused.
-        n_paths: walks for each angle of incidence.
+        n_paths: walks for each angle of incidence; by default `default_paths(medium)`.
         seed, backend: as in `halfspace_sss.trace`; the same seed gives the same result.
         progress: called with (steps done, steps in all).
 
@@ -138,7 +128,7 @@ def curves(
     title, medium = _one_channel(medium, channel)
     angles = _checked_angles(theta_i_deg, theta_o_deg, delta_phi_deg, line_deg)
     check_count("n_r", n_r, 2)
-    check_count("n_paths", n_paths, 256)
+    check_count("n_paths", 256 if n_paths is None else n_paths, 256)
     check_count("seed", seed, 0)
     check_interval("half_width", half_width, 1e-6, math.pi)
     low, high = _checked_range(r_min, r_max, medium)
@@ -146,6 +136,7 @@ def curves(
     line = _Line(theta_o, delta_phi, line_phi, half_width, np.geomspace(low, high, n_r + 1))
     _check_orders(orders, line, angles, medium.eta)
     chosen, notes = _chosen_models(models, medium)
+    n_paths = default_paths(medium, backend) if n_paths is None else n_paths
     steps = _Steps(progress, len(angles) * (launch_shape(n_paths)[2] + 1 + len(chosen)) + len(chosen))
     found, walks, seconds = [], 0, 0.0
     for k, theta in enumerate(angles):
@@ -170,7 +161,8 @@ class _Steps:
     """Counts the work done for `progress`."""
 
     def __init__(self, progress: Progress | None, total: int) -> None:
-        self.progress, self.total, self.done = progress, total, 0
+        self.progress, self.total, self.done = progress, total, -1
+        self.advance()
 
     def advance(self, *_: int) -> None:
         self.done += 1

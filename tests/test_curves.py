@@ -10,9 +10,9 @@ import pytest
 
 import halfspace_sss
 from halfspace_sss import Medium, measure, single_scattering
+from halfspace_sss.curve_defaults import default_paths, default_range
 from halfspace_sss.curve_set import TRACED, CurveSet
 from halfspace_sss.interface import BSSRDF, Query
-from halfspace_sss.reflectance_curves import default_range
 
 FIG10 = Medium.from_albedo(0.75, 0.241)
 PATHS = 400_000
@@ -159,7 +159,13 @@ def test_progress_counts_to_the_end() -> None:
     halfspace_sss.curves(
         FIG10, theta_i_deg=[0, 30], models=["better_dipole"], n_paths=256, progress=lambda *p: seen.append(p)
     )
-    assert seen[-1][0] == seen[-1][1] == len(seen)
+    assert [done for done, _ in seen] == list(range(seen[-1][1] + 1))
+
+
+def test_bright_media_get_fewer_walks_by_default() -> None:
+    dim, bright = (default_paths(Medium.from_albedo(albedo, 1.0)) for albedo in (0.1, 0.999))
+    assert dim == 64_000_000
+    assert 250_000 <= bright < 16_000_000
 
 
 @pytest.mark.parametrize(
