@@ -28,8 +28,8 @@ ROULETTE_WEIGHT, ROULETTE_BOOST = (
 # Albedo 1 never absorbs: roulette at each doubling of the number of events from LONG_PATH on. As P(order > N) ~ N^-1/2,
 # survival s per doubling costs a sum over k of (sqrt(2) s)^k events and has a variance of a sum of (1 / (sqrt(2) s))^k;
 # no s keeps both finite. sqrt(1/2), at which both grow with k only, goes on until VERY_LONG_PATH, then 1/2, which
-# spares the one lane that goes on and on. z of R at albedo 1 (60 runs of 8192 walks): rms 1.3, worst -4.4; with 1/2 from the
-# start 1.7, -7.2; with sqrt(1/2) to the end 1.2, -2.6 in up to ten times the wall time.
+# spares the one lane that goes on and on. z of R at albedo 1 (60 runs of 8192 walks): rms 1.3, worst -4.4;
+# with 1/2 from the start 1.7, -7.2; with sqrt(1/2) to the end 1.2, -2.6 in up to ten times the wall time.
 LONG_PATH, VERY_LONG_PATH = 4096, 2**18
 LONG_SURVIVAL, VERY_LONG_SURVIVAL = math.sqrt(0.5), 0.5
 
