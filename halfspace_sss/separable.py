@@ -13,7 +13,10 @@ __all__ = ["Separable", "exit_normaliser"]
 
 
 def exit_normaliser(eta: float) -> float:
-    """∫ T_21(w) cos(theta) dw / pi = 4 C_phi(1/eta): what the exit lobe T_21/pi lacks to unit flux. Source: d'Eon 2012."""
+    """∫ T_21(w) cos(theta) dw / pi = 4 C_phi(1/eta): what the exit lobe T_21/pi lacks to unit flux.
+
+    Source: d'Eon 2012.
+    """
     return 4 * C_phi(1 / eta)
 
 

@@ -22,7 +22,9 @@ FORWARD = Medium.from_albedo(0.99, 1.0, 0.8, 1.5)
 SMALL = MapGrid(n_theta=3, n_phi=16, n_r=10, n_psi=8)
 
 
-@pytest.mark.parametrize("medium", [FIG10, FORWARD, Medium.from_albedo(0.6, 1.0, -0.5, 0.8)], ids=["fig10", "g0.8", "eta0.8"])
+@pytest.mark.parametrize(
+    "medium", [FIG10, FORWARD, Medium.from_albedo(0.6, 1.0, -0.5, 0.8)], ids=["fig10", "g0.8", "eta0.8"]
+)
 def test_a_map_summed_over_the_plane_is_the_angular_reflectance(medium):
     unit = MapUnit(medium, SMALL, 1, 3, 0, None, 400_000)
     result = trace_unit(unit)
