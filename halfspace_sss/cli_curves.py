@@ -4,30 +4,18 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from halfspace_sss.cli_shared import Bar, console, numbers, stated_medium
 from halfspace_sss.curve_set import TRACED, CurveSet, check_folder
 
 if TYPE_CHECKING:
     import pandas
     from rich.table import Table
 
-    from halfspace_sss.medium import Medium
-
-__all__ = ["curves_command", "error_table", "numbers"]
-
-TABLE_WIDTH = 130  # where the output is no terminal
-FIG10 = {"sigma_t": 0.241, "albedo": 0.75, "g": 0.0, "eta": 1.3}
-
-
-def numbers(name: str, text: str) -> list[float]:
-    """Comma-separated numbers; ValueError with the name of the option."""
-    try:
-        return [float(part) for part in text.split(",")]
-    except ValueError:
-        raise ValueError(f"{name} must be numbers separated by commas, got {text!r}") from None
+__all__ = ["curves_command", "error_table"]
 
 
 def curves_command(
@@ -58,51 +46,17 @@ def curves_command(
     from halfspace_sss.reflectance_curves import curves
 
     check_folder(out)
-    medium = _medium(material, {"sigma_t": sigma_t, "albedo": albedo, "g": g, "eta": eta})
-    with _Bar() as bar:
+    given = {"sigma_t": sigma_t, "albedo": albedo, "g": g, "eta": eta}
+    medium = stated_medium([] if material is None else [material], given)
+    if medium is None:
+        medium = "fig10" if material is None else material
+    with Bar("tracing") as bar:
         result = curves(
             medium, channel=channel, theta_i_deg=numbers("theta_i", theta_i), theta_o_deg=theta_o,
             delta_phi_deg=delta_phi, line_deg=line, r_min=r_min, r_max=r_max, models=model or None, orders=orders,
             n_paths=paths, seed=seed, backend=backend, progress=bar.show,
         )  # fmt: skip
     _report(result, result.save(out))
-
-
-def _medium(material: str | None, given: dict[str, float | None]) -> Medium | str:
-    """A material by name, or the medium of Fig. 10 with the coefficients that were given."""
-    from halfspace_sss.medium import Medium
-
-    stated = {name: value for name, value in given.items() if value is not None}
-    if material is not None:
-        for name, value in stated.items():
-            raise ValueError(f"{name} must be left out for a named material, got {value!r} with {material!r}")
-        return material
-    return Medium.from_albedo(**{**FIG10, **stated}) if stated else "fig10"
-
-
-class _Bar:
-    """Progress with the time left, on stderr; appears when tracing begins, so that refused input leaves no trace."""
-
-    def __init__(self) -> None:
-        self._progress: Any = None
-
-    def __enter__(self) -> _Bar:
-        return self
-
-    def show(self, done: int, total: int) -> None:
-        from rich.console import Console
-        from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-
-        if self._progress is None:
-            columns = (TextColumn("tracing"), BarColumn(), TimeElapsedColumn(), TextColumn("left"))
-            self._progress = Progress(*columns, TimeRemainingColumn(), console=Console(stderr=True))
-            self._progress.start()
-            self._task = self._progress.add_task("", total=total)
-        self._progress.update(self._task, completed=done, total=total)
-
-    def __exit__(self, *_: object) -> None:
-        if self._progress is not None:
-            self._progress.stop()
 
 
 def error_table(result: CurveSet) -> Table:
@@ -149,17 +103,13 @@ def _table_row(rows: pandas.DataFrame, series: str) -> list[str]:
 
 
 def _report(result: CurveSet, files: list[Path]) -> None:
-    from rich.console import Console
-
-    console = Console()
-    if not console.is_terminal:
-        console = Console(width=TABLE_WIDTH)
-    console.print(error_table(result))
+    screen = console()
+    screen.print(error_table(result))
     for note in result.notes:
-        console.print(note, highlight=False, markup=False)
+        screen.print(note, highlight=False, markup=False)
     if not any(file.suffix == ".pdf" for file in files):
-        console.print("no figure: it needs `pip install halfspace-sss[figures]`", highlight=False, markup=False)
+        screen.print("no figure: it needs `pip install halfspace-sss[figures]`", highlight=False, markup=False)
     walks = f"{result.n_paths:,} walks for each direction, {result.seconds:.0f} s"
-    console.print(f"{walks}; written:", highlight=False, markup=False)
+    screen.print(f"{walks}; written:", highlight=False, markup=False)
     for file in files:
-        console.print(f"  {file}", highlight=False, markup=False, soft_wrap=True)
+        screen.print(f"  {file}", highlight=False, markup=False, soft_wrap=True)

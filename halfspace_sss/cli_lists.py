@@ -6,6 +6,8 @@ from typing import Annotated
 
 import typer
 
+from halfspace_sss.cli_shared import console
+
 __all__ = ["materials_command", "models_command"]
 
 
@@ -29,7 +31,7 @@ def _print_materials() -> None:
         columns = [" ".join(f"{value:.4g}" for value in rows[column]) for column in ("sigma_t", "albedo")]
         g, eta = (" ".join(dict.fromkeys(f"{value:.3g}" for value in rows[column])) for column in ("g", "eta"))
         table.add_row(name, group, " ".join(rows["channel"]), *columns, g, eta)
-    _console().print(table)
+    console().print(table)
 
 
 def _print_material(name: str) -> None:
@@ -62,12 +64,4 @@ def models_command() -> None:
             table.add_row(name, "", "", f"not made for a plain medium: {error}")
             continue
         table.add_row(name, model.orders, "yes" if model.reciprocal else "no", model.source)
-    _console().print(table)
-
-
-def _console(width: int = 132):
-    """A console that does not fold lines at 80 columns where the output is a file."""
-    from rich.console import Console
-
-    console = Console()
-    return console if console.is_terminal else Console(width=width)
+    console().print(table)
