@@ -16,54 +16,67 @@ __all__ = [
 ]  # fmt: skip
 
 
-def F_r(mu: Any, eta: float) -> Any:
+def _matched(eta: Any) -> bool:
+    """Whether the index is the number 1, for which formulas shorten to exact ones; arrays are masked instead."""
+    return isinstance(eta, (int, float)) and eta == 1
+
+
+def _m2(mu: Any, eta: Any) -> Any:
+    """(eta mu_t)² = eta² - 1 + mu², which keeps its digits for eta -> 1 and mu -> 0."""
+    return (eta - 1) * (eta + 1) + mu * mu
+
+
+def F_r(mu: Any, eta: Any) -> Any:
     """Unpolarised Fresnel reflectance of light that meets the surface at cosine mu.
 
-    F = (r_s² + r_p²) / 2 with mu_t = sqrt(1 - (1 - mu²)/eta²); total internal reflection gives 1,
+    F = (r_s² + r_p²) / 2, r_s = (mu - m) / (mu + m), r_p = (eta² mu - m) / (eta² mu + m) with m = eta mu_t =
+    sqrt(eta² - 1 + mu²), mu_t the cosine of the refracted direction; total internal reflection gives 1,
     eta = 1 gives exactly 0.
 
     Args:
         mu: cosine on the incident side, [0, 1].
         eta: index beyond the surface over index on the incident side (light leaving the medium:
-            1 / medium.eta).
+            1 / medium.eta), a number or an array of the library of mu.
 
     Returns:
         Reflectance in [0, 1], the shape and precision of mu.
     """
-    lib = library(mu)
-    if eta == 1:
+    lib = library(mu, eta)
+    if _matched(eta):
         return 0 * mu
-    mu_t2 = 1 - (1 - mu) * (1 + mu) / eta**2
-    mu_t = lib.sqrt(lib.maximum(mu_t2, 0.0))
-    # eta >= 1: both denominators vanish only where mu_t does too, i.e. never; eta < 1: under the mask
-    r_s = (mu - eta * mu_t) / lib.maximum(mu + eta * mu_t, 1e-30)
-    r_p = (eta * mu - mu_t) / lib.maximum(eta * mu + mu_t, 1e-30)
-    return lib.where(mu_t2 <= 0, 1 + 0 * mu, lib.minimum(0.5 * (r_s * r_s + r_p * r_p), 1.0))
+    m2, eta2 = _m2(mu, eta), eta * eta
+    m = lib.sqrt(lib.maximum(m2, 0.0))
+    # eta >= 1: both denominators vanish only where m does too, i.e. never; eta < 1: under the mask
+    r_s = (mu - m) / lib.maximum(mu + m, 1e-30)
+    r_p = (eta2 * mu - m) / lib.maximum(eta2 * mu + m, 1e-30)
+    F = lib.where(m2 <= 0, 1 + 0 * mu, lib.minimum(0.5 * (r_s * r_s + r_p * r_p), 1.0))
+    return F if isinstance(eta, (int, float)) else lib.where(eta == 1, 0 * mu, F)
 
 
-def F_t(mu: Any, eta: float) -> Any:
+def F_t(mu: Any, eta: Any) -> Any:
     """Fresnel transmittance 1 - F_r, with the digits of T kept at grazing incidence.
 
     T = 2 eta mu mu_t [1 / (mu + eta mu_t)² + 1 / (eta mu + mu_t)²]. Same function for light entering
     under the external cosine mu and leaving under it. Arguments as `F_r`.
     """
-    lib = library(mu)
-    if eta == 1:
+    lib = library(mu, eta)
+    if _matched(eta):
         return 1 + 0 * mu
     mu_t = mu_internal(mu, eta)
     s, p = lib.maximum(mu + eta * mu_t, 1e-15), lib.maximum(eta * mu + mu_t, 1e-15)
-    return 2 * eta * mu * mu_t * (1 / (s * s) + 1 / (p * p))
+    T = 2 * eta * mu * mu_t * (1 / (s * s) + 1 / (p * p))
+    return T if isinstance(eta, (int, float)) else lib.where(eta == 1, 1 + 0 * mu, T)
 
 
-def mu_internal(mu: Any, eta: float) -> Any:
+def mu_internal(mu: Any, eta: Any) -> Any:
     """Cosine inside for the cosine mu outside, sqrt(1 - (1 - mu²)/eta²); 0 where nothing refracts (eta < 1)."""
-    lib = library(mu)
-    if eta == 1:
+    lib = library(mu, eta)
+    if _matched(eta):
         return mu
-    return lib.sqrt(lib.maximum(1 - (1 - mu) * (1 + mu) / eta**2, 0.0))
+    return lib.sqrt(lib.maximum(_m2(mu, eta), 0.0)) / eta
 
 
-def mu_external(mu: Any, eta: float) -> Any:
+def mu_external(mu: Any, eta: Any) -> Any:
     """Cosine outside for the cosine mu inside; 0 beyond the critical angle (eta > 1)."""
     return mu_internal(mu, 1 / eta)
 

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-__all__ = ["Medium"]
+__all__ = ["Medium", "check_ratios"]
 
 
 def _check(name: str, value: np.ndarray, ok: np.ndarray, bound: str) -> None:
     if not np.all(ok):
         bad = np.atleast_1d(value)[~np.atleast_1d(ok)][0]
-        raise ValueError(f"{name} must be {bound}, got {bad!r}")
+        raise ValueError(f"{name} must be {bound}, got {bad.item()!r}")
 
 
 def _number(name: str, value: object) -> np.ndarray:
@@ -23,6 +23,17 @@ def _number(name: str, value: object) -> np.ndarray:
     if array.ndim > 1:
         raise ValueError(f"{name} must be a scalar or one value per channel, got shape {array.shape}")
     return array
+
+
+def check_ratios(albedo: np.ndarray, g: np.ndarray, eta: np.ndarray) -> None:
+    """Check arrays of what a half-space in mean free paths is made of, by the ranges of `Medium`.
+
+    Raises:
+        ValueError: an albedo is outside [0, 1], a g outside (-1, 1), an eta not finite or not > 0.
+    """
+    _check("albedo", albedo, (albedo >= 0) & (albedo <= 1), "in [0, 1]")
+    _check("g", g, np.abs(g) < 1, "in the open interval (-1, 1)")
+    _check("eta", eta, np.isfinite(eta) & (eta > 0), "finite and > 0")
 
 
 @dataclass(frozen=True, eq=False)

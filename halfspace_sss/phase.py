@@ -9,8 +9,6 @@ from halfspace_sss.arrays import library
 
 __all__ = ["eval_hg", "pdf_hg", "sample_hg"]
 
-G_ISOTROPIC = 1e-3  # below this |g| the inverse of the distribution loses more digits than g = 0 is wrong by
-
 
 def eval_hg(cos_theta: Any, g: Any) -> Any:
     """Henyey-Greenstein phase function p(cos_theta), 1/sr.
@@ -41,17 +39,10 @@ def pdf_hg(cos_theta: Any, g: Any) -> Any:
 def sample_hg(u: Any, g: Any) -> Any:
     """Cosine of the scattering angle for a uniform number u in [0, 1).
 
-    g = 0: 1 - 2u; otherwise (1 + g² - q²) / (2g), q = (1 - g²) / (1 - g + 2gu); clamped to [-1, 1].
+    cos = 1 - (1 - g) (1 - u) (1 - g + q) / b with b = 1 - g + 2gu, q = (1 - g²) / b: the published
+    (1 + g² - q²) / (2g) without its division by g, so that it holds for every g, 0 included, and keeps its digits.
     The azimuth about the old direction is uniform and left to the caller.
     """
     lib = library(u, g)
-    if isinstance(g, (int, float)):
-        if abs(g) < G_ISOTROPIC:
-            return 1 - 2 * u
-        q = (1 - g * g) / (1 - g + 2 * g * u)
-        return lib.minimum(lib.maximum((1 + g * g - q * q) / (2 * g), -1.0), 1.0)
-    isotropic = lib.abs(g) < G_ISOTROPIC
-    g = lib.where(isotropic, 0.5, g)
-    q = (1 - g * g) / (1 - g + 2 * g * u)
-    cosine = lib.minimum(lib.maximum((1 + g * g - q * q) / (2 * g), -1.0), 1.0)
-    return lib.where(isotropic, 1 - 2 * u, cosine)
+    ratio = (1 - g) / (1 - g + 2 * g * u)
+    return lib.maximum(1 - ratio * (1 - u) * (1 - g + ratio * (1 + g)), -1.0)

@@ -169,11 +169,14 @@ class LineTally:
         self, types: ModuleType, angular: AngularTally, edges: np.ndarray, line_phi: float, half_width: float,
         symmetry: str,
     ) -> None:  # fmt: skip
-        self.angular, self.symmetry, self.half_width = angular, symmetry, half_width
-        self.line = abs(math.remainder(line_phi, 2 * math.pi)) if symmetry == "mirror" else line_phi
+        import drjit as dr
+
+        self.angular, self.symmetry = angular, symmetry
+        line = abs(math.remainder(line_phi, 2 * math.pi)) if symmetry == "mirror" else line_phi
+        self.line, self.half_width = (dr.opaque(types.Float, v) for v in (line, half_width))
         self.edges2 = types.Float(np.asarray(edges, dtype=np.float64) ** 2)
         self.cells = CellSums(types, len(edges) - 1)
-        low, high = max(self.line - half_width, 0.0), min(self.line + half_width, math.pi)
+        low, high = max(line - half_width, 0.0), min(line + half_width, math.pi)
         self.angle = {"rotation": 2 * math.pi, "mirror": 2 * (high - low), "none": 2 * half_width}[symmetry]
         self.areas = 0.5 * self.angle * np.diff(np.asarray(edges, dtype=np.float64) ** 2)
 

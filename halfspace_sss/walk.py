@@ -16,15 +16,13 @@ from typing import Any, Protocol
 import numpy as np
 
 from halfspace_sss.fresnel import F_r
-from halfspace_sss.medium import Medium
+from halfspace_sss.medium import Medium, check_ratios
 from halfspace_sss.phase import sample_hg
 
 __all__ = ["Boundary", "Scatter", "Tally", "WalkConstants", "pass_seed", "walk"]
 
-ROULETTE_WEIGHT, ROULETTE_BOOST = (
-    0.3,
-    3.0,
-)  # least variance x time over (0.75, 0, 1.3), (0.99, 0, 1.5), (0.999, 0.9, 1.3)
+# least variance x time over the media (albedo, g, eta) = (0.75, 0, 1.3), (0.99, 0, 1.5), (0.999, 0.9, 1.3)
+ROULETTE_WEIGHT, ROULETTE_BOOST = 0.3, 3.0
 # Albedo 1 never absorbs: roulette at each doubling of the number of events from LONG_PATH on. As P(order > N) ~ N^-1/2,
 # survival s per doubling costs a sum over k of (sqrt(2) s)^k events and has a variance of a sum of (1 / (sqrt(2) s))^k;
 # no s keeps both finite. sqrt(1/2), at which both grow with k only, goes on until VERY_LONG_PATH, then 1/2, which
@@ -77,19 +75,50 @@ class Tally(Protocol):
 
 @dataclass(frozen=True)
 class WalkConstants:
-    """The medium as opaque Dr.Jit numbers, so that one kernel serves all media; isotropic media have their own."""
+    """What the walk knows of a medium: Dr.Jit numbers, or one value per lane.
+
+    Numbers are opaque, so that one kernel serves all media; isotropic and matched media have kernels of their own.
+    """
 
     albedo: Any
     g: Any
-    isotropic: bool
-    eta: float
+    inverse_eta: Any
+    isotropic: bool  # g = 0 in every lane
+    matched: bool  # eta = 1 in every lane
 
     @classmethod
     def of(cls, types: ModuleType, medium: Medium) -> WalkConstants:
+        """One scalar medium for all lanes."""
         import drjit as dr
 
-        albedo = dr.opaque(types.Float, medium.albedo)
-        return cls(albedo, dr.opaque(types.Float, medium.g), medium.g == 0, medium.eta)
+        opaque = (dr.opaque(types.Float, v) for v in (medium.albedo, medium.g, 1 / medium.eta))
+        return cls(*opaque, medium.g == 0, medium.eta == 1)
+
+    @classmethod
+    def per_lane(cls, types: ModuleType, albedo: np.ndarray, g: np.ndarray, eta: np.ndarray) -> WalkConstants:
+        """A medium of its own for each lane.
+
+        Args:
+            types: Dr.Jit array module, from `backend.array_types`.
+            albedo, g, eta: arrays of shape (lanes,), in the ranges of `Medium`.
+
+        Raises:
+            ValueError: the shapes differ or a value is out of range.
+        """
+        albedo, g, eta = (np.asarray(v, dtype=np.float64) for v in (albedo, g, eta))
+        if albedo.ndim != 1 or not albedo.shape == g.shape == eta.shape:
+            shapes = ", ".join(str(v.shape) for v in (albedo, g, eta))
+            raise ValueError(f"albedo, g and eta must be arrays of one shape (lanes,), got {shapes}")
+        check_ratios(albedo, g, eta)
+        lanes = (types.Float(types.Float64(v)) for v in (albedo, g, 1 / eta))  # rounded by Dr.Jit: aligned memory
+        return cls(*lanes, bool(np.all(g == 0)), bool(np.all(eta == 1)))
+
+    def check_lanes(self, lanes: int) -> None:
+        """ValueError unless the constants are those of one medium or of as many lanes as are walked."""
+        import drjit as dr
+
+        if dr.width(self.albedo) not in (1, lanes):
+            raise ValueError(f"medium must have one value or {lanes} (one per lane), got {dr.width(self.albedo)}")
 
 
 def pass_seed(seed: int, *indices: int) -> tuple[int, int]:
@@ -117,11 +146,12 @@ def _turn(dx: Any, dy: Any, dz: Any, cosine: Any, azimuth: Any) -> tuple[Any, An
 
 def walk(
     types: ModuleType,
-    medium: Medium,
+    medium: Medium | WalkConstants,
     mu_in: Any,
     paths_per_lane: int,
     seed: tuple[int, int],
     tallies: Sequence[Tally],
+    weight: Any = 1.0,
 ) -> tuple[tuple, Any]:
     """Trace `paths_per_lane` walks one after another in each lane and return the tallies' sums and event counts.
 
@@ -129,34 +159,43 @@ def walk(
 
     Args:
         types: Dr.Jit array module, from `backend.array_types`.
-        medium: scalar medium; only albedo, g and eta matter (lengths are mean free paths).
-        mu_in: internal cosine of the beam in each lane; walks start with weight 1, T_12 is left to the caller.
+        medium: scalar medium, or the constants of one or of a medium per lane; only albedo, g and eta matter
+            (lengths are mean free paths).
+        mu_in: internal cosine of the beam in each lane, taken as at least 1e-6; T_12 is left to the caller.
         paths_per_lane: number of walks per lane.
         seed: from `pass_seed`.
         tallies: what to record.
+        weight: of a walk at its start, a number or one per lane. Above one it keeps roulette away for longer: with
+            albedo^-n all walks get to order n.
 
     Returns:
         The sums of each tally, one entry per lane and summed over its walks, and scattering events per lane.
+
+    Raises:
+        ValueError: the constants are of another number of lanes.
     """
     import drjit as dr
 
     Float, UInt32 = types.Float, types.UInt32
     lanes = dr.width(mu_in)
-    constants = WalkConstants.of(types, medium)
+    constants = medium if isinstance(medium, WalkConstants) else WalkConstants.of(types, medium)
+    constants.check_lanes(lanes)
+    mu_in = dr.clip(mu_in, 1e-6, 1.0)
     sin_in = dr.sqrt(dr.maximum((1 - mu_in) * (1 + mu_in), 0.0))
-    dr.eval(mu_in, sin_in)
+    dr.eval(mu_in, sin_in, constants.albedo, constants.g, constants.inverse_eta)
     last = dr.opaque(UInt32, paths_per_lane)
     lane = dr.arange(UInt32, lanes)
     zero = dr.zeros(Float, lanes)
     count = dr.zeros(UInt32, lanes)
+    begin = dr.opaque(Float, weight) if isinstance(weight, float) else weight
     state = {
-        "rng": types.PCG32(lanes, initstate=seed[0], initseq=seed[1]),
+        "rng": types.PCG32(lanes, *(dr.opaque(types.UInt64, s) for s in seed)),
         "x": zero, "y": zero, "z": zero, "dx": sin_in, "dy": zero, "dz": mu_in, "length": zero,
-        "weight": zero + 1, "order": count, "path": count, "events": count,
+        "weight": zero + begin, "order": count, "path": count, "events": count,
     }  # fmt: skip
 
     def body(s: dict, sums: tuple) -> tuple[dict, tuple]:
-        return _step(s, sums, constants, (sin_in, mu_in), lane, tallies)
+        return _step(s, sums, constants, (sin_in, mu_in, begin), lane, tallies)
 
     start = tuple(t.start(lanes) for t in tallies)
     s, sums = dr.while_loop((state, start), lambda s, sums: s["path"] < last, body, mode="symbolic", label="walk")
@@ -190,7 +229,7 @@ def _step(s: dict, sums: tuple, m: WalkConstants, start: tuple, lane: Any, talli
     below = z + dz * path
     crosses = below < 0
     mu = dr.abs(dz)
-    F = F_r(mu, 1 / m.eta) if m.eta != 1 else Float(0)
+    F = Float(0) if m.matched else F_r(mu, m.inverse_eta)
     leaving = dr.select(crosses, s["weight"] * (1 - F), 0.0)
     t = z / dr.maximum(mu, 1e-12)
     event = Boundary(s["order"], leaving, x + dx * t, y + dy * t, mu, s["length"] + t)
@@ -204,7 +243,7 @@ def _step(s: dict, sums: tuple, m: WalkConstants, start: tuple, lane: Any, talli
     sums = tuple(tally.scatter(state, event) for tally, state in zip(tallies, sums))
 
     u, azimuth = rng.next_float32(), 2 * math.pi * rng.next_float32()
-    cosine = 1 - 2 * u if m.isotropic else sample_hg(u, m.g)
+    cosine = 2 * u - 1 if m.isotropic else sample_hg(u, m.g)
     dx, dy, dz = _turn(dx, dy, dz, cosine, azimuth)
 
     survive, weight = _roulette(weight, order)
@@ -216,7 +255,7 @@ def _step(s: dict, sums: tuple, m: WalkConstants, start: tuple, lane: Any, talli
     return {
         "rng": rng, "x": renew(0.0, x), "y": renew(0.0, y), "z": renew(0.0, z),
         "dx": renew(start[0], dx), "dy": renew(0.0, dy), "dz": renew(start[1], dz),
-        "length": renew(0.0, s["length"] + path), "weight": renew(1.0, weight),
+        "length": renew(0.0, s["length"] + path), "weight": renew(start[2], weight),
         "order": renew(UInt32(0), order), "path": s["path"] + dr.select(ends, UInt32(1), UInt32(0)),
         "events": s["events"] + 1,
     }, sums  # fmt: skip

@@ -52,12 +52,25 @@ def cdf_hg(c, g):
     return (1 - g**2) / (2 * g) * (1 / np.sqrt(1 + g**2 - 2 * g * c) - 1 / (1 + g))
 
 
-@pytest.mark.parametrize("g", [-0.999, -0.6, 0.0, 5e-4, 0.3, 0.9, 0.999])
+@pytest.mark.parametrize("g", [-0.999, -0.6, 0.0, 1e-9, 5e-4, 0.3, 0.9, 0.999])
 def test_samples_pass_a_chi_square_test_at_one_in_a_thousand(g):
     c = sample_hg(np.random.default_rng(11).random(200_000), g)
-    u = np.clip(cdf_hg(c, g if abs(g) >= 1e-3 else 0.0), 0, 1)  # rounding at the ends
+    u = np.clip(cdf_hg(c, g if abs(g) >= 1e-6 else 0.0), 0, 1)  # rounding at the ends
     observed, _ = np.histogram(u, bins=50, range=(0, 1))
     assert stats.chisquare(observed, np.full(50, len(c) / 50)).pvalue > 1e-3
+
+
+@pytest.mark.parametrize("g", [-0.9, -0.3, -2e-3, -1e-5, 0.0, 1e-5, 2e-3, 0.3, 0.9, 0.999])
+def test_samples_are_as_exact_in_float32_as_a_cosine_can_be(g):
+    g, u = np.float32(g), np.linspace(0, 1, 1001, endpoint=False, dtype=np.float32)
+    exact = sample_hg(u.astype(np.float64), np.float64(g))
+    np.testing.assert_allclose(sample_hg(u, g), exact, rtol=0, atol=6e-7 / (1 - abs(min(g, 0.0))))
+
+
+def test_sampling_inverts_the_distribution():
+    u = np.linspace(0, 1, 101, endpoint=False)
+    for g in (-0.9, -0.1, 0.01, 0.5, 0.99):
+        np.testing.assert_allclose(cdf_hg(sample_hg(u, g), g), u, atol=1e-10)
 
 
 @pytest.mark.parametrize("g", GS)
