@@ -1,12 +1,18 @@
-"""What things cost: the walk, the walk against Mitsuba's volpath at equal error, and every model per backend."""
+"""What things cost: the walk, the walk against Mitsuba's volpath at equal error, and every model per backend.
+
+Every function yields its rows one by one, as they are measured.
+"""
 
 from __future__ import annotations
 
 import math
-import resource
+import os
+import platform
 import statistics
+import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,12 +26,17 @@ from halfspace_sss.medium import Medium
 from halfspace_sss.tallies import AngularTally, FluxTally
 from halfspace_sss.walk import pass_seed, walk
 
-__all__ = ["MEDIA", "bench_maps", "bench_models", "bench_volpath", "bench_walk", "peak_memory"]
+__all__ = [
+    "MAP_MEDIA", "MEDIA", "ROULETTE_DEPTHS", "bench_maps", "bench_models", "bench_volpath", "bench_walk", "machine",
+    "peak_memory",
+]  # fmt: skip
 
 MEDIA = ((0.75, 0.0, 1.3), (0.99, 0.0, 1.5), (0.999, 0.9, 1.3))
+MAP_MEDIA = ((0.75, 0.0, 1.3), (0.99, 0.8, 1.5))
 ROULETTE_DEPTHS = (5, 64, 256, 1024)
 REPEATS = 3
 Row = dict[str, Any]
+Media = Sequence[tuple[float, float, float]]  # albedo, g, eta
 
 
 def _medium(albedo: float, g: float, eta: float) -> Medium:
@@ -46,13 +57,12 @@ def _walk_once(medium: Medium, lanes: int, per_lane: int, seed: int, peel_off: b
     return flux, count, time.perf_counter() - started
 
 
-def bench_walk(lanes: int = 32768, per_lane: int = 64) -> list[Row]:
+def bench_walk(lanes: int = 32768, per_lane: int = 64, media: Media = MEDIA) -> Iterator[Row]:
     """Events and paths per second of the walk, recording flux alone and with peel-off towards one direction.
 
     Medians over three launches after one that compiles; efficiency is 1 / (variance of a path x seconds a path).
     """
-    rows = []
-    for albedo, g, eta in MEDIA:
+    for albedo, g, eta in media:
         medium = _medium(albedo, g, eta)
         for peel_off in (False, True):
             _walk_once(medium, 1024, 1, 0, peel_off)
@@ -64,8 +74,7 @@ def bench_walk(lanes: int = 32768, per_lane: int = 64) -> list[Row]:
             row |= {"events_per_s": events / seconds, "paths_per_s": paths / seconds, "events_per_path": events / paths}
             if not peel_off:
                 row |= {"sd_per_path": math.sqrt(variance), "efficiency": paths / (variance * seconds)}
-            rows.append(row)
-    return rows
+            yield row
 
 
 def _half_space(mi: Any, albedo: float, g: float, eta: float, rr_depth: int, size: int) -> Any:
@@ -83,20 +92,22 @@ def _half_space(mi: Any, albedo: float, g: float, eta: float, rr_depth: int, siz
     return mi.load_dict({"type": "scene", "i": integrator, "camera": camera, "light": light, "plane": plane})
 
 
-def bench_volpath(walk_rows: list[Row], size: int = 256, spp: int = 4) -> list[Row]:
+def bench_volpath(
+    walk_rows: Sequence[Row], size: int = 256, spp: int = 4, depths: Sequence[int] = ROULETTE_DEPTHS
+) -> Iterator[Row]:
     """Equal-error ratio of the walk and Mitsuba's `volpath` on total reflectance at normal incidence.
 
-    For each Russian-roulette depth: 1 / (variance x time) of volpath, and how many times more that of the walk
-    is. volpath includes the specular reflection, which the walk knows exactly; the variance is over pixels.
+    For each medium of `walk_rows`, which `bench_walk` gave, and each Russian-roulette depth: 1 / (variance x time) of
+    volpath, and how many times more that of the walk is. volpath includes the specular reflection, which the walk
+    knows exactly; the variance is over pixels.
     """
     array_types()
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_mono")
-    rows = []
-    for albedo, g, eta in MEDIA:
-        ours = next(r for r in walk_rows if (r["albedo"], r["g"], r["eta"]) == (albedo, g, eta) and not r["peel_off"])
-        for rr_depth in ROULETTE_DEPTHS:
+    for ours in (row for row in walk_rows if not row["peel_off"]):
+        albedo, g, eta = ours["albedo"], ours["g"], ours["eta"]
+        for rr_depth in depths:
             scene = _half_space(mi, albedo, g, eta, rr_depth, size)
             np.array(mi.render(scene, spp=1, seed=0))
             started = time.perf_counter()
@@ -107,11 +118,10 @@ def bench_volpath(walk_rows: list[Row], size: int = 256, spp: int = 4) -> list[R
             row: Row = {"albedo": albedo, "g": g, "eta": eta, "rr_depth": rr_depth}
             row |= {"mean": image.mean() - F_r(1.0, eta), "standard_error": math.sqrt(variance / (image.size * spp))}
             row |= {"paths_per_s": image.size * spp / seconds, "efficiency": efficiency}
-            rows.append(row | {"equal_error_ratio": ours["efficiency"] / efficiency})
-    return rows
+            yield row | {"equal_error_ratio": ours["efficiency"] / efficiency}
 
 
-def _rate(call: Callable[[], Any], n: int, least_seconds: float = 0.2) -> float:
+def _rate(call: Callable[[], Any], n: int, least_seconds: float) -> float:
     """Queries per second, median of repeats that each last at least `least_seconds`."""
     call()
     rates = []
@@ -132,7 +142,7 @@ def _queries(n: int) -> list[np.ndarray]:
     return [a.astype(np.float32) for a in (r, mu_i, phi_i, mu_o, phi_o)]
 
 
-def bench_models(names: tuple[str, ...] | None = None, n: int = 1 << 15) -> list[Row]:
+def bench_models(names: tuple[str, ...] | None = None, n: int = 1 << 15, least_seconds: float = 0.2) -> Iterator[Row]:
     """Evaluations of S per second in float32, batches of `n`: NumPy, torch (if installed) and Dr.Jit on the CPU.
 
     Dr.Jit is given batches 16 times as large, since a kernel launch has a fixed cost; the sum of S is evaluated.
@@ -144,38 +154,51 @@ def bench_models(names: tuple[str, ...] | None = None, n: int = 1 << 15) -> list
         import torch
     except ImportError:
         torch = None
-    medium, rows = _medium(0.75, 0.0, 1.3), []
+    medium = _medium(0.75, 0.0, 1.3)
     for name in names or models():
         model = bssrdf(name, medium)
         arrays, many = _queries(n), [types.Float(a) for a in _queries(16 * n)]
         dr.eval(many)
         row: Row = {"model": name, "orders": model.orders}
-        row["numpy"] = _rate(lambda m=model, q=arrays: m.eval(*q), n)
+        row["numpy"] = _rate(lambda m=model, q=arrays: m.eval(*q), n, least_seconds)
         if torch is not None:
             tensors = [torch.from_numpy(a) for a in arrays]
             with torch.no_grad():
-                row["torch"] = _rate(lambda m=model, q=tensors: m.eval(*q), n)
-        row["drjit"] = _rate(lambda m=model, q=many: dr.sum(m.eval(*q)).numpy(), 16 * n)
-        rows.append(row)
-    return rows
+                row["torch"] = _rate(lambda m=model, q=tensors: m.eval(*q), n, least_seconds)
+        row["drjit"] = _rate(lambda m=model, q=many: dr.sum(m.eval(*q)).numpy(), 16 * n, least_seconds)
+        yield row
 
 
-def bench_maps(target_error: float = 0.05) -> list[Row]:
-    """Seconds for a set of 16 x 64 maps of 48 x 24 cells to the target mean cell error, order >= 2."""
-    rows = []
-    for albedo, g, eta in ((0.75, 0.0, 1.3), (0.99, 0.8, 1.5)):
+def bench_maps(target_error: float = 0.05, grid: MapGrid | None = None, media: Media = MAP_MEDIA) -> Iterator[Row]:
+    """Seconds for a set of maps (16 x 64 of 48 x 24 cells) to the target mean cell error, order >= 2."""
+    grid = grid or MapGrid()
+    for albedo, g, eta in media:
         medium = _medium(albedo, g, eta)
         started = time.perf_counter()
-        units = [MapUnit(medium, MapGrid(), a, 0, 0, target_error, 2**33) for a in range(16)]
+        units = [MapUnit(medium, grid, a, 0, 0, target_error, 2**33) for a in range(grid.n_theta)]
         results = [trace_unit(unit) for unit in units]
         seconds = time.perf_counter() - started
         error = float(np.mean([r.mean_cell_error for r in results]))
         events = sum(r.n_events for r in results)
-        row: Row = {"albedo": albedo, "g": g, "eta": eta, "mean_cell_error": error, "seconds": seconds}
-        rows.append(row | {"paths": sum(r.n_paths for r in results), "events_per_s": events / seconds})
-    return rows
+        row: Row = {"albedo": albedo, "g": g, "eta": eta, "maps": grid.n_theta * grid.n_phi}
+        row |= {"mean_cell_error": error, "seconds": seconds}
+        yield row | {"paths": sum(r.n_paths for r in results), "events_per_s": events / seconds}
 
 
-def peak_memory() -> float:
-    """Largest resident memory of this process so far, GB."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+def peak_memory() -> float | None:
+    """Largest resident memory of this process so far, GiB; None where the system does not tell."""
+    try:
+        import resource
+    except ImportError:
+        return None
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**30 if sys.platform == "darwin" else 2**20)
+
+
+def machine() -> dict[str, Any]:
+    """What the figures depend on: processor, number of its threads, system."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        processor = next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        processor = platform.processor() or platform.machine()
+    return {"processor": processor, "threads": os.cpu_count(), "system": f"{platform.system()} {platform.machine()}"}

@@ -14,6 +14,7 @@ from typer.core import TyperGroup
 
 import halfspace_sss
 from halfspace_sss.backend import BackendError
+from halfspace_sss.cli_bench import bench_command
 from halfspace_sss.cli_curves import curves_command
 from halfspace_sss.cli_lists import materials_command, models_command
 from halfspace_sss.cli_validate import validate_command
@@ -22,6 +23,7 @@ from halfspace_sss.extensions import commands
 __all__ = ["app", "main"]
 
 _OWN = {
+    "bench": bench_command,
     "curves": curves_command,
     "materials": materials_command,
     "models": models_command,

@@ -59,7 +59,7 @@ class Bar:
         from rich.console import Console
         from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-        steps = (TextColumn(self._title), BarColumn(), TextColumn("{task.completed:.0f}/{task.total:.0f}"))
+        steps = (TextColumn(self._title), BarColumn(), TextColumn("{task.percentage:.0f} %"))
         times = (TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn())
         text = TextColumn("{task.fields[text]}", markup=False)
         screen = Console(stderr=True)
