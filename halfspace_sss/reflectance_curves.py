@@ -9,7 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from halfspace_sss import materials, measure
+from halfspace_sss import measure
+from halfspace_sss.channels import one_channel
 from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.curve_defaults import default_paths, default_range
 from halfspace_sss.curve_set import TRACED, Curve, CurveSet
@@ -125,7 +126,7 @@ def curves(
 
     Source: the paper's Fig. 10 (Neural SSS, EGSR 2024).
     """
-    title, medium = _one_channel(medium, channel)
+    title, medium = one_channel(medium, channel)
     angles = _checked_angles(theta_i_deg, theta_o_deg, delta_phi_deg, line_deg)
     check_count("n_r", n_r, 2)
     check_count("n_paths", 256 if n_paths is None else n_paths, 256)
@@ -202,27 +203,6 @@ def _evaluations_per_s(model: BSSRDF, line: _Line, n: int = 4096, least_seconds:
         model.eval(*query)
         done += n
     return done / elapsed
-
-
-def _one_channel(medium: Medium | str, channel: int | str | None) -> tuple[str, Medium]:
-    """A title and the scalar medium of one channel."""
-    names: tuple[str, ...] | None = None
-    title = ""
-    if isinstance(medium, str):
-        material = materials.load(medium)
-        title, medium, names = material.name, material.medium, material.channels
-    if not isinstance(medium, Medium):
-        raise ValueError(f"medium must be a Medium or the name of a material, got {medium!r}")
-    if medium.n_channels is None:
-        if channel not in (None, 0):
-            raise ValueError(f"channel must be left out for a medium with one channel, got {channel!r}")
-        return title, medium
-    names = names or tuple(str(k) for k in range(medium.n_channels))
-    known = {**{str(k): k for k in range(len(names))}, **{name.casefold(): k for k, name in enumerate(names)}}
-    key = "0" if channel is None else str(channel).casefold()
-    if key not in known:
-        raise ValueError(f"channel must be one of {', '.join(names)}, or a number below {len(names)}, got {channel!r}")
-    return f"{title} {names[known[key]]}".strip(), medium.channel(known[key])
 
 
 def _checked_angles(theta_i_deg: Sequence[float], theta_o: float, delta_phi: float, line: float) -> list[float]:
