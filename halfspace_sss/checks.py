@@ -6,9 +6,11 @@ import math
 import numbers
 from typing import Any
 
+import numpy as np
+
 from halfspace_sss.medium import Medium
 
-__all__ = ["check_count", "check_finite", "check_interval", "check_scalar_medium"]
+__all__ = ["check_count", "check_edges", "check_finite", "check_interval", "check_scalar_medium"]
 
 
 def check_scalar_medium(medium: Any) -> None:
@@ -36,3 +38,12 @@ def check_interval(name: str, value: Any, low: float, high: float) -> None:
 def check_finite(name: str, value: Any) -> None:
     if isinstance(value, bool) or not isinstance(value, numbers.Real) or not math.isfinite(value):
         raise ValueError(f"{name} must be a finite number, got {value!r}")
+
+
+def check_edges(name: str, value: Any) -> np.ndarray:
+    """The edges of rings or cells (mm) as an array."""
+    edges = np.asarray(value, dtype=np.float64)
+    enough = edges.ndim == 1 and len(edges) > 1 and np.all(np.isfinite(edges))
+    if not enough or edges[0] < 0 or np.any(np.diff(edges) <= 0):
+        raise ValueError(f"{name} must be two or more finite, ascending lengths >= 0 in mm, got {value!r}")
+    return edges

@@ -14,11 +14,13 @@ from halfspace_sss.channels import one_channel
 from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.curve_defaults import default_paths, default_range
 from halfspace_sss.curve_set import TRACED, Curve, CurveSet
+from halfspace_sss.curve_tracing import CurveTrace, trace_curve
 from halfspace_sss.fresnel import mu_internal
 from halfspace_sss.interface import BSSRDF, bssrdf
 from halfspace_sss.interface import models as all_models
 from halfspace_sss.medium import Medium
-from halfspace_sss.tracer import CurveTrace, Trace, launch_shape, trace, trace_curve
+from halfspace_sss.passes import launch_shape
+from halfspace_sss.tracer import Trace, trace
 
 __all__ = ["FIG10_THETA_I", "curves"]
 

@@ -11,11 +11,12 @@ import numpy as np
 
 from halfspace_sss.backend import array_types
 from halfspace_sss.checks import check_count, check_interval
-from halfspace_sss.fresnel import F_r, F_t, mu_internal
+from halfspace_sss.fresnel import F_r
 from halfspace_sss.medium import Medium
-from halfspace_sss.tracer import Estimate, Trace, launch_shape, trace
+from halfspace_sss.passes import Estimate, estimate, walk_passes
+from halfspace_sss.tracer import Trace, trace
 from halfspace_sss.truths import NotCovered, Truth, read_truths
-from halfspace_sss.walk import Boundary, Scatter, pass_seed, walk
+from halfspace_sss.walk import Boundary, Scatter
 
 __all__ = ["Z_LIMIT", "Comparison", "Validation", "trace_order", "validate"]
 
@@ -113,18 +114,11 @@ def trace_order(
     if mu_i != "diffuse":
         check_interval("mu_i", mu_i, 0.0, 1.0)
     types = array_types(backend)
-    lanes, per_lane, passes = launch_shape(n_paths)
-    samples, events = [], 0
-    for k in range(passes):
-        rng = np.random.default_rng([seed, order, k])
-        mu = np.sqrt(rng.random(lanes)) if mu_i == "diffuse" else np.full(lanes, float(mu_i))
-        start = types.Float(np.maximum(mu_internal(mu, medium.eta), 1e-6))
-        ((flux,),), n = walk(types, medium, start, per_lane, pass_seed(seed, order, k), [OrderTally(types, order)])
-        samples.append(flux.numpy().astype(np.float64) * F_t(mu, medium.eta) / per_lane)
-        events += int(n.numpy().astype(np.int64).sum())
-    all_lanes = np.concatenate(samples)
-    error = all_lanes.std(ddof=1) / math.sqrt(len(all_lanes))
-    return Estimate(float(all_lanes.mean()), float(error)), passes * lanes * per_lane, events
+    samples, events, paths = [], 0, 0
+    for done in walk_passes(types, medium, mu_i, n_paths, (seed, order), lambda: [OrderTally(types, order)]):
+        samples.append(done.lanes()[:, 0])
+        events, paths = events + done.n_events, paths + done.n_paths
+    return estimate(np.concatenate(samples)), paths, events
 
 
 def validate(
@@ -196,10 +190,8 @@ def _compare(group: Sequence[Truth], seed: int, loosen: float) -> list[Compariso
 def _run(group: Sequence[Truth], n_paths: int, seed: int) -> list[Comparison]:
     medium, mu_i = group[0].medium, group[0].mu_i
     if group[0].measure == "double":
-        estimate, n, events = trace_order(medium, mu_i, 2, n_paths, seed)
-        return [
-            Comparison(t, t.factor * estimate.value, t.factor * estimate.standard_error, n, events, seed) for t in group
-        ]
+        (value, error), n, events = trace_order(medium, mu_i, 2, n_paths, seed)
+        return [Comparison(t, t.factor * value, t.factor * error, n, events, seed) for t in group]
     directions = list(dict.fromkeys(t.direction for t in group if t.direction))
     edges = sorted({r for t in group if t.ring for r in t.ring})
     padded = directions + directions[:1] * (_padded(len(directions)) - len(directions))

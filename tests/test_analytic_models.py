@@ -275,27 +275,3 @@ def test_directional_dipole_gains_energy_as_documented():
         lobe = math.pi * Boundary.of(eta).N / F_t(1.0, eta) ** 2
         total = plane_integral(lambda r: lobe * model.eval(r, 1.0, 0.0, 1.0, 0.0), 1.0)  # noqa: B023
         assert total == pytest.approx(expected, abs=0.01)
-
-
-@pytest.mark.parametrize(
-    ("build", "message"),
-    [
-        (lambda m: PhotonBeamDiffusion(m, n_samples=1), "n_samples must be an integer in"),
-        (lambda m: PhotonBeamDiffusion(m, kappa="half"), "kappa must be one of"),
-        (lambda m: BetterDipole(m, moments="fitted"), "moments must be one of"),
-        (lambda m: ForwardScatteringDipole(m, n_samples=2.5), "n_samples must be an integer in"),
-        (lambda m: ForwardScatteringDipole(m, virtual_source="none"), "virtual_source must be one of"),
-        (lambda m: ForwardScatteringDipole(Medium(1.0, 0.1, -0.2, 1.3)), "g must be >= 0 .* got -0.2"),
-    ],
-)
-def test_bad_options_are_refused(build, message):
-    with pytest.raises(ValueError, match=message):
-        build(MEDIA[0])
-
-
-def test_options_survive_a_change_of_medium():
-    other = PhotonBeamDiffusion(MEDIA[0], n_samples=8, kappa="none", moments="published").for_medium(MEDIA[1])
-    assert (other.n_samples, other.kappa, other.moments) == (8, "none", "published")
-    assert (
-        ForwardScatteringDipole(MEDIA[0], virtual_source="grosjean").for_medium(MEDIA[1]).virtual_source == "grosjean"
-    )

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from halfspace_sss import Medium, make_maps, trace
+from halfspace_sss.curve_tracing import trace_curve
 from halfspace_sss.map_grid import MapGrid, cell_edges, map_directions, radial_scale, unwarp, warp
 from halfspace_sss.map_tracing import MapUnit, trace_unit
 from halfspace_sss.maps import load_maps
-from halfspace_sss.tracer import trace_curve
 
 FIG10 = Medium.from_albedo(0.75, 1.0, 0.0, 1.3)
 FORWARD = Medium.from_albedo(0.99, 1.0, 0.8, 1.5)
