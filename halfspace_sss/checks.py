@@ -13,6 +13,11 @@ from halfspace_sss.medium import Medium
 __all__ = ["check_count", "check_edges", "check_finite", "check_interval", "check_scalar_medium"]
 
 
+def _plain(value: Any) -> Any:
+    """The value as messages show it: NumPy's numbers as Python's."""
+    return value.item() if isinstance(value, np.generic) else value
+
+
 def check_scalar_medium(medium: Any) -> None:
     if not isinstance(medium, Medium):
         raise ValueError(f"medium must be a Medium, got {type(medium).__name__}")
@@ -22,7 +27,7 @@ def check_scalar_medium(medium: Any) -> None:
 
 def check_count(name: str, value: Any, least: int) -> None:
     if isinstance(value, bool) or not isinstance(value, numbers.Integral) or value < least:
-        raise ValueError(f"{name} must be a whole number >= {least}, got {value!r}")
+        raise ValueError(f"{name} must be a whole number >= {least}, got {_plain(value)!r}")
 
 
 def check_interval(name: str, value: Any, low: float, high: float) -> None:
@@ -32,18 +37,21 @@ def check_interval(name: str, value: Any, low: float, high: float) -> None:
         or not math.isfinite(value)
         or not low <= value <= high
     ):
-        raise ValueError(f"{name} must be a number in [{low:g}, {high:g}], got {value!r}")
+        raise ValueError(f"{name} must be a number in [{low:g}, {high:g}], got {_plain(value)!r}")
 
 
 def check_finite(name: str, value: Any) -> None:
     if isinstance(value, bool) or not isinstance(value, numbers.Real) or not math.isfinite(value):
-        raise ValueError(f"{name} must be a finite number, got {value!r}")
+        raise ValueError(f"{name} must be a finite number, got {_plain(value)!r}")
 
 
 def check_edges(name: str, value: Any) -> np.ndarray:
     """The edges of rings or cells (mm) as an array."""
-    edges = np.asarray(value, dtype=np.float64)
+    try:
+        edges = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name} must be lengths in mm, got {value!r}") from error
     enough = edges.ndim == 1 and len(edges) > 1 and np.all(np.isfinite(edges))
     if not enough or edges[0] < 0 or np.any(np.diff(edges) <= 0):
-        raise ValueError(f"{name} must be two or more finite, ascending lengths >= 0 in mm, got {value!r}")
+        raise ValueError(f"{name} must be two or more finite, ascending lengths >= 0 in mm, got {edges.tolist()}")
     return edges

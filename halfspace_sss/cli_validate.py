@@ -13,6 +13,7 @@ from typing import Annotated, Any
 
 import typer
 
+from halfspace_sss.cli_shared import Bar, console
 from halfspace_sss.provenance import provenance, write_atomically
 from halfspace_sss.truths import MEASURES, Truth
 from halfspace_sss.validate import Z_LIMIT, Comparison, Validation, validate
@@ -112,42 +113,29 @@ def validate_command(
     rows: Annotated[str | None, typer.Option(help="Only these ids, measures (R_d, BRDF, ...) or kinds.")] = None,
 ) -> None:
     """Trace every published, third-party or exact half-space number of the packaged table and compare."""
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
-
-    chosen = row_filter(rows)
-    columns = (TextColumn("tracing"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True)) as bar:
-        task = bar.add_task("", total=None)
-        result = validate(chosen, seed, quick, progress=lambda done, all_: bar.update(task, completed=done, total=all_))
+    with Bar("tracing") as bar:
+        result = validate(row_filter(rows), seed, quick, progress=bar.show)
     if out is not None:
         write_results(result, out)
-    _print(Console(), result)
+    _print(console(), result)
     if result.failures:
         raise typer.Exit(1)
 
 
-def _print(console: Any, result: Validation) -> None:
+def _print(screen: Any, result: Validation) -> None:
     from rich.table import Table
 
     table = Table("quantity", "rows", "max |z|", "rms z", "largest relative error", title="traced against truths.csv")
     for s in summary(result.comparisons):
         numbers = (f"{s['max_abs_z']:.2f}", f"{s['rms_z']:.2f}", f"{s['max_relative_error']:.1e}")
         table.add_row(s["quantity"].replace("[", r"\["), str(s["rows"]), *numbers)
-    console.print(table)
+    screen.print(table)
     for reason, count in Counter(n.reason for n in result.not_covered).most_common():
-        console.print(f"not covered: {count} rows: {reason}", highlight=False)
+        screen.print(f"not covered: {count} rows: {reason}", highlight=False)
     for c in result.failures:
-        console.print(
+        screen.print(
             f"[red]{c.truth.id}[/red] {c.truth.quantity.replace('[', chr(92) + '[')}: traced {c.traced:.8g} ± "
             f"{c.standard_error:.1e}, truth {c.truth.value:.8g} ± {c.truth.uncertainty:.1e}, z = {c.z:.2f}"
         )
     verdict = f"{len(result.failures)} of {len(result.comparisons)} rows have |z| >= {Z_LIMIT:g}"
-    console.print(f"{verdict}; {result.seconds:.0f} s", highlight=False)
+    screen.print(f"{verdict}; {result.seconds:.0f} s", highlight=False)

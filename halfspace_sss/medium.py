@@ -17,12 +17,12 @@ def _check(name: str, value: np.ndarray, ok: np.ndarray, bound: str) -> None:
 
 def _number(name: str, value: object) -> np.ndarray:
     try:
-        array = np.array(value, dtype=np.float64)
+        array = np.array(value, dtype=np.float64) + 0.0  # no -0.0, whose hash is not that of 0.0
     except (TypeError, ValueError) as error:
         raise ValueError(f"{name} must be a number or a sequence of numbers, got {value!r}") from error
     if array.ndim > 1:
         raise ValueError(f"{name} must be a scalar or one value per channel, got shape {array.shape}")
-    return array
+    return np.asarray(array)
 
 
 def check_ratios(albedo: np.ndarray, g: np.ndarray, eta: np.ndarray) -> None:

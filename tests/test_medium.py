@@ -76,6 +76,13 @@ def test_equal_media_are_equal_and_hash_alike():
     assert Medium(**SCALAR) == Medium(**SCALAR) != Medium(**{**SCALAR, "g": 0.0})
     assert hash(Medium(**SCALAR)) == hash(Medium(**SCALAR))
     assert Medium(**SCALAR) != 3
+    assert Medium(1.0, 0.0, -0.0) == Medium(1.0, 0.0, 0.0) and len({Medium(1.0, 0.0, -0.0), Medium(1.0, 0.0, 0.0)}) == 1
+
+
+@pytest.mark.parametrize("sigma_s", [-1.5, np.float64(-1.5), np.float32(-1.5), [2.0, -1.5], np.array([2.0, -1.5])])
+def test_messages_show_plain_numbers(sigma_s):
+    with pytest.raises(ValueError, match=r"got -1\.5$"):
+        Medium(sigma_s, 0.1)
 
 
 @pytest.mark.parametrize("albedo", [0.0, 1 - 1e-7, 1.0])
