@@ -17,6 +17,7 @@ from halfspace_sss.backend import BackendError
 from halfspace_sss.cli_bench import bench_command
 from halfspace_sss.cli_curves import curves_command
 from halfspace_sss.cli_lists import materials_command, models_command
+from halfspace_sss.cli_maps import maps_command
 from halfspace_sss.cli_validate import validate_command
 from halfspace_sss.extensions import commands
 
@@ -25,6 +26,7 @@ __all__ = ["app", "main"]
 _OWN = {
     "bench": bench_command,
     "curves": curves_command,
+    "maps": maps_command,
     "materials": materials_command,
     "models": models_command,
     "validate": validate_command,

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from halfspace_sss.cli_shared import Bar, console
-from halfspace_sss.curve_set import check_folder
-from halfspace_sss.provenance import provenance, write_atomically
+from halfspace_sss.provenance import check_folder, provenance, write_atomically
 
 if TYPE_CHECKING:
     from rich.table import Table

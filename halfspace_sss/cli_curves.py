@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from halfspace_sss.cli_shared import Bar, console, numbers, stated_medium
-from halfspace_sss.curve_set import TRACED, CurveSet, check_folder
+from halfspace_sss.curve_set import TRACED, CurveSet
+from halfspace_sss.provenance import check_folder
 
 if TYPE_CHECKING:
     import pandas

@@ -58,12 +58,13 @@ class Bar:
     def _start(self, done: int, total: int) -> None:
         from rich.console import Console
         from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+        from rich.table import Column
 
-        steps = (TextColumn(self._title), BarColumn(), TextColumn("{task.percentage:.0f} %"))
+        steps = (TextColumn(self._title), BarColumn(30), TextColumn("{task.percentage:.0f} %"))
         times = (TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn())
-        text = TextColumn("{task.fields[text]}", markup=False)
+        text = TextColumn("{task.fields[text]}", markup=False, table_column=Column(ratio=1, no_wrap=True))
         screen = Console(stderr=True)
-        self._progress = Progress(*steps, *times, text, console=screen, speed_estimate_period=MEMORY)
+        self._progress = Progress(*steps, *times, text, console=screen, expand=True, speed_estimate_period=MEMORY)
         self._progress.start()
         self._task = self._progress.add_task("", total=total, completed=done, text="")
 

@@ -13,12 +13,12 @@ import numpy as np
 
 from halfspace_sss.extensions import renderer
 from halfspace_sss.medium import Medium
-from halfspace_sss.provenance import provenance, write_atomically
+from halfspace_sss.provenance import check_folder, provenance, write_atomically
 
 if TYPE_CHECKING:
     import pandas
 
-__all__ = ["TRACED", "Curve", "CurveSet", "check_folder", "range_edges"]
+__all__ = ["TRACED", "Curve", "CurveSet", "range_edges"]
 
 TRACED = "path_traced"
 UNITS = {
@@ -219,14 +219,3 @@ def range_edges(r_edges: np.ndarray) -> list[float]:
     low, high = float(r_edges[0]), float(r_edges[-1])
     powers = [10.0**k for k in range(math.floor(math.log10(low)) - 1, math.ceil(math.log10(high)) + 1)]
     return [low, *(p for p in powers if low < p < high), high]
-
-
-def check_folder(folder: str | Path) -> Path:
-    """The folder as a path; ValueError if it, or what it would lie in, is a file."""
-    path = Path(folder)
-    for part in (path, *path.parents):
-        if part.exists():
-            if not part.is_dir():
-                raise ValueError(f"folder must be a folder or new, got {str(folder)!r}, where {str(part)!r} is a file")
-            break
-    return path

@@ -57,40 +57,51 @@ def make_maps(
         target_error: stop a unit at this mean cell error (see `trace_unit`); None to trace `n_paths` exactly.
         n_paths: walks per unit and group of 16 observations; with a target error, the most that are traced.
         seed, backend: as in `trace`.
-        share: (k, n) does every n-th unit from the k-th on, so that n processes can fill one folder together;
-            make the stores first with share (0, 1) or let the first process create them.
-        progress: called with (units done, units in all, text).
+        share: (k, n) does every n-th unit from the k-th on, so that n processes can fill one folder together.
+        progress: called with (units done, units in all, what was just done), first with those that were done before.
 
     Returns:
         name -> path of the store.
 
     Raises:
-        ValueError: an argument is out of range, or a store exists with other parameters or is damaged.
+        ValueError: an argument is out of range, or a store exists with other parameters; nothing has been written
+            then. Or a unit of a store is damaged; nothing has been traced then.
     """
     grid = grid or MapGrid()
     _check(media, target_error, n_paths, seed, share)
     array_types(backend)
     paths = {name: Path(folder) / f"{name}.zarr" for name in media}
-    units: list[tuple[str, int, MapUnit]] = []
-    for name, medium in media.items():
-        asked = _parameters(medium, grid, target_error, n_paths, seed, backend)
-        for channel in range(medium.n_channels or 1):
-            mfp = medium.channel(channel).in_mfp()
-            most = n_paths or MOST_PATHS
-            for a in range(grid.n_theta):
-                units.append((name, channel, MapUnit(mfp, grid, a, seed, channel, target_error, most, backend)))
+    asked = {name: _parameters(m, grid, target_error, n_paths, seed, backend) for name, m in media.items()}
+    for name in media:
         if paths[name].exists():
-            _refuse_other(paths[name], asked)
-        else:
-            _create(paths[name], medium, grid, seed, asked)
-    stores = {name: _open(path) for name, path in paths.items()}
-    mine = units[share[0] :: share[1]]
-    for i, (name, channel, unit) in enumerate(mine):
-        if not _done(paths[name], stores[name], channel, unit.theta_index):
-            _write(paths[name], channel, unit.theta_index, trace_unit(unit))
+            _open_same(paths[name], asked[name])
+    for name, medium in media.items():
+        if not paths[name].exists():
+            _create(paths[name], medium, grid, seed, asked[name])
+    stores = {name: _open_same(path, asked[name]) for name, path in paths.items()}
+    units = _units(media, grid, target_error, n_paths or MOST_PATHS, seed, backend)[share[0] :: share[1]]
+    left = [u for u in units if not _done(paths[u[0]], stores[u[0]], u[1], u[2].theta_index)]
+    before = len(units) - len(left)
+    if progress:
+        progress(before, len(units), "")
+    for done, (name, channel, unit) in enumerate(left, before + 1):
+        _write(paths[name], channel, unit.theta_index, trace_unit(unit))
         if progress:
-            progress(i + 1, len(mine), f"{name} channel {channel} direction {unit.theta_index + 1}/{grid.n_theta}")
+            progress(done, len(units), f"{name} channel {channel} direction {unit.theta_index + 1}/{grid.n_theta}")
     return paths
+
+
+def _units(
+    media: Mapping[str, Medium], grid: MapGrid, target_error: float | None, n_paths: int, seed: int, backend: str
+) -> list[tuple[str, int, MapUnit]]:
+    """Name, channel and work of every unit, in the order of the shares."""
+    return [
+        (name, channel, MapUnit(mfp, grid, a, seed, channel, target_error, n_paths, backend))
+        for name, medium in media.items()
+        for channel in range(medium.n_channels or 1)
+        for mfp in (medium.channel(channel).in_mfp(),)
+        for a in range(grid.n_theta)
+    ]
 
 
 def _check(media: Any, target_error: Any, n_paths: Any, seed: Any, share: Any) -> None:
@@ -161,7 +172,12 @@ def _create(path: Path, medium: Medium, grid: MapGrid, seed: int, asked: dict[st
     path.parent.mkdir(parents=True, exist_ok=True)
     chunks = {name: (1, 1, *dataset[name].shape[2:]) for name in dataset.data_vars}
     dataset.to_zarr(temporary, mode="w", zarr_format=2, encoding={k: {"chunks": v} for k, v in chunks.items()})
-    os.replace(temporary, path)
+    try:
+        os.replace(temporary, path)
+    except OSError:
+        shutil.rmtree(temporary, ignore_errors=True)
+        if not path.exists():  # else another process, with another share, was first
+            raise
 
 
 def _open(path: Path) -> xr.Dataset:
@@ -180,13 +196,16 @@ def _open(path: Path) -> xr.Dataset:
     return dataset
 
 
-def _refuse_other(path: Path, asked: dict[str, Any]) -> None:
-    """A store that another run made must have been made with the same parameters."""
-    found = json.loads(_open(path).attrs["halfspace_sss_maps"])
+def _open_same(path: Path, asked: dict[str, Any]) -> xr.Dataset:
+    """The store at a path, which must have been made with the same parameters."""
+    dataset = _open(path)
+    found = json.loads(dataset.attrs["halfspace_sss_maps"])
     wanted = json.loads(json.dumps(asked))
     for key, value in wanted.items():
         if found.get(key) != value:
-            raise ValueError(f"map store {path} was made with {key} = {found.get(key)!r}, got {value!r}")
+            was = f"map store {path} was made with {key} = {found.get(key)!r}"
+            raise ValueError(f"{was}, got {value!r}: ask for the same, or take another folder")
+    return dataset
 
 
 def _checksum(S: np.ndarray, variance: np.ndarray) -> int:

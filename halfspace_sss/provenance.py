@@ -12,7 +12,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-__all__ = ["provenance", "write_atomically"]
+__all__ = ["check_folder", "provenance", "write_atomically"]
 
 LIBRARIES = ("halfspace-sss", "numpy", "drjit", "mitsuba", "torch", "xarray", "zarr")
 
@@ -47,6 +47,20 @@ def provenance(**parameters: Any) -> dict[str, Any]:
         "versions": {"python": platform.python_version(), **versions},
         "commit": _commit(),
     }
+
+
+def check_folder(folder: str | Path) -> Path:
+    """The folder as a path; ValueError if it, or what it would lie in, is a file or cannot be written to."""
+    path = Path(folder)
+    part = next(part for part in (path, *path.absolute().parents) if part.exists())
+    if not part.is_dir():
+        raise ValueError(f"folder must be a folder or new, got {str(folder)!r}, where {str(part)!r} is a file")
+    try:
+        with tempfile.TemporaryFile(dir=part):
+            pass
+    except OSError as error:
+        raise ValueError(f"folder must be one that can be written to, got {str(folder)!r}: {error.strerror}") from error
+    return path
 
 
 def write_atomically(path: Path, content: bytes | str) -> None:

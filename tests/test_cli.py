@@ -129,6 +129,18 @@ def test_an_output_folder_that_is_a_file_is_refused_before_tracing(tmp_path: Pat
     assert "folder must be a folder or new" in result.stderr
 
 
+@pytest.mark.parametrize("command", ["bench", "curves", "maps"])
+def test_a_folder_that_cannot_be_written_to_is_refused_before_any_work(command: str, monkeypatch: Any) -> None:
+    def refuse(dir: Path) -> None:
+        raise PermissionError(13, "Permission denied", str(dir))
+
+    monkeypatch.setattr("tempfile.TemporaryFile", refuse)
+    result = _invoke(command, "--out", "/nowhere/new")
+    assert result.exit_code == 2
+    message = "error: folder must be one that can be written to, got '/nowhere/new': Permission denied\n"
+    assert result.stderr == message
+
+
 def test_bad_input_ends_the_process_with_2_and_no_traceback(tmp_path: Path) -> None:
     run = _run("curves", "marbel", folder=tmp_path)
     assert (run.returncode, run.stdout) == (2, "")
@@ -215,7 +227,7 @@ def test_the_version_is_that_of_the_package() -> None:
 
 def test_help_names_every_command() -> None:
     text = _invoke("--help").stdout
-    for name in ("curves", "materials", "models", "validate"):
+    for name in ("bench", "curves", "maps", "materials", "models", "validate"):
         assert name in text
 
 

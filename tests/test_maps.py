@@ -15,7 +15,7 @@ from halfspace_sss import Medium, make_maps, trace
 from halfspace_sss.curve_tracing import trace_curve
 from halfspace_sss.map_grid import MapGrid, cell_edges, map_directions, radial_scale, unwarp, warp
 from halfspace_sss.map_tracing import MapUnit, trace_unit
-from halfspace_sss.maps import load_maps
+from halfspace_sss.maps import _template, load_maps
 
 FIG10 = Medium.from_albedo(0.75, 1.0, 0.0, 1.3)
 FORWARD = Medium.from_albedo(0.99, 1.0, 0.8, 1.5)
@@ -125,6 +125,7 @@ def test_a_killed_run_resumes_to_the_same_bits(tmp_path):
     unbroken = start(tmp_path / "a")
     assert unbroken.wait(120) == 0
     broken = start(tmp_path / "b")
+    assert broken.stdout.readline() == "0 6 \n"
     broken.stdout.readline()  # one unit done; the next is under way
     time.sleep(0.15)
     os.kill(broken.pid, signal.SIGKILL)
@@ -135,6 +136,27 @@ def test_a_killed_run_resumes_to_the_same_bits(tmp_path):
     a, b = (load_maps(tmp_path / name / "m.zarr") for name in "ab")
     for name in ("S", "variance", "n_paths", "n_events", "checksum"):
         assert a[name].values.tobytes() == b[name].values.tobytes(), name
+
+
+def test_progress_begins_with_the_units_that_were_done_before(tmp_path):
+    arguments = {"grid": SMALL, "target_error": None, "n_paths": 1024}
+    calls = []
+    make_maps({"m": FIG10}, tmp_path, share=(1, 2), **arguments)
+    make_maps({"m": FIG10}, tmp_path, progress=lambda *call: calls.append(call), **arguments)
+    assert calls == [(1, 3, ""), (2, 3, "m channel 0 direction 1/3"), (3, 3, "m channel 0 direction 3/3")]
+
+
+def test_a_process_that_makes_the_store_second_takes_that_of_the_first(store, monkeypatch):
+    of_the_first = store.rename(store.with_name("elsewhere"))
+
+    def template(*arguments):
+        of_the_first.rename(store)
+        return _template(*arguments)
+
+    monkeypatch.setattr("halfspace_sss.maps._template", template)
+    make_maps({"m": FIG10}, store.parent, grid=SMALL, target_error=None, n_paths=1024)
+    assert [path.name for path in store.parent.iterdir()] == ["m.zarr"]
+    load_maps(store)
 
 
 @pytest.fixture
