@@ -62,6 +62,9 @@ class DirectionalDipole(BSSRDF):
         return type(self)(medium, moments=self.moments)
 
     def G(self, q: Query) -> Any:
+        return q.lib.maximum(self.G_unclamped(q), 0.0)
+
+    def G_unclamped(self, q: Query) -> Any:
         q = q.in_float64()
         lib, c, C_phi, C_E = q.lib, self._c, self._boundary.C_phi, self._boundary.C_E
         D, a, d_e, h, scale = (q.constant(v) for v in (c.D, c.sigma_tr, c.d_e, c.h, c.scale))
@@ -76,4 +79,4 @@ class DirectionalDipole(BSSRDF):
         # x.w_v = x.w_12 - h mu, w_v.n = mu, x.n = -h at the virtual source; k + 2 k_v = k_r + k_v
         by_fluence = fluence / D + 3 * x_w * k + 3 * h * mu * k_v
         by_irradiance = 3 * D * mu * (k + 2 * k_v) + h * k_v + 3 * D * h * m_v * (x_w - h * mu)
-        return scale * lib.exp(-a * d_r) * lib.maximum(C_phi * by_fluence + C_E * by_irradiance, 0.0)
+        return scale * lib.exp(-a * d_r) * (C_phi * by_fluence + C_E * by_irradiance)

@@ -10,7 +10,7 @@ import numpy as np
 
 from halfspace_sss.medium import Medium
 
-__all__ = ["check_count", "check_edges", "check_finite", "check_interval", "check_scalar_medium"]
+__all__ = ["check_count", "check_edges", "check_finite", "check_interval", "check_query", "check_scalar_medium"]
 
 
 def _plain(value: Any) -> Any:
@@ -55,3 +55,19 @@ def check_edges(name: str, value: Any) -> np.ndarray:
     if not enough or edges[0] < 0 or np.any(np.diff(edges) <= 0):
         raise ValueError(f"{name} must be two or more finite, ascending lengths >= 0 in mm, got {edges.tolist()}")
     return edges
+
+
+def check_query(args: tuple) -> None:
+    """Ranges of a query; also catches NaN, for which every comparison is false."""
+    if type(args[0]).__module__.startswith(("drjit", "mitsuba")):
+        return
+    bounds = {"r": (0.0, math.inf), "mu_i": (0.0, 1.0), "phi_i": None, "mu_o": (0.0, 1.0), "phi_o": None}
+    for (name, bound), value in zip(bounds.items(), args):
+        low, high = (-math.inf, math.inf) if bound is None else bound
+        if 0 in value.shape:
+            continue
+        smallest, largest = float(value.min()), float(value.max())
+        if not (smallest >= low and largest <= high and math.isfinite(smallest) and math.isfinite(largest)):
+            what = "finite" if bound is None else f"finite and in [{low:g}, {high:g}]"
+            wrong = smallest if not smallest >= low else largest
+            raise ValueError(f"{name} must be {what}, got {wrong!r}")

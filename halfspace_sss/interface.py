@@ -5,13 +5,14 @@ from __future__ import annotations
 import abc
 import functools
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from halfspace_sss.arrays import broadcast_query, library
+from halfspace_sss.arrays import broadcast_query
+from halfspace_sss.checks import check_query
 from halfspace_sss.fresnel import F_t, mu_internal
 from halfspace_sss.medium import Medium
 from halfspace_sss.radial import RadialSampler
@@ -114,6 +115,10 @@ class BSSRDF(abc.ABC):
     def G(self, q: Query) -> Any:
         """S / (T_12 T_21) in 1/(mfp² sr) for a query in mean free paths."""
 
+    def G_unclamped(self, q: Query) -> Any:
+        """`G` before negative values are clamped; a model that clamps gives it."""
+        return self.G(q)
+
     def eval(self, r: Any, mu_i: Any, phi_i: Any, mu_o: Any, phi_o: Any) -> Any:
         """S in 1/(mm² sr).
 
@@ -127,8 +132,16 @@ class BSSRDF(abc.ABC):
             ValueError: an argument is out of range or not a number (NumPy and torch; Dr.Jit lanes cannot be
                 inspected while a kernel is recorded), or libraries are mixed.
         """
-        lib, args = broadcast_query(r, mu_i, phi_i, mu_o, phi_o)
-        _check_query(lib, args)
+        return self._S(self.G, r, mu_i, phi_i, mu_o, phi_o)
+
+    def eval_unclamped(self, r: Any, mu_i: Any, phi_i: Any, mu_o: Any, phi_o: Any) -> Any:
+        """`eval` without the clamp that keeps a model from turning negative; the same where it has none."""
+        return self._S(self.G_unclamped, r, mu_i, phi_i, mu_o, phi_o)
+
+    def _S(self, G_of: Callable[[Query], Any], *query: Any) -> Any:
+        """sigma_t² T_12 T_21 G_of(query)."""
+        lib, args = broadcast_query(*query)
+        check_query(args)
         if self.medium.n_channels is not None:
             lib.constant(self.medium.sigma_t, args[0])
             args = tuple(a[..., None] for a in args)
@@ -136,7 +149,7 @@ class BSSRDF(abc.ABC):
         sigma_t = lib.constant(self.medium.sigma_t, r)
         eta = self.medium.eta
         q = Query(lib, sigma_t * r, mu_i, phi_i, mu_o, phi_o, eta, r, self.medium.sigma_t)
-        G = lib.like(self.G(q), r) if lib is not library(0.0) else np.asarray(self.G(q), dtype=r.dtype)
+        G = lib.like(G_of(q), r)
         S = sigma_t * sigma_t * F_t(mu_i, eta) * F_t(mu_o, eta) * G
         return S[()] if isinstance(S, np.ndarray) else S
 
@@ -225,22 +238,6 @@ def _split(u: Any) -> tuple[Any, Any]:
     if u.shape[-1] != 2:
         raise ValueError(f"u must have a last axis of length 2, got shape {tuple(u.shape)}")
     return u[..., 0], u[..., 1]
-
-
-def _check_query(lib: Any, args: tuple) -> None:
-    """Ranges of a query; also catches NaN, for which every comparison is false."""
-    if type(args[0]).__module__.startswith(("drjit", "mitsuba")):
-        return
-    bounds = {"r": (0.0, math.inf), "mu_i": (0.0, 1.0), "phi_i": None, "mu_o": (0.0, 1.0), "phi_o": None}
-    for (name, bound), value in zip(bounds.items(), args):
-        low, high = (-math.inf, math.inf) if bound is None else bound
-        if 0 in value.shape:
-            continue
-        smallest, largest = float(value.min()), float(value.max())
-        if not (smallest >= low and largest <= high and math.isfinite(smallest) and math.isfinite(largest)):
-            what = "finite" if bound is None else f"finite and in [{low:g}, {high:g}]"
-            wrong = smallest if not smallest >= low else largest
-            raise ValueError(f"{name} must be {what}, got {wrong!r}")
 
 
 _registered: dict[str, type[BSSRDF]] = {}

@@ -8,15 +8,14 @@ Smooth models come out to 1e-6 relative or better; a model that clamps has kinks
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from halfspace_sss import single_scattering
-from halfspace_sss.arrays import broadcast_query
 from halfspace_sss.fresnel import C_1, F_t, mu_external
-from halfspace_sss.interface import BSSRDF, Query, bssrdf, models
+from halfspace_sss.interface import BSSRDF, bssrdf, models
 from halfspace_sss.medium import Medium
 from halfspace_sss.plane_quadrature import Angles, Quadrature, cosine_nodes, distances, flux, log_sum
 
@@ -159,30 +158,16 @@ def reciprocity_gap(model: BSSRDF, n: int = 4096, seed: int = 0) -> ReciprocityG
 def clamped_energy(model: BSSRDF, mu_i: Any = 1.0, quadrature: Quadrature = DEFAULT) -> Any:
     """Flux per incident flux that clamping negative values adds, ∫∫ (S - S_unclamped) mu_o dw_o dA_o, >= 0.
 
-    Asks the model's `eval_unclamped(r, mu_i, phi_i, mu_o, phi_o)`, or its `G_unclamped(query)`; a model with neither
-    does not clamp and gives 0. Arguments, shapes and errors as `reflectance`.
+    0 for a model that does not clamp. Arguments, shapes and errors as `reflectance`.
     """
-    if hasattr(model, "eval_unclamped"):
-        unclamped = model.eval_unclamped
-    elif getattr(model, "G_unclamped", None) is not None:
-        unclamped = _unclamped(model)
-    else:
-        return 0.0 * _over_incidence(Angles(model.eval, model.medium, Quadrature(4, 4, 2)), mu_i, Quadrature(4, 4, 2))
-    angles = Angles(lambda *query: model.eval(*query) - unclamped(*query), model.medium, quadrature)
-    return _over_incidence(angles, mu_i, quadrature)
+    if type(model).G_unclamped is BSSRDF.G_unclamped:
+        coarse = Quadrature(4, 4, 2)
+        return 0.0 * _over_incidence(Angles(model.eval, model.medium, coarse), mu_i, coarse)
 
+    def added(*query: Any) -> Any:
+        return model.eval(*query) - model.eval_unclamped(*query)
 
-def _unclamped(model: BSSRDF) -> Callable:
-    """S from the model's `G_unclamped`, as `BSSRDF.eval` makes it from `G`."""
-
-    def evaluate(*query: Any) -> Any:
-        medium = model.medium
-        lib, args = broadcast_query(*query)
-        r, mu_i, phi_i, mu_o, phi_o = (a if medium.n_channels is None else a[..., None] for a in args)
-        q = Query(lib, medium.sigma_t * r, mu_i, phi_i, mu_o, phi_o, medium.eta)
-        return medium.sigma_t**2 * F_t(mu_i, medium.eta) * F_t(mu_o, medium.eta) * model.G_unclamped(q)
-
-    return evaluate
+    return _over_incidence(Angles(added, model.medium, quadrature, model.eval), mu_i, quadrature)
 
 
 def energy_table(

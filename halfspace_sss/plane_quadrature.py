@@ -41,9 +41,12 @@ class Quadrature:
 
 
 class Angles:
-    """Quadrature over exit directions and azimuths for one S(r, mu_i, phi_i, mu_o, phi_o) of a medium."""
+    """Quadrature over exit directions and azimuths for one S(r, mu_i, phi_i, mu_o, phi_o) of a medium.
 
-    def __init__(self, evaluate: Callable, medium: Medium, q: Quadrature) -> None:
+    `probe` is asked which azimuths matter where S itself is 0 at most queries and would not tell.
+    """
+
+    def __init__(self, evaluate: Callable, medium: Medium, q: Quadrature, probe: Callable | None = None) -> None:
         self.evaluate, self.medium = evaluate, medium
         self.mu_o, self.w_mu = cosine_nodes(medium.eta, q.n_mu)
         self.phi_o = 2 * math.pi * (np.arange(q.n_azimuth) + 0.5) / q.n_azimuth
@@ -51,21 +54,21 @@ class Angles:
         self.phi_i = math.pi * np.arange(half + 1) / half
         self.w_i = np.r_[0.5, np.ones(half - 1), 0.5] / half
         self.w_x = -self.w_i * np.cos(self.phi_i)
-        free_i, free_o = self._unused_azimuths()
+        free_i, free_o = self._unused_azimuths(probe or evaluate)
         if free_i:
             self.phi_i, self.w_i, self.w_x = np.array([0.5 * math.pi]), np.ones(1), np.zeros(1)
         if free_o:
             self.phi_o = np.array([0.5 * math.pi])
 
-    def _unused_azimuths(self) -> tuple[bool, bool]:
+    def _unused_azimuths(self, evaluate: Callable) -> tuple[bool, bool]:
         """Whether S ignores phi_i and phi_o, asked at random queries about the mean free paths of all channels."""
         rng = np.random.default_rng(1)
         n = 48
         r = np.exp(rng.uniform(math.log(0.01), math.log(20.0), n)) * rng.choice(np.atleast_1d(self.medium.mfp), n)
         mu_i, mu_o = (mu_external(np.sqrt(rng.uniform(0, 1, n)), min(self.medium.eta, 1.0)) for _ in range(2))
         phi_i, phi_o, other_i, other_o = rng.uniform(-math.pi, math.pi, (4, n))
-        S = self.evaluate(r, mu_i, phi_i, mu_o, phi_o)
-        others = self.evaluate(r, mu_i, other_i, mu_o, phi_o), self.evaluate(r, mu_i, phi_i, mu_o, other_o)
+        S = evaluate(r, mu_i, phi_i, mu_o, phi_o)
+        others = evaluate(r, mu_i, other_i, mu_o, phi_o), evaluate(r, mu_i, phi_i, mu_o, other_o)
         return tuple(bool(np.all(np.abs(S - other) <= 1e-10 * np.abs(S))) for other in others)
 
     def exitance(self, r: np.ndarray, mu_i: float) -> tuple[np.ndarray, np.ndarray]:

@@ -46,13 +46,17 @@ class Clamped(Tilted):
         return q.lib.maximum(self.G_unclamped(q), 0.0)
 
 
-class ClampedByEval(Clamped):
-    """A model that gives S itself without the clamp."""
+class Unclamped(BSSRDF):
+    """Any model without its clamp."""
 
-    G_unclamped = Tilted.G
+    name, orders, reciprocal, source = "unclamped", "total", False, "this test"
 
-    def eval_unclamped(self, *query):
-        return self.eval(*query) - 0.25 * abs(self.eval(*query))
+    def __init__(self, model):
+        super().__init__(model.medium)
+        self.model = model
+
+    def G(self, q):
+        return self.model.G_unclamped(q)
 
 
 class Total(Tilted):
@@ -185,13 +189,20 @@ def test_clamping_adds_the_energy_of_the_negative_part():
     assert measure.clamped_energy(Clamped(Medium([1.0, 2.0], 0.1)), 0.9).shape == (2,)
 
 
-def test_a_model_that_gives_its_unclamped_value_is_asked_for_it():
-    model = ClampedByEval(Medium(1.0, 0.1))
-    assert measure.clamped_energy(model) == pytest.approx(0.25 * measure.reflectance(model), rel=1e-9)
+@pytest.mark.parametrize(("albedo", "g", "mu_i"), [(0.9, 0.3, 0.3), (0.9, 0.3, 0.1), (0.99, 0.0, 0.2)])
+def test_the_directional_dipole_is_clamped_under_oblique_light_by_what_its_plane_integrals_differ(albedo, g, mu_i):
+    model, fine = bssrdf("directional_dipole", Medium.from_albedo(albedo, 1.0, g, 1.0)), Quadrature(80, 128, 24)
+    energy = measure.clamped_energy(model, mu_i, fine)
+    difference = measure.reflectance(model, mu_i, quadrature=fine) - measure.reflectance(
+        Unclamped(model), mu_i, quadrature=fine
+    )
+    assert energy == pytest.approx(difference, rel=1e-3) and energy > 1e-3
+    assert measure.clamped_energy(model, 1.0) == 0
 
 
 def test_a_model_that_does_not_clamp_has_no_clamped_energy():
-    assert measure.clamped_energy(bssrdf("standard_dipole", Medium(1.0, 0.1))) == 0
+    for model in ("standard_dipole", "forward_scattering_dipole"):
+        assert measure.clamped_energy(bssrdf(model, Medium(1.0, 0.1))) == 0
     assert measure.clamped_energy(Tilted(Medium([1.0, 2.0], 0.1)), "diffuse").tolist() == [0, 0]
 
 
@@ -229,6 +240,6 @@ def test_the_energy_table_notes_a_model_that_refuses_the_medium():
         (lambda s: Quadrature(n_mu=1), "n_mu must be >= 2, got 1"),
     ],
 )
-def test_bad_arguments_are_refused_with_name_bound_and_value(call, message):
+def test_bad_arguments_are_refused_with_modelbound_and_value(call, message):
     with pytest.raises(ValueError, match=message):
         call(bssrdf("standard_dipole", Medium(1.0, 0.1)))

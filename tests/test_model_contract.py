@@ -49,6 +49,11 @@ def test_values_are_finite_and_not_negative(name, medium, queries):
     assert np.isfinite(S).all() and (S >= 0).all() and S.max() > 0
 
 
+def test_clamping_cuts_off_negative_values_and_nothing_else(name, medium, queries):
+    model, query = halfspace_sss.bssrdf(name, medium), queries(1000, medium)
+    np.testing.assert_array_equal(model.eval(*query), np.maximum(model.eval_unclamped(*query), 0.0))
+
+
 @pytest.mark.parametrize("c", [1e-3, 7.3, 1e3])
 def test_scaling_the_medium_scales_the_lengths(name, medium, queries, c):
     """S(r; c sigma) = c² S(c r; sigma)."""
