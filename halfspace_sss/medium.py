@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numbers
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,12 +18,24 @@ def _check(name: str, value: np.ndarray, ok: np.ndarray, bound: str) -> None:
 
 def _number(name: str, value: object) -> np.ndarray:
     try:
+        if value is None or isinstance(value, (str, bytes)):  # NumPy would make NaN of one, read the other
+            raise TypeError
         array = np.array(value, dtype=np.float64) + 0.0  # no -0.0, whose hash is not that of 0.0
     except (TypeError, ValueError) as error:
         raise ValueError(f"{name} must be a number or a sequence of numbers, got {value!r}") from error
     if array.ndim > 1:
         raise ValueError(f"{name} must be a scalar or one value per channel, got shape {array.shape}")
     return np.asarray(array)
+
+
+def _common_shape(**fields: np.ndarray) -> tuple[int, ...]:
+    """Shape of coefficients together: () or (channels,)."""
+    try:
+        return np.broadcast_shapes(*(value.shape for value in fields.values()))
+    except ValueError as error:
+        *first, last = fields
+        names, shapes = f"{', '.join(first)} and {last}", ", ".join(str(value.shape) for value in fields.values())
+        raise ValueError(f"{names} must have the same number of channels, got {shapes}") from error
 
 
 def check_ratios(albedo: np.ndarray, g: np.ndarray, eta: np.ndarray) -> None:
@@ -69,11 +82,7 @@ class Medium:
             value = fields[name]
             _check(name, value, np.isfinite(value) & (value >= 0), "finite and >= 0 (1/mm)")
         _check("g", fields["g"], np.abs(fields["g"]) < 1, "in the open interval (-1, 1)")
-        try:
-            shape = np.broadcast_shapes(*(value.shape for value in fields.values()))
-        except ValueError as error:
-            shapes = {name: value.shape for name, value in fields.items()}
-            raise ValueError(f"sigma_s, sigma_a and g must have the same number of channels, got {shapes}") from error
+        shape = _common_shape(**fields)
         if shape == (0,):
             raise ValueError("sigma_s must have at least one channel, got none")
         for name, value in fields.items():
@@ -83,7 +92,9 @@ class Medium:
                 getattr(self, name).setflags(write=False)
         object.__setattr__(self, "eta", float(eta))
         sigma_t = np.asarray(self.sigma_t)
-        _check("sigma_t = sigma_s + sigma_a", sigma_t, np.isfinite(sigma_t) & (sigma_t > 0), "finite and > 0 (1/mm)")
+        with np.errstate(divide="ignore", over="ignore"):
+            ok = np.isfinite(sigma_t) & (sigma_t > 0) & np.isfinite(1 / sigma_t)
+        _check("sigma_t = sigma_s + sigma_a", sigma_t, ok, "finite and > 0 (1/mm), and 1 / sigma_t finite")
 
     @classmethod
     def from_albedo(cls, albedo, sigma_t, g=0.0, eta=1.3) -> Medium:
@@ -94,6 +105,7 @@ class Medium:
         albedo, sigma_t = _number("albedo", albedo), _number("sigma_t", sigma_t)
         _check("albedo", albedo, (albedo >= 0) & (albedo <= 1), "in [0, 1]")
         _check("sigma_t", sigma_t, np.isfinite(sigma_t) & (sigma_t > 0), "finite and > 0 (1/mm)")
+        _common_shape(albedo=albedo, sigma_t=sigma_t)
         return cls(albedo * sigma_t, (1 - albedo) * sigma_t, g, eta)
 
     @classmethod
@@ -104,6 +116,7 @@ class Medium:
             "sigma_s_prime", sigma_s_prime, np.isfinite(sigma_s_prime) & (sigma_s_prime >= 0), "finite and >= 0 (1/mm)"
         )
         _check("g", g, np.abs(g) < 1, "in the open interval (-1, 1)")
+        _common_shape(sigma_s_prime=sigma_s_prime, g=g)
         return cls(sigma_s_prime / (1 - g), sigma_a, g, eta)
 
     @property
@@ -143,8 +156,11 @@ class Medium:
 
     def scaled(self, factor: float) -> Medium:
         """The same medium with both coefficients multiplied by `factor` > 0 (a dilution, or a change of unit)."""
-        factor = float(factor)
-        _check("factor", np.asarray(factor), np.asarray(np.isfinite(factor) and factor > 0), "finite and > 0")
+        number = _number("factor", factor)
+        if number.ndim:
+            raise ValueError(f"factor must be one number, got shape {number.shape}")
+        _check("factor", number, np.isfinite(number) & (number > 0), "finite and > 0")
+        factor = float(number)
         return Medium(factor * self.sigma_s, factor * self.sigma_a, self.g, self.eta)
 
     def in_mfp(self) -> Medium:
@@ -154,8 +170,8 @@ class Medium:
     def channel(self, index: int) -> Medium:
         """The scalar medium of one channel; a scalar medium has only channel 0."""
         n = self.n_channels or 1
-        if not 0 <= index < n:
-            raise ValueError(f"channel must be in [0, {n - 1}], got {index}")
+        if not isinstance(index, numbers.Integral) or not 0 <= index < n:
+            raise ValueError(f"channel must be a whole number in [0, {n - 1}], got {index!r}")
         s, a, g = (np.atleast_1d(v)[index] for v in (self.sigma_s, self.sigma_a, self.g))
         return Medium(float(s), float(a), float(g), self.eta)
 

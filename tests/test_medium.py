@@ -106,10 +106,18 @@ def test_extreme_albedos_are_accepted(albedo):
         ({"eta": math.inf}, "eta must be finite and > 0, got .*inf"),
         ({"eta": [1.3, 1.4]}, r"eta must be one number for all channels, got shape \(2,\)"),
         ({"sigma_s": "red"}, "sigma_s must be a number or a sequence of numbers, got 'red'"),
-        ({"sigma_s": None}, "sigma_s must be"),
+        ({"sigma_s": None}, "sigma_s must be a number .* got None"),
+        ({"eta": "1.3"}, "eta must be a number .* got '1.3'"),
         ({"sigma_s": [[1.0]]}, r"sigma_s must be a scalar or one value per channel, got shape \(1, 1\)"),
         ({"sigma_s": []}, "sigma_s must have at least one channel"),
-        ({"sigma_s": [1.0, 2.0], "sigma_a": [1.0, 2.0, 3.0]}, "same number of channels"),
+        (
+            {"sigma_s": [1.0, 2.0], "sigma_a": [1.0, 2.0, 3.0]},
+            r"sigma_s, sigma_a and g must have the same number of channels, got \(2,\), \(3,\), \(\)",
+        ),
+        (
+            {"sigma_s": 1e-320, "sigma_a": 0.0},
+            "sigma_t = .* must be .* 1 / sigma_t finite, got 1e-320",
+        ),
         ({"sigma_s": 0.0, "sigma_a": 0.0}, "sigma_t = sigma_s [+] sigma_a must be finite and > 0"),
     ],
 )
@@ -127,8 +135,13 @@ def test_bad_coefficients_are_refused_with_name_bound_and_value(change, message)
         (lambda: Medium.from_reduced(-1.0, 0.1), "sigma_s_prime must be finite and >= 0 .*-1"),
         (lambda: Medium.from_reduced(1.0, 0.1, g=1.0), "g must be in the open interval .*1"),
         (lambda: Medium(**SCALAR).scaled(0.0), "factor must be finite and > 0, got .*0"),
-        (lambda: Medium(**SCALAR).channel(1), r"channel must be in \[0, 0\], got 1"),
-        (lambda: Medium([1.0, 2.0], 0.1).channel(-1), r"channel must be in \[0, 1\], got -1"),
+        (lambda: Medium(**SCALAR).scaled("a"), "factor must be a number .*'a'"),
+        (lambda: Medium(**SCALAR).scaled([1.0, 2.0]), r"factor must be one number, got shape \(2,\)"),
+        (lambda: Medium.from_albedo([0.1, 0.2], [1, 2, 3]), "albedo and sigma_t must have the same number of channels"),
+        (lambda: Medium.from_reduced([1, 2], 0.1, g=[0.1] * 3), "sigma_s_prime and g must have the same number"),
+        (lambda: Medium(**SCALAR).channel(1), r"channel must be a whole number in \[0, 0\], got 1"),
+        (lambda: Medium([1.0, 2.0], 0.1).channel(-1), r"channel must be a whole number in \[0, 1\], got -1"),
+        (lambda: Medium([1.0, 2.0], 0.1).channel(0.5), r"channel must be a whole number in \[0, 1\], got 0.5"),
     ],
 )
 def test_bad_arguments_of_its_makers_are_refused(call, message):
