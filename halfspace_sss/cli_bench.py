@@ -55,7 +55,7 @@ def chosen_parts(text: str | None) -> list[str]:
 
 
 def bench_command(
-    only: Annotated[str | None, typer.Option(help="Parts, of walk,volpath,models,maps [all].")] = None,
+    only: Annotated[str | None, typer.Option(help="Parts, of walk,volpath,models,maps.", show_default="all")] = None,
     quick: Annotated[bool, typer.Option("--quick", help="Small runs that only show that everything works.")] = False,
     out: Annotated[Path, typer.Option(help="Folder for the files; those of the same names are replaced.")] = Path(
         "bench"

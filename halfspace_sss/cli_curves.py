@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from halfspace_sss.cli_shared import Bar, console, numbers, stated_medium
+from halfspace_sss.cli_shared import Albedo, Backend, Bar, Eta, MeanCosine, SigmaT, console, numbers, stated_medium
 from halfspace_sss.curve_set import TRACED, CurveSet
 from halfspace_sss.provenance import check_folder
 
@@ -21,24 +21,26 @@ __all__ = ["curves_command", "error_table"]
 
 def curves_command(
     material: Annotated[str | None, typer.Argument(help="Name of a material; see `halfspace-sss materials`.")] = None,
-    channel: Annotated[str | None, typer.Option(help="Channel of the material, name or number [first].")] = None,
-    sigma_t: Annotated[float | None, typer.Option(help="Extinction, 1/mm [0.241].")] = None,
-    albedo: Annotated[float | None, typer.Option(help="Single-scattering albedo [0.75].")] = None,
-    g: Annotated[float | None, typer.Option(help="Mean cosine of the phase function [0].")] = None,
-    eta: Annotated[float | None, typer.Option(help="Index inside over outside [1.3].")] = None,
+    channel: Annotated[str | None, typer.Option(help="Channel, by name or number.", show_default="first")] = None,
+    sigma_t: SigmaT = None,
+    albedo: Albedo = None,
+    g: MeanCosine = None,
+    eta: Eta = None,
     theta_i: Annotated[str, typer.Option(help="Angles of incidence, degrees.")] = "0,30,60,75",
     theta_o: Annotated[float, typer.Option(help="Angle of observation, degrees.")] = 0.0,
     delta_phi: Annotated[float, typer.Option(help="Azimuth of observation from forward, degrees.")] = 0.0,
     line: Annotated[float, typer.Option(help="Azimuth of the line from forward, degrees.")] = 90.0,
-    r_min: Annotated[float | None, typer.Option(help="Smallest distance, mm [from the medium].")] = None,
-    r_max: Annotated[float | None, typer.Option(help="Largest distance, mm [from the medium].")] = None,
-    model: Annotated[list[str] | None, typer.Option(help="A model; repeat for more [all].")] = None,
-    orders: Annotated[str, typer.Option(help="multiple: reflectance at each model's orders; total: with single.")] = (
-        "multiple"
-    ),
-    paths: Annotated[int | None, typer.Option(help="Walks for each angle of incidence [from the medium].")] = None,
+    r_min: Annotated[float | None, typer.Option(help="Smallest distance, mm.", show_default="from the medium")] = None,
+    r_max: Annotated[float | None, typer.Option(help="Largest distance, mm.", show_default="from the medium")] = None,
+    model: Annotated[
+        list[str] | None, typer.Option(help="A model; repeat for more.", metavar="NAME", show_default="all")
+    ] = None,
+    orders: Annotated[
+        str, typer.Option(help="multiple: reflectance at the orders of each model; total: with single.")
+    ] = ("multiple"),
+    paths: Annotated[int | None, typer.Option(help="Walks for each theta_i.", show_default="from the medium")] = None,
     seed: Annotated[int, typer.Option(help="Seed of the tracer.")] = 0,
-    backend: Annotated[str, typer.Option(help="llvm or cuda.")] = "llvm",
+    backend: Backend = "llvm",
     out: Annotated[Path, typer.Option(help="Folder for the files; those of the same names are replaced.")] = Path(
         "curves"
     ),

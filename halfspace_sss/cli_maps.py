@@ -8,7 +8,18 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from halfspace_sss.cli_shared import FIG10, Bar, console, numbers, stated_medium
+from halfspace_sss.cli_shared import (
+    FIG10,
+    Albedo,
+    Backend,
+    Bar,
+    Eta,
+    MeanCosine,
+    SigmaT,
+    console,
+    numbers,
+    stated_medium,
+)
 from halfspace_sss.provenance import check_folder
 
 if TYPE_CHECKING:
@@ -26,13 +37,17 @@ def maps_command(
     material: Annotated[
         list[str] | None, typer.Argument(help="Names of materials; see `halfspace-sss materials`.")
     ] = None,
-    channel: Annotated[str | None, typer.Option(help="Only these, as R,B: a store each [all in one store].")] = None,
-    sigma_t: Annotated[float | None, typer.Option(help="Extinction, 1/mm [0.241].")] = None,
-    albedo: Annotated[float | None, typer.Option(help="Single-scattering albedo [0.75].")] = None,
-    g: Annotated[float | None, typer.Option(help="Mean cosine of the phase function [0].")] = None,
-    eta: Annotated[float | None, typer.Option(help="Index inside over outside [1.3].")] = None,
-    name: Annotated[str | None, typer.Option(help="Store of a medium stated by coefficients [medium].")] = None,
-    target_error: Annotated[float | None, typer.Option(help="Mean cell error to stop at [0.05].")] = None,
+    channel: Annotated[
+        str | None, typer.Option(help="Only these, as R,B, a store each.", show_default="all in one store")
+    ] = None,
+    sigma_t: SigmaT = None,
+    albedo: Albedo = None,
+    g: MeanCosine = None,
+    eta: Eta = None,
+    name: Annotated[str | None, typer.Option(help="Store of a stated medium.", show_default="medium")] = None,
+    target_error: Annotated[
+        float | None, typer.Option(help="Mean cell error to stop at.", show_default="0.05, none with --paths")
+    ] = None,
     paths: Annotated[
         int | None, typer.Option(help="Walks for 16 maps: this number, or the most with --target-error.")
     ] = None,
@@ -40,7 +55,7 @@ def maps_command(
         str, typer.Option(help="Numbers of angles of incidence, of observations, of cells in r, in azimuth.")
     ] = ("16,64,48,24"),
     seed: Annotated[int, typer.Option(help="Seed of directions and walks.")] = 0,
-    backend: Annotated[str, typer.Option(help="llvm or cuda.")] = "llvm",
+    backend: Backend = "llvm",
     share: Annotated[str, typer.Option(help="k/n: of n processes that fill one folder, this is number k < n.")] = "0/1",
     out: Annotated[Path, typer.Option(help="Folder of the stores; what is there is continued.")] = Path("maps"),
 ) -> None:

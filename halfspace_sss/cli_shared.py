@@ -2,18 +2,29 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
 
 if TYPE_CHECKING:
     from rich.console import Console
 
     from halfspace_sss.medium import Medium
 
-__all__ = ["FIG10", "Bar", "console", "numbers", "stated_medium"]
+__all__ = [
+    "FIG10", "Albedo", "Backend", "Bar", "Eta", "MeanCosine", "SigmaT", "console", "numbers", "stated_medium",
+]  # fmt: skip
 
 TABLE_WIDTH = 132  # where the output is no terminal
 FIG10 = {"sigma_t": 0.241, "albedo": 0.75, "g": 0.0, "eta": 1.3}
 MEMORY = 3600.0  # seconds; steps may take minutes, and the time left is estimated from several of them
+
+
+SigmaT = Annotated[float | None, typer.Option(help="Extinction, 1/mm.", show_default="0.241")]
+Albedo = Annotated[float | None, typer.Option(help="Single-scattering albedo.", show_default="0.75")]
+MeanCosine = Annotated[float | None, typer.Option(help="Mean cosine of the phase function.", show_default="0")]
+Eta = Annotated[float | None, typer.Option(help="Index inside over outside.", show_default="1.3")]
+Backend = Annotated[str, typer.Option(help="llvm or cuda.")]
 
 
 def numbers(name: str, text: str) -> list[float]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import numbers
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -212,7 +213,8 @@ def _checked_angles(theta_i_deg: Sequence[float], theta_o: float, delta_phi: flo
     if not angles:
         raise ValueError("theta_i_deg must hold at least one angle, got none")
     for name, value in (*(("theta_i_deg", a) for a in angles), ("theta_o_deg", theta_o)):
-        check_interval(name, value, 0.0, math.nextafter(90.0, 0.0))
+        if isinstance(value, bool) or not isinstance(value, numbers.Real) or not 0 <= value < 90:
+            raise ValueError(f"{name} must be a number in [0, 90) degrees, got {value!r}")
     for name, value in (("delta_phi_deg", delta_phi), ("line_deg", line)):
         check_interval(name, value, -360.0, 360.0)
     if len(set(angles)) < len(angles):

@@ -101,7 +101,7 @@ def test_without_matplotlib_there_are_tables_and_a_hint(tmp_path: Path, monkeypa
         (["--albedo", "2"], "albedo must be in [0, 1]"),
         (["--g", "1"], "g must be in the open interval (-1, 1)"),
         (["--theta-i", "0,abc"], "theta_i must be numbers separated by commas, got '0,abc'"),
-        (["--theta-i", "90"], "theta_i_deg must be a number in [0, 90]"),
+        (["--theta-i", "90"], "theta_i_deg must be a number in [0, 90) degrees, got 90.0"),
         (["--r-min", "30"], "r_min must be < r_max = 25 mm, got 30"),
         (["--model", "beter_dipole"], "did you mean 'better_dipole'?"),
         (["--orders", "single"], "orders must be 'multiple' or 'total', got 'single'"),
@@ -229,6 +229,12 @@ def test_help_names_every_command() -> None:
     text = _invoke("--help").stdout
     for name in ("bench", "curves", "maps", "materials", "models", "validate"):
         assert name in text
+
+
+def test_help_shows_what_is_taken_by_default() -> None:
+    text = " ".join(_invoke("curves", "--help").stdout.split())
+    for default in ("0.241", "first", "from the medium", "all"):
+        assert f"[default: ({default})]" in text
 
 
 class _Entry:
