@@ -49,6 +49,8 @@ class _Group(TyperGroup):
             raise _end("interrupted; files that were being written are whole or absent", 130) from None
         except ValueError as error:
             raise _end(f"error: {error}", 2) from error
+        except BrokenPipeError:
+            raise  # the reader, `head` for instance, has what it wanted: typer ends in silence
         except (BackendError, OSError) as error:
             raise _end(f"error: {error}", 1) from error
 

@@ -190,6 +190,14 @@ def test_a_missing_backend_ends_with_1_and_its_message(monkeypatch: Any) -> None
     assert (result.exit_code, result.stderr) == (1, "error: no LLVM here\n")
 
 
+def test_a_reader_that_closes_the_pipe_hears_no_complaint(tmp_path: Path) -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    run = subprocess.run([*START, "materials", "marble"], stdout=writer, stderr=subprocess.PIPE, text=True)
+    os.close(writer)
+    assert (run.returncode, run.stderr) == (1, "")
+
+
 def test_a_mistake_in_the_library_is_not_hidden(monkeypatch: Any) -> None:
     assert isinstance(_ends_with(TypeError("a bug"), monkeypatch).exception, TypeError)
 

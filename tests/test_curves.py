@@ -171,7 +171,7 @@ def test_bright_media_get_fewer_walks_by_default() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"theta_i_deg": [90]}, r"theta_i_deg must be a number in \[0, 90\], got 90"),
+        ({"theta_i_deg": [90]}, r"theta_i_deg must be a number in \[0, 90\) degrees, got 90"),
         ({"theta_i_deg": []}, "theta_i_deg must hold at least one angle"),
         ({"theta_i_deg": [5, 5]}, "theta_i_deg must be different angles"),
         ({"theta_o_deg": -1}, "theta_o_deg must be a number in"),
