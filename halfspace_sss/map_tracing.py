@@ -93,7 +93,7 @@ class MapTally:
         q = []
         for ox, oy, mu, inverse_mu, scale in self.directions:
             cosine = event.dx * ox + event.dy * oy - event.dz * mu
-            q.append(scale * eval_hg(cosine, self.g) * dr.exp(-event.z * inverse_mu))
+            q.append(scale * self._phase(cosine, event) * dr.exp(-event.z * inverse_mu))
         total = sum(q[1:], q[0])
         for hit in range(HITS):
             target = (event.random() + hit) / HITS * total
@@ -103,6 +103,10 @@ class MapTally:
             index = k * (self.n_r * self.n_psi) + cell
             self.cells.add(event.weight * total / HITS, index, event.lane, inside & (event.order > 1))
         return sums
+
+    def _phase(self, cosine: Any, event: Scatter) -> Any:
+        """Phase function towards an observation."""
+        return eval_hg(cosine, self.g)
 
     def _choose(self, q: list, target: Any) -> tuple[Any, tuple]:
         """The observation in whose share of the running sum the target lies."""
@@ -124,6 +128,7 @@ class MapTally:
         Int32, UInt32 = self.types.Int32, self.types.UInt32
         ratio = dr.sqrt(x * x + y * y) * self.inverse_L
         u = dr.select(ratio > 15, ratio, dr.log(dr.maximum(dr.exp(dr.minimum(ratio, 16)) - 1, 1e-12)))
+        u = dr.select(ratio < 0.01, dr.log(dr.maximum(ratio, 1e-30)) + 0.5 * ratio, u)  # exp(x) - 1 has lost its digits
         i = Int32(dr.floor((u - self.low) * self.rate))
         j = Int32(dr.floor((dr.atan2(y, x) / (2 * math.pi) + 0.5) * self.n_psi))
         j = dr.clip(j, 0, self.n_psi - 1)
