@@ -24,7 +24,7 @@ SECONDS = {"walk": 1, "volpath": 15, "models": 3, "maps": 100}  # about, for a r
 TITLES = {
     "walk": "walk at normal incidence, flux alone or with peel-off towards one direction",
     "volpath": "Mitsuba's volpath for the same reflectance: time for equal error over that of the walk",
-    "models": "evaluations of S per second, float32, one CPU process",
+    "models": "evaluations of S per second, float32; NumPy runs on one thread, torch and Dr.Jit on all",
     "maps": "training maps to a mean cell error",
 }
 COLUMNS = {  # key of a row -> heading and format
