@@ -12,7 +12,7 @@ import numpy as np
 
 from halfspace_sss.fresnel import F_t, mu_internal
 from halfspace_sss.medium import Medium
-from halfspace_sss.tallies import CellSums
+from halfspace_sss.tallies import BATCHES, CellSums
 from halfspace_sss.walk import Tally, pass_seed, walk
 
 __all__ = ["PATHS_PER_LANE", "Estimate", "Pass", "Progress", "estimate", "launch_shape", "walk_passes"]
@@ -36,9 +36,9 @@ def estimate(samples: np.ndarray) -> Estimate:
 
 
 def launch_shape(n_paths: int) -> tuple[int, int, int]:
-    """Lanes, walks per lane and passes that together trace at least `n_paths` walks."""
+    """Lanes (whole batches), walks per lane and passes that together trace at least `n_paths` walks."""
     per_lane = int(np.clip(n_paths // 16384, 1, PATHS_PER_LANE))
-    lanes = min(math.ceil(n_paths / per_lane), MAX_LANES)
+    lanes = min(BATCHES * math.ceil(n_paths / (per_lane * BATCHES)), MAX_LANES)
     return lanes, per_lane, math.ceil(n_paths / (lanes * per_lane))
 
 
@@ -70,10 +70,7 @@ class Pass:
 
     def cells(self, sums: CellSums) -> np.ndarray:
         """Means of each batch of lanes, independent samples, of cells lit by one beam; shape (batches, cells)."""
-        cells, lanes = sums.result(), len(self.T_i)
-        batches = len(cells)  # they differ by a lane where their number does not divide the lanes
-        in_batch = lanes // batches + (np.arange(batches) < lanes % batches)
-        return cells * (self.T_i[0] / (self.per_lane * in_batch))[:, None]
+        return sums.result() * (self.T_i[0] * sums.batches / self.n_paths)
 
 
 def _incidence(mu_i: float | str, lanes: int, rng: np.random.Generator) -> np.ndarray:

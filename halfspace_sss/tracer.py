@@ -34,7 +34,7 @@ class Trace:
 
     Attributes:
         medium, mu_i, seed, backend: what was asked.
-        n_paths: walks traced, the asked number rounded up to whole lanes.
+        n_paths: walks traced, the asked number rounded up to whole batches of lanes.
         n_events: scattering events.
         seconds: wall time, compilation included.
     """
@@ -108,13 +108,13 @@ def trace(
     """Trace walks of a beam in a half-space and return what leaves it, by scattering order.
 
     Walks are in float32, so that an albedo is rounded to a multiple of 6e-8. At albedo 1 exactly, where walks of any
-    length occur (P(order > N) ~ N^-1/2), few walks tell their own standard error slightly too small: over 60 runs of
-    8192 walks the reflectance was off by 1.3 standard errors rms, at worst 4.4.
+    length occur (P(order > N) ~ N^-1/2), few walks miss the longest and state standard errors slightly too small: over
+    120 runs of 8192 walks the reflectance was 0.6 standard errors low on average, 1.4 off rms, at worst 3.6.
 
     Args:
         medium: scalar medium (take `medium.channel(k)` of a coloured one).
         mu_i: cosine of incidence outside, [0, 1], or "diffuse" for uniform radiance from above.
-        n_paths: number of walks, at least 256; rounded up to whole lanes.
+        n_paths: number of walks, at least 256; rounded up to whole batches of lanes.
         seed: results repeat for the same seed, backend and version.
         directions: pairs (mu_o, delta_phi) for `angular_reflectance`; delta_phi = 0 is forward, the far
             side; not for diffuse light.

@@ -127,6 +127,26 @@ def pass_seed(seed: int, *indices: int) -> tuple[int, int]:
     return int(state), int(stream >> np.uint64(1))
 
 
+def _generator(types: ModuleType, lanes: int, seed: tuple[int, int]) -> Any:
+    """A generator whose lanes are independent: state and stream of each are hashed (SplitMix64).
+
+    Lanes of PCG32 whose states and streams differ in a few low bits only are correlated: the variance of the mean of
+    16384 first numbers was 0.07 to 4.2 times that of independent ones, and standard errors were wrong by as much.
+    """
+    import drjit as dr
+
+    UInt64 = types.UInt64
+    lane = dr.arange(UInt64, lanes)
+
+    def hashed(start: int) -> Any:
+        z = dr.opaque(UInt64, start) + lane * UInt64(0x9E3779B97F4A7C15)
+        z = (z ^ (z >> 30)) * UInt64(0xBF58476D1CE4E5B9)
+        z = (z ^ (z >> 27)) * UInt64(0x94D049BB133111EB)
+        return z ^ (z >> 31)
+
+    return types.PCG32(lanes, *map(hashed, seed))
+
+
 def _turn(dx: Any, dy: Any, dz: Any, cosine: Any, azimuth: Any) -> tuple[Any, Any, Any]:
     """Direction at the given polar cosine and azimuth about (dx, dy, dz); frame of Duff et al. 2017."""
     import drjit as dr
@@ -189,7 +209,7 @@ def walk(
     count = dr.zeros(UInt32, lanes)
     begin = dr.opaque(Float, weight) if isinstance(weight, float) else weight
     state = {
-        "rng": types.PCG32(lanes, *(dr.opaque(types.UInt64, s) for s in seed)),
+        "rng": _generator(types, lanes, seed),
         "x": zero, "y": zero, "z": zero, "dx": sin_in, "dy": zero, "dz": mu_in, "length": zero,
         "weight": zero + begin, "order": count, "path": count, "events": count,
     }  # fmt: skip
