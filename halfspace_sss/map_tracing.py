@@ -14,9 +14,9 @@ from halfspace_sss.backend import array_types
 from halfspace_sss.fresnel import F_t, mu_internal
 from halfspace_sss.map_grid import MapGrid, cell_edges, map_directions, radial_scale, warp
 from halfspace_sss.medium import Medium
+from halfspace_sss.passes import PATHS_PER_LANE
 from halfspace_sss.phase import eval_hg
 from halfspace_sss.tallies import CellSums
-from halfspace_sss.tracer import PATHS_PER_LANE
 from halfspace_sss.walk import Boundary, Scatter, pass_seed, walk
 
 __all__ = ["MapUnit", "UnitResult", "trace_unit"]

@@ -13,11 +13,11 @@ from halfspace_sss.backend import array_types
 from halfspace_sss.checks import check_count, check_edges, check_finite, check_interval, check_scalar_medium
 from halfspace_sss.fresnel import F_t
 from halfspace_sss.medium import Medium
-from halfspace_sss.passes import PATHS_PER_LANE, Estimate, Progress, estimate, launch_shape, walk_passes
+from halfspace_sss.passes import Estimate, Progress, estimate, walk_passes
 from halfspace_sss.tallies import AngularTally, FluxTally, MomentTally, RingTally
 from halfspace_sss.walk import Tally
 
-__all__ = ["ORDERS", "PATHS_PER_LANE", "Estimate", "Trace", "launch_shape", "trace"]
+__all__ = ["ORDERS", "Estimate", "Trace", "trace"]
 
 ORDERS = ("single", "multiple", "total")
 
