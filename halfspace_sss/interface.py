@@ -99,12 +99,14 @@ class BSSRDF(abc.ABC):
         orders: "multiple" (two or more scattering events) or "total" (single scattering included).
         reciprocal: whether S(x_i, w_i; x_o, w_o) = S(x_o, w_o; x_i, w_i) holds exactly.
         source: paper and equation.
+        mirror_invariant: whether S(phi_i, phi_o) = S(-phi_i, -phi_o) holds exactly.
     """
 
     name: ClassVar[str]
     orders: ClassVar[str]
     reciprocal: ClassVar[bool]
     source: ClassVar[str]
+    mirror_invariant: ClassVar[bool] = True
 
     def __init__(self, medium: Medium) -> None:
         if not isinstance(medium, Medium):

@@ -57,6 +57,7 @@ class Scatter:
     dy: Any
     dz: Any
     lane: Any
+    first: Any  # cosine of the first scattering angle; 1 before it is drawn
     random: Any  # further uniform numbers: call it
 
 
@@ -211,7 +212,7 @@ def walk(
     state = {
         "rng": _generator(types, lanes, seed),
         "x": zero, "y": zero, "z": zero, "dx": sin_in, "dy": zero, "dz": mu_in, "length": zero,
-        "weight": zero + begin, "order": count, "path": count, "events": count,
+        "weight": zero + begin, "first": zero + 1, "order": count, "path": count, "events": count,
     }  # fmt: skip
 
     def body(s: dict, sums: tuple) -> tuple[dict, tuple]:
@@ -259,11 +260,12 @@ def _step(s: dict, sums: tuple, m: WalkConstants, start: tuple, lane: Any, talli
     x, y, z, dz = x + dx * path, y + dy * path, dr.abs(below), dr.select(crosses, -dz, dz)
     weight = dr.select(crosses, s["weight"] * F, s["weight"]) * m.albedo
     order = s["order"] + 1
-    event = Scatter(order, weight, x, y, z, dx, dy, dz, lane, rng.next_float32)
+    event = Scatter(order, weight, x, y, z, dx, dy, dz, lane, s["first"], rng.next_float32)
     sums = tuple(tally.scatter(state, event) for tally, state in zip(tallies, sums))
 
     u, azimuth = rng.next_float32(), 2 * math.pi * rng.next_float32()
     cosine = 2 * u - 1 if m.isotropic else sample_hg(u, m.g)
+    first = dr.select(order == 1, cosine, s["first"])
     dx, dy, dz = _turn(dx, dy, dz, cosine, azimuth)
 
     survive, weight = _roulette(weight, order)
@@ -275,7 +277,7 @@ def _step(s: dict, sums: tuple, m: WalkConstants, start: tuple, lane: Any, talli
     return {
         "rng": rng, "x": renew(0.0, x), "y": renew(0.0, y), "z": renew(0.0, z),
         "dx": renew(start[0], dx), "dy": renew(0.0, dy), "dz": renew(start[1], dz),
-        "length": renew(0.0, s["length"] + path), "weight": renew(start[2], weight),
+        "length": renew(0.0, s["length"] + path), "weight": renew(start[2], weight), "first": renew(1.0, first),
         "order": renew(UInt32(0), order), "path": s["path"] + dr.select(ends, UInt32(1), UInt32(0)),
         "events": s["events"] + 1,
     }, sums  # fmt: skip

@@ -34,7 +34,12 @@ def same(a, b, rtol: float, floor: float = 1e-30) -> None:
 
 
 @pytest.fixture(params=range(len(MEDIA)))
-def medium(request) -> Medium:
+def medium(request, name) -> Medium:
+    """Each of the media that the model accepts."""
+    try:
+        halfspace_sss.bssrdf(name, MEDIA[request.param])
+    except ValueError as error:
+        pytest.skip(f"refused: {error}")
     return MEDIA[request.param]
 
 
@@ -62,10 +67,14 @@ def test_scaling_the_medium_scales_the_lengths(name, medium, queries, c):
     same(scaled, c**2 * halfspace_sss.bssrdf(name, medium).eval(r, *directions), 1e-9)
 
 
-def test_mirrored_azimuths_give_the_same_value(name, medium, queries):
+def test_mirrored_azimuths_give_the_same_value_or_not_as_declared(name, medium, queries):
     model = halfspace_sss.bssrdf(name, medium)
     r, mu_i, phi_i, mu_o, phi_o = queries(500, medium)
-    same(model.eval(r, mu_i, -phi_i, mu_o, -phi_o), model.eval(r, mu_i, phi_i, mu_o, phi_o), 1e-9)
+    mirrored, S = model.eval(r, mu_i, -phi_i, mu_o, -phi_o), model.eval(r, mu_i, phi_i, mu_o, phi_o)
+    if model.mirror_invariant:
+        same(mirrored, S, 1e-9)
+    else:
+        assert not np.allclose(mirrored, S, rtol=1e-3)
 
 
 def test_reciprocity_is_kept_or_broken_as_declared(name, medium, queries):
@@ -184,7 +193,7 @@ def test_direction_samples_follow_their_density(name, medium):
 
 def test_densities_integrate_to_one(name, medium):
     model, turn = halfspace_sss.bssrdf(name, medium), np.array([0, 2 * np.pi])
-    everywhere = np.linspace(np.log(1e-9), np.log(1e12), 40)
+    everywhere = np.linspace(np.log(1e-9), np.log(1e12), 200)
     assert position_probabilities(model, 0.6, everywhere, turn).sum() == pytest.approx(1, abs=1e-3)
     given = (0.7 / medium.sigma_t, 0.6, 0.4)
     assert direction_probabilities(model, given, np.linspace(0, 1, 41), turn).sum() == pytest.approx(1, abs=1e-3)

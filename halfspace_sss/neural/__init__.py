@@ -1,0 +1,32 @@
+"""Learnt BSSRDFs of a half-space, order >= 2, and their training.
+
+- `neural`: one network for every medium with albedo in [0, 1], g in [-0.5, 0.98], eta in [1, 2]; needs no training.
+- `neural_material`: a small network of one medium, trained in seconds by `train`.
+- `neural_paper`: the architecture and loss of the paper, to compare with.
+
+`train(material)` trains a material or medium; its weights are then found by `halfspace_sss.bssrdf`. Training needs
+torch, evaluation does not.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from halfspace_sss.neural.material_model import NeuralMaterial
+from halfspace_sss.neural.paper_model import NeuralPaper
+from halfspace_sss.neural.universal import Neural
+
+if TYPE_CHECKING:
+    from halfspace_sss.neural.training import train, train_universal
+
+__all__ = ["MODELS", "Neural", "NeuralMaterial", "NeuralPaper", "train", "train_universal"]
+
+MODELS = [Neural, NeuralMaterial, NeuralPaper]
+
+
+def __getattr__(name: str) -> Any:
+    if name in ("train", "train_universal"):
+        from halfspace_sss.neural import training
+
+        return getattr(training, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

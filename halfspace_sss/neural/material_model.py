@@ -1,0 +1,54 @@
+"""The small learnt BSSRDF of one medium."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from halfspace_sss.medium import Medium
+from halfspace_sss.neural.features import N_FEATURES
+from halfspace_sss.neural.network import SILU, Activation, Network, layer_shapes
+from halfspace_sss.neural.store import load_weights
+from halfspace_sss.neural.symmetric import SymmetricModel, channels
+from halfspace_sss.neural.trained import find_weights
+
+__all__ = ["KIND", "NeuralMaterial", "load_network", "network_arrays"]
+
+KIND = "neural_material"
+
+
+def network_arrays(network: Network) -> dict[str, np.ndarray]:
+    """Arrays of a network by name, for a file of weights."""
+    pairs = enumerate(zip(network.matrices, network.biases))
+    return {f"{name}_{k}": array for k, pair in pairs for name, array in zip("Wb", pair)}
+
+
+def load_network(path: Path, kind: str, n_in: int, activation: Activation = SILU) -> Network:
+    """The network of a file of weights; ValueError names the file if it cannot be used."""
+    arrays, record = load_weights(path, kind)
+    shapes = layer_shapes(n_in, record["width"], record["depth"])
+    found = [arrays[f"W_{k}"].shape for k in range(len(arrays) // 2) if f"W_{k}" in arrays]
+    if found != shapes or len(arrays) != 2 * len(shapes):
+        raise ValueError(f"{path}: layers must be {shapes}, got {found}")
+    matrices = tuple(arrays[f"W_{k}"].astype(np.float32) for k in range(len(shapes)))
+    return Network(matrices, tuple(arrays[f"b_{k}"].astype(np.float32) for k in range(len(shapes))), activation)
+
+
+class NeuralMaterial(SymmetricModel):
+    """A small network per medium: S = T_12 T_21 B(r) exp(MLP(features)), 3 x 32 SiLU, order >= 2.
+
+    Positive, reciprocal and mirror-invariant by construction; B is the analytic backbone. The weights are those that
+    `halfspace_sss.neural.train` or `halfspace-sss train` made for each channel of the medium; media that were not
+    trained are refused. Single scattering is left out.
+    """
+
+    name = KIND
+    source = "this project; training data by path tracing as in TG, Tran, Jensen, Ramamoorthi and Frisvad 2024"
+
+    def __init__(self, medium: Medium) -> None:
+        super().__init__(medium)
+        self.networks = [load_network(find_weights(KIND, m), KIND, N_FEATURES) for m in channels(medium)]
+
+    def for_medium(self, medium: Medium) -> NeuralMaterial:
+        return NeuralMaterial(medium)

@@ -1,0 +1,172 @@
+"""A multilayer perceptron, evaluated in NumPy, torch or Dr.Jit from the same numbers."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+__all__ = ["RELU", "SILU", "Activation", "Network", "layer_shapes"]
+
+NUMPY_BLOCK = 4096  # queries whose activations stay in the cache
+
+
+def layer_shapes(n_in: int, width: int, depth: int) -> list[tuple[int, int]]:
+    """Shapes (inputs, outputs) of the layers of a network with `depth` hidden layers and one output."""
+    return [(n_in, width), *[(width, width)] * (depth - 1), (width, 1)]
+
+
+class Activation(NamedTuple):
+    """A function of each number in the three libraries; NumPy's changes its argument."""
+
+    numpy: Callable[[np.ndarray], Any]
+    torch: Callable[[Any], Any]
+    drjit: Callable[[Any], Any]
+
+
+def _silu_numpy(h: np.ndarray) -> None:
+    h /= 1 + np.exp(-np.maximum(h, -80.0))
+
+
+def _silu_torch(h: Any) -> Any:
+    import torch
+
+    return torch.nn.functional.silu(h)
+
+
+def _silu_drjit(h: Any) -> Any:
+    import drjit as dr
+
+    return h * (0.5 + 0.5 * dr.tanh(0.5 * h))
+
+
+def _relu_drjit(h: Any) -> Any:
+    import drjit as dr
+
+    return dr.maximum(h, 0)
+
+
+SILU = Activation(_silu_numpy, _silu_torch, _silu_drjit)  # x / (1 + exp(-x))
+RELU = Activation(lambda h: np.maximum(h, 0, out=h), lambda h: h.clamp_min(0), _relu_drjit)
+
+
+@dataclass(frozen=True, eq=False)
+class Network:
+    """h_{k+1} = a(h_k W_k + b_k), the last layer without a.
+
+    Args:
+        matrices: W_k of shape (inputs, outputs), NumPy float32.
+        biases: b_k of shape (outputs,).
+        activation: a, SILU or RELU.
+    """
+
+    matrices: tuple[np.ndarray, ...]
+    biases: tuple[np.ndarray, ...]
+    activation: Activation = SILU
+
+    @classmethod
+    def from_vector(
+        cls, vector: np.ndarray, shapes: Sequence[tuple[int, int]], activation: Activation = SILU
+    ) -> Network:
+        """The network whose numbers stand in `vector` layer after layer, each matrix before its bias."""
+        matrices, biases, at = [], [], 0
+        for n_in, n_out in shapes:
+            matrices.append(np.ascontiguousarray(vector[at : at + n_in * n_out].reshape(n_in, n_out), np.float32))
+            at += n_in * n_out
+            biases.append(np.ascontiguousarray(vector[at : at + n_out], np.float32))
+            at += n_out
+        return cls(tuple(matrices), tuple(biases), activation)
+
+    def __call__(self, features: Sequence[Any]) -> Any:
+        """The output for features that are arrays of one shape, in their library and precision."""
+        kind = type(features[0]).__module__.split(".")[0]
+        evaluate = {"torch": self._torch, "drjit": self._drjit, "mitsuba": self._drjit}.get(kind, self._numpy)
+        return evaluate(features)
+
+    def _numpy(self, features: Sequence[np.ndarray]) -> np.ndarray:
+        shape = np.broadcast_shapes(*(np.shape(f) for f in features))
+        dtype = np.result_type(*features)
+        columns = np.stack([np.broadcast_to(f, shape).ravel() for f in features], axis=-1).astype(dtype, copy=False)
+        layers = [(W.astype(dtype), b.astype(dtype)) for W, b in zip(self.matrices, self.biases)]
+        out = np.empty(len(columns), dtype)
+        for at in range(0, len(columns), NUMPY_BLOCK):
+            h = columns[at : at + NUMPY_BLOCK]
+            for W, b in layers[:-1]:
+                h = h @ W
+                h += b
+                self.activation.numpy(h)
+            W, b = layers[-1]
+            out[at : at + NUMPY_BLOCK] = (h @ W)[:, 0] + b[0]
+        return out.reshape(shape)
+
+    @functools.cached_property
+    def _tensors(self) -> dict:
+        return {}
+
+    def _torch(self, features: Sequence[Any]) -> Any:
+        import torch
+
+        x = torch.stack(torch.broadcast_tensors(*features), dim=-1)
+        key = (x.dtype, x.device)
+        if key not in self._tensors:
+            pairs = [(np.ascontiguousarray(W.T), b) for W, b in zip(self.matrices, self.biases)]
+            self._tensors[key] = [tuple(torch.from_numpy(v).to(x) for v in pair) for pair in pairs]
+        *hidden, (W, b) = self._tensors[key]
+        for V, c in hidden:
+            x = self.activation.torch(torch.nn.functional.linear(x, V, c))
+        return torch.nn.functional.linear(x, W, b)[..., 0]
+
+    @functools.cached_property
+    def _views(self) -> dict:
+        return {}
+
+    def _drjit(self, features: Sequence[Any]) -> Any:
+        """By cooperative vectors in single precision, half precision on CUDA, which has no other; else by loops."""
+        import drjit as dr
+        from drjit import nn
+
+        kind = type(sum(features[1:], features[0]))
+        if dr.type_v(kind) == dr.VarType.Float64:
+            return self._drjit_loops(features, kind)
+        inner = dr.float16_array_t(kind) if dr.backend_v(kind) == dr.JitBackend.CUDA else kind
+        if inner not in self._views:
+            tensor = dr.tensor_t(inner)
+            parts = [tensor(np.ascontiguousarray(W.T)) for W in self.matrices] + [inner(b) for b in self.biases]
+            self._views[inner] = nn.pack(*parts)
+        n = len(self.matrices)
+        views = self._views[inner][-2 * n :]
+        x = nn.CoopVec(*(inner(f) for f in features))
+        for k in range(n):
+            x = nn.matvec(views[k], x, views[n + k])
+            if k < n - 1:
+                x = self.activation.drjit(x)
+        return kind(list(x)[0])
+
+    def _drjit_loops(self, features: Sequence[Any], kind: type) -> Any:
+        """One symbolic loop over the outputs of each layer and one over its inputs: slow, in any precision."""
+        import drjit as dr
+
+        UInt32 = dr.uint32_array_t(kind)
+        h = dr.alloc_local(kind, len(features))
+        for k, f in enumerate(features):
+            h[UInt32(k)] = f
+        for k, (W, b) in enumerate(zip(self.matrices, self.biases)):
+            n_in, n_out = W.shape
+            weights, bias, out = kind(W.T.ravel()), kind(b), dr.alloc_local(kind, n_out)
+
+            def sum_inputs(j: Any, h: Any = h, n_in: int = n_in, weights: Any = weights, bias: Any = bias) -> Any:
+                return dr.while_loop(
+                    (UInt32(0), dr.gather(kind, bias, j)), lambda i, _: i < n_in,
+                    lambda i, a: (i + 1, dr.fma(dr.gather(kind, weights, j * n_in + i), h[i], a)),
+                )[1]  # fmt: skip
+
+            def output(j: Any, out: Any, last: bool = k == len(self.matrices) - 1, rows: Any = sum_inputs) -> tuple:
+                a = rows(j)
+                out[j] = a if last else self.activation.drjit(a)
+                return j + 1, out
+
+            _, h = dr.while_loop((UInt32(0), out), lambda j, _, n=n_out: j < n, output)
+        return h[UInt32(0)]

@@ -1,0 +1,79 @@
+"""The network of the paper: a plain 3 x 256 perceptron of position and directions, kept to compare with."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from halfspace_sss.fresnel import F_t
+from halfspace_sss.interface import BSSRDF, Query
+from halfspace_sss.medium import Medium
+from halfspace_sss.neural.backbone import U_MAX, length_scale
+from halfspace_sss.neural.material_model import load_network
+from halfspace_sss.neural.network import RELU, Network
+from halfspace_sss.neural.store import load_weights
+from halfspace_sss.neural.symmetric import channel_queries, channels
+from halfspace_sss.neural.trained import find_weights
+
+__all__ = ["KIND", "N_INPUTS", "NeuralPaper", "paper_inputs"]
+
+KIND, N_INPUTS = "neural_paper", 6
+RADIUS = 4.0  # L; positions are divided by it
+T_SMALLEST = 1e-6  # product of transmittances; the network holds S, which is 0 where they are
+
+
+def paper_inputs(lib: Any, r: Any, line: Any, w_i: tuple[Any, Any], w_o: tuple[Any, Any], L: Any) -> list[Any]:
+    """Six numbers: (x, y) of x_o - x_i over 4 L and the horizontal parts of w_i and w_o.
+
+    Args:
+        r: distance in mean free paths.
+        line: azimuth of x_o - x_i in a fixed frame; the network is not invariant under rotation.
+        w_i, w_o: sine and azimuth of the directions outside, in the same frame.
+    """
+    rho = r / (RADIUS * L)
+    parts = [f(azimuth) * sine for sine, azimuth in (w_i, w_o) for f in (lib.cos, lib.sin)]
+    return [rho * lib.cos(line), rho * lib.sin(line), *parts]
+
+
+class NeuralPaper(BSSRDF):
+    """The paper's setting: S ~ MLP(x, y, w_i, w_o), 3 hidden layers of 256 with ReLU, from the squared error of S.
+
+    Neither reciprocal nor rotation-invariant nor positive: negative values are clamped (`measure.clamped_energy` tells
+    how much), and it is asked in the frame in which w_i has azimuth 0. The weights come from `halfspace-sss train
+    MATERIAL --model neural_paper`, for as long as asked; they are not the authors' and not their converged result
+    unless trained as long. Zero beyond 12 L, where it was not trained. Single scattering is left out.
+    """
+
+    name = KIND
+    orders = "multiple"
+    reciprocal = False
+    mirror_invariant = False
+    source = "TG, Tran, Jensen, Ramamoorthi and Frisvad 2024, half-space network"
+
+    def __init__(self, medium: Medium) -> None:
+        super().__init__(medium)
+        files = [find_weights(KIND, m) for m in channels(medium)]
+        self.networks: list[Network] = [load_network(file, KIND, N_INPUTS, RELU) for file in files]
+        self.scales = [float(load_weights(file, KIND)[1]["scale"]) for file in files]
+
+    def for_medium(self, medium: Medium) -> NeuralPaper:
+        return NeuralPaper(medium)
+
+    def G(self, q: Query) -> Any:
+        return q.lib.maximum(self.G_unclamped(q), 0.0)
+
+    def G_unclamped(self, q: Query) -> Any:
+        """G before negative values are set to zero."""
+        m = self.medium
+        queries = [q] if m.n_channels is None else channel_queries(q, m)
+        values = [self._one(*parts) for parts in zip(queries, channels(m), self.networks, self.scales)]
+        return values[0] if m.n_channels is None else q.lib.stack(values)
+
+    def _one(self, query: Query, m: Medium, network: Network, scale: float) -> Any:
+        q = query.in_float64()  # the raw output crosses zero, where float32 has no digits
+        lib, L = q.lib, length_scale(m.albedo, m.g)
+        sines = [lib.sqrt(lib.maximum((1 - mu) * (1 + mu), 0.0)) for mu in (q.mu_i, q.mu_o)]
+        w_i, w_o = (sines[0], 0 * q.phi_i), (sines[1], q.phi_o - q.phi_i)
+        r = lib.minimum(q.r, U_MAX * L)
+        S = scale * network(paper_inputs(lib, r, -q.phi_i, w_i, w_o, L))
+        G = S / lib.maximum(F_t(q.mu_i, m.eta) * F_t(q.mu_o, m.eta), T_SMALLEST)
+        return lib.like(lib.where(q.r > U_MAX * L, 0 * G, G), query.r)

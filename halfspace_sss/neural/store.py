@@ -1,0 +1,107 @@
+"""Weights on disk: a safetensors file of arrays and, beside it, a JSON record of what they are and how they were made.
+
+Loading runs no code of the file. The record names the checksum of the arrays, and both must agree with the format
+version, kind and shapes that are asked for.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from halfspace_sss.provenance import write_atomically
+
+__all__ = ["FORMAT", "load_weights", "save_weights"]
+
+FORMAT = 1
+LARGEST = 1e4  # no weight of a network that works is as large
+
+
+def _record_path(path: Path) -> Path:
+    return path.with_suffix(".json")
+
+
+def save_weights(path: str | os.PathLike, kind: str, arrays: Mapping[str, np.ndarray], record: dict[str, Any]) -> Path:
+    """Write `path` (.safetensors) and its record (.json); both whole or absent, the record last.
+
+    Args:
+        kind: which network it is, e.g. "neural_material".
+        arrays: name -> float array.
+        record: what else is known: medium, architecture, data, error, time, versions; ready for JSON.
+
+    Raises:
+        ValueError: the name does not end in .safetensors.
+    """
+    from safetensors.numpy import save
+
+    path = Path(path)
+    if path.suffix != ".safetensors":
+        raise ValueError(f"path must end in .safetensors, got {str(path)!r}")
+    data = save({name: np.ascontiguousarray(array) for name, array in arrays.items()})
+    shapes = {name: list(array.shape) for name, array in arrays.items()}
+    head = {"format": FORMAT, "kind": kind, "sha256": hashlib.sha256(data).hexdigest(), "shapes": shapes}
+    write_atomically(path, data)
+    write_atomically(_record_path(path), json.dumps({**head, **record}, indent=1) + "\n")
+    return path
+
+
+def load_weights(path: str | os.PathLike, kind: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Arrays and record of a file of weights.
+
+    Raises:
+        ValueError: it is no such file, is truncated or altered, of another kind, version or shape, or holds numbers
+            that are not finite; the message names the file.
+    """
+    path = Path(path)
+    record = _read_record(path, kind)
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise ValueError(f"{path}: weights cannot be read: {error.strerror}") from error
+    if hashlib.sha256(data).hexdigest() != record["sha256"]:
+        raise ValueError(f"{path}: sha256 must be {record['sha256'][:12]}..., got another: truncated or altered")
+    return _arrays(path, data, record), record
+
+
+def _read_record(path: Path, kind: str) -> dict[str, Any]:
+    if path.suffix != ".safetensors":
+        raise ValueError(f"{path}: weights must be a .safetensors file (a pickle could run code), got {path.suffix!r}")
+    place = _record_path(path)
+    try:
+        record = json.loads(place.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ValueError(f"{place}: record of the weights cannot be read: {error.strerror}") from error
+    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise ValueError(f"{place}: record of the weights must be JSON: {error}") from error
+    if not isinstance(record, dict):
+        raise ValueError(f"{place}: record of the weights must be a JSON object, got {type(record).__name__}")
+    for key, wanted in (("format", FORMAT), ("kind", kind)):
+        if record.get(key) != wanted:
+            raise ValueError(f"{place}: {key} must be {wanted!r}, got {record.get(key)!r}")
+    for key, sort in (("sha256", str), ("shapes", dict)):
+        if not isinstance(record.get(key), sort):
+            raise ValueError(f"{place}: {key} must be a {sort.__name__}, got {record.get(key)!r}")
+    return record
+
+
+def _arrays(path: Path, data: bytes, record: dict[str, Any]) -> dict[str, np.ndarray]:
+    from safetensors import SafetensorError
+    from safetensors.numpy import load
+
+    try:
+        arrays = load(data)
+    except SafetensorError as error:
+        raise ValueError(f"{path}: must be a safetensors file: {error}") from error
+    shapes = {name: list(array.shape) for name, array in arrays.items()}
+    if shapes != record["shapes"]:
+        raise ValueError(f"{path}: shapes must be {record['shapes']}, got {shapes}")
+    for name, array in arrays.items():
+        if array.dtype.kind != "f" or not np.all(np.abs(array) <= LARGEST):
+            raise ValueError(f"{path}: {name} must be floating-point numbers of size <= {LARGEST:g}, got others")
+    return arrays

@@ -1,0 +1,72 @@
+"""Training of the network for all media: maps of many media, then one fit."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from halfspace_sss.neural.fit import Fit, fit
+from halfspace_sss.neural.hypernetwork import RANGES
+from halfspace_sss.neural.learners import Hyper
+from halfspace_sss.neural.media import draw_media
+from halfspace_sss.neural.noisy_maps import CellGrid, Progress, draw_directions, make_pool
+from halfspace_sss.neural.pool import MapPool
+from halfspace_sss.neural.store import save_weights
+from halfspace_sss.provenance import provenance
+
+__all__ = ["UniversalRecipe", "train_universal"]
+
+
+@dataclass(frozen=True)
+class UniversalRecipe:
+    """Size of the training: media (each with one direction of incidence and 16 of observation), events, fit."""
+
+    n_media: int = 12288
+    events: float = 3e9
+    grid: CellGrid = CellGrid(40, 16)
+    how: Fit = field(default_factory=lambda: Fit(steps=150_000, n_groups=32, n_queries=256))
+    rank: int = 48
+
+
+def train_universal(
+    folder: str | os.PathLike,
+    seed: int = 0,
+    recipe: UniversalRecipe | None = None,
+    *,
+    backend: str = "llvm",
+    progress: Progress | None = None,
+    validate: Callable[[Hyper], float] | None = None,
+) -> Path:
+    """Train the universal network in `folder`, going on with what a killed run left there; returns the weights.
+
+    Args:
+        folder: gets maps, checkpoint and `neural.safetensors` with its record.
+        seed: media, maps, batches and first weights follow from it.
+        recipe: size of the training.
+        backend: of the maps, "llvm" or "cuda".
+        progress: called with (what, done, total).
+        validate: error of the learner, for the history.
+    """
+    recipe, folder, started = recipe or UniversalRecipe(), Path(folder), time.monotonic()
+    folder.mkdir(parents=True, exist_ok=True)
+    rng = np.random.default_rng([seed, 0])
+    groups = draw_directions(*draw_media(recipe.n_media, rng), rng)
+    halves = make_pool(groups, recipe.grid, recipe.events, (seed, 1), folder, progress, backend)
+    pool, data_seconds = MapPool(groups, recipe.grid, halves), time.monotonic() - started
+    del halves
+    learner = Hyper(rank=recipe.rank, seed=seed)
+    check = (lambda: validate(learner)) if validate else None
+    history = fit(learner, pool, recipe.how, seed, checkpoint=folder / "checkpoint.safetensors", validate=check,
+                  progress=progress)  # fmt: skip
+    record: dict[str, Any] = {
+        "width": learner.width, "depth": learner.depth, "ranges": {k: list(v) for k, v in RANGES.items()}, "seed": seed,
+        "recipe": asdict(recipe), "data_seconds": data_seconds, "seconds": time.monotonic() - started,
+        "history": history, "provenance": provenance(seed=seed),
+    }  # fmt: skip
+    return save_weights(folder / "neural.safetensors", "neural", learner.parameters_as_arrays(), record)

@@ -1,0 +1,60 @@
+"""The learnt BSSRDF of every homogeneous medium, with weights that come with the package."""
+
+from __future__ import annotations
+
+import functools
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+
+from halfspace_sss.medium import Medium
+from halfspace_sss.neural.hypernetwork import Hypernetwork, check_range
+from halfspace_sss.neural.store import load_weights
+from halfspace_sss.neural.symmetric import SymmetricModel, channels
+
+__all__ = ["Neural", "load_hypernetwork", "shipped_weights"]
+
+KIND = "neural"
+
+
+def shipped_weights() -> Path:
+    """The file of weights that comes with the package."""
+    return Path(str(resources.files("halfspace_sss.neural").joinpath("data", "neural.safetensors")))
+
+
+@functools.cache
+def load_hypernetwork(path: Path) -> Hypernetwork:
+    """The network of a file of weights; ValueError names the file if it cannot be used."""
+    arrays, record = load_weights(path, KIND)
+    layers = []
+    while f"medium_{len(layers)}_W" in arrays:
+        k = len(layers)
+        layers.append((arrays[f"medium_{k}_W"], arrays[f"medium_{k}_b"]))
+    network = Hypernetwork(tuple(layers), arrays["base"], arrays["basis"], record["width"], record["depth"])
+    size = sum(i * o + o for i, o in network.shapes)
+    if network.base.shape != (size,) or network.basis.shape[1:] != (size,):
+        raise ValueError(f"{path}: base must have {size} numbers for this architecture, got {network.base.shape}")
+    return network
+
+
+class Neural(SymmetricModel):
+    """One network for all media: S = T_12 T_21 B(r) exp(MLP(features; theta(albedo, g, eta))), order >= 2.
+
+    A second network maps the medium to the numbers theta of a small one, once; evaluation costs that of the small
+    one. Positive, reciprocal and mirror-invariant by construction. Trained on path tracing over albedo [0, 1],
+    g [-0.5, 0.98], eta [1, 2]; other media are refused. Single scattering is left out.
+    """
+
+    name = "neural"
+    source = "this project; training data by path tracing as in TG, Tran, Jensen, Ramamoorthi and Frisvad 2024"
+
+    def __init__(self, medium: Medium, weights: Path | None = None) -> None:
+        super().__init__(medium)
+        check_range(medium)
+        self._weights = weights
+        hyper = load_hypernetwork(weights or shipped_weights())
+        self.networks = [hyper.network(float(m.albedo), float(np.float64(m.g)), m.eta) for m in channels(medium)]
+
+    def for_medium(self, medium: Medium) -> Neural:
+        return Neural(medium, self._weights)
