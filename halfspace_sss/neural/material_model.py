@@ -9,7 +9,7 @@ import numpy as np
 from halfspace_sss.medium import Medium
 from halfspace_sss.neural.features import N_FEATURES
 from halfspace_sss.neural.network import SILU, Activation, Network, layer_shapes
-from halfspace_sss.neural.store import load_weights
+from halfspace_sss.neural.store import load_weights, record_count
 from halfspace_sss.neural.symmetric import SymmetricModel, channels
 from halfspace_sss.neural.trained import find_weights
 
@@ -27,10 +27,11 @@ def network_arrays(network: Network) -> dict[str, np.ndarray]:
 def load_network(path: Path, kind: str, n_in: int, activation: Activation = SILU) -> Network:
     """The network of a file of weights; ValueError names the file if it cannot be used."""
     arrays, record = load_weights(path, kind)
-    shapes = layer_shapes(n_in, record["width"], record["depth"])
-    found = [arrays[f"W_{k}"].shape for k in range(len(arrays) // 2) if f"W_{k}" in arrays]
-    if found != shapes or len(arrays) != 2 * len(shapes):
-        raise ValueError(f"{path}: layers must be {shapes}, got {found}")
+    shapes = layer_shapes(n_in, record_count(path, record, "width"), record_count(path, record, "depth", 64))
+    wanted = {f"{name}_{k}": s for k, pair in enumerate(shapes) for name, s in zip("Wb", (pair, pair[1:]))}
+    found = {name: array.shape for name, array in arrays.items()}
+    if found != wanted:
+        raise ValueError(f"{path}: layers must be {wanted}, got {found}")
     matrices = tuple(arrays[f"W_{k}"].astype(np.float32) for k in range(len(shapes)))
     return Network(matrices, tuple(arrays[f"b_{k}"].astype(np.float32) for k in range(len(shapes))), activation)
 

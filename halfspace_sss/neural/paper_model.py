@@ -10,7 +10,7 @@ from halfspace_sss.medium import Medium
 from halfspace_sss.neural.backbone import U_MAX, length_scale
 from halfspace_sss.neural.material_model import load_network
 from halfspace_sss.neural.network import RELU, Network
-from halfspace_sss.neural.store import load_weights
+from halfspace_sss.neural.store import load_weights, record_number
 from halfspace_sss.neural.symmetric import channel_queries, channels
 from halfspace_sss.neural.trained import find_weights
 
@@ -53,7 +53,7 @@ class NeuralPaper(BSSRDF):
         super().__init__(medium)
         files = [find_weights(KIND, m) for m in channels(medium)]
         self.networks: list[Network] = [load_network(file, KIND, N_INPUTS, RELU) for file in files]
-        self.scales = [float(load_weights(file, KIND)[1]["scale"]) for file in files]
+        self.scales = [record_number(file, load_weights(file, KIND)[1], "scale", 0.0, 1e30) for file in files]
 
     def for_medium(self, medium: Medium) -> NeuralPaper:
         return NeuralPaper(medium)

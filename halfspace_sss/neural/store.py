@@ -15,9 +15,10 @@ from typing import Any
 
 import numpy as np
 
+from halfspace_sss.checks import check_interval
 from halfspace_sss.provenance import write_atomically
 
-__all__ = ["FORMAT", "load_weights", "save_weights"]
+__all__ = ["FORMAT", "load_weights", "record_count", "record_number", "save_weights"]
 
 FORMAT = 1
 LARGEST = 1e4  # no weight of a network that works is as large
@@ -25,6 +26,20 @@ LARGEST = 1e4  # no weight of a network that works is as large
 
 def _record_path(path: Path) -> Path:
     return path.with_suffix(".json")
+
+
+def record_count(path: Path, record: Mapping[str, Any], key: str, most: int = 4096) -> int:
+    """A whole number in [1, most] of the record of `path`; ValueError names file, key, bound and value."""
+    value = record.get(key)
+    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= most:
+        raise ValueError(f"{_record_path(path)}: {key} must be a whole number in [1, {most}], got {value!r}")
+    return value
+
+
+def record_number(path: Path, record: Mapping[str, Any], key: str, low: float, high: float) -> float:
+    """A number in [low, high] of the record of `path`; ValueError names file, key, bound and value."""
+    check_interval(f"{_record_path(path)}: {key}", record.get(key), low, high)
+    return float(record[key])
 
 
 def save_weights(path: str | os.PathLike, kind: str, arrays: Mapping[str, np.ndarray], record: dict[str, Any]) -> Path:
@@ -46,8 +61,9 @@ def save_weights(path: str | os.PathLike, kind: str, arrays: Mapping[str, np.nda
     data = save({name: np.ascontiguousarray(array) for name, array in arrays.items()})
     shapes = {name: list(array.shape) for name, array in arrays.items()}
     head = {"format": FORMAT, "kind": kind, "sha256": hashlib.sha256(data).hexdigest(), "shapes": shapes}
+    text = json.dumps(head | record | head, indent=1) + "\n"  # the head of a record that was loaded is of other weights
     write_atomically(path, data)
-    write_atomically(_record_path(path), json.dumps({**head, **record}, indent=1) + "\n")
+    write_atomically(_record_path(path), text)
     return path
 
 
@@ -77,7 +93,7 @@ def _read_record(path: Path, kind: str) -> dict[str, Any]:
         record = json.loads(place.read_text(encoding="utf-8"))
     except OSError as error:
         raise ValueError(f"{place}: record of the weights cannot be read: {error.strerror}") from error
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
+    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
         raise ValueError(f"{place}: record of the weights must be JSON: {error}") from error
     if not isinstance(record, dict):
         raise ValueError(f"{place}: record of the weights must be a JSON object, got {type(record).__name__}")

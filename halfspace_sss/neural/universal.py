@@ -9,8 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from halfspace_sss.medium import Medium
+from halfspace_sss.neural.features import N_FEATURES, N_MEDIUM
 from halfspace_sss.neural.hypernetwork import Hypernetwork, check_range
-from halfspace_sss.neural.store import load_weights
+from halfspace_sss.neural.network import layer_shapes
+from halfspace_sss.neural.store import load_weights, record_count
 from halfspace_sss.neural.symmetric import SymmetricModel, channels
 
 __all__ = ["Neural", "load_hypernetwork", "shipped_weights"]
@@ -27,15 +29,19 @@ def shipped_weights() -> Path:
 def load_hypernetwork(path: Path) -> Hypernetwork:
     """The network of a file of weights; ValueError names the file if it cannot be used."""
     arrays, record = load_weights(path, KIND)
-    layers = []
-    while f"medium_{len(layers)}_W" in arrays:
-        k = len(layers)
-        layers.append((arrays[f"medium_{k}_W"], arrays[f"medium_{k}_b"]))
-    network = Hypernetwork(tuple(layers), arrays["base"], arrays["basis"], record["width"], record["depth"])
-    size = sum(i * o + o for i, o in network.shapes)
-    if network.base.shape != (size,) or network.basis.shape[1:] != (size,):
-        raise ValueError(f"{path}: base must have {size} numbers for this architecture, got {network.base.shape}")
-    return network
+    width, depth = record_count(path, record, "width"), record_count(path, record, "depth", 64)
+    size = sum(i * o + o for i, o in layer_shapes(N_FEATURES, width, depth))
+    sizes = [N_MEDIUM]
+    while f"medium_{len(sizes) - 1}_b" in arrays:
+        sizes.append(arrays[f"medium_{len(sizes) - 1}_b"].size)
+    layers = range(len(sizes) - 1)
+    wanted = {"base": (size,), "basis": (sizes[-1], size), **{f"medium_{k}_b": (sizes[k + 1],) for k in layers}}
+    wanted |= {f"medium_{k}_W": (sizes[k], sizes[k + 1]) for k in layers}
+    found = {name: array.shape for name, array in arrays.items()}
+    if found != wanted or not layers:
+        raise ValueError(f"{path}: shapes must be {wanted}, got {found}")
+    pairs = tuple((arrays[f"medium_{k}_W"], arrays[f"medium_{k}_b"]) for k in layers)
+    return Hypernetwork(pairs, arrays["base"], arrays["basis"], width, depth)
 
 
 class Neural(SymmetricModel):
