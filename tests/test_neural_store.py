@@ -125,6 +125,18 @@ def test_numbers_that_are_not_finite_or_too_large_are_refused(saved: Path, value
     assert str(saved) in _refusal(saved) and "b_1" in _refusal(saved)
 
 
+def test_weights_that_could_not_be_loaded_are_not_saved(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="w.safetensors: a must be floating-point numbers"):
+        save_weights(tmp_path / "w.safetensors", KIND, {"a": np.full(3, np.nan, np.float32)}, {})
+    assert not list(tmp_path.iterdir())
+
+
+def test_numbers_of_numpy_stand_in_a_record_as_numbers(tmp_path: Path) -> None:
+    record = {"seed": np.int64(3), "recipe": {"events": np.float32(0.5)}}
+    path = save_weights(tmp_path / "w.safetensors", KIND, _layers(N_FEATURES), record)
+    assert load_weights(path, KIND)[1] | {"seed": 3, "recipe": {"events": 0.5}} == load_weights(path, KIND)[1]
+
+
 def test_whole_numbers_are_refused(saved: Path) -> None:
     _rewrite(saved, {**_layers(N_FEATURES), "b_1": np.zeros(WIDTH, np.int32)})
     assert str(saved) in _refusal(saved) and "b_1" in _refusal(saved)

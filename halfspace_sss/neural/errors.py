@@ -18,7 +18,7 @@ from halfspace_sss.fresnel import F_t, mu_internal
 from halfspace_sss.interface import BSSRDF
 from halfspace_sss.medium import Medium
 from halfspace_sss.neural.backbone import unwarp
-from halfspace_sss.neural.noisy_maps import CellGrid, Groups, Progress, make_pool, radial_edges
+from halfspace_sss.neural.noisy_maps import LEAST_ALBEDO, CellGrid, Groups, Progress, make_pool, radial_edges
 from halfspace_sss.phase import eval_hg
 
 __all__ = ["ModelError", "Reference", "model_error", "reference_maps"]
@@ -58,6 +58,8 @@ class Reference:
     def energies(self) -> np.ndarray:
         """∫ S mu_i mu_o dA of each block in both halves, (n, 2, 16, n_u / block, n_psi / block)."""
         weight = _weight(self.groups.mu_i, self.medium.eta)[:, None] * _weight(self.groups.mu_o, self.medium.eta)
+        albedo = float(self.medium.albedo)
+        weight *= (albedo / max(albedo, LEAST_ALBEDO)) ** 2  # darker media were traced at that albedo
         return self._blocks(self.halves.astype(np.float64) * weight[:, None, :, None, None])
 
     def _blocks(self, cells: np.ndarray) -> np.ndarray:
@@ -131,7 +133,7 @@ def model_error(model: BSSRDF, reference: Reference) -> ModelError:
     traced = halves.mean(axis=1)
     if model.orders == "total":
         traced = traced + reference.single_energies()
-    total = traced.sum()
+    total = float(traced.sum() or E.sum() or 1.0)  # a medium that does not scatter has none
     deviation, noise = np.abs(E - traced), 0.5 * np.abs(halves[:, 0] - halves[:, 1])
     raw, blur = float(deviation.sum() / total), float(noise.sum() / total)
     bias_noise = float(0.5 * abs(halves[:, 0].sum() - halves[:, 1].sum()) / total)
@@ -144,7 +146,7 @@ def model_error(model: BSSRDF, reference: Reference) -> ModelError:
             decades[f"{10.0**d:g}-{10.0 ** (d + 1):g}"] = float(
                 _denoised(deviation[rows].sum(), noise[rows].sum()) / share
             )
-    return ModelError(_denoised(raw, blur), raw, blur, float(E.sum() / total) - 1, bias_noise, decades)
+    return ModelError(_denoised(raw, blur), raw, blur, float((E.sum() - traced.sum()) / total), bias_noise, decades)
 
 
 def _denoised(raw: float, noise: float) -> float:

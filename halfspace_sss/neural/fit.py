@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 import time
 from collections.abc import Callable
@@ -11,6 +12,7 @@ from typing import Any, Protocol
 
 import torch
 
+from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.neural.noisy_maps import Progress
 from halfspace_sss.neural.pool import Batch, MapPool
 from halfspace_sss.provenance import write_atomically
@@ -45,6 +47,12 @@ class Fit:
     checkpoint_every: float = 20.0
     validate_every: int = 2000
 
+    def __post_init__(self) -> None:
+        for name in ("steps", "n_groups", "n_queries", "validate_every"):
+            check_count(name, getattr(self, name), 1)
+        check_interval("rate", self.rate, 1e-8, 1.0)
+        check_interval("checkpoint_every", self.checkpoint_every, 0.0, 1e9)
+
 
 def fit(
     learner: torch.nn.Module,
@@ -64,10 +72,13 @@ def fit(
         validate: error of the learner as it is; called every `how.validate_every` steps.
         target_error: stop once the validation error has come down to it.
         progress: called with ("training", steps done, steps in all).
+
+    Raises:
+        ValueError: the checkpoint is damaged.
     """
     run = _Run(learner, how, seed)
     if checkpoint and checkpoint.exists():
-        run.load(checkpoint)
+        run.load(checkpoint, target_error)
     saved = time.monotonic()
     while run.step < how.steps and not run.done:
         run.advance(pool)
@@ -111,7 +122,10 @@ class _Run:
     def validated(self, error: float, target_error: float | None) -> None:
         seconds = time.monotonic() - self.started
         self.history.append({"step": self.step, "loss": self.loss, "error": error, "seconds": seconds})
-        self.done = target_error is not None and error <= target_error
+        self.done = self._reached(target_error)
+
+    def _reached(self, target_error: float | None) -> bool:
+        return target_error is not None and bool(self.history) and self.history[-1]["error"] <= target_error
 
     def _tensors(self) -> dict[str, torch.Tensor]:
         """Everything the next step depends on, by name; changing the tensors in place changes the run."""
@@ -130,25 +144,40 @@ class _Run:
         rows = [[h[k] for k in ("step", "loss", "error", "seconds")] for h in self.history]
         extra = {
             "generator": self.generator.get_state(),
-            "counter": torch.tensor([self.step, self.loss, float(self.done)], dtype=torch.float64),
+            "counter": torch.tensor([self.step, self.loss], dtype=torch.float64),
             "history": torch.tensor(rows, dtype=torch.float64).reshape(-1, 4),
         }
-        write_atomically(path, save({n: t.clone() for n, t in {**self._tensors(), **extra}.items()}))
+        state = {n: t.clone() for n, t in {**self._tensors(), **extra}.items()}
+        write_atomically(path, save({**state, "checksum": _checksum(state)}))
 
-    def load(self, path: Path) -> None:
-        """Go on from a checkpoint; ValueError if it is damaged or of another run."""
+    def load(self, path: Path, target_error: float | None) -> None:
+        """Go on from a checkpoint; ValueError if it is damaged or of another architecture."""
         from safetensors import SafetensorError
         from safetensors.torch import load
 
         try:
             stored = load(path.read_bytes())
+            if not torch.equal(stored.pop("checksum"), _checksum(stored)):
+                raise RuntimeError("it was altered")
             for name, tensor in self._tensors().items():
+                if stored[name].shape != tensor.shape:
+                    raise RuntimeError(f"{name} must have shape {tuple(tensor.shape)}")
                 tensor.copy_(stored[name])
             self.generator.set_state(stored["generator"])
-            step, self.loss, done = stored["counter"].tolist()
+            step, self.loss = stored["counter"].tolist()
             rows = stored["history"].tolist()
         except (SafetensorError, KeyError, RuntimeError) as error:
             raise ValueError(f"{path}: checkpoint cannot be used, remove it to start anew: {error}") from error
-        self.step, self.done = int(step), bool(done)
-        self.history = [dict(zip(("step", "loss", "error", "seconds"), row)) for row in rows]
+        self.step = int(step)
+        self.history = [{"step": int(step), "loss": a, "error": b, "seconds": c} for step, a, b, c in rows]
+        self.done = self._reached(target_error)
         self.started -= self.history[-1]["seconds"] if self.history else 0.0
+
+
+def _checksum(tensors: dict[str, torch.Tensor]) -> torch.Tensor:
+    """SHA-256 of names and contents, as 32 bytes."""
+    digest = hashlib.sha256()
+    for name in sorted(tensors):
+        digest.update(name.encode())
+        digest.update(tensors[name].numpy().tobytes())
+    return torch.tensor(list(digest.digest()), dtype=torch.uint8)

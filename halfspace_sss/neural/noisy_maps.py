@@ -19,6 +19,7 @@ import numpy as np
 
 from halfspace_sss.arrays import library
 from halfspace_sss.backend import array_types
+from halfspace_sss.checks import check_count
 from halfspace_sss.map_tracing import GROUP, MapTally
 from halfspace_sss.neural.backbone import U_MAX, backbone, length_scale, unwarp, warp
 from halfspace_sss.phase import eval_hg
@@ -48,10 +49,16 @@ Progress = Callable[[str, int, int], None]  # what is done, steps done, steps in
 
 @dataclass(frozen=True)
 class CellGrid:
-    """Numbers of cells of a map in u and in azimuth."""
+    """Numbers of cells of a map in u, at least 2, and in azimuth, an even number."""
 
     n_u: int = 40
     n_psi: int = 16
+
+    def __post_init__(self) -> None:
+        check_count("n_u", self.n_u, 2)
+        check_count("n_psi", self.n_psi, 2)
+        if self.n_psi % 2:
+            raise ValueError(f"n_psi must be even, got {self.n_psi}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,6 +227,19 @@ def trace_groups(
     ]
 
 
+def _load_maps(place: Path, shape: tuple[int, ...]) -> np.ndarray:
+    """Maps of a launch as an earlier run left them."""
+    try:
+        maps = np.load(place, allow_pickle=False)
+    except (ValueError, EOFError, OSError) as error:
+        raise ValueError(f"{place}: maps cannot be used, remove the file to make them anew: {error}") from error
+    if maps.shape != shape or maps.dtype != np.float32 or not np.isfinite(maps).all():
+        raise ValueError(
+            f"{place}: maps must be {shape} finite float32, got {maps.shape} {maps.dtype}; remove the file"
+        )
+    return maps
+
+
 def make_pool(
     groups: Groups,
     grid: CellGrid,
@@ -231,14 +251,18 @@ def make_pool(
 ) -> np.ndarray:
     """Cell integrals of all groups, (n, 2, 16, n_u, n_psi), kept launch by launch in `folder` so that a run can go on.
 
-    Args: as `trace_groups`; progress is called with ("data", launches done, launches in all).
+    Args: as `trace_groups`; progress is called with ("data", launches done, launches in all). The folder must be that
+        of this run, see `work_folder`.
+
+    Raises:
+        ValueError: a file of maps in the folder is damaged.
     """
     halves = np.zeros((len(groups), 2, 16, grid.n_u, grid.n_psi), np.float32)
     launches = trace_groups(groups, grid, events, seed, backend=backend)
     for k, launch in enumerate(launches):
         place = folder / f"maps-{'-'.join(map(str, seed))}-{k:05d}.npy" if folder else None
         if place and place.exists():
-            maps = np.load(place, allow_pickle=False)
+            maps = _load_maps(place, (len(launch.index), *halves.shape[1:]))
         else:
             maps = launch.trace()
             if place:

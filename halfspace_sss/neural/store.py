@@ -18,10 +18,25 @@ import numpy as np
 from halfspace_sss.checks import check_interval
 from halfspace_sss.provenance import write_atomically
 
-__all__ = ["FORMAT", "load_weights", "record_count", "record_number", "save_weights"]
+__all__ = ["FORMAT", "load_weights", "record_count", "record_number", "save_weights", "to_json"]
 
 FORMAT = 1
 LARGEST = 1e4  # no weight of a network that works is as large
+
+
+def to_json(content: dict[str, Any]) -> str:
+    """The text of a JSON file; NumPy's numbers become Python's.
+
+    Raises:
+        TypeError: something in it has no form in JSON.
+    """
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, np.generic):
+            return value.item()
+        raise TypeError(f"content must be ready for JSON, got {value!r}")
+
+    return json.dumps(content, indent=1, default=plain) + "\n"
 
 
 def _record_path(path: Path) -> Path:
@@ -51,17 +66,19 @@ def save_weights(path: str | os.PathLike, kind: str, arrays: Mapping[str, np.nda
         record: what else is known: medium, architecture, data, error, time, versions; ready for JSON.
 
     Raises:
-        ValueError: the name does not end in .safetensors.
+        ValueError: the name does not end in .safetensors, or a number is such that loading would refuse it, which is
+            what a training that diverged gives.
     """
     from safetensors.numpy import save
 
     path = Path(path)
     if path.suffix != ".safetensors":
         raise ValueError(f"path must end in .safetensors, got {str(path)!r}")
+    _check_numbers(path, arrays)
     data = save({name: np.ascontiguousarray(array) for name, array in arrays.items()})
     shapes = {name: list(array.shape) for name, array in arrays.items()}
     head = {"format": FORMAT, "kind": kind, "sha256": hashlib.sha256(data).hexdigest(), "shapes": shapes}
-    text = json.dumps(head | record | head, indent=1) + "\n"  # the head of a record that was loaded is of other weights
+    text = to_json(head | record | head)  # the head of a record that was loaded is of other weights
     write_atomically(path, data)
     write_atomically(_record_path(path), text)
     return path
@@ -117,7 +134,11 @@ def _arrays(path: Path, data: bytes, record: dict[str, Any]) -> dict[str, np.nda
     shapes = {name: list(array.shape) for name, array in arrays.items()}
     if shapes != record["shapes"]:
         raise ValueError(f"{path}: shapes must be {record['shapes']}, got {shapes}")
+    _check_numbers(path, arrays)
+    return arrays
+
+
+def _check_numbers(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
     for name, array in arrays.items():
         if array.dtype.kind != "f" or not np.all(np.abs(array) <= LARGEST):
             raise ValueError(f"{path}: {name} must be floating-point numbers of size <= {LARGEST:g}, got others")
-    return arrays

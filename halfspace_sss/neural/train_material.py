@@ -10,6 +10,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.interface import BSSRDF
 from halfspace_sss.medium import Medium
 from halfspace_sss.neural.errors import ModelError, model_error, reference_maps
@@ -19,6 +20,7 @@ from halfspace_sss.neural.noisy_maps import CellGrid, Groups, Progress, draw_dir
 from halfspace_sss.neural.pool import MapPool
 from halfspace_sss.neural.store import save_weights
 from halfspace_sss.neural.trained import weights_folder, weights_name
+from halfspace_sss.neural.work_folder import CHECKPOINT, claim
 from halfspace_sss.provenance import provenance
 
 __all__ = ["FAST", "STANDARD", "MaterialRecipe", "Subject", "TrainedChannel", "train_channel"]
@@ -43,6 +45,10 @@ class MaterialRecipe:
     events: float = 6e8
     grid: CellGrid = CellGrid(40, 16)
     how: Fit = field(default_factory=lambda: Fit(steps=5000, n_groups=16, n_queries=256, validate_every=1000))
+
+    def __post_init__(self) -> None:
+        check_count("n_groups", self.n_groups, 1)
+        check_interval("events", self.events, 1e4, 1e15)
 
 
 STANDARD = MaterialRecipe()
@@ -95,13 +101,17 @@ def train_channel(
         recipe: STANDARD, FAST or your own.
         seed: maps, batches and first numbers follow from it.
         folder: for the weights; by default where `bssrdf` finds them.
-        work: folder for maps and checkpoint of an unfinished run, which a run with the same arguments continues.
+        work: folder for maps and checkpoint of an unfinished run, which a run with the same arguments continues;
+            that of another run is refused.
         target_error: stop early at this validation error.
         backend: of the maps, "llvm" or "cuda".
         progress: called with (what, done, total).
     """
     started, place = time.monotonic(), Path(work) if work else None
     medium = medium.in_mfp()
+    if place:
+        what = {"model": subject.kind, **vars(subject)}
+        claim(place, medium=_ratios(medium), subject=what, recipe=asdict(recipe), seed=seed, backend=backend)
     groups = _groups(medium, recipe.n_groups, np.random.default_rng([seed, 0]))
     halves = make_pool(groups, recipe.grid, recipe.events, (seed, 1), place, progress, backend)
     pool = MapPool(groups, recipe.grid, halves)
@@ -112,7 +122,7 @@ def train_channel(
     data_seconds = time.monotonic() - started
     learner = subject.learner(medium, pool, seed)
     history = fit(
-        learner, pool, recipe.how, seed, checkpoint=place / "checkpoint.safetensors" if place else None,
+        learner, pool, recipe.how, seed, checkpoint=place / CHECKPOINT if place else None,
         validate=lambda: model_error(subject.model(medium, learner), reference).error,
         target_error=target_error, progress=progress,
     )  # fmt: skip
@@ -123,6 +133,10 @@ def train_channel(
     path = Path(folder or weights_folder()) / weights_name(subject.kind, medium)
     save_weights(path, subject.kind, network_arrays(learner.network()), record)
     return TrainedChannel(medium, path, error, data_seconds, fit_seconds)
+
+
+def _ratios(medium: Medium) -> dict[str, float]:
+    return {"albedo": float(medium.albedo), "g": float(medium.g), "eta": medium.eta}
 
 
 def _groups(medium: Medium, n: int, rng: np.random.Generator) -> Groups:
@@ -136,7 +150,7 @@ def _record(
     """What the JSON beside the weights tells."""
     plain = {k: v if isinstance(v, dict) else float(v) for k, v in error._asdict().items()}
     return {
-        "medium": {"albedo": float(medium.albedo), "g": float(medium.g), "eta": medium.eta},
+        "medium": _ratios(medium),
         "orders": "multiple", "seed": seed, "recipe": asdict(recipe), "validation": plain, "history": history,
         "data_seconds": data_seconds, "fit_seconds": fit_seconds, "provenance": provenance(seed=seed),
     }  # fmt: skip

@@ -11,6 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from halfspace_sss.backend import array_types
+from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.neural.fit import Fit, fit
 from halfspace_sss.neural.hypernetwork import RANGES
 from halfspace_sss.neural.learners import Hyper
@@ -18,7 +20,8 @@ from halfspace_sss.neural.media import draw_media
 from halfspace_sss.neural.noisy_maps import CellGrid, Progress, draw_directions, make_pool
 from halfspace_sss.neural.pool import MapPool
 from halfspace_sss.neural.store import save_weights
-from halfspace_sss.provenance import provenance
+from halfspace_sss.neural.work_folder import CHECKPOINT, claim
+from halfspace_sss.provenance import check_folder, provenance
 
 __all__ = ["UniversalRecipe", "train_universal"]
 
@@ -32,6 +35,11 @@ class UniversalRecipe:
     grid: CellGrid = CellGrid(40, 16)
     how: Fit = field(default_factory=lambda: Fit(steps=150_000, n_groups=32, n_queries=256))
     rank: int = 48
+
+    def __post_init__(self) -> None:
+        check_count("n_media", self.n_media, 1)
+        check_count("rank", self.rank, 1)
+        check_interval("events", self.events, 1e4, 1e15)
 
 
 def train_universal(
@@ -52,9 +60,15 @@ def train_universal(
         backend: of the maps, "llvm" or "cuda".
         progress: called with (what, done, total).
         validate: error of the learner, for the history.
+
+    Raises:
+        ValueError: an argument is out of range, or the folder holds the work of another run; nothing was done then.
     """
     recipe, folder, started = recipe or UniversalRecipe(), Path(folder), time.monotonic()
-    folder.mkdir(parents=True, exist_ok=True)
+    check_count("seed", seed, 0)
+    array_types(backend)
+    seed = int(seed)  # torch takes no other
+    claim(check_folder(folder), recipe=asdict(recipe), seed=seed, backend=backend)
     rng = np.random.default_rng([seed, 0])
     groups = draw_directions(*draw_media(recipe.n_media, rng), rng)
     halves = make_pool(groups, recipe.grid, recipe.events, (seed, 1), folder, progress, backend)
@@ -62,7 +76,7 @@ def train_universal(
     del halves
     learner = Hyper(rank=recipe.rank, seed=seed)
     check = (lambda: validate(learner)) if validate else None
-    history = fit(learner, pool, recipe.how, seed, checkpoint=folder / "checkpoint.safetensors", validate=check,
+    history = fit(learner, pool, recipe.how, seed, checkpoint=folder / CHECKPOINT, validate=check,
                   progress=progress)  # fmt: skip
     record: dict[str, Any] = {
         "width": learner.width, "depth": learner.depth, "ranges": {k: list(v) for k, v in RANGES.items()}, "seed": seed,

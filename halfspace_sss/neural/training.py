@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+from halfspace_sss.backend import array_types
 from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.medium import Medium
 from halfspace_sss.neural.noisy_maps import Progress
@@ -12,6 +13,8 @@ from halfspace_sss.neural.subjects import SUBJECTS
 from halfspace_sss.neural.symmetric import channels
 from halfspace_sss.neural.train_material import FAST, STANDARD, MaterialRecipe, TrainedChannel, train_channel
 from halfspace_sss.neural.train_universal import UniversalRecipe, train_universal
+from halfspace_sss.neural.trained import weights_folder
+from halfspace_sss.provenance import check_folder
 
 __all__ = ["FAST", "STANDARD", "MaterialRecipe", "UniversalRecipe", "train", "train_universal"]
 
@@ -38,6 +41,7 @@ def train(
         folder: for the weights; by default HALFSPACE_SSS_WEIGHTS or the user's data folder.
         work: folder for unfinished work; a killed run that is started again with it ends with the same weights.
         target_error: stop early at this validation error.
+        backend: of the maps, "llvm" or "cuda".
         progress: called with (what, done, total).
 
     Raises:
@@ -45,13 +49,19 @@ def train(
     """
     if model not in SUBJECTS:
         raise ValueError(f"model must be one of {', '.join(SUBJECTS)}, got {model!r}")
+    if not isinstance(recipe, MaterialRecipe):
+        raise ValueError(f"recipe must be a MaterialRecipe, got {recipe!r}")
     check_count("seed", seed, 0)
     if target_error is not None:
         check_interval("target_error", target_error, 1e-4, 1.0)
     media = channels(_medium(material))
+    for place in (folder or weights_folder(), work):
+        if place is not None:
+            check_folder(place)
+    array_types(backend)
     return [
         train_channel(
-            m, SUBJECTS[model], recipe, seed, folder=folder, work=Path(work) / f"channel-{k}" if work else None,
+            m, SUBJECTS[model], recipe, int(seed), folder=folder, work=Path(work) / f"channel-{k}" if work else None,
             target_error=target_error, backend=backend, progress=progress,
         )
         for k, m in enumerate(media)

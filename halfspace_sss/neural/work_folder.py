@@ -1,0 +1,61 @@
+"""A folder of unfinished work belongs to one run: it says to which, and another run is refused."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import halfspace_sss
+from halfspace_sss.neural.store import to_json
+from halfspace_sss.provenance import write_atomically
+
+__all__ = ["CHECKPOINT", "RUN", "claim"]
+
+RUN, CHECKPOINT = "run.json", "checkpoint.safetensors"
+
+
+def claim(folder: Path, **run: Any) -> None:
+    """Write in `folder` which run it belongs to; where that is written already, check that it is the same.
+
+    Args:
+        folder: for maps and checkpoint; made if it is not there.
+        run: all that the result follows from (medium, recipe, seed, ...), ready for JSON; the version is added.
+
+    Raises:
+        ValueError: the folder holds the work of another run, or work of which nothing is known.
+    """
+    run = {"version": halfspace_sss.__version__, **run}
+    place = folder / RUN
+    if not place.exists():
+        left = sorted(path.name for pattern in ("maps-*.npy", CHECKPOINT) for path in folder.glob(pattern))
+        if left:
+            raise ValueError(f"{folder}: work must be that of a known run, got {left[0]} without {RUN}; remove it")
+        write_atomically(place, to_json(run))
+        return
+    wanted, found = _flat(json.loads(to_json(run))), _flat(_read(place))
+    for key in sorted(wanted.keys() | found.keys()):
+        if wanted.get(key) != found.get(key):
+            asked, stands = wanted.get(key), found.get(key)
+            raise ValueError(
+                f"{place}: {key} must be {asked!r} to go on with this work, got {stands!r}; name another folder"
+            )
+
+
+def _read(place: Path) -> dict[str, Any]:
+    try:
+        run = json.loads(place.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise ValueError(f"{place}: must be a readable JSON file, remove the folder to start anew: {error}") from error
+    if not isinstance(run, dict):
+        raise ValueError(f"{place}: must be a JSON object, remove the folder to start anew, got {type(run).__name__}")
+    return run
+
+
+def _flat(tree: dict[str, Any]) -> dict[str, Any]:
+    """Leaves by their path, {"recipe.how.steps": 100}."""
+    leaves = {}
+    for key, value in tree.items():
+        inner = _flat(value) if isinstance(value, dict) else None
+        leaves |= {f"{key}.{k}": v for k, v in inner.items()} if inner else {key: value}
+    return leaves
