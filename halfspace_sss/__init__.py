@@ -27,7 +27,7 @@ from halfspace_sss.backend import prefer_bundled_llvm
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from halfspace_sss import materials, measure
+    from halfspace_sss import materials, measure, neural
     from halfspace_sss.interface import BSSRDF, bssrdf, models, register_model
     from halfspace_sss.maps import make_maps
     from halfspace_sss.medium import Medium
@@ -46,7 +46,7 @@ _HOME = {
     "register_model": "interface",
     "trace": "tracer",
 }
-_SUBMODULES = ("materials", "measure")
+_SUBMODULES = ("materials", "measure", "neural")
 __all__ = [
     "BSSRDF",
     "Medium",
@@ -56,6 +56,7 @@ __all__ = [
     "materials",
     "measure",
     "models",
+    "neural",
     "register_model",
     "trace",
 ]

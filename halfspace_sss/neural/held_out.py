@@ -100,5 +100,5 @@ def losses(table: pandas.DataFrame, name: str = "neural") -> pandas.DataFrame:
     analytic = table[~table["model"].str.startswith("neural")]
     best = analytic.loc[analytic.groupby("medium")["error"].idxmin()].set_index("medium")
     mine = table[table["model"] == name].set_index("medium")
-    both = mine.join(best[["model", "error"]], rsuffix="_best")
+    both = mine.join(best[["model", "error"]].add_suffix("_best"))
     return both[both["error_best"] < both["error"]].reset_index()
