@@ -6,7 +6,6 @@ import math
 import numbers
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
@@ -47,7 +46,6 @@ class Material:
         dilutable: whether it mixes with water, so that `diluted` makes sense.
         published_dilution: volume fraction at which it was measured, None if not known or not diluted.
         dilution: volume fraction that `medium` stands for, 1 for the pure material.
-        weights: files of trained weights by model name, for the models that need them.
 
     Raises:
         ValueError: an argument is of the wrong kind or out of range, or channels do not match the medium.
@@ -65,7 +63,6 @@ class Material:
     dilutable: bool = False
     published_dilution: float | None = None
     dilution: float = 1.0
-    weights: Mapping[str, Path] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
         for name in ("name", "set", "source"):
@@ -84,11 +81,10 @@ class Material:
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, tuple(getattr(self, name)))
         # the registry hands out one object to all callers, so none of them may change it
-        for name in ("sources", "weights"):
-            object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
+        object.__setattr__(self, "sources", MappingProxyType(dict(self.sources)))
 
     def __getstate__(self) -> dict:
-        return {**self.__dict__, "sources": dict(self.sources), "weights": dict(self.weights)}
+        return {**self.__dict__, "sources": dict(self.sources)}
 
     def diluted(self, fraction: float) -> Material:
         """The material mixed with water to the volume fraction `fraction` in (0, 1] of what it is now.
