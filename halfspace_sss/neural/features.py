@@ -14,9 +14,10 @@ from halfspace_sss.neural.backbone import U_MAX, warp
 
 __all__ = ["N_FEATURES", "N_MEDIUM", "medium_features", "symmetric_features", "travel"]
 
-N_FEATURES, N_MEDIUM = 11, 9
+N_FEATURES, N_MEDIUM = 13, 9
 R_SMALLEST = 0.01  # of min(L, mfp): below it the learnt factor stays as it is there
 DEPTHS = (0.25, 1.0, 4.0)  # mean free paths along the refracted rays; L is the fourth
+RIDGE = 1e-3
 SOFT = 1e-4  # share of the squared depth that keeps the logarithm of a distance finite
 Ray = tuple[Any, Any, Any]
 
@@ -52,7 +53,32 @@ def symmetric_features(lib: Any, r: Any, incoming: Ray, outgoing: Ray, L: Any) -
         along = r - s * x
         s2 = s * s
         gaps.append(0.5 * lib.log((along * along + s2 * (side + SOFT)) / (r * r + s2)))
-    return [0.25 * u, x, mu_i + mu_o - 1, d * d, mu * mu, d * mu, y_i * y_o, *gaps]
+    return [
+        0.25 * u,
+        x,
+        mu_i + mu_o - 1,
+        d * d,
+        mu * mu,
+        d * mu,
+        y_i * y_o,
+        *gaps,
+        *_meeting(lib, r, incoming, outgoing),
+    ]
+
+
+def _meeting(lib: Any, r: Any, incoming: Ray, outgoing: Ray) -> tuple[Any, Any]:
+    """How closely the refracted rays pass each other, and how far light travels until there.
+
+    At depth z they are |r - z v| apart, v = d_i/mu_i' + d_o/mu_o' in the plane; the least is at
+    z = r v_x / (v² + 0.05). Returns log(|r - z v| / r) and p / (1 + p) of the path p = z (1/mu_i' + 1/mu_o').
+    """
+    (x_i, y_i, mu_i), (x_o, y_o, mu_o) = incoming, outgoing
+    a, b = 1 / lib.maximum(mu_i, 1e-3), 1 / lib.maximum(mu_o, 1e-3)
+    v_x, v_y = a * x_i + b * x_o, a * y_i + b * y_o
+    z = lib.maximum(v_x, 0.0) / (v_x * v_x + v_y * v_y + 0.05)  # over r
+    across, along = z * v_y, 1 - z * v_x
+    path = r * z * (a + b)
+    return 0.5 * lib.log(along * along + across * across + RIDGE), path / (1 + path)
 
 
 def medium_features(lib: Any, albedo: Any, g: Any, eta: Any, L: Any) -> list[Any]:

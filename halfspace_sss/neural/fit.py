@@ -34,7 +34,7 @@ class Fit:
 
     Args:
         steps: of the optimiser, each on one batch.
-        n_groups, n_queries: groups of a batch, and queries of each group.
+        n_groups, n_queries: groups of a batch, and cells of each group, of which two points are asked.
         rate: largest learning rate; it rises over the first 200 steps and falls by a cosine.
         checkpoint_every: seconds between checkpoints.
         validate_every: steps between two calls of the validation.
@@ -42,7 +42,7 @@ class Fit:
 
     steps: int
     n_groups: int = 32
-    n_queries: int = 256
+    n_queries: int = 128
     rate: float = 4e-3
     checkpoint_every: float = 20.0
     validate_every: int = 2000

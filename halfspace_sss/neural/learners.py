@@ -14,9 +14,27 @@ from halfspace_sss.neural.features import N_FEATURES, N_MEDIUM
 from halfspace_sss.neural.network import Network, layer_shapes
 from halfspace_sss.neural.pool import Batch
 
-__all__ = ["Hyper", "Small", "apply_networks", "initial_numbers", "relative_loss"]
+__all__ = ["Hyper", "Small", "apply_networks", "cell_loss", "initial_numbers", "relative_loss"]
 
 LOG_RANGE = 30.0
+
+
+def cell_loss(p: torch.Tensor, y: torch.Tensor, weight: Callable[[torch.Tensor], torch.Tensor]) -> torch.Tensor:
+    """A loss whose gradient is h(p_1) ∇p_1 (p_2 - y) + h(p_2) ∇p_2 (p_1 - y) for independent points of a cell.
+
+    y is the mean over the cell: the expectation of the gradient is that of its squared error, E[h ∇p] (E[p] - y),
+    whatever the weight h. The squared error of single points would add the variance within the cell and so flatten
+    what is learnt.
+
+    Args:
+        p: (B, 2 S), the first points of all cells and then the second ones.
+        y: (B, S).
+        weight: h of p without gradient, for points (B, 2 S).
+    """
+    p_1, p_2 = p.detach().chunk(2, dim=1)
+    slope = weight(p.detach()) * torch.cat((p_2 - y, p_1 - y), dim=1)
+    error = (slope.detach() * (p - p.detach())).mean()
+    return error + ((p_1 - y) * (p_2 - y) * weight(p.detach()).chunk(2, dim=1)[0]).mean().detach()
 
 
 def relative_loss(p: torch.Tensor, batch: Batch) -> torch.Tensor:
@@ -25,8 +43,8 @@ def relative_loss(p: torch.Tensor, batch: Batch) -> torch.Tensor:
     p hit is the variance of y where few scores have met a cell, so that those cells count by their noise and the others
     by their relative error.
     """
-    q = p.detach()
-    return ((p - batch.y) ** 2 / (q * (q + batch.hit) + 1e-20)).mean()
+    hit = torch.cat((batch.hit, batch.hit), dim=1)
+    return cell_loss(p, batch.y, lambda q: 1 / (q * (q + hit) + 1e-20))
 
 
 def initial_numbers(shapes: list[tuple[int, int]], generator: torch.Generator) -> torch.Tensor:
@@ -75,7 +93,7 @@ class Small(nn.Module):
     def loss(self, batch: Batch) -> torch.Tensor:
         features = batch.features().flatten(0, 1)[None]
         p = torch.exp(apply_networks(features, self.numbers[None], self.shapes).clamp(-LOG_RANGE, LOG_RANGE))
-        return relative_loss(p.view_as(batch.y), batch)
+        return relative_loss(p.view_as(batch.u), batch)
 
     def network(self) -> Network:
         return Network.from_vector(self.numbers.detach().numpy(), self.shapes)

@@ -54,7 +54,10 @@ class PaperLearner(nn.Module):
 
     def loss(self, batch: Batch) -> torch.Tensor:
         S = apply_networks(self.inputs(batch).flatten(0, 1)[None], self.numbers[None], self.shapes, torch.relu)
-        return ((S.view_as(batch.y) - self.S_over_y(batch) * batch.y) ** 2).mean()
+        S_1, S_2 = S.view_as(batch.u).chunk(2, dim=1)
+        scale_1, scale_2 = self.S_over_y(batch).chunk(2, dim=1)
+        # as `cell_loss` of S / scale with the weight scale_1 scale_2, but scale may be 0
+        return ((S_1 - scale_1 * batch.y) * (S_2 - scale_2 * batch.y)).mean()
 
     def network(self) -> Network:
         return Network.from_vector(self.numbers.detach().numpy(), self.shapes, RELU)

@@ -17,15 +17,16 @@ __all__ = ["Batch", "MapPool"]
 
 ENERGY_SHARE = 0.5  # of the queries of a batch follow the energy over u, the others are uniform in u
 TINY = 1e-30
+FLAT, STEEP = 1e-3, 8.0  # bounds of a slope
 
 
 @dataclass(frozen=True)
 class Batch:
-    """Queries (B, S) of B groups: y = G/B(r) as traced, its noise, and what the learners are given."""
+    """Cells (B, S) of B groups: y = G/B(r) as traced and its noise; and queries (B, 2 S), two points of each cell."""
 
     y: torch.Tensor
     hit: torch.Tensor  # value that one score adds to y
-    u: torch.Tensor
+    u: torch.Tensor  # first the first points of all cells, then the second ones, as in what follows
     r: torch.Tensor
     psi: torch.Tensor  # azimuth of x_o - x_i from the forward direction
     mu_i: torch.Tensor  # cosines inside
@@ -36,7 +37,7 @@ class Batch:
     medium: torch.Tensor  # features of the medium (B, N_MEDIUM)
 
     def features(self) -> torch.Tensor:
-        """Symmetric features (B, S, N_FEATURES)."""
+        """Symmetric features (B, 2 S, N_FEATURES)."""
         incoming, outgoing = _ray(self.mu_i, -self.psi), _ray(self.mu_o, self.delta_phi - self.psi)
         lib = _torch_library()
         return torch.stack(torch.broadcast_tensors(*symmetric_features(lib, self.r, incoming, outgoing, self.L)), -1)
@@ -73,6 +74,8 @@ class MapPool:
         energy = _smooth(energy) / np.maximum(energy.sum(axis=1, keepdims=True), TINY)
         share = ENERGY_SHARE * energy + (1 - ENERGY_SHARE) / grid.n_u
         self.cdf = _float(np.cumsum(share / share.sum(axis=1, keepdims=True), axis=1))
+        slope = np.gradient(np.log(mass), axis=1)  # of the weight of a point within its cell, over the cell
+        self.slope = _float(np.where(np.abs(slope) < FLAT, FLAT, np.clip(slope, -STEEP, STEEP)))
         edges = radial_edges(groups, grid)
         self.low, self.step = _float(edges[:, :1]), _float(edges[:, 1:2] - edges[:, :1])
         self.mu_i, self.mu_o = _inside(groups.mu_i[:, None], groups), _inside(groups.mu_o, groups)
@@ -83,24 +86,32 @@ class MapPool:
         self.medium = torch.stack(medium_features(_torch_library(), albedo, g, eta, L), -1)
 
     def batch(self, n_groups: int, n_queries: int, generator: torch.Generator) -> Batch:
-        """Random cells, and a random point in each: the target is the mean of the cell."""
+        """Random cells, and two points in each, with the weight B r dr/du that the mean over the cell gives them.
+
+        The weight is taken as exponential in u within a cell. See `learners.cell_loss` for why two.
+        """
         n_psi = self.grid.n_psi
         shape = (n_groups, n_queries)
 
-        def uniform() -> torch.Tensor:
-            return torch.rand(shape, generator=generator)
+        def uniform(points: int = 1) -> torch.Tensor:
+            return torch.rand((n_groups, points * n_queries), generator=generator)
 
         j = torch.randint(len(self.groups), (n_groups,), generator=generator)
         k = torch.randint(self.mu_o.shape[1], shape, generator=generator)
         i = torch.searchsorted(self.cdf[j].contiguous(), uniform()).clamp_max(self.grid.n_u - 1)
         p = torch.randint(n_psi, shape, generator=generator)
         y = self.y.view(-1)[((j[:, None] * self.mu_o.shape[1] + k) * self.grid.n_u + i) * n_psi + p]
-        u = self.low[j] + self.step[j] * (i + uniform())
-        psi = (2 * math.pi / n_psi) * (p + uniform()) - math.pi
-        L, row = self.L[j], j[:, None]
+        row = j[:, None]
+        slope = self.slope[row, i]
+        slopes = torch.cat((slope, slope), dim=1)
+        inner = torch.log1p(uniform(2) * torch.expm1(slopes)) / slopes
+        u = self.low[j] + self.step[j] * (torch.cat((i, i), dim=1) + inner)
+        psi = (2 * math.pi / n_psi) * (torch.cat((p, p), dim=1) + uniform(2)) - math.pi
+        twice = torch.cat((k, k), dim=1)
+        L = self.L[j]
         r = L * unwarp(_torch_library(), u)
         return Batch(
-            y, self.hit[row, i], u, r, psi, self.mu_i[j], self.mu_o[row, k], self.delta_phi[row, k], L, j,
+            y, self.hit[row, i], u, r, psi, self.mu_i[j], self.mu_o[row, twice], self.delta_phi[row, twice], L, j,
             self.medium[j],
         )  # fmt: skip
 

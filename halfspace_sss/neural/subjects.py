@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
-
-import numpy as np
 
 from halfspace_sss.medium import Medium
 from halfspace_sss.neural import material_model, paper_model
@@ -81,8 +80,8 @@ class PaperSubject:
     def learner(self, medium: Medium, pool: MapPool, seed: int) -> PaperLearner:
         probe = PaperLearner(medium, 1.0, width=1)
         batch = pool.batch(64, 1024, _generator())
-        S = probe.S_over_y(batch) * batch.y
-        return PaperLearner(medium, max(float(np.sqrt((S**2).mean())), 1e-20), seed=seed)
+        S = probe.S_over_y(batch)[:, : batch.y.shape[1]] * batch.y
+        return PaperLearner(medium, max(math.sqrt(float((S**2).mean())), 1e-20), seed=seed)
 
     def model(self, medium: Medium, learner: PaperLearner) -> PaperTrial:
         return PaperTrial(medium, learner.network(), learner.scale)

@@ -31,9 +31,9 @@ class UniversalRecipe:
     """Size of the training: media (each with one direction of incidence and 16 of observation), events, fit."""
 
     n_media: int = 12288
-    events: float = 3e9
+    events: float = 4e9
     grid: CellGrid = CellGrid(40, 16)
-    how: Fit = field(default_factory=lambda: Fit(steps=150_000, n_groups=32, n_queries=256))
+    how: Fit = field(default_factory=lambda: Fit(steps=100_000, n_groups=32, n_queries=128))
     rank: int = 48
 
     def __post_init__(self) -> None:

@@ -1,0 +1,99 @@
+"""The universal model with the medium as arrays: gradients with respect to it, for inverse problems."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from halfspace_sss.arrays import broadcast_query, library
+from halfspace_sss.fresnel import F_t
+from halfspace_sss.interface import Query
+from halfspace_sss.neural.backbone import backbone_shape, length_scale
+from halfspace_sss.neural.features import medium_features, symmetric_features, travel
+from halfspace_sss.neural.hypernetwork import Hypernetwork
+from halfspace_sss.neural.universal import load_hypernetwork, shipped_weights
+
+__all__ = ["neural_S"]
+
+
+def neural_S(sigma_t: Any, albedo: Any, g: Any, eta: Any, r: Any, mu_i: Any, phi_i: Any, mu_o: Any, phi_o: Any) -> Any:
+    """S of order >= 2 of the model `neural` in 1/(mm² sr), differentiable in all arguments, torch or Dr.Jit.
+
+    Args:
+        sigma_t: extinction, 1/mm; one number as a torch tensor or Dr.Jit array, as the next three.
+        albedo, g, eta: of the medium, inside the ranges of `neural` (not checked: they may be traced).
+        r, mu_i, phi_i, mu_o, phi_o: query as in `BSSRDF.eval`, arrays of the same library.
+
+    Raises:
+        ValueError: the arrays are of another library, or of several.
+    """
+    lib = library(sigma_t, albedo, g, eta, r, mu_i, phi_i, mu_o, phi_o)
+    if lib is library(0.0):
+        raise ValueError(
+            "sigma_t must be a torch tensor or Dr.Jit array, got numbers; use bssrdf('neural', medium).eval"
+        )
+    _, (r, mu_i, phi_i, mu_o, phi_o) = broadcast_query(r, mu_i, phi_i, mu_o, phi_o)
+    hyper = load_hypernetwork(shipped_weights())
+    L = length_scale(albedo, g)
+    c = medium_features(lib, albedo, g, eta, L)
+    q = Query(lib, sigma_t * r, mu_i, phi_i, mu_o, phi_o, eta)
+    features = symmetric_features(lib, q.r, *travel(q), L)
+    evaluate = _torch_network if hasattr(lib, "torch") else _drjit_network
+    factor = lib.exp(evaluate(hyper, c, features))
+    G = albedo * albedo * (backbone_shape(q.r, albedo, g, eta) * factor)
+    return sigma_t * sigma_t * F_t(mu_i, eta) * F_t(mu_o, eta) * G
+
+
+def _torch_network(hyper: Hypernetwork, c: list, features: list) -> Any:
+    import torch
+
+    x = torch.stack(torch.broadcast_tensors(*features), dim=-1)
+
+    def tensor(array: np.ndarray) -> torch.Tensor:
+        return torch.from_numpy(np.asarray(array, np.float64)).to(x)
+
+    h = torch.stack([torch.as_tensor(v).to(x).reshape(()) for v in c])
+    for k, (W, b) in enumerate(hyper.medium_layers):
+        h = h @ tensor(W) + tensor(b)
+        if k < len(hyper.medium_layers) - 1:
+            h = torch.nn.functional.silu(h)
+    numbers, at = tensor(hyper.base) + h @ tensor(hyper.basis), 0
+    for k, (i, j) in enumerate(hyper.shapes):
+        x = x @ numbers[at : at + i * j].reshape(i, j) + numbers[at + i * j : at + i * j + j]
+        at += i * j + j
+        if k < len(hyper.shapes) - 1:
+            x = torch.nn.functional.silu(x)
+    return x[..., 0]
+
+
+def _drjit_network(hyper: Hypernetwork, c: list, features: list) -> Any:
+    import drjit as dr
+    from drjit import nn
+
+    kind = type(sum(features[1:], features[0]))
+    tensor = dr.tensor_t(kind)
+
+    def of(array: np.ndarray) -> Any:
+        return tensor(np.ascontiguousarray(array, np.float32))
+
+    h = tensor(dr.concat([kind(v) for v in c]), (1, len(c)))
+    for k, (W, b) in enumerate(hyper.medium_layers):
+        h = h @ of(W) + of(b[None])
+        if k < len(hyper.medium_layers) - 1:
+            h = h / (1 + dr.exp(-h))
+    numbers, at, parts = (of(hyper.base[None]) + h @ of(hyper.basis)).array, 0, []
+    for i, j in hyper.shapes:
+        transposed = (np.arange(i * j).reshape(i, j).T + at).ravel()
+        index = dr.uint32_array_t(kind)
+        parts.append(tensor(dr.gather(kind, numbers, index(transposed)), (j, i)))
+        parts.append(dr.gather(kind, numbers, index(np.arange(j) + at + i * j)))
+        at += i * j + j
+    views = nn.pack(*parts, layout="training")[-len(parts) :]
+    zero = dr.zeros(kind, max(dr.width(f) for f in features))  # cooperative vectors do not sum over what they broadcast
+    x = nn.CoopVec(*(f + zero for f in features))
+    for k in range(len(hyper.shapes)):
+        x = nn.matvec(views[2 * k], x, views[2 * k + 1])
+        if k < len(hyper.shapes) - 1:
+            x = x * (0.5 + 0.5 * dr.tanh(0.5 * x))
+    return kind(list(x)[0])
