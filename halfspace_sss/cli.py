@@ -16,8 +16,10 @@ import halfspace_sss
 from halfspace_sss.backend import BackendError
 from halfspace_sss.cli_bench import bench_command
 from halfspace_sss.cli_curves import curves_command
+from halfspace_sss.cli_errors import errors_command
 from halfspace_sss.cli_lists import materials_command, models_command
 from halfspace_sss.cli_maps import maps_command
+from halfspace_sss.cli_train import train_command
 from halfspace_sss.cli_validate import validate_command
 from halfspace_sss.extensions import commands
 
@@ -26,9 +28,11 @@ __all__ = ["app", "main"]
 _OWN = {
     "bench": bench_command,
     "curves": curves_command,
+    "errors": errors_command,
     "maps": maps_command,
     "materials": materials_command,
     "models": models_command,
+    "train": train_command,
     "validate": validate_command,
 }
 
