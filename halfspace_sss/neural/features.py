@@ -17,7 +17,7 @@ __all__ = ["N_FEATURES", "N_MEDIUM", "medium_features", "symmetric_features", "t
 N_FEATURES, N_MEDIUM = 13, 9
 R_SMALLEST = 0.01  # of min(L, mfp): below it the learnt factor stays as it is there
 DEPTHS = (0.25, 1.0, 4.0)  # mean free paths along the refracted rays; L is the fourth
-RIDGE = 1e-3
+RIDGE, ROUNDING = 1e-3, 1e-5
 SOFT = 1e-4  # share of the squared depth that keeps the logarithm of a distance finite
 Ray = tuple[Any, Any, Any]
 
@@ -75,7 +75,8 @@ def _meeting(lib: Any, r: Any, incoming: Ray, outgoing: Ray) -> tuple[Any, Any]:
     (x_i, y_i, mu_i), (x_o, y_o, mu_o) = incoming, outgoing
     a, b = 1 / lib.maximum(mu_i, 1e-3), 1 / lib.maximum(mu_o, 1e-3)
     v_x, v_y = a * x_i + b * x_o, a * y_i + b * y_o
-    z = lib.maximum(v_x, 0.0) / (v_x * v_x + v_y * v_y + 0.05)  # over r
+    forward = lib.maximum(v_x - ROUNDING * (a + b), 0.0)  # grazing rays that cancel leave no noise of rounding
+    z = forward / (v_x * v_x + v_y * v_y + 0.05)  # over r
     across, along = z * v_y, 1 - z * v_x
     path = r * z * (a + b)
     return 0.5 * lib.log(along * along + across * across + RIDGE), path / (1 + path)
