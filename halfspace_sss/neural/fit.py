@@ -79,7 +79,8 @@ def fit(
     run = _Run(learner, how, seed)
     if checkpoint and checkpoint.exists():
         run.load(checkpoint, target_error)
-    saved = time.monotonic()
+    saved, threads = time.monotonic(), torch.get_num_threads()
+    torch.set_num_threads(1)  # batches of this size lose by being shared, and sums keep their order
     while run.step < how.steps and not run.done:
         run.advance(pool)
         if validate and (run.step % how.validate_every == 0 or run.step == how.steps):
@@ -89,6 +90,7 @@ def fit(
         if checkpoint and (time.monotonic() - saved > how.checkpoint_every or run.done):
             run.save(checkpoint)
             saved = time.monotonic()
+    torch.set_num_threads(threads)
     return run.history
 
 

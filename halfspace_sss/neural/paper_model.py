@@ -14,7 +14,7 @@ from halfspace_sss.neural.store import load_weights, record_number
 from halfspace_sss.neural.symmetric import channel_queries, channels
 from halfspace_sss.neural.trained import find_weights
 
-__all__ = ["KIND", "N_INPUTS", "NeuralPaper", "paper_inputs"]
+__all__ = ["KIND", "N_INPUTS", "NeuralPaper", "paper_inputs", "query_inputs"]
 
 KIND, N_INPUTS = "neural_paper", 6
 RADIUS = 4.0  # L; positions are divided by it
@@ -32,6 +32,14 @@ def paper_inputs(lib: Any, r: Any, line: Any, w_i: tuple[Any, Any], w_o: tuple[A
     rho = r / (RADIUS * L)
     parts = [f(azimuth) * sine for sine, azimuth in (w_i, w_o) for f in (lib.cos, lib.sin)]
     return [rho * lib.cos(line), rho * lib.sin(line), *parts]
+
+
+def query_inputs(q: Query, L: Any) -> list[Any]:
+    """The six numbers of a query, in the frame in which w_i has azimuth 0, at most 12 L away."""
+    lib = q.lib
+    sines = [lib.sqrt(lib.maximum((1 - mu) * (1 + mu), 0.0)) for mu in (q.mu_i, q.mu_o)]
+    w_i, w_o = (sines[0], 0 * q.phi_i), (sines[1], q.phi_o - q.phi_i)
+    return paper_inputs(lib, lib.minimum(q.r, U_MAX * L), -q.phi_i, w_i, w_o, L)
 
 
 class NeuralPaper(BSSRDF):
@@ -71,9 +79,6 @@ class NeuralPaper(BSSRDF):
     def _one(self, query: Query, m: Medium, network: Network, scale: float) -> Any:
         q = query.in_float64()  # the raw output crosses zero, where float32 has no digits
         lib, L = q.lib, length_scale(m.albedo, m.g)
-        sines = [lib.sqrt(lib.maximum((1 - mu) * (1 + mu), 0.0)) for mu in (q.mu_i, q.mu_o)]
-        w_i, w_o = (sines[0], 0 * q.phi_i), (sines[1], q.phi_o - q.phi_i)
-        r = lib.minimum(q.r, U_MAX * L)
-        S = scale * network(paper_inputs(lib, r, -q.phi_i, w_i, w_o, L))
+        S = scale * network(query_inputs(q, L))
         G = S / lib.maximum(F_t(q.mu_i, m.eta) * F_t(q.mu_o, m.eta), T_SMALLEST)
         return lib.like(lib.where(q.r > U_MAX * L, 0 * G, G), query.r)

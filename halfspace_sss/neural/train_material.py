@@ -42,9 +42,9 @@ class MaterialRecipe:
     """
 
     n_groups: int = 256
-    events: float = 6e8
+    events: float = 4e8
     grid: CellGrid = CellGrid(40, 16)
-    how: Fit = field(default_factory=lambda: Fit(steps=5000, n_groups=16, n_queries=128, validate_every=1000))
+    how: Fit = field(default_factory=lambda: Fit(steps=2500, n_groups=16, n_queries=128, validate_every=1250))
 
     def __post_init__(self) -> None:
         check_count("n_groups", self.n_groups, 1)
@@ -52,7 +52,7 @@ class MaterialRecipe:
 
 
 STANDARD = MaterialRecipe()
-FAST = MaterialRecipe(128, 1e8, how=Fit(steps=1200, n_groups=16, n_queries=128, validate_every=600))
+FAST = MaterialRecipe(128, 6e7, how=Fit(steps=800, n_groups=16, n_queries=128, validate_every=800))
 
 
 @dataclass(frozen=True)
