@@ -176,11 +176,12 @@ def summary(table: pandas.DataFrame) -> pandas.DataFrame:
 
 def caption(seconds: float) -> str:
     """What the table says, and what it does not."""
+    threads = torch.get_num_threads()
     return (
         f"Each row changes one thing against the row above it. All are trained on the same maps for {seconds:g} s on "
-        f"{torch.get_num_threads()} thread(s) and asked for unseen pairs of directions; error and bias: energy-weighted, "
-        f"order >= 2, blocks of {BLOCK} x {BLOCK} cells, noise removed; ± is the standard deviation over seeds. The first "
-        "row is the paper's set-up (inputs, size, loss) at this budget: the authors trained 2118 s on an RTX 4090, so it "
-        "is not their converged error and says nothing against their figures; what it says is how much each change "
+        f"{threads} thread(s) and asked for unseen pairs of directions; error and bias: energy-weighted, order >= 2, "
+        f"blocks of {BLOCK} x {BLOCK} cells, noise removed; ± is the standard deviation over seeds. The first row is "
+        "the paper's set-up (inputs, size, loss) at this budget: the authors trained 2118 s on an RTX 4090, so it is "
+        "not their converged error and says nothing against their figures; what it says is how much each change "
         "brings where time is short. The training of the universal network, done once for all media, is not counted."
     )
