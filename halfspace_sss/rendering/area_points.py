@@ -1,0 +1,59 @@
+"""Points uniform over the area of an object, with its geometric and its shading normal."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+__all__ = ["AreaPoints", "Point"]
+
+
+class Point(NamedTuple):
+    """Position, geometric normal, shading normal (as the shape has them) and face of a point."""
+
+    p: Any
+    n: Any
+    n_shading: Any
+    prim_index: Any
+
+
+class AreaPoints:
+    """Uniform points of a shape; for a mesh by its faces, as Mitsuba gives one of the two normals only.
+
+    Args:
+        shape: the Mitsuba shape.
+    """
+
+    def __init__(self, shape: Any) -> None:
+        import mitsuba as mi
+
+        self.shape = shape
+        self.faces = None
+        parameters = mi.traverse(shape)
+        if "faces" in parameters:
+            faces = np.array(parameters["faces"]).reshape(-1, 3)
+            a, b, c = np.array(parameters["vertex_positions"]).reshape(-1, 3)[faces].transpose(1, 0, 2)
+            areas = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+            self.faces = mi.DiscreteDistribution(mi.Float(areas.astype(np.float32)))
+
+    def sample(self, u_face: Any, u: Any, active: Any) -> Point:
+        """A point for uniform numbers u_face and the pair u."""
+        import drjit as dr
+        import mitsuba as mi
+
+        if self.faces is None:
+            ps = self.shape.sample_position(0.0, u, active)
+            return Point(ps.p, ps.n, ps.n, mi.UInt32(0))
+        face = self.faces.sample(u_face, active)
+        index = self.shape.face_indices(face, active)
+        corners = [self.shape.vertex_position(i, active) for i in (index.x, index.y, index.z)]
+        b = mi.warp.square_to_uniform_triangle(u)
+        weights = (1 - b.x - b.y, b.x, b.y)
+        n = dr.normalize(dr.cross(corners[1] - corners[0], corners[2] - corners[0]))
+        n_shading = n
+        if self.shape.has_vertex_normals():
+            normals = [self.shape.vertex_normal(i, active) for i in (index.x, index.y, index.z)]
+            n_shading = dr.normalize(sum(w * v for w, v in zip(weights, normals)))
+        p = sum(w * c for w, c in zip(weights, corners))
+        return Point(mi.Point3f(p), mi.Normal3f(n), mi.Normal3f(n_shading), face)

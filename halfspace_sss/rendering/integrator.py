@@ -1,0 +1,41 @@
+"""The Mitsuba integrator `bssrdf`: paths that enter translucent objects through the BSSRDF of the half-space."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from halfspace_sss.rendering.body import make_bodies
+from halfspace_sss.rendering.paths import trace_paths
+from halfspace_sss.rendering.settings import read_settings
+
+__all__ = ["integrator_class"]
+
+
+def integrator_class() -> type:
+    """The class of the integrator for the current variant of Mitsuba."""
+    import mitsuba as mi
+
+    class BSSRDFIntegrator(mi.SamplingIntegrator):
+        """Renders scenes with `translucent` objects; parameters as in `Settings`."""
+
+        def __init__(self, props: Any) -> None:
+            mi.SamplingIntegrator.__init__(self, props)
+            self.settings = read_settings(props)
+            self._prepared: tuple[Any, Any] = (None, None)
+
+        def bodies(self, scene: Any) -> list[Any]:
+            """The translucent objects of a scene, made ready once."""
+            if self._prepared[0] is not scene:
+                self._prepared = (scene, make_bodies(scene, self.settings))
+            return self._prepared[1]
+
+        def sample(
+            self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Any = True
+        ) -> tuple[Any, Any, list]:
+            L, seen = trace_paths(scene, self.bodies(scene), self.settings, sampler, ray, active)
+            return L, seen, []
+
+        def to_string(self) -> str:
+            return f"BSSRDFIntegrator[{self.settings}]"
+
+    return BSSRDFIntegrator

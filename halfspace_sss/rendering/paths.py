@@ -1,0 +1,196 @@
+"""The path loop of the integrator: surfaces by their BSDFs, and inside the translucent ones by the BSSRDF."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from halfspace_sss.rendering.body import Body
+from halfspace_sss.rendering.plane import Exit, local_frame, plane_query
+from halfspace_sss.rendering.settings import Settings
+
+__all__ = ["trace_paths"]
+
+LEAST_REFLECTION = 0.05  # probability of reflection at a surface that reflects; Fresnel's is 0.04 face on
+
+
+class Onward(NamedTuple):
+    """Where a path goes on after a vertex: the point it leaves from, the direction, and what that is worth."""
+
+    p: Any
+    n: Any
+    d: Any
+    weight: Any  # spectrum
+    pdf: Any
+    delta: Any
+    direct: Any  # spectrum: light that was sampled at the vertex
+
+
+def trace_paths(scene: Any, bodies: list[Body], settings: Settings, sampler: Any, ray: Any, active: Any) -> tuple:
+    """Radiance along a ray, and whether it hits anything.
+
+    One loop over the vertices. At each, emitters are sampled and the direction goes on by the surface (balance
+    heuristic between the two). At a translucent surface one of reflection, multiple and single scattering is chosen.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    def step(sampler: Any, ray: Any, L: Any, throughput: Any, last: tuple, depth: Any, seen: Any, active: Any) -> tuple:
+        si = scene.ray_intersect(ray, mi.RayFlags.All, depth == 0, active)
+        L = L + throughput * _emitted(scene, settings, si, last, depth, active)
+        seen = seen | ((depth == 0) & si.is_valid())
+        active = active & si.is_valid() & (depth + 1 < _unsigned(settings.max_depth))
+        on = _vertex(scene, bodies, settings, sampler, ray, si, active)
+        L = L + dr.select(active, throughput * on.direct, 0)
+        throughput = dr.select(active, throughput * on.weight, throughput)
+        best = dr.max(throughput)
+        active = active & (best > 0)
+        depth = dr.select(active, depth + 1, depth)
+        survival = dr.select(depth >= settings.rr_depth, dr.minimum(best, 0.95), 1.0)
+        active = active & (sampler.next_1d() < survival)
+        throughput = throughput * dr.rcp(dr.maximum(survival, 1e-8))
+        start = mi.Interaction3f(0.0, ray.time, ray.wavelengths, on.p, on.n)
+        ray = dr.select(active, start.spawn_ray(on.d), ray)
+        return sampler, ray, L, throughput, (on.p, on.n, on.pdf, on.delta), depth, seen, active
+
+    last = (mi.Point3f(0), mi.Normal3f(0), mi.Float(1), mi.Bool(True))
+    state = (
+        sampler, mi.Ray3f(ray), mi.Spectrum(0), mi.Spectrum(1), last, mi.UInt32(0), mi.Bool(False), mi.Bool(active),
+    )  # fmt: skip
+    out = dr.while_loop(state, lambda *state: state[-1], step, label="bssrdf")
+    return out[2], out[6]
+
+
+def _unsigned(max_depth: int) -> int:
+    return 0xFFFFFFFF if max_depth < 0 else max_depth
+
+
+def _emitted(scene: Any, settings: Settings, si: Any, last: tuple, depth: Any, active: Any) -> Any:
+    """Emitted light where the path arrives, weighted against the sampling of emitters at the last vertex."""
+    import drjit as dr
+    import mitsuba as mi
+
+    p, n, pdf, delta = last
+    emitter = si.emitter(scene, active)
+    before = mi.Interaction3f(0.0, si.time, si.wavelengths, p, n)
+    ds = mi.DirectionSample3f(scene, si, before)
+    pdf_emitter = scene.pdf_emitter_direction(before, ds, active & ~delta & (emitter != None))  # noqa: E711
+    weight = dr.select(delta, 1, _balance(pdf, pdf_emitter))
+    if settings.hide_emitters:
+        active = active & (depth > 0)
+    return dr.select(active & (emitter != None), weight * emitter.eval(si, active), 0)  # noqa: E711
+
+
+def _balance(pdf: Any, other: Any) -> Any:
+    import drjit as dr
+
+    total = pdf + other
+    return dr.select(total > 0, pdf / dr.maximum(total, 1e-30), 0)
+
+
+def _vertex(scene: Any, bodies: list[Body], settings: Settings, sampler: Any, ray: Any, si: Any, active: Any) -> Onward:
+    """What happens at a surface point: its BSDF, or for the bodies the light that entered elsewhere."""
+    import drjit as dr
+    import mitsuba as mi
+
+    u_event = sampler.next_1d()
+    inside, share = mi.Bool(False), mi.Float(1)
+    chosen = []
+    for body in bodies:
+        here = active & (si.shape == mi.ShapePtr(body.found.shape))
+        p_reflect = _reflection_probability(body, si)
+        below = here & (u_event >= p_reflect)
+        inside |= below
+        share = dr.select(here, dr.select(below, 1 - p_reflect, p_reflect), share)
+        chosen.append((body, below))
+    on = _surface(scene, sampler, ray, si, active & ~inside)
+    for body, below in chosen:
+        if body.models:
+            entered = _multiple(scene, body, settings, sampler, si, below)
+            on = Onward(*(dr.select(below, a, b) for a, b in zip(entered, on)))
+    return on._replace(weight=on.weight / share, direct=on.direct / share)
+
+
+def _reflection_probability(body: Body, si: Any) -> Any:
+    import drjit as dr
+    import mitsuba as mi
+
+    if not body.surface.inside.reflection:
+        return mi.Float(0)
+    F = mi.fresnel(dr.abs(dr.dot(si.wi, mi.Vector3f(0, 0, 1))), body.surface.inside.medium.eta)[0]
+    return dr.clip(F, LEAST_REFLECTION, 0.95)
+
+
+def _surface(scene: Any, sampler: Any, ray: Any, si: Any, active: Any) -> Onward:
+    """Light sampled by emitters, and a direction sampled by the BSDF."""
+    import drjit as dr
+    import mitsuba as mi
+
+    bsdf, ctx = si.bsdf(ray), mi.BSDFContext()
+    smooth = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+    ds, light = scene.sample_emitter_direction(si, sampler.next_2d(), True, smooth)
+    smooth &= ds.pdf != 0
+    wo = si.to_local(ds.d)
+    value, pdf = bsdf.eval_pdf(ctx, si, wo, smooth)
+    weight = dr.select(ds.delta, 1, _balance(ds.pdf, pdf))
+    direct = dr.select(smooth, value * light * weight, 0)
+    bs, bsdf_weight = bsdf.sample(ctx, si, sampler.next_1d(), sampler.next_2d(), active)
+    delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+    return Onward(
+        mi.Point3f(si.p), mi.Normal3f(si.n), si.to_world(bs.wo), bsdf_weight, mi.Float(bs.pdf), delta,
+        mi.Spectrum(direct),
+    )  # fmt: skip
+
+
+def _multiple(scene: Any, body: Body, settings: Settings, sampler: Any, si: Any, active: Any) -> Onward:
+    """Light that entered the body elsewhere and comes out here by its model."""
+    import drjit as dr
+    import mitsuba as mi
+
+    out = exit_at(body, si)
+    entry = body.positions.sample(out, si.prim_index, sampler, active)
+    active = active & (entry.weight > 0)
+    at = mi.Interaction3f(0.0, si.time, si.wavelengths, entry.p, entry.n)
+
+    ds, light = scene.sample_emitter_direction(at, sampler.next_2d(), True, active)
+    S_mu = _S_mu(body, settings, entry, ds.d, out, active & (ds.pdf != 0))
+    pdf = _direction_pdf(body, settings, entry, ds.d, out)
+    direct = S_mu * light * entry.weight * dr.select(ds.delta, 1, _balance(ds.pdf, pdf))
+
+    u = sampler.next_2d()
+    frame = local_frame(entry.n_out, out.p - entry.p)
+    drawn = body.models[0].sample_direction(mi.Float(0), mi.Float(1), mi.Float(0), (u.x, u.y))
+    d = frame.direction(drawn.mu_i, drawn.phi_i)
+    pdf = drawn.pdf
+    weight = _S_mu(body, settings, entry, d, out, active) * entry.weight / dr.maximum(pdf, 1e-8)
+    return Onward(
+        mi.Point3f(entry.p), mi.Normal3f(entry.n), mi.Vector3f(d), dr.select(active, weight, 0), mi.Float(pdf),
+        mi.Bool(False), dr.select(active & (ds.pdf != 0), direct, 0),
+    )  # fmt: skip
+
+
+def exit_at(body: Body, si: Any) -> Exit:
+    """The exit of light towards `si.wi`, with the normal that points outwards."""
+    import drjit as dr
+    import mitsuba as mi
+
+    n = mi.Normal3f(si.sh_frame.n) * body.found.sign
+    w = si.to_world(si.wi)
+    flip = dr.select(body.found.closed | (dr.dot(n, w) > 0), 1.0, -1.0)
+    return Exit(mi.Point3f(si.p), n * flip, w)
+
+
+def _S_mu(body: Body, settings: Settings, entry: Any, w_i: Any, out: Exit, active: Any) -> Any:
+    """S mu_i for each channel, 1/((scene unit)² sr)."""
+    import drjit as dr
+    import mitsuba as mi
+
+    query = plane_query(entry.p, entry.n_out, w_i, out, settings.geometry)
+    mu_i = query[1]
+    lit = active & (mu_i > 0) & (query[3] > 0)
+    values = [model.eval(*query) * mu_i for model in body.models]
+    return dr.select(lit, mi.Spectrum(*values) if len(values) > 1 else mi.Spectrum(values[0]), 0)
+
+
+def _direction_pdf(body: Body, settings: Settings, entry: Any, w_i: Any, out: Exit) -> Any:
+    r, mu_i, phi_i, mu_o, phi_o = plane_query(entry.p, entry.n_out, w_i, out, settings.geometry)
+    return body.models[0].pdf_direction(mu_i, phi_i, r, mu_o, phi_o)

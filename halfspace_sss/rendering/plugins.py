@@ -1,0 +1,57 @@
+"""Registration of the plugins with Mitsuba, once for each variant."""
+
+from __future__ import annotations
+
+from halfspace_sss.backend import BackendError
+
+__all__ = ["register", "variant_channels"]
+
+_active = False
+
+
+def register() -> None:
+    """Register the plugins with the current variant of Mitsuba, and with every variant that is set later.
+
+    Raises:
+        ValueError: no variant is set, or the plugins do not run under it (scalar, spectral or polarised ones).
+        BackendError: Mitsuba is not installed.
+    """
+    global _active
+    try:
+        import mitsuba as mi
+    except ImportError as error:
+        raise BackendError('rendering needs Mitsuba 3: pip install "halfspace-sss[render]"') from error
+    variant_channels()
+    _register_all()
+    if not _active:
+        mi.detail.add_variant_callback(_on_variant)
+        _active = True
+
+
+def variant_channels() -> int:
+    """3 under an RGB variant of Mitsuba, 1 under a mono one.
+
+    Raises:
+        ValueError: no variant is set, or another kind is.
+    """
+    import mitsuba as mi
+
+    variant = mi.variant()
+    if variant not in ("llvm_ad_rgb", "cuda_ad_rgb", "llvm_ad_mono", "cuda_ad_mono"):
+        raise ValueError(f"variant must be llvm_ad_ or cuda_ad_ with rgb or mono, got {variant!r}")
+    return 3 if variant.endswith("rgb") else 1
+
+
+def _on_variant(old: str, new: str) -> None:
+    if new in ("llvm_ad_rgb", "cuda_ad_rgb", "llvm_ad_mono", "cuda_ad_mono"):
+        _register_all()
+
+
+def _register_all() -> None:
+    import mitsuba as mi
+
+    from halfspace_sss.rendering.integrator import integrator_class
+    from halfspace_sss.rendering.translucent import translucent_class
+
+    mi.register_bsdf("translucent", translucent_class())
+    mi.register_integrator("bssrdf", integrator_class())
