@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from halfspace_sss.rendering.body import Body
-from halfspace_sss.rendering.plane import Exit, local_frame, plane_query
+from halfspace_sss.rendering.plane import Exit, local_frame, place, plane_query
 from halfspace_sss.rendering.settings import Settings
+from halfspace_sss.rendering.single import single_scattering_at
 
 __all__ = ["trace_paths"]
 
@@ -23,6 +24,7 @@ class Onward(NamedTuple):
     pdf: Any
     delta: Any
     direct: Any  # spectrum: light that was sampled at the vertex
+    sky_only: Any  # all emitters but the environment are in `direct`
 
 
 def trace_paths(scene: Any, bodies: list[Body], settings: Settings, sampler: Any, ray: Any, active: Any) -> tuple:
@@ -47,12 +49,11 @@ def trace_paths(scene: Any, bodies: list[Body], settings: Settings, sampler: Any
         depth = dr.select(active, depth + 1, depth)
         survival = dr.select(depth >= settings.rr_depth, dr.minimum(best, 0.95), 1.0)
         active = active & (sampler.next_1d() < survival)
-        throughput = throughput * dr.rcp(dr.maximum(survival, 1e-8))
-        start = mi.Interaction3f(0.0, ray.time, ray.wavelengths, on.p, on.n)
-        ray = dr.select(active, start.spawn_ray(on.d), ray)
-        return sampler, ray, L, throughput, (on.p, on.n, on.pdf, on.delta), depth, seen, active
+        throughput = throughput / survival
+        ray = dr.select(active, place(on.p, on.n).spawn_ray(on.d), ray)
+        return sampler, ray, L, throughput, (on.p, on.n, on.pdf, on.delta, on.sky_only), depth, seen, active
 
-    last = (mi.Point3f(0), mi.Normal3f(0), mi.Float(1), mi.Bool(True))
+    last = (mi.Point3f(0), mi.Normal3f(0), mi.Float(1), mi.Bool(True), mi.Bool(False))
     state = (
         sampler, mi.Ray3f(ray), mi.Spectrum(0), mi.Spectrum(1), last, mi.UInt32(0), mi.Bool(False), mi.Bool(active),
     )  # fmt: skip
@@ -69,15 +70,16 @@ def _emitted(scene: Any, settings: Settings, si: Any, last: tuple, depth: Any, a
     import drjit as dr
     import mitsuba as mi
 
-    p, n, pdf, delta = last
+    p, n, pdf, delta, sky_only = last
     emitter = si.emitter(scene, active)
-    before = mi.Interaction3f(0.0, si.time, si.wavelengths, p, n)
+    before = place(p, n)
     ds = mi.DirectionSample3f(scene, si, before)
     pdf_emitter = scene.pdf_emitter_direction(before, ds, active & ~delta & (emitter != None))  # noqa: E711
     weight = dr.select(delta, 1, _balance(pdf, pdf_emitter))
+    active = active & (emitter != None) & ~(sky_only & ~emitter.is_environment())  # noqa: E711
     if settings.hide_emitters:
         active = active & (depth > 0)
-    return dr.select(active & (emitter != None), weight * emitter.eval(si, active), 0)  # noqa: E711
+    return dr.select(active, weight * emitter.eval(si, active), 0)
 
 
 def _balance(pdf: Any, other: Any) -> Any:
@@ -93,21 +95,30 @@ def _vertex(scene: Any, bodies: list[Body], settings: Settings, sampler: Any, ra
     import mitsuba as mi
 
     u_event = sampler.next_1d()
-    inside, share = mi.Bool(False), mi.Float(1)
-    chosen = []
+    inside, share, chosen = mi.Bool(False), mi.Float(1), []
     for body in bodies:
         here = active & (si.shape == mi.ShapePtr(body.found.shape))
-        p_reflect = _reflection_probability(body, si)
-        below = here & (u_event >= p_reflect)
-        inside |= below
-        share = dr.select(here, dr.select(below, 1 - p_reflect, p_reflect), share)
-        chosen.append((body, below))
+        reflect = _reflection_probability(body, si)
+        once = (1 - reflect) * body.single_share
+        single = here & (u_event < once)
+        multiple = here & (u_event >= once + reflect)
+        inside |= single | multiple
+        taken = dr.select(single, once, dr.select(multiple, 1 - reflect - once, reflect))
+        share = dr.select(here, taken, share)
+        chosen.append((body, single, multiple))
     on = _surface(scene, sampler, ray, si, active & ~inside)
-    for body, below in chosen:
+    for body, single, multiple in chosen:
         if body.models:
-            entered = _multiple(scene, body, settings, sampler, si, below)
-            on = Onward(*(dr.select(below, a, b) for a, b in zip(entered, on)))
+            on = _where(multiple, _multiple(scene, body, settings, sampler, si, multiple), on)
+        if body.single_share > 0:
+            on = _where(single, _single(scene, body, sampler, si, single), on)
     return on._replace(weight=on.weight / share, direct=on.direct / share)
+
+
+def _where(mask: Any, a: Onward, b: Onward) -> Onward:
+    import drjit as dr
+
+    return Onward(*(dr.select(mask, x, y) for x, y in zip(a, b)))
 
 
 def _reflection_probability(body: Body, si: Any) -> Any:
@@ -137,7 +148,7 @@ def _surface(scene: Any, sampler: Any, ray: Any, si: Any, active: Any) -> Onward
     delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
     return Onward(
         mi.Point3f(si.p), mi.Normal3f(si.n), si.to_world(bs.wo), bsdf_weight, mi.Float(bs.pdf), delta,
-        mi.Spectrum(direct),
+        mi.Spectrum(direct), mi.Bool(False),
     )  # fmt: skip
 
 
@@ -149,7 +160,7 @@ def _multiple(scene: Any, body: Body, settings: Settings, sampler: Any, si: Any,
     out = exit_at(body, si)
     entry = body.positions.sample(out, si.prim_index, sampler, active)
     active = active & (entry.weight > 0)
-    at = mi.Interaction3f(0.0, si.time, si.wavelengths, entry.p, entry.n)
+    at = place(entry.p, entry.n)
 
     ds, light = scene.sample_emitter_direction(at, sampler.next_2d(), True, active)
     S_mu = _S_mu(body, settings, entry, ds.d, out, active & (ds.pdf != 0))
@@ -164,8 +175,18 @@ def _multiple(scene: Any, body: Body, settings: Settings, sampler: Any, si: Any,
     weight = _S_mu(body, settings, entry, d, out, active) * entry.weight / dr.maximum(pdf, 1e-8)
     return Onward(
         mi.Point3f(entry.p), mi.Normal3f(entry.n), mi.Vector3f(d), dr.select(active, weight, 0), mi.Float(pdf),
-        mi.Bool(False), dr.select(active & (ds.pdf != 0), direct, 0),
+        mi.Bool(False), dr.select(active & (ds.pdf != 0), direct, 0), mi.Bool(False),
     )  # fmt: skip
+
+
+def _single(scene: Any, body: Body, sampler: Any, si: Any, active: Any) -> Onward:
+    """Light that was scattered once inside the body."""
+    import mitsuba as mi
+
+    lights = any(not emitter.is_environment() for emitter in scene.emitters())
+    found = single_scattering_at(scene, body, exit_at(body, si), sampler, lights, active)
+    yes = mi.Bool(True)
+    return Onward(found.p, found.n, found.d, found.weight, mi.Float(1), yes, found.direct, yes)
 
 
 def exit_at(body: Body, si: Any) -> Exit:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-__all__ = ["GEOMETRIES", "Exit", "Frame", "local_frame", "plane_query", "separation"]
+__all__ = ["GEOMETRIES", "Exit", "Frame", "local_frame", "place", "plane_query", "separation"]
 
 GEOMETRIES = ("distance", "tangent")
 
@@ -36,6 +36,16 @@ class Frame(NamedTuple):
 
         sine, (s, c) = dr.safe_sqrt((1 - mu) * (1 + mu)), dr.sincos(phi)
         return self.t * (sine * c) + self.b * (sine * s) + self.n * mu
+
+
+def place(p: Any, n: Any) -> Any:
+    """A point with its geometric normal, from which rays start clear of the surface."""
+    import drjit as dr
+    import mitsuba as mi
+
+    found = dr.zeros(mi.Interaction3f)
+    found.p, found.n = mi.Point3f(p), mi.Normal3f(n)
+    return found
 
 
 def local_frame(n: Any, d: Any) -> Frame:
