@@ -1,1 +1,29 @@
-"""One file per figure of the paper, `compute()` apart from `draw()`."""
+"""The figures of the paper: what each is made of, apart from how it is drawn, so that only what changed is computed.
+
+A figure is one file `figures/NAME.py` and one entry of `FIGURES` below. The module has
+
+- `TITLE`: a few words for `halfspace-sss figures list`;
+- `parts(quality) -> list[Part]`: what is to be computed, for the quality "draft" (minutes on two cores) or "paper";
+- `draw(results) -> {file name: bytes or str}`: pictures, pages and tables from the results, by name of the part.
+
+`figures.runner.compute(name, quality, folder)` computes the parts, `figures.runner.draw(...)` writes what is drawn.
+
+A `Part` is a name, parameters ready for JSON, a function and its estimated work:
+
+    def render(task: Task) -> dict[str, Any]:
+        image = ...task.params["material"]...        # task.progress(done, total) moves the bar
+        return {"image": image, "variance": variance, "mean": float(image.mean())}
+
+    Part("marble, neural", render, {"material": "marble", "model": "neural", "spp": 64}, work=64 * 256**2)
+
+- Arrays of shape (height, width) or (height, width, 3) are kept as float32 EXR; everything else must be ready for
+  JSON. Both are checked: a NaN is refused with the name of the part.
+- A part is computed again when its parameters, its function's name or `version` (raise it when the code computes
+  something else), the content of a file in `inputs` (weights, scenes), or a part in `needs` changed; not when `work`
+  did. A part that is damaged is computed again and named.
+- `needs` names parts that stand before it in the list; their results are in `task.needed`. `task.folder` is kept
+  until the part is done: passes of a long render stored there survive an interruption.
+- Seconds for a unit of `work` are measured: what a draft took says what the paper quality will take.
+"""
+
+FIGURES = ("fig10",)
