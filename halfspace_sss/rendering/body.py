@@ -87,7 +87,7 @@ def _make_body(shape: Any, settings: Settings) -> Body:
 
 def _area_share(ratio: float) -> float:
     """Share of uniform entries for a ratio of mean distance to object size."""
-    return float(np.clip(0.5 * (np.log10(max(ratio, 1e-9)) + 1.5), 0.0, 0.5))
+    return float(np.clip(0.5 * (np.log10(max(ratio, 1e-9)) + 0.5), 0.0, 0.5))
 
 
 def _single_share(media: list[Medium]) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from halfspace_sss.rendering.body import Body
+from halfspace_sss.rendering.lights import Lights
 from halfspace_sss.rendering.plane import Exit, local_frame, place, plane_query
 from halfspace_sss.rendering.settings import Settings
 from halfspace_sss.rendering.single import single_scattering_at
@@ -22,9 +23,10 @@ class Onward(NamedTuple):
     d: Any
     weight: Any  # spectrum
     pdf: Any
-    delta: Any
-    direct: Any  # spectrum: light that was sampled at the vertex
+    emitter_share: Any  # of directions sampled by emitters at the vertex, 1 for a second sample beside d; for weights
     sky_only: Any  # all emitters but the environment are in `direct`
+    aim: Any  # distance of the emitter that d was sampled for, and nothing else counts; negative: d goes anywhere
+    direct: Any  # spectrum: light that was sampled at the vertex
 
 
 def trace_paths(scene: Any, bodies: list[Body], settings: Settings, sampler: Any, ray: Any, active: Any) -> tuple:
@@ -36,12 +38,14 @@ def trace_paths(scene: Any, bodies: list[Body], settings: Settings, sampler: Any
     import drjit as dr
     import mitsuba as mi
 
+    lights = Lights.of(scene)
+
     def step(sampler: Any, ray: Any, L: Any, throughput: Any, last: tuple, depth: Any, seen: Any, active: Any) -> tuple:
         si = scene.ray_intersect(ray, mi.RayFlags.All, depth == 0, active)
         L = L + throughput * _emitted(scene, settings, si, last, depth, active)
         seen = seen | ((depth == 0) & si.is_valid())
-        active = active & si.is_valid() & (depth + 1 < _unsigned(settings.max_depth))
-        on = _vertex(scene, bodies, settings, sampler, ray, si, active)
+        active = active & si.is_valid() & (last[-1] < 0) & (depth + 1 < _unsigned(settings.max_depth))
+        on = _vertex(scene, lights, bodies, settings, sampler, ray, si, active)
         L = L + dr.select(active, throughput * on.direct, 0)
         throughput = dr.select(active, throughput * on.weight, throughput)
         best = dr.max(throughput)
@@ -51,9 +55,10 @@ def trace_paths(scene: Any, bodies: list[Body], settings: Settings, sampler: Any
         active = active & (sampler.next_1d() < survival)
         throughput = throughput / survival
         ray = dr.select(active, place(on.p, on.n).spawn_ray(on.d), ray)
-        return sampler, ray, L, throughput, (on.p, on.n, on.pdf, on.delta, on.sky_only), depth, seen, active
+        last = (on.p, on.n, on.pdf, on.emitter_share, on.sky_only, on.aim)
+        return sampler, ray, L, throughput, last, depth, seen, active
 
-    last = (mi.Point3f(0), mi.Normal3f(0), mi.Float(1), mi.Bool(True), mi.Bool(False))
+    last = (mi.Point3f(0), mi.Normal3f(0), mi.Float(1), mi.Float(0), mi.Bool(False), mi.Float(-1))
     state = (
         sampler, mi.Ray3f(ray), mi.Spectrum(0), mi.Spectrum(1), last, mi.UInt32(0), mi.Bool(False), mi.Bool(active),
     )  # fmt: skip
@@ -70,16 +75,16 @@ def _emitted(scene: Any, settings: Settings, si: Any, last: tuple, depth: Any, a
     import drjit as dr
     import mitsuba as mi
 
-    p, n, pdf, delta, sky_only = last
+    p, n, pdf, emitter_share, sky_only, aim = last
     emitter = si.emitter(scene, active)
-    before = place(p, n)
-    ds = mi.DirectionSample3f(scene, si, before)
-    pdf_emitter = scene.pdf_emitter_direction(before, ds, active & ~delta & (emitter != None))  # noqa: E711
-    weight = dr.select(delta, 1, _balance(pdf, pdf_emitter))
     active = active & (emitter != None) & ~(sky_only & ~emitter.is_environment())  # noqa: E711
+    active &= (aim < 0) | dr.select(si.is_valid(), dr.abs(si.t - aim) < 1e-3 * aim, aim == dr.inf)
     if settings.hide_emitters:
         active = active & (depth > 0)
-    return dr.select(active, weight * emitter.eval(si, active), 0)
+    before = place(p, n)
+    ds = mi.DirectionSample3f(scene, si, before)
+    pdf_emitter = emitter_share * scene.pdf_emitter_direction(before, ds, active & (emitter_share > 0))
+    return dr.select(active, _balance(pdf, pdf_emitter) * emitter.eval(si, active), 0)
 
 
 def _balance(pdf: Any, other: Any) -> Any:
@@ -89,7 +94,9 @@ def _balance(pdf: Any, other: Any) -> Any:
     return dr.select(total > 0, pdf / dr.maximum(total, 1e-30), 0)
 
 
-def _vertex(scene: Any, bodies: list[Body], settings: Settings, sampler: Any, ray: Any, si: Any, active: Any) -> Onward:
+def _vertex(
+    scene: Any, lights: Lights, bodies: list[Body], settings: Settings, sampler: Any, ray: Any, si: Any, active: Any
+) -> Onward:
     """What happens at a surface point: its BSDF, or for the bodies the light that entered elsewhere."""
     import drjit as dr
     import mitsuba as mi
@@ -109,9 +116,9 @@ def _vertex(scene: Any, bodies: list[Body], settings: Settings, sampler: Any, ra
     on = _surface(scene, sampler, ray, si, active & ~inside)
     for body, single, multiple in chosen:
         if body.models:
-            on = _where(multiple, _multiple(scene, body, settings, sampler, si, multiple), on)
+            on = _where(multiple, _multiple(scene, lights, body, settings, sampler, si, multiple), on)
         if body.single_share > 0:
-            on = _where(single, _single(scene, body, sampler, si, single), on)
+            on = _where(single, _single(scene, lights, body, sampler, si, single), on)
     return on._replace(weight=on.weight / share, direct=on.direct / share)
 
 
@@ -147,46 +154,58 @@ def _surface(scene: Any, sampler: Any, ray: Any, si: Any, active: Any) -> Onward
     bs, bsdf_weight = bsdf.sample(ctx, si, sampler.next_1d(), sampler.next_2d(), active)
     delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
     return Onward(
-        mi.Point3f(si.p), mi.Normal3f(si.n), si.to_world(bs.wo), bsdf_weight, mi.Float(bs.pdf), delta,
-        mi.Spectrum(direct), mi.Bool(False),
+        mi.Point3f(si.p), mi.Normal3f(si.n), si.to_world(bs.wo), bsdf_weight, dr.select(delta, 1, bs.pdf),
+        dr.select(delta, mi.Float(0), 1), mi.Bool(False), mi.Float(-1), mi.Spectrum(direct),
     )  # fmt: skip
 
 
-def _multiple(scene: Any, body: Body, settings: Settings, sampler: Any, si: Any, active: Any) -> Onward:
-    """Light that entered the body elsewhere and comes out here by its model."""
+def _multiple(scene: Any, lights: Lights, body: Body, settings: Settings, sampler: Any, si: Any, active: Any) -> Onward:
+    """Light that entered the body elsewhere and comes out here by its model.
+
+    S is evaluated once, the costly part: the direction is sampled by emitters or by the model (one-sample balance
+    heuristic), and the ray that goes on is what tests visibility.
+    """
     import drjit as dr
     import mitsuba as mi
 
     out = exit_at(body, si)
     entry = body.positions.sample(out, si.prim_index, sampler, active)
     active = active & (entry.weight > 0)
-    at = place(entry.p, entry.n)
-
-    ds, light = scene.sample_emitter_direction(at, sampler.next_2d(), True, active)
-    S_mu = _S_mu(body, settings, entry, ds.d, out, active & (ds.pdf != 0))
-    pdf = _direction_pdf(body, settings, entry, ds.d, out)
-    direct = S_mu * light * entry.weight * dr.select(ds.delta, 1, _balance(ds.pdf, pdf))
+    at, share, model = place(entry.p, entry.n), lights.share, body.models[0]
 
     u = sampler.next_2d()
     frame = local_frame(entry.n_out, out.p - entry.p)
-    drawn = body.models[0].sample_direction(mi.Float(0), mi.Float(1), mi.Float(0), (u.x, u.y))
-    d = frame.direction(drawn.mu_i, drawn.phi_i)
-    pdf = drawn.pdf
-    weight = _S_mu(body, settings, entry, d, out, active) * entry.weight / dr.maximum(pdf, 1e-8)
+    drawn = model.sample_direction(mi.Float(0), mi.Float(1), mi.Float(0), (u.x, u.y))
+    d, pdf, aim = mi.Vector3f(frame.direction(drawn.mu_i, drawn.phi_i)), (1 - share) * drawn.pdf, mi.Float(-1)
+    delta, light = mi.Bool(False), mi.Spectrum(0)
+    if share > 0:
+        by_emitter = active & (sampler.next_1d() < share)
+        ds, light = scene.sample_emitter_direction(at, sampler.next_2d(), False, by_emitter)
+        sky, delta = ds.emitter.is_environment(), by_emitter & ds.delta
+        mu_i, rest = dr.clip(dr.dot(ds.d, entry.n_out), 0, 1), (mi.Float(0), mi.Float(0), mi.Float(1), mi.Float(0))
+        by_model = model.pdf_direction(mu_i, *rest)
+        d = dr.select(by_emitter, ds.d, d)
+        pdf = dr.select(by_emitter, share * ds.pdf + dr.select(ds.delta, 0, (1 - share) * by_model), pdf)
+        aim = dr.select(by_emitter, dr.select(sky, dr.inf, ds.dist), aim)
+        active &= pdf > 0
+    value = dr.select(active, _S_mu(body, settings, entry, d, out, active) * entry.weight / dr.maximum(pdf, 1e-8), 0)
+    direct = mi.Spectrum(0)
+    if lights.some_delta:
+        direct = dr.select(delta & ~scene.ray_test(at.spawn_ray_to(ds.p), False, delta), value * light, 0)
     return Onward(
-        mi.Point3f(entry.p), mi.Normal3f(entry.n), mi.Vector3f(d), dr.select(active, weight, 0), mi.Float(pdf),
-        mi.Bool(False), dr.select(active & (ds.pdf != 0), direct, 0), mi.Bool(False),
+        mi.Point3f(entry.p), mi.Normal3f(entry.n), d, dr.select(delta, 0, value), dr.select(aim < 0, pdf, 1),
+        dr.select(aim < 0, mi.Float(share), 0), mi.Bool(False), aim, direct,
     )  # fmt: skip
 
 
-def _single(scene: Any, body: Body, sampler: Any, si: Any, active: Any) -> Onward:
+def _single(scene: Any, lights: Lights, body: Body, sampler: Any, si: Any, active: Any) -> Onward:
     """Light that was scattered once inside the body."""
     import mitsuba as mi
 
-    lights = any(not emitter.is_environment() for emitter in scene.emitters())
-    found = single_scattering_at(scene, body, exit_at(body, si), sampler, lights, active)
-    yes = mi.Bool(True)
-    return Onward(found.p, found.n, found.d, found.weight, mi.Float(1), yes, found.direct, yes)
+    found = single_scattering_at(scene, body, exit_at(body, si), sampler, lights.some_local, active)
+    return Onward(
+        found.p, found.n, found.d, found.weight, mi.Float(1), mi.Float(0), mi.Bool(True), mi.Float(-1), found.direct
+    )
 
 
 def exit_at(body: Body, si: Any) -> Exit:
@@ -210,8 +229,3 @@ def _S_mu(body: Body, settings: Settings, entry: Any, w_i: Any, out: Exit, activ
     lit = active & (mu_i > 0) & (query[3] > 0)
     values = [model.eval(*query) * mu_i for model in body.models]
     return dr.select(lit, mi.Spectrum(*values) if len(values) > 1 else mi.Spectrum(values[0]), 0)
-
-
-def _direction_pdf(body: Body, settings: Settings, entry: Any, w_i: Any, out: Exit) -> Any:
-    r, mu_i, phi_i, mu_o, phi_o = plane_query(entry.p, entry.n_out, w_i, out, settings.geometry)
-    return body.models[0].pdf_direction(mu_i, phi_i, r, mu_o, phi_o)

@@ -1,0 +1,37 @@
+"""What kinds of emitters a scene has, and so how directions of incidence are sampled."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+__all__ = ["Lights"]
+
+EMITTER_SHARE = 0.5
+
+
+@dataclass(frozen=True)
+class Lights:
+    """Kinds of emitters.
+
+    Args:
+        share: share of the directions into an object that are sampled by emitters; 0 where all light is the same from
+            everywhere, which the model's own directions find better.
+        some_local: whether there is an emitter beside the environment.
+        some_delta: whether there is one that no ray can hit (point, spot, directional).
+    """
+
+    share: float
+    some_local: bool
+    some_delta: bool
+
+    @classmethod
+    def of(cls, scene: Any) -> Lights:
+        """The lights of a scene."""
+        import mitsuba as mi
+
+        emitters = scene.emitters()
+        even = all("Constant" in emitter.class_name() for emitter in emitters)
+        delta = any(emitter.flags() & int(mi.EmitterFlags.Delta) for emitter in emitters)
+        local = any(not emitter.is_environment() for emitter in emitters)
+        return cls(0.0 if even else EMITTER_SHARE, local, delta)
