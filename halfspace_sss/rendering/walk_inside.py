@@ -1,0 +1,92 @@
+"""One step of the random walk inside an object, with spectral multiple importance sampling.
+
+A walk draws distances and angles with the coefficients of one channel, chosen at its start. Every channel c gets a
+value: with f_c the measured contribution and p_k the density of the whole walk under channel k, the weight is
+w_c = f_c / mean_k p_k (balance heuristic over channels). State are w_c and q_k = p_k / mean_j p_j; both stay in range
+whatever the length of the walk. Absorption is part of w.
+
+Source: Wilkie et al. 2014 (hero wavelength sampling); Miller, Georgiev and Jarosz 2019 for volumes.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from halfspace_sss.phase import eval_hg, sample_hg
+from halfspace_sss.rendering.walk_media import Coefficients
+from halfspace_sss.walk import ROULETTE_BOOST, ROULETTE_WEIGHT
+
+__all__ = ["Flight", "fly", "pick", "roulette", "turn", "weigh"]
+
+
+class Flight(NamedTuple):
+    """A free flight: distance to the event, whether it is a scattering one, weights after it."""
+
+    distance: Any
+    scatters: Any
+    weight: Any
+    density: Any
+
+
+def pick(values: Any, channel: Any) -> Any:
+    """The value of one channel."""
+    import drjit as dr
+
+    found = values[0]
+    for c in range(1, len(values)):
+        found = dr.select(channel == c, values[c], found)
+    return found
+
+
+def weigh(weight: Any, density: Any, value: Any, pdf: Any) -> tuple[Any, Any]:
+    """w and q after a step with the value f_c and the density p_c, each up to one factor that they share."""
+    import drjit as dr
+
+    if len(weight) == 1:
+        return weight * value / pdf, density
+    grown = density * pdf
+    scale = 1 / dr.maximum(dr.mean(grown), 1e-37)
+    return weight * value * scale, grown * scale
+
+
+def fly(m: Coefficients, weight: Any, density: Any, channel: Any, reach: Any, u: Any) -> Flight:
+    """A free flight, cut short by the boundary at the distance `reach`."""
+    import drjit as dr
+    import mitsuba as mi
+
+    sigma = pick(m.sigma_t, channel)
+    t = -dr.log(1 - u) / sigma
+    scatters = t < reach
+    distance = dr.minimum(t, reach)
+    if len(weight) == 1:
+        value = dr.select(scatters, m.sigma_s / m.sigma_t, 1)
+        return Flight(distance, scatters, weight * value, density)
+    through = dr.exp(-(m.sigma_t - sigma) * distance)  # over exp(-sigma t) of the walk's own channel
+    value = dr.select(scatters, m.sigma_s, mi.Spectrum(1)) * through
+    pdf = dr.select(scatters, m.sigma_t, mi.Spectrum(1)) * through
+    return Flight(distance, scatters, *weigh(weight, density, value, pdf))
+
+
+def turn(m: Coefficients, weight: Any, density: Any, channel: Any, d: Any, u: Any, same_g: bool) -> tuple:
+    """A new direction by the phase function, and w and q after it."""
+    import drjit as dr
+    import mitsuba as mi
+
+    cosine = sample_hg(u.x, pick(m.g, channel))
+    sine = dr.safe_sqrt((1 - cosine) * (1 + cosine))
+    sin_phi, cos_phi = dr.sincos(2 * dr.pi * u.y)
+    new = mi.Frame3f(d).to_world(mi.Vector3f(sine * cos_phi, sine * sin_phi, cosine))
+    new *= 1.5 - 0.5 * dr.squared_norm(new)  # one Newton step: float32 drifts over thousands of turns
+    if same_g or len(weight) == 1:
+        return new, weight, density
+    phase = mi.Spectrum([eval_hg(cosine, m.g[c]) for c in range(len(weight))])
+    return new, *weigh(weight, density, phase, phase)
+
+
+def roulette(weight: Any, scale: Any, u: Any) -> tuple[Any, Any]:
+    """Whether a walk goes on, and its weight if it does; `scale` is the square of the relative index passed so far."""
+    import drjit as dr
+
+    size = dr.max(weight) * scale
+    survive = dr.select(size < ROULETTE_WEIGHT, size / (ROULETTE_WEIGHT * ROULETTE_BOOST), 1)
+    return u < survive, dr.select(survive < 1, weight / dr.maximum(survive, 1e-30), weight)
