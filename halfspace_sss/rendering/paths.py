@@ -213,10 +213,11 @@ def exit_at(body: Body, si: Any) -> Exit:
     import drjit as dr
     import mitsuba as mi
 
-    n = mi.Normal3f(si.sh_frame.n) * body.found.sign
-    w = si.to_world(si.wi)
-    flip = dr.select(body.found.closed | (dr.dot(n, w) > 0), 1.0, -1.0)
-    return Exit(mi.Point3f(si.p), n * flip, w)
+    w, n = si.to_world(si.wi), mi.Normal3f(si.sh_frame.n)
+    sign = mi.Float(body.found.sign)
+    if not body.found.closed:  # a sheet is a half-space from both sides
+        sign = dr.select(dr.dot(n, w) > 0, 1.0, -1.0)
+    return Exit(mi.Point3f(si.p), n * sign, w, sign)
 
 
 def _S_mu(body: Body, settings: Settings, entry: Any, w_i: Any, out: Exit, active: Any) -> Any:

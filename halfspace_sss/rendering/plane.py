@@ -10,11 +10,12 @@ GEOMETRIES = ("distance", "tangent")
 
 
 class Exit(NamedTuple):
-    """Where light leaves: position, outward normal, and w_o, which points away from the surface (Mitsuba's wi)."""
+    """Where light leaves: position, outward normal, w_o, which points away from the surface (Mitsuba's wi)."""
 
     p: Any
     n: Any
     w: Any
+    sign: Any  # that turns the normals of the shape outwards
 
 
 class Frame(NamedTuple):

@@ -114,7 +114,7 @@ class PositionSampler:
             share = dr.select(total > 0, hope / total, 0)
             take = (u < share) & (hope > 0)
             u = dr.clip(dr.select(take, u / dr.maximum(share, 1e-20), (u - share) / dr.maximum(1 - share, 1e-7)), 0, 1)
-            found = (si.p, si.n, si.sh_frame.n * self.found.sign, 1 / (density * dr.maximum(hope, 1e-30)))
+            found = (si.p, si.n, si.sh_frame.n * out.sign, 1 / (density * dr.maximum(hope, 1e-30)))
             entry = tuple(dr.select(take, a, b) for a, b in zip(found, entry))
             onward = si.spawn_ray(ray.d)
             onward.maxt = ray.maxt - si.t
@@ -131,7 +131,7 @@ class PositionSampler:
         at = self.points.sample(u_face, u, active)
         same = self.found.piece(at.prim_index, active) == piece
         weight = dr.select(active & same, 1 / self.density(at.p, at.n, out, axes), 0)
-        return Entry(at.p, at.n, at.n_shading * self.found.sign, weight)
+        return Entry(at.p, at.n, at.n_shading * out.sign, weight)
 
 
 def _FLAGS() -> int:
