@@ -179,7 +179,7 @@ def test_the_pixel_under_the_pointer_stays_there_while_zooming(browser: Any) -> 
 
 
 def test_pixels_are_enlarged_without_smoothing(browser: Any) -> None:
-    _press(browser, "1", *"++++")
+    _press(browser, "1", *"++")
     inside = _pixels(browser)[20:-20, 20:-20].reshape(-1, 3)
     assert set(np.unique(inside)) == {255, round(255 * float(srgb(np.array(REFERENCE))))}
 
