@@ -2,27 +2,32 @@
 
 from __future__ import annotations
 
+import copy
 from typing import Any
 
+import numpy as np
 import torch
 from torch import nn
 
+from halfspace_sss.arrays import library
 from halfspace_sss.fresnel import F_t
 from halfspace_sss.interface import BSSRDF, Query
 from halfspace_sss.medium import Medium
-from halfspace_sss.neural.backbone import backbone, length_scale
+from halfspace_sss.neural.backbone import backbone, length_scale, unwarp
 from halfspace_sss.neural.features import N_FEATURES
-from halfspace_sss.neural.learners import apply_networks, initial_numbers, relative_loss
+from halfspace_sss.neural.learners import apply_networks, initial_numbers
 from halfspace_sss.neural.network import RELU, SILU, Network, layer_shapes
+from halfspace_sss.neural.noisy_maps import radial_edges
 from halfspace_sss.neural.paper_learner import PaperLearner
 from halfspace_sss.neural.paper_model import N_INPUTS, T_SMALLEST, query_inputs
-from halfspace_sss.neural.pool import Batch
+from halfspace_sss.neural.pool import Batch, MapPool
 from halfspace_sss.neural.subjects import PaperTrial, Trial
 
-__all__ = ["Factored", "PlainTrial", "model_of"]
+__all__ = ["Factored", "PlainTrial", "drawn_by_area", "model_of"]
 
 LOG_RANGE = 40.0  # of log(G/B); its exponential squared is still a float32
 DEPTH = 3
+STEEPEST = 10.0  # slope over log p: without a bound, points where p is far too small are all that counts in a batch
 
 
 class Factored(nn.Module):
@@ -53,7 +58,11 @@ class Factored(nn.Module):
         log_p = log_p.view_as(batch.u)
         if not self.with_backbone:
             log_p = log_p - torch.log(self.frame[0].S_over_y(batch).clamp_min(1e-30))
-        return relative_loss(torch.exp(log_p.clamp(-LOG_RANGE, LOG_RANGE)), batch)
+        hit, y = (torch.cat((part, part), dim=1) for part in (batch.hit, batch.y))
+        p = torch.exp(log_p.detach().clamp(-LOG_RANGE, LOG_RANGE))
+        # the gradient of `relative_loss`, which the bound leaves alone once p is about right
+        slope = (torch.roll(p, batch.y.shape[1], dims=1) - y) / (p + hit + 1e-20)
+        return (slope.clamp(-STEEPEST, STEEPEST) * log_p).mean()
 
     def network(self) -> Network:
         return Network.from_vector(self.numbers.detach().numpy(), self.shapes, self.activation)
@@ -96,3 +105,11 @@ def model_of(learner: Any, medium: Medium) -> BSSRDF:
     if not isinstance(learner, Factored) or learner.symmetric:
         return Trial(medium, network)
     return PlainTrial(medium, network, None if learner.with_backbone else learner.frame[0].scale)
+
+
+def drawn_by_area(pool: MapPool) -> MapPool:
+    """The same maps, of which batches show cells in proportion to their area."""
+    r = pool.groups.L[:, None] * unwarp(library(0.0), radial_edges(pool.groups, pool.grid))
+    drawn = copy.copy(pool)
+    drawn.cdf = torch.from_numpy(((r**2 - r[:, :1] ** 2)[:, 1:] / (r[:, -1:] ** 2 - r[:, :1] ** 2)).astype(np.float32))
+    return drawn
