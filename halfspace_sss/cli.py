@@ -14,6 +14,7 @@ from typer.core import TyperGroup
 
 import halfspace_sss
 from halfspace_sss.backend import BackendError
+from halfspace_sss.cli_ablation import ablation_command
 from halfspace_sss.cli_bench import bench_command
 from halfspace_sss.cli_curves import curves_command
 from halfspace_sss.cli_errors import errors_command
@@ -26,6 +27,7 @@ from halfspace_sss.extensions import commands
 __all__ = ["app", "main"]
 
 _OWN = {
+    "ablation": ablation_command,
     "bench": bench_command,
     "curves": curves_command,
     "errors": errors_command,
