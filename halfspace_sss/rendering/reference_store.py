@@ -1,0 +1,146 @@
+"""The file of a long render: mean and variance of the mean as channels of one EXR, what it is of in its header.
+
+Each quantity q is two float32 channels, q and q.rest, whose sum holds 48 bits: the state after a pass is rounded to
+that, so that a run that is read back goes on with the same numbers as one that was never interrupted.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from halfspace_sss.provenance import write_atomically
+
+__all__ = ["Reference", "load"]
+
+FORMAT = "halfspace-sss reference 1"
+HEADER = "halfspace_sss"
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """The average of passes of a render.
+
+    Args:
+        mean: image, float64, shape (height, width, channels).
+        variance: of the mean, per pixel and channel, from the spread of the passes; zero after one pass.
+        passes: number of passes.
+        seconds: time spent on them.
+        about: what was rendered: scene (hash), integrator, spp per pass, seed, and provenance.
+    """
+
+    mean: np.ndarray
+    variance: np.ndarray
+    passes: int
+    seconds: float
+    about: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def spp(self) -> int:
+        """Samples per pixel of all passes together."""
+        return self.passes * int(self.about.get("spp_per_pass", 0))
+
+    @property
+    def standard_error(self) -> np.ndarray:
+        """Of the mean, per pixel and channel; infinite after fewer than two passes."""
+        return np.sqrt(self.variance) if self.passes > 1 else np.full_like(self.mean, np.inf)
+
+    @property
+    def relative_error(self) -> float:
+        """sqrt(sum variance / sum mean²) over the colours of lit pixels (mean > 0); infinite before two passes."""
+        lit = self.mean[..., :3] > 0
+        if self.passes < 2 or not lit.any():
+            return float("inf")
+        return float(np.sqrt(self.variance[..., :3][lit].sum() / np.sum(self.mean[..., :3][lit] ** 2)))
+
+    def add(self, image: np.ndarray, seconds: float) -> Reference:
+        """The average with one more pass (Welford 1962), rounded to what a file keeps."""
+        n = self.passes + 1
+        delta = image.astype(np.float64) - self.mean
+        mean = self.mean + delta / n
+        squares = self.variance * self.passes * (self.passes - 1) + delta * (image - mean)
+        variance = squares / (n * (n - 1)) if n > 1 else np.zeros_like(mean)
+        return replace(
+            self, mean=sum(_halves(mean)), variance=sum(_halves(variance)), passes=n, seconds=self.seconds + seconds
+        )
+
+
+def _halves(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A float64 array as the sum of two whose values are float32."""
+    high = values.astype(np.float32).astype(np.float64)
+    return high, (values - high).astype(np.float32).astype(np.float64)
+
+
+def _names(channels: int) -> list[str]:
+    known = {1: ["Y"], 3: ["R", "G", "B"], 4: ["R", "G", "B", "A"]}
+    return known.get(channels) or [f"channel{k}" for k in range(channels)]
+
+
+def _all_names(channels: int) -> list[str]:
+    names = _names(channels)
+    parts = ("{}", "variance.{}", "rest.{}", "variance.rest.{}")
+    return [part.format(name) for part in parts for name in names]
+
+
+def save(path: Path, found: Reference) -> None:
+    """Write the EXR, whole or not at all, and beside it the JSON of its header for people to read."""
+    import mitsuba as mi
+
+    (mean, mean_rest), (variance, variance_rest) = _halves(found.mean), _halves(found.variance)
+    pixels = np.ascontiguousarray(np.concatenate([mean, variance, mean_rest, variance_rest], axis=2), dtype=np.float32)
+    header = {
+        "format": FORMAT,
+        "passes": found.passes,
+        "seconds": found.seconds,
+        "relative_error": found.relative_error if found.passes > 1 else None,
+        "pixels": hashlib.sha256(pixels.tobytes()).hexdigest(),
+        **found.about,
+    }
+    bitmap = mi.Bitmap(pixels, mi.Bitmap.PixelFormat.MultiChannel, channel_names=_all_names(found.mean.shape[2]))
+    text = json.dumps(header, indent=1)
+    bitmap.metadata()[HEADER] = text
+    stream = mi.MemoryStream()
+    bitmap.write(stream, mi.Bitmap.FileFormat.OpenEXR)
+    write_atomically(path, bytes(stream.raw_buffer()))
+    write_atomically(path.with_suffix(".json"), text + "\n")
+
+
+def load(path: str | os.PathLike) -> Reference:
+    """Read the file of a reference.
+
+    Raises:
+        ValueError: there is no such file, or it is damaged or not one of these; the message names it.
+    """
+    import mitsuba as mi
+
+    name = os.fspath(path)
+    if not Path(name).is_file():
+        raise ValueError(f"reference must be a file, got {name!r}")
+    try:
+        bitmap = mi.Bitmap(name)
+        pixels = np.array(bitmap)
+        header = json.loads(bitmap.metadata()[HEADER])
+    except (RuntimeError, KeyError, json.JSONDecodeError) as error:
+        raise ValueError(f"{name} must be an EXR file written by reference.render: {error}") from error
+    names = [channel.name for channel in bitmap.struct_()]
+    channels = len(names) // 4
+    wanted = _all_names(channels)
+    if not isinstance(header, dict) or header.get("format") != FORMAT or sorted(names) != sorted(wanted):
+        raise ValueError(f"{name} must have the format {FORMAT!r}, got channels {names}")
+    pixels = np.ascontiguousarray(pixels[..., [names.index(key) for key in wanted]])
+    if hashlib.sha256(pixels.tobytes()).hexdigest() != header.pop("pixels", None):
+        raise ValueError(f"{name} is damaged: its pixels are not those that were written")
+    try:
+        passes, seconds = int(header.pop("passes")), float(header.pop("seconds"))
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{name} must tell passes and seconds: {error!r}") from error
+    for key in ("format", "relative_error"):
+        header.pop(key, None)
+    mean, variance, mean_rest, variance_rest = np.split(pixels.astype(np.float64), 4, axis=2)
+    return Reference(mean + mean_rest, variance + variance_rest, passes, seconds, header)
