@@ -20,6 +20,7 @@ from halfspace_sss.cli_curves import curves_command
 from halfspace_sss.cli_errors import errors_command
 from halfspace_sss.cli_lists import materials_command, models_command
 from halfspace_sss.cli_maps import maps_command
+from halfspace_sss.cli_render import render_command
 from halfspace_sss.cli_train import train_command
 from halfspace_sss.cli_validate import validate_command
 from halfspace_sss.extensions import commands
@@ -34,6 +35,7 @@ _OWN = {
     "maps": maps_command,
     "materials": materials_command,
     "models": models_command,
+    "render": render_command,
     "train": train_command,
     "validate": validate_command,
 }

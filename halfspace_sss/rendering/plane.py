@@ -65,7 +65,9 @@ def local_frame(n: Any, d: Any) -> Frame:
 def separation(p_i: Any, n_i: Any, p_o: Any, n_o: Any, geometry: str) -> Any:
     """Distance r of the half-space query, in scene units.
 
-    "distance" takes |x_o - x_i|; "tangent" takes the length of x_o - x_i projected to the plane across n_i + n_o.
+    "distance" takes |d|, d = x_o - x_i. "tangent" takes sqrt(d² - c (d.n)²), n along n_i + n_o and c = max(n_i.n_o, 0):
+    the length of d in the common tangent plane where the normals are parallel, |d| where they are at right angles or
+    turn away from each other, as on the two sides of something thin.
     """
     import drjit as dr
 
@@ -73,9 +75,8 @@ def separation(p_i: Any, n_i: Any, p_o: Any, n_o: Any, geometry: str) -> Any:
     if geometry == "distance":
         return dr.norm(d)
     middle = n_i + n_o
-    size2 = dr.squared_norm(middle)
-    n = dr.select(size2 > 1e-6, middle * dr.rsqrt(dr.maximum(size2, 1e-12)), n_o)
-    return dr.norm(d - n * dr.dot(n, d))
+    along = dr.square(dr.dot(d, middle)) / dr.maximum(dr.squared_norm(middle), 1e-12)
+    return dr.sqrt(dr.maximum(dr.squared_norm(d) - dr.maximum(dr.dot(n_i, n_o), 0) * along, 0))
 
 
 def plane_query(p_i: Any, n_i: Any, w_i: Any, out: Exit, geometry: str) -> tuple[Any, Any, Any, Any, Any]:
