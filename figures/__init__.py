@@ -23,7 +23,9 @@ A `Part` is a name, parameters ready for JSON, a function and its estimated work
   did. A part that is damaged is computed again and named.
 - `needs` names parts that stand before it in the list; their results are in `task.needed`. `task.folder` is kept
   until the part is done: passes of a long render stored there survive an interruption.
+- For images: `figures.shot.compared` makes shots with FLIP, relMSE and maps from results; `figures.image_grid` and
+  `figures.page` draw the same {scene: [shots]} as PDF and PNG, and as a page that flips between them.
 - Seconds for a unit of `work` are measured: what a draft took says what the paper quality will take.
 """
 
-FIGURES = ("fig10",)
+FIGURES = ("fig09", "fig10")

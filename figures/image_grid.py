@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
+from matplotlib.font_manager import FontProperties
 from matplotlib.patches import Rectangle
 from matplotlib.textpath import TextPath
 
@@ -46,7 +47,8 @@ def image_grid(
 ) -> Figure:  # fmt: skip
     """The figure; draw it under `figures.style.paper` and write it with `figures.style.saved`.
 
-    FLIP maps and numbers are drawn as they are: `compared` must have had the exposure of the scene. A model that has no image in a scene (`figures.shot.absent`, or none at all) gets a pale frame that says so.
+    FLIP maps and numbers are drawn as they are: `compared` must have had the exposure of the scene. A model that has no
+    image in a scene (`figures.shot.absent`, or none at all) gets a pale frame that says so.
 
     Args:
         scenes: name of a scene -> its images, the reference first; the columns are their labels in order.
@@ -172,7 +174,8 @@ def _draw_row(page: _Page, row: _Row, columns: Sequence[str], top: float, printe
         text = "   ".join(_said(column, shot.numbers[column]) for column in printed if column in shot.numbers)
         weight = "bold" if printed and best is not None and shot.numbers.get(printed[0]) == best else "normal"
         below = top + row.pictures_height + 0.02
-        page.text(x + row.cell / 2, below, text, ha="center", va="top", fontsize=6.5, fontweight=weight)
+        size = 6.5 * min(1.0, 72 * row.cell / max(_text_width(text, 6.5, weight), 1e-6))
+        page.text(x + row.cell / 2, below, text, ha="center", va="top", fontsize=size, fontweight=weight)
 
 
 def _draw_absent(ax: Axes, why: str) -> None:
@@ -241,5 +244,10 @@ def _title_size(labels: Sequence[str], cell: float) -> float:
     """The size of type, points, at which the widest title fits above its column."""
     size = mpl.rcParams["axes.titlesize"]
     size = size if isinstance(size, float | int) else mpl.rcParams["font.size"]
-    widest = max(TextPath((0, 0), label, size=size).get_extents().width for label in labels)
+    widest = max(_text_width(label, size) for label in labels)
     return size * min(1.0, 72 * cell / max(widest, 1e-6))
+
+
+def _text_width(text: str, size: float, weight: str = "normal") -> float:
+    """Points that a line of the figure's type takes."""
+    return TextPath((0, 0), text, prop=FontProperties(size=size, weight=weight)).get_extents().width if text else 0.0

@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
+import figures
 from figures.exr import exr_bytes, read_exr
-from figures.part import Part, Task, keys_of
+from figures.image_grid import image_grid
+from figures.page import page
+from figures.part import Part, Result, Task, keys_of
 from figures.projection import duration
+from figures.runner import compute, draw
+from figures.shot import Shot, absent, compared
+from figures.style import paper, saved
 
 
 def shade(task: Task) -> dict[str, Any]:
@@ -57,3 +65,51 @@ def test_durations_are_said_as_people_say_them() -> None:
         "50 min",
         "3.5 h",
     ]
+
+
+def paint(task: Task) -> dict[str, Any]:
+    """An image of one brightness with noise."""
+    noise = np.random.default_rng(task.params["seed"]).uniform(0.95, 1.05, (16, 24, 3))
+    return {"image": (task.params["level"] * noise).astype(np.float32)}
+
+
+class Images(SimpleNamespace):
+    """A figure of images: a part for each material and model, a grid and a page from the same shots."""
+
+    TITLE = "two models against a reference"
+    LEVELS = {"path traced": 0.3, "model A": 0.35, "model B": 0.6}
+
+    def parts(self, quality: str) -> list[Part]:
+        work = {"draft": 1, "paper": 64}[quality]
+        return [
+            Part(f"{material}, {model}", paint, {"level": level * scale, "seed": seed}, work)
+            for material, scale in (("marble", 1.0), ("ketchup", 0.5))
+            for seed, (model, level) in enumerate(self.LEVELS.items())
+        ]
+
+    def draw(self, results: dict[str, Result]) -> dict[str, bytes | str]:
+        scenes = {}
+        for material in ("marble", "ketchup"):
+            reference = results[f"{material}, path traced"]
+            scenes[material] = [Shot("path traced", reference.images["image"], {"time, s": reference.seconds})]
+            for model in list(self.LEVELS)[1:]:
+                found = results[f"{material}, {model}"]
+                numbers = {"time, s": found.seconds}
+                image = found.images["image"]
+                scenes[material].append(compared(model, image, reference.images["image"], numbers=numbers))
+            scenes[material].append(absent("full geometry"))
+        with paper():
+            files = saved(image_grid(scenes), dpi=60)
+        named = {f"images.{ending}": data for ending, data in files.items()}
+        return {**named, "images.html": page(self.TITLE, scenes)}
+
+
+def test_a_figure_of_images_is_parts_a_grid_and_a_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(figures, "FIGURES", ("images",))
+    monkeypatch.setitem(sys.modules, "figures.images", Images())
+    compute("images", "draft", tmp_path)
+    written = draw("images", "draft", tmp_path)
+    assert [path.name for path in written] == ["images.pdf", "images.png", "images.html", "images.json"]
+    assert len(list(tmp_path.rglob("*.exr"))) == 6
+    again = {path: path.read_bytes() for path in draw("images", "draft", tmp_path)}
+    assert all(path.read_bytes() == data for path, data in again.items())
