@@ -9,12 +9,15 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 import figures
+from halfspace_sss.backend import BackendError
 from halfspace_sss.cli_shared import Bar, console
 
 if TYPE_CHECKING:
     from figures.runner import Plan
 
 __all__ = ["figures_command"]
+
+EXTRAS = ("PIL", "flip_evaluator", "matplotlib", "mitsuba")
 
 
 class Action(str, Enum):
@@ -47,10 +50,15 @@ def figures_command(
     from figures.runner import figure, plan
 
     chosen = list(dict.fromkeys(names or figures.FIGURES))
-    for name in chosen:
-        figure(name)
-    plans = [plan(name, quality.value, out) for name in chosen]
-    {Action.list: _list, Action.compute: _compute, Action.draw: _draw, Action.all: _all}[action](plans, out)
+    do = {Action.list: _list, Action.compute: _compute, Action.draw: _draw, Action.all: _all}[action]
+    try:
+        for name in chosen:
+            figure(name)
+        do([plan(name, quality.value, out) for name in chosen], out)
+    except ModuleNotFoundError as error:
+        if (error.name or "").split(".")[0] not in EXTRAS:
+            raise
+        raise BackendError(f'figures need {error.name}: pip install "halfspace-sss[figures,render]"') from error
 
 
 def _say(text: str) -> None:

@@ -247,6 +247,22 @@ def test_the_command_states_the_time_of_the_paper_quality_before_it_is_spent(toy
     assert "3 measured by the same part in draft, scaled by work" in said
 
 
+@pytest.mark.parametrize(("module", "code"), [("matplotlib.figure", 1), ("tpyo", None)])
+def test_a_missing_library_is_named_and_a_mistake_is_not_hidden(
+    module: str, code: int | None, toy: Toy, tmp_path: Path
+) -> None:
+    def fail(_: Any) -> dict[str, bytes]:
+        raise ModuleNotFoundError(f"No module named {module!r}", name=module)
+
+    toy.draw = fail
+    result = _invoke("all", "toy", "--out", str(tmp_path))
+    if code is None:
+        assert isinstance(result.exception, ModuleNotFoundError)
+    else:
+        assert result.exit_code == code
+        assert 'figures need matplotlib.figure: pip install "halfspace-sss[figures,render]"' in result.stderr
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
