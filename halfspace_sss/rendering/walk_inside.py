@@ -16,13 +16,12 @@ from halfspace_sss.phase import eval_hg, sample_hg
 from halfspace_sss.rendering.walk_media import Coefficients
 from halfspace_sss.walk import ROULETTE_BOOST, ROULETTE_WEIGHT
 
-__all__ = ["Flight", "fly", "pick", "roulette", "turn", "weigh"]
+__all__ = ["Flight", "fly", "free_path", "pick", "roulette", "turn", "weigh"]
 
 
 class Flight(NamedTuple):
-    """A free flight: distance to the event, whether it is a scattering one, weights after it."""
+    """How a free flight ended: whether in a scattering event, and the weights after it."""
 
-    distance: Any
     scatters: Any
     weight: Any
     density: Any
@@ -49,22 +48,26 @@ def weigh(weight: Any, density: Any, value: Any, pdf: Any) -> tuple[Any, Any]:
     return weight * value * scale, grown * scale
 
 
-def fly(m: Coefficients, weight: Any, density: Any, channel: Any, reach: Any, u: Any) -> Flight:
-    """A free flight, cut short by the boundary at the distance `reach`."""
+def free_path(m: Coefficients, channel: Any, u: Any) -> Any:
+    """Distance to the next scattering event, scene units."""
+    import drjit as dr
+
+    return -dr.log(1 - u) / pick(m.sigma_t, channel)
+
+
+def fly(m: Coefficients, weight: Any, density: Any, channel: Any, t: Any, reach: Any) -> Flight:
+    """A free flight of length t, cut short by the boundary where that is at a distance `reach` < t."""
     import drjit as dr
     import mitsuba as mi
 
-    sigma = pick(m.sigma_t, channel)
-    t = -dr.log(1 - u) / sigma
     scatters = t < reach
-    distance = dr.minimum(t, reach)
     if len(weight) == 1:
         value = dr.select(scatters, m.sigma_s / m.sigma_t, 1)
-        return Flight(distance, scatters, weight * value, density)
-    through = dr.exp(-(m.sigma_t - sigma) * distance)  # over exp(-sigma t) of the walk's own channel
+        return Flight(scatters, weight * value, density)
+    through = dr.exp(-(m.sigma_t - pick(m.sigma_t, channel)) * dr.minimum(t, reach))  # over that of the walk's channel
     value = dr.select(scatters, m.sigma_s, mi.Spectrum(1)) * through
     pdf = dr.select(scatters, m.sigma_t, mi.Spectrum(1)) * through
-    return Flight(distance, scatters, *weigh(weight, density, value, pdf))
+    return Flight(scatters, *weigh(weight, density, value, pdf))
 
 
 def turn(m: Coefficients, weight: Any, density: Any, channel: Any, d: Any, u: Any, same_g: bool) -> tuple:

@@ -58,6 +58,7 @@ class WalkMedia:
         tables["rough"] = mi.Bool([is_rough(b) for b in self.boundaries])
         tables["shape"] = _by_pointer([mi.ShapePtr(found.shape) for found in self.objects])
         object.__setattr__(self, "tables", tables)
+        object.__setattr__(self, "box", _bounds(self.scene))
 
     @property
     def isotropic(self) -> bool:
@@ -148,6 +149,17 @@ class WalkMedia:
             [surface.boundary for surface in surfaces],
             float(mm_per_unit),
         )
+
+
+def _bounds(scene: Any) -> Any:
+    """The bounding box, a little larger; what is outside has leaked through the boundary by rounding."""
+    import mitsuba as mi
+
+    box = scene.bbox()
+    if not box.valid():
+        return box
+    margin = 1e-3 * (box.max - box.min)
+    return mi.BoundingBox3f(mi.Point3f(box.min - margin), mi.Point3f(box.max + margin))
 
 
 def is_rough(boundary: Any) -> bool:

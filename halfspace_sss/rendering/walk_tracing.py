@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from halfspace_sss.rendering.walk_inside import fly, roulette, turn
+from halfspace_sss.rendering.walk_inside import fly, free_path, roulette, turn
 from halfspace_sss.rendering.walk_media import WalkMedia
 from halfspace_sss.walk import _generator, pass_seed
 
@@ -88,15 +88,15 @@ class PathTracer:
         import mitsuba as mi
 
         rng, media = s["rng"], self.media
-        ray = mi.Ray3f(s["o"], s["d"])
-        hit = media.scene.ray_intersect_preliminary(ray, coherent=False)
         m = media.coefficients(s["object"])
-        flight = fly(m, s["weight"], s["density"], s["channel"], hit.t, rng.next_float32())
-        s = {**s, "weight": flight.weight, "density": flight.density, "alive": s["alive"] & hit.is_valid()}
-        s["object"] = dr.select(s["alive"], s["object"], OUTSIDE)
-        s = dr.if_stmt((s, ray, flight.distance, m), s["alive"] & flight.scatters, self._scatter,
-                       lambda s, *rest: s, label="scatter")  # fmt: skip
-        at_boundary = s["alive"] & ~flight.scatters
+        t = free_path(m, s["channel"], rng.next_float32())
+        ray = mi.Ray3f(s["o"], s["d"])
+        ray.maxt = t
+        hit = media.scene.ray_intersect_preliminary(ray, coherent=False)
+        flight = fly(m, s["weight"], s["density"], s["channel"], t, hit.t)
+        s = {**s, "weight": flight.weight, "density": flight.density}
+        s = dr.if_stmt((s, ray, t, m), flight.scatters, self._scatter, lambda s, *rest: s, label="scatter")
+        at_boundary = ~flight.scatters
         return dr.if_stmt((s, ray, hit), at_boundary, self._leave, lambda s, *rest: s, label="boundary")
 
     def _scatter(self, s: dict, ray: Any, distance: Any, m: Any) -> dict:
@@ -108,9 +108,10 @@ class PathTracer:
         d, weight, density = turn(m, s["weight"], s["density"], s["channel"], ray.d, u, self.media.same_g)
         survives, weight = roulette(weight, s["scale"], rng.next_float32())
         order = s["order"] + 1
-        alive = survives & (order <= self.media.row("most", s["object"]))
+        o = ray(distance)
+        alive = survives & (order <= self.media.row("most", s["object"])) & self.media.box.contains(o)
         number = dr.select(alive, s["object"], OUTSIDE)
-        return {**s, "o": ray(distance), "d": d, "weight": weight, "density": density, "order": order,
+        return {**s, "o": o, "d": d, "weight": weight, "density": density, "order": order,
                 "alive": alive, "object": number}  # fmt: skip
 
     def _leave(self, s: dict, ray: Any, hit: Any) -> dict:
