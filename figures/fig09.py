@@ -1,0 +1,129 @@
+"""Fig. 9: five materials under a small light and in surroundings, path traced and by the models, with FLIP."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from figures.image_grid import image_grid
+from figures.model_inputs import weight_files
+from figures.page import page
+from figures.part import Part, Result, Task
+from figures.scenes import BUNNY, bunny_scene
+from figures.shot import Shot, absent, compared
+from figures.style import look, paper, saved
+from halfspace_sss import materials
+from halfspace_sss.provenance import check_folder
+
+__all__ = ["TITLE", "draw", "parts", "path_traced", "rendered"]
+
+TITLE = "five materials, path traced and by five models, with FLIP"
+MATERIALS = ("marble", "apple", "potato", "ketchup", "regular chocolate milk")
+MODELS = ("standard_dipole", "better_dipole", "directional_dipole", "photon_beam_diffusion", "neural")
+SIZES = {"draft": 96, "paper": 384}
+MODEL_SPP = {"draft": 64, "paper": 1024}
+TRUTH_SPP = {"draft": 256, "paper": 8192}
+SPP_PER_PASS = 16
+FULL_GEOMETRY = "Full geometry"
+NOTES = (
+    "All images contain all scattering orders: to the models without single scattering it is added, path traced. "
+    "FLIP and relative squared error of the pixels of the object at the stated exposure, against the path traced image, "
+    "whose own noise is in all of them alike. Seconds for the image on this machine, without compilation."
+)
+
+
+def parts(quality: str) -> list[Part]:
+    """For each material the path-traced image, then the image of each model."""
+    size, found = SIZES[quality], []
+    for material in MATERIALS:
+        common = {"material": material, "size": size, "seed": 0}
+        spp = TRUTH_SPP[quality]
+        found.append(
+            Part(f"{material}, path traced", path_traced, {**common, "spp": spp}, spp * size**2, inputs=(BUNNY,))
+        )
+        spp = MODEL_SPP[quality]
+        for model in MODELS:
+            params = {**common, "spp": spp, "model": model}
+            weights = weight_files(model, materials.load(material).medium)
+            found.append(Part(f"{material}, {model}", rendered, params, spp * size**2, inputs=(BUNNY, *weights)))
+    return found
+
+
+def prepare() -> None:
+    """Set the variant of Mitsuba that the figures use, and register the plugins."""
+    import mitsuba as mi
+
+    from halfspace_sss import rendering
+
+    if mi.variant() != "llvm_ad_rgb":
+        mi.set_variant("llvm_ad_rgb")
+    rendering.register()
+
+
+def path_traced(task: Task) -> dict[str, Any]:
+    """The image by random walks, in passes that survive an interruption."""
+    from halfspace_sss.rendering import reference
+    from halfspace_sss.rendering.scene_files import load_scene
+
+    prepare()
+    p = task.params
+    scene = load_scene(bunny_scene(p["material"], p["size"]), "path_traced")
+    passes = p["spp"] // SPP_PER_PASS
+    found = reference.render(
+        scene, check_folder(task.folder) / "passes.exr", spp_per_pass=SPP_PER_PASS, seed=p["seed"], passes=passes,
+        progress=lambda so_far: task.progress(so_far.passes, passes),
+    )  # fmt: skip
+    image, variance = (v.astype(np.float32) for v in (found.mean, found.variance))
+    return {"image": image, "variance": variance, "seconds": found.seconds, "spp": found.spp}
+
+
+def rendered(task: Task) -> dict[str, Any]:
+    """The image of a model, and the seconds it takes once it is compiled."""
+    import mitsuba as mi
+
+    from halfspace_sss.rendering.scene_files import load_scene
+
+    prepare()
+    p = task.params
+    scene = load_scene(bunny_scene(p["material"], p["size"]), p["model"])
+    np.array(mi.render(scene, spp=1, seed=p["seed"]))
+    started = time.perf_counter()
+    image = np.array(mi.render(scene, spp=p["spp"], seed=p["seed"] + 1))
+    return {"image": image.astype(np.float32), "seconds": time.perf_counter() - started, "spp": p["spp"]}
+
+
+def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
+    """The figure as PDF and PNG, the page to flip between the images, and the numbers as a table."""
+    import pandas
+
+    scenes, rows = {}, []
+    for material in MATERIALS:
+        name, shots = _shots(results, material)
+        scenes[name] = shots
+        rows += [{"material": material, "model": s.label, **s.numbers} for s in shots if s.image is not None]
+    with paper():
+        files: dict[str, bytes | str] = {f"fig09.{end}": data for end, data in saved(image_grid(scenes)).items()}
+    files["fig09.csv"] = pandas.DataFrame(rows).to_csv(index=False, lineterminator="\n")
+    files["fig09.html"] = page("Fig. 9: five materials by five models", scenes, notes=NOTES)
+    return files
+
+
+def _shots(results: Mapping[str, Result], material: str) -> tuple[str, list[Shot]]:
+    """The material with its exposure, and the images, multiplied by it."""
+    truth = results[f"{material}, path traced"]
+    reference = truth.images["image"]
+    mask = reference.max(axis=2) > 0
+    stops = float(np.round(-np.log2(np.percentile(reference[mask], 97)), 1))
+    gain = np.float32(2.0**stops)
+    error = float(np.sqrt(truth.images["variance"][mask].sum() / np.sum(reference[mask] ** 2)))
+    numbers = {"seconds": truth.numbers["seconds"], "spp": truth.numbers["spp"], "standard error": error}
+    shots = [Shot("Path traced", gain * reference, numbers)]
+    for model in MODELS:
+        found = results[f"{material}, {model}"]
+        numbers = {"seconds": found.numbers["seconds"], "spp": found.numbers["spp"]}
+        label = "Neural half-space" if model == "neural" else look(model).label
+        shots.append(compared(label, gain * found.images["image"], gain * reference, mask=mask, numbers=numbers))
+    return f"{material} ({stops:+g} stops)", [*shots, absent(FULL_GEOMETRY, "later")]
