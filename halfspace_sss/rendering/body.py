@@ -104,7 +104,7 @@ def _check_size(found: Object, media: list[Medium], settings: Settings) -> None:
     thickness = [found.size * float(m.sigma_t) for m in media]
     if min(thickness) < SMALL or max(thickness) > LARGE:
         warnings.warn(
-            f"object {found.shape.id()!r} is {found.size * settings.mm_per_unit:.3g} mm, that is {min(thickness):.3g} "
-            f"to {max(thickness):.3g} mean free paths, across: check mm_per_unit = {settings.mm_per_unit:g}",
+            f"object {found.shape.id()!r} is {min(thickness):.3g} to {max(thickness):.3g} mean free paths across, "
+            f"{found.size * settings.mm_per_unit:.3g} mm: check mm_per_unit = {settings.mm_per_unit:g}",
             stacklevel=2,
         )

@@ -23,8 +23,8 @@ def integrator_class() -> type:
             self.settings = read_settings(props)
             self._prepared: tuple[Any, Any] = (None, None)
 
-        def bodies(self, scene: Any) -> list[Any]:
-            """The translucent objects of a scene, made ready once."""
+        def prepare(self, scene: Any) -> list[Any]:
+            """The translucent objects of a scene, made ready once; ValueError if the scene cannot be rendered."""
             if self._prepared[0] is not scene:
                 self._prepared = (scene, make_bodies(scene, self.settings))
             return self._prepared[1]
@@ -32,7 +32,7 @@ def integrator_class() -> type:
         def sample(
             self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Any = True
         ) -> tuple[Any, Any, list]:
-            L, seen = trace_paths(scene, self.bodies(scene), self.settings, sampler, ray, active)
+            L, seen = trace_paths(scene, self.prepare(scene), self.settings, sampler, ray, active)
             return L, seen, []
 
         def to_string(self) -> str:

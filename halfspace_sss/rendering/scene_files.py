@@ -24,7 +24,8 @@ def load_scene(scene: dict | str | Path, model: str | None = None, orders: str |
         orders: of all translucent objects, instead of what the scene says.
 
     Raises:
-        ValueError: no such file, model or orders, the file is no scene, or it has no translucent object.
+        ValueError: no such file, model or orders, the file is no scene, it has no translucent object, or the integrator
+            refuses it.
     """
     import mitsuba as mi
 
@@ -42,7 +43,11 @@ def load_scene(scene: dict | str | Path, model: str | None = None, orders: str |
         for node in state.nodes:
             if node.props.plugin_name() in _INTEGRATORS.values():
                 _set_integrator(node.props, _INTEGRATORS[model == PATH_TRACED])
-    return mi.parser.instantiate(config, state)
+    loaded = mi.parser.instantiate(config, state)
+    integrator = loaded.integrator()
+    if hasattr(integrator, "prepare"):
+        integrator.prepare(loaded)  # here, because Mitsuba wraps what is refused while it renders
+    return loaded
 
 
 def _check(model: str | None) -> None:

@@ -48,5 +48,5 @@ class Settings:
 
 def read_settings(props: Any) -> Settings:
     """Settings from the parameters of the plugin; ValueError if one is out of range."""
-    given = {key: props[key] for key in Settings.__dataclass_fields__ if props.has_property(key)}
+    given = {key: props[key] for key in Settings.__dataclass_fields__ if key in props}
     return Settings(**given)

@@ -131,11 +131,11 @@ def _check_model(name: str) -> None:
 
 
 def _medium(props: Any) -> tuple[str, Medium]:
-    inline = [key for key in ("sigma_s", "sigma_a", "g", "eta") if props.has_property(key)]
-    if props.has_property("material"):
+    inline = [key for key in ("sigma_s", "sigma_a", "g", "eta") if key in props]
+    if "material" in props:
         if inline:
             raise ValueError(f"material must stand without {', '.join(inline)}, got both")
-        dilution = float(props["dilution"]) if props.has_property("dilution") else None
+        dilution = float(props["dilution"]) if "dilution" in props else None
         material = materials.load(props["material"], dilution=dilution)
         label, medium, names = material.name, material.medium, material.channels
     elif "sigma_s" in inline and "sigma_a" in inline:
@@ -149,7 +149,7 @@ def _medium(props: Any) -> tuple[str, Medium]:
 
 def _for_variant(label: str, medium: Medium, names: Any, props: Any) -> tuple[str, Medium]:
     n, wanted = medium.n_channels, variant_channels()
-    channel = props["channel"] if props.has_property("channel") else None
+    channel = props["channel"] if "channel" in props else None
     if wanted == 1 and n is not None:
         if channel is None:
             raise ValueError(f"channel must be given under a mono variant, got none for {label} with {n} channels")
