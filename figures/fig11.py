@@ -1,0 +1,156 @@
+"""Fig. 11: path tracing and ours in the same time, raw and denoised by Open Image Denoise, with FLIP."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from figures.contenders import MODELS, VOLUMES, WALK, contender, label
+from figures.denoise import check_denoiser, denoised, guides
+from figures.fig09 import prepare
+from figures.image_grid import image_grid
+from figures.model_inputs import weight_files
+from figures.page import page
+from figures.part import Part, Result, Task
+from figures.scenes import BUNNY
+from figures.shot import FLIP, RELATIVE_MSE, Shot, compared
+from figures.style import paper, saved
+from figures.timed import Timed, alternating, pass_size
+from halfspace_sss import materials
+from halfspace_sss.provenance import check_folder
+
+__all__ = ["TITLE", "draw", "parts", "rivals", "truth"]
+
+TITLE = "path tracing and ours in equal time, raw and denoised, with FLIP"
+MATERIALS = ("marble", "ketchup")
+LIGHTS = "both"
+OURS = MODELS[-1]
+METHODS = (*VOLUMES, WALK, OURS)
+SIZES = {"draft": 96, "paper": 384}
+SECONDS = {"draft": 3.0, "paper": 60.0}  # for an image
+TRUTH_SPP = {"draft": 512, "paper": 16384}
+TRUTH_PASS = 32
+PASSES, SHORTEST = 8, 1.5  # of an image, about; seconds, of a pass: a render has a cost of its own
+NOTES = (
+    "Every method had the same time, compilation left out; passes of all methods took turns on the same machine. Of "
+    "Mitsuba's volpathmis with Russian roulette from vertex 5, 64, 200 and 1024 on, the one with the smallest relMSE "
+    "is shown, a choice in its favour; the table of the files lists all. FLIP and relMSE of the pixels of the object "
+    "at the stated exposure, against a long render by our walk, whose own noise is in all of them alike. The denoiser "
+    "is led by the normals of the object."
+)
+
+
+def parts(quality: str) -> list[Part]:
+    """For each material a long path-traced image, then what every method makes of the time."""
+    size, found = SIZES[quality], []
+    for material in MATERIALS:
+        common = {"material": material, "size": size, "lights": LIGHTS}
+        spp = TRUTH_SPP[quality]
+        found.append(
+            Part(f"{material}, truth", truth, {**common, "spp": spp, "seed": 0}, spp * size**2, inputs=(BUNNY,))
+        )
+        params = {**common, "seconds": SECONDS[quality], "methods": list(METHODS), "seed": 1}
+        inputs = (BUNNY, *weight_files(OURS, materials.load(material).medium))
+        found.append(Part(f"{material}, equal time", rivals, params, len(METHODS) * SECONDS[quality], inputs=inputs))
+    return found
+
+
+def truth(task: Task) -> dict[str, Any]:
+    """A long image by our walk, in passes that survive an interruption."""
+    from halfspace_sss.rendering import reference
+
+    check_denoiser()  # before time is spent
+    prepare()
+    p = task.params
+    each = min(p["spp"], TRUTH_PASS)
+    passes = max(p["spp"] // each, 2)
+    found = reference.render(
+        contender(WALK, p["material"], p["size"], p["lights"]), check_folder(task.folder) / "passes.exr",
+        spp_per_pass=each, seed=p["seed"], passes=passes, progress=lambda now: task.progress(now.passes, passes),
+    )  # fmt: skip
+    image, variance = (v[..., :3].astype(np.float32) for v in (found.mean, found.variance))
+    return {"image": image, "variance": variance, "seconds": found.seconds, "spp": found.spp}
+
+
+def rivals(task: Task) -> dict[str, Any]:
+    """What each method makes of the same time, raw and denoised."""
+    check_denoiser()
+    prepare()
+    p = task.params
+    scenes = {name: contender(name, p["material"], p["size"], p["lights"]) for name in p["methods"]}
+    each = max(p["seconds"] / PASSES, min(SHORTEST, p["seconds"]))
+    spp = {name: pass_size(scene, each, p["seed"]) for name, scene in scenes.items()}
+    found = alternating(scenes, spp, p["seed"], seconds=p["seconds"], progress=task.progress)
+    about = guides(next(iter(scenes.values())))
+    images, numbers = {"cover": about[0][..., 0]}, {}
+    for name, timed in found.items():
+        images[_key(name, "raw")] = timed.image.astype(np.float32)
+        images[_key(name, "denoised")], seconds = denoised(timed.image, *about)
+        numbers[name] = _numbers(timed, seconds)
+    return {**images, "methods": numbers}
+
+
+def _key(name: str, state: str) -> str:
+    """Of an image in a result."""
+    return f"{name.replace(' ', '_')}-{state}"
+
+
+def _numbers(timed: Timed, seconds: float) -> dict[str, Any]:
+    return {
+        "spp": timed.spp,
+        "seconds": timed.seconds,
+        "passes": len(timed.pass_seconds),
+        "seconds of denoising": seconds,
+    }
+
+
+def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
+    """The figure as PDF and PNG, the page to flip between the images, and the numbers as a table."""
+    import pandas
+
+    scenes, rows = {}, []
+    for material in dict.fromkeys(name.split(",")[0] for name in results):
+        name, shots, found = _shots(results[f"{material}, truth"], results[f"{material}, equal time"], material)
+        scenes[name] = shots
+        rows += found
+    with paper():
+        grid = image_grid(scenes, printed=(FLIP, RELATIVE_MSE, "spp"))
+        files: dict[str, bytes | str] = {f"fig11.{ending}": data for ending, data in saved(grid).items()}
+    files["fig11.csv"] = pandas.DataFrame(rows).to_csv(index=False, lineterminator="\n")
+    files["fig11.html"] = page("Fig. 11: path tracing and ours in equal time", scenes, notes=NOTES)
+    return files
+
+
+def _shots(truth: Result, rivals: Result, material: str) -> tuple[str, list[Shot], list[dict[str, Any]]]:
+    """The material with its exposure, the images that are shown, multiplied by it, and the rows of all methods."""
+    reference, mask = truth.images["image"], rivals.images["cover"] > 0
+    stops = float(np.round(-np.log2(np.percentile(reference[mask], 97)), 1))
+    gain = np.float32(2.0**stops)
+    error = float(np.sqrt(truth.images["variance"][mask].sum() / np.sum(reference[mask] ** 2)))
+    numbers = {name: truth.numbers[name] for name in ("spp", "seconds")}
+    shots, rows = {}, [{"material": material, "method": WALK, "state": "truth", **numbers, "standard error": error}]
+    for name, about in rivals.numbers["methods"].items():
+        for state in ("raw", "denoised"):
+            image = gain * rivals.images[_key(name, state)]
+            extra = {"spp": str(about["spp"]), "seconds": about["seconds"]}
+            if state == "denoised":
+                extra["seconds"] += about["seconds of denoising"]
+            shot = compared(_title(name, state), image, gain * reference, mask=mask, numbers=extra)
+            shots[name, state] = shot
+            rows.append({"material": material, "method": name, "state": state, **shot.numbers})
+    volumes = [name for name in rivals.numbers["methods"] if name in VOLUMES]
+    best = min(volumes, key=lambda name: shots[name, "raw"].numbers[RELATIVE_MSE])
+    for row in rows:
+        row["shown"] = row["state"] == "truth" or row["method"] not in volumes or row["method"] == best
+    reference_shot = Shot(
+        "Path traced, long", gain * reference, {**numbers, "spp": str(numbers["spp"]), "standard error": error}
+    )
+    chosen = [shot for (name, _), shot in shots.items() if name not in volumes or name == best]
+    return f"{material} ({stops:+g} stops)", [reference_shot, *chosen], rows
+
+
+def _title(name: str, state: str) -> str:
+    """Title of a column; the settings of volpathmis share one."""
+    return f"{'Mitsuba volpathmis' if name in VOLUMES else label(name)}, {state}"

@@ -1,0 +1,125 @@
+"""Renders against the clock: equal passes of several scenes in turn, so that what else runs slows all of them alike."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from halfspace_sss.checks import check_count, check_interval
+
+__all__ = ["Timed", "alternating", "pass_size", "rendered"]
+
+MOST_LANES = 2**22  # camera rays of a pass, for memory
+GROWTH = 16
+
+
+@dataclass(frozen=True, eq=False)
+class Timed:
+    """The average of passes.
+
+    Attributes:
+        image: linear radiance, float64 (H, W, 3).
+        spp: samples per pixel in all.
+        pass_seconds: of each pass, without compilation.
+    """
+
+    image: np.ndarray
+    spp: int
+    pass_seconds: tuple[float, ...]
+
+    @property
+    def seconds(self) -> float:
+        """Of all passes."""
+        return float(sum(self.pass_seconds))
+
+    @property
+    def steady_seconds(self) -> float:
+        """Of all passes, had each taken as long as their median: what a busy machine delays now and then counts not."""
+        return float(np.median(self.pass_seconds) * len(self.pass_seconds))
+
+
+def rendered(scene: Any, spp: int, *seed: int) -> tuple[np.ndarray, float]:
+    """An image (H, W, 3) and the seconds it took; ValueError if it is not finite."""
+    import mitsuba as mi
+
+    number = int(np.random.SeedSequence(seed).generate_state(1)[0])
+    started = time.perf_counter()
+    image = np.array(mi.render(scene, spp=spp, seed=number), dtype=np.float64)[..., :3]
+    seconds = time.perf_counter() - started
+    if not np.isfinite(image).all():
+        raise ValueError(f"a render must be finite, got {int((~np.isfinite(image)).sum())} values that are not")
+    return image, seconds
+
+
+def pass_size(scene: Any, seconds: float, seed: int = 0) -> int:
+    """Samples per pixel of a pass that takes about so many seconds; its kernels are compiled then.
+
+    Args:
+        scene: Mitsuba scene.
+        seconds: aimed at; one sample per pixel may take longer.
+        seed: of what is rendered for it.
+
+    Raises:
+        ValueError: seconds is not above 0.
+    """
+    check_interval("seconds", seconds, 1e-6, 1e6)
+    pixels = int(np.prod(np.array(scene.sensors()[0].film().crop_size())))
+    most, spp, found = max(1, MOST_LANES // pixels), 1, []
+    rendered(scene, spp, seed, 0)  # compiles
+    while True:
+        rendered(scene, spp, seed, 2 * spp)  # some integrators compile for each number of samples
+        found.append((spp, rendered(scene, spp, seed, 2 * spp + 1)[1]))
+        if found[-1][1] > 0.3 * seconds or spp == most:
+            return min(most, _samples_in(seconds, found))
+        spp = min(most, max(spp + 1, int(spp * min(GROWTH, 0.5 * seconds / found[-1][1]))))
+
+
+def _samples_in(seconds: float, found: list[tuple[int, float]]) -> int:
+    """Samples in so many seconds from what the smallest and the largest number took: a render has a cost of its own."""
+    (few, least), (many, longest) = found[0], found[-1]
+    each = longest / many if many == few else max((longest - least) / (many - few), 0.2 * longest / many)
+    return max(1, many + round((seconds - longest) / each))
+
+
+def alternating(
+    scenes: Mapping[str, Any], spp: Mapping[str, int], seed: int, *, passes: int | None = None,
+    seconds: float | None = None, progress: Callable[[int, int], None] | None = None,
+) -> dict[str, Timed]:  # fmt: skip
+    """Render scenes in turn, a pass of each, until every one has its passes or its seconds.
+
+    Args:
+        scenes: by name; compiled before, e.g. by `pass_size`.
+        spp: of a pass, by name.
+        seed: of the run.
+        passes: of each scene.
+        seconds: of each scene; it ends with the pass that comes nearest.
+        progress: called with (done, in all).
+
+    Raises:
+        ValueError: neither passes nor seconds is given, or one is out of range.
+    """
+    if (passes is None) == (seconds is None):
+        raise ValueError(f"one of passes and seconds must be given, got {passes!r} and {seconds!r}")
+    check_count("passes", passes or 1, 1)
+    check_interval("seconds", seconds or 1.0, 1e-6, 1e6)
+    sums: dict[str, Any] = dict.fromkeys(scenes, 0.0)
+    times: dict[str, list[float]] = {name: [] for name in scenes}
+
+    def share(name: str) -> float:
+        """Done of what is to be done; half a pass before the end of the time it is all done."""
+        took = times[name]
+        if passes is not None:
+            return len(took) / passes
+        return (sum(took) + 0.5 * sum(took) / len(took)) / seconds if took else 0.0
+
+    while waiting := [name for name in scenes if share(name) < 1]:
+        for name in waiting:
+            image, took = rendered(scenes[name], spp[name], seed, list(scenes).index(name), len(times[name]) + 1)
+            sums[name], times[name] = sums[name] + image, [*times[name], took]
+            if progress is not None:
+                progress(int(1000 * sum(min(share(n), 1.0) for n in scenes)), 1000 * len(scenes))
+    return {name: Timed(sums[name] / len(t), len(t) * spp[name], tuple(t)) for name, t in times.items()}
