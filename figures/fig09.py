@@ -24,14 +24,14 @@ TITLE = "five materials, path traced and by five models, with FLIP"
 MATERIALS = ("marble", "apple", "potato", "ketchup", "regular chocolate milk")
 MODELS = ("standard_dipole", "better_dipole", "directional_dipole", "photon_beam_diffusion", "neural")
 SIZES = {"draft": 96, "paper": 384}
-MODEL_SPP = {"draft": 64, "paper": 1024}
+MODEL_SPP = {"draft": 192, "paper": 1024}
 TRUTH_SPP = {"draft": 256, "paper": 8192}
 SPP_PER_PASS = 16
 FULL_GEOMETRY = "Full geometry"
 NOTES = (
     "All images contain all scattering orders: to the models without single scattering it is added, path traced. "
-    "FLIP and relative squared error of the pixels of the object at the stated exposure, against the path traced image, "
-    "whose own noise is in all of them alike. Seconds for the image on this machine, without compilation."
+    "FLIP and relative squared error of the pixels of the object at the stated exposure, against the path traced "
+    "image, whose own noise is in all of them alike. Seconds for the image on this machine, without compilation."
 )
 
 
