@@ -22,6 +22,7 @@ from halfspace_sss.fresnel import F_r, F_t
 from halfspace_sss.interface import bssrdf, models
 from halfspace_sss.map_grid import MapGrid
 from halfspace_sss.map_tracing import MapUnit, trace_unit
+from halfspace_sss.measure import weight_variance
 from halfspace_sss.medium import Medium
 from halfspace_sss.tallies import AngularTally, FluxTally
 from halfspace_sss.walk import pass_seed, walk
@@ -145,6 +146,8 @@ def _queries(n: int) -> list[np.ndarray]:
 def bench_models(names: tuple[str, ...] | None = None, n: int = 1 << 15, least_seconds: float = 0.2) -> Iterator[Row]:
     """Evaluations of S per second in float32, batches of `n`: NumPy, torch (if installed) and Dr.Jit on the CPU.
 
+    With them the relative variance of the weight of the model's own samples, `measure.weight_variance`.
+
     Dr.Jit is given batches 16 times as large, since a kernel launch has a fixed cost; the sum of S is evaluated.
     """
     types = array_types()
@@ -164,7 +167,7 @@ def bench_models(names: tuple[str, ...] | None = None, n: int = 1 << 15, least_s
             continue  # not trained for this medium
         arrays, many = _queries(n), [types.Float(a) for a in _queries(16 * n)]
         dr.eval(many)
-        row: Row = {"model": name, "orders": model.orders}
+        row: Row = {"model": name, "orders": model.orders, "weight_variance": weight_variance(model)}
         row["numpy"] = _rate(lambda m=model, q=arrays: m.eval(*q), n, least_seconds)
         if torch is not None:
             tensors = [torch.from_numpy(a) for a in arrays]

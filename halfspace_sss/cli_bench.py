@@ -34,6 +34,7 @@ COLUMNS = {  # key of a row -> heading and format
     "mean": ("reflectance", "{:.4f}"), "standard_error": ("standard\nerror", "{:.1e}"),
     "equal_error_ratio": ("times slower\nthan the walk", "{:.3g}"),
     "model": ("model", "{}"), "orders": ("orders", "{}"),
+    "weight_variance": ("variance of\nsample weight", "{:.2f}"),
     "numpy": ("NumPy", "{:.1e}"), "torch": ("torch", "{:.1e}"), "drjit": ("Dr.Jit", "{:.1e}"), "maps": ("maps", "{}"),
     "mean_cell_error": ("mean cell\nerror", "{:.3f}"), "seconds": ("seconds", "{:.3g}"), "paths": ("paths", "{:.2e}"),
 }  # fmt: skip

@@ -243,3 +243,14 @@ def test_the_energy_table_notes_a_model_that_refuses_the_medium():
 def test_bad_arguments_are_refused_with_modelbound_and_value(call, message):
     with pytest.raises(ValueError, match=message):
         call(bssrdf("standard_dipole", Medium(1.0, 0.1)))
+
+
+def test_positions_of_a_denser_medium_raise_the_variance_of_the_weight(name):
+    try:
+        model, other = (bssrdf(name, Medium.from_albedo(0.9, sigma_t, 0.3, 1.3)) for sigma_t in (1.0, 8.0))
+    except ValueError as error:
+        pytest.skip(f"refused: {error}")
+    own = measure.weight_variance(model)
+    model.sample_position = other.sample_position
+    assert 0 < own < 10
+    assert measure.weight_variance(model) > 2 * own
