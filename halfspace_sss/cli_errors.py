@@ -33,6 +33,9 @@ def errors_command(
     ] = None,
     registry: Annotated[bool, typer.Option("--registry", help="All registered materials, every channel.")] = False,
     held_out: Annotated[int | None, typer.Option(help="This many random media over the range of `neural`.")] = None,
+    as_trained: Annotated[
+        bool, typer.Option("--as-trained", help="Held-out media as for the training: a third of them with g near 1.")
+    ] = False,
     truths: Annotated[
         bool, typer.Option("--truths", help="Reflectance against published and exact values instead.")
     ] = False,
@@ -55,7 +58,13 @@ def errors_command(
     if truths:
         _truths(material or registry or held_out is not None, model, out)
         return
-    media = _media(material or [], registry, held_out, seed, {"sigma_t": sigma_t, "albedo": albedo, "g": g, "eta": eta})
+    media = _media(
+        material or [],
+        registry,
+        (held_out, as_trained),
+        seed,
+        {"sigma_t": sigma_t, "albedo": albedo, "g": g, "eta": eta},
+    )
     _check(model, events, block, seed)
     _check_accepted(model or (), list(media.values()))
     array_types(backend)
@@ -90,7 +99,7 @@ def _truths(others: bool, names: list[str] | None, out: Path) -> None:
 
 
 def _media(
-    names: list[str], registry: bool, held_out: int | None, seed: int, given: dict[str, float | None]
+    names: list[str], registry: bool, drawn: tuple[int | None, bool], seed: int, given: dict[str, float | None]
 ) -> dict[str, Medium]:
     """Scalar media by label."""
     from halfspace_sss import materials
@@ -99,11 +108,14 @@ def _media(
     from halfspace_sss.neural.symmetric import channels
 
     stated = stated_medium(names, given)
+    held_out, as_trained = drawn
+    if as_trained and held_out is None:
+        raise ValueError("as_trained must come with held_out, got it alone")
     if sum((bool(names) or stated is not None, registry, held_out is not None)) > 1:
         raise ValueError("material, registry and held_out must be given one at a time, got several")
     if held_out is not None:
         check_count("held_out", held_out, 1)
-        media = held_out_media(held_out, seed)
+        media = held_out_media(held_out, seed, as_trained)
         return {f"a {float(m.albedo):.5g} g {float(m.g):.3g} eta {m.eta:.3g}": m for m in media}
     if stated is not None:
         return {"medium": stated}

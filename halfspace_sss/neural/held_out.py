@@ -31,9 +31,13 @@ BANDS = {
 }
 
 
-def held_out_media(n: int, seed: int = 0) -> list[Medium]:
-    """Media drawn as for the training of the universal network, from another seed."""
-    ratios = draw_media(n, np.random.default_rng([HELD_OUT_SEED, seed]))
+def held_out_media(n: int, seed: int = 0, as_trained: bool = False) -> list[Medium]:
+    """Media over the whole range, from other seeds than those of the training.
+
+    g is uniform, or, `as_trained`, log-uniform in 1 - g for a third of them: a harder set. albedo and eta as there.
+    """
+    rng = np.random.default_rng([HELD_OUT_SEED, seed])
+    ratios = draw_media(n, rng) if as_trained else draw_media(n, rng, steep_share=0.0)
     return [Medium.from_albedo(float(a), 1.0, float(g), float(eta)) for a, g, eta in zip(*ratios)]
 
 
