@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -14,14 +15,16 @@ import torch
 from typer.testing import CliRunner
 
 from halfspace_sss import Medium, cli, materials
+from halfspace_sss.arrays import library
 from halfspace_sss.neural import ablation as module
 from halfspace_sss.neural import noisy_maps, training
 from halfspace_sss.neural.ablation import BUDGETS, VARIANTS, Variant, ablation, caption, summary
-from halfspace_sss.neural.ablation_learner import drawn_by_area, model_of
+from halfspace_sss.neural.ablation_learner import SharedTurn, drawn_by_area, model_of
 from halfspace_sss.neural.budget import Samples, Seconds, train_within
 from halfspace_sss.neural.errors import Reference, model_error, reference_maps
 from halfspace_sss.neural.fit import Fit
 from halfspace_sss.neural.noisy_maps import CellGrid, draw_directions, make_pool
+from halfspace_sss.neural.paper_model import paper_inputs
 from halfspace_sss.neural.pool import MapPool
 from halfspace_sss.neural.training import MaterialRecipe
 
@@ -105,6 +108,18 @@ def test_the_variant_that_starts_from_the_universal_network_starts_ahead(pool: M
         for v in VARIANTS[-2:]
     )
     assert warm < 0.1 * cold
+
+
+def test_both_points_of_a_cell_are_seen_under_one_azimuth_of_incidence(pool: MapPool) -> None:
+    batch, medium = pool.batch(8, 16, torch.Generator().manual_seed(0)), FIG10.in_mfp()
+    found = SharedTurn(medium, 1.0, width=1).inputs(batch)
+    turn = torch.atan2(-found[..., 3], -found[..., 2])  # the forward direction
+    torch.testing.assert_close(turn[:, :16], turn[:, 16:], atol=1e-4, rtol=0.0)
+    assert float(turn[:, :16].std()) > 1.0
+    w_i, w_o = (1.3 * torch.sqrt(1 - mu**2) for mu in (batch.mu_i, batch.mu_o))
+    directions = (w_i, turn + math.pi), (w_o, turn + batch.delta_phi)
+    expected = paper_inputs(library(batch.r), batch.r, turn + batch.psi, *directions, batch.L)
+    torch.testing.assert_close(found, torch.stack(torch.broadcast_tensors(*expected), -1), atol=1e-4, rtol=1e-3)
 
 
 def test_cells_by_area_are_drawn_as_often_as_their_area_says(pool: MapPool) -> None:

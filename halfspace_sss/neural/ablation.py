@@ -14,7 +14,7 @@ import torch
 from halfspace_sss.backend import array_types
 from halfspace_sss.checks import check_count, check_scalar_medium
 from halfspace_sss.medium import Medium
-from halfspace_sss.neural.ablation_learner import Factored, drawn_by_area, model_of
+from halfspace_sss.neural.ablation_learner import Factored, SharedTurn, drawn_by_area, model_of
 from halfspace_sss.neural.budget import Budget, Samples, Seconds, train_within
 from halfspace_sss.neural.errors import Reference, model_error, reference_maps
 from halfspace_sss.neural.fit import Fit
@@ -58,7 +58,7 @@ class Variant:
 
     def learner(self, medium: Medium, pool: MapPool, seed: int) -> Any:
         """A torch module with `loss` and `network`."""
-        paper = PaperSubject().learner(medium, pool, seed)
+        paper = SharedTurn(medium, PaperSubject().learner(medium, pool, seed).scale, seed=seed)
         if self.learned == "S":
             return paper
         if self.symmetric and self.silu and self.width == 32:
@@ -67,9 +67,10 @@ class Variant:
 
 
 _WIDE = {"width": 256, "silu": False}
+_PAPER = {"learned": "S", "symmetric": False, **_WIDE}
 VARIANTS = (
-    Variant("paper: 6 inputs, S, squared error by area, 3 x 256 ReLU", "S", symmetric=False, by_area=True, **_WIDE),
-    Variant("+ cells by energy and evenly over u", "S", symmetric=False, **_WIDE),
+    Variant("paper: 6 inputs, S, squared error by area, 3 x 256 ReLU", by_area=True, **_PAPER),
+    Variant("+ cells by energy and evenly over u", **_PAPER),
     Variant("+ exponential output, relative error", "log S", symmetric=False, **_WIDE),
     Variant("+ analytic backbone", symmetric=False, **_WIDE),
     Variant("+ symmetric features", **_WIDE),

@@ -15,7 +15,7 @@ from halfspace_sss.interface import BSSRDF, Query
 from halfspace_sss.medium import Medium
 from halfspace_sss.neural.backbone import backbone, length_scale, unwarp
 from halfspace_sss.neural.features import N_FEATURES
-from halfspace_sss.neural.learners import apply_networks, initial_numbers
+from halfspace_sss.neural.learners import apply_networks, initial_numbers, relative_loss
 from halfspace_sss.neural.network import RELU, SILU, Network, layer_shapes
 from halfspace_sss.neural.noisy_maps import radial_edges
 from halfspace_sss.neural.paper_learner import PaperLearner
@@ -23,11 +23,24 @@ from halfspace_sss.neural.paper_model import N_INPUTS, T_SMALLEST, query_inputs
 from halfspace_sss.neural.pool import Batch, MapPool
 from halfspace_sss.neural.subjects import PaperTrial, Trial
 
-__all__ = ["Factored", "PlainTrial", "drawn_by_area", "model_of"]
+__all__ = ["Factored", "PlainTrial", "SharedTurn", "drawn_by_area", "model_of"]
 
 LOG_RANGE = 40.0  # of log(G/B); its exponential squared is still a float32
 DEPTH = 3
-STEEPEST = 10.0  # slope over log p: without a bound, points where p is far too small are all that counts in a batch
+
+
+class SharedTurn(PaperLearner):
+    """The paper's network, which sees both points of a cell under one random azimuth of incidence.
+
+    With an azimuth for each point the loss fits no more than the mean over azimuths, see `learners.cell_loss`.
+    """
+
+    def inputs(self, batch: Batch) -> torch.Tensor:
+        vectors = torch.view_as_complex(super().inputs(batch).unflatten(-1, (3, 2)))  # position, w_i, w_o
+        heading = torch.sgn(vectors[..., 1:2])
+        first = heading[:, : batch.y.shape[1]]
+        turn = torch.cat((first, first), dim=1) * heading.conj()
+        return torch.view_as_real(vectors * turn).flatten(-2)
 
 
 class Factored(nn.Module):
@@ -58,11 +71,7 @@ class Factored(nn.Module):
         log_p = log_p.view_as(batch.u)
         if not self.with_backbone:
             log_p = log_p - torch.log(self.frame[0].S_over_y(batch).clamp_min(1e-30))
-        hit, y = (torch.cat((part, part), dim=1) for part in (batch.hit, batch.y))
-        p = torch.exp(log_p.detach().clamp(-LOG_RANGE, LOG_RANGE))
-        # the gradient of `relative_loss`, which the bound leaves alone once p is about right
-        slope = (torch.roll(p, batch.y.shape[1], dims=1) - y) / (p + hit + 1e-20)
-        return (slope.clamp(-STEEPEST, STEEPEST) * log_p).mean()
+        return relative_loss(torch.exp(log_p.clamp(-LOG_RANGE, LOG_RANGE)), batch)
 
     def network(self) -> Network:
         return Network.from_vector(self.numbers.detach().numpy(), self.shapes, self.activation)
