@@ -28,4 +28,4 @@ A `Part` is a name, parameters ready for JSON, a function and its estimated work
 - Seconds for a unit of `work` are measured: what a draft took says what the paper quality will take.
 """
 
-FIGURES = ("fig09", "fig10", "fig11", "spheres")
+FIGURES = ("fig09", "fig10", "fig11", "spheres", "equal_error")

@@ -4,14 +4,20 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
+from figures.fig09 import prepare
+from figures.part import Task
 from figures.scenes import MM_PER_UNIT, bunny_scene
 from figures.style import look
+from halfspace_sss.provenance import check_folder
 
-__all__ = ["MODELS", "RR_DEPTHS", "VOLUMES", "WALK", "contender", "label", "volume"]
+__all__ = ["MODELS", "RR_DEPTHS", "VOLUMES", "WALK", "contender", "label", "long_walk", "volume"]
 
 MODELS = ("standard_dipole", "better_dipole", "directional_dipole", "photon_beam_diffusion", "neural")
 WALK = "translucent_walk"
 RR_DEPTHS = (5, 64, 200, 1024)
+LONG_PASS = 32  # samples per pixel of a pass of the long render
 _VOLUME = "volpathmis"
 
 
@@ -57,3 +63,22 @@ def label(method: str) -> str:
     if method == WALK:
         return "Our walk"
     return "Neural half-space" if method == "neural" else look(method).label
+
+
+def long_walk(task: Task) -> dict[str, Any]:
+    """A long image by our walk, in passes that survive an interruption: what the other images are compared with.
+
+    The parameters of the task are material, size, lights, spp and seed.
+    """
+    from halfspace_sss.rendering import reference
+
+    prepare()
+    p = task.params
+    each = min(max(p["spp"] // 8, 1), LONG_PASS)
+    passes = max(p["spp"] // each, 2)
+    found = reference.render(
+        contender(WALK, p["material"], p["size"], p["lights"]), check_folder(task.folder) / "passes.exr",
+        spp_per_pass=each, seed=p["seed"], passes=passes, progress=lambda now: task.progress(now.passes, passes),
+    )  # fmt: skip
+    image, variance = (v[..., :3].astype(np.float32) for v in (found.mean, found.variance))
+    return {"image": image, "variance": variance, "seconds": found.seconds, "spp": found.spp}

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from figures.contenders import MODELS, VOLUMES, WALK, contender, label
+from figures.contenders import MODELS, VOLUMES, WALK, contender, label, long_walk
 from figures.denoise import check_denoiser, denoised, guides
 from figures.fig09 import prepare
 from figures.image_grid import image_grid
@@ -19,7 +19,6 @@ from figures.shot import FLIP, RELATIVE_MSE, Shot, compared
 from figures.style import paper, saved
 from figures.timed import Timed, alternating, pass_size
 from halfspace_sss import materials
-from halfspace_sss.provenance import check_folder
 
 __all__ = ["TITLE", "draw", "parts", "rivals", "truth"]
 
@@ -31,7 +30,6 @@ METHODS = (*VOLUMES, WALK, OURS)
 SIZES = {"draft": 96, "paper": 384}
 SECONDS = {"draft": 3.0, "paper": 60.0}  # for an image
 TRUTH_SPP = {"draft": 512, "paper": 16384}
-TRUTH_PASS = 32
 PASSES, SHORTEST = 8, 1.5  # of an image, about; seconds, of a pass: a render has a cost of its own
 NOTES = (
     "Every method had the same time, compilation left out; passes of all methods took turns on the same machine. Of "
@@ -58,20 +56,9 @@ def parts(quality: str) -> list[Part]:
 
 
 def truth(task: Task) -> dict[str, Any]:
-    """A long image by our walk, in passes that survive an interruption."""
-    from halfspace_sss.rendering import reference
-
+    """The long image, if its rivals can be denoised."""
     check_denoiser()  # before time is spent
-    prepare()
-    p = task.params
-    each = min(p["spp"], TRUTH_PASS)
-    passes = max(p["spp"] // each, 2)
-    found = reference.render(
-        contender(WALK, p["material"], p["size"], p["lights"]), check_folder(task.folder) / "passes.exr",
-        spp_per_pass=each, seed=p["seed"], passes=passes, progress=lambda now: task.progress(now.passes, passes),
-    )  # fmt: skip
-    image, variance = (v[..., :3].astype(np.float32) for v in (found.mean, found.variance))
-    return {"image": image, "variance": variance, "seconds": found.seconds, "spp": found.spp}
+    return long_walk(task)
 
 
 def rivals(task: Task) -> dict[str, Any]:

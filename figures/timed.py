@@ -19,17 +19,22 @@ GROWTH = 16
 
 @dataclass(frozen=True, eq=False)
 class Timed:
-    """The average of passes.
+    """Passes of a scene.
 
     Attributes:
-        image: linear radiance, float64 (H, W, 3).
-        spp: samples per pixel in all.
+        images: of each pass, linear radiance, float32 (passes, H, W, 3).
+        spp: samples per pixel of all together.
         pass_seconds: of each pass, without compilation.
     """
 
-    image: np.ndarray
+    images: np.ndarray
     spp: int
     pass_seconds: tuple[float, ...]
+
+    @property
+    def image(self) -> np.ndarray:
+        """Their average, float64."""
+        return self.images.mean(axis=0, dtype=np.float64)
 
     @property
     def seconds(self) -> float:
@@ -37,9 +42,9 @@ class Timed:
         return float(sum(self.pass_seconds))
 
     @property
-    def steady_seconds(self) -> float:
-        """Of all passes, had each taken as long as their median: what a busy machine delays now and then counts not."""
-        return float(np.median(self.pass_seconds) * len(self.pass_seconds))
+    def typical_seconds(self) -> float:
+        """Of a pass: the median, on which what delays a few of them on a busy machine has no influence."""
+        return float(np.median(self.pass_seconds))
 
 
 def rendered(scene: Any, spp: int, *seed: int) -> tuple[np.ndarray, float]:
@@ -48,7 +53,7 @@ def rendered(scene: Any, spp: int, *seed: int) -> tuple[np.ndarray, float]:
 
     number = int(np.random.SeedSequence(seed).generate_state(1)[0])
     started = time.perf_counter()
-    image = np.array(mi.render(scene, spp=spp, seed=number), dtype=np.float64)[..., :3]
+    image = np.array(mi.render(scene, spp=spp, seed=number), dtype=np.float32)[..., :3]
     seconds = time.perf_counter() - started
     if not np.isfinite(image).all():
         raise ValueError(f"a render must be finite, got {int((~np.isfinite(image)).sum())} values that are not")
@@ -106,7 +111,7 @@ def alternating(
         raise ValueError(f"one of passes and seconds must be given, got {passes!r} and {seconds!r}")
     check_count("passes", passes or 1, 1)
     check_interval("seconds", seconds or 1.0, 1e-6, 1e6)
-    sums: dict[str, Any] = dict.fromkeys(scenes, 0.0)
+    images: dict[str, list[np.ndarray]] = {name: [] for name in scenes}
     times: dict[str, list[float]] = {name: [] for name in scenes}
 
     def share(name: str) -> float:
@@ -119,7 +124,8 @@ def alternating(
     while waiting := [name for name in scenes if share(name) < 1]:
         for name in waiting:
             image, took = rendered(scenes[name], spp[name], seed, list(scenes).index(name), len(times[name]) + 1)
-            sums[name], times[name] = sums[name] + image, [*times[name], took]
+            images[name].append(image)
+            times[name].append(took)
             if progress is not None:
                 progress(int(1000 * sum(min(share(n), 1.0) for n in scenes)), 1000 * len(scenes))
-    return {name: Timed(sums[name] / len(t), len(t) * spp[name], tuple(t)) for name, t in times.items()}
+    return {name: Timed(np.stack(images[name]), len(t) * spp[name], tuple(t)) for name, t in times.items()}

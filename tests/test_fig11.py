@@ -130,7 +130,7 @@ def test_errors_fall_with_the_time_and_every_scene_ends_at_its_budget(monkeypatc
     assert errors[0] > 5 * errors[1] > 25 * errors[2]
     assert clock.asked[:4] == [4, 5, 4, 5]
     found = alternating({"a": None}, {"a": 4}, 3, passes=3)["a"]
-    assert found.spp == 12 and found.steady_seconds == pytest.approx(0.12)
+    assert found.spp == 12 and found.typical_seconds == pytest.approx(0.04)
 
 
 @pytest.mark.parametrize("wrong", [{}, {"passes": 2, "seconds": 1.0}, {"passes": -1}, {"seconds": -1.0}])

@@ -1,0 +1,147 @@
+"""The time in which each method reaches the same error as Mitsuba's volume path tracer, and where that time goes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from figures import error_tables
+from figures.contenders import MODELS, VOLUMES, WALK, contender, long_walk
+from figures.denoise import guides
+from figures.fig09 import MATERIALS, prepare
+from figures.furnace import furnace, furnace_models
+from figures.model_inputs import weight_files
+from figures.part import Part, Result, Task
+from figures.sampling_cost import split
+from figures.scenes import BUNNY
+from figures.timed import Timed, alternating, rendered
+from halfspace_sss import materials
+
+__all__ = ["TITLE", "draw", "errors", "measured", "parts"]
+
+TITLE = "time to equal error against Mitsuba's volume path tracer, time per sample, white furnace"
+LIGHTS = ("small light", "even sky")
+BARE = "bare"  # without reflection and without the single scattering that a model lacks, as the prototype was
+PROTOTYPED = ("marble", "potato", "ketchup")
+SPLIT_MATERIAL = "marble"
+SIZES = {"draft": 48, "paper": 128}
+TRUTH_SPP = {"draft": 64, "paper": 8192}
+PASSES = {"draft": 3, "paper": 8}
+SPP = {  # of a pass; one that is much shorter would show what a render costs before its first sample
+    "draft": {"volume": 4, WALK: 8, "model": 64},
+    "paper": {"volume": 32, WALK: 64, "model": 512},
+}
+BARE_MODELS = {"draft": (MODELS[0], MODELS[-1]), "paper": MODELS}  # most of the time of a draft goes into compiling
+LANES = {"draft": 2**18, "paper": 2**22}
+FURNACE = {"draft": {"size": 16, "spp": 256}, "paper": {"size": 32, "spp": 16384}}
+
+
+def parts(quality: str) -> list[Part]:
+    """For each material and light the truth and the errors with times; then the time per sample, and the furnace."""
+    found = []
+    for material in MATERIALS:
+        for lights in LIGHTS:
+            found += _parts_of(material, lights, quality)
+    weights = weight_files("neural", materials.load(SPLIT_MATERIAL).medium)
+    common = {"material": SPLIT_MATERIAL, "models": list(MODELS), "lanes": LANES[quality], "repeats": 5}
+    found.append(Part("time per sample", split, common, LANES[quality], inputs=(BUNNY, *weights)))
+    for model in (WALK, *furnace_models()):
+        params = {"model": model, **FURNACE[quality]}
+        inputs = weight_files(model, materials.load(SPLIT_MATERIAL).medium) if model == "neural" else ()
+        work = params["spp"] * params["size"] ** 2
+        found.append(Part(f"furnace, {model}", furnace, params, work, inputs=inputs))
+    return found
+
+
+def _parts_of(material: str, lights: str, quality: str) -> list[Part]:
+    size, spp = SIZES[quality], SPP[quality]
+    common = {"material": material, "size": size, "lights": lights}
+    methods = [*VOLUMES, WALK, *MODELS]
+    if material in PROTOTYPED:
+        methods += [f"{model}, {BARE}" for model in BARE_MODELS[quality]]
+    kinds = {name: "volume" if name in VOLUMES else WALK if name == WALK else "model" for name in methods}
+    params = {**common, "passes": PASSES[quality], "spp": {name: spp[kinds[name]] for name in methods}, "seed": 1}
+    work = sum(params["spp"].values()) * params["passes"] * size**2
+    truth = f"{material}, {lights}, truth"
+    inputs = (BUNNY, *weight_files("neural", materials.load(material).medium))
+    long = {**common, "spp": TRUTH_SPP[quality], "seed": 0}
+    return [
+        Part(truth, long_walk, long, long["spp"] * size**2, inputs=(BUNNY,)),
+        Part(f"{material}, {lights}, errors", measured, params, work, needs=(truth,), inputs=inputs),
+    ]
+
+
+def measured(task: Task) -> dict[str, Any]:
+    """Errors and times of all methods, whose passes take turns."""
+    prepare()
+    p = task.params
+    (truth,) = task.needed.values()
+    scenes = {}
+    for k, (name, spp) in enumerate(p["spp"].items()):
+        method, _, bare = name.partition(", ")
+        scenes[name] = contender(method, p["material"], p["size"], p["lights"], bare == BARE)
+        rendered(scenes[name], 1, p["seed"])  # compiles
+        if method == WALK:
+            rendered(scenes[name], spp, p["seed"])  # it compiles for each number of samples
+        task.progress(k, 2 * len(p["spp"]))
+    cover = guides(scenes[WALK], 8)[0][..., 0] > 0
+
+    def progress(done: int, total: int) -> None:
+        task.progress(total + done, 2 * total)
+
+    found = alternating(scenes, p["spp"], p["seed"], passes=p["passes"], progress=progress)
+    traced = (WALK, *VOLUMES)
+    rows = [{"method": name, **errors(timed, truth, cover, name in traced)} for name, timed in found.items()]
+    level = float(np.mean(truth.images["image"][cover].astype(np.float64) ** 2))
+    noise = float(np.mean(truth.images["variance"][cover], dtype=np.float64))
+    about = {"mean square": level, "variance": noise, "seconds": truth.numbers["seconds"], "spp": truth.numbers["spp"]}
+    return {"rows": rows, "truth": about}
+
+
+def errors(timed: Timed, truth: Result, mask: np.ndarray, is_exact: bool) -> dict[str, float]:
+    """Mean squared errors of one pass, about a long independent image of the same method and about the truth.
+
+    The independent image of a model is the average of all other passes; that of a path tracer is the truth itself.
+    What the independent image and the truth vary by themselves is taken off, so that an error that is lost in the noise
+    of the truth can come out below 0.
+
+    Args:
+        timed: at least two passes.
+        truth: with images "image" and "variance".
+        mask: (H, W), true for the pixels that count.
+        is_exact: whether the method is a path tracer.
+    """
+    images = timed.images[:, mask].astype(np.float64)
+    count, total = len(images), images.sum(axis=0)
+    against = truth.images["image"][mask].astype(np.float64)
+    error = float(np.mean((images - against) ** 2)) - float(np.mean(truth.images["variance"][mask], dtype=np.float64))
+    others = [(total - image) / (count - 1) for image in images]
+    spread = float(np.mean([(image - other) ** 2 for image, other in zip(images, others)]) * (count - 1) / count)
+    variance = error if is_exact else spread
+    return {
+        "spp": timed.spp // count,
+        "seconds": timed.typical_seconds,
+        "variance": variance,
+        "bias2": 0.0 if is_exact else error - spread,
+        "error": error,
+        "spread": spread,
+    }
+
+
+def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
+    """The tables: all numbers as CSV, and what they say as Markdown."""
+    scenes = {
+        tuple(name.split(", ")[:2]): result.numbers for name, result in results.items() if name.endswith(", errors")
+    }
+    tables = {
+        "errors": error_tables.equal_error(scenes),
+        "sampling": error_tables.sampling(results["time per sample"].numbers["rows"]),
+        "furnace": error_tables.furnace({n[9:]: r.numbers for n, r in results.items() if n.startswith("furnace, ")}),
+    }
+    files: dict[str, bytes | str] = {
+        f"equal_error_{name}.csv": table.to_csv(index=False, lineterminator="\n") for name, table in tables.items()
+    }
+    files["equal_error.md"] = error_tables.markdown(tables["errors"], tables["sampling"], tables["furnace"])
+    return files
