@@ -170,7 +170,8 @@ def test_weights_are_not_taken_for_another_model(fig10: TrainedChannel, folder: 
         halfspace_sss.bssrdf("neural_paper", FIG10)
 
 
-def test_a_material_lists_the_model_if_it_is_trained() -> None:
+def test_a_material_lists_the_model_if_it_is_trained(look_in: Any, tmp_path: Path) -> None:
+    look_in(tmp_path)
     assert "neural_material" in materials.load("marble").models()
     assert "neural_material" not in materials.load("cream").models()
 
