@@ -67,7 +67,7 @@ def _reflectance(name: str, t: Truth) -> tuple[float, float] | None:
     return (R, error) if model.orders == "total" else (R + single_scattering.reflectance(t.medium, t.mu_i), error)
 
 
-def sampled_reflectance(model: BSSRDF, mu_i: float | str, seed: int = 0) -> tuple[float, float]:
+def sampled_reflectance(model: BSSRDF, mu_i: float | str, seed: int = 0, points: int = POINTS) -> tuple[float, float]:
     """R(mu_i) = ∫∫ S mu_o dw_o dA of a scalar medium by quasi Monte Carlo, and its error.
 
     R = mean of pi S / pdf_position with mu_o dw_o / pi sampled; mu_i is a cosine or "diffuse". The error is that of the
@@ -77,10 +77,10 @@ def sampled_reflectance(model: BSSRDF, mu_i: float | str, seed: int = 0) -> tupl
 
     values = []
     for k in range(REPEATS):
-        u = qmc.Sobol(5, seed=np.random.default_rng([seed, k])).random(POINTS).T
+        u = qmc.Sobol(5, seed=np.random.default_rng([seed, k])).random(points).T
         mu_o, phi_o = np.sqrt(u[2]), 2 * math.pi * u[3]
         at = model.sample_position(mu_o, (u[0], u[1]))
-        mu = np.sqrt(u[4]) if mu_i == "diffuse" else np.full(POINTS, float(mu_i))
+        mu = np.sqrt(u[4]) if mu_i == "diffuse" else np.full(points, float(mu_i))
         S = model.eval(at.r, mu, 2 * math.pi * u[1], mu_o, phi_o)
         values.append(float(np.mean(math.pi * S / at.pdf)))
     return float(np.mean(values)), float(np.std(values, ddof=1) / math.sqrt(REPEATS))

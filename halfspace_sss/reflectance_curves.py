@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from halfspace_sss import measure
+from halfspace_sss import single_scattering
 from halfspace_sss.channels import one_channel
 from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.curve_defaults import default_paths, default_range
@@ -20,13 +20,14 @@ from halfspace_sss.fresnel import mu_internal
 from halfspace_sss.interface import BSSRDF, bssrdf
 from halfspace_sss.interface import models as all_models
 from halfspace_sss.medium import Medium
+from halfspace_sss.model_truths import sampled_reflectance
 from halfspace_sss.passes import launch_shape
 from halfspace_sss.tracer import Trace, trace
 
 __all__ = ["FIG10_THETA_I", "curves"]
 
 FIG10_THETA_I = (0.0, 30.0, 60.0, 75.0)
-QUADRATURE = measure.Quadrature(per_decade=20, n_azimuth=12, n_mu=12)
+REFLECTANCE_POINTS = 2**14
 REFLECTANCE_PATHS = 4_000_000
 Progress = Callable[[int, int], None]  # steps done, steps in all
 
@@ -190,9 +191,11 @@ def _traced(
 def _modelled(model: BSSRDF, theta_deg: float, line: _Line, orders: str) -> Curve:
     mu_i = math.cos(math.radians(theta_deg))
     order = "total" if orders == "total" else model.orders
-    R = float(measure.reflectance(model, mu_i, order, QUADRATURE))
+    R, error = sampled_reflectance(model, mu_i, points=REFLECTANCE_POINTS)
+    if order != model.orders:
+        R += float(single_scattering.reflectance(model.medium, mu_i))
     S, S_at_r = line.cell_mean(model, mu_i), line.at_middle(model, mu_i)
-    return Curve(model.name, model.orders, theta_deg, S, S_at_r, np.zeros_like(S), {order: (R, 0.0)})
+    return Curve(model.name, model.orders, theta_deg, S, S_at_r, np.zeros_like(S), {order: (R, error)})
 
 
 def _evaluations_per_s(model: BSSRDF, line: _Line, n: int = 4096, least_seconds: float = 0.1) -> float:
