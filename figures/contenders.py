@@ -10,6 +10,8 @@ from figures.fig09 import prepare
 from figures.part import Task
 from figures.scenes import MM_PER_UNIT, bunny_scene
 from figures.style import look
+from halfspace_sss.medium import Medium
+from halfspace_sss.neural.symmetric import channels
 from halfspace_sss.provenance import check_folder
 
 __all__ = ["MODELS", "RR_DEPTHS", "VOLUMES", "WALK", "contender", "label", "long_walk", "volume"]
@@ -30,7 +32,9 @@ VOLUMES = tuple(volume(rr_depth) for rr_depth in RR_DEPTHS)
 
 
 def contender(method: str, material: str, size: int, lights: str, bare: bool = False) -> Any:
-    """The Mitsuba scene of the bunny for a method.
+    """The Mitsuba scene of the bunny for a method, or three, one for each channel; `timed.rendered` takes both.
+
+    Mitsuba's media have one phase function for all channels: it is given the channels of others one by one.
 
     Args:
         method: a name in `VOLUMES`, `WALK`, or a model of the library.
@@ -41,19 +45,31 @@ def contender(method: str, material: str, size: int, lights: str, bare: bool = F
         ValueError: no such method, material or lights.
     """
     from halfspace_sss import bssrdf, materials
-    from halfspace_sss.rendering.mitsuba_scene import with_media
     from halfspace_sss.rendering.scene_files import PATH_TRACED, load_scene
 
     description = bunny_scene(material, size, lights)
     if method in VOLUMES:
-        integrator = {"type": _VOLUME, "max_depth": -1, "rr_depth": int(method.split()[1]), "hide_emitters": True}
-        return with_media(description, MM_PER_UNIT, integrator)
+        return _volume_scene(description, materials.load(material).medium, int(method.split()[1]))
     if method == WALK:
         return load_scene(description, PATH_TRACED)
     if not bare:
         return load_scene(description, method)
     description["bunny"]["bsdf"]["reflection"] = False
     return load_scene(description, method, bssrdf(method, materials.load(material).medium).orders)
+
+
+def _volume_scene(description: dict[str, Any], medium: Medium, rr_depth: int) -> Any:
+    from halfspace_sss.rendering.mitsuba_scene import with_media
+
+    integrator = {"type": _VOLUME, "max_depth": -1, "rr_depth": rr_depth, "hide_emitters": True}
+    if np.ptp(medium.g) == 0:
+        return with_media(description, MM_PER_UNIT, integrator)
+    found = []
+    for one in channels(medium):
+        values = {key: float(getattr(one, key)) for key in ("sigma_s", "sigma_a", "g", "eta")}
+        bunny = {**description["bunny"], "bsdf": {"type": "translucent", **values}}
+        found.append(with_media({**description, "bunny": bunny}, MM_PER_UNIT, integrator))
+    return tuple(found)
 
 
 def label(method: str) -> str:

@@ -32,7 +32,8 @@ same error. *Variance*: the error is that about a long independent render by the
 about the path traced image, at the number of samples of this run; bias does not fall with time, so this ratio does.
 *Bias* is the root mean square of what the model would still be off after any time, over that of the image, and
 *until* the seconds after which `volpathmis` is as near to the truth as that. A dash: lost in the noise of the truth.
-The error of a path tracer that has not yet met its rare bright paths is underestimated, which lowers the ratios."""
+The error of a path tracer that has not yet met its rare bright paths is underestimated, which lowers the ratios.
+`volpathmis` renders the channels of a medium whose mean cosine differs between them one by one."""
 BARE_NOTES = """\
 The models without surface reflection and without added single scattering, as the prototype was measured, against
 `volpathmis` at its best setting and at rr_depth 200, which the prototype took. Asked for the dipoles, half of it for

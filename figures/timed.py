@@ -48,12 +48,19 @@ class Timed:
 
 
 def rendered(scene: Any, spp: int, *seed: int) -> tuple[np.ndarray, float]:
-    """An image (H, W, 3) and the seconds it took; ValueError if it is not finite."""
+    """An image (H, W, 3) and the seconds it took; ValueError if it is not finite.
+
+    Of a tuple of scenes the first gives the first channel, and so on; their times add up.
+    """
     import mitsuba as mi
 
     number = int(np.random.SeedSequence(seed).generate_state(1)[0])
     started = time.perf_counter()
-    image = np.array(mi.render(scene, spp=spp, seed=number), dtype=np.float32)[..., :3]
+    if isinstance(scene, tuple):
+        found = [np.array(mi.render(one, spp=spp, seed=number + k))[..., k] for k, one in enumerate(scene)]
+        image = np.stack(found, axis=2)
+    else:
+        image = np.array(mi.render(scene, spp=spp, seed=number), dtype=np.float32)[..., :3]
     seconds = time.perf_counter() - started
     if not np.isfinite(image).all():
         raise ValueError(f"a render must be finite, got {int((~np.isfinite(image)).sum())} values that are not")

@@ -11,11 +11,14 @@ import pandas
 import pytest
 
 from figures import equal_error, error_tables
-from figures.contenders import MODELS, VOLUMES, WALK
+from figures.contenders import MODELS, VOLUMES, WALK, contender
+from figures.fig09 import prepare
 from figures.furnace import furnace, furnace_models
 from figures.part import Part, Result, Task
 from figures.sampling_cost import STEPS
-from figures.timed import Timed
+from figures.scenes import MM_PER_UNIT
+from figures.timed import Timed, rendered
+from halfspace_sss import materials
 
 mi = pytest.importorskip("mitsuba")
 DIPOLE, BARE = MODELS[0], f"{MODELS[0]}, bare"
@@ -136,6 +139,37 @@ def test_the_white_furnace_of_a_walk_is_one(tmp_path: Path, results: dict[str, R
     assert DIPOLE in furnace_models() and "neural" in furnace_models()
     conserving: Any = furnace(Task({"model": "normalized_diffusion", "size": 16, "spp": 64}, tmp_path))
     assert conserving["mean"] < 1 + 4 * conserving["standard error"]
+
+
+def test_a_medium_with_a_mean_cosine_for_each_channel_is_shown_to_mitsuba_channel_by_channel() -> None:
+    prepare()
+    name = "regular chocolate milk"
+    medium, scenes = materials.load(name).medium, contender(VOLUMES[-1], name, 8, "even sky")
+    assert len(scenes) == 3
+    for k, scene in enumerate(scenes):
+        found = mi.traverse(scene)
+        assert float(found["bunny.interior_medium.phase_function.g"][0]) == pytest.approx(medium.g[k])
+        assert float(found["bunny.interior_medium.scale"]) == pytest.approx(MM_PER_UNIT * medium.sigma_t[k])
+        albedo = np.array(found["bunny.interior_medium.albedo.value.value"]).ravel()
+        np.testing.assert_allclose(albedo, medium.albedo[k], rtol=1e-6)
+
+
+def test_scenes_of_one_channel_each_make_one_image() -> None:
+    prepare()
+    film = {"type": "hdrfilm", "width": 4, "height": 4, "rfilter": {"type": "box"}}
+    skies = [{"type": "rgb", "value": [k, k + 1, k + 2]} for k in (1, 4, 7)]
+    scenes = tuple(
+        mi.load_dict(
+            {
+                "type": "scene",
+                "integrator": {"type": "path"},
+                "sensor": {"type": "perspective", "film": film},
+                "sky": {"type": "constant", "radiance": sky},
+            }
+        )
+        for sky in skies
+    )
+    np.testing.assert_allclose(rendered(scenes, 4, 1)[0].mean(axis=(0, 1)), [1, 5, 9], rtol=1e-5)
 
 
 def test_the_figure_covers_five_materials_two_lights_and_every_model() -> None:
