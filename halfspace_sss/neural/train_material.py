@@ -52,7 +52,7 @@ class MaterialRecipe:
 
 
 STANDARD = MaterialRecipe()
-FAST = MaterialRecipe(128, 6e7, how=Fit(steps=800, n_groups=16, n_queries=128, validate_every=800))
+FAST = MaterialRecipe(96, 4e7, how=Fit(steps=400, n_groups=16, n_queries=128, validate_every=400))
 
 
 @dataclass(frozen=True)
@@ -121,12 +121,17 @@ def train_channel(
     )
     data_seconds = time.monotonic() - started
     learner = subject.learner(medium, pool, seed)
+    found: list[ModelError] = []  # the last of them is that of the end, unless the run was over when it was resumed
+
+    def validate() -> float:
+        found.append(model_error(subject.model(medium, learner), reference))
+        return found[-1].error
+
     history = fit(
-        learner, pool, recipe.how, seed, checkpoint=place / CHECKPOINT if place else None,
-        validate=lambda: model_error(subject.model(medium, learner), reference).error,
+        learner, pool, recipe.how, seed, checkpoint=place / CHECKPOINT if place else None, validate=validate,
         target_error=target_error, progress=progress,
     )  # fmt: skip
-    error = model_error(subject.model(medium, learner), reference)
+    error = found[-1] if found else model_error(subject.model(medium, learner), reference)
     fit_seconds = time.monotonic() - started - data_seconds
     record = {"width": learner.width, "depth": learner.depth, **subject.record(learner)}
     record |= _record(medium, recipe, seed, error, history, data_seconds, fit_seconds)
