@@ -114,20 +114,28 @@ def errors(timed: Timed, truth: Result, mask: np.ndarray, is_exact: bool) -> dic
         is_exact: whether the method is a path tracer.
     """
     images = timed.images[:, mask].astype(np.float64)
-    count, total = len(images), images.sum(axis=0)
-    against = truth.images["image"][mask].astype(np.float64)
-    error = float(np.mean((images - against) ** 2)) - float(np.mean(truth.images["variance"][mask], dtype=np.float64))
-    others = [(total - image) / (count - 1) for image in images]
-    spread = float(np.mean([(image - other) ** 2 for image, other in zip(images, others)]) * (count - 1) / count)
-    variance = error if is_exact else spread
+    count = len(images)
+    against, noise = (truth.images[name][mask].astype(np.float64) for name in ("image", "variance"))
+    spread = images.var(axis=0, ddof=1).mean(
+        axis=1
+    )  # is the mean square about all other passes times (count - 1)/count
+    error = (np.mean((images - against) ** 2, axis=0) - noise).mean(axis=1)
+    bias2 = np.zeros_like(error) if is_exact else error - spread
     return {
         "spp": timed.spp // count,
         "seconds": timed.typical_seconds,
-        "variance": variance,
-        "bias2": 0.0 if is_exact else error - spread,
-        "error": error,
-        "spread": spread,
+        "variance": float(np.mean(error if is_exact else spread)),
+        "bias2": float(np.mean(bias2)),
+        "bias2 standard error": _standard_error(bias2),
+        "error": float(np.mean(error)),
+        "error standard error": _standard_error(error),
+        "spread": float(np.mean(spread)),
     }
+
+
+def _standard_error(pixels: np.ndarray) -> float:
+    """Of the mean; the noise of pixels is independent."""
+    return float(pixels.std(ddof=1) / np.sqrt(len(pixels)))
 
 
 def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:

@@ -25,6 +25,7 @@ ASKED = {  # times less time than volpathmis that a dipole without reflection is
 }
 PROTOTYPE = volume(200)  # what the numbers above were measured against
 LEARNT_SHARE = 0.5  # of what is asked of a dipole, for the learnt model
+CERTAIN = 2.0  # standard errors by which an error must stand out of the noise of the truth
 NOTES = """\
 Cost is mean squared error of the pixels of the object times seconds, compilation left out; a ratio is the cost of
 `volpathmis` at the best of its settings over that of the method: how many times less time the method needs for the
@@ -32,8 +33,9 @@ same error. *Variance*: the error is that about a long independent render by the
 about the path traced image, at the number of samples of this run; bias does not fall with time, so this ratio does.
 *Bias* is the root mean square of what the model would still be off after any time, over that of the image, and
 *until* the seconds after which `volpathmis` is as near to the truth as that. A dash: lost in the noise of the truth.
-The error of a path tracer that has not yet met its rare bright paths is underestimated, which lowers the ratios.
-`volpathmis` renders the channels of a medium whose mean cosine differs between them one by one."""
+Russian roulette only adds variance: where a setting of `volpathmis` seems to have less than one whose roulette begins
+later, it has not met its rare bright paths yet, and counts with the variance of the other. `volpathmis` renders the
+channels of a medium whose mean cosine differs between them one by one."""
 BARE_NOTES = """\
 The models without surface reflection and without added single scattering, as the prototype was measured, against
 `volpathmis` at its best setting and at rr_depth 200, which the prototype took. Asked for the dipoles, half of it for
@@ -56,34 +58,49 @@ def equal_error(scenes: Mapping[tuple[str, str], Mapping[str, Any]]) -> pandas.D
     """
     import pandas
 
-    rows = []
-    for (material, lights), found in scenes.items():
-        costs = {row["method"]: _product(row["variance"], row["seconds"]) for row in found["rows"]}
-        best = min((name for name in VOLUMES if costs.get(name, 0.0) > 0), key=lambda name: costs[name], default=None)
-        best_cost = costs[best] if best else np.nan
-        for row in found["rows"]:
-            name, level = row["method"], found["truth"]["mean square"]
-            rows.append(
-                {
-                    "material": material,
-                    "lights": lights,
-                    **row,
-                    "cost": costs[name],
-                    "relative bias": np.sqrt(max(row["bias2"], 0.0) / level),
-                    "ratio": _ratio(best_cost, costs[name]),
-                    "ratio with bias": _ratio(best_cost, _product(row["error"], row["seconds"])),
-                    "ratio to rr_depth 200": _ratio(costs[PROTOTYPE], costs[name]),
-                    "seconds until bias": _ratio(best_cost, row["bias2"]),
-                    "asked": asked(material, lights, name),
-                    "is best volpathmis": name == best,
-                }
-            )
-    return pandas.DataFrame(rows)
+    return pandas.DataFrame([row for scene, found in scenes.items() for row in _scene_rows(scene, found)])
 
 
-def _product(error: float, seconds: float) -> float:
-    """A cost; NaN where the error is lost in noise."""
-    return error * seconds if error > 0 else np.nan
+def _scene_rows(scene: tuple[str, str], found: Mapping[str, Any]) -> list[dict[str, Any]]:
+    costs = _costs(found["rows"])
+    best = min((name for name in VOLUMES if costs.get(name, 0.0) > 0), key=lambda name: costs[name], default=None)
+    best_cost, level, rows = costs.get(best, np.nan), found["truth"]["mean square"], []
+    for row in found["rows"]:
+        name, bias2, error = row["method"], _certain(row, "bias2"), _certain(row, "error")
+        if "," in name:  # it leaves out on purpose what the truth has
+            bias2 = error = np.nan
+        rows.append(
+            {
+                "material": scene[0],
+                "lights": scene[1],
+                **row,
+                "cost": costs[name],
+                "relative bias": np.sqrt(bias2 / level),
+                "ratio": _ratio(best_cost, costs[name]),
+                "ratio with bias": _ratio(best_cost, error * row["seconds"]),
+                "ratio to rr_depth 200": _ratio(costs.get(PROTOTYPE, np.nan), costs[name]),
+                "seconds until bias": _ratio(best_cost, bias2),
+                "asked": asked(*scene, name),
+                "is best volpathmis": name == best,
+            }
+        )
+    return rows
+
+
+def _costs(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+    """Variance times seconds by method; of volpathmis no variance is below that of a later roulette."""
+    of_a_sample, found = {row["method"]: row["variance"] * row["spp"] for row in rows}, {}
+    for row in rows:
+        name = row["method"]
+        later = VOLUMES[VOLUMES.index(name) :] if name in VOLUMES else (name,)
+        variance = max(of_a_sample[other] for other in later if other in of_a_sample) / row["spp"]
+        found[name] = variance * row["seconds"] if variance > 0 else np.nan
+    return found
+
+
+def _certain(row: Mapping[str, Any], key: str) -> float:
+    """A number of a row, NaN where the noise of the truth hides it."""
+    return row[key] if row[key] > CERTAIN * row[f"{key} standard error"] else np.nan
 
 
 def _ratio(above: float, below: float) -> float:
@@ -128,11 +145,17 @@ def _whole(rows: pandas.DataFrame) -> str:
         variance=kept["ratio"],
         **{
             "with bias": kept["ratio with bias"],
-            "bias": [f"{100 * v:.2g} %" if v else "0" for v in kept["relative bias"]],
+            "bias": [_percent(*pair) for pair in zip(kept["method"], kept["relative bias"])],
         },
         **{"until, s": kept["seconds until bias"]},
     )
     return _table(table)
+
+
+def _percent(method: str, share: float) -> str:
+    if method in (WALK, *VOLUMES):
+        return "none"
+    return f"{100 * share:.2g} %" if np.isfinite(share) else "—"
 
 
 def _bare(rows: pandas.DataFrame) -> str:

@@ -96,6 +96,7 @@ def test_variance_and_bias_are_told_apart_and_the_noise_of_the_truth_is_taken_of
     assert found["variance"] == pytest.approx(0.25, rel=0.05)
     assert found["bias2"] == pytest.approx(0.25, abs=0.02)
     assert found["error"] == pytest.approx(0.5, abs=0.03)
+    assert abs(found["bias2"] - 0.25) < 4 * found["bias2 standard error"] < 0.05
     traced = equal_error.errors(_noisy(exact, 0.0, 1.0, 4, 4), truth, mask, True)
     assert traced["variance"] == traced["error"] == pytest.approx(0.25, abs=0.02)
 
@@ -109,15 +110,38 @@ def test_a_cost_does_not_depend_on_how_long_the_render_was() -> None:
     assert max(costs) < 1.1 * min(costs)
 
 
-def test_a_truth_that_hides_an_error_leaves_a_dash() -> None:
-    row = {"seconds": 1.0, "bias2": -1e-6, "spread": 1.0, "spp": 4}
-    rows = [{**row, "method": VOLUMES[k], "variance": v, "error": v} for k, v in ((0, -0.1), (2, 2.0))]
-    rows.append({**row, "method": DIPOLE, "variance": 0.5, "error": -0.1})
-    table = error_tables.equal_error({("marble", "even sky"): {"rows": rows, "truth": {"mean square": 1.0}}})
-    table = table.set_index("method")
-    assert list(table["is best volpathmis"]) == [False, True, False]
-    assert table.loc[DIPOLE, "ratio"] == 4 and np.isnan(table.loc[DIPOLE, "ratio with bias"])
-    assert np.isnan(table.loc[VOLUMES[0], "ratio"])
+def _table(*errors: tuple[str, float, float]) -> pandas.DataFrame:
+    """The table of methods with a variance and an error, of the same time and number of samples, by method."""
+    plain = {"seconds": 2.0, "spp": 4, "spread": 1.0, "bias2 standard error": 0.1, "error standard error": 0.1}
+    rows = [
+        {**plain, "method": name, "variance": variance, "error": error, "bias2": error - variance}
+        for name, variance, error in errors
+    ]
+    scene = {"rows": rows, "truth": {"mean square": 4.0}}
+    return error_tables.equal_error({("marble", "even sky"): scene}).set_index("method")
+
+
+def test_what_the_noise_of_the_truth_hides_is_left_out() -> None:
+    table = _table((VOLUMES[0], 2.0, 2.0), (VOLUMES[2], -0.1, -0.1), (DIPOLE, 0.5, 0.15), (MODELS[1], 0.5, 1.5))
+    assert list(table["is best volpathmis"]) == [True, False, False, False]
+    assert np.isnan(table.loc[VOLUMES[2], "ratio"])
+    assert table.loc[DIPOLE, "ratio"] == 4
+    assert np.isnan(table.loc[DIPOLE, ["ratio with bias", "relative bias", "seconds until bias"]].astype(float)).all()
+    assert table.loc[MODELS[1], "ratio with bias"] == pytest.approx(2 / 1.5)
+    assert table.loc[MODELS[1], "relative bias"] == 0.5 and table.loc[MODELS[1], "seconds until bias"] == 4
+
+
+def test_roulette_that_begins_earlier_counts_with_no_less_variance() -> None:
+    table = _table((VOLUMES[0], 0.1, 0.1), (VOLUMES[1], 3.0, 3.0), (VOLUMES[2], 2.0, 2.0), (DIPOLE, 0.5, 0.5))
+    assert list(table["cost"]) == [6.0, 6.0, 4.0, 1.0]
+    assert list(table["is best volpathmis"]) == [False, False, True, False]
+    assert table.loc[VOLUMES[0], "variance"] == 0.1
+
+
+def test_a_bare_model_is_not_held_against_a_truth_with_all_orders() -> None:
+    table = _table((VOLUMES[2], 2.0, 2.0), (BARE, 0.5, 1.5))
+    assert table.loc[BARE, "ratio"] == table.loc[BARE, "ratio to rr_depth 200"] == 4
+    assert np.isnan(table.loc[BARE, "ratio with bias"]) and np.isnan(table.loc[BARE, "relative bias"])
 
 
 def test_half_of_what_a_dipole_is_asked_for_is_asked_of_the_neural_model() -> None:
