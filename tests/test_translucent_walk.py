@@ -119,6 +119,32 @@ def test_single_and_multiple_scattering_add_up_to_the_total() -> None:
     assert 0.02 < single.mean() / total.mean() < 0.9
 
 
+def _small_lamp() -> dict:
+    """A lamp that walks from the camera hardly ever hit."""
+    view = mi.ScalarTransform4f().look_at([20, 30, 40], [0, 0, 0], [0, 1, 0]).scale(2)
+    return {"type": "rectangle", "to_world": view, "emitter": {"type": "area", "radiance": 300.0},
+            "bsdf": {"type": "diffuse", "reflectance": 0.0}}  # fmt: skip
+
+
+def test_joins_bring_the_light_that_chance_brings_with_less_noise() -> None:
+    surface = {"sigma_s": 0.5, "sigma_a": 0.02, "eta": 1.5, "reflection": False, "orders": "multiple"}
+    joined, left_to_chance = (
+        _runs(mi.load_dict(_scene(surface, _small_lamp(), _cube(), join_share=share)), 12, spp, 1)
+        for share, spp in ((0.5, 64), (0.0, 1024))
+    )
+    assert np.abs(_z(joined, left_to_chance)).max() < 6.0
+    assert 64 * np.median(joined.var(axis=0)) < 0.05 * 1024 * left_to_chance.var(axis=0).mean()
+
+
+def test_a_point_light_is_seen_as_a_small_lamp_of_the_same_power() -> None:
+    surface = {"sigma_s": 0.5, "sigma_a": 0.02, "eta": 1.0, "orders": "multiple"}
+    place, radius = [20.0, 30.0, 40.0], 0.5
+    lamp = {"type": "sphere", "center": place, "radius": radius, "emitter": {"type": "area", "radiance": 100.0}}
+    point = {"type": "point", "position": place, "intensity": 100.0 * np.pi * radius**2}
+    a, b = (_runs(mi.load_dict(_scene(surface, light)), 12, 128, seed) for light, seed in ((lamp, 1), (point, 100)))
+    assert np.abs(_z(a, b)).max() < 6.0
+
+
 def test_normals_that_point_inwards_change_nothing() -> None:
     sphere = {"type": "sphere", "radius": 10.0}
     surface = {**COLOURED, "eta": 1.5}
@@ -142,7 +168,9 @@ def test_a_mono_variant_renders_one_channel_of_the_colours() -> None:
     assert np.abs(_z(colours, grey)).max() < 6.0
 
 
-@pytest.mark.parametrize(("key", "value"), [("mm_per_unit", 0.0), ("mm_per_unit", np.inf), ("max_depth", 0)])
+@pytest.mark.parametrize(
+    ("key", "value"), [("mm_per_unit", 0.0), ("mm_per_unit", np.inf), ("max_depth", 0), ("join_share", 1.5)]
+)
 def test_parameters_out_of_range_are_refused(key: str, value: float) -> None:
     with pytest.raises(RuntimeError, match=f"{key} must be .* got {value}"):
         mi.load_dict({"type": "translucent_walk", key: value})

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from halfspace_sss.rendering.walk_connect import find_joins
+from halfspace_sss.rendering.walk_guide import Guide
 from halfspace_sss.rendering.walk_media import WalkMedia
 from halfspace_sss.rendering.walk_tracing import PathTracer
 
@@ -24,7 +26,8 @@ def walk_integrator_class() -> type:
         """Path tracer whose paths walk through objects with the surface `translucent`.
 
         Parameters: `mm_per_unit` (1), `max_depth` (-1: no limit; counts surfaces seen from outside), `rr_depth` (5),
-        `hide_emitters` (false).
+        `hide_emitters` (false), `join_share` (0.5; probability of looking for light of small emitters from a scattering
+        event near the boundary, 0 leaves all light to chance).
         """
 
         def __init__(self, props: Any) -> None:
@@ -33,34 +36,45 @@ def walk_integrator_class() -> type:
             self.max_depth = _depth("max_depth", int(props.get("max_depth", -1)))
             self.rr_depth = _depth("rr_depth", int(props.get("rr_depth", 5)))
             self.hidden = bool(props.get("hide_emitters", False))
+            self.join_share = _share("join_share", float(props.get("join_share", 0.5)))
             self._prepared: tuple[Any, Any] = (None, None)
 
         def tracer(self, scene: Any) -> PathTracer:
             """What paths through a scene need, made ready once."""
             if self._prepared[0] is not scene:
-                media = WalkMedia.of(scene, self.mm_per_unit)
-                self._prepared = scene, PathTracer(scene, media, self.max_depth, self.rr_depth, self.hidden)
+                self._prepared = scene, _tracer_of(self, scene)
             return self._prepared[1]
 
         def render(
             self, scene: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0, develop: bool = True, evaluate: bool = True
         ) -> Any:
             sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
-            film = sensor.film()
             with dr.suspend_grad():
-                tracer = self.tracer(scene)
-                film.prepare([])
-                spp = spp or sensor.sampler().sample_count()
-                pixels = int(dr.prod(_sampled_size(film)))
-                most = max(1, SAMPLES_PER_LAUNCH // pixels)
-                for launch, start in enumerate(range(0, spp, most)):
-                    _launch(tracer, sensor, min(most, spp - start), (int(mi.UInt32(seed)[0]), launch))
-                return film.develop() if develop else None
+                _render(self.tracer(scene), sensor, int(mi.UInt32(seed)[0]), spp or sensor.sampler().sample_count())
+                return sensor.film().develop() if develop else None
 
         def to_string(self) -> str:
             return f"TranslucentWalk[mm_per_unit = {self.mm_per_unit:g}, max_depth = {self.max_depth}]"
 
     return TranslucentWalk
+
+
+def _render(tracer: PathTracer, sensor: Any, seed: int, spp: int) -> None:
+    """Fill the film of a sensor, in launches that fit into memory."""
+    import drjit as dr
+
+    sensor.film().prepare([])
+    most = max(1, SAMPLES_PER_LAUNCH // int(dr.prod(_sampled_size(sensor.film()))))
+    for launch, start in enumerate(range(0, spp, most)):
+        _launch(tracer, sensor, min(most, spp - start), (seed, launch))
+
+
+def _tracer_of(integrator: Any, scene: Any) -> PathTracer:
+    media = WalkMedia.of(scene, integrator.mm_per_unit)
+    joins = find_joins(scene, media, integrator.join_share)
+    guide = None if joins is None else Guide(scene, media, joins)
+    limits = integrator.max_depth, integrator.rr_depth, integrator.hidden
+    return PathTracer(scene, media, *limits, joins, guide)
 
 
 def _launch(tracer: PathTracer, sensor: Any, spp: int, seed: tuple[int, int]) -> None:
@@ -122,6 +136,12 @@ def _camera_rays(sensor: Any, spp: int, seed: tuple[int, int]) -> tuple[Any, Any
 def _positive(name: str, value: float) -> float:
     if not (math.isfinite(value) and value > 0):
         raise ValueError(f"{name} must be finite and > 0, got {value!r}")
+    return value
+
+
+def _share(name: str, value: float) -> float:
+    if not 0 <= value <= 1:
+        raise ValueError(f"{name} must be in [0, 1], got {value!r}")
     return value
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from halfspace_sss.rendering.object import Object, survey
 
-__all__ = ["Coefficients", "WalkMedia"]
+__all__ = ["Coefficients", "WalkMedia", "by_pointer", "pointer_numbers"]
 
 _FEWEST = {"total": 0, "multiple": 2, "single": 1}
 _MOST = {"total": 2**31 - 1, "multiple": 2**31 - 1, "single": 1}
@@ -42,6 +42,7 @@ class WalkMedia:
     mm_per_unit: float
 
     def __post_init__(self) -> None:
+        import drjit as dr
         import mitsuba as mi
 
         media = [inside.medium for inside in self.insides]
@@ -50,13 +51,16 @@ class WalkMedia:
         for key in ("sigma_t", "sigma_s", "g"):
             scale = 1.0 if key == "g" else self.mm_per_unit
             rows = np.array([np.broadcast_to(getattr(m, key), n) for m in media], dtype=float) * scale
-            tables[key] = [mi.Float(rows[:, c]) for c in range(n)] if len(media) else []
+            tables[key] = [mi.Float(rows[:, c].tolist()) for c in range(n)] if len(media) else []
+        tables["eta"] = mi.Float([m.eta for m in media])
         tables["sign"] = mi.Float([found.sign for found in self.objects])
         tables["fewest"] = mi.UInt32([_FEWEST[inside.orders] for inside in self.insides])
         tables["most"] = mi.UInt32([_MOST[inside.orders] for inside in self.insides])
         tables["reflects"] = mi.Bool([inside.reflection for inside in self.insides])
         tables["rough"] = mi.Bool([is_rough(b) for b in self.boundaries])
-        tables["shape"] = _by_pointer([mi.ShapePtr(found.shape) for found in self.objects])
+        tables["boundary"] = pointer_numbers([mi.BSDFPtr(b) for b in self.boundaries])
+        tables["shape"] = by_pointer([mi.ShapePtr(found.shape) for found in self.objects])
+        dr.make_opaque(tables)  # one kernel for all media
         object.__setattr__(self, "tables", tables)
         object.__setattr__(self, "box", _bounds(self.scene))
 
@@ -74,6 +78,11 @@ class WalkMedia:
     def any_rough(self) -> bool:
         """Whether a boundary is rough, so that emitters can be sampled through it."""
         return any(is_rough(b) for b in self.boundaries)
+
+    @property
+    def all_rough(self) -> bool:
+        """Whether no boundary is smooth."""
+        return all(is_rough(b) for b in self.boundaries)
 
     def row(self, key: str, k: Any) -> Any:
         """An entry of a table for object k."""
@@ -111,8 +120,7 @@ class WalkMedia:
 
         if len(self.boundaries) == 1:
             return self.boundaries[0]
-        pointers = mi.UInt32([int(dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(b))[0]) for b in self.boundaries])
-        return dr.reinterpret_array(mi.BSDFPtr, dr.gather(mi.UInt32, pointers, k))
+        return dr.reinterpret_array(mi.BSDFPtr, dr.gather(mi.UInt32, self.tables["boundary"], k))
 
     def face_outwards(self, si: Any, k: Any, direction: Any) -> Any:
         """The interaction with its normals turned to the outside of object k; `direction` is that of the ray."""
@@ -169,13 +177,20 @@ def is_rough(boundary: Any) -> bool:
     return bool(boundary.flags() & int(mi.BSDFFlags.Smooth))
 
 
-def _by_pointer(pointers: list[Any]) -> Any:
-    """Table from the number of a shape in Dr.Jit's registry to the number of the object."""
+def pointer_numbers(pointers: list[Any]) -> Any:
+    """What Dr.Jit's registry calls each."""
     import drjit as dr
     import mitsuba as mi
 
-    ids = [int(dr.reinterpret_array(mi.UInt32, pointer)[0]) for pointer in pointers]
+    return mi.UInt32([int(dr.reinterpret_array(mi.UInt32, pointer)[0]) for pointer in pointers])
+
+
+def by_pointer(pointers: list[Any]) -> Any:
+    """Table from the number of a pointer in Dr.Jit's registry to its place in the list, -1 for others."""
+    import mitsuba as mi
+
+    ids = np.array(pointer_numbers(pointers), dtype=int).tolist()
     table = np.full(max(ids, default=0) + 1, -1, dtype=np.int32)
     for k, number in enumerate(ids):
         table[number] = k
-    return mi.Int32(table)
+    return mi.Int32(table.tolist())  # lists, not NumPy arrays: memory in any alignment would need kernels of its own

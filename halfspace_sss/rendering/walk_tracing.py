@@ -5,6 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+from halfspace_sss.phase import eval_hg
+from halfspace_sss.rendering.walk_connect import Joins
+from halfspace_sss.rendering.walk_guide import Guide
 from halfspace_sss.rendering.walk_inside import fly, free_path, roulette, turn
 from halfspace_sss.rendering.walk_media import WalkMedia
 from halfspace_sss.walk import _generator, pass_seed
@@ -24,6 +27,8 @@ class PathTracer:
         max_depth: most vertices on surfaces seen from outside; what happens inside an object does not count.
         rr_depth: vertices outside after which roulette may end a path.
         hide_emitters: whether the camera sees no emitters.
+        joins: how light of small emitters enters objects, if there are any.
+        guide: how it leaves them where joins cannot find it.
     """
 
     scene: Any
@@ -31,6 +36,8 @@ class PathTracer:
     max_depth: int
     rr_depth: int
     hide_emitters: bool
+    joins: Joins | None
+    guide: Guide | None
 
     def trace(self, rays: Any, lanes: int, seed: tuple[int, ...]) -> tuple[Any, Any]:
         """Radiance along each ray, and whether it hits anything."""
@@ -71,6 +78,9 @@ class PathTracer:
             "density": full(mi.Spectrum, 1), "scale": full(mi.Float, 1), "L": full(mi.Spectrum, 0),
             "seen": full(mi.Bool, False), "depth": full(mi.UInt32, 0), "order": full(mi.UInt32, 0),
             "last": full(mi.Point3f, 0), "pdf": full(mi.Float, 1), "delta": full(mi.Bool, True),
+            "straight": full(mi.Bool, False), "joined": full(mi.Bool, False), "pivot": full(mi.Point3f, 0),
+            "guided": full(mi.Bool, False), "event": full(mi.Point3f, 0), "ahead": full(mi.Vector3f, 0),
+            "phase": full(mi.Float, 1), "from": full(mi.Int32, 0),
         }  # fmt: skip
 
     def _renew(self, s: dict, rays: Any, lanes: int, found: tuple) -> dict:
@@ -104,15 +114,41 @@ class PathTracer:
         import mitsuba as mi
 
         rng = s["rng"]
+        o = ray(distance)
+        if self.joins is not None:
+            smooth = ~self.media.row("rough", s["object"])
+            edge = s["straight"] & smooth & (s["order"] > 0)  # this event ends one
+            s = {**s, "joined": s["joined"] | edge, "pivot": dr.select(edge, ray.o, s["pivot"])}
+            s = dr.if_stmt((s, o, ray.d, m), self._may_join(s), self._join, lambda s, *rest: s, label="joins")
+            s["straight"] = mi.Bool(True)
+            s["guided"] = smooth & ~s["joined"] & self._counts(s, s["order"] + 1)
+            s = dr.if_stmt((s, o, ray.d, m), s["guided"], self._guide, lambda s, *rest: s, label="guide")
         u = mi.Point2f(rng.next_float32(), rng.next_float32())
         d, weight, density = turn(m, s["weight"], s["density"], s["channel"], ray.d, u, self.media.same_g)
         survives, weight = roulette(weight, s["scale"], rng.next_float32())
         order = s["order"] + 1
-        o = ray(distance)
         alive = survives & (order <= self.media.row("most", s["object"])) & self.media.box.contains(o)
         number = dr.select(alive, s["object"], OUTSIDE)
+        s["phase"] = dr.mean(mi.Spectrum([eval_hg(dr.dot(ray.d, d), g) for g in m.g]))
         return {**s, "o": o, "d": d, "weight": weight, "density": density, "order": order,
                 "alive": alive, "object": number}  # fmt: skip
+
+    def _may_join(self, s: dict) -> Any:
+        k = s["object"]
+        return ~self.media.row("rough", k) & (s["order"] + 2 <= self.media.row("most", k))
+
+    def _join(self, s: dict, p: Any, along: Any, m: Any) -> dict:
+        light = self.joins.light(p, along, s["object"], m, s["rng"])
+        return {**s, "L": s["L"] + s["weight"] * light}
+
+    def _guide(self, s: dict, v: Any, along: Any, m: Any) -> dict:
+        light = self.guide.light(v, along, s["object"], m, s["rng"])
+        return {**s, "L": s["L"] + s["weight"] * light}
+
+    def _counts(self, s: dict, order: Any) -> Any:
+        """Whether a walk that leaves after so many events counts."""
+        k = s["object"]
+        return (order >= self.media.row("fewest", k)) & (order <= self.media.row("most", k))
 
     def _leave(self, s: dict, ray: Any, hit: Any) -> dict:
         """Reflection at the boundary seen from inside, or the way out."""
@@ -124,7 +160,7 @@ class PathTracer:
         foreign = media.number(si.shape) != k  # of an object that overlaps: the flight goes on behind it
         si = media.face_outwards(si, k, ray.d)
         leaked = ~foreign & (dr.dot(si.n, ray.d) < 0)  # rounding has put the walk outside
-        counts = (s["order"] >= media.row("fewest", k)) & (s["order"] <= media.row("most", k))
+        counts = self._counts(s, s["order"])
         if media.any_rough:
             s["L"] += self._emitters(s, si, media.boundary(k), ~foreign & counts)
         bs, value = self._sample(media.boundary(k), si, rng)
@@ -132,6 +168,10 @@ class PathTracer:
         out = ~foreign & (dr.dot(d, si.n) > 0)
         alive = ~leaked & (foreign | (bs.pdf > 0)) & (~out | counts)
         d = dr.select(foreign, ray.d, d)
+        if self.joins is not None:
+            s["straight"] = s["straight"] & out
+            s["guided"] = s["guided"] & s["straight"]
+            s = {**s, "event": ray.o, "ahead": ray.d, "from": k}
         return {**s, "o": si.spawn_ray(d).o, "d": d, "alive": alive,
                 "object": dr.select(alive & ~out, k, OUTSIDE),
                 "weight": dr.select(foreign, s["weight"], s["weight"] * value),
@@ -147,6 +187,7 @@ class PathTracer:
         si = self.scene.ray_intersect(ray, mi.RayFlags.All, coherent=False)
         first = s["depth"] == 0
         s = {**s, "L": s["L"] + self._emission(s, si), "seen": s["seen"] | (first & si.is_valid())}
+        s["joined"], s["guided"] = mi.Bool(False), mi.Bool(False)
         s["depth"] += 1
         s["alive"] = si.is_valid() & (s["depth"] < mi.UInt32(self.max_depth))
         return dr.if_stmt((s, si, ray.d), s["alive"], self._bounce, lambda s, *rest: s, label="bounce")
@@ -206,7 +247,15 @@ class PathTracer:
         sampled = active & ~s["delta"]
         pdf = dr.select(sampled, self.scene.pdf_emitter_direction(last, ds, sampled), 0)
         share = dr.select(s["delta"], 1, balance(s["pdf"], pdf))
+        if self.joins is not None:
+            active &= ~(s["joined"] & self.joins.covers(emitter, si.p, s["d"], s["pivot"]))
+            guided = active & s["guided"]
+            _, _, more = dr.if_stmt((emitter, s, share), guided, self._against_guide, lambda *state: state)
+            share = dr.select(guided, more, share)
         return dr.select(active, s["weight"] * emitter.eval(si, active) * share, 0)
+
+    def _against_guide(self, emitter: Any, s: dict, share: Any) -> tuple:
+        return emitter, s, self.guide.share(emitter, s, s["guided"])
 
     def _emitters(self, s: dict, si: Any, bsdf: Any, active: Any, outwards: Any = True) -> Any:
         """Light of a sampled emitter by the surface at `si`; by a boundary only from its outer side."""
