@@ -100,6 +100,7 @@ class BSSRDF(abc.ABC):
         reciprocal: whether S(x_i, w_i; x_o, w_o) = S(x_o, w_o; x_i, w_i) holds exactly.
         source: paper and equation.
         mirror_invariant: whether S(phi_i, phi_o) = S(-phi_i, -phi_o) holds exactly.
+        fast_in: array library that evaluates it fastest on a CPU, "drjit" or "numpy".
     """
 
     name: ClassVar[str]
@@ -107,6 +108,7 @@ class BSSRDF(abc.ABC):
     reciprocal: ClassVar[bool]
     source: ClassVar[str]
     mirror_invariant: ClassVar[bool] = True
+    fast_in: str = "drjit"
 
     def __init__(self, medium: Medium) -> None:
         if not isinstance(medium, Medium):

@@ -88,6 +88,7 @@ class PlainTrial(BSSRDF):
     orders = "multiple"
     reciprocal = False
     mirror_invariant = False
+    fast_in = "numpy"
     source = "under training"
 
     def __init__(self, medium: Medium, network: Network, scale: float | None) -> None:

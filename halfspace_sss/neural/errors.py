@@ -19,12 +19,12 @@ from halfspace_sss.interface import BSSRDF
 from halfspace_sss.medium import Medium
 from halfspace_sss.neural.backbone import unwarp
 from halfspace_sss.neural.noisy_maps import LEAST_ALBEDO, CellGrid, Groups, Progress, make_pool, radial_edges
+from halfspace_sss.neural.quadrature import cell_energies
 from halfspace_sss.phase import eval_hg
 
 __all__ = ["ModelError", "Reference", "model_error", "reference_maps"]
 
 SET = 8  # directions of a set, each towards each at two azimuths
-NODES, NODE_WEIGHTS = np.polynomial.legendre.leggauss(2)
 
 
 class ModelError(NamedTuple):
@@ -68,22 +68,8 @@ class Reference:
         return cells[..., : n_u * b, : n_psi * b].reshape(*cells.shape[:-2], n_u, b, n_psi, b).sum(axis=(-3, -1))
 
     def model_energies(self, model: BSSRDF) -> np.ndarray:
-        """The same of a model, by Gauss quadrature of two by two points in each cell; (n, 16, ...)."""
-        groups, grid = self.groups, self.grid
-        out = np.empty((len(groups), groups.mu_o.shape[1], grid.n_u, grid.n_psi))
-        edges, lib = radial_edges(groups, grid), library(0.0)
-        psi, psi_weight = _points(np.linspace(-math.pi, math.pi, grid.n_psi + 1))
-        for k in range(len(groups)):
-            u, u_weight = _points(edges[k])
-            L = float(groups.L[k])
-            r = L * unwarp(lib, u)
-            area = (r * L / (1 + np.exp(-u)) * u_weight)[:, None] * psi_weight
-            mu_i, mu_o = groups.mu_i[k], groups.mu_o[k][:, None, None]
-            phi_o = groups.delta_phi[k][:, None, None] - psi
-            S = model.eval(r[:, None], mu_i, math.pi - psi, mu_o, phi_o)
-            E = S * area * mu_i * mu_o
-            out[k] = E.reshape(-1, grid.n_u, 2, grid.n_psi, 2).sum(axis=(2, 4))
-        return self._blocks(out)
+        """The same of a model, by quadrature; (n, 16, ...)."""
+        return self._blocks(cell_energies(model, self.groups, self.grid))
 
     def single_energies(self) -> np.ndarray:
         """The same of single scattering, exactly: a line of each pair of directions, (n, 16, ...)."""
@@ -114,12 +100,6 @@ class Reference:
 
 def _weight(mu: np.ndarray, eta: float) -> np.ndarray:
     return mu * F_t(mu, eta)
-
-
-def _points(edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    half = 0.5 * np.diff(edges)[:, None]
-    middle = 0.5 * (edges[1:] + edges[:-1])[:, None]
-    return (middle + half * NODES).ravel(), (half * NODE_WEIGHTS).ravel()
 
 
 def model_error(model: BSSRDF, reference: Reference) -> ModelError:

@@ -55,6 +55,7 @@ class NeuralPaper(BSSRDF):
     orders = "multiple"
     reciprocal = False
     mirror_invariant = False
+    fast_in = "numpy"  # 1.6e5 evaluations per second and core, 5e4 in Dr.Jit
     source = "TG, Tran, Jensen, Ramamoorthi and Frisvad 2024, half-space network"
 
     def __init__(self, medium: Medium) -> None:

@@ -30,10 +30,10 @@ __all__ = ["UniversalRecipe", "train_universal"]
 class UniversalRecipe:
     """Size of the training: media (each with one direction of incidence and 16 of observation), events, fit."""
 
-    n_media: int = 12288
-    events: float = 4e9
+    n_media: int = 16384
+    events: float = 1e10
     grid: CellGrid = CellGrid(40, 16)
-    how: Fit = field(default_factory=lambda: Fit(steps=100_000, n_groups=32, n_queries=128))
+    how: Fit = field(default_factory=lambda: Fit(steps=150_000, n_groups=32, n_queries=128))
     rank: int = 48
 
     def __post_init__(self) -> None:
