@@ -33,7 +33,7 @@ SPP = {  # of a pass; one that is much shorter would show what a render costs be
     "draft": {"volume": 4, WALK: 8, "model": 64},
     "paper": {"volume": 32, WALK: 64, "model": 512},
 }
-BARE_MODELS = {"draft": (MODELS[0], MODELS[-1]), "paper": MODELS}  # most of the time of a draft goes into compiling
+TRIED = {"draft": (MODELS[0], MODELS[-1]), "paper": MODELS}  # most of the time of a draft goes into compiling
 LANES = {"draft": 2**18, "paper": 2**22}
 FURNACE = {"draft": {"size": 16, "spp": 256}, "paper": {"size": 32, "spp": 16384}}
 
@@ -58,9 +58,9 @@ def parts(quality: str) -> list[Part]:
 def _parts_of(material: str, lights: str, quality: str) -> list[Part]:
     size, spp = SIZES[quality], SPP[quality]
     common = {"material": material, "size": size, "lights": lights}
-    methods = [*VOLUMES, WALK, *MODELS]
+    methods = [*VOLUMES, WALK, *TRIED[quality]]
     if material in PROTOTYPED:
-        methods += [f"{model}, {BARE}" for model in BARE_MODELS[quality]]
+        methods += [f"{model}, {BARE}" for model in TRIED[quality]]
     kinds = {name: "volume" if name in VOLUMES else WALK if name == WALK else "model" for name in methods}
     params = {**common, "passes": PASSES[quality], "spp": {name: spp[kinds[name]] for name in methods}, "seed": 1}
     work = sum(params["spp"].values()) * params["passes"] * size**2

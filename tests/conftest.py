@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import csv
+import os
 from importlib import resources
 from pathlib import Path
+
+if "PYTEST_XDIST_WORKER" in os.environ:  # the tests run side by side: threads of each would only get in their way
+    os.environ["OMP_NUM_THREADS"] = "1"
 
 import numpy as np
 import pytest

@@ -52,7 +52,7 @@ class MaterialRecipe:
 
 
 STANDARD = MaterialRecipe()
-FAST = MaterialRecipe(96, 4e7, how=Fit(steps=400, n_groups=16, n_queries=128, validate_every=400))
+FAST = MaterialRecipe(96, 4e7, how=Fit(steps=250, n_groups=16, n_queries=128, validate_every=250))
 
 
 @dataclass(frozen=True)
