@@ -35,13 +35,15 @@ def cell_energies(model: BSSRDF, groups: Groups, grid: CellGrid) -> np.ndarray:
     n_psi = FIRST_N_PSI
     while rows.size and n_psi < LAST_N_PSI:
         n_psi *= 2
-        bright = np.argsort(-cells[rows[:, 0]].sum(axis=(2, 3)), axis=1)[:, :BRIGHT]
+        order = np.argsort(-cells[rows[:, 0]].sum(axis=(2, 3)), axis=1)
+        bright, others = order[:, :BRIGHT], order[:, BRIGHT:]
         finer = _at(model, groups, grid, rows, bright, n_psi)
         change = np.abs(finer - cells[rows, bright]).sum(axis=(1, 2, 3))
         cells[rows, bright] = finer
-        rows = rows[change > CONVERGED * finer.sum(axis=(1, 2, 3))]
+        changed = change > CONVERGED * finer.sum(axis=(1, 2, 3))
+        rows, others = rows[changed], others[changed]
         if rows.size:
-            cells[rows, columns] = _at(model, groups, grid, rows, columns, n_psi)
+            cells[rows, others] = _at(model, groups, grid, rows, others, n_psi)
     return cells
 
 
