@@ -33,7 +33,7 @@ SPP = {  # of a pass; one that is much shorter would show what a render costs be
     "draft": {"volume": 4, WALK: 8, "model": 64},
     "paper": {"volume": 32, WALK: 64, "model": 512},
 }
-TRIED = {"draft": (MODELS[0], MODELS[-1]), "paper": MODELS}  # most of the time of a draft goes into compiling
+BARE_MODELS = {"draft": (MODELS[0], MODELS[-1]), "paper": MODELS}  # most of the time of a draft goes into compiling
 LANES = {"draft": 2**18, "paper": 2**22}
 FURNACE = {"draft": {"size": 16, "spp": 256}, "paper": {"size": 32, "spp": 16384}}
 
@@ -58,9 +58,9 @@ def parts(quality: str) -> list[Part]:
 def _parts_of(material: str, lights: str, quality: str) -> list[Part]:
     size, spp = SIZES[quality], SPP[quality]
     common = {"material": material, "size": size, "lights": lights}
-    methods = [*VOLUMES, WALK, *TRIED[quality]]
+    methods = [*VOLUMES, WALK, *MODELS]
     if material in PROTOTYPED:
-        methods += [f"{model}, {BARE}" for model in TRIED[quality]]
+        methods += [f"{model}, {BARE}" for model in BARE_MODELS[quality]]
     kinds = {name: "volume" if name in VOLUMES else WALK if name == WALK else "model" for name in methods}
     params = {**common, "passes": PASSES[quality], "spp": {name: spp[kinds[name]] for name in methods}, "seed": 1}
     work = sum(params["spp"].values()) * params["passes"] * size**2
@@ -116,9 +116,8 @@ def errors(timed: Timed, truth: Result, mask: np.ndarray, is_exact: bool) -> dic
     images = timed.images[:, mask].astype(np.float64)
     count = len(images)
     against, noise = (truth.images[name][mask].astype(np.float64) for name in ("image", "variance"))
-    spread = images.var(axis=0, ddof=1).mean(
-        axis=1
-    )  # is the mean square about all other passes times (count - 1)/count
+    # the mean square about all other passes times (count - 1)/count
+    spread = images.var(axis=0, ddof=1).mean(axis=1)
     error = (np.mean((images - against) ** 2, axis=0) - noise).mean(axis=1)
     bias2 = np.zeros_like(error) if is_exact else error - spread
     return {
