@@ -130,6 +130,14 @@ def test_faces_of_a_mesh_do_not_matter():
     assert abs(a - b) < 4 * np.hypot(e, f)
 
 
+def test_what_lies_straight_behind_a_thin_object_is_found_by_probes():
+    """Probes are short but for a few; the other side of a plate is parallel to all that run along its tangents."""
+    plate = {"type": "cube", "to_world": mi.ScalarTransform4f().scale([2, 2, 0.3])}
+    (a, e), (b, f) = (kernel_integral(position_sampler(plate, share), (0.2, 0.1, 5), (0, 0, -1)) for share in (0, 1))
+    assert abs(a - b) < 4 * np.hypot(e, f)
+    assert e < 0.01 * a
+
+
 def subdivided(mesh):
     """Each triangle as four."""
     parameters = mi.traverse(mesh)

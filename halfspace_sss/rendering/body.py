@@ -20,7 +20,7 @@ from halfspace_sss.rendering.settings import AUTOMATIC, Settings
 __all__ = ["Body", "make_bodies"]
 
 SMALL, LARGE = 1.0, 5e3  # mean free paths across an object, beyond which the units of the scene are doubted
-LEAST_SHARE = 0.1  # of the events inside that each of the two kinds gets
+LEAST_SHARE = 0.2  # of the events inside that each of the two kinds gets
 
 
 @dataclass(frozen=True, eq=False)

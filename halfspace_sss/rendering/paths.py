@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 from halfspace_sss.rendering.body import Body
@@ -33,7 +35,8 @@ def trace_paths(scene: Any, bodies: list[Body], settings: Settings, sampler: Any
     """Radiance along a ray, and whether it hits anything.
 
     One loop over the vertices. At each, emitters are sampled and the direction goes on by the surface (balance
-    heuristic between the two). At a translucent surface one of reflection, multiple and single scattering is chosen.
+    heuristic between the two). At a translucent surface one of reflection, multiple and single scattering is chosen;
+    at the first one the light that it mirrors from emitters is added whatever is chosen, as highlights are bright.
     """
     import drjit as dr
     import mitsuba as mi
@@ -45,8 +48,8 @@ def trace_paths(scene: Any, bodies: list[Body], settings: Settings, sampler: Any
         L = L + throughput * _emitted(scene, settings, si, last, depth, active)
         seen = seen | ((depth == 0) & si.is_valid())
         active = active & si.is_valid() & (last[-1] < 0) & (depth + 1 < _unsigned(settings.max_depth))
-        on = _vertex(scene, lights, bodies, settings, sampler, ray, si, active)
-        L = L + dr.select(active, throughput * on.direct, 0)
+        on, mirrored = _vertex(scene, lights, bodies, settings, sampler, ray, si, depth, active)
+        L = L + dr.select(active, throughput * (on.direct + mirrored), 0)
         throughput = dr.select(active, throughput * on.weight, throughput)
         best = dr.max(throughput)
         active = active & (best > 0)
@@ -95,14 +98,18 @@ def _balance(pdf: Any, other: Any) -> Any:
 
 
 def _vertex(
-    scene: Any, lights: Lights, bodies: list[Body], settings: Settings, sampler: Any, ray: Any, si: Any, active: Any
-) -> Onward:
-    """What happens at a surface point: its BSDF, or for the bodies the light that entered elsewhere."""
+    scene: Any, lights: Lights, bodies: list[Body], settings: Settings, sampler: Any, ray: Any, si: Any, depth: Any,
+    active: Any,
+) -> tuple[Onward, Any]:  # fmt: skip
+    """What happens at a surface point: its BSDF, or for the bodies the light that entered elsewhere.
+
+    Also the light of emitters that a body mirrors at the first vertex, where the reflected path leaves it out.
+    """
     import drjit as dr
     import mitsuba as mi
 
     u_event = sampler.next_1d()
-    inside, share, chosen = mi.Bool(False), mi.Float(1), []
+    inside, glossy, share, events = mi.Bool(False), mi.Bool(False), mi.Float(1), []
     for body in bodies:
         here = active & (si.shape == mi.ShapePtr(body.found.shape))
         reflect = _reflection_probability(body, si)
@@ -110,22 +117,66 @@ def _vertex(
         single = here & (u_event < once)
         multiple = here & (u_event >= once + reflect)
         inside |= single | multiple
+        if body.surface.inside.reflection:
+            glossy |= here & (depth == 0)
         taken = dr.select(single, once, dr.select(multiple, 1 - reflect - once, reflect))
         share = dr.select(here, taken, share)
-        chosen.append((body, single, multiple))
-    on = _surface(scene, sampler, ray, si, active & ~inside)
-    for body, single, multiple in chosen:
         if body.models:
-            on = _where(multiple, _multiple(scene, lights, body, settings, sampler, si, multiple), on)
+            events.append((multiple, partial(_multiple, scene, lights, body, settings, sampler, si, multiple)))
         if body.single_share > 0:
-            on = _where(single, _single(scene, lights, body, sampler, si, single), on)
-    return on._replace(weight=on.weight / share, direct=on.direct / share)
+            events.append((single, partial(_single, scene, lights, body, sampler, si, single)))
+    plain = glossy | (active & ~inside)
+    on = _instead(plain, sampler, _nothing(), partial(_surface, scene, sampler, ray, si, plain))
+    (mirrored,) = _where(glossy, (), (mi.Spectrum(0),), lambda: (_mirrored(scene, settings, on, glossy),))
+    on = Onward(*(dr.select(glossy, a, b) for a, b in zip(_unlit(on), on)))
+    for mask, event in events:
+        on = _instead(mask, sampler, on, event)
+    return on._replace(weight=on.weight / share, direct=on.direct / share), mirrored
 
 
-def _where(mask: Any, a: Onward, b: Onward) -> Onward:
+def _mirrored(scene: Any, settings: Settings, on: Onward, active: Any) -> Any:
+    """Light of emitters by a reflection: sampled at the vertex, and met by the ray that goes on."""
+    import mitsuba as mi
+
+    si = scene.ray_intersect(place(on.p, on.n).spawn_ray(on.d), mi.RayFlags.All, False, active)
+    last = (on.p, on.n, on.pdf, on.emitter_share, on.sky_only, on.aim)
+    return on.direct + on.weight * _emitted(scene, settings, si, last, mi.UInt32(1), active)
+
+
+def _unlit(on: Onward) -> Onward:
+    """The same path, to which no emitter counts at its next vertex."""
+    import mitsuba as mi
+
+    return on._replace(pdf=mi.Float(0), emitter_share=mi.Float(0), direct=mi.Spectrum(0))
+
+
+def _nothing() -> Onward:
+    import mitsuba as mi
+
+    zero = mi.Float(0)
+    return Onward(
+        mi.Point3f(0), mi.Normal3f(0), mi.Vector3f(0), mi.Spectrum(0), zero, zero, mi.Bool(False), mi.Float(-1),
+        mi.Spectrum(0),
+    )  # fmt: skip
+
+
+def _where(mask: Any, state: tuple, otherwise: tuple, event: Callable[[], tuple]) -> tuple:
+    """`event()` where the mask holds, and `otherwise` elsewhere; what no neighbouring lane asks for is not computed.
+
+    `state` is what the event changes, as a sampler.
+    """
     import drjit as dr
 
-    return Onward(*(dr.select(mask, x, y) for x, y in zip(a, b)))
+    n = len(state)
+    found = dr.if_stmt(
+        (*state, *otherwise), mask, lambda *all: (*all[:n], *event()), lambda *all: all,
+        arg_labels=[str(k) for k in range(n + len(otherwise))],
+    )  # fmt: skip
+    return tuple(found[n:])
+
+
+def _instead(mask: Any, sampler: Any, on: Onward, event: Callable[[], Onward]) -> Onward:
+    return Onward(*_where(mask, (sampler,), tuple(on), event))
 
 
 def _reflection_probability(body: Body, si: Any) -> Any:

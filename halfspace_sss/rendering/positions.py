@@ -1,10 +1,11 @@
 """Where light enters a mesh: probe rays about the exit, points uniform over the area, or both, with their densities.
 
-A probe ray follows the normal of the exit with probability 1/2, each tangent with 1/4, at a distance drawn from the
+A probe ray follows the normal of the exit with probability 0.8, each tangent with 0.1, at a distance drawn from the
 radial density of the models; all hits on the object count, and one is chosen in proportion to what it may bring. The
-density of hits at x is D(x) = sum over axes p_a |n(x).a| p(r_a(x)), r_a the distance of x from x_o across the axis
-(King, Kulla, Conty and Fajardo 2013); with points uniform over the area A, a share s of the samples, it is
-(1 - s) D(x) + s/A (balance heuristic).
+density of hits at x is D(x) = sum over axes p_a |n(x).a| p(r_a(x)) l_a(x), r_a the distance of x from x_o across the
+axis (King, Kulla, Conty and Fajardo 2013), l_a the probability that the probe is long enough: most reach no further
+along the axis than 4 r_a, beyond which another axis finds x more often, and the others through the whole object. With
+points uniform over the area A, a share s of the samples, the density is (1 - s) D(x) + s/A (balance heuristic).
 """
 
 from __future__ import annotations
@@ -20,7 +21,10 @@ from halfspace_sss.rendering.radial_table import RadialTable
 __all__ = ["Entry", "PositionSampler"]
 
 MOST_HITS = 64
-NORMAL_SHARE = 0.5
+NORMAL_SHARE = 0.8
+LONG_SHARE = 0.1  # of the probes go through the whole object, for what lies straight behind the exit
+REACH = 4.0  # length of the others to either side, over their distance from the exit
+LEAST_REACH = 1e-3  # of the size of the object, for the roughness of a mesh and rounding
 
 
 class Entry(NamedTuple):
@@ -60,7 +64,8 @@ class PositionSampler:
         for axis, share in zip(axes, (NORMAL_SHARE, 0.5 * (1 - NORMAL_SHARE), 0.5 * (1 - NORMAL_SHARE))):
             along = dr.dot(d, axis)
             across = dr.norm(d - axis * along)
-            total += share * dr.abs(dr.dot(n, axis)) * self.table.pdf(across)
+            reached = dr.select(dr.abs(along) <= self._reach(across), 1.0, LONG_SHARE)
+            total += share * reached * dr.abs(dr.dot(n, axis)) * self.table.pdf(across)
         return (1 - s) * total + s / self.found.area
 
     def sample(self, out: Exit, prim_index: Any, sampler: Any, active: Any) -> Entry:
@@ -70,18 +75,22 @@ class PositionSampler:
 
         axes = (out.n, *mi.coordinate_system(out.n))
         piece = self.found.piece(prim_index, active)
-        u_choice, u_axis, u_hit, u = sampler.next_1d(), sampler.next_1d(), sampler.next_1d(), sampler.next_2d()
+        u_choice, u_axis, u_length, u_hit = (sampler.next_1d() for _ in range(4))
+        u = sampler.next_2d()
         by_area = active & (u_choice < self.area_share)
         entry = _nowhere()
         if self.area_share < 1:
-            ray = self._probe(out, axes, u_axis, u)
+            ray = self._probe(out, axes, u_axis, u_length, u)
             entry = self._hits(ray, out, axes, piece, u_hit, active & ~by_area)
         if self.area_share > 0:
             uniform = self._uniform(out, axes, piece, u_hit, u, by_area)
             entry = Entry(*(dr.select(by_area, a, b) for a, b in zip(uniform, entry)))
         return entry
 
-    def _probe(self, out: Exit, axes: Any, u_axis: Any, u: Any) -> Any:
+    def _reach(self, across: Any) -> Any:
+        return REACH * across + LEAST_REACH * self.found.size
+
+    def _probe(self, out: Exit, axes: Any, u_axis: Any, u_length: Any, u: Any) -> Any:
         import drjit as dr
         import mitsuba as mi
 
@@ -92,7 +101,7 @@ class PositionSampler:
         second = dr.select(to_n, t, dr.select(to_s, n, s))
         sin_phi, cos_phi = dr.sincos(2 * dr.pi * u.y)
         r = self.table.sample(u.x)
-        reach = 1.01 * self.found.size
+        reach = dr.select(u_length < LONG_SHARE, 1.01 * self.found.size, self._reach(r))
         start = out.p + (first * cos_phi + second * sin_phi) * r - along * reach
         ray = mi.Ray3f(mi.Point3f(start), mi.Vector3f(along))
         ray.maxt = 2 * reach

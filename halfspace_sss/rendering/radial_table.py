@@ -35,10 +35,10 @@ class RadialTable:
         self.r_min, self.reach = r_min, reach
         self.per_log = (N_CELLS - 1) / math.log(reach / r_min)
         self.mean = float(np.sum(probability * middle))
-        self._numpy = (np.cumsum(probability), probability, edges)
+        self._numpy = (np.cumsum(probability), probability, edges, probability / (2 * math.pi * np.diff(edges)))
         self._lanes: dict[str, Any] = {}
 
-    def _arrays(self) -> tuple[Any, Any, Any]:
+    def _arrays(self) -> tuple[Any, ...]:
         import drjit as dr
         import mitsuba as mi
 
@@ -52,7 +52,7 @@ class RadialTable:
         import drjit as dr
         import mitsuba as mi
 
-        cdf, probability, edges = self._arrays()
+        cdf, probability, edges, _ = self._arrays()
         k = dr.binary_search(0, N_CELLS - 1, lambda i: dr.gather(mi.Float, cdf, i) <= u)
         share = 1 - (dr.gather(mi.Float, cdf, k) - u) / dr.gather(mi.Float, probability, k)
         low, high = dr.gather(mi.Float, edges, k), dr.gather(mi.Float, edges, k + 1)
@@ -63,9 +63,8 @@ class RadialTable:
         import drjit as dr
         import mitsuba as mi
 
-        _, probability, edges = self._arrays()
+        *_, times_r = self._arrays()
         steps = dr.log(dr.maximum(r, self.r_min) / self.r_min) * self.per_log
         k = dr.select(r < self.r_min, 0, dr.minimum(mi.UInt32(steps) + 1, N_CELLS - 1))
-        width = dr.gather(mi.Float, edges, k + 1) - dr.gather(mi.Float, edges, k)
-        density = dr.gather(mi.Float, probability, k) / (2 * dr.pi * dr.maximum(r, 1e-3 * self.r_min) * width)
+        density = dr.gather(mi.Float, times_r, k) / dr.maximum(r, 1e-3 * self.r_min)
         return dr.select(r < self.reach, density, 0)
