@@ -31,7 +31,9 @@ def volume(rr_depth: int) -> str:
 VOLUMES = tuple(volume(rr_depth) for rr_depth in RR_DEPTHS)
 
 
-def contender(method: str, material: str, size: int, lights: str, bare: bool = False) -> Any:
+def contender(
+    method: str, material: str, size: int, lights: str, bare: bool = False, sampler: str = "independent"
+) -> Any:
     """The Mitsuba scene of the bunny for a method, or three, one for each channel; `timed.rendered` takes both.
 
     Mitsuba's media have one phase function for all channels: it is given the channels of others one by one.
@@ -40,6 +42,7 @@ def contender(method: str, material: str, size: int, lights: str, bare: bool = F
         method: a name in `VOLUMES`, `WALK`, or a model of the library.
         material, size, lights: as in `figures.scenes.bunny_scene`.
         bare: whether a model is left without surface reflection and without the single scattering that it lacks.
+        sampler: Mitsuba's plugin of random numbers.
 
     Raises:
         ValueError: no such method, material or lights.
@@ -48,6 +51,7 @@ def contender(method: str, material: str, size: int, lights: str, bare: bool = F
     from halfspace_sss.rendering.scene_files import PATH_TRACED, load_scene
 
     description = bunny_scene(material, size, lights)
+    description["sensor"]["sampler"] = {"type": sampler}
     if method in VOLUMES:
         return _volume_scene(description, materials.load(material).medium, int(method.split()[1]))
     if method == WALK:

@@ -28,10 +28,11 @@ PROTOTYPED = ("marble", "potato", "ketchup")
 SPLIT_MATERIAL = "marble"
 SIZES = {"draft": 48, "paper": 128}
 TRUTH_SPP = {"draft": 64, "paper": 8192}
+SAMPLER = "multijitter"  # of all methods; it takes square numbers of samples as they are
 PASSES = {"draft": 3, "paper": 8}
 SPP = {  # of a pass; one that is much shorter would show what a render costs before its first sample
-    "draft": {"volume": 4, WALK: 8, "model": 64},
-    "paper": {"volume": 32, WALK: 64, "model": 512},
+    "draft": {"volume": 4, WALK: 16, "model": 64},
+    "paper": {"volume": 64, WALK: 64, "model": 1024},
 }
 BARE_MODELS = {"draft": (MODELS[0], MODELS[-1]), "paper": MODELS}  # most of the time of a draft goes into compiling
 LANES = {"draft": 2**18, "paper": 2**22}
@@ -62,7 +63,10 @@ def _parts_of(material: str, lights: str, quality: str) -> list[Part]:
     if material in PROTOTYPED:
         methods += [f"{model}, {BARE}" for model in BARE_MODELS[quality]]
     kinds = {name: "volume" if name in VOLUMES else WALK if name == WALK else "model" for name in methods}
-    params = {**common, "passes": PASSES[quality], "spp": {name: spp[kinds[name]] for name in methods}, "seed": 1}
+    params = {
+        **common, "passes": PASSES[quality], "spp": {name: spp[kinds[name]] for name in methods}, "seed": 1,
+        "sampler": SAMPLER,
+    }  # fmt: skip
     work = sum(params["spp"].values()) * params["passes"] * size**2
     truth = f"{material}, {lights}, truth"
     inputs = (BUNNY, *weight_files("neural", materials.load(material).medium))
@@ -81,10 +85,8 @@ def measured(task: Task) -> dict[str, Any]:
     scenes = {}
     for k, (name, spp) in enumerate(p["spp"].items()):
         method, _, bare = name.partition(", ")
-        scenes[name] = contender(method, p["material"], p["size"], p["lights"], bare == BARE)
-        rendered(scenes[name], 1, p["seed"])  # compiles
-        if method == WALK:
-            rendered(scenes[name], spp, p["seed"])  # it compiles for each number of samples
+        scenes[name] = contender(method, p["material"], p["size"], p["lights"], bare == BARE, p["sampler"])
+        rendered(scenes[name], spp, p["seed"])  # compiles, the walk and the sampler for each number of samples
         task.progress(k, 2 * len(p["spp"]))
     cover = guides(scenes[WALK], 8)[0][..., 0] > 0
 

@@ -36,9 +36,7 @@ def bunny_scene(material: str, size: int, lights: str = "both", model: str = "ne
     scene: dict[str, Any] = {
         "type": "scene",
         "integrator": {"type": "bssrdf", "mm_per_unit": MM_PER_UNIT, "hide_emitters": True},
-        "sensor": {
-            "type": "perspective", "fov": 26.0, "to_world": view, "film": film, "sampler": {"type": "multijitter"},
-        },  # fmt: skip
+        "sensor": {"type": "perspective", "fov": 26.0, "to_world": view, "film": film},
         "bunny": {
             "type": "ply",
             "filename": str(BUNNY),

@@ -36,7 +36,7 @@ def trace_paths(scene: Any, bodies: list[Body], settings: Settings, sampler: Any
 
     One loop over the vertices. At each, emitters are sampled and the direction goes on by the surface (balance
     heuristic between the two). At a translucent surface one of reflection, multiple and single scattering is chosen;
-    at the first one the light that it mirrors from emitters is added whatever is chosen, as highlights are bright.
+    light of emitters that it mirrors is added whatever is chosen, as highlights are bright.
     """
     import drjit as dr
     import mitsuba as mi
@@ -48,7 +48,7 @@ def trace_paths(scene: Any, bodies: list[Body], settings: Settings, sampler: Any
         L = L + throughput * _emitted(scene, settings, si, last, depth, active)
         seen = seen | ((depth == 0) & si.is_valid())
         active = active & si.is_valid() & (last[-1] < 0) & (depth + 1 < _unsigned(settings.max_depth))
-        on, mirrored = _vertex(scene, lights, bodies, settings, sampler, ray, si, depth, active)
+        on, mirrored = _vertex(scene, lights, bodies, settings, sampler, ray, si, active)
         L = L + dr.select(active, throughput * (on.direct + mirrored), 0)
         throughput = dr.select(active, throughput * on.weight, throughput)
         best = dr.max(throughput)
@@ -98,12 +98,11 @@ def _balance(pdf: Any, other: Any) -> Any:
 
 
 def _vertex(
-    scene: Any, lights: Lights, bodies: list[Body], settings: Settings, sampler: Any, ray: Any, si: Any, depth: Any,
-    active: Any,
-) -> tuple[Onward, Any]:  # fmt: skip
+    scene: Any, lights: Lights, bodies: list[Body], settings: Settings, sampler: Any, ray: Any, si: Any, active: Any
+) -> tuple[Onward, Any]:
     """What happens at a surface point: its BSDF, or for the bodies the light that entered elsewhere.
 
-    Also the light of emitters that a body mirrors at the first vertex, where the reflected path leaves it out.
+    Also the light of emitters that a body mirrors, which the reflected path leaves out.
     """
     import drjit as dr
     import mitsuba as mi
@@ -118,7 +117,7 @@ def _vertex(
         multiple = here & (u_event >= once + reflect)
         inside |= single | multiple
         if body.surface.inside.reflection:
-            glossy |= here & (depth == 0)
+            glossy |= here
         taken = dr.select(single, once, dr.select(multiple, 1 - reflect - once, reflect))
         share = dr.select(here, taken, share)
         if body.models:

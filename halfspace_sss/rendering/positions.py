@@ -22,7 +22,7 @@ __all__ = ["Entry", "PositionSampler"]
 
 MOST_HITS = 64
 NORMAL_SHARE = 0.8
-LONG_SHARE = 0.1  # of the probes go through the whole object, for what lies straight behind the exit
+LONG_SHARE = 0.05  # of the probes go through the whole object, for what lies straight behind the exit
 REACH = 4.0  # length of the others to either side, over their distance from the exit
 LEAST_REACH = 1e-3  # of the size of the object, for the roughness of a mesh and rounding
 
