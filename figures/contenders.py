@@ -40,9 +40,8 @@ def contender(
 
     Args:
         method: a name in `VOLUMES`, `WALK`, or a model of the library.
-        material, size, lights: as in `figures.scenes.bunny_scene`.
+        material, size, lights, sampler: as in `figures.scenes.bunny_scene`.
         bare: whether a model is left without surface reflection and without the single scattering that it lacks.
-        sampler: Mitsuba's plugin of random numbers.
 
     Raises:
         ValueError: no such method, material or lights.
@@ -50,8 +49,7 @@ def contender(
     from halfspace_sss import bssrdf, materials
     from halfspace_sss.rendering.scene_files import PATH_TRACED, load_scene
 
-    description = bunny_scene(material, size, lights)
-    description["sensor"]["sampler"] = {"type": sampler}
+    description = bunny_scene(material, size, lights, sampler=sampler)
     if method in VOLUMES:
         return _volume_scene(description, materials.load(material).medium, int(method.split()[1]))
     if method == WALK:

@@ -14,7 +14,9 @@ MM_PER_UNIT = 3.8  # the bunny is 37 mm tall
 LIGHTS = ("both", "small light", "even sky")
 
 
-def bunny_scene(material: str, size: int, lights: str = "both", model: str = "neural") -> dict[str, Any]:
+def bunny_scene(
+    material: str, size: int, lights: str = "both", model: str = "neural", sampler: str = "independent"
+) -> dict[str, Any]:
     """A translucent bunny on its own, as a dict for `rendering.scene_files.load_scene`.
 
     Args:
@@ -23,6 +25,7 @@ def bunny_scene(material: str, size: int, lights: str = "both", model: str = "ne
         lights: "both" for the small light and dim surroundings with two windows, "small light", or "even sky",
             radiance 1 from everywhere.
         model: of the BSSRDF.
+        sampler: Mitsuba's plugin of random numbers; "multijitter" has less noise and takes square numbers of samples.
 
     Raises:
         ValueError: lights is something else.
@@ -36,7 +39,7 @@ def bunny_scene(material: str, size: int, lights: str = "both", model: str = "ne
     scene: dict[str, Any] = {
         "type": "scene",
         "integrator": {"type": "bssrdf", "mm_per_unit": MM_PER_UNIT, "hide_emitters": True},
-        "sensor": {"type": "perspective", "fov": 26.0, "to_world": view, "film": film},
+        "sensor": {"type": "perspective", "fov": 26.0, "to_world": view, "film": film, "sampler": {"type": sampler}},
         "bunny": {
             "type": "ply",
             "filename": str(BUNNY),

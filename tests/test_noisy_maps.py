@@ -17,7 +17,14 @@ from halfspace_sss import Medium, single_scattering, trace
 from halfspace_sss.neural import errors
 from halfspace_sss.neural.backbone import unwarp
 from halfspace_sss.neural.errors import Reference, model_error, reference_maps
-from halfspace_sss.neural.noisy_maps import CellGrid, Groups, draw_directions, make_pool, radial_edges
+from halfspace_sss.neural.noisy_maps import (
+    CellGrid,
+    Groups,
+    draw_directions,
+    looking_back,
+    make_pool,
+    radial_edges,
+)
 
 GRID = CellGrid(24, 8)
 COPIES, SET = 16, 8
@@ -168,3 +175,16 @@ def test_a_model_that_is_off_by_all_has_an_error_of_one(
     E = factor * _copies(references[1], 4).mean(axis=(0, 2))
     error = model_error(_answer(monkeypatch, E), _first_copy(references[1], 4))
     assert error.error == pytest.approx(1, abs=0.03) and error.bias == pytest.approx(bias, abs=0.03)
+
+
+def test_two_observations_of_a_group_can_look_back_along_the_incident_ray():
+    rng = np.random.default_rng(3)
+    groups = draw_directions(*(np.full(2000, v) for v in (0.9, 0.3, 1.4)), rng)
+    back = looking_back(groups, rng)
+    assert np.array_equal(back.mu_o[:, :14], groups.mu_o[:, :14])
+    w_i = np.stack([-np.sqrt(1 - groups.mu_i**2), 0 * groups.mu_i, groups.mu_i])[..., None]
+    sine = np.sqrt(1 - back.mu_o**2)
+    w_o = np.stack([sine * np.cos(back.delta_phi), sine * np.sin(back.delta_phi), back.mu_o])
+    distance = np.linalg.norm(w_o - w_i, axis=0)
+    assert distance[:, 14:].max() < 0.65  # twice 0.3, where the horizon is crossed and z turned up
+    assert np.median(distance[:, 14:]) < 0.03 < np.quantile(distance[:, :14], 0.02)

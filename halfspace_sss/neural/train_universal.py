@@ -17,7 +17,7 @@ from halfspace_sss.neural.fit import Fit, fit
 from halfspace_sss.neural.hypernetwork import RANGES
 from halfspace_sss.neural.learners import Hyper
 from halfspace_sss.neural.media import draw_media
-from halfspace_sss.neural.noisy_maps import CellGrid, Progress, draw_directions, make_pool
+from halfspace_sss.neural.noisy_maps import CellGrid, Progress, draw_directions, looking_back, make_pool
 from halfspace_sss.neural.pool import MapPool
 from halfspace_sss.neural.store import save_weights
 from halfspace_sss.neural.work_folder import CHECKPOINT, claim
@@ -70,7 +70,7 @@ def train_universal(
     seed = int(seed)  # torch takes no other
     claim(check_folder(folder), recipe=asdict(recipe), seed=seed, backend=backend)
     rng = np.random.default_rng([seed, 0])
-    groups = draw_directions(*draw_media(recipe.n_media, rng), rng)
+    groups = looking_back(draw_directions(*draw_media(recipe.n_media, rng), rng), rng)
     halves = make_pool(groups, recipe.grid, recipe.events, (seed, 1), folder, progress, backend)
     pool, data_seconds = MapPool(groups, recipe.grid, halves), time.monotonic() - started
     del halves
