@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import time
 from collections.abc import Mapping
 from typing import Any
@@ -53,7 +54,10 @@ def parts(quality: str) -> list[Part]:
 
 
 def prepare() -> None:
-    """Set the variant of Mitsuba that the figures use, and register the plugins."""
+    """Set the variant of Mitsuba that the figures use, and register the plugins.
+
+    Scenes of earlier parts are freed, so that the objects of the next get their numbers, and it their kernels.
+    """
     import mitsuba as mi
 
     from halfspace_sss import rendering
@@ -61,6 +65,7 @@ def prepare() -> None:
     if mi.variant() != "llvm_ad_rgb":
         mi.set_variant("llvm_ad_rgb")
     rendering.register()
+    gc.collect()
 
 
 def path_traced(task: Task) -> dict[str, Any]:

@@ -133,7 +133,7 @@ class _DrJitLibrary:
     def constant(self, value: Any, x: Any) -> Any:
         if np.ndim(value):
             raise ValueError("a Dr.Jit query is answered by a medium of one channel: use medium.channel(k)")
-        return float(value)
+        return self.dr.opaque(type(x), float(value))  # kernels then differ in their data, and are compiled once
 
     def interval(self, edges: np.ndarray, x: Any) -> Any:
         dr = self.dr

@@ -69,10 +69,11 @@ def backbone_shape(r: Any, albedo: Any, g: Any, eta: Any) -> Any:
     D = (2 * (1 - albedo) + albedo * (1 - g)) / (3 * sigma_t_prime * sigma_t_prime)
     s = (lib.sqrt if hasattr(albedo, "shape") else math.sqrt)((1 - albedo) / D)
     z_r = 1 / sigma_t_prime
-    far = _source(lib, r, z_r, s) + _source(lib, r, z_r + 4 * _boundary_A(eta) * D, s)
-    reduced = (1 - g) / sigma_t_prime
-    near = reduced * reduced * lib.exp(-r) / (r + NEAR)
-    return far / (4 * math.pi**2) + near / (16 * math.pi**2)
+    z_v, near = z_r + 4 * _boundary_A(eta) * D, ((1 - g) / sigma_t_prime) ** 2 / (16 * math.pi**2)
+    if isinstance(albedo, float):
+        s, z_r, z_v, near = (lib.constant(v, r) for v in (s, z_r, z_v, near))
+    far = _source(lib, r, z_r, s) + _source(lib, r, z_v, s)
+    return far / (4 * math.pi**2) + near * lib.exp(-r) / (r + NEAR)
 
 
 def _source(lib: Any, r: Any, z: Any, s: Any) -> Any:

@@ -18,10 +18,10 @@ LOG_RANGE = 30.0  # bound of the logarithm of the learnt factor
 
 def factored_G(network: Network, q: Query, albedo: Any, g: Any, eta: Any) -> Any:
     """G = B(r) exp(network(features)) for a query of one channel: positive, reciprocal and mirror-invariant."""
-    lib = q.lib
-    log_factor = network(symmetric_features(lib, q.r, *travel(q), length_scale(albedo, g)))
+    lib, L = q.lib, q.constant(length_scale(albedo, g))
+    log_factor = network(symmetric_features(lib, q.r, *travel(q), L))
     factor = lib.exp(lib.minimum(lib.maximum(log_factor, -LOG_RANGE), LOG_RANGE))
-    return albedo * albedo * (backbone_shape(q.r, albedo, g, eta) * factor)
+    return q.constant(albedo * albedo) * (backbone_shape(q.r, albedo, g, eta) * factor)
 
 
 class SymmetricModel(BSSRDF):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from halfspace_sss.rendering.body import make_bodies
+from halfspace_sss.rendering.object import same_objects
 from halfspace_sss.rendering.paths import trace_paths
 from halfspace_sss.rendering.settings import read_settings
 
@@ -21,12 +22,13 @@ def integrator_class() -> type:
         def __init__(self, props: Any) -> None:
             mi.SamplingIntegrator.__init__(self, props)
             self.settings = read_settings(props)
-            self._prepared: tuple[Any, Any] = (None, None)
+            self._prepared: tuple[list, list] = ([], [])
 
         def prepare(self, scene: Any) -> list[Any]:
             """The translucent objects of a scene, made ready once; ValueError if the scene cannot be rendered."""
-            if self._prepared[0] is not scene:
-                self._prepared = (scene, make_bodies(scene, self.settings))
+            shapes = scene.shapes()  # the scene itself, which holds its integrator, would never be freed
+            if not self._prepared[1] or not same_objects(self._prepared[0], shapes):
+                self._prepared = shapes, make_bodies(scene, self.settings)
             return self._prepared[1]
 
         def sample(

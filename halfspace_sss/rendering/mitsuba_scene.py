@@ -36,6 +36,7 @@ def with_media(scene: dict | str | Path, mm_per_unit: float, integrator: dict | 
     if not (math.isfinite(mm_per_unit) and mm_per_unit > 0):
         raise ValueError(f"mm_per_unit must be finite and > 0, got {mm_per_unit!r}")
     config = mi.parser.ParserConfig(mi.variant())
+    config.parallel = False  # objects then have the same numbers each time, and kernels are found in Dr.Jit's cache
     config.merge_meshes = False  # merged ones would lose the medium
     is_dict = isinstance(scene, dict)
     state = mi.parser.parse_dict(config, scene) if is_dict else mi.parser.parse_file(config, str(scene))

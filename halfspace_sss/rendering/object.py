@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["RAYS", "Object", "is_inside", "survey"]
+__all__ = ["RAYS", "Object", "is_inside", "same_objects", "survey"]
 
 RAYS = 4096  # of the survey
 MOST_HITS = 64  # that one ray counts
@@ -45,6 +45,11 @@ class Object:
         if self.pieces is None:
             return mi.UInt32(0)
         return dr.gather(mi.UInt32, self.pieces, prim_index, active)
+
+
+def same_objects(a: list[Any], b: list[Any]) -> bool:
+    """Whether two lists hold the same objects of Mitsuba."""
+    return len(a) == len(b) and all(x is y for x, y in zip(a, b))
 
 
 def survey(shape: Any) -> Object:

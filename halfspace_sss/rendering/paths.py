@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from halfspace_sss.rendering.body import Body
 from halfspace_sss.rendering.lights import Lights
-from halfspace_sss.rendering.plane import Exit, local_frame, place, plane_query
+from halfspace_sss.rendering.plane import Exit, local_frame, number, place, plane_query
 from halfspace_sss.rendering.settings import Settings
 from halfspace_sss.rendering.single import single_scattering_at
 
@@ -112,7 +112,7 @@ def _vertex(
     for body in bodies:
         here = active & (si.shape == mi.ShapePtr(body.found.shape))
         reflect = _reflection_probability(body, si)
-        once = (1 - reflect) * body.single_share
+        once = (1 - reflect) * number(body.single_share)
         single = here & (u_event < once)
         multiple = here & (u_event >= once + reflect)
         inside |= single | multiple

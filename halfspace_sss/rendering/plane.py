@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-__all__ = ["GEOMETRIES", "Exit", "Frame", "local_frame", "place", "plane_query", "separation"]
+__all__ = ["GEOMETRIES", "Exit", "Frame", "local_frame", "number", "place", "plane_query", "separation"]
 
 GEOMETRIES = ("distance", "tangent")
 
@@ -37,6 +37,14 @@ class Frame(NamedTuple):
 
         sine, (s, c) = dr.safe_sqrt((1 - mu) * (1 + mu)), dr.sincos(phi)
         return self.t * (sine * c) + self.b * (sine * s) + self.n * mu
+
+
+def number(value: float) -> Any:
+    """A number of a scene as data of a kernel, which then serves other materials and sizes too."""
+    import drjit as dr
+    import mitsuba as mi
+
+    return dr.opaque(mi.Float, value)
 
 
 def place(p: Any, n: Any) -> Any:

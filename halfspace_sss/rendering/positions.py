@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 from halfspace_sss.rendering.area_points import AreaPoints
 from halfspace_sss.rendering.object import Object
-from halfspace_sss.rendering.plane import Exit
+from halfspace_sss.rendering.plane import Exit, number
 from halfspace_sss.rendering.radial_table import RadialTable
 
 __all__ = ["Entry", "PositionSampler"]
@@ -58,7 +58,7 @@ class PositionSampler:
 
         s = self.area_share
         if s == 1:
-            return 1 / self.found.area
+            return number(1 / self.found.area)
         d = p - out.p
         total = 0.0
         for axis, share in zip(axes, (NORMAL_SHARE, 0.5 * (1 - NORMAL_SHARE), 0.5 * (1 - NORMAL_SHARE))):
@@ -66,7 +66,7 @@ class PositionSampler:
             across = dr.norm(d - axis * along)
             reached = dr.select(dr.abs(along) <= self._reach(across), 1.0, LONG_SHARE)
             total += share * reached * dr.abs(dr.dot(n, axis)) * self.table.pdf(across)
-        return (1 - s) * total + s / self.found.area
+        return number(1 - s) * total + number(s / self.found.area)
 
     def sample(self, out: Exit, prim_index: Any, sampler: Any, active: Any) -> Entry:
         """A point of entry for light that leaves at `out` on the face `prim_index`."""
@@ -77,7 +77,7 @@ class PositionSampler:
         piece = self.found.piece(prim_index, active)
         u_choice, u_axis, u_length, u_hit = (sampler.next_1d() for _ in range(4))
         u = sampler.next_2d()
-        by_area = active & (u_choice < self.area_share)
+        by_area = active & (u_choice < number(self.area_share))
         entry = _nowhere()
         if self.area_share < 1:
             ray = self._probe(out, axes, u_axis, u_length, u)
@@ -88,7 +88,7 @@ class PositionSampler:
         return entry
 
     def _reach(self, across: Any) -> Any:
-        return REACH * across + LEAST_REACH * self.found.size
+        return REACH * across + number(LEAST_REACH * self.found.size)
 
     def _probe(self, out: Exit, axes: Any, u_axis: Any, u_length: Any, u: Any) -> Any:
         import drjit as dr
@@ -101,7 +101,7 @@ class PositionSampler:
         second = dr.select(to_n, t, dr.select(to_s, n, s))
         sin_phi, cos_phi = dr.sincos(2 * dr.pi * u.y)
         r = self.table.sample(u.x)
-        reach = dr.select(u_length < LONG_SHARE, 1.01 * self.found.size, self._reach(r))
+        reach = dr.select(u_length < LONG_SHARE, number(1.01 * self.found.size), self._reach(r))
         start = out.p + (first * cos_phi + second * sin_phi) * r - along * reach
         ray = mi.Ray3f(mi.Point3f(start), mi.Vector3f(along))
         ray.maxt = 2 * reach

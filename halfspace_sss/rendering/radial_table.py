@@ -43,7 +43,8 @@ class RadialTable:
         import mitsuba as mi
 
         if mi.variant() not in self._lanes:
-            self._lanes[mi.variant()] = tuple(mi.Float(v.astype(np.float32)) for v in self._numpy)
+            numbers = (dr.opaque(mi.Float, v) for v in (self.r_min, self.per_log, self.reach))
+            self._lanes[mi.variant()] = (*(mi.Float(v.astype(np.float32)) for v in self._numpy), *numbers)
             dr.eval(self._lanes[mi.variant()])
         return self._lanes[mi.variant()]
 
@@ -52,7 +53,7 @@ class RadialTable:
         import drjit as dr
         import mitsuba as mi
 
-        cdf, probability, edges, _ = self._arrays()
+        cdf, probability, edges, *_ = self._arrays()
         k = dr.binary_search(0, N_CELLS - 1, lambda i: dr.gather(mi.Float, cdf, i) <= u)
         share = 1 - (dr.gather(mi.Float, cdf, k) - u) / dr.gather(mi.Float, probability, k)
         low, high = dr.gather(mi.Float, edges, k), dr.gather(mi.Float, edges, k + 1)
@@ -63,8 +64,8 @@ class RadialTable:
         import drjit as dr
         import mitsuba as mi
 
-        *_, times_r = self._arrays()
-        steps = dr.log(dr.maximum(r, self.r_min) / self.r_min) * self.per_log
-        k = dr.select(r < self.r_min, 0, dr.minimum(mi.UInt32(steps) + 1, N_CELLS - 1))
-        density = dr.gather(mi.Float, times_r, k) / dr.maximum(r, 1e-3 * self.r_min)
-        return dr.select(r < self.reach, density, 0)
+        *_, times_r, r_min, per_log, reach = self._arrays()
+        steps = dr.log(dr.maximum(r, r_min) / r_min) * per_log
+        k = dr.select(r < r_min, 0, dr.minimum(mi.UInt32(steps) + 1, N_CELLS - 1))
+        density = dr.gather(mi.Float, times_r, k) / dr.maximum(r, 1e-3 * r_min)
+        return dr.select(r < reach, density, 0)

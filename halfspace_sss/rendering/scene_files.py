@@ -64,6 +64,7 @@ def _parsed(scene: dict | str | Path) -> tuple[Any, Any]:
     import mitsuba as mi
 
     config = mi.parser.ParserConfig(mi.variant())
+    config.parallel = False  # objects then have the same numbers each time, and kernels are found in Dr.Jit's cache
     if isinstance(scene, dict):
         state = mi.parser.parse_dict(config, scene)
     else:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
+from halfspace_sss.rendering.object import same_objects
 from halfspace_sss.rendering.walk_connect import find_joins
 from halfspace_sss.rendering.walk_guide import Guide
 from halfspace_sss.rendering.walk_media import WalkMedia
@@ -37,13 +39,19 @@ def walk_integrator_class() -> type:
             self.rr_depth = _depth("rr_depth", int(props.get("rr_depth", 5)))
             self.hidden = bool(props.get("hide_emitters", False))
             self.join_share = _share("join_share", float(props.get("join_share", 0.5)))
-            self._prepared: tuple[Any, Any] = (None, None)
+            self._prepared: tuple[Any, Any, Any] = ([], None, None)
 
         def tracer(self, scene: Any) -> PathTracer:
-            """What paths through a scene need, made ready once."""
-            if self._prepared[0] is not scene:
-                self._prepared = scene, _tracer_of(self, scene)
-            return self._prepared[1]
+            """What paths through a scene need; the costly part is made ready once."""
+            shapes = scene.shapes()  # the scene itself, which holds its integrator, would never be freed
+            if self._prepared[1] is None or not same_objects(self._prepared[0], shapes):
+                media = WalkMedia.of(scene, self.mm_per_unit)
+                joins = find_joins(scene, media, self.join_share)
+                self._prepared = shapes, media, joins and replace(joins, scene=None)
+            _, media, joins = self._prepared
+            joins = joins and replace(joins, scene=scene)
+            guide = joins and Guide(scene, media, joins)
+            return PathTracer(scene, media, self.max_depth, self.rr_depth, self.hidden, joins, guide)
 
         def render(
             self, scene: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0, develop: bool = True, evaluate: bool = True
@@ -67,14 +75,6 @@ def _render(tracer: PathTracer, sensor: Any, seed: int, spp: int) -> None:
     most = max(1, SAMPLES_PER_LAUNCH // int(dr.prod(_sampled_size(sensor.film()))))
     for launch, start in enumerate(range(0, spp, most)):
         _launch(tracer, sensor, min(most, spp - start), (seed, launch))
-
-
-def _tracer_of(integrator: Any, scene: Any) -> PathTracer:
-    media = WalkMedia.of(scene, integrator.mm_per_unit)
-    joins = find_joins(scene, media, integrator.join_share)
-    guide = None if joins is None else Guide(scene, media, joins)
-    limits = integrator.max_depth, integrator.rr_depth, integrator.hidden
-    return PathTracer(scene, media, *limits, joins, guide)
 
 
 def _launch(tracer: PathTracer, sensor: Any, spp: int, seed: tuple[int, int]) -> None:
