@@ -30,7 +30,7 @@ METHODS = (*VOLUMES, WALK, OURS)
 SIZES = {"draft": 96, "paper": 384}
 SECONDS = {"draft": 2.0, "paper": 60.0}  # for an image
 TRUTH_SPP = {"draft": 256, "paper": 16384}
-PASSES, SHORTEST = 8, 1.5  # of an image, about; seconds, of a pass: a render has a cost of its own
+PASSES, SHORTEST = 8, 0.5  # of an image, about; seconds, of a pass: a render has a cost of its own
 NOTES = (
     "Every method had the same time, compilation left out; passes of all methods took turns on the same machine. Of "
     "Mitsuba's volpathmis with Russian roulette from vertex 5, 64, 200 and 1024 on, the one with the smallest relMSE "
