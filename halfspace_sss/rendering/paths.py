@@ -126,7 +126,7 @@ def _vertex(
             events.append((single, partial(_single, scene, lights, body, sampler, si, single)))
     plain = glossy | (active & ~inside)
     on = _instead(plain, sampler, _nothing(), partial(_surface, scene, sampler, ray, si, plain))
-    (mirrored,) = _where(glossy, (), (mi.Spectrum(0),), lambda: (_mirrored(scene, settings, on, glossy),))
+    (mirrored,) = _where(glossy, sampler, (mi.Spectrum(0),), lambda: (_mirrored(scene, settings, on, glossy),))
     on = Onward(*(dr.select(glossy, a, b) for a, b in zip(_unlit(on), on)))
     for mask, event in events:
         on = _instead(mask, sampler, on, event)
@@ -159,23 +159,15 @@ def _nothing() -> Onward:
     )  # fmt: skip
 
 
-def _where(mask: Any, state: tuple, otherwise: tuple, event: Callable[[], tuple]) -> tuple:
-    """`event()` where the mask holds, and `otherwise` elsewhere; what no neighbouring lane asks for is not computed.
-
-    `state` is what the event changes, as a sampler.
-    """
+def _where(mask: Any, sampler: Any, otherwise: tuple, event: Callable[[], tuple]) -> tuple:
+    """`event()` where the mask holds, and `otherwise` elsewhere; what no neighbouring lane asks for is not computed."""
     import drjit as dr
 
-    n = len(state)
-    found = dr.if_stmt(
-        (*state, *otherwise), mask, lambda *all: (*all[:n], *event()), lambda *all: all,
-        arg_labels=[str(k) for k in range(n + len(otherwise))],
-    )  # fmt: skip
-    return tuple(found[n:])
+    return dr.if_stmt((sampler, otherwise), mask, lambda s, _: (s, tuple(event())), lambda s, other: (s, other))[1]
 
 
 def _instead(mask: Any, sampler: Any, on: Onward, event: Callable[[], Onward]) -> Onward:
-    return Onward(*_where(mask, (sampler,), tuple(on), event))
+    return Onward(*_where(mask, sampler, tuple(on), event))
 
 
 def _reflection_probability(body: Body, si: Any) -> Any:

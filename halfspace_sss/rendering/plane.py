@@ -44,7 +44,7 @@ def number(value: float) -> Any:
     import drjit as dr
     import mitsuba as mi
 
-    return dr.opaque(mi.Float, value)
+    return dr.opaque(mi.Float, float(value))
 
 
 def place(p: Any, n: Any) -> Any:

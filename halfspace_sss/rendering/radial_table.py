@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from halfspace_sss.rendering.plane import number
+
 __all__ = ["RadialTable"]
 
 N_CELLS = 512
@@ -43,7 +45,7 @@ class RadialTable:
         import mitsuba as mi
 
         if mi.variant() not in self._lanes:
-            numbers = (dr.opaque(mi.Float, v) for v in (self.r_min, self.per_log, self.reach))
+            numbers = (number(v) for v in (self.r_min, self.per_log, self.reach))
             self._lanes[mi.variant()] = (*(mi.Float(v.astype(np.float32)) for v in self._numpy), *numbers)
             dr.eval(self._lanes[mi.variant()])
         return self._lanes[mi.variant()]

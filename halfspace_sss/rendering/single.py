@@ -50,7 +50,7 @@ def single_scattering_at(scene: Any, body: Body, out: Exit, sampler: Any, lights
     import mitsuba as mi
 
     event, active = _event(body, out, sampler, active)
-    g = [number(float(m.g)) for m in body.media]
+    g = [number(m.g) for m in body.media]
     g_mean = number(sum(float(m.g) for m in body.media) / len(g))
     u = sampler.next_2d()
     cosine = sample_hg(u.x, g_mean)
@@ -80,7 +80,7 @@ def _event(body: Body, out: Exit, sampler: Any, active: Any) -> tuple[_Event, An
     ray = start.spawn_ray(along)
     wall = body.found.scene.ray_intersect(ray, mi.RayFlags.Minimal, False, active)
     furthest = dr.select(wall.is_valid(), wall.t, number(1e3 * body.found.size))
-    sigma_t = [number(float(m.sigma_t)) for m in body.media]
+    sigma_t = [number(m.sigma_t) for m in body.media]
     u_channel, u = sampler.next_1d(), sampler.next_1d()
     chosen, total = mi.Float(0), mi.Float(0)
     for k, s in enumerate(sigma_t):
@@ -90,7 +90,7 @@ def _event(body: Body, out: Exit, sampler: Any, active: Any) -> tuple[_Event, An
     for t in sigma_t:
         total += t * dr.exp(-t * s) / dr.maximum(1 - dr.exp(-t * furthest), 1e-12)
     density = dr.maximum(total / len(sigma_t), 1e-30)
-    scattered = [number(float(m.sigma_s)) * dr.exp(-t * s) / density for m, t in zip(body.media, sigma_t)]
+    scattered = [number(m.sigma_s) * dr.exp(-t * s) / density for m, t in zip(body.media, sigma_t)]
     weight = dr.select(active, (1 - F) * _spectrum(scattered), 0)
     return _Event(mi.Point3f(out.p + along * s), mi.Vector3f(along), weight), active
 
@@ -110,7 +110,7 @@ def _connected(scene: Any, body: Body, event: _Event, sampler: Any, active: Any)
     # solid angle at the event per solid angle of the straight direction, over which the emitter was sampled
     facing = dr.select(dr.squared_norm(ds.n) > 0, dr.abs(dr.dot(ds.n, met.w)) / dr.abs(dr.dot(ds.n, ds.d)), 1)
     spread = dr.select(ds.delta, 1, facing) * reach * reach * met.density
-    phase = _spectrum([eval_hg(dr.dot(event.along, met.d), number(float(m.g))) for m in body.media])
+    phase = _spectrum([eval_hg(dr.dot(event.along, met.d), number(m.g)) for m in body.media])
     value = event.weight * phase * _extinction(body, met.length) * (met.T * spread) * light
     edge = place(met.p, met.n)
     blocked = scene.ray_test(edge.spawn_ray_to(target), False, met.valid)
@@ -120,7 +120,7 @@ def _connected(scene: Any, body: Body, event: _Event, sampler: Any, active: Any)
 def _extinction(body: Body, length: Any) -> Any:
     import drjit as dr
 
-    return _spectrum([dr.exp(-number(float(m.sigma_t)) * length) for m in body.media])
+    return _spectrum([dr.exp(-number(m.sigma_t) * length) for m in body.media])
 
 
 def _spectrum(values: list[Any]) -> Any:
