@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from halfspace_sss import fresnel
-from halfspace_sss.medium import Medium
+from halfspace_sss.physics import fresnel
+from halfspace_sss.physics.medium import Medium
 
 __all__ = ["MOMENTS", "Boundary", "Grosjean", "safe_differences", "unit_gauss"]
 

@@ -6,9 +6,9 @@ import math
 from typing import Any
 
 from analytic_models._diffusion import Boundary, Grosjean, safe_differences
-from halfspace_sss.interface import Query
-from halfspace_sss.medium import Medium
-from halfspace_sss.separable import Separable
+from halfspace_sss.interface.model import Query
+from halfspace_sss.interface.separable import Separable
+from halfspace_sss.physics.medium import Medium
 
 __all__ = ["BetterDipole"]
 

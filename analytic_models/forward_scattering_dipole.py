@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from analytic_models._diffusion import unit_gauss
-from halfspace_sss.fresnel import boundary_A
-from halfspace_sss.interface import BSSRDF, Query
-from halfspace_sss.medium import Medium
+from halfspace_sss.interface.model import BSSRDF, Query
+from halfspace_sss.physics.fresnel import boundary_A
+from halfspace_sss.physics.medium import Medium
 
 __all__ = ["ForwardScatteringDipole", "Monopole"]
 

@@ -6,8 +6,8 @@ import math
 from typing import Any
 
 from analytic_models._diffusion import Boundary, Grosjean, safe_differences, unit_gauss
-from halfspace_sss.interface import BSSRDF, Query
-from halfspace_sss.medium import Medium
+from halfspace_sss.interface.model import BSSRDF, Query
+from halfspace_sss.physics.medium import Medium
 
 __all__ = ["PhotonBeamDiffusion"]
 

@@ -6,7 +6,8 @@ A figure is one file `figures/NAME.py` and one entry of `FIGURES` below. The mod
 - `parts(quality) -> list[Part]`: what is to be computed, for the quality "draft" (minutes on two cores) or "paper";
 - `draw(results) -> {file name: bytes or str}`: pictures, pages and tables from the results, by name of the part.
 
-`figures.runner.compute(name, quality, folder)` computes the parts, `figures.runner.draw(...)` writes what is drawn.
+`figures.parts.runner.compute(name, quality, folder)` computes the parts, `figures.parts.runner.draw(...)` writes what
+is drawn.
 
 A `Part` is a name, parameters ready for JSON, a function and its estimated work:
 
@@ -23,8 +24,9 @@ A `Part` is a name, parameters ready for JSON, a function and its estimated work
   did. A part that is damaged is computed again and named.
 - `needs` names parts that stand before it in the list; their results are in `task.needed`. `task.folder` is kept
   until the part is done: passes of a long render stored there survive an interruption.
-- For images: `figures.shot.compared` makes shots with FLIP, relMSE and maps from results; `figures.image_grid` and
-  `figures.page` draw the same {scene: [shots]} as PDF and PNG, and as a page that flips between them.
+- For images: `figures.drawing.shot.compared` makes shots with FLIP, relMSE and maps from results;
+  `figures.drawing.image_grid` and `figures.drawing.page` draw the same {scene: [shots]} as PDF and
+  PNG, and as a page that flips between them.
 - Seconds for a unit of `work` are measured: what a draft took says what the paper quality will take.
 """
 

@@ -7,16 +7,16 @@ from typing import Any
 
 import numpy as np
 
-from figures import error_tables
-from figures.contenders import MODELS, VOLUMES, WALK, contender, long_walk
-from figures.denoise import guides
+from figures.computing.contenders import MODELS, VOLUMES, WALK, contender, long_walk
+from figures.computing.denoise import guides
+from figures.computing.furnace import furnace, furnace_models
+from figures.computing.model_inputs import weight_files
+from figures.computing.sampling_cost import split
+from figures.computing.scenes import BUNNY
+from figures.computing.timed import Timed, alternating, rendered
+from figures.drawing import error_tables
 from figures.fig09 import MATERIALS, prepare
-from figures.furnace import furnace, furnace_models
-from figures.model_inputs import weight_files
-from figures.part import Part, Result, Task
-from figures.sampling_cost import split
-from figures.scenes import BUNNY
-from figures.timed import Timed, alternating, rendered
+from figures.parts.part import Part, Result, Task
 from halfspace_sss import materials
 
 __all__ = ["TITLE", "draw", "errors", "measured", "parts"]

@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from figures.image_grid import image_grid
-from figures.model_inputs import weight_files
-from figures.page import page
-from figures.part import Part, Result, Task
-from figures.scenes import BUNNY, bunny_scene
-from figures.shot import Shot, absent, compared
-from figures.style import look, paper, saved
+from figures.computing.model_inputs import weight_files
+from figures.computing.scenes import BUNNY, bunny_scene
+from figures.drawing.image_grid import image_grid
+from figures.drawing.page import page
+from figures.drawing.shot import Shot, absent, compared
+from figures.drawing.style import look, paper, saved
+from figures.parts.part import Part, Result, Task
 from halfspace_sss import materials
 from halfspace_sss.provenance import check_folder
 
@@ -70,8 +70,8 @@ def prepare() -> None:
 
 def path_traced(task: Task) -> dict[str, Any]:
     """The image by random walks, in passes that survive an interruption."""
-    from halfspace_sss.rendering import reference
-    from halfspace_sss.rendering.scene_files import load_scene
+    from halfspace_sss.rendering.scenes import reference
+    from halfspace_sss.rendering.scenes.scene_files import load_scene
 
     prepare()
     p = task.params
@@ -89,7 +89,7 @@ def rendered(task: Task) -> dict[str, Any]:
     """The image of a model, and the seconds it takes once it is compiled."""
     import mitsuba as mi
 
-    from halfspace_sss.rendering.scene_files import load_scene
+    from halfspace_sss.rendering.scenes.scene_files import load_scene
 
     prepare()
     p = task.params

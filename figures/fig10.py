@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from figures.model_inputs import accepting, weight_files
-from figures.part import Part, Result, Task
-from halfspace_sss.curve_set import Curve, CurveSet
+from figures.computing.model_inputs import accepting, weight_files
+from figures.parts.part import Part, Result, Task
+from halfspace_sss.comparison.curve_set import Curve, CurveSet
+from halfspace_sss.comparison.reflectance_curves import FIG10_THETA_I, curves
 from halfspace_sss.materials import load
-from halfspace_sss.medium import Medium
-from halfspace_sss.reflectance_curves import FIG10_THETA_I, curves
+from halfspace_sss.physics.medium import Medium
 
 __all__ = ["TITLE", "draw", "parts"]
 
@@ -56,7 +56,7 @@ def model_curves(task: Task) -> dict[str, Any]:
 
 def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
     """The figure as PDF and PNG, the values and the errors as tables."""
-    from figures.curve_plot import render
+    from figures.drawing.curve_plot import render
 
     result = curve_set(results)
     files: dict[str, bytes | str] = {f"fig10.{ending}": data for ending, data in render(result).items()}

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from figures.computing.model_inputs import weight_files
+from figures.drawing.style import COLUMN, look, paper, saved
 from figures.fig09 import MODELS, prepare
-from figures.model_inputs import weight_files
-from figures.part import Part, Result, Task
-from figures.style import COLUMN, look, paper, saved
-from halfspace_sss.medium import Medium
+from figures.parts.part import Part, Result, Task
+from halfspace_sss.physics.medium import Medium
 
 __all__ = ["TITLE", "draw", "parts"]
 
@@ -54,7 +54,7 @@ def _measured(task: Task) -> dict[str, Any]:
 
     import mitsuba as mi
 
-    from halfspace_sss.rendering.scene_files import load_scene
+    from halfspace_sss.rendering.scenes.scene_files import load_scene
 
     prepare()
     p, means, errors = task.params, [], []

@@ -28,23 +28,23 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from halfspace_sss import materials, measure, neural
-    from halfspace_sss.interface import BSSRDF, bssrdf, models, register_model
-    from halfspace_sss.maps import make_maps
-    from halfspace_sss.medium import Medium
-    from halfspace_sss.reflectance_curves import curves
-    from halfspace_sss.tracer import trace
+    from halfspace_sss.comparison.reflectance_curves import curves
+    from halfspace_sss.interface.model import BSSRDF, bssrdf, models, register_model
+    from halfspace_sss.maps.store import make_maps
+    from halfspace_sss.physics.medium import Medium
+    from halfspace_sss.tracing.tracer import trace
 
 prefer_bundled_llvm()
 
 _HOME = {
-    "BSSRDF": "interface",
-    "Medium": "medium",
-    "bssrdf": "interface",
-    "curves": "reflectance_curves",
-    "make_maps": "maps",
-    "models": "interface",
-    "register_model": "interface",
-    "trace": "tracer",
+    "BSSRDF": "interface.model",
+    "Medium": "physics.medium",
+    "bssrdf": "interface.model",
+    "curves": "comparison.reflectance_curves",
+    "make_maps": "maps.store",
+    "models": "interface.model",
+    "register_model": "interface.model",
+    "trace": "tracing.tracer",
 }
 _SUBMODULES = ("materials", "measure", "neural")
 __all__ = [

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from halfspace_sss.medium import Medium
+from halfspace_sss.physics.medium import Medium
 
 __all__ = ["check_count", "check_edges", "check_finite", "check_interval", "check_query", "check_scalar_medium"]
 

@@ -50,7 +50,7 @@ def stand_ins(tmp_path_factory: pytest.TempPathFactory):
 @pytest.fixture(scope="session")
 def truths() -> list[dict[str, str]]:
     """Rows of the packaged reference values."""
-    text = resources.files("halfspace_sss").joinpath("data/truths.csv").read_text(encoding="utf-8")
+    text = resources.files("halfspace_sss.comparison").joinpath("data/truths.csv").read_text(encoding="utf-8")
     return list(csv.DictReader(line for line in text.splitlines() if not line.startswith("#")))
 
 

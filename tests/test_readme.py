@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import typer
 
-from halfspace_sss import cli
+from halfspace_sss.cli import app as cli
 
 ROOT = Path(__file__).resolve().parent.parent
 README = (ROOT / "README.md").read_text(encoding="utf-8")

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from halfspace_sss import Medium
-from halfspace_sss.passes import Estimate
+from halfspace_sss.tracing.passes import Estimate
 
 MEDIA = {
     "matched": Medium.from_albedo(0.9, 1.0, 0.5, 1.0),

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StringConstraints, ValidationError
 
 from halfspace_sss.materials.material import Material
-from halfspace_sss.medium import Medium
+from halfspace_sss.physics.medium import Medium
 
 if sys.version_info >= (3, 11):
     import tomllib

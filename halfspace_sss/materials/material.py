@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from halfspace_sss.medium import Medium
+from halfspace_sss.physics.medium import Medium
 
 if TYPE_CHECKING:
-    from halfspace_sss.interface import BSSRDF
+    from halfspace_sss.interface.model import BSSRDF
 
 __all__ = ["Material", "key_of"]
 

@@ -17,7 +17,7 @@ from halfspace_sss.neural.paper_model import NeuralPaper
 from halfspace_sss.neural.universal import Neural
 
 if TYPE_CHECKING:
-    from halfspace_sss.neural.training import train, train_universal
+    from halfspace_sss.neural.training.recipes import train, train_universal
 
 __all__ = ["MODELS", "Neural", "NeuralMaterial", "NeuralPaper", "train", "train_universal"]
 
@@ -26,7 +26,7 @@ MODELS = [Neural, NeuralMaterial, NeuralPaper]
 
 def __getattr__(name: str) -> Any:
     if name in ("train", "train_universal"):
-        from halfspace_sss.neural import training
+        from halfspace_sss.neural.training import recipes
 
-        return getattr(training, name)
+        return getattr(recipes, name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

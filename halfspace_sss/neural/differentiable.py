@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 
 from halfspace_sss.arrays import broadcast_query, library
-from halfspace_sss.fresnel import F_t
-from halfspace_sss.interface import Query
-from halfspace_sss.neural.backbone import backbone_shape, length_scale
+from halfspace_sss.interface.model import Query
 from halfspace_sss.neural.features import medium_features, symmetric_features, travel
 from halfspace_sss.neural.hypernetwork import Hypernetwork
 from halfspace_sss.neural.universal import load_hypernetwork, shipped_weights
+from halfspace_sss.physics.backbone import backbone_shape, length_scale
+from halfspace_sss.physics.fresnel import F_t
 
 __all__ = ["neural_S"]
 

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from halfspace_sss.arrays import library
-from halfspace_sss.medium import Medium
-from halfspace_sss.neural.backbone import length_scale
 from halfspace_sss.neural.features import N_FEATURES, medium_features
 from halfspace_sss.neural.network import Network, layer_shapes
+from halfspace_sss.physics.backbone import length_scale
+from halfspace_sss.physics.medium import Medium
 
 __all__ = ["RANGES", "Hypernetwork", "check_range", "in_range"]
 

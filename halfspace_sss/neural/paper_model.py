@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from typing import Any
 
-from halfspace_sss.fresnel import F_t
-from halfspace_sss.interface import BSSRDF, Query
-from halfspace_sss.medium import Medium
-from halfspace_sss.neural.backbone import U_MAX, length_scale
+from halfspace_sss.interface.model import BSSRDF, Query
 from halfspace_sss.neural.material_model import load_network
 from halfspace_sss.neural.network import RELU, Network
 from halfspace_sss.neural.store import load_weights, record_number
 from halfspace_sss.neural.symmetric import channel_queries, channels
 from halfspace_sss.neural.trained import find_weights
+from halfspace_sss.physics.backbone import U_MAX, length_scale
+from halfspace_sss.physics.fresnel import F_t
+from halfspace_sss.physics.medium import Medium
 
 __all__ = ["KIND", "N_INPUTS", "NeuralPaper", "paper_inputs", "query_inputs"]
 

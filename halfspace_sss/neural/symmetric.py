@@ -5,11 +5,11 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from halfspace_sss.interface import BSSRDF, Query
-from halfspace_sss.medium import Medium
-from halfspace_sss.neural.backbone import backbone_shape, length_scale
+from halfspace_sss.interface.model import BSSRDF, Query
 from halfspace_sss.neural.features import symmetric_features, travel
 from halfspace_sss.neural.network import Network
+from halfspace_sss.physics.backbone import backbone_shape, length_scale
+from halfspace_sss.physics.medium import Medium
 
 __all__ = ["LOG_RANGE", "SymmetricModel", "channel_queries", "channels", "factored_G"]
 

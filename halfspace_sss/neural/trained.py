@@ -6,7 +6,7 @@ import os
 from importlib import resources
 from pathlib import Path
 
-from halfspace_sss.medium import Medium
+from halfspace_sss.physics.medium import Medium
 
 __all__ = ["ENVIRONMENT_VARIABLE", "find_weights", "weights_folder", "weights_name"]
 

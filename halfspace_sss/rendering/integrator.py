@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from halfspace_sss.rendering.body import make_bodies
-from halfspace_sss.rendering.object import same_objects
 from halfspace_sss.rendering.paths import trace_paths
-from halfspace_sss.rendering.settings import read_settings
+from halfspace_sss.rendering.surface.object import same_objects
+from halfspace_sss.rendering.transport.body import make_bodies
+from halfspace_sss.rendering.transport.settings import read_settings
 
 __all__ = ["integrator_class"]
 

@@ -6,11 +6,11 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
-from halfspace_sss.rendering.body import Body
 from halfspace_sss.rendering.lights import Lights
-from halfspace_sss.rendering.plane import Exit, local_frame, number, place, plane_query
-from halfspace_sss.rendering.settings import Settings
-from halfspace_sss.rendering.single import single_scattering_at
+from halfspace_sss.rendering.transport.body import Body
+from halfspace_sss.rendering.transport.plane import Exit, local_frame, number, place, plane_query
+from halfspace_sss.rendering.transport.settings import Settings
+from halfspace_sss.rendering.transport.single import single_scattering_at
 
 __all__ = ["trace_paths"]
 

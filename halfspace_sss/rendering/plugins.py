@@ -51,8 +51,8 @@ def _register_all() -> None:
     import mitsuba as mi
 
     from halfspace_sss.rendering.integrator import integrator_class
-    from halfspace_sss.rendering.translucent import translucent_class
-    from halfspace_sss.rendering.walk_integrator import walk_integrator_class
+    from halfspace_sss.rendering.surface.translucent import translucent_class
+    from halfspace_sss.rendering.walk.integrator import walk_integrator_class
 
     mi.register_bsdf("translucent", translucent_class())
     mi.register_integrator("bssrdf", integrator_class())

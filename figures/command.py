@@ -1,0 +1,152 @@
+"""The command `halfspace-sss figures`: compute what changed of the paper's figures, and draw them."""
+
+from __future__ import annotations
+
+from enum import Enum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+import figures
+from halfspace_sss.backend import BackendError
+from halfspace_sss.cli.shared import Bar, console
+
+if TYPE_CHECKING:
+    from figures.parts.runner import Plan
+
+__all__ = ["figures_command"]
+
+EXTRAS = ("PIL", "flip_evaluator", "matplotlib", "mitsuba")
+
+
+class Action(str, Enum):
+    """What is done with the figures."""
+
+    list = "list"
+    compute = "compute"
+    draw = "draw"
+    all = "all"
+
+
+class Quality(str, Enum):
+    """How much is spent on them."""
+
+    draft = "draft"
+    paper = "paper"
+
+
+def figures_command(
+    action: Annotated[
+        Action, typer.Argument(help="list what there is, compute parts, draw, or all: compute and draw.")
+    ],
+    names: Annotated[
+        list[str] | None, typer.Argument(help="Names of figures.", metavar="[NAMES]...", show_default="all")
+    ] = None,
+    quality: Annotated[Quality, typer.Option(help="draft: minutes on two cores. paper: as published.")] = Quality.draft,
+    out: Annotated[Path, typer.Option(help="Folder for parts and pictures of all figures.")] = Path("out"),
+) -> None:
+    """Make the figures of the paper; a part that is there is computed again only if what it depends on changed."""
+    from figures.parts.runner import figure, plan
+
+    chosen = list(dict.fromkeys(names or figures.FIGURES))
+    do = {Action.list: _list, Action.compute: _compute, Action.draw: _draw, Action.all: _all}[action]
+    try:
+        for name in chosen:
+            figure(name)
+        do([plan(name, quality.value, out) for name in chosen], out)
+    except ModuleNotFoundError as error:
+        if (error.name or "").split(".")[0] not in EXTRAS:
+            raise
+        raise BackendError(f'figures need {error.name}: pip install "halfspace-sss[figures,render]"') from error
+
+
+def _say(text: str) -> None:
+    console().print(text, highlight=False, markup=False, soft_wrap=True)
+
+
+def _list(plans: list[Plan], out: Path) -> None:
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table
+
+    from figures.parts.runner import figure
+
+    table = Table(box=SIMPLE_HEAD, pad_edge=False, title=f"quality {plans[0].quality}, in {out}", title_justify="left")
+    for heading in ("figure", "shows", "parts", "computed", "damaged", "time for the rest", "drawn"):
+        table.add_column(heading, justify="left" if heading in ("figure", "shows") else "right", overflow="fold")
+    for p in plans:
+        done = len(p.parts) - len(p.missing)
+        drawn = "yes" if (p.folder / f"{p.name}.json").exists() else "no"
+        counts = (str(len(p.parts)), str(done), str(len(p.damaged)))
+        table.add_row(p.name, figure(p.name).TITLE, *counts, _time(p), drawn)
+    console().print(table)
+    for p in plans:
+        for reason in p.damaged.values():
+            _say(f"damaged: {reason}")
+
+
+def _time(p: Plan) -> str:
+    """What the missing parts will take, and how many of them nobody has measured."""
+    from figures.parts.projection import duration
+
+    if not p.missing:
+        return "none"
+    unknown = f"{len(p.unmeasured)} parts not measured yet" if p.unmeasured else ""
+    if len(p.unmeasured) == len(p.missing):
+        return unknown
+    return f"about {duration(p.projected_seconds)}" + (f" and {unknown}" if unknown else "")
+
+
+def _announce(p: Plan) -> None:
+    """The time, before it is spent."""
+    if not p.missing:
+        _say(f"{p.name} {p.quality}: all {len(p.parts)} parts are there")
+        return
+    _say(f"{p.name} {p.quality}: {len(p.missing)} of {len(p.parts)} parts to compute, {_time(p)}")
+    if p.unmeasured and p.quality == "paper":
+        _say(f"  `halfspace-sss figures compute {p.name} --quality draft` measures them first")
+    sources = [found.source for found in p.seconds.values() if found.source]
+    for source in dict.fromkeys(sources):
+        _say(f"  {sources.count(source)} measured by {source}, scaled by work")
+
+
+def _compute(plans: list[Plan], out: Path) -> None:
+    _announce_all(plans)
+    for p in plans:
+        _compute_one(p, out)
+
+
+def _announce_all(plans: list[Plan]) -> None:
+    from figures.parts.projection import duration
+
+    for p in plans:
+        _announce(p)
+    if sum(bool(p.missing) for p in plans) > 1:
+        unknown = sum(len(p.unmeasured) for p in plans)
+        more = f" and {unknown} parts not measured yet" if unknown else ""
+        _say(f"together about {duration(sum(p.projected_seconds for p in plans))}{more}")
+
+
+def _compute_one(p: Plan, out: Path) -> None:
+    from figures.parts.projection import duration
+    from figures.parts.runner import compute
+
+    with Bar(p.name) as bar:
+        results = compute(p.name, p.quality, out, bar.show, _say)
+    if p.missing:
+        _say(f"{p.name}: computed in {duration(sum(results[name].seconds for name in p.missing))}")
+
+
+def _draw(plans: list[Plan], out: Path) -> None:
+    from figures.parts.runner import draw
+
+    for p in plans:
+        for path in draw(p.name, p.quality, out):
+            _say(f"  {path}")
+
+
+def _all(plans: list[Plan], out: Path) -> None:
+    _announce_all(plans)
+    for p in plans:
+        _compute_one(p, out)
+        _draw([p], out)

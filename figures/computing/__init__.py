@@ -1,0 +1,1 @@
+"""What figures compute: scenes, contenders in equal time, images and their errors."""

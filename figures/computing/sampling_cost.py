@@ -1,0 +1,95 @@
+"""Where the time of a sample of the BSSRDF goes: finding the entry, looking for light there, and evaluating S."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from figures.computing.contenders import contender
+from figures.fig09 import prepare
+from figures.parts.part import Task
+
+__all__ = ["split"]
+
+STEPS = ("entries", "visibility", "evaluation")
+
+
+def split(task: Task) -> dict[str, Any]:
+    """Seconds per million samples of each step and model, each step as a kernel of its own over the same lanes.
+
+    The models take turns; of the repeats the fastest counts, which is the one that nothing else delayed.
+    """
+    prepare()
+    p = task.params
+    steps = {model: _steps(contender(model, p["material"], 64, "small light"), p["lanes"]) for model in p["models"]}
+    best = {(model, step): np.inf for model in p["models"] for step in STEPS}
+    for k in range(p["repeats"] + 1):  # the first compiles
+        for model, step in best:
+            seconds = _kernel_seconds(steps[model][step])
+            best[model, step] = min(best[model, step], seconds) if k else np.inf
+        task.progress(k + 1, p["repeats"] + 1)
+    scale = 1e6 / p["lanes"]
+    return {
+        "rows": [{"model": model, **{step: scale * best[model, step] for step in STEPS}} for model in p["models"]],
+        "lanes": p["lanes"],
+    }
+
+
+def _steps(scene: Any, n: int) -> dict[str, Callable[[], Any]]:
+    """For each step what it computes, from inputs that are in memory."""
+    import drjit as dr
+    import mitsuba as mi
+
+    from halfspace_sss.rendering.paths import exit_at
+    from halfspace_sss.rendering.transport.plane import place, plane_query
+
+    (body,) = scene.integrator().prepare(scene)
+    si, sampler = _seen(scene, n), mi.load_dict({"type": "independent"})
+    sampler.seed(11, n)
+    out, face = exit_at(body, si), mi.UInt32(si.prim_index)
+    entry = body.positions.sample(out, face, sampler, mi.Bool(True))
+    direction = mi.Frame3f(entry.n_out).to_world(mi.warp.square_to_cosine_hemisphere(sampler.next_2d()))
+    dr.eval(tuple(out), face, tuple(entry), direction, sampler)  # named tuples are passed over
+    query = plane_query(entry.p, entry.n_out, direction, out, scene.integrator().settings.geometry)
+    ray = place(entry.p, entry.n).spawn_ray(direction)
+    dr.eval(query, ray)
+    found = entry.weight > 0
+    dr.eval(found)
+
+    def evaluated() -> Any:
+        return [dr.select(found, model.eval(*query), 0) for model in body.models]
+
+    return {
+        "entries": lambda: tuple(body.positions.sample(out, face, sampler.clone(), mi.Bool(True))),
+        "visibility": lambda: scene.ray_intersect_preliminary(ray, coherent=False, active=found),
+        "evaluation": evaluated,
+    }
+
+
+def _seen(scene: Any, n: int) -> Any:
+    """Points of the object where n rays of the camera meet it."""
+    import drjit as dr
+    import mitsuba as mi
+
+    rng, sensor, found = np.random.default_rng(5), scene.sensors()[0], np.zeros((2, 0), dtype=np.float32)
+    while found.shape[1] < n:
+        place = rng.random((2, 2 * n)).astype(np.float32)
+        ray, _ = sensor.sample_ray(0.0, 0.5, mi.Point2f(place), mi.Point2f(0.5))
+        found = np.hstack([found, place[:, np.array(scene.ray_intersect_preliminary(ray).is_valid())]])
+    ray, _ = sensor.sample_ray(0.0, 0.5, mi.Point2f(found[:, :n]), mi.Point2f(0.5))
+    si = scene.ray_intersect(ray)
+    dr.eval(si)
+    return si
+
+
+def _kernel_seconds(make: Callable[[], Any]) -> float:
+    """Seconds in which the kernels run that compute what `make` returns, without tracing and compiling them."""
+    import drjit as dr
+
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        dr.eval(make())
+        dr.sync_thread()
+        return 1e-3 * sum(kernel["execution_time"] for kernel in dr.kernel_history([dr.KernelType.JIT]))

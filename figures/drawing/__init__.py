@@ -1,0 +1,1 @@
+"""What figures draw: their style, images side by side, pages, curves and tables."""

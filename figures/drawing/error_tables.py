@@ -1,0 +1,191 @@
+"""Tables of equal-error times, of the time per sample and of the white furnace, as data frames and as Markdown."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from figures.computing.contenders import VOLUMES, WALK, label, volume
+from figures.drawing.style import look
+
+if TYPE_CHECKING:
+    import pandas
+
+__all__ = ["asked", "equal_error", "furnace", "markdown", "sampling"]
+
+ASKED = {  # times less time than volpathmis that a dipole without reflection is to need
+    ("marble", "small light"): 5000.0,
+    ("marble", "even sky"): 224.0,
+    ("potato", "small light"): 2000.0,
+    ("potato", "even sky"): 1.0,
+    ("ketchup", "small light"): 2000.0,
+    ("ketchup", "even sky"): 1.3,
+}
+PROTOTYPE = volume(200)  # what the numbers above were measured against
+LEARNT_SHARE = 0.5  # of what is asked of a dipole, for the learnt model
+CERTAIN = 2.0  # standard errors by which an error must stand out of the noise of the truth
+NOTES = """\
+Cost is mean squared error of the pixels of the object times seconds, compilation left out; a ratio is the cost of
+`volpathmis` at the best of its settings over that of the method: how many times less time the method needs for the
+same error. *Variance*: the error is that about a long independent render by the same method. *With bias*: it is that
+about the path traced image, at the number of samples of this run; bias does not fall with time, so this ratio does.
+*Bias* is the root mean square of what the model would still be off after any time, over that of the image, and
+*until* the seconds after which `volpathmis` is as near to the truth as that. A dash: lost in the noise of the truth.
+Russian roulette only adds variance: where a setting of `volpathmis` seems to have less than one whose roulette begins
+later, it has not met its rare bright paths yet, and counts with the variance of the other. `volpathmis` renders the
+channels of a medium whose mean cosine differs between them one by one."""
+BARE_NOTES = """\
+The models without surface reflection and without added single scattering, as the prototype was measured, against
+`volpathmis` at its best setting and at rr_depth 200, which the prototype took. Asked for the dipoles, half of it for
+the neural model."""
+
+
+def asked(material: str, lights: str, method: str) -> float | None:
+    """The ratio that a bare model is to reach in a scene; None where none is asked for."""
+    name, _, bare = method.partition(", ")
+    if not bare or (material, lights) not in ASKED:
+        return None
+    return ASKED[material, lights] * (LEARNT_SHARE if name == "neural" else 1.0)
+
+
+def equal_error(scenes: Mapping[tuple[str, str], Mapping[str, Any]]) -> pandas.DataFrame:
+    """A row for each scene and method.
+
+    Args:
+        scenes: (material, lights) -> what `figures.equal_error.measured` gave.
+    """
+    import pandas
+
+    return pandas.DataFrame([row for scene, found in scenes.items() for row in _scene_rows(scene, found)])
+
+
+def _scene_rows(scene: tuple[str, str], found: Mapping[str, Any]) -> list[dict[str, Any]]:
+    costs = _costs(found["rows"])
+    best = min((name for name in VOLUMES if costs.get(name, 0.0) > 0), key=lambda name: costs[name], default=None)
+    best_cost, level, rows = costs.get(best, np.nan), found["truth"]["mean square"], []
+    for row in found["rows"]:
+        name, bias2, error = row["method"], _certain(row, "bias2"), _certain(row, "error")
+        if "," in name:  # it leaves out on purpose what the truth has
+            bias2 = error = np.nan
+        rows.append(
+            {
+                "material": scene[0],
+                "lights": scene[1],
+                **row,
+                "cost": costs[name],
+                "relative bias": np.sqrt(bias2 / level),
+                "ratio": _ratio(best_cost, costs[name]),
+                "ratio with bias": _ratio(best_cost, error * row["seconds"]),
+                "ratio to rr_depth 200": _ratio(costs.get(PROTOTYPE, np.nan), costs[name]),
+                "seconds until bias": _ratio(best_cost, bias2),
+                "asked": asked(*scene, name),
+                "is best volpathmis": name == best,
+            }
+        )
+    return rows
+
+
+def _costs(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+    """Variance times seconds by method; of volpathmis no variance is below that of a later roulette."""
+    of_a_sample, found = {row["method"]: row["variance"] * row["spp"] for row in rows}, {}
+    for row in rows:
+        name = row["method"]
+        later = VOLUMES[VOLUMES.index(name) :] if name in VOLUMES else (name,)
+        variance = max(of_a_sample[other] for other in later if other in of_a_sample) / row["spp"]
+        found[name] = variance * row["seconds"] if variance > 0 else np.nan
+    return found
+
+
+def _certain(row: Mapping[str, Any], key: str) -> float:
+    """A number of a row, NaN where the noise of the truth hides it."""
+    return row[key] if row[key] > CERTAIN * row[f"{key} standard error"] else np.nan
+
+
+def _ratio(above: float, below: float) -> float:
+    return above / below if below > 0 else np.nan
+
+
+def sampling(rows: Sequence[Mapping[str, Any]]) -> pandas.DataFrame:
+    """Seconds per million samples, with their sum."""
+    import pandas
+
+    table = pandas.DataFrame(rows)
+    table["sum"] = table.drop(columns="model").sum(axis=1)
+    return table
+
+
+def furnace(numbers: Mapping[str, Mapping[str, float]]) -> pandas.DataFrame:
+    """Mean radiance by method, with its excess over 1."""
+    import pandas
+
+    rows = [{"method": name, **found, "excess": found["mean"] - 1} for name, found in numbers.items()]
+    return pandas.DataFrame(rows)
+
+
+def markdown(errors: pandas.DataFrame, sampling: pandas.DataFrame, furnace: pandas.DataFrame) -> str:
+    """All three as one text."""
+    whole = errors[~errors["method"].str.contains(", ")]
+    bare = errors[errors["asked"].notna()]
+    parts = ["# Time to equal error", NOTES, _whole(whole)]
+    if len(bare):
+        parts += ["## Without reflection and single scattering", BARE_NOTES, _bare(bare)]
+    steps = sampling.assign(model=[look(name).label for name in sampling["model"]])
+    parts += ["## Seconds per million samples", "Each step as a kernel of its own; S of three channels.", _table(steps)]
+    names = [label(name) if name == WALK else look(name).label for name in furnace["method"]]
+    parts += ["## White furnace", "Mean radiance, 1 for what neither absorbs nor gains.", _furnace(furnace, names)]
+    return "\n\n".join(parts) + "\n"
+
+
+def _whole(rows: pandas.DataFrame) -> str:
+    kept = rows[~rows["method"].isin(VOLUMES) | rows["is best volpathmis"]]
+    table = kept[["material", "lights"]].assign(
+        method=[label(name) for name in kept["method"]],
+        variance=kept["ratio"],
+        **{
+            "with bias": kept["ratio with bias"],
+            "bias": [_percent(*pair) for pair in zip(kept["method"], kept["relative bias"])],
+        },
+        **{"until, s": kept["seconds until bias"]},
+    )
+    return _table(table)
+
+
+def _percent(method: str, share: float) -> str:
+    if method in (WALK, *VOLUMES):
+        return "none"
+    return f"{100 * share:.2g} %" if np.isfinite(share) else "—"
+
+
+def _bare(rows: pandas.DataFrame) -> str:
+    table = rows[["material", "lights"]].assign(
+        model=[label(name.partition(", ")[0]) for name in rows["method"]],
+        **{"to the best": rows["ratio"], "to rr_depth 200": rows["ratio to rr_depth 200"], "asked": rows["asked"]},
+        reached=["yes" if r >= a else "no" for r, a in zip(rows["ratio"], rows["asked"])],
+    )
+    return _table(table)
+
+
+def _furnace(rows: pandas.DataFrame, names: Sequence[str]) -> str:
+    table = rows[[]].assign(
+        method=names,
+        mean=[f"{m:.4f} ± {e:.4f}" for m, e in zip(rows["mean"], rows["standard error"])],
+        excess=[f"{v:+.4f}" for v in rows["excess"]],
+    )
+    return _table(table)
+
+
+def _table(table: pandas.DataFrame) -> str:
+    """A table in Markdown, numbers with three digits."""
+    lines = [list(table.columns), ["---"] * len(table.columns)]
+    lines += [[_said(value) for value in row] for row in table.itertuples(index=False)]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def _said(value: Any) -> str:
+    if isinstance(value, str):
+        return value
+    if not np.isfinite(value):
+        return "—"
+    return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"

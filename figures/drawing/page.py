@@ -1,0 +1,136 @@
+"""One HTML page, without anything outside it, in which the images of scenes are flipped between and zoomed in step."""
+
+from __future__ import annotations
+
+import base64
+import html
+import io
+import json
+import math
+from collections.abc import Mapping, Sequence
+from importlib import resources
+from typing import Any
+
+import numpy as np
+
+from figures.computing.tone import srgb
+from figures.drawing.shot import FLIP, RELATIVE_MSE, Shot
+
+__all__ = ["page"]
+
+DIFFERENCE_SPAN = 1.0  # relative difference at the ends of the colours
+MAPS = {
+    "flip": ("FLIP", "magma", ("no difference, 0", "1")),
+    "difference": ("relative difference", "RdBu_r", ("darker, ≤ −1", "brighter, ≥ 1")),
+}
+
+
+def page(
+    title: str, scenes: Mapping[str, Sequence[Shot]], *, exposure: float = 0.0, caption: str = "", notes: str = "",
+    lower_is_better: Sequence[str] = (FLIP, RELATIVE_MSE),
+) -> str:  # fmt: skip
+    """The page as text, to be written as one file; the same arguments give the same text.
+
+    Args:
+        title: heading, and title of the window.
+        scenes: name of a scene -> its images, the reference first. `figures.drawing.shot.compared` makes those with
+            maps, `figures.drawing.shot.absent` keeps a place for what does not exist yet.
+        exposure: stops at which the images are encoded; the slider of the page starts from there.
+        caption: a sentence under the title.
+        notes: what the numbers are, below the table.
+        lower_is_better: columns of which the smallest number is set in bold; they come first, the first of them is
+            repeated above each image.
+
+    Raises:
+        ValueError: there is no scene, a scene starts without an image, or its images and maps differ in size.
+    """
+    if not scenes:
+        raise ValueError("scenes must hold at least one scene, got none")
+    for name, shots in scenes.items():
+        _check(name, shots)
+    given = dict.fromkeys(column for shots in scenes.values() for shot in shots for column in shot.numbers)
+    columns = [column for column in lower_is_better if column in given]
+    columns += [column for column in given if column not in columns]
+    data = {
+        "scenes": [_scene(name, shots, exposure) for name, shots in scenes.items()],
+        "columns": columns,
+        "lower": list(lower_is_better),
+        "maps": {kind: _map(kind) for kind in MAPS},
+    }
+    content = {name: html.escape(text) for name, text in (("title", title), ("caption", caption), ("notes", notes))}
+    content |= {"style": _file("page.css"), "script": _file("page.js")}
+    content["data"] = json.dumps(data, allow_nan=False, ensure_ascii=False).replace("</", "<\\/")
+    return _filled(_file("page.html"), content)
+
+
+def _filled(template: str, content: Mapping[str, str]) -> str:
+    """The template with {{name}} replaced; what is put in is not looked at again."""
+    pieces = template.split("{{")
+    text = pieces[0]
+    for piece in pieces[1:]:
+        name, rest = piece.split("}}", 1)
+        text += content[name] + rest
+    return text
+
+
+def _file(name: str) -> str:
+    return resources.files("figures").joinpath("page_files", name).read_text(encoding="utf-8")
+
+
+def _check(name: str, shots: Sequence[Shot]) -> None:
+    if not shots or shots[0].image is None:
+        raise ValueError(f"scene {name!r} must start with the image of its reference, got none")
+    labels = [shot.label for shot in shots]
+    if len(set(labels)) < len(labels):
+        raise ValueError(f"labels of scene {name!r} must differ, got {labels!r}")
+    size = np.shape(shots[0].image)[:2]
+    for shot in shots:
+        for kind in ("image", "flip", "difference"):
+            pixels = getattr(shot, kind)
+            if pixels is not None and np.shape(pixels)[:2] != size:
+                raise ValueError(f"{kind} of {shot.label!r} in {name!r} must have the size {size}, got {pixels.shape}")
+
+
+def _scene(name: str, shots: Sequence[Shot], exposure: float) -> dict[str, Any]:
+    height, width = np.shape(shots[0].image)[:2]
+    return {"name": name, "size": [width, height], "shots": [_shot(shot, exposure) for shot in shots]}
+
+
+def _shot(shot: Shot, exposure: float) -> dict[str, Any]:
+    found: dict[str, Any] = {"label": shot.label, "why": shot.why, "numbers": {}}
+    for column, value in shot.numbers.items():
+        plain = value if isinstance(value, str) else float(value)
+        found["numbers"][column] = plain if isinstance(plain, str) or math.isfinite(plain) else str(plain)
+    if shot.image is not None:
+        found["image"] = _png(np.round(255 * srgb(shot.image, exposure)).astype(np.uint8))
+    for kind, low in (("flip", 0.0), ("difference", -DIFFERENCE_SPAN)):
+        values = getattr(shot, kind)
+        if values is not None:
+            scaled = np.clip((np.asarray(values) - low) / (DIFFERENCE_SPAN - low), 0.0, 1.0)
+            found[kind] = _png(np.round(255 * scaled).astype(np.uint8), _colors(MAPS[kind][1]))
+    return found
+
+
+def _colors(name: str) -> np.ndarray:
+    """The 256 colours of a colour map, (256, 3) bytes."""
+    from matplotlib import colormaps
+
+    return np.round(255 * colormaps[name](np.arange(256))[:, :3]).astype(np.uint8)
+
+
+def _map(kind: str) -> dict[str, Any]:
+    """What the legend of a map shows."""
+    title, name, ends = MAPS[kind]
+    colors = ["#" + bytes(color).hex() for color in _colors(name)[::17]]
+    return {"title": title, "colors": colors, "ends": ends}
+
+
+def _png(pixels: np.ndarray, palette: np.ndarray | None = None) -> str:
+    """A data address of the pixels: (H, W, 3) colours, or (H, W) numbers of colours in a palette."""
+    from PIL import Image
+
+    image, buffer = Image.fromarray(pixels), io.BytesIO()
+    if palette is not None:
+        image.putpalette(palette.tobytes())
+    image.save(buffer, "PNG", optimize=True)
+    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode()

@@ -1,0 +1,191 @@
+"""Computes the parts of a figure that changed, keeps them, and draws the figure from them."""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import json
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+
+import figures
+from figures.parts.part import QUALITIES, Part, Result, Task, check_quality, keys_of
+from figures.parts.projection import Projected, projected
+from figures.parts.store import DamagedPartError, PartStore
+from halfspace_sss.provenance import check_folder, provenance, write_atomically
+
+__all__ = ["Plan", "compute", "draw", "figure", "plan"]
+
+STEPS = 10_000  # of the bar
+Progress = Callable[[int, int, str], None]  # steps done, steps in all, what is being done
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a figure is made of and what of it there is.
+
+    Attributes:
+        name, quality, folder: of the figure; its pictures go there, its parts below.
+        parts, keys: in the order of computing; the hash of what each depends on, by name.
+        damaged: by name of a part that must be computed again because its files are not sound, what is wrong with them.
+        missing: names of the parts to be computed, those included.
+        seconds: projected for each missing part, by name.
+    """
+
+    name: str
+    quality: str
+    folder: Path
+    parts: tuple[Part, ...]
+    keys: Mapping[str, str]
+    damaged: Mapping[str, str]
+    missing: tuple[str, ...]
+    seconds: Mapping[str, Projected]
+
+    @property
+    def store(self) -> PartStore:
+        """Where its parts are."""
+        return PartStore(self.folder / "parts")
+
+    @property
+    def projected_seconds(self) -> float:
+        """Of the missing parts whose time can be told."""
+        return sum(p.seconds for p in self.seconds.values() if p.seconds is not None)
+
+    @property
+    def unmeasured(self) -> tuple[str, ...]:
+        """Missing parts like which nothing was measured."""
+        return tuple(name for name, p in self.seconds.items() if p.seconds is None)
+
+
+def figure(name: str) -> ModuleType:
+    """The module of a figure; ValueError with the nearest name if there is none."""
+    if name not in figures.FIGURES:
+        close = difflib.get_close_matches(str(name), figures.FIGURES, n=1)
+        hint = f"; did you mean {close[0]!r}?" if close else ""
+        raise ValueError(f"figure must be one of {', '.join(figures.FIGURES)}, got {name!r}{hint}")
+    return importlib.import_module(f"figures.{name}")
+
+
+def plan(name: str, quality: str, out: str | Path) -> Plan:
+    """What is to be done for a figure; reads every finished part, computes nothing.
+
+    Args:
+        name: of the figure.
+        quality: "draft" or "paper".
+        out: folder of all figures; this one lies in OUT/NAME/QUALITY.
+
+    Raises:
+        ValueError: no such figure or quality, out is a file, or a part is not well formed.
+    """
+    module = figure(name)
+    check_quality(quality)
+    folder = check_folder(out) / name
+    parts = tuple(module.parts(quality))
+    keys = keys_of(parts)
+    store = PartStore(folder / quality / "parts")
+    damaged, missing = {}, []
+    for part in parts:
+        try:
+            sound = store.holds(part, keys[part.name])
+        except DamagedPartError as error:
+            sound, damaged[part.name] = False, str(error)
+        if not sound:
+            missing.append(part.name)
+    measured = [(q, PartStore(folder / q / "parts")) for q in sorted(QUALITIES, key=lambda q: q != quality)]
+    seconds = projected([part for part in parts if part.name in missing], measured)
+    return Plan(name, quality, folder / quality, parts, keys, damaged, tuple(missing), seconds)
+
+
+def compute(
+    name: str, quality: str, out: str | Path, progress: Progress | None = None, say: Say | None = None
+) -> dict[str, Result]:
+    """Compute what is missing, damaged or changed of a figure; finished parts survive an interruption.
+
+    Args:
+        name, quality, out: as in `plan`.
+        progress: called with (steps done, steps in all, name of the part).
+        say: called with a line for each part that was damaged.
+
+    Returns:
+        The results of all parts by name.
+
+    Raises:
+        ValueError: as in `plan`, or from a part, whose name it gives.
+    """
+    todo = plan(name, quality, out)
+    for part_name, reason in todo.damaged.items():
+        if say:
+            say(f"{name}: part {part_name!r} is damaged and computed again: {reason}")
+    weights = _weights(todo)
+    total, done, results = sum(weights.values()), 0.0, {}
+    for part in todo.parts:
+        if part.name not in todo.missing:
+            results[part.name] = todo.store.load(part, todo.keys[part.name])
+            continue
+        weight = weights[part.name]
+
+        def show(k: int, n: int, start: float = done, weight: float = weight, text: str = part.name) -> None:
+            if progress:
+                progress(int(STEPS * (start + weight * k / max(n, 1)) / total), STEPS, text)
+
+        show(0, 1)
+        results[part.name] = _computed(todo, part, results, show)
+        done += weight
+        show(1, 1)
+    return results
+
+
+def draw(name: str, quality: str, out: str | Path) -> list[Path]:
+    """Draw a figure from its finished parts: writes OUT/NAME/QUALITY/FILE for every file, and NAME.json.
+
+    Raises:
+        ValueError: as in `plan`; a part is missing, changed or damaged.
+    """
+    done = plan(name, quality, out)
+    if done.missing:
+        few = ", ".join(repr(part) for part in done.missing[:3]) + (", ..." if len(done.missing) > 3 else "")
+        reason = "".join(f"; {text}" for text in done.damaged.values())
+        raise ValueError(
+            f"parts of {name} must be computed before it is drawn, {len(done.missing)} of {len(done.parts)} are not: "
+            f"{few}{reason}; `halfspace-sss figures compute {name} --quality {quality}` does it"
+        )
+    results = {part.name: done.store.load(part, done.keys[part.name]) for part in done.parts}
+    content = dict(figure(name).draw(results))
+    about = provenance(figure=name, quality=quality)
+    about["parts"] = {
+        part.name: {"key": done.keys[part.name], "params": part.params, "seconds": results[part.name].seconds}
+        for part in done.parts
+    }
+    content[f"{name}.json"] = json.dumps({**about, "files": sorted(content)}, indent=1) + "\n"
+    for file, data in content.items():
+        write_atomically(done.folder / file, data)
+    return [done.folder / file for file in content]
+
+
+def _weights(todo: Plan) -> dict[str, float]:
+    """What each missing part counts in the bar: its seconds, or its work while the seconds of some are unknown."""
+    parts = [part for part in todo.parts if part.name in todo.missing]
+    if todo.unmeasured:
+        return {part.name: part.work for part in parts}
+    return {part.name: max(todo.seconds[part.name].seconds, 1e-3) for part in parts}
+
+
+def _computed(todo: Plan, part: Part, results: Mapping[str, Result], show: Callable[[int, int], None]) -> Result:
+    key = todo.keys[part.name]
+    folder = todo.store.unfinished(part, key)
+    folder.mkdir(parents=True, exist_ok=True)
+    needed = {name: results[name] for name in part.needs}
+    task = Task(part.params, folder, needed, tuple(Path(path) for path in part.inputs), show)
+    started = time.perf_counter()
+    try:
+        found = part.function(task)
+        return todo.store.save(part, key, found, time.perf_counter() - started)
+    except ValueError as error:
+        raise ValueError(f"{todo.name}, part {part.name!r}: {error}") from error
+    finally:
+        if folder.is_dir() and not any(folder.iterdir()):
+            folder.rmdir()

@@ -1,0 +1,157 @@
+"""The command `halfspace-sss bench`: what the walk, Mitsuba's volpath, the models and maps cost here."""
+
+from __future__ import annotations
+
+import difflib
+import json
+from collections.abc import Iterator
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from halfspace_sss.cli.shared import Bar, console
+from halfspace_sss.provenance import check_folder, provenance, write_atomically
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+__all__ = ["PARTS", "bench_command", "chosen_parts"]
+
+PARTS = ("walk", "volpath", "models", "maps")
+SECONDS = {"walk": 1, "volpath": 15, "models": 3, "maps": 100}  # about, for a row; only the time left depends on it
+TITLES = {
+    "walk": "walk at normal incidence, flux alone or with peel-off towards one direction",
+    "volpath": "Mitsuba's volpath for the same reflectance: time for equal error over that of the walk",
+    "models": "evaluations of S per second, float32; NumPy runs on one thread, torch and Dr.Jit on all",
+    "maps": "training maps to a mean cell error",
+}
+COLUMNS = {  # key of a row -> heading and format
+    "albedo": ("albedo", "{:g}"), "g": ("g", "{:g}"), "eta": ("eta", "{:g}"),
+    "peel_off": ("peel-off", "{}"), "events_per_s": ("events/s", "{:.2e}"), "paths_per_s": ("paths/s", "{:.2e}"),
+    "events_per_path": ("events/path", "{:.3g}"), "rr_depth": ("roulette\ndepth", "{}"),
+    "mean": ("reflectance", "{:.4f}"), "standard_error": ("standard\nerror", "{:.1e}"),
+    "equal_error_ratio": ("times slower\nthan the walk", "{:.3g}"),
+    "model": ("model", "{}"), "orders": ("orders", "{}"),
+    "weight_variance": ("variance of\nsample weight", "{:.2f}"),
+    "numpy": ("NumPy", "{:.1e}"), "torch": ("torch", "{:.1e}"), "drjit": ("Dr.Jit", "{:.1e}"), "maps": ("maps", "{}"),
+    "mean_cell_error": ("mean cell\nerror", "{:.3f}"), "seconds": ("seconds", "{:.3g}"), "paths": ("paths", "{:.2e}"),
+}  # fmt: skip
+
+
+def chosen_parts(text: str | None) -> list[str]:
+    """The parts to measure, in the order of `PARTS`; volpath is compared with the walk and brings it along.
+
+    Raises:
+        ValueError: an entry is no part (the nearest is given), or there is none.
+    """
+    asked = list(PARTS) if text is None else [part.strip() for part in text.split(",")]
+    for part in asked:
+        if part not in PARTS:
+            close = difflib.get_close_matches(part, PARTS, n=1)
+            hint = f"; did you mean {close[0]!r}?" if close else ""
+            raise ValueError(f"only must list parts of {', '.join(PARTS)}, got {part!r}{hint}")
+    return [part for part in PARTS if part in asked or (part == "walk" and "volpath" in asked)]
+
+
+def bench_command(
+    only: Annotated[str | None, typer.Option(help="Parts, of walk,volpath,models,maps.", show_default="all")] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="Small runs that only show that everything works.")] = False,
+    out: Annotated[Path, typer.Option(help="Folder for the files; those of the same names are replaced.")] = Path(
+        "bench"
+    ),
+) -> None:
+    """Measure speed: events and paths per second, equal-error time of volpath, evaluations of models, maps."""
+    parts, notes = chosen_parts(only), []
+    check_folder(out)
+    if "volpath" in parts and find_spec("mitsuba") is None:
+        parts.remove("volpath")
+        notes.append("volpath is left out: Mitsuba is not installed (`pip install halfspace-sss[render]`)")
+    if "models" in parts and find_spec("torch") is None:
+        notes.append("the models are not measured in torch, which is not installed")
+    tables = _measured(parts, quick)
+    content, memory = _content(tables, quick, notes)
+    for name, text in content.items():
+        write_atomically(out / name, text)
+    screen = console()
+    for part, rows in tables.items():
+        screen.print(TITLES[part], _table(rows), sep="\n")
+    peak = "" if memory is None else f"peak memory {memory:.2f} GiB; "
+    for line in (*notes, f"{peak}written:", *(f"  {out / name}" for name in content)):
+        screen.print(line, highlight=False, markup=False, soft_wrap=True)
+
+
+def _measured(parts: list[str], quick: bool) -> dict[str, list[dict]]:
+    """Rows by part."""
+    tables: dict[str, list[dict]] = {part: [] for part in parts}
+    lengths = _lengths(quick)
+    total, done = sum(SECONDS[part] * lengths[part] for part in parts), 0
+    with Bar("measuring") as bar:
+        for part in parts:
+            bar.show(done, total, part)
+            for row in _rows(part, quick, tables):
+                tables[part].append(row)
+                done += SECONDS[part]
+                bar.show(done, total, part)
+    return tables
+
+
+def _lengths(quick: bool) -> dict[str, int]:
+    """Number of rows of each part."""
+    from halfspace_sss import models
+    from halfspace_sss.comparison import bench
+
+    media = 1 if quick else len(bench.MEDIA)
+    depths = 1 if quick else len(bench.ROULETTE_DEPTHS)
+    maps = 1 if quick else len(bench.MAP_MEDIA)
+    return {"walk": 2 * media, "volpath": media * depths, "models": len(models()), "maps": maps}
+
+
+def _rows(part: str, quick: bool, tables: dict[str, list[dict]]) -> Iterator[dict]:
+    from halfspace_sss.comparison import bench
+    from halfspace_sss.maps.grid import MapGrid
+
+    if part == "walk":
+        return bench.bench_walk(1024, 4, bench.MEDIA[:1]) if quick else bench.bench_walk()
+    if part == "volpath":
+        return bench.bench_volpath(tables["walk"], *((16, 4, (64,)) if quick else ()))
+    if part == "models":
+        return bench.bench_models(n=1024, least_seconds=0.01) if quick else bench.bench_models()
+    return bench.bench_maps(1.0, MapGrid(2, 16, 8, 8), bench.MAP_MEDIA[:1]) if quick else bench.bench_maps()
+
+
+def _content(tables: dict[str, list[dict]], quick: bool, notes: list[str]) -> tuple[dict[str, str], float | None]:
+    """Text of each file by name, and the peak memory, GiB."""
+    import pandas
+
+    from halfspace_sss.comparison.bench import machine, peak_memory
+
+    memory = peak_memory()
+    texts = {
+        f"bench_{part}.csv": pandas.DataFrame(rows).to_csv(index=False, lineterminator="\n")
+        for part, rows in tables.items()
+    }
+    about = {"provenance": provenance(quick=quick, parts=list(tables)), "machine": machine(), "notes": notes}
+    about |= {"peak_memory_gib": memory, **tables}
+    texts["bench.json"] = json.dumps(about, indent=1, allow_nan=False) + "\n"
+    return texts, memory
+
+
+def _table(rows: list[dict]) -> Table:
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table
+
+    keys = [key for key in rows[0] if key in COLUMNS]
+    table = Table(box=SIMPLE_HEAD, pad_edge=False)
+    for key in keys:
+        table.add_column(COLUMNS[key][0], justify="left" if isinstance(rows[0][key], str) else "right")
+    for row in rows:
+        table.add_row(*(_cell(key, row[key]) for key in keys))
+    return table
+
+
+def _cell(key: str, value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return COLUMNS[key][1].format(value)

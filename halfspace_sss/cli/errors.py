@@ -1,0 +1,207 @@
+"""The command `halfspace-sss errors`: every model against path-traced maps, on materials or on held-out media."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from halfspace_sss.backend import array_types
+from halfspace_sss.cli.shared import Bar, console, stated_medium
+from halfspace_sss.provenance import check_folder
+
+if TYPE_CHECKING:
+    import pandas
+
+    from halfspace_sss.physics.medium import Medium
+
+__all__ = ["errors_command"]
+
+EVENTS = 2e7  # for each medium
+DEFINITION = (
+    "error: sum |E_model - E_traced| / sum E_traced over unseen pairs of directions, E = ∫ S mu_i mu_o dA over "
+    "blocks of {0} x {0} cells of 40 x 16 from r = 0.02 mfp on; noise of the reference taken out; orders of each model"
+)
+
+
+def errors_command(
+    material: Annotated[
+        list[str] | None, typer.Argument(help="Names of materials; see `halfspace-sss materials`.")
+    ] = None,
+    registry: Annotated[bool, typer.Option("--registry", help="All registered materials, every channel.")] = False,
+    held_out: Annotated[int | None, typer.Option(help="This many random media over the range of `neural`.")] = None,
+    as_trained: Annotated[
+        bool, typer.Option("--as-trained", help="Held-out media as for the training: a third of them with g near 1.")
+    ] = False,
+    truths: Annotated[
+        bool, typer.Option("--truths", help="Reflectance against published and exact values instead.")
+    ] = False,
+    sigma_t: Annotated[float | None, typer.Option(help="Extinction, 1/mm [0.241].")] = None,
+    albedo: Annotated[float | None, typer.Option(help="Single-scattering albedo [0.75].")] = None,
+    g: Annotated[float | None, typer.Option(help="Mean cosine of the phase function [0].")] = None,
+    eta: Annotated[float | None, typer.Option(help="Index inside over outside [1.3].")] = None,
+    model: Annotated[list[str] | None, typer.Option(help="A model; repeat for more [all].")] = None,
+    events: Annotated[float, typer.Option(help="Scattering events of the reference for each medium.")] = EVENTS,
+    block: Annotated[int, typer.Option(help="Cells put together for the comparison, in distance and azimuth.")] = 4,
+    seed: Annotated[int, typer.Option(help="Seed of media, directions and walks.")] = 0,
+    backend: Annotated[str, typer.Option(help="llvm or cuda.")] = "llvm",
+    out: Annotated[Path, typer.Option(help="Folder for the files; those of the same names are replaced.")] = Path(
+        "errors"
+    ),
+) -> None:
+    """Compare models with path tracing over all directions: error, bias, decades of r; written as CSV and JSON."""
+    from halfspace_sss.comparison import held_out as tables
+
+    if truths:
+        _truths(material or registry or held_out is not None, model, out)
+        return
+    media = _media(
+        material or [],
+        registry,
+        (held_out, as_trained),
+        seed,
+        {"sigma_t": sigma_t, "albedo": albedo, "g": g, "eta": eta},
+    )
+    _check(model, events, block, seed)
+    _check_accepted(model or (), list(media.values()))
+    array_types(backend)
+    check_folder(out)
+    with Bar("errors") as bar:
+
+        def show(what: str, done: int, total: int) -> None:
+            bar.show(done, 2 * total if what == "data" else total, what)
+
+        found = tables.references(list(media.values()), events * len(media), seed, block, show, backend)
+        table = tables.error_table(media, found, model or None)
+    files = _write(out, table, tables.percentiles(table), {"events": events, "block": block, "seed": seed})
+    _report(table, tables, len(media), block)
+    for file in files:
+        console().print(f"  {file}", highlight=False, markup=False, soft_wrap=True)
+
+
+def _truths(others: bool, names: list[str] | None, out: Path) -> None:
+    """Reflectance against the packaged truths: files and a summary."""
+    from halfspace_sss.comparison.model_truths import reflectance_truths, truth_summary
+    from halfspace_sss.provenance import write_atomically
+
+    if others:
+        raise ValueError("truths must stand alone, got it with materials or held-out media")
+    _check_models(names)
+    check_folder(out)
+    with Bar("truths") as bar:
+        table = reflectance_truths(names or None, lambda what, done, total: bar.show(done, total))
+    write_atomically(out / "truths.csv", table.to_csv(index=False, lineterminator="\n"))
+    console().print(_rich(truth_summary(table), "relative error of the reflectance (single order included), %"))
+    console().print(f"  {out / 'truths.csv'}", highlight=False, markup=False, soft_wrap=True)
+
+
+def _media(
+    names: list[str], registry: bool, drawn: tuple[int | None, bool], seed: int, given: dict[str, float | None]
+) -> dict[str, Medium]:
+    """Scalar media by label."""
+    from halfspace_sss import materials
+    from halfspace_sss.checks import check_count
+    from halfspace_sss.comparison.held_out import held_out_media
+    from halfspace_sss.neural.symmetric import channels
+
+    stated = stated_medium(names, given)
+    held_out, as_trained = drawn
+    if as_trained and held_out is None:
+        raise ValueError("as_trained must come with held_out, got it alone")
+    if sum((bool(names) or stated is not None, registry, held_out is not None)) > 1:
+        raise ValueError("material, registry and held_out must be given one at a time, got several")
+    if held_out is not None:
+        check_count("held_out", held_out, 1)
+        media = held_out_media(held_out, seed, as_trained)
+        return {f"a {float(m.albedo):.5g} g {float(m.g):.3g} eta {m.eta:.3g}": m for m in media}
+    if stated is not None:
+        return {"medium": stated}
+    found = [materials.load(name) for name in (materials.names() if registry else names or ["fig10"])]
+    return {
+        f"{m.name} {c}".strip(): one
+        for m in found
+        for c, one in zip(m.channels or ("",), channels(m.medium))
+        if float(one.albedo) > 0
+    }
+
+
+def _check_models(names: list[str] | None) -> None:
+    from halfspace_sss import models
+
+    for name in names or ():
+        if name not in models():
+            raise ValueError(f"model must be one of {', '.join(models())}, got {name!r}")
+
+
+def _check(names: list[str] | None, events: float, block: int, seed: int) -> None:
+    from halfspace_sss.checks import check_count, check_interval
+
+    _check_models(names)
+    check_interval("events", events, 1e4, 1e12)
+    check_count("seed", seed, 0)
+    if block not in (1, 2, 4, 8):
+        raise ValueError(f"block must be 1, 2, 4 or 8, got {block}")
+
+
+def _check_accepted(names: Iterable[str], media: list[Medium]) -> None:
+    """Refuse a model, with its own words, that refuses all media."""
+    from halfspace_sss import bssrdf
+
+    for name in names:
+        for k, medium in enumerate(media):
+            try:
+                bssrdf(name, medium)
+                break
+            except ValueError:
+                if k == len(media) - 1:
+                    raise
+
+
+def _write(out: Path, table: pandas.DataFrame, summary: pandas.DataFrame, how: dict[str, Any]) -> list[Path]:
+    from halfspace_sss.provenance import provenance, write_atomically
+
+    content = {"provenance": provenance(**how), "definition": DEFINITION.format(how["block"])}
+    content["summary"] = json.loads(summary.to_json(orient="records"))
+    files = {"errors.csv": table.to_csv(index=False, lineterminator="\n"), "errors.json": json.dumps(content, indent=1)}
+    for name, text in files.items():
+        write_atomically(out / name, text)
+    return [out / name for name in files]
+
+
+def _report(table: pandas.DataFrame, tables: Any, n_media: int, block: int) -> None:
+    screen = console()
+    if n_media <= 3:
+        columns = ["medium", "model", "error", "noise", "bias", *(c for c in table if c.startswith("r "))]
+        screen.print(_rich(table[columns], "errors, %"))
+    else:
+        screen.print(_rich(tables.percentiles(table), "errors over the media, %"))
+        for name in ("neural",):
+            if (table["model"] == name).any():
+                screen.print(_rich(tables.bands(table, name), f"{name} over ranges of media, %"))
+                lost = tables.losses(table, name)[["medium", "error", "noise", "model_best", "error_best"]]
+                title = f"media on which an analytic model has a smaller error than {name}: {len(lost)}"
+                screen.print(_rich(lost, title) if len(lost) else title)
+    screen.print(DEFINITION.format(block), highlight=False, markup=False)
+
+
+def _rich(table: pandas.DataFrame, title: str) -> Any:
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table
+
+    out = Table(title=title, box=SIMPLE_HEAD, pad_edge=False)
+    for name in table.columns:
+        out.add_column(str(name), justify="left" if table[name].dtype.kind == "O" else "right", overflow="fold")
+    for row in table.itertuples(index=False):
+        out.add_row(*(_cell(value) for value in row))
+    return out
+
+
+def _cell(value: Any) -> str:
+    if isinstance(value, str):
+        return value
+    if isinstance(value, int):
+        return str(value)
+    return "–" if value != value else f"{100 * value:.3g}"

@@ -1,0 +1,146 @@
+"""The command `halfspace-sss maps`: training maps of materials or of a stated medium, one store each."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from halfspace_sss.cli.shared import (
+    FIG10,
+    Albedo,
+    Backend,
+    Bar,
+    Eta,
+    MeanCosine,
+    SigmaT,
+    console,
+    numbers,
+    stated_medium,
+)
+from halfspace_sss.provenance import check_folder
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from halfspace_sss.maps.grid import MapGrid
+    from halfspace_sss.physics.medium import Medium
+
+__all__ = ["maps_command"]
+
+TARGET_ERROR = 0.05
+
+
+def maps_command(
+    material: Annotated[
+        list[str] | None, typer.Argument(help="Names of materials; see `halfspace-sss materials`.")
+    ] = None,
+    channel: Annotated[
+        str | None, typer.Option(help="Only these, as R,B, a store each.", show_default="all in one store")
+    ] = None,
+    sigma_t: SigmaT = None,
+    albedo: Albedo = None,
+    g: MeanCosine = None,
+    eta: Eta = None,
+    name: Annotated[str | None, typer.Option(help="Store of a stated medium.", show_default="medium")] = None,
+    target_error: Annotated[
+        float | None, typer.Option(help="Mean cell error to stop at.", show_default="0.05, none with --paths")
+    ] = None,
+    paths: Annotated[
+        int | None, typer.Option(help="Walks for 16 maps: this number, or the most with --target-error.")
+    ] = None,
+    grid: Annotated[
+        str, typer.Option(help="Numbers of angles of incidence, of observations, of cells in r, in azimuth.")
+    ] = ("16,64,48,24"),
+    seed: Annotated[int, typer.Option(help="Seed of directions and walks.")] = 0,
+    backend: Backend = "llvm",
+    share: Annotated[str, typer.Option(help="k/n: of n processes that fill one folder, this is number k < n.")] = "0/1",
+    out: Annotated[Path, typer.Option(help="Folder of the stores; what is there is continued.")] = Path("maps"),
+) -> None:
+    """Trace training maps into Zarr stores; an interrupted run goes on when it is started again."""
+    from halfspace_sss.maps.store import make_maps
+
+    media = _media(material or [], channel, {"sigma_t": sigma_t, "albedo": albedo, "g": g, "eta": eta}, name)
+    if target_error is None and paths is None:
+        target_error = TARGET_ERROR
+    part = _share(share)
+    check_folder(out)
+    with Bar("tracing") as bar:
+        stores = make_maps(
+            media, out, grid=_grid(grid), target_error=target_error, n_paths=paths, seed=seed, backend=backend,
+            share=part, progress=bar.show,
+        )  # fmt: skip
+    _report(stores, part)
+
+
+def _media(
+    names: list[str], channels: str | None, given: dict[str, float | None], name: str | None
+) -> dict[str, Medium]:
+    """Media by the name of their store."""
+    from halfspace_sss import Medium, materials
+    from halfspace_sss.materials.channels import one_channel
+
+    stated = stated_medium(names, given)
+    if name is not None and stated is None:
+        raise ValueError(f"name must be left out unless coefficients are given, got {name!r}")
+    if channels is not None and not names:
+        raise ValueError(f"channel must be left out unless materials are named, got {channels!r}")
+    if not names:
+        return {"fig10": Medium.from_albedo(**FIG10)} if stated is None else {name or "medium": stated}
+    if channels is None:
+        chosen = [(material.name, material.medium) for material in map(materials.load, names)]
+    else:
+        chosen = [one_channel(material, channel.strip()) for material in names for channel in channels.split(",")]
+    media = {re.sub(r"[^\w.-]+", "_", title): medium for title, medium in chosen}
+    if len(media) < len(chosen):
+        raise ValueError(f"materials and channels must be different, got {', '.join(title for title, _ in chosen)}")
+    return media
+
+
+def _share(text: str) -> tuple[int, int]:
+    try:
+        k, n = (int(part) for part in text.split("/"))
+    except ValueError:
+        raise ValueError(f"share must be k/n with 0 <= k < n, got {text!r}") from None
+    return k, n
+
+
+def _grid(text: str) -> MapGrid:
+    from halfspace_sss.maps.grid import MapGrid
+
+    values = numbers("grid", text)
+    if len(values) != 4 or not all(value.is_integer() for value in values):
+        raise ValueError(f"grid must be four whole numbers separated by commas, got {text!r}")
+    return MapGrid(*(int(value) for value in values))
+
+
+def _report(stores: dict[str, Path], share: tuple[int, int]) -> None:
+    screen = console()
+    if share[1] > 1:
+        line = f"share {share[0]}/{share[1]} is done; the stores are whole when all {share[1]} shares are:"
+        screen.print(line, highlight=False)
+    else:
+        screen.print(_table(stores))
+    for path in stores.values():
+        screen.print(f"  {path}", highlight=False, markup=False, soft_wrap=True)
+
+
+def _table(stores: dict[str, Path]) -> Table:
+    """What each store holds; loading it checks that it is whole."""
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table
+
+    from halfspace_sss.maps.store import load_maps
+
+    table = Table(box=SIMPLE_HEAD, pad_edge=False)
+    for heading in ("store", "channels", "maps", "mean cell error", "walks", "seconds"):
+        table.add_column(heading, justify="left" if heading == "store" else "right")
+    for name, path in stores.items():
+        maps = load_maps(path)
+        channels, n = maps.sizes["channel"], maps.sizes["channel"] * maps.sizes["theta"] * maps.sizes["phi"]
+        error, walks, seconds = (maps[key].values for key in ("mean_cell_error", "n_paths", "seconds"))
+        row = (channels, n, f"{error.max():.3f}", f"{walks.sum():.2e}", f"{seconds.sum():.0f}")
+        table.add_row(name, *map(str, row))
+    return table

@@ -1,0 +1,134 @@
+"""The command `halfspace-sss train`: networks of materials, or the one for all media."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from halfspace_sss.cli.shared import Bar, console, stated_medium
+
+if TYPE_CHECKING:
+    from halfspace_sss.physics.medium import Medium
+
+__all__ = ["train_command"]
+
+
+def train_command(
+    material: Annotated[
+        list[str] | None, typer.Argument(help="Names of materials; see `halfspace-sss materials`.")
+    ] = None,
+    universal: Annotated[bool, typer.Option("--universal", help="Train the network for all media instead.")] = False,
+    model: Annotated[str, typer.Option(help="neural_material or neural_paper.")] = "neural_material",
+    sigma_t: Annotated[float | None, typer.Option(help="Extinction, 1/mm [0.241].")] = None,
+    albedo: Annotated[float | None, typer.Option(help="Single-scattering albedo [0.75].")] = None,
+    g: Annotated[float | None, typer.Option(help="Mean cosine of the phase function [0].")] = None,
+    eta: Annotated[float | None, typer.Option(help="Index inside over outside [1.3].")] = None,
+    fast: Annotated[bool, typer.Option("--fast", help="A quarter of the time, about twice the error.")] = False,
+    steps: Annotated[int | None, typer.Option(help="Steps of the optimiser [from the recipe].")] = None,
+    target_error: Annotated[float | None, typer.Option(help="Stop early at this validation error.")] = None,
+    seed: Annotated[int, typer.Option(help="Seed of maps, batches and first numbers.")] = 0,
+    backend: Annotated[str, typer.Option(help="llvm or cuda, for the maps.")] = "llvm",
+    out: Annotated[Path | None, typer.Option(help="Folder for the weights [where models find them].")] = None,
+    work: Annotated[
+        Path | None, typer.Option(help="Folder for unfinished work, which an interrupted run continues.")
+    ] = None,
+) -> None:
+    """Train networks on path tracing; trained materials are then found by their medium."""
+    if find_spec("torch") is None:
+        raise ValueError("training needs torch: `pip install halfspace-sss[train]`")
+    given = {"sigma_t": sigma_t, "albedo": albedo, "g": g, "eta": eta}
+    if universal:
+        others = {"material": material, **given, "fast": fast, "target_error": target_error, "work": work}
+        _check_alone({**others, "model": None if model == "neural_material" else model})
+        _universal(out or Path("universal"), seed, steps, backend)
+        return
+    media = _media(material or [], given)
+    recipe = _recipe(fast, steps)
+    rows = []
+    with Bar("training") as bar:
+        for name, medium in media.items():
+            rows += [
+                (name, r) for r in _train(name, medium, bar, model, recipe, seed, out, work, target_error, backend)
+            ]
+    _report(rows)
+
+
+def _check_alone(others: dict[str, Any]) -> None:
+    for name, value in others.items():
+        if value not in (None, False, []):
+            raise ValueError(f"{name} must be left out with --universal, got {value!r}")
+
+
+def _media(names: list[str], given: dict[str, float | None]) -> dict[str, Medium]:
+    from halfspace_sss import materials
+
+    stated = stated_medium(names, given)
+    if not names:
+        return {"fig10": materials.load("fig10").medium} if stated is None else {"medium": stated}
+    return {found.name: found.medium for found in map(materials.load, names)}
+
+
+def _recipe(fast: bool, steps: int | None) -> Any:
+    from dataclasses import replace
+
+    from halfspace_sss.checks import check_count
+    from halfspace_sss.neural.training.recipes import FAST, STANDARD
+
+    recipe = FAST if fast else STANDARD
+    if steps is None:
+        return recipe
+    check_count("steps", steps, 1)
+    return replace(recipe, how=replace(recipe.how, steps=steps))
+
+
+def _train(
+    name: str, medium: Medium, bar: Bar, model: str, recipe: Any, seed: int, out: Path | None, work: Path | None,
+    target_error: float | None, backend: str,
+) -> list[Any]:  # fmt: skip
+    from halfspace_sss.neural import train
+
+    def show(what: str, done: int, total: int) -> None:
+        bar.show(done, total, f"{name}: {what}")
+
+    return train(
+        medium, model=model, recipe=recipe, seed=seed, folder=out, work=work / name if work else None,
+        target_error=target_error, backend=backend, progress=show,
+    )  # fmt: skip
+
+
+def _universal(folder: Path, seed: int, steps: int | None, backend: str) -> None:
+    from dataclasses import replace
+
+    from halfspace_sss.checks import check_count
+    from halfspace_sss.neural.training.recipes import UniversalRecipe, train_universal
+
+    recipe = UniversalRecipe()
+    if steps is not None:
+        check_count("steps", steps, 1)
+        recipe = replace(recipe, how=replace(recipe.how, steps=steps))
+    with Bar("universal") as bar:
+        path = train_universal(
+            folder, seed, recipe, backend=backend, progress=lambda what, done, total: bar.show(done, total, what)
+        )
+    console().print(f"written: {path}", highlight=False, markup=False, soft_wrap=True)
+
+
+def _report(rows: list[tuple[str, Any]]) -> None:
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table
+
+    caption = "error: energy-weighted relative L1 of unseen maps in blocks of 2 x 2 cells, noise removed; order >= 2"
+    table = Table(box=SIMPLE_HEAD, pad_edge=False, caption=caption, caption_justify="left")
+    for heading in ("material", "albedo", "g", "eta", "error %", "noise %", "bias %", "maps s", "fit s"):
+        table.add_column(heading, justify="left" if heading == "material" else "right")
+    for name, r in rows:
+        ratios = (f"{float(getattr(r.medium, key)):.4g}" for key in ("albedo", "g", "eta"))
+        errors = (f"{100 * r.error.error:.2f}", f"{100 * r.error.noise:.2f}", f"{100 * r.error.bias:+.2f}")
+        table.add_row(name, *ratios, *errors, f"{r.data_seconds:.0f}", f"{r.fit_seconds:.0f}")
+    screen = console()
+    screen.print(table)
+    for _, r in rows:
+        screen.print(f"  {r.path}", highlight=False, markup=False, soft_wrap=True)

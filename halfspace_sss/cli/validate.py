@@ -1,0 +1,141 @@
+"""The command `halfspace-sss validate`: trace the table of half-space truths, print a summary, write every row."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from halfspace_sss.cli.shared import Bar, console
+from halfspace_sss.comparison.truths import MEASURES, Truth
+from halfspace_sss.comparison.validate import Z_LIMIT, Comparison, Validation, validate
+from halfspace_sss.provenance import provenance, write_atomically
+
+__all__ = ["row_filter", "summary", "validate_command", "write_results"]
+
+KINDS = ("published", "thirdparty", "exact")
+
+
+def row_filter(text: str | None) -> Callable[[Truth], bool] | None:
+    """Choose rows by a comma-separated list of ids, measures (R_d, BRDF, ring, ...) or kinds; None chooses all.
+
+    Raises:
+        ValueError: an entry is none of these.
+    """
+    if not text:
+        return None
+    wanted = {part.strip() for part in text.split(",") if part.strip()}
+    known = {*MEASURES.values(), *KINDS}
+    for part in sorted(wanted - known):
+        if not (part[:1] == "T" and part[1:].isdigit()):
+            raise ValueError(f"rows must be ids such as T0134, or of {', '.join(sorted(known))}; got {part!r}")
+    return lambda truth: bool(wanted & {truth.id, truth.measure, truth.kind})
+
+
+def summary(comparisons: list[Comparison]) -> list[dict[str, Any]]:
+    """One record per quantity: rows, largest and rms z, largest standard error relative to the traced value.
+
+    `dim` marks reflectances of albedo below 0.5, of which larger relative errors are asked.
+    """
+    groups: dict[str, list[Comparison]] = {}
+    for c in comparisons:
+        dim = c.truth.measure in ("R_d", "R_total") and c.truth.medium.albedo < 0.5
+        groups.setdefault(c.truth.quantity + (", albedo < 0.5" if dim else ""), []).append(c)
+    return [
+        {
+            "quantity": name,
+            "rows": len(group),
+            "max_abs_z": max(abs(c.z) for c in group),
+            "rms_z": math.sqrt(sum(c.z**2 for c in group) / len(group)),
+            "max_relative_error": max(_relative_error(c) for c in group),
+        }
+        for name, group in sorted(groups.items())
+    ]
+
+
+def _relative_error(c: Comparison) -> float:
+    return c.standard_error / abs(c.reflected) if c.reflected else math.inf
+
+
+def _record(c: Comparison) -> dict[str, Any]:
+    """A row of the CSV and JSON files."""
+    t, m = c.truth, c.truth.medium
+    mu_o, phi = t.direction or (None, None)
+    inner, outer = t.ring or (None, None)
+    return {
+        "id": t.id, "kind": t.kind, "quantity": t.quantity, "sigma_s_per_mm": m.sigma_s, "sigma_a_per_mm": m.sigma_a,
+        "g": m.g, "eta": m.eta, "mu_i": t.mu_i, "mu_o": mu_o, "delta_phi_rad": phi, "r_inner_mm": inner,
+        "r_outer_mm": outer, "truth": t.value, "uncertainty": t.uncertainty, "traced": c.traced,
+        "standard_error": c.standard_error, "z": c.z, "n_paths": c.n_paths, "n_events": c.n_events, "seed": c.seed,
+        "source": t.source,
+    }  # fmt: skip
+
+
+def write_results(result: Validation, folder: Path) -> None:
+    """Write validate.csv (a line per row) and validate.json (rows, summary, rows not covered, provenance)."""
+    records = [_record(c) for c in result.comparisons]
+    text = io.StringIO()
+    writer = csv.DictWriter(text, fieldnames=list(records[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(records)
+    write_atomically(folder / "validate.csv", text.getvalue())
+    content = {
+        "provenance": provenance(seed=result.seed, quick=result.quick, z_limit=Z_LIMIT),
+        "seconds": result.seconds,
+        "summary": summary(result.comparisons),
+        "failures": [c.truth.id for c in result.failures],
+        "not_covered": [vars(n) for n in result.not_covered],
+        "rows": records,
+    }
+    write_atomically(folder / "validate.json", json.dumps(_strict(content), indent=1, allow_nan=False) + "\n")
+
+
+def _strict(value: Any) -> Any:
+    """The value with None in place of infinities and NaN, which JSON does not know."""
+    if isinstance(value, dict):
+        return {key: _strict(v) for key, v in value.items()}
+    if isinstance(value, list):
+        return [_strict(v) for v in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def validate_command(
+    out: Annotated[Path | None, typer.Option(help="Folder for validate.csv and validate.json.")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of all runs.")] = 0,
+    quick: Annotated[bool, typer.Option(help="Ten times looser standard errors.")] = False,
+    rows: Annotated[str | None, typer.Option(help="Only these ids, measures (R_d, BRDF, ...) or kinds.")] = None,
+) -> None:
+    """Trace every published, third-party or exact half-space number of the packaged table and compare."""
+    with Bar("tracing") as bar:
+        result = validate(row_filter(rows), seed, quick, progress=bar.show)
+    if out is not None:
+        write_results(result, out)
+    _print(console(), result)
+    if result.failures:
+        raise typer.Exit(1)
+
+
+def _print(screen: Any, result: Validation) -> None:
+    from rich.table import Table
+
+    table = Table("quantity", "rows", "max |z|", "rms z", "largest relative error", title="traced against truths.csv")
+    for s in summary(result.comparisons):
+        numbers = (f"{s['max_abs_z']:.2f}", f"{s['rms_z']:.2f}", f"{s['max_relative_error']:.1e}")
+        table.add_row(s["quantity"].replace("[", r"\["), str(s["rows"]), *numbers)
+    screen.print(table)
+    for reason, count in Counter(n.reason for n in result.not_covered).most_common():
+        screen.print(f"not covered: {count} rows: {reason}", highlight=False)
+    for c in result.failures:
+        screen.print(
+            f"[red]{c.truth.id}[/red] {c.truth.quantity.replace('[', chr(92) + '[')}: traced {c.traced:.8g} ± "
+            f"{c.standard_error:.1e}, truth {c.truth.value:.8g} ± {c.truth.uncertainty:.1e}, z = {c.z:.2f}"
+        )
+    verdict = f"{len(result.failures)} of {len(result.comparisons)} rows have |z| >= {Z_LIMIT:g}"
+    screen.print(f"{verdict}; {result.seconds:.0f} s", highlight=False)

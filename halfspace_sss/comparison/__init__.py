@@ -1,0 +1,1 @@
+"""Models beside path tracing: curves, published truths, speed, and errors over media."""

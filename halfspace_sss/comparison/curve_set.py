@@ -1,0 +1,221 @@
+"""Reflectance curves of a path tracer and of models, their errors, and the files that hold them."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from halfspace_sss.extensions import renderer
+from halfspace_sss.physics.medium import Medium
+from halfspace_sss.provenance import check_folder, provenance, write_atomically
+
+if TYPE_CHECKING:
+    import pandas
+
+__all__ = ["TRACED", "Curve", "CurveSet", "range_edges"]
+
+TRACED = "path_traced"
+UNITS = {
+    "theta_i_deg": "degree, w_i from the normal",
+    "theta_o_deg": "degree, w_o from the normal",
+    "delta_phi_deg": "degree, azimuth of w_o from the forward direction of the plane of incidence",
+    "line_deg": "degree, azimuth of x_o - x_i from the forward direction",
+    "r_mm": "mm, geometric middle of the cell",
+    "S": "1/(mm2 sr), mean over the cell of r and azimuth",
+    "S_at_r": "1/(mm2 sr), at the middle of the cell; path traced: the mean again",
+    "standard_error": "1/(mm2 sr), Monte Carlo; 0 for models",
+    "L1": "sum |S - S_traced| area / sum S_traced area, cells of the range",
+    "bias": "sum (S - S_traced) area / sum S_traced area, cells of the range",
+    "noise": "expected L1 of the path-traced curve against the truth",
+    "bias_standard_error": "Monte Carlo standard error of bias",
+    "reflectance": "fraction of incident flux at reflectance_orders",
+    "evaluations_per_s": "evaluations of S per second, NumPy, float64",
+}
+
+
+@dataclass(frozen=True)
+class Curve:
+    """One series in one direction of incidence.
+
+    Args:
+        series: name of the model, or "path_traced".
+        orders: scattering orders it contains; "multiple" for the path-traced curve.
+        theta_i_deg: angle of incidence, degrees.
+        S: mean of S over each cell, 1/(mm² sr).
+        S_at_r: S at the middle of each cell, 1/(mm² sr); the mean again for the path-traced curve.
+        standard_error: Monte Carlo standard error of S, 0 for a model.
+        reflectance: order -> (fraction of incident flux, Monte Carlo standard error), at the orders that were asked.
+    """
+
+    series: str
+    orders: str
+    theta_i_deg: float
+    S: np.ndarray
+    S_at_r: np.ndarray
+    standard_error: np.ndarray
+    reflectance: Mapping[str, tuple[float, float]]
+
+
+@dataclass(frozen=True)
+class CurveSet:
+    """What `curves` measured: S along a line for several directions of incidence, path traced and by models.
+
+    Off the line where the two refracted rays meet, the single order of a pencil beam has no radiance: the orders
+    "multiple" and "total" have the same curve, so that models of either are compared with the one path-traced curve.
+
+    Attributes:
+        title, medium: what it is of; medium is scalar.
+        theta_o_deg, delta_phi_deg, line_deg: direction of observation and of the line, degrees.
+        half_width: half the angle about the line that a cell spans, radians.
+        orders: "multiple", where reflectances are of each model's own orders, or "total".
+        r_edges: edges of the cells, mm.
+        curves: for each direction of incidence the path-traced curve, then the models.
+        evaluations_per_s: by model, evaluations of S per second in NumPy, float64.
+        n_paths: walks per direction of incidence. seed, backend: of the tracer. seconds: spent in tracing.
+        notes: what was left out, and why.
+    """
+
+    title: str
+    medium: Medium
+    theta_o_deg: float
+    delta_phi_deg: float
+    line_deg: float
+    half_width: float
+    orders: str
+    r_edges: np.ndarray
+    curves: tuple[Curve, ...]
+    evaluations_per_s: Mapping[str, float]
+    n_paths: int
+    seed: int
+    backend: str
+    seconds: float
+    notes: tuple[str, ...] = ()
+
+    @property
+    def r(self) -> np.ndarray:
+        """Geometric middle of each cell, mm."""
+        return np.sqrt(self.r_edges[:-1] * self.r_edges[1:])
+
+    @property
+    def theta_i_deg(self) -> tuple[float, ...]:
+        """Angles of incidence, degrees."""
+        return tuple(dict.fromkeys(c.theta_i_deg for c in self.curves))
+
+    @property
+    def series(self) -> tuple[str, ...]:
+        """Names of the series, "path_traced" first."""
+        return tuple(dict.fromkeys(c.series for c in self.curves))
+
+    def curve(self, series: str, theta_i_deg: float) -> Curve:
+        """The curve of one series and direction; ValueError if there is none."""
+        for c in self.curves:
+            if (c.series, c.theta_i_deg) == (series, theta_i_deg):
+                return c
+        raise ValueError(
+            f"series, theta_i_deg must be of {self.series}, {self.theta_i_deg}, got {(series, theta_i_deg)!r}"
+        )
+
+    def to_dataframe(self) -> pandas.DataFrame:
+        """One row per direction, series and distance: where, r_mm, series, orders, S, S_at_r, standard_error."""
+        import pandas
+
+        parts = [
+            pandas.DataFrame({
+                "theta_i_deg": c.theta_i_deg, "theta_o_deg": self.theta_o_deg, "delta_phi_deg": self.delta_phi_deg,
+                "line_deg": self.line_deg, "r_mm": self.r, "series": c.series, "orders": c.orders,
+                "S": c.S, "S_at_r": c.S_at_r, "standard_error": c.standard_error,
+            })
+            for c in self.curves
+        ]  # fmt: skip
+        return pandas.concat(parts, ignore_index=True)
+
+    def errors(self) -> pandas.DataFrame:
+        """Error of every model per decade of r and over all, with reflectance and speed; one row each.
+
+        L1 = sum |S - S_t| A / sum S_t A and bias = sum (S - S_t) A / sum S_t A over the cells of a range, where S_t
+        is path traced and A = r_out² - r_in² weights by energy; a cell belongs to the decade of its middle. `noise`
+        is the L1 that Monte Carlo noise alone gives, and `bias_standard_error` what it does to the bias, with cells
+        taken as independent. The row of the path-traced series has L1 = noise. NaN where no light was traced.
+        """
+        import pandas
+
+        rows = []
+        for c in self.curves:
+            traced = self.curve(TRACED, c.theta_i_deg)
+            order = "total" if "total" in (self.orders, c.orders) else "multiple"
+            R, R_error = c.reflectance[order]
+            R_t, R_t_error = traced.reflectance[order]
+            common = {"reflectance_orders": order, "reflectance": R, "reflectance_traced": R_t}
+            common["reflectance_standard_error"] = R_error if c is traced else R_t_error
+            common["evaluations_per_s"] = self.evaluations_per_s.get(c.series, math.nan)
+            edges = range_edges(self.r_edges)
+            ranges = [(edges[0], edges[-1]), *zip(edges[:-1], edges[1:])] if len(edges) > 2 else [tuple(edges)]
+            for low, high in ranges:
+                row = {"theta_i_deg": c.theta_i_deg, "series": c.series, "orders": c.orders}
+                row |= {"r_from_mm": low, "r_to_mm": high, **self._error(c, traced, low, high)}
+                rows.append(row | common)
+        return pandas.DataFrame(rows)
+
+    def _error(self, c: Curve, traced: Curve, low: float, high: float) -> dict[str, float]:
+        inside = (self.r >= low) & (self.r <= high)
+        area = np.diff(self.r_edges**2)[inside]
+        S_t, error = traced.S[inside] * area, traced.standard_error[inside] * area
+        flux = S_t.sum()
+        if not flux > 0:
+            return dict.fromkeys(("L1", "bias", "noise", "bias_standard_error"), math.nan)
+        gap, noise = c.S[inside] * area - S_t, math.sqrt(2 / math.pi) * error.sum() / flux
+        L1 = noise if c is traced else np.abs(gap).sum() / flux
+        spread = math.sqrt((error**2).sum()) / flux
+        return {"L1": L1, "bias": gap.sum() / flux, "noise": noise, "bias_standard_error": spread}
+
+    def parameters(self) -> dict[str, Any]:
+        """Everything that defines the result, ready for JSON."""
+        medium = {name: getattr(self.medium, name) for name in ("sigma_s", "sigma_a", "g", "eta", "sigma_t", "albedo")}
+        names = ("title", "theta_i_deg", "theta_o_deg", "delta_phi_deg", "line_deg", "half_width", "orders", "series")
+        return {
+            "medium": medium,
+            **{name: getattr(self, name) for name in names},
+            "r_edges_mm": self.r_edges.tolist(),
+            "n_paths": self.n_paths,
+            "seed": self.seed,
+            "backend": self.backend,
+        }
+
+    def save(self, folder: str | Path, name: str = "curves") -> list[Path]:
+        """Write NAME.csv (every series), NAME_errors.csv, NAME.json (provenance) and the figure as NAME.pdf and .png.
+
+        Every file is whole or absent; files of those names are replaced. Without matplotlib there is no figure.
+
+        Returns:
+            The paths that were written.
+
+        Raises:
+            ValueError: folder exists and is a file.
+        """
+        folder = check_folder(folder)
+        content: dict[str, bytes | str] = {
+            f"{name}.csv": self.to_dataframe().to_csv(index=False, lineterminator="\n"),
+            f"{name}_errors.csv": self.errors().to_csv(index=False, lineterminator="\n"),
+        }
+        render = renderer("curves")
+        figures = {} if render is None else render(self)
+        content |= {f"{name}.{ending}": data for ending, data in figures.items()}
+        about = {**provenance(**self.parameters()), "units": UNITS, "notes": list(self.notes)}
+        about |= {"seconds_tracing": self.seconds, "evaluations_per_s": dict(self.evaluations_per_s)}
+        content[f"{name}.json"] = json.dumps({**about, "files": sorted(content)}, indent=1) + "\n"
+        for file, data in content.items():
+            write_atomically(folder / file, data)
+        return [folder / file for file in content]
+
+
+def range_edges(r_edges: np.ndarray) -> list[float]:
+    """The ends of r_edges and the powers of ten between them."""
+    low, high = float(r_edges[0]), float(r_edges[-1])
+    powers = [10.0**k for k in range(math.floor(math.log10(low)) - 1, math.ceil(math.log10(high)) + 1)]
+    return [low, *(p for p in powers if low < p < high), high]

@@ -1,0 +1,187 @@
+"""How wrong a model is against path tracing: energy-weighted relative L1 over unseen pairs of directions.
+
+error = sum |E_model - E_traced| / sum E_traced, E = ∫ S mu_i mu_o dA over blocks of cells, order >= 2; the noise of the
+reference, known from two independent halves, is taken out: sqrt(error² - noise²). The number depends on the size of the
+blocks, which is stated with it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from halfspace_sss.arrays import library
+from halfspace_sss.comparison.cell_energies import cell_energies
+from halfspace_sss.interface.model import BSSRDF
+from halfspace_sss.maps.noisy_maps import LEAST_ALBEDO, CellGrid, Groups, Progress, make_pool, radial_edges
+from halfspace_sss.physics.backbone import unwarp
+from halfspace_sss.physics.fresnel import F_t, mu_internal
+from halfspace_sss.physics.medium import Medium
+from halfspace_sss.physics.phase import eval_hg
+
+__all__ = ["ModelError", "Reference", "model_error", "reference_maps"]
+
+SET = 8  # directions of a set, each towards each at two azimuths
+
+
+class ModelError(NamedTuple):
+    """Relative errors: noise removed, as measured, the noise, the signed error of the energy and its own noise."""
+
+    error: float
+    raw: float
+    noise: float
+    bias: float
+    bias_noise: float
+    by_decade: dict[str, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """Traced maps of one medium: groups of directions, cells, two independent estimates of ∫ G dA per cell.
+
+    Args:
+        medium: scalar medium in mean free paths.
+        groups, grid: directions and cells.
+        halves: (n, 2, 16, n_u, n_psi).
+        block: cells of u and of psi that are put together before the comparison.
+    """
+
+    medium: Medium
+    groups: Groups
+    grid: CellGrid
+    halves: np.ndarray
+    block: int
+
+    def energies(self) -> np.ndarray:
+        """∫ S mu_i mu_o dA of each block in both halves, (n, 2, 16, n_u / block, n_psi / block)."""
+        weight = _weight(self.groups.mu_i, self.medium.eta)[:, None] * _weight(self.groups.mu_o, self.medium.eta)
+        albedo = float(self.medium.albedo)
+        weight *= (albedo / max(albedo, LEAST_ALBEDO)) ** 2  # darker media were traced at that albedo
+        return self._blocks(self.halves.astype(np.float64) * weight[:, None, :, None, None])
+
+    def _blocks(self, cells: np.ndarray) -> np.ndarray:
+        b = self.block
+        n_u, n_psi = (n // b for n in cells.shape[-2:])
+        return cells[..., : n_u * b, : n_psi * b].reshape(*cells.shape[:-2], n_u, b, n_psi, b).sum(axis=(-3, -1))
+
+    def model_energies(self, model: BSSRDF) -> np.ndarray:
+        """The same of a model, by quadrature; (n, 16, ...)."""
+        return self._blocks(cell_energies(model, self.groups, self.grid))
+
+    def single_energies(self) -> np.ndarray:
+        """The same of single scattering, exactly: a line of each pair of directions, (n, 16, ...)."""
+        groups, m = self.groups, self.medium
+        mu_i = mu_internal(groups.mu_i, m.eta)[:, None]
+        mu_o, phi = mu_internal(groups.mu_o, m.eta), groups.delta_phi
+        sin_i, sin_o = np.sqrt(1 - mu_i**2), np.sqrt(1 - mu_o**2)
+        # a ray that scatters after a path s leaves at s v and has gone on for s mu_i / mu_o
+        ratio = mu_i / mu_o
+        v_x, v_y = sin_i + ratio * sin_o * np.cos(phi), ratio * sin_o * np.sin(phi)
+        p = eval_hg(sin_i * sin_o * np.cos(phi) - mu_i * mu_o, m.g)
+        r = groups.L[:, None] * unwarp(library(0.0), radial_edges(groups, self.grid))
+        s = r[:, None, :] / np.maximum(np.hypot(v_x, v_y), 1e-12)[..., None]
+        share = -np.diff(np.exp(-(1 + ratio)[..., None] * s), axis=-1)
+        weight = _weight(groups.mu_i, m.eta)[:, None] * _weight(groups.mu_o, m.eta)
+        E = (weight * m.albedo * p / (m.eta**2 * (mu_i + mu_o)))[..., None] * share
+        n_psi = self.grid.n_psi
+        column = np.floor((np.arctan2(v_y, v_x) / (2 * math.pi) + 0.5) * n_psi).astype(int) % n_psi
+        cells = np.zeros((*E.shape, n_psi))
+        np.put_along_axis(cells, np.broadcast_to(column[..., None, None], (*E.shape, 1)), E[..., None], axis=-1)
+        return self._blocks(cells)
+
+    def block_radii(self) -> np.ndarray:
+        """Distance in the middle of each row of blocks, mean free paths, (n, n_u / block)."""
+        edges = radial_edges(self.groups, self.grid)[:, :: self.block]
+        return self.groups.L[:, None] * unwarp(library(0.0), 0.5 * (edges[:, 1:] + edges[:, :-1]))
+
+
+def _weight(mu: np.ndarray, eta: float) -> np.ndarray:
+    return mu * F_t(mu, eta)
+
+
+def model_error(model: BSSRDF, reference: Reference) -> ModelError:
+    """Error of a model against traced maps of its medium, at the orders of the model; see the module.
+
+    Args:
+        model: made for `reference.medium`. Where it contains single scattering the exact one is added to the maps.
+        reference: traced with seeds that the model was not trained with.
+    """
+    halves, E = reference.energies(), reference.model_energies(model)
+    traced = halves.mean(axis=1)
+    if model.orders == "total":
+        traced = traced + reference.single_energies()
+    total = float(traced.sum() or E.sum() or 1.0)  # a medium that does not scatter has none
+    deviation, noise = np.abs(E - traced), 0.5 * np.abs(halves[:, 0] - halves[:, 1])
+    raw, blur = float(deviation.sum() / total), float(noise.sum() / total)
+    bias_noise = float(0.5 * abs(halves[:, 0].sum() - halves[:, 1].sum()) / total)
+    decades = {}
+    decade = np.floor(np.log10(reference.block_radii())).astype(int)
+    for d in np.unique(decade):
+        rows = np.broadcast_to((decade == d)[:, None, :, None], traced.shape)
+        share = traced[rows].sum()
+        if share > 1e-4 * total:
+            decades[f"{10.0**d:g}-{10.0 ** (d + 1):g}"] = float(
+                _denoised(deviation[rows].sum(), noise[rows].sum()) / share
+            )
+    return ModelError(_denoised(raw, blur), raw, blur, float((E.sum() - traced.sum()) / total), bias_noise, decades)
+
+
+def _denoised(raw: float, noise: float) -> float:
+    return math.sqrt(max(raw * raw - noise * noise, 0.0))
+
+
+def _reciprocal_directions(medium: Medium, n_sets: int, n_psi: int, rng: np.random.Generator) -> Groups:
+    """Sets of 8 cosines, every pair at two azimuths that are whole numbers of cells: each pair also runs backwards."""
+    lowest = math.sqrt(max(1 - medium.eta**2, 0.0))
+    mu, turns = [], []
+    for _ in range(n_sets):
+        mu.append(lowest + (1 - lowest) * (rng.permutation(SET) + rng.random(SET)) / SET)
+        m = rng.integers(0, n_psi, (2, SET, SET))
+        m = np.triu(m, 1) - np.swapaxes(np.triu(m, 1), 1, 2)
+        m[:, range(SET), range(SET)] = np.array([[0], [n_psi // 2]])
+        turns.append(np.moveaxis(m, 0, -1).reshape(SET, 2 * SET))
+    one = np.ones(n_sets * SET)
+    mu_o = np.repeat(np.repeat(np.stack(mu), 2, axis=1)[:, None], SET, axis=1).reshape(-1, 2 * SET)
+    ratios = (float(medium.albedo) * one, float(medium.g) * one, medium.eta * one)
+    return Groups(*ratios, np.concatenate(mu), mu_o, 2 * math.pi / n_psi * np.concatenate(turns))
+
+
+def _mean_of_both_ways(groups: Groups, halves: np.ndarray) -> np.ndarray:
+    """G of each pair from the maps both ways, (M(i, o; psi) + M(o, i; psi - delta_phi)) / 2."""
+    n_psi = halves.shape[-1]
+    sets = halves.reshape(-1, SET, 2, SET, 2, *halves.shape[-2:])  # set, k, half, j, azimuth, u, psi
+    back = np.swapaxes(sets, 1, 3)
+    turns = np.rint(groups.delta_phi * n_psi / (2 * math.pi)).astype(int).reshape(-1, SET, SET, 2)
+    psi = (np.arange(n_psi) - turns[..., None]) % n_psi  # set, k, j, azimuth, psi
+    psi = psi[:, :, None, :, :, None, :]
+    rolled = np.take_along_axis(back, np.broadcast_to(psi, back.shape), axis=-1)
+    return (0.5 * (sets + rolled)).reshape(halves.shape)
+
+
+def reference_maps(
+    media: list[Medium],
+    n_sets: int,
+    grid: CellGrid,
+    block: int,
+    events: float,
+    seed: tuple[int, ...],
+    progress: Progress | None = None,
+    backend: str = "llvm",
+) -> list[Reference]:
+    """Traced maps of scalar media, each with `n_sets` times 8 directions of incidence times 16 of observation.
+
+    Args:
+        media: scalar media; lengths are mean free paths of each.
+        events: scattering events over all media.
+        seed: must differ from that of any training.
+    """
+    rng = np.random.default_rng(list(seed))
+    parts = [_reciprocal_directions(m, n_sets, grid.n_psi, rng) for m in media]
+    columns = (np.concatenate([getattr(p, n) for p in parts]) for n in Groups.__dataclass_fields__)
+    halves = make_pool(Groups(*columns), grid, events, (*seed, 1), None, progress, backend)
+    n = n_sets * SET
+    maps = [_mean_of_both_ways(p, halves[k * n : (k + 1) * n]) for k, p in enumerate(parts)]
+    return [Reference(m.in_mfp(), p, grid, h, block) for m, p, h in zip(media, parts, maps)]

@@ -1,0 +1,1 @@
+"""What every half-space model answers, and the registry of models by name."""

@@ -1,0 +1,290 @@
+"""The one interface of all half-space models, and the registry of models by name."""
+
+from __future__ import annotations
+
+import abc
+import functools
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+
+from halfspace_sss.arrays import broadcast_query
+from halfspace_sss.checks import check_query
+from halfspace_sss.interface.radial import RadialSampler
+from halfspace_sss.physics.fresnel import F_t, mu_internal
+from halfspace_sss.physics.medium import Medium
+
+__all__ = ["BSSRDF", "DirectionSample", "PositionSample", "Query", "bssrdf", "models", "register_model"]
+
+
+class PositionSample(NamedTuple):
+    """Where light enters: distance r (mm) and azimuth phi of x_i about x_o from w_o, density pdf (1/mm²)."""
+
+    r: Any
+    phi: Any
+    pdf: Any
+
+
+class DirectionSample(NamedTuple):
+    """Where light comes from: mu_i, phi_i as in `BSSRDF.eval`, density pdf over outside directions (1/sr)."""
+
+    mu_i: Any
+    phi_i: Any
+    pdf: Any
+
+
+@dataclass(frozen=True)
+class Query:
+    """A half-space query in mean free paths, with refracted cosines, in one array library.
+
+    The refracted directions of travel, in a frame whose x axis points from x_i to x_o and z outwards, are
+    w_12 = (-sin_i cos phi_i, -sin_i sin phi_i, -mu_i_in) and w_21 = (sin_o cos phi_o, sin_o sin phi_o, mu_o_in).
+    """
+
+    lib: Any
+    r: Any
+    mu_i: Any
+    phi_i: Any
+    mu_o: Any
+    phi_o: Any
+    eta: float
+    r_mm: Any = None
+    sigma_t: Any = None  # r = sigma_t r_mm, kept so that `in_float64` does not inherit the rounding of r
+
+    @functools.cached_property
+    def mu_i_in(self) -> Any:
+        return mu_internal(self.mu_i, self.eta)
+
+    @functools.cached_property
+    def mu_o_in(self) -> Any:
+        return mu_internal(self.mu_o, self.eta)
+
+    @functools.cached_property
+    def sin_i(self) -> Any:
+        """Sine of the refracted angle, sqrt(1 - mu_i²)/eta, at most 1."""
+        return self._sine(self.mu_i)
+
+    @functools.cached_property
+    def sin_o(self) -> Any:
+        return self._sine(self.mu_o)
+
+    def _sine(self, mu: Any) -> Any:
+        lib = self.lib
+        return lib.minimum(lib.sqrt(lib.maximum((1 - mu) * (1 + mu), 0.0)) / self.eta, 1.0)
+
+    def constant(self, value: Any) -> Any:
+        """A constant of the model (number, or one per channel) in the library and precision of the query."""
+        return self.lib.constant(value, self.r)
+
+    def in_float64(self) -> Query:
+        """The same query in float64, for formulas whose terms cancel."""
+        f = self.lib.float64
+        r = f(self.r) if self.r_mm is None else f(self.r_mm)
+        if self.r_mm is not None:
+            r = self.lib.constant(self.sigma_t, r) * r
+        return Query(self.lib, r, f(self.mu_i), f(self.phi_i), f(self.mu_o), f(self.phi_o), self.eta)
+
+
+class BSSRDF(abc.ABC):
+    """S(x_i, w_i; x_o, w_o) of a half-space in 1/(mm² sr), made once from a medium, then only asked.
+
+    A model gives `G`, the BSSRDF without its two Fresnel transmittances in mean free paths; this class adds
+    what all share: S = sigma_t² T_12(mu_i) T_21(mu_o) G(sigma_t r, ...), checks, channels and sampling.
+
+    Class attributes of a model:
+        name: its name in the registry.
+        orders: "multiple" (two or more scattering events) or "total" (single scattering included).
+        reciprocal: whether S(x_i, w_i; x_o, w_o) = S(x_o, w_o; x_i, w_i) holds exactly.
+        source: paper and equation.
+        mirror_invariant: whether S(phi_i, phi_o) = S(-phi_i, -phi_o) holds exactly.
+        fast_in: array library that evaluates it fastest on a CPU, "drjit" or "numpy".
+    """
+
+    name: ClassVar[str]
+    orders: ClassVar[str]
+    reciprocal: ClassVar[bool]
+    source: ClassVar[str]
+    mirror_invariant: ClassVar[bool] = True
+    fast_in: str = "drjit"
+
+    def __init__(self, medium: Medium) -> None:
+        if not isinstance(medium, Medium):
+            raise ValueError(f"medium must be a Medium, got {type(medium).__name__}")
+        self.medium = medium
+
+    @abc.abstractmethod
+    def G(self, q: Query) -> Any:
+        """S / (T_12 T_21) in 1/(mfp² sr) for a query in mean free paths."""
+
+    def G_unclamped(self, q: Query) -> Any:
+        """`G` before negative values are clamped; a model that clamps gives it."""
+        return self.G(q)
+
+    def eval(self, r: Any, mu_i: Any, phi_i: Any, mu_o: Any, phi_o: Any) -> Any:
+        """S in 1/(mm² sr).
+
+        Args:
+            r: distance |x_o - x_i| in mm, >= 0.
+            mu_i, mu_o: cosines of w_i and w_o with the outward normal, [0, 1].
+            phi_i, phi_o: azimuths of w_i and w_o about the normal from the direction x_i -> x_o, radians.
+                Arguments broadcast as in NumPy; a medium with channels adds its channel axis last.
+
+        Raises:
+            ValueError: an argument is out of range or not a number (NumPy and torch; Dr.Jit lanes cannot be
+                inspected while a kernel is recorded), or libraries are mixed.
+        """
+        return self._S(self.G, r, mu_i, phi_i, mu_o, phi_o)
+
+    def eval_unclamped(self, r: Any, mu_i: Any, phi_i: Any, mu_o: Any, phi_o: Any) -> Any:
+        """`eval` without the clamp that keeps a model from turning negative; the same where it has none."""
+        return self._S(self.G_unclamped, r, mu_i, phi_i, mu_o, phi_o)
+
+    def _S(self, G_of: Callable[[Query], Any], *query: Any) -> Any:
+        """sigma_t² T_12 T_21 G_of(query)."""
+        lib, args = broadcast_query(*query)
+        check_query(args)
+        if self.medium.n_channels is not None:
+            lib.constant(self.medium.sigma_t, args[0])
+            args = tuple(a[..., None] for a in args)
+        r, mu_i, phi_i, mu_o, phi_o = args
+        sigma_t = lib.constant(self.medium.sigma_t, r)
+        eta = self.medium.eta
+        q = Query(lib, sigma_t * r, mu_i, phi_i, mu_o, phi_o, eta, r, self.medium.sigma_t)
+        G = lib.like(G_of(q), r)
+        S = sigma_t * sigma_t * F_t(mu_i, eta) * F_t(mu_o, eta) * G
+        return S[()] if isinstance(S, np.ndarray) else S
+
+    @functools.cached_property
+    def _radial_samplers(self) -> list[RadialSampler]:
+        media = [self.medium.in_mfp().channel(k) for k in range(self.medium.n_channels or 1)]
+        return [RadialSampler(self.for_medium(m)) for m in media]
+
+    def for_medium(self, medium: Medium) -> BSSRDF:
+        """The same model, with the same options, of another medium; models with options override it."""
+        return type(self)(medium)
+
+    def _per_channel(self, lib: Any, x: Any, answer: Any) -> Any:
+        """`answer(sampler, sigma_t)` for each channel, stacked last."""
+        if self.medium.n_channels is None:
+            return answer(self._radial_samplers[0], self.medium.sigma_t)
+        lib.constant(self.medium.sigma_t, x)
+        parts = [answer(s, float(t)) for s, t in zip(self._radial_samplers, self.medium.sigma_t)]
+        return lib.stack(parts)
+
+    def sample_position(self, mu_o: Any, u: Any) -> PositionSample:
+        """Sample where light enters for an exit direction, from the model's own radial profile.
+
+        Args:
+            mu_o: cosine of w_o, [0, 1].
+            u: pair (u_1, u_2) of arrays of uniform numbers in [0, 1) (a last axis of length 2 also works).
+
+        Returns:
+            r in mm, azimuth phi of x_i about x_o measured from w_o (so phi_o = pi - phi), and the density in
+            1/mm². A medium with channels adds its channel axis last.
+        """
+        u_1, u_2 = _split(u)
+        lib, (u_1, u_2, mu_o) = broadcast_query(u_1, u_2, mu_o)
+        r = self._per_channel(lib, u_1, lambda sampler, sigma_t: sampler.sample(lib, u_1) / sigma_t)
+        phi = 2 * math.pi * u_2
+        pdf = self._pdf_own_channel(lib, r)
+        return PositionSample(r, phi[..., None] + 0 * r if self.medium.n_channels else phi, pdf)
+
+    def _pdf_own_channel(self, lib: Any, r: Any) -> Any:
+        """Density of `sample_position` for r that already carries the channel axis, 1/mm²."""
+        if self.medium.n_channels is None:
+            sigma_t = self.medium.sigma_t
+            return sigma_t**2 * self._radial_samplers[0].pdf(lib, sigma_t * r)
+        parts = [
+            float(t) ** 2 * s.pdf(lib, float(t) * r[..., k])
+            for k, (s, t) in enumerate(zip(self._radial_samplers, self.medium.sigma_t))
+        ]
+        return lib.stack(parts)
+
+    def pdf_position(self, r: Any, phi: Any, mu_o: Any) -> Any:
+        """Density of `sample_position` in 1/mm² at distance r (mm) and azimuth phi; arguments broadcast."""
+        lib, (r, phi, mu_o) = broadcast_query(r, phi, mu_o)
+        return self._per_channel(lib, r, lambda sampler, sigma_t: sigma_t**2 * sampler.pdf(lib, sigma_t * r))
+
+    def sample_direction(self, r: Any, mu_o: Any, phi_o: Any, u: Any) -> DirectionSample:
+        """Sample where light comes from, given the position: by the cosine over the directions that refract.
+
+        pdf = mu_i / pi, or mu_i / (pi eta²) within the cone 1 - mu_i² < eta² for eta < 1.
+
+        Args:
+            r, mu_o, phi_o: the rest of the query, as in `eval`.
+            u: pair of arrays of uniform numbers in [0, 1).
+        """
+        u_1, u_2 = _split(u)
+        lib, (u_1, u_2, r, mu_o, phi_o) = broadcast_query(u_1, u_2, r, mu_o, phi_o)
+        cone = min(1.0, self.medium.eta**2)
+        mu_i = lib.sqrt(lib.maximum(1 - cone * u_1, 0.0))
+        phi_i = 2 * math.pi * u_2 - math.pi
+        return DirectionSample(mu_i, phi_i, mu_i / (math.pi * cone))
+
+    def pdf_direction(self, mu_i: Any, phi_i: Any, r: Any, mu_o: Any, phi_o: Any) -> Any:
+        """Density of `sample_direction` over outside directions, 1/sr."""
+        lib, (mu_i, phi_i, r, mu_o, phi_o) = broadcast_query(mu_i, phi_i, r, mu_o, phi_o)
+        cone = min(1.0, self.medium.eta**2)
+        inside = (1 - mu_i) * (1 + mu_i) <= cone
+        return lib.where(inside, mu_i / (math.pi * cone), 0 * mu_i)
+
+
+def _split(u: Any) -> tuple[Any, Any]:
+    if isinstance(u, (tuple, list)):
+        if len(u) != 2:
+            raise ValueError(f"u must be a pair of arrays, got {len(u)} of them")
+        return u[0], u[1]
+    if type(u).__module__.startswith(("drjit", "mitsuba")):
+        return u[0], u[1]
+    if u.shape[-1] != 2:
+        raise ValueError(f"u must have a last axis of length 2, got shape {tuple(u.shape)}")
+    return u[..., 0], u[..., 1]
+
+
+_registered: dict[str, type[BSSRDF]] = {}
+
+
+@functools.cache
+def _installed() -> Mapping[str, type[BSSRDF]]:
+    """Models of all installed packages: entry points of the group `halfspace_sss.models` are lists of classes."""
+    from importlib.metadata import entry_points
+
+    return {cls.name: cls for entry in entry_points(group="halfspace_sss.models") for cls in entry.load()}
+
+
+def register_model(cls: type[BSSRDF]) -> type[BSSRDF]:
+    """Add a model class under its `name`; usable as a decorator.
+
+    Raises:
+        ValueError: it is not a BSSRDF, or the name is taken.
+    """
+    if not (isinstance(cls, type) and issubclass(cls, BSSRDF)):
+        raise ValueError(f"a model must be a subclass of BSSRDF, got {cls!r}")
+    if cls.name in models():
+        raise ValueError(f"model name must be new, got {cls.name!r}, which is registered already")
+    _registered[cls.name] = cls
+    return cls
+
+
+def models() -> tuple[str, ...]:
+    """Names of all models, in the order of their lists."""
+    return (*_installed(), *_registered)
+
+
+def bssrdf(name: str, medium: Medium) -> BSSRDF:
+    """The model called `name` for a medium.
+
+    Raises:
+        ValueError: no such model (the nearest name is given), or the model refuses the medium.
+    """
+    import difflib
+
+    known = {**_installed(), **_registered}
+    if name not in known:
+        close = difflib.get_close_matches(str(name), known, n=1)
+        hint = f"; did you mean {close[0]!r}?" if close else ""
+        raise ValueError(f"model must be one of {', '.join(known)}, got {name!r}{hint}")
+    return known[name](medium)

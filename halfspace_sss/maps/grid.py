@@ -1,0 +1,85 @@
+"""Where a set of training maps is sampled: directions of incidence and observation, and cells of the plane."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from halfspace_sss.physics.medium import Medium
+
+__all__ = ["MapGrid", "cell_edges", "map_directions", "radial_scale"]
+
+R_SMALLEST, R_LARGEST = 0.02, 12.0  # first edge in min(L, mfp), last edge in L
+LONGEST_SCALE = 20.0  # transport mean free paths; caps L where nothing absorbs
+
+
+@dataclass(frozen=True)
+class MapGrid:
+    """Numbers of directions and cells of a set of maps.
+
+    Args:
+        n_theta, n_phi: directions of incidence; each pair has one map with its own direction of observation.
+        n_r, n_psi: cells of a map in distance and azimuth.
+
+    Raises:
+        ValueError: a number is below its bound, or n_phi is no multiple of 16 (maps are traced 16 at a time).
+    """
+
+    n_theta: int = 16
+    n_phi: int = 64
+    n_r: int = 48
+    n_psi: int = 24
+
+    def __post_init__(self) -> None:
+        for name, least in (("n_theta", 1), ("n_phi", 16), ("n_r", 2), ("n_psi", 2)):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int) or value < least:
+                raise ValueError(f"{name} must be a whole number >= {least}, got {value!r}")
+        if self.n_phi % 16:
+            raise ValueError(f"n_phi must be a multiple of 16, got {self.n_phi}")
+
+
+def radial_scale(medium: Medium) -> float:
+    """Length L of the radial grid in mean free paths: 1/sigma_tr of classical diffusion, capped for albedo -> 1.
+
+    Args:
+        medium: scalar medium.
+    """
+    m = medium.in_mfp()
+    sigma_tr = math.sqrt(3 * m.sigma_a * m.sigma_t_prime)
+    return min(1 / sigma_tr if sigma_tr > 0 else math.inf, LONGEST_SCALE / m.sigma_t_prime)
+
+
+def warp(r: np.ndarray, L: float) -> np.ndarray:
+    """u = log(exp(r/L) - 1): logarithmic in r below L, linear above, where S falls exponentially."""
+    x = np.asarray(r, dtype=np.float64) / L
+    return x + np.log(-np.expm1(-x))
+
+
+def unwarp(u: np.ndarray, L: float) -> np.ndarray:
+    """Distance for the warped coordinate, r = L log(1 + exp(u))."""
+    return L * np.logaddexp(0.0, u)
+
+
+def cell_edges(medium: Medium, grid: MapGrid) -> tuple[np.ndarray, np.ndarray]:
+    """Edges of the cells: distances in mean free paths (uniform in `warp`), azimuths of x_o - x_i in [-pi, pi]."""
+    L = radial_scale(medium)
+    low, high = warp(np.array([R_SMALLEST * min(L, 1.0), R_LARGEST * L]), L)
+    return unwarp(np.linspace(low, high, grid.n_r + 1), L), np.linspace(-math.pi, math.pi, grid.n_psi + 1)
+
+
+def map_directions(medium: Medium, grid: MapGrid, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Directions of a set: mu_i (theta), mu_o and delta_phi (theta, phi); delta_phi = 0 is the far side.
+
+    mu_i stands in the middle of equal steps of the cosine. The observations of one mu_i are a jittered Latin
+    square over cosine and azimuth, another one for each mu_i. For eta < 1 cosines stay where light refracts.
+    """
+    lowest = math.sqrt(max(1 - medium.eta**2, 0.0))
+    mu_i = lowest + (1 - lowest) * (np.arange(grid.n_theta) + 0.5) / grid.n_theta
+    rng = np.random.default_rng([seed, 1])
+    shape = (grid.n_theta, grid.n_phi)
+    strata = np.stack([rng.permutation(grid.n_phi) for _ in range(2 * grid.n_theta)]).reshape(2, *shape)
+    u = (strata + rng.uniform(0.1, 0.9, strata.shape)) / grid.n_phi
+    return mu_i, lowest + (1 - lowest) * u[0], 2 * math.pi * u[1] - math.pi

@@ -1,0 +1,296 @@
+"""Training data: many noisy maps of order >= 2, each of its own directions and, if wanted, its own medium.
+
+A group is a medium, a direction of incidence and 16 directions of observation that share the walks of 64 lanes or more;
+its maps hold the integral of G over cells of the plane of x_o - x_i, uniform in u = log(exp(r/L) - 1) and azimuth.
+Groups of different media run side by side in one kernel.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from halfspace_sss.arrays import library
+from halfspace_sss.backend import array_types
+from halfspace_sss.checks import check_count
+from halfspace_sss.maps.map_tracing import GROUP, MapTally
+from halfspace_sss.physics.backbone import U_MAX, backbone, length_scale, unwarp, warp
+from halfspace_sss.physics.phase import eval_hg
+from halfspace_sss.provenance import write_atomically
+from halfspace_sss.tracing.tallies import CellSums
+from halfspace_sss.tracing.walk import Scatter, WalkConstants, pass_seed, walk
+
+__all__ = [
+    "CellGrid",
+    "Groups",
+    "Launch",
+    "backbone_mass",
+    "Progress",
+    "draw_directions",
+    "looking_back",
+    "make_pool",
+    "radial_edges",
+    "trace_groups",
+]
+
+LANES = 32768  # of one launch, at most
+FIRST_R = 0.02  # of min(L, mfp): smallest distance in the maps
+LEAST_ALBEDO = 1e-4  # G/albedo² of darker media is that of this one to 1e-4
+PILOT_LANES = 8  # of a group, one walk each
+WALKS_PER_LANE = 8  # at least, where there are enough for it: lanes then end at about the same time
+N_BACK = 2  # of the observations look back along the incident ray, where that is asked for
+BACK = (-3.0, math.log10(0.3))  # exponents of their distance from it
+Progress = Callable[[str, int, int], None]  # what is done, steps done, steps in all
+
+
+@dataclass(frozen=True)
+class CellGrid:
+    """Numbers of cells of a map in u, at least 2, and in azimuth, an even number."""
+
+    n_u: int = 40
+    n_psi: int = 16
+
+    def __post_init__(self) -> None:
+        check_count("n_u", self.n_u, 2)
+        check_count("n_psi", self.n_psi, 2)
+        if self.n_psi % 2:
+            raise ValueError(f"n_psi must be even, got {self.n_psi}")
+
+
+@dataclass(frozen=True, eq=False)
+class Groups:
+    """Media and directions: albedo, g, eta, mu_i of shape (n,), mu_o and delta_phi of shape (n, 16).
+
+    Outside cosines; delta_phi = 0 is the far side of the plane of incidence.
+    """
+
+    albedo: np.ndarray
+    g: np.ndarray
+    eta: np.ndarray
+    mu_i: np.ndarray
+    mu_o: np.ndarray
+    delta_phi: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.albedo)
+
+    def __getitem__(self, index: Any) -> Groups:
+        return Groups(*(getattr(self, f.name)[index] for f in fields(self)))
+
+    @property
+    def L(self) -> np.ndarray:
+        return np.asarray(length_scale(self.albedo, self.g))
+
+
+def draw_directions(albedo: np.ndarray, g: np.ndarray, eta: np.ndarray, rng: np.random.Generator) -> Groups:
+    """One group per entry: mu_i stratified over the entries, observations a Latin square of cosine and azimuth."""
+    n = len(albedo)
+    lowest = np.sqrt(np.maximum(1 - eta**2, 0.0))  # eta < 1: only these cosines refract
+    mu_i = lowest + (1 - lowest) * (rng.permutation(n) + rng.random(n)) / n
+    strata = np.argsort(rng.random((2, n, GROUP)), axis=-1)
+    u = (strata + rng.random((2, n, GROUP))) / GROUP
+    mu_o = lowest[:, None] + (1 - lowest[:, None]) * u[0]
+    return Groups(albedo, g, eta, mu_i, mu_o, 2 * math.pi * u[1] - math.pi)
+
+
+def looking_back(groups: Groups, rng: np.random.Generator) -> Groups:
+    """The same groups with two directions of observation near that from which the light comes.
+
+    There the refracted rays lie close to each other and the features of a pair change fastest, and there are all curves
+    of normal incidence and exit; uniform directions hardly ever fall there. The distance from w_i is 0.001 to 0.3.
+    """
+    n = (len(groups), N_BACK)
+    off = rng.standard_normal((3, *n))
+    off *= 10 ** rng.uniform(*BACK, n) / np.linalg.norm(off, axis=0)
+    mu_i = groups.mu_i[:, None]
+    x, y, z = off[0] - np.sqrt(1 - mu_i**2), off[1], off[2] + mu_i
+    lowest = np.sqrt(np.maximum(1 - groups.eta**2, 0.0))[:, None]
+    mu_o, delta_phi = groups.mu_o.copy(), groups.delta_phi.copy()
+    mu_o[:, -N_BACK:] = np.clip(np.abs(z) / np.sqrt(x * x + y * y + z * z), lowest, 1.0)
+    delta_phi[:, -N_BACK:] = np.arctan2(y, x)
+    return replace(groups, mu_o=mu_o, delta_phi=delta_phi)
+
+
+def radial_edges(groups: Groups, grid: CellGrid) -> np.ndarray:
+    """Edges of the cells in u, shape (n, n_u + 1)."""
+    lib, L = library(0.0), groups.L
+    low = warp(lib, FIRST_R * np.minimum(L, 1.0) / L)
+    return low[:, None] + (U_MAX - low[:, None]) * np.arange(grid.n_u + 1) / grid.n_u
+
+
+def backbone_mass(groups: Groups, grid: CellGrid) -> np.ndarray:
+    """Integral of the backbone over each cell, shape (n, n_u); Gauss quadrature of four points in u."""
+    edges, lib = radial_edges(groups, grid), library(0.0)
+    nodes, weights = np.polynomial.legendre.leggauss(4)
+    half = 0.5 * np.diff(edges, axis=1)[..., None]
+    u = 0.5 * (edges[:, 1:] + edges[:, :-1])[..., None] + half * nodes
+    L, albedo, g, eta = (np.asarray(v)[:, None, None] for v in (groups.L, groups.albedo, groups.g, groups.eta))
+    r, dr_du = L * unwarp(lib, u), L / (1 + np.exp(-u))
+    B = backbone(r, np.maximum(albedo, LEAST_ALBEDO), g, eta)
+    return (B * r * dr_du * half * weights).sum(axis=-1) * (2 * math.pi / grid.n_psi)
+
+
+class _GroupCells(CellSums):
+    """Fixed-point sums of the cells of each group in two independent halves; lanes of a group are neighbours."""
+
+    def __init__(self, types: ModuleType, cells: int, groups: int, lanes_per_group: int) -> None:
+        super().__init__(types, cells, 2 * groups)
+        self.half = lanes_per_group // 2
+
+    def add(self, value: Any, cell: Any, lane: Any, active: Any) -> None:
+        super().add(value, cell, lane // self.half, active)
+
+
+class GroupTally(MapTally):
+    """As `MapTally`, with a medium and observations of its own for each group of lanes, and halved by reciprocity.
+
+    A path that turns back early is found by walks from the other end: its score is weighted by p_1 / (p_1 + p_n), the
+    balance of both ends with the phase functions of the first and the last angle, which takes the rare large scores
+    of forward scattering away. The maps hold 2 H with G(i, o) = H(i, o) + H(o, i): fitting them with a reciprocal
+    function gives G, and so does the mean of both directions.
+    """
+
+    def __init__(self, types: ModuleType, groups: Groups, grid: CellGrid, lanes_per_group: int) -> None:
+        import drjit as dr
+
+        def lanes(values: np.ndarray) -> Any:
+            return types.Float(np.repeat(values, lanes_per_group).astype(np.float32))
+
+        self.types, self.n_r, self.n_psi, self.g = types, grid.n_u, grid.n_psi, lanes(groups.g)
+        eta = groups.eta[:, None]
+        mu = np.maximum(np.sqrt(np.maximum(1 - (1 - groups.mu_o**2) / eta**2, 0.0)), 1e-4)
+        sine = np.sqrt(1 - mu**2)
+        columns = (sine * np.cos(groups.delta_phi), sine * np.sin(groups.delta_phi), mu, 1 / mu, 1 / (eta**2 * mu))
+        self.directions = [tuple(lanes(c[:, k]) for c in columns) for k in range(GROUP)]
+        edges = radial_edges(groups, grid)
+        self.inverse_L, self.low = lanes(1 / groups.L), lanes(edges[:, 0])
+        self.rate = lanes(grid.n_u / (edges[:, -1] - edges[:, 0]))
+        self.cells = _GroupCells(types, GROUP * grid.n_u * grid.n_psi, len(groups), lanes_per_group)
+        dr.eval(self.g, self.directions, self.inverse_L, self.low, self.rate)
+
+    def _phase(self, cosine: Any, event: Scatter) -> Any:
+        last, first = eval_hg(cosine, self.g), eval_hg(event.first, self.g)
+        return 2 * last * first / (first + last)
+
+
+def _launch(
+    groups: Groups, grid: CellGrid, per_group: int, walks: int, seed: tuple[int, int], backend: str
+) -> tuple[np.ndarray, int]:
+    """Cell integrals of G of one launch, two independent estimates (n, 2, 16, n_u, n_psi), and events."""
+    types = array_types(backend)
+    albedo = np.maximum(groups.albedo, LEAST_ALBEDO)
+    tally = GroupTally(types, groups, grid, per_group)
+    constants = WalkConstants.per_lane(types, *(np.repeat(v, per_group) for v in (albedo, groups.g, groups.eta)))
+    mu_in = np.maximum(np.sqrt(np.maximum(1 - (1 - groups.mu_i**2) / groups.eta**2, 0.0)), 1e-4)
+    start = types.Float(np.repeat(mu_in, per_group).astype(np.float32))
+    # order 1 is not recorded: walks start with weight albedo^-2 so that roulette spares them until order 2
+    _, events = walk(
+        types, constants, start, walks, seed, [tally], weight=types.Float(np.repeat(albedo**-2, per_group))
+    )
+    sums = tally.cells.result().reshape(len(groups), 2, GROUP, grid.n_u, grid.n_psi)
+    sums *= (2 * albedo**2 / (walks * per_group))[:, None, None, None, None]
+    return sums.astype(np.float32), int(events.numpy().astype(np.int64).sum())
+
+
+@dataclass(frozen=True, eq=False)
+class Launch:
+    """Groups that are traced side by side: `index` says which, `trace` does it.
+
+    The number of walks follows from the events of a pilot, so that the result depends on the arguments alone.
+    """
+
+    index: np.ndarray
+    groups: Groups
+    grid: CellGrid
+    events: float
+    seed: tuple[int, ...]
+    backend: str
+
+    def trace(self) -> np.ndarray:
+        """Two independent estimates of the cell integrals of G, (k, 2, 16, n_u, n_psi)."""
+        n = len(self.groups)
+        _, pilot = _launch(self.groups, self.grid, PILOT_LANES, 1, pass_seed(*self.seed, 0), self.backend)
+        per_group_walks = self.events / pilot * PILOT_LANES
+        per_group = 2 * int(np.clip(per_group_walks / (2 * WALKS_PER_LANE), PILOT_LANES // 2, LANES // (2 * n)))
+        walks = max(int(per_group_walks / per_group), 1)
+        return _launch(self.groups, self.grid, per_group, walks, pass_seed(*self.seed, 1), self.backend)[0]
+
+
+def trace_groups(
+    groups: Groups,
+    grid: CellGrid,
+    events: float,
+    seed: tuple[int, ...],
+    *,
+    per_launch: int = 256,
+    backend: str = "llvm",
+) -> list[Launch]:
+    """Launches of `per_launch` groups that together trace all of them, those of long walks side by side.
+
+    Args:
+        groups: media and directions.
+        grid: cells of the maps.
+        events: scattering events over all launches, about; each has its share.
+        seed: seeds of the random numbers.
+    """
+    order = np.argsort((1 - groups.albedo) * (1 - groups.albedo * groups.g), kind="stable")
+    parts = [order[at : at + per_launch] for at in range(0, len(order), per_launch)]
+    return [
+        Launch(part, groups[part], grid, events * len(part) / len(groups), (*seed, k), backend)
+        for k, part in enumerate(parts)
+    ]
+
+
+def _load_maps(place: Path, shape: tuple[int, ...]) -> np.ndarray:
+    """Maps of a launch as an earlier run left them."""
+    try:
+        maps = np.load(place, allow_pickle=False)
+    except (ValueError, EOFError, OSError) as error:
+        raise ValueError(f"{place}: maps cannot be used, remove the file to make them anew: {error}") from error
+    if maps.shape != shape or maps.dtype != np.float32 or not np.isfinite(maps).all():
+        raise ValueError(
+            f"{place}: maps must be {shape} finite float32, got {maps.shape} {maps.dtype}; remove the file"
+        )
+    return maps
+
+
+def make_pool(
+    groups: Groups,
+    grid: CellGrid,
+    events: float,
+    seed: tuple[int, ...],
+    folder: Path | None = None,
+    progress: Progress | None = None,
+    backend: str = "llvm",
+) -> np.ndarray:
+    """Cell integrals of all groups, (n, 2, 16, n_u, n_psi), kept launch by launch in `folder` so that a run can go on.
+
+    Args: as `trace_groups`; progress is called with ("data", launches done, launches in all). The folder must be that
+        of this run, see `work_folder`.
+
+    Raises:
+        ValueError: a file of maps in the folder is damaged.
+    """
+    halves = np.zeros((len(groups), 2, 16, grid.n_u, grid.n_psi), np.float32)
+    launches = trace_groups(groups, grid, events, seed, backend=backend)
+    for k, launch in enumerate(launches):
+        place = folder / f"maps-{'-'.join(map(str, seed))}-{k:05d}.npy" if folder else None
+        if place and place.exists():
+            maps = _load_maps(place, (len(launch.index), *halves.shape[1:]))
+        else:
+            maps = launch.trace()
+            if place:
+                file = io.BytesIO()
+                np.save(file, maps)
+                write_atomically(place, file.getvalue())
+        halves[launch.index] = maps
+        if progress:
+            progress("data", k + 1, len(launches))
+    return halves

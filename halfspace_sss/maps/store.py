@@ -1,0 +1,267 @@
+"""Training maps of half-spaces: made in units that can be killed, resumed and spread; stored as labelled Zarr."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import zlib
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from halfspace_sss.backend import array_types
+from halfspace_sss.checks import check_count, check_interval
+from halfspace_sss.maps.grid import MapGrid, cell_edges, map_directions
+from halfspace_sss.maps.map_tracing import MapUnit, UnitResult, trace_unit
+from halfspace_sss.physics.medium import Medium
+from halfspace_sss.provenance import provenance
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+__all__ = ["load_maps", "make_maps"]
+
+FORMAT = 1
+MOST_PATHS = 2**33
+DATA = ("S", "variance")
+Progress = Callable[[int, int, str], None]  # units done, units in all, what was just done
+
+
+def make_maps(
+    media: Mapping[str, Medium],
+    folder: str | os.PathLike,
+    *,
+    grid: MapGrid | None = None,
+    target_error: float | None = 0.05,
+    n_paths: int | None = None,
+    seed: int = 0,
+    backend: str = "llvm",
+    share: tuple[int, int] = (0, 1),
+    progress: Progress | None = None,
+) -> dict[str, Path]:
+    """Trace training maps of media into `folder/NAME.zarr`, one Zarr store each, continuing what is there.
+
+    For each of n_theta directions of incidence and each of n_phi azimuths (which follow from the first by
+    rotation, so the walks are shared) a map holds S of order >= 2 towards its own direction of observation,
+    over cells of x_o - x_i. One direction of incidence of one channel is one unit of work: its result depends on
+    the arguments alone, so a killed and resumed run equals an unbroken one bit for bit, and units can be shared.
+
+    Args:
+        media: name -> medium; channels of a medium become a dimension of its store.
+        folder: where the stores are, made if absent.
+        grid: numbers of directions and cells.
+        target_error: stop a unit at this mean cell error (see `trace_unit`); None to trace `n_paths` exactly.
+        n_paths: walks per unit and group of 16 observations; with a target error, the most that are traced.
+        seed, backend: as in `trace`.
+        share: (k, n) does every n-th unit from the k-th on, so that n processes can fill one folder together.
+        progress: called with (units done, units in all, what was just done), first with those that were done before.
+
+    Returns:
+        name -> path of the store.
+
+    Raises:
+        ValueError: an argument is out of range, or a store exists with other parameters; nothing has been written
+            then. Or a unit of a store is damaged; nothing has been traced then.
+    """
+    grid = grid or MapGrid()
+    _check(media, target_error, n_paths, seed, share)
+    array_types(backend)
+    paths = {name: Path(folder) / f"{name}.zarr" for name in media}
+    asked = {name: _parameters(m, grid, target_error, n_paths, seed, backend) for name, m in media.items()}
+    for name in media:
+        if paths[name].exists():
+            _open_same(paths[name], asked[name])
+    for name, medium in media.items():
+        if not paths[name].exists():
+            _create(paths[name], medium, grid, seed, asked[name])
+    stores = {name: _open_same(path, asked[name]) for name, path in paths.items()}
+    units = _units(media, grid, target_error, n_paths or MOST_PATHS, seed, backend)[share[0] :: share[1]]
+    left = [u for u in units if not _done(paths[u[0]], stores[u[0]], u[1], u[2].theta_index)]
+    before = len(units) - len(left)
+    if progress:
+        progress(before, len(units), "")
+    for done, (name, channel, unit) in enumerate(left, before + 1):
+        _write(paths[name], channel, unit.theta_index, trace_unit(unit))
+        if progress:
+            progress(done, len(units), f"{name} channel {channel} direction {unit.theta_index + 1}/{grid.n_theta}")
+    return paths
+
+
+def _units(
+    media: Mapping[str, Medium], grid: MapGrid, target_error: float | None, n_paths: int, seed: int, backend: str
+) -> list[tuple[str, int, MapUnit]]:
+    """Name, channel and work of every unit, in the order of the shares."""
+    return [
+        (name, channel, MapUnit(mfp, grid, a, seed, channel, target_error, n_paths, backend))
+        for name, medium in media.items()
+        for channel in range(medium.n_channels or 1)
+        for mfp in (medium.channel(channel).in_mfp(),)
+        for a in range(grid.n_theta)
+    ]
+
+
+def _check(media: Any, target_error: Any, n_paths: Any, seed: Any, share: Any) -> None:
+    if not isinstance(media, Mapping) or not media:
+        raise ValueError(f"media must map at least one name to a Medium, got {media!r}")
+    for name, medium in media.items():
+        if not isinstance(medium, Medium):
+            raise ValueError(f"media[{name!r}] must be a Medium, got {type(medium).__name__}")
+        if not isinstance(name, str) or not name or name != Path(name).name or name.startswith("."):
+            raise ValueError(f"a name in media must be usable as a file name, got {name!r}")
+    if target_error is None and n_paths is None:
+        raise ValueError("target_error or n_paths must be given, got None for both")
+    if target_error is not None:
+        check_interval("target_error", target_error, 1e-4, 1.0)
+    if n_paths is not None:
+        check_count("n_paths", n_paths, 1024)
+    check_count("seed", seed, 0)
+    if len(share) != 2 or not 0 <= share[0] < share[1]:
+        raise ValueError(f"share must be (k, n) with 0 <= k < n, got {share!r}")
+
+
+def _parameters(
+    medium: Medium, grid: MapGrid, target_error: float | None, n_paths: int | None, seed: int, backend: str
+) -> dict[str, Any]:
+    """What defines the contents of a store; a resumed run must agree in all of it."""
+    numbers = {k: np.asarray(getattr(medium, k)).tolist() for k in ("sigma_s", "sigma_a", "g", "eta")}
+    stop = {"target_error": target_error, "n_paths": n_paths}
+    return {"format": FORMAT, "medium": numbers, "grid": asdict(grid), **stop, "seed": seed, "backend": backend}
+
+
+def _template(medium: Medium, grid: MapGrid, seed: int) -> xr.Dataset:
+    """All coordinates, and data that say nothing yet: NaN, count 0, no checksum."""
+    import xarray as xr
+
+    channels = [medium.channel(k).in_mfp() for k in range(medium.n_channels or 1)]
+    mu_i, mu_o, delta_phi = map_directions(medium.channel(0), grid, seed)
+    edges = np.stack([cell_edges(m, grid)[0] for m in channels])
+    psi = cell_edges(channels[0], grid)[1]
+    shape = (len(channels), grid.n_theta, grid.n_phi, grid.n_r, grid.n_psi)
+    dims = ("channel", "theta", "phi", "r", "psi")
+    unit = "1/(mfp2 sr)"
+    data = {name: (dims, np.full(shape, np.nan, np.float32), {"units": unit}) for name in DATA}
+    data["variance"][2].update(units="1/(mfp4 sr2)", long_name="variance of the mean of S in the cell")
+    data["S"][2].update(long_name="BSSRDF of order >= 2, mean over the cell, Fresnel transmittances included")
+    for name in ("n_paths", "n_events", "checksum"):
+        data[name] = (dims[:2], np.zeros(shape[:2], np.uint64))
+    for name in ("mean_cell_error", "seconds"):
+        data[name] = (dims[:2], np.full(shape[:2], np.nan))
+    coords = {
+        "theta_i": ("theta", np.degrees(np.arccos(mu_i)), {"units": "degree"}),
+        "mu_i": ("theta", mu_i),
+        "phi_i": ("phi", 2 * np.pi * np.arange(grid.n_phi) / grid.n_phi, {"units": "radian"}),
+        "mu_o": (("theta", "phi"), mu_o),
+        "delta_phi": (("theta", "phi"), delta_phi, {"units": "radian", "long_name": "azimuth of w_o from forward"}),
+        "r_edges": (("channel", "r_edge"), edges, {"units": "mfp"}),
+        "psi_edges": ("psi_edge", psi, {"units": "radian", "long_name": "azimuth of x_o - x_i from forward"}),
+        "mfp": ("channel", np.atleast_1d(medium.mfp), {"units": "mm"}),
+    }
+    return xr.Dataset(data, coords)
+
+
+def _create(path: Path, medium: Medium, grid: MapGrid, seed: int, asked: dict[str, Any]) -> None:
+    """A store of the right shape, made under another name and renamed."""
+    dataset = _template(medium, grid, seed)
+    dataset.attrs = {"halfspace_sss_maps": json.dumps(asked, sort_keys=True), "provenance": json.dumps(provenance())}
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    shutil.rmtree(temporary, ignore_errors=True)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    chunks = {name: (1, 1, *dataset[name].shape[2:]) for name in dataset.data_vars}
+    dataset.to_zarr(temporary, mode="w", zarr_format=2, encoding={k: {"chunks": v} for k, v in chunks.items()})
+    try:
+        os.replace(temporary, path)
+    except OSError:
+        shutil.rmtree(temporary, ignore_errors=True)
+        if not path.exists():  # else another process, with another share, was first
+            raise
+
+
+def _open(path: Path) -> xr.Dataset:
+    import xarray as xr
+
+    try:
+        dataset = xr.open_zarr(path, chunks=None)
+        asked = json.loads(dataset.attrs["halfspace_sss_maps"])
+        missing = {*DATA, "checksum", "n_paths", "n_events"} - set(dataset.data_vars)
+        if missing:
+            raise KeyError(f"arrays {', '.join(sorted(missing))}")
+    except Exception as error:  # zarr, JSON and xarray each raise their own kinds
+        raise ValueError(f"map store {path} is damaged or not a map store: {error}") from error
+    if asked.get("format") != FORMAT:
+        raise ValueError(f"map store {path} must have format {FORMAT}, got {asked.get('format')!r}")
+    return dataset
+
+
+def _open_same(path: Path, asked: dict[str, Any]) -> xr.Dataset:
+    """The store at a path, which must have been made with the same parameters."""
+    dataset = _open(path)
+    found = json.loads(dataset.attrs["halfspace_sss_maps"])
+    wanted = json.loads(json.dumps(asked))
+    for key, value in wanted.items():
+        if found.get(key) != value:
+            was = f"map store {path} was made with {key} = {found.get(key)!r}"
+            raise ValueError(f"{was}, got {value!r}: ask for the same, or take another folder")
+    return dataset
+
+
+def _checksum(S: np.ndarray, variance: np.ndarray) -> int:
+    """Never 0, which marks a unit not done."""
+    data = np.ascontiguousarray(S, np.float32).tobytes(), np.ascontiguousarray(variance, np.float32).tobytes()
+    return (1 << 32) | zlib.crc32(data[1], zlib.crc32(data[0]))
+
+
+def _done(path: Path, dataset: xr.Dataset, channel: int, theta: int) -> bool:
+    """Whether a unit is whole; one whose data do not fit its checksum was cut off and is made again."""
+    at = {"channel": channel, "theta": theta}
+    try:
+        stored = int(dataset["checksum"].isel(at).values)
+        return stored != 0 and stored == _checksum(*(dataset[name].isel(at).values for name in DATA))
+    except Exception as error:
+        raise ValueError(f"map store {path} is damaged in channel {channel}, theta {theta}: {error}") from error
+
+
+def _write(path: Path, channel: int, theta: int, result: UnitResult) -> None:
+    """The data of a unit, then the checksum that says it is whole."""
+    import xarray as xr
+
+    dims = ("channel", "theta", "phi", "r", "psi")
+    data: dict[str, Any] = {name: (dims, getattr(result, name)[None, None]) for name in DATA}
+    for name, kind in (("n_paths", np.uint64), ("n_events", np.uint64), ("mean_cell_error", float), ("seconds", float)):
+        data[name] = (dims[:2], np.full((1, 1), getattr(result, name), kind))
+    region = {"channel": slice(channel, channel + 1), "theta": slice(theta, theta + 1)}
+    xr.Dataset(data).to_zarr(path, region=region, mode="r+")
+    checksum = np.full((1, 1), _checksum(result.S, result.variance), np.uint64)
+    xr.Dataset({"checksum": (dims[:2], checksum)}).to_zarr(path, region=region, mode="r+")
+
+
+def load_maps(path: str | os.PathLike) -> xr.Dataset:
+    """Load a finished store of `make_maps` and check every unit of it.
+
+    Returns:
+        Dataset over (channel, theta, phi, r, psi) with S and variance per mean free path squared, directions,
+        cell edges, counts and provenance.
+
+    Raises:
+        ValueError: the store is absent, damaged or unfinished; the message names store, channel and direction.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise ValueError(f"map store must exist, got {path}")
+    dataset = _open(path)
+    try:
+        dataset = dataset.load()
+    except Exception as error:
+        raise ValueError(f"map store {path} is damaged: {error}") from error
+    for channel in range(dataset.sizes["channel"]):
+        for theta in range(dataset.sizes["theta"]):
+            part = dataset.isel(channel=channel, theta=theta)
+            where = f"channel {channel}, direction {theta}"
+            if int(part["checksum"]) == 0:
+                raise ValueError(f"map store {path} is unfinished at {where}: run the same command again to resume")
+            if int(part["checksum"]) != _checksum(part["S"].values, part["variance"].values):
+                raise ValueError(f"map store {path} is damaged at {where}: the checksum does not match")
+    return dataset

@@ -1,0 +1,143 @@
+"""What is trained: the small network of one medium, and the network that writes the small networks of all media."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from torch import nn
+
+from halfspace_sss.neural.features import N_FEATURES, N_MEDIUM
+from halfspace_sss.neural.network import Network, layer_shapes
+from halfspace_sss.neural.training.pool import Batch
+
+__all__ = ["Hyper", "Small", "apply_networks", "cell_loss", "initial_numbers", "relative_loss"]
+
+LOG_RANGE = 30.0
+
+
+def cell_loss(p: torch.Tensor, y: torch.Tensor, weight: Callable[[torch.Tensor], torch.Tensor]) -> torch.Tensor:
+    """A loss whose gradient is h(p_1) ∇p_1 (p_2 - y) + h(p_2) ∇p_2 (p_1 - y) for independent points of a cell.
+
+    y is the mean over the cell: the expectation of the gradient is that of its squared error, E[h ∇p] (E[p] - y),
+    whatever the weight h. The squared error of single points would add the variance within the cell and so flatten
+    what is learnt.
+
+    Args:
+        p: (B, 2 S), the first points of all cells and then the second ones.
+        y: (B, S).
+        weight: h of p without gradient, for points (B, 2 S).
+    """
+    p_1, p_2 = p.detach().chunk(2, dim=1)
+    slope = weight(p.detach()) * torch.cat((p_2 - y, p_1 - y), dim=1)
+    error = (slope.detach() * (p - p.detach())).mean()
+    return error + ((p_1 - y) * (p_2 - y) * weight(p.detach()).chunk(2, dim=1)[0]).mean().detach()
+
+
+def relative_loss(p: torch.Tensor, batch: Batch) -> torch.Tensor:
+    """Mean of (p - y)² / (p² + p hit), the denominator held fixed; its minimum is unbiased for noisy y.
+
+    p hit is the variance of y where few scores have met a cell, so that those cells count by their noise and the others
+    by their relative error.
+    """
+    hit = torch.cat((batch.hit, batch.hit), dim=1)
+    return cell_loss(p, batch.y, lambda q: 1 / (q * (q + hit) + 1e-20))
+
+
+def initial_numbers(shapes: list[tuple[int, int]], generator: torch.Generator) -> torch.Tensor:
+    """Numbers of a network at the start: He scaling, a tenth of it in the last layer, biases zero."""
+    parts = []
+    for k, (n_in, n_out) in enumerate(shapes):
+        gain = math.sqrt((1.0 if k == 0 else 1.5) / n_in) * (0.1 if n_out == 1 else 1.0)
+        parts += [gain * torch.randn(n_in * n_out, generator=generator), torch.zeros(n_out)]
+    return torch.cat(parts)
+
+
+def apply_networks(
+    h: torch.Tensor,
+    numbers: torch.Tensor,
+    shapes: list[tuple[int, int]],
+    activation: Callable[[torch.Tensor], torch.Tensor] = nn.functional.silu,
+) -> torch.Tensor:
+    """Networks of rows `numbers` (B, P) on features (B, S, n_in); gives (B, S)."""
+    parts = torch.split(numbers, [n for i, j in shapes for n in (i * j, j)], dim=1)
+    for k, (i, j) in enumerate(shapes):
+        h = torch.baddbmm(parts[2 * k + 1][:, None], h, parts[2 * k].view(-1, i, j))
+        if k < len(shapes) - 1:
+            h = activation(h)
+    return h[..., 0]
+
+
+class Small(nn.Module):
+    """log(G/B) of one medium: `Network` as a torch module.
+
+    Args:
+        width, depth: hidden layers.
+        seed: of the numbers at the start.
+        start: network to start from instead.
+    """
+
+    def __init__(self, width: int = 32, depth: int = 3, seed: int = 0, start: Network | None = None) -> None:
+        super().__init__()
+        self.width, self.depth = width, depth
+        self.shapes = layer_shapes(N_FEATURES, width, depth)
+        numbers = initial_numbers(self.shapes, torch.Generator().manual_seed(seed))
+        if start is not None:
+            pairs = zip(start.matrices, start.biases)
+            numbers = torch.cat([torch.from_numpy(np.copy(v)).flatten() for pair in pairs for v in pair])
+        self.numbers = nn.Parameter(numbers)
+
+    def loss(self, batch: Batch) -> torch.Tensor:
+        features = batch.features().flatten(0, 1)[None]
+        p = torch.exp(apply_networks(features, self.numbers[None], self.shapes).clamp(-LOG_RANGE, LOG_RANGE))
+        return relative_loss(p.view_as(batch.u), batch)
+
+    def network(self) -> Network:
+        return Network.from_vector(self.numbers.detach().numpy(), self.shapes)
+
+
+class Hyper(nn.Module):
+    """log(G/B) of any medium: `Hypernetwork` as a torch module.
+
+    Args:
+        width, depth: hidden layers of the small network it writes.
+        rank: number of coefficients of a medium.
+        medium_width: hidden units of the network of the medium, which has two hidden layers.
+        seed: of the numbers at the start.
+    """
+
+    def __init__(
+        self, width: int = 32, depth: int = 3, rank: int = 48, medium_width: int = 64, seed: int = 0
+    ) -> None:  # fmt: skip
+        super().__init__()
+        generator = torch.Generator().manual_seed(seed)
+        self.width, self.depth = width, depth
+        self.shapes = layer_shapes(N_FEATURES, width, depth)
+        sizes = [N_MEDIUM, medium_width, medium_width, rank]
+        self.matrices = nn.ParameterList(
+            torch.randn(i, j, generator=generator) / math.sqrt(i) for i, j in zip(sizes, sizes[1:])
+        )
+        self.biases = nn.ParameterList(0.1 * torch.randn(j, generator=generator) for j in sizes[1:])
+        self.base = nn.Parameter(initial_numbers(self.shapes, generator))
+        scale = torch.cat([torch.full((i * j + j,), 1 / math.sqrt(i)) for i, j in self.shapes])
+        self.basis = nn.Parameter(0.5 / math.sqrt(rank) * scale * torch.randn(rank, len(scale), generator=generator))
+
+    def loss(self, batch: Batch) -> torch.Tensor:
+        c = batch.medium
+        for k, (W, b) in enumerate(zip(self.matrices, self.biases)):
+            c = torch.addmm(b, c, W)
+            if k < len(self.matrices) - 1:
+                c = nn.functional.silu(c)
+        log_factor = apply_networks(batch.features(), torch.addmm(self.base, c, self.basis), self.shapes)
+        return relative_loss(torch.exp(log_factor.clamp(-LOG_RANGE, LOG_RANGE)), batch)
+
+    def parameters_as_arrays(self) -> dict[str, Any]:
+        """Arrays for the file of weights, in half precision."""
+        layers = {}
+        for k, (W, b) in enumerate(zip(self.matrices, self.biases)):
+            layers |= {f"medium_{k}_W": W, f"medium_{k}_b": b}
+        arrays = {**layers, "base": self.base, "basis": self.basis}
+        return {name: value.detach().numpy().astype(np.float16) for name, value in arrays.items()}

@@ -1,0 +1,161 @@
+"""Training of the network of one medium: its maps, then one fit; the weights are found again by the medium."""
+
+from __future__ import annotations
+
+import os
+import time
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from halfspace_sss.checks import check_count, check_interval
+from halfspace_sss.comparison.model_errors import ModelError, model_error, reference_maps
+from halfspace_sss.interface.model import BSSRDF
+from halfspace_sss.maps.noisy_maps import CellGrid, Groups, Progress, draw_directions, make_pool
+from halfspace_sss.neural.material_model import network_arrays
+from halfspace_sss.neural.store import save_weights
+from halfspace_sss.neural.trained import weights_folder, weights_name
+from halfspace_sss.neural.training.fit import Fit, fit
+from halfspace_sss.neural.training.pool import MapPool
+from halfspace_sss.neural.training.work_folder import CHECKPOINT, claim
+from halfspace_sss.physics.medium import Medium
+from halfspace_sss.provenance import provenance
+
+__all__ = ["FAST", "STANDARD", "MaterialRecipe", "Subject", "TrainedChannel", "train_channel"]
+
+VALIDATION_SEED = 104729
+VALIDATION_SETS = 4  # of 8 directions
+BLOCK = 2  # cells of a map put together for the validation error
+
+
+@dataclass(frozen=True)
+class MaterialRecipe:
+    """Size of the training of one medium.
+
+    Args:
+        n_groups: directions of incidence, each with 16 of observation.
+        events: scattering events of the maps; a quarter as many make the validation maps.
+        grid: cells of a map.
+        how: the fit.
+    """
+
+    n_groups: int = 256
+    events: float = 4e8
+    grid: CellGrid = CellGrid(40, 16)
+    how: Fit = field(default_factory=lambda: Fit(steps=2500, n_groups=16, n_queries=128, validate_every=1250))
+
+    def __post_init__(self) -> None:
+        check_count("n_groups", self.n_groups, 1)
+        check_interval("events", self.events, 1e4, 1e15)
+
+
+STANDARD = MaterialRecipe()
+FAST = MaterialRecipe(96, 4e7, how=Fit(steps=250, n_groups=16, n_queries=128, validate_every=250))
+
+
+@dataclass(frozen=True)
+class TrainedChannel:
+    """Weights of one medium, their error on the validation maps, seconds of maps and fit."""
+
+    medium: Medium
+    path: Path
+    error: ModelError
+    data_seconds: float
+    fit_seconds: float
+
+
+class Subject(Protocol):
+    """What is trained: a kind of model, with its learner and how the learner answers as a model."""
+
+    kind: str
+
+    def learner(self, medium: Medium, pool: MapPool, seed: int) -> Any:
+        """A torch module with `loss`, `network`, `width` and `depth`."""
+
+    def model(self, medium: Medium, learner: Any) -> BSSRDF:
+        """The learner as it is, as a model."""
+
+    def record(self, learner: Any) -> dict[str, Any]:
+        """What must be known beside the network to load it."""
+
+
+def train_channel(
+    medium: Medium,
+    subject: Subject,
+    recipe: MaterialRecipe = STANDARD,
+    seed: int = 0,
+    *,
+    folder: str | os.PathLike | None = None,
+    work: str | os.PathLike | None = None,
+    target_error: float | None = None,
+    backend: str = "llvm",
+    progress: Progress | None = None,
+) -> TrainedChannel:
+    """Train a network for one scalar medium.
+
+    Args:
+        medium: scalar; only albedo, g and eta count.
+        subject: what is trained, see `subjects`.
+        recipe: STANDARD, FAST or your own.
+        seed: maps, batches and first numbers follow from it.
+        folder: for the weights; by default where `bssrdf` finds them.
+        work: folder for maps and checkpoint of an unfinished run, which a run with the same arguments continues;
+            that of another run is refused.
+        target_error: stop early at this validation error.
+        backend: of the maps, "llvm" or "cuda".
+        progress: called with (what, done, total).
+    """
+    started, place = time.monotonic(), Path(work) if work else None
+    medium = medium.in_mfp()
+    if place:
+        what = {"model": subject.kind, **vars(subject)}
+        claim(place, medium=_ratios(medium), subject=what, recipe=asdict(recipe), seed=seed, backend=backend)
+    groups = _groups(medium, recipe.n_groups, np.random.default_rng([seed, 0]))
+    halves = make_pool(groups, recipe.grid, recipe.events, (seed, 1), place, progress, backend)
+    pool = MapPool(groups, recipe.grid, halves)
+    check = (VALIDATION_SEED, seed)
+    (reference,) = reference_maps(
+        [medium], VALIDATION_SETS, recipe.grid, BLOCK, recipe.events / 4, check, None, backend
+    )
+    data_seconds = time.monotonic() - started
+    learner = subject.learner(medium, pool, seed)
+    found: list[ModelError] = []  # the last of them is that of the end, unless the run was over when it was resumed
+
+    def validate() -> float:
+        found.append(model_error(subject.model(medium, learner), reference))
+        return found[-1].error
+
+    history = fit(
+        learner, pool, recipe.how, seed, checkpoint=place / CHECKPOINT if place else None, validate=validate,
+        target_error=target_error, progress=progress,
+    )  # fmt: skip
+    error = found[-1] if found else model_error(subject.model(medium, learner), reference)
+    fit_seconds = time.monotonic() - started - data_seconds
+    record = {"width": learner.width, "depth": learner.depth, **subject.record(learner)}
+    record |= _record(medium, recipe, seed, error, history, data_seconds, fit_seconds)
+    path = Path(folder or weights_folder()) / weights_name(subject.kind, medium)
+    save_weights(path, subject.kind, network_arrays(learner.network()), record)
+    return TrainedChannel(medium, path, error, data_seconds, fit_seconds)
+
+
+def _ratios(medium: Medium) -> dict[str, float]:
+    return {"albedo": float(medium.albedo), "g": float(medium.g), "eta": medium.eta}
+
+
+def _groups(medium: Medium, n: int, rng: np.random.Generator) -> Groups:
+    one = np.ones(n)
+    return draw_directions(float(medium.albedo) * one, float(medium.g) * one, medium.eta * one, rng)
+
+
+def _record(
+    medium: Medium, recipe: Any, seed: int, error: ModelError, history: list, data_seconds: float, fit_seconds: float
+) -> dict[str, Any]:
+    """What the JSON beside the weights tells."""
+    plain = {k: v if isinstance(v, dict) else float(v) for k, v in error._asdict().items()}
+    return {
+        "medium": _ratios(medium),
+        "orders": "multiple", "seed": seed, "recipe": asdict(recipe), "validation": plain, "history": history,
+        "data_seconds": data_seconds, "fit_seconds": fit_seconds, "provenance": provenance(seed=seed),
+    }  # fmt: skip

@@ -1,0 +1,1 @@
+"""The optics of a medium and its boundary: coefficients, Fresnel, phase function, single scattering."""

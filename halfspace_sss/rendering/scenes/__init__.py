@@ -1,0 +1,1 @@
+"""Scenes from files and for Mitsuba alone, and long renders in passes."""

@@ -1,0 +1,202 @@
+"""The Mitsuba surface `translucent`: which material, model and scattering orders an object has.
+
+In a scene:
+
+    {"type": "translucent", "material": "marble", "model": "directional_dipole"}
+
+    <bsdf type="translucent">
+        <string name="material" value="marble"/>
+        <bsdf type="roughdielectric"> <float name="alpha" value="0.1"/> </bsdf>
+    </bsdf>
+
+Parameters, all optional but the medium:
+    material: a name of the registry; or else `sigma_s`, `sigma_a` (1/mm; numbers, rgb, or strings of numbers separated
+        by commas), `g` and `eta`.
+    model: name of a model of the library, by default "neural".
+    orders: "total" (single scattering is added where the model lacks it), "multiple" or "single".
+    channel: R, G or B, or a number; under a mono variant, for a medium with channels.
+    dilution: of a material that has one, see `halfspace_sss.materials.load`.
+    a BSDF inside: the boundary, a `dielectric` or `roughdielectric`; by default smooth, with the eta of the medium.
+    reflection: whether the boundary reflects light, by default true.
+
+To an integrator that knows nothing of the inside, the surface shows its reflection only.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from halfspace_sss import materials
+from halfspace_sss.interface.model import models
+from halfspace_sss.materials.channels import one_channel
+from halfspace_sss.physics.medium import Medium
+from halfspace_sss.rendering.plugins import variant_channels
+
+__all__ = ["ORDERS", "Inside", "translucent_class"]
+
+ORDERS = ("total", "multiple", "single")
+
+
+@dataclass(frozen=True)
+class Inside:
+    """What is below a translucent surface.
+
+    Args:
+        label: name of the material, or of its coefficients.
+        medium: with 3 channels under RGB variants, 1/mm; scalar under mono ones.
+        model: name of the model.
+        orders: "total", "multiple" or "single".
+        reflection: whether the boundary reflects.
+    """
+
+    label: str
+    medium: Medium
+    model: str
+    orders: str
+    reflection: bool
+
+    def channels(self) -> list[Medium]:
+        """The scalar media of the channels."""
+        n = self.medium.n_channels
+        return [self.medium] if n is None else [self.medium.channel(k) for k in range(n)]
+
+
+def translucent_class() -> type:
+    """The class of the surface for the current variant of Mitsuba."""
+    import mitsuba as mi
+
+    class Translucent(mi.BSDF):
+        """The reflection of the boundary as a BSDF, with an `inside`."""
+
+        def __init__(self, props: Any) -> None:
+            mi.BSDF.__init__(self, props)
+            self.inside = read_inside(props)
+            self.boundary = _boundary(props, self.inside.medium.eta)
+            self.lobe = _reflection_lobe(self.boundary)
+            self.m_components = [self.boundary.flags(self.lobe)]
+            self.m_flags = self.m_components[0]
+
+        def _context(self, ctx: Any) -> Any:
+            return mi.BSDFContext(ctx.mode, ctx.type_mask, self.lobe)
+
+        def _shown(self, ctx: Any) -> bool:
+            return self.inside.reflection and ctx.component in (0, 0xFFFFFFFF)
+
+        def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> tuple[Any, Any]:
+            bs, weight = self.boundary.sample(self._context(ctx), si, sample1, sample2, active)
+            bs.sampled_component = 0
+            return bs, weight if self._shown(ctx) else 0 * weight
+
+        def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+            value = self.boundary.eval(self._context(ctx), si, wo, active)
+            return value if self._shown(ctx) else 0 * value
+
+        def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+            value = self.boundary.pdf(self._context(ctx), si, wo, active)
+            return value if self._shown(ctx) else 0 * value
+
+        def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> tuple[Any, Any]:
+            return self.eval(ctx, si, wo, active), self.pdf(ctx, si, wo, active)
+
+        def to_string(self) -> str:
+            return f"Translucent[{self.inside}, boundary = {self.boundary}]"
+
+    return Translucent
+
+
+def read_inside(props: Any) -> Inside:
+    """The inside from the parameters of a surface.
+
+    Raises:
+        ValueError: a parameter is missing, unknown in value, or out of range.
+    """
+    label, medium = _medium(props)
+    model, orders = props.get("model", "neural"), props.get("orders", "total")
+    if orders not in ORDERS:
+        raise ValueError(f"orders must be one of {', '.join(ORDERS)}, got {orders!r}")
+    _check_model(model)
+    return Inside(label, medium, model, orders, bool(props.get("reflection", True)))
+
+
+def _check_model(name: str) -> None:
+    import difflib
+
+    if name not in models():
+        close = difflib.get_close_matches(name, models(), n=1)
+        hint = f"; did you mean {close[0]!r}?" if close else ""
+        raise ValueError(f"model must be one of {', '.join(models())}, got {name!r}{hint}")
+
+
+def _medium(props: Any) -> tuple[str, Medium]:
+    inline = [key for key in ("sigma_s", "sigma_a", "g", "eta") if key in props]
+    if "material" in props:
+        if inline:
+            raise ValueError(f"material must stand without {', '.join(inline)}, got both")
+        dilution = float(props["dilution"]) if "dilution" in props else None
+        material = materials.load(props["material"], dilution=dilution)
+        label, medium, names = material.name, material.medium, material.channels
+    elif "sigma_s" in inline and "sigma_a" in inline:
+        values = {key: _numbers(key, props[key]) for key in inline}
+        values["eta"] = float(np.max(values.get("eta", 1.3)))
+        label, medium, names = "medium", Medium(**values), None
+    else:
+        raise ValueError("a translucent surface must have material, or sigma_s and sigma_a, got neither")
+    return _for_variant(label, medium, names, props)
+
+
+def _for_variant(label: str, medium: Medium, names: Any, props: Any) -> tuple[str, Medium]:
+    n, wanted = medium.n_channels, variant_channels()
+    channel = props["channel"] if "channel" in props else None
+    if wanted == 1 and n is not None:
+        if channel is None:
+            raise ValueError(f"channel must be given under a mono variant, got none for {label} with {n} channels")
+        by_name = {name.casefold(): k for k, name in enumerate(names or ())}
+        return f"{label} {channel}", one_channel(medium, by_name.get(str(channel).casefold(), channel))[1]
+    if channel is not None:
+        raise ValueError(f"channel must be left out under this variant or for this medium, got {channel!r}")
+    if wanted == 3 and n is None:
+        same = {key: np.full(3, float(getattr(medium, key))) for key in ("sigma_s", "sigma_a", "g")}
+        return label, Medium(**same, eta=medium.eta)
+    if wanted == 3 and n != 3:
+        raise ValueError(f"medium must have 1 or 3 channels, got {n}")
+    return label, medium
+
+
+def _numbers(key: str, value: Any) -> Any:
+    """A number, or one per channel, from a parameter."""
+    try:
+        parts = value.split(",") if isinstance(value, str) else np.ravel(np.array(value, dtype=float)).tolist()
+        found = np.array([float(part) for part in parts])
+    except (TypeError, ValueError):
+        raise ValueError(f"{key} must be a number, rgb, or numbers separated by commas, got {value!r}") from None
+    return float(found[0]) if len(found) == 1 else found
+
+
+def _boundary(props: Any, eta: float) -> Any:
+    """The dielectric of the surface."""
+    import mitsuba as mi
+
+    inner = [props[key] for key in props.keys() if isinstance(props[key], mi.BSDF)]
+    if len(inner) > 1:
+        raise ValueError(f"a translucent surface must have at most one BSDF inside, got {len(inner)}")
+    if not inner:
+        return mi.load_dict({"type": "dielectric", "int_ior": float(eta), "ext_ior": 1.0})
+    found = mi.traverse(inner[0]).get("eta")
+    found = None if found is None else float(np.max(np.array(found)))
+    if found is None or abs(found - eta) > 2e-3 * eta:
+        raise ValueError(
+            f"the boundary must be a dielectric with eta {eta:g} of the medium (int_ior/ext_ior), got {found}"
+        )
+    return inner[0]
+
+
+def _reflection_lobe(boundary: Any) -> int:
+    import mitsuba as mi
+
+    for k in range(boundary.component_count()):
+        if boundary.flags(k) & int(mi.BSDFFlags.Reflection):
+            return k
+    raise ValueError(f"the boundary must reflect, got {boundary}")

@@ -1,0 +1,1 @@
+"""Where light enters an object for an exit, and what it is worth there."""

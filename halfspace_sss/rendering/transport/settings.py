@@ -1,0 +1,52 @@
+"""What the user may set on the integrator, checked before a scene is touched."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from halfspace_sss.checks import check_interval
+from halfspace_sss.rendering.transport.plane import GEOMETRIES
+
+__all__ = ["AUTOMATIC", "Settings", "read_settings"]
+
+AUTOMATIC = -1.0
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Parameters of the integrator `bssrdf`.
+
+    Args:
+        mm_per_unit: millimetres in one unit of the scene.
+        max_depth: vertices of a path after the camera, an entry and its exit counting as one; -1 for no limit.
+        rr_depth: vertices after which Russian roulette begins.
+        geometry: "distance" or "tangent", see `plane.separation`.
+        area_share: share of entries drawn uniformly over the area, 0 to 1; AUTOMATIC chooses by the ratio of the
+            distance that light travels to the size of the object.
+        hide_emitters: whether directly visible emitters are left out.
+    """
+
+    mm_per_unit: float = 1.0
+    max_depth: int = 8
+    rr_depth: int = 5
+    geometry: str = "distance"
+    area_share: float = AUTOMATIC
+    hide_emitters: bool = False
+
+    def __post_init__(self) -> None:
+        check_interval("mm_per_unit", self.mm_per_unit, 1e-9, 1e9)
+        if self.max_depth < -1 or self.max_depth == 0:
+            raise ValueError(f"max_depth must be -1 or at least 1, got {self.max_depth}")
+        if self.rr_depth < 1:
+            raise ValueError(f"rr_depth must be at least 1, got {self.rr_depth}")
+        if self.geometry not in GEOMETRIES:
+            raise ValueError(f"geometry must be one of {', '.join(GEOMETRIES)}, got {self.geometry!r}")
+        if self.area_share != AUTOMATIC:
+            check_interval("area_share", self.area_share, 0.0, 1.0)
+
+
+def read_settings(props: Any) -> Settings:
+    """Settings from the parameters of the plugin; ValueError if one is out of range."""
+    given = {key: props[key] for key in Settings.__dataclass_fields__ if key in props}
+    return Settings(**given)

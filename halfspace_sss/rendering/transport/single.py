@@ -1,0 +1,129 @@
+"""Exact single scattering inside an object: one scattering event between the refracted ray of exit and that of entry.
+
+    L_o = T_o ∫_0^s_max ds sigma_s exp(-sigma_t s) ∫ dw p(w) exp(-sigma_t s_i) T_i L_i(x_i, w_i)
+
+s and s_i are the lengths of the rays of exit and of entry, T_o and T_i the Fresnel transmittances where they cross the
+boundary; the factors eta² of radiance cancel. Light that is reflected inside at the boundary belongs to higher orders.
+The environment is found by directions of the phase function; other emitters by the ray that is refracted towards a
+sampled point of them, see `refracted_connection`. The boundary refracts as if it were smooth.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from halfspace_sss.physics.phase import eval_hg, sample_hg
+from halfspace_sss.rendering.transport.body import Body
+from halfspace_sss.rendering.transport.plane import Exit, number, place
+from halfspace_sss.rendering.transport.refraction import leave, refracted_connection
+
+__all__ = ["Scattered", "single_scattering_at"]
+
+
+class Scattered(NamedTuple):
+    """Where a path leaves the body after one scattering event, and light of emitters that came the same way."""
+
+    p: Any
+    n: Any
+    d: Any
+    weight: Any  # spectrum
+    direct: Any  # spectrum
+
+
+class _Event(NamedTuple):
+    """A scattering event: position, direction of travel towards the exit reversed, what a path through it is worth."""
+
+    p: Any
+    along: Any
+    weight: Any  # spectrum: T_o sigma_s exp(-sigma_t s) / density of s
+
+
+def single_scattering_at(scene: Any, body: Body, out: Exit, sampler: Any, lights: bool, active: Any) -> Scattered:
+    """One scattering event for light that leaves at `out`.
+
+    Args:
+        scene: the whole scene, for visibility and emitters.
+        body: the object; out: point, normal and direction of exit.
+        lights: whether the scene has emitters other than its environment.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    event, active = _event(body, out, sampler, active)
+    g = [number(m.g) for m in body.media]
+    g_mean = number(sum(float(m.g) for m in body.media) / len(g))
+    u = sampler.next_2d()
+    cosine = sample_hg(u.x, g_mean)
+    sin_phi, cos_phi = dr.sincos(2 * dr.pi * u.y)
+    sine = dr.safe_sqrt((1 - cosine) * (1 + cosine))
+    d = mi.Frame3f(event.along).to_world(mi.Vector3f(sine * cos_phi, sine * sin_phi, cosine))
+    passed = leave(body, event.p, d, active)
+    ratio = _spectrum([eval_hg(cosine, k) for k in g]) / eval_hg(cosine, g_mean)
+    weight = dr.select(passed.valid, event.weight * ratio * _extinction(body, passed.length) * passed.T, 0)
+    direct = mi.Spectrum(0)
+    if lights:
+        direct = _connected(scene, body, event, sampler, active)
+    return Scattered(passed.p, passed.n, passed.w, weight, direct)
+
+
+def _event(body: Body, out: Exit, sampler: Any, active: Any) -> tuple[_Event, Any]:
+    """An event on the refracted ray of exit: exponential in the length, a channel by chance, balance heuristic."""
+    import drjit as dr
+    import mitsuba as mi
+
+    eta = body.surface.inside.medium.eta
+    mu_o = dr.dot(out.w, out.n)
+    active = active & (mu_o > 0)
+    F, mu_in, _, into = mi.fresnel(dr.maximum(mu_o, 0), eta)
+    along = dr.normalize(-into * out.w + out.n * (into * mu_o - dr.abs(mu_in)))
+    start = place(out.p, out.n)
+    ray = start.spawn_ray(along)
+    wall = body.found.scene.ray_intersect(ray, mi.RayFlags.Minimal, False, active)
+    furthest = dr.select(wall.is_valid(), wall.t, number(1e3 * body.found.size))
+    sigma_t = [number(m.sigma_t) for m in body.media]
+    u_channel, u = sampler.next_1d(), sampler.next_1d()
+    chosen, total = mi.Float(0), mi.Float(0)
+    for k, s in enumerate(sigma_t):
+        chosen = dr.select(mi.UInt32(u_channel * len(sigma_t)) == k, s, chosen)
+    chosen = dr.maximum(chosen, 1e-12)
+    s = -dr.log(1 - u * (1 - dr.exp(-chosen * furthest))) / chosen
+    for t in sigma_t:
+        total += t * dr.exp(-t * s) / dr.maximum(1 - dr.exp(-t * furthest), 1e-12)
+    density = dr.maximum(total / len(sigma_t), 1e-30)
+    scattered = [number(m.sigma_s) * dr.exp(-t * s) / density for m, t in zip(body.media, sigma_t)]
+    weight = dr.select(active, (1 - F) * _spectrum(scattered), 0)
+    return _Event(mi.Point3f(out.p + along * s), mi.Vector3f(along), weight), active
+
+
+def _connected(scene: Any, body: Body, event: _Event, sampler: Any, active: Any) -> Any:
+    """Light of a sampled emitter that is refracted at the boundary into the event."""
+    import drjit as dr
+    import mitsuba as mi
+
+    at = place(event.p, mi.Normal3f(0, 0, 0))
+    ds, light = scene.sample_emitter_direction(at, sampler.next_2d(), False, active)
+    distant = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
+    active = active & (ds.pdf > 0) & ~ds.emitter.is_environment()
+    reach = dr.select(distant, number(1e4 * body.found.size), ds.dist)
+    target = event.p + ds.d * reach
+    met = refracted_connection(body, event.p, target, active)
+    # solid angle at the event per solid angle of the straight direction, over which the emitter was sampled
+    facing = dr.select(dr.squared_norm(ds.n) > 0, dr.abs(dr.dot(ds.n, met.w)) / dr.abs(dr.dot(ds.n, ds.d)), 1)
+    spread = dr.select(ds.delta, 1, facing) * reach * reach * met.density
+    phase = _spectrum([eval_hg(dr.dot(event.along, met.d), number(m.g)) for m in body.media])
+    value = event.weight * phase * _extinction(body, met.length) * (met.T * spread) * light
+    edge = place(met.p, met.n)
+    blocked = scene.ray_test(edge.spawn_ray_to(target), False, met.valid)
+    return dr.select(met.valid & ~blocked, value, 0)
+
+
+def _extinction(body: Body, length: Any) -> Any:
+    import drjit as dr
+
+    return _spectrum([dr.exp(-number(m.sigma_t) * length) for m in body.media])
+
+
+def _spectrum(values: list[Any]) -> Any:
+    import mitsuba as mi
+
+    return mi.Spectrum(*values) if len(values) > 1 else mi.Spectrum(values[0])

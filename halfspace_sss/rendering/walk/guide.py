@@ -1,0 +1,126 @@
+"""Light of small emitters that leaves an object right after an event: directions drawn about the one that hits.
+
+Where no join can find a path (see `walk_connect`), the walk from the camera has to hit the emitter through the
+refracting boundary. The direction that does so from the event v is guessed: w_0 is refracted at the normal of the
+place where the last guess meets the boundary, three times. Directions are then drawn about the guess, from a narrow
+lobe as wide as the emitter and from wider ones for guesses that are wrong, and weighted against those of the phase
+function (balance heuristic), so that no guess has to be right.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from halfspace_sss.physics.phase import eval_hg
+from halfspace_sss.rendering.walk.connect import DEEPEST, Joins, draw
+from halfspace_sss.rendering.walk.media import Coefficients, WalkMedia
+
+__all__ = ["Guide"]
+
+GUESSES = 3
+SHARES = (0.5, 0.3, 0.2)  # of the lobes
+WIDER = (131.0, 8.0)  # concentrations of the others: 5 and 20 degrees
+
+
+@dataclass(frozen=True, eq=False)
+class Guide:
+    """Directions from events to small emitters.
+
+    Args:
+        scene: the Mitsuba scene.
+        media: its translucent objects.
+        joins: the small emitters.
+    """
+
+    scene: Any
+    media: WalkMedia
+    joins: Joins
+
+    def _guess(self, v: Any, k: Any, which: Any, m: Coefficients, active: Any) -> tuple[Any, Any, Any]:
+        """The direction from v by which an emitter sees it through the boundary, its concentration, and if any."""
+        import drjit as dr
+        import mitsuba as mi
+
+        toward, small = self.joins.direction(which, v)
+        eta, sign = self.media.row("eta", k), self.media.row("sign", k)
+        valid, d, w = active & small, toward, toward
+        for _ in range(GUESSES):
+            ray = mi.Ray3f(v, d)
+            ray.maxt = DEEPEST / dr.min(m.sigma_t)
+            si = self.media.scene.ray_intersect(ray, mi.RayFlags.Minimal, coherent=False, active=valid)
+            valid &= si.is_valid()
+            n = si.n * sign
+            w, _ = self.joins.direction(which, si.p)
+            cosine = dr.dot(w, n)
+            _, cos_t, _, eta_ti = mi.fresnel(dr.clip(cosine, 0, 1), eta)
+            refracted = w * eta_ti + n * (dr.abs(cos_t) - eta_ti * cosine)
+            d = dr.normalize(dr.select(cosine > 0, refracted, d))
+        return d, dr.minimum(dr.square(eta) / dr.maximum(self.joins.angle2(which, v), 1e-6), 1e6), valid
+
+    def pdf(self, emitter: Any, v: Any, d: Any, k: Any, m: Coefficients, active: Any) -> Any:
+        """Density per solid angle of the direction d from v on the way to an emitter; 0 where there is no guess."""
+        import drjit as dr
+
+        which = self.joins.number(emitter)
+        active &= which >= 0
+        guess, concentration, valid = self._guess(v, k, type(k)(dr.maximum(which, 0)), m, active)
+        return dr.select(valid, _lobes(dr.dot(guess, d), concentration) / len(self.joins.emitters), 0)
+
+    def light(self, v: Any, along: Any, k: Any, m: Coefficients, rng: Any) -> Any:
+        """An estimate of the light of small emitters that leaves from v, per weight of a walk that came `along`."""
+        import drjit as dr
+        import mitsuba as mi
+
+        n = len(self.joins.emitters)
+        which = mi.Int32(draw(n, rng))
+        guess, concentration, valid = self._guess(v, k, which, m, True)
+        d, pdf = _draw_lobe(guess, concentration, rng)
+        ray = mi.Ray3f(v, d)
+        ray.maxt = 2 * DEEPEST / dr.min(m.sigma_t)
+        si = self.media.scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=valid)
+        valid &= si.is_valid() & (self.media.number(si.shape) == k)
+        si = self.media.face_outwards(si, k, d)
+        F, cos_t, eta_it, eta_ti = mi.fresnel(mi.Frame3f.cos_theta(si.wi), self.media.row("eta", k))
+        w = si.to_world(mi.refract(si.wi, cos_t, eta_ti))
+        valid &= (dr.dot(d, si.n) > 0) & (dr.dot(w, si.n) > 0) & (F < 1)
+        outside = self.scene.ray_intersect(si.spawn_ray(w), mi.RayFlags.All, coherent=False, active=valid)
+        emitter = outside.emitter(self.scene, valid)
+        valid &= outside.is_valid() & (self.joins.number(emitter) == which)
+        cosine = dr.dot(along, d)
+        phase = mi.Spectrum([eval_hg(cosine, g) for g in m.g])
+        # radiance shrinks by eta² on its way out, as the weight of the walk has when it came in
+        factor = (1 - F) * dr.square(eta_ti) / (pdf / n + dr.mean(phase))
+        value = phase * dr.exp(-m.sigma_t * si.t) * factor
+        return dr.select(valid, value * emitter.eval(outside, valid), 0)
+
+    def share(self, emitter: Any, s: dict, active: Any) -> Any:
+        """Weight of having hit an emitter by the phase function, from the state after the walk has left."""
+        import drjit as dr
+
+        k = s["from"]
+        pdf = self.pdf(emitter, s["event"], s["ahead"], k, self.media.coefficients(k), active)
+        return s["phase"] / (s["phase"] + dr.select(active, pdf, 0))
+
+
+def _lobes(cosine: Any, concentration: Any) -> Any:
+    """Density of the sum of lobes c e^(-c (1 - cos)) / (2 pi), 1/sr; what falls beyond cos = -1 is left out."""
+    import drjit as dr
+
+    x = dr.maximum(1 - cosine, 0)
+    parts = zip(SHARES, (concentration, *WIDER))
+    return sum(a * c * dr.exp(-c * x) for a, c in parts) / (2 * dr.pi)
+
+
+def _draw_lobe(guess: Any, concentration: Any, rng: Any) -> tuple[Any, Any]:
+    """A direction about the guess, and its density."""
+    import drjit as dr
+    import mitsuba as mi
+
+    u = rng.next_float32()
+    c = dr.select(u < SHARES[0], concentration, dr.select(u < SHARES[0] + SHARES[1], WIDER[0], WIDER[1]))
+    x = dr.minimum(-dr.log(1 - rng.next_float32()) / c, 2)
+    sine = dr.safe_sqrt(x * (2 - x))
+    sin_phi, cos_phi = dr.sincos(2 * dr.pi * rng.next_float32())
+    d = mi.Frame3f(guess).to_world(mi.Vector3f(sine * cos_phi, sine * sin_phi, 1 - x))
+    return d, _lobes(1 - x, concentration)

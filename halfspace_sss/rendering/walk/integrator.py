@@ -1,0 +1,152 @@
+"""The Mitsuba integrator `translucent_walk`: light inside translucent objects by exact random walks."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+from halfspace_sss.rendering.surface.object import same_objects
+from halfspace_sss.rendering.walk.connect import find_joins
+from halfspace_sss.rendering.walk.guide import Guide
+from halfspace_sss.rendering.walk.media import WalkMedia
+from halfspace_sss.rendering.walk.tracing import PathTracer
+
+__all__ = ["walk_integrator_class"]
+
+SAMPLES_PER_LAUNCH = 2**21
+LANES = 2**14  # fastest of 2**12 to 2**18 on 2 cores
+FOREVER = 2**31 - 1
+
+
+def walk_integrator_class() -> type:
+    """The class of the integrator for the current variant of Mitsuba."""
+    import drjit as dr
+    import mitsuba as mi
+
+    class TranslucentWalk(mi.SamplingIntegrator):
+        """Path tracer whose paths walk through objects with the surface `translucent`.
+
+        Parameters: `mm_per_unit` (1), `max_depth` (-1: no limit; counts surfaces seen from outside), `rr_depth` (5),
+        `hide_emitters` (false), `join_share` (0.5; probability of looking for light of small emitters from a scattering
+        event near the boundary, 0 leaves all light to chance).
+        """
+
+        def __init__(self, props: Any) -> None:
+            mi.SamplingIntegrator.__init__(self, props)
+            self.mm_per_unit = _positive("mm_per_unit", float(props.get("mm_per_unit", 1.0)))
+            self.max_depth = _depth("max_depth", int(props.get("max_depth", -1)))
+            self.rr_depth = _depth("rr_depth", int(props.get("rr_depth", 5)))
+            self.hidden = bool(props.get("hide_emitters", False))
+            self.join_share = _share("join_share", float(props.get("join_share", 0.5)))
+            self._prepared: tuple[Any, Any, Any] = ([], None, None)
+
+        def tracer(self, scene: Any) -> PathTracer:
+            """What paths through a scene need; the costly part is made ready once."""
+            shapes = scene.shapes()  # the scene itself, which holds its integrator, would never be freed
+            if self._prepared[1] is None or not same_objects(self._prepared[0], shapes):
+                media = WalkMedia.of(scene, self.mm_per_unit)
+                joins = find_joins(scene, media, self.join_share)
+                self._prepared = shapes, media, joins and replace(joins, scene=None)
+            _, media, joins = self._prepared
+            joins = joins and replace(joins, scene=scene)
+            guide = joins and Guide(scene, media, joins)
+            return PathTracer(scene, media, self.max_depth, self.rr_depth, self.hidden, joins, guide)
+
+        def render(
+            self, scene: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0, develop: bool = True, evaluate: bool = True
+        ) -> Any:
+            sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+            with dr.suspend_grad():
+                _render(self.tracer(scene), sensor, int(mi.UInt32(seed)[0]), spp or sensor.sampler().sample_count())
+                return sensor.film().develop() if develop else None
+
+        def to_string(self) -> str:
+            return f"TranslucentWalk[mm_per_unit = {self.mm_per_unit:g}, max_depth = {self.max_depth}]"
+
+    return TranslucentWalk
+
+
+def _render(tracer: PathTracer, sensor: Any, seed: int, spp: int) -> None:
+    """Fill the film of a sensor, in launches that fit into memory."""
+    import drjit as dr
+
+    sensor.film().prepare([])
+    most = max(1, SAMPLES_PER_LAUNCH // int(dr.prod(_sampled_size(sensor.film()))))
+    for launch, start in enumerate(range(0, spp, most)):
+        _launch(tracer, sensor, min(most, spp - start), (seed, launch))
+
+
+def _launch(tracer: PathTracer, sensor: Any, spp: int, seed: tuple[int, int]) -> None:
+    """Trace spp rays through each pixel and add them to the film."""
+    import drjit as dr
+    import mitsuba as mi
+
+    film = sensor.film()
+    rays, weight, position = _camera_rays(sensor, spp, seed)
+    L, seen = tracer.trace(rays, LANES, seed)
+    block = film.create_block()
+    block.set_coalesce(block.coalesce() and spp >= 4)
+    L = weight * L
+    alpha = dr.select(seen, mi.Float(1), mi.Float(0))
+    has_alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
+    if mi.has_flag(film.flags(), mi.FilmFlags.Special):
+        values = film.prepare_sample(L, rays.wavelengths, block.channel_count(), weight=1.0, alpha=alpha)
+    else:
+        rgb = [L[0]] * 3 if len(L) == 1 and block.channel_count() >= 4 else list(L)
+        values = [*rgb, *([alpha] if has_alpha else []), mi.Float(1)]
+    block.put(position, values)
+    film.put_block(block)
+    dr.eval(block.tensor())
+
+
+def _sampled_size(film: Any) -> Any:
+    size = film.crop_size()
+    return size + 2 * film.rfilter().border_size() if film.sample_border() else size
+
+
+def _camera_rays(sensor: Any, spp: int, seed: tuple[int, int]) -> tuple[Any, Any, Any]:
+    """Rays of spp samples of each pixel, their weights, and their positions on the film."""
+    import drjit as dr
+    import mitsuba as mi
+    import numpy as np
+
+    film, size = sensor.film(), _sampled_size(sensor.film())
+    border = film.rfilter().border_size() if film.sample_border() else 0
+    sampler = sensor.sampler().clone()
+    sampler.set_sample_count(spp)
+    spp = sampler.sample_count()  # some samplers take squares only
+    n = int(dr.prod(size)) * spp
+    sampler.set_samples_per_wavefront(spp)
+    sampler.seed(int(np.random.SeedSequence(list(seed)).generate_state(1)[0]), n)
+    index = dr.arange(mi.UInt32, n) // mi.UInt32(spp)
+    pixel = mi.Vector2i(index % int(size[0]), index // int(size[0])) - border + mi.Vector2i(film.crop_offset())
+    position = mi.Vector2f(pixel) + sampler.next_2d()
+    scale = 1 / mi.ScalarVector2f(film.crop_size())
+    offset = -mi.ScalarVector2f(film.crop_offset()) * scale
+    aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
+    time = sensor.shutter_open()
+    if sensor.shutter_open_time() > 0:
+        time += sampler.next_1d() * sensor.shutter_open_time()
+    ray, weight = sensor.sample_ray(time, sampler.next_1d(), dr.fma(position, scale, offset), aperture)
+    # in a box filter a position that rounding puts on the edge of a pixel belongs to the neighbour too
+    return ray, weight, mi.Vector2f(pixel) if film.rfilter().is_box_filter() else position
+
+
+def _positive(name: str, value: float) -> float:
+    if not (math.isfinite(value) and value > 0):
+        raise ValueError(f"{name} must be finite and > 0, got {value!r}")
+    return value
+
+
+def _share(name: str, value: float) -> float:
+    if not 0 <= value <= 1:
+        raise ValueError(f"{name} must be in [0, 1], got {value!r}")
+    return value
+
+
+def _depth(name: str, value: int) -> int:
+    """A number of vertices; -1 stands for no limit."""
+    if value < -1 or value == 0:
+        raise ValueError(f"{name} must be -1 (no limit) or at least 1, got {value}")
+    return FOREVER if value == -1 else value

@@ -1,0 +1,196 @@
+"""What the walk inside objects knows of them: coefficients, boundary and geometry, by the number of the object."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from halfspace_sss.rendering.surface.object import Object, survey
+
+__all__ = ["Coefficients", "WalkMedia", "by_pointer", "pointer_numbers"]
+
+_FEWEST = {"total": 0, "multiple": 2, "single": 1}
+_MOST = {"total": 2**31 - 1, "multiple": 2**31 - 1, "single": 1}
+
+
+class Coefficients(NamedTuple):
+    """Of the medium in each lane: 1/(scene unit) and mean cosine, one value per channel."""
+
+    sigma_t: Any
+    sigma_s: Any
+    g: Any
+
+
+@dataclass(frozen=True, eq=False)
+class WalkMedia:
+    """The translucent objects of a scene, each addressed by its number.
+
+    Args:
+        objects: geometry of each.
+        insides: the `Inside` of each.
+        scene: a Mitsuba scene that holds these objects only.
+        boundaries: dielectric BSDF of each.
+        mm_per_unit: length of a scene unit, mm.
+    """
+
+    objects: list[Object]
+    insides: list[Any]
+    scene: Any
+    boundaries: list[Any]
+    mm_per_unit: float
+
+    def __post_init__(self) -> None:
+        import drjit as dr
+        import mitsuba as mi
+
+        media = [inside.medium for inside in self.insides]
+        n = len(mi.Spectrum(0))
+        tables = {}
+        for key in ("sigma_t", "sigma_s", "g"):
+            scale = 1.0 if key == "g" else self.mm_per_unit
+            rows = np.array([np.broadcast_to(getattr(m, key), n) for m in media], dtype=float) * scale
+            tables[key] = [mi.Float(rows[:, c].tolist()) for c in range(n)] if len(media) else []
+        tables["eta"] = mi.Float([m.eta for m in media])
+        tables["sign"] = mi.Float([found.sign for found in self.objects])
+        tables["fewest"] = mi.UInt32([_FEWEST[inside.orders] for inside in self.insides])
+        tables["most"] = mi.UInt32([_MOST[inside.orders] for inside in self.insides])
+        tables["reflects"] = mi.Bool([inside.reflection for inside in self.insides])
+        tables["rough"] = mi.Bool([is_rough(b) for b in self.boundaries])
+        tables["boundary"] = pointer_numbers([mi.BSDFPtr(b) for b in self.boundaries])
+        tables["shape"] = by_pointer([mi.ShapePtr(found.shape) for found in self.objects])
+        dr.make_opaque(tables)  # one kernel for all media
+        object.__setattr__(self, "tables", tables)
+        object.__setattr__(self, "box", _bounds(self.scene))
+
+    @property
+    def isotropic(self) -> bool:
+        """Whether g = 0 in every medium."""
+        return all(np.all(inside.medium.g == 0) for inside in self.insides)
+
+    @property
+    def same_g(self) -> bool:
+        """Whether g of every medium is the same in all channels."""
+        return all(np.ptp(inside.medium.g) == 0 for inside in self.insides)
+
+    @property
+    def any_rough(self) -> bool:
+        """Whether a boundary is rough, so that emitters can be sampled through it."""
+        return any(is_rough(b) for b in self.boundaries)
+
+    @property
+    def all_rough(self) -> bool:
+        """Whether no boundary is smooth."""
+        return all(is_rough(b) for b in self.boundaries)
+
+    def row(self, key: str, k: Any) -> Any:
+        """An entry of a table for object k."""
+        import drjit as dr
+
+        table = self.tables[key]
+        return dr.gather(type(table), table, k)
+
+    def coefficients(self, k: Any) -> Coefficients:
+        """Of object k."""
+        import drjit as dr
+        import mitsuba as mi
+
+        return Coefficients(
+            *(
+                mi.Spectrum([dr.gather(mi.Float, channel, k) for channel in self.tables[key]])
+                for key in ("sigma_t", "sigma_s", "g")
+            )
+        )
+
+    def number(self, shape: Any, active: Any = True) -> Any:
+        """The number of the object that a shape is, or -1."""
+        import drjit as dr
+        import mitsuba as mi
+
+        pointer = dr.reinterpret_array(mi.UInt32, shape)
+        table = self.tables["shape"]
+        known = active & (pointer < dr.width(table))
+        return dr.select(known, dr.gather(mi.Int32, table, pointer, known), -1)
+
+    def boundary(self, k: Any) -> Any:
+        """The dielectric of object k: one BSDF, or a pointer in each lane."""
+        import drjit as dr
+        import mitsuba as mi
+
+        if len(self.boundaries) == 1:
+            return self.boundaries[0]
+        return dr.reinterpret_array(mi.BSDFPtr, dr.gather(mi.UInt32, self.tables["boundary"], k))
+
+    def face_outwards(self, si: Any, k: Any, direction: Any) -> Any:
+        """The interaction with its normals turned to the outside of object k; `direction` is that of the ray."""
+        import drjit as dr
+        import mitsuba as mi
+
+        if all(found.sign > 0 for found in self.objects):
+            return si
+        flip = (k >= 0) & (self.row("sign", dr.maximum(k, 0)) < 0)
+        si.n = dr.select(flip, -si.n, si.n)
+        n = si.sh_frame.n
+        si.sh_frame = dr.select(flip, mi.Frame3f(-n), si.sh_frame)
+        si.wi = si.to_local(-direction)
+        return si
+
+    @classmethod
+    def of(cls, scene: Any, mm_per_unit: float) -> WalkMedia:
+        """The objects of a scene whose surface is `translucent`.
+
+        Raises:
+            ValueError: mm_per_unit is not a finite number > 0, or an object is an instance.
+        """
+        import mitsuba as mi
+
+        if not (np.isfinite(mm_per_unit) and mm_per_unit > 0):
+            raise ValueError(f"mm_per_unit must be finite and > 0, got {mm_per_unit!r}")
+        shapes = [shape for shape in scene.shapes() if hasattr(shape.bsdf(), "inside")]
+        inner = mi.load_dict({"type": "scene", **{f"shape{k}": shape for k, shape in enumerate(shapes)}})
+        surfaces = [shape.bsdf() for shape in shapes]
+        return cls(
+            [survey(shape) for shape in shapes],
+            [surface.inside for surface in surfaces],
+            inner,
+            [surface.boundary for surface in surfaces],
+            float(mm_per_unit),
+        )
+
+
+def _bounds(scene: Any) -> Any:
+    """The bounding box, a little larger; what is outside has leaked through the boundary by rounding."""
+    import mitsuba as mi
+
+    box = scene.bbox()
+    if not box.valid():
+        return box
+    margin = 1e-3 * (box.max - box.min)
+    return mi.BoundingBox3f(mi.Point3f(box.min - margin), mi.Point3f(box.max + margin))
+
+
+def is_rough(boundary: Any) -> bool:
+    """Whether a boundary scatters into a solid angle."""
+    import mitsuba as mi
+
+    return bool(boundary.flags() & int(mi.BSDFFlags.Smooth))
+
+
+def pointer_numbers(pointers: list[Any]) -> Any:
+    """What Dr.Jit's registry calls each."""
+    import drjit as dr
+    import mitsuba as mi
+
+    return mi.UInt32([int(dr.reinterpret_array(mi.UInt32, pointer)[0]) for pointer in pointers])
+
+
+def by_pointer(pointers: list[Any]) -> Any:
+    """Table from the number of a pointer in Dr.Jit's registry to its place in the list, -1 for others."""
+    import mitsuba as mi
+
+    ids = np.array(pointer_numbers(pointers), dtype=int).tolist()
+    table = np.full(max(ids, default=0) + 1, -1, dtype=np.int32)
+    for k, number in enumerate(ids):
+        table[number] = k
+    return mi.Int32(table.tolist())  # lists, not NumPy arrays: memory in any alignment would need kernels of its own

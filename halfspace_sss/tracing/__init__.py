@@ -1,0 +1,1 @@
+"""The random walk in the half-space and what is tallied from it."""

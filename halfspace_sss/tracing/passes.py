@@ -1,0 +1,110 @@
+"""A beam on a half-space, walked pass by pass: the loop behind every traced quantity, and its estimates."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from halfspace_sss.physics.fresnel import F_t, mu_internal
+from halfspace_sss.physics.medium import Medium
+from halfspace_sss.tracing.tallies import BATCHES, CellSums
+from halfspace_sss.tracing.walk import Tally, pass_seed, walk
+
+__all__ = ["PATHS_PER_LANE", "Estimate", "Pass", "Progress", "estimate", "launch_shape", "walk_passes"]
+
+PATHS_PER_LANE, MAX_LANES = 64, 131072
+Progress = Callable[[int, int], None]  # passes done, passes in all
+
+
+class Estimate(NamedTuple):
+    """A Monte Carlo number (or array) and its standard error."""
+
+    value: Any
+    standard_error: Any
+
+
+def estimate(samples: np.ndarray) -> Estimate:
+    """Mean over the first axis of independent samples, and its standard error."""
+    n = len(samples)
+    value, error = samples.mean(axis=0), samples.std(axis=0, ddof=1) / math.sqrt(n)
+    return Estimate(float(value), float(error)) if samples.ndim == 1 else Estimate(value, error)
+
+
+def launch_shape(n_paths: int) -> tuple[int, int, int]:
+    """Lanes (whole batches), walks per lane and passes that together trace at least `n_paths` walks."""
+    per_lane = int(np.clip(n_paths // 16384, 1, PATHS_PER_LANE))
+    lanes = min(BATCHES * math.ceil(n_paths / (per_lane * BATCHES)), MAX_LANES)
+    return lanes, per_lane, math.ceil(n_paths / (lanes * per_lane))
+
+
+@dataclass(frozen=True)
+class Pass:
+    """What one launch of the walk recorded, per incident flux: what enters is T_12 of it.
+
+    Attributes:
+        tallies, sums: the tallies of this pass and their per-lane sums.
+        T_i: transmittance T_12 of the beam of each lane.
+        per_lane, n_events: walks of each lane, scattering events of all.
+    """
+
+    tallies: list[Tally]
+    sums: tuple
+    T_i: np.ndarray
+    per_lane: int
+    n_events: int
+
+    @property
+    def n_paths(self) -> int:
+        """Walks of all lanes."""
+        return len(self.T_i) * self.per_lane
+
+    def lanes(self) -> np.ndarray:
+        """Means of each lane, independent samples, for all per-lane sums in turn; shape (lanes, sums)."""
+        columns = [column.numpy() for tally_sums in self.sums for column in tally_sums]
+        return np.stack(columns, axis=1).astype(np.float64) * (self.T_i / self.per_lane)[:, None]
+
+    def cells(self, sums: CellSums) -> np.ndarray:
+        """Means of each batch of lanes, independent samples, of cells lit by one beam; shape (batches, cells)."""
+        return sums.result() * (self.T_i[0] * sums.batches / self.n_paths)
+
+
+def _incidence(mu_i: float | str, lanes: int, rng: np.random.Generator) -> np.ndarray:
+    """Outside cosine of each lane; diffuse light is stratified over lanes by its cosine."""
+    if mu_i == "diffuse":
+        return np.sqrt((np.arange(lanes) + rng.random(lanes)) / lanes)
+    return np.full(lanes, float(mu_i))
+
+
+def walk_passes(
+    types: ModuleType,
+    medium: Medium,
+    mu_i: float | str,
+    n_paths: int,
+    seed: Sequence[int],
+    tallies: Callable[[], list[Tally]],
+    progress: Progress | None = None,
+) -> Iterator[Pass]:
+    """Trace at least `n_paths` walks, one pass after another for as long as passes are asked for.
+
+    Args:
+        types: Dr.Jit array module, from `backend.array_types`.
+        medium: scalar medium.
+        mu_i: cosine of incidence outside, [0, 1], or "diffuse".
+        seed: whole numbers that name this run; each pass has a stream of its own.
+        tallies: makes the tallies of a pass.
+        progress: called with (passes done, passes in all).
+    """
+    lanes, per_lane, passes = launch_shape(n_paths)
+    for done in range(1, passes + 1):
+        mu = _incidence(mu_i, lanes, np.random.default_rng([*seed, done]))
+        mu_in, recorded = types.Float(mu_internal(mu, medium.eta)), tallies()
+        sums, events = walk(types, medium, mu_in, per_lane, pass_seed(*seed, done), recorded)
+        n_events = int(events.numpy().astype(np.int64).sum())
+        if progress:
+            progress(done, passes)
+        yield Pass(recorded, sums, F_t(mu, medium.eta), per_lane, n_events)

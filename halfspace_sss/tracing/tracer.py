@@ -1,0 +1,187 @@
+"""Path-traced ground truth of a half-space: reflectance, moments, angular radiance and rings, with their errors."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from halfspace_sss.backend import array_types
+from halfspace_sss.checks import check_count, check_edges, check_finite, check_interval, check_scalar_medium
+from halfspace_sss.physics.fresnel import F_t
+from halfspace_sss.physics.medium import Medium
+from halfspace_sss.tracing.passes import Estimate, Progress, estimate, walk_passes
+from halfspace_sss.tracing.tallies import AngularTally, FluxTally, MomentTally, RingTally
+from halfspace_sss.tracing.walk import Tally
+
+__all__ = ["ORDERS", "Estimate", "Trace", "trace"]
+
+ORDERS = ("single", "multiple", "total")
+
+
+def _order_sum(order: str, single: np.ndarray, multiple: np.ndarray) -> np.ndarray:
+    if order not in ORDERS:
+        raise ValueError(f"order must be one of {', '.join(ORDERS)}, got {order!r}")
+    return {"single": single, "multiple": multiple, "total": single + multiple}[order]
+
+
+@dataclass(frozen=True)
+class Trace:
+    """What `trace` measured; every method returns an `Estimate` (value, standard_error) by scattering order.
+
+    Attributes:
+        medium, mu_i, seed, backend: what was asked.
+        n_paths: walks traced, the asked number rounded up to whole batches of lanes.
+        n_events: scattering events.
+        seconds: wall time, compilation included.
+    """
+
+    medium: Medium
+    mu_i: float | str
+    seed: int
+    backend: str
+    n_paths: int
+    n_events: int
+    seconds: float
+    _lanes: np.ndarray  # (lanes, sums), T_12 included
+    _rings: np.ndarray | None
+    _n_directions: int
+    _T_o: np.ndarray | None
+
+    def _pair(self, single: int) -> tuple[np.ndarray, np.ndarray]:
+        return self._lanes[:, single], self._lanes[:, single + 1]
+
+    def reflectance(self, order: str = "total") -> Estimate:
+        """Fraction of incident flux that leaves the medium after `order` scattering; surface reflection excluded."""
+        return estimate(_order_sum(order, *self._pair(0)))
+
+    def _ratio(self, order: str, column: int, unit: float) -> Estimate:
+        flux = _order_sum(order, *self._pair(0))
+        moment = _order_sum(order, *self._pair(column))
+        if not flux.mean() > 0:
+            return Estimate(math.nan, math.nan)
+        ratio = moment.mean() / flux.mean()
+        error = (moment - ratio * flux).std(ddof=1) / (math.sqrt(len(flux)) * flux.mean())
+        return Estimate(float(unit * ratio), float(unit * error))
+
+    def mean_r2(self, order: str = "total") -> Estimate:
+        """Mean squared distance between entry and exit, weighted by exitant flux, mm²."""
+        return self._ratio(order, 2, self.medium.mfp**2)
+
+    def mean_x(self, order: str = "total") -> Estimate:
+        """Mean displacement in the forward direction of the plane of incidence, mm."""
+        return self._ratio(order, 4, self.medium.mfp)
+
+    def mean_path_length(self, order: str = "total") -> Estimate:
+        """Mean path length inside the medium of the light that leaves, mm."""
+        return self._ratio(order, 6, self.medium.mfp)
+
+    def angular_reflectance(self, order: str = "total") -> Estimate:
+        """∫ S dA towards each of `directions`, 1/sr: the BRDF of the uniformly lit half-space."""
+        if self._T_o is None:
+            raise ValueError("directions must be given to trace() for angular_reflectance, got None")
+        pairs = self._lanes[:, 8:].reshape(len(self._lanes), self._n_directions, 2)
+        return estimate(_order_sum(order, pairs[..., 0], pairs[..., 1]) * self._T_o)
+
+    def exitance(self, order: str = "total") -> Estimate:
+        """Mean exitance over each ring between consecutive `radii`, 1/mm² per incident flux."""
+        if self._rings is None:
+            raise ValueError("radii must be given to trace() for exitance, got None")
+        return estimate(_order_sum(order, self._rings[:, 0], self._rings[:, 1]))
+
+
+def trace(
+    medium: Medium,
+    mu_i: float | str = 1.0,
+    n_paths: int = 1_000_000,
+    seed: int = 0,
+    *,
+    directions: Sequence[tuple[float, float]] | None = None,
+    radii: Sequence[float] | None = None,
+    backend: str = "llvm",
+    relative_error: float | None = None,
+    progress: Progress | None = None,
+) -> Trace:
+    """Trace walks of a beam in a half-space and return what leaves it, by scattering order.
+
+    Walks are in float32, so that an albedo is rounded to a multiple of 6e-8. At albedo 1 exactly, where walks of any
+    length occur (P(order > N) ~ N^-1/2), few walks miss the longest and state standard errors slightly too small: over
+    120 runs of 8192 walks the reflectance was 0.6 standard errors low on average, 1.4 off rms, at worst 3.6.
+
+    Args:
+        medium: scalar medium (take `medium.channel(k)` of a coloured one).
+        mu_i: cosine of incidence outside, [0, 1], or "diffuse" for uniform radiance from above.
+        n_paths: number of walks, at least 256; rounded up to whole batches of lanes.
+        seed: results repeat for the same seed, backend and version.
+        directions: pairs (mu_o, delta_phi) for `angular_reflectance`; delta_phi = 0 is forward, the far
+            side; not for diffuse light.
+        radii: edges in mm of the rings for `exitance`, ascending.
+        backend: "llvm" or "cuda".
+        relative_error: stop early, at a pass of up to 8.4 million walks, once the standard error of the total
+            reflectance has come down to this fraction of it.
+        progress: called with (passes done, passes in all).
+
+    Raises:
+        ValueError: an argument is out of range; nothing has been traced then.
+    """
+    check_scalar_medium(medium)
+    check_count("n_paths", n_paths, 256)
+    check_count("seed", seed, 0)
+    if mu_i != "diffuse":
+        check_interval("mu_i", mu_i, 0.0, 1.0)
+    if relative_error is not None:
+        check_interval("relative_error", relative_error, 0.0, 1.0)
+    edges = _checked_radii(radii, mu_i)
+    pairs = _checked_directions(directions, mu_i)
+    types, started = array_types(backend), time.perf_counter()
+
+    def tallies() -> list[Tally]:
+        angular = [] if pairs is None else [AngularTally(types, medium.g, medium.eta, *pairs.T)]
+        ring = [] if edges is None else [RingTally(types, edges * medium.sigma_t)]
+        return [FluxTally(types), MomentTally(types), *angular, *ring]
+
+    rows, rings, events, paths = [], [], 0, 0
+    for done in walk_passes(types, medium, mu_i, n_paths, (seed,), tallies, progress):
+        rows.append(done.lanes())
+        if edges is not None:
+            rings.append(done.cells(done.tallies[-1].cells).reshape(-1, 2, len(edges) - 1))
+        events, paths = events + done.n_events, paths + done.n_paths
+        if relative_error and _is_certain(rows, relative_error):
+            break
+    exitance = None if edges is None else np.concatenate(rings) / (np.pi * np.diff(edges**2))
+    return Trace(
+        medium, mu_i, seed, backend, paths, events, time.perf_counter() - started, np.concatenate(rows), exitance,
+        0 if pairs is None else len(pairs), None if pairs is None else F_t(pairs[:, 0], medium.eta),
+    )  # fmt: skip
+
+
+def _is_certain(rows: list[np.ndarray], relative_error: float) -> bool:
+    """Whether the total reflectance of all passes so far has this relative standard error."""
+    R = estimate(np.concatenate(rows)[:, :2].sum(axis=1))
+    return R.standard_error <= relative_error * R.value
+
+
+def _checked_radii(radii: Sequence[float] | None, mu_i: float | str) -> np.ndarray | None:
+    if radii is None:
+        return None
+    edges = check_edges("radii", radii)
+    if mu_i == "diffuse":
+        raise ValueError("radii must be None for diffuse light, which enters everywhere, got radii")
+    return edges
+
+
+def _checked_directions(directions: Sequence[tuple[float, float]] | None, mu_i: float | str) -> np.ndarray | None:
+    if directions is None:
+        return None
+    if mu_i == "diffuse":
+        raise ValueError("directions must be None for diffuse light, which has no forward direction, got directions")
+    pairs = np.asarray(directions, dtype=np.float64)
+    if pairs.ndim != 2 or pairs.shape[1] != 2 or len(pairs) == 0:
+        raise ValueError(f"directions must be a list of pairs (mu_o, delta_phi), got shape {pairs.shape}")
+    for mu_o, delta_phi in pairs:
+        check_interval("mu_o", mu_o, 0.0, 1.0)
+        check_finite("delta_phi", delta_phi)
+    return pairs

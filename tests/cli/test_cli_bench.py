@@ -1,0 +1,110 @@
+"""The command `bench`: what it measures, prints and writes, and how it ends."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+import halfspace_sss
+from halfspace_sss.cli import app as cli
+from halfspace_sss.cli import bench as cli_bench
+
+
+def _invoke(*arguments: str) -> Any:
+    return CliRunner().invoke(cli.app, ["bench", *arguments])
+
+
+def _rows(path: Path) -> list[dict[str, str]]:
+    with path.open(encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: Any) -> tuple[Any, Path]:
+    """One quick run of all parts, and its folder."""
+    folder = tmp_path_factory.mktemp("run") / "bench"
+    return _invoke("--quick", "--out", str(folder)), folder
+
+
+def test_every_part_has_a_file_and_all_are_in_the_json(finished: tuple[Any, Path]) -> None:
+    result, folder = finished
+    assert result.exit_code == 0
+    names = [f"bench_{part}.csv" for part in cli_bench.PARTS]
+    assert sorted(path.name for path in folder.iterdir()) == sorted([*names, "bench.json"])
+    content = json.loads((folder / "bench.json").read_text())
+    for part in cli_bench.PARTS:
+        assert len(content[part]) == len(_rows(folder / f"bench_{part}.csv")) == cli_bench._lengths(quick=True)[part]
+
+
+def test_every_file_is_named_and_progress_goes_to_stderr(finished: tuple[Any, Path]) -> None:
+    result, folder = finished
+    for path in folder.iterdir():
+        assert str(path) in result.stdout
+    assert "measuring" in result.stderr and "measuring" not in result.stdout
+
+
+def test_the_json_says_where_the_numbers_come_from(finished: tuple[Any, Path]) -> None:
+    content = json.loads((finished[1] / "bench.json").read_text())
+    assert content["provenance"]["parameters"] == {"quick": True, "parts": list(cli_bench.PARTS)}
+    assert content["provenance"]["versions"]["drjit"]
+    assert content["machine"]["threads"] >= 1
+    assert content["peak_memory_gib"] > 0.05
+
+
+def test_every_rate_is_positive(finished: tuple[Any, Path]) -> None:
+    folder = finished[1]
+    for row in _rows(folder / "bench_walk.csv") + _rows(folder / "bench_maps.csv"):
+        assert float(row["events_per_s"]) > 0
+    for row in _rows(folder / "bench_volpath.csv"):
+        assert float(row["equal_error_ratio"]) > 0
+    models = _rows(folder / "bench_models.csv")
+    assert [row["model"] for row in models] == list(halfspace_sss.models())
+    for row in models:
+        assert min(float(row[library]) for library in ("numpy", "torch", "drjit")) > 0
+
+
+def test_without_mitsuba_volpath_is_left_out_with_a_sentence(tmp_path: Path, monkeypatch: Any) -> None:
+    monkeypatch.setattr(cli_bench, "find_spec", lambda name: None if name == "mitsuba" else name)
+    result = _invoke("--quick", "--only", "volpath", "--out", str(tmp_path))
+    assert result.exit_code == 0
+    assert "volpath is left out: Mitsuba is not installed (`pip install halfspace-sss[render]`)" in result.stdout
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["bench.json", "bench_walk.csv"]
+
+
+@pytest.mark.parametrize(
+    ("text", "parts"),
+    [
+        (None, ["walk", "volpath", "models", "maps"]),
+        ("maps,models", ["models", "maps"]),
+        ("volpath", ["walk", "volpath"]),
+        (" walk , walk", ["walk"]),
+    ],
+)
+def test_parts_are_chosen_in_order_and_volpath_brings_the_walk(text: str | None, parts: list[str]) -> None:
+    assert cli_bench.chosen_parts(text) == parts
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--only", "walks"], "only must list parts of walk, volpath, models, maps, got 'walks'; did you mean 'walk'?"),
+        (["--only", ""], "only must list parts of walk, volpath, models, maps, got ''"),
+        (["--only", "walk,,maps"], "got ''"),
+        (["--out", "file"], "folder must be a folder or new, got 'file'"),
+    ],
+)
+def test_bad_input_ends_with_2_and_writes_nothing(
+    arguments: list[str], message: str, tmp_path: Path, monkeypatch: Any
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").write_text("x")
+    result = _invoke(*arguments)
+    assert result.exit_code == 2
+    assert message in result.stderr
+    assert result.stderr.startswith("error: ") and result.stderr.count("\n") == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]

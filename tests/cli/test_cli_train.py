@@ -1,0 +1,205 @@
+"""The commands `train` and `errors`: which files they write, what they print, and what they refuse."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pandas
+import pytest
+from typer.testing import CliRunner
+
+from halfspace_sss import bssrdf, materials
+from halfspace_sss.cli import app as cli
+from halfspace_sss.maps import noisy_maps
+from halfspace_sss.maps.noisy_maps import CellGrid
+from halfspace_sss.neural import material_model, paper_model, trained
+from halfspace_sss.neural.store import load_weights
+from halfspace_sss.neural.training import recipes as training
+from halfspace_sss.neural.training.fit import Fit
+from halfspace_sss.neural.training.recipes import MaterialRecipe, UniversalRecipe
+
+FIG10 = materials.load("fig10").medium
+HOW = Fit(steps=20, n_groups=4, n_queries=32, validate_every=5)
+TINY = MaterialRecipe(n_groups=8, events=1e5, grid=CellGrid(8, 4), how=HOW)
+TINY_UNIVERSAL = UniversalRecipe(n_media=8, events=1e5, grid=CellGrid(8, 4), how=HOW, rank=2)
+
+
+def _invoke(*arguments: str) -> Any:
+    return CliRunner().invoke(cli.app, list(arguments))
+
+
+@pytest.fixture(autouse=True)
+def _small(monkeypatch: Any, tmp_path: Path) -> None:
+    """Recipes of a second, in an empty folder, where weights are looked up too."""
+    for name, recipe in {"STANDARD": TINY, "FAST": TINY, "UniversalRecipe": lambda: TINY_UNIVERSAL}.items():
+        monkeypatch.setattr(training, name, recipe)
+    for module in (material_model, paper_model):
+        monkeypatch.setattr(module, "find_weights", trained.find_weights)
+    monkeypatch.setenv(trained.ENVIRONMENT_VARIABLE, str(tmp_path / "weights"))
+    monkeypatch.chdir(tmp_path)
+
+
+def _record(path: Path) -> dict:
+    return json.loads(path.with_suffix(".json").read_text())
+
+
+def _weights(folder: str = "weights") -> list[Path]:
+    return sorted(Path(folder).glob("*.safetensors"))
+
+
+def test_training_a_material_writes_weights_where_its_model_finds_them() -> None:
+    result = _invoke("train", "fig10")
+    assert result.exit_code == 0, result.output
+    (path,) = _weights()
+    assert path.name == trained.weights_name("neural_material", FIG10) and path.name in result.stdout
+    assert bssrdf("neural_material", FIG10).eval(1.0, 1.0, 0.0, 1.0, 0.0) > 0
+
+
+def test_without_arguments_the_material_is_fig10() -> None:
+    assert _invoke("train").exit_code == 0
+    assert _record(_weights()[0])["medium"] == {"albedo": 0.75, "g": 0.0, "eta": 1.3}
+
+
+def test_every_channel_of_every_material_has_its_row_and_weights() -> None:
+    result = _invoke("train", "ketchup", "fig10", "--fast", "--out", "mine")
+    assert result.exit_code == 0 and len(_weights("mine")) == 4 and not _weights()
+    rows = [line.split() for line in result.stdout.splitlines() if line.strip().startswith(("ketchup", "fig10"))]
+    assert [row[0] for row in rows] == ["ketchup"] * 3 + ["fig10"]
+    assert all(float(row[4]) >= 0 for row in rows)  # the error, %
+
+
+def test_given_coefficients_are_trained() -> None:
+    assert _invoke("train", "--albedo", "0.6", "--g", "0.2", "--eta", "1.1", "--sigma-t", "3").exit_code == 0
+    assert _record(_weights()[0])["medium"] == {"albedo": pytest.approx(0.6), "g": 0.2, "eta": 1.1}
+
+
+def test_the_network_of_the_paper_is_trained_by_name() -> None:
+    assert _invoke("train", "--model", "neural_paper", "--steps", "2").exit_code == 0
+    (path,) = _weights()
+    assert load_weights(path, "neural_paper")[1]["recipe"]["how"]["steps"] == 2
+
+
+def test_training_stops_at_the_target_error_that_is_given() -> None:
+    assert _invoke("train", "--target-error", "1", "--seed", "4").exit_code == 0
+    record = _record(_weights()[0])
+    assert [h["step"] for h in record["history"]] == [5] and record["seed"] == 4
+
+
+def test_unfinished_work_lies_in_a_folder_of_each_material_and_channel() -> None:
+    assert _invoke("train", "fig10", "--work", "unfinished").exit_code == 0
+    assert (Path("unfinished") / "fig10" / "channel-0" / "run.json").is_file()
+
+
+def test_the_universal_network_is_trained_into_a_folder() -> None:
+    result = _invoke("train", "--universal", "--steps", "3", "--out", "all")
+    assert result.exit_code == 0 and "neural.safetensors" in result.stdout
+    assert load_weights(Path("all") / "neural.safetensors", "neural")[1]["recipe"]["how"]["steps"] == 3
+
+
+REFUSED_BY_TRAIN = [
+    (["no such material"], "material must be one of"),
+    (["fig10", "--albedo", "0.5"], "albedo must be left out for a named material"),
+    (["--albedo", "1.5"], "albedo must be in [0, 1], got 1.5"),
+    (["--model", "neural"], "model must be one of neural_material, neural_paper, got 'neural'"),
+    (["--steps", "0"], "steps must be a whole number >= 1, got 0"),
+    (["--universal", "--steps", "-1"], "steps must be a whole number >= 1, got -1"),
+    (["--seed", "-1"], "seed must be a whole number >= 0, got -1"),
+    (["--universal", "--seed", "-1"], "seed must be a whole number >= 0, got -1"),
+    (["--target-error", "2"], "target_error must be a number in [0.0001, 1], got 2.0"),
+    (["--backend", "opencl"], "backend must be one of llvm, cuda, got 'opencl'"),
+    (["--universal", "--backend", "opencl"], "backend must be one of llvm, cuda, got 'opencl'"),
+    (["--out", "file"], "folder must be a folder or new, got 'file'"),
+    (["--work", "file"], "folder must be a folder or new, got 'file"),
+    (["--universal", "--out", "file"], "folder must be a folder or new, got 'file'"),
+    (["fig10", "--universal"], "material must be left out with --universal, got ['fig10']"),
+    (["--universal", "--albedo", "0.5"], "albedo must be left out with --universal, got 0.5"),
+    (["--universal", "--fast"], "fast must be left out with --universal, got True"),
+    (["--universal", "--target-error", "0.1"], "target_error must be left out with --universal, got 0.1"),
+    (["--universal", "--work", "w"], "work must be left out with --universal"),
+    (["--universal", "--model", "neural_paper"], "model must be left out with --universal, got 'neural_paper'"),
+]
+REFUSED_BY_ERRORS = [
+    (["no such material"], "material must be one of"),
+    (["fig10", "--g", "0.5"], "g must be left out for a named material"),
+    (["fig10", "--registry"], "material, registry and held_out must be given one at a time"),
+    (["--registry", "--held-out", "3"], "material, registry and held_out must be given one at a time"),
+    (["--held-out", "0"], "held_out must be a whole number >= 1, got 0"),
+    (["--model", "no_such_model"], "model must be one of"),
+    (["--model", "neural_material", "--g", "0.01"], "medium must be trained for neural_material, got one that is not"),
+    (["--model", "neural", "--g", "0.99"], "g must be in [-0.5, 0.98] for the neural model, got 0.99"),
+    (["--events", "10"], "events must be a number in [10000, 1e+12], got 10.0"),
+    (["--block", "3"], "block must be 1, 2, 4 or 8, got 3"),
+    (["--seed", "-1"], "seed must be a whole number >= 0, got -1"),
+    (["--backend", "opencl"], "backend must be one of llvm, cuda, got 'opencl'"),
+    (["--out", "file"], "folder must be a folder or new, got 'file'"),
+]
+REFUSED = [("train", *case) for case in REFUSED_BY_TRAIN] + [("errors", *case) for case in REFUSED_BY_ERRORS]
+
+
+@pytest.mark.parametrize(
+    ("command", "arguments", "message"), REFUSED, ids=[f"{c} {' '.join(a)}" for c, a, _ in REFUSED]
+)
+def test_bad_input_is_refused_before_any_work(
+    command: str, arguments: list[str], message: str, tmp_path: Path, monkeypatch: Any
+) -> None:
+    monkeypatch.setattr(noisy_maps, "_launch", None)
+    (tmp_path / "file").touch()
+    result = _invoke(command, *arguments)
+    assert result.exit_code == 2, result.output
+    assert result.stderr.startswith("error: ") and message in result.stderr and len(result.stderr.splitlines()) == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_errors_are_written_for_every_model_that_takes_the_medium() -> None:
+    result = _invoke("errors", "--events", "2e4", "--out", "deep/found")
+    assert result.exit_code == 0, result.output
+    table = pandas.read_csv("deep/found/errors.csv")
+    assert {"standard_dipole", "directional_dipole", "neural", "neural_material"} <= set(table["model"])
+    assert "neural_paper" not in set(table["model"])  # not trained
+    assert (table["error"] >= 0).all() and (table["noise"] > 0).all() and table["bias"].notna().all()
+    for name in ("errors.csv", "errors.json"):
+        assert f"deep/found/{name}" in result.stdout
+
+
+def test_errors_of_a_material_are_those_of_its_channels() -> None:
+    assert _invoke("errors", "ketchup", "--events", "2e4", "--model", "standard_dipole").exit_code == 0
+    table = pandas.read_csv("errors/errors.csv")
+    assert list(table["medium"]) == ["ketchup R", "ketchup G", "ketchup B"]
+    assert list(table["albedo"]) == pytest.approx(materials.load("ketchup").medium.albedo)
+
+
+def test_the_json_says_what_an_error_is_and_where_the_numbers_come_from() -> None:
+    assert (
+        _invoke("errors", "--events", "2e4", "--model", "better_dipole", "--block", "8", "--seed", "3").exit_code == 0
+    )
+    content = json.loads(Path("errors/errors.json").read_text())
+    assert content["provenance"]["parameters"] == {"events": 2e4, "block": 8, "seed": 3}
+    assert "blocks of 8 x 8 cells" in content["definition"]
+    assert [row["model"] for row in content["summary"]] == ["better_dipole"]
+
+
+def test_errors_are_repeated_by_their_seed() -> None:
+    for out in ("a", "b"):
+        assert _invoke("errors", "--events", "2e4", "--model", "better_dipole", "--out", out).exit_code == 0
+    assert Path("a/errors.csv").read_bytes() == Path("b/errors.csv").read_bytes()
+
+
+def test_a_trained_material_is_among_the_errors() -> None:
+    assert _invoke("train", "--albedo", "0.6").exit_code == 0
+    result = _invoke("errors", "--albedo", "0.6", "--events", "2e4", "--model", "neural_material")
+    assert result.exit_code == 0 and "neural_material" in result.stdout
+
+
+def test_held_out_media_are_summed_up_by_percentiles_ranges_and_losses() -> None:
+    chosen = ("--model", "neural", "--model", "standard_dipole")
+    result = _invoke("errors", "--held-out", "4", "--events", "2e4", *chosen)
+    assert result.exit_code == 0, result.output
+    assert len(pandas.read_csv("errors/errors.csv")) == 8
+    for words in ("errors over the media", "neural over ranges of media", "has a smaller error than neural"):
+        assert words in result.stdout
+
+
+def test_held_out_media_can_be_asked_of_one_model_alone() -> None:
+    assert _invoke("errors", "--held-out", "4", "--events", "2e4", "--model", "neural").exit_code == 0

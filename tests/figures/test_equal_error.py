@@ -1,0 +1,209 @@
+"""Equal-error times: the estimates of error, small real runs of every part, and the tables."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas
+import pytest
+
+from figures import equal_error
+from figures.computing.contenders import MODELS, VOLUMES, WALK, contender
+from figures.computing.furnace import furnace, furnace_models
+from figures.computing.sampling_cost import STEPS
+from figures.computing.scenes import MM_PER_UNIT
+from figures.computing.timed import Timed, rendered
+from figures.drawing import error_tables
+from figures.fig09 import prepare
+from figures.parts.part import Part, Result, Task
+from halfspace_sss import materials
+
+mi = pytest.importorskip("mitsuba")
+DIPOLE, BARE = MODELS[0], f"{MODELS[0]}, bare"
+CHOSEN = (VOLUMES[0], VOLUMES[2], WALK, DIPOLE, BARE)
+
+
+def _computed(part: Part, done: dict[str, Result], folder: Path) -> Result:
+    """The function of a part, run as the machinery runs it, with few methods."""
+    params = dict(part.params)
+    if "passes" in params:
+        params["spp"] = {name: 16 if name in (DIPOLE, BARE) else 4 for name in CHOSEN}
+    params |= {"models": [DIPOLE], "repeats": 1} if "repeats" in params else {}
+    found = part.function(Task(params, folder, {name: done[name] for name in part.needs}))
+    images = {name: v for name, v in found.items() if isinstance(v, np.ndarray)}
+    return Result(images, {name: v for name, v in found.items() if name not in images}, 1.0, part.work)
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Result]:
+    """All parts of one material under the sky, small."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(equal_error, "MATERIALS", ("ketchup",))
+        patch.setattr(equal_error, "LIGHTS", ("even sky",))
+        patch.setattr(equal_error, "furnace_models", lambda: [DIPOLE])
+        for name, value in (("SIZES", 24), ("TRUTH_SPP", 64), ("LANES", 4096), ("FURNACE", {"size": 8, "spp": 64})):
+            patch.setitem(getattr(equal_error, name), "draft", value)
+        parts, found = equal_error.parts("draft"), {}
+        for part in parts:
+            found[part.name] = _computed(part, found, tmp_path_factory.mktemp("part"))
+    return found
+
+
+def test_every_method_of_a_scene_has_errors_and_times(results: dict[str, Result]) -> None:
+    found = results["ketchup, even sky, errors"].numbers
+    rows = {row["method"]: row for row in found["rows"]}
+    assert tuple(rows) == CHOSEN
+    for row in rows.values():
+        assert row["seconds"] > 0 and row["spread"] > 0
+        assert all(np.isfinite(row[key]) for key in ("variance", "bias2", "error"))
+    assert rows[DIPOLE]["variance"] == rows[DIPOLE]["spread"] > rows[BARE]["spread"]
+    assert rows[WALK]["bias2"] == 0
+    assert 0 < found["truth"]["variance"] < found["truth"]["mean square"]
+
+
+def test_the_tables_say_ratios_and_what_was_asked(results: dict[str, Result]) -> None:
+    files = equal_error.draw(results)
+    table = pandas.read_csv(io.StringIO(files["equal_error_errors.csv"])).set_index("method")
+    assert table["is best volpathmis"].sum() == 1
+    best = table.index[table["is best volpathmis"]][0]
+    assert table.loc[best, "ratio"] == pytest.approx(1.0)
+    expected = table.loc[best, "cost"] / (table.loc[DIPOLE, "spread"] * table.loc[DIPOLE, "seconds"])
+    assert table.loc[DIPOLE, "ratio"] == pytest.approx(expected)
+    assert table.loc[BARE, "asked"] == 1.3 and np.isnan(table.loc[DIPOLE, "asked"])
+    assert list(pandas.read_csv(io.StringIO(files["equal_error_sampling.csv"])).columns) == ["model", *STEPS, "sum"]
+    assert list(pandas.read_csv(io.StringIO(files["equal_error_furnace.csv"]))["method"]) == [WALK, DIPOLE]
+    for said in ("Standard dipole", "Our walk", "volpathmis", "White furnace", "| asked |", "Seconds per million"):
+        assert said in files["equal_error.md"]
+    assert "nan" not in files["equal_error.md"]
+
+
+def _noisy(truth: np.ndarray, bias: float, sigma: float, passes: int, spp: int) -> Timed:
+    rng = np.random.default_rng(spp)
+    images = truth + bias + sigma / np.sqrt(spp) * rng.standard_normal((passes, *truth.shape))
+    return Timed(images.astype(np.float32), passes * spp, (0.01 * spp,) * passes)
+
+
+def test_variance_and_bias_are_told_apart_and_the_noise_of_the_truth_is_taken_off() -> None:
+    rng, exact = np.random.default_rng(1), np.full((64, 64, 3), 2.0)
+    noise = 0.3
+    image = (exact + noise * rng.standard_normal(exact.shape)).astype(np.float32)
+    truth = Result({"image": image, "variance": np.full(exact.shape, noise**2, np.float32)}, {}, 1.0, 1.0)
+    mask = np.ones((64, 64), dtype=bool)
+    found = equal_error.errors(_noisy(exact, 0.5, 1.0, 4, 4), truth, mask, False)
+    assert found["spp"] == 4 and found["seconds"] == pytest.approx(0.04)
+    assert found["variance"] == pytest.approx(0.25, rel=0.05)
+    assert found["bias2"] == pytest.approx(0.25, abs=0.02)
+    assert found["error"] == pytest.approx(0.5, abs=0.03)
+    assert abs(found["bias2"] - 0.25) < 4 * found["bias2 standard error"] < 0.05
+    traced = equal_error.errors(_noisy(exact, 0.0, 1.0, 4, 4), truth, mask, True)
+    assert traced["variance"] == traced["error"] == pytest.approx(0.25, abs=0.02)
+
+
+def test_a_cost_does_not_depend_on_how_long_the_render_was() -> None:
+    exact, mask = np.zeros((64, 64, 3)), np.ones((64, 64), dtype=bool)
+    truth = Result({"image": exact.astype(np.float32), "variance": exact.astype(np.float32)}, {}, 1.0, 1.0)
+    found = [equal_error.errors(_noisy(exact, 0.0, 1.0, 3, spp), truth, mask, False) for spp in (1, 4, 64)]
+    assert found[0]["variance"] > 3 * found[1]["variance"] > 30 * found[2]["variance"]
+    costs = [row["variance"] * row["seconds"] for row in found]
+    assert max(costs) < 1.1 * min(costs)
+
+
+def _table(*errors: tuple[str, float, float]) -> pandas.DataFrame:
+    """The table of methods with a variance and an error, of the same time and number of samples, by method."""
+    plain = {"seconds": 2.0, "spp": 4, "spread": 1.0, "bias2 standard error": 0.1, "error standard error": 0.1}
+    rows = [
+        {**plain, "method": name, "variance": variance, "error": error, "bias2": error - variance}
+        for name, variance, error in errors
+    ]
+    scene = {"rows": rows, "truth": {"mean square": 4.0}}
+    return error_tables.equal_error({("marble", "even sky"): scene}).set_index("method")
+
+
+def test_what_the_noise_of_the_truth_hides_is_left_out() -> None:
+    table = _table((VOLUMES[0], 2.0, 2.0), (VOLUMES[2], -0.1, -0.1), (DIPOLE, 0.5, 0.15), (MODELS[1], 0.5, 1.5))
+    assert list(table["is best volpathmis"]) == [True, False, False, False]
+    assert np.isnan(table.loc[VOLUMES[2], "ratio"])
+    assert table.loc[DIPOLE, "ratio"] == 4
+    assert np.isnan(table.loc[DIPOLE, ["ratio with bias", "relative bias", "seconds until bias"]].astype(float)).all()
+    assert table.loc[MODELS[1], "ratio with bias"] == pytest.approx(2 / 1.5)
+    assert table.loc[MODELS[1], "relative bias"] == 0.5 and table.loc[MODELS[1], "seconds until bias"] == 4
+
+
+def test_roulette_that_begins_earlier_counts_with_no_less_variance() -> None:
+    table = _table((VOLUMES[0], 0.1, 0.1), (VOLUMES[1], 3.0, 3.0), (VOLUMES[2], 2.0, 2.0), (DIPOLE, 0.5, 0.5))
+    assert list(table["cost"]) == [6.0, 6.0, 4.0, 1.0]
+    assert list(table["is best volpathmis"]) == [False, False, True, False]
+    assert table.loc[VOLUMES[0], "variance"] == 0.1
+
+
+def test_a_bare_model_is_not_held_against_a_truth_with_all_orders() -> None:
+    table = _table((VOLUMES[2], 2.0, 2.0), (BARE, 0.5, 1.5))
+    assert table.loc[BARE, "ratio"] == table.loc[BARE, "ratio to rr_depth 200"] == 4
+    assert np.isnan(table.loc[BARE, "ratio with bias"]) and np.isnan(table.loc[BARE, "relative bias"])
+
+
+def test_half_of_what_a_dipole_is_asked_for_is_asked_of_the_neural_model() -> None:
+    assert error_tables.asked("marble", "small light", "better_dipole, bare") == 5000
+    assert error_tables.asked("marble", "small light", "neural, bare") == 2500
+    assert error_tables.asked("marble", "small light", "neural") is None
+    assert error_tables.asked("apple", "small light", "neural, bare") is None
+
+
+def test_the_time_of_a_sample_is_split_in_three(results: dict[str, Result]) -> None:
+    (row,) = results["time per sample"].numbers["rows"]
+    assert row["model"] == DIPOLE and all(0 < row[step] < 1e3 for step in STEPS)
+    assert row["evaluation"] < row["entries"]
+
+
+def test_the_white_furnace_of_a_walk_is_one(tmp_path: Path, results: dict[str, Result]) -> None:
+    found = results[f"furnace, {WALK}"].numbers
+    assert abs(found["mean"] - 1) < 4 * found["standard error"] + 0.01
+    assert DIPOLE in furnace_models() and "neural" in furnace_models()
+    conserving: Any = furnace(Task({"model": "normalized_diffusion", "size": 16, "spp": 64}, tmp_path))
+    assert conserving["mean"] < 1 + 4 * conserving["standard error"]
+
+
+def test_a_medium_with_a_mean_cosine_for_each_channel_is_shown_to_mitsuba_channel_by_channel() -> None:
+    prepare()
+    name = "regular chocolate milk"
+    medium, scenes = materials.load(name).medium, contender(VOLUMES[-1], name, 8, "even sky")
+    assert len(scenes) == 3
+    for k, scene in enumerate(scenes):
+        found = mi.traverse(scene)
+        assert float(found["bunny.interior_medium.phase_function.g"][0]) == pytest.approx(medium.g[k])
+        assert float(found["bunny.interior_medium.scale"]) == pytest.approx(MM_PER_UNIT * medium.sigma_t[k])
+        albedo = np.array(found["bunny.interior_medium.albedo.value.value"]).ravel()
+        np.testing.assert_allclose(albedo, medium.albedo[k], rtol=1e-6)
+
+
+def test_scenes_of_one_channel_each_make_one_image() -> None:
+    prepare()
+    film = {"type": "hdrfilm", "width": 4, "height": 4, "rfilter": {"type": "box"}}
+    skies = [{"type": "rgb", "value": [k, k + 1, k + 2]} for k in (1, 4, 7)]
+    scenes = tuple(
+        mi.load_dict(
+            {
+                "type": "scene",
+                "integrator": {"type": "path"},
+                "sensor": {"type": "perspective", "film": film},
+                "sky": {"type": "constant", "radiance": sky},
+            }
+        )
+        for sky in skies
+    )
+    np.testing.assert_allclose(rendered(scenes, 4, 1)[0].mean(axis=(0, 1)), [1, 5, 9], rtol=1e-5)
+
+
+def test_the_figure_covers_five_materials_two_lights_and_every_model() -> None:
+    draft, paper = equal_error.parts("draft"), equal_error.parts("paper")
+    assert [part.name for part in draft] == [part.name for part in paper]
+    assert f"{MODELS[1]}, bare" in paper[1].params["spp"]
+    scenes = [part for part in draft if part.name.endswith(", errors")]
+    assert len(scenes) == 10
+    for part in scenes:
+        assert {*VOLUMES, WALK, *MODELS} <= set(part.params["spp"])
+    assert sum(BARE in part.params["spp"] for part in scenes) == 6
+    assert all(b.work > 4 * a.work for a, b in zip(draft, paper))

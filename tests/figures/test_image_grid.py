@@ -1,0 +1,112 @@
+"""Figures of images: what is in each cell, what is printed, and the place of a model that is not there."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from figures.computing.tone import srgb
+from figures.drawing.image_grid import Crop, image_grid
+from figures.drawing.shot import Shot, absent, compared
+from figures.drawing.style import paper, saved
+
+
+def _scenes() -> dict[str, list[Shot]]:
+    rng = np.random.default_rng(1)
+    scenes = {}
+    for name in ("marble", "ketchup"):
+        reference = rng.uniform(0.1, 0.6, (12, 16, 3)).astype(np.float32)
+        near, far = (compared(label, reference * s, reference) for label, s in (("near", 1.05), ("far", 1.8)))
+        scenes[name] = [Shot("path traced", reference, {"time, s": 3600.0}), far, near, absent("later", "to come")]
+    return scenes
+
+
+@pytest.fixture(scope="module")
+def scenes() -> dict[str, list[Shot]]:
+    return _scenes()
+
+
+@pytest.fixture(scope="module")
+def figure(scenes: dict[str, list[Shot]]) -> Figure:
+    with paper():
+        crops = {"marble": [Crop(2, 3, 8, 6), Crop(0, 0, 4, 3)]}
+        return image_grid(scenes, crops=crops, exposures={"ketchup": 1.0}, printed=("FLIP", "time, s"))
+
+
+def _pictures(figure: Figure) -> list[np.ndarray]:
+    return [np.asarray(image.get_array()) for ax in figure.axes for image in ax.images]
+
+
+def _texts(figure: Figure) -> list[Any]:
+    return [*figure.texts, *(text for ax in figure.axes for text in ax.texts)]
+
+
+def _contains(pictures: list[np.ndarray], wanted: np.ndarray) -> bool:
+    return any(p.shape == wanted.shape and np.allclose(p, wanted, atol=1e-6) for p in pictures)
+
+
+def test_every_image_map_and_crop_is_in_the_figure(figure: Figure, scenes: dict[str, list[Shot]]) -> None:
+    pictures = _pictures(figure)
+    for name, exposure in (("marble", 0.0), ("ketchup", 1.0)):
+        for shot in scenes[name][:3]:
+            assert _contains(pictures, srgb(shot.image, exposure))
+            assert shot.flip is None or _contains(pictures, shot.flip)
+    for shot in scenes["marble"][:3]:
+        assert _contains(pictures, srgb(shot.image[3:9, 2:10])) and _contains(pictures, srgb(shot.image[:3, :4]))
+
+
+def test_names_exposures_and_numbers_are_printed(figure: Figure, scenes: dict[str, list[Shot]]) -> None:
+    texts = [text.get_text() for text in _texts(figure)]
+    assert {"path traced", "near", "far", "later", "marble", "ketchup (+1 stops)", "time 3600 s"} <= set(texts)
+    for shot in (shot for shots in scenes.values() for shot in shots if shot.flip is not None):
+        assert f"FLIP {shot.numbers['FLIP']:#.3g}" in texts
+
+
+def test_the_smallest_number_of_a_row_is_bold(figure: Figure, scenes: dict[str, list[Shot]]) -> None:
+    bold = [text.get_text() for text in _texts(figure) if text.get_fontweight() == "bold"]
+    assert bold == [f"FLIP {scenes[name][2].numbers['FLIP']:#.3g}" for name in ("marble", "ketchup")]
+
+
+def test_a_model_that_is_not_there_has_a_frame_that_says_so(figure: Figure, scenes: dict[str, list[Shot]]) -> None:
+    assert sum(text.get_text() == "to come" for text in _texts(figure)) == 2
+    without = {"marble": scenes["marble"], "ketchup": scenes["ketchup"][:2]}
+    assert sum(text.get_text() == "not available" for text in _texts(image_grid(without))) == 2
+
+
+def test_nothing_overlaps_and_nothing_leaves_the_figure(figure: Figure) -> None:
+    boxes = [ax.get_position() for ax in figure.axes]
+    for k, a in enumerate(boxes):
+        assert a.x0 >= 0 and a.x1 <= 1 + 1e-9 and a.y0 >= 0 and a.y1 <= 1
+        for b in boxes[:k]:
+            width, height = min(a.x1, b.x1) - max(a.x0, b.x0), min(a.y1, b.y1) - max(a.y0, b.y0)
+            assert width <= 1e-9 or height <= 1e-9
+
+
+def test_it_is_saved_as_pdf_with_type_and_as_png(figure: Figure) -> None:
+    with paper():
+        files = saved(figure)
+    assert b"/FontFile2" in files["pdf"] and files["png"].startswith(b"\x89PNG")
+
+
+def test_images_without_maps_or_crops_make_a_figure(scenes: dict[str, list[Shot]]) -> None:
+    plain = {"marble": [Shot("raw", scenes["marble"][0].image), Shot("denoised", scenes["marble"][1].image)]}
+    assert len(_pictures(image_grid(plain))) == 2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "options", "message"),
+    [
+        ({}, {}, "scenes must hold at least one scene"),
+        ({"s": [absent("a")]}, {}, "scene 's' must start with the image of its reference"),
+        (_scenes(), {"crops": {"marble": [Crop(10, 0, 8, 4)]}}, "crops of 'marble' must lie inside 16 x 12 pixels"),
+        (_scenes(), {"crops": {"marble": [Crop(0, 0, 0, 4)]}}, "crops of 'marble' must lie inside"),
+        (_scenes(), {"crops": {"marble": [Crop(0, 0, 4, 4)] * 4}}, "crops of 'marble' must be 3 at most, got 4"),
+        (_scenes(), {"exposures": {"marbel": 1.0}}, "exposures must be of the scenes marble, ketchup, got 'marbel'"),
+    ],
+)
+def test_bad_input_is_refused(arguments: Any, options: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        image_grid(arguments, **options)

@@ -1,0 +1,101 @@
+"""What is special to the learnt models: range, size, accuracy of what is shipped, gradients of the medium."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import halfspace_sss
+from halfspace_sss import Medium
+from halfspace_sss.comparison.model_errors import model_error, reference_maps
+from halfspace_sss.comparison.model_truths import sampled_reflectance
+from halfspace_sss.maps.noisy_maps import CellGrid
+from halfspace_sss.neural.differentiable import neural_S
+from halfspace_sss.neural.universal import shipped_weights
+
+FIG10 = Medium.from_albedo(0.75, 1.0, 0.0, 1.3)
+RATIOS = {"sigma_t": 2.0, "albedo": 0.9, "g": 0.3, "eta": 1.4}
+QUERY = (np.array([0.3, 1.0, 2.0]), 0.7, 0.4, 0.9, 0.2)
+
+
+@pytest.mark.parametrize(
+    ("medium", "bound"),
+    [
+        (Medium.from_albedo(0.5, 1.0, 0.985, 1.3), "g must be in [-0.5, 0.98]"),
+        (Medium.from_albedo(0.5, 1.0, -0.6, 1.3), "g must be in [-0.5, 0.98]"),
+        (Medium.from_albedo(0.5, 1.0, 0.0, 0.9), "eta must be in [1, 2]"),
+        (Medium.from_albedo(0.5, 1.0, 0.0, 2.1), "eta must be in [1, 2]"),
+    ],
+)
+def test_media_out_of_range_are_refused_by_name_bound_and_value(medium, bound):
+    with pytest.raises(ValueError) as refused:
+        halfspace_sss.bssrdf("neural", medium)
+    assert bound in str(refused.value) and "got" in str(refused.value)
+
+
+def test_the_shipped_weights_are_small():
+    size = sum(path.stat().st_size for path in (shipped_weights(), shipped_weights().with_suffix(".json")))
+    assert size <= 300_000
+
+
+@pytest.mark.parametrize(
+    "medium", [FIG10, Medium.from_albedo(0.99, 1.0, 0.5, 1.5), Medium.from_albedo(0.3, 1.0, 0.0, 1.0)]
+)
+def test_unseen_maps_are_met_better_than_by_any_dipole(medium):
+    (reference,) = reference_maps([medium], 1, CellGrid(40, 16), 4, 5e6, (31,))
+    error = model_error(halfspace_sss.bssrdf("neural", medium), reference).error
+    dipoles = ("standard_dipole", "better_dipole", "photon_beam_diffusion", "normalized_diffusion")
+    others = [model_error(halfspace_sss.bssrdf(name, medium), reference).error for name in dipoles]
+    assert error < 0.10 and error < 0.4 * min(others)
+
+
+def test_a_dilution_changes_lengths_only():
+    m = Medium.from_albedo(0.9, 3.0, 0.5, 1.3)
+    r, *directions = QUERY
+    thin = halfspace_sss.bssrdf("neural", m.scaled(0.1)).eval(10 * r, *directions)
+    np.testing.assert_allclose(100 * thin, halfspace_sss.bssrdf("neural", m).eval(r, *directions), rtol=1e-9)
+
+
+def test_sampled_reflectance_agrees_with_quadrature_for_a_smooth_model():
+    model = halfspace_sss.bssrdf("better_dipole", FIG10)
+    R, error = sampled_reflectance(model, 1.0)
+    assert R == pytest.approx(halfspace_sss.measure.reflectance(model, 1.0), rel=1e-4) and error < 1e-5
+
+
+def _finite_differences() -> dict[str, float]:
+    def total(**ratios):
+        medium = Medium.from_albedo(ratios["albedo"], ratios["sigma_t"], ratios["g"], ratios["eta"])
+        return halfspace_sss.bssrdf("neural", medium).eval(*QUERY).sum()
+
+    h = 1e-4
+    return {k: (total(**{**RATIOS, k: v + h}) - total(**{**RATIOS, k: v - h})) / (2 * h) for k, v in RATIOS.items()}
+
+
+def test_torch_differentiates_with_respect_to_the_medium():
+    torch = pytest.importorskip("torch")
+    ratios = {k: torch.tensor(v, dtype=torch.float64, requires_grad=True) for k, v in RATIOS.items()}
+    S = neural_S(**ratios, **_named(lambda x: torch.as_tensor(x, dtype=torch.float64)))
+    S.sum().backward()
+    for name, slope in _finite_differences().items():
+        assert ratios[name].grad.item() == pytest.approx(slope, rel=1e-2)
+
+
+def test_drjit_differentiates_with_respect_to_the_medium():
+    import drjit as dr
+    from drjit.llvm.ad import Float
+
+    ratios = {k: Float(v) for k, v in RATIOS.items()}
+    dr.enable_grad(list(ratios.values()))
+    S = neural_S(**ratios, **_named(lambda x: Float(np.asarray(x, np.float32))))
+    dr.backward(dr.sum(S))
+    for name, slope in _finite_differences().items():
+        assert dr.grad(ratios[name])[0] == pytest.approx(slope, rel=1e-2)
+
+
+def _named(convert) -> dict:
+    return {k: convert(v) for k, v in zip(("r", "mu_i", "phi_i", "mu_o", "phi_o"), QUERY)}
+
+
+def test_numbers_are_refused_where_gradients_are_asked_for():
+    with pytest.raises(ValueError, match="sigma_t must be a torch tensor or Dr.Jit array"):
+        neural_S(**RATIOS, **_named(lambda x: x))

@@ -1,0 +1,158 @@
+"""Long renders: passes add up, killed ones resume to the same image, and other files are refused by name."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import halfspace_sss.rendering as rendering
+from halfspace_sss.rendering.scenes import reference
+
+mi = pytest.importorskip("mitsuba")
+
+
+@pytest.fixture(autouse=True)
+def variant() -> None:
+    mi.set_variant("llvm_ad_rgb")
+    rendering.register()
+
+
+def _scene(radius: float = 1.0) -> dict:
+    film = {"type": "hdrfilm", "width": 6, "height": 4, "rfilter": {"type": "box"}, "component_format": "float32",
+            "pixel_format": "rgb"}  # fmt: skip
+    surface = {"type": "translucent", "sigma_s": "3,4,5", "sigma_a": "0.1,0.5,1", "eta": 1.4}
+    view = mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0])
+    return {
+        "type": "scene",
+        "integrator": {"type": "translucent_walk"},
+        "sensor": {"type": "perspective", "fov": 40.0, "to_world": view, "film": film},
+        "light": {"type": "constant"},
+        "object": {"type": "sphere", "radius": radius, "bsdf": surface},
+    }
+
+
+KILLED = """
+import sys
+import halfspace_sss.rendering as rendering
+import mitsuba as mi
+from halfspace_sss.rendering.scenes import reference
+sys.path.insert(0, {folder!r})
+mi.set_variant("llvm_ad_rgb")
+rendering.register()
+from test_reference import _scene
+print("ready", flush=True)
+reference.render(_scene(), {path!r}, spp_per_pass=4, passes=10**6, interval=0)
+"""
+
+
+def test_mean_and_variance_are_those_of_the_passes(tmp_path: Path) -> None:
+    images = []
+    found = reference.render(_scene(), tmp_path / "a.exr", spp_per_pass=4, passes=5)
+    for k in range(5):
+        seed = int(np.random.SeedSequence([0, k]).generate_state(1)[0])
+        images.append(np.array(mi.render(mi.load_dict(_scene()), spp=4, seed=seed), dtype=float))
+    np.testing.assert_allclose(found.mean, np.mean(images, axis=0), rtol=1e-6)
+    np.testing.assert_allclose(found.variance, np.var(images, axis=0, ddof=1) / 5, rtol=1e-5, atol=1e-12)
+    assert (found.passes, found.spp) == (5, 20)
+
+
+def test_a_file_reads_back_as_it_was_and_tells_its_origin(tmp_path: Path) -> None:
+    made = reference.render(_scene(), tmp_path / "a.exr", spp_per_pass=4, passes=3, seed=7)
+    found = reference.load(tmp_path / "a.exr")
+    assert np.array_equal(found.mean, made.mean) and np.array_equal(found.variance, made.variance)
+    header = json.loads((tmp_path / "a.json").read_text())
+    assert (header["passes"], header["seed"], header["spp_per_pass"]) == (3, 7, 4)
+    assert "TranslucentWalk" in header["integrator"] and "mitsuba" in header["provenance"]["versions"]
+    rgb = np.array(mi.Bitmap(str(tmp_path / "a.exr")))[..., :3]
+    np.testing.assert_allclose(rgb, made.mean, rtol=1e-6)
+
+
+def test_a_run_in_two_parts_gives_the_bits_of_a_run_in_one(tmp_path: Path) -> None:
+    whole = reference.render(_scene(), tmp_path / "whole.exr", spp_per_pass=4, passes=9)
+    reference.render(_scene(), tmp_path / "parts.exr", spp_per_pass=4, passes=4)
+    parts = reference.render(_scene(), tmp_path / "parts.exr", spp_per_pass=4, passes=9)
+    assert np.array_equal(whole.mean, parts.mean) and np.array_equal(whole.variance, parts.variance)
+
+
+def test_a_killed_run_leaves_a_whole_file_and_resumes(tmp_path: Path) -> None:
+    path = tmp_path / "killed.exr"
+    code = KILLED.format(folder=str(Path(__file__).parent), path=str(path))
+    run = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE)
+    deadline = time.monotonic() + 60
+    while not path.exists() and time.monotonic() < deadline:
+        time.sleep(0.02)
+    time.sleep(0.3)
+    os.kill(run.pid, signal.SIGKILL)
+    run.wait()
+    run.stdout.close()
+    passes = reference.load(path).passes
+    resumed = reference.render(_scene(), path, spp_per_pass=4, passes=passes + 2)
+    whole = reference.render(_scene(), tmp_path / "whole.exr", spp_per_pass=4, passes=passes + 2)
+    assert resumed.passes == passes + 2
+    assert np.array_equal(resumed.mean, whole.mean) and np.array_equal(resumed.variance, whole.variance)
+
+
+def test_a_run_stops_at_the_target_error(tmp_path: Path) -> None:
+    seen = []
+    found = reference.render(_scene(), tmp_path / "a.exr", spp_per_pass=16, target_error=0.02, passes=500,
+                             progress=lambda r: seen.append(r.relative_error))  # fmt: skip
+    assert found.relative_error <= 0.02 and 8 <= found.passes < 500
+    assert all(error > 0.02 for error in seen[7:-1])
+
+
+def test_a_run_stops_after_its_time(tmp_path: Path) -> None:
+    found = reference.render(_scene(), tmp_path / "a.exr", spp_per_pass=1, seconds=0.3)
+    assert 0.3 <= found.seconds < 5
+
+
+def test_an_interrupted_run_keeps_its_passes(tmp_path: Path) -> None:
+    def stop(found: reference.Reference) -> None:
+        if found.passes == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        reference.render(_scene(), tmp_path / "a.exr", spp_per_pass=1, passes=9, progress=stop)
+    assert reference.load(tmp_path / "a.exr").passes == 3
+
+
+@pytest.mark.parametrize("kept", [0, 100, -30])
+def test_a_cut_file_is_refused_by_name(tmp_path: Path, kept: int) -> None:
+    path = tmp_path / "cut.exr"
+    reference.render(_scene(), path, spp_per_pass=1, passes=2)
+    path.write_bytes(path.read_bytes()[:kept])
+    with pytest.raises(ValueError, match="cut.exr must be an EXR file"):
+        reference.render(_scene(), path, spp_per_pass=1, passes=3)
+
+
+def test_a_file_of_another_render_is_refused_by_name(tmp_path: Path) -> None:
+    path = tmp_path / "other.exr"
+    reference.render(_scene(), path, spp_per_pass=1, passes=2)
+    with pytest.raises(ValueError, match=r"other.exr must be of the same render.*: scene is"):
+        reference.render(_scene(radius=1.1), path, spp_per_pass=1, passes=3)
+    with pytest.raises(ValueError, match="other.exr.*seed is 0 there and 1 here"):
+        reference.render(_scene(), path, spp_per_pass=1, passes=3, seed=1)
+    with pytest.raises(ValueError, match="other.exr.*: scene is"):
+        reference.render(_scene(), path, integrator={"type": "path"}, spp_per_pass=1, passes=3)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({}, "one of passes"),
+        ({"passes": 0}, "passes must be .* got 0"),
+        ({"target_error": 0.0}, "target_error must be .* got 0.0"),
+        ({"passes": 1, "spp_per_pass": 1.5}, "spp_per_pass must be .* got 1.5"),
+    ],
+)
+def test_arguments_out_of_range_are_refused(tmp_path: Path, arguments: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        reference.render(_scene(), tmp_path / "a.exr", **arguments)
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,66 @@
+"""Kernels are compiled once for what differs in numbers only, and scenes go when nobody holds them."""
+
+from __future__ import annotations
+
+import gc
+import warnings
+
+import numpy as np
+import pytest
+
+mi = pytest.importorskip("mitsuba")
+import drjit as dr  # noqa: E402
+
+
+@pytest.fixture(autouse=True)
+def _variant():
+    from halfspace_sss import rendering
+
+    mi.set_variant("llvm_ad_rgb")
+    rendering.register()
+    gc.collect()
+
+
+def loaded(material: str, model: str, mm_per_unit: float = 3.0):
+    from halfspace_sss.rendering.scenes.scene_files import load_scene
+
+    view = mi.ScalarTransform4f().look_at([3, 4, 9], [0, 0, 0], [0, 1, 0])
+    film = {"type": "hdrfilm", "width": 4, "height": 4}
+    description = {
+        "type": "scene", "integrator": {"type": "bssrdf", "mm_per_unit": mm_per_unit}, "light": {"type": "constant"},
+        "object": {"type": "cube", "bsdf": {"type": "translucent", "material": material}},
+        "sensor": {"type": "perspective", "to_world": view, "film": film},
+    }  # fmt: skip
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return load_scene(description, model)
+
+
+def largest_kernel(scene) -> str:
+    """Hash of the largest kernel of a render."""
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        np.array(mi.render(scene, spp=1))
+        return max(dr.kernel_history([dr.KernelType.JIT]), key=lambda kernel: kernel["operation_count"])["hash"]
+
+
+@pytest.mark.parametrize("model", ["standard_dipole", "photon_beam_diffusion", "neural", "path_traced"])
+def test_a_kernel_serves_other_materials_of_the_same_index_and_other_units(model):
+    kernels = set()
+    for material, mm_per_unit in (("potato", 3.0), ("ketchup", 3.0), ("apple", 6.0)):
+        gc.collect()
+        kernels.add(largest_kernel(loaded(material, model, mm_per_unit)))
+    assert len(kernels) == 1
+
+
+@pytest.mark.parametrize("model", ["standard_dipole", "path_traced"])
+def test_a_rendered_scene_is_freed_with_its_last_name(model):
+    """Its objects then give their numbers back."""
+    numbers = []
+    for _ in range(3):
+        gc.collect()
+        scene = loaded("potato", model)
+        np.array(mi.render(scene, spp=1))
+        numbers.append(int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(scene.shapes()[0]))[0]))
+        del scene
+    assert len(set(numbers)) == 1

@@ -1,0 +1,178 @@
+"""Points of entry: chi-square tests of the sampler on a plane and a sphere, and what must not matter."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from halfspace_sss import Medium, bssrdf
+
+mi = pytest.importorskip("mitsuba")
+import drjit as dr  # noqa: E402
+
+N = 1 << 18
+MODELS = [Medium(1.0, 0.2, 0.3, 1.4), Medium(0.3, 0.01, 0.0, 1.4), Medium(3.0, 0.5, 0.0, 1.4)]
+
+
+@pytest.fixture(autouse=True)
+def _variant():
+    from halfspace_sss import rendering
+
+    mi.set_variant("llvm_ad_rgb")
+    rendering.register()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
+
+
+def position_sampler(shape: dict, share: float):
+    from halfspace_sss.rendering.surface.object import survey
+    from halfspace_sss.rendering.transport.area_points import AreaPoints
+    from halfspace_sss.rendering.transport.positions import PositionSampler
+    from halfspace_sss.rendering.transport.radial_table import RadialTable
+
+    scene = mi.load_dict({"type": "scene", "object": shape})
+    found = survey(scene.shapes()[0])
+    table = RadialTable([bssrdf("standard_dipole", m) for m in MODELS], found.size)
+    return PositionSampler(found, table, AreaPoints(found.shape), share)
+
+
+def entries(positions, origin, along, n: int = N, seed: int = 1):
+    from halfspace_sss.rendering.transport.plane import Exit
+
+    ray = mi.Ray3f(mi.Point3f(*origin), mi.Vector3f(*along))
+    si = positions.found.scene.ray_intersect(ray)
+    sign = positions.found.sign
+    out = Exit(mi.Point3f(si.p), mi.Normal3f(si.sh_frame.n) * sign, -ray.d, sign)
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(seed, n)
+    return out, positions.sample(out, si.prim_index, sampler, mi.Bool(True))
+
+
+def chi_square(counts: np.ndarray, expected: np.ndarray) -> float:
+    """p-value, cells with few expected counts put together."""
+    few = expected < 20
+    counts = np.append(counts[~few], counts[few].sum())
+    expected = np.append(expected[~few], expected[few].sum())
+    keep = expected > 0
+    chi2 = np.sum((counts[keep] - expected[keep]) ** 2 / expected[keep])
+    return float(stats.chi2.sf(chi2, keep.sum() - 1))
+
+
+def density_of(positions, p, n, out):
+    axes = (out.n, *mi.coordinate_system(out.n))
+    density = np.array(positions.density(mi.Point3f(p), mi.Normal3f(n), out, axes))
+    return np.broadcast_to(density, np.shape(p)[1:])
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
+def test_entries_on_a_plane_follow_their_density(share):
+    half = 4.0
+    shape = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(half)}
+    positions = position_sampler(shape, share)
+    out, entry = entries(positions, (0.3, -0.2, 5), (0, 0, -1))
+    found = np.array(entry.weight) > 0
+    x, y = np.array(entry.p)[:2, found]
+    cells = 24
+    edges = np.linspace(-half, half, cells + 1)
+    counts = np.histogram2d(x, y, bins=(edges, edges))[0]
+    fine = 32
+    middle = (np.arange(cells * fine) + 0.5) / (cells * fine) * 2 * half - half
+    X, Y = np.meshgrid(middle, middle, indexing="ij")
+    p = np.stack([X.ravel(), Y.ravel(), np.zeros(X.size)])
+    density = density_of(positions, p, np.array([0, 0, 1.0])[:, None] + 0 * p, out).reshape(cells, fine, cells, fine)
+    mass = density.mean(axis=(1, 3)) * (2 * half / cells) ** 2
+    # the few cells about the exit, where the density is too steep for this grid, are left out
+    keep = mass < 0.3 * mass.max() if share < 1 else mass > 0
+    counts = np.append(counts[keep], N - counts[keep].sum())
+    assert chi_square(counts, N * np.append(mass[keep], 1 - mass[keep].sum())) > 1e-3
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3])
+def test_entries_on_a_sphere_follow_their_density(share):
+    """Of all hits of a probe one is taken, so counts are compared as sums of weights: the area of each cell."""
+    positions = position_sampler({"type": "sphere", "radius": 2.0}, share)
+    out, entry = entries(positions, (0.4, 0.3, 9), (0, 0, -1))
+    weight, p = np.array(entry.weight), np.array(entry.p) / 2.0
+    cells_z, cells_phi = 12, 16
+    k = np.minimum(((p[2] + 1) / 2 * cells_z).astype(int), cells_z - 1)
+    j = ((np.arctan2(p[1], p[0]) / (2 * np.pi) + 0.5) * cells_phi).astype(int) % cells_phi
+    index = np.where(weight > 0, k * cells_phi + j, 0)
+    area = 4 * np.pi * 4.0 / (cells_z * cells_phi)
+    first = np.bincount(index, weight, cells_z * cells_phi) / N
+    second = np.bincount(index, weight**2, cells_z * cells_phi) / N
+    z = (first - area) / np.sqrt((second - first**2) / N)
+    assert stats.chi2.sf(np.sum(z**2), len(z)) > 1e-3
+
+
+def kernel_integral(positions, origin, along):
+    """∫ exp(-|x - x_o|) dA and its standard error."""
+    out, entry = entries(positions, origin, along)
+    value = np.array(dr.exp(-dr.norm(entry.p - out.p)) * entry.weight)
+    return value.mean(), value.std() / np.sqrt(N)
+
+
+def test_faces_of_a_mesh_do_not_matter():
+    coarse = position_sampler({"type": "cube"}, 0.2)
+    parts = [kernel_integral(coarse, (0.2, 0.1, 5), (0, 0, -1))]
+    box = mi.load_dict({"type": "cube"})
+    vertices, faces = subdivided(box)
+    mesh = mi.Mesh("fine", len(vertices), len(faces))
+    parameters = mi.traverse(mesh)
+    parameters["vertex_positions"] = np.ravel(vertices)
+    parameters["faces"] = np.ravel(faces)
+    parameters.update()
+    parts.append(kernel_integral(position_sampler(mesh, 0.2), (0.2, 0.1, 5), (0, 0, -1)))
+    (a, e), (b, f) = parts
+    assert abs(a - b) < 4 * np.hypot(e, f)
+
+
+def test_what_lies_straight_behind_a_thin_object_is_found_by_probes():
+    """Probes are short but for a few; the other side of a plate is parallel to all that run along its tangents."""
+    plate = {"type": "cube", "to_world": mi.ScalarTransform4f().scale([2, 2, 0.3])}
+    (a, e), (b, f) = (kernel_integral(position_sampler(plate, share), (0.2, 0.1, 5), (0, 0, -1)) for share in (0, 1))
+    assert abs(a - b) < 4 * np.hypot(e, f)
+    assert e < 0.01 * a
+
+
+def subdivided(mesh):
+    """Each triangle as four."""
+    parameters = mi.traverse(mesh)
+    v = np.array(parameters["vertex_positions"]).reshape(-1, 3)
+    f = np.array(parameters["faces"]).reshape(-1, 3)
+    a, b, c = v[f[:, 0]], v[f[:, 1]], v[f[:, 2]]
+    ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
+    triangles = np.concatenate([np.stack(t, 1) for t in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))])
+    return triangles.reshape(-1, 3), np.arange(3 * len(triangles), dtype=np.uint32).reshape(-1, 3)
+
+
+def test_light_does_not_cross_from_one_object_to_another_of_the_same_surface():
+    """Mitsuba merges meshes with the same BSDF into one shape."""
+    at = mi.ScalarTransform4f()
+    bsdf = {"type": "translucent", "material": "marble"}
+    scene = mi.load_dict({
+        "type": "scene", "a": {"type": "cube", "bsdf": bsdf},
+        "b": {"type": "cube", "to_world": at.translate([2.5, 0, 0]), "bsdf": bsdf},
+    })  # fmt: skip
+    assert len(scene.shapes()) == 1
+    positions = position_sampler(scene.shapes()[0], 0.3)
+    out, entry = entries(positions, (0.9, 0, 5), (0, 0, -1))
+    found = np.array(entry.weight) > 0
+    assert found.any() and np.array(entry.p)[0, found].max() < 1.01
+
+
+def test_the_radial_table_gives_back_its_own_density():
+    from halfspace_sss.rendering.transport.radial_table import RadialTable
+
+    table = RadialTable([bssrdf("standard_dipole", m) for m in MODELS], 50.0)
+    u = mi.Float((np.arange(N) + 0.5) / N)
+    r = np.array(table.sample(u))
+    edges = np.geomspace(1e-3, 49.9, 60)
+    counts = np.histogram(r, bins=edges)[0]
+    fine = np.geomspace(1e-3, 49.9, 59 * 40 + 1)
+    middle = np.sqrt(fine[1:] * fine[:-1])
+    mass = (np.array(table.pdf(mi.Float(middle))) * 2 * np.pi * middle * np.diff(fine)).reshape(59, 40).sum(axis=1)
+    assert np.allclose(counts / N, mass, rtol=0.05, atol=2e-5)

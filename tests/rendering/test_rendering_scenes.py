@@ -1,0 +1,207 @@
+"""Scenes at the edge of what can be rendered: what is refused, what is warned of, what must stay finite."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import warnings
+
+import numpy as np
+import pytest
+from rendered import MEDIUM, direction, plane_scene, render, sun, surface
+
+mi = pytest.importorskip("mitsuba")
+
+START = [sys.executable, "-c", "from halfspace_sss.cli import main; main()"]
+SPHERE = {"type": "sphere", "radius": 5.0}
+
+
+@pytest.fixture(autouse=True)
+def _variant():
+    from halfspace_sss import rendering
+
+    mi.set_variant("llvm_ad_rgb")
+    rendering.register()
+
+
+def view(shape: dict, emitter: dict | None = None, distance: float = 30.0, n: int = 16, **settings) -> dict:
+    """An object in the middle of a perspective image."""
+    at = mi.ScalarTransform4f().look_at((distance * direction(20)).tolist(), [0, 0, 0], [0, 1, 0])
+    film = {"type": "hdrfilm", "width": n, "height": n, "rfilter": {"type": "box"}}
+    return {
+        "type": "scene", "integrator": {"type": "bssrdf", "max_depth": 3, **settings},
+        "light": emitter or {"type": "constant"}, "object": shape,
+        "sensor": {"type": "perspective", "fov": 20.0, "to_world": at, "film": film},
+    }  # fmt: skip
+
+
+def quietly(scene: dict, spp: int = 4) -> np.ndarray:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return render(scene, spp)
+
+
+def refused(message: str, scene: dict) -> None:
+    """Mitsuba wraps what an integrator raises while rendering; `load_scene` lets it through."""
+    from halfspace_sss.rendering.scenes.scene_files import load_scene
+
+    with pytest.raises((ValueError, RuntimeError), match=message), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        load_scene(scene)
+
+
+def test_an_unknown_model_is_refused_with_the_nearest_name():
+    refused("did you mean 'directional_dipole'", view({**SPHERE, "bsdf": surface("directional_dipol")}))
+
+
+def test_an_unknown_material_is_refused_with_the_nearest_name():
+    refused("did you mean 'marble'", view({**SPHERE, "bsdf": {"type": "translucent", "material": "marbel"}}))
+
+
+def test_a_surface_without_material_is_refused():
+    refused("must have material, or sigma_s and sigma_a", view({**SPHERE, "bsdf": {"type": "translucent"}}))
+
+
+def test_orders_that_the_model_cannot_give_are_refused():
+    refused("orders must be total", view({**SPHERE, "bsdf": surface("directional_dipole", "multiple")}))
+
+
+def test_a_boundary_of_another_index_than_the_medium_is_refused():
+    bsdf = {**surface(), "boundary": {"type": "dielectric", "int_ior": 1.9, "ext_ior": 1.0}}
+    refused("boundary must be a dielectric", view({**SPHERE, "bsdf": bsdf}))
+
+
+def test_a_camera_inside_the_object_is_refused():
+    refused("camera must be outside", view({**SPHERE, "bsdf": surface()}, distance=1.0))
+
+
+def test_a_scene_without_translucent_object_is_refused():
+    refused("must have an object with a translucent BSDF", view(SPHERE))
+
+
+@pytest.mark.parametrize("settings", [{"mm_per_unit": 0.0}, {"geometry": "round"}, {"area_share": 1.5},
+                                      {"max_depth": 0}, {"rr_depth": 0}])  # fmt: skip
+def test_settings_out_of_range_are_refused_by_name(settings):
+    refused(next(iter(settings)), view({**SPHERE, "bsdf": surface()}, **settings))
+
+
+@pytest.mark.parametrize("factor", [1e-3, 1e3])
+def test_units_wrong_by_a_thousand_are_warned_of_with_the_size_in_mean_free_paths(factor):
+    scene = view({**SPHERE, "bsdf": surface()}, mm_per_unit=factor)
+    with pytest.warns(UserWarning, match="mean free paths across"):
+        render(scene, 1)
+
+
+def test_an_object_with_a_hole_is_warned_of():
+    with pytest.warns(UserWarning, match="not closed"):
+        render(view({"type": "cylinder", "radius": 4.0, "bsdf": surface()}), 1)
+
+
+@pytest.mark.parametrize(
+    "medium",
+    [
+        {**MEDIUM, "eta": 1.0},
+        {"sigma_s": "1.0, 0.0, 0.5", "sigma_a": 0.2, "g": 0.0, "eta": 1.3},
+        {"sigma_s": 1e-3, "sigma_a": 1e-4, "g": 0.0, "eta": 1.3},
+        {"sigma_s": 400.0, "sigma_a": 1e-4, "g": 0.9, "eta": 1.5},
+    ],
+    ids=["eta 1", "one channel without scattering", "smaller than a mean free path", "many mean free paths"],
+)
+@pytest.mark.parametrize("orders", ["total", "single"])
+def test_media_at_the_edge_stay_finite_and_not_negative(medium, orders):
+    image = quietly(view({**SPHERE, "bsdf": {**surface(orders=orders, medium=medium), "reflection": True}}))
+    assert np.isfinite(image).all() and image.min() >= 0
+
+
+def test_a_channel_without_scattering_is_black():
+    medium = {"sigma_s": "1.0, 0.0, 0.5", "sigma_a": 0.2, "g": 0.0, "eta": 1.3}
+    image = quietly(view({**SPHERE, "bsdf": surface(orders="total", medium=medium)}), 16)
+    middle = image[6:10, 6:10].mean(axis=(0, 1))
+    assert middle[1] == 0 and middle[0] > 0.1 and middle[2] > 0.05
+
+
+def test_flipped_normals_of_a_closed_object_change_nothing():
+    flipped = [quietly(view({**SPHERE, "flip_normals": flip, "bsdf": surface()}), 64) for flip in (False, True)]
+    assert np.allclose(*(image.mean(axis=(0, 1)) for image in flipped), rtol=0.01)
+
+
+def test_many_samples_do_not_hang():
+    image = quietly(view({**SPHERE, "bsdf": surface()}, n=8), 4096)
+    assert np.isfinite(image).all()
+
+
+def test_objects_of_different_models_stand_side_by_side_with_ordinary_ones():
+    at = mi.ScalarTransform4f()
+    scene = view({**SPHERE, "radius": 1.5, "bsdf": surface("standard_dipole")}, n=24)
+    scene["other"] = {"type": "sphere", "center": [3.2, 0, 0], "radius": 1.5, "bsdf": surface("better_dipole")}
+    floor = at.translate([0, 0, -3]).scale(8.0)
+    scene["floor"] = {"type": "rectangle", "to_world": floor, "bsdf": {"type": "diffuse"}}
+    image = quietly(scene, 16)
+    assert np.isfinite(image).all() and image.std() > 0.01
+
+
+def test_a_variant_switch_keeps_the_plugins():
+    for variant in ("llvm_ad_mono", "scalar_rgb", "llvm_ad_rgb"):
+        mi.set_variant(variant)
+    assert np.isfinite(quietly(view({**SPHERE, "bsdf": surface()}))).all()
+
+
+def test_other_integrators_see_the_reflection_only():
+    scene = view({**SPHERE, "bsdf": {**surface(), "reflection": True}}, hide_emitters=True, n=24)
+    scene["integrator"] = {"type": "path", "hide_emitters": True}
+    image = quietly(scene, 64)
+    F = ((1.4 - 1) / (1.4 + 1)) ** 2
+    assert abs(image[11:13, 11:13].mean() - F) < 0.1 * F
+
+
+def test_a_lamp_lights_a_sphere_by_single_scattering_as_in_the_walk():
+    """Connections through the curved boundary against walks that find the lamp by chance; the walk alone counts light
+    that is reflected inside on its way, next to nothing at this index."""
+    medium = {**MEDIUM, "eta": 1.08}
+    lamp = {"type": "sphere", "center": [12, 3, 12], "radius": 4.0, "emitter": {"type": "area", "radiance": 3.0}}
+    bsdf = surface(orders="single", medium=medium)
+    scene = view({**SPHERE, "bsdf": bsdf}, lamp, n=12, hide_emitters=True, max_depth=2)
+    connected = quietly(scene, 1024)
+    walked = quietly({**scene, "integrator": {"type": "translucent_walk", "hide_emitters": True}}, 4096)
+    lit = walked.mean(axis=2) > 0.1 * walked.max()
+    assert abs(connected[lit].mean() / walked[lit].mean() - 1) < 0.02
+
+
+def test_the_environment_may_have_any_colour():
+    sky = {"type": "constant", "radiance": {"type": "rgb", "value": [1.0, 0.5, 0.0]}}
+    image = quietly(view({**SPHERE, "bsdf": surface()}, sky, hide_emitters=True), 16)
+    mean = image.mean(axis=(0, 1))
+    assert mean[2] == 0 and abs(mean[1] / mean[0] - 0.5) < 0.01
+
+
+def test_the_command_renders_a_file_and_refuses_a_wrong_model(tmp_path):
+    file = tmp_path / "ball.xml"
+    file.write_text(XML)
+    run = [*START, "render", str(file), "--spp", "4", "--out", str(tmp_path / "out")]
+    done = subprocess.run(run, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert sorted(p.suffix for p in (tmp_path / "out").iterdir()) == [".exr", ".json", ".png"]
+    wrong = subprocess.run([*run[:-1], str(tmp_path / "none"), "--model", "neurl"], capture_output=True, text=True)
+    assert wrong.returncode == 2 and "did you mean 'neural'" in wrong.stderr
+    assert not (tmp_path / "none").exists()
+
+
+XML = """<scene version="3.0.0">
+  <integrator type="bssrdf"><integer name="max_depth" value="3"/></integrator>
+  <emitter type="constant"/>
+  <shape type="sphere"><float name="radius" value="5"/>
+    <bsdf type="translucent"><string name="material" value="marble"/><string name="model" value="better_dipole"/></bsdf>
+  </shape>
+  <sensor type="perspective"><float name="fov" value="20"/>
+    <transform name="to_world"><lookat origin="0,0,40" target="0,0,0" up="0,1,0"/></transform>
+    <film type="hdrfilm"><integer name="width" value="16"/><integer name="height" value="16"/></film>
+  </sensor>
+</scene>
+"""
+
+
+def test_sunlight_is_visible_only_where_nothing_stands_in_its_way():
+    at = mi.ScalarTransform4f()
+    scene = plane_scene(surface(), sun(0.0, 0.0), 30.0)
+    scene["shade"] = {"type": "rectangle", "to_world": at.translate([0, 0, 50]).scale(200.0)}
+    assert quietly(scene).max() == 0

@@ -1,0 +1,62 @@
+"""Traced curves: their integral, symmetry, errors and repeatability. Seeds and significance as in test_tracer.py."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from traced import MEDIA, check_spread, z
+
+from halfspace_sss import Medium, trace
+from halfspace_sss.tracing.curve_tracing import trace_curve
+from halfspace_sss.tracing.passes import Estimate
+
+
+@pytest.fixture(scope="module", params=MEDIA)
+def medium(request) -> Medium:
+    return MEDIA[request.param]
+
+
+@pytest.mark.parametrize(("mu_i", "mu_o", "delta_phi"), [(1.0, 1.0, 0.0), (0.8, 0.9, math.pi), (0.8, 0.9, 1.1)])
+def test_curves_integrate_to_the_angular_reflectance_of_the_multiple_order(medium, mu_i, mu_o, delta_phi):
+    edges = np.concatenate([[0.0], np.geomspace(1e-2, 200, 12)]) * medium.mfp
+    curve = trace_curve(medium, mu_i, mu_o, delta_phi, 0.0, edges, math.pi, 200_000, 81)
+    area = np.pi * np.diff(edges**2)
+    whole = Estimate(np.sum(curve.S * area), np.sum(curve.standard_error * area))  # the cells share their walks
+    angular = trace(medium, mu_i, 200_000, 82, directions=[(mu_o, delta_phi)]).angular_reflectance("multiple")
+    assert abs(z(angular, whole)[0]) < 4 and whole.standard_error < 0.05 * whole.value
+
+
+def test_curves_on_both_sides_of_the_plane_of_incidence_agree(medium):
+    edges = np.array([0.2, 0.5, 1.0, 2.0]) * medium.mfp
+    a = trace_curve(medium, 0.8, 0.9, 1.0, 0.7, edges, 0.4, 200_000, 83)
+    b = trace_curve(medium, 0.8, 0.9, -1.0, -0.7, edges, 0.4, 200_000, 84)
+    assert np.all(np.abs(z((a.S, a.standard_error), (b.S, b.standard_error))) < 4)
+
+
+def test_the_same_seed_gives_the_same_curve_and_another_seed_another_one():
+    a, b, c = (trace_curve(MEDIA["denser"], 0.6, 0.5, 0.3, 1.0, [0.1, 1.0, 2.0], 0.3, 30_000, s) for s in (1, 1, 2))
+    assert a.S.tobytes() == b.S.tobytes() and a.S.tobytes() != c.S.tobytes()
+
+
+def test_standard_errors_of_curves_are_the_spread_of_independent_runs():
+    edges = [0.05, 0.2, 1.0]
+    runs = [trace_curve(MEDIA["denser"], 0.7, 0.6, 1.0, 2.0, edges, 0.5, 32_768, k) for k in range(20)]
+    check_spread(tuple(r.S for r in runs), tuple(r.standard_error for r in runs))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "parameter", "bound", "value"),
+    [
+        ({"half_width": 4.0}, "half_width", "3.14", "4.0"),
+        ({"mu_o": -0.1}, "mu_o", r"\[0, 1\]", "-0.1"),
+        ({"line_phi": math.inf}, "line_phi", "finite", "inf"),
+        ({"delta_phi": math.nan}, "delta_phi", "finite", "nan"),
+        ({"mu_i": "diffuse"}, "mu_i", r"\[0, 1\]", "diffuse"),
+    ],
+)
+def test_bad_input_to_a_curve_is_refused_with_name_bound_and_value(arguments, parameter, bound, value):
+    given = {"mu_i": 0.5, "mu_o": 0.5, "delta_phi": 0.0, "line_phi": 0.0, "r_edges": [0.1, 1.0], "n_paths": 1024}
+    with pytest.raises(ValueError, match=f"{parameter} must be.*({bound}).*{value}"):
+        trace_curve(MEDIA["matched"], **(given | arguments))
