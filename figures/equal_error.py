@@ -12,10 +12,9 @@ from figures.computing.denoise import guides
 from figures.computing.furnace import furnace, furnace_models
 from figures.computing.model_inputs import weight_files
 from figures.computing.sampling_cost import split
-from figures.computing.scenes import BUNNY
+from figures.computing.scenes import BUNNY, MATERIALS, prepare
 from figures.computing.timed import Timed, alternating, rendered
 from figures.drawing import error_tables
-from figures.fig09 import MATERIALS, prepare
 from figures.parts.part import Part, Result, Task
 from halfspace_sss import materials
 

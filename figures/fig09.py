@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import gc
 import time
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
+from figures.computing.contenders import MODELS
 from figures.computing.model_inputs import weight_files
-from figures.computing.scenes import BUNNY, bunny_scene
+from figures.computing.scenes import BUNNY, MATERIALS, bunny_scene, prepare
 from figures.drawing.image_grid import image_grid
 from figures.drawing.page import page
 from figures.drawing.shot import Shot, absent, compared
@@ -22,8 +22,6 @@ from halfspace_sss.provenance import check_folder
 __all__ = ["TITLE", "draw", "parts", "path_traced", "rendered"]
 
 TITLE = "five materials, path traced and by five models, with FLIP"
-MATERIALS = ("marble", "apple", "potato", "ketchup", "regular chocolate milk")
-MODELS = ("standard_dipole", "better_dipole", "directional_dipole", "photon_beam_diffusion", "neural")
 SIZES = {"draft": 96, "paper": 384}
 MODEL_SPP = {"draft": 100, "paper": 576}  # of each of two passes; square numbers, for the sampler
 TRUTH_SPP = {"draft": 192, "paper": 8192}
@@ -51,21 +49,6 @@ def parts(quality: str) -> list[Part]:
             weights = weight_files(model, materials.load(material).medium)
             found.append(Part(f"{material}, {model}", rendered, params, 2 * spp * size**2, inputs=(BUNNY, *weights)))
     return found
-
-
-def prepare() -> None:
-    """Set the variant of Mitsuba that the figures use, and register the plugins.
-
-    Scenes of earlier parts are freed, so that the objects of the next get their numbers, and it their kernels.
-    """
-    import mitsuba as mi
-
-    from halfspace_sss import rendering
-
-    if mi.variant() != "llvm_ad_rgb":
-        mi.set_variant("llvm_ad_rgb")
-    rendering.register()
-    gc.collect()
 
 
 def path_traced(task: Task) -> dict[str, Any]:

@@ -7,16 +7,16 @@ from typing import Any
 
 import numpy as np
 
-from figures.computing.contenders import MODELS, VOLUMES, WALK, contender, label, long_walk
+from figures.computing.contenders import MODELS, VOLUMES, WALK, contender, long_walk
 from figures.computing.denoise import check_denoiser, denoised, guides
 from figures.computing.model_inputs import weight_files
-from figures.computing.scenes import BUNNY
+from figures.computing.scenes import BUNNY, prepare
 from figures.computing.timed import Timed, alternating, pass_size
+from figures.drawing.error_tables import label
 from figures.drawing.image_grid import image_grid
 from figures.drawing.page import page
 from figures.drawing.shot import FLIP, RELATIVE_MSE, Shot, compared
 from figures.drawing.style import paper, saved
-from figures.fig09 import prepare
 from figures.parts.part import Part, Result, Task
 from halfspace_sss import materials
 

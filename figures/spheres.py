@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from figures.computing.contenders import MODELS
 from figures.computing.model_inputs import weight_files
+from figures.computing.scenes import prepare
 from figures.drawing.style import COLUMN, look, paper, saved
-from figures.fig09 import MODELS, prepare
 from figures.parts.part import Part, Result, Task
 from halfspace_sss.physics.medium import Medium
 

@@ -8,21 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from halfspace_sss.physics.medium import Medium
-
-__all__ = ["check_count", "check_edges", "check_finite", "check_interval", "check_query", "check_scalar_medium"]
+__all__ = ["check_count", "check_edges", "check_finite", "check_interval", "check_query"]
 
 
 def _plain(value: Any) -> Any:
     """The value as messages show it: NumPy's numbers as Python's."""
     return value.item() if isinstance(value, np.generic) else value
-
-
-def check_scalar_medium(medium: Any) -> None:
-    if not isinstance(medium, Medium):
-        raise ValueError(f"medium must be a Medium, got {type(medium).__name__}")
-    if medium.n_channels is not None:
-        raise ValueError(f"medium must have one channel (take medium.channel(k)), got {medium.n_channels} channels")
 
 
 def check_count(name: str, value: Any, least: int) -> None:

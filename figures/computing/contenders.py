@@ -6,15 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from figures.computing.scenes import MM_PER_UNIT, bunny_scene
-from figures.drawing.style import look
-from figures.fig09 import prepare
+from figures.computing.scenes import MM_PER_UNIT, bunny_scene, prepare
 from figures.parts.part import Task
 from halfspace_sss.neural.symmetric import channels
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.provenance import check_folder
 
-__all__ = ["MODELS", "RR_DEPTHS", "VOLUMES", "WALK", "contender", "label", "long_walk", "volume"]
+__all__ = ["MODELS", "RR_DEPTHS", "VOLUMES", "WALK", "contender", "long_walk", "volume"]
 
 MODELS = ("standard_dipole", "better_dipole", "directional_dipole", "photon_beam_diffusion", "neural")
 WALK = "translucent_walk"
@@ -72,15 +70,6 @@ def _volume_scene(description: dict[str, Any], medium: Medium, rr_depth: int) ->
         bunny = {**description["bunny"], "bsdf": {"type": "translucent", **values}}
         found.append(with_media({**description, "bunny": bunny}, MM_PER_UNIT, integrator))
     return tuple(found)
-
-
-def label(method: str) -> str:
-    """The name of a method as people read it."""
-    if method in VOLUMES:
-        return f"Mitsuba {_VOLUME}, roulette from {method.split()[1]}"
-    if method == WALK:
-        return "Our walk"
-    return "Neural half-space" if method == "neural" else look(method).label
 
 
 def long_walk(task: Task) -> dict[str, Any]:

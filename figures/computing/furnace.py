@@ -8,7 +8,7 @@ import numpy as np
 
 from figures.computing.contenders import WALK
 from figures.computing.model_inputs import accepting
-from figures.fig09 import prepare
+from figures.computing.scenes import prepare
 from figures.parts.part import Task
 from halfspace_sss.physics.medium import Medium
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from figures.computing.contenders import contender
-from figures.fig09 import prepare
+from figures.computing.scenes import prepare
 from figures.parts.part import Task
 
 __all__ = ["split"]

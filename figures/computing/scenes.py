@@ -2,16 +2,33 @@
 
 from __future__ import annotations
 
+import gc
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-__all__ = ["BUNNY", "MM_PER_UNIT", "bunny_scene", "surroundings"]
+__all__ = ["BUNNY", "MATERIALS", "MM_PER_UNIT", "bunny_scene", "prepare", "surroundings"]
 
 BUNNY = Path(__file__).parent.parent / "assets" / "bunny.ply"
 MM_PER_UNIT = 3.8  # the bunny is 37 mm tall
+MATERIALS = ("marble", "apple", "potato", "ketchup", "regular chocolate milk")
 LIGHTS = ("both", "small light", "even sky")
+
+
+def prepare() -> None:
+    """Set the variant of Mitsuba that the figures use, and register the plugins.
+
+    Scenes of earlier parts are freed, so that the objects of the next get their numbers, and it their kernels.
+    """
+    import mitsuba as mi
+
+    from halfspace_sss import rendering
+
+    if mi.variant() != "llvm_ad_rgb":
+        mi.set_variant("llvm_ad_rgb")
+    rendering.register()
+    gc.collect()
 
 
 def bunny_scene(

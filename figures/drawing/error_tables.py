@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from figures.computing.contenders import VOLUMES, WALK, label, volume
+from figures.computing.contenders import VOLUMES, WALK, volume
 from figures.drawing.style import look
 
 if TYPE_CHECKING:
     import pandas
 
-__all__ = ["asked", "equal_error", "furnace", "markdown", "sampling"]
+__all__ = ["asked", "equal_error", "furnace", "label", "markdown", "sampling"]
 
 ASKED = {  # times less time than volpathmis that a dipole without reflection is to need
     ("marble", "small light"): 5000.0,
@@ -40,6 +40,16 @@ BARE_NOTES = """\
 The models without surface reflection and without added single scattering, as the prototype was measured, against
 `volpathmis` at its best setting and at rr_depth 200, which the prototype took. Asked for the dipoles, half of it for
 the neural model."""
+
+
+def label(method: str) -> str:
+    """The name of a method as people read it."""
+    if method in VOLUMES:
+        kind, rr_depth = method.split()
+        return f"Mitsuba {kind}, roulette from {rr_depth}"
+    if method == WALK:
+        return "Our walk"
+    return "Neural half-space" if method == "neural" else look(method).label
 
 
 def asked(material: str, lights: str, method: str) -> float | None:

@@ -160,7 +160,7 @@ class BSSRDF(abc.ABC):
     @functools.cached_property
     def _radial_samplers(self) -> list[RadialSampler]:
         media = [self.medium.in_mfp().channel(k) for k in range(self.medium.n_channels or 1)]
-        return [RadialSampler(self.for_medium(m)) for m in media]
+        return [RadialSampler(self.for_medium(m).eval) for m in media]
 
     def for_medium(self, medium: Medium) -> BSSRDF:
         """The same model, with the same options, of another medium; models with options override it."""

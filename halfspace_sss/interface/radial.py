@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
-
-if TYPE_CHECKING:
-    from halfspace_sss.interface.model import BSSRDF
 
 __all__ = ["RadialSampler"]
 
@@ -24,18 +22,18 @@ class RadialSampler:
     r_max / r², which covers the plane also where a profile falls as r⁻³ (no absorption).
 
     Args:
-        model: a model of a scalar medium with sigma_t = 1.
+        S: `BSSRDF.eval` of a model of a scalar medium with sigma_t = 1.
     """
 
-    def __init__(self, model: BSSRDF, n_cells: int = 256) -> None:
+    def __init__(self, S: Callable[..., Any], n_cells: int = 256) -> None:
         r = np.geomspace(R_MIN, R_MAX, 2 * n_cells)
-        mass = r * r * _profile(model, r)
+        mass = r * r * _profile(S, r)
         top = max(float(mass.max()), 1e-300)
         beyond = np.nonzero(mass > 1e-7 * top)[0]
         r_max = r[min(beyond[-1] + 1, len(r) - 1)] if len(beyond) else 1.0
         self.edges = np.concatenate([[0.0], np.geomspace(R_MIN, r_max, n_cells)])
         middle = np.concatenate([[0.5 * R_MIN], np.sqrt(self.edges[1:-1] * self.edges[2:])])
-        weight = middle * _profile(model, middle) * np.diff(self.edges)
+        weight = middle * _profile(S, middle) * np.diff(self.edges)
         if not weight.sum() > 0:
             weight = np.diff(np.log(np.maximum(self.edges, 0.5 * R_MIN)))
         probability = np.append((1 - TAIL_MASS) * weight / weight.sum(), TAIL_MASS)
@@ -64,10 +62,10 @@ class RadialSampler:
         return lib.like(density * ratio * ratio / (2 * math.pi * lib.maximum(r64, 1e-12)), r)
 
 
-def _profile(model: BSSRDF, r: np.ndarray) -> np.ndarray:
+def _profile(S: Callable[..., Any], r: np.ndarray) -> np.ndarray:
     """∫ S mu_i dw_i over directions of incidence at steep exit, averaged over azimuths: what positions follow."""
     mu_i = np.array([0.95, 0.7, 0.4])
     phi = np.linspace(0, math.pi, 5)
-    S = model.eval(r[:, None, None], mu_i[:, None], phi, 0.9, 0.5 * math.pi)
-    S = np.where(np.isfinite(S), S, 0.0)
-    return (S * mu_i[:, None]).mean(axis=(1, 2))
+    values = S(r[:, None, None], mu_i[:, None], phi, 0.9, 0.5 * math.pi)
+    values = np.where(np.isfinite(values), values, 0.0)
+    return (values * mu_i[:, None]).mean(axis=(1, 2))

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from halfspace_sss.neural.hypernetwork import RANGES
+__all__ = ["RANGES", "draw_media"]
 
-__all__ = ["draw_media"]
-
+RANGES = {"albedo": (0.0, 1.0), "g": (-0.5, 0.98), "eta": (1.0, 2.0)}  # what the shipped weights were trained on
 LEAST_ABSORPTION = 1e-5  # 1 - albedo of the log-uniform half
 
 

@@ -7,14 +7,11 @@ import numbers
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from halfspace_sss.interface.model import BSSRDF, bssrdf, models
 from halfspace_sss.physics.medium import Medium
-
-if TYPE_CHECKING:
-    from halfspace_sss.interface.model import BSSRDF
 
 __all__ = ["Material", "key_of"]
 
@@ -123,9 +120,7 @@ class Material:
 
     def models(self) -> tuple[str, ...]:
         """Names of the models that `bssrdf` can make for this material; a model that refuses its medium is left out."""
-        import halfspace_sss
-
-        return tuple(name for name in halfspace_sss.models() if self._accepted_by(name))
+        return tuple(name for name in models() if self._accepted_by(name))
 
     def bssrdf(self, model: str) -> BSSRDF:
         """The BSSRDF of this material by the model of that name.
@@ -133,9 +128,7 @@ class Material:
         Raises:
             ValueError: there is no such model, or it refuses the medium.
         """
-        import halfspace_sss
-
-        return halfspace_sss.bssrdf(model, self.medium)
+        return bssrdf(model, self.medium)
 
     def _accepted_by(self, model: str) -> bool:
         try:

@@ -8,14 +8,13 @@ from typing import Any
 import numpy as np
 
 from halfspace_sss.arrays import library
+from halfspace_sss.maps.media import RANGES
 from halfspace_sss.neural.features import N_FEATURES, medium_features
 from halfspace_sss.neural.network import Network, layer_shapes
 from halfspace_sss.physics.backbone import length_scale
 from halfspace_sss.physics.medium import Medium
 
-__all__ = ["RANGES", "Hypernetwork", "check_range", "in_range"]
-
-RANGES = {"albedo": (0.0, 1.0), "g": (-0.5, 0.98), "eta": (1.0, 2.0)}  # what the shipped weights were trained on
+__all__ = ["Hypernetwork", "check_range", "in_range"]
 
 
 def check_range(medium: Medium) -> None:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numbers
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-__all__ = ["Medium", "check_ratios"]
+__all__ = ["Medium", "check_ratios", "check_scalar_medium"]
 
 
 def _check(name: str, value: np.ndarray, ok: np.ndarray, bound: str) -> None:
@@ -182,3 +183,10 @@ class Medium:
 
     def __hash__(self) -> int:
         return hash(tuple(np.asarray(getattr(self, n)).tobytes() for n in ("sigma_s", "sigma_a", "g", "eta")))
+
+
+def check_scalar_medium(medium: Any) -> None:
+    if not isinstance(medium, Medium):
+        raise ValueError(f"medium must be a Medium, got {type(medium).__name__}")
+    if medium.n_channels is not None:
+        raise ValueError(f"medium must have one channel (take medium.channel(k)), got {medium.n_channels} channels")

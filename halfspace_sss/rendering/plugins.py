@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from halfspace_sss.backend import BackendError
+from halfspace_sss.rendering.surface.variants import VARIANTS, variant_channels
 
-__all__ = ["register", "variant_channels"]
+__all__ = ["register"]
 
 _active = False
 
@@ -28,22 +29,8 @@ def register() -> None:
         _active = True
 
 
-def variant_channels() -> int:
-    """3 under an RGB variant of Mitsuba, 1 under a mono one.
-
-    Raises:
-        ValueError: no variant is set, or another kind is.
-    """
-    import mitsuba as mi
-
-    variant = mi.variant()
-    if variant not in ("llvm_ad_rgb", "cuda_ad_rgb", "llvm_ad_mono", "cuda_ad_mono"):
-        raise ValueError(f"variant must be llvm_ad_ or cuda_ad_ with rgb or mono, got {variant!r}")
-    return 3 if variant.endswith("rgb") else 1
-
-
 def _on_variant(old: str, new: str) -> None:
-    if new in ("llvm_ad_rgb", "cuda_ad_rgb", "llvm_ad_mono", "cuda_ad_mono"):
+    if new in VARIANTS:
         _register_all()
 
 

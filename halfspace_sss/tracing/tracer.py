@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from halfspace_sss.backend import array_types
-from halfspace_sss.checks import check_count, check_edges, check_finite, check_interval, check_scalar_medium
+from halfspace_sss.checks import check_count, check_edges, check_finite, check_interval
 from halfspace_sss.physics.fresnel import F_t
-from halfspace_sss.physics.medium import Medium
+from halfspace_sss.physics.medium import Medium, check_scalar_medium
 from halfspace_sss.tracing.passes import Estimate, Progress, estimate, walk_passes
 from halfspace_sss.tracing.tallies import AngularTally, FluxTally, MomentTally, RingTally
 from halfspace_sss.tracing.walk import Tally

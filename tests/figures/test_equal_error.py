@@ -14,10 +14,9 @@ from figures import equal_error
 from figures.computing.contenders import MODELS, VOLUMES, WALK, contender
 from figures.computing.furnace import furnace, furnace_models
 from figures.computing.sampling_cost import STEPS
-from figures.computing.scenes import MM_PER_UNIT
+from figures.computing.scenes import MM_PER_UNIT, prepare
 from figures.computing.timed import Timed, rendered
 from figures.drawing import error_tables
-from figures.fig09 import prepare
 from figures.parts.part import Part, Result, Task
 from halfspace_sss import materials
 

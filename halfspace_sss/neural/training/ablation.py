@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from halfspace_sss.backend import array_types
-from halfspace_sss.checks import check_count, check_scalar_medium
+from halfspace_sss.checks import check_count
 from halfspace_sss.comparison.model_errors import Reference, model_error, reference_maps
 from halfspace_sss.maps.noisy_maps import Progress, draw_directions, make_pool
 from halfspace_sss.neural.hypernetwork import in_range
@@ -22,7 +22,7 @@ from halfspace_sss.neural.training.fit import Fit
 from halfspace_sss.neural.training.pool import MapPool
 from halfspace_sss.neural.training.subjects import MaterialSubject, PaperSubject
 from halfspace_sss.neural.training.train_material import BLOCK, STANDARD, VALIDATION_SEED, MaterialRecipe
-from halfspace_sss.physics.medium import Medium
+from halfspace_sss.physics.medium import Medium, check_scalar_medium
 
 if TYPE_CHECKING:
     import pandas

@@ -13,9 +13,8 @@ import numpy as np
 
 from halfspace_sss.backend import array_types
 from halfspace_sss.checks import check_count, check_interval
-from halfspace_sss.maps.media import draw_media
+from halfspace_sss.maps.media import RANGES, draw_media
 from halfspace_sss.maps.noisy_maps import CellGrid, Progress, draw_directions, looking_back, make_pool
-from halfspace_sss.neural.hypernetwork import RANGES
 from halfspace_sss.neural.store import save_weights
 from halfspace_sss.neural.training.fit import Fit, fit
 from halfspace_sss.neural.training.learners import Hyper

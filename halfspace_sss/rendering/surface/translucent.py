@@ -33,7 +33,7 @@ from halfspace_sss import materials
 from halfspace_sss.interface.model import models
 from halfspace_sss.materials.channels import one_channel
 from halfspace_sss.physics.medium import Medium
-from halfspace_sss.rendering.plugins import variant_channels
+from halfspace_sss.rendering.surface.variants import variant_channels
 
 __all__ = ["ORDERS", "Inside", "translucent_class"]
 
