@@ -19,10 +19,10 @@ Conventions, kept by every part of the library:
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from halfspace_sss.backend import prefer_bundled_llvm
+from halfspace_sss.lazy import lazy_names
 
 __version__ = "0.1.0"
 
@@ -36,17 +36,6 @@ if TYPE_CHECKING:
 
 prefer_bundled_llvm()
 
-_HOME = {
-    "BSSRDF": "interface.model",
-    "Medium": "physics.medium",
-    "bssrdf": "interface.model",
-    "curves": "comparison.reflectance_curves",
-    "make_maps": "maps.store",
-    "models": "interface.model",
-    "register_model": "interface.model",
-    "trace": "tracing.tracer",
-}
-_SUBMODULES = ("materials", "measure", "neural")
 __all__ = [
     "BSSRDF",
     "Medium",
@@ -61,14 +50,19 @@ __all__ = [
     "trace",
 ]
 
-
-def __getattr__(name: str) -> Any:
-    if name in _SUBMODULES:
-        return importlib.import_module(f"halfspace_sss.{name}")
-    if name in _HOME:
-        return getattr(importlib.import_module(f"halfspace_sss.{_HOME[name]}"), name)
-    raise AttributeError(f"module 'halfspace_sss' has no attribute {name!r}")
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+__getattr__, __dir__ = lazy_names(
+    __name__,
+    {
+        "BSSRDF": "interface.model",
+        "Medium": "physics.medium",
+        "bssrdf": "interface.model",
+        "curves": "comparison.reflectance_curves",
+        "make_maps": "maps.store",
+        "materials": "",
+        "measure": "",
+        "models": "interface.model",
+        "neural": "",
+        "register_model": "interface.model",
+        "trace": "tracing.tracer",
+    },
+)

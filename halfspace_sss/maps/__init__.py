@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from halfspace_sss.lazy import lazy_names
 
 if TYPE_CHECKING:
     from halfspace_sss.maps.grid import MapGrid
@@ -11,10 +12,4 @@ if TYPE_CHECKING:
 
 __all__ = ["MapGrid", "load_maps", "make_maps"]
 
-_HOME = {"MapGrid": "grid", "load_maps": "store", "make_maps": "store"}
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOME:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)
+__getattr__, __dir__ = lazy_names(__name__, {"MapGrid": "grid", "load_maps": "store", "make_maps": "store"})

@@ -10,8 +10,9 @@ torch, evaluation does not.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from halfspace_sss.lazy import lazy_names
 from halfspace_sss.neural.material_model import NeuralMaterial
 from halfspace_sss.neural.paper_model import NeuralPaper
 from halfspace_sss.neural.universal import Neural
@@ -23,10 +24,4 @@ __all__ = ["MODELS", "Neural", "NeuralMaterial", "NeuralPaper", "train", "train_
 
 MODELS = [Neural, NeuralMaterial, NeuralPaper]
 
-
-def __getattr__(name: str) -> Any:
-    if name in ("train", "train_universal"):
-        from halfspace_sss.neural.training import recipes
-
-        return getattr(recipes, name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+__getattr__, __dir__ = lazy_names(__name__, {"train": "training.recipes", "train_universal": "training.recipes"})

@@ -10,15 +10,13 @@ Plugins: the surface `translucent` (which material, model and scattering orders 
 
 from __future__ import annotations
 
-import importlib
-from typing import Any
+from typing import TYPE_CHECKING
+
+from halfspace_sss.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from halfspace_sss.rendering.plugins import register
 
 __all__ = ["register"]
 
-_HOME = {"register": "plugins"}
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOME:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)
+__getattr__, __dir__ = lazy_names(__name__, {"register": "plugins"})

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from halfspace_sss.lazy import lazy_names
 
 if TYPE_CHECKING:
     from halfspace_sss.neural.training.fit import Fit
@@ -18,9 +19,4 @@ if TYPE_CHECKING:
 
 __all__ = ["FAST", "STANDARD", "Fit", "MaterialRecipe", "UniversalRecipe", "train", "train_universal"]
 
-
-def __getattr__(name: str) -> Any:
-    if name not in __all__:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    home = "fit" if name == "Fit" else "recipes"
-    return getattr(importlib.import_module(f"{__name__}.{home}"), name)
+__getattr__, __dir__ = lazy_names(__name__, {name: "fit" if name == "Fit" else "recipes" for name in __all__})
