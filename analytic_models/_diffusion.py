@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from halfspace_sss.checks import check_choice
 from halfspace_sss.physics import fresnel
 from halfspace_sss.physics.medium import Medium
 
@@ -34,8 +35,7 @@ class Boundary:
     @staticmethod
     def of(eta: float, moments: str = "exact") -> Boundary:
         """With moments by quadrature ("exact"), or by the polynomials printed in papers ("published", eta <= 2.5)."""
-        if moments not in MOMENTS:
-            raise ValueError(f"moments must be one of {', '.join(MOMENTS)}, got {moments!r}")
+        check_choice("moments", moments, MOMENTS)
         if moments == "exact":
             return Boundary(fresnel.C_phi(eta), fresnel.C_E(eta), 4 * fresnel.C_phi(1 / eta))
         two_C_1, three_C_2 = fresnel.published_polynomial_2C_1, fresnel.published_polynomial_3C_2

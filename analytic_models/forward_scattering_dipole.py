@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from analytic_models._diffusion import unit_gauss
+from halfspace_sss.checks import check_choice
 from halfspace_sss.interface.model import BSSRDF, Query
 from halfspace_sss.physics.fresnel import boundary_A
 from halfspace_sss.physics.medium import Medium
@@ -118,8 +119,7 @@ class ForwardScatteringDipole(BSSRDF):
             raise ValueError(f"g must be >= 0 for the forward-scattering dipole, got {float(np.min(medium.g))!r}")
         if not (isinstance(n_samples, int) and 2 <= n_samples <= 1000):
             raise ValueError(f"n_samples must be an integer in [2, 1000], got {n_samples!r}")
-        if virtual_source not in VIRTUAL_SOURCES:
-            raise ValueError(f"virtual_source must be one of {', '.join(VIRTUAL_SOURCES)}, got {virtual_source!r}")
+        check_choice("virtual_source", virtual_source, VIRTUAL_SOURCES)
         self.n_samples, self.virtual_source, self.radiance_scaling = n_samples, virtual_source, bool(radiance_scaling)
         m = medium.in_mfp()
         self._p = np.maximum(0.5 * m.sigma_s * (1 - m.g), 1e-12)

@@ -6,6 +6,7 @@ import math
 from typing import Any
 
 from analytic_models._diffusion import Boundary, Grosjean, safe_differences, unit_gauss
+from halfspace_sss.checks import check_choice
 from halfspace_sss.interface.model import BSSRDF, Query
 from halfspace_sss.physics.medium import Medium
 
@@ -47,8 +48,7 @@ class PhotonBeamDiffusion(BSSRDF):
         super().__init__(medium)
         if not (isinstance(n_samples, int) and 2 <= n_samples <= 1000):
             raise ValueError(f"n_samples must be an integer in [2, 1000], got {n_samples!r}")
-        if kappa not in KAPPAS:
-            raise ValueError(f"kappa must be one of {', '.join(KAPPAS)}, got {kappa!r}")
+        check_choice("kappa", kappa, KAPPAS)
         self.n_samples, self.kappa, self.moments = n_samples, kappa, moments
         self._boundary = Boundary.of(medium.eta, moments)
         self._c = Grosjean(medium, self._boundary)

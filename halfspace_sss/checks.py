@@ -2,18 +2,45 @@
 
 from __future__ import annotations
 
+import difflib
 import math
 import numbers
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
 
-__all__ = ["check_count", "check_edges", "check_finite", "check_interval", "check_query"]
+__all__ = [
+    "check_choice",
+    "check_count",
+    "check_edges",
+    "check_finite",
+    "check_interval",
+    "check_query",
+    "did_you_mean",
+]
 
 
 def _plain(value: Any) -> Any:
     """The value as messages show it: NumPy's numbers as Python's."""
     return value.item() if isinstance(value, np.generic) else value
+
+
+def did_you_mean(value: Any, known: Iterable[str], most: int = 1) -> str:
+    """The end of a message about an unknown name: the nearest known ones, or nothing if none is near.
+
+    Args:
+        known: names, or a mapping from what is compared to the name that is shown.
+    """
+    shown = dict(known) if isinstance(known, Mapping) else {name: name for name in known}
+    close = difflib.get_close_matches(str(value), shown, n=most)
+    return f"; did you mean {', '.join(repr(shown[key]) for key in close)}?" if close else ""
+
+
+def check_choice(name: str, value: Any, known: Iterable[str]) -> None:
+    known = list(known)
+    if value not in known:
+        raise ValueError(f"{name} must be one of {', '.join(known)}, got {value!r}{did_you_mean(value, known)}")
 
 
 def check_count(name: str, value: Any, least: int) -> None:

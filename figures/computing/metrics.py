@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from figures.computing.tone import check_image, luminance
-from halfspace_sss.checks import check_count, check_interval
+from halfspace_sss.checks import check_choice, check_count, check_interval
 
 __all__ = [
     "PIXELS_PER_DEGREE", "Difference", "exposure_range", "flip_hdr", "flip_ldr", "relative_mse",
@@ -179,5 +179,4 @@ def _checked_range(exposures: tuple[float, float]) -> tuple[float, float]:
 
 
 def _check_tone_mapper(tone_mapper: str) -> None:
-    if tone_mapper not in TONE_CURVES:
-        raise ValueError(f"tone_mapper must be one of {', '.join(TONE_CURVES)}, got {tone_mapper!r}")
+    check_choice("tone_mapper", tone_mapper, TONE_CURVES)

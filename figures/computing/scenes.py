@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from halfspace_sss.checks import check_choice
+
 __all__ = ["BUNNY", "MATERIALS", "MM_PER_UNIT", "bunny_scene", "prepare", "surroundings"]
 
 BUNNY = Path(__file__).parent.parent / "assets" / "bunny.ply"
@@ -49,8 +51,7 @@ def bunny_scene(
     """
     import mitsuba as mi
 
-    if lights not in LIGHTS:
-        raise ValueError(f"lights must be one of {', '.join(LIGHTS)}, got {lights!r}")
+    check_choice("lights", lights, LIGHTS)
     view = mi.ScalarTransform4f().look_at([6, 9, 24], [-0.55, 4.7, 0], [0, 1, 0])
     film = {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}}
     scene: dict[str, Any] = {

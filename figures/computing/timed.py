@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from halfspace_sss.checks import check_count, check_interval
+from halfspace_sss.progress import Progress
 
 __all__ = ["Timed", "alternating", "pass_size", "rendered"]
 
@@ -99,7 +100,7 @@ def _samples_in(seconds: float, found: list[tuple[int, float]]) -> int:
 
 def alternating(
     scenes: Mapping[str, Any], spp: Mapping[str, int], seed: int, *, passes: int | None = None,
-    seconds: float | None = None, progress: Callable[[int, int], None] | None = None,
+    seconds: float | None = None, progress: Progress | None = None,
 ) -> dict[str, Timed]:  # fmt: skip
     """Render scenes in turn, a pass of each, until every one has its passes or its seconds.
 

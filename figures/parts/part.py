@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from halfspace_sss.checks import check_count, check_interval
+from halfspace_sss.checks import check_choice, check_count, check_interval
+from halfspace_sss.progress import Progress
 
 __all__ = ["QUALITIES", "Part", "Result", "Task", "canonical", "check_quality", "keys_of"]
 
@@ -56,7 +57,7 @@ class Task:
     folder: Path
     needed: Mapping[str, Result] = field(default_factory=dict)
     inputs: tuple[Path, ...] = ()
-    progress: Callable[[int, int], None] = _no_progress
+    progress: Progress = _no_progress
 
 
 @dataclass(frozen=True)
@@ -112,8 +113,7 @@ def canonical(value: Any, what: str) -> str:
 
 def check_quality(quality: str) -> None:
     """ValueError unless the quality is "draft" or "paper"."""
-    if quality not in QUALITIES:
-        raise ValueError(f"quality must be one of {', '.join(QUALITIES)}, got {quality!r}")
+    check_choice("quality", quality, QUALITIES)
 
 
 def keys_of(parts: Sequence[Part]) -> dict[str, str]:

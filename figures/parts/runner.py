@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import importlib
 import json
 import time
@@ -15,12 +14,13 @@ import figures
 from figures.parts.part import QUALITIES, Part, Result, Task, check_quality, keys_of
 from figures.parts.projection import Projected, projected
 from figures.parts.store import DamagedPartError, PartStore
+from halfspace_sss.checks import check_choice
+from halfspace_sss.progress import ProgressText
 from halfspace_sss.provenance import check_folder, provenance, write_atomically
 
 __all__ = ["Plan", "compute", "draw", "figure", "plan"]
 
 STEPS = 10_000  # of the bar
-Progress = Callable[[int, int, str], None]  # steps done, steps in all, what is being done
 Say = Callable[[str], None]
 
 
@@ -63,10 +63,7 @@ class Plan:
 
 def figure(name: str) -> ModuleType:
     """The module of a figure; ValueError with the nearest name if there is none."""
-    if name not in figures.FIGURES:
-        close = difflib.get_close_matches(str(name), figures.FIGURES, n=1)
-        hint = f"; did you mean {close[0]!r}?" if close else ""
-        raise ValueError(f"figure must be one of {', '.join(figures.FIGURES)}, got {name!r}{hint}")
+    check_choice("figure", name, figures.FIGURES)
     return importlib.import_module(f"figures.{name}")
 
 
@@ -101,7 +98,7 @@ def plan(name: str, quality: str, out: str | Path) -> Plan:
 
 
 def compute(
-    name: str, quality: str, out: str | Path, progress: Progress | None = None, say: Say | None = None
+    name: str, quality: str, out: str | Path, progress: ProgressText | None = None, say: Say | None = None
 ) -> dict[str, Result]:
     """Compute what is missing, damaged or changed of a figure; finished parts survive an interruption.
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import json
 from collections.abc import Iterator
 from importlib.util import find_spec
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from halfspace_sss.checks import did_you_mean
 from halfspace_sss.cli.shared import Bar, console
 from halfspace_sss.provenance import check_folder, provenance, write_atomically
 
@@ -49,8 +49,7 @@ def chosen_parts(text: str | None) -> list[str]:
     asked = list(PARTS) if text is None else [part.strip() for part in text.split(",")]
     for part in asked:
         if part not in PARTS:
-            close = difflib.get_close_matches(part, PARTS, n=1)
-            hint = f"; did you mean {close[0]!r}?" if close else ""
+            hint = did_you_mean(part, PARTS)
             raise ValueError(f"only must list parts of {', '.join(PARTS)}, got {part!r}{hint}")
     return [part for part in PARTS if part in asked or (part == "walk" and "volpath" in asked)]
 

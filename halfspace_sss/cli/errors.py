@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from halfspace_sss.backend import array_types
+from halfspace_sss.checks import check_choice
 from halfspace_sss.cli.shared import Bar, console, stated_medium
 from halfspace_sss.provenance import check_folder
 
@@ -132,8 +133,7 @@ def _check_models(names: list[str] | None) -> None:
     from halfspace_sss import models
 
     for name in names or ():
-        if name not in models():
-            raise ValueError(f"model must be one of {', '.join(models())}, got {name!r}")
+        check_choice("model", name, models())
 
 
 def _check(names: list[str] | None, events: float, block: int, seed: int) -> None:

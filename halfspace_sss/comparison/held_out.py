@@ -10,8 +10,9 @@ import numpy as np
 from halfspace_sss.comparison.model_errors import Reference, model_error, reference_maps
 from halfspace_sss.interface.model import bssrdf, models
 from halfspace_sss.maps.media import draw_media
-from halfspace_sss.maps.noisy_maps import CellGrid, Progress
+from halfspace_sss.maps.noisy_maps import CellGrid
 from halfspace_sss.physics.medium import Medium
+from halfspace_sss.progress import NamedProgress
 
 if TYPE_CHECKING:
     import pandas
@@ -43,14 +44,17 @@ def held_out_media(n: int, seed: int = 0, as_trained: bool = False) -> list[Medi
 
 def references(
     media: list[Medium], events: float, seed: int = 0, block: int = BLOCK,
-    progress: Progress | None = None, backend: str = "llvm",
+    progress: NamedProgress | None = None, backend: str = "llvm",
 ) -> list[Reference]:  # fmt: skip
     """Traced maps of the media: 128 unseen pairs of directions each, `events` over all."""
     return reference_maps(media, 1, GRID, block, events, (HELD_OUT_SEED, seed), progress, backend)
 
 
 def error_table(
-    labels: Iterable[str], found: list[Reference], names: Iterable[str] | None = None, progress: Progress | None = None
+    labels: Iterable[str],
+    found: list[Reference],
+    names: Iterable[str] | None = None,
+    progress: NamedProgress | None = None,
 ) -> pandas.DataFrame:
     """One row per medium and model that accepts it: error, noise, bias (fractions), error by decade of r in mfp."""
     import pandas

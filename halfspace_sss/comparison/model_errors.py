@@ -16,11 +16,12 @@ import numpy as np
 from halfspace_sss.arrays import library
 from halfspace_sss.comparison.cell_energies import cell_energies
 from halfspace_sss.interface.model import BSSRDF
-from halfspace_sss.maps.noisy_maps import LEAST_ALBEDO, CellGrid, Groups, Progress, make_pool, radial_edges
+from halfspace_sss.maps.noisy_maps import LEAST_ALBEDO, CellGrid, Groups, make_pool, radial_edges
 from halfspace_sss.physics.backbone import unwarp
 from halfspace_sss.physics.fresnel import F_t, mu_internal
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.physics.phase import eval_hg
+from halfspace_sss.progress import NamedProgress
 
 __all__ = ["ModelError", "Reference", "model_error", "reference_maps"]
 
@@ -168,7 +169,7 @@ def reference_maps(
     block: int,
     events: float,
     seed: tuple[int, ...],
-    progress: Progress | None = None,
+    progress: NamedProgress | None = None,
     backend: str = "llvm",
 ) -> list[Reference]:
     """Traced maps of scalar media, each with `n_sets` times 8 directions of incidence times 16 of observation.

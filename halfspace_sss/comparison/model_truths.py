@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,6 +12,7 @@ from halfspace_sss.comparison.truths import Truth, read_truths
 from halfspace_sss.interface.model import BSSRDF, bssrdf, models
 from halfspace_sss.physics import single_scattering
 from halfspace_sss.physics.fresnel import F_r
+from halfspace_sss.progress import NamedProgress
 
 if TYPE_CHECKING:
     import pandas
@@ -20,10 +21,9 @@ __all__ = ["reflectance_truths", "sampled_reflectance", "truth_summary"]
 
 MEASURES = ("R_d", "R_total")
 POINTS, REPEATS = 2**15, 4  # scrambled Sobol points, for models whose S has ridges in azimuth
-Progress = Callable[[str, int, int], None]
 
 
-def reflectance_truths(names: Iterable[str] | None = None, progress: Progress | None = None) -> pandas.DataFrame:
+def reflectance_truths(names: Iterable[str] | None = None, progress: NamedProgress | None = None) -> pandas.DataFrame:
     """One row per true reflectance and model that accepts its medium: truth, model's value at total order, error.
 
     Args:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import numbers
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +20,7 @@ from halfspace_sss.materials.channels import one_channel
 from halfspace_sss.physics import single_scattering
 from halfspace_sss.physics.fresnel import mu_internal
 from halfspace_sss.physics.medium import Medium
+from halfspace_sss.progress import Progress
 from halfspace_sss.tracing.curve_tracing import CurveTrace, trace_curve
 from halfspace_sss.tracing.passes import launch_shape
 from halfspace_sss.tracing.tracer import Trace, trace
@@ -29,7 +30,6 @@ __all__ = ["FIG10_THETA_I", "curves"]
 FIG10_THETA_I = (0.0, 30.0, 60.0, 75.0)
 REFLECTANCE_POINTS = 2**14
 REFLECTANCE_PATHS = 4_000_000
-Progress = Callable[[int, int], None]  # steps done, steps in all
 
 
 @dataclass(frozen=True)

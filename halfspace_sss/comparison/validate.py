@@ -14,6 +14,7 @@ from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.comparison.truths import NotCovered, Truth, read_truths
 from halfspace_sss.physics.fresnel import F_r
 from halfspace_sss.physics.medium import Medium
+from halfspace_sss.progress import Progress
 from halfspace_sss.tracing.passes import Estimate, estimate, walk_passes
 from halfspace_sss.tracing.tracer import Trace, trace
 from halfspace_sss.tracing.walk import Boundary, Scatter
@@ -26,7 +27,6 @@ REFLECTANCE_ERROR, DIM_ERROR, OTHER_ERROR = 1e-3, 3e-3, 2e-3  # relative: albedo
 LEAST_CERTAIN = 0.2  # relative: beyond it a standard error rests on too few walks to be trusted
 SHARE = 0.3  # of the row's own uncertainty: a smaller error would not sharpen the test
 DIRECTION_COUNTS = (1, 2, 4, 8)  # kernels are compiled for these numbers of directions
-Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)

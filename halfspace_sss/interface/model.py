@@ -12,7 +12,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from halfspace_sss.arrays import broadcast_query
-from halfspace_sss.checks import check_query
+from halfspace_sss.checks import check_choice, check_query
 from halfspace_sss.interface.radial import RadialSampler
 from halfspace_sss.physics.fresnel import F_t, mu_internal
 from halfspace_sss.physics.medium import Medium
@@ -280,11 +280,6 @@ def bssrdf(name: str, medium: Medium) -> BSSRDF:
     Raises:
         ValueError: no such model (the nearest name is given), or the model refuses the medium.
     """
-    import difflib
-
     known = {**_installed(), **_registered}
-    if name not in known:
-        close = difflib.get_close_matches(str(name), known, n=1)
-        hint = f"; did you mean {close[0]!r}?" if close else ""
-        raise ValueError(f"model must be one of {', '.join(known)}, got {name!r}{hint}")
+    check_choice("model", name, known)
     return known[name](medium)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from types import ModuleType
@@ -23,6 +22,7 @@ from halfspace_sss.checks import check_count
 from halfspace_sss.maps.map_tracing import GROUP, MapTally
 from halfspace_sss.physics.backbone import U_MAX, backbone, length_scale, unwarp, warp
 from halfspace_sss.physics.phase import eval_hg
+from halfspace_sss.progress import NamedProgress
 from halfspace_sss.provenance import write_atomically
 from halfspace_sss.tracing.tallies import CellSums
 from halfspace_sss.tracing.walk import Scatter, WalkConstants, pass_seed, walk
@@ -32,7 +32,6 @@ __all__ = [
     "Groups",
     "Launch",
     "backbone_mass",
-    "Progress",
     "draw_directions",
     "looking_back",
     "make_pool",
@@ -47,7 +46,6 @@ PILOT_LANES = 8  # of a group, one walk each
 WALKS_PER_LANE = 8  # at least, where there are enough for it: lanes then end at about the same time
 N_BACK = 2  # of the observations look back along the incident ray, where that is asked for
 BACK = (-3.0, math.log10(0.3))  # exponents of their distance from it
-Progress = Callable[[str, int, int], None]  # what is done, steps done, steps in all
 
 
 @dataclass(frozen=True)
@@ -267,7 +265,7 @@ def make_pool(
     events: float,
     seed: tuple[int, ...],
     folder: Path | None = None,
-    progress: Progress | None = None,
+    progress: NamedProgress | None = None,
     backend: str = "llvm",
 ) -> np.ndarray:
     """Cell integrals of all groups, (n, 2, 16, n_u, n_psi), kept launch by launch in `folder` so that a run can go on.

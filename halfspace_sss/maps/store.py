@@ -6,7 +6,7 @@ import json
 import os
 import shutil
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,6 +18,7 @@ from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.maps.grid import MapGrid, cell_edges, map_directions
 from halfspace_sss.maps.map_tracing import MapUnit, UnitResult, trace_unit
 from halfspace_sss.physics.medium import Medium
+from halfspace_sss.progress import ProgressText
 from halfspace_sss.provenance import provenance
 
 if TYPE_CHECKING:
@@ -28,7 +29,6 @@ __all__ = ["load_maps", "make_maps"]
 FORMAT = 1
 MOST_PATHS = 2**33
 DATA = ("S", "variance")
-Progress = Callable[[int, int, str], None]  # units done, units in all, what was just done
 
 
 def make_maps(
@@ -41,7 +41,7 @@ def make_maps(
     seed: int = 0,
     backend: str = "llvm",
     share: tuple[int, int] = (0, 1),
-    progress: Progress | None = None,
+    progress: ProgressText | None = None,
 ) -> dict[str, Path]:
     """Trace training maps of media into `folder/NAME.zarr`, one Zarr store each, continuing what is there.
 

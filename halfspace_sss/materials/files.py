@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import sys
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -10,6 +9,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StringConstraints, ValidationError
 
+from halfspace_sss.checks import did_you_mean
 from halfspace_sss.materials.material import Material
 from halfspace_sss.physics.medium import Medium
 
@@ -119,9 +119,8 @@ def _problem(error: Any, raw: dict) -> str:
     loc = [part for part in loc if part != "[key]"]
     key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in loc).lstrip(".")
     if error["type"] == "extra_forbidden":
-        close = difflib.get_close_matches(str(loc[-1]), model.model_fields, n=1)
-        hint = f"did you mean {close[0]!r}?" if close else f"known keys: {', '.join(model.model_fields)}"
-        return f"{where}key {key} is unknown; {hint}"
+        hint = did_you_mean(loc[-1], list(model.model_fields)) or f"; known keys: {', '.join(model.model_fields)}"
+        return f"{where}key {key} is unknown{hint}"
     if error["type"] == "missing":
         return f"{where}key {key} is required, got nothing"
     message = error["msg"][0].lower() + error["msg"][1:]

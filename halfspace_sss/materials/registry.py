@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import os
 from collections.abc import Iterable, Iterator
 from importlib import resources
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from halfspace_sss.checks import did_you_mean
 from halfspace_sss.materials.material import Material, key_of
 
 if TYPE_CHECKING:
@@ -41,10 +41,9 @@ class Registry:
         if not isinstance(name, str):
             raise ValueError(f"material must be a name, got {name!r}")
         if key_of(name) not in materials:
-            close = difflib.get_close_matches(key_of(name), materials, n=3)
-            near = ", ".join(repr(materials[key].name) for key in close)
-            hint = f"did you mean {near}?" if near else "see halfspace_sss.materials.names()"
-            raise ValueError(f"material must be one of the {len(materials)} registered, got {name!r}; {hint}")
+            hint = did_you_mean(key_of(name), {key: m.name for key, m in materials.items()}, most=3)
+            hint = hint or "; see halfspace_sss.materials.names()"
+            raise ValueError(f"material must be one of the {len(materials)} registered, got {name!r}{hint}")
         return materials[key_of(name)]
 
     def register(self, material_or_path: Material | str | os.PathLike) -> tuple[str, ...]:

@@ -13,7 +13,8 @@ from halfspace_sss.backend import array_types
 from halfspace_sss.checks import check_count, check_edges, check_finite, check_interval
 from halfspace_sss.physics.fresnel import F_t
 from halfspace_sss.physics.medium import Medium, check_scalar_medium
-from halfspace_sss.tracing.passes import Progress, estimate, walk_passes
+from halfspace_sss.progress import Progress
+from halfspace_sss.tracing.passes import estimate, walk_passes
 from halfspace_sss.tracing.tallies import AngularTally, LineTally
 from halfspace_sss.tracing.walk import Tally
 

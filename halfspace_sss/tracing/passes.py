@@ -12,13 +12,13 @@ import numpy as np
 
 from halfspace_sss.physics.fresnel import F_t, mu_internal
 from halfspace_sss.physics.medium import Medium
+from halfspace_sss.progress import Progress
 from halfspace_sss.tracing.tallies import BATCHES, CellSums
 from halfspace_sss.tracing.walk import Tally, pass_seed, walk
 
-__all__ = ["PATHS_PER_LANE", "Estimate", "Pass", "Progress", "estimate", "launch_shape", "walk_passes"]
+__all__ = ["PATHS_PER_LANE", "Estimate", "Pass", "estimate", "launch_shape", "walk_passes"]
 
 PATHS_PER_LANE, MAX_LANES = 64, 131072
-Progress = Callable[[int, int], None]  # passes done, passes in all
 
 
 class Estimate(NamedTuple):

@@ -10,10 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from halfspace_sss.backend import array_types
-from halfspace_sss.checks import check_count, check_edges, check_finite, check_interval
+from halfspace_sss.checks import check_choice, check_count, check_edges, check_finite, check_interval
 from halfspace_sss.physics.fresnel import F_t
 from halfspace_sss.physics.medium import Medium, check_scalar_medium
-from halfspace_sss.tracing.passes import Estimate, Progress, estimate, walk_passes
+from halfspace_sss.progress import Progress
+from halfspace_sss.tracing.passes import Estimate, estimate, walk_passes
 from halfspace_sss.tracing.tallies import AngularTally, FluxTally, MomentTally, RingTally
 from halfspace_sss.tracing.walk import Tally
 
@@ -23,8 +24,7 @@ ORDERS = ("single", "multiple", "total")
 
 
 def _order_sum(order: str, single: np.ndarray, multiple: np.ndarray) -> np.ndarray:
-    if order not in ORDERS:
-        raise ValueError(f"order must be one of {', '.join(ORDERS)}, got {order!r}")
+    check_choice("order", order, ORDERS)
     return {"single": single, "multiple": multiple, "total": single + multiple}[order]
 
 

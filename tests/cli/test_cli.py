@@ -162,7 +162,7 @@ def test_typing_mistakes_end_with_2_and_name_what_was_meant(arguments: list[str]
 
 @pytest.mark.skipif(os.name == "nt", reason="POSIX signals")
 def test_an_interrupted_run_ends_with_130_and_leaves_no_file(tmp_path: Path) -> None:
-    code = "from halfspace_sss.cli import main; print('ready', flush=True); main()"
+    code = "import halfspace_sss.cli.app; from halfspace_sss.cli import main; print('ready', flush=True); main()"
     command = [sys.executable, "-c", code, "curves", "--paths", "4000000000"]
     process = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     assert process.stdout.readline() == "ready\n"

@@ -27,23 +27,23 @@ from halfspace_sss.neural.training.pool import MapPool
 from halfspace_sss.neural.training.recipes import MaterialRecipe, UniversalRecipe, train, train_universal
 from halfspace_sss.neural.training.subjects import MaterialSubject, PaperSubject, Trial
 from halfspace_sss.neural.training.train_material import TrainedChannel, train_channel
+from halfspace_sss.progress import NamedProgress
 
 FIG10 = materials.load("fig10").medium
 HOW = Fit(steps=100, n_groups=8, n_queries=64, checkpoint_every=0.0, validate_every=50)
 GRID = CellGrid(8, 4)
 RECIPE = MaterialRecipe(n_groups=272, events=2e5, grid=GRID, how=HOW)  # more groups than one launch traces
 UNIVERSAL = UniversalRecipe(n_media=272, events=2e5, grid=GRID, how=HOW, rank=4)
-Progress = Callable[[str, int, int], None]
 
 
-def run_channel(work: Path, progress: Progress | None = None) -> Path:
+def run_channel(work: Path, progress: NamedProgress | None = None) -> Path:
     """Weights of a training of Fig. 10 that goes on with what is in `work`."""
     return train_channel(
         FIG10, MaterialSubject(), RECIPE, 3, folder=work / "weights", work=work / "work", progress=progress
     ).path
 
 
-def run_universal(work: Path, progress: Progress | None = None) -> Path:
+def run_universal(work: Path, progress: NamedProgress | None = None) -> Path:
     """Weights of a training of the universal network that goes on with what is in `work`."""
     return train_universal(work, 3, UNIVERSAL, progress=progress)
 

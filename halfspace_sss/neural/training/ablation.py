@@ -14,7 +14,7 @@ import torch
 from halfspace_sss.backend import array_types
 from halfspace_sss.checks import check_count
 from halfspace_sss.comparison.model_errors import Reference, model_error, reference_maps
-from halfspace_sss.maps.noisy_maps import Progress, draw_directions, make_pool
+from halfspace_sss.maps.noisy_maps import draw_directions, make_pool
 from halfspace_sss.neural.hypernetwork import in_range
 from halfspace_sss.neural.training.ablation_learner import Factored, SharedTurn, drawn_by_area, model_of
 from halfspace_sss.neural.training.budget import Budget, Samples, Seconds, train_within
@@ -23,6 +23,7 @@ from halfspace_sss.neural.training.pool import MapPool
 from halfspace_sss.neural.training.subjects import MaterialSubject, PaperSubject
 from halfspace_sss.neural.training.train_material import BLOCK, STANDARD, VALIDATION_SEED, MaterialRecipe
 from halfspace_sss.physics.medium import Medium, check_scalar_medium
+from halfspace_sss.progress import NamedProgress
 
 if TYPE_CHECKING:
     import pandas
@@ -88,7 +89,7 @@ def ablation(
     seed: int = 0,
     *,
     backend: str = "llvm",
-    progress: Progress | None = None,
+    progress: NamedProgress | None = None,
 ) -> pandas.DataFrame:
     """Train every variant within the same budgets on the same maps; one row per seed, budget and variant.
 

@@ -13,8 +13,8 @@ from typing import Any, Protocol
 import torch
 
 from halfspace_sss.checks import check_count, check_interval
-from halfspace_sss.maps.noisy_maps import Progress
 from halfspace_sss.neural.training.pool import Batch, MapPool
+from halfspace_sss.progress import NamedProgress
 from halfspace_sss.provenance import write_atomically
 
 __all__ = ["Fit", "Learner", "fit"]
@@ -63,7 +63,7 @@ def fit(
     checkpoint: Path | None = None,
     validate: Callable[[], float] | None = None,
     target_error: float | None = None,
-    progress: Progress | None = None,
+    progress: NamedProgress | None = None,
 ) -> list[dict[str, float]]:
     """Fit in place and return the history: step, loss, validation error, seconds.
 

@@ -6,14 +6,14 @@ import os
 from pathlib import Path
 
 from halfspace_sss.backend import array_types
-from halfspace_sss.checks import check_count, check_interval
-from halfspace_sss.maps.noisy_maps import Progress
+from halfspace_sss.checks import check_choice, check_count, check_interval
 from halfspace_sss.neural.symmetric import channels
 from halfspace_sss.neural.trained import weights_folder
 from halfspace_sss.neural.training.subjects import SUBJECTS
 from halfspace_sss.neural.training.train_material import FAST, STANDARD, MaterialRecipe, TrainedChannel, train_channel
 from halfspace_sss.neural.training.train_universal import UniversalRecipe, train_universal
 from halfspace_sss.physics.medium import Medium
+from halfspace_sss.progress import NamedProgress
 from halfspace_sss.provenance import check_folder
 
 __all__ = ["FAST", "STANDARD", "MaterialRecipe", "UniversalRecipe", "train", "train_universal"]
@@ -29,7 +29,7 @@ def train(
     work: str | os.PathLike | None = None,
     target_error: float | None = None,
     backend: str = "llvm",
-    progress: Progress | None = None,
+    progress: NamedProgress | None = None,
 ) -> list[TrainedChannel]:
     """Train a model for every channel of a material; `halfspace_sss.bssrdf(model, medium)` then finds the weights.
 
@@ -47,8 +47,7 @@ def train(
     Raises:
         ValueError: an argument is out of range, or the material is unknown; nothing has been traced then.
     """
-    if model not in SUBJECTS:
-        raise ValueError(f"model must be one of {', '.join(SUBJECTS)}, got {model!r}")
+    check_choice("model", model, SUBJECTS)
     if not isinstance(recipe, MaterialRecipe):
         raise ValueError(f"recipe must be a MaterialRecipe, got {recipe!r}")
     check_count("seed", seed, 0)

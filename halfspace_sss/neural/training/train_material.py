@@ -13,7 +13,7 @@ import numpy as np
 from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.comparison.model_errors import ModelError, model_error, reference_maps
 from halfspace_sss.interface.model import BSSRDF
-from halfspace_sss.maps.noisy_maps import CellGrid, Groups, Progress, draw_directions, make_pool
+from halfspace_sss.maps.noisy_maps import CellGrid, Groups, draw_directions, make_pool
 from halfspace_sss.neural.material_model import network_arrays
 from halfspace_sss.neural.store import save_weights
 from halfspace_sss.neural.trained import weights_folder, weights_name
@@ -21,6 +21,7 @@ from halfspace_sss.neural.training.fit import Fit, fit
 from halfspace_sss.neural.training.pool import MapPool
 from halfspace_sss.neural.training.work_folder import CHECKPOINT, claim
 from halfspace_sss.physics.medium import Medium
+from halfspace_sss.progress import NamedProgress
 from halfspace_sss.provenance import provenance
 
 __all__ = ["FAST", "STANDARD", "MaterialRecipe", "Subject", "TrainedChannel", "train_channel"]
@@ -91,7 +92,7 @@ def train_channel(
     work: str | os.PathLike | None = None,
     target_error: float | None = None,
     backend: str = "llvm",
-    progress: Progress | None = None,
+    progress: NamedProgress | None = None,
 ) -> TrainedChannel:
     """Train a network for one scalar medium.
 

@@ -14,12 +14,13 @@ import numpy as np
 from halfspace_sss.backend import array_types
 from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.maps.media import RANGES, draw_media
-from halfspace_sss.maps.noisy_maps import CellGrid, Progress, draw_directions, looking_back, make_pool
+from halfspace_sss.maps.noisy_maps import CellGrid, draw_directions, looking_back, make_pool
 from halfspace_sss.neural.store import save_weights
 from halfspace_sss.neural.training.fit import Fit, fit
 from halfspace_sss.neural.training.learners import Hyper
 from halfspace_sss.neural.training.pool import MapPool
 from halfspace_sss.neural.training.work_folder import CHECKPOINT, claim
+from halfspace_sss.progress import NamedProgress
 from halfspace_sss.provenance import check_folder, provenance
 
 __all__ = ["UniversalRecipe", "train_universal"]
@@ -47,7 +48,7 @@ def train_universal(
     recipe: UniversalRecipe | None = None,
     *,
     backend: str = "llvm",
-    progress: Progress | None = None,
+    progress: NamedProgress | None = None,
     validate: Callable[[Hyper], float] | None = None,
 ) -> Path:
     """Train the universal network in `folder`, going on with what a killed run left there; returns the weights.
