@@ -1,6 +1,7 @@
 """The figures of the paper: what each is made of, apart from how it is drawn, so that only what changed is computed.
 
-A figure is one file `figures/NAME.py` and one entry of `FIGURES` below. The module has
+A figure is one file `figures/NAME.py` and one entry of `FIGURES` below; other packages add figures by entry points of
+the group `halfspace_sss.figure_modules`, name = module. The module has
 
 - `TITLE`: a few words for `halfspace-sss figures list`;
 - `parts(quality) -> list[Part]`: what is to be computed, for the quality "draft" (minutes on two cores) or "paper";
@@ -19,9 +20,9 @@ A `Part` is a name, parameters ready for JSON, a function and its estimated work
 
 - Arrays of shape (height, width) or (height, width, 3) are kept as float32 EXR; everything else must be ready for
   JSON. Both are checked: a NaN is refused with the name of the part.
-- A part is computed again when its parameters, its function's name or `version` (raise it when the code computes
-  something else), the content of a file in `inputs` (weights, scenes), or a part in `needs` changed; not when `work`
-  did. A part that is damaged is computed again and named.
+- A part is computed again when its parameters, the code of its function or of anything that it imports from this
+  project (also of the models that its parameters name), the content of a file in `inputs` (weights, scenes), or a part
+  in `needs` changed; not when comments or `work` did. A part that is damaged is computed again and named.
 - `needs` names parts that stand before it in the list; their results are in `task.needed`. `task.folder` is kept
   until the part is done: passes of a long render stored there survive an interruption.
 - For images: `figures.drawing.shot.compared` makes shots with FLIP, relMSE and maps from results;
@@ -30,4 +31,18 @@ A `Part` is a name, parameters ready for JSON, a function and its estimated work
 - Seconds for a unit of `work` are measured: what a draft took says what the paper quality will take.
 """
 
+from __future__ import annotations
+
+from importlib.metadata import entry_points
+
+__all__ = ["FIGURES", "figure_modules"]
+
 FIGURES = ("fig09", "fig10", "fig11", "spheres", "equal_error")
+GROUP = "halfspace_sss.figure_modules"
+
+
+def figure_modules() -> dict[str, str]:
+    """The module of each figure by its name, those of other packages last; a name that is taken is not given anew."""
+    added = {entry.name: entry.value for entry in entry_points(group=GROUP)}
+    own = {name: f"figures.{name}" for name in FIGURES}
+    return own | {name: module for name, module in added.items() if name not in own}

@@ -49,7 +49,7 @@ def figures_command(
     """Make the figures of the paper; a part that is there is computed again only if what it depends on changed."""
     from figures.parts.runner import figure, plan
 
-    chosen = list(dict.fromkeys(names or figures.FIGURES))
+    chosen = list(dict.fromkeys(names or figures.figure_modules()))
     do = {Action.list: _list, Action.compute: _compute, Action.draw: _draw, Action.all: _all}[action]
     try:
         for name in chosen:

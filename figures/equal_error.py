@@ -22,8 +22,8 @@ __all__ = ["TITLE", "draw", "errors", "measured", "parts"]
 
 TITLE = "time to equal error against Mitsuba's volume path tracer, time per sample, white furnace"
 LIGHTS = ("small light", "even sky")
-BARE = "bare"  # without reflection and without the single scattering that a model lacks, as the prototype was
-PROTOTYPED = ("marble", "potato", "ketchup")
+BARE = "bare"  # without reflection and without the single scattering that a model lacks
+BARE_MATERIALS = ("marble", "potato", "ketchup")
 SPLIT_MATERIAL = "marble"
 SIZES = {"draft": 48, "paper": 128}
 TRUTH_SPP = {"draft": 64, "paper": 8192}
@@ -51,15 +51,23 @@ def parts(quality: str) -> list[Part]:
         params = {"model": model, **FURNACE[quality]}
         inputs = weight_files(model, materials.load(SPLIT_MATERIAL).medium) if model == "neural" else ()
         work = params["spp"] * params["size"] ** 2
-        found.append(Part(f"furnace, {model}", furnace, params, work, inputs=inputs))
+        found.append(Part(_furnace_name(model), furnace, params, work, inputs=inputs))
     return found
+
+
+def _errors_name(material: str, lights: str) -> str:
+    return f"{material}, {lights}, errors"
+
+
+def _furnace_name(method: str) -> str:
+    return f"furnace, {method}"
 
 
 def _parts_of(material: str, lights: str, quality: str) -> list[Part]:
     size, spp = SIZES[quality], SPP[quality]
     common = {"material": material, "size": size, "lights": lights}
     methods = [*VOLUMES, WALK, *MODELS]
-    if material in PROTOTYPED:
+    if material in BARE_MATERIALS:
         methods += [f"{model}, {BARE}" for model in BARE_MODELS[quality]]
     kinds = {name: "volume" if name in VOLUMES else WALK if name == WALK else "model" for name in methods}
     params = {
@@ -72,7 +80,7 @@ def _parts_of(material: str, lights: str, quality: str) -> list[Part]:
     long = {**common, "spp": TRUTH_SPP[quality], "seed": 0}
     return [
         Part(truth, long_walk, long, long["spp"] * size**2, inputs=(BUNNY,)),
-        Part(f"{material}, {lights}, errors", measured, params, work, needs=(truth,), inputs=inputs),
+        Part(_errors_name(material, lights), measured, params, work, needs=(truth,), inputs=inputs),
     ]
 
 
@@ -140,13 +148,16 @@ def _standard_error(pixels: np.ndarray) -> float:
 
 def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
     """The tables: all numbers as CSV, and what they say as Markdown."""
-    scenes = {
-        tuple(name.split(", ")[:2]): result.numbers for name, result in results.items() if name.endswith(", errors")
-    }
+    scenes = {(m, lights): _errors_name(m, lights) for m in MATERIALS for lights in LIGHTS}
+    furnaces = {method: _furnace_name(method) for method in (WALK, *furnace_models())}
+
+    def numbers(names: Mapping[Any, str]) -> dict[Any, Mapping[str, Any]]:
+        return {key: results[name].numbers for key, name in names.items() if name in results}
+
     tables = {
-        "errors": error_tables.equal_error(scenes),
+        "errors": error_tables.equal_error(numbers(scenes)),
         "sampling": error_tables.sampling(results["time per sample"].numbers["rows"]),
-        "furnace": error_tables.furnace({n[9:]: r.numbers for n, r in results.items() if n.startswith("furnace, ")}),
+        "furnace": error_tables.furnace(numbers(furnaces)),
     }
     files: dict[str, bytes | str] = {
         f"equal_error_{name}.csv": table.to_csv(index=False, lineterminator="\n") for name, table in tables.items()

@@ -35,22 +35,13 @@ def parts(quality: str) -> list[Part]:
             params = {"model": model, "light": light, "radii": list(RADII), "medium": MEDIUM}
             params |= {"size": SIZE[quality], "spp": SPP[quality]}
             inputs = () if model == PATH_TRACED else weight_files(model, medium)
-            function = walked if model == PATH_TRACED else modelled
-            found.append(Part(f"{light}, {model}", function, params, SPP[quality], inputs=inputs))
+            like = "walk" if model == PATH_TRACED else "model"
+            found.append(Part(f"{light}, {model}", measured, params, SPP[quality], inputs=inputs, like=like))
     return found
 
 
-def modelled(task: Task) -> dict[str, Any]:
-    """Mean radiance of the spheres by a model, and its standard error."""
-    return _measured(task)
-
-
-def walked(task: Task) -> dict[str, Any]:
-    """Mean radiance of the spheres by random walks, and its standard error."""
-    return _measured(task)
-
-
-def _measured(task: Task) -> dict[str, Any]:
+def measured(task: Task) -> dict[str, Any]:
+    """Mean radiance of the spheres, and its standard error."""
     import warnings
 
     import mitsuba as mi

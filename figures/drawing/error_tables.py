@@ -13,18 +13,9 @@ from figures.drawing.style import look
 if TYPE_CHECKING:
     import pandas
 
-__all__ = ["asked", "equal_error", "furnace", "label", "markdown", "sampling"]
+__all__ = ["equal_error", "furnace", "label", "markdown", "sampling"]
 
-ASKED = {  # times less time than volpathmis that a dipole without reflection is to need
-    ("marble", "small light"): 5000.0,
-    ("marble", "even sky"): 224.0,
-    ("potato", "small light"): 2000.0,
-    ("potato", "even sky"): 1.0,
-    ("ketchup", "small light"): 2000.0,
-    ("ketchup", "even sky"): 1.3,
-}
-PROTOTYPE = volume(200)  # what the numbers above were measured against
-LEARNT_SHARE = 0.5  # of what is asked of a dipole, for the learnt model
+LATE_ROULETTE = volume(200)  # the usual setting of volpathmis for media that hardly absorb
 CERTAIN = 2.0  # standard errors by which an error must stand out of the noise of the truth
 NOTES = """\
 Cost is mean squared error of the pixels of the object times seconds, compilation left out; a ratio is the cost of
@@ -37,9 +28,8 @@ Russian roulette only adds variance: where a setting of `volpathmis` seems to ha
 later, it has not met its rare bright paths yet, and counts with the variance of the other. `volpathmis` renders the
 channels of a medium whose mean cosine differs between them one by one."""
 BARE_NOTES = """\
-The models without surface reflection and without added single scattering, as the prototype was measured, against
-`volpathmis` at its best setting and at rr_depth 200, which the prototype took. Asked for the dipoles, half of it for
-the neural model."""
+The models without surface reflection and without the single scattering that they lack, against `volpathmis` at its
+best setting and at rr_depth 200."""
 
 
 def label(method: str) -> str:
@@ -50,14 +40,6 @@ def label(method: str) -> str:
     if method == WALK:
         return "Our walk"
     return "Neural half-space" if method == "neural" else look(method).label
-
-
-def asked(material: str, lights: str, method: str) -> float | None:
-    """The ratio that a bare model is to reach in a scene; None where none is asked for."""
-    name, _, bare = method.partition(", ")
-    if not bare or (material, lights) not in ASKED:
-        return None
-    return ASKED[material, lights] * (LEARNT_SHARE if name == "neural" else 1.0)
 
 
 def equal_error(scenes: Mapping[tuple[str, str], Mapping[str, Any]]) -> pandas.DataFrame:
@@ -88,9 +70,8 @@ def _scene_rows(scene: tuple[str, str], found: Mapping[str, Any]) -> list[dict[s
                 "relative bias": np.sqrt(bias2 / level),
                 "ratio": _ratio(best_cost, costs[name]),
                 "ratio with bias": _ratio(best_cost, error * row["seconds"]),
-                "ratio to rr_depth 200": _ratio(costs.get(PROTOTYPE, np.nan), costs[name]),
+                "ratio to rr_depth 200": _ratio(costs.get(LATE_ROULETTE, np.nan), costs[name]),
                 "seconds until bias": _ratio(best_cost, bias2),
-                "asked": asked(*scene, name),
                 "is best volpathmis": name == best,
             }
         )
@@ -137,7 +118,7 @@ def furnace(numbers: Mapping[str, Mapping[str, float]]) -> pandas.DataFrame:
 def markdown(errors: pandas.DataFrame, sampling: pandas.DataFrame, furnace: pandas.DataFrame) -> str:
     """All three as one text."""
     whole = errors[~errors["method"].str.contains(", ")]
-    bare = errors[errors["asked"].notna()]
+    bare = errors[errors["method"].str.contains(", ")]
     parts = ["# Time to equal error", NOTES, _whole(whole)]
     if len(bare):
         parts += ["## Without reflection and single scattering", BARE_NOTES, _bare(bare)]
@@ -171,8 +152,7 @@ def _percent(method: str, share: float) -> str:
 def _bare(rows: pandas.DataFrame) -> str:
     table = rows[["material", "lights"]].assign(
         model=[label(name.partition(", ")[0]) for name in rows["method"]],
-        **{"to the best": rows["ratio"], "to rr_depth 200": rows["ratio to rr_depth 200"], "asked": rows["asked"]},
-        reached=["yes" if r >= a else "no" for r, a in zip(rows["ratio"], rows["asked"])],
+        **{"to the best": rows["ratio"], "to rr_depth 200": rows["ratio to rr_depth 200"]},
     )
     return _table(table)
 

@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from halfspace_sss.checks import check_choice, check_count, check_interval
+from figures.parts.sources import code_hash, models_named
+from halfspace_sss.checks import check_choice, check_interval
 from halfspace_sss.progress import Progress
 
 __all__ = ["QUALITIES", "Part", "Result", "Task", "canonical", "check_quality", "keys_of"]
@@ -71,7 +72,7 @@ class Part:
         work: estimated, in a unit of the function's own, e.g. samples; seconds go with it.
         needs: names of parts earlier in the list whose results it gets.
         inputs: files whose content it depends on.
-        version: raised when the function computes something else from the same parameters.
+        like: which of the parts of a function take the same time for the same work; by default all do.
 
     Raises:
         ValueError: the name is empty, params are not ready for JSON, or work is not above 0.
@@ -83,14 +84,13 @@ class Part:
     work: float
     needs: tuple[str, ...] = ()
     inputs: tuple[str | os.PathLike, ...] = ()
-    version: int = 1
+    like: str = ""
 
     def __post_init__(self) -> None:
         if not self.slug:
             raise ValueError(f"name of a part must hold a letter or digit, got {self.name!r}")
         canonical(self.params, f"params of part {self.name!r}")
         check_interval(f"work of part {self.name!r}", self.work, 1e-9, 1e18)
-        check_count(f"version of part {self.name!r}", self.version, 1)
 
     @property
     def slug(self) -> str:
@@ -99,8 +99,9 @@ class Part:
 
     @property
     def kind(self) -> str:
-        """Name of the function: parts of a kind take the same time for the same work."""
-        return f"{self.function.__module__}.{self.function.__qualname__}"
+        """Name of the function and what the part is like: parts of a kind take the same time for the same work."""
+        name = f"{self.function.__module__}.{self.function.__qualname__}"
+        return f"{name}, {self.like}" if self.like else name
 
 
 def canonical(value: Any, what: str) -> str:
@@ -134,7 +135,9 @@ def keys_of(parts: Sequence[Part]) -> dict[str, str]:
         for name in part.needs:
             if name not in keys:
                 raise ValueError(f"part {part.name!r} must need parts that stand before it, got {name!r}")
-        about = {"kind": part.kind, "version": part.version, "params": part.params}
+        params = canonical(part.params, f"params of part {part.name!r}")
+        about = {"function": part.function.__qualname__, "params": part.params}
+        about |= {"code": code_hash(part.function.__module__, part.function.__qualname__, models_named(params))}
         about |= {"inputs": [_file_hash(part, path) for path in part.inputs]}
         about |= {"needs": {name: keys[name] for name in part.needs}}
         keys[part.name] = hashlib.sha256(canonical(about, part.name).encode()).hexdigest()

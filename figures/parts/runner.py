@@ -63,8 +63,9 @@ class Plan:
 
 def figure(name: str) -> ModuleType:
     """The module of a figure; ValueError with the nearest name if there is none."""
-    check_choice("figure", name, figures.FIGURES)
-    return importlib.import_module(f"figures.{name}")
+    modules = figures.figure_modules()
+    check_choice("figure", name, modules)
+    return importlib.import_module(modules[name])
 
 
 def plan(name: str, quality: str, out: str | Path) -> Plan:

@@ -96,7 +96,7 @@ class PartStore:
         for name in arrays:
             if not re.fullmatch(r"[\w-]+", name):
                 raise ValueError(f"images of part {part.name!r} must be named by letters, digits, _, -, got {name!r}")
-        origin = provenance(part=part.name, kind=part.kind, version=part.version, **part.params)
+        origin = provenance(part=part.name, kind=part.kind, **part.params)
         about = canonical({**origin, "key": key}, f"provenance of part {part.name!r}")
         images = {name: exr_bytes(array, f"{name} of part {part.name!r}", about) for name, array in arrays.items()}
         files = {f"{name}.exr": data for name, data in images.items()}

@@ -17,7 +17,7 @@ from halfspace_sss.interface.radial import RadialSampler
 from halfspace_sss.physics.fresnel import F_t, mu_internal
 from halfspace_sss.physics.medium import Medium
 
-__all__ = ["BSSRDF", "DirectionSample", "PositionSample", "Query", "bssrdf", "models", "register_model"]
+__all__ = ["BSSRDF", "DirectionSample", "PositionSample", "Query", "bssrdf", "model_class", "models", "register_model"]
 
 
 class PositionSample(NamedTuple):
@@ -280,6 +280,11 @@ def bssrdf(name: str, medium: Medium) -> BSSRDF:
     Raises:
         ValueError: no such model (the nearest name is given), or the model refuses the medium.
     """
+    return model_class(name)(medium)
+
+
+def model_class(name: str) -> type[BSSRDF]:
+    """The class of a model; ValueError with the nearest name if there is none."""
     known = {**_installed(), **_registered}
     check_choice("model", name, known)
-    return known[name](medium)
+    return known[name]

@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from halfspace_sss import Medium, trace
-from halfspace_sss.cli import app
+from halfspace_sss.cli.app import app
 from halfspace_sss.cli.validate import row_filter, summary
 from halfspace_sss.comparison.truths import read_truths
 from halfspace_sss.comparison.validate import Comparison, trace_order, validate
