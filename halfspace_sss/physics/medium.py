@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from halfspace_sss.physics.reflectance import DIFFUSE, albedo_of_reflectance, half_space_reflectance
+
 __all__ = ["Medium", "check_ratios", "check_scalar_medium"]
 
 
@@ -119,6 +121,41 @@ class Medium:
         _check("g", g, np.abs(g) < 1, "in the open interval (-1, 1)")
         _common_shape(sigma_s_prime=sigma_s_prime, g=g)
         return cls(sigma_s_prime / (1 - g), sigma_a, g, eta)
+
+    @classmethod
+    def from_reflectance(cls, reflectance, mfp, g=0.0, eta=1.3, mu_i=DIFFUSE) -> Medium:
+        """The medium whose half-space has a wanted reflectance, with the mean free path mfp = 1 / sigma_t (mm).
+
+        What artists give: colour, radius and anisotropy (`subsurface_color`, `subsurface_radius` and
+        `subsurface_scatter_anisotropy` of OpenPBR). `reflectance` is the fraction of incident flux that comes back out
+        of the medium, without what the boundary mirrors, under uniform radiance from above ("diffuse") or at the cosine
+        of incidence mu_i. Exact by discrete ordinates, to 1e-4 of itself; `Medium.reflectance` is the
+        inverse. For a texture take `physics.reflectance.albedo_of_reflectance`.
+
+        Raises:
+            ValueError: a colour is out of reach at this eta, or another argument is out of range.
+        """
+        reflectance, mfp, g = (_number(n, v) for n, v in (("reflectance", reflectance), ("mfp", mfp), ("g", g)))
+        _check("mfp", mfp, np.isfinite(mfp) & (mfp > 0), "finite and > 0 (mm)")
+        _check("g", g, np.abs(g) < 1, "in the open interval (-1, 1)")
+        shape = _common_shape(reflectance=reflectance, mfp=mfp, g=g)
+        eta = _number("eta", eta)
+        if eta.ndim:
+            raise ValueError(f"eta must be one number for all channels, got shape {eta.shape}")
+        _check("eta", eta, np.isfinite(eta) & (eta > 0), "finite and > 0")
+        pairs = np.broadcast(reflectance, np.broadcast_to(g, shape))
+        albedo = np.array([float(albedo_of_reflectance(R, float(k), float(eta), mu_i)) for R, k in pairs])
+        return cls.from_albedo(albedo.reshape(pairs.shape), 1 / mfp, g, eta)
+
+    def reflectance(self, mu_i: float | str = DIFFUSE):
+        """The fraction of incident flux that comes back out of the half-space, per channel, all orders.
+
+        mu_i is the cosine of incidence, or "diffuse" for uniform radiance from above. Exact by discrete
+        ordinates; left out is what the boundary mirrors.
+        """
+        pairs = np.broadcast(self.albedo, self.g)
+        found = np.array([half_space_reflectance(float(a), float(g), self.eta, mu_i) for a, g in pairs])
+        return found if self.n_channels is not None else float(found[0])
 
     @property
     def n_channels(self) -> int | None:
