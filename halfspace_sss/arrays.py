@@ -17,6 +17,8 @@ from typing import Any
 
 import numpy as np
 
+from halfspace_sss.once import once
+
 __all__ = ["broadcast_query", "library"]
 
 
@@ -162,12 +164,12 @@ class _DrJitLibrary:
 _NUMPY = _NumpyLibrary()
 
 
-@functools.cache
+@once
 def _torch_library() -> _TorchLibrary:
     return _TorchLibrary()
 
 
-@functools.cache
+@once
 def _drjit_library() -> _DrJitLibrary:
     return _DrJitLibrary()
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import ctypes
-import functools
 import os
 import sys
 from pathlib import Path
 from types import ModuleType
+
+from halfspace_sss.once import once
 
 __all__ = ["BACKENDS", "BackendError", "array_types", "prefer_bundled_llvm", "prepare_llvm"]
 
@@ -62,7 +63,7 @@ def _refuse_old_loaded_llvm() -> None:
         )
 
 
-@functools.cache
+@once
 def prepare_llvm() -> str:
     """Point Dr.Jit at a usable LLVM and return its path; a path that the user set is kept.
 
@@ -93,7 +94,7 @@ def prepare_llvm() -> str:
     )
 
 
-@functools.cache
+@once
 def array_types(backend: str = "llvm") -> ModuleType:
     """The module of Dr.Jit array types of a backend (`drjit.llvm` or `drjit.cuda`), ready to compute.
 

@@ -14,6 +14,7 @@ import numpy as np
 from halfspace_sss.arrays import broadcast_query
 from halfspace_sss.checks import check_choice, check_query
 from halfspace_sss.interface.radial import RadialSampler
+from halfspace_sss.once import once
 from halfspace_sss.physics.fresnel import F_t, mu_internal
 from halfspace_sss.physics.medium import Medium
 
@@ -247,7 +248,7 @@ def _split(u: Any) -> tuple[Any, Any]:
 _registered: dict[str, type[BSSRDF]] = {}
 
 
-@functools.cache
+@once
 def _installed() -> Mapping[str, type[BSSRDF]]:
     """Models of all installed packages: entry points of the group `halfspace_sss.models` are lists of classes."""
     from importlib.metadata import entry_points

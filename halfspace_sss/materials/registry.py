@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Iterable, Iterator
 from importlib import resources
 from importlib.metadata import entry_points
@@ -24,12 +25,13 @@ ENTRY_POINT_GROUP = "halfspace_sss.materials"
 
 
 class Registry:
-    """Materials by name, read on first use; an addition takes effect as a whole or not at all."""
+    """Materials by name, read on first use; an addition takes effect as a whole or not at all, in any thread."""
 
     def __init__(self) -> None:
         self._materials: dict[str, Material] = {}
         self._origins: dict[str, str] = {}
         self._complete = False
+        self._lock = threading.RLock()
 
     def names(self) -> list[str]:
         """Names of all materials, sorted."""
@@ -48,7 +50,6 @@ class Registry:
 
     def register(self, material_or_path: Material | str | os.PathLike) -> tuple[str, ...]:
         """Add a material, or those of a TOML file or folder; returns their names."""
-        self._all()
         if isinstance(material_or_path, Material):
             found = [("register()", material_or_path)]
         elif isinstance(material_or_path, (str, os.PathLike)):
@@ -57,14 +58,17 @@ class Registry:
             raise ValueError(f"material_or_path must be a Material or a path, got {material_or_path!r}")
         if not found:
             raise ValueError(f"material_or_path must hold at least one *.toml file, got {str(material_or_path)!r}")
-        self._add(found)
+        with self._lock:
+            self._all()
+            self._add(found)
         return tuple(material.name for _, material in found)
 
     def _all(self) -> dict[str, Material]:
-        if not self._complete:
-            self._add(list(_installed()))
-            self._complete = True
-        return self._materials
+        with self._lock:
+            if not self._complete:
+                self._add(list(_installed()))
+                self._complete = True
+            return self._materials
 
     def _add(self, found: Iterable[tuple[str, Material]]) -> None:
         materials, origins = dict(self._materials), dict(self._origins)

@@ -110,11 +110,11 @@ class Network:
         import torch
 
         x = torch.stack(torch.broadcast_tensors(*features), dim=-1)
-        key = (x.dtype, x.device)
-        if key not in self._tensors:
+        tensors, key = self._tensors, (x.dtype, x.device)
+        if key not in tensors:
             pairs = [(np.ascontiguousarray(W.T), b) for W, b in zip(self.matrices, self.biases)]
-            self._tensors[key] = [tuple(torch.from_numpy(v).to(x) for v in pair) for pair in pairs]
-        *hidden, (W, b) = self._tensors[key]
+            tensors[key] = [tuple(torch.from_numpy(v).to(x) for v in pair) for pair in pairs]
+        *hidden, (W, b) = tensors[key]
         for V, c in hidden:
             x = self.activation.torch(torch.nn.functional.linear(x, V, c))
         return torch.nn.functional.linear(x, W, b)[..., 0]
@@ -132,12 +132,13 @@ class Network:
         if dr.type_v(kind) == dr.VarType.Float64:
             return self._drjit_loops(features, kind)
         inner = dr.float16_array_t(kind) if dr.backend_v(kind) == dr.JitBackend.CUDA else kind
-        if inner not in self._views:
+        packed = self._views
+        if inner not in packed:
             tensor = dr.tensor_t(inner)
             parts = [tensor(np.ascontiguousarray(W.T)) for W in self.matrices] + [inner(b) for b in self.biases]
-            self._views[inner] = nn.pack(*parts)
+            packed[inner] = nn.pack(*parts)
         n = len(self.matrices)
-        views = self._views[inner][-2 * n :]
+        views = packed[inner][-2 * n :]
         x = nn.CoopVec(*(inner(f) for f in features))
         for k in range(n):
             x = nn.matvec(views[k], x, views[n + k])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from importlib import resources
 from pathlib import Path
 
@@ -13,6 +12,7 @@ from halfspace_sss.neural.hypernetwork import Hypernetwork, check_range
 from halfspace_sss.neural.network import layer_shapes
 from halfspace_sss.neural.store import load_weights, record_count
 from halfspace_sss.neural.symmetric import SymmetricModel, channels
+from halfspace_sss.once import once
 from halfspace_sss.physics.medium import Medium
 
 __all__ = ["Neural", "load_hypernetwork", "shipped_weights"]
@@ -25,7 +25,7 @@ def shipped_weights() -> Path:
     return Path(str(resources.files("halfspace_sss.neural").joinpath("data", "neural.safetensors")))
 
 
-@functools.cache
+@once
 def load_hypernetwork(path: Path) -> Hypernetwork:
     """The network of a file of weights; ValueError names the file if it cannot be used."""
     arrays, record = load_weights(path, KIND)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import threading
+
 from halfspace_sss.backend import BackendError
 from halfspace_sss.rendering.surface.variants import VARIANTS, variant_channels
 
 __all__ = ["register"]
 
 _active = False
+_lock = threading.Lock()
 
 
 def register() -> None:
@@ -23,10 +26,11 @@ def register() -> None:
     except ImportError as error:
         raise BackendError('rendering needs Mitsuba 3: pip install "halfspace-sss[render]"') from error
     variant_channels()
-    _register_all()
-    if not _active:
-        mi.detail.add_variant_callback(_on_variant)
-        _active = True
+    with _lock:
+        _register_all()
+        if not _active:
+            mi.detail.add_variant_callback(_on_variant)
+            _active = True
 
 
 def _on_variant(old: str, new: str) -> None:
