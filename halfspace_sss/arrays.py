@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from halfspace_sss.backend import prepare_llvm
 from halfspace_sss.once import once
 
 __all__ = ["broadcast_query", "library"]
@@ -179,11 +180,15 @@ def library(*args: Any) -> Any:
 
     Raises:
         ValueError: torch and Dr.Jit arrays are mixed.
+        BackendError: the LLVM that Dr.Jit found would abort the process.
     """
-    modules = {type(a).__module__.split(".")[0] for a in args}
+    parts = [type(a).__module__.split(".") for a in args]
+    modules = {part[0] for part in parts}
     if "torch" in modules and "drjit" in modules:
         raise ValueError("torch and Dr.Jit arrays cannot be mixed in one query")
     if "drjit" in modules:
+        if any(part[:2] == ["drjit", "llvm"] for part in parts):
+            prepare_llvm()
         return _drjit_library()
     return _torch_library() if "torch" in modules else _NUMPY
 

@@ -21,13 +21,16 @@ class BackendError(RuntimeError):
 
 
 def _llvm_version(path: str) -> int | None:
-    """Major version of an LLVM library, None if it cannot be loaded."""
+    """Major version of an LLVM library, 0 for those before 16, which do not tell, None if it cannot be loaded."""
     try:
         library = ctypes.CDLL(path)
-        major, minor, patch = (ctypes.c_uint() for _ in range(3))
-        library.LLVMGetVersion(*(ctypes.byref(v) for v in (major, minor, patch)))
-    except (OSError, AttributeError):
+    except OSError:
         return None
+    major, minor, patch = (ctypes.c_uint() for _ in range(3))
+    try:
+        library.LLVMGetVersion(*(ctypes.byref(v) for v in (major, minor, patch)))
+    except AttributeError:
+        return 0
     return major.value
 
 
@@ -43,7 +46,7 @@ def _candidates() -> list[str]:
 def prefer_bundled_llvm() -> None:
     """Point Dr.Jit at the LLVM that pip installed, unless the user set one; called when the package is imported.
 
-    Dr.Jit looks for LLVM when it is imported itself, and an old one of the system would abort the process later.
+    Dr.Jit loads LLVM while it is imported itself and keeps it: what is set later has no effect.
     """
     bundled = sorted((Path(sys.prefix) / "lib").glob("libLLVM.so*"))
     if bundled and "drjit" not in sys.modules:
@@ -51,43 +54,48 @@ def prefer_bundled_llvm() -> None:
 
 
 def _refuse_old_loaded_llvm() -> None:
-    """drjit may have been imported before this package, with whatever LLVM it found."""
+    """Whichever LLVM Dr.Jit has loaded is the one that will compile."""
     import drjit as dr
 
-    version = dr.detail.llvm_version()
-    if version is None or version[0] < OLDEST_LLVM:
-        found = "no LLVM" if version is None else "LLVM " + ".".join(map(str, version))
-        raise BackendError(
-            f"drjit was imported before halfspace_sss and found {found}, but it needs {OLDEST_LLVM} or newer: "
-            "import halfspace_sss before drjit and mitsuba, or set DRJIT_LIBLLVM_PATH"
-        )
+    version, given = dr.detail.llvm_version(), os.environ.get("DRJIT_LIBLLVM_PATH")
+    if version is not None and version[0] >= OLDEST_LLVM:
+        return
+    found = "no LLVM that it takes" if version is None or version[0] < 0 else "LLVM " + ".".join(map(str, version))
+    remedy = "import halfspace_sss before drjit and mitsuba (`pip install karellen-llvm-core` brings an LLVM along)"
+    if given and (_llvm_version(given) or 0) < OLDEST_LLVM:
+        remedy = f"unset DRJIT_LIBLLVM_PATH = {given}"
+    raise BackendError(
+        f"Dr.Jit found {found} when it was imported, but it needs LLVM {OLDEST_LLVM} or newer: {remedy}, "
+        "or set DRJIT_LIBLLVM_PATH before Python starts"
+    )
 
 
 @once
-def prepare_llvm() -> str:
-    """Point Dr.Jit at a usable LLVM and return its path; a path that the user set is kept.
+def prepare_llvm() -> None:
+    """See to it that Dr.Jit uses an LLVM that works; a path that the user set is kept.
 
     Raises:
-        BackendError: none is found, the one the user set is too old or cannot be loaded, or drjit was imported
-            before with an old one.
+        BackendError: none is found, the one the user set is too old or cannot be loaded, or Dr.Jit was imported
+            before with an old one, which would abort the process.
     """
     if "drjit" in sys.modules:
         _refuse_old_loaded_llvm()
+        return
     given = os.environ.get("DRJIT_LIBLLVM_PATH")
     if given:
         version = _llvm_version(given)
         if version is None or version < OLDEST_LLVM:
-            found = "cannot be loaded" if version is None else f"is LLVM {version}"
+            found = "cannot be loaded" if version is None else f"is LLVM {version or 'before 16'}"
             raise BackendError(
                 f"DRJIT_LIBLLVM_PATH = {given} {found}; Dr.Jit needs LLVM {OLDEST_LLVM} or newer: "
                 "unset it, or `pip install karellen-llvm-core`"
             )
-        return given
+        return
     for path in _candidates():
         version = _llvm_version(path)
         if version is not None and version >= OLDEST_LLVM:
             os.environ["DRJIT_LIBLLVM_PATH"] = path
-            return path
+            return
     raise BackendError(
         f"no LLVM library of version {OLDEST_LLVM} or newer was found: `pip install karellen-llvm-core` "
         "(Linux x86-64), install your system's LLVM, or set DRJIT_LIBLLVM_PATH"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 
-from halfspace_sss.backend import BackendError
+from halfspace_sss.backend import BackendError, prepare_llvm
 from halfspace_sss.rendering.surface.variants import VARIANTS, variant_channels
 
 __all__ = ["register"]
@@ -18,7 +18,7 @@ def register() -> None:
 
     Raises:
         ValueError: no variant is set, or the plugins do not run under it (scalar, spectral or polarised ones).
-        BackendError: Mitsuba is not installed.
+        BackendError: Mitsuba is not installed, or the LLVM that Dr.Jit found would abort the process.
     """
     global _active
     try:
@@ -40,6 +40,9 @@ def _on_variant(old: str, new: str) -> None:
 
 def _register_all() -> None:
     import mitsuba as mi
+
+    if mi.variant().startswith("llvm"):
+        prepare_llvm()
 
     from halfspace_sss.rendering.integrator import integrator_class
     from halfspace_sss.rendering.surface.translucent import translucent_class
