@@ -54,6 +54,44 @@ def test_an_unknown_model_is_refused_with_the_nearest_name():
     refused("did you mean 'directional_dipole'", view({**SPHERE, "bsdf": surface("directional_dipol")}))
 
 
+@pytest.mark.parametrize(
+    ("plugin", "wrong", "meant"),
+    [
+        ({"type": "translucent", "material": "marble", "modle": "neural"}, "modle", "model"),
+        ({"type": "translucent", "material": "marble", "reflektion": False}, "reflektion", "reflection"),
+        ({"type": "translucent", "material": "marble", "shiny": {"type": "uniform", "value": 1.0}}, "shiny", None),
+        ({"type": "bssrdf", "mm_per_unti": 10.0}, "mm_per_unti", "mm_per_unit"),
+        ({"type": "translucent_walk", "max_dpth": 3}, "max_dpth", "max_depth"),
+        ({"type": "translucent_walk", "area_share": 0.5}, "area_share", None),
+    ],
+)
+def test_an_unknown_parameter_is_refused_by_name(plugin, wrong, meant):
+    with pytest.raises(Exception) as error:
+        mi.load_dict(plugin)
+    assert f"parameter of {plugin['type']} must be one of" in str(error.value)
+    assert f"got {wrong!r}" in str(error.value)
+    assert meant is None or f"got {wrong!r}; did you mean {meant!r}?" in str(error.value)
+
+
+def test_an_unknown_parameter_in_a_file_is_refused_by_name():
+    scene = (
+        '<scene version="3.0.0"><bsdf type="translucent"><string name="material" value="marble"/>'
+        '<string name="modle" value="neural"/></bsdf></scene>'
+    )
+    with pytest.raises(Exception, match="got 'modle'; did you mean 'model'"):
+        mi.load_string(scene)
+
+
+def test_a_dilution_without_a_material_is_refused():
+    with pytest.raises(Exception, match="dilution must be left out without material, got 0.5"):
+        mi.load_dict({**surface(), "dilution": 0.5})
+
+
+@pytest.mark.parametrize("plugin", ["bssrdf", "translucent_walk"])
+def test_what_mitsuba_reads_of_an_integrator_is_allowed(plugin):
+    mi.load_dict({"type": plugin, "block_size": 16, "timeout": 5.0, "hide_emitters": True})
+
+
 def test_an_unknown_material_is_refused_with_the_nearest_name():
     refused("did you mean 'marble'", view({**SPHERE, "bsdf": {"type": "translucent", "material": "marbel"}}))
 

@@ -6,7 +6,9 @@ In a scene:
 
     <bsdf type="translucent">
         <string name="material" value="marble"/>
-        <bsdf type="roughdielectric"> <float name="alpha" value="0.1"/> </bsdf>
+        <bsdf type="roughdielectric">
+            <float name="alpha" value="0.1"/> <float name="int_ior" value="1.5"/> <float name="ext_ior" value="1"/>
+        </bsdf>
     </bsdf>
 
 Parameters, all optional but the medium:
@@ -16,7 +18,8 @@ Parameters, all optional but the medium:
     orders: "total" (single scattering is added where the model lacks it), "multiple" or "single".
     channel: R, G or B, or a number; under a mono variant, for a medium with channels.
     dilution: of a material that has one, see `halfspace_sss.materials.load`.
-    a BSDF inside: the boundary, a `dielectric` or `roughdielectric`; by default smooth, with the eta of the medium.
+    a BSDF inside: the boundary, a `dielectric` or `roughdielectric` with int_ior / ext_ior equal to the eta of the
+        medium; by default smooth.
     reflection: whether the boundary reflects light, by default true.
 
 To an integrator that knows nothing of the inside, the surface shows its reflection only.
@@ -30,14 +33,19 @@ from typing import Any
 import numpy as np
 
 from halfspace_sss import materials
+from halfspace_sss.checks import check_choice
 from halfspace_sss.interface.model import models
 from halfspace_sss.materials.channels import one_channel
 from halfspace_sss.physics.medium import Medium
+from halfspace_sss.rendering.surface.parameters import check_parameters
 from halfspace_sss.rendering.surface.variants import variant_channels
 
 __all__ = ["ORDERS", "Inside", "translucent_class"]
 
 ORDERS = ("total", "multiple", "single")
+PARAMETERS = (
+    "material", "sigma_s", "sigma_a", "g", "eta", "model", "orders", "channel", "dilution", "reflection",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -113,21 +121,13 @@ def read_inside(props: Any) -> Inside:
     Raises:
         ValueError: a parameter is missing, unknown in value, or out of range.
     """
+    inner = [key for key, _ in _boundaries(props)]
+    check_parameters("translucent", props, (*PARAMETERS, *inner))
     label, medium = _medium(props)
     model, orders = props.get("model", "neural"), props.get("orders", "total")
-    if orders not in ORDERS:
-        raise ValueError(f"orders must be one of {', '.join(ORDERS)}, got {orders!r}")
-    _check_model(model)
+    check_choice("orders", orders, ORDERS)
+    check_choice("model", model, models())
     return Inside(label, medium, model, orders, bool(props.get("reflection", True)))
-
-
-def _check_model(name: str) -> None:
-    import difflib
-
-    if name not in models():
-        close = difflib.get_close_matches(name, models(), n=1)
-        hint = f"; did you mean {close[0]!r}?" if close else ""
-        raise ValueError(f"model must be one of {', '.join(models())}, got {name!r}{hint}")
 
 
 def _medium(props: Any) -> tuple[str, Medium]:
@@ -138,6 +138,8 @@ def _medium(props: Any) -> tuple[str, Medium]:
         dilution = float(props["dilution"]) if "dilution" in props else None
         material = materials.load(props["material"], dilution=dilution)
         label, medium, names = material.name, material.medium, material.channels
+    elif "dilution" in props:
+        raise ValueError(f"dilution must be left out without material, got {props['dilution']!r}")
     elif "sigma_s" in inline and "sigma_a" in inline:
         values = {key: _numbers(key, props[key]) for key in inline}
         values["eta"] = float(np.max(values.get("eta", 1.3)))
@@ -175,11 +177,18 @@ def _numbers(key: str, value: Any) -> Any:
     return float(found[0]) if len(found) == 1 else found
 
 
+def _boundaries(props: Any) -> list[tuple[str, Any]]:
+    """Names and surfaces of what stands inside."""
+    import mitsuba as mi
+
+    return [(key, found) for key, found in props.objects() if isinstance(found, mi.BSDF)]
+
+
 def _boundary(props: Any, eta: float) -> Any:
     """The dielectric of the surface."""
     import mitsuba as mi
 
-    inner = [props[key] for key in props.keys() if isinstance(props[key], mi.BSDF)]
+    inner = [boundary for _, boundary in _boundaries(props)]
     if len(inner) > 1:
         raise ValueError(f"a translucent surface must have at most one BSDF inside, got {len(inner)}")
     if not inner:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from halfspace_sss.checks import check_interval
+from halfspace_sss.rendering.surface.parameters import OF_MITSUBA, check_parameters
 from halfspace_sss.rendering.transport.plane import GEOMETRIES
 
 __all__ = ["AUTOMATIC", "Settings", "read_settings"]
@@ -47,6 +48,7 @@ class Settings:
 
 
 def read_settings(props: Any) -> Settings:
-    """Settings from the parameters of the plugin; ValueError if one is out of range."""
+    """Settings from the parameters of the plugin; ValueError if one is unknown or out of range."""
+    check_parameters("bssrdf", props, (*Settings.__dataclass_fields__, *OF_MITSUBA))
     given = {key: props[key] for key in Settings.__dataclass_fields__ if key in props}
     return Settings(**given)

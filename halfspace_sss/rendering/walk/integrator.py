@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 from halfspace_sss.rendering.surface.object import same_objects
+from halfspace_sss.rendering.surface.parameters import OF_MITSUBA, check_parameters
 from halfspace_sss.rendering.walk.connect import find_joins
 from halfspace_sss.rendering.walk.guide import Guide
 from halfspace_sss.rendering.walk.media import WalkMedia
@@ -14,6 +15,7 @@ from halfspace_sss.rendering.walk.tracing import PathTracer
 
 __all__ = ["walk_integrator_class"]
 
+PARAMETERS = ("mm_per_unit", "max_depth", "rr_depth", "hide_emitters", "join_share")
 SAMPLES_PER_LAUNCH = 2**21
 LANES = 2**14  # fastest of 2**12 to 2**18 on 2 cores
 FOREVER = 2**31 - 1
@@ -33,6 +35,7 @@ def walk_integrator_class() -> type:
         """
 
         def __init__(self, props: Any) -> None:
+            check_parameters("translucent_walk", props, (*PARAMETERS, *OF_MITSUBA))
             mi.SamplingIntegrator.__init__(self, props)
             self.mm_per_unit = _positive("mm_per_unit", float(props.get("mm_per_unit", 1.0)))
             self.max_depth = _depth("max_depth", int(props.get("max_depth", -1)))
