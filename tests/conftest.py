@@ -38,7 +38,9 @@ def stand_ins(tmp_path_factory: pytest.TempPathFactory):
             for k, shape in enumerate(layer_shapes(inputs[kind][0], inputs[kind][1], 3)):
                 arrays[f"W_{k}"] = (rng.standard_normal(shape) / np.sqrt(shape[0])).astype(np.float32)
                 arrays[f"b_{k}"] = (0.1 * rng.standard_normal(shape[1])).astype(np.float32)
-            save_weights(path, kind, arrays, {"width": inputs[kind][1], "depth": 3, "scale": float(medium.albedo) ** 2})
+            ratios = {key: float(getattr(medium, key)) for key in trained.RATIOS}
+            record = {"width": inputs[kind][1], "depth": 3, "scale": float(medium.albedo) ** 2, "medium": ratios}
+            save_weights(path, kind, arrays, record)
         return path
 
     with pytest.MonkeyPatch.context() as patch:

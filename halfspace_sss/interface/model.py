@@ -259,15 +259,23 @@ def _installed() -> Mapping[str, type[BSSRDF]]:
 def register_model(cls: type[BSSRDF]) -> type[BSSRDF]:
     """Add a model class under its `name`; usable as a decorator.
 
+    A class of the same module and qualified name as one that was registered before, as from a cell of a notebook that
+    runs again, takes its place.
+
     Raises:
-        ValueError: it is not a BSSRDF, or the name is taken.
+        ValueError: it is not a BSSRDF, or the name is taken by another class.
     """
     if not (isinstance(cls, type) and issubclass(cls, BSSRDF)):
         raise ValueError(f"a model must be a subclass of BSSRDF, got {cls!r}")
-    if cls.name in models():
+    if cls.name in models() and not _defined_again(cls):
         raise ValueError(f"model name must be new, got {cls.name!r}, which is registered already")
     _registered[cls.name] = cls
     return cls
+
+
+def _defined_again(cls: type[BSSRDF]) -> bool:
+    before = _registered.get(cls.name)
+    return before is not None and (before.__module__, before.__qualname__) == (cls.__module__, cls.__qualname__)
 
 
 def models() -> tuple[str, ...]:

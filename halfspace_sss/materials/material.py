@@ -15,6 +15,8 @@ from halfspace_sss.physics.medium import Medium
 
 __all__ = ["Material", "key_of"]
 
+LONGEST_NAME = 80  # bytes in UTF-8; file systems end at 255
+
 
 def key_of(name: str) -> str:
     """What of a name counts in a look-up: its letters and digits, whatever the case, and `&` as `and`."""
@@ -26,12 +28,24 @@ def _check_text(name: str, value: object) -> None:
         raise ValueError(f"{name} must be a text that is not empty, got {value!r}")
 
 
+def _check_name(name: str) -> None:
+    if not key_of(name):
+        raise ValueError(f"name must contain a letter or a digit, got {name!r}")
+    wrong = [c for c in name if c in '/\\<>:"|?*' or not c.isprintable()]
+    if wrong:
+        raise ValueError(f"name must be without {wrong[0]!r}, as folders are called by it, got {name!r}")
+    if name.startswith(".") or name.endswith(".") or name != name.strip():
+        raise ValueError(f"name must neither begin nor end with a dot or a space, got {name!r}")
+    if len(name.encode()) > LONGEST_NAME:
+        raise ValueError(f"name must have at most {LONGEST_NAME} bytes, got {len(name.encode())}: {name[:20]!r}...")
+
+
 @dataclass(frozen=True)
 class Material:
     """A named medium with its provenance.
 
     Args:
-        name: name in the registry; case and separators do not count.
+        name: name in the registry, which folders may be called by; case and separators do not count.
         medium: its optical properties, 1/mm.
         channels: names of the channels of `medium`, e.g. ("R", "G", "B"); None for a medium with one channel.
         set: the group it was published in, e.g. "Jensen2001".
@@ -64,8 +78,7 @@ class Material:
     def __post_init__(self) -> None:
         for name in ("name", "set", "source"):
             _check_text(name, getattr(self, name))
-        if not key_of(self.name):
-            raise ValueError(f"name must contain a letter or a digit, got {self.name!r}")
+        _check_name(self.name)
         if not isinstance(self.medium, Medium):
             raise ValueError(f"medium must be a Medium, got {type(self.medium).__name__}")
         n = None if self.channels is None else len(self.channels)

@@ -22,6 +22,7 @@ __all__ = ["ENTRY_POINT_GROUP", "ENVIRONMENT_VARIABLE", "Registry", "load", "nam
 
 ENVIRONMENT_VARIABLE = "HALFSPACE_SSS_MATERIALS"
 ENTRY_POINT_GROUP = "halfspace_sss.materials"
+IN_CODE = "register()"
 
 
 class Registry:
@@ -51,7 +52,7 @@ class Registry:
     def register(self, material_or_path: Material | str | os.PathLike) -> tuple[str, ...]:
         """Add a material, or those of a TOML file or folder; returns their names."""
         if isinstance(material_or_path, Material):
-            found = [("register()", material_or_path)]
+            found = [(IN_CODE, material_or_path)]
         elif isinstance(material_or_path, (str, os.PathLike)):
             found = list(_from_path(material_or_path))
         else:
@@ -71,14 +72,19 @@ class Registry:
             return self._materials
 
     def _add(self, found: Iterable[tuple[str, Material]]) -> None:
-        materials, origins = dict(self._materials), dict(self._origins)
+        materials, origins, added = dict(self._materials), dict(self._origins), set()
         for origin, material in found:
             key = key_of(material.name)
-            if key in materials:
+            if key in materials and (key in added or not self._comes_again(key, origin, material)):
                 taken = f"{materials[key].name!r} of {origins[key]}"
                 raise ValueError(f"{origin}: key name must be new, got {material.name!r}, which is {taken}")
             materials[key], origins[key] = material, origin
+            added.add(key)
         self._materials, self._origins = materials, origins
+
+    def _comes_again(self, key: str, origin: str, material: Material) -> bool:
+        """Whether a material may take the place of that of the same name: it is equal, or of the same file."""
+        return material == self._materials[key] or (origin == self._origins[key] != IN_CODE)
 
 
 def _installed() -> Iterator[tuple[str, Material]]:
@@ -166,6 +172,8 @@ def load(name: str, *, dilution: float | None = None, g: Any = None) -> Material
 
 def register(material_or_path: Material | str | os.PathLike) -> tuple[str, ...]:
     """Add a `Material`, or all materials of a TOML file or folder, for this process; returns their names.
+
+    A file that is read again replaces what it gave before; an equal material may be added again.
 
     Raises:
         ValueError: a file is refused (file, key, bound and value are named) or a name is taken; nothing is added then.

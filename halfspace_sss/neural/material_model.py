@@ -10,7 +10,7 @@ from halfspace_sss.neural.features import N_FEATURES
 from halfspace_sss.neural.network import SILU, Activation, Network, layer_shapes
 from halfspace_sss.neural.store import load_weights, record_count
 from halfspace_sss.neural.symmetric import SymmetricModel, channels
-from halfspace_sss.neural.trained import find_weights
+from halfspace_sss.neural.trained import check_medium, find_weights
 from halfspace_sss.physics.medium import Medium
 
 __all__ = ["KIND", "NeuralMaterial", "load_network", "network_arrays"]
@@ -24,9 +24,10 @@ def network_arrays(network: Network) -> dict[str, np.ndarray]:
     return {f"{name}_{k}": array for k, pair in pairs for name, array in zip("Wb", pair)}
 
 
-def load_network(path: Path, kind: str, n_in: int, activation: Activation = SILU) -> Network:
-    """The network of a file of weights; ValueError names the file if it cannot be used."""
+def load_network(path: Path, kind: str, medium: Medium, n_in: int, activation: Activation = SILU) -> Network:
+    """The network of a file of weights; ValueError names the file if it cannot be used, or not for this medium."""
     arrays, record = load_weights(path, kind)
+    check_medium(path, record, medium)
     shapes = layer_shapes(n_in, record_count(path, record, "width"), record_count(path, record, "depth", 64))
     wanted = {f"{name}_{k}": s for k, pair in enumerate(shapes) for name, s in zip("Wb", (pair, pair[1:]))}
     found = {name: array.shape for name, array in arrays.items()}
@@ -49,7 +50,7 @@ class NeuralMaterial(SymmetricModel):
 
     def __init__(self, medium: Medium) -> None:
         super().__init__(medium)
-        self.networks = [load_network(find_weights(KIND, m), KIND, N_FEATURES) for m in channels(medium)]
+        self.networks = [load_network(find_weights(KIND, m), KIND, m, N_FEATURES) for m in channels(medium)]
 
     def for_medium(self, medium: Medium) -> NeuralMaterial:
         return NeuralMaterial(medium)

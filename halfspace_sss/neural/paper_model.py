@@ -61,7 +61,8 @@ class NeuralPaper(BSSRDF):
     def __init__(self, medium: Medium) -> None:
         super().__init__(medium)
         files = [find_weights(KIND, m) for m in channels(medium)]
-        self.networks: list[Network] = [load_network(file, KIND, N_INPUTS, RELU) for file in files]
+        pairs = zip(files, channels(medium))
+        self.networks: list[Network] = [load_network(file, KIND, m, N_INPUTS, RELU) for file, m in pairs]
         self.scales = [record_number(file, load_weights(file, KIND)[1], "scale", 0.0, 1e30) for file in files]
 
     def for_medium(self, medium: Medium) -> NeuralPaper:

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 from halfspace_sss.physics.medium import Medium
 
-__all__ = ["ENVIRONMENT_VARIABLE", "find_weights", "weights_folder", "weights_name"]
+__all__ = ["ENVIRONMENT_VARIABLE", "check_medium", "find_weights", "weights_folder", "weights_name"]
 
 ENVIRONMENT_VARIABLE = "HALFSPACE_SSS_WEIGHTS"
+RATIOS = ("albedo", "g", "eta")
 
 
 def weights_folder() -> Path:
@@ -23,8 +26,26 @@ def weights_folder() -> Path:
 
 def weights_name(kind: str, medium: Medium) -> str:
     """File name of the weights of a scalar medium: all that counts is albedo, g and eta, to eight digits."""
-    numbers = (f"{name}{float(getattr(medium, name)):.8g}" for name in ("albedo", "g", "eta"))
+    numbers = (f"{name}{value}" for name, value in _digits(medium).items())
     return "-".join((kind, *numbers)) + ".safetensors"
+
+
+def _digits(medium: Medium) -> dict[str, str]:
+    """What counts of a scalar medium, to the digits that count."""
+    return {name: f"{float(getattr(medium, name)):.8g}" for name in RATIOS}
+
+
+def check_medium(path: Path, record: Mapping[str, Any], medium: Medium) -> None:
+    """ValueError if the weights of `path` were trained for another medium, whatever the file is called."""
+    found = record.get("medium")
+    if not isinstance(found, dict) or any(type(found.get(name)) not in (int, float) for name in RATIOS):
+        raise ValueError(f"{path.with_suffix('.json')}: medium must have {', '.join(RATIOS)} as numbers, got {found!r}")
+    for name, wanted in _digits(medium).items():
+        if f"{found[name]:.8g}" != wanted:
+            raise ValueError(
+                f"{path.with_suffix('.json')}: {name} of medium must be {wanted} for this medium, got {found[name]!r}: "
+                "the weights are those of another one, renamed"
+            )
 
 
 def find_weights(kind: str, medium: Medium) -> Path:
@@ -38,7 +59,7 @@ def find_weights(kind: str, medium: Medium) -> Path:
     for folder in (weights_folder(), shipped):
         if (folder / name).exists():
             return folder / name
-    ratios = ", ".join(f"{n} {float(getattr(medium, n)):.4g}" for n in ("albedo", "g", "eta"))
+    ratios = ", ".join(f"{n} {float(getattr(medium, n)):.4g}" for n in RATIOS)
     raise ValueError(
         f"medium must be trained for {kind}, got one that is not ({ratios}); "
         f"`halfspace-sss train` does it, the model `neural` needs no training"

@@ -14,6 +14,7 @@ from halfspace_sss import bssrdf, materials
 from halfspace_sss.cli import app as cli
 from halfspace_sss.maps import noisy_maps
 from halfspace_sss.maps.noisy_maps import CellGrid
+from halfspace_sss.materials import registry
 from halfspace_sss.neural import material_model, paper_model, trained
 from halfspace_sss.neural.store import load_weights
 from halfspace_sss.neural.training import recipes as training
@@ -90,6 +91,18 @@ def test_training_stops_at_the_target_error_that_is_given() -> None:
 def test_unfinished_work_lies_in_a_folder_of_each_material_and_channel() -> None:
     assert _invoke("train", "fig10", "--work", "unfinished").exit_code == 0
     assert (Path("unfinished") / "fig10" / "channel-0" / "run.json").is_file()
+
+
+def test_the_name_of_a_material_cannot_lead_out_of_the_work_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    entry = '[[material]]\nname = "../../x"\nsigma_s = 1.0\nsigma_a = 0.1\ng = 0.0\n'
+    (tmp_path / "mine.toml").write_text(f'set = "mine"\nunit = "1/mm"\neta = 1.3\nsource = "mine"\n{entry}')
+    monkeypatch.setenv(registry.ENVIRONMENT_VARIABLE, str(tmp_path / "mine.toml"))
+    monkeypatch.setattr(registry, "_registry", registry.Registry())
+    result = _invoke("train", "../../x", "--work", "a/b/ww")
+    assert result.exit_code == 2 and "name must be without '/', as folders are called by it" in result.stderr
+    assert not (Path("a") / "x").exists() and not Path("x").exists()
 
 
 def test_the_universal_network_is_trained_into_a_folder() -> None:

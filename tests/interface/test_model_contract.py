@@ -11,8 +11,10 @@ import pytest
 from scipy.stats import chisquare
 
 import halfspace_sss
+from analytic_models.standard_dipole import StandardDipole
 from halfspace_sss import Medium
 from halfspace_sss.backend import array_types
+from halfspace_sss.interface import model as interface
 
 MEDIA = [
     Medium(1.8075, 0.6025, 0.0, 1.3),
@@ -223,6 +225,41 @@ def test_for_medium_keeps_the_model(name):
     model = halfspace_sss.bssrdf(name, MEDIA[0])
     other = model.for_medium(MEDIA[1])
     assert type(other) is type(model) and other.medium == MEDIA[1]
+
+
+DEFINE = "class Twice(StandardDipole):\n    name = 'twice'\n    version = {}\n"
+
+
+@pytest.fixture
+def define(monkeypatch):
+    """`define(version, **scope)`: the class of a cell of a notebook, in a registry of its own."""
+    monkeypatch.setattr(interface, "_registered", {})
+
+    def run(version: int, **scope: str) -> type:
+        names = {"StandardDipole": StandardDipole, "__name__": "__main__", **scope}
+        exec(DEFINE.format(version), names)
+        return names["Twice"]
+
+    return run
+
+
+def test_a_class_that_is_defined_again_takes_the_place_of_the_old_one(define):
+    for version in (1, 2):
+        halfspace_sss.register_model(define(version))
+    assert halfspace_sss.models().count("twice") == 1
+    assert halfspace_sss.bssrdf("twice", MEDIA[0]).version == 2
+
+
+def test_another_class_of_the_same_name_is_refused(define):
+    halfspace_sss.register_model(define(1))
+    with pytest.raises(ValueError, match="model name must be new, got 'twice', which is registered already"):
+        halfspace_sss.register_model(define(2, __name__="other_module"))
+    assert halfspace_sss.bssrdf("twice", MEDIA[0]).version == 1
+
+
+def test_an_installed_model_is_not_replaced(define):
+    with pytest.raises(ValueError, match="model name must be new, got 'standard_dipole'"):
+        halfspace_sss.register_model(StandardDipole)
 
 
 JOIN = """

@@ -152,6 +152,8 @@ def test_a_file_is_read_in_its_unit(fresh, written):
 
 
 WRONG = {
+    "path as a name": ('"wax"', '"../../wax"', "material '../../wax': name must be without '/', as folders are"),
+    "long name": ('"wax"', '"' + 300 * "w" + '"', "name must have at most 80 bytes, got 300"),
     "unknown key": ("eta = 1.4", "eta = 1.4\nsorce = 'x'", "key sorce is unknown; did you mean 'source'?"),
     "unknown key of a material": ("g = [", "gg = [", "material 'wax', key gg is unknown; did you mean 'g'?"),
     "missing key": ('source = "own measurement"', "", "key source is required, got nothing"),
@@ -217,11 +219,32 @@ def test_a_file_that_is_not_text_is_refused(fresh, tmp_path):
         fresh.register(tmp_path / "damaged.toml")
 
 
-def test_a_material_made_in_code_can_be_registered_once(fresh):
+def test_another_material_of_the_same_name_is_refused(fresh):
     mine = Material("My Stone", Medium(1.0, 0.1), source="a note")
     assert fresh.register(mine) == ("My Stone",) and load("my-stone") is mine
     with pytest.raises(ValueError, match=re.escape("register(): key name must be new, got 'My Stone'")):
-        fresh.register(mine)
+        fresh.register(Material("My Stone", Medium(1.0, 0.2), source="a note"))
+    assert load("my-stone") is mine
+
+
+def test_an_equal_material_can_be_registered_again(fresh):
+    for _ in range(2):
+        assert fresh.register(Material("My Stone", Medium(1.0, 0.1), source="a note")) == ("My Stone",)
+    assert len(names()) == 49
+
+
+def test_a_file_that_was_changed_and_registered_again_replaces_what_it_gave(fresh, written):
+    fresh.register(written(FILE))
+    fresh.register(written(FILE.replace("eta = 1.4", "eta = 1.45")))
+    assert load("soap").medium.eta == 1.45 and len(names()) == 50
+
+
+def test_another_file_cannot_replace_a_material(fresh, written):
+    fresh.register(written(FILE))
+    with pytest.raises(
+        ValueError, match="other.toml: key name must be new, got 'soap', which is 'soap' of .*mine.toml"
+    ):
+        fresh.register(written(FILE.replace("eta = 1.4", "eta = 1.45"), "other.toml"))
 
 
 def test_only_a_material_or_a_path_can_be_registered(fresh):
@@ -258,6 +281,12 @@ def test_a_wrong_entry_point_is_refused_by_name(fresh, monkeypatch, offered):
 
 WRONG_FIELDS = {
     "name": ({"name": " "}, "name must be a text that is not empty, got ' '"),
+    "path": ({"name": "../../x"}, "name must be without '/', as folders are called by it, got '../../x'"),
+    "path of Windows": ({"name": "a\\b"}, "name must be without '\\\\', as folders"),
+    "drive": ({"name": "c:marble"}, "name must be without ':', as folders"),
+    "hidden": ({"name": ".marble"}, "name must neither begin nor end with a dot or a space, got '.marble'"),
+    "control character": ({"name": "mar\nble"}, "name must be without '\\n', as folders"),
+    "length": ({"name": "m" * 300}, "name must have at most 80 bytes, got 300: 'mmmmm"),
     "punctuation": ({"name": "--"}, "name must contain a letter or a digit, got '--'"),
     "medium": ({"medium": 1.0}, "medium must be a Medium, got float"),
     "channels": ({"channels": ("R", "G", "B")}, "channels must match the None of medium"),

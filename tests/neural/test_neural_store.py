@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from safetensors.numpy import save
 
-from halfspace_sss import Medium
-from halfspace_sss.neural import paper_model
+from halfspace_sss import Medium, bssrdf
+from halfspace_sss.neural import material_model, paper_model, trained
 from halfspace_sss.neural.features import N_FEATURES, N_MEDIUM
 from halfspace_sss.neural.material_model import load_network
 from halfspace_sss.neural.network import layer_shapes
@@ -23,6 +23,8 @@ from halfspace_sss.neural.universal import load_hypernetwork
 
 KIND = "neural_material"
 WIDTH, DEPTH = 4, 2
+MEDIUM = Medium(1.0, 1.0, 0.0, 1.3)
+RECORD = {"width": WIDTH, "depth": DEPTH, "medium": {"albedo": 0.5, "g": 0.0, "eta": 1.3}}
 
 
 def _numbers(*shape: int, kind: type = np.float32) -> np.ndarray:
@@ -45,7 +47,7 @@ def _universal() -> dict[str, np.ndarray]:
 @pytest.fixture
 def saved(tmp_path: Path) -> Path:
     """A whole file of weights; its record lies beside it."""
-    return save_weights(tmp_path / "w.safetensors", KIND, _layers(N_FEATURES), {"width": WIDTH, "depth": DEPTH})
+    return save_weights(tmp_path / "w.safetensors", KIND, _layers(N_FEATURES), RECORD)
 
 
 def _rewrite(path: Path, arrays: dict[str, np.ndarray] | None = None, **record: Any) -> None:
@@ -233,7 +235,7 @@ WRONG = [("width", None), ("width", "4"), ("width", 4.0), ("width", True), ("wid
 def test_an_entry_that_a_network_needs_is_refused_by_file_and_key(saved: Path, key: str, value: Any) -> None:
     _rewrite(saved, **{key: value})
     with pytest.raises(ValueError) as error:
-        load_network(saved, KIND, N_FEATURES)
+        load_network(saved, KIND, MEDIUM, N_FEATURES)
     assert f"{saved.with_suffix('.json')}: {key} must be" in str(error.value) and repr(value) in str(error.value)
 
 
@@ -243,7 +245,38 @@ def test_an_entry_that_a_network_needs_is_refused_by_file_and_key(saved: Path, k
 def test_layers_that_do_not_fit_the_architecture_are_refused(saved: Path, change: dict) -> None:
     _replaced(saved, _layers(N_FEATURES), change)
     with pytest.raises(ValueError, match=f"{saved}: layers must be"):
-        load_network(saved, KIND, N_FEATURES)
+        load_network(saved, KIND, MEDIUM, N_FEATURES)
+
+
+@pytest.mark.parametrize(("key", "value"), [("albedo", 0.4), ("g", 0.1), ("eta", 1.3000001)])
+def test_weights_renamed_to_another_medium_are_refused(saved: Path, key: str, value: float) -> None:
+    ratios = {**RECORD["medium"], key: value}
+    other = Medium.from_albedo(ratios["albedo"], 2.0, ratios["g"], ratios["eta"])
+    load_network(saved, KIND, MEDIUM, N_FEATURES)
+    with pytest.raises(ValueError) as error:
+        load_network(saved, KIND, other, N_FEATURES)
+    wrong = f"{saved.with_suffix('.json')}: {key} of medium must be {value:.8g} for this medium"
+    assert f"{wrong}, got {RECORD['medium'][key]!r}" in str(error.value)
+
+
+@pytest.mark.parametrize("medium", [None, {}, "marble", {"albedo": "0.5", "g": 0, "eta": 1.3}], ids=str)
+def test_weights_that_name_no_medium_are_refused(saved: Path, medium: Any) -> None:
+    _rewrite(saved, medium=medium)
+    with pytest.raises(ValueError, match="json: medium must have albedo, g, eta as numbers, got"):
+        load_network(saved, KIND, MEDIUM, N_FEATURES)
+
+
+@pytest.mark.parametrize("model", [material_model, paper_model])
+def test_a_model_refuses_weights_renamed_to_its_medium(tmp_path: Path, monkeypatch: Any, model: Any) -> None:
+    monkeypatch.setenv(trained.ENVIRONMENT_VARIABLE, str(tmp_path))
+    monkeypatch.setattr(model, "find_weights", trained.find_weights)
+    n_in = {material_model.KIND: N_FEATURES, paper_model.KIND: paper_model.N_INPUTS}[model.KIND]
+    other = Medium.from_albedo(0.625, 1.0, 0.0, 1.3)
+    save_weights(
+        tmp_path / trained.weights_name(model.KIND, other), model.KIND, _layers(n_in), {**RECORD, "scale": 1.0}
+    )
+    with pytest.raises(ValueError, match="albedo of medium must be 0.625 for this medium, got 0.5"):
+        bssrdf(model.KIND, other)
 
 
 def _replaced(path: Path, arrays: dict[str, np.ndarray], change: dict) -> None:
@@ -283,10 +316,10 @@ def test_arrays_that_do_not_fit_the_universal_network_are_refused(universal: Pat
 
 @pytest.mark.parametrize("value", [None, "1", -1.0, float("inf"), float("nan"), True])
 def test_a_scale_that_is_no_number_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, value: Any) -> None:
-    record = {"width": WIDTH, "depth": DEPTH, "scale": value}
+    record = {**RECORD, "scale": value}
     path = save_weights(tmp_path / "p.safetensors", paper_model.KIND, _layers(paper_model.N_INPUTS), record)
     monkeypatch.setattr(paper_model, "find_weights", lambda kind, medium: path)
     with pytest.raises(ValueError) as error:
-        paper_model.NeuralPaper(Medium(1.0, 0.1))
+        paper_model.NeuralPaper(MEDIUM)
     message = str(error.value)
     assert f"{path.with_suffix('.json')}: scale must be a number in" in message and repr(value) in message
