@@ -7,6 +7,7 @@ from functools import partial
 from typing import Any, NamedTuple
 
 from halfspace_sss.rendering.lights import Lights
+from halfspace_sss.rendering.surface.object import turned
 from halfspace_sss.rendering.transport.body import Body
 from halfspace_sss.rendering.transport.plane import Exit, local_frame, number, place, plane_query
 from halfspace_sss.rendering.transport.settings import Settings
@@ -255,8 +256,8 @@ def exit_at(body: Body, si: Any) -> Exit:
     import drjit as dr
     import mitsuba as mi
 
-    w, n = si.to_world(si.wi), mi.Normal3f(si.sh_frame.n)
-    sign = mi.Float(body.found.sign)
+    w, n = si.to_world(si.wi), mi.Normal3f(turned(si.sh_frame.n, si.n))
+    sign = body.found.side(si.prim_index)
     if not body.found.closed:  # a sheet is a half-space from both sides
         sign = dr.select(dr.dot(n, w) > 0, 1.0, -1.0)
     return Exit(mi.Point3f(si.p), n * sign, w, sign)

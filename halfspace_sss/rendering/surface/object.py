@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["RAYS", "Object", "is_inside", "same_objects", "survey"]
+__all__ = ["RAYS", "Object", "is_inside", "same_objects", "survey", "turned"]
 
 RAYS = 4096  # of the survey
 MOST_HITS = 64  # that one ray counts
@@ -22,7 +22,9 @@ class Object:
     Args:
         shape: the Mitsuba shape.
         scene: a scene that holds this shape only.
-        sign: 1 if its normals point outwards, -1 if inwards.
+        sign: 1 if its geometric normals point outwards, -1 if inwards.
+        signs: Float array of the same for each face, or None if it is the same for all.
+        agree: whether shading normals are on the side of the geometric ones, as far as was seen.
         closed: whether rays that enter also leave.
         pieces: UInt32 array of the connected piece of each face, or None if there is one piece.
         size: diagonal of the bounding box, scene units.
@@ -32,6 +34,8 @@ class Object:
     shape: Any
     scene: Any
     sign: float
+    signs: Any
+    agree: bool
     closed: bool
     pieces: Any
     size: float
@@ -45,6 +49,32 @@ class Object:
         if self.pieces is None:
             return mi.UInt32(0)
         return dr.gather(mi.UInt32, self.pieces, prim_index, active)
+
+    @property
+    def upright(self) -> bool:
+        """Whether every normal points outwards."""
+        return self.sign > 0 and self.signs is None and self.agree
+
+    @property
+    def curvature_sign(self) -> float:
+        """-1 for a mesh with flip_normals, whose normals Mitsuba turns, but not their derivatives."""
+        return -1.0 if self.shape.is_mesh() and self.shape.has_flipped_normals() else 1.0
+
+    def side(self, prim_index: Any, active: Any = True) -> Any:
+        """1 where the geometric normal of a face points outwards, -1 where it points inwards."""
+        import drjit as dr
+        import mitsuba as mi
+
+        if self.signs is None:
+            return mi.Float(self.sign)
+        return dr.gather(mi.Float, self.signs, prim_index, active)
+
+
+def turned(n_shading: Any, n: Any) -> Any:
+    """The shading normal on the side of the geometric one: vertex normals need not agree with the winding of a face."""
+    import drjit as dr
+
+    return dr.select(dr.dot(n_shading, n) < 0, -n_shading, n_shading)
 
 
 def same_objects(a: list[Any], b: list[Any]) -> bool:
@@ -62,27 +92,77 @@ def survey(shape: Any) -> Object:
 
     if "nstance" in shape.class_name():
         raise ValueError(f"a translucent object must not be an instance, got {shape.id() or shape}")
+    name = shape.id()
     scene = mi.load_dict({"type": "scene", "shape": shape})
+    shape.set_id(name)  # the scene has renamed it
     box = scene.bbox()
     low, high = np.array(box.min, dtype=float), np.array(box.max, dtype=float)
     size = float(np.linalg.norm(high - low))
-    sides, odd = _outside_view(scene, 0.5 * (low + high), 0.5 * size)
+    pieces = _pieces(shape)
+    votes = _Votes(pieces)
+    sides, odd = _outside_view(scene, 0.5 * (low + high), 0.5 * size, votes)
     outward = sides[sides != 0]
     share = float((outward > 0).mean()) if len(outward) else 1.0
-    sheet = 1 - MAJORITY < share < MAJORITY
+    sheet = 1 - MAJORITY < share < MAJORITY and not votes.agree()
     if odd > 0 or sheet:
         warnings.warn(
-            f"object {shape.id()!r} is not closed: {100 * odd:.2g} % of the rays that enter it do not leave it again; "
+            f"object {name!r} is not closed: {100 * odd:.2g} % of the rays that enter it do not leave it again; "
             "light that enters or leaves at the gap is lost",
             stacklevel=2,
         )
     area = float(np.sum(np.array(shape.surface_area())))
-    return Object(
-        shape, scene, -1.0 if share <= 1 - MAJORITY else 1.0, odd == 0 and not sheet, _pieces(shape), size, area
-    )
+    closed, sign = odd == 0 and not sheet, -1.0 if share <= 1 - MAJORITY else 1.0
+    signs = votes.signs() if closed else None
+    return Object(shape, scene, sign, signs, float(votes.opposed[0]) == 0, closed, pieces, size, area)
 
 
-def _outside_view(scene: Any, centre: np.ndarray, radius: float) -> tuple[np.ndarray, float]:
+class _Votes:
+    """Of the hits on each piece, how many say that its normals point outwards: against a ray that enters.
+
+    A ray from outside enters a closed object with its first, third, ... hit, whatever hides the piece.
+    """
+
+    def __init__(self, pieces: Any) -> None:
+        import drjit as dr
+        import mitsuba as mi
+
+        self.pieces = pieces
+        n = 0 if pieces is None else int(dr.max(pieces)[0]) + 1
+        self.hits, self.outward = dr.zeros(mi.Float, n), dr.zeros(mi.Float, n)
+        self.opposed = dr.zeros(mi.Float, 1)
+
+    def add(self, si: Any, along: Any, entering: Any, active: Any) -> None:
+        """Count a hit."""
+        import drjit as dr
+        import mitsuba as mi
+
+        dr.scatter_add(self.opposed, mi.Float(1), 0, active & (dr.dot(si.sh_frame.n, si.n) < 0))
+        if self.pieces is None:
+            return
+        piece = dr.gather(mi.UInt32, self.pieces, si.prim_index, active)
+        agrees = (dr.dot(si.n, along) < 0) == entering
+        dr.scatter_add(self.hits, mi.Float(1), piece, active)
+        dr.scatter_add(self.outward, dr.select(agrees, mi.Float(1), 0), piece, active)
+
+    def _shares(self) -> np.ndarray:
+        hits = np.array(self.hits)
+        return np.where(hits > 0, np.array(self.outward) / np.maximum(hits, 1), 1.0)
+
+    def agree(self) -> bool:
+        """Whether there are pieces, and the hits on each say the same."""
+        shares = self._shares()
+        return len(shares) > 0 and bool((np.abs(shares - 0.5) >= MAJORITY - 0.5).all())
+
+    def signs(self) -> Any:
+        """Of each face, or None if all pieces have the same."""
+        import mitsuba as mi
+
+        sign = np.where(self._shares() < 0.5, -1.0, 1.0)
+        mixed = len(sign) > 0 and np.ptp(sign) > 0
+        return mi.Float(sign[np.array(self.pieces)].astype(np.float32)) if mixed else None
+
+
+def _outside_view(scene: Any, centre: np.ndarray, radius: float, votes: _Votes) -> tuple[np.ndarray, float]:
     """Per ray the side of the normal at the first hit (1 towards the ray, 0 no hit); share of rays with odd hits."""
     import mitsuba as mi
 
@@ -94,21 +174,23 @@ def _outside_view(scene: Any, centre: np.ndarray, radius: float) -> tuple[np.nda
     along = target - start
     along /= np.linalg.norm(along, axis=0)
     ray = mi.Ray3f(mi.Point3f(start), mi.Vector3f(along))
-    side, count = crossings(scene, ray)
+    side, count = crossings(scene, ray, votes)
     side, count = np.array(side), np.array(count)
     hit = count > 0
     return side, float((count[hit] % 2).mean()) if hit.any() else 0.0
 
 
-def crossings(scene: Any, ray: Any) -> tuple[Any, Any]:
+def crossings(scene: Any, ray: Any, votes: _Votes | None = None) -> tuple[Any, Any]:
     """Side of the first hit of each ray (1: the normal points to the ray, 0: no hit) and the number of hits."""
     import drjit as dr
     import mitsuba as mi
 
     def step(ray: Any, side: Any, count: Any, active: Any) -> tuple:
-        si = scene.ray_intersect(ray, mi.RayFlags.Minimal, False, active)
+        si = scene.ray_intersect(ray, mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame, False, active)
         active &= si.is_valid()
         first = dr.select(dr.dot(si.n, ray.d) < 0, 1.0, -1.0)
+        if votes is not None:
+            votes.add(si, ray.d, (count & 1) == 0, active)
         side = dr.select(active & (count == 0), first, side)
         count = dr.select(active, count + 1, count)
         return dr.select(active, si.spawn_ray(ray.d), ray), side, count, active & (count < MOST_HITS)

@@ -94,16 +94,20 @@ def translucent_class() -> type:
             return self.inside.reflection and ctx.component in (0, 0xFFFFFFFF)
 
         def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> tuple[Any, Any]:
-            bs, weight = self.boundary.sample(self._context(ctx), si, sample1, sample2, active)
+            seen, sign = _from_outside(si)
+            bs, weight = self.boundary.sample(self._context(ctx), seen, sample1, sample2, active)
+            bs.wo = _turned(bs.wo, sign)
             bs.sampled_component = 0
             return bs, weight if self._shown(ctx) else 0 * weight
 
         def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
-            value = self.boundary.eval(self._context(ctx), si, wo, active)
+            seen, sign = _from_outside(si)
+            value = self.boundary.eval(self._context(ctx), seen, _turned(wo, sign), active)
             return value if self._shown(ctx) else 0 * value
 
         def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
-            value = self.boundary.pdf(self._context(ctx), si, wo, active)
+            seen, sign = _from_outside(si)
+            value = self.boundary.pdf(self._context(ctx), seen, _turned(wo, sign), active)
             return value if self._shown(ctx) else 0 * value
 
         def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> tuple[Any, Any]:
@@ -113,6 +117,24 @@ def translucent_class() -> type:
             return f"Translucent[{self.inside}, boundary = {self.boundary}]"
 
     return Translucent
+
+
+def _from_outside(si: Any) -> tuple[Any, Any]:
+    """The interaction with the normal on the side that is seen, which is the outside, and 1 or -1 if it was turned."""
+    import drjit as dr
+    import mitsuba as mi
+
+    sign = dr.select(mi.Frame3f.cos_theta(si.wi) < 0, mi.Float(-1), 1)
+    seen = mi.SurfaceInteraction3f(si)
+    seen.wi = _turned(si.wi, sign)
+    return seen, sign
+
+
+def _turned(w: Any, sign: Any) -> Any:
+    """A local direction in the frame that is turned about its first axis where the sign is -1."""
+    import mitsuba as mi
+
+    return mi.Vector3f(w.x, w.y * sign, w.z * sign)
 
 
 def read_inside(props: Any) -> Inside:

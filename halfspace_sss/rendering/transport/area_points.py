@@ -51,6 +51,7 @@ class AreaPoints:
         b = mi.warp.square_to_uniform_triangle(u)
         weights = (1 - b.x - b.y, b.x, b.y)
         n = dr.normalize(dr.cross(corners[1] - corners[0], corners[2] - corners[0]))
+        n = -n if self.shape.has_flipped_normals() else n
         n_shading = n
         if self.shape.has_vertex_normals():
             normals = [self.shape.vertex_normal(i, active) for i in (index.x, index.y, index.z)]

@@ -13,7 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from halfspace_sss.rendering.surface.object import Object
+from halfspace_sss.rendering.surface.object import Object, turned
 from halfspace_sss.rendering.transport.area_points import AreaPoints
 from halfspace_sss.rendering.transport.plane import Exit, number
 from halfspace_sss.rendering.transport.radial_table import RadialTable
@@ -123,7 +123,7 @@ class PositionSampler:
             share = dr.select(total > 0, hope / total, 0)
             take = (u < share) & (hope > 0)
             u = dr.clip(dr.select(take, u / dr.maximum(share, 1e-20), (u - share) / dr.maximum(1 - share, 1e-7)), 0, 1)
-            found = (si.p, si.n, si.sh_frame.n * out.sign, 1 / (density * dr.maximum(hope, 1e-30)))
+            found = (si.p, si.n, turned(si.sh_frame.n, si.n) * out.sign, 1 / (density * dr.maximum(hope, 1e-30)))
             entry = tuple(dr.select(take, a, b) for a, b in zip(found, entry))
             onward = si.spawn_ray(ray.d)
             onward.maxt = ray.maxt - si.t
@@ -140,7 +140,7 @@ class PositionSampler:
         at = self.points.sample(u_face, u, active)
         same = self.found.piece(at.prim_index, active) == piece
         weight = dr.select(active & same, 1 / self.density(at.p, at.n, out, axes), 0)
-        return Entry(at.p, at.n, at.n_shading * out.sign, weight)
+        return Entry(at.p, at.n, turned(at.n_shading, at.n) * out.sign, weight)
 
 
 def _FLAGS() -> int:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+from halfspace_sss.rendering.surface.object import turned
 from halfspace_sss.rendering.transport.body import Body
 
 __all__ = ["Connection", "Passage", "leave", "refracted_connection"]
@@ -60,10 +61,10 @@ def _meet(body: Body, p: Any, d: Any, flags: Any, active: Any) -> tuple[Any, Any
     import mitsuba as mi
 
     si = body.found.scene.ray_intersect(mi.Ray3f(p, d), flags, False, active)
-    sign = body.found.sign
+    sign = body.found.side(si.prim_index, active & si.is_valid())
     if not body.found.closed:
         sign = dr.select(dr.dot(si.n, d) > 0, 1.0, -1.0)
-    return si, si.sh_frame.n * sign, si.n * sign
+    return si, turned(si.sh_frame.n, si.n) * sign, si.n * sign
 
 
 def _refract(body: Body, d: Any, n: Any) -> tuple[Any, Any, Any]:
@@ -135,7 +136,7 @@ def _aim(body: Body, p: Any, d: Any, target: Any, active: Any) -> tuple[tuple, t
     w, F, valid = _refract(body, d, n_out)
     eta, c = body.surface.inside.medium.eta, dr.dot(d, n_out)
     c_t = dr.sqrt(dr.maximum(1 - eta * eta * (1 - c * c), 1e-6))
-    flip = dr.select(dr.dot(si.sh_frame.n, n_out) > 0, 1.0, -1.0)
+    flip = dr.select(dr.dot(si.sh_frame.n, n_out) > 0, 1.0, -1.0) * body.found.curvature_sign
     D = dr.dot(target - si.p, w)
     f = mi.coordinate_system(w)
     columns = []

@@ -132,7 +132,7 @@ class Joins:
         ray = mi.Ray3f(p, w_0)
         ray.maxt = DEEPEST / dr.min(m.sigma_t)
         si = self.media.scene.ray_intersect(ray, mi.RayFlags.Minimal, coherent=False)
-        n = si.n * self.media.row("sign", k)
+        n = si.n * self.media.side(k, si.prim_index)
         facing = si.is_valid() & (dr.dot(n, w_0) > 0)
         far = dr.select(si.is_valid(), si.t, ray.maxt)
         _, cos_t, _, eta_ti = mi.fresnel(dr.select(facing, dr.dot(n, w_0), 1), self.media.row("eta", k))

@@ -43,14 +43,14 @@ class Guide:
         import mitsuba as mi
 
         toward, small = self.joins.direction(which, v)
-        eta, sign = self.media.row("eta", k), self.media.row("sign", k)
+        eta = self.media.row("eta", k)
         valid, d, w = active & small, toward, toward
         for _ in range(GUESSES):
             ray = mi.Ray3f(v, d)
             ray.maxt = DEEPEST / dr.min(m.sigma_t)
             si = self.media.scene.ray_intersect(ray, mi.RayFlags.Minimal, coherent=False, active=valid)
             valid &= si.is_valid()
-            n = si.n * sign
+            n = si.n * self.media.side(k, si.prim_index)
             w, _ = self.joins.direction(which, si.p)
             cosine = dr.dot(w, n)
             _, cos_t, _, eta_ti = mi.fresnel(dr.clip(cosine, 0, 1), eta)

@@ -53,7 +53,10 @@ class WalkMedia:
             rows = np.array([np.broadcast_to(getattr(m, key), n) for m in media], dtype=float) * scale
             tables[key] = [mi.Float(rows[:, c].tolist()) for c in range(n)] if len(media) else []
         tables["eta"] = mi.Float([m.eta for m in media])
-        tables["sign"] = mi.Float([found.sign for found in self.objects])
+        sides = [[found.sign] if found.signs is None else np.array(found.signs).tolist() for found in self.objects]
+        tables["side"] = mi.Float(sum(sides, []))
+        tables["first"] = mi.UInt32(np.cumsum([0, *map(len, sides)])[:-1].tolist())
+        tables["step"] = mi.UInt32([int(len(side) > 1) for side in sides])
         tables["fewest"] = mi.UInt32([_FEWEST[inside.orders] for inside in self.insides])
         tables["most"] = mi.UInt32([_MOST[inside.orders] for inside in self.insides])
         tables["reflects"] = mi.Bool([inside.reflection for inside in self.insides])
@@ -122,16 +125,25 @@ class WalkMedia:
             return self.boundaries[0]
         return dr.reinterpret_array(mi.BSDFPtr, dr.gather(mi.UInt32, self.tables["boundary"], k))
 
+    def side(self, k: Any, prim_index: Any) -> Any:
+        """1 where the geometric normal of a face of object k points outwards, -1 where it points inwards."""
+        import drjit as dr
+
+        if all(found.signs is None for found in self.objects):
+            return self.row("side", k)
+        index = self.row("first", k) + prim_index * self.row("step", k)
+        return self.row("side", dr.minimum(index, dr.width(self.tables["side"]) - 1))
+
     def face_outwards(self, si: Any, k: Any, direction: Any) -> Any:
         """The interaction with its normals turned to the outside of object k; `direction` is that of the ray."""
         import drjit as dr
         import mitsuba as mi
 
-        if all(found.sign > 0 for found in self.objects):
+        if all(found.upright for found in self.objects):
             return si
-        flip = (k >= 0) & (self.row("sign", dr.maximum(k, 0)) < 0)
-        si.n = dr.select(flip, -si.n, si.n)
-        n = si.sh_frame.n
+        n = dr.select(k >= 0, si.n * self.side(dr.maximum(k, 0), si.prim_index), si.n)
+        flip = (k >= 0) & (dr.dot(si.sh_frame.n, n) < 0)
+        si.n, n = n, si.sh_frame.n
         si.sh_frame = dr.select(flip, mi.Frame3f(-n), si.sh_frame)
         si.wi = si.to_local(-direction)
         return si
