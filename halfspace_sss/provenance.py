@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import os
 import platform
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator, Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-__all__ = ["check_folder", "provenance", "write_atomically"]
+__all__ = ["check_folder", "provenance", "replace_together", "write_atomically", "write_together"]
 
 LIBRARIES = ("halfspace-sss", "numpy", "drjit", "mitsuba", "torch", "xarray", "zarr")
 
@@ -65,16 +67,49 @@ def check_folder(folder: str | Path) -> Path:
 
 def write_atomically(path: Path, content: bytes | str) -> None:
     """Write a file under a temporary name beside it and rename it: it is whole or it is not there."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    data = content.encode() if isinstance(content, str) else content
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    write_together({path: content})
+
+
+def write_together(files: Mapping[Path, bytes | str]) -> None:
+    """Write files that belong together: those that are there at any moment are all whole and of the same writing.
+
+    All are written under temporary names first, so that a full disk leaves the files of before.
+
+    Raises:
+        OSError: a file cannot be written; the message names it.
+    """
+    written: dict[Path, Path] = {}
     try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+        for path, content in files.items():
+            with _naming(path):
+                path.parent.mkdir(parents=True, exist_ok=True)
+                handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+                written[path] = Path(temporary)
+                with os.fdopen(handle, "wb") as file:
+                    file.write(content.encode() if isinstance(content, str) else content)
+                    file.flush()
+                    os.fsync(file.fileno())
+                os.chmod(temporary, 0o644)
+        replace_together({temporary: path for path, temporary in written.items()})
+    finally:
+        for temporary in written.values():
+            temporary.unlink(missing_ok=True)
+
+
+def replace_together(moves: Mapping[Path, Path]) -> None:
+    """Rename files, old name to new, so that those with the new names are at any moment of one set."""
+    first, *others = moves.values()
+    for path in others:
+        path.unlink(missing_ok=True)
+    for old, new in moves.items():
+        with _naming(new):
+            os.replace(old, new)
+
+
+@contextlib.contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    """What the system refuses is told with the path that was meant."""
+    try:
+        yield
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(path)) from error

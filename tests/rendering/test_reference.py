@@ -69,7 +69,7 @@ def test_a_file_reads_back_as_it_was_and_tells_its_origin(tmp_path: Path) -> Non
     found = reference.load(tmp_path / "a.exr")
     assert np.array_equal(found.mean, made.mean) and np.array_equal(found.variance, made.variance)
     header = json.loads((tmp_path / "a.json").read_text())
-    assert (header["passes"], header["seed"], header["spp_per_pass"]) == (3, 7, 4)
+    assert (header["passes"], header["seed"], header["spp"]) == (3, 7, 12)
     assert "TranslucentWalk" in header["integrator"] and "mitsuba" in header["provenance"]["versions"]
     rgb = np.array(mi.Bitmap(str(tmp_path / "a.exr")))[..., :3]
     np.testing.assert_allclose(rgb, made.mean, rtol=1e-6)
@@ -80,6 +80,53 @@ def test_a_run_in_two_parts_gives_the_bits_of_a_run_in_one(tmp_path: Path) -> No
     reference.render(_scene(), tmp_path / "parts.exr", spp_per_pass=4, passes=4)
     parts = reference.render(_scene(), tmp_path / "parts.exr", spp_per_pass=4, passes=9)
     assert np.array_equal(whole.mean, parts.mean) and np.array_equal(whole.variance, parts.variance)
+
+
+def test_more_samples_asked_for_later_give_the_bits_of_a_run_that_asked_at_once(tmp_path: Path) -> None:
+    whole = reference.render(_scene(), tmp_path / "whole.exr", spp=64)
+    for spp in (4, 16, 64):
+        parts = reference.render(_scene(), tmp_path / "parts.exr", spp=spp)
+        assert parts.spp == spp
+    assert np.array_equal(whole.mean, parts.mean) and np.array_equal(whole.variance, parts.variance)
+
+
+def test_passes_of_any_size_count_by_their_samples(tmp_path: Path) -> None:
+    images, sizes = [], (5, 2, 2, 1)
+    reference.render(_scene(), tmp_path / "a.exr", spp=5, spp_per_pass=5)
+    reference.render(_scene(), tmp_path / "a.exr", spp=9, spp_per_pass=2)
+    found = reference.render(_scene(), tmp_path / "a.exr", spp=10)
+    for k, n in enumerate(sizes):
+        seed = int(np.random.SeedSequence([0, k]).generate_state(1)[0])
+        images.append(np.array(mi.render(mi.load_dict(_scene()), spp=n, seed=seed), dtype=float))
+    weights = np.array(sizes)[:, None, None, None]
+    mean = np.sum(weights * images, axis=0) / 10
+    np.testing.assert_allclose(found.mean, mean, rtol=1e-6)
+    spread = np.sum(weights * (np.array(images) - mean) ** 2, axis=0)
+    np.testing.assert_allclose(found.variance, spread / (3 * 10), rtol=1e-5, atol=1e-12)
+    assert (found.passes, found.spp) == (4, 10)
+
+
+def test_the_error_of_passes_that_grow_is_the_error(tmp_path: Path) -> None:
+    """Over seeds and pixels, the squared distance from a long run is the variance that is told, to 15 %."""
+    truth = reference.render(_scene(), tmp_path / "long.exr", spp=8192, seed=99).mean
+    runs = [reference.render(_scene(), tmp_path / f"{seed}.exr", spp=32, seed=seed) for seed in range(24)]
+    told = np.mean([run.variance.sum() for run in runs])
+    assert abs(np.mean([((run.mean - truth) ** 2).sum() for run in runs]) / told - 1) < 0.15
+
+
+def test_a_run_that_begins_anew_forgets_the_file_that_is_there(tmp_path: Path) -> None:
+    reference.render(_scene(radius=1.1), tmp_path / "a.exr", spp=4)
+    assert reference.render(_scene(), tmp_path / "a.exr", spp=2, resume=False).spp == 2
+    assert reference.load(tmp_path / "a.exr").spp == 2
+
+
+def test_a_run_that_goes_on_from_another_file_leaves_it_as_it_is(tmp_path: Path) -> None:
+    first, second = tmp_path / "first.exr", tmp_path / "second.exr"
+    reference.render(_scene(), first, spp=4)
+    before = first.read_bytes()
+    for spp in (4, 8):
+        assert reference.render(_scene(), second, spp=spp, resume=first).spp == reference.load(second).spp == spp
+    assert first.read_bytes() == before
 
 
 def test_a_killed_run_leaves_a_whole_file_and_resumes(tmp_path: Path) -> None:
@@ -146,7 +193,7 @@ def test_a_file_of_another_render_is_refused_by_name(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({}, "one of passes"),
+        ({}, "one of spp, passes"),
         ({"passes": 0}, "passes must be .* got 0"),
         ({"target_error": 0.0}, "target_error must be .* got 0.0"),
         ({"passes": 1, "spp_per_pass": 1.5}, "spp_per_pass must be .* got 1.5"),

@@ -3,27 +3,32 @@
     reference.render("scene.xml", "truth.exr", integrator={"type": "translucent_walk"}, target_error=0.01)
     truth = reference.load("truth.exr")             # .mean, .variance, .standard_error, .about
 
-The seed of pass k depends on the seed of the run and on k only, so that a resumed run gives the same image.
+The seed of pass k depends on the seed of the run and on k only, and the size of a pass on the samples before it, so
+that a resumed run gives the same image, also one that was to have more samples from the start.
 """
 
 from __future__ import annotations
 
-import hashlib
 import math
 import os
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from halfspace_sss.checks import check_count
 from halfspace_sss.provenance import check_folder, provenance
+from halfspace_sss.rendering.scene_identity import scene_hash, words
 from halfspace_sss.rendering.scenes.reference_store import Reference, load, save
 
-__all__ = ["Reference", "load", "render", "scene_hash"]
+__all__ = ["Reference", "load", "render"]
 
 FEWEST_PASSES = 8  # before the spread of the passes is trusted to stop a run
+SHARE = 4  # a growing pass has at most a quarter of the samples so far: enough passes for their spread, few launches
+LARGEST_PASS = 64  # samples per pixel: an interrupt waits for one pass
 Progress = Callable[[Reference], None]
 
 
@@ -33,53 +38,57 @@ def render(
     *,
     integrator: dict | None = None,
     sensor: int = 0,
-    spp_per_pass: int = 16,
+    spp_per_pass: int | None = None,
     seed: int = 0,
+    spp: int | None = None,
     passes: int | None = None,
     target_error: float | None = None,
     seconds: float | None = None,
     interval: float = 30.0,
+    resume: bool | str | os.PathLike = True,
     progress: Progress | None = None,
 ) -> Reference:
     """Render a scene in passes into an EXR file, or go on with the file that is there.
 
-    The run ends as soon as one of `passes`, `target_error` and `seconds` is reached; all count what the file holds
-    already. Under an interrupt or an error the passes so far are kept.
+    The run ends as soon as one of `spp`, `passes`, `target_error` and `seconds` is reached; all count what the file
+    holds already. Under an interrupt or an error the passes so far are kept.
 
     Args:
         scene: a dict, the path of an XML file, or a Mitsuba scene.
         path: of the EXR file; a JSON file beside it repeats its header.
         integrator: dict of the integrator; by default that of the scene.
         sensor: number of the sensor.
-        spp_per_pass: samples per pixel of a pass.
+        spp_per_pass: samples per pixel of a pass; by default passes grow with what is there, from 1 to 64. The last
+            one is cut to `spp`.
         seed: of the run.
+        spp: samples per pixel in all.
         passes: number of passes in all.
         target_error: `Reference.relative_error` to come down to; looked at from the 8th pass on.
         seconds: of rendering in all.
         interval: seconds between writes of the file; 0 writes after every pass.
+        resume: True goes on with the file at `path` if there is one, False begins anew, another path goes on with the
+            file there and leaves it as it is.
         progress: called after each pass.
 
     Raises:
         ValueError: an argument is out of range, the file is damaged or of another render, or a pass has values that
             are not finite.
     """
-    _check(passes, target_error, seconds, spp_per_pass, seed, interval)
+    limits = Limits(spp, passes, target_error, seconds)
+    _check(spp_per_pass, seed, interval)
     path = Path(path)
     if path.suffix.lower() != ".exr":
         raise ValueError(f"path must end in .exr, got {str(path)!r}")
     check_folder(path.parent)
     scene, integrator = _load(scene, integrator)
-    about = _about(scene, integrator, sensor, spp_per_pass, seed)
-    found = _resume(path, about) if path.exists() else None
-    written = found
-
-    def is_done() -> bool:
-        return found is not None and _ends(found, passes, target_error, seconds)
-
+    _check_sensor(scene, sensor)
+    about = _about(scene, integrator, sensor, seed)
+    found = _start(path, resume, about)
+    written = found if resume is True else None
     last = time.monotonic()
     try:
-        while not is_done():
-            found = _pass(found, scene, integrator, sensor, about)
+        while not limits.reached(found):
+            found = _pass(found, scene, integrator, sensor, about, _pass_spp(found, spp_per_pass, spp))
             if time.monotonic() - last >= interval:
                 save(path, found)
                 written, last = found, time.monotonic()
@@ -91,41 +100,63 @@ def render(
     return found
 
 
-def _pass(found: Reference | None, scene: Any, integrator: Any, sensor: int, about: dict) -> Reference:
+@dataclass(frozen=True)
+class Limits:
+    """What ends a run: samples per pixel, passes, relative error, seconds, whichever comes first; None is no limit."""
+
+    spp: int | None
+    passes: int | None
+    target_error: float | None
+    seconds: float | None
+
+    def __post_init__(self) -> None:
+        if all(value is None for value in vars(self).values()):
+            raise ValueError(f"one of {', '.join(vars(self))} must be given, got none")
+        for name in ("spp", "passes"):
+            if getattr(self, name) is not None:
+                check_count(name, getattr(self, name), 1)
+        for name in ("target_error", "seconds"):
+            value = getattr(self, name)
+            if value is not None and not (math.isfinite(value) and value > 0):
+                raise ValueError(f"{name} must be finite and > 0, got {value!r}")
+
+    def reached(self, found: Reference | None) -> bool:
+        if found is None:
+            return False
+        trusted = found.passes >= FEWEST_PASSES
+        pairs = ((self.spp, found.spp), (self.passes, found.passes), (self.seconds, found.seconds))
+        certain = self.target_error is not None and trusted and found.relative_error <= self.target_error
+        return certain or any(limit is not None and value >= limit for limit, value in pairs)
+
+
+def _pass_spp(found: Reference | None, fixed: int | None, most: int | None) -> int:
+    """Samples per pixel of the next pass; a power of two where it grows, for Mitsuba compiles others anew."""
+    done = found.spp if found else 0
+    size = fixed or min(2 ** (max(done // SHARE, 1).bit_length() - 1), LARGEST_PASS)
+    return size if most is None else min(size, most - done)
+
+
+def _pass(found: Reference | None, scene: Any, integrator: Any, sensor: int, about: dict, spp: int) -> Reference:
     """One more pass."""
     import mitsuba as mi
 
     number = found.passes if found else 0
     started = time.perf_counter()
     seed = int(np.random.SeedSequence([about["seed"], number]).generate_state(1)[0])
-    image = mi.render(scene, sensor=sensor, integrator=integrator, seed=seed, spp=about["spp_per_pass"])
+    image = mi.render(scene, sensor=sensor, integrator=integrator, seed=seed, spp=spp)
     image = np.array(image, dtype=np.float32)
     image = image[..., None] if image.ndim == 2 else image
     if not np.isfinite(image).all():
         bad = int((~np.isfinite(image)).any(axis=2).sum())
         raise ValueError(f"pass {number} must be finite, got {bad} pixels that are not")
-    start = found or Reference(np.zeros(image.shape), np.zeros(image.shape), 0, 0.0, about)
-    return start.add(image, time.perf_counter() - started)
+    start = found or Reference(np.zeros(image.shape), np.zeros(image.shape), 0, 0, 0.0, about)
+    return start.add(image, spp, time.perf_counter() - started)
 
 
-def _ends(found: Reference, passes: int | None, target_error: float | None, seconds: float | None) -> bool:
-    certain = target_error is not None and found.passes >= FEWEST_PASSES and found.relative_error <= target_error
-    return (
-        certain or (passes is not None and found.passes >= passes) or (seconds is not None and found.seconds >= seconds)
-    )
-
-
-def _check(
-    passes: int | None, target_error: float | None, seconds: float | None, spp: int, seed: int, interval: float
-) -> None:
-    if passes is None and target_error is None and seconds is None:
-        raise ValueError("one of passes, target_error and seconds must be given, got none")
-    for name, value, least in (("passes", passes, 1), ("spp_per_pass", spp, 1), ("seed", seed, 0)):
-        if value is not None and (isinstance(value, bool) or int(value) != value or value < least):
-            raise ValueError(f"{name} must be a whole number >= {least}, got {value!r}")
-    for name, value in (("target_error", target_error), ("seconds", seconds)):
-        if value is not None and not (math.isfinite(value) and value > 0):
-            raise ValueError(f"{name} must be finite and > 0, got {value!r}")
+def _check(spp_per_pass: int | None, seed: int, interval: float) -> None:
+    if spp_per_pass is not None:
+        check_count("spp_per_pass", spp_per_pass, 1)
+    check_count("seed", seed, 0)
     if not interval >= 0:
         raise ValueError(f"interval must be >= 0, got {interval!r}")
 
@@ -146,47 +177,39 @@ def _load(scene: Any, integrator: dict | None) -> tuple[Any, Any]:
     return scene, integrator
 
 
-def _about(scene: Any, integrator: Any, sensor: int, spp: int, seed: int) -> dict[str, Any]:
+def _check_sensor(scene: Any, sensor: int) -> None:
+    n = len(scene.sensors())
+    if n == 0:
+        raise ValueError("the scene must have a sensor, got none")
+    check_count("sensor", sensor, 0)
+    if sensor >= n:
+        raise ValueError(f"sensor must be below {n}, the number of sensors of the scene, got {sensor}")
+
+
+def _about(scene: Any, integrator: Any, sensor: int, seed: int) -> dict[str, Any]:
     import mitsuba as mi
 
     about = {
         "scene": scene_hash(scene, integrator),
-        "integrator": str(integrator),
+        "integrator": words(integrator),
         "sensor": sensor,
-        "spp_per_pass": int(spp),
         "seed": int(seed),
         "variant": mi.variant(),
     }
     return {**about, "provenance": provenance(**about)}
 
 
-def scene_hash(scene: Any, integrator: Any) -> str:
-    """SHA-256 of what Mitsuba tells of a scene in words and of all its parameters, without its own integrator."""
-    import mitsuba as mi
-
-    own = scene.integrator()
-    lines = str(scene).splitlines()
-    for line in str(own).splitlines() if own is not None else ():
-        index = next((k for k, found in enumerate(lines) if line.strip() in found), None)
-        if index is not None:
-            del lines[index]
-    # objects that are loaded in parallel stand in any order
-    digest = hashlib.sha256("\n".join([*sorted(lines), str(integrator)]).encode())
-    for key, value in sorted(mi.traverse(scene).items()):
-        digest.update(key.encode())
-        numbers = np.array(getattr(value, "matrix", value))
-        digest.update(str(value).encode() if numbers.dtype == object else numbers.tobytes())
-    return digest.hexdigest()
-
-
-def _resume(path: Path, about: dict[str, Any]) -> Reference:
-    """The file so far.
+def _start(path: Path, resume: bool | str | os.PathLike, about: dict[str, Any]) -> Reference | None:
+    """What to go on with, if anything.
 
     Raises:
         ValueError: it is damaged or of another render.
     """
+    if resume is False or (resume is True and not path.exists()):
+        return None
+    path = path if resume is True else Path(resume)
     found = load(path)
-    for key in ("scene", "integrator", "sensor", "spp_per_pass", "seed", "variant"):
+    for key in ("scene", "integrator", "sensor", "seed", "variant"):
         if found.about.get(key) != about[key]:
             raise ValueError(
                 f"{path} must be of the same render to go on with it: {key} is {found.about.get(key)!r} there and "

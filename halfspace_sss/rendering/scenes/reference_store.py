@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -15,11 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from halfspace_sss.provenance import write_atomically
+from halfspace_sss.provenance import write_together
 
 __all__ = ["Reference", "load"]
 
-FORMAT = "halfspace-sss reference 1"
+FORMAT = "halfspace-sss reference 2"
 HEADER = "halfspace_sss"
 
 
@@ -31,20 +32,17 @@ class Reference:
         mean: image, float64, shape (height, width, channels).
         variance: of the mean, per pixel and channel, from the spread of the passes; zero after one pass.
         passes: number of passes.
+        spp: samples per pixel of all passes together.
         seconds: time spent on them.
-        about: what was rendered: scene (hash), integrator, spp per pass, seed, and provenance.
+        about: what was rendered: scene (hash), integrator, seed, and provenance.
     """
 
     mean: np.ndarray
     variance: np.ndarray
     passes: int
+    spp: int
     seconds: float
     about: dict[str, Any] = field(default_factory=dict)
-
-    @property
-    def spp(self) -> int:
-        """Samples per pixel of all passes together."""
-        return self.passes * int(self.about.get("spp_per_pass", 0))
 
     @property
     def standard_error(self) -> np.ndarray:
@@ -53,22 +51,30 @@ class Reference:
 
     @property
     def relative_error(self) -> float:
-        """sqrt(sum variance / sum mean²) over the colours of lit pixels (mean > 0); infinite before two passes."""
+        """sqrt(sum variance / sum mean²) over the colours of lit pixels (mean > 0), 0 if every pass was black.
+
+        Infinite before two passes.
+        """
         lit = self.mean[..., :3] > 0
-        if self.passes < 2 or not lit.any():
-            return float("inf")
+        if self.passes < 2:
+            return math.inf
+        if not lit.any():
+            return math.inf if self.mean[..., :3].any() else 0.0
         return float(np.sqrt(self.variance[..., :3][lit].sum() / np.sum(self.mean[..., :3][lit] ** 2)))
 
-    def add(self, image: np.ndarray, seconds: float) -> Reference:
-        """The average with one more pass (Welford 1962), rounded to what a file keeps."""
-        n = self.passes + 1
+    def add(self, image: np.ndarray, spp: int, seconds: float) -> Reference:
+        """The average with one more pass of spp samples per pixel, rounded to what a file keeps.
+
+        Passes count by their samples n_k: mean m = sum n_k x_k / N, variance of the mean
+        sum n_k (x_k - m)² / ((K - 1) N), updated as by West (1979).
+        """
+        n, passes = self.spp + spp, self.passes + 1
         delta = image.astype(np.float64) - self.mean
-        mean = self.mean + delta / n
-        squares = self.variance * self.passes * (self.passes - 1) + delta * (image - mean)
-        variance = squares / (n * (n - 1)) if n > 1 else np.zeros_like(mean)
-        return replace(
-            self, mean=sum(_halves(mean)), variance=sum(_halves(variance)), passes=n, seconds=self.seconds + seconds
-        )
+        mean = self.mean + delta * (spp / n)
+        squares = self.variance * self.spp * (self.passes - 1) + spp * delta * (image - mean)
+        variance = squares / (n * (passes - 1)) if passes > 1 else np.zeros_like(mean)
+        mean, variance = sum(_halves(mean)), sum(_halves(variance))
+        return replace(self, mean=mean, variance=variance, passes=passes, spp=n, seconds=self.seconds + seconds)
 
 
 def _halves(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -89,7 +95,7 @@ def _all_names(channels: int) -> list[str]:
 
 
 def save(path: Path, found: Reference) -> None:
-    """Write the EXR, whole or not at all, and beside it the JSON of its header for people to read."""
+    """Write the EXR, whole or not at all, and beside it the JSON of its header for people to read, never of another."""
     import mitsuba as mi
 
     (mean, mean_rest), (variance, variance_rest) = _halves(found.mean), _halves(found.variance)
@@ -97,8 +103,9 @@ def save(path: Path, found: Reference) -> None:
     header = {
         "format": FORMAT,
         "passes": found.passes,
+        "spp": found.spp,
         "seconds": found.seconds,
-        "relative_error": found.relative_error if found.passes > 1 else None,
+        "relative_error": found.relative_error if math.isfinite(found.relative_error) else None,
         "pixels": hashlib.sha256(pixels.tobytes()).hexdigest(),
         **found.about,
     }
@@ -107,8 +114,7 @@ def save(path: Path, found: Reference) -> None:
     bitmap.metadata()[HEADER] = text
     stream = mi.MemoryStream()
     bitmap.write(stream, mi.Bitmap.FileFormat.OpenEXR)
-    write_atomically(path, bytes(stream.raw_buffer()))
-    write_atomically(path.with_suffix(".json"), text + "\n")
+    write_together({path: bytes(stream.raw_buffer()), path.with_suffix(".json"): text + "\n"})
 
 
 def load(path: str | os.PathLike) -> Reference:
@@ -137,10 +143,10 @@ def load(path: str | os.PathLike) -> Reference:
     if hashlib.sha256(pixels.tobytes()).hexdigest() != header.pop("pixels", None):
         raise ValueError(f"{name} is damaged: its pixels are not those that were written")
     try:
-        passes, seconds = int(header.pop("passes")), float(header.pop("seconds"))
+        passes, spp, seconds = int(header.pop("passes")), int(header.pop("spp")), float(header.pop("seconds"))
     except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{name} must tell passes and seconds: {error!r}") from error
+        raise ValueError(f"{name} must tell passes, spp and seconds: {error!r}") from error
     for key in ("format", "relative_error"):
         header.pop(key, None)
     mean, variance, mean_rest, variance_rest = np.split(pixels.astype(np.float64), 4, axis=2)
-    return Reference(mean + mean_rest, variance + variance_rest, passes, seconds, header)
+    return Reference(mean + mean_rest, variance + variance_rest, passes, spp, seconds, header)

@@ -1,0 +1,130 @@
+"""The identity of a scene: the same in every process and order of loading, another as soon as its image is another."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import halfspace_sss.rendering as rendering
+from halfspace_sss.rendering.scene_identity import scene_hash
+from halfspace_sss.rendering.scenes.scene_files import load_scene
+
+mi = pytest.importorskip("mitsuba")
+
+XML = """<scene version="3.0.0">
+  <integrator type="bssrdf"/>
+  <emitter type="constant"/>
+  <shape type="sphere"><float name="radius" value="5"/>
+    <bsdf type="translucent"><string name="material" value="marble"/><string name="model" value="better_dipole"/></bsdf>
+  </shape>
+  <shape type="rectangle"><bsdf type="diffuse"><texture type="checkerboard" name="reflectance"/></bsdf></shape>
+  <sensor type="perspective"><sampler type="multijitter"><integer name="sample_count" value="16"/></sampler>
+    <transform name="to_world"><lookat origin="0,0,40" target="0,0,0" up="0,1,0"/></transform>
+    <film type="hdrfilm"><integer name="width" value="8"/><integer name="height" value="8"/></film>
+  </sensor>
+</scene>
+"""
+TELL = """
+import sys
+import halfspace_sss.rendering as rendering
+import mitsuba as mi
+from halfspace_sss.rendering.scenes.scene_files import load_scene
+from halfspace_sss.rendering.scene_identity import scene_hash
+mi.set_variant("llvm_ad_rgb")
+rendering.register()
+scene = load_scene(sys.argv[1])
+print(scene_hash(scene, scene.integrator()))
+"""
+
+
+@pytest.fixture(autouse=True)
+def variant() -> None:
+    mi.set_variant("llvm_ad_rgb")
+    rendering.register()
+
+
+def _hash(text: str, folder: Path) -> str:
+    file = folder / "scene.xml"
+    file.write_text(text)
+    scene = load_scene(file)
+    return scene_hash(scene, scene.integrator())
+
+
+def test_a_scene_without_ids_is_the_same_in_every_process(tmp_path: Path) -> None:
+    here = _hash(XML, tmp_path)
+    run = [sys.executable, "-c", TELL, str(tmp_path / "scene.xml")]
+    assert {subprocess.run(run, capture_output=True, text=True, check=True).stdout.strip() for _ in range(2)} == {here}
+
+
+def test_rendering_does_not_change_the_identity(tmp_path: Path) -> None:
+    (tmp_path / "scene.xml").write_text(XML)
+    scene = load_scene(tmp_path / "scene.xml")
+    before = scene_hash(scene, scene.integrator())
+    mi.render(scene, spp=4)
+    assert scene_hash(scene, scene.integrator()) == before
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ('<shape type="sphere">', '<shape type="sphere" id="ball">'),
+        ('name="sample_count" value="16"', 'name="sample_count" value="64"'),
+        ('<emitter type="constant"/>', '<emitter type="constant" id="sky"/>'),
+    ],
+)
+def test_names_and_numbers_of_samples_are_no_part_of_the_identity(old: str, new: str, tmp_path: Path) -> None:
+    assert old in XML
+    assert _hash(XML.replace(old, new), tmp_path) == _hash(XML, tmp_path)
+
+
+def test_the_order_of_the_objects_is_no_part_of_the_identity(tmp_path: Path) -> None:
+    lines = XML.splitlines()
+    assert _hash("\n".join([*lines[:3], lines[6], *lines[3:6], *lines[7:]]), tmp_path) == _hash(XML, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ('value="5"', 'value="5.00001"'),
+        ("marble", "ketchup"),
+        ("better_dipole", "standard_dipole"),
+        ('<emitter type="constant"/>', '<emitter type="constant"><rgb name="radiance" value="1,1,0.99"/></emitter>'),
+        ('type="multijitter"', 'type="independent"'),
+        ('name="width" value="8"', 'name="width" value="9"'),
+        ('origin="0,0,40"', 'origin="0,0,40.001"'),
+        ('<integrator type="bssrdf"/>', '<integrator type="bssrdf"><float name="mm_per_unit" value="2"/></integrator>'),
+        ('<texture type="checkerboard" name="reflectance"/>', '<rgb name="reflectance" value="0.5"/>'),
+        ('<float name="radius"', '<boolean name="flip_normals" value="true"/><float name="radius"'),
+    ],
+)
+def test_what_changes_the_image_changes_the_identity(old: str, new: str, tmp_path: Path) -> None:
+    assert old in XML
+    assert _hash(XML.replace(old, new), tmp_path) != _hash(XML, tmp_path)
+
+
+def test_media_that_differ_in_the_last_digits_are_different_scenes() -> None:
+    def scene(sigma_s: float) -> str:
+        bsdf = {"type": "translucent", "sigma_s": sigma_s, "sigma_a": 0.1, "model": "better_dipole"}
+        found = load_scene({"type": "scene", "integrator": {"type": "bssrdf"}, "s": {"type": "sphere", "bsdf": bsdf}})
+        return scene_hash(found, found.integrator())
+
+    assert scene(2.0) == scene(2.0) != scene(float(np.nextafter(2.0, 3.0)))
+
+
+def test_objects_that_swap_their_surfaces_are_another_scene() -> None:
+    def scene(a: float, b: float) -> str:
+        balls = {
+            f"s{x:+g}": {
+                "type": "sphere", "center": [x, 0, 0], "radius": 1.0,
+                "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [value, value, 0.5]}},
+            }
+            for x, value in ((-3.0, a), (3.0, b))
+        }  # fmt: skip
+        found = mi.load_dict({"type": "scene", "integrator": {"type": "path"}, **balls})
+        return scene_hash(found, found.integrator())
+
+    assert scene(0.1, 0.2) != scene(0.2, 0.1)
