@@ -18,14 +18,16 @@ for 1/D.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
-from halfspace_sss.physics.phase import eval_hg
-from halfspace_sss.rendering.walk.inside import fly, free_path, pick, turn
-from halfspace_sss.rendering.walk.media import Coefficients, WalkMedia, by_pointer, pointer_numbers
+from halfspace_sss.rendering.walk.inside import eval_phase, fly, free_path, pick, turn
+from halfspace_sss.rendering.walk.media import WalkMedia, by_pointer, pointer_numbers
+from halfspace_sss.rendering.walk_steps import Event, Walk, start_walk
 
 __all__ = ["DEEPEST", "Joins", "draw", "find_joins"]
 
@@ -36,6 +38,25 @@ STEEPEST = 0.5  # least cosine of a ray with w_0
 # falls no faster than any light at the least cosine, so that weights stay bounded.
 RATES = (1.0, 0.4)
 LEAST_PROMISE = 0.1  # of an event far below the boundary: light may enter nearer on another side
+
+
+@dataclass
+class Aim:
+    """How a ray of light is aimed at an event."""
+
+    emitter: mi.UInt32
+    w_0: mi.Vector3f  # direction to it
+    shift: mi.Vector3f  # from the event to the place aimed at, across w_0
+    depth: mi.Float  # of the event below the boundary
+
+
+@dataclass
+class LightWalk:
+    """State of a walk from an emitter."""
+
+    walk: Walk
+    joinable: mi.Bool  # whether its ray may be joined to the event
+    L: mi.Spectrum  # what the joins so far bring
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,16 +86,10 @@ class Joins:
     pointers: Any
 
     def _centre(self, k: Any) -> Any:
-        import drjit as dr
-        import mitsuba as mi
-
         return mi.Vector3f(*(dr.gather(mi.Float, column, k) for column in self.centres))
 
     def direction(self, k: Any, p: Any) -> tuple[Any, Any]:
         """w_0 from p to emitter k, and whether the emitter looks small from there."""
-        import drjit as dr
-        import mitsuba as mi
-
         centre, distant = self._centre(k), dr.gather(mi.Bool, self.distant, k)
         way = dr.select(distant, centre, centre - mi.Vector3f(p))
         size = dr.norm(way)
@@ -83,17 +98,11 @@ class Joins:
 
     def angle2(self, k: Any, p: Any) -> Any:
         """Square of the angle under which the radius of emitter k is seen from p."""
-        import drjit as dr
-        import mitsuba as mi
-
         way = self._centre(k) - mi.Vector3f(p)
         return dr.square(dr.gather(mi.Float, self.radii, k)) / dr.squared_norm(way)
 
-    def number(self, emitter: Any) -> Any:
+    def index_of(self, emitter: Any) -> Any:
         """The number of an emitter here, or -1."""
-        import drjit as dr
-        import mitsuba as mi
-
         pointer = dr.reinterpret_array(mi.UInt32, emitter)
         known = pointer < dr.width(self.numbers)
         return dr.select(known, dr.gather(mi.Int32, self.numbers, pointer, known), -1)
@@ -103,32 +112,25 @@ class Joins:
 
         The line must cross the plane through the pivot steeply on its way from the emitter.
         """
-        import drjit as dr
-
-        k = self.number(emitter)
+        k = self.index_of(emitter)
         w_0, small = self.direction(dr.maximum(k, 0), pivot)
         cosine = dr.dot(w, w_0)
         return (k >= 0) & small & (dr.abs(cosine) > STEEPEST) & (dr.dot(y - pivot, w_0) * cosine > 0)
 
-    def light(self, p: Any, along: Any, k: Any, m: Coefficients, rng: Any) -> Any:
-        """An estimate of what joins at the event p of object k bring per weight of a walk that came `along`."""
-        import drjit as dr
-        import mitsuba as mi
-
+    def light(self, event: Event, rng: Any) -> tuple[Any, Any]:
+        """An estimate of what joins at an event bring per weight of the walk from the camera, and the generator."""
         n = len(self.emitters)
         which = draw(n, rng)
-        w_0, small = self.direction(which, p)
-        shift, depth, survive = self._aim(p, w_0, k, m)
+        w_0, small = self.direction(which, event.p)
+        aim, survive = self._aim(which, w_0, event)
         chosen = small & (rng.next_float32() < self.share * survive)
-        state = (rng, mi.Spectrum(0) + dr.zeros(mi.Spectrum, dr.width(p)), p, along, k, m, which, w_0, shift, depth)
-        _, found, *_ = dr.if_stmt(state, chosen, self._enter, lambda *state: state, label="join")
-        return found * (n / (self.share * survive))
+        L = mi.Spectrum(0) + dr.zeros(mi.Spectrum, dr.width(event.p))
+        rng, L, *_ = dr.if_stmt((rng, L, event, aim), chosen, self._enter, lambda *state: state, label="join")
+        return L * (n / (self.share * survive)), rng
 
-    def _aim(self, p: Any, w_0: Any, k: Any, m: Coefficients) -> tuple[Any, Any, Any]:
-        """Where to aim across w_0 relative to p, the depth of p, and how promising p is, (0, 1]."""
-        import drjit as dr
-        import mitsuba as mi
-
+    def _aim(self, which: Any, w_0: Any, event: Event) -> tuple[Aim, Any]:
+        """Where to aim so that light gets to an event, and how promising that is, (0, 1]."""
+        p, k, m = event.p, event.object, event.m
         ray = mi.Ray3f(p, w_0)
         ray.maxt = DEEPEST / dr.min(m.sigma_t)
         si = self.media.scene.ray_intersect(ray, mi.RayFlags.Minimal, coherent=False)
@@ -140,29 +142,21 @@ class Joins:
         entry = back * (dr.dot(n, w_0) * far / dr.maximum(dr.abs(cos_t), 1e-3))
         shift = dr.select(facing, entry - w_0 * dr.dot(entry, w_0), 0)
         depth = dr.select(facing, dr.minimum(dr.norm(entry), far), far)
-        return shift, depth, dr.maximum(dr.exp(-0.5 * dr.min(m.sigma_t) * depth), LEAST_PROMISE)
+        promise = dr.maximum(dr.exp(-0.5 * dr.min(m.sigma_t) * depth), LEAST_PROMISE)
+        return Aim(which, w_0, mi.Vector3f(shift), depth), promise
 
-    def _enter(self, rng: Any, found: Any, p: Any, along: Any, k: Any, m: Coefficients, which: Any, w_0: Any,
-               shift: Any, depth: Any) -> tuple:  # fmt: skip
+    def _enter(self, rng: Any, L: Any, event: Event, aim: Aim) -> tuple:
         """Aim a ray of light, refract it into the object and follow it."""
-        import drjit as dr
-        import mitsuba as mi
-
-        wide = m.sigma_t * dr.rsqrt(1 + m.sigma_t * depth)
-        rate = dr.select(rng.next_float32() < 0.5, RATES[0], RATES[1]) * pick(wide, draw(len(wide), rng))
-        r = dr.maximum(-dr.log(1 - rng.next_float32()) / rate, 1e-20)
-        pdf = sum(dr.mean(c * wide * dr.exp(-c * wide * r)) for c in RATES) / (len(RATES) * 2 * dr.pi * r)
-        sin_phi, cos_phi = dr.sincos(2 * dr.pi * rng.next_float32())
-        s, t = mi.coordinate_system(w_0)
-        at = dr.zeros(mi.Interaction3f)
-        at.p = mi.Point3f(p + shift + (s * cos_phi + t * sin_phi) * r)
+        k, m = event.object, event.m
+        at, density = _draw_across(event, aim, rng)
+        which = aim.emitter
         ds, light = self._emitter(which).sample_direction(at, mi.Point2f(rng.next_float32(), rng.next_float32()))
-        flux = light * (dr.abs(dr.dot(ds.d, w_0)) / pdf)
+        flux = light * (dr.abs(dr.dot(ds.d, aim.w_0)) / density)
         distant = dr.gather(mi.Bool, self.distant, which)
         away = dr.select(distant, 4 * dr.norm(self.scene.bbox().extents()), ds.dist * (1 - 1e-4))
         si = self.scene.ray_intersect(mi.Ray3f(mi.Point3f(at.p + ds.d * away), -ds.d), mi.RayFlags.All, coherent=False)
-        steep = dr.abs(dr.dot(ds.d, w_0)) > STEEPEST
-        enters = si.is_valid() & (ds.pdf > 0) & steep & (self.media.number(si.shape) == mi.Int32(k))
+        steep = dr.abs(dr.dot(ds.d, aim.w_0)) > STEEPEST
+        enters = si.is_valid() & (ds.pdf > 0) & steep & (self.media.index_of(si.shape) == mi.Int32(k))
         si = self.media.face_outwards(si, dr.select(enters, mi.Int32(k), -1), -ds.d)
         F, cos_t, _, eta_ti = mi.fresnel(mi.Frame3f.cos_theta(si.wi), self.media.row("eta", k))
         d = si.to_world(mi.refract(si.wi, cos_t, eta_ti))
@@ -171,80 +165,81 @@ class Joins:
         bend = dr.dot(d, si.n) * mi.Frame3f.cos_theta(si.wi) / (dr.dot(d, si.sh_frame.n) * dr.dot(ds.d, si.n))
         weight = dr.select(enters, flux * ((1 - F) * bend), 0)
         enters &= dr.max(weight) > 0
-        o, channel = si.spawn_ray(d).o, draw(len(wide), rng)
-        state = (enters, rng, o, d, weight, dr.full(mi.Spectrum, 1, dr.width(p)), mi.Bool(enters), found, p, along,
-                 k, m, channel)  # fmt: skip
-        _, rng, *_, found, p, along, k, m, _ = dr.while_loop(state, lambda on, *rest: on, self._follow, label="light")
-        return rng, found, p, along, k, m, which, w_0, shift, depth
+        walk = start_walk(si.spawn_ray(d).o, d, rng)
+        walk = replace(walk, alive=enters, object=k, weight=weight, channel=draw(len(m.sigma_t), rng))
+        state = (LightWalk(walk, mi.Bool(enters), L), event)
+        s, event = dr.while_loop(state, lambda s, event: s.walk.alive, self._follow, label="light")
+        return s.walk.rng, s.L, event, aim
 
     def _emitter(self, k: Any) -> Any:
-        import drjit as dr
-        import mitsuba as mi
-
         if len(self.emitters) == 1:
             return self.emitters[0]
         return dr.reinterpret_array(mi.EmitterPtr, dr.gather(mi.UInt32, self.pointers, k))
 
-    def _follow(self, on: Any, rng: Any, o: Any, d: Any, weight: Any, density: Any, joinable: Any, found: Any, p: Any,
-                along: Any, k: Any, m: Coefficients, channel: Any) -> tuple:  # fmt: skip
+    def _follow(self, s: LightWalk, event: Event) -> tuple[LightWalk, Event]:
         """One ray of the walk from the light: a join on it, if it may have one, and a free flight."""
-        import drjit as dr
-        import mitsuba as mi
-
+        walk, m, rng = s.walk, event.m, s.walk.rng
         u = rng.next_float32()
-        t, value = _on_ray(o, d, p, along, m, u)
-        t = dr.select(joinable, t, 0)
-        flight = free_path(m, channel, rng.next_float32())
-        ray = mi.Ray3f(o, d)
+        t, value = _on_ray(walk, event, u)
+        t = dr.select(s.joinable, t, 0)
+        flight = free_path(m, walk.channel, rng.next_float32())
+        ray = mi.Ray3f(walk.o, walk.d)
         ray.maxt = dr.maximum(t, flight)
         hit = self.media.scene.ray_intersect_preliminary(ray, coherent=False)
-        value = dr.select(joinable & (t < hit.t), weight * value, 0)
-        q = mi.Point3f(o + d * t)
-        to_p = mi.Ray3f(q, dr.normalize(p - q))
-        to_p.maxt = dr.norm(p - q)
+        value = dr.select(s.joinable & (t < hit.t), walk.weight * value, 0)
+        q = mi.Point3f(walk.o + walk.d * t)
+        to_p = mi.Ray3f(q, dr.normalize(event.p - q))
+        to_p.maxt = dr.norm(event.p - q)
         bright = dr.max(value) > 0
-        found = found + dr.select(self.media.scene.ray_test(to_p, False, bright), 0, dr.select(bright, value, 0))
+        L = s.L + dr.select(self.media.scene.ray_test(to_p, False, bright), 0, dr.select(bright, value, 0))
 
-        ended = fly(m, weight, density, channel, flight, hit.t)
+        ended = fly(m, walk.weight, walk.density, walk.channel, flight, hit.t)
         u = mi.Point2f(rng.next_float32(), rng.next_float32())
-        turned, weight, density = turn(m, ended.weight, ended.density, channel, d, u, self.media.same_g)
-        state = (o, d, rng, k, ray, hit, mi.Bool(True))
-        o_b, d_b, rng, k, _, _, reflected = dr.if_stmt(state, ~ended.scatters, self._reflect, lambda *state: state)
-        weight = dr.select(ended.scatters, weight, ended.weight)
-        density = dr.select(ended.scatters, density, ended.density)
-        o = dr.select(ended.scatters, mi.Point3f(o + d * flight), o_b)
-        d = dr.select(ended.scatters, turned, d_b)
-        on = on & dr.select(ended.scatters, joinable, reflected)
-        return on, rng, o, d, weight, density, ~ended.scatters, found, p, along, k, m, channel
+        turned, weight, density = turn(m, ended.weight, ended.density, walk.channel, walk.d, u, self.media.same_g)
+        scatters = ended.scatters
+        scattered = replace(walk, alive=walk.alive & s.joinable, o=mi.Point3f(walk.o + walk.d * flight), d=turned,
+                            weight=weight, density=density)  # fmt: skip
+        walk = replace(walk, weight=ended.weight, density=ended.density)
+        walk, *_ = dr.if_stmt((walk, ray, hit), ~scatters, self._reflect, lambda *state: state)
+        scattered.rng = walk.rng
+        return LightWalk(dr.select(scatters, scattered, walk), ~scatters, L), event
 
-    def _reflect(self, o: Any, d: Any, rng: Any, k: Any, ray: Any, hit: Any, on: Any) -> tuple:
+    def _reflect(self, walk: Walk, ray: Any, hit: Any) -> tuple:
         """Reflection at the boundary from inside with the probability of its reflectance."""
-        import drjit as dr
-        import mitsuba as mi
-
+        k, d = mi.Int32(walk.object), walk.d
         si = hit.compute_surface_interaction(ray)
-        si = self.media.face_outwards(si, mi.Int32(k), d)
+        si = self.media.face_outwards(si, k, d)
         F, _, _, _ = mi.fresnel(mi.Frame3f.cos_theta(si.wi), self.media.row("eta", k))
         new = si.to_world(mi.reflect(si.wi))
-        foreign = self.media.number(si.shape) != mi.Int32(k)  # an object that overlaps: the ray goes on behind it
+        foreign = self.media.index_of(si.shape) != k  # an object that overlaps: the ray goes on behind it
         new = dr.select(foreign, d, new)
-        inside = (dr.dot(si.n, d) > 0) & (dr.dot(si.n, new) < 0) & (rng.next_float32() < F)
-        return si.spawn_ray(new).o, new, rng, k, ray, hit, foreign | inside
+        inside = (dr.dot(si.n, d) > 0) & (dr.dot(si.n, new) < 0) & (walk.rng.next_float32() < F)
+        walk = replace(walk, o=si.spawn_ray(new).o, d=new, alive=walk.alive & (foreign | inside))
+        return walk, ray, hit
 
 
 def draw(n: int, rng: Any) -> Any:
     """A whole number below n."""
-    import drjit as dr
-    import mitsuba as mi
-
     return dr.minimum(mi.UInt32(rng.next_float32() * n), n - 1)
 
 
-def _on_ray(o: Any, d: Any, p: Any, along: Any, m: Coefficients, u: Any) -> tuple[Any, Any]:
-    """Distance of an event q on a ray of light, and what the two events and the way between bring over its density."""
-    import drjit as dr
-    import mitsuba as mi
+def _draw_across(event: Event, aim: Aim, rng: Any) -> tuple[Any, Any]:
+    """A point of the plane across w_0 through the event, and its density per area."""
+    sigma_t = event.m.sigma_t
+    wide = sigma_t * dr.rsqrt(1 + sigma_t * aim.depth)
+    rate = dr.select(rng.next_float32() < 0.5, RATES[0], RATES[1]) * pick(wide, draw(len(wide), rng))
+    r = dr.maximum(-dr.log(1 - rng.next_float32()) / rate, 1e-20)
+    density = sum(dr.mean(c * wide * dr.exp(-c * wide * r)) for c in RATES) / (len(RATES) * 2 * dr.pi * r)
+    sin_phi, cos_phi = dr.sincos(2 * dr.pi * rng.next_float32())
+    s, t = mi.coordinate_system(aim.w_0)
+    at = dr.zeros(mi.Interaction3f)
+    at.p = mi.Point3f(event.p + aim.shift + (s * cos_phi + t * sin_phi) * r)
+    return at, density
 
+
+def _on_ray(walk: Walk, event: Event, u: Any) -> tuple[Any, Any]:
+    """Distance of an event q on a ray of light, and what the two events and the way between bring over its density."""
+    o, d, p, m = walk.o, walk.d, event.p, event.m
     v = p - o
     t_0 = dr.dot(v, d)
     D = dr.maximum(dr.norm(v - d * t_0), 1e-9)
@@ -254,17 +249,13 @@ def _on_ray(o: Any, d: Any, p: Any, along: Any, m: Coefficients, u: Any) -> tupl
     way = o + d * t - p
     distance = dr.norm(way)
     way = way / dr.maximum(distance, 1e-20)
-    c_1, c_2 = dr.dot(along, way), -dr.dot(way, d)
-    phases = mi.Spectrum([eval_hg(c_1, g) * eval_hg(c_2, g) for g in m.g])
+    phases = eval_phase(m, dr.dot(event.along, way)) * eval_phase(m, -dr.dot(way, d))
     value = m.sigma_s * phases * dr.exp(-m.sigma_t * (t + distance)) * (width / D)
     return t, dr.select(dr.isfinite(t), value, 0)
 
 
 def find_joins(scene: Any, media: WalkMedia, share: float) -> Joins | None:
     """The small emitters of a scene, or None if there are none, or no object whose boundary is smooth."""
-    import drjit as dr
-    import mitsuba as mi
-
     at = mi.Interaction3f()
     at.p = mi.Point3f(0)
     emitters, centres, distant, radii = [], [], [], []

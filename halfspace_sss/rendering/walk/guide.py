@@ -12,15 +12,29 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from halfspace_sss.physics.phase import eval_hg
-from halfspace_sss.rendering.walk.connect import DEEPEST, Joins, draw
-from halfspace_sss.rendering.walk.media import Coefficients, WalkMedia
+import drjit as dr
+import mitsuba as mi
 
-__all__ = ["Guide"]
+from halfspace_sss.rendering.walk.connect import DEEPEST, Joins, draw
+from halfspace_sss.rendering.walk.inside import eval_phase
+from halfspace_sss.rendering.walk.media import Coefficients, WalkMedia
+from halfspace_sss.rendering.walk_steps import Event
+
+__all__ = ["Departure", "Guide"]
 
 GUESSES = 3
 SHARES = (0.5, 0.3, 0.2)  # of the lobes
 WIDER = (131.0, 8.0)  # concentrations of the others: 5 and 20 degrees
+
+
+@dataclass
+class Departure:
+    """A walk's last event and its way out from there, by which it left the object straight."""
+
+    p: mi.Point3f
+    along: mi.Vector3f  # direction of arrival at the event
+    ahead: mi.Vector3f  # direction from it
+    object: mi.Int32
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,9 +53,6 @@ class Guide:
 
     def _guess(self, v: Any, k: Any, which: Any, m: Coefficients, active: Any) -> tuple[Any, Any, Any]:
         """The direction from v by which an emitter sees it through the boundary, its concentration, and if any."""
-        import drjit as dr
-        import mitsuba as mi
-
         toward, small = self.joins.direction(which, v)
         eta = self.media.row("eta", k)
         valid, d, w = active & small, toward, toward
@@ -58,20 +69,9 @@ class Guide:
             d = dr.normalize(dr.select(cosine > 0, refracted, d))
         return d, dr.minimum(dr.square(eta) / dr.maximum(self.joins.angle2(which, v), 1e-6), 1e6), valid
 
-    def pdf(self, emitter: Any, v: Any, d: Any, k: Any, m: Coefficients, active: Any) -> Any:
-        """Density per solid angle of the direction d from v on the way to an emitter; 0 where there is no guess."""
-        import drjit as dr
-
-        which = self.joins.number(emitter)
-        active &= which >= 0
-        guess, concentration, valid = self._guess(v, k, type(k)(dr.maximum(which, 0)), m, active)
-        return dr.select(valid, _lobes(dr.dot(guess, d), concentration) / len(self.joins.emitters), 0)
-
-    def light(self, v: Any, along: Any, k: Any, m: Coefficients, rng: Any) -> Any:
-        """An estimate of the light of small emitters that leaves from v, per weight of a walk that came `along`."""
-        import drjit as dr
-        import mitsuba as mi
-
+    def light(self, event: Event, rng: Any) -> Any:
+        """An estimate of the light of small emitters that leaves from an event, per weight of the walk."""
+        v, k, m = event.p, event.object, event.m
         n = len(self.joins.emitters)
         which = mi.Int32(draw(n, rng))
         guess, concentration, valid = self._guess(v, k, which, m, True)
@@ -79,28 +79,28 @@ class Guide:
         ray = mi.Ray3f(v, d)
         ray.maxt = 2 * DEEPEST / dr.min(m.sigma_t)
         si = self.media.scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=valid)
-        valid &= si.is_valid() & (self.media.number(si.shape) == k)
+        valid &= si.is_valid() & (self.media.index_of(si.shape) == k)
         si = self.media.face_outwards(si, k, d)
         F, cos_t, eta_it, eta_ti = mi.fresnel(mi.Frame3f.cos_theta(si.wi), self.media.row("eta", k))
         w = si.to_world(mi.refract(si.wi, cos_t, eta_ti))
         valid &= (dr.dot(d, si.n) > 0) & (dr.dot(w, si.n) > 0) & (F < 1)
         outside = self.scene.ray_intersect(si.spawn_ray(w), mi.RayFlags.All, coherent=False, active=valid)
         emitter = outside.emitter(self.scene, valid)
-        valid &= outside.is_valid() & (self.joins.number(emitter) == which)
-        cosine = dr.dot(along, d)
-        phase = mi.Spectrum([eval_hg(cosine, g) for g in m.g])
+        valid &= outside.is_valid() & (self.joins.index_of(emitter) == which)
+        phase = eval_phase(m, dr.dot(event.along, d))
         # radiance shrinks by eta² on its way out, as the weight of the walk has when it came in
         factor = (1 - F) * dr.square(eta_ti) / (pdf / n + dr.mean(phase))
         value = phase * dr.exp(-m.sigma_t * si.t) * factor
         return dr.select(valid, value * emitter.eval(outside, valid), 0)
 
-    def share(self, emitter: Any, s: dict, active: Any) -> Any:
-        """Weight of having hit an emitter by the phase function, from the state after the walk has left."""
-        import drjit as dr
-
-        k = s["from"]
-        pdf = self.pdf(emitter, s["event"], s["ahead"], k, self.media.coefficients(k), active)
-        return s["phase"] / (s["phase"] + dr.select(active, pdf, 0))
+    def share(self, emitter: Any, way: Departure, active: Any) -> Any:
+        """Weight of having hit an emitter by the phase function (balance heuristic against `light`)."""
+        k, m = way.object, self.media.coefficients(way.object)
+        which = self.joins.index_of(emitter)
+        guess, concentration, valid = self._guess(way.p, k, type(k)(dr.maximum(which, 0)), m, active & (which >= 0))
+        lobes = _lobes(dr.dot(guess, way.ahead), concentration) / len(self.joins.emitters)
+        phase = dr.mean(eval_phase(m, dr.dot(way.along, way.ahead)))
+        return phase / (phase + dr.select(active & valid, lobes, 0))
 
 
 def _lobes(cosine: Any, concentration: Any) -> Any:
@@ -114,9 +114,6 @@ def _lobes(cosine: Any, concentration: Any) -> Any:
 
 def _draw_lobe(guess: Any, concentration: Any, rng: Any) -> tuple[Any, Any]:
     """A direction about the guess, and its density."""
-    import drjit as dr
-    import mitsuba as mi
-
     u = rng.next_float32()
     c = dr.select(u < SHARES[0], concentration, dr.select(u < SHARES[0] + SHARES[1], WIDER[0], WIDER[1]))
     x = dr.minimum(-dr.log(1 - rng.next_float32()) / c, 2)

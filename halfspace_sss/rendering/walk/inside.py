@@ -12,35 +12,34 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import drjit as dr
+import mitsuba as mi
+
 from halfspace_sss.physics.phase import eval_hg, sample_hg
 from halfspace_sss.rendering.walk.media import Coefficients
 from halfspace_sss.tracing.walk import ROULETTE_BOOST, ROULETTE_WEIGHT
 
-__all__ = ["Flight", "fly", "free_path", "pick", "roulette", "turn", "weigh"]
+__all__ = ["Flight", "eval_phase", "fly", "free_path", "pick", "roulette", "turn", "weigh"]
 
 
 class Flight(NamedTuple):
     """How a free flight ended: whether in a scattering event, and the weights after it."""
 
-    scatters: Any
-    weight: Any
-    density: Any
+    scatters: mi.Bool
+    weight: mi.Spectrum
+    density: mi.Spectrum
 
 
 def pick(values: Any, channel: Any) -> Any:
     """The value of one channel."""
-    import drjit as dr
-
-    found = values[0]
+    value = values[0]
     for c in range(1, len(values)):
-        found = dr.select(channel == c, values[c], found)
-    return found
+        value = dr.select(channel == c, values[c], value)
+    return value
 
 
 def weigh(weight: Any, density: Any, value: Any, pdf: Any) -> tuple[Any, Any]:
     """w and q after a step with the value f_c and the density p_c, each up to one factor that they share."""
-    import drjit as dr
-
     if len(weight) == 1:
         return weight * value / pdf, density
     grown = density * pdf
@@ -50,16 +49,11 @@ def weigh(weight: Any, density: Any, value: Any, pdf: Any) -> tuple[Any, Any]:
 
 def free_path(m: Coefficients, channel: Any, u: Any) -> Any:
     """Distance to the next scattering event, scene units."""
-    import drjit as dr
-
     return -dr.log(1 - u) / pick(m.sigma_t, channel)
 
 
 def fly(m: Coefficients, weight: Any, density: Any, channel: Any, t: Any, reach: Any) -> Flight:
     """A free flight of length t, cut short by the boundary where that is at a distance `reach` < t."""
-    import drjit as dr
-    import mitsuba as mi
-
     scatters = t < reach
     if len(weight) == 1:
         value = dr.select(scatters, m.sigma_s / m.sigma_t, 1)
@@ -70,11 +64,13 @@ def fly(m: Coefficients, weight: Any, density: Any, channel: Any, t: Any, reach:
     return Flight(scatters, *weigh(weight, density, value, pdf))
 
 
+def eval_phase(m: Coefficients, cosine: Any) -> Any:
+    """Henyey-Greenstein phase function of each channel, 1/sr."""
+    return mi.Spectrum([eval_hg(cosine, g) for g in m.g])
+
+
 def turn(m: Coefficients, weight: Any, density: Any, channel: Any, d: Any, u: Any, same_g: bool) -> tuple:
     """A new direction by the phase function, and w and q after it."""
-    import drjit as dr
-    import mitsuba as mi
-
     cosine = sample_hg(u.x, pick(m.g, channel))
     sine = dr.safe_sqrt((1 - cosine) * (1 + cosine))
     sin_phi, cos_phi = dr.sincos(2 * dr.pi * u.y)
@@ -82,14 +78,12 @@ def turn(m: Coefficients, weight: Any, density: Any, channel: Any, d: Any, u: An
     new *= 1.5 - 0.5 * dr.squared_norm(new)  # one Newton step: float32 drifts over thousands of turns
     if same_g or len(weight) == 1:
         return new, weight, density
-    phase = mi.Spectrum([eval_hg(cosine, m.g[c]) for c in range(len(weight))])
+    phase = eval_phase(m, cosine)
     return new, *weigh(weight, density, phase, phase)
 
 
 def roulette(weight: Any, scale: Any, u: Any) -> tuple[Any, Any]:
     """Whether a walk goes on, and its weight if it does; `scale` is the square of the relative index passed so far."""
-    import drjit as dr
-
     size = dr.max(weight) * scale
     survive = dr.select(size < ROULETTE_WEIGHT, size / (ROULETTE_WEIGHT * ROULETTE_BOOST), 1)
     return u < survive, dr.select(survive < 1, weight / dr.maximum(survive, 1e-30), weight)

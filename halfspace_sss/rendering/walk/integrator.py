@@ -12,6 +12,7 @@ from halfspace_sss.rendering.walk.connect import find_joins
 from halfspace_sss.rendering.walk.guide import Guide
 from halfspace_sss.rendering.walk.media import WalkMedia
 from halfspace_sss.rendering.walk.tracing import PathTracer
+from halfspace_sss.rendering.walk_light import LightVisitor
 
 __all__ = ["walk_integrator_class"]
 
@@ -54,7 +55,8 @@ def walk_integrator_class() -> type:
             _, media, joins = self._prepared
             joins = joins and replace(joins, scene=scene)
             guide = joins and Guide(scene, media, joins)
-            return PathTracer(scene, media, self.max_depth, self.rr_depth, self.hidden, joins, guide)
+            visitor = LightVisitor(scene, media, joins, guide)
+            return PathTracer(visitor, self.max_depth, self.rr_depth, self.hidden)
 
         def render(
             self, scene: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0, develop: bool = True, evaluate: bool = True

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from halfspace_sss.rendering.surface.object import Object, survey
@@ -42,9 +44,6 @@ class WalkMedia:
     mm_per_unit: float
 
     def __post_init__(self) -> None:
-        import drjit as dr
-        import mitsuba as mi
-
         media = [inside.medium for inside in self.insides]
         n = len(mi.Spectrum(0))
         tables = {}
@@ -53,7 +52,7 @@ class WalkMedia:
             rows = np.array([np.broadcast_to(getattr(m, key), n) for m in media], dtype=float) * scale
             tables[key] = [mi.Float(rows[:, c].tolist()) for c in range(n)] if len(media) else []
         tables["eta"] = mi.Float([m.eta for m in media])
-        sides = [[found.sign] if found.signs is None else np.array(found.signs).tolist() for found in self.objects]
+        sides = [[obj.sign] if obj.signs is None else np.array(obj.signs).tolist() for obj in self.objects]
         tables["side"] = mi.Float(sum(sides, []))
         tables["first"] = mi.UInt32(np.cumsum([0, *map(len, sides)])[:-1].tolist())
         tables["step"] = mi.UInt32([int(len(side) > 1) for side in sides])
@@ -62,7 +61,7 @@ class WalkMedia:
         tables["reflects"] = mi.Bool([inside.reflection for inside in self.insides])
         tables["rough"] = mi.Bool([is_rough(b) for b in self.boundaries])
         tables["boundary"] = pointer_numbers([mi.BSDFPtr(b) for b in self.boundaries])
-        tables["shape"] = by_pointer([mi.ShapePtr(found.shape) for found in self.objects])
+        tables["shape"] = by_pointer([mi.ShapePtr(obj.shape) for obj in self.objects])
         dr.make_opaque(tables)  # one kernel for all media
         object.__setattr__(self, "tables", tables)
         object.__setattr__(self, "box", _bounds(self.scene))
@@ -89,16 +88,15 @@ class WalkMedia:
 
     def row(self, key: str, k: Any) -> Any:
         """An entry of a table for object k."""
-        import drjit as dr
-
         table = self.tables[key]
         return dr.gather(type(table), table, k)
 
+    def counts(self, k: Any, order: Any) -> Any:
+        """Whether a walk that leaves object k after so many events counts."""
+        return (order >= self.row("fewest", k)) & (order <= self.row("most", k))
+
     def coefficients(self, k: Any) -> Coefficients:
         """Of object k."""
-        import drjit as dr
-        import mitsuba as mi
-
         return Coefficients(
             *(
                 mi.Spectrum([dr.gather(mi.Float, channel, k) for channel in self.tables[key]])
@@ -106,11 +104,8 @@ class WalkMedia:
             )
         )
 
-    def number(self, shape: Any, active: Any = True) -> Any:
+    def index_of(self, shape: Any, active: Any = True) -> Any:
         """The number of the object that a shape is, or -1."""
-        import drjit as dr
-        import mitsuba as mi
-
         pointer = dr.reinterpret_array(mi.UInt32, shape)
         table = self.tables["shape"]
         known = active & (pointer < dr.width(table))
@@ -118,9 +113,6 @@ class WalkMedia:
 
     def boundary(self, k: Any) -> Any:
         """The dielectric of object k: one BSDF, or a pointer in each lane."""
-        import drjit as dr
-        import mitsuba as mi
-
         if len(self.boundaries) == 1:
             return self.boundaries[0]
         return dr.reinterpret_array(mi.BSDFPtr, dr.gather(mi.UInt32, self.tables["boundary"], k))
@@ -129,17 +121,14 @@ class WalkMedia:
         """1 where the geometric normal of a face of object k points outwards, -1 where it points inwards."""
         import drjit as dr
 
-        if all(found.signs is None for found in self.objects):
+        if all(obj.signs is None for obj in self.objects):
             return self.row("side", k)
         index = self.row("first", k) + prim_index * self.row("step", k)
         return self.row("side", dr.minimum(index, dr.width(self.tables["side"]) - 1))
 
     def face_outwards(self, si: Any, k: Any, direction: Any) -> Any:
         """The interaction with its normals turned to the outside of object k; `direction` is that of the ray."""
-        import drjit as dr
-        import mitsuba as mi
-
-        if all(found.upright for found in self.objects):
+        if all(obj.upright for obj in self.objects):
             return si
         n = dr.select(k >= 0, si.n * self.side(dr.maximum(k, 0), si.prim_index), si.n)
         flip = (k >= 0) & (dr.dot(si.sh_frame.n, n) < 0)
@@ -155,8 +144,6 @@ class WalkMedia:
         Raises:
             ValueError: mm_per_unit is not a finite number > 0, or an object is an instance.
         """
-        import mitsuba as mi
-
         if not (np.isfinite(mm_per_unit) and mm_per_unit > 0):
             raise ValueError(f"mm_per_unit must be finite and > 0, got {mm_per_unit!r}")
         shapes = [shape for shape in scene.shapes() if hasattr(shape.bsdf(), "inside")]
@@ -173,8 +160,6 @@ class WalkMedia:
 
 def _bounds(scene: Any) -> Any:
     """The bounding box, a little larger; what is outside has leaked through the boundary by rounding."""
-    import mitsuba as mi
-
     box = scene.bbox()
     if not box.valid():
         return box
@@ -184,23 +169,16 @@ def _bounds(scene: Any) -> Any:
 
 def is_rough(boundary: Any) -> bool:
     """Whether a boundary scatters into a solid angle."""
-    import mitsuba as mi
-
     return bool(boundary.flags() & int(mi.BSDFFlags.Smooth))
 
 
 def pointer_numbers(pointers: list[Any]) -> Any:
     """What Dr.Jit's registry calls each."""
-    import drjit as dr
-    import mitsuba as mi
-
     return mi.UInt32([int(dr.reinterpret_array(mi.UInt32, pointer)[0]) for pointer in pointers])
 
 
 def by_pointer(pointers: list[Any]) -> Any:
     """Table from the number of a pointer in Dr.Jit's registry to its place in the list, -1 for others."""
-    import mitsuba as mi
-
     ids = np.array(pointer_numbers(pointers), dtype=int).tolist()
     table = np.full(max(ids, default=0) + 1, -1, dtype=np.int32)
     for k, number in enumerate(ids):

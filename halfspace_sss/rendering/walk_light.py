@@ -1,0 +1,145 @@
+"""Light that paths from the camera gather inside objects: the visitor of walks for images.
+
+Emitters that a path meets are weighted against those that were sampled at its last vertex (power heuristic), against
+joins and against the guide, which find small emitters (`walk_connect`, `walk_guide`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from halfspace_sss.rendering.walk.connect import Joins
+from halfspace_sss.rendering.walk.guide import Departure, Guide
+from halfspace_sss.rendering.walk.media import WalkMedia
+from halfspace_sss.rendering.walk_steps import Crossing, Event, Walk
+
+__all__ = ["Light", "LightVisitor", "power_heuristic", "start_light"]
+
+
+@dataclass
+class Light:
+    """What a path has gathered, and what weighs the next emitter that it meets."""
+
+    L: mi.Spectrum  # radiance
+    last: mi.Point3f  # vertex that the ray comes from
+    pdf: mi.Float  # density of the ray's direction there, 1/sr
+    delta: mi.Bool  # whether that direction was the only one
+    straight: mi.Bool  # nothing has reflected since the last event
+    joined: mi.Bool  # there was a straight edge: joins find what small emitters send along this path
+    pivot: mi.Point3f  # the event at the end of that edge
+    guided: mi.Bool  # the guide looked for small emitters from the last event, and nothing has reflected since
+    departure: Departure  # from the last event
+
+
+@dataclass(frozen=True, eq=False)
+class LightVisitor:
+    """Light gathered at the events and boundaries of walks.
+
+    Args:
+        scene: the Mitsuba scene.
+        media: its translucent objects.
+        joins: how light of small emitters enters objects, if there are any.
+        guide: how it leaves them where joins cannot find it.
+    """
+
+    scene: Any
+    media: WalkMedia
+    joins: Joins | None
+    guide: Guide | None
+
+    def event(self, walk: Walk, record: Light, event: Event) -> tuple[Walk, Light]:
+        if self.joins is None:
+            return walk, record
+        smooth = ~self.media.row("rough", walk.object)
+        edge = record.straight & smooth & (walk.order > 0)  # this event ends one
+        joined = record.joined | edge
+        record = replace(record, joined=joined, pivot=dr.select(edge, event.p, record.pivot))
+        joins = smooth & (walk.order + 2 <= self.media.row("most", walk.object))
+        walk, record, _ = dr.if_stmt((walk, record, event), joins, self._join, _same, label="joins")
+        guided = smooth & ~joined & self.media.counts(walk.object, walk.order + 1)
+        record = replace(record, straight=mi.Bool(True), guided=guided)
+        walk, record, _ = dr.if_stmt((walk, record, event), guided, self._guide, _same, label="guide")
+        departure = Departure(event.p, event.along, record.departure.ahead, walk.object)
+        return walk, replace(record, departure=departure)
+
+    def _join(self, walk: Walk, record: Light, event: Event) -> tuple[Walk, Light, Event]:
+        light, rng = self.joins.light(event, walk.rng)
+        return replace(walk, rng=rng), replace(record, L=record.L + walk.weight * light), event
+
+    def _guide(self, walk: Walk, record: Light, event: Event) -> tuple[Walk, Light, Event]:
+        light = self.guide.light(event, walk.rng)
+        return walk, replace(record, L=record.L + walk.weight * light), event
+
+    def boundary(self, walk: Walk, record: Light, si: Any, active: Any) -> tuple[Walk, Light]:
+        if not self.media.any_rough:
+            return walk, record
+        light = self.sampled_emitter(walk, si, self.media.boundary(walk.object), active)
+        return walk, replace(record, L=record.L + light)
+
+    def crossing(self, walk: Walk, record: Light, crossing: Crossing) -> tuple[Walk, Light]:
+        record = replace(record, last=crossing.si.p, pdf=crossing.pdf, delta=crossing.delta)
+        if self.joins is None:
+            return walk, record
+        straight = record.straight & crossing.leaves
+        departure = replace(record.departure, ahead=crossing.along)
+        return walk, replace(record, straight=straight, guided=record.guided & straight, departure=departure)
+
+    def met_emitter(self, walk: Walk, record: Light, si: Any, active: Any) -> Any:
+        """Light of an emitter that the ray meets, weighted against sampling it from the last vertex."""
+        emitter = si.emitter(self.scene)
+        active = active & (emitter != None)  # noqa: E711
+        last = dr.zeros(mi.Interaction3f)
+        last.p = record.last
+        ds = mi.DirectionSample3f(self.scene, si, last)
+        sampled = active & ~record.delta
+        pdf = dr.select(sampled, self.scene.pdf_emitter_direction(last, ds, sampled), 0)
+        share = dr.select(record.delta, 1, power_heuristic(record.pdf, pdf))
+        if self.joins is not None:
+            active &= ~(record.joined & self.joins.covers(emitter, si.p, walk.d, record.pivot))
+            guided = active & record.guided
+            state = (emitter, record.departure, share, guided)
+            _, _, share, _ = dr.if_stmt(state, guided, self._against_guide, lambda *state: state)
+        return dr.select(active, walk.weight * emitter.eval(si, active) * share, 0)
+
+    def _against_guide(self, emitter: Any, departure: Departure, share: Any, guided: Any) -> tuple:
+        return emitter, departure, self.guide.share(emitter, departure, guided), guided
+
+    def sampled_emitter(self, walk: Walk, si: Any, bsdf: Any, active: Any, outwards: Any = True) -> Any:
+        """Light of a sampled emitter by the surface at `si`; by a boundary only from its outer side."""
+        rng = walk.rng
+        u = mi.Point2f(rng.next_float32(), rng.next_float32())
+        active = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+        ds, light = self.scene.sample_emitter_direction(si, u, True, active)
+        active &= (ds.pdf > 0) & (~mi.Bool(outwards) | (dr.dot(ds.d, si.n) > 0))
+        value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(ds.d), active)
+        share = dr.select(ds.delta, 1, power_heuristic(ds.pdf, pdf))
+        return dr.select(active, walk.weight * value * light * share, 0)
+
+
+def _same(*state: Any) -> tuple:
+    return state
+
+
+def start_light(lanes: int) -> Light:
+    """Of a path that begins at the camera."""
+
+    def full(kind: type, value: Any) -> Any:
+        return dr.full(kind, value, lanes)
+
+    point, along = full(mi.Point3f, 0), full(mi.Vector3f, 0)
+    return Light(
+        L=full(mi.Spectrum, 0), last=point, pdf=full(mi.Float, 1), delta=full(mi.Bool, True),
+        straight=full(mi.Bool, False), joined=full(mi.Bool, False), pivot=mi.Point3f(point),
+        guided=full(mi.Bool, False),
+        departure=Departure(mi.Point3f(point), along, mi.Vector3f(along), full(mi.Int32, 0)),
+    )  # fmt: skip
+
+
+def power_heuristic(a: Any, b: Any) -> Any:
+    """Weight of a sample of density a against another of density b: a² / (a² + b²)."""
+    share = dr.square(a) / (dr.square(a) + dr.square(b))
+    return dr.select(dr.isfinite(share), share, 0)

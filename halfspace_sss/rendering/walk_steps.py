@@ -1,0 +1,150 @@
+"""The walk inside one object as a part of its own: its state, its step, and visitors that say what is recorded.
+
+A step is a free flight to a scattering event or to the boundary. A visitor has a record of its own, any PyTree of
+Dr.Jit, which goes through the loop beside the walk: light for images, exits for learning.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import drjit as dr
+import mitsuba as mi
+
+from halfspace_sss.rendering.walk.inside import fly, free_path, roulette, turn
+from halfspace_sss.rendering.walk.media import Coefficients, WalkMedia
+
+__all__ = ["OUTSIDE", "Crossing", "Event", "Visitor", "Walk", "Walker", "start_walk"]
+
+OUTSIDE = -1
+
+
+@dataclass
+class Walk:
+    """State of a walk."""
+
+    alive: mi.Bool  # whether it goes on
+    object: mi.Int32  # the object around it, by number, or OUTSIDE
+    o: mi.Point3f  # where its ray begins
+    d: mi.Vector3f  # direction of the ray
+    channel: mi.UInt32  # by which distances and angles are drawn
+    weight: mi.Spectrum  # w_c = f_c / mean_k p_k
+    density: mi.Spectrum  # q_c = p_c / mean_k p_k
+    scale: mi.Float  # square of the relative index passed so far
+    order: mi.UInt32  # scattering events since it entered the object
+    rng: mi.PCG32
+
+
+@dataclass
+class Event:
+    """A scattering event, before the walk turns."""
+
+    p: mi.Point3f
+    along: mi.Vector3f  # direction of arrival
+    object: mi.Int32
+    m: Coefficients
+
+
+@dataclass
+class Crossing:
+    """What a walk did at the boundary."""
+
+    si: mi.SurfaceInteraction3f  # with the normals outwards
+    along: mi.Vector3f  # direction of arrival
+    leaves: mi.Bool  # or is reflected
+    pdf: mi.Float  # density of the new direction, 1/sr
+    delta: mi.Bool  # whether that direction was the only one
+
+
+class Visitor(Protocol):
+    """What is recorded of a walk. Each method returns the walk, whose random numbers it may use up, and its record."""
+
+    def event(self, walk: Walk, record: Any, event: Event) -> tuple[Walk, Any]:
+        """At a scattering event, of which `walk.order` came before."""
+
+    def boundary(self, walk: Walk, record: Any, si: Any, active: Any) -> tuple[Walk, Any]:
+        """At the boundary from inside, where the walk may leave if `active`."""
+
+    def crossing(self, walk: Walk, record: Any, crossing: Crossing) -> tuple[Walk, Any]:
+        """After reflection at the boundary or refraction through it; `walk` is on its way again."""
+
+
+@dataclass(frozen=True, eq=False)
+class Walker:
+    """A walk inside translucent objects.
+
+    Args:
+        media: the objects.
+        visitor: what is recorded.
+    """
+
+    media: WalkMedia
+    visitor: Visitor
+
+    def step(self, walk: Walk, record: Any) -> tuple[Walk, Any]:
+        """A free flight, and the scattering event or the boundary at its end."""
+        m = self.media.coefficients(walk.object)
+        t = free_path(m, walk.channel, walk.rng.next_float32())
+        ray = mi.Ray3f(walk.o, walk.d)
+        ray.maxt = t
+        hit = self.media.scene.ray_intersect_preliminary(ray, coherent=False)
+        flight = fly(m, walk.weight, walk.density, walk.channel, t, hit.t)
+        walk = replace(walk, weight=flight.weight, density=flight.density)
+        event = Event(ray(t), ray.d, walk.object, m)
+        walk, record = dr.if_stmt((walk, record, event), flight.scatters, self._scatter, _pass, label="scatter")
+        return dr.if_stmt((walk, record, ray, hit), ~flight.scatters, self._meet, _pass, label="boundary")
+
+    def _scatter(self, walk: Walk, record: Any, event: Event) -> tuple[Walk, Any]:
+        walk, record = self.visitor.event(walk, record, event)
+        rng, media = walk.rng, self.media
+        u = mi.Point2f(rng.next_float32(), rng.next_float32())
+        d, weight, density = turn(event.m, walk.weight, walk.density, walk.channel, event.along, u, media.same_g)
+        survives, weight = roulette(weight, walk.scale, rng.next_float32())
+        order = walk.order + 1
+        alive = survives & (order <= media.row("most", walk.object)) & media.box.contains(event.p)
+        walk = replace(walk, o=event.p, d=d, weight=weight, density=density, order=order, alive=alive,
+                       object=dr.select(alive, walk.object, OUTSIDE))  # fmt: skip
+        return walk, record
+
+    def _meet(self, walk: Walk, record: Any, ray: Any, hit: Any) -> tuple[Walk, Any]:
+        """Reflection at the boundary seen from inside, or the way out."""
+        media, k = self.media, walk.object
+        si = hit.compute_surface_interaction(ray)
+        foreign = media.index_of(si.shape) != k  # of an object that overlaps: the flight goes on behind it
+        si = media.face_outwards(si, k, ray.d)
+        leaked = ~foreign & (dr.dot(si.n, ray.d) < 0)  # rounding has put the walk outside
+        counts = media.counts(k, walk.order)
+        walk, record = self.visitor.boundary(walk, record, si, ~foreign & counts)
+        bs, value = sample_bsdf(media.boundary(k), si, walk.rng)
+        d = si.to_world(bs.wo)
+        out = ~foreign & (dr.dot(d, si.n) > 0)
+        alive = ~leaked & (foreign | (bs.pdf > 0)) & (~out | counts)
+        d = dr.select(foreign, ray.d, d)
+        walk = replace(walk, o=si.spawn_ray(d).o, d=d, alive=alive,
+                       object=dr.select(alive & ~out, k, OUTSIDE),
+                       weight=dr.select(foreign, walk.weight, walk.weight * value),
+                       scale=walk.scale * dr.select(foreign, 1, dr.square(bs.eta)))  # fmt: skip
+        delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        return self.visitor.crossing(walk, record, Crossing(si, mi.Vector3f(ray.d), out, bs.pdf, delta))
+
+
+def _pass(walk: Walk, record: Any, *rest: Any) -> tuple[Walk, Any]:
+    return walk, record
+
+
+def start_walk(o: Any, d: Any, rng: Any) -> Walk:
+    """A walk that begins outside."""
+    lanes = dr.width(o)
+    return Walk(
+        alive=dr.full(mi.Bool, True, lanes), object=dr.full(mi.Int32, OUTSIDE, lanes), o=o, d=d,
+        channel=dr.full(mi.UInt32, 0, lanes), weight=dr.full(mi.Spectrum, 1, lanes),
+        density=dr.full(mi.Spectrum, 1, lanes), scale=dr.full(mi.Float, 1, lanes),
+        order=dr.full(mi.UInt32, 0, lanes), rng=rng,
+    )  # fmt: skip
+
+
+def sample_bsdf(bsdf: Any, si: Any, rng: Any, ctx: Any = None) -> tuple[Any, Any]:
+    """A direction by a BSDF, and its weight."""
+    u, v = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
+    return bsdf.sample(ctx or mi.BSDFContext(), si, u, v)
