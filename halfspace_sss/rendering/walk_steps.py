@@ -15,7 +15,7 @@ import mitsuba as mi
 from halfspace_sss.rendering.walk.inside import fly, free_path, roulette, turn
 from halfspace_sss.rendering.walk.media import Coefficients, WalkMedia
 
-__all__ = ["OUTSIDE", "Crossing", "Event", "Visitor", "Walk", "Walker", "start_walk"]
+__all__ = ["OUTSIDE", "Crossing", "Event", "Visitor", "Walk", "Walker", "draw", "sample_bsdf", "start_walk"]
 
 OUTSIDE = -1
 
@@ -148,3 +148,8 @@ def sample_bsdf(bsdf: Any, si: Any, rng: Any, ctx: Any = None) -> tuple[Any, Any
     """A direction by a BSDF, and its weight."""
     u, v = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
     return bsdf.sample(ctx or mi.BSDFContext(), si, u, v)
+
+
+def draw(n: int, rng: Any) -> Any:
+    """A whole number below n."""
+    return dr.minimum(mi.UInt32(rng.next_float32() * n), n - 1)

@@ -27,9 +27,9 @@ import numpy as np
 
 from halfspace_sss.rendering.walk.inside import eval_phase, fly, free_path, pick, turn
 from halfspace_sss.rendering.walk.media import WalkMedia, by_pointer, pointer_numbers
-from halfspace_sss.rendering.walk_steps import Event, Walk, start_walk
+from halfspace_sss.rendering.walk_steps import Event, Walk, draw, start_walk
 
-__all__ = ["DEEPEST", "Joins", "draw", "find_joins"]
+__all__ = ["DEEPEST", "Joins", "find_joins"]
 
 DEEPEST = 12.0  # mean free paths up to which the boundary in front of an event is looked for
 LARGEST = 0.5  # radius of an emitter over its distance
@@ -216,11 +216,6 @@ class Joins:
         inside = (dr.dot(si.n, d) > 0) & (dr.dot(si.n, new) < 0) & (walk.rng.next_float32() < F)
         walk = replace(walk, o=si.spawn_ray(new).o, d=new, alive=walk.alive & (foreign | inside))
         return walk, ray, hit
-
-
-def draw(n: int, rng: Any) -> Any:
-    """A whole number below n."""
-    return dr.minimum(mi.UInt32(rng.next_float32() * n), n - 1)
 
 
 def _draw_across(event: Event, aim: Aim, rng: Any) -> tuple[Any, Any]:

@@ -1,0 +1,142 @@
+"""Where walks from given exits leave an object: what a model of its light transport is learnt from.
+
+A walk enters at x_o against the direction w_o and leaves at x_i into w_i with the throughput T of each channel. Both
+refractions and absorption are in T; reflection at x_o is not, so that walks which never enter have none:
+
+    ∫∫ S(x_i, w_i; x_o, w_o) mu_i f(x_i, w_i) dw_i dA_i = E[T f(x_i, w_i)]
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from halfspace_sss.rendering.walk.media import WalkMedia
+from halfspace_sss.rendering.walk_steps import Crossing, Event, Walk, Walker, draw, sample_bsdf, start_walk
+from halfspace_sss.tracing.walk import _generator, pass_seed
+
+__all__ = ["ExitVisitor", "Exits", "Start", "exits"]
+
+LANES = 2**14
+
+
+@dataclass
+class Start:
+    """Where walks begin, one entry per walk."""
+
+    x_o: mi.Point3f  # on the surface
+    n_o: mi.Normal3f  # outward normal there
+    w_o: mi.Vector3f  # direction outside, away from the surface
+
+
+@dataclass
+class Exits:
+    """Where walks leave, in the order of their starts."""
+
+    left: mi.Bool  # whether the walk left, rather than ended inside; the rest is 0 if not
+    x_i: mi.Point3f
+    n_i: mi.Normal3f  # outward shading normal
+    w_i: mi.Vector3f  # direction outside, away from the surface
+    throughput: mi.Spectrum  # T
+    order: mi.UInt32  # scattering events
+
+
+@dataclass(frozen=True, eq=False)
+class ExitVisitor:
+    """Stores each exit at the number of its walk, which is the record, and ends the walk there."""
+
+    exits: Exits
+
+    def event(self, walk: Walk, record: Any, event: Event) -> tuple[Walk, Any]:
+        return walk, record
+
+    def boundary(self, walk: Walk, record: Any, si: Any, active: Any) -> tuple[Walk, Any]:
+        return walk, record
+
+    def crossing(self, walk: Walk, record: Any, crossing: Crossing) -> tuple[Walk, Any]:
+        leaves = walk.alive & crossing.leaves
+        to, si = self.exits, crossing.si
+        dr.scatter(to.left, mi.Bool(True), record, leaves)
+        dr.scatter(to.x_i, si.p, record, leaves)
+        dr.scatter(to.n_i, mi.Normal3f(si.sh_frame.n), record, leaves)
+        dr.scatter(to.w_i, walk.d, record, leaves)
+        dr.scatter(to.throughput, walk.weight, record, leaves)
+        dr.scatter(to.order, walk.order, record, leaves)
+        return replace(walk, alive=walk.alive & ~leaves), record
+
+
+def exits(media: WalkMedia, k: int, start: Start, seed: int | tuple[int, ...], lanes: int = LANES) -> Exits:
+    """Walk from exits of object k until the walks leave it.
+
+    Args:
+        media: the translucent objects of a scene, see `WalkMedia.of`.
+        k: number of the object.
+        start: x_o, n_o and w_o, arrays of one length; where w_o is below the surface, no walk enters.
+        seed: one whole number or more.
+        lanes: walks at a time; another number gives other walks.
+
+    Returns:
+        Exits in the order of the starts. A walk counts if its order is among the orders of the object.
+
+    Raises:
+        ValueError: there is no object k, or the arrays of `start` are of different lengths.
+    """
+    n = _check(media, k, start)
+    result = _nowhere(n)
+    dr.eval(result, start)
+    if n == 0:
+        return result
+    lanes = min(lanes, n)
+    walker, total, k = Walker(media, ExitVisitor(result)), dr.opaque(mi.UInt32, n), dr.opaque(mi.UInt32, k)
+
+    def renew(walk: Walk, index: Any) -> tuple[Walk, Any]:
+        return _enter(media, k, start, index + lanes, walk.rng), index + lanes
+
+    def body(walk: Walk, index: Any) -> tuple[Walk, Any]:
+        walk, index = dr.if_stmt((walk, index), walk.alive, walker.step, lambda *s: s, label="inside")
+        return dr.if_stmt((walk, index), ~walk.alive, renew, lambda *s: s, label="renew")
+
+    seeds = seed if isinstance(seed, tuple) else (seed,)
+    index = dr.arange(mi.UInt32, lanes)
+    walk = _enter(media, k, start, index, _generator(mi, lanes, pass_seed(*seeds)))
+    dr.while_loop((walk, index), lambda walk, index: index < total, body, label="exits")
+    dr.eval(result)
+    return result
+
+
+def _nowhere(n: int) -> Exits:
+    kinds = mi.Bool, mi.Point3f, mi.Normal3f, mi.Vector3f, mi.Spectrum, mi.UInt32
+    return Exits(*(dr.zeros(kind, n) for kind in kinds))
+
+
+def _check(media: WalkMedia, k: int, start: Start) -> int:
+    """The number of starts."""
+    if not 0 <= k < len(media.objects):
+        raise ValueError(f"k must be a whole number in [0, {len(media.objects) - 1}], got {k!r}")
+    widths = [dr.width(start.x_o), dr.width(start.n_o), dr.width(start.w_o)]
+    if len(set(widths)) > 1:
+        raise ValueError(f"x_o, n_o and w_o must be of one length, got {widths}")
+    return widths[0]
+
+
+def _enter(media: WalkMedia, k: Any, start: Start, index: Any, rng: Any) -> Walk:
+    """The walk of a start, refracted into the object."""
+    known = index < dr.width(start.x_o)
+    si = dr.zeros(mi.SurfaceInteraction3f, dr.width(index))
+    si.p = dr.gather(mi.Point3f, start.x_o, index, known)
+    si.n = dr.gather(mi.Normal3f, start.n_o, index, known)
+    si.sh_frame = mi.Frame3f(si.n)
+    w = dr.gather(mi.Vector3f, start.w_o, index, known)
+    si.wi = si.to_local(w)
+    ctx = mi.BSDFContext()
+    ctx.type_mask = mi.BSDFFlags.Transmission
+    bs, value = sample_bsdf(media.boundary(k), si, rng, ctx)
+    d = si.to_world(bs.wo)
+    walk = start_walk(si.spawn_ray(d).o, d, rng)
+    enters = known & (dr.dot(w, si.n) > 0) & (dr.dot(d, si.n) < 0) & (dr.max(value) > 0)
+    channel = draw(len(value), rng) if len(value) > 1 else walk.channel
+    return replace(walk, alive=enters, object=mi.Int32(k) + dr.zeros(mi.Int32, dr.width(index)), weight=value,
+                   scale=dr.square(bs.eta), channel=channel)  # fmt: skip

@@ -1,0 +1,136 @@
+"""Where walks leave an object: energy, the half-space, orders, what is refused."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import halfspace_sss.rendering as rendering
+from halfspace_sss import Medium
+from halfspace_sss.physics import single_scattering
+from halfspace_sss.physics.fresnel import F_r
+from halfspace_sss.tracing.tracer import trace
+
+mi = pytest.importorskip("mitsuba")
+
+N = 2**17
+WIDEST_Z = 4.4  # two-sided 1e-5
+
+
+@pytest.fixture(autouse=True)
+def variant() -> None:
+    mi.set_variant("llvm_ad_rgb")
+    rendering.register()
+
+
+def _media(shape: dict, **surface: object):
+    from halfspace_sss.rendering.walk.media import WalkMedia
+
+    scene = {"type": "scene", "object": {**shape, "bsdf": {"type": "translucent", **surface}}}
+    return WalkMedia.of(mi.load_dict(scene), 1.0)
+
+
+def _slab() -> dict:
+    """A box whose top, z = 0, is a half-space to walks that begin at the origin."""
+    return {"type": "cube", "to_world": mi.ScalarTransform4f().translate([0, 0, -500]).scale([2000, 2000, 500])}
+
+
+def _start(mu: float, n: int = N):
+    """Walks that enter at the origin with the cosine mu."""
+    from halfspace_sss.rendering.walk_exits import Start
+
+    w = np.repeat([[np.sqrt(1 - mu * mu)], [0.0], [mu]], n, axis=1)
+    up = np.repeat([[0.0], [0.0], [1.0]], n, axis=1)
+    return Start(mi.Point3f(np.zeros((3, n))), mi.Normal3f(up), mi.Vector3f(w))
+
+
+def _on_sphere(radius: float, n: int):
+    """Random points of a sphere about the origin and directions within 70 degrees of its normals."""
+    from halfspace_sss.rendering.walk_exits import Start
+
+    rng = np.random.default_rng(3)
+    up = rng.standard_normal((3, n))
+    up /= np.linalg.norm(up, axis=0)
+    w = rng.standard_normal((3, n))
+    w = 1.05 * up + w / np.linalg.norm(w, axis=0)
+    w /= np.linalg.norm(w, axis=0)
+    return Start(mi.Point3f(radius * up), mi.Normal3f(up), mi.Vector3f(w)), (up * w).sum(axis=0)
+
+
+def _exits(*arguments: object, **options: object):
+    from halfspace_sss.rendering.walk_exits import exits
+
+    return exits(*arguments, **options)
+
+
+def _check_mean(values: np.ndarray, expected: float, error: float = 0.0) -> None:
+    z = (values.mean() - expected) / np.hypot(values.std() / np.sqrt(len(values)), error)
+    assert abs(z) < WIDEST_Z, (values.mean(), expected, z)
+
+
+def test_without_absorption_all_that_enters_a_sphere_leaves_it() -> None:
+    media = _media({"type": "sphere", "radius": 5.0}, sigma_s="0.5,1,2", sigma_a=0.0, g=0.3, eta=1.5)
+    start, mu = _on_sphere(5.0, N)
+    out = _exits(media, 0, start, 1)
+    left = np.array(out.left)
+    assert left.mean() > 0.9999
+    entered = 1 - F_r(mu, 1.5)
+    for channel in np.array(out.throughput):
+        _check_mean(channel - entered, 0.0)
+
+
+def test_exits_lie_on_the_surface_with_directions_that_point_away_from_it() -> None:
+    media = _media({"type": "sphere", "radius": 5.0}, sigma_s="0.5,1,2", sigma_a=0.01, eta=1.5)
+    out = _exits(media, 0, _on_sphere(5.0, 4096)[0], 1)
+    left = np.array(out.left)
+    x, n, w = (np.array(a)[:, left] for a in (out.x_i, out.n_i, out.w_i))
+    assert np.allclose(np.linalg.norm(x, axis=0), 5, atol=1e-3)
+    assert np.allclose(n, x / 5, atol=1e-3)
+    assert np.all((n * w).sum(axis=0) > 0)
+
+
+def test_exits_of_a_large_slab_carry_the_reflectance_of_the_half_space() -> None:
+    media = _media(_slab(), sigma_s="1,0.8,0.3", sigma_a="0.01,0.2,0.7", g=0.5, eta=1.4)
+    throughput = np.array(_exits(media, 0, _start(0.6), 2).throughput)
+    for values, (s, a) in zip(throughput, ((1.0, 0.01), (0.8, 0.2), (0.3, 0.7))):
+        expected = trace(Medium(s, a, 0.5, 1.4), 0.6, n_paths=2**19).reflectance()
+        _check_mean(values, expected.value, expected.standard_error)
+
+
+def test_walks_count_their_scattering_events() -> None:
+    media = _media(_slab(), sigma_s="1,0.8,0.3", sigma_a="0.01,0.2,0.7", g=0.5, eta=1.4)
+    out = _exits(media, 0, _start(0.6), 3)
+    once = np.array(out.order) == 1
+    for values, (s, a) in zip(np.array(out.throughput), ((1.0, 0.01), (0.8, 0.2), (0.3, 0.7))):
+        _check_mean(values * once, single_scattering.reflectance(Medium(s, a, 0.5, 1.4), 0.6))
+
+
+def test_an_object_of_multiple_scattering_has_no_exits_of_lower_orders() -> None:
+    sphere = {"type": "sphere", "radius": 1.0}
+    out = _exits(_media(sphere, sigma_s=1.0, sigma_a=0.1, orders="multiple"), 0, _on_sphere(1.0, 4096)[0], 4)
+    assert np.array(out.order)[np.array(out.left)].min() == 2
+
+
+def test_a_walk_whose_direction_is_below_the_surface_never_enters() -> None:
+    start = _start(0.6, 8)
+    start.w_o = -start.w_o
+    out = _exits(_media(_slab(), sigma_s=1.0, sigma_a=0.1), 0, start, 5)
+    assert not np.array(out.left).any()
+    assert not np.array(out.throughput).any()
+
+
+def test_a_rough_boundary_lets_walks_in_and_out() -> None:
+    rough = {"type": "roughdielectric", "int_ior": 1.3, "ext_ior": 1.0, "alpha": 0.05}
+    out = _exits(_media(_slab(), sigma_s=1.0, sigma_a=0.5, eta=1.3, b=rough), 0, _start(0.9), 6)
+    expected = trace(Medium(1.0, 0.5, 0.0, 1.3), 0.9, n_paths=2**18).reflectance()
+    assert np.array(out.throughput)[0].mean() == pytest.approx(expected.value, rel=0.02)
+
+
+def test_numbers_of_objects_and_lengths_that_do_not_fit_are_refused() -> None:
+    media = _media(_slab(), sigma_s=1.0, sigma_a=0.5)
+    with pytest.raises(ValueError, match=r"k must be a whole number in \[0, 0\], got 1"):
+        _exits(media, 1, _start(0.6, 8), 1)
+    start = _start(0.6, 8)
+    start.n_o = mi.Normal3f(0, 0, 1)
+    with pytest.raises(ValueError, match=r"x_o, n_o and w_o must be of one length, got \[8, 1, 8\]"):
+        _exits(media, 0, start, 1)
