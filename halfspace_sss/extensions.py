@@ -1,36 +1,66 @@
-"""What packages add to the command line and to the results, found by entry points so that no import goes back.
+"""What packages add to the library and to the command line, found by entry points so that no import goes back.
 
+- `halfspace_sss.models`: list of model classes.
+- `halfspace_sss.materials`: path of a material file or folder, or an iterable of `Material`.
 - `halfspace_sss.commands`: name -> function with typer annotations, a further command of `halfspace-sss`.
 - `halfspace_sss.figures`: kind of result -> function that takes the result and returns {file ending: bytes}.
+
+What a package offers may fail in any way: it is left out with a warning in one line that names it, and nothing else is.
 """
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterator
 from importlib.metadata import entry_points
 from typing import Any
 
-__all__ = ["COMMANDS", "FIGURES", "commands", "renderer"]
+__all__ = ["COMMANDS", "FAILURES", "FIGURES", "MODELS", "commands", "offered", "renderer", "warn_left_out"]
 
-COMMANDS, FIGURES = "halfspace_sss.commands", "halfspace_sss.figures"
+COMMANDS, FIGURES, MODELS = "halfspace_sss.commands", "halfspace_sss.figures", "halfspace_sss.models"
+FAILURES = (Exception, SystemExit)  # what code of somebody else may end with
+OWN = ("analytic_models", "figures", "full_geometry", "halfspace_sss")
 Renderer = Callable[[Any], dict[str, bytes]]
 
 
-def commands() -> Iterator[tuple[str, Callable | str]]:
-    """Name and function of every command that a package adds; a text instead of the function says why there is none."""
-    for entry in entry_points(group=COMMANDS):
+def warn_left_out(group: str, name: str, error: object) -> None:
+    """Warn in one line, without the source line that `warnings.warn` would show, that something is left out."""
+    why = f"{type(error).__name__}: {error}" if isinstance(error, BaseException) else error
+    message = " ".join(f"entry point {name!r} is left out: {why}".split())
+    warnings.warn_explicit(message, UserWarning, group, 0)
+
+
+def offered(group: str) -> Iterator[tuple[str, Any]]:
+    """Name and object of every entry point of a group that loads, those of this project first."""
+    for entry in sorted(entry_points(group=group), key=lambda e: e.value.split(":")[0].split(".")[0] not in OWN):
         try:
-            yield entry.name, entry.load()
-        except Exception as error:  # a package of somebody else may fail in any way and must not stop the others
-            yield entry.name, f"{entry.value} cannot be loaded: {type(error).__name__}: {error}"
+            found = entry.load()
+        except FAILURES as error:
+            warn_left_out(group, entry.name, error)
+            continue
+        yield entry.name, found
+
+
+def commands() -> Iterator[tuple[str, Callable]]:
+    """Name and function of every command that a package adds."""
+    for name, found in offered(COMMANDS):
+        if callable(found):
+            yield name, found
+        else:
+            warn_left_out(COMMANDS, name, f"it must be a function, got {found!r}")
 
 
 def renderer(kind: str) -> Renderer | None:
     """The function that draws results of a kind, e.g. "curves"; None if it or the drawing library is not installed."""
     for entry in entry_points(group=FIGURES, name=kind):
         try:
-            return entry.load()
-        except ModuleNotFoundError as error:
-            if (error.name or "").split(".")[0] not in ("matplotlib", "figures"):
-                raise
+            found = entry.load()
+        except FAILURES as error:
+            missing = getattr(error, "name", None) or ""
+            if not isinstance(error, ModuleNotFoundError) or missing.split(".")[0] not in ("matplotlib", "figures"):
+                warn_left_out(FIGURES, kind, error)
+            continue
+        if callable(found):
+            return found
+        warn_left_out(FIGURES, kind, f"it must be a function, got {found!r}")
     return None

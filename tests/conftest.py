@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import halfspace_sss
+from halfspace_sss.materials import registry
 from halfspace_sss.neural import material_model, paper_model, trained
 from halfspace_sss.neural.features import N_FEATURES
 from halfspace_sss.neural.network import layer_shapes
@@ -68,3 +69,27 @@ def queries():
         return [r, mu_i, phi_i, mu_o, phi_o]
 
     return make
+
+
+@pytest.fixture
+def fresh(monkeypatch, tmp_path):
+    """A registry of its own, with no files of the user and no entry points, as the one behind the public functions."""
+    monkeypatch.delenv(registry.ENVIRONMENT_VARIABLE, raising=False)
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
+    monkeypatch.setenv("APPDATA", str(tmp_path / "config"))
+    monkeypatch.setattr(registry, "entry_points", lambda group: [])
+    monkeypatch.setattr(registry, "_registry", registry.Registry())
+    return registry
+
+
+@pytest.fixture
+def written(tmp_path):
+    """`written(text, name)`: the path of a file with that text."""
+
+    def write(text: str, name: str = "mine.toml"):
+        path = tmp_path / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+        return path
+
+    return write

@@ -7,6 +7,7 @@ interrupted.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import typer
@@ -23,7 +24,7 @@ from halfspace_sss.cli.maps import maps_command
 from halfspace_sss.cli.render import render_command
 from halfspace_sss.cli.train import train_command
 from halfspace_sss.cli.validate import validate_command
-from halfspace_sss.extensions import commands
+from halfspace_sss.extensions import COMMANDS, FAILURES, commands, warn_left_out
 
 __all__ = ["app"]
 
@@ -80,14 +81,23 @@ def _options(version: bool = typer.Option(False, "--version", callback=_show_ver
     pass
 
 
+def _check_command(name: str, function: Callable) -> None:
+    """Raises, in whichever way typer does, if the function cannot be a command beside the others."""
+    if name in _OWN:
+        raise ValueError(f"name must be new, got {name!r}")
+    alone = typer.Typer()
+    alone.command(name)(function)
+    typer.main.get_command(alone)
+
+
 def _add_commands() -> None:
     for name, function in _OWN.items():
         app.command(name)(function)
     for name, function in commands():
-        if isinstance(function, str):
-            typer.echo(f"command {name} is missing: {function}", err=True)
-        elif name in _OWN:
-            typer.echo(f"command {name} of {function.__module__} is left out: the name is taken", err=True)
+        try:
+            _check_command(name, function)
+        except FAILURES as error:
+            warn_left_out(COMMANDS, name, error)
         else:
             app.command(name)(function)
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from halfspace_sss.extensions import renderer
+from halfspace_sss.extensions import FAILURES, FIGURES, renderer, warn_left_out
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.provenance import check_folder, provenance, write_atomically
 
@@ -190,7 +190,8 @@ class CurveSet:
     def save(self, folder: str | Path, name: str = "curves") -> list[Path]:
         """Write NAME.csv (every series), NAME_errors.csv, NAME.json (provenance) and the figure as NAME.pdf and .png.
 
-        Every file is whole or absent; files of those names are replaced. Without matplotlib there is no figure.
+        Every file is whole or absent; files of those names are replaced. Without matplotlib there is no figure, and if
+        it cannot be drawn a warning says why; the numbers are written before.
 
         Returns:
             The paths that were written.
@@ -203,15 +204,29 @@ class CurveSet:
             f"{name}.csv": self.to_dataframe().to_csv(index=False, lineterminator="\n"),
             f"{name}_errors.csv": self.errors().to_csv(index=False, lineterminator="\n"),
         }
-        render = renderer("curves")
-        figures = {} if render is None else render(self)
-        content |= {f"{name}.{ending}": data for ending, data in figures.items()}
-        about = {**provenance(**self.parameters()), "units": UNITS, "notes": list(self.notes)}
-        about |= {"seconds_tracing": self.seconds, "evaluations_per_s": dict(self.evaluations_per_s)}
-        content[f"{name}.json"] = json.dumps({**about, "files": sorted(content)}, indent=1) + "\n"
         for file, data in content.items():
             write_atomically(folder / file, data)
-        return [folder / file for file in content]
+        self._write_about(folder / f"{name}.json", sorted(content))  # once before the drawing, which may fail or hang
+        figures = {f"{name}.{ending}": data for ending, data in self._figures().items()}
+        for file, data in figures.items():
+            write_atomically(folder / file, data)
+        if figures:
+            self._write_about(folder / f"{name}.json", sorted(content | figures))
+        return [folder / file for file in (*content, *figures, f"{name}.json")]
+
+    def _figures(self) -> dict[str, bytes]:
+        """The figure by file ending; none, with a warning, if it cannot be drawn."""
+        render = renderer("curves")
+        try:
+            return {} if render is None else dict(render(self))
+        except FAILURES as error:
+            warn_left_out(FIGURES, "curves", error)
+            return {}
+
+    def _write_about(self, path: Path, files: list[str]) -> None:
+        about = {**provenance(**self.parameters()), "units": UNITS, "notes": list(self.notes)}
+        about |= {"seconds_tracing": self.seconds, "evaluations_per_s": dict(self.evaluations_per_s)}
+        write_atomically(path, json.dumps({**about, "files": files}, indent=1) + "\n")
 
 
 def range_edges(r_edges: np.ndarray) -> list[float]:

@@ -14,6 +14,7 @@ import numpy as np
 from halfspace_sss.arrays import broadcast_query
 from halfspace_sss.checks import check_choice, check_query
 from halfspace_sss.interface.radial import RadialSampler
+from halfspace_sss.model_lists import check_model_class, listed_models
 from halfspace_sss.once import once
 from halfspace_sss.physics.fresnel import F_t, mu_internal
 from halfspace_sss.physics.medium import Medium
@@ -251,9 +252,7 @@ _registered: dict[str, type[BSSRDF]] = {}
 @once
 def _installed() -> Mapping[str, type[BSSRDF]]:
     """Models of all installed packages: entry points of the group `halfspace_sss.models` are lists of classes."""
-    from importlib.metadata import entry_points
-
-    return {cls.name: cls for entry in entry_points(group="halfspace_sss.models") for cls in entry.load()}
+    return listed_models(BSSRDF)
 
 
 def register_model(cls: type[BSSRDF]) -> type[BSSRDF]:
@@ -263,10 +262,9 @@ def register_model(cls: type[BSSRDF]) -> type[BSSRDF]:
     runs again, takes its place.
 
     Raises:
-        ValueError: it is not a BSSRDF, or the name is taken by another class.
+        ValueError: it is not a BSSRDF with name and orders, or the name is taken by another class.
     """
-    if not (isinstance(cls, type) and issubclass(cls, BSSRDF)):
-        raise ValueError(f"a model must be a subclass of BSSRDF, got {cls!r}")
+    check_model_class(cls, BSSRDF)
     if cls.name in models() and not _defined_again(cls):
         raise ValueError(f"model name must be new, got {cls.name!r}, which is registered already")
     _registered[cls.name] = cls

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from halfspace_sss.checks import did_you_mean
+from halfspace_sss.extensions import FAILURES, warn_left_out
 from halfspace_sss.materials.material import Material, key_of
 
 if TYPE_CHECKING:
@@ -23,6 +24,7 @@ __all__ = ["ENTRY_POINT_GROUP", "ENVIRONMENT_VARIABLE", "Registry", "load", "nam
 ENVIRONMENT_VARIABLE = "HALFSPACE_SSS_MATERIALS"
 ENTRY_POINT_GROUP = "halfspace_sss.materials"
 IN_CODE = "register()"
+State = tuple[dict[str, Material], dict[str, str]]  # materials and where they come from, by key
 
 
 class Registry:
@@ -61,18 +63,29 @@ class Registry:
             raise ValueError(f"material_or_path must hold at least one *.toml file, got {str(material_or_path)!r}")
         with self._lock:
             self._all()
-            self._add(found)
+            self._materials, self._origins = self._with(found, (self._materials, self._origins))
         return tuple(material.name for _, material in found)
 
     def _all(self) -> dict[str, Material]:
         with self._lock:
             if not self._complete:
-                self._add(list(_installed()))
+                self._materials, self._origins = self._read()
                 self._complete = True
             return self._materials
 
-    def _add(self, found: Iterable[tuple[str, Material]]) -> None:
-        materials, origins, added = dict(self._materials), dict(self._origins), set()
+    def _read(self) -> State:
+        """All materials that are installed; those of a package that fails are left out with a warning."""
+        state = self._with(list(_own()), ({}, {}))
+        for entry in entry_points(group=ENTRY_POINT_GROUP):
+            try:
+                state = self._with(list(_from_entry_point(entry)), state)
+            except FAILURES as error:
+                warn_left_out(ENTRY_POINT_GROUP, entry.name, error)
+        return self._with(list(_of_user()), state)
+
+    def _with(self, found: Iterable[tuple[str, Material]], state: State) -> State:
+        """The materials and origins of `state` and those found; ValueError if a name is taken."""
+        (materials, origins), added = map(dict, state), set()
         for origin, material in found:
             key = key_of(material.name)
             if key in materials and (key in added or not self._comes_again(key, origin, material)):
@@ -80,14 +93,16 @@ class Registry:
                 raise ValueError(f"{origin}: key name must be new, got {material.name!r}, which is {taken}")
             materials[key], origins[key] = material, origin
             added.add(key)
-        self._materials, self._origins = materials, origins
+        return materials, origins
 
     def _comes_again(self, key: str, origin: str, material: Material) -> bool:
-        """Whether a material may take the place of that of the same name: it is equal, or of the same file."""
+        """Whether a material may take the place of a registered one of that name: it is equal, or of the same file."""
+        if not self._complete:
+            return False
         return material == self._materials[key] or (origin == self._origins[key] != IN_CODE)
 
 
-def _installed() -> Iterator[tuple[str, Material]]:
+def _own() -> Iterator[tuple[str, Material]]:
     from halfspace_sss.materials.files import parse
 
     data = resources.files("halfspace_sss.materials").joinpath("data")
@@ -96,8 +111,9 @@ def _installed() -> Iterator[tuple[str, Material]]:
             origin = f"halfspace_sss/materials/data/{file.name}"
             for material in parse(file.read_text(encoding="utf-8"), origin):
                 yield origin, material
-    for entry in entry_points(group=ENTRY_POINT_GROUP):
-        yield from _from_entry_point(entry)
+
+
+def _of_user() -> Iterator[tuple[str, Material]]:
     folder = _user_folder()
     if folder.is_dir():
         yield from _from_path(folder)
@@ -123,19 +139,15 @@ def _from_path(path: str | os.PathLike) -> Iterator[tuple[str, Material]]:
 
 
 def _from_entry_point(entry: Any) -> Iterator[tuple[str, Material]]:
-    origin = f"entry point {entry.name!r} of group {ENTRY_POINT_GROUP}"
-    try:
-        offered = entry.load()
-    except Exception as error:  # a package of somebody else may fail in any way; its name must be in the message
-        raise ValueError(f"{origin}: must be importable, got {type(error).__name__}: {error}") from error
+    origin, offered = f"entry point {entry.name!r} of group {ENTRY_POINT_GROUP}", entry.load()
     if isinstance(offered, (str, os.PathLike)):
         yield from _from_path(offered)
         return
     if not isinstance(offered, Iterable):
-        raise ValueError(f"{origin}: must be a path or an iterable of Material, got {offered!r}")
+        raise ValueError(f"it must be a path or an iterable of Material, got {offered!r}")
     for material in offered:
         if not isinstance(material, Material):
-            raise ValueError(f"{origin}: must be a path or an iterable of Material, got an item {material!r}")
+            raise ValueError(f"it must be a path or an iterable of Material, got an item {material!r}")
         yield origin, material
 
 
@@ -143,10 +155,10 @@ _registry = Registry()
 
 
 def names() -> list[str]:
-    """Names of all materials, sorted.
+    """Names of all materials, sorted; what an installed package offers and is refused is left out with a warning.
 
     Raises:
-        ValueError: a material file of the user or of a package is refused.
+        ValueError: a material file of the user is refused.
     """
     return _registry.names()
 

@@ -12,11 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import typer
 from typer.testing import CliRunner
 
 import halfspace_sss
-from halfspace_sss import extensions
 from halfspace_sss.backend import BackendError
 from halfspace_sss.cli import app as cli
 
@@ -244,45 +242,3 @@ def test_help_shows_what_is_taken_by_default() -> None:
     text = " ".join(_invoke("curves", "--help").stdout.split())
     for default in ("0.241", "first", "from the medium", "all"):
         assert f"[default: ({default})]" in text
-
-
-class _Entry:
-    """An entry point of another package."""
-
-    def __init__(self, name: str, value: Any) -> None:
-        self.name, self.value, self._loaded = name, "other.package:thing", value
-
-    def load(self) -> Any:
-        if isinstance(self._loaded, Exception):
-            raise self._loaded
-        return self._loaded
-
-
-def test_packages_add_commands_by_entry_points(monkeypatch: Any) -> None:
-    def greet() -> None:
-        """Say hello."""
-        typer.echo("hello")
-
-    monkeypatch.setattr(extensions, "entry_points", lambda **_: [_Entry("greet", greet)])
-    assert dict(extensions.commands()) == {"greet": greet}
-
-
-def test_a_command_that_cannot_be_loaded_does_not_stop_the_others(monkeypatch: Any) -> None:
-    broken, sound = _Entry("broken", ImportError("no such thing")), _Entry("sound", print)
-    monkeypatch.setattr(extensions, "entry_points", lambda **_: [broken, sound])
-    found = dict(extensions.commands())
-    assert found["sound"] is print
-    assert found["broken"] == "other.package:thing cannot be loaded: ImportError: no such thing"
-
-
-def test_a_missing_drawing_library_means_no_figure(monkeypatch: Any) -> None:
-    missing = _Entry("curves", ModuleNotFoundError("No module named 'matplotlib'", name="matplotlib.axes"))
-    monkeypatch.setattr(extensions, "entry_points", lambda **_: [missing])
-    assert extensions.renderer("curves") is None
-
-
-def test_another_missing_module_in_a_drawing_is_not_hidden(monkeypatch: Any) -> None:
-    broken = _Entry("curves", ModuleNotFoundError("No module named 'tpyo'", name="tpyo"))
-    monkeypatch.setattr(extensions, "entry_points", lambda **_: [broken])
-    with pytest.raises(ModuleNotFoundError):
-        extensions.renderer("curves")

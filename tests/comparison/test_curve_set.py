@@ -109,14 +109,27 @@ def test_a_folder_that_is_a_file_is_refused(small: CurveSet, tmp_path: Any) -> N
     assert (tmp_path / "file").read_text() == "x"
 
 
-def test_a_failure_while_drawing_leaves_no_file(small: CurveSet, tmp_path: Any, monkeypatch: Any) -> None:
+DATA = ["curves.csv", "curves.json", "curves_errors.csv"]
+
+
+@pytest.mark.parametrize("error", [RuntimeError("no\nink"), SystemExit(3), KeyboardInterrupt()])
+def test_a_failure_while_drawing_loses_no_result(
+    small: CurveSet, tmp_path: Any, monkeypatch: Any, error: BaseException
+) -> None:
     def fail(_: CurveSet) -> dict[str, bytes]:
-        raise RuntimeError("no ink")
+        assert sorted(path.name for path in (tmp_path / "new").iterdir()) == DATA
+        raise error
 
     monkeypatch.setattr("halfspace_sss.comparison.curve_set.renderer", lambda kind: fail)
-    with pytest.raises(RuntimeError, match="no ink"):
-        small.save(tmp_path / "new")
-    assert not (tmp_path / "new").exists()
+    if isinstance(error, KeyboardInterrupt):
+        with pytest.raises(KeyboardInterrupt):
+            small.save(tmp_path / "new")
+    else:
+        with pytest.warns(
+            UserWarning, match="^entry point 'curves' is left out: (RuntimeError: no ink|SystemExit: 3)$"
+        ):
+            assert sorted(path.name for path in small.save(tmp_path / "new")) == DATA
+    assert json.loads((tmp_path / "new" / "curves.json").read_text())["files"] == ["curves.csv", "curves_errors.csv"]
 
 
 def test_curves_without_light_can_be_drawn_and_saved(tmp_path: Any) -> None:

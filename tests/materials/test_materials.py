@@ -10,63 +10,11 @@ import sys
 
 import numpy as np
 import pytest
+from registered import FILE
 
 import halfspace_sss
 from halfspace_sss import Medium
 from halfspace_sss.materials import Material, load, names, registry, table
-
-FILE = """
-set = "mine"
-unit = "1/cm"
-eta = 1.4
-source = "own measurement"
-channels = ["R", "G", "B"]
-
-[[material]]
-name = "soap"
-sigma_s_prime = [13.0, 14.0, 16.0]
-sigma_a = [0.1, 0.2, 0.4]
-
-[[material]]
-name = "wax"
-sigma_s = 10.0
-sigma_a = [0.1, 0.2, 0.4]
-g = [0.5, 0.0, -0.5]
-"""
-
-
-@pytest.fixture
-def fresh(monkeypatch, tmp_path):
-    """A registry of its own, with no files of the user and no entry points, as the one behind the public functions."""
-    monkeypatch.delenv(registry.ENVIRONMENT_VARIABLE, raising=False)
-    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
-    monkeypatch.setenv("APPDATA", str(tmp_path / "config"))
-    monkeypatch.setattr(registry, "entry_points", lambda group: [])
-    monkeypatch.setattr(registry, "_registry", registry.Registry())
-    return registry
-
-
-@pytest.fixture
-def written(tmp_path):
-    """`written(text, name)`: the path of a file with that text."""
-
-    def write(text: str, name: str = "mine.toml"):
-        path = tmp_path / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text, encoding="utf-8")
-        return path
-
-    return write
-
-
-class EntryPoint:
-    def __init__(self, offered):
-        self.name, self.offered = "plugin", offered
-
-    def load(self):
-        if isinstance(self.offered, Exception):
-            raise self.offered
-        return self.offered
 
 
 def test_there_are_two_published_sets_and_the_medium_of_fig_10(fresh):
@@ -219,34 +167,6 @@ def test_a_file_that_is_not_text_is_refused(fresh, tmp_path):
         fresh.register(tmp_path / "damaged.toml")
 
 
-def test_another_material_of_the_same_name_is_refused(fresh):
-    mine = Material("My Stone", Medium(1.0, 0.1), source="a note")
-    assert fresh.register(mine) == ("My Stone",) and load("my-stone") is mine
-    with pytest.raises(ValueError, match=re.escape("register(): key name must be new, got 'My Stone'")):
-        fresh.register(Material("My Stone", Medium(1.0, 0.2), source="a note"))
-    assert load("my-stone") is mine
-
-
-def test_an_equal_material_can_be_registered_again(fresh):
-    for _ in range(2):
-        assert fresh.register(Material("My Stone", Medium(1.0, 0.1), source="a note")) == ("My Stone",)
-    assert len(names()) == 49
-
-
-def test_a_file_that_was_changed_and_registered_again_replaces_what_it_gave(fresh, written):
-    fresh.register(written(FILE))
-    fresh.register(written(FILE.replace("eta = 1.4", "eta = 1.45")))
-    assert load("soap").medium.eta == 1.45 and len(names()) == 50
-
-
-def test_another_file_cannot_replace_a_material(fresh, written):
-    fresh.register(written(FILE))
-    with pytest.raises(
-        ValueError, match="other.toml: key name must be new, got 'soap', which is 'soap' of .*mine.toml"
-    ):
-        fresh.register(written(FILE.replace("eta = 1.4", "eta = 1.45"), "other.toml"))
-
-
 def test_only_a_material_or_a_path_can_be_registered(fresh):
     with pytest.raises(ValueError, match="material_or_path must be a Material or a path, got 3"):
         fresh.register(3)
@@ -263,19 +183,6 @@ def test_folders_of_the_environment_variable_and_of_the_user_are_read(fresh, wri
 def test_a_missing_folder_of_the_environment_variable_is_refused(fresh, monkeypatch):
     monkeypatch.setenv(registry.ENVIRONMENT_VARIABLE, "/no/such/folder")
     with pytest.raises(ValueError, match="HALFSPACE_SSS_MATERIALS must list existing .* got '/no/such/folder'"):
-        names()
-
-
-def test_packages_offer_paths_or_materials(fresh, written, monkeypatch):
-    offers = [EntryPoint(written(FILE)), EntryPoint([Material("gum", Medium(1.0, 0.1))])]
-    monkeypatch.setattr(registry, "entry_points", lambda group: offers if group == "halfspace_sss.materials" else [])
-    assert {"soap", "wax", "gum"} <= set(names())
-
-
-@pytest.mark.parametrize("offered", [3, [3], ImportError("broken")], ids=["number", "list", "broken"])
-def test_a_wrong_entry_point_is_refused_by_name(fresh, monkeypatch, offered):
-    monkeypatch.setattr(registry, "entry_points", lambda group: [EntryPoint(offered)])
-    with pytest.raises(ValueError, match="entry point 'plugin' of group halfspace_sss.materials: must be"):
         names()
 
 

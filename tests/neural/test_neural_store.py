@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from safetensors.numpy import save
 
-from halfspace_sss import Medium, bssrdf
-from halfspace_sss.neural import material_model, paper_model, trained
+from halfspace_sss import Medium
+from halfspace_sss.neural import paper_model
 from halfspace_sss.neural.features import N_FEATURES, N_MEDIUM
 from halfspace_sss.neural.material_model import load_network
 from halfspace_sss.neural.network import layer_shapes
@@ -246,37 +246,6 @@ def test_layers_that_do_not_fit_the_architecture_are_refused(saved: Path, change
     _replaced(saved, _layers(N_FEATURES), change)
     with pytest.raises(ValueError, match=f"{saved}: layers must be"):
         load_network(saved, KIND, MEDIUM, N_FEATURES)
-
-
-@pytest.mark.parametrize(("key", "value"), [("albedo", 0.4), ("g", 0.1), ("eta", 1.3000001)])
-def test_weights_renamed_to_another_medium_are_refused(saved: Path, key: str, value: float) -> None:
-    ratios = {**RECORD["medium"], key: value}
-    other = Medium.from_albedo(ratios["albedo"], 2.0, ratios["g"], ratios["eta"])
-    load_network(saved, KIND, MEDIUM, N_FEATURES)
-    with pytest.raises(ValueError) as error:
-        load_network(saved, KIND, other, N_FEATURES)
-    wrong = f"{saved.with_suffix('.json')}: {key} of medium must be {value:.8g} for this medium"
-    assert f"{wrong}, got {RECORD['medium'][key]!r}" in str(error.value)
-
-
-@pytest.mark.parametrize("medium", [None, {}, "marble", {"albedo": "0.5", "g": 0, "eta": 1.3}], ids=str)
-def test_weights_that_name_no_medium_are_refused(saved: Path, medium: Any) -> None:
-    _rewrite(saved, medium=medium)
-    with pytest.raises(ValueError, match="json: medium must have albedo, g, eta as numbers, got"):
-        load_network(saved, KIND, MEDIUM, N_FEATURES)
-
-
-@pytest.mark.parametrize("model", [material_model, paper_model])
-def test_a_model_refuses_weights_renamed_to_its_medium(tmp_path: Path, monkeypatch: Any, model: Any) -> None:
-    monkeypatch.setenv(trained.ENVIRONMENT_VARIABLE, str(tmp_path))
-    monkeypatch.setattr(model, "find_weights", trained.find_weights)
-    n_in = {material_model.KIND: N_FEATURES, paper_model.KIND: paper_model.N_INPUTS}[model.KIND]
-    other = Medium.from_albedo(0.625, 1.0, 0.0, 1.3)
-    save_weights(
-        tmp_path / trained.weights_name(model.KIND, other), model.KIND, _layers(n_in), {**RECORD, "scale": 1.0}
-    )
-    with pytest.raises(ValueError, match="albedo of medium must be 0.625 for this medium, got 0.5"):
-        bssrdf(model.KIND, other)
 
 
 def _replaced(path: Path, arrays: dict[str, np.ndarray], change: dict) -> None:
