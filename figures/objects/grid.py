@@ -1,0 +1,115 @@
+"""Media that vary inside an object: extinction and albedo on a grid, from shares of tissues, and as files of Mitsuba."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from figures.objects.mesh import Box, in_chunks
+from halfspace_sss.materials.files import parse
+from halfspace_sss.materials.material import Material
+from halfspace_sss.provenance import write_atomically
+
+__all__ = ["Grid", "mixed", "tissue"]
+
+Tissues = Callable[[np.ndarray], Mapping[str, np.ndarray]]
+
+
+@functools.cache
+def _tissues() -> dict[str, Material]:
+    file = resources.files("figures.objects") / "tissues.toml"
+    return {material.name: material for material in parse(file.read_text(encoding="utf-8"), "tissues.toml")}
+
+
+def tissue(name: str) -> Material:
+    """What an object is made of, with its source; ValueError if there is none of that name."""
+    if name not in _tissues():
+        raise ValueError(f"tissue must be one of {', '.join(_tissues())}, got {name!r}")
+    return _tissues()[name]
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """A medium on the cells of a box; g = 0.
+
+    Args:
+        sigma_t: (nz, ny, nx), 1/mm, > 0: extinction, the same in all channels.
+        albedo: (nz, ny, nx, 3), in [0, 1].
+        box: that the cells fill, mm; values belong to their middles.
+
+    Raises:
+        ValueError: the shapes do not match or a value is out of range.
+    """
+
+    sigma_t: np.ndarray
+    albedo: np.ndarray
+    box: Box
+
+    def __post_init__(self) -> None:
+        if self.sigma_t.ndim != 3 or self.albedo.shape != (*self.sigma_t.shape, 3):
+            got = f"{self.sigma_t.shape} and {self.albedo.shape}"
+            raise ValueError(f"sigma_t and albedo must have the shapes (nz, ny, nx) and (nz, ny, nx, 3), got {got}")
+        if not (np.isfinite(self.sigma_t).all() and self.sigma_t.min() > 0):
+            raise ValueError(f"sigma_t must be finite and > 0, got {self.sigma_t.min()}")
+        if not (self.albedo.min() >= 0 and self.albedo.max() <= 1):
+            raise ValueError(f"albedo must be in [0, 1], got {self.albedo.min()} to {self.albedo.max()}")
+
+    def volumes(self) -> dict[str, Any]:
+        """Grid volumes of Mitsuba, by name: "sigma_t" with one channel, "albedo" with three."""
+        import mitsuba as mi
+
+        arrays = {"sigma_t": self.sigma_t[..., None], "albedo": self.albedo}
+        return {name: mi.VolumeGrid(np.ascontiguousarray(v, dtype=np.float32)) for name, v in arrays.items()}
+
+    def write(self, folder: Path, name: str) -> dict[str, Any]:
+        """Write FOLDER/NAME_sigma_t.vol and ..._albedo.vol, and return the `heterogeneous` medium that reads them."""
+        import mitsuba as mi
+
+        low, high = np.array(self.box.low), np.array(self.box.high)
+        to_world = mi.ScalarTransform4f().translate(low.tolist()).scale((high - low).tolist())
+        medium: dict[str, Any] = {"type": "heterogeneous"}
+        for key, volume in self.volumes().items():
+            path, stream = Path(folder) / f"{name}_{key}.vol", mi.MemoryStream()
+            volume.write(stream)
+            write_atomically(path, bytes(stream.raw_buffer()))
+            medium[key] = {"type": "gridvolume", "filename": str(path), "to_world": to_world}
+        return medium
+
+
+def mixed(tissues: Tissues, box: Box, resolution: int) -> Grid:
+    """The medium of shares f_k of tissues: sigma_t = sum f_k sigma_t,k; albedo = sum f_k sigma_t,k albedo_k / sigma_t.
+
+    Args:
+        tissues: of points (n, 3), mm: share of each tissue by name, >= 0, summing to 1.
+        box: that is covered; the grid's box is larger by less than a cell.
+        resolution: cells along the longest side, >= 8.
+
+    Raises:
+        ValueError: the resolution is too small, there is no such tissue, or shares are out of range.
+    """
+    cell = box.cell(resolution)
+    counts = box.counts(cell)
+    high = tuple(float(low + cell * n) for low, n in zip(box.low, counts))
+    x, y, z = (low + cell * (np.arange(n) + 0.5) for low, n in zip(box.low, counts))
+    points = np.stack(np.broadcast_arrays(x[None, None], y[None, :, None], z[:, None, None]), axis=-1).reshape(-1, 3)
+    found = in_chunks(lambda p: _coefficients(tissues(p)), points).astype(np.float32)
+    sigma_t, sigma_s = found[:, 0], found[:, 1:]
+    shape = tuple(counts[::-1])
+    albedo = np.minimum(sigma_s / sigma_t[:, None], 1)
+    return Grid(sigma_t.reshape(shape), albedo.reshape(*shape, 3), Box(box.low, high))
+
+
+def _coefficients(shares: Mapping[str, np.ndarray]) -> np.ndarray:
+    """sigma_t and sigma_s of each channel, (n, 4)."""
+    total = sum(shares.values())
+    if min(v.min() for v in shares.values()) < -1e-6 or np.abs(total - 1).max() > 1e-6:
+        raise ValueError(f"shares of tissues must be >= 0 and sum to 1, got sums up to {float(total.max())!r}")
+    media = {name: tissue(name).medium for name in shares}
+    columns = [[m.sigma_t[0], *m.sigma_s] for m in media.values()]
+    return np.stack(list(shares.values()), axis=1) @ np.array(columns)
