@@ -1,0 +1,202 @@
+"""How wrong a model of one object is: radiance of random exits against walks, with the noise of both taken out.
+
+Exits are uniform over the area with w_o by the cosine. Light is 1 from everywhere, or one of four lobes
+max(0, w . l)^16; nothing blocks it. With the estimates a of the model and b of the walks and their variances,
+
+    error² = mean_k[(a_k - b_k)² - var a_k - var b_k] / (mean_k b_k)²,
+
+for lobes the mean of the four; its standard error by the jackknife over exits.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from full_geometry.exits import trace_exits
+from full_geometry.pairs import Proposals
+from full_geometry.subject import Subject, SurfacePoint
+from halfspace_sss.checks import check_count
+from halfspace_sss.tracing.walk import _generator, pass_seed
+
+__all__ = ["LIGHTS", "ModelError", "Reference", "Transport", "compare", "errors", "reference"]
+
+LIGHTS = ("constant", "lobes")
+LOBES = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / np.sqrt(3.0)
+POWER = 16
+LANES = 2**20  # of one pass
+
+
+class Transport(Protocol):
+    """A model of what light that enters an object is worth where it leaves."""
+
+    def prepare(self, at: SurfacePoint, active: Any = True) -> Any: ...
+
+    def S(self, exit: Any, at: SurfacePoint, active: Any = True) -> Any: ...
+
+
+class ModelError(NamedTuple):
+    """Relative RMSE of one channel under one kind of light, its standard error, and the ratio of the means."""
+
+    channel: int
+    light: str
+    error: float
+    standard_error: float
+    ratio: float
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """Radiance of exits under all lights and its variance, (channels, exits, lights)."""
+
+    mean: np.ndarray
+    variance: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """Exits and what walks say of them."""
+
+    exits: SurfacePoint
+    truth: Estimate
+
+
+class _Sums:
+    """Sums of value and square over the samples of each exit."""
+
+    def __init__(self, n_exits: int) -> None:
+        self.n_exits, self.n, self.sums = n_exits, 0, 0.0
+
+    def add(self, value: Any, w: Any, per_exit: int) -> None:
+        """Samples of all exits, `per_exit` neighbouring lanes for each: value per channel of unit light from w."""
+        import drjit as dr
+        import mitsuba as mi
+
+        lights = [mi.Float(1)] + [dr.maximum(dr.dot(w, mi.Vector3f(*axis.tolist())), 0) ** POWER for axis in LOBES]
+        rows = []
+        for v in value:
+            products = [v * light for light in lights]
+            parts = [dr.block_sum(p + 0 * v, per_exit) for p in (*products, *(p * p for p in products))]
+            dr.eval(parts)
+            rows.append(np.stack([p.numpy() for p in parts], axis=-1).astype(float))
+        self.sums = self.sums + np.stack(rows)
+        self.n += per_exit
+
+    def estimate(self) -> Estimate:
+        first, second = np.split(self.sums / self.n, 2, axis=-1)
+        return Estimate(first, (second - first**2) / (self.n - 1))
+
+
+def _passes(n_exits: int, per_exit: int) -> list[int]:
+    """Samples of each exit in each pass."""
+    most = max(LANES // n_exits, 1)
+    return [min(most, per_exit - done) for done in range(0, per_exit, most)]
+
+
+def reference(subject: Subject, exits: int = 256, walks: int = 8192, seed: int = 0, fewest: int = 2) -> Reference:
+    """Exits and their radiance by walks.
+
+    Args:
+        exits: number of exits.
+        walks: of each.
+        seed: of the exits and the walks.
+        fewest: scattering events that count.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    for name, value, least in (("exits", exits, 2), ("walks", walks, 2), ("seed", seed, 0)):
+        check_count(name, value, least)
+    points = subject.random_points(_generator(mi, exits, pass_seed(seed, 17)))
+    dr.eval(points)
+    sums = _Sums(exits)
+    for k, per_exit in enumerate(_passes(exits, walks)):
+        starts = _repeated(points, per_exit)
+        found = trace_exits(subject, starts, (seed, 18, k), fewest=fewest)
+        sums.add(found.T, found.at.w, per_exit)
+    return Reference(points, sums.estimate())
+
+
+def _repeated(points: SurfacePoint, times: int) -> SurfacePoint:
+    import drjit as dr
+    import mitsuba as mi
+
+    return points.gather(dr.arange(mi.UInt32, dr.width(points.p) * times) // times)
+
+
+def modelled(transport: Transport, proposals: Proposals, exits: SurfacePoint, samples: int, seed: int = 0) -> Estimate:
+    """Radiance of exits by a model.
+
+    Args:
+        transport: the model.
+        proposals: where its entries are drawn.
+        exits: from a reference.
+        samples: entries of each exit.
+        seed: of the entries.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    n = dr.width(exits.p)
+    sums = _Sums(n)
+    for k, per_exit in enumerate(_passes(n, samples)):
+        points = _repeated(exits, per_exit)
+        rng = _generator(mi, n * per_exit, pass_seed(seed, 19, k))
+        entries, weight = proposals.sample(points, rng)
+        value = transport.S(transport.prepare(points), entries, weight > 0) * weight
+        dr.eval(value, entries)
+        sums.add(value, entries.w, per_exit)
+    return sums.estimate()
+
+
+def compare(model: Estimate, truth: Estimate) -> list[ModelError]:
+    """The errors of all channels under both kinds of light."""
+    found = []
+    for c in range(len(truth.mean)):
+        for light, columns in zip(LIGHTS, (slice(0, 1), slice(1, None))):
+            a, b = model.mean[c][:, columns], truth.mean[c][:, columns]
+            square = (a - b) ** 2 - model.variance[c][:, columns] - truth.variance[c][:, columns]
+            found.append(ModelError(c, light, *_jackknife(square, b), float(a.mean() / max(b.mean(), 1e-300))))
+    return found
+
+
+def _jackknife(square: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
+    """Error and standard error from the squared errors (exits, lights) and the truth."""
+    n = len(square)
+
+    def ratio(sums: np.ndarray, means: np.ndarray) -> np.ndarray:
+        return np.mean(sums / np.maximum(means, 1e-300) ** 2, axis=-1)
+
+    whole = float(ratio(square.mean(0), truth.mean(0)))
+    parts = ratio((square.sum(0) - square) / (n - 1), (truth.sum(0) - truth) / (n - 1))
+    spread = float(np.sqrt((n - 1) * np.mean((parts - parts.mean()) ** 2)))
+    error = float(np.sqrt(max(whole, 0.0)))
+    return error, spread / (2 * max(error, np.sqrt(spread), 1e-12))
+
+
+def errors(
+    subject: Subject,
+    transport: Transport,
+    proposals: Proposals,
+    *,
+    truth: Reference | None = None,
+    samples: int = 8192,
+    seed: int = 0,
+) -> list[ModelError]:
+    """The error of a model of an object, per channel, under constant light and lobes.
+
+    Args:
+        subject: the object.
+        transport: `FullGeometry` or `HalfSpaceTransport`.
+        proposals: where entries are drawn.
+        truth: from `reference`; made anew by default.
+        samples: entries of each exit.
+        seed: of everything.
+
+    Source: this project; the exits, lights and the removal of noise are those of the recorded prototypes.
+    """
+    check_count("samples", samples, 2)
+    truth = truth or reference(subject, seed=seed)
+    return compare(modelled(transport, proposals, truth.exits, samples, seed), truth.truth)

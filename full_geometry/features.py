@@ -1,0 +1,100 @@
+"""What the network of one object is told about an exit, an entry and the pair of them.
+
+One definition in Dr.Jit, for training data and for rendering. Lengths and positions are over half the diagonal of the
+object, in its own frame; logarithms of lengths are in mean free paths of the mean over channels.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from full_geometry.first_event import FirstEvent
+from full_geometry.subject import SurfacePoint
+
+__all__ = ["N_PAIR", "Frame", "Side", "n_side", "pair_features", "side_features"]
+
+OCTAVES = 2
+N_PAIR = 15
+LEAST_P, LEAST_LENGTH = 1e-3, 1e-2
+
+
+class Side(NamedTuple):
+    """Exit or entry: its point and its first event."""
+
+    at: SurfacePoint
+    event: FirstEvent
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """The object's own frame and scales.
+
+    Args:
+        centre: of the object, scene units.
+        radius: half the diagonal of its bounding box, scene units.
+        sigma_t: 1/(scene unit), geometric mean over channels.
+        turn: 3 x 3 rows that turn world directions into the frame; None where it is the identity.
+    """
+
+    centre: Any
+    radius: Any
+    sigma_t: Any
+    turn: Any = None
+
+    def position(self, p: Any) -> Any:
+        """In the frame, of order one."""
+        return self.direction(p - self.centre) / self.radius
+
+    def direction(self, w: Any) -> Any:
+        """In the frame."""
+        import drjit as dr
+        import mitsuba as mi
+
+        return mi.Vector3f(w) if self.turn is None else mi.Vector3f(*(dr.dot(row, w) for row in self.turn))
+
+
+def n_side(channels: int) -> int:
+    """Number of features of a side."""
+    return 2 * 3 * (1 + 2 * OCTAVES) + 3 + 3 + 2 + channels
+
+
+def _octaves(x: Any) -> list[Any]:
+    import drjit as dr
+
+    found = list(x)
+    for k in range(OCTAVES):
+        for component in x:
+            found += dr.sincos(math.pi * 2**k * component)
+    return found
+
+
+def side_features(frame: Frame, side: Side) -> list[Any]:
+    """Position and y with two octaves of sine and cosine, normal, w, mu, log of the way to y, log P."""
+    import drjit as dr
+
+    at, event = side
+    n, w = frame.direction(at.n_out), frame.direction(at.w)
+    way = dr.log(event.length * frame.sigma_t + LEAST_LENGTH)
+    return [
+        *_octaves(frame.position(at.p)), *_octaves(frame.position(event.y)), *n, *w, dr.dot(n, w), 0.5 * way,
+        *(0.5 * dr.log(P + LEAST_P) for P in event.P),
+    ]  # fmt: skip
+
+
+def pair_features(frame: Frame, exit: Side, entry: Side) -> list[Any]:
+    """x_i - x_o as direction and length, log r, log |y_i - y_o|, dot products of directions and normals."""
+    import drjit as dr
+
+    o, i = exit.at, entry.at
+    d = i.p - o.p
+    r = dr.norm(d)
+    d = d / dr.maximum(r, 1e-6 * frame.radius)
+    gap = dr.norm(exit.event.y - entry.event.y)
+    return [
+        *frame.direction(d), r / frame.radius, 0.5 * dr.log(r * frame.sigma_t + LEAST_LENGTH),
+        0.5 * dr.log(gap * frame.sigma_t + LEAST_LENGTH), gap / frame.radius,
+        dr.dot(o.n_out, i.n_out), dr.dot(o.w, i.w), dr.dot(o.n_out, d), dr.dot(i.n_out, d), dr.dot(o.w, d),
+        dr.dot(i.w, d), dr.dot(o.n_out, i.w), dr.dot(i.n_out, o.w),
+    ]  # fmt: skip

@@ -1,0 +1,103 @@
+"""Fitting the correction of one object: Adam by a cosine, a running average of the numbers, checkpoints."""
+
+from __future__ import annotations
+
+import copy
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from full_geometry.learner import Correction, likelihood
+from full_geometry.pairs import Pairs
+from halfspace_sss.checks import check_count, check_interval
+
+__all__ = ["Fitting", "Recipe"]
+
+BETAS, CLIP, LAST_RATE, WARM_UP = (0.9, 0.99), 1.0, 0.01, 100
+AVERAGE = 0.998  # of the numbers, each step
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How an object is learnt.
+
+    Args:
+        width, depth: hidden layers of the network.
+        batch: walks, and proposals, of a step.
+        rate: largest learning rate.
+        chunk: walks, and proposals, that are made at once.
+        reuse: times that each is used.
+        backbone: name of the half-space model that is corrected.
+    """
+
+    width: int = 64
+    depth: int = 3
+    batch: int = 4096
+    rate: float = 6e-3
+    chunk: int = 2**17
+    reuse: int = 2
+    backbone: str = "better_dipole"
+
+    def __post_init__(self) -> None:
+        for name in ("width", "depth", "batch", "chunk", "reuse"):
+            check_count(name, getattr(self, name), 1)
+        check_interval("rate", self.rate, 1e-8, 1.0)
+
+
+class Fitting:
+    """The state of a fit, which follows from recipe, seed, number of steps and data.
+
+    Args:
+        n_in: features of a pair.
+        channels: of the medium.
+        recipe: sizes and rates.
+        seed: of the numbers at the start and of the order of the data.
+    """
+
+    def __init__(self, n_in: int, channels: int, recipe: Recipe, seed: int) -> None:
+        self.recipe = recipe
+        self.module = Correction(n_in, channels, recipe.width, recipe.depth, seed)
+        self.average = copy.deepcopy(self.module)
+        self.parameters = list(self.module.parameters())
+        self.adam = torch.optim.Adam(self.parameters, lr=recipe.rate, betas=BETAS, foreach=True)
+        self.step, self.scale = 0, torch.ones(channels, 1)
+
+    def set_scale(self, walks: Pairs) -> None:
+        """Divide each channel by its mean throughput, so that all count alike."""
+        mean = torch.from_numpy(walks.values.sum(axis=1) / walks.drawn)
+        self.scale = torch.where(mean > 0, 1 / mean.clamp_min(1e-30), torch.zeros_like(mean))[:, None].float()
+
+    def use(self, walks: Pairs, proposals: Pairs, steps: int, order: np.random.Generator) -> None:
+        """Steps on all batches of a chunk, `reuse` times over.
+
+        Args:
+            walks, proposals: the chunk.
+            steps: of the whole fit, for the decay of the rate.
+            order: of the batches; walks meet other proposals each time.
+        """
+        batch = self.recipe.batch
+        x, T = (torch.from_numpy(v) for v in (walks.features, walks.values))
+        y, W = (torch.from_numpy(v) for v in (proposals.features, proposals.values))
+        n_x, n_y = max(T.shape[1] // batch, 1), max(W.shape[1] // batch, 1)
+        kept = T.shape[1] / walks.drawn
+        for _ in range(self.recipe.reuse):
+            for i, j in zip(order.permutation(n_x), order.integers(0, n_y, n_x)):
+                a, b = slice(i * batch, (i + 1) * batch), slice(j * batch, (j + 1) * batch)
+                self._advance(torch.cat((x[:, a], y[:, b]), dim=1), T[:, a], W[:, b], kept, steps)
+
+    def _advance(self, x: torch.Tensor, T: torch.Tensor, W: torch.Tensor, kept: float, steps: int) -> None:
+        at = min(self.step / max(steps, 1), 1.0)
+        decay = LAST_RATE + (1 - LAST_RATE) * 0.5 * (1 + math.cos(math.pi * at))
+        for group in self.adam.param_groups:
+            group["lr"] = self.recipe.rate * min(1.0, (self.step + 1) / WARM_UP) * decay
+        loss = likelihood(self.module(x), T * self.scale, W * self.scale, kept)
+        self.adam.zero_grad(set_to_none=True)
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(self.parameters, CLIP)
+        self.adam.step()
+        self.step += 1
+        with torch.no_grad():
+            share = 1 - min(AVERAGE, (1 + self.step) / (10 + self.step))
+            torch._foreach_lerp_(list(self.average.parameters()), self.parameters, share)

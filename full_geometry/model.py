@@ -1,0 +1,101 @@
+"""S of one object: the half-space times what a small network has learnt, evaluated in Dr.Jit."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from full_geometry.features import Frame, Side, n_side, pair_features, side_features
+from full_geometry.first_event import first_event
+from full_geometry.half_space import HalfSpace
+from full_geometry.subject import Subject, SurfacePoint
+
+__all__ = ["BOUND", "FullGeometry", "PreparedExit"]
+
+BOUND = 6.0  # of f: where walks leave but no proposal comes, nothing else would hold it
+
+
+class PreparedExit(NamedTuple):
+    """What is done once for all entries of an exit: its first event, and its share of the first layer."""
+
+    side: Side
+    hidden: list[Any]
+
+
+@dataclass(frozen=True, eq=False)
+class FullGeometry:
+    """S = S_0 P_o P_i exp f, f = 6 tanh(g/6), g a perceptron of the features of exit, entry and pair.
+
+    Orders two and more; positive; reciprocal as far as it has been learnt.
+
+    Args:
+        subject: the object.
+        frame: of the features.
+        half_space: S_0 P_o P_i.
+        weights: W_k (outputs, inputs) and b_k of the layers.
+    """
+
+    subject: Subject
+    frame: Frame
+    half_space: HalfSpace
+    weights: Mapping[str, np.ndarray]
+
+    @property
+    def depth(self) -> int:
+        """Number of layers."""
+        return len(self.weights) // 2
+
+    @functools.cached_property
+    def _views(self) -> dict[str, tuple]:
+        """Matrix and bias of each layer as Dr.Jit's views, the first one split into exit and the rest."""
+        import mitsuba as mi
+        from drjit import nn
+
+        split = n_side(len(self.subject.media))
+        layers = [(f"W_{k}", f"b_{k}") for k in range(self.depth)]
+        matrices = [self.weights[W] for W, _ in layers]
+        matrices = [matrices[0][:, :split], matrices[0][:, split:], *matrices[1:]]
+        tensors = [mi.TensorXf(np.ascontiguousarray(W, dtype=np.float32)) for W in matrices]
+        biases = [mi.Float(self.weights[b].astype(np.float32)) for _, b in layers]
+        views = nn.pack(*tensors, *biases)[-len(tensors) - len(biases) :]
+        return {"W": tuple(views[: len(tensors)]), "b": tuple(views[len(tensors) :])}
+
+    def prepare(self, at: SurfacePoint, active: Any = True) -> PreparedExit:
+        """The exit's side, for as many entries as are asked for."""
+        from drjit import nn
+
+        side = Side(at, first_event(self.subject, at, active))
+        x = nn.CoopVec(*side_features(self.frame, side))
+        return PreparedExit(side, list(nn.matvec(self._views["W"][0], x, self._views["b"][0])))
+
+    def S(self, exit: PreparedExit, at: SurfacePoint, active: Any = True) -> Any:
+        """S(x_i, w_i; x_o, w_o) per channel, 1/((scene unit)² sr); 0 below the horizons.
+
+        Args:
+            exit: from `prepare`.
+            at: entry, with w_i.
+            active: mask of lanes.
+        """
+        import drjit as dr
+        import mitsuba as mi
+
+        entry = Side(at, first_event(self.subject, at, active))
+        f = mi.Spectrum(self._network(exit, entry))
+        S_0 = self.half_space(exit.side, entry)
+        return dr.select(active, S_0 * dr.exp(BOUND * dr.tanh(f / BOUND)), 0)
+
+    def _network(self, exit: PreparedExit, entry: Side) -> list[Any]:
+        import drjit as dr
+        from drjit import nn
+
+        W, b = self._views["W"], self._views["b"]
+        x = nn.CoopVec(*side_features(self.frame, entry), *pair_features(self.frame, exit.side, entry))
+        x = nn.matvec(W[1], x) + nn.CoopVec(*exit.hidden)
+        for k in range(1, self.depth):
+            x = x * dr.clip(x * (1 / 6) + 0.5, 0, 1)  # hard swish: a fifth of SiLU's time
+            x = nn.matvec(W[k + 1], x, b[k])
+        return list(x)

@@ -1,0 +1,129 @@
+"""Training data of one object: walks with their throughput, and proposals with S_0 over their density."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from full_geometry.exits import trace_exits
+from full_geometry.features import Frame, Side, pair_features, side_features
+from full_geometry.first_event import first_event
+from full_geometry.half_space import HalfSpace
+from full_geometry.subject import Subject, SurfacePoint, cosine_direction
+from halfspace_sss.rendering.transport.plane import Exit, number
+from halfspace_sss.rendering.transport.positions import PositionSampler
+from halfspace_sss.rendering.transport.radial_table import RadialTable
+from halfspace_sss.tracing.walk import _generator, pass_seed
+
+__all__ = ["AREA_SHARE", "Pairs", "PairSource", "Proposals"]
+
+AREA_SHARE = 0.4  # of the proposals that are uniform over the area
+
+
+class Numbers:
+    """Uniform numbers of a generator under the names that Mitsuba's samplers give them."""
+
+    def __init__(self, rng: Any) -> None:
+        self.rng = rng
+
+    def next_1d(self) -> Any:
+        return self.rng.next_float32()
+
+    def next_2d(self) -> Any:
+        import mitsuba as mi
+
+        return mi.Point2f(self.rng.next_float32(), self.rng.next_float32())
+
+
+class Pairs(NamedTuple):
+    """Pairs as columns: features (inputs, n), values (channels, n); `drawn` of them were drawn, the rest have value 0."""
+
+    features: np.ndarray
+    values: np.ndarray
+    drawn: int
+
+
+class Proposals:
+    """Entries for given exits: probes and uniform points, directions by the cosine.
+
+    Args:
+        subject: the object.
+        half_space: S_0, whose radial densities the probes follow.
+        area_share: of the points that are uniform over the area.
+    """
+
+    def __init__(self, subject: Subject, half_space: HalfSpace, area_share: float = AREA_SHARE) -> None:
+        live = [m for m in half_space.models if float(m.medium.sigma_s) > 0]
+        table = RadialTable(live or half_space.models, subject.found.size)
+        self.subject = subject
+        # light may leave by another piece of the surface than it entered by
+        self.positions = PositionSampler(replace(subject.found, pieces=None), table, subject.points, area_share)
+
+    def sample(self, exit: SurfacePoint, rng: Any) -> tuple[SurfacePoint, Any]:
+        """An entry for each exit, and mu_i over its density; 0 where none was found."""
+        import drjit as dr
+        import mitsuba as mi
+
+        out = Exit(exit.p, exit.n_out, exit.w, number(self.subject.found.sign))
+        entry = self.positions.sample(out, mi.UInt32(0), Numbers(rng), mi.Bool(True))
+        w = cosine_direction(entry.n_out, rng)
+        n = entry.n * self.subject.found.sign
+        return SurfacePoint(entry.p, n, entry.n_out, w), dr.pi * entry.weight
+
+
+@dataclass(frozen=True, eq=False)
+class PairSource:
+    """Makes training data.
+
+    Args:
+        subject: the object.
+        frame: of its features.
+        half_space: S_0.
+        proposals: where they come from.
+    """
+
+    subject: Subject
+    frame: Frame
+    half_space: HalfSpace
+    proposals: Proposals
+
+    def walks(self, n: int, seed: tuple[int, ...]) -> Pairs:
+        """n walks of random exits; those that left at an order that counts, T as values."""
+        import drjit as dr
+        import mitsuba as mi
+
+        rng = _generator(mi, n, pass_seed(*seed, 0))
+        starts = self.subject.random_points(rng)
+        exits = trace_exits(self.subject, starts, (*seed, 1))
+        kept = dr.compress(dr.max(exits.T) > 0)
+        if dr.width(kept) == 0:
+            return self._columns(starts, starts, dr.zeros(mi.Spectrum, n))
+        ends = exits.at.gather(kept)
+        T = dr.gather(mi.Spectrum, exits.T, kept)
+        return self._columns(starts.gather(kept), ends, T)._replace(drawn=n)
+
+    def proposed(self, n: int, seed: tuple[int, ...]) -> Pairs:
+        """n proposals of random exits, S_0 mu_i over their density as values."""
+        import mitsuba as mi
+
+        rng = _generator(mi, n, pass_seed(*seed, 2))
+        starts = self.subject.random_points(rng)
+        entries, weight = self.proposals.sample(starts, rng)
+        return self._columns(starts, entries, weight)
+
+    def _columns(self, exits: SurfacePoint, entries: SurfacePoint, value: Any) -> Pairs:
+        """Features of pairs; `value` is a spectrum, or a weight that S_0 is to be multiplied by."""
+        import drjit as dr
+        import mitsuba as mi
+
+        exit, entry = (Side(at, first_event(self.subject, at)) for at in (exits, entries))
+        if isinstance(value, mi.Float):
+            value = self.half_space(exit, entry) * value
+        columns = [*side_features(self.frame, exit), *side_features(self.frame, entry)]
+        columns += pair_features(self.frame, exit, entry)
+        dr.eval(columns, value)
+        n = dr.width(value)
+        features = np.stack([np.broadcast_to(c.numpy(), n) for c in columns])
+        return Pairs(features, np.array(value, dtype=np.float32).reshape(len(value), n), n)

@@ -1,0 +1,154 @@
+"""One object with its medium, ready for walks inside it: geometry, coefficients of each channel, smooth boundary."""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from halfspace_sss.physics.medium import Medium
+from halfspace_sss.rendering.surface.object import Object, survey
+from halfspace_sss.rendering.transport.area_points import AreaPoints
+from halfspace_sss.rendering.transport.plane import number
+from halfspace_sss.rendering.walk.media import Coefficients
+
+__all__ = ["Subject", "SurfacePoint", "clearance", "refract_in"]
+
+
+class SurfacePoint(NamedTuple):
+    """A point of the surface and a direction outside: position, outward geometric and shading normal, w."""
+
+    p: Any
+    n: Any
+    n_out: Any
+    w: Any
+
+    def gather(self, k: Any) -> SurfacePoint:
+        """The points of the lanes k."""
+        import drjit as dr
+
+        return SurfacePoint(*(dr.gather(type(v), v, k) for v in self))
+
+
+@dataclass(frozen=True, eq=False)
+class Subject:
+    """One translucent object on its own.
+
+    Args:
+        found: its geometry.
+        media: scalar medium of each channel of the variant, 1/(scene unit).
+        boundary: its smooth dielectric.
+        points: uniform points of its surface.
+    """
+
+    found: Object
+    media: tuple[Medium, ...]
+    boundary: Any
+    points: AreaPoints
+
+    @classmethod
+    def of(cls, shape: Any, medium: Medium, mm_per_unit: float = 1.0) -> Subject:
+        """The object of a Mitsuba shape filled with a medium.
+
+        Args:
+            shape: closed, no instance; its own BSDF does not count.
+            medium: 1/mm, scalar or with one value for each channel of the variant.
+            mm_per_unit: length of a scene unit, mm.
+
+        Raises:
+            ValueError: the medium has other channels than the variant, mm_per_unit is not a finite number > 0, or the
+                shape is an instance.
+        """
+        import mitsuba as mi
+
+        if not (math.isfinite(mm_per_unit) and mm_per_unit > 0):
+            raise ValueError(f"mm_per_unit must be finite and > 0, got {mm_per_unit!r}")
+        if not isinstance(medium, Medium):
+            raise ValueError(f"medium must be a Medium, got {type(medium).__name__}")
+        n = len(mi.Spectrum(0))
+        if medium.n_channels not in (None, n):
+            raise ValueError(f"medium must have {n} channels under {mi.variant()}, got {medium.n_channels}")
+        scaled = medium.scaled(mm_per_unit)
+        media = tuple(scaled if medium.n_channels is None else scaled.channel(k) for k in range(n))
+        boundary = mi.load_dict({"type": "dielectric", "int_ior": medium.eta, "ext_ior": 1.0})
+        return cls(survey(shape), media, boundary, AreaPoints(shape))
+
+    @property
+    def eta(self) -> float:
+        """Relative index."""
+        return self.media[0].eta
+
+    @property
+    def same_g(self) -> bool:
+        """Whether g is the same in all channels."""
+        return all(m.g == self.media[0].g for m in self.media)
+
+    @functools.cached_property
+    def coefficients(self) -> Coefficients:
+        """Of the medium, as data of kernels: one kernel serves all media."""
+        import mitsuba as mi
+
+        keys = ("sigma_t", "sigma_s", "g")
+        return Coefficients(*(mi.Spectrum([number(getattr(m, key)) for m in self.media]) for key in keys))
+
+    @functools.cached_property
+    def box(self) -> Any:
+        """The bounding box, a little larger; what is outside has leaked through the boundary by rounding."""
+        import mitsuba as mi
+
+        box = self.found.scene.bbox()
+        margin = 1e-3 * (box.max - box.min)
+        return mi.BoundingBox3f(mi.Point3f(box.min - margin), mi.Point3f(box.max + margin))
+
+    def random_points(self, rng: Any) -> SurfacePoint:
+        """Points uniform over the area with directions by the cosine to the shading normal, one for each lane of rng."""
+        import mitsuba as mi
+
+        u_face, u = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
+        at = self.points.sample(u_face, u, True)
+        n, n_out = at.n * self.found.sign, at.n_shading * self.found.sign
+        return SurfacePoint(mi.Point3f(at.p), mi.Normal3f(n), mi.Normal3f(n_out), cosine_direction(n_out, rng))
+
+    def mean_free_paths(self) -> np.ndarray:
+        """sigma_t sqrt(area) of each channel: the size of the object in mean free paths."""
+        return np.array([float(m.sigma_t) for m in self.media]) * math.sqrt(self.found.area)
+
+
+def cosine_direction(n: Any, rng: Any) -> Any:
+    """A direction by the cosine to n."""
+    import mitsuba as mi
+
+    local = mi.warp.square_to_cosine_hemisphere(mi.Point2f(rng.next_float32(), rng.next_float32()))
+    return mi.Frame3f(n).to_world(local)
+
+
+def clearance(p: Any, n: Any, d: Any) -> Any:
+    """Length along d after which a ray from the surface at p is clear of it.
+
+    Mitsuba moves the origin along the normal instead, which lays the walk deeper: at 1000 mean free paths from the
+    origin of the scene it took 8 % of the single and 1 to 6 % of the multiple scattering away.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    offset = (1 + dr.max(dr.abs(p))) * mi.math.RayEpsilon
+    return offset / dr.maximum(dr.abs(dr.dot(n, d)), 0.1)
+
+
+def refract_in(at: SurfacePoint, eta: Any) -> tuple[Any, Any, Any]:
+    """Direction inside of light that is seen along w, Fresnel transmittance, and whether it goes inwards at all.
+
+    mu' = sqrt(1 - (1 - mu²)/eta²), d = -w/eta + n (mu/eta - mu').
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    mu = dr.dot(at.w, at.n_out)
+    inner = 1 - (1 - mu * mu) / (eta * eta)
+    d = at.n_out * (mu / eta - dr.safe_sqrt(inner)) - at.w / eta
+    F = mi.fresnel(dr.maximum(mu, 0), eta)[0]
+    valid = (mu > 0) & (inner > 0) & (dr.dot(at.w, at.n) > 0) & (dr.dot(d, at.n) < 0)
+    return mi.Vector3f(dr.normalize(d)), dr.select(valid, 1 - F, 0), valid

@@ -1,0 +1,125 @@
+"""Walks inside one object and the exact way to the first event: energy, the plane, reciprocity, orders.
+
+Statistical tests have fixed seeds; a z-test fails at 4 standard errors (two-sided 6e-5).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from halfspace_sss import Medium, trace
+from halfspace_sss.physics.fresnel import F_t
+from halfspace_sss.tracing.walk import _generator, pass_seed
+
+mi = pytest.importorskip("mitsuba")
+
+from full_geometry.exits import trace_exits  # noqa: E402
+from full_geometry.first_event import first_event  # noqa: E402
+from full_geometry.subject import Subject, SurfacePoint, refract_in  # noqa: E402
+
+N = 2**16
+COLOURS = Medium(np.array([0.99, 0.75, 0.3]), np.array([0.01, 0.25, 0.7]), np.array([0.0, 0.3, 0.0]), 1.4)
+
+
+@pytest.fixture(autouse=True)
+def variant() -> None:
+    mi.set_variant("llvm_ad_rgb")
+
+
+def ball(medium: Medium, radius: float) -> Subject:
+    return Subject.of(mi.load_dict({"type": "sphere", "radius": radius}), medium)
+
+
+def starts(subject: Subject, n: int = N, seed: int = 1) -> SurfacePoint:
+    return subject.random_points(_generator(mi, n, pass_seed(seed)))
+
+
+def mean_and_error(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return values.mean(axis=-1), values.std(axis=-1, ddof=1) / np.sqrt(values.shape[-1])
+
+
+def test_all_light_comes_out_where_nothing_absorbs() -> None:
+    subject = ball(Medium(1.0, 0.0, 0.5, 1.5), 2.0)
+    points = starts(subject)
+    T = np.array(trace_exits(subject, points, (2,), fewest=0).T)
+    entering = np.array(refract_in(points, 1.5)[1])
+    mean, error = mean_and_error(T - entering)
+    assert np.all(np.abs(mean) < 4 * error + 1e-4)
+
+
+@pytest.mark.parametrize(("fewest", "most", "order"), [(1, 1, "single"), (2, 2**31 - 1, "multiple")])
+def test_a_large_ball_reflects_diffuse_light_as_the_plane_does(fewest: int, most: int, order: str) -> None:
+    subject = ball(COLOURS, 1000.0)
+    exits = trace_exits(subject, starts(subject), (3,), fewest=fewest, most=most)
+    mean, error = mean_and_error(np.array(exits.T))
+    for c in range(3):
+        plane = trace(COLOURS.channel(c), "diffuse", 200_000, 5).reflectance(order)
+        assert abs(mean[c] - plane.value) < 4 * np.hypot(error[c], plane.standard_error) + 1e-3 * plane.value
+
+
+def test_orders_outside_of_those_kept_carry_nothing() -> None:
+    subject = ball(COLOURS, 2.0)
+    exits = trace_exits(subject, starts(subject, 4096), (4,), fewest=2, most=5)
+    order, T = np.array(exits.order), np.array(exits.T).max(axis=0)
+    assert set(np.unique(order[T > 0])) == {2, 3, 4, 5}
+
+
+def test_walks_there_and_back_carry_the_same_light() -> None:
+    subject = Subject.of(mi.load_dict({"type": "cube"}), COLOURS)
+    points = starts(subject)
+    exits = trace_exits(subject, points, (5,))
+    T, x_o, x_i = (np.array(v) for v in (exits.T, points.p, exits.at.p))
+    mu_o = np.sum(np.array(points.w) * np.array(points.n_out), axis=0)
+    mu_i = np.sum(np.array(exits.at.w) * np.array(exits.at.n_out), axis=0)
+    forward = T * ((x_o[0] > 0.99) & (mu_o > 0.8) & (x_i[1] > 0.99) & (mu_i < 0.6))
+    backward = T * ((x_i[0] > 0.99) & (mu_i > 0.8) & (x_o[1] > 0.99) & (mu_o < 0.6))
+    mean, error = mean_and_error(forward - backward)
+    assert np.all(forward.mean(axis=-1) > 5 * error) and np.all(np.abs(mean) < 4 * error)
+
+
+def test_the_same_seed_gives_the_same_exits() -> None:
+    subject = ball(COLOURS, 2.0)
+    a, b = (trace_exits(subject, starts(subject, 1024), (6,)) for _ in range(2))
+    assert np.array_equal(np.array(a.T), np.array(b.T)) and np.array_equal(np.array(a.at.p), np.array(b.at.p))
+
+
+def test_on_a_plane_light_is_always_scattered_a_mean_free_path_along_the_refracted_ray() -> None:
+    subject = ball(COLOURS, 1000.0)
+    points = starts(subject, 1024)
+    event = first_event(subject, points)
+    d, _, _ = refract_in(points, subject.eta)
+    expected = np.array(points.p) + np.array(d)
+    steep = np.abs(np.sum(np.array(d) * np.array(points.n), axis=0)) > 0.3
+    assert np.allclose(np.array(event.P)[:, steep], 1, atol=1e-5)
+    assert np.allclose(np.array(event.y)[:, steep], expected[:, steep], atol=2e-3)
+    assert np.allclose(np.array(event.length)[steep], 1, atol=1e-4)
+
+
+def test_the_way_to_the_first_event_is_that_of_walks() -> None:
+    medium = Medium(0.5, 0.2, 0.0, 1.5)
+    subject = ball(medium, 0.4)
+    points = starts(subject)
+    P, entering = np.array(first_event(subject, points).P)[0], np.array(refract_in(points, 1.5)[1])
+    unscattered = np.array(trace_exits(subject, points, (7,), fewest=0, most=0).T)[0]
+    mean, error = mean_and_error(unscattered - entering * (1 - P))
+    assert unscattered.mean() > 0.1 and abs(mean) < 4 * error + 1e-3  # light that stays longer than 4 reflections
+
+
+@pytest.mark.parametrize("mm_per_unit", [0.0, -1.0, float("nan")])
+def test_a_scale_that_is_no_length_is_refused(mm_per_unit: float) -> None:
+    with pytest.raises(ValueError, match="mm_per_unit must be finite"):
+        Subject.of(mi.load_dict({"type": "sphere"}), COLOURS, mm_per_unit)
+
+
+def test_a_medium_of_other_channels_than_the_variant_is_refused() -> None:
+    with pytest.raises(ValueError, match="3 channels"):
+        Subject.of(mi.load_dict({"type": "sphere"}), Medium(np.ones(2), np.ones(2)))
+
+
+def test_transmittance_enters_with_the_light() -> None:
+    subject = ball(COLOURS, 10.0)
+    points = starts(subject, 512)
+    _, T, valid = refract_in(points, subject.eta)
+    mu = np.sum(np.array(points.w) * np.array(points.n_out), axis=0)
+    assert np.allclose(np.array(T), np.where(np.array(valid), F_t(mu, subject.eta), 0), atol=1e-4)
