@@ -1,7 +1,7 @@
 """The way of light to its first scattering event inside an object, without randomness.
 
-From (x, w): refract, go to the boundary, lose the part that Fresnel lets out, reflect, at most four times. With segments
-k of length l_k from o_k along d_k that are reached with the weight v_k (v_0 = 1, v_{k+1} = v_k exp(-sigma_t l_k) F_k),
+From (x, w): refract, go to the boundary, lose the part that Fresnel lets out, reflect, at most four times. Segments k
+of length l_k from o_k along d_k are reached with the weight v_k: v_0 = 1, v_{k+1} = v_k exp(-sigma_t l_k) F_k, and
 
     P = sum_k v_k (1 - exp(-sigma_t l_k)),    P y = sum_k v_k ∫_0^{l_k} sigma_t exp(-sigma_t s) (o_k + s d_k) ds.
 
@@ -39,9 +39,8 @@ def first_event(subject: Subject, at: SurfacePoint, active: Any = True) -> First
     d, _, valid = refract_in(at, eta)
     flags = mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame
 
-    def step(
-        k: Any, o: Any, d: Any, skip: Any, v: Any, way: Any, P: Any, moment: Any, length: Any, active: Any
-    ) -> tuple:
+    def step(k: Any, o: Any, d: Any, skip: Any, v: Any, way: Any, found: tuple, active: Any) -> tuple:
+        P, moment, length = found
         si = subject.found.scene.ray_intersect(mi.Ray3f(o + d * skip, d), flags, False, active)
         l = dr.select(si.is_valid(), si.t + skip, 1e4 / dr.min(sigma_t))  # noqa: E741
         through = dr.exp(-sigma_t * l)
@@ -56,12 +55,12 @@ def first_event(subject: Subject, at: SurfacePoint, active: Any = True) -> First
         goes_on = si.is_valid() & (dr.dot(onward, si.n) * sign < 0) & (dr.max(v) > NEGLIGIBLE) & (k < REFLECTIONS)
         skip = clearance(si.p, si.n, onward)
         onward = mi.Vector3f(onward)
-        return k + 1, mi.Point3f(si.p), onward, skip, v, way + l, P + part, moment, length, active & goes_on
+        return k + 1, mi.Point3f(si.p), onward, skip, v, way + l, (P + part, moment, length), active & goes_on
 
     state = (
-        mi.UInt32(0), mi.Point3f(at.p), d, clearance(at.p, at.n, d), mi.Spectrum(1), mi.Float(0), mi.Spectrum(0),
-        mi.Vector3f(0), mi.Float(0), valid & active,
+        mi.UInt32(0), mi.Point3f(at.p), d, clearance(at.p, at.n, d), mi.Spectrum(1), mi.Float(0),
+        (mi.Spectrum(0), mi.Vector3f(0), mi.Float(0)), valid & active,
     )  # fmt: skip
-    *_, P, moment, length, _ = dr.while_loop(state, lambda *s: s[-1], step, label="first event")
+    P, moment, length = dr.while_loop(state, lambda *s: s[-1], step, label="first event")[-2]
     total = dr.maximum(dr.mean(P), 1e-20)
     return FirstEvent(P, dr.select(dr.mean(P) > 0, mi.Point3f(moment / total), at.p), length / total)

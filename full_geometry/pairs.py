@@ -38,7 +38,7 @@ class Numbers:
 
 
 class Pairs(NamedTuple):
-    """Pairs as columns: features (inputs, n), values (channels, n); `drawn` of them were drawn, the rest have value 0."""
+    """Pairs as columns: features (inputs, n), values (channels, n); `drawn` were drawn, those left out have value 0."""
 
     features: np.ndarray
     values: np.ndarray

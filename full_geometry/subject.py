@@ -104,7 +104,7 @@ class Subject:
         return mi.BoundingBox3f(mi.Point3f(box.min - margin), mi.Point3f(box.max + margin))
 
     def random_points(self, rng: Any) -> SurfacePoint:
-        """Points uniform over the area with directions by the cosine to the shading normal, one for each lane of rng."""
+        """Points uniform over the area, directions by the cosine to the shading normal, one for each lane of rng."""
         import mitsuba as mi
 
         u_face, u = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
