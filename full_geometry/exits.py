@@ -25,12 +25,13 @@ LANES = 2**15
 
 
 class Left(NamedTuple):
-    """A walk that leaves: its number, where and whereto, throughput per channel, scattering events."""
+    """A walk that leaves: its number, where and whereto, throughput per channel, scattering events, the face there."""
 
     walk: Any
     at: SurfacePoint
     T: Any
     order: Any
+    face: Any
 
 
 class Visitor(Protocol):
@@ -47,6 +48,7 @@ class Exits(NamedTuple):
     at: SurfacePoint
     T: Any
     order: Any
+    face: Any
 
 
 class _Store:
@@ -57,7 +59,7 @@ class _Store:
         import mitsuba as mi
 
         at = SurfacePoint(*(dr.zeros(kind, n) for kind in (mi.Point3f, mi.Normal3f, mi.Normal3f, mi.Vector3f)))
-        self.exits = Exits(at, dr.zeros(mi.Spectrum, n), dr.zeros(mi.UInt32, n))
+        self.exits = Exits(at, dr.zeros(mi.Spectrum, n), dr.zeros(mi.UInt32, n), dr.zeros(mi.UInt32, n))
         self.fewest, self.most = (dr.opaque(mi.UInt32, order) for order in (fewest, most))
         dr.eval(self.exits)
 
@@ -65,7 +67,8 @@ class _Store:
         import drjit as dr
 
         kept = (left.order >= self.fewest) & (left.order <= self.most) & (dr.dot(left.at.w, left.at.n_out) > 0)
-        for target, value in zip((*self.exits.at, self.exits.T, self.exits.order), (*left.at, left.T, left.order)):
+        targets, values = (*self.exits.at, *self.exits[1:]), (*left.at, *left[2:])
+        for target, value in zip(targets, values):
             dr.scatter(target, value, left.walk, kept)
 
 
@@ -180,7 +183,11 @@ class _Walker:
         weight = s["weight"] * value
         out = (dr.dot(d, n) > 0) & ~leaked & si.is_valid()
         left = Left(
-            s["walk"], SurfacePoint(mi.Point3f(si.p), mi.Normal3f(n), mi.Normal3f(n_out), d), weight, s["order"]
+            s["walk"],
+            SurfacePoint(mi.Point3f(si.p), mi.Normal3f(n), mi.Normal3f(n_out), d),
+            weight,
+            s["order"],
+            si.prim_index,
         )
         (_,) = dr.if_stmt((left,), out, self._leave, lambda left: (mi.Bool(False),), label="leave")
         alive = ~out & ~leaked & si.is_valid() & (bs.pdf > 0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -12,8 +13,9 @@ import torch
 from full_geometry.learner import Correction, likelihood
 from full_geometry.pairs import Pairs
 from halfspace_sss.checks import check_count, check_interval
+from halfspace_sss.provenance import write_atomically
 
-__all__ = ["Fitting", "Recipe"]
+__all__ = ["STANDARD", "Fitting", "Recipe"]
 
 BETAS, CLIP, LAST_RATE, WARM_UP = (0.9, 0.99), 1.0, 0.01, 100
 AVERAGE = 0.998  # of the numbers, each step
@@ -44,6 +46,9 @@ class Recipe:
         for name in ("width", "depth", "batch", "chunk", "reuse"):
             check_count(name, getattr(self, name), 1)
         check_interval("rate", self.rate, 1e-8, 1.0)
+
+
+STANDARD = Recipe()
 
 
 class Fitting:
@@ -101,3 +106,43 @@ class Fitting:
         with torch.no_grad():
             share = 1 - min(AVERAGE, (1 + self.step) / (10 + self.step))
             torch._foreach_lerp_(list(self.average.parameters()), self.parameters, share)
+
+    def _tensors(self) -> dict[str, torch.Tensor]:
+        """Everything the next step depends on, by name; changing the tensors in place changes the fit."""
+        tensors = {"scale": self.scale}
+        for k, (p, mean) in enumerate(zip(self.parameters, self.average.parameters())):
+            state = self.adam.state[p]
+            if not state:
+                state.update(step=torch.tensor(0.0), exp_avg=torch.zeros_like(p), exp_avg_sq=torch.zeros_like(p))
+            tensors |= {f"{k}.value": p.data, f"{k}.mean": mean.data}
+            tensors |= {f"{k}.{name}": state[name] for name in ("step", "exp_avg", "exp_avg_sq")}
+        return tensors
+
+    def save(self, path: Path, done: int, history: list) -> None:
+        """Write a checkpoint after `done` chunks."""
+        from safetensors.torch import save
+
+        counters = torch.tensor([self.step, done], dtype=torch.float64)
+        rows = torch.tensor([list(row) for row in history], dtype=torch.float64).reshape(-1, 3)
+        state = {name: tensor.clone() for name, tensor in self._tensors().items()}
+        write_atomically(path, save({**state, "counters": counters, "history": rows}))
+
+    def load(self, path: Path) -> tuple[int, list]:
+        """Go on from a checkpoint; returns its chunks and history.
+
+        Raises:
+            ValueError: it is damaged or of another recipe.
+        """
+        from safetensors import SafetensorError
+        from safetensors.torch import load
+
+        try:
+            stored = load(path.read_bytes())
+            for name, tensor in self._tensors().items():
+                tensor.copy_(stored[name])
+            step, done = (int(v) for v in stored["counters"].tolist())
+            history = [(int(k), error, spread) for k, error, spread in stored["history"].tolist()]
+        except (SafetensorError, KeyError, RuntimeError, OSError) as error:
+            raise ValueError(f"{path}: checkpoint cannot be used, remove it to start anew: {error}") from error
+        self.step = step
+        return done, history

@@ -37,7 +37,8 @@ class HalfSpace:
             N = 4 * math.pi * fresnel.C_phi(1 / m.eta)
             albedo = float(m.albedo_prime)
             R_d = albedo**2 * math.exp(-2 * math.sqrt(max(1 - albedo, 0.0)))
-            found.append(number(FLOOR * max(R_d, 1e-6) / (self.subject.found.area * N)))
+            share = FLOOR * max(R_d, 1e-6) if float(m.sigma_s) > 0 else 0.0
+            found.append(number(share / (self.subject.found.area * N)))
         return found
 
     def __call__(self, exit: Side, entry: Side) -> Any:

@@ -1,0 +1,122 @@
+"""Which object weights belong to: the same shape of the same size in mean free paths, wherever it stands."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from full_geometry.features import Frame
+from full_geometry.subject import Subject
+from halfspace_sss.rendering.transport.plane import number
+
+__all__ = ["Identity", "frame_of", "identify"]
+
+ANCHORS = 256
+CLOSE = 1e-4  # positions over the size of the object, coefficients relative
+
+
+@dataclass(frozen=True, eq=False)
+class Identity:
+    """What tells objects apart.
+
+    Args:
+        kind: class of the shape.
+        topology: checksum of its faces, and whether it has normals of its own; empty for a shape without faces.
+        anchors: points that move with the shape, (n, 3), scene units.
+        medium: per channel albedo, g and sigma_t sqrt(area), and eta.
+    """
+
+    kind: str
+    topology: str
+    anchors: np.ndarray
+    medium: dict[str, Any]
+
+    def digest(self) -> str:
+        """A name for shape and ratios of the medium, without sizes."""
+        ratios = [f"{v:.6g}" for key in ("albedo", "g", "eta") for v in np.atleast_1d(self.medium[key])]
+        return hashlib.sha256("|".join([self.kind, self.topology, *ratios]).encode()).hexdigest()[:12]
+
+    def record(self) -> dict[str, Any]:
+        """Everything but the anchors, ready for JSON."""
+        return {"kind_of_shape": self.kind, "topology": self.topology, "medium": self.medium}
+
+    def pose(self, other: Identity) -> tuple[np.ndarray, np.ndarray]:
+        """R and t with R x + t = y for the points x of this object and y of the other, which is the same one moved.
+
+        Raises:
+            ValueError: it is another object; says in what.
+        """
+        for key, mine, theirs in (("shape", self.kind, other.kind), ("mesh", self.topology, other.topology)):
+            if mine != theirs:
+                raise ValueError(f"{key} must be {mine or 'without faces'}, as trained, got {theirs or 'none'}")
+        R, t, miss = _kabsch(self.anchors.astype(float), other.anchors.astype(float))
+        spread, others = (float(np.linalg.norm(np.std(v, axis=0))) for v in (self.anchors, other.anchors))
+        if miss > CLOSE * spread:
+            raise ValueError(
+                f"object must be the one that was trained, moved and turned only, got one that differs by "
+                f"{miss / spread:.2g} of its size (about {others / max(spread, 1e-30):.3g} times as large)"
+            )
+        for key, mine in self.medium.items():
+            theirs = other.medium[key]
+            if np.shape(mine) != np.shape(theirs) or not np.allclose(mine, theirs, rtol=CLOSE, atol=1e-7):
+                raise ValueError(f"{key} of the medium must be {mine}, as trained, got {theirs}")
+        return R, t
+
+
+def _kabsch(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    """Rotation and shift that take a to b best, and the largest distance that is left."""
+    if a.shape != b.shape:
+        return np.eye(3), np.zeros(3), np.inf
+    mean_a, mean_b = a.mean(axis=0), b.mean(axis=0)
+    U, _, V = np.linalg.svd((a - mean_a).T @ (b - mean_b))
+    flip = np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ V))])
+    R = (U @ flip @ V).T
+    t = mean_b - R @ mean_a
+    return R, t, float(np.linalg.norm(a @ R.T + t - b, axis=1).max())
+
+
+def identify(subject: Subject) -> Identity:
+    """The identity of an object as it stands."""
+    import mitsuba as mi
+
+    shape = subject.found.shape
+    parameters = mi.traverse(shape)
+    topology = ""
+    if "faces" in parameters:
+        faces = np.array(parameters["faces"], dtype=np.uint32)
+        positions = np.array(parameters["vertex_positions"], dtype=float).reshape(-1, 3)
+        smooth = "smooth" if shape.has_vertex_normals() else "flat"
+        topology = f"{hashlib.sha256(faces.tobytes()).hexdigest()[:16]} {smooth}"
+        anchors = positions[np.unique(np.linspace(0, len(positions) - 1, ANCHORS).astype(int))]
+    elif "to_world" in parameters:
+        matrix = np.array(parameters["to_world"].matrix, dtype=float).reshape(4, 4)
+        corners = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, 8)
+        anchors = (matrix[:3, :3] @ corners + matrix[:3, 3:]).T
+    else:
+        raise ValueError(f"shape must be a mesh or have a transformation, got {shape.class_name()}")
+    media = subject.media
+    medium = {key: [float(getattr(m, key)) for m in media] for key in ("albedo", "g")}
+    medium |= {"size_in_mfp": subject.mean_free_paths().tolist(), "eta": float(subject.eta)}
+    return Identity(shape.class_name(), topology, anchors.astype(np.float32), medium)
+
+
+def frame_of(subject: Subject, trained: Identity | None = None) -> Frame:
+    """The frame of the features; that of training for an object that has been moved since.
+
+    Raises:
+        ValueError: the object is not the one that was trained.
+    """
+    import mitsuba as mi
+
+    here = identify(subject)
+    R, t = (np.eye(3), np.zeros(3)) if trained is None else trained.pose(here)
+    anchors = here.anchors if trained is None else trained.anchors
+    low, high = anchors.min(axis=0).astype(float), anchors.max(axis=0).astype(float)
+    centre = R @ (0.5 * (low + high)) + t
+    radius = 0.5 * float(np.linalg.norm(high - low))
+    sigma_t = float(np.exp(np.mean([np.log(float(m.sigma_t)) for m in subject.media])))
+    turn = None if np.allclose(R, np.eye(3), atol=1e-6) else [mi.Vector3f(*map(number, row)) for row in R.T]
+    return Frame(mi.Point3f(*map(number, centre)), number(radius), number(sigma_t), turn)

@@ -1,0 +1,210 @@
+"""Learning S of one object: walks and steps in turn, with the error measured as it falls."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from full_geometry import storing
+from full_geometry.errors import ModelError, Reference, errors, reference
+from full_geometry.features import N_PAIR, n_side
+from full_geometry.fitting import STANDARD, Fitting, Recipe
+from full_geometry.half_space import HalfSpace
+from full_geometry.identity import frame_of, identify
+from full_geometry.model import FullGeometry
+from full_geometry.pairs import PairSource, Proposals
+from full_geometry.subject import Subject
+from halfspace_sss.checks import check_count, check_interval
+from halfspace_sss.neural.store import to_json
+from halfspace_sss.neural.trained import weights_folder
+from halfspace_sss.neural.training.work_folder import CHECKPOINT, claim
+from halfspace_sss.physics.medium import Medium
+from halfspace_sss.provenance import check_folder, provenance, write_atomically
+
+__all__ = ["Trained", "train"]
+
+Progress = Callable[[str, int, int], None]
+VALIDATIONS = 4  # in a run
+EXITS, WALKS, SAMPLES = 256, 2048, 512  # of a validation
+CHECKPOINT_EVERY = 15.0  # seconds
+PLAN = "plan.json"
+
+
+@dataclass(frozen=True, eq=False)
+class Trained:
+    """What came of a training.
+
+    Args:
+        model: ready to be asked.
+        path: file of its weights; None after 0 seconds.
+        errors: per channel and light, at the end.
+        steps: of the fit.
+        seconds: that it took in this process.
+    """
+
+    model: FullGeometry
+    path: Path | None
+    errors: list[ModelError]
+    steps: int
+    seconds: float
+
+
+def train(
+    shape: Any,
+    medium: Medium,
+    *,
+    mm_per_unit: float = 1.0,
+    seconds: float = 60.0,
+    target_error: float | None = None,
+    seed: int = 0,
+    recipe: Recipe = STANDARD,
+    chunks: int | None = None,
+    folder: str | Path | None = None,
+    work: str | Path | None = None,
+    progress: Progress | None = None,
+) -> Trained:
+    """Learn S of an object and write its weights.
+
+    The number of chunks is planned once, from the speed of the first ones, so that a run that was killed and is started
+    again with the same `work` ends with the same weights; a machine that slows down on the way takes longer.
+
+    Args:
+        shape: a closed Mitsuba shape.
+        medium: 1/mm, scalar or with one value per channel of the variant.
+        mm_per_unit: length of a scene unit, mm.
+        seconds: for data, fit and validation, after the kernels are compiled; 0 gives the half-space, with a warning.
+        target_error: stop once the largest error under constant light has come down to it.
+        seed: of everything.
+        recipe: sizes and rates.
+        chunks: number of chunks instead of a plan by time.
+        folder: for the weights; by default HALFSPACE_SSS_WEIGHTS or the user's data folder.
+        work: folder for unfinished work.
+        progress: called with (what, done, total).
+
+    Raises:
+        ValueError: an argument is out of range, or `work` is of another run; nothing has been traced then.
+    """
+    check_interval("seconds", seconds, 0.0, 1e7)
+    check_count("seed", seed, 0)
+    if target_error is not None:
+        check_interval("target_error", target_error, 1e-4, 1.0)
+    if chunks is not None:
+        check_count("chunks", chunks, 1)
+    for place in (folder or weights_folder(), work):
+        if place is not None:
+            check_folder(place)
+    subject = Subject.of(shape, medium, mm_per_unit)
+    run = _Run(subject, recipe, int(seed), Path(work) if work else None)
+    if seconds == 0:
+        warnings.warn("an object that is trained for 0 seconds is rendered as a half-space", stacklevel=2)
+        return Trained(run.model(), None, [], 0, 0.0)
+    return run.go(seconds, chunks, target_error, Path(folder or weights_folder()), progress)
+
+
+class _Run:
+    """A training on its way."""
+
+    def __init__(self, subject: Subject, recipe: Recipe, seed: int, work: Path | None) -> None:
+        self.subject, self.recipe, self.seed, self.work = subject, recipe, seed, work
+        self.identity, self.frame = identify(subject), frame_of(subject)
+        self.half_space = HalfSpace(subject, recipe.backbone)
+        self.proposals = Proposals(subject, self.half_space)
+        self.source = PairSource(subject, self.frame, self.half_space, self.proposals)
+        channels = len(subject.media)
+        self.fitting = Fitting(2 * n_side(channels) + N_PAIR, channels, recipe, seed)
+        self.done, self.walks, self.history = 0, recipe.chunk, []
+
+    def model(self) -> FullGeometry:
+        """The model as it stands."""
+        return FullGeometry(self.subject, self.frame, self.half_space, self.fitting.average.arrays())
+
+    def go(
+        self, seconds: float, chunks: int | None, target: float | None, folder: Path, progress: Progress | None
+    ) -> Trained:
+        started = time.monotonic()
+        self._prepare()
+        truth = reference(self.subject, EXITS, WALKS, self.seed)
+        total = self._plan(seconds, chunks)
+        marks = {round(total * (k + 1) / VALIDATIONS) for k in range(VALIDATIONS - 1)}
+        saved, what = time.monotonic(), "training"
+        while self.done < total and not self._reached(target):
+            self._chunk(total)
+            if self.done in marks:
+                self.history.append(self._validated(truth))
+                what = f"training (error {self.history[-1][1]:.3f} ± {self.history[-1][2]:.3f})"
+            if self.work and (time.monotonic() - saved > CHECKPOINT_EVERY or self.done in marks):
+                self._save()
+                saved = time.monotonic()
+            if progress:
+                progress(what, self.done, total)
+        found = errors(self.subject, self.model(), self.proposals, truth=truth, samples=2 * WALKS, seed=self.seed)
+        spent = time.monotonic() - started
+        path = storing.save(folder, self.identity, self.fitting.average.arrays(), self._record(found, spent))
+        return Trained(self.model(), path, found, self.fitting.step, spent)
+
+    def _prepare(self) -> None:
+        """Scales and shares from a pilot; the work of a run that was killed."""
+        pilot = self.source.walks(self.recipe.chunk // 4, (self.seed, 2**31))
+        share = pilot.values.shape[1] / pilot.drawn
+        self.walks = int(self.recipe.chunk / min(max(share, 0.05), 1.0))
+        self.fitting.set_scale(pilot)
+        if self.work:
+            run = {"object": self.identity.record(), "recipe": asdict(self.recipe), "seed": self.seed}
+            claim(self.work, **run)
+            if (self.work / CHECKPOINT).exists():
+                self.done, self.history = self.fitting.load(self.work / CHECKPOINT)
+
+    def _plan(self, seconds: float, chunks: int | None) -> int:
+        """Number of chunks: given, written down by the run before, or by the time that the second one takes."""
+        import json
+
+        place = self.work / PLAN if self.work else None
+        if place and place.exists():
+            return int(json.loads(place.read_text(encoding="utf-8"))["chunks"])
+        if chunks is None:
+            trial = Fitting(2 * n_side(len(self.subject.media)) + N_PAIR, len(self.subject.media), self.recipe, 0)
+            trial.scale = self.fitting.scale
+            spent = []
+            for k in range(3):
+                at = time.monotonic()
+                trial.use(*self._data(2**31 + k), 10**6, np.random.default_rng(0))
+                spent.append(time.monotonic() - at)
+            chunks = max(int(seconds / min(spent[1:])), 1)
+        if place:
+            write_atomically(place, to_json({"chunks": chunks}))
+        return chunks
+
+    def _data(self, k: int) -> tuple:
+        return self.source.walks(self.walks, (self.seed, k)), self.source.proposed(self.recipe.chunk, (self.seed, k))
+
+    def _chunk(self, total: int) -> None:
+        walks, proposals = self._data(self.done)
+        per_chunk = self.recipe.reuse * max(self.recipe.chunk // self.recipe.batch, 1)
+        self.fitting.use(walks, proposals, total * per_chunk, np.random.default_rng([self.seed, self.done]))
+        self.done += 1
+
+    def _validated(self, truth: Reference) -> tuple[int, float, float]:
+        """Chunk, largest error under constant light and its standard error."""
+        rows = errors(self.subject, self.model(), self.proposals, truth=truth, samples=SAMPLES, seed=self.seed)
+        live = [r for r in rows if r.light == "constant" and float(self.subject.media[r.channel].sigma_s) > 0]
+        worst = max(live, key=lambda r: r.error, default=rows[0])
+        return self.done, worst.error, worst.standard_error
+
+    def _reached(self, target: float | None) -> bool:
+        return target is not None and bool(self.history) and self.history[-1][1] <= target
+
+    def _save(self) -> None:
+        self.fitting.save(self.work / CHECKPOINT, self.done, self.history)
+
+    def _record(self, found: list[ModelError], seconds: float) -> dict[str, Any]:
+        return {
+            "recipe": asdict(self.recipe), "seed": self.seed, "steps": self.fitting.step, "chunks": self.done,
+            "walks": self.walks * self.done, "seconds": seconds, "history": self.history,
+            "errors": [row._asdict() for row in found], "provenance": provenance(seed=self.seed),
+        }  # fmt: skip

@@ -1,0 +1,196 @@
+"""The model of one object: learning it, its files, whom they belong to, and how its error is measured."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from halfspace_sss import Medium
+
+mi = pytest.importorskip("mitsuba")
+pytest.importorskip("torch")
+
+from full_geometry import storing, training  # noqa: E402
+from full_geometry.errors import LIGHTS, Estimate, compare, errors, reference  # noqa: E402
+from full_geometry.fitting import Recipe  # noqa: E402
+from full_geometry.half_space import HalfSpace, HalfSpaceTransport  # noqa: E402
+from full_geometry.model import FullGeometry  # noqa: E402
+from full_geometry.pairs import Proposals  # noqa: E402
+from full_geometry.subject import Subject, SurfacePoint  # noqa: E402
+from full_geometry.training import Trained, train  # noqa: E402
+from halfspace_sss.tracing.walk import _generator, pass_seed  # noqa: E402
+
+QUICK = Recipe(width=24, depth=2, batch=1024, chunk=2**14, reuse=4)
+WAX = Medium(np.array([0.95, 0.8, 0.6]), np.array([0.05, 0.2, 0.4]), 0.0, 1.4)
+CHUNKS = 12
+
+
+@pytest.fixture(autouse=True)
+def variant() -> None:
+    mi.set_variant("llvm_ad_rgb")
+
+
+def bunny(scale: float = 1.0, turn: float = 0.0, shift: float = 0.0) -> dict:
+    """The bunny, as it stands or moved."""
+    at = mi.ScalarTransform4f().translate([shift, 0, -shift]).rotate([0.6, 0.8, 0], turn).scale(2.0 * scale)
+    return {"type": "ply", "filename": str(BUNNY), "to_world": at}
+
+
+BUNNY = Path(__file__).parent.parent / "figures" / "assets" / "bunny.ply"
+
+
+def ball(radius: float = 2.0) -> object:
+    return mi.load_dict({"type": "sphere", "radius": radius})
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Trained:
+    mi.set_variant("llvm_ad_rgb")
+    return train(ball(), WAX, chunks=CHUNKS, recipe=QUICK, folder=tmp_path_factory.mktemp("weights"))
+
+
+def constant(found: list) -> np.ndarray:
+    return np.array([row.error for row in found if row.light == LIGHTS[0]])
+
+
+def test_training_halves_the_error_of_the_half_space(trained: Trained) -> None:
+    subject = trained.model.subject
+    proposals = Proposals(subject, HalfSpace(subject, "better_dipole"))
+    plane = errors(subject, HalfSpaceTransport(subject, "better_dipole"), proposals, samples=1024)
+    assert np.all(constant(trained.errors) < 0.5 * constant(plane))
+    assert all(abs(row.ratio - 1) < 0.03 for row in trained.errors)
+
+
+def test_the_file_gives_the_same_model_again(trained: Trained) -> None:
+    subject = Subject.of(ball(), WAX)
+    again = storing.load(storing.find_weights(subject, trained.path.parent), subject)
+    assert np.array_equal(S_of(again), S_of(trained.model))
+    record = json.loads(trained.path.with_suffix(".json").read_text())
+    assert record["orders"] == "multiple" and len(record["errors"]) == 6 and record["steps"] == trained.steps
+
+
+def points_of(model: FullGeometry, n: int = 4096) -> list[SurfacePoint]:
+    rng = _generator(mi, n, pass_seed(7))
+    return [model.subject.random_points(rng) for _ in range(2)]
+
+
+def S_of(model: FullGeometry, points: list[SurfacePoint] | None = None) -> np.ndarray:
+    exits, entries = points or points_of(model)
+    return np.array(model.S(model.prepare(exits), entries))
+
+
+def test_S_is_positive_and_finite(trained: Trained) -> None:
+    S = S_of(trained.model)
+    assert np.all(np.isfinite(S)) and np.all(S >= 0) and np.mean(S > 0) > 0.9
+
+
+def test_a_killed_run_ends_with_the_same_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    arguments = {"chunks": 4, "recipe": QUICK, "seed": 3}
+    whole = train(ball(), WAX, folder=tmp_path / "a", work=tmp_path / "whole", **arguments)
+    monkeypatch.setattr(training, "CHECKPOINT_EVERY", 0.0)
+
+    def kill(what: str, done: int, total: int) -> None:
+        if done == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(ball(), WAX, folder=tmp_path / "b", work=tmp_path / "killed", progress=kill, **arguments)
+    again = train(ball(), WAX, folder=tmp_path / "b", work=tmp_path / "killed", **arguments)
+    assert again.steps == whole.steps
+    assert all(np.array_equal(v, again.model.weights[name]) for name, v in whole.model.weights.items())
+
+
+def test_work_of_another_object_is_refused(tmp_path: Path) -> None:
+    train(ball(), WAX, chunks=1, recipe=QUICK, folder=tmp_path / "a", work=tmp_path / "work")
+    with pytest.raises(ValueError, match="size_in_mfp"):
+        train(ball(2.5), WAX, chunks=1, recipe=QUICK, folder=tmp_path / "a", work=tmp_path / "work")
+
+
+def test_a_run_stops_where_its_error_is_small_enough(tmp_path: Path) -> None:
+    found = train(ball(), WAX, chunks=8, recipe=QUICK, target_error=0.9, folder=tmp_path)
+    assert found.steps < 0.5 * 8 * QUICK.reuse * QUICK.chunk / QUICK.batch
+
+
+def test_no_training_gives_the_half_space_with_a_warning(tmp_path: Path) -> None:
+    with pytest.warns(UserWarning, match="as a half-space"):
+        found = train(ball(200.0), WAX, seconds=0, folder=tmp_path)
+    assert found.path is None and not list(tmp_path.iterdir())
+    plane = HalfSpaceTransport(found.model.subject, "better_dipole")
+    exits, entries = (found.model.subject.random_points(_generator(mi, 64, pass_seed(k))) for k in (1, 2))
+    near = entries._replace(p=exits.p + 0.5 * mi.Vector3f(mi.coordinate_system(exits.n)[0]), n=exits.n, n_out=exits.n)
+    near = near._replace(w=exits.n)
+    S, S_0 = (np.array(t.S(t.prepare(exits), near)) for t in (found.model, plane))
+    assert np.allclose(S, S_0, rtol=2e-2)
+
+
+@pytest.mark.parametrize(
+    ("shape", "medium", "message"),
+    [
+        ({"type": "sphere", "radius": 2.5}, WAX, "about 1.25 times as large"),
+        ({"type": "sphere", "radius": 2.0}, WAX.scaled(1.1), "size_in_mfp of the medium"),
+        ({"type": "sphere", "radius": 2.0}, Medium(WAX.sigma_s, WAX.sigma_a, 0.0, 1.5), "must be trained"),
+        ({"type": "cube"}, WAX, "must be trained"),
+    ],
+)
+def test_weights_of_another_object_are_refused(trained: Trained, shape: dict, medium: Medium, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        storing.find_weights(Subject.of(mi.load_dict(shape), medium), trained.path.parent)
+
+
+def test_an_altered_file_is_refused(trained: Trained, tmp_path: Path) -> None:
+    for path in (trained.path, trained.path.with_suffix(".json")):
+        shutil.copy(path, tmp_path)
+    path = tmp_path / trained.path.name
+    path.write_bytes(path.read_bytes()[:-4] + b"abcd")
+    with pytest.raises(ValueError, match="sha256"):
+        storing.load(path, trained.model.subject)
+
+
+def test_a_moved_and_turned_mesh_is_the_same_object(tmp_path: Path) -> None:
+    model = train(mi.load_dict(bunny()), WAX, chunks=2, recipe=QUICK, folder=tmp_path).model
+    moved = Subject.of(mi.load_dict(bunny(turn=40.0, shift=3.0)), WAX)
+    again = storing.load(storing.find_weights(moved, tmp_path), moved)
+    turn = mi.Transform4f().translate([3, 0, -3]).rotate([0.6, 0.8, 0], 40)
+    turned = [SurfacePoint(*(turn @ v for v in point)) for point in points_of(model)]
+    a, b = S_of(model), S_of(again, turned)
+    seen = a > 1e-3 * a.max()
+    assert np.median(np.abs(b[seen] / a[seen] - 1)) < 1e-3
+    with pytest.raises(ValueError, match="times as large"):
+        storing.find_weights(Subject.of(mi.load_dict(bunny(scale=1.2)), WAX), tmp_path)
+
+
+def test_the_error_leaves_noise_out() -> None:
+    rng = np.random.default_rng(5)
+    truth = 1 + rng.random((1, 256, 5))
+    found = []
+    for bias in (0.0, 0.1):
+        noisy = [truth * (1 + bias * k) + 0.05 * rng.standard_normal(truth.shape) for k in (1, 0)]
+        found.append(compare(*(Estimate(value, np.full(truth.shape, 0.05**2)) for value in noisy)))
+    assert all(row.error < max(4 * row.standard_error, 0.01) for row in found[0])
+    expected = 0.1 * np.sqrt(np.mean(truth[0] ** 2)) / truth[0].mean()
+    assert all(abs(row.error - expected) < 4 * row.standard_error for row in found[1])
+
+
+def test_the_truth_has_no_error_against_itself() -> None:
+    subject = Subject.of(ball(), WAX)
+    a, b = (reference(subject, 64, 2048, seed=1), reference(subject, 64, 2048, seed=1))
+    assert np.array_equal(a.truth.mean, b.truth.mean)
+
+
+@pytest.mark.parametrize(
+    ("bad", "message"),
+    [
+        ({"seconds": -1.0}, "seconds must be"),
+        ({"target_error": 2.0}, "target_error must be"),
+        ({"seed": -1}, "seed must"),
+    ],
+)
+def test_bad_arguments_are_refused_before_any_walk(bad: dict, message: str, tmp_path: Path) -> None:
+    with warnings.catch_warnings(), pytest.raises(ValueError, match=message):
+        warnings.simplefilter("error")
+        train(ball(), WAX, folder=tmp_path, **bad)
