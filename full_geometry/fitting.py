@@ -10,8 +10,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from full_geometry.learner import Correction, likelihood
+from full_geometry.features import n_side
+from full_geometry.learner import Correction, PatchLogits, likelihood, patch_likelihood
 from full_geometry.pairs import Pairs
+from full_geometry.patches import Patches
 from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.provenance import write_atomically
 
@@ -19,6 +21,7 @@ __all__ = ["STANDARD", "Fitting", "Recipe"]
 
 BETAS, CLIP, LAST_RATE, WARM_UP = (0.9, 0.99), 1.0, 0.01, 100
 AVERAGE = 0.998  # of the numbers, each step
+PATCH_HIDDEN, PATCH_BATCH = (64, 32), 1024
 
 
 @dataclass(frozen=True)
@@ -59,13 +62,17 @@ class Fitting:
         channels: of the medium.
         recipe: sizes and rates.
         seed: of the numbers at the start and of the order of the data.
+        patches: of the surface, for whose weights a network is fitted beside; None for a shape without faces.
     """
 
-    def __init__(self, n_in: int, channels: int, recipe: Recipe, seed: int) -> None:
-        self.recipe = recipe
-        self.module = Correction(n_in, channels, recipe.width, recipe.depth, seed)
-        self.average = copy.deepcopy(self.module)
-        self.parameters = list(self.module.parameters())
+    def __init__(self, n_in: int, channels: int, recipe: Recipe, seed: int, patches: Patches | None = None) -> None:
+        self.recipe, self.patches, self.n_side = recipe, patches, n_side(channels)
+        parts = {"S": Correction(n_in, channels, recipe.width, recipe.depth, seed)}
+        if patches is not None:
+            parts["patches"] = PatchLogits(self.n_side, patches.areas, PATCH_HIDDEN, seed)
+        self.modules = torch.nn.ModuleDict(parts)
+        self.average = copy.deepcopy(self.modules)
+        self.parameters = list(self.modules.parameters())
         self.adam = torch.optim.Adam(self.parameters, lr=recipe.rate, betas=BETAS, foreach=True)
         self.step, self.scale = 0, torch.ones(channels, 1)
 
@@ -85,22 +92,38 @@ class Fitting:
         batch = self.recipe.batch
         x, T = (torch.from_numpy(v) for v in (walks.features, walks.values))
         y, W = (torch.from_numpy(v) for v in (proposals.features, proposals.values))
+        patch = None
+        if self.patches is not None:
+            patch = torch.from_numpy(self.patches.of_face[walks.faces].astype(np.int64))
         n_x, n_y = max(T.shape[1] // batch, 1), max(W.shape[1] // batch, 1)
         kept = T.shape[1] / walks.drawn
         for _ in range(self.recipe.reuse):
             for i, j in zip(order.permutation(n_x), order.integers(0, n_y, n_x)):
                 a, b = slice(i * batch, (i + 1) * batch), slice(j * batch, (j + 1) * batch)
-                self._advance(torch.cat((x[:, a], y[:, b]), dim=1), T[:, a], W[:, b], kept, steps)
+                f = self.modules["S"](torch.cat((x[:, a], y[:, b]), dim=1))
+                loss = likelihood(f, T[:, a] * self.scale, W[:, b] * self.scale, kept)
+                if patch is not None:
+                    loss = loss + self._patch_loss(x[:, a], T[:, a], patch[a])
+                self._advance(loss, steps)
 
-    def _advance(self, x: torch.Tensor, T: torch.Tensor, W: torch.Tensor, kept: float, steps: int) -> None:
+    def _patch_loss(self, x: torch.Tensor, T: torch.Tensor, patch: torch.Tensor) -> torch.Tensor:
+        """Of a part of a batch."""
+        T = (T[:, :PATCH_BATCH] * self.scale).mean(dim=0)
+        return patch_likelihood(self.modules["patches"](x[: self.n_side, :PATCH_BATCH]), T, patch[:PATCH_BATCH])
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The averaged numbers of all networks by name."""
+        return {name: value for module in self.average.values() for name, value in module.arrays().items()}
+
+    def _advance(self, loss: torch.Tensor, steps: int) -> None:
         at = min(self.step / max(steps, 1), 1.0)
         decay = LAST_RATE + (1 - LAST_RATE) * 0.5 * (1 + math.cos(math.pi * at))
         for group in self.adam.param_groups:
             group["lr"] = self.recipe.rate * min(1.0, (self.step + 1) / WARM_UP) * decay
-        loss = likelihood(self.module(x), T * self.scale, W * self.scale, kept)
         self.adam.zero_grad(set_to_none=True)
         loss.backward()
-        torch.nn.utils.clip_grad_norm_(self.parameters, CLIP)
+        for module in self.modules.values():
+            torch.nn.utils.clip_grad_norm_(module.parameters(), CLIP)
         self.adam.step()
         self.step += 1
         with torch.no_grad():

@@ -11,7 +11,33 @@ from torch import nn
 
 from full_geometry.model import BOUND
 
-__all__ = ["Correction", "likelihood"]
+__all__ = ["Correction", "PatchLogits", "likelihood", "patch_likelihood"]
+
+
+class Layers(nn.Module):
+    """A perceptron with hard swish between its layers; 0 at the start."""
+
+    def __init__(self, sizes: list[int], generator: torch.Generator) -> None:
+        super().__init__()
+        self.matrices, self.biases = nn.ParameterList(), nn.ParameterList()
+        last = len(sizes) - 2
+        for k, (i, j) in enumerate(zip(sizes, sizes[1:])):
+            gain = math.sqrt((1.0 if k == 0 else 2.0) / i) if k < last else 0.0
+            self.matrices.append(gain * torch.randn(j, i, generator=generator))
+            self.biases.append(torch.zeros(j, 1))
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        for k, (W, b) in enumerate(zip(self.matrices, self.biases)):
+            x = torch.addmm(b, W, x)
+            if k < len(self.matrices) - 1:
+                x = nn.functional.hardswish(x)
+        return x
+
+    def arrays(self, matrix: str, bias: str) -> dict[str, np.ndarray]:
+        found: dict[str, Any] = {}
+        for k, (W, b) in enumerate(zip(self.matrices, self.biases)):
+            found |= {f"{matrix}_{k}": W.detach().numpy().copy(), f"{bias}_{k}": b.detach().numpy()[:, 0].copy()}
+        return found
 
 
 class Correction(nn.Module):
@@ -26,28 +52,15 @@ class Correction(nn.Module):
 
     def __init__(self, n_in: int, channels: int, width: int = 64, depth: int = 3, seed: int = 0) -> None:
         super().__init__()
-        generator = torch.Generator().manual_seed(seed)
-        sizes = [n_in, *[width] * depth, channels]
-        self.matrices, self.biases = nn.ParameterList(), nn.ParameterList()
-        for k, (i, j) in enumerate(zip(sizes, sizes[1:])):
-            gain = math.sqrt((1.0 if k == 0 else 2.0) / i) if k < depth else 0.0
-            self.matrices.append(gain * torch.randn(j, i, generator=generator))
-            self.biases.append(torch.zeros(j, 1))
+        self.layers = Layers([n_in, *[width] * depth, channels], torch.Generator().manual_seed(seed))
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """f (channels, n) of features (inputs, n)."""
-        for k, (W, b) in enumerate(zip(self.matrices, self.biases)):
-            x = torch.addmm(b, W, x)
-            if k < len(self.matrices) - 1:
-                x = nn.functional.hardswish(x)
-        return BOUND * torch.tanh(x / BOUND)
+        return BOUND * torch.tanh(self.layers(x) / BOUND)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Matrices (outputs, inputs) and biases by name."""
-        found: dict[str, Any] = {}
-        for k, (W, b) in enumerate(zip(self.matrices, self.biases)):
-            found |= {f"W_{k}": W.detach().numpy().copy(), f"b_{k}": b.detach().numpy()[:, 0].copy()}
-        return found
+        return self.layers.arrays("W", "b")
 
 
 def likelihood(f: torch.Tensor, walks: torch.Tensor, proposals: torch.Tensor, kept: float) -> torch.Tensor:
@@ -62,3 +75,32 @@ def likelihood(f: torch.Tensor, walks: torch.Tensor, proposals: torch.Tensor, ke
     n = walks.shape[1]
     gain = (proposals * torch.exp(f[:, n:])).mean(dim=1) - kept * (walks * f[:, :n]).mean(dim=1)
     return gain.sum()
+
+
+class PatchLogits(nn.Module):
+    """log p(patch | exit) up to a constant; shares of the area at the start.
+
+    Args:
+        n_in: features of an exit.
+        areas: of the patches.
+        hidden: widths of the hidden layers.
+        seed: of the numbers at the start.
+    """
+
+    def __init__(self, n_in: int, areas: np.ndarray, hidden: tuple[int, ...], seed: int = 0) -> None:
+        super().__init__()
+        self.layers = Layers([n_in, *hidden, len(areas)], torch.Generator().manual_seed(seed))
+        shares = np.log(np.maximum(areas / areas.sum(), 1e-30))
+        self.register_buffer("log_share", torch.from_numpy(shares.astype(np.float32))[:, None])
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return self.layers(x) + self.log_share
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Matrices (outputs, inputs) and biases by name, without the shares of the area."""
+        return self.layers.arrays("V", "c")
+
+
+def patch_likelihood(logits: torch.Tensor, T: torch.Tensor, patch: torch.Tensor) -> torch.Tensor:
+    """-E[T log p(patch of x_i | exit)] over walks, for T (n,) of one channel or a mean of them."""
+    return (T * nn.functional.cross_entropy(logits.T, patch, reduction="none")).mean()

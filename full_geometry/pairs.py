@@ -43,6 +43,7 @@ class Pairs(NamedTuple):
     features: np.ndarray
     values: np.ndarray
     drawn: int
+    faces: np.ndarray | None = None  # where walks left
 
 
 class Proposals:
@@ -99,10 +100,11 @@ class PairSource:
         exits = trace_exits(self.subject, starts, (*seed, 1))
         kept = dr.compress(dr.max(exits.T) > 0)
         if dr.width(kept) == 0:
-            return self._columns(starts, starts, dr.zeros(mi.Spectrum, n))
+            return self._columns(starts, starts, dr.zeros(mi.Spectrum, n))._replace(faces=np.zeros(n, np.uint32))
         ends = exits.at.gather(kept)
         T = dr.gather(mi.Spectrum, exits.T, kept)
-        return self._columns(starts.gather(kept), ends, T)._replace(drawn=n)
+        faces = np.array(dr.gather(mi.UInt32, exits.face, kept))
+        return self._columns(starts.gather(kept), ends, T)._replace(drawn=n, faces=faces)
 
     def proposed(self, n: int, seed: tuple[int, ...]) -> Pairs:
         """n proposals of random exits, S_0 mu_i over their density as values."""

@@ -3,22 +3,32 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from full_geometry.features import Frame
 from full_geometry.half_space import HalfSpace
 from full_geometry.identity import Identity, frame_of, identify
 from full_geometry.model import FullGeometry
+from full_geometry.patches import Patches, PatchSampler
 from full_geometry.subject import Subject
 from halfspace_sss.neural.store import load_weights, save_weights
 from halfspace_sss.neural.trained import weights_folder
 
-__all__ = ["KIND", "find_weights", "load", "save", "weights_name"]
+__all__ = ["CENTRES", "KIND", "Learnt", "assemble", "find_weights", "load", "save", "weights_name"]
 
 KIND = "full_geometry"
-LAYER = ("W_", "b_")
+S_LAYERS, PATCH_LAYERS, CENTRES = ("W_", "b_"), ("V_", "c_"), "centres"
+
+
+class Learnt(NamedTuple):
+    """What weights give: the model, and the sampler of its entries, None for a shape without faces."""
+
+    model: FullGeometry
+    sampler: PatchSampler | None
 
 
 def weights_name(identity: Identity) -> str:
@@ -68,8 +78,8 @@ def _trained(path: Path) -> tuple[Identity, dict[str, np.ndarray], dict[str, Any
     return identity, arrays, record
 
 
-def load(path: str | os.PathLike, subject: Subject) -> FullGeometry:
-    """The model of an object from its weights.
+def load(path: str | os.PathLike, subject: Subject) -> Learnt:
+    """The model of an object and its sampler from its weights.
 
     Raises:
         ValueError: the file is damaged, of another kind or version, or of another object.
@@ -80,5 +90,19 @@ def load(path: str | os.PathLike, subject: Subject) -> FullGeometry:
         frame = frame_of(subject, identity)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
-    layers = {name: value for name, value in arrays.items() if name.startswith(LAYER)}
-    return FullGeometry(subject, frame, HalfSpace(subject, record["recipe"]["backbone"]), layers)
+    return assemble(subject, frame, HalfSpace(subject, record["recipe"]["backbone"]), arrays)
+
+
+def assemble(
+    subject: Subject, frame: Frame, half_space: HalfSpace, arrays: Mapping[str, np.ndarray], patches: Any = None
+) -> Learnt:
+    """Model and sampler from the arrays of a file; `patches` are made from their centres if they are not given."""
+
+    def layers(names: tuple[str, ...]) -> dict[str, np.ndarray]:
+        return {name: value for name, value in arrays.items() if name.startswith(names)}
+
+    model = FullGeometry(subject, frame, half_space, layers(S_LAYERS))
+    if CENTRES not in arrays:
+        return Learnt(model, None)
+    patches = patches or Patches(subject, frame, arrays[CENTRES].astype(np.float32))
+    return Learnt(model, PatchSampler(frame, patches, layers(PATCH_LAYERS)))

@@ -19,6 +19,8 @@ from full_geometry.half_space import HalfSpace
 from full_geometry.identity import frame_of, identify
 from full_geometry.model import FullGeometry
 from full_geometry.pairs import PairSource, Proposals
+from full_geometry.patches import Patches, PatchSampler, cluster
+from full_geometry.storing import CENTRES, Learnt, assemble
 from full_geometry.subject import Subject
 from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.neural.store import to_json
@@ -42,6 +44,7 @@ class Trained:
 
     Args:
         model: ready to be asked.
+        sampler: of its entries; None for a shape without faces.
         path: file of its weights; None after 0 seconds.
         errors: per channel and light, at the end.
         steps: of the fit.
@@ -49,6 +52,7 @@ class Trained:
     """
 
     model: FullGeometry
+    sampler: PatchSampler | None
     path: Path | None
     errors: list[ModelError]
     steps: int
@@ -103,7 +107,7 @@ def train(
     run = _Run(subject, recipe, int(seed), Path(work) if work else None)
     if seconds == 0:
         warnings.warn("an object that is trained for 0 seconds is rendered as a half-space", stacklevel=2)
-        return Trained(run.model(), None, [], 0, 0.0)
+        return Trained(*run.learnt(), None, [], 0, 0.0)
     return run.go(seconds, chunks, target_error, Path(folder or weights_folder()), progress)
 
 
@@ -111,18 +115,32 @@ class _Run:
     """A training on its way."""
 
     def __init__(self, subject: Subject, recipe: Recipe, seed: int, work: Path | None) -> None:
+        import mitsuba as mi
+
         self.subject, self.recipe, self.seed, self.work = subject, recipe, seed, work
         self.identity, self.frame = identify(subject), frame_of(subject)
         self.half_space = HalfSpace(subject, recipe.backbone)
         self.proposals = Proposals(subject, self.half_space)
         self.source = PairSource(subject, self.frame, self.half_space, self.proposals)
-        channels = len(subject.media)
-        self.fitting = Fitting(2 * n_side(channels) + N_PAIR, channels, recipe, seed)
+        self.patches = self.centres = None
+        if "faces" in mi.traverse(subject.found.shape):
+            self.centres = cluster(subject, self.frame, seed=seed).astype(np.float16)
+            self.patches = Patches(subject, self.frame, self.centres.astype(np.float32))
+        self.fitting = self._new_fitting()
         self.done, self.walks, self.history = 0, recipe.chunk, []
 
-    def model(self) -> FullGeometry:
-        """The model as it stands."""
-        return FullGeometry(self.subject, self.frame, self.half_space, self.fitting.average.arrays())
+    def _new_fitting(self) -> Fitting:
+        channels = len(self.subject.media)
+        return Fitting(2 * n_side(channels) + N_PAIR, channels, self.recipe, self.seed, self.patches)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """What is written: everything in half precision."""
+        found = {name: value.astype(np.float16) for name, value in self.fitting.arrays().items()}
+        return found if self.centres is None else {**found, CENTRES: self.centres}
+
+    def learnt(self) -> Learnt:
+        """Model and sampler as they stand."""
+        return assemble(self.subject, self.frame, self.half_space, self.arrays(), self.patches)
 
     def go(
         self, seconds: float, chunks: int | None, target: float | None, folder: Path, progress: Progress | None
@@ -143,10 +161,12 @@ class _Run:
                 saved = time.monotonic()
             if progress:
                 progress(what, self.done, total)
-        found = errors(self.subject, self.model(), self.proposals, truth=truth, samples=2 * WALKS, seed=self.seed)
+        found = errors(
+            self.subject, self.learnt().model, self.proposals, truth=truth, samples=2 * WALKS, seed=self.seed
+        )
         spent = time.monotonic() - started
-        path = storing.save(folder, self.identity, self.fitting.average.arrays(), self._record(found, spent))
-        return Trained(self.model(), path, found, self.fitting.step, spent)
+        path = storing.save(folder, self.identity, self.arrays(), self._record(found, spent))
+        return Trained(*self.learnt(), path, found, self.fitting.step, spent)
 
     def _prepare(self) -> None:
         """Scales and shares from a pilot; the work of a run that was killed."""
@@ -168,7 +188,7 @@ class _Run:
         if place and place.exists():
             return int(json.loads(place.read_text(encoding="utf-8"))["chunks"])
         if chunks is None:
-            trial = Fitting(2 * n_side(len(self.subject.media)) + N_PAIR, len(self.subject.media), self.recipe, 0)
+            trial = self._new_fitting()
             trial.scale = self.fitting.scale
             spent = []
             for k in range(3):
@@ -191,7 +211,7 @@ class _Run:
 
     def _validated(self, truth: Reference) -> tuple[int, float, float]:
         """Chunk, largest error under constant light and its standard error."""
-        rows = errors(self.subject, self.model(), self.proposals, truth=truth, samples=SAMPLES, seed=self.seed)
+        rows = errors(self.subject, self.learnt().model, self.proposals, truth=truth, samples=SAMPLES, seed=self.seed)
         live = [r for r in rows if r.light == "constant" and float(self.subject.media[r.channel].sigma_s) > 0]
         worst = max(live, key=lambda r: r.error, default=rows[0])
         return self.done, worst.error, worst.standard_error

@@ -68,7 +68,7 @@ def test_training_halves_the_error_of_the_half_space(trained: Trained) -> None:
 
 def test_the_file_gives_the_same_model_again(trained: Trained) -> None:
     subject = Subject.of(ball(), WAX)
-    again = storing.load(storing.find_weights(subject, trained.path.parent), subject)
+    again = storing.load(storing.find_weights(subject, trained.path.parent), subject).model
     assert np.array_equal(S_of(again), S_of(trained.model))
     record = json.loads(trained.path.with_suffix(".json").read_text())
     assert record["orders"] == "multiple" and len(record["errors"]) == 6 and record["steps"] == trained.steps
@@ -154,7 +154,7 @@ def test_an_altered_file_is_refused(trained: Trained, tmp_path: Path) -> None:
 def test_a_moved_and_turned_mesh_is_the_same_object(tmp_path: Path) -> None:
     model = train(mi.load_dict(bunny()), WAX, chunks=2, recipe=QUICK, folder=tmp_path).model
     moved = Subject.of(mi.load_dict(bunny(turn=40.0, shift=3.0)), WAX)
-    again = storing.load(storing.find_weights(moved, tmp_path), moved)
+    again = storing.load(storing.find_weights(moved, tmp_path), moved).model
     turn = mi.Transform4f().translate([3, 0, -3]).rotate([0.6, 0.8, 0], 40)
     turned = [SurfacePoint(*(turn @ v for v in point)) for point in points_of(model)]
     a, b = S_of(model), S_of(again, turned)

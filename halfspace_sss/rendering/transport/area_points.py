@@ -39,13 +39,18 @@ class AreaPoints:
 
     def sample(self, u_face: Any, u: Any, active: Any) -> Point:
         """A point for uniform numbers u_face and the pair u."""
-        import drjit as dr
         import mitsuba as mi
 
         if self.faces is None:
             ps = self.shape.sample_position(0.0, u, active)
             return Point(ps.p, ps.n, ps.n, mi.UInt32(0))
-        face = self.faces.sample(u_face, active)
+        return self.on_face(self.faces.sample(u_face, active), u, active)
+
+    def on_face(self, face: Any, u: Any, active: Any = True) -> Point:
+        """A uniform point of a face of a mesh."""
+        import drjit as dr
+        import mitsuba as mi
+
         index = self.shape.face_indices(face, active)
         corners = [self.shape.vertex_position(i, active) for i in (index.x, index.y, index.z)]
         b = mi.warp.square_to_uniform_triangle(u)

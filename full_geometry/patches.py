@@ -1,0 +1,211 @@
+"""The surface of an object cut into patches, among which light is drawn by weights that are learnt.
+
+Patches are clusters of faces (k-means weighted by area) over centroid and 0.4 mean free paths times the normal, so
+that the two sides of something thin are apart. A network of the exit alone gives log p(patch | exit) up to a constant, to
+which the log of the patch's area is added. A sample is a patch by 0.9 p + 0.1 area share and a uniform point in it:
+
+    density(x | exit) = (0.9 p_k + 0.1 A_k / A) / A_k,    k the patch of x.
+
+The network is asked once for all samples of an exit, and no ray is shot.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from full_geometry.features import Frame, Side, side_features
+from full_geometry.subject import Subject
+from halfspace_sss.rendering.transport.area_points import Point
+
+__all__ = ["LEARNT_SHARE", "PATCHES", "PatchSampler", "PatchWeights", "Patches", "cluster", "mesh_faces"]
+
+PATCHES = 512
+LEARNT_SHARE = 0.9
+NORMAL_LENGTH = 0.4  # mean free paths
+ROUNDS = 12  # of k-means
+HIGHEST = 60.0  # of a logit, for the range of float32
+
+
+def mesh_faces(subject: Subject) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Centroids (n, 3), unit normals (n, 3) and areas (n,) of the faces.
+
+    Raises:
+        ValueError: the shape is no mesh.
+    """
+    import mitsuba as mi
+
+    parameters = mi.traverse(subject.found.shape)
+    if "faces" not in parameters:
+        raise ValueError(f"shape must be a mesh to be cut into patches, got {subject.found.shape.class_name()}")
+    faces = np.array(parameters["faces"]).reshape(-1, 3)
+    a, b, c = np.array(parameters["vertex_positions"], dtype=float).reshape(-1, 3)[faces].transpose(1, 0, 2)
+    cross = np.cross(b - a, c - a)
+    double = np.linalg.norm(cross, axis=1)
+    return (a + b + c) / 3, cross / np.maximum(double, 1e-30)[:, None], 0.5 * double
+
+
+def _places(subject: Subject, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
+    """What faces are clustered by, (n, 6) in the object's frame over its radius, and their areas."""
+    centroids, normals, areas = mesh_faces(subject)
+    turn = np.eye(3) if frame.turn is None else np.array([np.array(row).ravel() for row in frame.turn])
+    radius, centre = float(np.array(frame.radius).item()), np.array(frame.centre, dtype=float).ravel()
+    length = NORMAL_LENGTH / (float(np.array(frame.sigma_t).item()) * radius)
+    return np.concatenate([(centroids - centre) @ turn.T / radius, length * normals @ turn.T], axis=1), areas
+
+
+def cluster(subject: Subject, frame: Frame, n: int = PATCHES, seed: int = 0) -> np.ndarray:
+    """Centres of at most n patches, (n, 6), in the frame of the object."""
+    from scipy.spatial import cKDTree
+
+    x, areas = _places(subject, frame)
+    rng = np.random.default_rng(seed)
+    n = min(n, int(np.count_nonzero(areas)))
+    centres = x[rng.choice(len(x), n, replace=False, p=areas / areas.sum())]
+    for _ in range(ROUNDS):
+        nearest = cKDTree(centres).query(x)[1]
+        mass = np.bincount(nearest, areas, n)
+        sums = np.stack([np.bincount(nearest, areas * column, n) for column in x.T], axis=1)
+        centres = np.where(mass[:, None] > 0, sums / np.maximum(mass, 1e-30)[:, None], centres)
+    return centres.astype(np.float32)
+
+
+class Patches:
+    """Faces by patch, and uniform points of a patch.
+
+    Args:
+        subject: the object, a mesh.
+        frame: its frame.
+        centres: from `cluster`, of this object or of the one that was trained.
+    """
+
+    def __init__(self, subject: Subject, frame: Frame, centres: np.ndarray) -> None:
+        import drjit as dr
+        import mitsuba as mi
+        from scipy.spatial import cKDTree
+
+        x, areas = _places(subject, frame)
+        self.subject, self.n = subject, len(centres)
+        self.of_face = cKDTree(centres).query(x)[1].astype(np.uint32)
+        self.areas = np.bincount(self.of_face, areas, self.n)
+        order = np.argsort(self.of_face, kind="stable")
+        ends = np.searchsorted(self.of_face[order], np.arange(self.n + 1))
+        # areas summed within each patch alone: over the whole mesh float32 would lose the small faces
+        sums = np.cumsum(areas[order])
+        first = np.concatenate([[0.0], sums])[ends[:-1]]
+        within = (sums - np.repeat(first, np.diff(ends))).astype(np.float32)
+        self.tables = {
+            "patch": mi.UInt32(self.of_face), "face": mi.UInt32(order.astype(np.uint32)), "within": mi.Float(within),
+            "start": mi.UInt32(ends.astype(np.uint32)), "area": mi.Float(self.areas.astype(np.float32)),
+            "share": mi.Float((self.areas / self.areas.sum()).astype(np.float32)),
+            "upto": mi.Float(np.cumsum(self.areas / self.areas.sum()).astype(np.float32)),
+        }  # fmt: skip
+        dr.eval(self.tables)
+
+    def row(self, key: str, k: Any) -> Any:
+        """An entry of a table."""
+        import drjit as dr
+
+        return dr.gather(type(self.tables[key]), self.tables[key], k)
+
+    def point(self, patch: Any, u_face: Any, u: Any) -> Point:
+        """A uniform point of a patch."""
+        import drjit as dr
+        import mitsuba as mi
+
+        low, high = self.row("start", patch), self.row("start", patch + 1)
+        goal = u_face * self.row("area", patch)
+
+        def before(i: Any) -> Any:
+            i = mi.UInt32(i)
+            return (i < low) | ((i + 1 < high) & (self.row("within", i) <= goal))
+
+        k = dr.binary_search(0, len(self.of_face), before)
+        return self.subject.points.on_face(self.row("face", mi.UInt32(k)), u)
+
+
+class PatchWeights(NamedTuple):
+    """Sums of the learnt weights of an exit up to each patch, in memory of the lane, and the last of them."""
+
+    cumulative: Any
+    total: Any
+
+
+@dataclass(frozen=True, eq=False)
+class PatchSampler:
+    """Points of entry by learnt weights of patches.
+
+    Args:
+        frame: of the object.
+        patches: of its surface.
+        weights: V_k (outputs, inputs) and c_k of the layers; the last has one output for each patch.
+    """
+
+    frame: Frame
+    patches: Patches
+    weights: Mapping[str, np.ndarray]
+
+    @functools.cached_property
+    def _views(self) -> tuple:
+        import mitsuba as mi
+        from drjit import nn
+
+        n = len(self.weights) // 2
+        biases = [self.weights[f"c_{k}"].astype(np.float32) for k in range(n)]
+        areas = self.patches.areas
+        biases[-1] = biases[-1] + np.log(np.maximum(areas / areas.sum(), 1e-30)).astype(np.float32)
+        matrices = [np.ascontiguousarray(self.weights[f"V_{k}"], dtype=np.float32) for k in range(n)]
+        return nn.pack(*map(mi.TensorXf, matrices), *map(mi.Float, biases))[-2 * n :]
+
+    def prepare(self, exit: Side) -> PatchWeights:
+        """Weights of all patches for an exit."""
+        import drjit as dr
+        import mitsuba as mi
+        from drjit import nn
+
+        n, x = len(self.weights) // 2, nn.CoopVec(*side_features(self.frame, exit))
+        for k in range(n):
+            x = nn.matvec(self._views[k], x, self._views[n + k])
+            if k < n - 1:
+                x = x * dr.clip(x * (1 / 6) + 0.5, 0, 1)
+        sums = dr.alloc_local(mi.Float, self.patches.n)
+        for k, logit in enumerate(x):
+            sums[mi.UInt32(k)] = dr.minimum(logit, HIGHEST)
+
+        def add(k: Any, total: Any, sums: Any) -> tuple:
+            total = total + dr.exp(sums[k])
+            sums[k] = total
+            return k + 1, total, sums
+
+        state = (mi.UInt32(0), mi.Float(0), sums)
+        _, total, sums = dr.while_loop(state, lambda k, *_: k < self.patches.n, add, label="patch weights")
+        return PatchWeights(sums, total)
+
+    def sample(self, exit: PatchWeights, u_patch: Any, u_face: Any, u: Any) -> tuple[Point, Any]:
+        """A point of entry and its density, 1/(scene unit)², for uniform numbers u_patch, u_face and the pair u."""
+        import drjit as dr
+        import mitsuba as mi
+
+        learnt, last = u_patch < LEARNT_SHARE, self.patches.n - 1
+        u_1, u_2 = u_patch / LEARNT_SHARE * exit.total, (u_patch - LEARNT_SHARE) / (1 - LEARNT_SHARE)
+        by_weight = dr.binary_search(0, last, lambda i: exit.cumulative[mi.UInt32(i)] <= u_1)
+        by_area = dr.binary_search(0, last, lambda i: self.patches.row("upto", mi.UInt32(i)) <= u_2)
+        patch = dr.select(learnt, mi.UInt32(by_weight), mi.UInt32(by_area))
+        return self.patches.point(patch, u_face, u), self._share(exit, patch) / self.patches.row("area", patch)
+
+    def density(self, exit: PatchWeights, face: Any) -> Any:
+        """Density of `sample` on a face, 1/(scene unit)²."""
+        patch = self.patches.row("patch", face)
+        return self._share(exit, patch) / self.patches.row("area", patch)
+
+    def _share(self, exit: PatchWeights, patch: Any) -> Any:
+        import drjit as dr
+        import mitsuba as mi
+
+        before = dr.select(patch > 0, exit.cumulative[dr.maximum(patch, 1) - 1], mi.Float(0))
+        learnt = (exit.cumulative[patch] - before) / exit.total
+        return LEARNT_SHARE * learnt + (1 - LEARNT_SHARE) * self.patches.row("share", patch)

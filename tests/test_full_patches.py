@@ -1,0 +1,149 @@
+"""Patches of a surface and the sampler of entries: cover, densities, what is learnt.
+
+A chi-square test fails at 1e-3, with fixed seeds.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from halfspace_sss import Medium
+
+mi = pytest.importorskip("mitsuba")
+dr = pytest.importorskip("drjit")
+pytest.importorskip("torch")
+
+from full_geometry.features import Side, n_side  # noqa: E402
+from full_geometry.first_event import first_event  # noqa: E402
+from full_geometry.fitting import Recipe  # noqa: E402
+from full_geometry.identity import frame_of  # noqa: E402
+from full_geometry.patches import Patches, PatchSampler, cluster, mesh_faces  # noqa: E402
+from full_geometry.subject import Subject  # noqa: E402
+from full_geometry.training import train  # noqa: E402
+from halfspace_sss.tracing.walk import _generator, pass_seed  # noqa: E402
+
+BUNNY = Path(__file__).parent.parent / "figures" / "assets" / "bunny.ply"
+WAX = Medium(np.array([0.95, 0.8, 0.6]), np.array([0.05, 0.2, 0.4]), 0.0, 1.4)
+N_PATCHES = 64
+
+
+@pytest.fixture(autouse=True)
+def variant() -> None:
+    mi.set_variant("llvm_ad_rgb")
+
+
+@pytest.fixture(scope="module")
+def subject() -> Subject:
+    mi.set_variant("llvm_ad_rgb")
+    return Subject.of(mi.load_dict({"type": "ply", "filename": str(BUNNY)}), WAX)
+
+
+@pytest.fixture(scope="module")
+def sampler(subject: Subject) -> PatchSampler:
+    """With random weights: densities hold for any."""
+    frame = frame_of(subject)
+    patches = Patches(subject, frame, cluster(subject, frame, N_PATCHES))
+    rng, weights = np.random.default_rng(2), {}
+    for k, (i, j) in enumerate([(n_side(3), 16), (16, N_PATCHES)]):
+        weights |= {f"V_{k}": rng.standard_normal((j, i)) / np.sqrt(i), f"c_{k}": rng.standard_normal(j)}
+    return PatchSampler(frame, patches, weights)
+
+
+def one_exit(subject: Subject, lanes: int) -> Side:
+    point = subject.random_points(_generator(mi, 1, pass_seed(4)))
+    at = point.gather(dr.zeros(mi.UInt32, lanes))
+    return Side(at, first_event(subject, at))
+
+
+def draws(subject: Subject, sampler: PatchSampler, n: int = 2**17) -> tuple:
+    rng = _generator(mi, n, pass_seed(9))
+    weights = sampler.prepare(one_exit(subject, n))
+    u = (rng.next_float32(), rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32()))
+    point, density = sampler.sample(weights, *u)
+    return point, density, sampler.density(weights, point.prim_index)
+
+
+def chi_square(counts: np.ndarray, expected: np.ndarray) -> float:
+    keep = expected >= 10
+    observed, wanted = np.append(counts[keep], counts[~keep].sum()), np.append(expected[keep], expected[~keep].sum())
+    some = wanted > 0
+    chi2 = np.sum((observed[some] - wanted[some]) ** 2 / wanted[some])
+    return float(stats.chi2.sf(chi2, some.sum() - 1))
+
+
+def test_every_face_is_in_one_patch_and_areas_add_up(subject: Subject, sampler: PatchSampler) -> None:
+    areas = mesh_faces(subject)[2]
+    assert len(sampler.patches.of_face) == len(areas) and sampler.patches.of_face.max() < N_PATCHES
+    assert np.isclose(sampler.patches.areas.sum(), areas.sum(), rtol=1e-6)
+
+
+def test_faces_are_drawn_by_their_density(subject: Subject, sampler: PatchSampler) -> None:
+    point, _, _ = draws(subject, sampler)
+    faces, areas = np.array(point.prim_index), mesh_faces(subject)[2]
+    n = len(areas)
+    weights = sampler.prepare(one_exit(subject, n))
+    density = np.array(sampler.density(weights, dr.arange(mi.UInt32, n)))
+    assert np.isclose(np.sum(density * areas), 1, atol=1e-4)
+    assert chi_square(np.bincount(faces, minlength=n), len(faces) * density * areas) > 1e-3
+
+
+def test_the_density_of_a_sample_is_that_of_its_face(subject: Subject, sampler: PatchSampler) -> None:
+    _, density, again = draws(subject, sampler, 4096)
+    assert np.allclose(np.array(density), np.array(again), rtol=1e-4) and np.all(np.array(density) > 0)
+
+
+def test_samples_lie_on_their_face(subject: Subject, sampler: PatchSampler) -> None:
+    point, _, _ = draws(subject, sampler, 4096)
+    centroids, normals, _ = mesh_faces(subject)
+    face = np.array(point.prim_index)
+    off = np.sum((np.array(point.p).T - centroids[face]) * normals[face], axis=1)
+    assert np.abs(off).max() < 1e-4 * subject.found.size
+    assert np.allclose(np.array(point.n).T, normals[face], atol=1e-3)
+
+
+def test_the_two_sides_of_a_thin_plate_are_apart() -> None:
+    plate = mi.load_dict({"type": "cube", "to_world": mi.ScalarTransform4f().scale([3, 3, 0.01])})
+    found = Subject.of(plate, WAX)
+    frame = frame_of(found)
+    patches = Patches(found, frame, cluster(found, frame, 6))
+    normals = mesh_faces(found)[1]
+    up, down = (set(patches.of_face[np.sign(normals[:, 2].round()) == side]) for side in (1, -1))
+    assert not up & down
+
+
+def test_a_shape_without_faces_has_no_patches() -> None:
+    ball = Subject.of(mi.load_dict({"type": "sphere"}), WAX)
+    with pytest.raises(ValueError, match="must be a mesh"):
+        cluster(ball, frame_of(ball))
+
+
+def test_learnt_weights_lower_the_variance_below_that_of_uniform_points(subject: Subject, tmp_path: Path) -> None:
+    recipe = Recipe(width=24, depth=2, batch=1024, chunk=2**14, reuse=4)
+    found = train(subject.found.shape, WAX.scaled(1.5), chunks=6, recipe=recipe, folder=tmp_path)
+    assert sum(path.stat().st_size for path in tmp_path.glob("*.safetensors")) < 100_000
+    inside, n = found.model.subject, 2**15
+    rng = _generator(mi, n, pass_seed(5))
+    exits = inside.random_points(_generator(mi, 64, pass_seed(6))).gather(dr.arange(mi.UInt32, n) // (n // 64))
+    prepared = found.model.prepare(exits)
+    weights = found.sampler.prepare(prepared.side)
+    u = (rng.next_float32(), rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32()))
+    point, density = found.sampler.sample(weights, *u)
+    at = entry_at(inside, point, rng)
+    estimates = [np.array(found.model.S(prepared, at))[0] * np.pi / np.array(density)]
+    uniform = inside.random_points(rng)
+    estimates.append(np.array(found.model.S(prepared, uniform))[0] * np.pi * inside.found.area)
+    learnt, flat = (v.reshape(64, -1) for v in estimates)
+    spread = [np.mean(v.var(axis=1) / v.mean(axis=1).clip(1e-9) ** 2) for v in (learnt, flat)]
+    assert spread[0] < 0.5 * spread[1]
+    assert abs(learnt.mean() / flat.mean() - 1) < 0.1
+
+
+def entry_at(subject: Subject, point, rng):
+    from full_geometry.subject import SurfacePoint, cosine_direction
+
+    n_out = point.n_shading * subject.found.sign
+    return SurfacePoint(point.p, point.n * subject.found.sign, n_out, cosine_direction(n_out, rng))
