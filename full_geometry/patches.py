@@ -1,8 +1,8 @@
 """The surface of an object cut into patches, among which light is drawn by weights that are learnt.
 
 Patches are clusters of faces (k-means weighted by area) over centroid and 0.4 mean free paths times the normal, so
-that the two sides of something thin are apart. A network of the exit alone gives log p(patch | exit) up to a constant, to
-which the log of the patch's area is added. A sample is a patch by 0.9 p + 0.1 area share and a uniform point in it:
+that the two sides of something thin are apart. A network of the exit alone gives log p(patch | exit) up to a constant,
+to which the log of the patch's area is added. A sample is a patch by 0.9 p + 0.1 area share and a uniform point in it:
 
     density(x | exit) = (0.9 p_k + 0.1 A_k / A) / A_k,    k the patch of x.
 

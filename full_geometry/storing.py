@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from full_geometry.features import Frame
-from full_geometry.half_space import HalfSpace
+from full_geometry.half_space import HalfSpace, HalfSpaceTransport
 from full_geometry.identity import Identity, frame_of, identify
 from full_geometry.model import FullGeometry
 from full_geometry.patches import Patches, PatchSampler
@@ -18,7 +18,7 @@ from full_geometry.subject import Subject
 from halfspace_sss.neural.store import load_weights, save_weights
 from halfspace_sss.neural.trained import weights_folder
 
-__all__ = ["CENTRES", "KIND", "Learnt", "assemble", "find_weights", "load", "save", "weights_name"]
+__all__ = ["CENTRES", "KIND", "Learnt", "assemble", "find_weights", "load", "save", "transport", "weights_name"]
 
 KIND = "full_geometry"
 S_LAYERS, PATCH_LAYERS, CENTRES = ("W_", "b_"), ("V_", "c_"), "centres"
@@ -91,6 +91,17 @@ def load(path: str | os.PathLike, subject: Subject) -> Learnt:
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
     return assemble(subject, frame, HalfSpace(subject, record["recipe"]["backbone"]), arrays)
+
+
+def transport(subject: Subject, model: str, folder: str | os.PathLike | None = None) -> Any:
+    """The transport called `model` of an object: "full_geometry", or a half-space model.
+
+    Raises:
+        ValueError: the object has not been trained, or there is no such model.
+    """
+    if model == KIND:
+        return load(find_weights(subject, folder), subject).model
+    return HalfSpaceTransport(subject, model)
 
 
 def assemble(

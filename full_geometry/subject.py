@@ -76,6 +76,27 @@ class Subject:
         boundary = mi.load_dict({"type": "dielectric", "int_ior": medium.eta, "ext_ior": 1.0})
         return cls(survey(shape), media, boundary, AreaPoints(shape))
 
+    @classmethod
+    def given(cls, shape: Any, medium: Medium | None, mm_per_unit: float = 1.0, name: str | None = None) -> Subject:
+        """The object of a shape and a medium, or the one called `name` in a scene.
+
+        Raises:
+            ValueError: a scene has no such object with a smooth `translucent` surface, a medium is missing, or as `of`.
+        """
+        import mitsuba as mi
+
+        if not isinstance(shape, mi.Scene):
+            return cls.of(shape, medium, mm_per_unit)
+        known = {s.id(): s for s in shape.shapes() if hasattr(s.bsdf(), "inside")}
+        if name is None and len(known) == 1:
+            name = next(iter(known))
+        if name not in known:
+            raise ValueError(f"object must be one of {', '.join(known) or 'none'}, got {name!r}")
+        surface = known[name].bsdf()
+        if surface.boundary.flags() & int(mi.BSDFFlags.Smooth):
+            raise ValueError(f"the boundary of {name!r} must be smooth to be learnt, got a rough one")
+        return cls.of(known[name], surface.inside.medium, mm_per_unit)
+
     @property
     def eta(self) -> float:
         """Relative index."""

@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 
 from full_geometry import storing
-from full_geometry.errors import ModelError, Reference, errors, reference
 from full_geometry.features import N_PAIR, n_side
 from full_geometry.fitting import STANDARD, Fitting, Recipe
 from full_geometry.half_space import HalfSpace
 from full_geometry.identity import frame_of, identify
 from full_geometry.model import FullGeometry
+from full_geometry.model_errors import ModelError, Reference, measure, reference
 from full_geometry.pairs import PairSource, Proposals
 from full_geometry.patches import Patches, PatchSampler, cluster
 from full_geometry.storing import CENTRES, Learnt, assemble
@@ -61,9 +61,10 @@ class Trained:
 
 def train(
     shape: Any,
-    medium: Medium,
+    medium: Medium | None = None,
     *,
     mm_per_unit: float = 1.0,
+    object: str | None = None,
     seconds: float = 60.0,
     target_error: float | None = None,
     seed: int = 0,
@@ -79,9 +80,11 @@ def train(
     again with the same `work` ends with the same weights; a machine that slows down on the way takes longer.
 
     Args:
-        shape: a closed Mitsuba shape.
-        medium: 1/mm, scalar or with one value per channel of the variant.
+        shape: a closed Mitsuba shape, or a scene.
+        medium: 1/mm, scalar or with one value per channel of the variant; of a scene it is that of the object's
+            `translucent` surface.
         mm_per_unit: length of a scene unit, mm.
+        object: id of the object in a scene; may be left out where there is one.
         seconds: for data, fit and validation, after the kernels are compiled; 0 gives the half-space, with a warning.
         target_error: stop once the largest error under constant light has come down to it.
         seed: of everything.
@@ -103,7 +106,7 @@ def train(
     for place in (folder or weights_folder(), work):
         if place is not None:
             check_folder(place)
-    subject = Subject.of(shape, medium, mm_per_unit)
+    subject = Subject.given(shape, medium, mm_per_unit, object)
     run = _Run(subject, recipe, int(seed), Path(work) if work else None)
     if seconds == 0:
         warnings.warn("an object that is trained for 0 seconds is rendered as a half-space", stacklevel=2)
@@ -161,7 +164,7 @@ class _Run:
                 saved = time.monotonic()
             if progress:
                 progress(what, self.done, total)
-        found = errors(
+        found = measure(
             self.subject, self.learnt().model, self.proposals, truth=truth, samples=2 * WALKS, seed=self.seed
         )
         spent = time.monotonic() - started
@@ -211,7 +214,7 @@ class _Run:
 
     def _validated(self, truth: Reference) -> tuple[int, float, float]:
         """Chunk, largest error under constant light and its standard error."""
-        rows = errors(self.subject, self.learnt().model, self.proposals, truth=truth, samples=SAMPLES, seed=self.seed)
+        rows = measure(self.subject, self.learnt().model, self.proposals, truth=truth, samples=SAMPLES, seed=self.seed)
         live = [r for r in rows if r.light == "constant" and float(self.subject.media[r.channel].sigma_s) > 0]
         worst = max(live, key=lambda r: r.error, default=rows[0])
         return self.done, worst.error, worst.standard_error

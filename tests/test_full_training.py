@@ -15,14 +15,16 @@ from halfspace_sss import Medium
 mi = pytest.importorskip("mitsuba")
 pytest.importorskip("torch")
 
+import full_geometry  # noqa: E402
 from full_geometry import storing, training  # noqa: E402
-from full_geometry.errors import LIGHTS, Estimate, compare, errors, reference  # noqa: E402
 from full_geometry.fitting import Recipe  # noqa: E402
 from full_geometry.half_space import HalfSpace, HalfSpaceTransport  # noqa: E402
 from full_geometry.model import FullGeometry  # noqa: E402
+from full_geometry.model_errors import LIGHTS, Estimate, compare, measure, reference  # noqa: E402
 from full_geometry.pairs import Proposals  # noqa: E402
 from full_geometry.subject import Subject, SurfacePoint  # noqa: E402
 from full_geometry.training import Trained, train  # noqa: E402
+from halfspace_sss import rendering  # noqa: E402
 from halfspace_sss.tracing.walk import _generator, pass_seed  # noqa: E402
 
 QUICK = Recipe(width=24, depth=2, batch=1024, chunk=2**14, reuse=4)
@@ -61,7 +63,7 @@ def constant(found: list) -> np.ndarray:
 def test_training_halves_the_error_of_the_half_space(trained: Trained) -> None:
     subject = trained.model.subject
     proposals = Proposals(subject, HalfSpace(subject, "better_dipole"))
-    plane = errors(subject, HalfSpaceTransport(subject, "better_dipole"), proposals, samples=1024)
+    plane = measure(subject, HalfSpaceTransport(subject, "better_dipole"), proposals, samples=1024)
     assert np.all(constant(trained.errors) < 0.5 * constant(plane))
     assert all(abs(row.ratio - 1) < 0.03 for row in trained.errors)
 
@@ -194,3 +196,27 @@ def test_bad_arguments_are_refused_before_any_walk(bad: dict, message: str, tmp_
     with warnings.catch_warnings(), pytest.raises(ValueError, match=message):
         warnings.simplefilter("error")
         train(ball(), WAX, folder=tmp_path, **bad)
+
+
+def test_errors_of_models_are_asked_by_name(trained: Trained) -> None:
+    few = {"exits": 32, "walks": 512, "samples": 512}
+    rows = full_geometry.errors(ball(), WAX, folder=trained.path.parent, **few)
+    assert [(r.channel, r.light) for r in rows] == [(c, light) for c in range(3) for light in LIGHTS]
+    plane = full_geometry.errors(ball(), WAX, "better_dipole", **few)
+    assert np.all(constant(rows) < constant(plane))
+    with pytest.raises(ValueError, match="model must be one of"):
+        full_geometry.errors(ball(), WAX, "no_such_model", **few)
+
+
+def test_an_object_of_a_scene_is_found_by_its_id() -> None:
+    rendering.register()
+    surface = {"type": "translucent", "sigma_s": "0.95,0.8,0.6", "sigma_a": "0.05,0.2,0.4", "eta": 1.4}
+    one, two = ({"type": "sphere", "radius": r, "bsdf": surface} for r in (1.0, 2.0))
+    scene = mi.load_dict({"type": "scene", "one": one, "two": two})
+    with pytest.raises(ValueError, match="one of one, two, got None"):
+        Subject.given(scene, None)
+    found = Subject.given(scene, None, 2.0, "two")
+    assert np.isclose(found.found.area, 16 * np.pi) and np.isclose(float(found.media[0].sigma_t), 2.0)
+    rough = {**surface, "boundary": {"type": "roughdielectric", "alpha": 0.2, "int_ior": 1.4, "ext_ior": 1.0}}
+    with pytest.raises(ValueError, match="must be smooth"):
+        Subject.given(mi.load_dict({"type": "scene", "one": {**one, "bsdf": rough}}), None)

@@ -10,23 +10,27 @@ for lobes the mean of the four; its standard error by the jackknife over exits.
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from full_geometry.exits import trace_exits
+from full_geometry.half_space import HalfSpace
 from full_geometry.pairs import Proposals
 from full_geometry.subject import Subject, SurfacePoint
 from halfspace_sss.checks import check_count
+from halfspace_sss.physics.medium import Medium
 from halfspace_sss.tracing.walk import _generator, pass_seed
 
-__all__ = ["LIGHTS", "ModelError", "Reference", "Transport", "compare", "errors", "reference"]
+__all__ = ["LIGHTS", "ModelError", "Reference", "Transport", "compare", "errors", "measure", "reference"]
 
 LIGHTS = ("constant", "lobes")
 LOBES = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / np.sqrt(3.0)
 POWER = 16
 LANES = 2**20  # of one pass
+PROBES = "better_dipole"  # whose radial density entries follow
 
 
 class Transport(Protocol):
@@ -176,7 +180,7 @@ def _jackknife(square: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
     return error, spread / (2 * max(error, np.sqrt(spread), 1e-12))
 
 
-def errors(
+def measure(
     subject: Subject,
     transport: Transport,
     proposals: Proposals,
@@ -185,7 +189,7 @@ def errors(
     samples: int = 8192,
     seed: int = 0,
 ) -> list[ModelError]:
-    """The error of a model of an object, per channel, under constant light and lobes.
+    """The error of a transport of an object, per channel, under constant light and lobes.
 
     Args:
         subject: the object.
@@ -194,9 +198,46 @@ def errors(
         truth: from `reference`; made anew by default.
         samples: entries of each exit.
         seed: of everything.
-
-    Source: this project; the exits, lights and the removal of noise are those of the recorded prototypes.
     """
     check_count("samples", samples, 2)
     truth = truth or reference(subject, seed=seed)
     return compare(modelled(transport, proposals, truth.exits, samples, seed), truth.truth)
+
+
+def errors(
+    shape: Any,
+    medium: Medium | None = None,
+    model: str = "full_geometry",
+    *,
+    mm_per_unit: float = 1.0,
+    object: str | None = None,
+    folder: str | os.PathLike | None = None,
+    exits: int = 256,
+    walks: int = 8192,
+    samples: int = 8192,
+    seed: int = 0,
+) -> list[ModelError]:
+    """The error of a model of an object, by name: what a user is to expect of images before the first one.
+
+    Orders two and more; single scattering is exact beside every model.
+
+    Args:
+        shape: a Mitsuba shape, or a scene.
+        medium: 1/mm; of a scene it is that of the object's `translucent` surface.
+        model: "full_geometry", whose weights must have been trained, or the name of a half-space model.
+        mm_per_unit: length of a scene unit, mm.
+        object: id of the object in a scene; may be left out where there is one.
+        folder: of weights.
+        exits: number of exits.
+        walks, samples: of each exit, for the truth and for the model.
+        seed: of everything.
+
+    Raises:
+        ValueError: an argument is out of range, the object has not been trained, or there is no such model.
+    """
+    from full_geometry.storing import transport
+
+    subject = Subject.given(shape, medium, mm_per_unit, object)
+    found = transport(subject, model, folder)
+    proposals = Proposals(subject, HalfSpace(subject, PROBES))
+    return measure(subject, found, proposals, truth=reference(subject, exits, walks, seed), samples=samples, seed=seed)
