@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from halfspace_sss.rendering.paths import trace_paths
-from halfspace_sss.rendering.surface.object import same_objects
-from halfspace_sss.rendering.transport.body import make_bodies
+from halfspace_sss.rendering.differentiable import check_parameters, replayer
+from halfspace_sss.rendering.paths import replay_paths, trace_paths
+from halfspace_sss.rendering.transport.body import Bodies
 from halfspace_sss.rendering.transport.settings import read_settings
 
 __all__ = ["integrator_class"]
@@ -14,27 +14,52 @@ __all__ = ["integrator_class"]
 
 def integrator_class() -> type:
     """The class of the integrator for the current variant of Mitsuba."""
+    import drjit as dr
     import mitsuba as mi
 
     class BSSRDFIntegrator(mi.SamplingIntegrator):
-        """Renders scenes with `translucent` objects; parameters as in `Settings`."""
+        """Renders scenes with `translucent` objects; parameters as in `Settings`.
+
+        Images can be differentiated by emitters, surfaces, textures and the medium of each object (`albedo`, `sigma_t`,
+        `g`), forward and backward; where paths go is held, and derivatives by geometry are refused.
+        """
 
         def __init__(self, props: Any) -> None:
             mi.SamplingIntegrator.__init__(self, props)
             self.settings = read_settings(props)
-            self._prepared: tuple[list, list] = ([], [])
+            self._bodies = Bodies(self.settings)
 
         def prepare(self, scene: Any) -> list[Any]:
             """The translucent objects of a scene, made ready once; ValueError if the scene cannot be rendered."""
-            shapes = scene.shapes()  # the scene itself, which holds its integrator, would never be freed
-            if not self._prepared[1] or not same_objects(self._prepared[0], shapes):
-                self._prepared = shapes, make_bodies(scene, self.settings)
-            return self._prepared[1]
+            check_parameters(scene)
+            with dr.suspend_grad():
+                return self._bodies.of(scene)
+
+        def render(self, scene: Any, *args: Any, **more: Any) -> Any:
+            self.prepare(scene)
+            with dr.suspend_grad():
+                return super().render(scene, *args, **more)
+
+        def render_forward(self, scene: Any, *args: Any, **more: Any) -> Any:
+            return self._replayer(scene).render_forward(scene, *args, **more)
+
+        def render_backward(self, scene: Any, *args: Any, **more: Any) -> None:
+            self._replayer(scene).render_backward(scene, *args, **more)
+
+        def _replayer(self, scene: Any) -> Any:
+            bodies = self.prepare(scene)
+            for body in bodies:
+                body.variation.prepare()
+            return replayer(
+                lambda scene, *path: trace_paths(scene, bodies, self.settings, *path),
+                lambda scene, *path: replay_paths(scene, bodies, self.settings, *path),
+            )
 
         def sample(
             self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Any = True
         ) -> tuple[Any, Any, list]:
-            L, seen = trace_paths(scene, self.prepare(scene), self.settings, sampler, ray, active)
+            with dr.suspend_grad():
+                L, seen = trace_paths(scene, self._bodies.of(scene), self.settings, sampler, ray, active)
             return L, seen, []
 
         def to_string(self) -> str:

@@ -29,6 +29,7 @@ class Object:
         pieces: UInt32 array of the connected piece of each face, or None if there is one piece.
         size: diagonal of the bounding box, scene units.
         area: scene units squared.
+        geometry: what it was surveyed with, from `_geometry`.
     """
 
     shape: Any
@@ -40,6 +41,11 @@ class Object:
     pieces: Any
     size: float
     area: float
+    geometry: Any
+
+    def is_current(self) -> bool:
+        """Whether the shape still is as it was surveyed."""
+        return _geometry(self.shape)[0] == self.geometry[0]
 
     def piece(self, prim_index: Any, active: Any) -> Any:
         """The number of the piece that a face belongs to."""
@@ -113,7 +119,23 @@ def survey(shape: Any) -> Object:
     area = float(np.sum(np.array(shape.surface_area())))
     closed, sign = odd == 0 and not sheet, -1.0 if share <= 1 - MAJORITY else 1.0
     signs = votes.signs() if closed else None
-    return Object(shape, scene, sign, signs, float(votes.opposed[0]) == 0, closed, pieces, size, area)
+    return Object(shape, scene, sign, signs, float(votes.opposed[0]) == 0, closed, pieces, size, area,
+                  _geometry(shape))  # fmt: skip
+
+
+def _geometry(shape: Any) -> tuple[list, list]:
+    """What tells one geometry of a shape from the next, and the arrays that it tells of, kept so that none is reused."""
+    import drjit as dr
+    import mitsuba as mi
+
+    found, kept = [], []
+    for key, value in mi.traverse(shape).items():
+        if key in ("vertex_positions", "vertex_normals", "faces", "grid"):
+            kept.append(dr.detach(value))
+            found.append((key, dr.detail.collect_indices(kept[-1])))
+        elif key == "to_world":
+            found.append((key, np.array(dr.detach(value).matrix).tobytes()))
+    return found, kept
 
 
 class _Votes:

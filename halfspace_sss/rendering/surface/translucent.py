@@ -22,12 +22,13 @@ Parameters, all optional but the medium:
         medium; by default smooth.
     reflection: whether the boundary reflects light, by default true.
 
+`mitsuba.traverse` shows `albedo`, `sigma_t` (1/mm) and `g` of each channel, and the parameters of the boundary.
 To an integrator that knows nothing of the inside, the surface shows its reflection only.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -40,9 +41,10 @@ from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.surface.parameters import check_parameters
 from halfspace_sss.rendering.surface.variants import variant_channels
 
-__all__ = ["ORDERS", "Inside", "translucent_class"]
+__all__ = ["ORDERS", "VARIABLE", "Inside", "translucent_class"]
 
 ORDERS = ("total", "multiple", "single")
+VARIABLE = ("albedo", "sigma_t", "g")  # by which light can be differentiated
 PARAMETERS = (
     "material", "sigma_s", "sigma_a", "g", "eta", "model", "orders", "channel", "dilution", "reflection",
 )  # fmt: skip
@@ -71,6 +73,22 @@ class Inside:
         n = self.medium.n_channels
         return [self.medium] if n is None else [self.medium.channel(k) for k in range(n)]
 
+    def changed(self, **values: np.ndarray) -> Inside:
+        """The same with another medium; numbers that are the same in single precision are kept as they are.
+
+        Args:
+            values: `albedo`, `sigma_t` (1/mm) and `g`, one for each channel.
+        """
+        m, n = self.medium, self.medium.n_channels
+        old = {name: np.atleast_1d(getattr(m, name)) for name in values}
+        kept = {name: np.float32(old[name]) == np.float32(value) for name, value in values.items()}
+        if all(same.all() for same in kept.values()):
+            return self
+        new = {name: np.where(kept[name], old[name], value) for name, value in values.items()}
+        if n is None:
+            new = {name: float(value[0]) for name, value in new.items()}
+        return replace(self, label="medium", medium=Medium.from_albedo(**new, eta=m.eta))
+
 
 def translucent_class() -> type:
     """The class of the surface for the current variant of Mitsuba."""
@@ -86,6 +104,25 @@ def translucent_class() -> type:
             self.lobe = _reflection_lobe(self.boundary)
             self.m_components = [self.boundary.flags(self.lobe)]
             self.m_flags = self.m_components[0]
+            self._expose()
+
+        def _expose(self) -> None:
+            """The parameters of the medium as arrays that can be changed and differentiated by."""
+            medium = self.inside.medium
+            for name in VARIABLE:
+                setattr(self, name, mi.Spectrum(np.atleast_1d(getattr(medium, name)).astype(float).tolist()))
+
+        def traverse(self, callback: Any) -> None:
+            for name in VARIABLE:
+                callback.put(name, getattr(self, name), mi.ParamFlags.Differentiable)
+            callback.put("boundary", self.boundary, mi.ParamFlags.Differentiable)
+
+        def parameters_changed(self, keys: Any = ()) -> None:
+            values = {name: np.array(getattr(self, name), dtype=float).ravel() for name in VARIABLE}
+            inside = self.inside.changed(**values)
+            check_eta(self.boundary, inside.medium.eta)
+            if inside != self.inside:
+                self.inside = inside  # what is made of it is made anew when the scene is rendered next
 
         def _context(self, ctx: Any) -> Any:
             return mi.BSDFContext(ctx.mode, ctx.type_mask, self.lobe)
@@ -215,13 +252,20 @@ def _boundary(props: Any, eta: float) -> Any:
         raise ValueError(f"a translucent surface must have at most one BSDF inside, got {len(inner)}")
     if not inner:
         return mi.load_dict({"type": "dielectric", "int_ior": float(eta), "ext_ior": 1.0})
-    found = mi.traverse(inner[0]).get("eta")
+    check_eta(inner[0], eta)
+    return inner[0]
+
+
+def check_eta(boundary: Any, eta: float) -> None:
+    """Refuse a boundary of another index than the medium's."""
+    import mitsuba as mi
+
+    found = mi.traverse(boundary).get("eta")
     found = None if found is None else float(np.max(np.array(found)))
     if found is None or abs(found - eta) > 2e-3 * eta:
         raise ValueError(
             f"the boundary must be a dielectric with eta {eta:g} of the medium (int_ior/ext_ior), got {found}"
         )
-    return inner[0]
 
 
 def _reflection_lobe(boundary: Any) -> int:

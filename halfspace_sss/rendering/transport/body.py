@@ -12,13 +12,14 @@ from halfspace_sss import measure
 from halfspace_sss.interface.model import bssrdf
 from halfspace_sss.physics import single_scattering
 from halfspace_sss.physics.medium import Medium
-from halfspace_sss.rendering.surface.object import Object, is_inside, survey
+from halfspace_sss.rendering.surface.object import Object, is_inside, same_objects, survey
 from halfspace_sss.rendering.transport.area_points import AreaPoints
 from halfspace_sss.rendering.transport.positions import PositionSampler
 from halfspace_sss.rendering.transport.radial_table import RadialTable
 from halfspace_sss.rendering.transport.settings import AUTOMATIC, Settings
+from halfspace_sss.rendering.variation import Variation
 
-__all__ = ["Body", "make_bodies"]
+__all__ = ["Bodies", "Body", "make_bodies"]
 
 SMALL, LARGE = 1.0, 5e3  # mean free paths across an object, beyond which the units of the scene are doubted
 LEAST_SHARE = 0.2  # of the events inside that each of the two kinds gets
@@ -35,6 +36,7 @@ class Body:
         models: model of each channel; empty where only single scattering is asked for.
         positions: sampler of points of entry; None without models.
         single_share: probability of single scattering among the events inside.
+        variation: how its light varies with its medium.
     """
 
     found: Object
@@ -43,6 +45,27 @@ class Body:
     models: list[Any]
     positions: PositionSampler | None
     single_share: float
+    variation: Variation
+
+    def is_current(self) -> bool:
+        """Whether the object still has the shape and the medium that it was made of."""
+        return self.surface.inside is self.variation.inside and self.found.is_current()
+
+
+class Bodies:
+    """The bodies of the scene that was asked for last, made anew when its objects, their shape or media changed."""
+
+    def __init__(self, settings: Settings) -> None:
+        self.settings = settings
+        self._made: tuple[list, list[Body]] = ([], [])
+
+    def of(self, scene: Any) -> list[Body]:
+        """The bodies of a scene; errors as in `make_bodies`."""
+        shapes = scene.shapes()  # the scene itself, which holds its integrator, would never be freed
+        before, bodies = self._made
+        if not bodies or not same_objects(before, shapes) or not all(body.is_current() for body in bodies):
+            self._made = shapes, make_bodies(scene, self.settings)
+        return self._made[1]
 
 
 def make_bodies(scene: Any, settings: Settings) -> list[Body]:
@@ -75,15 +98,16 @@ def _make_body(shape: Any, settings: Settings) -> Body:
         raise ValueError(f"orders must be total for the model {inside.model!r}, which contains them all, got multiple")
     adds_single = inside.orders == "single" or (inside.orders == "total" and models and models[0].orders == "multiple")
     share = _single_share(media) if adds_single and models else float(bool(adds_single))
+    variation = Variation(surface, settings.mm_per_unit)
     if not models:
-        return Body(found, surface, media, [], None, share)
+        return Body(found, surface, media, [], None, share, variation)
     live = [model for model, s in zip(models, scatters) if s]
     table = RadialTable(live, found.size)
     area_share = settings.area_share
     if area_share == AUTOMATIC:
         area_share = _area_share(table.mean / found.size)
     positions = PositionSampler(found, table, AreaPoints(shape), area_share)
-    return Body(found, surface, media, models, positions, share)
+    return Body(found, surface, media, models, positions, share, variation)
 
 
 def _area_share(ratio: float) -> float:

@@ -13,9 +13,11 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from halfspace_sss.physics.phase import eval_hg, sample_hg
+from halfspace_sss.rendering.books import detached
 from halfspace_sss.rendering.transport.body import Body
 from halfspace_sss.rendering.transport.plane import Exit, number, place
 from halfspace_sss.rendering.transport.refraction import leave, refracted_connection
+from halfspace_sss.rendering.world import World, sampled_light
 
 __all__ = ["Scattered", "single_scattering_at"]
 
@@ -38,31 +40,26 @@ class _Event(NamedTuple):
     weight: Any  # spectrum: T_o sigma_s exp(-sigma_t s) / density of s
 
 
-def single_scattering_at(scene: Any, body: Body, out: Exit, sampler: Any, lights: bool, active: Any) -> Scattered:
-    """One scattering event for light that leaves at `out`.
-
-    Args:
-        scene: the whole scene, for visibility and emitters.
-        body: the object; out: point, normal and direction of exit.
-        lights: whether the scene has emitters other than its environment.
-    """
+def single_scattering_at(world: World, body: Body, out: Exit, sampler: Any, active: Any) -> Scattered:
+    """One scattering event for light that leaves at `out` of a body: point, normal and direction."""
     import drjit as dr
     import mitsuba as mi
 
     event, active = _event(body, out, sampler, active)
-    g = [number(m.g) for m in body.media]
-    g_mean = number(sum(float(m.g) for m in body.media) / len(g))
-    u = sampler.next_2d()
-    cosine = sample_hg(u.x, g_mean)
-    sin_phi, cos_phi = dr.sincos(2 * dr.pi * u.y)
-    sine = dr.safe_sqrt((1 - cosine) * (1 + cosine))
-    d = mi.Frame3f(event.along).to_world(mi.Vector3f(sine * cos_phi, sine * sin_phi, cosine))
-    passed = leave(body, event.p, d, active)
-    ratio = _spectrum([eval_hg(cosine, k) for k in g]) / eval_hg(cosine, g_mean)
+    with detached():
+        g_mean = number(sum(float(m.g) for m in body.media) / len(body.media))
+        u = sampler.next_2d()
+        cosine = sample_hg(u.x, g_mean)
+        sin_phi, cos_phi = dr.sincos(2 * dr.pi * u.y)
+        sine = dr.safe_sqrt((1 - cosine) * (1 + cosine))
+        d = mi.Frame3f(event.along).to_world(mi.Vector3f(sine * cos_phi, sine * sin_phi, cosine))
+        passed = leave(body, event.p, d, active)
+        density = eval_hg(cosine, g_mean)
+    ratio = _phase(body, cosine) / density
     weight = dr.select(passed.valid, event.weight * ratio * _extinction(body, passed.length) * passed.T, 0)
     direct = mi.Spectrum(0)
-    if lights:
-        direct = _connected(scene, body, event, sampler, active)
+    if world.lights.some_local:
+        direct = _connected(world, body, event, sampler, active)
     return Scattered(passed.p, passed.n, passed.w, weight, direct)
 
 
@@ -72,14 +69,24 @@ def _event(body: Body, out: Exit, sampler: Any, active: Any) -> tuple[_Event, An
     import mitsuba as mi
 
     eta = body.surface.inside.medium.eta
-    mu_o = dr.dot(out.w, out.n)
-    active = active & (mu_o > 0)
-    F, mu_in, _, into = mi.fresnel(dr.maximum(mu_o, 0), eta)
-    along = dr.normalize(-into * out.w + out.n * (into * mu_o - dr.abs(mu_in)))
-    start = place(out.p, out.n)
-    ray = start.spawn_ray(along)
-    wall = body.found.scene.ray_intersect(ray, mi.RayFlags.Minimal, False, active)
-    furthest = dr.select(wall.is_valid(), wall.t, number(1e3 * body.found.size))
+    with detached():
+        mu_o = dr.dot(out.w, out.n)
+        active = active & (mu_o > 0)
+        F, mu_in, _, into = mi.fresnel(dr.maximum(mu_o, 0), eta)
+        along = dr.normalize(-into * out.w + out.n * (into * mu_o - dr.abs(mu_in)))
+        wall = body.found.scene.ray_intersect(place(out.p, out.n).spawn_ray(along), mi.RayFlags.Minimal, False, active)
+        furthest = dr.select(wall.is_valid(), wall.t, number(1e3 * body.found.size))
+        s, density = _free_path(body, furthest, sampler)
+    scattered = [sigma_s * dr.exp(-sigma_t * s) / density for sigma_s, sigma_t, _ in _coefficients(body)]
+    weight = dr.select(active, (1 - F) * _spectrum(scattered), 0)
+    return _Event(mi.Point3f(out.p + along * s), mi.Vector3f(along), weight), active
+
+
+def _free_path(body: Body, furthest: Any, sampler: Any) -> tuple[Any, Any]:
+    """A length up to `furthest`, and its density."""
+    import drjit as dr
+    import mitsuba as mi
+
     sigma_t = [number(m.sigma_t) for m in body.media]
     u_channel, u = sampler.next_1d(), sampler.next_1d()
     chosen, total = mi.Float(0), mi.Float(0)
@@ -89,38 +96,44 @@ def _event(body: Body, out: Exit, sampler: Any, active: Any) -> tuple[_Event, An
     s = -dr.log(1 - u * (1 - dr.exp(-chosen * furthest))) / chosen
     for t in sigma_t:
         total += t * dr.exp(-t * s) / dr.maximum(1 - dr.exp(-t * furthest), 1e-12)
-    density = dr.maximum(total / len(sigma_t), 1e-30)
-    scattered = [number(m.sigma_s) * dr.exp(-t * s) / density for m, t in zip(body.media, sigma_t)]
-    weight = dr.select(active, (1 - F) * _spectrum(scattered), 0)
-    return _Event(mi.Point3f(out.p + along * s), mi.Vector3f(along), weight), active
+    return s, dr.maximum(total / len(sigma_t), 1e-30)
 
 
-def _connected(scene: Any, body: Body, event: _Event, sampler: Any, active: Any) -> Any:
+def _connected(world: World, body: Body, event: _Event, sampler: Any, active: Any) -> Any:
     """Light of a sampled emitter that is refracted at the boundary into the event."""
     import drjit as dr
     import mitsuba as mi
 
     at = place(event.p, mi.Normal3f(0, 0, 0))
-    ds, light = scene.sample_emitter_direction(at, sampler.next_2d(), False, active)
-    distant = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
-    active = active & (ds.pdf > 0) & ~ds.emitter.is_environment()
-    reach = dr.select(distant, number(1e4 * body.found.size), ds.dist)
-    target = event.p + ds.d * reach
-    met = refracted_connection(body, event.p, target, active)
-    # solid angle at the event per solid angle of the straight direction, over which the emitter was sampled
-    facing = dr.select(dr.squared_norm(ds.n) > 0, dr.abs(dr.dot(ds.n, met.w)) / dr.abs(dr.dot(ds.n, ds.d)), 1)
-    spread = dr.select(ds.delta, 1, facing) * reach * reach * met.density
-    phase = _spectrum([eval_hg(dr.dot(event.along, met.d), number(m.g)) for m in body.media])
-    value = event.weight * phase * _extinction(body, met.length) * (met.T * spread) * light
+    ds, light = sampled_light(world, at, sampler.next_2d(), False, active)
+    with detached():
+        distant = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
+        active = active & (ds.pdf > 0) & ~ds.emitter.is_environment()
+        reach = dr.select(distant, number(1e4 * body.found.size), ds.dist)
+        target = event.p + ds.d * reach
+        met = refracted_connection(body, event.p, target, active)
+        # solid angle at the event per solid angle of the straight direction, over which the emitter was sampled
+        facing = dr.select(dr.squared_norm(ds.n) > 0, dr.abs(dr.dot(ds.n, met.w)) / dr.abs(dr.dot(ds.n, ds.d)), 1)
+        spread = dr.select(ds.delta, 1, facing) * reach * reach * met.density
+        cosine, passed = dr.dot(event.along, met.d), met.T * spread
+    value = event.weight * _phase(body, cosine) * _extinction(body, met.length) * passed * light
     edge = place(met.p, met.n)
-    blocked = scene.ray_test(edge.spawn_ray_to(target), False, met.valid)
+    blocked = world.scene.ray_test(edge.spawn_ray_to(target), False, met.valid)
     return dr.select(met.valid & ~blocked, value, 0)
+
+
+def _coefficients(body: Body) -> list[tuple[Any, Any, Any]]:
+    return body.variation.coefficients(body.media)
+
+
+def _phase(body: Body, cosine: Any) -> Any:
+    return _spectrum([eval_hg(cosine, g) for _, _, g in _coefficients(body)])
 
 
 def _extinction(body: Body, length: Any) -> Any:
     import drjit as dr
 
-    return _spectrum([dr.exp(-number(m.sigma_t) * length) for m in body.media])
+    return _spectrum([dr.exp(-sigma_t * length) for _, sigma_t, _ in _coefficients(body)])
 
 
 def _spectrum(values: list[Any]) -> Any:

@@ -1,0 +1,79 @@
+"""What a render can be differentiated by, and Mitsuba's machinery of forward and backward passes around a replay."""
+
+from __future__ import annotations
+
+from typing import Any
+
+__all__ = ["check_parameters", "replayer"]
+
+GEOMETRY = ("to_world", "vertex_positions", "vertex_normals", "vertex_texcoords")
+
+
+def check_parameters(scene: Any) -> None:
+    """Refuse derivatives that a replay with fixed paths does not have.
+
+    Raises:
+        ValueError: gradients are enabled for the geometry of a shape, for a sensor or film, or for what Mitsuba does
+            not differentiate by, such as the index of a smooth dielectric.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    parameters = mi.traverse(scene)
+    for key, (value, kind, owner, flags) in parameters.properties.items():
+        if kind is not None:
+            continue  # a number of Python, without gradients
+        with dr.resume_grad():
+            if not dr.grad_enabled(value):
+                continue
+        name = key.rsplit(".", 1)[-1]
+        fixed = bool(flags & int(mi.ParamFlags.NonDifferentiable))
+        if fixed or name in GEOMETRY or _moves(owner, name) or _selects(parameters, owner):
+            raise ValueError(
+                f"{key} must not have gradients enabled: bssrdf differentiates light by emitters, surfaces, textures "
+                "and media, with paths held where they are"
+            )
+
+
+def _moves(owner: Any, name: str) -> bool:
+    """Whether a parameter moves a shape or a sensor; attributes of vertices and faces are textures."""
+    import mitsuba as mi
+
+    if isinstance(owner, mi.Shape):
+        return not name.startswith(("vertex_", "face_"))
+    return isinstance(owner, (mi.Sensor, mi.Film))
+
+
+def _selects(parameters: Any, owner: Any) -> bool:
+    """Whether a parameter chooses between surfaces of which one is a mirror: its share has no density to hold."""
+    import mitsuba as mi
+
+    while owner is not None:
+        if isinstance(owner, mi.BSDF) and owner.class_name() == "BlendBSDF":
+            return bool(owner.flags() & int(mi.BSDFFlags.Delta))
+        owner = parameters.hierarchy[owner][0]
+    return False
+
+
+def replayer(trace: Any, replay: Any) -> Any:
+    """An integrator of Mitsuba's radiative backpropagation around two functions.
+
+    Args:
+        trace: (scene, sampler, ray, active) -> radiance, whether something was hit.
+        replay: (scene, sampler, ray, L, d, backward) -> derivative, see `replay_paths`.
+    """
+    import drjit as dr
+    import mitsuba as mi
+    from mitsuba.python.ad.integrators.common import RBIntegrator
+
+    class Replayer(RBIntegrator):
+        """Mitsuba's camera rays and films, this project's paths."""
+
+        def sample(self, mode: Any, scene: Any, sampler: Any, ray: Any, **given: Any) -> tuple:
+            if mode == dr.ADMode.Primal:
+                L, seen = trace(scene, sampler, ray, given["active"])
+                return L, seen, [], L
+            L, backward = given["state_in"], mode == dr.ADMode.Backward
+            return replay(scene, sampler, ray, L, given["δL"], backward), mi.Bool(True), [], L
+
+    return Replayer(mi.Properties())

@@ -1,0 +1,45 @@
+"""What every path needs to know: the scene, its lights and bodies, the settings, and how its light is written down."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from halfspace_sss.rendering.books import Replay, Tally, detached
+from halfspace_sss.rendering.lights import Lights
+from halfspace_sss.rendering.transport.body import Body
+from halfspace_sss.rendering.transport.settings import Settings
+
+__all__ = ["World", "sampled_light"]
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """What every path needs.
+
+    Args:
+        scene: the Mitsuba scene.
+        lights: its kinds of emitters.
+        bodies: its translucent objects.
+        settings: those of the integrator.
+        books: what is written down.
+    """
+
+    scene: Any
+    lights: Lights
+    bodies: list[Body]
+    settings: Settings
+    books: Tally | Replay
+
+
+def sampled_light(world: World, ref: Any, u: Any, test_visibility: bool, active: Any) -> tuple[Any, Any]:
+    """A direction sampled by the emitters, and their light over its density; derivatives are those of the light."""
+    import drjit as dr
+
+    with detached():
+        ds, light = world.scene.sample_emitter_direction(ref, u, test_visibility, active)
+        inverse = dr.select(ds.pdf > 0, dr.rcp(ds.pdf), 0)
+    if not world.books.tracks:
+        return ds, light
+    shines = active & (ds.pdf > 0)
+    return ds, dr.replace_grad(light, world.scene.eval_emitter_direction(ref, ds, shines) * inverse)
