@@ -50,6 +50,10 @@ class _NumpyLibrary:
         return np.asarray(value, dtype=np.asarray(x).dtype)
 
     @staticmethod
+    def largest(x: Any) -> float:
+        return float(np.finfo(np.asarray(x).dtype).max)
+
+    @staticmethod
     def constant(value: Any, x: Any) -> Any:
         return np.asarray(value, dtype=np.asarray(x).dtype) if np.ndim(value) else float(value)
 
@@ -96,6 +100,9 @@ class _TorchLibrary:
             return value.to(device=x.device, dtype=x.dtype)
         return self.torch.as_tensor(value, dtype=x.dtype, device=x.device)
 
+    def largest(self, x: Any) -> float:
+        return self.torch.finfo(x.dtype).max
+
     def constant(self, value: Any, x: Any) -> Any:
         return self.like(value, x) if np.ndim(value) else float(value)
 
@@ -132,6 +139,9 @@ class _DrJitLibrary:
 
     def like(self, value: Any, x: Any) -> Any:
         return type(x)(value)
+
+    def largest(self, x: Any) -> float:
+        return self.dr.largest(type(x))
 
     def constant(self, value: Any, x: Any) -> Any:
         if np.ndim(value):

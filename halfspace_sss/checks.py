@@ -11,14 +11,11 @@ from typing import Any
 import numpy as np
 
 __all__ = [
-    "check_choice",
-    "check_count",
-    "check_edges",
-    "check_finite",
-    "check_interval",
-    "check_query",
-    "did_you_mean",
-]
+    "check_choice", "check_cosine", "check_count", "check_edges", "check_finite", "check_interval", "check_query",
+    "did_you_mean", "rounding",
+]  # fmt: skip
+
+ROUNDING_ULPS = 4
 
 
 def _plain(value: Any) -> Any:
@@ -75,17 +72,45 @@ def check_edges(name: str, value: Any) -> np.ndarray:
     return edges
 
 
-def check_query(args: tuple) -> None:
-    """Ranges of a query; also catches NaN, for which every comparison is false."""
+def rounding(value: Any) -> float:
+    """By how much a cosine may exceed 1 by rounding alone: 4 units in the last place of its own precision."""
+    kind = getattr(value, "dtype", None)
+    if type(value).__module__.split(".")[0] == "torch":
+        import torch
+
+        return ROUNDING_ULPS * torch.finfo(kind).eps if kind.is_floating_point else 0.0
+    return ROUNDING_ULPS * float(np.finfo(kind if getattr(kind, "kind", "") == "f" else np.float64).eps)
+
+
+def check_cosine(name: str, value: Any, low: float = 0.0) -> float:
+    """The cosine as a number in [low, 1]; what exceeds 1 by rounding is 1."""
+    if isinstance(value, numbers.Real) and 1 < value <= 1 + rounding(value):
+        return 1.0
+    check_interval(name, value, low, 1.0)
+    return float(value)
+
+
+def check_query(lib: Any, args: tuple, given: tuple) -> tuple:
+    """Arguments of a query in their ranges, cosines that exceed 1 by rounding as 1; also refuses NaN.
+
+    Args:
+        args: the arguments in one library and precision.
+        given: the same as they came, whose precision says what is rounding.
+    """
     if type(args[0]).__module__.startswith(("drjit", "mitsuba")):
-        return
+        return args
     bounds = {"r": (0.0, math.inf), "mu_i": (0.0, 1.0), "phi_i": None, "mu_o": (0.0, 1.0), "phi_o": None}
-    for (name, bound), value in zip(bounds.items(), args):
+    checked = []
+    for (name, bound), value, raw in zip(bounds.items(), args, given):
+        checked.append(value)
         low, high = (-math.inf, math.inf) if bound is None else bound
         if 0 in value.shape:
             continue
         smallest, largest = float(value.min()), float(value.max())
+        if high == 1 < largest <= 1 + rounding(raw):
+            checked[-1], largest = lib.minimum(value, 1.0), 1.0
         if not (smallest >= low and largest <= high and math.isfinite(smallest) and math.isfinite(largest)):
             what = "finite" if bound is None else f"finite and in [{low:g}, {high:g}]"
             wrong = smallest if not smallest >= low else largest
             raise ValueError(f"{name} must be {what}, got {wrong!r}")
+    return tuple(checked)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from halfspace_sss.backend import array_types
-from halfspace_sss.checks import check_count, check_interval
+from halfspace_sss.checks import check_cosine, check_count
 from halfspace_sss.comparison.truths import NotCovered, Truth, read_truths
 from halfspace_sss.physics.fresnel import F_r
 from halfspace_sss.physics.medium import Medium
@@ -112,7 +112,7 @@ def trace_order(
     check_count("order", order, 1)
     check_count("n_paths", n_paths, 256)
     if mu_i != "diffuse":
-        check_interval("mu_i", mu_i, 0.0, 1.0)
+        mu_i = check_cosine("mu_i", mu_i)
     types = array_types(backend)
     samples, events, paths = [], 0, 0
     for done in walk_passes(types, medium, mu_i, n_paths, (seed, order), lambda: [OrderTally(types, order)]):

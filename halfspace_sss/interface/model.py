@@ -22,6 +22,9 @@ from halfspace_sss.physics.medium import Medium
 __all__ = ["BSSRDF", "DirectionSample", "PositionSample", "Query", "bssrdf", "model_class", "models", "register_model"]
 
 
+FARTHEST = 0.44  # of the exponent range: in mean free paths, where r² is finite and r⁻³ is 0 in every precision
+
+
 class PositionSample(NamedTuple):
     """Where light enters: distance r (mm) and azimuth phi of x_i about x_o from w_o, density pdf (1/mm²)."""
 
@@ -147,12 +150,13 @@ class BSSRDF(abc.ABC):
     def _S(self, G_of: Callable[[Query], Any], *query: Any) -> Any:
         """sigma_t² T_12 T_21 G_of(query)."""
         lib, args = broadcast_query(*query)
-        check_query(args)
+        args = check_query(lib, args, query)
         if self.medium.n_channels is not None:
             lib.constant(self.medium.sigma_t, args[0])
             args = tuple(a[..., None] for a in args)
         r, mu_i, phi_i, mu_o, phi_o = args
         sigma_t = lib.constant(self.medium.sigma_t, r)
+        r = lib.minimum(r, lib.largest(r) ** FARTHEST / sigma_t)
         eta = self.medium.eta
         q = Query(lib, sigma_t * r, mu_i, phi_i, mu_o, phi_o, eta, r, self.medium.sigma_t)
         G = lib.like(G_of(q), r)

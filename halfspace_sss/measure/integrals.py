@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from halfspace_sss.checks import check_count, check_interval
+from halfspace_sss.checks import check_cosine, check_count, rounding
 from halfspace_sss.interface.model import BSSRDF, bssrdf, models
 from halfspace_sss.measure.quadrature import Angles, Quadrature, cosine_nodes, distances, flux, log_sum
 from halfspace_sss.physics import single_scattering
@@ -54,18 +54,21 @@ def _over_incidence(angles: Angles, mu_i: Any, q: Quadrature) -> np.ndarray:
         mu, w = cosine_nodes(angles.medium.eta, q.n_mu)
         R = 2 * w @ np.stack([flux(angles, m, q) for m in mu])
     else:
-        mu = np.asarray(mu_i, dtype=np.float64)
-        _check_cosines(mu)
+        mu = _cosines(mu_i)
         R = np.stack([flux(angles, m, q) for m in mu.ravel()]).reshape(*mu.shape, -1)
     return R if angles.medium.n_channels is not None else R[..., 0][()]
 
 
-def _check_cosines(mu: np.ndarray) -> None:
+def _cosines(mu_i: Any) -> np.ndarray:
+    """Cosines in [0, 1] in float64, those that exceed 1 by rounding as 1; ValueError otherwise."""
+    mu = np.asarray(mu_i, dtype=np.float64)
+    mu = np.where((mu > 1) & (mu <= 1 + rounding(mu_i)), 1.0, mu)
     if not mu.size or not np.all((mu >= 0) & (mu <= 1)):
         bad = mu[~((mu >= 0) & (mu <= 1))]
         raise ValueError(
             f"mu_i must be in [0, 1], got {float(bad.flat[0])!r}" if bad.size else "mu_i must not be empty"
         )
+    return mu
 
 
 def reflectance(model: BSSRDF, mu_i: Any = 1.0, order: str | None = None, quadrature: Quadrature = DEFAULT) -> Any:
@@ -106,8 +109,8 @@ def profile(model: BSSRDF, r: Any, mu_i: float = 1.0, quadrature: Quadrature = D
         ValueError: r or mu_i is out of range.
     """
     r = np.asarray(r, dtype=np.float64)
-    _check_cosines(np.asarray(mu_i, dtype=np.float64))
-    M = Angles(model.eval, model.medium, quadrature).exitance(r.ravel(), float(mu_i))[0].reshape(*r.shape, -1)
+    mu_i = float(_cosines(mu_i))
+    M = Angles(model.eval, model.medium, quadrature).exitance(r.ravel(), mu_i)[0].reshape(*r.shape, -1)
     return M if model.medium.n_channels is not None else M[..., 0][()]
 
 
@@ -117,10 +120,10 @@ def moments(model: BSSRDF, mu_i: float = 1.0, quadrature: Quadrature = DEFAULT) 
     x runs along the horizontal direction of travel of the incident light. A moment that diverges (no absorption: the
     profile falls as r^-3) is inf; NaN where nothing comes out. mu_i: one number in [0, 1]; ValueError otherwise.
     """
-    _check_cosines(np.asarray(mu_i, dtype=np.float64))
+    mu_i = float(_cosines(mu_i))
     angles = Angles(model.eval, model.medium, quadrature)
-    r = distances(angles, float(mu_i), quadrature, (2, 4))
-    M, M_x = angles.exitance(r, float(mu_i))
+    r = distances(angles, mu_i, quadrature, (2, 4))
+    M, M_x = angles.exitance(r, mu_i)
     h, r = math.log(r[1] / r[0]), r[:, None]
     with np.errstate(invalid="ignore", divide="ignore"):
         R = log_sum(M * r**2, h)
@@ -230,7 +233,7 @@ def weight_variance(model: BSSRDF, mu_o: float = 0.8, n: int = 1 << 14, seed: in
     Raises:
         ValueError: an argument is out of range.
     """
-    check_interval("mu_o", mu_o, 1e-6, 1.0)
+    mu_o = check_cosine("mu_o", mu_o, 1e-6)
     check_count("n", n, 2)
     check_count("seed", seed, 0)
     if model.medium.n_channels is not None:

@@ -73,7 +73,7 @@ def mu_internal(mu: Any, eta: Any) -> Any:
     lib = library(mu, eta)
     if _matched(eta):
         return mu
-    return lib.sqrt(lib.maximum(_m2(mu, eta), 0.0)) / eta
+    return lib.minimum(lib.sqrt(lib.maximum(_m2(mu, eta), 0.0)) / eta, 1.0)  # in float32 mu = 1 may give 1 + 1e-7
 
 
 def mu_external(mu: Any, eta: Any) -> Any:

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from halfspace_sss.arrays import broadcast_query, library
+from halfspace_sss.checks import rounding
 from halfspace_sss.physics.fresnel import F_t, mu_external, mu_internal
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.physics.phase import eval_hg
@@ -27,7 +28,7 @@ __all__ = [
 ]  # fmt: skip
 
 TINY = 1e-30
-_ANY = (-math.inf, math.inf)
+_RANGES = dict.fromkeys(("phi", "delta_phi"), (-math.inf, math.inf)) | dict.fromkeys(("r", "s"), (0.0, math.inf))
 _NUMPY = library(0.0)
 
 
@@ -50,22 +51,23 @@ class Contribution(NamedTuple):
 def _arguments(medium: Medium, **args: Any) -> tuple[Any, Any]:
     """Broadcast arguments in one library, with a channel axis last if the medium has channels; refuses bad ranges."""
     lib, values = broadcast_query(*args.values())
-    for name, value in zip(args, values):
-        _check(name, value)
+    values = tuple(_checked(lib, name, value, given) for (name, given), value in zip(args.items(), values))
     if medium.n_channels is not None:
         lib.constant(medium.sigma_t, values[0])
         values = [v[..., None] for v in values]
     return lib, values
 
 
-def _check(name: str, value: Any) -> None:
-    """Cosines in [0, 1], distances >= 0, angles finite; Dr.Jit lanes cannot be inspected while a kernel is recorded."""
+def _checked(lib: Any, name: str, value: Any, given: Any) -> Any:
+    """Cosines in [0, 1] up to rounding of what was given, distances >= 0, angles finite; Dr.Jit lanes as they are."""
     if type(value).__module__.startswith(("drjit", "mitsuba")) or 0 in value.shape:
-        return
-    low, high = {"phi": _ANY, "delta_phi": _ANY, "r": (0.0, math.inf), "s": (0.0, math.inf)}.get(name, (0.0, 1.0))
+        return value
+    low, high = _RANGES.get(name, (0.0, 1.0))
+    value = lib.minimum(value, 1.0) if high == 1 < float(value.max()) <= 1 + rounding(given) else value
     for v in (float(value.min()), float(value.max())):
         if not (low <= v <= high and math.isfinite(v)):
             raise ValueError(f"{name} must be finite and in [{low:g}, {high:g}], got {v!r}")
+    return value
 
 
 def _sine(lib: Any, mu: Any, eta: float) -> Any:
@@ -167,9 +169,7 @@ def _cosines(medium: Medium, mu_i: Any) -> tuple[np.ndarray, np.ndarray | None]:
             raise ValueError(f'mu_i must be cosines in [0, 1] or "diffuse", got {mu_i!r}')
         x, _, w = _graded(12, 12, 10)
         return mu_external(x, min(medium.eta, 1.0)), 2 * min(medium.eta, 1.0) ** 2 * x * w
-    mu = np.asarray(mu_i, dtype=np.float64)
-    _check("mu_i", mu)
-    return mu, None
+    return _checked(library(0.0), "mu_i", np.asarray(mu_i, dtype=np.float64), mu_i), None
 
 
 def reflectance(medium: Medium, mu_i: Any = 1.0) -> Any:
@@ -290,7 +290,7 @@ def contribution(medium: Medium, s: Any, mu_i: Any, mu_o: Any, delta_phi: Any) -
     else:
         lib, (mu_i, mu_o, delta_phi) = _arguments(medium, mu_i=mu_i, mu_o=mu_o, delta_phi=delta_phi)
         _, (s, mu_i, mu_o, delta_phi) = broadcast_query(s, mu_i, mu_o, delta_phi)
-        _check("s", s)
+        s = _checked(lib, "s", s, s)
     eta, sigma_t = medium.eta, lib.constant(medium.sigma_t, s)
     a = lib.maximum(mu_internal(mu_i, eta), TINY)
     s_i = s * mu_internal(mu_o, eta) / a

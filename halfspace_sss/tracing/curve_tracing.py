@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from halfspace_sss.backend import array_types
-from halfspace_sss.checks import check_count, check_edges, check_finite, check_interval
+from halfspace_sss.checks import check_cosine, check_count, check_edges, check_finite, check_interval
 from halfspace_sss.physics.fresnel import F_t
 from halfspace_sss.physics.medium import Medium, check_scalar_medium
 from halfspace_sss.progress import Progress
@@ -66,8 +66,7 @@ def trace_curve(
         ValueError: an argument is out of range.
     """
     check_scalar_medium(medium)
-    check_interval("mu_i", mu_i, 0.0, 1.0)
-    check_interval("mu_o", mu_o, 0.0, 1.0)
+    mu_i, mu_o = check_cosine("mu_i", mu_i), check_cosine("mu_o", mu_o)
     check_finite("delta_phi", delta_phi)
     check_finite("line_phi", line_phi)
     check_interval("half_width", half_width, 1e-6, math.pi)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from halfspace_sss.backend import array_types
-from halfspace_sss.checks import check_choice, check_count, check_edges, check_finite, check_interval
+from halfspace_sss.checks import check_choice, check_cosine, check_count, check_edges, check_finite, check_interval
 from halfspace_sss.physics.fresnel import F_t
 from halfspace_sss.physics.medium import Medium, check_scalar_medium
 from halfspace_sss.progress import Progress
@@ -131,7 +131,7 @@ def trace(
     check_count("n_paths", n_paths, 256)
     check_count("seed", seed, 0)
     if mu_i != "diffuse":
-        check_interval("mu_i", mu_i, 0.0, 1.0)
+        mu_i = check_cosine("mu_i", mu_i)
     if relative_error is not None:
         check_interval("relative_error", relative_error, 0.0, 1.0)
     edges = _checked_radii(radii, mu_i)
@@ -178,10 +178,10 @@ def _checked_directions(directions: Sequence[tuple[float, float]] | None, mu_i: 
         return None
     if mu_i == "diffuse":
         raise ValueError("directions must be None for diffuse light, which has no forward direction, got directions")
-    pairs = np.asarray(directions, dtype=np.float64)
+    pairs = np.asarray(directions, dtype=np.float64).copy()
     if pairs.ndim != 2 or pairs.shape[1] != 2 or len(pairs) == 0:
         raise ValueError(f"directions must be a list of pairs (mu_o, delta_phi), got shape {pairs.shape}")
-    for mu_o, delta_phi in pairs:
-        check_interval("mu_o", mu_o, 0.0, 1.0)
+    for pair, (mu_o, delta_phi) in zip(pairs, directions):
+        pair[0] = check_cosine("mu_o", mu_o)
         check_finite("delta_phi", delta_phi)
     return pairs
