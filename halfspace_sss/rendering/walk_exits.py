@@ -20,7 +20,7 @@ from halfspace_sss.tracing.walk import _generator, pass_seed
 
 __all__ = ["ExitVisitor", "Exits", "Start", "exits"]
 
-LANES = 2**14
+LANES = 2**13
 
 
 @dataclass

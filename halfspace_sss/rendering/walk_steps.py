@@ -83,17 +83,25 @@ class Walker:
     visitor: Visitor
 
     def step(self, walk: Walk, record: Any) -> tuple[Walk, Any]:
-        """A free flight, and the scattering event or the boundary at its end."""
-        m = self.media.coefficients(walk.object)
-        t = free_path(m, walk.channel, walk.rng.next_float32())
+        """A free flight, and the scattering event, the null collision or the boundary at its end."""
+        media, rng = self.media, walk.rng
+        m, u = media.coefficients(walk.object, walk.o), None
+        t = free_path(m, walk.channel, rng.next_float32())
         ray = mi.Ray3f(walk.o, walk.d)
         ray.maxt = t
-        hit = self.media.scene.ray_intersect_preliminary(ray, coherent=False)
-        flight = fly(m, walk.weight, walk.density, walk.channel, t, hit.t)
+        hit = media.scene.ray_intersect_preliminary(ray, coherent=False)
+        if media.varies:
+            m, u = media.coefficients(walk.object, ray(t)), rng.next_float32()
+        flight = fly(m, walk.weight, walk.density, walk.channel, t, hit.t, u)
         walk = replace(walk, weight=flight.weight, density=flight.density)
         event = Event(ray(t), ray.d, walk.object, m)
+        meets = ~(flight.scatters | flight.null)
+        if media.varies:
+            o = dr.select(flight.null, event.p, walk.o)
+            walk = replace(walk, o=o, alive=walk.alive & (~flight.null | media.box.contains(o)))
+            walk.object = dr.select(walk.alive, walk.object, OUTSIDE)
         walk, record = dr.if_stmt((walk, record, event), flight.scatters, self._scatter, _pass, label="scatter")
-        return dr.if_stmt((walk, record, ray, hit), ~flight.scatters, self._meet, _pass, label="boundary")
+        return dr.if_stmt((walk, record, ray, hit), meets, self._meet, _pass, label="boundary")
 
     def _scatter(self, walk: Walk, record: Any, event: Event) -> tuple[Walk, Any]:
         walk, record = self.visitor.event(walk, record, event)

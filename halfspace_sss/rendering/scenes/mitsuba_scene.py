@@ -17,7 +17,8 @@ VOLUME_PATH = {"type": "volpathmis", "max_depth": -1, "rr_depth": 64}
 
 
 def with_media(scene: dict | str | Path, mm_per_unit: float, integrator: dict | None = None) -> Any:
-    """A Mitsuba scene in which each translucent object is a dielectric shape filled with a `homogeneous` medium.
+    """A Mitsuba scene in which each translucent object is a dielectric shape filled with a `homogeneous` medium,
+    or with a `heterogeneous` one where the medium varies in space.
 
     The medium has the albedo sigma_s / sigma_t, the extinction sigma_t mm_per_unit in 1/(scene unit) and the phase
     function `hg`; the boundary is the dielectric of the surface.
@@ -95,7 +96,7 @@ _OURS = ("bssrdf", "translucent_walk")
 
 
 def medium(inside: Any, mm_per_unit: float) -> Any:
-    """The `homogeneous` medium of an inside."""
+    """The `homogeneous` or `heterogeneous` medium of an inside."""
     import mitsuba as mi
 
     if inside.orders != "total" or not inside.reflection:
@@ -106,6 +107,10 @@ def medium(inside: Any, mm_per_unit: float) -> Any:
     m = inside.medium
     if np.ptp(m.g) > 0:
         raise ValueError(f"g must be the same in all channels for Mitsuba's media, got {m.g} for {inside.label}")
+    g = float(np.max(m.g))
+    phase = {"type": "hg", "g": g} if g else {"type": "isotropic"}
+    if inside.varying is not None:
+        return mi.load_dict({"type": "heterogeneous", **_volumes(inside.varying, mm_per_unit), "phase": phase})
     scale = float(np.max(m.sigma_t))  # Mitsuba takes colours up to one
     albedo, sigma_t = (np.atleast_1d(v).tolist() for v in (m.albedo, m.sigma_t / scale))
     values = (
@@ -113,6 +118,15 @@ def medium(inside: Any, mm_per_unit: float) -> Any:
         if len(albedo) == 3
         else {"albedo": albedo[0], "sigma_t": sigma_t[0]}
     )
-    g = float(np.max(m.g))
-    phase = {"type": "hg", "g": g} if g else {"type": "isotropic"}
     return mi.load_dict({"type": "homogeneous", **values, "scale": scale * mm_per_unit, "phase": phase})
+
+
+def _volumes(varying: Any, mm_per_unit: float) -> dict:
+    """The coefficients of a `heterogeneous` medium."""
+    from halfspace_sss.rendering.varying import one_voxel
+
+    scale, albedo = varying.factor, varying.albedo
+    if np.ptp(scale) > 0:
+        raise ValueError(f"sigma_t must be a grid of all channels for Mitsuba's media, got a scale of {scale.tolist()}")
+    volume = varying.albedo_volume if np.all(albedo == 1) else one_voxel(albedo)
+    return {"sigma_t": varying.density, "albedo": volume, "scale": float(scale[0]) * mm_per_unit}

@@ -13,7 +13,8 @@ In a scene:
 
 Parameters, all optional but the medium:
     material: a name of the registry; or else `sigma_s`, `sigma_a` (1/mm; numbers, rgb, or strings of numbers separated
-        by commas), `g` and `eta`.
+        by commas), `g` and `eta`; or `sigma_t` (1/mm), `albedo` and `scale` (a factor of sigma_t) instead of the
+        first two. For a medium that varies in space `albedo` and one of `sigma_t` and `scale` may be a `gridvolume`.
     model: name of a model of the library, by default "neural".
     orders: "total" (single scattering is added where the model lacks it), "multiple" or "single".
     channel: R, G or B, or a number; under a mono variant, for a medium with channels.
@@ -46,7 +47,8 @@ __all__ = ["ORDERS", "VARIABLE", "Inside", "translucent_class"]
 ORDERS = ("total", "multiple", "single")
 VARIABLE = ("albedo", "sigma_t", "g")  # by which light can be differentiated
 PARAMETERS = (
-    "material", "sigma_s", "sigma_a", "g", "eta", "model", "orders", "channel", "dilution", "reflection",
+    "material", "sigma_s", "sigma_a", "sigma_t", "albedo", "scale", "g", "eta", "model", "orders", "channel",
+    "dilution", "reflection",
 )  # fmt: skip
 
 
@@ -60,6 +62,7 @@ class Inside:
         model: name of the model.
         orders: "total", "multiple" or "single".
         reflection: whether the boundary reflects.
+        varying: a `VaryingMedium`, whose mean over its grids `medium` is then.
     """
 
     label: str
@@ -67,6 +70,7 @@ class Inside:
     model: str
     orders: str
     reflection: bool
+    varying: Any = None
 
     def channels(self) -> list[Medium]:
         """The scalar media of the channels."""
@@ -180,17 +184,19 @@ def read_inside(props: Any) -> Inside:
     Raises:
         ValueError: a parameter is missing, unknown in value, or out of range.
     """
-    inner = [key for key, _ in _boundaries(props)]
-    check_parameters("translucent", props, (*PARAMETERS, *inner))
-    label, medium = _medium(props)
+    check_parameters("translucent", props, (*PARAMETERS, *(key for key, _ in _boundaries(props))))
+    label, medium, varying = _medium(props)
     model, orders = props.get("model", "neural"), props.get("orders", "total")
     check_choice("orders", orders, ORDERS)
     check_choice("model", model, models())
-    return Inside(label, medium, model, orders, bool(props.get("reflection", True)))
+    return Inside(label, medium, model, orders, bool(props.get("reflection", True)), varying)
 
 
-def _medium(props: Any) -> tuple[str, Medium]:
-    inline = [key for key in ("sigma_s", "sigma_a", "g", "eta") if key in props]
+def _medium(props: Any) -> tuple[str, Medium, Any]:
+    from halfspace_sss.rendering.varying import constant_value
+
+    keys = ("sigma_s", "sigma_a", "sigma_t", "albedo", "scale", "g", "eta")
+    inline = {key: constant_value(props[key]) for key in keys if key in props}
     if "material" in props:
         if inline:
             raise ValueError(f"material must stand without {', '.join(inline)}, got both")
@@ -199,13 +205,38 @@ def _medium(props: Any) -> tuple[str, Medium]:
         label, medium, names = material.name, material.medium, material.channels
     elif "dilution" in props:
         raise ValueError(f"dilution must be left out without material, got {props['dilution']!r}")
-    elif "sigma_s" in inline and "sigma_a" in inline:
-        values = {key: _numbers(key, props[key]) for key in inline}
-        values["eta"] = float(np.max(values.get("eta", 1.3)))
-        label, medium, names = "medium", Medium(**values), None
+    elif {"sigma_s", "sigma_a"} <= inline.keys() or {"sigma_t", "albedo"} <= inline.keys():
+        label, names = "medium", None
+        medium, varying = _inline_medium(inline)
+        if varying is not None:
+            return label, medium, varying
     else:
-        raise ValueError("a translucent surface must have material, or sigma_s and sigma_a, got neither")
-    return _for_variant(label, medium, names, props)
+        raise ValueError("a translucent surface must have material, sigma_s and sigma_a, or sigma_t and albedo")
+    return *_for_variant(label, medium, names, props), None
+
+
+def _inline_medium(inline: dict) -> tuple[Medium, Any]:
+    """The medium of coefficients, and how it varies if it does."""
+    import mitsuba as mi
+
+    from halfspace_sss.rendering.varying import mean_of_grids, varying_medium
+
+    values = {key: value if isinstance(value, mi.Volume) else _numbers(key, value) for key, value in inline.items()}
+    eta = values.pop("eta", 1.3)
+    volumes = [key for key, value in values.items() if isinstance(value, mi.Volume)]
+    for key in volumes:
+        if key not in ("sigma_t", "scale", "albedo"):
+            raise ValueError(f"{key} must be constant, got a volume; sigma_t, scale and albedo may vary")
+    if "sigma_s" in values:
+        if extra := values.keys() - {"sigma_s", "sigma_a", "g"}:
+            raise ValueError(f"sigma_s and sigma_a must stand without {', '.join(sorted(extra))}, got both")
+        return Medium(**values, eta=float(np.max(eta))), None
+    g, scale = values.get("g", 0.0), values.get("scale", 1.0)
+    eta = float(np.max(eta))
+    if not volumes:
+        return Medium.from_albedo(values["albedo"], np.asarray(values["sigma_t"]) * scale, g, eta), None
+    varying = varying_medium(values["sigma_t"], values["albedo"], scale, variant_channels())
+    return mean_of_grids(varying, g, eta), varying
 
 
 def _for_variant(label: str, medium: Medium, names: Any, props: Any) -> tuple[str, Medium]:

@@ -18,6 +18,7 @@ from halfspace_sss.rendering.transport.positions import PositionSampler
 from halfspace_sss.rendering.transport.radial_table import RadialTable
 from halfspace_sss.rendering.transport.settings import AUTOMATIC, Settings
 from halfspace_sss.rendering.variation import Variation
+from halfspace_sss.rendering.varying import equivalent
 
 __all__ = ["Bodies", "Body", "make_bodies"]
 
@@ -88,7 +89,7 @@ def make_bodies(scene: Any, settings: Settings) -> list[Body]:
 
 def _make_body(shape: Any, settings: Settings) -> Body:
     found, surface = survey(shape), shape.bsdf()
-    inside = surface.inside
+    inside = equivalent(surface.inside, found)
     media = [m.scaled(settings.mm_per_unit) for m in inside.channels()]
     _check_size(found, media, settings)
     scatters = [float(m.sigma_s) > 0 for m in media]

@@ -55,7 +55,8 @@ class LightWalk:
     """State of a walk from an emitter."""
 
     walk: Walk
-    joinable: mi.Bool  # whether its ray may be joined to the event
+    lit: mi.Bool  # whether its ray comes from an emitter or a reflection, so that it may be joined to the event
+    fresh: mi.Bool  # whether it begins there, rather than at a null collision
     L: mi.Spectrum  # what the joins so far bring
 
 
@@ -132,7 +133,7 @@ class Joins:
         """Where to aim so that light gets to an event, and how promising that is, (0, 1]."""
         p, k, m = event.p, event.object, event.m
         ray = mi.Ray3f(p, w_0)
-        ray.maxt = DEEPEST / dr.min(m.sigma_t)
+        ray.maxt = DEEPEST / dr.min(m.mean_t)
         si = self.media.scene.ray_intersect(ray, mi.RayFlags.Minimal, coherent=False)
         n = si.n * self.media.side(k, si.prim_index)
         facing = si.is_valid() & (dr.dot(n, w_0) > 0)
@@ -142,7 +143,7 @@ class Joins:
         entry = back * (dr.dot(n, w_0) * far / dr.maximum(dr.abs(cos_t), 1e-3))
         shift = dr.select(facing, entry - w_0 * dr.dot(entry, w_0), 0)
         depth = dr.select(facing, dr.minimum(dr.norm(entry), far), far)
-        promise = dr.maximum(dr.exp(-0.5 * dr.min(m.sigma_t) * depth), LEAST_PROMISE)
+        promise = dr.maximum(dr.exp(-0.5 * dr.min(m.mean_t) * depth), LEAST_PROMISE)
         return Aim(which, w_0, mi.Vector3f(shift), depth), promise
 
     def _enter(self, rng: Any, L: Any, event: Event, aim: Aim) -> tuple:
@@ -167,7 +168,7 @@ class Joins:
         enters &= dr.max(weight) > 0
         walk = start_walk(si.spawn_ray(d).o, d, rng)
         walk = replace(walk, alive=enters, object=k, weight=weight, channel=draw(len(m.sigma_t), rng))
-        state = (LightWalk(walk, mi.Bool(enters), L), event)
+        state = (LightWalk(walk, mi.Bool(enters), mi.Bool(enters), L), event)
         s, event = dr.while_loop(state, lambda s, event: s.walk.alive, self._follow, label="light")
         return s.walk.rng, s.L, event, aim
 
@@ -177,32 +178,47 @@ class Joins:
         return dr.reinterpret_array(mi.EmitterPtr, dr.gather(mi.UInt32, self.pointers, k))
 
     def _follow(self, s: LightWalk, event: Event) -> tuple[LightWalk, Event]:
-        """One ray of the walk from the light: a join on it, if it may have one, and a free flight."""
-        walk, m, rng = s.walk, event.m, s.walk.rng
-        u = rng.next_float32()
-        t, value = _on_ray(walk, event, u)
-        t = dr.select(s.joinable, t, 0)
+        """One flight of the walk from the light, and a join on its ray if that may have one."""
+        media, walk, rng = self.media, s.walk, s.walk.rng
+        m = media.coefficients(event.object, walk.o)
+        joinable = s.lit & s.fresh
+        t, over = _on_ray(walk, event, rng.next_float32())
+        t = dr.select(joinable, t, 0)
         flight = free_path(m, walk.channel, rng.next_float32())
         ray = mi.Ray3f(walk.o, walk.d)
         ray.maxt = dr.maximum(t, flight)
-        hit = self.media.scene.ray_intersect_preliminary(ray, coherent=False)
-        value = dr.select(s.joinable & (t < hit.t), walk.weight * value, 0)
-        q = mi.Point3f(walk.o + walk.d * t)
+        hit = media.scene.ray_intersect_preliminary(ray, coherent=False)
+        L = s.L + self._joined(walk, event, ray, t, dr.select(joinable & (t < hit.t), over, 0))
+        u, p = None, mi.Point3f(walk.o + walk.d * flight)
+        if media.varies:
+            m, u = media.coefficients(event.object, p), rng.next_float32()
+        ended = fly(m, walk.weight, walk.density, walk.channel, flight, hit.t, u)
+        u = mi.Point2f(rng.next_float32(), rng.next_float32())
+        turned, weight, density = turn(m, ended.weight, ended.density, walk.channel, walk.d, u, media.same_g)
+        scattered = replace(walk, alive=walk.alive & s.lit, o=p, d=turned, weight=weight, density=density)
+        walk = replace(walk, weight=ended.weight, density=ended.density)
+        if media.varies:
+            walk.o = dr.select(ended.null, p, walk.o)
+            walk.alive &= ~ended.null | media.box.contains(p)
+        collided = ended.scatters | ended.null
+        walk, *_ = dr.if_stmt((walk, ray, hit), ~collided, self._reflect, lambda *state: state)
+        scattered.rng = walk.rng
+        lit = ~ended.scatters & (s.lit | ~collided)
+        return LightWalk(dr.select(ended.scatters, scattered, walk), lit, ~ended.null, L), event
+
+    def _joined(self, walk: Walk, event: Event, ray: Any, t: Any, over: Any) -> Any:
+        """What a join at the distance t on a ray of light brings; `over` is one over its density."""
+        media, q = self.media, mi.Point3f(walk.o + walk.d * t)
         to_p = mi.Ray3f(q, dr.normalize(event.p - q))
         to_p.maxt = dr.norm(event.p - q)
+        at_q = media.coefficients(event.object, q)
+        phases = eval_phase(event.m, dr.dot(event.along, -to_p.d)) * eval_phase(event.m, dr.dot(to_p.d, walk.d))
+        value = dr.select(over > 0, walk.weight * at_q.sigma_s * phases * over, 0)
         bright = dr.max(value) > 0
-        L = s.L + dr.select(self.media.scene.ray_test(to_p, False, bright), 0, dr.select(bright, value, 0))
-
-        ended = fly(m, walk.weight, walk.density, walk.channel, flight, hit.t)
-        u = mi.Point2f(rng.next_float32(), rng.next_float32())
-        turned, weight, density = turn(m, ended.weight, ended.density, walk.channel, walk.d, u, self.media.same_g)
-        scatters = ended.scatters
-        scattered = replace(walk, alive=walk.alive & s.joinable, o=mi.Point3f(walk.o + walk.d * flight), d=turned,
-                            weight=weight, density=density)  # fmt: skip
-        walk = replace(walk, weight=ended.weight, density=ended.density)
-        walk, *_ = dr.if_stmt((walk, ray, hit), ~scatters, self._reflect, lambda *state: state)
-        scattered.rng = walk.rng
-        return LightWalk(dr.select(scatters, scattered, walk), ~scatters, L), event
+        bright &= ~media.scene.ray_test(to_p, False, bright)
+        T = media.transmittance(event.object, ray, dr.select(bright, t, 0), walk.rng)
+        T *= media.transmittance(event.object, to_p, dr.select(bright, to_p.maxt, 0), walk.rng)
+        return dr.select(bright, value * T, 0)
 
     def _reflect(self, walk: Walk, ray: Any, hit: Any) -> tuple:
         """Reflection at the boundary from inside with the probability of its reflectance."""
@@ -220,7 +236,7 @@ class Joins:
 
 def _draw_across(event: Event, aim: Aim, rng: Any) -> tuple[Any, Any]:
     """A point of the plane across w_0 through the event, and its density per area."""
-    sigma_t = event.m.sigma_t
+    sigma_t = event.m.mean_t
     wide = sigma_t * dr.rsqrt(1 + sigma_t * aim.depth)
     rate = dr.select(rng.next_float32() < 0.5, RATES[0], RATES[1]) * pick(wide, draw(len(wide), rng))
     r = dr.maximum(-dr.log(1 - rng.next_float32()) / rate, 1e-20)
@@ -233,20 +249,14 @@ def _draw_across(event: Event, aim: Aim, rng: Any) -> tuple[Any, Any]:
 
 
 def _on_ray(walk: Walk, event: Event, u: Any) -> tuple[Any, Any]:
-    """Distance of an event q on a ray of light, and what the two events and the way between bring over its density."""
-    o, d, p, m = walk.o, walk.d, event.p, event.m
-    v = p - o
-    t_0 = dr.dot(v, d)
-    D = dr.maximum(dr.norm(v - d * t_0), 1e-9)
+    """Distance of an event q on a ray of light, and 1 / (its density |p - q|²)."""
+    v = event.p - walk.o
+    t_0 = dr.dot(v, walk.d)
+    D = dr.maximum(dr.norm(v - walk.d * t_0), 1e-9)
     start = dr.atan2(-t_0, D)
     width = 0.5 * dr.pi - start
     t = dr.maximum(t_0 + D * dr.tan(start + u * width), 0)
-    way = o + d * t - p
-    distance = dr.norm(way)
-    way = way / dr.maximum(distance, 1e-20)
-    phases = eval_phase(m, dr.dot(event.along, way)) * eval_phase(m, -dr.dot(way, d))
-    value = m.sigma_s * phases * dr.exp(-m.sigma_t * (t + distance)) * (width / D)
-    return t, dr.select(dr.isfinite(t), value, 0)
+    return t, dr.select(dr.isfinite(t), width / D, 0)
 
 
 def find_joins(scene: Any, media: WalkMedia, share: float) -> Joins | None:

@@ -58,7 +58,7 @@ class Guide:
         valid, d, w = active & small, toward, toward
         for _ in range(GUESSES):
             ray = mi.Ray3f(v, d)
-            ray.maxt = DEEPEST / dr.min(m.sigma_t)
+            ray.maxt = DEEPEST / dr.min(m.mean_t)
             si = self.media.scene.ray_intersect(ray, mi.RayFlags.Minimal, coherent=False, active=valid)
             valid &= si.is_valid()
             n = si.n * self.media.side(k, si.prim_index)
@@ -77,7 +77,7 @@ class Guide:
         guess, concentration, valid = self._guess(v, k, which, m, True)
         d, pdf = _draw_lobe(guess, concentration, rng)
         ray = mi.Ray3f(v, d)
-        ray.maxt = 2 * DEEPEST / dr.min(m.sigma_t)
+        ray.maxt = 2 * DEEPEST / dr.min(m.mean_t)
         si = self.media.scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=valid)
         valid &= si.is_valid() & (self.media.index_of(si.shape) == k)
         si = self.media.face_outwards(si, k, d)
@@ -90,12 +90,13 @@ class Guide:
         phase = eval_phase(m, dr.dot(event.along, d))
         # radiance shrinks by eta² on its way out, as the weight of the walk has when it came in
         factor = (1 - F) * dr.square(eta_ti) / (pdf / n + dr.mean(phase))
-        value = phase * dr.exp(-m.sigma_t * si.t) * factor
+        T = self.media.transmittance(k, ray, dr.select(valid, si.t, 0), rng)
+        value = phase * T * factor
         return dr.select(valid, value * emitter.eval(outside, valid), 0)
 
     def share(self, emitter: Any, way: Departure, active: Any) -> Any:
         """Weight of having hit an emitter by the phase function (balance heuristic against `light`)."""
-        k, m = way.object, self.media.coefficients(way.object)
+        k, m = way.object, self.media.coefficients(way.object, way.p)
         which = self.joins.index_of(emitter)
         guess, concentration, valid = self._guess(way.p, k, type(k)(dr.maximum(which, 0)), m, active & (which >= 0))
         lobes = _lobes(dr.dot(guess, way.ahead), concentration) / len(self.joins.emitters)

@@ -23,9 +23,10 @@ __all__ = ["Flight", "eval_phase", "fly", "free_path", "pick", "roulette", "turn
 
 
 class Flight(NamedTuple):
-    """How a free flight ended: whether in a scattering event, and the weights after it."""
+    """How a free flight ended: in a scattering event, a null collision or at the boundary; the weights after it."""
 
     scatters: mi.Bool
+    null: mi.Bool
     weight: mi.Spectrum
     density: mi.Spectrum
 
@@ -48,20 +49,39 @@ def weigh(weight: Any, density: Any, value: Any, pdf: Any) -> tuple[Any, Any]:
 
 
 def free_path(m: Coefficients, channel: Any, u: Any) -> Any:
-    """Distance to the next scattering event, scene units."""
-    return -dr.log(1 - u) / pick(m.sigma_t, channel)
+    """Distance to the next collision, scene units; where the medium is homogeneous, that is a scattering event."""
+    return -dr.log(1 - u) / pick(m.majorant, channel)
 
 
-def fly(m: Coefficients, weight: Any, density: Any, channel: Any, t: Any, reach: Any) -> Flight:
-    """A free flight of length t, cut short by the boundary where that is at a distance `reach` < t."""
-    scatters = t < reach
+def fly(m: Coefficients, weight: Any, density: Any, channel: Any, t: Any, reach: Any, u: Any = None) -> Flight:
+    """A free flight of length t, cut short by the boundary where that is at a distance `reach` < t.
+
+    Collisions are drawn by the majorant M_k of the channel of the walk. With M_c - sigma_t,c of null matter added, all
+    channels fly through T_c = exp(-M_c t), and a collision is real with the probability sigma_t,k / M_k, so that the
+    path, null collisions included, gains (Miller, Georgiev and Jarosz 2019, section 4)
+
+        f_c = T_c sigma_s,c,             p_c = T_c sigma_t,c             real collision,
+        f_c = T_c (M_c - sigma_t,c),     p_c = T_c (M_c - sigma_t,c)     null collision,
+        f_c = T_c,                       p_c = T_c                       boundary.
+
+    As every part of f_c is at most that of p_c, w_c = f_c / mean_k p_k is at most the number of channels.
+
+    Args:
+        m: coefficients at the distance t.
+        u: uniform number that decides whether a collision is real; None where M = sigma_t, so that all are.
+    """
+    collides = t < reach
+    scatters = collides if u is None else collides & (u * pick(m.majorant, channel) < pick(m.sigma_t, channel))
+    null = mi.Bool(False) if u is None else collides & ~scatters
     if len(weight) == 1:
         value = dr.select(scatters, m.sigma_s / m.sigma_t, 1)
-        return Flight(scatters, weight * value, density)
-    through = dr.exp(-(m.sigma_t - pick(m.sigma_t, channel)) * dr.minimum(t, reach))  # over that of the walk's channel
-    value = dr.select(scatters, m.sigma_s, mi.Spectrum(1)) * through
-    pdf = dr.select(scatters, m.sigma_t, mi.Spectrum(1)) * through
-    return Flight(scatters, *weigh(weight, density, value, pdf))
+        return Flight(scatters, null, weight * value, density)
+    # over that of the walk's channel
+    through = dr.exp(-(m.majorant - pick(m.majorant, channel)) * dr.minimum(t, reach))
+    otherwise = mi.Spectrum(1) if u is None else dr.select(null, dr.maximum(m.majorant - m.sigma_t, 0), 1)
+    value = dr.select(scatters, m.sigma_s, otherwise) * through
+    pdf = dr.select(scatters, m.sigma_t, otherwise) * through
+    return Flight(scatters, null, *weigh(weight, density, value, pdf))
 
 
 def eval_phase(m: Coefficients, cosine: Any) -> Any:

@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from halfspace_sss.rendering.surface.object import Object, survey
+from halfspace_sss.rendering.walk_grids import Grids, per_channel
 
 __all__ = ["Coefficients", "WalkMedia", "by_pointer", "pointer_numbers"]
 
@@ -18,11 +19,13 @@ _MOST = {"total": 2**31 - 1, "multiple": 2**31 - 1, "single": 1}
 
 
 class Coefficients(NamedTuple):
-    """Of the medium in each lane: 1/(scene unit) and mean cosine, one value per channel."""
+    """Of the medium at a point in each lane: 1/(scene unit) and mean cosine, one value per channel."""
 
-    sigma_t: Any
-    sigma_s: Any
-    g: Any
+    sigma_t: mi.Spectrum
+    sigma_s: mi.Spectrum
+    g: mi.Spectrum
+    majorant: mi.Spectrum  # at least sigma_t, everywhere in the object; sigma_t where the medium is homogeneous
+    mean_t: mi.Spectrum  # sigma_t, or its mean where that varies
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,12 +48,10 @@ class WalkMedia:
 
     def __post_init__(self) -> None:
         media = [inside.medium for inside in self.insides]
-        n = len(mi.Spectrum(0))
         tables = {}
         for key in ("sigma_t", "sigma_s", "g"):
             scale = 1.0 if key == "g" else self.mm_per_unit
-            rows = np.array([np.broadcast_to(getattr(m, key), n) for m in media], dtype=float) * scale
-            tables[key] = [mi.Float(rows[:, c].tolist()) for c in range(n)] if len(media) else []
+            tables[key] = per_channel([getattr(m, key) for m in media], scale)
         tables["eta"] = mi.Float([m.eta for m in media])
         sides = [[obj.sign] if obj.signs is None else np.array(obj.signs).tolist() for obj in self.objects]
         tables["side"] = mi.Float(sum(sides, []))
@@ -65,6 +66,8 @@ class WalkMedia:
         dr.make_opaque(tables)  # one kernel for all media
         object.__setattr__(self, "tables", tables)
         object.__setattr__(self, "box", _bounds(self.scene))
+        varies = any(inside.varying is not None for inside in self.insides)
+        object.__setattr__(self, "grids", Grids.of(self.insides, self.mm_per_unit) if varies else None)
 
     @property
     def isotropic(self) -> bool:
@@ -95,14 +98,28 @@ class WalkMedia:
         """Whether a walk that leaves object k after so many events counts."""
         return (order >= self.row("fewest", k)) & (order <= self.row("most", k))
 
-    def coefficients(self, k: Any) -> Coefficients:
-        """Of object k."""
-        return Coefficients(
-            *(
-                mi.Spectrum([dr.gather(mi.Float, channel, k) for channel in self.tables[key]])
-                for key in ("sigma_t", "sigma_s", "g")
-            )
-        )
+    @property
+    def varies(self) -> bool:
+        """Whether a medium varies in space, so that collisions may be null."""
+        return self.grids is not None
+
+    def spectrum(self, key: str, k: Any) -> Any:
+        """An entry of a table with one column per channel."""
+        return mi.Spectrum([dr.gather(mi.Float, column, k) for column in self.tables[key]])
+
+    def coefficients(self, k: Any, p: Any) -> Coefficients:
+        """Of object k at the point p."""
+        mean, g = self.spectrum("sigma_t", k), self.spectrum("g", k)
+        if self.grids is None:
+            return Coefficients(mean, self.spectrum("sigma_s", k), g, mean, mean)
+        sigma_t, sigma_s = self.grids.coefficients(k, p)
+        return Coefficients(sigma_t, sigma_s, g, self.grids.majorant(k), mean)
+
+    def transmittance(self, k: Any, ray: Any, distance: Any, rng: Any) -> Any:
+        """exp(-∫ sigma_t) over a distance along a ray inside object k; by ratio tracking where a medium varies."""
+        if self.grids is None:
+            return dr.exp(-self.spectrum("sigma_t", k) * distance)
+        return self.grids.transmittance(k, ray, distance, rng)
 
     def index_of(self, shape: Any, active: Any = True) -> Any:
         """The number of the object that a shape is, or -1."""
