@@ -19,7 +19,7 @@ import numpy as np
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.surface.object import Object, crossings
 
-__all__ = ["VaryingMedium", "constant_value", "equivalent", "grid_values", "one_voxel", "varying_medium"]
+__all__ = ["VaryingMedium", "constant_value", "equivalent", "eval_volume", "mean_of_grids", "varying_medium"]
 
 POINTS = 2**15  # at which a medium is averaged over an object
 
@@ -29,9 +29,9 @@ class VaryingMedium:
     """Extinction and albedo of a medium that varies in space.
 
     Args:
-        density: the volume D, with one channel or one per channel of the variant, >= 0.
+        density: the volume D >= 0, with one channel or one per channel of the variant; None for one everywhere.
         factor: 1/mm, one value per channel, >= 0.
-        albedo_volume: the volume A.
+        albedo_volume: the volume A, likewise.
         albedo: one value per channel; albedo A is in [0, 1].
     """
 
@@ -43,29 +43,30 @@ class VaryingMedium:
     @property
     def majorant(self) -> np.ndarray:
         """The largest sigma_t of each channel, 1/mm: interpolation exceeds no voxel."""
+        if self.density is None:
+            return self.factor
         values = grid_values(self.density)
         return self.factor * values.reshape(-1, values.shape[-1]).max(axis=0)
 
     def coefficients(self, p: Any) -> tuple[np.ndarray, np.ndarray]:
         """sigma_t and sigma_s at points, arrays of shape (channels, n), 1/mm."""
-        it = dr.zeros(mi.Interaction3f, dr.width(p))
-        it.p = p
-        D, A = (
-            np.array(volume.eval(it)).reshape(len(self.factor), -1) for volume in (self.density, self.albedo_volume)
-        )
-        sigma_t = self.factor[:, None] * D
-        return sigma_t, self.albedo[:, None] * A * sigma_t
+        sigma_t = self.factor[:, None] * np.array(eval_volume(self.density, p))
+        return sigma_t, self.albedo[:, None] * np.array(eval_volume(self.albedo_volume, p)) * sigma_t
+
+
+def eval_volume(volume: Any, p: Any, active: Any = True) -> Any:
+    """The value of a volume at points, one per channel of the variant."""
+    n = dr.width(p)
+    if volume is None:
+        return dr.full(mi.Spectrum, 1, n)
+    it = dr.zeros(mi.Interaction3f, n)
+    it.p = p
+    return mi.Spectrum(volume.eval(it, active))
 
 
 def grid_values(volume: Any) -> np.ndarray:
     """The voxels of a grid, shape (z, y, x, channels)."""
     return np.array(mi.traverse(volume)["data"])
-
-
-def one_voxel(values: Any = 1.0) -> Any:
-    """A volume that is the same everywhere, with one channel or several."""
-    grid = np.asarray(values, dtype=np.float32).reshape(1, 1, 1, -1)
-    return mi.load_dict({"type": "gridvolume", "grid": mi.VolumeGrid(grid), "raw": True})
 
 
 def constant_value(value: Any) -> Any:
@@ -96,12 +97,12 @@ def varying_medium(sigma_t: Any, albedo: Any, scale: Any, channels: int) -> Vary
     if isinstance(density, mi.Volume):
         _check_grid(name, density, channels, np.inf)
     else:
-        density, factor = one_voxel(), factor * _per_channel("sigma_t", density, channels)
+        density, factor = None, factor * _per_channel("sigma_t", density, channels)
     if isinstance(albedo, mi.Volume):
         _check_grid("albedo", albedo, channels, 1.0)
         medium = VaryingMedium(density, factor, albedo, np.ones(channels))
     else:
-        medium = VaryingMedium(density, factor, one_voxel(), _per_channel("albedo", albedo, channels, 1.0))
+        medium = VaryingMedium(density, factor, None, _per_channel("albedo", albedo, channels, 1.0))
     if not np.all(medium.majorant > 0):
         raise ValueError(f"sigma_t must be > 0 somewhere in each channel, got at most {medium.majorant.tolist()}")
     return medium
@@ -143,9 +144,8 @@ def mean_medium(medium: VaryingMedium, p: Any, g: Any, eta: float) -> Medium:
 
 def mean_of_grids(medium: VaryingMedium, g: Any, eta: float) -> Medium:
     """The mean over the box of the grids, before the object is known."""
-    boxes = [volume.bbox() for volume in (medium.density, medium.albedo_volume) if np.prod(volume.resolution()) > 1]
-    box = boxes[0] if boxes else medium.density.bbox()
-    return mean_medium(medium, _points(box), g, eta)
+    volume = medium.albedo_volume if medium.density is None else medium.density
+    return mean_medium(medium, _points(volume.bbox()), g, eta)
 
 
 def equivalent(inside: Any, obj: Object) -> Any:

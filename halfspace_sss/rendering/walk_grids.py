@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from halfspace_sss.rendering.varying import VaryingMedium, one_voxel
+from halfspace_sss.rendering.varying import VaryingMedium, eval_volume
 
 __all__ = ["Grids", "per_channel"]
 
@@ -19,13 +19,11 @@ class Grids:
     """The media of all objects, of which at least one varies.
 
     Args:
-        densities: volume of each object, see `VaryingMedium`.
+        densities: volume of each object, or None, see `VaryingMedium`.
         albedos: likewise.
         factor: table with one column per channel, 1/(scene unit).
         albedo: likewise, without a unit.
         majorants: likewise, 1/(scene unit).
-        density_pointers: table of what Dr.Jit's registry calls the densities.
-        albedo_pointers: likewise.
     """
 
     densities: list[Any]
@@ -33,23 +31,18 @@ class Grids:
     factor: list[Any]
     albedo: list[Any]
     majorants: list[Any]
-    density_pointers: Any
-    albedo_pointers: Any
 
     @classmethod
     def of(cls, insides: list[Any], mm_per_unit: float) -> Grids:
-        """Of the insides of objects; a homogeneous medium has one voxel."""
+        """Of the insides of objects."""
         media = [inside.varying or _homogeneous(inside.medium) for inside in insides]
-        densities, albedos = [m.density for m in media], [m.albedo_volume for m in media]
         tables = (
             per_channel([m.factor for m in media], mm_per_unit),
             per_channel([m.albedo for m in media], 1.0),
             per_channel([m.majorant for m in media], mm_per_unit),
-            _pointers(densities),
-            _pointers(albedos),
         )
         dr.make_opaque(tables)
-        return cls(densities, albedos, *tables)
+        return cls([m.density for m in media], [m.albedo_volume for m in media], *tables)
 
     def majorant(self, k: Any) -> Any:
         """Of object k, 1/(scene unit)."""
@@ -57,12 +50,12 @@ class Grids:
 
     def sigma_t(self, k: Any, p: Any) -> Any:
         """Extinction of object k at the point p, 1/(scene unit)."""
-        return _row(self.factor, k) * _eval(self.densities, self.density_pointers, k, p)
+        return _row(self.factor, k) * _eval(self.densities, k, p)
 
     def coefficients(self, k: Any, p: Any) -> tuple[Any, Any]:
         """sigma_t and sigma_s of object k at the point p, 1/(scene unit)."""
         sigma_t = self.sigma_t(k, p)
-        return sigma_t, sigma_t * _row(self.albedo, k) * _eval(self.albedos, self.albedo_pointers, k, p)
+        return sigma_t, sigma_t * _row(self.albedo, k) * _eval(self.albedos, k, p)
 
     def transmittance(self, k: Any, ray: Any, distance: Any, rng: Any) -> Any:
         """An unbiased estimate of exp(-∫ sigma_t) over a distance along a ray inside object k: ratio tracking.
@@ -92,21 +85,20 @@ def per_channel(rows: list[Any], scale: float) -> list[Any]:
 
 
 def _homogeneous(medium: Any) -> VaryingMedium:
-    voxel = one_voxel()
-    return VaryingMedium(voxel, np.atleast_1d(medium.sigma_t), voxel, np.atleast_1d(medium.albedo))
-
-
-def _pointers(volumes: list[Any]) -> Any:
-    return mi.UInt32([int(dr.reinterpret_array(mi.UInt32, mi.VolumePtr(volume))[0]) for volume in volumes])
+    return VaryingMedium(None, np.atleast_1d(medium.sigma_t), None, np.atleast_1d(medium.albedo))
 
 
 def _row(table: list[Any], k: Any) -> Any:
     return mi.Spectrum([dr.gather(mi.Float, column, k) for column in table])
 
 
-def _eval(volumes: list[Any], pointers: Any, k: Any, p: Any) -> Any:
-    it = dr.zeros(mi.Interaction3f, dr.width(p))
-    it.p = p
+def _eval(volumes: list[Any], k: Any, p: Any) -> Any:
+    """The value of the volume of object k, 1 where it has none; Mitsuba's volumes cannot be called by pointers."""
     if len(volumes) == 1:
-        return mi.Spectrum(volumes[0].eval(it))
-    return mi.Spectrum(dr.reinterpret_array(mi.VolumePtr, dr.gather(mi.UInt32, pointers, k)).eval(it))
+        return eval_volume(volumes[0], p)
+    value = mi.Spectrum(1)
+    for number, volume in enumerate(volumes):
+        if volume is not None:
+            here = k == number
+            value = dr.select(here, eval_volume(volume, p, here), value)
+    return value

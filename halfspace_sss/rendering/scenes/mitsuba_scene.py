@@ -13,6 +13,7 @@ import numpy as np
 
 __all__ = ["with_media"]
 
+FAR = 1e5  # scene units within which objects lie
 VOLUME_PATH = {"type": "volpathmis", "max_depth": -1, "rr_depth": 64}
 
 
@@ -21,7 +22,8 @@ def with_media(scene: dict | str | Path, mm_per_unit: float, integrator: dict | 
     or with a `heterogeneous` one where the medium varies in space.
 
     The medium has the albedo sigma_s / sigma_t, the extinction sigma_t mm_per_unit in 1/(scene unit) and the phase
-    function `hg`; the boundary is the dielectric of the surface.
+    function `hg`; the boundary is the dielectric of the surface. Where an object is larger than the grid of its
+    sigma_t, Mitsuba's medium is empty beyond it, while ours goes on as the grid's `wrap_mode` says.
 
     Args:
         scene: a dict as for `mitsuba.load_dict`, or a path of an XML file.
@@ -123,10 +125,19 @@ def medium(inside: Any, mm_per_unit: float) -> Any:
 
 def _volumes(varying: Any, mm_per_unit: float) -> dict:
     """The coefficients of a `heterogeneous` medium."""
-    from halfspace_sss.rendering.varying import one_voxel
-
     scale, albedo = varying.factor, varying.albedo
-    if np.ptp(scale) > 0:
+    if varying.density is not None and np.ptp(scale) > 0:
         raise ValueError(f"sigma_t must be a grid of all channels for Mitsuba's media, got a scale of {scale.tolist()}")
-    volume = varying.albedo_volume if np.all(albedo == 1) else one_voxel(albedo)
-    return {"sigma_t": varying.density, "albedo": volume, "scale": float(scale[0]) * mm_per_unit}
+    sigma_t = _one_voxel(scale) if varying.density is None else varying.density
+    volume = _one_voxel(albedo) if varying.albedo_volume is None else varying.albedo_volume
+    scale = mm_per_unit * (1.0 if varying.density is None else float(scale[0]))
+    return {"sigma_t": sigma_t, "albedo": volume, "scale": scale}
+
+
+def _one_voxel(values: np.ndarray) -> Any:
+    """A volume that is the same everywhere: Mitsuba's constant ones take colours up to one only."""
+    import mitsuba as mi
+
+    grid = mi.VolumeGrid(np.asarray(values, dtype=np.float32).reshape(1, 1, 1, -1))
+    anywhere = mi.ScalarTransform4f().scale(2 * FAR).translate(-0.5)
+    return mi.load_dict({"type": "gridvolume", "grid": grid, "raw": True, "to_world": anywhere})

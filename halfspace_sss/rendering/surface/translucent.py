@@ -222,17 +222,16 @@ def _inline_medium(inline: dict) -> tuple[Medium, Any]:
     from halfspace_sss.rendering.varying import mean_of_grids, varying_medium
 
     values = {key: value if isinstance(value, mi.Volume) else _numbers(key, value) for key, value in inline.items()}
-    eta = values.pop("eta", 1.3)
     volumes = [key for key, value in values.items() if isinstance(value, mi.Volume)]
     for key in volumes:
         if key not in ("sigma_t", "scale", "albedo"):
             raise ValueError(f"{key} must be constant, got a volume; sigma_t, scale and albedo may vary")
+    eta = float(np.max(values.pop("eta", 1.3)))
     if "sigma_s" in values:
         if extra := values.keys() - {"sigma_s", "sigma_a", "g"}:
             raise ValueError(f"sigma_s and sigma_a must stand without {', '.join(sorted(extra))}, got both")
-        return Medium(**values, eta=float(np.max(eta))), None
+        return Medium(**values, eta=eta), None
     g, scale = values.get("g", 0.0), values.get("scale", 1.0)
-    eta = float(np.max(eta))
     if not volumes:
         return Medium.from_albedo(values["albedo"], np.asarray(values["sigma_t"]) * scale, g, eta), None
     varying = varying_medium(values["sigma_t"], values["albedo"], scale, variant_channels())
