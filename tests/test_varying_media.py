@@ -214,6 +214,12 @@ def test_models_of_the_half_space_take_the_means_over_the_object() -> None:
         assert medium.sigma_a == pytest.approx(0.25 * sigma_t, rel=0.02)
 
 
+def test_a_scale_that_varies_under_a_coloured_extinction_has_no_counterpart_in_mitsuba() -> None:
+    surface = {"sigma_t": "1,0.5,2", "scale": _grid(_cloud(1, 0.1, 2.0)), "albedo": 0.5}
+    with pytest.raises(ValueError, match="sigma_t must be a grid of all channels for Mitsuba's media"):
+        with_media(_scene(surface), 1.0)
+
+
 def test_constant_volumes_and_numbers_are_the_homogeneous_medium() -> None:
     flat = {"type": "constvolume", "value": {"type": "rgb", "value": [0.9, 0.5, 0.1]}}
     surface = {"type": "translucent", "sigma_t": 2.0, "scale": 1.5, "albedo": flat, "g": 0.2, "eta": 1.4}

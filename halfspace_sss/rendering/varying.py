@@ -143,9 +143,13 @@ def mean_medium(medium: VaryingMedium, p: Any, g: Any, eta: float) -> Medium:
 
 
 def mean_of_grids(medium: VaryingMedium, g: Any, eta: float) -> Medium:
-    """The mean over the box of the grids, before the object is known."""
-    volume = medium.albedo_volume if medium.density is None else medium.density
-    return mean_medium(medium, _points(volume.bbox()), g, eta)
+    """The homogeneous medium with the mean extinction and the mean albedo of the grids, before an object is known."""
+    sigma_t, albedo = (
+        factor * (1.0 if volume is None else grid_values(volume).mean(axis=(0, 1, 2)))
+        for factor, volume in ((medium.factor, medium.density), (medium.albedo, medium.albedo_volume))
+    )
+    albedo = np.minimum(albedo, 1)
+    return Medium.from_albedo(*(v if len(v) > 1 else float(v[0]) for v in (albedo, sigma_t)), g, eta)
 
 
 def equivalent(inside: Any, obj: Object) -> Any:

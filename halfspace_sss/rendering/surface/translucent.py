@@ -62,7 +62,7 @@ class Inside:
         model: name of the model.
         orders: "total", "multiple" or "single".
         reflection: whether the boundary reflects.
-        varying: a `VaryingMedium`, whose mean over its grids `medium` is then.
+        varying: how the medium varies in space, a `VaryingMedium`, or None. `medium` then has the means of the grids.
     """
 
     label: str
@@ -211,7 +211,7 @@ def _medium(props: Any) -> tuple[str, Medium, Any]:
         if varying is not None:
             return label, medium, varying
     else:
-        raise ValueError("a translucent surface must have material, sigma_s and sigma_a, or sigma_t and albedo")
+        raise ValueError("a translucent surface must have material, or sigma_s and sigma_a, or sigma_t and albedo")
     return *_for_variant(label, medium, names, props), None
 
 
