@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import functools
 import os
 import platform
@@ -14,8 +15,11 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-__all__ = ["check_folder", "provenance", "replace_together", "write_atomically", "write_together"]
+__all__ = [
+    "check_folder", "provenance", "read_bytes", "read_text", "replace_together", "write_atomically", "write_together",
+]  # fmt: skip
 
+LARGEST, LARGEST_TEXT = 10**9, 10**7  # bytes
 LIBRARIES = ("halfspace-sss", "numpy", "drjit", "mitsuba", "torch", "xarray", "zarr")
 
 
@@ -63,6 +67,24 @@ def check_folder(folder: str | Path) -> Path:
     except OSError as error:
         raise ValueError(f"folder must be one that can be written to, got {str(folder)!r}: {error.strerror}") from error
     return path
+
+
+def read_bytes(path: str | Path, most: int = LARGEST) -> bytes:
+    """The content of a file; OSError if it is no regular file (a device has no end) or larger than `most` bytes."""
+    path = Path(path)
+    path.stat()  # says why, if there is none
+    if not path.is_file():
+        raise OSError(errno.EINVAL, "it must be a regular file", str(path))
+    with path.open("rb") as file:
+        data = file.read(most + 1)
+    if len(data) > most:
+        raise OSError(errno.EFBIG, f"it must have at most {most} bytes", str(path))
+    return data
+
+
+def read_text(path: str | Path, most: int = LARGEST_TEXT) -> str:
+    """The text of a file in UTF-8; OSError as `read_bytes`."""
+    return read_bytes(path, most).decode("utf-8")
 
 
 def write_atomically(path: Path, content: bytes | str) -> None:

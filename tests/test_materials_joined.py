@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import re
+from pathlib import Path
 
 import pytest
 from registered import FILE
@@ -47,6 +49,26 @@ def test_another_file_cannot_replace_a_material(fresh, written):
         ValueError, match="other.toml: key name must be new, got 'soap', which is 'soap' of .*mine.toml"
     ):
         fresh.register(written(FILE.replace("eta = 1.4", "eta = 1.45"), "other.toml"))
+
+
+@pytest.mark.skipif(not Path("/dev/zero").exists(), reason="no devices here")
+@pytest.mark.parametrize("kind", ["device", "pipe"])
+def test_what_has_no_end_is_not_read(fresh, monkeypatch, tmp_path, kind):
+    path = Path("/dev/zero") if kind == "device" else tmp_path / "pipe"
+    if kind == "pipe":
+        os.mkfifo(path)
+    monkeypatch.setenv(registry.ENVIRONMENT_VARIABLE, str(path))
+    with pytest.raises(
+        ValueError, match=f"^{path}: must be a readable TOML file in UTF-8, got .*must be a regular file"
+    ):
+        names()
+
+
+def test_a_file_that_is_too_large_is_refused(fresh, tmp_path):
+    with (tmp_path / "large.toml").open("wb") as file:
+        file.truncate(10**12)  # sparse
+    with pytest.raises(ValueError, match="large.toml: must be a readable TOML file in UTF-8, .*at most 10000000 bytes"):
+        fresh.register(tmp_path / "large.toml")
 
 
 def test_packages_offer_paths_or_materials(fresh, written, monkeypatch):

@@ -1,4 +1,4 @@
-"""Weights of one medium are refused for another, whatever their file is called."""
+"""Weights of one medium are refused for another, and what has no end is not read, whatever their file is called."""
 
 from __future__ import annotations
 
@@ -47,6 +47,15 @@ def test_weights_that_name_no_medium_are_refused(saved: Path, medium: Any) -> No
     record = saved.with_suffix(".json")
     record.write_text(json.dumps(json.loads(record.read_text()) | {"medium": medium}))
     with pytest.raises(ValueError, match="json: medium must have albedo, g, eta as numbers, got"):
+        load_network(saved, KIND, MEDIUM, N_FEATURES)
+
+
+@pytest.mark.parametrize("ending", [".json", ".safetensors"])
+def test_weights_without_end_are_not_read(saved: Path, ending: str) -> None:
+    path = saved.with_suffix(ending)
+    path.unlink()
+    path.symlink_to("/dev/zero")
+    with pytest.raises(ValueError, match=f"{path}: .*cannot be read: it must be a regular file"):
         load_network(saved, KIND, MEDIUM, N_FEATURES)
 
 

@@ -13,6 +13,7 @@ __all__ = ["MapGrid", "cell_edges", "map_directions", "radial_scale"]
 
 R_SMALLEST, R_LARGEST = 0.02, 12.0  # first edge in min(L, mfp), last edge in L
 LONGEST_SCALE = 20.0  # transport mean free paths; caps L where nothing absorbs
+MOST_THETA, MOST_CELLS = 4096, 2**22  # 3 GiB for the maps of one direction of incidence
 
 
 @dataclass(frozen=True)
@@ -24,7 +25,8 @@ class MapGrid:
         n_r, n_psi: cells of a map in distance and azimuth.
 
     Raises:
-        ValueError: a number is below its bound, or n_phi is no multiple of 16 (maps are traced 16 at a time).
+        ValueError: a number is out of its bounds, n_theta <= 4096 and n_phi n_r n_psi <= 2**22 (3 GiB) among them, or
+            n_phi is no multiple of 16 (maps are traced 16 at a time).
     """
 
     n_theta: int = 16
@@ -37,6 +39,12 @@ class MapGrid:
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or value < least:
                 raise ValueError(f"{name} must be a whole number >= {least}, got {value!r}")
+        if self.n_theta > MOST_THETA:
+            raise ValueError(f"n_theta must be at most {MOST_THETA}, got {self.n_theta}")
+        cells = self.n_phi * self.n_r * self.n_psi
+        if cells > MOST_CELLS:
+            given = f"{self.n_phi} x {self.n_r} x {self.n_psi} = {cells}"
+            raise ValueError(f"n_phi n_r n_psi must be at most {MOST_CELLS}, which memory holds at once, got {given}")
         if self.n_phi % 16:
             raise ValueError(f"n_phi must be a multiple of 16, got {self.n_phi}")
 

@@ -264,4 +264,4 @@ def load_maps(path: str | os.PathLike) -> xr.Dataset:
                 raise ValueError(f"map store {path} is unfinished at {where}: run the same command again to resume")
             if int(part["checksum"]) != _checksum(part["S"].values, part["variance"].values):
                 raise ValueError(f"map store {path} is damaged at {where}: the checksum does not match")
-    return dataset
+    return dataset.drop_encoding()  # codecs of the store, which another format does not take

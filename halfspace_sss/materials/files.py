@@ -12,6 +12,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StringConstr
 from halfspace_sss.checks import did_you_mean
 from halfspace_sss.materials.material import Material
 from halfspace_sss.physics.medium import Medium
+from halfspace_sss.provenance import read_text
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -78,7 +79,7 @@ def read(path: Path) -> list[Material]:
         ValueError: the file cannot be read, or `parse` refuses it.
     """
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_text(path)
     except (OSError, UnicodeDecodeError) as error:
         raise ValueError(f"{path}: must be a readable TOML file in UTF-8, got {error}") from error
     return parse(text, str(path))

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from halfspace_sss.checks import check_interval
-from halfspace_sss.provenance import write_atomically
+from halfspace_sss.provenance import read_bytes, read_text, write_atomically
 
 __all__ = ["FORMAT", "load_weights", "record_count", "record_number", "save_weights", "to_json"]
 
@@ -94,7 +94,7 @@ def load_weights(path: str | os.PathLike, kind: str) -> tuple[dict[str, np.ndarr
     path = Path(path)
     record = _read_record(path, kind)
     try:
-        data = path.read_bytes()
+        data = read_bytes(path)
     except OSError as error:
         raise ValueError(f"{path}: weights cannot be read: {error.strerror}") from error
     if hashlib.sha256(data).hexdigest() != record["sha256"]:
@@ -107,7 +107,7 @@ def _read_record(path: Path, kind: str) -> dict[str, Any]:
         raise ValueError(f"{path}: weights must be a .safetensors file (a pickle could run code), got {path.suffix!r}")
     place = _record_path(path)
     try:
-        record = json.loads(place.read_text(encoding="utf-8"))
+        record = json.loads(read_text(place))
     except OSError as error:
         raise ValueError(f"{place}: record of the weights cannot be read: {error.strerror}") from error
     except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:

@@ -164,6 +164,15 @@ def store(tmp_path):
     return make_maps({"m": FIG10}, tmp_path, grid=SMALL, target_error=None, n_paths=1024)["m"]
 
 
+@pytest.mark.parametrize("zarr_format", [2, 3])
+def test_loaded_maps_can_be_written_elsewhere(store, tmp_path, zarr_format):
+    maps = load_maps(store)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # on metadata of format 3
+        maps.to_zarr(tmp_path / "copy.zarr", zarr_format=zarr_format)
+        assert load_maps(tmp_path / "copy.zarr").identical(maps)
+
+
 def test_an_altered_chunk_is_refused_by_store_and_direction(store):
     import xarray as xr
 
@@ -215,6 +224,12 @@ def test_a_wrong_argument_is_refused_and_nothing_written(tmp_path, changes, mess
     with pytest.raises(ValueError, match=message):
         make_maps(**arguments)
     assert not (tmp_path / "maps").exists()
+
+
+@pytest.mark.parametrize("numbers", [(2, 16, 99999, 999), (1, 16, 2**17, 3), (4097, 16, 2, 2), (1, 2**22, 2, 2)])
+def test_a_grid_must_fit_into_memory(numbers):
+    with pytest.raises(ValueError, match="n_theta must be at most 4096|n_phi n_r n_psi must be at most 4194304, .*got"):
+        MapGrid(*numbers)
 
 
 def test_a_grid_must_hold_whole_groups_of_observations():

@@ -8,7 +8,7 @@ from typing import Any
 
 import halfspace_sss
 from halfspace_sss.neural.store import to_json
-from halfspace_sss.provenance import write_atomically
+from halfspace_sss.provenance import read_text, write_atomically
 
 __all__ = ["CHECKPOINT", "RUN", "claim"]
 
@@ -44,7 +44,7 @@ def claim(folder: Path, **run: Any) -> None:
 
 def _read(place: Path) -> dict[str, Any]:
     try:
-        run = json.loads(place.read_text(encoding="utf-8"))
+        run = json.loads(read_text(place))
     except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
         raise ValueError(f"{place}: must be a readable JSON file, remove the folder to start anew: {error}") from error
     if not isinstance(run, dict):
