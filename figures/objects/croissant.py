@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from figures.objects.distance import cells, cut, fbm, join, length, noise, overlap, ridges, smoothstep
+from figures.objects.distance import cells, cut, fbm, length, noise, overlap, smoothstep
 from figures.objects.mesh import Box
 
 __all__ = ["BOX", "Croissant"]

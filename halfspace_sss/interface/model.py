@@ -13,8 +13,8 @@ import numpy as np
 
 from halfspace_sss.arrays import broadcast_query
 from halfspace_sss.checks import check_choice, check_query
+from halfspace_sss.interface.model_lists import check_model_class, listed_models
 from halfspace_sss.interface.radial import RadialSampler
-from halfspace_sss.model_lists import check_model_class, listed_models
 from halfspace_sss.once import once
 from halfspace_sss.physics.fresnel import F_t, mu_internal
 from halfspace_sss.physics.medium import Medium

@@ -44,7 +44,7 @@ def _register_all() -> None:
     if mi.variant().startswith("llvm"):
         prepare_llvm()
 
-    from halfspace_sss.rendering.integrator import integrator_class
+    from halfspace_sss.rendering.paths.integrator import integrator_class
     from halfspace_sss.rendering.surface.translucent import translucent_class
     from halfspace_sss.rendering.walk.integrator import walk_integrator_class
 

@@ -21,7 +21,7 @@ import numpy as np
 
 from halfspace_sss.checks import check_count
 from halfspace_sss.provenance import check_folder, provenance
-from halfspace_sss.rendering.scene_identity import scene_hash, words
+from halfspace_sss.rendering.scenes.identity import scene_hash, words
 from halfspace_sss.rendering.scenes.reference_store import Reference, load, save
 
 __all__ = ["Reference", "load", "render"]

@@ -193,7 +193,7 @@ def read_inside(props: Any) -> Inside:
 
 
 def _medium(props: Any) -> tuple[str, Medium, Any]:
-    from halfspace_sss.rendering.varying import constant_value
+    from halfspace_sss.rendering.surface.varying import constant_value
 
     keys = ("sigma_s", "sigma_a", "sigma_t", "albedo", "scale", "g", "eta")
     inline = {key: constant_value(props[key]) for key in keys if key in props}
@@ -219,7 +219,7 @@ def _inline_medium(inline: dict) -> tuple[Medium, Any]:
     """The medium of coefficients, and how it varies if it does."""
     import mitsuba as mi
 
-    from halfspace_sss.rendering.varying import mean_of_grids, varying_medium
+    from halfspace_sss.rendering.surface.varying import mean_of_grids, varying_medium
 
     values = {key: value if isinstance(value, mi.Volume) else _numbers(key, value) for key, value in inline.items()}
     volumes = [key for key, value in values.items() if isinstance(value, mi.Volume)]

@@ -13,12 +13,12 @@ from halfspace_sss.interface.model import bssrdf
 from halfspace_sss.physics import single_scattering
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.surface.object import Object, is_inside, same_objects, survey
+from halfspace_sss.rendering.surface.varying import equivalent
 from halfspace_sss.rendering.transport.area_points import AreaPoints
 from halfspace_sss.rendering.transport.positions import PositionSampler
 from halfspace_sss.rendering.transport.radial_table import RadialTable
 from halfspace_sss.rendering.transport.settings import AUTOMATIC, Settings
-from halfspace_sss.rendering.variation import Variation
-from halfspace_sss.rendering.varying import equivalent
+from halfspace_sss.rendering.transport.variation import Variation
 
 __all__ = ["Bodies", "Body", "make_bodies"]
 

@@ -27,7 +27,7 @@ import numpy as np
 
 from halfspace_sss.rendering.walk.inside import eval_phase, fly, free_path, pick, turn
 from halfspace_sss.rendering.walk.media import WalkMedia, by_pointer, pointer_numbers
-from halfspace_sss.rendering.walk_steps import Event, Walk, draw, start_walk
+from halfspace_sss.rendering.walk.steps import Event, Walk, draw, start_walk
 
 __all__ = ["DEEPEST", "Joins", "find_joins"]
 

@@ -18,7 +18,7 @@ import mitsuba as mi
 from halfspace_sss.rendering.walk.connect import DEEPEST, Joins
 from halfspace_sss.rendering.walk.inside import eval_phase
 from halfspace_sss.rendering.walk.media import Coefficients, WalkMedia
-from halfspace_sss.rendering.walk_steps import Event, draw
+from halfspace_sss.rendering.walk.steps import Event, draw
 
 __all__ = ["Departure", "Guide"]
 

@@ -10,9 +10,9 @@ from halfspace_sss.rendering.surface.object import same_objects
 from halfspace_sss.rendering.surface.parameters import OF_MITSUBA, check_parameters
 from halfspace_sss.rendering.walk.connect import find_joins
 from halfspace_sss.rendering.walk.guide import Guide
+from halfspace_sss.rendering.walk.light import LightVisitor
 from halfspace_sss.rendering.walk.media import WalkMedia
 from halfspace_sss.rendering.walk.tracing import PathTracer
-from halfspace_sss.rendering.walk_light import LightVisitor
 
 __all__ = ["walk_integrator_class"]
 

@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from halfspace_sss.rendering.surface.object import Object, survey
-from halfspace_sss.rendering.walk_grids import Grids, per_channel
+from halfspace_sss.rendering.walk.grids import Grids, per_channel
 
 __all__ = ["Coefficients", "WalkMedia", "by_pointer", "pointer_numbers"]
 

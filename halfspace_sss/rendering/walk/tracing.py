@@ -8,8 +8,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from halfspace_sss.rendering.walk_light import Light, LightVisitor, start_light
-from halfspace_sss.rendering.walk_steps import OUTSIDE, Walk, Walker, sample_bsdf, start_walk
+from halfspace_sss.rendering.walk.light import Light, LightVisitor, start_light
+from halfspace_sss.rendering.walk.steps import OUTSIDE, Walk, Walker, sample_bsdf, start_walk
 from halfspace_sss.tracing.walk import _generator, pass_seed
 
 __all__ = ["PathTracer"]

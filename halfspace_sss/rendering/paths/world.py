@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from halfspace_sss.rendering.books import Replay, Tally, detached
-from halfspace_sss.rendering.lights import Lights
+from halfspace_sss.rendering.paths.books import Replay, Tally
+from halfspace_sss.rendering.paths.lights import Lights
+from halfspace_sss.rendering.surface.derivatives import detached
 from halfspace_sss.rendering.transport.body import Body
 from halfspace_sss.rendering.transport.settings import Settings
 

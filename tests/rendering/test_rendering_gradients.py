@@ -63,8 +63,8 @@ def envmap() -> dict:
 
 def image(scene, bodies: list | None = None) -> np.ndarray:
     """The image whose derivative the replay gives for the same seed."""
-    from halfspace_sss.rendering.differentiable import replayer
-    from halfspace_sss.rendering.paths import trace_paths
+    from halfspace_sss.rendering.paths.differentiable import replayer
+    from halfspace_sss.rendering.paths.tracing import trace_paths
 
     integrator = scene.integrator()
     bodies = bodies or integrator.prepare(scene)

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-from halfspace_sss.rendering.books import detached
+from halfspace_sss.rendering.paths.single import single_scattering_at
+from halfspace_sss.rendering.paths.world import World, sampled_light
+from halfspace_sss.rendering.surface.derivatives import detached
 from halfspace_sss.rendering.surface.object import turned
 from halfspace_sss.rendering.transport.body import Body
 from halfspace_sss.rendering.transport.plane import Exit, local_frame, place, plane_query
-from halfspace_sss.rendering.transport.single import single_scattering_at
-from halfspace_sss.rendering.world import World, sampled_light
 
 __all__ = ["Onward", "balance", "exit_at", "multiple", "nothing", "single", "surface"]
 

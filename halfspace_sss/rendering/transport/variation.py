@@ -13,7 +13,7 @@ from typing import Any
 
 from halfspace_sss.interface.model import bssrdf
 from halfspace_sss.physics.medium import Medium
-from halfspace_sss.rendering.books import detached
+from halfspace_sss.rendering.surface.derivatives import detached
 from halfspace_sss.rendering.surface.translucent import VARIABLE
 from halfspace_sss.rendering.transport.plane import number
 

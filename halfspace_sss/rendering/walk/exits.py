@@ -15,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 
 from halfspace_sss.rendering.walk.media import WalkMedia
-from halfspace_sss.rendering.walk_steps import Crossing, Event, Walk, Walker, draw, sample_bsdf, start_walk
+from halfspace_sss.rendering.walk.steps import Crossing, Event, Walk, Walker, draw, sample_bsdf, start_walk
 from halfspace_sss.tracing.walk import _generator, pass_seed
 
 __all__ = ["ExitVisitor", "Exits", "Start", "exits"]

@@ -43,7 +43,7 @@ def bunny(scale: float = 1.0, turn: float = 0.0, shift: float = 0.0) -> dict:
     return {"type": "ply", "filename": str(BUNNY), "to_world": at}
 
 
-BUNNY = Path(__file__).parent.parent / "figures" / "assets" / "bunny.ply"
+BUNNY = Path(__file__).parents[2] / "figures" / "assets" / "bunny.ply"
 
 
 def ball(radius: float = 2.0) -> object:

@@ -37,7 +37,7 @@ def _slab() -> dict:
 
 def _start(mu: float, n: int = N):
     """Walks that enter at the origin with the cosine mu."""
-    from halfspace_sss.rendering.walk_exits import Start
+    from halfspace_sss.rendering.walk.exits import Start
 
     w = np.repeat([[np.sqrt(1 - mu * mu)], [0.0], [mu]], n, axis=1)
     up = np.repeat([[0.0], [0.0], [1.0]], n, axis=1)
@@ -46,7 +46,7 @@ def _start(mu: float, n: int = N):
 
 def _on_sphere(radius: float, n: int):
     """Random points of a sphere about the origin and directions within 70 degrees of its normals."""
-    from halfspace_sss.rendering.walk_exits import Start
+    from halfspace_sss.rendering.walk.exits import Start
 
     rng = np.random.default_rng(3)
     up = rng.standard_normal((3, n))
@@ -58,7 +58,7 @@ def _on_sphere(radius: float, n: int):
 
 
 def _exits(*arguments: object, **options: object):
-    from halfspace_sss.rendering.walk_exits import exits
+    from halfspace_sss.rendering.walk.exits import exits
 
     return exits(*arguments, **options)
 

@@ -15,7 +15,7 @@ import mitsuba as mi
 from halfspace_sss.rendering.walk.connect import Joins
 from halfspace_sss.rendering.walk.guide import Departure, Guide
 from halfspace_sss.rendering.walk.media import WalkMedia
-from halfspace_sss.rendering.walk_steps import Crossing, Event, Walk
+from halfspace_sss.rendering.walk.steps import Crossing, Event, Walk
 
 __all__ = ["Light", "LightVisitor", "power_heuristic", "start_light"]
 

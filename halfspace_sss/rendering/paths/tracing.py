@@ -6,13 +6,14 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from halfspace_sss.rendering.books import Books, Replay, Tally, detached, tracking
-from halfspace_sss.rendering.events import Onward, balance, multiple, nothing, single, surface
-from halfspace_sss.rendering.lights import Lights
+from halfspace_sss.rendering.paths.books import Books, Replay, Tally
+from halfspace_sss.rendering.paths.events import Onward, balance, multiple, nothing, single, surface
+from halfspace_sss.rendering.paths.lights import Lights
+from halfspace_sss.rendering.paths.world import World
+from halfspace_sss.rendering.surface.derivatives import detached, tracking
 from halfspace_sss.rendering.transport.body import Body
 from halfspace_sss.rendering.transport.plane import number, place
 from halfspace_sss.rendering.transport.settings import Settings
-from halfspace_sss.rendering.world import World
 
 __all__ = ["replay_paths", "trace_paths"]
 

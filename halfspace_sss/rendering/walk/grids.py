@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from halfspace_sss.rendering.varying import VaryingMedium, eval_volume
+from halfspace_sss.rendering.surface.varying import VaryingMedium, eval_volume
 
 __all__ = ["Grids", "per_channel"]
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from halfspace_sss.rendering.differentiable import check_parameters, replayer
-from halfspace_sss.rendering.paths import replay_paths, trace_paths
+from halfspace_sss.rendering.paths.differentiable import check_parameters, replayer
+from halfspace_sss.rendering.paths.tracing import replay_paths, trace_paths
 from halfspace_sss.rendering.transport.body import Bodies
 from halfspace_sss.rendering.transport.settings import read_settings
 

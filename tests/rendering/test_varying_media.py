@@ -113,8 +113,8 @@ def _layers(values: list, thickness: float, **more: Any) -> dict:
 
 
 def _exits(surface: dict, thickness: float, mu: float, seed: int) -> Any:
+    from halfspace_sss.rendering.walk.exits import Start, exits
     from halfspace_sss.rendering.walk.media import WalkMedia
-    from halfspace_sss.rendering.walk_exits import Start, exits
 
     scene = {"type": "scene", "object": {**_slab(thickness), "bsdf": {"type": "translucent", **surface}}}
     w = np.repeat([[np.sqrt(1 - mu * mu)], [0.0], [mu]], N, axis=1)
@@ -251,7 +251,7 @@ def test_grids_that_are_no_media_are_refused(parameters: dict, message: str) -> 
 
 
 def test_volumes_that_are_no_grids_are_refused() -> None:
-    from halfspace_sss.rendering.varying import varying_medium
+    from halfspace_sss.rendering.surface.varying import varying_medium
 
     class Ramp(mi.Volume):
         pass

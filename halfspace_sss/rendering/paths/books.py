@@ -7,27 +7,12 @@ the others held, and no loop is recorded. Where paths go, and with what density,
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any
 
-__all__ = ["Books", "Replay", "Tally", "detached", "tracking"]
+__all__ = ["Books", "Replay", "Tally"]
 
 Books = tuple[Any, Any]  # radiance so far, or in a replay still to come; its derivative, or adjoint; spectra
-
-
-def tracking(when: bool) -> AbstractContextManager:
-    """Where derivatives are followed, in a replay."""
-    import drjit as dr
-
-    return dr.resume_grad(when=when)
-
-
-def detached() -> AbstractContextManager:
-    """Where they are not: for what decides where a path goes."""
-    import drjit as dr
-
-    return dr.suspend_grad()
 
 
 @dataclass(frozen=True)

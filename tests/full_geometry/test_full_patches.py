@@ -26,7 +26,7 @@ from full_geometry.subject import Subject  # noqa: E402
 from full_geometry.training import train  # noqa: E402
 from halfspace_sss.tracing.walk import _generator, pass_seed  # noqa: E402
 
-BUNNY = Path(__file__).parent.parent / "figures" / "assets" / "bunny.ply"
+BUNNY = Path(__file__).parents[2] / "figures" / "assets" / "bunny.ply"
 WAX = Medium(np.array([0.95, 0.8, 0.6]), np.array([0.05, 0.2, 0.4]), 0.0, 1.4)
 N_PATCHES = 64
 

@@ -13,11 +13,11 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from halfspace_sss.physics.phase import eval_hg, sample_hg
-from halfspace_sss.rendering.books import detached
+from halfspace_sss.rendering.paths.refraction import leave, refracted_connection
+from halfspace_sss.rendering.paths.world import World, sampled_light
+from halfspace_sss.rendering.surface.derivatives import detached
 from halfspace_sss.rendering.transport.body import Body
 from halfspace_sss.rendering.transport.plane import Exit, number, place
-from halfspace_sss.rendering.transport.refraction import leave, refracted_connection
-from halfspace_sss.rendering.world import World, sampled_light
 
 __all__ = ["Scattered", "single_scattering_at"]
 

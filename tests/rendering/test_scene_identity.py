@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import halfspace_sss.rendering as rendering
-from halfspace_sss.rendering.scene_identity import scene_hash
+from halfspace_sss.rendering.scenes.identity import scene_hash
 from halfspace_sss.rendering.scenes.scene_files import load_scene
 
 mi = pytest.importorskip("mitsuba")
@@ -33,7 +33,7 @@ import sys
 import halfspace_sss.rendering as rendering
 import mitsuba as mi
 from halfspace_sss.rendering.scenes.scene_files import load_scene
-from halfspace_sss.rendering.scene_identity import scene_hash
+from halfspace_sss.rendering.scenes.identity import scene_hash
 mi.set_variant("llvm_ad_rgb")
 rendering.register()
 scene = load_scene(sys.argv[1])
