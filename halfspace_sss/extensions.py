@@ -3,6 +3,7 @@
 - `halfspace_sss.models`: list of model classes.
 - `halfspace_sss.materials`: path of a material file or folder, or an iterable of `Material`.
 - `halfspace_sss.commands`: name -> function with typer annotations, a further command of `halfspace-sss`.
+- `halfspace_sss.transports`: mapping of names to "module:function", see `rendering.surface.transports`.
 - `halfspace_sss.figures`: kind of result -> function that takes the result and returns {file ending: bytes}.
 
 What a package offers may fail in any way: it is left out with a warning in one line that names it, and nothing else is.
@@ -15,9 +16,20 @@ from collections.abc import Callable, Iterator
 from importlib.metadata import entry_points
 from typing import Any
 
-__all__ = ["COMMANDS", "FAILURES", "FIGURES", "MODELS", "commands", "offered", "renderer", "warn_left_out"]
+__all__ = [
+    "COMMANDS",
+    "FAILURES",
+    "FIGURES",
+    "MODELS",
+    "TRANSPORTS",
+    "commands",
+    "offered",
+    "renderer",
+    "warn_left_out",
+]
 
 COMMANDS, FIGURES, MODELS = "halfspace_sss.commands", "halfspace_sss.figures", "halfspace_sss.models"
+TRANSPORTS = "halfspace_sss.transports"
 FAILURES = (Exception, SystemExit)  # what code of somebody else may end with
 OWN = ("analytic_models", "figures", "full_geometry", "halfspace_sss")
 Renderer = Callable[[Any], dict[str, bytes]]

@@ -43,26 +43,25 @@ def _steps(scene: Any, n: int) -> dict[str, Callable[[], Any]]:
     import mitsuba as mi
 
     from halfspace_sss.rendering.paths.events import exit_at
-    from halfspace_sss.rendering.transport.plane import place, plane_query
+    from halfspace_sss.rendering.transport.plane import place
 
     (body,) = scene.integrator().prepare(scene)
     si, sampler = _seen(scene, n), mi.load_dict({"type": "independent"})
     sampler.seed(11, n)
     out, face = exit_at(body, si), mi.UInt32(si.prim_index)
-    entry = body.positions.sample(out, face, sampler, mi.Bool(True))
+    entry = body.proposals.sample(out, face, sampler, mi.Bool(True))
     direction = mi.Frame3f(entry.n_out).to_world(mi.warp.square_to_cosine_hemisphere(sampler.next_2d()))
     dr.eval(tuple(out), face, tuple(entry), direction, sampler)  # named tuples are passed over
-    query = plane_query(entry.p, entry.n_out, direction, out, scene.integrator().settings.geometry)
     ray = place(entry.p, entry.n).spawn_ray(direction)
-    dr.eval(query, ray)
+    dr.eval(ray)
     found = entry.weight > 0
     dr.eval(found)
 
     def evaluated() -> Any:
-        return [dr.select(found, model.eval(*query), 0) for model in body.models]
+        return body.transport.S_mu(body.transport.prepare(out, found), entry, direction, found)
 
     return {
-        "entries": lambda: tuple(body.positions.sample(out, face, sampler.clone(), mi.Bool(True))),
+        "entries": lambda: tuple(body.proposals.sample(out, face, sampler.clone(), mi.Bool(True))),
         "visibility": lambda: scene.ray_intersect_preliminary(ray, coherent=False, active=found),
         "evaluation": evaluated,
     }

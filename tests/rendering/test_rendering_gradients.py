@@ -112,7 +112,7 @@ class Shifted:
                            for own, m in ((bssrdf(self.inside.model, c.in_mfp()), s)
                                           for c, s in zip(self.inside.channels(), media))]  # fmt: skip
         else:
-            self.models = [bssrdf(self.inside.model, m) for m in media] if body.models else []
+            self.models = [bssrdf(self.inside.model, m) for m in media] if body.transport else []
         self.media = media
 
     def S(self, values: list, query: tuple) -> list:
@@ -124,13 +124,18 @@ class Shifted:
         return [tuple(number(v) for v in (m.sigma_s, m.sigma_t, m.g)) for m in self.media]
 
 
+def _varied(body, variation):
+    transport = body.transport and dataclasses.replace(body.transport, variation=variation)
+    return dataclasses.replace(body, variation=variation, transport=transport)
+
+
 def medium_difference(scene, name: str, only: int | None = None) -> float:
     """Central difference by a coefficient of the medium, with densities held."""
     bodies = scene.integrator().prepare(scene)
     h = {"albedo": 1e-3, "sigma_t": 5e-3, "g": 4e-3}[name]
     sides = []
     for sign in (1, -1):
-        shifted = [dataclasses.replace(body, variation=Shifted(body, name, sign * h, only)) for body in bodies]
+        shifted = [_varied(body, Shifted(body, name, sign * h, only)) for body in bodies]
         sides.append((image(scene, shifted) * weights(scene)).sum())
     return float(sides[0] - sides[1]) / (2 * h)
 

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+from halfspace_sss.rendering.paths.entering import entering_light
 from halfspace_sss.rendering.paths.single import single_scattering_at
 from halfspace_sss.rendering.paths.world import World, sampled_light
 from halfspace_sss.rendering.surface.derivatives import detached
 from halfspace_sss.rendering.surface.object import turned
 from halfspace_sss.rendering.transport.body import Body
-from halfspace_sss.rendering.transport.plane import Exit, local_frame, place, plane_query
+from halfspace_sss.rendering.transport.plane import Exit, place
 
 __all__ = ["Onward", "balance", "exit_at", "multiple", "nothing", "single", "surface"]
 
@@ -90,45 +91,22 @@ def _differentiable(bsdf: Any, ctx: Any, si: Any, bs: Any, weight: Any, active: 
 
 
 def multiple(world: World, body: Body, sampler: Any, si: Any, active: Any) -> tuple[Onward, Any]:
-    """Light that entered the body elsewhere and comes out here by its model, and what is seen of point lights so.
-
-    S is evaluated once, the costly part: the direction is sampled by emitters or by the model (one-sample balance
-    heuristic), and the ray that goes on is what tests visibility.
-    """
+    """Light that entered the body elsewhere and comes out here by its model, and what is seen of point lights so."""
     import drjit as dr
     import mitsuba as mi
 
-    lights = world.lights
     with detached():
         out = exit_at(body, si)
-        entry = body.positions.sample(out, si.prim_index, sampler, active)
-        active = active & (entry.weight > 0)
-        at, share, model = place(entry.p, entry.n), lights.share, body.models[0]
-        u = sampler.next_2d()
-        frame = local_frame(entry.n_out, out.p - entry.p)
-        drawn = model.sample_direction(mi.Float(0), mi.Float(1), mi.Float(0), (u.x, u.y))
-        d, pdf, aim = mi.Vector3f(frame.direction(drawn.mu_i, drawn.phi_i)), (1 - share) * drawn.pdf, mi.Float(-1)
-    delta, light = mi.Bool(False), mi.Spectrum(0)
-    if share > 0:
-        by_emitter = active & (sampler.next_1d() < share)
-        ds, light = sampled_light(world, at, sampler.next_2d(), False, by_emitter)
-        with detached():
-            sky, delta = ds.emitter.is_environment(), by_emitter & ds.delta
-            mu_i, rest = dr.clip(dr.dot(ds.d, entry.n_out), 0, 1), (mi.Float(0), mi.Float(0), mi.Float(1), mi.Float(0))
-            by_model = model.pdf_direction(mu_i, *rest)
-            d = dr.select(by_emitter, ds.d, d)
-            pdf = dr.select(by_emitter, share * ds.pdf + dr.select(ds.delta, 0, (1 - share) * by_model), pdf)
-            aim = dr.select(by_emitter, dr.select(sky, dr.inf, ds.dist), aim)
-            active &= pdf > 0
-    value = _S_mu(world, body, entry, d, out, active) * (entry.weight / dr.maximum(pdf, 1e-8))
-    value = dr.select(active, value, 0)
+    found = entering_light(world, body, out, si.prim_index, sampler, active)
     direct = mi.Spectrum(0)
-    if lights.some_delta:
-        seen = delta & ~world.scene.ray_test(at.spawn_ray_to(ds.p), False, delta)
-        direct = dr.select(seen, value * light, 0)
+    if world.lights.some_delta:
+        shadow = place(found.p, found.n).spawn_ray_to(found.target)
+        seen = found.delta & ~world.scene.ray_test(shadow, False, found.delta)
+        direct = dr.select(seen, found.value * found.light, 0)
+    anywhere = found.aim < 0
     on = Onward(
-        mi.Point3f(entry.p), mi.Normal3f(entry.n), d, dr.select(delta, 0, value), dr.select(aim < 0, pdf, 1),
-        dr.select(aim < 0, mi.Float(share), 0), mi.Bool(False), aim,
+        found.p, found.n, found.d, dr.select(found.delta, 0, found.value), dr.select(anywhere, found.pdf, 1),
+        dr.select(anywhere, mi.Float(world.lights.share), 0), mi.Bool(False), found.aim,
     )  # fmt: skip
     return on, direct
 
@@ -152,18 +130,4 @@ def exit_at(body: Body, si: Any) -> Exit:
     sign = body.found.side(si.prim_index)
     if not body.found.closed:  # a sheet is a half-space from both sides
         sign = dr.select(dr.dot(n, w) > 0, 1.0, -1.0)
-    return Exit(mi.Point3f(si.p), n * sign, w, sign)
-
-
-def _S_mu(world: World, body: Body, entry: Any, w_i: Any, out: Exit, active: Any) -> Any:
-    """S mu_i for each channel, 1/((scene unit)² sr)."""
-    import drjit as dr
-    import mitsuba as mi
-
-    with detached():
-        query = plane_query(entry.p, entry.n_out, w_i, out, world.settings.geometry)
-        mu_i = query[1]
-        lit = active & (mu_i > 0) & (query[3] > 0)
-        values = [model.eval(*query) for model in body.models]
-    values = [value * mu_i for value in body.variation.S(values, query)]
-    return dr.select(lit, mi.Spectrum(*values) if len(values) > 1 else mi.Spectrum(values[0]), 0)
+    return Exit(mi.Point3f(si.p), n * sign, w, sign, mi.Normal3f(si.n) * sign)

@@ -125,7 +125,7 @@ def _vertex(
             glossy |= here
         taken = dr.select(is_single, once, dr.select(is_multiple, 1 - reflect - once, reflect))
         share = dr.select(here, taken, share)
-        if body.models:
+        if body.transport is not None:
             events.append((is_multiple, partial(multiple, world, body, sampler, si, is_multiple)))
         if body.single_share > 0:
             events.append((is_single, partial(single, world, body, sampler, si, is_single)))

@@ -12,12 +12,13 @@ from halfspace_sss import measure
 from halfspace_sss.interface.model import bssrdf
 from halfspace_sss.physics import single_scattering
 from halfspace_sss.physics.medium import Medium
+from halfspace_sss.rendering.surface.inside import Inside
 from halfspace_sss.rendering.surface.object import Object, is_inside, same_objects, survey
+from halfspace_sss.rendering.surface.transports import object_transport
 from halfspace_sss.rendering.surface.varying import equivalent
-from halfspace_sss.rendering.transport.area_points import AreaPoints
-from halfspace_sss.rendering.transport.positions import PositionSampler
-from halfspace_sss.rendering.transport.radial_table import RadialTable
-from halfspace_sss.rendering.transport.settings import AUTOMATIC, Settings
+from halfspace_sss.rendering.transport.half_space import half_space_means
+from halfspace_sss.rendering.transport.protocols import Means, Proposals, Transport
+from halfspace_sss.rendering.transport.settings import Settings
 from halfspace_sss.rendering.transport.variation import Variation
 
 __all__ = ["Bodies", "Body", "make_bodies"]
@@ -34,8 +35,8 @@ class Body:
         found: its geometry.
         surface: its `translucent` BSDF.
         media: medium of each channel, 1/(scene unit).
-        models: model of each channel; empty where only single scattering is asked for.
-        positions: sampler of points of entry; None without models.
+        transport: what light that enters elsewhere is worth here; None where only single scattering is asked for.
+        proposals: where it may enter; None without a transport.
         single_share: probability of single scattering among the events inside.
         variation: how its light varies with its medium.
     """
@@ -43,8 +44,8 @@ class Body:
     found: Object
     surface: Any
     media: list[Medium]
-    models: list[Any]
-    positions: PositionSampler | None
+    transport: Transport | None
+    proposals: Proposals | None
     single_share: float
     variation: Variation
 
@@ -92,28 +93,22 @@ def _make_body(shape: Any, settings: Settings) -> Body:
     inside = equivalent(surface.inside, found)
     media = [m.scaled(settings.mm_per_unit) for m in inside.channels()]
     _check_size(found, media, settings)
-    scatters = [float(m.sigma_s) > 0 for m in media]
-    single_only = inside.orders == "single" or not any(scatters)
-    models = [] if single_only else [bssrdf(inside.model, m) for m in media]
-    if models and models[0].orders == "total" and inside.orders == "multiple":
-        raise ValueError(f"orders must be total for the model {inside.model!r}, which contains them all, got multiple")
-    adds_single = inside.orders == "single" or (inside.orders == "total" and models and models[0].orders == "multiple")
-    share = _single_share(media) if adds_single and models else float(bool(adds_single))
+    single_only = inside.orders == "single" or not any(float(m.sigma_s) > 0 for m in media)
     variation = Variation(surface, settings.mm_per_unit)
-    if not models:
-        return Body(found, surface, media, [], None, share, variation)
-    live = [model for model, s in zip(models, scatters) if s]
-    table = RadialTable(live, found.size)
-    area_share = settings.area_share
-    if area_share == AUTOMATIC:
-        area_share = _area_share(table.mean / found.size)
-    positions = PositionSampler(found, table, AreaPoints(shape), area_share)
-    return Body(found, surface, media, models, positions, share, variation)
+    transport, proposals = (None, None) if single_only else _means(inside, found, media, settings, variation)
+    if transport and transport.orders == "total" and inside.orders == "multiple":
+        raise ValueError(f"orders must be total for the model {inside.model!r}, which contains them all, got multiple")
+    lacks_single = transport is None or transport.orders == "multiple"
+    adds_single = inside.orders == "single" or (inside.orders == "total" and not single_only and lacks_single)
+    share = _single_share(media) if adds_single and transport else float(adds_single)
+    return Body(found, surface, media, transport, proposals, share, variation)
 
 
-def _area_share(ratio: float) -> float:
-    """Share of uniform entries for a ratio of mean distance to object size."""
-    return float(np.clip(0.5 * (np.log10(max(ratio, 1e-9)) + 0.5), 0.0, 0.5))
+def _means(inside: Inside, found: Object, media: list[Medium], settings: Settings, variation: Variation) -> Means:
+    of_object = object_transport(inside.model)
+    if of_object is not None:
+        return of_object(found, inside, media, settings)
+    return half_space_means(inside.model, found, media, settings, variation)
 
 
 def _single_share(media: list[Medium]) -> float:

@@ -15,7 +15,8 @@ class Exit(NamedTuple):
     p: Any
     n: Any
     w: Any
-    sign: Any  # that turns the normals of the shape outwards
+    sign: Any = None  # that turns the normals of the shape outwards
+    n_face: Any = None  # outward geometric normal
 
 
 class Frame(NamedTuple):

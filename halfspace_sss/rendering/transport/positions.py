@@ -11,29 +11,21 @@ points uniform over the area A, a share s of the samples, the density is (1 - s)
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 from halfspace_sss.rendering.surface.object import Object, turned
 from halfspace_sss.rendering.transport.area_points import AreaPoints
 from halfspace_sss.rendering.transport.plane import Exit, number
+from halfspace_sss.rendering.transport.protocols import Entry
 from halfspace_sss.rendering.transport.radial_table import RadialTable
 
-__all__ = ["Entry", "PositionSampler"]
+__all__ = ["PositionSampler"]
 
 MOST_HITS = 64
 NORMAL_SHARE = 0.8
 LONG_SHARE = 0.05  # of the probes go through the whole object, for what lies straight behind the exit
 REACH = 4.0  # length of the others to either side, over their distance from the exit
 LEAST_REACH = 1e-3  # of the size of the object, for the roughness of a mesh and rounding
-
-
-class Entry(NamedTuple):
-    """A point of entry: position, geometric normal, outward shading normal, weight 1/density (0: none was found)."""
-
-    p: Any
-    n: Any
-    n_out: Any
-    weight: Any
 
 
 @dataclass(frozen=True, eq=False)

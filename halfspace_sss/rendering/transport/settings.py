@@ -25,6 +25,7 @@ class Settings:
         geometry: "distance" or "tangent", see `plane.separation`.
         area_share: share of entries drawn uniformly over the area, 0 to 1; AUTOMATIC chooses by the ratio of the
             distance that light travels to the size of the object.
+        entries: points of entry that an exit draws, of which one is followed, chosen by what it may bring.
         hide_emitters: whether directly visible emitters are left out.
     """
 
@@ -33,6 +34,7 @@ class Settings:
     rr_depth: int = 5
     geometry: str = "distance"
     area_share: float = AUTOMATIC
+    entries: int = 1
     hide_emitters: bool = False
 
     def __post_init__(self) -> None:
@@ -41,6 +43,8 @@ class Settings:
             raise ValueError(f"max_depth must be -1 or at least 1, got {self.max_depth}")
         if self.rr_depth < 1:
             raise ValueError(f"rr_depth must be at least 1, got {self.rr_depth}")
+        if self.entries < 1:
+            raise ValueError(f"entries must be at least 1, got {self.entries}")
         if self.geometry not in GEOMETRIES:
             raise ValueError(f"geometry must be one of {', '.join(GEOMETRIES)}, got {self.geometry!r}")
         if self.area_share != AUTOMATIC:

@@ -1,0 +1,41 @@
+"""The names that `model` may have in a scene: the half-space models, and what packages add that knows whole objects.
+
+An entry point of the group `halfspace_sss.transports` is a mapping of names to "module:function"; the function takes
+(found, inside, media, settings), the `Object`, the `Inside`, the medium of each channel in 1/(scene unit) and the
+`Settings` of the integrator, and returns `Means`: a transport and its proposals. It is imported when it is asked for.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Mapping
+
+from halfspace_sss.extensions import TRANSPORTS, offered, warn_left_out
+from halfspace_sss.interface.model import models
+from halfspace_sss.once import once
+
+__all__ = ["model_names", "object_transport"]
+
+
+@once
+def _added() -> dict[str, str]:
+    found: dict[str, str] = {}
+    for name, mapping in offered(TRANSPORTS):
+        if not isinstance(mapping, Mapping) or not all(isinstance(v, str) and ":" in v for v in mapping.values()):
+            warn_left_out(TRANSPORTS, name, f"it must map names to 'module:function', got {mapping!r}")
+            continue
+        found |= {key: value for key, value in mapping.items() if key not in found}
+    return found
+
+
+def model_names() -> tuple[str, ...]:
+    """All names that the `model` of a surface may have."""
+    return (*models(), *(name for name in _added() if name not in models()))
+
+
+def object_transport(name: str) -> Callable | None:
+    """The function that makes the transport of that name for an object; None for a half-space model."""
+    if name in models() or name not in _added():
+        return None
+    module, _, function = _added()[name].partition(":")
+    return getattr(importlib.import_module(module), function)

@@ -1,0 +1,112 @@
+"""The half-space models laid onto a surface: a transport, and the proposals that follow the same models."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from halfspace_sss.interface.model import bssrdf
+from halfspace_sss.physics.medium import Medium
+from halfspace_sss.rendering.surface.derivatives import detached
+from halfspace_sss.rendering.surface.object import Object
+from halfspace_sss.rendering.transport.area_points import AreaPoints
+from halfspace_sss.rendering.transport.plane import Exit, local_frame, plane_query
+from halfspace_sss.rendering.transport.positions import PositionSampler
+from halfspace_sss.rendering.transport.protocols import Entry, Means
+from halfspace_sss.rendering.transport.radial_table import RadialTable
+from halfspace_sss.rendering.transport.settings import AUTOMATIC, Settings
+from halfspace_sss.rendering.transport.variation import Variation
+
+__all__ = ["HalfSpaceProposals", "HalfSpaceTransport", "half_space_means"]
+
+
+@dataclass(frozen=True, eq=False)
+class HalfSpaceTransport:
+    """S of the half-space at the distance of two surface points, see `plane_query`.
+
+    Args:
+        models: one per channel, in scene units.
+        geometry: "distance" or "tangent", see `plane.separation`.
+        variation: how they vary with the medium.
+    """
+
+    models: list[Any]
+    geometry: str
+    variation: Variation
+
+    @property
+    def orders(self) -> str:
+        return self.models[0].orders
+
+    def prepare(self, out: Exit, active: Any) -> Exit:
+        """Nothing is done for the exit alone."""
+        return out
+
+    def S_mu(self, prepared: Exit, entry: Entry, w_i: Any, active: Any) -> Any:
+        import drjit as dr
+        import mitsuba as mi
+
+        with detached():
+            query = plane_query(entry.p, entry.n_out, w_i, prepared, self.geometry)
+            mu_i = query[1]
+            lit = active & (mu_i > 0) & (query[3] > 0)
+            values = [model.eval(*query) for model in self.models]
+        values = [value * mu_i for value in self.variation.S(values, query)]
+        return dr.select(lit, mi.Spectrum(*values) if len(values) > 1 else mi.Spectrum(values[0]), 0)
+
+
+@dataclass(frozen=True, eq=False)
+class HalfSpaceProposals:
+    """Points by probes and over the area, directions by a model.
+
+    Args:
+        positions: of entries.
+        model: whose directions of incidence are drawn.
+    """
+
+    positions: PositionSampler
+    model: Any
+
+    def sample(self, out: Exit, prim_index: Any, sampler: Any, active: Any) -> Entry:
+        return self.positions.sample(out, prim_index, sampler, active)
+
+    def sample_direction(self, entry: Entry, out: Exit, u: Any) -> tuple[Any, Any]:
+        import mitsuba as mi
+
+        frame = local_frame(entry.n_out, out.p - entry.p)
+        drawn = self.model.sample_direction(mi.Float(0), mi.Float(1), mi.Float(0), (u.x, u.y))
+        return mi.Vector3f(frame.direction(drawn.mu_i, drawn.phi_i)), drawn.pdf
+
+    def pdf_direction(self, entry: Entry, out: Exit, w_i: Any) -> Any:
+        import drjit as dr
+        import mitsuba as mi
+
+        mu_i = dr.clip(dr.dot(w_i, entry.n_out), 0, 1)
+        return self.model.pdf_direction(mu_i, mi.Float(0), mi.Float(0), mi.Float(1), mi.Float(0))
+
+
+def half_space_means(name: str, found: Object, media: list[Medium], settings: Settings, variation: Variation) -> Means:
+    """The transport and the proposals of a half-space model on an object.
+
+    Args:
+        name: of the model.
+        found: the object.
+        media: of each channel, 1/(scene unit).
+        settings: geometry and share of uniform entries.
+        variation: for derivatives by the medium.
+    """
+    models = [bssrdf(name, m) for m in media]
+    table = RadialTable([model for model, m in zip(models, media) if float(m.sigma_s) > 0], found.size)
+    area_share = settings.area_share
+    if area_share == AUTOMATIC:
+        area_share = _area_share(table.mean / found.size)
+    positions = PositionSampler(found, table, AreaPoints(found.shape), area_share)
+    transport = HalfSpaceTransport(models, settings.geometry, variation)
+    return Means(transport, HalfSpaceProposals(positions, models[0]))
+
+
+def _area_share(ratio: float) -> float:
+    """Share of uniform entries for a ratio of mean distance to object size."""
+    return float(np.clip(0.5 * (np.log10(max(ratio, 1e-9)) + 0.5), 0.0, 0.5))

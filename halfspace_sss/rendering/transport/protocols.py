@@ -1,0 +1,61 @@
+"""The two words the path loop knows of a model: where light may enter for an exit, and what it is worth there.
+
+A *proposal* draws an entry and the direction that light comes from, with densities; a *transport* gives S for an exit
+and an entry. A half-space model laid onto the surface is one transport, a network that knows the object another.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, Protocol
+
+from halfspace_sss.rendering.transport.plane import Exit
+
+__all__ = ["Entry", "Means", "Proposals", "Transport"]
+
+
+class Entry(NamedTuple):
+    """A point of entry: position, geometric normal, outward shading normal, weight 1/density (0: none was found)."""
+
+    p: Any
+    n: Any
+    n_out: Any
+    weight: Any
+
+
+class Proposals(Protocol):
+    """Where light that leaves at an exit may have entered."""
+
+    def sample(self, out: Exit, prim_index: Any, sampler: Any, active: Any) -> Entry:
+        """A point of entry; its weight is the inverse of the density of such points over the surface, (scene unit)²."""
+
+    def sample_direction(self, entry: Entry, out: Exit, u: Any) -> tuple[Any, Any]:
+        """A direction w_i that points away from the surface at the entry, for a pair of uniforms, and its density.
+
+        The density is over solid angle, 1/sr.
+        """
+
+    def pdf_direction(self, entry: Entry, out: Exit, w_i: Any) -> Any:
+        """The density of `sample_direction`, 1/sr; 0 below the surface."""
+
+
+class Transport(Protocol):
+    """S of one object, for any exit and entry.
+
+    Attributes:
+        orders: "multiple" (two or more scattering events) or "total".
+    """
+
+    orders: str
+
+    def prepare(self, out: Exit, active: Any) -> Any:
+        """What is done once for all entries of an exit, handed to `S_mu` as it is."""
+
+    def S_mu(self, prepared: Any, entry: Entry, w_i: Any, active: Any) -> Any:
+        """S(x_i, w_i; x_o, w_o) mu_i for each channel, 1/((scene unit)² sr); 0 below the horizons."""
+
+
+class Means(NamedTuple):
+    """What renders an object inside: a transport and the proposals that suit it."""
+
+    transport: Transport
+    proposals: Proposals
