@@ -10,10 +10,12 @@ import math
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from full_geometry.first_event import FirstEvent
 from full_geometry.subject import SurfacePoint
 
-__all__ = ["N_PAIR", "Frame", "Side", "n_side", "pair_features", "side_features"]
+__all__ = ["N_PAIR", "Frame", "Side", "n_side", "pair_features", "reverse", "side_features"]
 
 OCTAVES = 2
 N_PAIR = 15
@@ -98,3 +100,12 @@ def pair_features(frame: Frame, exit: Side, entry: Side) -> list[Any]:
         dr.dot(o.n_out, i.n_out), dr.dot(o.w, i.w), dr.dot(o.n_out, d), dr.dot(i.n_out, d), dr.dot(o.w, d),
         dr.dot(i.w, d), dr.dot(o.n_out, i.w), dr.dot(i.n_out, o.w),
     ]  # fmt: skip
+
+
+def reverse(channels: int) -> tuple[np.ndarray, np.ndarray]:
+    """Order and signs that turn the features of (exit, entry, pair) into those of the way back."""
+    n = n_side(channels)
+    pair = np.array([0, 1, 2, 3, 4, 5, 6, 7, 8, 10, 9, 12, 11, 14, 13])
+    signs = np.ones(2 * n + N_PAIR, dtype=np.float32)
+    signs[2 * n + np.array([0, 1, 2, 9, 10, 11, 12])] = -1
+    return np.concatenate([np.arange(n, 2 * n), np.arange(n), 2 * n + pair]), signs

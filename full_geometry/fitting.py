@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from full_geometry.features import n_side
+from full_geometry.features import n_side, reverse
 from full_geometry.learner import Correction, PatchLogits, likelihood, patch_likelihood
 from full_geometry.pairs import Pairs
 from full_geometry.patches import Patches
@@ -82,7 +82,9 @@ class Fitting:
         self.scale = torch.where(mean > 0, 1 / mean.clamp_min(1e-30), torch.zeros_like(mean))[:, None].float()
 
     def use(self, walks: Pairs, proposals: Pairs, steps: int, order: np.random.Generator) -> None:
-        """Steps on all batches of a chunk, `reuse` times over.
+        """Steps on all batches of a chunk, `reuse` times over, every other time with exit and entry exchanged.
+
+        As S is reciprocal and exits are drawn by area and cosine, a pair read backwards is as good a sample.
 
         Args:
             walks, proposals: the chunk.
@@ -97,12 +99,15 @@ class Fitting:
             patch = torch.from_numpy(self.patches.of_face[walks.faces].astype(np.int64))
         n_x, n_y = max(T.shape[1] // batch, 1), max(W.shape[1] // batch, 1)
         kept = T.shape[1] / walks.drawn
-        for _ in range(self.recipe.reuse):
+        order_back, signs = (torch.from_numpy(v) for v in reverse(T.shape[0]))
+        for k in range(self.recipe.reuse):
+            if k:
+                x, y = (v[order_back] * signs[:, None] for v in (x, y))
             for i, j in zip(order.permutation(n_x), order.integers(0, n_y, n_x)):
                 a, b = slice(i * batch, (i + 1) * batch), slice(j * batch, (j + 1) * batch)
                 f = self.modules["S"](torch.cat((x[:, a], y[:, b]), dim=1))
                 loss = likelihood(f, T[:, a] * self.scale, W[:, b] * self.scale, kept)
-                if patch is not None:
+                if patch is not None and k % 2 == 0:
                     loss = loss + self._patch_loss(x[:, a], T[:, a], patch[a])
                 self._advance(loss, steps)
 

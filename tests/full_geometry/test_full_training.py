@@ -12,13 +12,17 @@ import pytest
 
 from halfspace_sss import Medium
 
+dr = pytest.importorskip("drjit")
 mi = pytest.importorskip("mitsuba")
 pytest.importorskip("torch")
 
 import full_geometry  # noqa: E402
 from full_geometry import storing, training  # noqa: E402
+from full_geometry.features import Side, pair_features, reverse, side_features  # noqa: E402
+from full_geometry.first_event import first_event  # noqa: E402
 from full_geometry.fitting import Recipe  # noqa: E402
 from full_geometry.half_space import HalfSpace, HalfSpaceTransport  # noqa: E402
+from full_geometry.identity import frame_of  # noqa: E402
 from full_geometry.model import FullGeometry  # noqa: E402
 from full_geometry.model_errors import LIGHTS, Estimate, compare, measure, reference  # noqa: E402
 from full_geometry.pairs import Proposals  # noqa: E402
@@ -84,6 +88,19 @@ def points_of(model: FullGeometry, n: int = 4096) -> list[SurfacePoint]:
 def S_of(model: FullGeometry, points: list[SurfacePoint] | None = None) -> np.ndarray:
     exits, entries = points or points_of(model)
     return np.array(model.S(model.prepare(exits), entries))
+
+
+def test_features_of_the_way_back_are_those_of_exit_and_entry_exchanged() -> None:
+    subject = Subject.of(mi.load_dict(bunny()), WAX)
+    frame, rng = frame_of(subject), _generator(mi, 256, pass_seed(8))
+    a, b = (Side(at, first_event(subject, at)) for at in (subject.random_points(rng), subject.random_points(rng)))
+
+    def features(exit: Side, entry: Side) -> np.ndarray:
+        columns = [*side_features(frame, exit), *side_features(frame, entry), *pair_features(frame, exit, entry)]
+        return np.stack([np.array(column) for column in columns])
+
+    order, signs = reverse(3)
+    assert np.allclose(features(a, b)[order] * signs[:, None], features(b, a), atol=1e-5)
 
 
 def test_S_is_positive_and_finite(trained: Trained) -> None:
@@ -220,3 +237,18 @@ def test_an_object_of_a_scene_is_found_by_its_id() -> None:
     rough = {**surface, "boundary": {"type": "roughdielectric", "alpha": 0.2, "int_ior": 1.4, "ext_ior": 1.0}}
     with pytest.raises(ValueError, match="must be smooth"):
         Subject.given(mi.load_dict({"type": "scene", "one": {**one, "bsdf": rough}}), None)
+
+
+def test_one_exit_gathers_many_entries_in_one_loop(trained: Trained) -> None:
+    model, n, times = trained.model, 512, 4
+    exits, entries = points_of(model, n)[0], points_of(model, n * times)[1]
+    prepared = model.prepare(exits)
+    lanes = dr.arange(mi.UInt32, n)
+
+    def add(k: mi.UInt32, total: mi.Spectrum) -> tuple:
+        return k + 1, total + model.S(prepared, entries.gather(lanes * times + k))
+
+    _, gathered = dr.while_loop((mi.UInt32(0), dr.zeros(mi.Spectrum, n)), lambda k, _: k < times, add)
+    repeated = exits.gather(dr.arange(mi.UInt32, n * times) // times)
+    alone = np.array(model.S(model.prepare(repeated), entries)).reshape(3, n, times).sum(axis=2)
+    assert np.allclose(np.array(gathered), alone, rtol=1e-4, atol=1e-7 * alone.max())
