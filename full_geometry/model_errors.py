@@ -171,7 +171,7 @@ def _jackknife(square: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
     n = len(square)
 
     def ratio(sums: np.ndarray, means: np.ndarray) -> np.ndarray:
-        return np.mean(sums / np.maximum(means, 1e-300) ** 2, axis=-1)
+        return np.mean(sums / np.maximum(means, 1e-150) ** 2, axis=-1)
 
     whole = float(ratio(square.mean(0), truth.mean(0)))
     parts = ratio((square.sum(0) - square) / (n - 1), (truth.sum(0) - truth) / (n - 1))

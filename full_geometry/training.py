@@ -36,6 +36,7 @@ VALIDATIONS = 4  # in a run
 EXITS, WALKS, SAMPLES = 256, 2048, 512  # of a validation
 CHECKPOINT_EVERY = 15.0  # seconds
 PLAN = "plan.json"
+LOOP_SHARE = 0.9  # of the seconds for data and steps, the rest for the truth, the trial and the errors
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,7 +185,7 @@ class _Run:
                 self.done, self.history = self.fitting.load(self.work / CHECKPOINT)
 
     def _plan(self, seconds: float, chunks: int | None) -> int:
-        """Number of chunks: given, written down by the run before, or by the time that the second one takes."""
+        """Number of chunks: given, written down by the run before, or by the time that one takes."""
         import json
 
         place = self.work / PLAN if self.work else None
@@ -193,12 +194,10 @@ class _Run:
         if chunks is None:
             trial = self._new_fitting()
             trial.scale = self.fitting.scale
-            spent = []
-            for k in range(3):
-                at = time.monotonic()
-                trial.use(*self._data(2**31 + k), 10**6, np.random.default_rng(0))
-                spent.append(time.monotonic() - at)
-            chunks = max(int(seconds / min(spent[1:])), 1)
+            self.source.proposed(1024, (self.seed, 2**31))  # compiles its kernels
+            at = time.monotonic()
+            trial.use(*self._data(2**31 + 1), 10**6, np.random.default_rng(0))
+            chunks = max(int(LOOP_SHARE * seconds / (time.monotonic() - at)), 1)
         if place:
             write_atomically(place, to_json({"chunks": chunks}))
         return chunks

@@ -252,3 +252,23 @@ def test_one_exit_gathers_many_entries_in_one_loop(trained: Trained) -> None:
     repeated = exits.gather(dr.arange(mi.UInt32, n * times) // times)
     alone = np.array(model.S(model.prepare(repeated), entries)).reshape(3, n, times).sum(axis=2)
     assert np.allclose(np.array(gathered), alone, rtol=1e-4, atol=1e-7 * alone.max())
+
+
+def test_a_plan_by_time_is_kept_by_the_run_that_goes_on(tmp_path: Path) -> None:
+    found = train(ball(), WAX, seconds=2.0, recipe=QUICK, folder=tmp_path, work=tmp_path / "work")
+    planned = json.loads((tmp_path / "work" / training.PLAN).read_text())["chunks"]
+    record = json.loads(found.path.with_suffix(".json").read_text())
+    assert record["chunks"] == planned >= 1
+
+
+def test_a_mono_variant_learns_one_channel(tmp_path: Path) -> None:
+    mi.set_variant("llvm_ad_mono")
+    found = train(ball(), WAX.channel(1), chunks=4, recipe=QUICK, folder=tmp_path)
+    assert len(found.errors) == 2 and all(row.error < 0.2 for row in found.errors)
+    assert S_of(found.model).shape == (1, 4096)
+
+
+def test_a_channel_that_does_not_scatter_carries_nothing(tmp_path: Path) -> None:
+    black = Medium(np.array([0.95, 0.0, 0.6]), np.array([0.05, 1.0, 0.4]), 0.0, 1.4)
+    S = S_of(train(ball(), black, chunks=2, recipe=QUICK, folder=tmp_path).model)
+    assert np.all(S[1] == 0) and np.all(np.isfinite(S)) and np.mean(S[0] > 0) > 0.9
