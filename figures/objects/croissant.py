@@ -18,7 +18,7 @@ THICK, TIP = 22.0, 6.5  # radius in the middle and at the tips
 FLAT = 0.86  # height over width
 BANDS = 3.6  # layers to be seen on each side of the middle
 MIDDLE = ARC + 6.0  # z of the centre of the arc
-STEP = 2.2  # height of a layer's edge
+STEP = 2.8  # height of a layer's edge
 CUT = 0.56  # of the reach, where the tip is cut off
 CRUST = 1.5  # thickness, mm
 
@@ -65,8 +65,8 @@ class Croissant:
 
     def _relief(self, p: np.ndarray, number: np.ndarray) -> np.ndarray:
         """Height of fine layers and blisters, mm."""
-        fine = 0.28 * np.sin(2 * np.pi * 7 * number + 2.2 * fbm(p / 9, self.seed + 1, 2))
-        return fine * smoothstep(-0.4, 0.4, noise(p / 11, self.seed + 2)) + 0.45 * fbm(p / 6, self.seed + 3, 3)
+        fine = 0.4 * np.sin(2 * np.pi * 7 * number + 2.2 * fbm(p / 9, self.seed + 1, 2))
+        return fine * smoothstep(-0.4, 0.4, noise(p / 11, self.seed + 2)) + 0.6 * fbm(p / 6, self.seed + 3, 3)
 
     def _beyond(self, p: np.ndarray) -> np.ndarray:
         """Distance of the half-space that was cut off; < 0 there."""
@@ -116,7 +116,7 @@ class Croissant:
         lips = smoothstep(0.1, 0.8, f)
         fine = 0.5 + 0.5 * np.sin(2 * np.pi * 7 * number + 2.2 * fbm(p / 9, self.seed + 1, 2))
         up = smoothstep(-0.9, 0.8, np.sin(turn))
-        return np.clip(0.12 + 0.45 * lips * up + 0.18 * fine + 0.3 * fbm(p / 10, self.seed + 5, 3) + 0.15 * up, 0, 1)
+        return np.clip(0.08 + 0.55 * lips * up + 0.22 * fine * up + 0.4 * fbm(p / 9, self.seed + 5, 3) + 0.1 * up, 0, 1)
 
     def tissues(self, p: np.ndarray) -> dict[str, np.ndarray]:
         """Share of each tissue, summing to 1: "crumb", "crumb pores", "pale crust", "dark crust"."""

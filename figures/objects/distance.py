@@ -31,7 +31,7 @@ def smoothstep(low: float, high: float, x: np.ndarray) -> np.ndarray:
 
 
 def ellipsoid(p: np.ndarray, radii: tuple[float, float, float]) -> np.ndarray:
-    """Ellipsoid about the origin: k (k - 1) / |grad k|/2 with k the scaled radius; exact to first order at the surface."""
+    """Ellipsoid about the origin: k (k - 1) / |p / r²|, k = |p / r|; exact to first order at the surface."""
     r = np.asarray(radii)
     k = length(*np.moveaxis(p / r, -1, 0))
     gradient = length(*np.moveaxis(p / r**2, -1, 0))

@@ -1,4 +1,4 @@
-"""Media that vary inside an object: extinction and albedo on a grid, from shares of tissues, and as files of Mitsuba."""
+"""Media that vary inside an object: extinction and albedo on a grid, from shares of tissues; as files of Mitsuba."""
 
 from __future__ import annotations
 

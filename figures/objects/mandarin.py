@@ -23,6 +23,7 @@ from figures.objects.distance import (
     ring_noise,
     rotated,
     smoothstep,
+    twisted,
 )
 from figures.objects.mesh import Box
 
@@ -35,6 +36,7 @@ OUT = (0, 1)  # those taken out
 MEMBRANE = 0.45  # thickness, mm
 ROUND = 5.5  # of the edges of a segment
 REACH = 27.0  # from the middle of a segment taken out to where its distance no longer counts, mm
+TWIST = 0.005  # of the whole about its axis, radians per mm
 CREASE = 0.35  # filling of the grooves between segments, mm
 CORE = 2.6  # radius of the hollow in the middle
 PIP = (2.1, 4.6, 1.6)  # half axes
@@ -72,7 +74,7 @@ class Mandarin:
         """For the whole and each segment taken out: which points are near, those in the fruit's own coordinates as they
         were before, and the number of the nearest segment of each and of the next one to it."""
         everywhere = np.ones(p.shape[:-1], dtype=bool)
-        q = p - np.array([0.0, HALF + 0.2, 0.0])
+        q = twisted(p - np.array([0.0, HALF + 0.2, 0.0]), TWIST)
         yield everywhere, q, self._nearest(q)
         for k, ((x, z), _, _), height in zip(OUT, LAID, self._heights):
             r = length(p[..., 0] - x, p[..., 1], p[..., 2] - z)
@@ -141,11 +143,11 @@ class Mandarin:
         ball = ellipsoid(q, (RADIUS, HALF, RADIUS))
         outside = smoothstep(-3.0, -1.2, ball)
         warp = np.stack([fbm(q / 9, self.seed + 60 + i, 2) for i in range(3)], axis=-1)
-        net = smoothstep(0.93, 0.985, ridges(q * np.array([1, 0.5, 1]) / 8.5 + 0.35 * warp, self.seed + 3, 1))
-        patches = smoothstep(-0.05, 0.45, fbm(q / 15, self.seed + 4, 2) + 0.25 * np.abs(y) / HALF)
+        net = smoothstep(0.90, 0.975, ridges(q * np.array([1, 0.5, 1]) / 8.5 + 0.35 * warp, self.seed + 3, 1))
+        patches = smoothstep(-0.35, 0.2, fbm(q / 15, self.seed + 4, 2) + 0.25 * np.abs(y) / HALF)
         across = np.abs(rho * self._off(x, z, k) + 0.9 * warp[..., 0] * 2)
         middle = smoothstep(0.75, 0.2, across) * smoothstep(-0.3, 0.35, noise(q / 7, self.seed + 5) + 0.3)
-        return outside * np.maximum(net * patches, 0.8 * middle * patches)
+        return outside * np.maximum(net * patches, 0.9 * middle * patches)
 
     def tissues(self, p: np.ndarray) -> dict[str, np.ndarray]:
         """Share of each tissue, summing to 1: "mandarin flesh", "membrane", "pip"."""
@@ -165,8 +167,8 @@ class Mandarin:
         rho = length(q[..., 0], q[..., 2])
         away = q / np.maximum(length(*np.moveaxis(q, -1, 0)), 1e-6)[..., None]
         first, second, _ = cells(away * 7.5 + (rho / 9.0)[..., None], self.seed + 6)
-        walls = 0.16 * smoothstep(0.12, 0.0, second - first)
-        skin = 0.3 * smoothstep(-MEMBRANE, -0.2 * MEMBRANE, d)
+        walls = 0.3 * smoothstep(0.16, 0.0, second - first)
+        skin = 0.2 * smoothstep(-MEMBRANE, -0.2 * MEMBRANE, d)
         strands = self.strands(q, k) * smoothstep(-1.1, -0.5, d)
         core = 0.9 * smoothstep(CORE + 2.2, CORE + 0.8, rho)
         return np.clip(np.maximum.reduce([walls, skin, strands, core]), 0, 1)

@@ -28,11 +28,11 @@ SPP = {"draft": 32, "paper": 1024}
 RESOLUTION = {"draft": 96, "paper": 240}  # of surfaces and of grids
 SPP_PER_PASS = 8
 GUIDE_PASSES = 8
-FLOOR, GAP = 0.3, 0.02  # reflectance of the floor, and how far it lies below the lowest point, mm
+FLOOR, GAP = (0.33, 0.3, 0.27), 0.02  # reflectance of the floor, and how far it lies below the lowest point, mm
 NOTES = (
-    "The candle by exact walks in homogeneous wax, the others by Mitsuba's volpathmis in grid volumes of extinction and "
-    "albedo under a rough dielectric; all orders. Denoised by Open Image Denoise, led by normals and, for grids, by "
-    "the albedo at the surface. Lengths are mm; the coefficients are chosen, see figures/objects/tissues.toml."
+    "The candle by exact walks in homogeneous wax, the others by Mitsuba's volpathmis in grid volumes of extinction "
+    "and albedo under a rough dielectric; all orders. Denoised by Open Image Denoise, led by normals and, for grids, "
+    "by the albedo at the surface. Lengths are mm; the coefficients are chosen, see figures/objects/tissues.toml."
 )
 
 
@@ -48,10 +48,10 @@ class View(NamedTuple):
 
 
 VIEWS = {
-    "candle": View((25, 125, 140), (0, 33, 0), 31, "sunset", 0.25, 0),
+    "candle": View((25, 125, 140), (0, 31.5, 0), 29, "sunset", 0.25, 0),
     "mandarin": View((18, 100, 150), (1, 14, 14), 33, "studio", 0.3, 0),
-    "meat": View((10, 120, 110), (0, 7, 2), 35, "studio", 0.3, 0),
-    "croissant": View((30, 110, 170), (-2, 11, 21), 37, "studio", 0.3, 0),
+    "meat": View((10, 120, 110), (-1, 7, 2), 34, "studio", 0.3, 0),
+    "croissant": View((30, 110, 170), (-2, 11, 21), 34, "studio", 0.24, -75),
 }
 
 
@@ -79,7 +79,11 @@ def scene(shown: Mapping[str, Any], view: View, size: int, low: float = 0.0) -> 
         "type": "scene",
         "sensor": {"type": "perspective", "fov": view.fov, "to_world": to_world, "film": film},
         "sky": environment(view.light, view.scale, view.turn),
-        "floor": {"type": "rectangle", "to_world": floor, "bsdf": {"type": "diffuse", "reflectance": FLOOR}},
+        "floor": {
+            "type": "rectangle",
+            "to_world": floor,
+            "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(FLOOR)}},
+        },
         **shown,
     }
 

@@ -16,8 +16,8 @@ __all__ = ["FLAME_RADIANCE", "OBJECTS", "VARYING", "Varying", "candle_parts", "m
 VARYING = ("mandarin", "meat", "croissant")
 OBJECTS = ("candle", *VARYING)
 FLAME_RADIANCE = (60.0, 30.0, 8.5)
-ROUGHNESS = {"candle": 0.12, "mandarin": 0.22, "meat": 0.2, "croissant": 0.4}  # alpha of the boundary, chosen
-ETA = {"mandarin": 1.36, "meat": 1.4, "croissant": 1.4}
+ROUGHNESS = {"candle": 0.12, "mandarin": 0.22, "meat": 0.2, "croissant": 0.5}  # alpha of the boundary, chosen
+ETA = {"mandarin": 1.36, "meat": 1.4, "croissant": 1.3}
 _MODELS = {
     "mandarin": (mandarin.Mandarin, mandarin.BOX),
     "meat": (meat.Meat, meat.BOX),
