@@ -14,7 +14,7 @@ from figures import environments
 from figures.objects import candle, grid, mesh, pictures, scene_parts  # noqa: E402
 from figures.parts import runner  # noqa: E402
 
-LOW, HIGH = 40, 80
+LOW, HIGH = 32, 64
 CELLS = 24
 
 
@@ -113,8 +113,8 @@ def test_the_flame_lies_inside_the_convex_hull_of_the_candle_but_outside_of_the_
 
     found = candle.make_candle(LOW, seed)
     assert (Delaunay(found.wax.vertices[::5]).find_simplex(found.flame.vertices) >= 0).all()
-    winding = igl.winding_number(found.wax.vertices, found.wax.faces.astype(np.int64), found.flame.vertices)
-    assert np.abs(winding).max() < 1e-6
+    winding = igl.fast_winding_number(found.wax.vertices, found.wax.faces.astype(np.int64), found.flame.vertices)
+    assert np.abs(winding).max() < 0.1
 
 
 def test_the_wick_does_not_touch_the_wax() -> None:
@@ -146,7 +146,7 @@ def test_a_grid_volume_of_mitsuba_gives_the_values_at_their_places(media: dict, 
     k = np.array([5, 4, 7])  # x, y, z
     at = low + (k + 0.5) / np.array(found.sigma_t.shape[::-1]) * (high - low)
     it = mi.Interaction3f()
-    it.p = mi.Point3f(*at)
+    it.p = mi.Point3f(*at.tolist())
     assert np.allclose(np.array(volume.eval(it)).ravel(), found.albedo[k[2], k[1], k[0]], atol=1e-4)
 
 

@@ -1,6 +1,6 @@
 """A pillar candle burnt down to a bowl with a pool of molten wax, its wick and flame; one homogeneous wax throughout.
 
-56 mm wide, about 66 mm tall; the pool stands at 40 mm, the flame, 11 mm tall and 4.4 mm wide, in the bowl above it.
+56 mm wide, about 65 mm tall; the pool stands at 40 mm, the flame, 11 mm tall and 4.4 mm wide, in the bowl above it.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A peeled mandarin, 56 mm wide and 41 mm tall, two of its segments taken out and laid beside it.
+"""A peeled mandarin, about 56 mm wide and 40 mm tall, two of its segments taken out and laid beside it.
 
 Each segment is flesh of juice sacs in a thin membrane, with white strands outside and a pip or two at its inner edge.
 """

@@ -1,4 +1,4 @@
-"""A steak of marbled beef, 84 mm long, 60 mm wide and 20 mm thick, with a rim of fat along one side."""
+"""A steak of marbled beef, about 87 mm long, 64 mm wide and 21 mm thick, with a rim of fat along one side."""
 
 from __future__ import annotations
 

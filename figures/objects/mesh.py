@@ -13,7 +13,7 @@ import numpy as np
 from halfspace_sss.checks import check_count
 from halfspace_sss.provenance import write_atomically
 
-__all__ = ["LEAST_RESOLUTION", "Box", "Mesh", "surface"]
+__all__ = ["LEAST_RESOLUTION", "Box", "Mesh", "in_chunks", "surface"]
 
 LEAST_RESOLUTION = 8
 COARSE = 4  # cells of the first look in one of the grid
