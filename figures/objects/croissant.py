@@ -1,4 +1,4 @@
-"""A croissant, about 102 mm across, 79 mm deep and 37 mm tall, with one tip cut off: layered crust outside, crumb with pores on the cut."""
+"""A croissant, about 102 mm across, 79 mm deep and 37 mm tall, one tip cut off: layered crust, crumb with pores."""
 
 from __future__ import annotations
 
