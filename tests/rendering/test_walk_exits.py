@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -103,6 +105,26 @@ def test_walks_count_their_scattering_events() -> None:
     once = np.array(out.order) == 1
     for values, (s, a) in zip(np.array(out.throughput), ((1.0, 0.01), (0.8, 0.2), (0.3, 0.7))):
         _check_mean(values * once, single_scattering.reflectance(Medium(s, a, 0.5, 1.4), 0.6))
+
+
+def test_a_visitor_sees_every_scattering_event() -> None:
+    import drjit as dr
+
+    from halfspace_sss.rendering.walk_exits import ExitVisitor, walk_from
+
+    n = 4096
+    media = _media({"type": "sphere", "radius": 2.0}, sigma_s="1,0.8,0.3", sigma_a="0.01,0.2,0.7", g=0.5, eta=1.4)
+    start, events = _on_sphere(2.0, n)[0], dr.zeros(mi.UInt32, n)
+
+    class Counter(ExitVisitor):
+        def event(self, walk: Any, record: Any, event: Any) -> tuple[Any, Any]:
+            dr.scatter_add(events, mi.UInt32(1), record)
+            return walk, record
+
+    out = _exits(media, 0, start, 7)
+    walk_from(media, 0, start, Counter(_exits(media, 0, start, 8)), 7)
+    left = np.array(out.left)
+    assert np.array_equal(np.array(events)[left], np.array(out.order)[left])
 
 
 def test_an_object_of_multiple_scattering_has_no_exits_of_lower_orders() -> None:

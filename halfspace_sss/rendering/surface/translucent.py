@@ -10,6 +10,10 @@ In a scene:
             <float name="alpha" value="0.1"/> <float name="int_ior" value="1.5"/> <float name="ext_ior" value="1"/>
         </bsdf>
     </bsdf>
+    <bsdf type="translucent">
+        <volume name="sigma_t" type="gridvolume"> <string name="filename" value="wax.vol"/> </volume>
+        <string name="albedo" value="0.99, 0.97, 0.9"/>
+    </bsdf>
 
 Parameters, all optional but the medium:
     material: a name of the registry; or else `sigma_s`, `sigma_a` (1/mm; numbers, rgb, or strings of numbers separated

@@ -72,8 +72,8 @@ class Joins:
         distant: table of whether each is infinitely far.
         radii: table of the radius of the sphere about each emitter.
         share: probability of a join at an event near the boundary.
-        numbers: table from the number of an emitter in Dr.Jit's registry to that here.
-        pointers: table of those numbers.
+        indices: table from what Dr.Jit's registry calls an emitter to its place in `emitters`.
+        pointers: table of what the registry calls each.
     """
 
     scene: Any
@@ -83,7 +83,7 @@ class Joins:
     distant: Any
     radii: Any
     share: float
-    numbers: Any
+    indices: Any
     pointers: Any
 
     def _centre(self, k: Any) -> Any:
@@ -103,10 +103,10 @@ class Joins:
         return dr.square(dr.gather(mi.Float, self.radii, k)) / dr.squared_norm(way)
 
     def index_of(self, emitter: Any) -> Any:
-        """The number of an emitter here, or -1."""
+        """The place of an emitter in `emitters`, or -1."""
         pointer = dr.reinterpret_array(mi.UInt32, emitter)
-        known = pointer < dr.width(self.numbers)
-        return dr.select(known, dr.gather(mi.Int32, self.numbers, pointer, known), -1)
+        known = pointer < dr.width(self.indices)
+        return dr.select(known, dr.gather(mi.Int32, self.indices, pointer, known), -1)
 
     def covers(self, emitter: Any, y: Any, w: Any, pivot: Any) -> Any:
         """Whether joins at `pivot` find light that arrives from the point y of an emitter along -w.
@@ -198,8 +198,8 @@ class Joins:
         scattered = replace(walk, alive=walk.alive & s.lit, o=p, d=turned, weight=weight, density=density)
         walk = replace(walk, weight=ended.weight, density=ended.density)
         if media.varies:
-            walk.o = dr.select(ended.null, p, walk.o)
-            walk.alive &= ~ended.null | media.box.contains(p)
+            on = walk.alive & (~ended.null | media.box.contains(p))
+            walk = replace(walk, alive=on, o=dr.select(ended.null, p, walk.o))
         collided = ended.scatters | ended.null
         walk, *_ = dr.if_stmt((walk, ray, hit), ~collided, self._reflect, lambda *state: state)
         scattered.rng = walk.rng

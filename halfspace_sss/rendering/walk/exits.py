@@ -15,10 +15,10 @@ import drjit as dr
 import mitsuba as mi
 
 from halfspace_sss.rendering.walk.media import WalkMedia
-from halfspace_sss.rendering.walk.steps import Crossing, Event, Walk, Walker, draw, sample_bsdf, start_walk
+from halfspace_sss.rendering.walk.steps import Crossing, Event, Visitor, Walk, Walker, draw, sample_bsdf, start_walk
 from halfspace_sss.tracing.walk import _generator, pass_seed
 
-__all__ = ["ExitVisitor", "Exits", "Start", "exits"]
+__all__ = ["ExitVisitor", "Exits", "Start", "exits", "walk_from"]
 
 LANES = 2**13
 
@@ -69,14 +69,10 @@ class ExitVisitor:
 
 
 def exits(media: WalkMedia, k: int, start: Start, seed: int | tuple[int, ...], lanes: int = LANES) -> Exits:
-    """Walk from exits of object k until the walks leave it.
+    """Where walks from points on object k leave it.
 
     Args:
-        media: the translucent objects of a scene, see `WalkMedia.of`.
-        k: number of the object.
-        start: x_o, n_o and w_o, arrays of one length; where w_o is below the surface, no walk enters.
-        seed: one whole number or more.
-        lanes: walks at a time; another number gives other walks.
+        media, k, start, seed, lanes: as of `walk_from`.
 
     Returns:
         Exits in the order of the starts. A walk counts if its order is among the orders of the object.
@@ -84,13 +80,35 @@ def exits(media: WalkMedia, k: int, start: Start, seed: int | tuple[int, ...], l
     Raises:
         ValueError: there is no object k, or the arrays of `start` are of different lengths.
     """
+    result = _nowhere(dr.width(start.x_o))
+    dr.eval(result)
+    walk_from(media, k, start, ExitVisitor(result), seed, lanes)
+    dr.eval(result)
+    return result
+
+
+def walk_from(
+    media: WalkMedia, k: int, start: Start, visitor: Visitor, seed: int | tuple[int, ...], lanes: int = LANES
+) -> None:
+    """Walk from points on object k until the walks leave it or end inside.
+
+    Args:
+        media: the translucent objects of a scene, see `WalkMedia.of`.
+        k: number of the object.
+        start: x_o, n_o and w_o, arrays of one length; where w_o is below the surface, no walk enters.
+        visitor: what is recorded; its record is the number of the walk. It has to end walks that leave.
+        seed: one whole number or more.
+        lanes: walks at a time; another number gives other walks.
+
+    Raises:
+        ValueError: there is no object k, or the arrays of `start` are of different lengths.
+    """
     n = _check(media, k, start)
-    result = _nowhere(n)
-    dr.eval(result, start)
     if n == 0:
-        return result
+        return
+    dr.eval(start)
     lanes = min(lanes, n)
-    walker, total, k = Walker(media, ExitVisitor(result)), dr.opaque(mi.UInt32, n), dr.opaque(mi.UInt32, k)
+    walker, total, k = Walker(media, visitor), dr.opaque(mi.UInt32, n), dr.opaque(mi.UInt32, k)
 
     def renew(walk: Walk, index: Any) -> tuple[Walk, Any]:
         return _enter(media, k, start, index + lanes, walk.rng), index + lanes
@@ -102,9 +120,8 @@ def exits(media: WalkMedia, k: int, start: Start, seed: int | tuple[int, ...], l
     seeds = seed if isinstance(seed, tuple) else (seed,)
     index = dr.arange(mi.UInt32, lanes)
     walk = _enter(media, k, start, index, _generator(mi, lanes, pass_seed(*seeds)))
-    dr.while_loop((walk, index), lambda walk, index: index < total, body, label="exits")
-    dr.eval(result)
-    return result
+    dr.while_loop((walk, index), lambda walk, index: index < total, body, label="walks")
+    dr.eval()
 
 
 def _nowhere(n: int) -> Exits:

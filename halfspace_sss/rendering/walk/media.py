@@ -70,11 +70,6 @@ class WalkMedia:
         object.__setattr__(self, "grids", Grids.of(self.insides, self.mm_per_unit) if varies else None)
 
     @property
-    def isotropic(self) -> bool:
-        """Whether g = 0 in every medium."""
-        return all(np.all(inside.medium.g == 0) for inside in self.insides)
-
-    @property
     def same_g(self) -> bool:
         """Whether g of every medium is the same in all channels."""
         return all(np.ptp(inside.medium.g) == 0 for inside in self.insides)
