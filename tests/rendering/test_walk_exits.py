@@ -141,6 +141,21 @@ def test_a_walk_whose_direction_is_below_the_surface_never_enters() -> None:
     assert not np.array(out.throughput).any()
 
 
+def test_each_object_of_a_scene_has_exits_of_its_own() -> None:
+    from halfspace_sss.rendering.walk.media import WalkMedia
+
+    def ball(x: float, eta: float, sigma_a: float) -> dict:
+        surface = {"type": "translucent", "sigma_s": 1.0, "sigma_a": sigma_a, "eta": eta}
+        return {"type": "sphere", "center": [x, 0, 0], "radius": 2.0, "bsdf": surface}
+
+    scene = {"type": "scene", "a": ball(20, 1.2, 0.5), "b": ball(0, 1.5, 0.0), "c": ball(-20, 1.4, 0.5)}
+    media = WalkMedia.of(mi.load_dict(scene), 1.0)
+    start, mu = _on_sphere(2.0, 2**14)
+    middle = [k for k, obj in enumerate(media.objects) if abs(obj.scene.bbox().center().x) < 1]
+    throughput = np.array(_exits(media, middle[0], start, 8).throughput)
+    assert np.mean(np.abs(throughput - (1 - F_r(mu, 1.5)))) < 1e-4  # rounding lets a walk escape now and then
+
+
 def test_a_rough_boundary_lets_walks_in_and_out() -> None:
     rough = {"type": "roughdielectric", "int_ior": 1.3, "ext_ior": 1.0, "alpha": 0.05}
     out = _exits(_media(_slab(), sigma_s=1.0, sigma_a=0.5, eta=1.3, b=rough), 0, _start(0.9), 6)

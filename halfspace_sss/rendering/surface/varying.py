@@ -45,7 +45,7 @@ class VaryingMedium:
         """The largest sigma_t of each channel, 1/mm: interpolation exceeds no voxel."""
         if self.density is None:
             return self.factor
-        values = grid_values(self.density)
+        values = grid_values(self.density)  # Mitsuba's own maxima do not follow changes of the voxels
         return self.factor * values.reshape(-1, values.shape[-1]).max(axis=0)
 
     def coefficients(self, p: Any) -> tuple[np.ndarray, np.ndarray]:
