@@ -39,9 +39,6 @@ class BetterDipole(Separable):
         self._boundary = Boundary.of(medium.eta, moments)
         self._c = Grosjean(medium, self._boundary)
 
-    def for_medium(self, medium: Medium) -> BetterDipole:
-        return type(self)(medium, moments=self.moments)
-
     @property
     def N(self) -> float:
         return self._boundary.N

@@ -58,9 +58,6 @@ class DirectionalDipole(BSSRDF):
         self._boundary = Boundary.of(medium.eta, moments)
         self._c = _Constants(medium, self._boundary)
 
-    def for_medium(self, medium: Medium) -> DirectionalDipole:
-        return type(self)(medium, moments=self.moments)
-
     def G(self, q: Query) -> Any:
         return q.lib.maximum(self.G_unclamped(q), 0.0)
 

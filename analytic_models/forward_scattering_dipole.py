@@ -133,10 +133,6 @@ class ForwardScatteringDipole(BSSRDF):
         if self.radiance_scaling:
             self._scale = self._scale / m.eta**2
 
-    def for_medium(self, medium: Medium) -> ForwardScatteringDipole:
-        options = ("n_samples", "virtual_source", "radiance_scaling")
-        return type(self)(medium, **{name: getattr(self, name) for name in options})
-
     def G(self, q: Query) -> Any:
         q = q.in_float64()
         lib, integrand = q.lib, _Integrand(q, *(q.constant(v) for v in (self._p, self._absorption, self._z_v)))

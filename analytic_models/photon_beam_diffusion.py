@@ -54,9 +54,6 @@ class PhotonBeamDiffusion(BSSRDF):
         self._c = Grosjean(medium, self._boundary)
         self._kappa_rate = 2 * (self._c.sigma_t_prime if kappa == "reduced" else 1 + 0 * self._c.sigma_t_prime)
 
-    def for_medium(self, medium: Medium) -> PhotonBeamDiffusion:
-        return type(self)(medium, n_samples=self.n_samples, kappa=self.kappa, moments=self.moments)
-
     @property
     def strength(self) -> Any:
         """Factor of the integral that does not vary along the beam, albedo'² sigma_t' / (4 pi), in 1/mfp."""

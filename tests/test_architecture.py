@@ -1,4 +1,4 @@
-"""Imports go one way, the package is light to import, and files and functions stay short."""
+"""Imports go one way, from room to room without a circle, the package is light to import, and files stay short."""
 
 from __future__ import annotations
 
@@ -13,7 +13,16 @@ ROOT = Path(__file__).resolve().parent.parent
 ORDER = ["figures", "full_geometry", "analytic_models", "halfspace_sss"]  # a package may import those to its right
 SOURCES = sorted(path for package in ORDER for path in (ROOT / package).rglob("*.py"))
 HEAVY = ["torch", "mitsuba", "matplotlib", "drjit", "pandas", "xarray"]
-LONGEST_FILE, LONGEST_BODY = 300, 45
+FLOORS = {  # of each package, a room may import those to its left; "" is what lies beside the rooms
+    "halfspace_sss": [
+        "", "physics", "interface", "tracing", "maps", "measure", "materials", "comparison", "neural",
+        "neural.training", "rendering.surface", "rendering.transport", "rendering.scenes", "rendering.walk",
+        "rendering", "cli",
+    ],
+    "figures": ["parts", "computing", "drawing", ""],
+}  # fmt: skip
+HIDING = {"bssrdf", "curves", "models", "trace"}  # public functions: a folder of that name would hide one
+LONGEST_FILE, LONGEST_BODY, MOST_MODULES = 300, 45, 14
 
 
 def _tree(path: Path) -> ast.Module:
@@ -29,6 +38,55 @@ def _imported_packages(path: Path) -> set[str]:
         if isinstance(node, ast.ImportFrom) and not node.level:
             found.add(node.module.split(".")[0])
     return found
+
+
+def _name(path: Path) -> str:
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+MODULES = {_name(path): path for path in SOURCES}
+
+
+def _room(module: str) -> str:
+    """The folder of a module below its package; a package within is in itself."""
+    folder = MODULES[module].parent.relative_to(ROOT).parts
+    return ".".join(folder[1:])
+
+
+def _module(name: str) -> str | None:
+    """The module that holds a dotted name; None outside this project."""
+    while name and name not in MODULES:
+        name = name.rpartition(".")[0]
+    return name or None
+
+
+def _arrows(path: Path) -> set[str]:
+    """Modules of this project that a file imports, also inside functions; the doors of a package do not count.
+
+    Doors are the names that an `__init__` imports for type checkers and opens when they are asked for.
+    """
+    tree = _tree(path)
+    if path.name == "__init__.py":
+        tree.body = [n for n in tree.body if not (isinstance(n, ast.If) and ast.unparse(n.test) == "TYPE_CHECKING")]
+    names = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        if isinstance(node, ast.ImportFrom) and not node.level:
+            names |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return {found for name in names if (found := _module(name))} - {_name(path)}
+
+
+ARROWS = {module: _arrows(path) for module, path in MODULES.items()}
+
+
+def _circles(arrows: dict[str, set[str]]) -> set[str]:
+    """What is left when all that leads nowhere has been taken away again and again."""
+    left = {module: set(targets) for module, targets in arrows.items()}
+    while ends := {module for module, targets in left.items() if not targets & left.keys()}:
+        left = {module: targets for module, targets in left.items() if module not in ends}
+    return set(left)
 
 
 def _body_lines(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
@@ -52,6 +110,45 @@ def test_a_package_imports_only_packages_below_it(package: str) -> None:
         if (bad := _imported_packages(path) & above)
     }
     assert not back
+
+
+@pytest.mark.parametrize("package", FLOORS)
+def test_a_room_imports_only_rooms_below_it(package: str) -> None:
+    floors = FLOORS[package]
+    up = {
+        f"{module} -> {target}"
+        for module, targets in ARROWS.items()
+        for target in targets - set(FLOORS)
+        if module.partition(".")[0] == target.partition(".")[0] == package
+        and floors.index(_room(target)) > floors.index(_room(module))
+    }
+    assert not up
+
+
+def test_no_modules_import_each_other_in_a_circle() -> None:
+    assert not _circles(ARROWS)
+
+
+def test_a_circle_is_found() -> None:
+    arrows = {"a": {"b"}, "b": {"c"}, "c": {"b", "d"}, "d": set()}
+    assert _circles(arrows) == {"a", "b", "c"}  # with what leads to it
+    assert not _circles({"a": {"b", "d"}, "b": {"d"}, "d": set()})
+
+
+def test_every_room_has_its_floor() -> None:
+    for package, floors in FLOORS.items():
+        rooms = {_room(module) for module in MODULES if module.partition(".")[0] == package}
+        assert rooms == set(floors)
+
+
+def test_no_folder_has_more_than_14_modules() -> None:
+    folders = {path.parent for path in SOURCES}
+    counts = {str(folder.relative_to(ROOT)): len(list(folder.glob("[!_]*.py"))) for folder in folders}
+    assert not {folder: n for folder, n in counts.items() if n > MOST_MODULES}
+
+
+def test_no_folder_hides_a_public_function() -> None:
+    assert not [path for path in (ROOT / "halfspace_sss").rglob("*") if path.is_dir() and path.name in HIDING]
 
 
 def test_every_top_level_package_is_in_the_order() -> None:

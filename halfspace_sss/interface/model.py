@@ -115,6 +115,12 @@ class BSSRDF(abc.ABC):
     mirror_invariant: ClassVar[bool] = True
     fast_in: str = "drjit"
 
+    def __new__(cls, *made_of: Any, **options: Any) -> BSSRDF:
+        model = super().__new__(cls)
+        options.pop("medium", None)
+        model._options = (made_of[1:], options)
+        return model
+
     def __init__(self, medium: Medium) -> None:
         if not isinstance(medium, Medium):
             raise ValueError(f"medium must be a Medium, got {type(medium).__name__}")
@@ -169,8 +175,9 @@ class BSSRDF(abc.ABC):
         return [RadialSampler(self.for_medium(m).eval) for m in media]
 
     def for_medium(self, medium: Medium) -> BSSRDF:
-        """The same model, with the same options, of another medium; models with options override it."""
-        return type(self)(medium)
+        """The same model, made with the same options, of another medium."""
+        positional, named = self._options
+        return type(self)(medium, *positional, **named)
 
     def _per_channel(self, lib: Any, x: Any, answer: Any) -> Any:
         """`answer(sampler, sigma_t)` for each channel, stacked last."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
@@ -58,28 +59,32 @@ class UnitResult:
     seconds: float
 
 
+@dataclass(eq=False)
 class MapTally:
     """Order >= 2 radiance towards 16 observations over cells of the plane, without Fresnel factors.
 
     At each event one observation is drawn in proportion to its contribution q_k = p(d.d_k) exp(-z/mu_k) / (eta² mu_k)
     and scored with the sum of all, twice, stratified: all scores of an event are equal, which for forward
     scattering cuts the variance x time of a cell by 2.7 against scoring one observation drawn uniformly.
+
+    Args:
+        types: Dr.Jit's array types.
+        n_r, n_psi: cells of a map.
+        phase: phase function towards an observation, of its cosine and the event.
+        directions: of each observation d_x, d_y, mu, 1/mu and 1/(eta² mu), as lanes or constants.
+        inverse_scale, low, rate: of the cells (inverse_scale is 1/L), uniform in u: row = (u(r/L) - low) rate.
+        cells: the sums.
     """
 
-    def __init__(self, types: ModuleType, unit: MapUnit, mu_o: np.ndarray, delta_phi: np.ndarray) -> None:
-        import drjit as dr
-
-        m, grid = unit.medium, unit.grid
-        self.types, self.n_r, self.n_psi = types, grid.n_r, grid.n_psi
-        self.g = m.g if m.g == 0 else dr.opaque(types.Float, m.g)
-        mu = np.maximum(mu_internal(mu_o, m.eta), 1e-6)
-        sine = np.sqrt(1 - mu**2)
-        columns = (sine * np.cos(delta_phi), sine * np.sin(delta_phi), mu, 1 / mu, 1 / (m.eta**2 * mu))
-        self.directions = [tuple(dr.opaque(types.Float, v) for v in row) for row in np.stack(columns, axis=1)]
-        L = radial_scale(m)
-        low, high = warp(cell_edges(m, grid)[0][[0, -1]], L)
-        self.inverse_L, self.low, self.rate = (dr.opaque(types.Float, v) for v in (1 / L, low, grid.n_r / (high - low)))
-        self.cells = CellSums(types, GROUP * grid.n_r * grid.n_psi, MAP_BATCHES)
+    types: ModuleType
+    n_r: int
+    n_psi: int
+    phase: Callable[[Any, Scatter], Any]
+    directions: list[tuple]
+    inverse_scale: Any
+    low: Any
+    rate: Any
+    cells: CellSums
 
     def start(self, lanes: int) -> tuple:
         return ()
@@ -93,7 +98,7 @@ class MapTally:
         q = []
         for ox, oy, mu, inverse_mu, scale in self.directions:
             cosine = event.dx * ox + event.dy * oy - event.dz * mu
-            q.append(scale * self._phase(cosine, event) * dr.exp(-event.z * inverse_mu))
+            q.append(scale * self.phase(cosine, event) * dr.exp(-event.z * inverse_mu))
         total = sum(q[1:], q[0])
         for hit in range(HITS):
             target = (event.random() + hit) / HITS * total
@@ -103,10 +108,6 @@ class MapTally:
             index = k * (self.n_r * self.n_psi) + cell
             self.cells.add(event.weight * total / HITS, index, event.lane, inside & (event.order > 1))
         return sums
-
-    def _phase(self, cosine: Any, event: Scatter) -> Any:
-        """Phase function towards an observation."""
-        return eval_hg(cosine, self.g)
 
     def _choose(self, q: list, target: Any) -> tuple[Any, tuple]:
         """The observation in whose share of the running sum the target lies."""
@@ -126,7 +127,7 @@ class MapTally:
         import drjit as dr
 
         Int32, UInt32 = self.types.Int32, self.types.UInt32
-        ratio = dr.sqrt(x * x + y * y) * self.inverse_L
+        ratio = dr.sqrt(x * x + y * y) * self.inverse_scale
         u = dr.select(ratio > 15, ratio, dr.log(dr.maximum(dr.exp(dr.minimum(ratio, 16)) - 1, 1e-12)))
         u = dr.select(ratio < 0.01, dr.log(dr.maximum(ratio, 1e-30)) + 0.5 * ratio, u)  # exp(x) - 1 has lost its digits
         i = Int32(dr.floor((u - self.low) * self.rate))
@@ -135,12 +136,29 @@ class MapTally:
         return UInt32(i) * self.n_psi + UInt32(j), (i >= 0) & (i < self.n_r)
 
 
+def _unit_tally(types: ModuleType, unit: MapUnit, mu_o: np.ndarray, delta_phi: np.ndarray) -> MapTally:
+    """The tally of one medium and its observations."""
+    import drjit as dr
+
+    m, grid = unit.medium, unit.grid
+    g = m.g if m.g == 0 else dr.opaque(types.Float, m.g)
+    mu = np.maximum(mu_internal(mu_o, m.eta), 1e-6)
+    sine = np.sqrt(1 - mu**2)
+    columns = (sine * np.cos(delta_phi), sine * np.sin(delta_phi), mu, 1 / mu, 1 / (m.eta**2 * mu))
+    directions = [tuple(dr.opaque(types.Float, v) for v in row) for row in np.stack(columns, axis=1)]
+    L = radial_scale(m)
+    low, high = warp(cell_edges(m, grid)[0][[0, -1]], L)
+    cells = CellSums(types, GROUP * grid.n_r * grid.n_psi, MAP_BATCHES)
+    scale = [dr.opaque(types.Float, v) for v in (1 / L, low, grid.n_r / (high - low))]
+    return MapTally(types, grid.n_r, grid.n_psi, lambda cosine, event: eval_hg(cosine, g), directions, *scale, cells)
+
+
 def _trace_group(unit: MapUnit, group: int, launch: int, lanes: int, per_lane: int) -> tuple[np.ndarray, int]:
     """Fixed-point cell sums (batch, observation x cell) and events of one launch for one group of observations."""
     types = array_types(unit.backend)
     mu_i, mu_o, delta_phi = map_directions(unit.medium, unit.grid, unit.seed)
     members = slice(group * GROUP, (group + 1) * GROUP)
-    tally = MapTally(types, unit, mu_o[unit.theta_index, members], delta_phi[unit.theta_index, members])
+    tally = _unit_tally(types, unit, mu_o[unit.theta_index, members], delta_phi[unit.theta_index, members])
     mu_in = max(float(mu_internal(float(mu_i[unit.theta_index]), unit.medium.eta)), 1e-6)
     seed = pass_seed(unit.seed, unit.stream, unit.theta_index, group, launch)
     _, events = walk(types, unit.medium, types.Float(np.full(lanes, mu_in)), per_lane, seed, [tally])

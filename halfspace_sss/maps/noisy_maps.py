@@ -146,36 +146,33 @@ class _GroupCells(CellSums):
         super().add(value, cell, lane // self.half, active)
 
 
-class GroupTally(MapTally):
-    """As `MapTally`, with a medium and observations of its own for each group of lanes, and halved by reciprocity.
+def _group_tally(types: ModuleType, groups: Groups, grid: CellGrid, lanes_per_group: int) -> MapTally:
+    """The tally of media and observations of their own for each group of lanes, halved by reciprocity.
 
     A path that turns back early is found by walks from the other end: its score is weighted by p_1 / (p_1 + p_n), the
     balance of both ends with the phase functions of the first and the last angle, which takes the rare large scores
     of forward scattering away. The maps hold 2 H with G(i, o) = H(i, o) + H(o, i): fitting them with a reciprocal
     function gives G, and so does the mean of both directions.
     """
+    import drjit as dr
 
-    def __init__(self, types: ModuleType, groups: Groups, grid: CellGrid, lanes_per_group: int) -> None:
-        import drjit as dr
+    def lanes(values: np.ndarray) -> Any:
+        return types.Float(np.repeat(values, lanes_per_group).astype(np.float32))
 
-        def lanes(values: np.ndarray) -> Any:
-            return types.Float(np.repeat(values, lanes_per_group).astype(np.float32))
-
-        self.types, self.n_r, self.n_psi, self.g = types, grid.n_u, grid.n_psi, lanes(groups.g)
-        eta = groups.eta[:, None]
-        mu = np.maximum(np.sqrt(np.maximum(1 - (1 - groups.mu_o**2) / eta**2, 0.0)), 1e-4)
-        sine = np.sqrt(1 - mu**2)
-        columns = (sine * np.cos(groups.delta_phi), sine * np.sin(groups.delta_phi), mu, 1 / mu, 1 / (eta**2 * mu))
-        self.directions = [tuple(lanes(c[:, k]) for c in columns) for k in range(GROUP)]
-        edges = radial_edges(groups, grid)
-        self.inverse_L, self.low = lanes(1 / groups.L), lanes(edges[:, 0])
-        self.rate = lanes(grid.n_u / (edges[:, -1] - edges[:, 0]))
-        self.cells = _GroupCells(types, GROUP * grid.n_u * grid.n_psi, len(groups), lanes_per_group)
-        dr.eval(self.g, self.directions, self.inverse_L, self.low, self.rate)
-
-    def _phase(self, cosine: Any, event: Scatter) -> Any:
-        last, first = eval_hg(cosine, self.g), eval_hg(event.first, self.g)
+    def phase(cosine: Any, event: Scatter) -> Any:
+        last, first = eval_hg(cosine, g), eval_hg(event.first, g)
         return 2 * last * first / (first + last)
+
+    g, eta = lanes(groups.g), groups.eta[:, None]
+    mu = np.maximum(np.sqrt(np.maximum(1 - (1 - groups.mu_o**2) / eta**2, 0.0)), 1e-4)
+    sine = np.sqrt(1 - mu**2)
+    columns = (sine * np.cos(groups.delta_phi), sine * np.sin(groups.delta_phi), mu, 1 / mu, 1 / (eta**2 * mu))
+    directions = [tuple(lanes(c[:, k]) for c in columns) for k in range(GROUP)]
+    edges = radial_edges(groups, grid)
+    scale = (lanes(1 / groups.L), lanes(edges[:, 0]), lanes(grid.n_u / (edges[:, -1] - edges[:, 0])))
+    cells = _GroupCells(types, GROUP * grid.n_u * grid.n_psi, len(groups), lanes_per_group)
+    dr.eval(g, directions, *scale)
+    return MapTally(types, grid.n_u, grid.n_psi, phase, directions, *scale, cells)
 
 
 def _launch(
@@ -184,7 +181,7 @@ def _launch(
     """Cell integrals of G of one launch, two independent estimates (n, 2, 16, n_u, n_psi), and events."""
     types = array_types(backend)
     albedo = np.maximum(groups.albedo, LEAST_ALBEDO)
-    tally = GroupTally(types, groups, grid, per_group)
+    tally = _group_tally(types, groups, grid, per_group)
     constants = WalkConstants.per_lane(types, *(np.repeat(v, per_group) for v in (albedo, groups.g, groups.eta)))
     mu_in = np.maximum(np.sqrt(np.maximum(1 - (1 - groups.mu_i**2) / groups.eta**2, 0.0)), 1e-4)
     start = types.Float(np.repeat(mu_in, per_group).astype(np.float32))

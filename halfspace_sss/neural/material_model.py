@@ -51,6 +51,3 @@ class NeuralMaterial(SymmetricModel):
     def __init__(self, medium: Medium) -> None:
         super().__init__(medium)
         self.networks = [load_network(find_weights(KIND, m), KIND, m, N_FEATURES) for m in channels(medium)]
-
-    def for_medium(self, medium: Medium) -> NeuralMaterial:
-        return NeuralMaterial(medium)

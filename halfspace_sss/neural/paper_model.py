@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from halfspace_sss.interface.model import BSSRDF, Query
@@ -42,6 +44,12 @@ def query_inputs(q: Query, L: Any) -> list[Any]:
     return paper_inputs(lib, lib.minimum(q.r, U_MAX * L), -q.phi_i, w_i, w_o, L)
 
 
+def _load(file: Path, medium: Medium) -> tuple[Network, float]:
+    """Network and scale of a file of weights."""
+    scale = record_number(file, load_weights(file, KIND)[1], "scale", 0.0, 1e30)
+    return load_network(file, KIND, medium, N_INPUTS, RELU), scale
+
+
 class NeuralPaper(BSSRDF):
     """The paper's setting: S ~ MLP(x, y, w_i, w_o), 3 hidden layers of 256 with ReLU, from the squared error of S.
 
@@ -58,15 +66,9 @@ class NeuralPaper(BSSRDF):
     fast_in = "numpy"  # 1.6e5 evaluations per second and core, 5e4 in Dr.Jit
     source = "TG, Tran, Jensen, Ramamoorthi and Frisvad 2024, half-space network"
 
-    def __init__(self, medium: Medium) -> None:
+    def __init__(self, medium: Medium, trained: Sequence[tuple[Network, float]] | None = None) -> None:
         super().__init__(medium)
-        files = [find_weights(KIND, m) for m in channels(medium)]
-        pairs = zip(files, channels(medium))
-        self.networks: list[Network] = [load_network(file, KIND, m, N_INPUTS, RELU) for file, m in pairs]
-        self.scales = [record_number(file, load_weights(file, KIND)[1], "scale", 0.0, 1e30) for file in files]
-
-    def for_medium(self, medium: Medium) -> NeuralPaper:
-        return NeuralPaper(medium)
+        self.trained = trained or [_load(find_weights(KIND, m), m) for m in channels(medium)]
 
     def G(self, q: Query) -> Any:
         return q.lib.maximum(self.G_unclamped(q), 0.0)
@@ -75,10 +77,11 @@ class NeuralPaper(BSSRDF):
         """G before negative values are set to zero."""
         m = self.medium
         queries = [q] if m.n_channels is None else channel_queries(q, m)
-        values = [self._one(*parts) for parts in zip(queries, channels(m), self.networks, self.scales)]
+        values = [self._one(*parts) for parts in zip(queries, channels(m), self.trained)]
         return values[0] if m.n_channels is None else q.lib.stack(values)
 
-    def _one(self, query: Query, m: Medium, network: Network, scale: float) -> Any:
+    def _one(self, query: Query, m: Medium, trained: tuple[Network, float]) -> Any:
+        network, scale = trained
         q = query.in_float64()  # the raw output crosses zero, where float32 has no digits
         lib, L = q.lib, length_scale(m.albedo, m.g)
         S = scale * network(query_inputs(q, L))

@@ -58,9 +58,5 @@ class Neural(SymmetricModel):
     def __init__(self, medium: Medium, weights: Path | None = None) -> None:
         super().__init__(medium)
         check_range(medium)
-        self._weights = weights
         hyper = load_hypernetwork(weights or shipped_weights())
         self.networks = [hyper.network(float(m.albedo), float(np.float64(m.g)), m.eta) for m in channels(medium)]
-
-    def for_medium(self, medium: Medium) -> Neural:
-        return Neural(medium, self._weights)

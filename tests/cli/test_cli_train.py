@@ -18,8 +18,8 @@ from halfspace_sss.materials import registry
 from halfspace_sss.neural import material_model, paper_model, trained
 from halfspace_sss.neural.store import load_weights
 from halfspace_sss.neural.training import recipes as training
-from halfspace_sss.neural.training.fit import Fit
 from halfspace_sss.neural.training.recipes import MaterialRecipe, UniversalRecipe
+from halfspace_sss.neural.training.schedules import Fit
 
 FIG10 = materials.load("fig10").medium
 HOW = Fit(steps=20, n_groups=4, n_queries=32, validate_every=5)

@@ -28,9 +28,6 @@ class Ridge(halfspace_sss.BSSRDF):
         super().__init__(medium)
         self.kappa, self.fast_in, self.evaluated = kappa, fast_in, 0
 
-    def for_medium(self, medium: halfspace_sss.Medium) -> Ridge:
-        return Ridge(medium, self.kappa, self.fast_in)
-
     def G(self, q: Any) -> Any:
         self.evaluated += len(q.r)
         return q.lib.exp(-q.r - self.kappa * (1 + q.lib.cos(q.phi_i)))

@@ -25,10 +25,10 @@ from halfspace_sss.neural.training import ablation as module
 from halfspace_sss.neural.training import recipes as training
 from halfspace_sss.neural.training.ablation import BUDGETS, VARIANTS, Variant, ablation, caption, summary
 from halfspace_sss.neural.training.ablation_learner import SharedTurn, drawn_by_area, model_of
-from halfspace_sss.neural.training.budget import Samples, Seconds, train_within
-from halfspace_sss.neural.training.fit import Fit
+from halfspace_sss.neural.training.fit import fit
 from halfspace_sss.neural.training.pool import MapPool
 from halfspace_sss.neural.training.recipes import MaterialRecipe
+from halfspace_sss.neural.training.schedules import Fit, Samples, Seconds, Within
 
 FIG10 = materials.load("fig10").medium
 GRID, HOW = CellGrid(8, 4), Fit(steps=1, n_groups=4, n_queries=32)
@@ -78,7 +78,7 @@ def _trained(variant: Variant, pool: MapPool, steps: int, measure: Callable[[Any
     """A measure before and after the training."""
     learner = variant.learner(FIG10.in_mfp(), pool, 0)
     before = measure(learner)
-    train_within(Samples(steps * BATCH), learner, pool, HOW, 0)
+    fit(learner, pool.batches(HOW.n_groups, HOW.n_queries), Within(Samples(steps * BATCH), HOW), 0)
     return before, measure(learner)
 
 

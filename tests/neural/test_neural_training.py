@@ -20,11 +20,12 @@ from halfspace_sss.comparison.model_errors import Reference, model_error, refere
 from halfspace_sss.maps.media import draw_media
 from halfspace_sss.maps.noisy_maps import CellGrid, draw_directions, make_pool
 from halfspace_sss.neural.hypernetwork import Hypernetwork
-from halfspace_sss.neural.training.fit import Fit, fit
+from halfspace_sss.neural.training.fit import Source, fit
 from halfspace_sss.neural.training.learners import Hyper, Small
 from halfspace_sss.neural.training.paper_learner import PaperLearner
 from halfspace_sss.neural.training.pool import MapPool
 from halfspace_sss.neural.training.recipes import MaterialRecipe, UniversalRecipe, train, train_universal
+from halfspace_sss.neural.training.schedules import Fit
 from halfspace_sss.neural.training.subjects import MaterialSubject, PaperSubject, Trial
 from halfspace_sss.neural.training.train_material import TrainedChannel, train_channel
 from halfspace_sss.progress import NamedProgress
@@ -71,11 +72,15 @@ def reference() -> Reference:
     return reference_maps([FIG10], 1, GRID, 2, 1e6, (2,))[0]
 
 
+def _batches(pool: MapPool) -> Source:
+    return pool.batches(HOW.n_groups, HOW.n_queries)
+
+
 def test_a_trained_network_beats_its_untrained_start(pool: MapPool, reference: Reference) -> None:
     subject = MaterialSubject(warm=False)
     learner = subject.learner(reference.medium, pool, 0)
     before = model_error(subject.model(reference.medium, learner), reference).error
-    fit(learner, pool, replace(HOW, steps=150), 0)
+    fit(learner, _batches(pool), replace(HOW, steps=150), 0)
     assert model_error(subject.model(reference.medium, learner), reference).error < 0.5 * before
 
 
@@ -83,7 +88,7 @@ def test_a_trained_network_of_the_paper_beats_its_untrained_start_by_its_own_los
     learner = PaperLearner(FIG10.in_mfp(), PaperSubject().learner(FIG10.in_mfp(), pool, 0).scale, width=32)
     batch = pool.batch(64, 256, torch.Generator().manual_seed(1))
     before = float(learner.loss(batch).detach())
-    fit(learner, pool, replace(HOW, steps=150), 0)
+    fit(learner, _batches(pool), replace(HOW, steps=150), 0)
     assert float(learner.loss(batch).detach()) < 0.8 * before
 
 
@@ -98,7 +103,7 @@ def test_a_trained_universal_network_beats_its_untrained_start(reference: Refere
     groups = draw_directions(*draw_media(64, rng), rng)
     learner = Hyper(rank=4)
     before = error(learner)
-    fit(learner, MapPool(groups, GRID, make_pool(groups, GRID, 1e6, (1,))), replace(HOW, steps=150), 0)
+    fit(learner, _batches(MapPool(groups, GRID, make_pool(groups, GRID, 1e6, (1,)))), replace(HOW, steps=150), 0)
     assert error(learner) < 0.5 * before
 
 
@@ -248,29 +253,29 @@ def _altered(data: bytes) -> bytes:
 def test_a_damaged_checkpoint_is_refused(pool: MapPool, tmp_path: Path, damage: Callable[[bytes], bytes]) -> None:
     file = tmp_path / "c.safetensors"
     how = replace(HOW, steps=2)
-    fit(Small(width=4), pool, how, 0, checkpoint=file)
+    fit(Small(width=4), _batches(pool), how, 0, checkpoint=file)
     file.write_bytes(damage(file.read_bytes()))
     with pytest.raises(ValueError, match=f"{file}: checkpoint cannot be used, remove it to start anew"):
-        fit(Small(width=4), pool, how, 0, checkpoint=file)
+        fit(Small(width=4), _batches(pool), how, 0, checkpoint=file)
 
 
 def test_a_checkpoint_of_another_architecture_is_refused(pool: MapPool, tmp_path: Path) -> None:
     file = tmp_path / "c.safetensors"
-    fit(Small(width=4), pool, replace(HOW, steps=2), 0, checkpoint=file)
+    fit(Small(width=4), _batches(pool), replace(HOW, steps=2), 0, checkpoint=file)
     with pytest.raises(ValueError, match=f"{file}: checkpoint cannot be used.*shape"):
-        fit(Small(width=5), pool, replace(HOW, steps=2), 0, checkpoint=file)
+        fit(Small(width=5), _batches(pool), replace(HOW, steps=2), 0, checkpoint=file)
 
 
 def test_training_stops_at_the_target_error(pool: MapPool, tmp_path: Path) -> None:
     errors, how = iter([0.5, 0.21, 0.2, 0.1]), replace(HOW, validate_every=10)
     arguments = {"checkpoint": tmp_path / "c.safetensors", "target_error": 0.2}
-    history = fit(Small(width=4), pool, how, 0, validate=lambda: next(errors), **arguments)
+    history, _ = fit(Small(width=4), _batches(pool), how, 0, validate=lambda: next(errors), **arguments)
     assert [(h["step"], h["error"]) for h in history] == [(10, 0.5), (20, 0.21), (30, 0.2)]
-    assert fit(Small(width=4), pool, how, 0, validate=lambda: next(errors), **arguments) == history
+    assert fit(Small(width=4), _batches(pool), how, 0, validate=lambda: next(errors), **arguments).history == history
 
 
 def test_training_that_stopped_goes_on_towards_a_smaller_target(pool: MapPool, tmp_path: Path) -> None:
     how, file = replace(HOW, validate_every=10), tmp_path / "c.safetensors"
-    fit(Small(width=4), pool, how, 0, checkpoint=file, validate=lambda: 0.2, target_error=0.2)
-    history = fit(Small(width=4), pool, how, 0, checkpoint=file, validate=lambda: 0.1, target_error=0.1)
+    fit(Small(width=4), _batches(pool), how, 0, checkpoint=file, validate=lambda: 0.2, target_error=0.2)
+    history, _ = fit(Small(width=4), _batches(pool), how, 0, checkpoint=file, validate=lambda: 0.1, target_error=0.1)
     assert [(h["step"], h["error"]) for h in history] == [(10, 0.2), (20, 0.1)]

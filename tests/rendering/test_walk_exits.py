@@ -109,7 +109,6 @@ def test_walks_count_their_scattering_events() -> None:
 
 def test_a_visitor_sees_every_scattering_event() -> None:
     import drjit as dr
-
     from halfspace_sss.rendering.walk_exits import ExitVisitor, walk_from
 
     n = 4096

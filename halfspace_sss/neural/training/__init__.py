@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 from halfspace_sss.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from halfspace_sss.neural.training.fit import Fit
     from halfspace_sss.neural.training.recipes import (
         FAST,
         STANDARD,
@@ -16,7 +15,8 @@ if TYPE_CHECKING:
         train,
         train_universal,
     )
+    from halfspace_sss.neural.training.schedules import Fit
 
 __all__ = ["FAST", "STANDARD", "Fit", "MaterialRecipe", "UniversalRecipe", "train", "train_universal"]
 
-__getattr__, __dir__ = lazy_names(__name__, {name: "fit" if name == "Fit" else "recipes" for name in __all__})
+__getattr__, __dir__ = lazy_names(__name__, {name: "schedules" if name == "Fit" else "recipes" for name in __all__})

@@ -17,9 +17,9 @@ from halfspace_sss.comparison.model_errors import Reference, model_error, refere
 from halfspace_sss.maps.noisy_maps import draw_directions, make_pool
 from halfspace_sss.neural.hypernetwork import in_range
 from halfspace_sss.neural.training.ablation_learner import Factored, SharedTurn, drawn_by_area, model_of
-from halfspace_sss.neural.training.budget import Budget, Samples, Seconds, train_within
-from halfspace_sss.neural.training.fit import Fit
+from halfspace_sss.neural.training.fit import fit
 from halfspace_sss.neural.training.pool import MapPool
+from halfspace_sss.neural.training.schedules import Budget, Fit, Samples, Seconds, Within
 from halfspace_sss.neural.training.subjects import MaterialSubject, PaperSubject
 from halfspace_sss.neural.training.train_material import BLOCK, STANDARD, VALIDATION_SEED, MaterialRecipe
 from halfspace_sss.physics.medium import Medium, check_scalar_medium
@@ -150,7 +150,8 @@ def _row(
     if variant.by_area:
         pool = drawn_by_area(pool)
     learner = variant.learner(reference.medium, pool, seed)
-    spent = train_within(budget, learner, pool, how, seed)
+    source = pool.batches(how.n_groups, how.n_queries)
+    spent = fit(learner, source, Within(budget, how), seed, threads=None).spent
     e = model_error(model_of(learner, reference.medium), reference)
     row = {"kB": 4e-3 * sum(p.numel() for p in learner.parameters()), **spent._asdict()}
     row |= {"error": e.error, "raw": e.raw, "noise": e.noise, "bias": e.bias}

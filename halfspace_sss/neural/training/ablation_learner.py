@@ -14,11 +14,11 @@ from halfspace_sss.interface.model import BSSRDF, Query
 from halfspace_sss.maps.noisy_maps import radial_edges
 from halfspace_sss.neural.features import N_FEATURES
 from halfspace_sss.neural.network import RELU, SILU, Network, layer_shapes
-from halfspace_sss.neural.paper_model import N_INPUTS, T_SMALLEST, query_inputs
+from halfspace_sss.neural.paper_model import N_INPUTS, T_SMALLEST, NeuralPaper, query_inputs
 from halfspace_sss.neural.training.learners import apply_networks, initial_numbers, relative_loss
 from halfspace_sss.neural.training.paper_learner import PaperLearner
 from halfspace_sss.neural.training.pool import Batch, MapPool
-from halfspace_sss.neural.training.subjects import PaperTrial, Trial
+from halfspace_sss.neural.training.subjects import Trial
 from halfspace_sss.physics.backbone import backbone, length_scale, unwarp
 from halfspace_sss.physics.fresnel import F_t
 from halfspace_sss.physics.medium import Medium
@@ -95,9 +95,6 @@ class PlainTrial(BSSRDF):
         super().__init__(medium)
         self.network, self.scale = network, scale
 
-    def for_medium(self, medium: Medium) -> PlainTrial:
-        return PlainTrial(medium, self.network, self.scale)
-
     def G(self, q: Query) -> Any:
         lib, m = q.lib, self.medium
         log_factor = self.network(query_inputs(q, length_scale(m.albedo, m.g)))
@@ -111,7 +108,7 @@ def model_of(learner: Any, medium: Medium) -> BSSRDF:
     """A learner of this table as it is, as a model of its medium."""
     network = learner.network()
     if isinstance(learner, PaperLearner):
-        return PaperTrial(medium, network, learner.scale)
+        return NeuralPaper(medium, [(network, learner.scale)])
     if not isinstance(learner, Factored) or learner.symmetric:
         return Trial(medium, network)
     return PlainTrial(medium, network, None if learner.with_backbone else learner.frame[0].scale)

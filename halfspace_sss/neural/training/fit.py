@@ -1,4 +1,4 @@
-"""Fitting a learner to a pool of maps: Adam, cosine decay, checkpoints from which a killed run goes on bit for bit."""
+"""Fitting of a learner, whatever it learns from: Adam, and checkpoints from which a killed run goes on bit for bit."""
 
 from __future__ import annotations
 
@@ -6,118 +6,113 @@ import hashlib
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import torch
 
-from halfspace_sss.checks import check_count, check_interval
-from halfspace_sss.neural.training.pool import Batch, MapPool
+from halfspace_sss.neural.training.schedules import Schedule, Spent
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.provenance import write_atomically
 
-__all__ = ["Fit", "Learner", "fit"]
+__all__ = ["Fitted", "Learner", "Source", "fit"]
 
-BETAS, CLIP, LAST_RATE, WARM_UP = (0.9, 0.99), 1.0, 0.002, 200
+BETAS, CLIP = (0.9, 0.99), 1.0
+Source = Callable[[torch.Generator], Any]  # the next batch; all chance in it is drawn from the generator
 
 
 class Learner(Protocol):
-    """A torch module that knows its loss."""
+    """A torch module that knows its loss for a batch of its source."""
 
-    def loss(self, batch: Batch) -> torch.Tensor: ...
+    def parameters(self) -> Any: ...
+
+    def loss(self, batch: Any) -> torch.Tensor: ...
 
 
-@dataclass(frozen=True)
-class Fit:
-    """How a learner is fitted.
+class Fitted(NamedTuple):
+    """Validations (step, loss, error, seconds) and what was spent."""
 
-    Args:
-        steps: of the optimiser, each on one batch.
-        n_groups, n_queries: groups of a batch, and cells of each group, of which two points are asked.
-        rate: largest learning rate; it rises over the first 200 steps and falls by a cosine.
-        checkpoint_every: seconds between checkpoints.
-        validate_every: steps between two calls of the validation.
-    """
-
-    steps: int
-    n_groups: int = 32
-    n_queries: int = 128
-    rate: float = 4e-3
-    checkpoint_every: float = 20.0
-    validate_every: int = 2000
-
-    def __post_init__(self) -> None:
-        for name in ("steps", "n_groups", "n_queries", "validate_every"):
-            check_count(name, getattr(self, name), 1)
-        check_interval("rate", self.rate, 1e-8, 1.0)
-        check_interval("checkpoint_every", self.checkpoint_every, 0.0, 1e9)
+    history: list[dict[str, float]]
+    spent: Spent
 
 
 def fit(
-    learner: torch.nn.Module,
-    pool: MapPool,
-    how: Fit,
+    learner: Learner,
+    source: Source,
+    schedule: Schedule,
     seed: int,
     *,
     checkpoint: Path | None = None,
     validate: Callable[[], float] | None = None,
     target_error: float | None = None,
     progress: NamedProgress | None = None,
-) -> list[dict[str, float]]:
-    """Fit in place and return the history: step, loss, validation error, seconds.
+    threads: int | None = 1,
+) -> Fitted:
+    """Fit in place.
 
     Args:
+        learner: what is fitted.
+        source: gives the batches.
+        schedule: how long, and at which rate.
+        seed: of the batches.
         checkpoint: file to go on from if it is there, and to write as time goes by.
-        validate: error of the learner as it is; called every `how.validate_every` steps.
+        validate: error of the learner as it is; called every `schedule.validate_every` steps and at the end.
         target_error: stop once the validation error has come down to it.
-        progress: called with ("training", steps done, steps in all).
+        progress: called with ("training", steps done, steps in all), for a schedule of steps.
+        threads: of torch, None for as many as it has; batches of small networks lose by being shared, and with one
+            thread sums keep their order.
 
     Raises:
         ValueError: the checkpoint is damaged.
     """
-    run = _Run(learner, how, seed)
+    run = _Run(learner, schedule, seed)
     if checkpoint and checkpoint.exists():
         run.load(checkpoint, target_error)
-    saved, threads = time.monotonic(), torch.get_num_threads()
-    torch.set_num_threads(1)  # batches of this size lose by being shared, and sums keep their order
-    while run.step < how.steps and not run.done:
-        run.advance(pool)
-        if validate and (run.step % how.validate_every == 0 or run.step == how.steps):
+    saved, before = time.monotonic(), torch.get_num_threads()
+    torch.set_num_threads(threads or before)
+    while not run.over:
+        run.advance(source)
+        if validate and (run.step % schedule.validate_every == 0 or run.over):
             run.validated(validate(), target_error)
-        if progress and (run.step % 50 == 0 or run.step == how.steps):
-            progress("training", run.step, how.steps)
-        if checkpoint and (time.monotonic() - saved > how.checkpoint_every or run.done):
+        if progress and (run.step % 50 == 0 or run.over):
+            progress("training", run.step, schedule.steps)
+        if checkpoint and (time.monotonic() - saved > schedule.checkpoint_every or run.done):
             run.save(checkpoint)
             saved = time.monotonic()
-    torch.set_num_threads(threads)
-    return run.history
+    torch.set_num_threads(before)
+    return Fitted(run.history, run.spent)
 
 
 class _Run:
     """State of a fit: the numbers, Adam's moments, the generator, the history."""
 
-    def __init__(self, learner: Any, how: Fit, seed: int) -> None:
-        self.learner, self.how = learner, how
+    def __init__(self, learner: Any, schedule: Schedule, seed: int) -> None:
+        self.learner, self.schedule = learner, schedule
         self.parameters = [p for p in learner.parameters() if p.requires_grad]
-        self.adam = torch.optim.Adam(self.parameters, lr=how.rate, betas=BETAS)
+        self.adam = torch.optim.Adam(self.parameters, lr=schedule.rate_at(Spent(0, 0, 0.0)), betas=BETAS)
         self.generator = torch.Generator().manual_seed(seed)
         self.step, self.loss, self.done = 0, math.nan, False
         self.history: list[dict[str, float]] = []
-        self.started = time.monotonic()
+        self.started, self.seconds = time.monotonic(), 0.0
 
-    def advance(self, pool: MapPool) -> None:
+    @property
+    def spent(self) -> Spent:
+        return Spent(self.step, self.step * self.schedule.per_step, self.seconds)
+
+    @property
+    def over(self) -> bool:
+        return self.done or self.schedule.share(self.spent) >= 1
+
+    def advance(self, source: Source) -> None:
         """One step."""
-        how = self.how
-        decay = LAST_RATE + (1 - LAST_RATE) * 0.5 * (1 + math.cos(math.pi * self.step / how.steps))
         for group in self.adam.param_groups:
-            group["lr"] = how.rate * min(1.0, (self.step + 1) / WARM_UP) * decay
-        loss = self.learner.loss(pool.batch(how.n_groups, how.n_queries, self.generator))
+            group["lr"] = self.schedule.rate_at(self.spent)
+        loss = self.learner.loss(source(self.generator))
         self.adam.zero_grad(set_to_none=True)
         loss.backward()
         torch.nn.utils.clip_grad_norm_(self.parameters, CLIP)
         self.adam.step()
-        self.step += 1
+        self.step, self.seconds = self.step + 1, time.monotonic() - self.started
         value = float(loss.detach())
         self.loss = value if math.isnan(self.loss) else 0.99 * self.loss + 0.01 * value
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -84,6 +85,10 @@ class MapPool:
         L = length_scale(albedo, g)
         self.L = L[:, None]
         self.medium = torch.stack(medium_features(_torch_library(), albedo, g, eta, L), -1)
+
+    def batches(self, n_groups: int, n_queries: int) -> Callable[[torch.Generator], Batch]:
+        """The source of a fit: `batch` of one size."""
+        return lambda generator: self.batch(n_groups, n_queries, generator)
 
     def batch(self, n_groups: int, n_queries: int, generator: torch.Generator) -> Batch:
         """Random cells, and two points in each, with the weight B r dr/du that the mean over the cell gives them.

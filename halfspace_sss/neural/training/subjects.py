@@ -34,22 +34,6 @@ class Trial(SymmetricModel):
         if network.matrices[0].shape[1] > WIDEST_IN_DRJIT:
             self.fast_in = "numpy"
 
-    def for_medium(self, medium: Medium) -> Trial:
-        return Trial(medium, self.networks[0])
-
-
-class PaperTrial(NeuralPaper):
-    """The paper's network under training as a model."""
-
-    name = "paper_trial"
-
-    def __init__(self, medium: Medium, network: Network, scale: float) -> None:
-        super(NeuralPaper, self).__init__(medium)
-        self.networks, self.scales = [network], [scale]
-
-    def for_medium(self, medium: Medium) -> PaperTrial:
-        return PaperTrial(medium, self.networks[0], self.scales[0])
-
 
 class MaterialSubject:
     """`neural_material`, started from what the universal network says of the medium, where it says anything.
@@ -88,8 +72,8 @@ class PaperSubject:
         S = probe.S_over_y(batch)[:, : batch.y.shape[1]] * batch.y
         return PaperLearner(medium, max(math.sqrt(float((S**2).mean())), 1e-20), seed=seed)
 
-    def model(self, medium: Medium, learner: PaperLearner) -> PaperTrial:
-        return PaperTrial(medium, learner.network(), learner.scale)
+    def model(self, medium: Medium, learner: PaperLearner) -> NeuralPaper:
+        return NeuralPaper(medium, [(learner.network(), learner.scale)])
 
     def record(self, learner: PaperLearner) -> dict[str, Any]:
         return {"scale": learner.scale}

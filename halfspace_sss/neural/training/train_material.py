@@ -17,8 +17,9 @@ from halfspace_sss.maps.noisy_maps import CellGrid, Groups, draw_directions, mak
 from halfspace_sss.neural.material_model import network_arrays
 from halfspace_sss.neural.store import save_weights
 from halfspace_sss.neural.trained import weights_folder, weights_name
-from halfspace_sss.neural.training.fit import Fit, fit
+from halfspace_sss.neural.training.fit import fit
 from halfspace_sss.neural.training.pool import MapPool
+from halfspace_sss.neural.training.schedules import Fit
 from halfspace_sss.neural.training.work_folder import CHECKPOINT, claim
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.progress import NamedProgress
@@ -128,8 +129,10 @@ def train_channel(
         found.append(model_error(subject.model(medium, learner), reference))
         return found[-1].error
 
-    history = fit(
-        learner, pool, recipe.how, seed, checkpoint=place / CHECKPOINT if place else None, validate=validate,
+    how = recipe.how
+    history, _ = fit(
+        learner, pool.batches(how.n_groups, how.n_queries), how, seed,
+        checkpoint=place / CHECKPOINT if place else None, validate=validate,
         target_error=target_error, progress=progress,
     )  # fmt: skip
     error = found[-1] if found else model_error(subject.model(medium, learner), reference)

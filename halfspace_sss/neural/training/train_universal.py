@@ -16,9 +16,10 @@ from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.maps.media import RANGES, draw_media
 from halfspace_sss.maps.noisy_maps import CellGrid, draw_directions, looking_back, make_pool
 from halfspace_sss.neural.store import save_weights
-from halfspace_sss.neural.training.fit import Fit, fit
+from halfspace_sss.neural.training.fit import fit
 from halfspace_sss.neural.training.learners import Hyper
 from halfspace_sss.neural.training.pool import MapPool
+from halfspace_sss.neural.training.schedules import Fit
 from halfspace_sss.neural.training.work_folder import CHECKPOINT, claim
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.provenance import check_folder, provenance
@@ -75,9 +76,9 @@ def train_universal(
     pool, data_seconds = MapPool(groups, recipe.grid, halves), time.monotonic() - started
     del halves
     learner = Hyper(rank=recipe.rank, seed=seed)
-    check = (lambda: validate(learner)) if validate else None
-    history = fit(learner, pool, recipe.how, seed, checkpoint=folder / CHECKPOINT, validate=check,
-                  progress=progress)  # fmt: skip
+    how, check = recipe.how, (lambda: validate(learner)) if validate else None
+    history, _ = fit(learner, pool.batches(how.n_groups, how.n_queries), how, seed, checkpoint=folder / CHECKPOINT,
+                     validate=check, progress=progress)  # fmt: skip
     record: dict[str, Any] = {
         "width": learner.width, "depth": learner.depth, "ranges": {k: list(v) for k, v in RANGES.items()}, "seed": seed,
         "recipe": asdict(recipe), "data_seconds": data_seconds, "seconds": time.monotonic() - started,

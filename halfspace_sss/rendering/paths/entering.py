@@ -86,6 +86,4 @@ def _candidate(
     S_mu = body.transport.S_mu(prepared, entry, d, active)
     value = dr.select(active, S_mu * (entry.weight / dr.maximum(pdf, 1e-8)), 0)
     hope = dr.detach(dr.max(value)) * bright
-    return Candidate(
-        mi.Point3f(entry.p), mi.Normal3f(entry.n), d, value, pdf, aim, delta, target, light, hope, aims
-    )
+    return Candidate(mi.Point3f(entry.p), mi.Normal3f(entry.n), d, value, pdf, aim, delta, target, light, hope, aims)
