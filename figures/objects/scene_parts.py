@@ -16,7 +16,7 @@ __all__ = ["FLAME_RADIANCE", "OBJECTS", "VARYING", "Varying", "candle_parts", "m
 VARYING = ("mandarin", "meat", "croissant")
 OBJECTS = ("candle", *VARYING)
 FLAME_RADIANCE = (60.0, 30.0, 8.5)
-ROUGHNESS = {"candle": 0.12, "mandarin": 0.22, "meat": 0.2, "croissant": 0.5}  # alpha of the boundary, chosen
+ROUGHNESS = {"mandarin": 0.22, "meat": 0.2, "croissant": 0.5}  # alpha of the boundary, chosen
 ETA = {"mandarin": 1.36, "meat": 1.4, "croissant": 1.3}
 _MODELS = {
     "mandarin": (mandarin.Mandarin, mandarin.BOX),
@@ -66,8 +66,7 @@ def candle_parts(folder: Path, resolution: int = 192, seed: int = 0, model: str 
     """
     made, wax = make_candle(resolution, seed), tissue("candle wax").medium
     files = {name: getattr(made, name).write_ply(Path(folder) / f"{name}.ply") for name in ("wax", "wick", "flame")}
-    boundary = {"type": "roughdielectric", "alpha": ROUGHNESS["candle"], "int_ior": wax.eta, "ext_ior": 1.0}
-    surface = {"type": "translucent", "model": model, "g": 0.0, "eta": wax.eta, "boundary": boundary}
+    surface = {"type": "translucent", "model": model, "g": 0.0, "eta": wax.eta}  # smooth, so that walks join the flame
     for key in ("sigma_s", "sigma_a"):
         surface[key] = ", ".join(f"{v:.9g}" for v in getattr(wax, key))
     black = {"type": "diffuse", "reflectance": 0.0}
