@@ -10,7 +10,7 @@ igl = pytest.importorskip("igl")
 
 import mitsuba as mi  # noqa: E402
 
-from figures import environments
+from figures import environments  # noqa: E402
 from figures.objects import candle, grid, mesh, pictures, scene_parts  # noqa: E402
 from figures.parts import runner  # noqa: E402
 
