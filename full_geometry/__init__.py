@@ -17,7 +17,8 @@ _HOME = {
     "train": "training",
     "transport": "storing",
 }
-__all__ = ["Recipe", "Subject", "errors", "load", "train", "transport"]
+TRANSPORTS = {"full_geometry": "full_geometry.scene:learnt_means"}
+__all__ = ["TRANSPORTS", "Recipe", "Subject", "errors", "load", "train", "transport"]
 
 
 def __getattr__(name: str) -> Any:

@@ -73,8 +73,15 @@ class Subject:
             raise ValueError(f"medium must have {n} channels under {mi.variant()}, got {medium.n_channels}")
         scaled = medium.scaled(mm_per_unit)
         media = tuple(scaled if medium.n_channels is None else scaled.channel(k) for k in range(n))
-        boundary = mi.load_dict({"type": "dielectric", "int_ior": medium.eta, "ext_ior": 1.0})
-        return cls(survey(shape), media, boundary, AreaPoints(shape))
+        return cls.surveyed(survey(shape), media)
+
+    @classmethod
+    def surveyed(cls, found: Object, media: tuple[Medium, ...]) -> Subject:
+        """The object of a known geometry and the scalar medium of each channel, 1/(scene unit)."""
+        import mitsuba as mi
+
+        boundary = mi.load_dict({"type": "dielectric", "int_ior": media[0].eta, "ext_ior": 1.0})
+        return cls(found, media, boundary, AreaPoints(found.shape))
 
     @classmethod
     def given(cls, shape: Any, medium: Medium | None, mm_per_unit: float = 1.0, name: str | None = None) -> Subject:
@@ -112,7 +119,7 @@ class Subject:
         """Of the medium, as data of kernels: one kernel serves all media."""
         import mitsuba as mi
 
-        keys = ("sigma_t", "sigma_s", "g")
+        keys = ("sigma_t", "sigma_s", "g", "sigma_t", "sigma_t")  # majorant and mean are sigma_t itself
         return Coefficients(*(mi.Spectrum([number(getattr(m, key)) for m in self.media]) for key in keys))
 
     @functools.cached_property

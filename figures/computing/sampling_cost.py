@@ -49,7 +49,9 @@ def _steps(scene: Any, n: int) -> dict[str, Callable[[], Any]]:
     si, sampler = _seen(scene, n), mi.load_dict({"type": "independent"})
     sampler.seed(11, n)
     out, face = exit_at(body, si), mi.UInt32(si.prim_index)
-    entry = body.proposals.sample(out, face, sampler, mi.Bool(True))
+    prepared = body.transport.prepare(out, mi.Bool(True))
+    where = body.proposals.prepare(out, prepared, mi.Bool(True))
+    entry = body.proposals.sample(out, face, where, sampler, mi.Bool(True))
     direction = mi.Frame3f(entry.n_out).to_world(mi.warp.square_to_cosine_hemisphere(sampler.next_2d()))
     dr.eval(tuple(out), face, tuple(entry), direction, sampler)  # named tuples are passed over
     ray = place(entry.p, entry.n).spawn_ray(direction)
@@ -58,10 +60,10 @@ def _steps(scene: Any, n: int) -> dict[str, Callable[[], Any]]:
     dr.eval(found)
 
     def evaluated() -> Any:
-        return body.transport.S_mu(body.transport.prepare(out, found), entry, direction, found)
+        return body.transport.S_mu(prepared, entry, direction, found)
 
     return {
-        "entries": lambda: tuple(body.proposals.sample(out, face, sampler.clone(), mi.Bool(True))),
+        "entries": lambda: tuple(body.proposals.sample(out, face, where, sampler.clone(), mi.Bool(True))),
         "visibility": lambda: scene.ray_intersect_preliminary(ray, coherent=False, active=found),
         "evaluation": evaluated,
     }

@@ -18,6 +18,15 @@ from halfspace_sss.rendering.transport.plane import Exit, place
 __all__ = ["Candidate", "entering_light"]
 
 
+class _Exit(NamedTuple):
+    """An exit, its face, and what transport and proposals have made of it."""
+
+    out: Exit
+    prim_index: Any
+    prepared: Any
+    where: Any
+
+
 class Candidate(NamedTuple):
     """An entry with a direction of light."""
 
@@ -40,9 +49,10 @@ def entering_light(world: World, body: Body, out: Exit, prim_index: Any, sampler
 
     with detached():
         prepared = body.transport.prepare(out, active)
+        where = body.proposals.prepare(out, prepared, active)
 
     def draw(aims: Any = None) -> Candidate:
-        return _candidate(world, body, out, prepared, prim_index, aims, sampler, active)
+        return _candidate(world, body, _Exit(out, prim_index, prepared, where), aims, sampler, active)
 
     n, kept = world.settings.entries, draw()
     if n == 1:
@@ -57,17 +67,15 @@ def entering_light(world: World, body: Body, out: Exit, prim_index: Any, sampler
     return kept._replace(value=kept.value * dr.select(hope > 0, total / (n * dr.maximum(hope, 1e-30)), 0))
 
 
-def _candidate(
-    world: World, body: Body, out: Exit, prepared: Any, prim_index: Any, aims: Any, sampler: Any, active: Any
-) -> Candidate:
+def _candidate(world: World, body: Body, exit: _Exit, aims: Any, sampler: Any, active: Any) -> Candidate:
     import drjit as dr
     import mitsuba as mi
 
     share, proposals = world.lights.share, body.proposals
     with detached():
-        entry = proposals.sample(out, prim_index, sampler, active)
+        entry = proposals.sample(exit.out, exit.prim_index, exit.where, sampler, active)
         active = active & (entry.weight > 0)
-        d, pdf = proposals.sample_direction(entry, out, sampler.next_2d())
+        d, pdf = proposals.sample_direction(entry, exit.out, sampler.next_2d())
         at, pdf, aim = place(entry.p, entry.n), (1 - share) * pdf, mi.Float(-1)
     delta, target, light, bright = mi.Bool(False), mi.Point3f(0), mi.Spectrum(0), mi.Float(1)
     aims = mi.Bool(False) if share == 0 else sampler.next_1d() < share if aims is None else aims
@@ -76,14 +84,14 @@ def _candidate(
         ds, light = sampled_light(world, at, sampler.next_2d(), False, by_emitter)
         with detached():
             delta, target = by_emitter & ds.delta, mi.Point3f(ds.p)
-            by_model = proposals.pdf_direction(entry, out, ds.d)
+            by_model = proposals.pdf_direction(entry, exit.out, ds.d)
             d = dr.select(by_emitter, ds.d, d)
             pdf = dr.select(by_emitter, share * ds.pdf + dr.select(ds.delta, 0, (1 - share) * by_model), pdf)
             far = dr.select(ds.emitter.is_environment(), dr.inf, ds.dist)
             aim = dr.select(by_emitter, far, aim)
             active = active & (pdf > 0)
             bright = dr.select(by_emitter, dr.max(light) * dr.select(ds.delta, 1, ds.pdf), 1)
-    S_mu = body.transport.S_mu(prepared, entry, d, active)
+    S_mu = body.transport.S_mu(exit.prepared, entry, d, active)
     value = dr.select(active, S_mu * (entry.weight / dr.maximum(pdf, 1e-8)), 0)
     hope = dr.detach(dr.max(value)) * bright
     return Candidate(mi.Point3f(entry.p), mi.Normal3f(entry.n), d, value, pdf, aim, delta, target, light, hope, aims)

@@ -69,7 +69,10 @@ class HalfSpaceProposals:
     positions: PositionSampler
     model: Any
 
-    def sample(self, out: Exit, prim_index: Any, sampler: Any, active: Any) -> Entry:
+    def prepare(self, out: Exit, prepared: Any, active: Any) -> None:
+        """Nothing is done for the exit alone."""
+
+    def sample(self, out: Exit, prim_index: Any, prepared: None, sampler: Any, active: Any) -> Entry:
         return self.positions.sample(out, prim_index, sampler, active)
 
     def sample_direction(self, entry: Entry, out: Exit, u: Any) -> tuple[Any, Any]:

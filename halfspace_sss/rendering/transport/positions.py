@@ -115,7 +115,13 @@ class PositionSampler:
             share = dr.select(total > 0, hope / total, 0)
             take = (u < share) & (hope > 0)
             u = dr.clip(dr.select(take, u / dr.maximum(share, 1e-20), (u - share) / dr.maximum(1 - share, 1e-7)), 0, 1)
-            found = (si.p, si.n, turned(si.sh_frame.n, si.n) * out.sign, 1 / (density * dr.maximum(hope, 1e-30)))
+            found = (
+                si.p,
+                si.n,
+                turned(si.sh_frame.n, si.n) * out.sign,
+                1 / (density * dr.maximum(hope, 1e-30)),
+                si.prim_index,
+            )
             entry = tuple(dr.select(take, a, b) for a, b in zip(found, entry))
             onward = si.spawn_ray(ray.d)
             onward.maxt = ray.maxt - si.t
@@ -123,8 +129,8 @@ class PositionSampler:
 
         state = (ray, u, mi.UInt32(MOST_HITS), mi.Float(0), tuple(_nowhere()), mi.Bool(active))
         *_, total, entry, _ = dr.while_loop(state, lambda *state: state[-1], step, label="probe")
-        p, n, n_out, weight = entry
-        return Entry(p, n, n_out, dr.select(total > 0, weight * total, 0))
+        p, n, n_out, weight, face = entry
+        return Entry(p, n, n_out, dr.select(total > 0, weight * total, 0), face)
 
     def _uniform(self, out: Exit, axes: Any, piece: Any, u_face: Any, u: Any, active: Any) -> Entry:
         import drjit as dr
@@ -132,7 +138,7 @@ class PositionSampler:
         at = self.points.sample(u_face, u, active)
         same = self.found.piece(at.prim_index, active) == piece
         weight = dr.select(active & same, 1 / self.density(at.p, at.n, out, axes), 0)
-        return Entry(at.p, at.n, turned(at.n_shading, at.n) * out.sign, weight)
+        return Entry(at.p, at.n, turned(at.n_shading, at.n) * out.sign, weight, at.prim_index)
 
 
 def _FLAGS() -> int:
@@ -144,4 +150,4 @@ def _FLAGS() -> int:
 def _nowhere() -> Entry:
     import mitsuba as mi
 
-    return Entry(mi.Point3f(0), mi.Normal3f(0, 0, 1), mi.Normal3f(0, 0, 1), mi.Float(0))
+    return Entry(mi.Point3f(0), mi.Normal3f(0, 0, 1), mi.Normal3f(0, 0, 1), mi.Float(0), mi.UInt32(0))

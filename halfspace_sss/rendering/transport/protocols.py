@@ -14,18 +14,22 @@ __all__ = ["Entry", "Means", "Proposals", "Transport"]
 
 
 class Entry(NamedTuple):
-    """A point of entry: position, geometric normal, outward shading normal, weight 1/density (0: none was found)."""
+    """A point of entry: position, geometric and outward shading normal, weight 1/density (0: none was found), face."""
 
     p: Any
     n: Any
     n_out: Any
     weight: Any
+    face: Any
 
 
 class Proposals(Protocol):
     """Where light that leaves at an exit may have entered."""
 
-    def sample(self, out: Exit, prim_index: Any, sampler: Any, active: Any) -> Entry:
+    def prepare(self, out: Exit, prepared: Any, active: Any) -> Any:
+        """What is done once for all entries of an exit; `prepared` is what the transport has made of it."""
+
+    def sample(self, out: Exit, prim_index: Any, prepared: Any, sampler: Any, active: Any) -> Entry:
         """A point of entry; its weight is the inverse of the density of such points over the surface, (scene unit)²."""
 
     def sample_direction(self, entry: Entry, out: Exit, u: Any) -> tuple[Any, Any]:
