@@ -38,7 +38,14 @@ def _variant():
         yield
 
 
-def make(light: str | dict = "sky", model: str = "standard_dipole", n: int = 8, floor: bool = True, **bsdf):
+def make(
+    light: str | dict = "sky",
+    model: str = "standard_dipole",
+    n: int = 8,
+    floor: bool = True,
+    max_depth: int = 4,
+    **bsdf,
+):
     """A ball over a floor, three media in its channels."""
     medium = {**MEDIUM, "sigma_s": "1, 2, 0.5"}
     orders = bsdf.pop("orders", "total")
@@ -46,9 +53,11 @@ def make(light: str | dict = "sky", model: str = "standard_dipole", n: int = 8, 
     sensor = {"type": "perspective", "fov": 20.0, "film": {"type": "hdrfilm", "width": n, "height": n}}
     sensor["to_world"] = at.look_at((30 * direction(50)).tolist(), [0, 0, 0], [0, 0, 1])
     scene = {
-        "type": "scene", "integrator": {"type": "bssrdf", "max_depth": 4, "rr_depth": 100},
+        "type": "scene",
+        "integrator": {"type": "bssrdf", "max_depth": max_depth, "rr_depth": 100, "hide_emitters": True},
         "light": LIGHTS[light] if isinstance(light, str) else light, "sensor": sensor,
-        "ball": {"type": "sphere", "radius": 3.0, "bsdf": {**surface(model, orders, medium), "reflection": True, **bsdf}},
+        "ball": {"type": "sphere", "radius": 3.0,
+                 "bsdf": {**surface(model, orders, medium), "reflection": True, **bsdf}},
     }  # fmt: skip
     if floor:
         board = {"type": "checkerboard", "color0": {"type": "rgb", "value": [0.2, 0.5, 0.7]}, "color1": 0.4}
@@ -78,23 +87,36 @@ def weights(scene) -> np.ndarray:
     return np.random.default_rng(3).uniform(0.5, 1.5, (size[1], size[0], 3)).astype(np.float32)
 
 
+def followed(parameters, key: str):
+    """The parameter with gradients enabled; some emitters keep a copy of what they are given."""
+    value = type(parameters[key])(parameters[key])
+    dr.enable_grad(value)
+    return value
+
+
 def backward(scene, key: str) -> np.ndarray:
     """Derivative of the weighted sum of the image."""
     parameters = mi.traverse(scene)
-    dr.enable_grad(parameters[key])
+    value = followed(parameters, key)
+    parameters[key] = value
+    parameters.update()
     scene.integrator().render_backward(scene, parameters, mi.TensorXf(weights(scene)), 0, SEED, SPP)
-    found = np.array(dr.grad(parameters[key]), dtype=float).ravel()
-    dr.disable_grad(parameters[key])
-    return found
+    parameters[key] = dr.detach(value)
+    parameters.update()
+    return np.array(dr.grad(value), dtype=float).ravel()
 
 
 def forward(scene, key: str) -> float:
     """The sum of it over all numbers of the parameter."""
     parameters = mi.traverse(scene)
-    dr.enable_grad(parameters[key])
-    dr.set_grad(parameters[key], 1.0)
+    value = followed(parameters, key)
+    dr.set_grad(value, 1.0)
+    parameters[key] = value
+    dr.forward_to(parameters[key], flags=dr.ADFlag.ClearEdges)
+    parameters.update()
     found = np.array(scene.integrator().render_forward(scene, parameters, 0, SEED, SPP), dtype=float)
-    dr.disable_grad(parameters[key])
+    parameters[key] = dr.detach(value)
+    parameters.update()
     return float((found * weights(scene)).sum())
 
 
@@ -129,15 +151,16 @@ def _varied(body, variation):
     return dataclasses.replace(body, variation=variation, transport=transport)
 
 
-def medium_difference(scene, name: str, only: int | None = None) -> float:
-    """Central difference by a coefficient of the medium, with densities held."""
+def medium_difference(scene, name: str, only: int | None = None) -> tuple[float, float]:
+    """Central difference by a coefficient of the medium, with densities held; and the sum of its size over pixels."""
     bodies = scene.integrator().prepare(scene)
     h = {"albedo": 1e-3, "sigma_t": 5e-3, "g": 4e-3}[name]
     sides = []
     for sign in (1, -1):
         shifted = [_varied(body, Shifted(body, name, sign * h, only)) for body in bodies]
-        sides.append((image(scene, shifted) * weights(scene)).sum())
-    return float(sides[0] - sides[1]) / (2 * h)
+        sides.append(image(scene, shifted) * weights(scene))
+    difference = (sides[0] - sides[1]) / (2 * h)
+    return float(difference.sum()), float(np.abs(difference).sum())
 
 
 @pytest.mark.parametrize("parameter", ["albedo", "sigma_t", "g"])
@@ -145,10 +168,9 @@ def test_derivatives_by_the_medium_agree_with_finite_differences_for_every_model
     if name in UNTRAINED and parameter != "sigma_t":
         pytest.skip("trained for one albedo and g")
     model = halfspace_sss.interface.model.bssrdf(name, Medium(**MEDIUM))
-    scene = make(model=name, n=4, floor=False, orders="total" if model.orders == "total" else "multiple")
-    assert backward(scene, f"ball.bsdf.{parameter}").sum() == pytest.approx(
-        medium_difference(scene, parameter), rel=5e-3
-    )
+    scene = make("point", name, n=4, floor=False, orders="total" if model.orders == "total" else "multiple")
+    expected, size = medium_difference(scene, parameter)
+    assert backward(scene, f"ball.bsdf.{parameter}").sum() == pytest.approx(expected, abs=2e-3 * size)
 
 
 @pytest.mark.parametrize("light", [*LIGHTS, "envmap"])
@@ -156,27 +178,32 @@ def test_derivatives_by_each_channel_agree_with_finite_differences_under_every_l
     scene = make(envmap() if light == "envmap" else light)
     for parameter in ("albedo", "sigma_t", "g"):
         found = backward(scene, f"ball.bsdf.{parameter}")
-        expected = [medium_difference(scene, parameter, k) for k in range(3)]
-        assert found == pytest.approx(expected, rel=1e-2)
-        assert forward(scene, f"ball.bsdf.{parameter}") == pytest.approx(found.sum(), rel=1e-4)
+        for k in range(3):
+            expected, size = medium_difference(scene, parameter, k)
+            assert found[k] == pytest.approx(expected, abs=2e-3 * size)
+        assert forward(scene, f"ball.bsdf.{parameter}") == pytest.approx(found.sum(), abs=1e-4 * np.abs(found).sum())
 
 
 def test_single_scattering_alone_is_differentiated_by_the_medium():
     scene = make("lamp", orders="single", floor=False)
     for parameter in ("albedo", "sigma_t", "g"):
-        assert backward(scene, f"ball.bsdf.{parameter}").sum() == pytest.approx(
-            medium_difference(scene, parameter), rel=5e-3
-        )
+        expected, size = medium_difference(scene, parameter)
+        assert backward(scene, f"ball.bsdf.{parameter}").sum() == pytest.approx(expected, abs=2e-3 * size)
 
 
-@pytest.mark.parametrize("reflection", [True, False])
-def test_the_radiance_of_a_constant_sky_times_its_derivative_is_the_image(name, reflection):
+def test_the_radiance_of_a_constant_sky_times_its_derivative_is_the_image(name):
     model = halfspace_sss.interface.model.bssrdf(name, Medium(**MEDIUM))
     orders = "total" if model.orders == "total" else "multiple"
-    scene = make(model=name, orders=orders, reflection=reflection, floor=False, n=4)
+    scene = make(model=name, orders=orders, floor=False, n=4)
     expected = (image(scene) * weights(scene)).sum()
     assert backward(scene, "light.radiance.value").sum() == pytest.approx(expected, rel=1e-3)
-    assert forward(scene, "light.radiance.value") == pytest.approx(expected, rel=1e-3)
+
+
+@pytest.mark.parametrize("key", ["light.radiance.value", "floor.bsdf.reflectance.color1.value", "ball.bsdf.albedo"])
+@pytest.mark.parametrize("reflection", [True, False])
+def test_forward_and_backward_derivatives_agree(key, reflection):
+    scene = make(orders="total", reflection=reflection, boundary=ROUGH)
+    assert forward(scene, key) == pytest.approx(backward(scene, key).sum(), rel=1e-4)
 
 
 @pytest.mark.parametrize(
@@ -226,15 +253,10 @@ def test_derivatives_by_a_bitmap_agree_with_finite_differences():
 
 
 def test_derivatives_by_the_roughness_of_the_boundary_agree_with_finite_differences():
-    """The roughness moves the sampled directions of the image, so that only means agree."""
-    scene = make("lamp", boundary=ROUGH, floor=False, n=16)
+    """Of what a point light shows at the first vertex: there the roughness moves no sampled direction."""
+    scene = make("point", boundary=ROUGH, floor=False, max_depth=2)
     key = "ball.bsdf.boundary.alpha.value"
-    global SPP
-    few, SPP = SPP, 4096
-    try:
-        assert backward(scene, key).sum() == pytest.approx(difference(scene, key, 0.02, mi.Float), rel=0.05)
-    finally:
-        SPP = few
+    assert backward(scene, key).sum() == pytest.approx(difference(scene, key, 2e-3, mi.Float), rel=5e-3)
 
 
 def test_render_and_backward_give_the_derivative_of_the_image():
@@ -249,6 +271,16 @@ def test_render_and_backward_give_the_derivative_of_the_image():
     assert float(dr.grad(parameters[key])[0]) == pytest.approx(total, rel=0.02)
 
 
+def refused(key: str, render) -> bool:
+    """Whether it is refused with the name of the parameter; Mitsuba wraps the error once more."""
+    with pytest.raises((ValueError, RuntimeError)) as caught:
+        render()
+    errors = [caught.value]
+    while errors[-1].__cause__ is not None:
+        errors.append(errors[-1].__cause__)
+    return any(f"{key} must not have gradients enabled" in str(error) for error in errors)
+
+
 @pytest.mark.parametrize(
     "key", ["ball.to_world", "floor.to_world", "sensor.to_world", "ball.bsdf.boundary.eta", "light.position"]
 )
@@ -261,17 +293,38 @@ def test_geometry_is_refused_before_anything_is_rendered(key):
         lambda: mi.render(scene, spp=1),
         lambda: scene.integrator().render_backward(scene, parameters, mi.TensorXf(weights(scene)), 0, 1, 1),
     ):
-        with pytest.raises((ValueError, RuntimeError), match=f"{key} must not have gradients enabled"):
-            render()
+        assert refused(key, render)
+
+
+def test_the_walk_refuses_derivatives():
+    scene = make("sky")
+    parameters = mi.traverse(scene)
+    dr.enable_grad(parameters["light.radiance.value"])
+    found = mi.render(scene, parameters, integrator=mi.load_dict({"type": "translucent_walk"}), spp=1)
+    with pytest.raises((ValueError, RuntimeError)) as caught:
+        dr.backward(dr.sum(found, axis=None))
+    assert "must be bssrdf" in str(caught.value) + str(caught.value.__cause__)
+
+
+def test_derivatives_through_another_integrator_around_it_are_refused():
+    scene = make("sky")
+    parameters = mi.traverse(scene)
+    around = mi.load_dict({"type": "moment", "nested": {"type": "bssrdf"}})
+    assert np.isfinite(np.array(mi.render(scene, integrator=around, spp=1))).all()
+    dr.enable_grad(parameters["light.radiance.value"])
+    found = mi.render(scene, parameters, integrator=around, spp=1)
+    with pytest.raises((ValueError, RuntimeError)) as caught:
+        dr.backward(dr.sum(found, axis=None))
+    assert "outermost" in str(caught.value) + str(caught.value.__cause__)
 
 
 def test_the_vertices_of_a_mesh_are_refused():
-    scene = mi.load_dict({"type": "scene", "integrator": {"type": "bssrdf"}, "cube": {"type": "cube", "bsdf": surface()},
+    scene = mi.load_dict({"type": "scene", "integrator": {"type": "bssrdf"},
+                          "cube": {"type": "cube", "bsdf": surface()},
                           "light": LIGHTS["sky"], "sensor": {"type": "perspective"}})  # fmt: skip
     parameters = mi.traverse(scene)
     dr.enable_grad(parameters["cube.vertex_positions"])
-    with pytest.raises((ValueError, RuntimeError), match="cube.vertex_positions must not have gradients"):
-        mi.render(scene, parameters, spp=1)
+    assert refused("cube.vertex_positions", lambda: mi.render(scene, parameters, spp=1))
 
 
 def test_a_model_that_knows_one_medium_refuses_derivatives_by_albedo(monkeypatch):
@@ -295,11 +348,9 @@ def test_a_changed_medium_is_rendered_as_if_the_scene_had_been_made_with_it():
     scene = make(floor=False)
     image(scene)
     parameters = mi.traverse(scene)
-    old = parameters["ball.bsdf.albedo"]
     parameters["ball.bsdf.albedo"] = mi.Color3f(0.8)
     parameters["ball.bsdf.sigma_t"] = mi.Color3f(1.5)
     parameters.update()
-    assert not np.allclose(np.array(old), 0.8)
     fresh = make(floor=False, sigma_s=1.2, sigma_a=0.3)
     assert np.allclose(image(scene), image(fresh), rtol=1e-4, atol=1e-6)
 
@@ -322,23 +373,17 @@ def test_a_medium_out_of_range_is_refused_by_name():
         parameters.update()
 
 
-def test_an_unknown_size_is_found_by_gradient_descent():
-    """The albedo of a ball from its image, and its mean free path from the same."""
-    target_scene = make(floor=False, sigma_s=1.6, sigma_a=0.1, n=6)
-    target = mi.TensorXf(mi.render(target_scene, spp=512, seed=9))
-    scene = make(floor=False, sigma_s=0.8, sigma_a=0.3, n=6)
-    parameters = mi.traverse(scene)
-    keys = ["ball.bsdf.albedo"]
-    parameters["ball.bsdf.sigma_t"] = mi.Color3f(1.7)
-    parameters.update()
-    optimiser = mi.ad.Adam(lr=0.03)
-    for key in keys:
-        optimiser[key] = parameters[key]
-    for step in range(50):
-        for key in keys:
-            optimiser[key] = dr.clip(optimiser[key], 0.1, 0.99)
+def test_the_albedo_of_a_ball_is_found_from_its_image():
+    target = make(floor=False, sigma_s=1.6, sigma_a=0.1, n=6)
+    target = mi.TensorXf(mi.render(target, spp=512, seed=9))
+    scene = make(floor=False, sigma_s=1.02, sigma_a=0.68, n=6)
+    parameters, key = mi.traverse(scene), "ball.bsdf.albedo"
+    optimiser = mi.ad.Adam(lr=0.05)
+    optimiser[key] = parameters[key]
+    for step in range(40):
+        optimiser[key] = dr.clip(optimiser[key], 0.1, 0.99)
         parameters.update(optimiser)
         found = mi.render(scene, parameters, spp=32, seed=step)
         dr.backward(dr.mean(dr.square(found - target), axis=None))
         optimiser.step()
-    assert np.array(optimiser[keys[0]]).mean() == pytest.approx(1.6 / 1.7, abs=0.02)
+    assert np.array(optimiser[key]).mean() == pytest.approx(1.6 / 1.7, abs=0.01)

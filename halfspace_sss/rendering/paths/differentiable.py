@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-__all__ = ["check_parameters", "replayer"]
+__all__ = ["check_outermost", "check_parameters", "replayer"]
 
 GEOMETRY = ("to_world", "vertex_positions", "vertex_normals", "vertex_texcoords")
 
@@ -20,19 +20,33 @@ def check_parameters(scene: Any) -> None:
     import mitsuba as mi
 
     parameters = mi.traverse(scene)
-    for key, (value, kind, owner, flags) in parameters.properties.items():
-        if kind is not None:
-            continue  # a number of Python, without gradients
+    for key, (_, _, owner, flags) in parameters.properties.items():
         with dr.resume_grad():
-            if not dr.grad_enabled(value):
+            if not dr.grad_enabled(parameters[key]):
                 continue
         name = key.rsplit(".", 1)[-1]
         fixed = bool(flags & int(mi.ParamFlags.NonDifferentiable))
-        if fixed or name in GEOMETRY or _moves(owner, name) or _selects(parameters, owner):
+        if fixed or name in GEOMETRY or _moves(owner, name) or _selects(parameters, owner, name):
             raise ValueError(
                 f"{key} must not have gradients enabled: bssrdf differentiates light by emitters, surfaces, textures "
                 "and media, with paths held where they are"
             )
+
+
+def check_outermost(scene: Any) -> None:
+    """Refuse derivatives of another integrator that asks this one for samples: they would be missing in silence.
+
+    Raises:
+        ValueError: gradients are enabled for a parameter of the scene, and followed.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    followed = [key for key, value in mi.traverse(scene).items() if dr.grad_enabled(value)]
+    if followed:
+        raise ValueError(
+            f"bssrdf must be the outermost integrator for derivatives, got one around it for {followed[0]}"
+        )
 
 
 def _moves(owner: Any, name: str) -> bool:
@@ -44,14 +58,16 @@ def _moves(owner: Any, name: str) -> bool:
     return isinstance(owner, (mi.Sensor, mi.Film))
 
 
-def _selects(parameters: Any, owner: Any) -> bool:
-    """Whether a parameter chooses between surfaces of which one is a mirror: its share has no density to hold."""
+def _selects(parameters: Any, owner: Any, name: str) -> bool:
+    """Whether a parameter does more than scale light: the share of a mirror in a blend, the index that a medium has."""
     import mitsuba as mi
 
     while owner is not None:
         if isinstance(owner, mi.BSDF) and owner.class_name() == "BlendBSDF":
             return bool(owner.flags() & int(mi.BSDFFlags.Delta))
         owner = parameters.hierarchy[owner][0]
+        if hasattr(owner, "inside") and name == "eta":
+            return True
     return False
 
 

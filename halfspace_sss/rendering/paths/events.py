@@ -50,19 +50,19 @@ def balance(pdf: Any, other: Any) -> Any:
     return dr.select(total > 0, pdf / dr.maximum(total, 1e-30), 0)
 
 
-def surface(world: World, sampler: Any, ray: Any, si: Any, active: Any) -> tuple[Onward, Any]:
-    """A direction sampled by the BSDF, and light sampled by emitters."""
+def surface(world: World, u: tuple[Any, Any, Any], ray: Any, si: Any, active: Any) -> tuple[Onward, Any]:
+    """A direction sampled by the BSDF, and light sampled by emitters, for uniform numbers u: a pair, one, a pair."""
     import drjit as dr
     import mitsuba as mi
 
     bsdf, ctx = si.bsdf(ray), mi.BSDFContext()
     smooth = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-    ds, light = sampled_light(world, si, sampler.next_2d(), True, smooth)
+    ds, light = sampled_light(world, si, u[0], True, smooth)
     smooth &= ds.pdf != 0
     value, pdf = bsdf.eval_pdf(ctx, si, si.to_local(ds.d), smooth)
     share = dr.select(ds.delta, 1, balance(ds.pdf, dr.detach(pdf)))
     direct = mi.Spectrum(dr.select(smooth, value * light * share, 0))
-    bs, weight = bsdf.sample(ctx, si, sampler.next_1d(), sampler.next_2d(), active)
+    bs, weight = bsdf.sample(ctx, si, u[1], u[2], active)
     if world.books.tracks:
         weight = _differentiable(bsdf, ctx, si, bs, weight, active)
     bs = dr.detach(bs)

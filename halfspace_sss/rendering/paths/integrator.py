@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from halfspace_sss.rendering.paths.differentiable import check_parameters, replayer
+from halfspace_sss.rendering.paths.differentiable import check_outermost, check_parameters, replayer
 from halfspace_sss.rendering.paths.tracing import replay_paths, trace_paths
 from halfspace_sss.rendering.transport.body import Bodies
 from halfspace_sss.rendering.transport.settings import read_settings
@@ -58,6 +58,7 @@ def integrator_class() -> type:
         def sample(
             self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Any = True
         ) -> tuple[Any, Any, list]:
+            check_outermost(scene)
             with dr.suspend_grad():
                 L, seen = trace_paths(scene, self._bodies.of(scene), self.settings, sampler, ray, active)
             return L, seen, []

@@ -132,8 +132,12 @@ def _vertex(
     plain = glossy | (active & ~inside)
 
     def outside(books: Books) -> tuple[Onward, Books]:
-        on, direct = surface(world, sampler, ray, si, plain)
-        shown, books = _mirrored(world, sampler, dr.detach(on), throughput, books, glossy)
+        u = sampler.next_2d(), sampler.next_1d(), sampler.next_2d()
+        with detached():
+            on, direct = surface(world, u, ray, si, plain)
+        shown, books = _mirrored(world, sampler, on, throughput, books, glossy)
+        if world.books.tracks:  # again: no derivatives may be pending while others are passed on
+            on, direct = surface(world, u, ray, si, plain)
         return on, world.books.settle(books, throughput * direct, on.weight, plain & ~inside, shown)
 
     on, books = _instead(plain, sampler, nothing(), books, world, outside)

@@ -124,7 +124,7 @@ def survey(shape: Any) -> Object:
 
 
 def _geometry(shape: Any) -> tuple[list, list]:
-    """What tells one geometry of a shape from the next, and the arrays that it tells of, kept so none is reused."""
+    """What tells one geometry of a shape from the next; the arrays with it are kept so that no number is reused."""
     import drjit as dr
     import mitsuba as mi
 

@@ -98,7 +98,7 @@ class Variation:
 def _slope(stencil: Stencil, S: Any, query: tuple) -> Any:
     import drjit as dr
 
-    sides = [(S if model is None else model.eval(*query), c) for model, c in stencil]
+    sides = [(S if model is None else model.eval(*query), number(c)) for model, c in stencil]
     least = sides[0][0]
     for value, _ in sides[1:]:
         least = dr.minimum(least, value)

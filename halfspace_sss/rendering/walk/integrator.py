@@ -66,6 +66,12 @@ def walk_integrator_class() -> type:
                 _render(self.tracer(scene), sensor, int(mi.UInt32(seed)[0]), spp or sensor.sampler().sample_count())
                 return sensor.film().develop() if develop else None
 
+        def render_forward(self, *_: Any, **__: Any) -> Any:
+            raise ValueError("the integrator of a derivative of light must be bssrdf, got translucent_walk")
+
+        def render_backward(self, *_: Any, **__: Any) -> None:
+            self.render_forward()
+
         def to_string(self) -> str:
             return f"TranslucentWalk[mm_per_unit = {self.mm_per_unit:g}, max_depth = {self.max_depth}]"
 
