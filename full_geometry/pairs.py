@@ -11,15 +11,17 @@ from full_geometry.exits import trace_exits
 from full_geometry.features import Frame, Side, pair_features, side_features
 from full_geometry.first_event import first_event
 from full_geometry.half_space import HalfSpace
-from full_geometry.subject import Subject, SurfacePoint, cosine_direction
+from full_geometry.patches import PatchSampler
+from full_geometry.subject import Subject, SurfacePoint, clearance, cosine_direction
 from halfspace_sss.rendering.transport.plane import Exit, number
-from halfspace_sss.rendering.transport.positions import PositionSampler
+from halfspace_sss.rendering.transport.positions import Entry, PositionSampler
 from halfspace_sss.rendering.transport.radial_table import RadialTable
 from halfspace_sss.tracing.walk import _generator, pass_seed
 
 __all__ = ["AREA_SHARE", "Pairs", "PairSource", "Proposals"]
 
 AREA_SHARE = 0.4  # of the proposals that are uniform over the area
+PATCH_SHARE = 0.6  # of those by patches, where they are learnt
 
 
 class Numbers:
@@ -47,18 +49,28 @@ class Pairs(NamedTuple):
 
 
 class Proposals:
-    """Entries for given exits: probes and uniform points, directions by the cosine.
+    """Entries for given exits: probes and uniform points, and learnt patches beside them; directions by the cosine.
+
+    Probes have the density D of all their hits, patches q; with a share s of patches (balance heuristic) a point of
+    weight v by a probe alone counts v D / ((1 - s) D + s q), one of a patch 1 / ((1 - s) D + s q).
 
     Args:
         subject: the object.
         half_space: S_0, whose radial densities the probes follow.
-        area_share: of the points that are uniform over the area.
+        area_share: of the points that are uniform over the area, without patches.
+        patches: learnt weights, or None.
     """
 
-    def __init__(self, subject: Subject, half_space: HalfSpace, area_share: float = AREA_SHARE) -> None:
+    def __init__(
+        self,
+        subject: Subject,
+        half_space: HalfSpace,
+        area_share: float = AREA_SHARE,
+        patches: PatchSampler | None = None,
+    ) -> None:
         live = [m for m in half_space.models if float(m.medium.sigma_s) > 0]
         table = RadialTable(live or half_space.models, subject.found.size)
-        self.subject = subject
+        self.subject, self.half_space, self.patches = subject, half_space, patches
         # light may leave by another piece of the surface than it entered by
         self.positions = PositionSampler(replace(subject.found, pieces=None), table, subject.points, area_share)
 
@@ -69,9 +81,40 @@ class Proposals:
 
         out = Exit(exit.p, exit.n_out, exit.w, number(self.subject.found.sign))
         entry = self.positions.sample(out, mi.UInt32(0), Numbers(rng), mi.Bool(True))
+        if self.patches is not None:
+            entry = self._mixed(exit, out, entry, rng)
         w = cosine_direction(entry.n_out, rng)
         n = entry.n * self.subject.found.sign
         return SurfacePoint(entry.p, n, entry.n_out, w), dr.pi * entry.weight
+
+    def with_patches(self, patches: PatchSampler | None) -> Proposals:
+        """The same with learnt weights of patches, which take the place of uniform points."""
+        return Proposals(self.subject, self.half_space, 0.0, patches) if patches is not None else self
+
+    def _mixed(self, exit: SurfacePoint, out: Exit, entry: Entry, rng: Any) -> Entry:
+        """The entry of the probe, or one by patches."""
+        import drjit as dr
+        import mitsuba as mi
+
+        weights = self.patches.prepare(Side(exit, first_event(self.subject, exit)))
+        u = (rng.next_float32(), rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32()))
+        point, q = self.patches.sample(weights, *u)
+        by_patch = rng.next_float32() < PATCH_SHARE
+        q = dr.select(by_patch, q, self.patches.density(weights, self._face(entry)))
+        drawn = Entry(point.p, point.n, point.n_shading * self.subject.found.sign, mi.Float(1))
+        p, n, n_out, v = (dr.select(by_patch, a, b) for a, b in zip(drawn, entry))
+        D = self.positions.density(p, n, out, (out.n, *mi.coordinate_system(out.n)))
+        mixture = (1 - PATCH_SHARE) * D + PATCH_SHARE * q
+        return Entry(p, n, n_out, dr.select(by_patch, 1, v * D) / dr.maximum(mixture, 1e-30))
+
+    def _face(self, entry: Entry) -> Any:
+        """The face that a point was found on, by a short ray through it."""
+        import drjit as dr
+        import mitsuba as mi
+
+        start = entry.p + entry.n * clearance(entry.p, entry.n, entry.n)
+        hit = self.subject.found.scene.ray_intersect_preliminary(mi.Ray3f(start, -entry.n), False, entry.weight > 0)
+        return dr.select(hit.is_valid(), hit.prim_index, 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,13 +149,13 @@ class PairSource:
         faces = np.array(dr.gather(mi.UInt32, exits.face, kept))
         return self._columns(starts.gather(kept), ends, T)._replace(drawn=n, faces=faces)
 
-    def proposed(self, n: int, seed: tuple[int, ...]) -> Pairs:
-        """n proposals of random exits, S_0 mu_i over their density as values."""
+    def proposed(self, n: int, seed: tuple[int, ...], patches: PatchSampler | None = None) -> Pairs:
+        """n proposals of random exits, S_0 mu_i over their density as values; by learnt patches if they are given."""
         import mitsuba as mi
 
         rng = _generator(mi, n, pass_seed(*seed, 2))
         starts = self.subject.random_points(rng)
-        entries, weight = self.proposals.sample(starts, rng)
+        entries, weight = self.proposals.with_patches(patches).sample(starts, rng)
         return self._columns(starts, entries, weight)
 
     def _columns(self, exits: SurfacePoint, entries: SurfacePoint, value: Any) -> Pairs:

@@ -194,7 +194,7 @@ class _Run:
         if chunks is None:
             trial = self._new_fitting()
             trial.scale = self.fitting.scale
-            self.source.proposed(1024, (self.seed, 2**31))  # compiles its kernels
+            self.source.proposed(1024, (self.seed, 2**31), self.learnt().sampler)  # compiles its kernels
             at = time.monotonic()
             trial.use(*self._data(2**31 + 1), 10**6, np.random.default_rng(0))
             chunks = max(int(LOOP_SHARE * seconds / (time.monotonic() - at)), 1)
@@ -203,7 +203,8 @@ class _Run:
         return chunks
 
     def _data(self, k: int) -> tuple:
-        return self.source.walks(self.walks, (self.seed, k)), self.source.proposed(self.recipe.chunk, (self.seed, k))
+        walks = self.source.walks(self.walks, (self.seed, k))
+        return walks, self.source.proposed(self.recipe.chunk, (self.seed, k), self.learnt().sampler)
 
     def _chunk(self, total: int) -> None:
         walks, proposals = self._data(self.done)

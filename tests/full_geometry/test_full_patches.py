@@ -20,7 +20,9 @@ pytest.importorskip("torch")
 from full_geometry.features import Side, n_side  # noqa: E402
 from full_geometry.first_event import first_event  # noqa: E402
 from full_geometry.fitting import Recipe  # noqa: E402
+from full_geometry.half_space import HalfSpace  # noqa: E402
 from full_geometry.identity import frame_of  # noqa: E402
+from full_geometry.pairs import Proposals  # noqa: E402
 from full_geometry.patches import Patches, PatchSampler, cluster, mesh_faces  # noqa: E402
 from full_geometry.subject import Subject  # noqa: E402
 from full_geometry.training import train  # noqa: E402
@@ -147,3 +149,17 @@ def entry_at(subject: Subject, point, rng):
 
     n_out = point.n_shading * subject.found.sign
     return SurfacePoint(point.p, point.n * subject.found.sign, n_out, cosine_direction(n_out, rng))
+
+
+def test_probes_and_patches_together_give_the_estimate_of_each_alone(subject: Subject, sampler: PatchSampler) -> None:
+    half_space = HalfSpace(subject, "better_dipole")
+    alone = Proposals(subject, half_space, 0.4)
+    exits = subject.random_points(_generator(mi, 2**17, pass_seed(12)))
+    means, errors = [], []
+    for k, proposals in enumerate((alone, alone.with_patches(sampler))):
+        entries, weight = proposals.sample(exits, _generator(mi, 2**17, pass_seed(13, k)))
+        near = dr.exp(-0.1 * dr.squared_norm(entries.p - exits.p))  # any function of the two points
+        values = np.array(near * weight, dtype=float)
+        means.append(values.mean())
+        errors.append(values.std() / np.sqrt(len(values)))
+    assert abs(means[0] - means[1]) < 4 * np.hypot(*errors) and np.hypot(*errors) < 0.02 * means[0]
