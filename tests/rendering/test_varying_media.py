@@ -63,14 +63,15 @@ def test_images_agree_with_the_heterogeneous_medium_of_mitsuba(surface: dict, sh
     assert np.abs(_z(_runs(mi.load_dict(scene), 12, 64, 1), _runs(theirs, 12, 64, 1001))).max() < WIDEST_Z
 
 
-@pytest.mark.parametrize("light", ["lamp", "small lamp"])
-def test_a_grid_that_is_the_same_everywhere_is_a_homogeneous_medium(light: str) -> None:
+@pytest.mark.parametrize(("light", "orders"), [("lamp", "total"), ("small", "multiple"), ("small", "single")])
+def test_a_grid_that_is_the_same_everywhere_is_a_homogeneous_medium(light: str, orders: str) -> None:
+    """Under the small lamp joins bring the multiple scattering, and the guide the single one."""
     lamp = _lamp() if light == "lamp" else _small_lamp()
     spread = np.ones((2, 3, 4, 3))
     grids = {"sigma_t": _grid([0.51, 1.1, 2.5] * spread), "albedo": _grid([0.98, 0.9, 0.8] * spread)}
     same = {"sigma_t": "0.51,1.1,2.5", "albedo": "0.98,0.9,0.8"}
     a, b = (
-        _runs(mi.load_dict(_scene({**medium, "g": 0.5, "eta": 1.4}, lamp)), 12, 64, seed)
+        _runs(mi.load_dict(_scene({**medium, "g": 0.5, "eta": 1.4, "orders": orders}, lamp)), 12, 64, seed)
         for medium, seed in ((grids, 1), (same, 100))
     )
     assert np.abs(_z(a, b)).max() < WIDEST_Z
