@@ -6,7 +6,7 @@ import math
 from typing import Any
 
 from analytic_models._diffusion import Boundary, Grosjean, safe_differences
-from halfspace_sss.interface.model import Query
+from halfspace_sss.interface.query import Query
 from halfspace_sss.interface.separable import Separable
 from halfspace_sss.physics.medium import Medium
 

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from analytic_models._diffusion import Boundary, safe_differences
-from halfspace_sss.interface.model import BSSRDF, Query
+from halfspace_sss.interface.model import BSSRDF
+from halfspace_sss.interface.query import Query
 from halfspace_sss.physics.medium import Medium
 
 __all__ = ["DirectionalDipole"]

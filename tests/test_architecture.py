@@ -16,10 +16,10 @@ HEAVY = ["torch", "mitsuba", "matplotlib", "drjit", "pandas", "xarray"]
 FLOORS = {  # of each package, a room may import those to its left; "" is what lies beside the rooms
     "halfspace_sss": [
         "", "physics", "interface", "tracing", "maps", "measure", "materials", "comparison", "neural",
-        "neural.training", "rendering.surface", "rendering.transport", "rendering.scenes", "rendering.walk",
-        "rendering", "cli",
+        "neural.training", "rendering.surface", "rendering.transport", "rendering.walk", "rendering.paths",
+        "rendering.scenes", "rendering", "cli",
     ],
-    "figures": ["parts", "computing", "drawing", ""],
+    "figures": ["parts", "modelling", "computing", "drawing", ""],
 }  # fmt: skip
 HIDING = {"bssrdf", "curves", "models", "trace"}  # public functions: a folder of that name would hide one
 LONGEST_FILE, LONGEST_BODY, MOST_MODULES = 300, 45, 14
@@ -90,9 +90,10 @@ def _circles(arrows: dict[str, set[str]]) -> set[str]:
 
 
 def _body_lines(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
-    """Lines of a function without its signature and docstring."""
+    """Lines of a function without its signature, docstring and classes, whose methods count alone."""
     body = function.body[1:] if ast.get_docstring(function) is not None else function.body
-    return function.end_lineno - body[0].lineno + 1 if body else 0
+    classes = sum(node.end_lineno - node.lineno + 1 for node in body if isinstance(node, ast.ClassDef))
+    return function.end_lineno - body[0].lineno + 1 - classes if body else 0
 
 
 def _loaded_by(statement: str) -> set[str]:

@@ -6,7 +6,6 @@ import abc
 import functools
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -14,12 +13,13 @@ import numpy as np
 from halfspace_sss.arrays import broadcast_query
 from halfspace_sss.checks import check_choice, check_query
 from halfspace_sss.interface.model_lists import check_model_class, listed_models
+from halfspace_sss.interface.query import Query
 from halfspace_sss.interface.radial import RadialSampler
 from halfspace_sss.once import once
-from halfspace_sss.physics.fresnel import F_t, mu_internal
+from halfspace_sss.physics.fresnel import F_t
 from halfspace_sss.physics.medium import Medium
 
-__all__ = ["BSSRDF", "DirectionSample", "PositionSample", "Query", "bssrdf", "model_class", "models", "register_model"]
+__all__ = ["BSSRDF", "DirectionSample", "PositionSample", "bssrdf", "model_class", "models", "register_model"]
 
 
 FARTHEST = 0.44  # of the exponent range: in mean free paths, where r² is finite and r⁻³ is 0 in every precision
@@ -39,58 +39,6 @@ class DirectionSample(NamedTuple):
     mu_i: Any
     phi_i: Any
     pdf: Any
-
-
-@dataclass(frozen=True)
-class Query:
-    """A half-space query in mean free paths, with refracted cosines, in one array library.
-
-    The refracted directions of travel, in a frame whose x axis points from x_i to x_o and z outwards, are
-    w_12 = (-sin_i cos phi_i, -sin_i sin phi_i, -mu_i_in) and w_21 = (sin_o cos phi_o, sin_o sin phi_o, mu_o_in).
-    """
-
-    lib: Any
-    r: Any
-    mu_i: Any
-    phi_i: Any
-    mu_o: Any
-    phi_o: Any
-    eta: float
-    r_mm: Any = None
-    sigma_t: Any = None  # r = sigma_t r_mm, kept so that `in_float64` does not inherit the rounding of r
-
-    @functools.cached_property
-    def mu_i_in(self) -> Any:
-        return mu_internal(self.mu_i, self.eta)
-
-    @functools.cached_property
-    def mu_o_in(self) -> Any:
-        return mu_internal(self.mu_o, self.eta)
-
-    @functools.cached_property
-    def sin_i(self) -> Any:
-        """Sine of the refracted angle, sqrt(1 - mu_i²)/eta, at most 1."""
-        return self._sine(self.mu_i)
-
-    @functools.cached_property
-    def sin_o(self) -> Any:
-        return self._sine(self.mu_o)
-
-    def _sine(self, mu: Any) -> Any:
-        lib = self.lib
-        return lib.minimum(lib.sqrt(lib.maximum((1 - mu) * (1 + mu), 0.0)) / self.eta, 1.0)
-
-    def constant(self, value: Any) -> Any:
-        """A constant of the model (number, or one per channel) in the library and precision of the query."""
-        return self.lib.constant(value, self.r)
-
-    def in_float64(self) -> Query:
-        """The same query in float64, for formulas whose terms cancel."""
-        f = self.lib.float64
-        r = f(self.r) if self.r_mm is None else f(self.r_mm)
-        if self.r_mm is not None:
-            r = self.lib.constant(self.sigma_t, r) * r
-        return Query(self.lib, r, f(self.mu_i), f(self.phi_i), f(self.mu_o), f(self.phi_o), self.eta)
 
 
 class BSSRDF(abc.ABC):

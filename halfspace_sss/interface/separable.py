@@ -6,7 +6,8 @@ import abc
 import math
 from typing import Any
 
-from halfspace_sss.interface.model import BSSRDF, Query
+from halfspace_sss.interface.model import BSSRDF
+from halfspace_sss.interface.query import Query
 from halfspace_sss.physics.fresnel import C_phi
 
 __all__ = ["Separable", "exit_normaliser"]

@@ -5,7 +5,8 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from halfspace_sss.interface.model import BSSRDF, Query
+from halfspace_sss.interface.model import BSSRDF
+from halfspace_sss.interface.query import Query
 from halfspace_sss.neural.features import symmetric_features, travel
 from halfspace_sss.neural.network import Network
 from halfspace_sss.physics.backbone import backbone_shape, length_scale

@@ -10,8 +10,9 @@ igl = pytest.importorskip("igl")
 
 import mitsuba as mi  # noqa: E402
 
-from figures import environments  # noqa: E402
-from figures.objects import candle, grid, mesh, pictures, scene_parts  # noqa: E402
+from figures import objects as pictures  # noqa: E402
+from figures.computing import environments  # noqa: E402
+from figures.modelling import candle, grid, mesh, scene_parts  # noqa: E402
 from figures.parts import runner  # noqa: E402
 
 LOW, HIGH = 32, 64

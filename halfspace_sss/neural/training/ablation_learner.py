@@ -10,7 +10,8 @@ import torch
 from torch import nn
 
 from halfspace_sss.arrays import library
-from halfspace_sss.interface.model import BSSRDF, Query
+from halfspace_sss.interface.model import BSSRDF
+from halfspace_sss.interface.query import Query
 from halfspace_sss.maps.noisy_maps import radial_edges
 from halfspace_sss.neural.features import N_FEATURES
 from halfspace_sss.neural.network import RELU, SILU, Network, layer_shapes

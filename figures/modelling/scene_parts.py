@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from figures.objects import croissant, mandarin, meat
-from figures.objects.candle import make_candle
-from figures.objects.grid import Grid, mixed, tissue
-from figures.objects.mesh import Mesh, surface
+from figures.modelling import croissant, mandarin, meat
+from figures.modelling.candle import make_candle
+from figures.modelling.grid import Grid, mixed, tissue
+from figures.modelling.mesh import Mesh, surface
 
 __all__ = ["FLAME_RADIANCE", "OBJECTS", "VARYING", "Varying", "candle_parts", "make_varying", "varying_parts"]
 

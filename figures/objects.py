@@ -9,14 +9,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from figures.computing.denoise import check_denoiser, denoised, guides
+from figures.computing.environments import environment, environment_file
 from figures.computing.scenes import prepare
 from figures.drawing.image_grid import image_grid
 from figures.drawing.page import page
 from figures.drawing.shot import Shot
 from figures.drawing.style import paper, saved
-from figures.environments import environment, environment_file
-from figures.objects.grid import Grid
-from figures.objects.scene_parts import OBJECTS, VARYING, Varying, candle_parts, make_varying, varying_parts
+from figures.modelling.grid import Grid
+from figures.modelling.scene_parts import OBJECTS, VARYING, Varying, candle_parts, make_varying, varying_parts
 from figures.parts.part import Part, Result, Task
 from halfspace_sss.provenance import check_folder
 
@@ -32,7 +32,7 @@ FLOOR, GAP = (0.33, 0.3, 0.27), 0.02  # reflectance of the floor, and how far it
 NOTES = (
     "The candle by exact walks in homogeneous wax, the others by Mitsuba's volpathmis in grid volumes of extinction "
     "and albedo under a rough dielectric; all orders. Denoised by Open Image Denoise, led by normals and, for grids, "
-    "by the albedo at the surface. Lengths are mm; the coefficients are chosen, see figures/objects/tissues.toml."
+    "by the albedo at the surface. Lengths are mm; the coefficients are chosen, see figures/modelling/tissues.toml."
 )
 
 
@@ -60,7 +60,7 @@ def parts(quality: str) -> list[Part]:
     size, spp, found = SIZES[quality], SPP[quality], []
     for name in OBJECTS:
         params = {"object": name, "size": size, "spp": spp, "resolution": RESOLUTION[quality], "seed": 0}
-        inputs = (environment_file(VIEWS[name].light), Path(__file__).parent / "tissues.toml")
+        inputs = (environment_file(VIEWS[name].light), Path(__file__).parent / "modelling" / "tissues.toml")
         params |= {"view": list(VIEWS[name])}
         function = varying if name in VARYING else candle
         found.append(Part(name, function, params, spp * size**2, inputs=inputs))

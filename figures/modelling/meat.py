@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from figures.objects.distance import cells, fbm, length, noise, overlap, rotated, smoothstep
-from figures.objects.mesh import Box
+from figures.modelling.distance import cells, fbm, length, noise, overlap, rotated, smoothstep
+from figures.modelling.mesh import Box
 
 __all__ = ["BOX", "Meat"]
 

@@ -7,8 +7,8 @@ from functools import cached_property
 
 import numpy as np
 
-from figures.objects.distance import cells, cut, fbm, length, noise, overlap, smoothstep
-from figures.objects.mesh import Box
+from figures.modelling.distance import cells, cut, fbm, length, noise, overlap, smoothstep
+from figures.modelling.mesh import Box
 
 __all__ = ["BOX", "Croissant"]
 

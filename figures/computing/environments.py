@@ -18,7 +18,7 @@ def environment_file(name: str) -> Path:
     """The file of an environment map, for `Part.inputs`; ValueError if there is none of that name."""
     if name not in ENVIRONMENTS:
         raise ValueError(f"environment must be one of {', '.join(ENVIRONMENTS)}, got {name!r}")
-    return Path(__file__).parent / "assets" / f"{name}.exr"
+    return Path(__file__).parents[1] / "assets" / f"{name}.exr"
 
 
 def environment(name: str, scale: float = 1.0, turn: float = 0.0) -> dict[str, Any]:

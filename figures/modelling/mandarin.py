@@ -11,7 +11,7 @@ from functools import cached_property
 
 import numpy as np
 
-from figures.objects.distance import (
+from figures.modelling.distance import (
     cells,
     ellipsoid,
     fbm,
@@ -25,7 +25,7 @@ from figures.objects.distance import (
     smoothstep,
     twisted,
 )
-from figures.objects.mesh import Box
+from figures.modelling.mesh import Box
 
 __all__ = ["BOX", "Mandarin"]
 

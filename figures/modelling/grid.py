@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from figures.objects.mesh import Box, in_chunks
+from figures.modelling.mesh import Box, in_chunks
 from halfspace_sss.materials.files import parse
 from halfspace_sss.materials.material import Material
 from halfspace_sss.provenance import write_atomically
@@ -23,7 +23,7 @@ Tissues = Callable[[np.ndarray], Mapping[str, np.ndarray]]
 
 @functools.cache
 def _tissues() -> dict[str, Material]:
-    file = resources.files("figures.objects") / "tissues.toml"
+    file = resources.files("figures.modelling") / "tissues.toml"
     return {material.name: material for material in parse(file.read_text(encoding="utf-8"), "tissues.toml")}
 
 

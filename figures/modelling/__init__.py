@@ -4,7 +4,3 @@
 make surfaces and media of them, `scene_parts` makes them ready for Mitsuba. Lengths are mm, y is up, and they stand
 about y = 0. `halfspace-sss figures all objects` shows them.
 """
-
-from figures.objects.pictures import TITLE, draw, parts
-
-__all__ = ["TITLE", "draw", "parts"]
