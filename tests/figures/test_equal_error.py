@@ -59,7 +59,8 @@ def test_every_method_of_a_scene_has_errors_and_times(results: dict[str, Result]
         assert row["seconds"] > 0 and row["spread"] > 0
         assert all(np.isfinite(row[key]) for key in ("variance", "bias2", "error"))
     assert rows[DIPOLE]["variance"] == rows[DIPOLE]["spread"] > rows[BARE]["spread"]
-    assert rows[WALK]["bias2"] == 0
+    walk = rows[WALK]  # about the truth as about itself: nothing but noise is between them
+    assert abs(walk["error"] - walk["spread"]) < 5 * walk["error standard error"] < walk["spread"]
     assert 0 < found["truth"]["variance"] < found["truth"]["mean square"]
 
 

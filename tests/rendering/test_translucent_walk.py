@@ -16,6 +16,8 @@ from halfspace_sss.tracing.tracer import trace
 mi = pytest.importorskip("mitsuba")
 
 WIDEST_Z = 4.4  # two-sided 1e-5, for a few hundred comparisons
+WIDEST_Z_OF_RUNS = 6.0  # Student's t with about 20 degrees of freedom
+LARGEST_ERROR = 0.05  # of the mean of an image
 COLOURED = {"sigma_s": "0.5,1.0,2.0", "sigma_a": "0.01,0.1,0.5"}
 
 
@@ -59,11 +61,21 @@ def _z(a: np.ndarray, b: np.ndarray | float) -> np.ndarray:
     def quarters(x: np.ndarray) -> np.ndarray:
         return x.reshape(len(x), 2, 4, 2, 4, -1).mean(axis=(2, 4)).reshape(len(x), -1)
 
-    a, error = quarters(a), 0.0
+    a, variance = quarters(a), 0.0
     if isinstance(b, np.ndarray):
         b = quarters(b)
-        b, error = b.mean(axis=0), b.var(axis=0, ddof=1) / len(b)
-    return (a.mean(axis=0) - b) / np.sqrt(a.var(axis=0, ddof=1) / len(a) + error)
+        b, variance = b.mean(axis=0), b.var(axis=0, ddof=1) / len(b)
+    error = np.sqrt(a.var(axis=0, ddof=1) / len(a) + variance)
+    return (a.mean(axis=0) - b) / error
+
+
+def _agree(a: np.ndarray, b: np.ndarray, known_to: float = LARGEST_ERROR) -> None:
+    """Quarters and whole images agree, and not by noise alone: the whole is known to a share of itself."""
+    assert np.abs(_z(a, b)).max() < WIDEST_Z_OF_RUNS
+    whole = [x.mean(axis=(1, 2, 3), keepdims=True) for x in (a, b)]
+    z, error = ((whole[0].mean() - whole[1].mean()), np.hypot(*(x.std(ddof=1) / np.sqrt(len(x)) for x in whole)))
+    assert abs(z) < WIDEST_Z_OF_RUNS * error
+    assert error < known_to * whole[1].mean()
 
 
 def test_a_medium_without_absorption_is_invisible_in_uniform_light() -> None:
@@ -90,8 +102,7 @@ def test_images_agree_with_the_volume_path_tracer_of_mitsuba(surface: dict, shap
     scene = _scene(surface, None if uniform else _lamp(), _cube() if shape else None, mm_per_unit=1.2)
     theirs = with_media(scene, 1.2, {"type": "volpathmis", "max_depth": -1, "rr_depth": 1000})
     spp = 32 if uniform else 128
-    z = _z(_runs(mi.load_dict(scene), 12, spp, 1), _runs(theirs, 12, spp, 1001))
-    assert np.abs(z).max() < 6.0  # Student's t with about 20 degrees of freedom
+    _agree(_runs(mi.load_dict(scene), 12, spp, 1), _runs(theirs, 12, spp, 1001))
 
 
 def test_a_large_flat_box_shows_the_reflectance_of_the_half_space() -> None:
@@ -115,7 +126,7 @@ def test_single_and_multiple_scattering_add_up_to_the_total() -> None:
         _runs(mi.load_dict(_scene({**surface, "orders": orders, "reflection": False}, _lamp())), 12, 128, seed)
         for orders, seed in (("single", 1), ("multiple", 100), ("total", 200))
     )
-    assert np.abs(_z(single + multiple, total)).max() < 6.0
+    _agree(single + multiple, total)
     assert 0.02 < single.mean() / total.mean() < 0.9
 
 
@@ -132,7 +143,7 @@ def test_joins_bring_the_light_that_chance_brings_with_less_noise() -> None:
         _runs(mi.load_dict(_scene(surface, _small_lamp(), _cube(), join_share=share)), 12, spp, 1)
         for share, spp in ((0.5, 64), (0.0, 1024))
     )
-    assert np.abs(_z(joined, left_to_chance)).max() < 6.0
+    _agree(joined, left_to_chance, known_to=0.1)
     assert 64 * np.median(joined.var(axis=0)) < 0.05 * 1024 * left_to_chance.var(axis=0).mean()
 
 
@@ -142,7 +153,7 @@ def test_a_point_light_is_seen_as_a_small_lamp_of_the_same_power() -> None:
     lamp = {"type": "sphere", "center": place, "radius": radius, "emitter": {"type": "area", "radiance": 100.0}}
     point = {"type": "point", "position": place, "intensity": 100.0 * np.pi * radius**2}
     a, b = (_runs(mi.load_dict(_scene(surface, light)), 12, 128, seed) for light, seed in ((lamp, 1), (point, 100)))
-    assert np.abs(_z(a, b)).max() < 6.0
+    _agree(a, b)
 
 
 def test_normals_that_point_inwards_change_nothing() -> None:
@@ -150,7 +161,7 @@ def test_normals_that_point_inwards_change_nothing() -> None:
     surface = {**COLOURED, "eta": 1.5}
     a = _runs(mi.load_dict(_scene(surface, shape=sphere)), 8, 32, 1)
     b = _runs(mi.load_dict(_scene(surface, shape={**sphere, "flip_normals": True})), 8, 32, 100)
-    assert np.abs(_z(a, b)).max() < 6.0
+    _agree(a, b)
 
 
 def test_objects_of_different_media_stand_in_one_scene() -> None:
@@ -158,14 +169,14 @@ def test_objects_of_different_media_stand_in_one_scene() -> None:
     other = {"type": "translucent", "sigma_s": 1.0, "sigma_a": "1,0.1,0.01", "g": 0.5, "eta": 1.3}
     scene["other"] = {"type": "sphere", "radius": 4.0, "center": [5, 0, 0], "bsdf": other}
     theirs = with_media(scene, 1.0, {"type": "volpathmis", "max_depth": -1, "rr_depth": 1000})
-    assert np.abs(_z(_runs(mi.load_dict(scene), 12, 64, 1), _runs(theirs, 12, 64, 100))).max() < 6.0
+    _agree(_runs(mi.load_dict(scene), 12, 64, 1), _runs(theirs, 12, 64, 100))
 
 
 def test_a_mono_variant_renders_one_channel_of_the_colours() -> None:
     colours = _runs(mi.load_dict(_scene({**COLOURED, "eta": 1.3})), 12, 64, 1)[..., 1:2]
     mi.set_variant("llvm_ad_mono")
     grey = _runs(mi.load_dict(_scene({"sigma_s": 1.0, "sigma_a": 0.1, "eta": 1.3})), 12, 64, 100)[..., :1]
-    assert np.abs(_z(colours, grey)).max() < 6.0
+    _agree(colours, grey)
 
 
 @pytest.mark.parametrize(
