@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from enum import Enum
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 
 __all__ = ["figures_command"]
 
+DRAWING = ("PIL", "flip_evaluator", "matplotlib")
 EXTRAS = ("PIL", "flip_evaluator", "matplotlib", "mitsuba")
 
 
@@ -54,11 +56,20 @@ def figures_command(
     try:
         for name in chosen:
             figure(name)
+        if action in (Action.draw, Action.all):
+            _check_drawing()
         do([plan(name, quality.value, out) for name in chosen], out)
     except ModuleNotFoundError as error:
         if (error.name or "").split(".")[0] not in EXTRAS:
             raise
         raise BackendError(f'figures need {error.name}: pip install "halfspace-sss[figures,render]"') from error
+
+
+def _check_drawing() -> None:
+    """Before anything is computed: BackendError unless the libraries that figures are drawn with are there."""
+    for name in DRAWING:
+        if find_spec(name) is None:
+            raise BackendError(f'figures need {name}: pip install "halfspace-sss[figures,render]"')
 
 
 def _say(text: str) -> None:

@@ -68,8 +68,8 @@ def renderer(kind: str) -> Renderer | None:
         try:
             found = entry.load()
         except FAILURES as error:
-            missing = getattr(error, "name", None) or ""
-            if not isinstance(error, ModuleNotFoundError) or missing.split(".")[0] not in ("matplotlib", "figures"):
+            missing = (getattr(error, "name", None) or "").split(".")[0]
+            if not isinstance(error, ModuleNotFoundError) or missing not in ("PIL", "matplotlib", "figures"):
                 warn_left_out(FIGURES, kind, error)
             continue
         if callable(found):

@@ -10,13 +10,14 @@ import platform
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 __all__ = [
-    "check_folder", "provenance", "read_bytes", "read_text", "replace_together", "write_atomically", "write_together",
+    "check_folder", "naming", "provenance", "read_bytes", "read_text", "replace_together", "write_atomically",
+    "write_together",
 ]  # fmt: skip
 
 LARGEST, LARGEST_TEXT = 10**9, 10**7  # bytes
@@ -103,7 +104,7 @@ def write_together(files: Mapping[Path, bytes | str]) -> None:
     written: dict[Path, Path] = {}
     try:
         for path, content in files.items():
-            with _naming(path):
+            with naming(path):
                 path.parent.mkdir(parents=True, exist_ok=True)
                 handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
                 written[path] = Path(temporary)
@@ -118,20 +119,37 @@ def write_together(files: Mapping[Path, bytes | str]) -> None:
             temporary.unlink(missing_ok=True)
 
 
-def replace_together(moves: Mapping[Path, Path]) -> None:
-    """Rename files, old name to new, so that those with the new names are at any moment of one set."""
-    first, *others = moves.values()
-    for path in others:
-        path.unlink(missing_ok=True)
-    for old, new in moves.items():
-        with _naming(new):
-            os.replace(old, new)
+def replace_together(moves: Mapping[Path, Path], gone: Iterable[Path] = ()) -> None:
+    """Rename files, old name to new, so that those with the new names are at any moment of one set.
+
+    Args:
+        moves: old path -> new path.
+        gone: files of the set before that the new one does not have; they are removed.
+    """
+    others = [*list(moves.values())[1:], *gone]
+    aside = {path: path.with_name(f".{path.name}.before") for path in others if path.exists()}
+    placed = False
+    try:
+        for path, hidden in aside.items():
+            with naming(path):
+                os.replace(path, hidden)
+        for old, new in moves.items():
+            with naming(new):
+                os.replace(old, new)
+            placed = True
+    finally:
+        for path, hidden in aside.items():
+            if hidden.exists() and not placed:
+                os.replace(hidden, path)
+            hidden.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager
-def _naming(path: Path) -> Iterator[None]:
-    """What the system refuses is told with the path that was meant."""
+def naming(path: Path) -> Iterator[None]:
+    """What the system refuses is told with the path that it was meant for."""
     try:
         yield
     except OSError as error:
+        if error.errno is None:
+            raise
         raise OSError(error.errno, error.strerror, str(path)) from error

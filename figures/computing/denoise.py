@@ -24,7 +24,7 @@ def check_denoiser() -> Any:
     return mitsuba_oidn
 
 
-def guides(scene: Any, spp: int = GUIDE_SPP) -> tuple[np.ndarray, np.ndarray]:
+def guides(scene: Any, spp: int = GUIDE_SPP, sensor: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Cover of each pixel by objects, as an albedo (H, W, 3), and mean shading normal (H, W, 3), both float32.
 
     What is below a translucent surface has no albedo of its own: covered pixels get 1.
@@ -32,7 +32,7 @@ def guides(scene: Any, spp: int = GUIDE_SPP) -> tuple[np.ndarray, np.ndarray]:
     import mitsuba as mi
 
     aov = mi.load_dict({"type": "aov", "aovs": "n:sh_normal"})
-    normal = np.array(mi.render(scene, integrator=aov, spp=spp, seed=7), dtype=np.float32)[..., :3]
+    normal = np.array(mi.render(scene, integrator=aov, sensor=sensor, spp=spp, seed=7), dtype=np.float32)[..., :3]
     cover = np.clip(np.linalg.norm(normal, axis=2), 0, 1)
     return np.repeat(cover[..., None], 3, axis=2), np.clip(normal, -1, 1)
 

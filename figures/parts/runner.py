@@ -16,7 +16,7 @@ from figures.parts.projection import Projected, projected
 from figures.parts.store import DamagedPartError, PartStore
 from halfspace_sss.checks import check_choice
 from halfspace_sss.progress import ProgressText
-from halfspace_sss.provenance import check_folder, provenance, write_atomically
+from halfspace_sss.provenance import check_folder, provenance, write_together
 
 __all__ = ["Plan", "compute", "draw", "figure", "plan"]
 
@@ -159,8 +159,7 @@ def draw(name: str, quality: str, out: str | Path) -> list[Path]:
         for part in done.parts
     }
     content[f"{name}.json"] = json.dumps({**about, "files": sorted(content)}, indent=1) + "\n"
-    for file, data in content.items():
-        write_atomically(done.folder / file, data)
+    write_together({done.folder / file: data for file, data in content.items()})
     return [done.folder / file for file in content]
 
 

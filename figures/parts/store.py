@@ -14,7 +14,7 @@ import numpy as np
 
 from figures.parts.exr import exr_bytes, read_exr
 from figures.parts.part import Part, Result, canonical
-from halfspace_sss.provenance import provenance, write_atomically
+from halfspace_sss.provenance import provenance, write_together
 
 __all__ = ["DamagedPartError", "PartStore"]
 
@@ -100,8 +100,6 @@ class PartStore:
         about = canonical({**origin, "key": key}, f"provenance of part {part.name!r}")
         images = {name: exr_bytes(array, f"{name} of part {part.name!r}", about) for name, array in arrays.items()}
         files = {f"{name}.exr": data for name, data in images.items()}
-        for file, data in files.items():
-            write_atomically(self._part_folder(part) / file, data)
         record = {"format": FORMAT, "part": part.name, "key": key, "kind": part.kind, "work": part.work}
         record |= {"seconds": seconds, "numbers": numbers, "provenance": origin}
         record["inputs"] = [Path(path).name for path in part.inputs]
@@ -110,7 +108,8 @@ class PartStore:
         }
         record = json.loads(json.dumps(record))
         text = json.dumps({**record, "checksum": _checksum(record)}, indent=1)
-        write_atomically(self._record_path(part), text + "\n")
+        places = {self._part_folder(part) / file: data for file, data in files.items()}
+        write_together({**places, self._record_path(part): text + "\n"})
         self._sweep(part, set(files))
         shown = {name: array.astype(np.float32) for name, array in arrays.items()}
         return Result(shown, record["numbers"], seconds, part.work)

@@ -5,6 +5,6 @@ __all__ = ["main"]
 
 def main() -> None:
     """Run the command line; the entry point of `halfspace-sss`."""
-    from halfspace_sss.cli.app import app
+    from halfspace_sss.cli import app
 
-    app()
+    app.main()

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from halfspace_sss.cli.shared import Albedo, Backend, Bar, Eta, MeanCosine, SigmaT, console, stated_medium
-from halfspace_sss.provenance import check_folder, provenance, write_atomically
+from halfspace_sss.cli.shared import Albedo, Backend, Bar, Eta, MeanCosine, SigmaT, console, stated_medium, whole
+from halfspace_sss.provenance import check_folder, provenance, write_together
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -39,10 +39,11 @@ def ablation_command(
         float | None, typer.Option(help="Equal time: of each training.", show_default="20, none with --samples")
     ] = None,
     samples: Annotated[
-        int | None, typer.Option(help="Equal data: of each training.", show_default="1000000, none with --seconds")
+        int | None,
+        typer.Option(help="Equal data: of each training.", parser=whole, show_default="1000000, none with --seconds"),
     ] = None,
-    seeds: Annotated[int, typer.Option(help="Trainings of each variant.")] = 3,
-    seed: Annotated[int, typer.Option(help="Seed of the maps, and the first of the trainings.")] = 0,
+    seeds: Annotated[int, typer.Option(help="Trainings of each variant.", parser=whole)] = 3,
+    seed: Annotated[int, typer.Option(help="Seed of the maps, and the first of the trainings.", parser=whole)] = 0,
     backend: Backend = "llvm",
     out: Annotated[Path, typer.Option(help="Folder for the files; those of the same names are replaced.")] = Path(
         "ablation"
@@ -101,8 +102,7 @@ def _write(out: Path, table: pandas.DataFrame, summary: pandas.DataFrame, captio
         "ablation.csv": table.to_csv(index=False, lineterminator="\n"),
         "ablation.json": json.dumps(content, indent=1, allow_nan=False) + "\n",
     }
-    for name, text in files.items():
-        write_atomically(out / name, text)
+    write_together({out / name: text for name, text in files.items()})
     return [out / name for name in files]
 
 

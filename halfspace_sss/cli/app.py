@@ -1,88 +1,103 @@
-"""The command `halfspace-sss`: what it can do, and the one place where errors become messages and exit codes.
+"""The command `halfspace-sss`: what it can do.
 
-A command is a function with typer annotations in a file `cli_*.py`; it joins by one line in `_OWN`. Packages above
-add theirs by an entry point of the group `halfspace_sss.commands`. Exit codes: 0 done, 1 failed, 2 bad input, 130
-interrupted.
+A command is a function with typer annotations in a file of this folder; it joins by one line in `_OWN`. Packages above
+add theirs by an entry point of the group `halfspace_sss.commands`. How commands end is in `endings`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+import functools
+import importlib
+import os
+import sys
+from typing import TYPE_CHECKING, Any
 
-import typer
-from typer.core import TyperGroup
+from halfspace_sss.cli.interrupts import interrupts
 
-import halfspace_sss
-from halfspace_sss.backend import BackendError
-from halfspace_sss.cli.ablation import ablation_command
-from halfspace_sss.cli.bench import bench_command
-from halfspace_sss.cli.curves import curves_command
-from halfspace_sss.cli.errors import errors_command
-from halfspace_sss.cli.lists import materials_command, models_command
-from halfspace_sss.cli.maps import maps_command
-from halfspace_sss.cli.render import render_command
-from halfspace_sss.cli.train import train_command
-from halfspace_sss.cli.validate import validate_command
-from halfspace_sss.extensions import COMMANDS, FAILURES, commands, warn_left_out
+if TYPE_CHECKING:
+    import typer
 
-__all__ = ["app"]
+    app: typer.Typer
+
+__all__ = ["app", "main"]
 
 _OWN = {
-    "ablation": ablation_command,
-    "bench": bench_command,
-    "curves": curves_command,
-    "errors": errors_command,
-    "maps": maps_command,
-    "materials": materials_command,
-    "models": models_command,
-    "render": render_command,
-    "train": train_command,
-    "validate": validate_command,
+    "ablation": "ablation_command",
+    "bench": "bench_command",
+    "curves": "curves_command",
+    "errors": "errors_command",
+    "maps": "maps_command",
+    "materials": "materials_command",
+    "models": "models_command",
+    "render": "render_command",
+    "train": "train_command",
+    "validate": "validate_command",
 }
+_LISTS = ("materials", "models")  # which are asked for what they print
+_FILES = {"materials": "lists", "models": "lists"}  # those that are not in the file of their name
 
 
-def _end(message: str, code: int) -> typer.Exit:
-    """The exit that ends the command, after one line on stderr."""
-    typer.echo(" ".join(message.split()), err=True)
-    return typer.Exit(code)
+def __getattr__(name: str) -> Any:
+    if name != "app":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return _app()
 
 
-class _Group(TyperGroup):
-    """The commands; what the library refuses becomes a line on stderr and an exit code here and nowhere else."""
+@functools.cache
+def _app() -> Any:
+    """The commands; made when they are needed, so that an interrupt is heard from the first moment on."""
+    import typer
 
-    def invoke(self, ctx: Any) -> Any:
+    from halfspace_sss.cli.endings import Commands
+    from halfspace_sss.cli.shared import with_quiet
+
+    app = typer.Typer(
+        cls=Commands, no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
+        context_settings={"help_option_names": ["-h", "--help"]},
+        help="Half-space subsurface scattering: compare path tracing and models of the BSSRDF.",
+    )  # fmt: skip
+    app.callback()(_options(typer))
+    for name, function in _OWN.items():
+        module = importlib.import_module(f"halfspace_sss.cli.{_FILES.get(name, name)}")
+        found = getattr(module, function)
+        app.command(name)(found if name in _LISTS else with_quiet(found))
+    _add_commands(app)
+    return app
+
+
+def _options(typer: Any) -> Any:
+    def show_version(wanted: bool) -> None:
+        if wanted:
+            import halfspace_sss
+
+            typer.echo(f"halfspace-sss {halfspace_sss.__version__}")
+            raise typer.Exit()
+
+    def options(version: bool = typer.Option(False, "--version", callback=show_version, is_eager=True)) -> None:
+        pass
+
+    options.__annotations__ = {"version": bool, "return": None}
+    return options
+
+
+def _add_commands(app: Any) -> None:
+    """The commands of other packages."""
+    from halfspace_sss.cli.shared import with_quiet
+    from halfspace_sss.extensions import COMMANDS, FAILURES, commands, warn_left_out
+
+    for name, function in commands():
         try:
-            return super().invoke(ctx)
-        except KeyboardInterrupt:
-            raise _end("interrupted; files that were being written are whole or absent", 130) from None
-        except ValueError as error:
-            raise _end(f"error: {error}", 2) from error
-        except BrokenPipeError:
-            raise  # the reader, `head` for instance, has what it wanted: typer ends in silence
-        except (BackendError, OSError) as error:
-            raise _end(f"error: {error}", 1) from error
+            _check_command(name, function)
+        except FAILURES as error:
+            warn_left_out(COMMANDS, name, error)
+        else:
+            app.command(name)(with_quiet(function))
 
 
-app = typer.Typer(
-    cls=_Group, no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
-    help="Half-space subsurface scattering: compare path tracing and models of the BSSRDF.",
-)  # fmt: skip
-
-
-def _show_version(wanted: bool) -> None:
-    if wanted:
-        typer.echo(f"halfspace-sss {halfspace_sss.__version__}")
-        raise typer.Exit()
-
-
-@app.callback()
-def _options(version: bool = typer.Option(False, "--version", callback=_show_version, is_eager=True)) -> None:
-    pass
-
-
-def _check_command(name: str, function: Callable) -> None:
+def _check_command(name: str, function: Any) -> None:
     """Raises, in whichever way typer does, if the function cannot be a command beside the others."""
+    import typer
+
     if name in _OWN:
         raise ValueError(f"name must be new, got {name!r}")
     alone = typer.Typer()
@@ -90,16 +105,23 @@ def _check_command(name: str, function: Callable) -> None:
     typer.main.get_command(alone)
 
 
-def _add_commands() -> None:
-    for name, function in _OWN.items():
-        app.command(name)(function)
-    for name, function in commands():
+def main() -> None:
+    """Run the command line; the entry point of `halfspace-sss`."""
+    with interrupts:
         try:
-            _check_command(name, function)
-        except FAILURES as error:
-            warn_left_out(COMMANDS, name, error)
-        else:
-            app.command(name)(function)
+            _app()()
+        except BaseException as end:
+            if interrupts.received is None:
+                raise
+            _leave(end)
 
 
-_add_commands()
+def _leave(end: BaseException) -> None:
+    """End at once: Mitsuba's and Dr.Jit's own ends are not made for the middle of work."""
+    if not interrupts.told:
+        from halfspace_sss.cli.endings import tell_interrupt
+
+        tell_interrupt(end)
+    for stream in (sys.stdout, sys.stderr):
+        stream.flush()
+    os._exit(interrupts.exit_code)

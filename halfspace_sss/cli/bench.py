@@ -12,7 +12,7 @@ import typer
 
 from halfspace_sss.checks import did_you_mean
 from halfspace_sss.cli.shared import Bar, console
-from halfspace_sss.provenance import check_folder, provenance, write_atomically
+from halfspace_sss.provenance import check_folder, provenance, write_together
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -71,8 +71,7 @@ def bench_command(
         notes.append("the models are not measured in torch, which is not installed")
     tables = _measured(parts, quick)
     content, memory = _content(tables, quick, notes)
-    for name, text in content.items():
-        write_atomically(out / name, text)
+    write_together({out / name: text for name, text in content.items()})
     screen = console()
     for part, rows in tables.items():
         screen.print(TITLES[part], _table(rows), sep="\n")
@@ -91,8 +90,9 @@ def _measured(parts: list[str], quick: bool) -> dict[str, list[dict]]:
             bar.show(done, total, part)
             for row in _rows(part, quick, tables):
                 tables[part].append(row)
-                done += SECONDS[part]
-                bar.show(done, total, part)
+                bar.show(done + SECONDS[part] * len(tables[part]), total, part)
+            done += SECONDS[part] * lengths[part]  # a model may have refused the medium
+            bar.show(done, total, part)
     return tables
 
 

@@ -8,7 +8,18 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from halfspace_sss.cli.shared import Albedo, Backend, Bar, Eta, MeanCosine, SigmaT, console, numbers, stated_medium
+from halfspace_sss.cli.shared import (
+    Albedo,
+    Backend,
+    Bar,
+    Eta,
+    MeanCosine,
+    SigmaT,
+    console,
+    numbers,
+    stated_medium,
+    whole,
+)
 from halfspace_sss.comparison.curve_set import TRACED, CurveSet
 from halfspace_sss.provenance import check_folder
 
@@ -38,8 +49,10 @@ def curves_command(
     orders: Annotated[
         str, typer.Option(help="multiple: reflectance at the orders of each model; total: with single.")
     ] = ("multiple"),
-    paths: Annotated[int | None, typer.Option(help="Walks for each theta_i.", show_default="from the medium")] = None,
-    seed: Annotated[int, typer.Option(help="Seed of the tracer.")] = 0,
+    paths: Annotated[
+        int | None, typer.Option(help="Walks for each theta_i.", parser=whole, show_default="from the medium")
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Seed of the tracer.", parser=whole)] = 0,
     backend: Backend = "llvm",
     out: Annotated[Path, typer.Option(help="Folder for the files; those of the same names are replaced.")] = Path(
         "curves"

@@ -11,7 +11,18 @@ import typer
 
 from halfspace_sss.backend import array_types
 from halfspace_sss.checks import check_choice
-from halfspace_sss.cli.shared import Bar, console, stated_medium
+from halfspace_sss.cli.shared import (
+    Albedo,
+    Bar,
+    Eta,
+    MeanCosine,
+    SigmaT,
+    by_channel,
+    check_channel,
+    console,
+    stated_medium,
+    whole,
+)  # fmt: skip
 from halfspace_sss.provenance import check_folder
 
 if TYPE_CHECKING:
@@ -22,6 +33,7 @@ if TYPE_CHECKING:
 __all__ = ["errors_command"]
 
 EVENTS = 2e7  # for each medium
+HIDDEN = 0.3  # of the noise: an error below it raised the spread by less than 5 %, which may be chance
 DEFINITION = (
     "error: sum |E_model - E_traced| / sum E_traced over unseen pairs of directions, E = ∫ S mu_i mu_o dA over "
     "blocks of {0} x {0} cells of 40 x 16 from r = 0.02 mfp on; noise of the reference taken out; orders of each model"
@@ -32,22 +44,25 @@ def errors_command(
     material: Annotated[
         list[str] | None, typer.Argument(help="Names of materials; see `halfspace-sss materials`.")
     ] = None,
+    channel: Annotated[str | None, typer.Option(help="Only these, as R,B.", show_default="all")] = None,
     registry: Annotated[bool, typer.Option("--registry", help="All registered materials, every channel.")] = False,
-    held_out: Annotated[int | None, typer.Option(help="This many random media over the range of `neural`.")] = None,
+    held_out: Annotated[
+        int | None, typer.Option(help="This many random media over the range of `neural`.", parser=whole)
+    ] = None,
     as_trained: Annotated[
         bool, typer.Option("--as-trained", help="Held-out media as for the training: a third of them with g near 1.")
     ] = False,
     truths: Annotated[
         bool, typer.Option("--truths", help="Reflectance against published and exact values instead.")
     ] = False,
-    sigma_t: Annotated[float | None, typer.Option(help="Extinction, 1/mm [0.241].")] = None,
-    albedo: Annotated[float | None, typer.Option(help="Single-scattering albedo [0.75].")] = None,
-    g: Annotated[float | None, typer.Option(help="Mean cosine of the phase function [0].")] = None,
-    eta: Annotated[float | None, typer.Option(help="Index inside over outside [1.3].")] = None,
-    model: Annotated[list[str] | None, typer.Option(help="A model; repeat for more [all].")] = None,
+    sigma_t: SigmaT = None,
+    albedo: Albedo = None,
+    g: MeanCosine = None,
+    eta: Eta = None,
+    model: Annotated[list[str] | None, typer.Option(help="A model; repeat for more.", show_default="all")] = None,
     events: Annotated[float, typer.Option(help="Scattering events of the reference for each medium.")] = EVENTS,
     block: Annotated[int, typer.Option(help="Cells put together for the comparison, in distance and azimuth.")] = 4,
-    seed: Annotated[int, typer.Option(help="Seed of media, directions and walks.")] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of media, directions and walks.", parser=whole)] = 0,
     backend: Annotated[str, typer.Option(help="llvm or cuda.")] = "llvm",
     out: Annotated[Path, typer.Option(help="Folder for the files; those of the same names are replaced.")] = Path(
         "errors"
@@ -60,7 +75,7 @@ def errors_command(
         _truths(material or registry or held_out is not None, model, out)
         return
     media = _media(
-        material or [],
+        (material or [], channel),
         registry,
         (held_out, as_trained),
         seed,
@@ -73,10 +88,10 @@ def errors_command(
     with Bar("errors") as bar:
 
         def show(what: str, done: int, total: int) -> None:
-            bar.show(done, 2 * total if what == "data" else total, what)
+            bar.show(round(1000 * ((what == "models") + done / total)), 2000, what)
 
         found = tables.references(list(media.values()), events * len(media), seed, block, show, backend)
-        table = tables.error_table(media, found, model or None)
+        table = tables.error_table(media, found, model or None, show)
     files = _write(out, table, tables.percentiles(table), {"events": events, "block": block, "seed": seed})
     _report(table, tables, len(media), block)
     for file in files:
@@ -100,7 +115,11 @@ def _truths(others: bool, names: list[str] | None, out: Path) -> None:
 
 
 def _media(
-    names: list[str], registry: bool, drawn: tuple[int | None, bool], seed: int, given: dict[str, float | None]
+    chosen: tuple[list[str], str | None],
+    registry: bool,
+    drawn: tuple[int | None, bool],
+    seed: int,
+    given: dict[str, float | None],
 ) -> dict[str, Medium]:
     """Scalar media by label."""
     from halfspace_sss import materials
@@ -108,7 +127,9 @@ def _media(
     from halfspace_sss.comparison.held_out import held_out_media
     from halfspace_sss.neural.symmetric import channels
 
+    names, channel = chosen
     stated = stated_medium(names, given)
+    check_channel(channel, names)
     held_out, as_trained = drawn
     if as_trained and held_out is None:
         raise ValueError("as_trained must come with held_out, got it alone")
@@ -120,6 +141,8 @@ def _media(
         return {f"a {float(m.albedo):.5g} g {float(m.g):.3g} eta {m.eta:.3g}": m for m in media}
     if stated is not None:
         return {"medium": stated}
+    if channel is not None:
+        return dict(by_channel(names, channel))
     found = [materials.load(name) for name in (materials.names() if registry else names or ["fig10"])]
     return {
         f"{m.name} {c}".strip(): one
@@ -161,13 +184,12 @@ def _check_accepted(names: Iterable[str], media: list[Medium]) -> None:
 
 
 def _write(out: Path, table: pandas.DataFrame, summary: pandas.DataFrame, how: dict[str, Any]) -> list[Path]:
-    from halfspace_sss.provenance import provenance, write_atomically
+    from halfspace_sss.provenance import provenance, write_together
 
     content = {"provenance": provenance(**how), "definition": DEFINITION.format(how["block"])}
     content["summary"] = json.loads(summary.to_json(orient="records"))
     files = {"errors.csv": table.to_csv(index=False, lineterminator="\n"), "errors.json": json.dumps(content, indent=1)}
-    for name, text in files.items():
-        write_atomically(out / name, text)
+    write_together({out / name: text for name, text in files.items()})
     return [out / name for name in files]
 
 
@@ -194,9 +216,14 @@ def _rich(table: pandas.DataFrame, title: str) -> Any:
     out = Table(title=title, box=SIMPLE_HEAD, pad_edge=False)
     for name in table.columns:
         out.add_column(str(name), justify="left" if table[name].dtype.kind == "O" else "right", overflow="fold")
-    for row in table.itertuples(index=False):
-        out.add_row(*(_cell(value) for value in row))
+    for row in table.to_dict("records"):
+        out.add_row(*(_error(row) if name == "error" and "noise" in row else _cell(row[name]) for name in table))
     return out
+
+
+def _error(row: dict[str, Any]) -> str:
+    """Of errors that noise hides, the noise as their bound."""
+    return f"< {_cell(row['noise'])}" if row["error"] < HIDDEN * row["noise"] else _cell(row["error"])
 
 
 def _cell(value: Any) -> str:

@@ -29,9 +29,14 @@ def _print_materials() -> None:
     table = Table("material", "set", "channels", "sigma_t [1/mm]", "albedo", "g", "eta", pad_edge=False)
     for (name, group), rows in materials.table().groupby(["material", "set"], sort=False):
         columns = [" ".join(f"{value:.4g}" for value in rows[column]) for column in ("sigma_t", "albedo")]
-        g, eta = (" ".join(dict.fromkeys(f"{value:.3g}" for value in rows[column])) for column in ("g", "eta"))
+        g, eta = (_once([f"{value:.3g}" for value in rows[column]]) for column in ("g", "eta"))
         table.add_row(name, group, " ".join(rows["channel"]), *columns, g, eta)
     console().print(table)
+
+
+def _once(values: list[str]) -> str:
+    """The values, or one if they are the same in all channels."""
+    return values[0] if len(set(values)) == 1 else " ".join(values)
 
 
 def _print_material(name: str) -> None:

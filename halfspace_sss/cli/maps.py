@@ -16,9 +16,12 @@ from halfspace_sss.cli.shared import (
     Eta,
     MeanCosine,
     SigmaT,
+    by_channel,
+    check_channel,
     console,
     numbers,
     stated_medium,
+    whole,
 )
 from halfspace_sss.provenance import check_folder
 
@@ -49,12 +52,12 @@ def maps_command(
         float | None, typer.Option(help="Mean cell error to stop at.", show_default="0.05, none with --paths")
     ] = None,
     paths: Annotated[
-        int | None, typer.Option(help="Walks for 16 maps: this number, or the most with --target-error.")
+        int | None, typer.Option(help="Walks for 16 maps: this number, or the most with --target-error.", parser=whole)
     ] = None,
     grid: Annotated[
         str, typer.Option(help="Numbers of angles of incidence, of observations, of cells in r, in azimuth.")
     ] = ("16,64,48,24"),
-    seed: Annotated[int, typer.Option(help="Seed of directions and walks.")] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of directions and walks.", parser=whole)] = 0,
     backend: Backend = "llvm",
     share: Annotated[str, typer.Option(help="k/n: of n processes that fill one folder, this is number k < n.")] = "0/1",
     out: Annotated[Path, typer.Option(help="Folder of the stores; what is there is continued.")] = Path("maps"),
@@ -80,19 +83,17 @@ def _media(
 ) -> dict[str, Medium]:
     """Media by the name of their store."""
     from halfspace_sss import Medium, materials
-    from halfspace_sss.materials.channels import one_channel
 
     stated = stated_medium(names, given)
     if name is not None and stated is None:
         raise ValueError(f"name must be left out unless coefficients are given, got {name!r}")
-    if channels is not None and not names:
-        raise ValueError(f"channel must be left out unless materials are named, got {channels!r}")
+    check_channel(channels, names)
     if not names:
         return {"fig10": Medium.from_albedo(**FIG10)} if stated is None else {name or "medium": stated}
     if channels is None:
         chosen = [(material.name, material.medium) for material in map(materials.load, names)]
     else:
-        chosen = [one_channel(material, channel.strip()) for material in names for channel in channels.split(",")]
+        chosen = by_channel(names, channels)
     media = {re.sub(r"[^\w.-]+", "_", title): medium for title, medium in chosen}
     if len(media) < len(chosen):
         raise ValueError(f"materials and channels must be different, got {', '.join(title for title, _ in chosen)}")

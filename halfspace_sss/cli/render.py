@@ -2,22 +2,30 @@
 
 from __future__ import annotations
 
+import math
+from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from halfspace_sss.backend import BackendError, prepare_llvm
-from halfspace_sss.cli.shared import Bar, console
-from halfspace_sss.provenance import check_folder
+from halfspace_sss.cli.shared import Bar, console, whole
+from halfspace_sss.extensions import renderer
+from halfspace_sss.provenance import check_folder, replace_together, write_atomically
 
 if TYPE_CHECKING:
+    import numpy as np
+
+    from halfspace_sss.extensions import Renderer
+    from halfspace_sss.rendering.scenes.picture import Picture
+    from halfspace_sss.rendering.scenes.reference import Limits
     from halfspace_sss.rendering.scenes.reference_store import Reference
 
 __all__ = ["render_command"]
 
-PASSES = 16  # that --spp is divided into, for the progress and the estimate of the error
-MOST_SPP_PER_PASS = 64
+SPP = 64
+ENDINGS = ("png", "html", "denoised.exr", "denoised.png")  # of what is drawn
 VARIANTS = ("llvm_ad_rgb", "llvm_ad_mono", "cuda_ad_rgb", "cuda_ad_mono")
 
 
@@ -29,46 +37,49 @@ def render_command(
     orders: Annotated[
         str | None, typer.Option(help="total, multiple or single.", show_default="as the scene says")
     ] = None,
-    spp: Annotated[int, typer.Option(help="Samples for each pixel.")] = 64,
-    target_error: Annotated[
-        float | None, typer.Option(help="Stop at this relative error of the image, instead of spp.")
+    spp: Annotated[
+        int | None, typer.Option(help="Samples for each pixel.", parser=whole, show_default="64, or what else ends it")
     ] = None,
-    seed: Annotated[int, typer.Option(help="Seed of the samples.")] = 0,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with the render of the same settings.")] = False,
+    target_error: Annotated[float | None, typer.Option(help="Stop at this relative error of the image.")] = None,
+    seconds: Annotated[float | None, typer.Option(help="Stop after this time of rendering.")] = None,
+    seed: Annotated[int, typer.Option(help="Seed of the samples.", parser=whole)] = 0,
+    sensor: Annotated[int, typer.Option(help="Number of the sensor.", parser=whole)] = 0,
+    define: Annotated[
+        list[str] | None,
+        typer.Option("--define", "-D", help="Value of $NAME in the scene; repeat for more.", metavar="NAME=VALUE"),
+    ] = None,
+    denoise: Annotated[bool, typer.Option("--denoise", help="An image without noise beside the other.")] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on with the unfinished or finished render of the same settings.")
+    ] = False,
     variant: Annotated[str, typer.Option(help="Variant of Mitsuba.")] = "llvm_ad_rgb",
     out: Annotated[Path, typer.Option(help="Folder for the files; those of the same names are replaced.")] = Path(
         "render"
     ),
 ) -> None:
-    """Render a scene: NAME_MODEL.exr with variance, and .png; orders, error, samples and time are printed."""
+    """Render a scene: NAME_MODEL.exr with variance, .png, and .html; error, samples and time are printed.
+
+    Until it is done, NAME_MODEL.unfinished.exr holds it, and the files of before stay.
+    """
+    _prepare(variant)
     from halfspace_sss.checks import check_count
-    from halfspace_sss.rendering.scenes import reference
+    from halfspace_sss.rendering.scenes.picture import Picture
+    from halfspace_sss.rendering.scenes.reference import Limits
+    from halfspace_sss.rendering.scenes.scene_files import load_scene
 
-    check_count("spp", spp, 1)
+    limits = Limits(SPP if (spp, target_error, seconds) == (None,) * 3 else spp, None, target_error, seconds)
     check_count("seed", seed, 0)
+    parameters, draw = _parameters(define or []), _renderer(denoise)
     check_folder(out)
-    loaded = _load(scene, model, orders, variant)
-    file = out / f"{scene.stem}_{model or 'scene'}.exr"
-    per_pass = min(max(1, -(-spp // PASSES)), MOST_SPP_PER_PASS)
-    passes = None if target_error else -(-spp // per_pass)
-    if not resume:
-        file.unlink(missing_ok=True)
-    with Bar("rendering") as bar:
-
-        def show(found: Reference) -> None:
-            if passes:
-                bar.show(found.passes, passes)
-            else:
-                share = min((target_error / found.relative_error) ** 2, 1.0) if found.passes > 1 else 0.0
-                bar.show(round(1000 * share), 1000, f"{found.spp} spp, error {found.relative_error:.2%}")
-
-        found = reference.render(
-            loaded, file, spp_per_pass=per_pass, seed=seed, passes=passes, target_error=target_error, progress=show
-        )
-    _report(found, file)
+    loaded = load_scene(scene, model, orders, parameters)
+    file = out / f"{scene.stem}_{model or 'scene'}{f'_sensor{sensor}' if sensor else ''}.exr"
+    found = _rendered(loaded, file, limits, {"seed": seed, "sensor": sensor}, resume)
+    picture = Picture(file.stem, _colours(found.mean), _numbers(found), _error(found), loaded, sensor, denoise)
+    _report(found, _publish(picture, file, draw))
 
 
-def _load(scene: Path, model: str | None, orders: str | None, variant: str) -> object:
+def _prepare(variant: str) -> None:
+    """Mitsuba with our plugins."""
     if variant not in VARIANTS:
         raise ValueError(f"variant must be one of {', '.join(VARIANTS)}, got {variant!r}")
     if variant.startswith("llvm"):
@@ -78,28 +89,94 @@ def _load(scene: Path, model: str | None, orders: str | None, variant: str) -> o
     except ImportError as error:
         raise BackendError('rendering needs Mitsuba 3: pip install "halfspace-sss[render]"') from error
     from halfspace_sss import rendering
-    from halfspace_sss.rendering.scenes.scene_files import load_scene
 
     try:
         mi.set_variant(variant)
     except ImportError as error:
         raise BackendError(f"variant {variant} does not run here: {error}") from error
     rendering.register()
-    return load_scene(scene, model, orders)
 
 
-def _report(found: Reference, file: Path) -> None:
-    import mitsuba as mi
-    import numpy as np
+def _parameters(texts: list[str]) -> dict[str, str]:
+    pairs = [text.partition("=") for text in texts]
+    for text, (name, equals, _) in zip(texts, pairs):
+        if not (name.isidentifier() and equals):
+            raise ValueError(f"define must be NAME=VALUE, got {text!r}")
+    return {name: value for name, _, value in pairs}
 
-    picture = file.with_suffix(".png")
-    temporary = picture.with_name(f".{picture.name}.tmp.png")
-    mi.util.write_bitmap(str(temporary), mi.TensorXf(found.mean.astype(np.float32)), write_async=False)
-    temporary.replace(picture)
+
+def _renderer(denoise: bool) -> Renderer | None:
+    """What draws the page and denoises, if it is there; BackendError before anything is rendered in vain."""
+    found = renderer("render")
+    if denoise and (found is None or find_spec("mitsuba_oidn") is None):
+        raise BackendError('denoising needs mitsuba-oidn and a page: pip install "halfspace-sss[figures]"')
+    return found
+
+
+def _unfinished(file: Path) -> Path:
+    return file.with_suffix(".unfinished.exr")
+
+
+def _rendered(scene: Any, file: Path, limits: Limits, which: dict[str, int], resume: bool) -> Reference:
+    """The render, in files of another name until it is done."""
+    from halfspace_sss.rendering.scenes import reference
+    from halfspace_sss.rendering.scenes.causes import first_cause
+
+    part, so_far = _unfinished(file), 0
+    start = file if resume and file.exists() and not part.exists() else resume
+    with Bar("rendering") as bar:
+
+        def show(found: Reference) -> None:
+            nonlocal so_far
+            so_far = found.spp
+            error = f", error {found.relative_error:.2%}" if math.isfinite(found.relative_error) else ""
+            bar.show(round(1000 * limits.share(found)), 1000, f"{found.spp} spp{error}")
+
+        try:
+            return reference.render(scene, part, resume=start, progress=show, **which, **vars(limits))
+        except RuntimeError as error:
+            raise BackendError(first_cause(error)) from error
+        except KeyboardInterrupt:
+            if not so_far:
+                raise
+            raise KeyboardInterrupt(f"{so_far} samples a pixel are kept for --resume in {part}") from None
+
+
+def _publish(picture: Picture, file: Path, draw: Renderer | None) -> list[Path]:
+    """Put the finished files in the place of those of before, all of one render at any moment; their paths."""
+    part = _unfinished(file)
+    drawn = {"png": picture.png(), **(draw(picture) if draw else {})}
+    for ending, data in drawn.items():
+        write_atomically(part.with_suffix(f".{ending}"), data)
+    endings = ["exr", "json", *drawn]
+    moves = {part.with_suffix(f".{ending}"): file.with_suffix(f".{ending}") for ending in endings}
+    replace_together(moves, [file.with_suffix(f".{ending}") for ending in ENDINGS if ending not in endings])
+    return [path for path in moves.values() if path.suffix != ".json"]
+
+
+def _colours(image: np.ndarray) -> np.ndarray:
+    return image[..., :3] if image.shape[2] >= 3 else image[..., :1].repeat(3, axis=2)
+
+
+def _numbers(found: Reference) -> dict[str, str]:
+    error = found.relative_error
+    told = f"{error:.2%}" if 0 < error < math.inf else "–"
+    return {"samples": str(found.spp), "time, s": f"{found.seconds:.3g}", "relative error": told}
+
+
+def _report(found: Reference, files: list[Path]) -> None:
     screen = console()
-    screen.print(
-        f"{found.spp} samples a pixel in {found.seconds:.1f} s; relative standard error of the image "
-        f"{found.relative_error:.2%}", highlight=False,
-    )  # fmt: skip
-    for path in (file, picture):
+    screen.print(f"{found.spp} samples a pixel in {found.seconds:.1f} s; {_error(found)}", highlight=False)
+    for path in files:
         screen.print(f"  {path}", highlight=False, markup=False, soft_wrap=True)
+
+
+def _error(found: Reference) -> str:
+    """What is known of the error of an image."""
+    if not found.mean[..., :3].any():
+        return "every pixel is black: no light reaches the camera"
+    if found.passes < 2:
+        return "one pass has no estimate of its error"
+    if found.relative_error == 0:
+        return "all passes are the same: the camera sees nothing that varies, such as the sky alone"
+    return f"relative standard error of the image {found.relative_error:.2%}"

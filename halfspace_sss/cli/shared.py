@@ -1,23 +1,26 @@
-"""What several commands share: reading numbers and media, a bar of progress, and a console for tables."""
+"""What several commands share: reading numbers and media, a bar of progress, a console for tables, and --quiet."""
 
 from __future__ import annotations
 
+import functools
+import inspect
+import math
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-if TYPE_CHECKING:
-    from rich.console import Console
+from halfspace_sss.cli.progress import Bar, console, set_quiet
 
+if TYPE_CHECKING:
     from halfspace_sss.physics.medium import Medium
 
 __all__ = [
-    "FIG10", "Albedo", "Backend", "Bar", "Eta", "MeanCosine", "SigmaT", "console", "numbers", "stated_medium",
+    "FIG10", "Albedo", "Backend", "Bar", "Eta", "MeanCosine", "SigmaT", "console", "numbers", "stated_medium", "whole",
+    "by_channel", "check_channel", "with_quiet",
 ]  # fmt: skip
 
-TABLE_WIDTH = 132  # where the output is no terminal
 FIG10 = {"sigma_t": 0.241, "albedo": 0.75, "g": 0.0, "eta": 1.3}
-MEMORY = 3600.0  # seconds; steps may take minutes, and the time left is estimated from several of them
 
 
 SigmaT = Annotated[float | None, typer.Option(help="Extinction, 1/mm.", show_default="0.241")]
@@ -35,6 +38,21 @@ def numbers(name: str, text: str) -> list[float]:
         raise ValueError(f"{name} must be numbers separated by commas, got {text!r}") from None
 
 
+def whole(text: str | int) -> int:
+    """A whole number as people write it, 1e6 too; the parser of an option, which gets its default as well."""
+    try:
+        return int(text)
+    except ValueError:
+        pass
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not value.is_integer():
+        raise typer.BadParameter(f"{text!r} is not a whole number.")
+    return int(value)
+
+
 def stated_medium(materials: list[str], given: dict[str, float | None]) -> Medium | None:
     """The medium of Fig. 10 with the coefficients that were given; None if none was.
 
@@ -50,43 +68,34 @@ def stated_medium(materials: list[str], given: dict[str, float | None]) -> Mediu
     return Medium.from_albedo(**{**FIG10, **stated}) if stated else None
 
 
-class Bar:
-    """Progress with the time left, on stderr; appears with the first step, so that refused input leaves no trace."""
+def by_channel(names: list[str], channels: str) -> list[tuple[str, Medium]]:
+    """A title and a scalar medium for each of the channels, as in "R,B", of each material."""
+    from halfspace_sss.materials.channels import one_channel
 
-    def __init__(self, title: str) -> None:
-        self._title = title
-        self._progress: Any = None
-
-    def __enter__(self) -> Bar:
-        return self
-
-    def show(self, done: int, total: int, text: str = "") -> None:
-        """Move the bar; `text` says what was just done."""
-        if self._progress is None:
-            self._start(done, total)
-        self._progress.update(self._task, completed=done, total=total, text=text)
-
-    def _start(self, done: int, total: int) -> None:
-        from rich.console import Console
-        from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-        from rich.table import Column
-
-        steps = (TextColumn(self._title), BarColumn(30), TextColumn("{task.percentage:.0f} %"))
-        times = (TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn())
-        text = TextColumn("{task.fields[text]}", markup=False, table_column=Column(ratio=1, no_wrap=True))
-        screen = Console(stderr=True)
-        self._progress = Progress(*steps, *times, text, console=screen, expand=True, speed_estimate_period=MEMORY)
-        self._progress.start()
-        self._task = self._progress.add_task("", total=total, completed=done, text="")
-
-    def __exit__(self, *_: object) -> None:
-        if self._progress is not None:
-            self._progress.stop()
+    return [one_channel(name, channel.strip()) for name in names for channel in channels.split(",")]
 
 
-def console() -> Console:
-    """A console that does not fold lines at 80 columns where the output is a file."""
-    from rich.console import Console
+def check_channel(channel: str | None, names: list[str]) -> None:
+    """ValueError if channels are chosen and no material is."""
+    if channel is not None and not names:
+        raise ValueError(f"channel must be left out unless materials are named, got {channel!r}")
 
-    found = Console()
-    return found if found.is_terminal else Console(width=TABLE_WIDTH)
+
+def with_quiet(command: Callable) -> Callable:
+    """The command with a further option, --quiet."""
+
+    @functools.wraps(command)
+    def silenced(*arguments: Any, quiet: bool = False, **options: Any) -> Any:
+        set_quiet(quiet)
+        try:
+            return command(*arguments, **options)
+        finally:
+            set_quiet(False)
+
+    found = inspect.signature(command, eval_str=True)
+    kind = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but warnings and errors.")]
+    option = inspect.Parameter("quiet", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=kind)
+    silenced.__signature__ = found.replace(parameters=[*found.parameters.values(), option])
+    silenced.__annotations__ = {**{p.name: p.annotation for p in found.parameters.values()}, "quiet": kind}
+    del silenced.__wrapped__  # of which the signature would be read
+    return silenced

@@ -8,7 +8,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from halfspace_sss.cli.shared import Bar, console, stated_medium
+from halfspace_sss.cli.shared import (
+    Albedo,
+    Bar,
+    Eta,
+    MeanCosine,
+    SigmaT,
+    by_channel,
+    check_channel,
+    console,
+    stated_medium,
+    whole,
+)
 
 if TYPE_CHECKING:
     from halfspace_sss.physics.medium import Medium
@@ -20,18 +31,23 @@ def train_command(
     material: Annotated[
         list[str] | None, typer.Argument(help="Names of materials; see `halfspace-sss materials`.")
     ] = None,
+    channel: Annotated[str | None, typer.Option(help="Only these, as R,B.", show_default="all")] = None,
     universal: Annotated[bool, typer.Option("--universal", help="Train the network for all media instead.")] = False,
     model: Annotated[str, typer.Option(help="neural_material or neural_paper.")] = "neural_material",
-    sigma_t: Annotated[float | None, typer.Option(help="Extinction, 1/mm [0.241].")] = None,
-    albedo: Annotated[float | None, typer.Option(help="Single-scattering albedo [0.75].")] = None,
-    g: Annotated[float | None, typer.Option(help="Mean cosine of the phase function [0].")] = None,
-    eta: Annotated[float | None, typer.Option(help="Index inside over outside [1.3].")] = None,
+    sigma_t: SigmaT = None,
+    albedo: Albedo = None,
+    g: MeanCosine = None,
+    eta: Eta = None,
     fast: Annotated[bool, typer.Option("--fast", help="A quarter of the time, about twice the error.")] = False,
-    steps: Annotated[int | None, typer.Option(help="Steps of the optimiser [from the recipe].")] = None,
+    steps: Annotated[
+        int | None, typer.Option(help="Steps of the optimiser.", parser=whole, show_default="from the recipe")
+    ] = None,
     target_error: Annotated[float | None, typer.Option(help="Stop early at this validation error.")] = None,
-    seed: Annotated[int, typer.Option(help="Seed of maps, batches and first numbers.")] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of maps, batches and first numbers.", parser=whole)] = 0,
     backend: Annotated[str, typer.Option(help="llvm or cuda, for the maps.")] = "llvm",
-    out: Annotated[Path | None, typer.Option(help="Folder for the weights [where models find them].")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for the weights.", show_default="where models find them")
+    ] = None,
     work: Annotated[
         Path | None, typer.Option(help="Folder for unfinished work, which an interrupted run continues.")
     ] = None,
@@ -41,11 +57,18 @@ def train_command(
         raise ValueError("training needs torch: `pip install halfspace-sss[train]`")
     given = {"sigma_t": sigma_t, "albedo": albedo, "g": g, "eta": eta}
     if universal:
-        others = {"material": material, **given, "fast": fast, "target_error": target_error, "work": work}
+        others = {
+            "material": material,
+            "channel": channel,
+            **given,
+            "fast": fast,
+            "target_error": target_error,
+            "work": work,
+        }
         _check_alone({**others, "model": None if model == "neural_material" else model})
         _universal(out or Path("universal"), seed, steps, backend)
         return
-    media = _media(material or [], given)
+    media = _media(material or [], channel, given)
     recipe = _recipe(fast, steps)
     rows = []
     with Bar("training") as bar:
@@ -62,9 +85,12 @@ def _check_alone(others: dict[str, Any]) -> None:
             raise ValueError(f"{name} must be left out with --universal, got {value!r}")
 
 
-def _media(names: list[str], given: dict[str, float | None]) -> dict[str, Medium]:
+def _media(names: list[str], channel: str | None, given: dict[str, float | None]) -> dict[str, Medium]:
     from halfspace_sss import materials
 
+    check_channel(channel, names)
+    if channel is not None:
+        return dict(by_channel(names, channel))
     stated = stated_medium(names, given)
     if not names:
         return {"fig10": materials.load("fig10").medium} if stated is None else {"medium": stated}

@@ -13,10 +13,11 @@ from typing import Annotated, Any
 
 import typer
 
-from halfspace_sss.cli.shared import Bar, console
+from halfspace_sss.checks import check_count
+from halfspace_sss.cli.shared import Bar, console, whole
 from halfspace_sss.comparison.truths import MEASURES, Truth
 from halfspace_sss.comparison.validate import Z_LIMIT, Comparison, Validation, validate
-from halfspace_sss.provenance import provenance, write_atomically
+from halfspace_sss.provenance import check_folder, provenance, write_together
 
 __all__ = ["row_filter", "summary", "validate_command", "write_results"]
 
@@ -85,7 +86,6 @@ def write_results(result: Validation, folder: Path) -> None:
     writer = csv.DictWriter(text, fieldnames=list(records[0]), lineterminator="\n")
     writer.writeheader()
     writer.writerows(records)
-    write_atomically(folder / "validate.csv", text.getvalue())
     content = {
         "provenance": provenance(seed=result.seed, quick=result.quick, z_limit=Z_LIMIT),
         "seconds": result.seconds,
@@ -94,7 +94,8 @@ def write_results(result: Validation, folder: Path) -> None:
         "not_covered": [vars(n) for n in result.not_covered],
         "rows": records,
     }
-    write_atomically(folder / "validate.json", json.dumps(_strict(content), indent=1, allow_nan=False) + "\n")
+    about = json.dumps(_strict(content), indent=1, allow_nan=False) + "\n"
+    write_together({folder / "validate.csv": text.getvalue(), folder / "validate.json": about})
 
 
 def _strict(value: Any) -> Any:
@@ -108,11 +109,14 @@ def _strict(value: Any) -> Any:
 
 def validate_command(
     out: Annotated[Path | None, typer.Option(help="Folder for validate.csv and validate.json.")] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of all runs.")] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of all runs.", parser=whole)] = 0,
     quick: Annotated[bool, typer.Option(help="Ten times looser standard errors.")] = False,
     rows: Annotated[str | None, typer.Option(help="Only these ids, measures (R_d, BRDF, ...) or kinds.")] = None,
 ) -> None:
     """Trace every published, third-party or exact half-space number of the packaged table and compare."""
+    check_count("seed", seed, 0)
+    if out is not None:
+        check_folder(out)
     with Bar("tracing") as bar:
         result = validate(row_filter(rows), seed, quick, progress=bar.show)
     if out is not None:

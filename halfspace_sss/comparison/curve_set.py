@@ -13,7 +13,7 @@ import numpy as np
 
 from halfspace_sss.extensions import FAILURES, FIGURES, renderer, warn_left_out
 from halfspace_sss.physics.medium import Medium
-from halfspace_sss.provenance import check_folder, provenance, write_atomically
+from halfspace_sss.provenance import check_folder, provenance, write_together
 
 if TYPE_CHECKING:
     import pandas
@@ -190,8 +190,8 @@ class CurveSet:
     def save(self, folder: str | Path, name: str = "curves") -> list[Path]:
         """Write NAME.csv (every series), NAME_errors.csv, NAME.json (provenance) and the figure as NAME.pdf and .png.
 
-        Every file is whole or absent; files of those names are replaced. Without matplotlib there is no figure, and if
-        it cannot be drawn a warning says why; the numbers are written before.
+        Files of those names are replaced, all or none. Without matplotlib there is no figure, and if it cannot be drawn
+        a warning says why; the numbers are written all the same.
 
         Returns:
             The paths that were written.
@@ -204,15 +204,12 @@ class CurveSet:
             f"{name}.csv": self.to_dataframe().to_csv(index=False, lineterminator="\n"),
             f"{name}_errors.csv": self.errors().to_csv(index=False, lineterminator="\n"),
         }
-        for file, data in content.items():
-            write_atomically(folder / file, data)
-        self._write_about(folder / f"{name}.json", sorted(content))  # once before the drawing, which may fail or hang
-        figures = {f"{name}.{ending}": data for ending, data in self._figures().items()}
-        for file, data in figures.items():
-            write_atomically(folder / file, data)
-        if figures:
-            self._write_about(folder / f"{name}.json", sorted(content | figures))
-        return [folder / file for file in (*content, *figures, f"{name}.json")]
+        try:
+            figures = self._figures()
+        except BaseException:  # an interrupt while it was drawn
+            self._write(folder, name, content)
+            raise
+        return self._write(folder, name, content | {f"{name}.{ending}": data for ending, data in figures.items()})
 
     def _figures(self) -> dict[str, bytes]:
         """The figure by file ending; none, with a warning, if it cannot be drawn."""
@@ -223,10 +220,12 @@ class CurveSet:
             warn_left_out(FIGURES, "curves", error)
             return {}
 
-    def _write_about(self, path: Path, files: list[str]) -> None:
+    def _write(self, folder: Path, name: str, content: dict[str, Any]) -> list[Path]:
         about = {**provenance(**self.parameters()), "units": UNITS, "notes": list(self.notes)}
         about |= {"seconds_tracing": self.seconds, "evaluations_per_s": dict(self.evaluations_per_s)}
-        write_atomically(path, json.dumps({**about, "files": files}, indent=1) + "\n")
+        content = {**content, f"{name}.json": json.dumps({**about, "files": sorted(content)}, indent=1) + "\n"}
+        write_together({folder / file: data for file, data in content.items()})
+        return [folder / file for file in content]
 
 
 def range_edges(r_edges: np.ndarray) -> list[float]:

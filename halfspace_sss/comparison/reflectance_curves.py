@@ -16,6 +16,7 @@ from halfspace_sss.comparison.curve_set import TRACED, Curve, CurveSet
 from halfspace_sss.comparison.model_truths import sampled_reflectance
 from halfspace_sss.interface.model import BSSRDF, bssrdf
 from halfspace_sss.interface.model import models as all_models
+from halfspace_sss.materials import Material
 from halfspace_sss.materials.channels import one_channel
 from halfspace_sss.physics import single_scattering
 from halfspace_sss.physics.fresnel import mu_internal
@@ -84,7 +85,7 @@ class _Line:
 
 
 def curves(
-    medium: Medium | str = "fig10",
+    medium: Medium | Material | str = "fig10",
     *,
     channel: int | str | None = None,
     theta_i_deg: Sequence[float] = FIG10_THETA_I,
@@ -108,7 +109,7 @@ def curves(
     line (and its mirror image, where that is the same). Without arguments: the setting of Fig. 10.
 
     Args:
-        medium: a Medium, or the name of a material.
+        medium: a Medium, a Material, or the name of one.
         channel: which channel of a coloured medium, number or name; the first by default.
         theta_i_deg: angles of incidence outside, degrees, [0, 90).
         theta_o_deg, delta_phi_deg: angle of observation outside, [0, 90), and azimuth of w_o from the forward direction

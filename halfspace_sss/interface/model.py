@@ -17,7 +17,7 @@ from halfspace_sss.interface.query import Query
 from halfspace_sss.interface.radial import RadialSampler
 from halfspace_sss.once import once
 from halfspace_sss.physics.fresnel import F_t
-from halfspace_sss.physics.medium import Medium
+from halfspace_sss.physics.medium import Medium, medium_of
 
 __all__ = ["BSSRDF", "DirectionSample", "PositionSample", "bssrdf", "model_class", "models", "register_model"]
 
@@ -241,12 +241,12 @@ def models() -> tuple[str, ...]:
 
 
 def bssrdf(name: str, medium: Medium) -> BSSRDF:
-    """The model called `name` for a medium.
+    """The model called `name` for a medium, or for that of a material.
 
     Raises:
         ValueError: no such model (the nearest name is given), or the model refuses the medium.
     """
-    return model_class(name)(medium)
+    return model_class(name)(medium_of(medium))
 
 
 def model_class(name: str) -> type[BSSRDF]:

@@ -19,7 +19,7 @@ from halfspace_sss.maps.grid import MapGrid, cell_edges, map_directions
 from halfspace_sss.maps.map_tracing import MapUnit, UnitResult, trace_unit
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.progress import ProgressText
-from halfspace_sss.provenance import provenance
+from halfspace_sss.provenance import naming, provenance
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -169,15 +169,17 @@ def _create(path: Path, medium: Medium, grid: MapGrid, seed: int, asked: dict[st
     dataset.attrs = {"halfspace_sss_maps": json.dumps(asked, sort_keys=True), "provenance": json.dumps(provenance())}
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     shutil.rmtree(temporary, ignore_errors=True)
-    path.parent.mkdir(parents=True, exist_ok=True)
     chunks = {name: (1, 1, *dataset[name].shape[2:]) for name in dataset.data_vars}
-    dataset.to_zarr(temporary, mode="w", zarr_format=2, encoding={k: {"chunks": v} for k, v in chunks.items()})
     try:
-        os.replace(temporary, path)
+        with naming(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            dataset.to_zarr(temporary, mode="w", zarr_format=2, encoding={k: {"chunks": v} for k, v in chunks.items()})
+            os.replace(temporary, path)
     except OSError:
-        shutil.rmtree(temporary, ignore_errors=True)
         if not path.exists():  # else another process, with another share, was first
             raise
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def _open(path: Path) -> xr.Dataset:
@@ -233,9 +235,11 @@ def _write(path: Path, channel: int, theta: int, result: UnitResult) -> None:
     for name, kind in (("n_paths", np.uint64), ("n_events", np.uint64), ("mean_cell_error", float), ("seconds", float)):
         data[name] = (dims[:2], np.full((1, 1), getattr(result, name), kind))
     region = {"channel": slice(channel, channel + 1), "theta": slice(theta, theta + 1)}
-    xr.Dataset(data).to_zarr(path, region=region, mode="r+")
+    with naming(path):
+        xr.Dataset(data).to_zarr(path, region=region, mode="r+")
     checksum = np.full((1, 1), _checksum(result.S, result.variance), np.uint64)
-    xr.Dataset({"checksum": (dims[:2], checksum)}).to_zarr(path, region=region, mode="r+")
+    with naming(path):
+        xr.Dataset({"checksum": (dims[:2], checksum)}).to_zarr(path, region=region, mode="r+")
 
 
 def load_maps(path: str | os.PathLike) -> xr.Dataset:

@@ -8,11 +8,11 @@ from halfspace_sss.physics.medium import Medium
 __all__ = ["one_channel"]
 
 
-def one_channel(medium: Medium | str, channel: int | str | None) -> tuple[str, Medium]:
+def one_channel(medium: Medium | materials.Material | str, channel: int | str | None) -> tuple[str, Medium]:
     """A title and the scalar medium of one channel.
 
     Args:
-        medium: a Medium, or the name of a material.
+        medium: a Medium, a Material, or the name of one.
         channel: name or number; None for the first.
 
     Raises:
@@ -21,10 +21,11 @@ def one_channel(medium: Medium | str, channel: int | str | None) -> tuple[str, M
     names: tuple[str, ...] | None = None
     title = ""
     if isinstance(medium, str):
-        material = materials.load(medium)
-        title, medium, names = material.name, material.medium, material.channels
+        medium = materials.load(medium)
+    if isinstance(medium, materials.Material):
+        title, medium, names = medium.name, medium.medium, medium.channels
     if not isinstance(medium, Medium):
-        raise ValueError(f"medium must be a Medium or the name of a material, got {medium!r}")
+        raise ValueError(f"medium must be a Medium, a Material or the name of one, got {medium!r}")
     if medium.n_channels is None:
         if channel is not None and str(channel) != "0":
             raise ValueError(f"channel must be left out for a medium with one channel, got {channel!r}")

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from halfspace_sss.checks import check_interval
-from halfspace_sss.provenance import read_bytes, read_text, write_atomically
+from halfspace_sss.provenance import read_bytes, read_text, write_together
 
 __all__ = ["FORMAT", "load_weights", "record_count", "record_number", "save_weights", "to_json"]
 
@@ -58,7 +58,7 @@ def record_number(path: Path, record: Mapping[str, Any], key: str, low: float, h
 
 
 def save_weights(path: str | os.PathLike, kind: str, arrays: Mapping[str, np.ndarray], record: dict[str, Any]) -> Path:
-    """Write `path` (.safetensors) and its record (.json); both whole or absent, the record last.
+    """Write `path` (.safetensors) and its record (.json); together or not at all.
 
     Args:
         kind: which network it is, e.g. "neural_material".
@@ -79,8 +79,7 @@ def save_weights(path: str | os.PathLike, kind: str, arrays: Mapping[str, np.nda
     shapes = {name: list(array.shape) for name, array in arrays.items()}
     head = {"format": FORMAT, "kind": kind, "sha256": hashlib.sha256(data).hexdigest(), "shapes": shapes}
     text = to_json(head | record | head)  # the head of a record that was loaded is of other weights
-    write_atomically(path, data)
-    write_atomically(_record_path(path), text)
+    write_together({path: data, _record_path(path): text})
     return path
 
 

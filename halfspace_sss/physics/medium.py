@@ -10,7 +10,7 @@ import numpy as np
 
 from halfspace_sss.physics.reflectance import DIFFUSE, albedo_of_reflectance, half_space_reflectance
 
-__all__ = ["Medium", "check_ratios", "check_scalar_medium"]
+__all__ = ["Medium", "check_ratios", "check_scalar_medium", "medium_of"]
 
 
 def _check(name: str, value: np.ndarray, ok: np.ndarray, bound: str) -> None:
@@ -227,3 +227,8 @@ def check_scalar_medium(medium: Any) -> None:
         raise ValueError(f"medium must be a Medium, got {type(medium).__name__}")
     if medium.n_channels is not None:
         raise ValueError(f"medium must have one channel (take medium.channel(k)), got {medium.n_channels} channels")
+
+
+def medium_of(found: Any) -> Any:
+    """The medium of a material; anything else as it is."""
+    return getattr(found, "medium", found)

@@ -193,7 +193,7 @@ def test_bright_media_get_fewer_walks_by_default() -> None:
         ({"medium": "marbel"}, "did you mean 'marble'"),
         ({"medium": "marble", "channel": "X"}, "channel must be one of R, G, B"),
         ({"medium": FIG10, "channel": 1}, "channel must be left out"),
-        ({"medium": 3}, "medium must be a Medium or the name of a material, got 3"),
+        ({"medium": 3}, "medium must be a Medium, a Material or the name of one, got 3"),
     ],
 )
 def test_bad_input_is_refused_with_name_bound_and_value(options: dict[str, Any], message: str) -> None:

@@ -219,7 +219,7 @@ def test_the_command_renders_a_file_and_refuses_a_wrong_model(tmp_path):
     run = [*START, "render", str(file), "--spp", "4", "--out", str(tmp_path / "out")]
     done = subprocess.run(run, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert sorted(p.suffix for p in (tmp_path / "out").iterdir()) == [".exr", ".json", ".png"]
+    assert {".exr", ".json", ".png"} <= {p.suffix for p in (tmp_path / "out").iterdir()}
     wrong = subprocess.run([*run[:-1], str(tmp_path / "none"), "--model", "neurl"], capture_output=True, text=True)
     assert wrong.returncode == 2 and "did you mean 'neural'" in wrong.stderr
     assert not (tmp_path / "none").exists()

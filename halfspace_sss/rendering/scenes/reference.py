@@ -21,6 +21,7 @@ import numpy as np
 
 from halfspace_sss.checks import check_count
 from halfspace_sss.provenance import check_folder, provenance
+from halfspace_sss.rendering.scenes.causes import first_cause
 from halfspace_sss.rendering.scenes.identity import scene_hash, words
 from halfspace_sss.rendering.scenes.reference_store import Reference, load, save
 
@@ -28,6 +29,7 @@ __all__ = ["Reference", "load", "render"]
 
 FEWEST_PASSES = 8  # before the spread of the passes is trusted to stop a run
 SHARE = 4  # a growing pass has at most a quarter of the samples so far: enough passes for their spread, few launches
+MOST_PIXELS = 2**26  # 8192 x 8192: the numbers of the pixels alone take some 10 GB
 LARGEST_PASS = 64  # samples per pixel: an interrupt waits for one pass
 Progress = Callable[[Reference], None]
 
@@ -128,6 +130,15 @@ class Limits:
         certain = self.target_error is not None and trusted and found.relative_error <= self.target_error
         return certain or any(limit is not None and value >= limit for limit, value in pairs)
 
+    def share(self, found: Reference) -> float:
+        """Of the work that is done, 0 to 1."""
+        pairs = ((found.spp, self.spp), (found.passes, self.passes), (found.seconds, self.seconds))
+        shares = [value / limit for value, limit in pairs if limit is not None]
+        if self.target_error is not None and found.passes > 1:
+            error = found.relative_error
+            shares.append((self.target_error / error) ** 2 if error > self.target_error else 1.0)
+        return min(max(shares, default=0.0), 1.0)
+
 
 def _pass_spp(found: Reference | None, fixed: int | None, most: int | None) -> int:
     """Samples per pixel of the next pass; a power of two where it grows, for Mitsuba compiles others anew."""
@@ -165,25 +176,32 @@ def _load(scene: Any, integrator: dict | None) -> tuple[Any, Any]:
     """The scene and its integrator as Mitsuba objects."""
     import mitsuba as mi
 
-    if isinstance(scene, dict):
-        scene = mi.load_dict(scene, parallel=False)
-    elif isinstance(scene, (str, os.PathLike)):
-        if not Path(scene).is_file():
-            raise ValueError(f"scene must be a dict, a Mitsuba scene or a file, got {os.fspath(scene)!r}")
-        scene = mi.load_file(os.fspath(scene), parallel=False)
-    integrator = mi.load_dict(integrator) if integrator is not None else scene.integrator()
+    if isinstance(scene, (str, os.PathLike)) and not Path(scene).is_file():
+        raise ValueError(f"scene must be a dict, a Mitsuba scene or a file, got {os.fspath(scene)!r}")
+    try:
+        if isinstance(scene, dict):
+            scene = mi.load_dict(scene, parallel=False)
+        elif isinstance(scene, (str, os.PathLike)):
+            scene = mi.load_file(os.fspath(scene), parallel=False)
+        integrator = mi.load_dict(integrator) if integrator is not None else scene.integrator()
+    except RuntimeError as error:
+        raise ValueError(first_cause(error)) from error
     if integrator is None:
         raise ValueError("integrator must be given, for the scene has none")
     return scene, integrator
 
 
 def _check_sensor(scene: Any, sensor: int) -> None:
+    """ValueError unless there is such a sensor, with a film that has pixels and fits into memory."""
     n = len(scene.sensors())
     if n == 0:
         raise ValueError("the scene must have a sensor, got none")
     check_count("sensor", sensor, 0)
     if sensor >= n:
         raise ValueError(f"sensor must be below {n}, the number of sensors of the scene, got {sensor}")
+    width, height = (int(size) for size in scene.sensors()[sensor].film().crop_size())
+    if not 0 < width * height <= MOST_PIXELS:
+        raise ValueError(f"a film must have 1 to {MOST_PIXELS} pixels, got {width} x {height}")
 
 
 def _about(scene: Any, integrator: Any, sensor: int, seed: int) -> dict[str, Any]:

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import difflib
+import warnings
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from halfspace_sss.interface.model import models
+from halfspace_sss.rendering.scenes.causes import first_cause
+from halfspace_sss.rendering.surface.translucent import ORDERS
 
 __all__ = ["PATH_TRACED", "load_scene"]
 
@@ -14,23 +19,34 @@ _INTEGRATORS = {False: "bssrdf", True: "translucent_walk"}
 _KEPT = ("mm_per_unit", "max_depth", "rr_depth", "hide_emitters")  # what both integrators understand
 
 
-def load_scene(scene: dict | str | Path, model: str | None = None, orders: str | None = None) -> Any:
+def load_scene(
+    scene: dict | str | Path,
+    model: str | None = None,
+    orders: str | None = None,
+    parameters: Mapping[str, str] | None = None,
+) -> Any:
     """A Mitsuba scene with translucent objects.
+
+    Where model or orders are asked for and the integrator of the scene shows no light from inside, ours takes its
+    place, with its mm_per_unit, max_depth, rr_depth and hide_emitters; a warning says so. A scene without integrator
+    gets ours.
 
     Args:
         scene: a dict as for `mitsuba.load_dict`, or the path of an XML file.
         model: for all translucent objects, instead of what the scene says: the name of a model, or "path_traced",
             which walks through the objects instead.
         orders: of all translucent objects, instead of what the scene says.
+        parameters: values of the parameters $name of an XML file.
 
     Raises:
-        ValueError: no such file, model or orders, the file is no scene, it has no translucent object, or the integrator
-            refuses it.
+        ValueError: no such file, parameter, model or orders, the file is no scene, a plugin refuses what it is given,
+            there is no translucent object, or the integrator refuses the scene.
     """
     import mitsuba as mi
 
-    _check(model)
-    state, config = _parsed(scene)
+    _check("model", model, (*models(), PATH_TRACED))
+    _check("orders", orders, ORDERS)
+    state, config = _parsed(scene, parameters or {})
     surfaces = [node.props for node in state.nodes if node.props.plugin_name() == "translucent"]
     if not surfaces:
         raise ValueError("the scene must have an object with a translucent BSDF, got none")
@@ -39,43 +55,68 @@ def load_scene(scene: dict | str | Path, model: str | None = None, orders: str |
             props["model"] = model
         if orders:
             props["orders"] = orders
-    if model:
-        for node in state.nodes:
-            if node.props.plugin_name() in _INTEGRATORS.values():
-                _set_integrator(node.props, _INTEGRATORS[model == PATH_TRACED])
-    loaded = mi.parser.instantiate(config, state)
+    _choose_integrator(state, model, bool(model or orders))
+    try:
+        loaded = mi.parser.instantiate(config, state)
+    except RuntimeError as error:
+        raise ValueError(first_cause(error)) from error
     integrator = loaded.integrator()
     if hasattr(integrator, "prepare"):
         integrator.prepare(loaded)  # here, because Mitsuba wraps what is refused while it renders
+    elif not any(hasattr(shape.bsdf(), "inside") for shape in loaded.shapes()):
+        raise ValueError("the scene must have an object with a translucent BSDF, got none")
     return loaded
 
 
-def _check(model: str | None) -> None:
-    import difflib
-
-    known = (*models(), PATH_TRACED)
-    if model is not None and model not in known:
-        close = difflib.get_close_matches(model, known, n=1)
+def _check(name: str, value: str | None, known: tuple[str, ...]) -> None:
+    if value is not None and value not in known:
+        close = difflib.get_close_matches(value, known, n=1)
         hint = f"; did you mean {close[0]!r}?" if close else ""
-        raise ValueError(f"model must be one of {', '.join(known)}, got {model!r}{hint}")
+        raise ValueError(f"{name} must be one of {', '.join(known)}, got {value!r}{hint}")
 
 
-def _parsed(scene: dict | str | Path) -> tuple[Any, Any]:
+def _parsed(scene: dict | str | Path, parameters: Mapping[str, str]) -> tuple[Any, Any]:
     import mitsuba as mi
 
     config = mi.parser.ParserConfig(mi.variant())
     config.parallel = False  # objects then have the same numbers each time, and kernels are found in Dr.Jit's cache
-    if isinstance(scene, dict):
-        state = mi.parser.parse_dict(config, scene)
-    else:
-        if not Path(scene).is_file():
-            raise ValueError(f"scene must be an XML file, got {str(scene)!r}, which is none")
-        try:
-            state = mi.parser.parse_file(config, str(scene))
-        except RuntimeError as error:
-            raise ValueError(f"scene {str(scene)!r} cannot be read: {error}") from error
-    mi.parser.transform_all(config, state)
+    if not isinstance(scene, dict) and not Path(scene).is_file():
+        raise ValueError(f"scene must be an XML file, got {str(scene)!r}, which is none")
+    try:
+        if isinstance(scene, dict):
+            state = mi.parser.parse_dict(config, scene)
+        else:
+            state = mi.parser.parse_file(config, str(scene), **parameters)
+        mi.parser.transform_all(config, state)
+    except RuntimeError as error:
+        name = "scene" if isinstance(scene, dict) else f"scene {str(scene)!r}"
+        raise ValueError(f"{name} cannot be read: {first_cause(error)}") from error
     return state, config
+
+
+def _choose_integrator(state: Any, model: str | None, asked: bool) -> None:
+    """Make the integrator fit what is asked for."""
+    import mitsuba as mi
+
+    wanted = _INTEGRATORS[model == PATH_TRACED]
+    ours = [node.props for node in state.nodes if node.props.plugin_name() in _INTEGRATORS.values()]
+    for props in ours if model else ():
+        _set_integrator(props, wanted)
+    if ours:
+        return
+    others = [node.props for node in state.nodes if node.type == mi.ObjectType.Integrator]
+    if not others:
+        state.nodes[0].props["integrator"] = mi.load_dict({"type": wanted})
+    elif asked:
+        name = others[0].plugin_name()
+        warnings.warn(f"the integrator {name!r} of the scene is replaced by {wanted!r}", stacklevel=3)
+        _set_integrator(others[0], wanted)
+    else:
+        warnings.warn(
+            f"the integrator {others[0].plugin_name()!r} of the scene shows no light from inside translucent objects; "
+            "'bssrdf' and 'translucent_walk' do, which a model that is asked for brings along",
+            stacklevel=3,
+        )
 
 
 def _set_integrator(props: Any, plugin: str) -> None:
@@ -84,4 +125,4 @@ def _set_integrator(props: Any, plugin: str) -> None:
     props.set_plugin_name(plugin)
     for key in list(props.keys()):
         if key not in _KEPT:
-            props.remove_property(key)
+            del props[key]

@@ -112,7 +112,7 @@ def survey(shape: Any) -> Object:
     sheet = 1 - MAJORITY < share < MAJORITY and not votes.agree()
     if odd > 0 or sheet:
         warnings.warn(
-            f"object {name!r} is not closed: {100 * odd:.2g} % of the rays that enter it do not leave it again; "
+            f"object {name!r} is not closed: {100 * odd:.3g} % of the rays that enter it do not leave it again; "
             "light that enters or leaves at the gap is lost",
             stacklevel=2,
         )

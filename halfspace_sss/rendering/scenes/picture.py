@@ -1,0 +1,54 @@
+"""A finished render as what people look at."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+__all__ = ["Picture"]
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """What is drawn of a render, here and by the entry point "render" of `halfspace_sss.figures`.
+
+    Args:
+        title: name of the scene and the model.
+        image: linear radiance (H, W, 3).
+        numbers: name -> what is known of it.
+        caption: a sentence.
+        scene, sensor: Mitsuba scene and number of the sensor, to render guides for a denoiser.
+        denoise: whether an image without noise is asked for.
+    """
+
+    title: str
+    image: np.ndarray
+    numbers: Mapping[str, str]
+    caption: str
+    scene: Any
+    sensor: int
+    denoise: bool
+
+    def png(self, image: np.ndarray | None = None) -> bytes:
+        """The image as a display shows it."""
+        import mitsuba as mi
+
+        shown = self.image if image is None else image
+        return _written(mi.util.convert_to_bitmap(mi.TensorXf(shown.astype(np.float32))), mi.Bitmap.FileFormat.PNG)
+
+    def exr(self, image: np.ndarray) -> bytes:
+        """An image as it is."""
+        import mitsuba as mi
+
+        return _written(mi.Bitmap(np.ascontiguousarray(image, dtype=np.float32)), mi.Bitmap.FileFormat.OpenEXR)
+
+
+def _written(bitmap: Any, kind: Any) -> bytes:
+    import mitsuba as mi
+
+    stream = mi.MemoryStream()
+    bitmap.write(stream, kind)
+    return bytes(stream.raw_buffer())

@@ -1,0 +1,137 @@
+"""Ctrl-C where it is hard to hear: wrapped, swallowed, in an import, in a kernel."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.skipif(os.name == "nt", reason="POSIX signals")
+
+START = """
+import sys, time
+from halfspace_sss import materials
+from halfspace_sss.cli import app as cli
+def table():
+{body}
+materials.table = table
+sys.argv = ["halfspace-sss", "materials"]
+cli.main()
+"""
+
+
+def _started(body: str, folder: Path) -> subprocess.Popen:
+    """A command that runs the body, from the line that it is ready on."""
+    code = START.format(body="".join(f"    {line}\n" for line in body.splitlines()))
+    run = [sys.executable, "-c", code]
+    process = subprocess.Popen(run, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert process.stdout.readline() == "ready\n"
+    return process
+
+
+def _interrupted(body: str, folder: Path) -> tuple[int, str]:
+    process = _started(body, folder)
+    time.sleep(0.2)
+    process.send_signal(signal.SIGINT)
+    _, messages = process.communicate(timeout=30)
+    return process.returncode, messages
+
+
+LINE = "interrupted; files that were being written are whole or absent\n"
+
+
+def test_an_interrupt_that_a_library_wraps_ends_with_130_and_one_line(tmp_path: Path) -> None:
+    body = """
+print('ready', flush=True)
+try:
+    time.sleep(9)
+except KeyboardInterrupt as error:
+    raise RuntimeError("error in a callback") from error"""
+    assert _interrupted(body, tmp_path) == (130, LINE)
+
+
+def test_an_interrupt_that_a_library_swallows_is_raised_by_the_progress(tmp_path: Path) -> None:
+    body = """
+from halfspace_sss.cli.shared import Bar
+print('ready', flush=True)
+try:
+    time.sleep(9)
+except KeyboardInterrupt:
+    pass
+with Bar("work") as bar:
+    bar.show(0, 1)
+raise SystemExit("not heard")"""
+    assert _interrupted(body, tmp_path) == (130, LINE)
+
+
+def test_an_interrupt_in_a_destructor_is_not_lost(tmp_path: Path) -> None:
+    body = """
+from halfspace_sss.cli.shared import Bar
+class Late:
+    def __del__(self):
+        print('ready', flush=True)
+        time.sleep(9)
+late = Late()
+del late
+with Bar("work") as bar:
+    bar.show(0, 1)"""
+    assert _interrupted(body, tmp_path) == (130, LINE)
+
+
+def test_an_interrupt_in_an_import_waits_for_its_end(tmp_path: Path) -> None:
+    lines = "import time", "print('ready', flush=True)", "time.sleep(1)", "print('whole', flush=True)"
+    (tmp_path / "slow_module.py").write_text("\n".join(lines))
+    process = _started("sys.path.insert(0, '')\nimport slow_module\ntime.sleep(9)", tmp_path)
+    time.sleep(0.2)
+    process.send_signal(signal.SIGINT)
+    output, messages = process.communicate(timeout=30)
+    assert (process.returncode, output, messages) == (130, "whole\n", LINE)
+
+
+def test_a_second_interrupt_does_not_disturb_what_the_first_one_puts_in_order(tmp_path: Path) -> None:
+    body = """
+print('ready', flush=True)
+try:
+    time.sleep(9)
+finally:
+    time.sleep(1)
+    print('in order', flush=True)"""
+    process = _started(body, tmp_path)
+    for _ in range(3):
+        time.sleep(0.2)
+        process.send_signal(signal.SIGINT)
+    output, messages = process.communicate(timeout=30)
+    assert (process.returncode, output, messages) == (130, "in order\n", LINE)
+
+
+def test_a_kernel_that_hears_nothing_is_told_of_and_ended_by_the_next_interrupt(tmp_path: Path) -> None:
+    body = """
+import ctypes
+from halfspace_sss.cli import interrupts as cli_interrupts
+cli_interrupts.PATIENCE = 0.3
+print('ready', flush=True)
+mutex = ctypes.create_string_buffer(128)
+for _ in range(2):
+    ctypes.CDLL(None).pthread_mutex_lock(mutex)"""
+    process = _started(body, tmp_path)
+    time.sleep(0.2)
+    started = time.monotonic()
+    process.send_signal(signal.SIGINT)
+    time.sleep(0.5)
+    process.send_signal(signal.SIGINT)
+    _, messages = process.communicate(timeout=30)
+    assert process.returncode == 130 and time.monotonic() - started < 5
+    assert messages == "interrupted; waits for a kernel that cannot be, the next one ends it\n"
+
+
+def test_a_signal_to_terminate_ends_in_order_too(tmp_path: Path) -> None:
+    process = _started("print('ready', flush=True)\ntime.sleep(9)", tmp_path)
+    time.sleep(0.2)
+    process.terminate()
+    _, messages = process.communicate(timeout=30)
+    assert (process.returncode, messages) == (143, LINE)
