@@ -37,12 +37,12 @@ class Recipe:
         backbone: name of the half-space model that is corrected.
     """
 
-    width: int = 64
+    width: int = 48
     depth: int = 3
-    batch: int = 4096
+    batch: int = 2048
     rate: float = 6e-3
     chunk: int = 2**17
-    reuse: int = 2
+    reuse: int = 4
     backbone: str = "better_dipole"
 
     def __post_init__(self) -> None:
