@@ -4,6 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
+from halfspace_sss.rendering.paths.tracing import replay_paths, trace_paths
+from halfspace_sss.rendering.transport.body import Body
+from halfspace_sss.rendering.transport.settings import Settings
+
 __all__ = ["check_outermost", "check_parameters", "replayer"]
 
 GEOMETRY = ("to_world", "vertex_positions", "vertex_normals", "vertex_texcoords")
@@ -71,25 +75,28 @@ def _selects(parameters: Any, owner: Any, name: str) -> bool:
     return False
 
 
-def replayer(trace: Any, replay: Any) -> Any:
-    """An integrator of Mitsuba's radiative backpropagation around two functions.
+def replayer(bodies: list[Body], settings: Settings) -> Any:
+    """An integrator of Mitsuba's radiative backpropagation around the paths through a scene with these bodies.
 
-    Args:
-        trace: (scene, sampler, ray, active) -> radiance, whether something was hit.
-        replay: (scene, sampler, ray, L, d, backward) -> derivative, see `replay_paths`.
+    Raises:
+        ValueError: gradients are enabled for a medium, and the model knows no other.
     """
     import drjit as dr
     import mitsuba as mi
     from mitsuba.python.ad.integrators.common import RBIntegrator
+
+    for body in bodies:
+        body.variation.prepare()
 
     class Replayer(RBIntegrator):
         """Mitsuba's camera rays and films, this project's paths."""
 
         def sample(self, mode: Any, scene: Any, sampler: Any, ray: Any, **given: Any) -> tuple:
             if mode == dr.ADMode.Primal:
-                L, seen = trace(scene, sampler, ray, given["active"])
+                L, seen = trace_paths(scene, bodies, settings, sampler, ray, given["active"])
                 return L, seen, [], L
             L, backward = given["state_in"], mode == dr.ADMode.Backward
-            return replay(scene, sampler, ray, L, given["δL"], backward), mi.Bool(True), [], L
+            d = replay_paths(scene, bodies, settings, sampler, ray, L, given["δL"], backward)
+            return d, mi.Bool(True), [], L
 
     return Replayer(mi.Properties())

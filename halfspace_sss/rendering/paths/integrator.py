@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from halfspace_sss.rendering.paths.differentiable import check_outermost, check_parameters, replayer
-from halfspace_sss.rendering.paths.tracing import replay_paths, trace_paths
+from halfspace_sss.rendering.paths.tracing import trace_paths
 from halfspace_sss.rendering.transport.body import Bodies
 from halfspace_sss.rendering.transport.settings import read_settings
 
@@ -41,23 +41,12 @@ def integrator_class() -> type:
                 return super().render(scene, *args, **more)
 
         def render_forward(self, scene: Any, *args: Any, **more: Any) -> Any:
-            return self._replayer(scene).render_forward(scene, *args, **more)
+            return replayer(self.prepare(scene), self.settings).render_forward(scene, *args, **more)
 
         def render_backward(self, scene: Any, *args: Any, **more: Any) -> None:
-            self._replayer(scene).render_backward(scene, *args, **more)
+            replayer(self.prepare(scene), self.settings).render_backward(scene, *args, **more)
 
-        def _replayer(self, scene: Any) -> Any:
-            bodies = self.prepare(scene)
-            for body in bodies:
-                body.variation.prepare()
-            return replayer(
-                lambda scene, *path: trace_paths(scene, bodies, self.settings, *path),
-                lambda scene, *path: replay_paths(scene, bodies, self.settings, *path),
-            )
-
-        def sample(
-            self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Any = True
-        ) -> tuple[Any, Any, list]:
+        def sample(self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Any = True) -> tuple:
             check_outermost(scene)
             with dr.suspend_grad():
                 L, seen = trace_paths(scene, self._bodies.of(scene), self.settings, sampler, ray, active)

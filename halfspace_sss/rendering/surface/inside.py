@@ -55,6 +55,7 @@ class Inside:
             values: `albedo`, `sigma_t` (1/mm) and `g`, one for each channel.
         """
         m, n = self.medium, self.medium.n_channels
+        values = {name: np.asarray(value, dtype=float) for name, value in values.items()}
         old = {name: np.atleast_1d(getattr(m, name)) for name in values}
         kept = {name: np.float32(old[name]) == np.float32(value) for name, value in values.items()}
         if all(same.all() for same in kept.values()):

@@ -39,6 +39,7 @@ import numpy as np
 
 from halfspace_sss.rendering.surface.inside import PARAMETERS, read_inside
 from halfspace_sss.rendering.surface.parameters import check_parameters
+from halfspace_sss.rendering.surface.reflection import Reflection
 
 __all__ = ["VARIABLE", "translucent_class"]
 
@@ -57,51 +58,36 @@ def translucent_class() -> type:
             check_parameters("translucent", props, (*PARAMETERS, *(key for key, _ in _boundaries(props))))
             self.inside = read_inside(props)
             self.boundary = _boundary(props, self.inside.medium.eta)
-            self.lobe = _reflection_lobe(self.boundary)
-            self.m_components = [self.boundary.flags(self.lobe)]
+            self.reflection = Reflection.of(self.boundary)
+            self.m_components = [self.boundary.flags(self.reflection.lobe)]
             self.m_flags = self.m_components[0]
-            self._expose()
-
-        def _expose(self) -> None:
-            """The parameters of the medium as arrays that can be changed and differentiated by."""
-            medium = self.inside.medium
             for name in VARIABLE:
-                setattr(self, name, mi.Spectrum(np.atleast_1d(getattr(medium, name)).astype(float).tolist()))
+                value = np.atleast_1d(getattr(self.inside.medium, name)).astype(float)
+                setattr(self, name, mi.Spectrum(value.tolist()))
 
         def traverse(self, callback: Any) -> None:
-            for name in VARIABLE:
+            for name in VARIABLE if self.inside.varying is None else ():
                 callback.put(name, getattr(self, name), mi.ParamFlags.Differentiable)
             callback.put("boundary", self.boundary, mi.ParamFlags.Differentiable)
 
         def parameters_changed(self, keys: Any = ()) -> None:
-            values = {name: np.array(getattr(self, name), dtype=float).ravel() for name in VARIABLE}
-            inside = self.inside.changed(**values)
-            check_eta(self.boundary, inside.medium.eta)
-            if inside != self.inside:
-                self.inside = inside  # what is made of it is made anew when the scene is rendered next
+            # the integrators see another `inside`, and make anew what they made of it
+            if self.inside.varying is None:
+                self.inside = self.inside.changed(**{name: np.ravel(getattr(self, name)) for name in VARIABLE})
+            check_eta(self.boundary, self.inside.medium.eta)
 
-        def _context(self, ctx: Any) -> Any:
-            return mi.BSDFContext(ctx.mode, ctx.type_mask, self.lobe)
-
-        def _shown(self, ctx: Any) -> bool:
-            return self.inside.reflection and ctx.component in (0, 0xFFFFFFFF)
+        def _shown(self, ctx: Any, value: Any) -> Any:
+            return value if self.inside.reflection and ctx.component in (0, 0xFFFFFFFF) else 0 * value
 
         def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> tuple[Any, Any]:
-            seen, sign = _from_outside(si)
-            bs, weight = self.boundary.sample(self._context(ctx), seen, sample1, sample2, active)
-            bs.wo = _turned(bs.wo, sign)
-            bs.sampled_component = 0
-            return bs, weight if self._shown(ctx) else 0 * weight
+            bs, weight = self.reflection.sample(ctx, si, sample1, sample2, active)
+            return bs, self._shown(ctx, weight)
 
         def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
-            seen, sign = _from_outside(si)
-            value = self.boundary.eval(self._context(ctx), seen, _turned(wo, sign), active)
-            return value if self._shown(ctx) else 0 * value
+            return self._shown(ctx, self.reflection.eval(ctx, si, wo, active))
 
         def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
-            seen, sign = _from_outside(si)
-            value = self.boundary.pdf(self._context(ctx), seen, _turned(wo, sign), active)
-            return value if self._shown(ctx) else 0 * value
+            return self._shown(ctx, self.reflection.pdf(ctx, si, wo, active))
 
         def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> tuple[Any, Any]:
             return self.eval(ctx, si, wo, active), self.pdf(ctx, si, wo, active)
@@ -110,24 +96,6 @@ def translucent_class() -> type:
             return f"Translucent[{self.inside}, boundary = {self.boundary}]"
 
     return Translucent
-
-
-def _from_outside(si: Any) -> tuple[Any, Any]:
-    """The interaction with the normal on the side that is seen, which is the outside, and 1 or -1 if it was turned."""
-    import drjit as dr
-    import mitsuba as mi
-
-    sign = dr.select(mi.Frame3f.cos_theta(si.wi) < 0, mi.Float(-1), 1)
-    seen = mi.SurfaceInteraction3f(si)
-    seen.wi = _turned(si.wi, sign)
-    return seen, sign
-
-
-def _turned(w: Any, sign: Any) -> Any:
-    """A local direction in the frame that is turned about its first axis where the sign is -1."""
-    import mitsuba as mi
-
-    return mi.Vector3f(w.x, w.y * sign, w.z * sign)
 
 
 def _boundaries(props: Any) -> list[tuple[str, Any]]:
@@ -160,12 +128,3 @@ def check_eta(boundary: Any, eta: float) -> None:
         raise ValueError(
             f"the boundary must be a dielectric with eta {eta:g} of the medium (int_ior/ext_ior), got {found}"
         )
-
-
-def _reflection_lobe(boundary: Any) -> int:
-    import mitsuba as mi
-
-    for k in range(boundary.component_count()):
-        if boundary.flags(k) & int(mi.BSDFFlags.Reflection):
-            return k
-    raise ValueError(f"the boundary must reflect, got {boundary}")

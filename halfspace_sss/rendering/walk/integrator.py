@@ -47,11 +47,7 @@ def walk_integrator_class() -> type:
 
         def tracer(self, scene: Any) -> PathTracer:
             """What paths through a scene need; the costly part is made ready once."""
-            shapes = scene.shapes()  # the scene itself, which holds its integrator, would never be freed
-            if self._prepared[1] is None or not same_objects(self._prepared[0], shapes):
-                media = WalkMedia.of(scene, self.mm_per_unit)
-                joins = find_joins(scene, media, self.join_share)
-                self._prepared = shapes, media, joins and replace(joins, scene=None)
+            self._prepared = _prepared(scene, self._prepared, self.mm_per_unit, self.join_share)
             _, media, joins = self._prepared
             joins = joins and replace(joins, scene=scene)
             guide = joins and Guide(scene, media, joins)
@@ -66,16 +62,26 @@ def walk_integrator_class() -> type:
                 _render(self.tracer(scene), sensor, int(mi.UInt32(seed)[0]), spp or sensor.sampler().sample_count())
                 return sensor.film().develop() if develop else None
 
-        def render_forward(self, *_: Any, **__: Any) -> Any:
-            raise ValueError("the integrator of a derivative of light must be bssrdf, got translucent_walk")
-
-        def render_backward(self, *_: Any, **__: Any) -> None:
-            self.render_forward()
+        render_forward = render_backward = _refuse_derivatives
 
         def to_string(self) -> str:
             return f"TranslucentWalk[mm_per_unit = {self.mm_per_unit:g}, max_depth = {self.max_depth}]"
 
     return TranslucentWalk
+
+
+def _prepared(scene: Any, before: tuple, mm_per_unit: float, join_share: float) -> tuple[list, Any, Any]:
+    """Shapes, media and joins of a scene: those of before, unless its objects, their shape or media changed."""
+    shapes = scene.shapes()  # the scene itself, which holds its integrator, would never be freed
+    if before[1] is not None and same_objects(before[0], shapes) and before[1].is_current():
+        return before
+    media = WalkMedia.of(scene, mm_per_unit)
+    joins = find_joins(scene, media, join_share)
+    return shapes, media, joins and replace(joins, scene=None)
+
+
+def _refuse_derivatives(*_: Any, **__: Any) -> None:
+    raise ValueError("the integrator of a derivative of light must be bssrdf, got translucent_walk")
 
 
 def _render(tracer: PathTracer, sensor: Any, seed: int, spp: int) -> None:

@@ -69,6 +69,11 @@ class WalkMedia:
         varies = any(inside.varying is not None for inside in self.insides)
         object.__setattr__(self, "grids", Grids.of(self.insides, self.mm_per_unit) if varies else None)
 
+    def is_current(self) -> bool:
+        """Whether the objects still have the shapes and the media that this was made of."""
+        pairs = zip(self.objects, self.insides)
+        return all(inside is obj.shape.bsdf().inside and obj.is_current() for obj, inside in pairs)
+
     @property
     def same_g(self) -> bool:
         """Whether g of every medium is the same in all channels."""
