@@ -10,11 +10,11 @@ import importlib
 from typing import Any
 
 _HOME = {
-    "Recipe": "fitting",
+    "Recipe": "learning.fitting",
     "Subject": "subject",
-    "errors": "model_errors",
+    "errors": "learning.model_errors",
     "load": "storing",
-    "train": "training",
+    "train": "learning.training",
     "transport": "storing",
 }
 TRANSPORTS = {"full_geometry": "full_geometry.scene:learnt_means"}

@@ -14,8 +14,8 @@ from halfspace_sss.tracing.walk import _generator, pass_seed
 
 mi = pytest.importorskip("mitsuba")
 
-from full_geometry.exits import trace_exits  # noqa: E402
 from full_geometry.first_event import first_event  # noqa: E402
+from full_geometry.learning.exits import trace_exits  # noqa: E402
 from full_geometry.subject import Subject, SurfacePoint, refract_in  # noqa: E402
 
 N = 2**16

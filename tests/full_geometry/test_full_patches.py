@@ -19,13 +19,13 @@ pytest.importorskip("torch")
 
 from full_geometry.features import Side, n_side  # noqa: E402
 from full_geometry.first_event import first_event  # noqa: E402
-from full_geometry.fitting import Recipe  # noqa: E402
 from full_geometry.half_space import HalfSpace  # noqa: E402
 from full_geometry.identity import frame_of  # noqa: E402
-from full_geometry.pairs import Proposals  # noqa: E402
+from full_geometry.learning.fitting import Recipe  # noqa: E402
+from full_geometry.learning.pairs import Proposals  # noqa: E402
+from full_geometry.learning.training import train  # noqa: E402
 from full_geometry.patches import Patches, PatchSampler, cluster, mesh_faces  # noqa: E402
 from full_geometry.subject import Subject  # noqa: E402
-from full_geometry.training import train  # noqa: E402
 from halfspace_sss.tracing.walk import _generator, pass_seed  # noqa: E402
 
 BUNNY = Path(__file__).parents[2] / "figures" / "assets" / "bunny.ply"

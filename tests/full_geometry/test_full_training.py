@@ -17,17 +17,18 @@ mi = pytest.importorskip("mitsuba")
 pytest.importorskip("torch")
 
 import full_geometry  # noqa: E402
-from full_geometry import storing, training  # noqa: E402
+from full_geometry import storing  # noqa: E402
 from full_geometry.features import Side, pair_features, reverse, side_features  # noqa: E402
 from full_geometry.first_event import first_event  # noqa: E402
-from full_geometry.fitting import Recipe  # noqa: E402
 from full_geometry.half_space import HalfSpace, HalfSpaceTransport  # noqa: E402
 from full_geometry.identity import frame_of  # noqa: E402
+from full_geometry.learning import training  # noqa: E402
+from full_geometry.learning.fitting import Recipe  # noqa: E402
+from full_geometry.learning.model_errors import LIGHTS, Estimate, compare, measure, reference  # noqa: E402
+from full_geometry.learning.pairs import Proposals  # noqa: E402
+from full_geometry.learning.training import Trained, train  # noqa: E402
 from full_geometry.model import FullGeometry  # noqa: E402
-from full_geometry.model_errors import LIGHTS, Estimate, compare, measure, reference  # noqa: E402
-from full_geometry.pairs import Proposals  # noqa: E402
 from full_geometry.subject import Subject, SurfacePoint  # noqa: E402
-from full_geometry.training import Trained, train  # noqa: E402
 from halfspace_sss import rendering  # noqa: E402
 from halfspace_sss.tracing.walk import _generator, pass_seed  # noqa: E402
 

@@ -11,8 +11,8 @@ import numpy as np
 import torch
 
 from full_geometry.features import n_side, reverse
-from full_geometry.learner import Correction, PatchLogits, likelihood, patch_likelihood
-from full_geometry.pairs import Pairs
+from full_geometry.learning.learner import Correction, PatchLogits, likelihood, patch_likelihood
+from full_geometry.learning.pairs import Pairs
 from full_geometry.patches import Patches
 from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.provenance import write_atomically

@@ -13,12 +13,12 @@ import numpy as np
 
 from full_geometry import storing
 from full_geometry.features import N_PAIR, n_side
-from full_geometry.fitting import STANDARD, Fitting, Recipe
 from full_geometry.half_space import HalfSpace
 from full_geometry.identity import frame_of, identify
+from full_geometry.learning.fitting import STANDARD, Fitting, Recipe
+from full_geometry.learning.model_errors import ModelError, Reference, measure, reference
+from full_geometry.learning.pairs import PairSource, Proposals
 from full_geometry.model import FullGeometry
-from full_geometry.model_errors import ModelError, Reference, measure, reference
-from full_geometry.pairs import PairSource, Proposals
 from full_geometry.patches import Patches, PatchSampler, cluster
 from full_geometry.storing import CENTRES, Learnt, assemble
 from full_geometry.subject import Subject

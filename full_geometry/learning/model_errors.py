@@ -16,9 +16,9 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from full_geometry.exits import trace_exits
 from full_geometry.half_space import HalfSpace
-from full_geometry.pairs import Proposals
+from full_geometry.learning.exits import trace_exits
+from full_geometry.learning.pairs import Proposals
 from full_geometry.subject import Subject, SurfacePoint
 from halfspace_sss.checks import check_count
 from halfspace_sss.physics.medium import Medium

@@ -7,20 +7,21 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from full_geometry.exits import trace_exits
+from full_geometry.entries import AREA_SHARE, LearntProposals
 from full_geometry.features import Frame, Side, pair_features, side_features
 from full_geometry.first_event import first_event
 from full_geometry.half_space import HalfSpace
+from full_geometry.learning.exits import trace_exits
+from full_geometry.model import PreparedExit
 from full_geometry.patches import PatchSampler
-from full_geometry.subject import Subject, SurfacePoint, clearance, cosine_direction
+from full_geometry.subject import Subject, SurfacePoint, cosine_direction
 from halfspace_sss.rendering.transport.plane import Exit, number
-from halfspace_sss.rendering.transport.positions import Entry, PositionSampler
+from halfspace_sss.rendering.transport.positions import PositionSampler
 from halfspace_sss.rendering.transport.radial_table import RadialTable
 from halfspace_sss.tracing.walk import _generator, pass_seed
 
-__all__ = ["AREA_SHARE", "Pairs", "PairSource", "Proposals"]
+__all__ = ["Pairs", "PairSource", "Proposals"]
 
-AREA_SHARE = 0.4  # of the proposals that are uniform over the area
 PATCH_SHARE = 0.6  # of those by patches, where they are learnt
 
 
@@ -80,9 +81,13 @@ class Proposals:
         import mitsuba as mi
 
         out = Exit(exit.p, exit.n_out, exit.w, number(self.subject.found.sign))
-        entry = self.positions.sample(out, mi.UInt32(0), Numbers(rng), mi.Bool(True))
-        if self.patches is not None:
-            entry = self._mixed(exit, out, entry, rng)
+        known = (out, mi.UInt32(0))
+        if self.patches is None:
+            entry = self.positions.sample(*known, Numbers(rng), mi.Bool(True))
+        else:
+            drawn = LearntProposals(self.patches, self.positions, PATCH_SHARE, self.subject.found.sign)
+            where = drawn.prepare(out, PreparedExit(Side(exit, first_event(self.subject, exit)), []), mi.Bool(True))
+            entry = drawn.sample(*known, where, Numbers(rng), mi.Bool(True))
         w = cosine_direction(entry.n_out, rng)
         n = entry.n * self.subject.found.sign
         return SurfacePoint(entry.p, n, entry.n_out, w), dr.pi * entry.weight
@@ -90,31 +95,6 @@ class Proposals:
     def with_patches(self, patches: PatchSampler | None) -> Proposals:
         """The same with learnt weights of patches, which take the place of uniform points."""
         return Proposals(self.subject, self.half_space, 0.0, patches) if patches is not None else self
-
-    def _mixed(self, exit: SurfacePoint, out: Exit, entry: Entry, rng: Any) -> Entry:
-        """The entry of the probe, or one by patches."""
-        import drjit as dr
-        import mitsuba as mi
-
-        weights = self.patches.prepare(Side(exit, first_event(self.subject, exit)))
-        u = (rng.next_float32(), rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32()))
-        point, q = self.patches.sample(weights, *u)
-        by_patch = rng.next_float32() < PATCH_SHARE
-        q = dr.select(by_patch, q, self.patches.density(weights, self._face(entry)))
-        drawn = Entry(point.p, point.n, point.n_shading * self.subject.found.sign, mi.Float(1))
-        p, n, n_out, v = (dr.select(by_patch, a, b) for a, b in zip(drawn, entry))
-        D = self.positions.density(p, n, out, (out.n, *mi.coordinate_system(out.n)))
-        mixture = (1 - PATCH_SHARE) * D + PATCH_SHARE * q
-        return Entry(p, n, n_out, dr.select(by_patch, 1, v * D) / dr.maximum(mixture, 1e-30))
-
-    def _face(self, entry: Entry) -> Any:
-        """The face that a point was found on, by a short ray through it."""
-        import drjit as dr
-        import mitsuba as mi
-
-        start = entry.p + entry.n * clearance(entry.p, entry.n, entry.n)
-        hit = self.subject.found.scene.ray_intersect_preliminary(mi.Ray3f(start, -entry.n), False, entry.weight > 0)
-        return dr.select(hit.is_valid(), hit.prim_index, 0)
 
 
 @dataclass(frozen=True, eq=False)
