@@ -68,11 +68,13 @@ class PhotonBeamDiffusion(BSSRDF):
         offset = 4 * z_b * (z + z_b)  # d_v² - d_r²
         d_v = lib.sqrt(d_r * d_r + offset)
         decay, fluence, _ = safe_differences(lib, sigma_tr, d_r, d_v, offset / (d_r + d_v))
+        # E d_r exp(sigma_tr d_r) 4 pi = [k(z, d_r) + k(z + 2 z_b, d_v)] d_r exp(sigma_tr d_r)
         irradiance = z * (1 + sigma_tr * d_r) / (d_r * d_r)
         irradiance = irradiance + (z + 2 * z_b) * (1 + sigma_tr * d_v) * decay * (d_r / d_v) / (d_v * d_v)
+        # C_phi phi + C_E E, times exp(-sigma_t' t)
         exitance = self._boundary.C_phi / D * (fluence * d_r) + self._boundary.C_E * irradiance
         exitance = exitance * lib.exp(-sigma_tr * d_r - sigma_t_prime * t)
-        if self.kappa != "none":
+        if self.kappa != "none":  # kappa = 1 - exp(-2 sigma_t (d_r + t))
             exitance = -lib.expm1(-q.constant(self._kappa_rate) * (d_r + t)) * exitance
         return exitance
 
@@ -82,18 +84,20 @@ class PhotonBeamDiffusion(BSSRDF):
         r, mu = lib.maximum(q.r, R_MIN), lib.maximum(q.mu_i_in, MU_MIN)
         sin_i = lib.sqrt((1 - mu) * (1 + mu))
         cosine, sine = -sin_i * lib.cos(q.phi_i), sin_i * lib.sin(q.phi_i)
-        h2_over_r2 = mu * mu + sine * sine
+        h2_over_r2 = mu * mu + sine * sine  # 1 - cosine², cosine that of the beam with x_o - x_i
         t_0 = r * cosine  # where the beam is nearest to x_o, at the distance h = r sqrt(h2_over_r2)
         gap = r * lib.where(cosine > 0, h2_over_r2 / (1 + lib.abs(cosine)), 1 - cosine)  # r - t_0
         log_tail = 7.0 + 0.5 * self.n_samples  # what is cut off is exp(-log_tail) of the integral
         rate = sigma_t_prime - sigma_tr * cosine  # of the decay at t = 0, where it is slowest
         end = lib.maximum(t_0, 0.0) + log_tail / sigma_t_prime
         end = lib.minimum(end, log_tail / lib.maximum(rate, 1e-30))
+        # span = v(end) - v(0), t - t_0 = h sinh(v + v_0): exp(span) = (end - t_0 + d_end) / (r - t_0) = 1 + ratio
         d_end = lib.sqrt(r * r * h2_over_r2 + (end - t_0) * (end - t_0))
         ratio = end * (1 + (end - 2 * t_0) / (d_end + r)) / gap
         span = lib.where(ratio < 1e-2, ratio * (1 - 0.5 * ratio), lib.log(1 + ratio))
 
         def add(total: Any, x: Any, weight: Any) -> tuple:
+            # with e = exp(v/2), s = sinh(v/2), r - t_0 = gap: t = 2 s (r/e + gap s), d_r = r/e² + gap sinh v
             half = lib.expm1(0.5 * x * span)
             e = 1 + half
             s, cosh = 0.5 * (half + half / e), 0.5 * (e + 1 / e)

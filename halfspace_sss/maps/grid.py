@@ -7,12 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from halfspace_sss.arrays import library
+from halfspace_sss.physics.backbone import length_scale, unwarp, warp
 from halfspace_sss.physics.medium import Medium
 
 __all__ = ["MapGrid", "cell_edges", "map_directions", "radial_scale"]
 
 R_SMALLEST, R_LARGEST = 0.02, 12.0  # first edge in min(L, mfp), last edge in L
-LONGEST_SCALE = 20.0  # transport mean free paths; caps L where nothing absorbs
 MOST_THETA, MOST_CELLS = 4096, 2**22  # 3 GiB for the maps of one direction of incidence
 
 
@@ -50,32 +51,15 @@ class MapGrid:
 
 
 def radial_scale(medium: Medium) -> float:
-    """Length L of the radial grid in mean free paths: 1/sigma_tr of classical diffusion, capped for albedo -> 1.
-
-    Args:
-        medium: scalar medium.
-    """
-    m = medium.in_mfp()
-    sigma_tr = math.sqrt(3 * m.sigma_a * m.sigma_t_prime)
-    return min(1 / sigma_tr if sigma_tr > 0 else math.inf, LONGEST_SCALE / m.sigma_t_prime)
-
-
-def warp(r: np.ndarray, L: float) -> np.ndarray:
-    """u = log(exp(r/L) - 1): logarithmic in r below L, linear above, where S falls exponentially."""
-    x = np.asarray(r, dtype=np.float64) / L
-    return x + np.log(-np.expm1(-x))
-
-
-def unwarp(u: np.ndarray, L: float) -> np.ndarray:
-    """Distance for the warped coordinate, r = L log(1 + exp(u))."""
-    return L * np.logaddexp(0.0, u)
+    """Length L of the radial grid of a scalar medium in mean free paths, `length_scale` of its ratios."""
+    return float(length_scale(float(medium.albedo), float(medium.g)))
 
 
 def cell_edges(medium: Medium, grid: MapGrid) -> tuple[np.ndarray, np.ndarray]:
     """Edges of the cells: distances in mean free paths (uniform in `warp`), azimuths of x_o - x_i in [-pi, pi]."""
-    L = radial_scale(medium)
-    low, high = warp(np.array([R_SMALLEST * min(L, 1.0), R_LARGEST * L]), L)
-    return unwarp(np.linspace(low, high, grid.n_r + 1), L), np.linspace(-math.pi, math.pi, grid.n_psi + 1)
+    lib, L = library(0.0), radial_scale(medium)
+    low, high = warp(lib, np.array([R_SMALLEST * min(L, 1.0) / L, R_LARGEST]))
+    return L * unwarp(lib, np.linspace(low, high, grid.n_r + 1)), np.linspace(-math.pi, math.pi, grid.n_psi + 1)
 
 
 def map_directions(medium: Medium, grid: MapGrid, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

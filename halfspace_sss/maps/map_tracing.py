@@ -11,8 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from halfspace_sss.arrays import library
 from halfspace_sss.backend import array_types
-from halfspace_sss.maps.grid import MapGrid, cell_edges, map_directions, radial_scale, warp
+from halfspace_sss.maps.grid import MapGrid, cell_edges, map_directions, radial_scale
+from halfspace_sss.physics.backbone import warp
 from halfspace_sss.physics.fresnel import F_t, mu_internal
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.physics.phase import eval_hg
@@ -147,7 +149,7 @@ def _unit_tally(types: ModuleType, unit: MapUnit, mu_o: np.ndarray, delta_phi: n
     columns = (sine * np.cos(delta_phi), sine * np.sin(delta_phi), mu, 1 / mu, 1 / (m.eta**2 * mu))
     directions = [tuple(dr.opaque(types.Float, v) for v in row) for row in np.stack(columns, axis=1)]
     L = radial_scale(m)
-    low, high = warp(cell_edges(m, grid)[0][[0, -1]], L)
+    low, high = warp(library(0.0), cell_edges(m, grid)[0][[0, -1]] / L)
     cells = CellSums(types, GROUP * grid.n_r * grid.n_psi, MAP_BATCHES)
     scale = [dr.opaque(types.Float, v) for v in (1 / L, low, grid.n_r / (high - low))]
     return MapTally(types, grid.n_r, grid.n_psi, lambda cosine, event: eval_hg(cosine, g), directions, *scale, cells)

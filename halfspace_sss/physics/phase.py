@@ -7,7 +7,7 @@ from typing import Any
 
 from halfspace_sss.arrays import library
 
-__all__ = ["eval_hg", "pdf_hg", "sample_hg"]
+__all__ = ["eval_hg", "sample_hg"]
 
 
 def eval_hg(cos_theta: Any, g: Any) -> Any:
@@ -31,17 +31,12 @@ def eval_hg(cos_theta: Any, g: Any) -> Any:
     return (1 - size) * (1 + size) / (4 * math.pi * gap * lib.sqrt(gap))
 
 
-def pdf_hg(cos_theta: Any, g: Any) -> Any:
-    """Density of `sample_hg` per solid angle, 1/sr: the phase function itself."""
-    return eval_hg(cos_theta, g)
-
-
 def sample_hg(u: Any, g: Any) -> Any:
     """Cosine of the scattering angle for a uniform number u in [0, 1).
 
     cos = 1 - (1 - g) (1 - u) (1 - g + q) / b with b = 1 - g + 2gu, q = (1 - g²) / b: the published
     (1 + g² - q²) / (2g) without its division by g, so that it holds for every g, 0 included, and keeps its digits.
-    The azimuth about the old direction is uniform and left to the caller.
+    The azimuth about the old direction is uniform and left to the caller; the density per solid angle is `eval_hg`.
     """
     lib = library(u, g)
     ratio = (1 - g) / (1 - g + 2 * g * u)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from halfspace_sss import Medium, make_maps, trace
-from halfspace_sss.maps.grid import MapGrid, cell_edges, map_directions, radial_scale, unwarp, warp
+from halfspace_sss.maps.grid import MapGrid, cell_edges, map_directions, radial_scale
 from halfspace_sss.maps.map_tracing import MapUnit, trace_unit
 from halfspace_sss.maps.store import _template, load_maps
 from halfspace_sss.tracing.curve_tracing import trace_curve
@@ -75,11 +75,6 @@ def test_a_unit_repeats_bit_for_bit():
 def test_no_scattering_makes_black_maps():
     result = trace_unit(MapUnit(Medium(0.0, 1.0), SMALL, 0, 0, 0, 0.05, 100_000))
     assert not result.S.any()
-
-
-def test_warp_and_unwarp_are_inverse():
-    r = np.geomspace(1e-3, 1e3, 50)
-    np.testing.assert_allclose(unwarp(warp(r, 2.5), 2.5), r, rtol=1e-9)
 
 
 @pytest.mark.parametrize("albedo", [0.0, 0.5, 1.0])

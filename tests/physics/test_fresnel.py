@@ -142,3 +142,9 @@ def test_published_polynomials_keep_their_stated_errors(low, high, error_1, erro
 def test_published_polynomials_are_wrong_at_equal_indices():
     assert fresnel.published_polynomial_2C_1(1.0) == pytest.approx(0.00433, abs=5e-6)
     assert fresnel.published_polynomial_3C_2(1.0) == pytest.approx(-0.00684, abs=5e-4)
+
+
+@pytest.mark.parametrize("n", [0.6, 0.7, 0.8, 0.9, 0.95, 1.2, 1.5, 1.8])
+def test_the_published_fit_of_the_diffuse_reflectance_is_that_of_the_moments(n: float) -> None:
+    A = fresnel.boundary_A_jensen(n)
+    assert (A - 1) / (A + 1) == pytest.approx(2 * C_1(n), abs=1.5e-3)

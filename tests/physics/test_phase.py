@@ -5,7 +5,7 @@ import pytest
 from scipy import integrate, stats
 
 from halfspace_sss.backend import array_types
-from halfspace_sss.physics.phase import eval_hg, pdf_hg, sample_hg
+from halfspace_sss.physics.phase import eval_hg, sample_hg
 
 GS = [-0.999, -0.9, -0.3, -1e-4, 0.0, 1e-4, 0.5, 0.95, 0.999]
 
@@ -38,11 +38,6 @@ def test_it_is_the_published_formula(g):
 
 def test_forward_is_cosine_one():
     assert eval_hg(np.float64(1.0), 0.5) > eval_hg(np.float64(-1.0), 0.5)
-
-
-def test_its_density_is_itself():
-    c = np.linspace(-1, 1, 11)
-    np.testing.assert_array_equal(pdf_hg(c, 0.7), eval_hg(c, 0.7))
 
 
 def cdf_hg(c, g):
