@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["RAYS", "Object", "is_inside", "same_objects", "survey", "turned"]
+__all__ = ["RAYS", "Object", "is_inside", "same_objects", "scene_of", "survey", "turned"]
 
 RAYS = 4096  # of the survey
 MOST_HITS = 64  # that one ray counts
@@ -94,13 +94,10 @@ def survey(shape: Any) -> Object:
     Raises:
         ValueError: the shape is an instance, whose geometry belongs to several objects.
     """
-    import mitsuba as mi
 
     if "nstance" in shape.class_name():
         raise ValueError(f"a translucent object must not be an instance, got {shape.id() or shape}")
-    name = shape.id()
-    scene = mi.load_dict({"type": "scene", "shape": shape})
-    shape.set_id(name)  # the scene has renamed it
+    name, scene = shape.id(), scene_of([shape])
     box = scene.bbox()
     low, high = np.array(box.min, dtype=float), np.array(box.max, dtype=float)
     size = float(np.linalg.norm(high - low))
@@ -184,6 +181,17 @@ class _Votes:
         return mi.Float(sign[np.array(self.pieces)].astype(np.float32)) if mixed else None
 
 
+def scene_of(shapes: list[Any]) -> Any:
+    """A Mitsuba scene that holds these shapes, which keep their ids."""
+    import mitsuba as mi
+
+    names = [shape.id() for shape in shapes]
+    scene = mi.load_dict({"type": "scene", **{f"shape{k}": shape for k, shape in enumerate(shapes)}})
+    for shape, name in zip(shapes, names):
+        shape.set_id(name)
+    return scene
+
+
 def _outside_view(scene: Any, centre: np.ndarray, radius: float, votes: _Votes) -> tuple[np.ndarray, float]:
     """Per ray the side of the normal at the first hit (1 towards the ray, 0 no hit); share of rays with odd hits."""
     import mitsuba as mi
@@ -222,17 +230,19 @@ def crossings(scene: Any, ray: Any, votes: _Votes | None = None) -> tuple[Any, A
     return dr.while_loop(state, lambda ray, side, count, active: active, step, label="crossings")[1:3]
 
 
-def is_inside(found: Object, point: Any) -> bool:
-    """Whether a point lies inside a closed object, by the parity of the hits of rays from it."""
+def is_inside(found: Object, points: Any) -> np.ndarray:
+    """Which points (array of shape (3, n)) lie inside a closed object, by the parity of the hits of rays from them."""
     import mitsuba as mi
 
+    points = np.asarray(points, dtype=float)
     if not found.closed:
-        return False
+        return np.zeros(points.shape[1], dtype=bool)
     along = np.random.default_rng(11).standard_normal((3, 65))
     along /= np.linalg.norm(along, axis=0)
-    start = np.repeat(np.asarray(point, dtype=float)[:, None], along.shape[1], axis=1)
-    _, count = crossings(found.scene, mi.Ray3f(mi.Point3f(start), mi.Vector3f(along)))
-    return bool((np.array(count) % 2).mean() > 0.5)
+    start = np.repeat(points, along.shape[1], axis=1)
+    ends = np.tile(along, points.shape[1])
+    _, count = crossings(found.scene, mi.Ray3f(mi.Point3f(start), mi.Vector3f(ends)))
+    return (np.array(count) % 2).reshape(-1, along.shape[1]).mean(axis=1) > 0.5
 
 
 def _pieces(shape: Any) -> Any:

@@ -62,8 +62,7 @@ def translucent_class() -> type:
             self.m_components = [self.boundary.flags(self.reflection.lobe)]
             self.m_flags = self.m_components[0]
             for name in VARIABLE:
-                value = np.atleast_1d(getattr(self.inside.medium, name)).astype(float)
-                setattr(self, name, mi.Spectrum(value.tolist()))
+                setattr(self, name, mi.Spectrum(np.atleast_1d(getattr(self.inside.medium, name)).tolist()))
 
         def traverse(self, callback: Any) -> None:
             for name in VARIABLE if self.inside.varying is None else ():

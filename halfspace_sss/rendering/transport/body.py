@@ -13,7 +13,9 @@ from halfspace_sss.interface.model import bssrdf
 from halfspace_sss.physics import single_scattering
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.surface.inside import Inside
-from halfspace_sss.rendering.surface.object import Object, is_inside, same_objects, survey
+from halfspace_sss.rendering.surface.object import Object, same_objects, survey
+from halfspace_sss.rendering.surface.placement import translucent_shapes
+from halfspace_sss.rendering.surface.sensors import check_sensors
 from halfspace_sss.rendering.surface.transports import object_transport
 from halfspace_sss.rendering.surface.varying import equivalent
 from halfspace_sss.rendering.transport.half_space import half_space_means
@@ -77,14 +79,11 @@ def make_bodies(scene: Any, settings: Settings) -> list[Body]:
         ValueError: there is none, a camera is inside one, a model refuses its medium, or the orders that are asked for
             are not those of the model.
     """
-    shapes = [s for s in scene.shapes() if hasattr(s.bsdf(), "inside")]
+    shapes = translucent_shapes(scene)
     if not shapes:
         raise ValueError("the scene must have an object with a translucent BSDF, got none")
     bodies = [_make_body(shape, settings) for shape in shapes]
-    for body in bodies:
-        for sensor in scene.sensors():
-            if is_inside(body.found, np.array(sensor.world_transform().translation()).ravel()):
-                raise ValueError(f"the camera must be outside of every object, got it inside {body.found.shape.id()!r}")
+    check_sensors(scene, [body.found for body in bodies])
     return bodies
 
 

@@ -102,14 +102,17 @@ def half_space_means(name: str, found: Object, media: list[Medium], settings: Se
     """
     models = [bssrdf(name, m) for m in media]
     table = RadialTable([model for model, m in zip(models, media) if float(m.sigma_s) > 0], found.size)
-    area_share = settings.area_share
-    if area_share == AUTOMATIC:
-        area_share = _area_share(table.mean / found.size)
+    area_share = _area_share(found, table.mean / found.size, settings.area_share)
     positions = PositionSampler(found, table, AreaPoints(found.shape), area_share)
     transport = HalfSpaceTransport(models, settings.geometry, variation)
     return Means(transport, HalfSpaceProposals(positions, models[0]))
 
 
-def _area_share(ratio: float) -> float:
-    """Share of uniform entries for a ratio of mean distance to object size."""
-    return float(np.clip(0.5 * (np.log10(max(ratio, 1e-9)) + 0.5), 0.0, 0.5))
+def _area_share(found: Object, ratio: float, wanted: float) -> float:
+    """Share of uniform entries, by default for a ratio of mean distance to object size."""
+    if found.area > 0:
+        return wanted if wanted != AUTOMATIC else float(np.clip(0.5 * (np.log10(max(ratio, 1e-9)) + 0.5), 0.0, 0.5))
+    if wanted > 0:
+        kind = found.shape.class_name()
+        raise ValueError(f"area_share must be 0 for {found.shape.id()!r}, a {kind} without known area, got {wanted:g}")
+    return 0.0

@@ -58,7 +58,7 @@ class PositionSampler:
             across = dr.norm(d - axis * along)
             reached = dr.select(dr.abs(along) <= self._reach(across), 1.0, LONG_SHARE)
             total += share * reached * dr.abs(dr.dot(n, axis)) * self.table.pdf(across)
-        return number(1 - s) * total + number(s / self.found.area)
+        return number(1 - s) * total + number(s / self.found.area if s else 0.0)
 
     def sample(self, out: Exit, prim_index: Any, sampler: Any, active: Any) -> Entry:
         """A point of entry for light that leaves at `out` on the face `prim_index`."""

@@ -8,6 +8,7 @@ from typing import Any
 
 from halfspace_sss.rendering.surface.object import same_objects
 from halfspace_sss.rendering.surface.parameters import OF_MITSUBA, check_parameters
+from halfspace_sss.rendering.surface.sensors import check_sensors
 from halfspace_sss.rendering.walk.connect import find_joins
 from halfspace_sss.rendering.walk.guide import Guide
 from halfspace_sss.rendering.walk.light import LightVisitor
@@ -62,6 +63,9 @@ def walk_integrator_class() -> type:
                 _render(self.tracer(scene), sensor, int(mi.UInt32(seed)[0]), spp or sensor.sampler().sample_count())
                 return sensor.film().develop() if develop else None
 
+        def sample(self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Any = True) -> tuple:
+            return _samples(self.tracer(scene), sampler, ray, active)
+
         render_forward = render_backward = _refuse_derivatives
 
         def to_string(self) -> str:
@@ -76,6 +80,7 @@ def _prepared(scene: Any, before: tuple, mm_per_unit: float, join_share: float) 
     if before[1] is not None and same_objects(before[0], shapes) and before[1].is_current():
         return before
     media = WalkMedia.of(scene, mm_per_unit)
+    check_sensors(scene, media.objects)
     joins = find_joins(scene, media, join_share)
     return shapes, media, joins and replace(joins, scene=None)
 
@@ -92,6 +97,16 @@ def _render(tracer: PathTracer, sensor: Any, seed: int, spp: int) -> None:
     most = max(1, SAMPLES_PER_LAUNCH // int(dr.prod(_sampled_size(sensor.film()))))
     for launch, start in enumerate(range(0, spp, most)):
         _launch(tracer, sensor, min(most, spp - start), (seed, launch))
+
+
+def _samples(tracer: PathTracer, sampler: Any, ray: Any, active: Any) -> tuple[Any, Any, list]:
+    """Radiance along rays of another integrator around this one."""
+    import drjit as dr
+
+    with dr.suspend_grad():
+        seed = tuple(int(2**24 * sampler.next_1d()[0]) for _ in range(2))
+        L, seen = tracer.trace(_widened(ray, sampler.wavefront_size()), LANES, seed)
+    return dr.select(active, L, 0), active & seen, []
 
 
 def _launch(tracer: PathTracer, sensor: Any, spp: int, seed: tuple[int, int]) -> None:
@@ -145,9 +160,19 @@ def _camera_rays(sensor: Any, spp: int, seed: tuple[int, int]) -> tuple[Any, Any
     time = sensor.shutter_open()
     if sensor.shutter_open_time() > 0:
         time += sampler.next_1d() * sensor.shutter_open_time()
-    ray, weight = sensor.sample_ray(time, sampler.next_1d(), dr.fma(position, scale, offset), aperture)
+    ray, weight = sensor.sample_ray_differential(time, sampler.next_1d(), dr.fma(position, scale, offset), aperture)
     # in a box filter a position that rounding puts on the edge of a pixel belongs to the neighbour too
-    return ray, weight, mi.Vector2f(pixel) if film.rfilter().is_box_filter() else position
+    return _widened(ray, n), weight, mi.Vector2f(pixel) if film.rfilter().is_box_filter() else position
+
+
+def _widened(ray: Any, n: int) -> Any:
+    """n rays; those of a sensor that knows one ray only are one."""
+    import drjit as dr
+    import mitsuba as mi
+
+    found = mi.Ray3f(ray)
+    found.o, found.d = found.o + dr.zeros(mi.Point3f, n), found.d + dr.zeros(mi.Vector3f, n)
+    return found
 
 
 def _positive(name: str, value: float) -> float:

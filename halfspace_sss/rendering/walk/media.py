@@ -9,7 +9,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from halfspace_sss.rendering.surface.object import Object, survey
+from halfspace_sss.rendering.surface.object import Object, scene_of, survey
+from halfspace_sss.rendering.surface.placement import translucent_shapes
 from halfspace_sss.rendering.walk.grids import Grids, per_channel
 
 __all__ = ["Coefficients", "WalkMedia", "by_pointer", "pointer_numbers"]
@@ -163,8 +164,8 @@ class WalkMedia:
         """
         if not (np.isfinite(mm_per_unit) and mm_per_unit > 0):
             raise ValueError(f"mm_per_unit must be finite and > 0, got {mm_per_unit!r}")
-        shapes = [shape for shape in scene.shapes() if hasattr(shape.bsdf(), "inside")]
-        inner = mi.load_dict({"type": "scene", **{f"shape{k}": shape for k, shape in enumerate(shapes)}})
+        shapes = translucent_shapes(scene)
+        inner = scene_of(shapes)
         surfaces = [shape.bsdf() for shape in shapes]
         return cls(
             [survey(shape) for shape in shapes],

@@ -1,0 +1,151 @@
+"""Kinds of sensors, shapes, surfaces and integrators of Mitsuba with translucent objects: they work or are refused."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pytest
+from rendered import surface
+
+mi = pytest.importorskip("mitsuba")
+
+INTEGRATORS = ("bssrdf", "translucent_walk")
+FILM = {"type": "hdrfilm", "width": 8, "height": 4, "rfilter": {"type": "box"}}
+POINT = {**FILM, "width": 1, "height": 1}
+
+
+@pytest.fixture(autouse=True)
+def _variant():
+    from halfspace_sss import rendering
+
+    mi.set_variant("llvm_ad_rgb")
+    rendering.register()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
+
+
+def camera(z: float, film: dict | None = None, kind: str = "perspective", **more) -> dict:
+    at = mi.ScalarTransform4f().look_at([1.0, 0, z], [0, 0, z - 1 if z < 9 else 0], [0, 1, 0])
+    return {"type": kind, "to_world": at, **({"film": film} if film else {}), **more}
+
+
+def make(integrator: str | dict = "bssrdf", sensor: dict | None = None, **parts):
+    """A ball of radius 4 in a constant sky."""
+    if isinstance(integrator, str):
+        integrator = {"type": integrator}
+    ball = {"type": "sphere", "radius": 4.0, "bsdf": {**surface(orders="total"), "reflection": True}}
+    return mi.load_dict({"type": "scene", "integrator": integrator, "sky": {"type": "constant"}, "ball": ball,
+                         "sensor": sensor or camera(30.0, FILM, fov=20.0), **parts})  # fmt: skip
+
+
+def image(scene, spp: int = 64) -> np.ndarray:
+    return np.array(mi.render(scene, spp=spp, seed=1))
+
+
+def refusal(scene) -> str:
+    """What is said, by Mitsuba in the second place."""
+    with pytest.raises((ValueError, RuntimeError)) as caught:
+        image(scene, 1)
+    errors = [caught.value]
+    while errors[-1].__cause__ is not None:
+        errors.append(errors[-1].__cause__)
+    return str(errors[-1])
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_a_batch_of_cameras_shows_what_each_of_them_shows(integrator):
+    whole = image(make(integrator, {"type": "batch", "a": camera(30.0, fov=20.0), "b": camera(15.0, fov=50.0),
+                                    "film": FILM}), 4096)  # fmt: skip
+    half = {**FILM, "width": 4}
+    for k, one in enumerate((camera(30.0, half, fov=20.0), camera(15.0, half, fov=50.0))):
+        alone = image(make(integrator, one), 4096)
+        assert abs(whole[:, 4 * k : 4 * k + 4].mean() / alone.mean() - 1) < 0.01
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize(
+    "sensor",
+    [{"type": "batch", "a": {"z": 30.0}, "b": {"z": 1.0}}, {"kind": "thinlens", "aperture_radius": 0.1,
+     "focus_distance": 5.0}, {"kind": "orthographic"}],
+    ids=["one of a batch", "thin lens", "orthographic"],
+)  # fmt: skip
+def test_a_sensor_inside_an_object_is_refused(integrator, sensor):
+    if "type" in sensor:
+        parts = {name: camera(value["z"]) for name, value in sensor.items() if name != "type"}
+        sensor = {"type": "batch", **parts, "film": FILM}
+    else:
+        sensor = camera(1.0, FILM, **sensor)
+    assert refusal(make(integrator, sensor)) == "the camera must be outside of every object, got it inside 'ball'"
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_a_radiance_meter_sees_what_a_narrow_camera_sees(integrator):
+    meter = image(make(integrator, camera(30.0, POINT, "radiancemeter")), 2**15)
+    narrow = image(make(integrator, camera(30.0, POINT, fov=0.01)), 2**15)
+    assert abs(meter.mean() / narrow.mean() - 1) < 0.03
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_an_irradiance_meter_on_a_convex_object_sees_the_whole_sky(integrator):
+    meter = {"type": "irradiancemeter", "film": POINT}
+    parts = {"ball": {"type": "sphere", "radius": 4.0, "bsdf": surface(), "sensor": meter}}
+    scene = mi.load_dict({"type": "scene", "integrator": {"type": integrator}, "sky": {"type": "constant"}, **parts})
+    assert np.allclose(image(scene), np.pi, rtol=1e-4)
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_ids_survive_the_first_render(integrator):
+    scene = make(integrator, **{"a second ball": {"type": "sphere", "center": [9, 0, 0], "bsdf": surface()}})
+    before = list(mi.traverse(scene).keys())
+    image(scene, 1)
+    assert list(mi.traverse(scene).keys()) == before
+    assert {"ball.to_world", "ball.bsdf.albedo", "ball.bsdf.sigma_t", "ball.bsdf.g"} <= set(before)
+
+
+def grid(radius: float) -> object:
+    """The distance to a sphere in the unit cube."""
+    x = np.stack(np.meshgrid(*3 * [np.linspace(-0.5, 0.5, 32)], indexing="ij"), axis=-1)
+    return mi.TensorXf((np.linalg.norm(x, axis=-1) - radius)[..., None].astype(np.float32))
+
+
+def test_a_distance_field_looks_like_the_sphere_that_it_is_of():
+    at = mi.ScalarTransform4f()
+    bsdf = {**surface(orders="total"), "reflection": True}
+    field = {"type": "sdfgrid", "grid": grid(0.4), "to_world": at.scale(10.0).translate([-0.5, -0.5, -0.5])}
+    images = [image(make(ball={**shape, "bsdf": bsdf}), 512) for shape in (field, {"type": "sphere", "radius": 4.0})]
+    assert abs(images[0].mean() / images[1].mean() - 1) < 0.01
+
+
+def test_points_uniform_over_a_distance_field_are_refused():
+    field = {"type": "sdfgrid", "grid": grid(0.4), "to_world": mi.ScalarTransform4f().scale(10.0), "bsdf": surface()}
+    found = refusal(make({"type": "bssrdf", "area_share": 0.5}, ball=field))
+    assert found == "area_share must be 0 for 'ball', a SDFGrid without known area, got 0.5"
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("outer", [{"type": "moment"}, {"type": "aov", "aovs": "depth:depth"}], ids=["moment", "aov"])
+def test_integrators_around_ours_show_the_same_image(outer, integrator):
+    around = image(make({**outer, "nested": {"type": integrator}}), 512)[..., :3]
+    assert abs(around.mean() / image(make(integrator), 512).mean() - 1) < 0.01
+
+
+@pytest.mark.parametrize(
+    "wrapper, label",
+    [({"type": "twosided"}, "TwoSidedBRDF"), ({"type": "mask", "opacity": 0.5}, "MaskBSDF"),
+     ({"type": "blendbsdf", "weight": 0.5, "other": {"type": "diffuse"}}, "BlendBSDF"),
+     ({"type": "bumpmap", "map": {"type": "checkerboard"}}, "BumpMap"),
+     ({"type": "normalmap", "normalmap": {"type": "checkerboard"}}, "NormalMap")],
+)  # fmt: skip
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_a_translucent_surface_inside_of_another_is_refused(integrator, wrapper, label):
+    scene = make(integrator, second={"type": "cube", "bsdf": {**wrapper, "inner": surface()}})
+    assert refusal(scene) == f"a translucent surface must stand alone, got one inside the {label} of 'second'"
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_instances_of_a_translucent_object_are_refused(integrator):
+    group = {"type": "shapegroup", "part": {"type": "cube", "bsdf": surface()}}
+    scene = make(integrator, group=group, one={"type": "instance", "of": {"type": "ref", "id": "group"}})
+    assert "must stand in the scene itself, got 'part' in a shapegroup" in refusal(scene)
