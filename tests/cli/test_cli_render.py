@@ -173,8 +173,8 @@ def test_a_model_takes_the_place_of_an_integrator_that_does_not_know_the_inside(
         assert result.exit_code == 0
         told = "the integrator 'path' of the scene is replaced by"
         assert (told in result.stderr) == (kind == "path")
-        images.append(np.array(mi.Bitmap(str(scene.parent / kind / f"ball_{model}.exr"))))
-    assert np.array_equal(*images)
+        images.append(np.array(mi.Bitmap(str(scene.parent / kind / f"ball_{model}.exr")))[..., :3])
+    np.testing.assert_allclose(*images, rtol=1e-5, atol=1e-6)  # samples are added in any order
 
 
 def test_orders_take_the_place_of_an_integrator_that_does_not_know_the_inside(scene: Path) -> None:

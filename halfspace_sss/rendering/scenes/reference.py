@@ -92,14 +92,23 @@ def render(
         while not limits.reached(found):
             found = _pass(found, scene, integrator, sensor, about, _pass_spp(found, spp_per_pass, spp))
             if time.monotonic() - last >= interval:
-                save(path, found)
+                _keep(path, found)
                 written, last = found, time.monotonic()
             if progress is not None:
                 progress(found)
     finally:
         if found is not None and found is not written:
-            save(path, found)
+            _keep(path, found)
     return found
+
+
+def _keep(path: Path, found: Reference) -> None:
+    """Save, also if an interrupt comes in the middle of it."""
+    try:
+        save(path, found)
+    except KeyboardInterrupt:
+        save(path, found)
+        raise
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,142 @@
+"""How every command ends on bad input, interrupts, a full disk, a read-only folder: the table in docs/endings.md."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from render_files import XML
+
+pytestmark = pytest.mark.slow
+
+SMALL = {  # a small run of each command, and what it refuses
+    "ablation": (["--samples", "2000", "--seeds", "1", "--out", "o"], ["marbel"]),
+    "bench": (["--quick", "--only", "walk", "--out", "o"], ["--only", "nope"]),
+    "curves": (["--paths", "4096", "--theta-i", "0", "--model", "better_dipole", "--out", "o"], ["marbel"]),
+    "errors": (["--model", "better_dipole", "--events", "1e4", "--out", "o"], ["marbel"]),
+    "figures": (["compute", "fig10", "--out", "o"], ["compute", "nope"]),
+    "maps": (["--grid", "2,16,6,4", "--paths", "2048", "--out", "o"], ["marbel"]),
+    "materials": ([], ["marbel"]),
+    "models": ([], ["extra"]),
+    "render": (["ball.xml", "--spp", "4", "--out", "o"], ["none.xml"]),
+    "train": (["--out", "o", "--work", "o/work"], ["marbel"]),
+    "validate": (["--rows", "thirdparty", "--quick", "--out", "o"], ["--rows", "nope"]),
+}
+STUB = """
+import pandas
+from halfspace_sss.neural.training import ablation as module
+def stub(*_, progress, **__):
+    progress("maps", 0, 1)
+    row = {"budget": "2,000 samples", "variant": "x", "kB": 1.0, "samples": 1.0, "seconds": 1.0, "noise": 0.1}
+    return pandas.DataFrame([row | {k: 0.1 for k in ("error", "bias", "error_sd", "bias_sd", "r 1-10")}])
+module.ablation, module.summary = stub, lambda table: table
+"""
+HARNESS = """
+import os, signal, sys
+from halfspace_sss import cli_progress
+from halfspace_sss.cli import app as cli
+moment, stub = sys.argv[1:3]
+del sys.argv[1:3]
+exec(stub)
+def before(function):
+    def changed(*arguments, **options):
+        os.kill(os.getpid(), signal.SIGINT)
+        return function(*arguments, **options)
+    return changed
+if moment == "start":
+    made = cli._app()
+    cli._app = before(lambda: made)
+elif moment == "progress":
+    cli_progress.Bar.show = before(cli_progress.Bar.show)
+elif moment == "file":
+    os.fsync, os.replace = before(os.fsync), before(os.replace)
+cli.main()
+"""
+COLUMNS = {
+    "bad input": ("none", "work", "2"),
+    "interrupt at the start": ("start", "work", "130"),
+    "interrupt at the first progress": ("progress", "work", "130"),
+    "interrupt at the first file": ("file", "work", "130"),
+    "full disk": ("none", "full", "1"),
+    "read-only folder": ("none", "locked", "2"),
+}
+MOUNTS = {"full": "size=4k", "locked": "ro"}
+NO_FILES = ("materials", "models")
+
+
+def _ended(command: str, column: str, folder: Path) -> tuple[str, str, set[str]]:
+    """Exit code, stderr and files left of a run."""
+    moment, place, _ = COLUMNS[column]
+    small, wrong = SMALL[command]
+    (folder / "ball.xml").write_text(XML)
+    arguments = [command, *(wrong if column == "bad input" else small)]
+    run = [sys.executable, "-c", HARNESS, moment, STUB if command == "ablation" else "", *arguments]
+    if place in MOUNTS:
+        (folder / "o").mkdir()
+        script = f'mount -t tmpfs -o {MOUNTS[place]} none o && "$@"; code=$?; find o -type f >left; exit $code'
+        run = ["unshare", "-rm", "sh", "-c", script, "sh", *run]
+    done = subprocess.run(run, capture_output=True, text=True, cwd=folder, timeout=600)
+    mounted = (folder / "left").read_text().split("\n") if place in MOUNTS else []
+    found = {*mounted, *(str(p.relative_to(folder)) for p in (folder / "o").rglob("*") if p.is_file())} - {""}
+    return str(done.returncode), done.stderr, found
+
+
+def _kinds(files: set[str]) -> str:
+    """The files in the folder of the results, a store as one."""
+    names = {re.sub(r"\.zarr/.*", ".zarr/", name.removeprefix("o/")) for name in files}
+    return ", ".join(sorted(names)) or "none"
+
+
+@pytest.fixture(scope="module")
+def table(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, str], tuple[str, str, set[str]]]:
+    if shutil.which("unshare") is None or subprocess.run(["unshare", "-rm", "true"]).returncode:
+        pytest.skip("a full disk and a read-only folder need a mount namespace")
+    found = {}
+    for command in SMALL:
+        for column in COLUMNS:
+            if command in NO_FILES and column not in ("bad input", "interrupt at the start"):
+                continue
+            found[command, column] = _ended(command, column, tmp_path_factory.mktemp("run"))
+    return found
+
+
+def test_every_command_is_in_the_table() -> None:
+    from halfspace_sss.cli import app as cli
+
+    assert {info.name for info in cli.app.registered_commands} == set(SMALL)
+
+
+def test_exit_codes_are_those_that_are_promised(table: dict) -> None:
+    assert {key: code for key, (code, _, _) in table.items()} == {key: COLUMNS[key[1]][2] for key in table}
+
+
+def test_no_command_ends_with_a_traceback_or_in_silence(table: dict) -> None:
+    for key, (_, messages, _) in table.items():
+        assert "Traceback" not in messages and messages.strip(), (key, messages)
+
+
+def test_bad_input_and_a_read_only_folder_leave_no_file(table: dict) -> None:
+    left = {key: files for key, (_, _, files) in table.items() if COLUMNS[key[1]][2] == "2" and files}
+    assert not left
+
+
+def test_no_temporary_file_is_left(table: dict) -> None:
+    hidden = {key: [n for n in files if re.search(r"(^|/)\.(?!z)", n)] for key, (_, _, files) in table.items()}
+    assert not {key: names for key, names in hidden.items() if names}
+
+
+def test_the_table_of_the_documentation_is_what_happens(table: dict) -> None:
+    lines = ["| command | " + " | ".join(COLUMNS) + " |", "|---" * (len(COLUMNS) + 1) + "|"]
+    for command in SMALL:
+        cells = (table.get((command, column)) for column in COLUMNS)
+        lines.append(f"| `{command}` | " + " | ".join(f"{c[0]}: {_kinds(c[2])}" if c else "–" for c in cells) + " |")
+    document = Path(__file__).parent.parent / "docs" / "endings.md"
+    if "HALFSPACE_SSS_WRITE_DOCS" in os.environ:
+        head = document.read_text().split("| command")[0]
+        document.write_text(head + "\n".join(lines) + "\n")
+    assert "\n".join(lines) in document.read_text()
