@@ -95,6 +95,29 @@ def _prepare(variant: str) -> None:
     except ImportError as error:
         raise BackendError(f"variant {variant} does not run here: {error}") from error
     rendering.register()
+    _hear_warnings()
+
+
+def _hear_warnings() -> None:
+    """Mitsuba's warnings as ours, on stderr: by itself it prints them among the results."""
+    import mitsuba as mi
+
+    class Lines(mi.Appender):
+        def __init__(self) -> None:
+            mi.Appender.__init__(self)
+
+        def append(self, level: Any, text: str) -> None:
+            if level >= mi.LogLevel.Warn:
+                typer.echo(f"warning: {' '.join(text.split())}", err=True)
+
+        def log_progress(self, *_: Any) -> None:
+            pass
+
+    logger = mi.logger()
+    for part in ("date", "class", "thread", "log_level"):
+        getattr(logger.formatter(), f"set_has_{part}")(False)
+    logger.clear_appenders()
+    logger.add_appender(Lines())
 
 
 def _parameters(texts: list[str]) -> dict[str, str]:

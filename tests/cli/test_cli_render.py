@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import re
 import signal
 import subprocess
 import time
@@ -187,6 +188,20 @@ def test_an_integrator_that_does_not_know_the_inside_is_warned_of(scene: Path) -
     result = _render(scene, "--spp", "1")
     (line,) = [line for line in result.stderr.splitlines() if line.startswith("warning: ")]
     assert "the integrator 'path' of the scene shows no light from inside" in line
+
+
+def test_a_warning_of_mitsuba_is_a_line_on_stderr(scene: Path, monkeypatch: Any) -> None:
+    from halfspace_sss.rendering.scenes import scene_files
+
+    load = scene_files.load_scene
+
+    def warned(*arguments: Any) -> Any:
+        mi.Log(mi.LogLevel.Warn, "the lens is\n thick")
+        return load(*arguments)
+
+    monkeypatch.setattr(scene_files, "load_scene", warned)
+    result = _render(scene, "--spp", "1")
+    assert re.search(r"^warning: .*the lens is thick$", result.stderr, re.MULTILINE) and "thick" not in result.stdout
 
 
 def test_a_scene_without_integrator_is_rendered_by_ours(scene: Path) -> None:
