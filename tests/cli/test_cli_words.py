@@ -13,10 +13,11 @@ import typer
 from typer.testing import CliRunner
 
 import halfspace_sss
+from halfspace_sss import materials
 from halfspace_sss.cli import app as cli
-from halfspace_sss.cli import cli_progress, materials
 from halfspace_sss.cli import errors as cli_errors
 from halfspace_sss.cli import interrupts as cli_interrupts
+from halfspace_sss.cli import progress as cli_progress
 from halfspace_sss.materials import Material
 from halfspace_sss.physics.medium import Medium
 

@@ -109,7 +109,8 @@ def test_walks_count_their_scattering_events() -> None:
 
 def test_a_visitor_sees_every_scattering_event() -> None:
     import drjit as dr
-    from halfspace_sss.rendering.walk_exits import ExitVisitor, walk_from
+
+    from halfspace_sss.rendering.walk.exits import ExitVisitor, walk_from
 
     n = 4096
     media = _media({"type": "sphere", "radius": 2.0}, sigma_s="1,0.8,0.3", sigma_a="0.01,0.2,0.7", g=0.5, eta=1.4)

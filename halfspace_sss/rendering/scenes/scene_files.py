@@ -10,7 +10,7 @@ from typing import Any
 
 from halfspace_sss.interface.model import models
 from halfspace_sss.rendering.scenes.causes import first_cause
-from halfspace_sss.rendering.surface.translucent import ORDERS
+from halfspace_sss.rendering.surface.inside import ORDERS
 
 __all__ = ["PATH_TRACED", "load_scene"]
 

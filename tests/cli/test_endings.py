@@ -38,7 +38,7 @@ module.ablation, module.summary = stub, lambda table: table
 """
 HARNESS = """
 import os, signal, sys
-from halfspace_sss import cli_progress
+from halfspace_sss.cli import progress as cli_progress
 from halfspace_sss.cli import app as cli
 moment, stub = sys.argv[1:3]
 del sys.argv[1:3]
