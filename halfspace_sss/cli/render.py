@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import signal
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -11,6 +12,7 @@ import typer
 
 from halfspace_sss.backend import BackendError, prepare_llvm
 from halfspace_sss.cli.shared import Bar, console, whole
+from halfspace_sss.cli_interrupts import interrupts
 from halfspace_sss.extensions import renderer
 from halfspace_sss.provenance import check_folder, replace_together, write_atomically
 
@@ -107,7 +109,9 @@ def _hear_warnings() -> None:
             mi.Appender.__init__(self)
 
         def append(self, level: Any, text: str) -> None:
-            if level >= mi.LogLevel.Warn:
+            if "Received interrupt signal" in text:  # while it renders Mitsuba listens in the place of Python
+                interrupts.received = interrupts.received or signal.SIGINT
+            elif level >= mi.LogLevel.Warn:
                 typer.echo(f"warning: {' '.join(text.split())}", err=True)
 
         def log_progress(self, *_: Any) -> None:

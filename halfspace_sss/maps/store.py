@@ -15,6 +15,7 @@ import numpy as np
 
 from halfspace_sss.backend import array_types
 from halfspace_sss.checks import check_count, check_interval
+from halfspace_sss.map_chunks import check_chunks
 from halfspace_sss.maps.grid import MapGrid, cell_edges, map_directions
 from halfspace_sss.maps.map_tracing import MapUnit, UnitResult, trace_unit
 from halfspace_sss.physics.medium import Medium
@@ -186,6 +187,7 @@ def _open(path: Path) -> xr.Dataset:
     import xarray as xr
 
     try:
+        check_chunks(path)
         dataset = xr.open_zarr(path, chunks=None)
         asked = json.loads(dataset.attrs["halfspace_sss_maps"])
         missing = {*DATA, "checksum", "n_paths", "n_events"} - set(dataset.data_vars)
