@@ -66,6 +66,7 @@ class HalfSpaceTransport:
     def __init__(self, subject: Subject, model: str) -> None:
         self.name = model
         self.models: list[BSSRDF] = [bssrdf(model, m) for m in subject.media]
+        self.orders = self.models[0].orders
 
     def prepare(self, at: SurfacePoint, active: Any = True) -> SurfacePoint:
         """Nothing is done for the exit alone."""

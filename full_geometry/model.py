@@ -43,6 +43,7 @@ class FullGeometry:
     frame: Frame
     half_space: HalfSpace
     weights: Mapping[str, np.ndarray]
+    orders = "multiple"
 
     @property
     def depth(self) -> int:

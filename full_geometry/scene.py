@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from full_geometry.entries import AREA_SHARE, LearntProposals
+from full_geometry.learnable import check_surface
 from full_geometry.model import FullGeometry, PreparedExit
 from full_geometry.storing import find_weights, load
 from full_geometry.subject import Subject, SurfacePoint
@@ -55,8 +56,9 @@ def learnt_means(found: Object, inside: Inside, media: list[Medium], settings: S
     """Transport and proposals of an object that was trained.
 
     Raises:
-        ValueError: the object was not trained, its boundary is rough, or weights are damaged.
+        ValueError: the object was not trained or cannot be, or weights are damaged.
     """
+    check_surface(found.shape.id(), found.shape.bsdf())
     subject = Subject.surveyed(found, tuple(media))
     model, sampler = load(find_weights(subject), subject)
     transport = LearntTransport(model, found.sign)

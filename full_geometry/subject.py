@@ -9,9 +9,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from full_geometry.learnable import check_geometry, object_of
 from halfspace_sss.physics.medium import Medium
+from halfspace_sss.rendering.scenes.scene_files import millimetres
 from halfspace_sss.rendering.surface.object import Object, survey
 from halfspace_sss.rendering.transport.area_points import AreaPoints
+from halfspace_sss.rendering.transport.body import check_size
 from halfspace_sss.rendering.transport.plane import number
 from halfspace_sss.rendering.walk.media import Coefficients
 
@@ -77,32 +80,41 @@ class Subject:
 
     @classmethod
     def surveyed(cls, found: Object, media: tuple[Medium, ...]) -> Subject:
-        """The object of a known geometry and the scalar medium of each channel, 1/(scene unit)."""
+        """The object of a known geometry and the scalar medium of each channel, 1/(scene unit).
+
+        Raises:
+            ValueError: its normals point to both sides.
+        """
         import mitsuba as mi
 
+        check_geometry(found)
         boundary = mi.load_dict({"type": "dielectric", "int_ior": media[0].eta, "ext_ior": 1.0})
         return cls(found, media, boundary, AreaPoints(found.shape))
 
     @classmethod
-    def given(cls, shape: Any, medium: Medium | None, mm_per_unit: float = 1.0, name: str | None = None) -> Subject:
+    def given(
+        cls, shape: Any, medium: Medium | None, mm_per_unit: float | None = None, name: str | None = None
+    ) -> Subject:
         """The object of a shape and a medium, or the one called `name` in a scene.
 
+        Args:
+            shape: a Mitsuba shape or scene.
+            medium: 1/mm; of a scene it is that of the object's `translucent` surface.
+            mm_per_unit: length of a scene unit, mm; by default what the integrator of a scene says, and 1 for a shape.
+            name: id of the object; may be left out where there is one.
+
         Raises:
-            ValueError: a scene has no such object with a smooth `translucent` surface, a medium is missing, or as `of`.
+            ValueError: a scene has no such object, or one that cannot be learnt; a medium is missing; or as `of`.
         """
         import mitsuba as mi
 
         if not isinstance(shape, mi.Scene):
-            return cls.of(shape, medium, mm_per_unit)
-        known = {s.id(): s for s in shape.shapes() if hasattr(s.bsdf(), "inside")}
-        if name is None and len(known) == 1:
-            name = next(iter(known))
-        if name not in known:
-            raise ValueError(f"object must be one of {', '.join(known) or 'none'}, got {name!r}")
-        surface = known[name].bsdf()
-        if surface.boundary.flags() & int(mi.BSDFFlags.Smooth):
-            raise ValueError(f"the boundary of {name!r} must be smooth to be learnt, got a rough one")
-        return cls.of(known[name], surface.inside.medium, mm_per_unit)
+            return cls.of(shape, medium, 1.0 if mm_per_unit is None else mm_per_unit)
+        found = object_of(shape, name)
+        unit = millimetres(shape) if mm_per_unit is None else mm_per_unit
+        subject = cls.of(found, found.bsdf().inside.medium, unit)
+        check_size(subject.found, subject.media, unit)
+        return subject
 
     @property
     def eta(self) -> float:

@@ -4,6 +4,7 @@
 - `halfspace_sss.materials`: path of a material file or folder, or an iterable of `Material`.
 - `halfspace_sss.commands`: name -> function with typer annotations, a further command of `halfspace-sss`.
 - `halfspace_sss.transports`: mapping of names to "module:function", see `rendering.surface.transports`.
+- `halfspace_sss.learners`: name of a model -> what learns it, see `rendering.scenes.learners`.
 - `halfspace_sss.figures`: kind of result -> function that takes the result and returns {file ending: bytes}.
 
 What a package offers may fail in any way: it is left out with a warning in one line that names it, and nothing else is.
@@ -20,6 +21,7 @@ __all__ = [
     "COMMANDS",
     "FAILURES",
     "FIGURES",
+    "LEARNERS",
     "MODELS",
     "TRANSPORTS",
     "commands",
@@ -29,7 +31,7 @@ __all__ = [
 ]
 
 COMMANDS, FIGURES, MODELS = "halfspace_sss.commands", "halfspace_sss.figures", "halfspace_sss.models"
-TRANSPORTS = "halfspace_sss.transports"
+LEARNERS, TRANSPORTS = "halfspace_sss.learners", "halfspace_sss.transports"
 FAILURES = (Exception, SystemExit)  # what code of somebody else may end with
 OWN = ("analytic_models", "figures", "full_geometry", "halfspace_sss")
 Renderer = Callable[[Any], dict[str, bytes]]

@@ -11,6 +11,7 @@ for lobes the mean of the four; its standard error by the jackknife over exits.
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
@@ -22,19 +23,27 @@ from full_geometry.learning.pairs import Proposals
 from full_geometry.subject import Subject, SurfacePoint
 from halfspace_sss.checks import check_count
 from halfspace_sss.physics.medium import Medium
+from halfspace_sss.progress import NamedProgress
 from halfspace_sss.tracing.walk import _generator, pass_seed
 
-__all__ = ["LIGHTS", "ModelError", "Reference", "Transport", "compare", "errors", "measure", "reference"]
+__all__ = ["LIGHTS", "ModelError", "Reference", "Transport", "compare", "errors", "errors_of", "measure", "reference"]
 
 LIGHTS = ("constant", "lobes")
 LOBES = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / np.sqrt(3.0)
 POWER = 16
 LANES = 2**20  # of one pass
+FEWEST = {"multiple": 2, "total": 1}  # scattering events of what a model contains
 PROBES = "better_dipole"  # whose radial density entries follow
 
 
 class Transport(Protocol):
-    """A model of what light that enters an object is worth where it leaves."""
+    """A model of what light that enters an object is worth where it leaves.
+
+    Attributes:
+        orders: "multiple" (two or more scattering events) or "total" (one or more).
+    """
+
+    orders: str
 
     def prepare(self, at: SurfacePoint, active: Any = True) -> Any: ...
 
@@ -195,13 +204,55 @@ def measure(
         subject: the object.
         transport: `FullGeometry` or `HalfSpaceTransport`.
         proposals: where entries are drawn.
-        truth: from `reference`; made anew by default.
+        truth: from `reference`, of the orders of the transport; made anew by default.
         samples: entries of each exit.
         seed: of everything.
     """
     check_count("samples", samples, 2)
-    truth = truth or reference(subject, seed=seed)
+    truth = truth or reference(subject, seed=seed, fewest=FEWEST[transport.orders])
     return compare(modelled(transport, proposals, truth.exits, samples, seed), truth.truth)
+
+
+def errors_of(
+    subject: Subject,
+    transports: Mapping[str, Transport],
+    *,
+    exits: int = 256,
+    walks: int = 8192,
+    samples: int = 8192,
+    seed: int = 0,
+    progress: NamedProgress | None = None,
+) -> dict[str, list[ModelError]]:
+    """The errors of several transports of an object, by name; the truth is traced once for all of the same orders.
+
+    Args:
+        subject: the object.
+        transports: by name.
+        exits: number of exits.
+        walks, samples: of each exit, for the truth and for the models.
+        seed: of everything.
+        progress: called with (what, done, total).
+    """
+    check_count("samples", samples, 2)
+    proposals = Proposals(subject, HalfSpace(subject, PROBES))
+    truths: dict[str, Reference] = {}
+    found, done = {}, 0
+    total = len(transports) + len({t.orders for t in transports.values()})
+
+    def tell(what: str, steps: int) -> None:
+        if progress:
+            progress(what, steps, total)
+
+    for name, model in transports.items():
+        if model.orders not in truths:
+            tell("truth", done)
+            truths[model.orders] = reference(subject, exits, walks, seed, FEWEST[model.orders])
+            done += 1
+        tell(name, done)
+        found[name] = measure(subject, model, proposals, truth=truths[model.orders], samples=samples, seed=seed)
+        done += 1
+    tell("models", total)
+    return found
 
 
 def errors(
@@ -209,7 +260,7 @@ def errors(
     medium: Medium | None = None,
     model: str = "full_geometry",
     *,
-    mm_per_unit: float = 1.0,
+    mm_per_unit: float | None = None,
     object: str | None = None,
     folder: str | os.PathLike | None = None,
     exits: int = 256,
@@ -219,13 +270,13 @@ def errors(
 ) -> list[ModelError]:
     """The error of a model of an object, by name: what a user is to expect of images before the first one.
 
-    Orders two and more; single scattering is exact beside every model.
+    The truth has the orders of the model: two and more, or for a model that says "total" one and more.
 
     Args:
         shape: a Mitsuba shape, or a scene.
         medium: 1/mm; of a scene it is that of the object's `translucent` surface.
         model: "full_geometry", whose weights must have been trained, or the name of a half-space model.
-        mm_per_unit: length of a scene unit, mm.
+        mm_per_unit: length of a scene unit, mm; by default what the integrator of a scene says, and 1 for a shape.
         object: id of the object in a scene; may be left out where there is one.
         folder: of weights.
         exits: number of exits.
@@ -238,6 +289,5 @@ def errors(
     from full_geometry.storing import transport
 
     subject = Subject.given(shape, medium, mm_per_unit, object)
-    found = transport(subject, model, folder)
-    proposals = Proposals(subject, HalfSpace(subject, PROBES))
-    return measure(subject, found, proposals, truth=reference(subject, exits, walks, seed), samples=samples, seed=seed)
+    found = {model: transport(subject, model, folder)}
+    return errors_of(subject, found, exits=exits, walks=walks, samples=samples, seed=seed)[model]

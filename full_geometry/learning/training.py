@@ -64,7 +64,7 @@ def train(
     shape: Any,
     medium: Medium | None = None,
     *,
-    mm_per_unit: float = 1.0,
+    mm_per_unit: float | None = None,
     object: str | None = None,
     seconds: float = 60.0,
     target_error: float | None = None,
@@ -84,7 +84,7 @@ def train(
         shape: a closed Mitsuba shape, or a scene.
         medium: 1/mm, scalar or with one value per channel of the variant; of a scene it is that of the object's
             `translucent` surface.
-        mm_per_unit: length of a scene unit, mm.
+        mm_per_unit: length of a scene unit, mm; by default what the integrator of a scene says, and 1 for a shape.
         object: id of the object in a scene; may be left out where there is one.
         seconds: for data, fit and validation, after the kernels are compiled; 0 gives the half-space, with a warning.
         target_error: stop once the largest error under constant light has come down to it.

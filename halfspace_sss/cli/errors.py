@@ -1,9 +1,9 @@
-"""The command `halfspace-sss errors`: every model against path-traced maps, on materials or on held-out media."""
+"""The command `halfspace-sss errors`: every model against path tracing, on materials, held-out media or an object."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,13 +14,18 @@ from halfspace_sss.checks import check_choice
 from halfspace_sss.cli.shared import (
     Albedo,
     Bar,
+    Define,
     Eta,
     MeanCosine,
     SigmaT,
+    Variant,
     by_channel,
     check_channel,
+    check_left_out,
     console,
+    defined,
     stated_medium,
+    use_mitsuba,
     whole,
 )  # fmt: skip
 from halfspace_sss.provenance import check_folder
@@ -29,14 +34,20 @@ if TYPE_CHECKING:
     import pandas
 
     from halfspace_sss.physics.medium import Medium
+    from halfspace_sss.rendering.scenes.learners import ObjectError
 
-__all__ = ["errors_command"]
+__all__ = ["OBJECT_DEFINITION", "errors_command", "object_table"]
 
-EVENTS = 2e7  # for each medium
+EVENTS, BLOCK, BACKEND, VARIANT = 2e7, 4, "llvm", "llvm_ad_rgb"  # events for each medium
 HIDDEN = 0.3  # of the noise: an error below it raised the spread by less than 5 %, which may be chance
 DEFINITION = (
     "error: sum |E_model - E_traced| / sum E_traced over unseen pairs of directions, E = ∫ S mu_i mu_o dA over "
     "blocks of {0} x {0} cells of 40 x 16 from r = 0.02 mfp on; noise of the reference taken out; orders of each model"
+)
+
+OBJECT_DEFINITION = (
+    "error: relative RMSE of the radiance of random exits under constant light, or of four lobes cos^16, against "
+    "walks; noise of both taken out; orders of each model"
 )
 
 
@@ -55,15 +66,23 @@ def errors_command(
     truths: Annotated[
         bool, typer.Option("--truths", help="Reflectance against published and exact values instead.")
     ] = False,
+    scene: Annotated[
+        Path | None, typer.Option(help="Mitsuba XML file: radiance of an object of it against walks instead.")
+    ] = None,
+    object: Annotated[
+        str | None, typer.Option(help="Its id in the scene.", show_default="the only translucent one")
+    ] = None,
     sigma_t: SigmaT = None,
     albedo: Albedo = None,
     g: MeanCosine = None,
     eta: Eta = None,
     model: Annotated[list[str] | None, typer.Option(help="A model; repeat for more.", show_default="all")] = None,
     events: Annotated[float, typer.Option(help="Scattering events of the reference for each medium.")] = EVENTS,
-    block: Annotated[int, typer.Option(help="Cells put together for the comparison, in distance and azimuth.")] = 4,
+    block: Annotated[int, typer.Option(help="Cells put together for the comparison, in distance and azimuth.")] = BLOCK,
     seed: Annotated[int, typer.Option(help="Seed of media, directions and walks.", parser=whole)] = 0,
-    backend: Annotated[str, typer.Option(help="llvm or cuda.")] = "llvm",
+    backend: Annotated[str, typer.Option(help="llvm or cuda.")] = BACKEND,
+    define: Define = None,
+    variant: Variant = VARIANT,
     out: Annotated[Path, typer.Option(help="Folder for the files; those of the same names are replaced.")] = Path(
         "errors"
     ),
@@ -71,16 +90,20 @@ def errors_command(
     """Compare models with path tracing over all directions: error, bias, decades of r; written as CSV and JSON."""
     from halfspace_sss.comparison import held_out as tables
 
+    given = {"sigma_t": sigma_t, "albedo": albedo, "g": g, "eta": eta}
+    if scene is not None:
+        changed = {"events": (events, EVENTS), "block": (block, BLOCK), "backend": (backend, BACKEND)}
+        others = {"material": material, "channel": channel, "registry": registry, "held_out": held_out,
+                  "as_trained": as_trained, "truths": truths, **given}  # fmt: skip
+        check_left_out({**others, **{k: None if a == b else a for k, (a, b) in changed.items()}}, "with --scene")
+        _object(scene, model or [], {"object": object, "seed": seed}, variant, define, out)
+        return
+    of_scenes = {"object": object, "define": define, "variant": None if variant == VARIANT else variant}
+    check_left_out(of_scenes, "without --scene")
     if truths:
         _truths(material or registry or held_out is not None, model, out)
         return
-    media = _media(
-        (material or [], channel),
-        registry,
-        (held_out, as_trained),
-        seed,
-        {"sigma_t": sigma_t, "albedo": albedo, "g": g, "eta": eta},
-    )
+    media = _media((material or [], channel), registry, (held_out, as_trained), seed, given)
     _check(model, events, block, seed)
     _check_accepted(model or (), list(media.values()))
     array_types(backend)
@@ -92,10 +115,48 @@ def errors_command(
 
         found = tables.references(list(media.values()), events * len(media), seed, block, show, backend)
         table = tables.error_table(media, found, model or None, show)
-    files = _write(out, table, tables.percentiles(table), {"events": events, "block": block, "seed": seed})
+    how = {"events": events, "block": block, "seed": seed}
+    files = _write(out, table, tables.percentiles(table), DEFINITION.format(block), how)
     _report(table, tables, len(media), block)
     for file in files:
         console().print(f"  {file}", highlight=False, markup=False, soft_wrap=True)
+
+
+def _object(
+    scene: Path, models: list[str], how: dict[str, Any], variant: str, define: list[str] | None, out: Path
+) -> None:
+    """Errors of models of an object of a scene: files and a table."""
+    import pandas
+
+    parameters = defined(define)
+    check_folder(out)
+    use_mitsuba(variant)
+    from halfspace_sss.rendering.scenes.learners import learner
+    from halfspace_sss.rendering.scenes.scene_files import load_objects
+
+    measures, loaded = learner(), load_objects(scene, parameters)
+    with Bar("errors") as bar:
+        rows = measures.errors(loaded, models, **how, progress=lambda what, done, total: bar.show(done, total, what))
+    table = pandas.DataFrame(rows)
+    files = _write(out, table, table, OBJECT_DEFINITION, {"scene": str(scene), **how})
+    screen = console()
+    screen.print(object_table(rows), OBJECT_DEFINITION, highlight=False, sep="\n")
+    for file in files:
+        screen.print(f"  {file}", highlight=False, markup=False, soft_wrap=True)
+
+
+def object_table(rows: Sequence[ObjectError]) -> Any:
+    """Errors of models of an object."""
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table
+
+    table = Table(title="errors, %", box=SIMPLE_HEAD, pad_edge=False)
+    for heading in ("object", "channel", "model", "light", "error", "standard error", "mean / traced mean"):
+        table.add_column(heading, justify="right" if heading[0] in "ems" and heading != "model" else "left")
+    for row in rows:
+        numbers = (f"{100 * row.error:.3g}", f"{100 * row.standard_error:.2g}", f"{row.ratio:.3f}")
+        table.add_row(row.object, row.channel, row.model, row.light, *numbers)
+    return table
 
 
 def _truths(others: bool, names: list[str] | None, out: Path) -> None:
@@ -183,10 +244,12 @@ def _check_accepted(names: Iterable[str], media: list[Medium]) -> None:
                     raise
 
 
-def _write(out: Path, table: pandas.DataFrame, summary: pandas.DataFrame, how: dict[str, Any]) -> list[Path]:
+def _write(
+    out: Path, table: pandas.DataFrame, summary: pandas.DataFrame, definition: str, how: dict[str, Any]
+) -> list[Path]:
     from halfspace_sss.provenance import provenance, write_together
 
-    content = {"provenance": provenance(**how), "definition": DEFINITION.format(how["block"])}
+    content = {"provenance": provenance(**how), "definition": definition}
     content["summary"] = json.loads(summary.to_json(orient="records"))
     files = {"errors.csv": table.to_csv(index=False, lineterminator="\n"), "errors.json": json.dumps(content, indent=1)}
     write_together({out / name: text for name, text in files.items()})

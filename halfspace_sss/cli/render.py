@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import math
-import signal
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from halfspace_sss.backend import BackendError, prepare_llvm
-from halfspace_sss.cli.shared import Bar, console, whole
-from halfspace_sss.cli_interrupts import interrupts
+from halfspace_sss.backend import BackendError
+from halfspace_sss.cli.shared import Bar, Define, Variant, console, defined, use_mitsuba, whole
 from halfspace_sss.extensions import renderer
 from halfspace_sss.provenance import check_folder, replace_together, write_atomically
 
@@ -28,7 +26,6 @@ __all__ = ["render_command"]
 
 SPP = 64
 ENDINGS = ("png", "html", "denoised.exr", "denoised.png")  # of what is drawn
-VARIANTS = ("llvm_ad_rgb", "llvm_ad_mono", "cuda_ad_rgb", "cuda_ad_mono")
 
 
 def render_command(
@@ -46,15 +43,12 @@ def render_command(
     seconds: Annotated[float | None, typer.Option(help="Stop after this time of rendering.")] = None,
     seed: Annotated[int, typer.Option(help="Seed of the samples.", parser=whole)] = 0,
     sensor: Annotated[int, typer.Option(help="Number of the sensor.", parser=whole)] = 0,
-    define: Annotated[
-        list[str] | None,
-        typer.Option("--define", "-D", help="Value of $NAME in the scene; repeat for more.", metavar="NAME=VALUE"),
-    ] = None,
+    define: Define = None,
     denoise: Annotated[bool, typer.Option("--denoise", help="An image without noise beside the other.")] = False,
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on with the unfinished or finished render of the same settings.")
     ] = False,
-    variant: Annotated[str, typer.Option(help="Variant of Mitsuba.")] = "llvm_ad_rgb",
+    variant: Variant = "llvm_ad_rgb",
     out: Annotated[Path, typer.Option(help="Folder for the files; those of the same names are replaced.")] = Path(
         "render"
     ),
@@ -63,7 +57,7 @@ def render_command(
 
     Until it is done, NAME_MODEL.unfinished.exr holds it, and the files of before stay.
     """
-    _prepare(variant)
+    use_mitsuba(variant)
     from halfspace_sss.checks import check_count
     from halfspace_sss.rendering.scenes.picture import Picture
     from halfspace_sss.rendering.scenes.reference import Limits
@@ -71,65 +65,13 @@ def render_command(
 
     limits = Limits(SPP if (spp, target_error, seconds) == (None,) * 3 else spp, None, target_error, seconds)
     check_count("seed", seed, 0)
-    parameters, draw = _parameters(define or []), _renderer(denoise)
+    parameters, draw = defined(define), _renderer(denoise)
     check_folder(out)
     loaded = load_scene(scene, model, orders, parameters)
     file = out / f"{scene.stem}_{model or 'scene'}{f'_sensor{sensor}' if sensor else ''}.exr"
     found = _rendered(loaded, file, limits, {"seed": seed, "sensor": sensor}, resume)
     picture = Picture(file.stem, _colours(found.mean), _numbers(found), _error(found), loaded, sensor, denoise)
     _report(found, _publish(picture, file, draw))
-
-
-def _prepare(variant: str) -> None:
-    """Mitsuba with our plugins."""
-    if variant not in VARIANTS:
-        raise ValueError(f"variant must be one of {', '.join(VARIANTS)}, got {variant!r}")
-    if variant.startswith("llvm"):
-        prepare_llvm()
-    try:
-        import mitsuba as mi
-    except ImportError as error:
-        raise BackendError('rendering needs Mitsuba 3: pip install "halfspace-sss[render]"') from error
-    from halfspace_sss import rendering
-
-    try:
-        mi.set_variant(variant)
-    except ImportError as error:
-        raise BackendError(f"variant {variant} does not run here: {error}") from error
-    rendering.register()
-    _hear_warnings()
-
-
-def _hear_warnings() -> None:
-    """Mitsuba's warnings as ours, on stderr: by itself it prints them among the results."""
-    import mitsuba as mi
-
-    class Lines(mi.Appender):
-        def __init__(self) -> None:
-            mi.Appender.__init__(self)
-
-        def append(self, level: Any, text: str) -> None:
-            if "Received interrupt signal" in text:  # while it renders Mitsuba listens in the place of Python
-                interrupts.received = interrupts.received or signal.SIGINT
-            elif level >= mi.LogLevel.Warn:
-                typer.echo(f"warning: {' '.join(text.split())}", err=True)
-
-        def log_progress(self, *_: Any) -> None:
-            pass
-
-    logger = mi.logger()
-    for part in ("date", "class", "thread", "log_level"):
-        getattr(logger.formatter(), f"set_has_{part}")(False)
-    logger.clear_appenders()
-    logger.add_appender(Lines())
-
-
-def _parameters(texts: list[str]) -> dict[str, str]:
-    pairs = [text.partition("=") for text in texts]
-    for text, (name, equals, _) in zip(texts, pairs):
-        if not (name.isidentifier() and equals):
-            raise ValueError(f"define must be NAME=VALUE, got {text!r}")
-    return {name: value for name, _, value in pairs}
 
 
 def _renderer(denoise: bool) -> Renderer | None:

@@ -5,19 +5,23 @@ from __future__ import annotations
 import functools
 import inspect
 import math
+import signal
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from halfspace_sss.backend import BackendError, prepare_llvm
+from halfspace_sss.cli.interrupts import interrupts
 from halfspace_sss.cli.progress import Bar, console, set_quiet
 
 if TYPE_CHECKING:
     from halfspace_sss.physics.medium import Medium
 
 __all__ = [
-    "FIG10", "Albedo", "Backend", "Bar", "Eta", "MeanCosine", "SigmaT", "console", "numbers", "stated_medium", "whole",
-    "by_channel", "check_channel", "with_quiet",
+    "FIG10", "Albedo", "Backend", "Bar", "Define", "Eta", "MeanCosine", "SigmaT", "Variant", "by_channel",
+    "check_channel", "check_left_out", "console", "defined", "numbers", "stated_medium", "use_mitsuba", "whole",
+    "with_quiet",
 ]  # fmt: skip
 
 FIG10 = {"sigma_t": 0.241, "albedo": 0.75, "g": 0.0, "eta": 1.3}
@@ -28,6 +32,12 @@ Albedo = Annotated[float | None, typer.Option(help="Single-scattering albedo.", 
 MeanCosine = Annotated[float | None, typer.Option(help="Mean cosine of the phase function.", show_default="0")]
 Eta = Annotated[float | None, typer.Option(help="Index inside over outside.", show_default="1.3")]
 Backend = Annotated[str, typer.Option(help="llvm or cuda.")]
+VARIANTS = ("llvm_ad_rgb", "llvm_ad_mono", "cuda_ad_rgb", "cuda_ad_mono")
+Variant = Annotated[str, typer.Option(help="Variant of Mitsuba.")]
+Define = Annotated[
+    list[str] | None,
+    typer.Option("--define", "-D", help="Value of $NAME in the scene; repeat for more.", metavar="NAME=VALUE"),
+]
 
 
 def numbers(name: str, text: str) -> list[float]:
@@ -79,6 +89,66 @@ def check_channel(channel: str | None, names: list[str]) -> None:
     """ValueError if channels are chosen and no material is."""
     if channel is not None and not names:
         raise ValueError(f"channel must be left out unless materials are named, got {channel!r}")
+
+
+def use_mitsuba(variant: str) -> None:
+    """Mitsuba with our plugins, under a variant."""
+    if variant not in VARIANTS:
+        raise ValueError(f"variant must be one of {', '.join(VARIANTS)}, got {variant!r}")
+    if variant.startswith("llvm"):
+        prepare_llvm()
+    try:
+        import mitsuba as mi
+    except ImportError as error:
+        raise BackendError('rendering needs Mitsuba 3: pip install "halfspace-sss[render]"') from error
+    from halfspace_sss import rendering
+
+    try:
+        mi.set_variant(variant)
+    except ImportError as error:
+        raise BackendError(f"variant {variant} does not run here: {error}") from error
+    rendering.register()
+    _hear_warnings()
+
+
+def _hear_warnings() -> None:
+    """Mitsuba's warnings as ours, on stderr: by itself it prints them among the results."""
+    import mitsuba as mi
+
+    class Lines(mi.Appender):
+        def __init__(self) -> None:
+            mi.Appender.__init__(self)
+
+        def append(self, level: Any, text: str) -> None:
+            if "Received interrupt signal" in text:  # while it renders Mitsuba listens in the place of Python
+                interrupts.received = interrupts.received or signal.SIGINT
+            elif level >= mi.LogLevel.Warn:
+                typer.echo(f"warning: {' '.join(text.split())}", err=True)
+
+        def log_progress(self, *_: Any) -> None:
+            pass
+
+    logger = mi.logger()
+    for part in ("date", "class", "thread", "log_level"):
+        getattr(logger.formatter(), f"set_has_{part}")(False)
+    logger.clear_appenders()
+    logger.add_appender(Lines())
+
+
+def defined(texts: list[str] | None) -> dict[str, str]:
+    """Values of $NAME from texts NAME=VALUE."""
+    pairs = [text.partition("=") for text in texts or ()]
+    for text, (name, equals, _) in zip(texts or (), pairs):
+        if not (name.isidentifier() and equals):
+            raise ValueError(f"define must be NAME=VALUE, got {text!r}")
+    return {name: value for name, _, value in pairs}
+
+
+def check_left_out(names: dict[str, Any], beside: str) -> None:
+    """ValueError if one of the options, by name, was given where `beside` says that it has no place."""
+    for name, value in names.items():
+        if value not in (None, False, []):
+            raise ValueError(f"{name} must be left out {beside}, got {value!r}")
 
 
 def with_quiet(command: Callable) -> Callable:

@@ -1,4 +1,4 @@
-"""The command `halfspace-sss train`: networks of materials, or the one for all media."""
+"""The command `halfspace-sss train`: networks of materials, the one for all media, or that of an object of a scene."""
 
 from __future__ import annotations
 
@@ -11,20 +11,29 @@ import typer
 from halfspace_sss.cli.shared import (
     Albedo,
     Bar,
+    Define,
     Eta,
     MeanCosine,
     SigmaT,
+    Variant,
     by_channel,
     check_channel,
+    check_left_out,
     console,
+    defined,
     stated_medium,
+    use_mitsuba,
     whole,
 )
 
 if TYPE_CHECKING:
     from halfspace_sss.physics.medium import Medium
+    from halfspace_sss.rendering.scenes.learners import LearntObject
 
 __all__ = ["train_command"]
+
+MODEL, BACKEND, VARIANT = "neural_material", "llvm", "llvm_ad_rgb"
+SECONDS = 60.0  # for an object
 
 
 def train_command(
@@ -33,7 +42,18 @@ def train_command(
     ] = None,
     channel: Annotated[str | None, typer.Option(help="Only these, as R,B.", show_default="all")] = None,
     universal: Annotated[bool, typer.Option("--universal", help="Train the network for all media instead.")] = False,
-    model: Annotated[str, typer.Option(help="neural_material or neural_paper.")] = "neural_material",
+    scene: Annotated[
+        Path | None, typer.Option(help="Mitsuba XML file: train an object of it instead, which `render` then knows.")
+    ] = None,
+    object: Annotated[
+        str | None, typer.Option(help="Its id in the scene.", show_default="the only translucent one")
+    ] = None,
+    seconds: Annotated[
+        float | None, typer.Option(help="Time for an object, all included but compiling.", show_default="60")
+    ] = None,
+    model: Annotated[
+        str, typer.Option(help="neural_material or neural_paper; of an object full_geometry.", show_default=False)
+    ] = MODEL,
     sigma_t: SigmaT = None,
     albedo: Albedo = None,
     g: MeanCosine = None,
@@ -44,7 +64,9 @@ def train_command(
     ] = None,
     target_error: Annotated[float | None, typer.Option(help="Stop early at this validation error.")] = None,
     seed: Annotated[int, typer.Option(help="Seed of maps, batches and first numbers.", parser=whole)] = 0,
-    backend: Annotated[str, typer.Option(help="llvm or cuda, for the maps.")] = "llvm",
+    backend: Annotated[str, typer.Option(help="llvm or cuda, for the maps.")] = BACKEND,
+    define: Define = None,
+    variant: Variant = VARIANT,
     out: Annotated[
         Path | None, typer.Option(help="Folder for the weights.", show_default="where models find them")
     ] = None,
@@ -52,10 +74,20 @@ def train_command(
         Path | None, typer.Option(help="Folder for unfinished work, which an interrupted run continues.")
     ] = None,
 ) -> None:
-    """Train networks on path tracing; trained materials are then found by their medium."""
+    """Train networks on path tracing; trained materials are then found by their medium, objects by their shape too."""
     if find_spec("torch") is None:
         raise ValueError("training needs torch: `pip install halfspace-sss[train]`")
     given = {"sigma_t": sigma_t, "albedo": albedo, "g": g, "eta": eta}
+    if scene is not None:
+        others = {"material": material, "channel": channel, "universal": universal, **given, "fast": fast,
+                  "steps": steps, "backend": None if backend == BACKEND else backend}  # fmt: skip
+        check_left_out(others, "with --scene")
+        how = {"object": object, "seconds": SECONDS if seconds is None else seconds, "target_error": target_error}
+        files = {"seed": seed, "folder": out, "work": work}
+        _object(scene, None if model == MODEL else model, {**how, **files}, variant, define)
+        return
+    of_scenes = {"object": object, "seconds": seconds, "define": define}
+    check_left_out({**of_scenes, "variant": None if variant == VARIANT else variant}, "without --scene")
     if universal:
         others = {
             "material": material,
@@ -65,7 +97,7 @@ def train_command(
             "target_error": target_error,
             "work": work,
         }
-        _check_alone({**others, "model": None if model == "neural_material" else model})
+        check_left_out({**others, "model": None if model == MODEL else model}, "with --universal")
         _universal(out or Path("universal"), seed, steps, backend)
         return
     media = _media(material or [], channel, given)
@@ -77,12 +109,6 @@ def train_command(
                 (name, r) for r in _train(name, medium, bar, model, recipe, seed, out, work, target_error, backend)
             ]
     _report(rows)
-
-
-def _check_alone(others: dict[str, Any]) -> None:
-    for name, value in others.items():
-        if value not in (None, False, []):
-            raise ValueError(f"{name} must be left out with --universal, got {value!r}")
 
 
 def _media(names: list[str], channel: str | None, given: dict[str, float | None]) -> dict[str, Medium]:
@@ -123,6 +149,32 @@ def _train(
         medium, model=model, recipe=recipe, seed=seed, folder=out, work=work / name if work else None,
         target_error=target_error, backend=backend, progress=show,
     )  # fmt: skip
+
+
+def _object(scene: Path, model: str | None, how: dict[str, Any], variant: str, define: list[str] | None) -> None:
+    """Train an object of a scene and say how wrong the result is."""
+    parameters = defined(define)
+    use_mitsuba(variant)
+    from halfspace_sss.rendering.scenes.learners import learner
+    from halfspace_sss.rendering.scenes.scene_files import load_objects
+
+    learns = learner(model)
+    loaded = load_objects(scene, parameters)
+    with Bar("training") as bar:
+        found = learns.train(loaded, **how, progress=lambda what, done, total: bar.show(done, total, what))
+    _report_object(found)
+
+
+def _report_object(found: LearntObject) -> None:
+    from halfspace_sss.cli.errors import OBJECT_DEFINITION, object_table
+
+    screen = console()
+    if found.path is None:
+        screen.print(f"{found.object}: no weights are written", highlight=False, markup=False)
+        return
+    screen.print(object_table(found.errors), OBJECT_DEFINITION, highlight=False, sep="\n")
+    told = f"{found.steps} steps in {found.seconds:.0f} s; written:"
+    screen.print(told, f"  {found.path}", highlight=False, markup=False, soft_wrap=True, sep="\n")
 
 
 def _universal(folder: Path, seed: int, steps: int | None, backend: str) -> None:

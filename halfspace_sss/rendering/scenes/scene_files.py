@@ -8,14 +8,15 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from halfspace_sss.interface.model import models
 from halfspace_sss.rendering.scenes.causes import first_cause
 from halfspace_sss.rendering.surface.inside import ORDERS
+from halfspace_sss.rendering.surface.transports import knows_objects, model_names
 
-__all__ = ["PATH_TRACED", "load_scene"]
+__all__ = ["PATH_TRACED", "load_objects", "load_scene", "millimetres"]
 
 PATH_TRACED = "path_traced"
 _INTEGRATORS = {False: "bssrdf", True: "translucent_walk"}
+_NO_OBJECT = "the scene must have an object with a translucent BSDF, got none"
 _KEPT = ("mm_per_unit", "max_depth", "rr_depth", "hide_emitters")  # what both integrators understand
 
 
@@ -42,30 +43,56 @@ def load_scene(
         ValueError: no such file, parameter, model or orders, the file is no scene, a plugin refuses what it is given,
             there is no translucent object, or the integrator refuses the scene.
     """
-    import mitsuba as mi
 
-    _check("model", model, (*models(), PATH_TRACED))
+    _check("model", model, (*model_names(), PATH_TRACED))
     _check("orders", orders, ORDERS)
     state, config = _parsed(scene, parameters or {})
-    surfaces = [node.props for node in state.nodes if node.props.plugin_name() == "translucent"]
-    if not surfaces:
-        raise ValueError("the scene must have an object with a translucent BSDF, got none")
+    surfaces = _surfaces(state)
+    # a model that knows whole objects does not know what Mitsuba makes of several with the same BSDF
+    config.merge_meshes = not any(knows_objects(str(model or props.get("model", ""))) for props in surfaces)
+    _transform(scene, state, config)
     for props in surfaces:
         if model and model != PATH_TRACED:
             props["model"] = model
         if orders:
             props["orders"] = orders
     _choose_integrator(state, model, bool(model or orders))
-    try:
-        loaded = mi.parser.instantiate(config, state)
-    except RuntimeError as error:
-        raise ValueError(first_cause(error)) from error
+    loaded = _made(state, config)
     integrator = loaded.integrator()
     if hasattr(integrator, "prepare"):
         integrator.prepare(loaded)  # here, because Mitsuba wraps what is refused while it renders
     elif not any(hasattr(shape.bsdf(), "inside") for shape in loaded.shapes()):
-        raise ValueError("the scene must have an object with a translucent BSDF, got none")
+        raise ValueError(_NO_OBJECT)
     return loaded
+
+
+def load_objects(scene: dict | str | Path, parameters: Mapping[str, str] | None = None) -> Any:
+    """A Mitsuba scene whose objects are looked at one by one: none is merged with another, and no model is made.
+
+    Args:
+        scene: a dict as for `mitsuba.load_dict`, or the path of an XML file.
+        parameters: values of the parameters $name of an XML file.
+
+    Raises:
+        ValueError: no such file or parameter, the file is no scene, a plugin refuses what it is given, or there is no
+            translucent object.
+    """
+    state, config = _parsed(scene, parameters or {})
+    _surfaces(state)
+    config.merge_meshes = False
+    _transform(scene, state, config)
+    return _made(state, config)
+
+
+def millimetres(scene: Any) -> float:
+    """Millimetres in a unit of a scene, as its integrator says; 1, with a warning, if that is none of ours."""
+    integrator = scene.integrator()
+    stated = getattr(integrator, "settings", integrator)
+    if hasattr(stated, "mm_per_unit"):
+        return float(stated.mm_per_unit)
+    ours = " or ".join(_INTEGRATORS.values())
+    warnings.warn(f"a unit of the scene is taken for 1 mm: its integrator is not {ours}", stacklevel=3)
+    return 1.0
 
 
 def _check(name: str, value: str | None, known: tuple[str, ...]) -> None:
@@ -73,6 +100,23 @@ def _check(name: str, value: str | None, known: tuple[str, ...]) -> None:
         close = difflib.get_close_matches(value, known, n=1)
         hint = f"; did you mean {close[0]!r}?" if close else ""
         raise ValueError(f"{name} must be one of {', '.join(known)}, got {value!r}{hint}")
+
+
+def _surfaces(state: Any) -> list[Any]:
+    """The parameters of all translucent surfaces."""
+    found = [node.props for node in state.nodes if node.props.plugin_name() == "translucent"]
+    if not found:
+        raise ValueError(_NO_OBJECT)
+    return found
+
+
+def _made(state: Any, config: Any) -> Any:
+    import mitsuba as mi
+
+    try:
+        return mi.parser.instantiate(config, state)
+    except RuntimeError as error:
+        raise ValueError(first_cause(error)) from error
 
 
 def _parsed(scene: dict | str | Path, parameters: Mapping[str, str]) -> tuple[Any, Any]:
@@ -87,11 +131,23 @@ def _parsed(scene: dict | str | Path, parameters: Mapping[str, str]) -> tuple[An
             state = mi.parser.parse_dict(config, scene)
         else:
             state = mi.parser.parse_file(config, str(scene), **parameters)
+    except RuntimeError as error:
+        raise _unreadable(scene, error) from error
+    return state, config
+
+
+def _transform(scene: dict | str | Path, state: Any, config: Any) -> None:
+    import mitsuba as mi
+
+    try:
         mi.parser.transform_all(config, state)
     except RuntimeError as error:
-        name = "scene" if isinstance(scene, dict) else f"scene {str(scene)!r}"
-        raise ValueError(f"{name} cannot be read: {first_cause(error)}") from error
-    return state, config
+        raise _unreadable(scene, error) from error
+
+
+def _unreadable(scene: dict | str | Path, error: RuntimeError) -> ValueError:
+    name = "scene" if isinstance(scene, dict) else f"scene {str(scene)!r}"
+    return ValueError(f"{name} cannot be read: {first_cause(error)}")
 
 
 def _choose_integrator(state: Any, model: str | None, asked: bool) -> None:

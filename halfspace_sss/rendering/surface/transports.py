@@ -14,7 +14,7 @@ from halfspace_sss.extensions import TRANSPORTS, offered, warn_left_out
 from halfspace_sss.interface.model import models
 from halfspace_sss.once import once
 
-__all__ = ["model_names", "object_transport"]
+__all__ = ["knows_objects", "model_names", "object_transport"]
 
 
 @once
@@ -33,9 +33,14 @@ def model_names() -> tuple[str, ...]:
     return (*models(), *(name for name in _added() if name not in models()))
 
 
+def knows_objects(name: str) -> bool:
+    """Whether a name is that of a model which knows whole objects, not one of the half-space."""
+    return name not in models() and name in _added()
+
+
 def object_transport(name: str) -> Callable | None:
     """The function that makes the transport of that name for an object; None for a half-space model."""
-    if name in models() or name not in _added():
+    if not knows_objects(name):
         return None
     module, _, function = _added()[name].partition(":")
     return getattr(importlib.import_module(module), function)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,7 +24,7 @@ from halfspace_sss.rendering.transport.protocols import Means, Proposals, Transp
 from halfspace_sss.rendering.transport.settings import Settings
 from halfspace_sss.rendering.transport.variation import Variation
 
-__all__ = ["Bodies", "Body", "make_bodies"]
+__all__ = ["Bodies", "Body", "check_size", "make_bodies"]
 
 SMALL, LARGE = 1.0, 5e3  # mean free paths across an object, beyond which the units of the scene are doubted
 LEAST_SHARE = 0.2  # of the events inside that each of the two kinds gets
@@ -91,7 +92,7 @@ def _make_body(shape: Any, settings: Settings) -> Body:
     found, surface = survey(shape), shape.bsdf()
     inside = equivalent(surface.inside, found)
     media = [m.scaled(settings.mm_per_unit) for m in inside.channels()]
-    _check_size(found, media, settings)
+    check_size(found, media, settings.mm_per_unit)
     single_only = inside.orders == "single" or not any(float(m.sigma_s) > 0 for m in media)
     variation = Variation(surface, settings.mm_per_unit)
     transport, proposals = (None, None) if single_only else _means(inside, found, media, settings, variation)
@@ -120,11 +121,12 @@ def _single_share(media: list[Medium]) -> float:
     return float(np.clip(np.mean(shares), LEAST_SHARE, 1 - LEAST_SHARE))
 
 
-def _check_size(found: Object, media: list[Medium], settings: Settings) -> None:
+def check_size(found: Object, media: Sequence[Medium], mm_per_unit: float) -> None:
+    """Warn of an object whose size in mean free paths speaks of another unit of length."""
     thickness = [found.size * float(m.sigma_t) for m in media]
     if min(thickness) < SMALL or max(thickness) > LARGE:
         warnings.warn(
             f"object {found.shape.id()!r} is {min(thickness):.3g} to {max(thickness):.3g} mean free paths across, "
-            f"{found.size * settings.mm_per_unit:.3g} mm: check mm_per_unit = {settings.mm_per_unit:g}",
+            f"{found.size * mm_per_unit:.3g} mm: check mm_per_unit = {mm_per_unit:g}",
             stacklevel=2,
         )

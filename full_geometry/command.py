@@ -1,0 +1,85 @@
+"""The learner `full_geometry` of the commands `train --scene` and `errors --scene`; objects are those of a scene."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from full_geometry.learning.model_errors import ModelError, errors_of
+from full_geometry.storing import KIND, transport
+from full_geometry.subject import Subject
+from halfspace_sss.checks import check_count
+from halfspace_sss.interface.model import models as half_space_models
+from halfspace_sss.progress import NamedProgress
+from halfspace_sss.rendering.scenes.learners import LearntObject, ObjectError
+
+__all__ = ["errors", "train"]
+
+
+def train(
+    scene: Any,
+    *,
+    object: str | None = None,
+    seconds: float = 60.0,
+    target_error: float | None = None,
+    seed: int = 0,
+    folder: Path | None = None,
+    work: Path | None = None,
+    progress: NamedProgress | None = None,
+) -> LearntObject:
+    """As `learning.training.train`, of which the rows of errors are told with the names of object and channels."""
+    from full_geometry.learning.training import train as learn
+
+    found = learn(
+        scene, object=object, seconds=seconds, target_error=target_error, seed=seed, folder=folder, work=work,
+        progress=progress,
+    )  # fmt: skip
+    name = found.model.subject.found.shape.id()
+    return LearntObject(name, found.path, _rows(name, KIND, found.errors), found.steps, found.seconds)
+
+
+def errors(
+    scene: Any,
+    models: Sequence[str] = (),
+    *,
+    object: str | None = None,
+    seed: int = 0,
+    progress: NamedProgress | None = None,
+) -> list[ObjectError]:
+    """How wrong models of an object are, the truth of each kind of orders traced once.
+
+    Args:
+        scene: with the object.
+        models: "full_geometry", whose weights must have been trained, and half-space models; by default all of them
+            that have learnt the object or take its medium.
+        object: its id; may be left out where there is one.
+        seed: of everything.
+        progress: called with (what, done, total).
+
+    Raises:
+        ValueError: there is no such model or object, or a model that is named refuses it.
+    """
+    check_count("seed", seed, 0)
+    subject = Subject.given(scene, None, None, object)
+    transports = {name: transport(subject, name) for name in models} or _that_take(subject)
+    name = subject.found.shape.id()
+    found = errors_of(subject, transports, seed=seed, progress=progress)
+    return [row for model, rows in found.items() for row in _rows(name, model, rows)]
+
+
+def _that_take(subject: Subject) -> dict[str, Any]:
+    """All transports of an object that can be asked."""
+    found = {}
+    for name in (KIND, *half_space_models()):
+        try:
+            found[name] = transport(subject, name)
+        except ValueError:
+            continue
+    return found
+
+
+def _rows(name: str, model: str, errors: list[ModelError]) -> list[ObjectError]:
+    n = 1 + max((row.channel for row in errors), default=0)
+    channels = "RGB" if n == 3 else ["mono"]
+    return [ObjectError(name, channels[e.channel], model, e.light, e.error, e.standard_error, e.ratio) for e in errors]

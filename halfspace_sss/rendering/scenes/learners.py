@@ -1,0 +1,83 @@
+"""What learns an object of a scene and says how wrong models of it are: the commands `train --scene`, `errors --scene`.
+
+An entry point of the group `halfspace_sss.learners` has the name of the model that it learns, and is a module or an
+object with the functions of `Learner`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+from halfspace_sss.checks import check_choice
+from halfspace_sss.extensions import LEARNERS, offered, warn_left_out
+from halfspace_sss.progress import NamedProgress
+
+__all__ = ["Learner", "LearntObject", "ObjectError", "learner"]
+
+
+class ObjectError(NamedTuple):
+    """How wrong a model of an object is: relative RMSE of the radiance of its exits, and the ratio of the means."""
+
+    object: str
+    channel: str
+    model: str
+    light: str
+    error: float
+    standard_error: float
+    ratio: float
+
+
+class LearntObject(NamedTuple):
+    """What came of a training: where its weights lie (None: there are none), how wrong they are, and its cost."""
+
+    object: str
+    path: Path | None
+    errors: list[ObjectError]
+    steps: int
+    seconds: float
+
+
+class Learner(Protocol):
+    """Learns objects of scenes from `scene_files.load_objects`, and measures models of them.
+
+    Both functions raise ValueError before they trace anything: an argument is out of range, the object cannot be
+    learnt, or there are several and none is named.
+    """
+
+    def train(
+        self,
+        scene: Any,
+        *,
+        object: str | None,
+        seconds: float,
+        target_error: float | None,
+        seed: int,
+        folder: Path | None,
+        work: Path | None,
+        progress: NamedProgress | None,
+    ) -> LearntObject:
+        """Learn an object and write its weights."""
+
+    def errors(
+        self, scene: Any, models: Sequence[str], *, object: str | None, seed: int, progress: NamedProgress | None
+    ) -> list[ObjectError]:
+        """The errors of models of an object; of all that can be asked where none is named."""
+
+
+def learner(name: str | None = None) -> Learner:
+    """The learner of the model `name`, by default the first one.
+
+    Raises:
+        ValueError: there is none.
+    """
+    known: dict[str, Any] = {}
+    for key, found in offered(LEARNERS):
+        if callable(getattr(found, "train", None)) and callable(getattr(found, "errors", None)):
+            known.setdefault(key, found)
+        else:
+            warn_left_out(LEARNERS, key, f"it must have the functions train and errors, got {found!r}")
+    if name is not None or not known:
+        check_choice("model", name or "full_geometry", tuple(known))
+    return known[name] if name is not None else next(iter(known.values()))
