@@ -123,9 +123,9 @@ def test_no_command_falls_with_a_broken_package(tmp_path: Path, arguments: list[
     assert run.returncode == 0, run.stderr
     lines = run.stderr.splitlines()
     assert all(" is left out: " in line or line.startswith("tracing ") for line in lines), run.stderr
-    found = [line.split(":0: UserWarning: entry point ")[0].rsplit(".")[-1] for line in lines if "UserWarning" in line]
-    also = {"models": ["models"], "materials": ["materials"], "curves": ["materials", "models", "figures"]}
-    assert found == ["commands"] * 3 + also[arguments[0]]
+    # three commands, and of the other groups those that the command asks for
+    also = {"models": 1, "materials": 1, "curves": 3}
+    assert sum(" is left out: " in line for line in lines) == 3 + also[arguments[0]], run.stderr
     if arguments[0] == "curves":
         assert {"curves.csv", "curves_errors.csv", "curves.json"} <= {
             path.name for path in (tmp_path / "out").iterdir()

@@ -23,7 +23,7 @@ mi = pytest.importorskip("mitsuba")
 @pytest.fixture
 def scene(tmp_path: Path, monkeypatch: Any) -> Path:
     """A scene file; the page is drawn as the project file says, whatever is installed."""
-    text = (Path(__file__).parent.parent / "pyproject.toml").read_text()
+    text = (Path(__file__).parents[2] / "pyproject.toml").read_text()
     module, name = re.search(r'^render = "([\w.]+):(\w+)"$', text, re.MULTILINE).groups()
     monkeypatch.setattr(cli_render, "renderer", lambda kind: getattr(import_module(module), name))
     file = tmp_path / "ball.xml"

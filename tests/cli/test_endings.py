@@ -135,7 +135,7 @@ def test_the_table_of_the_documentation_is_what_happens(table: dict) -> None:
     for command in SMALL:
         cells = (table.get((command, column)) for column in COLUMNS)
         lines.append(f"| `{command}` | " + " | ".join(f"{c[0]}: {_kinds(c[2])}" if c else "–" for c in cells) + " |")
-    document = Path(__file__).parent.parent / "docs" / "endings.md"
+    document = Path(__file__).parents[2] / "docs" / "endings.md"
     if "HALFSPACE_SSS_WRITE_DOCS" in os.environ:
         head = document.read_text().split("| command")[0]
         document.write_text(head + "\n".join(lines) + "\n")
