@@ -108,6 +108,8 @@ def train(
         if place is not None:
             check_folder(place)
     subject = Subject.given(shape, medium, mm_per_unit, object)
+    if not any(float(m.sigma_s) > 0 for m in subject.media):
+        raise ValueError("medium must scatter in at least one channel to be learnt, got sigma_s 0 in all")
     run = _Run(subject, recipe, int(seed), Path(work) if work else None)
     if seconds == 0:
         warnings.warn("an object that is trained for 0 seconds is rendered as a half-space", stacklevel=2)

@@ -47,11 +47,11 @@ def load_scene(
     _check("model", model, (*model_names(), PATH_TRACED))
     _check("orders", orders, ORDERS)
     state, config = _parsed(scene, parameters or {})
-    surfaces = _surfaces(state)
     # a model that knows whole objects does not know what Mitsuba makes of several with the same BSDF
-    config.merge_meshes = not any(knows_objects(str(model or props.get("model", ""))) for props in surfaces)
+    names = [model or str(props.get("model", "")) for props in _surfaces(state)]
+    config.merge_meshes = not any(knows_objects(name) for name in names)
     _transform(scene, state, config)
-    for props in surfaces:
+    for props in _surfaces(state):  # anew: the nodes have moved
         if model and model != PATH_TRACED:
             props["model"] = model
         if orders:

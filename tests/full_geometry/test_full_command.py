@@ -1,0 +1,175 @@
+"""The commands `train --scene` and `errors --scene`: files, exit codes, what they refuse, and how they go on."""
+
+from __future__ import annotations
+
+import errno
+import functools
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas
+import pytest
+from typer.testing import CliRunner
+
+pytest.importorskip("mitsuba")
+pytest.importorskip("torch")
+
+from full_geometry.learning import model_errors, training  # noqa: E402
+from full_geometry.learning.fitting import Recipe  # noqa: E402
+from halfspace_sss.cli import app as cli  # noqa: E402
+from halfspace_sss.neural import trained as known_weights  # noqa: E402
+from halfspace_sss.neural.store import load_weights  # noqa: E402
+
+QUICK = Recipe(width=24, depth=2, batch=1024, chunk=2**13, reuse=4)
+TRAIN, REFERENCE = training.train, model_errors.reference
+BALL = """<shape type="sphere" id="NAME"><float name="radius" value="1"/><bsdf type="translucent">
+  <string name="sigma_s" value="0.95,0.8,0.6"/><string name="sigma_a" value="0.05,0.2,0.4"/></bsdf></shape>
+"""
+XML = f"""<scene version="3.0.0">
+  <integrator type="bssrdf"><float name="mm_per_unit" value="2"/></integrator>
+  <emitter type="constant"/>
+  {BALL.replace("NAME", "ball")}
+  <sensor type="perspective"><transform name="to_world"><lookat origin="0,0,5" target="0,0,0" up="0,1,0"/></transform>
+    <film type="hdrfilm"><integer name="width" value="8"/><integer name="height" value="8"/></film></sensor>
+</scene>
+"""
+
+
+@pytest.fixture(autouse=True)
+def _small(monkeypatch: Any, tmp_path: Path) -> None:
+    """A recipe of seconds and a scene, in an empty folder, where weights are looked for too."""
+    monkeypatch.setattr(training, "train", functools.partial(TRAIN, recipe=QUICK, chunks=4))
+    monkeypatch.setattr(training, "CHECKPOINT_EVERY", 0.0)
+    monkeypatch.setenv(known_weights.ENVIRONMENT_VARIABLE, str(tmp_path / "weights"))
+    monkeypatch.chdir(tmp_path)
+    Path("ball.xml").write_text(XML)
+
+
+def _invoke(*arguments: str) -> Any:
+    return CliRunner().invoke(cli.app, list(arguments))
+
+
+def _weights(folder: str = "weights") -> list[Path]:
+    return sorted(Path(folder).glob("*"))
+
+
+def test_an_object_is_trained_measured_and_rendered(monkeypatch: Any) -> None:
+    result = _invoke("train", "--scene", "ball.xml", "--seconds", "2")
+    assert result.exit_code == 0, result.output
+    (record, path) = _weights()
+    assert path.name in result.stdout and record.suffix == ".json"
+    for words in ("ball", "constant", "lobes", "full_geometry", "mean / traced mean"):
+        assert words in result.stdout
+    traced = []
+    monkeypatch.setattr(model_errors, "reference", lambda *a: traced.append(a) or REFERENCE(a[0], 32, 512, *a[3:]))
+    chosen = [word for name in ("full_geometry", "better_dipole", "standard_dipole") for word in ("--model", name)]
+    result = _invoke("errors", "--scene", "ball.xml", "--object", "ball", *chosen)
+    assert result.exit_code == 0, result.output
+    table = pandas.read_csv("errors/errors.csv")
+    assert list(table.columns) == ["object", "channel", "model", "light", "error", "standard_error", "ratio"]
+    assert len(table) == 18 and len(traced) == 1  # three models, one truth
+    mean = table.groupby("model")["error"].mean()
+    assert mean["full_geometry"] < 0.5 * mean["better_dipole"]
+    result = _invoke("render", "ball.xml", "--model", "full_geometry", "--spp", "4")
+    assert result.exit_code == 0 and Path("render/ball_full_geometry.exr").exists(), result.output
+
+
+def test_a_model_with_single_scattering_is_held_against_walks_with_it(monkeypatch: Any) -> None:
+    fewest = []
+    monkeypatch.setattr(model_errors, "reference", lambda *a: fewest.append(a[4]) or REFERENCE(a[0], 8, 64, *a[3:]))
+    chosen = ("--model", "directional_dipole", "--model", "better_dipole", "--model", "normalized_diffusion")
+    assert _invoke("errors", "--scene", "ball.xml", *chosen).exit_code == 0
+    assert fewest == [1, 2]
+
+
+def test_a_render_says_what_trains_an_object() -> None:
+    result = _invoke("render", "ball.xml", "--model", "full_geometry")
+    assert result.exit_code == 2 and "object 'ball' must be trained for full_geometry" in result.stderr
+    assert "halfspace-sss train --scene" in result.stderr and result.stderr.count("\n") == 1
+
+
+def test_no_seconds_write_nothing_and_say_so() -> None:
+    result = _invoke("train", "--scene", "ball.xml", "--seconds", "0")
+    assert result.exit_code == 0 and "no weights are written" in result.stdout
+    assert "is rendered as a half-space" in result.stderr and not _weights()
+
+
+def _stops(monkeypatch: Any, error: BaseException) -> None:
+    """Training is struck once, after its second chunk."""
+    chunk, left = training._Run._chunk, [1]
+
+    def strike(run: Any, total: int) -> None:
+        if run.done == 2 and left:
+            left.pop()
+            raise error
+        chunk(run, total)
+
+    monkeypatch.setattr(training._Run, "_chunk", strike)
+
+
+def _same(a: str, b: str) -> bool:
+    (_, one), (_, two) = _weights(a), _weights(b)
+    left, right = (load_weights(path, "full_geometry")[0] for path in (one, two))
+    return left.keys() == right.keys() and all(np.array_equal(left[name], right[name]) for name in left)
+
+
+def test_an_interrupted_training_goes_on_to_the_same_weights(monkeypatch: Any) -> None:
+    arguments = ("train", "--scene", "ball.xml", "--seed", "3")
+    assert _invoke(*arguments, "--out", "whole").exit_code == 0
+    _stops(monkeypatch, KeyboardInterrupt())
+    again = (*arguments, "--work", "work", "--out", "parts")
+    assert _invoke(*again).exit_code == 130 and not _weights("parts")
+    assert _invoke(*again).exit_code == 0 and _same("whole", "parts")
+
+
+def test_a_disk_that_fills_up_leaves_no_half_weights_and_work_to_go_on_from(monkeypatch: Any) -> None:
+    arguments = ("train", "--scene", "ball.xml", "--work", "work")
+    sync = os.fsync
+
+    def full(handle: int) -> None:
+        if "safetensors" in os.readlink(f"/proc/self/fd/{handle}") and Path("work/checkpoint.safetensors").exists():
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        sync(handle)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", full)
+        result = _invoke(*arguments)
+    assert result.exit_code == 1 and "No space left on device" in result.stderr and not _weights()
+    assert [path.name for path in Path("work").iterdir() if path.name.startswith(".")] == []
+    assert _invoke(*arguments).exit_code == 0 and len(_weights()) == 2
+
+
+REFUSED = [
+    (["train", "--scene", "no.xml"], "scene must be an XML file, got 'no.xml'"),
+    (["train", "--scene", "ball.xml", "--object", "cube"], "object must be one of ball, got 'cube'"),
+    (["train", "--scene", "two.xml"], "object must be one of ball, other, got None"),
+    (["train", "--scene", "ball.xml", "--seconds", "-1"], "seconds must be a number in [0, 1e+07], got -1.0"),
+    (["train", "--scene", "ball.xml", "--target-error", "2"], "target_error must be a number in [0.0001, 1], got 2.0"),
+    (["train", "--scene", "ball.xml", "--seed", "-1"], "seed must be a whole number >= 0, got -1"),
+    (["train", "--scene", "ball.xml", "--model", "neural"], "model must be one of full_geometry, got 'neural'"),
+    (["train", "--scene", "ball.xml", "--fast"], "fast must be left out with --scene, got True"),
+    (["train", "ketchup", "--scene", "ball.xml"], "material must be left out with --scene, got ['ketchup']"),
+    (["train", "--scene", "ball.xml", "--out", "ball.xml"], "folder must be a folder or new, got 'ball.xml'"),
+    (["train", "--scene", "ball.xml", "--define", "x"], "define must be NAME=VALUE, got 'x'"),
+    (["train", "--seconds", "3"], "seconds must be left out without --scene, got 3.0"),
+    (["train", "--object", "ball"], "object must be left out without --scene, got 'ball'"),
+    (["errors", "--object", "ball"], "object must be left out without --scene, got 'ball'"),
+    (["errors", "--scene", "ball.xml", "--events", "1e5"], "events must be left out with --scene, got 100000.0"),
+    (["errors", "--scene", "ball.xml", "--model", "no_model"], "model must be one of"),
+    (["errors", "--scene", "ball.xml", "--model", "full_geometry"], "object 'ball' must be trained for full_geometry"),
+    (["errors", "--scene", "ball.xml", "--seed", "-1"], "seed must be a whole number >= 0, got -1"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "message"), REFUSED, ids=[" ".join(a) for a, _ in REFUSED])
+def test_bad_input_is_refused_before_anything_is_traced(arguments: list[str], message: str, monkeypatch: Any) -> None:
+    Path("two.xml").write_text(XML.replace("<sensor", BALL.replace("NAME", "other") + "<sensor"))
+    before = sorted(Path().iterdir())
+    monkeypatch.setattr(training, "reference", None)
+    monkeypatch.setattr(model_errors, "reference", None)
+    result = _invoke(*arguments)
+    assert result.exit_code == 2, result.output
+    assert message in result.stderr and result.stderr.count("\n") == 1
+    assert sorted(Path().iterdir()) == before

@@ -1,0 +1,212 @@
+"""Objects that were trained, in scenes: images against walks, what moves with them, and which are refused.
+
+Ratios of means are held to the stated error of the model and four standard errors of the images.
+"""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from halfspace_sss import Medium
+
+mi = pytest.importorskip("mitsuba")
+pytest.importorskip("torch")
+
+from full_geometry import storing  # noqa: E402
+from full_geometry.learning.fitting import Recipe  # noqa: E402
+from full_geometry.learning.model_errors import LIGHTS  # noqa: E402
+from full_geometry.learning.training import Trained, train  # noqa: E402
+from full_geometry.subject import Subject  # noqa: E402
+from halfspace_sss import rendering  # noqa: E402
+from halfspace_sss.neural import trained as known_weights  # noqa: E402
+from halfspace_sss.rendering.scenes.scene_files import load_objects, load_scene  # noqa: E402
+
+BUNNY = Path(__file__).parents[2] / "figures" / "assets" / "bunny.ply"
+QUICK = Recipe(width=32, depth=2, batch=1024, chunk=2**15, reuse=4)
+CHUNKS, PASSES = 16, 6
+COLOURS = {"sigma_s": "0.95,0.8,0.6", "sigma_a": "0.05,0.2,0.4", "eta": 1.4}
+WAX = Medium(np.array([0.95, 0.8, 0.6]), np.array([0.05, 0.2, 0.4]), 0.0, 1.4)
+SURFACE = {"type": "translucent", **COLOURS, "model": "full_geometry", "orders": "multiple", "reflection": False}
+
+
+@pytest.fixture(autouse=True)
+def variant() -> None:
+    mi.set_variant("llvm_ad_rgb")
+    rendering.register()
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory):
+    """Where weights are kept and looked for."""
+    found = tmp_path_factory.mktemp("weights")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(known_weights.ENVIRONMENT_VARIABLE, str(found))
+        yield found
+
+
+@pytest.fixture(scope="module")
+def trained(folder: Path) -> Trained:
+    mi.set_variant("llvm_ad_rgb")
+    rendering.register()
+    return train(mi.load_dict(bunny()), WAX, chunks=CHUNKS, recipe=QUICK, folder=folder)
+
+
+def bunny(mirror: bool = False, turn: float = 0.0, shift: float = 0.0, flip: bool = False, **more) -> dict:
+    """About 0.3 across, in a medium of 2 mean free paths a unit once it is scaled."""
+    at = mi.ScalarTransform4f().translate([shift, 0, 0]).rotate([0, 1, 0], turn).scale([-2 if mirror else 2, 2, 2])
+    return {"type": "ply", "filename": str(BUNNY), "flip_normals": flip, "to_world": at, **more}
+
+
+def scene(objects: dict, model: str, **integrator) -> dict:
+    """Objects under an even sky, alone in the picture."""
+    box = mi.load_dict({"type": "scene", **objects}).bbox()
+    centre, size = np.array(box.center()), float(np.linalg.norm(np.array(box.extents())))
+    at = mi.ScalarTransform4f().look_at((centre + [0, 0.3 * size, 2 * size]).tolist(), centre.tolist(), [0, 1, 0])
+    film = {"type": "hdrfilm", "width": 24, "height": 16, "rfilter": {"type": "box"}}
+    plugin = "translucent_walk" if model == "path_traced" else "bssrdf"
+    return {
+        "type": "scene", "integrator": {"type": plugin, "max_depth": -1, "hide_emitters": True, **integrator},
+        "light": {"type": "constant"}, **objects,
+        "sensor": {"type": "perspective", "fov": 28.0, "to_world": at, "film": film},
+    }  # fmt: skip
+
+
+def halves(objects: dict, model: str, spp: int = 128) -> np.ndarray:
+    """Mean of the left and of the right half of the picture in every pass, (passes, 2, channels)."""
+    loaded = load_scene(scene(objects, model), model)
+    images = np.array([np.array(mi.render(loaded, spp=spp, seed=k)) for k in range(PASSES)])
+    return images.reshape(PASSES, 16, 2, 12, -1)[..., :3].mean(axis=(1, 3))
+
+
+def agree(objects: dict, trained: Trained) -> None:
+    """Both halves have the light of walks, up to the stated error; the half-space has not."""
+    found, walked = halves(objects, "full_geometry"), halves(objects, "path_traced")
+    stated = np.array([row.error for row in trained.errors if row.light == LIGHTS[0]])
+    ratio = found.mean(axis=0) / walked.mean(axis=0)
+    errors = [v.std(axis=0, ddof=1) / np.sqrt(PASSES) / v.mean(axis=0) for v in (found, walked)]
+    assert np.all(np.abs(ratio - 1) < stated + 4 * np.hypot(*errors)), (ratio, stated)
+    assert np.all(stated < 0.1) and np.all(np.hypot(*errors) < 0.02)
+
+
+def test_an_image_has_the_light_of_walks_within_the_stated_error(trained: Trained) -> None:
+    agree({"bunny": bunny(bsdf=SURFACE)}, trained)
+
+
+def test_the_half_space_misses_that_light_by_more(trained: Trained) -> None:
+    objects = {"bunny": bunny(bsdf=SURFACE)}
+    plane, walked = (halves(objects, model).mean(axis=0) for model in ("better_dipole", "path_traced"))
+    stated = max(row.error for row in trained.errors if row.light == LIGHTS[0])
+    assert np.all(np.abs(plane / walked - 1) > 2 * stated)
+
+
+def test_two_objects_of_one_mesh_are_both_known_moved_and_turned_inside_out(trained: Trained) -> None:
+    shared = {"type": "ref", "id": "wax"}
+    one, two = bunny(shift=-0.25, bsdf=shared), bunny(shift=0.25, turn=130.0, flip=True, bsdf=shared)
+    agree({"wax": {**SURFACE, "id": "wax"}, "one": one, "two": two}, trained)
+
+
+def test_another_object_beside_it_keeps_its_own_model(trained: Trained) -> None:
+    ball = {"type": "sphere", "center": [0.3, 0, 0], "radius": 0.1, "bsdf": {**SURFACE, "model": "better_dipole"}}
+    loaded = load_scene(scene({"bunny": bunny(bsdf=SURFACE), "ball": ball}, "mixed"))
+    kinds = {b.found.shape.id(): type(b.transport).__name__ for b in loaded.integrator().prepare(loaded)}
+    assert kinds["bunny"] == "LearntTransport" and kinds["ball"] != "LearntTransport"
+
+
+def test_the_mirrored_object_is_another_one_and_can_be_learnt(trained: Trained, folder: Path) -> None:
+    mirrored = {"bunny": bunny(mirror=True, bsdf=SURFACE)}
+    with pytest.raises(ValueError, match="moved and turned only"):
+        load_scene(scene(mirrored, "full_geometry"))
+    agree(mirrored, train(mi.load_dict(bunny(mirror=True)), WAX, chunks=CHUNKS, recipe=QUICK, folder=folder))
+
+
+def test_objects_with_the_same_surface_are_not_merged(tmp_path: Path) -> None:
+    text = "".join(
+        f'<shape type="ply" id="{name}"><string name="filename" value="{BUNNY}"/><ref id="wax"/></shape>'
+        for name in ("one", "two")
+    )
+    surface = '<bsdf type="translucent" id="wax"><string name="material" value="marble"/></bsdf>'
+    (tmp_path / "two.xml").write_text(f'<scene version="3.0.0">{surface}{text}</scene>')
+    assert sorted(s.id() for s in load_objects(tmp_path / "two.xml").shapes()) == ["one", "two"]
+
+
+def refused(objects: dict, message: str, folder: Path) -> None:
+    """Refused by what learns and by what renders, before either has traced anything."""
+    whole = scene(objects, "full_geometry")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # sizes that are beside the point
+        with pytest.raises(ValueError, match=message):
+            train(load_objects(whole), folder=folder)
+        with pytest.raises(ValueError, match=message):
+            load_scene(whole)
+
+
+def test_a_rough_boundary_is_refused(trained: Trained, folder: Path) -> None:
+    rough = {"type": "roughdielectric", "alpha": 0.2, "int_ior": 1.4, "ext_ior": 1.0}
+    refused({"bunny": bunny(bsdf={**SURFACE, "boundary": rough})}, "boundary of 'bunny' must be smooth", folder)
+
+
+def test_a_medium_that_varies_is_refused(folder: Path) -> None:
+    grid = mi.VolumeGrid(np.random.default_rng(1).random((4, 4, 4, 1)).astype(np.float32))
+    volume = {"type": "gridvolume", "grid": grid, "raw": True}
+    surface = {"type": "translucent", "sigma_t": volume, "albedo": 0.9, "eta": 1.4, "model": "full_geometry"}
+    refused({"ball": {"type": "sphere", "bsdf": surface}}, "medium of 'ball' must be the same everywhere", folder)
+
+
+def test_an_instance_is_refused(folder: Path) -> None:
+    group = {"type": "shapegroup", "inner": {"type": "sphere", "bsdf": SURFACE}}
+    objects = {"group": group, "copy": {"type": "instance", "inner": {"type": "ref", "id": "group"}}}
+    with pytest.raises(ValueError, match="object must not be an instance to be learnt, got 'copy'"):
+        train(load_objects({"type": "scene", **objects}), folder=folder)
+
+
+def test_a_medium_that_nowhere_scatters_is_refused(folder: Path) -> None:
+    with pytest.raises(ValueError, match="medium must scatter in at least one channel"):
+        train(mi.load_dict({"type": "sphere"}), Medium(0.0, 1.0), folder=folder)
+
+
+def test_a_mesh_with_a_hole_is_warned_of_in_a_sentence() -> None:
+    shape = mi.load_dict(bunny())
+    parameters = mi.traverse(shape)
+    parameters["faces"] = np.array(parameters["faces"])[: 3 * (shape.face_count() - 2000)]
+    parameters.update()
+    with pytest.warns(UserWarning, match="is not closed: .* light that enters or leaves at the gap is lost"):
+        Subject.of(shape, WAX)
+
+
+def test_vertex_normals_against_their_faces_are_refused() -> None:
+    shape = mi.load_dict(bunny())
+    parameters = mi.traverse(shape)
+    parameters["vertex_normals"] = -parameters["vertex_normals"]
+    parameters.update()
+    with pytest.raises(ValueError, match="must all point to the same side to be learnt, got faces and vertices"):
+        Subject.of(shape, WAX)
+
+
+def test_pieces_that_are_wound_differently_are_refused() -> None:
+    cube = mi.traverse(mi.load_dict({"type": "cube"}))
+    corners, faces = (np.array(cube[key]).reshape(-1, 3) for key in ("vertex_positions", "faces"))
+    both = mi.Mesh("both", 2 * len(corners), 2 * len(faces))
+    parameters = mi.traverse(both)
+    parameters["vertex_positions"] = np.concatenate([corners, corners + [5, 0, 0]]).ravel().astype(np.float32)
+    parameters["faces"] = np.concatenate([faces, faces[:, ::-1] + len(corners)]).ravel().astype(np.uint32)
+    parameters.update()
+    with pytest.raises(ValueError, match="must all point to the same side to be learnt, got pieces"):
+        Subject.of(both, WAX)
+
+
+def test_weights_of_another_version_are_left_aside_by_name(trained: Trained, tmp_path: Path) -> None:
+    for path in (trained.path, trained.path.with_suffix(".json")):
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    record = tmp_path / trained.path.with_suffix(".json").name
+    record.write_text(record.read_text().replace('"format": ', '"format": 9'))
+    with pytest.raises(ValueError, match=f"must be trained for full_geometry.*{trained.path.name}.*format must be"):
+        storing.find_weights(trained.model.subject, tmp_path)
+
+
+def test_a_scene_of_another_unit_is_another_object(trained: Trained) -> None:
+    with pytest.raises(ValueError, match="size_in_mfp of the medium"):
+        load_scene(scene({"bunny": bunny(bsdf=SURFACE)}, "full_geometry", mm_per_unit=1.1))
