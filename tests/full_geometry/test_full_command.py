@@ -41,7 +41,8 @@ XML = f"""<scene version="3.0.0">
 def _small(monkeypatch: Any, tmp_path: Path) -> None:
     """A recipe of seconds and a scene, in an empty folder, where weights are looked for too."""
     monkeypatch.setattr(training, "train", functools.partial(TRAIN, recipe=QUICK, chunks=4))
-    monkeypatch.setattr(training, "CHECKPOINT_EVERY", 0.0)
+    for name, value in {"CHECKPOINT_EVERY": 0.0, "EXITS": 64, "WALKS": 512, "SAMPLES": 128}.items():
+        monkeypatch.setattr(training, name, value)
     monkeypatch.setenv(known_weights.ENVIRONMENT_VARIABLE, str(tmp_path / "weights"))
     monkeypatch.chdir(tmp_path)
     Path("ball.xml").write_text(XML)
