@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-from full_geometry.subject import Subject, SurfacePoint, clearance, refract_in
+from full_geometry.subject import Subject, SurfacePoint, refract_in
 from halfspace_sss.rendering.transport.plane import number
 
 __all__ = ["REFLECTIONS", "FirstEvent", "first_event"]
@@ -35,7 +35,8 @@ def first_event(subject: Subject, at: SurfacePoint, active: Any = True) -> First
     import drjit as dr
     import mitsuba as mi
 
-    sigma_t, eta, sign = subject.coefficients.sigma_t, number(subject.eta), number(subject.found.sign)
+    sigma_t, eta, sign = subject.sigma_t, number(subject.eta), number(subject.found.sign)
+    media = subject.walk_media
     d, _, valid = refract_in(at, eta)
     flags = mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame
 
@@ -53,12 +54,12 @@ def first_event(subject: Subject, at: SurfacePoint, active: Any = True) -> First
         v = v * through * mi.fresnel(dr.abs(c), dr.select(c > 0, 1 / eta, eta))[0]
         onward = d - n * (2 * c)
         goes_on = si.is_valid() & (dr.dot(onward, si.n) * sign < 0) & (dr.max(v) > NEGLIGIBLE) & (k < REFLECTIONS)
-        skip = clearance(si.p, si.n, onward)
+        skip = media.clear(mi.UInt32(0), si.n, onward)
         onward = mi.Vector3f(onward)
         return k + 1, mi.Point3f(si.p), onward, skip, v, way + l, (P + part, moment, length), active & goes_on
 
     state = (
-        mi.UInt32(0), mi.Point3f(at.p), d, clearance(at.p, at.n, d), mi.Spectrum(1), mi.Float(0),
+        mi.UInt32(0), mi.Point3f(at.p), d, media.clear(mi.UInt32(0), at.n, d), mi.Spectrum(1), mi.Float(0),
         (mi.Spectrum(0), mi.Vector3f(0), mi.Float(0)), valid & active,
     )  # fmt: skip
     P, moment, length = dr.while_loop(state, lambda *s: s[-1], step, label="first event")[-2]

@@ -120,6 +120,36 @@ def test_a_large_flat_box_shows_the_reflectance_of_the_half_space() -> None:
     assert abs(z) < WIDEST_Z
 
 
+def _top_of_ball(away: float, mu: float, light: dict, **surface: Any) -> dict:
+    """The top of a ball of 1000 mean free paths radius, which lies at z = `away`, from close by."""
+    ball = {"type": "sphere", "radius": 1000.0, "center": [0, 0, away - 1000]}
+    medium = {"sigma_s": "0.99,0.75,0.3", "sigma_a": "0.01,0.25,0.7", "eta": 1.4, "reflection": False}
+    scene = _scene({**medium, **surface}, light, ball)
+    eye = [50 * np.sqrt(1 - mu * mu), 0, away + 50 * mu]
+    scene["sensor"]["to_world"] = mi.ScalarTransform4f().look_at(eye, [0, 0, away], [0, 1, 0])
+    scene["sensor"]["fov"] = 0.1
+    return scene
+
+
+@pytest.mark.parametrize("orders", ["single", "multiple"])
+def test_a_large_ball_far_from_the_origin_shows_the_reflectance_of_the_half_space(orders: str) -> None:
+    images = _runs(mi.load_dict(_top_of_ball(1000.0, 0.6, {"type": "constant"}, orders=orders)), 16, 512, 1)
+    for c, (s, a) in enumerate(((0.99, 0.01), (0.75, 0.25), (0.3, 0.7))):
+        expected = trace(Medium(s, a, 0.0, 1.4), 0.6, n_paths=2**20).reflectance(orders)
+        value = images[..., c].mean(axis=(1, 2))
+        error = np.hypot(value.std(ddof=1) / 4, expected.standard_error)
+        assert abs(value.mean() - expected.value) < WIDEST_Z_OF_RUNS * error
+        assert error < 0.012 * expected.value
+
+
+def test_light_that_joins_bring_does_not_depend_on_the_origin_of_the_scene() -> None:
+    sun = {"type": "directional", "direction": [0.5, 0.3, -0.8], "irradiance": 3.0}
+    near, far = (
+        _runs(mi.load_dict(_top_of_ball(away, 0.6, sun)), 12, 256, seed) for away, seed in ((100.0, 1), (5000.0, 101))
+    )
+    _agree(far, near, 0.01)
+
+
 def test_single_and_multiple_scattering_add_up_to_the_total() -> None:
     surface = {**COLOURED, "g": 0.3, "eta": 1.3}
     single, multiple, total = (

@@ -25,11 +25,11 @@ def variant() -> None:
     rendering.register()
 
 
-def _media(shape: dict, **surface: object):
+def _media(shape: dict, mm_per_unit: float = 1.0, **surface: object):
     from halfspace_sss.rendering.walk.media import WalkMedia
 
     scene = {"type": "scene", "object": {**shape, "bsdf": {"type": "translucent", **surface}}}
-    return WalkMedia.of(mi.load_dict(scene), 1.0)
+    return WalkMedia.of(mi.load_dict(scene), mm_per_unit)
 
 
 def _slab() -> dict:
@@ -46,15 +46,15 @@ def _start(mu: float, n: int = N):
     return Start(mi.Point3f(np.zeros((3, n))), mi.Normal3f(up), mi.Vector3f(w))
 
 
-def _on_sphere(radius: float, n: int):
-    """Random points of a sphere about the origin and directions within 70 degrees of its normals."""
+def _on_sphere(radius: float, n: int, diffuse: bool = False):
+    """Random points of a sphere about the origin; directions within 70 degrees of its normals, or by the cosine."""
     from halfspace_sss.rendering.walk.exits import Start
 
     rng = np.random.default_rng(3)
     up = rng.standard_normal((3, n))
     up /= np.linalg.norm(up, axis=0)
     w = rng.standard_normal((3, n))
-    w = 1.05 * up + w / np.linalg.norm(w, axis=0)
+    w = (1.0 if diffuse else 1.05) * up + w / np.linalg.norm(w, axis=0)
     w /= np.linalg.norm(w, axis=0)
     return Start(mi.Point3f(radius * up), mi.Normal3f(up), mi.Vector3f(w)), (up * w).sum(axis=0)
 
@@ -97,6 +97,25 @@ def test_exits_of_a_large_slab_carry_the_reflectance_of_the_half_space() -> None
     for values, (s, a) in zip(throughput, ((1.0, 0.01), (0.8, 0.2), (0.3, 0.7))):
         expected = trace(Medium(s, a, 0.5, 1.4), 0.6, n_paths=2**19).reflectance()
         _check_mean(values, expected.value, expected.standard_error)
+
+
+@pytest.mark.parametrize(("radius", "away"), [(1000.0, 0.0), (5.0, 100.0)], ids=["large", "small and far away"])
+def test_a_ball_of_many_mean_free_paths_reflects_diffuse_light_as_the_half_space(radius: float, away: float) -> None:
+    """Rounding of positions, or what keeps rays clear of the surface, must not lay walks deeper."""
+    scale = 1000 / radius  # mean free paths in a scene unit
+    colours = {"sigma_s": "0.99,0.75,0.3", "sigma_a": "0.01,0.25,0.7", "g": "0,0.3,0", "eta": 1.4}
+    media = _media({"type": "sphere", "radius": radius, "center": [away, 0, 0]}, scale, **colours)
+    start, _ = _on_sphere(radius, N, diffuse=True)
+    start.x_o = mi.Point3f(start.x_o + mi.Vector3f(away, 0, 0))
+    out = _exits(media, 0, start, 9)
+    order = np.array(out.order)
+    for values, s, a, g in zip(np.array(out.throughput), (0.99, 0.75, 0.3), (0.01, 0.25, 0.7), (0.0, 0.3, 0.0)):
+        plane = trace(Medium(s, a, g, 1.4), "diffuse", 200_000, 5)
+        for name, kept in (("single", order == 1), ("multiple", order > 1)):
+            expected = plane.reflectance(name)
+            # the last part is the curvature of the ball
+            error = np.hypot(expected.standard_error, 1e-3 / WIDEST_Z * expected.value)
+            _check_mean(values * kept, expected.value, error)
 
 
 def test_walks_count_their_scattering_events() -> None:

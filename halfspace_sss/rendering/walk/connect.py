@@ -166,8 +166,9 @@ class Joins:
         bend = dr.dot(d, si.n) * mi.Frame3f.cos_theta(si.wi) / (dr.dot(d, si.sh_frame.n) * dr.dot(ds.d, si.n))
         weight = dr.select(enters, flux * ((1 - F) * bend), 0)
         enters &= dr.max(weight) > 0
-        walk = start_walk(si.spawn_ray(d).o, d, rng)
-        walk = replace(walk, alive=enters, object=k, weight=weight, channel=draw(len(m.sigma_t), rng))
+        walk = start_walk(mi.Point3f(si.p), d, rng)
+        walk = replace(walk, skip=self.media.clear(k, si.n, d), alive=enters, object=k, weight=weight,
+                       channel=draw(len(m.sigma_t), rng))  # fmt: skip
         state = (LightWalk(walk, mi.Bool(enters), mi.Bool(enters), L), event)
         s, event = dr.while_loop(state, lambda s, event: s.walk.alive, self._follow, label="light")
         return s.walk.rng, s.L, event, aim
@@ -185,28 +186,30 @@ class Joins:
         t, over = _on_ray(walk, event, rng.next_float32())
         t = dr.select(joinable, t, 0)
         flight = free_path(m, walk.channel, rng.next_float32())
-        ray = mi.Ray3f(walk.o, walk.d)
-        ray.maxt = dr.maximum(t, flight)
+        ray = walk.ray(dr.maximum(t, flight))
         hit = media.scene.ray_intersect_preliminary(ray, coherent=False)
-        L = s.L + self._joined(walk, event, ray, t, dr.select(joinable & (t < hit.t), over, 0))
+        reach = hit.t + walk.skip
+        L = s.L + self._joined(walk, event, t, dr.select(joinable & (t < reach), over, 0))
         u, p = None, mi.Point3f(walk.o + walk.d * flight)
         if media.varies:
             m, u = media.coefficients(event.object, p), rng.next_float32()
-        ended = fly(m, walk.weight, walk.density, walk.channel, flight, hit.t, u)
+        ended = fly(m, walk.weight, walk.density, walk.channel, flight, reach, u)
         u = mi.Point2f(rng.next_float32(), rng.next_float32())
         turned, weight, density = turn(m, ended.weight, ended.density, walk.channel, walk.d, u, media.same_g)
-        scattered = replace(walk, alive=walk.alive & s.lit, o=p, d=turned, weight=weight, density=density)
+        scattered = replace(walk, alive=walk.alive & s.lit, o=p, d=turned, skip=mi.Float(0), weight=weight,
+                            density=density)  # fmt: skip
         walk = replace(walk, weight=ended.weight, density=ended.density)
         if media.varies:
             on = walk.alive & (~ended.null | media.box.contains(p))
-            walk = replace(walk, alive=on, o=dr.select(ended.null, p, walk.o))
+            skip = dr.select(ended.null, 0, walk.skip)
+            walk = replace(walk, alive=on, o=dr.select(ended.null, p, walk.o), skip=skip)
         collided = ended.scatters | ended.null
         walk, *_ = dr.if_stmt((walk, ray, hit), ~collided, self._reflect, lambda *state: state)
         scattered.rng = walk.rng
         lit = ~ended.scatters & (s.lit | ~collided)
         return LightWalk(dr.select(ended.scatters, scattered, walk), lit, ~ended.null, L), event
 
-    def _joined(self, walk: Walk, event: Event, ray: Any, t: Any, over: Any) -> Any:
+    def _joined(self, walk: Walk, event: Event, t: Any, over: Any) -> Any:
         """What a join at the distance t on a ray of light brings; `over` is one over its density."""
         media, q = self.media, mi.Point3f(walk.o + walk.d * t)
         to_p = mi.Ray3f(q, dr.normalize(event.p - q))
@@ -216,7 +219,7 @@ class Joins:
         value = dr.select(over > 0, walk.weight * at_q.sigma_s * phases * over, 0)
         bright = dr.max(value) > 0
         bright &= ~media.scene.ray_test(to_p, False, bright)
-        T = media.transmittance(event.object, ray, dr.select(bright, t, 0), walk.rng)
+        T = media.transmittance(event.object, mi.Ray3f(walk.o, walk.d), dr.select(bright, t, 0), walk.rng)
         T *= media.transmittance(event.object, to_p, dr.select(bright, to_p.maxt, 0), walk.rng)
         return dr.select(bright, value * T, 0)
 
@@ -227,10 +230,12 @@ class Joins:
         si = self.media.face_outwards(si, k, d)
         F, _, _, _ = mi.fresnel(mi.Frame3f.cos_theta(si.wi), self.media.row("eta", k))
         new = si.to_world(mi.reflect(si.wi))
-        foreign = self.media.index_of(si.shape) != k  # an object that overlaps: the ray goes on behind it
+        met = self.media.met(si.shape, k)
+        foreign = met != k  # an object that overlaps: the ray goes on behind it
         new = dr.select(foreign, d, new)
         inside = (dr.dot(si.n, d) > 0) & (dr.dot(si.n, new) < 0) & (walk.rng.next_float32() < F)
-        walk = replace(walk, o=si.spawn_ray(new).o, d=new, alive=walk.alive & (foreign | inside))
+        o, skip = mi.Point3f(si.p), self.media.clear(met, si.n, new)
+        walk = replace(walk, o=o, d=new, skip=skip, alive=walk.alive & (foreign | inside))
         return walk, ray, hit
 
 

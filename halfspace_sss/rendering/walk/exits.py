@@ -30,6 +30,7 @@ class Start:
     x_o: mi.Point3f  # on the surface
     n_o: mi.Normal3f  # outward normal there
     w_o: mi.Vector3f  # direction outside, away from the surface
+    n_shading: mi.Normal3f | None = None  # outward shading normal, if it is not n_o
 
 
 @dataclass
@@ -88,7 +89,13 @@ def exits(media: WalkMedia, k: int, start: Start, seed: int | tuple[int, ...], l
 
 
 def walk_from(
-    media: WalkMedia, k: int, start: Start, visitor: Visitor, seed: int | tuple[int, ...], lanes: int = LANES
+    media: WalkMedia,
+    k: int,
+    start: Start,
+    visitor: Visitor,
+    seed: int | tuple[int, ...],
+    lanes: int = LANES,
+    roulette_from: int = 1,
 ) -> None:
     """Walk from points on object k until the walks leave it or end inside.
 
@@ -99,6 +106,7 @@ def walk_from(
         visitor: what is recorded; its record is the number of the walk. It has to end walks that leave.
         seed: one whole number or more.
         lanes: walks at a time; another number gives other walks.
+        roulette_from: scattering events from which on roulette may end a walk.
 
     Raises:
         ValueError: there is no object k, or the arrays of `start` are of different lengths.
@@ -108,7 +116,7 @@ def walk_from(
         return
     dr.eval(start)
     lanes = min(lanes, n)
-    walker, total, k = Walker(media, visitor), dr.opaque(mi.UInt32, n), dr.opaque(mi.UInt32, k)
+    walker, total, k = Walker(media, visitor, roulette_from), dr.opaque(mi.UInt32, n), dr.opaque(mi.UInt32, k)
 
     def renew(walk: Walk, index: Any) -> tuple[Walk, Any]:
         return _enter(media, k, start, index + lanes, walk.rng), index + lanes
@@ -134,6 +142,8 @@ def _check(media: WalkMedia, k: int, start: Start) -> int:
     if not 0 <= k < len(media.objects):
         raise ValueError(f"k must be a whole number in [0, {len(media.objects) - 1}], got {k!r}")
     widths = [dr.width(start.x_o), dr.width(start.n_o), dr.width(start.w_o)]
+    if start.n_shading is not None:
+        widths.append(dr.width(start.n_shading))
     if len(set(widths)) > 1:
         raise ValueError(f"x_o, n_o and w_o must be of one length, got {widths}")
     return widths[0]
@@ -145,15 +155,17 @@ def _enter(media: WalkMedia, k: Any, start: Start, index: Any, rng: Any) -> Walk
     si = dr.zeros(mi.SurfaceInteraction3f, dr.width(index))
     si.p = dr.gather(mi.Point3f, start.x_o, index, known)
     si.n = dr.gather(mi.Normal3f, start.n_o, index, known)
-    si.sh_frame = mi.Frame3f(si.n)
+    shading = start.n_o if start.n_shading is None else start.n_shading
+    si.sh_frame = mi.Frame3f(dr.gather(mi.Normal3f, shading, index, known))
     w = dr.gather(mi.Vector3f, start.w_o, index, known)
     si.wi = si.to_local(w)
     ctx = mi.BSDFContext()
     ctx.type_mask = mi.BSDFFlags.Transmission
     bs, value = sample_bsdf(media.boundary(k), si, rng, ctx)
     d = si.to_world(bs.wo)
-    walk = start_walk(si.spawn_ray(d).o, d, rng)
+    walk = start_walk(si.p, d, rng)
     enters = known & (dr.dot(w, si.n) > 0) & (dr.dot(d, si.n) < 0) & (dr.max(value) > 0)
+    enters &= mi.Frame3f.cos_theta(si.wi) > 0
     channel = draw(len(value), rng) if len(value) > 1 else walk.channel
     return replace(walk, alive=enters, object=mi.Int32(k) + dr.zeros(mi.Int32, dr.width(index)), weight=value,
-                   scale=dr.square(bs.eta), channel=channel)  # fmt: skip
+                   skip=media.clear(k, si.n, d), scale=dr.square(bs.eta), channel=channel)  # fmt: skip

@@ -60,6 +60,7 @@ class WalkMedia:
         tables["step"] = mi.UInt32([int(len(side) > 1) for side in sides])
         tables["fewest"] = mi.UInt32([_FEWEST[inside.orders] for inside in self.insides])
         tables["most"] = mi.UInt32([_MOST[inside.orders] for inside in self.insides])
+        tables["rounding"] = mi.Float([_rounding(obj.scene.bbox()) for obj in self.objects])
         tables["reflects"] = mi.Bool([inside.reflection for inside in self.insides])
         tables["rough"] = mi.Bool([is_rough(b) for b in self.boundaries])
         tables["boundary"] = pointer_numbers([mi.BSDFPtr(b) for b in self.boundaries])
@@ -86,6 +87,12 @@ class WalkMedia:
         return any(is_rough(b) for b in self.boundaries)
 
     @property
+    def needed(self) -> Any:
+        """What boundaries have to know of a point that a walk meets: derivatives of positions where one is rough."""
+        few = mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame | mi.RayFlags.UV
+        return mi.RayFlags.All if self.any_rough else few
+
+    @property
     def all_rough(self) -> bool:
         """Whether no boundary is smooth."""
         return all(is_rough(b) for b in self.boundaries)
@@ -93,7 +100,11 @@ class WalkMedia:
     def row(self, key: str, k: Any) -> Any:
         """An entry of a table for object k."""
         table = self.tables[key]
-        return dr.gather(type(table), table, k)
+        return dr.gather(type(table), table, self._place(k))
+
+    def _place(self, k: Any) -> Any:
+        """Of object k in tables: the same in all lanes, which is faster, where there is one object."""
+        return mi.UInt32(0) if len(self.objects) == 1 else k
 
     def counts(self, k: Any, order: Any) -> Any:
         """Whether a walk that leaves object k after so many events counts."""
@@ -106,7 +117,7 @@ class WalkMedia:
 
     def spectrum(self, key: str, k: Any) -> Any:
         """An entry of a table with one column per channel."""
-        return mi.Spectrum([dr.gather(mi.Float, column, k) for column in self.tables[key]])
+        return mi.Spectrum([dr.gather(mi.Float, column, self._place(k)) for column in self.tables[key]])
 
     def coefficients(self, k: Any, p: Any) -> Coefficients:
         """Of object k at the point p."""
@@ -129,6 +140,10 @@ class WalkMedia:
         known = active & (pointer < dr.width(table))
         return dr.select(known, dr.gather(mi.Int32, table, pointer, known), -1)
 
+    def met(self, shape: Any, k: Any) -> Any:
+        """The number of the object whose boundary, the given shape, a ray inside object k has met."""
+        return k if len(self.objects) == 1 else self.index_of(shape)
+
     def boundary(self, k: Any) -> Any:
         """The dielectric of object k: one BSDF, or a pointer in each lane."""
         if len(self.boundaries) == 1:
@@ -143,6 +158,19 @@ class WalkMedia:
             return self.row("side", k)
         index = self.row("first", k) + prim_index * self.row("step", k)
         return self.row("side", dr.minimum(index, dr.width(self.tables["side"]) - 1))
+
+    def clear(self, k: Any, n: Any, d: Any) -> Any:
+        """Length along d after which a ray from the surface of object k is clear of it; n is the normal there.
+
+        Mitsuba moves the origin along the normal instead, which lays the walk deeper: at 1000 mean free paths from the
+        origin of the scene it took 8 % of the single and 1 to 6 % of the multiple scattering away.
+        """
+        return self.row("rounding", k) / dr.maximum(dr.abs(dr.dot(n, d)), 0.1)
+
+    def depart(self, k: Any, si: Any, d: Any, inside: Any) -> tuple[Any, Any]:
+        """Where a ray along d from the surface of object k begins, and the length that it skips if it runs inside."""
+        skip = self.clear(dr.maximum(mi.Int32(k), 0), si.n, d)
+        return dr.select(inside, si.p, si.spawn_ray(d).o), dr.select(inside, skip, 0)
 
     def face_outwards(self, si: Any, k: Any, direction: Any) -> Any:
         """The interaction with its normals turned to the outside of object k; `direction` is that of the ray."""
@@ -183,6 +211,16 @@ def _bounds(scene: Any) -> Any:
         return box
     margin = 1e-3 * (box.max - box.min)
     return mi.BoundingBox3f(mi.Point3f(box.min - margin), mi.Point3f(box.max + margin))
+
+
+def _rounding(box: Any) -> float:
+    """A bound of how far from its surface rounding puts points of an object, scene units.
+
+    The largest coordinate counts, not that of the point: those of a large face or ball near the origin are no better.
+    """
+    if not box.valid():
+        return 0.0
+    return float(np.max(np.abs([box.min, box.max]))) * mi.math.RayEpsilon
 
 
 def is_rough(boundary: Any) -> bool:

@@ -15,7 +15,9 @@ import mitsuba as mi
 from halfspace_sss.rendering.walk.inside import fly, free_path, roulette, turn
 from halfspace_sss.rendering.walk.media import Coefficients, WalkMedia
 
-__all__ = ["OUTSIDE", "Crossing", "Event", "Visitor", "Walk", "Walker", "draw", "sample_bsdf", "start_walk"]
+__all__ = [
+    "OUTSIDE", "Crossing", "Event", "Visitor", "Walk", "Walker", "draw", "sample_bsdf", "start_walk",
+]  # fmt: skip
 
 OUTSIDE = -1
 
@@ -26,14 +28,21 @@ class Walk:
 
     alive: mi.Bool  # whether it goes on
     object: mi.Int32  # the object around it, by number, or OUTSIDE
-    o: mi.Point3f  # where its ray begins
-    d: mi.Vector3f  # direction of the ray
+    o: mi.Point3f  # where its flight begins
+    d: mi.Vector3f  # direction of the flight
+    skip: mi.Float  # length of the flight after which a ray looks for the boundary, see `WalkMedia.clear`
     channel: mi.UInt32  # by which distances and angles are drawn
     weight: mi.Spectrum  # w_c = f_c / mean_k p_k
     density: mi.Spectrum  # q_c = p_c / mean_k p_k
     scale: mi.Float  # square of the relative index passed so far
     order: mi.UInt32  # scattering events since it entered the object
     rng: mi.PCG32
+
+    def ray(self, t: Any) -> Any:
+        """Looks for the boundary on a flight of length t; its distances begin after `skip`."""
+        ray = mi.Ray3f(self.o + self.d * self.skip, self.d)
+        ray.maxt = dr.maximum(t - self.skip, 0)
+        return ray
 
 
 @dataclass
@@ -77,28 +86,29 @@ class Walker:
     Args:
         media: the objects.
         visitor: what is recorded.
+        roulette_from: scattering events from which on roulette may end a walk.
     """
 
     media: WalkMedia
     visitor: Visitor
+    roulette_from: int = 1
 
     def step(self, walk: Walk, record: Any) -> tuple[Walk, Any]:
         """A free flight, and the scattering event, the null collision or the boundary at its end."""
         media, rng = self.media, walk.rng
         m, u = media.coefficients(walk.object, walk.o), None
         t = free_path(m, walk.channel, rng.next_float32())
-        ray = mi.Ray3f(walk.o, walk.d)
-        ray.maxt = t
+        ray, p = walk.ray(t), mi.Point3f(walk.o + walk.d * t)
         hit = media.scene.ray_intersect_preliminary(ray, coherent=False)
         if media.varies:
-            m, u = media.coefficients(walk.object, ray(t)), rng.next_float32()
-        flight = fly(m, walk.weight, walk.density, walk.channel, t, hit.t, u)
+            m, u = media.coefficients(walk.object, p), rng.next_float32()
+        flight = fly(m, walk.weight, walk.density, walk.channel, t, hit.t + walk.skip, u)
         walk = replace(walk, weight=flight.weight, density=flight.density)
-        event = Event(ray(t), ray.d, walk.object, m)
+        event = Event(p, ray.d, walk.object, m)
         meets = ~(flight.scatters | flight.null)
         if media.varies:
-            o = dr.select(flight.null, event.p, walk.o)
-            walk = replace(walk, o=o, alive=walk.alive & (~flight.null | media.box.contains(o)))
+            o, skip = dr.select(flight.null, p, walk.o), dr.select(flight.null, 0, walk.skip)
+            walk = replace(walk, o=o, skip=skip, alive=walk.alive & (~flight.null | media.box.contains(o)))
             walk.object = dr.select(walk.alive, walk.object, OUTSIDE)
         walk, record = dr.if_stmt((walk, record, event), flight.scatters, self._scatter, _pass, label="scatter")
         return dr.if_stmt((walk, record, ray, hit), meets, self._meet, _pass, label="boundary")
@@ -108,18 +118,20 @@ class Walker:
         rng, media = walk.rng, self.media
         u = mi.Point2f(rng.next_float32(), rng.next_float32())
         d, weight, density = turn(event.m, walk.weight, walk.density, walk.channel, event.along, u, media.same_g)
-        survives, weight = roulette(weight, walk.scale, rng.next_float32())
         order = walk.order + 1
+        scale = walk.scale if self.roulette_from <= 1 else dr.select(order < self.roulette_from, dr.inf, walk.scale)
+        survives, weight = roulette(weight, scale, rng.next_float32())
         alive = survives & (order <= media.row("most", walk.object)) & media.box.contains(event.p)
-        walk = replace(walk, o=event.p, d=d, weight=weight, density=density, order=order, alive=alive,
-                       object=dr.select(alive, walk.object, OUTSIDE))  # fmt: skip
+        walk = replace(walk, o=event.p, d=d, skip=mi.Float(0), weight=weight, density=density, order=order,
+                       alive=alive, object=dr.select(alive, walk.object, OUTSIDE))  # fmt: skip
         return walk, record
 
     def _meet(self, walk: Walk, record: Any, ray: Any, hit: Any) -> tuple[Walk, Any]:
         """Reflection at the boundary seen from inside, or the way out."""
         media, k = self.media, walk.object
-        si = hit.compute_surface_interaction(ray)
-        foreign = media.index_of(si.shape) != k  # of an object that overlaps: the flight goes on behind it
+        si = hit.compute_surface_interaction(ray, media.needed)
+        met = media.met(si.shape, k)
+        foreign = met != k  # of an object that overlaps: the flight goes on behind it
         si = media.face_outwards(si, k, ray.d)
         leaked = ~foreign & (dr.dot(si.n, ray.d) < 0)  # rounding has put the walk outside
         counts = media.counts(k, walk.order)
@@ -129,7 +141,8 @@ class Walker:
         out = ~foreign & (dr.dot(d, si.n) > 0)
         alive = ~leaked & (foreign | (bs.pdf > 0)) & (~out | counts)
         d = dr.select(foreign, ray.d, d)
-        walk = replace(walk, o=si.spawn_ray(d).o, d=d, alive=alive,
+        o, skip = media.depart(met, si, d, ~out)
+        walk = replace(walk, o=o, d=d, skip=skip, alive=alive,
                        object=dr.select(alive & ~out, k, OUTSIDE),
                        weight=dr.select(foreign, walk.weight, walk.weight * value),
                        scale=walk.scale * dr.select(foreign, 1, dr.square(bs.eta)))  # fmt: skip
@@ -146,7 +159,7 @@ def start_walk(o: Any, d: Any, rng: Any) -> Walk:
     lanes = dr.width(o)
     return Walk(
         alive=dr.full(mi.Bool, True, lanes), object=dr.full(mi.Int32, OUTSIDE, lanes), o=o, d=d,
-        channel=dr.full(mi.UInt32, 0, lanes), weight=dr.full(mi.Spectrum, 1, lanes),
+        skip=dr.full(mi.Float, 0, lanes), channel=dr.full(mi.UInt32, 0, lanes), weight=dr.full(mi.Spectrum, 1, lanes),
         density=dr.full(mi.Spectrum, 1, lanes), scale=dr.full(mi.Float, 1, lanes),
         order=dr.full(mi.UInt32, 0, lanes), rng=rng,
     )  # fmt: skip

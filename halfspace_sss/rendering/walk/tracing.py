@@ -109,7 +109,8 @@ class PathTracer:
         channel = walk.channel
         if len(weight) > 1:  # drawn once in a path, whose densities are counted from there
             channel = dr.select(p.depth == 1, _channel(u, len(weight)), channel)
-        walk = replace(walk, o=si.spawn_ray(d).o, d=d, alive=alive, order=dr.select(enters, 0, walk.order),
+        o, skip = media.depart(near, si, d, enters) if media.objects else (si.spawn_ray(d).o, walk.skip)
+        walk = replace(walk, o=o, d=d, skip=skip, alive=alive, order=dr.select(enters, 0, walk.order),
                        object=dr.select(alive & enters, k, OUTSIDE), weight=weight, scale=scale,
                        channel=channel)  # fmt: skip
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
