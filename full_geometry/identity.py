@@ -35,9 +35,16 @@ class Identity:
     medium: dict[str, Any]
 
     def digest(self) -> str:
-        """A name for shape and ratios of the medium, without sizes."""
+        """A name for shape, its handedness and ratios of the medium, without sizes."""
         ratios = [f"{v:.6g}" for key in ("albedo", "g", "eta") for v in np.atleast_1d(self.medium[key])]
-        return hashlib.sha256("|".join([self.kind, self.topology, *ratios]).encode()).hexdigest()[:12]
+        return hashlib.sha256("|".join([self.kind, self.topology, self._hand(), *ratios]).encode()).hexdigest()[:12]
+
+    def _hand(self) -> str:
+        """Which of an object and its mirror image, that have the same faces and size, it is."""
+        x = self.anchors.astype(float)
+        x = (x - x.mean(axis=0)) / max(np.linalg.norm(np.std(x, axis=0)), 1e-30)
+        turns = np.linalg.det(np.random.default_rng(0).standard_normal((3, len(x))) @ x / np.sqrt(len(x)))
+        return "left" if turns < 0 else "right"
 
     def record(self) -> dict[str, Any]:
         """Everything but the anchors, ready for JSON."""

@@ -48,8 +48,8 @@ def load_scene(
     _check("orders", orders, ORDERS)
     state, config = _parsed(scene, parameters or {})
     # a model that knows whole objects does not know what Mitsuba makes of several with the same BSDF
-    names = [model or str(props.get("model", "")) for props in _surfaces(state)]
-    config.merge_meshes = not any(knows_objects(name) for name in names)
+    names = [str(props.get("model", "")) for props in _surfaces(state)]
+    config.merge_meshes = not any(knows_objects(name) for name in (*names, model or ""))
     _transform(scene, state, config)
     for props in _surfaces(state):  # anew: the nodes have moved
         if model and model != PATH_TRACED:
