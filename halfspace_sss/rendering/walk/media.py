@@ -152,12 +152,11 @@ class WalkMedia:
 
     def side(self, k: Any, prim_index: Any) -> Any:
         """1 where the geometric normal of a face of object k points outwards, -1 where it points inwards."""
-        import drjit as dr
-
         if all(obj.signs is None for obj in self.objects):
             return self.row("side", k)
+        table = self.tables["side"]  # by face, not by object
         index = self.row("first", k) + prim_index * self.row("step", k)
-        return self.row("side", dr.minimum(index, dr.width(self.tables["side"]) - 1))
+        return dr.gather(mi.Float, table, dr.minimum(index, dr.width(table) - 1))
 
     def clear(self, k: Any, n: Any, d: Any) -> Any:
         """Length along d after which a ray from the surface of object k is clear of it; n is the normal there.
