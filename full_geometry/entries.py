@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 from full_geometry.model import PreparedExit
 from full_geometry.patches import PatchSampler, PatchWeights
+from halfspace_sss.rendering.surface.object import turned
 from halfspace_sss.rendering.transport.plane import Exit, number
 from halfspace_sss.rendering.transport.positions import PositionSampler
 from halfspace_sss.rendering.transport.protocols import Entry
@@ -50,7 +51,7 @@ class LearntProposals:
 
         by_patch = active & (sampler.next_1d() < number(self.patch_share))
         at, _ = self.patches.sample(prepared.weights, sampler.next_1d(), sampler.next_1d(), sampler.next_2d())
-        n_out = dr.select(dr.dot(at.n_shading, at.n) < 0, -at.n_shading, at.n_shading) * number(self.sign)
+        n_out = turned(at.n_shading, at.n) * number(self.sign)
         entry = Entry(mi.Point3f(at.p), mi.Normal3f(at.n), mi.Normal3f(n_out), mi.Float(1), mi.UInt32(at.prim_index))
         if self.patch_share < 1:
             probed = self.positions.sample(out, prim_index, sampler, active & ~by_patch)

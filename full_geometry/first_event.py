@@ -14,6 +14,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from full_geometry.subject import Subject, SurfacePoint, refract_in
+from halfspace_sss.rendering.surface.object import turned
 from halfspace_sss.rendering.transport.plane import number
 
 __all__ = ["REFLECTIONS", "FirstEvent", "first_event"]
@@ -49,7 +50,7 @@ def first_event(subject: Subject, at: SurfacePoint, active: Any = True) -> First
         inner = v * ((1 - through) / sigma_t - l * through)
         moment = moment + (o * dr.mean(part) + d * dr.mean(inner))
         length = length + dr.mean(part) * way + dr.mean(inner)
-        n = si.sh_frame.n * sign
+        n = turned(si.sh_frame.n, si.n) * sign
         c = dr.dot(d, n)
         v = v * through * mi.fresnel(dr.abs(c), dr.select(c > 0, 1 / eta, eta))[0]
         onward = d - n * (2 * c)

@@ -10,11 +10,10 @@ __all__ = ["check_geometry", "check_surface", "object_of"]
 
 
 def check_geometry(found: Object) -> None:
-    """ValueError if the normals of an object do not all point to the same side: one sign stands for all of them."""
-    if found.signs is not None or not found.agree:
-        where = "pieces" if found.signs is not None else "faces and vertices"
+    """ValueError if the faces of an object do not all point to the same side: one sign stands for all of them."""
+    if found.signs is not None:
         raise ValueError(
-            f"normals of {found.shape.id()!r} must all point to the same side to be learnt, got {where} that disagree"
+            f"normals of {found.shape.id()!r} must all point to the same side to be learnt, got pieces that disagree"
         )
 
 

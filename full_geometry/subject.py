@@ -13,7 +13,7 @@ from full_geometry.learnable import check_geometry, object_of
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.scenes.scene_files import millimetres
 from halfspace_sss.rendering.surface.inside import Inside
-from halfspace_sss.rendering.surface.object import Object, survey
+from halfspace_sss.rendering.surface.object import Object, survey, turned
 from halfspace_sss.rendering.transport.area_points import AreaPoints
 from halfspace_sss.rendering.transport.body import check_size
 from halfspace_sss.rendering.transport.plane import number
@@ -145,7 +145,7 @@ class Subject:
 
         u_face, u = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
         at = self.points.sample(u_face, u, True)
-        n, n_out = at.n * self.found.sign, at.n_shading * self.found.sign
+        n, n_out = at.n * self.found.sign, turned(at.n_shading, at.n) * self.found.sign
         return SurfacePoint(mi.Point3f(at.p), mi.Normal3f(n), mi.Normal3f(n_out), cosine_direction(n_out, rng))
 
     def mean_free_paths(self) -> np.ndarray:
