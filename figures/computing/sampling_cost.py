@@ -42,7 +42,7 @@ def _steps(scene: Any, n: int) -> dict[str, Callable[[], Any]]:
     import drjit as dr
     import mitsuba as mi
 
-    from halfspace_sss.rendering.paths.events import exit_at
+    from halfspace_sss.rendering.paths.choice import exit_at
     from halfspace_sss.rendering.transport.plane import place
 
     (body,) = scene.integrator().prepare(scene)

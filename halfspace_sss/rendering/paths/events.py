@@ -9,14 +9,12 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from halfspace_sss.rendering.paths.entering import entering_light
-from halfspace_sss.rendering.paths.single import single_scattering_at
+from halfspace_sss.rendering.paths.few import Leg, few_orders
 from halfspace_sss.rendering.paths.world import World, sampled_light
-from halfspace_sss.rendering.surface.derivatives import detached
-from halfspace_sss.rendering.surface.object import turned
 from halfspace_sss.rendering.transport.body import Body
 from halfspace_sss.rendering.transport.plane import Exit, place
 
-__all__ = ["Onward", "balance", "exit_at", "multiple", "nothing", "single", "surface"]
+__all__ = ["Onward", "balance", "few", "multiple", "nothing", "surface"]
 
 
 class Onward(NamedTuple):
@@ -90,14 +88,12 @@ def _differentiable(bsdf: Any, ctx: Any, si: Any, bs: Any, weight: Any, active: 
     return dr.replace_grad(dr.detach(weight), dr.select(delta, lobe, value))
 
 
-def multiple(world: World, body: Body, sampler: Any, si: Any, active: Any) -> tuple[Onward, Any]:
+def multiple(world: World, body: Body, out: Exit, face: Any, sampler: Any, active: Any) -> tuple[Onward, Any]:
     """Light that entered the body elsewhere and comes out here by its model, and what is seen of point lights so."""
     import drjit as dr
     import mitsuba as mi
 
-    with detached():
-        out = exit_at(body, si)
-    found = entering_light(world, body, out, si.prim_index, sampler, active)
+    found = entering_light(world, body, out, face, sampler, active)
     direct = mi.Spectrum(0)
     if world.lights.some_delta:
         shadow = place(found.p, found.n).spawn_ray_to(found.target)
@@ -111,23 +107,11 @@ def multiple(world: World, body: Body, sampler: Any, si: Any, active: Any) -> tu
     return on, direct
 
 
-def single(world: World, body: Body, sampler: Any, si: Any, active: Any) -> tuple[Onward, Any]:
-    """Light that was scattered once inside the body, and that of emitters that came the same way."""
+def few(world: World, body: Body, leg: Leg, sampler: Any, active: Any) -> tuple[Onward, Any]:
+    """Light that was scattered at most once inside the body, and that of emitters that came the same way."""
     import mitsuba as mi
 
-    found = single_scattering_at(world, body, exit_at(body, si), sampler, active)
+    found = few_orders(world, body, leg, sampler, active)
     zero = mi.Float(0)
-    on = Onward(found.p, found.n, found.d, found.weight, mi.Float(1), zero, mi.Bool(True), mi.Float(-1))
+    on = Onward(found.p, found.n, found.d, found.weight, mi.Float(1), zero, found.connected, mi.Float(-1))
     return on, found.direct
-
-
-def exit_at(body: Body, si: Any) -> Exit:
-    """The exit of light towards `si.wi`, with the normal that points outwards."""
-    import drjit as dr
-    import mitsuba as mi
-
-    w, n = si.to_world(si.wi), mi.Normal3f(turned(si.sh_frame.n, si.n))
-    sign = body.found.side(si.prim_index)
-    if not body.found.closed:  # a sheet is a half-space from both sides
-        sign = dr.select(dr.dot(n, w) > 0, 1.0, -1.0)
-    return Exit(mi.Point3f(si.p), n * sign, w, sign, mi.Normal3f(si.n) * sign)

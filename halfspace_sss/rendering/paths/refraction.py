@@ -1,4 +1,4 @@
-"""Rays from inside an object through its boundary, and the one ray that is refracted towards a given point.
+"""Where rays inside an object meet its boundary, and the one ray that is refracted towards a given point.
 
 The connection follows Walter, Zhao, Holzschuch and Bala 2009 in spirit: the direction at the event is moved by Newton's
 method until the refracted ray meets the target; the derivative of the refracted ray (Igehy 1999) contains the curvature
@@ -13,22 +13,11 @@ from typing import Any, NamedTuple
 from halfspace_sss.rendering.surface.object import turned
 from halfspace_sss.rendering.transport.body import Body
 
-__all__ = ["Connection", "Passage", "leave", "refracted_connection"]
+__all__ = ["Connection", "meet", "refracted_connection"]
 
 ITERATIONS = 6
 LONGEST_STEP = 0.5  # of the direction, radians
 TOLERANCE = 1e-3  # distance by which the target may be missed, over its distance
-
-
-class Passage(NamedTuple):
-    """A ray that leaves: point, geometric normal (outwards), direction outside, transmittance, length inside."""
-
-    p: Any
-    n: Any
-    w: Any
-    T: Any
-    length: Any
-    valid: Any
 
 
 class Connection(NamedTuple):
@@ -44,18 +33,7 @@ class Connection(NamedTuple):
     valid: Any
 
 
-def leave(body: Body, p: Any, d: Any, active: Any) -> Passage:
-    """The ray from p inside the body along d, refracted where it meets the boundary."""
-    import drjit as dr
-    import mitsuba as mi
-
-    si, n_out, n = _meet(body, p, d, mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame, active)
-    w, F, valid = _refract(body, d, n_out)
-    valid = active & si.is_valid() & valid & (dr.dot(w, n) > 0)
-    return Passage(mi.Point3f(si.p), mi.Normal3f(n), mi.Vector3f(w), 1 - F, si.t, valid)
-
-
-def _meet(body: Body, p: Any, d: Any, flags: Any, active: Any) -> tuple[Any, Any, Any]:
+def meet(body: Body, p: Any, d: Any, flags: Any, active: Any) -> tuple[Any, Any, Any]:
     """Interaction with the boundary, shading normal and geometric normal, both outwards (along d for a sheet)."""
     import drjit as dr
     import mitsuba as mi
@@ -118,7 +96,7 @@ def _first_guess(body: Body, p: Any, w: Any, active: Any) -> Any:
     import drjit as dr
     import mitsuba as mi
 
-    _, n_out, _ = _meet(body, p, w, mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame, active)
+    _, n_out, _ = meet(body, p, w, mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame, active)
     across = (w - n_out * dr.dot(w, n_out)) / body.surface.inside.medium.eta
     return dr.normalize(across + n_out * dr.sqrt(dr.maximum(1 - dr.squared_norm(across), 1e-4)))
 
@@ -132,7 +110,7 @@ def _aim(body: Body, p: Any, d: Any, target: Any, active: Any) -> tuple[tuple, t
     import mitsuba as mi
 
     flags = mi.RayFlags.All | mi.RayFlags.dNSdUV
-    si, n_out, n = _meet(body, p, d, flags, active)
+    si, n_out, n = meet(body, p, d, flags, active)
     w, F, valid = _refract(body, d, n_out)
     eta, c = body.surface.inside.medium.eta, dr.dot(d, n_out)
     c_t = dr.sqrt(dr.maximum(1 - eta * eta * (1 - c * c), 1e-6))

@@ -4,20 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 from halfspace_sss.rendering.paths.books import Books, Replay, Tally
-from halfspace_sss.rendering.paths.events import Onward, balance, multiple, nothing, single, surface
+from halfspace_sss.rendering.paths.choice import choose
+from halfspace_sss.rendering.paths.events import Onward, balance, few, multiple, nothing, surface
 from halfspace_sss.rendering.paths.lights import Lights
 from halfspace_sss.rendering.paths.world import World
 from halfspace_sss.rendering.surface.derivatives import detached, tracking
 from halfspace_sss.rendering.transport.body import Body
-from halfspace_sss.rendering.transport.plane import number, place
+from halfspace_sss.rendering.transport.plane import place
 from halfspace_sss.rendering.transport.settings import Settings
 
 __all__ = ["replay_paths", "trace_paths"]
-
-LEAST_REFLECTION = 0.05  # probability of reflection at a surface that reflects; Fresnel's is 0.04 face on
 
 
 def trace_paths(scene: Any, bodies: list[Body], settings: Settings, sampler: Any, ray: Any, active: Any) -> tuple:
@@ -49,7 +48,7 @@ def replay_paths(
 
 def _trace(world: World, sampler: Any, ray: Any, books: Books, active: Any) -> tuple[Books, Any]:
     """One loop over the vertices. At each, emitters are sampled and the direction goes on by the surface (balance
-    heuristic between the two). At a translucent surface one of reflection, multiple and single scattering is chosen;
+    heuristic between the two). At a translucent surface one of reflection, orders below two and the rest is chosen;
     light of emitters that it mirrors is added whatever is chosen, as highlights are bright.
     """
     import drjit as dr
@@ -112,36 +111,23 @@ def _vertex(
     import drjit as dr
     import mitsuba as mi
 
-    u_event = sampler.next_1d()
-    inside, glossy, share, events = mi.Bool(False), mi.Bool(False), mi.Float(1), []
-    for body in world.bodies:
-        here = active & (si.shape == mi.ShapePtr(body.found.shape))
-        reflect = _reflection_probability(body, si)
-        once = (1 - reflect) * number(body.single_share)
-        is_single = here & (u_event < once)
-        is_multiple = here & (u_event >= once + reflect)
-        inside |= is_single | is_multiple
-        if body.surface.inside.reflection:
-            glossy |= here
-        taken = dr.select(is_single, once, dr.select(is_multiple, 1 - reflect - once, reflect))
-        share = dr.select(here, taken, share)
+    choices = []
+    with detached():
+        for body in world.bodies:
+            here = active & (si.shape == mi.ShapePtr(body.found.shape))
+            choices.append((body, here, choose(body, si, throughput, here)))
+    on, books, taken = _outside(world, sampler, ray, si, throughput, books, active, choices)
+    share, events = taken.share, []
+    for body, here, choice in choices:
+        inside = here & ~taken.reflects
+        by_few = inside & (taken.u < choice.few)
+        share = dr.select(inside, share * dr.select(by_few, choice.few, 1 - choice.few), share)
         if body.transport is not None:
-            events.append((is_multiple, partial(multiple, world, body, sampler, si, is_multiple)))
-        if body.single_share > 0:
-            events.append((is_single, partial(single, world, body, sampler, si, is_single)))
-    plain = glossy | (active & ~inside)
-
-    def outside(books: Books) -> tuple[Onward, Books]:
-        u = sampler.next_2d(), sampler.next_1d(), sampler.next_2d()
-        with detached():
-            on, direct = surface(world, u, ray, si, plain)
-        shown, books = _mirrored(world, sampler, on, throughput, books, glossy)
-        if world.books.tracks:  # again: no derivatives may be pending while others are passed on
-            on, direct = surface(world, u, ray, si, plain)
-        return on, world.books.settle(books, throughput * direct, on.weight, plain & ~inside, shown)
-
-    on, books = _instead(plain, sampler, nothing(), books, world, outside)
-    on = Onward(*(dr.select(glossy, a, b) for a, b in zip(_unlit(on), on)))
+            by_more = inside & ~by_few
+            more = partial(multiple, world, body, choice.leg.out, si.prim_index, sampler, by_more)
+            events.append((by_more, more))
+        if body.few:
+            events.append((by_few, partial(few, world, body, choice.leg, sampler, by_few)))
     for mask, event in events:
 
         def below(books: Books, mask: Any = mask, event: Callable = event) -> tuple[Onward, Books]:
@@ -152,18 +138,68 @@ def _vertex(
     return on._replace(weight=on.weight / share), books
 
 
-def _mirrored(world: World, sampler: Any, on: Onward, throughput: Any, books: Books, active: Any) -> tuple[Any, Books]:
-    """Light of emitters that a body mirrors, which the reflected path leaves out; over the weight of the reflection."""
+class _Taken(NamedTuple):
+    """Whether a path goes on outside, the probability of that, and a uniform number for what comes next."""
+
+    reflects: Any
+    share: Any
+    u: Any
+
+
+def _outside(
+    world: World, sampler: Any, ray: Any, si: Any, throughput: Any, books: Books, active: Any, choices: list
+) -> tuple[Onward, Books, _Taken]:
+    """The BSDF. Of a body, light of emitters that it mirrors is added, and the path goes on if there may be more."""
+    import drjit as dr
+    import mitsuba as mi
+
+    u_event = sampler.next_1d()
+    inside, glossy, reflection = mi.Bool(False), mi.Bool(False), mi.Float(0)
+    for body, here, choice in choices:
+        inside |= here
+        reflection = dr.select(here, choice.reflection, reflection)
+        if body.surface.inside.reflection:
+            glossy |= here
+    plain = active & ~inside
+
+    def scatter(books: Books) -> tuple:
+        u = sampler.next_2d(), sampler.next_1d(), sampler.next_2d()
+        with detached():
+            on, direct = surface(world, u, ray, si, plain | glossy)
+        shown, meets, books = _mirrored(world, sampler, on, throughput, books, glossy)
+        reflects = glossy & meets & (u_event < reflection)
+        if world.books.tracks:  # again: no derivatives may be pending while others are passed on
+            on, direct = surface(world, u, ray, si, plain | glossy)
+        books = world.books.settle(books, throughput * direct, on.weight, plain | reflects, shown)
+        return tuple(on), meets, books
+
+    found, meets, books = _where(plain | glossy, sampler, (tuple(nothing()), mi.Bool(False), books), world, scatter)
+    on, reflection = Onward(*found), dr.select(glossy & meets, reflection, 0)
+    on = Onward(*(dr.select(glossy, a, b) for a, b in zip(_unlit(on), on)))
+    reflects = plain | (u_event < reflection)
+    on = on._replace(weight=dr.select(reflects, on.weight, 0))
+    share = dr.select(plain, 1, dr.select(reflects, reflection, 1 - reflection))
+    u = dr.select(reflects, 0, (u_event - reflection) / dr.maximum(1 - reflection, 1e-6))
+    return on, books, _Taken(reflects, share, u)
+
+
+def _mirrored(
+    world: World, sampler: Any, on: Onward, throughput: Any, books: Books, active: Any
+) -> tuple[Any, Any, Books]:
+    """Light of emitters that a body mirrors, which the reflected path leaves out; over the weight of the reflection.
+
+    With it, whether the reflected ray meets a surface, from which more light may come.
+    """
     import mitsuba as mi
 
     last = (on.p, on.n, on.pdf, on.emitter_share, on.sky_only, on.aim)
 
-    def look(books: Books) -> tuple[Any, Books]:
+    def look(books: Books) -> tuple[Any, Any, Books]:
         si = world.scene.ray_intersect(place(on.p, on.n).spawn_ray(on.d), mi.RayFlags.All, False, active)
         light = throughput * _emitted(world, si, last, mi.UInt32(1), active)
-        return light, world.books.add(books, on.weight * light)
+        return light, active & si.is_valid(), world.books.add(books, on.weight * light)
 
-    return _where(active, sampler, (mi.Spectrum(0), books), world, look)
+    return _where(active, sampler, (mi.Spectrum(0), mi.Bool(False), books), world, look)
 
 
 def _unlit(on: Onward) -> Onward:
@@ -197,13 +233,3 @@ def _instead(
 
     found, books = _where(mask, sampler, (tuple(on), books), world, happens)
     return Onward(*found), books
-
-
-def _reflection_probability(body: Body, si: Any) -> Any:
-    import drjit as dr
-    import mitsuba as mi
-
-    if not body.surface.inside.reflection:
-        return mi.Float(0)
-    F = mi.fresnel(dr.abs(dr.dot(si.wi, mi.Vector3f(0, 0, 1))), body.surface.inside.medium.eta)[0]
-    return dr.clip(F, LEAST_REFLECTION, 0.95)

@@ -57,6 +57,18 @@ class Object:
         return dr.gather(mi.UInt32, self.pieces, prim_index, active)
 
     @property
+    def rounding(self) -> float:
+        """A bound of how far from its surface rounding puts points, scene units.
+
+        The largest coordinate counts, not that of the point: those of a large face or ball near the origin are no
+        better.
+        """
+        import mitsuba as mi
+
+        box = self.scene.bbox()
+        return float(np.max(np.abs([box.min, box.max]))) * mi.math.RayEpsilon if box.valid() else 0.0
+
+    @property
     def upright(self) -> bool:
         """Whether every normal points outwards."""
         return self.sign > 0 and self.signs is None and self.agree

@@ -7,11 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
-from halfspace_sss import measure
-from halfspace_sss.interface.model import bssrdf
-from halfspace_sss.physics import single_scattering
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.surface.inside import Inside
 from halfspace_sss.rendering.surface.object import Object, same_objects, survey
@@ -19,6 +14,7 @@ from halfspace_sss.rendering.surface.placement import translucent_shapes
 from halfspace_sss.rendering.surface.sensors import check_sensors
 from halfspace_sss.rendering.surface.transports import object_transport
 from halfspace_sss.rendering.surface.varying import equivalent
+from halfspace_sss.rendering.transport.expected import Expected, expected_of
 from halfspace_sss.rendering.transport.half_space import half_space_means
 from halfspace_sss.rendering.transport.protocols import Means, Proposals, Transport
 from halfspace_sss.rendering.transport.settings import Settings
@@ -27,7 +23,6 @@ from halfspace_sss.rendering.transport.variation import Variation
 __all__ = ["Bodies", "Body", "check_size", "make_bodies"]
 
 SMALL, LARGE = 1.0, 5e3  # mean free paths across an object, beyond which the units of the scene are doubted
-LEAST_SHARE = 0.2  # of the events inside that each of the two kinds gets
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,9 +33,10 @@ class Body:
         found: its geometry.
         surface: its `translucent` BSDF.
         media: medium of each channel, 1/(scene unit).
-        transport: what light that enters elsewhere is worth here; None where only single scattering is asked for.
+        transport: what light that enters elsewhere is worth here; None where no order from two on is asked for.
         proposals: where it may enter; None without a transport.
-        single_share: probability of single scattering among the events inside.
+        few: the orders below two that are traced beside it: (0, 1), (1,) or none.
+        expected: what each kind of light is expected to bring.
         variation: how its light varies with its medium.
     """
 
@@ -49,7 +45,8 @@ class Body:
     media: list[Medium]
     transport: Transport | None
     proposals: Proposals | None
-    single_share: float
+    few: tuple[int, ...]
+    expected: Expected
     variation: Variation
 
     def is_current(self) -> bool:
@@ -98,10 +95,16 @@ def _make_body(shape: Any, settings: Settings) -> Body:
     transport, proposals = (None, None) if single_only else _means(inside, found, media, settings, variation)
     if transport and transport.orders == "total" and inside.orders == "multiple":
         raise ValueError(f"orders must be total for the model {inside.model!r}, which contains them all, got multiple")
-    lacks_single = transport is None or transport.orders == "multiple"
-    adds_single = inside.orders == "single" or (inside.orders == "total" and not single_only and lacks_single)
-    share = _single_share(media) if adds_single and transport else float(adds_single)
-    return Body(found, surface, media, transport, proposals, share, variation)
+    few = _few(inside.orders, transport)
+    return Body(found, surface, media, transport, proposals, few, expected_of(media), variation)
+
+
+def _few(orders: str, transport: Transport | None) -> tuple[int, ...]:
+    """The orders below two that are traced beside a transport."""
+    if orders == "single":
+        return (1,)
+    lacks = transport is None or transport.orders == "multiple"
+    return (0, 1) if orders == "total" and lacks else ()
 
 
 def _means(inside: Inside, found: Object, media: list[Medium], settings: Settings, variation: Variation) -> Means:
@@ -109,16 +112,6 @@ def _means(inside: Inside, found: Object, media: list[Medium], settings: Setting
     if of_object is not None:
         return of_object(found, inside, media, settings)
     return half_space_means(inside.model, found, media, settings, variation)
-
-
-def _single_share(media: list[Medium]) -> float:
-    """Single scattering's share of what comes back at normal incidence, mean over channels."""
-    shares = []
-    for m in media:
-        single = float(single_scattering.reflectance(m, 1.0))
-        total = single + float(measure.reflectance(bssrdf("better_dipole", m), 1.0))
-        shares.append(single / total if total > 0 else 0.5)
-    return float(np.clip(np.mean(shares), LEAST_SHARE, 1 - LEAST_SHARE))
 
 
 def check_size(found: Object, media: Sequence[Medium], mm_per_unit: float) -> None:

@@ -60,7 +60,7 @@ class WalkMedia:
         tables["step"] = mi.UInt32([int(len(side) > 1) for side in sides])
         tables["fewest"] = mi.UInt32([_FEWEST[inside.orders] for inside in self.insides])
         tables["most"] = mi.UInt32([_MOST[inside.orders] for inside in self.insides])
-        tables["rounding"] = mi.Float([_rounding(obj.scene.bbox()) for obj in self.objects])
+        tables["rounding"] = mi.Float([obj.rounding for obj in self.objects])
         tables["reflects"] = mi.Bool([inside.reflection for inside in self.insides])
         tables["rough"] = mi.Bool([is_rough(b) for b in self.boundaries])
         tables["boundary"] = pointer_numbers([mi.BSDFPtr(b) for b in self.boundaries])
@@ -210,16 +210,6 @@ def _bounds(scene: Any) -> Any:
         return box
     margin = 1e-3 * (box.max - box.min)
     return mi.BoundingBox3f(mi.Point3f(box.min - margin), mi.Point3f(box.max + margin))
-
-
-def _rounding(box: Any) -> float:
-    """A bound of how far from its surface rounding puts points of an object, scene units.
-
-    The largest coordinate counts, not that of the point: those of a large face or ball near the origin are no better.
-    """
-    if not box.valid():
-        return 0.0
-    return float(np.max(np.abs([box.min, box.max]))) * mi.math.RayEpsilon
 
 
 def is_rough(boundary: Any) -> bool:

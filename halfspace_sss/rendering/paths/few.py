@@ -1,0 +1,249 @@
+"""Orders 0 and 1 of the light inside an object, exactly: a walk that is scattered at most once.
+
+From the exit the walk is refracted inwards, passes or is scattered by the phase function, then never again; it is
+reflected at the boundary by Fresnel as often as it takes, and leaves. After k = 0, 1 events and a way Λ
+
+    L_o = T_o L_i f / p,    f = sigma_s^k p(cos)^k exp(-sigma_t Λ),
+
+p the density of the walk; the factors eta² of radiance cancel, and Fresnel's inside with the chance to be reflected.
+Whether a leg is passed, and where and how the walk is scattered, is drawn for the channels by their weights f_c so far.
+
+Light of emitters that reaches the event without reflection is found by the ray that is refracted towards a sampled
+point of them, see `refracted_connection`; all other light by chance. The boundary refracts as if it were smooth. Lights
+that no ray can hit are missed where they pass unscattered, or are reflected inside before they are scattered.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+from halfspace_sss.physics.phase import eval_hg, sample_hg
+from halfspace_sss.rendering.paths.refraction import meet, refracted_connection
+from halfspace_sss.rendering.paths.world import World, sampled_light
+from halfspace_sss.rendering.surface.derivatives import detached
+from halfspace_sss.rendering.transport.body import Body
+from halfspace_sss.rendering.transport.plane import Exit, number, place
+
+__all__ = ["Few", "Leg", "few_orders"]
+
+MOST_LEGS = 256
+FAINT = 0.1  # weight below which a scattered walk may end
+
+Media = list[tuple[Any, Any, Any]]  # sigma_s, sigma_t and g of each channel
+
+
+class Leg(NamedTuple):
+    """The way from an exit into the body: direction, Fresnel transmittance, whether there is one.
+
+    `passing` is the probability to go along it to the boundary.
+    """
+
+    out: Exit
+    along: Any
+    T: Any
+    valid: Any
+    passing: Any
+
+
+class Few(NamedTuple):
+    """Where a walk leaves the body, and light of emitters that came to its event."""
+
+    p: Any
+    n: Any
+    d: Any
+    weight: Any  # spectrum
+    connected: Any  # whether light of emitters on this way is in `direct`
+    direct: Any  # spectrum
+
+
+@dataclass
+class _Walk:
+    """State of a walk; after it is `out`, o, d and n are those of the way outside."""
+
+    o: Any
+    d: Any
+    n: Any
+    skip: Any  # length after which a ray is clear of the boundary
+    way: Any
+    inverse: Any  # 1 / p
+    order: Any
+    cosine: Any
+    event: Any
+    along: Any
+    event_way: Any
+    event_inverse: Any  # 1 / p before the phase function
+    straight: Any  # nothing has reflected since the event
+    out: Any
+    alive: Any
+
+
+def few_orders(world: World, body: Body, leg: Leg, sampler: Any, active: Any) -> Few:
+    """Light that leaves at the exit of `leg` after at most one scattering event."""
+    import drjit as dr
+    import mitsuba as mi
+
+    with detached():
+        walk = _walk(body, leg, sampler, active & leg.valid)
+        once = walk.order == 1
+        counts = walk.out & (once if 0 not in body.few else mi.Bool(True))
+        straight = once & walk.straight
+    coefficients = body.variation.coefficients(body.media)
+    f = _value(coefficients, walk.way, walk.order, walk.cosine)
+    weight = dr.select(counts, f * (walk.inverse * leg.T), 0)
+    direct = mi.Spectrum(0)
+    if world.lights.some_local:
+        value = _value(coefficients, walk.event_way, mi.UInt32(1), None) * (walk.event_inverse * leg.T)
+        direct = _connected(world, (body, coefficients), walk, dr.select(once, value, 0), sampler, once)
+    return Few(walk.o, walk.n, walk.d, weight, straight, direct)
+
+
+def _walk(body: Body, leg: Leg, sampler: Any, active: Any) -> _Walk:
+    import drjit as dr
+    import mitsuba as mi
+
+    zero, point = mi.Float(0), mi.Point3f(leg.out.p)
+    media = [tuple(number(v) for v in (m.sigma_s, m.sigma_t, m.g)) for m in body.media]
+    skip = _clear(body, leg.out.n_face, leg.along)
+    start = _Walk(
+        point, mi.Vector3f(leg.along), mi.Normal3f(leg.out.n_face), mi.Float(skip), zero, mi.Float(1), mi.UInt32(0),
+        zero, mi.Point3f(point), mi.Vector3f(leg.along), zero, zero, mi.Bool(True), mi.Bool(False), mi.Bool(active),
+    )  # fmt: skip
+
+    def step(k: Any, sampler: Any, passing: Any, walk: _Walk) -> tuple:
+        return k + 1, sampler, passing, _step((body, media), k, sampler, passing, walk)
+
+    state = (mi.UInt32(0), sampler, mi.Float(leg.passing), start)
+    return dr.while_loop(state, lambda k, sampler, passing, walk: walk.alive, step, label="few orders")[3]
+
+
+def _step(of: tuple[Body, Media], k: Any, sampler: Any, passing: Any, walk: _Walk) -> _Walk:
+    """To the event, or to the boundary and what happens there."""
+    import drjit as dr
+    import mitsuba as mi
+
+    (body, media), flags = of, mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame
+    si, n_out, n = meet(body, walk.o + walk.d * walk.skip, walk.d, flags, walk.alive)
+    length = si.t + walk.skip
+    W = _value(media, walk.way, walk.order, walk.cosine) * walk.inverse
+    T = dr.select(si.is_valid(), dr.exp(-_row(media, 1) * length), 0)
+    passing = dr.select(k == 0, passing, dr.sum(W * T) / dr.maximum(dr.sum(W), 1e-30))
+    first = walk.order == 0
+    scatters = first & (sampler.next_1d() >= passing)
+    scattered = _scatter(media, walk, (W, 1 - T), dr.maximum(1 - passing, 1e-7), sampler)
+    met = replace(walk, way=walk.way + length, inverse=walk.inverse / dr.select(first, passing, 1))
+    met = _meet_boundary(of, met, (si, n_out, n), sampler)
+    met.alive &= ~walk.out & (k + 1 < MOST_LEGS)
+    return dr.select(scatters, scattered, met)
+
+
+def _scatter(media: Media, walk: _Walk, weights: tuple[Any, Any], scattering: Any, sampler: Any) -> _Walk:
+    """The event on this leg, which happens with the probability `scattering`.
+
+    `weights` are f_c / p and the chance of channel c to be scattered on the leg.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    sigma_t, g, (W, ends) = _row(media, 1), _row(media, 2), weights
+    u, v, channel, chance = sampler.next_1d(), sampler.next_2d(), sampler.next_2d(), W * ends
+    rate = dr.maximum(_pick(sigma_t, chance, channel.x), 1e-12)
+    s = -dr.log(1 - u * dr.minimum(_pick(ends, chance, channel.x), 1 - 1e-7)) / rate
+    density = dr.sum(W * sigma_t * dr.exp(-sigma_t * s)) / dr.maximum(dr.sum(chance), 1e-30)
+    inverse = walk.inverse / dr.maximum(density * scattering, 1e-30)
+    W = _value(media, walk.way + s, mi.UInt32(1), None) * inverse
+    cosine = sample_hg(v.x, _pick(g, W, channel.y))
+    phase = dr.sum(W * _spectrum([eval_hg(cosine, m[2]) for m in media])) / dr.maximum(dr.sum(W), 1e-30)
+    sine, (sin_phi, cos_phi) = dr.safe_sqrt((1 - cosine) * (1 + cosine)), dr.sincos(2 * dr.pi * v.y)
+    d = mi.Frame3f(walk.d).to_world(mi.Vector3f(sine * cos_phi, sine * sin_phi, cosine))
+    p = mi.Point3f(walk.o + walk.d * s)
+    return replace(
+        walk, o=p, d=mi.Vector3f(d), skip=mi.Float(0), way=walk.way + s, inverse=inverse / dr.maximum(phase, 1e-30),
+        order=mi.UInt32(1), cosine=mi.Float(cosine), event=p, along=mi.Vector3f(walk.d), event_way=walk.way + s,
+        event_inverse=inverse, straight=mi.Bool(True), alive=walk.alive & (dr.sum(W) > 0) & (dr.sum(chance) > 0),
+    )  # fmt: skip
+
+
+def _meet_boundary(of: tuple[Body, Media], walk: _Walk, met: tuple[Any, Any, Any], sampler: Any) -> _Walk:
+    """Reflection by Fresnel, or the way out; what is faint may end."""
+    import drjit as dr
+    import mitsuba as mi
+
+    (body, media), (si, n_out, n) = of, met
+    size = dr.max(_value(media, walk.way, walk.order, walk.cosine) * walk.inverse)
+    survival = dr.select(walk.order == 1, dr.minimum(size / FAINT, 1), 1)
+    frame = mi.Frame3f(n_out)
+    w = frame.to_local(-walk.d)
+    F, cos_t, _, eta_ti = mi.fresnel(mi.Frame3f.cos_theta(w), body.surface.inside.medium.eta)
+    reflects = sampler.next_1d() < F
+    d = mi.Vector3f(frame.to_world(dr.select(reflects, mi.reflect(w), mi.refract(w, cos_t, eta_ti))))
+    out = dr.dot(d, n) > 0
+    alive = walk.alive & si.is_valid() & (dr.dot(n, walk.d) > 0) & (sampler.next_1d() < survival)
+    return replace(
+        walk, o=mi.Point3f(si.p), d=d, n=mi.Normal3f(n), skip=mi.Float(_clear(body, n, d)), out=alive & out,
+        straight=walk.straight & out, alive=alive & ~out, inverse=walk.inverse / dr.maximum(survival, 1e-30),
+    )  # fmt: skip
+
+
+def _connected(world: World, of: tuple[Body, Media], walk: _Walk, weight: Any, sampler: Any, active: Any) -> Any:
+    """Light of a sampled emitter that is refracted at the boundary into the event, which has a weight."""
+    import drjit as dr
+    import mitsuba as mi
+
+    body, media = of
+    at = place(walk.event, mi.Normal3f(0, 0, 0))
+    ds, light = sampled_light(world, at, sampler.next_2d(), False, active)
+    with detached():
+        distant = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
+        active = active & (ds.pdf > 0) & ~ds.emitter.is_environment()
+        reach = dr.select(distant, number(1e4 * body.found.size), ds.dist)
+        target = walk.event + ds.d * reach
+        met = refracted_connection(body, walk.event, target, active)
+        # solid angle at the event per solid angle of the straight direction, over which the emitter was sampled
+        facing = dr.select(dr.squared_norm(ds.n) > 0, dr.abs(dr.dot(ds.n, met.w)) / dr.abs(dr.dot(ds.n, ds.d)), 1)
+        spread = dr.select(ds.delta, 1, facing) * reach * reach * met.density
+        cosine, passed = dr.dot(walk.along, met.d), met.T * spread
+    phase = _spectrum([eval_hg(cosine, g) for _, _, g in media])
+    value = weight * phase * _value(media, met.length, mi.UInt32(0), None) * passed * light
+    edge = place(met.p, met.n)
+    blocked = world.scene.ray_test(edge.spawn_ray_to(target), False, met.valid)
+    return dr.select(met.valid & ~blocked, value, 0)
+
+
+def _clear(body: Body, n: Any, d: Any) -> Any:
+    """Length along d after which a ray from the surface is clear of it; an origin moved instead lies deeper."""
+    import drjit as dr
+
+    return number(body.found.rounding) / dr.maximum(dr.abs(dr.dot(n, d)), 0.1)
+
+
+def _row(media: Media, k: int) -> Any:
+    return _spectrum([m[k] for m in media])
+
+
+def _value(media: Media, way: Any, order: Any, cosine: Any) -> Any:
+    """sigma_s^k p(cos)^k exp(-sigma_t Λ); without the phase function where there is no cosine."""
+    import drjit as dr
+
+    found = []
+    for sigma_s, sigma_t, g in media:
+        once = sigma_s if cosine is None else sigma_s * eval_hg(cosine, g)
+        found.append(dr.select(order == 1, once, 1) * dr.exp(-sigma_t * way))
+    return _spectrum(found)
+
+
+def _pick(values: Any, weights: Any, u: Any) -> Any:
+    """The value of a channel drawn by its weight, for a uniform number."""
+    import drjit as dr
+
+    u, value = u * dr.sum(weights), values[0]
+    for k in range(1, len(values)):
+        u = u - weights[k - 1]
+        value = dr.select(u >= 0, values[k], value)
+    return value
+
+
+def _spectrum(values: list[Any]) -> Any:
+    import mitsuba as mi
+
+    return mi.Spectrum(*values) if len(values) > 1 else mi.Spectrum(values[0])
