@@ -93,10 +93,10 @@ def replayer(bodies: list[Body], settings: Settings) -> Any:
 
         def sample(self, mode: Any, scene: Any, sampler: Any, ray: Any, **given: Any) -> tuple:
             if mode == dr.ADMode.Primal:
-                L, seen = trace_paths(scene, bodies, settings, sampler, ray, given["active"])
-                return L, seen, [], L
-            L, backward = given["state_in"], mode == dr.ADMode.Backward
-            d = replay_paths(scene, bodies, settings, sampler, ray, L, given["δL"], backward)
-            return d, mi.Bool(True), [], L
+                parts, seen = trace_paths(scene, bodies, settings, sampler, ray, given["active"])
+                return parts[0] + parts[1], seen, [], parts
+            parts, backward = given["state_in"], mode == dr.ADMode.Backward
+            d = replay_paths(scene, bodies, settings, sampler, ray, parts, given["δL"], backward)
+            return d, mi.Bool(True), [], parts
 
     return Replayer(mi.Properties())

@@ -49,8 +49,8 @@ def integrator_class() -> type:
         def sample(self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Any = True) -> tuple:
             check_outermost(scene)
             with dr.suspend_grad():
-                L, seen = trace_paths(scene, self._bodies.of(scene), self.settings, sampler, ray, active)
-            return L, seen, []
+                parts, seen = trace_paths(scene, self._bodies.of(scene), self.settings, sampler, ray, active)
+            return parts[0] + parts[1], seen, []
 
         def to_string(self) -> str:
             return f"BSSRDFIntegrator[{self.settings}]"

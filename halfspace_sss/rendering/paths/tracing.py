@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 from halfspace_sss.rendering.paths.books import Books, Replay, Tally
-from halfspace_sss.rendering.paths.choice import choose
-from halfspace_sss.rendering.paths.events import Onward, balance, few, multiple, nothing, surface
 from halfspace_sss.rendering.paths.lights import Lights
+from halfspace_sss.rendering.paths.vertex import Vertex, emitted, vertex
 from halfspace_sss.rendering.paths.world import World
 from halfspace_sss.rendering.surface.derivatives import detached, tracking
 from halfspace_sss.rendering.transport.body import Body
@@ -20,49 +17,60 @@ __all__ = ["replay_paths", "trace_paths"]
 
 
 def trace_paths(scene: Any, bodies: list[Body], settings: Settings, sampler: Any, ray: Any, active: Any) -> tuple:
-    """Radiance along a ray, and whether it hits anything."""
+    """Radiance along a ray, in two parts for a replay, and whether it hits anything.
+
+    The second part is light of orders below two of the object that the ray meets first.
+    """
     import mitsuba as mi
 
     world = World(scene, Lights.of(scene), bodies, settings, Tally())
-    books, seen = _trace(world, sampler, ray, (mi.Spectrum(0), ()), active)
-    return books[0], seen
+    (parts, _), seen = _trace(world, sampler, ray, ((mi.Spectrum(0), mi.Spectrum(0)), ()), active)
+    return parts, seen
 
 
 def replay_paths(
-    scene: Any, bodies: list[Body], settings: Settings, sampler: Any, ray: Any, L: Any, d: Any, backward: bool
+    scene: Any, bodies: list[Body], settings: Settings, sampler: Any, ray: Any, L: tuple, d: Any, backward: bool
 ) -> Any:
     """The derivative of the radiance of traced paths.
 
     Args:
         sampler: as it was before the paths were traced.
         ray: rays of the paths.
-        L: radiance that they brought.
+        L: radiance that they brought, in two parts.
         d: backward: derivative of the outcome by the radiance, which is handed on to the parameters of the scene.
         backward: otherwise the derivative of the radiance is returned, for the derivatives that the parameters carry.
     """
     import mitsuba as mi
 
     world = World(scene, Lights.of(scene), bodies, settings, Replay(backward))
-    return _trace(world, sampler, ray, (mi.Spectrum(L), mi.Spectrum(0 if d is None else d)), mi.Bool(True))[0][1]
+    return _trace(world, sampler, ray, (L, mi.Spectrum(0 if d is None else d)), mi.Bool(True))[0][1]
 
 
-def _trace(world: World, sampler: Any, ray: Any, books: Books, active: Any) -> tuple[Books, Any]:
+def _trace(world: World, sampler: Any, camera: Any, books: tuple, active: Any) -> tuple[tuple, Any]:
     """One loop over the vertices. At each, emitters are sampled and the direction goes on by the surface (balance
     heuristic between the two). At a translucent surface one of reflection, orders below two and the rest is chosen;
     light of emitters that it mirrors is added whatever is chosen, as highlights are bright.
+
+    Where the first vertex is on a body, the path begins there a second time for its orders below two: choosing between
+    them and the rest was most of the variance under a sky.
     """
     import drjit as dr
     import mitsuba as mi
 
-    scene, settings = world.scene, world.settings
+    scene, settings, (parts, more) = world.scene, world.settings, books
+    camera = mi.Ray3f(camera)
+    unlinked = (mi.Point3f(0), mi.Normal3f(0), mi.Float(1), mi.Float(0), mi.Bool(False), mi.Float(-1))
 
-    def step(sampler: Any, ray: Any, books: Books, throughput: Any, last: tuple, depth: Any, seen: Any, active: Any):
-        si = scene.ray_intersect(ray, mi.RayFlags.All, depth == 0, active)
+    def step(sampler: Any, ray: Any, books: Books, throughput: Any, last: tuple, depth: Any, turn: tuple, active: Any):
+        (second, splits, kept, seen), first = turn, depth == 0
+        si = scene.ray_intersect(ray, mi.RayFlags.All, first, active)
         with tracking(world.books.tracks):
-            books = world.books.add(books, throughput * _emitted(world, si, last, depth, active))
-        seen = seen | ((depth == 0) & si.is_valid())
+            light = emitted(world, si, last, depth, active & ~(first & second))
+            books = world.books.add(books, throughput * light)
+        seen = seen | (first & si.is_valid())
         active = active & si.is_valid() & (last[-1] < 0) & (depth + 1 < _unsigned(settings.max_depth))
-        on, books = _vertex(world, sampler, ray, si, throughput, books, active)
+        splits = splits | (active & first & _on_splitting(world, si))
+        on, books = vertex(world, sampler, Vertex(si, ray, throughput, first, second, active), books)
         throughput = dr.select(active, throughput * on.weight, throughput)
         best = dr.max(throughput)
         active = active & (best > 0)
@@ -72,164 +80,35 @@ def _trace(world: World, sampler: Any, ray: Any, books: Books, active: Any) -> t
         throughput = throughput / survival
         ray = dr.select(active, place(on.p, on.n).spawn_ray(on.d), ray)
         last = (on.p, on.n, on.pdf, on.emitter_share, on.sky_only, on.aim)
-        return sampler, ray, books, throughput, last, depth, seen, active
+        again = ~active & splits & ~second
+        kept, books = dr.select(again, books[0], kept), (dr.select(again, parts[1], books[0]), books[1])
+        ray, throughput, depth = (
+            dr.select(again, camera, ray),
+            dr.select(again, 1, throughput),
+            dr.select(again, 0, depth),
+        )
+        last = tuple(dr.select(again, a, b) for a, b in zip(unlinked, last))
+        return sampler, ray, books, throughput, last, depth, (second | again, splits, kept, seen), active | again
 
-    last = (mi.Point3f(0), mi.Normal3f(0), mi.Float(1), mi.Float(0), mi.Bool(False), mi.Float(-1))
-    state = (sampler, mi.Ray3f(ray), books, mi.Spectrum(1), last, mi.UInt32(0), mi.Bool(False), mi.Bool(active))
+    no, one = mi.Bool(False), mi.Spectrum(1)
+    turn = (mi.Bool(no), mi.Bool(no), mi.Spectrum(0), mi.Bool(no))
+    state = (sampler, camera, (parts[0], more), one, unlinked, mi.UInt32(0), turn, mi.Bool(active))
     with detached():
         out = dr.while_loop(state, lambda *state: state[-1], step, label="bssrdf")
-    return out[2], out[6]
+    (L, more), (second, _, kept, seen) = out[2], out[6]
+    return ((dr.select(second, kept, L), dr.select(second, L, 0)), more), seen
+
+
+def _on_splitting(world: World, si: Any) -> Any:
+    """Whether a point is on a body with orders below two beside others."""
+    import mitsuba as mi
+
+    found = mi.Bool(False)
+    for body in world.bodies:
+        if body.splits:
+            found |= si.shape == mi.ShapePtr(body.found.shape)
+    return found
 
 
 def _unsigned(max_depth: int) -> int:
     return 0xFFFFFFFF if max_depth < 0 else max_depth
-
-
-def _emitted(world: World, si: Any, last: tuple, depth: Any, active: Any) -> Any:
-    """Emitted light where the path arrives, weighted against the sampling of emitters at the last vertex."""
-    import drjit as dr
-    import mitsuba as mi
-
-    p, n, pdf, emitter_share, sky_only, aim = last
-    with detached():
-        emitter = si.emitter(world.scene, active)
-        active = active & (emitter != None) & ~(sky_only & ~emitter.is_environment())  # noqa: E711
-        active &= (aim < 0) | dr.select(si.is_valid(), dr.abs(si.t - aim) < 1e-3 * aim, aim == dr.inf)
-        if world.settings.hide_emitters:
-            active = active & (depth > 0)
-        before = place(p, n)
-        ds = mi.DirectionSample3f(world.scene, si, before)
-        pdf_emitter = emitter_share * world.scene.pdf_emitter_direction(before, ds, active & (emitter_share > 0))
-        share = balance(pdf, pdf_emitter)
-    return dr.select(active, share * emitter.eval(si, active), 0)
-
-
-def _vertex(
-    world: World, sampler: Any, ray: Any, si: Any, throughput: Any, books: Books, active: Any
-) -> tuple[Onward, Books]:
-    """What happens at a surface point: its BSDF, or for the bodies the light that entered elsewhere."""
-    import drjit as dr
-    import mitsuba as mi
-
-    choices = []
-    with detached():
-        for body in world.bodies:
-            here = active & (si.shape == mi.ShapePtr(body.found.shape))
-            choices.append((body, here, choose(body, si, throughput, here)))
-    on, books, taken = _outside(world, sampler, ray, si, throughput, books, active, choices)
-    share, events = taken.share, []
-    for body, here, choice in choices:
-        inside = here & ~taken.reflects
-        by_few = inside & (taken.u < choice.few)
-        share = dr.select(inside, share * dr.select(by_few, choice.few, 1 - choice.few), share)
-        if body.transport is not None:
-            by_more = inside & ~by_few
-            more = partial(multiple, world, body, choice.leg.out, si.prim_index, sampler, by_more)
-            events.append((by_more, more))
-        if body.few:
-            events.append((by_few, partial(few, world, body, choice.leg, sampler, by_few)))
-    for mask, event in events:
-
-        def below(books: Books, mask: Any = mask, event: Callable = event) -> tuple[Onward, Books]:
-            on, direct = event()
-            return on, world.books.settle(books, throughput / share * direct, on.weight, mask, mi.Spectrum(0))
-
-        on, books = _instead(mask, sampler, on, books, world, below)
-    return on._replace(weight=on.weight / share), books
-
-
-class _Taken(NamedTuple):
-    """Whether a path goes on outside, the probability of that, and a uniform number for what comes next."""
-
-    reflects: Any
-    share: Any
-    u: Any
-
-
-def _outside(
-    world: World, sampler: Any, ray: Any, si: Any, throughput: Any, books: Books, active: Any, choices: list
-) -> tuple[Onward, Books, _Taken]:
-    """The BSDF. Of a body, light of emitters that it mirrors is added, and the path goes on if there may be more."""
-    import drjit as dr
-    import mitsuba as mi
-
-    u_event = sampler.next_1d()
-    inside, glossy, reflection = mi.Bool(False), mi.Bool(False), mi.Float(0)
-    for body, here, choice in choices:
-        inside |= here
-        reflection = dr.select(here, choice.reflection, reflection)
-        if body.surface.inside.reflection:
-            glossy |= here
-    plain = active & ~inside
-
-    def scatter(books: Books) -> tuple:
-        u = sampler.next_2d(), sampler.next_1d(), sampler.next_2d()
-        with detached():
-            on, direct = surface(world, u, ray, si, plain | glossy)
-        shown, meets, books = _mirrored(world, sampler, on, throughput, books, glossy)
-        reflects = glossy & meets & (u_event < reflection)
-        if world.books.tracks:  # again: no derivatives may be pending while others are passed on
-            on, direct = surface(world, u, ray, si, plain | glossy)
-        books = world.books.settle(books, throughput * direct, on.weight, plain | reflects, shown)
-        return tuple(on), meets, books
-
-    found, meets, books = _where(plain | glossy, sampler, (tuple(nothing()), mi.Bool(False), books), world, scatter)
-    on, reflection = Onward(*found), dr.select(glossy & meets, reflection, 0)
-    on = Onward(*(dr.select(glossy, a, b) for a, b in zip(_unlit(on), on)))
-    reflects = plain | (u_event < reflection)
-    on = on._replace(weight=dr.select(reflects, on.weight, 0))
-    share = dr.select(plain, 1, dr.select(reflects, reflection, 1 - reflection))
-    u = dr.select(reflects, 0, (u_event - reflection) / dr.maximum(1 - reflection, 1e-6))
-    return on, books, _Taken(reflects, share, u)
-
-
-def _mirrored(
-    world: World, sampler: Any, on: Onward, throughput: Any, books: Books, active: Any
-) -> tuple[Any, Any, Books]:
-    """Light of emitters that a body mirrors, which the reflected path leaves out; over the weight of the reflection.
-
-    With it, whether the reflected ray meets a surface, from which more light may come.
-    """
-    import mitsuba as mi
-
-    last = (on.p, on.n, on.pdf, on.emitter_share, on.sky_only, on.aim)
-
-    def look(books: Books) -> tuple[Any, Any, Books]:
-        si = world.scene.ray_intersect(place(on.p, on.n).spawn_ray(on.d), mi.RayFlags.All, False, active)
-        light = throughput * _emitted(world, si, last, mi.UInt32(1), active)
-        return light, active & si.is_valid(), world.books.add(books, on.weight * light)
-
-    return _where(active, sampler, (mi.Spectrum(0), mi.Bool(False), books), world, look)
-
-
-def _unlit(on: Onward) -> Onward:
-    """The same path, to which no emitter counts at its next vertex."""
-    import mitsuba as mi
-
-    return on._replace(pdf=mi.Float(0), emitter_share=mi.Float(0))
-
-
-def _where(mask: Any, sampler: Any, otherwise: tuple, world: World, event: Callable[[Books], tuple]) -> tuple:
-    """`event(books)` where the mask holds, and `otherwise`, which ends with the books, elsewhere.
-
-    What no neighbouring lane asks for is not computed; derivatives do not leave the event.
-    """
-    import drjit as dr
-
-    def happens(sampler: Any, otherwise: tuple) -> tuple:
-        with tracking(world.books.tracks):
-            return sampler, dr.detach(tuple(event(otherwise[-1])))
-
-    with detached():
-        return dr.if_stmt((sampler, otherwise), mask, happens, lambda s, other: (s, other))[1]
-
-
-def _instead(
-    mask: Any, sampler: Any, on: Onward, books: Books, world: World, event: Callable[[Books], tuple[Onward, Books]]
-) -> tuple[Onward, Books]:
-    def happens(books: Books) -> tuple:
-        found, books = event(books)
-        return tuple(found), books
-
-    found, books = _where(mask, sampler, (tuple(on), books), world, happens)
-    return Onward(*found), books

@@ -49,6 +49,11 @@ class Body:
     expected: Expected
     variation: Variation
 
+    @property
+    def splits(self) -> bool:
+        """Whether light is of both kinds, orders below two and the transport's."""
+        return self.transport is not None and bool(self.few)
+
     def is_current(self) -> bool:
         """Whether the object still has the shape and the medium that it was made of."""
         return self.surface.inside is self.variation.inside and self.found.is_current()
