@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from full_geometry.entries import AREA_SHARE, LearntProposals
-from full_geometry.first_event import first_event
 from full_geometry.learnable import check_surface
 from full_geometry.model import FullGeometry, PreparedExit
 from full_geometry.storing import find_weights, load
@@ -23,12 +21,10 @@ from halfspace_sss.rendering.transport.positions import PositionSampler
 from halfspace_sss.rendering.transport.protocols import Entry, Means
 from halfspace_sss.rendering.transport.radial_table import RadialTable
 from halfspace_sss.rendering.transport.settings import AUTOMATIC, Settings
-from halfspace_sss.tracing.walk import _generator, pass_seed
 
-__all__ = ["LearntTransport", "learnt_means", "warn_of_unscattered"]
+__all__ = ["LearntTransport", "learnt_means"]
 
 FINE = 2.0  # mean distances of light across a patch, up to which patches do without probes
-POINTS, MOST_UNSCATTERED = 4096, 0.02  # of the light that enters, above which a warning says so
 PATCH_SHARE = 0.5  # of the entries where patches are larger
 
 
@@ -56,22 +52,6 @@ class LearntTransport:
         return self.model.S(prepared, at, active) * dr.maximum(dr.dot(w_i, entry.n_out), 0)
 
 
-def warn_of_unscattered(subject: Subject) -> None:
-    """Warn where much light would pass unscattered: renders hold what is scattered once, directly, or more often."""
-    import drjit as dr
-    import mitsuba as mi
-
-    at = subject.random_points(_generator(mi, POINTS, pass_seed(3)))
-    through = 1 - float(np.mean(np.array(first_event(subject, at).P)))
-    dr.eval()
-    if through > MOST_UNSCATTERED:
-        warnings.warn(
-            f"object {subject.found.shape.id()!r} lets {100 * through:.0f} % of the light pass unscattered; renders by "
-            "full_geometry leave that out, and single scattering after a reflection inside: take translucent_walk",
-            stacklevel=2,
-        )
-
-
 def learnt_means(found: Object, inside: Inside, media: list[Medium], settings: Settings) -> Means:
     """Transport and proposals of an object that was trained.
 
@@ -81,7 +61,6 @@ def learnt_means(found: Object, inside: Inside, media: list[Medium], settings: S
     check_surface(found.shape.id(), found.shape.bsdf())
     subject = Subject.surveyed(found, tuple(media))
     model, sampler = load(find_weights(subject), subject)
-    warn_of_unscattered(subject)
     transport = LearntTransport(model, found.sign)
     backbone = model.half_space.models
     table = RadialTable([m for m in backbone if float(m.medium.sigma_s) > 0], found.size)

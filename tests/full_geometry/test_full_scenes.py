@@ -218,16 +218,3 @@ def test_weights_of_another_version_are_left_aside_by_name(trained: Trained, tmp
 def test_a_scene_of_another_unit_is_another_object(trained: Trained) -> None:
     with pytest.raises(ValueError, match="size_in_mfp of the medium"):
         load_scene(scene({"bunny": bunny(bsdf=SURFACE)}, "full_geometry", mm_per_unit=1.1))
-
-
-@pytest.mark.parametrize(("mm_per_unit", "warned"), [(0.5, True), (20.0, False)])
-def test_light_that_passes_an_object_unscattered_is_told_of(mm_per_unit: float, warned: bool) -> None:
-    import warnings
-
-    from full_geometry.scene import warn_of_unscattered
-
-    subject = Subject.of(mi.load_dict({"type": "sphere"}), Medium(1.0, 0.1, 0.0, 1.4), mm_per_unit)
-    with warnings.catch_warnings(record=True) as found:
-        warnings.simplefilter("always")
-        warn_of_unscattered(subject)
-    assert ["pass unscattered" in str(w.message) for w in found] == [True] * warned

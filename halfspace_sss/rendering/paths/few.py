@@ -9,8 +9,9 @@ p the density of the walk; the factors eta² of radiance cancel, and Fresnel's i
 Whether a leg is passed, and where and how the walk is scattered, is drawn for the channels by their weights f_c so far.
 
 Light of emitters that reaches the event without reflection is found by the ray that is refracted towards a sampled
-point of them, see `refracted_connection`; all other light by chance. The boundary refracts as if it were smooth. Lights
-that no ray can hit are missed where they pass unscattered, or are reflected inside before they are scattered.
+point of them, see `refracted_connection`, where there is one that it finds; all other light by chance. The boundary
+refracts as if it were smooth. Lights that no ray can hit are missed where they pass unscattered, or are reflected
+inside before they are scattered.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ __all__ = ["Few", "Leg", "few_orders"]
 
 MOST_LEGS = 256
 FAINT = 0.1  # weight below which a scattered walk may end
+SAME_WAY = 1e-2  # by which points of exit may differ, over their distance from the event
 
 Media = list[tuple[Any, Any, Any]]  # sigma_s, sigma_t and g of each channel
 
@@ -95,6 +97,8 @@ def few_orders(world: World, body: Body, leg: Leg, sampler: Any, active: Any) ->
     if world.lights.some_local:
         value = _value(coefficients, walk.event_way, mi.UInt32(1), None) * (walk.event_inverse * leg.T)
         direct = _connected(world, (body, coefficients), walk, dr.select(once, value, 0), sampler, once)
+    if world.lights.some_shaped:
+        direct = direct + weight * _met_by_chance(world, body, walk, counts & straight)
     return Few(walk.o, walk.n, walk.d, weight, straight, direct)
 
 
@@ -219,6 +223,21 @@ def _clear(body: Body, n: Any, d: Any) -> Any:
 
 def _row(media: Media, k: int) -> Any:
     return _spectrum([m[k] for m in media])
+
+
+def _met_by_chance(world: World, body: Body, walk: _Walk, active: Any) -> Any:
+    """Light of an emitter that a walk meets from its event, which no connection with that point of it would find."""
+    import drjit as dr
+    import mitsuba as mi
+
+    with detached():
+        ray = place(walk.o, walk.n).spawn_ray(walk.d)
+        si = world.scene.ray_intersect(ray, mi.RayFlags.All, False, active)
+        emitter = si.emitter(world.scene, active)
+        active = active & si.is_valid() & (emitter != None)  # noqa: E711
+        met = refracted_connection(body, walk.event, mi.Point3f(si.p), active)
+        apart = dr.norm(mi.Point3f(met.p) - walk.o) > SAME_WAY * dr.norm(walk.o - walk.event)
+    return dr.select(active & (~met.valid | apart), emitter.eval(si, active), 0)
 
 
 def _value(media: Media, way: Any, order: Any, cosine: Any) -> Any:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import gc
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from halfspace_sss.rendering.paths.differentiable import check_outermost, check_parameters, replayer
@@ -37,18 +40,22 @@ def integrator_class() -> type:
 
         def render(self, scene: Any, *args: Any, **more: Any) -> Any:
             self.prepare(scene)
-            with dr.suspend_grad():
+            with undisturbed(), dr.suspend_grad():
                 return super().render(scene, *args, **more)
 
         def render_forward(self, scene: Any, *args: Any, **more: Any) -> Any:
-            return replayer(self.prepare(scene), self.settings).render_forward(scene, *args, **more)
+            bodies = self.prepare(scene)
+            with undisturbed():
+                return replayer(bodies, self.settings).render_forward(scene, *args, **more)
 
         def render_backward(self, scene: Any, *args: Any, **more: Any) -> None:
-            replayer(self.prepare(scene), self.settings).render_backward(scene, *args, **more)
+            bodies = self.prepare(scene)
+            with undisturbed():
+                replayer(bodies, self.settings).render_backward(scene, *args, **more)
 
         def sample(self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Any = True) -> tuple:
             check_outermost(scene)
-            with dr.suspend_grad():
+            with undisturbed(), dr.suspend_grad():
                 parts, seen = trace_paths(scene, self._bodies.of(scene), self.settings, sampler, ray, active)
             return parts[0] + parts[1], seen, []
 
@@ -56,3 +63,19 @@ def integrator_class() -> type:
             return f"BSSRDFIntegrator[{self.settings}]"
 
     return BSSRDFIntegrator
+
+
+@contextmanager
+def undisturbed() -> Iterator[None]:
+    """No garbage collection while a kernel is recorded.
+
+    It would free objects of earlier scenes. A call that is recorded before that has other targets than the same call
+    after it, and Dr.Jit then writes the same function twice, which LLVM refuses.
+    """
+    collects = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if collects:
+            gc.enable()

@@ -18,11 +18,13 @@ class Lights:
         share: share of the directions into an object that are sampled by emitters; 0 where all light is the same from
             everywhere, which the model's own directions find better.
         some_local: whether there is an emitter beside the environment.
+        some_shaped: whether there is one with a shape, which rays can hit.
         some_delta: whether there is one that no ray can hit (point, spot, directional).
     """
 
     share: float
     some_local: bool
+    some_shaped: bool
     some_delta: bool
 
     @classmethod
@@ -34,4 +36,5 @@ class Lights:
         even = all("Constant" in emitter.class_name() for emitter in emitters)
         delta = any(emitter.flags() & int(mi.EmitterFlags.Delta) for emitter in emitters)
         local = any(not emitter.is_environment() for emitter in emitters)
-        return cls(0.0 if even else EMITTER_SHARE, local, delta)
+        shaped = any(emitter.get_shape() is not None for emitter in emitters)
+        return cls(0.0 if even else EMITTER_SHARE, local, shaped, delta)

@@ -1,0 +1,102 @@
+"""Orders 0 and 1 beside a model of the others: against random walks that are scattered at most once.
+
+Comparisons are z-tests per quarter of the image and channel; every one states its orders.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_translucent_walk import COLOURED, _agree, _lamp, _runs, _scene, _small_lamp, _z
+
+import halfspace_sss.rendering as rendering
+from halfspace_sss.rendering.transport import body as bodies
+from halfspace_sss.rendering.transport.protocols import Means
+from halfspace_sss.rendering.walk import media as walks
+
+mi = pytest.importorskip("mitsuba")
+
+BUNNY = Path(__file__).parents[2] / "figures" / "assets" / "bunny.ply"
+BRIGHT = {"sigma_s": "0.19,0.1,0.05", "sigma_a": "0.01,0.002,0.001", "g": 0.3, "eta": 1.3}
+DARK = {"sigma_s": "0.02,0.05,0.1", "sigma_a": "0.2,0.1,0.02", "g": -0.2, "eta": 1.5}
+
+
+@pytest.fixture(autouse=True)
+def variant() -> None:
+    mi.set_variant("llvm_ad_rgb")
+    rendering.register()
+
+
+@pytest.fixture
+def only_few(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No order from two on: neither in walks nor by a model."""
+    monkeypatch.setattr(bodies, "_means", lambda *_: Means(None, None))
+    monkeypatch.setitem(walks._MOST, "total", 1)
+
+
+def _shape(name: str) -> dict:
+    at = mi.ScalarTransform4f()
+    if name == "slab":
+        return {"type": "cube", "to_world": at.rotate([1, 1, 0], 30).scale([7, 7, 0.7])}
+    if name == "bunny":
+        return {"type": "ply", "filename": str(BUNNY), "to_world": at.scale(1.5).translate([0, -4.5, 0])}
+    return {"type": "sphere", "radius": 9.0}
+
+
+def _pair(surface: dict, light: dict | None, shape: str, spp: tuple[int, int], runs: int = 12) -> list[np.ndarray]:
+    """Images by the integrators `bssrdf` and `translucent_walk`."""
+    found = []
+    for k, kind in enumerate(("bssrdf", "translucent_walk")):
+        scene = _scene({**surface, "model": "better_dipole"}, light, _shape(shape))
+        scene["integrator"] = {"type": kind, "max_depth": -1, "rr_depth": 20}
+        found.append(_runs(mi.load_dict(scene), runs, spp[k], 1 + 100 * k))
+    return found
+
+
+@pytest.mark.parametrize("light", [None, "lamp"], ids=["sky", "lamp"])
+@pytest.mark.parametrize("medium", [BRIGHT, DARK], ids=["bright", "dark"])
+@pytest.mark.parametrize("shape", ["sphere", "slab", "bunny"])
+@pytest.mark.filterwarnings("ignore:object:UserWarning")
+def test_orders_below_two_are_those_of_walks(only_few: None, shape: str, medium: dict, light: str | None) -> None:
+    lamp = _lamp() if light else None
+    _agree(*_pair({**medium, "orders": "total"}, lamp, shape, (192, 768 if light else 192)))
+
+
+@pytest.mark.parametrize("light", [None, "lamp"], ids=["sky", "lamp"])
+@pytest.mark.filterwarnings("ignore:object:UserWarning")
+def test_single_scattering_holds_what_is_reflected_inside(light: str | None) -> None:
+    lamp = _lamp() if light else None
+    _agree(*_pair({**DARK, "orders": "single", "reflection": False}, lamp, "slab", (256, 256)))
+
+
+@pytest.mark.filterwarnings("ignore:object:UserWarning")
+def test_a_medium_that_does_not_scatter_shows_what_is_behind_it() -> None:
+    surface = {"sigma_s": 0.0, "sigma_a": "0.001,0.05,0.2", "eta": 1.5, "orders": "total"}
+    images = _pair(surface, None, "sphere", (64, 64))
+    _agree(*images)
+    assert images[0][..., 0].mean() > 0.95 and images[0][..., 2].mean() < 0.7
+
+
+@pytest.mark.filterwarnings("ignore:object:UserWarning")
+def test_a_small_lamp_is_found_by_the_refracted_ray_to_it(only_few: None) -> None:
+    """What it brings unscattered and by reflection is left to chance, and so to the sky in this test."""
+    surface = {**BRIGHT, "orders": "single", "reflection": False, "eta": 1.0}
+    found, truth = _pair(surface, _small_lamp(), "sphere", (64, 256))
+    _agree(found, truth)
+    assert 64 * np.median(found.var(axis=0)) < 256 * np.median(truth.var(axis=0))
+
+
+def test_each_part_of_the_light_of_a_body_is_counted_once() -> None:
+    parts = []
+    for k, (orders, reflection) in enumerate((("total", True), ("single", False), ("multiple", False))):
+        surface = {**COLOURED, "g": 0.3, "eta": 1.4, "orders": orders, "reflection": reflection}
+        scene = _scene({**surface, "model": "better_dipole"}, None, {"type": "sphere", "radius": 10.0})
+        scene["integrator"] = {"type": "bssrdf", "max_depth": 2, "hide_emitters": True}
+        parts.append(_runs(mi.load_dict(scene), 12, 256, 1 + 100 * k))
+    mirror = _scene({"sigma_s": 1e-3, "sigma_a": 50.0, "eta": 1.4, "model": "better_dipole", "orders": "multiple"})
+    mirror["integrator"] = {"type": "bssrdf", "max_depth": 2, "hide_emitters": True}
+    reflected = _runs(mi.load_dict(mirror), 12, 256, 1000)
+    total, inside = parts[0], parts[1] + parts[2] + reflected
+    assert np.abs(_z(total, inside)).max() < 6.0
