@@ -12,7 +12,7 @@ from halfspace_sss.rendering.surface.inside import Inside
 from halfspace_sss.rendering.surface.object import Object, same_objects, survey
 from halfspace_sss.rendering.surface.placement import translucent_shapes
 from halfspace_sss.rendering.surface.sensors import check_sensors
-from halfspace_sss.rendering.surface.transports import object_transport
+from halfspace_sss.rendering.surface.transports import knows_objects, object_transport
 from halfspace_sss.rendering.surface.varying import equivalent
 from halfspace_sss.rendering.transport.expected import Expected, expected_of
 from halfspace_sss.rendering.transport.half_space import half_space_means
@@ -100,16 +100,20 @@ def _make_body(shape: Any, settings: Settings) -> Body:
     transport, proposals = (None, None) if single_only else _means(inside, found, media, settings, variation)
     if transport and transport.orders == "total" and inside.orders == "multiple":
         raise ValueError(f"orders must be total for the model {inside.model!r}, which contains them all, got multiple")
-    few = _few(inside.orders, transport)
+    few = _few(inside, transport)
     return Body(found, surface, media, transport, proposals, few, expected_of(media), variation)
 
 
-def _few(orders: str, transport: Transport | None) -> tuple[int, ...]:
-    """The orders below two that are traced beside a transport."""
-    if orders == "single":
-        return (1,)
-    lacks = transport is None or transport.orders == "multiple"
-    return (0, 1) if orders == "total" and lacks else ()
+def _few(inside: Inside, transport: Transport | None) -> tuple[int, ...]:
+    """The orders below two that are traced beside a transport.
+
+    No light passes a half-space: its models put into orders from two on what passes something thin.
+    """
+    if inside.orders != "total":
+        return (1,) if inside.orders == "single" else ()
+    if transport is None or knows_objects(inside.model):
+        return (0, 1)
+    return (1,) if transport.orders == "multiple" else ()
 
 
 def _means(inside: Inside, found: Object, media: list[Medium], settings: Settings, variation: Variation) -> Means:
