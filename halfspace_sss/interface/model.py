@@ -55,6 +55,7 @@ class BSSRDF(abc.ABC):
         source: paper and equation.
         mirror_invariant: whether S(phi_i, phi_o) = S(-phi_i, -phi_o) holds exactly.
         fast_in: array library that evaluates it fastest on a CPU, "drjit" or "numpy".
+        checksums: of the numbers that it was trained to, one for each network; a property where they are known late.
     """
 
     name: ClassVar[str]
@@ -63,6 +64,7 @@ class BSSRDF(abc.ABC):
     source: ClassVar[str]
     mirror_invariant: ClassVar[bool] = True
     fast_in: str = "drjit"
+    checksums: tuple[str, ...] = ()
 
     def __new__(cls, *made_of: Any, **options: Any) -> BSSRDF:
         model = super().__new__(cls)
