@@ -10,8 +10,9 @@ import numpy as np
 from full_geometry.entries import AREA_SHARE, LearntProposals
 from full_geometry.learnable import check_surface
 from full_geometry.model import FullGeometry, PreparedExit
-from full_geometry.storing import find_weights, load
+from full_geometry.storing import KIND, find_weights, load
 from full_geometry.subject import Subject, SurfacePoint
+from halfspace_sss.neural.store import checksum_of
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.surface.inside import Inside
 from halfspace_sss.rendering.surface.object import Object
@@ -35,10 +36,12 @@ class LearntTransport:
     Args:
         model: what was learnt.
         sign: that turns geometric normals outwards.
+        checksums: of the file of weights, and of those of its half-space model.
     """
 
     model: FullGeometry
     sign: float
+    checksums: tuple[str, ...]
     orders = "multiple"
 
     def prepare(self, out: Exit, active: Any) -> PreparedExit:
@@ -60,9 +63,11 @@ def learnt_means(found: Object, inside: Inside, media: list[Medium], settings: S
     """
     check_surface(found.shape.id(), found.shape.bsdf())
     subject = Subject.surveyed(found, tuple(media))
-    model, sampler = load(find_weights(subject), subject)
-    transport = LearntTransport(model, found.sign)
+    path = find_weights(subject)
+    model, sampler = load(path, subject)
     backbone = model.half_space.models
+    checksums = (checksum_of(path, KIND), *(checksum for m in backbone for checksum in m.checksums))
+    transport = LearntTransport(model, found.sign, checksums)
     table = RadialTable([m for m in backbone if float(m.medium.sigma_s) > 0], found.size)
     share = AREA_SHARE if settings.area_share == AUTOMATIC else settings.area_share
     positions = PositionSampler(replace(found, pieces=None), table, subject.points, share)

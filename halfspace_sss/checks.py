@@ -106,7 +106,8 @@ def check_query(lib: Any, args: tuple, given: tuple) -> tuple:
         low, high = (-math.inf, math.inf) if bound is None else bound
         if 0 in value.shape:
             continue
-        smallest, largest = float(value.min()), float(value.max())
+        plain = value.detach() if hasattr(value, "detach") else value
+        smallest, largest = float(plain.min()), float(plain.max())
         if high == 1 < largest <= 1 + rounding(raw):
             checked[-1], largest = lib.minimum(value, 1.0), 1.0
         if not (smallest >= low and largest <= high and math.isfinite(smallest) and math.isfinite(largest)):

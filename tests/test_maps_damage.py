@@ -1,20 +1,26 @@
-"""Damage in a store of maps that would take the process down in the library that reads it."""
+"""Damage in a store of maps that the libraries that read it do not see, or that takes the process down there."""
 
 from __future__ import annotations
 
+import json
+import zlib
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from halfspace_sss import Medium
 from halfspace_sss.maps.grid import MapGrid
 from halfspace_sss.maps.store import load_maps, make_maps
 
+MEDIA = {"m": Medium([1.0, 2.0], 0.1)}
+HOW = {"grid": MapGrid(2, 16, 4, 4), "target_error": None, "n_paths": 1024}
+COORDINATES = ("theta_i", "mu_i", "phi_i", "mu_o", "delta_phi", "r_edges", "psi_edges", "mfp")
+
 
 @pytest.mark.parametrize(("at", "what"), [(4, "bytes"), (8, "bytes of a block"), (12, "compressed bytes")])
 def test_a_chunk_whose_head_tells_other_sizes_is_refused_by_name(at: int, what: str, tmp_path: Path) -> None:
-    how = {"grid": MapGrid(2, 16, 4, 4), "target_error": None, "n_paths": 1024}
-    path = make_maps({"m": Medium(1.0, 0.1)}, tmp_path, **how)["m"]
+    path = make_maps(MEDIA, tmp_path, **HOW)["m"]
     load_maps(path)
     chunk = path / "mu_o" / "0.0"
     data = bytearray(chunk.read_bytes())
@@ -22,3 +28,42 @@ def test_a_chunk_whose_head_tells_other_sizes_is_refused_by_name(at: int, what: 
     chunk.write_bytes(data[:183] if at == 12 else data)
     with pytest.raises(ValueError, match=r"m.zarr is damaged or not a map store: chunk mu_o/0.0 must be of 256 bytes"):
         load_maps(path)
+
+
+def _change(path: Path, name: str) -> None:
+    """Another last bit in the first number of a coordinate, in a chunk that is whole."""
+    import zarr
+
+    array = zarr.open_group(path, mode="r+")[name]
+    values = array[...]
+    values.flat[0] = np.nextafter(values.flat[0], np.inf)
+    array[...] = values
+
+
+@pytest.mark.parametrize("coordinate", COORDINATES)
+def test_a_coordinate_with_another_last_bit_is_refused_by_name(coordinate: str, tmp_path: Path) -> None:
+    path = make_maps(MEDIA, tmp_path, **HOW)["m"]
+    assert set(load_maps(path).coords) == set(COORDINATES)
+    _change(path, coordinate)
+    said = rf"m.zarr is damaged or .*: coordinate {coordinate} does not match its checksum"
+    for read in (lambda: load_maps(path), lambda: make_maps(MEDIA, tmp_path, **HOW)):
+        with pytest.raises(ValueError, match=said):
+            read()
+
+
+def test_a_store_of_before_whose_coordinates_have_no_checksums_is_read(tmp_path: Path) -> None:
+    path = make_maps(MEDIA, tmp_path, **HOW)["m"]
+    maps = load_maps(path)
+    for name in (".zattrs", ".zmetadata"):
+        about = json.loads((path / name).read_text())
+        attributes = about if name == ".zattrs" else about["metadata"][".zattrs"]
+        del attributes["checksums_of_coordinates"]
+        (path / name).write_text(json.dumps(about))
+    assert load_maps(path).equals(maps)
+    make_maps(MEDIA, tmp_path, **HOW)
+
+
+def test_checksums_of_coordinates_are_those_of_their_numbers(tmp_path: Path) -> None:
+    maps = load_maps(make_maps(MEDIA, tmp_path, **HOW)["m"])
+    written = json.loads(maps.attrs["checksums_of_coordinates"])
+    assert written == {name: zlib.crc32(maps[name].values.tobytes()) for name in COORDINATES}

@@ -12,6 +12,7 @@ import numpy as np
 
 from halfspace_sss.arrays import broadcast_query
 from halfspace_sss.checks import check_choice, check_query
+from halfspace_sss.interface.blocks import recorded_in_blocks
 from halfspace_sss.interface.model_lists import check_model_class, listed_models
 from halfspace_sss.interface.query import Query
 from halfspace_sss.interface.radial import RadialSampler
@@ -54,6 +55,7 @@ class BSSRDF(abc.ABC):
         source: paper and equation.
         mirror_invariant: whether S(phi_i, phi_o) = S(-phi_i, -phi_o) holds exactly.
         fast_in: array library that evaluates it fastest on a CPU, "drjit" or "numpy".
+        checksums: of the numbers that it was trained to, one for each network; a property where they are known late.
     """
 
     name: ClassVar[str]
@@ -62,6 +64,7 @@ class BSSRDF(abc.ABC):
     source: ClassVar[str]
     mirror_invariant: ClassVar[bool] = True
     fast_in: str = "drjit"
+    checksums: tuple[str, ...] = ()
 
     def __new__(cls, *made_of: Any, **options: Any) -> BSSRDF:
         model = super().__new__(cls)
@@ -91,6 +94,8 @@ class BSSRDF(abc.ABC):
             phi_i, phi_o: azimuths of w_i and w_o about the normal from the direction x_i -> x_o, radians.
                 Arguments broadcast as in NumPy; a medium with channels adds its channel axis last.
 
+        Derivatives by torch are recorded in blocks, so that their memory is bounded; the numbers are the same.
+
         Raises:
             ValueError: an argument is out of range or not a number (NumPy and torch; Dr.Jit lanes cannot be
                 inspected while a kernel is recorded), or libraries are mixed.
@@ -105,6 +110,10 @@ class BSSRDF(abc.ABC):
         """sigma_t² T_12 T_21 G_of(query)."""
         lib, args = broadcast_query(*query)
         args = check_query(lib, args, query)
+        S = recorded_in_blocks(lib, functools.partial(self._S_of_checked, lib, G_of), args)
+        return S[()] if isinstance(S, np.ndarray) else S
+
+    def _S_of_checked(self, lib: Any, G_of: Callable[[Query], Any], *args: Any) -> Any:
         if self.medium.n_channels is not None:
             lib.constant(self.medium.sigma_t, args[0])
             args = tuple(a[..., None] for a in args)
@@ -114,8 +123,7 @@ class BSSRDF(abc.ABC):
         eta = self.medium.eta
         q = Query(lib, sigma_t * r, mu_i, phi_i, mu_o, phi_o, eta, r, self.medium.sigma_t)
         G = lib.like(G_of(q), r)
-        S = sigma_t * sigma_t * F_t(mu_i, eta) * F_t(mu_o, eta) * G
-        return S[()] if isinstance(S, np.ndarray) else S
+        return sigma_t * sigma_t * F_t(mu_i, eta) * F_t(mu_o, eta) * G
 
     @functools.cached_property
     def _radial_samplers(self) -> list[RadialSampler]:

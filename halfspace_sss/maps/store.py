@@ -30,6 +30,7 @@ __all__ = ["load_maps", "make_maps"]
 FORMAT = 1
 MOST_PATHS = 2**33
 DATA = ("S", "variance")
+COORDINATES = "checksums_of_coordinates"  # an attribute
 
 
 def make_maps(
@@ -161,13 +162,30 @@ def _template(medium: Medium, grid: MapGrid, seed: int) -> xr.Dataset:
         "psi_edges": ("psi_edge", psi, {"units": "radian", "long_name": "azimuth of x_o - x_i from forward"}),
         "mfp": ("channel", np.atleast_1d(medium.mfp), {"units": "mm"}),
     }
-    return xr.Dataset(data, coords)
+    dataset = xr.Dataset(data, coords)
+    dataset.attrs[COORDINATES] = json.dumps(_coordinate_checksums(dataset), sort_keys=True)
+    return dataset
+
+
+def _coordinate_checksums(dataset: xr.Dataset) -> dict[str, int]:
+    """Of every coordinate, in float64."""
+    return {str(name): zlib.crc32(np.asarray(c.values, "<f8").tobytes()) for name, c in dataset.coords.items()}
+
+
+def _check_coordinates(dataset: xr.Dataset) -> None:
+    """ValueError names a coordinate that is not as it was written; stores of before have no checksums of them."""
+    if COORDINATES not in dataset.attrs:
+        return
+    written, found = json.loads(dataset.attrs[COORDINATES]), _coordinate_checksums(dataset)
+    for name in sorted(written.keys() | found.keys()):
+        if written.get(name) != found.get(name):
+            raise ValueError(f"coordinate {name} does not match its checksum")
 
 
 def _create(path: Path, medium: Medium, grid: MapGrid, seed: int, asked: dict[str, Any]) -> None:
     """A store of the right shape, made under another name and renamed."""
     dataset = _template(medium, grid, seed)
-    dataset.attrs = {"halfspace_sss_maps": json.dumps(asked, sort_keys=True), "provenance": json.dumps(provenance())}
+    dataset.attrs |= {"halfspace_sss_maps": json.dumps(asked, sort_keys=True), "provenance": json.dumps(provenance())}
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     shutil.rmtree(temporary, ignore_errors=True)
     chunks = {name: (1, 1, *dataset[name].shape[2:]) for name in dataset.data_vars}
@@ -193,6 +211,7 @@ def _open(path: Path) -> xr.Dataset:
         missing = {*DATA, "checksum", "n_paths", "n_events"} - set(dataset.data_vars)
         if missing:
             raise KeyError(f"arrays {', '.join(sorted(missing))}")
+        _check_coordinates(dataset)
     except Exception as error:  # zarr, JSON and xarray each raise their own kinds
         raise ValueError(f"map store {path} is damaged or not a map store: {error}") from error
     if asked.get("format") != FORMAT:

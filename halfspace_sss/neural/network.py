@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -79,6 +80,14 @@ class Network:
             biases.append(np.ascontiguousarray(vector[at : at + n_out], np.float32))
             at += n_out
         return cls(tuple(matrices), tuple(biases), activation)
+
+    @property
+    def checksum(self) -> str:
+        """SHA-256 of all numbers."""
+        digest = hashlib.sha256(repr([W.shape for W in self.matrices]).encode())
+        for array in (*self.matrices, *self.biases):
+            digest.update(np.ascontiguousarray(array, np.float32).tobytes())
+        return digest.hexdigest()
 
     def __call__(self, features: Sequence[Any]) -> Any:
         """The output for features that are arrays of one shape, in their library and precision."""

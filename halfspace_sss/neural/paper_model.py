@@ -71,6 +71,10 @@ class NeuralPaper(BSSRDF):
         super().__init__(medium)
         self.trained = trained or [_load(find_weights(KIND, m), m) for m in channels(medium)]
 
+    @property
+    def checksums(self) -> tuple[str, ...]:
+        return tuple(f"{network.checksum} {scale!r}" for network, scale in self.trained)
+
     def G(self, q: Query) -> Any:
         return q.lib.maximum(self.G_unclamped(q), 0.0)
 

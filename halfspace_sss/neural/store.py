@@ -18,7 +18,7 @@ import numpy as np
 from halfspace_sss.checks import check_interval
 from halfspace_sss.provenance import read_bytes, read_text, write_together
 
-__all__ = ["FORMAT", "load_weights", "record_count", "record_number", "save_weights", "to_json"]
+__all__ = ["FORMAT", "checksum_of", "load_weights", "record_count", "record_number", "save_weights", "to_json"]
 
 FORMAT = 1
 LARGEST = 1e4  # no weight of a network that works is as large
@@ -99,6 +99,11 @@ def load_weights(path: str | os.PathLike, kind: str) -> tuple[dict[str, np.ndarr
     if hashlib.sha256(data).hexdigest() != record["sha256"]:
         raise ValueError(f"{path}: sha256 must be {record['sha256'][:12]}..., got another: truncated or altered")
     return _arrays(path, data, record), record
+
+
+def checksum_of(path: str | os.PathLike, kind: str) -> str:
+    """SHA-256 of the arrays of a file of weights, as its record names it; errors as in `load_weights`."""
+    return _read_record(Path(path), kind)["sha256"]
 
 
 def _read_record(path: Path, kind: str) -> dict[str, Any]:

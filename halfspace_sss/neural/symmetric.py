@@ -35,6 +35,10 @@ class SymmetricModel(BSSRDF):
     reciprocal = True
     networks: list[Network]
 
+    @property
+    def checksums(self) -> tuple[str, ...]:
+        return tuple(network.checksum for network in self.networks)
+
     def G(self, q: Query) -> Any:
         m = self.medium
         if m.n_channels is None:

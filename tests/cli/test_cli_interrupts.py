@@ -135,3 +135,36 @@ def test_a_signal_to_terminate_ends_in_order_too(tmp_path: Path) -> None:
     process.terminate()
     _, messages = process.communicate(timeout=30)
     assert (process.returncode, messages) == (143, LINE)
+
+
+SCRIPT = """import sys
+from halfspace_sss.cli import main
+sys.exit(main())
+"""
+SITE = """
+import os, signal, sys
+class Interrupting:
+    def find_spec(self, name, *_):
+        if name == {module!r}:
+            sys.meta_path.remove(self)
+            os.kill(os.getpid(), signal.SIGINT)
+sys.meta_path.insert(0, Interrupting())
+"""
+FIRST = ("backend", "once", "lazy", "cli", "cli.app", "cli.interrupts", "cli.endings", "cli.shared")
+
+
+@pytest.mark.parametrize("module", [f"halfspace_sss.{name}" for name in FIRST] + ["typer"])
+def test_an_interrupt_while_the_command_is_being_imported_ends_with_130_and_one_line(module, tmp_path) -> None:
+    """Sent by what Python asks first for each of the modules."""
+    (tmp_path / "halfspace-sss").write_text(SCRIPT)
+    (tmp_path / "sitecustomize.py").write_text(SITE.format(module=module))
+    path = os.pathsep.join([str(tmp_path), *filter(None, [os.environ.get("PYTHONPATH")])])
+    run = [sys.executable, str(tmp_path / "halfspace-sss"), "materials"]
+    done = subprocess.run(run, capture_output=True, text=True, env={**os.environ, "PYTHONPATH": path})
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", LINE)
+
+
+def test_the_library_alone_leaves_signals_as_they_are() -> None:
+    code = "import signal, halfspace_sss.cli; print(signal.getsignal(signal.SIGINT) is signal.default_int_handler)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "True\n"

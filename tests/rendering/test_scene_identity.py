@@ -9,7 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import halfspace_sss
 import halfspace_sss.rendering as rendering
+from halfspace_sss.neural import universal
+from halfspace_sss.neural.store import load_weights, save_weights
+from halfspace_sss.neural.universal import shipped_weights
 from halfspace_sss.rendering.scenes.identity import scene_hash
 from halfspace_sss.rendering.scenes.scene_files import load_scene
 
@@ -128,3 +132,34 @@ def test_objects_that_swap_their_surfaces_are_another_scene() -> None:
         return scene_hash(found, found.integrator())
 
     assert scene(0.1, 0.2) != scene(0.2, 0.1)
+
+
+@pytest.mark.parametrize(
+    "holder", ["{}", '<integrator type="aov"><string name="aovs" value="d:depth"/>{}</integrator>']
+)
+def test_weights_that_a_model_was_trained_to_are_part_of_the_identity(holder, tmp_path, monkeypatch) -> None:
+    plain = '<integrator type="bssrdf"/>'
+    text = XML.replace(plain, holder.format(plain)).replace("better_dipole", "neural")
+    before = _hash(text, tmp_path)
+    arrays, record = load_weights(shipped_weights(), "neural")
+    path = save_weights(tmp_path / "again.safetensors", "neural", arrays, record)
+    monkeypatch.setattr(universal, "shipped_weights", lambda: path)
+    assert _hash(text, tmp_path) == before
+    arrays["base"][0] *= 1.01
+    path = save_weights(tmp_path / "other.safetensors", "neural", arrays, record)
+    assert _hash(text, tmp_path) != before
+
+
+def test_weights_are_no_part_of_the_identity_of_a_render_by_walks(tmp_path, monkeypatch) -> None:
+    text = XML.replace('type="bssrdf"', 'type="translucent_walk"').replace("better_dipole", "neural")
+    before = _hash(text, tmp_path)
+    monkeypatch.setattr(universal, "shipped_weights", lambda: tmp_path / "absent.safetensors")
+    assert _hash(text, tmp_path) == before
+
+
+def test_every_learnt_model_tells_what_it_was_trained_to(stand_ins) -> None:
+    medium = halfspace_sss.Medium([1.0, 2.0], [0.5, 0.1], 0.0, 1.3)
+    told = {name: halfspace_sss.bssrdf(name, medium).checksums for name in halfspace_sss.models()}
+    learnt = {name: checksums for name, checksums in told.items() if checksums}
+    assert learnt.keys() == {"neural", "neural_material", "neural_paper"}
+    assert all(len(checksums) == 2 for checksums in learnt.values())

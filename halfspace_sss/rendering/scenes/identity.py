@@ -19,15 +19,24 @@ _LEFT_OUT = re.compile(r'^\s*(name = ".*"|(sample_count|samples_per_wavefront|wa
 def scene_hash(scene: Any, integrator: Any) -> str:
     """SHA-256 of the objects of a scene, in words and by all their parameters, and of the integrator that renders it.
 
+    What models have learnt is part of it: the same scene is another render after a training.
     The integrator of the scene itself, ids, the order of objects and the number of samples of a sampler are left out.
     """
     own = scene.integrator()
     found = sorted(_object_digest(child) for child in _children(scene) if child is not own)
-    return hashlib.sha256("\n".join([*found, words(integrator)]).encode()).hexdigest()
+    return hashlib.sha256("\n".join([*found, words(integrator), *_learnt(scene, integrator)]).encode()).hexdigest()
 
 
-def _children(scene: Any) -> list[Any]:
-    """The objects that stand in a scene, in any order."""
+def _learnt(scene: Any, integrator: Any) -> list[str]:
+    """Checksums of what the models of the objects have learnt, for an integrator that asks them, or holds one."""
+    if hasattr(integrator, "prepare"):
+        transports = (body.transport for body in integrator.prepare(scene))
+        return sorted(checksum for transport in transports for checksum in getattr(transport, "checksums", ()))
+    return [checksum for inner in _children(integrator) for checksum in _learnt(scene, inner)]
+
+
+def _children(holder: Any) -> list[Any]:
+    """The objects that stand in a scene or in another object, in any order."""
     import mitsuba as mi
 
     class Children(mi.TraversalCallback):
@@ -40,7 +49,7 @@ def _children(scene: Any) -> list[Any]:
                 self.found.append(value)
 
     callback = Children()
-    scene.traverse(callback)
+    holder.traverse(callback)
     return callback.found
 
 

@@ -40,6 +40,10 @@ class HalfSpaceTransport:
     def orders(self) -> str:
         return self.models[0].orders
 
+    @property
+    def checksums(self) -> tuple[str, ...]:
+        return tuple(checksum for model in self.models for checksum in model.checksums)
+
     def prepare(self, out: Exit, active: Any) -> Exit:
         """Nothing is done for the exit alone."""
         return out

@@ -47,9 +47,11 @@ class Transport(Protocol):
 
     Attributes:
         orders: "multiple" (two or more scattering events) or "total".
+        checksums: of what it has learnt, which are part of a render's identity; empty where nothing is.
     """
 
     orders: str
+    checksums: tuple[str, ...]
 
     def prepare(self, out: Exit, active: Any) -> Any:
         """What is done once for all entries of an exit, handed to `S_mu` as it is."""
