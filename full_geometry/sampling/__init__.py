@@ -1,0 +1,1 @@
+"""What ways of drawing entries cost: variance of a sample times its time, under several kinds of light."""
