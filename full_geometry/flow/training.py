@@ -1,4 +1,4 @@
-"""Learning a flow, and with it or alone weights of patches, from the exits of walks; for any light or for a given one."""
+"""Learning a flow, or weights of patches, from the exits of walks; for any light or for a given one."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from full_geometry.flow.chart import Chart
 from full_geometry.flow.conditional import ConditionalFlow
 from full_geometry.flow.context import N_CONTEXT
 from full_geometry.flow.fitting import FlowNetwork
+from full_geometry.flow.lights import Lighting
 from full_geometry.flow.sampler import FlowSampler
 from full_geometry.flow.walks import Walks, flow_walks
 from full_geometry.learning.learner import PatchLogits, patch_likelihood
 from full_geometry.patches import PatchSampler
-from full_geometry.sampling.lights import Lighting
 from full_geometry.storing import Learnt
 from halfspace_sss.checks import check_count, check_interval
 

@@ -10,9 +10,9 @@ from full_geometry.features import Frame, Side, side_features
 from full_geometry.first_event import first_event
 from full_geometry.flow.chart import Chart
 from full_geometry.flow.context import context, direction_square
+from full_geometry.flow.lights import Lighting
 from full_geometry.learning.exits import trace_exits
 from full_geometry.patches import Patches
-from full_geometry.sampling.lights import Lighting
 from full_geometry.subject import Subject
 from halfspace_sss.rendering.transport.protocols import Entry
 from halfspace_sss.tracing.walk import _generator, pass_seed

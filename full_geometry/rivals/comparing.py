@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from full_geometry.sampling.lights import Lighting
+from full_geometry.flow.lights import Lighting
 from full_geometry.subject import Subject
 from halfspace_sss.rendering.surface.object import turned
 from halfspace_sss.rendering.transport.plane import Exit, number

@@ -1,4 +1,4 @@
-"""Light that samplers of entries are compared under: a sky, a direction, a small light near the object.
+"""Light that samplers of entries are fitted to and compared under: a sky, a direction, a small light near the object.
 
 Each gives for an entry a direction of incidence and the light from there over its density. The object itself casts
 shadows.
