@@ -58,7 +58,7 @@ def _places(subject: Subject, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate([(centroids - centre) @ turn.T / radius, length * normals @ turn.T], axis=1), areas
 
 
-def cluster(subject: Subject, frame: Frame, n: int = PATCHES, seed: int = 0) -> np.ndarray:
+def cluster(subject: Subject, frame: Frame, n: int = PATCHES, seed: int = 0, rounds: int = ROUNDS) -> np.ndarray:
     """Centres of at most n patches, (n, 6), in the frame of the object."""
     from scipy.spatial import cKDTree
 
@@ -66,7 +66,7 @@ def cluster(subject: Subject, frame: Frame, n: int = PATCHES, seed: int = 0) -> 
     rng = np.random.default_rng(seed)
     n = min(n, int(np.count_nonzero(areas)))
     centres = x[rng.choice(len(x), n, replace=False, p=areas / areas.sum())]
-    for _ in range(ROUNDS):
+    for _ in range(rounds):
         nearest = cKDTree(centres).query(x)[1]
         mass = np.bincount(nearest, areas, n)
         sums = np.stack([np.bincount(nearest, areas * column, n) for column in x.T], axis=1)

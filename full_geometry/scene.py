@@ -10,8 +10,10 @@ import numpy as np
 
 from full_geometry.entries import AREA_SHARE, LearntProposals
 from full_geometry.first_event import first_event
+from full_geometry.flow.sampler import FlowProposals
 from full_geometry.learnable import check_surface
 from full_geometry.model import FullGeometry, PreparedExit
+from full_geometry.patch_table import PatchTable
 from full_geometry.storing import find_weights, load
 from full_geometry.subject import Subject, SurfacePoint
 from halfspace_sss.physics.medium import Medium
@@ -80,7 +82,7 @@ def learnt_means(found: Object, inside: Inside, media: list[Medium], settings: S
     """
     check_surface(found.shape.id(), found.shape.bsdf())
     subject = Subject.surveyed(found, tuple(media))
-    model, sampler = load(find_weights(subject), subject)
+    model, sampler, flow = load(find_weights(subject), subject)
     warn_of_unscattered(subject)
     transport = LearntTransport(model, found.sign)
     backbone = model.half_space.models
@@ -89,6 +91,8 @@ def learnt_means(found: Object, inside: Inside, media: list[Medium], settings: S
     positions = PositionSampler(replace(found, pieces=None), table, subject.points, share)
     if sampler is None:
         return Means(transport, HalfSpaceProposals(positions, backbone[0]))
+    if flow is not None:
+        return Means(transport, FlowProposals(flow, found.sign, PatchTable(flow.patches)))
     radius = np.sqrt(found.area / (np.pi * sampler.patches.n))
     patch_share = 1.0 if radius < FINE * table.mean else PATCH_SHARE
-    return Means(transport, LearntProposals(sampler, positions, patch_share, found.sign))
+    return Means(transport, LearntProposals(sampler, positions, patch_share, found.sign, PatchTable(sampler)))

@@ -56,14 +56,16 @@ class AlphaP:
     scale: tuple[float, ...]
     orders = "multiple"
 
-    def _face(self, at: SurfacePoint) -> Any:
-        """The face that a point lies on, as a short ray from outside meets it."""
+    def _face(self, at: SurfacePoint, active: Any) -> tuple[Any, Any]:
+        """The face that a point lies on, as a short ray from outside meets it, and where there is one."""
+        import drjit as dr
         import mitsuba as mi
 
         clear = number(CLEAR * self.subject.found.size)
         ray = mi.Ray3f(mi.Point3f(at.p + at.n * clear), mi.Vector3f(-at.n))
         ray.maxt = 2 * clear
-        return mi.UInt32(self.subject.found.scene.ray_intersect_preliminary(ray, False, True).prim_index)
+        hit = self.subject.found.scene.ray_intersect_preliminary(ray, False, active=mi.Bool(active))
+        return dr.select(hit.is_valid(), mi.UInt32(hit.prim_index), 0), active & hit.is_valid()
 
     def _network(self, matrix: str, bias: str, x: list[Any]) -> list[Any]:
         import drjit as dr
@@ -112,7 +114,7 @@ class AlphaP:
         import mitsuba as mi
 
         if face is None:
-            face = self._face(at)
+            face, active = self._face(at, active)
         sampler = self.sampler
         patch = sampler.patches.patches.row("patch", face)
         told = context(sampler.frame, exit.side, sampler.chart.frame(patch))

@@ -10,6 +10,7 @@ from full_geometry.flow.chart import Chart
 from full_geometry.flow.conditional import ConditionalFlow
 from full_geometry.flow.context import context
 from full_geometry.model import PreparedExit
+from full_geometry.patch_table import PatchTable
 from full_geometry.patches import PatchSampler, PatchWeights
 from halfspace_sss.rendering.surface.object import turned
 from halfspace_sss.rendering.transport.area_points import Point
@@ -54,7 +55,7 @@ class FlowSampler:
 
 class _Prepared(NamedTuple):
     side: Side
-    weights: PatchWeights
+    weights: PatchWeights | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,20 +65,24 @@ class FlowProposals:
     Args:
         sampler: of the points.
         sign: that turns geometric normals outwards.
+        table: of the weights of patches by the face of an exit; without it the network is asked for each exit.
     """
 
     sampler: FlowSampler
     sign: float
+    table: PatchTable | None = None
 
     def prepare(self, out: Exit, prepared: PreparedExit, active: Any) -> _Prepared:
-        return _Prepared(prepared.side, self.sampler.patches.prepare(prepared.side))
+        weights = self.sampler.patches.prepare(prepared.side) if self.table is None else None
+        return _Prepared(prepared.side, weights)
 
     def sample(self, out: Exit, prim_index: Any, prepared: _Prepared, sampler: Any, active: Any) -> Entry:
         import drjit as dr
         import mitsuba as mi
 
         u = sampler.next_1d(), tuple(sampler.next_2d())
-        at, density = self.sampler.sample(prepared.side, prepared.weights, *u)
+        weights = prepared.weights if self.table is None else self.table.weights(prim_index)
+        at, density = self.sampler.sample(prepared.side, weights, *u)
         n_out = turned(at.n_shading, at.n) * number(self.sign)
         weight = dr.select(active & (density > 0), 1 / density, 0)
         return Entry(mi.Point3f(at.p), mi.Normal3f(at.n), mi.Normal3f(n_out), weight, mi.UInt32(at.prim_index))

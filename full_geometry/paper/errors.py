@@ -1,7 +1,8 @@
 """How wrong the paper's network is, by the error measure of all models of an object.
 
 Its N points come from walks, as in training, or are uniform over the area with directions by the cosine: what a
-renderer has that knows nothing. Each exit is asked several times with new points, and the noise of their mean is taken out.
+renderer has that knows nothing. Each exit is asked several times with new points, and the noise of their mean is
+taken out.
 """
 
 from __future__ import annotations

@@ -67,8 +67,10 @@ def _made(
     from tempfile import TemporaryDirectory
 
     from full_geometry.flow.training import FlowRecipe
-    from full_geometry.rivals.errors import error_table, learn_by_cpu
+    from full_geometry.learning.training import train_by_cpu
+    from full_geometry.rivals.errors import error_table
     from full_geometry.rivals.samplers import sampler_table
+    from full_geometry.subject import Subject
 
     def show(what: str, done: int, total: int) -> None:
         bar.show(done, total, what)
@@ -76,7 +78,7 @@ def _made(
     if table == "errors":
         return error_table(scene, name, seconds=seconds, walks=samples, samples=samples, seed=seed, progress=show)
     with TemporaryDirectory() as folder:
-        learnt = learn_by_cpu(scene, name, seconds, Path(folder), seed)
+        learnt, _ = train_by_cpu(Subject.given(scene, None, None, name), seconds, folder, seed=seed)
     return sampler_table(learnt, FlowRecipe(seconds=0.5 * seconds), samples=samples, seed=seed, progress=show)
 
 

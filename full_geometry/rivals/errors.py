@@ -5,9 +5,7 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
-from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
@@ -16,30 +14,17 @@ from full_geometry.flow.training import FlowRecipe
 from full_geometry.half_space import HalfSpace, HalfSpaceTransport
 from full_geometry.learning import model_errors
 from full_geometry.learning.pairs import Proposals
-from full_geometry.learning.training import LOOP_SHARE, train
+from full_geometry.learning.training import train_by_cpu
 from full_geometry.paper.errors import POINTS, paper_errors
 from full_geometry.paper.network import PaperRecipe, fit_paper
-from full_geometry.storing import Learnt, load
 from full_geometry.subject import Subject
 
 if TYPE_CHECKING:
     import pandas
 
-__all__ = ["BACKBONE", "error_table", "learn_by_cpu"]
+__all__ = ["BACKBONE", "error_table"]
 
 BACKBONE = "better_dipole"
-
-
-def learn_by_cpu(scene: Any, name: str | None, seconds: float, folder: Path, seed: int = 0) -> Learnt:
-    """`full_geometry` of an object after so many seconds of CPU time, whatever else the machine does."""
-    spent = []
-    for chunks in (1, 3):
-        began = time.process_time()
-        train(scene, object=name, chunks=chunks, seed=seed, folder=folder)
-        spent.append(time.process_time() - began)
-    each = max((spent[1] - spent[0]) / 2, 1e-3)
-    found = train(scene, object=name, chunks=max(int(LOOP_SHARE * seconds / each), 1), seed=seed, folder=folder)
-    return load(found.path, found.model.subject)
 
 
 def error_table(
@@ -68,7 +53,7 @@ def error_table(
 
     tell("full_geometry", 0)
     with TemporaryDirectory() as folder:
-        learnt = learn_by_cpu(scene, name, seconds, Path(folder), seed)
+        learnt, _ = train_by_cpu(subject, seconds, folder, seed=seed)
     proposals = Proposals(subject, HalfSpace(subject, BACKBONE)).with_patches(learnt.sampler)
     tell("S = alpha p", 1)
     models = {BACKBONE: HalfSpaceTransport(subject, BACKBONE), "full_geometry": learnt.model}

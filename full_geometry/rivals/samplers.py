@@ -10,6 +10,7 @@ from full_geometry.entries import AREA_SHARE, LearntProposals
 from full_geometry.flow.lights import LIGHTINGS, Lighting, lighting
 from full_geometry.flow.sampler import FlowProposals
 from full_geometry.flow.training import FlowRecipe, fit_flow, fit_patches
+from full_geometry.patch_table import PatchTable
 from full_geometry.rivals.comparing import costs, spread
 from full_geometry.scene import LearntTransport
 from full_geometry.storing import Learnt
@@ -23,7 +24,9 @@ if TYPE_CHECKING:
 
 __all__ = ["SAMPLERS", "sampler_table", "samplers"]
 
-SAMPLERS = ("uniform", "probes", "patches", "patches and probes", "flow", "patches, light", "flow, light")
+SAMPLERS = (
+    "uniform", "probes", "patches by network", "patches", "patches and probes", "flow", "patches, light", "flow, light",
+)  # fmt: skip
 SAMPLES_OF_AN_EXIT = (1, 8)
 
 
@@ -37,21 +40,23 @@ def samplers(learnt: Learnt, recipe: FlowRecipe, light: Lighting, flow: Any, see
         flow: fitted to S alone.
         seed: of the fits.
     """
-    model, patches = learnt
+    model, patches, _ = learnt
     found, sign = model.subject.found, model.subject.found.sign
     backbone = model.half_space.models
     table = RadialTable([m for m in backbone if float(m.medium.sigma_s) > 0], found.size)
     probes = PositionSampler(replace(found, pieces=None), table, model.subject.points, AREA_SHARE)
     lit = fit_patches(learnt, recipe, light=light, seed=seed)
     lit_flow = fit_flow(learnt._replace(sampler=lit), recipe, light=light, seed=seed)
+    by_face, lit_by_face = PatchTable(patches), PatchTable(lit)
     return {
         "uniform": HalfSpaceProposals(replace(probes, area_share=1.0), backbone[0]),
         "probes": HalfSpaceProposals(probes, backbone[0]),
-        "patches": LearntProposals(patches, probes, 1.0, sign),
-        "patches and probes": LearntProposals(patches, probes, 0.5, sign),
-        "flow": FlowProposals(flow, sign),
-        "patches, light": LearntProposals(lit, probes, 1.0, sign),
-        "flow, light": FlowProposals(lit_flow, sign),
+        "patches by network": LearntProposals(patches, probes, 1.0, sign),
+        "patches": LearntProposals(patches, probes, 1.0, sign, by_face),
+        "patches and probes": LearntProposals(patches, probes, 0.5, sign, by_face),
+        "flow": FlowProposals(flow, sign, by_face),
+        "patches, light": LearntProposals(lit, probes, 1.0, sign, lit_by_face),
+        "flow, light": FlowProposals(lit_flow, sign, lit_by_face),
     }
 
 
