@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from full_geometry.model import PreparedExit
+from full_geometry.patch_table import PatchTable
 from full_geometry.patches import PatchSampler, PatchWeights
 from halfspace_sss.rendering.surface.object import turned
 from halfspace_sss.rendering.transport.plane import Exit, number
@@ -20,7 +21,7 @@ AREA_SHARE = 0.4  # of the entries without patches that are uniform over the are
 class _Prepared(NamedTuple):
     """Of an exit: the weights of patches, and the axes of probes."""
 
-    weights: PatchWeights
+    weights: PatchWeights | None
     axes: tuple[Any, Any, Any]
 
 
@@ -33,30 +34,34 @@ class LearntProposals:
         positions: probes and uniform points.
         patch_share: of the entries, (0, 1]; 1 shoots no ray.
         sign: that turns geometric normals outwards.
+        table: of the weights by the face of an exit; without it the network is asked for each exit.
     """
 
     patches: PatchSampler
     positions: PositionSampler
     patch_share: float
     sign: float
+    table: PatchTable | None = None
 
     def prepare(self, out: Exit, prepared: PreparedExit, active: Any) -> _Prepared:
         import mitsuba as mi
 
-        return _Prepared(self.patches.prepare(prepared.side), (out.n, *mi.coordinate_system(out.n)))
+        weights = self.patches.prepare(prepared.side) if self.table is None else None
+        return _Prepared(weights, (out.n, *mi.coordinate_system(out.n)))
 
     def sample(self, out: Exit, prim_index: Any, prepared: _Prepared, sampler: Any, active: Any) -> Entry:
         import drjit as dr
         import mitsuba as mi
 
         by_patch = active & (sampler.next_1d() < number(self.patch_share))
-        at, _ = self.patches.sample(prepared.weights, sampler.next_1d(), sampler.next_1d(), sampler.next_2d())
+        weights = prepared.weights if self.table is None else self.table.weights(prim_index)
+        at, _ = self.patches.sample(weights, sampler.next_1d(), sampler.next_1d(), sampler.next_2d())
         n_out = turned(at.n_shading, at.n) * number(self.sign)
         entry = Entry(mi.Point3f(at.p), mi.Normal3f(at.n), mi.Normal3f(n_out), mi.Float(1), mi.UInt32(at.prim_index))
         if self.patch_share < 1:
             probed = self.positions.sample(out, prim_index, sampler, active & ~by_patch)
             entry = Entry(*(dr.select(by_patch, a, b) for a, b in zip(entry, probed)))
-        learnt = self.patches.density(prepared.weights, entry.face)
+        learnt = self.patches.density(weights, entry.face)
         if self.patch_share == 1:
             return entry._replace(weight=dr.select(by_patch, 1 / learnt, 0))
         near = self.positions.density(entry.p, entry.n, out, prepared.axes)

@@ -58,7 +58,7 @@ def _places(subject: Subject, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate([(centroids - centre) @ turn.T / radius, length * normals @ turn.T], axis=1), areas
 
 
-def cluster(subject: Subject, frame: Frame, n: int = PATCHES, seed: int = 0) -> np.ndarray:
+def cluster(subject: Subject, frame: Frame, n: int = PATCHES, seed: int = 0, rounds: int = ROUNDS) -> np.ndarray:
     """Centres of at most n patches, (n, 6), in the frame of the object."""
     from scipy.spatial import cKDTree
 
@@ -66,7 +66,7 @@ def cluster(subject: Subject, frame: Frame, n: int = PATCHES, seed: int = 0) -> 
     rng = np.random.default_rng(seed)
     n = min(n, int(np.count_nonzero(areas)))
     centres = x[rng.choice(len(x), n, replace=False, p=areas / areas.sum())]
-    for _ in range(ROUNDS):
+    for _ in range(rounds):
         nearest = cKDTree(centres).query(x)[1]
         mass = np.bincount(nearest, areas, n)
         sums = np.stack([np.bincount(nearest, areas * column, n) for column in x.T], axis=1)
@@ -187,15 +187,20 @@ class PatchSampler:
 
     def sample(self, exit: PatchWeights, u_patch: Any, u_face: Any, u: Any) -> tuple[Point, Any]:
         """A point of entry and its density, 1/(scene unit)², for uniform numbers u_patch, u_face and the pair u."""
+        patch, density = self.patch(exit, u_patch)
+        return self.patches.point(patch, u_face, u), density
+
+    def patch(self, exit: PatchWeights, u: Any) -> tuple[Any, Any]:
+        """A patch for a uniform number, and the density of uniform points in a patch that is drawn so."""
         import drjit as dr
         import mitsuba as mi
 
-        learnt, last = u_patch < LEARNT_SHARE, self.patches.n - 1
-        u_1, u_2 = u_patch / LEARNT_SHARE * exit.total, (u_patch - LEARNT_SHARE) / (1 - LEARNT_SHARE)
+        learnt, last = u < LEARNT_SHARE, self.patches.n - 1
+        u_1, u_2 = u / LEARNT_SHARE * exit.total, (u - LEARNT_SHARE) / (1 - LEARNT_SHARE)
         by_weight = dr.binary_search(0, last, lambda i: exit.cumulative[mi.UInt32(i)] <= u_1)
         by_area = dr.binary_search(0, last, lambda i: self.patches.row("upto", mi.UInt32(i)) <= u_2)
         patch = dr.select(learnt, mi.UInt32(by_weight), mi.UInt32(by_area))
-        return self.patches.point(patch, u_face, u), self._share(exit, patch) / self.patches.row("area", patch)
+        return patch, self._share(exit, patch) / self.patches.row("area", patch)
 
     def density(self, exit: PatchWeights, face: Any) -> Any:
         """Density of `sample` on a face, 1/(scene unit)²."""

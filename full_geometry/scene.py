@@ -8,8 +8,10 @@ from typing import Any
 import numpy as np
 
 from full_geometry.entries import AREA_SHARE, LearntProposals
+from full_geometry.flow.sampler import FlowProposals
 from full_geometry.learnable import check_surface
 from full_geometry.model import FullGeometry, PreparedExit
+from full_geometry.patch_table import PatchTable
 from full_geometry.storing import KIND, find_weights, load
 from full_geometry.subject import Subject, SurfacePoint
 from halfspace_sss.neural.store import checksum_of
@@ -64,7 +66,7 @@ def learnt_means(found: Object, inside: Inside, media: list[Medium], settings: S
     check_surface(found.shape.id(), found.shape.bsdf())
     subject = Subject.surveyed(found, tuple(media))
     path = find_weights(subject)
-    model, sampler = load(path, subject)
+    model, sampler, flow = load(path, subject)
     backbone = model.half_space.models
     checksums = (checksum_of(path, KIND), *(checksum for m in backbone for checksum in m.checksums))
     transport = LearntTransport(model, found.sign, checksums)
@@ -73,6 +75,8 @@ def learnt_means(found: Object, inside: Inside, media: list[Medium], settings: S
     positions = PositionSampler(replace(found, pieces=None), table, subject.points, share)
     if sampler is None:
         return Means(transport, HalfSpaceProposals(positions, backbone[0]))
+    if flow is not None:
+        return Means(transport, FlowProposals(flow, found.sign, PatchTable(flow.patches)))
     radius = np.sqrt(found.area / (np.pi * sampler.patches.n))
     patch_share = 1.0 if radius < FINE * table.mean else PATCH_SHARE
-    return Means(transport, LearntProposals(sampler, positions, patch_share, found.sign))
+    return Means(transport, LearntProposals(sampler, positions, patch_share, found.sign, PatchTable(sampler)))

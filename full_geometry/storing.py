@@ -10,6 +10,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from full_geometry.features import Frame
+from full_geometry.flow.chart import Chart
+from full_geometry.flow.conditional import ConditionalFlow
+from full_geometry.flow.sampler import FlowSampler
 from full_geometry.half_space import HalfSpace, HalfSpaceTransport
 from full_geometry.identity import Identity, frame_of, identify
 from full_geometry.model import FullGeometry
@@ -18,17 +21,20 @@ from full_geometry.subject import Subject
 from halfspace_sss.neural.store import load_weights, save_weights
 from halfspace_sss.neural.trained import weights_folder
 
-__all__ = ["CENTRES", "KIND", "Learnt", "assemble", "find_weights", "load", "save", "transport", "weights_name"]
+__all__ = [
+    "CENTRES", "KIND", "Learnt", "add_flow", "assemble", "find_weights", "load", "save", "transport", "weights_name",
+]  # fmt: skip
 
 KIND = "full_geometry"
-S_LAYERS, PATCH_LAYERS, CENTRES = ("W_", "b_"), ("V_", "c_"), "centres"
+S_LAYERS, PATCH_LAYERS, FLOW_LAYERS, CENTRES = ("W_", "b_"), ("V_", "c_"), ("F_", "h_"), "centres"
 
 
 class Learnt(NamedTuple):
-    """What weights give: the model, and the sampler of its entries, None for a shape without faces."""
+    """What weights give: the model, the sampler of its entries, None for a shape without faces, and a flow if any."""
 
     model: FullGeometry
     sampler: PatchSampler | None
+    flow: FlowSampler | None = None
 
 
 def weights_name(identity: Identity) -> str:
@@ -116,4 +122,14 @@ def assemble(
     if CENTRES not in arrays:
         return Learnt(model, None)
     patches = patches or Patches(subject, frame, arrays[CENTRES].astype(np.float32))
-    return Learnt(model, PatchSampler(frame, patches, layers(PATCH_LAYERS)))
+    sampler, flow = PatchSampler(frame, patches, layers(PATCH_LAYERS)), None
+    if layers(FLOW_LAYERS):
+        flow = FlowSampler(sampler, Chart(subject, frame, patches), ConditionalFlow(2, layers(FLOW_LAYERS)))
+    return Learnt(model, sampler, flow)
+
+
+def add_flow(path: str | os.PathLike, flow: FlowSampler) -> None:
+    """Write the numbers of a flow into the weights of an object: renders draw its entries by it from then on."""
+    arrays, record = load_weights(Path(path), KIND)
+    arrays |= {name: value.astype(np.float16) for name, value in flow.flow.weights.items()}
+    save_weights(Path(path), KIND, arrays, record)

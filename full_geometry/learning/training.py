@@ -29,7 +29,7 @@ from halfspace_sss.neural.training.work_folder import CHECKPOINT, claim
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.provenance import check_folder, provenance, write_atomically
 
-__all__ = ["Trained", "train"]
+__all__ = ["Trained", "train", "train_by_cpu"]
 
 Progress = Callable[[str, int, int], None]
 VALIDATIONS = 4  # in a run
@@ -113,8 +113,30 @@ def train(
     run = _Run(subject, recipe, int(seed), Path(work) if work else None)
     if seconds == 0:
         warnings.warn("an object that is trained for 0 seconds is rendered as a half-space", stacklevel=2)
-        return Trained(*run.learnt(), None, [], 0, 0.0)
+        return Trained(*run.learnt()[:2], None, [], 0, 0.0)
     return run.go(seconds, chunks, target_error, Path(folder or weights_folder()), progress)
+
+
+def train_by_cpu(
+    subject: Subject, seconds: float, folder: str | Path, *, seed: int = 0, recipe: Recipe = STANDARD
+) -> tuple[Learnt, Path]:
+    """Learn an object in so many seconds of CPU time, whatever else the machine does; errors are not measured.
+
+    Args:
+        subject: the object.
+        seconds: of CPU time of this process, for data and fit.
+        folder: for the weights.
+        seed: of everything.
+        recipe: sizes and rates.
+    """
+    check_interval("seconds", seconds, 1e-3, 1e7)
+    run, began = _Run(subject, recipe, seed, None), time.process_time()
+    run._prepare()
+    total = run._plan(seconds, None, time.process_time)
+    while run.done < total:
+        run._chunk(total)
+    record = run._record([], time.process_time() - began)
+    return run.learnt(), storing.save(folder, run.identity, run.arrays(), record)
 
 
 class _Run:
@@ -172,7 +194,7 @@ class _Run:
         )
         spent = time.monotonic() - started
         path = storing.save(folder, self.identity, self.arrays(), self._record(found, spent))
-        return Trained(*self.learnt(), path, found, self.fitting.step, spent)
+        return Trained(*self.learnt()[:2], path, found, self.fitting.step, spent)
 
     def _prepare(self) -> None:
         """Scales and shares from a pilot; the work of a run that was killed."""
@@ -186,7 +208,7 @@ class _Run:
             if (self.work / CHECKPOINT).exists():
                 self.done, self.history = self.fitting.load(self.work / CHECKPOINT)
 
-    def _plan(self, seconds: float, chunks: int | None) -> int:
+    def _plan(self, seconds: float, chunks: int | None, clock: Callable[[], float] = time.monotonic) -> int:
         """Number of chunks: given, written down by the run before, or by the time that one takes."""
         import json
 
@@ -197,9 +219,9 @@ class _Run:
             trial = self._new_fitting()
             trial.scale = self.fitting.scale
             self.source.proposed(1024, (self.seed, 2**31), self.learnt().sampler)  # compiles its kernels
-            at = time.monotonic()
+            at = clock()
             trial.use(*self._data(2**31 + 1), 10**6, np.random.default_rng(0))
-            chunks = max(int(LOOP_SHARE * seconds / (time.monotonic() - at)), 1)
+            chunks = max(int(LOOP_SHARE * seconds / (clock() - at)), 1)
         if place:
             write_atomically(place, to_json({"chunks": chunks}))
         return chunks

@@ -24,8 +24,9 @@ from full_geometry.identity import frame_of  # noqa: E402
 from full_geometry.learning.fitting import Recipe  # noqa: E402
 from full_geometry.learning.pairs import Proposals  # noqa: E402
 from full_geometry.learning.training import train  # noqa: E402
+from full_geometry.patch_table import PatchTable  # noqa: E402
 from full_geometry.patches import Patches, PatchSampler, cluster, mesh_faces  # noqa: E402
-from full_geometry.subject import Subject  # noqa: E402
+from full_geometry.subject import Subject, SurfacePoint, cosine_direction  # noqa: E402
 from halfspace_sss.tracing.walk import _generator, pass_seed  # noqa: E402
 
 BUNNY = Path(__file__).parents[2] / "figures" / "assets" / "bunny.ply"
@@ -107,6 +108,29 @@ def test_samples_lie_on_their_face(subject: Subject, sampler: PatchSampler) -> N
     assert np.allclose(np.array(point.n).T, normals[face], atol=1e-3)
 
 
+@pytest.mark.parametrize("cells", [256, 2**20])
+def test_faces_are_drawn_by_the_density_of_a_table(subject: Subject, sampler: PatchSampler, cells: int) -> None:
+    table, rng, n = PatchTable(sampler, cells), _generator(mi, 2**17, pass_seed(14)), len(mesh_faces(subject)[2])
+    u = (rng.next_float32(), rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32()))
+    point, drawn = sampler.sample(table.weights(mi.UInt32(77)), *u)
+    faces, areas = np.array(point.prim_index), mesh_faces(subject)[2]
+    density = np.array(sampler.density(table.weights(mi.UInt32(77)), dr.arange(mi.UInt32, n)))
+    assert np.allclose(np.array(drawn), density[faces], rtol=1e-4)
+    assert np.isclose(np.sum(density * areas), 1, atol=1e-4)
+    assert chi_square(np.bincount(faces, minlength=n), len(faces) * density * areas) > 1e-3
+
+
+def test_a_table_is_near_the_network(subject: Subject, sampler: PatchSampler) -> None:
+    n = len(mesh_faces(subject)[2])
+    by_table = np.array(sampler.density(PatchTable(sampler).weights(mi.UInt32(0)), dr.arange(mi.UInt32, n)))
+    at = subject.points.on_face(mi.UInt32(0), mi.Point2f(0.5, 0.5))
+    n_out = mi.Normal3f(at.n_shading * subject.found.sign)
+    exit = SurfacePoint(at.p, mi.Normal3f(at.n * subject.found.sign), n_out, mi.Vector3f(n_out))
+    weights = sampler.prepare(Side(exit, first_event(subject, exit)))
+    by_network = np.array(sampler.density(weights, dr.arange(mi.UInt32, n)))
+    assert np.corrcoef(np.log(by_table), np.log(by_network))[0, 1] > 0.8
+
+
 def test_the_two_sides_of_a_thin_plate_are_apart() -> None:
     plate = mi.load_dict({"type": "cube", "to_world": mi.ScalarTransform4f().scale([3, 3, 0.01])})
     found = Subject.of(plate, WAX)
@@ -145,8 +169,6 @@ def test_learnt_weights_lower_the_variance_below_that_of_uniform_points(subject:
 
 
 def entry_at(subject: Subject, point, rng):
-    from full_geometry.subject import SurfacePoint, cosine_direction
-
     n_out = point.n_shading * subject.found.sign
     return SurfacePoint(point.p, point.n * subject.found.sign, n_out, cosine_direction(n_out, rng))
 

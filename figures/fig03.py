@@ -1,0 +1,147 @@
+"""Fig. 3: points of entry of one exit by the paper's flow and by learnt patches, beside uniform ones."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from figures.computing.learnt_objects import SHAPES, shape_of
+from figures.computing.scenes import BUNNY, prepare
+from figures.drawing.style import TEXT, paper, saved
+from figures.parts.part import Part, Result, Task
+
+__all__ = ["TITLE", "draw", "parts", "sampled"]
+
+TITLE = "points of entry drawn by the paper's flow and by patches, beside uniform ones"
+SECONDS = {"draft": 12, "paper": 600}  # CPU time of the object, and of the flow
+POINTS = {"draft": 512, "paper": 2048}
+RESOLUTION = {"draft": 64, "paper": 192}  # of the candle
+SHOWN = 6000  # barycentres behind the points
+TOWARDS = {"bunny": (0.1, 0.25, 1.0), "candle": (0.1, 0.8, 1.0)}  # where the eye stands, and near what the exit lies
+
+
+def parts(quality: str) -> list[Part]:
+    """The points of each object."""
+    seconds = SECONDS[quality]
+    common = {"seconds": seconds, "points": POINTS[quality], "resolution": RESOLUTION[quality], "seed": 0}
+    return [
+        Part(name, sampled, {"object": name, "towards": list(TOWARDS[name]), **common}, seconds, inputs=(BUNNY,))
+        for name in SHAPES
+    ]
+
+
+def sampled(task: Task) -> dict[str, Any]:
+    """Points in the object's frame over its radius, and their RMSD to the nearest barycentre."""
+    from full_geometry.identity import frame_of
+    from full_geometry.learning.training import train_by_cpu
+    from full_geometry.paper.flow import fit_space_flow, mesh_arrays, on_surface, rmsd
+    from full_geometry.subject import Subject
+
+    prepare()
+    p, n = task.params, task.params["points"]
+    subject = Subject.of(*shape_of(p["object"], task.folder, p["resolution"], p["seed"]))
+    learnt, _ = train_by_cpu(subject, p["seconds"], task.folder, seed=p["seed"])
+    task.progress(1, 3)
+    frame = frame_of(subject)
+    flow = fit_space_flow(learnt.model, frame, p["seconds"], p["seed"])
+    task.progress(2, 3)
+    vertices, faces = mesh_arrays(subject, frame)
+    exit = _exit(subject, p["towards"])
+    in_space = flow.sample(exit, n, p["seed"])[0]
+    rng = np.random.default_rng(p["seed"])
+    found = {
+        "uniform": _positions(frame, subject.random_points(_lanes(n, 41)).p),
+        "flow in space": in_space,
+        "flow on the surface": on_surface(in_space, vertices, faces, p["seed"]),
+        "patches": _positions(frame, _by_patches(learnt, exit, n)),
+    }
+    shown = vertices[faces].mean(axis=1)[rng.permutation(len(faces))[:SHOWN]]
+    return {
+        "points": {name: np.round(points, 5).tolist() for name, points in found.items()},
+        "rmsd": {name: rmsd(points, vertices, faces) for name, points in found.items()},
+        "mesh": np.round(shown, 4).tolist(),
+        "exit": _positions(frame, exit.p)[0].tolist(),
+        "seconds": p["seconds"],
+    }
+
+
+def _lanes(n: int, seed: int) -> Any:
+    import mitsuba as mi
+
+    from halfspace_sss.tracing.walk import _generator, pass_seed
+
+    return _generator(mi, n, pass_seed(seed))
+
+
+def _exit(subject: Any, towards: list[float]) -> Any:
+    """The point of the surface that lies farthest towards the eye among those that face it, seen along its normal."""
+    import drjit as dr
+    import mitsuba as mi
+
+    points = subject.random_points(_lanes(4096, 40))
+    eye = np.array(towards) / np.linalg.norm(towards)
+    faces_it = eye @ np.array(points.n) > 0.8
+    k = int(np.argmax(np.where(faces_it, eye @ np.array(points.p), -np.inf)))
+    at = points.gather(dr.full(mi.UInt32, k, 1))
+    return at._replace(w=mi.Vector3f(at.n_out))
+
+
+def _by_patches(learnt: Any, exit: Any, n: int) -> Any:
+    import drjit as dr
+    import mitsuba as mi
+
+    from full_geometry.features import Side
+    from full_geometry.first_event import first_event
+
+    rng = _lanes(n, 42)
+    at = exit.gather(dr.zeros(mi.UInt32, n))
+    weights = learnt.sampler.prepare(Side(at, first_event(learnt.model.subject, at)))
+    u = (rng.next_float32(), rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32()))
+    return learnt.sampler.sample(weights, *u)[0].p
+
+
+def _positions(frame: Any, p: Any) -> np.ndarray:
+    return np.array(frame.position(p), dtype=float).T
+
+
+def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
+    """The figure as PDF and PNG, and the distances as a table."""
+    import pandas
+    from matplotlib.figure import Figure
+
+    with paper():
+        names = list(next(iter(results.values())).numbers["points"])
+        figure = Figure(figsize=(TEXT, 0.31 * TEXT * len(results)))
+        axes = figure.subplots(len(results), len(names), squeeze=False)
+        for row, (name, result) in zip(axes, results.items()):
+            for ax, kind in zip(row, names):
+                _draw_points(ax, result.numbers, kind, TOWARDS[name])
+                ax.set_title(f"{kind}\nRMSD {result.numbers['rmsd'][kind]:.4f}")
+            row[0].set_ylabel(name)
+        figure.tight_layout(pad=0.3)
+        files: dict[str, bytes | str] = {f"fig03.{end}": data for end, data in saved(figure).items()}
+    rows = [
+        {"object": name, "points": kind, "rmsd over the radius": value, "CPU seconds": result.numbers["seconds"]}
+        for name, result in results.items()
+        for kind, value in result.numbers["rmsd"].items()
+    ]
+    files["fig03.csv"] = pandas.DataFrame(rows).to_csv(index=False, lineterminator="\n")
+    return files
+
+
+def _draw_points(ax: Any, numbers: Mapping[str, Any], kind: str, towards: tuple[float, float, float]) -> None:
+    """The mesh in grey, points as the eye sees them, those on the far side paler, and the exit."""
+    eye = np.array(towards) / np.linalg.norm(towards)
+    right = np.cross([0, 1, 0], eye)
+    right /= np.linalg.norm(right)
+    axes = np.stack([right, np.cross(eye, right), eye])
+    mesh, points, exit = (np.array(v) @ axes.T for v in (numbers["mesh"], numbers["points"][kind], [numbers["exit"]]))
+    ax.scatter(*mesh.T[:2], s=0.6, c="#d5d5d5", linewidths=0, rasterized=True)
+    ax.scatter(*points.T[:2], s=3, c="#0072B2", alpha=0.6, linewidths=0, rasterized=True)
+    ax.scatter(*exit.T[:2], s=30, c="#D55E00", marker="*", linewidths=0, zorder=5)
+    low, high = mesh.min(axis=0), mesh.max(axis=0)
+    ax.set(xlim=(low[0] - 0.1, high[0] + 0.1), ylim=(low[1] - 0.1, high[1] + 0.1), aspect="equal", xticks=[], yticks=[])
+    for side in ax.spines.values():
+        side.set_visible(False)

@@ -1,0 +1,120 @@
+"""Fig. 8: error against the number N of incident samples, the paper's network and ours."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from figures.computing.learnt_objects import shape_of
+from figures.computing.scenes import BUNNY, prepare
+from figures.drawing.style import COLUMN, paper, saved
+from figures.parts.part import Part, Result, Task
+
+__all__ = ["TITLE", "draw", "ours", "papers", "parts", "truth_of"]
+
+TITLE = "error against the number of incident samples, the paper's network and ours"
+SECONDS = {"draft": 12, "paper": 600}  # CPU time of each training
+NUMBERS = {"draft": (1, 4, 16, 64), "paper": (1, 2, 4, 8, 16, 32, 64, 128)}
+TRUTH = {"draft": (96, 512), "paper": (256, 8192)}  # exits, and walks of each
+OURS = "full_geometry"
+LOOKS = {
+    OURS: ("#C00000", "-", "o"), "paper, points of walks": ("#0072B2", "-", "s"),
+    "paper, uniform points": ("#0072B2", (0, (2, 1.4)), "^"),
+}  # fmt: skip
+
+
+def parts(quality: str) -> list[Part]:
+    """Ours for all N, and a training of the paper's network for each N."""
+    seconds, (exits, walks) = SECONDS[quality], TRUTH[quality]
+    common = {"seconds": seconds, "exits": exits, "walks": walks, "seed": 0}
+    found = [Part(OURS, ours, {"numbers": list(NUMBERS[quality]), **common}, seconds, inputs=(BUNNY,))]
+    for n in NUMBERS[quality]:
+        found.append(Part(f"paper, N = {n}", papers, {"n": n, **common}, seconds, inputs=(BUNNY,)))
+    return found
+
+
+def truth_of(subject: Any, p: Mapping[str, Any]) -> Any:
+    """Exits and their radiance."""
+    from full_geometry.learning.model_errors import reference
+
+    return reference(subject, p["exits"], p["walks"], p["seed"])
+
+
+def _rmse(found: Any, truth: Any, per_estimate: float) -> dict[str, float]:
+    """Relative RMSE of one estimate, its noise included and that of the truth taken out, mean over channels.
+
+    Args:
+        found: estimates of the exits.
+        truth: from walks.
+        per_estimate: variance of one estimate over that of their mean.
+    """
+    values = {}
+    for light, columns in (("constant", slice(0, 1)), ("lobes", slice(1, None))):
+        a, b = found.mean[..., columns], truth.truth.mean[..., columns]
+        spread = found.variance[..., columns]
+        square = (a - b) ** 2 - spread - truth.truth.variance[..., columns] + per_estimate * spread
+        ratio = square.mean(axis=1) / np.maximum(b.mean(axis=1), 1e-30) ** 2
+        values[light] = float(np.sqrt(np.maximum(ratio.mean(axis=1), 0)).mean())
+    return values
+
+
+def ours(task: Task) -> dict[str, Any]:
+    """Errors of `full_geometry` with N entries by patches."""
+    from full_geometry.half_space import HalfSpace
+    from full_geometry.learning.model_errors import modelled
+    from full_geometry.learning.pairs import Proposals
+    from full_geometry.learning.training import train_by_cpu
+    from full_geometry.rivals.errors import BACKBONE
+    from full_geometry.subject import Subject
+
+    prepare()
+    p = task.params
+    subject = Subject.of(*shape_of("bunny", task.folder))
+    learnt, _ = train_by_cpu(subject, p["seconds"], task.folder, seed=p["seed"])
+    truth = truth_of(subject, p)
+    proposals = Proposals(subject, HalfSpace(subject, BACKBONE)).with_patches(learnt.sampler)
+    found = modelled(learnt.model, proposals, truth.exits, p["walks"], p["seed"])
+    rows = [{"method": OURS, "N": n, **_rmse(found, truth, p["walks"] / n)} for n in p["numbers"]]
+    return {"rows": rows}
+
+
+def papers(task: Task) -> dict[str, Any]:
+    """Errors of the paper's network for one N, its points from walks and uniform."""
+    from full_geometry.paper.errors import estimate
+    from full_geometry.paper.network import PaperRecipe, fit_paper
+    from full_geometry.subject import Subject
+
+    prepare()
+    p, repeats = task.params, 8
+    subject = Subject.of(*shape_of("bunny", task.folder))
+    truth = truth_of(subject, p)
+    net, steps = fit_paper(subject, PaperRecipe(n=p["n"], seconds=p["seconds"]), p["seed"])
+    rows = []
+    for points, name in (("walks", "paper, points of walks"), ("uniform", "paper, uniform points")):
+        found = estimate(subject, net, truth.exits, points, repeats, p["seed"])
+        rows.append({"method": name, "N": p["n"], **_rmse(found, truth, repeats)})
+    return {"rows": rows, "steps": steps}
+
+
+def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
+    """The figure as PDF and PNG, and the numbers as a table."""
+    import pandas
+    from matplotlib.figure import Figure
+
+    table = pandas.DataFrame([row for result in results.values() for row in result.numbers["rows"]])
+    with paper():
+        figure = Figure(figsize=(2 * COLUMN, 0.75 * COLUMN))
+        for ax, light in zip(figure.subplots(1, 2, sharey=True), ("constant", "lobes")):
+            for name, (color, dash, marker) in LOOKS.items():
+                rows = table[table["method"] == name].sort_values("N")
+                ax.plot(rows["N"], rows[light], color=color, ls=dash, marker=marker, ms=3, lw=1, label=name)
+            ax.set(xscale="log", yscale="log", xlabel="incident samples N", title=f"{light} light")
+            ax.grid(True, which="both", lw=0.3, color="#dddddd")
+        figure.axes[0].set_ylabel("relative RMSE of one estimate")
+        figure.axes[1].legend(frameon=False)
+        figure.tight_layout(pad=0.4)
+        files: dict[str, bytes | str] = {f"fig08.{end}": data for end, data in saved(figure).items()}
+    files["fig08.csv"] = table.to_csv(index=False, lineterminator="\n")
+    return files

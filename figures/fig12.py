@@ -1,0 +1,115 @@
+"""Fig. 12: one sample a pixel with and without sampling that has learnt, against the converged image."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from figures.computing.learnt_objects import known_weights, shape_of
+from figures.computing.scenes import BUNNY, bunny_scene, prepare
+from figures.drawing.image_grid import image_grid
+from figures.drawing.page import page
+from figures.drawing.shot import Shot, compared
+from figures.drawing.style import paper, saved
+from figures.parts.part import Part, Result, Task
+
+__all__ = ["SAMPLERS", "TITLE", "draw", "parts", "rendered"]
+
+TITLE = "one sample a pixel, with and without sampling that has learnt"
+SIZES = {"draft": 128, "paper": 512}
+SECONDS = {"draft": 15, "paper": 600}  # CPU time of the training, and of the flow
+REFERENCE_SPP = {"draft": 256, "paper": 16384}
+LIGHTS = ("even sky", "small light")
+SAMPLERS = ("probes", "patches", "flow")
+ENTRIES = (1, 8)  # points of entry of an exit
+SPP_PER_PASS = 64
+NOTES = (
+    "The same network in all images, one path a pixel; what differs is where points of entry are drawn: probes that "
+    "follow the half-space, learnt weights of patches, a flow inside patches. Of N entries of an exit one is followed. "
+    "FLIP and relative squared error against many samples by patches."
+)
+
+
+def parts(quality: str) -> list[Part]:
+    """All images of each light; the training is done once for each."""
+    size, seconds = SIZES[quality], SECONDS[quality]
+    params = {"size": size, "seconds": seconds, "spp": REFERENCE_SPP[quality], "seed": 0, "lights": list(LIGHTS)}
+    return [Part("bunny", rendered, params, seconds + REFERENCE_SPP[quality] * size**2 * 1e-6, inputs=(BUNNY,))]
+
+
+def rendered(task: Task) -> dict[str, Any]:
+    """The images of all samplers and numbers of entries under all lights, and the converged ones."""
+    prepare()
+    p, found, done = task.params, {}, 0
+    folders = _weights(task)
+    total = len(p["lights"]) * (1 + len(SAMPLERS) * len(ENTRIES))
+    for light in p["lights"]:
+        passes = max(p["spp"] // SPP_PER_PASS, 1)
+        images = [_image(folders["patches"], p, light, 1, SPP_PER_PASS, 100 + k) for k in range(passes)]
+        found[f"{light}, converged"] = np.mean(images, axis=0).astype(np.float32)
+        for sampler in SAMPLERS:
+            for n in ENTRIES:
+                found[f"{light}, {sampler}, {n}"] = _image(folders[sampler], p, light, n, 1, 7)
+                done += 1
+                task.progress(done, total)
+    return found
+
+
+def _weights(task: Task) -> dict[str, Path]:
+    """A folder of weights for each sampler: of one training, without patches, with them, and with a flow beside."""
+    from full_geometry.flow.training import FlowRecipe, fit_flow
+    from full_geometry.learning.training import train_by_cpu
+    from full_geometry.storing import CENTRES, KIND, add_flow
+    from full_geometry.subject import Subject
+    from halfspace_sss.neural.store import load_weights, save_weights
+
+    p, folders = task.params, {name: task.folder / name for name in SAMPLERS}
+    subject = Subject.of(*shape_of("bunny", task.folder))
+    learnt, path = train_by_cpu(subject, p["seconds"], folders["patches"], seed=p["seed"])
+    arrays, record = load_weights(path, KIND)
+    save_weights(folders["flow"] / path.name, KIND, arrays, record)
+    add_flow(folders["flow"] / path.name, fit_flow(learnt, FlowRecipe(seconds=p["seconds"]), seed=p["seed"]))
+    of_patches = {CENTRES} | {name for name in arrays if name.startswith(("V_", "c_"))}
+    bare = {name: value for name, value in arrays.items() if name not in of_patches}
+    save_weights(folders["probes"] / path.name, KIND, bare, record)
+    return folders
+
+
+def _image(folder: Path, p: Mapping[str, Any], light: str, entries: int, spp: int, seed: int) -> np.ndarray:
+    import mitsuba as mi
+
+    from halfspace_sss.rendering.scenes.scene_files import load_scene
+
+    description = bunny_scene("potato", p["size"], light)
+    description["integrator"]["entries"] = entries
+    description["bunny"]["bsdf"]["orders"] = "multiple"
+    with known_weights(folder):
+        scene = load_scene(description, "full_geometry")
+        return np.array(mi.render(scene, spp=spp, seed=seed), dtype=np.float32)
+
+
+def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
+    """The figure as PDF and PNG, the page to flip between the images, and the numbers as a table."""
+    import pandas
+
+    images, scenes, rows = results["bunny"].images, {}, []
+    for light in LIGHTS:
+        reference = images[f"{light}, converged"]
+        mask = reference.max(axis=2) > 0
+        gain = np.float32(2.0 ** np.round(-np.log2(np.percentile(reference[mask], 97)), 1))
+        shots = [Shot("Converged", gain * reference, {})]
+        for n in ENTRIES:
+            for sampler in SAMPLERS:
+                image = images[f"{light}, {sampler}, {n}"]
+                label = f"{sampler.capitalize()}, N = {n}"
+                shots.append(compared(label, gain * image, gain * reference, mask=mask, numbers={}))
+                rows.append({"light": light, "sampler": sampler, "N": n, **shots[-1].numbers})
+        scenes[light] = shots
+    with paper():
+        files: dict[str, bytes | str] = {f"fig12.{end}": data for end, data in saved(image_grid(scenes)).items()}
+    files["fig12.csv"] = pandas.DataFrame(rows).to_csv(index=False, lineterminator="\n")
+    files["fig12.html"] = page("Fig. 12: one sample a pixel", scenes, notes=NOTES)
+    return files

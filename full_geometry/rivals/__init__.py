@@ -1,0 +1,1 @@
+"""Rivals at equal time: ways of drawing entries, and models of one object."""

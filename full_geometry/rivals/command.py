@@ -1,0 +1,100 @@
+"""The command `halfspace-sss rivals`: tables of samplers and of models for one object, at equal time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from halfspace_sss.checks import check_choice, check_count, check_interval
+from halfspace_sss.cli.shared import Bar, Define, Variant, console, defined, use_mitsuba, whole
+from halfspace_sss.provenance import check_folder, write_together
+
+if TYPE_CHECKING:
+    import pandas
+
+__all__ = ["TABLES", "rivals_command"]
+
+TABLES = ("errors", "samplers")
+
+
+def rivals_command(
+    scene: Annotated[Path, typer.Option(help="Mitsuba XML file with the object.")],
+    object: Annotated[
+        str | None, typer.Option(help="Its id in the scene.", show_default="the only translucent one")
+    ] = None,
+    table: Annotated[
+        list[str] | None, typer.Option(help="errors or samplers; repeat for both.", show_default="both")
+    ] = None,
+    seconds: Annotated[float, typer.Option(help="CPU time of each training, data included.")] = 60.0,
+    samples: Annotated[int, typer.Option(help="Of each exit, for errors and variances.", parser=whole)] = 2048,
+    seed: Annotated[int, typer.Option(help="Seed of everything.", parser=whole)] = 0,
+    define: Define = None,
+    variant: Variant = "llvm_ad_rgb",
+    out: Annotated[Path, typer.Option(help="Folder for the files; those of the same names are replaced.")] = Path(
+        "rivals"
+    ),
+) -> None:
+    """Compare ways of drawing entries by variance x time, and models of an object by errors, at equal CPU time."""
+    chosen = table or list(TABLES)
+    for name in chosen:
+        check_choice("table", name, TABLES)
+    check_interval("seconds", seconds, 0.1, 1e6)
+    for key, value, least in (("samples", samples, 2), ("seed", seed, 0)):
+        check_count(key, value, least)
+    parameters = defined(define)
+    check_folder(out)
+    use_mitsuba(variant)
+    from halfspace_sss.rendering.scenes.scene_files import load_objects
+
+    loaded, files = load_objects(scene, parameters), {}
+    for name in chosen:
+        with Bar(name) as bar:
+            found = _made(name, loaded, object, seconds, samples, seed, bar)
+        files[out / f"{name}.csv"] = found.to_csv(index=False, lineterminator="\n")
+        files[out / f"{name}.md"] = markdown(_errors_wide(found) if name == "errors" else found)
+    write_together(files)
+    for path, text in files.items():
+        if path.suffix == ".md":
+            console().print(text, highlight=False, markup=False, soft_wrap=True)
+        console().print(f"  {path}", highlight=False, markup=False, soft_wrap=True)
+
+
+def _made(
+    table: str, scene: Any, name: str | None, seconds: float, samples: int, seed: int, bar: Bar
+) -> pandas.DataFrame:
+    from tempfile import TemporaryDirectory
+
+    from full_geometry.flow.training import FlowRecipe
+    from full_geometry.learning.training import train_by_cpu
+    from full_geometry.rivals.errors import error_table
+    from full_geometry.rivals.samplers import sampler_table
+    from full_geometry.subject import Subject
+
+    def show(what: str, done: int, total: int) -> None:
+        bar.show(done, total, what)
+
+    if table == "errors":
+        return error_table(scene, name, seconds=seconds, walks=samples, samples=samples, seed=seed, progress=show)
+    with TemporaryDirectory() as folder:
+        learnt, _ = train_by_cpu(Subject.given(scene, None, None, name), seconds, folder, seed=seed)
+    return sampler_table(learnt, FlowRecipe(seconds=0.5 * seconds), samples=samples, seed=seed, progress=show)
+
+
+def _errors_wide(table: pandas.DataFrame) -> pandas.DataFrame:
+    """A row for each model, a column for each channel and light: error ± standard error, %."""
+    texts = table.assign(
+        what=[f"{light}, channel {channel}" for light, channel in zip(table["light"], table["channel"])],
+        text=[f"{100 * a:.2g} ± {100 * b:.1g}" for a, b in zip(table["error"], table["standard_error"])],
+    )
+    wide = texts.pivot(index="model", columns="what", values="text")
+    return wide.loc[list(dict.fromkeys(table["model"])), list(dict.fromkeys(texts["what"]))].reset_index()
+
+
+def markdown(table: pandas.DataFrame) -> str:
+    """The table for a page."""
+    rows = [[f"{v:.3g}" if isinstance(v, float) else str(v) for v in row] for row in table.itertuples(index=False)]
+    kinds = ["---:" if table[key].dtype.kind == "f" else "---" for key in table]
+    lines = [list(map(str, table.columns)), kinds, *rows]
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)

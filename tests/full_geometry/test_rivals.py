@@ -1,0 +1,150 @@
+"""S = alpha p, the paper's network and flow, and the tables of rivals: norms, inputs, stops, places.
+
+Estimates are held against each other within four standard errors, with fixed seeds.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from halfspace_sss import Medium
+
+mi = pytest.importorskip("mitsuba")
+dr = pytest.importorskip("drjit")
+torch = pytest.importorskip("torch")
+pytest.importorskip("zuko")
+pytest.importorskip("igl")
+
+from full_geometry.alpha_p.model import AlphaP  # noqa: E402
+from full_geometry.alpha_p.training import fit_alpha_p  # noqa: E402
+from full_geometry.features import n_side  # noqa: E402
+from full_geometry.flow.chart import Chart  # noqa: E402
+from full_geometry.flow.conditional import ConditionalFlow  # noqa: E402
+from full_geometry.flow.context import N_CONTEXT  # noqa: E402
+from full_geometry.flow.fitting import FlowNetwork  # noqa: E402
+from full_geometry.flow.lights import LIGHTINGS, lighting  # noqa: E402
+from full_geometry.flow.sampler import FlowSampler  # noqa: E402
+from full_geometry.flow.training import FlowRecipe  # noqa: E402
+from full_geometry.identity import frame_of  # noqa: E402
+from full_geometry.learning.model_errors import reference  # noqa: E402
+from full_geometry.paper import network as paper  # noqa: E402
+from full_geometry.paper.errors import paper_errors  # noqa: E402
+from full_geometry.paper.flow import mesh_arrays, on_surface, rmsd  # noqa: E402
+from full_geometry.paper.lights import measured_lights, random_lights  # noqa: E402
+from full_geometry.patches import Patches, PatchSampler, cluster  # noqa: E402
+from full_geometry.subject import Subject  # noqa: E402
+from halfspace_sss.rendering.transport.protocols import Entry  # noqa: E402
+from halfspace_sss.tracing.walk import _generator, pass_seed  # noqa: E402
+
+BUNNY = Path(__file__).parents[2] / "figures" / "assets" / "bunny.ply"
+WAX = Medium(np.array([0.95, 0.8, 0.6]), np.array([0.05, 0.2, 0.4]), 0.0, 1.4)
+N_PATCHES = 24
+
+
+@pytest.fixture(autouse=True)
+def variant() -> None:
+    mi.set_variant("llvm_ad_rgb")
+
+
+@pytest.fixture(scope="module")
+def subject() -> Subject:
+    mi.set_variant("llvm_ad_rgb")
+    return Subject.of(mi.load_dict({"type": "ply", "filename": str(BUNNY)}), WAX)
+
+
+@pytest.fixture(scope="module")
+def shaken(subject: Subject) -> AlphaP:
+    """S = alpha p with random numbers: what it integrates to holds for any."""
+    frame, rng, n = frame_of(subject), np.random.default_rng(5), n_side(3)
+    patches = Patches(subject, frame, cluster(subject, frame, N_PATCHES))
+
+    def layers(W: str, b: str, sizes: list[int]) -> dict[str, np.ndarray]:
+        found = {}
+        for k, (i, j) in enumerate(zip(sizes, sizes[1:])):
+            found |= {f"{W}_{k}": rng.standard_normal((j, i)) / np.sqrt(i), f"{b}_{k}": 0.3 * rng.standard_normal(j)}
+        return found
+
+    net = FlowNetwork(4, N_CONTEXT, (16,), 1)
+    with torch.no_grad():
+        net.transform.hyper[-1].bias.copy_(torch.randn(92, generator=torch.Generator().manual_seed(2)))
+    points = PatchSampler(frame, patches, layers("V", "c", [n, 16, N_PATCHES]))
+    sampler = FlowSampler(points, Chart(subject, frame, patches), ConditionalFlow(4, net.arrays()))
+    weights = {**layers("A", "a", [n, 8, 1]), **layers("P", "p", [2 * n + N_CONTEXT, 8, 3])}
+    return AlphaP(subject, sampler, weights, (0.5, 0.3, 0.1))
+
+
+def test_alpha_is_the_light_that_comes_back_from_everywhere(subject: Subject, shaken: AlphaP) -> None:
+    n = 2**17
+    exit = subject.random_points(_generator(mi, 1, pass_seed(4))).gather(dr.zeros(mi.UInt32, n))
+    entries = subject.random_points(_generator(mi, n, pass_seed(5)))
+    prepared = shaken.prepare(exit)
+    S = np.array(shaken.S(prepared, entries), dtype=float) / np.array(shaken.scale)[:, None]
+    values = S.mean(axis=0) * np.pi * subject.found.area
+    alpha = np.array(prepared.alpha)[0]
+    assert abs(values.mean() - alpha) < 4 * values.std() / np.sqrt(n)
+    assert values.std() / np.sqrt(n) < 0.05 * alpha
+
+
+def test_a_little_training_brings_alpha_to_the_truth(subject: Subject) -> None:
+    model = fit_alpha_p(subject, FlowRecipe(seconds=3.0, chunk=2**13, batch=512))
+    truth = reference(subject, 64, 512)
+    alpha = np.array(model.prepare(truth.exits).alpha)
+    wanted = (truth.truth.mean[:, :, 0] / np.array(model.scale)[:, None]).mean(axis=0)
+    assert np.corrcoef(alpha, wanted)[0, 1] > 0.5
+    assert abs(alpha.mean() / wanted.mean() - 1) < 0.15
+
+
+def test_the_papers_network_takes_5_and_8_for_each_sample() -> None:
+    net = paper.PaperNetwork(7)
+    linear = [m for m in net.layers if isinstance(m, torch.nn.Linear)]
+    assert linear[0].in_features == 5 + 8 * 7 and [m.out_features for m in linear] == [256, 256, 256, 3]
+
+
+def test_the_papers_network_learns_from_walks(subject: Subject) -> None:
+    truth = reference(subject, 64, 512)
+    recipe = paper.PaperRecipe(n=8, seconds=4.0, batch=128, exits=512, reuse=8)
+    net, steps = paper.fit_paper(subject, recipe)
+    fresh = paper_errors(subject, paper.PaperNetwork(8), truth, repeats=4)
+    assert steps > 10
+    assert np.mean([e.error for e in paper_errors(subject, net, truth, repeats=4)]) < np.mean([e.error for e in fresh])
+
+
+def test_the_papers_training_stops_where_the_error_has_stayed_small(
+    subject: Subject, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(paper, "_step", lambda *a: 0.5 * paper.ENOUGH)
+    assert paper.fit_paper(subject, paper.PaperRecipe(n=2, exits=256, batch=32, reuse=64))[1] == paper.FOR_STEPS
+
+
+def test_lights_scale_with_their_factor_and_lobes_look_along_their_axes() -> None:
+    w = np.random.default_rng(0).standard_normal((4, 6, 3))
+    w /= np.linalg.norm(w, axis=2, keepdims=True)
+    constant, lobe = measured_lights(4, 3)[:2]
+    assert np.allclose(constant(w), 1)
+    assert np.allclose(lobe(np.ones((4, 1, 3)) / np.sqrt(3)), 1)
+    assert np.all(random_lights(4, 3, np.random.default_rng(1))(w) >= 0)
+
+
+def test_points_are_laid_onto_the_nearest_triangle(subject: Subject) -> None:
+    vertices, faces = mesh_arrays(subject, frame_of(subject))
+    centres = vertices[faces].mean(axis=1)
+    chosen = np.random.default_rng(3).choice(len(faces), 200, replace=False)
+    normals = np.cross(vertices[faces[chosen, 1]] - centres[chosen], vertices[faces[chosen, 2]] - centres[chosen])
+    away = centres[chosen] + 1e-4 * normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    laid = on_surface(away, vertices, faces)
+    d = np.sum((laid - centres[chosen]) * normals, axis=1) / np.linalg.norm(normals, axis=1)
+    assert np.abs(d).max() < 1e-9
+    assert rmsd(centres, vertices, faces) < 1e-12 < 1e-5 < rmsd(away, vertices, faces)
+
+
+@pytest.mark.parametrize("kind", LIGHTINGS)
+def test_no_light_comes_from_below_the_surface(subject: Subject, kind: str) -> None:
+    at = subject.random_points(_generator(mi, 4096, pass_seed(6)))
+    n = mi.Normal3f(at.n * subject.found.sign)
+    entry = Entry(at.p, n, at.n_out, mi.Float(1), dr.zeros(mi.UInt32, 4096))
+    w, value = lighting(kind, subject).sample(entry, mi.Point2f(0.3, 0.6), mi.Bool(True))
+    value, mu = np.array(value), np.array(dr.dot(w, at.n_out))
+    assert np.all(value[mu <= 0] == 0) and np.all(value >= 0) and (value > 0).mean() > 0.1
