@@ -79,7 +79,7 @@ def learnt_means(found: Object, inside: Inside, media: list[Medium], settings: S
         ValueError: the object was not trained or cannot be, or weights are damaged.
     """
     check_surface(found.shape.id(), found.shape.bsdf())
-    subject = Subject.surveyed(found, tuple(media))
+    subject = Subject.surveyed(found, tuple(media), inside.varying, settings.mm_per_unit)
     model, sampler = load(find_weights(subject), subject)
     warn_of_unscattered(subject)
     transport = LearntTransport(model, found.sign)
