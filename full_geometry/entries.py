@@ -15,7 +15,7 @@ from halfspace_sss.rendering.transport.protocols import Entry
 
 __all__ = ["AREA_SHARE", "LearntProposals"]
 
-AREA_SHARE = 0.4  # of the entries without patches that are uniform over the area
+AREA_SHARE = 0.75  # of the candidates for entries without patches that are uniform over the area
 
 
 class _Prepared(NamedTuple):

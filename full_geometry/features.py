@@ -57,9 +57,9 @@ class Frame:
         return mi.Vector3f(w) if self.turn is None else mi.Vector3f(*(dr.dot(row, w) for row in self.turn))
 
 
-def n_side(channels: int) -> int:
-    """Number of features of a side."""
-    return 2 * 3 * (1 + 2 * OCTAVES) + 3 + 3 + 2 + channels
+def n_side(channels: int, local: int = 0) -> int:
+    """Number of features of a side, of which twice `local` are what varies where light enters and at y."""
+    return 2 * 3 * (1 + 2 * OCTAVES) + 3 + 3 + 2 + channels + 2 * local
 
 
 def _octaves(x: Any) -> list[Any]:
@@ -73,7 +73,7 @@ def _octaves(x: Any) -> list[Any]:
 
 
 def side_features(frame: Frame, side: Side) -> list[Any]:
-    """Position and y with two octaves of sine and cosine, normal, w, mu, log of the way to y, log P."""
+    """Position and y with two octaves of sine and cosine, normal, w, mu, log of the way to y, log P, what varies."""
     import drjit as dr
 
     at, event = side
@@ -81,7 +81,7 @@ def side_features(frame: Frame, side: Side) -> list[Any]:
     way = dr.log(event.length * frame.sigma_t + LEAST_LENGTH)
     return [
         *_octaves(frame.position(at.p)), *_octaves(frame.position(event.y)), *n, *w, dr.dot(n, w), 0.5 * way,
-        *(0.5 * dr.log(P + LEAST_P) for P in event.P),
+        *(0.5 * dr.log(P + LEAST_P) for P in event.P), *event.local,
     ]  # fmt: skip
 
 
@@ -102,9 +102,8 @@ def pair_features(frame: Frame, exit: Side, entry: Side) -> list[Any]:
     ]  # fmt: skip
 
 
-def reverse(channels: int) -> tuple[np.ndarray, np.ndarray]:
-    """Order and signs that turn the features of (exit, entry, pair) into those of the way back."""
-    n = n_side(channels)
+def reverse(n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Order and signs that turn the features of (exit, entry, pair), n of each side, into those of the way back."""
     pair = np.array([0, 1, 2, 3, 4, 5, 6, 7, 8, 10, 9, 12, 11, 14, 13])
     signs = np.ones(2 * n + N_PAIR, dtype=np.float32)
     signs[2 * n + np.array([0, 1, 2, 9, 10, 11, 12])] = -1

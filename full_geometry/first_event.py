@@ -21,14 +21,60 @@ __all__ = ["REFLECTIONS", "FirstEvent", "first_event"]
 
 REFLECTIONS = 4
 NEGLIGIBLE = 1e-3  # weight of what is still inside
+CELLS, FIRST_CELL = 12, 0.25  # of a march; the first one in mean free paths
 
 
 class FirstEvent(NamedTuple):
-    """P per channel; y and the mean length of the way there, means over channels weighted by P."""
+    """P per channel; y and the mean length of the way there, means over channels weighted by P.
+
+    Of a medium that varies also `local`: logarithms of its coefficients where light enters and at y.
+    """
 
     P: Any
     y: Any
     length: Any
+    local: tuple[Any, ...] = ()
+
+
+def flight(subject: Subject, o: Any, d: Any, l: Any) -> tuple[Any, Any]:  # noqa: E741
+    """exp(-∫ sigma_t) over a length l from o along d, and ∫ s sigma_t exp(-∫ sigma_t) ds, per channel.
+
+    A medium that varies is marched in cells that grow from a part of a mean free path on, each homogeneous.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    def add(sigma_t: Any, T: Any, inner: Any, s: Any, h: Any) -> tuple[Any, Any]:
+        through = dr.exp(-sigma_t * h)
+        mean = (1 - through) / dr.maximum(sigma_t, 1e-20) - h * through
+        return T * through, inner + T * (mean + s * (1 - through))
+
+    T, inner = mi.Spectrum(1), mi.Spectrum(0)
+    if subject.varying is None:
+        return add(subject.sigma_t, T, inner, mi.Float(0), l)
+    h = dr.minimum(l / CELLS, FIRST_CELL / dr.max(subject.sigma_t))
+    growth = _growth(l / h)
+
+    def cell(k: Any, s: Any, h: Any, T: Any, inner: Any) -> tuple:
+        sigma_t = subject.walk_media.grids.sigma_t(mi.UInt32(0), o + d * (s + 0.5 * h))
+        T, inner = add(sigma_t, T, inner, s, h)
+        return k + 1, s + h, h * growth, T, inner
+
+    state = (mi.UInt32(0), mi.Float(0), h, T, inner)
+    return dr.while_loop(state, lambda k, *_: k < CELLS, cell, label="march")[3:]
+
+
+def _growth(ratio: Any) -> Any:
+    """q with 1 + q + ... + q^(CELLS-1) = ratio >= CELLS, by a few steps of Newton on its logarithm."""
+    import drjit as dr
+
+    x = dr.maximum(dr.log(ratio) / CELLS, 1e-3)
+    for _ in range(5):
+        top, bottom = dr.exp(CELLS * x) - 1, dr.exp(x) - 1
+        f = dr.log(top / bottom) - dr.log(ratio)
+        slope = CELLS * (top + 1) / top - (bottom + 1) / bottom
+        x = dr.maximum(x - f / slope, 1e-4)
+    return dr.exp(x)
 
 
 def first_event(subject: Subject, at: SurfacePoint, active: Any = True) -> FirstEvent:
@@ -45,9 +91,8 @@ def first_event(subject: Subject, at: SurfacePoint, active: Any = True) -> First
         P, moment, length = found
         si = subject.found.scene.ray_intersect(mi.Ray3f(o + d * skip, d), flags, False, active)
         l = dr.select(si.is_valid(), si.t + skip, 1e4 / dr.min(sigma_t))  # noqa: E741
-        through = dr.exp(-sigma_t * l)
-        part = v * (1 - through)
-        inner = v * ((1 - through) / sigma_t - l * through)
+        through, inner = flight(subject, o, d, l)
+        part, inner = v * (1 - through), v * inner
         moment = moment + (o * dr.mean(part) + d * dr.mean(inner))
         length = length + dr.mean(part) * way + dr.mean(inner)
         n = turned(si.sh_frame.n, si.n) * sign
@@ -65,4 +110,5 @@ def first_event(subject: Subject, at: SurfacePoint, active: Any = True) -> First
     )  # fmt: skip
     P, moment, length = dr.while_loop(state, lambda *s: s[-1], step, label="first event")[-2]
     total = dr.maximum(dr.mean(P), 1e-20)
-    return FirstEvent(P, dr.select(dr.mean(P) > 0, mi.Point3f(moment / total), at.p), length / total)
+    y = dr.select(dr.mean(P) > 0, mi.Point3f(moment / total), at.p)
+    return FirstEvent(P, y, length / total, (*subject.local(at.p), *subject.local(y)))

@@ -10,12 +10,14 @@ import numpy as np
 
 from full_geometry.features import Frame
 from full_geometry.subject import Subject
+from full_geometry.varying import check_same, digest_of_grids, probed
 from halfspace_sss.rendering.transport.plane import number
 
 __all__ = ["Identity", "frame_of", "identify"]
 
 ANCHORS = 256
 CLOSE = 1e-4  # positions over the size of the object, coefficients relative
+SAMPLED = 0.05  # of the homogeneous equivalent of a medium that varies, a mean over random points
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,17 +28,23 @@ class Identity:
         kind: class of the shape.
         topology: checksum of its faces, and whether it has normals of its own; empty for a shape without faces.
         anchors: points that move with the shape, (n, 3), scene units.
-        medium: per channel albedo, g and sigma_t sqrt(area), and eta.
+        medium: per channel albedo, g and sigma_t sqrt(area), and eta; of a medium that varies its equivalent.
+        grids: digest of the voxels of a medium that varies.
+        probes: coefficients of a medium that varies, see `varying.probed`.
     """
 
     kind: str
     topology: str
     anchors: np.ndarray
     medium: dict[str, Any]
+    grids: str = ""
+    probes: np.ndarray | None = None
 
     def digest(self) -> str:
         """A name for shape, its handedness and ratios of the medium, without sizes."""
-        ratios = [f"{v:.6g}" for key in ("albedo", "g", "eta") for v in np.atleast_1d(self.medium[key])]
+        keys = ("g", "eta") if self.grids else ("albedo", "g", "eta")  # an equivalent is known up to its sampling
+        ratios = [self.grids] * bool(self.grids)
+        ratios += [f"{v:.6g}" for key in keys for v in np.atleast_1d(self.medium[key])]
         return hashlib.sha256("|".join([self.kind, self.topology, self._hand(), *ratios]).encode()).hexdigest()[:12]
 
     def _hand(self) -> str:
@@ -47,8 +55,8 @@ class Identity:
         return "left" if turns < 0 else "right"
 
     def record(self) -> dict[str, Any]:
-        """Everything but the anchors, ready for JSON."""
-        return {"kind_of_shape": self.kind, "topology": self.topology, "medium": self.medium}
+        """Everything but the anchors and probes, ready for JSON."""
+        return {"kind_of_shape": self.kind, "topology": self.topology, "medium": self.medium, "grids": self.grids}
 
     def pose(self, other: Identity) -> tuple[np.ndarray, np.ndarray]:
         """R and t with R x + t = y for the points x of this object and y of the other, which is the same one moved.
@@ -56,9 +64,11 @@ class Identity:
         Raises:
             ValueError: it is another object; says in what.
         """
-        for key, mine, theirs in (("shape", self.kind, other.kind), ("mesh", self.topology, other.topology)):
+        pairs = ("kind", "shape", "without faces"), ("topology", "mesh", "without faces"), ("grids", "grids", "none")
+        for key, name, none in pairs:
+            mine, theirs = getattr(self, key), getattr(other, key)
             if mine != theirs:
-                raise ValueError(f"{key} must be {mine or 'without faces'}, as trained, got {theirs or 'none'}")
+                raise ValueError(f"{name} must be {mine or none}, as trained, got {theirs or 'none'}")
         R, t, miss = _kabsch(self.anchors.astype(float), other.anchors.astype(float))
         spread, others = (float(np.linalg.norm(np.std(v, axis=0))) for v in (self.anchors, other.anchors))
         if miss > CLOSE * spread:
@@ -68,8 +78,11 @@ class Identity:
             )
         for key, mine in self.medium.items():
             theirs = other.medium[key]
-            if np.shape(mine) != np.shape(theirs) or not np.allclose(mine, theirs, rtol=CLOSE, atol=1e-7):
+            close = SAMPLED if self.grids else CLOSE
+            if np.shape(mine) != np.shape(theirs) or not np.allclose(mine, theirs, rtol=close, atol=1e-7):
                 raise ValueError(f"{key} of the medium must be {mine}, as trained, got {theirs}")
+        if self.grids:
+            check_same(self.probes, other.probes)
         return R, t
 
 
@@ -107,7 +120,8 @@ def identify(subject: Subject) -> Identity:
     media = subject.media
     medium = {key: [float(getattr(m, key)) for m in media] for key in ("albedo", "g")}
     medium |= {"size_in_mfp": subject.mean_free_paths().tolist(), "eta": float(subject.eta)}
-    return Identity(shape.class_name(), topology, anchors.astype(np.float32), medium)
+    grids, probes = digest_of_grids(subject), probed(subject, anchors)
+    return Identity(shape.class_name(), topology, anchors.astype(np.float32), medium, grids, probes)
 
 
 def frame_of(subject: Subject, trained: Identity | None = None) -> Frame:

@@ -23,8 +23,6 @@ def check_surface(name: str, surface: Any) -> None:
 
     if surface.boundary.flags() & int(mi.BSDFFlags.Smooth):
         raise ValueError(f"the boundary of {name!r} must be smooth to be learnt, got a rough one")
-    if surface.inside.varying is not None:
-        raise ValueError(f"the medium of {name!r} must be the same everywhere to be learnt, got one that varies")
 
 
 def object_of(scene: Any, name: str | None) -> Any:

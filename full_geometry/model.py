@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from full_geometry.features import Frame, Side, n_side, pair_features, side_features
+from full_geometry.features import N_PAIR, Frame, Side, pair_features, side_features
 from full_geometry.first_event import first_event
 from full_geometry.half_space import HalfSpace
 from full_geometry.subject import Subject, SurfacePoint
@@ -56,7 +56,7 @@ class FullGeometry:
         import mitsuba as mi
         from drjit import nn
 
-        split = n_side(len(self.subject.media))
+        split = (self.weights["W_0"].shape[1] - N_PAIR) // 2
         layers = [(f"W_{k}", f"b_{k}") for k in range(self.depth)]
         matrices = [self.weights[W] for W, _ in layers]
         matrices = [matrices[0][:, :split], matrices[0][:, split:], *matrices[1:]]

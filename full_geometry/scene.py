@@ -64,7 +64,7 @@ def learnt_means(found: Object, inside: Inside, media: list[Medium], settings: S
         ValueError: the object was not trained or cannot be, or weights are damaged.
     """
     check_surface(found.shape.id(), found.shape.bsdf())
-    subject = Subject.surveyed(found, tuple(media))
+    subject = Subject.surveyed(found, tuple(media), inside.varying, settings.mm_per_unit)
     path = find_weights(subject)
     model, sampler, flow = load(path, subject)
     backbone = model.half_space.models

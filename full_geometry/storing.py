@@ -45,9 +45,10 @@ def weights_name(identity: Identity) -> str:
 def save(folder: str | os.PathLike, identity: Identity, arrays: dict[str, np.ndarray], record: dict[str, Any]) -> Path:
     """Write the weights of an object and their record; returns the path."""
     whole = {"orders": "multiple", **identity.record(), **record}
-    return save_weights(
-        Path(folder) / weights_name(identity), KIND, {**arrays, "anchors": identity.anchors.astype(np.float32)}, whole
-    )
+    bound = {"anchors": identity.anchors.astype(np.float32)}
+    if identity.grids:
+        bound["probes"] = identity.probes
+    return save_weights(Path(folder) / weights_name(identity), KIND, {**arrays, **bound}, whole)
 
 
 def find_weights(subject: Subject, folder: str | os.PathLike | None = None) -> Path:
@@ -75,8 +76,9 @@ def find_weights(subject: Subject, folder: str | os.PathLike | None = None) -> P
 def _trained(path: Path) -> tuple[Identity, dict[str, np.ndarray], dict[str, Any]]:
     arrays, record = load_weights(path, KIND)
     try:
-        anchors = arrays.pop("anchors")
-        identity = Identity(record["kind_of_shape"], record["topology"], anchors, dict(record["medium"]))
+        anchors, grids = arrays.pop("anchors"), record.get("grids", "")
+        probes = arrays.pop("probes") if grids else None
+        identity = Identity(record["kind_of_shape"], record["topology"], anchors, dict(record["medium"]), grids, probes)
         if {"albedo", "g", "eta", "size_in_mfp"} - set(identity.medium):
             raise KeyError("medium")
     except (KeyError, TypeError, ValueError) as error:
@@ -93,6 +95,7 @@ def load(path: str | os.PathLike, subject: Subject) -> Learnt:
     path = Path(path)
     identity, arrays, record = _trained(path)
     try:
+        subject = subject.as_trained(identity.medium)
         frame = frame_of(subject, identity)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,12 +14,15 @@ from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.scenes.scene_files import millimetres
 from halfspace_sss.rendering.surface.inside import Inside
 from halfspace_sss.rendering.surface.object import Object, survey, turned
+from halfspace_sss.rendering.surface.varying import VaryingMedium, equivalent, grid_values
 from halfspace_sss.rendering.transport.area_points import AreaPoints
 from halfspace_sss.rendering.transport.body import check_size
 from halfspace_sss.rendering.transport.plane import number
 from halfspace_sss.rendering.walk.media import WalkMedia
 
 __all__ = ["Subject", "SurfacePoint", "refract_in"]
+
+LEAST_RATIO = 1e-3  # in logarithms of what varies
 
 
 class SurfacePoint(NamedTuple):
@@ -46,12 +49,14 @@ class Subject:
         media: scalar medium of each channel of the variant, 1/(scene unit).
         boundary: its smooth dielectric.
         points: uniform points of its surface.
+        varying: how its medium varies in space, 1/(scene unit); `media` are then a homogeneous equivalent.
     """
 
     found: Object
     media: tuple[Medium, ...]
     boundary: Any
     points: AreaPoints
+    varying: VaryingMedium | None = None
 
     @classmethod
     def of(cls, shape: Any, medium: Medium, mm_per_unit: float = 1.0) -> Subject:
@@ -66,22 +71,19 @@ class Subject:
             ValueError: the medium has other channels than the variant, mm_per_unit is not a finite number > 0, or the
                 shape is an instance.
         """
-        import mitsuba as mi
-
-        if not (math.isfinite(mm_per_unit) and mm_per_unit > 0):
-            raise ValueError(f"mm_per_unit must be finite and > 0, got {mm_per_unit!r}")
-        if not isinstance(medium, Medium):
-            raise ValueError(f"medium must be a Medium, got {type(medium).__name__}")
-        n = len(mi.Spectrum(0))
-        if medium.n_channels not in (None, n):
-            raise ValueError(f"medium must have {n} channels under {mi.variant()}, got {medium.n_channels}")
-        scaled = medium.scaled(mm_per_unit)
-        media = tuple(scaled if medium.n_channels is None else scaled.channel(k) for k in range(n))
-        return cls.surveyed(survey(shape), media)
+        return cls.surveyed(survey(shape), _in_scene_units(medium, mm_per_unit))
 
     @classmethod
-    def surveyed(cls, found: Object, media: tuple[Medium, ...]) -> Subject:
+    def surveyed(
+        cls, found: Object, media: tuple[Medium, ...], varying: VaryingMedium | None = None, mm_per_unit: float = 1.0
+    ) -> Subject:
         """The object of a known geometry and the scalar medium of each channel, 1/(scene unit).
+
+        Args:
+            found: geometry.
+            media: of each channel; of a medium that varies the homogeneous equivalent.
+            varying: how the medium varies, 1/mm.
+            mm_per_unit: length of a scene unit, mm.
 
         Raises:
             ValueError: its normals point to both sides.
@@ -90,7 +92,9 @@ class Subject:
 
         check_geometry(found)
         boundary = mi.load_dict({"type": "dielectric", "int_ior": media[0].eta, "ext_ior": 1.0})
-        return cls(found, media, boundary, AreaPoints(found.shape))
+        if varying is not None:
+            varying = replace(varying, factor=varying.factor * mm_per_unit)
+        return cls(found, media, boundary, AreaPoints(found.shape), varying)
 
     @classmethod
     def given(
@@ -111,11 +115,24 @@ class Subject:
 
         if not isinstance(shape, mi.Scene):
             return cls.of(shape, medium, 1.0 if mm_per_unit is None else mm_per_unit)
-        found = object_of(shape, name)
+        found = survey(object_of(shape, name))
         unit = millimetres(shape) if mm_per_unit is None else mm_per_unit
-        subject = cls.of(found, found.bsdf().inside.medium, unit)
+        inside = equivalent(found.shape.bsdf().inside, found)
+        subject = cls.surveyed(found, _in_scene_units(inside.medium, unit), inside.varying, unit)
         check_size(subject.found, subject.media, unit)
         return subject
+
+    def as_trained(self, medium: dict[str, Any]) -> Subject:
+        """The same with the homogeneous equivalent of training, see `Identity`; itself where the medium is homogeneous.
+
+        Another equivalent, over the random points that the object has where it stands now, would be another S_0.
+        """
+        if self.varying is None or len(medium["albedo"]) != len(self.media):
+            return self
+        known = zip(medium["albedo"], medium["size_in_mfp"], medium["g"])
+        length = math.sqrt(self.found.area)
+        media = tuple(Medium.from_albedo(albedo, size / length, g, self.eta) for albedo, size, g in known)
+        return replace(self, media=media)
 
     @property
     def eta(self) -> float:
@@ -136,8 +153,35 @@ class Subject:
         if len(self.media) > 1:
             values = {key: np.array([getattr(m, key) for m in self.media]) for key in ("sigma_s", "sigma_a", "g")}
             medium = Medium(**values, eta=self.eta)
-        inside = Inside("medium", medium, "", "total", True)
+        inside = Inside("medium", medium, "", "total", True, self.varying)
         return WalkMedia([self.found], [inside], self.found.scene, [self.boundary], 1.0)
+
+    @functools.cached_property
+    def _local_channels(self) -> tuple[int, int]:
+        """Channels in which extinction and albedo vary in space."""
+        volumes = (None, None) if self.varying is None else (self.varying.density, self.varying.albedo_volume)
+        n_t, n_albedo = (0 if volume is None else grid_values(volume).shape[-1] for volume in volumes)
+        return n_t, n_albedo
+
+    @property
+    def n_local(self) -> int:
+        """Number of what `local` gives."""
+        return sum(self._local_channels)
+
+    def local(self, p: Any) -> tuple[Any, ...]:
+        """What varies, at the point p: log of sigma_t over its mean, and half the log of 1 - albedo."""
+        import drjit as dr
+        import mitsuba as mi
+
+        if self.varying is None:
+            return ()
+        n_t, n_albedo = self._local_channels
+        sigma_t, sigma_s = self.walk_media.grids.coefficients(mi.UInt32(0), p)
+        ratio, albedo = sigma_t / self.sigma_t, sigma_s / dr.maximum(sigma_t, 1e-20)
+        return (
+            *(dr.log(ratio[c] + LEAST_RATIO) for c in range(n_t)),
+            *(0.5 * dr.log(1 - albedo[c] + LEAST_RATIO) for c in range(n_albedo)),
+        )
 
     def random_points(self, rng: Any) -> SurfacePoint:
         """Points uniform over the area, directions by the cosine to the shading normal, one for each lane of rng."""
@@ -151,6 +195,21 @@ class Subject:
     def mean_free_paths(self) -> np.ndarray:
         """sigma_t sqrt(area) of each channel: the size of the object in mean free paths."""
         return np.array([float(m.sigma_t) for m in self.media]) * math.sqrt(self.found.area)
+
+
+def _in_scene_units(medium: Medium, mm_per_unit: float) -> tuple[Medium, ...]:
+    """The scalar medium of each channel, 1/(scene unit)."""
+    import mitsuba as mi
+
+    if not (math.isfinite(mm_per_unit) and mm_per_unit > 0):
+        raise ValueError(f"mm_per_unit must be finite and > 0, got {mm_per_unit!r}")
+    if not isinstance(medium, Medium):
+        raise ValueError(f"medium must be a Medium, got {type(medium).__name__}")
+    n = len(mi.Spectrum(0))
+    if medium.n_channels not in (None, n):
+        raise ValueError(f"medium must have {n} channels under {mi.variant()}, got {medium.n_channels}")
+    scaled = medium.scaled(mm_per_unit)
+    return tuple(scaled if medium.n_channels is None else scaled.channel(k) for k in range(n))
 
 
 def cosine_direction(n: Any, rng: Any) -> Any:

@@ -11,7 +11,10 @@ from figures.modelling.candle import make_candle
 from figures.modelling.grid import Grid, mixed, tissue
 from figures.modelling.mesh import Mesh, surface
 
-__all__ = ["FLAME_RADIANCE", "OBJECTS", "VARYING", "Varying", "candle_parts", "make_varying", "varying_parts"]
+__all__ = [
+    "FLAME_RADIANCE", "OBJECTS", "VARYING", "Varying", "candle_parts", "learnable_parts", "make_varying",
+    "varying_parts",
+]  # fmt: skip
 
 VARYING = ("mandarin", "meat", "croissant")
 OBJECTS = ("candle", *VARYING)
@@ -90,3 +93,17 @@ def varying_parts(found: Varying, folder: Path) -> dict[str, Any]:
     boundary = {"type": "roughdielectric", "alpha": found.alpha, "int_ior": found.eta, "ext_ior": 1.0}
     medium = found.grid.write(Path(folder), found.name)
     return {found.name: {"type": "ply", "filename": str(path), "bsdf": boundary, "interior": medium}}
+
+
+def learnable_parts(found: Varying, folder: Path, model: str = "full_geometry") -> dict[str, Any]:
+    """An object whose medium varies with the surface `translucent` and a smooth boundary, so that it can be learnt; mm.
+
+    Args:
+        found: the object.
+        folder: where its PLY file and its grid volumes are written.
+        model: of light in it.
+    """
+    parts = varying_parts(found, folder)[found.name]
+    grids = {key: parts["interior"][key] for key in ("sigma_t", "albedo")}
+    surface = {"type": "translucent", "model": model, "g": 0.0, "eta": found.eta, **grids}
+    return {found.name: {"type": "ply", "filename": parts["filename"], "bsdf": surface}}

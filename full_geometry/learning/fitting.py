@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from full_geometry.features import n_side, reverse
+from full_geometry.features import N_PAIR, reverse
 from full_geometry.learning.learner import Correction, PatchLogits, likelihood, patch_likelihood
 from full_geometry.learning.pairs import Pairs
 from full_geometry.patches import Patches
@@ -66,7 +66,7 @@ class Fitting:
     """
 
     def __init__(self, n_in: int, channels: int, recipe: Recipe, seed: int, patches: Patches | None = None) -> None:
-        self.recipe, self.patches, self.n_side = recipe, patches, n_side(channels)
+        self.recipe, self.patches, self.n_side = recipe, patches, (n_in - N_PAIR) // 2
         parts = {"S": Correction(n_in, channels, recipe.width, recipe.depth, seed)}
         if patches is not None:
             parts["patches"] = PatchLogits(self.n_side, patches.areas, PATCH_HIDDEN, seed)
@@ -99,7 +99,7 @@ class Fitting:
             patch = torch.from_numpy(self.patches.of_face[walks.faces].astype(np.int64))
         n_x, n_y = max(T.shape[1] // batch, 1), max(W.shape[1] // batch, 1)
         kept = T.shape[1] / walks.drawn
-        order_back, signs = (torch.from_numpy(v) for v in reverse(T.shape[0]))
+        order_back, signs = (torch.from_numpy(v) for v in reverse(self.n_side))
         for k in range(self.recipe.reuse):
             if k:
                 x, y = (v[order_back] * signs[:, None] for v in (x, y))

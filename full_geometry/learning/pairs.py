@@ -58,7 +58,7 @@ class Proposals:
     Args:
         subject: the object.
         half_space: S_0, whose radial densities the probes follow.
-        area_share: of the points that are uniform over the area, without patches.
+        area_share: of the candidates that are uniform over the area, without patches.
         patches: learnt weights, or None.
     """
 

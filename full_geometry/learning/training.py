@@ -159,7 +159,8 @@ class _Run:
 
     def _new_fitting(self) -> Fitting:
         channels = len(self.subject.media)
-        return Fitting(2 * n_side(channels) + N_PAIR, channels, self.recipe, self.seed, self.patches)
+        n_in = 2 * n_side(channels, self.subject.n_local) + N_PAIR
+        return Fitting(n_in, channels, self.recipe, self.seed, self.patches)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """What is written: everything in half precision."""

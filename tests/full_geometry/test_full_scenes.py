@@ -154,13 +154,6 @@ def test_a_rough_boundary_is_refused(trained: Trained, folder: Path) -> None:
     refused({"bunny": bunny(bsdf={**SURFACE, "boundary": rough})}, "boundary of 'bunny' must be smooth", folder)
 
 
-def test_a_medium_that_varies_is_refused(folder: Path) -> None:
-    grid = mi.VolumeGrid(np.random.default_rng(1).random((4, 4, 4, 1)).astype(np.float32))
-    volume = {"type": "gridvolume", "grid": grid, "raw": True}
-    surface = {"type": "translucent", "sigma_t": volume, "albedo": 0.9, "eta": 1.4, "model": "full_geometry"}
-    refused({"ball": {"type": "sphere", "bsdf": surface}}, "medium of 'ball' must be the same everywhere", folder)
-
-
 def test_an_instance_is_refused(folder: Path) -> None:
     group = {"type": "shapegroup", "inner": {"type": "sphere", "bsdf": SURFACE}}
     objects = {"group": group, "copy": {"type": "instance", "inner": {"type": "ref", "id": "group"}}}

@@ -18,7 +18,7 @@ pytest.importorskip("torch")
 
 import full_geometry  # noqa: E402
 from full_geometry import storing  # noqa: E402
-from full_geometry.features import Side, pair_features, reverse, side_features  # noqa: E402
+from full_geometry.features import Side, n_side, pair_features, reverse, side_features  # noqa: E402
 from full_geometry.first_event import first_event  # noqa: E402
 from full_geometry.half_space import HalfSpace, HalfSpaceTransport  # noqa: E402
 from full_geometry.identity import frame_of  # noqa: E402
@@ -100,7 +100,7 @@ def test_features_of_the_way_back_are_those_of_exit_and_entry_exchanged() -> Non
         columns = [*side_features(frame, exit), *side_features(frame, entry), *pair_features(frame, exit, entry)]
         return np.stack([np.array(column) for column in columns])
 
-    order, signs = reverse(3)
+    order, signs = reverse(n_side(3))
     assert np.allclose(features(a, b)[order] * signs[:, None], features(b, a), atol=1e-5)
 
 

@@ -19,7 +19,10 @@ import numpy as np
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.surface.object import Object, crossings
 
-__all__ = ["VaryingMedium", "constant_value", "equivalent", "eval_volume", "mean_of_grids", "varying_medium"]
+__all__ = [
+    "VaryingMedium", "constant_value", "equivalent", "eval_volume", "grid_values", "mean_of_grids", "varying_medium",
+    "warn_of_means",
+]  # fmt: skip
 
 POINTS = 2**15  # at which a medium is averaged over an object
 
@@ -155,7 +158,7 @@ def mean_of_grids(medium: VaryingMedium, g: Any, eta: float) -> Medium:
 def equivalent(inside: Any, obj: Object) -> Any:
     """The inside of an object with a homogeneous medium, which models of the half-space take.
 
-    Its sigma_s and sigma_a are the means over the volume of the object; warns that they are.
+    Its sigma_s and sigma_a are the means over the volume of the object.
     """
     if inside.varying is None:
         return inside
@@ -165,13 +168,17 @@ def equivalent(inside: Any, obj: Object) -> Any:
         within = np.array(crossings(obj.scene, ray)[1]) % 2 == 1
         if within.any():
             p = mi.Point3f(np.array(p)[:, within])
-    medium = mean_medium(inside.varying, p, inside.medium.g, inside.medium.eta)
-    warnings.warn(
-        f"object {obj.shape.id()!r} varies in space: models of the half-space take its mean sigma_s {medium.sigma_s} "
-        f"and sigma_a {medium.sigma_a} 1/mm",
-        stacklevel=2,
-    )
-    return replace(inside, medium=medium)
+    return replace(inside, medium=mean_medium(inside.varying, p, inside.medium.g, inside.medium.eta))
+
+
+def warn_of_means(inside: Any, obj: Object) -> None:
+    """Warn that models of the half-space take the medium of `equivalent`, if it stands for one that varies."""
+    if inside.varying is not None:
+        warnings.warn(
+            f"object {obj.shape.id()!r} varies in space: models of the half-space take its mean sigma_s "
+            f"{inside.medium.sigma_s} and sigma_a {inside.medium.sigma_a} 1/mm",
+            stacklevel=2,
+        )
 
 
 def _points(box: Any) -> Any:

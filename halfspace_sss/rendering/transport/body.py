@@ -13,7 +13,7 @@ from halfspace_sss.rendering.surface.object import Object, same_objects, survey
 from halfspace_sss.rendering.surface.placement import translucent_shapes
 from halfspace_sss.rendering.surface.sensors import check_sensors
 from halfspace_sss.rendering.surface.transports import knows_objects, object_transport
-from halfspace_sss.rendering.surface.varying import equivalent
+from halfspace_sss.rendering.surface.varying import equivalent, warn_of_means
 from halfspace_sss.rendering.transport.expected import Expected, expected_of
 from halfspace_sss.rendering.transport.half_space import half_space_means
 from halfspace_sss.rendering.transport.protocols import Means, Proposals, Transport
@@ -120,6 +120,7 @@ def _means(inside: Inside, found: Object, media: list[Medium], settings: Setting
     of_object = object_transport(inside.model)
     if of_object is not None:
         return of_object(found, inside, media, settings)
+    warn_of_means(inside, found)
     return half_space_means(inside.model, found, media, settings, variation)
 
 

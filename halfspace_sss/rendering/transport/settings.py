@@ -23,8 +23,9 @@ class Settings:
         max_depth: vertices of a path after the camera, an entry and its exit counting as one; -1 for no limit.
         rr_depth: vertices after which Russian roulette begins.
         geometry: "distance" or "tangent", see `plane.separation`.
-        area_share: share of entries drawn uniformly over the area, 0 to 1; AUTOMATIC chooses by the ratio of the
-            distance that light travels to the size of the object.
+        area_share: share of the candidates for an entry that are drawn uniformly over the area, the others by a probe
+            near the exit, 0 to 1; AUTOMATIC chooses by the ratio of the distance that light travels to the size of the
+            object.
         entries: points of entry that an exit draws, of which one is followed, chosen by what it may bring.
         hide_emitters: whether directly visible emitters are left out.
     """

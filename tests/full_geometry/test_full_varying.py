@@ -1,0 +1,196 @@
+"""Media that vary in space as `full_geometry` learns them: the way to the first event, identity, images, objects.
+
+Ratios of means are held to the stated error of the model and four standard errors of the images.
+"""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+dr = pytest.importorskip("drjit")
+mi = pytest.importorskip("mitsuba")
+pytest.importorskip("torch")
+
+from full_geometry import storing  # noqa: E402
+from full_geometry.first_event import first_event, flight  # noqa: E402
+from full_geometry.half_space import HalfSpace, HalfSpaceTransport  # noqa: E402
+from full_geometry.learning import training  # noqa: E402
+from full_geometry.learning.fitting import Recipe  # noqa: E402
+from full_geometry.learning.model_errors import LIGHTS, measure  # noqa: E402
+from full_geometry.learning.pairs import Proposals  # noqa: E402
+from full_geometry.learning.training import Trained, train  # noqa: E402
+from full_geometry.subject import Subject, SurfacePoint  # noqa: E402
+from halfspace_sss import rendering  # noqa: E402
+from halfspace_sss.neural import trained as known_weights  # noqa: E402
+from halfspace_sss.rendering.scenes.scene_files import load_objects, load_scene  # noqa: E402
+from halfspace_sss.tracing.walk import _generator, pass_seed  # noqa: E402
+
+BUNNY = Path(__file__).parents[2] / "figures" / "assets" / "bunny.ply"
+QUICK = Recipe(width=32, depth=2, batch=1024, chunk=2**15, reuse=4)
+CHUNKS, PASSES = 8, 6
+RNG = np.random.default_rng(3)
+DENSITY = 8.0 ** -RNG.random((4, 4, 4, 1))
+ALBEDO = 0.9 + 0.095 * RNG.random((4, 4, 4, 3))
+
+
+@pytest.fixture(autouse=True)
+def variant() -> None:
+    mi.set_variant("llvm_ad_rgb")
+    rendering.register()
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory):
+    """Where weights are kept and looked for; the truth of validations is noisier than by default."""
+    found = tmp_path_factory.mktemp("weights")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(training, "WALKS", 512)
+        patch.setenv(known_weights.ENVIRONMENT_VARIABLE, str(found))
+        yield found
+
+
+def grid(values: np.ndarray, to_world, **more) -> dict:
+    volume = mi.VolumeGrid(np.asarray(values, dtype=np.float32))
+    return {"type": "gridvolume", "grid": volume, "raw": True, "to_world": to_world, **more}
+
+
+def bunny(turn: float = 0.0, shift: float = 0.0, slip: float = 0.0, density: np.ndarray = DENSITY, **more) -> dict:
+    """About 5 mean free paths of a mean extinction across, its grids moved with it, or slipped by a length."""
+    at = mi.ScalarTransform4f().translate([shift, 0, 0]).rotate([0.6, 0.8, 0], turn).scale(0.4)
+    box = at.translate([-1.2 + slip, -0.1, -1.0]).scale([2.4, 2.4, 2.0])
+    media = {"sigma_t": grid(density, box), "albedo": grid(ALBEDO, box), "scale": 5.0, "eta": 1.4, **more}
+    surface = {"type": "translucent", "model": "full_geometry", "orders": "multiple", "reflection": False, **media}
+    return {"type": "ply", "filename": str(BUNNY), "to_world": at, "bsdf": surface}
+
+
+def objects(mm_per_unit: float = 1.0, **found) -> dict:
+    return {"type": "scene", "integrator": {"type": "bssrdf", "mm_per_unit": mm_per_unit}, **found}
+
+
+def subject_of(**found) -> Subject:
+    return Subject.given(load_objects(objects(bunny=bunny(**found))), None)
+
+
+@pytest.fixture(scope="module")
+def trained(folder: Path) -> Trained:
+    mi.set_variant("llvm_ad_rgb")
+    rendering.register()
+    return train(load_objects(objects(bunny=bunny())), chunks=CHUNKS, recipe=QUICK, folder=folder)
+
+
+def constant(rows: list) -> np.ndarray:
+    return np.array([row.error for row in rows if row.light == LIGHTS[0]])
+
+
+def test_a_march_gives_the_transmittance_and_the_way_of_light_in_layers() -> None:
+    layers = np.array([0.4, 3.0, 0.2, 1.0])
+    at = mi.ScalarTransform4f().scale([4, 4, 4])
+    medium = {"sigma_t": grid(layers.reshape(4, 1, 1, 1), at), "albedo": 0.9, "eta": 1.4}
+    cube = {"type": "cube", "to_world": at.translate([0.5, 0.5, 0.5]).scale(0.5)}
+    scene = {"cube": {**cube, "bsdf": {"type": "translucent", **medium}}}
+    subject = Subject.given(load_objects(objects(**scene)), None)
+    starts, lengths = np.array([0.0, 0.3, 1.0, 2.2]), np.array([4.0, 2.0, 0.5, 1.7])
+    o = mi.Point3f(np.stack([0 * starts + 2, 0 * starts + 2, starts]))
+    T, inner = flight(subject, o, mi.Vector3f(0, 0, 1), mi.Float(lengths))
+    for k, (start, length) in enumerate(zip(starts, lengths)):
+        s = np.linspace(0, length, 20001)
+        sigma_t = np.interp(start + s, np.arange(4) + 0.5, layers)
+        way = np.append(0, np.cumsum(0.5 * (sigma_t[1:] + sigma_t[:-1]) * np.diff(s)))
+        assert np.array(T)[0, k] == pytest.approx(np.exp(-way[-1]), abs=0.01)
+        assert np.array(inner)[0, k] == pytest.approx(np.trapezoid(s * sigma_t * np.exp(-way), s), rel=0.05)
+
+
+def test_a_grid_of_one_value_gives_the_first_event_of_the_homogeneous_medium() -> None:
+    plain = {"sigma_t": "2.0", "scale": 1.0, "albedo": "0.9, 0.8, 0.7"}
+    same = subject_of(density=np.full((2, 2, 2, 1), 0.4), albedo="0.9, 0.8, 0.7")
+    known = subject_of(**plain)
+    at = known.random_points(_generator(mi, 2048, pass_seed(4)))
+    a, b = first_event(same, at), first_event(known, at)
+    assert np.allclose(np.array(a.P), np.array(b.P), atol=2e-3)
+    assert np.allclose(np.array(a.y), np.array(b.y), atol=2e-3)
+
+
+def test_training_halves_the_error_of_the_half_space_in_a_medium_that_varies(trained: Trained) -> None:
+    subject = trained.model.subject
+    proposals = Proposals(subject, HalfSpace(subject, "better_dipole"))
+    plane = measure(subject, HalfSpaceTransport(subject, "better_dipole"), proposals, samples=1024)
+    assert np.all(constant(trained.errors) < 0.5 * constant(plane))
+
+
+def S_of(model, points: list[SurfacePoint]) -> np.ndarray:
+    exits, entries = points
+    return np.array(model.S(model.prepare(exits), entries))
+
+
+def test_an_object_moved_with_its_grids_is_the_same_one(trained: Trained, folder: Path) -> None:
+    moved = subject_of(turn=40.0, shift=3.0)
+    again = storing.load(storing.find_weights(moved, folder), moved).model
+    rng = _generator(mi, 4096, pass_seed(7))
+    points = [trained.model.subject.random_points(rng) for _ in range(2)]
+    turn = mi.Transform4f().translate([3, 0, 0]).rotate([0.6, 0.8, 0], 40)
+    a, b = S_of(trained.model, points), S_of(again, [SurfacePoint(*(turn @ v for v in point)) for point in points])
+    seen = a > 1e-3 * a.max()
+    assert np.median(np.abs(b[seen] / a[seen] - 1)) < 2e-3
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"density": DENSITY[::-1]}, "must be trained for full_geometry"),
+        ({"slip": 0.3}, "medium must vary in the object as trained, got grids placed"),
+        ({"scale": 5.1}, "medium must vary in the object as trained|size_in_mfp of the medium"),
+        ({"sigma_t": 5.0, "albedo": 0.95, "scale": 0.5}, "must be trained for full_geometry"),
+    ],
+    ids=["voxels", "place", "scale", "homogeneous"],
+)
+def test_weights_of_another_medium_are_refused(trained: Trained, folder: Path, changed: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        storing.find_weights(subject_of(**changed), folder)
+
+
+def halves(shown: dict, model: str, mm_per_unit: float, spp: int = 128) -> np.ndarray:
+    """Mean of the left and of the right half of the picture in every pass under an even sky, (passes, 2, channels)."""
+    box = load_objects(objects(**shown)).bbox()
+    centre, size = np.array(box.center()), float(np.linalg.norm(np.array(box.extents())))
+    at = mi.ScalarTransform4f().look_at((centre + [0, 0.3 * size, 2 * size]).tolist(), centre.tolist(), [0, 1, 0])
+    film = {"type": "hdrfilm", "width": 24, "height": 16, "rfilter": {"type": "box"}}
+    plugin = "translucent_walk" if model == "path_traced" else "bssrdf"
+    scene = {
+        "type": "scene",
+        "integrator": {"type": plugin, "max_depth": -1, "hide_emitters": True, "mm_per_unit": mm_per_unit},
+        "light": {"type": "constant"}, **shown,
+        "sensor": {"type": "perspective", "fov": 28.0, "to_world": at, "film": film},
+    }  # fmt: skip
+    loaded = load_scene(scene, model)
+    images = np.array([np.array(mi.render(loaded, spp=spp, seed=k)) for k in range(PASSES)])
+    return images.reshape(PASSES, 16, 2, 12, -1)[..., :3].mean(axis=(1, 3))
+
+
+def agree(shown: dict, trained: Trained, mm_per_unit: float = 1.0) -> None:
+    found, walked = (halves(shown, model, mm_per_unit) for model in ("full_geometry", "path_traced"))
+    ratio = found.mean(axis=0) / walked.mean(axis=0)
+    errors = np.hypot(*(v.std(axis=0, ddof=1) / np.sqrt(PASSES) / v.mean(axis=0) for v in (found, walked)))
+    stated = constant(trained.errors)
+    assert np.all(np.abs(ratio - 1) < stated + 4 * errors), (ratio, stated)
+    assert np.all(stated < 0.12) and np.all(errors < 0.02)
+
+
+def test_an_image_has_the_light_of_walks_within_the_stated_error(trained: Trained) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # no model of the half-space is laid onto it, so none takes means
+        load_scene(objects(bunny=bunny()))
+    agree({"bunny": bunny()}, trained)
+
+
+def test_an_object_of_the_figures_can_be_learnt_and_rendered(folder: Path, tmp_path: Path) -> None:
+    from figures.modelling.scene_parts import learnable_parts, make_varying
+
+    parts = learnable_parts(make_varying("meat", 16, 16), tmp_path)
+    parts["meat"]["bsdf"] |= {"orders": "multiple", "reflection": False}
+    unit = 0.03  # the steak is 3 mm long, a few mean free paths
+    found = train(load_objects(objects(unit, **parts)), chunks=CHUNKS, recipe=QUICK, folder=folder)
+    agree(parts, found, unit)
