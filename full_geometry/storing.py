@@ -18,7 +18,9 @@ from full_geometry.subject import Subject
 from halfspace_sss.neural.store import load_weights, save_weights
 from halfspace_sss.neural.trained import weights_folder
 
-__all__ = ["CENTRES", "KIND", "Learnt", "assemble", "find_weights", "load", "save", "transport", "weights_name"]
+__all__ = [
+    "CENTRES", "KIND", "Learnt", "assemble", "find_weights", "load", "save", "trained", "transport", "weights_name",
+]  # fmt: skip
 
 KIND = "full_geometry"
 S_LAYERS, PATCH_LAYERS, CENTRES = ("W_", "b_"), ("V_", "c_"), "centres"
@@ -64,6 +66,15 @@ def find_weights(subject: Subject, folder: str | os.PathLike | None = None) -> P
         f"object {subject.found.shape.id()!r} must be trained for {KIND}, got one that is not in {place}{why}; "
         "`halfspace-sss train --scene` does it"
     )
+
+
+def trained(subject: Subject) -> bool:
+    """Whether there are weights of an object."""
+    try:
+        find_weights(subject)
+    except ValueError:
+        return False
+    return True
 
 
 def _trained(path: Path) -> tuple[Identity, dict[str, np.ndarray], dict[str, Any]]:
