@@ -133,7 +133,7 @@ class _Bars:
     def kept(self, part: Path) -> str:
         """What an interrupt leaves."""
         if self.title == "learning":
-            return f"what is learnt so far is kept for --resume beside {part}"
+            return f"what was learnt up to the last checkpoint is kept for --resume beside {part}"
         return f"{self.so_far} samples a pixel are kept for --resume in {part}" if self.so_far else ""
 
     def _begin(self, title: str) -> None:
