@@ -50,6 +50,10 @@ class CameraWalks:
         self.progress, self.about = progress, {**about, PASSES: {}}
         self.found: Reference | None = load(path) if path.exists() else None
 
+    def check(self) -> None:
+        """ValueError if walks cannot be traced in the scene, say for a camera inside an object."""
+        self.integrator.tracer(self.scene)
+
     @property
     def pixels(self) -> int:
         """Camera rays of one sample per pixel."""

@@ -19,7 +19,7 @@ def combined(walks: Reference, model: Reference) -> Reference:
     V is the sum of the variances of the mean over pixels and colours. As a pixel that happens to be bright has a large
     variance too, weights from the pixels themselves would darken the image: the image is cut into tiles like a
     chessboard, and the white ones take s from the black ones and the other way round. With fewer than two passes of
-    one of them, or where neither varies, s is the share of the samples.
+    one of them, or where neither varies, s is the share of the samples. The bias of the model does not count.
 
     Args:
         walks, model: of the same scene and sensor. What `model` is about is kept; `about["combined"]` tells the rest.

@@ -115,6 +115,7 @@ def render(
     if walks.found is not None:
         reference.check_same(walks.found, parts["walks.exr"], about)
     if names:
+        walks.check()
         integrator.check(scene, [name for ids in names.values() for name in ids])
     records = _learnt(scene, walks, seed, parts["training"], learning, told or (lambda sentence: None))
     integrator.prepare(scene)
