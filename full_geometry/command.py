@@ -3,18 +3,43 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from full_geometry.learning.model_errors import ModelError, errors_of
-from full_geometry.storing import KIND, transport
+from full_geometry.storing import KIND, trained, transport
 from full_geometry.subject import Subject
 from halfspace_sss.checks import check_count
 from halfspace_sss.interface.model import models as half_space_models
+from halfspace_sss.neural.trained import weights_folder
 from halfspace_sss.progress import NamedProgress
+from halfspace_sss.provenance import check_folder
 from halfspace_sss.rendering.scenes.learners import LearntObject, ObjectError
 
-__all__ = ["errors", "train"]
+__all__ = ["errors", "train", "untrained"]
+
+
+def untrained(scene: Any) -> list[str]:
+    """Ids of the objects of a scene that have this model and no weights yet; none without torch, which learns them.
+
+    Raises:
+        ValueError: one cannot be learnt, or the folder of weights cannot be written to.
+    """
+    found = []
+    for shape in scene.shapes() if find_spec("torch") else ():
+        inside = getattr(shape.bsdf(), "inside", None)
+        asked = inside is not None and inside.model == KIND and inside.orders != "single"
+        if not asked or not np.any(inside.medium.sigma_s > 0):
+            continue
+        subject = Subject.given(scene, None, None, shape.id())
+        if not trained(subject):
+            found.append(shape.id())
+    if found:
+        check_folder(weights_folder())
+    return found
 
 
 def train(
@@ -27,13 +52,14 @@ def train(
     folder: Path | None = None,
     work: Path | None = None,
     progress: NamedProgress | None = None,
+    camera: Any = None,
 ) -> LearntObject:
     """As `learning.training.train`, of which the rows of errors are told with the names of object and channels."""
     from full_geometry.learning.training import train as learn
 
     found = learn(
         scene, object=object, seconds=seconds, target_error=target_error, seed=seed, folder=folder, work=work,
-        progress=progress,
+        progress=progress, camera=camera,
     )  # fmt: skip
     name = found.model.subject.found.shape.id()
     return LearntObject(name, found.path, _rows(name, KIND, found.errors), found.steps, found.seconds)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, replace
+from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -12,7 +14,7 @@ from full_geometry.flow.sampler import FlowProposals
 from full_geometry.learnable import check_surface
 from full_geometry.model import FullGeometry, PreparedExit
 from full_geometry.patch_table import PatchTable
-from full_geometry.storing import KIND, find_weights, load
+from full_geometry.storing import KIND, find_weights, load, trained
 from full_geometry.subject import Subject, SurfacePoint
 from halfspace_sss.neural.store import checksum_of
 from halfspace_sss.physics.medium import Medium
@@ -57,14 +59,27 @@ class LearntTransport:
         return self.model.S(prepared, at, active) * dr.maximum(dr.dot(w_i, entry.n_out), 0)
 
 
+def _learn(subject: Subject, settings: Settings) -> None:
+    """Train and write the weights."""
+    from full_geometry.learning.training import learn
+
+    warnings.warn(
+        f"object {subject.found.shape.id()!r} has no weights: it is learnt first, for {settings.train_seconds:g} s",
+        stacklevel=2,
+    )
+    learn(subject, seconds=settings.train_seconds, target_error=settings.train_error)
+
+
 def learnt_means(found: Object, inside: Inside, media: list[Medium], settings: Settings) -> Means:
-    """Transport and proposals of an object that was trained.
+    """Transport and proposals of an object that was trained, or is now for `train_seconds` of the settings.
 
     Raises:
-        ValueError: the object was not trained or cannot be, or weights are damaged.
+        ValueError: the object cannot be trained, was not and has no time for it, or weights are damaged.
     """
     check_surface(found.shape.id(), found.shape.bsdf())
     subject = Subject.surveyed(found, tuple(media), inside.varying, settings.mm_per_unit)
+    if settings.train_seconds > 0 and find_spec("torch") and not trained(subject):
+        _learn(subject, settings)
     path = find_weights(subject)
     model, sampler, flow = load(path, subject)
     backbone = model.half_space.models

@@ -22,7 +22,8 @@ from halfspace_sss.neural.store import load_weights, save_weights
 from halfspace_sss.neural.trained import weights_folder
 
 __all__ = [
-    "CENTRES", "KIND", "Learnt", "add_flow", "assemble", "find_weights", "load", "save", "transport", "weights_name",
+    "CENTRES", "KIND", "Learnt", "add_flow", "assemble", "find_weights", "load", "save", "trained", "transport",
+    "weights_name",
 ]  # fmt: skip
 
 KIND = "full_geometry"
@@ -71,6 +72,15 @@ def find_weights(subject: Subject, folder: str | os.PathLike | None = None) -> P
         f"object {subject.found.shape.id()!r} must be trained for {KIND}, got one that is not in {place}{why}; "
         "`halfspace-sss train --scene` does it"
     )
+
+
+def trained(subject: Subject) -> bool:
+    """Whether there are weights of an object."""
+    try:
+        find_weights(subject)
+    except ValueError:
+        return False
+    return True
 
 
 def _trained(path: Path) -> tuple[Identity, dict[str, np.ndarray], dict[str, Any]]:

@@ -11,7 +11,7 @@ from full_geometry.entries import AREA_SHARE, LearntProposals
 from full_geometry.features import Frame, Side, pair_features, side_features
 from full_geometry.first_event import first_event
 from full_geometry.half_space import HalfSpace
-from full_geometry.learning.exits import trace_exits
+from full_geometry.learning.exits import Exits, trace_exits
 from full_geometry.model import PreparedExit
 from full_geometry.patches import PatchSampler
 from full_geometry.subject import Subject, SurfacePoint, cosine_direction
@@ -20,7 +20,7 @@ from halfspace_sss.rendering.transport.positions import PositionSampler
 from halfspace_sss.rendering.transport.radial_table import RadialTable
 from halfspace_sss.tracing.walk import _generator, pass_seed
 
-__all__ = ["Pairs", "PairSource", "Proposals"]
+__all__ = ["Pairs", "PairSource", "Proposals", "shuffled"]
 
 PATCH_SHARE = 0.6  # of those by patches, where they are learnt
 
@@ -47,6 +47,15 @@ class Pairs(NamedTuple):
     values: np.ndarray
     drawn: int
     faces: np.ndarray | None = None  # where walks left
+
+
+def shuffled(parts: list[Pairs], order: np.random.Generator) -> Pairs:
+    """The pairs of several sources as those of one: exits then are distributed as those of all together."""
+    features = np.concatenate([part.features for part in parts], axis=1)
+    values = np.concatenate([part.values for part in parts], axis=1)
+    places = order.permutation(values.shape[1])
+    faces = None if parts[0].faces is None else np.concatenate([part.faces for part in parts])[places]
+    return Pairs(features[:, places], values[:, places], sum(part.drawn for part in parts), faces)
 
 
 class Proposals:
@@ -115,12 +124,18 @@ class PairSource:
 
     def walks(self, n: int, seed: tuple[int, ...]) -> Pairs:
         """n walks of random exits; those that left at an order that counts, T as values."""
-        import drjit as dr
         import mitsuba as mi
 
         rng = _generator(mi, n, pass_seed(*seed, 0))
         starts = self.subject.random_points(rng)
-        exits = trace_exits(self.subject, starts, (*seed, 1))
+        return self.ended(starts, trace_exits(self.subject, starts, (*seed, 1)))
+
+    def ended(self, starts: SurfacePoint, exits: Exits) -> Pairs:
+        """The pairs of walks whose ends are known; those with T > 0, T as values."""
+        import drjit as dr
+        import mitsuba as mi
+
+        n = dr.width(starts.p)
         kept = dr.compress(dr.max(exits.T) > 0)
         if dr.width(kept) == 0:
             return self._columns(starts, starts, dr.zeros(mi.Spectrum, n))._replace(faces=np.zeros(n, np.uint32))
@@ -129,12 +144,21 @@ class PairSource:
         faces = np.array(dr.gather(mi.UInt32, exits.face, kept))
         return self._columns(starts.gather(kept), ends, T)._replace(drawn=n, faces=faces)
 
-    def proposed(self, n: int, seed: tuple[int, ...], patches: PatchSampler | None = None) -> Pairs:
-        """n proposals of random exits, S_0 mu_i over their density as values; by learnt patches if they are given."""
+    def proposed(
+        self, n: int, seed: tuple[int, ...], patches: PatchSampler | None = None, starts: SurfacePoint | None = None
+    ) -> Pairs:
+        """n proposals, S_0 mu_i over their density as values.
+
+        Args:
+            n: how many.
+            seed: of them.
+            patches: learnt weights that they follow, if they are given.
+            starts: n exits that they are of; by default random ones.
+        """
         import mitsuba as mi
 
         rng = _generator(mi, n, pass_seed(*seed, 2))
-        starts = self.subject.random_points(rng)
+        starts = starts or self.subject.random_points(rng)
         entries, weight = self.proposals.with_patches(patches).sample(starts, rng)
         return self._columns(starts, entries, weight)
 

@@ -18,6 +18,7 @@ from full_geometry.identity import frame_of, identify
 from full_geometry.learning.fitting import STANDARD, Fitting, Recipe
 from full_geometry.learning.model_errors import ModelError, Reference, measure, reference
 from full_geometry.learning.pairs import PairSource, Proposals
+from full_geometry.learning.seen import Seen
 from full_geometry.model import FullGeometry
 from full_geometry.patches import Patches, PatchSampler, cluster
 from full_geometry.storing import CENTRES, Learnt, assemble
@@ -29,7 +30,7 @@ from halfspace_sss.neural.training.work_folder import CHECKPOINT, claim
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.provenance import check_folder, provenance, write_atomically
 
-__all__ = ["Trained", "train", "train_by_cpu"]
+__all__ = ["Trained", "learn", "train", "train_by_cpu"]
 
 Progress = Callable[[str, int, int], None]
 VALIDATIONS = 4  # in a run
@@ -73,6 +74,7 @@ def train(
     chunks: int | None = None,
     folder: str | Path | None = None,
     work: str | Path | None = None,
+    camera: Any = None,
     progress: Progress | None = None,
 ) -> Trained:
     """Learn S of an object and write its weights.
@@ -93,11 +95,33 @@ def train(
         chunks: number of chunks instead of a plan by time.
         folder: for the weights; by default HALFSPACE_SSS_WEIGHTS or the user's data folder.
         work: folder for unfinished work.
+        camera: a `CameraWalks`, whose walks join those of random exits.
         progress: called with (what, done, total).
 
     Raises:
         ValueError: an argument is out of range, or `work` is of another run; nothing has been traced then.
     """
+    subject = Subject.given(shape, medium, mm_per_unit, object)
+    return learn(
+        subject, seconds=seconds, target_error=target_error, seed=seed, recipe=recipe, chunks=chunks, folder=folder,
+        work=work, camera=camera, progress=progress,
+    )  # fmt: skip
+
+
+def learn(
+    subject: Subject,
+    *,
+    seconds: float = 60.0,
+    target_error: float | None = None,
+    seed: int = 0,
+    recipe: Recipe = STANDARD,
+    chunks: int | None = None,
+    folder: str | Path | None = None,
+    work: str | Path | None = None,
+    camera: Any = None,
+    progress: Progress | None = None,
+) -> Trained:
+    """`train` for an object that has been looked at."""
     check_interval("seconds", seconds, 0.0, 1e7)
     check_count("seed", seed, 0)
     if target_error is not None:
@@ -107,10 +131,9 @@ def train(
     for place in (folder or weights_folder(), work):
         if place is not None:
             check_folder(place)
-    subject = Subject.given(shape, medium, mm_per_unit, object)
     if not any(float(m.sigma_s) > 0 for m in subject.media):
         raise ValueError("medium must scatter in at least one channel to be learnt, got sigma_s 0 in all")
-    run = _Run(subject, recipe, int(seed), Path(work) if work else None)
+    run = _Run(subject, recipe, int(seed), Path(work) if work else None, camera)
     if seconds == 0:
         warnings.warn("an object that is trained for 0 seconds is rendered as a half-space", stacklevel=2)
         return Trained(*run.learnt()[:2], None, [], 0, 0.0)
@@ -130,7 +153,7 @@ def train_by_cpu(
         recipe: sizes and rates.
     """
     check_interval("seconds", seconds, 1e-3, 1e7)
-    run, began = _Run(subject, recipe, seed, None), time.process_time()
+    run, began = _Run(subject, recipe, seed, None, None), time.process_time()
     run._prepare()
     total = run._plan(seconds, None, time.process_time)
     while run.done < total:
@@ -142,14 +165,15 @@ def train_by_cpu(
 class _Run:
     """A training on its way."""
 
-    def __init__(self, subject: Subject, recipe: Recipe, seed: int, work: Path | None) -> None:
+    def __init__(self, subject: Subject, recipe: Recipe, seed: int, work: Path | None, camera: Any) -> None:
         import mitsuba as mi
 
-        self.subject, self.recipe, self.seed, self.work = subject, recipe, seed, work
+        self.subject, self.recipe, self.seed, self.work, self.camera = subject, recipe, seed, work, camera
         self.identity, self.frame = identify(subject), frame_of(subject)
         self.half_space = HalfSpace(subject, recipe.backbone)
         self.proposals = Proposals(subject, self.half_space)
         self.source = PairSource(subject, self.frame, self.half_space, self.proposals)
+        self.seen: Seen | None = None
         self.patches = self.centres = None
         if "faces" in mi.traverse(subject.found.shape):
             self.centres = cluster(subject, self.frame, seed=seed).astype(np.float16)
@@ -186,7 +210,8 @@ class _Run:
                 self.history.append(self._validated(truth))
                 what = f"training (error {self.history[-1][1]:.3f} ± {self.history[-1][2]:.3f})"
             if self.work and (time.monotonic() - saved > CHECKPOINT_EVERY or self.done in marks):
-                self._save()
+                self._save_camera()  # first: what its image holds beyond the checkpoint is not added again
+                self.fitting.save(self.work / CHECKPOINT, self.done, self.history)
                 saved = time.monotonic()
             if progress:
                 progress(what, self.done, total)
@@ -194,6 +219,7 @@ class _Run:
             self.subject, self.learnt().model, self.proposals, truth=truth, samples=2 * WALKS, seed=self.seed
         )
         spent = time.monotonic() - started
+        self._save_camera()
         path = storing.save(folder, self.identity, self.arrays(), self._record(found, spent))
         return Trained(*self.learnt()[:2], path, found, self.fitting.step, spent)
 
@@ -203,8 +229,11 @@ class _Run:
         share = pilot.values.shape[1] / pilot.drawn
         self.walks = int(self.recipe.chunk / min(max(share, 0.05), 1.0))
         self.fitting.set_scale(pilot)
+        run = {"object": self.identity.record(), "recipe": asdict(self.recipe), "seed": self.seed}
+        if self.camera:
+            self.seen = Seen(self.source, self.camera, self.walks, self.seed)
+            run["camera"] = {"scene": self.camera.about.get("scene"), "schedule": self.seen.schedule}
         if self.work:
-            run = {"object": self.identity.record(), "recipe": asdict(self.recipe), "seed": self.seed}
             claim(self.work, **run)
             if (self.work / CHECKPOINT).exists():
                 self.done, self.history = self.fitting.load(self.work / CHECKPOINT)
@@ -220,14 +249,17 @@ class _Run:
             trial = self._new_fitting()
             trial.scale = self.fitting.scale
             self.source.proposed(1024, (self.seed, 2**31), self.learnt().sampler)  # compiles its kernels
+            spared = self.seen.seconds_spared() if self.seen else 0.0
             at = clock()
-            trial.use(*self._data(2**31 + 1), 10**6, np.random.default_rng(0))
-            chunks = max(int(LOOP_SHARE * seconds / (clock() - at)), 1)
+            trial.use(*self._data(2**31 + 1, trial=True), 10**6, np.random.default_rng(0))
+            chunks = max(int(LOOP_SHARE * seconds / (clock() - at - spared)), 1)
         if place:
             write_atomically(place, to_json({"chunks": chunks}))
         return chunks
 
-    def _data(self, k: int) -> tuple:
+    def _data(self, k: int, trial: bool = False) -> tuple:
+        if self.seen:
+            return self.seen.data(k, self.recipe.chunk, self.learnt().sampler, trial)
         walks = self.source.walks(self.walks, (self.seed, k))
         return walks, self.source.proposed(self.recipe.chunk, (self.seed, k), self.learnt().sampler)
 
@@ -247,8 +279,9 @@ class _Run:
     def _reached(self, target: float | None) -> bool:
         return target is not None and bool(self.history) and self.history[-1][1] <= target
 
-    def _save(self) -> None:
-        self.fitting.save(self.work / CHECKPOINT, self.done, self.history)
+    def _save_camera(self) -> None:
+        if self.camera:
+            self.camera.save()
 
     def _record(self, found: list[ModelError], seconds: float) -> dict[str, Any]:
         return {

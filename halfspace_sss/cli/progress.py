@@ -12,7 +12,7 @@ from halfspace_sss.cli.interrupts import interrupts
 if TYPE_CHECKING:
     from rich.console import Console
 
-__all__ = ["Bar", "console", "set_quiet"]
+__all__ = ["Bar", "console", "set_quiet", "tell"]
 
 TABLE_WIDTH = 132  # where the output is no terminal
 LINE_EVERY = 30.0  # seconds
@@ -32,6 +32,12 @@ def console() -> Console:
 
     found = Console(quiet=_quiet)
     return found if found.is_terminal else Console(width=TABLE_WIDTH, quiet=_quiet)
+
+
+def tell(sentence: str) -> None:
+    """A sentence on stderr, before work starts."""
+    if not _quiet:
+        typer.echo(sentence, err=True)
 
 
 class Bar:

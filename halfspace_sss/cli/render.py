@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from halfspace_sss.backend import BackendError
-from halfspace_sss.cli.shared import Bar, Define, Variant, console, defined, use_mitsuba, whole
+from halfspace_sss.cli.shared import Bar, Define, Variant, console, defined, tell, use_mitsuba, whole
 from halfspace_sss.extensions import renderer
 from halfspace_sss.provenance import check_folder, replace_together, write_atomically
 
@@ -26,6 +26,7 @@ __all__ = ["render_command"]
 
 SPP = 64
 ENDINGS = ("png", "html", "denoised.exr", "denoised.png")  # of what is drawn
+PHASES = ("walks.exr", "walks.json", "model.exr", "model.json")  # of an image with walks in it
 
 
 def render_command(
@@ -44,6 +45,13 @@ def render_command(
     seed: Annotated[int, typer.Option(help="Seed of the samples.", parser=whole)] = 0,
     sensor: Annotated[int, typer.Option(help="Number of the sensor.", parser=whole)] = 0,
     define: Define = None,
+    train_seconds: Annotated[
+        float | None,
+        typer.Option(help="Time to learn an object without weights; 0 refuses it.", show_default="60, or the scene's"),
+    ] = None,
+    train_error: Annotated[
+        float | None, typer.Option(help="Error at which it has learnt enough.", show_default="0.03, or the scene's")
+    ] = None,
     denoise: Annotated[bool, typer.Option("--denoise", help="An image without noise beside the other.")] = False,
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on with the unfinished or finished render of the same settings.")
@@ -55,19 +63,22 @@ def render_command(
 ) -> None:
     """Render a scene: NAME_MODEL.exr with variance, .png, and .html; error, samples and time are printed.
 
-    Until it is done, NAME_MODEL.unfinished.exr holds it, and the files of before stay.
+    Until it is done, NAME_MODEL.unfinished.exr holds it, and the files of before stay. Objects whose model has to learn
+    them are learnt first, where they have no weights, from walks that join the image.
     """
     use_mitsuba(variant)
     from halfspace_sss.checks import check_count
     from halfspace_sss.rendering.scenes.picture import Picture
     from halfspace_sss.rendering.scenes.reference import Limits
-    from halfspace_sss.rendering.scenes.scene_files import load_scene
+    from halfspace_sss.rendering.scenes.scene_files import open_scene
 
     limits = Limits(SPP if (spp, target_error, seconds) == (None,) * 3 else spp, None, target_error, seconds)
     check_count("seed", seed, 0)
     parameters, draw = defined(define), _renderer(denoise)
     check_folder(out)
-    loaded = load_scene(scene, model, orders, parameters)
+    settings = {"train_seconds": train_seconds, "train_error": train_error}
+    settings = {name: value for name, value in settings.items() if value is not None}
+    loaded = open_scene(scene, model, orders, parameters, settings)
     file = out / f"{scene.stem}_{model or 'scene'}{f'_sensor{sensor}' if sensor else ''}.exr"
     found = _rendered(loaded, file, limits, {"seed": seed, "sensor": sensor}, resume)
     picture = Picture(file.stem, _colours(found.mean), _numbers(found), _error(found), loaded, sensor, denoise)
@@ -88,27 +99,60 @@ def _unfinished(file: Path) -> Path:
 
 def _rendered(scene: Any, file: Path, limits: Limits, which: dict[str, int], resume: bool) -> Reference:
     """The render, in files of another name until it is done."""
-    from halfspace_sss.rendering.scenes import reference
+    from halfspace_sss.rendering.scenes import online
     from halfspace_sss.rendering.scenes.causes import first_cause
 
-    part, so_far = _unfinished(file), 0
-    start = file if resume and file.exists() and not part.exists() else resume
-    with Bar("rendering") as bar:
-
-        def show(found: Reference) -> None:
-            nonlocal so_far
-            so_far = found.spp
-            error = f", error {found.relative_error:.2%}" if math.isfinite(found.relative_error) else ""
-            bar.show(round(1000 * limits.share(found)), 1000, f"{found.spp} spp{error}")
-
+    part, bars = _unfinished(file), _Bars(limits)
+    begun = any(path.exists() for path in (part, *online.files(part).values()))
+    start = file if resume and file.exists() and not begun else resume
+    with bars:
         try:
-            return reference.render(scene, part, resume=start, progress=show, **which, **vars(limits))
+            return online.render(scene, part, resume=start, **which, **vars(limits), **bars.callbacks())
         except RuntimeError as error:
             raise BackendError(first_cause(error)) from error
         except KeyboardInterrupt:
-            if not so_far:
-                raise
-            raise KeyboardInterrupt(f"{so_far} samples a pixel are kept for --resume in {part}") from None
+            raise KeyboardInterrupt(bars.kept(part)) from None
+
+
+class _Bars:
+    """Progress of learning and of rendering, one after the other."""
+
+    def __init__(self, limits: Limits) -> None:
+        self.limits, self.bar, self.title, self.so_far = limits, Bar(""), "", 0
+
+    def __enter__(self) -> _Bars:
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        self.bar.__exit__(*error)
+
+    def callbacks(self) -> dict[str, Any]:
+        """What `online.render` is to call."""
+        return {"progress": self._rendered, "learning": self._learnt, "told": self._told}
+
+    def kept(self, part: Path) -> str:
+        """What an interrupt leaves."""
+        if self.title == "learning":
+            return f"what was learnt up to the last checkpoint is kept for --resume beside {part}"
+        return f"{self.so_far} samples a pixel are kept for --resume in {part}" if self.so_far else ""
+
+    def _begin(self, title: str) -> None:
+        self.bar.__exit__(None, None, None)
+        self.bar, self.title = Bar(title), title
+
+    def _told(self, sentence: str) -> None:
+        self._begin("learning")
+        tell(sentence)
+
+    def _learnt(self, what: str, done: int, total: int) -> None:
+        self.bar.show(done, total, what)
+
+    def _rendered(self, found: Reference) -> None:
+        if self.title != "rendering":
+            self._begin("rendering")
+        self.so_far = found.spp
+        error = f", error {found.relative_error:.2%}" if math.isfinite(found.relative_error) else ""
+        self.bar.show(round(1000 * self.limits.share(found)), 1000, f"{found.spp} spp{error}")
 
 
 def _publish(picture: Picture, file: Path, draw: Renderer | None) -> list[Path]:
@@ -117,9 +161,11 @@ def _publish(picture: Picture, file: Path, draw: Renderer | None) -> list[Path]:
     drawn = {"png": picture.png(), **(draw(picture) if draw else {})}
     for ending, data in drawn.items():
         write_atomically(part.with_suffix(f".{ending}"), data)
-    endings = ["exr", "json", *drawn]
+    phases = [ending for ending in PHASES if part.with_suffix(f".{ending}").exists()]
+    endings = ["exr", "json", *drawn, *phases]
     moves = {part.with_suffix(f".{ending}"): file.with_suffix(f".{ending}") for ending in endings}
-    replace_together(moves, [file.with_suffix(f".{ending}") for ending in ENDINGS if ending not in endings])
+    gone = [file.with_suffix(f".{ending}") for ending in (*ENDINGS, *PHASES) if ending not in endings]
+    replace_together(moves, gone)
     return [path for path in moves.values() if path.suffix != ".json"]
 
 

@@ -13,14 +13,14 @@ import typer
 
 from halfspace_sss.backend import BackendError, prepare_llvm
 from halfspace_sss.cli.interrupts import interrupts
-from halfspace_sss.cli.progress import Bar, console, set_quiet
+from halfspace_sss.cli.progress import Bar, console, set_quiet, tell
 
 if TYPE_CHECKING:
     from halfspace_sss.physics.medium import Medium
 
 __all__ = [
     "FIG10", "Albedo", "Backend", "Bar", "Define", "Eta", "MeanCosine", "SigmaT", "Variant", "by_channel",
-    "check_channel", "check_left_out", "console", "defined", "numbers", "stated_medium", "use_mitsuba", "whole",
+    "check_channel", "check_left_out", "console", "defined", "numbers", "stated_medium", "tell", "use_mitsuba", "whole",
     "with_quiet",
 ]  # fmt: skip
 

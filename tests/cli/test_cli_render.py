@@ -193,13 +193,13 @@ def test_an_integrator_that_does_not_know_the_inside_is_warned_of(scene: Path) -
 def test_a_warning_of_mitsuba_is_a_line_on_stderr(scene: Path, monkeypatch: Any) -> None:
     from halfspace_sss.rendering.scenes import scene_files
 
-    load = scene_files.load_scene
+    load = scene_files.open_scene
 
     def warned(*arguments: Any) -> Any:
         mi.Log(mi.LogLevel.Warn, "the lens is\n thick")
         return load(*arguments)
 
-    monkeypatch.setattr(scene_files, "load_scene", warned)
+    monkeypatch.setattr(scene_files, "open_scene", warned)
     result = _render(scene, "--spp", "1")
     assert re.search(r"^warning: .*the lens is thick$", result.stderr, re.MULTILINE) and "thick" not in result.stdout
 

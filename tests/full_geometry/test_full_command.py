@@ -86,7 +86,7 @@ def test_a_model_with_single_scattering_is_held_against_walks_with_it(monkeypatc
 
 
 def test_a_render_says_what_trains_an_object() -> None:
-    result = _invoke("render", "ball.xml", "--model", "full_geometry")
+    result = _invoke("render", "ball.xml", "--model", "full_geometry", "--train-seconds", "0")
     assert result.exit_code == 2 and "object 'ball' must be trained for full_geometry" in result.stderr
     assert "halfspace-sss train --scene" in result.stderr and result.stderr.count("\n") == 1
 

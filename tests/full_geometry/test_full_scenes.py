@@ -124,7 +124,7 @@ def test_another_object_beside_it_keeps_its_own_model(trained: Trained) -> None:
 def test_the_mirrored_object_is_another_one_and_can_be_learnt(trained: Trained, folder: Path) -> None:
     mirrored = {"bunny": bunny(mirror=True, bsdf=SURFACE)}
     with pytest.raises(ValueError, match="must be trained for full_geometry"):
-        load_scene(scene(mirrored, "full_geometry"))
+        load_scene(scene(mirrored, "full_geometry", train_seconds=0))
     agree(mirrored, train(mi.load_dict(bunny(mirror=True)), WAX, chunks=CHUNKS, recipe=QUICK, folder=folder))
 
 
@@ -210,4 +210,4 @@ def test_weights_of_another_version_are_left_aside_by_name(trained: Trained, tmp
 
 def test_a_scene_of_another_unit_is_another_object(trained: Trained) -> None:
     with pytest.raises(ValueError, match="size_in_mfp of the medium"):
-        load_scene(scene({"bunny": bunny(bsdf=SURFACE)}, "full_geometry", mm_per_unit=1.1))
+        load_scene(scene({"bunny": bunny(bsdf=SURFACE)}, "full_geometry", mm_per_unit=1.1, train_seconds=0))

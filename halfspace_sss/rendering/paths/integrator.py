@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import gc
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from typing import Any
 
 from halfspace_sss.rendering.paths.differentiable import check_outermost, check_parameters, replayer
 from halfspace_sss.rendering.paths.tracing import trace_paths
-from halfspace_sss.rendering.transport.body import Bodies
+from halfspace_sss.rendering.transport.body import Bodies, make_bodies
 from halfspace_sss.rendering.transport.settings import read_settings
 
 __all__ = ["integrator_class"]
@@ -22,6 +22,9 @@ def integrator_class() -> type:
 
     class BSSRDFIntegrator(mi.SamplingIntegrator):
         """Renders scenes with `translucent` objects; parameters as in `Settings`.
+
+        An object whose model has to learn it, and has not, is learnt while the scene is prepared, from walks that do
+        not serve the image; `rendering.scenes.online.render` and `halfspace-sss render` use them for both.
 
         Images can be differentiated by emitters, surfaces, textures and the medium of each object (`albedo`, `sigma_t`,
         `g`), forward and backward; where paths go is held, and derivatives by geometry are refused.
@@ -37,6 +40,12 @@ def integrator_class() -> type:
             check_parameters(scene)
             with dr.suspend_grad():
                 return self._bodies.of(scene)
+
+        def check(self, scene: Any, without: Collection[str] = ()) -> None:
+            """ValueError if the scene cannot be rendered, as far as can be told without the objects `without`."""
+            check_parameters(scene)
+            with dr.suspend_grad():
+                make_bodies(scene, self.settings, without)
 
         def render(self, scene: Any, *args: Any, **more: Any) -> Any:
             self.prepare(scene)

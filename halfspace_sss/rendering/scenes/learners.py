@@ -13,6 +13,7 @@ from typing import Any, NamedTuple, Protocol
 from halfspace_sss.checks import check_choice
 from halfspace_sss.extensions import LEARNERS, offered, warn_left_out
 from halfspace_sss.progress import NamedProgress
+from halfspace_sss.rendering.scenes.camera_walks import CameraWalks
 
 __all__ = ["Learner", "LearntObject", "ObjectError", "learner"]
 
@@ -42,7 +43,7 @@ class LearntObject(NamedTuple):
 class Learner(Protocol):
     """Learns objects of scenes from `scene_files.load_objects`, and measures models of them.
 
-    Both functions raise ValueError before they trace anything: an argument is out of range, the object cannot be
+    All functions raise ValueError before they trace anything: an argument is out of range, the object cannot be
     learnt, or there are several and none is named.
     """
 
@@ -57,8 +58,12 @@ class Learner(Protocol):
         folder: Path | None,
         work: Path | None,
         progress: NamedProgress | None,
+        camera: CameraWalks | None = None,
     ) -> LearntObject:
-        """Learn an object and write its weights."""
+        """Learn an object and write its weights; walks of a camera that is given are data too."""
+
+    def untrained(self, scene: Any) -> list[str]:
+        """Ids of the objects that have the model and no weights; a learner without it has none."""
 
     def errors(
         self, scene: Any, models: Sequence[str], *, object: str | None, seed: int, progress: NamedProgress | None

@@ -25,7 +25,7 @@ from halfspace_sss.rendering.scenes.causes import first_cause
 from halfspace_sss.rendering.scenes.identity import scene_hash, words
 from halfspace_sss.rendering.scenes.reference_store import Reference, load, save
 
-__all__ = ["Reference", "load", "render"]
+__all__ = ["Limits", "Progress", "Reference", "about_render", "check_same", "load", "loaded", "render"]
 
 FEWEST_PASSES = 8  # before the spread of the passes is trusted to stop a run
 SHARE = 4  # a growing pass has at most a quarter of the samples so far: enough passes for their spread, few launches
@@ -82,9 +82,8 @@ def render(
     if path.suffix.lower() != ".exr":
         raise ValueError(f"path must end in .exr, got {str(path)!r}")
     check_folder(path.parent)
-    scene, integrator = _load(scene, integrator)
-    _check_sensor(scene, sensor)
-    about = _about(scene, integrator, sensor, seed)
+    scene, integrator = loaded(scene, integrator, sensor)
+    about = about_render(scene, integrator, sensor, seed)
     found = _start(path, resume, about)
     written = found if resume is True else None
     last = time.monotonic()
@@ -181,8 +180,8 @@ def _check(spp_per_pass: int | None, seed: int, interval: float) -> None:
         raise ValueError(f"interval must be >= 0, got {interval!r}")
 
 
-def _load(scene: Any, integrator: dict | None) -> tuple[Any, Any]:
-    """The scene and its integrator as Mitsuba objects."""
+def loaded(scene: Any, integrator: dict | None, sensor: int) -> tuple[Any, Any]:
+    """The scene and its integrator as Mitsuba objects; errors as of `render`."""
     import mitsuba as mi
 
     if isinstance(scene, (str, os.PathLike)) and not Path(scene).is_file():
@@ -197,6 +196,7 @@ def _load(scene: Any, integrator: dict | None) -> tuple[Any, Any]:
         raise ValueError(first_cause(error)) from error
     if integrator is None:
         raise ValueError("integrator must be given, for the scene has none")
+    _check_sensor(scene, sensor)
     return scene, integrator
 
 
@@ -213,7 +213,8 @@ def _check_sensor(scene: Any, sensor: int) -> None:
         raise ValueError(f"a film must have 1 to {MOST_PIXELS} pixels, got {width} x {height}")
 
 
-def _about(scene: Any, integrator: Any, sensor: int, seed: int) -> dict[str, Any]:
+def about_render(scene: Any, integrator: Any, sensor: int, seed: int) -> dict[str, Any]:
+    """What tells one render from another, with its provenance."""
     import mitsuba as mi
 
     about = {
@@ -236,6 +237,12 @@ def _start(path: Path, resume: bool | str | os.PathLike, about: dict[str, Any]) 
         return None
     path = path if resume is True else Path(resume)
     found = load(path)
+    check_same(found, path, about)
+    return found
+
+
+def check_same(found: Reference, path: Path, about: dict[str, Any]) -> None:
+    """ValueError if an image of a file is of another render, so that it cannot be gone on with."""
     for key in ("scene", "integrator", "sensor", "seed", "variant"):
         if found.about.get(key) != about[key]:
             raise ValueError(
@@ -245,4 +252,3 @@ def _start(path: Path, resume: bool | str | os.PathLike, about: dict[str, Any]) 
     versions = [p["provenance"]["versions"] for p in (found.about, about)]
     if versions[0] != versions[1]:
         raise ValueError(f"{path} must be of the same versions to go on with it, got {versions[0]} and {versions[1]}")
-    return found

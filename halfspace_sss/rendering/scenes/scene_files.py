@@ -12,7 +12,7 @@ from halfspace_sss.rendering.scenes.causes import first_cause
 from halfspace_sss.rendering.surface.inside import ORDERS
 from halfspace_sss.rendering.surface.transports import knows_objects, model_names
 
-__all__ = ["PATH_TRACED", "load_objects", "load_scene", "millimetres"]
+__all__ = ["PATH_TRACED", "load_objects", "load_scene", "millimetres", "open_scene"]
 
 PATH_TRACED = "path_traced"
 _INTEGRATORS = {False: "bssrdf", True: "translucent_walk"}
@@ -25,8 +25,9 @@ def load_scene(
     model: str | None = None,
     orders: str | None = None,
     parameters: Mapping[str, str] | None = None,
+    settings: Mapping[str, float] | None = None,
 ) -> Any:
-    """A Mitsuba scene with translucent objects.
+    """A Mitsuba scene with translucent objects, ready to be rendered: objects without weights are learnt here.
 
     Where model or orders are asked for and the integrator of the scene shows no light from inside, ours takes its
     place, with its mm_per_unit, max_depth, rr_depth and hide_emitters; a warning says so. A scene without integrator
@@ -38,12 +39,27 @@ def load_scene(
             which walks through the objects instead.
         orders: of all translucent objects, instead of what the scene says.
         parameters: values of the parameters $name of an XML file.
+        settings: parameters of the integrator `bssrdf`, instead of what the scene says.
 
     Raises:
         ValueError: no such file, parameter, model or orders, the file is no scene, a plugin refuses what it is given,
             there is no translucent object, or the integrator refuses the scene.
     """
+    loaded = open_scene(scene, model, orders, parameters, settings)
+    integrator = loaded.integrator()
+    if hasattr(integrator, "prepare"):
+        integrator.prepare(loaded)  # here, because Mitsuba wraps what is refused while it renders
+    return loaded
 
+
+def open_scene(
+    scene: dict | str | Path,
+    model: str | None = None,
+    orders: str | None = None,
+    parameters: Mapping[str, str] | None = None,
+    settings: Mapping[str, float] | None = None,
+) -> Any:
+    """As `load_scene`, but nothing is prepared yet: no model is made, and no object is learnt."""
     _check("model", model, (*model_names(), PATH_TRACED))
     _check("orders", orders, ORDERS)
     state, config = _parsed(scene, parameters or {})
@@ -56,14 +72,19 @@ def load_scene(
             props["model"] = model
         if orders:
             props["orders"] = orders
-    _choose_integrator(state, model, bool(model or orders))
+    _choose_integrator(state, model, bool(model or orders), settings or {})
+    _set_parameters(state, settings or {})
     loaded = _made(state, config)
-    integrator = loaded.integrator()
-    if hasattr(integrator, "prepare"):
-        integrator.prepare(loaded)  # here, because Mitsuba wraps what is refused while it renders
-    elif not any(hasattr(shape.bsdf(), "inside") for shape in loaded.shapes()):
+    if not any(hasattr(shape.bsdf(), "inside") for shape in loaded.shapes()):
         raise ValueError(_NO_OBJECT)
     return loaded
+
+
+def _set_parameters(state: Any, settings: Mapping[str, float]) -> None:
+    for node in state.nodes if settings else ():
+        if node.props.plugin_name() == _INTEGRATORS[False]:
+            for key, value in settings.items():
+                node.props[key] = value
 
 
 def load_objects(scene: dict | str | Path, parameters: Mapping[str, str] | None = None) -> Any:
@@ -150,8 +171,8 @@ def _unreadable(scene: dict | str | Path, error: RuntimeError) -> ValueError:
     return ValueError(f"{name} cannot be read: {first_cause(error)}")
 
 
-def _choose_integrator(state: Any, model: str | None, asked: bool) -> None:
-    """Make the integrator fit what is asked for."""
+def _choose_integrator(state: Any, model: str | None, asked: bool, settings: Mapping[str, float]) -> None:
+    """Make the integrator fit what is asked for; one that is made gets the settings."""
     import mitsuba as mi
 
     wanted = _INTEGRATORS[model == PATH_TRACED]
@@ -162,7 +183,8 @@ def _choose_integrator(state: Any, model: str | None, asked: bool) -> None:
         return
     others = [node.props for node in state.nodes if node.type == mi.ObjectType.Integrator]
     if not others:
-        state.nodes[0].props["integrator"] = mi.load_dict({"type": wanted})
+        given = {} if model == PATH_TRACED else settings
+        state.nodes[0].props["integrator"] = mi.load_dict({"type": wanted, **given})
     elif asked:
         name = others[0].plugin_name()
         warnings.warn(f"the integrator {name!r} of the scene is replaced by {wanted!r}", stacklevel=3)

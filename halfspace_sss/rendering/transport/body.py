@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -75,8 +75,8 @@ class Bodies:
         return self._made[1]
 
 
-def make_bodies(scene: Any, settings: Settings) -> list[Body]:
-    """All objects of a scene that have a `translucent` surface.
+def make_bodies(scene: Any, settings: Settings, without: Collection[str] = ()) -> list[Body]:
+    """All objects of a scene that have a `translucent` surface, but for those with the ids in `without`.
 
     Raises:
         ValueError: there is none, a camera is inside one, a model refuses its medium, or the orders that are asked for
@@ -85,7 +85,7 @@ def make_bodies(scene: Any, settings: Settings) -> list[Body]:
     shapes = translucent_shapes(scene)
     if not shapes:
         raise ValueError("the scene must have an object with a translucent BSDF, got none")
-    bodies = [_make_body(shape, settings) for shape in shapes]
+    bodies = [_make_body(shape, settings) for shape in shapes if shape.id() not in without]
     check_sensors(scene, [body.found for body in bodies])
     return bodies
 

@@ -28,6 +28,8 @@ class Settings:
             object.
         entries: points of entry that an exit draws, of which one is followed, chosen by what it may bring.
         hide_emitters: whether directly visible emitters are left out.
+        train_seconds: time for each object whose model has to learn it first; 0 refuses objects without weights.
+        train_error: relative error under constant light, measured on the way, from which on it has learnt enough.
     """
 
     mm_per_unit: float = 1.0
@@ -37,6 +39,8 @@ class Settings:
     area_share: float = AUTOMATIC
     entries: int = 1
     hide_emitters: bool = False
+    train_seconds: float = 60.0
+    train_error: float = 0.03
 
     def __post_init__(self) -> None:
         check_interval("mm_per_unit", self.mm_per_unit, 1e-9, 1e9)
@@ -50,6 +54,8 @@ class Settings:
             raise ValueError(f"geometry must be one of {', '.join(GEOMETRIES)}, got {self.geometry!r}")
         if self.area_share != AUTOMATIC:
             check_interval("area_share", self.area_share, 0.0, 1.0)
+        check_interval("train_seconds", self.train_seconds, 0.0, 1e7)
+        check_interval("train_error", self.train_error, 1e-4, 1.0)
 
 
 def read_settings(props: Any) -> Settings:

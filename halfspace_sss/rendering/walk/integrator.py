@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -10,17 +11,19 @@ from halfspace_sss.rendering.surface.object import same_objects
 from halfspace_sss.rendering.surface.parameters import OF_MITSUBA, check_parameters
 from halfspace_sss.rendering.surface.sensors import check_sensors
 from halfspace_sss.rendering.walk.connect import find_joins
+from halfspace_sss.rendering.walk.first_exits import FirstExits
 from halfspace_sss.rendering.walk.guide import Guide
 from halfspace_sss.rendering.walk.light import LightVisitor
 from halfspace_sss.rendering.walk.media import WalkMedia
 from halfspace_sss.rendering.walk.tracing import PathTracer
 
-__all__ = ["walk_integrator_class"]
+__all__ = ["camera_rays", "walk_integrator_class"]
 
 PARAMETERS = ("mm_per_unit", "max_depth", "rr_depth", "hide_emitters", "join_share")
 SAMPLES_PER_LAUNCH = 2**21
 LANES = 2**14  # fastest of 2**12 to 2**18 on 2 cores
 FOREVER = 2**31 - 1
+Keep = Callable[[FirstExits], None]
 
 
 def walk_integrator_class() -> type:
@@ -56,11 +59,14 @@ def walk_integrator_class() -> type:
             return PathTracer(visitor, self.max_depth, self.rr_depth, self.hidden)
 
         def render(
-            self, scene: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0, develop: bool = True, evaluate: bool = True
-        ) -> Any:
+            self, scene: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0, develop: bool = True, evaluate: bool = True,
+            keep: Keep | None = None,
+        ) -> Any:  # fmt: skip
+            """The image; `keep` is called with the first exits of each launch, which are stored for it."""
             sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+            spp = spp or sensor.sampler().sample_count()
             with dr.suspend_grad():
-                _render(self.tracer(scene), sensor, int(mi.UInt32(seed)[0]), spp or sensor.sampler().sample_count())
+                _render(self.tracer(scene), sensor, int(mi.UInt32(seed)[0]), spp, keep)
                 return sensor.film().develop() if develop else None
 
         def sample(self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Any = True) -> tuple:
@@ -89,14 +95,14 @@ def _refuse_derivatives(*_: Any, **__: Any) -> None:
     raise ValueError("the integrator of a derivative of light must be bssrdf, got translucent_walk")
 
 
-def _render(tracer: PathTracer, sensor: Any, seed: int, spp: int) -> None:
+def _render(tracer: PathTracer, sensor: Any, seed: int, spp: int, keep: Keep | None) -> None:
     """Fill the film of a sensor, in launches that fit into memory."""
     import drjit as dr
 
     sensor.film().prepare([])
     most = max(1, SAMPLES_PER_LAUNCH // int(dr.prod(_sampled_size(sensor.film()))))
     for launch, start in enumerate(range(0, spp, most)):
-        _launch(tracer, sensor, min(most, spp - start), (seed, launch))
+        _launch(tracer, sensor, min(most, spp - start), (seed, launch), keep)
 
 
 def _samples(tracer: PathTracer, sampler: Any, ray: Any, active: Any) -> tuple[Any, Any, list]:
@@ -109,14 +115,17 @@ def _samples(tracer: PathTracer, sampler: Any, ray: Any, active: Any) -> tuple[A
     return dr.select(active, L, 0), active & seen, []
 
 
-def _launch(tracer: PathTracer, sensor: Any, spp: int, seed: tuple[int, int]) -> None:
+def _launch(tracer: PathTracer, sensor: Any, spp: int, seed: tuple[int, int], keep: Keep | None) -> None:
     """Trace spp rays through each pixel and add them to the film."""
     import drjit as dr
     import mitsuba as mi
 
     film = sensor.film()
-    rays, weight, position = _camera_rays(sensor, spp, seed)
-    L, seen = tracer.trace(rays, LANES, seed)
+    rays, weight, position = camera_rays(sensor, spp, seed)
+    exits = FirstExits.of(tracer.visitor.scene, tracer.visitor.media, rays) if keep else None
+    L, seen = tracer.trace(rays, LANES, seed, exits)
+    if keep:
+        keep(exits)
     block = film.create_block()
     block.set_coalesce(block.coalesce() and spp >= 4)
     L = weight * L
@@ -137,7 +146,7 @@ def _sampled_size(film: Any) -> Any:
     return size + 2 * film.rfilter().border_size() if film.sample_border() else size
 
 
-def _camera_rays(sensor: Any, spp: int, seed: tuple[int, int]) -> tuple[Any, Any, Any]:
+def camera_rays(sensor: Any, spp: int, seed: tuple[int, int]) -> tuple[Any, Any, Any]:
     """Rays of spp samples of each pixel, their weights, and their positions on the film."""
     import drjit as dr
     import mitsuba as mi

@@ -8,6 +8,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from halfspace_sss.rendering.walk.first_exits import FirstExits, FirstExitVisitor, Watched
 from halfspace_sss.rendering.walk.light import Light, LightVisitor, start_light
 from halfspace_sss.rendering.walk.steps import OUTSIDE, Walk, Walker, sample_bsdf, start_walk
 from halfspace_sss.tracing.walk import _generator, pass_seed
@@ -42,19 +43,20 @@ class PathTracer:
     rr_depth: int
     hide_emitters: bool
 
-    def trace(self, rays: Any, lanes: int, seed: tuple[int, ...]) -> tuple[Any, Any]:
-        """Radiance along each ray, and whether it hits anything."""
+    def trace(self, rays: Any, lanes: int, seed: tuple[int, ...], exits: FirstExits | None = None) -> tuple[Any, Any]:
+        """Radiance along each ray, and whether it hits anything; `exits`, if given, stores the first exits."""
         n = dr.width(rays)
         dr.eval(rays)
         lanes = min(lanes, n)
         L, seen = dr.zeros(mi.Spectrum, n), dr.zeros(mi.Bool, n)
         dr.eval(L, seen)
-        walker = Walker(self.visitor.media, self.visitor)
+        walker = Walker(self.visitor.media, FirstExitVisitor(self.visitor, exits) if exits else self.visitor)
         total = dr.opaque(mi.UInt32, n)
 
         def inside(p: Path) -> Path:
-            walk, light = walker.step(p.walk, p.light)
-            return replace(p, walk=walk, light=light)
+            record = Watched(p.light, p.index, p.depth == 1) if exits else p.light
+            walk, record = walker.step(p.walk, record)
+            return replace(p, walk=walk, light=record.light if exits else record)
 
         def renew(p: Path) -> Path:
             dr.scatter(L, p.light.L, p.index)

@@ -1,0 +1,150 @@
+"""Fig. 5: error of the image over time for walks alone, walks that learn, and the model trained before."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from figures.computing.against_time import modelled, trained_online, walked, weights_in
+from figures.computing.contenders import long_walk
+from figures.computing.scenes import BUNNY, prepare
+from figures.computing.tone import srgb
+from figures.drawing.shot import FLIP, RELATIVE_MSE, compared
+from figures.drawing.style import TEXT, Look, paper, saved
+from figures.parts.part import Part, Result, Task
+from full_geometry.storing import KIND
+from halfspace_sss.provenance import check_folder
+
+__all__ = ["TITLE", "draw", "parts", "rivals"]
+
+TITLE = "error of the image over time: walks alone, walks that learn, the model trained before"
+MATERIALS = {"draft": ("marble",), "paper": ("marble", "potato", "ketchup")}
+LIGHTS = "both"
+SIZES = {"draft": 64, "paper": 256}
+SECONDS = {"draft": 30.0, "paper": 600.0}  # of each way
+TRAIN_SECONDS = {"draft": 12.0, "paper": 60.0}
+TRUTH_SPP = {"draft": 256, "paper": 16384}
+WARM_UP = 0.5  # seconds of learning; the first run compiles
+LOOKS = {
+    "walks": Look("Walks alone", "#000000", "-"),
+    "online": Look("Learnt while rendering", "#C00000", "-"),
+    "before": Look("Trained before", "#0072B2", (0, (5, 1.6))),
+}
+
+
+def parts(quality: str) -> list[Part]:
+    """For each material a long path-traced image, then the three ways one after the other."""
+    size, seconds, found = SIZES[quality], SECONDS[quality], []
+    for material in MATERIALS[quality]:
+        common = {"material": material, "size": size, "lights": LIGHTS}
+        spp = TRUTH_SPP[quality]
+        found.append(
+            Part(f"{material}, truth", long_walk, {**common, "spp": spp, "seed": 0}, spp * size**2, inputs=(BUNNY,))
+        )
+        times = {"seconds": seconds, "train_seconds": TRAIN_SECONDS[quality]}
+        params = {**common, **times, "train_error": 1e-3, "model": KIND, "seed": 1}
+        found.append(Part(f"{material}, ways", rivals, params, 3 * seconds, inputs=(BUNNY,)))
+    return found
+
+
+def rivals(task: Task) -> dict[str, Any]:
+    """Images at growing times of each way, and what was learnt."""
+    prepare()
+    p, seconds = task.params, task.params["seconds"]
+    folder = check_folder(task.folder)
+    for name in ("first", "weights"):  # a run that was killed begins anew: its clock is gone
+        for path in (folder / name).glob("*"):
+            path.unlink()
+    for path in folder.glob("*.exr"):
+        path.unlink()
+    with weights_in(folder / "first"):  # compiles
+        trained_online(p, folder, WARM_UP, WARM_UP)
+        modelled(p, folder, WARM_UP)
+        walked(p, folder, WARM_UP)
+    for path in folder.glob("*.*"):
+        path.unlink()
+    task.progress(1, 4)
+    with weights_in(folder / "weights"):
+        online = trained_online(p, folder, seconds, p["train_seconds"])
+        task.progress(2, 4)
+        ways = {"online": online["snapshots"], "before": modelled(p, folder, seconds)}
+    task.progress(3, 4)
+    ways["walks"] = walked(p, folder, seconds)
+    images = {f"{way}-{k}": image for way, shots in ways.items() for k, image in enumerate(shots.images)}
+    numbers = {way: {"seconds": shots.times, "spp": shots.spp} for way, shots in ways.items()}
+    return {**images, "ways": numbers, "switch": online["switch"], "training": online["training"]}
+
+
+def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
+    """The figure as PDF and PNG, and the errors as a table."""
+    import pandas
+
+    materials = list(dict.fromkeys(name.split(",")[0] for name in results))
+    tables = {m: _errors(m, results[f"{m}, truth"], results[f"{m}, ways"]) for m in materials}
+    with paper():
+        files: dict[str, bytes | str] = {f"fig05.{end}": data for end, data in saved(_figure(results, tables)).items()}
+    rows = [row for table in tables.values() for row in table]
+    files["fig05.csv"] = pandas.DataFrame(rows).to_csv(index=False, lineterminator="\n")
+    return files
+
+
+def _gain(truth: Result) -> float:
+    """Of the images as they are shown: the object's 97th percentile is 1."""
+    image = truth.images["image"]
+    return 1 / float(np.percentile(image[image.max(axis=2) > 0], 97))
+
+
+def _errors(material: str, truth: Result, ways: Result) -> list[dict[str, Any]]:
+    """A row for each image: seconds, samples, relMSE and FLIP of the pixels of the object, and the phase."""
+    reference, gain = truth.images["image"], np.float32(_gain(truth))
+    mask, rows = reference.max(axis=2) > 0, []
+    for way, about in ways.numbers["ways"].items():
+        for k, (seconds, spp) in enumerate(zip(about["seconds"], about["spp"])):
+            image = np.maximum(ways.images[f"{way}-{k}"], 0)
+            shot = compared(way, gain * image, gain * reference, mask=mask)
+            learning = way == "online" and seconds < ways.numbers["switch"]
+            row = {"material": material, "way": way, "phase": "learning" if learning else "rendering"}
+            rows.append({**row, "seconds": seconds, "spp": spp, **shot.numbers})
+    return rows
+
+
+def _figure(results: Mapping[str, Result], tables: Mapping[str, list[dict[str, Any]]]) -> Any:
+    """A row for each material: relMSE and FLIP over seconds, and the last images."""
+    from matplotlib.figure import Figure
+
+    columns = (1.6, 1.6, 1, 1, 1, 1)
+    figure = Figure(figsize=(TEXT, 1.75 * len(tables) + 0.35), layout="constrained")
+    grid = figure.subplots(len(tables), len(columns), squeeze=False, width_ratios=columns)
+    for axes, (material, rows) in zip(grid, tables.items()):
+        truth, ways = results[f"{material}, truth"], results[f"{material}, ways"]
+        for ax, key in zip(axes, (RELATIVE_MSE, FLIP)):
+            _curves(ax, rows, key, ways.numbers["switch"])
+        axes[0].set_title(f"{material}: {_told(ways)}", loc="left", pad=3)
+        shown = {"Truth": truth.images["image"]}
+        for way, look in LOOKS.items():
+            shown[look.label] = ways.images[f"{way}-{len(ways.numbers['ways'][way]['spp']) - 1}"]
+        for ax, (label, image) in zip(axes[2:], shown.items()):
+            ax.imshow(srgb(_gain(truth) * np.maximum(image, 0)), interpolation="nearest")
+            ax.set(xticks=[], yticks=[])
+            ax.set_title(label, pad=3, fontsize=7)
+    handles, labels = grid[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False, handlelength=2.8)
+    return figure
+
+
+def _curves(ax: Any, rows: list[dict[str, Any]], key: str, switch: float) -> None:
+    for way, look in LOOKS.items():
+        points = [(row["seconds"], row[key]) for row in rows if row["way"] == way]
+        ax.plot(*zip(*points), color=look.color, ls=look.dash, marker="o", ms=1.8, mew=0, label=look.label)
+    ax.axvline(switch, color="0.5", lw=0.7, ls=":", label="Switch to the model")
+    ax.set(xscale="log", yscale="log", ylabel=key, xlabel="seconds")
+    ax.grid(color="0.9", lw=0.4)
+
+
+def _told(ways: Result) -> str:
+    """The error of the model at the switch, the largest of the channels under constant light."""
+    (trained,) = ways.numbers["training"]
+    worst = max((row for row in trained["errors"] if row["light"] == "constant"), key=lambda row: row["error"])
+    return f"model's error {100 * worst['error']:.1f} ± {100 * worst['standard_error']:.1f} %"

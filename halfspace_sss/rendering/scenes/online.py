@@ -1,0 +1,197 @@
+"""Renders of scenes with objects that have to be learnt first: walks until they are, and both in one image.
+
+    online.render("scene.xml", "image.exr", spp=256)
+
+Walks from the camera, exact and with light of all orders, make an image, and where they leave the object is what its
+model is learnt from, beside walks from random points. Once the error of the model is small enough, or the time for
+learning is over, the model renders, and the image is the mean of the two by their variances (`combined`).
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from halfspace_sss.checks import check_count
+from halfspace_sss.neural.trained import weights_folder
+from halfspace_sss.progress import NamedProgress
+from halfspace_sss.provenance import check_folder
+from halfspace_sss.rendering.scenes import reference
+from halfspace_sss.rendering.scenes.camera_walks import CameraWalks
+from halfspace_sss.rendering.scenes.combined import combined
+from halfspace_sss.rendering.scenes.learners import LearntObject, learner
+from halfspace_sss.rendering.scenes.reference_store import Reference, load, save
+from halfspace_sss.rendering.surface.transports import knows_objects
+
+__all__ = ["files", "render", "untrained"]
+
+TRAINING = "training"
+
+
+def files(path: Path) -> dict[str, Path]:
+    """Beside the image at `path`: the images by walks and by the model that it is made of, and unfinished training."""
+    return {name: path.with_suffix(f".{name}") for name in ("walks.exr", "model.exr", "training")}
+
+
+def untrained(scene: Any) -> dict[str, list[str]]:
+    """Ids of the objects that are learnt before the scene is rendered, by the name of their model.
+
+    Raises:
+        ValueError: one cannot be learnt, or there is no place for its weights.
+    """
+    settings = getattr(scene.integrator(), "settings", None)
+    if not getattr(settings, "train_seconds", 0) > 0:
+        return {}
+    insides = [shape.bsdf().inside for shape in scene.shapes() if hasattr(shape.bsdf(), "inside")]
+    names = sorted({inside.model for inside in insides if knows_objects(inside.model)})
+    found = {}
+    for name in names:
+        asked = getattr(learner(name), "untrained", None)
+        if asked and (ids := asked(scene)):
+            found[name] = ids
+    return found
+
+
+def render(
+    scene: Any,
+    path: str | os.PathLike,
+    *,
+    sensor: int = 0,
+    seed: int = 0,
+    resume: bool | str | os.PathLike = True,
+    progress: reference.Progress | None = None,
+    walked: reference.Progress | None = None,
+    learning: NamedProgress | None = None,
+    told: Callable[[str], None] | None = None,
+    **limits: Any,
+) -> Reference:
+    """`reference.render`, before which objects without weights are learnt from walks that join the image.
+
+    The limits are those of the model's image; what walks have traced comes on top. How long an object may be learnt,
+    and up to which error, the integrator says (`train_seconds`, `train_error`). Walks join the image if every
+    translucent object of the scene has a model that is learnt: others are to look as their models have it. A run that
+    was killed and goes on ends with the same weights and the same image.
+
+    Args:
+        scene: a dict, the path of an XML file, or a Mitsuba scene.
+        path: of the EXR file; while it is made, the parts are beside it, see `files`.
+        sensor: number of the sensor.
+        seed: of walks, learning and render.
+        resume: True goes on with what is at `path`, False begins anew, another path goes on with what is there.
+        progress: called after each pass of the model, with its image.
+        walked: called after each pass of walks, with theirs.
+        learning: called with (what, done, total) while an object is learnt.
+        told: called with a sentence before an object is learnt.
+        limits: as of `reference.render`: spp, passes, target_error, seconds, spp_per_pass, interval.
+
+    Returns:
+        The image; `about["combined"]` tells of the two phases, `about["training"]` of what was learnt.
+
+    Raises:
+        ValueError: as `reference.render`, or an object cannot be learnt; nothing has been traced then.
+    """
+    path = Path(path)
+    check_count("seed", seed, 0)
+    reference.Limits(*(limits.get(name) for name in ("spp", "passes", "target_error", "seconds")))
+    check_folder(path.parent)
+    scene, integrator = reference.loaded(scene, None, sensor)
+    about = reference.about_render(scene, integrator, sensor, seed)
+    parts, base = files(path), path if isinstance(resume, bool) else Path(resume)
+    if resume is False:
+        _forget(parts)
+    elif base != path:
+        _fetch(files(base), parts)
+    names = untrained(scene)
+    how = {"sensor": sensor, "seed": seed, "progress": progress, **limits}
+    if not names and not parts["walks.exr"].exists():
+        if hasattr(integrator, "prepare"):
+            integrator.prepare(scene)  # here, because Mitsuba wraps what is refused while it renders
+        return reference.render(scene, path, resume=resume, **how)
+    walks = CameraWalks(scene, integrator.settings, sensor, seed, parts["walks.exr"], about, walked)
+    if walks.found is not None:
+        reference.check_same(walks.found, parts["walks.exr"], about)
+    if names:
+        walks.check()
+        integrator.check(scene, [name for ids in names.values() for name in ids])
+    records = _learnt(scene, walks, seed, parts["training"], learning, told or (lambda sentence: None))
+    integrator.prepare(scene)
+    if walks.found is None:
+        found = reference.render(scene, path, resume=resume, **how)
+        found = replace(found, about={**found.about, TRAINING: records})
+    else:
+        model = reference.render(scene, parts["model.exr"], **how)
+        found = combined(walks.found, model)
+        found = replace(found, about={**found.about, TRAINING: walks.found.about.get(TRAINING, [])})
+    save(path, found)
+    shutil.rmtree(parts["training"], ignore_errors=True)
+    return found
+
+
+def _learnt(
+    scene: Any, walks: CameraWalks, seed: int, work: Path, learning: NamedProgress | None, told: Callable[[str], None]
+) -> list[dict[str, Any]]:
+    """Learn one object after the other; those of the same mesh and medium share what was learnt."""
+    settings, camera, records = scene.integrator().settings, walks if _join(scene) else None, []
+    while names := untrained(scene):
+        model, (name, *_) = next(iter(names.items()))
+        if any(name == record["object"] for record in records):
+            raise ValueError(f"weights of object {name!r} must be found once they are written, got none")
+        told(_sentence(name, model, settings, camera is not None))
+        found = learner(model).train(
+            scene, object=name, seconds=settings.train_seconds, target_error=settings.train_error, seed=seed,
+            folder=None, work=work / name, progress=learning, camera=camera,
+        )  # fmt: skip
+        records.append(_record(found, model))
+        if walks.found is not None:
+            known = walks.found.about.get(TRAINING, [])
+            walks.found = replace(walks.found, about={**walks.found.about, TRAINING: [*known, records[-1]]})
+            walks.save()
+    return records
+
+
+def _join(scene: Any) -> bool:
+    """Whether walks show what the models show: all objects are learnt, and paths go farther than to an object."""
+    insides = [shape.bsdf().inside for shape in scene.shapes() if hasattr(shape.bsdf(), "inside")]
+    return scene.integrator().settings.max_depth != 1 and all(knows_objects(inside.model) for inside in insides)
+
+
+def _sentence(name: str, model: str, settings: Any, joined: bool) -> str:
+    use = "which join the image" if joined else "which cannot join the image"
+    return (
+        f"object {name!r} has no weights of {model} yet: it is learnt for {settings.train_seconds:g} s, or until its "
+        f"error is below {100 * settings.train_error:g} %, from walks, {use}; then the model renders; weights are kept "
+        f"in {weights_folder()}"
+    )
+
+
+def _record(found: LearntObject, model: str) -> dict[str, Any]:
+    """What the header of the image tells of a training."""
+    return {
+        "object": found.object,
+        "model": model,
+        "weights": found.path.name if found.path else None,
+        "steps": found.steps,
+        "seconds": found.seconds,
+        "errors": [row._asdict() for row in found.errors],
+    }
+
+
+def _forget(parts: dict[str, Path]) -> None:
+    """Remove what a run before left."""
+    for path in parts.values():
+        if path.suffix == ".training":
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            for one in (path, path.with_suffix(".json")):
+                one.unlink(missing_ok=True)
+
+
+def _fetch(there: dict[str, Path], here: dict[str, Path]) -> None:
+    """Go on with the parts of a finished image, which stay as they are."""
+    for name in ("walks.exr", "model.exr"):
+        if there[name].exists() and not here[name].exists():
+            save(here[name], load(there[name]))
