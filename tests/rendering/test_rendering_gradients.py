@@ -46,7 +46,7 @@ def test_derivatives_by_the_medium_agree_with_finite_differences_for_every_model
     if name in UNTRAINED and parameter != "sigma_t":
         pytest.skip("trained for one albedo and g")
     model = halfspace_sss.interface.model.bssrdf(name, Medium(**MEDIUM))
-    scene = make("point", name, n=4, floor=False, orders="total" if model.orders == "total" else "multiple")
+    scene = make("point", name, n=8, floor=False, orders="total" if model.orders == "total" else "multiple")
     expected, size = medium_difference(scene, parameter)
     assert backward(scene, f"ball.bsdf.{parameter}").sum() == pytest.approx(expected, abs=2e-3 * size)
 

@@ -21,7 +21,8 @@ Parameters, all optional but the medium:
         first two. For a medium that varies in space `albedo` and one of `sigma_t` and `scale` may be a `gridvolume`.
     model: name of a model of the library, by default "neural"; or "full_geometry", S of this very object, which is
         learnt before its first render, or by `halfspace-sss train --scene`.
-    orders: "total" (single scattering is added where the model lacks it), "multiple" or "single".
+    orders: "total" (what the model lacks of the orders below two is traced; order 0 only beside a model that knows
+        the object), "multiple" or "single".
     channel: R, G or B, or a number; under a mono variant, for a medium with channels.
     dilution: of a material that has one, see `halfspace_sss.materials.load`.
     a BSDF inside: the boundary, a `dielectric` or `roughdielectric` with int_ior / ext_ior equal to the eta of the
