@@ -16,6 +16,8 @@ from halfspace_sss.rendering.scenes.learners import LearntObject, ObjectError
 
 __all__ = ["errors", "train"]
 
+PAPER = "full_geometry_paper"
+
 
 def train(
     scene: Any,
@@ -51,7 +53,8 @@ def errors(
 
     Args:
         scene: with the object.
-        models: "full_geometry", whose weights must have been trained, and half-space models; by default all of them
+        models: "full_geometry" and "full_geometry_paper", whose weights must have been trained, and half-space models;
+            by default all of them
             that have learnt the object or take its medium.
         object: its id; may be left out where there is one.
         seed: of everything.
@@ -61,6 +64,12 @@ def errors(
         ValueError: there is no such model or object, or a model that is named refuses it.
     """
     check_count("seed", seed, 0)
+    if PAPER in models:
+        from full_geometry.paper import learner as papers
+
+        others = [name for name in models if name != PAPER]
+        found = errors(scene, others, object=object, seed=seed, progress=progress) if others else []
+        return [*found, *papers.errors(scene, object=object, seed=seed)]
     subject = Subject.given(scene, None, None, object)
     transports = {name: transport(subject, name) for name in models} or _that_take(subject)
     name = subject.found.shape.id()
