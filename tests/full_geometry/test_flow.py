@@ -199,7 +199,7 @@ class Numbers:
 
 
 def test_proposals_of_the_flow_and_of_patches_give_the_same_estimate(sampler: FlowSampler) -> None:
-    subject, n = sampler.chart.subject, 2**17
+    subject, n = sampler.chart.subject, 2**18
     at = subject.points.sample(floats(uniform(n, 1, 20))[0], mi.Point2f(uniform(n, 2, 21)), True)
     sign = subject.found.sign
     n_out = mi.Normal3f(at.n_shading * sign)
