@@ -32,6 +32,7 @@ class FlowRecipe:
 
     Args:
         seconds: of CPU time of this process, data included.
+        steps: instead of the seconds, where the end is to be the same every time.
         batch, rate: of a step.
         chunk: walks that are made at once.
         reuse: times that each is used.
@@ -40,6 +41,7 @@ class FlowRecipe:
     """
 
     seconds: float = 30.0
+    steps: int | None = None
     batch: int = 2048
     rate: float = 4e-3
     chunk: int = 2**16
@@ -52,6 +54,7 @@ class FlowRecipe:
         check_interval("rate", self.rate, 1e-8, 1.0)
         for name in ("batch", "chunk", "reuse"):
             check_count(name, getattr(self, name), 1)
+        check_count("steps", 1 if self.steps is None else self.steps, 1)
 
 
 class Schedule:
@@ -69,7 +72,9 @@ class Schedule:
 
     @property
     def spent(self) -> float:
-        """Share of the seconds, in [0, 1]."""
+        """Share of the seconds, or steps, in [0, 1]."""
+        if self.recipe.steps is not None:
+            return min(self.steps / self.recipe.steps, 1.0)
         return min((time.process_time() - self.started) / self.recipe.seconds, 1.0)
 
     def run(self, data: Callable[[int], Walks], loss: Callable[[Walks, np.ndarray], torch.Tensor], seed: int) -> None:

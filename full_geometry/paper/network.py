@@ -36,12 +36,14 @@ class PaperRecipe:
     Args:
         n: incident samples N of an exit.
         seconds: of CPU time of this process, data included.
+        steps: instead of the seconds, where the end is to be the same every time.
         batch, rate: of a step.
         exits: that are made at once, N walks each. reuse: times that each is used, under new light.
     """
 
     n: int = 16
     seconds: float = 60.0
+    steps: int | None = None
     batch: int = 256
     rate: float = 1e-3
     exits: int = 2**12
@@ -51,6 +53,7 @@ class PaperRecipe:
         check_interval("seconds", self.seconds, 1e-3, 1e6)
         for name in ("n", "batch", "exits", "reuse"):
             check_count(name, getattr(self, name), 1)
+        check_count("steps", 1 if self.steps is None else self.steps, 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,7 +147,12 @@ def fit_paper(
     net = PaperNetwork(recipe.n, channels, seed)
     adam = torch.optim.Adam(net.parameters(), lr=recipe.rate)
     rng, began, steps, below, chunk = np.random.default_rng([seed, 80]), time.process_time(), 0, 0, 0
-    while time.process_time() - began < recipe.seconds and below < FOR_STEPS:
+
+    def ends() -> bool:
+        spent = time.process_time() - began > recipe.seconds if recipe.steps is None else steps >= recipe.steps
+        return spent or below >= FOR_STEPS
+
+    while not ends():
         generator = _generator(mi, recipe.exits, pass_seed(seed, 81, chunk))
         samples = walk_samples(subject, frame, subject.random_points(generator), recipe.n, (seed, 82, chunk))
         for _ in range(recipe.reuse):
@@ -152,7 +160,7 @@ def fit_paper(
                 error = _step(net, adam, samples, rows, rng)
                 below = below + 1 if error < ENOUGH else 0
                 steps += 1
-                if below >= FOR_STEPS or time.process_time() - began > recipe.seconds:
+                if ends():
                     return net, steps
         chunk += 1
         if progress:

@@ -18,16 +18,21 @@ dr = pytest.importorskip("drjit")
 torch = pytest.importorskip("torch")
 pytest.importorskip("zuko")
 
-from full_geometry.features import Side, n_side  # noqa: E402
+from full_geometry.entries import LearntProposals  # noqa: E402
+from full_geometry.features import N_PAIR, Side, n_side  # noqa: E402
 from full_geometry.first_event import first_event  # noqa: E402
 from full_geometry.flow.chart import Chart  # noqa: E402
 from full_geometry.flow.conditional import ConditionalFlow  # noqa: E402
 from full_geometry.flow.context import N_CONTEXT, direction_square, from_square  # noqa: E402
 from full_geometry.flow.fitting import FlowNetwork  # noqa: E402
-from full_geometry.flow.sampler import FlowSampler  # noqa: E402
-from full_geometry.identity import frame_of  # noqa: E402
+from full_geometry.flow.sampler import FlowProposals, FlowSampler  # noqa: E402
+from full_geometry.identity import frame_of, identify  # noqa: E402
+from full_geometry.model import PreparedExit  # noqa: E402
+from full_geometry.patch_table import PatchTable  # noqa: E402
 from full_geometry.patches import Patches, PatchSampler, cluster, mesh_faces  # noqa: E402
-from full_geometry.subject import Subject  # noqa: E402
+from full_geometry.storing import CENTRES, add_flow, load, save  # noqa: E402
+from full_geometry.subject import Subject, SurfacePoint  # noqa: E402
+from halfspace_sss.rendering.transport.plane import Exit  # noqa: E402
 from halfspace_sss.tracing.walk import _generator, pass_seed  # noqa: E402
 
 BUNNY = Path(__file__).parents[2] / "figures" / "assets" / "bunny.ply"
@@ -178,3 +183,53 @@ def test_directions_come_back_from_their_square() -> None:
     back = direction_square(normal, towards, w)
     assert np.quantile(np.abs(np.stack([np.array(v) for v in back]) - np.stack([np.array(v) for v in u])), 0.995) < 1e-2
     assert np.all(np.array(dr.dot(w, normal)) > -1e-6)
+
+
+class Numbers:
+    """Uniform numbers as Mitsuba's samplers name them."""
+
+    def __init__(self, n: int, seed: int) -> None:
+        self.rng = _generator(mi, n, pass_seed(seed))
+
+    def next_1d(self):
+        return self.rng.next_float32()
+
+    def next_2d(self):
+        return mi.Point2f(self.rng.next_float32(), self.rng.next_float32())
+
+
+def test_proposals_of_the_flow_and_of_patches_give_the_same_estimate(sampler: FlowSampler) -> None:
+    subject, n = sampler.chart.subject, 2**18
+    at = subject.points.sample(floats(uniform(n, 1, 20))[0], mi.Point2f(uniform(n, 2, 21)), True)
+    sign = subject.found.sign
+    n_out = mi.Normal3f(at.n_shading * sign)
+    exit = Side(SurfacePoint(at.p, mi.Normal3f(at.n * sign), n_out, mi.Vector3f(n_out)), None)
+    exit = exit._replace(event=first_event(subject, exit.at))
+    out, on, table = Exit(at.p, n_out, mi.Vector3f(n_out), mi.Float(sign)), mi.Bool(True), PatchTable(sampler.patches)
+    means, errors = [], []
+    for k, proposals in enumerate(
+        (FlowProposals(sampler, sign), FlowProposals(sampler, sign, table),
+         LearntProposals(sampler.patches, None, 1.0, sign, table))
+    ):  # fmt: skip
+        where = proposals.prepare(out, PreparedExit(exit, []), on)
+        entry = proposals.sample(out, at.prim_index, where, Numbers(n, 22 + k), on)
+        near = dr.exp(-0.05 * dr.squared_norm(entry.p - at.p))
+        values = np.array(near * entry.weight, dtype=float)
+        means.append(values.mean())
+        errors.append(values.std() / np.sqrt(n))
+    for a, b in ((0, 1), (0, 2), (1, 2)):
+        assert abs(means[a] - means[b]) < 4 * np.hypot(errors[a], errors[b])
+    assert max(errors) < 0.03 * means[0]
+
+
+def test_weights_with_a_flow_are_drawn_from_by_it(sampler: FlowSampler, tmp_path: Path) -> None:
+    subject, frame = sampler.chart.subject, sampler.frame
+    rng, n = np.random.default_rng(6), 2 * n_side(3) + N_PAIR
+    arrays = {"W_0": rng.standard_normal((3, n)), "b_0": np.zeros(3), CENTRES: cluster(subject, frame, N_PATCHES)}
+    arrays = {name: value.astype(np.float16) for name, value in {**arrays, **sampler.patches.weights}.items()}
+    path = save(tmp_path, identify(subject), arrays, {"recipe": {"backbone": "better_dipole"}})
+    assert load(path, subject).flow is None
+    add_flow(path, sampler)
+    found = load(path, subject).flow
+    told_, x = floats(told(512)), floats(uniform(512, 2, 23))
+    assert np.allclose(np.array(found.flow.density(told_, x)), np.array(sampler.flow.density(told_, x)), rtol=5e-2)

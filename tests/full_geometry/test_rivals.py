@@ -8,7 +8,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pandas
 import pytest
+from typer.testing import CliRunner
 
 from halfspace_sss import Medium
 
@@ -30,12 +32,15 @@ from full_geometry.flow.sampler import FlowSampler  # noqa: E402
 from full_geometry.flow.training import FlowRecipe  # noqa: E402
 from full_geometry.identity import frame_of  # noqa: E402
 from full_geometry.learning.model_errors import reference  # noqa: E402
+from full_geometry.paper import learner  # noqa: E402
 from full_geometry.paper import network as paper  # noqa: E402
 from full_geometry.paper.errors import paper_errors  # noqa: E402
 from full_geometry.paper.flow import mesh_arrays, on_surface, rmsd  # noqa: E402
 from full_geometry.paper.lights import measured_lights, random_lights  # noqa: E402
 from full_geometry.patches import Patches, PatchSampler, cluster  # noqa: E402
+from full_geometry.rivals.command import _errors_wide, markdown  # noqa: E402
 from full_geometry.subject import Subject  # noqa: E402
+from halfspace_sss.cli import app as cli  # noqa: E402
 from halfspace_sss.rendering.transport.protocols import Entry  # noqa: E402
 from halfspace_sss.tracing.walk import _generator, pass_seed  # noqa: E402
 
@@ -89,11 +94,11 @@ def test_alpha_is_the_light_that_comes_back_from_everywhere(subject: Subject, sh
 
 
 def test_a_little_training_brings_alpha_to_the_truth(subject: Subject) -> None:
-    model = fit_alpha_p(subject, FlowRecipe(seconds=3.0, chunk=2**13, batch=512))
+    model = fit_alpha_p(subject, FlowRecipe(steps=320, chunk=2**13, batch=512, rate=8e-3))
     truth = reference(subject, 64, 512)
     alpha = np.array(model.prepare(truth.exits).alpha)
     wanted = (truth.truth.mean[:, :, 0] / np.array(model.scale)[:, None]).mean(axis=0)
-    assert np.corrcoef(alpha, wanted)[0, 1] > 0.5
+    assert np.corrcoef(alpha, wanted)[0, 1] > 0.4  # of 64 exits: by chance less than once in a thousand
     assert abs(alpha.mean() / wanted.mean() - 1) < 0.15
 
 
@@ -105,7 +110,7 @@ def test_the_papers_network_takes_5_and_8_for_each_sample() -> None:
 
 def test_the_papers_network_learns_from_walks(subject: Subject) -> None:
     truth = reference(subject, 64, 512)
-    recipe = paper.PaperRecipe(n=8, seconds=4.0, batch=128, exits=512, reuse=8)
+    recipe = paper.PaperRecipe(n=8, steps=100, batch=128, exits=512, reuse=8)
     net, steps = paper.fit_paper(subject, recipe)
     fresh = paper_errors(subject, paper.PaperNetwork(8), truth, repeats=4)
     assert steps > 10
@@ -148,3 +153,52 @@ def test_no_light_comes_from_below_the_surface(subject: Subject, kind: str) -> N
     w, value = lighting(kind, subject).sample(entry, mi.Point2f(0.3, 0.6), mi.Bool(True))
     value, mu = np.array(value), np.array(dr.dot(w, at.n_out))
     assert np.all(value[mu <= 0] == 0) and np.all(value >= 0) and (value > 0).mean() > 0.1
+
+
+XML = f"""<scene version="3.0.0">
+  <integrator type="bssrdf"><float name="mm_per_unit" value="1"/></integrator>
+  <emitter type="constant"/>
+  <shape type="ply" id="bunny"><string name="filename" value="{BUNNY}"/><bsdf type="translucent">
+    <string name="sigma_s" value="0.95,0.8,0.6"/><string name="sigma_a" value="0.05,0.2,0.4"/></bsdf></shape>
+</scene>
+"""
+
+
+@pytest.fixture
+def scene_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("HALFSPACE_SSS_WEIGHTS", str(tmp_path / "weights"))
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "bunny.xml").write_text(XML)
+    return tmp_path / "bunny.xml"
+
+
+def test_the_papers_network_is_trained_and_measured_by_the_commands(
+    scene_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(learner, "EXITS", 32)
+    monkeypatch.setattr(learner, "WALKS", 64)
+    name = "full_geometry_paper"
+    run = CliRunner().invoke(cli.app, ["train", "--scene", str(scene_file), "--model", name, "--seconds", "1"])
+    assert run.exit_code == 0 and name in run.stdout, run.output
+    run = CliRunner().invoke(cli.app, ["errors", "--scene", str(scene_file), "--model", name])
+    assert run.exit_code == 0 and "constant" in run.stdout, run.output
+
+
+@pytest.mark.parametrize(
+    "bad, message",
+    [
+        (["--table", "images"], "table must be one of errors, samplers"),
+        (["--seconds", "0"], "seconds must"),
+        (["--samples", "1"], "samples must"),
+    ],
+)
+def test_tables_refuse_bad_input_before_anything_is_traced(scene_file: Path, bad: list[str], message: str) -> None:
+    run = CliRunner().invoke(cli.app, ["rivals", "--scene", str(scene_file), *bad])
+    assert run.exit_code != 0 and message in run.output
+
+
+def test_a_table_of_errors_has_a_row_for_each_model() -> None:
+    rows = [{"model": m, "channel": c, "light": "constant", "error": 0.1, "standard_error": 0.01, "ratio": 1.0}
+            for m in ("a", "b") for c in (0, 1)]  # fmt: skip
+    text = markdown(_errors_wide(pandas.DataFrame(rows)))
+    assert text.splitlines()[2:] == ["| a | 10 ± 1 | 10 ± 1 |", "| b | 10 ± 1 | 10 ± 1 |"]
