@@ -10,7 +10,7 @@ import numpy as np
 
 from full_geometry.features import Frame
 from full_geometry.subject import Subject
-from full_geometry.varying import check_same, digest_of_grids, probed
+from halfspace_sss.rendering.surface.varying import grid_values
 from halfspace_sss.rendering.transport.plane import number
 
 __all__ = ["Identity", "frame_of", "identify"]
@@ -18,6 +18,9 @@ __all__ = ["Identity", "frame_of", "identify"]
 ANCHORS = 256
 CLOSE = 1e-4  # positions over the size of the object, coefficients relative
 SAMPLED = 0.05  # of the homogeneous equivalent of a medium that varies, a mean over random points
+PROBED = 64  # anchors towards which a medium that varies is probed,
+DEPTHS = (1.0, 0.7, 0.4)  # at these parts of their distance from the middle
+NEAR, MOST_FAR = 1e-2, 0.03  # of the largest coefficient; share of points, for voxels that are not interpolated
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +33,7 @@ class Identity:
         anchors: points that move with the shape, (n, 3), scene units.
         medium: per channel albedo, g and sigma_t sqrt(area), and eta; of a medium that varies its equivalent.
         grids: digest of the voxels of a medium that varies.
-        probes: coefficients of a medium that varies, see `varying.probed`.
+        probes: coefficients of a medium that varies, see `_probed`.
     """
 
     kind: str
@@ -82,7 +85,7 @@ class Identity:
             if np.shape(mine) != np.shape(theirs) or not np.allclose(mine, theirs, rtol=close, atol=1e-7):
                 raise ValueError(f"{key} of the medium must be {mine}, as trained, got {theirs}")
         if self.grids:
-            check_same(self.probes, other.probes)
+            _check_same(self.probes, other.probes)
         return R, t
 
 
@@ -120,8 +123,51 @@ def identify(subject: Subject) -> Identity:
     media = subject.media
     medium = {key: [float(getattr(m, key)) for m in media] for key in ("albedo", "g")}
     medium |= {"size_in_mfp": subject.mean_free_paths().tolist(), "eta": float(subject.eta)}
-    grids, probes = digest_of_grids(subject), probed(subject, anchors)
+    grids, probes = _digest_of_grids(subject), _probed(subject, anchors)
     return Identity(shape.class_name(), topology, anchors.astype(np.float32), medium, grids, probes)
+
+
+def _digest_of_grids(subject: Subject) -> str:
+    """Of the voxels and of the ratios of what they are multiplied by; empty for a homogeneous medium."""
+    medium = subject.varying
+    if medium is None:
+        return ""
+    found = hashlib.sha256()
+    for volume in (medium.density, medium.albedo_volume):
+        voxels = np.zeros(0) if volume is None else np.ascontiguousarray(grid_values(volume), dtype=np.float32)
+        found.update(str(voxels.shape).encode() + voxels.tobytes())
+    ratios = (*medium.factor / medium.factor.max(), *medium.albedo)
+    found.update("|".join(f"{v:.6g}" for v in ratios).encode())
+    return found.hexdigest()[:16]
+
+
+def _probed(subject: Subject, anchors: np.ndarray) -> np.ndarray:
+    """sigma_t and sigma_s times sqrt(area) at points that move with the shape, (2 channels, points); none if constant.
+
+    They tell grids that lie elsewhere in the object, or are interpolated in another way.
+    """
+    import mitsuba as mi
+
+    if subject.varying is None:
+        return np.zeros((0, 0), dtype=np.float32)
+    centre, some = anchors.mean(axis=0), anchors[:: max(len(anchors) // PROBED, 1)]
+    points = np.concatenate([centre + depth * (some - centre) for depth in DEPTHS])
+    values = np.concatenate(subject.varying.coefficients(mi.Point3f(points.T.astype(np.float32))))
+    return (values * np.sqrt(subject.found.area)).astype(np.float32)
+
+
+def _check_same(trained: np.ndarray, here: np.ndarray) -> None:
+    """ValueError if the coefficients at the points of `_probed` are not those of training."""
+    if trained.shape == here.shape:
+        scale = np.abs(trained.astype(float)).max(initial=1e-30)
+        gap = np.abs(trained.astype(float) - here.astype(float))
+        if trained.size == 0 or np.mean(gap > NEAR * scale) <= MOST_FAR:
+            return
+        raise ValueError(
+            "the medium must vary in the object as trained, got grids placed, scaled or interpolated in another way "
+            f"(coefficients differ by up to {gap.max() / scale:.2g} of the largest)"
+        )
+    raise ValueError(f"coefficients must be known at {trained.shape} points, as trained, got {here.shape}")
 
 
 def frame_of(subject: Subject, trained: Identity | None = None) -> Frame:

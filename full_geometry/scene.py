@@ -86,7 +86,8 @@ def learnt_means(found: Object, inside: Inside, media: list[Medium], settings: S
     checksums = (checksum_of(path, KIND), *(checksum for m in backbone for checksum in m.checksums))
     transport = LearntTransport(model, found.sign, checksums)
     table = RadialTable([m for m in backbone if float(m.medium.sigma_s) > 0], found.size)
-    share = AREA_SHARE if settings.area_share == AUTOMATIC else settings.area_share
+    by_itself = AREA_SHARE if sampler is None else 0.0  # patches reach everywhere
+    share = by_itself if settings.area_share == AUTOMATIC else settings.area_share
     positions = PositionSampler(replace(found, pieces=None), table, subject.points, share)
     if sampler is None:
         return Means(transport, HalfSpaceProposals(positions, backbone[0]))

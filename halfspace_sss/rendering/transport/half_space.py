@@ -118,8 +118,7 @@ def _area_share(found: Object, ratio: float, wanted: float) -> float:
     """Share of candidates over the area, by default for a ratio of mean distance to object size.
 
     On a dragon of ratio 0.16 nine such points beside a probe bring variance x time to a third of that without, 15 do
-    the same; at 0.05 (bunny) and 0.04 (candle) the first ones cut the tail, kurtosis 18 to 7 and 15 to 5, at equal
-    cost.
+    the same; at 0.05 (bunny) and 0.04 (candle) the first ones cut the tail at equal cost, kurtosis 18 to 7 and 15 to 5.
     """
     if found.area > 0:
         m = int(np.clip(round(POINTS_PER_RATIO * ratio), 1, MOST_POINTS))
