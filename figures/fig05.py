@@ -20,12 +20,14 @@ from halfspace_sss.provenance import check_folder
 __all__ = ["TITLE", "draw", "parts", "rivals"]
 
 TITLE = "error of the image over time: walks alone, walks that learn, the model trained before"
-MATERIALS = {"draft": ("marble",), "paper": ("marble", "potato", "ketchup")}
-LIGHTS = "both"
-SIZES = {"draft": 64, "paper": 256}
-SECONDS = {"draft": 30.0, "paper": 600.0}  # of each way
-TRAIN_SECONDS = {"draft": 12.0, "paper": 60.0}
-TRUTH_SPP = {"draft": 256, "paper": 16384}
+SCENES = {  # material and lights
+    "draft": (("potato", "small light"),),
+    "paper": (("potato", "small light"), ("marble", "small light"), ("potato", "both"), ("marble", "both")),
+}
+SIZES = {"draft": 48, "paper": 256}
+SECONDS = {"draft": 20.0, "paper": 600.0}  # of each way
+TRAIN_SECONDS = {"draft": 10.0, "paper": 60.0}
+TRUTH_SPP = {"draft": 512, "paper": 16384}
 WARM_UP = 0.5  # seconds of learning; the first run compiles
 LOOKS = {
     "walks": Look("Walks alone", "#000000", "-"),
@@ -35,17 +37,15 @@ LOOKS = {
 
 
 def parts(quality: str) -> list[Part]:
-    """For each material a long path-traced image, then the three ways one after the other."""
+    """For each scene a long path-traced image, then the three ways one after the other."""
     size, seconds, found = SIZES[quality], SECONDS[quality], []
-    for material in MATERIALS[quality]:
-        common = {"material": material, "size": size, "lights": LIGHTS}
-        spp = TRUTH_SPP[quality]
-        found.append(
-            Part(f"{material}, truth", long_walk, {**common, "spp": spp, "seed": 0}, spp * size**2, inputs=(BUNNY,))
-        )
+    for material, lights in SCENES[quality]:
+        common = {"material": material, "size": size, "lights": lights}
+        name, truth = f"{material}, {lights}", {**common, "spp": TRUTH_SPP[quality], "seed": 0}
+        found.append(Part(f"{name}: truth", long_walk, truth, truth["spp"] * size**2, inputs=(BUNNY,)))
         times = {"seconds": seconds, "train_seconds": TRAIN_SECONDS[quality]}
         params = {**common, **times, "train_error": 1e-3, "model": KIND, "seed": 1}
-        found.append(Part(f"{material}, ways", rivals, params, 3 * seconds, inputs=(BUNNY,)))
+        found.append(Part(f"{name}: ways", rivals, params, 3 * seconds, inputs=(BUNNY,)))
     return found
 
 
@@ -81,8 +81,8 @@ def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
     """The figure as PDF and PNG, and the errors as a table."""
     import pandas
 
-    materials = list(dict.fromkeys(name.split(",")[0] for name in results))
-    tables = {m: _errors(m, results[f"{m}, truth"], results[f"{m}, ways"]) for m in materials}
+    scenes = list(dict.fromkeys(name.split(":")[0] for name in results))
+    tables = {name: _errors(name, results[f"{name}: truth"], results[f"{name}: ways"]) for name in scenes}
     with paper():
         files: dict[str, bytes | str] = {f"fig05.{end}": data for end, data in saved(_figure(results, tables)).items()}
     rows = [row for table in tables.values() for row in table]
@@ -96,7 +96,7 @@ def _gain(truth: Result) -> float:
     return 1 / float(np.percentile(image[image.max(axis=2) > 0], 97))
 
 
-def _errors(material: str, truth: Result, ways: Result) -> list[dict[str, Any]]:
+def _errors(scene: str, truth: Result, ways: Result) -> list[dict[str, Any]]:
     """A row for each image: seconds, samples, relMSE and FLIP of the pixels of the object, and the phase."""
     reference, gain = truth.images["image"], np.float32(_gain(truth))
     mask, rows = reference.max(axis=2) > 0, []
@@ -105,23 +105,23 @@ def _errors(material: str, truth: Result, ways: Result) -> list[dict[str, Any]]:
             image = np.maximum(ways.images[f"{way}-{k}"], 0)
             shot = compared(way, gain * image, gain * reference, mask=mask)
             learning = way == "online" and seconds < ways.numbers["switch"]
-            row = {"material": material, "way": way, "phase": "learning" if learning else "rendering"}
+            row = {"scene": scene, "way": way, "phase": "learning" if learning else "rendering"}
             rows.append({**row, "seconds": seconds, "spp": spp, **shot.numbers})
     return rows
 
 
 def _figure(results: Mapping[str, Result], tables: Mapping[str, list[dict[str, Any]]]) -> Any:
-    """A row for each material: relMSE and FLIP over seconds, and the last images."""
+    """A row for each scene: relMSE and FLIP over seconds, and the last images."""
     from matplotlib.figure import Figure
 
     columns = (1.6, 1.6, 1, 1, 1, 1)
     figure = Figure(figsize=(TEXT, 1.75 * len(tables) + 0.35), layout="constrained")
     grid = figure.subplots(len(tables), len(columns), squeeze=False, width_ratios=columns)
-    for axes, (material, rows) in zip(grid, tables.items()):
-        truth, ways = results[f"{material}, truth"], results[f"{material}, ways"]
+    for axes, (name, rows) in zip(grid, tables.items()):
+        truth, ways = results[f"{name}: truth"], results[f"{name}: ways"]
         for ax, key in zip(axes, (RELATIVE_MSE, FLIP)):
             _curves(ax, rows, key, ways.numbers["switch"])
-        axes[0].set_title(f"{material}: {_told(ways)}", loc="left", pad=3)
+        axes[0].set_title(f"{name}: {_told(ways)}", loc="left", pad=3)
         shown = {"Truth": truth.images["image"]}
         for way, look in LOOKS.items():
             shown[look.label] = ways.images[f"{way}-{len(ways.numbers['ways'][way]['spp']) - 1}"]

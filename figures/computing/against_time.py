@@ -48,6 +48,7 @@ class Snapshots:
             return
         if last and self.spp and self.spp[-1] == found.spp:
             return
+        now = max(now, self.times[-1] + 1e-6) if self.times else now
         self.times.append(now)
         self.images.append(found.mean[..., :3].astype(np.float32))
         self.spp.append(found.spp)
@@ -95,7 +96,9 @@ def trained_online(p: dict[str, Any], folder: Path, seconds: float, train_second
         found.add(image)
 
     def rendered(image: Reference) -> None:
-        switch[0] = switch[0] or found.seconds - image.seconds
+        if not switch[0]:
+            switch[0] = found.seconds - image.seconds
+            found.add(walks[0], last=True)
         found.add(combined(walks[0], image))
 
     image = online.render(

@@ -30,7 +30,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Result]:
         patch.setattr(training, "learn", lambda *a, **how: learn(*a, **{**how, "recipe": QUICK, "chunks": 2}))
         for name, value in (("EXITS", 16), ("WALKS", 128), ("SAMPLES", 64)):
             patch.setattr(training, name, value)
-        for name, value in (("MATERIALS", ("ketchup",)), ("SIZES", SIZE), ("TRUTH_SPP", 64)):
+        for name, value in (("SCENES", (("ketchup", "both"),)), ("SIZES", SIZE), ("TRUTH_SPP", 64)):
             patch.setitem(getattr(fig05, name), "draft", value)
         patch.setitem(fig05.SECONDS, "draft", 1.0)
         return {part.name: _result(part, tmp_path_factory.mktemp("part")) for part in fig05.parts("draft")}
@@ -43,7 +43,7 @@ def _result(part: Part, folder: Path) -> Result:
 
 
 def test_each_way_has_images_at_times_that_grow(results: dict[str, Result]) -> None:
-    found = results["ketchup, ways"]
+    found = results["ketchup, both: ways"]
     assert set(found.numbers["ways"]) == set(fig05.LOOKS)
     for way, about in found.numbers["ways"].items():
         assert np.all(np.diff(about["seconds"]) > 0) and np.all(np.diff(about["spp"]) > 0)
@@ -54,7 +54,7 @@ def test_the_figure_marks_the_switch_and_its_table_tells_the_phases(results: dic
     files = fig05.draw(results)
     assert files["fig05.pdf"].startswith(b"%PDF") and files["fig05.png"].startswith(b"\x89PNG")
     table = pandas.read_csv(io.StringIO(files["fig05.csv"]))
-    switch = results["ketchup, ways"].numbers["switch"]
+    switch = results["ketchup, both: ways"].numbers["switch"]
     assert switch > 0
     online = table[table["way"] == "online"]
     assert np.array_equal(online["phase"] == "learning", online["seconds"] < switch)

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import zlib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -143,7 +144,7 @@ def _learnt(
         told(_sentence(name, model, settings, camera is not None))
         found = learner(model).train(
             scene, object=name, seconds=settings.train_seconds, target_error=settings.train_error, seed=seed,
-            folder=None, work=work / name, progress=learning, camera=camera,
+            folder=None, work=work / f"{zlib.crc32(name.encode()):08x}", progress=learning, camera=camera,
         )  # fmt: skip
         records.append(_record(found, model))
         if walks.found is not None:
