@@ -1,0 +1,98 @@
+"""Long use of one process: memory stays flat, threads agree, many queries are answered block by block.
+
+Minutes, so only where HALFSPACE_SSS_SOAK is set: 1 for all of it, a smaller number for that share.
+"""
+
+from __future__ import annotations
+
+import gc
+import os
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import psutil
+import pytest
+
+import halfspace_sss
+from halfspace_sss import Medium
+
+SHARE = float(os.environ.get("HALFSPACE_SSS_SOAK", "0"))
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(SHARE <= 0, reason="HALFSPACE_SSS_SOAK is not set")]
+
+RENDERS, QUERIES, BLOCK, THREADS = 500, 10**8, 10**6, 64
+MIB = 2**20
+
+
+def _resident() -> float:
+    """Memory of this process, MiB."""
+    gc.collect()
+    return psutil.Process().memory_info().rss / MIB
+
+
+def _scene(rng: np.random.Generator) -> dict:
+    """A ball of another size, medium and model over a floor, under a sky."""
+    import mitsuba as mi
+
+    albedo, sigma_t = rng.uniform(0.3, 0.99, 3), rng.uniform(0.5, 4, 3)
+    at = mi.ScalarTransform4f().look_at([0, 20, 20], [0, 0, 0], [0, 0, 1])
+    film = {"type": "hdrfilm", "width": 16, "height": 16}
+    return {
+        "type": "scene", "integrator": {"type": "bssrdf", "max_depth": 4}, "sky": {"type": "constant"},
+        "floor": {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -4]).scale(9.0)},
+        "ball": {"type": "sphere", "radius": rng.uniform(2, 4), "bsdf": {
+            "type": "translucent", "albedo": ", ".join(map(str, albedo)), "sigma_t": ", ".join(map(str, sigma_t)),
+            "model": str(rng.choice(["better_dipole", "directional_dipole", "neural"]))}},
+        "camera": {"type": "perspective", "fov": 25.0, "to_world": at, "film": film},
+    }  # fmt: skip
+
+
+def test_renders_of_changing_scenes_leave_no_memory_behind() -> None:
+    """The mean of the last quarter against that of the second; what a process caches at first is not counted."""
+    import halfspace_sss.rendering as rendering
+
+    mi = pytest.importorskip("mitsuba")
+    mi.set_variant("llvm_ad_rgb")
+    rendering.register()
+    rng, used = np.random.default_rng(1), []
+    n = max(40, int(SHARE * RENDERS))
+    for k in range(n):
+        scene = mi.load_dict(_scene(rng), parallel=False)
+        image = np.array(mi.render(scene, spp=4, seed=k))
+        assert np.isfinite(image).all() and image.mean() > 0
+        del scene
+        used.append(_resident())
+    quarter = n // 4
+    second, last = np.mean(used[quarter : 2 * quarter]), np.mean(used[-quarter:])
+    print(f"{n} renders: {used[0]:.0f} MiB after the first, {second:.0f} in the second quarter, {last:.0f} in the last")
+    assert last - second < 0.05 * second
+
+
+def test_threads_that_ask_at_once_get_the_answers_of_one_alone() -> None:
+    medium = Medium(1.0, 0.1, 0.3, 1.3)
+    rng = np.random.default_rng(2)
+    query = [10 ** rng.uniform(-2, 1, 5000), *rng.random((4, 5000))]
+    names = [name for name in halfspace_sss.models() if name not in ("neural_material", "neural_paper")]
+    alone = {name: halfspace_sss.bssrdf(name, medium).eval(*query) for name in names}
+
+    def ask(k: int) -> bool:
+        name = names[k % len(names)]
+        return np.array_equal(halfspace_sss.bssrdf(name, medium).eval(*query), alone[name])
+
+    with ThreadPoolExecutor(THREADS) as threads:
+        assert all(threads.map(ask, range(max(THREADS, int(SHARE * 10 * THREADS)))))
+
+
+def test_many_queries_are_answered_block_by_block_in_flat_memory() -> None:
+    """1e8 queries: the mean of S over them agrees with that of the first block, within five standard errors."""
+    model = halfspace_sss.bssrdf("better_dipole", Medium(1.0, 0.1, 0.3, 1.3))
+    rng, means, used = np.random.default_rng(3), [], []
+    for _ in range(max(8, int(SHARE * QUERIES / BLOCK))):
+        r, mu_i, mu_o = rng.uniform(0.1, 3, BLOCK), rng.random(BLOCK), rng.random(BLOCK)
+        S = model.eval(r, mu_i, 0.0, mu_o, 0.0)
+        assert S.shape == (BLOCK,) and np.isfinite(S).all() and (S >= 0).all()
+        means.append((S.mean(), S.std() / np.sqrt(BLOCK)))
+        used.append(_resident())
+    values, errors = np.array(means).T
+    assert np.all(np.abs(values - values.mean()) < 5 * errors)
+    print(f"{len(used) * BLOCK:.0e} queries: {used[1]:.0f} MiB after the second block, {max(used):.0f} at most")
+    assert max(used) < 1.1 * used[1]
