@@ -41,6 +41,7 @@ def untrained(scene: Any) -> list[str]:
         check_folder(weights_folder())
     return found
 
+
 PAPER = "full_geometry_paper"
 
 
