@@ -139,7 +139,7 @@ def _curves(ax: Any, rows: list[dict[str, Any]], key: str, switch: float) -> Non
         points = [(row["seconds"], row[key]) for row in rows if row["way"] == way]
         ax.plot(*zip(*points), color=look.color, ls=look.dash, marker="o", ms=1.8, mew=0, label=look.label)
     ax.axvline(switch, color="0.5", lw=0.7, ls=":", label="Switch to the model")
-    ax.set(xscale="log", yscale="log", ylabel=key, xlabel="seconds")
+    ax.set(xscale="log", yscale="log" if key == RELATIVE_MSE else "linear", ylabel=key, xlabel="seconds")
     ax.grid(color="0.9", lw=0.4)
 
 

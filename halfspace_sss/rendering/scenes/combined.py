@@ -16,18 +16,21 @@ TILE = 8  # pixels
 def combined(walks: Reference, model: Reference) -> Reference:
     """s walks + (1 - s) model, with the share s = V_model / (V_walks + V_model) that has the smallest variance.
 
-    V is the sum of the variances of the mean over pixels and colours. As a pixel that happens to be bright has a large
-    variance too, weights from the pixels themselves would darken the image: the image is cut into tiles like a
-    chessboard, and the white ones take s from the black ones and the other way round. With fewer than two passes of
+    The image is cut into tiles like a chessboard. In each the variances of the mean are summed over pixels and colours,
+    and V is the square of the mean of the roots of these sums, so that a single spike, as walks have them that find a
+    small light by chance, does not decide alone. As a pixel that happens to be bright has a large variance too, weights
+    from the pixels themselves would darken the image: white tiles take s from the black ones and the other way round.
+    Filters wider than a box let neighbours at the edges of tiles share samples. With fewer than two passes of
     one of them, or where neither varies, s is the share of the samples. The bias of the model does not count.
 
     Args:
         walks, model: of the same scene and sensor. What `model` is about is kept; `about["combined"]` tells the rest.
     """
     share = np.zeros(model.mean.shape[:2])
-    white = _white(*share.shape)
+    row, column, tiles = _tiles(*share.shape)
+    white = (row + column) % 2 == 0
     for to, of in ((white, ~white), (~white, white)):
-        share[to] = _share(walks, model, of)
+        share[to] = _share(walks, model, np.where(of, tiles, -1))
     s = share[..., None]
     about = {
         "share_of_walks": float(share.mean()),
@@ -43,17 +46,27 @@ def combined(walks: Reference, model: Reference) -> Reference:
     )  # fmt: skip
 
 
-def _white(height: int, width: int) -> np.ndarray:
-    tile = max(min(TILE, height // 2, width // 2), 1)
-    y, x = np.indices((height, width)) // tile
-    return (x + y) % 2 == 0
+def _tiles(height: int, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Row, column and number of the tile of each pixel."""
+    side = max(min(TILE, height // 2, width // 2), 1)
+    row, column = np.indices((height, width)) // side
+    return row, column, row * (column.max() + 1) + column
 
 
-def _share(walks: Reference, model: Reference, of: np.ndarray) -> float:
-    by_walks, by_model = (float(image.variance[of][..., :3].sum()) for image in (walks, model))
+def _share(walks: Reference, model: Reference, tiles: np.ndarray) -> float:
+    """s from the pixels whose tile is not -1."""
+    by_walks, by_model = (_spread(image.variance[..., :3], tiles) ** 2 for image in (walks, model))
     if min(walks.passes, model.passes) < 2 or not by_walks + by_model > 0:
         return walks.spp / (walks.spp + model.spp)
     return by_model / (by_walks + by_model)
+
+
+def _spread(variance: np.ndarray, tiles: np.ndarray) -> float:
+    """Mean over tiles of the root of the sum of variances."""
+    inside = tiles >= 0
+    sums = np.bincount(tiles[inside], weights=variance[inside].sum(axis=-1))
+    counts = np.bincount(tiles[inside])
+    return float(np.sqrt(np.maximum(sums[counts > 0], 0)).mean()) if inside.any() else 0.0
 
 
 def _told(image: Reference) -> dict[str, float | int | None]:
