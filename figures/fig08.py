@@ -19,6 +19,7 @@ SECONDS = {"draft": 12, "paper": 600}  # CPU time of each training
 NUMBERS = {"draft": (1, 4, 16, 64), "paper": (1, 2, 4, 8, 16, 32, 64, 128)}
 TRUTH = {"draft": (96, 512), "paper": (256, 8192)}  # exits, and walks of each
 OURS = "full_geometry"
+LIGHTS = ("constant", "lobes")
 LOOKS = {
     OURS: ("#C00000", "-", "o"), "paper, points of walks": ("#0072B2", "-", "s"),
     "paper, uniform points": ("#0072B2", (0, (2, 1.4)), "^"),
@@ -106,11 +107,14 @@ def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
     table = pandas.DataFrame([row for result in results.values() for row in result.numbers["rows"]])
     with paper():
         figure = Figure(figsize=(2 * COLUMN, 0.75 * COLUMN))
-        for ax, light in zip(figure.subplots(1, 2, sharey=True), ("constant", "lobes")):
+        for ax, light in zip(figure.subplots(1, 2, sharey=True), LIGHTS):
             for name, (color, dash, marker) in LOOKS.items():
                 rows = table[table["method"] == name].sort_values("N")
                 ax.plot(rows["N"], rows[light], color=color, ls=dash, marker=marker, ms=3, lw=1, label=name)
-            ax.set(xscale="log", yscale="log", xlabel="incident samples N", title=f"{light} light")
+            ax.set(xscale="log", yscale="log", xlabel="incident samples N", title=light)
+            numbers = sorted(set(table["N"]))
+            ax.set_xticks(numbers, [str(n) for n in numbers])
+            ax.set_xticks([], minor=True)
             ax.grid(True, which="both", lw=0.3, color="#dddddd")
         figure.axes[0].set_ylabel("relative RMSE of one estimate")
         figure.axes[1].legend(frameon=False)
