@@ -44,7 +44,8 @@ def make_scene(model: str, pixels: int, albedo: Any, mfp: Any, integrator: str =
     scene = {
         "type": "scene",
         "integrator": {"type": integrator, "max_depth": 2, "hide_emitters": True},
-        "lamp": {"type": "directional", "direction": [0, 0, -1], "irradiance": 3.0},
+        "lamp": {"type": "sphere", "center": [0, 0, 16 * RADIUS], "radius": 4 * RADIUS,
+                 "emitter": {"type": "area", "radiance": 15.0}},
         "ball": {"type": "sphere", "radius": RADIUS, "bsdf": {
             "type": "translucent", "albedo": text(albedo), "sigma_t": text(1 / np.asarray(mfp)), "eta": 1.3,
             "model": model, "reflection": False}},

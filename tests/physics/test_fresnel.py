@@ -148,3 +148,10 @@ def test_published_polynomials_are_wrong_at_equal_indices():
 def test_the_published_fit_of_the_diffuse_reflectance_is_that_of_the_moments(n: float) -> None:
     A = fresnel.boundary_A_jensen(n)
     assert (A - 1) / (A + 1) == pytest.approx(2 * C_1(n), abs=1.5e-3)
+
+
+def test_indices_as_an_array_give_what_each_gives_alone_and_equal_ones_let_all_through() -> None:
+    eta, mu = np.array([0.8, 1.0, 1.3, 1.0]), np.array([0.9, 0.4, 0.2, 0.0])
+    for f in (F_r, F_t):
+        np.testing.assert_allclose(f(mu, eta), [f(m, float(n)) for m, n in zip(mu, eta)], rtol=1e-12, atol=1e-15)
+    assert F_t(mu, eta)[3] == 1 and F_r(mu, eta)[3] == 0

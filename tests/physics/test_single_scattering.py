@@ -272,3 +272,9 @@ def test_exitance_agrees_in_torch_and_keeps_the_precision_of_the_query():
 def test_bad_arguments_are_refused_with_name_bound_and_value(call, message, channels):
     with pytest.raises(ValueError, match=message):
         call(Medium([1.0, 2.0], 0.1) if channels else medium())
+
+
+def test_exitance_at_the_beam_is_infinite_only_where_light_scatters():
+    r = np.array([0.0, 1.0])
+    assert np.array_equal(np.isinf(single.exitance(medium(), r)), [True, False])
+    assert np.array_equal(single.exitance(Medium(0.0, 1.0), r), [0.0, 0.0])
