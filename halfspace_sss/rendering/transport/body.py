@@ -17,7 +17,7 @@ from halfspace_sss.rendering.surface.inside import Inside
 from halfspace_sss.rendering.surface.object import Object, same_objects, survey
 from halfspace_sss.rendering.surface.placement import translucent_shapes
 from halfspace_sss.rendering.surface.sensors import check_sensors
-from halfspace_sss.rendering.surface.transports import object_transport
+from halfspace_sss.rendering.surface.transports import AUTO, choose_models, object_transport
 from halfspace_sss.rendering.surface.varying import equivalent
 from halfspace_sss.rendering.transport.half_space import half_space_means
 from halfspace_sss.rendering.transport.protocols import Means, Proposals, Transport
@@ -83,6 +83,8 @@ def make_bodies(scene: Any, settings: Settings) -> list[Body]:
     shapes = translucent_shapes(scene)
     if not shapes:
         raise ValueError("the scene must have an object with a translucent BSDF, got none")
+    if any(shape.bsdf().inside.model == AUTO for shape in shapes):
+        choose_models(scene, settings)
     bodies = [_make_body(shape, settings) for shape in shapes]
     check_sensors(scene, [body.found for body in bodies])
     return bodies

@@ -27,6 +27,7 @@ class Settings:
             distance that light travels to the size of the object.
         entries: points of entry that an exit draws, of which one is followed, chosen by what it may bring.
         hide_emitters: whether directly visible emitters are left out.
+        tolerance: relative error of the radiance of an object that its model "auto" keeps, if one does.
     """
 
     mm_per_unit: float = 1.0
@@ -36,9 +37,11 @@ class Settings:
     area_share: float = AUTOMATIC
     entries: int = 1
     hide_emitters: bool = False
+    tolerance: float = 0.05
 
     def __post_init__(self) -> None:
         check_interval("mm_per_unit", self.mm_per_unit, 1e-9, 1e9)
+        check_interval("tolerance", self.tolerance, 1e-4, 10.0)
         if self.max_depth < -1 or self.max_depth == 0:
             raise ValueError(f"max_depth must be -1 or at least 1, got {self.max_depth}")
         if self.rr_depth < 1:
