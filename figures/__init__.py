@@ -37,7 +37,7 @@ from importlib.metadata import entry_points
 
 __all__ = ["FIGURES", "figure_modules"]
 
-FIGURES = ("fig09", "fig10", "fig11", "spheres", "equal_error", "objects")
+FIGURES = ("fig09", "fig10", "fig11", "spheres", "equal_error", "objects", "trade")
 GROUP = "halfspace_sss.figure_modules"
 
 

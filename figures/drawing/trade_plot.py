@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -13,10 +13,10 @@ from figures.drawing.page import page
 from figures.drawing.shot import Shot, compared
 from figures.drawing.style import TEXT, TRACED, Look, look, paper, saved
 from halfspace_sss.trade.picture import TradePicture
-from halfspace_sss.trade.results import ObjectTrade, WayTrade
+from halfspace_sss.trade.results import Assessment, ObjectTrade, WayTrade
 from halfspace_sss.trade.ways import NO_SINGLE
 
-__all__ = ["draw", "render", "trade_panels"]
+__all__ = ["draw", "image_shots", "multiples", "render", "trade_panels"]
 
 NOISE = 0.01  # of the mean radiance, to which times are
 LEAST = 0.003  # smallest bias that is drawn; what is below lies there, an arrow down
@@ -71,7 +71,9 @@ def _time(row: WayTrade, pixels: float) -> float:
     return row.time_to(NOISE) * pixels
 
 
-def _pareto(ax: Axes, rows: Sequence[WayTrade], pixels: float, tolerance: float) -> dict[str, object]:
+def _pareto(
+    ax: Axes, rows: Sequence[WayTrade], pixels: float, tolerance: float, small: bool = False
+) -> dict[str, object]:
     """Bias over the time to a given noise; the front of what nothing beats in both."""
     handles: dict[str, object] = {}
     for row in rows:
@@ -79,8 +81,9 @@ def _pareto(ax: Axes, rows: Sequence[WayTrade], pixels: float, tolerance: float)
         y = LEAST if exact else max(row.bias, LEAST)
         bare = row.way.endswith(NO_SINGLE)
         mark = MARKERS.get(row.way, "o")
+        size = (9 if exact else 5) * (0.7 if small else 1)
         (handle,) = ax.plot(
-            x, y, mark, color=style.color, mfc="white" if bare else style.color, ms=9 if exact else 5, mew=0.9,
+            x, y, mark, color=style.color, mfc="white" if bare else style.color, ms=size, mew=0.7 if small else 0.9,
             ls="none", zorder=3, clip_on=False, label=style.label,
         )  # fmt: skip
         handles[style.label] = handle
@@ -89,12 +92,13 @@ def _pareto(ax: Axes, rows: Sequence[WayTrade], pixels: float, tolerance: float)
             ax.plot([x, x], [max(low, LEAST), max(high, LEAST)], color=style.color, lw=0.8, zorder=2)
     _front(ax, [(_time(w, pixels), 0.0 if w.way == TRACED else w.bias) for w in rows])
     ax.axhline(tolerance, color="0.55", lw=0.6, ls=(0, (4, 3)), zorder=0)
-    asked = {"ha": "right", "va": "bottom", "size": 6.5, "color": "0.4"}
-    ax.text(0.99, tolerance, "asked", transform=ax.get_yaxis_transform(), **asked)
     ax.set(xscale="log", yscale="log", xlabel=f"time to {100 * NOISE:g} % noise [s]", ylabel="bias of radiance")
     top = max([w.bias_bound for w in rows if w.way != TRACED], default=1.0)
     ax.set_ylim(LEAST, max(1.6 * top, 3 * tolerance))
-    ax.text(0.99, 0.02, f"exact, or below {100 * LEAST:g} %", transform=ax.transAxes, **asked)
+    if not small:
+        asked = {"ha": "right", "va": "bottom", "size": 6.5, "color": "0.4"}
+        ax.text(0.99, tolerance, "asked", transform=ax.get_yaxis_transform(), **asked)
+        ax.text(0.99, 0.02, f"exact, or below {100 * LEAST:g} %", transform=ax.transAxes, **asked)
     xs = [_time(w, pixels) for w in rows]
     ax.set_xlim(min(xs) / 2, max(xs) * 4)
     _plain(ax)
@@ -115,7 +119,7 @@ def _front(ax: Axes, points: list[tuple[float, float]]) -> None:
             steps.append((x, max(y, LEAST)))
             best = y
     xs, ys = zip(*steps)
-    ax.step([*xs, 1e3 * xs[-1]], [*ys, ys[-1]], where="post", color="0.75", lw=3.0, zorder=1, scalex=False)
+    ax.step([*xs, 1e3 * xs[-1]], [*ys, ys[-1]], where="post", color="0.8", lw=2.5, zorder=1, scalex=False)
 
 
 def _over_time(ax: Axes, rows: Sequence[WayTrade], pixels: float, tolerance: float) -> None:
@@ -149,19 +153,64 @@ def _plain(ax: Axes) -> None:
     ax.yaxis.set_minor_formatter(NullFormatter())
 
 
-def _page(picture: TradePicture) -> str:
+def multiples(found: Mapping[tuple[str, str, str], ObjectTrade], tolerance: float) -> Figure:
+    """Bias over time for each material, a row, and each shape and light, a column."""
+    materials = list(dict.fromkeys(key[0] for key in found))
+    columns = list(dict.fromkeys(key[1:] for key in found))
+    figure = Figure(figsize=(TEXT, 1.45 * len(materials) + 0.9), layout="constrained")
+    figure.get_layout_engine().set(w_pad=0.015, h_pad=0.015, wspace=0.0, hspace=0.01)
+    grid = figure.subplots(len(materials), len(columns), squeeze=False, sharex="col", sharey=True)
+    handles: dict[str, object] = {}
+    for i, material in enumerate(materials):
+        for j, (shape, light) in enumerate(columns):
+            ax, o = grid[i, j], found.get((material, *columns[j]))
+            if o is None:
+                ax.set_visible(False)
+                continue
+            rows = [w for w in o.ways if not w.refusal and w.variance > 0]
+            handles |= _pareto(ax, rows, o.pixels, tolerance, small=True)
+            ax.set_title(f"{material}: {_mfp(o)} mfp" if j else f"{material}: {_mfp(o)} mean free paths", pad=2, size=7)
+            ax.set(
+                xlabel=f"{shape}, {light}: s to {100 * NOISE:g} % noise" if i == len(materials) - 1 else "", ylabel=""
+            )
+            ax.label_outer()
+    for ax in grid[:, 0]:
+        ax.set_ylabel("bias of radiance")
+    tops = [w.bias_bound for o in found.values() for w in o.ways if not w.refusal and w.bias2 > 0]
+    grid[0, 0].set_ylim(LEAST, 1.6 * max([*tops, tolerance]))
+    for j in range(len(columns)):
+        _span(grid[0, j], [o for key, o in found.items() if key[1:] == columns[j]])
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=4, frameon=False)
+    return figure
+
+
+def _span(ax: Axes, objects: Sequence[ObjectTrade]) -> None:
+    xs = [_time(w, o.pixels) for o in objects for w in o.ways if not w.refusal and w.variance > 0]
+    ax.set_xlim(min(xs) / 2, max(xs) * 3)
+
+
+def image_shots(images: Mapping[str, np.ndarray], found: Assessment) -> list[Shot]:
     """The images of all ways, path traced first, with FLIP and what each costs."""
-    reference = picture.images[TRACED]
-    bright = float(np.percentile(reference, 99.0))
-    exposure = math.log2(0.9 / bright) if bright > 0 else 0.0
-    numbers = {w.way: w for o in picture.found.objects for w in o.ways}
+    reference = images[TRACED]
+    exposure = _exposure(reference)
+    numbers = {w.way: w for o in found.objects for w in o.ways}
     shots = [Shot(_look(TRACED).label, reference, _numbers(numbers[TRACED]))]
-    for name, image in picture.images.items():
+    for name, image in images.items():
         if name != TRACED:
             told = _numbers(numbers[name])
             shots.append(compared(_look(name).label, image, reference, exposure=exposure, numbers=told))
+    return shots
+
+
+def _exposure(reference: np.ndarray) -> float:
+    bright = float(np.percentile(reference, 99.0))
+    return math.log2(0.9 / bright) if bright > 0 else 0.0
+
+
+def _page(picture: TradePicture) -> str:
+    shots = image_shots(picture.images, picture.found)
     caption = picture.sentences[0] if picture.sentences else ""
-    return page(picture.title, {picture.title: shots}, exposure=exposure, caption=caption)
+    return page(picture.title, {picture.title: shots}, exposure=_exposure(picture.images[TRACED]), caption=caption)
 
 
 def _numbers(row: WayTrade) -> dict[str, float | str]:

@@ -31,7 +31,8 @@ ENDINGS = ("png", "html", "denoised.exr", "denoised.png")  # of what is drawn
 def render_command(
     scene: Annotated[Path, typer.Argument(help="Mitsuba XML file whose objects use the BSDF `translucent`.")],
     model: Annotated[
-        str | None, typer.Option(help="A model for all objects, or path_traced.", show_default="as the scene says")
+        str | None,
+        typer.Option(help="A model for all objects, auto, or path_traced.", show_default="as the scene says"),
     ] = None,
     orders: Annotated[
         str | None, typer.Option(help="total, multiple or single.", show_default="as the scene says")
@@ -62,12 +63,15 @@ def render_command(
     from halfspace_sss.rendering.scenes.picture import Picture
     from halfspace_sss.rendering.scenes.reference import Limits
     from halfspace_sss.rendering.scenes.scene_files import load_scene
+    from halfspace_sss.rendering.surface.placement import choices
 
     limits = Limits(SPP if (spp, target_error, seconds) == (None,) * 3 else spp, None, target_error, seconds)
     check_count("seed", seed, 0)
     parameters, draw = defined(define), _renderer(denoise)
     check_folder(out)
     loaded = load_scene(scene, model, orders, parameters)
+    for sentence in choices(loaded).values():
+        console().print(sentence, highlight=False, markup=False, soft_wrap=True)
     file = out / f"{scene.stem}_{model or 'scene'}{f'_sensor{sensor}' if sensor else ''}.exr"
     found = _rendered(loaded, file, limits, {"seed": seed, "sensor": sensor}, resume)
     picture = Picture(file.stem, _colours(found.mean), _numbers(found), _error(found), loaded, sensor, denoise)

@@ -48,6 +48,8 @@ def choose(scene: Any, settings: Any) -> None:
     Raises:
         ValueError: the scene cannot be rendered, or the file of an earlier choice is damaged.
     """
+    import mitsuba as mi
+
     on = _stage(scene, settings)
     wanted = [k for k, shape in enumerate(on.shapes) if shape.bsdf().inside.model == AUTO]
     path = choices_folder() / f"{_identity(on, settings)}.json"
@@ -55,21 +57,14 @@ def choose(scene: Any, settings: Any) -> None:
     if record is None or len(record["models"]) != len(wanted):
         record = _measured(on, wanted, settings.tolerance)
         write_atomically(path, json.dumps(record, indent=1, allow_nan=False) + "\n")
-    surfaces: dict[int, tuple[Any, str]] = {}
-    for k, model in zip(wanted, record["models"]):
+    given: dict[int, str] = {}
+    for k, model, sentence in zip(wanted, record["models"], record["sentences"]):
         surface = on.shapes[k].bsdf()
-        surfaces.setdefault(id(surface), (surface, model))  # objects of one surface take that of the first
-    for surface, model in surfaces.values():
-        surface.inside = replace(surface.inside, model=model)
-    for sentence in record["sentences"]:
-        tell(sentence)
-
-
-def tell(sentence: str) -> None:
-    """Print a choice where Mitsuba's own messages go."""
-    import mitsuba as mi
-
-    mi.Log(mi.LogLevel.Warn if "would be better" in sentence else mi.LogLevel.Info, sentence)
+        if id(surface) in given:  # objects of one surface take the model of the first
+            continue
+        given[id(surface)] = model
+        surface.inside, surface.choice = replace(surface.inside, model=model), sentence
+        mi.Log(mi.LogLevel.Info, sentence)
 
 
 def _stage(scene: Any, settings: Any) -> Stage:
@@ -93,7 +88,11 @@ def _read(path: Path) -> dict[str, Any]:
     try:
         record = json.loads(path.read_text(encoding="utf-8"))
         models = [str(name) for name in record["models"]]
-        known = record["format"] == FORMAT and all(name in model_names() and name != AUTO for name in models)
+        known = (
+            len(models) == len(record["sentences"])
+            and record["format"] == FORMAT
+            and all(name in model_names() and name != AUTO for name in models)
+        )
         sentences = [str(s) for s in record["sentences"]]
     except (OSError, KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path} must be the record of a choice, got {error!r}; delete it to choose anew") from error
@@ -115,8 +114,7 @@ def _measured(on: Stage, wanted: list[int], tolerance: float) -> dict[str, Any]:
 
 
 def _about(found: Assessment, tolerance: float) -> dict[str, Any]:
-    numbers = json.loads(json.dumps(found.record()).replace("NaN", "null").replace("Infinity", "null"))
-    return {"assessment": numbers, "provenance": provenance(tolerance=tolerance, samples=SAMPLES, exits=EXITS)}
+    return {"assessment": found.record(), "provenance": provenance(tolerance=tolerance, samples=SAMPLES, exits=EXITS)}
 
 
 def picked(found: ObjectTrade, tolerance: float) -> tuple[str, str]:

@@ -155,17 +155,31 @@ class Assessment:
         return pandas.DataFrame(rows)
 
     def record(self) -> dict[str, Any]:
-        """Ready for JSON."""
-        return asdict(self)
+        """Ready for JSON; what is not known is None there."""
+        return _plain(asdict(self))
 
     @classmethod
     def of(cls, record: dict[str, Any]) -> Assessment:
         """From a record."""
         objects = []
         for o in record["objects"]:
-            rows = tuple(
-                WayTrade(**{**w, "ratio": tuple(w["ratio"]), "ratio_error": tuple(w["ratio_error"])}) for w in o["ways"]
-            )
+            rows = tuple(WayTrade(**{key: _known(key, value) for key, value in w.items()}) for w in o["ways"])
             lists = {key: tuple(o[key]) for key in ("mfp", "radiance", "notes")}
             objects.append(ObjectTrade(**{**o, **lists, "ways": rows}))
         return cls(tuple(objects), record["seconds"], record["compilation"], record["seed"])
+
+
+def _plain(value: Any) -> Any:
+    """Without nan, which JSON has not."""
+    if isinstance(value, dict):
+        return {key: _plain(v) for key, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(v) for v in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _known(key: str, value: Any) -> Any:
+    """A field of a `WayTrade` from JSON."""
+    if key in ("ratio", "ratio_error"):
+        return tuple(math.nan if v is None else v for v in value)
+    return math.nan if value is None and key not in ("flip", "flip_noise") else value

@@ -24,6 +24,8 @@ from halfspace_sss.provenance import check_folder, provenance
 from halfspace_sss.rendering.scenes.causes import first_cause
 from halfspace_sss.rendering.scenes.identity import scene_hash, words
 from halfspace_sss.rendering.scenes.reference_store import Reference, load, save
+from halfspace_sss.rendering.surface.placement import choices
+from halfspace_sss.rendering.surface.transports import AUTO
 
 __all__ = ["Reference", "load", "render"]
 
@@ -85,6 +87,7 @@ def render(
     scene, integrator = _load(scene, integrator)
     _check_sensor(scene, sensor)
     about = _about(scene, integrator, sensor, seed)
+    about |= _chosen(scene, integrator)
     found = _start(path, resume, about)
     written = found if resume is True else None
     last = time.monotonic()
@@ -224,6 +227,15 @@ def _about(scene: Any, integrator: Any, sensor: int, seed: int) -> dict[str, Any
         "variant": mi.variant(),
     }
     return {**about, "provenance": provenance(**about)}
+
+
+def _chosen(scene: Any, integrator: Any) -> dict[str, Any]:
+    """The choices of the models "auto", which are made now if they have not been."""
+    if any(getattr(getattr(shape.bsdf(), "inside", None), "model", None) == AUTO for shape in scene.shapes()):
+        if hasattr(integrator, "prepare"):
+            integrator.prepare(scene)
+    found = choices(scene)
+    return {"choices": found} if found else {}
 
 
 def _start(path: Path, resume: bool | str | os.PathLike, about: dict[str, Any]) -> Reference | None:

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from halfspace_sss.checks import check_count
-from halfspace_sss.provenance import write_together
+from halfspace_sss.provenance import write_atomically
 
-__all__ = ["LIGHTS", "SHAPES", "RandomScene", "random_scene", "write_scene"]
+__all__ = ["LIGHTS", "SHAPES", "RandomScene", "mesh_file", "random_scene", "write_scene"]
 
 SHAPES = ("ball", "blob", "slab", "ring", "spikes")
 LIGHTS = ("sky", "lamp", "lamp and sky")
@@ -78,10 +78,17 @@ def _digits(values: np.ndarray) -> tuple[float, ...]:
 
 def write_scene(scene: RandomScene, folder: Path) -> Path:
     """Write NAME.xml and its mesh NAME.ply; the path of the first."""
-    name = f"scene-{scene.seed}-{scene.number:03d}"
-    mesh, file = folder / f"{name}.ply", folder / f"{name}.xml"
-    write_together({mesh: _ply(*_mesh(scene)), file: _xml(scene, mesh.name)})
+    mesh = mesh_file(scene, folder)
+    file = mesh.with_suffix(".xml")
+    write_atomically(file, _xml(scene, mesh.name))
     return file
+
+
+def mesh_file(scene: RandomScene, folder: Path) -> Path:
+    """Write the mesh alone, NAME.ply; its path."""
+    path = folder / f"scene-{scene.seed}-{scene.number:03d}.ply"
+    write_atomically(path, _ply(*_mesh(scene)))
+    return path
 
 
 def _mesh(scene: RandomScene) -> tuple[np.ndarray, np.ndarray]:
