@@ -17,7 +17,7 @@ from figures.drawing.style import paper, saved
 from figures.drawing.trade_plot import image_shots, multiples
 from figures.parts.part import Part, Result, Task
 from halfspace_sss.trade.checking.random_scenes import RandomScene, mesh_file
-from halfspace_sss.trade.results import Assessment
+from halfspace_sss.trade.measuring.results import Assessment
 
 __all__ = ["TITLE", "draw", "measured", "parts"]
 
@@ -56,9 +56,9 @@ def _name(material: str, shape: str, light: str) -> str:
 
 def measured(task: Task) -> dict[str, Any]:
     """The assessment of a scene, and an image by each way."""
-    from halfspace_sss.trade.assessing import assess_stage
     from halfspace_sss.trade.images import small_images, with_flip
-    from halfspace_sss.trade.ways import stage, ways
+    from halfspace_sss.trade.measuring.objects import assess_stage
+    from halfspace_sss.trade.measuring.ways import stage, ways
 
     prepare()
     p = task.params
@@ -74,7 +74,8 @@ def measured(task: Task) -> dict[str, Any]:
         found = with_flip(on, chosen, found, 0, p["seed"])
         named = {row.way for row in found.objects[0].ways if not row.refusal}
         images = small_images(on, [w for w in chosen if w.name in named], 0, p["seed"], p["size"], p["spp"])
-    return {"assessment": found.record(), **{f"image {name}": image for name, image in images.items()}}
+    numbered = {f"image_{k}": image for k, image in enumerate(images.values())}
+    return {"assessment": found.record(), "shown": list(images), **numbered}
 
 
 def turned(task: Task) -> dict[str, Any]:
@@ -82,7 +83,7 @@ def turned(task: Task) -> dict[str, Any]:
     from halfspace_sss import materials
     from halfspace_sss.neural.symmetric import channels
     from halfspace_sss.trade.knobs import channel_settings, entry_settings, node_settings
-    from halfspace_sss.trade.ways import stage
+    from halfspace_sss.trade.measuring.ways import stage
 
     prepare()
     p = task.params
@@ -120,7 +121,8 @@ def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
                     continue
                 assessment = Assessment.of(results[name].numbers["assessment"])
                 found[material, shape, light] = assessment.objects[0]
-                images = {k.removeprefix("image "): np.asarray(v) for k, v in results[name].images.items()}
+                shown = enumerate(results[name].numbers["shown"])
+                images = {way: np.asarray(results[name].images[f"image_{k}"]) for k, way in shown}
                 shots[name] = image_shots(images, assessment)
     table = trade_tables.trade_table(found)
     with paper():

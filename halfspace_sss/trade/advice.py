@@ -18,7 +18,7 @@ from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED
 from halfspace_sss.trade.assessing import assess
-from halfspace_sss.trade.results import Assessment, ObjectTrade, WayTrade
+from halfspace_sss.trade.measuring.results import Assessment, ObjectTrade, WayTrade
 
 __all__ = ["Advice", "ObjectAdvice", "Option", "Job", "advise", "recommend"]
 
@@ -141,7 +141,7 @@ def recommend(
         return advise(scene, job)
     if "assess_seconds" in assessing:
         assessing["seconds"] = assessing.pop("assess_seconds")
-    return advise(assess(scene, seed=seed, **{"flip": False, **assessing}), job)
+    return advise(assess(scene, seed=seed, **{"flip": False, "tolerance": tolerance, **assessing}), job)
 
 
 def advise(found: Assessment, job: Job) -> Advice:

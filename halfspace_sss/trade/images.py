@@ -10,9 +10,9 @@ import numpy as np
 
 from halfspace_sss.extensions import renderer
 from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED
-from halfspace_sss.trade.results import Assessment
-from halfspace_sss.trade.seeds import seeded
-from halfspace_sss.trade.ways import Stage, Way
+from halfspace_sss.trade.measuring.results import Assessment
+from halfspace_sss.trade.measuring.seeds import seeded
+from halfspace_sss.trade.measuring.ways import Stage, Way
 
 __all__ = ["small_images", "with_flip"]
 

@@ -17,9 +17,9 @@ from halfspace_sss.comparison.model_errors import model_error
 from halfspace_sss.interface.model import model_class
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED
-from halfspace_sss.trade.assessing import assess_stage
-from halfspace_sss.trade.results import ObjectTrade
-from halfspace_sss.trade.ways import Stage, Way
+from halfspace_sss.trade.measuring.objects import assess_stage
+from halfspace_sss.trade.measuring.results import ObjectTrade
+from halfspace_sss.trade.measuring.ways import Stage, Way
 
 __all__ = ["Setting", "channel_settings", "entry_settings", "node_settings"]
 

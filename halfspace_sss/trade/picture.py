@@ -11,8 +11,8 @@ import numpy as np
 
 from halfspace_sss.trade.advice import Advice
 from halfspace_sss.trade.images import small_images
-from halfspace_sss.trade.results import Assessment
-from halfspace_sss.trade.ways import Way, stage
+from halfspace_sss.trade.measuring.results import Assessment
+from halfspace_sss.trade.measuring.ways import Way, stage
 
 __all__ = ["TradePicture", "picture_of"]
 

@@ -10,8 +10,8 @@ import pytest
 from halfspace_sss.trade import recommend
 from halfspace_sss.trade.advice import Job, advise
 from halfspace_sss.trade.automatic import picked
-from halfspace_sss.trade.results import Assessment, ObjectTrade, WayTrade
-from halfspace_sss.trade.statistics import Estimate, mean_square, relative_variance
+from halfspace_sss.trade.measuring.results import Assessment, ObjectTrade, WayTrade
+from halfspace_sss.trade.measuring.statistics import Estimate, mean_square, relative_variance
 
 SEEDS, EXITS, SAMPLES = 400, 48, 12
 

@@ -10,12 +10,13 @@ from typing import Any
 from halfspace_sss.provenance import provenance, write_atomically
 from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED
 from halfspace_sss.trade.advice import Job, advise
-from halfspace_sss.trade.assessing import assess_stage
 from halfspace_sss.trade.automatic import picked
 from halfspace_sss.trade.checking.random_scenes import RandomScene, random_scene, write_scene
-from halfspace_sss.trade.results import Assessment, WayTrade
-from halfspace_sss.trade.seeds import seeded
-from halfspace_sss.trade.ways import Way, stage
+from halfspace_sss.trade.measuring.objects import assess_stage
+from halfspace_sss.trade.measuring.results import Assessment, WayTrade
+from halfspace_sss.trade.measuring.seeds import seeded
+from halfspace_sss.trade.measuring.ways import Way, stage
+from halfspace_sss.trade.refining import assess_for
 
 __all__ = ["WAYS", "check_scene", "outcome", "z_values"]
 
@@ -37,7 +38,7 @@ def check_scene(number: int, seed: int, folder: Path, seconds: float, truth_seco
         if record.get("format") == FORMAT and json.loads(json.dumps(how)).items() <= record.items():
             return record
     on, ways = stage(file), [Way.of(name) for name in WAYS]
-    quick = assess_stage(on, ways, seconds=seconds, seed=seeded(seed, number, 0))
+    quick = assess_for(on, ways, scene.tolerance, seconds=seconds, seed=seeded(seed, number, 0))
     long = assess_stage(on, ways, seconds=truth_seconds, seed=seeded(seed, number, 1))
     record = {"format": FORMAT, **how, "quick": quick.record(), "long": long.record(), "provenance": provenance(**how)}
     write_atomically(path, json.dumps(record, indent=1) + "\n")

@@ -25,7 +25,7 @@ from halfspace_sss.provenance import check_folder
 
 if TYPE_CHECKING:
     from halfspace_sss.trade.advice import Advice, Job
-    from halfspace_sss.trade.results import ObjectTrade, WayTrade
+    from halfspace_sss.trade.measuring.results import ObjectTrade, WayTrade
 
 __all__ = ["SHIPPED", "object_table", "trade_command"]
 
@@ -112,7 +112,9 @@ def _scene(file: Path, job: Job, how: dict[str, Any], out: Path) -> None:
     from halfspace_sss.trade.assessing import assess
 
     with Bar("trade") as bar:
-        found = assess(file, **how, progress=lambda what, done, total: bar.show(done, total, what))
+        found = assess(
+            file, **how, tolerance=job.tolerance, progress=lambda what, done, total: bar.show(done, total, what)
+        )
     advice = advise(found, job)
     about = {"provenance": provenance(scene=str(file), tolerance=job.tolerance, images=job.images, **how)}
     about |= {"integrator": advice.integrator, "sentences": str(advice).splitlines(), "assessment": found.record()}

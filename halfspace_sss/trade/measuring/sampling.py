@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from halfspace_sss.rendering.surface.variants import variant_channels
-from halfspace_sss.trade.exits import Exits
-from halfspace_sss.trade.seeds import seeded
-from halfspace_sss.trade.statistics import Estimate
-from halfspace_sss.trade.ways import Stage, Way
+from halfspace_sss.trade.measuring.exits import Exits
+from halfspace_sss.trade.measuring.seeds import seeded
+from halfspace_sss.trade.measuring.statistics import Estimate
+from halfspace_sss.trade.measuring.ways import Stage, Way
 
 __all__ = ["Sampled", "clock", "first_sample", "sample_more"]
 
