@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from halfspace_sss.checks import check_count, check_interval
+from halfspace_sss.checks import check_choice, check_count, check_interval
 from halfspace_sss.comparison.held_out import references
 from halfspace_sss.comparison.model_errors import Reference, model_error
 from halfspace_sss.interface.model import BSSRDF, bssrdf, models
@@ -56,6 +57,7 @@ def recommend_flat(
     r: tuple[float, float] | None = None,
     *,
     tolerance: float = 0.05,
+    only: Sequence[str] | None = None,
     events: float = EVENTS,
     seed: int = 0,
 ) -> FlatAdvice:
@@ -65,6 +67,7 @@ def recommend_flat(
         medium: or a material; of several channels the worst counts.
         r: smallest and largest distance, mm; by default 0.02 to 60 mean free paths.
         tolerance: relative error of S mu_i mu_o, summed over cells of the range and pairs of directions.
+        only: names of models, by default all.
         events: scattering events of the walks, for each channel.
         seed: of the walks.
 
@@ -75,6 +78,8 @@ def recommend_flat(
     check_interval("tolerance", tolerance, 1e-4, 10.0)
     check_interval("events", events, 1e4, 1e12)
     check_count("seed", seed, 0)
+    for name in only or ():
+        check_choice("model", name, models())
     parts = [m for m in channels(medium) if float(m.sigma_s) > 0]
     if not parts:
         raise ValueError("medium must scatter, got albedo 0: S of order 2 and more is 0, no model is needed")
@@ -85,7 +90,7 @@ def recommend_flat(
     within = [(r[0] * float(m.sigma_t), r[1] * float(m.sigma_t)) if r else REACH for m in parts]
     for m, one, bounds in zip(parts, found, within):
         _check_light(m, one, bounds)
-    rows = [_row(name, parts, found, within) for name in models()]
+    rows = [_row(name, parts, found, within) for name in only or models()]
     noise = max((row[2] for row in rows if row[2] < math.inf), default=math.inf)
     rows.append((PATH_TRACED, 0.0, tolerance, tracing * (noise / tolerance) ** 2, ""))
     return _advice(rows, tolerance, r or REACH, "mm" if r else "mean free paths")

@@ -203,8 +203,10 @@ def test_the_check_goes_on_where_it_stopped(tmp_path: Path, monkeypatch: pytest.
 
 def test_a_medium_without_a_scene_gets_a_model_of_the_half_space() -> None:
     medium = Medium.from_albedo(0.75, 0.241, 0.0, 1.3)
-    found = recommend(medium=medium, r=(1.0, 40.0), tolerance=0.2, events=2e5)
-    assert found.model in ("neural", "neural_material") and len(found.options) >= 10
+    found = recommend(medium=medium, r=(1.0, 40.0), tolerance=0.2, events=2e5, only=["better_dipole", "neural"])
+    assert found.model == "neural"
+    assert [option.model for option in found.options] == ["neural", "path_traced", "better_dipole"]
+    assert found.options[-1].why.endswith("asked 20 %")
 
 
 @pytest.mark.parametrize(
