@@ -10,16 +10,17 @@ from typing import Any
 import numpy as np
 
 from full_geometry.learning.model_errors import ModelError, errors_of
-from full_geometry.storing import KIND, trained, transport
+from full_geometry.storing import KIND, find_weights, trained, transport
 from full_geometry.subject import Subject
 from halfspace_sss.checks import check_count
 from halfspace_sss.interface.model import models as half_space_models
+from halfspace_sss.neural.store import load_weights
 from halfspace_sss.neural.trained import weights_folder
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.provenance import check_folder
 from halfspace_sss.rendering.scenes.learners import LearntObject, ObjectError
 
-__all__ = ["errors", "train", "untrained"]
+__all__ = ["cost", "errors", "train", "untrained"]
 
 
 def untrained(scene: Any) -> list[str]:
@@ -102,6 +103,12 @@ def errors(
     name = subject.found.shape.id()
     found = errors_of(subject, transports, seed=seed, progress=progress)
     return [row for model, rows in found.items() for row in _rows(name, model, rows)]
+
+
+def cost(scene: Any, object: str) -> float:
+    """Seconds that the weights of an object of a scene took to learn; ValueError if it has not been trained."""
+    found = find_weights(Subject.given(scene, None, None, object))
+    return float(load_weights(found, KIND)[1].get("seconds", 0.0))
 
 
 def _that_take(subject: Subject) -> dict[str, Any]:

@@ -17,7 +17,8 @@ FLOORS = {  # of each package, a room may import those to its left; "" is what l
     "halfspace_sss": [
         "", "physics", "interface", "tracing", "maps", "measure", "materials", "comparison", "neural",
         "neural.training", "rendering.surface", "rendering.transport", "rendering.walk", "rendering.paths",
-        "rendering.scenes", "rendering", "cli",
+        "rendering.scenes", "rendering", "trade.measuring", "trade", "trade.checking", "cli",
+        "trade.commands",
     ],
     "figures": ["parts", "modelling", "computing", "drawing", ""],
 }  # fmt: skip

@@ -32,7 +32,8 @@ PHASES = ("walks.exr", "walks.json", "model.exr", "model.json")  # of an image w
 def render_command(
     scene: Annotated[Path, typer.Argument(help="Mitsuba XML file whose objects use the BSDF `translucent`.")],
     model: Annotated[
-        str | None, typer.Option(help="A model for all objects, or path_traced.", show_default="as the scene says")
+        str | None,
+        typer.Option(help="A model for all objects, auto, or path_traced.", show_default="as the scene says"),
     ] = None,
     orders: Annotated[
         str | None, typer.Option(help="total, multiple or single.", show_default="as the scene says")
@@ -69,7 +70,7 @@ def render_command(
     use_mitsuba(variant)
     from halfspace_sss.checks import check_count
     from halfspace_sss.rendering.scenes.picture import Picture
-    from halfspace_sss.rendering.scenes.reference import Limits
+    from halfspace_sss.rendering.scenes.reference import Limits, chosen
     from halfspace_sss.rendering.scenes.scene_files import open_scene
 
     limits = Limits(SPP if (spp, target_error, seconds) == (None,) * 3 else spp, None, target_error, seconds)
@@ -79,6 +80,8 @@ def render_command(
     settings = {"train_seconds": train_seconds, "train_error": train_error}
     settings = {name: value for name, value in settings.items() if value is not None}
     loaded = open_scene(scene, model, orders, parameters, settings)
+    for sentence in chosen(loaded, loaded.integrator()).get("choices", {}).values():
+        console().print(sentence, highlight=False, markup=False, soft_wrap=True)
     file = out / f"{scene.stem}_{model or 'scene'}{f'_sensor{sensor}' if sensor else ''}.exr"
     found = _rendered(loaded, file, limits, {"seed": seed, "sensor": sensor}, resume)
     picture = Picture(file.stem, _colours(found.mean), _numbers(found), _error(found), loaded, sensor, denoise)

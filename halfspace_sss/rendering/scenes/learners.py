@@ -15,7 +15,7 @@ from halfspace_sss.extensions import LEARNERS, offered, warn_left_out
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.rendering.scenes.camera_walks import CameraWalks
 
-__all__ = ["Learner", "LearntObject", "ObjectError", "learner"]
+__all__ = ["Learner", "LearntObject", "ObjectError", "learner", "learners"]
 
 
 class ObjectError(NamedTuple):
@@ -71,18 +71,24 @@ class Learner(Protocol):
         """The errors of models of an object; of all that can be asked where none is named."""
 
 
-def learner(name: str | None = None) -> Learner:
-    """The learner of the model `name`, by default the first one.
-
-    Raises:
-        ValueError: there is none.
-    """
+def learners() -> dict[str, Learner]:
+    """All learners by the name of their model."""
     known: dict[str, Any] = {}
     for key, found in offered(LEARNERS):
         if callable(getattr(found, "train", None)) and callable(getattr(found, "errors", None)):
             known.setdefault(key, found)
         else:
             warn_left_out(LEARNERS, key, f"it must have the functions train and errors, got {found!r}")
+    return known
+
+
+def learner(name: str | None = None) -> Learner:
+    """The learner of the model `name`, by default the first one.
+
+    Raises:
+        ValueError: there is none.
+    """
+    known = learners()
     if name is not None or not known:
         check_choice("model", name or "full_geometry", tuple(known))
     return known[name] if name is not None else next(iter(known.values()))

@@ -24,9 +24,8 @@ from halfspace_sss.provenance import check_folder
 from halfspace_sss.rendering.scenes import reference
 from halfspace_sss.rendering.scenes.camera_walks import CameraWalks
 from halfspace_sss.rendering.scenes.combined import combined
-from halfspace_sss.rendering.scenes.learners import LearntObject, learner
+from halfspace_sss.rendering.scenes.learners import LearntObject, learner, learners
 from halfspace_sss.rendering.scenes.reference_store import Reference, load, save
-from halfspace_sss.rendering.surface.transports import knows_objects
 
 __all__ = ["files", "render", "untrained"]
 
@@ -48,10 +47,9 @@ def untrained(scene: Any) -> dict[str, list[str]]:
     if not getattr(settings, "train_seconds", 0) > 0:
         return {}
     insides = [shape.bsdf().inside for shape in scene.shapes() if hasattr(shape.bsdf(), "inside")]
-    names = sorted({inside.model for inside in insides if knows_objects(inside.model)})
-    found = {}
+    names, known, found = sorted({inside.model for inside in insides}), learners(), {}
     for name in names:
-        asked = getattr(learner(name), "untrained", None)
+        asked = getattr(known.get(name), "untrained", None)
         if asked and (ids := asked(scene)):
             found[name] = ids
     return found
@@ -157,7 +155,7 @@ def _learnt(
 def _join(scene: Any) -> bool:
     """Whether walks show what the models show: all objects are learnt, and paths go farther than to an object."""
     insides = [shape.bsdf().inside for shape in scene.shapes() if hasattr(shape.bsdf(), "inside")]
-    return scene.integrator().settings.max_depth != 1 and all(knows_objects(inside.model) for inside in insides)
+    return scene.integrator().settings.max_depth != 1 and all(inside.model in learners() for inside in insides)
 
 
 def _sentence(name: str, model: str, settings: Any, joined: bool) -> str:

@@ -24,8 +24,10 @@ from halfspace_sss.provenance import check_folder, provenance
 from halfspace_sss.rendering.scenes.causes import first_cause
 from halfspace_sss.rendering.scenes.identity import scene_hash, words
 from halfspace_sss.rendering.scenes.reference_store import Reference, load, save
+from halfspace_sss.rendering.surface.placement import choices
+from halfspace_sss.rendering.surface.transports import AUTO
 
-__all__ = ["Limits", "Progress", "Reference", "about_render", "check_same", "load", "loaded", "render"]
+__all__ = ["Limits", "Progress", "Reference", "about_render", "check_same", "chosen", "load", "loaded", "render"]
 
 FEWEST_PASSES = 8  # before the spread of the passes is trusted to stop a run
 SHARE = 4  # a growing pass has at most a quarter of the samples so far: enough passes for their spread, few launches
@@ -83,7 +85,7 @@ def render(
         raise ValueError(f"path must end in .exr, got {str(path)!r}")
     check_folder(path.parent)
     scene, integrator = loaded(scene, integrator, sensor)
-    about = about_render(scene, integrator, sensor, seed)
+    about = about_render(scene, integrator, sensor, seed) | chosen(scene, integrator)
     found = _start(path, resume, about)
     written = found if resume is True else None
     last = time.monotonic()
@@ -225,6 +227,15 @@ def about_render(scene: Any, integrator: Any, sensor: int, seed: int) -> dict[st
         "variant": mi.variant(),
     }
     return {**about, "provenance": provenance(**about)}
+
+
+def chosen(scene: Any, integrator: Any) -> dict[str, Any]:
+    """The choices of the models "auto", which are made now if they have not been."""
+    if any(getattr(getattr(shape.bsdf(), "inside", None), "model", None) == AUTO for shape in scene.shapes()):
+        if hasattr(integrator, "prepare"):
+            integrator.prepare(scene)
+    found = choices(scene)
+    return {"choices": found} if found else {}
 
 
 def _start(path: Path, resume: bool | str | os.PathLike, about: dict[str, Any]) -> Reference | None:

@@ -74,7 +74,7 @@ def open_scene(
             props["orders"] = orders
     _choose_integrator(state, model, bool(model or orders), settings or {})
     _set_parameters(state, settings or {})
-    loaded = _made(state, config)
+    loaded = _made(scene, state, config)
     if not any(hasattr(shape.bsdf(), "inside") for shape in loaded.shapes()):
         raise ValueError(_NO_OBJECT)
     return loaded
@@ -102,7 +102,7 @@ def load_objects(scene: dict | str | Path, parameters: Mapping[str, str] | None 
     _surfaces(state)
     config.merge_meshes = False
     _transform(scene, state, config)
-    return _made(state, config)
+    return _made(scene, state, config)
 
 
 def millimetres(scene: Any) -> float:
@@ -131,13 +131,20 @@ def _surfaces(state: Any) -> list[Any]:
     return found
 
 
-def _made(state: Any, config: Any) -> Any:
+def _made(scene: dict | str | Path, state: Any, config: Any) -> Any:
+    """The scene; files that an XML file names are looked for beside it first."""
     import mitsuba as mi
 
+    before, here = mi.file_resolver(), mi.FileResolver(mi.file_resolver())
+    if not isinstance(scene, dict):
+        here.prepend(str(Path(scene).resolve().parent))
+    mi.set_file_resolver(here)
     try:
         return mi.parser.instantiate(config, state)
     except RuntimeError as error:
         raise ValueError(first_cause(error)) from error
+    finally:
+        mi.set_file_resolver(before)
 
 
 def _parsed(scene: dict | str | Path, parameters: Mapping[str, str]) -> tuple[Any, Any]:

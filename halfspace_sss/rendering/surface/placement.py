@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-__all__ = ["translucent_shapes"]
+__all__ = ["choices", "translucent_shapes"]
 
 
 def translucent_shapes(scene: Any) -> list[Any]:
@@ -30,6 +30,11 @@ def translucent_shapes(scene: Any) -> list[Any]:
                 f"a translucent surface must stand alone, got one inside the {bsdf.class_name()} of {shape.id()!r}"
             )
     return [shape for shape in shapes if hasattr(shape.bsdf(), "inside")]
+
+
+def choices(scene: Any) -> dict[str, str]:
+    """Why the model "auto" of objects became the one that they have, by id; empty before it was chosen."""
+    return {shape.id(): why for shape in scene.shapes() if (why := getattr(shape.bsdf(), "choice", ""))}
 
 
 def _inside(bsdf: Any) -> bool:

@@ -12,7 +12,7 @@ from halfspace_sss.rendering.surface.inside import Inside
 from halfspace_sss.rendering.surface.object import Object, same_objects, survey
 from halfspace_sss.rendering.surface.placement import translucent_shapes
 from halfspace_sss.rendering.surface.sensors import check_sensors
-from halfspace_sss.rendering.surface.transports import knows_objects, object_transport
+from halfspace_sss.rendering.surface.transports import AUTO, choose_models, knows_objects, object_transport
 from halfspace_sss.rendering.surface.varying import equivalent, warn_of_means
 from halfspace_sss.rendering.transport.expected import Expected, expected_of
 from halfspace_sss.rendering.transport.half_space import half_space_means
@@ -85,6 +85,8 @@ def make_bodies(scene: Any, settings: Settings, without: Collection[str] = ()) -
     shapes = translucent_shapes(scene)
     if not shapes:
         raise ValueError("the scene must have an object with a translucent BSDF, got none")
+    if any(shape.bsdf().inside.model == AUTO for shape in shapes):
+        choose_models(scene, settings)
     bodies = [_make_body(shape, settings) for shape in shapes if shape.id() not in without]
     check_sensors(scene, [body.found for body in bodies])
     return bodies
@@ -111,9 +113,9 @@ def _few(inside: Inside, transport: Transport | None) -> tuple[int, ...]:
     """
     if inside.orders != "total":
         return (1,) if inside.orders == "single" else ()
-    if transport is None or knows_objects(inside.model):
-        return (0, 1)
-    return (1,) if transport.orders == "multiple" else ()
+    if transport is not None and transport.orders == "total":
+        return ()
+    return (0, 1) if transport is None or knows_objects(inside.model) else (1,)
 
 
 def _means(inside: Inside, found: Object, media: list[Medium], settings: Settings, variation: Variation) -> Means:

@@ -30,6 +30,7 @@ class Settings:
         hide_emitters: whether directly visible emitters are left out.
         train_seconds: time for each object whose model has to learn it first; 0 refuses objects without weights.
         train_error: relative error under constant light, measured on the way, from which on it has learnt enough.
+        tolerance: relative error of the radiance of an object that its model "auto" keeps, if one does.
     """
 
     mm_per_unit: float = 1.0
@@ -41,9 +42,11 @@ class Settings:
     hide_emitters: bool = False
     train_seconds: float = 60.0
     train_error: float = 0.03
+    tolerance: float = 0.05
 
     def __post_init__(self) -> None:
         check_interval("mm_per_unit", self.mm_per_unit, 1e-9, 1e9)
+        check_interval("tolerance", self.tolerance, 1e-4, 10.0)
         if self.max_depth < -1 or self.max_depth == 0:
             raise ValueError(f"max_depth must be -1 or at least 1, got {self.max_depth}")
         if self.rr_depth < 1:

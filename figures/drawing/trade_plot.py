@@ -1,0 +1,218 @@
+"""Speed against accuracy: each way as a point, time to a given noise over the bias, and total error over time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from figures.drawing.page import page
+from figures.drawing.shot import Shot, compared
+from figures.drawing.style import TEXT, TRACED, Look, look, paper, saved
+from halfspace_sss.trade.measuring.results import Assessment, ObjectTrade, WayTrade
+from halfspace_sss.trade.measuring.ways import NO_SINGLE
+from halfspace_sss.trade.picture import TradePicture
+
+__all__ = ["draw", "image_shots", "multiples", "render", "trade_panels"]
+
+NOISE = 0.01  # of the mean radiance, to which times are
+LEAST = 0.003  # smallest bias that is drawn; what is below lies there, an arrow down
+MARKERS = {"full_geometry": "P", "neural_shape": "X", "neural": "D", "neural_material": "d", TRACED: "*"}
+
+
+def render(picture: TradePicture) -> dict[str, bytes]:
+    """{"pdf", "png", "html"}: the figure, and the page to flip between the images of the ways."""
+    files: dict[str, bytes] = {}
+    shown = [o for o in picture.found.objects if len(o.ways) > 1 and not o.is_dark]
+    if shown:
+        with paper():
+            files = saved(draw(shown, picture.tolerance))
+    if picture.images:
+        files["html"] = _page(picture).encode()
+    return files
+
+
+def draw(objects: Sequence[ObjectTrade], tolerance: float) -> Figure:
+    """A row of two panels for each object, and the legend below."""
+    figure = Figure(figsize=(TEXT, 2.5 * len(objects) + 0.75), layout="constrained")
+    figure.get_layout_engine().set(w_pad=0.03, h_pad=0.03, wspace=0.03)
+    grid = figure.subplots(len(objects), 2, squeeze=False)
+    handles: dict[str, object] = {}
+    for found, (left, right) in zip(objects, grid):
+        handles |= trade_panels(found, left, right, tolerance)
+        left.set_title(f"{found.object}: {_mfp(found)} mean free paths across", pad=3)
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=4, frameon=False)
+    return figure
+
+
+def _mfp(found: ObjectTrade) -> str:
+    low, high = (f"{v:.3g}" for v in found.mfp)
+    return low if low == high else f"{low} to {high}"
+
+
+def trade_panels(found: ObjectTrade, left: Axes, right: Axes, tolerance: float) -> dict[str, object]:
+    """Draw an object; the handles of the legend by label."""
+    rows = [w for w in found.ways if not w.refusal and w.variance > 0]
+    handles = _pareto(left, rows, found.pixels, tolerance)
+    _over_time(right, rows, found.pixels, tolerance)
+    return handles
+
+
+def _look(way: str) -> Look:
+    model, _, bare = way.partition(", ")
+    style = look(model)
+    return style._replace(label=f"{style.label}, no single") if bare else style
+
+
+def _time(row: WayTrade, pixels: float) -> float:
+    return row.time_to(NOISE) * pixels
+
+
+def _pareto(
+    ax: Axes, rows: Sequence[WayTrade], pixels: float, tolerance: float, small: bool = False
+) -> dict[str, object]:
+    """Bias over the time to a given noise; the front of what nothing beats in both."""
+    handles: dict[str, object] = {}
+    for row in rows:
+        style, x, exact = _look(row.way), _time(row, pixels), row.way == TRACED
+        y = LEAST if exact else max(row.bias, LEAST)
+        bare = row.way.endswith(NO_SINGLE)
+        mark = MARKERS.get(row.way, "o")
+        size = (9 if exact else 5) * (0.7 if small else 1)
+        (handle,) = ax.plot(
+            x, y, mark, color=style.color, mfc="white" if bare else style.color, ms=size, mew=0.7 if small else 0.9,
+            ls="none", zorder=3, clip_on=False, label=style.label,
+        )  # fmt: skip
+        handles[style.label] = handle
+        if not exact:
+            low, high = _interval(row)
+            ax.plot([x, x], [max(low, LEAST), max(high, LEAST)], color=style.color, lw=0.8, zorder=2)
+    _front(ax, [(_time(w, pixels), 0.0 if w.way == TRACED else w.bias) for w in rows])
+    ax.axhline(tolerance, color="0.55", lw=0.6, ls=(0, (4, 3)), zorder=0)
+    ax.set(xscale="log", yscale="log", xlabel=f"time to {100 * NOISE:g} % noise [s]", ylabel="bias of radiance")
+    top = max([w.bias_bound for w in rows if w.way != TRACED], default=1.0)
+    ax.set_ylim(LEAST, max(1.6 * top, 3 * tolerance))
+    if not small:
+        asked = {"ha": "right", "va": "bottom", "size": 6.5, "color": "0.4"}
+        ax.text(0.99, tolerance, "asked", transform=ax.get_yaxis_transform(), **asked)
+        ax.text(0.99, 0.02, f"exact, or below {100 * LEAST:g} %", transform=ax.transAxes, **asked)
+    xs = [_time(w, pixels) for w in rows]
+    ax.set_xlim(min(xs) / 2, max(xs) * 4)
+    _plain(ax)
+    return handles
+
+
+def _interval(row: WayTrade) -> tuple[float, float]:
+    """Bias within one standard error of its square."""
+    low, high = row.bias2 - row.bias2_error, row.bias2 + row.bias2_error
+    return math.sqrt(max(low, 0.0)), math.sqrt(max(high, 0.0))
+
+
+def _front(ax: Axes, points: list[tuple[float, float]]) -> None:
+    """The staircase of points that nothing beats in time and bias."""
+    best, steps = math.inf, []
+    for x, y in sorted(points):
+        if y < best:
+            steps.append((x, max(y, LEAST)))
+            best = y
+    xs, ys = zip(*steps)
+    ax.step([*xs, 1e3 * xs[-1]], [*ys, ys[-1]], where="post", color="0.8", lw=2.5, zorder=1, scalex=False)
+
+
+def _over_time(ax: Axes, rows: Sequence[WayTrade], pixels: float, tolerance: float) -> None:
+    """Total error over time, and where path tracing overtakes."""
+    traced = next(w for w in rows if w.way == TRACED)
+    middle = traced.variance * traced.seconds * pixels / tolerance**2
+    times = np.geomspace(middle / 300, middle * 30, 200)
+    for row in (w for w in rows if not w.way.endswith(NO_SINGLE)):
+        style = _look(row.way)
+        floor, slope = (0.0 if row is traced else row.bias**2), row.variance * row.seconds * pixels
+        width = 1.6 if row is traced else 1.0
+        ax.plot(times, np.sqrt(floor + slope / times), color=style.color, ls=style.dash, lw=width)
+        crossing = (traced.variance * traced.seconds * pixels - slope) / floor if floor > 0 else 0.0
+        if times[0] < crossing < times[-1]:
+            ax.plot(crossing, math.sqrt(traced.variance * traced.seconds * pixels / crossing), "o", ms=3.2,
+                    mfc="white", mec=style.color, mew=0.9, zorder=4)  # fmt: skip
+    ax.axhline(tolerance, color="0.55", lw=0.6, ls=(0, (4, 3)), zorder=0)
+    ax.set(xscale="log", yscale="log", xlabel="time of an image [s]", ylabel="total error")
+    ax.set_xlim(times[0], times[-1])
+    ax.set_ylim(tolerance / 6, min(tolerance * 20, 4.0))
+    ax.set_title("circles: path tracing overtakes", pad=3)
+    _plain(ax)
+
+
+def _plain(ax: Axes) -> None:
+    """Percent on the axis of errors."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
+    ax.yaxis.set_major_formatter(FuncFormatter(lambda v, _: rf"{100 * v:.3g} %"))
+    ax.yaxis.set_minor_formatter(NullFormatter())
+
+
+def multiples(found: Mapping[tuple[str, str, str], ObjectTrade], tolerance: float) -> Figure:
+    """Bias over time for each material, a row, and each shape and light, a column."""
+    materials = list(dict.fromkeys(key[0] for key in found))
+    columns = list(dict.fromkeys(key[1:] for key in found))
+    figure = Figure(figsize=(TEXT, 1.45 * len(materials) + 0.9), layout="constrained")
+    figure.get_layout_engine().set(w_pad=0.015, h_pad=0.015, wspace=0.0, hspace=0.01)
+    grid = figure.subplots(len(materials), len(columns), squeeze=False, sharex="col", sharey=True)
+    handles: dict[str, object] = {}
+    for i, material in enumerate(materials):
+        for j, (shape, light) in enumerate(columns):
+            ax, o = grid[i, j], found.get((material, *columns[j]))
+            if o is None:
+                ax.set_visible(False)
+                continue
+            rows = [w for w in o.ways if not w.refusal and w.variance > 0]
+            handles |= _pareto(ax, rows, o.pixels, tolerance, small=True)
+            ax.set_title(f"{material}: {_mfp(o)} mfp" if j else f"{material}: {_mfp(o)} mean free paths", pad=2, size=7)
+            ax.set(
+                xlabel=f"{shape}, {light}: s to {100 * NOISE:g} % noise" if i == len(materials) - 1 else "", ylabel=""
+            )
+            ax.label_outer()
+    for ax in grid[:, 0]:
+        ax.set_ylabel("bias of radiance")
+    tops = [w.bias_bound for o in found.values() for w in o.ways if not w.refusal and w.bias2 > 0]
+    grid[0, 0].set_ylim(LEAST, 1.6 * max([*tops, tolerance]))
+    for j in range(len(columns)):
+        _span(grid[0, j], [o for key, o in found.items() if key[1:] == columns[j]])
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=4, frameon=False)
+    return figure
+
+
+def _span(ax: Axes, objects: Sequence[ObjectTrade]) -> None:
+    xs = [_time(w, o.pixels) for o in objects for w in o.ways if not w.refusal and w.variance > 0]
+    ax.set_xlim(min(xs) / 2, max(xs) * 3)
+
+
+def image_shots(images: Mapping[str, np.ndarray], found: Assessment) -> list[Shot]:
+    """The images of all ways, path traced first, with FLIP and what each costs."""
+    reference = images[TRACED]
+    exposure = _exposure(reference)
+    numbers = {w.way: w for o in found.objects for w in o.ways}
+    shots = [Shot(_look(TRACED).label, reference, _numbers(numbers[TRACED]))]
+    for name, image in images.items():
+        if name != TRACED:
+            told = _numbers(numbers[name])
+            shots.append(compared(_look(name).label, image, reference, exposure=exposure, numbers=told))
+    return shots
+
+
+def _exposure(reference: np.ndarray) -> float:
+    bright = float(np.percentile(reference, 99.0))
+    return math.log2(0.9 / bright) if bright > 0 else 0.0
+
+
+def _page(picture: TradePicture) -> str:
+    shots = image_shots(picture.images, picture.found)
+    caption = picture.sentences[0] if picture.sentences else ""
+    return page(picture.title, {picture.title: shots}, exposure=_exposure(picture.images[TRACED]), caption=caption)
+
+
+def _numbers(row: WayTrade) -> dict[str, float | str]:
+    bias = "exact" if row.way == TRACED else f"{100 * row.bias:.3g}"
+    return {"bias, %": bias, "variance": f"{row.variance:.3g}", "s a million": f"{1e6 * row.seconds:.3g}"}

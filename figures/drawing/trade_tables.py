@@ -1,0 +1,90 @@
+"""The table of the trade: every way on every scene, as a data frame and as Markdown."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from figures.drawing.style import TRACED
+from halfspace_sss.trade.advice import Job, advise
+from halfspace_sss.trade.measuring.results import Assessment, ObjectTrade, WayTrade
+
+if TYPE_CHECKING:
+    import pandas
+
+__all__ = ["JOBS", "markdown", "trade_table"]
+
+Scenes = Mapping[tuple[str, str, str], ObjectTrade]
+JOBS = ((0.02, 1), (0.05, 1), (0.1, 1), (0.2, 1))  # tolerance, images
+CERTAIN = 2.0  # standard errors
+
+
+def trade_table(found: Scenes) -> pandas.DataFrame:
+    """A row for each scene and way that renders it."""
+    import pandas
+
+    rows: list[dict[str, Any]] = []
+    for (material, shape, light), o in found.items():
+        for w in o.ways:
+            if w.refusal:
+                continue
+            row: dict[str, Any] = {"material": material, "shape": shape, "light": light, "way": w.way, "bias": w.bias}
+            row |= {"bias_standard_error": w.bias_error, "variance": w.variance}
+            row |= {"seconds_per_million": 1e6 * w.seconds, "cost": 1e6 * w.seconds * w.variance}
+            rows.append(row | {"flip": w.flip, "flip_noise": w.flip_noise})
+    return pandas.DataFrame(rows)
+
+
+def markdown(found: Scenes, table: pandas.DataFrame, settings: Sequence[Mapping[str, Any]] = ()) -> str:
+    """What is recommended, the bias of every way, and its cost."""
+    lines = ["## The cheapest way that keeps a tolerance", ""]
+    lines += ["For one image of 512 x 512 pixels; in brackets the seconds of two cores.", ""]
+    lines.append("| material | shape | light | " + " | ".join(f"{100 * e:g} %" for e, _ in JOBS) + " |")
+    lines.append("|---|---|---|" + "---|" * len(JOBS))
+    for scene, o in found.items():
+        told = []
+        for tolerance, images in JOBS:
+            option = advise(Assessment((o,), 0.0, 0.0, 0), Job(tolerance, images)).objects[0].options[0]
+            told.append(f"{option.way} ({option.seconds:.2g})")
+        lines.append(f"| {' | '.join(scene)} | {' | '.join(told)} |")
+    lines += ["", "## Bias", "", "Relative error of radiance over visible points, %.", ""]
+    lines += _grid(found, _bias)
+    lines += [
+        "",
+        "## Cost",
+        "",
+        "Variance of a sample times seconds of a million samples, over that of path tracing.",
+        "",
+    ]
+    lines += _grid(found, lambda w, o: f"{w.variance * w.seconds / (o.traced.variance * o.traced.seconds):.2g}")
+    if settings:
+        lines += ["", "## Knobs", "", "| material | knob | setting | way | cost | error, % |"]
+        lines.append("|---|---|---:|---|---:|---:|")
+        for s in settings:
+            words = " | ".join(str(s[key]) for key in ("material", "knob", "value", "way"))
+            lines.append(f"| {words} | {s['cost']:.2g} | {100 * s['error']:.2g} |")
+    return "\n".join(lines) + "\n"
+
+
+def _bias(w: WayTrade, o: ObjectTrade) -> str:
+    if w.way == TRACED:
+        return "exact"
+    if w.bias2 < CERTAIN * w.bias2_error:
+        return f"< {100 * w.bias_bound:.2g}"
+    return f"{100 * w.bias:.2g} ± {100 * w.bias_error:.1g}"
+
+
+def _grid(found: Scenes, cell: Any) -> list[str]:
+    """A row for each way, a column for each scene of a material, a table for each material."""
+    lines: list[str] = []
+    for material in dict.fromkeys(key[0] for key in found):
+        mine = {key: o for key, o in found.items() if key[0] == material}
+        lines.append(f"| {material} | " + " | ".join(f"{shape}, {light}" for _, shape, light in mine) + " |")
+        lines.append("|---|" + "---:|" * len(mine))
+        names = dict.fromkeys(w.way for o in mine.values() for w in o.ways if not w.refusal)
+        for name in names:
+            rows = [next((w for w in o.ways if w.way == name and not w.refusal), None) for o in mine.values()]
+            cells = ["–" if w is None else cell(w, o) for w, o in zip(rows, mine.values())]
+            lines.append(f"| {name} | {' | '.join(cells)} |")
+        lines.append("")
+    return lines[:-1]

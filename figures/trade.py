@@ -1,0 +1,135 @@
+"""The trade of speed for accuracy: five materials, two shapes and two lights by every way of rendering."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from figures.computing.scenes import BUNNY, MATERIALS, bunny_scene, prepare
+from figures.drawing import trade_tables
+from figures.drawing.page import page
+from figures.drawing.style import paper, saved
+from figures.drawing.trade_plot import image_shots, multiples
+from figures.parts.part import Part, Result, Task
+from halfspace_sss.trade.checking.random_scenes import RandomScene, mesh_file
+from halfspace_sss.trade.measuring.results import Assessment
+
+__all__ = ["TITLE", "draw", "measured", "parts"]
+
+TITLE = "bias against time to a given noise, for every way of rendering"
+SHAPES = ("bunny", "spikes")
+LIGHTS = {"sky": "even sky", "small light": "small light"}
+SECONDS = {"draft": 2.0, "paper": 120.0}
+SIZE = {"draft": 64, "paper": 256}
+SPP = {"draft": 16, "paper": 1024}
+SPIKES = RandomScene(0, 0, "spikes", "sky", (), (), 0.0, 1.3, 0.0, (), 0.05, 1)
+MM_PER_UNIT = 3.8
+TOLERANCE = 0.05
+KNOB_MATERIALS = ("marble", "ketchup")
+KNOB_WAYS = ("better_dipole", "neural")
+
+
+def parts(quality: str) -> list[Part]:
+    """A scene each."""
+    found = []
+    for material in MATERIALS:
+        for shape in SHAPES:
+            for light in LIGHTS:
+                params = {"material": material, "shape": shape, "light": light, "seconds": SECONDS[quality]}
+                params |= {"size": SIZE[quality], "spp": SPP[quality], "seed": 0}
+                found.append(Part(_name(material, shape, light), measured, params, SECONDS[quality], inputs=(BUNNY,)))
+    for material in KNOB_MATERIALS:
+        params = {"material": material, "shape": "bunny", "light": "small light", "seconds": SECONDS[quality]}
+        params |= {"seed": 0, "names": list(KNOB_WAYS)}
+        found.append(Part(f"{material}, knobs", turned, params, 6 * SECONDS[quality], inputs=(BUNNY,)))
+    return found
+
+
+def _name(material: str, shape: str, light: str) -> str:
+    return f"{material}, {shape}, {light}"
+
+
+def measured(task: Task) -> dict[str, Any]:
+    """The assessment of a scene, and an image by each way."""
+    from halfspace_sss.trade.images import small_images, with_flip
+    from halfspace_sss.trade.measuring.objects import assess_stage
+    from halfspace_sss.trade.measuring.ways import stage, ways
+
+    prepare()
+    p = task.params
+    with TemporaryDirectory() as folder, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # they are in the notes of the assessment
+        on = stage(_scene(p, Path(folder)))
+        chosen = ways()
+
+        def tell(what: str, done: int, total: int) -> None:
+            task.progress(done, total + 1)
+
+        found = assess_stage(on, chosen, seconds=p["seconds"], seed=p["seed"], progress=tell)
+        found = with_flip(on, chosen, found, 0, p["seed"])
+        named = {row.way for row in found.objects[0].ways if not row.refusal}
+        images = small_images(on, [w for w in chosen if w.name in named], 0, p["seed"], p["size"], p["spp"])
+    numbered = {f"image_{k}": image for k, image in enumerate(images.values())}
+    return {"assessment": found.record(), "shown": list(images), **numbered}
+
+
+def turned(task: Task) -> dict[str, Any]:
+    """What the knobs bring on a scene."""
+    from halfspace_sss import materials
+    from halfspace_sss.neural.symmetric import channels
+    from halfspace_sss.trade.knobs import channel_settings, entry_settings, node_settings
+    from halfspace_sss.trade.measuring.ways import stage
+
+    prepare()
+    p = task.params
+    on = stage(_scene(p, task.folder))
+    settings = entry_settings(on, p["names"], p["seconds"], p["seed"])
+    task.progress(1, 3)
+    settings += channel_settings(on, p["seconds"], p["seed"])
+    task.progress(2, 3)
+    settings += node_settings(channels(materials.load(p["material"]).medium)[0], seed=p["seed"])
+    return {"settings": [{**vars(s), "material": p["material"]} for s in settings]}
+
+
+def _scene(p: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """The bunny, or what stands in its place at the same size."""
+    scene = bunny_scene(p["material"], 512, LIGHTS[p["light"]])
+    if p["shape"] != "bunny":
+        import mitsuba as mi
+
+        # 37 mm across as the bunny is tall, in the middle of the picture
+        to_world = mi.ScalarTransform4f().translate([-0.55, 4.7, 0]).scale(0.42 / MM_PER_UNIT)
+        bsdf = scene.pop("bunny")["bsdf"]
+        mesh = mesh_file(SPIKES, folder)
+        scene["spikes"] = {"type": "ply", "filename": str(mesh), "to_world": to_world, "bsdf": bsdf}
+    return scene
+
+
+def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
+    """The figure, the table as CSV and Markdown, and the page to flip between images."""
+    found, shots = {}, {}
+    for material in MATERIALS:
+        for shape in SHAPES:
+            for light in LIGHTS:
+                name = _name(material, shape, light)
+                if name not in results:
+                    continue
+                assessment = Assessment.of(results[name].numbers["assessment"])
+                found[material, shape, light] = assessment.objects[0]
+                shown = enumerate(results[name].numbers["shown"])
+                images = {way: np.asarray(results[name].images[f"image_{k}"]) for k, way in shown}
+                shots[name] = image_shots(images, assessment)
+    table = trade_tables.trade_table(found)
+    with paper():
+        figure = multiples(found, TOLERANCE)
+        files: dict[str, bytes | str] = {f"trade.{ending}": data for ending, data in saved(figure).items()}
+    files["trade.csv"] = table.to_csv(index=False, lineterminator="\n", float_format="%.5g")
+    knobs = [results[f"{m}, knobs"].numbers["settings"] for m in KNOB_MATERIALS if f"{m}, knobs" in results]
+    files["trade.md"] = trade_tables.markdown(found, table, [s for settings in knobs for s in settings])
+    files["trade.html"] = page("Speed against accuracy", shots)
+    return files

@@ -1,0 +1,72 @@
+"""Light that leaves where it entered: a diffuse surface with the reflectance of the medium, as a transport."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from halfspace_sss.physics.medium import Medium
+from halfspace_sss.rendering.surface.inside import Inside
+from halfspace_sss.rendering.surface.object import Object
+from halfspace_sss.rendering.transport.plane import Exit, number
+from halfspace_sss.rendering.transport.protocols import Entry, Means
+from halfspace_sss.rendering.transport.settings import Settings
+
+__all__ = ["LambertProposals", "LambertTransport", "lambert_means"]
+
+
+@dataclass(frozen=True, eq=False)
+class LambertTransport:
+    """S = R delta(x_i - x_o) / pi, R the exact reflectance of the half-space under light from everywhere.
+
+    Args:
+        reflectance: R of each channel.
+    """
+
+    reflectance: list[float]
+    orders = "total"
+
+    def prepare(self, out: Exit, active: Any) -> Exit:
+        """Nothing is done for the exit alone."""
+        return out
+
+    def S_mu(self, prepared: Exit, entry: Entry, w_i: Any, active: Any) -> Any:
+        """Over the density of `LambertProposals.sample`, whose point is the only one."""
+        import drjit as dr
+        import mitsuba as mi
+
+        R = [number(value) for value in self.reflectance]
+        mu_i = dr.maximum(dr.dot(w_i, entry.n_out), 0)
+        lit = active & (dr.dot(prepared.w, prepared.n) > 0)
+        return dr.select(lit, (mi.Spectrum(*R) if len(R) > 1 else mi.Spectrum(R[0])) * (mu_i * dr.inv_pi), 0)
+
+
+@dataclass(frozen=True, eq=False)
+class LambertProposals:
+    """The exit itself, directions by the cosine."""
+
+    def prepare(self, out: Exit, prepared: Any, active: Any) -> None:
+        """Nothing is done for the exit alone."""
+
+    def sample(self, out: Exit, prim_index: Any, prepared: None, sampler: Any, active: Any) -> Entry:
+        import drjit as dr
+        import mitsuba as mi
+
+        n = mi.Normal3f(out.n_face * out.sign)
+        return Entry(mi.Point3f(out.p), n, mi.Normal3f(out.n), dr.select(active, mi.Float(1), 0), prim_index)
+
+    def sample_direction(self, entry: Entry, out: Exit, u: Any) -> tuple[Any, Any]:
+        import mitsuba as mi
+
+        local = mi.warp.square_to_cosine_hemisphere(u)
+        return mi.Frame3f(entry.n_out).to_world(local), mi.warp.square_to_cosine_hemisphere_pdf(local)
+
+    def pdf_direction(self, entry: Entry, out: Exit, w_i: Any) -> Any:
+        import drjit as dr
+
+        return dr.maximum(dr.dot(w_i, entry.n_out), 0) * dr.inv_pi
+
+
+def lambert_means(found: Object, inside: Inside, media: list[Medium], settings: Settings) -> Means:
+    """The transport of a diffuse surface: what a half-space tends to as its mean free path goes to 0."""
+    return Means(LambertTransport([float(m.reflectance()) for m in media]), LambertProposals())

@@ -1,0 +1,31 @@
+"""The trade of speed for accuracy, measured: what each way of rendering a scene costs, and how wrong it is.
+
+found = trade.assess(scene)                                    # each way, on each translucent object
+advice = trade.recommend(scene, tolerance=0.05, images=10)     # the cheapest way that is good enough
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from halfspace_sss.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from halfspace_sss.trade.advice import recommend
+    from halfspace_sss.trade.assessing import assess
+    from halfspace_sss.trade.flat import recommend_flat
+    from halfspace_sss.trade.measuring.results import Assessment, ObjectTrade, WayTrade
+
+__all__ = ["Assessment", "ObjectTrade", "WayTrade", "assess", "recommend", "recommend_flat"]
+
+__getattr__, __dir__ = lazy_names(
+    __name__,
+    {
+        "Assessment": "measuring.results",
+        "ObjectTrade": "measuring.results",
+        "WayTrade": "measuring.results",
+        "assess": "assessing",
+        "recommend": "advice",
+        "recommend_flat": "flat",
+    },
+)

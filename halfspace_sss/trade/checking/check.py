@@ -1,0 +1,97 @@
+"""One random scene: an assessment as users make it, a recommendation, and long runs that say how right they were."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+from halfspace_sss.provenance import provenance, write_atomically
+from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED
+from halfspace_sss.trade.advice import Job, advise
+from halfspace_sss.trade.automatic import picked
+from halfspace_sss.trade.checking.random_scenes import RandomScene, random_scene, write_scene
+from halfspace_sss.trade.measuring.objects import assess_stage
+from halfspace_sss.trade.measuring.results import Assessment, WayTrade
+from halfspace_sss.trade.measuring.seeds import seeded
+from halfspace_sss.trade.measuring.ways import Way, stage
+from halfspace_sss.trade.refining import assess_for
+
+__all__ = ["WAYS", "check_scene", "outcome", "z_values"]
+
+WAYS = (
+    PATH_TRACED, "lambert", "standard_dipole", "better_dipole", "directional_dipole", "photon_beam_diffusion", "neural",
+    "better_dipole, without single scattering", "neural, without single scattering",
+)  # fmt: skip
+FORMAT = "halfspace-sss trade check 1"
+
+
+def check_scene(number: int, seed: int, folder: Path, seconds: float, truth_seconds: float) -> dict[str, Any]:
+    """The record of a scene, from its file if that is there: assessments of two lengths, and what was recommended."""
+    scene = random_scene(number, seed)
+    file = write_scene(scene, folder)
+    path = file.with_suffix(".json")
+    how = {"scene": scene.record(), "seconds": seconds, "truth_seconds": truth_seconds}
+    if path.is_file():
+        record = json.loads(path.read_text(encoding="utf-8"))
+        if record.get("format") == FORMAT and json.loads(json.dumps(how)).items() <= record.items():
+            return record
+    on, ways = stage(file), [Way.of(name) for name in WAYS]
+    quick = assess_for(on, ways, scene.tolerance, seconds=seconds, seed=seeded(seed, number, 0))
+    long = assess_stage(on, ways, seconds=truth_seconds, seed=seeded(seed, number, 1))
+    record = {"format": FORMAT, **how, "quick": quick.record(), "long": long.record(), "provenance": provenance(**how)}
+    write_atomically(path, json.dumps(record, indent=1) + "\n")
+    return record
+
+
+def outcome(record: dict[str, Any]) -> dict[str, Any]:
+    """What came of a scene: error and cost of the recommendation by the long runs, and those of the cheapest way."""
+    scene = RandomScene(**{k: tuple(v) if isinstance(v, list) else v for k, v in record["scene"].items()})
+    quick, long = (Assessment.of(record[key]) for key in ("quick", "long"))
+    found: dict[str, Any] = {"number": scene.number, "shape": scene.shape, "light": scene.light, "mfp": scene.mfp}
+    found |= {"tolerance": scene.tolerance, "images": scene.images, "seconds": quick.seconds}
+    if not quick.objects[0].ways or quick.objects[0].is_dark:
+        return {**found, "way": None}
+    job = Job(scene.tolerance, scene.images)
+    chosen = advise(quick, job).objects[0]
+    option = chosen.options[0]
+    truth = {row.way: row for row in long.objects[0].ways if not row.refusal}
+    row, pixels = truth[option.way], long.objects[0].pixels
+    error2 = max(row.bias2, 0.0) + row.variance / option.spp
+    error2_error = math.hypot(row.bias2_error, row.variance_error / option.spp)
+    least = {name: _least(w, scene, pixels) for name, w in truth.items()}
+    cheapest = min(least, key=lambda name: least[name])
+    cost = row.preparation + scene.images * pixels * option.spp * row.seconds
+    automatic = picked(quick.objects[0], scene.tolerance)[0]
+    found |= {"way": option.way, "spp": option.spp, "error": math.sqrt(error2)}
+    found |= {"error_standard_error": error2_error / (2 * math.sqrt(error2)), "cost_s": cost}
+    found |= {"cheapest": cheapest, "cheapest_s": least[cheapest], "ratio": cost / least[cheapest]}
+    found |= {"keeps": error2 - 2 * error2_error <= scene.tolerance**2, "auto": automatic}
+    return (
+        found
+        | {f"{name}_s": least.get(name, math.inf) for name in (PATH_TRACED, "neural", "better_dipole")}
+        | {"auto_s": least.get(automatic, math.inf)}
+    )
+
+
+def _least(row: WayTrade, scene: RandomScene, pixels: float) -> float:
+    """Seconds of a job by a way if bias and variance were known."""
+    left = scene.tolerance**2 - max(row.bias2, 0.0)
+    if not left > 0:
+        return math.inf
+    return row.preparation + scene.images * pixels * max(math.ceil(row.variance / left), 1) * row.seconds
+
+
+def z_values(record: dict[str, Any]) -> list[tuple[str, float]]:
+    """(bias² of the assessment - that of the long run) over their standard errors together, for each way."""
+    quick, long = (Assessment.of(record[key]) for key in ("quick", "long"))
+    found = []
+    for a in quick.objects[0].ways:
+        if a.refusal or a.way == PATH_TRACED:
+            continue
+        b = long.objects[0].way(a.way)
+        error = math.hypot(a.bias2_error, b.bias2_error)
+        if error > 0:
+            found.append((a.way, (a.bias2 - b.bias2) / error))
+    return found

@@ -1,0 +1,94 @@
+"""What came of many random scenes: shares that kept their tolerance, costs, misses, and whether errors are honest."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from halfspace_sss.trade.checking.check import outcome, z_values
+
+if TYPE_CHECKING:
+    import pandas
+
+__all__ = ["markdown", "outcomes", "summary"]
+
+DEAR = 1.5  # times the cheapest way, up to which a recommendation is called cheap
+ALWAYS = ("neural", "better_dipole", "path_traced", "auto")
+
+
+def outcomes(records: Sequence[dict[str, Any]]) -> pandas.DataFrame:
+    """One row for each scene in which something is seen."""
+    import pandas
+
+    rows = [row for row in map(outcome, records) if row["way"] is not None]
+    return pandas.DataFrame(rows)
+
+
+def summary(records: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Counts of scenes: kept, cheap, misses by number; mean and spread of z; times of fixed choices.
+
+    A fixed choice that never keeps the tolerance of a scene is counted as one that failed; times are sums over the
+    scenes in which all of them keep it, so that they are of equal work.
+    """
+    table = outcomes(records)
+    z = np.array([value for record in records for _, value in z_values(record)])
+    cheap = table["ratio"] <= DEAR
+    found: dict[str, Any] = {"scenes": len(table), "kept": int(table["keeps"].sum()), "cheap": int(cheap.sum())}
+    found |= {"kept_and_cheap": int((table["keeps"] & cheap).sum())}
+    found["not_kept"] = [int(n) for n in table.loc[~table["keeps"], "number"]]
+    found["dear"] = [int(n) for n in table.loc[~cheap, "number"]]
+    found["assess_s"] = float(table["seconds"].max())
+    found["z"] = {"count": len(z), "mean": float(z.mean()), "sd": float(z.std(ddof=1)) if len(z) > 1 else math.nan}
+    found["z"] |= {"beyond_2": float(np.mean(np.abs(z) > 2)), "beyond_3": float(np.mean(np.abs(z) > 3))}
+    found["recommended"] = {str(k): int(v) for k, v in table["way"].value_counts().items()}
+    found["always"] = {name: _always(table, name) for name in ALWAYS}
+    found["recommended_s"], found["cheapest_s"] = float(table["cost_s"].sum()), float(table["cheapest_s"].sum())
+    return found
+
+
+def _always(table: pandas.DataFrame, name: str) -> dict[str, Any]:
+    """A fixed choice: in how many scenes it can keep the tolerance, and its time there over the recommended one."""
+    time = table[f"{name}_s"].astype(float)
+    can = np.isfinite(time)
+    told: dict[str, Any] = {"keeps": int(can.sum())}
+    if can.any():
+        ratio = time[can] / table.loc[can, "cost_s"]
+        told |= {"seconds": float(time[can].sum()), "recommended_s": float(table.loc[can, "cost_s"].sum())}
+        told |= {"median_ratio": float(ratio.median())}
+    return told
+
+
+def markdown(found: dict[str, Any], table: pandas.DataFrame) -> str:
+    """The summary and the misses as text."""
+    n, z = found["scenes"], found["z"]
+    lines = [
+        f"{found['kept']} of {n} recommendations keep their tolerance (within two standard errors of the long run), "
+        f"{found['cheap']} cost at most {DEAR:g} times the cheapest way that does; an assessment took at most "
+        f"{found['assess_s']:.2g} s of two cores, compilation left out.",
+        "",
+        f"(bias² of the assessment - bias² of the long run) over their standard errors, {z['count']} pairs: mean "
+        f"{z['mean']:+.2f}, standard deviation {z['sd']:.2f}, {100 * z['beyond_2']:.1f} % beyond 2, "
+        f"{100 * z['beyond_3']:.1f} % beyond 3.",
+        "",
+        f"Recommended: {', '.join(f'{name} {count}' for name, count in found['recommended'].items())}.",
+        "",
+        "| always | keeps the tolerance in | its time there, s | recommended there, s | median of ratios |",
+        "|---|---:|---:|---:|---:|",
+    ]
+    for name, row in found["always"].items():
+        numbers = [f"{row[key]:.3g}" if key in row else "–" for key in ("seconds", "recommended_s", "median_ratio")]
+        lines.append(f"| {name} | {row['keeps']} of {n} | {' | '.join(numbers)} |")
+    misses = table[~table["keeps"] | (table["ratio"] > DEAR)]
+    if len(misses):
+        lines += ["", "| miss | shape, light | mfp | asked | way | error | cost over cheapest | cheapest |"]
+        lines.append("|---:|---|---:|---:|---|---:|---:|---|")
+    for row in misses.itertuples():
+        error = f"{100 * row.error:.3g} ± {100 * row.error_standard_error:.1g} %"
+        lines.append(
+            f"| {row.number} | {row.shape}, {row.light} | {row.mfp:.3g} | {100 * row.tolerance:.3g} % | {row.way} | "
+            f"{error} | {row.ratio:.3g} | {row.cheapest} |"
+        )
+    return "\n".join(lines) + "\n"

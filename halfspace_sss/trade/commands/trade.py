@@ -1,0 +1,175 @@
+"""The command `halfspace-sss trade`: what each way of rendering costs, how wrong it is, and which one to take."""
+
+from __future__ import annotations
+
+import json
+from importlib import resources
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from halfspace_sss.checks import check_count, check_interval
+from halfspace_sss.cli.shared import (
+    Bar,
+    Define,
+    Variant,
+    check_left_out,
+    console,
+    defined,
+    numbers,
+    use_mitsuba,
+    whole,
+)
+from halfspace_sss.provenance import check_folder
+
+if TYPE_CHECKING:
+    from halfspace_sss.trade.advice import Advice, Job
+    from halfspace_sss.trade.measuring.results import ObjectTrade, WayTrade
+
+__all__ = ["SHIPPED", "object_table", "trade_command"]
+
+SHIPPED = "trade.csv"  # in the package: five materials, two shapes, two lights
+TOLERANCE, IMAGES, ASSESS = 0.05, 1, 4.0
+
+
+def trade_command(
+    what: Annotated[
+        str | None,
+        typer.Argument(help="A Mitsuba XML file, or a material for curves.", show_default="the shipped table"),
+    ] = None,
+    tolerance: Annotated[float, typer.Option(help="Relative error, bias and noise together.")] = TOLERANCE,
+    images: Annotated[int, typer.Option(help="How many are to be rendered.", parser=whole)] = IMAGES,
+    seconds: Annotated[float | None, typer.Option(help="That the whole job may take.", show_default="no limit")] = None,
+    way: Annotated[
+        list[str] | None, typer.Option(help="A way, e.g. neural; repeat for more.", show_default="all")
+    ] = None,
+    assess: Annotated[float, typer.Option(help="Seconds of measuring for each object.")] = ASSESS,
+    r: Annotated[str | None, typer.Option(help="Of a material: smallest and largest distance, mm, as 0.1,20.")] = None,
+    sensor: Annotated[int, typer.Option(help="Number of the sensor.", parser=whole)] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of the samples.", parser=whole)] = 0,
+    define: Define = None,
+    variant: Variant = "llvm_ad_rgb",
+    out: Annotated[Path, typer.Option(help="Folder for the files; those of the same names are replaced.")] = Path(
+        "trade"
+    ),
+) -> None:
+    """Measure speed against accuracy: a table, a recommendation, CSV, JSON, and the figure and page of a scene."""
+    check_interval("tolerance", tolerance, 1e-4, 10.0)
+    check_count("images", images, 1)
+    check_count("seed", seed, 0)
+    if what is None:
+        given = {"seconds": seconds, "way": way, "r": r, "define": define}
+        check_left_out(given, "without a scene or a material")
+        _shipped()
+    elif Path(what).suffix == ".xml" or Path(what).is_file():
+        check_left_out({"r": r}, "with a scene")
+        parameters = defined(define)
+        check_folder(out)
+        use_mitsuba(variant)
+        from halfspace_sss.trade.advice import Job
+
+        how = {"seconds": assess, "only": way, "sensor": sensor, "seed": seed, "parameters": parameters}
+        _scene(Path(what), Job(tolerance, images, seconds), how, out)
+    else:
+        check_left_out({"seconds": seconds, "way": way, "define": define}, "with a material")
+        _material(what, r, tolerance, seed)
+
+
+def _shipped() -> None:
+    """The table of the package."""
+    import pandas
+
+    file = resources.files("halfspace_sss.trade").joinpath("data", SHIPPED)
+    with resources.as_file(file) as path:
+        table = pandas.read_csv(path)
+    screen = console()
+    screen.print(_rich(["material", "shape", "light", *_HEADINGS], [_shipped_row(row) for row in table.itertuples()]))
+    screen.print("measured by `halfspace-sss figures all trade`; docs/trade.md says how", highlight=False)
+
+
+def _shipped_row(row: Any) -> list[str]:
+    bias = f"{100 * row.bias:.3g} ± {100 * row.bias_standard_error:.1g}" if row.way != "path_traced" else "exact"
+    cost = (f"{row.variance:.3g}", f"{row.seconds_per_million:.3g}", f"{row.cost:.3g}")
+    return [row.material, row.shape, row.light, row.way, bias, *cost, f"{row.flip:.3f}"]
+
+
+_HEADINGS = ("way", "bias, %", "variance", "s a million", "cost", "FLIP")
+
+
+def _material(name: str, r: str | None, tolerance: float, seed: int) -> None:
+    from halfspace_sss import materials
+    from halfspace_sss.trade.flat import recommend_flat
+
+    limits = None if r is None else tuple(numbers("r", r))
+    found = recommend_flat(materials.load(name).medium, limits, tolerance=tolerance, seed=seed)
+    console().print(str(found), highlight=False, markup=False, soft_wrap=True)
+
+
+def _scene(file: Path, job: Job, how: dict[str, Any], out: Path) -> None:
+    from halfspace_sss.provenance import provenance, write_together
+    from halfspace_sss.trade.advice import advise
+    from halfspace_sss.trade.assessing import assess
+
+    with Bar("trade") as bar:
+        found = assess(
+            file, **how, tolerance=job.tolerance, progress=lambda what, done, total: bar.show(done, total, what)
+        )
+    advice = advise(found, job)
+    about = {"provenance": provenance(scene=str(file), tolerance=job.tolerance, images=job.images, **how)}
+    about |= {"integrator": advice.integrator, "sentences": str(advice).splitlines(), "assessment": found.record()}
+    files: dict[str, bytes | str] = {
+        "csv": found.table().to_csv(index=False, lineterminator="\n"),
+        "json": json.dumps(about, indent=1) + "\n",
+        **_drawn(file, advice, how),
+    }
+    paths = {out / f"{file.stem}_trade.{ending}": data for ending, data in files.items()}
+    write_together(paths)
+    screen = console()
+    for o in found.objects:
+        screen.print(object_table(o))
+    screen.print(str(advice), highlight=False, markup=False, soft_wrap=True)
+    for o in found.objects:
+        for note in o.notes:
+            typer.echo(f"warning: {note}", err=True)
+    screen.print(f"measured in {found.seconds:.1f} s, compilation {found.compilation:.1f} s beside", highlight=False)
+    for path in paths:
+        screen.print(f"  {path}", highlight=False, markup=False, soft_wrap=True)
+
+
+def _drawn(file: Path, advice: Advice, how: dict[str, Any]) -> dict[str, bytes]:
+    """The figure and the page, if what draws them is installed."""
+    from halfspace_sss.extensions import renderer
+    from halfspace_sss.trade.picture import picture_of
+
+    draw = renderer("trade")
+    return draw(picture_of(file, advice, how)) if draw else {}
+
+
+def object_table(found: ObjectTrade) -> Any:
+    """All ways of rendering an object."""
+    rows = [_row(row) for row in found.ways if not row.refusal]
+    title = f"{found.object}: {found.mfp[0]:.3g} to {found.mfp[1]:.3g} mean free paths, {100 * found.share:.3g} % seen"
+    headings = (*_HEADINGS[:-1], "mean / traced", "preparation, s", "memory, MB", "FLIP")
+    return _rich(headings, rows, title)
+
+
+def _row(row: WayTrade) -> list[str]:
+    bias = "exact" if row.way == "path_traced" else f"{100 * row.bias:.3g} ± {100 * row.bias_error:.1g}"
+    cost = (f"{row.variance:.3g}", f"{1e6 * row.seconds:.3g}", f"{1e6 * row.seconds * row.variance:.3g}")
+    means = " ".join(f"{value:.3f}" for value in row.ratio)
+    flip = "–" if row.flip is None else f"{row.flip:.3f}"
+    return [row.way, bias, *cost, means, f"{row.preparation:.2g}", f"{row.memory / 1e6:.3g}", flip]
+
+
+def _rich(headings: Any, rows: list[list[str]], title: str | None = None) -> Any:
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table
+
+    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False)
+    for heading in headings:
+        words = heading in ("way", "material", "shape", "light")
+        table.add_column(heading, justify="left" if words else "right", overflow="fold")
+    for row in rows:
+        table.add_row(*row)
+    return table

@@ -1,0 +1,172 @@
+"""The cheapest model of a medium for curves, over a range of distances, without a scene.
+
+Error: energy-weighted relative L1 over pairs of directions against path tracing, see `comparison.model_errors`; cost:
+seconds of a million values of S. Path tracing takes until its own noise is at the tolerance.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from halfspace_sss.checks import check_choice, check_count, check_interval
+from halfspace_sss.comparison.held_out import references
+from halfspace_sss.comparison.model_errors import Reference, model_error
+from halfspace_sss.interface.model import BSSRDF, bssrdf, models
+from halfspace_sss.neural.symmetric import channels
+from halfspace_sss.physics.medium import Medium, medium_of
+
+__all__ = ["FlatAdvice", "FlatOption", "recommend_flat"]
+
+EVENTS = 4e6  # of the walks of each channel
+QUERIES = 2**12
+REACH = (0.02, 60.0)  # mean free paths that are compared where no range is given
+PATH_TRACED = "path_traced"
+
+
+@dataclass(frozen=True)
+class FlatOption:
+    """A model for a medium: largest error of its channels, its noise, seconds for a million values, one sentence."""
+
+    model: str
+    error: float
+    noise: float
+    seconds_per_million: float
+    why: str
+
+
+@dataclass(frozen=True)
+class FlatAdvice:
+    """The model for a medium, and all that were compared, the chosen one first."""
+
+    model: str
+    tolerance: float
+    r: tuple[float, float]
+    options: tuple[FlatOption, ...]
+
+    def __str__(self) -> str:
+        return "\n".join(option.why for option in self.options)
+
+
+def recommend_flat(
+    medium: Medium,
+    r: tuple[float, float] | None = None,
+    *,
+    tolerance: float = 0.05,
+    only: Sequence[str] | None = None,
+    events: float = EVENTS,
+    seed: int = 0,
+) -> FlatAdvice:
+    """The cheapest model of the half-space that keeps a tolerance over a range of distances.
+
+    Args:
+        medium: or a material; of several channels the worst counts.
+        r: smallest and largest distance, mm; by default 0.02 to 60 mean free paths.
+        tolerance: relative error of S mu_i mu_o, summed over cells of the range and pairs of directions.
+        only: names of models, by default all.
+        events: scattering events of the walks, for each channel.
+        seed: of the walks.
+
+    Raises:
+        ValueError: an argument is out of range, or no light comes back within the distances.
+    """
+    medium = medium_of(medium)
+    check_interval("tolerance", tolerance, 1e-4, 10.0)
+    check_interval("events", events, 1e4, 1e12)
+    check_count("seed", seed, 0)
+    for name in only or ():
+        check_choice("model", name, models())
+    parts = [m for m in channels(medium) if float(m.sigma_s) > 0]
+    if not parts:
+        raise ValueError("medium must scatter, got albedo 0: S of order 2 and more is 0, no model is needed")
+    _check_range(r)
+    started = time.perf_counter()
+    found = references([m.in_mfp() for m in parts], events * len(parts), seed, 4)
+    tracing = time.perf_counter() - started
+    within = [(r[0] * float(m.sigma_t), r[1] * float(m.sigma_t)) if r else REACH for m in parts]
+    for m, one, bounds in zip(parts, found, within):
+        _check_light(m, one, bounds)
+    rows = [_row(name, parts, found, within) for name in only or models()]
+    noise = max((row[2] for row in rows if row[2] < math.inf), default=math.inf)
+    rows.append((PATH_TRACED, 0.0, tolerance, tracing * (noise / tolerance) ** 2, ""))
+    return _advice(rows, tolerance, r or REACH, "mm" if r else "mean free paths")
+
+
+def _check_range(r: tuple[float, float] | None) -> None:
+    if r is None:
+        return
+    if len(r) != 2:
+        raise ValueError(f"r must be a smallest and a largest distance, mm, got {r!r}")
+    check_interval("r[0]", r[0], 0.0, 1e9)
+    check_interval("r[1]", r[1], 0.0, 1e9)
+    if not r[0] < r[1]:
+        raise ValueError(f"r must ascend, got {r!r}")
+
+
+def _check_light(m: Medium, found: Reference, within: tuple[float, float]) -> None:
+    radii = found.block_radii()
+    counts = ((radii >= within[0]) & (radii <= within[1]))[:, None, None, :, None]
+    if not (found.energies() * counts).sum() > 0:
+        low, high = within
+        raise ValueError(
+            f"r must hold distances at which light comes back, got {low:.3g} to {high:.3g} mean free paths for "
+            f"albedo {float(m.albedo):.4g}; walks reach {radii.min():.2g} to {radii.max():.3g}"
+        )
+
+
+_Row = tuple[str, float, float, float, str]  # model, error, noise, seconds, refusal
+
+
+def _row(name: str, media: list[Medium], found: list[Reference], within: list[tuple[float, float]]) -> _Row:
+    errors, noises, seconds = [], [], 0.0
+    for m, one, bounds in zip(media, found, within):
+        try:
+            model = bssrdf(name, m.in_mfp())
+        except ValueError as error:
+            return name, math.inf, math.inf, math.inf, str(error)
+        e = model_error(model, one, bounds)
+        errors.append(e.error)
+        noises.append(e.noise)
+        seconds += _seconds(model)
+    return name, max(errors), max(noises), seconds / len(media), ""
+
+
+def _seconds(model: BSSRDF) -> float:
+    """Of one value of S, NumPy."""
+    rng = np.random.default_rng(0)
+    r, mu = 10 ** rng.uniform(-2, 1, QUERIES), rng.uniform(0.05, 1, (2, QUERIES))
+    took = []
+    for _ in range(2):
+        started = time.perf_counter()
+        model.eval(r, mu[0], 0.3, mu[1], 1.0)
+        took.append(time.perf_counter() - started)
+    return min(took) / QUERIES
+
+
+def _advice(rows: list[_Row], tolerance: float, r: tuple[float, float], unit: str) -> FlatAdvice:
+    keeping = [row for row in rows if row[1] + row[2] <= tolerance and row[0] != PATH_TRACED]
+    best = min(keeping, key=lambda row: row[3]) if keeping else rows[-1]
+    options = []
+    for row in sorted(rows, key=lambda row: (row is not best, row[1])):
+        name, error, noise, seconds, refusal = row
+        off = f"{100 * error:.3g} % off (noise of the walks {100 * noise:.2g} %)"
+        cost = f"{1e6 * seconds:.3g} s for a million values"
+        if name == PATH_TRACED:
+            why = f"{name} takes {seconds:.3g} s until its noise is {100 * tolerance:.3g} %"
+        elif refusal:
+            why = f"{name}: {refusal}"
+        elif row is best:
+            why = f"{name} is the cheapest that keeps {100 * tolerance:.3g} %, r {r[0]:.3g} to {r[1]:.3g} {unit}: "
+            why += f"{off}, {cost}"
+        elif row in keeping:
+            why = f"{name} is {seconds / best[3]:.2g} times dearer: {off}, {cost}"
+        elif error - noise > tolerance:
+            why = f"{name} is {off}, asked {100 * tolerance:.3g} %"
+        else:
+            why = f"{name} is {off}: whether it keeps {100 * tolerance:.3g} % takes more events to tell"
+        options.append(FlatOption(name, error, noise, 1e6 * seconds, why))
+    return FlatAdvice(best[0], tolerance, r, tuple(options))

@@ -1,0 +1,93 @@
+"""Small images of a scene by each way, and how different they look: FLIP."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from halfspace_sss.extensions import renderer
+from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED
+from halfspace_sss.trade.measuring.results import Assessment
+from halfspace_sss.trade.measuring.seeds import seeded
+from halfspace_sss.trade.measuring.ways import Stage, Way
+
+__all__ = ["small_images", "with_flip"]
+
+SIDE, SPP = 40, 32
+
+
+def small_images(
+    on: Stage, chosen: Sequence[Way], sensor: int, seed: int, side: int = SIDE, spp: int = SPP
+) -> dict[str, np.ndarray]:
+    """Linear images (H, W, 3) of the ways that do not refuse the scene, by name; one seed for all.
+
+    Args:
+        on: the scene.
+        chosen: ways.
+        sensor: number of the sensor.
+        seed: of the samples.
+        side: longest side, pixels.
+        spp: samples for each pixel.
+    """
+    import mitsuba as mi
+
+    camera = on.scene.sensors()[sensor]
+    film = camera.film()
+    small = _film(np.array(film.crop_size(), dtype=int), side)
+    found = {}
+    for k, way in enumerate(chosen):
+        with on.shown_by(way) as integrator:
+            try:
+                image = _rendered(mi, on.scene, camera, integrator, small, spp, seeded(seed, 51, k))
+            except (ValueError, RuntimeError):
+                continue
+        found[way.name] = image
+    return found
+
+
+def _film(size: np.ndarray, side: int) -> tuple[int, int]:
+    scale = min(side / size.max(), 1.0)
+    return tuple(int(v) for v in np.maximum(np.rint(size * scale), 4))
+
+
+def _rendered(
+    mi: Any, scene: Any, camera: Any, integrator: Any, size: tuple[int, int], spp: int, seed: int
+) -> np.ndarray:
+    """Rays of the camera over its whole film, averaged in fewer pixels."""
+    import drjit as dr
+
+    n = size[0] * size[1] * spp
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(seed, n)
+    index = dr.arange(mi.UInt32, n) // dr.opaque(mi.UInt32, spp)
+    x, y = index % dr.opaque(mi.UInt32, size[0]), index // dr.opaque(mi.UInt32, size[0])
+    inverse = mi.Vector2f(dr.opaque(mi.Float, 1 / size[0]), dr.opaque(mi.Float, 1 / size[1]))
+    position = (mi.Vector2f(x, y) + sampler.next_2d()) * inverse
+    ray, weight = camera.sample_ray_differential(camera.shutter_open(), 0.5, mi.Point2f(position), sampler.next_2d())
+    ray = mi.Ray3f(ray)
+    ray.o, ray.d = ray.o + dr.zeros(mi.Point3f, n), ray.d + dr.zeros(mi.Vector3f, n)
+    dr.eval(ray)
+    L = weight * integrator.sample(scene, sampler, ray, None, mi.Bool(True))[0]
+    columns = [dr.block_sum(v + dr.zeros(mi.Float, n), spp).numpy() / spp for v in L]
+    image = np.stack(columns * (3 if len(columns) == 1 else 1), axis=1)
+    return np.maximum(image, 0).reshape(size[1], size[0], 3).astype(np.float32)
+
+
+def with_flip(on: Stage, chosen: Sequence[Way], found: Assessment, sensor: int, seed: int) -> Assessment:
+    """The assessment with FLIP of the whole small image, where the evaluator is installed and something shines."""
+    flip = renderer("flip")
+    if flip is None or all(o.is_dark for o in found.objects):
+        return found
+    images = small_images(on, [chosen[0], *chosen], sensor, seed)
+    again = small_images(on, [chosen[0]], sensor, seeded(seed, 52))[PATH_TRACED]
+    truth = images[PATH_TRACED]
+    noise = flip(truth, again)
+    values = {name: noise if name == PATH_TRACED else flip(truth, image) for name, image in images.items()}
+    objects = []
+    for o in found.objects:
+        rows = tuple(replace(w, flip=values.get(w.way), flip_noise=noise) if not w.refusal else w for w in o.ways)
+        objects.append(replace(o, ways=rows))
+    return replace(found, objects=tuple(objects))

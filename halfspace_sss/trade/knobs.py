@@ -1,0 +1,94 @@
+"""What the knobs of a way bring: entries for an exit, channels of one walk, nodes of photon beam diffusion.
+
+Costs are variance of a sample times seconds, in time to equal noise; 1 is that of the setting everything else uses.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from halfspace_sss.comparison.held_out import references
+from halfspace_sss.comparison.model_errors import model_error
+from halfspace_sss.interface.model import model_class
+from halfspace_sss.physics.medium import Medium
+from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED
+from halfspace_sss.trade.measuring.objects import assess_stage
+from halfspace_sss.trade.measuring.results import ObjectTrade
+from halfspace_sss.trade.measuring.ways import Stage, Way
+
+__all__ = ["Setting", "channel_settings", "entry_settings", "node_settings"]
+
+ENTRIES, NODES = (1, 2, 4, 8), (4, 8, 16, 32, 64)
+BEAMS, USUAL_NODES, QUERIES = "photon_beam_diffusion", 16, 2**14
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A setting of a knob: its cost over that of the usual setting, and the error that it has."""
+
+    knob: str
+    value: str
+    way: str
+    cost: float
+    error: float
+
+
+def entry_settings(
+    on: Stage, names: Sequence[str], seconds: float, seed: int = 0, entries: Sequence[int] = ENTRIES
+) -> list[Setting]:
+    """How many points of entry an exit draws, for models on the first object of a scene."""
+    found = []
+    for n in entries:
+        stage = replace(on, bssrdf={**on.bssrdf, "entries": n}, _integrators={}, _insides={})
+        chosen = [Way(PATH_TRACED), *map(Way, names)]
+        seen = assess_stage(stage, chosen, seconds=seconds, seed=seed).objects[0]
+        found += [("entries", str(n), name, _cost(seen, name), seen.way(name).bias) for name in names]
+    usual = {way: cost for _, value, way, cost, _ in found if value == str(entries[0])}
+    return [Setting(knob, value, way, cost / usual[way], error) for knob, value, way, cost, error in found]
+
+
+def _cost(found: ObjectTrade, way: str) -> float:
+    row = found.way(way)
+    return row.variance * row.seconds
+
+
+def channel_settings(on: Stage, seconds: float, seed: int = 0) -> list[Setting]:
+    """All channels in one walk against walks for each, at equal mean variance over the channels.
+
+    With time t_c and variance V_c of channel c alone the least is (Σ sqrt(V_c t_c))².
+    """
+    together = assess_stage(on, [Way(PATH_TRACED)], seconds=seconds, seed=seed).objects[0]
+    n, surface = len(together.radiance), on.shapes[0].bsdf()
+    variance = n * together.traced.variance * np.mean(together.radiance) ** 2
+    before, alone = surface.inside, 0.0
+    try:
+        for m in before.channels():
+            same = {key: np.full(n, float(getattr(m, key))) for key in ("sigma_s", "sigma_a", "g")}
+            surface.inside = replace(before, medium=Medium(**same, eta=m.eta))
+            one = assess_stage(on, [Way(PATH_TRACED)], seconds=seconds, seed=seed).objects[0]
+            alone += math.sqrt(one.traced.variance * one.traced.seconds) * one.radiance[0]
+    finally:
+        surface.inside = before
+    ratio = alone**2 / (variance * together.traced.seconds)
+    knob = "channels in one walk"
+    return [Setting(knob, str(n), PATH_TRACED, 1.0, 0.0), Setting(knob, "1", PATH_TRACED, ratio, 0.0)]
+
+
+def node_settings(medium: Medium, events: float = 4e6, seed: int = 0) -> list[Setting]:
+    """Nodes of the quadrature of photon beam diffusion on a scalar medium: error against walks, time of S in NumPy."""
+    (traced,) = references([medium.in_mfp()], events, seed, 4)
+    rng = np.random.default_rng(0)
+    r, mu = 10 ** rng.uniform(-2, 1, QUERIES), rng.uniform(0.05, 1, (2, QUERIES))
+    found = []
+    for n in NODES:
+        model = model_class(BEAMS)(medium.in_mfp(), n_samples=n)
+        started = time.perf_counter()
+        model.eval(r, mu[0], 0.3, mu[1], 1.0)
+        found.append((n, time.perf_counter() - started, model_error(model, traced).error))
+    usual = next(took for n, took, _ in found if n == USUAL_NODES)
+    return [Setting("nodes", str(n), BEAMS, took / usual, error) for n, took, error in found]

@@ -1,0 +1,102 @@
+"""Where the camera sees an object: rays to its visible points, and how much of the image they fill.
+
+Points in which the boundary mirrors a lamp are left out: every way shows them alike, and by chance the few of them that
+are drawn would decide all means.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+__all__ = ["Exits", "visible_exits"]
+
+LAUNCH, LAUNCHES = 2**16, 16  # rays of a look at the scene, and the most looks for an object that is hardly seen
+FEWEST = 32  # exits of an object that is assessed
+
+
+@dataclass(frozen=True, eq=False)
+class Exits:
+    """Rays of the camera that meet an object first.
+
+    Args:
+        o, d: origins and directions, float32 (3, n).
+        share: of the image that the object fills.
+        pixels: of the film that it fills.
+    """
+
+    o: np.ndarray
+    d: np.ndarray
+    share: float
+    pixels: float
+
+    @property
+    def n(self) -> int:
+        return self.o.shape[1]
+
+    def rays(self, each: int) -> Any:
+        """Every ray `each` times, next to each other."""
+        import drjit as dr
+        import mitsuba as mi
+
+        index = dr.arange(mi.UInt32, self.n * each) // dr.opaque(mi.UInt32, each)
+        o, d = (mi.TensorXf(v) for v in (self.o, self.d))
+        columns = [dr.gather(mi.Float, table.array, index + k * self.n) for table in (o, d) for k in range(3)]
+        ray = mi.Ray3f(mi.Point3f(*columns[:3]), mi.Vector3f(*columns[3:]))
+        dr.eval(ray)
+        return ray
+
+
+def visible_exits(scene: Any, shapes: list[Any], sensor: int, n: int, seed: int) -> list[Exits | None]:
+    """For each shape n rays of a sensor that meet it first, fewer where it is hardly seen, None where it is not.
+
+    Args:
+        scene: the Mitsuba scene.
+        shapes: of it.
+        sensor: number of the sensor.
+        n: rays of each.
+        seed: of the rays.
+    """
+    camera = scene.sensors()[sensor]
+    pixels = int(np.prod(np.array(camera.film().crop_size())))
+    found: list[list[np.ndarray]] = [[] for _ in shapes]
+    drawn = 0
+    for k in range(LAUNCHES):
+        rays, hit = _look(scene, camera, shapes, (seed, k))
+        drawn += LAUNCH
+        for mine, mask in zip(found, hit):
+            mine.append(rays[:, mask])
+        if all(sum(part.shape[1] for part in mine) >= n for mine in found):
+            break
+    made: list[Exits | None] = []
+    for mine in found:
+        rays = np.concatenate(mine, axis=1)
+        share = rays.shape[1] / drawn
+        few = rays.shape[1] < FEWEST
+        made.append(None if few else Exits(rays[:3, :n], rays[3:, :n], share, share * pixels))
+    return made
+
+
+def _look(scene: Any, camera: Any, shapes: list[Any], seed: tuple[int, int]) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Random rays of a camera, (6, LAUNCH), and which of them meet each shape first."""
+    import mitsuba as mi
+
+    rng = np.random.default_rng([*seed, 23])
+    u = [mi.Float(row) for row in rng.random((5, LAUNCH)).astype(np.float32)]
+    ray, _ = camera.sample_ray_differential(camera.shutter_open(), u[0], mi.Point2f(*u[1:3]), mi.Point2f(*u[3:]))
+    si = scene.ray_intersect(mi.Ray3f(ray), mi.RayFlags.All, coherent=False)
+    plain = si.is_valid() & ~_mirrors_lamp(scene, si)
+    hit = [np.array((si.shape == mi.ShapePtr(shape)) & plain) for shape in shapes]
+    columns = np.concatenate([np.array(v, dtype=np.float32).reshape(3, -1) for v in (ray.o, ray.d)])
+    return np.broadcast_to(columns, (6, LAUNCH)) if columns.shape[1] == 1 else columns, hit
+
+
+def _mirrors_lamp(scene: Any, si: Any) -> Any:
+    """Whether a smooth boundary would show an emitter other than the environment."""
+    import mitsuba as mi
+
+    mirrored = si.spawn_ray(si.to_world(mi.reflect(si.wi)))
+    met = scene.ray_intersect(mirrored, mi.RayFlags.Minimal, False, si.is_valid())
+    return met.is_valid() & (met.emitter(scene) != None)  # noqa: E711

@@ -1,0 +1,137 @@
+"""One way of rendering, against the clock: radiance of exits from random samples, with what they cost."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from halfspace_sss.rendering.surface.variants import variant_channels
+from halfspace_sss.trade.measuring.exits import Exits
+from halfspace_sss.trade.measuring.seeds import seeded
+from halfspace_sss.trade.measuring.statistics import Estimate
+from halfspace_sss.trade.measuring.ways import Stage, Way
+
+__all__ = ["Sampled", "clock", "first_sample", "sample_more"]
+
+LANES = 2**18  # of a launch
+PILOT, FEWEST = 64, 8  # samples of each exit by which the time is foreseen, and of a launch that is worth it
+LEAST_SHARE = 0.2  # of the time of a launch that its samples take
+
+
+@dataclass(eq=False)
+class Sampled:
+    """What has been sampled of an object by a way.
+
+    Attributes:
+        estimate: radiance of the exits.
+        preparation: seconds, of tables and surveys, once for a scene.
+        compilation: seconds of the first launch beyond those of the next, by the clock on the wall.
+        compiling: the same by `clock`.
+        overhead: seconds of a launch of hardly any samples.
+        launches: (samples of all exits, seconds) of each larger launch.
+        memory: most bytes that Dr.Jit held while it ran.
+    """
+
+    estimate: Estimate
+    preparation: float
+    compilation: float
+    compiling: float
+    overhead: float
+    memory: int = 0
+    launches: list[tuple[int, float]] = field(default_factory=list)
+
+    @property
+    def seconds(self) -> float:
+        """Of one sample, without what a launch takes whatever its size, as images are larger."""
+        n, took = max(self.launches)
+        return max(took - self.overhead, LEAST_SHARE * took) / n
+
+
+def clock() -> float:
+    """Seconds: on a CPU those of all threads over their number, on which what else runs has little influence."""
+    import drjit as dr
+    import mitsuba as mi
+
+    return time.process_time() / dr.thread_count() if mi.variant().startswith("llvm") else time.perf_counter()
+
+
+def first_sample(stage: Stage, way: Way, exits: Exits, seed: int) -> Sampled:
+    """Make a way ready and take few samples, which compiles its kernels.
+
+    Raises:
+        ValueError: the way refuses the scene.
+    """
+    with stage.shown_by(way) as integrator:
+        started = time.perf_counter()
+        prepare = integrator.prepare if hasattr(integrator, "prepare") else integrator.tracer
+        prepare(stage.scene)
+        prepared = time.perf_counter()
+        estimate = Estimate(variant_channels(), exits.n)
+        _, first = _launch(stage, integrator, exits, estimate, 2, seeded(seed, 31, 0))
+        compiled = time.perf_counter()
+        _, overhead = _launch(stage, integrator, exits, estimate, 2, seeded(seed, 31, 1))
+        again = time.perf_counter() - compiled
+    waited = max(compiled - prepared - again, 0.0)
+    return Sampled(estimate, prepared - started, waited, max(first - overhead, 0.0), overhead)
+
+
+def sample_more(
+    stage: Stage, way: Way, exits: Exits, found: Sampled, seed: int, *, seconds: float = 0.0, samples: int | None = None
+) -> None:
+    """Sample further, for so many seconds or a number of samples of each exit.
+
+    Args:
+        stage: the scene.
+        way: how it is rendered.
+        exits: of the object.
+        found: what is there already.
+        seed: of the samples.
+        seconds: to spend.
+        samples: of each exit, instead; the outcome then depends on the seed alone.
+    """
+    most, started = max(LANES // exits.n, 2), clock()
+    with stage.shown_by(way) as integrator:
+        while True:
+            if samples:
+                each = samples - found.estimate.samples
+            else:
+                each = _affordable(found, exits.n, seconds - (clock() - started)) if found.launches else PILOT
+            if each < FEWEST:
+                return
+            each = min(each, most)
+            number = seeded(seed, 32, found.estimate.samples)
+            memory, took = _launch(stage, integrator, exits, found.estimate, each, number)
+            found.memory = max(found.memory, memory)
+            found.launches.append((exits.n * each, took))
+
+
+def _affordable(found: Sampled, n: int, left: float) -> int:
+    """Samples of each exit that the rest of the time allows."""
+    return int(max(left - found.overhead, 0) / (found.seconds * n))
+
+
+def _launch(stage: Stage, integrator: Any, exits: Exits, estimate: Estimate, each: int, seed: int) -> tuple[int, float]:
+    """`each` samples of every exit; bytes and seconds that it took."""
+    import drjit as dr
+    import mitsuba as mi
+
+    rays = exits.rays(each)
+    sampler = mi.load_dict({"type": "independent"})
+    dr.flush_malloc_cache()
+    dr.detail.malloc_clear_statistics()
+    started = clock()
+    sampler.seed(seed, exits.n * each)
+    L = integrator.sample(stage.scene, sampler, rays, None, mi.Bool(True))[0]
+    sums = [dr.block_sum(v + dr.zeros(mi.Float, exits.n * each), each) for c in L for v in (c, c * c)]
+    dr.eval(sums)
+    dr.sync_thread()
+    took = clock() - started
+    memory = int(dr.detail.malloc_watermark(dr.backend_v(mi.Float)))
+    rows = np.array([s.numpy() for s in sums], dtype=np.float64)
+    if not np.isfinite(rows).all():
+        raise ValueError(f"samples must be finite, got {int((~np.isfinite(rows)).sum())} exits that are not")
+    estimate.add(rows[0::2], rows[1::2], each)
+    return memory, took

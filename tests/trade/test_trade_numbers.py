@@ -1,0 +1,142 @@
+"""The arithmetic of the trade: unbiased squares, honest standard errors, the cheapest way, and its sentences."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from halfspace_sss.trade import recommend
+from halfspace_sss.trade.advice import Job, advise
+from halfspace_sss.trade.automatic import picked
+from halfspace_sss.trade.measuring.results import Assessment, ObjectTrade, WayTrade
+from halfspace_sss.trade.measuring.statistics import Estimate, mean_square, relative_variance
+
+SEEDS, EXITS, SAMPLES = 400, 48, 12
+
+
+def _estimate(rng: np.random.Generator, mean: np.ndarray, sd: float) -> Estimate:
+    values = mean[..., None] + sd * rng.standard_normal((*mean.shape, SAMPLES))
+    found = Estimate(*mean.shape)
+    found.add(values.sum(-1), (values**2).sum(-1), SAMPLES)
+    return found
+
+
+def _squares(off: float, sd: float) -> np.ndarray:
+    rng, found = np.random.default_rng(3), []
+    for _ in range(SEEDS):
+        truth = 1 + 0.3 * rng.standard_normal((3, EXITS))
+        found.append(mean_square(_estimate(rng, truth * (1 + off), sd), _estimate(rng, truth, 2 * sd)))
+    return np.array(found)
+
+
+@pytest.mark.parametrize("off", [0.0, 0.1])
+def test_noise_puts_no_bias_into_a_square(off: float) -> None:
+    found = _squares(off, 0.5)[:, 0]
+    expected = off**2 * (1 + 0.3**2)
+    assert abs(found.mean() - expected) < 4 * found.std() / math.sqrt(SEEDS)  # 4 standard errors
+
+
+@pytest.mark.parametrize("off", [0.0, 0.1])
+def test_standard_errors_are_the_spread_over_seeds(off: float) -> None:
+    found = _squares(off, 0.5)
+    assert 0.85 < np.mean(found[:, 1]) / found[:, 0].std() < 1.15
+
+
+def test_the_variance_of_a_sample_is_relative_to_the_mean() -> None:
+    rng = np.random.default_rng(4)
+    flat = np.full((3, 2000), 2.0)
+    value = relative_variance(_estimate(rng, flat, 0.6), _estimate(rng, flat, 0.1))
+    assert abs(value.value - 0.09) < 4 * value.error
+
+
+def _way(name: str, bias: float, error: float, cost: float, **more) -> WayTrade:
+    return WayTrade(name, bias**2, error**2, (1.0,), (0.0,), 1.0, 0.0, cost, 100, **more)
+
+
+def _assessment(*ways: WayTrade, radiance: float = 1.0) -> Assessment:
+    ways = (_way("path_traced", 0.0, 0.0, 1e-5), *ways)
+    return Assessment((ObjectTrade("ball", (30.0, 40.0), 0.5, 100.0, (radiance,), ways),), 1.0, 0.0, 0)
+
+
+CHEAP, GOOD = _way("lambert", 0.2, 0.01, 1e-7), _way("neural", 0.01, 0.01, 2e-6)
+
+
+@pytest.mark.parametrize(("tolerance", "way"), [(0.5, "lambert"), (0.1, "neural"), (0.011, "path_traced")])
+def test_the_cheapest_way_that_keeps_the_tolerance_is_recommended(tolerance: float, way: str) -> None:
+    assert recommend(_assessment(CHEAP, GOOD), tolerance=tolerance).objects[0].way == way
+
+
+def test_every_way_gets_one_sentence() -> None:
+    refused = WayTrade("full_geometry", refusal="it must be trained")
+    doubtful = _way("better_dipole", 0.05, 0.2, 1e-7)
+    found = recommend(_assessment(CHEAP, GOOD, doubtful, refused), tolerance=0.1).objects[0]
+    why = {option.way: option.why for option in found.options}
+    assert why["neural"].startswith("neural is the cheapest that keeps 0.1 (30 to 40 mean free paths across)")
+    assert why["lambert"] == "lambert is 20 ± 0.03 % off, asked 10 %"
+    assert "cannot be told" in why["better_dipole"]
+    assert "times as long (exact)" in why["path_traced"]
+    assert why["full_geometry"] == "full_geometry: it must be trained"
+    assert len(why) == len(found.options) == 5
+
+
+def test_a_training_counts_once() -> None:
+    trained = _way("full_geometry", 0.001, 0.001, 1e-9, training=60.0)
+    found = _assessment(GOOD, trained)
+    assert recommend(found, tolerance=0.05).objects[0].way == "neural"
+    assert recommend(found, tolerance=0.05, images=10_000).objects[0].way == "full_geometry"
+    assert recommend(found, tolerance=0.05, count_training=False).objects[0].way == "full_geometry"
+
+
+def test_a_limit_of_time_names_the_least_error_where_nothing_keeps_the_tolerance() -> None:
+    found = recommend(_assessment(CHEAP, GOOD), tolerance=0.02, images=1000, seconds=0.2).objects[0]
+    assert found.way == "lambert"
+    assert found.options[0].why.startswith("no way keeps 0.02 in 0.2 s; lambert comes nearest")
+
+
+def test_a_dark_object_takes_the_fastest_way() -> None:
+    found = recommend(_assessment(CHEAP, GOOD, radiance=0.0)).objects[0]
+    assert found.way == "lambert"
+    assert "no light comes from it" in found.options[0].why
+
+
+def test_several_objects_share_an_integrator() -> None:
+    one = _assessment(CHEAP, GOOD).objects[0]
+    other = _assessment(_way("neural", 0.5, 0.01, 1e-7)).objects[0]
+    found = advise(Assessment((one, other), 1.0, 0.0, 0), Job(0.1))
+    assert [o.way for o in found.objects] == ["neural", "path_traced"]
+    assert found.integrator == "path_traced"
+    assert "all objects together: path_traced" in str(found)
+
+
+def test_auto_takes_the_cheapest_that_keeps_and_says_when_walks_are_better() -> None:
+    found = _assessment(CHEAP, GOOD).objects[0]
+    assert picked(found, 0.5)[0] == "lambert"
+    assert picked(found, 0.1)[0] == "neural"
+    model, why = picked(_assessment(CHEAP).objects[0], 0.1)
+    assert model == "lambert" and "translucent_walk would be better" in why
+
+
+def test_a_record_comes_back_as_it_was() -> None:
+    found = _assessment(CHEAP, GOOD)
+    assert Assessment.of(found.record()) == found
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"tolerance": 0.0}, "tolerance must be a number in"),
+        ({"images": 0}, "images must be a whole number >= 1"),
+        ({"seconds": -1.0}, "seconds must be a number in"),
+        ({"r": (1.0, 2.0)}, "r must be left out with a scene"),
+    ],
+)
+def test_bad_input_is_refused(given: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        recommend(_assessment(GOOD), **given)
+
+
+def test_a_scene_or_a_medium_must_be_given() -> None:
+    with pytest.raises(ValueError, match="a scene must be given"):
+        recommend()

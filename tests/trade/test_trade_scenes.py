@@ -1,0 +1,218 @@
+"""Assessments of scenes: what they say of spheres and extremes, the model auto, random scenes and the commands."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from halfspace_sss import Medium
+from halfspace_sss.cli import app as cli
+from halfspace_sss.physics.fresnel import F_r
+from halfspace_sss.trade import assess, recommend
+from halfspace_sss.trade.checking.random_scenes import random_scene, write_scene
+
+mi = pytest.importorskip("mitsuba")
+QUICK = {"seconds": 0.4, "flip": False, "exits": 64}
+FEW = ["better_dipole", "lambert"]
+
+
+@pytest.fixture(autouse=True)
+def rendering(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    from halfspace_sss import rendering
+
+    monkeypatch.setenv("HALFSPACE_SSS_CHOICES", str(tmp_path / "choices"))
+    mi.set_variant("llvm_ad_rgb")
+    rendering.register()
+
+
+def scene(medium: dict | None = None, light: dict | None = None, n: int = 1, **more: Any) -> dict[str, Any]:
+    """Balls of radius 1 mm in a row under an even sky."""
+    medium = medium or {"sigma_s": 9.5, "sigma_a": 0.5}
+    view = mi.ScalarTransform4f().look_at([0, 0, 4 + 3 * n], [0, 0, 0], [0, 1, 0])
+    balls = {
+        f"ball{k}": {
+            "type": "sphere",
+            "center": [2.5 * (k - 0.5 * (n - 1)), 0, 0],
+            "bsdf": {"type": "translucent", **medium, **more},
+        }
+        for k in range(n)
+    }
+    film = {"type": "hdrfilm", "width": 64, "height": 64}
+    return {
+        "type": "scene",
+        "integrator": {"type": "bssrdf", "hide_emitters": True},
+        "light": light or {"type": "constant"},
+        "sensor": {"type": "perspective", "fov": 40, "to_world": view, "film": film},
+        **balls,
+    }
+
+
+def test_a_ball_of_ten_mean_free_paths_is_as_dark_by_a_half_space_as_images_say() -> None:
+    found = assess(scene({"sigma_s": 9.5, "sigma_a": 0.5, "eta": 1.3}), only=["neural"], **{**QUICK, "seconds": 1.0})
+    row = found.objects[0].way("neural")
+    # of light from inside 0.85 is left (README, spheres); about a quarter of the radiance is reflected or single
+    assert row.ratio[0] == pytest.approx(0.9, abs=0.05) and row.bias > 0.05
+    assert row.ratio_error[0] < 0.03
+    assert found.objects[0].mfp == pytest.approx((34.6, 34.6), rel=0.01)
+    assert row.seconds > 0 and row.memory > 0 and row.samples > 0
+
+
+def test_the_scene_is_as_it_was_after_an_assessment() -> None:
+    loaded = mi.load_dict(scene(model="standard_dipole"))
+    before = loaded.shapes()[0].bsdf().inside
+    assess(loaded, only=FEW, **QUICK)
+    assert loaded.shapes()[0].bsdf().inside is before
+
+
+def test_a_diffuse_surface_is_right_for_a_large_object_under_an_even_sky() -> None:
+    found = assess(scene({"sigma_s": 950, "sigma_a": 50}), only=["lambert"], **QUICK)
+    row = found.objects[0].way("lambert")
+    assert row.bias_bound < 0.15
+    assert all(abs(r - 1) < 0.06 for r in row.ratio)
+
+
+EXTREMES = {
+    "smaller than a mean free path": {"sigma_s": 0.1, "sigma_a": 0.02},
+    "larger than 5000": {"sigma_s": 3000.0, "sigma_a": 300.0},
+    "albedo 0": {"sigma_s": 0.0, "sigma_a": 5.0},
+    "albedo 1": {"sigma_s": 5.0, "sigma_a": 0.0},
+    "eta 1": {"sigma_s": 9.5, "sigma_a": 0.5, "eta": 1.0},
+    "black": {"sigma_s": 0.0, "sigma_a": 5.0, "eta": 1.0},
+}
+
+
+@pytest.mark.parametrize("extreme", EXTREMES)
+def test_an_extreme_object_is_assessed(extreme: str) -> None:
+    assessed = assess(scene(EXTREMES[extreme]), only=FEW, **QUICK)
+    found, advice = assessed.objects[0], recommend(assessed, tolerance=0.5).objects[0]
+    assert all(not row.refusal and row.seconds > 0 for row in found.ways)
+    assert advice.way is not None and len(advice.options) == 3
+    assert bool(found.notes) == extreme.startswith(("smaller", "larger"))
+
+
+def test_without_light_every_way_shows_it_black() -> None:
+    found = recommend(scene(light={"type": "constant", "radiance": 0.0}), only=FEW, **QUICK_ASSESS)
+    assert "no light comes from it, every way shows it black" in str(found)
+
+
+QUICK_ASSESS = {"assess_seconds": 0.4, "exits": 64}
+
+
+def test_ten_objects_are_assessed_one_by_one() -> None:
+    found = assess(scene(n=10), only=["lambert"], **{**QUICK, "seconds": 0.05, "exits": 32})
+    assert [o.object for o in found.objects] == [f"ball{k}" for k in range(10)]
+    assert all(o.ways for o in found.objects)
+
+
+def test_an_object_behind_another_is_refused_in_a_sentence() -> None:
+    hidden = scene()
+    hidden["ball1"] = {**hidden["ball0"], "center": [0, 0, -1.0], "radius": 0.3}
+    found = recommend(hidden, only=["lambert"], **QUICK_ASSESS).objects[1]
+    assert found.way is None and "hardly seen by the camera" in str(found)
+
+
+def test_an_instance_is_refused_in_a_sentence() -> None:
+    group = {"type": "shapegroup", "ball": scene()["ball0"]}
+    instanced = {**scene(), "group": group, "one": {"type": "instance", "g": {"type": "ref", "id": "group"}}}
+    with pytest.raises(ValueError, match="a translucent object must stand in the scene itself"):
+        assess(instanced, only=FEW, **QUICK)
+
+
+def test_a_way_that_refuses_says_why() -> None:
+    found = assess(scene(), only=["full_geometry"], **QUICK).objects[0]
+    assert "must be trained" in found.way("full_geometry").refusal
+
+
+def test_an_unknown_way_is_refused_with_the_nearest() -> None:
+    with pytest.raises(ValueError, match="did you mean 'neural'"):
+        assess(scene(), only=["nural"], **QUICK)
+
+
+def test_auto_is_chosen_once_kept_and_found_again(tmp_path: Path) -> None:
+    names = []
+    for _ in range(2):
+        loaded = mi.load_dict(scene(model="auto"))
+        loaded.integrator().prepare(loaded)
+        names.append(loaded.shapes()[0].bsdf().inside.model)
+    files = list((tmp_path / "choices").iterdir())
+    assert names[0] == names[1] != "auto" and len(files) == 1
+    record = json.loads(files[0].read_text())
+    assert record["models"] == [names[0]] and record["sentences"][0].startswith("object 'ball0'")
+    files[0].write_text(files[0].read_text().replace(f'"{names[0]}"', '"standard_dipole"', 1))
+    pinned = mi.load_dict(scene(model="auto"))
+    assert mi.render(pinned, spp=1).shape == (64, 64, 3)
+    assert pinned.shapes()[0].bsdf().inside.model == "standard_dipole"
+    files[0].write_text("{}")
+    with pytest.raises(ValueError, match="delete it to choose anew"):
+        damaged = mi.load_dict(scene(model="auto"))
+        damaged.integrator().prepare(damaged)
+
+
+def test_lambert_in_a_white_furnace_is_white() -> None:
+    white = scene({"sigma_s": 5.0, "sigma_a": 0.0}, model="lambert")
+    image = np.array(mi.render(mi.load_dict(white), spp=256))[24:40, 24:40, :3]
+    expected = Medium(5.0, 0.0, eta=1.3).reflectance() + float(F_r(0.98, 1.3))  # of the middle of the ball
+    assert image.mean() == pytest.approx(expected, abs=0.01)
+
+
+def test_random_scenes_come_again_by_their_number(tmp_path: Path) -> None:
+    assert random_scene(3, 1) == random_scene(3, 1) != random_scene(4, 1)
+    first = write_scene(random_scene(3, 1), tmp_path / "a").read_bytes()
+    assert first == write_scene(random_scene(3, 1), tmp_path / "b").read_bytes()
+
+
+@pytest.mark.parametrize("number", range(6))
+def test_a_random_scene_is_closed_and_faces_outwards(number: int, tmp_path: Path) -> None:
+    from halfspace_sss.rendering.scenes.scene_files import load_objects
+    from halfspace_sss.rendering.surface.object import survey
+
+    loaded = load_objects(write_scene(random_scene(number, 5), tmp_path))
+    (shape,) = (s for s in loaded.shapes() if s.id() == "object")
+    found = survey(shape)
+    assert found.closed and found.upright and found.size == pytest.approx(100, rel=0.01)
+
+
+def test_the_command_measures_a_scene_and_writes_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from halfspace_sss import extensions
+
+    monkeypatch.setattr(extensions, "renderer", lambda kind: None)  # neither figure nor page
+    file = write_scene(random_scene(0, 0), tmp_path)
+    arguments = ["--way", "lambert", "--tolerance", "0.4", "--assess", "0.3", "--out", str(tmp_path / "out")]
+    result = CliRunner().invoke(cli.app, ["trade", str(file), *arguments])
+    assert result.exit_code == 0, result.stderr
+    names = sorted(path.name for path in (tmp_path / "out").iterdir())
+    assert names == ["scene-0-000_trade.csv", "scene-0-000_trade.json"]
+    assert "is the cheapest that keeps 0.4" in result.stdout
+
+
+def test_the_check_goes_on_where_it_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from halfspace_sss.trade.checking import check
+
+    monkeypatch.setattr(check, "WAYS", ("path_traced", "lambert"))
+    first = check.check_scene(1, 0, tmp_path, 0.2, 0.3)
+    monkeypatch.setattr(check, "assess_stage", None)
+    assert check.check_scene(1, 0, tmp_path, 0.2, 0.3) == json.loads(json.dumps(first))
+    found = check.outcome(first)
+    assert found["way"] in ("path_traced", "lambert") and found["ratio"] > 0 and len(check.z_values(first)) == 1
+
+
+def test_a_medium_without_a_scene_gets_a_model_of_the_half_space() -> None:
+    medium = Medium.from_albedo(0.75, 0.241, 0.0, 1.3)
+    found = recommend(medium=medium, r=(1.0, 40.0), tolerance=0.2, events=2e5, only=["better_dipole", "neural"])
+    assert found.model == "neural"
+    assert [option.model for option in found.options] == ["neural", "path_traced", "better_dipole"]
+    assert found.options[-1].why.endswith("asked 20 %")
+
+
+@pytest.mark.parametrize(
+    ("medium", "r", "message"),
+    [((1.0, 0.2), (2.0, 1.0), "r must ascend"), ((0.0, 1.0), None, "medium must scatter, got albedo 0")],
+)
+def test_a_medium_or_a_range_without_light_is_refused(medium: tuple, r: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        recommend(medium=Medium(*medium), r=r)
