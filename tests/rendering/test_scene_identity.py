@@ -14,7 +14,7 @@ import halfspace_sss.rendering as rendering
 from halfspace_sss.neural import universal
 from halfspace_sss.neural.store import load_weights, save_weights
 from halfspace_sss.neural.universal import shipped_weights
-from halfspace_sss.rendering.scenes.identity import scene_hash
+from halfspace_sss.rendering.scenes.identity import learnt, scene_hash
 from halfspace_sss.rendering.scenes.scene_files import load_scene
 
 mi = pytest.importorskip("mitsuba")
@@ -56,6 +56,13 @@ def _hash(text: str, folder: Path) -> str:
     file.write_text(text)
     scene = load_scene(file)
     return scene_hash(scene, scene.integrator())
+
+
+def _learnt(text: str, folder: Path) -> list[str]:
+    file = folder / "scene.xml"
+    file.write_text(text)
+    scene = load_scene(file)
+    return learnt(scene, scene.integrator())
 
 
 def test_a_scene_without_ids_is_the_same_in_every_process(tmp_path: Path) -> None:
@@ -137,29 +144,31 @@ def test_objects_that_swap_their_surfaces_are_another_scene() -> None:
 @pytest.mark.parametrize(
     "holder", ["{}", '<integrator type="aov"><string name="aovs" value="d:depth"/>{}</integrator>']
 )
-def test_weights_that_a_model_was_trained_to_are_part_of_the_identity(holder, tmp_path, monkeypatch) -> None:
+def test_weights_that_a_model_was_trained_to_are_part_of_what_a_render_is_known_by(
+    holder, tmp_path, monkeypatch
+) -> None:
     plain = '<integrator type="bssrdf"/>'
     text = XML.replace(plain, holder.format(plain)).replace("better_dipole", "neural")
-    before = _hash(text, tmp_path)
+    before = _learnt(text, tmp_path)
     arrays, record = load_weights(shipped_weights(), "neural")
     path = save_weights(tmp_path / "again.safetensors", "neural", arrays, record)
     monkeypatch.setattr(universal, "shipped_weights", lambda: path)
-    assert _hash(text, tmp_path) == before
+    assert _learnt(text, tmp_path) == before
     arrays["base"][0] *= 1.01
     path = save_weights(tmp_path / "other.safetensors", "neural", arrays, record)
-    assert _hash(text, tmp_path) != before
+    assert _learnt(text, tmp_path) != before
 
 
-def test_weights_are_no_part_of_the_identity_of_a_render_by_walks(tmp_path, monkeypatch) -> None:
+def test_weights_are_no_part_of_what_a_render_by_walks_is_known_by(tmp_path, monkeypatch) -> None:
     text = XML.replace('type="bssrdf"', 'type="translucent_walk"').replace("better_dipole", "neural")
-    before = _hash(text, tmp_path)
+    before = _learnt(text, tmp_path)
     monkeypatch.setattr(universal, "shipped_weights", lambda: tmp_path / "absent.safetensors")
-    assert _hash(text, tmp_path) == before
+    assert _learnt(text, tmp_path) == before
 
 
 def test_every_learnt_model_tells_what_it_was_trained_to(stand_ins) -> None:
     medium = halfspace_sss.Medium([1.0, 2.0], [0.5, 0.1], 0.0, 1.3)
     told = {name: halfspace_sss.bssrdf(name, medium).checksums for name in halfspace_sss.models()}
-    learnt = {name: checksums for name, checksums in told.items() if checksums}
-    assert learnt.keys() == {"neural", "neural_material", "neural_paper"}
-    assert all(len(checksums) == 2 for checksums in learnt.values())
+    trained = {name: checksums for name, checksums in told.items() if checksums}
+    assert trained.keys() == {"neural", "neural_material", "neural_paper"}
+    assert all(len(checksums) == 2 for checksums in trained.values())

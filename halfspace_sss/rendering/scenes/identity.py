@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["scene_hash", "words"]
+__all__ = ["learnt", "scene_hash", "words"]
 
 # a name says nothing of the image, an address nothing of the scene, and how many samples are taken is told elsewhere
 _MADE_UP = re.compile(r"0x[0-9a-fA-F]+|\bobject_\d+|\b_unnamed_\d+|__Root\w*")
@@ -19,20 +19,22 @@ _LEFT_OUT = re.compile(r'^\s*(name = ".*"|(sample_count|samples_per_wavefront|wa
 def scene_hash(scene: Any, integrator: Any) -> str:
     """SHA-256 of the objects of a scene, in words and by all their parameters, and of the integrator that renders it.
 
-    What models have learnt is part of it: the same scene is another render after a training.
-    The integrator of the scene itself, ids, the order of objects and the number of samples of a sampler are left out.
+    What models have learnt is told by `learnt`. The integrator of the scene itself, ids, the order of objects and the number of samples of a sampler are left out.
     """
     own = scene.integrator()
     found = sorted(_object_digest(child) for child in _children(scene) if child is not own)
-    return hashlib.sha256("\n".join([*found, words(integrator), *_learnt(scene, integrator)]).encode()).hexdigest()
+    return hashlib.sha256("\n".join([*found, words(integrator)]).encode()).hexdigest()
 
 
-def _learnt(scene: Any, integrator: Any) -> list[str]:
-    """Checksums of what the models of the objects have learnt, for an integrator that asks them, or holds one."""
+def learnt(scene: Any, integrator: Any) -> list[str]:
+    """Checksums of what the models of the objects have learnt, for an integrator that asks them, or holds one.
+
+    The same scene is another render after a training.
+    """
     if hasattr(integrator, "prepare"):
         transports = (body.transport for body in integrator.prepare(scene))
         return sorted(checksum for transport in transports for checksum in getattr(transport, "checksums", ()))
-    return [checksum for inner in _children(integrator) for checksum in _learnt(scene, inner)]
+    return [checksum for inner in _children(integrator) for checksum in learnt(scene, inner)]
 
 
 def _children(holder: Any) -> list[Any]:

@@ -22,7 +22,7 @@ import numpy as np
 from halfspace_sss.checks import check_count
 from halfspace_sss.provenance import check_folder, provenance
 from halfspace_sss.rendering.scenes.causes import first_cause
-from halfspace_sss.rendering.scenes.identity import scene_hash, words
+from halfspace_sss.rendering.scenes.identity import learnt, scene_hash, words
 from halfspace_sss.rendering.scenes.reference_store import Reference, load, save
 from halfspace_sss.rendering.surface.placement import choices
 from halfspace_sss.rendering.surface.transports import AUTO
@@ -86,6 +86,7 @@ def render(
     check_folder(path.parent)
     scene, integrator = loaded(scene, integrator, sensor)
     about = about_render(scene, integrator, sensor, seed) | chosen(scene, integrator)
+    about["learnt"] = learnt(scene, integrator)
     found = _start(path, resume, about)
     written = found if resume is True else None
     last = time.monotonic()
@@ -254,11 +255,12 @@ def _start(path: Path, resume: bool | str | os.PathLike, about: dict[str, Any]) 
 
 def check_same(found: Reference, path: Path, about: dict[str, Any]) -> None:
     """ValueError if an image of a file is of another render, so that it cannot be gone on with."""
-    for key in ("scene", "integrator", "sensor", "seed", "variant"):
-        if found.about.get(key) != about[key]:
+    for key in ("scene", "integrator", "sensor", "seed", "variant", "learnt"):
+        there, here = found.about.get(key, []), about.get(key, [])
+        if there != here:
             raise ValueError(
-                f"{path} must be of the same render to go on with it: {key} is {found.about.get(key)!r} there and "
-                f"{about[key]!r} here; choose another file or delete it"
+                f"{path} must be of the same render to go on with it: {key} is {there!r} there and {here!r} here; "
+                "choose another file or delete it"
             )
     versions = [p["provenance"]["versions"] for p in (found.about, about)]
     if versions[0] != versions[1]:
