@@ -19,7 +19,8 @@ _LEFT_OUT = re.compile(r'^\s*(name = ".*"|(sample_count|samples_per_wavefront|wa
 def scene_hash(scene: Any, integrator: Any) -> str:
     """SHA-256 of the objects of a scene, in words and by all their parameters, and of the integrator that renders it.
 
-    What models have learnt is told by `learnt`. The integrator of the scene itself, ids, the order of objects and the number of samples of a sampler are left out.
+    The integrator of the scene itself, ids, the order of objects and the number of samples of a sampler are left out.
+    What models have learnt is told by `learnt`.
     """
     own = scene.integrator()
     found = sorted(_object_digest(child) for child in _children(scene) if child is not own)
