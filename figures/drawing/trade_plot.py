@@ -169,7 +169,7 @@ def multiples(found: Mapping[tuple[str, str, str], ObjectTrade], tolerance: floa
                 continue
             rows = [w for w in o.ways if not w.refusal and w.variance > 0]
             handles |= _pareto(ax, rows, o.pixels, tolerance, small=True)
-            ax.set_title(f"{material}: {_mfp(o)} mfp" if j else f"{material}: {_mfp(o)} mean free paths", pad=2, size=7)
+            ax.set_title(f"{material}: {_mfp(o)} mfp", pad=2, size=7)
             ax.set(
                 xlabel=f"{shape}, {light}: s to {100 * NOISE:g} % noise" if i == len(materials) - 1 else "", ylabel=""
             )

@@ -213,7 +213,7 @@ def _told(found: ObjectTrade, option: _Raw, best: _Raw, job: Job) -> Option:
     elif took < math.inf:
         over = job.seconds is not None and took > job.seconds
         why = f"{row.way} takes {_time(took)}"
-        why += f", allowed {_time(job.seconds)}" if over else f", {took / best[0]:.2g} times as long" + f" ({off})"
+        why += f", allowed {_time(job.seconds)}" if over else f", {_short(took / best[0])} times as long" + f" ({off})"
         why += _training(row, job)
     elif row.bias2 - 2 * row.bias2_error < job.tolerance**2:
         why = f"{row.way} is {off}: whether it keeps {job.tolerance:.3g} cannot be told from so few samples"
@@ -244,8 +244,8 @@ def _off(row: WayTrade) -> str:
     if row.way == PATH_TRACED:
         return "exact"
     if row.bias2 < 2 * row.bias2_error:
-        return f"less than {100 * row.bias_bound:.2g} % off"
-    return f"{100 * row.bias:.2g} ± {100 * row.bias_error:.1g} % off"
+        return f"less than {_short(100 * row.bias_bound)} % off"
+    return f"{_short(100 * row.bias)} ± {_short(100 * row.bias_error, 1)} % off"
 
 
 def _time(seconds: float) -> str:
@@ -254,4 +254,9 @@ def _time(seconds: float) -> str:
     for unit, length in (("h", 3600.0), ("min", 60.0)):
         if seconds >= 1.6 * length:
             return f"{seconds / length:.3g} {unit}"
-    return f"{seconds:.2g} s"
+    return f"{_short(seconds)} s"
+
+
+def _short(value: float, digits: int = 2) -> str:
+    """A number with few digits and without an exponent."""
+    return f"{float(f'{value:.{digits}g}'):.6g}"
