@@ -13,6 +13,7 @@ from halfspace_sss.checks import check_count
 from halfspace_sss.interface.model import models as half_space_models
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.rendering.scenes.learners import LearntObject, ObjectError
+from halfspace_sss.rendering.surface.transports import model_names
 
 __all__ = ["errors", "train"]
 
@@ -51,8 +52,8 @@ def errors(
 
     Args:
         scene: with the object.
-        models: "full_geometry", whose weights must have been trained, and half-space models; by default all of them
-            that have learnt the object or take its medium.
+        models: "full_geometry", whose weights must have been trained, others that know objects, and half-space models;
+            by default all of them that have learnt the object or take its medium.
         object: its id; may be left out where there is one.
         seed: of everything.
         progress: called with (what, done, total).
@@ -71,7 +72,7 @@ def errors(
 def _that_take(subject: Subject) -> dict[str, Any]:
     """All transports of an object that can be asked."""
     found = {}
-    for name in (KIND, *half_space_models()):
+    for name in sorted(model_names(), key=half_space_models().__contains__):
         try:
             found[name] = transport(subject, name)
         except ValueError:
