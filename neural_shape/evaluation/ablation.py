@@ -20,7 +20,7 @@ from neural_shape.surroundings import LENGTHS
 
 __all__ = ["ablation_table"]
 
-HELD_OUT_OBJECTS, SEED = 28, 79
+OBJECTS, HELD_OUT_OBJECTS, SEED = 300, 28, 79
 K = len(LENGTHS)
 OWN = {  # columns of an end
     "log P, way to y": (6, 7), "n.d, n.e": (8, 9), "D_k": tuple(range(10, 10 + K)),
@@ -38,7 +38,7 @@ def ablation_table(work: Path, seconds: float, progress: NamedProgress | None = 
     """A row for each set: steps, likelihood left on held-out objects, and how far their mean radiance is off.
 
     Args:
-        work: folder of a training, whose objects are taken.
+        work: folder of a training, whose first 300 objects are taken.
         seconds: processor time of each fit.
         progress: called with (what, done, total).
 
@@ -69,7 +69,7 @@ def ablation_table(work: Path, seconds: float, progress: NamedProgress | None = 
 
 def _objects(work: Path) -> list[PairData]:
     found = []
-    for path in sorted(work.glob("object-*.npz")):
+    for path in sorted(work.glob("object-*.npz"))[:OBJECTS]:
         with np.load(path) as stored:
             if "walks" in stored:
                 found.append(PairData.from_arrays(stored))

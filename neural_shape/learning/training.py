@@ -182,7 +182,7 @@ class _Run:
         record = {
             "orders": "multiple", "recipe": asdict(self.recipe), "seed": self.seed, "objects": len(self.pool),
             "families": families, "meshes": [m.name for m in self.meshes], "steps": self.fitting.step,
-            "planned_steps": steps, "seconds": seconds,
+            "planned_steps": steps, "seconds_of_last_process": seconds,
             "data_cpu_seconds": sum(r["cpu_seconds"] for r in self.seen),
             "ranges": {"size_in_mfp": SIZE, "albedo_prime": ALBEDO, "g": G, "eta": ETA},
             "provenance": provenance(seed=self.seed),

@@ -19,8 +19,8 @@ Parameters, all optional but the medium:
     material: a name of the registry; or else `sigma_s`, `sigma_a` (1/mm; numbers, rgb, or strings of numbers separated
         by commas), `g` and `eta`; or `sigma_t` (1/mm), `albedo` and `scale` (a factor of sigma_t) instead of the
         first two. For a medium that varies in space `albedo` and one of `sigma_t` and `scale` may be a `gridvolume`.
-    model: name of a model of the library, by default "neural"; or "full_geometry", S of this very object, which
-        `halfspace-sss train --scene` learns.
+    model: name of a model of the library, by default "neural"; or "neural_shape", which sees the shape and needs no
+        training, or "full_geometry", S of this very object, which `halfspace-sss train --scene` learns.
     orders: "total" (single scattering is added where the model lacks it), "multiple" or "single".
     channel: R, G or B, or a number; under a mono variant, for a medium with channels.
     dilution: of a material that has one, see `halfspace_sss.materials.load`.
