@@ -19,6 +19,7 @@ from halfspace_sss.neural.trained import weights_folder
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.provenance import check_folder
 from halfspace_sss.rendering.scenes.learners import LearntObject, ObjectError
+from halfspace_sss.rendering.surface.transports import model_names
 
 __all__ = ["cost", "errors", "train", "untrained"]
 
@@ -81,9 +82,8 @@ def errors(
 
     Args:
         scene: with the object.
-        models: "full_geometry" and "full_geometry_paper", whose weights must have been trained, and half-space models;
-            by default all of them
-            that have learnt the object or take its medium.
+        models: "full_geometry" and "full_geometry_paper", whose weights must have been trained, others that know
+            objects, and half-space models; by default all of them that have learnt the object or take its medium.
         object: its id; may be left out where there is one.
         seed: of everything.
         progress: called with (what, done, total).
@@ -114,7 +114,7 @@ def cost(scene: Any, object: str) -> float:
 def _that_take(subject: Subject) -> dict[str, Any]:
     """All transports of an object that can be asked."""
     found = {}
-    for name in (KIND, *half_space_models()):
+    for name in sorted(model_names(), key=half_space_models().__contains__):
         try:
             found[name] = transport(subject, name)
         except ValueError:

@@ -25,7 +25,7 @@ CELLS, FIRST_CELL = 12, 0.25  # of a march; the first one in mean free paths
 
 
 class FirstEvent(NamedTuple):
-    """P per channel; y and the mean length of the way there, means over channels weighted by P.
+    """P per channel; y and the mean length of the way there, means over channels weighted by P; both per channel.
 
     Of a medium that varies also `local`: logarithms of its coefficients where light enters and at y.
     """
@@ -33,6 +33,8 @@ class FirstEvent(NamedTuple):
     P: Any
     y: Any
     length: Any
+    ys: Any
+    lengths: Any
     local: tuple[Any, ...] = ()
 
 
@@ -88,13 +90,13 @@ def first_event(subject: Subject, at: SurfacePoint, active: Any = True) -> First
     flags = mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame
 
     def step(k: Any, o: Any, d: Any, skip: Any, v: Any, way: Any, found: tuple, active: Any) -> tuple:
-        P, moment, length = found
+        P, moments, length = found
         si = subject.found.scene.ray_intersect(mi.Ray3f(o + d * skip, d), flags, False, active)
         l = dr.select(si.is_valid(), si.t + skip, 1e4 / dr.min(sigma_t))  # noqa: E741
         through, inner = flight(subject, o, d, l)
         part, inner = v * (1 - through), v * inner
-        moment = moment + (o * dr.mean(part) + d * dr.mean(inner))
-        length = length + dr.mean(part) * way + dr.mean(inner)
+        moments = [moment + (o * a + d * b) for moment, a, b in zip(moments, part, inner)]
+        length = length + part * way + inner
         n = turned(si.sh_frame.n, si.n) * sign
         c = dr.dot(d, n)
         v = v * through * mi.fresnel(dr.abs(c), dr.select(c > 0, 1 / eta, eta))[0]
@@ -102,13 +104,15 @@ def first_event(subject: Subject, at: SurfacePoint, active: Any = True) -> First
         goes_on = si.is_valid() & (dr.dot(onward, si.n) * sign < 0) & (dr.max(v) > NEGLIGIBLE) & (k < REFLECTIONS)
         skip = media.clear(mi.UInt32(0), si.n, onward)
         onward = mi.Vector3f(onward)
-        return k + 1, mi.Point3f(si.p), onward, skip, v, way + l, (P + part, moment, length), active & goes_on
+        return k + 1, mi.Point3f(si.p), onward, skip, v, way + l, (P + part, moments, length), active & goes_on
 
     state = (
         mi.UInt32(0), mi.Point3f(at.p), d, media.clear(mi.UInt32(0), at.n, d), mi.Spectrum(1), mi.Float(0),
-        (mi.Spectrum(0), mi.Vector3f(0), mi.Float(0)), valid & active,
+        (mi.Spectrum(0), [mi.Vector3f(0) for _ in subject.media], mi.Spectrum(0)), valid & active,
     )  # fmt: skip
-    P, moment, length = dr.while_loop(state, lambda *s: s[-1], step, label="first event")[-2]
-    total = dr.maximum(dr.mean(P), 1e-20)
-    y = dr.select(dr.mean(P) > 0, mi.Point3f(moment / total), at.p)
-    return FirstEvent(P, y, length / total, (*subject.local(at.p), *subject.local(y)))
+    P, moments, length = dr.while_loop(state, lambda *s: s[-1], step, label="first event")[-2]
+    total, each = dr.maximum(dr.mean(P), 1e-20), dr.maximum(P, 1e-20)
+    y = dr.select(dr.mean(P) > 0, mi.Point3f(sum(moments) / (len(moments) * total)), at.p)
+    ys = [dr.select(p > 0, mi.Point3f(moment / e), at.p) for moment, p, e in zip(moments, P, each)]
+    local = (*subject.local(at.p), *subject.local(y))
+    return FirstEvent(P, y, dr.mean(length) / total, ys, length / each, local)

@@ -23,22 +23,23 @@ class HalfSpace:
     Args:
         subject: the object.
         model: name of a half-space model.
+        floor: reflectance of the floor, over that of the half-space.
     """
 
-    def __init__(self, subject: Subject, model: str) -> None:
-        self.subject, self.name = subject, model
+    def __init__(self, subject: Subject, model: str, floor: float = FLOOR) -> None:
+        self.subject, self.name, self.floor = subject, model, floor
         self.models: list[BSSRDF] = [bssrdf(model, m) for m in subject.media]
 
     @functools.cached_property
-    def _floors(self) -> list[Any]:
-        """Per channel floor of G: FLOOR R_d / (A N), N = 4 pi C_phi(1/eta) normalises F_t over exit directions."""
+    def floors(self) -> list[float]:
+        """Per channel floor of G: floor R_d / (A N), N = 4 pi C_phi(1/eta) normalises F_t over exit directions."""
         found = []
         for m in self.subject.media:
             N = 4 * math.pi * fresnel.C_phi(1 / m.eta)
             albedo = float(m.albedo_prime)
             R_d = albedo**2 * math.exp(-2 * math.sqrt(max(1 - albedo, 0.0)))
-            share = FLOOR * max(R_d, 1e-6) if float(m.sigma_s) > 0 else 0.0
-            found.append(number(share / (self.subject.found.area * N)))
+            share = self.floor * max(R_d, 1e-6) if float(m.sigma_s) > 0 else 0.0
+            found.append(share / (self.subject.found.area * N))
         return found
 
     def __call__(self, exit: Side, entry: Side) -> Any:
@@ -46,13 +47,18 @@ class HalfSpace:
         import drjit as dr
         import mitsuba as mi
 
-        o, i = exit.at, entry.at
+        query, F_t, above = self.query(exit.at, entry.at)
+        S_0 = mi.Spectrum([m.eval(*query) + F_t * number(floor) for m, floor in zip(self.models, self.floors)])
+        return dr.select(above, S_0 * exit.event.P * entry.event.P, 0)
+
+    def query(self, o: SurfacePoint, i: SurfacePoint) -> tuple[tuple, Any, Any]:
+        """The query of the models, both Fresnel transmittances, and whether both directions are above the horizons."""
+        import drjit as dr
+
         query = plane_query(i.p, i.n_out, i.w, Exit(o.p, o.n_out, o.w, None), "distance")
         mu_i, mu_o, eta = query[1], query[3], number(self.subject.eta)
         F_t = fresnel.F_t(mu_i, eta) * fresnel.F_t(mu_o, eta)
-        above = (mu_i > 0) & (mu_o > 0) & (dr.dot(o.w, o.n) > 0) & (dr.dot(i.w, i.n) > 0)
-        S_0 = mi.Spectrum([m.eval(*query) + F_t * floor for m, floor in zip(self.models, self._floors)])
-        return dr.select(above, S_0 * exit.event.P * entry.event.P, 0)
+        return query, F_t, (mu_i > 0) & (mu_o > 0) & (dr.dot(o.w, o.n) > 0) & (dr.dot(i.w, i.n) > 0)
 
 
 class HalfSpaceTransport:

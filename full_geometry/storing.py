@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from full_geometry.added import AddedTransport
 from full_geometry.features import Frame
 from full_geometry.flow.chart import Chart
 from full_geometry.flow.conditional import ConditionalFlow
@@ -20,6 +21,7 @@ from full_geometry.patches import Patches, PatchSampler
 from full_geometry.subject import Subject
 from halfspace_sss.neural.store import load_weights, save_weights
 from halfspace_sss.neural.trained import weights_folder
+from halfspace_sss.rendering.surface.transports import knows_objects
 
 __all__ = [
     "CENTRES", "KIND", "Learnt", "add_flow", "assemble", "find_weights", "load", "save", "trained", "transport",
@@ -113,13 +115,15 @@ def load(path: str | os.PathLike, subject: Subject) -> Learnt:
 
 
 def transport(subject: Subject, model: str, folder: str | os.PathLike | None = None) -> Any:
-    """The transport called `model` of an object: "full_geometry", or a half-space model.
+    """The transport called `model` of an object: "full_geometry", one that a package adds, or a half-space model.
 
     Raises:
         ValueError: the object has not been trained, or there is no such model.
     """
     if model == KIND:
         return load(find_weights(subject, folder), subject).model
+    if knows_objects(model):
+        return AddedTransport.of(subject, model)
     return HalfSpaceTransport(subject, model)
 
 

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from figures.modelling.distance import capsule, cut, fbm, join, length, noise, overlap, ring_noise, smoothstep
-from figures.modelling.mesh import Box, Mesh, surface
+from neural_shape.shapes.distance import capsule, cut, fbm, join, length, noise, overlap, ring_noise, smoothstep
+from neural_shape.shapes.mesh import Box, Mesh, surface
 
 __all__ = ["FLAME", "Candle", "make_candle"]
 

@@ -7,8 +7,8 @@ from functools import cached_property
 
 import numpy as np
 
-from figures.modelling.distance import cells, cut, fbm, length, noise, overlap, smoothstep
-from figures.modelling.mesh import Box
+from neural_shape.shapes.distance import cells, cut, fbm, length, noise, overlap, smoothstep
+from neural_shape.shapes.mesh import Box
 
 __all__ = ["BOX", "Croissant"]
 

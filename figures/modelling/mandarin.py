@@ -11,7 +11,7 @@ from functools import cached_property
 
 import numpy as np
 
-from figures.modelling.distance import (
+from neural_shape.shapes.distance import (
     cells,
     ellipsoid,
     fbm,
@@ -25,7 +25,7 @@ from figures.modelling.distance import (
     smoothstep,
     twisted,
 )
-from figures.modelling.mesh import Box
+from neural_shape.shapes.mesh import Box
 
 __all__ = ["BOX", "Mandarin"]
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from figures.modelling.distance import cells, fbm, length, noise, overlap, rotated, smoothstep
-from figures.modelling.mesh import Box
+from neural_shape.shapes.distance import cells, fbm, length, noise, overlap, rotated, smoothstep
+from neural_shape.shapes.mesh import Box
 
 __all__ = ["BOX", "Meat"]
 

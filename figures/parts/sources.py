@@ -15,7 +15,7 @@ from halfspace_sss.interface.model import model_class, models
 
 __all__ = ["PACKAGES", "code_hash", "models_named", "modules_of"]
 
-PACKAGES = ("figures", "full_geometry", "analytic_models", "halfspace_sss")
+PACKAGES = ("figures", "neural_shape", "full_geometry", "analytic_models", "halfspace_sss")
 MACHINERY = "figures.parts"  # keeps and orders what parts compute, and computes nothing of it
 
 

@@ -69,7 +69,13 @@ class _Store:
 
 
 def trace_exits(
-    subject: Subject, starts: SurfacePoint, seed: tuple[int, ...], *, fewest: int = 2, most: int = 2**31 - 1
+    subject: Subject,
+    starts: SurfacePoint,
+    seed: tuple[int, ...],
+    *,
+    fewest: int = 2,
+    most: int = 2**31 - 1,
+    roulette_from: int = ROULETTE_FROM,
 ) -> Exits:
     """One walk from each start.
 
@@ -77,6 +83,7 @@ def trace_exits(
         starts: where light is seen to leave, and the direction towards the eye.
         seed: of the pass, as for `walk.pass_seed`.
         fewest, most: numbers of scattering events that are kept.
+        roulette_from: scattering events, from which on walks of little weight are ended by chance.
 
     Raises:
         ValueError: fewest is not a whole number >= 0.
@@ -86,6 +93,6 @@ def trace_exits(
     check_count("fewest", fewest, 0)
     store = _Store.of(dr.width(starts.p), fewest, most)
     start = Start(starts.p, starts.n, starts.w, starts.n_out)
-    walk_from(subject.walk_media, 0, start, store, seed, LANES, ROULETTE_FROM)
+    walk_from(subject.walk_media, 0, start, store, seed, LANES, roulette_from)
     dr.eval(store.exits)
     return store.exits

@@ -1,4 +1,4 @@
-"""The command `halfspace-sss train`: networks of materials, the one for all media, or that of an object of a scene."""
+"""The command `halfspace-sss train`: networks of materials, for all media, for all shapes, of an object of a scene."""
 
 from __future__ import annotations
 
@@ -33,7 +33,8 @@ if TYPE_CHECKING:
 __all__ = ["train_command"]
 
 MODEL, BACKEND, VARIANT = "neural_material", "llvm", "llvm_ad_rgb"
-SECONDS = 60.0  # for an object
+SECONDS, SHAPE_SECONDS = 60.0, 600.0  # for an object, for all shapes
+SHAPE_VARIANT = "llvm_ad_mono"
 
 
 def train_command(
@@ -42,6 +43,12 @@ def train_command(
     ] = None,
     channel: Annotated[str | None, typer.Option(help="Only these, as R,B.", show_default="all")] = None,
     universal: Annotated[bool, typer.Option("--universal", help="Train the network for all media instead.")] = False,
+    shapes: Annotated[
+        bool, typer.Option("--shapes", help="Train the network for all shapes and media instead.")
+    ] = False,
+    mesh: Annotated[
+        list[Path] | None, typer.Option(help="With --shapes: a closed PLY file among the shapes; repeat for more.")
+    ] = None,
     scene: Annotated[
         Path | None, typer.Option(help="Mitsuba XML file: train an object of it instead, which `render` then knows.")
     ] = None,
@@ -49,7 +56,8 @@ def train_command(
         str | None, typer.Option(help="Its id in the scene.", show_default="the only translucent one")
     ] = None,
     seconds: Annotated[
-        float | None, typer.Option(help="Time for an object, all included but compiling.", show_default="60")
+        float | None,
+        typer.Option(help="Time for an object or all shapes, without compiling.", show_default="60, 600"),
     ] = None,
     model: Annotated[
         str, typer.Option(help="neural_material or neural_paper; of an object full_geometry.", show_default=False)
@@ -78,6 +86,15 @@ def train_command(
     if find_spec("torch") is None:
         raise ValueError("training needs torch: `pip install halfspace-sss[train]`")
     given = {"sigma_t": sigma_t, "albedo": albedo, "g": g, "eta": eta}
+    if shapes:
+        others = {"material": material, "channel": channel, "universal": universal, "scene": scene, "object": object,
+                  **given, "fast": fast, "steps": steps, "target_error": target_error, "define": define,
+                  "model": None if model == MODEL else model, "variant": None if variant == VARIANT else variant,
+                  "backend": None if backend == BACKEND else backend}  # fmt: skip
+        check_left_out(others, "with --shapes")
+        _shapes(out or Path("shapes"), SHAPE_SECONDS if seconds is None else seconds, seed, mesh or [], work)
+        return
+    check_left_out({"mesh": mesh}, "without --shapes")
     if scene is not None:
         others = {"material": material, "channel": channel, "universal": universal, **given, "fast": fast,
                   "steps": steps, "backend": None if backend == BACKEND else backend}  # fmt: skip
@@ -174,6 +191,21 @@ def _report_object(found: LearntObject) -> None:
         return
     screen.print(object_table(found.errors), OBJECT_DEFINITION, highlight=False, sep="\n")
     told = f"{found.steps} steps in {found.seconds:.0f} s; written:"
+    screen.print(told, f"  {found.path}", highlight=False, markup=False, soft_wrap=True, sep="\n")
+
+
+def _shapes(folder: Path, seconds: float, seed: int, meshes: list[Path], work: Path | None) -> None:
+    """Train the network of all shapes."""
+    use_mitsuba(SHAPE_VARIANT)
+    from halfspace_sss.rendering.scenes.learners import shape_learner
+
+    with Bar("shapes") as bar:
+        found = shape_learner().train_shapes(
+            folder, seconds=seconds, seed=seed, meshes=meshes, work=work,
+            progress=lambda what, done, total: bar.show(done, total, what),
+        )  # fmt: skip
+    screen = console()
+    told = f"{found.objects} objects, {found.steps} steps in {found.seconds:.0f} s; written:"
     screen.print(told, f"  {found.path}", highlight=False, markup=False, soft_wrap=True, sep="\n")
 
 

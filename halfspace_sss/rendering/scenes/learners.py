@@ -1,7 +1,7 @@
 """What learns an object of a scene and says how wrong models of it are: the commands `train --scene`, `errors --scene`.
 
 An entry point of the group `halfspace_sss.learners` has the name of the model that it learns, and is a module or an
-object with the functions of `Learner`.
+object with the functions of `Learner`, or with `train_shapes` of `ShapeLearner`, for `train --shapes`.
 """
 
 from __future__ import annotations
@@ -15,7 +15,9 @@ from halfspace_sss.extensions import LEARNERS, offered, warn_left_out
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.rendering.scenes.camera_walks import CameraWalks
 
-__all__ = ["Learner", "LearntObject", "ObjectError", "learner", "learners"]
+__all__ = [
+    "Learner", "LearntObject", "LearntShapes", "ObjectError", "ShapeLearner", "learner", "learners", "shape_learner",
+]  # fmt: skip
 
 
 class ObjectError(NamedTuple):
@@ -36,6 +38,15 @@ class LearntObject(NamedTuple):
     object: str
     path: Path | None
     errors: list[ObjectError]
+    steps: int
+    seconds: float
+
+
+class LearntShapes(NamedTuple):
+    """What came of a training on shapes without end: where its weights lie, objects that were drawn, and its cost."""
+
+    path: Path
+    objects: int
     steps: int
     seconds: float
 
@@ -71,15 +82,25 @@ class Learner(Protocol):
         """The errors of models of an object; of all that can be asked where none is named."""
 
 
+class ShapeLearner(Protocol):
+    """Learns one network for every shape."""
+
+    def train_shapes(
+        self,
+        folder: Path,
+        *,
+        seconds: float,
+        seed: int,
+        meshes: Sequence[Path],
+        work: Path | None,
+        progress: NamedProgress | None,
+    ) -> LearntShapes:
+        """Write its weights in a folder; ValueError before anything is traced if an argument is out of range."""
+
+
 def learners() -> dict[str, Learner]:
-    """All learners by the name of their model."""
-    known: dict[str, Any] = {}
-    for key, found in offered(LEARNERS):
-        if callable(getattr(found, "train", None)) and callable(getattr(found, "errors", None)):
-            known.setdefault(key, found)
-        else:
-            warn_left_out(LEARNERS, key, f"it must have the functions train and errors, got {found!r}")
-    return known
+    """All learners of objects by the name of their model."""
+    return _known("train", "errors")
 
 
 def learner(name: str | None = None) -> Learner:
@@ -92,3 +113,25 @@ def learner(name: str | None = None) -> Learner:
     if name is not None or not known:
         check_choice("model", name or "full_geometry", tuple(known))
     return known[name] if name is not None else next(iter(known.values()))
+
+
+def shape_learner() -> ShapeLearner:
+    """The first learner of shapes.
+
+    Raises:
+        ValueError: there is none.
+    """
+    known = _known("train_shapes")
+    check_choice("model", next(iter(known), "neural_shape"), tuple(known))
+    return next(iter(known.values()))
+
+
+def _known(*functions: str) -> dict[str, Any]:
+    """Entry points that have these functions; one that has none of any kind is left out with a warning."""
+    known: dict[str, Any] = {}
+    for key, found in offered(LEARNERS):
+        if all(callable(getattr(found, name, None)) for name in functions):
+            known.setdefault(key, found)
+        elif not any(callable(getattr(found, name, None)) for name in ("train_shapes", "train")):
+            warn_left_out(LEARNERS, key, f"it must have the functions train and errors, got {found!r}")
+    return known

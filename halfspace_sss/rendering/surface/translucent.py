@@ -19,10 +19,10 @@ Parameters, all optional but the medium:
     material: a name of the registry; or else `sigma_s`, `sigma_a` (1/mm; numbers, rgb, or strings of numbers separated
         by commas), `g` and `eta`; or `sigma_t` (1/mm), `albedo` and `scale` (a factor of sigma_t) instead of the
         first two. For a medium that varies in space `albedo` and one of `sigma_t` and `scale` may be a `gridvolume`.
-    model: name of a model of the library, by default "neural"; "full_geometry", S of this very object, which is learnt
-        before its first render, or by `halfspace-sss train --scene`; "lambert", a diffuse surface of the same
-        reflectance; or "auto", the cheapest of them that is within the `tolerance` of the integrator, by a measurement
-        before the first render.
+    model: name of a model of the library, by default "neural"; "neural_shape", which sees the shape and needs no
+        training; "full_geometry", S of this very object, which is learnt before its first render, or by
+        `halfspace-sss train --scene`; "lambert", a diffuse surface of the same reflectance; or "auto", the cheapest of
+        them that is within the `tolerance` of the integrator, by a measurement before the first render.
     orders: "total" (what the model lacks of the orders below two is traced; order 0 only beside a model that knows
         the object), "multiple" or "single".
     channel: R, G or B, or a number; under a mono variant, for a medium with channels.

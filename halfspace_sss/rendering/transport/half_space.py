@@ -19,7 +19,7 @@ from halfspace_sss.rendering.transport.radial_table import RadialTable
 from halfspace_sss.rendering.transport.settings import AUTOMATIC, Settings
 from halfspace_sss.rendering.transport.variation import Variation
 
-__all__ = ["HalfSpaceProposals", "HalfSpaceTransport", "half_space_means"]
+__all__ = ["HalfSpaceProposals", "HalfSpaceTransport", "half_space_means", "area_share"]
 
 POINTS_PER_RATIO, MOST_POINTS = 60.0, 9  # candidates over the area
 
@@ -108,13 +108,13 @@ def half_space_means(name: str, found: Object, media: list[Medium], settings: Se
     """
     models = [bssrdf(name, m) for m in media]
     table = RadialTable([model for model, m in zip(models, media) if float(m.sigma_s) > 0], found.size)
-    area_share = _area_share(found, table.mean / found.size, settings.area_share)
-    positions = PositionSampler(found, table, AreaPoints(found.shape), area_share)
+    share = area_share(found, table.mean / found.size, settings.area_share)
+    positions = PositionSampler(found, table, AreaPoints(found.shape), share)
     transport = HalfSpaceTransport(models, settings.geometry, variation)
     return Means(transport, HalfSpaceProposals(positions, models[0]))
 
 
-def _area_share(found: Object, ratio: float, wanted: float) -> float:
+def area_share(found: Object, ratio: float, wanted: float) -> float:
     """Share of candidates over the area, by default for a ratio of mean distance to object size.
 
     On a dragon of ratio 0.16 nine such points beside a probe bring variance x time to a third of that without, 15 do

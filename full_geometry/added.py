@@ -1,0 +1,52 @@
+"""Transports that packages add for renders, asked as those of objects are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from full_geometry.subject import Subject, SurfacePoint
+from halfspace_sss.rendering.surface.inside import Inside
+from halfspace_sss.rendering.surface.transports import object_transport
+from halfspace_sss.rendering.transport.plane import Exit, number
+from halfspace_sss.rendering.transport.protocols import Entry, Transport
+from halfspace_sss.rendering.transport.settings import Settings
+
+__all__ = ["AddedTransport"]
+
+
+@dataclass(frozen=True, eq=False)
+class AddedTransport:
+    """A transport of an entry point of `halfspace_sss.transports`.
+
+    Args:
+        subject: the object.
+        inner: what renders would use.
+    """
+
+    subject: Subject
+    inner: Transport
+
+    @classmethod
+    def of(cls, subject: Subject, name: str) -> AddedTransport:
+        """The one of that name, of an object; errors as it raises them."""
+        inside = Inside("medium", subject.media[0], name, "total", True)
+        return cls(subject, object_transport(name)(subject.found, inside, list(subject.media), Settings()).transport)
+
+    @property
+    def orders(self) -> str:
+        return self.inner.orders
+
+    def prepare(self, at: SurfacePoint, active: Any = True) -> Any:
+        """What is done for the exit alone."""
+        return self.inner.prepare(Exit(at.p, at.n_out, at.w, number(self.subject.found.sign), at.n), active)
+
+    def S(self, exit: Any, at: SurfacePoint, active: Any = True) -> Any:
+        """S per channel, 1/((scene unit)² sr); 0 below the horizons."""
+        import drjit as dr
+        import mitsuba as mi
+
+        mu = dr.dot(at.w, at.n_out)
+        entry = Entry(at.p, mi.Normal3f(at.n * number(self.subject.found.sign)), at.n_out, mi.Float(1), mi.UInt32(0))
+        value = self.inner.S_mu(exit, entry, at.w, active)
+        return dr.select(mu > 0, value / dr.maximum(mu, 1e-6), 0)

@@ -1,0 +1,156 @@
+"""What the network is told of a pair of points: the medium, the pair as on a plane, and how far it is from a plane.
+
+For a channel with l' = 1/sigma_t' and each end of the pair (exit and entry; d is the direction to the other end, e that
+from y to the other y; D_k and V_k are those of `surroundings`):
+
+    own:     mu, mu', w.d, w.n of the other end, refracted w.e, log of the depth of y in mean free paths;
+             log P, log of the way to y in mean free paths, n.d, n.e, D_k, -V_k.n, V_k.e
+    shared:  log r/l', log of |y_i - y_o|/l' as it would be on a plane, w_o.w_i, r/(r + l');
+             1 - n_o.n_i, log of |y_i - y_o| over that of a plane, whether the line y_o y_i leaves the object, and the
+             length that it is outside for, l/(l + l')
+    medium:  nine functions of albedo, g and eta, two of sigma_t' sqrt(area)
+
+What stands behind a semicolon, own numbers summed over both ends, is 0 on a plane. All are free of scale, place and
+turn, and exchanged with the ends.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from full_geometry.first_event import FirstEvent, first_event
+from full_geometry.subject import Subject, SurfacePoint, refract_in
+from halfspace_sss.neural.features import medium_features
+from halfspace_sss.physics.backbone import length_scale
+from halfspace_sss.rendering.transport.plane import number
+from neural_shape.surroundings import LENGTHS, Surroundings, look
+
+__all__ = ["CURVED_OWN", "CURVED_SHARED", "N_MEDIUM", "N_OWN", "N_SHARED", "End", "Pair", "describe", "end", "medium"]
+
+N_LOOK = 3 * len(LENGTHS)
+CURVED_OWN, CURVED_SHARED = slice(6, 10 + N_LOOK), slice(4, 8)  # which are 0 on a plane
+N_OWN, N_SHARED, N_MEDIUM = 10 + N_LOOK, 8, 11
+LEAST_P, LEAST_LENGTH, LEAST_R = 1e-3, 1e-2, 1e-9
+GRAZES = 0.999  # of the line between two points, from which on nothing is in between
+
+
+class End(NamedTuple):
+    """Exit or entry: its point, its first event, its surroundings, its refracted direction."""
+
+    at: SurfacePoint
+    event: FirstEvent
+    around: list[Surroundings]
+    inner: Any
+
+
+class Pair(NamedTuple):
+    """Descriptors of a channel: of both ends, and shared."""
+
+    exit: list[Any]
+    entry: list[Any]
+    shared: list[Any]
+
+
+class _Line(NamedTuple):
+    """From one point to another: direction, length."""
+
+    d: Any
+    length: Any
+
+    @classmethod
+    def between(cls, a: Any, b: Any) -> _Line:
+        import drjit as dr
+
+        way = b - a
+        length = dr.norm(way)
+        return cls(way / dr.maximum(length, LEAST_R), length)
+
+
+def end(subject: Subject, at: SurfacePoint, active: Any = True) -> End:
+    """What belongs to one end alone, measured once for all partners."""
+    inner = refract_in(at, number(subject.eta))[0]
+    event = first_event(subject, at, active)
+    return End(at, event, look(subject, at, event, active), inner)
+
+
+def medium(subject: Subject, channel: int) -> np.ndarray:
+    """The numbers of the medium of a channel and of the size of the object, (11,)."""
+    m = subject.media[channel]
+    albedo, g, eta = (np.float64(v) for v in (m.albedo, m.g, m.eta))
+    size = float(m.sigma_t_prime) * math.sqrt(subject.found.area)
+    found = medium_features(np, albedo, g, eta, length_scale(albedo, g))
+    return np.array([*found, 1 / (1 + 0.1 * size), 0.2 * math.log1p(size)], dtype=np.float32)
+
+
+def describe(subject: Subject, exit: End, entry: End, active: Any = True) -> list[Pair]:
+    """The descriptors of pairs for each channel."""
+    line = _Line.between(exit.at.p, entry.at.p)
+    clear = _clearance(subject, exit.event.y, entry.event.y, active)
+    return [_channel(subject, c, exit, entry, line, clear) for c in range(len(subject.media))]
+
+
+def _channel(subject: Subject, c: int, exit: End, entry: End, line: _Line, clear: tuple[Any, Any]) -> Pair:
+    import drjit as dr
+
+    m = subject.media[c]
+    s, t = number(float(m.sigma_t_prime)), number(float(m.sigma_t))
+    gap = _Line.between(exit.event.ys[c], entry.event.ys[c])
+    back, gap_back = _Line(-line.d, line.length), _Line(-gap.d, gap.length)
+    own_o, own_i = _own(c, t, exit, entry, line, gap), _own(c, t, entry, exit, back, gap_back)
+    r = line.length * s
+    plane = _plane_gap(exit, entry, line, 1 / t) * s
+    blocked, lost = clear
+    return Pair(own_o, own_i, [
+        0.5 * dr.log(r + LEAST_LENGTH), 0.5 * dr.log(plane + LEAST_LENGTH), dr.dot(exit.at.w, entry.at.w), r / (1 + r),
+        1 - dr.dot(exit.at.n_out, entry.at.n_out),
+        0.5 * dr.log((gap.length * s + LEAST_LENGTH) / (plane + LEAST_LENGTH)), blocked, lost * s / (1 + lost * s),
+    ])  # fmt: skip
+
+
+def _own(c: int, sigma_t: Any, here: End, there: End, line: _Line, gap: _Line) -> list[Any]:
+    import drjit as dr
+
+    at, event, n, around = here.at, here.event, here.at.n_out, here.around[c]
+    return [
+        dr.dot(at.w, n), -dr.dot(here.inner, n), dr.dot(at.w, line.d), dr.dot(at.w, there.at.n_out),
+        dr.dot(here.inner, gap.d), 0.5 * dr.log(around.depth * sigma_t + LEAST_LENGTH),
+        0.5 * dr.log((event.P[c] + LEAST_P) / (1 + LEAST_P)),
+        0.5 * dr.log((event.lengths[c] * sigma_t + LEAST_LENGTH) / (1 + LEAST_LENGTH)),
+        dr.dot(n, line.d), dr.dot(n, gap.d),
+        *around.D, *(-dr.dot(v, n) for v in around.V), *(dr.dot(v, gap.d) for v in around.V),
+    ]  # fmt: skip
+
+
+def _plane_gap(exit: End, entry: End, line: _Line, mfp: Any) -> Any:
+    """|y_i - y_o| on a plane, where both points lie a mean free path along their refracted rays."""
+    import drjit as dr
+    import mitsuba as mi
+
+    def inside(here: End, d: Any) -> Any:
+        n, along = here.at.n_out, here.inner
+        flat = mi.Vector3f(d - n * dr.dot(n, d))
+        spare = mi.coordinate_system(n)[0]
+        t = dr.normalize(dr.select(dr.squared_norm(flat) > 1e-12, flat, spare))
+        return mi.Vector3f(dr.dot(along, t), dr.dot(along, dr.cross(n, t)), dr.dot(along, n))
+
+    return dr.norm(mi.Vector3f(line.length, 0, 0) + mfp * (inside(entry, line.d) - inside(exit, line.d)))
+
+
+def _clearance(subject: Subject, a: Any, b: Any, active: Any) -> tuple[Any, Any]:
+    """Of the line between two points inside: 1 if it leaves the object, else 0; the length that it is outside for."""
+    import drjit as dr
+    import mitsuba as mi
+
+    line = _Line.between(a, b)
+
+    def reach(start: Any, d: Any, needed: Any) -> Any:
+        hit = subject.found.scene.ray_intersect_preliminary(mi.Ray3f(start, d), False, needed)
+        return dr.select(hit.is_valid() & (hit.t < line.length), hit.t, line.length)
+
+    one = reach(a, line.d, active)
+    blocked = one < GRAZES * line.length
+    lost = dr.select(blocked, line.length - one - reach(b, -line.d, active & blocked), 0)
+    return dr.select(blocked, mi.Float(1), 0), dr.maximum(lost, 0)

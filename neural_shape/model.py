@@ -1,0 +1,107 @@
+"""S of any object: the half-space times what one network says of the shape around two points, evaluated in Dr.Jit."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from full_geometry.features import Side
+from full_geometry.half_space import HalfSpace
+from full_geometry.subject import Subject, SurfacePoint
+from halfspace_sss.rendering.transport.plane import number
+from neural_shape.descriptors import CURVED_OWN, CURVED_SHARED, N_OWN, End, Pair, describe, end, medium
+
+__all__ = ["BACKBONE", "BOUND", "FLOOR", "NeuralShape"]
+
+BACKBONE = "neural"
+BOUND = 6.0  # of f
+FLOOR = 2e-3  # reflectance of what S_0 has everywhere, over that of the half-space
+
+
+@dataclass(frozen=True, eq=False)
+class NeuralShape:
+    """S = S_0 P_o P_i exp f, f = 6 tanh(h . u / 6), u = (c_o + c_i, c_oi) the descriptors that are 0 on a plane.
+
+    h is a perceptron whose first layer is asked for both ends in turn and summed, so that S is reciprocal as far as S_0
+    is; on a plane f = 0. Orders two and more; positive; 0 below the horizons.
+
+    Args:
+        subject: the object.
+        half_space: S_0 P_o P_i.
+        weights: W_k (outputs, inputs) and b_k of the layers.
+    """
+
+    subject: Subject
+    half_space: HalfSpace
+    weights: Mapping[str, np.ndarray]
+    orders = "multiple"
+
+    @classmethod
+    def of(cls, subject: Subject, weights: Mapping[str, np.ndarray]) -> NeuralShape:
+        """The model of an object from the arrays of a file."""
+        return cls(subject, HalfSpace(subject, BACKBONE, FLOOR), weights)
+
+    @functools.cached_property
+    def _views(self) -> tuple[list[Any], list[Any]]:
+        """Matrices and biases as Dr.Jit's views; the first layer is split into own and the rest."""
+        import mitsuba as mi
+        from drjit import nn
+
+        depth = len(self.weights) // 2
+        matrices = [self.weights[f"W_{k}"] for k in range(depth)]
+        matrices = [matrices[0][:, :N_OWN], matrices[0][:, N_OWN:], *matrices[1:]]
+        tensors = [mi.TensorXf(np.ascontiguousarray(W, dtype=np.float32)) for W in matrices]
+        biases = [mi.Float(self.weights[f"b_{k}"].astype(np.float32)) for k in range(depth)]
+        views = nn.pack(*tensors, *biases)[-len(tensors) - len(biases) :]
+        return list(views[: len(tensors)]), list(views[len(tensors) :])
+
+    @functools.cached_property
+    def _media(self) -> list[list[Any]]:
+        return [[number(v) for v in medium(self.subject, c)] for c in range(len(self.subject.media))]
+
+    def prepare(self, at: SurfacePoint, active: Any = True) -> End:
+        """The exit's side, for as many entries as are asked for."""
+        return end(self.subject, at, active)
+
+    def S(self, exit: End, at: SurfacePoint, active: Any = True) -> Any:
+        """S(x_i, w_i; x_o, w_o) per channel, 1/((scene unit)² sr); 0 below the horizons.
+
+        Args:
+            exit: from `prepare`.
+            at: entry, with w_i.
+            active: mask of lanes.
+        """
+        import drjit as dr
+        import mitsuba as mi
+
+        entry = end(self.subject, at, active)
+        pairs = describe(self.subject, exit, entry, active)
+        f = mi.Spectrum([self._f(pair, numbers) for pair, numbers in zip(pairs, self._media)])
+        S_0 = self.half_space(Side(exit.at, exit.event), Side(entry.at, entry.event))
+        return dr.select(active, S_0 * dr.exp(f), 0)
+
+    def _f(self, pair: Pair, numbers: list[Any]) -> Any:
+        import drjit as dr
+        from drjit import nn
+
+        W, b = self._views
+        rest = nn.matvec(W[1], nn.CoopVec(*pair.shared, *numbers), b[0])
+        ends = [_swish(nn.matvec(W[0], nn.CoopVec(*own)) + rest) for own in (pair.exit, pair.entry)]
+        x = ends[0] + ends[1]
+        for k in range(1, len(b)):
+            x = nn.matvec(W[k + 1], x, b[k])
+            x = _swish(x) if k < len(b) - 1 else x
+        u = [a + b for a, b in zip(pair.exit[CURVED_OWN], pair.entry[CURVED_OWN])] + pair.shared[CURVED_SHARED]
+        g = sum(h * v for h, v in zip(list(x), u))
+        return BOUND * dr.tanh(g / BOUND)
+
+
+def _swish(x: Any) -> Any:
+    """Hard swish, x clip(x/6 + 1/2, 0, 1)."""
+    import drjit as dr
+
+    return x * dr.clip(x * (1 / 6) + 0.5, 0, 1)

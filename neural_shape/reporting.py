@@ -1,0 +1,79 @@
+"""The command `halfspace-sss shapes`: the tables of docs/neural_shape.md, measured anew."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from halfspace_sss.checks import check_count
+from halfspace_sss.provenance import write_atomically
+
+__all__ = ["shapes_command"]
+
+MATERIALS = ("marble", "apple", "potato", "ketchup", "regular chocolate milk")  # of Fig. 9
+MM_PER_UNIT = 3.8  # the bunny of Fig. 9 is 37 mm tall
+VARIANT = "llvm_ad_mono"
+SPHERE_NOTE = "albedo 0.95, g = 0, eta = 1.3"
+
+
+def shapes_command(
+    objects: Annotated[int, typer.Option(help="Held-out shapes, each with its medium.")] = 35,
+    mesh: Annotated[
+        Path | None, typer.Option(help="A closed PLY file: an unseen shape, in the media of Fig. 9.")
+    ] = None,
+    mm_per_unit: Annotated[float, typer.Option(help="Of that file.")] = MM_PER_UNIT,
+    work: Annotated[
+        Path | None, typer.Option(help="Work of `train --shapes`: fit short ablations on its objects.")
+    ] = None,
+    seconds: Annotated[float, typer.Option(help="Processor time of each ablation.")] = 60.0,
+    out: Annotated[Path, typer.Option(help="Markdown file: the text between its marks is replaced.")] = Path(
+        "neural_shape.md"
+    ),
+) -> None:
+    """Measure the network of all shapes: held-out objects, a mesh, spheres, speed; tables into a Markdown file."""
+    from halfspace_sss.cli.shared import Bar, use_mitsuba
+
+    check_count("objects", objects, 1)
+    if mesh is not None and not mesh.is_file():
+        raise ValueError(f"mesh must be a PLY file, got {str(mesh)!r}, which is none")
+    use_mitsuba(VARIANT)
+    from neural_shape.evaluation import cases, tables
+
+    found: dict[str, str] = {}
+    with Bar("shapes") as bar:
+
+        def show(what: str, done: int, total: int) -> None:
+            bar.show(done, total, what)
+
+        balls = cases.evaluate(cases.spheres(), len(cases.RADII), progress=show)
+        found[f"Spheres: {SPHERE_NOTE}"] = tables.case_table(balls)
+        if mesh is not None:
+            bunny = list(cases.of_mesh(mesh, MATERIALS, mm_per_unit))
+            found["speed"] = tables.speed_table(cases.seconds_per_million(bunny[6].subject))
+            rows = cases.evaluate(iter(bunny), len(bunny), progress=show)
+            found[f"{mesh.stem}"] = tables.summary(rows) + "\n" + tables.case_table(rows)
+        rows = cases.evaluate(cases.held_out(objects), objects, progress=show)
+        found["held-out"] = tables.summary(rows) + "\n" + tables.by_property(rows) + "\n" + tables.case_table(rows)
+        if work is not None:
+            from neural_shape.evaluation.ablation import ablation_table
+
+            found["ablation"] = ablation_table(work, seconds, show)
+    _write(out, found)
+    typer.echo(f"written: {out}")
+
+
+def _write(out: Path, found: dict[str, str]) -> None:
+    """Replace what stands between the marks of each table; what has no marks is put at the end."""
+    text = out.read_text(encoding="utf-8") if out.exists() else ""
+    for name, table in found.items():
+        key = name.split(":")[0].lower()
+        marks = f"<!-- {key} -->\n", f"<!-- end of {key} -->\n"
+        block = f"{marks[0]}{table}{marks[1]}"
+        if marks[0] in text:
+            text = re.sub(re.escape(marks[0]) + ".*?" + re.escape(marks[1]), lambda _, b=block: b, text, flags=re.S)
+        else:
+            text += f"\n{block}"
+    write_atomically(out, text)

@@ -1,0 +1,197 @@
+"""S of any shape: what its form guarantees whatever the weights say, and what the shipped ones bring."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from halfspace_sss import Medium
+
+dr = pytest.importorskip("drjit")
+mi = pytest.importorskip("mitsuba")
+pytest.importorskip("igl")
+
+from full_geometry.half_space import HalfSpaceTransport  # noqa: E402
+from full_geometry.learning.model_errors import errors_of  # noqa: E402
+from full_geometry.subject import Subject, SurfacePoint, cosine_direction  # noqa: E402
+from halfspace_sss.tracing.walk import _generator, pass_seed  # noqa: E402
+from neural_shape.descriptors import CURVED_OWN, CURVED_SHARED, N_MEDIUM, N_OWN, N_SHARED, describe, end, medium  # noqa: E402
+from neural_shape.model import NeuralShape  # noqa: E402
+from neural_shape.shapes.generators import make_shape  # noqa: E402
+from neural_shape.shapes.mesh import Box, surface  # noqa: E402
+from neural_shape.storing import transport  # noqa: E402
+
+WAX = Medium(0.95, 0.05, 0.3, 1.4)
+N = 512
+
+
+@pytest.fixture(autouse=True)
+def variant() -> None:
+    mi.set_variant("llvm_ad_mono")
+
+
+def random_weights(seed: int = 0, width: int = 16) -> dict[str, np.ndarray]:
+    """Numbers with which f is of order one."""
+    pytest.importorskip("torch")
+    from neural_shape.learning.fitting import Network, Recipe
+
+    rng = np.random.default_rng(seed)
+    arrays = Network(Recipe(width=width, depth=2), seed).arrays()
+    return arrays | {"W_2": rng.normal(0, 1, arrays["W_2"].shape).astype(np.float32)}
+
+
+def mesh(vertices: np.ndarray, faces: np.ndarray) -> object:
+    """A Mitsuba mesh with flat normals."""
+    found = mi.Mesh("mesh", len(vertices), len(faces))
+    parameters = mi.traverse(found)
+    parameters["vertex_positions"] = vertices.astype(np.float32).ravel()
+    parameters["faces"] = faces.astype(np.uint32).ravel()
+    parameters.update()
+    return found
+
+
+def pairs(subject: Subject, n: int = N, seed: int = 5) -> tuple[SurfacePoint, SurfacePoint]:
+    """Exits and entries, each with a random direction."""
+    rng = _generator(mi, n, pass_seed(seed))
+    found = subject.random_points(rng), subject.random_points(rng)
+    dr.eval(found)
+    return found
+
+
+def S(model: NeuralShape, o: SurfacePoint, i: SurfacePoint) -> np.ndarray:
+    return np.array(model.S(model.prepare(o), i))
+
+
+def moved(at: SurfacePoint, turn: mi.ScalarTransform4f, scale: float) -> SurfacePoint:
+    """A point of a surface after it was turned and scaled."""
+    R = np.array(turn.matrix, dtype=float)[:3, :3]
+    rows = [mi.Vector3f(*row.tolist()) for row in R]
+
+    def turned(v: object) -> object:
+        return type(v)(*(dr.dot(row, mi.Vector3f(v)) for row in rows))
+
+    p, n, n_out, w = (turned(v) for v in at)
+    return SurfacePoint(p * scale, n, n_out, w)
+
+
+def test_on_a_plane_it_is_the_half_space_whatever_the_weights() -> None:
+    box = mi.load_dict({"type": "cube", "to_world": mi.ScalarTransform4f().scale(2000.0)})
+    subject = Subject.of(box, WAX)
+    rng = _generator(mi, N, pass_seed(1))
+    place = [mi.Point3f(12 * rng.next_float32(), 12 * rng.next_float32(), 2000.0) for _ in range(2)]
+    n = mi.Normal3f(dr.zeros(mi.Float, N), dr.zeros(mi.Float, N), dr.full(mi.Float, 1.0, N))
+    o, i = (SurfacePoint(p, n, n, cosine_direction(n, rng)) for p in place)
+    model = NeuralShape.of(subject, random_weights())
+    entry = end(subject, i)
+    plane = np.array(model.half_space(*(_side(e) for e in (end(subject, o), entry))))
+    assert np.allclose(S(model, o, i), plane, rtol=2e-3)
+    for pair in describe(subject, end(subject, o), entry):
+        sums = [a + b for a, b in zip(pair.exit[CURVED_OWN], pair.entry[CURVED_OWN])] + pair.shared[CURVED_SHARED]
+        assert max(float(np.abs(v.numpy()).max()) for v in sums) < 2e-3
+
+
+def _side(e: object) -> object:
+    from full_geometry.features import Side
+
+    return Side(e.at, e.event)
+
+
+def test_a_sphere_that_grows_becomes_the_half_space() -> None:
+    spread = []
+    for radius in (30.0, 1000.0, 30000.0):
+        subject = Subject.of(mi.load_dict({"type": "sphere", "radius": radius}), WAX)
+        model = NeuralShape.of(subject, random_weights())
+        o, _ = pairs(subject)
+        step = mi.Vector3f(cosine_direction(o.n, _generator(mi, N, pass_seed(2))))
+        n = mi.Normal3f(dr.normalize(mi.Vector3f(o.p + 3 * dr.normalize(dr.cross(o.n, step)))))
+        i = SurfacePoint(mi.Point3f(n * radius), n, n, cosine_direction(n, _generator(mi, N, pass_seed(3))))
+        plane = np.array(model.half_space(_side(end(subject, o)), _side(end(subject, i))))
+        spread.append(float(np.abs(np.log(S(model, o, i) / plane)).mean()))
+    assert spread[0] > 5 * spread[1] > 10 * spread[2] and spread[2] < 0.01
+
+
+def test_light_may_take_the_way_back() -> None:
+    subject = Subject.of(make_shape("blobs", 3, 24).mitsuba("blob"), WAX.scaled(20.0))
+    model, (o, i) = NeuralShape.of(subject, random_weights()), pairs(subject)
+    there, back = S(model, o, i), S(model, i, o)
+    assert (there > 0).mean() > 0.9
+    assert np.allclose(there, back, rtol=5e-3, atol=1e-6 * there.max())
+
+
+def test_scale_turn_and_order_of_triangles_do_not_count() -> None:
+    shape, scale = make_shape("ribbons", 4, 24), 7.0
+    turn = mi.ScalarTransform4f().rotate([0.36, 0.8, 0.48], 77.0)
+    R = np.array(turn.matrix, dtype=float)[:3, :3]
+    order = np.random.default_rng(0).permutation(len(shape.faces))
+    one = Subject.of(mesh(shape.vertices, shape.faces), WAX.scaled(10.0))
+    other = Subject.of(mesh(scale * shape.vertices @ R.T, shape.faces[order]), WAX.scaled(10.0 / scale))
+    weights, (o, i) = random_weights(), pairs(one)
+    first = S(NeuralShape.of(one, weights), o, i)
+    second = S(NeuralShape.of(other, weights), moved(o, turn, scale), moved(i, turn, scale))
+    ratio = second * scale**2 / first
+    assert np.quantile(np.abs(ratio - 1), 0.97) < 0.01  # a ray that meets an edge may go to either side
+
+
+def test_resolution_does_not_count() -> None:
+    def ball(p: np.ndarray) -> np.ndarray:
+        return np.linalg.norm(p, axis=-1) - 1
+
+    found = []
+    for resolution in (20, 80):
+        subject = Subject.of(surface(ball, Box((-1.1,) * 3, (1.1,) * 3), resolution).mitsuba("ball"), WAX.scaled(5.0))
+        o, i = pairs(subject, 2**13)
+        pair = describe(subject, end(subject, o), end(subject, i))[0]
+        columns = [np.broadcast_to(v.numpy(), 2**13) for v in (*pair.exit, *pair.shared)]
+        found.append(np.array([(c.mean(), c.std()) for c in columns]))
+    scatter = np.maximum(found[1][:, 1], 0.02)
+    assert (np.abs(found[0][:, 0] - found[1][:, 0]) / scatter).max() < 0.15
+
+
+def test_torch_and_drjit_say_the_same() -> None:
+    torch = pytest.importorskip("torch")
+    from neural_shape.learning.fitting import Network, Recipe
+
+    subject = Subject.of(make_shape("shells", 2, 24).mitsuba("bowl"), WAX.scaled(8.0))
+    weights, (o, i) = random_weights(), pairs(subject)
+    pair = describe(subject, end(subject, o), end(subject, i))[0]
+    columns = [np.broadcast_to(v.numpy(), N) for v in (*pair.exit, *pair.entry, *pair.shared)]
+    x = torch.from_numpy(np.stack(columns, axis=-1).astype(np.float32))
+    network = Network(Recipe(width=16, depth=2))
+    with torch.no_grad():
+        for k, (W, b) in enumerate(zip(network.matrices, network.biases)):
+            W.copy_(torch.from_numpy(weights[f"W_{k}"]))
+            b.copy_(torch.from_numpy(weights[f"b_{k}"]))
+        wanted = network(x, torch.from_numpy(medium(subject, 0)).expand(N, -1)).numpy()
+    model = NeuralShape.of(subject, weights)
+    found = model._f(pair, model._media[0]).numpy()
+    assert x.shape[1] == 2 * N_OWN + N_SHARED and len(medium(subject, 0)) == N_MEDIUM
+    assert np.allclose(found, wanted, atol=2e-3) and np.std(wanted) > 0.1
+
+
+def test_degenerate_triangles_needles_and_points_that_coincide_leave_no_nan() -> None:
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.001, 0.001, 40.0], [0.5, 0.0, 0.0]], dtype=float)
+    faces = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3], [0, 4, 1], [0, 4, 1], [2, 2, 2]])
+    with pytest.warns(UserWarning):
+        subject = Subject.of(mesh(vertices, faces), WAX)
+    model = NeuralShape.of(subject, random_weights())
+    o, i = pairs(subject, 2048)
+    for at in (i, o, SurfacePoint(o.p, o.n, o.n_out, i.w)):
+        value = S(model, o, at)
+        assert np.isfinite(value).all() and (value >= 0).all()
+
+
+@pytest.mark.parametrize("ratios", [(0.02, 0.98, 0.0, 1.3), (1.0, 0.0, 0.0, 1.5), (0.9, 0.1, 0.9, 1.0)])
+def test_media_at_the_ends_of_the_range_stay_finite(ratios: tuple[float, ...]) -> None:
+    for size in (1.0, 1000.0):
+        subject = Subject.of(mi.load_dict({"type": "sphere"}), Medium(*ratios).scaled(size))
+        value = S(transport(subject), *pairs(subject))
+        assert np.isfinite(value).all() and (value >= 0).all()
+
+
+@pytest.mark.parametrize("radius", [3.0, 10.0])
+def test_shipped_weights_are_several_times_better_than_the_half_space_on_a_sphere(radius: float) -> None:
+    subject = Subject.of(mi.load_dict({"type": "sphere", "radius": radius}), Medium(0.95, 0.05, 0.0, 1.3))
+    models = {"neural_shape": transport(subject), "neural": HalfSpaceTransport(subject, "neural")}
+    found = errors_of(subject, models, exits=64, walks=2048, samples=1024)
+    own, plane = (found[name][0].error for name in models)
+    assert own < plane / 3

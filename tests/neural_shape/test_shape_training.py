@@ -1,0 +1,129 @@
+"""Training on shapes without end: the shapes, the data, the same weights after a kill, the record, the command."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+mi = pytest.importorskip("mitsuba")
+pytest.importorskip("igl")
+torch = pytest.importorskip("torch")
+
+from halfspace_sss.cli import app as cli  # noqa: E402
+from neural_shape.learning import training  # noqa: E402
+from neural_shape.learning.drawing import draw_medium, draw_subject, mean_events  # noqa: E402
+from neural_shape.learning.fitting import Fitting, Recipe  # noqa: E402
+from neural_shape.learning.source import make_data  # noqa: E402
+from neural_shape.ranges import ALBEDO, ETA, SIZE, G  # noqa: E402
+from neural_shape.shapes.generators import HELD_OUT, TRAINING, make_shape  # noqa: E402
+from neural_shape.storing import WEIGHTS, load, shipped_weights  # noqa: E402
+
+QUICK = Recipe(width=16, depth=2, objects=4, pairs=64)
+PLAN = (4, 12)
+
+
+@pytest.fixture(autouse=True)
+def variant() -> None:
+    mi.set_variant("llvm_ad_mono")
+
+
+@pytest.mark.parametrize("family", [*TRAINING, *HELD_OUT])
+def test_shapes_are_closed_differ_by_seed_and_repeat(family: str) -> None:
+    one, same, other = (make_shape(family, seed, 20) for seed in (1, 1, 2))  # a mesh that is not closed is refused
+    assert np.array_equal(one.vertices, same.vertices) and np.array_equal(one.faces, same.faces)
+    assert one.vertices.shape != other.vertices.shape or not np.allclose(one.vertices, other.vertices)
+
+
+def test_families_that_are_held_out_are_not_trained_on() -> None:
+    assert not set(TRAINING) & set(HELD_OUT)
+
+
+def test_objects_are_drawn_over_the_whole_range_and_not_beyond() -> None:
+    media = np.array([draw_medium(np.random.default_rng(k)) for k in range(2000)])
+    albedo, g, eta = media.T
+    reduced = albedo * (1 - g) / (1 - albedo * g)
+    for values, (low, high) in ((reduced, ALBEDO), (g, G), (eta, ETA)):
+        assert low - 1e-9 <= values.min() < low + 0.1 * (high - low)
+        assert high - 0.1 * (high - low) < values.max() <= high + 1e-9
+    sizes = [draw_subject((3, k)).subject.mean_free_paths()[0] for k in range(12)]
+    assert SIZE[0] <= min(sizes) < 30 < max(sizes) <= SIZE[1]
+
+
+def test_data_repeat_and_have_a_mean_throughput_of_one() -> None:
+    subject = draw_subject((0, 4)).subject
+    one, two = (make_data(subject, mean_events(subject), (0, 4)) for _ in range(2))
+    assert np.array_equal(one.walks, two.walks) and np.array_equal(one.W, two.W)
+    assert np.isclose(one.T.mean() * one.share, 1.0, rtol=0.05)
+    assert np.isfinite(one.walks).all() and (one.W >= 0).all()
+
+
+def test_a_run_that_was_killed_ends_with_the_same_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(training, "CHECKPOINT_EVERY", 0.0)
+    how = {"recipe": QUICK, "plan": PLAN, "seed": 2}
+    whole = training.train_shapes(tmp_path / "a", **how)
+
+    def kill(what: str, done: int, total: int) -> None:
+        if done == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        training.train_shapes(tmp_path / "b", work=tmp_path / "work", progress=kill, **how)
+    again = training.train_shapes(tmp_path / "b", work=tmp_path / "work", **how)
+    assert whole.steps == again.steps == PLAN[1]
+    left, right = (load(run.path) for run in (whole, again))
+    assert all(np.array_equal(left[name], right[name]) for name in left)
+    with pytest.raises(ValueError, match="seed must be 3 to go on with this work"):
+        training.train_shapes(tmp_path / "b", work=tmp_path / "work", **{**how, "seed": 3})
+
+
+def test_a_step_lowers_the_likelihood_that_is_left() -> None:
+    subjects = [draw_subject((1, k)).subject for k in range(2)]
+    pool = [d for k, s in enumerate(subjects) if (d := make_data(s, mean_events(s), (1, k))) is not None]
+    fitting, rng = Fitting(QUICK, 0), np.random.default_rng(0)
+    losses = [fitting.advance(pool, rng, k / 150) for k in range(150)]
+    assert np.mean(losses[-20:]) < np.mean(losses[:20]) - 0.02
+
+
+def test_the_command_writes_weights_with_their_record(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(training, "STANDARD", QUICK)
+    monkeypatch.setattr(training._Run, "_plan", lambda run, seconds, plan: (3, 4))
+    result = CliRunner().invoke(cli.app, ["train", "--shapes", "--seconds", "5", "--seed", "1"])
+    assert result.exit_code == 0, result.output
+    record = json.loads(Path("shapes", WEIGHTS).with_suffix(".json").read_text(encoding="utf-8"))
+    assert record["kind"] == "neural_shape" and record["steps"] == 4 and sum(record["families"].values()) <= 3
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--shapes", "--seconds", "0"], "seconds must be a number in [1, 1e+07]"),
+        (["--shapes", "--mesh", "none.ply"], "meshes must be PLY files"),
+        (["--shapes", "--scene", "x.xml"], "with --shapes"),
+        (["--mesh", "x.ply"], "without --shapes"),
+    ],
+)
+def test_bad_input_meets_a_sentence(words: list[str], message: str) -> None:
+    result = CliRunner().invoke(cli.app, ["train", *words])
+    assert result.exit_code == 2 and message in " ".join(result.stderr.split())
+
+
+def test_shipped_weights_are_small_and_say_how_they_were_made() -> None:
+    path = shipped_weights()
+    record = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
+    assert path.stat().st_size <= 300_000 and load(path)
+    assert record["objects"] > 0 and record["steps"] > 0 and "provenance" in record
+
+
+def test_damaged_weights_are_refused_by_name(tmp_path: Path) -> None:
+    for suffix in (".safetensors", ".json"):
+        (tmp_path / WEIGHTS).with_suffix(suffix).write_bytes(shipped_weights().with_suffix(suffix).read_bytes())
+    data = bytearray((tmp_path / WEIGHTS).read_bytes())
+    data[-3] ^= 1
+    (tmp_path / WEIGHTS).write_bytes(bytes(data))
+    with pytest.raises(ValueError, match=WEIGHTS):
+        load(tmp_path / WEIGHTS)
