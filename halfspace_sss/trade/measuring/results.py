@@ -68,8 +68,8 @@ class WayTrade:
 
     @property
     def bias_bound(self) -> float:
-        """What the bias is below in 95 % of cases."""
-        return math.sqrt(max(self.bias2 + Z_UPPER * self.bias2_error, 0.0))
+        """What the bias is below in 95 % of cases; a square that came out below 0 counts as 0."""
+        return math.sqrt(max(self.bias2, 0.0) + Z_UPPER * self.bias2_error)
 
     @property
     def variance_bound(self) -> float:
