@@ -68,6 +68,12 @@ def test_the_cheapest_way_that_keeps_the_tolerance_is_recommended(tolerance: flo
     assert recommend(_assessment(CHEAP, GOOD), tolerance=tolerance).objects[0].way == way
 
 
+def test_a_square_that_noise_put_far_below_zero_keeps_no_tolerance_below_its_standard_error() -> None:
+    lucky = WayTrade("standard_dipole", -1.0, 0.1, (1.0,), (0.0,), 1.0, 0.0, 1e-9, 100)
+    assert lucky.bias == 0.0 and lucky.bias_bound == pytest.approx(math.sqrt(1.645 * 0.1))
+    assert recommend(_assessment(lucky), tolerance=0.3).objects[0].way == "path_traced"
+
+
 def test_every_way_gets_one_sentence() -> None:
     refused = WayTrade("full_geometry", refusal="it must be trained")
     doubtful = _way("better_dipole", 0.05, 0.2, 1e-7)

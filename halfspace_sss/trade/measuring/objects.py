@@ -13,7 +13,7 @@ from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED
 from halfspace_sss.rendering.surface.object import survey
 from halfspace_sss.trade.measuring.exits import Exits, visible_exits
 from halfspace_sss.trade.measuring.results import Assessment, ObjectTrade, WayTrade
-from halfspace_sss.trade.measuring.sampling import Sampled, clock, first_sample, sample_more
+from halfspace_sss.trade.measuring.sampling import Sampled, clock, first_sample, sample_more, warm_up
 from halfspace_sss.trade.measuring.seeds import seeded
 from halfspace_sss.trade.measuring.statistics import mean_square, ratio_of_means, relative_variance
 from halfspace_sss.trade.measuring.training import training_seconds
@@ -37,6 +37,10 @@ def assess_stage(
     progress: NamedProgress | None = None,
 ) -> Assessment:
     """As `assessing.assess`, of a scene that is made ready; or with `samples` of each exit instead of seconds."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # they are heard when the ways are made ready again
+        for walks in (True, False):
+            warm_up(on, [way for way in chosen if (way.model == PATH_TRACED) == walks])
     started = clock()
     seen = visible_exits(on.scene, on.shapes, sensor, exits, seeded(seed, 41))
     objects, compiled, compiling = [], 0.0, 0.0

@@ -26,8 +26,7 @@ class WayTrade:
             below 0. Mean over visible exits and channels, over the square of the mean radiance.
         bias2_error: its standard error.
         ratio, ratio_error: mean radiance over that of walks, for each channel, with standard errors.
-        variance, variance_error: of one sample, over the square of the mean radiance, with its standard error; what is
-            above the 98th percentile of the exits counts as that.
+        variance, variance_error: of one sample, over the square of the mean radiance, with its standard error.
         seconds: of one sample of the object, compilation left out.
         samples: that were taken for this.
         preparation, compilation: seconds, once for a scene; kernels that were compiled before are found again.
@@ -68,8 +67,8 @@ class WayTrade:
 
     @property
     def bias_bound(self) -> float:
-        """What the bias is below in 95 % of cases."""
-        return math.sqrt(max(self.bias2 + Z_UPPER * self.bias2_error, 0.0))
+        """What the bias is below in 95 % of cases; a square that came out below 0 counts as 0."""
+        return math.sqrt(max(self.bias2, 0.0) + Z_UPPER * self.bias2_error)
 
     @property
     def variance_bound(self) -> float:

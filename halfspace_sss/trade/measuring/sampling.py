@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -14,7 +16,7 @@ from halfspace_sss.trade.measuring.seeds import seeded
 from halfspace_sss.trade.measuring.statistics import Estimate
 from halfspace_sss.trade.measuring.ways import Stage, Way
 
-__all__ = ["Sampled", "clock", "first_sample", "sample_more"]
+__all__ = ["Sampled", "clock", "first_sample", "sample_more", "warm_up"]
 
 LANES = 2**18  # of a launch
 PILOT, FEWEST = 64, 8  # samples of each exit by which the time is foreseen, and of a launch that is worth it
@@ -65,17 +67,29 @@ def first_sample(stage: Stage, way: Way, exits: Exits, seed: int) -> Sampled:
         ValueError: the way refuses the scene.
     """
     with stage.shown_by(way) as integrator:
-        started = time.perf_counter()
-        prepare = integrator.prepare if hasattr(integrator, "prepare") else integrator.tracer
-        prepare(stage.scene)
-        prepared = time.perf_counter()
+        started = clock()
+        _prepare(stage, integrator)
+        preparation, prepared = clock() - started, time.perf_counter()
         estimate = Estimate(variant_channels(), exits.n)
         _, first = _launch(stage, integrator, exits, estimate, 2, seeded(seed, 31, 0))
         compiled = time.perf_counter()
         _, overhead = _launch(stage, integrator, exits, estimate, 2, seeded(seed, 31, 1))
         again = time.perf_counter() - compiled
     waited = max(compiled - prepared - again, 0.0)
-    return Sampled(estimate, prepared - started, waited, max(first - overhead, 0.0), overhead)
+    return Sampled(estimate, preparation, waited, max(first - overhead, 0.0), overhead)
+
+
+def warm_up(stage: Stage, ways: Sequence[Way]) -> None:
+    """Compile what preparation needs, by the first way that does not refuse the scene, and forget that way again."""
+    for way in ways:
+        with stage.shown_by(way) as integrator, contextlib.suppress(ValueError, RuntimeError):
+            _prepare(stage, integrator)
+            stage.forget(way)
+            return
+
+
+def _prepare(stage: Stage, integrator: Any) -> None:
+    (integrator.prepare if hasattr(integrator, "prepare") else integrator.tracer)(stage.scene)
 
 
 def sample_more(

@@ -15,8 +15,6 @@ import numpy as np
 
 __all__ = ["Estimate", "Number", "mean_square", "ratio_of_means", "relative_variance"]
 
-NOISIEST = 0.98  # quantile of the exits
-
 
 class Number(NamedTuple):
     """A value and its standard error."""
@@ -60,12 +58,8 @@ def mean_square(a: Estimate, b: Estimate) -> Number:
 
 
 def relative_variance(a: Estimate, b: Estimate) -> Number:
-    """Variance of one sample of a, mean over exits and channels, over the square of the mean radiance of b.
-
-    What is above the 98th percentile of the exits counts as that: single bright points would decide the mean by chance.
-    """
-    variance = a.sample_variance.mean(axis=0)
-    return _ratio(np.minimum(variance, np.quantile(variance, NOISIEST)), b.mean.mean(axis=0), 2)
+    """Variance of one sample of a, mean over exits and channels, over the square of the mean radiance of b."""
+    return _ratio(a.sample_variance.mean(axis=0), b.mean.mean(axis=0), 2)
 
 
 def ratio_of_means(a: Estimate, b: Estimate, channel: int) -> Number:

@@ -95,6 +95,11 @@ class Stage:
             for surface, inside in zip(surfaces, before):
                 surface.inside = inside
 
+    def forget(self, way: Way) -> None:
+        """What has been made ready for a way."""
+        self._integrators.pop(way, None)
+        self._insides.pop(way, None)
+
     def _of(self, way: Way, before: list[Any]) -> list[Any]:
         """The same `Inside` each time a way is shown, by which an integrator knows what it has made ready."""
         if way.model == PATH_TRACED:
