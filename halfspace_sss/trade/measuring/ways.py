@@ -115,8 +115,10 @@ class Stage:
 
         if way not in self._integrators:
             walks = way.model == PATH_TRACED
-            plugin = {"type": "translucent_walk" if walks else "bssrdf"}
-            self._integrators[way] = mi.load_dict(plugin | self.settings | ({} if walks else self.bssrdf))
+            plugin = {"type": "translucent_walk" if walks else "bssrdf"} | self.settings
+            # an object that was not learnt is refused: who asks does not wait for its training
+            alone = {} if walks else {**self.bssrdf, "train_seconds": 0.0}
+            self._integrators[way] = mi.load_dict(plugin | alone)
         return self._integrators[way]
 
 
