@@ -196,6 +196,8 @@ def _report_object(found: LearntObject) -> None:
 
 def _shapes(folder: Path, seconds: float, seed: int, meshes: list[Path], work: Path | None) -> None:
     """Train the network of all shapes."""
+    if find_spec("igl") is None:
+        raise ValueError("training on shapes needs libigl: `pip install halfspace-sss[train]`")
     use_mitsuba(SHAPE_VARIANT)
     from halfspace_sss.rendering.scenes.learners import shape_learner
 

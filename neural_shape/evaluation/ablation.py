@@ -26,11 +26,11 @@ OWN = {  # columns of an end
     "log P, way to y": (6, 7), "n.d, n.e": (8, 9), "D_k": tuple(range(10, 10 + K)),
     "V_k": tuple(range(10 + K, 10 + 3 * K)),
 }  # fmt: skip
-SHARED = {"n_o.n_i": (4,), "|y_i - y_o|": (5,), "line y_o y_i": (6, 7)}
+SHARED = {"n_o.n_i": (4,), "gap of the y": (5,), "line y_o y_i": (6, 7)}
 WITHOUT: dict[str, tuple[str, ...]] = {
     "all": (), "without log P, way to y": ("log P, way to y",), "without D_k": ("D_k",), "without V_k": ("V_k",),
     "without D_k and V_k": ("D_k", "V_k"), "without the line y_o y_i": ("line y_o y_i",),
-    "without n.d, n.e, n_o.n_i, |y_i - y_o|": ("n.d, n.e", "n_o.n_i", "|y_i - y_o|"),
+    "without n.d, n.e, n_o.n_i, gap of the y": ("n.d, n.e", "n_o.n_i", "gap of the y"),
 }  # fmt: skip
 
 

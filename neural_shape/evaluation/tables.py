@@ -9,7 +9,7 @@ import numpy as np
 from full_geometry.learning.model_errors import LIGHTS
 from neural_shape.evaluation.cases import Row
 
-__all__ = ["by_property", "case_table", "speed_table", "summary", "worst"]
+__all__ = ["by_property", "case_table", "speed_table", "summary"]
 
 MODEL = "neural_shape"
 BINS: dict[str, tuple[Callable[[Row], float], tuple[float, ...]]] = {
@@ -71,11 +71,6 @@ def by_property(rows: Sequence[Row]) -> str:
                 cells = (f"{100 * np.median(own):.1f}", f"{100 * max(own):.1f}", f"{100 * np.median(best):.1f}")
                 found.append([name, f"{low:g}{to}", str(len(inside)), *cells])
     return _table(["by", "range", "objects", "median", "largest", "best half-space: median"], found)
-
-
-def worst(rows: Sequence[Row], n: int = 10) -> str:
-    """The worst cases under constant light."""
-    return case_table(sorted(rows, key=lambda r: -r.of(MODEL))[:n])
 
 
 def speed_table(seconds: dict[str, float]) -> str:
