@@ -86,10 +86,16 @@ def medium(subject: Subject, channel: int) -> np.ndarray:
 
 
 def describe(subject: Subject, exit: End, entry: End, active: Any = True) -> list[Pair]:
-    """The descriptors of pairs for each channel."""
+    """The descriptors of pairs for each channel; channels of the same extinction share rays."""
     line = _Line.between(exit.at.p, entry.at.p)
-    clear = _clearance(subject, exit.event.y, entry.event.y, active)
-    return [_channel(subject, c, exit, entry, line, clear) for c in range(len(subject.media))]
+    clear: dict[float, tuple[Any, Any]] = {}
+    found = []
+    for c, m in enumerate(subject.media):
+        key = float(m.sigma_t)
+        if key not in clear:
+            clear[key] = _clearance(subject, exit.event.ys[c], entry.event.ys[c], active)
+        found.append(_channel(subject, c, exit, entry, line, clear[key]))
+    return found
 
 
 def _channel(subject: Subject, c: int, exit: End, entry: End, line: _Line, clear: tuple[Any, Any]) -> Pair:

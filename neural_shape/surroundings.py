@@ -45,7 +45,7 @@ def directions(n: int = RAYS) -> np.ndarray:
 
 
 def look(subject: Subject, at: SurfacePoint, event: FirstEvent, active: Any = True) -> list[Surroundings]:
-    """Surroundings of the first events of each channel; channels whose light goes the same way share them.
+    """Surroundings of the first events of each channel; channels of the same extinction share them.
 
     Args:
         subject: the object.

@@ -123,3 +123,13 @@ def test_transmittance_enters_with_the_light() -> None:
     _, T, valid = refract_in(points, subject.eta)
     mu = np.sum(np.array(points.w) * np.array(points.n_out), axis=0)
     assert np.allclose(np.array(T), np.where(np.array(valid), F_t(mu, subject.eta), 0), atol=1e-4)
+
+
+def test_the_mean_first_event_is_that_of_the_channels_by_their_chances() -> None:
+    subject = ball(Medium(np.array([0.9, 0.3, 0.1]), np.array([0.1, 0.2, 0.4]), 0.0, 1.4), 1.5)
+    event = first_event(subject, starts(subject, 1024))
+    P, lengths = np.array(event.P), np.array(event.lengths)
+    ys = np.array([np.array(y) for y in event.ys])
+    assert np.allclose((P[:, None] * ys).sum(axis=0) / P.sum(axis=0), np.array(event.y), atol=1e-4)
+    assert np.allclose((P * lengths).sum(axis=0) / P.sum(axis=0), np.array(event.length), rtol=1e-4)
+    assert (lengths[0] < lengths[1]).all()  # denser, so nearer

@@ -147,6 +147,20 @@ def test_resolution_does_not_count() -> None:
     assert (np.abs(found[0][:, 0] - found[1][:, 0]) / scatter).max() < 0.15
 
 
+def test_a_channel_is_what_its_medium_is_alone() -> None:
+    mi.set_variant("llvm_ad_rgb")
+    shape = make_shape("combs", 6, 24).mitsuba("comb")
+    columns = np.array([[19.0, 8.0, 1.0], [1.0, 2.0, 9.0], [0.6, 0.0, 0.0]])  # sigma_s, sigma_a, g of each channel
+    whole = Subject.of(shape, Medium(*columns, 1.4))
+    o, i = pairs(whole)
+    weights = random_weights()
+    together = S(NeuralShape.of(whole, weights), o, i)
+    for k, (sigma_s, sigma_a, g) in enumerate(columns.T):
+        alone = S(NeuralShape.of(Subject.of(shape, Medium(sigma_s, sigma_a, g, 1.4)), weights), o, i)
+        floor = 1e-2 * alone[k].max()  # rays end where the light of no channel is left, which differs a little
+        assert np.quantile(np.abs(together[k] - alone[k]) / (alone[k] + floor), 0.99) < 0.02
+
+
 def test_torch_and_drjit_say_the_same() -> None:
     torch = pytest.importorskip("torch")
     from neural_shape.learning.fitting import Network, Recipe
