@@ -36,6 +36,8 @@ _LOOKS = {
     "normalized_diffusion": Look("Normalized diffusion", "#E69F00", (0, (7, 1.5, 1, 1.5, 1, 1.5))),
     "forward_scattering_dipole": Look("Forward-scattering dipole", "#7B3294", (0, (8, 1.8))),
     "neural": Look("Neural", "#C00000", "-"),
+    "full_geometry": Look("Full geometry", "#5B0A91", "-"),
+    "neural_shape": Look("Neural, any shape", "#17806D", (0, (4, 1))),
     "neural_material": Look("Neural, one material", "#7A5C00", (0, (3, 1, 1, 1))),
 }
 _SPARE = ("#8C6D31", "#5F5F5F", "#17806D", "#A6761D", "#3B528B")
