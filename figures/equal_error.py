@@ -7,13 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from figures.computing.contenders import MODELS, VOLUMES, WALK, contender, long_walk
+from figures.computing.contenders import MODELS, OF_OBJECTS, VOLUMES, WALK, contender, long_walk
 from figures.computing.denoise import guides
 from figures.computing.furnace import furnace, furnace_models
 from figures.computing.model_inputs import weight_files
 from figures.computing.sampling_cost import split
-from figures.computing.scenes import BUNNY, MATERIALS, prepare
+from figures.computing.scenes import BUNNY, MATERIALS, SCANS, prepare
 from figures.computing.timed import Timed, alternating, rendered
+from figures.computing.trained import FULL_GEOMETRY, TRAINING, train_scan, training_of, with_weights
 from figures.drawing import error_tables
 from figures.parts.part import Part, Result, Task
 from halfspace_sss import materials
@@ -21,7 +22,9 @@ from halfspace_sss import materials
 __all__ = ["TITLE", "draw", "errors", "measured", "parts"]
 
 TITLE = "time to equal error against Mitsuba's volume path tracer, time per sample, white furnace"
+SUBJECTS = {name: ("bunny", name) for name in MATERIALS} | {"dragon of potato": ("dragon", "potato")}
 LIGHTS = ("small light", "even sky")
+TRUTH = "truth"  # last word of the names of parts
 BARE = "bare"  # without reflection and without the single scattering that a model lacks
 BARE_MATERIALS = ("marble", "potato", "ketchup")
 SPLIT_MATERIAL = "marble"
@@ -34,16 +37,19 @@ SPP = {  # of a pass; one that is much shorter would show what a render costs be
     "paper": {"volume": 64, WALK: 64, "model": 1024},
 }
 BARE_MODELS = {"draft": (MODELS[0], MODELS[-1]), "paper": MODELS}  # most of the time of a draft goes into compiling
+TRAIN_SECONDS = {"draft": 20.0, "paper": 240.0}  # CPU time for each object: half of it on two cores
 LANES = {"draft": 2**18, "paper": 2**22}
 FURNACE = {"draft": {"size": 16, "spp": 256}, "paper": {"size": 32, "spp": 16384}}
 
 
 def parts(quality: str) -> list[Part]:
-    """For each material and light the truth and the errors with times; then the time per sample, and the furnace."""
+    """For each object its training, for each light the truth and the errors with times; then samples and furnace."""
     found = []
-    for material in MATERIALS:
+    for name, (scan, material) in SUBJECTS.items():
+        if FULL_GEOMETRY in OF_OBJECTS:
+            found.append(train_scan(name, material, TRAIN_SECONDS[quality], scan=scan))
         for lights in LIGHTS:
-            found += _parts_of(material, lights, quality)
+            found += _parts_of(name, lights, quality)
     weights = weight_files("neural", materials.load(SPLIT_MATERIAL).medium)
     common = {"material": SPLIT_MATERIAL, "models": list(MODELS), "lanes": LANES[quality], "repeats": 5}
     found.append(Part("time per sample", split, common, LANES[quality], inputs=(BUNNY, *weights)))
@@ -55,58 +61,69 @@ def parts(quality: str) -> list[Part]:
     return found
 
 
-def _errors_name(material: str, lights: str) -> str:
-    return f"{material}, {lights}, errors"
+def _errors_name(name: str, lights: str) -> str:
+    return f"{name}, {lights}, errors"
 
 
 def _furnace_name(method: str) -> str:
     return f"furnace, {method}"
 
 
-def _parts_of(material: str, lights: str, quality: str) -> list[Part]:
-    size, spp = SIZES[quality], SPP[quality]
-    common = {"material": material, "size": size, "lights": lights}
-    methods = [*VOLUMES, WALK, *MODELS]
-    if material in BARE_MATERIALS:
+def _parts_of(name: str, lights: str, quality: str) -> list[Part]:
+    (scan, material), size, spp = SUBJECTS[name], SIZES[quality], SPP[quality]
+    common = {"scan": scan, "material": material, "size": size, "lights": lights}
+    methods = [*VOLUMES, WALK, *MODELS, *OF_OBJECTS]
+    if name in BARE_MATERIALS:
         methods += [f"{model}, {BARE}" for model in BARE_MODELS[quality]]
-    kinds = {name: "volume" if name in VOLUMES else WALK if name == WALK else "model" for name in methods}
+    kinds = {method: "volume" if method in VOLUMES else WALK if method == WALK else "model" for method in methods}
     params = {
-        **common, "passes": PASSES[quality], "spp": {name: spp[kinds[name]] for name in methods}, "seed": 1,
+        **common, "passes": PASSES[quality], "spp": {method: spp[kinds[method]] for method in methods}, "seed": 1,
         "sampler": SAMPLER,
     }  # fmt: skip
     work = sum(params["spp"].values()) * params["passes"] * size**2
-    truth = f"{material}, {lights}, truth"
-    inputs = (BUNNY, *weight_files("neural", materials.load(material).medium))
+    truth, file = f"{name}, {lights}, {TRUTH}", SCANS[scan].file
+    needs = (truth, *((training_of(name),) if FULL_GEOMETRY in OF_OBJECTS else ()))
+    models = (method for method in methods if kinds[method] == "model" and BARE not in method)
+    inputs = (file, *(f for model in models for f in weight_files(model, materials.load(material).medium)))
     long = {**common, "spp": TRUTH_SPP[quality], "seed": 0}
     return [
-        Part(truth, long_walk, long, long["spp"] * size**2, inputs=(BUNNY,)),
-        Part(_errors_name(material, lights), measured, params, work, needs=(truth,), inputs=inputs),
+        Part(truth, long_walk, long, long["spp"] * size**2, inputs=(file,)),
+        Part(_errors_name(name, lights), measured, params, work, needs=needs, inputs=inputs),
     ]
 
 
 def measured(task: Task) -> dict[str, Any]:
-    """Errors and times of all methods, whose passes take turns."""
+    """Errors and times of all methods, whose passes take turns, and the seconds of training."""
     prepare()
     p = task.params
-    (truth,) = task.needed.values()
-    scenes = {}
-    for k, (name, spp) in enumerate(p["spp"].items()):
-        method, _, bare = name.partition(", ")
-        scenes[name] = contender(method, p["material"], p["size"], p["lights"], bare == BARE, p["sampler"])
-        rendered(scenes[name], spp, p["seed"])  # compiles, the walk and the sampler for each number of samples
-        task.progress(k, 2 * len(p["spp"]))
-    cover = guides(scenes[WALK], 8)[0][..., 0] > 0
+    (truth,) = (found for name, found in task.needed.items() if name.endswith(TRUTH))
+    seconds = [found.numbers["seconds"] for name, found in task.needed.items() if name.endswith(TRAINING)]
 
     def progress(done: int, total: int) -> None:
         task.progress(total + done, 2 * total)
 
-    found = alternating(scenes, p["spp"], p["seed"], passes=p["passes"], progress=progress)
+    with with_weights(task.folder, task.needed):
+        scenes = _compiled(task)
+        cover = guides(scenes[WALK], 8)[0][..., 0] > 0
+        found = alternating(scenes, p["spp"], p["seed"], passes=p["passes"], progress=progress)
     traced = (WALK, *VOLUMES)
     rows = [{"method": name, **errors(timed, truth, cover, name in traced)} for name, timed in found.items()]
     level = float(np.mean(truth.images["image"][cover].astype(np.float64) ** 2))
     noise = float(np.mean(truth.images["variance"][cover], dtype=np.float64))
     about = {"mean square": level, "variance": noise, "seconds": truth.numbers["seconds"], "spp": truth.numbers["spp"]}
-    return {"rows": rows, "truth": about}
+    return {"rows": rows, "truth": about, "training": dict(zip([FULL_GEOMETRY], seconds))}
+
+
+def _compiled(task: Task) -> dict[str, Any]:
+    """The scenes of all methods, with their kernels: the walk and the sampler have one for each number of samples."""
+    p, scenes = task.params, {}
+    for k, (name, spp) in enumerate(p["spp"].items()):
+        method, _, bare = name.partition(", ")
+        more = (bare == BARE, p["sampler"], p["scan"])
+        scenes[name] = contender(method, p["material"], p["size"], p["lights"], *more)
+        rendered(scenes[name], spp, p["seed"])
+        task.progress(k, 2 * len(p["spp"]))
+    return scenes
 
 
 def errors(timed: Timed, truth: Result, mask: np.ndarray, is_exact: bool) -> dict[str, float]:
@@ -148,7 +165,7 @@ def _standard_error(pixels: np.ndarray) -> float:
 
 def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
     """The tables: all numbers as CSV, and what they say as Markdown."""
-    scenes = {(m, lights): _errors_name(m, lights) for m in MATERIALS for lights in LIGHTS}
+    scenes = {(name, lights): _errors_name(name, lights) for name in SUBJECTS for lights in LIGHTS}
     furnaces = {method: _furnace_name(method) for method in (WALK, *furnace_models())}
 
     def numbers(names: Mapping[Any, str]) -> dict[Any, Mapping[str, Any]]:

@@ -49,13 +49,18 @@ def rendered(task: Task) -> dict[str, Any]:
     for light in p["lights"]:
         passes = max(p["spp"] // SPP_PER_PASS, 1)
         images = [_image(folders["patches"], p, light, 1, SPP_PER_PASS, 100 + k) for k in range(passes)]
-        found[f"{light}, converged"] = np.mean(images, axis=0).astype(np.float32)
+        found[_key(light, "converged")] = np.mean(images, axis=0).astype(np.float32)
         for sampler in SAMPLERS:
             for n in ENTRIES:
-                found[f"{light}, {sampler}, {n}"] = _image(folders[sampler], p, light, n, 1, 7)
+                found[_key(light, sampler, n)] = _image(folders[sampler], p, light, n, 1, 7)
                 done += 1
                 task.progress(done, total)
     return found
+
+
+def _key(*words: object) -> str:
+    """Of an image in the result."""
+    return "-".join(str(word).replace(" ", "_") for word in words)
 
 
 def _weights(task: Task) -> dict[str, Path]:
@@ -97,13 +102,13 @@ def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
 
     images, scenes, rows = results["bunny"].images, {}, []
     for light in LIGHTS:
-        reference = images[f"{light}, converged"]
+        reference = images[_key(light, "converged")]
         mask = reference.max(axis=2) > 0
         gain = np.float32(2.0 ** np.round(-np.log2(np.percentile(reference[mask], 97)), 1))
         shots = [Shot("Converged", gain * reference, {})]
         for n in ENTRIES:
             for sampler in SAMPLERS:
-                image = images[f"{light}, {sampler}, {n}"]
+                image = images[_key(light, sampler, n)]
                 label = f"{sampler.capitalize()}, N = {n}"
                 shots.append(compared(label, gain * image, gain * reference, mask=mask, numbers={}))
                 rows.append({"light": light, "sampler": sampler, "N": n, **shots[-1].numbers})

@@ -11,7 +11,7 @@ from figures.parts.exr import read_exr
 
 __all__ = ["ENVIRONMENTS", "environment", "environment_file"]
 
-ENVIRONMENTS = ("studio", "sunset")
+ENVIRONMENTS = ("studio", "sunset", "forest")
 
 
 def environment_file(name: str) -> Path:
@@ -25,7 +25,8 @@ def environment(name: str, scale: float = 1.0, turn: float = 0.0) -> dict[str, A
     """An environment map as an emitter for `mitsuba.load_dict`.
 
     Args:
-        name: "studio" (two lamps in a dark hall) or "sunset" (a square by the sea, the sun just below the horizon).
+        name: "studio" (two lamps in a dark hall), "sunset" (a square by the sea, the sun just below the horizon) or
+            "forest" (a clearing by day).
         scale: of its radiance.
         turn: about y, degrees.
 

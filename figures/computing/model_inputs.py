@@ -35,4 +35,8 @@ def weight_files(model: str, medium: Medium) -> tuple[Path, ...]:
     trained = {module.KIND: module for module in (material_model, paper_model)}
     if model in trained:
         return tuple(dict.fromkeys(trained[model].find_weights(model, m) for m in channels(medium)))
+    if model == "neural_shape":
+        from neural_shape import storing
+
+        return (storing.shipped_weights(),)
     return (shipped_weights(),) if model == "neural" else ()

@@ -4,18 +4,35 @@ from __future__ import annotations
 
 import gc
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from halfspace_sss.checks import check_choice
 
-__all__ = ["BUNNY", "MATERIALS", "MM_PER_UNIT", "bunny_scene", "prepare", "surroundings"]
+__all__ = [
+    "BUNNY", "DRAGON", "MATERIALS", "MM_PER_UNIT", "SCANS", "Scan", "bunny_scene", "prepare", "scan_scene",
+    "surroundings",
+]  # fmt: skip
 
 BUNNY = Path(__file__).parent.parent / "assets" / "bunny.ply"
+DRAGON = BUNNY.with_name("dragon.ply")
 MM_PER_UNIT = 3.8  # the bunny is 37 mm tall
 MATERIALS = ("marble", "apple", "potato", "ketchup", "regular chocolate milk")
 LIGHTS = ("both", "small light", "even sky")
+
+
+class Scan(NamedTuple):
+    """A scanned object: its mesh, millimetres of its unit, where it is looked at, and its scale against the bunny."""
+
+    file: Path
+    mm_per_unit: float
+    centre: tuple[float, float, float]
+    scale: float
+
+
+SCANS = {"bunny": Scan(BUNNY, MM_PER_UNIT, (-0.55, 4.7, 0), 1.0), "dragon": Scan(DRAGON, 21.0, (0, 0, 0), 0.1)}
+_EYE, _LAMP = (6.55, 4.3, 24), (-13.45, 9.3, -9)  # from what is looked at, units of the bunny
 
 
 def prepare() -> None:
@@ -36,9 +53,17 @@ def prepare() -> None:
 def bunny_scene(
     material: str, size: int, lights: str = "both", model: str = "neural", sampler: str = "independent"
 ) -> dict[str, Any]:
-    """A translucent bunny on its own, as a dict for `rendering.scene_files.load_scene`.
+    """`scan_scene` of the bunny."""
+    return scan_scene("bunny", material, size, lights, model, sampler)
+
+
+def scan_scene(
+    scan: str, material: str, size: int, lights: str = "both", model: str = "neural", sampler: str = "independent"
+) -> dict[str, Any]:
+    """A translucent object on its own, as a dict for `rendering.scene_files.load_scene`, under its name.
 
     Args:
+        scan: name in `SCANS`.
         material: name in the registry.
         size: pixels of the square image.
         lights: "both" for the small light and dim surroundings with two windows, "small light", or "even sky",
@@ -47,31 +72,39 @@ def bunny_scene(
         sampler: Mitsuba's plugin of random numbers; "multijitter" has less noise and takes square numbers of samples.
 
     Raises:
-        ValueError: lights is something else.
+        ValueError: scan or lights is something else.
     """
     import mitsuba as mi
 
+    check_choice("scan", scan, SCANS)
     check_choice("lights", lights, LIGHTS)
-    view = mi.ScalarTransform4f().look_at([6, 9, 24], [-0.55, 4.7, 0], [0, 1, 0])
+    found = SCANS[scan]
+    view = mi.ScalarTransform4f().look_at(_beside(found, _EYE), list(found.centre), [0, 1, 0])
     film = {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}}
     scene: dict[str, Any] = {
         "type": "scene",
-        "integrator": {"type": "bssrdf", "mm_per_unit": MM_PER_UNIT, "hide_emitters": True},
+        "integrator": {"type": "bssrdf", "mm_per_unit": found.mm_per_unit, "hide_emitters": True},
         "sensor": {"type": "perspective", "fov": 26.0, "to_world": view, "film": film, "sampler": {"type": sampler}},
-        "bunny": {
+        scan: {
             "type": "ply",
-            "filename": str(BUNNY),
+            "filename": str(found.file),
             "bsdf": {"type": "translucent", "material": material, "model": model},
         },
     }
     if lights != "even sky":
         glow = {"type": "area", "radiance": {"type": "rgb", "value": [90.0, 84.0, 75.0]}}
-        scene["lamp"] = {"type": "sphere", "center": [-14, 14, -9], "radius": 1.6, "emitter": glow}
+        lamp = {"center": _beside(found, _LAMP), "radius": 1.6 * found.scale}
+        scene["lamp"] = {"type": "sphere", **lamp, "emitter": glow}
     if lights == "even sky":
         scene["sky"] = {"type": "constant", "radiance": 1.0}
     elif lights == "both":
         scene["sky"] = {"type": "envmap", "bitmap": mi.Bitmap(surroundings()), "scale": 1.0}
     return scene
+
+
+def _beside(scan: Scan, offset: tuple[float, float, float]) -> list[float]:
+    """A point of the bunny's scene in that of a scan."""
+    return [c + scan.scale * d for c, d in zip(scan.centre, offset)]
 
 
 def surroundings(height: int = 64) -> np.ndarray:

@@ -13,9 +13,10 @@ from figures.drawing.style import look
 if TYPE_CHECKING:
     import pandas
 
-__all__ = ["equal_error", "furnace", "label", "markdown", "sampling"]
+__all__ = ["equal_error", "furnace", "in_markdown", "label", "markdown", "sampling"]
 
 LATE_ROULETTE = volume(200)  # the usual setting of volpathmis for media that hardly absorb
+WANTED = 0.02  # noise of an image, root mean square over that of the image, at which a training is held against time
 CERTAIN = 2.0  # standard errors by which an error must stand out of the noise of the truth
 NOTES = """\
 Cost is mean squared error of the pixels of the object times seconds, compilation left out; a ratio is the cost of
@@ -26,7 +27,8 @@ about the path traced image, at the number of samples of this run; bias does not
 *until* the seconds after which `volpathmis` is as near to the truth as that. A dash: lost in the noise of the truth.
 Russian roulette only adds variance: where a setting of `volpathmis` seems to have less than one whose roulette begins
 later, it has not met its rare bright paths yet, and counts with the variance of the other. `volpathmis` renders the
-channels of a medium whose mean cosine differs between them one by one."""
+channels of a medium whose mean cosine differs between them one by one. Ratios do not count the *training* of
+`full_geometry`, which draws 4 entries an exit; with it counted, it has *paid after* so many images of 2 % noise."""
 BARE_NOTES = """\
 The models without surface reflection and without the single scattering that they lack, against `volpathmis` at its
 best setting and at rr_depth 200."""
@@ -73,9 +75,18 @@ def _scene_rows(scene: tuple[str, str], found: Mapping[str, Any]) -> list[dict[s
                 "ratio to rr_depth 200": _ratio(costs.get(LATE_ROULETTE, np.nan), costs[name]),
                 "seconds until bias": _ratio(best_cost, bias2),
                 "is best volpathmis": name == best,
+                "seconds of training": found.get("training", {}).get(name, np.nan),
+                "images until paid": _until_paid(name, found, costs[name], best_cost),
             }
         )
     return rows
+
+
+def _until_paid(name: str, found: Mapping[str, Any], cost: float, best: float) -> float:
+    """Images of noise `WANTED` after which training and renders took less time than `volpathmis`; NaN if never."""
+    training = found.get("training", {}).get(name, np.nan)
+    saved = (best - cost) / (WANTED**2 * found["truth"]["mean square"])
+    return float(np.ceil(training / saved)) if saved > 0 and np.isfinite(training) else np.nan
 
 
 def _costs(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
@@ -123,7 +134,11 @@ def markdown(errors: pandas.DataFrame, sampling: pandas.DataFrame, furnace: pand
     if len(bare):
         parts += ["## Without reflection and single scattering", BARE_NOTES, _bare(bare)]
     steps = sampling.assign(model=[look(name).label for name in sampling["model"]])
-    parts += ["## Seconds per million samples", "Each step as a kernel of its own; S of three channels.", _table(steps)]
+    parts += [
+        "## Seconds per million samples",
+        "Each step as a kernel of its own; S of three channels.",
+        in_markdown(steps),
+    ]
     names = [label(name) if name == WALK else look(name).label for name in furnace["method"]]
     parts += ["## White furnace", "Mean radiance, 1 for what neither absorbs nor gains.", _furnace(furnace, names)]
     return "\n\n".join(parts) + "\n"
@@ -138,9 +153,10 @@ def _whole(rows: pandas.DataFrame) -> str:
             "with bias": kept["ratio with bias"],
             "bias": [_percent(*pair) for pair in zip(kept["method"], kept["relative bias"])],
         },
-        **{"until, s": kept["seconds until bias"]},
+        **{"until, s": kept["seconds until bias"], "training, s": kept["seconds of training"]},
+        **{"paid after": kept["images until paid"]},
     )
-    return _table(table)
+    return in_markdown(table)
 
 
 def _percent(method: str, share: float) -> str:
@@ -154,7 +170,7 @@ def _bare(rows: pandas.DataFrame) -> str:
         model=[label(name.partition(", ")[0]) for name in rows["method"]],
         **{"to the best": rows["ratio"], "to rr_depth 200": rows["ratio to rr_depth 200"]},
     )
-    return _table(table)
+    return in_markdown(table)
 
 
 def _furnace(rows: pandas.DataFrame, names: Sequence[str]) -> str:
@@ -163,10 +179,10 @@ def _furnace(rows: pandas.DataFrame, names: Sequence[str]) -> str:
         mean=[f"{m:.4f} ± {e:.4f}" for m, e in zip(rows["mean"], rows["standard error"])],
         excess=[f"{v:+.4f}" for v in rows["excess"]],
     )
-    return _table(table)
+    return in_markdown(table)
 
 
-def _table(table: pandas.DataFrame) -> str:
+def in_markdown(table: pandas.DataFrame) -> str:
     """A table in Markdown, numbers with three digits."""
     lines = [list(table.columns), ["---"] * len(table.columns)]
     lines += [[_said(value) for value in row] for row in table.itertuples(index=False)]

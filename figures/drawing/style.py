@@ -38,7 +38,7 @@ _LOOKS = {
     "neural": Look("Neural", "#C00000", "-"),
     "full_geometry": Look("Full geometry", "#004D40", "-"),
     "lambert": Look("Lambert", "#8C8C8C", (0, (1, 1.2))),
-    "neural_shape": Look("Neural, any shape", "#E6007E", "-"),
+    "neural_shape": Look("Neural, any shape", "#E6007E", (0, (4, 1))),
     "neural_material": Look("Neural, one material", "#7A5C00", (0, (3, 1, 1, 1))),
 }
 _SPARE = ("#8C6D31", "#5F5F5F", "#17806D", "#A6761D", "#3B528B")

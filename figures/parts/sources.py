@@ -11,7 +11,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import NamedTuple
 
-from halfspace_sss.interface.model import model_class, models
+from halfspace_sss.interface.model import model_class
+from halfspace_sss.rendering.surface.transports import model_names, object_transport
 
 __all__ = ["PACKAGES", "code_hash", "models_named", "modules_of"]
 
@@ -27,7 +28,7 @@ class _Source(NamedTuple):
     doors: dict[str, str]
 
 
-def code_hash(module: str, function: str, model_names: Iterable[str] = ()) -> str:
+def code_hash(module: str, function: str, named: Iterable[str] = ()) -> str:
     """SHA-256 of the code of a function and of all that it imports from this project.
 
     Of its own file only those definitions count that it uses, so that what draws a figure may change. Comments,
@@ -36,13 +37,13 @@ def code_hash(module: str, function: str, model_names: Iterable[str] = ()) -> st
 
     Args:
         module, function: dotted name of a module, and name of a function at its top.
-        model_names: models of the registry that the code asks for.
+        named: models that the code asks for.
     """
     path = _path(module)
     if path is None:  # of nobody's file, as in a notebook: only its name is known
         return hashlib.sha256(f"{module} {function}".encode()).hexdigest()
     own = _digested(_used_by(function, _parsed(path)))
-    roots = [*_resolved(own), *(model_class(name).__module__ for name in model_names)]
+    roots = [*_resolved(own), *(_module_of_model(name) for name in named)]
     lines = [f"{name} {_source(path, path.stat().st_mtime_ns).digest}" for name, path in modules_of(roots).items()]
     return hashlib.sha256("\n".join([own.digest, *lines]).encode()).hexdigest()
 
@@ -167,6 +168,10 @@ def _bare(tree: ast.Module) -> str:
 
 
 def models_named(text: str) -> list[str]:
-    """The models of the registry whose names stand in a text."""
+    """The models, of the half-space and of objects, whose names stand in a text."""
     words = set(re.findall(r"\w+", text))
-    return [name for name in models() if name in words]
+    return [name for name in model_names() if name in words]
+
+
+def _module_of_model(name: str) -> str:
+    return (object_transport(name) or model_class(name)).__module__

@@ -18,18 +18,22 @@ from figures.computing.scenes import MM_PER_UNIT, prepare
 from figures.computing.timed import Timed, rendered
 from figures.drawing import error_tables
 from figures.parts.part import Part, Result, Task
+from full_geometry.learning import training
+from full_geometry.learning.fitting import Recipe
 from halfspace_sss import materials
 
 mi = pytest.importorskip("mitsuba")
 DIPOLE, BARE = MODELS[0], f"{MODELS[0]}, bare"
-CHOSEN = (VOLUMES[0], VOLUMES[2], WALK, DIPOLE, BARE)
+LEARNT = "full_geometry"
+CHOSEN = (VOLUMES[0], VOLUMES[2], WALK, DIPOLE, BARE, LEARNT)
+QUICK = Recipe(width=16, depth=2, batch=1024, chunk=2**12, reuse=2)
 
 
 def _computed(part: Part, done: dict[str, Result], folder: Path) -> Result:
     """The function of a part, run as the machinery runs it, with few methods."""
     params = dict(part.params)
     if "passes" in params:
-        params["spp"] = {name: 16 if name in (DIPOLE, BARE) else 4 for name in CHOSEN}
+        params["spp"] = {name: 16 if name in (DIPOLE, BARE, LEARNT) else 4 for name in CHOSEN}
     params |= {"models": [DIPOLE], "repeats": 1} if "repeats" in params else {}
     found = part.function(Task(params, folder, {name: done[name] for name in part.needs}))
     images = {name: v for name, v in found.items() if isinstance(v, np.ndarray)}
@@ -39,8 +43,11 @@ def _computed(part: Part, done: dict[str, Result], folder: Path) -> Result:
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Result]:
     """All parts of one material under the sky, small."""
+    train = training.train_by_cpu
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(equal_error, "MATERIALS", ("ketchup",))
+        patch.setattr(training, "train_by_cpu", lambda *a, **how: train(*a, **{**how, "recipe": QUICK}))
+        patch.setitem(equal_error.TRAIN_SECONDS, "draft", 0.01)
+        patch.setattr(equal_error, "SUBJECTS", {"ketchup": ("bunny", "ketchup")})
         patch.setattr(equal_error, "LIGHTS", ("even sky",))
         patch.setattr(equal_error, "furnace_models", lambda: [DIPOLE])
         for name, value in (("SIZES", 24), ("TRUTH_SPP", 64), ("LANES", 4096), ("FURNACE", {"size": 8, "spp": 64})):
@@ -145,6 +152,19 @@ def test_roulette_that_begins_earlier_counts_with_no_less_variance() -> None:
     assert table.loc[VOLUMES[0], "variance"] == 0.1
 
 
+def test_a_training_has_paid_once_the_images_have_saved_its_time() -> None:
+    plain = {"seconds": 2.0, "spp": 4, "spread": 1.0, "bias2 standard error": 0.1, "error standard error": 0.1}
+    rows = [
+        {**plain, "method": name, "variance": variance, "error": variance, "bias2": 0.0}
+        for name, variance in ((VOLUMES[0], 2.0), (DIPOLE, 0.5), (MODELS[1], 4.0))
+    ]
+    scene = {"rows": rows, "truth": {"mean square": 1000.0}, "training": {DIPOLE: 20.0, MODELS[1]: 20.0}}
+    table = error_tables.equal_error({("marble", "even sky"): scene}).set_index("method")
+    saved = (2.0 - 0.5) * 2.0 / (error_tables.WANTED**2 * 1000.0)  # seconds of an image of that noise
+    assert table.loc[DIPOLE, "images until paid"] == np.ceil(20.0 / saved) == 3
+    assert np.isnan(table.loc[[VOLUMES[0], MODELS[1]], "images until paid"]).all()
+
+
 def test_a_bare_model_is_not_held_against_a_truth_with_all_orders() -> None:
     table = _table((VOLUMES[2], 2.0, 2.0), (BARE, 0.5, 1.5))
     assert table.loc[BARE, "ratio"] == table.loc[BARE, "ratio to rr_depth 200"] == 4
@@ -196,13 +216,15 @@ def test_scenes_of_one_channel_each_make_one_image() -> None:
     np.testing.assert_allclose(rendered(scenes, 4, 1)[0].mean(axis=(0, 1)), [1, 5, 9], rtol=1e-5)
 
 
-def test_the_figure_covers_five_materials_two_lights_and_every_model() -> None:
+def test_the_figure_covers_five_materials_a_dragon_two_lights_and_every_model() -> None:
     draft, paper = equal_error.parts("draft"), equal_error.parts("paper")
     assert [part.name for part in draft] == [part.name for part in paper]
     assert f"{MODELS[1]}, bare" in paper[1].params["spp"]
     scenes = [part for part in draft if part.name.endswith(", errors")]
-    assert len(scenes) == 10
+    assert len(scenes) == 12
     for part in scenes:
-        assert {*VOLUMES, WALK, *MODELS} <= set(part.params["spp"])
+        assert {*VOLUMES, WALK, *MODELS, LEARNT} <= set(part.params["spp"])
+        assert any(name.endswith(", training") for name in part.needs)
+    assert sum(part.params["scan"] == "dragon" for part in scenes) == 2
     assert sum(BARE in part.params["spp"] for part in scenes) == 6
     assert all(b.work > 4 * a.work for a, b in zip(draft, paper))

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import itertools
+import re
 
 import numpy as np
 import pandas
@@ -57,8 +59,9 @@ def test_one_estimate_has_the_noise_of_its_samples() -> None:
 
 def test_images_of_all_samplers_are_compared() -> None:
     rng = np.random.default_rng(2)
-    names = [f"{light}, {sampler}, {n}" for light in fig12.LIGHTS for sampler in fig12.SAMPLERS for n in fig12.ENTRIES]
-    names += [f"{light}, converged" for light in fig12.LIGHTS]
+    names = [fig12._key(*case) for case in itertools.product(fig12.LIGHTS, fig12.SAMPLERS, fig12.ENTRIES)]
+    names += [fig12._key(light, "converged") for light in fig12.LIGHTS]
+    assert all(re.fullmatch(r"[\w-]+", name) for name in names)  # what images of parts may be called
     images = {name: 0.5 + 0.1 * rng.random((32, 32, 3)).astype(np.float32) for name in names}
     files = fig12.draw({"bunny": result(**images)})
     table = pandas.read_csv(io.StringIO(files["fig12.csv"]))

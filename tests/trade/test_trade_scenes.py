@@ -123,7 +123,8 @@ def test_an_instance_is_refused_in_a_sentence() -> None:
         assess(instanced, only=FEW, **QUICK)
 
 
-def test_a_way_that_refuses_says_why() -> None:
+def test_a_way_that_refuses_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HALFSPACE_SSS_WEIGHTS", str(tmp_path))
     found = assess(scene(), only=["full_geometry"], **QUICK).objects[0]
     assert "must be trained" in found.way("full_geometry").refusal
 

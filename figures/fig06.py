@@ -1,0 +1,127 @@
+"""Fig. 6: one full-geometry model under four environments and from four views, beside path tracing, with FLIP."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from figures.computing.contenders import ENTRIES
+from figures.computing.environments import ENVIRONMENTS, environment, environment_file
+from figures.computing.scenes import BUNNY, bunny_scene, prepare
+from figures.computing.trained import FULL_GEOMETRY, train_scan, training_of, with_weights
+from figures.drawing.image_grid import image_grid
+from figures.drawing.page import page
+from figures.drawing.shot import Shot, compared
+from figures.drawing.style import paper, saved
+from figures.parts.part import Part, Result, Task
+
+__all__ = ["TITLE", "draw", "parts", "seen"]
+
+TITLE = "one full-geometry model under four environments and from four views"
+MATERIAL = "potato"
+WINDOWS = "windows"  # the surroundings of Fig. 9 with its lamp
+LIGHTS = (*ENVIRONMENTS, WINDOWS)
+SCALES = {"studio": 0.4, "sunset": 1.5, "forest": 0.8}
+VIEWS = (0, 90, 180, 270)  # degrees about the bunny
+VIEWS_LIGHT = ENVIRONMENTS[0]
+SIZES = {"draft": 72, "paper": 384}
+SPP = {"draft": {"path_traced": 128, FULL_GEOMETRY: 64}, "paper": {"path_traced": 8192, FULL_GEOMETRY: 1024}}
+TRAIN_SECONDS = {"draft": 24, "paper": 240}  # CPU time: half of it on two cores
+AXIS = (-0.17, 0.15)  # x and z of the axis that the camera goes about
+NOTES = (
+    "Trained once, without any of these lights: the same weights in all images. All scattering orders. FLIP and "
+    "relative squared error of the pixels of the object, against walks, whose own noise is in them as well."
+)
+
+
+def parts(quality: str) -> list[Part]:
+    """The training, then each light and each view by walks and by the model."""
+    size, found = SIZES[quality], [train_scan(MATERIAL, MATERIAL, TRAIN_SECONDS[quality])]
+    for light, view in _cases():
+        files = (environment_file(light),) if light in ENVIRONMENTS else ()
+        for model, spp in SPP[quality].items():
+            params = {
+                "light": light,
+                "scale": SCALES.get(light, 1.0),
+                "view": view,
+                "size": size,
+                "spp": spp,
+                "seed": 0,
+            }
+            params |= {"model": model, "entries": ENTRIES.get(model, 1)}
+            needs = (training_of(MATERIAL),) if model == FULL_GEOMETRY else ()
+            name = _name(light, view, model)
+            found.append(Part(name, seen, params, spp * size**2, needs, (BUNNY, *files), model))
+    return found
+
+
+def _cases() -> list[tuple[str, int]]:
+    """Lights with views, each once."""
+    return list(dict.fromkeys([*((light, VIEWS[0]) for light in LIGHTS), *((VIEWS_LIGHT, view) for view in VIEWS)]))
+
+
+def _name(light: str, view: int, model: str) -> str:
+    return f"{light}, {view} degrees, {model}"
+
+
+def seen(task: Task) -> dict[str, Any]:
+    """The bunny under a light, from a view."""
+    import mitsuba as mi
+
+    from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED, load_scene
+
+    prepare()
+    p = task.params
+    description = bunny_scene(MATERIAL, p["size"], "both")
+    if p["light"] != WINDOWS:
+        del description["lamp"]
+        description["sky"] = environment(p["light"], p["scale"])
+    about = mi.ScalarTransform4f().translate([AXIS[0], 0, AXIS[1]])
+    turn = about @ mi.ScalarTransform4f().rotate([0, 1, 0], p["view"]) @ about.inverse()
+    description["sensor"]["to_world"] = turn @ description["sensor"]["to_world"]
+    if p["model"] != PATH_TRACED:
+        description["integrator"]["entries"] = p["entries"]
+    with with_weights(task.folder, task.needed):
+        scene = load_scene(description, p["model"])
+        image = np.array(mi.render(scene, spp=p["spp"], seed=p["seed"] + (p["model"] == PATH_TRACED)))
+    return {"image": image[..., :3].astype(np.float32), "spp": p["spp"]}
+
+
+def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
+    """Environments and views as PDF and PNG each, the page to flip between the images, and the numbers as a table."""
+    import pandas
+
+    pairs = {case: _pair(results, *case) for case in _cases()}
+    rows = [{"light": light, "view": view, **pair[1].numbers} for (light, view), pair in pairs.items()]
+    files: dict[str, bytes | str] = {"fig06.csv": pandas.DataFrame(rows).to_csv(index=False, lineterminator="\n")}
+    of_lights = {light.capitalize(): pairs[light, VIEWS[0]] for light in LIGHTS}
+    of_views = {f"{view}°": pairs[VIEWS_LIGHT, view] for view in VIEWS}
+    for name, shown in (("environments", of_lights), ("views", of_views)):
+        with paper():
+            drawn = saved(image_grid(_by_method(shown)))
+        files |= {f"fig06_{name}.{end}": data for end, data in drawn.items()}
+    scenes = {f"{light}, {view}°": list(pair) for (light, view), pair in pairs.items()}
+    files["fig06.html"] = page("Fig. 6: one model, all lights and views", scenes, notes=NOTES)
+    return files
+
+
+def _pair(results: Mapping[str, Result], light: str, view: int) -> tuple[Shot, Shot]:
+    """The images by walks and by the model, exposed alike."""
+    reference = results[_name(light, view, "path_traced")].images["image"]
+    mask = reference.max(axis=2) > 0
+    gain = np.float32(2.0 ** np.round(-np.log2(np.percentile(reference[mask], 97)), 1))
+    image = results[_name(light, view, FULL_GEOMETRY)].images["image"]
+    model = compared("Full geometry", gain * np.maximum(image, 0), gain * reference, mask=mask, numbers={})
+    return Shot("Path traced", gain * reference, {}), model
+
+
+def _by_method(pairs: Mapping[str, tuple[Shot, Shot]]) -> dict[str, list[Shot]]:
+    """A row for each method, a column for each light or view."""
+    rows: dict[str, list[Shot]] = {}
+    for title, pair in pairs.items():
+        for shot in pair:
+            renamed = Shot(title, shot.image, shot.numbers, shot.flip, shot.difference)
+            rows.setdefault(shot.label, []).append(renamed)
+    return rows

@@ -1,0 +1,100 @@
+"""Table 1: time of training and of rendering, samples and size of weights of the learnt models, the paper's beside."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from figures.computing.contenders import OF_OBJECTS
+from figures.computing.model_inputs import weight_files
+from figures.computing.scenes import BUNNY, MATERIALS
+from figures.computing.trained import FULL_GEOMETRY, train_scan, training_of
+from figures.drawing.error_tables import in_markdown, label
+from figures.fig09 import rendered
+from figures.parts.part import Part, Result
+from halfspace_sss import materials
+
+__all__ = ["PAPER", "TITLE", "Stated", "draw", "parts"]
+
+TITLE = "time of training and rendering, samples and size of weights, the paper's beside"
+SUBJECTS = {"draft": ("potato", "ketchup"), "paper": MATERIALS}
+MODELS = ("neural", *OF_OBJECTS)
+SIZES = {"draft": 64, "paper": 384}
+SPP = {"draft": 64, "paper": 1024}  # of each of two passes
+TRAIN_SECONDS = {"draft": 24, "paper": 240}  # CPU time for each material: half of it on two cores
+SEVERAL = 4  # entries of an exit, beside 1, of models of objects
+NOTES = """\
+The bunny of Fig. 9 on this machine, LLVM backend. *Training* in CPU seconds, compilation of kernels included where they
+were not in Dr.Jit's cache; *render* in seconds for the image, without compilation; *samples* of all pixels together.
+`neural` and `neural_shape` come trained for all media and take no time for an object. The paper's numbers are those of
+its authors, for its own networks on their machine: they stand beside for their order of magnitude."""
+
+
+class Stated(NamedTuple):
+    """What is known of the paper's own networks."""
+
+    network: str
+    training: str
+    machine: str
+    kilobytes: float
+
+
+PAPER = (
+    Stated("half-space, one material", "2118", "NVIDIA RTX 4090", 770.0),
+    Stated("full geometry, one object", "1300 to 1650", "NVIDIA RTX 4090", 770.0),
+)
+
+
+def parts(quality: str) -> list[Part]:
+    """For each material the training of the bunny, then an image by each model and number of entries."""
+    size, spp, found = SIZES[quality], SPP[quality], []
+    for material in SUBJECTS[quality]:
+        if FULL_GEOMETRY in MODELS:
+            found.append(train_scan(material, material, TRAIN_SECONDS[quality]))
+        for model, entries in _cases():
+            params = {"material": material, "size": size, "seed": 0, "spp": spp, "model": model, "entries": entries}
+            needs = (training_of(material),) if model == FULL_GEOMETRY else ()
+            inputs = (BUNNY, *weight_files(model, materials.load(material).medium))
+            work = 2 * spp * size**2 * entries
+            found.append(Part(_name(material, model, entries), rendered, params, work, needs, inputs, model))
+    return found
+
+
+def _cases() -> list[tuple[str, int]]:
+    """Models with numbers of entries."""
+    return [(model, n) for model in MODELS for n in ((1, SEVERAL) if model in OF_OBJECTS else (1,))]
+
+
+def _name(material: str, model: str, entries: int) -> str:
+    return f"{material}, {model}, N = {entries}"
+
+
+def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
+    """The rows as CSV, and both tables as Markdown."""
+    import pandas
+
+    subjects = dict.fromkeys(name.split(", ")[0] for name in results)
+    rows = pandas.DataFrame([_row(results, *case) for case in ((m, *c) for m in subjects for c in _cases())])
+    beside = pandas.DataFrame(PAPER).rename(columns={"training": "training, s", "kilobytes": "weights, kB"})
+    text = ["# Time, samples and size", NOTES, in_markdown(rows), "## As published", in_markdown(beside)]
+    return {
+        "table1.csv": rows.to_csv(index=False, lineterminator="\n"),
+        "table1_paper.csv": beside.to_csv(index=False, lineterminator="\n"),
+        "table1.md": "\n\n".join(text) + "\n",
+    }
+
+
+def _row(results: Mapping[str, Result], material: str, model: str, entries: int) -> dict[str, Any]:
+    found = results[_name(material, model, entries)]
+    pixels = found.images["image"].shape[0] * found.images["image"].shape[1]
+    row = {"material": material, "model": label(model), "N": entries, "training, CPU s": 0.0, "steps": 0, "walks": 0}
+    if model == FULL_GEOMETRY:
+        learnt = results[training_of(material)].numbers
+        row |= {"training, CPU s": learnt["cpu seconds"], "steps": learnt["steps"], "walks": learnt["walks"]}
+        size = learnt["kB"]
+    else:
+        size = sum(Path(file).stat().st_size for file in weight_files(model, materials.load(material).medium)) / 1000
+    samples = found.numbers["spp"] * pixels
+    seconds = found.numbers["seconds"]
+    return {**row, "weights, kB": size, "samples": samples, "render, s": seconds, "s per 10⁶": 1e6 * seconds / samples}

@@ -1,0 +1,114 @@
+"""Figures 6, 9, 11 and Table 1 with `full_geometry`, in miniature: trained, rendered and drawn."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import pandas
+import pytest
+
+pytest.importorskip("mitsuba")
+pytest.importorskip("torch")
+pytest.importorskip("flip_evaluator")
+
+from figures import fig06, fig09, fig11, table1  # noqa: E402
+from figures.computing import scenes, trained  # noqa: E402
+from figures.computing.contenders import OF_OBJECTS, VOLUMES  # noqa: E402
+from figures.parts import runner  # noqa: E402
+from figures.parts.part import Result, keys_of  # noqa: E402
+from full_geometry.learning import training  # noqa: E402
+from full_geometry.learning.fitting import Recipe  # noqa: E402
+
+QUICK = Recipe(width=16, depth=2, batch=1024, chunk=2**12, reuse=2)
+MODEL = "full_geometry"
+SETTINGS = {
+    fig06: {"LIGHTS": ("studio", "windows"), "VIEWS": (0, 180), "SIZES": {"draft": 12}},
+    fig09: {
+        "MATERIALS": ("ketchup",), "MODELS": (MODEL,), "SIZES": {"draft": 12}, "MODEL_SPP": {"draft": 4},
+        "TRUTH_SPP": {"draft": 32},
+    },
+    fig11: {"MATERIALS": ("ketchup",), "METHODS": (VOLUMES[0], MODEL), "SIZES": {"draft": 12}},
+    table1: {"SUBJECTS": {"draft": ("ketchup",)}, "MODELS": (MODEL,), "SIZES": {"draft": 12}, "SPP": {"draft": 4}},
+}  # fmt: skip
+
+
+@pytest.fixture()
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    train = training.train_by_cpu
+    monkeypatch.setattr(training, "train_by_cpu", lambda *a, **how: train(*a, **{**how, "recipe": QUICK}))
+    for module, settings in SETTINGS.items():
+        monkeypatch.setitem(module.TRAIN_SECONDS, "draft", 0.01)
+        for name, value in settings.items():
+            monkeypatch.setattr(module, name, value)
+    monkeypatch.setitem(fig06.SPP, "draft", {"path_traced": 16, MODEL: 4})
+    monkeypatch.setattr(fig06, "MATERIAL", "ketchup")
+    monkeypatch.setitem(fig11.SECONDS, "draft", 0.1)
+    monkeypatch.setitem(fig11.TRUTH_SPP, "draft", 32)
+
+
+def drawn(name: str, folder: Path) -> tuple[dict[str, Result], dict[str, bytes | str]]:
+    results = runner.compute(name, "draft", folder)
+    return results, runner.figure(name).draw(results)
+
+
+def rows(text: bytes | str) -> pandas.DataFrame:
+    return pandas.read_csv(io.StringIO(str(text)))
+
+
+def test_fig_9_has_a_column_of_the_full_geometry_with_the_time_of_its_training(small: None, tmp_path: Path) -> None:
+    results, files = drawn("fig09", tmp_path)
+    assert list(results) == ["ketchup, path traced", "ketchup, training", "ketchup, full_geometry"]
+    row = rows(files["fig09.csv"]).iloc[-1]
+    assert row["model"] == "Full geometry" and 0 < row["FLIP"] < 1 and row["CPU seconds of training"] > 0
+    assert runner.plan("fig09", "draft", tmp_path).missing == ()
+
+
+def test_fig_6_renders_all_lights_and_views_by_one_training(small: None, tmp_path: Path) -> None:
+    results, files = drawn("fig06", tmp_path)
+    assert sum(name.endswith("training") for name in results) == 1
+    table = rows(files["fig06.csv"])
+    assert sorted(zip(table["light"], table["view"])) == [("studio", 0), ("studio", 180), ("windows", 0)]
+    for name in ("fig06_environments.png", "fig06_views.png"):
+        assert files[name].startswith(b"\x89PNG")
+    front, back = (results[f"studio, {view} degrees, path_traced"].images["image"] for view in (0, 180))
+    assert ((front > 0) != (back > 0)).any()
+
+
+def test_table_1_tells_time_samples_and_size_with_the_papers_beside(small: None, tmp_path: Path) -> None:
+    _, files = drawn("table1", tmp_path)
+    table = rows(files["table1.csv"])
+    assert list(table["N"]) == [1, 4] and (table["samples"] == 8 * 12**2).all()
+    assert (table[["training, CPU s", "render, s", "weights, kB", "steps", "walks"]] > 0).all(axis=None)
+    assert "2118" in files["table1.md"] and "RTX 4090" in files["table1_paper.csv"]
+
+
+def test_fig_11_gives_the_full_geometry_the_same_time_and_a_denoised_image(small: None, tmp_path: Path) -> None:
+    pytest.importorskip("mitsuba_oidn")
+    _, files = drawn("fig11", tmp_path)
+    table = rows(files["fig11.csv"])
+    assert list(table[table["method"] == MODEL]["state"]) == ["raw", "denoised"]
+    assert "Full geometry, denoised" in files["fig11.html"]
+
+
+def test_weights_of_another_training_are_not_found(small: None, tmp_path: Path) -> None:
+    from halfspace_sss.rendering.scenes.scene_files import load_scene
+
+    scenes.prepare()
+    scene = scenes.bunny_scene("ketchup", 8)
+    scene["integrator"]["train_seconds"] = 0.0
+    with trained.with_weights(tmp_path, {}), pytest.raises(ValueError, match="must be trained for full_geometry"):
+        load_scene(scene, MODEL)
+
+
+@pytest.mark.parametrize("module", [fig06, table1])
+def test_parts_have_keys_and_more_work_in_paper_quality(module) -> None:
+    draft, paper = (module.parts(quality) for quality in ("draft", "paper"))
+    assert len(keys_of(draft)) == len(draft)
+    assert sum(p.work for p in paper) > 10 * sum(p.work for p in draft)
+
+
+def test_models_of_objects_are_among_the_columns() -> None:
+    assert MODEL in OF_OBJECTS
+    for module in (fig09, fig11, table1):
+        assert any(MODEL in part.name or MODEL in part.params.get("methods", ()) for part in module.parts("draft"))
