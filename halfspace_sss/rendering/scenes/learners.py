@@ -132,6 +132,6 @@ def _known(*functions: str) -> dict[str, Any]:
     for key, found in offered(LEARNERS):
         if all(callable(getattr(found, name, None)) for name in functions):
             known.setdefault(key, found)
-        elif not any(callable(getattr(found, name, None)) for name in ("train_shapes", "train")):
+        elif not callable(getattr(found, "train_shapes", None)) and "train" in functions:
             warn_left_out(LEARNERS, key, f"it must have the functions train and errors, got {found!r}")
     return known
