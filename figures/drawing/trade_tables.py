@@ -30,8 +30,6 @@ where it is lost in noise. *Cost* is variance of a sample times its seconds, whi
 are those of the processor, all cores together, compilation left out. What cannot be told in the seconds of a draft (2
 for a scene and all ways) is left open, under the small light nearly everything; quality `paper` takes 60 times as long.
 `full_geometry` is among the ways where an object was trained, here it was not.
-
-![Bias over time to a given noise for every way of rendering](trade.png)
 """
 
 
@@ -74,11 +72,19 @@ def markdown(found: Scenes, table: pandas.DataFrame, settings: Sequence[Mapping[
     ]
     lines += _grid(found, lambda w, o: f"{w.variance * w.seconds / (o.traced.variance * o.traced.seconds):.2g}")
     if settings:
-        lines += ["", "## Knobs", "", "| material | knob | setting | way | cost | error, % |"]
+        lines += [
+            "",
+            "## Knobs",
+            "",
+            "Bunny, small light; cost over that of the usual setting.",
+            "",
+            "| material | knob | setting | way | cost | error, % |",
+        ]
         lines.append("|---|---|---:|---|---:|---:|")
         for s in settings:
             words = " | ".join(str(s[key]) for key in ("material", "knob", "value", "way"))
-            lines.append(f"| {words} | {s['cost']:.2g} | {100 * s['error']:.2g} |")
+            error = _short(100 * s["error"]) if s["knob"] == "nodes" else "–"  # the others change none
+            lines.append(f"| {words} | {_short(s['cost'])} | {error} |")
     return "\n".join(lines) + "\n"
 
 

@@ -217,3 +217,25 @@ def test_a_medium_without_a_scene_gets_a_model_of_the_half_space() -> None:
 def test_a_medium_or_a_range_without_light_is_refused(medium: tuple, r: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         recommend(medium=Medium(*medium), r=r)
+
+
+def test_without_an_argument_the_shipped_table_is_shown() -> None:
+    result = CliRunner().invoke(cli.app, ["trade"])
+    assert result.exit_code == 0, result.stderr
+    assert "marble" in result.stdout and "path_traced" in result.stdout and "exact" in result.stdout
+
+
+def test_the_figure_and_the_page_are_drawn() -> None:
+    pytest.importorskip("matplotlib")
+    from figures.drawing.trade_plot import multiples, render
+    from halfspace_sss.trade.measuring.results import Assessment, ObjectTrade, WayTrade
+    from halfspace_sss.trade.picture import TradePicture
+
+    numbers = {"ratio": (1.0,), "ratio_error": (0.0,), "variance": 1.0, "variance_error": 0.1, "samples": 9}
+    ways = [WayTrade("path_traced", 0.0, 0.0, seconds=1e-5, **numbers)]
+    ways += [WayTrade(name, 0.01, 0.001, seconds=1e-6, **numbers) for name in ("neural", "lambert")]
+    ball = ObjectTrade("ball", (3.0, 4.0), 0.5, 100.0, (1.0,), tuple(ways))
+    images = {way.way: np.full((8, 8, 3), 0.5, np.float32) for way in ways}
+    files = render(TradePicture("ball", Assessment((ball,), 1.0, 0.0, 0), 0.05, ("neural",), images))
+    assert set(files) == {"pdf", "png", "html"} and b"Neural" in files["html"]
+    assert len(multiples({("marble", "ball", "sky"): ball}, 0.05).axes) == 1
