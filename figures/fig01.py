@@ -13,12 +13,13 @@ from figures.computing.denoise import guides
 from figures.computing.environments import environment_file
 from figures.computing.model_inputs import weight_files
 from figures.computing.scenes import prepare
-from figures.computing.trained import FULL_GEOMETRY, object_parts, train_modelled, training_of, with_weights
 from figures.drawing.error_tables import label
 from figures.drawing.image_grid import image_grid
 from figures.drawing.page import page
 from figures.drawing.shot import Shot, compared
 from figures.drawing.style import paper, saved
+from figures.learnt.training import object_parts, train_modelled
+from figures.learnt.weights import FULL_GEOMETRY, training_of, with_weights
 from figures.modelling.grid import tissue
 from figures.objects import VIEWS, View, scene
 from figures.parts.part import Part, Result, Task
