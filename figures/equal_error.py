@@ -14,8 +14,9 @@ from figures.computing.model_inputs import weight_files
 from figures.computing.sampling_cost import split
 from figures.computing.scenes import BUNNY, MATERIALS, SCANS, prepare
 from figures.computing.timed import Timed, alternating, rendered
-from figures.computing.trained import FULL_GEOMETRY, TRAINING, train_scan, training_of, with_weights
 from figures.drawing import error_tables
+from figures.learnt.training import train_scan
+from figures.learnt.weights import FULL_GEOMETRY, TRAINING, training_of, with_weights
 from figures.parts.part import Part, Result, Task
 from halfspace_sss import materials
 

@@ -10,11 +10,12 @@ import numpy as np
 from figures.computing.contenders import ENTRIES
 from figures.computing.environments import ENVIRONMENTS, environment, environment_file
 from figures.computing.scenes import BUNNY, bunny_scene, prepare
-from figures.computing.trained import FULL_GEOMETRY, train_scan, training_of, with_weights
 from figures.drawing.image_grid import image_grid
 from figures.drawing.page import page
 from figures.drawing.shot import Shot, compared
 from figures.drawing.style import paper, saved
+from figures.learnt.training import train_scan
+from figures.learnt.weights import FULL_GEOMETRY, training_of, with_weights
 from figures.parts.part import Part, Result, Task
 
 __all__ = ["TITLE", "draw", "parts", "seen"]

@@ -12,11 +12,12 @@ from figures.computing import contenders
 from figures.computing.contenders import ENTRIES
 from figures.computing.model_inputs import weight_files
 from figures.computing.scenes import BUNNY, MATERIALS, bunny_scene, prepare
-from figures.computing.trained import FULL_GEOMETRY, train_scan, training_of, with_weights
 from figures.drawing.image_grid import image_grid
 from figures.drawing.page import page
 from figures.drawing.shot import Shot, compared
 from figures.drawing.style import look, paper, saved
+from figures.learnt.training import train_scan
+from figures.learnt.weights import FULL_GEOMETRY, training_of, with_weights
 from figures.parts.part import Part, Result, Task
 from halfspace_sss import materials
 from halfspace_sss.provenance import check_folder

@@ -12,12 +12,13 @@ from figures.computing.denoise import check_denoiser, denoised, guides
 from figures.computing.model_inputs import weight_files
 from figures.computing.scenes import BUNNY, prepare
 from figures.computing.timed import Timed, alternating, pass_size
-from figures.computing.trained import FULL_GEOMETRY, train_scan, training_of, with_weights
 from figures.drawing.error_tables import label
 from figures.drawing.image_grid import image_grid
 from figures.drawing.page import page
 from figures.drawing.shot import FLIP, RELATIVE_MSE, Shot, compared
 from figures.drawing.style import paper, saved
+from figures.learnt.training import train_scan
+from figures.learnt.weights import FULL_GEOMETRY, training_of, with_weights
 from figures.parts.part import Part, Result, Task
 from halfspace_sss import materials
 

@@ -8,12 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from figures.computing.learnt_objects import known_weights, shape_of
+from figures.computing.learnt_objects import shape_of
 from figures.computing.scenes import BUNNY, bunny_scene, prepare
 from figures.drawing.image_grid import image_grid
 from figures.drawing.page import page
 from figures.drawing.shot import Shot, compared
 from figures.drawing.style import paper, saved
+from figures.learnt.weights import known_weights
 from figures.parts.part import Part, Result, Task
 
 __all__ = ["SAMPLERS", "TITLE", "draw", "parts", "rendered"]

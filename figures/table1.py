@@ -9,9 +9,10 @@ from typing import Any, NamedTuple
 from figures.computing.contenders import OF_OBJECTS
 from figures.computing.model_inputs import weight_files
 from figures.computing.scenes import BUNNY, MATERIALS
-from figures.computing.trained import FULL_GEOMETRY, train_scan, training_of
 from figures.drawing.error_tables import in_markdown, label
 from figures.fig09 import rendered
+from figures.learnt.training import train_scan
+from figures.learnt.weights import FULL_GEOMETRY, training_of
 from figures.parts.part import Part, Result
 from halfspace_sss import materials
 

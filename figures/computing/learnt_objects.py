@@ -1,10 +1,7 @@
-"""Objects that are learnt for figures: trained in the folder of a part, with the time that it took."""
+"""Objects that are learnt for figures, as shapes with their media."""
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +9,9 @@ from figures.computing.scenes import BUNNY, MM_PER_UNIT
 from figures.modelling.candle import make_candle
 from figures.modelling.grid import tissue
 from halfspace_sss import materials
-from halfspace_sss.neural.trained import ENVIRONMENT_VARIABLE
 from halfspace_sss.physics.medium import Medium
 
-__all__ = ["SHAPES", "known_weights", "shape_of"]
+__all__ = ["SHAPES", "shape_of"]
 
 SHAPES = ("bunny", "candle")
 
@@ -34,17 +30,3 @@ def shape_of(name: str, folder: Path, resolution: int = 96, seed: int = 0) -> tu
         return mi.load_dict({"type": "ply", "filename": str(BUNNY)}), materials.load("potato").medium, MM_PER_UNIT
     path = make_candle(resolution, seed).wax.write_ply(folder / "wax.ply")
     return mi.load_dict({"type": "ply", "filename": str(path)}), tissue("candle wax").medium, 1.0
-
-
-@contextmanager
-def known_weights(folder: Path) -> Iterator[None]:
-    """Renders look for weights in a folder of the part, and nowhere else."""
-    before = os.environ.get(ENVIRONMENT_VARIABLE)
-    os.environ[ENVIRONMENT_VARIABLE] = str(folder)
-    try:
-        yield
-    finally:
-        if before is None:
-            del os.environ[ENVIRONMENT_VARIABLE]
-        else:
-            os.environ[ENVIRONMENT_VARIABLE] = before

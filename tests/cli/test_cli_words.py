@@ -166,7 +166,7 @@ def test_a_warning_is_one_line_without_source(monkeypatch: Any) -> None:
 
 
 def test_figures_ask_for_what_they_are_drawn_with_before_they_are_computed(tmp_path: Path, monkeypatch: Any) -> None:
-    from figures import command as cli_figures
+    from figures.parts import command as cli_figures
 
     monkeypatch.setattr(cli_figures, "find_spec", lambda name: None if name == "matplotlib" else name)
     monkeypatch.setattr("figures.parts.runner.compute", lambda *_: pytest.fail("computed"))

@@ -219,7 +219,7 @@ def test_scenes_of_one_channel_each_make_one_image() -> None:
 def test_the_figure_covers_five_materials_a_dragon_two_lights_and_every_model() -> None:
     draft, paper = equal_error.parts("draft"), equal_error.parts("paper")
     assert [part.name for part in draft] == [part.name for part in paper]
-    assert f"{MODELS[1]}, bare" in paper[1].params["spp"]
+    assert f"{MODELS[1]}, bare" in paper[2].params["spp"]
     scenes = [part for part in draft if part.name.endswith(", errors")]
     assert len(scenes) == 12
     for part in scenes:

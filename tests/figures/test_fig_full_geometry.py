@@ -1,4 +1,4 @@
-"""Figures 6, 9, 11 and Table 1 with `full_geometry`, in miniature: trained, rendered and drawn."""
+"""Figures 1, 6, 9, 11 and Table 1 with `full_geometry`, in miniature: trained, rendered and drawn."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ pytest.importorskip("mitsuba")
 pytest.importorskip("torch")
 pytest.importorskip("flip_evaluator")
 
-from figures import fig06, fig09, fig11, table1  # noqa: E402
-from figures.computing import scenes, trained  # noqa: E402
+from figures import fig01, fig06, fig09, fig11, table1  # noqa: E402
+from figures.computing import scenes  # noqa: E402
 from figures.computing.contenders import OF_OBJECTS, VOLUMES  # noqa: E402
+from figures.learnt import weights  # noqa: E402
 from figures.parts import runner  # noqa: E402
 from figures.parts.part import Result, keys_of  # noqa: E402
 from full_geometry.learning import training  # noqa: E402
@@ -23,6 +24,9 @@ from full_geometry.learning.fitting import Recipe  # noqa: E402
 QUICK = Recipe(width=16, depth=2, batch=1024, chunk=2**12, reuse=2)
 MODEL = "full_geometry"
 SETTINGS = {
+    fig01: {
+        "OBJECTS": ("candle", "croissant"), "MODELS": (MODEL,), "SIZES": {"draft": 12}, "RESOLUTION": {"draft": 24},
+    },
     fig06: {"LIGHTS": ("studio", "windows"), "VIEWS": (0, 180), "SIZES": {"draft": 12}},
     fig09: {
         "MATERIALS": ("ketchup",), "MODELS": (MODEL,), "SIZES": {"draft": 12}, "MODEL_SPP": {"draft": 4},
@@ -41,6 +45,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setitem(module.TRAIN_SECONDS, "draft", 0.01)
         for name, value in settings.items():
             monkeypatch.setattr(module, name, value)
+    monkeypatch.setitem(fig01.SPP, "draft", {"path_traced": 16, "model": 4})
     monkeypatch.setitem(fig06.SPP, "draft", {"path_traced": 16, MODEL: 4})
     monkeypatch.setattr(fig06, "MATERIAL", "ketchup")
     monkeypatch.setitem(fig11.SECONDS, "draft", 0.1)
@@ -62,6 +67,16 @@ def test_fig_9_has_a_column_of_the_full_geometry_with_the_time_of_its_training(s
     row = rows(files["fig09.csv"]).iloc[-1]
     assert row["model"] == "Full geometry" and 0 < row["FLIP"] < 1 and row["CPU seconds of training"] > 0
     assert runner.plan("fig09", "draft", tmp_path).missing == ()
+
+
+def test_fig_1_compares_objects_with_walks_where_they_cover_pixels(small: None, tmp_path: Path) -> None:
+    results, files = drawn("fig01", tmp_path)
+    table = rows(files["fig01.csv"])
+    assert list(table["object"]) == ["candle", "croissant"] and table["FLIP"].between(0, 1).all()
+    for name in table["object"]:
+        found = results[f"{name}, full_geometry"].images
+        assert 0.02 < (found["cover"] > 0.5).mean() < 0.9 and found["image"][found["cover"] > 0.5].mean() > 1e-3
+    assert files["fig01.png"].startswith(b"\x89PNG")
 
 
 def test_fig_6_renders_all_lights_and_views_by_one_training(small: None, tmp_path: Path) -> None:
@@ -97,11 +112,11 @@ def test_weights_of_another_training_are_not_found(small: None, tmp_path: Path) 
     scenes.prepare()
     scene = scenes.bunny_scene("ketchup", 8)
     scene["integrator"]["train_seconds"] = 0.0
-    with trained.with_weights(tmp_path, {}), pytest.raises(ValueError, match="must be trained for full_geometry"):
+    with weights.with_weights(tmp_path, {}), pytest.raises(ValueError, match="must be trained for full_geometry"):
         load_scene(scene, MODEL)
 
 
-@pytest.mark.parametrize("module", [fig06, table1])
+@pytest.mark.parametrize("module", [fig01, fig06, table1])
 def test_parts_have_keys_and_more_work_in_paper_quality(module) -> None:
     draft, paper = (module.parts(quality) for quality in ("draft", "paper"))
     assert len(keys_of(draft)) == len(draft)
@@ -110,5 +125,5 @@ def test_parts_have_keys_and_more_work_in_paper_quality(module) -> None:
 
 def test_models_of_objects_are_among_the_columns() -> None:
     assert MODEL in OF_OBJECTS
-    for module in (fig09, fig11, table1):
+    for module in (fig01, fig06, fig09, fig11, table1):
         assert any(MODEL in part.name or MODEL in part.params.get("methods", ()) for part in module.parts("draft"))

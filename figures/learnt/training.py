@@ -4,27 +4,18 @@ from __future__ import annotations
 
 import base64
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from figures.computing.learnt_objects import known_weights
 from figures.computing.scenes import SCANS, prepare, scan_scene
+from figures.learnt.weights import FULL_GEOMETRY, training_of
 from figures.modelling.scene_parts import candle_parts, learnable_parts, make_varying
-from figures.parts.part import Part, Result, Task
+from figures.parts.part import Part, Task
 from halfspace_sss.provenance import check_folder
 
-__all__ = ["FULL_GEOMETRY", "TRAINING", "object_parts", "train_modelled", "train_scan", "training_of", "with_weights"]
+__all__ = ["object_parts", "train_modelled", "train_scan"]
 
-FULL_GEOMETRY = "full_geometry"
-TRAINING = "training"
 GRID = 0.5  # cells of a medium along an object over cubes of its surface
-
-
-def training_of(name: str) -> str:
-    """The name of the part in which an object is learnt."""
-    return f"{name}, {TRAINING}"
 
 
 def train_scan(name: str, material: str, seconds: float, seed: int = 0, scan: str = "bunny") -> Part:
@@ -98,20 +89,3 @@ def _trained(task: Task, scene: dict[str, Any], name: str) -> dict[str, Any]:
     files = {file.name: file.read_bytes() for file in (path, path.with_suffix(".json"))}
     about = {key: record[key] for key in ("steps", "walks")} | {"kB": len(files[path.name]) / 1000}
     return {**took, **about, "files": {file: base64.b64encode(data).decode() for file, data in files.items()}}
-
-
-@contextmanager
-def with_weights(folder: Path, needed: Mapping[str, Result]) -> Iterator[None]:
-    """Renders find what was learnt in the parts of training among the needed ones, and no other weights.
-
-    Args:
-        folder: of the task, where the files are put.
-        needed: results that the task was given.
-    """
-    place = check_folder(folder) / "weights"
-    place.mkdir(parents=True, exist_ok=True)
-    for name, result in needed.items():
-        for file, data in result.numbers["files"].items() if name.endswith(f", {TRAINING}") else ():
-            (place / file).write_bytes(base64.b64decode(data))
-    with known_weights(place):
-        yield

@@ -1,0 +1,109 @@
+"""Fig. 1: candle, mandarin and croissant in surroundings, path traced and by models, with FLIP."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from figures.computing.contenders import ENTRIES, OF_OBJECTS
+from figures.computing.denoise import guides
+from figures.computing.environments import environment_file
+from figures.computing.model_inputs import weight_files
+from figures.computing.scenes import prepare
+from figures.drawing.error_tables import label
+from figures.drawing.image_grid import image_grid
+from figures.drawing.page import page
+from figures.drawing.shot import Shot, compared
+from figures.drawing.style import paper, saved
+from figures.learnt.training import object_parts, train_modelled
+from figures.learnt.weights import FULL_GEOMETRY, training_of, with_weights
+from figures.modelling.grid import tissue
+from figures.objects import VIEWS, View, scene
+from figures.parts.part import Part, Result, Task
+
+__all__ = ["TITLE", "draw", "parts", "shown"]
+
+TITLE = "candle with its flame, mandarin and croissant, path traced and by models"
+OBJECTS = ("candle", "mandarin", "croissant")
+MODELS = ("neural", *(name for name in OF_OBJECTS if name == FULL_GEOMETRY))
+TRUTH = "path_traced"
+SIZES = {"draft": 72, "paper": 448}
+SPP = {"draft": {TRUTH: 64, "model": 64}, "paper": {TRUTH: 8192, "model": 1024}}
+SPP_PER_PASS = 16
+RESOLUTION = {"draft": 64, "paper": 240}  # of surfaces; grids have half of it
+TRAIN_SECONDS = {"draft": 24, "paper": 240}  # CPU time: half of it on two cores
+TISSUES = Path(__file__).parent / "modelling" / "tissues.toml"
+NOTES = (
+    "The candle is homogeneous wax with its flame as a small emitter in the bowl; mandarin and croissant are grid "
+    "volumes, of which the half-space takes the means. Smooth boundaries, all scattering orders. FLIP and relative "
+    "squared error of the pixels of the object, against our walk, whose own noise is in all of them alike."
+)
+
+
+def parts(quality: str) -> list[Part]:
+    """For each object its training, then its image by walks and by the models."""
+    size, found = SIZES[quality], []
+    for name in OBJECTS:
+        found.append(train_modelled(name, RESOLUTION[quality], TRAIN_SECONDS[quality]))
+        for model in (TRUTH, *MODELS):
+            spp = SPP[quality].get(model, SPP[quality]["model"])
+            params = {"object": name, "model": model, "size": size, "spp": spp, "resolution": RESOLUTION[quality]}
+            params |= {"entries": ENTRIES.get(model, 1), "view": list(VIEWS[name]), "seed": 0}
+            needs = (training_of(name),) if model == FULL_GEOMETRY else ()
+            weights = weight_files(model, tissue("candle wax").medium)
+            inputs = (environment_file(VIEWS[name].light), TISSUES, *weights)
+            found.append(Part(f"{name}, {model}", shown, params, spp * size**2, needs, inputs, f"{name} {model}"))
+    return found
+
+
+def shown(task: Task) -> dict[str, Any]:
+    """An object in its surroundings, and its cover of each pixel."""
+    import mitsuba as mi
+
+    from halfspace_sss.rendering.scenes.scene_files import load_scene
+
+    prepare()
+    p, name = task.params, task.params["object"]
+    made = object_parts(name, p["resolution"], task.folder, p["seed"])
+    description = scene(made, View(*p["view"]), p["size"])
+    alone = {key: description[key] for key in ("type", "sensor", name)}
+    cover = guides(mi.load_dict({**alone, "integrator": {"type": "path"}}))[0][..., 0]
+    if p["model"] != TRUTH:
+        description["integrator"] = {"type": "bssrdf", "entries": p["entries"]}
+    each = min(SPP_PER_PASS, p["spp"])
+    passes = p["spp"] // each
+    with with_weights(task.folder, task.needed):
+        loaded, total = load_scene(description, p["model"]), 0.0
+        for k in range(passes):
+            seed = int(np.random.SeedSequence((p["seed"], k, p["model"] == TRUTH)).generate_state(1)[0])
+            total = total + np.array(mi.render(loaded, spp=each, seed=seed))[..., :3]
+            task.progress(k + 1, passes)
+    return {"image": (total / passes).astype(np.float32), "cover": cover, "spp": passes * each}
+
+
+def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
+    """The figure as PDF and PNG, the page to flip between the images, and the numbers as a table."""
+    import pandas
+
+    scenes = {name: _shots(results, name) for name in dict.fromkeys(key.split(", ")[0] for key in results)}
+    rows = [{"object": name, "model": s.label, **s.numbers} for name, shots in scenes.items() for s in shots[1:]]
+    with paper():
+        files: dict[str, bytes | str] = {f"fig01.{end}": data for end, data in saved(image_grid(scenes)).items()}
+    files["fig01.csv"] = pandas.DataFrame(rows).to_csv(index=False, lineterminator="\n")
+    files["fig01.html"] = page("Fig. 1: candle, mandarin and croissant", scenes, notes=NOTES)
+    return files
+
+
+def _shots(results: Mapping[str, Result], name: str) -> list[Shot]:
+    """The images of an object, exposed alike."""
+    truth = results[f"{name}, {TRUTH}"]
+    reference, mask = np.maximum(truth.images["image"], 0), truth.images["cover"] > 0.5
+    gain = np.float32(2.0 ** np.round(-np.log2(np.percentile(reference[mask], 97)), 1))
+    shots = [Shot("Path traced", gain * reference, {})]
+    for model in MODELS:
+        image = np.maximum(results[f"{name}, {model}"].images["image"], 0)
+        shots.append(compared(label(model), gain * image, gain * reference, mask=mask, numbers={}))
+    return shots
