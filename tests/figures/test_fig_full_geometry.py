@@ -27,7 +27,7 @@ SETTINGS = {
     fig01: {
         "OBJECTS": ("candle", "croissant"), "MODELS": (MODEL,), "SIZES": {"draft": 12}, "RESOLUTION": {"draft": 24},
     },
-    fig06: {"LIGHTS": ("studio", "windows"), "VIEWS": (0, 180), "SIZES": {"draft": 12}},
+    fig06: {"LIGHTS": ("sunset", "even sky"), "VIEWS": (0, 180), "SIZES": {"draft": 12}},
     fig09: {
         "MATERIALS": ("ketchup",), "MODELS": (MODEL,), "SIZES": {"draft": 12}, "MODEL_SPP": {"draft": 4},
         "TRUTH_SPP": {"draft": 32},
@@ -83,10 +83,10 @@ def test_fig_6_renders_all_lights_and_views_by_one_training(small: None, tmp_pat
     results, files = drawn("fig06", tmp_path)
     assert sum(name.endswith("training") for name in results) == 1
     table = rows(files["fig06.csv"])
-    assert sorted(zip(table["light"], table["view"])) == [("studio", 0), ("studio", 180), ("windows", 0)]
+    assert sorted(zip(table["light"], table["view"])) == [("even sky", 0), ("sunset", 0), ("sunset", 180)]
     for name in ("fig06_environments.png", "fig06_views.png"):
         assert files[name].startswith(b"\x89PNG")
-    front, back = (results[f"studio, {view} degrees, path_traced"].images["image"] for view in (0, 180))
+    front, back = (results[f"sunset, {view} degrees, path_traced"].images["image"] for view in (0, 180))
     assert ((front > 0) != (back > 0)).any()
 
 
