@@ -156,11 +156,11 @@ class PositionSampler:
         import drjit as dr
         import mitsuba as mi
 
-        m = self.area_points
+        m, inverse = number(float(self.area_points)), number(1 / self.area_points)
 
         def step(k: Any, kept: tuple) -> tuple:
             v = mi.Point2f(*(_wrapped(x + k * ratio) for x, ratio in zip((u.x, u.y), LATTICE)))
-            at = self.points.sample(_wrapped(u_face + k * (1 / m)), v, active)
+            at = self.points.sample(_wrapped(u_face + k * inverse), v, active)
             same = self.found.piece(at.prim_index, active) == piece
             point = (at.p, at.n, turned(at.n_shading, at.n) * out.sign, at.prim_index)
             return k + 1, tuple(self._offer(_Kept(*kept), point, out, axes, active & same))
