@@ -83,7 +83,7 @@ def test_denoising_brings_a_noisy_image_nearer_to_the_truth() -> None:
 
 def test_without_the_denoiser_one_sentence_says_what_to_install(monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:
     monkeypatch.setitem(sys.modules, "mitsuba_oidn", None)
-    for part in fig11.parts("draft")[:2]:
+    for part in [part for part in fig11.parts("draft") if part.name.endswith(("truth", "equal time"))][:2]:
         with pytest.raises(
             BackendError, match=r'^denoising needs mitsuba-oidn: pip install "halfspace-sss\[figures\]"$'
         ):
@@ -143,5 +143,5 @@ def test_a_budget_that_is_none_is_refused(wrong: dict[str, float]) -> None:
 
 def test_the_paper_takes_more_time_and_names_are_readable() -> None:
     draft, paper = fig11.parts("draft"), fig11.parts("paper")
-    assert all(b.work > 10 * a.work for a, b in zip(draft, paper))
+    assert all(b.work >= 10 * a.work for a, b in zip(draft, paper))
     assert label("volpathmis 64") == "Mitsuba volpathmis, roulette from 64"

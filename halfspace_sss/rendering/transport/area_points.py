@@ -6,6 +6,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from halfspace_sss.rendering.transport.plane import number
+
 __all__ = ["AreaPoints", "Point"]
 
 
@@ -29,8 +31,10 @@ class AreaPoints:
         import mitsuba as mi
 
         self.shape = shape
-        self.faces = None
+        self.faces = self.centre = None
         parameters = mi.traverse(shape)
+        if shape.class_name() == "Sphere":  # Mitsuba's normals of sampled points are wrong where it is mirrored
+            self.centre = np.array(parameters["to_world"].matrix, dtype=np.float64).reshape(4, 4)[:3, 3]
         if "faces" in parameters:
             faces = np.array(parameters["faces"]).reshape(-1, 3)
             a, b, c = np.array(parameters["vertex_positions"]).reshape(-1, 3)[faces].transpose(1, 0, 2)
@@ -43,8 +47,16 @@ class AreaPoints:
 
         if self.faces is None:
             ps = self.shape.sample_position(0.0, u, active)
-            return Point(ps.p, ps.n, ps.n, mi.UInt32(0))
+            n = ps.n if self.centre is None else self._radial(ps.p)
+            return Point(ps.p, n, n, mi.UInt32(0))
         return self.on_face(self.faces.sample(u_face, active), u, active)
+
+    def _radial(self, p: Any) -> Any:
+        import drjit as dr
+        import mitsuba as mi
+
+        n = dr.normalize(p - mi.Point3f(*(number(c) for c in self.centre)))
+        return mi.Normal3f(-n if self.shape.has_flipped_normals() else n)
 
     def on_face(self, face: Any, u: Any, active: Any = True) -> Point:
         """A uniform point of a face of a mesh."""
