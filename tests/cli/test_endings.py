@@ -24,6 +24,10 @@ SMALL = {  # a small run of each command, and what it refuses
     "materials": ([], ["marbel"]),
     "models": ([], ["extra"]),
     "render": (["ball.xml", "--spp", "4", "--out", "o"], ["none.xml"]),
+    "rivals": (["--scene", "ball.xml", "--out", "o"], ["--scene", "none.xml"]),
+    "shapes": (["--objects", "1", "--out", "o/shapes.md"], ["--objects", "-1"]),
+    "trade": (["ball.xml", "--way", "better_dipole", "--assess", "0.2", "--out", "o"], ["marbel"]),
+    "trade-check": (["--scenes", "1", "--out", "o"], ["--scenes", "-1"]),
     "train": (["--out", "o", "--work", "o/work"], ["marbel"]),
     "validate": (["--rows", "thirdparty", "--quick", "--out", "o"], ["--rows", "nope"]),
 }
@@ -67,6 +71,7 @@ COLUMNS = {
 }
 MOUNTS = {"full": "size=4k", "locked": "ro"}
 NO_FILES = ("materials", "models")
+LONG = ("rivals", "shapes", "trade-check")  # take minutes
 
 
 def _ended(command: str, column: str, folder: Path) -> tuple[str, str, set[str]]:
@@ -99,7 +104,7 @@ def table(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, str], tup
     found = {}
     for command in SMALL:
         for column in COLUMNS:
-            if command in NO_FILES and column not in ("bad input", "interrupt at the start"):
+            if command in (*NO_FILES, *LONG) and column not in ("bad input", "interrupt at the start"):
                 continue
             found[command, column] = _ended(command, column, tmp_path_factory.mktemp("run"))
     return found
