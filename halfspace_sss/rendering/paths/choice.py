@@ -25,7 +25,7 @@ class Choice(NamedTuple):
     leg: Leg
 
 
-def choose(body: Body, si: Any, throughput: Any, active: Any) -> Choice:
+def choose(body: Body, si: Any, active: Any) -> Choice:
     """Probabilities of the events.
 
     With T the mean transmittance along the refracted ray to the other side, R_1 and R_2 the reflectances of the
@@ -44,7 +44,7 @@ def choose(body: Body, si: Any, throughput: Any, active: Any) -> Choice:
     reflection = dr.clip(F, LEAST_REFLECTION, 0.95) if body.surface.inside.reflection else mi.Float(0)
     if not body.few:
         return Choice(reflection, mi.Float(0), Leg(out, along, 1 - F, valid, mi.Float(0)))
-    T = _transmittance(body, out, along, throughput, valid)
+    T = _transmittance(body, out, along, valid)
     expected = body.expected
     passing = T if 0 in body.few else LEAST_PASSING * T
     albedo, single, multiple = (number(v) for v in (expected.albedo, expected.single, expected.multiple))
@@ -57,16 +57,16 @@ def choose(body: Body, si: Any, throughput: Any, active: Any) -> Choice:
     return Choice(reflection, few, Leg(out, along, 1 - F, valid, passing))
 
 
-def _transmittance(body: Body, out: Exit, along: Any, throughput: Any, active: Any) -> Any:
-    """To the other side, mean over channels by the throughput."""
+def _transmittance(body: Body, out: Exit, along: Any, active: Any) -> Any:
+    """To the other side, mean over channels; light of the path does not count, as choices hold in derivatives."""
     import drjit as dr
     import mitsuba as mi
 
     ray = place(out.p, out.n_face).spawn_ray(along)
     wall = body.found.scene.ray_intersect(ray, mi.RayFlags.Minimal, False, active)
-    T, total = mi.Float(0), dr.maximum(dr.sum(throughput), 1e-30)
-    for weight, m in zip(throughput, body.media):
-        T = T + weight / total * dr.exp(-number(m.sigma_t) * wall.t)
+    T = mi.Float(0)
+    for m in body.media:
+        T = T + dr.exp(-number(m.sigma_t) * wall.t) / len(body.media)
     return dr.select(active & wall.is_valid(), T, 0)
 
 

@@ -58,7 +58,7 @@ def vertex(world: World, sampler: Any, at: Vertex, books: Books) -> tuple[Onward
     with detached():
         for body in world.bodies:
             here = at.active & (si.shape == mi.ShapePtr(body.found.shape))
-            choice = choose(body, si, throughput, here)
+            choice = choose(body, si, here)
             if body.splits:
                 once = at.first & at.second
                 chance = dr.select(at.first, dr.select(at.second, mi.Float(1), 0), choice.few)
