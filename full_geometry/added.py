@@ -29,9 +29,17 @@ class AddedTransport:
 
     @classmethod
     def of(cls, subject: Subject, name: str) -> AddedTransport:
-        """The one of that name, of an object; errors as it raises them."""
+        """The one of that name, of an object.
+
+        Raises:
+            ValueError: as it raises, or it has no S for two points of a surface.
+        """
+        make = object_transport(name)
         inside = Inside("medium", subject.media[0], name, "total", True)
-        return cls(subject, object_transport(name)(subject.found, inside, list(subject.media), Settings()).transport)
+        inner = make(subject.found, inside, list(subject.media), Settings()).transport if make else None
+        if inner is None or getattr(inner, "is_delta", False):
+            raise ValueError(f"model must be one that has S for two points of a surface, got {name!r}")
+        return cls(subject, inner)
 
     @property
     def orders(self) -> str:

@@ -25,6 +25,7 @@ class LambertTransport:
 
     reflectance: list[float]
     orders = "total"
+    is_delta = True
 
     def prepare(self, out: Exit, active: Any) -> Exit:
         """Nothing is done for the exit alone."""
