@@ -44,9 +44,6 @@ def untrained(scene: Any) -> list[str]:
     return found
 
 
-PAPER = "full_geometry_paper"
-
-
 def train(
     scene: Any,
     *,
@@ -82,8 +79,8 @@ def errors(
 
     Args:
         scene: with the object.
-        models: "full_geometry" and "full_geometry_paper", whose weights must have been trained, others that know
-            objects, and half-space models; by default all of them that have learnt the object or take its medium.
+        models: "full_geometry", whose weights must have been trained, others that know objects, and half-space models;
+            by default all of them that have learnt the object or take its medium.
         object: its id; may be left out where there is one.
         seed: of everything.
         progress: called with (what, done, total).
@@ -92,12 +89,6 @@ def errors(
         ValueError: there is no such model or object, or a model that is named refuses it.
     """
     check_count("seed", seed, 0)
-    if PAPER in models:
-        from full_geometry.paper import learner as papers
-
-        others = [name for name in models if name != PAPER]
-        found = errors(scene, others, object=object, seed=seed, progress=progress) if others else []
-        return [*found, *papers.errors(scene, object=object, seed=seed)]
     subject = Subject.given(scene, None, None, object)
     transports = {name: transport(subject, name) for name in models} or _that_take(subject)
     name = subject.found.shape.id()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from full_geometry.flow.sampler import FlowProposals
 from full_geometry.learnable import check_surface
 from full_geometry.model import FullGeometry, PreparedExit
 from full_geometry.patch_table import PatchTable
-from full_geometry.storing import KIND, find_weights, load, trained
+from full_geometry.storing import KIND, find_weights, load
 from full_geometry.subject import Subject, SurfacePoint
 from halfspace_sss.neural.store import checksum_of
 from halfspace_sss.physics.medium import Medium
@@ -59,15 +60,20 @@ class LearntTransport:
         return self.model.S(prepared, at, active) * dr.maximum(dr.dot(w_i, entry.n_out), 0)
 
 
-def _learn(subject: Subject, settings: Settings) -> None:
-    """Train and write the weights."""
-    from full_geometry.learning.training import learn
+def _weights(subject: Subject, settings: Settings) -> Path:
+    """The file of its weights, learnt first where there is none and the settings give time for it."""
+    try:
+        return find_weights(subject)
+    except ValueError:
+        if settings.train_seconds == 0 or find_spec("torch") is None:
+            raise
+    from full_geometry.learning.training import train
 
     warnings.warn(
         f"object {subject.found.shape.id()!r} has no weights: it is learnt first, for {settings.train_seconds:g} s",
         stacklevel=2,
     )
-    learn(subject, seconds=settings.train_seconds, target_error=settings.train_error)
+    return train(subject, seconds=settings.train_seconds, target_error=settings.train_error).path
 
 
 def learnt_means(found: Object, inside: Inside, media: list[Medium], settings: Settings) -> Means:
@@ -78,9 +84,7 @@ def learnt_means(found: Object, inside: Inside, media: list[Medium], settings: S
     """
     check_surface(found.shape.id(), found.shape.bsdf())
     subject = Subject.surveyed(found, tuple(media), inside.varying, settings.mm_per_unit)
-    if settings.train_seconds > 0 and find_spec("torch") and not trained(subject):
-        _learn(subject, settings)
-    path = find_weights(subject)
+    path = _weights(subject, settings)
     model, sampler, flow = load(path, subject)
     backbone = model.half_space.models
     checksums = (checksum_of(path, KIND), *(checksum for m in backbone for checksum in m.checksums))

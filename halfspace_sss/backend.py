@@ -5,12 +5,14 @@ from __future__ import annotations
 import ctypes
 import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 from halfspace_sss.once import once
 
-__all__ = ["BACKENDS", "BackendError", "array_types", "prefer_bundled_llvm", "prepare_llvm"]
+__all__ = ["BACKENDS", "BackendError", "array_types", "kernel_seconds", "prefer_bundled_llvm", "prepare_llvm"]
 
 BACKENDS = ("llvm", "cuda")
 OLDEST_LLVM = 17  # 14 and 15 abort the process ("Cannot select: fminimum")
@@ -119,3 +121,14 @@ def array_types(backend: str = "llvm") -> ModuleType:
     if not dr.has_backend(getattr(dr.JitBackend, backend.upper())):
         raise BackendError(f"Dr.Jit's {backend} backend cannot run here")
     return getattr(dr, backend)
+
+
+def kernel_seconds(make: Callable[[], Any]) -> float:
+    """Seconds in which the kernels run that compute what `make` returns, without tracing and compiling them."""
+    import drjit as dr
+
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        dr.eval(make())
+        dr.sync_thread()
+        return 1e-3 * sum(kernel["execution_time"] for kernel in dr.kernel_history([dr.KernelType.JIT]))

@@ -10,6 +10,7 @@ import numpy as np
 from figures.computing.contenders import contender
 from figures.computing.scenes import prepare
 from figures.parts.part import Task
+from halfspace_sss.backend import kernel_seconds
 
 __all__ = ["split"]
 
@@ -27,7 +28,7 @@ def split(task: Task) -> dict[str, Any]:
     best = {(model, step): np.inf for model in p["models"] for step in STEPS}
     for k in range(p["repeats"] + 1):  # the first compiles
         for model, step in best:
-            seconds = _kernel_seconds(steps[model][step])
+            seconds = kernel_seconds(steps[model][step])
             best[model, step] = min(best[model, step], seconds) if k else np.inf
         task.progress(k + 1, p["repeats"] + 1)
     scale = 1e6 / p["lanes"]
@@ -83,14 +84,3 @@ def _seen(scene: Any, n: int) -> Any:
     si = scene.ray_intersect(ray)
     dr.eval(si)
     return si
-
-
-def _kernel_seconds(make: Callable[[], Any]) -> float:
-    """Seconds in which the kernels run that compute what `make` returns, without tracing and compiling them."""
-    import drjit as dr
-
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        dr.kernel_history_clear()
-        dr.eval(make())
-        dr.sync_thread()
-        return 1e-3 * sum(kernel["execution_time"] for kernel in dr.kernel_history([dr.KernelType.JIT]))

@@ -15,7 +15,7 @@ from full_geometry.learning.learner import Correction, PatchLogits, likelihood, 
 from full_geometry.learning.pairs import Pairs
 from full_geometry.patches import Patches
 from halfspace_sss.checks import check_count, check_interval
-from halfspace_sss.provenance import write_atomically
+from halfspace_sss.neural.training import checkpoint
 
 __all__ = ["STANDARD", "Fitting", "Recipe"]
 
@@ -137,23 +137,14 @@ class Fitting:
 
     def _tensors(self) -> dict[str, torch.Tensor]:
         """Everything the next step depends on, by name; changing the tensors in place changes the fit."""
-        tensors = {"scale": self.scale}
-        for k, (p, mean) in enumerate(zip(self.parameters, self.average.parameters())):
-            state = self.adam.state[p]
-            if not state:
-                state.update(step=torch.tensor(0.0), exp_avg=torch.zeros_like(p), exp_avg_sq=torch.zeros_like(p))
-            tensors |= {f"{k}.value": p.data, f"{k}.mean": mean.data}
-            tensors |= {f"{k}.{name}": state[name] for name in ("step", "exp_avg", "exp_avg_sq")}
-        return tensors
+        means = {f"{k}.mean": mean.data for k, mean in enumerate(self.average.parameters())}
+        return {"scale": self.scale, **checkpoint.tensors_of(self.adam, self.parameters), **means}
 
     def save(self, path: Path, done: int, history: list) -> None:
         """Write a checkpoint after `done` chunks."""
-        from safetensors.torch import save
-
-        counters = torch.tensor([self.step, done], dtype=torch.float64)
         rows = torch.tensor([list(row) for row in history], dtype=torch.float64).reshape(-1, 3)
-        state = {name: tensor.clone() for name, tensor in self._tensors().items()}
-        write_atomically(path, save({**state, "counters": counters, "history": rows}))
+        counters = torch.tensor([self.step, done], dtype=torch.float64)
+        checkpoint.write(path, self._tensors(), counters=counters, history=rows)
 
     def load(self, path: Path) -> tuple[int, list]:
         """Go on from a checkpoint; returns its chunks and history.
@@ -161,16 +152,7 @@ class Fitting:
         Raises:
             ValueError: it is damaged or of another recipe.
         """
-        from safetensors import SafetensorError
-        from safetensors.torch import load
-
-        try:
-            stored = load(path.read_bytes())
-            for name, tensor in self._tensors().items():
-                tensor.copy_(stored[name])
-            step, done = (int(v) for v in stored["counters"].tolist())
+        with checkpoint.gone_on_with(path, self._tensors()) as stored:
+            self.step, done = (int(v) for v in stored["counters"].tolist())
             history = [(int(k), error, spread) for k, error, spread in stored["history"].tolist()]
-        except (SafetensorError, KeyError, RuntimeError, OSError) as error:
-            raise ValueError(f"{path}: checkpoint cannot be used, remove it to start anew: {error}") from error
-        self.step = step
         return done, history

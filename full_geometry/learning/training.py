@@ -30,7 +30,7 @@ from halfspace_sss.neural.training.work_folder import CHECKPOINT, claim
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.provenance import check_folder, provenance, write_atomically
 
-__all__ = ["Trained", "learn", "train", "train_by_cpu"]
+__all__ = ["Trained", "train", "train_by_cpu"]
 
 Progress = Callable[[str, int, int], None]
 VALIDATIONS = 4  # in a run
@@ -83,7 +83,7 @@ def train(
     again with the same `work` ends with the same weights; a machine that slows down on the way takes longer.
 
     Args:
-        shape: a closed Mitsuba shape, or a scene.
+        shape: a closed Mitsuba shape, a scene, or a `Subject`, which has its medium.
         medium: 1/mm, scalar or with one value per channel of the variant; of a scene it is that of the object's
             `translucent` surface.
         mm_per_unit: length of a scene unit, mm; by default what the integrator of a scene says, and 1 for a shape.
@@ -101,27 +101,7 @@ def train(
     Raises:
         ValueError: an argument is out of range, or `work` is of another run; nothing has been traced then.
     """
-    subject = Subject.given(shape, medium, mm_per_unit, object)
-    return learn(
-        subject, seconds=seconds, target_error=target_error, seed=seed, recipe=recipe, chunks=chunks, folder=folder,
-        work=work, camera=camera, progress=progress,
-    )  # fmt: skip
-
-
-def learn(
-    subject: Subject,
-    *,
-    seconds: float = 60.0,
-    target_error: float | None = None,
-    seed: int = 0,
-    recipe: Recipe = STANDARD,
-    chunks: int | None = None,
-    folder: str | Path | None = None,
-    work: str | Path | None = None,
-    camera: Any = None,
-    progress: Progress | None = None,
-) -> Trained:
-    """`train` for an object that has been looked at."""
+    subject = shape if isinstance(shape, Subject) else Subject.given(shape, medium, mm_per_unit, object)
     check_interval("seconds", seconds, 0.0, 1e7)
     check_count("seed", seed, 0)
     if target_error is not None:

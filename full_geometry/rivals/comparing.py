@@ -10,14 +10,16 @@ work is shared by its N samples: V (t_exit/N + t_sample).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from full_geometry.flow.lights import Lighting
+from full_geometry.learning.pairs import Numbers
 from full_geometry.subject import Subject
+from halfspace_sss.backend import kernel_seconds
 from halfspace_sss.rendering.surface.object import turned
 from halfspace_sss.rendering.transport.plane import Exit, number
 from halfspace_sss.rendering.transport.protocols import Means
@@ -56,27 +58,12 @@ class _Exits:
     face: Any
 
 
-class _Numbers:
-    """Uniform numbers of a generator under the names that Mitsuba's samplers give them."""
-
-    def __init__(self, rng: Any) -> None:
-        self.rng = rng
-
-    def next_1d(self) -> Any:
-        return self.rng.next_float32()
-
-    def next_2d(self) -> Any:
-        import mitsuba as mi
-
-        return mi.Point2f(self.rng.next_float32(), self.rng.next_float32())
-
-
 def _exits(subject: Subject, n: int, repeated: int, seed: int) -> _Exits:
     """n random exits, `repeated` neighbouring lanes for each."""
     import drjit as dr
     import mitsuba as mi
 
-    rng = _Numbers(_generator(mi, n, pass_seed(seed, 31)))
+    rng = Numbers(_generator(mi, n, pass_seed(seed, 31)))
     at = subject.points.sample(rng.next_1d(), rng.next_2d(), True)
     sign = number(subject.found.sign)
     n_out = mi.Normal3f(turned(at.n_shading, at.n) * sign)
@@ -123,7 +110,7 @@ def spread(
     passes = max(samples // per_pass, 1)
     lanes = _exits(subject, exits, per_pass, seed)
     for k in range(passes):
-        rng = _Numbers(_generator(mi, exits * per_pass, pass_seed(seed, 32, k)))
+        rng = Numbers(_generator(mi, exits * per_pass, pass_seed(seed, 32, k)))
         found = _estimates(means, light, lanes, rng, 1)
         rows = [dr.block_sum(v, per_pass) for x in found for v in (x, x * x)]
         dr.eval(rows)
@@ -146,22 +133,11 @@ def costs(subject: Subject, all_means: Mapping[str, Means], light: Lighting) -> 
     best = {(name, n): np.inf for name in all_means for n in (1, MANY)}
     for k in range(REPEATS + 1):  # the first compiles
         for name, n in best:
-            numbers = _Numbers(mi.PCG32(rng))
-            seconds = _kernel_seconds(lambda: _estimates(all_means[name], light, lanes, numbers, n))  # noqa: B023
+            numbers = Numbers(mi.PCG32(rng))
+            seconds = kernel_seconds(lambda: _estimates(all_means[name], light, lanes, numbers, n))  # noqa: B023
             best[name, n] = min(best[name, n], seconds) if k else np.inf
     scale, found = 1e6 / TIMED_LANES, {}
     for name in all_means:
         each = max(best[name, MANY] - best[name, 1], 0.0) / (MANY - 1)
         found[name] = Cost(scale * max(best[name, 1] - each, 0.0), scale * each)
     return found
-
-
-def _kernel_seconds(make: Callable[[], Any]) -> float:
-    """Seconds in which the kernels run that compute what `make` returns, without tracing and compiling them."""
-    import drjit as dr
-
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        dr.kernel_history_clear()
-        dr.eval(make())
-        dr.sync_thread()
-        return 1e-3 * sum(kernel["execution_time"] for kernel in dr.kernel_history([dr.KernelType.JIT]))

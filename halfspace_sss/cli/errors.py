@@ -131,12 +131,12 @@ def _object(
     parameters = defined(define)
     check_folder(out)
     use_mitsuba(variant)
-    from halfspace_sss.rendering.scenes.learners import learner
+    from halfspace_sss.rendering.scenes.learners import object_errors
     from halfspace_sss.rendering.scenes.scene_files import load_objects
 
-    measures, loaded = learner(), load_objects(scene, parameters)
+    loaded = load_objects(scene, parameters)
     with Bar("errors") as bar:
-        rows = measures.errors(loaded, models, **how, progress=lambda what, done, total: bar.show(done, total, what))
+        rows = object_errors(loaded, models, **how, progress=lambda what, done, total: bar.show(done, total, what))
     table = pandas.DataFrame(rows)
     files = _write(out, table, table, OBJECT_DEFINITION, {"scene": str(scene), **how})
     screen = console()

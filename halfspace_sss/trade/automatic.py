@@ -70,11 +70,7 @@ def choose(scene: Any, settings: Any) -> None:
 def _stage(scene: Any, settings: Any) -> Stage:
     from halfspace_sss.rendering.surface.placement import translucent_shapes
 
-    common = {name: getattr(settings, name) for name in ("mm_per_unit", "max_depth", "rr_depth", "hide_emitters")}
-    alone = {name: getattr(settings, name) for name in ("geometry", "area_share", "entries")}
-    if alone["area_share"] < 0:
-        del alone["area_share"]
-    return Stage(scene, translucent_shapes(scene), common, alone)
+    return Stage(scene, translucent_shapes(scene), settings.shared(), settings.of_models())
 
 
 def _identity(on: Stage, settings: Any) -> str:
@@ -144,4 +140,4 @@ def _default(rows: list[WayTrade]) -> str:
 
 def _cost(row: WayTrade) -> float:
     """Seconds until the noise is that of one: compared between ways."""
-    return row.variance * row.seconds if row.variance >= 0 else math.inf
+    return row.time_to(1.0) if row.variance >= 0 else math.inf

@@ -54,7 +54,7 @@ def entry_settings(
 
 def _cost(found: ObjectTrade, way: str) -> float:
     row = found.way(way)
-    return row.variance * row.seconds
+    return row.time_to(1.0)
 
 
 def channel_settings(on: Stage, seconds: float, seed: int = 0) -> list[Setting]:

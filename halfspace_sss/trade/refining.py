@@ -59,7 +59,7 @@ def _doubtful(found: ObjectTrade, tolerance: float) -> list[str]:
 
 def _cost(row: WayTrade, tolerance: float, bias: float) -> float:
     left = tolerance**2 - bias**2
-    return row.variance * row.seconds / left if left > 0 else math.inf
+    return row.time_to(math.sqrt(left)) if left > 0 else math.inf
 
 
 def _merged(a: ObjectTrade, b: ObjectTrade) -> ObjectTrade:

@@ -12,7 +12,7 @@ import torch
 from torch import nn
 
 from halfspace_sss.checks import check_count, check_interval
-from halfspace_sss.provenance import write_atomically
+from halfspace_sss.neural.training import checkpoint
 from neural_shape.descriptors import CURVED_OWN, CURVED_SHARED, N_MEDIUM, N_OWN, N_SHARED
 from neural_shape.learning.source import PairData
 from neural_shape.model import BOUND
@@ -149,21 +149,12 @@ class Fitting:
 
     def _tensors(self) -> dict[str, torch.Tensor]:
         """Everything the next step depends on, by name; changing the tensors in place changes the fit."""
-        tensors = {}
-        for k, (p, mean) in enumerate(zip(self.parameters, self.average.parameters())):
-            state = self.adam.state[p]
-            if not state:
-                state.update(step=torch.tensor(0.0), exp_avg=torch.zeros_like(p), exp_avg_sq=torch.zeros_like(p))
-            tensors |= {f"{k}.value": p.data, f"{k}.mean": mean.data}
-            tensors |= {f"{k}.{name}": state[name] for name in ("step", "exp_avg", "exp_avg_sq")}
-        return tensors
+        means = {f"{k}.mean": mean.data for k, mean in enumerate(self.average.parameters())}
+        return {**checkpoint.tensors_of(self.adam, self.parameters), **means}
 
     def save(self, path: Path, done: int) -> None:
         """Write a checkpoint after `done` chunks."""
-        from safetensors.torch import save
-
-        counters = torch.tensor([self.step, done], dtype=torch.float64)
-        write_atomically(path, save({**{k: v.clone() for k, v in self._tensors().items()}, "counters": counters}))
+        checkpoint.write(path, self._tensors(), counters=torch.tensor([self.step, done], dtype=torch.float64))
 
     def load(self, path: Path) -> int:
         """Go on from a checkpoint; returns its chunks.
@@ -171,14 +162,6 @@ class Fitting:
         Raises:
             ValueError: it is damaged or of another recipe.
         """
-        from safetensors import SafetensorError
-        from safetensors.torch import load
-
-        try:
-            stored = load(path.read_bytes())
-            for name, tensor in self._tensors().items():
-                tensor.copy_(stored[name])
+        with checkpoint.gone_on_with(path, self._tensors()) as stored:
             self.step, done = (int(v) for v in stored["counters"].tolist())
-        except (SafetensorError, KeyError, RuntimeError, OSError) as error:
-            raise ValueError(f"{path}: checkpoint cannot be used, remove it to start anew: {error}") from error
         return done

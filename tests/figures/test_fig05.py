@@ -25,9 +25,9 @@ SIZE = 12
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Result]:
     """Both parts of one material, small and short."""
-    learn = training.learn
+    train = training.train
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(training, "learn", lambda *a, **how: learn(*a, **{**how, "recipe": QUICK, "chunks": 2}))
+        patch.setattr(training, "train", lambda *a, **how: train(*a, **{**how, "recipe": QUICK, "chunks": 2}))
         for name, value in (("EXITS", 16), ("WALKS", 128), ("SAMPLES", 64)):
             patch.setattr(training, name, value)
         for name, value in (("SCENES", (("ketchup", "both"),)), ("SIZES", SIZE), ("TRUTH_SPP", 64)):

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from halfspace_sss import Medium
-
 mi = pytest.importorskip("mitsuba")
 dr = pytest.importorskip("drjit")
 torch = pytest.importorskip("torch")
 pytest.importorskip("zuko")
+
+from waxen import random_patches, wax_bunny  # noqa: E402
 
 from full_geometry.entries import LearntProposals  # noqa: E402
 from full_geometry.features import N_PAIR, Side, n_side  # noqa: E402
@@ -26,17 +26,15 @@ from full_geometry.flow.conditional import ConditionalFlow  # noqa: E402
 from full_geometry.flow.context import N_CONTEXT, direction_square, from_square  # noqa: E402
 from full_geometry.flow.fitting import FlowNetwork  # noqa: E402
 from full_geometry.flow.sampler import FlowProposals, FlowSampler  # noqa: E402
-from full_geometry.identity import frame_of, identify  # noqa: E402
+from full_geometry.identity import identify  # noqa: E402
 from full_geometry.model import PreparedExit  # noqa: E402
 from full_geometry.patch_table import PatchTable  # noqa: E402
-from full_geometry.patches import Patches, PatchSampler, cluster, mesh_faces  # noqa: E402
+from full_geometry.patches import cluster, mesh_faces  # noqa: E402
 from full_geometry.storing import CENTRES, add_flow, load, save  # noqa: E402
-from full_geometry.subject import Subject, SurfacePoint  # noqa: E402
+from full_geometry.subject import SurfacePoint  # noqa: E402
 from halfspace_sss.rendering.transport.plane import Exit  # noqa: E402
 from halfspace_sss.tracing.walk import _generator, pass_seed  # noqa: E402
 
-BUNNY = Path(__file__).parents[2] / "figures" / "assets" / "bunny.ply"
-WAX = Medium(np.array([0.95, 0.8, 0.6]), np.array([0.05, 0.2, 0.4]), 0.0, 1.4)
 N_PATCHES = 24
 
 
@@ -48,15 +46,10 @@ def variant() -> None:
 @pytest.fixture(scope="module")
 def sampler() -> FlowSampler:
     """With random weights: densities hold for any."""
-    mi.set_variant("llvm_ad_rgb")
-    subject = Subject.of(mi.load_dict({"type": "ply", "filename": str(BUNNY)}), WAX)
-    frame = frame_of(subject)
-    patches = Patches(subject, frame, cluster(subject, frame, N_PATCHES))
-    rng, weights = np.random.default_rng(2), {}
-    for k, (i, j) in enumerate([(n_side(3), 16), (16, N_PATCHES)]):
-        weights |= {f"V_{k}": rng.standard_normal((j, i)) / np.sqrt(i), f"c_{k}": rng.standard_normal(j)}
+    subject = wax_bunny()
+    points = random_patches(subject, N_PATCHES, np.random.default_rng(2))
     flow = ConditionalFlow(2, shaken(2).arrays())
-    return FlowSampler(PatchSampler(frame, patches, weights), Chart(subject, frame, patches), flow)
+    return FlowSampler(points, Chart(subject, points.frame, points.patches), flow)
 
 
 def shaken(n: int, strength: float = 2.0) -> FlowNetwork:

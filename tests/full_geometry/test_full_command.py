@@ -16,6 +16,7 @@ from typer.testing import CliRunner
 pytest.importorskip("mitsuba")
 pytest.importorskip("torch")
 
+from full_geometry import command  # noqa: E402
 from full_geometry.learning import model_errors, training  # noqa: E402
 from full_geometry.learning.fitting import Recipe  # noqa: E402
 from halfspace_sss.cli import app as cli  # noqa: E402
@@ -85,6 +86,16 @@ def test_a_model_with_single_scattering_is_held_against_walks_with_it(monkeypatc
     assert fewest == [1, 2]
 
 
+def test_all_models_that_take_an_object_are_measured_where_none_is_named(monkeypatch: Any) -> None:
+    monkeypatch.setattr(model_errors, "reference", lambda *a: REFERENCE(a[0], 8, 64, *a[3:]))
+    monkeypatch.setattr(command, "errors_of", functools.partial(command.errors_of, exits=8, walks=64, samples=64))
+    result = _invoke("errors", "--scene", "ball.xml")
+    assert result.exit_code == 0, result.output
+    measured = set(pandas.read_csv("errors/errors.csv")["model"])
+    assert measured >= {"neural", "neural_shape", "better_dipole", "photon_beam_diffusion"}
+    assert not measured & {"auto", "lambert", "full_geometry"}
+
+
 def test_a_render_says_what_trains_an_object() -> None:
     result = _invoke("render", "ball.xml", "--model", "full_geometry", "--train-seconds", "0")
     assert result.exit_code == 2 and "object 'ball' must be trained for full_geometry" in result.stderr
@@ -149,7 +160,10 @@ REFUSED = [
     (["train", "--scene", "ball.xml", "--seconds", "-1"], "seconds must be a number in [0, 1e+07], got -1.0"),
     (["train", "--scene", "ball.xml", "--target-error", "2"], "target_error must be a number in [0.0001, 1], got 2.0"),
     (["train", "--scene", "ball.xml", "--seed", "-1"], "seed must be a whole number >= 0, got -1"),
-    (["train", "--scene", "ball.xml", "--model", "neural"], "model must be one of full_geometry"),
+    (
+        ["train", "--scene", "ball.xml", "--model", "neural"],
+        "model must be one of full_geometry, full_geometry_paper, got 'neural'",
+    ),
     (["train", "--scene", "ball.xml", "--fast"], "fast must be left out with --scene, got True"),
     (["train", "ketchup", "--scene", "ball.xml"], "material must be left out with --scene, got ['ketchup']"),
     (["train", "--scene", "ball.xml", "--out", "ball.xml"], "folder must be a folder or new, got 'ball.xml'"),
@@ -160,6 +174,8 @@ REFUSED = [
     (["errors", "--scene", "ball.xml", "--events", "1e5"], "events must be left out with --scene, got 100000.0"),
     (["errors", "--scene", "ball.xml", "--model", "no_model"], "model must be one of"),
     (["errors", "--scene", "ball.xml", "--model", "full_geometry"], "object 'ball' must be trained for full_geometry"),
+    (["errors", "--scene", "ball.xml", "--model", "auto"], "has S for two points of a surface, got 'auto'"),
+    (["errors", "--scene", "ball.xml", "--model", "lambert"], "has S for two points of a surface, got 'lambert'"),
     (["errors", "--scene", "ball.xml", "--seed", "-1"], "seed must be a whole number >= 0, got -1"),
 ]
 

@@ -37,7 +37,7 @@ from halfspace_sss.rendering.scenes.reference_store import Reference  # noqa: E4
 from halfspace_sss.rendering.scenes.scene_files import open_scene  # noqa: E402
 
 QUICK = Recipe(width=24, depth=2, batch=1024, chunk=2**13, reuse=4)
-LEARN = training.learn
+TRAIN = training.train
 SURFACE = """<bsdf type="translucent"><string name="model" value="full_geometry"/>
   <string name="sigma_s" value="0.95,0.8,0.6"/><string name="sigma_a" value="0.05,0.2,0.4"/></bsdf>"""
 BALL = f"""<shape type="sphere" id="ball"><float name="radius" value="1"/>{SURFACE}</shape>"""
@@ -58,7 +58,7 @@ def _patch(patch: pytest.MonkeyPatch, folder: Path) -> None:
     """A recipe of seconds and a scene, in an empty folder, where weights are looked for too."""
     mi.set_variant("llvm_ad_rgb")
     rendering.register()
-    patch.setattr(training, "learn", lambda *a, **how: LEARN(*a, **{**how, "recipe": QUICK, "chunks": 4}))
+    patch.setattr(training, "train", lambda *a, **how: TRAIN(*a, **{**how, "recipe": QUICK, "chunks": 4}))
     for name, value in {"CHECKPOINT_EVERY": 0.0, "EXITS": 32, "WALKS": 256, "SAMPLES": 64}.items():
         patch.setattr(training, name, value)
     patch.setattr(cli_render, "renderer", lambda kind: None)
@@ -202,7 +202,7 @@ def test_what_cannot_be_learnt_is_refused_before_anything_is_traced(
     old: str, new: str, arguments: list[str], message: str, monkeypatch: Any
 ) -> None:
     Path("ball.xml").write_text(XML.replace(old, new, 1) if old else XML)
-    monkeypatch.setattr(training, "learn", None)
+    monkeypatch.setattr(training, "train", None)
     monkeypatch.setattr(camera_walks.CameraWalks, "exits", None)
     _refused(monkeypatch, message, _render(*arguments))
 

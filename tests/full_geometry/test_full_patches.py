@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from halfspace_sss import Medium
-
 mi = pytest.importorskip("mitsuba")
 dr = pytest.importorskip("drjit")
 pytest.importorskip("torch")
 
-from full_geometry.features import Side, n_side  # noqa: E402
+from waxen import WAX, random_patches, wax_bunny  # noqa: E402
+
+from full_geometry.features import Side  # noqa: E402
 from full_geometry.first_event import first_event  # noqa: E402
 from full_geometry.half_space import HalfSpace  # noqa: E402
 from full_geometry.identity import frame_of  # noqa: E402
@@ -29,8 +29,6 @@ from full_geometry.patches import Patches, PatchSampler, cluster, mesh_faces  # 
 from full_geometry.subject import Subject, SurfacePoint, cosine_direction  # noqa: E402
 from halfspace_sss.tracing.walk import _generator, pass_seed  # noqa: E402
 
-BUNNY = Path(__file__).parents[2] / "figures" / "assets" / "bunny.ply"
-WAX = Medium(np.array([0.95, 0.8, 0.6]), np.array([0.05, 0.2, 0.4]), 0.0, 1.4)
 N_PATCHES = 64
 
 
@@ -41,19 +39,13 @@ def variant() -> None:
 
 @pytest.fixture(scope="module")
 def subject() -> Subject:
-    mi.set_variant("llvm_ad_rgb")
-    return Subject.of(mi.load_dict({"type": "ply", "filename": str(BUNNY)}), WAX)
+    return wax_bunny()
 
 
 @pytest.fixture(scope="module")
 def sampler(subject: Subject) -> PatchSampler:
     """With random weights: densities hold for any."""
-    frame = frame_of(subject)
-    patches = Patches(subject, frame, cluster(subject, frame, N_PATCHES))
-    rng, weights = np.random.default_rng(2), {}
-    for k, (i, j) in enumerate([(n_side(3), 16), (16, N_PATCHES)]):
-        weights |= {f"V_{k}": rng.standard_normal((j, i)) / np.sqrt(i), f"c_{k}": rng.standard_normal(j)}
-    return PatchSampler(frame, patches, weights)
+    return random_patches(subject, N_PATCHES, np.random.default_rng(2))
 
 
 def one_exit(subject: Subject, lanes: int) -> Side:

@@ -12,13 +12,13 @@ import pandas
 import pytest
 from typer.testing import CliRunner
 
-from halfspace_sss import Medium
-
 mi = pytest.importorskip("mitsuba")
 dr = pytest.importorskip("drjit")
 torch = pytest.importorskip("torch")
 pytest.importorskip("zuko")
 pytest.importorskip("igl")
+
+from waxen import BUNNY, random_layers, random_patches, wax_bunny  # noqa: E402
 
 from full_geometry.alpha_p.model import AlphaP  # noqa: E402
 from full_geometry.alpha_p.training import fit_alpha_p  # noqa: E402
@@ -37,15 +37,12 @@ from full_geometry.paper import network as paper  # noqa: E402
 from full_geometry.paper.errors import paper_errors  # noqa: E402
 from full_geometry.paper.flow import mesh_arrays, on_surface, rmsd  # noqa: E402
 from full_geometry.paper.lights import measured_lights, random_lights  # noqa: E402
-from full_geometry.patches import Patches, PatchSampler, cluster  # noqa: E402
 from full_geometry.rivals.command import _errors_wide, markdown  # noqa: E402
 from full_geometry.subject import Subject  # noqa: E402
 from halfspace_sss.cli import app as cli  # noqa: E402
 from halfspace_sss.rendering.transport.protocols import Entry  # noqa: E402
 from halfspace_sss.tracing.walk import _generator, pass_seed  # noqa: E402
 
-BUNNY = Path(__file__).parents[2] / "figures" / "assets" / "bunny.ply"
-WAX = Medium(np.array([0.95, 0.8, 0.6]), np.array([0.05, 0.2, 0.4]), 0.0, 1.4)
 N_PATCHES = 24
 
 
@@ -56,28 +53,20 @@ def variant() -> None:
 
 @pytest.fixture(scope="module")
 def subject() -> Subject:
-    mi.set_variant("llvm_ad_rgb")
-    return Subject.of(mi.load_dict({"type": "ply", "filename": str(BUNNY)}), WAX)
+    return wax_bunny()
 
 
 @pytest.fixture(scope="module")
 def shaken(subject: Subject) -> AlphaP:
     """S = alpha p with random numbers: what it integrates to holds for any."""
-    frame, rng, n = frame_of(subject), np.random.default_rng(5), n_side(3)
-    patches = Patches(subject, frame, cluster(subject, frame, N_PATCHES))
-
-    def layers(W: str, b: str, sizes: list[int]) -> dict[str, np.ndarray]:
-        found = {}
-        for k, (i, j) in enumerate(zip(sizes, sizes[1:])):
-            found |= {f"{W}_{k}": rng.standard_normal((j, i)) / np.sqrt(i), f"{b}_{k}": 0.3 * rng.standard_normal(j)}
-        return found
-
+    rng, n = np.random.default_rng(5), n_side(3)
     net = FlowNetwork(4, N_CONTEXT, (16,), 1)
     with torch.no_grad():
         net.transform.hyper[-1].bias.copy_(torch.randn(92, generator=torch.Generator().manual_seed(2)))
-    points = PatchSampler(frame, patches, layers("V", "c", [n, 16, N_PATCHES]))
-    sampler = FlowSampler(points, Chart(subject, frame, patches), ConditionalFlow(4, net.arrays()))
-    weights = {**layers("A", "a", [n, 8, 1]), **layers("P", "p", [2 * n + N_CONTEXT, 8, 3])}
+    points = random_patches(subject, N_PATCHES, rng, 0.3)
+    sampler = FlowSampler(points, Chart(subject, points.frame, points.patches), ConditionalFlow(4, net.arrays()))
+    own = (("A", "a", [n, 8, 1]), ("P", "p", [2 * n + N_CONTEXT, 8, 3]))
+    weights = {name: array for layers in own for name, array in random_layers(rng, *layers, 0.3).items()}
     return AlphaP(subject, sampler, weights, (0.5, 0.3, 0.1))
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 import time
 from collections.abc import Callable
@@ -11,9 +10,9 @@ from typing import Any, NamedTuple, Protocol
 
 import torch
 
+from halfspace_sss.neural.training import checkpoint
 from halfspace_sss.neural.training.schedules import Schedule, Spent
 from halfspace_sss.progress import NamedProgress
-from halfspace_sss.provenance import write_atomically
 
 __all__ = ["Fitted", "Learner", "Source", "fit"]
 
@@ -124,57 +123,21 @@ class _Run:
     def _reached(self, target_error: float | None) -> bool:
         return target_error is not None and bool(self.history) and self.history[-1]["error"] <= target_error
 
-    def _tensors(self) -> dict[str, torch.Tensor]:
-        """Everything the next step depends on, by name; changing the tensors in place changes the run."""
-        tensors = {}
-        for k, p in enumerate(self.parameters):
-            tensors[f"{k}.value"] = p.data
-            state = self.adam.state[p]
-            if not state:
-                state.update(step=torch.tensor(0.0), exp_avg=torch.zeros_like(p), exp_avg_sq=torch.zeros_like(p))
-            tensors |= {f"{k}.{name}": state[name] for name in ("step", "exp_avg", "exp_avg_sq")}
-        return tensors
-
     def save(self, path: Path) -> None:
-        from safetensors.torch import save
-
         rows = [[h[k] for k in ("step", "loss", "error", "seconds")] for h in self.history]
-        extra = {
-            "generator": self.generator.get_state(),
-            "counter": torch.tensor([self.step, self.loss], dtype=torch.float64),
-            "history": torch.tensor(rows, dtype=torch.float64).reshape(-1, 4),
-        }
-        state = {n: t.clone() for n, t in {**self._tensors(), **extra}.items()}
-        write_atomically(path, save({**state, "checksum": _checksum(state)}))
+        checkpoint.write(
+            path, checkpoint.tensors_of(self.adam, self.parameters),
+            generator=self.generator.get_state(), counter=torch.tensor([self.step, self.loss], dtype=torch.float64),
+            history=torch.tensor(rows, dtype=torch.float64).reshape(-1, 4),
+        )  # fmt: skip
 
     def load(self, path: Path, target_error: float | None) -> None:
         """Go on from a checkpoint; ValueError if it is damaged or of another architecture."""
-        from safetensors import SafetensorError
-        from safetensors.torch import load
-
-        try:
-            stored = load(path.read_bytes())
-            if not torch.equal(stored.pop("checksum"), _checksum(stored)):
-                raise RuntimeError("it was altered")
-            for name, tensor in self._tensors().items():
-                if stored[name].shape != tensor.shape:
-                    raise RuntimeError(f"{name} must have shape {tuple(tensor.shape)}")
-                tensor.copy_(stored[name])
+        with checkpoint.gone_on_with(path, checkpoint.tensors_of(self.adam, self.parameters)) as stored:
             self.generator.set_state(stored["generator"])
             step, self.loss = stored["counter"].tolist()
             rows = stored["history"].tolist()
-        except (SafetensorError, KeyError, RuntimeError) as error:
-            raise ValueError(f"{path}: checkpoint cannot be used, remove it to start anew: {error}") from error
         self.step = int(step)
         self.history = [{"step": int(step), "loss": a, "error": b, "seconds": c} for step, a, b, c in rows]
         self.done = self._reached(target_error)
         self.started -= self.history[-1]["seconds"] if self.history else 0.0
-
-
-def _checksum(tensors: dict[str, torch.Tensor]) -> torch.Tensor:
-    """SHA-256 of names and contents, as 32 bytes."""
-    digest = hashlib.sha256()
-    for name in sorted(tensors):
-        digest.update(name.encode())
-        digest.update(tensors[name].numpy().tobytes())
-    return torch.tensor(list(digest.digest()), dtype=torch.uint8)

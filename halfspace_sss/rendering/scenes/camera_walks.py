@@ -44,9 +44,8 @@ class CameraWalks:
     ) -> None:  # fmt: skip
         import mitsuba as mi
 
-        given = {key: getattr(settings, key) for key in ("mm_per_unit", "max_depth", "rr_depth", "hide_emitters")}
         self.scene, self.sensor, self.seed, self.path = scene, scene.sensors()[sensor], seed, path
-        self.integrator = mi.load_dict({"type": "translucent_walk", **given})
+        self.integrator = mi.load_dict({"type": "translucent_walk", **settings.shared()})
         self.progress, self.about = progress, {**about, PASSES: {}}
         self.found: Reference | None = load(path) if path.exists() else None
 

@@ -16,7 +16,8 @@ from halfspace_sss.progress import NamedProgress
 from halfspace_sss.rendering.scenes.camera_walks import CameraWalks
 
 __all__ = [
-    "Learner", "LearntObject", "LearntShapes", "ObjectError", "ShapeLearner", "learner", "learners", "shape_learner",
+    "Learner", "LearntObject", "LearntShapes", "ObjectError", "ShapeLearner", "learner", "learners",
+    "object_errors", "shape_learner",
 ]  # fmt: skip
 
 
@@ -113,6 +114,18 @@ def learner(name: str | None = None) -> Learner:
     if name is not None or not known:
         check_choice("model", name or "full_geometry", tuple(known))
     return known[name] if name is not None else next(iter(known.values()))
+
+
+def object_errors(
+    scene: Any, models: Sequence[str], *, object: str | None, seed: int, progress: NamedProgress | None
+) -> list[ObjectError]:
+    """The errors of models of an object: a learner measures the model of its name, the first one all others."""
+    first, known = learner(), learners()
+    own = [name for name in models if known.get(name, first) is not first]
+    others = [name for name in models if name not in own]
+    how = {"object": object, "seed": seed, "progress": progress}
+    found = first.errors(scene, others, **how) if others or not own else []
+    return [*found, *(row for name in own for row in known[name].errors(scene, [name], **how))]
 
 
 def shape_learner() -> ShapeLearner:

@@ -11,13 +11,13 @@ from typing import Any
 from halfspace_sss.rendering.scenes.causes import first_cause
 from halfspace_sss.rendering.surface.inside import ORDERS
 from halfspace_sss.rendering.surface.transports import knows_objects, model_names
+from halfspace_sss.rendering.transport.settings import SHARED
 
 __all__ = ["PATH_TRACED", "load_objects", "load_scene", "millimetres", "open_scene"]
 
 PATH_TRACED = "path_traced"
 _INTEGRATORS = {False: "bssrdf", True: "translucent_walk"}
 _NO_OBJECT = "the scene must have an object with a translucent BSDF, got none"
-_KEPT = ("mm_per_unit", "max_depth", "rr_depth", "hide_emitters")  # what both integrators understand
 
 
 def load_scene(
@@ -209,5 +209,5 @@ def _set_integrator(props: Any, plugin: str) -> None:
         return
     props.set_plugin_name(plugin)
     for key in list(props.keys()):
-        if key not in _KEPT:
+        if key not in SHARED:
             del props[key]

@@ -9,9 +9,11 @@ from halfspace_sss.checks import check_interval
 from halfspace_sss.rendering.surface.parameters import OF_MITSUBA, check_parameters
 from halfspace_sss.rendering.transport.plane import GEOMETRIES
 
-__all__ = ["AUTOMATIC", "Settings", "read_settings"]
+__all__ = ["AUTOMATIC", "SHARED", "Settings", "read_settings"]
 
 AUTOMATIC = -1.0
+SHARED = ("mm_per_unit", "max_depth", "rr_depth", "hide_emitters")  # what `translucent_walk` understands too
+OF_MODELS = ("geometry", "area_share", "entries")
 
 
 @dataclass(frozen=True)
@@ -59,6 +61,15 @@ class Settings:
             check_interval("area_share", self.area_share, 0.0, 1.0)
         check_interval("train_seconds", self.train_seconds, 0.0, 1e7)
         check_interval("train_error", self.train_error, 1e-4, 1.0)
+
+    def shared(self) -> dict[str, Any]:
+        """What `translucent_walk` understands too."""
+        return {name: getattr(self, name) for name in SHARED}
+
+    def of_models(self) -> dict[str, Any]:
+        """How models are laid on and sampled; an automatic share is left to them."""
+        given = {name: getattr(self, name) for name in OF_MODELS}
+        return {name: value for name, value in given.items() if value != AUTOMATIC}
 
 
 def read_settings(props: Any) -> Settings:

@@ -17,7 +17,6 @@ __all__ = ["LAMBERT", "NO_SINGLE", "Stage", "Way", "stage", "ways"]
 
 LAMBERT = "lambert"
 NO_SINGLE = "without single scattering"
-SHARED = ("mm_per_unit", "max_depth", "rr_depth", "hide_emitters")
 
 
 @dataclass(frozen=True)
@@ -155,10 +154,7 @@ def _settings(scene: Any) -> tuple[dict[str, Any], dict[str, Any]]:
     integrator = scene.integrator()
     stated = getattr(integrator, "settings", None)
     if stated is not None:
-        alone = {name: getattr(stated, name) for name in ("geometry", "area_share", "entries")}
-        if alone["area_share"] < 0:
-            del alone["area_share"]
-        return {name: getattr(stated, name) for name in SHARED}, alone
+        return stated.shared(), stated.of_models()
     common: dict[str, Any] = {"mm_per_unit": millimetres(scene), "hide_emitters": False, "max_depth": 8, "rr_depth": 5}
     if hasattr(integrator, "mm_per_unit"):
         common |= {"hide_emitters": integrator.hidden}
