@@ -8,8 +8,8 @@ from typing import Annotated
 
 import typer
 
-from halfspace_sss.checks import check_count
-from halfspace_sss.provenance import write_atomically
+from halfspace_sss.checks import check_count, check_interval
+from halfspace_sss.provenance import check_folder, write_atomically
 
 __all__ = ["shapes_command"]
 
@@ -37,6 +37,11 @@ def shapes_command(
     from halfspace_sss.cli.shared import Bar, use_mitsuba
 
     check_count("objects", objects, 1)
+    check_interval("mm_per_unit", mm_per_unit, 1e-9, 1e9)
+    check_interval("seconds", seconds, 1e-3, 1e7)
+    check_folder(out.parent)
+    if out.is_dir():
+        raise ValueError(f"out must be a file, got the folder {str(out)!r}")
     if mesh is not None and not mesh.is_file():
         raise ValueError(f"mesh must be a PLY file, got {str(mesh)!r}, which is none")
     use_mitsuba(VARIANT)
