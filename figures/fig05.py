@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from figures.computing.against_time import modelled, trained_online, walked, weights_in
+from figures.computing.against_time import modelled, trained_online, walked
 from figures.computing.contenders import long_walk
+from figures.computing.learnt_objects import weights_in
 from figures.computing.scenes import BUNNY, prepare
 from figures.computing.tone import srgb
 from figures.drawing.shot import FLIP, RELATIVE_MSE, compared

@@ -8,13 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from figures.computing.learnt_objects import shape_of
+from figures.computing.learnt_objects import shape_of, weights_in
 from figures.computing.scenes import BUNNY, bunny_scene, prepare
 from figures.drawing.image_grid import image_grid
 from figures.drawing.page import page
 from figures.drawing.shot import Shot, compared
 from figures.drawing.style import paper, saved
-from figures.learnt.weights import known_weights
 from figures.parts.part import Part, Result, Task
 
 __all__ = ["SAMPLERS", "TITLE", "draw", "parts", "rendered"]
@@ -92,7 +91,7 @@ def _image(folder: Path, p: Mapping[str, Any], light: str, entries: int, spp: in
     description = bunny_scene("potato", p["size"], light)
     description["integrator"]["entries"] = entries
     description["bunny"]["bsdf"]["orders"] = "multiple"
-    with known_weights(folder):
+    with weights_in(folder):
         scene = load_scene(description, "full_geometry")
         return np.array(mi.render(scene, spp=spp, seed=seed), dtype=np.float32)
 

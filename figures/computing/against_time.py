@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +13,7 @@ from halfspace_sss.rendering.scenes import online, reference
 from halfspace_sss.rendering.scenes.combined import combined
 from halfspace_sss.rendering.scenes.reference_store import Reference
 
-__all__ = ["Snapshots", "modelled", "trained_online", "walked", "weights_in"]
+__all__ = ["Snapshots", "modelled", "trained_online", "walked"]
 
 STEP = 1.25  # of the time from one image that is kept to the next
 
@@ -53,21 +50,6 @@ class Snapshots:
         self.images.append(found.mean[..., :3].astype(np.float32))
         self.spp.append(found.spp)
         self._started += self.seconds - now
-
-
-@contextmanager
-def weights_in(folder: Path) -> Iterator[None]:
-    """Weights are kept and looked for in a folder."""
-    from halfspace_sss.neural.trained import ENVIRONMENT_VARIABLE
-
-    before = os.environ.get(ENVIRONMENT_VARIABLE)
-    os.environ[ENVIRONMENT_VARIABLE] = str(folder)
-    try:
-        yield
-    finally:
-        os.environ.pop(ENVIRONMENT_VARIABLE)
-        if before is not None:
-            os.environ[ENVIRONMENT_VARIABLE] = before
 
 
 def _scene(p: dict[str, Any], model: str, train_seconds: float) -> Any:

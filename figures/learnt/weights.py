@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import base64
-import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
+from figures.computing.learnt_objects import weights_in
 from figures.parts.part import Result
-from halfspace_sss.neural.trained import ENVIRONMENT_VARIABLE
 from halfspace_sss.provenance import check_folder
 
-__all__ = ["FULL_GEOMETRY", "TRAINING", "known_weights", "training_of", "with_weights"]
+__all__ = ["FULL_GEOMETRY", "TRAINING", "training_of", "with_weights"]
 
 FULL_GEOMETRY = "full_geometry"
 TRAINING = "training"
@@ -21,20 +20,6 @@ TRAINING = "training"
 def training_of(name: str) -> str:
     """The name of the part in which an object is learnt."""
     return f"{name}, {TRAINING}"
-
-
-@contextmanager
-def known_weights(folder: Path) -> Iterator[None]:
-    """Renders look for weights in a folder of the part, and nowhere else."""
-    before = os.environ.get(ENVIRONMENT_VARIABLE)
-    os.environ[ENVIRONMENT_VARIABLE] = str(folder)
-    try:
-        yield
-    finally:
-        if before is None:
-            del os.environ[ENVIRONMENT_VARIABLE]
-        else:
-            os.environ[ENVIRONMENT_VARIABLE] = before
 
 
 @contextmanager
@@ -50,5 +35,5 @@ def with_weights(folder: Path, needed: Mapping[str, Result]) -> Iterator[None]:
     for name, result in needed.items():
         for file, data in result.numbers["files"].items() if name.endswith(f", {TRAINING}") else ():
             (place / file).write_bytes(base64.b64decode(data))
-    with known_weights(place):
+    with weights_in(place):
         yield

@@ -13,8 +13,10 @@ import pytest
 pytest.importorskip("matplotlib")
 
 from figures import fig03, fig08, fig12  # noqa: E402
-from figures.computing.learnt_objects import SHAPES  # noqa: E402
-from figures.learnt.weights import known_weights  # noqa: E402
+from figures.computing.learnt_objects import (
+    SHAPES,  # noqa: E402
+    weights_in,  # noqa: E402
+)
 from figures.parts.part import Result, keys_of  # noqa: E402
 from halfspace_sss.neural.trained import weights_folder  # noqa: E402
 
@@ -71,6 +73,6 @@ def test_images_of_all_samplers_are_compared() -> None:
 
 def test_renders_look_for_weights_in_the_folder_of_the_part_only(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HALFSPACE_SSS_WEIGHTS", "elsewhere")
-    with known_weights(tmp_path):
+    with weights_in(tmp_path):
         assert weights_folder() == tmp_path
     assert str(weights_folder()) == "elsewhere"
