@@ -6,26 +6,21 @@ network f. `train` learns it, `errors` says how wrong it is.
 
 from __future__ import annotations
 
-import importlib
-from typing import Any
+from halfspace_sss.lazy import lazy_names
 
-_HOME = {
-    "Recipe": "learning.fitting",
-    "Subject": "subject",
-    "errors": "learning.model_errors",
-    "load": "storing",
-    "train": "learning.training",
-    "transport": "storing",
+TRANSPORTS = {
+    "full_geometry": "full_geometry.scene:learnt_means",
+    "neural_shape": "full_geometry.neural_shape.scene:shape_means",
 }
-TRANSPORTS = {"full_geometry": "full_geometry.scene:learnt_means"}
 __all__ = ["TRANSPORTS", "Recipe", "Subject", "errors", "load", "train", "transport"]
-
-
-def __getattr__(name: str) -> Any:
-    if name in _HOME:
-        return getattr(importlib.import_module(f"full_geometry.{_HOME[name]}"), name)
-    raise AttributeError(f"module 'full_geometry' has no attribute {name!r}")
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+__getattr__, __dir__ = lazy_names(
+    __name__,
+    {
+        "Recipe": "learning.fitting",
+        "Subject": "subject",
+        "errors": "learning.model_errors",
+        "load": "storing",
+        "train": "learning.training",
+        "transport": "storing",
+    },
+)

@@ -33,7 +33,7 @@ __all__ = [
 COMMANDS, FIGURES, MODELS = "halfspace_sss.commands", "halfspace_sss.figures", "halfspace_sss.models"
 LEARNERS, TRANSPORTS = "halfspace_sss.learners", "halfspace_sss.transports"
 FAILURES = (Exception, SystemExit)  # what code of somebody else may end with
-OWN = ("analytic_models", "figures", "full_geometry", "halfspace_sss", "neural_shape")
+OWN = ("analytic_models", "figures", "full_geometry", "halfspace_sss")
 Renderer = Callable[[Any], dict[str, bytes]]
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
-ORDER = ["figures", "neural_shape", "full_geometry", "analytic_models", "halfspace_sss"]  # imports go to the right
+ORDER = ["figures", "full_geometry", "analytic_models", "halfspace_sss"]  # imports go to the right
 SOURCES = sorted(path for package in ORDER for path in (ROOT / package).rglob("*.py"))
 HEAVY = ["torch", "mitsuba", "matplotlib", "drjit", "pandas", "xarray"]
 FLOORS = {  # of each package, a room may import those to its left; "" is what lies beside the rooms

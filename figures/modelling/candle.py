@@ -9,8 +9,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from neural_shape.shapes.distance import capsule, cut, fbm, join, length, noise, overlap, ring_noise, smoothstep
-from neural_shape.shapes.mesh import Box, Mesh, surface
+from full_geometry.neural_shape.shapes.distance import (
+    capsule,
+    cut,
+    fbm,
+    join,
+    length,
+    noise,
+    overlap,
+    ring_noise,
+    smoothstep,
+)
+from full_geometry.neural_shape.shapes.mesh import Box, Mesh, surface
 
 __all__ = ["FLAME", "Candle", "make_candle"]
 

@@ -7,8 +7,8 @@ from functools import cached_property
 
 import numpy as np
 
-from neural_shape.shapes.distance import cells, cut, fbm, length, noise, overlap, smoothstep
-from neural_shape.shapes.mesh import Box
+from full_geometry.neural_shape.shapes.distance import cells, cut, fbm, length, noise, overlap, smoothstep
+from full_geometry.neural_shape.shapes.mesh import Box
 
 __all__ = ["BOX", "Croissant"]
 

@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from full_geometry.neural_shape.shapes.mesh import Box, in_chunks
 from halfspace_sss.materials.files import parse
 from halfspace_sss.materials.material import Material
 from halfspace_sss.provenance import write_atomically
-from neural_shape.shapes.mesh import Box, in_chunks
 
 __all__ = ["Grid", "mixed", "tissue"]
 

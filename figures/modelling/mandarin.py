@@ -11,7 +11,7 @@ from functools import cached_property
 
 import numpy as np
 
-from neural_shape.shapes.distance import (
+from full_geometry.neural_shape.shapes.distance import (
     cells,
     ellipsoid,
     fbm,
@@ -25,7 +25,7 @@ from neural_shape.shapes.distance import (
     smoothstep,
     twisted,
 )
-from neural_shape.shapes.mesh import Box
+from full_geometry.neural_shape.shapes.mesh import Box
 
 __all__ = ["BOX", "Mandarin"]
 

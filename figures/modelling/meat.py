@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from neural_shape.shapes.distance import cells, fbm, length, noise, overlap, rotated, smoothstep
-from neural_shape.shapes.mesh import Box
+from full_geometry.neural_shape.shapes.distance import cells, fbm, length, noise, overlap, rotated, smoothstep
+from full_geometry.neural_shape.shapes.mesh import Box
 
 __all__ = ["BOX", "Meat"]
 

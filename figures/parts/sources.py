@@ -16,7 +16,7 @@ from halfspace_sss.rendering.surface.transports import model_names, object_trans
 
 __all__ = ["PACKAGES", "code_hash", "models_named", "modules_of"]
 
-PACKAGES = ("figures", "neural_shape", "full_geometry", "analytic_models", "halfspace_sss")
+PACKAGES = ("figures", "full_geometry", "analytic_models", "halfspace_sss")
 MACHINERY = "figures.parts"  # keeps and orders what parts compute, and computes nothing of it
 
 

@@ -14,7 +14,7 @@ from figures import objects as pictures  # noqa: E402
 from figures.computing import environments  # noqa: E402
 from figures.modelling import candle, grid, scene_parts  # noqa: E402
 from figures.parts import runner  # noqa: E402
-from neural_shape.shapes import mesh  # noqa: E402
+from full_geometry.neural_shape.shapes import mesh  # noqa: E402
 
 LOW, HIGH = 32, 64
 CELLS = 24

@@ -12,15 +12,15 @@ import numpy as np
 
 from full_geometry.half_space import HalfSpaceTransport
 from full_geometry.learning.model_errors import LIGHTS, ModelError, errors_of
+from full_geometry.neural_shape.learning.drawing import draw_subject
+from full_geometry.neural_shape.shapes.generators import HELD_OUT
+from full_geometry.neural_shape.storing import transport
 from full_geometry.subject import Subject
 from halfspace_sss.interface.model import bssrdf
 from halfspace_sss.materials import load as load_material
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.tracing.walk import _generator, pass_seed
-from neural_shape.learning.drawing import draw_subject
-from neural_shape.shapes.generators import HELD_OUT
-from neural_shape.storing import transport
 
 __all__ = ["HALF_SPACES", "Case", "Row", "evaluate", "held_out", "of_mesh", "seconds_per_million", "spheres"]
 

@@ -6,8 +6,18 @@ from typing import Any
 
 import numpy as np
 
-from neural_shape.shapes.distance import capsule, cut, ellipsoid, fbm, join, length, overlap, rotated, twisted
-from neural_shape.shapes.mesh import Box, Distance
+from full_geometry.neural_shape.shapes.distance import (
+    capsule,
+    cut,
+    ellipsoid,
+    fbm,
+    join,
+    length,
+    overlap,
+    rotated,
+    twisted,
+)
+from full_geometry.neural_shape.shapes.mesh import Box, Distance
 
 __all__ = ["FAMILIES", "box", "margin", "turned_points"]
 

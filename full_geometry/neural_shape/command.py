@@ -11,6 +11,6 @@ __all__ = ["train_shapes"]
 
 def train_shapes(*arguments: Any, **options: Any) -> LearntShapes:
     """As `learning.training.train_shapes`, which loads torch."""
-    from neural_shape.learning.training import train_shapes as learn
+    from full_geometry.neural_shape.learning.training import train_shapes as learn
 
     return learn(*arguments, **options)

@@ -14,10 +14,10 @@ from full_geometry.first_event import first_event
 from full_geometry.half_space import HalfSpace
 from full_geometry.learning.exits import trace_exits
 from full_geometry.learning.pairs import Proposals
+from full_geometry.neural_shape.descriptors import describe, end, medium
+from full_geometry.neural_shape.model import BACKBONE, FLOOR
 from full_geometry.subject import Subject, SurfacePoint
 from halfspace_sss.tracing.walk import _generator, pass_seed
-from neural_shape.descriptors import describe, end, medium
-from neural_shape.model import BACKBONE, FLOOR
 
 __all__ = ["PairData", "make_data"]
 

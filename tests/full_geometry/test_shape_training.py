@@ -13,14 +13,14 @@ mi = pytest.importorskip("mitsuba")
 pytest.importorskip("igl")
 torch = pytest.importorskip("torch")
 
+from full_geometry.neural_shape.learning import training  # noqa: E402
+from full_geometry.neural_shape.learning.drawing import draw_medium, draw_subject, mean_events  # noqa: E402
+from full_geometry.neural_shape.learning.fitting import Fitting, Recipe  # noqa: E402
+from full_geometry.neural_shape.learning.source import make_data  # noqa: E402
+from full_geometry.neural_shape.ranges import ALBEDO, ETA, SIZE, G  # noqa: E402
+from full_geometry.neural_shape.shapes.generators import HELD_OUT, TRAINING, make_shape  # noqa: E402
+from full_geometry.neural_shape.storing import WEIGHTS, load, shipped_weights  # noqa: E402
 from halfspace_sss.cli import app as cli  # noqa: E402
-from neural_shape.learning import training  # noqa: E402
-from neural_shape.learning.drawing import draw_medium, draw_subject, mean_events  # noqa: E402
-from neural_shape.learning.fitting import Fitting, Recipe  # noqa: E402
-from neural_shape.learning.source import make_data  # noqa: E402
-from neural_shape.ranges import ALBEDO, ETA, SIZE, G  # noqa: E402
-from neural_shape.shapes.generators import HELD_OUT, TRAINING, make_shape  # noqa: E402
-from neural_shape.storing import WEIGHTS, load, shipped_weights  # noqa: E402
 
 QUICK = Recipe(width=16, depth=2, objects=4, pairs=64)
 PLAN = (4, 12)

@@ -13,13 +13,22 @@ pytest.importorskip("igl")
 
 from full_geometry.half_space import HalfSpaceTransport  # noqa: E402
 from full_geometry.learning.model_errors import errors_of  # noqa: E402
+from full_geometry.neural_shape.descriptors import (  # noqa: E402
+    CURVED_OWN,
+    CURVED_SHARED,
+    N_MEDIUM,
+    N_OWN,
+    N_SHARED,
+    describe,
+    end,
+    medium,
+)
+from full_geometry.neural_shape.model import NeuralShape  # noqa: E402
+from full_geometry.neural_shape.shapes.generators import make_shape  # noqa: E402
+from full_geometry.neural_shape.shapes.mesh import Box, surface  # noqa: E402
+from full_geometry.neural_shape.storing import transport  # noqa: E402
 from full_geometry.subject import Subject, SurfacePoint, cosine_direction  # noqa: E402
 from halfspace_sss.tracing.walk import _generator, pass_seed  # noqa: E402
-from neural_shape.descriptors import CURVED_OWN, CURVED_SHARED, N_MEDIUM, N_OWN, N_SHARED, describe, end, medium  # noqa: E402
-from neural_shape.model import NeuralShape  # noqa: E402
-from neural_shape.shapes.generators import make_shape  # noqa: E402
-from neural_shape.shapes.mesh import Box, surface  # noqa: E402
-from neural_shape.storing import transport  # noqa: E402
 
 WAX = Medium(0.95, 0.05, 0.3, 1.4)
 N = 512
@@ -33,7 +42,7 @@ def variant() -> None:
 def random_weights(seed: int = 0, width: int = 16) -> dict[str, np.ndarray]:
     """Numbers with which f is of order one."""
     pytest.importorskip("torch")
-    from neural_shape.learning.fitting import Network, Recipe
+    from full_geometry.neural_shape.learning.fitting import Network, Recipe
 
     rng = np.random.default_rng(seed)
     arrays = Network(Recipe(width=width, depth=2), seed).arrays()
@@ -163,7 +172,7 @@ def test_a_channel_is_what_its_medium_is_alone() -> None:
 
 def test_torch_and_drjit_say_the_same() -> None:
     torch = pytest.importorskip("torch")
-    from neural_shape.learning.fitting import Network, Recipe
+    from full_geometry.neural_shape.learning.fitting import Network, Recipe
 
     subject = Subject.of(make_shape("shells", 2, 24).mitsuba("bowl"), WAX.scaled(8.0))
     weights, (o, i) = random_weights(), pairs(subject)

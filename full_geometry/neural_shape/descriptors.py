@@ -22,11 +22,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from full_geometry.first_event import FirstEvent, first_event
+from full_geometry.neural_shape.surroundings import LENGTHS, Surroundings, look
 from full_geometry.subject import Subject, SurfacePoint, refract_in
 from halfspace_sss.neural.features import medium_features
 from halfspace_sss.physics.backbone import length_scale
 from halfspace_sss.rendering.transport.plane import number
-from neural_shape.surroundings import LENGTHS, Surroundings, look
 
 __all__ = ["CURVED_OWN", "CURVED_SHARED", "N_MEDIUM", "N_OWN", "N_SHARED", "End", "Pair", "describe", "end", "medium"]
 

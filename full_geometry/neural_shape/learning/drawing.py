@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from full_geometry.neural_shape.ranges import ALBEDO, ETA, SIZE, G
+from full_geometry.neural_shape.shapes.generators import TRAINING, make_shape
 from full_geometry.subject import Subject
 from halfspace_sss.physics.medium import Medium
-from neural_shape.ranges import ALBEDO, ETA, SIZE, G
-from neural_shape.shapes.generators import TRAINING, make_shape
 
 __all__ = ["Drawn", "draw_medium", "draw_subject", "mean_events"]
 

@@ -7,6 +7,8 @@ import warnings
 from dataclasses import replace
 
 from full_geometry.learnable import check_surface
+from full_geometry.neural_shape.ranges import ALBEDO, ETA, SIZE, G
+from full_geometry.neural_shape.storing import KIND, shipped_weights, transport
 from full_geometry.scene import LearntTransport
 from full_geometry.subject import Subject
 from halfspace_sss.neural.store import checksum_of
@@ -19,8 +21,6 @@ from halfspace_sss.rendering.transport.positions import PositionSampler
 from halfspace_sss.rendering.transport.protocols import Means
 from halfspace_sss.rendering.transport.radial_table import RadialTable
 from halfspace_sss.rendering.transport.settings import Settings
-from neural_shape.ranges import ALBEDO, ETA, SIZE, G
-from neural_shape.storing import KIND, shipped_weights, transport
 
 __all__ = ["shape_means", "warn_out_of_range"]
 

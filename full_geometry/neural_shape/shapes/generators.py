@@ -9,9 +9,9 @@ from collections.abc import Callable
 
 import numpy as np
 
+from full_geometry.neural_shape.shapes import families, held_out
+from full_geometry.neural_shape.shapes.mesh import Box, Distance, Mesh, surface
 from halfspace_sss.checks import check_choice, check_count
-from neural_shape.shapes import families, held_out
-from neural_shape.shapes.mesh import Box, Distance, Mesh, surface
 
 __all__ = ["HELD_OUT", "TRAINING", "make_shape"]
 

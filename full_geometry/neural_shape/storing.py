@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
+from full_geometry.neural_shape.descriptors import CURVED_OWN, CURVED_SHARED, N_MEDIUM, N_OWN, N_SHARED
+from full_geometry.neural_shape.model import NeuralShape
 from full_geometry.subject import Subject
 from halfspace_sss.neural.store import load_weights
 from halfspace_sss.once import once
-from neural_shape.descriptors import CURVED_OWN, CURVED_SHARED, N_MEDIUM, N_OWN, N_SHARED
-from neural_shape.model import NeuralShape
 
 __all__ = ["KIND", "WEIGHTS", "load", "shipped_weights", "transport"]
 
@@ -22,7 +22,7 @@ WEIGHTS = f"{KIND}.safetensors"
 
 def shipped_weights() -> Path:
     """The file of weights that comes with the package."""
-    return Path(str(resources.files("neural_shape").joinpath("data", WEIGHTS)))
+    return Path(str(resources.files("full_geometry.neural_shape").joinpath("data", WEIGHTS)))
 
 
 @once

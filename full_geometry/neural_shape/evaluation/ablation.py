@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from full_geometry.neural_shape.descriptors import N_OWN
+from full_geometry.neural_shape.learning.drawing import draw_subject, mean_events
+from full_geometry.neural_shape.learning.fitting import STANDARD, Fitting
+from full_geometry.neural_shape.learning.source import PairData, make_data
+from full_geometry.neural_shape.shapes.generators import HELD_OUT
+from full_geometry.neural_shape.surroundings import LENGTHS
 from halfspace_sss.progress import NamedProgress
-from neural_shape.descriptors import N_OWN
-from neural_shape.learning.drawing import draw_subject, mean_events
-from neural_shape.learning.fitting import STANDARD, Fitting
-from neural_shape.learning.source import PairData, make_data
-from neural_shape.shapes.generators import HELD_OUT
-from neural_shape.surroundings import LENGTHS
 
 __all__ = ["ablation_table"]
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from full_geometry.learning.model_errors import LIGHTS
-from neural_shape.evaluation.cases import Row
+from full_geometry.neural_shape.evaluation.cases import Row
 
 __all__ = ["by_property", "case_table", "speed_table", "summary"]
 

@@ -11,9 +11,9 @@ import numpy as np
 
 from full_geometry.features import Side
 from full_geometry.half_space import HalfSpace
+from full_geometry.neural_shape.descriptors import CURVED_OWN, CURVED_SHARED, N_OWN, End, Pair, describe, end, medium
 from full_geometry.subject import Subject, SurfacePoint
 from halfspace_sss.rendering.transport.plane import number
-from neural_shape.descriptors import CURVED_OWN, CURVED_SHARED, N_OWN, End, Pair, describe, end, medium
 
 __all__ = ["BACKBONE", "BOUND", "FLOOR", "NeuralShape"]
 

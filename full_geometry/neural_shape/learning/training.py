@@ -12,17 +12,17 @@ from typing import Any
 
 import numpy as np
 
+from full_geometry.neural_shape.learning.drawing import draw_subject, mean_events
+from full_geometry.neural_shape.learning.fitting import STANDARD, Fitting, Recipe
+from full_geometry.neural_shape.learning.source import PairData, make_data
+from full_geometry.neural_shape.ranges import ALBEDO, ETA, SIZE, G
+from full_geometry.neural_shape.storing import KIND, WEIGHTS
 from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.neural.store import save_weights, to_json
 from halfspace_sss.neural.training.work_folder import CHECKPOINT, claim
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.provenance import check_folder, provenance, write_atomically
 from halfspace_sss.rendering.scenes.learners import LearntShapes
-from neural_shape.learning.drawing import draw_subject, mean_events
-from neural_shape.learning.fitting import STANDARD, Fitting, Recipe
-from neural_shape.learning.source import PairData, make_data
-from neural_shape.ranges import ALBEDO, ETA, SIZE, G
-from neural_shape.storing import KIND, WEIGHTS
 
 __all__ = ["make_objects", "train_shapes"]
 

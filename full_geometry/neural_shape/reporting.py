@@ -45,7 +45,7 @@ def shapes_command(
     if mesh is not None and not mesh.is_file():
         raise ValueError(f"mesh must be a PLY file, got {str(mesh)!r}, which is none")
     use_mitsuba(VARIANT)
-    from neural_shape.evaluation import cases, tables
+    from full_geometry.neural_shape.evaluation import cases, tables
 
     found: dict[str, str] = {}
     with Bar("shapes") as bar:
@@ -63,7 +63,7 @@ def shapes_command(
         rows = cases.evaluate(cases.held_out(objects), objects, progress=show)
         found["held-out"] = tables.summary(rows) + "\n" + tables.by_property(rows) + "\n" + tables.case_table(rows)
         if work is not None:
-            from neural_shape.evaluation.ablation import ablation_table
+            from full_geometry.neural_shape.evaluation.ablation import ablation_table
 
             found["ablation"] = ablation_table(work, seconds, show)
     _write(out, found)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from neural_shape.shapes.distance import capsule, cut, join, length, overlap, rotated, smoothstep
-from neural_shape.shapes.families import margin
-from neural_shape.shapes.mesh import Box, Distance
+from full_geometry.neural_shape.shapes.distance import capsule, cut, join, length, overlap, rotated, smoothstep
+from full_geometry.neural_shape.shapes.families import margin
+from full_geometry.neural_shape.shapes.mesh import Box, Distance
 
 __all__ = ["FAMILIES"]
 

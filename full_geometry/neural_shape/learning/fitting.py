@@ -11,11 +11,11 @@ import numpy as np
 import torch
 from torch import nn
 
+from full_geometry.neural_shape.descriptors import CURVED_OWN, CURVED_SHARED, N_MEDIUM, N_OWN, N_SHARED
+from full_geometry.neural_shape.learning.source import PairData
+from full_geometry.neural_shape.model import BOUND
 from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.neural.training import checkpoint
-from neural_shape.descriptors import CURVED_OWN, CURVED_SHARED, N_MEDIUM, N_OWN, N_SHARED
-from neural_shape.learning.source import PairData
-from neural_shape.model import BOUND
 
 __all__ = ["STANDARD", "Fitting", "Network", "Recipe"]
 
