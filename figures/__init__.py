@@ -39,7 +39,7 @@ __all__ = ["FIGURES", "figure_modules"]
 
 FIGURES = (
     "fig01", "fig03", "fig05", "fig06", "fig08", "fig09", "fig10", "fig11", "fig12", "table1",
-    "spheres", "equal_error", "objects", "trade",
+    "spheres", "thin", "equal_error", "objects", "trade",
 )  # fmt: skip
 GROUP = "halfspace_sss.figure_modules"
 

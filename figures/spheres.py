@@ -1,4 +1,7 @@
-"""What the half-space costs on curved shapes: spheres of decreasing radius, models over path tracing."""
+"""What the half-space costs on curved shapes: spheres of decreasing radius, models over path tracing.
+
+`neural_shape` knows that they are curved.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from figures.computing.contenders import MODELS
+from figures.computing import contenders
 from figures.computing.model_inputs import weight_files
 from figures.computing.scenes import prepare
 from figures.drawing.style import COLUMN, look, paper, saved
@@ -16,7 +19,8 @@ from halfspace_sss.physics.medium import Medium
 
 __all__ = ["TITLE", "draw", "parts"]
 
-TITLE = "bias of the half-space on spheres of decreasing radius"
+TITLE = "bias of the half-space on spheres of decreasing radius, and what `neural_shape` leaves of it"
+MODELS = (*contenders.MODELS, "neural_shape")
 RADII = (1.0, 3.0, 10.0, 30.0, 100.0)  # mean free paths
 MEDIUM = {"albedo": 0.95, "g": 0.0, "eta": 1.3}
 LIGHTS = ("even sky", "half a sky from the left")
