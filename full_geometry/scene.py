@@ -30,7 +30,7 @@ from halfspace_sss.rendering.transport.settings import AUTOMATIC, Settings
 
 __all__ = ["LearntTransport", "learnt_means"]
 
-FINE = 2.0  # mean distances of light across a patch, up to which patches do without probes
+FINE = 2.5  # transport mean free paths of the radius of a patch, up to which patches do without probes
 PATCH_SHARE = 0.5  # of the entries where patches are larger
 
 
@@ -98,5 +98,6 @@ def learnt_means(found: Object, inside: Inside, media: list[Medium], settings: S
     if flow is not None:
         return Means(transport, FlowProposals(flow, found.sign, PatchTable(flow.patches)))
     radius = np.sqrt(found.area / (np.pi * sampler.patches.n))
-    patch_share = 1.0 if radius < FINE * table.mean else PATCH_SHARE
+    sigma_t_prime = np.mean([float(m.sigma_t_prime) for m in media])
+    patch_share = 1.0 if radius * sigma_t_prime < FINE else PATCH_SHARE
     return Means(transport, LearntProposals(sampler, positions, patch_share, found.sign, PatchTable(sampler)))
