@@ -1,7 +1,8 @@
 """The figures of the paper: what each is made of, apart from how it is drawn, so that only what changed is computed.
 
-A figure is one file `figures/NAME.py` and one entry of `FIGURES` below; other packages add figures by entry points of
-the group `halfspace_sss.figure_modules`, name = module. The module has
+A figure is one file, `figures/NAME.py` or, where the paper has none of the kind, `figures/beyond/NAME.py`, and one
+entry below; other packages add figures by entry points of the group `halfspace_sss.figure_modules`, name = module. The
+module has
 
 - `TITLE`: a few words for `halfspace-sss figures list`;
 - `parts(quality) -> list[Part]`: what is to be computed, for the quality "draft" (minutes on two cores) or "paper";
@@ -37,15 +38,14 @@ from importlib.metadata import entry_points
 
 __all__ = ["FIGURES", "figure_modules"]
 
-FIGURES = (
-    "fig01", "fig03", "fig05", "fig06", "fig08", "fig09", "fig10", "fig11", "fig12", "table1",
-    "spheres", "thin", "equal_error", "objects", "trade",
-)  # fmt: skip
+OF_PAPER = ("fig01", "fig03", "fig05", "fig06", "fig08", "fig09", "fig10", "fig11", "fig12", "table1")
+BEYOND = ("spheres", "thin", "equal_error", "objects", "trade")
+FIGURES = (*OF_PAPER, *BEYOND)
 GROUP = "halfspace_sss.figure_modules"
 
 
 def figure_modules() -> dict[str, str]:
     """The module of each figure by its name, those of other packages last; a name that is taken is not given anew."""
     added = {entry.name: entry.value for entry in entry_points(group=GROUP)}
-    own = {name: f"figures.{name}" for name in FIGURES}
+    own = {name: f"figures.{'beyond.' if name in BEYOND else ''}{name}" for name in FIGURES}
     return own | {name: module for name, module in added.items() if name not in own}

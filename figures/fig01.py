@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from figures.beyond.objects import VIEWS, View, scene
 from figures.computing.contenders import ENTRIES, OF_OBJECTS
 from figures.computing.denoise import guides
 from figures.computing.environments import environment_file
@@ -21,7 +22,6 @@ from figures.drawing.style import paper, saved
 from figures.learnt.training import object_parts, train_modelled
 from figures.learnt.weights import FULL_GEOMETRY, training_of, with_weights
 from figures.modelling.grid import tissue
-from figures.objects import VIEWS, View, scene
 from figures.parts.part import Part, Result, Task
 
 __all__ = ["TITLE", "draw", "parts", "shown"]

@@ -20,7 +20,7 @@ FLOORS = {  # of each package, a room may import those to its left; "" is what l
         "rendering.scenes", "rendering", "trade.measuring", "trade", "trade.checking", "cli",
         "trade.commands",
     ],
-    "figures": ["parts", "modelling", "computing", "learnt", "drawing", ""],
+    "figures": ["parts", "modelling", "computing", "learnt", "drawing", "beyond", ""],
 }  # fmt: skip
 HIDING = {"bssrdf", "curves", "models", "trace"}  # public functions: a folder of that name would hide one
 LONGEST_FILE, LONGEST_BODY, MOST_MODULES = 300, 45, 14

@@ -48,7 +48,7 @@ def equal_error(scenes: Mapping[tuple[str, str], Mapping[str, Any]]) -> pandas.D
     """A row for each scene and method.
 
     Args:
-        scenes: (material, lights) -> what `figures.equal_error.measured` gave.
+        scenes: (material, lights) -> what `figures.beyond.equal_error.measured` gave.
     """
     import pandas
 

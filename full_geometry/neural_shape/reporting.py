@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
+import numpy as np
 import typer
 
 from halfspace_sss.checks import check_count, check_interval
+from halfspace_sss.progress import NamedProgress
 from halfspace_sss.provenance import check_folder, write_atomically
+
+if TYPE_CHECKING:
+    from full_geometry.neural_shape.evaluation.cases import Row
 
 __all__ = ["shapes_command"]
 
@@ -29,6 +35,7 @@ def shapes_command(
         Path | None, typer.Option(help="Work of `train --shapes`: fit short ablations on its objects.")
     ] = None,
     seconds: Annotated[float, typer.Option(help="Processor time of each ablation.")] = 60.0,
+    pictures: Annotated[Path | None, typer.Option(help="PNG file of the ten worst held-out shapes.")] = None,
     out: Annotated[Path, typer.Option(help="Markdown file: the text between its marks is replaced.")] = Path(
         "neural_shape.md"
     ),
@@ -39,9 +46,13 @@ def shapes_command(
     check_count("objects", objects, 1)
     check_interval("mm_per_unit", mm_per_unit, 1e-9, 1e9)
     check_interval("seconds", seconds, 1e-3, 1e7)
-    check_folder(out.parent)
-    if out.is_dir():
-        raise ValueError(f"out must be a file, got the folder {str(out)!r}")
+    for name, path in (("out", out), ("pictures", pictures)):
+        if path is not None:
+            check_folder(path.parent)
+            if path.is_dir():
+                raise ValueError(f"{name} must be a file, got the folder {str(path)!r}")
+    if pictures is not None and pictures.suffix.lower() != ".png":
+        raise ValueError(f"pictures must end in .png, got {str(pictures)!r}")
     if mesh is not None and not mesh.is_file():
         raise ValueError(f"mesh must be a PLY file, got {str(mesh)!r}, which is none")
     use_mitsuba(VARIANT)
@@ -62,12 +73,27 @@ def shapes_command(
             found[f"{mesh.stem}"] = tables.summary(rows) + "\n" + tables.case_table(rows)
         rows = cases.evaluate(cases.held_out(objects), objects, progress=show)
         found["held-out"] = tables.summary(rows) + "\n" + tables.by_property(rows) + "\n" + tables.case_table(rows)
+        if pictures is not None:
+            _write_picture(pictures, rows, show)
         if work is not None:
             from full_geometry.neural_shape.evaluation.ablation import ablation_table
 
             found["ablation"] = ablation_table(work, seconds, show)
     _write(out, found)
     typer.echo(f"written: {out}")
+
+
+def _write_picture(path: Path, rows: Sequence[Row], progress: NamedProgress) -> None:
+    """The worst objects of the rows as a PNG file."""
+    import mitsuba as mi
+
+    from full_geometry.neural_shape.evaluation.pictures import worst_pictures
+
+    grey = np.round(255 * worst_pictures(rows, progress)).astype(np.uint8)
+    stream = mi.MemoryStream()
+    mi.Bitmap(grey[..., None]).write(stream, mi.Bitmap.FileFormat.PNG)
+    stream.seek(0)
+    write_atomically(path, bytes(stream.read(stream.size())))
 
 
 def _write(out: Path, found: dict[str, str]) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pandas
 import pytest
 
-from figures import equal_error
+from figures.beyond import equal_error
 from figures.computing.contenders import MODELS, VOLUMES, WALK, contender
 from figures.computing.furnace import furnace, furnace_models
 from figures.computing.sampling_cost import STEPS

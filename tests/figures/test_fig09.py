@@ -11,7 +11,8 @@ import pytest
 pytest.importorskip("mitsuba")
 pytest.importorskip("flip_evaluator")
 
-from figures import fig09, spheres
+from figures import fig09
+from figures.beyond import spheres
 from figures.parts import runner  # noqa: E402
 
 

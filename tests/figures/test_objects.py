@@ -10,7 +10,7 @@ igl = pytest.importorskip("igl")
 
 import mitsuba as mi  # noqa: E402
 
-from figures import objects as pictures  # noqa: E402
+from figures.beyond import objects as pictures  # noqa: E402
 from figures.computing import environments  # noqa: E402
 from figures.modelling import candle, grid, scene_parts  # noqa: E402
 from figures.parts import runner  # noqa: E402

@@ -60,7 +60,7 @@ def parts(quality: str) -> list[Part]:
     size, spp, found = SIZES[quality], SPP[quality], []
     for name in OBJECTS:
         params = {"object": name, "size": size, "spp": spp, "resolution": RESOLUTION[quality], "seed": 0}
-        inputs = (environment_file(VIEWS[name].light), Path(__file__).parent / "modelling" / "tissues.toml")
+        inputs = (environment_file(VIEWS[name].light), Path(__file__).parents[1] / "modelling" / "tissues.toml")
         params |= {"view": list(VIEWS[name])}
         function = varying if name in VARYING else candle
         found.append(Part(name, function, params, spp * size**2, inputs=inputs))
