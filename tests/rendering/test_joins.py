@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,7 +18,7 @@ mi = pytest.importorskip("mitsuba")
 
 import drjit as dr  # noqa: E402
 
-from halfspace_sss.rendering.walk.connect import Joins, find_joins  # noqa: E402
+from halfspace_sss.rendering.walk.connect import STEEPEST, Joins, find_joins  # noqa: E402
 from halfspace_sss.rendering.walk.media import WalkMedia  # noqa: E402
 from halfspace_sss.rendering.walk.steps import Event  # noqa: E402
 
@@ -42,14 +43,26 @@ class Beam(NamedTuple):
 
 
 def joins_of(lights: dict, g: float = 0.0, eta: float = 1.0, albedo: Any = ALBEDO, height: float = HEIGHT,
-             share: float = 1.0) -> Joins:  # fmt: skip
+             share: float = 1.0, shape: dict | None = None) -> Joins:  # fmt: skip
     """Of lights over a wide slab."""
     sigma_s, sigma_a = (",".join(f"{x:.9g}" for x in part) for part in (albedo * SIGMA_T, (1 - albedo) * SIGMA_T))
     at = mi.ScalarTransform4f()
-    slab = {"type": "cube", "to_world": at.translate([0, 0, -height / 2]).scale([60, 60, height / 2]),
-            "bsdf": {"type": "translucent", "sigma_s": sigma_s, "sigma_a": sigma_a, "g": g, "eta": eta}}  # fmt: skip
-    scene = mi.load_dict({"type": "scene", "slab": slab, **lights})
+    slab = {"type": "cube", "to_world": at.translate([0, 0, -height / 2]).scale([60, 60, height / 2])}
+    bsdf = {"type": "translucent", "sigma_s": sigma_s, "sigma_a": sigma_a, "g": g, "eta": eta}
+    scene = mi.load_dict({"type": "scene", "slab": {**(shape or slab), "bsdf": bsdf}, **lights})
     return find_joins(scene, WalkMedia.of(scene, 1.0), share)
+
+
+def slab_of_normal(path: Path, n: np.ndarray) -> dict:
+    """The wide slab, with the shading normal n on its top and geometric ones elsewhere."""
+    lines = [f"v {x} {y} {z}" for z in (-HEIGHT, 0) for x, y in ((-60, -60), (60, -60), (60, 60), (-60, 60))]
+    sides = [("1 4 3 2", [0, 0, -1]), ("5 6 7 8", n), ("1 2 6 5", [0, -1, 0]), ("2 3 7 6", [1, 0, 0]),
+             ("3 4 8 7", [0, 1, 0]), ("4 1 5 8", [-1, 0, 0])]  # fmt: skip
+    for k, (corners, normal) in enumerate(sides, 1):
+        a, b, c, d = (f"{corner}//{k}" for corner in corners.split())
+        lines += [f"vn {normal[0]} {normal[1]} {normal[2]}", f"f {a} {b} {c}", f"f {a} {c} {d}"]
+    path.write_text("\n".join(lines))
+    return {"type": "obj", "filename": str(path)}
 
 
 def brought(joins: Joins, depth: float, seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
@@ -128,26 +141,36 @@ def test_joins_follow_the_light_that_the_boundary_reflects(eta: float, theta: fl
     wanted = scattered(beams, depth, 0.4, albedo, height)
     assert (scattered(beams[1:], depth, 0.4, albedo, height) > 0.05 * wanted).all()
     joins = joins_of({"sun": sun(theta, 0.9)}, 0.4, eta, albedo, height)
-    agree(brought(joins, depth), wanted, known_to=0.02)
+    agree(brought(joins, depth), wanted, known_to=0.025)
 
 
-def test_joins_bring_the_light_of_a_point_from_every_place_that_it_reaches() -> None:
-    depth, g, intensity, lamp = 0.7, 0.3, 200.0, np.array([4.0, 3.0, 9.0])
+def test_shading_normals_bend_the_light_and_geometric_ones_hold_its_width(tmp_path) -> None:
+    """E (1 - F) cos_i / cos_t about the shading normal n of the top, along the ray that it refracts."""
+    eta, depth, g, w = 1.4, 0.6, 0.3, direction(35.0, 0.9)
+    n = direction(20.0, 0.9 + np.pi)
+    mu_i = float(w @ n)
+    mu, F = float(mu_internal(mu_i, eta)), float(F_r(np.float64(mu_i), eta))
+    d = (mu_i / eta - mu) * n - w / eta
+    beam = Beam(d, mu_i / mu * (1 - F) * np.exp(SIGMA_T * depth / d[2]))
+    albedo = 1e-4 * ALBEDO
+    joins = joins_of({"sun": sun(35.0, 0.9)}, g, eta, albedo, shape=slab_of_normal(tmp_path / "slab.obj", n))
+    agree(brought(joins, depth), scattered([beam], depth, g, albedo))
+
+
+def test_joins_bring_the_light_of_a_point_that_comes_steeply() -> None:
+    depth, g, intensity, lamp = 0.7, 0.3, 200.0, np.array([1.0, 0.5, 2.0])
     joins = joins_of({"lamp": {"type": "point", "position": lamp.tolist(), "intensity": intensity}}, g)
     u, solid = about_the_event()
-    t = (np.arange(400) + 0.5) * 0.02  # beyond which little comes
-    R = t * t / t[-1]
+    t = (np.arange(300) + 0.5) / 300
+    R, dR = 8 * t * t, 16 * t / 300  # beyond which little comes
     q = R[:, None, None, None] * u - [0, 0, depth]
     way = q - lamp
-    far = np.linalg.norm(way, axis=-1)
-    cosine = -way[..., 2] / far
-    reaches = (q[..., 2] < 0) & (cosine > 0)
+    far, straight = np.linalg.norm(way, axis=-1), -lamp - [0, 0, depth]
+    reaches = (q[..., 2] < 0) & (way @ straight > STEEPEST * far * np.linalg.norm(straight))
+    down = np.where(reaches, -way[..., 2] / far, 1)
     value = np.where(reaches, intensity / far**2, 0) * eval_hg(u @ ALONG, g) * eval_hg((way * -u).sum(axis=-1) / far, g)
-    lengths = R[:, None, None] - q[..., 2] / np.where(reaches, cosine, 1)
-    wanted = [
-        albedo * sigma * np.sum((0.04 * t / t[-1])[:, None, None] * solid * value * np.exp(-sigma * lengths))
-        for albedo, sigma in zip(ALBEDO, SIGMA_T)
-    ]
+    weights, lengths = dR[:, None, None] * solid * value, R[:, None, None] - q[..., 2] / down
+    wanted = [a * sigma * np.sum(weights * np.exp(-sigma * lengths)) for a, sigma in zip(ALBEDO, SIGMA_T)]
     agree(brought(joins, depth), np.array(wanted))
 
 
