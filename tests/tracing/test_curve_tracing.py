@@ -37,7 +37,7 @@ def test_curves_on_both_sides_of_the_plane_of_incidence_agree(medium):
 
 PI = math.pi
 SECTORS = {  # azimuth, half width and angle; where w_o is in the plane of incidence what lies beyond that counts too
-    PI: [(0.0, 0.5, 1.0), (1.25, 0.75, 3.0), (PI, PI - 2.0, 2 * (PI - 2.0))],
+    PI: [(0.0, 0.5, 1.0), (-1.25, 0.75, 3.0), (PI, PI - 2.0, 2 * (PI - 2.0))],
     1.1: [(-0.1, 0.7, 1.4), (1.6, 1.0, 2.0), (PI + 0.9, PI - 1.7, 2 * (PI - 1.7))],
 }
 
