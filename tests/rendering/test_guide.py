@@ -18,6 +18,7 @@ from halfspace_sss.rendering.walk.connect import find_joins  # noqa: E402
 from halfspace_sss.rendering.walk.guide import Departure, Guide  # noqa: E402
 from halfspace_sss.rendering.walk.media import WalkMedia  # noqa: E402
 from halfspace_sss.rendering.walk.steps import Event  # noqa: E402
+from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
 WIDEST_Z = 4.4  # two-sided 1e-5
 LANES, GRID = 2**17, 1200
@@ -87,8 +88,7 @@ def test_the_guide_and_chance_share_the_light_of_lamps_between_them() -> None:
         chance = np.array(found.share(mi.EmitterPtr(emitter), way, mi.Bool(True)))
         assert ((chance > 0) & (chance < 1)).all()
         whole, left = whole + solid * value.sum(axis=1), left + solid * (value * (1 - chance)).sum(axis=1)
-    rng = mi.PCG32(LANES, initseq=dr.arange(mi.UInt64, LANES))
-    L = np.array(found.light(event(found.media, LANES), rng))
+    L = np.array(found.light(event(found.media, LANES), generator(mi, LANES, pass_seed(1))))
     mean, error = L.mean(axis=1), L.std(axis=1, ddof=1) / np.sqrt(LANES)
     assert np.abs((mean - left) / np.hypot(error, 1e-3 * left)).max() < WIDEST_Z  # of the quadrature: the lamps' rims
     assert (error < 0.005 * left).all() and (left < 0.8 * whole).all()
