@@ -4,7 +4,8 @@
 
 Four cameras look at a ball under one lamp. From a wrong start, Gauss-Newton steps bring the images of the model to the
 given ones: forward derivatives of all images by albedo and mean free path, one pair for each channel, as no channel
-knows of another.
+knows of another. With these numbers the last three of ten steps are within 0.3 % of the albedos and 1.5 % of the mean
+free paths; an outlier of one pixel throws step 6 off, which step 8 has made up for.
 """
 
 from __future__ import annotations

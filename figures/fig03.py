@@ -70,9 +70,9 @@ def sampled(task: Task) -> dict[str, Any]:
 def _lanes(n: int, seed: int) -> Any:
     import mitsuba as mi
 
-    from halfspace_sss.tracing.walk import _generator, pass_seed
+    from halfspace_sss.tracing.walk import generator, pass_seed
 
-    return _generator(mi, n, pass_seed(seed))
+    return generator(mi, n, pass_seed(seed))
 
 
 def _exit(subject: Any, towards: list[float]) -> Any:

@@ -17,7 +17,7 @@ from full_geometry.first_event import first_event
 from full_geometry.patches import HIGHEST, Patches, PatchSampler, PatchWeights, cluster
 from full_geometry.subject import SurfacePoint, cosine_direction
 from halfspace_sss.rendering.surface.object import turned
-from halfspace_sss.tracing.walk import _generator, pass_seed
+from halfspace_sss.tracing.walk import generator, pass_seed
 
 __all__ = ["CELLS", "PatchTable"]
 
@@ -59,7 +59,7 @@ class PatchTable:
         faces = mi.UInt32(of_face)
         total = 0.0
         for k in range(EXITS):
-            rng = _generator(mi, n, pass_seed(51, k))
+            rng = generator(mi, n, pass_seed(51, k))
             u_face, u = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
             cell = dr.arange(mi.UInt32, n)
             at = subject.points.on_face(cell, u) if n == len(of_face) else parts.point(cell, u_face, u)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import os
+import warnings
 from importlib import resources
 from pathlib import Path
 
@@ -55,6 +56,20 @@ def truths() -> list[dict[str, str]]:
     """Rows of the packaged reference values."""
     text = resources.files("halfspace_sss.comparison").joinpath("data/truths.csv").read_text(encoding="utf-8")
     return list(csv.DictReader(line for line in text.splitlines() if not line.startswith("#")))
+
+
+@pytest.fixture
+def quiet_rgb():
+    """Our plugins under the variant llvm_ad_rgb of Mitsuba, without warnings."""
+    import mitsuba as mi
+
+    from halfspace_sss import rendering
+
+    mi.set_variant("llvm_ad_rgb")
+    rendering.register()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
 
 
 @pytest.fixture

@@ -82,7 +82,7 @@ def _above(subject: Subject) -> np.ndarray:
     """A point near the part of the surface that lies farthest towards the light."""
     import mitsuba as mi
 
-    from halfspace_sss.tracing.walk import _generator, pass_seed
+    from halfspace_sss.tracing.walk import generator, pass_seed
 
-    p = np.array(subject.random_points(_generator(mi, 4096, pass_seed(23))).p)
+    p = np.array(subject.random_points(generator(mi, 4096, pass_seed(23))).p)
     return p[:, np.argmax(TOWARDS @ p)] + GAP * float(subject.found.size) * TOWARDS

@@ -15,7 +15,7 @@ from full_geometry.learning.exits import trace_exits
 from full_geometry.patches import Patches
 from full_geometry.subject import Subject
 from halfspace_sss.rendering.transport.protocols import Entry
-from halfspace_sss.tracing.walk import _generator, pass_seed
+from halfspace_sss.tracing.walk import generator, pass_seed
 
 __all__ = ["Walks", "flow_walks"]
 
@@ -62,7 +62,7 @@ def flow_walks(
     import drjit as dr
     import mitsuba as mi
 
-    rng = _generator(mi, n, pass_seed(*seed, 0))
+    rng = generator(mi, n, pass_seed(*seed, 0))
     starts = subject.random_points(rng)
     exits = trace_exits(subject, starts, (*seed, 1))
     T = exits.T

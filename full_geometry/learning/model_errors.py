@@ -24,7 +24,7 @@ from full_geometry.subject import Subject, SurfacePoint
 from halfspace_sss.checks import check_count
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.progress import NamedProgress
-from halfspace_sss.tracing.walk import _generator, pass_seed
+from halfspace_sss.tracing.walk import generator, pass_seed
 
 __all__ = ["LIGHTS", "ModelError", "Reference", "Transport", "compare", "errors", "errors_of", "measure", "reference"]
 
@@ -122,7 +122,7 @@ def reference(subject: Subject, exits: int = 256, walks: int = 8192, seed: int =
 
     for name, value, least in (("exits", exits, 2), ("walks", walks, 2), ("seed", seed, 0)):
         check_count(name, value, least)
-    points = subject.random_points(_generator(mi, exits, pass_seed(seed, 17)))
+    points = subject.random_points(generator(mi, exits, pass_seed(seed, 17)))
     dr.eval(points)
     sums = _Sums(exits)
     for k, per_exit in enumerate(_passes(exits, walks)):
@@ -156,7 +156,7 @@ def modelled(transport: Transport, proposals: Proposals, exits: SurfacePoint, sa
     sums = _Sums(n)
     for k, per_exit in enumerate(_passes(n, samples)):
         points = _repeated(exits, per_exit)
-        rng = _generator(mi, n * per_exit, pass_seed(seed, 19, k))
+        rng = generator(mi, n * per_exit, pass_seed(seed, 19, k))
         entries, weight = proposals.sample(points, rng)
         value = transport.S(transport.prepare(points), entries, weight > 0) * weight
         dr.eval(value, entries)

@@ -18,7 +18,7 @@ from full_geometry.subject import Subject, SurfacePoint, cosine_direction
 from halfspace_sss.rendering.transport.plane import Exit, number
 from halfspace_sss.rendering.transport.positions import PositionSampler
 from halfspace_sss.rendering.transport.radial_table import RadialTable
-from halfspace_sss.tracing.walk import _generator, pass_seed
+from halfspace_sss.tracing.walk import generator, pass_seed
 
 __all__ = ["Pairs", "PairSource", "Proposals", "shuffled"]
 
@@ -126,7 +126,7 @@ class PairSource:
         """n walks of random exits; those that left at an order that counts, T as values."""
         import mitsuba as mi
 
-        rng = _generator(mi, n, pass_seed(*seed, 0))
+        rng = generator(mi, n, pass_seed(*seed, 0))
         starts = self.subject.random_points(rng)
         return self.ended(starts, trace_exits(self.subject, starts, (*seed, 1)))
 
@@ -157,7 +157,7 @@ class PairSource:
         """
         import mitsuba as mi
 
-        rng = _generator(mi, n, pass_seed(*seed, 2))
+        rng = generator(mi, n, pass_seed(*seed, 2))
         starts = starts or self.subject.random_points(rng)
         entries, weight = self.proposals.with_patches(patches).sample(starts, rng)
         return self._columns(starts, entries, weight)

@@ -18,7 +18,7 @@ from full_geometry.paper.lights import measured_lights
 from full_geometry.paper.network import PaperNetwork, Samples, placed, walk_samples
 from full_geometry.subject import Subject, SurfacePoint
 from halfspace_sss.checks import check_choice, check_count
-from halfspace_sss.tracing.walk import _generator, pass_seed
+from halfspace_sss.tracing.walk import generator, pass_seed
 
 __all__ = ["POINTS", "estimate", "paper_errors"]
 
@@ -70,7 +70,7 @@ def uniform_samples(subject: Subject, frame: Frame, exits: SurfacePoint, n: int,
     import mitsuba as mi
 
     m: Any = dr.width(exits.p)
-    at = subject.random_points(_generator(mi, m * n, pass_seed(*seed)))
+    at = subject.random_points(generator(mi, m * n, pass_seed(*seed)))
     w = np.array(at.w, dtype=np.float32).T.reshape(m, n, 3)
     points = placed(frame, at, m * n).reshape(m, n, 5)
     return Samples(placed(frame, exits, m), points, w, np.zeros((m, n, len(subject.media)), np.float32))

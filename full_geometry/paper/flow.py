@@ -20,7 +20,7 @@ from full_geometry.model import FullGeometry
 from full_geometry.paper.network import placed
 from full_geometry.subject import Subject, SurfacePoint
 from halfspace_sss.checks import check_interval
-from halfspace_sss.tracing.walk import _generator, pass_seed
+from halfspace_sss.tracing.walk import generator, pass_seed
 
 __all__ = ["SpaceFlow", "fit_space_flow", "incidence", "mesh_arrays", "on_surface", "rmsd"]
 
@@ -104,9 +104,9 @@ def _pairs(model: FullGeometry, frame: Frame, seed: tuple[int, ...]) -> tuple[np
     import mitsuba as mi
 
     n = PAIRS * POINTS
-    exits = model.subject.random_points(_generator(mi, PAIRS, pass_seed(*seed, 0)))
+    exits = model.subject.random_points(generator(mi, PAIRS, pass_seed(*seed, 0)))
     exits = exits.gather(dr.arange(mi.UInt32, n) // POINTS)
-    points = model.subject.random_points(_generator(mi, n, pass_seed(*seed, 1)))
+    points = model.subject.random_points(generator(mi, n, pass_seed(*seed, 1)))
     t = incidence(model, exits, points)
     return placed(frame, exits, n), placed(frame, points, n)[:, :3], (t / t.mean()).astype(np.float32)
 

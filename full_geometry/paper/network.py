@@ -21,7 +21,7 @@ from full_geometry.learning.exits import trace_exits
 from full_geometry.paper.lights import Light, random_lights
 from full_geometry.subject import Subject, SurfacePoint
 from halfspace_sss.checks import check_count, check_interval
-from halfspace_sss.tracing.walk import _generator, pass_seed
+from halfspace_sss.tracing.walk import generator, pass_seed
 
 __all__ = ["PaperNetwork", "PaperRecipe", "Samples", "fit_paper", "walk_samples"]
 
@@ -153,8 +153,8 @@ def fit_paper(
         return spent or below >= FOR_STEPS
 
     while not ends():
-        generator = _generator(mi, recipe.exits, pass_seed(seed, 81, chunk))
-        samples = walk_samples(subject, frame, subject.random_points(generator), recipe.n, (seed, 82, chunk))
+        exits = subject.random_points(generator(mi, recipe.exits, pass_seed(seed, 81, chunk)))
+        samples = walk_samples(subject, frame, exits, recipe.n, (seed, 82, chunk))
         for _ in range(recipe.reuse):
             for rows in np.array_split(rng.permutation(recipe.exits), max(recipe.exits // recipe.batch, 1)):
                 error = _step(net, adam, samples, rows, rng)

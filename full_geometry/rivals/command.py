@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from halfspace_sss.checks import check_choice, check_count, check_interval
-from halfspace_sss.cli.shared import Bar, Define, Variant, console, defined, use_mitsuba, whole
+from halfspace_sss.cli.shared import Bar, Define, ObjectId, OutFolder, Variant, console, defined, use_mitsuba, whole
 from halfspace_sss.provenance import check_folder, write_together
 
 if TYPE_CHECKING:
@@ -21,9 +21,7 @@ TABLES = ("errors", "samplers")
 
 def rivals_command(
     scene: Annotated[Path, typer.Option(help="Mitsuba XML file with the object.")],
-    object: Annotated[
-        str | None, typer.Option(help="Its id in the scene.", show_default="the only translucent one")
-    ] = None,
+    object: ObjectId = None,
     table: Annotated[
         list[str] | None, typer.Option(help="errors or samplers; repeat for both.", show_default="both")
     ] = None,
@@ -32,9 +30,7 @@ def rivals_command(
     seed: Annotated[int, typer.Option(help="Seed of everything.", parser=whole)] = 0,
     define: Define = None,
     variant: Variant = "llvm_ad_rgb",
-    out: Annotated[Path, typer.Option(help="Folder for the files; those of the same names are replaced.")] = Path(
-        "rivals"
-    ),
+    out: OutFolder = Path("rivals"),
 ) -> None:
     """Compare ways of drawing entries by variance x time, and models of an object by errors, at equal CPU time."""
     chosen = table or list(TABLES)

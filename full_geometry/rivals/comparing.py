@@ -23,7 +23,7 @@ from halfspace_sss.backend import kernel_seconds
 from halfspace_sss.rendering.surface.object import turned
 from halfspace_sss.rendering.transport.plane import Exit, number
 from halfspace_sss.rendering.transport.protocols import Means
-from halfspace_sss.tracing.walk import _generator, pass_seed
+from halfspace_sss.tracing.walk import generator, pass_seed
 
 __all__ = ["Cost", "Spread", "costs", "spread"]
 
@@ -63,7 +63,7 @@ def _exits(subject: Subject, n: int, repeated: int, seed: int) -> _Exits:
     import drjit as dr
     import mitsuba as mi
 
-    rng = Numbers(_generator(mi, n, pass_seed(seed, 31)))
+    rng = Numbers(generator(mi, n, pass_seed(seed, 31)))
     at = subject.points.sample(rng.next_1d(), rng.next_2d(), True)
     sign = number(subject.found.sign)
     n_out = mi.Normal3f(turned(at.n_shading, at.n) * sign)
@@ -110,7 +110,7 @@ def spread(
     passes = max(samples // per_pass, 1)
     lanes = _exits(subject, exits, per_pass, seed)
     for k in range(passes):
-        rng = Numbers(_generator(mi, exits * per_pass, pass_seed(seed, 32, k)))
+        rng = Numbers(generator(mi, exits * per_pass, pass_seed(seed, 32, k)))
         found = _estimates(means, light, lanes, rng, 1)
         rows = [dr.block_sum(v, per_pass) for x in found for v in (x, x * x)]
         dr.eval(rows)
@@ -128,7 +128,7 @@ def costs(subject: Subject, all_means: Mapping[str, Means], light: Lighting) -> 
     import mitsuba as mi
 
     lanes = _exits(subject, TIMED_LANES, 1, 5)
-    rng = _generator(mi, TIMED_LANES, pass_seed(6))
+    rng = generator(mi, TIMED_LANES, pass_seed(6))
     dr.eval(rng.state, rng.inc)
     best = {(name, n): np.inf for name in all_means for n in (1, MANY)}
     for k in range(REPEATS + 1):  # the first compiles

@@ -9,7 +9,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from halfspace_sss.cli.shared import Albedo, Backend, Bar, Eta, MeanCosine, SigmaT, console, stated_medium, whole
+from halfspace_sss.cli.shared import (
+    Albedo,
+    Backend,
+    Bar,
+    Eta,
+    MeanCosine,
+    OutFolder,
+    SigmaT,
+    console,
+    stated_medium,
+    whole,
+)
 from halfspace_sss.provenance import check_folder, provenance, write_together
 
 if TYPE_CHECKING:
@@ -45,9 +56,7 @@ def ablation_command(
     seeds: Annotated[int, typer.Option(help="Trainings of each variant.", parser=whole)] = 3,
     seed: Annotated[int, typer.Option(help="Seed of the maps, and the first of the trainings.", parser=whole)] = 0,
     backend: Backend = "llvm",
-    out: Annotated[Path, typer.Option(help="Folder for the files; those of the same names are replaced.")] = Path(
-        "ablation"
-    ),
+    out: OutFolder = Path("ablation"),
 ) -> None:
     """Train the paper's network, `neural_material` and what lies between them, at equal time and at equal data."""
     if find_spec("torch") is None:

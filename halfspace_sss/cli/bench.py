@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from halfspace_sss.checks import did_you_mean
-from halfspace_sss.cli.shared import Bar, console
+from halfspace_sss.cli.shared import Bar, OutFolder, console
 from halfspace_sss.provenance import check_folder, provenance, write_together
 
 if TYPE_CHECKING:
@@ -57,9 +57,7 @@ def chosen_parts(text: str | None) -> list[str]:
 def bench_command(
     only: Annotated[str | None, typer.Option(help="Parts, of walk,volpath,models,maps.", show_default="all")] = None,
     quick: Annotated[bool, typer.Option("--quick", help="Small runs that only show that everything works.")] = False,
-    out: Annotated[Path, typer.Option(help="Folder for the files; those of the same names are replaced.")] = Path(
-        "bench"
-    ),
+    out: OutFolder = Path("bench"),
 ) -> None:
     """Measure speed: events and paths per second, equal-error time of volpath, evaluations of models, maps."""
     parts, notes = chosen_parts(only), []

@@ -14,6 +14,7 @@ from halfspace_sss.cli.shared import (
     Bar,
     Eta,
     MeanCosine,
+    OutFolder,
     SigmaT,
     console,
     numbers,
@@ -54,9 +55,7 @@ def curves_command(
     ] = None,
     seed: Annotated[int, typer.Option(help="Seed of the tracer.", parser=whole)] = 0,
     backend: Backend = "llvm",
-    out: Annotated[Path, typer.Option(help="Folder for the files; those of the same names are replaced.")] = Path(
-        "curves"
-    ),
+    out: OutFolder = Path("curves"),
 ) -> None:
     """Compare curves of S, path traced and by every model; without arguments the setting of Fig. 10."""
     from halfspace_sss.comparison.reflectance_curves import curves

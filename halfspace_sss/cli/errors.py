@@ -13,10 +13,15 @@ from halfspace_sss.backend import array_types
 from halfspace_sss.checks import check_choice
 from halfspace_sss.cli.shared import (
     Albedo,
+    Backend,
     Bar,
+    Channels,
     Define,
     Eta,
+    Materials,
     MeanCosine,
+    ObjectId,
+    OutFolder,
     SigmaT,
     Variant,
     by_channel,
@@ -27,7 +32,7 @@ from halfspace_sss.cli.shared import (
     stated_medium,
     use_mitsuba,
     whole,
-)  # fmt: skip
+)
 from halfspace_sss.provenance import check_folder
 
 if TYPE_CHECKING:
@@ -52,10 +57,8 @@ OBJECT_DEFINITION = (
 
 
 def errors_command(
-    material: Annotated[
-        list[str] | None, typer.Argument(help="Names of materials; see `halfspace-sss materials`.")
-    ] = None,
-    channel: Annotated[str | None, typer.Option(help="Only these, as R,B.", show_default="all")] = None,
+    material: Materials = None,
+    channel: Channels = None,
     registry: Annotated[bool, typer.Option("--registry", help="All registered materials, every channel.")] = False,
     held_out: Annotated[
         int | None, typer.Option(help="This many random media over the range of `neural`.", parser=whole)
@@ -69,9 +72,7 @@ def errors_command(
     scene: Annotated[
         Path | None, typer.Option(help="Mitsuba XML file: radiance of an object of it against walks instead.")
     ] = None,
-    object: Annotated[
-        str | None, typer.Option(help="Its id in the scene.", show_default="the only translucent one")
-    ] = None,
+    object: ObjectId = None,
     sigma_t: SigmaT = None,
     albedo: Albedo = None,
     g: MeanCosine = None,
@@ -80,12 +81,10 @@ def errors_command(
     events: Annotated[float, typer.Option(help="Scattering events of the reference for each medium.")] = EVENTS,
     block: Annotated[int, typer.Option(help="Cells put together for the comparison, in distance and azimuth.")] = BLOCK,
     seed: Annotated[int, typer.Option(help="Seed of media, directions and walks.", parser=whole)] = 0,
-    backend: Annotated[str, typer.Option(help="llvm or cuda.")] = BACKEND,
+    backend: Backend = BACKEND,
     define: Define = None,
     variant: Variant = VARIANT,
-    out: Annotated[Path, typer.Option(help="Folder for the files; those of the same names are replaced.")] = Path(
-        "errors"
-    ),
+    out: OutFolder = Path("errors"),
 ) -> None:
     """Compare models with path tracing over all directions: error, bias, decades of r; written as CSV and JSON."""
     from halfspace_sss.comparison import held_out as tables

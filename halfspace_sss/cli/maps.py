@@ -14,6 +14,7 @@ from halfspace_sss.cli.shared import (
     Backend,
     Bar,
     Eta,
+    Materials,
     MeanCosine,
     SigmaT,
     by_channel,
@@ -37,9 +38,7 @@ TARGET_ERROR = 0.05
 
 
 def maps_command(
-    material: Annotated[
-        list[str] | None, typer.Argument(help="Names of materials; see `halfspace-sss materials`.")
-    ] = None,
+    material: Materials = None,
     channel: Annotated[
         str | None, typer.Option(help="Only these, as R,B, a store each.", show_default="all in one store")
     ] = None,

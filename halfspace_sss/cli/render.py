@@ -10,7 +10,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from halfspace_sss.backend import BackendError
-from halfspace_sss.cli.shared import Bar, Define, Variant, console, defined, tell, use_mitsuba, whole
+from halfspace_sss.cli.shared import (
+    Bar,
+    Define,
+    OutFolder,
+    SampleSeed,
+    SensorNumber,
+    Variant,
+    console,
+    defined,
+    tell,
+    use_mitsuba,
+    whole,
+)
 from halfspace_sss.extensions import renderer
 from halfspace_sss.provenance import check_folder, replace_together, write_atomically
 
@@ -43,8 +55,8 @@ def render_command(
     ] = None,
     target_error: Annotated[float | None, typer.Option(help="Stop at this relative error of the image.")] = None,
     seconds: Annotated[float | None, typer.Option(help="Stop after this time of rendering.")] = None,
-    seed: Annotated[int, typer.Option(help="Seed of the samples.", parser=whole)] = 0,
-    sensor: Annotated[int, typer.Option(help="Number of the sensor.", parser=whole)] = 0,
+    seed: SampleSeed = 0,
+    sensor: SensorNumber = 0,
     define: Define = None,
     train_seconds: Annotated[
         float | None,
@@ -58,9 +70,7 @@ def render_command(
         bool, typer.Option("--resume", help="Go on with the unfinished or finished render of the same settings.")
     ] = False,
     variant: Variant = "llvm_ad_rgb",
-    out: Annotated[Path, typer.Option(help="Folder for the files; those of the same names are replaced.")] = Path(
-        "render"
-    ),
+    out: OutFolder = Path("render"),
 ) -> None:
     """Render a scene: NAME_MODEL.exr with variance, .png, and .html; error, samples and time are printed.
 

@@ -7,6 +7,7 @@ import inspect
 import math
 import signal
 from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -19,33 +20,12 @@ if TYPE_CHECKING:
     from halfspace_sss.physics.medium import Medium
 
 __all__ = [
-    "FIG10", "Albedo", "Backend", "Bar", "Define", "Eta", "MeanCosine", "SigmaT", "Variant", "by_channel",
-    "check_channel", "check_left_out", "console", "defined", "numbers", "stated_medium", "tell", "use_mitsuba", "whole",
-    "with_quiet",
+    "FIG10", "Albedo", "Backend", "Bar", "Channels", "Define", "Eta", "Materials", "MeanCosine", "ObjectId",
+    "OutFolder", "SampleSeed", "SensorNumber", "SigmaT", "Variant", "by_channel", "check_channel", "check_left_out",
+    "console", "defined", "numbers", "stated_medium", "tell", "use_mitsuba", "whole", "with_quiet",
 ]  # fmt: skip
 
 FIG10 = {"sigma_t": 0.241, "albedo": 0.75, "g": 0.0, "eta": 1.3}
-
-
-SigmaT = Annotated[float | None, typer.Option(help="Extinction, 1/mm.", show_default="0.241")]
-Albedo = Annotated[float | None, typer.Option(help="Single-scattering albedo.", show_default="0.75")]
-MeanCosine = Annotated[float | None, typer.Option(help="Mean cosine of the phase function.", show_default="0")]
-Eta = Annotated[float | None, typer.Option(help="Index inside over outside.", show_default="1.3")]
-Backend = Annotated[str, typer.Option(help="llvm or cuda.")]
-VARIANTS = ("llvm_ad_rgb", "llvm_ad_mono", "cuda_ad_rgb", "cuda_ad_mono")
-Variant = Annotated[str, typer.Option(help="Variant of Mitsuba.")]
-Define = Annotated[
-    list[str] | None,
-    typer.Option("--define", "-D", help="Value of $NAME in the scene; repeat for more.", metavar="NAME=VALUE"),
-]
-
-
-def numbers(name: str, text: str) -> list[float]:
-    """Comma-separated numbers; ValueError with the name of the option."""
-    try:
-        return [float(part) for part in text.split(",")]
-    except ValueError:
-        raise ValueError(f"{name} must be numbers separated by commas, got {text!r}") from None
 
 
 def whole(text: str | int) -> int:
@@ -61,6 +41,33 @@ def whole(text: str | int) -> int:
     if not value.is_integer():
         raise typer.BadParameter(f"{text!r} is not a whole number.")
     return int(value)
+
+
+SigmaT = Annotated[float | None, typer.Option(help="Extinction, 1/mm.", show_default="0.241")]
+Albedo = Annotated[float | None, typer.Option(help="Single-scattering albedo.", show_default="0.75")]
+MeanCosine = Annotated[float | None, typer.Option(help="Mean cosine of the phase function.", show_default="0")]
+Eta = Annotated[float | None, typer.Option(help="Index inside over outside.", show_default="1.3")]
+Materials = Annotated[list[str] | None, typer.Argument(help="Names of materials; see `halfspace-sss materials`.")]
+Channels = Annotated[str | None, typer.Option(help="Only these, as R,B.", show_default="all")]
+ObjectId = Annotated[str | None, typer.Option(help="Its id in the scene.", show_default="the only translucent one")]
+SensorNumber = Annotated[int, typer.Option(help="Number of the sensor.", parser=whole)]
+SampleSeed = Annotated[int, typer.Option(help="Seed of the samples.", parser=whole)]
+OutFolder = Annotated[Path, typer.Option(help="Folder for the files; those of the same names are replaced.")]
+Backend = Annotated[str, typer.Option(help="llvm or cuda.")]
+VARIANTS = ("llvm_ad_rgb", "llvm_ad_mono", "cuda_ad_rgb", "cuda_ad_mono")
+Variant = Annotated[str, typer.Option(help="Variant of Mitsuba.")]
+Define = Annotated[
+    list[str] | None,
+    typer.Option("--define", "-D", help="Value of $NAME in the scene; repeat for more.", metavar="NAME=VALUE"),
+]
+
+
+def numbers(name: str, text: str) -> list[float]:
+    """Comma-separated numbers; ValueError with the name of the option."""
+    try:
+        return [float(part) for part in text.split(",")]
+    except ValueError:
+        raise ValueError(f"{name} must be numbers separated by commas, got {text!r}") from None
 
 
 def stated_medium(materials: list[str], given: dict[str, float | None]) -> Medium | None:

@@ -11,9 +11,12 @@ import typer
 from halfspace_sss.cli.shared import (
     Albedo,
     Bar,
+    Channels,
     Define,
     Eta,
+    Materials,
     MeanCosine,
+    ObjectId,
     SigmaT,
     Variant,
     by_channel,
@@ -38,10 +41,8 @@ SHAPE_VARIANT = "llvm_ad_mono"
 
 
 def train_command(
-    material: Annotated[
-        list[str] | None, typer.Argument(help="Names of materials; see `halfspace-sss materials`.")
-    ] = None,
-    channel: Annotated[str | None, typer.Option(help="Only these, as R,B.", show_default="all")] = None,
+    material: Materials = None,
+    channel: Channels = None,
     universal: Annotated[bool, typer.Option("--universal", help="Train the network for all media instead.")] = False,
     shapes: Annotated[
         bool, typer.Option("--shapes", help="Train the network for all shapes and media instead.")
@@ -52,9 +53,7 @@ def train_command(
     scene: Annotated[
         Path | None, typer.Option(help="Mitsuba XML file: train an object of it instead, which `render` then knows.")
     ] = None,
-    object: Annotated[
-        str | None, typer.Option(help="Its id in the scene.", show_default="the only translucent one")
-    ] = None,
+    object: ObjectId = None,
     seconds: Annotated[
         float | None,
         typer.Option(help="Time for an object or all shapes, without compiling.", show_default="60, 600"),

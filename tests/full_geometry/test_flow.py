@@ -33,7 +33,7 @@ from full_geometry.patches import cluster, mesh_faces  # noqa: E402
 from full_geometry.storing import CENTRES, add_flow, load, save  # noqa: E402
 from full_geometry.subject import SurfacePoint  # noqa: E402
 from halfspace_sss.rendering.transport.plane import Exit  # noqa: E402
-from halfspace_sss.tracing.walk import _generator, pass_seed  # noqa: E402
+from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
 N_PATCHES = 24
 
@@ -54,11 +54,11 @@ def sampler() -> FlowSampler:
 
 def shaken(n: int, strength: float = 2.0) -> FlowNetwork:
     """A flow far from the uniform one that it starts as."""
-    net, generator = FlowNetwork(n, N_CONTEXT, (16, 16), 1), torch.Generator().manual_seed(3)
+    net, numbers = FlowNetwork(n, N_CONTEXT, (16, 16), 1), torch.Generator().manual_seed(3)
     with torch.no_grad():
         layer = net.transform.hyper[-1]
-        layer.weight.copy_(strength * torch.randn(layer.weight.shape, generator=generator))
-        layer.bias.copy_(torch.randn(layer.bias.shape, generator=generator))
+        layer.weight.copy_(strength * torch.randn(layer.weight.shape, generator=numbers))
+        layer.bias.copy_(torch.randn(layer.bias.shape, generator=numbers))
     return net
 
 
@@ -136,7 +136,7 @@ def test_uniform_coordinates_are_uniform_over_a_patch(sampler: FlowSampler) -> N
 
 def draws(sampler: FlowSampler, n: int) -> tuple:
     subject = sampler.chart.subject
-    at = subject.random_points(_generator(mi, 1, pass_seed(4))).gather(dr.zeros(mi.UInt32, n))
+    at = subject.random_points(generator(mi, 1, pass_seed(4))).gather(dr.zeros(mi.UInt32, n))
     side = Side(at, first_event(subject, at))
     weights = sampler.patches.prepare(side)
     u = floats(uniform(n, 3, 12))
@@ -168,7 +168,7 @@ def test_entries_weighted_by_their_density_cover_the_area(sampler: FlowSampler, 
 
 def test_directions_come_back_from_their_square() -> None:
     n = 4096
-    rng = _generator(mi, n, pass_seed(13))
+    rng = generator(mi, n, pass_seed(13))
     normal = mi.warp.square_to_uniform_sphere(mi.Point2f(rng.next_float32(), rng.next_float32()))
     towards = mi.warp.square_to_uniform_sphere(mi.Point2f(rng.next_float32(), rng.next_float32()))
     u = floats(uniform(n, 2, 14))
@@ -182,7 +182,7 @@ class Numbers:
     """Uniform numbers as Mitsuba's samplers name them."""
 
     def __init__(self, n: int, seed: int) -> None:
-        self.rng = _generator(mi, n, pass_seed(seed))
+        self.rng = generator(mi, n, pass_seed(seed))
 
     def next_1d(self):
         return self.rng.next_float32()

@@ -10,7 +10,7 @@ import pytest
 
 from halfspace_sss import Medium, trace
 from halfspace_sss.physics.fresnel import F_t
-from halfspace_sss.tracing.walk import _generator, pass_seed
+from halfspace_sss.tracing.walk import generator, pass_seed
 
 mi = pytest.importorskip("mitsuba")
 
@@ -32,7 +32,7 @@ def ball(medium: Medium, radius: float) -> Subject:
 
 
 def starts(subject: Subject, n: int = N, seed: int = 1) -> SurfacePoint:
-    return subject.random_points(_generator(mi, n, pass_seed(seed)))
+    return subject.random_points(generator(mi, n, pass_seed(seed)))
 
 
 def mean_and_error(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

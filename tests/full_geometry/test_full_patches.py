@@ -27,7 +27,7 @@ from full_geometry.learning.training import train  # noqa: E402
 from full_geometry.patch_table import PatchTable  # noqa: E402
 from full_geometry.patches import Patches, PatchSampler, cluster, mesh_faces  # noqa: E402
 from full_geometry.subject import Subject, SurfacePoint, cosine_direction  # noqa: E402
-from halfspace_sss.tracing.walk import _generator, pass_seed  # noqa: E402
+from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
 N_PATCHES = 64
 
@@ -49,13 +49,13 @@ def sampler(subject: Subject) -> PatchSampler:
 
 
 def one_exit(subject: Subject, lanes: int) -> Side:
-    point = subject.random_points(_generator(mi, 1, pass_seed(4)))
+    point = subject.random_points(generator(mi, 1, pass_seed(4)))
     at = point.gather(dr.zeros(mi.UInt32, lanes))
     return Side(at, first_event(subject, at))
 
 
 def draws(subject: Subject, sampler: PatchSampler, n: int = 2**17) -> tuple:
-    rng = _generator(mi, n, pass_seed(9))
+    rng = generator(mi, n, pass_seed(9))
     weights = sampler.prepare(one_exit(subject, n))
     u = (rng.next_float32(), rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32()))
     point, density = sampler.sample(weights, *u)
@@ -102,7 +102,7 @@ def test_samples_lie_on_their_face(subject: Subject, sampler: PatchSampler) -> N
 
 @pytest.mark.parametrize("cells", [256, 2**20])
 def test_faces_are_drawn_by_the_density_of_a_table(subject: Subject, sampler: PatchSampler, cells: int) -> None:
-    table, rng, n = PatchTable(sampler, cells), _generator(mi, 2**17, pass_seed(14)), len(mesh_faces(subject)[2])
+    table, rng, n = PatchTable(sampler, cells), generator(mi, 2**17, pass_seed(14)), len(mesh_faces(subject)[2])
     u = (rng.next_float32(), rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32()))
     point, drawn = sampler.sample(table.weights(mi.UInt32(77)), *u)
     faces, areas = np.array(point.prim_index), mesh_faces(subject)[2]
@@ -144,8 +144,8 @@ def test_learnt_weights_lower_the_variance_below_that_of_uniform_points(subject:
     found = train(subject.found.shape, WAX.scaled(1.5), chunks=6, recipe=recipe, folder=tmp_path)
     assert sum(path.stat().st_size for path in tmp_path.glob("*.safetensors")) < 100_000
     inside, n = found.model.subject, 2**15
-    rng = _generator(mi, n, pass_seed(5))
-    exits = inside.random_points(_generator(mi, 64, pass_seed(6))).gather(dr.arange(mi.UInt32, n) // (n // 64))
+    rng = generator(mi, n, pass_seed(5))
+    exits = inside.random_points(generator(mi, 64, pass_seed(6))).gather(dr.arange(mi.UInt32, n) // (n // 64))
     prepared = found.model.prepare(exits)
     weights = found.sampler.prepare(prepared.side)
     u = (rng.next_float32(), rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32()))
@@ -168,10 +168,10 @@ def entry_at(subject: Subject, point, rng):
 def test_probes_and_patches_together_give_the_estimate_of_each_alone(subject: Subject, sampler: PatchSampler) -> None:
     half_space = HalfSpace(subject, "better_dipole")
     alone = Proposals(subject, half_space, 0.4)
-    exits = subject.random_points(_generator(mi, 2**17, pass_seed(12)))
+    exits = subject.random_points(generator(mi, 2**17, pass_seed(12)))
     means, errors = [], []
     for k, proposals in enumerate((alone, alone.with_patches(sampler))):
-        entries, weight = proposals.sample(exits, _generator(mi, 2**17, pass_seed(13, k)))
+        entries, weight = proposals.sample(exits, generator(mi, 2**17, pass_seed(13, k)))
         near = dr.exp(-0.1 * dr.squared_norm(entries.p - exits.p))  # any function of the two points
         values = np.array(near * weight, dtype=float)
         means.append(values.mean())

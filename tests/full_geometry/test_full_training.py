@@ -30,7 +30,7 @@ from full_geometry.learning.training import Trained, train  # noqa: E402
 from full_geometry.model import FullGeometry  # noqa: E402
 from full_geometry.subject import Subject, SurfacePoint  # noqa: E402
 from halfspace_sss import rendering  # noqa: E402
-from halfspace_sss.tracing.walk import _generator, pass_seed  # noqa: E402
+from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
 QUICK = Recipe(width=24, depth=2, batch=1024, chunk=2**14, reuse=4)
 WAX = Medium(np.array([0.95, 0.8, 0.6]), np.array([0.05, 0.2, 0.4]), 0.0, 1.4)
@@ -82,7 +82,7 @@ def test_the_file_gives_the_same_model_again(trained: Trained) -> None:
 
 
 def points_of(model: FullGeometry, n: int = 4096) -> list[SurfacePoint]:
-    rng = _generator(mi, n, pass_seed(7))
+    rng = generator(mi, n, pass_seed(7))
     return [model.subject.random_points(rng) for _ in range(2)]
 
 
@@ -93,7 +93,7 @@ def S_of(model: FullGeometry, points: list[SurfacePoint] | None = None) -> np.nd
 
 def test_features_of_the_way_back_are_those_of_exit_and_entry_exchanged() -> None:
     subject = Subject.of(mi.load_dict(bunny()), WAX)
-    frame, rng = frame_of(subject), _generator(mi, 256, pass_seed(8))
+    frame, rng = frame_of(subject), generator(mi, 256, pass_seed(8))
     a, b = (Side(at, first_event(subject, at)) for at in (subject.random_points(rng), subject.random_points(rng)))
 
     def features(exit: Side, entry: Side) -> np.ndarray:
@@ -141,7 +141,7 @@ def test_no_training_gives_the_half_space_with_a_warning(tmp_path: Path) -> None
         found = train(ball(200.0), WAX, seconds=0, folder=tmp_path)
     assert found.path is None and not list(tmp_path.iterdir())
     plane = HalfSpaceTransport(found.model.subject, "better_dipole")
-    exits, entries = (found.model.subject.random_points(_generator(mi, 64, pass_seed(k))) for k in (1, 2))
+    exits, entries = (found.model.subject.random_points(generator(mi, 64, pass_seed(k))) for k in (1, 2))
     near = entries._replace(p=exits.p + 0.5 * mi.Vector3f(mi.coordinate_system(exits.n)[0]), n=exits.n, n_out=exits.n)
     near = near._replace(w=exits.n)
     S, S_0 = (np.array(t.S(t.prepare(exits), near)) for t in (found.model, plane))

@@ -27,7 +27,7 @@ from full_geometry.subject import Subject, SurfacePoint  # noqa: E402
 from halfspace_sss import rendering  # noqa: E402
 from halfspace_sss.neural import trained as known_weights  # noqa: E402
 from halfspace_sss.rendering.scenes.scene_files import load_objects, load_scene  # noqa: E402
-from halfspace_sss.tracing.walk import _generator, pass_seed  # noqa: E402
+from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
 BUNNY = Path(__file__).parents[2] / "figures" / "assets" / "bunny.ply"
 QUICK = Recipe(width=32, depth=2, batch=1024, chunk=2**15, reuse=4)
@@ -108,7 +108,7 @@ def test_a_grid_of_one_value_gives_the_first_event_of_the_homogeneous_medium() -
     plain = {"sigma_t": "2.0", "scale": 1.0, "albedo": "0.9, 0.8, 0.7"}
     same = subject_of(density=np.full((2, 2, 2, 1), 0.4), albedo="0.9, 0.8, 0.7")
     known = subject_of(**plain)
-    at = known.random_points(_generator(mi, 2048, pass_seed(4)))
+    at = known.random_points(generator(mi, 2048, pass_seed(4)))
     a, b = first_event(same, at), first_event(known, at)
     assert np.allclose(np.array(a.P), np.array(b.P), atol=2e-3)
     assert np.allclose(np.array(a.y), np.array(b.y), atol=2e-3)
@@ -129,7 +129,7 @@ def S_of(model, points: list[SurfacePoint]) -> np.ndarray:
 def test_an_object_moved_with_its_grids_is_the_same_one(trained: Trained, folder: Path) -> None:
     moved = subject_of(turn=40.0, shift=3.0)
     again = storing.load(storing.find_weights(moved, folder), moved).model
-    rng = _generator(mi, 4096, pass_seed(7))
+    rng = generator(mi, 4096, pass_seed(7))
     points = [trained.model.subject.random_points(rng) for _ in range(2)]
     turn = mi.Transform4f().translate([3, 0, 0]).rotate([0.6, 0.8, 0], 40)
     a, b = S_of(trained.model, points), S_of(again, [SurfacePoint(*(turn @ v for v in point)) for point in points])

@@ -41,7 +41,7 @@ from full_geometry.rivals.command import _errors_wide, markdown  # noqa: E402
 from full_geometry.subject import Subject  # noqa: E402
 from halfspace_sss.cli import app as cli  # noqa: E402
 from halfspace_sss.rendering.transport.protocols import Entry  # noqa: E402
-from halfspace_sss.tracing.walk import _generator, pass_seed  # noqa: E402
+from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
 N_PATCHES = 24
 
@@ -72,8 +72,8 @@ def shaken(subject: Subject) -> AlphaP:
 
 def test_alpha_is_the_light_that_comes_back_from_everywhere(subject: Subject, shaken: AlphaP) -> None:
     n = 2**17
-    exit = subject.random_points(_generator(mi, 1, pass_seed(4))).gather(dr.zeros(mi.UInt32, n))
-    entries = subject.random_points(_generator(mi, n, pass_seed(5)))
+    exit = subject.random_points(generator(mi, 1, pass_seed(4))).gather(dr.zeros(mi.UInt32, n))
+    entries = subject.random_points(generator(mi, n, pass_seed(5)))
     prepared = shaken.prepare(exit)
     S = np.array(shaken.S(prepared, entries), dtype=float) / np.array(shaken.scale)[:, None]
     values = S.mean(axis=0) * np.pi * subject.found.area
@@ -136,7 +136,7 @@ def test_points_are_laid_onto_the_nearest_triangle(subject: Subject) -> None:
 
 @pytest.mark.parametrize("kind", LIGHTINGS)
 def test_no_light_comes_from_below_the_surface(subject: Subject, kind: str) -> None:
-    at = subject.random_points(_generator(mi, 4096, pass_seed(6)))
+    at = subject.random_points(generator(mi, 4096, pass_seed(6)))
     n = mi.Normal3f(at.n * subject.found.sign)
     entry = Entry(at.p, n, at.n_out, mi.Float(1), dr.zeros(mi.UInt32, 4096))
     w, value = lighting(kind, subject).sample(entry, mi.Point2f(0.3, 0.6), mi.Bool(True))

@@ -28,7 +28,7 @@ from full_geometry.neural_shape.shapes.generators import make_shape  # noqa: E40
 from full_geometry.neural_shape.shapes.mesh import Box, surface  # noqa: E402
 from full_geometry.neural_shape.storing import transport  # noqa: E402
 from full_geometry.subject import Subject, SurfacePoint, cosine_direction  # noqa: E402
-from halfspace_sss.tracing.walk import _generator, pass_seed  # noqa: E402
+from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
 WAX = Medium(0.95, 0.05, 0.3, 1.4)
 N = 512
@@ -61,7 +61,7 @@ def mesh(vertices: np.ndarray, faces: np.ndarray) -> object:
 
 def pairs(subject: Subject, n: int = N, seed: int = 5) -> tuple[SurfacePoint, SurfacePoint]:
     """Exits and entries, each with a random direction."""
-    rng = _generator(mi, n, pass_seed(seed))
+    rng = generator(mi, n, pass_seed(seed))
     found = subject.random_points(rng), subject.random_points(rng)
     dr.eval(found)
     return found
@@ -86,7 +86,7 @@ def moved(at: SurfacePoint, turn: mi.ScalarTransform4f, scale: float) -> Surface
 def test_on_a_plane_it_is_the_half_space_whatever_the_weights() -> None:
     box = mi.load_dict({"type": "cube", "to_world": mi.ScalarTransform4f().scale(2000.0)})
     subject = Subject.of(box, WAX)
-    rng = _generator(mi, N, pass_seed(1))
+    rng = generator(mi, N, pass_seed(1))
     place = [mi.Point3f(12 * rng.next_float32(), 12 * rng.next_float32(), 2000.0) for _ in range(2)]
     n = mi.Normal3f(dr.zeros(mi.Float, N), dr.zeros(mi.Float, N), dr.full(mi.Float, 1.0, N))
     o, i = (SurfacePoint(p, n, n, cosine_direction(n, rng)) for p in place)
@@ -111,9 +111,9 @@ def test_a_sphere_that_grows_becomes_the_half_space() -> None:
         subject = Subject.of(mi.load_dict({"type": "sphere", "radius": radius}), WAX)
         model = NeuralShape.of(subject, random_weights())
         o, _ = pairs(subject)
-        step = mi.Vector3f(cosine_direction(o.n, _generator(mi, N, pass_seed(2))))
+        step = mi.Vector3f(cosine_direction(o.n, generator(mi, N, pass_seed(2))))
         n = mi.Normal3f(dr.normalize(mi.Vector3f(o.p + 3 * dr.normalize(dr.cross(o.n, step)))))
-        i = SurfacePoint(mi.Point3f(n * radius), n, n, cosine_direction(n, _generator(mi, N, pass_seed(3))))
+        i = SurfacePoint(mi.Point3f(n * radius), n, n, cosine_direction(n, generator(mi, N, pass_seed(3))))
         plane = np.array(model.half_space(_side(end(subject, o)), _side(end(subject, i))))
         spread.append(float(np.abs(np.log(S(model, o, i) / plane)).mean()))
     assert spread[0] > 5 * spread[1] > 10 * spread[2] and spread[2] < 0.01

@@ -55,6 +55,11 @@ def test_from_albedo_keeps_albedo_and_extinction():
     assert medium.eta == 1.2 and medium.sigma_a[1] == 0
 
 
+def test_media_scatter_evenly_and_have_the_index_1_3_unless_it_is_said_otherwise():
+    for medium in (Medium(0.5, 1.5), Medium.from_albedo(0.25, 2.0), Medium.from_reduced(0.5, 1.5)):
+        assert medium == Medium(0.5, 1.5, 0.0, 1.3)
+
+
 def test_from_reduced_keeps_the_reduced_scattering():
     medium = Medium.from_reduced(1.5, 0.2, g=0.9)
     assert medium.sigma_s_prime == pytest.approx(1.5, rel=1e-15)

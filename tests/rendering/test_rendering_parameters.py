@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
-
 import numpy as np
 import pytest
 from rendered import MEDIUM, surface
@@ -21,16 +19,7 @@ from differentiated import (  # noqa: E402
     weights,
 )  # fmt: skip
 
-
-@pytest.fixture(autouse=True)
-def _variant():
-    from halfspace_sss import rendering
-
-    mi.set_variant("llvm_ad_rgb")
-    rendering.register()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        yield
+pytestmark = pytest.mark.usefixtures("quiet_rgb")
 
 
 def refused(key: str, render) -> bool:

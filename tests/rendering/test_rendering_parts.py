@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
-
 import numpy as np
 import pytest
 from rendered import surface
@@ -14,16 +12,7 @@ INTEGRATORS = ("bssrdf", "translucent_walk")
 FILM = {"type": "hdrfilm", "width": 8, "height": 4, "rfilter": {"type": "box"}}
 POINT = {**FILM, "width": 1, "height": 1}
 
-
-@pytest.fixture(autouse=True)
-def _variant():
-    from halfspace_sss import rendering
-
-    mi.set_variant("llvm_ad_rgb")
-    rendering.register()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        yield
+pytestmark = pytest.mark.usefixtures("quiet_rgb")
 
 
 def camera(z: float, film: dict | None = None, kind: str = "perspective", **more) -> dict:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
-
 import numpy as np
 import pytest
 from scipy import stats
@@ -16,16 +14,7 @@ import drjit as dr  # noqa: E402
 N = 1 << 18
 MODELS = [Medium(1.0, 0.2, 0.3, 1.4), Medium(0.3, 0.01, 0.0, 1.4), Medium(3.0, 0.5, 0.0, 1.4)]
 
-
-@pytest.fixture(autouse=True)
-def _variant():
-    from halfspace_sss import rendering
-
-    mi.set_variant("llvm_ad_rgb")
-    rendering.register()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        yield
+pytestmark = pytest.mark.usefixtures("quiet_rgb")
 
 
 def position_sampler(shape: dict, share: float):

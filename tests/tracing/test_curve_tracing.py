@@ -35,6 +35,24 @@ def test_curves_on_both_sides_of_the_plane_of_incidence_agree(medium):
     assert np.all(np.abs(z((a.S, a.standard_error), (b.S, b.standard_error))) < 4)
 
 
+PI = math.pi
+SECTORS = {  # azimuth, half width and angle; where w_o is in the plane of incidence what lies beyond that counts too
+    PI: [(0.0, 0.5, 1.0), (-1.25, 0.75, 3.0), (PI, PI - 2.0, 2 * (PI - 2.0))],
+    1.1: [(-0.1, 0.7, 1.4), (1.6, 1.0, 2.0), (PI + 0.9, PI - 1.7, 2 * (PI - 1.7))],
+}
+
+
+@pytest.mark.parametrize("delta_phi", SECTORS)
+def test_sectors_of_a_ring_add_up_to_it(delta_phi):
+    """Of the same walks."""
+
+    def curve(line_phi, half_width):
+        return trace_curve(MEDIA["denser"], 0.7, 0.6, delta_phi, line_phi, [0.05, 0.3, 1.0], half_width, 50_000, 5).S
+
+    parts = sum(angle * curve(line_phi, half_width) for line_phi, half_width, angle in SECTORS[delta_phi])
+    np.testing.assert_allclose(parts, 2 * PI * curve(0.0, PI), rtol=1e-5)
+
+
 def test_the_same_seed_gives_the_same_curve_and_another_seed_another_one():
     a, b, c = (trace_curve(MEDIA["denser"], 0.6, 0.5, 0.3, 1.0, [0.1, 1.0, 2.0], 0.3, 30_000, s) for s in (1, 1, 2))
     assert a.S.tobytes() == b.S.tobytes() and a.S.tobytes() != c.S.tobytes()

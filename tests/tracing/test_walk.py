@@ -12,7 +12,7 @@ from halfspace_sss import Medium, trace
 from halfspace_sss.backend import array_types
 from halfspace_sss.physics.fresnel import F_t, mu_internal
 from halfspace_sss.tracing.tallies import FluxTally
-from halfspace_sss.tracing.walk import WalkConstants, _generator, pass_seed, walk
+from halfspace_sss.tracing.walk import WalkConstants, generator, pass_seed, walk
 
 MIXTURES = {
     "all differ": [(0.9, 0.0, 1.0), (0.8, 0.7, 1.4), (0.95, -0.4, 0.75), (0.7, 1e-4, 1.3)],
@@ -73,7 +73,7 @@ def test_lanes_are_independent():
     types, lanes, draws = array_types(), 16384, 12
     spread = np.zeros(draws)
     for seed in range(400):
-        random = _generator(types, lanes, pass_seed(seed, 1))
+        random = generator(types, lanes, pass_seed(seed, 1))
         u = [random.next_float32() for _ in range(draws)]
         dr.eval(u)
         spread += [12 * lanes * (v.numpy().mean(dtype=np.float64) - 0.5) ** 2 for v in u]

@@ -20,7 +20,7 @@ from halfspace_sss.interface.model import bssrdf
 from halfspace_sss.materials import load as load_material
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.progress import NamedProgress
-from halfspace_sss.tracing.walk import _generator, pass_seed
+from halfspace_sss.tracing.walk import generator, pass_seed
 
 __all__ = ["HALF_SPACES", "Case", "Row", "evaluate", "held_out", "of_mesh", "seconds_per_million", "spheres"]
 
@@ -143,7 +143,7 @@ def _thickness(subject: Subject) -> float:
     """4 V/A sigma_t, the mean chord in mean free paths: V from the mean of x.n over the surface."""
     import mitsuba as mi
 
-    points = subject.random_points(_generator(mi, 2**16, pass_seed(23)))
+    points = subject.random_points(generator(mi, 2**16, pass_seed(23)))
     x, n = (np.array(v, dtype=float) for v in (points.p, points.n))
     x -= x.mean(axis=1, keepdims=True)
     return float(4 / 3 * (x * n).sum(axis=0).mean() * float(subject.media[0].sigma_t))
@@ -156,7 +156,7 @@ def seconds_per_million(subject: Subject, path: Path | None = None) -> dict[str,
 
     models: dict[str, Any] = {"neural_shape": transport(subject, path)}
     models |= {name: HalfSpaceTransport(subject, name) for name in HALF_SPACES}
-    rng = _generator(mi, LANES, pass_seed(29))
+    rng = generator(mi, LANES, pass_seed(29))
     exits, entries = subject.random_points(rng), subject.random_points(rng)
     dr.eval(exits, entries)
     found = {}

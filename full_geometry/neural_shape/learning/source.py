@@ -17,7 +17,7 @@ from full_geometry.learning.pairs import Proposals
 from full_geometry.neural_shape.descriptors import describe, end, medium
 from full_geometry.neural_shape.model import BACKBONE, FLOOR
 from full_geometry.subject import Subject, SurfacePoint
-from halfspace_sss.tracing.walk import _generator, pass_seed
+from halfspace_sss.tracing.walk import generator, pass_seed
 
 __all__ = ["PairData", "make_data"]
 
@@ -72,7 +72,7 @@ def make_data(subject: Subject, events: float, seed: tuple[int, ...]) -> PairDat
     import mitsuba as mi
 
     n = int(np.clip(EVENTS / events, FEWEST_WALKS, WALKS))
-    starts = subject.random_points(_generator(mi, n, pass_seed(*seed, 0)))
+    starts = subject.random_points(generator(mi, n, pass_seed(*seed, 0)))
     exits = trace_exits(subject, starts, (*seed, 1), roulette_from=ROULETTE_FROM)
     kept = dr.compress(exits.T[0] > 0)
     if dr.width(kept) < FEWEST_EXITS:
@@ -83,7 +83,7 @@ def make_data(subject: Subject, events: float, seed: tuple[int, ...]) -> PairDat
     T = dr.gather(mi.Float, exits.T[0], kept).numpy()
     walks = _columns(subject, starts.gather(kept), exits.at.gather(kept))
     half_space = HalfSpace(subject, BACKBONE, FLOOR)
-    rng = _generator(mi, KEPT, pass_seed(*seed, 2))
+    rng = generator(mi, KEPT, pass_seed(*seed, 2))
     starts = subject.random_points(rng)
     entries, weight = Proposals(subject, half_space).sample(starts, rng)
     W = (_half_space(half_space, starts, entries) * weight.numpy() / mean).astype(np.float32)

@@ -10,6 +10,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import drjit as dr
+
 __all__ = ["Books", "Replay", "Tally"]
 
 Books = tuple[Any, Any]  # radiance so far, or in a replay still to come; its derivative, or adjoint; spectra
@@ -50,23 +52,17 @@ class Replay:
 
     def add(self, books: Books, light: Any) -> Books:
         """Light that the path brings."""
-        import drjit as dr
-
         L, d = self._vary(books, light)
         return L - dr.detach(light), d
 
     def settle(self, books: Books, light: Any, weight: Any, goes_on: Any, shown: Any) -> Books:
         """As in `Tally`."""
-        import drjit as dr
-
         L = books[0] - dr.detach(light)
         fixed = dr.detach(weight)
         after = dr.select(goes_on & (fixed != 0), L / dr.select(fixed != 0, fixed, 1), 0)
         return self._vary((L, books[1]), light + weight * (after + shown))
 
     def _vary(self, books: Books, value: Any) -> Books:
-        import drjit as dr
-
         L, d = books
         if not dr.grad_enabled(value):
             return books

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import drjit as dr
+import mitsuba as mi
+
 from halfspace_sss.rendering.paths.few import Leg
 from halfspace_sss.rendering.surface.object import turned
 from halfspace_sss.rendering.transport.body import Body
@@ -32,9 +35,6 @@ def choose(body: Body, si: Any, active: Any) -> Choice:
     half-space by single scattering and more, and albedo a, the expected light is T of order 0,
     (1 - T) (R_1 + (a - R_1) T) of order 1 and (1 - T) R_2 of the rest.
     """
-    import drjit as dr
-    import mitsuba as mi
-
     out = exit_at(body, si)
     eta = body.surface.inside.medium.eta
     mu = dr.dot(out.w, out.n)
@@ -59,9 +59,6 @@ def choose(body: Body, si: Any, active: Any) -> Choice:
 
 def _transmittance(body: Body, out: Exit, along: Any, active: Any) -> Any:
     """To the other side, mean over channels; light of the path does not count, as choices hold in derivatives."""
-    import drjit as dr
-    import mitsuba as mi
-
     ray = place(out.p, out.n_face).spawn_ray(along)
     wall = body.found.scene.ray_intersect(ray, mi.RayFlags.Minimal, False, active)
     T = mi.Float(0)
@@ -72,9 +69,6 @@ def _transmittance(body: Body, out: Exit, along: Any, active: Any) -> Any:
 
 def exit_at(body: Body, si: Any) -> Exit:
     """The exit of light towards `si.wi`, with the normal that points outwards."""
-    import drjit as dr
-    import mitsuba as mi
-
     w, n = si.to_world(si.wi), mi.Normal3f(turned(si.sh_frame.n, si.n))
     sign = body.found.side(si.prim_index)
     if not body.found.closed:  # a sheet is a half-space from both sides

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
+
 from halfspace_sss.rendering.paths.tracing import replay_paths, trace_paths
 from halfspace_sss.rendering.transport.body import Body
 from halfspace_sss.rendering.transport.settings import Settings
@@ -20,9 +23,6 @@ def check_parameters(scene: Any) -> None:
         ValueError: gradients are enabled for the geometry of a shape, for a sensor or film, or for what Mitsuba does
             not differentiate by, such as the index of a smooth dielectric.
     """
-    import drjit as dr
-    import mitsuba as mi
-
     parameters = mi.traverse(scene)
     for key, (_, _, owner, flags) in parameters.properties.items():
         with dr.resume_grad():
@@ -43,9 +43,6 @@ def check_outermost(scene: Any) -> None:
     Raises:
         ValueError: gradients are enabled for a parameter of the scene, and followed.
     """
-    import drjit as dr
-    import mitsuba as mi
-
     followed = [key for key, value in mi.traverse(scene).items() if dr.grad_enabled(value)]
     if followed:
         raise ValueError(
@@ -55,8 +52,6 @@ def check_outermost(scene: Any) -> None:
 
 def _moves(owner: Any, name: str) -> bool:
     """Whether a parameter moves a shape or a sensor; attributes of vertices and faces are textures."""
-    import mitsuba as mi
-
     if isinstance(owner, mi.Shape):
         return not name.startswith(("vertex_", "face_"))
     return isinstance(owner, (mi.Sensor, mi.Film))
@@ -64,8 +59,6 @@ def _moves(owner: Any, name: str) -> bool:
 
 def _selects(parameters: Any, owner: Any, name: str) -> bool:
     """Whether a parameter does more than scale light: the share of a mirror in a blend, the index that a medium has."""
-    import mitsuba as mi
-
     while owner is not None:
         if isinstance(owner, mi.BSDF) and owner.class_name() == "BlendBSDF":
             return bool(owner.flags() & int(mi.BSDFFlags.Delta))
@@ -81,8 +74,6 @@ def replayer(bodies: list[Body], settings: Settings) -> Any:
     Raises:
         ValueError: gradients are enabled for a medium, and the model knows no other.
     """
-    import drjit as dr
-    import mitsuba as mi
     from mitsuba.python.ad.integrators.common import RBIntegrator
 
     for body in bodies:

@@ -10,6 +10,9 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import drjit as dr
+import mitsuba as mi
+
 from halfspace_sss.rendering.paths.world import World, sampled_light
 from halfspace_sss.rendering.surface.derivatives import detached
 from halfspace_sss.rendering.transport.body import Body
@@ -45,8 +48,6 @@ class Candidate(NamedTuple):
 
 def entering_light(world: World, body: Body, out: Exit, prim_index: Any, sampler: Any, active: Any) -> Candidate:
     """One entry for light that leaves at `out`, drawn among as many as the settings say."""
-    import drjit as dr
-
     with detached():
         prepared = body.transport.prepare(out, active)
         where = body.proposals.prepare(out, prepared, active)
@@ -68,9 +69,6 @@ def entering_light(world: World, body: Body, out: Exit, prim_index: Any, sampler
 
 
 def _candidate(world: World, body: Body, exit: _Exit, aims: Any, sampler: Any, active: Any) -> Candidate:
-    import drjit as dr
-    import mitsuba as mi
-
     share, proposals = world.lights.share, body.proposals
     with detached():
         entry = proposals.sample(exit.out, exit.prim_index, exit.where, sampler, active)

@@ -8,6 +8,9 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import drjit as dr
+import mitsuba as mi
+
 from halfspace_sss.rendering.paths.entering import entering_light
 from halfspace_sss.rendering.paths.few import Leg, few_orders
 from halfspace_sss.rendering.paths.world import World, sampled_light
@@ -32,8 +35,6 @@ class Onward(NamedTuple):
 
 def nothing() -> Onward:
     """A path that ends."""
-    import mitsuba as mi
-
     zero = mi.Float(0)
     return Onward(
         mi.Point3f(0), mi.Normal3f(0), mi.Vector3f(0), mi.Spectrum(0), zero, zero, mi.Bool(False), mi.Float(-1)
@@ -42,17 +43,12 @@ def nothing() -> Onward:
 
 def balance(pdf: Any, other: Any) -> Any:
     """The balance heuristic."""
-    import drjit as dr
-
     total = pdf + other
     return dr.select(total > 0, pdf / dr.maximum(total, 1e-30), 0)
 
 
 def surface(world: World, u: tuple[Any, Any, Any], ray: Any, si: Any, active: Any) -> tuple[Onward, Any]:
     """A direction sampled by the BSDF, and light sampled by emitters, for uniform numbers u: a pair, one, a pair."""
-    import drjit as dr
-    import mitsuba as mi
-
     bsdf, ctx = si.bsdf(ray), mi.BSDFContext()
     smooth = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
     ds, light = sampled_light(world, si, u[0], True, smooth)
@@ -77,9 +73,6 @@ def _differentiable(bsdf: Any, ctx: Any, si: Any, bs: Any, weight: Any, active: 
 
     A delta lobe has no value to ask for: its weight times the probability of the lobe has the derivative.
     """
-    import drjit as dr
-    import mitsuba as mi
-
     pdf = dr.detach(bs.pdf)
     inverse = dr.select(pdf > 0, dr.rcp(pdf), 0)
     lobe = weight * (bs.pdf * inverse)
@@ -90,9 +83,6 @@ def _differentiable(bsdf: Any, ctx: Any, si: Any, bs: Any, weight: Any, active: 
 
 def multiple(world: World, body: Body, out: Exit, face: Any, sampler: Any, active: Any) -> tuple[Onward, Any]:
     """Light that entered the body elsewhere and comes out here by its model, and what is seen of point lights so."""
-    import drjit as dr
-    import mitsuba as mi
-
     found = entering_light(world, body, out, face, sampler, active)
     direct = mi.Spectrum(0)
     if world.lights.some_delta:
@@ -109,8 +99,6 @@ def multiple(world: World, body: Body, out: Exit, face: Any, sampler: Any, activ
 
 def few(world: World, body: Body, leg: Leg, sampler: Any, active: Any) -> tuple[Onward, Any]:
     """Light that was scattered at most once inside the body, and that of emitters that came the same way."""
-    import mitsuba as mi
-
     found = few_orders(world, body, leg, sampler, active)
     zero = mi.Float(0)
     on = Onward(found.p, found.n, found.d, found.weight, mi.Float(1), zero, found.connected, mi.Float(-1))

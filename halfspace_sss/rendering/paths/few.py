@@ -19,6 +19,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
+import drjit as dr
+import mitsuba as mi
+
 from halfspace_sss.physics.phase import eval_hg, sample_hg
 from halfspace_sss.rendering.paths.refraction import meet, refracted_connection
 from halfspace_sss.rendering.paths.world import World, sampled_light
@@ -82,9 +85,6 @@ class _Walk:
 
 def few_orders(world: World, body: Body, leg: Leg, sampler: Any, active: Any) -> Few:
     """Light that leaves at the exit of `leg` after at most one scattering event."""
-    import drjit as dr
-    import mitsuba as mi
-
     with detached():
         walk = _walk(body, leg, sampler, active & leg.valid)
         once = walk.order == 1
@@ -103,9 +103,6 @@ def few_orders(world: World, body: Body, leg: Leg, sampler: Any, active: Any) ->
 
 
 def _walk(body: Body, leg: Leg, sampler: Any, active: Any) -> _Walk:
-    import drjit as dr
-    import mitsuba as mi
-
     zero, point = mi.Float(0), mi.Point3f(leg.out.p)
     media = [tuple(number(v) for v in (m.sigma_s, m.sigma_t, m.g)) for m in body.media]
     skip = _clear(body, leg.out.n_face, leg.along)
@@ -123,9 +120,6 @@ def _walk(body: Body, leg: Leg, sampler: Any, active: Any) -> _Walk:
 
 def _step(of: tuple[Body, Media], k: Any, sampler: Any, passing: Any, walk: _Walk) -> _Walk:
     """To the event, or to the boundary and what happens there."""
-    import drjit as dr
-    import mitsuba as mi
-
     (body, media), flags = of, mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame
     si, n_out, n = meet(body, walk.o + walk.d * walk.skip, walk.d, flags, walk.alive)
     length = si.t + walk.skip
@@ -146,9 +140,6 @@ def _scatter(media: Media, walk: _Walk, weights: tuple[Any, Any], scattering: An
 
     `weights` are f_c / p and the chance of channel c to be scattered on the leg.
     """
-    import drjit as dr
-    import mitsuba as mi
-
     sigma_t, g, (W, ends) = _row(media, 1), _row(media, 2), weights
     u, v, channel, chance = sampler.next_1d(), sampler.next_2d(), sampler.next_2d(), W * ends
     rate = dr.maximum(_pick(sigma_t, chance, channel.x), 1e-12)
@@ -170,9 +161,6 @@ def _scatter(media: Media, walk: _Walk, weights: tuple[Any, Any], scattering: An
 
 def _meet_boundary(of: tuple[Body, Media], walk: _Walk, met: tuple[Any, Any, Any], sampler: Any) -> _Walk:
     """Reflection by Fresnel, or the way out; what is faint may end."""
-    import drjit as dr
-    import mitsuba as mi
-
     (body, media), (si, n_out, n) = of, met
     size = dr.max(_value(media, walk.way, walk.order, walk.cosine) * walk.inverse)
     survival = dr.select(walk.order == 1, dr.minimum(size / FAINT, 1), 1)
@@ -191,9 +179,6 @@ def _meet_boundary(of: tuple[Body, Media], walk: _Walk, met: tuple[Any, Any, Any
 
 def _connected(world: World, of: tuple[Body, Media], walk: _Walk, weight: Any, sampler: Any, active: Any) -> Any:
     """Light of a sampled emitter that is refracted at the boundary into the event, which has a weight."""
-    import drjit as dr
-    import mitsuba as mi
-
     body, media = of
     at = place(walk.event, mi.Normal3f(0, 0, 0))
     ds, light = sampled_light(world, at, sampler.next_2d(), False, active)
@@ -216,8 +201,6 @@ def _connected(world: World, of: tuple[Body, Media], walk: _Walk, weight: Any, s
 
 def _clear(body: Body, n: Any, d: Any) -> Any:
     """Length along d after which a ray from the surface is clear of it; an origin moved instead lies deeper."""
-    import drjit as dr
-
     return number(body.found.rounding) / dr.maximum(dr.abs(dr.dot(n, d)), 0.1)
 
 
@@ -227,9 +210,6 @@ def _row(media: Media, k: int) -> Any:
 
 def _met_by_chance(world: World, body: Body, walk: _Walk, active: Any) -> Any:
     """Light of an emitter that a walk meets from its event, which no connection with that point of it would find."""
-    import drjit as dr
-    import mitsuba as mi
-
     with detached():
         ray = place(walk.o, walk.n).spawn_ray(walk.d)
         si = world.scene.ray_intersect(ray, mi.RayFlags.All, False, active)
@@ -242,8 +222,6 @@ def _met_by_chance(world: World, body: Body, walk: _Walk, active: Any) -> Any:
 
 def _value(media: Media, way: Any, order: Any, cosine: Any) -> Any:
     """sigma_s^k p(cos)^k exp(-sigma_t Λ); without the phase function where there is no cosine."""
-    import drjit as dr
-
     found = []
     for sigma_s, sigma_t, g in media:
         once = sigma_s if cosine is None else sigma_s * eval_hg(cosine, g)
@@ -253,8 +231,6 @@ def _value(media: Media, way: Any, order: Any, cosine: Any) -> Any:
 
 def _pick(values: Any, weights: Any, u: Any) -> Any:
     """The value of a channel drawn by its weight, for a uniform number."""
-    import drjit as dr
-
     u, value = u * dr.sum(weights), values[0]
     for k in range(1, len(values)):
         u = u - weights[k - 1]
@@ -263,6 +239,4 @@ def _pick(values: Any, weights: Any, u: Any) -> Any:
 
 
 def _spectrum(values: list[Any]) -> Any:
-    import mitsuba as mi
-
     return mi.Spectrum(*values) if len(values) > 1 else mi.Spectrum(values[0])

@@ -7,6 +7,9 @@ from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
+
 from halfspace_sss.rendering.paths.differentiable import check_outermost, check_parameters, replayer
 from halfspace_sss.rendering.paths.tracing import trace_paths
 from halfspace_sss.rendering.transport.body import Bodies, make_bodies
@@ -17,8 +20,6 @@ __all__ = ["integrator_class"]
 
 def integrator_class() -> type:
     """The class of the integrator for the current variant of Mitsuba."""
-    import drjit as dr
-    import mitsuba as mi
 
     class BSSRDFIntegrator(mi.SamplingIntegrator):
         """Renders scenes with `translucent` objects; parameters as in `Settings`.

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import mitsuba as mi
+
 __all__ = ["Lights"]
 
 EMITTER_SHARE = 0.5
@@ -30,8 +32,6 @@ class Lights:
     @classmethod
     def of(cls, scene: Any) -> Lights:
         """The lights of a scene."""
-        import mitsuba as mi
-
         emitters = scene.emitters()
         even = all("Constant" in emitter.class_name() for emitter in emitters)
         delta = any(emitter.flags() & int(mi.EmitterFlags.Delta) for emitter in emitters)

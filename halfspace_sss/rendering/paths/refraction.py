@@ -10,6 +10,9 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import drjit as dr
+import mitsuba as mi
+
 from halfspace_sss.rendering.surface.object import turned
 from halfspace_sss.rendering.transport.body import Body
 
@@ -35,9 +38,6 @@ class Connection(NamedTuple):
 
 def meet(body: Body, p: Any, d: Any, flags: Any, active: Any) -> tuple[Any, Any, Any]:
     """Interaction with the boundary, shading normal and geometric normal, both outwards (along d for a sheet)."""
-    import drjit as dr
-    import mitsuba as mi
-
     si = body.found.scene.ray_intersect(mi.Ray3f(p, d), flags, False, active)
     sign = body.found.side(si.prim_index, active & si.is_valid())
     if not body.found.closed:
@@ -47,9 +47,6 @@ def meet(body: Body, p: Any, d: Any, flags: Any, active: Any) -> tuple[Any, Any,
 
 def _refract(body: Body, d: Any, n: Any) -> tuple[Any, Any, Any]:
     """Direction outside, Fresnel reflectance, and whether light passes, for a ray inside along d."""
-    import drjit as dr
-    import mitsuba as mi
-
     eta = body.surface.inside.medium.eta
     c = dr.dot(d, n)
     c_t2 = 1 - eta * eta * (1 - c * c)
@@ -60,8 +57,6 @@ def _refract(body: Body, d: Any, n: Any) -> tuple[Any, Any, Any]:
 
 def refracted_connection(body: Body, p: Any, target: Any, active: Any) -> Connection:
     """The ray from p inside the body that is refracted towards `target` outside."""
-    import drjit as dr
-    import mitsuba as mi
 
     def step(k: Any, d: Any, found: tuple, active: Any) -> tuple:
         e, J, met, valid = _aim(body, p, d, target, active)
@@ -93,9 +88,6 @@ def refracted_connection(body: Body, p: Any, target: Any, active: Any) -> Connec
 
 def _first_guess(body: Body, p: Any, w: Any, active: Any) -> Any:
     """The direction inside of light that arrives along -w where the straight ray along w meets the boundary."""
-    import drjit as dr
-    import mitsuba as mi
-
     _, n_out, _ = meet(body, p, w, mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame, active)
     across = (w - n_out * dr.dot(w, n_out)) / body.surface.inside.medium.eta
     return dr.normalize(across + n_out * dr.sqrt(dr.maximum(1 - dr.squared_norm(across), 1e-4)))
@@ -106,9 +98,6 @@ def _aim(body: Body, p: Any, d: Any, target: Any, active: Any) -> tuple[tuple, t
 
     With dw across d: dx = s (dw - d (dw.n)/(d.n)); dn = n_u du + n_v dv; refracted w = eta d + (c_t - eta c) n.
     """
-    import drjit as dr
-    import mitsuba as mi
-
     flags = mi.RayFlags.All | mi.RayFlags.dNSdUV
     si, n_out, n = meet(body, p, d, flags, active)
     w, F, valid = _refract(body, d, n_out)
@@ -135,8 +124,6 @@ def _aim(body: Body, p: Any, d: Any, target: Any, active: Any) -> tuple[tuple, t
 
 def _surface_steps(si: Any, dx: Any) -> tuple[Any, Any]:
     """(du, dv) with dp_du du + dp_dv dv = dx; 0 where the shape has no parametrisation."""
-    import drjit as dr
-
     a, b, c = dr.dot(si.dp_du, si.dp_du), dr.dot(si.dp_du, si.dp_dv), dr.dot(si.dp_dv, si.dp_dv)
     p, q = dr.dot(si.dp_du, dx), dr.dot(si.dp_dv, dx)
     det = a * c - b * b

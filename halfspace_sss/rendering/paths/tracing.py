@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
+
 from halfspace_sss.rendering.paths.books import Books, Replay, Tally
 from halfspace_sss.rendering.paths.lights import Lights
 from halfspace_sss.rendering.paths.vertex import Vertex, emitted, vertex
@@ -21,8 +24,6 @@ def trace_paths(scene: Any, bodies: list[Body], settings: Settings, sampler: Any
 
     The second part is light of orders below two of the object that the ray meets first.
     """
-    import mitsuba as mi
-
     world = World(scene, Lights.of(scene), bodies, settings, Tally())
     (parts, _), seen = _trace(world, sampler, ray, ((mi.Spectrum(0), mi.Spectrum(0)), ()), active)
     return parts, seen
@@ -40,8 +41,6 @@ def replay_paths(
         d: backward: derivative of the outcome by the radiance, which is handed on to the parameters of the scene.
         backward: otherwise the derivative of the radiance is returned, for the derivatives that the parameters carry.
     """
-    import mitsuba as mi
-
     world = World(scene, Lights.of(scene), bodies, settings, Replay(backward))
     return _trace(world, sampler, ray, (L, mi.Spectrum(0 if d is None else d)), mi.Bool(True))[0][1]
 
@@ -54,9 +53,6 @@ def _trace(world: World, sampler: Any, camera: Any, books: tuple, active: Any) -
     Where the first vertex is on a body, the path begins there a second time for its orders below two: choosing between
     them and the rest was most of the variance under a sky.
     """
-    import drjit as dr
-    import mitsuba as mi
-
     scene, settings, (parts, more) = world.scene, world.settings, books
     camera = mi.Ray3f(camera)
     unlinked = (mi.Point3f(0), mi.Normal3f(0), mi.Float(1), mi.Float(0), mi.Bool(False), mi.Float(-1))
@@ -101,8 +97,6 @@ def _trace(world: World, sampler: Any, camera: Any, books: tuple, active: Any) -
 
 def _on_splitting(world: World, si: Any) -> Any:
     """Whether a point is on a body with orders below two beside others."""
-    import mitsuba as mi
-
     found = mi.Bool(False)
     for body in world.bodies:
         if body.splits:

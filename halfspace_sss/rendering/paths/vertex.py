@@ -6,6 +6,9 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
+import drjit as dr
+import mitsuba as mi
+
 from halfspace_sss.rendering.paths.books import Books
 from halfspace_sss.rendering.paths.choice import choose
 from halfspace_sss.rendering.paths.events import Onward, balance, few, multiple, nothing, surface
@@ -32,9 +35,6 @@ class Vertex(NamedTuple):
 
 def emitted(world: World, si: Any, last: tuple, depth: Any, active: Any) -> Any:
     """Emitted light where the path arrives, weighted against the sampling of emitters at the last vertex."""
-    import drjit as dr
-    import mitsuba as mi
-
     p, n, pdf, emitter_share, sky_only, aim = last
     with detached():
         emitter = si.emitter(world.scene, active)
@@ -51,9 +51,6 @@ def emitted(world: World, si: Any, last: tuple, depth: Any, active: Any) -> Any:
 
 def vertex(world: World, sampler: Any, at: Vertex, books: Books) -> tuple[Onward, Books]:
     """What happens at a surface point: its BSDF, or for the bodies the light that entered elsewhere."""
-    import drjit as dr
-    import mitsuba as mi
-
     (si, _, throughput, *_), choices = at, []
     with detached():
         for body in world.bodies:
@@ -96,9 +93,6 @@ class _Taken(NamedTuple):
 
 def _outside(world: World, sampler: Any, at: Vertex, books: Books, choices: list) -> tuple[Onward, Books, _Taken]:
     """The BSDF. Of a body, light of emitters that it mirrors is added, and the path goes on if there may be more."""
-    import drjit as dr
-    import mitsuba as mi
-
     (si, ray, throughput, *_), u_event = at, sampler.next_1d()
     inside, glossy, reflection = mi.Bool(False), mi.Bool(False), mi.Float(0)
     for body, here, choice in choices:
@@ -136,8 +130,6 @@ def _mirrored(
 
     With it, whether the reflected ray meets a surface, from which more light may come.
     """
-    import mitsuba as mi
-
     last = (on.p, on.n, on.pdf, on.emitter_share, on.sky_only, on.aim)
 
     def look(books: Books) -> tuple[Any, Any, Books]:
@@ -150,8 +142,6 @@ def _mirrored(
 
 def _unlit(on: Onward) -> Onward:
     """The same path, to which no emitter counts at its next vertex."""
-    import mitsuba as mi
-
     return on._replace(pdf=mi.Float(0), emitter_share=mi.Float(0))
 
 
@@ -160,7 +150,6 @@ def _where(mask: Any, sampler: Any, otherwise: tuple, world: World, event: Calla
 
     What no neighbouring lane asks for is not computed; derivatives do not leave the event.
     """
-    import drjit as dr
 
     def happens(sampler: Any, otherwise: tuple) -> tuple:
         with tracking(world.books.tracks):

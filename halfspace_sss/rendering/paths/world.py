@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import drjit as dr
+
 from halfspace_sss.rendering.paths.books import Replay, Tally
 from halfspace_sss.rendering.paths.lights import Lights
 from halfspace_sss.rendering.surface.derivatives import detached
@@ -35,8 +37,6 @@ class World:
 
 def sampled_light(world: World, ref: Any, u: Any, test_visibility: bool, active: Any) -> tuple[Any, Any]:
     """A direction sampled by the emitters, and their light over its density; derivatives are those of the light."""
-    import drjit as dr
-
     with detached():
         ds, light = world.scene.sample_emitter_direction(ref, u, test_visibility, active)
         inverse = dr.select(ds.pdf > 0, dr.rcp(ds.pdf), 0)

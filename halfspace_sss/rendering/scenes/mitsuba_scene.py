@@ -9,6 +9,7 @@ import math
 from pathlib import Path
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
 __all__ = ["with_media"]
@@ -34,8 +35,6 @@ def with_media(scene: dict | str | Path, mm_per_unit: float, integrator: dict | 
         ValueError: mm_per_unit is out of range, or an object has something that Mitsuba's media have not: other
             orders than "total", a boundary without reflection, or a mean cosine that differs between channels.
     """
-    import mitsuba as mi
-
     if not (math.isfinite(mm_per_unit) and mm_per_unit > 0):
         raise ValueError(f"mm_per_unit must be finite and > 0, got {mm_per_unit!r}")
     config = mi.parser.ParserConfig(mi.variant())
@@ -53,8 +52,6 @@ def with_media(scene: dict | str | Path, mm_per_unit: float, integrator: dict | 
 
 def _references(props: Any) -> list[tuple[str, int]]:
     """Names and node numbers of what a node refers to."""
-    import mitsuba as mi
-
     values = [(key, props[key]) for key in props.keys()]
     return [(key, value.index()) for key, value in values if isinstance(value, mi.Properties.ResolvedReference)]
 
@@ -72,8 +69,6 @@ def _fill(config: Any, state: Any, shape: Any, mm_per_unit: float) -> None:
 
 def _instance(config: Any, state: Any, index: int) -> Any:
     """The object that a node stands for."""
-    import mitsuba as mi
-
     root, node = mi.parser.SceneNode(state.nodes[0]), mi.parser.SceneNode(state.nodes[index])
     state.nodes[0] = node
     try:
@@ -83,8 +78,6 @@ def _instance(config: Any, state: Any, index: int) -> Any:
 
 
 def _replace_integrator(state: Any, integrator: dict) -> None:
-    import mitsuba as mi
-
     root = state.nodes[0].props
     names = [key for key, index in _references(root) if state.nodes[index].type == mi.ObjectType.Integrator]
     unknown = [key for key, index in _references(root) if state.nodes[index].props.plugin_name() in _OURS]
@@ -99,8 +92,6 @@ _OURS = ("bssrdf", "translucent_walk")
 
 def medium(inside: Any, mm_per_unit: float) -> Any:
     """The `homogeneous` or `heterogeneous` medium of an inside."""
-    import mitsuba as mi
-
     if inside.orders != "total" or not inside.reflection:
         raise ValueError(
             f"orders must be 'total', with reflection, for Mitsuba's media, got {inside.orders!r} and "
@@ -136,8 +127,6 @@ def _volumes(varying: Any, mm_per_unit: float) -> dict:
 
 def _one_voxel(values: np.ndarray) -> Any:
     """A volume that is the same everywhere: Mitsuba's constant ones take colours up to one only."""
-    import mitsuba as mi
-
     grid = mi.VolumeGrid(np.asarray(values, dtype=np.float32).reshape(1, 1, 1, -1))
     anywhere = mi.ScalarTransform4f().scale(2 * FAR).translate(-0.5)
     return mi.load_dict({"type": "gridvolume", "grid": grid, "raw": True, "to_world": anywhere})

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
 __all__ = ["Picture"]
@@ -34,21 +35,15 @@ class Picture:
 
     def png(self, image: np.ndarray | None = None) -> bytes:
         """The image as a display shows it."""
-        import mitsuba as mi
-
         shown = self.image if image is None else image
         return _written(mi.util.convert_to_bitmap(mi.TensorXf(shown.astype(np.float32))), mi.Bitmap.FileFormat.PNG)
 
     def exr(self, image: np.ndarray) -> bytes:
         """An image as it is."""
-        import mitsuba as mi
-
         return _written(mi.Bitmap(np.ascontiguousarray(image, dtype=np.float32)), mi.Bitmap.FileFormat.OpenEXR)
 
 
 def _written(bitmap: Any, kind: Any) -> bytes:
-    import mitsuba as mi
-
     stream = mi.MemoryStream()
     bitmap.write(stream, kind)
     return bytes(stream.raw_buffer())

@@ -5,6 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
+
 __all__ = ["Reflection"]
 
 
@@ -23,8 +26,6 @@ class Reflection:
     @classmethod
     def of(cls, boundary: Any) -> Reflection:
         """The reflection of a boundary; ValueError if it does not reflect."""
-        import mitsuba as mi
-
         for k in range(boundary.component_count()):
             if boundary.flags(k) & int(mi.BSDFFlags.Reflection):
                 return cls(boundary, k)
@@ -49,16 +50,11 @@ class Reflection:
         return self.boundary.pdf(self._context(ctx), seen, _turned(wo, sign), active)
 
     def _context(self, ctx: Any) -> Any:
-        import mitsuba as mi
-
         return mi.BSDFContext(ctx.mode, ctx.type_mask, self.lobe)
 
 
 def _from_outside(si: Any) -> tuple[Any, Any]:
     """The interaction with the normal on the side that is seen, and 1, or -1 where it was turned."""
-    import drjit as dr
-    import mitsuba as mi
-
     sign = dr.select(mi.Frame3f.cos_theta(si.wi) < 0, mi.Float(-1), 1)
     seen = mi.SurfaceInteraction3f(si)
     seen.wi = _turned(si.wi, sign)
@@ -67,6 +63,4 @@ def _from_outside(si: Any) -> tuple[Any, Any]:
 
 def _turned(w: Any, sign: Any) -> Any:
     """A local direction in the frame that is turned about its first axis where the sign is -1."""
-    import mitsuba as mi
-
     return mi.Vector3f(w.x, w.y * sign, w.z * sign)

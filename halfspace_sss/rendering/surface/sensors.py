@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
 from halfspace_sss.rendering.surface.object import Object, is_inside
@@ -27,8 +28,6 @@ def check_sensors(scene: Any, objects: list[Object]) -> None:
 
 def _starts(sensor: Any, size: float) -> np.ndarray:
     """Shape (3, n); off a surface that the rays leave by a little of the size of an object."""
-    import mitsuba as mi
-
     u = np.random.default_rng(13).random((5, STARTS)).astype(np.float32)
     numbers = [mi.Float(row.tolist()) for row in u]
     # not sample_ray, which some sensors lack

@@ -39,6 +39,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
 from halfspace_sss.rendering.surface.inside import PARAMETERS, read_inside
@@ -52,7 +53,6 @@ VARIABLE = ("albedo", "sigma_t", "g")  # by which light can be differentiated
 
 def translucent_class() -> type:
     """The class of the surface for the current variant of Mitsuba."""
-    import mitsuba as mi
 
     class Translucent(mi.BSDF):
         """The reflection of the boundary as a BSDF, with an `inside`."""
@@ -104,15 +104,11 @@ def translucent_class() -> type:
 
 def _boundaries(props: Any) -> list[tuple[str, Any]]:
     """Names and surfaces of what stands inside."""
-    import mitsuba as mi
-
     return [(key, found) for key, found in props.objects() if isinstance(found, mi.BSDF)]
 
 
 def _boundary(props: Any, eta: float) -> Any:
     """The dielectric of the surface."""
-    import mitsuba as mi
-
     inner = [boundary for _, boundary in _boundaries(props)]
     if len(inner) > 1:
         raise ValueError(f"a translucent surface must have at most one BSDF inside, got {len(inner)}")
@@ -124,8 +120,6 @@ def _boundary(props: Any, eta: float) -> Any:
 
 def check_eta(boundary: Any, eta: float) -> None:
     """Refuse a boundary of another index than the medium's."""
-    import mitsuba as mi
-
     found = mi.traverse(boundary).get("eta")
     found = None if found is None else float(np.max(np.array(found)))
     if found is None or abs(found - eta) > 2e-3 * eta:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from halfspace_sss.rendering.transport.plane import number
@@ -28,8 +30,6 @@ class AreaPoints:
     """
 
     def __init__(self, shape: Any) -> None:
-        import mitsuba as mi
-
         self.shape = shape
         self.faces = self.centre = None
         parameters = mi.traverse(shape)
@@ -43,8 +43,6 @@ class AreaPoints:
 
     def sample(self, u_face: Any, u: Any, active: Any) -> Point:
         """A point for uniform numbers u_face and the pair u."""
-        import mitsuba as mi
-
         if self.faces is None:
             ps = self.shape.sample_position(0.0, u, active)
             n = ps.n if self.centre is None else self._radial(ps.p)
@@ -52,17 +50,11 @@ class AreaPoints:
         return self.on_face(self.faces.sample(u_face, active), u, active)
 
     def _radial(self, p: Any) -> Any:
-        import drjit as dr
-        import mitsuba as mi
-
         n = dr.normalize(p - mi.Point3f(*(number(c) for c in self.centre)))
         return mi.Normal3f(-n if self.shape.has_flipped_normals() else n)
 
     def on_face(self, face: Any, u: Any, active: Any = True) -> Point:
         """A uniform point of a face of a mesh."""
-        import drjit as dr
-        import mitsuba as mi
-
         index = self.shape.face_indices(face, active)
         corners = [self.shape.vertex_position(i, active) for i in (index.x, index.y, index.z)]
         b = mi.warp.square_to_uniform_triangle(u)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from halfspace_sss.interface.model import bssrdf
@@ -51,9 +53,6 @@ class HalfSpaceTransport:
         return out
 
     def S_mu(self, prepared: Exit, entry: Entry, w_i: Any, active: Any) -> Any:
-        import drjit as dr
-        import mitsuba as mi
-
         with detached():
             query = plane_query(entry.p, entry.n_out, w_i, prepared, self.geometry)
             mu_i = query[1]
@@ -82,16 +81,11 @@ class HalfSpaceProposals:
         return self.positions.sample(out, prim_index, sampler, active)
 
     def sample_direction(self, entry: Entry, out: Exit, u: Any) -> tuple[Any, Any]:
-        import mitsuba as mi
-
         frame = local_frame(entry.n_out, out.p - entry.p)
         drawn = self.model.sample_direction(mi.Float(0), mi.Float(1), mi.Float(0), (u.x, u.y))
         return mi.Vector3f(frame.direction(drawn.mu_i, drawn.phi_i)), drawn.pdf
 
     def pdf_direction(self, entry: Entry, out: Exit, w_i: Any) -> Any:
-        import drjit as dr
-        import mitsuba as mi
-
         mu_i = dr.clip(dr.dot(w_i, entry.n_out), 0, 1)
         return self.model.pdf_direction(mu_i, mi.Float(0), mi.Float(0), mi.Float(1), mi.Float(0))
 

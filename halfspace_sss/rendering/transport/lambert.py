@@ -5,6 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
+
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.surface.inside import Inside
 from halfspace_sss.rendering.surface.object import Object
@@ -33,9 +36,6 @@ class LambertTransport:
 
     def S_mu(self, prepared: Exit, entry: Entry, w_i: Any, active: Any) -> Any:
         """Over the density of `LambertProposals.sample`, whose point is the only one."""
-        import drjit as dr
-        import mitsuba as mi
-
         R = [number(value) for value in self.reflectance]
         mu_i = dr.maximum(dr.dot(w_i, entry.n_out), 0)
         lit = active & (dr.dot(prepared.w, prepared.n) > 0)
@@ -50,21 +50,14 @@ class LambertProposals:
         """Nothing is done for the exit alone."""
 
     def sample(self, out: Exit, prim_index: Any, prepared: None, sampler: Any, active: Any) -> Entry:
-        import drjit as dr
-        import mitsuba as mi
-
         n = mi.Normal3f(out.n_face * out.sign)
         return Entry(mi.Point3f(out.p), n, mi.Normal3f(out.n), dr.select(active, mi.Float(1), 0), prim_index)
 
     def sample_direction(self, entry: Entry, out: Exit, u: Any) -> tuple[Any, Any]:
-        import mitsuba as mi
-
         local = mi.warp.square_to_cosine_hemisphere(u)
         return mi.Frame3f(entry.n_out).to_world(local), mi.warp.square_to_cosine_hemisphere_pdf(local)
 
     def pdf_direction(self, entry: Entry, out: Exit, w_i: Any) -> Any:
-        import drjit as dr
-
         return dr.maximum(dr.dot(w_i, entry.n_out), 0) * dr.inv_pi
 
 

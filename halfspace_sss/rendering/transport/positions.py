@@ -16,6 +16,9 @@ import math
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import drjit as dr
+import mitsuba as mi
+
 from halfspace_sss.rendering.surface.object import Object, turned
 from halfspace_sss.rendering.transport.area_points import AreaPoints
 from halfspace_sss.rendering.transport.plane import Exit, number
@@ -68,8 +71,6 @@ class PositionSampler:
 
     def _candidates(self, p: Any, n: Any, out: Exit, axes: Any) -> Any:
         """c = D + m/A, 1/(scene unit)²."""
-        import drjit as dr
-
         uniform = number(self.area_points / self.found.area if self.area_points else 0.0)
         if not self.probes:
             return uniform
@@ -83,9 +84,6 @@ class PositionSampler:
 
     def sample(self, out: Exit, prim_index: Any, sampler: Any, active: Any) -> Entry:
         """A point of entry for light that leaves at `out` on the face `prim_index`."""
-        import drjit as dr
-        import mitsuba as mi
-
         axes = (out.n, *mi.coordinate_system(out.n))
         piece = self.found.piece(prim_index, active)
         u_axis, u_length, u_face, u_choice = (sampler.next_1d() for _ in range(4))
@@ -103,9 +101,6 @@ class PositionSampler:
         return REACH * across + number(LEAST_REACH * self.found.size + NEAR * self.table.mean)
 
     def _probe(self, out: Exit, axes: Any, u_axis: Any, u_length: Any, u: Any) -> Any:
-        import drjit as dr
-        import mitsuba as mi
-
         n, s, t = axes
         to_n, to_s = u_axis < NORMAL_SHARE, u_axis < 0.5 * (1 + NORMAL_SHARE)
         along = dr.select(to_n, n, dr.select(to_s, s, t))
@@ -121,8 +116,6 @@ class PositionSampler:
 
     def _offer(self, kept: _Kept, at: tuple, out: Exit, axes: Any, active: Any) -> _Kept:
         """Take a candidate (point, normal, outward shading normal, face) instead with the probability h / sum of h."""
-        import drjit as dr
-
         p, n, n_out, face = at
         c = self._candidates(p, n, out, axes)
         hope = dr.select(active & (c > 0), self.table.pdf(dr.norm(p - out.p)) / dr.maximum(c, 1e-30), 0)
@@ -135,8 +128,6 @@ class PositionSampler:
 
     def _hits(self, ray: Any, out: Exit, axes: Any, piece: Any, kept: _Kept, active: Any) -> _Kept:
         """All hits of a probe as candidates."""
-        import drjit as dr
-        import mitsuba as mi
 
         def step(ray: Any, left: Any, kept: tuple, active: Any) -> tuple:
             si = self.found.scene.ray_intersect(ray, _FLAGS(), False, active)
@@ -153,9 +144,6 @@ class PositionSampler:
 
     def _uniform(self, out: Exit, axes: Any, piece: Any, u_face: Any, u: Any, kept: _Kept, active: Any) -> _Kept:
         """Points over the area as candidates."""
-        import drjit as dr
-        import mitsuba as mi
-
         m, inverse = number(float(self.area_points)), number(1 / self.area_points)
 
         def step(k: Any, kept: tuple) -> tuple:
@@ -182,18 +170,12 @@ class _Kept(NamedTuple):
 
 def _wrapped(u: Any) -> Any:
     """u modulo one, below one."""
-    import drjit as dr
-
     return dr.minimum(u - dr.floor(u), 1 - 2**-24)
 
 
 def _FLAGS() -> int:
-    import mitsuba as mi
-
     return mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame
 
 
 def _nowhere() -> tuple:
-    import mitsuba as mi
-
     return mi.Point3f(0), mi.Normal3f(0, 0, 1), mi.Normal3f(0, 0, 1), mi.UInt32(0)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from halfspace_sss.rendering.transport.plane import number
@@ -41,9 +43,6 @@ class RadialTable:
         self._lanes: dict[str, Any] = {}
 
     def _arrays(self) -> tuple[Any, ...]:
-        import drjit as dr
-        import mitsuba as mi
-
         if mi.variant() not in self._lanes:
             numbers = (number(v) for v in (self.r_min, self.per_log, self.reach))
             self._lanes[mi.variant()] = (*(mi.Float(v.astype(np.float32)) for v in self._numpy), *numbers)
@@ -52,9 +51,6 @@ class RadialTable:
 
     def sample(self, u: Any) -> Any:
         """Distance r for uniform u in [0, 1)."""
-        import drjit as dr
-        import mitsuba as mi
-
         cdf, probability, edges, *_ = self._arrays()
         k = dr.binary_search(0, N_CELLS - 1, lambda i: dr.gather(mi.Float, cdf, i) <= u)
         share = 1 - (dr.gather(mi.Float, cdf, k) - u) / dr.gather(mi.Float, probability, k)
@@ -63,9 +59,6 @@ class RadialTable:
 
     def pdf(self, r: Any) -> Any:
         """Density over the plane at distance r, 1/(scene unit)²; 0 beyond the reach."""
-        import drjit as dr
-        import mitsuba as mi
-
         *_, times_r, r_min, per_log, reach = self._arrays()
         steps = dr.log(dr.maximum(r, r_min) / r_min) * per_log
         k = dr.select(r < r_min, 0, dr.minimum(mi.UInt32(steps) + 1, N_CELLS - 1))

@@ -11,6 +11,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import drjit as dr
+
 from halfspace_sss.interface.model import bssrdf
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.surface.derivatives import detached
@@ -41,8 +43,6 @@ class Variation:
         Raises:
             ValueError: the model knows no medium beside its own.
         """
-        import drjit as dr
-
         for name in VARIABLE:
             with dr.resume_grad():
                 wanted = dr.grad_enabled(getattr(self.surface, name))
@@ -71,8 +71,6 @@ class Variation:
 
     def S(self, values: list[Any], query: tuple) -> list[Any]:
         """The S of each channel at a query in scene units, with their derivatives where they are followed."""
-        import drjit as dr
-
         for name in VARIABLE:
             theta = getattr(self.surface, name)
             if not dr.grad_enabled(theta):
@@ -84,8 +82,6 @@ class Variation:
 
     def coefficients(self, media: list[Medium]) -> list[tuple[Any, Any, Any]]:
         """sigma_s, sigma_t in 1/(scene unit) and g of each channel, with derivatives where they are followed."""
-        import drjit as dr
-
         found = []
         for k, m in enumerate(media):
             albedo, sigma_t, g = (getattr(self.surface, name)[k] for name in VARIABLE)
@@ -96,8 +92,6 @@ class Variation:
 
 
 def _slope(stencil: Stencil, S: Any, query: tuple) -> Any:
-    import drjit as dr
-
     sides = [(S if model is None else model.eval(*query), number(c)) for model, c in stencil]
     least = sides[0][0]
     for value, _ in sides[1:]:

@@ -16,7 +16,7 @@ import mitsuba as mi
 
 from halfspace_sss.rendering.walk.media import WalkMedia
 from halfspace_sss.rendering.walk.steps import Crossing, Event, Visitor, Walk, Walker, draw, sample_bsdf, start_walk
-from halfspace_sss.tracing.walk import _generator, pass_seed
+from halfspace_sss.tracing.walk import generator, pass_seed
 
 __all__ = ["ExitVisitor", "Exits", "Start", "exits", "walk_from"]
 
@@ -127,7 +127,7 @@ def walk_from(
 
     seeds = seed if isinstance(seed, tuple) else (seed,)
     index = dr.arange(mi.UInt32, lanes)
-    walk = _enter(media, k, start, index, _generator(mi, lanes, pass_seed(*seeds)))
+    walk = _enter(media, k, start, index, generator(mi, lanes, pass_seed(*seeds)))
     dr.while_loop((walk, index), lambda walk, index: index < total, body, label="walks")
     dr.eval()
 

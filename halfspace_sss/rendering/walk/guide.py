@@ -106,8 +106,6 @@ class Guide:
 
 def _lobes(cosine: Any, concentration: Any) -> Any:
     """Density of the sum of lobes c e^(-c (1 - cos)) / (2 pi), 1/sr; what falls beyond cos = -1 is left out."""
-    import drjit as dr
-
     x = dr.maximum(1 - cosine, 0)
     parts = zip(SHARES, (concentration, *WIDER))
     return sum(a * c * dr.exp(-c * x) for a, c in parts) / (2 * dr.pi)

@@ -7,6 +7,10 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
 from halfspace_sss.rendering.surface.object import same_objects
 from halfspace_sss.rendering.surface.parameters import OF_MITSUBA, check_parameters
 from halfspace_sss.rendering.surface.sensors import check_sensors
@@ -28,8 +32,6 @@ Keep = Callable[[FirstExits], None]
 
 def walk_integrator_class() -> type:
     """The class of the integrator for the current variant of Mitsuba."""
-    import drjit as dr
-    import mitsuba as mi
 
     class TranslucentWalk(mi.SamplingIntegrator):
         """Path tracer whose paths walk through objects with the surface `translucent`.
@@ -97,8 +99,6 @@ def _refuse_derivatives(*_: Any, **__: Any) -> None:
 
 def _render(tracer: PathTracer, sensor: Any, seed: int, spp: int, keep: Keep | None) -> None:
     """Fill the film of a sensor, in launches that fit into memory."""
-    import drjit as dr
-
     sensor.film().prepare([])
     most = max(1, SAMPLES_PER_LAUNCH // int(dr.prod(_sampled_size(sensor.film()))))
     for launch, start in enumerate(range(0, spp, most)):
@@ -107,8 +107,6 @@ def _render(tracer: PathTracer, sensor: Any, seed: int, spp: int, keep: Keep | N
 
 def _samples(tracer: PathTracer, sampler: Any, ray: Any, active: Any) -> tuple[Any, Any, list]:
     """Radiance along rays of another integrator around this one."""
-    import drjit as dr
-
     with dr.suspend_grad():
         seed = tuple(int(2**24 * sampler.next_1d()[0]) for _ in range(2))
         L, seen = tracer.trace(_widened(ray, sampler.wavefront_size()), LANES, seed)
@@ -117,9 +115,6 @@ def _samples(tracer: PathTracer, sampler: Any, ray: Any, active: Any) -> tuple[A
 
 def _launch(tracer: PathTracer, sensor: Any, spp: int, seed: tuple[int, int], keep: Keep | None) -> None:
     """Trace spp rays through each pixel and add them to the film."""
-    import drjit as dr
-    import mitsuba as mi
-
     film = sensor.film()
     rays, weight, position = camera_rays(sensor, spp, seed)
     exits = FirstExits.of(tracer.visitor.scene, tracer.visitor.media, rays) if keep else None
@@ -148,10 +143,6 @@ def _sampled_size(film: Any) -> Any:
 
 def camera_rays(sensor: Any, spp: int, seed: tuple[int, int]) -> tuple[Any, Any, Any]:
     """Rays of spp samples of each pixel, their weights, and their positions on the film."""
-    import drjit as dr
-    import mitsuba as mi
-    import numpy as np
-
     film, size = sensor.film(), _sampled_size(sensor.film())
     border = film.rfilter().border_size() if film.sample_border() else 0
     sampler = sensor.sampler().clone()
@@ -176,9 +167,6 @@ def camera_rays(sensor: Any, spp: int, seed: tuple[int, int]) -> tuple[Any, Any,
 
 def _widened(ray: Any, n: int) -> Any:
     """n rays; those of a sensor that knows one ray only are one."""
-    import drjit as dr
-    import mitsuba as mi
-
     found = mi.Ray3f(ray)
     found.o, found.d = found.o + dr.zeros(mi.Point3f, n), found.d + dr.zeros(mi.Vector3f, n)
     return found

@@ -11,7 +11,7 @@ import mitsuba as mi
 from halfspace_sss.rendering.walk.first_exits import FirstExits, FirstExitVisitor, Watched
 from halfspace_sss.rendering.walk.light import Light, LightVisitor, start_light
 from halfspace_sss.rendering.walk.steps import OUTSIDE, Walk, Walker, sample_bsdf, start_walk
-from halfspace_sss.tracing.walk import _generator, pass_seed
+from halfspace_sss.tracing.walk import generator, pass_seed
 
 __all__ = ["PathTracer"]
 
@@ -69,7 +69,7 @@ class PathTracer:
             p = dr.if_stmt((p,), outside, self._outside, _same, label="outside")
             return (dr.if_stmt((p,), ~p.walk.alive, renew, _same),)
 
-        start = _begin(rays, dr.arange(mi.UInt32, lanes), _generator(mi, lanes, pass_seed(*seed)))
+        start = _begin(rays, dr.arange(mi.UInt32, lanes), generator(mi, lanes, pass_seed(*seed)))
         dr.while_loop((start,), lambda p: p.index < total, body, label="paths")
         dr.eval(L, seen)
         return L, seen

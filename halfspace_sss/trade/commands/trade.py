@@ -13,6 +13,9 @@ from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.cli.shared import (
     Bar,
     Define,
+    OutFolder,
+    SampleSeed,
+    SensorNumber,
     Variant,
     check_left_out,
     console,
@@ -46,13 +49,11 @@ def trade_command(
     ] = None,
     assess: Annotated[float, typer.Option(help="Seconds of measuring for each object.")] = ASSESS,
     r: Annotated[str | None, typer.Option(help="Of a material: smallest and largest distance, mm, as 0.1,20.")] = None,
-    sensor: Annotated[int, typer.Option(help="Number of the sensor.", parser=whole)] = 0,
-    seed: Annotated[int, typer.Option(help="Seed of the samples.", parser=whole)] = 0,
+    sensor: SensorNumber = 0,
+    seed: SampleSeed = 0,
     define: Define = None,
     variant: Variant = "llvm_ad_rgb",
-    out: Annotated[Path, typer.Option(help="Folder for the files; those of the same names are replaced.")] = Path(
-        "trade"
-    ),
+    out: OutFolder = Path("trade"),
 ) -> None:
     """Measure speed against accuracy: a table, a recommendation, CSV, JSON, and the figure and page of a scene."""
     check_interval("tolerance", tolerance, 1e-4, 10.0)

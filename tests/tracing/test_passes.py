@@ -1,0 +1,24 @@
+"""How walks are shared out, and what is told of independent samples."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from halfspace_sss.tracing.passes import MAX_LANES, PATHS_PER_LANE, estimate, launch_shape
+from halfspace_sss.tracing.tallies import BATCHES
+
+
+@pytest.mark.parametrize("n_paths", [256, 1000, 16_384, 32_769, 10**6, 8_388_609, 10**9])
+def test_walks_are_as_many_as_asked_for_in_whole_batches_and_no_pass_is_idle(n_paths: int) -> None:
+    lanes, per_lane, passes = launch_shape(n_paths)
+    assert lanes % BATCHES == 0 and lanes <= MAX_LANES and 1 <= per_lane <= PATHS_PER_LANE
+    assert (passes - 1) * lanes * per_lane < n_paths <= passes * lanes * per_lane
+    assert passes == 1 or lanes == MAX_LANES
+
+
+def test_an_estimate_is_the_mean_and_the_error_of_the_mean() -> None:
+    assert estimate(np.array([1.0, 2.0, 6.0])) == pytest.approx((3.0, np.sqrt(7 / 3)))
+    columns = estimate(np.array([[1.0, 0.0], [2.0, 4.0], [6.0, 8.0]]))
+    np.testing.assert_allclose(columns.value, [3.0, 4.0])
+    np.testing.assert_allclose(columns.standard_error, np.sqrt([7 / 3, 16 / 3]))
