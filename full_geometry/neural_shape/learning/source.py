@@ -15,7 +15,8 @@ from full_geometry.half_space import HalfSpace
 from full_geometry.learning.exits import trace_exits
 from full_geometry.learning.pairs import Proposals
 from full_geometry.neural_shape.descriptors import describe, end, medium
-from full_geometry.neural_shape.model import BACKBONE, FLOOR
+from full_geometry.neural_shape.mixing import mixed
+from full_geometry.neural_shape.model import backbone
 from full_geometry.subject import Subject, SurfacePoint
 from halfspace_sss.tracing.walk import _generator, pass_seed
 
@@ -82,13 +83,14 @@ def make_data(subject: Subject, events: float, seed: tuple[int, ...]) -> PairDat
     kept = dr.gather(mi.UInt32, kept, dr.arange(mi.UInt32, min(dr.width(kept), KEPT)))
     T = dr.gather(mi.Float, exits.T[0], kept).numpy()
     walks = _columns(subject, starts.gather(kept), exits.at.gather(kept))
-    half_space = HalfSpace(subject, BACKBONE, FLOOR)
+    mixtures = mixed(subject)
+    half_space = backbone(subject, mixtures)
     rng = _generator(mi, KEPT, pass_seed(*seed, 2))
     starts = subject.random_points(rng)
     entries, weight = Proposals(subject, half_space).sample(starts, rng)
     W = (_half_space(half_space, starts, entries) * weight.numpy() / mean).astype(np.float32)
     T = (T / mean).astype(np.float32)
-    return PairData(walks, T, _columns(subject, starts, entries), W, medium(subject, 0), share)
+    return PairData(walks, T, _columns(subject, starts, entries), W, medium(subject, 0, mixtures[0]), share)
 
 
 def _columns(subject: Subject, exits: SurfacePoint, entries: SurfacePoint) -> np.ndarray:
