@@ -31,12 +31,25 @@ from halfspace_sss.physics.backbone import length_scale
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.transport.plane import number
 
-__all__ = ["CURVED_OWN", "CURVED_SHARED", "N_MEDIUM", "N_OWN", "N_SHARED", "End", "Pair", "describe", "end", "medium"]
+__all__ = [
+    "CURVED_OWN",
+    "CURVED_SHARED",
+    "N_MEDIUM",
+    "N_OWN",
+    "N_SHARED",
+    "REFLECTIONS",
+    "End",
+    "Pair",
+    "describe",
+    "end",
+    "medium",
+]
 
 N_LOOK = 3 * N_LENGTHS
 CURVED_OWN, CURVED_SHARED = slice(6, 10 + N_LOOK), slice(4, 10)  # which are 0 on a plane
 N_OWN, N_SHARED, N_MEDIUM = 10 + N_LOOK, 10, 13
 LEAST_P, LEAST_LENGTH, LEAST_R = 1e-3, 1e-2, 1e-9
+REFLECTIONS = 8  # light in a thin thing may be led along it
 LEAST_RATIO, LEAST_PHASE = 1e-4, 1e-4
 GRAZES = 0.999  # of the line between two points, from which on nothing is in between
 
@@ -76,7 +89,7 @@ class _Line(NamedTuple):
 def end(subject: Subject, at: SurfacePoint, active: Any = True) -> End:
     """What belongs to one end alone, measured once for all partners."""
     inner = refract_in(at, number(subject.eta))[0]
-    event = first_event(subject, at, active)
+    event = first_event(subject, at, active, REFLECTIONS)
     return End(at, event, look(subject, at, event, active), inner)
 
 

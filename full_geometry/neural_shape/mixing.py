@@ -27,7 +27,7 @@ from halfspace_sss.tracing.walk import _generator, pass_seed
 
 __all__ = ["Mixed", "mean_chord", "mixed"]
 
-POINTS, SEED = 2**15, 31
+POINTS, SEED, REFLECTIONS = 2**15, 31, 64
 LEAST_ESCAPE = 1e-6
 
 
@@ -50,7 +50,7 @@ def mean_chord(subject: Subject) -> float:
 def mixed(subject: Subject) -> list[Mixed]:
     """What each channel mixes; M is 0 where there is no scattering or no volume."""
     at = subject.random_points(_generator(_mitsuba(), POINTS, pass_seed(SEED)))
-    entering, P = refract_in(at, number(subject.eta))[1], first_event(subject, at).P
+    entering, P = refract_in(at, number(subject.eta))[1], first_event(subject, at, True, REFLECTIONS).P
     chord = max(mean_chord(subject), 0.0)
     return [_of(subject, m, chord, float(np.mean((entering * P[c]).numpy()))) for c, m in enumerate(subject.media)]
 

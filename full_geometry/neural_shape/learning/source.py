@@ -14,7 +14,7 @@ from full_geometry.first_event import first_event
 from full_geometry.half_space import HalfSpace
 from full_geometry.learning.exits import trace_exits
 from full_geometry.learning.pairs import Proposals
-from full_geometry.neural_shape.descriptors import describe, end, medium
+from full_geometry.neural_shape.descriptors import REFLECTIONS, describe, end, medium
 from full_geometry.neural_shape.mixing import mixed
 from full_geometry.neural_shape.model import backbone
 from full_geometry.subject import Subject, SurfacePoint
@@ -110,7 +110,7 @@ def _half_space(half_space: HalfSpace, exits: SurfacePoint, entries: SurfacePoin
     import drjit as dr
 
     query, F_t, above = half_space.query(exits, entries)
-    P = (first_event(half_space.subject, at).P[0] for at in (exits, entries))
+    P = (first_event(half_space.subject, at, True, REFLECTIONS).P[0] for at in (exits, entries))
     factor = dr.select(above, next(P) * next(P), 0)
     dr.eval(query, F_t, factor)
     S_0 = half_space.models[0].eval(*(v.numpy() for v in query)) + F_t.numpy() * half_space.floors[0]
