@@ -65,9 +65,8 @@ def test_what_is_open_mixes_nothing() -> None:
     assert abs(mixed(subject)[0].M) < 1e-9
 
 
-@pytest.mark.parametrize("family", ["sheets", "blobs"])
-def test_it_is_most_of_the_light_of_thin_objects(family: str) -> None:
-    subject = Subject.of(make_shape(family, 3, 24).mitsuba(family), Medium(0.95, 0.05, 0.0, 1.45).scaled(0.15))
+def test_it_is_most_of_the_light_of_a_thin_sheet() -> None:
+    subject = Subject.of(make_shape("sheets", 3, 24).mitsuba("sheet"), Medium(0.95, 0.05, 0.0, 1.45).scaled(0.15))
     S_0 = HalfSpace(subject, "neural")
     models = {"mixed": Backbone(subject, backbone(subject, mixed(subject))), "plane": Backbone(subject, S_0)}
     found = errors_of(subject, models, exits=64, walks=2048, samples=1024)
