@@ -10,8 +10,8 @@ If every event forgets the one before and fills the volume evenly, orders two an
     S_mixed = F_t(w_o) P_o F_t(w_i) P_i M,    M = a² q/(1 - a q) / (4 pi V sigma_t eta²).
 
 It holds in what is thin and flat or rugged; in a smooth ball it is up to twice too much, as light that entered does not
-reach what is held near the surface. M is divided by 1 + (sigma_t' c)², as light of thick objects leaves near to where it
-entered.
+reach what is held near the surface. M is divided by 1 + (sigma_t' c)², as light of thick objects leaves near to where
+it entered.
 """
 
 from __future__ import annotations
