@@ -82,7 +82,7 @@ def turned(task: Task) -> dict[str, Any]:
     """What the knobs bring on a scene."""
     from halfspace_sss import materials
     from halfspace_sss.neural.symmetric import channels
-    from halfspace_sss.trade.knobs import channel_settings, entry_settings, node_settings
+    from halfspace_sss.trade.knobs import channel_settings, entry_settings, node_settings, precision_settings
     from halfspace_sss.trade.measuring.ways import stage
 
     prepare()
@@ -92,7 +92,8 @@ def turned(task: Task) -> dict[str, Any]:
     task.progress(1, 3)
     settings += channel_settings(on, p["seconds"], p["seed"])
     task.progress(2, 3)
-    settings += node_settings(channels(materials.load(p["material"]).medium)[0], seed=p["seed"])
+    medium = channels(materials.load(p["material"]).medium)[0]
+    settings += node_settings(medium, seed=p["seed"]) + precision_settings(medium, seed=p["seed"])
     return {"settings": [{**vars(s), "material": p["material"]} for s in settings]}
 
 

@@ -83,7 +83,7 @@ def markdown(found: Scenes, table: pandas.DataFrame, settings: Sequence[Mapping[
         lines.append("|---|---|---:|---|---:|---:|")
         for s in settings:
             words = " | ".join(str(s[key]) for key in ("material", "knob", "value", "way"))
-            error = _short(100 * s["error"]) if s["knob"] == "nodes" else "–"  # the others change none
+            error = _short(100 * s["error"]) if s["knob"] in ("nodes", "precision") else "–"  # the others change none
             lines.append(f"| {words} | {_short(s['cost'])} | {error} |")
     return "\n".join(lines) + "\n"
 

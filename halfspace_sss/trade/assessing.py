@@ -20,7 +20,7 @@ __all__ = ["assess"]
 def assess(
     scene: Any,
     *,
-    seconds: float = 4.0,
+    seconds: float = 3.5,
     only: Sequence[str] | None = None,
     sensor: int = 0,
     seed: int = 0,
@@ -43,7 +43,7 @@ def assess(
         sensor: number of the sensor.
         seed: of everything; what depends on the clock is how many samples are taken.
         flip: whether to render small images for FLIP, if the evaluator is installed.
-        tolerance: of a job; the last part of the time is then for ways that might be the cheapest to keep it.
+        tolerance: of a job; more than half of the time is then for ways that might be the cheapest to keep it.
         exits: points of each object.
         parameters: values of the parameters $name of an XML file.
         progress: called with (what, done, total).

@@ -148,4 +148,5 @@ def _launch(stage: Stage, integrator: Any, exits: Exits, estimate: Estimate, eac
     if not np.isfinite(rows).all():
         raise ValueError(f"samples must be finite, got {int((~np.isfinite(rows)).sum())} exits that are not")
     estimate.add(rows[0::2], rows[1::2], each)
+    estimate.add_bright(np.array([np.broadcast_to(c.numpy(), exits.n * each) for c in L]), each)
     return memory, took
