@@ -75,7 +75,7 @@ def measured(task: Task) -> dict[str, Any]:
         named = {row.way for row in found.objects[0].ways if not row.refusal}
         images = small_images(on, [w for w in chosen if w.name in named], 0, p["seed"], p["size"], p["spp"])
     numbered = {f"image_{k}": image for k, image in enumerate(images.values())}
-    return {"assessment": found.record(), "shown": list(images), **numbered}
+    return {"assessment": found.record(), "seconds": p["seconds"], "shown": list(images), **numbered}
 
 
 def turned(task: Task) -> dict[str, Any]:
@@ -131,6 +131,7 @@ def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
         files: dict[str, bytes | str] = {f"trade.{ending}": data for ending, data in saved(figure).items()}
     files["trade.csv"] = table.to_csv(index=False, lineterminator="\n", float_format="%.5g")
     knobs = [results[f"{m}, knobs"].numbers["settings"] for m in KNOB_MATERIALS if f"{m}, knobs" in results]
-    files["trade.md"] = trade_tables.markdown(found, table, [s for settings in knobs for s in settings])
+    seconds = max(results[name].numbers["seconds"] for name in shots)
+    files["trade.md"] = trade_tables.markdown(found, table, seconds, [s for settings in knobs for s in settings])
     files["trade.html"] = page("Speed against accuracy", shots)
     return files

@@ -49,7 +49,7 @@ def entry_settings(
     """How many points of entry an exit draws, for models on the first object of a scene."""
     found = []
     for n in entries:
-        stage = replace(on, bssrdf={**on.bssrdf, "entries": n}, _integrators={}, _insides={})
+        stage = replace(on, bssrdf={**on.bssrdf, "entries": n}, paces={}, _integrators={}, _insides={})
         chosen = [Way(PATH_TRACED), *map(Way, names)]
         seen = assess_stage(stage, chosen, seconds=seconds, seed=seed).objects[0]
         found += [("entries", str(n), name, _cost(seen, name), seen.way(name).bias) for name in names]
@@ -75,7 +75,7 @@ def channel_settings(on: Stage, seconds: float, seed: int = 0) -> list[Setting]:
         for m in before.channels():
             same = {key: np.full(n, float(getattr(m, key))) for key in ("sigma_s", "sigma_a", "g")}
             surface.inside = replace(before, medium=Medium(**same, eta=m.eta))
-            one = assess_stage(on, [Way(PATH_TRACED)], seconds=seconds, seed=seed).objects[0]
+            one = assess_stage(replace(on, paces={}), [Way(PATH_TRACED)], seconds=seconds, seed=seed).objects[0]
             alone += math.sqrt(one.traced.variance * one.traced.seconds) * one.radiance[0]
     finally:
         surface.inside = before

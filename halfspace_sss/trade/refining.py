@@ -15,7 +15,8 @@ from halfspace_sss.trade.measuring.ways import Stage, Way
 
 __all__ = ["assess_for", "contenders"]
 
-FIRST_SHARE = 0.4  # of the time, for the look at all ways
+FIRST_SHARE = 0.3  # of the time, for the look at all ways
+LEAST_SHARE = 0.25  # of the time, for the second look, however long the first one took
 DOUBT = 2.0  # standard errors
 CLOSE = 1.3  # times the cost of the cheapest way, up to which another may turn out cheaper
 TRACED = (0.3, 0.85)  # least and most of the time of the second look for walks
@@ -26,7 +27,7 @@ def assess_for(
     chosen: Sequence[Way],
     tolerance: float,
     *,
-    seconds: float = 3.5,
+    seconds: float = 4.5,
     sensor: int = 0,
     seed: int = 0,
     exits: int = EXITS,
@@ -41,7 +42,8 @@ def assess_for(
     names = {name for o in seen for name in contenders(o, tolerance)}
     few = [way for way in chosen if way.name in names or way.model == PATH_TRACED]
     traced = sum(_traced_share(o, names) for o in seen) / len(seen)
-    again = assess_stage(on, few, seconds=(1 - FIRST_SHARE) * seconds, seed=seeded(seed, 71), traced=traced, **how)
+    left = max(seconds - first.seconds / len(seen), LEAST_SHARE * seconds)
+    again = assess_stage(on, few, seconds=left, seed=seeded(seed, 71), traced=traced, **how)
     objects = tuple(_merged(a, b) for a, b in zip(first.objects, again.objects))
     spent = (first.seconds + again.seconds, first.compilation + again.compilation)
     return Assessment(objects, *spent, first.seed)

@@ -125,6 +125,19 @@ def test_an_instance_is_refused_in_a_sentence() -> None:
         assess(instanced, only=FEW, **QUICK)
 
 
+def test_a_point_through_which_a_lamp_would_be_seen_is_left_out() -> None:
+    from halfspace_sss.trade.measuring.exits import visible_exits
+    from halfspace_sss.trade.measuring.ways import stage
+
+    lit = scene({"sigma_s": 9.5, "sigma_a": 0.5, "eta": 1.0})
+    lamp = {"type": "sphere", "center": [0, 0, -5.0], "radius": 0.4}
+    lit["lamp"] = {**lamp, "emitter": {"type": "area", "radiance": 9.0}}
+    on = stage(lit)
+    (found,) = visible_exits(on.scene, on.shapes, 0, 10**5, 1)
+    nearest = np.linalg.norm(np.cross(found.d.T, np.array([0, 0, -5.0]) - found.o.T), axis=1)  # d is a unit vector
+    assert 0.4 - 1e-3 < nearest.min() < 0.43
+
+
 def test_a_way_that_refuses_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HALFSPACE_SSS_WEIGHTS", str(tmp_path))
     found = assess(scene(), only=["full_geometry"], **QUICK).objects[0]

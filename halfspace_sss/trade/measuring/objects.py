@@ -59,7 +59,7 @@ def assess_stage(
 
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
-            sampled = _object(on, points, chosen, (seconds, samples, traced), seeded(seed, 42, k), tell)
+            sampled = _object(on, k, points, chosen, (seconds, samples, traced), seeded(seed, 42, k), tell)
             heard = [" ".join(str(w.message).split()) for w in caught]
         walks = sampled[chosen[0]]
         rows = tuple(_row(on, k, way, found, walks) for way, found in sampled.items())
@@ -84,7 +84,13 @@ def _mfp(on: Stage, k: int) -> tuple[float, float]:
 
 
 def _object(
-    on: Stage, points: Exits, chosen: Sequence[Way], budget: tuple[float, int | None, float], seed: int, tell: Any
+    on: Stage,
+    k: int,
+    points: Exits,
+    chosen: Sequence[Way],
+    budget: tuple[float, int | None, float],
+    seed: int,
+    tell: Any,
 ) -> dict[Way, Sampled | str]:
     """What all ways say of an object, or why they refuse it."""
     seconds, samples, traced = budget
@@ -95,7 +101,7 @@ def _object(
         started = clock()
         share = traced if way.model == PATH_TRACED and len(chosen) > 1 else 1 / (len(chosen) - done)
         try:
-            found = first_sample(on, way, points, seeded(seed, done))
+            found = first_sample(on, way, points, seeded(seed, done), k)
             end, started = end + found.compiling, started + found.compiling
             left = share * (end - started) - (clock() - started)
             sample_more(on, way, points, found, seeded(seed, done), seconds=left, samples=samples)
