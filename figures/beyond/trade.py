@@ -75,14 +75,14 @@ def measured(task: Task) -> dict[str, Any]:
         named = {row.way for row in found.objects[0].ways if not row.refusal}
         images = small_images(on, [w for w in chosen if w.name in named], 0, p["seed"], p["size"], p["spp"])
     numbered = {f"image_{k}": image for k, image in enumerate(images.values())}
-    return {"assessment": found.record(), "shown": list(images), **numbered}
+    return {"assessment": found.record(), "seconds": p["seconds"], "shown": list(images), **numbered}
 
 
 def turned(task: Task) -> dict[str, Any]:
     """What the knobs bring on a scene."""
     from halfspace_sss import materials
     from halfspace_sss.neural.symmetric import channels
-    from halfspace_sss.trade.knobs import channel_settings, entry_settings, node_settings
+    from halfspace_sss.trade.knobs import channel_settings, entry_settings, node_settings, precision_settings
     from halfspace_sss.trade.measuring.ways import stage
 
     prepare()
@@ -92,7 +92,8 @@ def turned(task: Task) -> dict[str, Any]:
     task.progress(1, 3)
     settings += channel_settings(on, p["seconds"], p["seed"])
     task.progress(2, 3)
-    settings += node_settings(channels(materials.load(p["material"]).medium)[0], seed=p["seed"])
+    medium = channels(materials.load(p["material"]).medium)[0]
+    settings += node_settings(medium, seed=p["seed"]) + precision_settings(medium, seed=p["seed"])
     return {"settings": [{**vars(s), "material": p["material"]} for s in settings]}
 
 
@@ -130,6 +131,7 @@ def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
         files: dict[str, bytes | str] = {f"trade.{ending}": data for ending, data in saved(figure).items()}
     files["trade.csv"] = table.to_csv(index=False, lineterminator="\n", float_format="%.5g")
     knobs = [results[f"{m}, knobs"].numbers["settings"] for m in KNOB_MATERIALS if f"{m}, knobs" in results]
-    files["trade.md"] = trade_tables.markdown(found, table, [s for settings in knobs for s in settings])
+    seconds = max(results[name].numbers["seconds"] for name in shots)
+    files["trade.md"] = trade_tables.markdown(found, table, seconds, [s for settings in knobs for s in settings])
     files["trade.html"] = page("Speed against accuracy", shots)
     return files

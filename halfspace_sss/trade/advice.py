@@ -5,7 +5,8 @@ object each takes, until bias and noise together are at the tolerance e,
 
     T = training + preparation + images n t V / (e² - b²),
 
-and a way with b >= e never gets there. b is a bound that holds in 95 % of cases, V one that holds in 84 %.
+and a way with b >= e never gets there. With standard errors s of b² and v of V, and x = 1 / samples, b² + V x is taken
+at its bound that holds in 95 % of cases, b² + V x + 1.645 sqrt(s² + v² x²).
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED
 from halfspace_sss.trade.assessing import assess
-from halfspace_sss.trade.measuring.results import Assessment, ObjectTrade, WayTrade
+from halfspace_sss.trade.measuring.results import Assessment, ObjectTrade, WayTrade, samples_for
 
 __all__ = ["Advice", "ObjectAdvice", "Option", "Job", "advise", "recommend"]
 
@@ -186,10 +187,10 @@ def _once(row: WayTrade, job: Job) -> float:
 
 
 def _option(found: ObjectTrade, row: WayTrade, job: Job) -> _Raw:
-    left = job.tolerance**2 - row.bias_bound**2
-    if not left > 0:
+    needed = samples_for(row, job.tolerance)
+    if not needed < math.inf:
         return math.inf, 0.0, row.bias, row
-    spp = max(math.ceil(row.variance_bound / left), 1)
+    spp = max(math.ceil(needed), 1)
     took = _once(row, job) + job.images * found.pixels * spp * row.seconds
     return took, spp, math.hypot(row.bias, math.sqrt(row.variance / spp)), row
 

@@ -20,7 +20,7 @@ __all__ = ["assess"]
 def assess(
     scene: Any,
     *,
-    seconds: float = 4.0,
+    seconds: float = 4.5,
     only: Sequence[str] | None = None,
     sensor: int = 0,
     seed: int = 0,
@@ -38,12 +38,12 @@ def assess(
 
     Args:
         scene: a Mitsuba scene, a dict as for `mitsuba.load_dict`, or the path of an XML file.
-        seconds: for each object, shared by all ways; compilation comes on top.
+        seconds: for each object, shared by all ways; compilation comes on top, and a little for many ways.
         only: names of ways, by default all; "path_traced" is always among them.
         sensor: number of the sensor.
         seed: of everything; what depends on the clock is how many samples are taken.
         flip: whether to render small images for FLIP, if the evaluator is installed.
-        tolerance: of a job; the last part of the time is then for ways that might be the cheapest to keep it.
+        tolerance: of a job; more than half of the time is then for ways that might be the cheapest to keep it.
         exits: points of each object.
         parameters: values of the parameters $name of an XML file.
         progress: called with (what, done, total).

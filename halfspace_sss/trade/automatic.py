@@ -1,8 +1,9 @@
 """The model "auto": the cheapest one of each object whose bias keeps the tolerance of the integrator, by measurement.
 
-Costs are variance of a sample times seconds. If no model keeps the tolerance the least biased is taken. The choice is
-kept in a file, so that the same scene gets the same model again; the file can be deleted, and a model that is named in
-the scene needs no choice. The integrator cannot mix walks with models, and says where walks would be the better way.
+All models that are installed are candidates. Costs are variance of a sample times seconds. If no model keeps the
+tolerance the least biased is taken. The choice is kept in a file, so that the same scene gets the same model again; the
+file can be deleted, and a model that is named in the scene needs no choice. The integrator cannot mix walks with
+models, and says where walks would be the better way.
 """
 
 from __future__ import annotations
@@ -20,15 +21,15 @@ from halfspace_sss.rendering.scenes.identity import scene_hash
 from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED
 from halfspace_sss.rendering.surface.transports import AUTO, model_names
 from halfspace_sss.trade.measuring.objects import assess_stage
-from halfspace_sss.trade.measuring.results import Assessment, ObjectTrade, WayTrade
-from halfspace_sss.trade.measuring.ways import LAMBERT, Stage, Way
+from halfspace_sss.trade.measuring.results import ObjectTrade, WayTrade
+from halfspace_sss.trade.measuring.ways import Stage, Way
 
 __all__ = ["ENVIRONMENT_VARIABLE", "choices_folder", "choose", "picked"]
 
 ENVIRONMENT_VARIABLE = "HALFSPACE_SSS_CHOICES"
 DEFAULT = "neural"
-CANDIDATES = (DEFAULT, LAMBERT, "better_dipole", "full_geometry", "neural_shape")
-SAMPLES, EXITS = 512, 96  # of each exit, and exits of each object: about a second for all ways
+EXITS = 96  # of each object
+SAMPLES = (64, 2048)  # fewest and most of each exit by each way; the fewest take some tenths of a second
 FORMAT = "halfspace-sss choice 1"
 
 
@@ -43,7 +44,8 @@ def choose(scene: Any, settings: Any) -> None:
 
     Args:
         scene: the Mitsuba scene, whose surfaces change.
-        settings: `Settings` of the integrator; the tolerance is theirs.
+        settings: `Settings` of the integrator; the tolerance is theirs, and the share of the samples of an image that
+            the choice takes, as far as `SAMPLES` allows.
 
     Raises:
         ValueError: the scene cannot be rendered, or the file of an earlier choice is damaged.
@@ -55,7 +57,7 @@ def choose(scene: Any, settings: Any) -> None:
     path = choices_folder() / f"{_identity(on, settings)}.json"
     record = _read(path) if path.is_file() else None
     if record is None or len(record["models"]) != len(wanted):
-        record = _measured(on, wanted, settings.tolerance)
+        record = _measured(on, wanted, settings)
         write_atomically(path, json.dumps(record, indent=1, allow_nan=False) + "\n")
     given: dict[int, str] = {}
     for k, model, sentence in zip(wanted, record["models"], record["sentences"]):
@@ -77,6 +79,7 @@ def _identity(on: Stage, settings: Any) -> str:
     import mitsuba as mi
 
     plugin = {"type": "bssrdf", **on.settings, **on.bssrdf, "tolerance": settings.tolerance}
+    plugin |= {"choice_share": settings.choice_share}
     return scene_hash(on.scene, mi.load_dict(plugin))[:32]
 
 
@@ -97,25 +100,28 @@ def _read(path: Path) -> dict[str, Any]:
     return {**record, "models": models, "sentences": sentences}
 
 
-def _measured(on: Stage, wanted: list[int], tolerance: float) -> dict[str, Any]:
-    names = [name for name in CANDIDATES if name in model_names()]
-    ways = [Way(PATH_TRACED), *(Way(name) for name in names)]
-    found = assess_stage(on, ways, samples=SAMPLES, exits=EXITS)
-    models, sentences = [], []
-    for k in wanted:
-        row, sentence = picked(found.objects[k], tolerance)
-        models.append(row)
-        sentences.append(sentence)
-    return {"format": FORMAT, "models": models, "sentences": sentences, **_about(found, tolerance)}
+def _measured(on: Stage, wanted: list[int], settings: Any) -> dict[str, Any]:
+    ways = [Way(name) for name in (PATH_TRACED, *model_names()) if name != AUTO]
+    samples = _samples(on, settings.choice_share / len(ways))
+    found = assess_stage(on, ways, samples=samples, exits=EXITS)
+    models, sentences = zip(*(picked(found.objects[k], settings.tolerance) for k in wanted))
+    about = provenance(tolerance=settings.tolerance, samples=samples, exits=EXITS)
+    record = {"format": FORMAT, "models": list(models), "sentences": list(sentences)}
+    return {**record, "assessment": found.record(), "provenance": about}
 
 
-def _about(found: Assessment, tolerance: float) -> dict[str, Any]:
-    return {"assessment": found.record(), "provenance": provenance(tolerance=tolerance, samples=SAMPLES, exits=EXITS)}
+def _samples(on: Stage, share: float) -> int:
+    """Of each exit by each way, which take that share of the samples of the first sensor's image."""
+    if not on.scene.sensors():
+        return SAMPLES[0]
+    camera = on.scene.sensors()[0]
+    image = math.prod(int(n) for n in camera.film().crop_size()) * camera.sampler().sample_count()
+    return min(max(int(share * image / (EXITS * len(on.shapes))), SAMPLES[0]), SAMPLES[1])
 
 
 def picked(found: ObjectTrade, tolerance: float) -> tuple[str, str]:
     """The model for an object, and one sentence."""
-    rows = [row for row in found.ways if not row.refusal and row.way != PATH_TRACED]
+    rows = [row for row in found.ways if not row.refusal and row.way in model_names()]
     if not rows or found.is_dark:
         return _default(rows), f"object {found.object!r}: {_default(rows)}, as nothing is seen that could be compared"
     keeping = [row for row in rows if row.bias_bound <= tolerance]

@@ -1,4 +1,4 @@
-"""What the knobs of a way bring: entries for an exit, channels of one walk, nodes of photon beam diffusion.
+"""What the knobs of a way bring: entries for an exit, channels of one walk, nodes of photon beam diffusion, precision.
 
 Costs are variance of a sample times seconds, in time to equal noise; 1 is that of the setting everything else uses.
 """
@@ -9,22 +9,27 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 
 from halfspace_sss.comparison.held_out import references
 from halfspace_sss.comparison.model_errors import model_error
 from halfspace_sss.interface.model import model_class
+from halfspace_sss.neural.network import Network
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED
 from halfspace_sss.trade.measuring.objects import assess_stage
 from halfspace_sss.trade.measuring.results import ObjectTrade
+from halfspace_sss.trade.measuring.sampling import clock
 from halfspace_sss.trade.measuring.ways import Stage, Way
 
-__all__ = ["Setting", "channel_settings", "entry_settings", "node_settings"]
+__all__ = ["Setting", "channel_settings", "entry_settings", "node_settings", "precision_settings"]
 
 ENTRIES, NODES = (1, 2, 4, 8), (4, 8, 16, 32, 64)
 BEAMS, USUAL_NODES, QUERIES = "photon_beam_diffusion", 16, 2**14
+PRECISIONS, LANES, REPEATS = ("float32", "float16"), 2**18, 3
 
 
 @dataclass(frozen=True)
@@ -44,7 +49,7 @@ def entry_settings(
     """How many points of entry an exit draws, for models on the first object of a scene."""
     found = []
     for n in entries:
-        stage = replace(on, bssrdf={**on.bssrdf, "entries": n}, _integrators={}, _insides={})
+        stage = replace(on, bssrdf={**on.bssrdf, "entries": n}, paces={}, _integrators={}, _insides={})
         chosen = [Way(PATH_TRACED), *map(Way, names)]
         seen = assess_stage(stage, chosen, seconds=seconds, seed=seed).objects[0]
         found += [("entries", str(n), name, _cost(seen, name), seen.way(name).bias) for name in names]
@@ -70,7 +75,7 @@ def channel_settings(on: Stage, seconds: float, seed: int = 0) -> list[Setting]:
         for m in before.channels():
             same = {key: np.full(n, float(getattr(m, key))) for key in ("sigma_s", "sigma_a", "g")}
             surface.inside = replace(before, medium=Medium(**same, eta=m.eta))
-            one = assess_stage(on, [Way(PATH_TRACED)], seconds=seconds, seed=seed).objects[0]
+            one = assess_stage(replace(on, paces={}), [Way(PATH_TRACED)], seconds=seconds, seed=seed).objects[0]
             alone += math.sqrt(one.traced.variance * one.traced.seconds) * one.radiance[0]
     finally:
         surface.inside = before
@@ -92,3 +97,46 @@ def node_settings(medium: Medium, events: float = 4e6, seed: int = 0) -> list[Se
         found.append((n, time.perf_counter() - started, model_error(model, traced).error))
     usual = next(took for n, took, _ in found if n == USUAL_NODES)
     return [Setting("nodes", str(n), BEAMS, took / usual, error) for n, took, error in found]
+
+
+def precision_settings(medium: Medium, events: float = 4e6, seed: int = 0) -> list[Setting]:
+    """Single against half precision of the network of `neural` on a scalar medium: error, time in Dr.Jit alone."""
+    (traced,) = references([medium.in_mfp()], events, seed, 4)
+    found = []
+    for precision in PRECISIONS:
+        model = model_class("neural")(medium.in_mfp())
+        (network,) = model.networks
+        took = _network_seconds(network, precision)
+        model.networks = [partial(_rounded, network, precision)]
+        found.append((precision, took, model_error(model, traced).error))
+    return [Setting("precision", name, "neural", took / found[0][1], error) for name, took, error in found]
+
+
+def _rounded(network: Network, precision: str, features: Sequence[Any]) -> Any:
+    """The network in a precision, for Dr.Jit arrays of single or double precision."""
+    kind = type(sum(features[1:], features[0]))
+    inner = _lanes(kind, precision)
+    return kind(network([inner(f) for f in features]))
+
+
+def _lanes(kind: type, precision: str) -> type:
+    import drjit as dr
+
+    return dr.float16_array_t(kind) if precision == "float16" else dr.float32_array_t(kind)
+
+
+def _network_seconds(network: Network, precision: str) -> float:
+    """Least of some runs over as many lanes as a launch has, compilation left out."""
+    import drjit as dr
+    import mitsuba as mi
+
+    rng, n_in = np.random.default_rng(0), len(network.matrices[0])
+    features = [_lanes(mi.Float, precision)(mi.Float(row)) for row in rng.random((n_in, LANES)).astype(np.float32)]
+    dr.eval(features)
+    took = []
+    for _ in range(REPEATS + 1):
+        started = clock()
+        dr.eval(network(features))
+        dr.sync_thread()
+        took.append(clock() - started)
+    return min(took[1:])

@@ -10,8 +10,9 @@ import pytest
 from halfspace_sss.trade import recommend
 from halfspace_sss.trade.advice import Job, advise
 from halfspace_sss.trade.automatic import picked
-from halfspace_sss.trade.measuring.results import Assessment, ObjectTrade, WayTrade
-from halfspace_sss.trade.measuring.statistics import Estimate, mean_square, relative_variance
+from halfspace_sss.trade.measuring.results import Assessment, ObjectTrade, WayTrade, samples_for
+from halfspace_sss.trade.measuring.statistics import FIREFLIES, Estimate, mean_square, relative_variance
+from halfspace_sss.trade.refining import contenders
 
 SEEDS, EXITS, SAMPLES = 400, 48, 12
 
@@ -49,6 +50,37 @@ def test_the_variance_of_a_sample_is_relative_to_the_mean() -> None:
     flat = np.full((3, 2000), 2.0)
     value = relative_variance(_estimate(rng, flat, 0.6), _estimate(rng, flat, 0.1))
     assert abs(value.value - 0.09) < 4 * value.error
+
+
+def test_fireflies_are_not_in_the_variance_of_a_sample() -> None:
+    rng, found = np.random.default_rng(5), Estimate(1, 100)
+    for _ in range(4):
+        values = 2 + 0.6 * rng.standard_normal((1, 100, 500))
+        values[0, rng.integers(0, 100, 3), 7] = 1e4  # of 50000, less than the share that is left out
+        found.add(values.sum(-1), (values**2).sum(-1), 500)
+        found.add_bright(values.reshape(1, -1), 500)
+    assert 12 <= FIREFLIES * 200_000
+    steady = relative_variance(found, found).value * found.mean.mean() ** 2
+    assert steady == pytest.approx(0.36, rel=0.01)  # the standard error of 2e5 samples is 0.3 %
+    assert found.sample_variance.mean() > 1000
+
+
+@pytest.mark.parametrize(("bias2", "bias2_error", "error"), [(0.0, 0.0, 0.1), (4e-4, 3e-4, 0.3), (-1e-3, 5e-4, 2.0)])
+def test_as_many_samples_are_taken_as_keep_the_tolerance_in_19_of_20_cases(
+    bias2: float, bias2_error: float, error: float
+) -> None:
+    row = WayTrade("neural", bias2, bias2_error, (1.0,), (0.0,), 1.0, error, 1e-6, 100)
+    n, tolerance = samples_for(row, 0.05), 0.05
+    bound = max(bias2, 0) + 1 / n + 1.645 * math.hypot(bias2_error, error / n)
+    assert bound == pytest.approx(tolerance**2, rel=1e-9)
+    assert samples_for(row, 0.01) == math.inf or bias2_error == 0
+
+
+def test_a_second_look_is_at_what_may_be_the_cheapest() -> None:
+    dear, wrong = _way("neural", 0.01, 0.01, 1e-3), _way("lambert", 0.3, 0.01, 1e-9)
+    doubtful = _way("better_dipole", 0.05, 0.2, 1e-7)
+    found = _assessment(dear, wrong, doubtful, WayTrade("full_geometry", refusal="it must be trained")).objects[0]
+    assert contenders(found, 0.1) == ["better_dipole"]
 
 
 def _way(name: str, bias: float, error: float, cost: float, **more) -> WayTrade:

@@ -125,6 +125,19 @@ def test_an_instance_is_refused_in_a_sentence() -> None:
         assess(instanced, only=FEW, **QUICK)
 
 
+def test_a_point_through_which_a_lamp_would_be_seen_is_left_out() -> None:
+    from halfspace_sss.trade.measuring.exits import visible_exits
+    from halfspace_sss.trade.measuring.ways import stage
+
+    lit = scene({"sigma_s": 9.5, "sigma_a": 0.5, "eta": 1.0})
+    lamp = {"type": "sphere", "center": [0, 0, -5.0], "radius": 0.4}
+    lit["lamp"] = {**lamp, "emitter": {"type": "area", "radiance": 9.0}}
+    on = stage(lit)
+    (found,) = visible_exits(on.scene, on.shapes, 0, 10**5, 1)
+    nearest = np.linalg.norm(np.cross(found.d.T, np.array([0, 0, -5.0]) - found.o.T), axis=1)  # d is a unit vector
+    assert 0.4 - 1e-3 < nearest.min() < 0.43
+
+
 def test_a_way_that_refuses_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HALFSPACE_SSS_WEIGHTS", str(tmp_path))
     found = assess(scene(), only=["full_geometry"], **QUICK).objects[0]
@@ -154,6 +167,34 @@ def test_auto_is_chosen_once_kept_and_found_again(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="delete it to choose anew"):
         damaged = mi.load_dict(scene(model="auto"))
         damaged.integrator().prepare(damaged)
+
+
+@pytest.mark.parametrize(("share", "spp", "samples"), [(0.0, 4, 64), (0.5, 256, 1365), (1.0, 1024, 2048)])
+def test_the_choice_takes_its_share_of_the_samples_of_an_image(share: float, spp: int, samples: int) -> None:
+    from halfspace_sss.trade.automatic import _samples
+    from halfspace_sss.trade.measuring.ways import stage
+
+    asked = scene(model="auto")
+    asked["sensor"]["sampler"] = {"type": "independent", "sample_count": spp}
+    assert _samples(stage(asked), share / 4) == samples  # 64² pixels, 96 exits, 4 ways
+
+
+def test_every_installed_model_is_a_candidate_of_auto(tmp_path: Path) -> None:
+    from halfspace_sss.rendering.surface.transports import AUTO, model_names
+
+    loaded = mi.load_dict(scene(model="auto"))
+    loaded.integrator().prepare(loaded)
+    (file,) = (tmp_path / "choices").iterdir()
+    rows = json.loads(file.read_text())["assessment"]["objects"][0]["ways"]
+    assert {row["way"] for row in rows} == {"path_traced", *model_names()} - {AUTO}
+
+
+def test_half_precision_of_a_network_is_measured_beside_single() -> None:
+    from halfspace_sss.trade.knobs import precision_settings
+
+    single, half = precision_settings(Medium.from_albedo(0.9, 1.0, 0.0, 1.3), events=2e5)
+    assert (single.value, single.cost, half.value) == ("float32", 1.0, "float16")
+    assert half.cost > 0 and abs(half.error - single.error) < 0.01
 
 
 def test_lambert_in_a_white_furnace_is_white() -> None:
@@ -194,11 +235,12 @@ def test_the_command_measures_a_scene_and_writes_files(tmp_path: Path, monkeypat
 
 
 def test_the_check_goes_on_where_it_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from halfspace_sss.trade.checking import check
+    from halfspace_sss.trade.checking import check, truth
 
     monkeypatch.setattr(check, "WAYS", ("path_traced", "lambert"))
     first = check.check_scene(1, 0, tmp_path, 0.2, 0.3)
-    monkeypatch.setattr(check, "assess_stage", None)
+    monkeypatch.setattr(check, "assess_for", None)
+    monkeypatch.setattr(truth, "assess_stage", None)
     assert check.check_scene(1, 0, tmp_path, 0.2, 0.3) == json.loads(json.dumps(first))
     found = check.outcome(first)
     assert found["way"] in ("path_traced", "lambert") and found["ratio"] > 0 and len(check.z_values(first)) == 1

@@ -33,6 +33,8 @@ class Settings:
         train_seconds: time for each object whose model has to learn it first; 0 refuses objects without weights.
         train_error: relative error under constant light, measured on the way, from which on it has learnt enough.
         tolerance: relative error of the radiance of an object that its model "auto" keeps, if one does.
+        choice_share: of the samples of the first sensor's image, that the choice of "auto" may take; see
+            `trade.automatic`.
     """
 
     mm_per_unit: float = 1.0
@@ -45,10 +47,12 @@ class Settings:
     train_seconds: float = 60.0
     train_error: float = 0.03
     tolerance: float = 0.05
+    choice_share: float = 0.1
 
     def __post_init__(self) -> None:
         check_interval("mm_per_unit", self.mm_per_unit, 1e-9, 1e9)
         check_interval("tolerance", self.tolerance, 1e-4, 10.0)
+        check_interval("choice_share", self.choice_share, 0.0, 1.0)
         if self.max_depth < -1 or self.max_depth == 0:
             raise ValueError(f"max_depth must be -1 or at least 1, got {self.max_depth}")
         if self.rr_depth < 1:

@@ -12,10 +12,10 @@ from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED
 from halfspace_sss.trade.advice import Job, advise
 from halfspace_sss.trade.automatic import picked
 from halfspace_sss.trade.checking.random_scenes import RandomScene, random_scene, write_scene
-from halfspace_sss.trade.measuring.objects import assess_stage
+from halfspace_sss.trade.checking.truth import long_run
 from halfspace_sss.trade.measuring.results import Assessment, WayTrade
 from halfspace_sss.trade.measuring.seeds import seeded
-from halfspace_sss.trade.measuring.ways import Way, stage
+from halfspace_sss.trade.measuring.ways import Stage, Way, stage
 from halfspace_sss.trade.refining import assess_for
 
 __all__ = ["WAYS", "check_scene", "outcome", "z_values"]
@@ -24,25 +24,31 @@ WAYS = (
     PATH_TRACED, "lambert", "standard_dipole", "better_dipole", "directional_dipole", "photon_beam_diffusion", "neural",
     "better_dipole, without single scattering", "neural, without single scattering",
 )  # fmt: skip
-FORMAT = "halfspace-sss trade check 1"
+FORMAT = "halfspace-sss trade check 2"
 
 
 def check_scene(number: int, seed: int, folder: Path, seconds: float, truth_seconds: float) -> dict[str, Any]:
-    """The record of a scene, from its file if that is there: assessments of two lengths, and what was recommended."""
+    """The record of a scene: the assessment, and the mean of long runs; what the folder holds is not run again."""
     scene = random_scene(number, seed)
     file = write_scene(scene, folder)
-    path = file.with_suffix(".json")
-    how = {"scene": scene.record(), "seconds": seconds, "truth_seconds": truth_seconds}
+    on, ways = stage(file), [Way.of(name) for name in WAYS]
+    quick = _quick(scene, on, ways, file.with_suffix(".json"), seconds)
+    truth = file.with_suffix(".truth.json")
+    long = long_run(on, ways, scene.tolerance, truth, seeded(seed, number, 1), truth_seconds)
+    return {"scene": scene.record(), "quick": quick, "long": long.record()}
+
+
+def _quick(scene: RandomScene, on: Stage, ways: list[Way], path: Path, seconds: float) -> dict[str, Any]:
+    """The assessment as users make it, on which the recommendation rests."""
+    how = {"format": FORMAT, "scene": scene.record(), "seconds": seconds, "ways": [way.name for way in ways]}
     if path.is_file():
         record = json.loads(path.read_text(encoding="utf-8"))
-        if record.get("format") == FORMAT and json.loads(json.dumps(how)).items() <= record.items():
-            return record
-    on, ways = stage(file), [Way.of(name) for name in WAYS]
-    quick = assess_for(on, ways, scene.tolerance, seconds=seconds, seed=seeded(seed, number, 0))
-    long = assess_stage(on, ways, seconds=truth_seconds, seed=seeded(seed, number, 1))
-    record = {"format": FORMAT, **how, "quick": quick.record(), "long": long.record(), "provenance": provenance(**how)}
+        if json.loads(json.dumps(how)).items() <= record.items():
+            return record["quick"]
+    found = assess_for(on, ways, scene.tolerance, seconds=seconds, seed=seeded(scene.seed, scene.number, 0)).record()
+    record = {**how, "quick": found, "provenance": provenance(**how)}
     write_atomically(path, json.dumps(record, indent=1) + "\n")
-    return record
+    return found
 
 
 def outcome(record: dict[str, Any]) -> dict[str, Any]:

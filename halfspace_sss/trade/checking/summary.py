@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from halfspace_sss.trade.checking.check import outcome, z_values
+from halfspace_sss.trade.checking.check import WAYS, outcome, z_values
 
 if TYPE_CHECKING:
     import pandas
@@ -61,10 +61,29 @@ def _always(table: pandas.DataFrame, name: str) -> dict[str, Any]:
     return told
 
 
-def markdown(found: dict[str, Any], table: pandas.DataFrame) -> str:
-    """The summary and the misses as text."""
+INTRODUCTION = """\
+# What the advice of the trade is worth
+
+Written by `halfspace-sss trade-check` ({arguments}): random scenes of shape x medium x light x size x tolerance, each
+with {assess:g} s for a recommendation among {ways} ways, and up to {truth:g} s of long runs with exits and samples of
+their own, which end when bias² is known to a fifth of the squared tolerance and variances to 15 %. Times are those of
+the processor, all cores together. *Always*: what one fixed choice costs where it can keep the tolerance, with as many
+samples as the long runs say; `auto` is what the model of that name takes for the tolerance of the scene.
+"""
+
+
+def markdown(found: dict[str, Any], table: pandas.DataFrame, how: dict[str, Any]) -> str:
+    """The page: the summary and the misses.
+
+    Args:
+        found: of `summary`.
+        table: of `outcomes`.
+        how: scenes, first, seed, assess, truth: what was asked.
+    """
     n, z = found["scenes"], found["z"]
+    arguments = " ".join(f"--{key} {how[key]}" for key in ("scenes", "first", "seed"))
     lines = [
+        INTRODUCTION.format(arguments=f"`{arguments}`", ways=len(WAYS), **{k: how[k] for k in ("assess", "truth")}),
         f"{found['kept']} of {n} recommendations keep their tolerance (within two standard errors of the long run), "
         f"{found['cheap']} cost at most {DEAR:g} times the cheapest way that does; an assessment took at most "
         f"{found['assess_s']:.2g} s of two cores, compilation left out.",

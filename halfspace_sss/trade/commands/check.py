@@ -19,8 +19,8 @@ def check_command(
     scenes: Annotated[int, typer.Option(help="How many.", parser=whole)] = 60,
     first: Annotated[int, typer.Option(help="Number of the first one.", parser=whole)] = 0,
     seed: Annotated[int, typer.Option(help="Other seeds draw other scenes.", parser=whole)] = 0,
-    assess: Annotated[float, typer.Option(help="Seconds of measuring for a recommendation.")] = 3.0,
-    truth: Annotated[float, typer.Option(help="Seconds of the long run, with seeds of its own.")] = 7.5,
+    assess: Annotated[float, typer.Option(help="Seconds of measuring for a recommendation.")] = 4.5,
+    truth: Annotated[float, typer.Option(help="Most seconds of the long runs, with seeds of their own.")] = 24.0,
     write_only: Annotated[bool, typer.Option("--write-only", help="Write the scenes, measure nothing.")] = False,
     variant: Variant = "llvm_ad_rgb",
     out: Annotated[Path, typer.Option(help="Folder; scenes that were measured there are not measured again.")] = Path(
@@ -52,8 +52,9 @@ def check_command(
             records.append(check_scene(k, seed, out, assess, truth))
             bar.show(len(records), scenes, f"scene {k}")
     table, found = outcomes(records), summary(records)
-    text = markdown(found, table)
-    about = {"provenance": provenance(scenes=scenes, first=first, seed=seed, assess=assess, truth=truth), **found}
+    how = {"scenes": scenes, "first": first, "seed": seed, "assess": assess, "truth": truth}
+    text = markdown(found, table, how)
+    about = {"provenance": provenance(**how), **found}
     write_together(
         {
             out / "check.csv": table.to_csv(index=False, lineterminator="\n"),

@@ -1,7 +1,7 @@
 """Where the camera sees an object: rays to its visible points, and how much of the image they fill.
 
-Points in which the boundary mirrors a lamp are left out: every way shows them alike, and by chance the few of them that
-are drawn would decide all means.
+Points in which the boundary mirrors a lamp, or through which one would be seen if the inside were clear, are left out:
+by chance the few of them that are drawn would decide all means.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ __all__ = ["Exits", "visible_exits"]
 
 LAUNCH, LAUNCHES = 2**16, 16  # rays of a look at the scene, and the most looks for an object that is hardly seen
 FEWEST = 32  # exits of an object that is assessed
+CHAIN = 4  # boundaries that light of a lamp may meet without scattering, mirrored by all or passing through
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,16 +88,29 @@ def _look(scene: Any, camera: Any, shapes: list[Any], seed: tuple[int, int]) -> 
     u = [mi.Float(row) for row in rng.random((5, LAUNCH)).astype(np.float32)]
     ray, _ = camera.sample_ray_differential(camera.shutter_open(), u[0], mi.Point2f(*u[1:3]), mi.Point2f(*u[3:]))
     si = scene.ray_intersect(mi.Ray3f(ray), mi.RayFlags.All, coherent=False)
-    plain = si.is_valid() & ~_mirrors_lamp(scene, si)
+    plain = si.is_valid() & ~(_shows_lamp(scene, shapes, si, False) | _shows_lamp(scene, shapes, si, True))
     hit = [np.array((si.shape == mi.ShapePtr(shape)) & plain) for shape in shapes]
     columns = np.concatenate([np.array(v, dtype=np.float32).reshape(3, -1) for v in (ray.o, ray.d)])
     return np.broadcast_to(columns, (6, LAUNCH)) if columns.shape[1] == 1 else columns, hit
 
 
-def _mirrors_lamp(scene: Any, si: Any) -> Any:
-    """Whether a smooth boundary would show an emitter other than the environment."""
+def _shows_lamp(scene: Any, shapes: list[Any], si: Any, through: bool) -> Any:
+    """Whether smooth boundaries show an emitter other than the environment, as mirrors or `through` clear objects."""
+    import drjit as dr
     import mitsuba as mi
 
-    mirrored = si.spawn_ray(si.to_world(mi.reflect(si.wi)))
-    met = scene.ray_intersect(mirrored, mi.RayFlags.Minimal, False, si.is_valid())
-    return met.is_valid() & (met.emitter(scene) != None)  # noqa: E711
+    active, found = si.is_valid(), mi.Bool(False)
+    for _ in range(CHAIN):
+        eta, translucent = mi.Float(1), mi.Bool(False)
+        for shape in shapes:
+            here = si.shape == mi.ShapePtr(shape)
+            eta, translucent = dr.select(here, float(shape.bsdf().inside.channels()[0].eta), eta), translucent | here
+        active &= translucent
+        cosine = mi.Frame3f.cos_theta(si.wi)
+        reflectance, cosine_t, _, eta_ti = mi.fresnel(cosine, eta)
+        passes = ((cosine < 0) | through) & (reflectance < 1)
+        onwards = dr.select(passes, mi.refract(si.wi, cosine_t, eta_ti), mi.reflect(si.wi))
+        si = scene.ray_intersect(si.spawn_ray(si.to_world(onwards)), mi.RayFlags.All, False, active)
+        active &= si.is_valid()
+        found |= active & (si.emitter(scene) != None)  # noqa: E711
+    return found

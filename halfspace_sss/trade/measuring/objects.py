@@ -34,9 +34,13 @@ def assess_stage(
     sensor: int = 0,
     seed: int = 0,
     exits: int = EXITS,
+    traced: float = TRACED_SHARE,
     progress: NamedProgress | None = None,
 ) -> Assessment:
-    """As `assessing.assess`, of a scene that is made ready; or with `samples` of each exit instead of seconds."""
+    """As `assessing.assess`, of a scene that is made ready.
+
+    With `samples` of each exit instead of seconds; `traced` is the share of the time for walks.
+    """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # they are heard when the ways are made ready again
         for walks in (True, False):
@@ -55,13 +59,13 @@ def assess_stage(
 
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
-            sampled = _object(on, points, chosen, (seconds, samples), seeded(seed, 42, k), tell)
+            sampled = _object(on, k, points, chosen, (seconds, samples, traced), seeded(seed, 42, k), tell)
             heard = [" ".join(str(w.message).split()) for w in caught]
-        traced = sampled[chosen[0]]
-        rows = tuple(_row(on, k, way, found, traced) for way, found in sampled.items())
+        walks = sampled[chosen[0]]
+        rows = tuple(_row(on, k, way, found, walks) for way, found in sampled.items())
         compiled += sum(row.compilation for row in rows)
         compiling += sum(found.compiling for found in sampled.values() if isinstance(found, Sampled))
-        radiance = tuple(float(v) for v in traced.estimate.mean.mean(axis=1))
+        radiance = tuple(float(v) for v in walks.estimate.mean.mean(axis=1))
         notes = tuple(dict.fromkeys(heard))
         objects.append(ObjectTrade(on.names[k], _mfp(on, k), points.share, points.pixels, radiance, rows, notes))
     return Assessment(tuple(objects), clock() - started - compiling, compiled, seed)
@@ -80,18 +84,24 @@ def _mfp(on: Stage, k: int) -> tuple[float, float]:
 
 
 def _object(
-    on: Stage, points: Exits, chosen: Sequence[Way], budget: tuple[float, int | None], seed: int, tell: Any
+    on: Stage,
+    k: int,
+    points: Exits,
+    chosen: Sequence[Way],
+    budget: tuple[float, int | None, float],
+    seed: int,
+    tell: Any,
 ) -> dict[Way, Sampled | str]:
     """What all ways say of an object, or why they refuse it."""
-    seconds, samples = budget
+    seconds, samples, traced = budget
     sampled: dict[Way, Sampled | str] = {}
     end = clock() + seconds
     for done, way in enumerate(chosen):
         tell(way.name, done)
         started = clock()
-        share = TRACED_SHARE if way.model == PATH_TRACED else 1 / (len(chosen) - done)
+        share = traced if way.model == PATH_TRACED and len(chosen) > 1 else 1 / (len(chosen) - done)
         try:
-            found = first_sample(on, way, points, seeded(seed, done))
+            found = first_sample(on, way, points, seeded(seed, done), k)
             end, started = end + found.compiling, started + found.compiling
             left = share * (end - started) - (clock() - started)
             sample_more(on, way, points, found, seeded(seed, done), seconds=left, samples=samples)

@@ -11,7 +11,7 @@ from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED
 if TYPE_CHECKING:
     import pandas
 
-__all__ = ["Z_UPPER", "Assessment", "ObjectTrade", "WayTrade"]
+__all__ = ["Z_UPPER", "Assessment", "ObjectTrade", "WayTrade", "samples_for"]
 
 Z_UPPER = 1.645  # a bound that holds in 95 % of cases
 
@@ -26,7 +26,8 @@ class WayTrade:
             below 0. Mean over visible exits and channels, over the square of the mean radiance.
         bias2_error: its standard error.
         ratio, ratio_error: mean radiance over that of walks, for each channel, with standard errors.
-        variance, variance_error: of one sample, over the square of the mean radiance, with its standard error.
+        variance, variance_error: of one sample without fireflies (`statistics.FIREFLIES`), over the square of the mean
+            radiance, with its standard error.
         seconds: of one sample of the object, compilation left out.
         samples: that were taken for this.
         preparation, compilation: seconds, once for a scene; kernels that were compiled before are found again.
@@ -70,14 +71,21 @@ class WayTrade:
         """What the bias is below in 95 % of cases; a square that came out below 0 counts as 0."""
         return math.sqrt(max(self.bias2, 0.0) + Z_UPPER * self.bias2_error)
 
-    @property
-    def variance_bound(self) -> float:
-        """The variance of a sample and one standard error: what it is below in 84 % of cases."""
-        return self.variance + self.variance_error
-
     def time_to(self, noise: float) -> float:
         """Seconds for each pixel of the object until its noise is so much of the mean radiance."""
         return self.variance / noise**2 * self.seconds
+
+
+def samples_for(row: WayTrade, tolerance: float, z: float = Z_UPPER) -> float:
+    """Samples n of a pixel by which bias² + variance / n and z of its standard errors are at tolerance²; inf for none.
+
+    With a = tolerance² - bias² the smaller root of (a - V / n)² = z² (s² + (v / n)²).
+    """
+    a, s, v = tolerance**2 - max(row.bias2, 0.0), z * row.bias2_error, z * row.variance_error
+    if not a > s:
+        return math.inf
+    V = row.variance
+    return (a * V + math.sqrt(max(a**2 * V**2 - (V**2 - v**2) * (a**2 - s**2), 0.0))) / (a**2 - s**2)
 
 
 @dataclass(frozen=True)

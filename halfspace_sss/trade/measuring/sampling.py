@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -60,12 +60,15 @@ def clock() -> float:
     return time.process_time() / dr.thread_count() if mi.variant().startswith("llvm") else time.perf_counter()
 
 
-def first_sample(stage: Stage, way: Way, exits: Exits, seed: int) -> Sampled:
-    """Make a way ready and take few samples, which compiles its kernels.
+def first_sample(stage: Stage, way: Way, exits: Exits, seed: int, object: int = 0) -> Sampled:
+    """Make a way ready and take few samples, which compiles its kernels; nothing if an earlier look knows its pace.
 
     Raises:
         ValueError: the way refuses the scene.
     """
+    if (object, way) in stage.paces:
+        estimate = Estimate(variant_channels(), exits.n)
+        return replace(stage.paces[object, way], estimate=estimate, compilation=0.0, compiling=0.0)
     with stage.shown_by(way) as integrator:
         started = clock()
         _prepare(stage, integrator)
@@ -76,7 +79,9 @@ def first_sample(stage: Stage, way: Way, exits: Exits, seed: int) -> Sampled:
         _, overhead = _launch(stage, integrator, exits, estimate, 2, seeded(seed, 31, 1))
         again = time.perf_counter() - compiled
     waited = max(compiled - prepared - again, 0.0)
-    return Sampled(estimate, preparation, waited, max(first - overhead, 0.0), overhead)
+    found = Sampled(estimate, preparation, waited, max(first - overhead, 0.0), overhead)
+    stage.paces[object, way] = found
+    return found
 
 
 def warm_up(stage: Stage, ways: Sequence[Way]) -> None:
@@ -113,6 +118,8 @@ def sample_more(
                 each = samples - found.estimate.samples
             else:
                 each = _affordable(found, exits.n, seconds - (clock() - started)) if found.launches else PILOT
+            if not found.estimate.samples:
+                each = max(each, PILOT)
             if each < FEWEST:
                 return
             each = min(each, most)
@@ -148,4 +155,5 @@ def _launch(stage: Stage, integrator: Any, exits: Exits, estimate: Estimate, eac
     if not np.isfinite(rows).all():
         raise ValueError(f"samples must be finite, got {int((~np.isfinite(rows)).sum())} exits that are not")
     estimate.add(rows[0::2], rows[1::2], each)
+    estimate.add_bright(np.array([np.broadcast_to(c.numpy(), exits.n * each) for c in L]), each)
     return memory, took

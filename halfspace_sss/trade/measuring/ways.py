@@ -63,12 +63,14 @@ class Stage:
         shapes: its translucent shapes.
         settings: of its integrator, by parameter name.
         bssrdf: parameters that `bssrdf` alone understands.
+        paces: what an earlier look found by (object, way), by which the next one need not feel its way.
     """
 
     scene: Any
     shapes: list[Any]
     settings: dict[str, Any]
     bssrdf: dict[str, Any]
+    paces: dict[tuple[int, Way], Any] = field(default_factory=dict)
     _integrators: dict[Way, Any] = field(default_factory=dict)
     _insides: dict[Way, list[Any]] = field(default_factory=dict)
 
