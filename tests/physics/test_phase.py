@@ -1,4 +1,4 @@
-"""The Henyey-Greenstein phase function: normalisation, mean cosine, sampling, extremes."""
+"""The Henyey-Greenstein phase function: normalisation, mean cosine, means over azimuth, sampling, extremes."""
 
 import numpy as np
 import pytest
@@ -6,6 +6,7 @@ from scipy import integrate, stats
 
 from halfspace_sss.backend import array_types
 from halfspace_sss.physics.phase import eval_hg, sample_hg
+from halfspace_sss.physics.single_scattering import _mean_hg
 
 GS = [-0.999, -0.9, -0.3, -1e-4, 0.0, 1e-4, 0.5, 0.95, 0.999]
 
@@ -98,3 +99,15 @@ def test_all_array_libraries_agree_also_for_arrays_of_g(g):
         )
         np.testing.assert_allclose(f(llvm.Float64(x), g).numpy(), want, rtol=1e-10, atol=1e-12)
         np.testing.assert_allclose(f(llvm.Float64(x), llvm.Float64(g)).numpy(), want, rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.parametrize("g", [-0.7, 0.3, 0.9])
+def test_means_of_the_phase_function_over_azimuth_are_those_of_its_values(g):
+    """Also next to the normal, where a series takes the place of a difference of elliptic integrals."""
+    mu, sine = 0.8, 0.6
+    nu_sine = np.array([0.0, 1e-6, 1e-4, 8e-4, 1.2e-3, 0.01, 0.3])
+    nu, phi = np.sqrt(1 - nu_sine**2), 2 * np.pi * (np.arange(2048) + 0.5) / 2048
+    p = eval_hg(-mu * nu[:, None] + sine * nu_sine[:, None] * np.cos(phi), g)
+    mean, mean_cosine = _mean_hg(g, mu, sine, nu, nu_sine)
+    np.testing.assert_allclose(mean, p.mean(axis=1), rtol=1e-13)
+    np.testing.assert_allclose(mean_cosine, (p * np.cos(phi)).mean(axis=1), rtol=1e-12, atol=1e-15)

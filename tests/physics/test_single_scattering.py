@@ -9,7 +9,6 @@ from halfspace_sss import Medium
 from halfspace_sss.backend import array_types
 from halfspace_sss.physics import single_scattering as single
 from halfspace_sss.physics.fresnel import F_t, mu_external, mu_internal
-from halfspace_sss.physics.phase import eval_hg
 
 ETAS = [0.75, 1.0, 1.3, 1.5]
 GS = [-0.9, 0.0, 0.6, 0.95]
@@ -279,18 +278,6 @@ def test_exitance_at_the_beam_is_infinite_only_where_light_scatters():
     r = np.array([0.0, 1.0])
     assert np.array_equal(np.isinf(single.exitance(medium(), r)), [True, False])
     assert np.array_equal(single.exitance(Medium(0.0, 1.0), r), [0.0, 0.0])
-
-
-@pytest.mark.parametrize("g", [-0.7, 0.3, 0.9])
-def test_means_of_the_phase_function_over_azimuth_are_those_of_its_values(g):
-    """Also next to the normal, where a series takes the place of a difference of elliptic integrals."""
-    mu, sine = 0.8, 0.6
-    nu_sine = np.array([0.0, 1e-6, 1e-4, 8e-4, 1.2e-3, 0.01, 0.3])
-    nu, phi = np.sqrt(1 - nu_sine**2), 2 * np.pi * (np.arange(2048) + 0.5) / 2048
-    p = eval_hg(-mu * nu[:, None] + sine * nu_sine[:, None] * np.cos(phi), g)
-    mean, mean_cosine = single._mean_hg(g, mu, sine, nu, nu_sine)
-    np.testing.assert_allclose(mean, p.mean(axis=1), rtol=1e-13)
-    np.testing.assert_allclose(mean_cosine, (p * np.cos(phi)).mean(axis=1), rtol=1e-12, atol=1e-15)
 
 
 def test_light_comes_from_above_unless_it_is_said_otherwise():

@@ -53,6 +53,19 @@ def test_sectors_of_a_ring_add_up_to_it(delta_phi):
     np.testing.assert_allclose(parts, 2 * PI * curve(0.0, PI), rtol=1e-5)
 
 
+def test_one_oblique_direction_tells_forward_from_backward_whichever_it_is():
+    """Light goes on along the one that enters; by reciprocity it is the same for the one that leaves."""
+    edges = np.array([0.2, 0.6]) * MEDIA["denser"].mfp
+
+    def curve(mu_i, mu_o, line_phi, seed):
+        found = trace_curve(MEDIA["denser"], mu_i, mu_o, 0.0, line_phi, edges, 0.4, 200_000, seed)
+        return found.S, found.standard_error
+
+    for line_phi in (0.0, math.pi):
+        assert abs(z(curve(0.4, 1.0, line_phi, 85), curve(1.0, 0.4, line_phi, 86))[0]) < 4
+    assert z(curve(0.4, 1.0, 0.0, 85), curve(0.4, 1.0, math.pi, 85))[0] > 20
+
+
 def test_the_same_seed_gives_the_same_curve_and_another_seed_another_one():
     a, b, c = (trace_curve(MEDIA["denser"], 0.6, 0.5, 0.3, 1.0, [0.1, 1.0, 2.0], 0.3, 30_000, s) for s in (1, 1, 2))
     assert a.S.tobytes() == b.S.tobytes() and a.S.tobytes() != c.S.tobytes()
