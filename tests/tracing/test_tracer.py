@@ -240,6 +240,12 @@ def test_bad_input_is_refused_with_name_bound_and_value(arguments, parameter, bo
         trace(MEDIA["matched"], **arguments)
 
 
+def test_walks_and_events_are_counted():
+    """Where all is absorbed a walk has one event."""
+    result = trace(Medium(0.0, 1.0), 1.0, 1024)
+    assert result.n_paths == result.n_events == 1024
+
+
 def test_a_medium_with_channels_is_refused():
     with pytest.raises(ValueError, match="medium must have one channel.*got 3 channels"):
         trace(Medium([1.0, 1.0, 1.0], 0.1))
