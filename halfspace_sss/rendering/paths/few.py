@@ -33,6 +33,7 @@ __all__ = ["Few", "Leg", "few_orders"]
 
 MOST_LEGS = 256
 FAINT = 0.1  # weight below which a scattered walk may end
+GRAZES = 0.05  # cosine at an emitter up to which its points are left to chance: their density over the area goes to 0
 SAME_WAY = 1e-2  # by which points of exit may differ, over their distance from the event
 
 Media = list[tuple[Any, Any, Any]]  # sigma_s, sigma_t and g of each channel
@@ -184,7 +185,7 @@ def _connected(world: World, of: tuple[Body, Media], walk: _Walk, weight: Any, s
     ds, light = sampled_light(world, at, sampler.next_2d(), False, active)
     with detached():
         distant = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
-        active = active & (ds.pdf > 0) & ~ds.emitter.is_environment()
+        active = active & (ds.pdf > 0) & ~ds.emitter.is_environment() & _faces(ds.n, ds.d)
         reach = dr.select(distant, number(1e4 * body.found.size), ds.dist)
         target = walk.event + ds.d * reach
         met = refracted_connection(body, walk.event, target, active)
@@ -217,7 +218,13 @@ def _met_by_chance(world: World, body: Body, walk: _Walk, active: Any) -> Any:
         active = active & si.is_valid() & (emitter != None)  # noqa: E711
         met = refracted_connection(body, walk.event, mi.Point3f(si.p), active)
         apart = dr.norm(mi.Point3f(met.p) - walk.o) > SAME_WAY * dr.norm(walk.o - walk.event)
-    return dr.select(active & (~met.valid | apart), emitter.eval(si, active), 0)
+        sampled = met.valid & ~apart & _faces(si.n, dr.normalize(si.p - walk.event))
+    return dr.select(active & ~sampled, emitter.eval(si, active), 0)
+
+
+def _faces(n: Any, d: Any) -> Any:
+    """Whether a point of an emitter with the normal n is seen along d straight from the front; all are without n."""
+    return (dr.dot(n, d) < -GRAZES) | (dr.squared_norm(n) == 0)
 
 
 def _value(media: Media, way: Any, order: Any, cosine: Any) -> Any:
