@@ -35,7 +35,7 @@ NOTES = (
     "All images contain all scattering orders: to the models without single scattering it is added, path traced. "
     "FLIP and relative squared error of the pixels of the object at the stated exposure, against the path traced "
     "image, whose own noise is in all of them alike. Seconds for the image on this machine, without compilation and "
-    "without the training of `full_geometry`, which the table of the files has as CPU time; it draws 4 entries an exit."
+    "without the training of `full_geometry`, which the table of the files has as CPU time; it draws 2 entries an exit."
 )
 
 

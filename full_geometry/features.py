@@ -18,7 +18,7 @@ from full_geometry.subject import SurfacePoint
 __all__ = ["N_PAIR", "Frame", "Side", "n_side", "pair_features", "reverse", "side_features"]
 
 OCTAVES = 2
-N_PAIR = 15
+N_PAIR = 21
 LEAST_P, LEAST_LENGTH = 1e-3, 1e-2
 
 
@@ -78,33 +78,61 @@ def side_features(frame: Frame, side: Side) -> list[Any]:
 
     at, event = side
     n, w = frame.direction(at.n_out), frame.direction(at.w)
-    way = dr.log(event.length * frame.sigma_t + LEAST_LENGTH)
     return [
-        *_octaves(frame.position(at.p)), *_octaves(frame.position(event.y)), *n, *w, dr.dot(n, w), 0.5 * way,
-        *(0.5 * dr.log(P + LEAST_P) for P in event.P), *event.local,
+        *_octaves(frame.position(at.p)), *_octaves(frame.position(event.y)), *n, *w, dr.dot(n, w),
+        _log(frame, event.length), *(0.5 * dr.log(P + LEAST_P) for P in event.P), *event.local,
     ]  # fmt: skip
 
 
 def pair_features(frame: Frame, exit: Side, entry: Side) -> list[Any]:
-    """x_i - x_o as direction and length, log r, log |y_i - y_o|, dot products of directions and normals."""
+    """x_i - x_o as direction and length, log r, log |y_i - y_o|, dot products of directions and normals, and what the
+    surface at one end says of y at the other: its depth below the plane there, its distance from the point, and the
+    cosine between the way to y and the way on to the other y.
+    """
     import drjit as dr
 
     o, i = exit.at, entry.at
     d = i.p - o.p
     r = dr.norm(d)
     d = d / dr.maximum(r, 1e-6 * frame.radius)
-    gap = dr.norm(exit.event.y - entry.event.y)
+    between = entry.event.y - exit.event.y
+    gap = dr.norm(between)
+    between = between / dr.maximum(gap, 1e-6 * frame.radius)
     return [
-        *frame.direction(d), r / frame.radius, 0.5 * dr.log(r * frame.sigma_t + LEAST_LENGTH),
-        0.5 * dr.log(gap * frame.sigma_t + LEAST_LENGTH), gap / frame.radius,
+        *frame.direction(d), r / frame.radius, _log(frame, r), _log(frame, gap), gap / frame.radius,
         dr.dot(o.n_out, i.n_out), dr.dot(o.w, i.w), dr.dot(o.n_out, d), dr.dot(i.n_out, d), dr.dot(o.w, d),
         dr.dot(i.w, d), dr.dot(o.n_out, i.w), dr.dot(i.n_out, o.w),
+        _depth(frame, i, exit.event.y), _depth(frame, o, entry.event.y),
+        _log(frame, dr.norm(exit.event.y - i.p)), _log(frame, dr.norm(entry.event.y - o.p)),
+        _cosine(frame, exit, between), _cosine(frame, entry, -between),
     ]  # fmt: skip
+
+
+def _log(frame: Frame, length: Any) -> Any:
+    import drjit as dr
+
+    return 0.5 * dr.log(length * frame.sigma_t + LEAST_LENGTH)
+
+
+def _depth(frame: Frame, at: SurfacePoint, y: Any) -> Any:
+    """t/(1 + |t|) of the depth t below the plane of a point, in mean free paths."""
+    import drjit as dr
+
+    t = dr.dot(at.n_out, at.p - y) * frame.sigma_t
+    return t / (1 + dr.abs(t))
+
+
+def _cosine(frame: Frame, side: Side, onward: Any) -> Any:
+    """Between the way from a point to its y and a direction."""
+    import drjit as dr
+
+    way = side.event.y - side.at.p
+    return dr.dot(way, onward) / dr.maximum(dr.norm(way), 1e-6 * frame.radius)
 
 
 def reverse(n: int) -> tuple[np.ndarray, np.ndarray]:
     """Order and signs that turn the features of (exit, entry, pair), n of each side, into those of the way back."""
-    pair = np.array([0, 1, 2, 3, 4, 5, 6, 7, 8, 10, 9, 12, 11, 14, 13])
+    pair = np.array([0, 1, 2, 3, 4, 5, 6, 7, 8, 10, 9, 12, 11, 14, 13, 16, 15, 18, 17, 20, 19])
     signs = np.ones(2 * n + N_PAIR, dtype=np.float32)
     signs[2 * n + np.array([0, 1, 2, 9, 10, 11, 12])] = -1
     return np.concatenate([np.arange(n, 2 * n), np.arange(n), 2 * n + pair]), signs

@@ -19,7 +19,7 @@ from full_geometry.subject import SurfacePoint, cosine_direction
 from halfspace_sss.rendering.surface.object import turned
 from halfspace_sss.tracing.walk import generator, pass_seed
 
-__all__ = ["CELLS", "PatchTable"]
+__all__ = ["CELLS", "ExitTable", "PatchTable"]
 
 CELLS = 4096
 EXITS = 4  # of a cell
@@ -36,6 +36,29 @@ class _Row:
         import drjit as dr
 
         return dr.gather(type(self.table), self.table, self.start + k)
+
+
+class ExitTable:
+    """Weights of given exits, looked up by their number.
+
+    Args:
+        sampler: whose network is asked, once for each.
+        exits: points of the surface.
+    """
+
+    def __init__(self, sampler: PatchSampler, exits: SurfacePoint) -> None:
+        import drjit as dr
+        import mitsuba as mi
+
+        side = Side(exits, first_event(sampler.patches.subject, exits))
+        rows = np.cumsum(_weights(sampler, side, dr.width(exits.p)), axis=1).astype(np.float32)
+        self.n, self.table, self.last = rows.shape[1], mi.Float(rows.ravel()), mi.Float(rows[:, -1].copy())
+
+    def weights(self, k: Any) -> PatchWeights:
+        """Of exit k."""
+        import drjit as dr
+
+        return PatchWeights(_Row(self.table, k * self.n), dr.gather(type(self.last), self.last, k))
 
 
 class PatchTable:

@@ -32,6 +32,7 @@ __all__ = ["LearntTransport", "learnt_means"]
 
 FINE = 2.5  # transport mean free paths of the radius of a patch, up to which patches do without probes
 PATCH_SHARE = 0.5  # of the entries where patches are larger
+ENTRIES = 2  # of an exit: its own work is done once, and patches draw without a ray
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,8 +97,9 @@ def learnt_means(found: Object, inside: Inside, media: list[Medium], settings: S
     if sampler is None:
         return Means(transport, HalfSpaceProposals(positions, backbone[0]))
     if flow is not None:
-        return Means(transport, FlowProposals(flow, found.sign, PatchTable(flow.patches)))
+        return Means(transport, FlowProposals(flow, found.sign, PatchTable(flow.patches)), ENTRIES)
     radius = np.sqrt(found.area / (np.pi * sampler.patches.n))
     sigma_t_prime = np.mean([float(m.sigma_t_prime) for m in media])
     patch_share = 1.0 if radius * sigma_t_prime < FINE else PATCH_SHARE
-    return Means(transport, LearntProposals(sampler, positions, patch_share, found.sign, PatchTable(sampler)))
+    proposals = LearntProposals(sampler, positions, patch_share, found.sign, PatchTable(sampler))
+    return Means(transport, proposals, ENTRIES)

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from full_geometry.added import AddedTransport
-from full_geometry.features import Frame
+from full_geometry.features import N_PAIR, Frame, n_side
 from full_geometry.flow.chart import Chart
 from full_geometry.flow.conditional import ConditionalFlow
 from full_geometry.flow.sampler import FlowSampler
@@ -109,6 +109,11 @@ def load(path: str | os.PathLike, subject: Subject) -> Learnt:
     try:
         subject = subject.as_trained(identity.medium)
         frame = frame_of(subject, identity)
+        n, known = 2 * n_side(len(subject.media), subject.n_local) + N_PAIR, arrays["W_0"].shape[1]
+        if n != known:
+            raise ValueError(f"W_0 must have {n} inputs, got {known}: of another version, to be trained again")
+    except KeyError as error:
+        raise ValueError(f"{path}: layers must be those of {KIND}, {error} is missing") from error
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
     return assemble(subject, frame, HalfSpace(subject, record["recipe"]["backbone"]), arrays)

@@ -17,7 +17,7 @@ __all__ = ["ENTRIES", "MODELS", "OF_OBJECTS", "RR_DEPTHS", "VOLUMES", "WALK", "c
 
 MODELS = ("standard_dipole", "better_dipole", "directional_dipole", "photon_beam_diffusion", "neural")
 OF_OBJECTS = tuple(name for name in ("neural_shape", "full_geometry") if name in model_names())
-ENTRIES = {"full_geometry": 4}  # of an exit; 1 for the others
+ENTRIES = {"full_geometry": 2}  # of an exit; 1 for the others
 WALK = "translucent_walk"
 RR_DEPTHS = (5, 64, 200, 1024)
 LONG_PASS = 32  # samples per pixel of a pass of the long render

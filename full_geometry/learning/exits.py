@@ -19,7 +19,7 @@ from halfspace_sss.rendering.walk.steps import Crossing, Event, Walk
 __all__ = ["LANES", "Exits", "trace_exits"]
 
 LANES = 2**15
-ROULETTE_FROM = 2  # scattering events: at low albedo few walks would get to the orders that count
+ROULETTE_FROM = 8  # scattering events: from 2 on weak channels of ketchup have 10 times the variance, for no time less
 
 
 class Exits(NamedTuple):

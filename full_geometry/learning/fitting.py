@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from full_geometry.features import N_PAIR, reverse
+from full_geometry.features import N_PAIR
 from full_geometry.learning.learner import Correction, PatchLogits, likelihood, patch_likelihood
 from full_geometry.learning.pairs import Pairs
 from full_geometry.patches import Patches
@@ -42,7 +44,7 @@ class Recipe:
     batch: int = 2048
     rate: float = 6e-3
     chunk: int = 2**17
-    reuse: int = 4
+    reuse: int = 2
     backbone: str = "better_dipole"
 
     def __post_init__(self) -> None:
@@ -52,6 +54,17 @@ class Recipe:
 
 
 STANDARD = Recipe()
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Torch with one thread: layers this small gain little by being shared, and threads that wait spin."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 class Fitting:
@@ -72,8 +85,9 @@ class Fitting:
             parts["patches"] = PatchLogits(self.n_side, patches.areas, PATCH_HIDDEN, seed)
         self.modules = torch.nn.ModuleDict(parts)
         self.average = copy.deepcopy(self.modules)
+        self.drawing = copy.deepcopy(parts.get("patches"))  # weights of patches that the next proposals follow
         self.parameters = list(self.modules.parameters())
-        self.adam = torch.optim.Adam(self.parameters, lr=recipe.rate, betas=BETAS, foreach=True)
+        self.adam = torch.optim.Adam(self.parameters, lr=recipe.rate, betas=BETAS, fused=True)
         self.step, self.scale = 0, torch.ones(channels, 1)
 
     def set_scale(self, walks: Pairs) -> None:
@@ -81,14 +95,14 @@ class Fitting:
         mean = torch.from_numpy(walks.values.sum(axis=1) / walks.drawn)
         self.scale = torch.where(mean > 0, 1 / mean.clamp_min(1e-30), torch.zeros_like(mean))[:, None].float()
 
-    def use(self, walks: Pairs, proposals: Pairs, steps: int, order: np.random.Generator) -> None:
+    def use(self, walks: Pairs, proposals: Pairs, steps: int | None, order: np.random.Generator) -> None:
         """Steps on all batches of a chunk, `reuse` times over, every other time with exit and entry exchanged.
 
         As S is reciprocal and exits are drawn by area and cosine, a pair read backwards is as good a sample.
 
         Args:
             walks, proposals: the chunk.
-            steps: of the whole fit, for the decay of the rate.
+            steps: of the whole fit, for the decay of the rate; None for no decay.
             order: of the batches; walks meet other proposals each time.
         """
         batch = self.recipe.batch
@@ -99,29 +113,34 @@ class Fitting:
             patch = torch.from_numpy(self.patches.of_face[walks.faces].astype(np.int64))
         n_x, n_y = max(T.shape[1] // batch, 1), max(W.shape[1] // batch, 1)
         kept = T.shape[1] / walks.drawn
-        order_back, signs = (torch.from_numpy(v) for v in reverse(self.n_side))
-        for k in range(self.recipe.reuse):
-            if k:
-                x, y = (v[order_back] * signs[:, None] for v in (x, y))
-            for i, j in zip(order.permutation(n_x), order.integers(0, n_y, n_x)):
-                a, b = slice(i * batch, (i + 1) * batch), slice(j * batch, (j + 1) * batch)
-                f = self.modules["S"](torch.cat((x[:, a], y[:, b]), dim=1))
-                loss = likelihood(f, T[:, a] * self.scale, W[:, b] * self.scale, kept)
-                if patch is not None and k % 2 == 0:
-                    loss = loss + self._patch_loss(x[:, a], T[:, a], patch[a])
-                self._advance(loss, steps)
+        T, W, S = T * self.scale, W * self.scale, self.modules["S"]
+        with one_thread():
+            for k in range(self.recipe.reuse):
+                back = k % 2 == 1
+                for i, j in zip(order.permutation(n_x), order.integers(0, n_y, n_x)):
+                    a, b = slice(i * batch, (i + 1) * batch), slice(j * batch, (j + 1) * batch)
+                    loss = likelihood((S(x[:, a], back), T[:, a]), (S(y[:, b], back), W[:, b]), kept)
+                    if patch is not None and not back:
+                        loss = loss + self._patch_loss(x[:, a], T[:, a], patch[a])
+                    self._advance(loss, steps)
 
     def _patch_loss(self, x: torch.Tensor, T: torch.Tensor, patch: torch.Tensor) -> torch.Tensor:
         """Of a part of a batch."""
-        T = (T[:, :PATCH_BATCH] * self.scale).mean(dim=0)
+        T = T[:, :PATCH_BATCH].mean(dim=0)
         return patch_likelihood(self.modules["patches"](x[: self.n_side, :PATCH_BATCH]), T, patch[:PATCH_BATCH])
+
+    def draw_by_average(self) -> None:
+        """From now on proposals follow the weights of patches as they are."""
+        if self.drawing is not None:
+            with torch.no_grad():
+                torch._foreach_copy_(list(self.drawing.parameters()), list(self.average["patches"].parameters()))
 
     def arrays(self) -> dict[str, np.ndarray]:
         """The averaged numbers of all networks by name."""
         return {name: value for module in self.average.values() for name, value in module.arrays().items()}
 
-    def _advance(self, loss: torch.Tensor, steps: int) -> None:
-        at = min(self.step / max(steps, 1), 1.0)
+    def _advance(self, loss: torch.Tensor, steps: int | None) -> None:
+        at = min(self.step / max(steps, 1), 1.0) if steps is not None else 0.0
         decay = LAST_RATE + (1 - LAST_RATE) * 0.5 * (1 + math.cos(math.pi * at))
         for group in self.adam.param_groups:
             group["lr"] = self.recipe.rate * min(1.0, (self.step + 1) / WARM_UP) * decay
@@ -138,6 +157,8 @@ class Fitting:
     def _tensors(self) -> dict[str, torch.Tensor]:
         """Everything the next step depends on, by name; changing the tensors in place changes the fit."""
         means = {f"{k}.mean": mean.data for k, mean in enumerate(self.average.parameters())}
+        drawing = [] if self.drawing is None else self.drawing.parameters()
+        means |= {f"drawing.{k}": value.data for k, value in enumerate(drawing)}
         return {"scale": self.scale, **checkpoint.tensors_of(self.adam, self.parameters), **means}
 
     def save(self, path: Path, done: int, history: list) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from full_geometry.features import N_PAIR, reverse
 from full_geometry.model import BOUND
 
 __all__ = ["Correction", "PatchLogits", "likelihood", "patch_likelihood"]
@@ -26,8 +27,10 @@ class Layers(nn.Module):
             self.matrices.append(gain * torch.randn(j, i, generator=generator))
             self.biases.append(torch.zeros(j, 1))
 
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        for k, (W, b) in enumerate(zip(self.matrices, self.biases)):
+    def forward(self, x: torch.Tensor, first: torch.Tensor | None = None) -> torch.Tensor:
+        """Of columns x; `first` takes the place of the first matrix."""
+        matrices = list(self.matrices) if first is None else [first, *self.matrices[1:]]
+        for k, (W, b) in enumerate(zip(matrices, self.biases)):
             x = torch.addmm(b, W, x)
             if k < len(self.matrices) - 1:
                 x = nn.functional.hardswish(x)
@@ -53,28 +56,31 @@ class Correction(nn.Module):
     def __init__(self, n_in: int, channels: int, width: int = 64, depth: int = 3, seed: int = 0) -> None:
         super().__init__()
         self.layers = Layers([n_in, *[width] * depth, channels], torch.Generator().manual_seed(seed))
+        order, signs = reverse((n_in - N_PAIR) // 2)
+        back = np.argsort(order)
+        self.register_buffer("order", torch.from_numpy(back), persistent=False)
+        self.register_buffer("signs", torch.from_numpy(signs[back]), persistent=False)
 
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        """f (channels, n) of features (inputs, n)."""
-        return BOUND * torch.tanh(self.layers(x) / BOUND)
+    def forward(self, x: torch.Tensor, back: bool = False) -> torch.Tensor:
+        """f (channels, n) of features (inputs, n); `back` reads pairs the other way round, exit and entry exchanged."""
+        first = self.layers.matrices[0][:, self.order] * self.signs if back else None
+        return BOUND * torch.tanh(self.layers(x, first) / BOUND)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Matrices (outputs, inputs) and biases by name."""
         return self.layers.arrays("W", "b")
 
 
-def likelihood(f: torch.Tensor, walks: torch.Tensor, proposals: torch.Tensor, kept: float) -> torch.Tensor:
+def likelihood(walks: tuple, proposals: tuple, kept: float) -> torch.Tensor:
     """E_q[(S_0 mu_i / q) exp f] - E_walks[T f], sum over channels.
 
     Args:
-        f: (channels, n + m) of n walks and then m proposals.
-        walks: T (channels, n).
-        proposals: S_0 mu_i / q (channels, m).
+        walks: f and T, (channels, n) both.
+        proposals: f and S_0 mu_i / q, (channels, m) both.
         kept: share of all walks that the n stand for.
     """
-    n = walks.shape[1]
-    gain = (proposals * torch.exp(f[:, n:])).mean(dim=1) - kept * (walks * f[:, :n]).mean(dim=1)
-    return gain.sum()
+    (f, T), (g, W) = walks, proposals
+    return ((W * torch.exp(g)).mean(dim=1) - kept * (T * f).mean(dim=1)).sum()
 
 
 class PatchLogits(nn.Module):

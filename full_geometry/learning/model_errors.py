@@ -20,6 +20,7 @@ import numpy as np
 from full_geometry.half_space import HalfSpace
 from full_geometry.learning.exits import trace_exits
 from full_geometry.learning.pairs import Proposals
+from full_geometry.patch_table import ExitTable
 from full_geometry.subject import Subject, SurfacePoint
 from halfspace_sss.checks import check_count
 from halfspace_sss.physics.medium import Medium
@@ -154,10 +155,11 @@ def modelled(transport: Transport, proposals: Proposals, exits: SurfacePoint, sa
 
     n = dr.width(exits.p)
     sums = _Sums(n)
+    table = ExitTable(proposals.patches, exits) if proposals.patches else None
     for k, per_exit in enumerate(_passes(n, samples)):
-        points = _repeated(exits, per_exit)
+        points, lanes = _repeated(exits, per_exit), dr.arange(mi.UInt32, n * per_exit)
         rng = generator(mi, n * per_exit, pass_seed(seed, 19, k))
-        entries, weight = proposals.sample(points, rng)
+        entries, weight = proposals.sample(points, rng, table, lanes // per_exit)
         value = transport.S(transport.prepare(points), entries, weight > 0) * weight
         dr.eval(value, entries)
         sums.add(value, entries.w, per_exit)

@@ -13,6 +13,7 @@ from full_geometry.first_event import first_event
 from full_geometry.half_space import HalfSpace
 from full_geometry.learning.exits import Exits, trace_exits
 from full_geometry.model import PreparedExit
+from full_geometry.patch_table import ExitTable
 from full_geometry.patches import PatchSampler
 from full_geometry.subject import Subject, SurfacePoint, cosine_direction
 from halfspace_sss.rendering.transport.plane import Exit, number
@@ -84,17 +85,26 @@ class Proposals:
         # light may leave by another piece of the surface than it entered by
         self.positions = PositionSampler(replace(subject.found, pieces=None), table, subject.points, area_share)
 
-    def sample(self, exit: SurfacePoint, rng: Any) -> tuple[SurfacePoint, Any]:
-        """An entry for each exit, and mu_i over its density; 0 where none was found."""
+    def sample(
+        self, exit: SurfacePoint, rng: Any, table: ExitTable | None = None, k: Any = 0
+    ) -> tuple[SurfacePoint, Any]:
+        """An entry for each exit, and mu_i over its density; 0 where none was found.
+
+        Args:
+            exit: points of the surface.
+            rng: generator of as many lanes.
+            table: of weights of patches, which are asked of the network otherwise.
+            k: of each exit, its number in the table.
+        """
         import drjit as dr
         import mitsuba as mi
 
         out = Exit(exit.p, exit.n_out, exit.w, number(self.subject.found.sign))
-        known = (out, mi.UInt32(0))
+        known = (out, mi.UInt32(k))
         if self.patches is None:
             entry = self.positions.sample(*known, Numbers(rng), mi.Bool(True))
         else:
-            drawn = LearntProposals(self.patches, self.positions, PATCH_SHARE, self.subject.found.sign)
+            drawn = LearntProposals(self.patches, self.positions, PATCH_SHARE, self.subject.found.sign, table)
             where = drawn.prepare(out, PreparedExit(Side(exit, first_event(self.subject, exit)), []), mi.Bool(True))
             entry = drawn.sample(*known, where, Numbers(rng), mi.Bool(True))
         w = cosine_direction(entry.n_out, rng)

@@ -62,30 +62,29 @@ class Seen:
         self.shape = source.subject.found.shape
         self.schedule = Schedule.of(walks, camera.hits(self.shape), camera.pixels)
 
-    def seconds_spared(self) -> float:
-        """Of a chunk with a pass, by chunks without one in the mean; compiles what passes need."""
-        if self.schedule is None:
+    def seconds_more(self) -> float:
+        """Of a chunk in the mean, by the second one; compiles what passes need."""
+        if self.schedule is None or self.schedule.every == 1:
             return 0.0
         for _ in range(2):
             started = time.monotonic()
             self.camera.exits(self.shape, TRIAL, self.schedule.spp)
-        return (time.monotonic() - started) * self.schedule.passes * (1 - 1 / self.schedule.every)
+        return (time.monotonic() - started) * self.schedule.passes / self.schedule.every
 
-    def data(self, k: int, chunk: int, patches: PatchSampler | None, trial: bool = False) -> tuple[Pairs, Pairs]:
+    def data(self, k: int, chunk: int, patches: PatchSampler | None) -> tuple[Pairs, Pairs]:
         """Walks and proposals of chunk k.
 
         Args:
             k: number of the chunk.
             chunk: number of proposals.
             patches: learnt weights that proposals follow.
-            trial: whether the walks are no part of the image.
         """
         import drjit as dr
 
         seed, order = (self.seed, k), np.random.default_rng([self.seed, k, 1])
         parts = []
         if self.schedule:
-            parts = self._exits([TRIAL] * self.schedule.passes if trial else self.schedule.numbers(k), order)
+            parts = self._exits(self.schedule.numbers(k), order)
         walks, proposals = [], []
         for j, (starts, ends) in enumerate(parts):
             n = dr.width(starts.p)

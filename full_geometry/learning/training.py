@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
+import math
 import time
 import warnings
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +20,7 @@ from full_geometry.half_space import HalfSpace
 from full_geometry.identity import frame_of, identify
 from full_geometry.learning.fitting import STANDARD, Fitting, Recipe
 from full_geometry.learning.model_errors import ModelError, Reference, measure, reference
-from full_geometry.learning.pairs import PairSource, Proposals
+from full_geometry.learning.pairs import Pairs, PairSource, Proposals
 from full_geometry.learning.seen import Seen
 from full_geometry.model import FullGeometry
 from full_geometry.patches import Patches, PatchSampler, cluster
@@ -37,7 +40,7 @@ VALIDATIONS = 4  # in a run
 EXITS, WALKS, SAMPLES = 256, 2048, 512  # of a validation
 CHECKPOINT_EVERY = 15.0  # seconds
 PLAN = "plan.json"
-LOOP_SHARE = 0.9  # of the seconds for data and steps, the rest for the truth, the trial and the errors
+LOOP_SHARE = 0.9  # of the seconds for data and steps, the rest for the pilot, the truth and the errors
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,8 +82,9 @@ def train(
 ) -> Trained:
     """Learn S of an object and write its weights.
 
-    The number of chunks is planned once, from the speed of the first ones, so that a run that was killed and is started
-    again with the same `work` ends with the same weights; a machine that slows down on the way takes longer.
+    The number of chunks is planned once, from the time of the first one, so that a run that was killed and is started
+    again with the same `work` ends with the same weights; a machine that slows down on the way takes longer. The data
+    of a chunk are made beside the steps on the one before it.
 
     Args:
         shape: a closed Mitsuba shape, a scene, or a `Subject`, which has its medium.
@@ -135,9 +139,8 @@ def train_by_cpu(
     check_interval("seconds", seconds, 1e-3, 1e7)
     run, began = _Run(subject, recipe, seed, None, None), time.process_time()
     run._prepare()
-    total = run._plan(seconds, None, time.process_time)
-    while run.done < total:
-        run._chunk(total)
+    while run.done < run.total:
+        run._chunk(seconds, time.process_time)
     record = run._record([], time.process_time() - began)
     return run.learnt(), storing.save(folder, run.identity, run.arrays(), record)
 
@@ -159,7 +162,9 @@ class _Run:
             self.centres = cluster(subject, self.frame, seed=seed).astype(np.float16)
             self.patches = Patches(subject, self.frame, self.centres.astype(np.float32))
         self.fitting = self._new_fitting()
-        self.done, self.walks, self.history = 0, recipe.chunk, []
+        self.done, self.total, self.walks, self.history = 0, math.inf, recipe.chunk, []
+        self.ready: tuple[Pairs, Pairs] | None = None
+        self.aside = ThreadPoolExecutor(1)
 
     def _new_fitting(self) -> Fitting:
         channels = len(self.subject.media)
@@ -179,79 +184,98 @@ class _Run:
         self, seconds: float, chunks: int | None, target: float | None, folder: Path, progress: Progress | None
     ) -> Trained:
         started = time.monotonic()
-        self._prepare()
+        self._prepare(chunks)
         truth = reference(self.subject, EXITS, WALKS, self.seed)
-        total = self._plan(seconds, chunks)
-        marks = {round(total * (k + 1) / VALIDATIONS) for k in range(VALIDATIONS - 1)}
         saved, what = time.monotonic(), "training"
-        while self.done < total and not self._reached(target):
-            self._chunk(total)
-            if self.done in marks:
+        while self.done < self.total and not self._reached(target):
+            self._chunk(seconds)
+            validates = self.done in self._marks()
+            if validates:
                 self.history.append(self._validated(truth))
                 what = f"training (error {self.history[-1][1]:.3f} ± {self.history[-1][2]:.3f})"
-            if self.work and (time.monotonic() - saved > CHECKPOINT_EVERY or self.done in marks):
+            if self.work and (time.monotonic() - saved > CHECKPOINT_EVERY or validates):
                 self._save_camera()  # first: what its image holds beyond the checkpoint is not added again
                 self.fitting.save(self.work / CHECKPOINT, self.done, self.history)
                 saved = time.monotonic()
             if progress:
-                progress(what, self.done, total)
-        found = measure(
-            self.subject, self.learnt().model, self.proposals, truth=truth, samples=2 * WALKS, seed=self.seed
-        )
+                progress(what, self.done, self.total)
+        found = self._errors(truth, 2 * WALKS)
         spent = time.monotonic() - started
         self._save_camera()
         path = storing.save(folder, self.identity, self.arrays(), self._record(found, spent))
         return Trained(*self.learnt()[:2], path, found, self.fitting.step, spent)
 
-    def _prepare(self) -> None:
-        """Scales and shares from a pilot; the work of a run that was killed."""
+    def _prepare(self, chunks: int | None = None) -> None:
+        """Scales and shares from a pilot, which compiles all kernels; the work of a run that was killed."""
         pilot = self.source.walks(self.recipe.chunk // 4, (self.seed, 2**31))
         share = pilot.values.shape[1] / pilot.drawn
         self.walks = int(self.recipe.chunk / min(max(share, 0.05), 1.0))
+        proposed = self.source.proposed(self.recipe.chunk // 4, (self.seed, 2**31), self._sampler())
         self.fitting.set_scale(pilot)
+        self._new_fitting().use(pilot, proposed, None, np.random.default_rng(0))
         run = {"object": self.identity.record(), "recipe": asdict(self.recipe), "seed": self.seed}
         if self.camera:
             self.seen = Seen(self.source, self.camera, self.walks, self.seed)
             run["camera"] = {"scene": self.camera.about.get("scene"), "schedule": self.seen.schedule}
         if self.work:
             claim(self.work, **run)
+            if (self.work / PLAN).exists():
+                chunks = int(json.loads((self.work / PLAN).read_text(encoding="utf-8"))["chunks"])
             if (self.work / CHECKPOINT).exists():
                 self.done, self.history = self.fitting.load(self.work / CHECKPOINT)
+        if chunks is not None:
+            self._plan(chunks)
 
-    def _plan(self, seconds: float, chunks: int | None, clock: Callable[[], float] = time.monotonic) -> int:
-        """Number of chunks: given, written down by the run before, or by the time that one takes."""
-        import json
+    def _plan(self, chunks: int) -> None:
+        """Fix the number of chunks, and write it down for a run that goes on after this one."""
+        self.total = chunks
+        if self.work:
+            write_atomically(self.work / PLAN, to_json({"chunks": chunks}))
 
-        place = self.work / PLAN if self.work else None
-        if place and place.exists():
-            return int(json.loads(place.read_text(encoding="utf-8"))["chunks"])
-        if chunks is None:
-            trial = self._new_fitting()
-            trial.scale = self.fitting.scale
-            self.source.proposed(1024, (self.seed, 2**31), self.learnt().sampler)  # compiles its kernels
-            spared = self.seen.seconds_spared() if self.seen else 0.0
-            at = clock()
-            trial.use(*self._data(2**31 + 1, trial=True), 10**6, np.random.default_rng(0))
-            chunks = max(int(LOOP_SHARE * seconds / (clock() - at - spared)), 1)
-        if place:
-            write_atomically(place, to_json({"chunks": chunks}))
-        return chunks
+    def _marks(self) -> set[int | float]:
+        """Chunks after which the error is measured."""
+        return {round(self.total * (k + 1) / VALIDATIONS) for k in range(VALIDATIONS - 1)}
 
-    def _data(self, k: int, trial: bool = False) -> tuple:
+    def _sampler(self) -> PatchSampler | None:
+        """What the next proposals follow."""
+        if self.patches is None:
+            return None
+        weights = {name: value.astype(np.float16) for name, value in self.fitting.drawing.arrays().items()}
+        return PatchSampler(self.frame, self.patches, weights)
+
+    def _data(self, k: int, sampler: PatchSampler | None) -> tuple[Pairs, Pairs]:
+        """Walks and proposals of chunk k."""
         if self.seen:
-            return self.seen.data(k, self.recipe.chunk, self.learnt().sampler, trial)
+            return self.seen.data(k, self.recipe.chunk, sampler)
         walks = self.source.walks(self.walks, (self.seed, k))
-        return walks, self.source.proposed(self.recipe.chunk, (self.seed, k), self.learnt().sampler)
+        return walks, self.source.proposed(self.recipe.chunk, (self.seed, k), sampler)
 
-    def _chunk(self, total: int) -> None:
-        walks, proposals = self._data(self.done)
+    def _chunk(self, seconds: float, clock: Callable[[], float] = time.monotonic) -> None:
+        """Steps on a chunk, while the data of the next one are made."""
+        walks, proposals = self.ready or self._data(self.done, self._sampler())
+        self.fitting.draw_by_average()
+        at, following = clock(), None
+        if self.done + 1 < self.total:
+            following = self.aside.submit(self._data, self.done + 1, self._sampler())
         per_chunk = self.recipe.reuse * max(self.recipe.chunk // self.recipe.batch, 1)
-        self.fitting.use(walks, proposals, total * per_chunk, np.random.default_rng([self.seed, self.done]))
+        # the first chunk does not know of the plan, and neither does its rate
+        steps = self.total * per_chunk if self.done or self.total == 1 else None
+        self.fitting.use(walks, proposals, steps, np.random.default_rng([self.seed, self.done]))
+        self.ready = following.result() if following else None
         self.done += 1
+        if self.total == math.inf:
+            each = clock() - at + (self.seen.seconds_more() if self.seen else 0.0)
+            self._plan(max(int(LOOP_SHARE * seconds / each), 2))
+
+    def _errors(self, truth: Reference, samples: int) -> list[ModelError]:
+        """Of the model as it stands; entries follow the patches, which have less noise than probes."""
+        model, sampler = self.learnt()[:2]
+        proposals = self.proposals.with_patches(sampler)
+        return measure(self.subject, model, proposals, truth=truth, samples=samples, seed=self.seed)
 
     def _validated(self, truth: Reference) -> tuple[int, float, float]:
         """Chunk, largest error under constant light and its standard error."""
-        rows = measure(self.subject, self.learnt().model, self.proposals, truth=truth, samples=SAMPLES, seed=self.seed)
+        rows = self._errors(truth, SAMPLES)
         live = [r for r in rows if r.light == "constant" and float(self.subject.media[r.channel].sigma_s) > 0]
         worst = max(live, key=lambda r: r.error, default=rows[0])
         return self.done, worst.error, worst.standard_error

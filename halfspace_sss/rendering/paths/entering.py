@@ -47,7 +47,7 @@ class Candidate(NamedTuple):
 
 
 def entering_light(world: World, body: Body, out: Exit, prim_index: Any, sampler: Any, active: Any) -> Candidate:
-    """One entry for light that leaves at `out`, drawn among as many as the settings say."""
+    """One entry for light that leaves at `out`, drawn among as many as the settings or the model say."""
     with detached():
         prepared = body.transport.prepare(out, active)
         where = body.proposals.prepare(out, prepared, active)
@@ -55,7 +55,7 @@ def entering_light(world: World, body: Body, out: Exit, prim_index: Any, sampler
     def draw(aims: Any = None) -> Candidate:
         return _candidate(world, body, _Exit(out, prim_index, prepared, where), aims, sampler, active)
 
-    n, kept = world.settings.entries, draw()
+    n, kept = body.entries, draw()
     if n == 1:
         return kept
     total = dr.detach(kept.hope)

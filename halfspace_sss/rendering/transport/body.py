@@ -17,7 +17,7 @@ from halfspace_sss.rendering.surface.varying import equivalent, warn_of_means
 from halfspace_sss.rendering.transport.expected import Expected, expected_of
 from halfspace_sss.rendering.transport.half_space import half_space_means
 from halfspace_sss.rendering.transport.protocols import Means, Proposals, Transport
-from halfspace_sss.rendering.transport.settings import Settings
+from halfspace_sss.rendering.transport.settings import AUTOMATIC, Settings
 from halfspace_sss.rendering.transport.variation import Variation
 
 __all__ = ["Bodies", "Body", "check_size", "make_bodies"]
@@ -35,6 +35,7 @@ class Body:
         media: medium of each channel, 1/(scene unit).
         transport: what light that enters elsewhere is worth here; None where no order from two on is asked for.
         proposals: where it may enter; None without a transport.
+        entries: how many of them an exit draws.
         few: the orders below two that are traced beside it: (0, 1), (1,) or none.
         expected: what each kind of light is expected to bring.
         variation: how its light varies with its medium.
@@ -45,6 +46,7 @@ class Body:
     media: list[Medium]
     transport: Transport | None
     proposals: Proposals | None
+    entries: int
     few: tuple[int, ...]
     expected: Expected
     variation: Variation
@@ -99,11 +101,13 @@ def _make_body(shape: Any, settings: Settings) -> Body:
     check_size(found, media, settings.mm_per_unit)
     single_only = inside.orders == "single" or not any(float(m.sigma_s) > 0 for m in media)
     variation = Variation(surface, settings.mm_per_unit)
-    transport, proposals = (None, None) if single_only else _means(inside, found, media, settings, variation)
+    none = Means(None, None)
+    transport, proposals, entries = none if single_only else _means(inside, found, media, settings, variation)
     if transport and transport.orders == "total" and inside.orders == "multiple":
         raise ValueError(f"orders must be total for the model {inside.model!r}, which contains them all, got multiple")
     few = _few(inside, transport)
-    return Body(found, surface, media, transport, proposals, few, expected_of(media), variation)
+    entries = entries if settings.entries == AUTOMATIC else settings.entries
+    return Body(found, surface, media, transport, proposals, entries, few, expected_of(media), variation)
 
 
 def _few(inside: Inside, transport: Transport | None) -> tuple[int, ...]:

@@ -61,7 +61,8 @@ class Transport(Protocol):
 
 
 class Means(NamedTuple):
-    """What renders an object inside: a transport and the proposals that suit it."""
+    """What renders an object inside: a transport, the proposals that suit it, and how many entries an exit draws."""
 
     transport: Transport
     proposals: Proposals
+    entries: int = 1

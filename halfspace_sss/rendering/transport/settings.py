@@ -28,7 +28,8 @@ class Settings:
         area_share: share of the candidates for an entry that are drawn uniformly over the area, the others by a probe
             near the exit, 0 to 1; AUTOMATIC chooses by the ratio of the distance that light travels to the size of the
             object.
-        entries: points of entry that an exit draws, of which one is followed, chosen by what it may bring.
+        entries: points of entry that an exit draws, of which one is followed, chosen by what it may bring; AUTOMATIC
+            leaves it to the model.
         hide_emitters: whether directly visible emitters are left out.
         train_seconds: time for each object whose model has to learn it first; 0 refuses objects without weights.
         train_error: relative error under constant light, measured on the way, from which on it has learnt enough.
@@ -42,7 +43,7 @@ class Settings:
     rr_depth: int = 5
     geometry: str = "distance"
     area_share: float = AUTOMATIC
-    entries: int = 1
+    entries: int = int(AUTOMATIC)
     hide_emitters: bool = False
     train_seconds: float = 60.0
     train_error: float = 0.03
@@ -57,7 +58,7 @@ class Settings:
             raise ValueError(f"max_depth must be -1 or at least 1, got {self.max_depth}")
         if self.rr_depth < 1:
             raise ValueError(f"rr_depth must be at least 1, got {self.rr_depth}")
-        if self.entries < 1:
+        if self.entries < 1 and self.entries != AUTOMATIC:
             raise ValueError(f"entries must be at least 1, got {self.entries}")
         if self.geometry not in GEOMETRIES:
             raise ValueError(f"geometry must be one of {', '.join(GEOMETRIES)}, got {self.geometry!r}")
@@ -71,7 +72,7 @@ class Settings:
         return {name: getattr(self, name) for name in SHARED}
 
     def of_models(self) -> dict[str, Any]:
-        """How models are laid on and sampled; an automatic share is left to them."""
+        """How models are laid on and sampled; what is automatic is left to them."""
         given = {name: getattr(self, name) for name in OF_MODELS}
         return {name: value for name, value in given.items() if value != AUTOMATIC}
 
