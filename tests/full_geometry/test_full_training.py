@@ -296,6 +296,5 @@ def test_a_mono_variant_learns_one_channel(tmp_path: Path) -> None:
 
 
 def test_a_channel_that_does_not_scatter_carries_nothing(tmp_path: Path) -> None:
-    black = Medium(np.array([0.95, 0.0, 0.6]), np.array([0.05, 1.0, 0.4]), 0.0, 1.4)
-    S = S_of(train(ball(), black, chunks=2, recipe=QUICK, folder=tmp_path).model)
+    S = S_of(train(ball(), Medium([0.95, 0.0, 0.6], [0.05, 1.0, 0.4], 0.0, 1.4), chunks=2, recipe=QUICK, folder=tmp_path).model)
     assert np.all(S[1] == 0) and np.all(np.isfinite(S)) and np.mean(S[0] > 0) > 0.9
