@@ -34,9 +34,8 @@ from halfspace_sss import rendering  # noqa: E402
 from halfspace_sss.neural.store import load_weights, save_weights  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
-QUICK = Recipe(width=24, depth=2, batch=1024, chunk=2**14, reuse=4)
-WAX = Medium(np.array([0.95, 0.8, 0.6]), np.array([0.05, 0.2, 0.4]), 0.0, 1.4)
-CHUNKS = 12
+QUICK, CHUNKS = Recipe(width=24, depth=2, batch=1024, chunk=2**14, reuse=4), 12
+WAX = Medium([0.95, 0.8, 0.6], [0.05, 0.2, 0.4], 0.0, 1.4)
 
 
 @pytest.fixture(autouse=True)
@@ -296,5 +295,6 @@ def test_a_mono_variant_learns_one_channel(tmp_path: Path) -> None:
 
 
 def test_a_channel_that_does_not_scatter_carries_nothing(tmp_path: Path) -> None:
-    S = S_of(train(ball(), Medium([0.95, 0.0, 0.6], [0.05, 1.0, 0.4], 0.0, 1.4), chunks=2, recipe=QUICK, folder=tmp_path).model)
+    black = Medium([0.95, 0.0, 0.6], [0.05, 1.0, 0.4], 0.0, 1.4)
+    S = S_of(train(ball(), black, chunks=2, recipe=QUICK, folder=tmp_path).model)
     assert np.all(S[1] == 0) and np.all(np.isfinite(S)) and np.mean(S[0] > 0) > 0.9
