@@ -34,6 +34,7 @@ __all__ = ["Few", "Leg", "few_orders"]
 MOST_LEGS = 256
 FAINT = 0.1  # weight below which a scattered walk may end
 GRAZES = 0.05  # cosine at an emitter up to which its points are left to chance: their density over the area goes to 0
+FOCUS = 10.0  # of the straight way into solid angle at the event; points of caustics beyond are left to chance
 SAME_WAY = 1e-2  # by which points of exit may differ, over their distance from the event
 
 Media = list[tuple[Any, Any, Any]]  # sigma_s, sigma_t and g of each channel
@@ -191,13 +192,14 @@ def _connected(world: World, of: tuple[Body, Media], walk: _Walk, weight: Any, s
         met = refracted_connection(body, walk.event, target, active)
         # solid angle at the event per solid angle of the straight direction, over which the emitter was sampled
         facing = dr.select(dr.squared_norm(ds.n) > 0, dr.abs(dr.dot(ds.n, met.w)) / dr.abs(dr.dot(ds.n, ds.d)), 1)
-        spread = dr.select(ds.delta, 1, facing) * reach * reach * met.density
-        cosine, passed = dr.dot(walk.along, met.d), met.T * spread
+        focus = reach * reach * met.density
+        found = met.valid & (ds.delta | (focus < FOCUS))
+        cosine, passed = dr.dot(walk.along, met.d), met.T * dr.select(ds.delta, 1, facing) * focus
     phase = _spectrum([eval_hg(cosine, g) for _, _, g in media])
     value = weight * phase * _value(media, met.length, mi.UInt32(0), None) * passed * light
     edge = place(met.p, met.n)
-    blocked = world.scene.ray_test(edge.spawn_ray_to(target), False, met.valid)
-    return dr.select(met.valid & ~blocked, value, 0)
+    blocked = world.scene.ray_test(edge.spawn_ray_to(target), False, found)
+    return dr.select(found & ~blocked, value, 0)
 
 
 def _clear(body: Body, n: Any, d: Any) -> Any:
@@ -218,7 +220,9 @@ def _met_by_chance(world: World, body: Body, walk: _Walk, active: Any) -> Any:
         active = active & si.is_valid() & (emitter != None)  # noqa: E711
         met = refracted_connection(body, walk.event, mi.Point3f(si.p), active)
         apart = dr.norm(mi.Point3f(met.p) - walk.o) > SAME_WAY * dr.norm(walk.o - walk.event)
-        sampled = met.valid & ~apart & _faces(si.n, dr.normalize(si.p - walk.event))
+        straight = si.p - walk.event
+        found = met.valid & (dr.squared_norm(straight) * met.density < FOCUS)
+        sampled = found & ~apart & _faces(si.n, dr.normalize(straight))
     return dr.select(active & ~sampled, emitter.eval(si, active), 0)
 
 
