@@ -71,9 +71,10 @@ def measured(task: Task) -> dict[str, Any]:
             task.progress(done, total + 1)
 
         found = assess_stage(on, chosen, seconds=p["seconds"], seed=p["seed"], progress=tell)
-        found = with_flip(on, chosen, found, 0, p["seed"])
         named = {row.way for row in found.objects[0].ways if not row.refusal}
-        images = small_images(on, [w for w in chosen if w.name in named], 0, p["seed"], p["size"], p["spp"])
+        shown = [way for way in chosen if way.name in named]
+        images = small_images(on, shown, 0, p["seed"], p["size"], p["spp"])
+        found = with_flip(on, shown, found, 0, p["seed"], images, p["spp"])
     numbered = {f"image_{k}": image for k, image in enumerate(images.values())}
     return {"assessment": found.record(), "seconds": p["seconds"], "shown": list(images), **numbered}
 

@@ -20,7 +20,7 @@ __all__ = ["assess"]
 def assess(
     scene: Any,
     *,
-    seconds: float = 4.5,
+    seconds: float = 4.0,
     only: Sequence[str] | None = None,
     sensor: int = 0,
     seed: int = 0,

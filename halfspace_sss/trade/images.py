@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -76,14 +76,32 @@ def _rendered(
     return np.maximum(image, 0).reshape(size[1], size[0], 3).astype(np.float32)
 
 
-def with_flip(on: Stage, chosen: Sequence[Way], found: Assessment, sensor: int, seed: int) -> Assessment:
-    """The assessment with FLIP of the whole small image, where the evaluator is installed and something shines."""
+def with_flip(
+    on: Stage,
+    chosen: Sequence[Way],
+    found: Assessment,
+    sensor: int,
+    seed: int,
+    images: Mapping[str, np.ndarray] | None = None,
+    spp: int = SPP,
+) -> Assessment:
+    """The assessment with FLIP of the whole small image, where the evaluator is installed and something shines.
+
+    Args:
+        on: the scene.
+        chosen: ways, path traced first.
+        found: the assessment.
+        sensor: number of the sensor.
+        seed: of the samples.
+        images: of `small_images`, if they have been rendered, with `spp` samples a pixel.
+        spp: samples for each pixel.
+    """
     flip = renderer("flip")
     if flip is None or all(o.is_dark for o in found.objects):
         return found
-    images = small_images(on, [chosen[0], *chosen], sensor, seed)
-    again = small_images(on, [chosen[0]], sensor, seeded(seed, 52))[PATH_TRACED]
+    images = small_images(on, chosen, sensor, seed, spp=spp) if images is None else images
     truth = images[PATH_TRACED]
+    again = small_images(on, [chosen[0]], sensor, seeded(seed, 52), max(truth.shape), spp)[PATH_TRACED]
     noise = flip(truth, again)
     values = {name: noise if name == PATH_TRACED else flip(truth, image) for name, image in images.items()}
     objects = []

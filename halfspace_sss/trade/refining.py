@@ -27,7 +27,7 @@ def assess_for(
     chosen: Sequence[Way],
     tolerance: float,
     *,
-    seconds: float = 4.5,
+    seconds: float = 4.0,
     sensor: int = 0,
     seed: int = 0,
     exits: int = EXITS,
@@ -85,10 +85,9 @@ def _mean(a: WayTrade, b: WayTrade, walks: tuple[WayTrade, WayTrade]) -> WayTrad
     noise = [V / row.samples + V_walks / walk.samples for row, walk in zip((a, b), walks)]
     u = noise[1] / (noise[0] + noise[1]) if sum(noise) > 0 else 0.5
     ratio = tuple(u * x + (1 - u) * y for x, y in zip(a.ratio, b.ratio))
-    longer = max((a, b), key=lambda row: row.samples)
     return replace(
         a, bias2=u * a.bias2 + (1 - u) * b.bias2, bias2_error=math.hypot(u * a.bias2_error, (1 - u) * b.bias2_error),
         ratio=ratio, ratio_error=tuple(math.hypot(u * x, (1 - u) * y) for x, y in zip(a.ratio_error, b.ratio_error)),
         variance=0.5 * V, variance_error=0.5 * math.hypot(a.variance_error, b.variance_error),
-        seconds=longer.seconds, samples=a.samples + b.samples, memory=max(a.memory, b.memory),
+        seconds=min(a.seconds, b.seconds), samples=a.samples + b.samples, memory=max(a.memory, b.memory),
     )  # fmt: skip

@@ -19,7 +19,7 @@ def check_command(
     scenes: Annotated[int, typer.Option(help="How many.", parser=whole)] = 60,
     first: Annotated[int, typer.Option(help="Number of the first one.", parser=whole)] = 0,
     seed: Annotated[int, typer.Option(help="Other seeds draw other scenes.", parser=whole)] = 0,
-    assess: Annotated[float, typer.Option(help="Seconds of measuring for a recommendation.")] = 4.5,
+    assess: Annotated[float, typer.Option(help="Seconds of measuring for a recommendation.")] = 4.0,
     truth: Annotated[float, typer.Option(help="Most seconds of the long runs, with seeds of their own.")] = 24.0,
     write_only: Annotated[bool, typer.Option("--write-only", help="Write the scenes, measure nothing.")] = False,
     variant: Variant = "llvm_ad_rgb",

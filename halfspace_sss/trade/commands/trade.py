@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 __all__ = ["SHIPPED", "object_table", "trade_command"]
 
 SHIPPED = "trade.csv"  # in the package: five materials, two shapes, two lights
-TOLERANCE, IMAGES, ASSESS = 0.05, 1, 4.5
+TOLERANCE, IMAGES, ASSESS = 0.05, 1, 4.0
 
 
 def trade_command(

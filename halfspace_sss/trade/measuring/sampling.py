@@ -47,9 +47,8 @@ class Sampled:
 
     @property
     def seconds(self) -> float:
-        """Of one sample, without what a launch takes whatever its size, as images are larger."""
-        n, took = max(self.launches)
-        return max(took - self.overhead, LEAST_SHARE * took) / n
+        """Of one sample, the least of all launches, without what one takes whatever its size, as images are larger."""
+        return min(max(took - self.overhead, LEAST_SHARE * took) / n for n, took in self.launches)
 
 
 def clock() -> float:
