@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import csv
+import gc
 import os
+import sys
 import warnings
 from importlib import resources
 from pathlib import Path
@@ -49,6 +51,13 @@ def stand_ins(tmp_path_factory: pytest.TempPathFactory):
         for module in (material_model, paper_model):
             patch.setattr(module, "find_weights", find)
         yield
+
+
+@pytest.fixture(scope="module", autouse=True)
+def no_scenes_of_other_files() -> None:
+    """Kernels call what is left of scenes of other tests too, such as textures without colour: they are freed."""
+    if "mitsuba" in sys.modules:
+        gc.collect()
 
 
 @pytest.fixture(scope="session")

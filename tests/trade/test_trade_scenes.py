@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import json
 from pathlib import Path
 from typing import Any
@@ -30,7 +29,6 @@ def rendering(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("HALFSPACE_SSS_CHOICES", str(tmp_path / "choices"))
     mi.set_variant("llvm_ad_rgb")
     rendering.register()
-    gc.collect()  # kernels call what is left of scenes of other tests too, such as textures without colour
 
 
 def scene(medium: dict | None = None, light: dict | None = None, n: int = 1, **more: Any) -> dict[str, Any]:
