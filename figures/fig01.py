@@ -14,6 +14,7 @@ from figures.computing.denoise import guides
 from figures.computing.environments import environment_file
 from figures.computing.model_inputs import weight_files
 from figures.computing.scenes import prepare
+from figures.computing.tone import stops_of
 from figures.drawing.error_tables import label
 from figures.drawing.image_grid import image_grid
 from figures.drawing.page import page
@@ -106,7 +107,7 @@ def _shots(results: Mapping[str, Result], name: str) -> list[Shot]:
     """The images of an object, exposed alike."""
     truth = results[f"{name}, {TRUTH}"]
     reference, mask = np.maximum(truth.images["image"], 0), truth.images["cover"] > 0.5
-    gain = np.float32(2.0 ** np.round(-np.log2(np.percentile(reference[mask], 97)), 1))
+    gain = np.float32(2.0 ** stops_of(reference, mask))
     shots = [Shot("Path traced", gain * reference, {})]
     for model in MODELS:
         image = np.maximum(results[f"{name}, {model}"].images["image"], 0)

@@ -10,6 +10,7 @@ import numpy as np
 from figures.computing.contenders import ENTRIES
 from figures.computing.environments import ENVIRONMENTS, environment, environment_file
 from figures.computing.scenes import BUNNY, bunny_scene, prepare
+from figures.computing.tone import stops_of
 from figures.drawing.image_grid import image_grid
 from figures.drawing.page import page
 from figures.drawing.shot import Shot, compared
@@ -113,7 +114,7 @@ def _pair(results: Mapping[str, Result], light: str, view: int) -> tuple[Shot, S
     """The images by walks and by the model, exposed alike."""
     reference = results[_name(light, view, "path_traced")].images["image"]
     mask = reference.max(axis=2) > 0
-    gain = np.float32(2.0 ** np.round(-np.log2(np.percentile(reference[mask], 97)), 1))
+    gain = np.float32(2.0 ** stops_of(reference, mask))
     image = results[_name(light, view, FULL_GEOMETRY)].images["image"]
     model = compared("Full geometry", gain * np.maximum(image, 0), gain * reference, mask=mask, numbers={})
     return Shot("Path traced", gain * reference, {}), model

@@ -10,17 +10,19 @@ import numpy as np
 
 from figures.computing import contenders
 from figures.computing.contenders import ENTRIES
+from figures.computing.long_render import long_render
 from figures.computing.model_inputs import weight_files
 from figures.computing.scenes import BUNNY, MATERIALS, bunny_scene, prepare
+from figures.computing.tone import noise_of, stops_of
+from figures.drawing.error_tables import label
 from figures.drawing.image_grid import image_grid
 from figures.drawing.page import page
 from figures.drawing.shot import Shot, compared
-from figures.drawing.style import look, paper, saved
+from figures.drawing.style import paper, saved
 from figures.learnt.training import train_scan
 from figures.learnt.weights import FULL_GEOMETRY, training_of, with_weights
 from figures.parts.part import Part, Result, Task
 from halfspace_sss import materials
-from halfspace_sss.provenance import check_folder
 
 __all__ = ["TITLE", "draw", "parts", "path_traced", "rendered"]
 
@@ -61,19 +63,12 @@ def parts(quality: str) -> list[Part]:
 
 def path_traced(task: Task) -> dict[str, Any]:
     """The image by random walks, in passes that survive an interruption."""
-    from halfspace_sss.rendering.scenes import reference
     from halfspace_sss.rendering.scenes.scene_files import load_scene
 
     prepare()
     p = task.params
     scene = load_scene(bunny_scene(p["material"], p["size"]), "path_traced")
-    passes = p["spp"] // SPP_PER_PASS
-    found = reference.render(
-        scene, check_folder(task.folder) / "passes.exr", spp_per_pass=SPP_PER_PASS, seed=p["seed"], passes=passes,
-        progress=lambda so_far: task.progress(so_far.passes, passes),
-    )  # fmt: skip
-    image, variance = (v.astype(np.float32) for v in (found.mean, found.variance))
-    return {"image": image, "variance": variance, "seconds": found.seconds, "spp": found.spp}
+    return long_render(task, scene, SPP_PER_PASS, p["spp"] // SPP_PER_PASS)
 
 
 def rendered(task: Task) -> dict[str, Any]:
@@ -116,9 +111,9 @@ def _shots(results: Mapping[str, Result], material: str) -> tuple[str, list[Shot
     truth = results[f"{material}, path traced"]
     reference = truth.images["image"]
     mask = reference.max(axis=2) > 0
-    stops = float(np.round(-np.log2(np.percentile(reference[mask], 97)), 1))
+    stops = stops_of(reference, mask)
     gain = np.float32(2.0**stops)
-    error = float(np.sqrt(truth.images["variance"][mask].sum() / np.sum(reference[mask] ** 2)))
+    error = noise_of(reference, truth.images["variance"], mask)
     numbers = {"seconds": truth.numbers["seconds"], "spp": truth.numbers["spp"], "standard error": error}
     shots = [Shot("Path traced", gain * reference, numbers)]
     for model in MODELS:
@@ -126,6 +121,5 @@ def _shots(results: Mapping[str, Result], material: str) -> tuple[str, list[Shot
         numbers = {"seconds": found.numbers["seconds"], "spp": found.numbers["spp"]}
         if model == FULL_GEOMETRY:
             numbers["CPU seconds of training"] = results[training_of(material)].numbers["cpu seconds"]
-        label = "Neural half-space" if model == "neural" else look(model).label
-        shots.append(compared(label, gain * found.images["image"], gain * reference, mask=mask, numbers=numbers))
+        shots.append(compared(label(model), gain * found.images["image"], gain * reference, mask=mask, numbers=numbers))
     return f"{material} ({stops:+g} stops)", shots

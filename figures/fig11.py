@@ -12,6 +12,7 @@ from figures.computing.denoise import check_denoiser, denoised, guides
 from figures.computing.model_inputs import weight_files
 from figures.computing.scenes import BUNNY, prepare
 from figures.computing.timed import Timed, alternating, pass_size
+from figures.computing.tone import noise_of, stops_of
 from figures.drawing.error_tables import label
 from figures.drawing.image_grid import image_grid
 from figures.drawing.page import page
@@ -121,9 +122,9 @@ def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
 def _shots(truth: Result, rivals: Result, material: str) -> tuple[str, list[Shot], list[dict[str, Any]]]:
     """The material with its exposure, the images that are shown, multiplied by it, and the rows of all methods."""
     reference, mask = truth.images["image"], rivals.images["cover"] > 0
-    stops = float(np.round(-np.log2(np.percentile(reference[mask], 97)), 1))
+    stops = stops_of(reference, mask)
     gain = np.float32(2.0**stops)
-    error = float(np.sqrt(truth.images["variance"][mask].sum() / np.sum(reference[mask] ** 2)))
+    error = noise_of(reference, truth.images["variance"], mask)
     numbers = {name: truth.numbers[name] for name in ("spp", "seconds")}
     shots, rows = {}, [{"material": material, "method": WALK, "state": "truth", **numbers, "standard error": error}]
     for name, about in rivals.numbers["methods"].items():

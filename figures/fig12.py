@@ -10,6 +10,7 @@ import numpy as np
 
 from figures.computing.learnt_objects import shape_of, weights_in
 from figures.computing.scenes import BUNNY, bunny_scene, prepare
+from figures.computing.tone import stops_of
 from figures.drawing.image_grid import image_grid
 from figures.drawing.page import page
 from figures.drawing.shot import Shot, compared
@@ -104,7 +105,7 @@ def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
     for light in LIGHTS:
         reference = images[_key(light, "converged")]
         mask = reference.max(axis=2) > 0
-        gain = np.float32(2.0 ** np.round(-np.log2(np.percentile(reference[mask], 97)), 1))
+        gain = np.float32(2.0 ** stops_of(reference, mask))
         shots = [Shot("Converged", gain * reference, {})]
         for n in ENTRIES:
             for sampler in SAMPLERS:

@@ -10,6 +10,7 @@ import numpy as np
 
 from figures.computing.denoise import check_denoiser, denoised, guides
 from figures.computing.environments import environment, environment_file
+from figures.computing.long_render import long_render
 from figures.computing.scenes import prepare
 from figures.drawing.image_grid import image_grid
 from figures.drawing.page import page
@@ -118,16 +119,11 @@ def varying(task: Task) -> dict[str, Any]:
 
 def _image(task: Task, loaded: Any, albedo: np.ndarray, normal: np.ndarray) -> dict[str, Any]:
     """The image in passes that survive an interruption, as rendered and denoised; then the files of the scene go."""
-    from halfspace_sss.rendering.scenes import reference
-
-    p, passes = task.params, max(task.params["spp"] // SPP_PER_PASS, 1)
-    found = reference.render(
-        loaded, task.folder / "passes.exr", spp_per_pass=min(SPP_PER_PASS, p["spp"]), seed=p["seed"], passes=passes,
-        progress=lambda so_far: task.progress(so_far.passes, passes),
-    )  # fmt: skip
-    image = np.maximum(found.mean[..., :3], 0).astype(np.float32)
+    spp = task.params["spp"]
+    found = long_render(task, loaded, min(SPP_PER_PASS, spp), max(spp // SPP_PER_PASS, 1))
+    image = np.maximum(found["image"], 0)
     smooth, _ = denoised(image, albedo, normal)
-    return {"image": image, "denoised": smooth, "seconds": found.seconds, "spp": found.spp}
+    return {"image": image, "denoised": smooth, "seconds": found["seconds"], "spp": found["spp"]}
 
 
 def _surface_albedo(loaded: Any, made: Varying) -> np.ndarray:

@@ -8,12 +8,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from figures.computing.long_render import long_render
 from figures.computing.model_inputs import weight_files
 from figures.computing.scenes import DRAGON, SCANS, prepare
+from figures.computing.tone import noise_of, stops_of
+from figures.drawing.error_tables import label
 from figures.drawing.image_grid import image_grid
 from figures.drawing.page import page
 from figures.drawing.shot import Shot, compared
-from figures.drawing.style import look, paper, saved
+from figures.drawing.style import paper, saved
 from figures.parts.part import Part, Result, Task
 from full_geometry.neural_shape.shapes.generators import make_shape
 from halfspace_sss import materials
@@ -73,17 +76,8 @@ def parts(quality: str) -> list[Part]:
 
 def path_traced(task: Task) -> dict[str, Any]:
     """The image by random walks, in passes that survive an interruption."""
-    from halfspace_sss.rendering.scenes import reference
-
     prepare()
-    p = task.params
-    passes = p["spp"] // SPP_PER_PASS
-    found = reference.render(
-        _scene(task, "path_traced"), check_folder(task.folder) / "passes.exr", spp_per_pass=SPP_PER_PASS,
-        seed=p["seed"], passes=passes, progress=lambda so_far: task.progress(so_far.passes, passes),
-    )  # fmt: skip
-    image, variance = (v.astype(np.float32) for v in (found.mean, found.variance))
-    return {"image": image, "variance": variance, "seconds": found.seconds, "spp": found.spp}
+    return long_render(task, _scene(task, "path_traced"), SPP_PER_PASS, task.params["spp"] // SPP_PER_PASS)
 
 
 def rendered(task: Task) -> dict[str, Any]:
@@ -152,12 +146,11 @@ def _shots(results: Mapping[str, Result], name: str) -> list[Shot]:
     truth = results[f"{name}, path traced"]
     reference = truth.images["image"]
     mask = reference.max(axis=2) > 0
-    gain = np.float32(2.0 ** np.round(-np.log2(np.percentile(reference[mask], 97)), 1))
-    error = float(np.sqrt(truth.images["variance"][mask].sum() / np.sum(reference[mask] ** 2)))
+    gain = np.float32(2.0 ** stops_of(reference, mask))
+    error = noise_of(reference, truth.images["variance"], mask)
     shots = [Shot("Path traced", gain * reference, {"standard error": error})]
     for model in MODELS:
         image = results[f"{name}, {model}"].images["image"]
         numbers = {"mean over path traced": float(image[mask].mean() / reference[mask].mean())}
-        label = "Neural half-space" if model == "neural" else look(model).label
-        shots.append(compared(label, gain * np.maximum(image, 0), gain * reference, mask=mask, numbers=numbers))
+        shots.append(compared(label(model), gain * np.maximum(image, 0), gain * reference, mask=mask, numbers=numbers))
     return shots

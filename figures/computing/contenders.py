@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
+from figures.computing.long_render import long_render
 from figures.computing.scenes import SCANS, prepare, scan_scene
 from figures.parts.part import Task
 from halfspace_sss.neural.symmetric import channels
 from halfspace_sss.physics.medium import Medium
-from halfspace_sss.provenance import check_folder
 from halfspace_sss.rendering.surface.transports import model_names
 
 __all__ = ["ENTRIES", "MODELS", "OF_OBJECTS", "RR_DEPTHS", "VOLUMES", "WALK", "contender", "long_walk", "volume"]
@@ -83,16 +83,9 @@ def long_walk(task: Task) -> dict[str, Any]:
 
     The parameters of the task are material, size, lights, spp, seed and, unless it is the bunny, scan.
     """
-    from halfspace_sss.rendering.scenes import reference
-
     prepare()
     p = task.params
     each = min(max(p["spp"] // 8, 1), LONG_PASS)
     passes = max(p["spp"] // each, 2)
     scene = contender(WALK, p["material"], p["size"], p["lights"], scan=p.get("scan", "bunny"))
-    found = reference.render(
-        scene, check_folder(task.folder) / "passes.exr",
-        spp_per_pass=each, seed=p["seed"], passes=passes, progress=lambda now: task.progress(now.passes, passes),
-    )  # fmt: skip
-    image, variance = (v[..., :3].astype(np.float32) for v in (found.mean, found.variance))
-    return {"image": image, "variance": variance, "seconds": found.seconds, "spp": found.spp}
+    return long_render(task, scene, each, passes)

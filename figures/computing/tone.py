@@ -6,7 +6,7 @@ import numpy as np
 
 from halfspace_sss.checks import check_finite
 
-__all__ = ["LARGEST", "check_image", "luminance", "srgb"]
+__all__ = ["LARGEST", "check_image", "luminance", "noise_of", "srgb", "stops_of"]
 
 LARGEST = 1e12  # radiance; squares of it, as tone mapping takes them, still fit float32
 
@@ -24,6 +24,16 @@ def srgb(image: np.ndarray, exposure: float = 0.0) -> np.ndarray:
     check_finite("exposure", exposure)
     x = np.clip(np.asarray(image, dtype=np.float32) * np.float32(2.0**exposure), 0.0, 1.0)
     return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 1e-9) ** (1 / 2.4) - 0.055).astype(np.float32)
+
+
+def stops_of(reference: np.ndarray, mask: np.ndarray) -> float:
+    """Stops, to a tenth, at which the 97th percentile of the pixels of a mask comes to 1."""
+    return float(np.round(-np.log2(np.percentile(reference[mask], 97)), 1))
+
+
+def noise_of(image: np.ndarray, variance: np.ndarray, mask: np.ndarray) -> float:
+    """Root mean square of the standard error of the pixels of a mask, over that of the image."""
+    return float(np.sqrt(variance[mask].sum() / np.sum(image[mask] ** 2)))
 
 
 def luminance(image: np.ndarray) -> np.ndarray:

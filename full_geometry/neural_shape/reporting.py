@@ -3,19 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
-import numpy as np
 import typer
 
 from halfspace_sss.checks import check_count, check_interval
-from halfspace_sss.progress import NamedProgress
 from halfspace_sss.provenance import check_folder, write_atomically
-
-if TYPE_CHECKING:
-    from full_geometry.neural_shape.evaluation.cases import Row
 
 __all__ = ["shapes_command"]
 
@@ -74,26 +68,16 @@ def shapes_command(
         rows = cases.evaluate(cases.held_out(objects), objects, progress=show)
         found["held-out"] = tables.summary(rows) + "\n" + tables.by_property(rows) + "\n" + tables.case_table(rows)
         if pictures is not None:
-            _write_picture(pictures, rows, show)
+            from full_geometry.neural_shape.evaluation.pictures import worst_pictures
+            from halfspace_sss.rendering.scenes.picture import as_png
+
+            write_atomically(pictures, as_png(worst_pictures(rows, show)[..., None]))
         if work is not None:
             from full_geometry.neural_shape.evaluation.ablation import ablation_table
 
             found["ablation"] = ablation_table(work, seconds, show)
     _write(out, found)
     typer.echo(f"written: {out}")
-
-
-def _write_picture(path: Path, rows: Sequence[Row], progress: NamedProgress) -> None:
-    """The worst objects of the rows as a PNG file."""
-    import mitsuba as mi
-
-    from full_geometry.neural_shape.evaluation.pictures import worst_pictures
-
-    grey = np.round(255 * worst_pictures(rows, progress)).astype(np.uint8)
-    stream = mi.MemoryStream()
-    mi.Bitmap(grey[..., None]).write(stream, mi.Bitmap.FileFormat.PNG)
-    stream.seek(0)
-    write_atomically(path, bytes(stream.read(stream.size())))
 
 
 def _write(out: Path, found: dict[str, str]) -> None:

@@ -31,7 +31,7 @@ def worst_pictures(rows: Sequence[Row], progress: NamedProgress | None = None) -
         progress: called with (what, done, total).
 
     Returns:
-        sRGB values (height, width) in [0, 1].
+        Radiance (height, width), 1 where it is white.
     """
     worst = sorted(range(len(rows)), key=lambda k: -rows[k].of("neural_shape"))[:WORST]
     objects = {k: case for k, case in enumerate(held_out(max(worst) + 1)) if k in worst}
@@ -43,7 +43,9 @@ def worst_pictures(rows: Sequence[Row], progress: NamedProgress | None = None) -
         images = [picture(objects[k], model) for model in models]
         lit = images[0][images[0] > 0]
         white = float(np.percentile(lit, BRIGHT)) if lit.size else 1.0
-        lines.append(np.concatenate([np.pad(_srgb(v / white), GAP // 2, constant_values=1) for v in images], axis=1))
+        lines.append(
+            np.concatenate([np.pad(np.minimum(v / white, 1), GAP // 2, constant_values=1) for v in images], axis=1)
+        )
     return np.concatenate(lines)
 
 
@@ -88,8 +90,3 @@ def _scene(case: Case, path: Path, size: int) -> dict[str, Any]:
             },
         },
     }  # fmt: skip
-
-
-def _srgb(v: np.ndarray) -> np.ndarray:
-    v = np.clip(v, 0, 1)
-    return np.where(v <= 0.0031308, 12.92 * v, 1.055 * v ** (1 / 2.4) - 0.055)

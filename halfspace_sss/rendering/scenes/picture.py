@@ -9,7 +9,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-__all__ = ["Picture"]
+__all__ = ["Picture", "as_png"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,12 +35,16 @@ class Picture:
 
     def png(self, image: np.ndarray | None = None) -> bytes:
         """The image as a display shows it."""
-        shown = self.image if image is None else image
-        return _written(mi.util.convert_to_bitmap(mi.TensorXf(shown.astype(np.float32))), mi.Bitmap.FileFormat.PNG)
+        return as_png(self.image if image is None else image)
 
     def exr(self, image: np.ndarray) -> bytes:
         """An image as it is."""
         return _written(mi.Bitmap(np.ascontiguousarray(image, dtype=np.float32)), mi.Bitmap.FileFormat.OpenEXR)
+
+
+def as_png(image: np.ndarray) -> bytes:
+    """Linear radiance (H, W, channels) as a display shows it."""
+    return _written(mi.util.convert_to_bitmap(mi.TensorXf(image.astype(np.float32))), mi.Bitmap.FileFormat.PNG)
 
 
 def _written(bitmap: Any, kind: Any) -> bytes:
