@@ -23,7 +23,7 @@ import drjit as dr
 import mitsuba as mi
 
 from halfspace_sss.physics.phase import eval_hg, sample_hg
-from halfspace_sss.rendering.paths.refraction import meet, refracted_connection
+from halfspace_sss.rendering.paths.refraction import Connection, meet, refracted_connection
 from halfspace_sss.rendering.paths.world import World, sampled_light
 from halfspace_sss.rendering.surface.derivatives import detached
 from halfspace_sss.rendering.transport.body import Body
@@ -186,15 +186,15 @@ def _connected(world: World, of: tuple[Body, Media], walk: _Walk, weight: Any, s
     ds, light = sampled_light(world, at, sampler.next_2d(), False, active)
     with detached():
         distant = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
-        active = active & (ds.pdf > 0) & ~ds.emitter.is_environment() & _faces(ds.n, ds.d)
+        active = active & (ds.pdf > 0) & ~ds.emitter.is_environment()
         reach = dr.select(distant, number(1e4 * body.found.size), ds.dist)
         target = walk.event + ds.d * reach
         met = refracted_connection(body, walk.event, target, active)
         # solid angle at the event per solid angle of the straight direction, over which the emitter was sampled
         facing = dr.select(dr.squared_norm(ds.n) > 0, dr.abs(dr.dot(ds.n, met.w)) / dr.abs(dr.dot(ds.n, ds.d)), 1)
-        focus = reach * reach * met.density
-        found = met.valid & (ds.delta | (focus < FOCUS))
-        cosine, passed = dr.dot(walk.along, met.d), met.T * dr.select(ds.delta, 1, facing) * focus
+        found = met.valid & (ds.delta | _is_sampled(walk.event, target, ds.n, met))
+        spread = dr.select(ds.delta, 1, facing) * reach * reach * met.density
+        cosine, passed = dr.dot(walk.along, met.d), met.T * spread
     phase = _spectrum([eval_hg(cosine, g) for _, _, g in media])
     value = weight * phase * _value(media, met.length, mi.UInt32(0), None) * passed * light
     edge = place(met.p, met.n)
@@ -220,10 +220,14 @@ def _met_by_chance(world: World, body: Body, walk: _Walk, active: Any) -> Any:
         active = active & si.is_valid() & (emitter != None)  # noqa: E711
         met = refracted_connection(body, walk.event, mi.Point3f(si.p), active)
         apart = dr.norm(mi.Point3f(met.p) - walk.o) > SAME_WAY * dr.norm(walk.o - walk.event)
-        straight = si.p - walk.event
-        found = met.valid & (dr.squared_norm(straight) * met.density < FOCUS)
-        sampled = found & ~apart & _faces(si.n, dr.normalize(straight))
+        sampled = met.valid & ~apart & _is_sampled(walk.event, si.p, si.n, met)
     return dr.select(active & ~sampled, emitter.eval(si, active), 0)
+
+
+def _is_sampled(event: Any, p: Any, n: Any, met: Connection) -> Any:
+    """Whether light of the point p of an emitter, with the normal n, comes by its connection with the event."""
+    way = p - event
+    return _faces(n, dr.normalize(way)) & (dr.squared_norm(way) * met.density < FOCUS)
 
 
 def _faces(n: Any, d: Any) -> Any:
