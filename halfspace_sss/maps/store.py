@@ -183,16 +183,23 @@ def _check_coordinates(dataset: xr.Dataset) -> None:
 
 
 def _create(path: Path, medium: Medium, grid: MapGrid, seed: int, asked: dict[str, Any]) -> None:
-    """A store of the right shape, made under another name and renamed."""
-    dataset = _template(medium, grid, seed)
+    """A store of the right shape, made under another name and renamed.
+
+    Encoded in memory: zarr's threads, which an interrupt does not end, would write on into a folder just removed.
+    """
+    from zarr.storage import MemoryStore
+
+    dataset, memory = _template(medium, grid, seed), {}
     dataset.attrs |= {"halfspace_sss_maps": json.dumps(asked, sort_keys=True), "provenance": json.dumps(provenance())}
+    chunks = {name: {"chunks": (1, 1, *dataset[name].shape[2:])} for name in dataset.data_vars}
+    dataset.to_zarr(MemoryStore(memory), mode="w", zarr_format=2, encoding=chunks)
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     shutil.rmtree(temporary, ignore_errors=True)
-    chunks = {name: (1, 1, *dataset[name].shape[2:]) for name in dataset.data_vars}
     try:
         with naming(path):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            dataset.to_zarr(temporary, mode="w", zarr_format=2, encoding={k: {"chunks": v} for k, v in chunks.items()})
+            for key, data in memory.items():
+                (temporary / key).parent.mkdir(parents=True, exist_ok=True)
+                (temporary / key).write_bytes(data.to_bytes())
             os.replace(temporary, path)
     except OSError:
         if not path.exists():  # else another process, with another share, was first
