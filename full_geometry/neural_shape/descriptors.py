@@ -1,14 +1,15 @@
 """What the network is told of a pair of points: the medium, the pair as on a plane, and how far it is from a plane.
 
 For a channel with l' = 1/sigma_t' and each end of the pair (exit and entry; d is the direction to the other end, e that
-from y to the other y; D_k and V_k are those of `surroundings`):
+from y to the other y; L_k and V_k are those of `surroundings`):
 
     own:     mu, mu', w.d, w.n of the other end, refracted w.e, log of the depth of y in mean free paths;
-             log P, log of the way to y in mean free paths, n.d, n.e, D_k, -V_k.n, V_k.e
+             log P, log of the way to y in mean free paths, n.d, n.e, L_k, -V_k.n, V_k.e
     shared:  log r/l', log of |y_i - y_o|/l' as it would be on a plane, w_o.w_i, r/(r + l');
-             1 - n_o.n_i, log of |y_i - y_o| over that of a plane, whether the line y_o y_i leaves the object, and the
-             length that it is outside for, l/(l + l')
-    medium:  nine functions of albedo, g and eta, two of sigma_t' sqrt(area)
+             1 - n_o.n_i, log of |y_i - y_o| over that of a plane, whether the line y_o y_i leaves the object, the
+             length that it is outside for, l/(l + l'), log of the phase functions at y_o and y_i for light between the
+             two and exp(-sigma_t |y_i - y_o|), over or less those of a plane
+    medium:  nine functions of albedo, g and eta, two of sigma_t' sqrt(area), two of what `mixing` says
 
 What stands behind a semicolon, own numbers summed over both ends, is 0 on a plane. All are free of scale, place and
 turn, and exchanged with the ends.
@@ -22,18 +23,34 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from full_geometry.first_event import FirstEvent, first_event
-from full_geometry.neural_shape.surroundings import LENGTHS, Surroundings, look
+from full_geometry.neural_shape.mixing import Mixed
+from full_geometry.neural_shape.surroundings import N_LENGTHS, Surroundings, look
 from full_geometry.subject import Subject, SurfacePoint, refract_in
 from halfspace_sss.neural.features import medium_features
 from halfspace_sss.physics.backbone import length_scale
+from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.transport.plane import number
 
-__all__ = ["CURVED_OWN", "CURVED_SHARED", "N_MEDIUM", "N_OWN", "N_SHARED", "End", "Pair", "describe", "end", "medium"]
+__all__ = [
+    "CURVED_OWN",
+    "CURVED_SHARED",
+    "N_MEDIUM",
+    "N_OWN",
+    "N_SHARED",
+    "REFLECTIONS",
+    "End",
+    "Pair",
+    "describe",
+    "end",
+    "medium",
+]
 
-N_LOOK = 3 * len(LENGTHS)
-CURVED_OWN, CURVED_SHARED = slice(6, 10 + N_LOOK), slice(4, 8)  # which are 0 on a plane
-N_OWN, N_SHARED, N_MEDIUM = 10 + N_LOOK, 8, 11
+N_LOOK = 3 * N_LENGTHS
+CURVED_OWN, CURVED_SHARED = slice(6, 10 + N_LOOK), slice(4, 10)  # which are 0 on a plane
+N_OWN, N_SHARED, N_MEDIUM = 10 + N_LOOK, 10, 13
 LEAST_P, LEAST_LENGTH, LEAST_R = 1e-3, 1e-2, 1e-9
+REFLECTIONS = 8  # light in a thin thing may be led along it
+LEAST_RATIO, LEAST_PHASE = 1e-4, 1e-4
 GRAZES = 0.999  # of the line between two points, from which on nothing is in between
 
 
@@ -72,17 +89,20 @@ class _Line(NamedTuple):
 def end(subject: Subject, at: SurfacePoint, active: Any = True) -> End:
     """What belongs to one end alone, measured once for all partners."""
     inner = refract_in(at, number(subject.eta))[0]
-    event = first_event(subject, at, active)
+    event = first_event(subject, at, active, REFLECTIONS)
     return End(at, event, look(subject, at, event, active), inner)
 
 
-def medium(subject: Subject, channel: int) -> np.ndarray:
-    """The numbers of the medium of a channel and of the size of the object, (11,)."""
+def medium(subject: Subject, channel: int, mixed: Mixed) -> np.ndarray:
+    """The numbers of the medium of a channel and of the size of the object, (13,)."""
     m = subject.media[channel]
     albedo, g, eta = (np.float64(v) for v in (m.albedo, m.g, m.eta))
     size = float(m.sigma_t_prime) * math.sqrt(subject.found.area)
     found = medium_features(np, albedo, g, eta, length_scale(albedo, g))
-    return np.array([*found, 1 / (1 + 0.1 * size), 0.2 * math.log1p(size)], dtype=np.float32)
+    return np.array(
+        [*found, 1 / (1 + 0.1 * size), 0.2 * math.log1p(size), 0.3 * math.log(mixed.chord + 1e-2), mixed.q],
+        dtype=np.float32,
+    )
 
 
 def describe(subject: Subject, exit: End, entry: End, active: Any = True) -> list[Pair]:
@@ -100,6 +120,7 @@ def describe(subject: Subject, exit: End, entry: End, active: Any = True) -> lis
 
 def _channel(subject: Subject, c: int, exit: End, entry: End, line: _Line, clear: tuple[Any, Any]) -> Pair:
     import drjit as dr
+    import mitsuba as mi
 
     m = subject.media[c]
     s, t = number(float(m.sigma_t_prime)), number(float(m.sigma_t))
@@ -107,12 +128,16 @@ def _channel(subject: Subject, c: int, exit: End, entry: End, line: _Line, clear
     back, gap_back = _Line(-line.d, line.length), _Line(-gap.d, gap.length)
     own_o, own_i = _own(c, t, exit, entry, line, gap), _own(c, t, entry, exit, back, gap_back)
     r = line.length * s
-    plane = _plane_gap(exit, entry, line, 1 / t) * s
+    d_o, d_i = _flat_directions(exit, entry, line)
+    flat = _Line.between(d_o / t, mi.Vector3f(line.length, 0, 0) + d_i / t)
+    plane = flat.length * s
+    phases = _phases(m, exit.inner, entry.inner, gap) / _phases(m, d_o, d_i, flat)
     blocked, lost = clear
     return Pair(own_o, own_i, [
         0.5 * dr.log(r + LEAST_LENGTH), 0.5 * dr.log(plane + LEAST_LENGTH), dr.dot(exit.at.w, entry.at.w), r / (1 + r),
         1 - dr.dot(exit.at.n_out, entry.at.n_out),
         0.5 * dr.log((gap.length * s + LEAST_LENGTH) / (plane + LEAST_LENGTH)), blocked, lost * s / (1 + lost * s),
+        0.5 * dr.log(dr.maximum(phases, LEAST_RATIO)), dr.exp(-gap.length * t) - dr.exp(-flat.length * t),
     ])  # fmt: skip
 
 
@@ -126,12 +151,15 @@ def _own(c: int, sigma_t: Any, here: End, there: End, line: _Line, gap: _Line) -
         0.5 * dr.log((event.P[c] + LEAST_P) / (1 + LEAST_P)),
         0.5 * dr.log((event.lengths[c] * sigma_t + LEAST_LENGTH) / (1 + LEAST_LENGTH)),
         dr.dot(n, line.d), dr.dot(n, gap.d),
-        *around.D, *(-dr.dot(v, n) for v in around.V), *(dr.dot(v, gap.d) for v in around.V),
+        *around.L, *(-dr.dot(v, n) for v in around.V), *(dr.dot(v, gap.d) for v in around.V),
     ]  # fmt: skip
 
 
-def _plane_gap(exit: End, entry: End, line: _Line, mfp: Any) -> Any:
-    """|y_i - y_o| on a plane, where both points lie a mean free path along their refracted rays."""
+def _flat_directions(exit: End, entry: End, line: _Line) -> tuple[Any, Any]:
+    """The refracted directions as on a plane, x along the line between the points, z along the normals.
+
+    There both y lie a mean free path along them.
+    """
     import drjit as dr
     import mitsuba as mi
 
@@ -142,7 +170,18 @@ def _plane_gap(exit: End, entry: End, line: _Line, mfp: Any) -> Any:
         t = dr.normalize(dr.select(dr.squared_norm(flat) > 1e-12, flat, spare))
         return mi.Vector3f(dr.dot(along, t), dr.dot(along, dr.cross(n, t)), dr.dot(along, n))
 
-    return dr.norm(mi.Vector3f(line.length, 0, 0) + mfp * (inside(entry, line.d) - inside(exit, line.d)))
+    return inside(exit, line.d), inside(entry, line.d)
+
+
+def _phases(m: Medium, d_o: Any, d_i: Any, gap: _Line) -> Any:
+    """Both phase functions of light that goes between y_o and y_i, times (4 pi)²."""
+    import drjit as dr
+
+    g = float(m.g)
+    a, b = number(1 + g * g), number(2 * g)
+    c_o, c_i = dr.dot(d_o, gap.d), -dr.dot(d_i, gap.d)
+    base = dr.maximum(a - b * c_o, LEAST_PHASE) * dr.maximum(a - b * c_i, LEAST_PHASE)
+    return number((1 - g * g) ** 2) / (base * dr.sqrt(base))
 
 
 def _clearance(subject: Subject, a: Any, b: Any, active: Any) -> tuple[Any, Any]:

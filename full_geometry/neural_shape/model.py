@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,19 +12,25 @@ import numpy as np
 from full_geometry.features import Side
 from full_geometry.half_space import HalfSpace
 from full_geometry.neural_shape.descriptors import CURVED_OWN, CURVED_SHARED, N_OWN, End, Pair, describe, end, medium
+from full_geometry.neural_shape.mixing import Mixed, mixed
 from full_geometry.subject import Subject, SurfacePoint
 from halfspace_sss.rendering.transport.plane import number
 
-__all__ = ["BACKBONE", "BOUND", "FLOOR", "NeuralShape"]
+__all__ = ["BOUND", "MOST", "NeuralShape", "backbone"]
 
 BACKBONE = "neural"
-BOUND = 6.0  # of f
+BOUND, MOST = 6.0, 1.5  # of f: the fit says too much of forward scattering in thin things
 FLOOR = 2e-3  # reflectance of what S_0 has everywhere, over that of the half-space
+
+
+def backbone(subject: Subject, mixtures: Sequence[Mixed]) -> HalfSpace:
+    """S_0 P_o P_i: the half-space, a floor, and light that the object has mixed."""
+    return HalfSpace(subject, BACKBONE, FLOOR, [mixture.M for mixture in mixtures])
 
 
 @dataclass(frozen=True, eq=False)
 class NeuralShape:
-    """S = S_0 P_o P_i exp f, f = 6 tanh(h . u / 6), u = (c_o + c_i, c_oi) the descriptors that are 0 on a plane.
+    """S = S_0 P_o P_i exp f, f = min(6 tanh(h . tanh(u) / 6), 1.5), u = (c_o + c_i, c_oi) what is 0 on a plane.
 
     h is a perceptron whose first layer is asked for both ends in turn and summed, so that S is reciprocal as far as S_0
     is; on a plane f = 0. Orders two and more; positive; 0 below the horizons.
@@ -33,17 +39,21 @@ class NeuralShape:
         subject: the object.
         half_space: S_0 P_o P_i.
         weights: W_k (outputs, inputs) and b_k of the layers.
+        media: numbers of each channel.
     """
 
     subject: Subject
     half_space: HalfSpace
     weights: Mapping[str, np.ndarray]
+    media: Sequence[np.ndarray]
     orders = "multiple"
 
     @classmethod
     def of(cls, subject: Subject, weights: Mapping[str, np.ndarray]) -> NeuralShape:
         """The model of an object from the arrays of a file."""
-        return cls(subject, HalfSpace(subject, BACKBONE, FLOOR), weights)
+        mixtures = mixed(subject)
+        numbers = [medium(subject, c, mixture) for c, mixture in enumerate(mixtures)]
+        return cls(subject, backbone(subject, mixtures), weights, numbers)
 
     @functools.cached_property
     def _views(self) -> tuple[list[Any], list[Any]]:
@@ -61,7 +71,7 @@ class NeuralShape:
 
     @functools.cached_property
     def _media(self) -> list[list[Any]]:
-        return [[number(v) for v in medium(self.subject, c)] for c in range(len(self.subject.media))]
+        return [[number(v) for v in numbers] for numbers in self.media]
 
     def prepare(self, at: SurfacePoint, active: Any = True) -> End:
         """The exit's side, for as many entries as are asked for."""
@@ -96,8 +106,8 @@ class NeuralShape:
             x = nn.matvec(W[k + 1], x, b[k])
             x = _swish(x) if k < len(b) - 1 else x
         u = [a + b for a, b in zip(pair.exit[CURVED_OWN], pair.entry[CURVED_OWN])] + pair.shared[CURVED_SHARED]
-        g = sum(h * v for h, v in zip(list(x), u))
-        return BOUND * dr.tanh(g / BOUND)
+        g = sum(h * dr.tanh(v) for h, v in zip(list(x), u))
+        return dr.minimum(BOUND * dr.tanh(g / BOUND), MOST)
 
 
 def _swish(x: Any) -> Any:

@@ -15,21 +15,22 @@ from full_geometry.neural_shape.learning.drawing import draw_subject, mean_event
 from full_geometry.neural_shape.learning.fitting import STANDARD, Fitting
 from full_geometry.neural_shape.learning.source import PairData, make_data
 from full_geometry.neural_shape.shapes.generators import HELD_OUT
-from full_geometry.neural_shape.surroundings import LENGTHS
+from full_geometry.neural_shape.surroundings import N_LENGTHS
 from halfspace_sss.progress import NamedProgress
 
 __all__ = ["ablation_table"]
 
 OBJECTS, HELD_OUT_OBJECTS, SEED = 300, 28, 79
-K = len(LENGTHS)
+K = N_LENGTHS
 OWN = {  # columns of an end
-    "log P, way to y": (6, 7), "n.d, n.e": (8, 9), "D_k": tuple(range(10, 10 + K)),
+    "log P, way to y": (6, 7), "n.d, n.e": (8, 9), "L_k": tuple(range(10, 10 + K)),
     "V_k": tuple(range(10 + K, 10 + 3 * K)),
 }  # fmt: skip
-SHARED = {"n_o.n_i": (4,), "gap of the y": (5,), "line y_o y_i": (6, 7)}
+SHARED = {"n_o.n_i": (4,), "gap of the y": (5,), "line y_o y_i": (6, 7), "phase functions": (8, 9)}
 WITHOUT: dict[str, tuple[str, ...]] = {
-    "all": (), "without log P, way to y": ("log P, way to y",), "without D_k": ("D_k",), "without V_k": ("V_k",),
-    "without D_k and V_k": ("D_k", "V_k"), "without the line y_o y_i": ("line y_o y_i",),
+    "all": (), "without log P, way to y": ("log P, way to y",), "without L_k": ("L_k",), "without V_k": ("V_k",),
+    "without L_k and V_k": ("L_k", "V_k"), "without the line y_o y_i": ("line y_o y_i",),
+    "without phase functions and attenuation": ("phase functions",),
     "without n.d, n.e, n_o.n_i, gap of the y": ("n.d, n.e", "n_o.n_i", "gap of the y"),
 }  # fmt: skip
 

@@ -8,11 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from full_geometry.half_space import HalfSpaceTransport
 from full_geometry.learning.model_errors import LIGHTS, ModelError, errors_of
 from full_geometry.neural_shape.learning.drawing import draw_subject
+from full_geometry.neural_shape.mixing import mean_chord
 from full_geometry.neural_shape.shapes.generators import HELD_OUT
 from full_geometry.neural_shape.storing import transport
 from full_geometry.subject import Subject
@@ -136,17 +135,8 @@ def _row(case: Case, found: Mapping[str, list[ModelError]]) -> Row:
         for model, rows in found.items()
     }  # fmt: skip
     size = float(case.subject.mean_free_paths()[0])
-    return Row(case.name, size, float(m.albedo), float(m.g), m.eta, _thickness(case.subject), errors)
-
-
-def _thickness(subject: Subject) -> float:
-    """4 V/A sigma_t, the mean chord in mean free paths: V from the mean of x.n over the surface."""
-    import mitsuba as mi
-
-    points = subject.random_points(generator(mi, 2**16, pass_seed(23)))
-    x, n = (np.array(v, dtype=float) for v in (points.p, points.n))
-    x -= x.mean(axis=1, keepdims=True)
-    return float(4 / 3 * (x * n).sum(axis=0).mean() * float(subject.media[0].sigma_t))
+    thickness = mean_chord(case.subject) * float(m.sigma_t)
+    return Row(case.name, size, float(m.albedo), float(m.g), m.eta, thickness, errors)
 
 
 def seconds_per_million(subject: Subject, path: Path | None = None) -> dict[str, float]:

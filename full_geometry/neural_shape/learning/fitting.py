@@ -68,7 +68,7 @@ class Network(nn.Module):
             self.biases.append(torch.zeros(j))
 
     def forward(self, x: torch.Tensor, medium: torch.Tensor) -> torch.Tensor:
-        """f (n,) of descriptors (n, numbers) and the numbers of media (n, 11)."""
+        """f (n,) of descriptors (n, numbers) and the numbers of media (n, 13)."""
         linear, swish = nn.functional.linear, nn.functional.hardswish
         o, i, shared = x[:, :N_OWN], x[:, N_OWN : 2 * N_OWN], x[:, 2 * N_OWN :]
         W = self.matrices[0]
@@ -78,7 +78,7 @@ class Network(nn.Module):
             h = linear(h, self.matrices[k], self.biases[k])
             h = swish(h) if k < len(self.matrices) - 1 else h
         u = torch.cat((o[:, CURVED_OWN] + i[:, CURVED_OWN], shared[:, CURVED_SHARED]), dim=1)
-        return BOUND * torch.tanh((h * u).sum(dim=1) / BOUND)
+        return BOUND * torch.tanh((h * torch.tanh(u)).sum(dim=1) / BOUND)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Matrices (outputs, inputs) and biases by name."""

@@ -14,8 +14,9 @@ from full_geometry.first_event import first_event
 from full_geometry.half_space import HalfSpace
 from full_geometry.learning.exits import trace_exits
 from full_geometry.learning.pairs import Proposals
-from full_geometry.neural_shape.descriptors import describe, end, medium
-from full_geometry.neural_shape.model import BACKBONE, FLOOR
+from full_geometry.neural_shape.descriptors import REFLECTIONS, describe, end, medium
+from full_geometry.neural_shape.mixing import mixed
+from full_geometry.neural_shape.model import backbone
 from full_geometry.subject import Subject, SurfacePoint
 from halfspace_sss.tracing.walk import generator, pass_seed
 
@@ -82,13 +83,14 @@ def make_data(subject: Subject, events: float, seed: tuple[int, ...]) -> PairDat
     kept = dr.gather(mi.UInt32, kept, dr.arange(mi.UInt32, min(dr.width(kept), KEPT)))
     T = dr.gather(mi.Float, exits.T[0], kept).numpy()
     walks = _columns(subject, starts.gather(kept), exits.at.gather(kept))
-    half_space = HalfSpace(subject, BACKBONE, FLOOR)
+    mixtures = mixed(subject)
+    half_space = backbone(subject, mixtures)
     rng = generator(mi, KEPT, pass_seed(*seed, 2))
     starts = subject.random_points(rng)
     entries, weight = Proposals(subject, half_space).sample(starts, rng)
     W = (_half_space(half_space, starts, entries) * weight.numpy() / mean).astype(np.float32)
     T = (T / mean).astype(np.float32)
-    return PairData(walks, T, _columns(subject, starts, entries), W, medium(subject, 0), share)
+    return PairData(walks, T, _columns(subject, starts, entries), W, medium(subject, 0, mixtures[0]), share)
 
 
 def _columns(subject: Subject, exits: SurfacePoint, entries: SurfacePoint) -> np.ndarray:
@@ -108,7 +110,7 @@ def _half_space(half_space: HalfSpace, exits: SurfacePoint, entries: SurfacePoin
     import drjit as dr
 
     query, F_t, above = half_space.query(exits, entries)
-    P = (first_event(half_space.subject, at).P[0] for at in (exits, entries))
+    P = (first_event(half_space.subject, at, True, REFLECTIONS).P[0] for at in (exits, entries))
     factor = dr.select(above, next(P) * next(P), 0)
     dr.eval(query, F_t, factor)
     S_0 = half_space.models[0].eval(*(v.numpy() for v in query)) + F_t.numpy() * half_space.floors[0]

@@ -27,7 +27,7 @@ from halfspace_sss.rendering.scenes.learners import LearntShapes
 __all__ = ["make_objects", "train_shapes"]
 
 PLAN = "plan.json"
-DATA_SHARE, FIRST_SHARE = 0.5, 0.25  # of the time for data; of the objects before the first step
+DATA_SHARE, FIRST_SHARE = 0.5, 0.75  # of the time for data; of the objects before the first step
 TRIAL_OBJECTS, TRIAL_STEPS = 4, 20
 CHECKPOINT_EVERY = 30.0  # seconds
 

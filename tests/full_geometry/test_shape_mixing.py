@@ -1,0 +1,74 @@
+"""Light that an object has mixed: the exact chance to leave, and what it brings where objects are thin."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from halfspace_sss import Medium
+
+dr = pytest.importorskip("drjit")
+mi = pytest.importorskip("mitsuba")
+pytest.importorskip("igl")
+
+from full_geometry.features import Side  # noqa: E402
+from full_geometry.first_event import first_event  # noqa: E402
+from full_geometry.half_space import HalfSpace  # noqa: E402
+from full_geometry.learning.model_errors import errors_of  # noqa: E402
+from full_geometry.neural_shape.mixing import mean_chord, mixed  # noqa: E402
+from full_geometry.neural_shape.model import backbone  # noqa: E402
+from full_geometry.neural_shape.shapes.generators import make_shape  # noqa: E402
+from full_geometry.subject import Subject, SurfacePoint  # noqa: E402
+
+
+@pytest.fixture(autouse=True)
+def variant() -> None:
+    mi.set_variant("llvm_ad_mono")
+
+
+class Backbone:
+    """S_0 P_o P_i alone, f = 0."""
+
+    orders = "multiple"
+
+    def __init__(self, subject: Subject, S_0: HalfSpace) -> None:
+        self.subject, self.S_0 = subject, S_0
+
+    def prepare(self, at: SurfacePoint, active: object = True) -> Side:
+        return Side(at, first_event(self.subject, at))
+
+    def S(self, exit: Side, at: SurfacePoint, active: object = True) -> object:
+        return dr.select(active, self.S_0(exit, self.prepare(at)), 0)
+
+
+@pytest.mark.parametrize("radius", [0.2, 1.0, 5.0])
+def test_the_chance_to_leave_a_sphere_without_a_boundary_is_the_exact_one(radius: float) -> None:
+    subject = Subject.of(mi.load_dict({"type": "sphere", "radius": radius}), Medium(0.9, 0.1, 0.0, 1.0))
+    t = 2 * radius  # optical diameter; <exp(-t mu)> = 2 ∫ mu exp(-t mu) dmu
+    stays = 1 - 2 * (1 - math.exp(-t) * (1 + t)) / t**2
+    found = mixed(subject)[0]
+    assert np.isclose(mean_chord(subject), 4 / 3 * radius, rtol=0.01)
+    assert np.isclose(1 - found.q, stays / (4 / 3 * radius), rtol=0.015)
+
+
+def test_the_mean_chord_of_a_box_that_is_turned_is_four_times_volume_over_area() -> None:
+    box = mi.ScalarTransform4f().rotate([0.36, 0.8, 0.48], 40).scale([0.1, 1, 2])
+    subject = Subject.of(mi.load_dict({"type": "cube", "to_world": box}), Medium(1.0, 0.0))
+    V, A = 8 * 0.2, 8 * (0.1 + 0.2 + 2)
+    assert np.isclose(mean_chord(subject), 4 * V / A, rtol=0.02)
+
+
+def test_what_is_open_mixes_nothing() -> None:
+    subject = Subject.of(mi.load_dict({"type": "rectangle"}), Medium(1.0, 0.0))
+    assert abs(mixed(subject)[0].M) < 1e-9
+
+
+def test_it_is_most_of_the_light_of_a_thin_sheet() -> None:
+    subject = Subject.of(make_shape("sheets", 3, 24).mitsuba("sheet"), Medium(0.95, 0.05, 0.0, 1.45).scaled(0.15))
+    S_0 = HalfSpace(subject, "neural")
+    models = {"mixed": Backbone(subject, backbone(subject, mixed(subject))), "plane": Backbone(subject, S_0)}
+    found = errors_of(subject, models, exits=64, walks=2048, samples=1024)
+    with_mixed, plane = (found[name][0].ratio for name in models)
+    assert plane < 0.3 and 0.75 < with_mixed < 1.25
