@@ -8,7 +8,7 @@ from y to the other y; L_k and V_k are those of `surroundings`):
     shared:  log r/l', log of |y_i - y_o|/l' as it would be on a plane, w_o.w_i, r/(r + l');
              1 - n_o.n_i, log of |y_i - y_o| over that of a plane, whether the line y_o y_i leaves the object, the
              length that it is outside for, l/(l + l'), log of the phase functions at y_o and y_i for light between the
-             two and exp(-sigma_t |y_i - y_o|), over or less those of a plane
+             two, over those of a plane, within 1/4 and 4, and exp(-sigma_t |y_i - y_o|) less that of a plane
     medium:  nine functions of albedo, g and eta, two of sigma_t' sqrt(area), two of what `mixing` says
 
 What stands behind a semicolon, own numbers summed over both ends, is 0 on a plane. All are free of scale, place and
@@ -50,7 +50,8 @@ CURVED_OWN, CURVED_SHARED = slice(6, 10 + N_LOOK), slice(4, 10)  # which are 0 o
 N_OWN, N_SHARED, N_MEDIUM = 10 + N_LOOK, 10, 13
 LEAST_P, LEAST_LENGTH, LEAST_R = 1e-3, 1e-2, 1e-9
 REFLECTIONS = 8  # light in a thin thing may be led along it
-LEAST_RATIO, LEAST_PHASE = 1e-4, 1e-4
+LEAST_PHASE = 1e-4
+MOST_RATIO = 4.0  # of phase functions: what is not bounded runs away outside of what was seen
 GRAZES = 0.999  # of the line between two points, from which on nothing is in between
 
 
@@ -137,7 +138,7 @@ def _channel(subject: Subject, c: int, exit: End, entry: End, line: _Line, clear
         0.5 * dr.log(r + LEAST_LENGTH), 0.5 * dr.log(plane + LEAST_LENGTH), dr.dot(exit.at.w, entry.at.w), r / (1 + r),
         1 - dr.dot(exit.at.n_out, entry.at.n_out),
         0.5 * dr.log((gap.length * s + LEAST_LENGTH) / (plane + LEAST_LENGTH)), blocked, lost * s / (1 + lost * s),
-        0.5 * dr.log(dr.maximum(phases, LEAST_RATIO)), dr.exp(-gap.length * t) - dr.exp(-flat.length * t),
+        0.5 * dr.log(dr.clip(phases, 1 / MOST_RATIO, MOST_RATIO)), dr.exp(-gap.length * t) - dr.exp(-flat.length * t),
     ])  # fmt: skip
 
 

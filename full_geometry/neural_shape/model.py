@@ -16,10 +16,10 @@ from full_geometry.neural_shape.mixing import Mixed, mixed
 from full_geometry.subject import Subject, SurfacePoint
 from halfspace_sss.rendering.transport.plane import number
 
-__all__ = ["BOUND", "MOST", "NeuralShape", "backbone"]
+__all__ = ["BOUND", "NeuralShape", "backbone"]
 
 BACKBONE = "neural"
-BOUND, MOST = 6.0, 1.5  # of f: the fit says too much of forward scattering in thin things
+BOUND = 6.0  # of f
 FLOOR = 2e-3  # reflectance of what S_0 has everywhere, over that of the half-space
 
 
@@ -30,7 +30,7 @@ def backbone(subject: Subject, mixtures: Sequence[Mixed]) -> HalfSpace:
 
 @dataclass(frozen=True, eq=False)
 class NeuralShape:
-    """S = S_0 P_o P_i exp f, f = min(6 tanh(h . tanh(u) / 6), 1.5), u = (c_o + c_i, c_oi) what is 0 on a plane.
+    """S = S_0 P_o P_i exp f, f = 6 tanh(h . tanh(u) / 6), u = (c_o + c_i, c_oi) what is 0 on a plane.
 
     h is a perceptron whose first layer is asked for both ends in turn and summed, so that S is reciprocal as far as S_0
     is; on a plane f = 0. Orders two and more; positive; 0 below the horizons.
@@ -107,7 +107,7 @@ class NeuralShape:
             x = _swish(x) if k < len(b) - 1 else x
         u = [a + b for a, b in zip(pair.exit[CURVED_OWN], pair.entry[CURVED_OWN])] + pair.shared[CURVED_SHARED]
         g = sum(h * dr.tanh(v) for h, v in zip(list(x), u))
-        return dr.minimum(BOUND * dr.tanh(g / BOUND), MOST)
+        return BOUND * dr.tanh(g / BOUND)
 
 
 def _swish(x: Any) -> Any:
