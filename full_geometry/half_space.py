@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Sequence
 from typing import Any
 
 from full_geometry.features import Side
@@ -25,29 +24,22 @@ class HalfSpace:
         subject: the object.
         model: name of a half-space model.
         floor: reflectance of the floor, over that of the half-space.
-        spread: of each channel, added to the floor: S/(F_t(w_o) F_t(w_i) P_o P_i) of light that is spread evenly.
     """
 
-    def __init__(
-        self, subject: Subject, model: str, floor: float = FLOOR, spread: Sequence[float] | None = None
-    ) -> None:
+    def __init__(self, subject: Subject, model: str, floor: float = FLOOR) -> None:
         self.subject, self.name, self.floor = subject, model, floor
-        self.spread = spread or [0.0] * len(subject.media)
         self.models: list[BSSRDF] = [bssrdf(model, m) for m in subject.media]
 
     @functools.cached_property
     def floors(self) -> list[float]:
-        """Per channel floor of G: what is spread, and floor R_d / (A N).
-
-        N = 4 pi C_phi(1/eta) normalises F_t over exit directions.
-        """
+        """Per channel floor of G: floor R_d / (A N), N = 4 pi C_phi(1/eta) normalises F_t over exit directions."""
         found = []
-        for m, spread in zip(self.subject.media, self.spread):
+        for m in self.subject.media:
             N = 4 * math.pi * fresnel.C_phi(1 / m.eta)
             albedo = float(m.albedo_prime)
             R_d = albedo**2 * math.exp(-2 * math.sqrt(max(1 - albedo, 0.0)))
             share = self.floor * max(R_d, 1e-6) if float(m.sigma_s) > 0 else 0.0
-            found.append(share / (self.subject.found.area * N) + spread)
+            found.append(share / (self.subject.found.area * N))
         return found
 
     def __call__(self, exit: Side, entry: Side) -> Any:

@@ -23,12 +23,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from full_geometry.first_event import FirstEvent, first_event
+from full_geometry.neural_shape.backbone import phases
 from full_geometry.neural_shape.mixing import Mixed
 from full_geometry.neural_shape.surroundings import N_LENGTHS, Surroundings, look
 from full_geometry.subject import Subject, SurfacePoint, refract_in
 from halfspace_sss.neural.features import medium_features
 from halfspace_sss.physics.backbone import length_scale
-from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.transport.plane import number
 
 __all__ = [
@@ -50,7 +50,6 @@ CURVED_OWN, CURVED_SHARED = slice(6, 10 + N_LOOK), slice(4, 10)  # which are 0 o
 N_OWN, N_SHARED, N_MEDIUM = 10 + N_LOOK, 10, 13
 LEAST_P, LEAST_LENGTH, LEAST_R = 1e-3, 1e-2, 1e-9
 REFLECTIONS = 8  # light in a thin thing may be led along it
-LEAST_PHASE = 1e-4
 MOST_RATIO = 4.0  # of phase functions: what is not bounded runs away outside of what was seen
 GRAZES = 0.999  # of the line between two points, from which on nothing is in between
 
@@ -124,7 +123,7 @@ def _channel(subject: Subject, c: int, exit: End, entry: End, line: _Line, clear
     import mitsuba as mi
 
     m = subject.media[c]
-    s, t = number(float(m.sigma_t_prime)), number(float(m.sigma_t))
+    s, t, g = number(float(m.sigma_t_prime)), number(float(m.sigma_t)), float(m.g)
     gap = _Line.between(exit.event.ys[c], entry.event.ys[c])
     back, gap_back = _Line(-line.d, line.length), _Line(-gap.d, gap.length)
     own_o, own_i = _own(c, t, exit, entry, line, gap), _own(c, t, entry, exit, back, gap_back)
@@ -132,13 +131,13 @@ def _channel(subject: Subject, c: int, exit: End, entry: End, line: _Line, clear
     d_o, d_i = _flat_directions(exit, entry, line)
     flat = _Line.between(d_o / t, mi.Vector3f(line.length, 0, 0) + d_i / t)
     plane = flat.length * s
-    phases = _phases(m, exit.inner, entry.inner, gap) / _phases(m, d_o, d_i, flat)
+    ratio = phases(g, exit.inner, entry.inner, gap.d) / phases(g, d_o, d_i, flat.d)
     blocked, lost = clear
     return Pair(own_o, own_i, [
         0.5 * dr.log(r + LEAST_LENGTH), 0.5 * dr.log(plane + LEAST_LENGTH), dr.dot(exit.at.w, entry.at.w), r / (1 + r),
         1 - dr.dot(exit.at.n_out, entry.at.n_out),
         0.5 * dr.log((gap.length * s + LEAST_LENGTH) / (plane + LEAST_LENGTH)), blocked, lost * s / (1 + lost * s),
-        0.5 * dr.log(dr.clip(phases, 1 / MOST_RATIO, MOST_RATIO)), dr.exp(-gap.length * t) - dr.exp(-flat.length * t),
+        0.5 * dr.log(dr.clip(ratio, 1 / MOST_RATIO, MOST_RATIO)), dr.exp(-gap.length * t) - dr.exp(-flat.length * t),
     ])  # fmt: skip
 
 
@@ -172,17 +171,6 @@ def _flat_directions(exit: End, entry: End, line: _Line) -> tuple[Any, Any]:
         return mi.Vector3f(dr.dot(along, t), dr.dot(along, dr.cross(n, t)), dr.dot(along, n))
 
     return inside(exit, line.d), inside(entry, line.d)
-
-
-def _phases(m: Medium, d_o: Any, d_i: Any, gap: _Line) -> Any:
-    """Both phase functions of light that goes between y_o and y_i, times (4 pi)²."""
-    import drjit as dr
-
-    g = float(m.g)
-    a, b = number(1 + g * g), number(2 * g)
-    c_o, c_i = dr.dot(d_o, gap.d), -dr.dot(d_i, gap.d)
-    base = dr.maximum(a - b * c_o, LEAST_PHASE) * dr.maximum(a - b * c_i, LEAST_PHASE)
-    return number((1 - g * g) ** 2) / (base * dr.sqrt(base))
 
 
 def _clearance(subject: Subject, a: Any, b: Any, active: Any) -> tuple[Any, Any]:

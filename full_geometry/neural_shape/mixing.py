@@ -5,18 +5,23 @@ surface of what enters and is scattered, over the mean chord c = 4 V/A:
 
     1 - q = <F_t P> / (sigma_t c eta²).
 
-If every event forgets the one before and fills the volume evenly, orders two and more are
+q_d of it before the boundary, by the same with eta = 1. Light of two events that met the boundary between them, and
+light of three events and more, if after the second it forgets where it is, as in the reduced medium (sigma_t', a',
+g = 0), of which <F_t P'> is scattered, k = <F_t P'>/<F_t P>, is spread evenly:
 
-    S_mixed = F_t(w_o) P_o F_t(w_i) P_i M,    M = a² q/(1 - a q) / (4 pi V sigma_t eta²).
+    S_mixed = F_t(w_o) P_o F_t(w_i) P_i M,
+    M = [a² (q - q_d)/sigma_t + a q k² a'² q'/(1 - a' q')/sigma_t'] / (4 pi V eta²).
 
 It holds in what is thin and flat or rugged; in a smooth ball it is up to twice too much, as light that entered does not
-reach what is held near the surface. M is divided by 1 + (sigma_t' c)², as light of thick objects leaves near to where
-it entered.
+reach what is held near the surface. M, and m_2 = a²/(4 pi eta)² of light of two events (see `backbone`), are divided by
+1 + (sigma_t' c)², as light of thick objects leaves near to where it entered.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -34,9 +39,10 @@ LEAST_ESCAPE = 1e-6
 
 
 class Mixed(NamedTuple):
-    """Of a channel: M, 1/(scene unit)²; the mean chord in transport mean free paths; q."""
+    """Of a channel: M, 1/(scene unit)²; m_2; the mean chord in transport mean free paths; q."""
 
     M: float
+    m_2: float
     chord: float
     q: float
 
@@ -50,21 +56,45 @@ def mean_chord(subject: Subject) -> float:
 
 
 def mixed(subject: Subject) -> list[Mixed]:
-    """What each channel mixes; M is 0 where there is no scattering or no volume."""
+    """What each channel mixes; M and m_2 are 0 where there is no scattering or no volume."""
     at = subject.random_points(generator(_mitsuba(), POINTS, pass_seed(SEED)))
-    entering, P = refract_in(at, number(subject.eta))[1], first_event(subject, at, True, REFLECTIONS).P
-    chord = max(mean_chord(subject), 0.0)
-    return [_of(subject, m, chord, float(np.mean((entering * P[c]).numpy()))) for c, m in enumerate(subject.media)]
+    entering, chord = refract_in(at, number(subject.eta))[1], max(mean_chord(subject), 0.0)
+    kinds = [tuple(kind(m) for m in subject.media) for kind in (_same, _reduced, _unbounded)]
+    P = [first_event(replace(subject, media=media), at, True, REFLECTIONS).P for media in kinds]
+    through = [entering, entering, 1.0]
+    scattered = [[float(np.mean((F_t * p).numpy())) for p in each] for F_t, each in zip(through, P)]
+    return [_of(subject, media, parts, chord) for media, parts in zip(zip(*kinds), zip(*scattered))]
 
 
-def _of(subject: Subject, m: Medium, chord: float, scattered: float) -> Mixed:
-    events, a = float(m.sigma_t) * chord * m.eta**2, float(m.albedo)
-    reduced = float(m.sigma_t_prime) * chord
-    if not events > 0:
-        return Mixed(0.0, reduced, 0.0)
-    q = 1 - min(max(scattered / events, LEAST_ESCAPE), 1.0)
-    M = a * a * q / (1 - a * q) / (math.pi * subject.found.area * events)  # 4 V = c A
-    return Mixed(M / (1 + reduced**2), reduced, q)
+def _same(m: Medium) -> Medium:
+    return m
+
+
+def _reduced(m: Medium) -> Medium:
+    return Medium(float(m.sigma_s) * (1 - float(m.g)), float(m.sigma_a), 0.0, m.eta)
+
+
+def _unbounded(m: Medium) -> Medium:
+    return Medium(m.sigma_s, m.sigma_a, m.g, 1.0)
+
+
+def _of(subject: Subject, media: Sequence[Medium], scattered: Sequence[float], chord: float) -> Mixed:
+    m, reduced, _ = media
+    thickness, a = float(reduced.sigma_t) * chord, float(m.albedo)
+    if not (thickness > 0 and a > 0 and scattered[0] > 0):
+        return Mixed(0.0, 0.0, thickness, 0.0)
+    q, q_reduced, q_direct = (_stays(medium, chord, part) for medium, part in zip(media, scattered))
+    a_reduced, k, thin = float(reduced.albedo), scattered[1] / scattered[0], 1 / (1 + thickness**2)
+    M = a**2 * max(q - q_direct, 0.0) / float(m.sigma_t)
+    M += a * q * k**2 * a_reduced**2 * q_reduced / (1 - a_reduced * q_reduced) / float(reduced.sigma_t)
+    M /= math.pi * subject.found.area * chord * m.eta**2  # 4 V = c A
+    return Mixed(M * thin, thin * (a / (4 * math.pi * m.eta)) ** 2, thickness, q)
+
+
+def _stays(m: Medium, chord: float, scattered: float) -> float:
+    """q of a medium."""
+    escapes = scattered / (float(m.sigma_t) * chord * m.eta**2)
+    return 1 - min(max(escapes, LEAST_ESCAPE), 1.0)
 
 
 def _mitsuba() -> object:

@@ -10,30 +10,24 @@ from typing import Any
 import numpy as np
 
 from full_geometry.features import Side
-from full_geometry.half_space import HalfSpace
+from full_geometry.neural_shape.backbone import Backbone
 from full_geometry.neural_shape.descriptors import CURVED_OWN, CURVED_SHARED, N_OWN, End, Pair, describe, end, medium
-from full_geometry.neural_shape.mixing import Mixed, mixed
+from full_geometry.neural_shape.mixing import mixed
 from full_geometry.subject import Subject, SurfacePoint
 from halfspace_sss.rendering.transport.plane import number
 
-__all__ = ["BOUND", "NeuralShape", "backbone"]
+__all__ = ["LEAST", "MOST", "NeuralShape"]
 
-BACKBONE = "neural"
-BOUND = 6.0  # of f
-FLOOR = 2e-3  # reflectance of what S_0 has everywhere, over that of the half-space
-
-
-def backbone(subject: Subject, mixtures: Sequence[Mixed]) -> HalfSpace:
-    """S_0 P_o P_i: the half-space, a floor, and light that the object has mixed."""
-    return HalfSpace(subject, BACKBONE, FLOOR, [mixture.M for mixture in mixtures])
+LEAST, MOST = -6.0, 1.5  # of f: what is too bright costs more than what is too dark, and S_0 is seldom that dark
 
 
 @dataclass(frozen=True, eq=False)
 class NeuralShape:
-    """S = S_0 P_o P_i exp f, f = 6 tanh(h . tanh(u) / 6), u = (c_o + c_i, c_oi) what is 0 on a plane.
+    """S = S_0 P_o P_i exp f, f = b tanh(h . tanh(u) / b), b = 1.5 above 0 and 6 below.
 
-    h is a perceptron whose first layer is asked for both ends in turn and summed, so that S is reciprocal as far as S_0
-    is; on a plane f = 0. Orders two and more; positive; 0 below the horizons.
+    u = (c_o + c_i, c_oi) is what is 0 on a plane, h a perceptron whose first layer is asked for both ends in turn and
+    summed, so that S is reciprocal as far as S_0 is; on a plane f = 0. Orders two and more;
+    positive; 0 below the horizons.
 
     Args:
         subject: the object.
@@ -43,7 +37,7 @@ class NeuralShape:
     """
 
     subject: Subject
-    half_space: HalfSpace
+    half_space: Backbone
     weights: Mapping[str, np.ndarray]
     media: Sequence[np.ndarray]
     orders = "multiple"
@@ -53,7 +47,7 @@ class NeuralShape:
         """The model of an object from the arrays of a file."""
         mixtures = mixed(subject)
         numbers = [medium(subject, c, mixture) for c, mixture in enumerate(mixtures)]
-        return cls(subject, backbone(subject, mixtures), weights, numbers)
+        return cls(subject, Backbone(subject, mixtures), weights, numbers)
 
     @functools.cached_property
     def _views(self) -> tuple[list[Any], list[Any]]:
@@ -96,6 +90,7 @@ class NeuralShape:
 
     def _f(self, pair: Pair, numbers: list[Any]) -> Any:
         import drjit as dr
+        import mitsuba as mi
         from drjit import nn
 
         W, b = self._views
@@ -107,7 +102,8 @@ class NeuralShape:
             x = _swish(x) if k < len(b) - 1 else x
         u = [a + b for a, b in zip(pair.exit[CURVED_OWN], pair.entry[CURVED_OWN])] + pair.shared[CURVED_SHARED]
         g = sum(h * dr.tanh(v) for h, v in zip(list(x), u))
-        return BOUND * dr.tanh(g / BOUND)
+        bound = dr.select(g > 0, mi.Float(MOST), -LEAST)
+        return bound * dr.tanh(g / bound)
 
 
 def _swish(x: Any) -> Any:

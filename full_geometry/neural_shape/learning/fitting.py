@@ -13,7 +13,7 @@ from torch import nn
 
 from full_geometry.neural_shape.descriptors import CURVED_OWN, CURVED_SHARED, N_MEDIUM, N_OWN, N_SHARED
 from full_geometry.neural_shape.learning.source import PairData
-from full_geometry.neural_shape.model import BOUND
+from full_geometry.neural_shape.model import LEAST, MOST
 from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.neural.training import checkpoint
 
@@ -78,7 +78,8 @@ class Network(nn.Module):
             h = linear(h, self.matrices[k], self.biases[k])
             h = swish(h) if k < len(self.matrices) - 1 else h
         u = torch.cat((o[:, CURVED_OWN] + i[:, CURVED_OWN], shared[:, CURVED_SHARED]), dim=1)
-        return BOUND * torch.tanh((h * torch.tanh(u)).sum(dim=1) / BOUND)
+        g = (h * torch.tanh(u)).sum(dim=1)
+        return torch.where(g > 0, MOST * torch.tanh(g / MOST), -LEAST * torch.tanh(g / -LEAST))
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Matrices (outputs, inputs) and biases by name."""

@@ -10,14 +10,15 @@ from typing import Any
 
 import numpy as np
 
+from full_geometry.features import Side
 from full_geometry.first_event import first_event
-from full_geometry.half_space import HalfSpace
 from full_geometry.learning.exits import trace_exits
 from full_geometry.learning.pairs import Proposals
+from full_geometry.neural_shape.backbone import Backbone
 from full_geometry.neural_shape.descriptors import REFLECTIONS, describe, end, medium
 from full_geometry.neural_shape.mixing import mixed
-from full_geometry.neural_shape.model import backbone
 from full_geometry.subject import Subject, SurfacePoint
+from halfspace_sss.rendering.transport.plane import number
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 __all__ = ["PairData", "make_data"]
@@ -84,7 +85,7 @@ def make_data(subject: Subject, events: float, seed: tuple[int, ...]) -> PairDat
     T = dr.gather(mi.Float, exits.T[0], kept).numpy()
     walks = _columns(subject, starts.gather(kept), exits.at.gather(kept))
     mixtures = mixed(subject)
-    half_space = backbone(subject, mixtures)
+    half_space = Backbone(subject, mixtures)
     rng = generator(mi, KEPT, pass_seed(*seed, 2))
     starts = subject.random_points(rng)
     entries, weight = Proposals(subject, half_space).sample(starts, rng)
@@ -105,13 +106,14 @@ def _columns(subject: Subject, exits: SurfacePoint, entries: SurfacePoint) -> np
     return np.nan_to_num(found, posinf=0, neginf=0).astype(np.float16)
 
 
-def _half_space(half_space: HalfSpace, exits: SurfacePoint, entries: SurfacePoint) -> np.ndarray:
+def _half_space(half_space: Backbone, exits: SurfacePoint, entries: SurfacePoint) -> np.ndarray:
     """S_0 P_o P_i of the first channel."""
     import drjit as dr
 
     query, F_t, above = half_space.query(exits, entries)
-    P = (first_event(half_space.subject, at, True, REFLECTIONS).P[0] for at in (exits, entries))
-    factor = dr.select(above, next(P) * next(P), 0)
-    dr.eval(query, F_t, factor)
-    S_0 = half_space.models[0].eval(*(v.numpy() for v in query)) + F_t.numpy() * half_space.floors[0]
+    sides = [Side(at, first_event(half_space.subject, at, True, REFLECTIONS)) for at in (exits, entries)]
+    factor = dr.select(above, sides[0].event.P[0] * sides[1].event.P[0], 0)
+    everywhere = F_t * (number(half_space.floors[0]) + half_space.twice(*sides)[0])
+    dr.eval(query, everywhere, factor)
+    S_0 = half_space.models[0].eval(*(v.numpy() for v in query)) + everywhere.numpy()
     return S_0 * factor.numpy()

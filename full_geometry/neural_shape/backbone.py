@@ -1,0 +1,85 @@
+"""S_0 of the network of all shapes: the half-space, a floor, and what the object as a whole brings where it is thin.
+
+Of light that is scattered twice, between the mean places y of both first events at a distance d,
+
+    S_twice = F_t(w_o) P_o F_t(w_i) P_i m_2 (4 pi)² p_o p_i exp(-sigma_t d)/(d² + e²),
+
+e² a twelfth of the squared ways to both y, as these are places in the mean; p of |g| <= 0.6, as so are directions.
+Light of more events is that of `mixing`.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from typing import Any
+
+from full_geometry.features import Side
+from full_geometry.half_space import HalfSpace
+from full_geometry.neural_shape.mixing import Mixed
+from full_geometry.subject import Subject, refract_in
+from halfspace_sss.rendering.transport.plane import number
+
+__all__ = ["Backbone", "phases"]
+
+MODEL = "neural"
+FLOOR = 2e-3  # reflectance of what S_0 has everywhere, over that of the half-space
+LEAST_LENGTH2 = 1e-6  # squared mean free paths
+MOST_G = 0.6
+LEAST_PHASE = 1e-4
+
+
+class Backbone(HalfSpace):
+    """S_0 P_o P_i per channel.
+
+    Args:
+        subject: the object.
+        mixtures: what each of its channels mixes.
+    """
+
+    def __init__(self, subject: Subject, mixtures: Sequence[Mixed]) -> None:
+        super().__init__(subject, MODEL, FLOOR)
+        self.mixtures = mixtures
+
+    @functools.cached_property
+    def floors(self) -> list[float]:
+        """Per channel what S_0 has everywhere."""
+        return [floor + mixture.M for floor, mixture in zip(HalfSpace.floors.func(self), self.mixtures)]
+
+    def __call__(self, exit: Side, entry: Side) -> Any:
+        """1/((scene unit)² sr), 0 below the horizons."""
+        import drjit as dr
+        import mitsuba as mi
+
+        query, F_t, above = self.query(exit.at, entry.at)
+        everywhere = mi.Spectrum([number(floor) for floor in self.floors]) + self.twice(exit, entry)
+        S_0 = mi.Spectrum([m.eval(*query) for m in self.models]) + F_t * everywhere
+        return dr.select(above, S_0 * exit.event.P * entry.event.P, 0)
+
+    def twice(self, exit: Side, entry: Side) -> Any:
+        """S_twice/(F_t(w_o) P_o F_t(w_i) P_i) per channel."""
+        import drjit as dr
+        import mitsuba as mi
+
+        eta = number(self.subject.eta)
+        inner = [refract_in(side.at, eta)[0] for side in (exit, entry)]
+        found = []
+        for c, (m, mixture) in enumerate(zip(self.subject.media, self.mixtures)):
+            way = mi.Vector3f(entry.event.ys[c] - exit.event.ys[c])
+            d2, t = dr.squared_norm(way), number(float(m.sigma_t))
+            spread = (dr.square(exit.event.lengths[c]) + dr.square(entry.event.lengths[c])) / 12
+            d = dr.sqrt(d2)
+            p = phases(min(max(float(m.g), -MOST_G), MOST_G), *inner, way / dr.maximum(d, 1e-20))
+            apart = d2 + spread + LEAST_LENGTH2 / dr.square(dr.maximum(t, 1e-20))
+            found.append(number(mixture.m_2) * p * dr.exp(-t * d) / apart)
+        return mi.Spectrum(found)
+
+
+def phases(g: float, d_o: Any, d_i: Any, d: Any) -> Any:
+    """Both phase functions of light that goes along d from one end to the other, times (4 pi)²."""
+    import drjit as dr
+
+    a, b = number(1 + g * g), number(2 * g)
+    c_o, c_i = dr.dot(d_o, d), -dr.dot(d_i, d)
+    base = dr.maximum(a - b * c_o, LEAST_PHASE) * dr.maximum(a - b * c_i, LEAST_PHASE)
+    return number((1 - g * g) ** 2) / (base * dr.sqrt(base))
