@@ -23,9 +23,9 @@ from halfspace_sss.tracing.walk import generator, pass_seed
 
 __all__ = ["PairData", "make_data"]
 
-EVENTS = 2e6  # of the walks of one object
-FEWEST_WALKS, WALKS = 2**13, 2**16
-KEPT = 2**14  # walks that left, and proposals, of one object
+EVENTS = 1e6  # of the walks of one object
+FEWEST_WALKS, WALKS = 2**13, 2**15
+KEPT = 2**13  # walks that left, and proposals, of one object
 FEWEST_EXITS = 128
 ROULETTE_FROM = 8
 NAMES = ("walks", "T", "proposals", "W", "medium", "share")
