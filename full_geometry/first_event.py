@@ -1,6 +1,6 @@
 """The way of light to its first scattering event inside an object, without randomness.
 
-From (x, w): refract, go to the boundary, lose the part that Fresnel lets out, reflect, a few times at most. Segments k
+From (x, w): refract, go to the boundary, lose the part that Fresnel lets out, reflect, at most four times. Segments k
 of length l_k from o_k along d_k are reached with the weight v_k: v_0 = 1, v_{k+1} = v_k exp(-sigma_t l_k) F_k, and
 
     P = sum_k v_k (1 - exp(-sigma_t l_k)),    P y = sum_k v_k ∫_0^{l_k} sigma_t exp(-sigma_t s) (o_k + s d_k) ds.
@@ -79,13 +79,13 @@ def _growth(ratio: Any) -> Any:
     return dr.exp(x)
 
 
-def first_event(subject: Subject, at: SurfacePoint, active: Any = True, reflections: int = REFLECTIONS) -> FirstEvent:
-    """Of light that goes in or out along w at a point of the surface, after so many reflections at most."""
+def first_event(subject: Subject, at: SurfacePoint, active: Any = True) -> FirstEvent:
+    """Of light that goes in or out along w at a point of the surface."""
     import drjit as dr
     import mitsuba as mi
 
     sigma_t, eta, sign = subject.sigma_t, number(subject.eta), number(subject.found.sign)
-    media, most = subject.walk_media, mi.UInt32(reflections)
+    media = subject.walk_media
     d, _, valid = refract_in(at, eta)
     flags = mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame
 
@@ -101,7 +101,7 @@ def first_event(subject: Subject, at: SurfacePoint, active: Any = True, reflecti
         c = dr.dot(d, n)
         v = v * through * mi.fresnel(dr.abs(c), dr.select(c > 0, 1 / eta, eta))[0]
         onward = d - n * (2 * c)
-        goes_on = si.is_valid() & (dr.dot(onward, si.n) * sign < 0) & (dr.max(v) > NEGLIGIBLE) & (k < most)
+        goes_on = si.is_valid() & (dr.dot(onward, si.n) * sign < 0) & (dr.max(v) > NEGLIGIBLE) & (k < REFLECTIONS)
         skip = media.clear(mi.UInt32(0), si.n, onward)
         onward = mi.Vector3f(onward)
         return k + 1, mi.Point3f(si.p), onward, skip, v, way + l, (P + part, moments, length), active & goes_on

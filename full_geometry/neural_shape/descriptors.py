@@ -37,7 +37,6 @@ __all__ = [
     "N_MEDIUM",
     "N_OWN",
     "N_SHARED",
-    "REFLECTIONS",
     "End",
     "Pair",
     "describe",
@@ -49,7 +48,6 @@ N_LOOK = 3 * N_LENGTHS
 CURVED_OWN, CURVED_SHARED = slice(6, 10 + N_LOOK), slice(4, 10)  # which are 0 on a plane
 N_OWN, N_SHARED, N_MEDIUM = 10 + N_LOOK, 10, 13
 LEAST_P, LEAST_LENGTH, LEAST_R = 1e-3, 1e-2, 1e-9
-REFLECTIONS = 8  # light in a thin thing may be led along it
 MOST_RATIO = 4.0  # of phase functions: what is not bounded runs away outside of what was seen
 GRAZES = 0.999  # of the line between two points, from which on nothing is in between
 
@@ -89,7 +87,7 @@ class _Line(NamedTuple):
 def end(subject: Subject, at: SurfacePoint, active: Any = True) -> End:
     """What belongs to one end alone, measured once for all partners."""
     inner = refract_in(at, number(subject.eta))[0]
-    event = first_event(subject, at, active, REFLECTIONS)
+    event = first_event(subject, at, active)
     return End(at, event, look(subject, at, event, active), inner)
 
 

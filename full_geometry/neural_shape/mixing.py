@@ -34,7 +34,7 @@ from halfspace_sss.tracing.walk import generator, pass_seed
 
 __all__ = ["Mixed", "mean_chord", "mixed"]
 
-POINTS, SEED, REFLECTIONS = 2**15, 31, 64
+POINTS, SEED = 2**15, 31
 LEAST_ESCAPE = 1e-6
 
 
@@ -60,7 +60,7 @@ def mixed(subject: Subject) -> list[Mixed]:
     at = subject.random_points(generator(_mitsuba(), POINTS, pass_seed(SEED)))
     entering, chord = refract_in(at, number(subject.eta))[1], max(mean_chord(subject), 0.0)
     kinds = [tuple(kind(m) for m in subject.media) for kind in (_same, _reduced, _unbounded)]
-    P = [first_event(replace(subject, media=media), at, True, REFLECTIONS).P for media in kinds]
+    P = [first_event(replace(subject, media=media), at).P for media in kinds]
     through = [entering, entering, 1.0]
     scattered = [[float(np.mean((F_t * p).numpy())) for p in each] for F_t, each in zip(through, P)]
     return [_of(subject, media, parts, chord) for media, parts in zip(zip(*kinds), zip(*scattered))]

@@ -15,7 +15,7 @@ from full_geometry.first_event import first_event
 from full_geometry.learning.exits import trace_exits
 from full_geometry.learning.pairs import Proposals
 from full_geometry.neural_shape.backbone import Backbone
-from full_geometry.neural_shape.descriptors import REFLECTIONS, describe, end, medium
+from full_geometry.neural_shape.descriptors import describe, end, medium
 from full_geometry.neural_shape.mixing import mixed
 from full_geometry.subject import Subject, SurfacePoint
 from halfspace_sss.rendering.transport.plane import number
@@ -111,7 +111,7 @@ def _half_space(half_space: Backbone, exits: SurfacePoint, entries: SurfacePoint
     import drjit as dr
 
     query, F_t, above = half_space.query(exits, entries)
-    sides = [Side(at, first_event(half_space.subject, at, True, REFLECTIONS)) for at in (exits, entries)]
+    sides = [Side(at, first_event(half_space.subject, at)) for at in (exits, entries)]
     factor = dr.select(above, sides[0].event.P[0] * sides[1].event.P[0], 0)
     everywhere = F_t * (number(half_space.floors[0]) + half_space.twice(*sides)[0])
     dr.eval(query, everywhere, factor)
