@@ -116,7 +116,7 @@ def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
             ax.axhline(1, color="k", lw=0.7)
             ax.set(xscale="log", xlabel="radius [mean free paths]", title=light)
         axes[0].set(ylabel="mean radiance, model / path traced")
-        axes[1].legend(frameon=False, loc="lower right")  # where no line runs
+        figure.legend(*axes[0].get_legend_handles_labels(), frameon=False, loc="outside lower center", ncols=3)
         files: dict[str, bytes | str] = {f"spheres.{end}": data for end, data in saved(figure).items()}
     files["spheres.csv"] = pandas.DataFrame(rows).to_csv(index=False, lineterminator="\n")
     return files

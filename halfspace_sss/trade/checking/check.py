@@ -68,11 +68,13 @@ def outcome(record: dict[str, Any]) -> dict[str, Any]:
     error2_error = math.hypot(row.bias2_error, row.variance_error / option.spp)
     least = {name: _least(w, scene, pixels) for name, w in truth.items()}
     cheapest = min(least, key=lambda name: least[name])
+    sure = min(least[name] for name, w in truth.items() if w.bias2 + 2 * w.bias2_error < scene.tolerance**2)
     cost = row.preparation + scene.images * pixels * option.spp * row.seconds
     automatic = picked(quick.objects[0], scene.tolerance)[0]
     found |= {"way": option.way, "spp": option.spp, "error": math.sqrt(error2)}
     found |= {"error_standard_error": error2_error / (2 * math.sqrt(error2)), "cost_s": cost}
     found |= {"cheapest": cheapest, "cheapest_s": least[cheapest], "ratio": cost / least[cheapest]}
+    found |= {"sure_ratio": cost / sure}
     found |= {"keeps": error2 - 2 * error2_error <= scene.tolerance**2, "auto": automatic}
     return (
         found
