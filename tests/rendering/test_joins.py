@@ -159,7 +159,7 @@ def test_shading_normals_bend_the_light_and_geometric_ones_hold_its_width(theta,
     beam = Beam(d, mu_i / mu * (1 - F) * np.exp(SIGMA_T * depth / d[2]))
     albedo = 1e-4 * ALBEDO
     joins = joins_of({"sun": sun(theta, 0.9)}, g, eta, albedo, shape=slab_of_normal(tmp_path / "slab.obj", n))
-    agree(brought(joins, depth, 4 * LANES), scattered([beam], depth, g, albedo))
+    agree(brought(joins, depth), scattered([beam], depth, g, albedo), known_to=0.02)
 
 
 def test_joins_bring_the_light_of_a_point_that_comes_steeply() -> None:
