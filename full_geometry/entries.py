@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 from full_geometry.model import PreparedExit
 from full_geometry.patch_table import PatchTable
 from full_geometry.patches import PatchSampler, PatchWeights
+from halfspace_sss.rendering.surface.horizon import cosine_above, cosine_density
 from halfspace_sss.rendering.surface.object import turned
 from halfspace_sss.rendering.transport.plane import Exit, number
 from halfspace_sss.rendering.transport.positions import PositionSampler
@@ -71,12 +72,7 @@ class LearntProposals:
         return entry._replace(weight=dr.select(active, entry.weight * scale, 0))
 
     def sample_direction(self, entry: Entry, out: Exit, u: Any) -> tuple[Any, Any]:
-        import mitsuba as mi
-
-        local = mi.warp.square_to_cosine_hemisphere(u)
-        return mi.Frame3f(entry.n_out).to_world(local), mi.warp.square_to_cosine_hemisphere_pdf(local)
+        return cosine_above(entry.n_out, entry.n_face, u)
 
     def pdf_direction(self, entry: Entry, out: Exit, w_i: Any) -> Any:
-        import drjit as dr
-
-        return dr.maximum(dr.dot(w_i, entry.n_out), 0) / dr.pi
+        return cosine_density(entry.n_out, entry.n_face, w_i)

@@ -1,7 +1,8 @@
 """The way of light to its first scattering event inside an object, without randomness.
 
-From (x, w): refract, go to the boundary, lose the part that Fresnel lets out, reflect, at most four times. Segments k
-of length l_k from o_k along d_k are reached with the weight v_k: v_0 = 1, v_{k+1} = v_k exp(-sigma_t l_k) F_k, and
+From (x, w): refract, go to the boundary, lose the part that Fresnel lets out, reflect, until nothing is left or 32
+times: thin things lead light by total reflection. Segments k of length l_k from o_k along d_k are reached with the
+weight v_k: v_0 = 1, v_{k+1} = v_k exp(-sigma_t l_k) F_k, and
 
     P = sum_k v_k (1 - exp(-sigma_t l_k)),    P y = sum_k v_k ∫_0^{l_k} sigma_t exp(-sigma_t s) (o_k + s d_k) ds.
 
@@ -14,12 +15,13 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from full_geometry.subject import Subject, SurfacePoint, refract_in
+from halfspace_sss.rendering.surface.horizon import lifted, mirrored
 from halfspace_sss.rendering.surface.object import turned
 from halfspace_sss.rendering.transport.plane import number
 
 __all__ = ["REFLECTIONS", "FirstEvent", "first_event"]
 
-REFLECTIONS = 4
+REFLECTIONS = 32
 NEGLIGIBLE = 1e-3  # weight of what is still inside
 CELLS, FIRST_CELL = 12, 0.25  # of a march; the first one in mean free paths
 
@@ -97,11 +99,12 @@ def first_event(subject: Subject, at: SurfacePoint, active: Any = True) -> First
         part, inner = v * (1 - through), v * inner
         moments = [moment + (o * a + d * b) for moment, a, b in zip(moments, part, inner)]
         length = length + part * way + inner
-        n = turned(si.sh_frame.n, si.n) * sign
+        n_face = si.n * sign
+        n = lifted(turned(si.sh_frame.n, si.n) * sign, n_face, d)
         c = dr.dot(d, n)
         v = v * through * mi.fresnel(dr.abs(c), dr.select(c > 0, 1 / eta, eta))[0]
-        onward = d - n * (2 * c)
-        goes_on = si.is_valid() & (dr.dot(onward, si.n) * sign < 0) & (dr.max(v) > NEGLIGIBLE) & (k < REFLECTIONS)
+        onward = -mirrored(n * (2 * c) - d, n_face)
+        goes_on = si.is_valid() & (c > 0) & (dr.max(v) > NEGLIGIBLE) & (k < REFLECTIONS)
         skip = media.clear(mi.UInt32(0), si.n, onward)
         onward = mi.Vector3f(onward)
         return k + 1, mi.Point3f(si.p), onward, skip, v, way + l, (P + part, moments, length), active & goes_on

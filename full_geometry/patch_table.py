@@ -15,7 +15,7 @@ import numpy as np
 from full_geometry.features import Side, side_features
 from full_geometry.first_event import first_event
 from full_geometry.patches import HIGHEST, Patches, PatchSampler, PatchWeights, cluster
-from full_geometry.subject import SurfacePoint, cosine_direction
+from full_geometry.subject import SurfacePoint, cosine_direction, surface_point
 from halfspace_sss.rendering.surface.object import turned
 from halfspace_sss.tracing.walk import generator, pass_seed
 
@@ -88,7 +88,7 @@ class PatchTable:
             at = subject.points.on_face(cell, u) if n == len(of_face) else parts.point(cell, u_face, u)
             n_out = mi.Normal3f(turned(at.n_shading, at.n) * subject.found.sign)
             normal = mi.Normal3f(at.n * subject.found.sign)
-            exit = SurfacePoint(mi.Point3f(at.p), normal, n_out, cosine_direction(n_out, rng))
+            exit = surface_point(at.p, normal, n_out, cosine_direction(n_out, normal, rng))
             total = total + _weights(sampler, Side(exit, first_event(subject, exit)), n)
         rows = np.cumsum(total / EXITS, axis=1).astype(np.float32)
         self.n, self.table, self.of_face = sampler.patches.n, mi.Float(rows.ravel()), faces

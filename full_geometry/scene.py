@@ -22,7 +22,7 @@ from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.surface.inside import Inside
 from halfspace_sss.rendering.surface.object import Object
 from halfspace_sss.rendering.transport.half_space import HalfSpaceProposals
-from halfspace_sss.rendering.transport.plane import Exit, number
+from halfspace_sss.rendering.transport.plane import Exit
 from halfspace_sss.rendering.transport.positions import PositionSampler
 from halfspace_sss.rendering.transport.protocols import Entry, Means
 from halfspace_sss.rendering.transport.radial_table import RadialTable
@@ -41,12 +41,10 @@ class LearntTransport:
 
     Args:
         model: what was learnt.
-        sign: that turns geometric normals outwards.
         checksums: of the file of weights, and of those of its half-space model.
     """
 
     model: FullGeometry
-    sign: float
     checksums: tuple[str, ...]
     orders = "multiple"
 
@@ -54,11 +52,8 @@ class LearntTransport:
         return self.model.prepare(SurfacePoint(out.p, out.n_face, out.n, out.w), active)
 
     def S_mu(self, prepared: PreparedExit, entry: Entry, w_i: Any, active: Any) -> Any:
-        import drjit as dr
-        import mitsuba as mi
-
-        at = SurfacePoint(entry.p, mi.Normal3f(entry.n * number(self.sign)), entry.n_out, w_i)
-        return self.model.S(prepared, at, active) * dr.maximum(dr.dot(w_i, entry.n_out), 0)
+        n_out, mu_i = entry.seen(w_i)
+        return self.model.S(prepared, SurfacePoint(entry.p, entry.n_face, n_out, w_i), active) * mu_i
 
 
 def _weights(subject: Subject, settings: Settings) -> Path:
@@ -89,7 +84,7 @@ def learnt_means(found: Object, inside: Inside, media: list[Medium], settings: S
     model, sampler, flow = load(path, subject)
     backbone = model.half_space.models
     checksums = (checksum_of(path, KIND), *(checksum for m in backbone for checksum in m.checksums))
-    transport = LearntTransport(model, found.sign, checksums)
+    transport = LearntTransport(model, checksums)
     table = RadialTable([m for m in backbone if float(m.medium.sigma_s) > 0], found.size)
     by_itself = AREA_SHARE if sampler is None else 0.0  # patches reach everywhere
     share = by_itself if settings.area_share == AUTOMATIC else settings.area_share

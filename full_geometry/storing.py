@@ -11,6 +11,7 @@ import numpy as np
 
 from full_geometry.added import AddedTransport
 from full_geometry.features import N_PAIR, Frame, n_side
+from full_geometry.first_event import REFLECTIONS
 from full_geometry.flow.chart import Chart
 from full_geometry.flow.conditional import ConditionalFlow
 from full_geometry.flow.sampler import FlowSampler
@@ -47,7 +48,7 @@ def weights_name(identity: Identity) -> str:
 
 def save(folder: str | os.PathLike, identity: Identity, arrays: dict[str, np.ndarray], record: dict[str, Any]) -> Path:
     """Write the weights of an object and their record; returns the path."""
-    whole = {"orders": "multiple", **identity.record(), **record}
+    whole = {"orders": "multiple", "reflections": REFLECTIONS, **identity.record(), **record}
     bound = {"anchors": identity.anchors.astype(np.float32)}
     if identity.grids:
         bound["probes"] = identity.probes
@@ -87,6 +88,9 @@ def trained(subject: Subject) -> bool:
 
 def _trained(path: Path) -> tuple[Identity, dict[str, np.ndarray], dict[str, Any]]:
     arrays, record = load_weights(path, KIND)
+    if record.get("reflections") != REFLECTIONS:
+        known = f"reflections must be {REFLECTIONS}, got {record.get('reflections')}"
+        raise ValueError(f"{path.with_suffix('.json')}: {known}: of another version, to be trained again")
     try:
         anchors, grids = arrays.pop("anchors"), record.get("grids", "")
         probes = arrays.pop("probes") if grids else None

@@ -12,6 +12,7 @@ import numpy as np
 from full_geometry.learnable import check_geometry, object_of
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.scenes.scene_files import millimetres
+from halfspace_sss.rendering.surface.horizon import cosine_above, lifted
 from halfspace_sss.rendering.surface.inside import Inside
 from halfspace_sss.rendering.surface.object import Object, survey, turned
 from halfspace_sss.rendering.surface.varying import VaryingMedium, equivalent, grid_values
@@ -20,13 +21,14 @@ from halfspace_sss.rendering.transport.body import check_size
 from halfspace_sss.rendering.transport.plane import number
 from halfspace_sss.rendering.walk.media import WalkMedia
 
-__all__ = ["Subject", "SurfacePoint", "refract_in"]
+__all__ = ["Subject", "SurfacePoint", "cosine_direction", "refract_in", "surface_point"]
 
 LEAST_RATIO = 1e-3  # in logarithms of what varies
 
 
 class SurfacePoint(NamedTuple):
-    """A point of the surface and a direction outside: position, outward geometric and shading normal, w."""
+    """A point of the surface and a direction outside: position, outward geometric normal, the shading normal that w
+    sees, w."""
 
     p: Any
     n: Any
@@ -190,7 +192,7 @@ class Subject:
         u_face, u = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
         at = self.points.sample(u_face, u, True)
         n, n_out = at.n * self.found.sign, turned(at.n_shading, at.n) * self.found.sign
-        return SurfacePoint(mi.Point3f(at.p), mi.Normal3f(n), mi.Normal3f(n_out), cosine_direction(n_out, rng))
+        return surface_point(at.p, n, n_out, cosine_direction(n_out, n, rng))
 
     def mean_free_paths(self) -> np.ndarray:
         """sigma_t sqrt(area) of each channel: the size of the object in mean free paths."""
@@ -212,12 +214,24 @@ def _in_scene_units(medium: Medium, mm_per_unit: float) -> tuple[Medium, ...]:
     return tuple(scaled if medium.n_channels is None else scaled.channel(k) for k in range(n))
 
 
-def cosine_direction(n: Any, rng: Any) -> Any:
-    """A direction by the cosine to n."""
+def cosine_direction(n_out: Any, n: Any, rng: Any) -> Any:
+    """A direction by the cosine to the shading normal, above the surface, see `surface.horizon`."""
     import mitsuba as mi
 
-    local = mi.warp.square_to_cosine_hemisphere(mi.Point2f(rng.next_float32(), rng.next_float32()))
-    return mi.Frame3f(n).to_world(local)
+    return cosine_above(n_out, n, mi.Point2f(rng.next_float32(), rng.next_float32()))[0]
+
+
+def surface_point(p: Any, n: Any, n_out: Any, w: Any) -> SurfacePoint:
+    """A point of the surface with the shading normal that w sees.
+
+    Args:
+        p: position.
+        n, n_out: outward geometric and shading normal.
+        w: direction outside.
+    """
+    import mitsuba as mi
+
+    return SurfacePoint(mi.Point3f(p), mi.Normal3f(n), lifted(n_out, n, w), mi.Vector3f(w))
 
 
 def refract_in(at: SurfacePoint, eta: Any) -> tuple[Any, Any, Any]:

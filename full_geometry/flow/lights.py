@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from full_geometry.subject import Subject
+from halfspace_sss.rendering.surface.horizon import cosine_above
 from halfspace_sss.rendering.transport.plane import number, place
 
 __all__ = ["LIGHTINGS", "Lighting", "lighting"]
@@ -44,7 +45,7 @@ class Lighting:
         w, value, distance = self.aim(entry, u)
         ray = place(entry.p, mi.Normal3f(entry.n * number(self.subject.found.sign))).spawn_ray(w)
         ray.maxt = distance
-        lit = active & (dr.dot(w, entry.n_out) > 0)
+        lit = active & (dr.dot(w, entry.n_face) > 0)
         return w, dr.select(lit & ~self.subject.found.scene.ray_test(ray, False, lit), value, 0)
 
 
@@ -63,9 +64,8 @@ def lighting(name: str, subject: Subject) -> Lighting:
     place_of_light = mi.Point3f(*map(number, _above(subject)))
 
     def sky(entry: Any, u: Any) -> tuple:
-        local = mi.warp.square_to_cosine_hemisphere(u)
-        density = mi.warp.square_to_cosine_hemisphere_pdf(local)
-        return mi.Frame3f(entry.n_out).to_world(local), 1 / dr.maximum(density, 1e-6), mi.Float(dr.inf)
+        w, density = cosine_above(entry.n_out, entry.n_face, u)
+        return w, 1 / dr.maximum(density, 1e-6), mi.Float(dr.inf)
 
     def direction(entry: Any, u: Any) -> tuple:
         return mi.Vector3f(towards), mi.Float(1), mi.Float(dr.inf)

@@ -12,6 +12,7 @@ from full_geometry.flow.context import context
 from full_geometry.model import PreparedExit
 from full_geometry.patch_table import PatchTable
 from full_geometry.patches import PatchSampler, PatchWeights
+from halfspace_sss.rendering.surface.horizon import cosine_above, cosine_density
 from halfspace_sss.rendering.surface.object import turned
 from halfspace_sss.rendering.transport.area_points import Point
 from halfspace_sss.rendering.transport.plane import Exit, number
@@ -88,12 +89,7 @@ class FlowProposals:
         return Entry(mi.Point3f(at.p), mi.Normal3f(at.n), mi.Normal3f(n_out), weight, mi.UInt32(at.prim_index))
 
     def sample_direction(self, entry: Entry, out: Exit, u: Any) -> tuple[Any, Any]:
-        import mitsuba as mi
-
-        local = mi.warp.square_to_cosine_hemisphere(u)
-        return mi.Frame3f(entry.n_out).to_world(local), mi.warp.square_to_cosine_hemisphere_pdf(local)
+        return cosine_above(entry.n_out, entry.n_face, u)
 
     def pdf_direction(self, entry: Entry, out: Exit, w_i: Any) -> Any:
-        import drjit as dr
-
-        return dr.maximum(dr.dot(w_i, entry.n_out), 0) / dr.pi
+        return cosine_density(entry.n_out, entry.n_face, w_i)

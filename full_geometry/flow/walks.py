@@ -70,7 +70,7 @@ def flow_walks(
         n_mesh = mi.Normal3f(exits.at.n * subject.found.sign)
         entry = Entry(exits.at.p, n_mesh, exits.at.n_out, mi.Float(1), exits.face)
         w, value = light.sample(entry, mi.Point2f(rng.next_float32(), rng.next_float32()), dr.max(T) > 0)
-        T = T * (value * dr.maximum(dr.dot(w, exits.at.n_out), 0))
+        T = T * (value * entry.seen(w)[1])
     from_all = side_features(frame, Side(starts, first_event(subject, starts)))
     total = _rows(list(T), n)
     starts_rows = _rows(from_all, n)

@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
-from full_geometry.subject import Subject, SurfacePoint
+from full_geometry.subject import Subject, SurfacePoint, surface_point
 from halfspace_sss.checks import check_count
 from halfspace_sss.rendering.walk.exits import Start, walk_from
 from halfspace_sss.rendering.walk.steps import Crossing, Event, Walk
@@ -23,8 +23,7 @@ ROULETTE_FROM = 8  # scattering events: from 2 on weak channels of ketchup have 
 
 
 class Exits(NamedTuple):
-    """Ends of walks, one lane for each: T is 0 where it ended inside, left at an order that is not kept, or below the
-    horizon of the shading normal."""
+    """Ends of walks, one lane for each: T is 0 where it ended inside or left at an order that is not kept."""
 
     at: SurfacePoint
     T: Any
@@ -60,8 +59,8 @@ class _Store:
         import drjit as dr
 
         leaves, si = walk.alive & crossing.leaves, crossing.si
-        at = si.p, si.n, si.sh_frame.n, walk.d
-        kept = leaves & (walk.order >= self.fewest) & (walk.order <= self.most) & (dr.dot(walk.d, si.sh_frame.n) > 0)
+        at = surface_point(si.p, si.n, si.sh_frame.n, walk.d)
+        kept = leaves & (walk.order >= self.fewest) & (walk.order <= self.most)
         targets, values = (*self.exits.at, *self.exits[1:]), (*at, walk.weight, walk.order, si.prim_index)
         for target, value in zip(targets, values):
             dr.scatter(target, type(target)(value), record, kept)

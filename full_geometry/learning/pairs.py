@@ -15,7 +15,7 @@ from full_geometry.learning.exits import Exits, trace_exits
 from full_geometry.model import PreparedExit
 from full_geometry.patch_table import ExitTable
 from full_geometry.patches import PatchSampler
-from full_geometry.subject import Subject, SurfacePoint, cosine_direction
+from full_geometry.subject import Subject, SurfacePoint, cosine_direction, surface_point
 from halfspace_sss.rendering.transport.plane import Exit, number
 from halfspace_sss.rendering.transport.positions import PositionSampler
 from halfspace_sss.rendering.transport.radial_table import RadialTable
@@ -107,9 +107,9 @@ class Proposals:
             drawn = LearntProposals(self.patches, self.positions, PATCH_SHARE, self.subject.found.sign, table)
             where = drawn.prepare(out, PreparedExit(Side(exit, first_event(self.subject, exit)), []), mi.Bool(True))
             entry = drawn.sample(*known, where, Numbers(rng), mi.Bool(True))
-        w = cosine_direction(entry.n_out, rng)
-        n = entry.n * self.subject.found.sign
-        return SurfacePoint(entry.p, n, entry.n_out, w), dr.pi * entry.weight
+        n = entry.n_face
+        w = cosine_direction(entry.n_out, n, rng)
+        return surface_point(entry.p, n, entry.n_out, w), dr.pi * entry.weight
 
     def with_patches(self, patches: PatchSampler | None) -> Proposals:
         """The same with learnt weights of patches, which take the place of uniform points."""

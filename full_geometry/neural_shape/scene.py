@@ -71,4 +71,4 @@ def shape_means(found: Object, inside: Inside, media: list[Medium], settings: Se
         checksum_of(shipped_weights(), KIND),
         *(checksum for m in model.half_space.models for checksum in m.checksums),
     )
-    return Means(LearntTransport(model, found.sign, checksums), HalfSpaceProposals(positions, live[0]))
+    return Means(LearntTransport(model, checksums), HalfSpaceProposals(positions, live[0]))

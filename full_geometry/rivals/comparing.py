@@ -20,6 +20,7 @@ from full_geometry.flow.lights import Lighting
 from full_geometry.learning.pairs import Numbers
 from full_geometry.subject import Subject
 from halfspace_sss.backend import kernel_seconds
+from halfspace_sss.rendering.surface.horizon import cosine_above, lifted
 from halfspace_sss.rendering.surface.object import turned
 from halfspace_sss.rendering.transport.plane import Exit, number
 from halfspace_sss.rendering.transport.protocols import Means
@@ -67,8 +68,9 @@ def _exits(subject: Subject, n: int, repeated: int, seed: int) -> _Exits:
     at = subject.points.sample(rng.next_1d(), rng.next_2d(), True)
     sign = number(subject.found.sign)
     n_out = mi.Normal3f(turned(at.n_shading, at.n) * sign)
-    w = mi.Frame3f(n_out).to_world(mi.warp.square_to_cosine_hemisphere(rng.next_2d()))
-    found = (mi.Point3f(at.p), n_out, mi.Vector3f(w), mi.Normal3f(at.n * sign), mi.UInt32(at.prim_index))
+    n_face = mi.Normal3f(at.n * sign)
+    w, _ = cosine_above(n_out, n_face, rng.next_2d())
+    found = (mi.Point3f(at.p), lifted(n_out, n_face, w), w, n_face, mi.UInt32(at.prim_index))
     dr.eval(found)
     k = dr.arange(mi.UInt32, n * repeated) // repeated
     p, n_out, w, n_face, face = (dr.gather(type(v), v, k) for v in found)

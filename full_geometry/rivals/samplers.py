@@ -76,7 +76,7 @@ def sampler_table(
     import pandas
 
     subject, rows = learnt.model.subject, []
-    transport = LearntTransport(learnt.model, subject.found.sign)
+    transport = LearntTransport(learnt.model, ())
     flow, total = fit_flow(learnt, recipe, seed=seed), len(LIGHTINGS) * len(SAMPLERS)
     for name in LIGHTINGS:
         light = lighting(name, subject)

@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from halfspace_sss.rendering.paths.few import Leg
+from halfspace_sss.rendering.surface.horizon import lifted
 from halfspace_sss.rendering.surface.object import turned
 from halfspace_sss.rendering.transport.body import Body
 from halfspace_sss.rendering.transport.plane import Exit, number, place
@@ -68,9 +69,10 @@ def _transmittance(body: Body, out: Exit, along: Any, active: Any) -> Any:
 
 
 def exit_at(body: Body, si: Any) -> Exit:
-    """The exit of light towards `si.wi`, with the normal that points outwards."""
-    w, n = si.to_world(si.wi), mi.Normal3f(turned(si.sh_frame.n, si.n))
+    """The exit of light towards `si.wi`, with the normal that points outwards, as `si.wi` sees it."""
+    w, n_face = si.to_world(si.wi), mi.Normal3f(si.n)
     sign = body.found.side(si.prim_index)
     if not body.found.closed:  # a sheet is a half-space from both sides
-        sign = dr.select(dr.dot(n, w) > 0, 1.0, -1.0)
-    return Exit(mi.Point3f(si.p), n * sign, w, sign, mi.Normal3f(si.n) * sign)
+        sign = dr.select(dr.dot(n_face, w) > 0, 1.0, -1.0)
+    n = lifted(turned(si.sh_frame.n, n_face), n_face, w)
+    return Exit(mi.Point3f(si.p), n * sign, w, sign, n_face * sign)

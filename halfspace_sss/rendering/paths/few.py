@@ -26,6 +26,7 @@ from halfspace_sss.physics.phase import eval_hg, sample_hg
 from halfspace_sss.rendering.paths.refraction import Connection, meet, refracted_connection
 from halfspace_sss.rendering.paths.world import World, sampled_light
 from halfspace_sss.rendering.surface.derivatives import detached
+from halfspace_sss.rendering.surface.horizon import lifted, mirrored, opposed
 from halfspace_sss.rendering.transport.body import Body
 from halfspace_sss.rendering.transport.plane import Exit, number, place
 
@@ -166,12 +167,12 @@ def _meet_boundary(of: tuple[Body, Media], walk: _Walk, met: tuple[Any, Any, Any
     (body, media), (si, n_out, n) = of, met
     size = dr.max(_value(media, walk.way, walk.order, walk.cosine) * walk.inverse)
     survival = dr.select(walk.order == 1, dr.minimum(size / FAINT, 1), 1)
-    frame = mi.Frame3f(n_out)
+    frame = mi.Frame3f(lifted(n_out, n, walk.d))
     w = frame.to_local(-walk.d)
     F, cos_t, _, eta_ti = mi.fresnel(mi.Frame3f.cos_theta(w), body.surface.inside.medium.eta)
     reflects = sampler.next_1d() < F
-    d = mi.Vector3f(frame.to_world(dr.select(reflects, mi.reflect(w), mi.refract(w, cos_t, eta_ti))))
-    out = dr.dot(d, n) > 0
+    back, on = -mirrored(-frame.to_world(mi.reflect(w)), n), opposed(frame.to_world(mi.refract(w, cos_t, eta_ti)), n)
+    d, out = mi.Vector3f(dr.select(reflects, back, on)), ~reflects
     alive = walk.alive & si.is_valid() & (dr.dot(n, walk.d) > 0) & (sampler.next_1d() < survival)
     return replace(
         walk, o=mi.Point3f(si.p), d=d, n=mi.Normal3f(n), skip=mi.Float(_clear(body, n, d)), out=alive & out,

@@ -8,6 +8,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from halfspace_sss.rendering.surface.horizon import mirrored
+
 __all__ = ["Reflection"]
 
 
@@ -32,10 +34,13 @@ class Reflection:
         raise ValueError(f"the boundary must reflect, got {boundary}")
 
     def sample(self, ctx: Any, si: Any, u: Any, v: Any, active: Any) -> tuple[Any, Any]:
-        """A direction and its weight."""
+        """A direction and its weight; one that a smooth boundary reflects to below the surface is reflected again."""
         seen, sign = _from_outside(si)
         bs, weight = self.boundary.sample(self._context(ctx), seen, u, v, active)
-        bs.wo = _turned(bs.wo, sign)
+        n = si.to_local(si.n)
+        n = dr.select(dr.dot(n, si.wi) < 0, -n, n)
+        wo = _turned(bs.wo, sign)
+        bs.wo = dr.select(mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta), mirrored(wo, n), wo)
         bs.sampled_component = 0
         return bs, weight
 

@@ -12,6 +12,7 @@ import numpy as np
 from halfspace_sss.interface.model import bssrdf
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.surface.derivatives import detached
+from halfspace_sss.rendering.surface.horizon import opposed
 from halfspace_sss.rendering.surface.object import Object
 from halfspace_sss.rendering.transport.area_points import AreaPoints
 from halfspace_sss.rendering.transport.plane import Exit, local_frame, plane_query
@@ -54,8 +55,8 @@ class HalfSpaceTransport:
 
     def S_mu(self, prepared: Exit, entry: Entry, w_i: Any, active: Any) -> Any:
         with detached():
-            query = plane_query(entry.p, entry.n_out, w_i, prepared, self.geometry)
-            mu_i = query[1]
+            n_i, mu_i = entry.seen(w_i)
+            query = plane_query(entry.p, n_i, w_i, prepared, self.geometry)
             lit = active & (mu_i > 0) & (query[3] > 0)
             values = [model.eval(*query) for model in self.models]
         values = [value * mu_i for value in self.variation.S(values, query)]
@@ -83,10 +84,10 @@ class HalfSpaceProposals:
     def sample_direction(self, entry: Entry, out: Exit, u: Any) -> tuple[Any, Any]:
         frame = local_frame(entry.n_out, out.p - entry.p)
         drawn = self.model.sample_direction(mi.Float(0), mi.Float(1), mi.Float(0), (u.x, u.y))
-        return mi.Vector3f(frame.direction(drawn.mu_i, drawn.phi_i)), drawn.pdf
+        return opposed(mi.Vector3f(frame.direction(drawn.mu_i, drawn.phi_i)), entry.n_face), drawn.pdf
 
     def pdf_direction(self, entry: Entry, out: Exit, w_i: Any) -> Any:
-        mu_i = dr.clip(dr.dot(w_i, entry.n_out), 0, 1)
+        mu_i = dr.clip(entry.seen(w_i)[1], 0, 1)
         return self.model.pdf_direction(mu_i, mi.Float(0), mi.Float(0), mi.Float(1), mi.Float(0))
 
 

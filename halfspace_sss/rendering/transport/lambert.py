@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from halfspace_sss.physics.medium import Medium
+from halfspace_sss.rendering.surface.horizon import cosine_above, cosine_density
 from halfspace_sss.rendering.surface.inside import Inside
 from halfspace_sss.rendering.surface.object import Object
 from halfspace_sss.rendering.transport.plane import Exit, number
@@ -37,7 +38,7 @@ class LambertTransport:
     def S_mu(self, prepared: Exit, entry: Entry, w_i: Any, active: Any) -> Any:
         """Over the density of `LambertProposals.sample`, whose point is the only one."""
         R = [number(value) for value in self.reflectance]
-        mu_i = dr.maximum(dr.dot(w_i, entry.n_out), 0)
+        _, mu_i = entry.seen(w_i)
         lit = active & (dr.dot(prepared.w, prepared.n) > 0)
         return dr.select(lit, (mi.Spectrum(*R) if len(R) > 1 else mi.Spectrum(R[0])) * (mu_i * dr.inv_pi), 0)
 
@@ -54,11 +55,10 @@ class LambertProposals:
         return Entry(mi.Point3f(out.p), n, mi.Normal3f(out.n), dr.select(active, mi.Float(1), 0), prim_index)
 
     def sample_direction(self, entry: Entry, out: Exit, u: Any) -> tuple[Any, Any]:
-        local = mi.warp.square_to_cosine_hemisphere(u)
-        return mi.Frame3f(entry.n_out).to_world(local), mi.warp.square_to_cosine_hemisphere_pdf(local)
+        return cosine_above(entry.n_out, entry.n_face, u)
 
     def pdf_direction(self, entry: Entry, out: Exit, w_i: Any) -> Any:
-        return dr.maximum(dr.dot(w_i, entry.n_out), 0) * dr.inv_pi
+        return cosine_density(entry.n_out, entry.n_face, w_i)
 
 
 def lambert_means(found: Object, inside: Inside, media: list[Medium], settings: Settings) -> Means:

@@ -8,6 +8,10 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple, Protocol
 
+import drjit as dr
+
+from halfspace_sss.rendering.surface.horizon import lifted
+from halfspace_sss.rendering.surface.object import turned
 from halfspace_sss.rendering.transport.plane import Exit
 
 __all__ = ["Entry", "Means", "Proposals", "Transport"]
@@ -21,6 +25,17 @@ class Entry(NamedTuple):
     n_out: Any
     weight: Any
     face: Any
+
+    @property
+    def n_face(self) -> Any:
+        """The geometric normal, outwards."""
+        return turned(self.n, self.n_out)
+
+    def seen(self, w: Any) -> tuple[Any, Any]:
+        """The outward shading normal that w sees, see `surface.horizon`, and the cosine to it; 0 below the surface."""
+        n_face = self.n_face
+        n_out = lifted(self.n_out, n_face, w)
+        return n_out, dr.select(dr.dot(w, n_face) > 0, dr.maximum(dr.dot(w, n_out), 0), 0)
 
 
 class Proposals(Protocol):

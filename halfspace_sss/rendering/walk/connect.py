@@ -25,6 +25,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from halfspace_sss.rendering.surface.horizon import sided
 from halfspace_sss.rendering.walk.inside import eval_phase, fly, free_path, pick, turn
 from halfspace_sss.rendering.walk.media import WalkMedia, by_pointer, pointer_numbers
 from halfspace_sss.rendering.walk.steps import Event, Walk, draw, start_walk
@@ -159,6 +160,7 @@ class Joins:
         steep = dr.abs(dr.dot(ds.d, aim.w_0)) > STEEPEST
         enters = si.is_valid() & (ds.pdf > 0) & steep & (self.media.index_of(si.shape) == mi.Int32(k))
         si = self.media.face_outwards(si, dr.select(enters, mi.Int32(k), -1), -ds.d)
+        si.wi = dr.select(mi.Frame3f.cos_theta(si.wi) < 0, -si.wi, si.wi)  # below its horizon, see `surface.horizon`
         F, cos_t, _, eta_ti = mi.fresnel(mi.Frame3f.cos_theta(si.wi), self.media.row("eta", k))
         d = si.to_world(mi.refract(si.wi, cos_t, eta_ti))
         enters &= (dr.dot(si.n, ds.d) > 0) & (mi.Frame3f.cos_theta(si.wi) > 0) & (dr.dot(si.n, d) < 0)
@@ -227,9 +229,9 @@ class Joins:
         """Reflection at the boundary from inside with the probability of its reflectance."""
         k, d = mi.Int32(walk.object), walk.d
         si = hit.compute_surface_interaction(ray)
-        si = self.media.face_outwards(si, k, d)
+        si = self.media.seen(si, k, d)
         F, _, _, _ = mi.fresnel(mi.Frame3f.cos_theta(si.wi), self.media.row("eta", k))
-        new = si.to_world(mi.reflect(si.wi))
+        new, _ = sided(si, mi.reflect(si.wi))
         met = self.media.met(si.shape, k)
         foreign = met != k  # an object that overlaps: the ray goes on behind it
         new = dr.select(foreign, d, new)

@@ -14,6 +14,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from halfspace_sss.rendering.surface.horizon import lift, lifted, sided
 from halfspace_sss.rendering.walk.media import WalkMedia
 from halfspace_sss.rendering.walk.steps import Crossing, Event, Visitor, Walk, Walker, draw, sample_bsdf, start_walk
 from halfspace_sss.tracing.walk import generator, pass_seed
@@ -39,7 +40,7 @@ class Exits:
 
     left: mi.Bool  # whether the walk left, rather than ended inside; the rest is 0 if not
     x_i: mi.Point3f
-    n_i: mi.Normal3f  # outward shading normal
+    n_i: mi.Normal3f  # outward shading normal, as w_i sees it
     w_i: mi.Vector3f  # direction outside, away from the surface
     throughput: mi.Spectrum  # T
     order: mi.UInt32  # scattering events
@@ -62,7 +63,7 @@ class ExitVisitor:
         to, si = self.exits, crossing.si
         dr.scatter(to.left, mi.Bool(True), record, leaves)
         dr.scatter(to.x_i, si.p, record, leaves)
-        dr.scatter(to.n_i, mi.Normal3f(si.sh_frame.n), record, leaves)
+        dr.scatter(to.n_i, lifted(si.sh_frame.n, si.n, walk.d), record, leaves)
         dr.scatter(to.w_i, walk.d, record, leaves)
         dr.scatter(to.throughput, walk.weight, record, leaves)
         dr.scatter(to.order, walk.order, record, leaves)
@@ -159,10 +160,11 @@ def _enter(media: WalkMedia, k: Any, start: Start, index: Any, rng: Any) -> Walk
     si.sh_frame = mi.Frame3f(dr.gather(mi.Normal3f, shading, index, known))
     w = dr.gather(mi.Vector3f, start.w_o, index, known)
     si.wi = si.to_local(w)
+    si = lift(si, w)
     ctx = mi.BSDFContext()
     ctx.type_mask = mi.BSDFFlags.Transmission
     bs, value = sample_bsdf(media.boundary(k), si, rng, ctx)
-    d = si.to_world(bs.wo)
+    d, _ = sided(si, bs.wo)
     walk = start_walk(si.p, d, rng)
     enters = known & (dr.dot(w, si.n) > 0) & (dr.dot(d, si.n) < 0) & (dr.max(value) > 0)
     enters &= mi.Frame3f.cos_theta(si.wi) > 0

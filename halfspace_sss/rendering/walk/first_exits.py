@@ -14,6 +14,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from halfspace_sss.rendering.surface.horizon import lifted
 from halfspace_sss.rendering.walk.light import Light, LightVisitor
 from halfspace_sss.rendering.walk.media import WalkMedia
 from halfspace_sss.rendering.walk.steps import Crossing, Event, Walk
@@ -23,7 +24,7 @@ __all__ = ["FirstExitVisitor", "FirstExits", "Watched"]
 
 @dataclass
 class FirstExits:
-    """One lane for each path; normals point outwards, directions away from the surface."""
+    """One lane for each path; normals point outwards, directions away from the surface, which see shading normals."""
 
     object: mi.Int32  # the number of the object that the path meets first, or -1
     x_o: mi.Point3f
@@ -43,7 +44,7 @@ class FirstExits:
         """What rays of the camera meet first, and room for where their walks leave."""
         si = scene.ray_intersect(rays, mi.RayFlags.All, coherent=True)
         k = media.index_of(si.shape, si.is_valid())
-        si = media.face_outwards(si, k, rays.d)
+        si = media.seen(si, k, rays.d)
         n = dr.width(rays)
         kinds = mi.Spectrum, mi.Point3f, mi.Normal3f, mi.Normal3f, mi.Vector3f, mi.UInt32, mi.UInt32
         found = cls(k, mi.Point3f(si.p), mi.Normal3f(si.n), mi.Normal3f(si.sh_frame.n), mi.Vector3f(-rays.d),
@@ -96,8 +97,8 @@ class FirstExitVisitor:
     def crossing(self, walk: Walk, record: Watched, crossing: Crossing) -> tuple[Walk, Watched]:
         walk, light = self.light.crossing(walk, record.light, crossing)
         to, si = self.exits, crossing.si
-        leaves = walk.alive & crossing.leaves & record.first & (dr.dot(walk.d, si.sh_frame.n) > 0)
-        pairs = ((to.throughput, walk.weight), (to.x_i, si.p), (to.n_i, si.n), (to.n_i_shading, si.sh_frame.n),
+        leaves, n_shading = walk.alive & crossing.leaves & record.first, lifted(si.sh_frame.n, si.n, walk.d)
+        pairs = ((to.throughput, walk.weight), (to.x_i, si.p), (to.n_i, si.n), (to.n_i_shading, n_shading),
                  (to.w_i, walk.d), (to.order, walk.order), (to.face, si.prim_index))  # fmt: skip
         for target, value in pairs:
             dr.scatter(target, type(target)(value), record.index, leaves)

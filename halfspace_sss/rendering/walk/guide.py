@@ -15,6 +15,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from halfspace_sss.rendering.surface.horizon import opposed
 from halfspace_sss.rendering.walk.connect import DEEPEST, Joins
 from halfspace_sss.rendering.walk.inside import eval_phase
 from halfspace_sss.rendering.walk.media import Coefficients, WalkMedia
@@ -80,9 +81,9 @@ class Guide:
         ray.maxt = 2 * DEEPEST / dr.min(m.mean_t)
         si = self.media.scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=valid)
         valid &= si.is_valid() & (self.media.index_of(si.shape) == k)
-        si = self.media.face_outwards(si, k, d)
+        si = self.media.seen(si, k, d)
         F, cos_t, eta_it, eta_ti = mi.fresnel(mi.Frame3f.cos_theta(si.wi), self.media.row("eta", k))
-        w = si.to_world(mi.refract(si.wi, cos_t, eta_ti))
+        w = opposed(si.to_world(mi.refract(si.wi, cos_t, eta_ti)), si.n)
         valid &= (dr.dot(d, si.n) > 0) & (dr.dot(w, si.n) > 0) & (F < 1)
         outside = self.scene.ray_intersect(si.spawn_ray(w), mi.RayFlags.All, coherent=False, active=valid)
         emitter = outside.emitter(self.scene, valid)

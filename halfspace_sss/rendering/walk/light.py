@@ -115,7 +115,10 @@ class LightVisitor:
         active = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
         ds, light = self.scene.sample_emitter_direction(si, u, True, active)
         active &= (ds.pdf > 0) & (~mi.Bool(outwards) | (dr.dot(ds.d, si.n) > 0))
-        value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(ds.d), active)
+        wo = si.to_local(ds.d)
+        below = outwards & (wo.z < 0)  # comes from inside by the opposite direction, and is not mirrored
+        active &= ~below | (mi.Frame3f.cos_theta(si.wi) < 0)
+        value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, dr.select(below, -wo, wo), active)
         share = dr.select(ds.delta, 1, power_heuristic(ds.pdf, pdf))
         return dr.select(active, walk.weight * value * light * share, 0)
 

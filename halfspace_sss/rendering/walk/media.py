@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from halfspace_sss.rendering.surface.horizon import lift
 from halfspace_sss.rendering.surface.object import Object, scene_of, survey
 from halfspace_sss.rendering.surface.placement import translucent_shapes
 from halfspace_sss.rendering.walk.grids import Grids, per_channel
@@ -170,6 +171,16 @@ class WalkMedia:
         """Where a ray along d from the surface of object k begins, and the length that it skips if it runs inside."""
         skip = self.clear(dr.maximum(mi.Int32(k), 0), si.n, d)
         return dr.select(inside, si.p, si.spawn_ray(d).o), dr.select(inside, skip, 0)
+
+    @property
+    def interpolates(self) -> bool:
+        """Whether normals of an object are not those of its surface."""
+        return any(obj.shape.is_mesh() and obj.shape.has_vertex_normals() for obj in self.objects)
+
+    def seen(self, si: Any, k: Any, direction: Any) -> Any:
+        """The interaction as a ray along `direction` sees it: normals outwards, none on the other side of the ray."""
+        si = self.face_outwards(si, k, direction)
+        return lift(si, -direction, k >= 0) if self.interpolates else si
 
     def face_outwards(self, si: Any, k: Any, direction: Any) -> Any:
         """The interaction with its normals turned to the outside of object k; `direction` is that of the ray."""

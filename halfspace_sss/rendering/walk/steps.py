@@ -12,6 +12,7 @@ from typing import Any, Protocol
 import drjit as dr
 import mitsuba as mi
 
+from halfspace_sss.rendering.surface.horizon import sided
 from halfspace_sss.rendering.walk.inside import fly, free_path, roulette, turn
 from halfspace_sss.rendering.walk.media import Coefficients, WalkMedia
 
@@ -132,12 +133,12 @@ class Walker:
         si = hit.compute_surface_interaction(ray, media.needed)
         met = media.met(si.shape, k)
         foreign = met != k  # of an object that overlaps: the flight goes on behind it
-        si = media.face_outwards(si, k, ray.d)
+        si = media.seen(si, k, ray.d)
         leaked = ~foreign & (dr.dot(si.n, ray.d) < 0)  # rounding has put the walk outside
         counts = media.counts(k, walk.order)
         walk, record = self.visitor.boundary(walk, record, si, ~foreign & counts)
         bs, value = sample_bsdf(media.boundary(k), si, walk.rng)
-        d = si.to_world(bs.wo)
+        d, turned = sided(si, bs.wo)
         out = ~foreign & (dr.dot(d, si.n) > 0)
         alive = ~leaked & (foreign | (bs.pdf > 0)) & (~out | counts)
         d = dr.select(foreign, ray.d, d)
@@ -146,7 +147,7 @@ class Walker:
                        object=dr.select(alive & ~out, k, OUTSIDE),
                        weight=dr.select(foreign, walk.weight, walk.weight * value),
                        scale=walk.scale * dr.select(foreign, 1, dr.square(bs.eta)))  # fmt: skip
-        delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta) | turned
         return self.visitor.crossing(walk, record, Crossing(si, mi.Vector3f(ray.d), out, bs.pdf, delta))
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from halfspace_sss.rendering.surface.horizon import sided
 from halfspace_sss.rendering.walk.first_exits import FirstExits, FirstExitVisitor, Watched
 from halfspace_sss.rendering.walk.light import Light, LightVisitor, start_light
 from halfspace_sss.rendering.walk.steps import OUTSIDE, Walk, Walker, sample_bsdf, start_walk
@@ -92,7 +93,7 @@ class PathTracer:
         walk, light, media = p.walk, p.light, self.visitor.media
         rng, k = walk.rng, media.index_of(si.shape)
         translucent, near = k >= 0, dr.maximum(k, 0)
-        si = media.face_outwards(si, k, walk.d)
+        si = media.seen(si, k, walk.d)
         bsdf = si.bsdf()
         if media.objects:
             boundary = media.boundary(near)
@@ -100,7 +101,8 @@ class PathTracer:
         mute = translucent & ~media.row("reflects", near) if media.objects else mi.Bool(False)
         L = light.L + self.visitor.sampled_emitter(walk, si, bsdf, ~mute, translucent)
         bs, value = sample_bsdf(bsdf, si, rng)
-        d = si.to_world(bs.wo)
+        d, turned = sided(si, bs.wo)
+        d, turned = dr.select(translucent, d, si.to_world(bs.wo)), turned & translucent
         enters = translucent & (dr.dot(d, si.n) < 0)
         weight, scale = walk.weight * value, walk.scale * dr.square(bs.eta)
         size = dr.max(weight) * scale
@@ -115,7 +117,7 @@ class PathTracer:
         walk = replace(walk, o=o, d=d, skip=skip, alive=alive, order=dr.select(enters, 0, walk.order),
                        object=dr.select(alive & enters, k, OUTSIDE), weight=weight, scale=scale,
                        channel=channel)  # fmt: skip
-        delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+        delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta) | turned
         return replace(p, walk=walk, light=replace(light, L=L, last=si.p, pdf=bs.pdf, delta=delta))
 
 
