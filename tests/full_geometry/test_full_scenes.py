@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from coarse import coarse_ball
 
 from halfspace_sss import Medium
 
@@ -99,6 +100,20 @@ def agree(objects: dict, trained: Trained) -> None:
 
 def test_an_image_has_the_light_of_walks_within_the_stated_error(trained: Trained) -> None:
     agree({"bunny": bunny(bsdf=SURFACE)}, trained)
+
+
+def test_a_coarse_ball_with_vertex_normals_has_the_light_of_walks(folder: Path, tmp_path: Path) -> None:
+    """Without what enters or leaves below the horizon of its interpolated normals 2.7 % were missing."""
+    ball = {**coarse_ball(tmp_path), "to_world": mi.ScalarTransform4f().scale(4.0)}
+    train(mi.load_dict(ball), WAX, chunks=CHUNKS, recipe=QUICK, folder=folder)
+    objects = {"ball": {**ball, "bsdf": SURFACE}}
+    found, walked = (halves(objects, model, 512).mean(axis=1) for model in ("full_geometry", "path_traced"))
+    errors = [v.std(axis=0, ddof=1) / np.sqrt(PASSES) / v.mean(axis=0) for v in (found, walked)]
+    ratio = found.mean(axis=0) / walked.mean(axis=0)
+    assert np.all(np.abs(ratio - 1) < 0.01 + 3 * np.hypot(*errors)) and np.all(np.hypot(*errors) < 0.004), (
+        ratio,
+        errors,
+    )
 
 
 def test_the_half_space_misses_that_light_by_more(trained: Trained) -> None:
