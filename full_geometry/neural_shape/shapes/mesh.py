@@ -82,7 +82,11 @@ class Mesh:
         return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
 
     def mitsuba(self, name: str, bsdf: Any = None) -> Any:
-        """The mesh as a shape of Mitsuba, with smooth normals; bsdf is a loaded BSDF, by default a diffuse one."""
+        """The mesh as a shape of Mitsuba, with smooth normals; bsdf is a loaded BSDF, by default a diffuse one.
+
+        Normals by libigl: Mitsuba adds them up in the order of its threads, which differs in the last bit.
+        """
+        import igl
         import mitsuba as mi
 
         props = mi.Properties()
@@ -92,6 +96,9 @@ class Mesh:
         parameters = mi.traverse(found)
         parameters["vertex_positions"] = self.vertices.astype(np.float32).ravel()
         parameters["faces"] = self.faces.astype(np.uint32).ravel()
+        parameters.update()
+        normals = igl.per_vertex_normals(self.vertices, self.faces, igl.PER_VERTEX_NORMALS_WEIGHTING_TYPE_ANGLE)
+        parameters["vertex_normals"] = normals.astype(np.float32).ravel()
         parameters.update()
         return found
 
