@@ -89,7 +89,7 @@ def test_on_a_plane_it_is_the_half_space_whatever_the_weights() -> None:
     rng = generator(mi, N, pass_seed(1))
     place = [mi.Point3f(12 * rng.next_float32(), 12 * rng.next_float32(), 2000.0) for _ in range(2)]
     n = mi.Normal3f(dr.zeros(mi.Float, N), dr.zeros(mi.Float, N), dr.full(mi.Float, 1.0, N))
-    o, i = (SurfacePoint(p, n, n, cosine_direction(n, rng)) for p in place)
+    o, i = (SurfacePoint(p, n, n, cosine_direction(n, n, rng)) for p in place)
     model = NeuralShape.of(subject, random_weights())
     entry = end(subject, i)
     plane = np.array(model.half_space(*(_side(e) for e in (end(subject, o), entry))))
@@ -111,9 +111,9 @@ def test_a_sphere_that_grows_becomes_the_half_space() -> None:
         subject = Subject.of(mi.load_dict({"type": "sphere", "radius": radius}), WAX)
         model = NeuralShape.of(subject, random_weights())
         o, _ = pairs(subject)
-        step = mi.Vector3f(cosine_direction(o.n, generator(mi, N, pass_seed(2))))
+        step = mi.Vector3f(cosine_direction(o.n, o.n, generator(mi, N, pass_seed(2))))
         n = mi.Normal3f(dr.normalize(mi.Vector3f(o.p + 3 * dr.normalize(dr.cross(o.n, step)))))
-        i = SurfacePoint(mi.Point3f(n * radius), n, n, cosine_direction(n, generator(mi, N, pass_seed(3))))
+        i = SurfacePoint(mi.Point3f(n * radius), n, n, cosine_direction(n, n, generator(mi, N, pass_seed(3))))
         plane = np.array(model.half_space(_side(end(subject, o)), _side(end(subject, i))))
         spread.append(float(np.abs(np.log(S(model, o, i) / plane)).mean()))
     assert spread[0] > 5 * spread[1] > 10 * spread[2] and spread[2] < 0.01
