@@ -26,7 +26,7 @@ from full_geometry.learning.pairs import Proposals  # noqa: E402
 from full_geometry.learning.training import train  # noqa: E402
 from full_geometry.patch_table import PatchTable  # noqa: E402
 from full_geometry.patches import Patches, PatchSampler, cluster, mesh_faces  # noqa: E402
-from full_geometry.subject import Subject, SurfacePoint, cosine_direction  # noqa: E402
+from full_geometry.subject import Subject, SurfacePoint, cosine_direction, surface_point  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
 N_PATCHES = 64
@@ -162,7 +162,8 @@ def test_learnt_weights_lower_the_variance_below_that_of_uniform_points(subject:
 
 def entry_at(subject: Subject, point, rng):
     n_out = point.n_shading * subject.found.sign
-    return SurfacePoint(point.p, point.n * subject.found.sign, n_out, cosine_direction(n_out, rng))
+    n = mi.Normal3f(point.n * subject.found.sign)
+    return surface_point(point.p, n, n_out, cosine_direction(n_out, n, rng))
 
 
 def test_probes_and_patches_together_give_the_estimate_of_each_alone(subject: Subject, sampler: PatchSampler) -> None:

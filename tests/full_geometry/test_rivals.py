@@ -140,7 +140,7 @@ def test_no_light_comes_from_below_the_surface(subject: Subject, kind: str) -> N
     n = mi.Normal3f(at.n * subject.found.sign)
     entry = Entry(at.p, n, at.n_out, mi.Float(1), dr.zeros(mi.UInt32, 4096))
     w, value = lighting(kind, subject).sample(entry, mi.Point2f(0.3, 0.6), mi.Bool(True))
-    value, mu = np.array(value), np.array(dr.dot(w, at.n_out))
+    value, mu = np.array(value), np.array(dr.dot(w, at.n))
     assert np.all(value[mu <= 0] == 0) and np.all(value >= 0) and (value > 0).mean() > 0.1
 
 
