@@ -68,7 +68,8 @@ def outcome(record: dict[str, Any]) -> dict[str, Any]:
     error2_error = math.hypot(row.bias2_error, row.variance_error / option.spp)
     least = {name: _least(w, scene, pixels) for name, w in truth.items()}
     cheapest = min(least, key=lambda name: least[name])
-    sure = min(least[name] for name, w in truth.items() if w.bias2 + 2 * w.bias2_error < scene.tolerance**2)
+    known = [name for name, w in truth.items() if w.bias2 + 2 * w.bias2_error < scene.tolerance**2]
+    sure = min((least[name] for name in known), default=math.inf)
     cost = row.preparation + scene.images * pixels * option.spp * row.seconds
     automatic = picked(quick.objects[0], scene.tolerance)[0]
     found |= {"way": option.way, "spp": option.spp, "error": math.sqrt(error2)}
