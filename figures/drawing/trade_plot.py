@@ -149,7 +149,7 @@ def _plain(ax: Axes) -> None:
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
-    ax.yaxis.set_major_formatter(FuncFormatter(lambda v, _: rf"{100 * v:.3g} %"))
+    ax.yaxis.set_major_formatter(FuncFormatter(lambda v, _: rf"{100 * v:.4g} %"))
     ax.yaxis.set_minor_formatter(NullFormatter())
 
 
