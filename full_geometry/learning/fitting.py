@@ -15,8 +15,10 @@ import torch
 from full_geometry.features import N_PAIR
 from full_geometry.learning.learner import Correction, PatchLogits, likelihood, patch_likelihood
 from full_geometry.learning.pairs import Pairs
+from full_geometry.neural_shape.storing import KIND as SHAPES
 from full_geometry.patches import Patches
-from halfspace_sss.checks import check_count, check_interval
+from halfspace_sss.checks import check_choice, check_count, check_interval
+from halfspace_sss.interface.model import models
 from halfspace_sss.neural.training import checkpoint
 
 __all__ = ["STANDARD", "Fitting", "Recipe"]
@@ -36,7 +38,7 @@ class Recipe:
         rate: largest learning rate.
         chunk: walks, and proposals, that are made at once.
         reuse: times that each is used.
-        backbone: name of the half-space model that is corrected.
+        start: what is corrected: the name of a half-space model, or `neural_shape`.
     """
 
     width: int = 48
@@ -45,12 +47,13 @@ class Recipe:
     rate: float = 6e-3
     chunk: int = 2**17
     reuse: int = 2
-    backbone: str = "better_dipole"
+    start: str = "better_dipole"
 
     def __post_init__(self) -> None:
         for name in ("width", "depth", "batch", "chunk", "reuse"):
             check_count(name, getattr(self, name), 1)
         check_interval("rate", self.rate, 1e-8, 1.0)
+        check_choice("start", self.start, (SHAPES, *models()))
 
 
 STANDARD = Recipe()
