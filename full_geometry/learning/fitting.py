@@ -6,7 +6,7 @@ import copy
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +26,7 @@ __all__ = ["STANDARD", "Fitting", "Recipe"]
 BETAS, CLIP, LAST_RATE, WARM_UP = (0.9, 0.99), 1.0, 0.01, 100
 AVERAGE = 0.998  # of the numbers, each step
 PATCH_HIDDEN, PATCH_BATCH = (64, 32), 1024
+RATES = {SHAPES: 1.5e-3}  # by start: noise of walks leads large steps away from a near one
 
 
 @dataclass(frozen=True)
@@ -54,6 +55,10 @@ class Recipe:
             check_count(name, getattr(self, name), 1)
         check_interval("rate", self.rate, 1e-8, 1.0)
         check_choice("start", self.start, (SHAPES, *models()))
+
+    def begun(self, start: str) -> Recipe:
+        """The same from another start, with the rate that suits it."""
+        return replace(self, start=start, rate=RATES.get(start, self.rate))
 
 
 STANDARD = Recipe()

@@ -8,7 +8,7 @@ import time
 import warnings
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -101,7 +101,7 @@ def train(
         work: folder for unfinished work.
         camera: a `CameraWalks`, whose walks join those of random exits.
         progress: called with (what, done, total).
-        start: model that it begins with: `neural_shape` or a half-space model; by default what the recipe says.
+        start: model that it begins with, `neural_shape` or a half-space model, with its rate; by default the recipe's.
 
     Raises:
         ValueError: an argument is out of range, or `work` is of another run; nothing has been traced then.
@@ -118,7 +118,7 @@ def train(
             check_folder(place)
     if not any(float(m.sigma_s) > 0 for m in subject.media):
         raise ValueError("medium must scatter in at least one channel to be learnt, got sigma_s 0 in all")
-    recipe = recipe if start is None else replace(recipe, start=start)
+    recipe = recipe if start is None else recipe.begun(start)
     run = _Run(subject, recipe, int(seed), Path(work) if work else None, camera)
     if seconds == 0:
         warnings.warn(f"an object that is trained for 0 seconds is rendered by {recipe.start}", stacklevel=2)

@@ -60,7 +60,7 @@ def start_table(
 
 def _learnt(subject: Subject, start: str, seconds: float, part: float, seed: int) -> tuple[Learnt, dict[str, Any]]:
     """A training with chunks of a part of those of the recipe; what it took."""
-    recipe = replace(STANDARD, start=start, chunk=int(STANDARD.chunk * part))
+    recipe = replace(STANDARD.begun(start), chunk=int(STANDARD.chunk * part))
     with TemporaryDirectory() as folder:
         if seconds == 0:
             with warnings.catch_warnings():

@@ -87,7 +87,8 @@ def test_few_steps_from_it_are_worth_more_than_from_the_half_space(trained: Trai
 
 def test_the_file_says_where_it_began_and_gives_the_same_model_again(trained: Trained) -> None:
     record = json.loads(trained.path.with_suffix(".json").read_text())
-    assert record["recipe"]["start"] == SHAPE and tuple(record[storing.CHECKSUMS]) == shapes.checksums(subject())
+    assert record["recipe"]["start"] == SHAPE and record["recipe"]["rate"] < QUICK.rate
+    assert tuple(record[storing.CHECKSUMS]) == shapes.checksums(subject())
     again = storing.load(storing.find_weights(subject(), trained.path.parent), subject()).model
     assert np.array_equal(S_of(again, subject()), S_of(trained.model, subject()))
     assert not np.allclose(S_of(again, subject()), S_of(shapes.transport(subject()), subject()), rtol=1e-3)
