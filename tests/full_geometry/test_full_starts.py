@@ -119,7 +119,7 @@ def test_a_killed_run_ends_with_the_same_weights(trained: Trained, tmp_path: Pat
 
     with pytest.raises(KeyboardInterrupt):
         learnt(tmp_path, work=tmp_path / "work", progress=kill)
-    with pytest.raises(ValueError, match="start"):
+    with pytest.raises(ValueError, match="to go on with this work"):
         learnt(tmp_path, "better_dipole", work=tmp_path / "work")
     again = learnt(tmp_path, work=tmp_path / "work")
     assert all(np.array_equal(v, again.model.weights[name]) for name, v in trained.model.weights.items())
