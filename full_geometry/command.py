@@ -55,13 +55,14 @@ def train(
     work: Path | None = None,
     progress: NamedProgress | None = None,
     camera: Any = None,
+    start: str | None = None,
 ) -> LearntObject:
     """As `learning.training.train`, of which the rows of errors are told with the names of object and channels."""
     from full_geometry.learning.training import train as learn
 
     found = learn(
         scene, object=object, seconds=seconds, target_error=target_error, seed=seed, folder=folder, work=work,
-        progress=progress, camera=camera,
+        progress=progress, camera=camera, start=start,
     )  # fmt: skip
     name = found.model.subject.found.shape.id()
     return LearntObject(name, found.path, _rows(name, KIND, found.errors), found.steps, found.seconds)

@@ -76,7 +76,7 @@ def side_features(frame: Frame, side: Side) -> list[Any]:
     """Position and y with two octaves of sine and cosine, normal, w, mu, log of the way to y, log P, what varies."""
     import drjit as dr
 
-    at, event = side
+    at, event = side.at, side.event
     n, w = frame.direction(at.n_out), frame.direction(at.w)
     return [
         *_octaves(frame.position(at.p)), *_octaves(frame.position(event.y)), *n, *w, dr.dot(n, w),

@@ -7,6 +7,7 @@ import math
 from typing import Any
 
 from full_geometry.features import Side
+from full_geometry.first_event import first_event
 from full_geometry.subject import Subject, SurfacePoint
 from halfspace_sss.interface.model import BSSRDF, bssrdf
 from halfspace_sss.physics import fresnel
@@ -42,7 +43,11 @@ class HalfSpace:
             found.append(share / (self.subject.found.area * N))
         return found
 
-    def __call__(self, exit: Side, entry: Side) -> Any:
+    def end(self, at: SurfacePoint, active: Any = True) -> Side:
+        """What belongs to one end alone."""
+        return Side(at, first_event(self.subject, at, active))
+
+    def __call__(self, exit: Side, entry: Side, active: Any = True) -> Any:
         """1/((scene unit)² sr), 0 below the horizons."""
         import drjit as dr
         import mitsuba as mi

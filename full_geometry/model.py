@@ -1,26 +1,42 @@
-"""S of one object: the half-space times what a small network has learnt, evaluated in Dr.Jit."""
+"""S of one object: a start, times what a small network has learnt, evaluated in Dr.Jit."""
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from full_geometry.features import N_PAIR, Frame, Side, pair_features, side_features
-from full_geometry.first_event import first_event
-from full_geometry.half_space import HalfSpace
 from full_geometry.subject import Subject, SurfacePoint
+from halfspace_sss.interface.model import BSSRDF
 
-__all__ = ["BOUND", "FullGeometry", "PreparedExit"]
+__all__ = ["BOUND", "FullGeometry", "PreparedExit", "Start"]
 
 BOUND = 6.0  # of f: where walks leave but no proposal comes, nothing else would hold it
 
 
+class Start(Protocol):
+    """What the network of one object begins with and multiplies: `HalfSpace`, or the network of all shapes.
+
+    Attributes:
+        models: half-space model of each channel, whose radial densities probes follow.
+    """
+
+    @property
+    def models(self) -> Sequence[BSSRDF]: ...
+
+    def end(self, at: SurfacePoint, active: Any = True) -> Side:
+        """What belongs to one end alone, its point and its first event among it."""
+
+    def __call__(self, exit: Side, entry: Side, active: Any = True) -> Any:
+        """S of two ends per channel, 1/((scene unit)² sr); 0 below the horizons."""
+
+
 class PreparedExit(NamedTuple):
-    """What is done once for all entries of an exit: its first event, and its share of the first layer."""
+    """What is done once for all entries of an exit: its end of the start, and its share of the first layer."""
 
     side: Side
     hidden: list[Any]
@@ -28,20 +44,20 @@ class PreparedExit(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class FullGeometry:
-    """S = S_0 P_o P_i exp f, f = 6 tanh(g/6), g a perceptron of the features of exit, entry and pair.
+    """S = S_start exp f, f = 6 tanh(g/6), g a perceptron of the features of exit, entry and pair.
 
     Orders two and more; positive; reciprocal as far as it has been learnt.
 
     Args:
         subject: the object.
         frame: of the features.
-        half_space: S_0 P_o P_i.
+        start: S_start.
         weights: W_k (outputs, inputs) and b_k of the layers.
     """
 
     subject: Subject
     frame: Frame
-    half_space: HalfSpace
+    start: Start
     weights: Mapping[str, np.ndarray]
     orders = "multiple"
 
@@ -69,7 +85,7 @@ class FullGeometry:
         """The exit's side, for as many entries as are asked for."""
         from drjit import nn
 
-        side = Side(at, first_event(self.subject, at, active))
+        side = self.start.end(at, active)
         x = nn.CoopVec(*side_features(self.frame, side))
         return PreparedExit(side, list(nn.matvec(self._views["W"][0], x, self._views["b"][0])))
 
@@ -84,9 +100,9 @@ class FullGeometry:
         import drjit as dr
         import mitsuba as mi
 
-        entry = Side(at, first_event(self.subject, at, active))
+        entry = self.start.end(at, active)
         f = mi.Spectrum(self._network(exit, entry))
-        S_0 = self.half_space(exit.side, entry)
+        S_0 = self.start(exit.side, entry, active)
         return dr.select(active, S_0 * dr.exp(BOUND * dr.tanh(f / BOUND)), 0)
 
     def _network(self, exit: PreparedExit, entry: Side) -> list[Any]:

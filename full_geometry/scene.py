@@ -15,9 +15,9 @@ from full_geometry.flow.sampler import FlowProposals
 from full_geometry.learnable import check_surface
 from full_geometry.model import FullGeometry, PreparedExit
 from full_geometry.patch_table import PatchTable
-from full_geometry.storing import KIND, find_weights, load
+from full_geometry.storing import CHECKSUMS, KIND, find_weights, load
 from full_geometry.subject import Subject, SurfacePoint
-from halfspace_sss.neural.store import checksum_of
+from halfspace_sss.neural.store import checksum_of, load_weights
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.surface.inside import Inside
 from halfspace_sss.rendering.surface.object import Object
@@ -41,7 +41,7 @@ class LearntTransport:
 
     Args:
         model: what was learnt.
-        checksums: of the file of weights, and of those of its half-space model.
+        checksums: of the file of weights, and of those of its start.
     """
 
     model: FullGeometry
@@ -82,9 +82,8 @@ def learnt_means(found: Object, inside: Inside, media: list[Medium], settings: S
     subject = Subject.surveyed(found, tuple(media), inside.varying, settings.mm_per_unit)
     path = _weights(subject, settings)
     model, sampler, flow = load(path, subject)
-    backbone = model.half_space.models
-    checksums = (checksum_of(path, KIND), *(checksum for m in backbone for checksum in m.checksums))
-    transport = LearntTransport(model, checksums)
+    backbone = model.start.models
+    transport = LearntTransport(model, (checksum_of(path, KIND), *load_weights(path, KIND)[1][CHECKSUMS]))
     table = RadialTable([m for m in backbone if float(m.medium.sigma_s) > 0], found.size)
     by_itself = AREA_SHARE if sampler is None else 0.0  # patches reach everywhere
     share = by_itself if settings.area_share == AUTOMATIC else settings.area_share

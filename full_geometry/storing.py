@@ -17,19 +17,22 @@ from full_geometry.flow.conditional import ConditionalFlow
 from full_geometry.flow.sampler import FlowSampler
 from full_geometry.half_space import HalfSpace, HalfSpaceTransport
 from full_geometry.identity import Identity, frame_of, identify
-from full_geometry.model import FullGeometry
+from full_geometry.model import FullGeometry, Start
+from full_geometry.neural_shape import storing as shapes
 from full_geometry.patches import Patches, PatchSampler
 from full_geometry.subject import Subject
+from halfspace_sss.interface.model import bssrdf
 from halfspace_sss.neural.store import load_weights, save_weights
 from halfspace_sss.neural.trained import weights_folder
 from halfspace_sss.rendering.surface.transports import knows_objects
 
 __all__ = [
-    "CENTRES", "KIND", "Learnt", "add_flow", "assemble", "find_weights", "load", "save", "trained", "transport",
-    "weights_name",
+    "CENTRES", "CHECKSUMS", "KIND", "Learnt", "add_flow", "assemble", "find_weights", "load", "save",
+    "start_checksums", "start_of", "trained", "transport", "weights_name",
 ]  # fmt: skip
 
 KIND = "full_geometry"
+CHECKSUMS = "start_checksums"  # of a record
 S_LAYERS, PATCH_LAYERS, FLOW_LAYERS, CENTRES = ("W_", "b_"), ("V_", "c_"), ("F_", "h_"), "centres"
 
 
@@ -66,7 +69,9 @@ def find_weights(subject: Subject, folder: str | os.PathLike | None = None) -> P
     reasons = []
     for path in sorted(place.glob(f"{KIND}-{here.digest()}-*.safetensors")):
         try:
-            _trained(path)[0].pose(here)
+            identity, _, record = _trained(path)
+            identity.pose(here)
+            _start(path, record, subject.as_trained(identity.medium))
             return path
         except ValueError as error:
             reasons.append(f"{path.name}: {error}")
@@ -102,6 +107,20 @@ def _trained(path: Path) -> tuple[Identity, dict[str, np.ndarray], dict[str, Any
     return identity, arrays, record
 
 
+def _start(path: Path, record: dict[str, Any], subject: Subject) -> str:
+    """Name of the model that weights multiply; ValueError if they were fitted to others of it than are here now."""
+    place = path.with_suffix(".json")
+    try:
+        name, fitted = record["recipe"]["start"], tuple(record[CHECKSUMS])
+    except (KeyError, TypeError) as error:
+        raise ValueError(f"{place}: start must be recorded: of another version, to be trained again") from error
+    if fitted != start_checksums(subject, name):
+        raise ValueError(
+            f"{place}: weights of the start {name} must be those of training, got others: to be trained again"
+        )
+    return name
+
+
 def load(path: str | os.PathLike, subject: Subject) -> Learnt:
     """The model of an object and its sampler from its weights.
 
@@ -116,11 +135,12 @@ def load(path: str | os.PathLike, subject: Subject) -> Learnt:
         n, known = 2 * n_side(len(subject.media), subject.n_local) + N_PAIR, arrays["W_0"].shape[1]
         if n != known:
             raise ValueError(f"W_0 must have {n} inputs, got {known}: of another version, to be trained again")
+        start = start_of(subject, _start(path, record, subject))
     except KeyError as error:
         raise ValueError(f"{path}: layers must be those of {KIND}, {error} is missing") from error
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
-    return assemble(subject, frame, HalfSpace(subject, record["recipe"]["backbone"]), arrays)
+    return assemble(subject, frame, start, arrays)
 
 
 def transport(subject: Subject, model: str, folder: str | os.PathLike | None = None) -> Any:
@@ -136,15 +156,31 @@ def transport(subject: Subject, model: str, folder: str | os.PathLike | None = N
     return HalfSpaceTransport(subject, model)
 
 
+def start_of(subject: Subject, name: str) -> Start:
+    """What the network of an object begins with: the network of all shapes, or a half-space model.
+
+    Raises:
+        ValueError: there is no such model, or it does not take the medium.
+    """
+    return shapes.transport(subject) if name == shapes.KIND else HalfSpace(subject, name)
+
+
+def start_checksums(subject: Subject, name: str) -> tuple[str, ...]:
+    """Of the weights that a start has."""
+    if name == shapes.KIND:
+        return shapes.checksums(subject)
+    return tuple(checksum for m in subject.media for checksum in bssrdf(name, m).checksums)
+
+
 def assemble(
-    subject: Subject, frame: Frame, half_space: HalfSpace, arrays: Mapping[str, np.ndarray], patches: Any = None
+    subject: Subject, frame: Frame, start: Start, arrays: Mapping[str, np.ndarray], patches: Any = None
 ) -> Learnt:
     """Model and sampler from the arrays of a file; `patches` are made from their centres if they are not given."""
 
     def layers(names: tuple[str, ...]) -> dict[str, np.ndarray]:
         return {name: value for name, value in arrays.items() if name.startswith(names)}
 
-    model = FullGeometry(subject, frame, half_space, layers(S_LAYERS))
+    model = FullGeometry(subject, frame, start, layers(S_LAYERS))
     if CENTRES not in arrays:
         return Learnt(model, None)
     patches = patches or Patches(subject, frame, arrays[CENTRES].astype(np.float32))

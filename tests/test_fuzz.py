@@ -39,7 +39,7 @@ COMPUTES = [  # what is replaced: the properties are of what comes before the co
     "halfspace_sss.trade.checking.random_scenes.write_scene", "full_geometry.neural_shape.evaluation.cases.evaluate",
     "full_geometry.neural_shape.learning.training._Run", "full_geometry.learning.training._Run",
     "full_geometry.command.errors_of", "full_geometry.paper.learner.fit_paper",
-    "full_geometry.rivals.errors.error_table",
+    "full_geometry.rivals.errors.error_table", "full_geometry.rivals.starts.start_table",
 ]  # fmt: skip
 ODD = ["", " ", "nan", "inf", "-inf", "-1", "0", "1", "2", "0.5", "1e6", "1e400", "1,2", "0,", "1/2", "2/1", "marble",
        "R", "fig10", "neural", "better_dipole", "total", "single", "llvm", "cuda", "[/red]", "[bold", "{", "%s", "../x",

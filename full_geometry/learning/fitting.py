@@ -6,7 +6,7 @@ import copy
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +15,10 @@ import torch
 from full_geometry.features import N_PAIR
 from full_geometry.learning.learner import Correction, PatchLogits, likelihood, patch_likelihood
 from full_geometry.learning.pairs import Pairs
+from full_geometry.neural_shape.storing import KIND as SHAPES
 from full_geometry.patches import Patches
-from halfspace_sss.checks import check_count, check_interval
+from halfspace_sss.checks import check_choice, check_count, check_interval
+from halfspace_sss.interface.model import models
 from halfspace_sss.neural.training import checkpoint
 
 __all__ = ["STANDARD", "Fitting", "Recipe"]
@@ -24,6 +26,7 @@ __all__ = ["STANDARD", "Fitting", "Recipe"]
 BETAS, CLIP, LAST_RATE, WARM_UP = (0.9, 0.99), 1.0, 0.01, 100
 AVERAGE = 0.998  # of the numbers, each step
 PATCH_HIDDEN, PATCH_BATCH = (64, 32), 1024
+RATES = {SHAPES: 1.5e-3}  # by start: noise of walks leads large steps away from a near one
 
 
 @dataclass(frozen=True)
@@ -36,7 +39,7 @@ class Recipe:
         rate: largest learning rate.
         chunk: walks, and proposals, that are made at once.
         reuse: times that each is used.
-        backbone: name of the half-space model that is corrected.
+        start: what is corrected: the name of a half-space model, or `neural_shape`.
     """
 
     width: int = 48
@@ -45,12 +48,17 @@ class Recipe:
     rate: float = 6e-3
     chunk: int = 2**17
     reuse: int = 2
-    backbone: str = "better_dipole"
+    start: str = "better_dipole"
 
     def __post_init__(self) -> None:
         for name in ("width", "depth", "batch", "chunk", "reuse"):
             check_count(name, getattr(self, name), 1)
         check_interval("rate", self.rate, 1e-8, 1.0)
+        check_choice("start", self.start, (SHAPES, *models()))
+
+    def begun(self, start: str) -> Recipe:
+        """The same from another start, with the rate that suits it."""
+        return replace(self, start=start, rate=RATES.get(start, self.rate))
 
 
 STANDARD = Recipe()

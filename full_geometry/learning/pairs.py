@@ -1,4 +1,4 @@
-"""Training data of one object: walks with their throughput, and proposals with S_0 over their density."""
+"""Training data of one object: walks with their throughput, and proposals with S at the start over their density."""
 
 from __future__ import annotations
 
@@ -10,9 +10,8 @@ import numpy as np
 from full_geometry.entries import AREA_SHARE, LearntProposals
 from full_geometry.features import Frame, Side, pair_features, side_features
 from full_geometry.first_event import first_event
-from full_geometry.half_space import HalfSpace
 from full_geometry.learning.exits import Exits, trace_exits
-from full_geometry.model import PreparedExit
+from full_geometry.model import PreparedExit, Start
 from full_geometry.patch_table import ExitTable
 from full_geometry.patches import PatchSampler
 from full_geometry.subject import Subject, SurfacePoint, cosine_direction, surface_point
@@ -67,7 +66,7 @@ class Proposals:
 
     Args:
         subject: the object.
-        half_space: S_0, whose radial densities the probes follow.
+        start: whose radial densities the probes follow.
         area_share: of the candidates that are uniform over the area, without patches.
         patches: learnt weights, or None.
     """
@@ -75,13 +74,13 @@ class Proposals:
     def __init__(
         self,
         subject: Subject,
-        half_space: HalfSpace,
+        start: Start,
         area_share: float = AREA_SHARE,
         patches: PatchSampler | None = None,
     ) -> None:
-        live = [m for m in half_space.models if float(m.medium.sigma_s) > 0]
-        table = RadialTable(live or half_space.models, subject.found.size)
-        self.subject, self.half_space, self.patches = subject, half_space, patches
+        live = [m for m in start.models if float(m.medium.sigma_s) > 0]
+        table = RadialTable(live or start.models, subject.found.size)
+        self.subject, self.start, self.patches = subject, start, patches
         # light may leave by another piece of the surface than it entered by
         self.positions = PositionSampler(replace(subject.found, pieces=None), table, subject.points, area_share)
 
@@ -113,7 +112,7 @@ class Proposals:
 
     def with_patches(self, patches: PatchSampler | None) -> Proposals:
         """The same with learnt weights of patches, which take the place of uniform points."""
-        return Proposals(self.subject, self.half_space, 0.0, patches) if patches is not None else self
+        return Proposals(self.subject, self.start, 0.0, patches) if patches is not None else self
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,13 +122,13 @@ class PairSource:
     Args:
         subject: the object.
         frame: of its features.
-        half_space: S_0.
+        start: S at the start, which values of proposals have.
         proposals: where they come from.
     """
 
     subject: Subject
     frame: Frame
-    half_space: HalfSpace
+    start: Start
     proposals: Proposals
 
     def walks(self, n: int, seed: tuple[int, ...]) -> Pairs:
@@ -157,7 +156,7 @@ class PairSource:
     def proposed(
         self, n: int, seed: tuple[int, ...], patches: PatchSampler | None = None, starts: SurfacePoint | None = None
     ) -> Pairs:
-        """n proposals, S_0 mu_i over their density as values.
+        """n proposals, S mu_i at the start over their density as values.
 
         Args:
             n: how many.
@@ -173,13 +172,13 @@ class PairSource:
         return self._columns(starts, entries, weight)
 
     def _columns(self, exits: SurfacePoint, entries: SurfacePoint, value: Any) -> Pairs:
-        """Features of pairs; `value` is a spectrum, or a weight that S_0 is to be multiplied by."""
+        """Features of pairs; `value` is a spectrum, or a weight that S_0 at the start is to be multiplied by."""
         import drjit as dr
         import mitsuba as mi
 
-        exit, entry = (Side(at, first_event(self.subject, at)) for at in (exits, entries))
+        exit, entry = (self.start.end(at) for at in (exits, entries))
         if isinstance(value, mi.Float):
-            value = self.half_space(exit, entry) * value
+            value = self.start(exit, entry) * value
         columns = [*side_features(self.frame, exit), *side_features(self.frame, entry)]
         columns += pair_features(self.frame, exit, entry)
         dr.eval(columns, value)

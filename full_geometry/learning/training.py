@@ -16,7 +16,6 @@ import numpy as np
 
 from full_geometry import storing
 from full_geometry.features import N_PAIR, n_side
-from full_geometry.half_space import HalfSpace
 from full_geometry.identity import frame_of, identify
 from full_geometry.learning.fitting import STANDARD, Fitting, Recipe
 from full_geometry.learning.model_errors import ModelError, Reference, measure, reference
@@ -24,7 +23,7 @@ from full_geometry.learning.pairs import Pairs, PairSource, Proposals
 from full_geometry.learning.seen import Seen
 from full_geometry.model import FullGeometry
 from full_geometry.patches import Patches, PatchSampler, cluster
-from full_geometry.storing import CENTRES, Learnt, assemble
+from full_geometry.storing import CENTRES, Learnt, assemble, start_of
 from full_geometry.subject import Subject
 from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.neural.store import to_json
@@ -79,6 +78,7 @@ def train(
     work: str | Path | None = None,
     camera: Any = None,
     progress: Progress | None = None,
+    start: str | None = None,
 ) -> Trained:
     """Learn S of an object and write its weights.
 
@@ -92,7 +92,7 @@ def train(
             `translucent` surface.
         mm_per_unit: length of a scene unit, mm; by default what the integrator of a scene says, and 1 for a shape.
         object: id of the object in a scene; may be left out where there is one.
-        seconds: for data, fit and validation, after the kernels are compiled; 0 gives the half-space, with a warning.
+        seconds: for data, fit and validation, after the kernels are compiled; 0 gives the start, with a warning.
         target_error: stop once the largest error under constant light has come down to it.
         seed: of everything.
         recipe: sizes and rates.
@@ -101,6 +101,7 @@ def train(
         work: folder for unfinished work.
         camera: a `CameraWalks`, whose walks join those of random exits.
         progress: called with (what, done, total).
+        start: model that it begins with, `neural_shape` or a half-space model, with its rate; by default the recipe's.
 
     Raises:
         ValueError: an argument is out of range, or `work` is of another run; nothing has been traced then.
@@ -117,9 +118,10 @@ def train(
             check_folder(place)
     if not any(float(m.sigma_s) > 0 for m in subject.media):
         raise ValueError("medium must scatter in at least one channel to be learnt, got sigma_s 0 in all")
+    recipe = recipe if start is None else recipe.begun(start)
     run = _Run(subject, recipe, int(seed), Path(work) if work else None, camera)
     if seconds == 0:
-        warnings.warn("an object that is trained for 0 seconds is rendered as a half-space", stacklevel=2)
+        warnings.warn(f"an object that is trained for 0 seconds is rendered by {recipe.start}", stacklevel=2)
         return Trained(*run.learnt()[:2], None, [], 0, 0.0)
     return run.go(seconds, chunks, target_error, Path(folder or weights_folder()), progress)
 
@@ -153,9 +155,9 @@ class _Run:
 
         self.subject, self.recipe, self.seed, self.work, self.camera = subject, recipe, seed, work, camera
         self.identity, self.frame = identify(subject), frame_of(subject)
-        self.half_space = HalfSpace(subject, recipe.backbone)
-        self.proposals = Proposals(subject, self.half_space)
-        self.source = PairSource(subject, self.frame, self.half_space, self.proposals)
+        self.start = start_of(subject, recipe.start)
+        self.proposals = Proposals(subject, self.start)
+        self.source = PairSource(subject, self.frame, self.start, self.proposals)
         self.seen: Seen | None = None
         self.patches = self.centres = None
         if "faces" in mi.traverse(subject.found.shape):
@@ -178,7 +180,7 @@ class _Run:
 
     def learnt(self) -> Learnt:
         """Model and sampler as they stand."""
-        return assemble(self.subject, self.frame, self.half_space, self.arrays(), self.patches)
+        return assemble(self.subject, self.frame, self.start, self.arrays(), self.patches)
 
     def go(
         self, seconds: float, chunks: int | None, target: float | None, folder: Path, progress: Progress | None
@@ -290,6 +292,7 @@ class _Run:
     def _record(self, found: list[ModelError], seconds: float) -> dict[str, Any]:
         return {
             "recipe": asdict(self.recipe), "seed": self.seed, "steps": self.fitting.step, "chunks": self.done,
+            storing.CHECKSUMS: storing.start_checksums(self.subject, self.recipe.start),
             "walks": self.walks * self.done, "seconds": seconds, "history": self.history,
             "errors": [row._asdict() for row in found], "provenance": provenance(seed=self.seed),
         }  # fmt: skip

@@ -20,7 +20,7 @@ from full_geometry.neural_shape.mixing import Mixed
 from full_geometry.subject import Subject, refract_in
 from halfspace_sss.rendering.transport.plane import number
 
-__all__ = ["Backbone", "phases"]
+__all__ = ["MODEL", "Backbone", "phases"]
 
 MODEL = "neural"
 FLOOR = 2e-3  # reflectance of what S_0 has everywhere, over that of the half-space
@@ -46,7 +46,7 @@ class Backbone(HalfSpace):
         """Per channel what S_0 has everywhere."""
         return [floor + mixture.M for floor, mixture in zip(HalfSpace.floors.func(self), self.mixtures)]
 
-    def __call__(self, exit: Side, entry: Side) -> Any:
+    def __call__(self, exit: Side, entry: Side, active: Any = True) -> Any:
         """1/((scene unit)² sr), 0 below the horizons."""
         import drjit as dr
         import mitsuba as mi

@@ -14,6 +14,7 @@ from full_geometry.neural_shape.backbone import Backbone
 from full_geometry.neural_shape.descriptors import CURVED_OWN, CURVED_SHARED, N_OWN, End, Pair, describe, end, medium
 from full_geometry.neural_shape.mixing import mixed
 from full_geometry.subject import Subject, SurfacePoint
+from halfspace_sss.interface.model import BSSRDF
 from halfspace_sss.rendering.transport.plane import number
 
 __all__ = ["LEAST", "MOST", "NeuralShape"]
@@ -67,9 +68,18 @@ class NeuralShape:
     def _media(self) -> list[list[Any]]:
         return [[number(v) for v in numbers] for numbers in self.media]
 
+    @property
+    def models(self) -> list[BSSRDF]:
+        """The half-space model of each channel."""
+        return self.half_space.models
+
+    def end(self, at: SurfacePoint, active: Any = True) -> End:
+        """What belongs to one end alone."""
+        return end(self.subject, at, active)
+
     def prepare(self, at: SurfacePoint, active: Any = True) -> End:
         """The exit's side, for as many entries as are asked for."""
-        return end(self.subject, at, active)
+        return self.end(at, active)
 
     def S(self, exit: End, at: SurfacePoint, active: Any = True) -> Any:
         """S(x_i, w_i; x_o, w_o) per channel, 1/((scene unit)² sr); 0 below the horizons.
@@ -79,10 +89,13 @@ class NeuralShape:
             at: entry, with w_i.
             active: mask of lanes.
         """
+        return self(exit, self.end(at, active), active)
+
+    def __call__(self, exit: End, entry: End, active: Any = True) -> Any:
+        """S of two ends, as `S`."""
         import drjit as dr
         import mitsuba as mi
 
-        entry = end(self.subject, at, active)
         pairs = describe(self.subject, exit, entry, active)
         f = mi.Spectrum([self._f(pair, numbers) for pair, numbers in zip(pairs, self._media)])
         S_0 = self.half_space(Side(exit.at, exit.event), Side(entry.at, entry.event))

@@ -8,10 +8,9 @@ from dataclasses import replace
 
 from full_geometry.learnable import check_surface
 from full_geometry.neural_shape.ranges import ALBEDO, ETA, SIZE, G
-from full_geometry.neural_shape.storing import KIND, shipped_weights, transport
+from full_geometry.neural_shape.storing import checksums, transport
 from full_geometry.scene import LearntTransport
 from full_geometry.subject import Subject
-from halfspace_sss.neural.store import checksum_of
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.surface.inside import Inside
 from halfspace_sss.rendering.surface.object import Object
@@ -67,8 +66,4 @@ def shape_means(found: Object, inside: Inside, media: list[Medium], settings: Se
     share = area_share(found, table.mean / found.size, settings.area_share)
     # light may leave by another piece of the surface than it entered by
     positions = PositionSampler(replace(found, pieces=None), table, AreaPoints(found.shape), share)
-    checksums = (
-        checksum_of(shipped_weights(), KIND),
-        *(checksum for m in model.half_space.models for checksum in m.checksums),
-    )
-    return Means(LearntTransport(model, checksums), HalfSpaceProposals(positions, live[0]))
+    return Means(LearntTransport(model, checksums(subject)), HalfSpaceProposals(positions, live[0]))

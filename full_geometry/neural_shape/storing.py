@@ -8,13 +8,15 @@ from pathlib import Path
 
 import numpy as np
 
+from full_geometry.neural_shape.backbone import MODEL
 from full_geometry.neural_shape.descriptors import CURVED_OWN, CURVED_SHARED, N_MEDIUM, N_OWN, N_SHARED
 from full_geometry.neural_shape.model import NeuralShape
 from full_geometry.subject import Subject
-from halfspace_sss.neural.store import load_weights
+from halfspace_sss.interface.model import bssrdf
+from halfspace_sss.neural.store import checksum_of, load_weights
 from halfspace_sss.once import once
 
-__all__ = ["KIND", "WEIGHTS", "load", "shipped_weights", "transport"]
+__all__ = ["KIND", "WEIGHTS", "checksums", "load", "shipped_weights", "transport"]
 
 KIND = "neural_shape"
 WEIGHTS = f"{KIND}.safetensors"
@@ -44,6 +46,13 @@ def load(path: Path) -> dict[str, np.ndarray]:
         if found != (wanted, wanted[:1]) or widths[-1] != outputs:
             raise ValueError(f"{path}: layer {k} must go from {widths[k]} to {widths[k + 1]} numbers, got {found}")
     return {name: value.astype(np.float32) for name, value in arrays.items()}
+
+
+def checksums(subject: Subject, path: str | os.PathLike | None = None) -> tuple[str, ...]:
+    """Of the shipped weights or others, and of those of the half-space models that they correct."""
+    models = [bssrdf(MODEL, m) for m in subject.media]
+    own = checksum_of(Path(path) if path is not None else shipped_weights(), KIND)
+    return (own, *(checksum for m in models for checksum in m.checksums))
 
 
 def transport(subject: Subject, path: str | os.PathLike | None = None) -> NeuralShape:

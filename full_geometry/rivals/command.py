@@ -1,4 +1,4 @@
-"""The command `halfspace-sss rivals`: tables of samplers and of models for one object, at equal time."""
+"""The command `halfspace-sss rivals`: tables of samplers, of models and of starts of one object, at equal time."""
 
 from __future__ import annotations
 
@@ -16,23 +16,26 @@ if TYPE_CHECKING:
 
 __all__ = ["TABLES", "rivals_command"]
 
-TABLES = ("errors", "samplers")
+KEYS = {"errors": ["model"], "starts": ["start", "planned", "seconds", "steps"]}  # of tables of errors: a training
+TABLES = ("errors", "samplers", "starts")
 
 
 def rivals_command(
     scene: Annotated[Path, typer.Option(help="Mitsuba XML file with the object.")],
     object: ObjectId = None,
     table: Annotated[
-        list[str] | None, typer.Option(help="errors or samplers; repeat for both.", show_default="both")
+        list[str] | None, typer.Option(help="errors, samplers or starts; repeat for several.", show_default="all")
     ] = None,
-    seconds: Annotated[float, typer.Option(help="CPU time of each training, data included.")] = 60.0,
+    seconds: Annotated[
+        float, typer.Option(help="CPU time of each training, data included; of starts of the longest.")
+    ] = 60.0,
     samples: Annotated[int, typer.Option(help="Of each exit, for errors and variances.", parser=whole)] = 2048,
     seed: Annotated[int, typer.Option(help="Seed of everything.", parser=whole)] = 0,
     define: Define = None,
     variant: Variant = "llvm_ad_rgb",
     out: OutFolder = Path("rivals"),
 ) -> None:
-    """Compare ways of drawing entries by variance x time, and models of an object by errors, at equal CPU time."""
+    """Compare ways of drawing entries by variance x time, models of an object and its starts by errors, by CPU time."""
     chosen = table or list(TABLES)
     for name in chosen:
         check_choice("table", name, TABLES)
@@ -49,7 +52,7 @@ def rivals_command(
         with Bar(name) as bar:
             found = _made(name, loaded, object, seconds, samples, seed, bar)
         files[out / f"{name}.csv"] = found.to_csv(index=False, lineterminator="\n")
-        files[out / f"{name}.md"] = markdown(_errors_wide(found) if name == "errors" else found)
+        files[out / f"{name}.md"] = markdown(_errors_wide(found, KEYS[name]) if name in KEYS else found)
     write_together(files)
     for path, text in files.items():
         if path.suffix == ".md":
@@ -66,26 +69,29 @@ def _made(
     from full_geometry.learning.training import train_by_cpu
     from full_geometry.rivals.errors import error_table
     from full_geometry.rivals.samplers import sampler_table
+    from full_geometry.rivals.starts import start_table
     from full_geometry.subject import Subject
 
     def show(what: str, done: int, total: int) -> None:
         bar.show(done, total, what)
 
-    if table == "errors":
-        return error_table(scene, name, seconds=seconds, walks=samples, samples=samples, seed=seed, progress=show)
+    if table in KEYS:
+        make = {"errors": error_table, "starts": start_table}[table]
+        return make(scene, name, seconds=seconds, walks=samples, samples=samples, seed=seed, progress=show)
     with TemporaryDirectory() as folder:
         learnt, _ = train_by_cpu(Subject.given(scene, None, None, name), seconds, folder, seed=seed)
     return sampler_table(learnt, FlowRecipe(seconds=0.5 * seconds), samples=samples, seed=seed, progress=show)
 
 
-def _errors_wide(table: pandas.DataFrame) -> pandas.DataFrame:
-    """A row for each model, a column for each channel and light: error ± standard error, %."""
+def _errors_wide(table: pandas.DataFrame, keys: list[str]) -> pandas.DataFrame:
+    """A row for each training, told by the columns `keys`; a column for each channel and light: error ± its own, %."""
     texts = table.assign(
         what=[f"{light}, channel {channel}" for light, channel in zip(table["light"], table["channel"])],
         text=[f"{100 * a:.2g} ± {100 * b:.1g}" for a, b in zip(table["error"], table["standard_error"])],
     )
-    wide = texts.pivot(index="model", columns="what", values="text")
-    return wide.loc[list(dict.fromkeys(table["model"])), list(dict.fromkeys(texts["what"]))].reset_index()
+    wide = texts.pivot(index=keys, columns="what", values="text")
+    rows = table[keys].drop_duplicates().set_index(keys).index
+    return wide.loc[rows, list(dict.fromkeys(texts["what"]))].reset_index()
 
 
 def markdown(table: pandas.DataFrame) -> str:

@@ -70,6 +70,13 @@ def train_command(
         int | None, typer.Option(help="Steps of the optimiser.", parser=whole, show_default="from the recipe")
     ] = None,
     target_error: Annotated[float | None, typer.Option(help="Stop early at this validation error.")] = None,
+    start: Annotated[
+        str | None,
+        typer.Option(
+            help="With --scene: neural_shape or the half-space model that the object's network begins with.",
+            show_default="better_dipole",
+        ),
+    ] = None,
     seed: Annotated[int, typer.Option(help="Seed of maps, batches and first numbers.", parser=whole)] = 0,
     backend: Annotated[str, typer.Option(help="llvm or cuda, for the maps.")] = BACKEND,
     define: Define = None,
@@ -87,7 +94,7 @@ def train_command(
     given = {"sigma_t": sigma_t, "albedo": albedo, "g": g, "eta": eta}
     if shapes:
         others = {"material": material, "channel": channel, "universal": universal, "scene": scene, "object": object,
-                  **given, "fast": fast, "steps": steps, "target_error": target_error, "define": define,
+                  **given, "fast": fast, "steps": steps, "target_error": target_error, "start": start, "define": define,
                   "model": None if model == MODEL else model, "variant": None if variant == VARIANT else variant,
                   "backend": None if backend == BACKEND else backend}  # fmt: skip
         check_left_out(others, "with --shapes")
@@ -99,10 +106,10 @@ def train_command(
                   "steps": steps, "backend": None if backend == BACKEND else backend}  # fmt: skip
         check_left_out(others, "with --scene")
         how = {"object": object, "seconds": SECONDS if seconds is None else seconds, "target_error": target_error}
-        files = {"seed": seed, "folder": out, "work": work}
+        files = {"seed": seed, "folder": out, "work": work} | ({"start": start} if start is not None else {})
         _object(scene, None if model == MODEL else model, {**how, **files}, variant, define)
         return
-    of_scenes = {"object": object, "seconds": seconds, "define": define}
+    of_scenes = {"object": object, "seconds": seconds, "start": start, "define": define}
     check_left_out({**of_scenes, "variant": None if variant == VARIANT else variant}, "without --scene")
     if universal:
         others = {

@@ -78,6 +78,15 @@ def test_an_object_is_trained_measured_and_rendered(monkeypatch: Any) -> None:
     assert result.exit_code == 0 and Path("render/ball_full_geometry.exr").exists(), result.output
 
 
+def test_an_object_begins_with_the_network_of_all_shapes_and_is_rendered() -> None:
+    result = _invoke("train", "--scene", "ball.xml", "--start", "neural_shape")
+    assert result.exit_code == 0, result.output
+    (_, path) = _weights()
+    assert load_weights(path, "full_geometry")[1]["recipe"]["start"] == "neural_shape"
+    result = _invoke("render", "ball.xml", "--model", "full_geometry", "--spp", "4", "--train-seconds", "0")
+    assert result.exit_code == 0 and Path("render/ball_full_geometry.exr").exists(), result.output
+
+
 def test_a_model_with_single_scattering_is_held_against_walks_with_it(monkeypatch: Any) -> None:
     fewest = []
     monkeypatch.setattr(model_errors, "reference", lambda *a: fewest.append(a[4]) or REFERENCE(a[0], 8, 64, *a[3:]))
@@ -105,7 +114,7 @@ def test_a_render_says_what_trains_an_object() -> None:
 def test_no_seconds_write_nothing_and_say_so() -> None:
     result = _invoke("train", "--scene", "ball.xml", "--seconds", "0")
     assert result.exit_code == 0 and "no weights are written" in result.stdout
-    assert "is rendered as a half-space" in result.stderr and not _weights()
+    assert "is rendered by better_dipole" in result.stderr and not _weights()
 
 
 def _stops(monkeypatch: Any, error: BaseException) -> None:
@@ -168,6 +177,13 @@ REFUSED = [
     (["train", "ketchup", "--scene", "ball.xml"], "material must be left out with --scene, got ['ketchup']"),
     (["train", "--scene", "ball.xml", "--out", "ball.xml"], "folder must be a folder or new, got 'ball.xml'"),
     (["train", "--scene", "ball.xml", "--define", "x"], "define must be NAME=VALUE, got 'x'"),
+    (["train", "--scene", "ball.xml", "--start", "neural_shap"], "start must be one of neural_shape,"),
+    (["train", "--start", "neural_shape"], "start must be left out without --scene, got 'neural_shape'"),
+    (["train", "--shapes", "--start", "neural_shape"], "start must be left out with --shapes, got 'neural_shape'"),
+    (
+        ["train", "--scene", "ball.xml", "--model", "full_geometry_paper", "--start", "neural_shape"],
+        "start must be left out for full_geometry_paper, got 'neural_shape'",
+    ),
     (["train", "--seconds", "3"], "seconds must be left out without --scene, got 3.0"),
     (["train", "--object", "ball"], "object must be left out without --scene, got 'ball'"),
     (["errors", "--object", "ball"], "object must be left out without --scene, got 'ball'"),

@@ -154,7 +154,7 @@ def test_a_run_stops_where_its_error_is_small_enough(tmp_path: Path) -> None:
 
 
 def test_no_training_gives_the_half_space_with_a_warning(tmp_path: Path) -> None:
-    with pytest.warns(UserWarning, match="as a half-space"):
+    with pytest.warns(UserWarning, match="rendered by better_dipole"):
         found = train(ball(200.0), WAX, seconds=0, folder=tmp_path)
     assert found.path is None and not list(tmp_path.iterdir())
     plane = HalfSpaceTransport(found.model.subject, "better_dipole")

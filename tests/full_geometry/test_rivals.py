@@ -176,7 +176,7 @@ def test_the_papers_network_is_trained_and_measured_by_the_commands(
 @pytest.mark.parametrize(
     "bad, message",
     [
-        (["--table", "images"], "table must be one of errors, samplers"),
+        (["--table", "images"], "table must be one of errors, samplers, starts"),
         (["--seconds", "0"], "seconds must"),
         (["--samples", "1"], "samples must"),
     ],
@@ -189,5 +189,5 @@ def test_tables_refuse_bad_input_before_anything_is_traced(scene_file: Path, bad
 def test_a_table_of_errors_has_a_row_for_each_model() -> None:
     rows = [{"model": m, "channel": c, "light": "constant", "error": 0.1, "standard_error": 0.01, "ratio": 1.0}
             for m in ("a", "b") for c in (0, 1)]  # fmt: skip
-    text = markdown(_errors_wide(pandas.DataFrame(rows)))
+    text = markdown(_errors_wide(pandas.DataFrame(rows), ["model"]))
     assert text.splitlines()[2:] == ["| a | 10 ± 1 | 10 ± 1 |", "| b | 10 ± 1 | 10 ± 1 |"]

@@ -71,8 +71,12 @@ class Learner(Protocol):
         work: Path | None,
         progress: NamedProgress | None,
         camera: CameraWalks | None = None,
+        start: str | None = None,
     ) -> LearntObject:
-        """Learn an object and write its weights; walks of a camera that is given are data too."""
+        """Learn an object and write its weights; walks of a camera that is given are data too.
+
+        `start` names the model that it begins with, where the learner knows several.
+        """
 
     def untrained(self, scene: Any) -> list[str]:
         """Ids of the objects that have the model and no weights; a learner without it has none."""

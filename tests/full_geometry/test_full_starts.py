@@ -1,0 +1,171 @@
+"""What the network of one object begins with: the network of all shapes beside the half-space."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from waxen import WAX
+
+mi = pytest.importorskip("mitsuba")
+pytest.importorskip("torch")
+
+from full_geometry import storing  # noqa: E402
+from full_geometry.half_space import HalfSpace  # noqa: E402
+from full_geometry.learning import training  # noqa: E402
+from full_geometry.learning.fitting import Recipe  # noqa: E402
+from full_geometry.learning.model_errors import LIGHTS, measure, reference  # noqa: E402
+from full_geometry.learning.pairs import Proposals  # noqa: E402
+from full_geometry.learning.training import Trained, train  # noqa: E402
+from full_geometry.neural_shape import storing as shapes  # noqa: E402
+from full_geometry.rivals import starts  # noqa: E402
+from full_geometry.scene import learnt_means  # noqa: E402
+from full_geometry.subject import Subject, SurfacePoint  # noqa: E402
+from halfspace_sss import Medium, rendering  # noqa: E402
+from halfspace_sss.neural import trained as known_weights  # noqa: E402
+from halfspace_sss.neural.store import load_weights, save_weights  # noqa: E402
+from halfspace_sss.rendering.surface.inside import Inside  # noqa: E402
+from halfspace_sss.rendering.transport.plane import Exit  # noqa: E402
+from halfspace_sss.rendering.transport.protocols import Entry  # noqa: E402
+from halfspace_sss.rendering.transport.settings import Settings  # noqa: E402
+from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
+
+QUICK, CHUNKS = Recipe(width=24, depth=2, batch=1024, chunk=2**13, reuse=2), 4
+SHAPE = shapes.KIND
+
+
+@pytest.fixture(autouse=True)
+def variant() -> None:
+    mi.set_variant("llvm_ad_mono")
+    rendering.register()
+
+
+def subject(radius: float = 3.0) -> Subject:
+    return Subject.of(mi.load_dict({"type": "sphere", "radius": radius}), WAX.channel(1))
+
+
+def learnt(folder: Path, start: str = SHAPE, **more) -> Trained:
+    return train(subject(), chunks=CHUNKS, recipe=QUICK, start=start, folder=folder, **more)
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Trained:
+    mi.set_variant("llvm_ad_mono")
+    return learnt(tmp_path_factory.mktemp("weights"))
+
+
+def points(of: Subject, n: int = 1024) -> list[SurfacePoint]:
+    rng = generator(mi, n, pass_seed(7))
+    return [of.random_points(rng) for _ in range(2)]
+
+
+def S_of(model, of: Subject) -> np.ndarray:
+    exits, entries = points(of)
+    return np.array(model.S(model.prepare(exits), entries))
+
+
+def test_before_any_step_it_is_the_network_of_all_shapes(tmp_path: Path) -> None:
+    with pytest.warns(UserWarning, match="rendered by neural_shape"):
+        found = train(subject(), seconds=0, start=SHAPE, folder=tmp_path)
+    S = S_of(shapes.transport(subject()), subject())
+    assert np.mean(S > 0) > 0.9 and np.allclose(S_of(found.model, subject()), S, rtol=1e-5)
+
+
+def test_few_steps_from_it_are_worth_more_than_from_the_half_space(trained: Trained, tmp_path: Path) -> None:
+    truth = reference(subject(), 128, 8192, seed=5)
+    proposals = Proposals(subject(), HalfSpace(subject(), "better_dipole"))
+    models = {SHAPE: trained.model, "better_dipole": learnt(tmp_path, "better_dipole").model}
+    constant = {}
+    for name, model in models.items():
+        rows = measure(subject(), model, proposals, truth=truth, samples=4096)
+        (constant[name],) = (row for row in rows if row.light == LIGHTS[0])
+    a, b = constant[SHAPE], constant["better_dipole"]
+    assert a.error + 4 * np.hypot(a.standard_error, b.standard_error) < b.error
+
+
+def test_the_file_says_where_it_began_and_gives_the_same_model_again(trained: Trained) -> None:
+    record = json.loads(trained.path.with_suffix(".json").read_text())
+    assert record["recipe"]["start"] == SHAPE and record["recipe"]["rate"] < QUICK.rate
+    assert tuple(record[storing.CHECKSUMS]) == shapes.checksums(subject())
+    again = storing.load(storing.find_weights(subject(), trained.path.parent), subject()).model
+    assert np.array_equal(S_of(again, subject()), S_of(trained.model, subject()))
+    assert not np.allclose(S_of(again, subject()), S_of(shapes.transport(subject()), subject()), rtol=1e-3)
+
+
+def test_renders_ask_the_model_that_was_trained(trained: Trained, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(known_weights.ENVIRONMENT_VARIABLE, str(trained.path.parent))
+    surface = {"type": "translucent", "sigma_s": 0.8, "sigma_a": 0.2, "eta": 1.4, "model": "full_geometry"}
+    shape = mi.load_dict({"type": "sphere", "radius": 3.0, "bsdf": surface})
+    here = Subject.of(shape, WAX.channel(1))
+    inside = Inside("medium", here.media[0], "full_geometry", "multiple", True)
+    transport = learnt_means(here.found, inside, list(here.media), Settings()).transport
+    o, i = points(here)
+    out = Exit(o.p, o.n_out, o.w, mi.Float(here.found.sign), o.n)
+    entry = Entry(i.p, i.n, i.n_out, mi.Float(1), mi.UInt32(0))
+    mu = np.array(mi.Float(sum(a * b for a, b in zip(i.w, i.n_out))))
+    rendered = np.array(transport.S_mu(transport.prepare(out, True), entry, i.w, True))
+    assert np.allclose(rendered, S_of(trained.model, here) * mu, rtol=1e-5)
+    assert set(shapes.checksums(here)) < set(transport.checksums)
+
+
+def test_a_killed_run_ends_with_the_same_weights(trained: Trained, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(training, "CHECKPOINT_EVERY", 0.0)
+
+    def kill(what: str, done: int, total: int) -> None:
+        if done == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        learnt(tmp_path, work=tmp_path / "work", progress=kill)
+    with pytest.raises(ValueError, match="to go on with this work"):
+        learnt(tmp_path, "better_dipole", work=tmp_path / "work")
+    again = learnt(tmp_path, work=tmp_path / "work")
+    assert all(np.array_equal(v, again.model.weights[name]) for name, v in trained.model.weights.items())
+
+
+def test_weights_that_began_with_another_network_of_all_shapes_are_refused(
+    trained: Trained, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    arrays, record = load_weights(shapes.shipped_weights(), SHAPE)
+    other = save_weights(tmp_path / shapes.WEIGHTS, SHAPE, {**arrays, "b_0": arrays["b_0"] + 1}, record)
+    monkeypatch.setattr(shapes, "shipped_weights", lambda: other)
+    monkeypatch.setenv(known_weights.ENVIRONMENT_VARIABLE, str(trained.path.parent))
+    assert not storing.trained(subject())
+    with pytest.raises(ValueError, match="weights of the start neural_shape must be those of training"):
+        storing.load(trained.path, subject())
+
+
+def test_weights_that_do_not_say_where_they_began_are_refused(trained: Trained, tmp_path: Path) -> None:
+    arrays, record = load_weights(trained.path, storing.KIND)
+    path = save_weights(tmp_path / trained.path.name, storing.KIND, arrays, {**record, "recipe": {}})
+    with pytest.raises(ValueError, match="start must be recorded"):
+        storing.load(path, subject())
+
+
+@pytest.mark.parametrize(
+    ("medium", "start", "message"),
+    [
+        (WAX.channel(1), "neural_shap", "start must be one of neural_shape, .*got 'neural_shap'"),
+        (Medium(0.8, 0.2, 0.0, 5.0), SHAPE, "eta must"),
+    ],
+)
+def test_a_start_that_is_none_is_refused_before_any_walk(
+    medium: Medium, start: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(training, "PairSource", None)
+    with pytest.raises(ValueError, match=message):
+        train(mi.load_dict({"type": "sphere"}), medium, start=start, folder=tmp_path)
+
+
+def test_the_table_of_starts_has_all_of_both(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(starts, "STANDARD", QUICK)
+    monkeypatch.setattr(starts, "TIMES", ((0.0, 1.0), (1.0, 0.5)))
+    monkeypatch.setattr(starts.Subject, "given", lambda *_: subject())
+    table = starts.start_table(None, seconds=0.5, exits=64, walks=1024, samples=1024)
+    assert list(table.groupby(["start", "planned"], sort=False).size()) == [2, 2, 2, 2]
+    assert np.all((table["steps"] > 0) == (table["planned"] > 0))
+    assert np.all(table["seconds"][table["planned"] > 0] > 0)
+    begun = table[(table["planned"] == 0) & (table["light"] == LIGHTS[0])].set_index("start")
+    assert begun["error"][SHAPE] < 0.5 * begun["error"]["better_dipole"]
