@@ -87,7 +87,9 @@ def pass_size(scene: Any, seconds: float, seed: int = 0) -> int:
         rendered(scene, spp, seed, 2 * spp)  # some integrators compile for each number of samples
         found.append((spp, rendered(scene, spp, seed, 2 * spp + 1)[1]))
         if found[-1][1] > 0.3 * seconds or spp == most:
-            return min(most, _samples_in(seconds, found))
+            many = min(most, _samples_in(seconds, found))
+            rendered(scene, many, seed, 1)  # compiles
+            return many
         spp = min(most, max(spp + 1, int(spp * min(GROWTH, 0.5 * seconds / found[-1][1]))))
 
 
