@@ -53,8 +53,12 @@ class HalfSpace:
         import mitsuba as mi
 
         query, F_t, above = self.query(exit.at, entry.at)
-        S_0 = mi.Spectrum([m.eval(*query) + F_t * number(floor) for m, floor in zip(self.models, self.floors)])
+        S_0 = mi.Spectrum([m.eval(*query) + F_t * G for m, G in zip(self.models, self.added(exit, entry))])
         return dr.select(above, S_0 * exit.event.P * entry.event.P, 0)
+
+    def added(self, exit: Side, entry: Side) -> list[Any]:
+        """Per channel what stands beside the plane, over F_t(w_o) P_o F_t(w_i) P_i."""
+        return [number(floor) for floor in self.floors]
 
     def query(self, o: SurfacePoint, i: SurfacePoint) -> tuple[tuple, Any, Any]:
         """The query of the models, both Fresnel transmittances, and whether both directions are above the horizons."""

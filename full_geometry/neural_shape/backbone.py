@@ -10,7 +10,6 @@ Light of more events is that of `mixing`.
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Sequence
 from typing import Any
 
@@ -41,20 +40,10 @@ class Backbone(HalfSpace):
         super().__init__(subject, MODEL, FLOOR)
         self.mixtures = mixtures
 
-    @functools.cached_property
-    def floors(self) -> list[float]:
-        """Per channel what S_0 has everywhere."""
-        return [floor + mixture.M for floor, mixture in zip(HalfSpace.floors.func(self), self.mixtures)]
-
-    def __call__(self, exit: Side, entry: Side, active: Any = True) -> Any:
-        """1/((scene unit)² sr), 0 below the horizons."""
-        import drjit as dr
-        import mitsuba as mi
-
-        query, F_t, above = self.query(exit.at, entry.at)
-        everywhere = mi.Spectrum([number(floor) for floor in self.floors]) + self.twice(exit, entry)
-        S_0 = mi.Spectrum([m.eval(*query) for m in self.models]) + F_t * everywhere
-        return dr.select(above, S_0 * exit.event.P * entry.event.P, 0)
+    def added(self, exit: Side, entry: Side) -> list[Any]:
+        """Per channel the floor, what is mixed and what is scattered twice, over F_t(w_o) P_o F_t(w_i) P_i."""
+        everywhere = [number(floor + mixture.M) for floor, mixture in zip(self.floors, self.mixtures)]
+        return [G + S for G, S in zip(everywhere, self.twice(exit, entry))]
 
     def twice(self, exit: Side, entry: Side) -> Any:
         """S_twice/(F_t(w_o) P_o F_t(w_i) P_i) per channel."""

@@ -59,15 +59,11 @@ def mixed(subject: Subject) -> list[Mixed]:
     """What each channel mixes; M and m_2 are 0 where there is no scattering or no volume."""
     at = subject.random_points(generator(_mitsuba(), POINTS, pass_seed(SEED)))
     entering, chord = refract_in(at, number(subject.eta))[1], max(mean_chord(subject), 0.0)
-    kinds = [tuple(kind(m) for m in subject.media) for kind in (_same, _reduced, _unbounded)]
+    kinds = [subject.media, *(tuple(map(kind, subject.media)) for kind in (_reduced, _unbounded))]
     P = [first_event(replace(subject, media=media), at).P for media in kinds]
     through = [entering, entering, 1.0]
     scattered = [[float(np.mean((F_t * p).numpy())) for p in each] for F_t, each in zip(through, P)]
     return [_of(subject, media, parts, chord) for media, parts in zip(zip(*kinds), zip(*scattered))]
-
-
-def _same(m: Medium) -> Medium:
-    return m
 
 
 def _reduced(m: Medium) -> Medium:

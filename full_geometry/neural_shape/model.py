@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from full_geometry.features import Side
 from full_geometry.neural_shape.backbone import Backbone
 from full_geometry.neural_shape.descriptors import CURVED_OWN, CURVED_SHARED, N_OWN, End, Pair, describe, end, medium
 from full_geometry.neural_shape.mixing import mixed
@@ -98,7 +97,7 @@ class NeuralShape:
 
         pairs = describe(self.subject, exit, entry, active)
         f = mi.Spectrum([self._f(pair, numbers) for pair, numbers in zip(pairs, self._media)])
-        S_0 = self.half_space(Side(exit.at, exit.event), Side(entry.at, entry.event))
+        S_0 = self.half_space(exit, entry)
         return dr.select(active, S_0 * dr.exp(f), 0)
 
     def _f(self, pair: Pair, numbers: list[Any]) -> Any:

@@ -10,15 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from full_geometry.features import Side
-from full_geometry.first_event import first_event
 from full_geometry.learning.exits import trace_exits
 from full_geometry.learning.pairs import Proposals
 from full_geometry.neural_shape.backbone import Backbone
 from full_geometry.neural_shape.descriptors import describe, end, medium
 from full_geometry.neural_shape.mixing import mixed
 from full_geometry.subject import Subject, SurfacePoint
-from halfspace_sss.rendering.transport.plane import number
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 __all__ = ["PairData", "make_data"]
@@ -111,9 +108,9 @@ def _half_space(half_space: Backbone, exits: SurfacePoint, entries: SurfacePoint
     import drjit as dr
 
     query, F_t, above = half_space.query(exits, entries)
-    sides = [Side(at, first_event(half_space.subject, at)) for at in (exits, entries)]
+    sides = [half_space.end(at) for at in (exits, entries)]
     factor = dr.select(above, sides[0].event.P[0] * sides[1].event.P[0], 0)
-    everywhere = F_t * (number(half_space.floors[0]) + half_space.twice(*sides)[0])
-    dr.eval(query, everywhere, factor)
-    S_0 = half_space.models[0].eval(*(v.numpy() for v in query)) + everywhere.numpy()
+    added = F_t * half_space.added(*sides)[0]
+    dr.eval(query, added, factor)
+    S_0 = half_space.models[0].eval(*(v.numpy() for v in query)) + added.numpy()
     return S_0 * factor.numpy()
