@@ -66,14 +66,14 @@ def test_what_is_open_mixes_nothing() -> None:
     assert abs(mixed(subject)[0].M) < 1e-9
 
 
-@pytest.mark.parametrize("g", [-0.3, 0.0, 0.6, 0.9])
-def test_they_are_most_of_the_light_of_a_thin_sheet(g: float) -> None:
+@pytest.mark.parametrize(("g", "least"), [(-0.3, 0.75), (0.0, 0.75), (0.6, 0.5), (0.9, 0.5)])
+def test_they_are_most_of_the_light_of_a_thin_sheet(g: float, least: float) -> None:
     subject = Subject.of(make_shape("sheets", 3, 24).mitsuba("sheet"), Medium(0.95, 0.05, g, 1.45).scaled(0.15))
     S_0 = HalfSpace(subject, "neural")
     models = {"mixed": Alone(subject, Backbone(subject, mixed(subject))), "plane": Alone(subject, S_0)}
     found = errors_of(subject, models, exits=64, walks=2048, samples=1024)
     with_mixed, plane = (found[name][0].ratio for name in models)
-    assert plane < 0.3 and 0.5 < with_mixed < 1.25
+    assert plane < 0.3 and least < with_mixed < 1.25
 
 
 def test_light_that_is_scattered_twice_is_the_same_both_ways() -> None:
