@@ -8,11 +8,10 @@ from typing import Any, NamedTuple
 from full_geometry.model import PreparedExit
 from full_geometry.patch_table import PatchTable
 from full_geometry.patches import PatchSampler, PatchWeights
-from halfspace_sss.rendering.surface.horizon import cosine_above, cosine_density
 from halfspace_sss.rendering.surface.object import turned
 from halfspace_sss.rendering.transport.plane import Exit, number
 from halfspace_sss.rendering.transport.positions import PositionSampler
-from halfspace_sss.rendering.transport.protocols import Entry
+from halfspace_sss.rendering.transport.protocols import CosineProposals, Entry
 
 __all__ = ["AREA_SHARE", "LearntProposals"]
 
@@ -27,7 +26,7 @@ class _Prepared(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class LearntProposals:
+class LearntProposals(CosineProposals):
     """Entries by learnt weights of patches, a share of them by probes, with the density of both (balance heuristic).
 
     Args:
@@ -70,9 +69,3 @@ class LearntProposals:
         # of a probe the weight is that of one hit among all, 1/density on average
         scale = dr.select(by_patch, 1, near) / (share * learnt + (1 - share) * near)
         return entry._replace(weight=dr.select(active, entry.weight * scale, 0))
-
-    def sample_direction(self, entry: Entry, out: Exit, u: Any) -> tuple[Any, Any]:
-        return cosine_above(entry.n_out, entry.n_face, u)
-
-    def pdf_direction(self, entry: Entry, out: Exit, w_i: Any) -> Any:
-        return cosine_density(entry.n_out, entry.n_face, w_i)

@@ -187,12 +187,17 @@ class Subject:
 
     def random_points(self, rng: Any) -> SurfacePoint:
         """Points uniform over the area, directions by the cosine to the shading normal, one for each lane of rng."""
+        at = self.random_places(rng)
+        return surface_point(at.p, at.n, at.n_out, cosine_direction(at.n_out, at.n, rng))
+
+    def random_places(self, rng: Any) -> SurfacePoint:
+        """Points uniform over the area, seen along geometric normals: `n_out` is the interpolated one itself."""
         import mitsuba as mi
 
         u_face, u = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
         at = self.points.sample(u_face, u, True)
-        n, n_out = at.n * self.found.sign, turned(at.n_shading, at.n) * self.found.sign
-        return surface_point(at.p, n, n_out, cosine_direction(n_out, n, rng))
+        n = at.n * self.found.sign
+        return surface_point(at.p, n, turned(at.n_shading, at.n) * self.found.sign, n)
 
     def mean_free_paths(self) -> np.ndarray:
         """sigma_t sqrt(area) of each channel: the size of the object in mean free paths."""

@@ -44,6 +44,7 @@ def _steps(scene: Any, n: int) -> dict[str, Callable[[], Any]]:
     import mitsuba as mi
 
     from halfspace_sss.rendering.paths.choice import exit_at
+    from halfspace_sss.rendering.surface.horizon import cosine_above
     from halfspace_sss.rendering.transport.plane import place
 
     (body,) = scene.integrator().prepare(scene)
@@ -53,7 +54,7 @@ def _steps(scene: Any, n: int) -> dict[str, Callable[[], Any]]:
     prepared = body.transport.prepare(out, mi.Bool(True))
     where = body.proposals.prepare(out, prepared, mi.Bool(True))
     entry = body.proposals.sample(out, face, where, sampler, mi.Bool(True))
-    direction = mi.Frame3f(entry.n_out).to_world(mi.warp.square_to_cosine_hemisphere(sampler.next_2d()))
+    direction, _ = cosine_above(entry.n_out, entry.n_face, sampler.next_2d())  # the same for all models
     dr.eval(tuple(out), face, tuple(entry), direction, sampler)  # named tuples are passed over
     ray = place(entry.p, entry.n).spawn_ray(direction)
     dr.eval(ray)

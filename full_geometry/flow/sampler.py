@@ -12,11 +12,10 @@ from full_geometry.flow.context import context
 from full_geometry.model import PreparedExit
 from full_geometry.patch_table import PatchTable
 from full_geometry.patches import PatchSampler, PatchWeights
-from halfspace_sss.rendering.surface.horizon import cosine_above, cosine_density
 from halfspace_sss.rendering.surface.object import turned
 from halfspace_sss.rendering.transport.area_points import Point
 from halfspace_sss.rendering.transport.plane import Exit, number
-from halfspace_sss.rendering.transport.protocols import Entry
+from halfspace_sss.rendering.transport.protocols import CosineProposals, Entry
 
 __all__ = ["FlowProposals", "FlowSampler"]
 
@@ -60,7 +59,7 @@ class _Prepared(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class FlowProposals:
+class FlowProposals(CosineProposals):
     """The proposals of a flow; directions by the cosine.
 
     Args:
@@ -87,9 +86,3 @@ class FlowProposals:
         n_out = turned(at.n_shading, at.n) * number(self.sign)
         weight = dr.select(active & (density > 0), 1 / density, 0)
         return Entry(mi.Point3f(at.p), mi.Normal3f(at.n), mi.Normal3f(n_out), weight, mi.UInt32(at.prim_index))
-
-    def sample_direction(self, entry: Entry, out: Exit, u: Any) -> tuple[Any, Any]:
-        return cosine_above(entry.n_out, entry.n_face, u)
-
-    def pdf_direction(self, entry: Entry, out: Exit, w_i: Any) -> Any:
-        return cosine_density(entry.n_out, entry.n_face, w_i)

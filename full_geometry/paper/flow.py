@@ -18,8 +18,9 @@ import zuko
 from full_geometry.features import Frame
 from full_geometry.model import FullGeometry
 from full_geometry.paper.network import placed
-from full_geometry.subject import Subject, SurfacePoint
+from full_geometry.subject import Subject, SurfacePoint, surface_point
 from halfspace_sss.checks import check_interval
+from halfspace_sss.rendering.surface.horizon import cosine_above
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 __all__ = ["SpaceFlow", "fit_space_flow", "incidence", "mesh_arrays", "on_surface", "rmsd"]
@@ -53,19 +54,24 @@ class SpaceFlow:
 
 
 def incidence(model: FullGeometry, exits: SurfacePoint, points: SurfacePoint) -> np.ndarray:
-    """t of pairs of exits and points, mean over channels: S mu over a grid of directions, uniform by the cosine."""
+    """t of pairs of exits and points, mean over channels: S mu over a grid of directions, uniform by the cosine.
+
+    Args:
+        model: of the object.
+        exits: one for each point.
+        points: of entry, with interpolated normals, see `Subject.random_places`.
+    """
     import drjit as dr
     import mitsuba as mi
 
     n, (rows, columns) = dr.width(exits.p), GRID
     prepared = model.prepare(exits)
     total, k = mi.Float(0), mi.UInt32(0)
-    local = mi.Frame3f(points.n_out)
 
     def add(k: Any, total: Any) -> tuple:
         u = mi.Point2f((mi.Float(k % rows) + 0.5) / rows, (mi.Float(k // rows) + 0.5) / columns)
-        w = local.to_world(mi.warp.square_to_cosine_hemisphere(u))
-        return k + 1, total + dr.mean(model.S(prepared, points._replace(w=w)))
+        w, _ = cosine_above(points.n_out, points.n, u)
+        return k + 1, total + dr.mean(model.S(prepared, surface_point(points.p, points.n, points.n_out, w)))
 
     k, total = dr.while_loop((k, total + dr.zeros(mi.Float, n)), lambda k, _: k < rows * columns, add)
     return np.array(total) * np.pi / (rows * columns)
@@ -106,7 +112,7 @@ def _pairs(model: FullGeometry, frame: Frame, seed: tuple[int, ...]) -> tuple[np
     n = PAIRS * POINTS
     exits = model.subject.random_points(generator(mi, PAIRS, pass_seed(*seed, 0)))
     exits = exits.gather(dr.arange(mi.UInt32, n) // POINTS)
-    points = model.subject.random_points(generator(mi, n, pass_seed(*seed, 1)))
+    points = model.subject.random_places(generator(mi, n, pass_seed(*seed, 1)))
     t = incidence(model, exits, points)
     return placed(frame, exits, n), placed(frame, points, n)[:, :3], (t / t.mean()).astype(np.float32)
 

@@ -18,7 +18,8 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("zuko")
 pytest.importorskip("igl")
 
-from waxen import BUNNY, random_layers, random_patches, wax_bunny  # noqa: E402
+from coarse import coarse_ball  # noqa: E402
+from waxen import BUNNY, WAX, random_layers, random_patches, wax_bunny  # noqa: E402
 
 from full_geometry.alpha_p.model import AlphaP  # noqa: E402
 from full_geometry.alpha_p.training import fit_alpha_p  # noqa: E402
@@ -35,10 +36,10 @@ from full_geometry.learning.model_errors import reference  # noqa: E402
 from full_geometry.paper import learner  # noqa: E402
 from full_geometry.paper import network as paper  # noqa: E402
 from full_geometry.paper.errors import paper_errors  # noqa: E402
-from full_geometry.paper.flow import mesh_arrays, on_surface, rmsd  # noqa: E402
+from full_geometry.paper.flow import incidence, mesh_arrays, on_surface, rmsd  # noqa: E402
 from full_geometry.paper.lights import measured_lights, random_lights  # noqa: E402
 from full_geometry.rivals.command import _errors_wide, markdown  # noqa: E402
-from full_geometry.subject import Subject  # noqa: E402
+from full_geometry.subject import Subject, SurfacePoint  # noqa: E402
 from halfspace_sss.cli import app as cli  # noqa: E402
 from halfspace_sss.rendering.transport.protocols import Entry  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
@@ -132,6 +133,23 @@ def test_points_are_laid_onto_the_nearest_triangle(subject: Subject) -> None:
     d = np.sum((laid - centres[chosen]) * normals, axis=1) / np.linalg.norm(normals, axis=1)
     assert np.abs(d).max() < 1e-9
     assert rmsd(centres, vertices, faces) < 1e-12 < 1e-5 < rmsd(away, vertices, faces)
+
+
+class EvenS:
+    """S = 1 above the horizons."""
+
+    def prepare(self, exits: SurfacePoint) -> None:
+        return None
+
+    def S(self, prepared: None, at: SurfacePoint) -> object:
+        return mi.Spectrum(dr.select((dr.dot(at.w, at.n) > 0) & (dr.dot(at.w, at.n_out) > 0), 1, 0))
+
+
+def test_an_even_S_takes_pi_from_all_directions_also_below_interpolated_horizons(tmp_path: Path) -> None:
+    ball = Subject.of(mi.load_dict(coarse_ball(tmp_path)), WAX)
+    places = ball.random_places(generator(mi, 512, pass_seed(3)))
+    assert np.array(dr.dot(places.n, places.n_out)).min() < 0.97
+    assert np.allclose(incidence(EvenS(), places, places), np.pi, rtol=1e-5)
 
 
 @pytest.mark.parametrize("kind", LIGHTINGS)

@@ -9,11 +9,10 @@ import drjit as dr
 import mitsuba as mi
 
 from halfspace_sss.physics.medium import Medium
-from halfspace_sss.rendering.surface.horizon import cosine_above, cosine_density
 from halfspace_sss.rendering.surface.inside import Inside
 from halfspace_sss.rendering.surface.object import Object
 from halfspace_sss.rendering.transport.plane import Exit, number
-from halfspace_sss.rendering.transport.protocols import Entry, Means
+from halfspace_sss.rendering.transport.protocols import CosineProposals, Entry, Means
 from halfspace_sss.rendering.transport.settings import Settings
 
 __all__ = ["LambertProposals", "LambertTransport", "lambert_means"]
@@ -44,7 +43,7 @@ class LambertTransport:
 
 
 @dataclass(frozen=True, eq=False)
-class LambertProposals:
+class LambertProposals(CosineProposals):
     """The exit itself, directions by the cosine."""
 
     def prepare(self, out: Exit, prepared: Any, active: Any) -> None:
@@ -53,12 +52,6 @@ class LambertProposals:
     def sample(self, out: Exit, prim_index: Any, prepared: None, sampler: Any, active: Any) -> Entry:
         n = mi.Normal3f(out.n_face * out.sign)
         return Entry(mi.Point3f(out.p), n, mi.Normal3f(out.n), dr.select(active, mi.Float(1), 0), prim_index)
-
-    def sample_direction(self, entry: Entry, out: Exit, u: Any) -> tuple[Any, Any]:
-        return cosine_above(entry.n_out, entry.n_face, u)
-
-    def pdf_direction(self, entry: Entry, out: Exit, w_i: Any) -> Any:
-        return cosine_density(entry.n_out, entry.n_face, w_i)
 
 
 def lambert_means(found: Object, inside: Inside, media: list[Medium], settings: Settings) -> Means:

@@ -10,11 +10,11 @@ from typing import Any, NamedTuple, Protocol
 
 import drjit as dr
 
-from halfspace_sss.rendering.surface.horizon import lifted
+from halfspace_sss.rendering.surface.horizon import cosine_above, cosine_density, lifted
 from halfspace_sss.rendering.surface.object import turned
 from halfspace_sss.rendering.transport.plane import Exit
 
-__all__ = ["Entry", "Means", "Proposals", "Transport"]
+__all__ = ["CosineProposals", "Entry", "Means", "Proposals", "Transport"]
 
 
 class Entry(NamedTuple):
@@ -55,6 +55,16 @@ class Proposals(Protocol):
 
     def pdf_direction(self, entry: Entry, out: Exit, w_i: Any) -> Any:
         """The density of `sample_direction`, 1/sr; 0 below the surface."""
+
+
+class CosineProposals(Proposals, Protocol):
+    """Proposals whose directions are by the cosine to the interpolated normal, above the surface."""
+
+    def sample_direction(self, entry: Entry, out: Exit, u: Any) -> tuple[Any, Any]:
+        return cosine_above(entry.n_out, entry.n_face, u)
+
+    def pdf_direction(self, entry: Entry, out: Exit, w_i: Any) -> Any:
+        return cosine_density(entry.n_out, entry.n_face, w_i)
 
 
 class Transport(Protocol):
