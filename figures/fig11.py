@@ -34,7 +34,7 @@ SIZES = {"draft": 96, "paper": 384}
 SECONDS = {"draft": 2.0, "paper": 60.0}  # for an image
 TRAIN_SECONDS = {"draft": 24.0, "paper": 240.0}  # CPU time for each material: half of it on two cores
 TRUTH_SPP = {"draft": 256, "paper": 16384}
-PASSES, SHORTEST = 8, 0.5  # of an image, about; seconds, of a pass: a render has a cost of its own
+PASSES, SHORTEST = 8, 1.0  # of an image, about; seconds, of a pass: a render has a cost of its own
 NOTES = (
     "Every method had the same time, compilation and the training of `full_geometry` left out; passes of all methods "
     "took turns on the same machine. Of "

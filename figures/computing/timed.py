@@ -15,7 +15,7 @@ from halfspace_sss.progress import Progress
 __all__ = ["Timed", "alternating", "pass_size", "rendered"]
 
 MOST_LANES = 2**22  # camera rays of a pass, for memory
-GROWTH = 16
+GROWTH, TOLERANCE, MOST_TRIALS = 16, 0.15, 8  # of the number of samples of a pass that is looked for
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,20 +82,20 @@ def pass_size(scene: Any, seconds: float, seed: int = 0) -> int:
     check_interval("seconds", seconds, 1e-6, 1e6)
     pixels = int(np.prod(np.array(scene.sensors()[0].film().crop_size())))
     most, spp, found = max(1, MOST_LANES // pixels), 1, []
-    rendered(scene, spp, seed, 0)  # compiles
-    while True:
-        rendered(scene, spp, seed, 2 * spp)  # some integrators compile for each number of samples
-        found.append((spp, rendered(scene, spp, seed, 2 * spp + 1)[1]))
-        if found[-1][1] > 0.3 * seconds or spp == most:
-            many = min(most, _samples_in(seconds, found))
-            rendered(scene, many, seed, 1)  # compiles
-            return many
-        spp = min(most, max(spp + 1, int(spp * min(GROWTH, 0.5 * seconds / found[-1][1]))))
+    for k in range(MOST_TRIALS):
+        rendered(scene, spp, seed, 2 * k)  # compiles, in some integrators for each number of samples
+        found.append((spp, rendered(scene, spp, seed, 2 * k + 1)[1]))
+        least = 1 if k or found[-1][1] > seconds else 2  # one sample may have taken what any render takes
+        wanted = min(most, GROWTH * spp, max(least, _samples_in(seconds, found)))
+        if abs(wanted - spp) <= TOLERANCE * spp:
+            break
+        spp = wanted
+    return found[-1][0]
 
 
 def _samples_in(seconds: float, found: list[tuple[int, float]]) -> int:
     """Samples in so many seconds from what the smallest and the largest number took: a render has a cost of its own."""
-    (few, least), (many, longest) = found[0], found[-1]
+    (few, least), (many, longest) = min(found), max(found)
     each = longest / many if many == few else max((longest - least) / (many - few), 0.2 * longest / many)
     return max(1, many + round((seconds - longest) / each))
 
