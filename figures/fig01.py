@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,7 +21,7 @@ from figures.drawing.shot import Shot, compared
 from figures.drawing.style import paper, saved
 from figures.learnt.training import object_parts, train_modelled
 from figures.learnt.weights import FULL_GEOMETRY, training_of, with_weights
-from figures.modelling.grid import tissue
+from figures.modelling.grid import TISSUES, tissue
 from figures.parts.part import Part, Result, Task
 
 __all__ = ["TITLE", "draw", "parts", "shown"]
@@ -37,7 +36,6 @@ SPP_PER_PASS = 16
 RESOLUTION = {"draft": 64, "paper": 240}  # of surfaces; grids have half of it
 TRAIN_SECONDS = {"draft": 24, "paper": 240}  # CPU time: half of it on two cores
 LIGHT = "sunset"  # the small lamps of the studio are hardly found by walks
-TISSUES = Path(__file__).parent / "modelling" / "tissues.toml"
 NOTES = (
     "The candle is homogeneous wax with its flame as a small emitter in the bowl; mandarin and croissant are grid "
     "volumes, of which the half-space takes the means. Smooth boundaries, all scattering orders. FLIP and relative "

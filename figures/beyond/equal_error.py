@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from figures.beyond.modelled import MODELLED, long_modelled, modelled_contender
 from figures.computing.contenders import MODELS, OF_OBJECTS, VOLUMES, WALK, contender, long_walk
 from figures.computing.denoise import guides
 from figures.computing.furnace import furnace, furnace_models
@@ -15,14 +17,18 @@ from figures.computing.sampling_cost import split
 from figures.computing.scenes import BUNNY, MATERIALS, SCANS, prepare
 from figures.computing.timed import Timed, alternating, rendered
 from figures.drawing import error_tables
-from figures.learnt.training import train_scan
+from figures.learnt.training import train_modelled, train_scan
 from figures.learnt.weights import FULL_GEOMETRY, TRAINING, training_of, with_weights
+from figures.modelling.grid import TISSUES, tissue
+from figures.modelling.scene_parts import VARYING
 from figures.parts.part import Part, Result, Task
 from halfspace_sss import materials
+from halfspace_sss.physics.medium import Medium
 
 __all__ = ["TITLE", "draw", "errors", "measured", "parts"]
 
 TITLE = "time to equal error against Mitsuba's volume path tracer, time per sample, white furnace"
+OBJECTS = MODELLED
 SUBJECTS = {name: ("bunny", name) for name in MATERIALS} | {"dragon of potato": ("dragon", "potato")}
 LIGHTS = ("small light", "even sky")
 TRUTH = "truth"  # last word of the names of parts
@@ -39,6 +45,7 @@ SPP = {  # of a pass; one that is much shorter would show what a render costs be
 }
 BARE_MODELS = {"draft": (MODELS[0], MODELS[-1]), "paper": MODELS}  # most of the time of a draft goes into compiling
 TRAIN_SECONDS = {"draft": 20.0, "paper": 240.0}  # CPU time for each object: half of it on two cores
+RESOLUTION = {"draft": 64, "paper": 192}  # of modelled objects
 LANES = {"draft": 2**18, "paper": 2**22}
 FURNACE = {"draft": {"size": 16, "spp": 256}, "paper": {"size": 32, "spp": 16384}}
 
@@ -49,6 +56,10 @@ def parts(quality: str) -> list[Part]:
     for name, (scan, material) in SUBJECTS.items():
         if FULL_GEOMETRY in OF_OBJECTS:
             found.append(train_scan(name, material, TRAIN_SECONDS[quality], scan=scan))
+        for lights in LIGHTS:
+            found += _parts_of(name, lights, quality)
+    for name in OBJECTS:
+        found.append(train_modelled(name, RESOLUTION[quality], TRAIN_SECONDS[quality]))
         for lights in LIGHTS:
             found += _parts_of(name, lights, quality)
     weights = weight_files("neural", materials.load(SPLIT_MATERIAL).medium)
@@ -71,9 +82,10 @@ def _furnace_name(method: str) -> str:
 
 
 def _parts_of(name: str, lights: str, quality: str) -> list[Part]:
-    (scan, material), size, spp = SUBJECTS[name], SIZES[quality], SPP[quality]
-    common = {"scan": scan, "material": material, "size": size, "lights": lights}
-    methods = [*VOLUMES, WALK, *MODELS, *OF_OBJECTS]
+    of_subject, file, medium = _subject(name, quality)
+    common, spp = {**of_subject, "size": SIZES[quality], "lights": lights}, SPP[quality]
+    known = (model for model in OF_OBJECTS if name not in VARYING or model == FULL_GEOMETRY)  # of media that vary
+    methods = [*VOLUMES, WALK, *MODELS, *known]
     if name in BARE_MATERIALS:
         methods += [f"{model}, {BARE}" for model in BARE_MODELS[quality]]
     kinds = {method: "volume" if method in VOLUMES else WALK if method == WALK else "model" for method in methods}
@@ -81,16 +93,24 @@ def _parts_of(name: str, lights: str, quality: str) -> list[Part]:
         **common, "passes": PASSES[quality], "spp": {method: spp[kinds[method]] for method in methods}, "seed": 1,
         "sampler": SAMPLER,
     }  # fmt: skip
-    work = sum(params["spp"].values()) * params["passes"] * size**2
-    truth, file = f"{name}, {lights}, {TRUTH}", SCANS[scan].file
+    work = sum(params["spp"].values()) * params["passes"] * SIZES[quality] ** 2
+    truth = f"{name}, {lights}, {TRUTH}"
     needs = (truth, *((training_of(name),) if FULL_GEOMETRY in OF_OBJECTS else ()))
     models = (method for method in methods if kinds[method] == "model" and BARE not in method)
-    inputs = (file, *(f for model in models for f in weight_files(model, materials.load(material).medium)))
-    long = {**common, "spp": TRUTH_SPP[quality], "seed": 0}
+    inputs = (file, *(f for model in models for f in weight_files(model, medium)))
+    long, trace = {**common, "spp": TRUTH_SPP[quality], "seed": 0}, long_modelled if name in OBJECTS else long_walk
     return [
-        Part(truth, long_walk, long, long["spp"] * size**2, inputs=(file,)),
+        Part(truth, trace, long, long["spp"] * SIZES[quality] ** 2, inputs=(file,)),
         Part(_errors_name(name, lights), measured, params, work, needs=needs, inputs=inputs),
     ]
+
+
+def _subject(name: str, quality: str) -> tuple[dict[str, Any], Path, Medium]:
+    """What of the parameters of its parts tells an object, the file that it depends on, and its medium."""
+    if name in OBJECTS:
+        return {"object": name, "resolution": RESOLUTION[quality]}, TISSUES, tissue("candle wax").medium
+    scan, material = SUBJECTS[name]
+    return {"scan": scan, "material": material}, SCANS[scan].file, materials.load(material).medium
 
 
 def measured(task: Task) -> dict[str, Any]:
@@ -120,8 +140,11 @@ def _compiled(task: Task) -> dict[str, Any]:
     p, scenes = task.params, {}
     for k, (name, spp) in enumerate(p["spp"].items()):
         method, _, bare = name.partition(", ")
-        more = (bare == BARE, p["sampler"], p["scan"])
-        scenes[name] = contender(method, p["material"], p["size"], p["lights"], *more)
+        if "object" in p:
+            scenes[name] = modelled_contender(method, p, task.folder, p["sampler"])
+        else:
+            more = (bare == BARE, p["sampler"], p["scan"])
+            scenes[name] = contender(method, p["material"], p["size"], p["lights"], *more)
         rendered(scenes[name], spp, p["seed"])
         task.progress(k, 2 * len(p["spp"]))
     return scenes
@@ -166,7 +189,7 @@ def _standard_error(pixels: np.ndarray) -> float:
 
 def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
     """The tables: all numbers as CSV, and what they say as Markdown."""
-    scenes = {(name, lights): _errors_name(name, lights) for name in SUBJECTS for lights in LIGHTS}
+    scenes = {(name, lights): _errors_name(name, lights) for name in (*SUBJECTS, *OBJECTS) for lights in LIGHTS}
     furnaces = {method: _furnace_name(method) for method in (WALK, *furnace_models())}
 
     def numbers(names: Mapping[Any, str]) -> dict[Any, Mapping[str, Any]]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,7 +15,7 @@ from figures.drawing.image_grid import image_grid
 from figures.drawing.page import page
 from figures.drawing.shot import Shot
 from figures.drawing.style import paper, saved
-from figures.modelling.grid import Grid
+from figures.modelling.grid import TISSUES, Grid
 from figures.modelling.scene_parts import OBJECTS, VARYING, Varying, candle_parts, make_varying, varying_parts
 from figures.parts.part import Part, Result, Task
 from halfspace_sss.provenance import check_folder
@@ -61,7 +60,7 @@ def parts(quality: str) -> list[Part]:
     size, spp, found = SIZES[quality], SPP[quality], []
     for name in OBJECTS:
         params = {"object": name, "size": size, "spp": spp, "resolution": RESOLUTION[quality], "seed": 0}
-        inputs = (environment_file(VIEWS[name].light), Path(__file__).parents[1] / "modelling" / "tissues.toml")
+        inputs = (environment_file(VIEWS[name].light), TISSUES)
         params |= {"view": list(VIEWS[name])}
         function = varying if name in VARYING else candle
         found.append(Part(name, function, params, spp * size**2, inputs=inputs))

@@ -7,13 +7,16 @@ from typing import Any
 import numpy as np
 
 from figures.computing.long_render import long_render
-from figures.computing.scenes import SCANS, prepare, scan_scene
+from figures.computing.scenes import prepare, scan_scene
 from figures.parts.part import Task
 from halfspace_sss.neural.symmetric import channels
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.surface.transports import model_names
 
-__all__ = ["ENTRIES", "MODELS", "OF_OBJECTS", "RR_DEPTHS", "VOLUMES", "WALK", "contender", "long_walk", "volume"]
+__all__ = [
+    "ENTRIES", "MODELS", "OF_OBJECTS", "RR_DEPTHS", "VOLUMES", "WALK", "contender", "long_passes", "long_walk", "ready",
+    "volume",
+]  # fmt: skip
 
 MODELS = ("standard_dipole", "better_dipole", "directional_dipole", "photon_beam_diffusion", "neural")
 OF_OBJECTS = tuple(name for name in ("neural_shape", "full_geometry") if name in model_names())
@@ -36,45 +39,62 @@ def contender(
     method: str, material: str, size: int, lights: str, bare: bool = False, sampler: str = "independent",
     scan: str = "bunny",
 ) -> Any:  # fmt: skip
-    """The Mitsuba scene of an object for a method, or three, one for each channel; `timed.rendered` takes both.
+    """The scene of a scanned object for a method, see `ready`.
+
+    Args:
+        method, bare: as in `ready`.
+        material, size, lights, sampler, scan: as in `figures.computing.scenes.scan_scene`.
+
+    Raises:
+        ValueError: no such method, material or lights.
+    """
+    from halfspace_sss import materials
+
+    description = scan_scene(scan, material, size, lights, sampler=sampler)
+    return ready(method, description, scan, materials.load(material).medium, bare)
+
+
+def ready(method: str, description: dict[str, Any], name: str, medium: Medium, bare: bool = False) -> Any:
+    """The Mitsuba scene for a method, or three, one for each channel; `timed.rendered` takes both.
 
     Mitsuba's media have one phase function for all channels: it is given the channels of others one by one.
 
     Args:
         method: a name in `VOLUMES`, `WALK`, or a model; `full_geometry` must have been trained.
-        material, size, lights, sampler, scan: as in `figures.computing.scenes.scan_scene`.
+        description: of the scene, with millimetres of its unit in the integrator; it is changed.
+        name: of the object in it.
+        medium: of the object, 1/mm; of one that varies any with its mean cosine.
         bare: whether a model is left without surface reflection and without the single scattering that it lacks.
 
     Raises:
-        ValueError: no such method, material or lights.
+        ValueError: no such method.
     """
-    from halfspace_sss import bssrdf, materials
+    from halfspace_sss import bssrdf
     from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED, load_scene
 
-    description = scan_scene(scan, material, size, lights, sampler=sampler)
     if method in VOLUMES:
-        return _volume_scene(description, scan, materials.load(material).medium, int(method.split()[1]))
+        return _volume_scene(description, name, medium, int(method.split()[1]))
     if method == WALK:
         return load_scene(description, PATH_TRACED)
     description["integrator"]["entries"] = ENTRIES.get(method, 1)
     if not bare:
         return load_scene(description, method)
-    description[scan]["bsdf"]["reflection"] = False
-    return load_scene(description, method, bssrdf(method, materials.load(material).medium).orders)
+    description[name]["bsdf"]["reflection"] = False
+    return load_scene(description, method, bssrdf(method, medium).orders)
 
 
-def _volume_scene(description: dict[str, Any], scan: str, medium: Medium, rr_depth: int) -> Any:
+def _volume_scene(description: dict[str, Any], name: str, medium: Medium, rr_depth: int) -> Any:
     from halfspace_sss.rendering.scenes.mitsuba_scene import with_media
 
     integrator = {"type": _VOLUME, "max_depth": -1, "rr_depth": rr_depth, "hide_emitters": True}
-    mm_per_unit = SCANS[scan].mm_per_unit
+    mm_per_unit = description["integrator"].get("mm_per_unit", 1.0)
     if np.ptp(medium.g) == 0:
         return with_media(description, mm_per_unit, integrator)
     found = []
     for channel in channels(medium):
         values = {key: float(getattr(channel, key)) for key in ("sigma_s", "sigma_a", "g", "eta")}
-        one = {**description[scan], "bsdf": {"type": "translucent", **values}}
-        found.append(with_media({**description, scan: one}, mm_per_unit, integrator))
+        one = {**description[name], "bsdf": {"type": "translucent", **values}}
+        found.append(with_media({**description, name: one}, mm_per_unit, integrator))
     return tuple(found)
 
 
@@ -85,7 +105,10 @@ def long_walk(task: Task) -> dict[str, Any]:
     """
     prepare()
     p = task.params
-    each = min(max(p["spp"] // 8, 1), LONG_PASS)
-    passes = max(p["spp"] // each, 2)
-    scene = contender(WALK, p["material"], p["size"], p["lights"], scan=p.get("scan", "bunny"))
-    return long_render(task, scene, each, passes)
+    return long_passes(task, contender(WALK, p["material"], p["size"], p["lights"], scan=p.get("scan", "bunny")))
+
+
+def long_passes(task: Task, scene: Any) -> dict[str, Any]:
+    """`long_render` of the samples per pixel "spp" of a task, in passes that are its eighth at most."""
+    each = min(max(task.params["spp"] // 8, 1), LONG_PASS)
+    return long_render(task, scene, each, max(task.params["spp"] // each, 2))

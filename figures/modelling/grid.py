@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -16,15 +15,16 @@ from halfspace_sss.materials.files import parse
 from halfspace_sss.materials.material import Material
 from halfspace_sss.provenance import write_atomically
 
-__all__ = ["Grid", "mixed", "tissue"]
+__all__ = ["TISSUES", "Grid", "mixed", "tissue"]
+
+TISSUES = Path(__file__).with_name("tissues.toml")
 
 Tissues = Callable[[np.ndarray], Mapping[str, np.ndarray]]
 
 
 @functools.cache
 def _tissues() -> dict[str, Material]:
-    file = resources.files("figures.modelling") / "tissues.toml"
-    return {material.name: material for material in parse(file.read_text(encoding="utf-8"), "tissues.toml")}
+    return {material.name: material for material in parse(TISSUES.read_text(encoding="utf-8"), TISSUES.name)}
 
 
 def tissue(name: str) -> Material:

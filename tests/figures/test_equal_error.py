@@ -11,6 +11,7 @@ import pandas
 import pytest
 
 from figures.beyond import equal_error
+from figures.beyond.modelled import MODELLED, modelled_contender, modelled_scene
 from figures.computing.contenders import MODELS, VOLUMES, WALK, contender
 from figures.computing.furnace import furnace, furnace_models
 from figures.computing.sampling_cost import STEPS
@@ -48,6 +49,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Result]:
         patch.setattr(training, "train_by_cpu", lambda *a, **how: train(*a, **{**how, "recipe": QUICK}))
         patch.setitem(equal_error.TRAIN_SECONDS, "draft", 0.01)
         patch.setattr(equal_error, "SUBJECTS", {"ketchup": ("bunny", "ketchup")})
+        patch.setattr(equal_error, "OBJECTS", ())
         patch.setattr(equal_error, "LIGHTS", ("even sky",))
         patch.setattr(equal_error, "furnace_models", lambda: [DIPOLE])
         for name, value in (("SIZES", 24), ("TRUTH_SPP", 64), ("LANES", 4096), ("FURNACE", {"size": 8, "spp": 64})):
@@ -216,15 +218,41 @@ def test_scenes_of_one_channel_each_make_one_image() -> None:
     np.testing.assert_allclose(rendered(scenes, 4, 1)[0].mean(axis=(0, 1)), [1, 5, 9], rtol=1e-5)
 
 
-def test_the_figure_covers_five_materials_a_dragon_two_lights_and_every_model() -> None:
+@pytest.mark.parametrize("shown", MODELLED)
+def test_modelled_objects_are_shown_alike_to_walks_and_to_mitsuba(shown: str, tmp_path: Path) -> None:
+    """Means of two images of 16 x 16 pixels, within four standard errors of passes and 3 % for Mitsuba's horizon."""
+    prepare()
+    p = {"object": shown, "resolution": 24, "size": 16, "lights": "even sky"}
+    means = []
+    for method in (WALK, VOLUMES[-1]):
+        scene = modelled_contender(method, p, tmp_path)
+        means.append([rendered(scene, 4, k)[0].mean(axis=(0, 1)) for k in range(4)])
+    found, wanted = (np.mean(m, axis=0) for m in means)
+    noise = np.hypot(*(np.std(m, axis=0, ddof=1) / 2 for m in means))
+    assert np.all(np.abs(found - wanted) < 4 * noise + 0.03 * wanted) and np.all(noise < 0.1 * wanted)
+
+
+def test_the_small_light_of_the_candle_is_its_flame_and_that_of_others_a_lamp(tmp_path: Path) -> None:
+    prepare()
+    lights = {name: modelled_scene(name, 16, 8, "small light", tmp_path) for name in MODELLED}
+    assert "lamp" not in lights["candle"] and "emitter" in lights["candle"]["flame"]
+    assert "emitter" in lights["mandarin"]["lamp"] and all("sky" not in found for found in lights.values())
+    assert set(modelled_scene("candle", 16, 8, "even sky", tmp_path)) & {"sky", "flame", "wick"} == {"sky"}
+    with pytest.raises(ValueError, match="lights must be one of small light, even sky"):
+        modelled_scene("candle", 16, 8, "dusk", tmp_path)
+
+
+def test_the_figure_covers_scans_and_modelled_objects_two_lights_and_every_model() -> None:
     draft, paper = equal_error.parts("draft"), equal_error.parts("paper")
     assert [part.name for part in draft] == [part.name for part in paper]
     assert f"{MODELS[1]}, bare" in paper[2].params["spp"]
     scenes = [part for part in draft if part.name.endswith(", errors")]
-    assert len(scenes) == 12
+    assert len(scenes) == 16
     for part in scenes:
         assert {*VOLUMES, WALK, *MODELS, LEARNT} <= set(part.params["spp"])
         assert any(name.endswith(", training") for name in part.needs)
-    assert sum(part.params["scan"] == "dragon" for part in scenes) == 2
+    assert sum(part.params.get("scan") == "dragon" for part in scenes) == 2
+    assert [part.params["object"] for part in scenes if "object" in part.params] == [n for n in MODELLED for _ in "ab"]
+    assert all(("neural_shape" in part.params["spp"]) == (part.params.get("object") != "mandarin") for part in scenes)
     assert sum(BARE in part.params["spp"] for part in scenes) == 6
     assert all(b.work > 4 * a.work for a, b in zip(draft, paper))
