@@ -114,11 +114,11 @@ def _subject(name: str, quality: str) -> tuple[dict[str, Any], Path, Medium]:
 
 
 def measured(task: Task) -> dict[str, Any]:
-    """Errors and times of all methods, whose passes take turns, and the seconds of training."""
+    """Errors and CPU seconds of all methods, whose passes take turns, and those of training."""
     prepare()
     p = task.params
     (truth,) = (found for name, found in task.needed.items() if name.endswith(TRUTH))
-    seconds = [found.numbers["seconds"] for name, found in task.needed.items() if name.endswith(TRAINING)]
+    seconds = [found.numbers["cpu seconds"] for name, found in task.needed.items() if name.endswith(TRAINING)]
 
     def progress(done: int, total: int) -> None:
         task.progress(total + done, 2 * total)
@@ -172,7 +172,7 @@ def errors(timed: Timed, truth: Result, mask: np.ndarray, is_exact: bool) -> dic
     bias2 = np.zeros_like(error) if is_exact else error - spread
     return {
         "spp": timed.spp // count,
-        "seconds": timed.typical_seconds,
+        "seconds": timed.typical_cpu_seconds,
         "variance": float(np.mean(error if is_exact else spread)),
         "bias2": float(np.mean(bias2)),
         "bias2 standard error": _standard_error(bias2),

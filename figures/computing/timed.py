@@ -26,11 +26,13 @@ class Timed:
         images: of each pass, linear radiance, float32 (passes, H, W, 3).
         spp: samples per pixel of all together.
         pass_seconds: of each pass, without compilation.
+        pass_cpu_seconds: of all threads, which other work on the machine does not lengthen.
     """
 
     images: np.ndarray
     spp: int
     pass_seconds: tuple[float, ...]
+    pass_cpu_seconds: tuple[float, ...]
 
     @property
     def image(self) -> np.ndarray:
@@ -43,9 +45,9 @@ class Timed:
         return float(sum(self.pass_seconds))
 
     @property
-    def typical_seconds(self) -> float:
-        """Of a pass: the median, on which what delays a few of them on a busy machine has no influence."""
-        return float(np.median(self.pass_seconds))
+    def typical_cpu_seconds(self) -> float:
+        """Of a pass: the median."""
+        return float(np.median(self.pass_cpu_seconds))
 
 
 def rendered(scene: Any, spp: int, *seed: int) -> tuple[np.ndarray, float]:
@@ -123,6 +125,7 @@ def alternating(
     check_interval("seconds", seconds or 1.0, 1e-6, 1e6)
     images: dict[str, list[np.ndarray]] = {name: [] for name in scenes}
     times: dict[str, list[float]] = {name: [] for name in scenes}
+    of_cpu: dict[str, list[float]] = {name: [] for name in scenes}
 
     def share(name: str) -> float:
         """Done of what is to be done; half a pass before the end of the time it is all done."""
@@ -133,9 +136,14 @@ def alternating(
 
     while waiting := [name for name in scenes if share(name) < 1]:
         for name in waiting:
+            began = time.process_time()
             image, took = rendered(scenes[name], spp[name], seed, list(scenes).index(name), len(times[name]) + 1)
+            of_cpu[name].append(time.process_time() - began)
             images[name].append(image)
             times[name].append(took)
             if progress is not None:
                 progress(int(1000 * sum(min(share(n), 1.0) for n in scenes)), 1000 * len(scenes))
-    return {name: Timed(np.stack(images[name]), len(t) * spp[name], tuple(t)) for name, t in times.items()}
+    return {
+        name: Timed(np.stack(images[name]), len(t) * spp[name], tuple(t), tuple(of_cpu[name]))
+        for name, t in times.items()
+    }

@@ -19,12 +19,13 @@ LATE_ROULETTE = volume(200)  # the usual setting of volpathmis for media that ha
 WANTED = 0.02  # noise of an image, root mean square over that of the image, at which a training is held against time
 CERTAIN = 2.0  # standard errors by which an error must stand out of the noise of the truth
 NOTES = f"""\
-Cost is mean squared error of the pixels of the object times seconds, compilation left out; a ratio is the cost of
+Cost is mean squared error of the pixels of the object times CPU seconds, compilation left out; a ratio is the cost of
 `volpathmis` at the best of its settings over that of the method: how many times less time the method needs for the
 same error. *Variance*: the error is that about a long independent render by the same method. *With bias*: it is that
 about the path traced image, at the number of samples of this run; bias does not fall with time, so this ratio does.
 *Bias* is the root mean square of what the model would still be off after any time, over that of the image, and
-*until* the seconds after which `volpathmis` is as near to the truth as that. A dash: lost in the noise of the truth.
+*until* the CPU seconds after which `volpathmis` is as near to the truth as that. A dash: lost in the noise of the
+truth.
 Russian roulette only adds variance: where a setting of `volpathmis` seems to have less than one whose roulette begins
 later, it has not met its rare bright paths yet, and counts with the variance of the other. `volpathmis` renders the
 channels of a medium whose mean cosine differs between them one by one. Ratios do not count the *training* of

@@ -98,7 +98,7 @@ def test_the_tables_say_ratios(results: dict[str, Result]) -> None:
 def _noisy(truth: np.ndarray, bias: float, sigma: float, passes: int, spp: int) -> Timed:
     rng = np.random.default_rng(spp)
     images = truth + bias + sigma / np.sqrt(spp) * rng.standard_normal((passes, *truth.shape))
-    return Timed(images.astype(np.float32), passes * spp, (0.01 * spp,) * passes)
+    return Timed(images.astype(np.float32), passes * spp, *[(0.01 * spp,) * passes] * 2)
 
 
 def test_variance_and_bias_are_told_apart_and_the_noise_of_the_truth_is_taken_off() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import sys
+import time
 from typing import Any
 
 import numpy as np
@@ -134,7 +135,16 @@ def test_errors_fall_with_the_time_and_every_scene_ends_at_its_budget(monkeypatc
     assert errors[0] > 5 * errors[1] > 25 * errors[2]
     assert clock.asked[:4] == [4, 5, 4, 5]
     found = alternating({"a": None}, {"a": 4}, 3, passes=3)["a"]
-    assert found.spp == 12 and found.typical_seconds == pytest.approx(0.04)
+    assert found.spp == 12 and found.seconds == pytest.approx(0.12)
+
+
+def test_time_in_which_others_have_the_machine_is_no_cpu_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    def rendered(scene: Any, spp: int, *seed: int) -> tuple[np.ndarray, float]:
+        time.sleep(0.1)
+        return np.zeros((2, 2, 3)), 0.1
+
+    monkeypatch.setattr(timed, "rendered", rendered)
+    assert alternating({"a": None}, {"a": 1}, 3, passes=3)["a"].typical_cpu_seconds < 0.05
 
 
 @pytest.mark.parametrize("wrong", [{}, {"passes": 2, "seconds": 1.0}, {"passes": -1}, {"seconds": -1.0}])
