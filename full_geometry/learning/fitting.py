@@ -13,7 +13,14 @@ import numpy as np
 import torch
 
 from full_geometry.features import N_PAIR
-from full_geometry.learning.learner import Correction, PatchLogits, likelihood, patch_likelihood
+from full_geometry.learning.learner import (
+    Correction,
+    MeanThroughput,
+    PatchLogits,
+    likelihood,
+    mean_likelihood,
+    patch_likelihood,
+)
 from full_geometry.learning.pairs import Pairs
 from full_geometry.neural_shape.storing import KIND as SHAPES
 from full_geometry.patches import Patches
@@ -26,6 +33,7 @@ __all__ = ["STANDARD", "Fitting", "Recipe"]
 BETAS, CLIP, LAST_RATE, WARM_UP = (0.9, 0.99), 1.0, 0.01, 100
 AVERAGE = 0.998  # of the numbers, each step
 PATCH_HIDDEN, PATCH_BATCH = (64, 32), 1024
+ALPHA_HIDDEN = (32, 32)
 RATES = {SHAPES: 1.5e-3}  # by start: noise of walks leads large steps away from a near one
 
 
@@ -81,14 +89,20 @@ class Fitting:
     Args:
         n_in: features of a pair.
         channels: of the medium.
+        eta: relative index.
         recipe: sizes and rates.
         seed: of the numbers at the start and of the order of the data.
         patches: of the surface, for whose weights a network is fitted beside; None for a shape without faces.
     """
 
-    def __init__(self, n_in: int, channels: int, recipe: Recipe, seed: int, patches: Patches | None = None) -> None:
+    def __init__(
+        self, n_in: int, channels: int, eta: float, recipe: Recipe, seed: int, patches: Patches | None = None
+    ) -> None:
         self.recipe, self.patches, self.n_side = recipe, patches, (n_in - N_PAIR) // 2
-        parts = {"S": Correction(n_in, channels, recipe.width, recipe.depth, seed)}
+        parts = {
+            "S": Correction(n_in, channels, recipe.width, recipe.depth, seed),
+            "alpha": MeanThroughput(self.n_side, channels, ALPHA_HIDDEN, eta, seed),
+        }
         if patches is not None:
             parts["patches"] = PatchLogits(self.n_side, patches.areas, PATCH_HIDDEN, seed)
         self.modules = torch.nn.ModuleDict(parts)
@@ -98,10 +112,12 @@ class Fitting:
         self.adam = torch.optim.Adam(self.parameters, lr=recipe.rate, betas=BETAS, fused=True)
         self.step, self.scale = 0, torch.ones(channels, 1)
 
-    def set_scale(self, walks: Pairs) -> None:
-        """Divide each channel by its mean throughput, so that all count alike."""
+    def set_scale(self, walks: Pairs, proposals: Pairs) -> None:
+        """Divide each channel by its mean throughput, so that all count alike; alpha begins with it."""
         mean = torch.from_numpy(walks.values.sum(axis=1) / walks.drawn)
         self.scale = torch.where(mean > 0, 1 / mean.clamp_min(1e-30), torch.zeros_like(mean))[:, None].float()
+        for networks in (self.modules, self.average):
+            networks["alpha"].begin(torch.from_numpy(proposals.features[: self.n_side]), mean)
 
     def use(self, walks: Pairs, proposals: Pairs, steps: int | None, order: np.random.Generator) -> None:
         """Steps on all batches of a chunk, `reuse` times over, every other time with exit and entry exchanged.
@@ -128,9 +144,17 @@ class Fitting:
                 for i, j in zip(order.permutation(n_x), order.integers(0, n_y, n_x)):
                     a, b = slice(i * batch, (i + 1) * batch), slice(j * batch, (j + 1) * batch)
                     loss = likelihood((S(x[:, a], back), T[:, a]), (S(y[:, b], back), W[:, b]), kept)
+                    if not back:
+                        loss = loss + self._mean_loss(x[:, a], y[:, b], T[:, a], kept)
                     if patch is not None and not back:
                         loss = loss + self._patch_loss(x[:, a], T[:, a], patch[a])
                     self._advance(loss, steps)
+
+    def _mean_loss(self, x: torch.Tensor, y: torch.Tensor, T: torch.Tensor, kept: float) -> torch.Tensor:
+        """Of alpha on a batch: proposals have the exits of walks, whatever those are."""
+        alpha, log_alpha = self.modules["alpha"](torch.cat([x[: self.n_side], y[: self.n_side]], dim=1))
+        n = x.shape[1]
+        return mean_likelihood(alpha[:, n:] * self.scale, log_alpha[:, :n], T, kept)
 
     def _patch_loss(self, x: torch.Tensor, T: torch.Tensor, patch: torch.Tensor) -> torch.Tensor:
         """Of a part of a batch."""

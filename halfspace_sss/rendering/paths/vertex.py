@@ -11,7 +11,8 @@ import mitsuba as mi
 
 from halfspace_sss.rendering.paths.books import Books
 from halfspace_sss.rendering.paths.choice import choose
-from halfspace_sss.rendering.paths.events import Onward, balance, few, multiple, nothing, surface
+from halfspace_sss.rendering.paths.events import Onward, few, multiple, nothing, surface
+from halfspace_sss.rendering.paths.lights import balance
 from halfspace_sss.rendering.paths.world import World
 from halfspace_sss.rendering.surface.derivatives import detached, tracking
 from halfspace_sss.rendering.transport.plane import place

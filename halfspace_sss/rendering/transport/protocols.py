@@ -60,6 +60,9 @@ class Proposals(Protocol):
 class Transport(Protocol):
     """S of one object, for any exit and entry.
 
+    One that knows what it is under even light also has `alpha(prepared)`: ∫ S mu_i dw_i dA_i of the exit per channel,
+    over all entries and directions, from which the path loop takes the mean light of the sky.
+
     Attributes:
         orders: "multiple" (two or more scattering events) or "total".
         checksums: of what it has learnt, which are part of a render's identity; empty where nothing is.
