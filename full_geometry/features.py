@@ -87,8 +87,8 @@ def side_features(frame: Frame, side: Side) -> list[Any]:
     ]  # fmt: skip
 
 
-def entering(columns: Any, eta: Any, channels: int) -> list[Any]:
-    """F_t(mu) P per channel: the share of light along w that enters and is scattered or absorbed.
+def entering(columns: Any, eta: Any, channels: int) -> tuple[list[Any], list[Any]]:
+    """F_t(mu), and F_t(mu) P, per channel: the shares of light along w that enter, and are scattered or absorbed.
 
     Args:
         columns: features of a side, of NumPy, torch or Dr.Jit.
@@ -97,7 +97,8 @@ def entering(columns: Any, eta: Any, channels: int) -> list[Any]:
     """
     lib, mu = library(columns[MU]), columns[MU]
     F_t = fresnel.F_t(lib.maximum(mu, 0 * mu), eta)
-    return [F_t * lib.maximum(lib.exp(2 * columns[P_0 + c]) - LEAST_P, 0 * mu) for c in range(channels)]
+    P = [lib.exp(2 * columns[P_0 + c]) - LEAST_P for c in range(channels)]
+    return [F_t] * channels, [F_t * lib.maximum(p, 0 * mu) for p in P]
 
 
 def pair_features(frame: Frame, exit: Side, entry: Side) -> list[Any]:

@@ -15,7 +15,7 @@ import torch
 from full_geometry.features import N_PAIR
 from full_geometry.learning.learner import (
     Correction,
-    MeanThroughput,
+    EvenLight,
     PatchLogits,
     likelihood,
     mean_likelihood,
@@ -101,7 +101,7 @@ class Fitting:
         self.recipe, self.patches, self.n_side = recipe, patches, (n_in - N_PAIR) // 2
         parts = {
             "S": Correction(n_in, channels, recipe.width, recipe.depth, seed),
-            "alpha": MeanThroughput(self.n_side, channels, ALPHA_HIDDEN, eta, seed),
+            "alpha": EvenLight(self.n_side, channels, ALPHA_HIDDEN, eta, seed),
         }
         if patches is not None:
             parts["patches"] = PatchLogits(self.n_side, patches.areas, PATCH_HIDDEN, seed)
@@ -110,14 +110,16 @@ class Fitting:
         self.drawing = copy.deepcopy(parts.get("patches"))  # weights of patches that the next proposals follow
         self.parameters = list(self.modules.parameters())
         self.adam = torch.optim.Adam(self.parameters, lr=recipe.rate, betas=BETAS, fused=True)
-        self.step, self.scale = 0, torch.ones(channels, 1)
+        self.step, self.scale, self.even_scale = 0, torch.ones(channels, 1), torch.ones(2 * channels, 1)
 
-    def set_scale(self, walks: Pairs, proposals: Pairs) -> None:
-        """Divide each channel by its mean throughput, so that all count alike; alpha begins with it."""
+    def set_scale(self, walks: Pairs) -> None:
+        """Divide each channel by its mean throughput, so that all count alike; alpha begins with the mean."""
         mean = torch.from_numpy(walks.values.sum(axis=1) / walks.drawn)
-        self.scale = torch.where(mean > 0, 1 / mean.clamp_min(1e-30), torch.zeros_like(mean))[:, None].float()
+        self.scale = _inverse(mean)
+        exits, T = (torch.from_numpy(v) for v in walks.even)
+        self.even_scale = _inverse(T.mean(dim=1))
         for networks in (self.modules, self.average):
-            networks["alpha"].begin(torch.from_numpy(proposals.features[: self.n_side]), mean)
+            networks["alpha"].begin(exits, T.mean(dim=1))
 
     def use(self, walks: Pairs, proposals: Pairs, steps: int | None, order: np.random.Generator) -> None:
         """Steps on all batches of a chunk, `reuse` times over, every other time with exit and entry exchanged.
@@ -132,29 +134,23 @@ class Fitting:
         batch = self.recipe.batch
         x, T = (torch.from_numpy(v) for v in (walks.features, walks.values))
         y, W = (torch.from_numpy(v) for v in (proposals.features, proposals.values))
+        exits, even = (torch.from_numpy(v) for v in walks.even)
         patch = None
         if self.patches is not None:
             patch = torch.from_numpy(self.patches.of_face[walks.faces].astype(np.int64))
         n_x, n_y = max(T.shape[1] // batch, 1), max(W.shape[1] // batch, 1)
-        kept = T.shape[1] / walks.drawn
+        kept, n_even = T.shape[1] / walks.drawn, max(even.shape[1] // n_x, 1)
         T, W, S = T * self.scale, W * self.scale, self.modules["S"]
         with one_thread():
             for k in range(self.recipe.reuse):
                 back = k % 2 == 1
                 for i, j in zip(order.permutation(n_x), order.integers(0, n_y, n_x)):
-                    a, b = slice(i * batch, (i + 1) * batch), slice(j * batch, (j + 1) * batch)
+                    a, b, e = (slice(k * m, (k + 1) * m) for k, m in ((i, batch), (j, batch), (i, n_even)))
                     loss = likelihood((S(x[:, a], back), T[:, a]), (S(y[:, b], back), W[:, b]), kept)
-                    if not back:
-                        loss = loss + self._mean_loss(x[:, a], y[:, b], T[:, a], kept)
+                    loss = loss + mean_likelihood(self.modules["alpha"](exits[:, e]), even[:, e], self.even_scale)
                     if patch is not None and not back:
                         loss = loss + self._patch_loss(x[:, a], T[:, a], patch[a])
                     self._advance(loss, steps)
-
-    def _mean_loss(self, x: torch.Tensor, y: torch.Tensor, T: torch.Tensor, kept: float) -> torch.Tensor:
-        """Of alpha on a batch: proposals have the exits of walks, whatever those are."""
-        alpha, log_alpha = self.modules["alpha"](torch.cat([x[: self.n_side], y[: self.n_side]], dim=1))
-        n = x.shape[1]
-        return mean_likelihood(alpha[:, n:] * self.scale, log_alpha[:, :n], T, kept)
 
     def _patch_loss(self, x: torch.Tensor, T: torch.Tensor, patch: torch.Tensor) -> torch.Tensor:
         """Of a part of a batch."""
@@ -191,7 +187,8 @@ class Fitting:
         means = {f"{k}.mean": mean.data for k, mean in enumerate(self.average.parameters())}
         drawing = [] if self.drawing is None else self.drawing.parameters()
         means |= {f"drawing.{k}": value.data for k, value in enumerate(drawing)}
-        return {"scale": self.scale, **checkpoint.tensors_of(self.adam, self.parameters), **means}
+        scales = {"scale": self.scale, "even_scale": self.even_scale}
+        return {**scales, **checkpoint.tensors_of(self.adam, self.parameters), **means}
 
     def save(self, path: Path, done: int, history: list) -> None:
         """Write a checkpoint after `done` chunks."""
@@ -209,3 +206,8 @@ class Fitting:
             self.step, done = (int(v) for v in stored["counters"].tolist())
             history = [(int(k), error, spread) for k, error, spread in stored["history"].tolist()]
         return done, history
+
+
+def _inverse(mean: torch.Tensor) -> torch.Tensor:
+    """1/mean as a column, 0 where there is nothing."""
+    return torch.where(mean > 0, 1 / mean.clamp_min(1e-30), torch.zeros_like(mean))[:, None].float()

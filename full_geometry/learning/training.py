@@ -213,7 +213,7 @@ class _Run:
         share = pilot.values.shape[1] / pilot.drawn
         self.walks = int(self.recipe.chunk / min(max(share, 0.05), 1.0))
         proposed = self.source.proposed(self.recipe.chunk // 4, (self.seed, 2**31), self._sampler())
-        self.fitting.set_scale(pilot, proposed)
+        self.fitting.set_scale(pilot)
         self._new_fitting().use(pilot, proposed, None, np.random.default_rng(0))
         run = {"object": self.identity.record(), "recipe": asdict(self.recipe), "seed": self.seed}
         if self.camera:

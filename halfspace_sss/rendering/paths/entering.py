@@ -48,13 +48,8 @@ class Candidate(NamedTuple):
     sky: Any  # weight of d among the ways to draw directions of the sky
 
 
-def entering_light(
-    world: World, body: Body, out: Exit, prim_index: Any, sampler: Any, active: Any
-) -> tuple[Candidate, Any]:
-    """One entry for light that leaves at `out`, and what the mean sky is worth here less what it is by the entry.
-
-    The entry is drawn among as many as the settings or the model say.
-    """
+def entering_light(world: World, body: Body, out: Exit, prim_index: Any, sampler: Any, active: Any) -> Candidate:
+    """One entry for light that leaves at `out`, drawn among as many as the settings or the model say."""
     with detached():
         prepared = body.transport.prepare(out, active)
         where = body.proposals.prepare(out, prepared, active)
@@ -63,19 +58,16 @@ def entering_light(
         return _candidate(world, body, _Exit(out, prim_index, prepared, where), aims, sampler, active)
 
     n, kept = body.entries, draw()
+    if n == 1:
+        return kept
     total = dr.detach(kept.hope)
     for _ in range(n - 1):
         other = draw(kept.aims)
         total = total + dr.detach(other.hope)
         take = sampler.next_1d() * total < dr.detach(other.hope)
         kept = Candidate(*(dr.select(take, a, b) for a, b in zip(other, kept)))
-    if n > 1:
-        hope = dr.detach(kept.hope)
-        kept = kept._replace(value=kept.value * dr.select(hope > 0, total / (n * dr.maximum(hope, 1e-30)), 0))
-    if not world.evens(body):
-        return kept, mi.Spectrum(0)
-    even = (body.transport.alpha(prepared) - kept.value * kept.sky) * world.sky.mean
-    return kept, dr.select(active, even, 0)
+    hope = dr.detach(kept.hope)
+    return kept._replace(value=kept.value * dr.select(hope > 0, total / (n * dr.maximum(hope, 1e-30)), 0))
 
 
 def _candidate(world: World, body: Body, exit: _Exit, aims: Any, sampler: Any, active: Any) -> Candidate:

@@ -77,8 +77,12 @@ def _differentiable(bsdf: Any, ctx: Any, si: Any, bs: Any, weight: Any, active: 
 
 
 def multiple(world: World, body: Body, out: Exit, face: Any, sampler: Any, active: Any) -> tuple[Onward, Any]:
-    """Light that entered the body elsewhere and comes out here by its model; what no ray has to look for is added."""
-    found, direct = entering_light(world, body, out, face, sampler, active)
+    """Light that entered the body elsewhere and comes out here by its model, and what is seen of point lights so.
+
+    Where the body is known under the mean light of the sky, that is left out, see `sky`.
+    """
+    found = entering_light(world, body, out, face, sampler, active)
+    direct = -found.value * found.sky * world.sky.mean if world.evens(body) else mi.Spectrum(0)
     if world.lights.some_delta:
         shadow = place(found.p, found.n).spawn_ray_to(found.target)
         seen = found.delta & ~world.scene.ray_test(shadow, False, found.delta)
@@ -92,8 +96,12 @@ def multiple(world: World, body: Body, out: Exit, face: Any, sampler: Any, activ
 
 
 def few(world: World, body: Body, leg: Leg, sampler: Any, active: Any) -> tuple[Onward, Any]:
-    """Light that was scattered at most once inside the body, and that of emitters that came the same way."""
+    """Light that was scattered at most once inside the body, and that of emitters that came the same way.
+
+    The mean light of the sky as in `multiple`.
+    """
     found = few_orders(world, body, leg, sampler, active)
     zero = mi.Float(0)
     on = Onward(found.p, found.n, found.d, found.weight, mi.Float(1), zero, found.connected, mi.Float(-1))
-    return on, found.direct
+    direct = found.direct - found.weight * world.sky.mean if world.evens(body) else found.direct
+    return on, direct
