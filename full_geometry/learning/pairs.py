@@ -157,25 +157,22 @@ class PairSource:
         import drjit as dr
         import mitsuba as mi
 
-        n, even = dr.width(starts.p), self._even(starts, exits)
-        exits = exits._replace(T=dr.select(exits.order >= 2, exits.T, 0))
-        kept = dr.compress(dr.max(exits.T) > 0)
+        n, exit = dr.width(starts.p), Side(starts, first_event(self.subject, starts))
+        once, columns = exits.order == 1, side_features(self.frame, exit)
+        T = [*dr.select(once, exits.T, 0), *dr.select(once, 0, exits.T)]
+        dr.eval(columns, exit.event.y, T)
+        even = Even(_stacked(columns, n), _stacked(T, n))
+        kept = dr.compress(dr.max(exits.T) * dr.select(once, 0, 1) > 0)
         if dr.width(kept) == 0:
             nothing = self._columns(starts, starts, dr.zeros(mi.Spectrum, n))
             return nothing._replace(faces=np.zeros(n, np.uint32), even=even)
-        ends = exits.at.gather(kept)
-        T = dr.gather(mi.Spectrum, exits.T, kept)
+        y, ends = dr.gather(mi.Point3f, exit.event.y, kept), exits.at.gather(kept)
+        exit = Side(starts.gather(kept), exit.event._replace(y=y))  # pairs ask for no more of it
+        entry = Side(ends, first_event(self.subject, ends))
+        columns = [*side_features(self.frame, entry), *pair_features(self.frame, exit, entry)]
+        features = np.concatenate([even.features[:, kept.numpy()], _stacked(columns, dr.width(kept))])
         faces = np.array(dr.gather(mi.UInt32, exits.face, kept))
-        return self._columns(starts.gather(kept), ends, T)._replace(drawn=n, faces=faces, even=even)
-
-    def _even(self, starts: SurfacePoint, exits: Exits) -> Even:
-        """What walks bring under the same light from everywhere."""
-        import drjit as dr
-
-        once = exits.order == 1
-        T = [*dr.select(once, exits.T, 0), *dr.select(once, 0, exits.T)]
-        columns = side_features(self.frame, Side(starts, first_event(self.subject, starts)))
-        return Even(*(_stacked(part, dr.width(starts.p)) for part in (columns, T)))
+        return Pairs(features, even.T[len(even.T) // 2 :, kept.numpy()], n, faces, even)
 
     def proposed(
         self, n: int, seed: tuple[int, ...], patches: PatchSampler | None = None, starts: SurfacePoint | None = None
