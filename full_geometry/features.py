@@ -14,12 +14,15 @@ import numpy as np
 
 from full_geometry.first_event import FirstEvent
 from full_geometry.subject import SurfacePoint
+from halfspace_sss.arrays import library
+from halfspace_sss.physics import fresnel
 
-__all__ = ["N_PAIR", "Frame", "Side", "n_side", "pair_features", "reverse", "side_features"]
+__all__ = ["N_PAIR", "Frame", "Side", "entering", "n_side", "pair_features", "reverse", "side_features"]
 
 OCTAVES = 2
 N_PAIR = 21
 LEAST_P, LEAST_LENGTH = 1e-3, 1e-2
+MU, P_0 = 36, 38  # numbers of the features of a side that `entering` reads
 
 
 class Side(NamedTuple):
@@ -82,6 +85,20 @@ def side_features(frame: Frame, side: Side) -> list[Any]:
         *_octaves(frame.position(at.p)), *_octaves(frame.position(event.y)), *n, *w, dr.dot(n, w),
         _log(frame, event.length), *(0.5 * dr.log(P + LEAST_P) for P in event.P), *event.local,
     ]  # fmt: skip
+
+
+def entering(columns: Any, eta: Any, channels: int) -> tuple[list[Any], list[Any]]:
+    """F_t(mu), and F_t(mu) P, per channel: the shares of light along w that enter, and are scattered or absorbed.
+
+    Args:
+        columns: features of a side, of NumPy, torch or Dr.Jit.
+        eta: relative index.
+        channels: of the medium.
+    """
+    lib, mu = library(columns[MU]), columns[MU]
+    F_t = fresnel.F_t(lib.maximum(mu, 0 * mu), eta)
+    P = [lib.exp(2 * columns[P_0 + c]) - LEAST_P for c in range(channels)]
+    return [F_t] * channels, [F_t * lib.maximum(p, 0 * mu) for p in P]
 
 
 def pair_features(frame: Frame, exit: Side, entry: Side) -> list[Any]:

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from full_geometry.features import N_PAIR, Frame, Side, pair_features, side_features
+from full_geometry.reflectance import Reflectance
 from full_geometry.subject import Subject, SurfacePoint
 from halfspace_sss.interface.model import BSSRDF
 
@@ -53,12 +54,14 @@ class FullGeometry:
         frame: of the features.
         start: S_start.
         weights: W_k (outputs, inputs) and b_k of the layers.
+        alpha: ∫ S mu_i of an exit, learnt beside S.
     """
 
     subject: Subject
     frame: Frame
     start: Start
     weights: Mapping[str, np.ndarray]
+    alpha: Reflectance
     orders = "multiple"
 
     @property

@@ -51,6 +51,9 @@ class LearntTransport:
     def prepare(self, out: Exit, active: Any) -> PreparedExit:
         return self.model.prepare(SurfacePoint(out.p, out.n_face, out.n, out.w), active)
 
+    def alpha(self, out: Exit, active: Any) -> tuple[Any, Any]:
+        return self.model.alpha(SurfacePoint(out.p, out.n_face, out.n, out.w), active)
+
     def S_mu(self, prepared: PreparedExit, entry: Entry, w_i: Any, active: Any) -> Any:
         n_out, mu_i = entry.seen(w_i)
         return self.model.S(prepared, SurfacePoint(entry.p, entry.n_face, n_out, w_i), active) * mu_i

@@ -20,6 +20,7 @@ from full_geometry.identity import Identity, frame_of, identify
 from full_geometry.model import FullGeometry, Start
 from full_geometry.neural_shape import storing as shapes
 from full_geometry.patches import Patches, PatchSampler
+from full_geometry.reflectance import Reflectance
 from full_geometry.subject import Subject
 from halfspace_sss.interface.model import bssrdf
 from halfspace_sss.neural.store import load_weights, save_weights
@@ -33,7 +34,8 @@ __all__ = [
 
 KIND = "full_geometry"
 CHECKSUMS = "start_checksums"  # of a record
-S_LAYERS, PATCH_LAYERS, FLOW_LAYERS, CENTRES = ("W_", "b_"), ("V_", "c_"), ("F_", "h_"), "centres"
+S_LAYERS, ALPHA_LAYERS, PATCH_LAYERS, FLOW_LAYERS = ("W_", "b_"), ("A_", "a_"), ("V_", "c_"), ("F_", "h_")
+CENTRES = "centres"
 
 
 class Learnt(NamedTuple):
@@ -96,6 +98,8 @@ def _trained(path: Path) -> tuple[Identity, dict[str, np.ndarray], dict[str, Any
     if record.get("reflections") != REFLECTIONS:
         known = f"reflections must be {REFLECTIONS}, got {record.get('reflections')}"
         raise ValueError(f"{path.with_suffix('.json')}: {known}: of another version, to be trained again")
+    if not any(name.startswith(ALPHA_LAYERS) for name in arrays):
+        raise ValueError(f"{path}: layers of alpha must be there, got none: of another version, to be trained again")
     try:
         anchors, grids = arrays.pop("anchors"), record.get("grids", "")
         probes = arrays.pop("probes") if grids else None
@@ -180,7 +184,7 @@ def assemble(
     def layers(names: tuple[str, ...]) -> dict[str, np.ndarray]:
         return {name: value for name, value in arrays.items() if name.startswith(names)}
 
-    model = FullGeometry(subject, frame, start, layers(S_LAYERS))
+    model = FullGeometry(subject, frame, start, layers(S_LAYERS), Reflectance(subject, frame, layers(ALPHA_LAYERS)))
     if CENTRES not in arrays:
         return Learnt(model, None)
     patches = patches or Patches(subject, frame, arrays[CENTRES].astype(np.float32))

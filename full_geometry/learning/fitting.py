@@ -13,7 +13,14 @@ import numpy as np
 import torch
 
 from full_geometry.features import N_PAIR
-from full_geometry.learning.learner import Correction, PatchLogits, likelihood, patch_likelihood
+from full_geometry.learning.learner import (
+    Correction,
+    EvenLight,
+    PatchLogits,
+    likelihood,
+    mean_likelihood,
+    patch_likelihood,
+)
 from full_geometry.learning.pairs import Pairs
 from full_geometry.neural_shape.storing import KIND as SHAPES
 from full_geometry.patches import Patches
@@ -26,6 +33,7 @@ __all__ = ["STANDARD", "Fitting", "Recipe"]
 BETAS, CLIP, LAST_RATE, WARM_UP = (0.9, 0.99), 1.0, 0.01, 100
 AVERAGE = 0.998  # of the numbers, each step
 PATCH_HIDDEN, PATCH_BATCH = (64, 32), 1024
+ALPHA_HIDDEN = (32, 32)
 RATES = {SHAPES: 1.5e-3}  # by start: noise of walks leads large steps away from a near one
 
 
@@ -81,14 +89,20 @@ class Fitting:
     Args:
         n_in: features of a pair.
         channels: of the medium.
+        eta: relative index.
         recipe: sizes and rates.
         seed: of the numbers at the start and of the order of the data.
         patches: of the surface, for whose weights a network is fitted beside; None for a shape without faces.
     """
 
-    def __init__(self, n_in: int, channels: int, recipe: Recipe, seed: int, patches: Patches | None = None) -> None:
+    def __init__(
+        self, n_in: int, channels: int, eta: float, recipe: Recipe, seed: int, patches: Patches | None = None
+    ) -> None:
         self.recipe, self.patches, self.n_side = recipe, patches, (n_in - N_PAIR) // 2
-        parts = {"S": Correction(n_in, channels, recipe.width, recipe.depth, seed)}
+        parts = {
+            "S": Correction(n_in, channels, recipe.width, recipe.depth, seed),
+            "alpha": EvenLight(self.n_side, channels, ALPHA_HIDDEN, eta, seed),
+        }
         if patches is not None:
             parts["patches"] = PatchLogits(self.n_side, patches.areas, PATCH_HIDDEN, seed)
         self.modules = torch.nn.ModuleDict(parts)
@@ -96,12 +110,16 @@ class Fitting:
         self.drawing = copy.deepcopy(parts.get("patches"))  # weights of patches that the next proposals follow
         self.parameters = list(self.modules.parameters())
         self.adam = torch.optim.Adam(self.parameters, lr=recipe.rate, betas=BETAS, fused=True)
-        self.step, self.scale = 0, torch.ones(channels, 1)
+        self.step, self.scale, self.even_scale = 0, torch.ones(channels, 1), torch.ones(2 * channels, 1)
 
     def set_scale(self, walks: Pairs) -> None:
-        """Divide each channel by its mean throughput, so that all count alike."""
+        """Divide each channel by its mean throughput, so that all count alike; alpha begins with the mean."""
         mean = torch.from_numpy(walks.values.sum(axis=1) / walks.drawn)
-        self.scale = torch.where(mean > 0, 1 / mean.clamp_min(1e-30), torch.zeros_like(mean))[:, None].float()
+        self.scale = _inverse(mean)
+        exits, T = (torch.from_numpy(v) for v in walks.even)
+        self.even_scale = _inverse(T.mean(dim=1))
+        for networks in (self.modules, self.average):
+            networks["alpha"].begin(exits, T.mean(dim=1))
 
     def use(self, walks: Pairs, proposals: Pairs, steps: int | None, order: np.random.Generator) -> None:
         """Steps on all batches of a chunk, `reuse` times over, every other time with exit and entry exchanged.
@@ -116,18 +134,21 @@ class Fitting:
         batch = self.recipe.batch
         x, T = (torch.from_numpy(v) for v in (walks.features, walks.values))
         y, W = (torch.from_numpy(v) for v in (proposals.features, proposals.values))
+        exits, even = (torch.from_numpy(v) for v in walks.even)
         patch = None
         if self.patches is not None:
             patch = torch.from_numpy(self.patches.of_face[walks.faces].astype(np.int64))
         n_x, n_y = max(T.shape[1] // batch, 1), max(W.shape[1] // batch, 1)
-        kept = T.shape[1] / walks.drawn
+        kept, n_even = T.shape[1] / walks.drawn, max(even.shape[1] // n_x, 1)
         T, W, S = T * self.scale, W * self.scale, self.modules["S"]
         with one_thread():
             for k in range(self.recipe.reuse):
                 back = k % 2 == 1
                 for i, j in zip(order.permutation(n_x), order.integers(0, n_y, n_x)):
-                    a, b = slice(i * batch, (i + 1) * batch), slice(j * batch, (j + 1) * batch)
+                    a, b, e = (slice(k * m, (k + 1) * m) for k, m in ((i, batch), (j, batch), (i, n_even)))
                     loss = likelihood((S(x[:, a], back), T[:, a]), (S(y[:, b], back), W[:, b]), kept)
+                    if not back:
+                        loss = loss + mean_likelihood(self.modules["alpha"](exits[:, e]), even[:, e], self.even_scale)
                     if patch is not None and not back:
                         loss = loss + self._patch_loss(x[:, a], T[:, a], patch[a])
                     self._advance(loss, steps)
@@ -167,7 +188,8 @@ class Fitting:
         means = {f"{k}.mean": mean.data for k, mean in enumerate(self.average.parameters())}
         drawing = [] if self.drawing is None else self.drawing.parameters()
         means |= {f"drawing.{k}": value.data for k, value in enumerate(drawing)}
-        return {"scale": self.scale, **checkpoint.tensors_of(self.adam, self.parameters), **means}
+        scales = {"scale": self.scale, "even_scale": self.even_scale}
+        return {**scales, **checkpoint.tensors_of(self.adam, self.parameters), **means}
 
     def save(self, path: Path, done: int, history: list) -> None:
         """Write a checkpoint after `done` chunks."""
@@ -185,3 +207,8 @@ class Fitting:
             self.step, done = (int(v) for v in stored["counters"].tolist())
             history = [(int(k), error, spread) for k, error, spread in stored["history"].tolist()]
         return done, history
+
+
+def _inverse(mean: torch.Tensor) -> torch.Tensor:
+    """1/mean as a column, 0 where there is nothing."""
+    return torch.where(mean > 0, 1 / mean.clamp_min(1e-30), torch.zeros_like(mean))[:, None].float()

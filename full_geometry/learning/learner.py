@@ -9,10 +9,12 @@ import numpy as np
 import torch
 from torch import nn
 
-from full_geometry.features import N_PAIR, reverse
+from full_geometry.features import N_PAIR, entering, reverse
 from full_geometry.model import BOUND
 
-__all__ = ["Correction", "PatchLogits", "likelihood", "patch_likelihood"]
+__all__ = ["Correction", "EvenLight", "PatchLogits", "likelihood", "mean_likelihood", "patch_likelihood"]
+
+LEAST_SHARE = 1e-5  # of F_t P that comes back
 
 
 class Layers(nn.Module):
@@ -81,6 +83,53 @@ def likelihood(walks: tuple, proposals: tuple, kept: float) -> torch.Tensor:
     """
     (f, T), (g, W) = walks, proposals
     return ((W * torch.exp(g)).mean(dim=1) - kept * (T * f).mean(dim=1)).sum()
+
+
+class EvenLight(nn.Module):
+    """F_t P sigmoid(a) of orders one, then two and more, per channel, a a perceptron of the exit.
+
+    Args:
+        n_in: features of an exit.
+        channels: of the medium.
+        hidden: widths of the hidden layers.
+        eta: relative index.
+        seed: of the numbers at the start.
+    """
+
+    def __init__(self, n_in: int, channels: int, hidden: tuple[int, ...], eta: float, seed: int = 0) -> None:
+        super().__init__()
+        self.eta, self.channels = eta, channels
+        self.layers = Layers([n_in, *hidden, 2 * channels], torch.Generator().manual_seed(seed))
+
+    def _most(self, x: torch.Tensor) -> torch.Tensor:
+        return torch.stack(entering(x, self.eta, self.channels)[1] * 2)
+
+    def begin(self, x: torch.Tensor, mean: torch.Tensor) -> None:
+        """Begin with a share of F_t P that is the same everywhere, and gives the mean over exits x."""
+        share = (mean / self._most(x).mean(dim=1).clamp_min(1e-6)).clamp(LEAST_SHARE, 1 - LEAST_SHARE)
+        with torch.no_grad():
+            self.layers.biases[-1].copy_(torch.logit(share)[:, None])
+
+    def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Shares (2 channels, n) of features (inputs, n), and their logarithms up to that of F_t P."""
+        a = self.layers(x)
+        return self._most(x) * torch.sigmoid(a), nn.functional.logsigmoid(a)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Matrices (outputs, inputs) and biases by name."""
+        return self.layers.arrays("A", "a")
+
+
+def mean_likelihood(found: tuple, T: torch.Tensor, scale: torch.Tensor) -> torch.Tensor:
+    """E[alpha - T log alpha] over walks, sum over channels times their scale; its minimum is alpha = E[T | exit].
+
+    Args:
+        found: from `EvenLight`.
+        T: (2 channels, n).
+        scale: (2 channels, 1).
+    """
+    alpha, log_alpha = found
+    return (scale * (alpha - T * log_alpha)).mean(dim=1).sum()
 
 
 class PatchLogits(nn.Module):

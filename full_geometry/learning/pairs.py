@@ -40,6 +40,13 @@ class Numbers:
         return mi.Point2f(self.rng.next_float32(), self.rng.next_float32())
 
 
+class Even(NamedTuple):
+    """Exits of all walks as columns, features (inputs, n), and T, (2 channels, n): of order one, then of the others."""
+
+    features: np.ndarray
+    T: np.ndarray
+
+
 class Pairs(NamedTuple):
     """Pairs as columns: features (inputs, n), values (channels, n); `drawn` were drawn, those left out have value 0."""
 
@@ -47,6 +54,7 @@ class Pairs(NamedTuple):
     values: np.ndarray
     drawn: int
     faces: np.ndarray | None = None  # where walks left
+    even: Even | None = None  # of walks
 
 
 def shuffled(parts: list[Pairs], order: np.random.Generator) -> Pairs:
@@ -55,7 +63,12 @@ def shuffled(parts: list[Pairs], order: np.random.Generator) -> Pairs:
     values = np.concatenate([part.values for part in parts], axis=1)
     places = order.permutation(values.shape[1])
     faces = None if parts[0].faces is None else np.concatenate([part.faces for part in parts])[places]
-    return Pairs(features[:, places], values[:, places], sum(part.drawn for part in parts), faces)
+    found = Pairs(features[:, places], values[:, places], sum(part.drawn for part in parts), faces)
+    if parts[0].even is None:
+        return found
+    exits, T = (np.concatenate(columns, axis=1) for columns in zip(*(part.even for part in parts)))
+    places = order.permutation(T.shape[1])
+    return found._replace(even=Even(exits[:, places], T[:, places]))
 
 
 class Proposals:
@@ -137,21 +150,29 @@ class PairSource:
 
         rng = generator(mi, n, pass_seed(*seed, 0))
         starts = self.subject.random_points(rng)
-        return self.ended(starts, trace_exits(self.subject, starts, (*seed, 1)))
+        return self.ended(starts, trace_exits(self.subject, starts, (*seed, 1), fewest=1))
 
     def ended(self, starts: SurfacePoint, exits: Exits) -> Pairs:
-        """The pairs of walks whose ends are known; those with T > 0, T as values."""
+        """The pairs of walks whose ends and orders from one on are known; those with T > 0, T as values."""
         import drjit as dr
         import mitsuba as mi
 
-        n = dr.width(starts.p)
-        kept = dr.compress(dr.max(exits.T) > 0)
+        n, exit = dr.width(starts.p), Side(starts, first_event(self.subject, starts))
+        once, columns = exits.order == 1, side_features(self.frame, exit)
+        T = [*dr.select(once, exits.T, 0), *dr.select(once, 0, exits.T)]
+        dr.eval(columns, exit.event.y, T)
+        even = Even(_stacked(columns, n), _stacked(T, n))
+        kept = dr.compress(dr.max(exits.T) * dr.select(once, 0, 1) > 0)
         if dr.width(kept) == 0:
-            return self._columns(starts, starts, dr.zeros(mi.Spectrum, n))._replace(faces=np.zeros(n, np.uint32))
-        ends = exits.at.gather(kept)
-        T = dr.gather(mi.Spectrum, exits.T, kept)
+            nothing = self._columns(starts, starts, dr.zeros(mi.Spectrum, n))
+            return nothing._replace(faces=np.zeros(n, np.uint32), even=even)
+        y, ends = dr.gather(mi.Point3f, exit.event.y, kept), exits.at.gather(kept)
+        exit = Side(starts.gather(kept), exit.event._replace(y=y))  # pairs ask for no more of it
+        entry = Side(ends, first_event(self.subject, ends))
+        columns = [*side_features(self.frame, entry), *pair_features(self.frame, exit, entry)]
+        features = np.concatenate([even.features[:, kept.numpy()], _stacked(columns, dr.width(kept))])
         faces = np.array(dr.gather(mi.UInt32, exits.face, kept))
-        return self._columns(starts.gather(kept), ends, T)._replace(drawn=n, faces=faces)
+        return Pairs(features, even.T[len(even.T) // 2 :, kept.numpy()], n, faces, even)
 
     def proposed(
         self, n: int, seed: tuple[int, ...], patches: PatchSampler | None = None, starts: SurfacePoint | None = None
@@ -183,5 +204,13 @@ class PairSource:
         columns += pair_features(self.frame, exit, entry)
         dr.eval(columns, value)
         n = dr.width(value)
-        features = np.stack([np.broadcast_to(c.numpy(), n) for c in columns])
+        features = _stacked(columns, n)
         return Pairs(features, np.array(value, dtype=np.float32).reshape(len(value), n), n)
+
+
+def _stacked(columns: list[Any], n: int) -> np.ndarray:
+    """Columns of n lanes as rows."""
+    import drjit as dr
+
+    dr.eval(columns)
+    return np.stack([np.broadcast_to(c.numpy(), n) for c in columns])

@@ -115,12 +115,12 @@ class Seen:
 
 
 def _points(part: Any) -> tuple[SurfacePoint, Exits]:
-    """First exits of the camera as walks of this package, of the orders from two on."""
+    """First exits of the camera as walks of this package, of the orders from one on."""
     import drjit as dr
 
     starts = SurfacePoint(part.x_o, part.n_o, part.n_o_shading, part.w_o)
     ends = SurfacePoint(part.x_i, part.n_i, part.n_i_shading, part.w_i)
-    return starts, Exits(ends, dr.select(part.order >= 2, part.throughput, 0), part.order, part.face)
+    return starts, Exits(ends, dr.select(part.order >= 1, part.throughput, 0), part.order, part.face)
 
 
 def _lanes(numbers: np.ndarray) -> Any:

@@ -171,7 +171,7 @@ class _Run:
     def _new_fitting(self) -> Fitting:
         channels = len(self.subject.media)
         n_in = 2 * n_side(channels, self.subject.n_local) + N_PAIR
-        return Fitting(n_in, channels, self.recipe, self.seed, self.patches)
+        return Fitting(n_in, channels, self.subject.eta, self.recipe, self.seed, self.patches)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """What is written: everything in half precision."""

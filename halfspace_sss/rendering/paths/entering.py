@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import drjit as dr
 import mitsuba as mi
 
+from halfspace_sss.rendering.paths.lights import balance
 from halfspace_sss.rendering.paths.world import World, sampled_light
 from halfspace_sss.rendering.surface.derivatives import detached
 from halfspace_sss.rendering.transport.body import Body
@@ -44,6 +45,7 @@ class Candidate(NamedTuple):
     light: Any  # spectrum: its light over the density, where delta
     hope: Any  # that it is chosen by
     aims: Any  # whether d is drawn by emitters, where there is an entry
+    sky: Any  # weight of d among the ways to draw directions of the sky
 
 
 def entering_light(world: World, body: Body, out: Exit, prim_index: Any, sampler: Any, active: Any) -> Candidate:
@@ -76,12 +78,16 @@ def _candidate(world: World, body: Body, exit: _Exit, aims: Any, sampler: Any, a
         d, pdf = proposals.sample_direction(entry, exit.out, sampler.next_2d())
         at, pdf, aim = place(entry.p, entry.n), (1 - share) * pdf, mi.Float(-1)
     delta, target, light, bright = mi.Bool(False), mi.Point3f(0), mi.Spectrum(0), mi.Float(1)
+    sky = mi.Float(1) if world.evens(body) else mi.Float(0)
     aims = mi.Bool(False) if share == 0 else sampler.next_1d() < share if aims is None else aims
     if share > 0:
         by_emitter = active & aims
         ds, light = sampled_light(world, at, sampler.next_2d(), False, by_emitter)
         with detached():
             delta, target = by_emitter & ds.delta, mi.Point3f(ds.p)
+            if world.evens(body):
+                of_sky = share * world.sky.density(world.scene, at, d, active & ~aims)
+                sky = dr.select(by_emitter, dr.select(ds.emitter.is_environment(), 1, 0), balance(pdf, of_sky))
             by_model = proposals.pdf_direction(entry, exit.out, ds.d)
             d = dr.select(by_emitter, ds.d, d)
             pdf = dr.select(by_emitter, share * ds.pdf + dr.select(ds.delta, 0, (1 - share) * by_model), pdf)
@@ -92,4 +98,5 @@ def _candidate(world: World, body: Body, exit: _Exit, aims: Any, sampler: Any, a
     S_mu = body.transport.S_mu(exit.prepared, entry, d, active)
     value = dr.select(active, S_mu * (entry.weight / dr.maximum(pdf, 1e-8)), 0)
     hope = dr.detach(dr.max(value)) * bright
-    return Candidate(mi.Point3f(entry.p), mi.Normal3f(entry.n), d, value, pdf, aim, delta, target, light, hope, aims)
+    p, n = mi.Point3f(entry.p), mi.Normal3f(entry.n)
+    return Candidate(p, n, d, value, pdf, aim, delta, target, light, hope, aims, sky)

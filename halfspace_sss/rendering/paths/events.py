@@ -13,11 +13,12 @@ import mitsuba as mi
 
 from halfspace_sss.rendering.paths.entering import entering_light
 from halfspace_sss.rendering.paths.few import Leg, few_orders
+from halfspace_sss.rendering.paths.lights import balance
 from halfspace_sss.rendering.paths.world import World, sampled_light
 from halfspace_sss.rendering.transport.body import Body
 from halfspace_sss.rendering.transport.plane import Exit, place
 
-__all__ = ["Onward", "balance", "few", "multiple", "nothing", "surface"]
+__all__ = ["Onward", "few", "multiple", "nothing", "surface"]
 
 
 class Onward(NamedTuple):
@@ -39,12 +40,6 @@ def nothing() -> Onward:
     return Onward(
         mi.Point3f(0), mi.Normal3f(0), mi.Vector3f(0), mi.Spectrum(0), zero, zero, mi.Bool(False), mi.Float(-1)
     )
-
-
-def balance(pdf: Any, other: Any) -> Any:
-    """The balance heuristic."""
-    total = pdf + other
-    return dr.select(total > 0, pdf / dr.maximum(total, 1e-30), 0)
 
 
 def surface(world: World, u: tuple[Any, Any, Any], ray: Any, si: Any, active: Any) -> tuple[Onward, Any]:
@@ -82,13 +77,16 @@ def _differentiable(bsdf: Any, ctx: Any, si: Any, bs: Any, weight: Any, active: 
 
 
 def multiple(world: World, body: Body, out: Exit, face: Any, sampler: Any, active: Any) -> tuple[Onward, Any]:
-    """Light that entered the body elsewhere and comes out here by its model, and what is seen of point lights so."""
+    """Light that entered the body elsewhere and comes out here by its model, and what is seen of point lights so.
+
+    Where the body is known under the mean light of the sky, that is left out, see `sky`.
+    """
     found = entering_light(world, body, out, face, sampler, active)
-    direct = mi.Spectrum(0)
+    direct = -found.value * found.sky * world.sky.mean if world.evens(body) else mi.Spectrum(0)
     if world.lights.some_delta:
         shadow = place(found.p, found.n).spawn_ray_to(found.target)
         seen = found.delta & ~world.scene.ray_test(shadow, False, found.delta)
-        direct = dr.select(seen, found.value * found.light, 0)
+        direct = direct + dr.select(seen, found.value * found.light, 0)
     anywhere = found.aim < 0
     on = Onward(
         found.p, found.n, found.d, dr.select(found.delta, 0, found.value), dr.select(anywhere, found.pdf, 1),
@@ -98,8 +96,12 @@ def multiple(world: World, body: Body, out: Exit, face: Any, sampler: Any, activ
 
 
 def few(world: World, body: Body, leg: Leg, sampler: Any, active: Any) -> tuple[Onward, Any]:
-    """Light that was scattered at most once inside the body, and that of emitters that came the same way."""
+    """Light that was scattered at most once inside the body, and that of emitters that came the same way.
+
+    The mean light of the sky as in `multiple`.
+    """
     found = few_orders(world, body, leg, sampler, active)
     zero = mi.Float(0)
     on = Onward(found.p, found.n, found.d, found.weight, mi.Float(1), zero, found.connected, mi.Float(-1))
-    return on, found.direct
+    direct = found.direct - found.weight * world.sky.mean if world.evens(body) else found.direct
+    return on, direct

@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 
-__all__ = ["Lights"]
+__all__ = ["Lights", "balance"]
 
 EMITTER_SHARE = 0.5
 
@@ -38,3 +39,9 @@ class Lights:
         local = any(not emitter.is_environment() for emitter in emitters)
         shaped = any(emitter.get_shape() is not None for emitter in emitters)
         return cls(0.0 if even else EMITTER_SHARE, local, shaped, delta)
+
+
+def balance(pdf: Any, other: Any) -> Any:
+    """The balance heuristic."""
+    total = pdf + other
+    return dr.select(total > 0, pdf / dr.maximum(total, 1e-30), 0)

@@ -8,7 +8,6 @@ import drjit as dr
 import mitsuba as mi
 
 from halfspace_sss.rendering.paths.books import Books, Replay, Tally
-from halfspace_sss.rendering.paths.lights import Lights
 from halfspace_sss.rendering.paths.vertex import Vertex, emitted, vertex
 from halfspace_sss.rendering.paths.world import World
 from halfspace_sss.rendering.surface.derivatives import detached, tracking
@@ -24,7 +23,7 @@ def trace_paths(scene: Any, bodies: list[Body], settings: Settings, sampler: Any
 
     The second part is light of orders below two of the object that the ray meets first.
     """
-    world = World(scene, Lights.of(scene), bodies, settings, Tally())
+    world = World.of(scene, bodies, settings, Tally())
     (parts, _), seen = _trace(world, sampler, ray, ((mi.Spectrum(0), mi.Spectrum(0)), ()), active)
     return parts, seen
 
@@ -41,7 +40,7 @@ def replay_paths(
         d: backward: derivative of the outcome by the radiance, which is handed on to the parameters of the scene.
         backward: otherwise the derivative of the radiance is returned, for the derivatives that the parameters carry.
     """
-    world = World(scene, Lights.of(scene), bodies, settings, Replay(backward))
+    world = World.of(scene, bodies, settings, Replay(backward))
     return _trace(world, sampler, ray, (L, mi.Spectrum(0 if d is None else d)), mi.Bool(True))[0][1]
 
 

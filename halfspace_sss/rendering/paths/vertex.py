@@ -11,10 +11,12 @@ import mitsuba as mi
 
 from halfspace_sss.rendering.paths.books import Books
 from halfspace_sss.rendering.paths.choice import choose
-from halfspace_sss.rendering.paths.events import Onward, balance, few, multiple, nothing, surface
+from halfspace_sss.rendering.paths.events import Onward, few, multiple, nothing, surface
+from halfspace_sss.rendering.paths.lights import balance
 from halfspace_sss.rendering.paths.world import World
 from halfspace_sss.rendering.surface.derivatives import detached, tracking
-from halfspace_sss.rendering.transport.plane import place
+from halfspace_sss.rendering.transport.body import Body
+from halfspace_sss.rendering.transport.plane import Exit, place
 
 __all__ = ["Vertex", "emitted", "vertex"]
 
@@ -61,6 +63,7 @@ def vertex(world: World, sampler: Any, at: Vertex, books: Books) -> tuple[Onward
                 chance = dr.select(at.first, dr.select(at.second, mi.Float(1), 0), choice.few)
                 choice = choice._replace(few=chance, reflection=dr.select(once, 0, choice.reflection))
             choices.append((body, here, choice))
+    books = _evened(world, sampler, at, books, choices)
     on, books, taken = _outside(world, sampler, at, books, choices)
     share, events = taken.share, []
     for body, here, choice in choices:
@@ -81,6 +84,22 @@ def vertex(world: World, sampler: Any, at: Vertex, books: Books) -> tuple[Onward
 
         on, books = _instead(mask, sampler, on, books, world, below)
     return on._replace(weight=on.weight / share), books
+
+
+def _evened(world: World, sampler: Any, at: Vertex, books: Books, choices: list) -> Books:
+    """Adds what bodies are under the mean light of the sky, which the events inside leave out, see `sky`."""
+    for body, here, choice in choices:
+        if not world.evens(body):
+            continue
+
+        def known(books: Books, body: Body = body, here: Any = here, out: Exit = choice.leg.out) -> tuple[Books]:
+            few, more = body.transport.alpha(out, here)
+            few = dr.select(at.first & ~at.second, 0, few) if body.few else mi.Spectrum(0)
+            light = (few + dr.select(at.first & at.second, 0, more)) * world.sky.mean
+            return (world.books.add(books, at.throughput * light),)
+
+        (books,) = _where(here, sampler, (books,), world, known)
+    return books
 
 
 class _Taken(NamedTuple):

@@ -9,6 +9,7 @@ import drjit as dr
 
 from halfspace_sss.rendering.paths.books import Replay, Tally
 from halfspace_sss.rendering.paths.lights import Lights
+from halfspace_sss.rendering.paths.sky import Sky, sky_of
 from halfspace_sss.rendering.surface.derivatives import detached
 from halfspace_sss.rendering.transport.body import Body
 from halfspace_sss.rendering.transport.settings import Settings
@@ -26,6 +27,7 @@ class World:
         bodies: its translucent objects.
         settings: those of the integrator.
         books: what is written down.
+        sky: its mean light, where it serves.
     """
 
     scene: Any
@@ -33,6 +35,17 @@ class World:
     bodies: list[Body]
     settings: Settings
     books: Tally | Replay
+    sky: Sky | None = None
+
+    @classmethod
+    def of(cls, scene: Any, bodies: list[Body], settings: Settings, books: Tally | Replay) -> World:
+        """That of a scene and its bodies."""
+        lights = Lights.of(scene)
+        return cls(scene, lights, bodies, settings, books, sky_of(scene, lights, bodies))
+
+    def evens(self, body: Body) -> bool:
+        """Whether the mean light of the sky serves a body."""
+        return self.sky is not None and hasattr(body.transport, "alpha")
 
 
 def sampled_light(world: World, ref: Any, u: Any, test_visibility: bool, active: Any) -> tuple[Any, Any]:

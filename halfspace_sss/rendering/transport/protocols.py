@@ -70,6 +70,10 @@ class CosineProposals(Proposals, Protocol):
 class Transport(Protocol):
     """S of one object, for any exit and entry.
 
+    One that knows what it is under the same light from everywhere also has `alpha(out, active)`: the share of it that
+    leaves at an exit, per channel, by orders below two and by those of S, ∫ S mu_i dw_i dA_i. The path loop takes the
+    mean light of the sky so.
+
     Attributes:
         orders: "multiple" (two or more scattering events) or "total".
         checksums: of what it has learnt, which are part of a render's identity; empty where nothing is.

@@ -1,0 +1,69 @@
+"""What leaves at an exit under the same light from everywhere, learnt beside S.
+
+Of the light that F_t lets in, 1 - P leaves without an event; the rest leaves after one, alpha_1, or after more,
+
+    alpha = ∫ S mu_i dw_i dA_i,    alpha_1, alpha = F_t(mu_o) P_o sigmoid(a),
+
+a a small network of the exit alone: positive, and no more than is scattered. As control variates they leave an even
+sky no noise but that of what blocks it.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from full_geometry.features import Frame, Side, entering, side_features
+from full_geometry.first_event import first_event
+from full_geometry.subject import Subject, SurfacePoint
+from halfspace_sss.rendering.transport.plane import number
+
+__all__ = ["Reflectance"]
+
+
+@dataclass(frozen=True, eq=False)
+class Reflectance:
+    """Of one object.
+
+    Args:
+        subject: the object.
+        frame: of the features.
+        weights: A_k (outputs, inputs) and a_k of the layers.
+    """
+
+    subject: Subject
+    frame: Frame
+    weights: Mapping[str, np.ndarray]
+
+    @functools.cached_property
+    def _views(self) -> tuple[list, list]:
+        import mitsuba as mi
+        from drjit import nn
+
+        n = len(self.weights) // 2
+        tensors = [mi.TensorXf(np.ascontiguousarray(self.weights[f"A_{k}"], dtype=np.float32)) for k in range(n)]
+        biases = [mi.Float(self.weights[f"a_{k}"].astype(np.float32)) for k in range(n)]
+        views = nn.pack(*tensors, *biases)[-2 * n :]
+        return list(views[:n]), list(views[n:])
+
+    def __call__(self, at: SurfacePoint, active: Any = True) -> tuple[Any, Any]:
+        """Orders zero and one, and alpha, per channel."""
+        import drjit as dr
+        import mitsuba as mi
+        from drjit import nn
+
+        columns = side_features(self.frame, Side(at, first_event(self.subject, at, active)))
+        media, (A, a) = self.subject.media, self._views
+        x = nn.CoopVec(*columns)
+        for k, (matrix, bias) in enumerate(zip(A, a)):
+            x = x if k == 0 else x * dr.clip(x * (1 / 6) + 0.5, 0, 1)
+            x = nn.matvec(matrix, x, bias)
+        x, n = list(x), len(media)
+        live = mi.Spectrum([number(float(m.sigma_s) > 0) for m in media])
+        enters, most = (mi.Spectrum(v) for v in entering(columns, number(self.subject.eta), n))
+        once, more = (live * most / (1 + dr.exp(-mi.Spectrum(part))) for part in (x[:n], x[n:]))
+        return dr.select(active, enters - most + once, 0), dr.select(active, more, 0)
