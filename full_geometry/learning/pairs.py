@@ -23,6 +23,7 @@ from halfspace_sss.tracing.walk import generator, pass_seed
 __all__ = ["Pairs", "PairSource", "Proposals", "shuffled"]
 
 PATCH_SHARE = 0.6  # of those by patches, where they are learnt
+ENOUGH = 1.5  # over the mean: pairs of less value are kept by chance, and then with more
 
 
 class Numbers:
@@ -124,27 +125,41 @@ class PairSource:
         frame: of its features.
         start: S at the start, which values of proposals have.
         proposals: where they come from.
+        scale: of T of each channel, one over its mean; without it every walk that left is kept.
     """
 
     subject: Subject
     frame: Frame
     start: Start
     proposals: Proposals
+    scale: Any = None
 
     def walks(self, n: int, seed: tuple[int, ...]) -> Pairs:
-        """n walks of random exits; those that left at an order that counts, T as values."""
+        """n walks of random exits; of those that left at an order that counts some, see `ended`."""
         import mitsuba as mi
 
         rng = generator(mi, n, pass_seed(*seed, 0))
         starts = self.subject.random_points(rng)
-        return self.ended(starts, trace_exits(self.subject, starts, (*seed, 1)))
+        return self.ended(starts, trace_exits(self.subject, starts, (*seed, 1)), seed)
 
-    def ended(self, starts: SurfacePoint, exits: Exits) -> Pairs:
-        """The pairs of walks whose ends are known; those with T > 0, T as values."""
+    def ended(self, starts: SurfacePoint, exits: Exits, seed: tuple[int, ...]) -> Pairs:
+        """The pairs of walks whose ends are known, T as values.
+
+        With t the mean over channels of T over its mean, a walk is kept with the chance p = min(1, t / 1.5), as T / p:
+        one of little T costs a step as much as another, and tells it less.
+
+        Args:
+            starts, exits: of the walks.
+            seed: of what is kept.
+        """
         import drjit as dr
         import mitsuba as mi
 
         n = dr.width(starts.p)
+        if self.scale is not None:
+            p = dr.minimum(dr.mean(exits.T * self.scale) / ENOUGH, 1)
+            stays = generator(mi, n, pass_seed(*seed, 4)).next_float32() < p
+            exits = exits._replace(T=dr.select(stays, exits.T / dr.maximum(p, 1e-20), 0))
         kept = dr.compress(dr.max(exits.T) > 0)
         if dr.width(kept) == 0:
             return self._columns(starts, starts, dr.zeros(mi.Spectrum, n))._replace(faces=np.zeros(n, np.uint32))
@@ -153,22 +168,19 @@ class PairSource:
         faces = np.array(dr.gather(mi.UInt32, exits.face, kept))
         return self._columns(starts.gather(kept), ends, T)._replace(drawn=n, faces=faces)
 
-    def proposed(
-        self, n: int, seed: tuple[int, ...], patches: PatchSampler | None = None, starts: SurfacePoint | None = None
-    ) -> Pairs:
+    def proposed(self, n: int, seed: tuple[int, ...], starts: SurfacePoint | None = None) -> Pairs:
         """n proposals, S mu_i at the start over their density as values.
 
         Args:
             n: how many.
             seed: of them.
-            patches: learnt weights that they follow, if they are given.
             starts: n exits that they are of; by default random ones.
         """
         import mitsuba as mi
 
         rng = generator(mi, n, pass_seed(*seed, 2))
         starts = starts or self.subject.random_points(rng)
-        entries, weight = self.proposals.with_patches(patches).sample(starts, rng)
+        entries, weight = self.proposals.sample(starts, rng)
         return self._columns(starts, entries, weight)
 
     def _columns(self, exits: SurfacePoint, entries: SurfacePoint, value: Any) -> Pairs:
