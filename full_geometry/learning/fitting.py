@@ -21,7 +21,7 @@ from full_geometry.learning.learner import (
     mean_likelihood,
     patch_likelihood,
 )
-from full_geometry.learning.pairs import Pairs
+from full_geometry.learning.pairs import ENOUGH, Pairs
 from full_geometry.neural_shape.storing import KIND as SHAPES
 from full_geometry.patches import Patches
 from halfspace_sss.checks import check_choice, check_count, check_interval
@@ -32,6 +32,7 @@ __all__ = ["STANDARD", "Fitting", "Recipe"]
 
 BETAS, CLIP, LAST_RATE, WARM_UP = (0.9, 0.99), 1.0, 0.01, 100
 AVERAGE = 0.998  # of the numbers, each step
+LEAST = 0.05  # chance of a proposal: f moves while the chunk is used
 PATCH_HIDDEN, PATCH_BATCH = (64, 32), 1024
 ALPHA_HIDDEN = (32, 32)
 RATES = {SHAPES: 1.5e-3}  # by start: noise of walks leads large steps away from a near one
@@ -107,7 +108,6 @@ class Fitting:
             parts["patches"] = PatchLogits(self.n_side, patches.areas, PATCH_HIDDEN, seed)
         self.modules = torch.nn.ModuleDict(parts)
         self.average = copy.deepcopy(self.modules)
-        self.drawing = copy.deepcopy(parts.get("patches"))  # weights of patches that the next proposals follow
         self.parameters = list(self.modules.parameters())
         self.adam = torch.optim.Adam(self.parameters, lr=recipe.rate, betas=BETAS, fused=True)
         self.step, self.scale, self.even_scale = 0, torch.ones(channels, 1), torch.ones(2 * channels, 1)
@@ -129,11 +129,11 @@ class Fitting:
         Args:
             walks, proposals: the chunk.
             steps: of the whole fit, for the decay of the rate; None for no decay.
-            order: of the batches; walks meet other proposals each time.
+            order: of the batches, in which walks meet other proposals each time, and of the proposals that are used.
         """
         batch = self.recipe.batch
         x, T = (torch.from_numpy(v) for v in (walks.features, walks.values))
-        y, W = (torch.from_numpy(v) for v in (proposals.features, proposals.values))
+        y, W = self._worthy(proposals, order)
         exits, even = (torch.from_numpy(v) for v in walks.even)
         patch = None
         if self.patches is not None:
@@ -153,16 +153,19 @@ class Fitting:
                         loss = loss + self._patch_loss(x[:, a], T[:, a], patch[a])
                     self._advance(loss, steps)
 
+    def _worthy(self, proposals: Pairs, order: np.random.Generator) -> tuple[torch.Tensor, torch.Tensor]:
+        """Features and values of some proposals, kept by chance as walks are: by W exp f as the fit has it now."""
+        y, W = torch.from_numpy(proposals.features), torch.from_numpy(proposals.values)
+        with torch.no_grad(), one_thread():
+            value = (W * self.scale * torch.exp(self.modules["S"](y))).mean(dim=0)
+            p = (value / (ENOUGH * value.mean().clamp_min(1e-30))).clamp(LEAST, 1.0)
+            kept = torch.nonzero(torch.from_numpy(order.random(len(p), np.float32)) < p)[:, 0]
+            return y[:, kept], W[:, kept] * (len(kept) / len(p)) / p[kept]
+
     def _patch_loss(self, x: torch.Tensor, T: torch.Tensor, patch: torch.Tensor) -> torch.Tensor:
         """Of a part of a batch."""
         T = T[:, :PATCH_BATCH].mean(dim=0)
         return patch_likelihood(self.modules["patches"](x[: self.n_side, :PATCH_BATCH]), T, patch[:PATCH_BATCH])
-
-    def draw_by_average(self) -> None:
-        """From now on proposals follow the weights of patches as they are."""
-        if self.drawing is not None:
-            with torch.no_grad():
-                torch._foreach_copy_(list(self.drawing.parameters()), list(self.average["patches"].parameters()))
 
     def arrays(self) -> dict[str, np.ndarray]:
         """The averaged numbers of all networks by name."""
@@ -186,8 +189,6 @@ class Fitting:
     def _tensors(self) -> dict[str, torch.Tensor]:
         """Everything the next step depends on, by name; changing the tensors in place changes the fit."""
         means = {f"{k}.mean": mean.data for k, mean in enumerate(self.average.parameters())}
-        drawing = [] if self.drawing is None else self.drawing.parameters()
-        means |= {f"drawing.{k}": value.data for k, value in enumerate(drawing)}
         scales = {"scale": self.scale, "even_scale": self.even_scale}
         return {**scales, **checkpoint.tensors_of(self.adam, self.parameters), **means}
 

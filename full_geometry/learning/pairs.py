@@ -23,6 +23,7 @@ from halfspace_sss.tracing.walk import generator, pass_seed
 __all__ = ["Pairs", "PairSource", "Proposals", "shuffled"]
 
 PATCH_SHARE = 0.6  # of those by patches, where they are learnt
+ENOUGH = 1.5  # over the mean: pairs of less value are kept by chance, and then with more
 
 
 class Numbers:
@@ -137,32 +138,47 @@ class PairSource:
         frame: of its features.
         start: S at the start, which values of proposals have.
         proposals: where they come from.
+        scale: of T of each channel, one over its mean; without it every walk that left is kept.
     """
 
     subject: Subject
     frame: Frame
     start: Start
     proposals: Proposals
+    scale: Any = None
 
     def walks(self, n: int, seed: tuple[int, ...]) -> Pairs:
-        """n walks of random exits; those that left at an order that counts, T as values."""
+        """n walks of random exits; of those that left at an order that counts some, see `ended`."""
         import mitsuba as mi
 
         rng = generator(mi, n, pass_seed(*seed, 0))
         starts = self.subject.random_points(rng)
-        return self.ended(starts, trace_exits(self.subject, starts, (*seed, 1), fewest=1))
+        return self.ended(starts, trace_exits(self.subject, starts, (*seed, 1), fewest=1), seed)
 
-    def ended(self, starts: SurfacePoint, exits: Exits) -> Pairs:
-        """The pairs of walks whose ends and orders from one on are known; those with T > 0, T as values."""
+    def ended(self, starts: SurfacePoint, exits: Exits, seed: tuple[int, ...]) -> Pairs:
+        """The pairs of walks whose ends and orders from one on are known, those of two and more, T as values.
+
+        With t the mean over channels of T over its mean, a walk is kept with the chance p = min(1, t / 1.5), as T / p:
+        one of little T costs a step as much as another, and tells it less.
+
+        Args:
+            starts, exits: of the walks.
+            seed: of what is kept.
+        """
         import drjit as dr
         import mitsuba as mi
 
         n, exit = dr.width(starts.p), Side(starts, first_event(self.subject, starts))
         once, columns = exits.order == 1, side_features(self.frame, exit)
-        T = [*dr.select(once, exits.T, 0), *dr.select(once, 0, exits.T)]
-        dr.eval(columns, exit.event.y, T)
-        even = Even(_stacked(columns, n), _stacked(T, n))
-        kept = dr.compress(dr.max(exits.T) * dr.select(once, 0, 1) > 0)
+        T = dr.select(once, 0, exits.T)
+        both = [*dr.select(once, exits.T, 0), *T]
+        if self.scale is not None:
+            p = dr.minimum(dr.mean(T * self.scale) / ENOUGH, 1)
+            stays = generator(mi, n, pass_seed(*seed, 4)).next_float32() < p
+            T = dr.select(stays, T / dr.maximum(p, 1e-20), 0)
+        dr.eval(columns, exit.event.y, both, T)
+        even = Even(_stacked(columns, n), _stacked(both, n))
+        kept = dr.compress(dr.max(T) > 0)
         if dr.width(kept) == 0:
             nothing = self._columns(starts, starts, dr.zeros(mi.Spectrum, n))
             return nothing._replace(faces=np.zeros(n, np.uint32), even=even)
@@ -172,24 +188,21 @@ class PairSource:
         columns = [*side_features(self.frame, entry), *pair_features(self.frame, exit, entry)]
         features = np.concatenate([even.features[:, kept.numpy()], _stacked(columns, dr.width(kept))])
         faces = np.array(dr.gather(mi.UInt32, exits.face, kept))
-        return Pairs(features, even.T[len(even.T) // 2 :, kept.numpy()], n, faces, even)
+        return Pairs(features, _stacked(list(dr.gather(mi.Spectrum, T, kept)), dr.width(kept)), n, faces, even)
 
-    def proposed(
-        self, n: int, seed: tuple[int, ...], patches: PatchSampler | None = None, starts: SurfacePoint | None = None
-    ) -> Pairs:
+    def proposed(self, n: int, seed: tuple[int, ...], starts: SurfacePoint | None = None) -> Pairs:
         """n proposals, S mu_i at the start over their density as values.
 
         Args:
             n: how many.
             seed: of them.
-            patches: learnt weights that they follow, if they are given.
             starts: n exits that they are of; by default random ones.
         """
         import mitsuba as mi
 
         rng = generator(mi, n, pass_seed(*seed, 2))
         starts = starts or self.subject.random_points(rng)
-        entries, weight = self.proposals.with_patches(patches).sample(starts, rng)
+        entries, weight = self.proposals.sample(starts, rng)
         return self._columns(starts, entries, weight)
 
     def _columns(self, exits: SurfacePoint, entries: SurfacePoint, value: Any) -> Pairs:

@@ -14,7 +14,6 @@ import numpy as np
 
 from full_geometry.learning.exits import Exits
 from full_geometry.learning.pairs import Pairs, PairSource, shuffled
-from full_geometry.patches import PatchSampler
 from full_geometry.subject import SurfacePoint
 from halfspace_sss.rendering.scenes.camera_walks import TRIAL
 
@@ -71,13 +70,12 @@ class Seen:
             self.camera.exits(self.shape, TRIAL, self.schedule.spp)
         return (time.monotonic() - started) * self.schedule.passes / self.schedule.every
 
-    def data(self, k: int, chunk: int, patches: PatchSampler | None) -> tuple[Pairs, Pairs]:
+    def data(self, k: int, proposed: int) -> tuple[Pairs, Pairs]:
         """Walks and proposals of chunk k.
 
         Args:
             k: number of the chunk.
-            chunk: number of proposals.
-            patches: learnt weights that proposals follow.
+            proposed: number of proposals.
         """
         import drjit as dr
 
@@ -88,13 +86,14 @@ class Seen:
         walks, proposals = [], []
         for j, (starts, ends) in enumerate(parts):
             n = dr.width(starts.p)
-            m = round(chunk * n / self.walks)
+            m = round(proposed * n / self.walks)
             at = starts.gather(_lanes(order.integers(0, n, m)))
-            walks.append(self.source.ended(starts, ends))
-            proposals.append(self.source.proposed(m, (*seed, 3, j), patches, at))
-        left = [total - sum(part.drawn for part in done) for total, done in ((self.walks, walks), (chunk, proposals))]
+            walks.append(self.source.ended(starts, ends, (*seed, 5, j)))
+            proposals.append(self.source.proposed(m, (*seed, 3, j), at))
+        wanted = (self.walks, walks), (proposed, proposals)
+        left = [total - sum(part.drawn for part in done) for total, done in wanted]
         walks.append(self.source.walks(left[0], seed))
-        proposals.append(self.source.proposed(left[1], seed, patches))
+        proposals.append(self.source.proposed(left[1], seed))
         return (shuffled(walks, order), shuffled(proposals, order)) if parts else (walks[0], proposals[0])
 
     def _exits(self, numbers: list[int], order: np.random.Generator) -> list[tuple[SurfacePoint, Exits]]:

@@ -8,7 +8,7 @@ import time
 import warnings
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +31,7 @@ from halfspace_sss.neural.trained import weights_folder
 from halfspace_sss.neural.training.work_folder import CHECKPOINT, claim
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.provenance import check_folder, provenance, write_atomically
+from halfspace_sss.rendering.transport.plane import number
 
 __all__ = ["Trained", "train", "train_by_cpu"]
 
@@ -39,6 +40,7 @@ VALIDATIONS = 4  # in a run
 EXITS, WALKS, SAMPLES = 256, 2048, 512  # of a validation
 CHECKPOINT_EVERY = 15.0  # seconds
 PLAN = "plan.json"
+PROPOSED = 2  # proposals for a walk that is kept
 LOOP_SHARE = 0.9  # of the seconds for data and steps, the rest for the pilot, the truth and the errors
 
 
@@ -209,11 +211,12 @@ class _Run:
 
     def _prepare(self, chunks: int | None = None) -> None:
         """Scales and shares from a pilot, which compiles all kernels; the work of a run that was killed."""
-        pilot = self.source.walks(self.recipe.chunk // 4, (self.seed, 2**31))
+        seed, n = (self.seed, 2**31), self.recipe.chunk // 4
+        self.fitting.set_scale(self.source.walks(n, seed))
+        self.source = replace(self.source, scale=self._scale())
+        pilot, proposed = self.source.walks(n, seed), self.source.proposed(n, seed)
         share = pilot.values.shape[1] / pilot.drawn
         self.walks = int(self.recipe.chunk / min(max(share, 0.05), 1.0))
-        proposed = self.source.proposed(self.recipe.chunk // 4, (self.seed, 2**31), self._sampler())
-        self.fitting.set_scale(pilot)
         self._new_fitting().use(pilot, proposed, None, np.random.default_rng(0))
         run = {"object": self.identity.record(), "recipe": asdict(self.recipe), "seed": self.seed}
         if self.camera:
@@ -228,6 +231,13 @@ class _Run:
         if chunks is not None:
             self._plan(chunks)
 
+    def _scale(self) -> Any:
+        """One over the mean of T, per channel that has any, so that the mean over channels is 1."""
+        import mitsuba as mi
+
+        scale = self.fitting.scale.numpy()[:, 0]
+        return mi.Spectrum([number(v * len(scale) / max(np.count_nonzero(scale), 1)) for v in scale.tolist()])
+
     def _plan(self, chunks: int) -> None:
         """Fix the number of chunks, and write it down for a run that goes on after this one."""
         self.total = chunks
@@ -238,27 +248,19 @@ class _Run:
         """Chunks after which the error is measured."""
         return {round(self.total * (k + 1) / VALIDATIONS) for k in range(VALIDATIONS - 1)}
 
-    def _sampler(self) -> PatchSampler | None:
-        """What the next proposals follow."""
-        if self.patches is None:
-            return None
-        weights = {name: value.astype(np.float16) for name, value in self.fitting.drawing.arrays().items()}
-        return PatchSampler(self.frame, self.patches, weights)
-
-    def _data(self, k: int, sampler: PatchSampler | None) -> tuple[Pairs, Pairs]:
+    def _data(self, k: int) -> tuple[Pairs, Pairs]:
         """Walks and proposals of chunk k."""
         if self.seen:
-            return self.seen.data(k, self.recipe.chunk, sampler)
+            return self.seen.data(k, PROPOSED * self.recipe.chunk)
         walks = self.source.walks(self.walks, (self.seed, k))
-        return walks, self.source.proposed(self.recipe.chunk, (self.seed, k), sampler)
+        return walks, self.source.proposed(PROPOSED * self.recipe.chunk, (self.seed, k))
 
     def _chunk(self, seconds: float, clock: Callable[[], float] = time.monotonic) -> None:
         """Steps on a chunk, while the data of the next one are made."""
-        walks, proposals = self.ready or self._data(self.done, self._sampler())
-        self.fitting.draw_by_average()
+        walks, proposals = self.ready or self._data(self.done)
         at, following = clock(), None
         if self.done + 1 < self.total:
-            following = self.aside.submit(self._data, self.done + 1, self._sampler())
+            following = self.aside.submit(self._data, self.done + 1)
         per_chunk = self.recipe.reuse * max(self.recipe.chunk // self.recipe.batch, 1)
         # the first chunk does not know of the plan, and neither does its rate
         steps = self.total * per_chunk if self.done or self.total == 1 else None
