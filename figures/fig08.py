@@ -103,6 +103,7 @@ def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
     """The figure as PDF and PNG, and the numbers as a table."""
     import pandas
     from matplotlib.figure import Figure
+    from matplotlib.ticker import FuncFormatter
 
     table = pandas.DataFrame([row for result in results.values() for row in result.numbers["rows"]])
     with paper():
@@ -115,6 +116,8 @@ def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
             numbers = sorted(set(table["N"]))
             ax.set_xticks(numbers, [str(n) for n in numbers])
             ax.set_xticks([], minor=True)
+            for set_formatter in (ax.yaxis.set_major_formatter, ax.yaxis.set_minor_formatter):
+                set_formatter(FuncFormatter(lambda y, _: f"{y:g}" if f"{y:.0e}"[0] in "1235" else ""))
             ax.grid(True, which="both", lw=0.3, color="#dddddd")
         figure.axes[0].set_ylabel("relative RMSE of one estimate")
         figure.axes[1].legend(frameon=False)
