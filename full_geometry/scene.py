@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -51,8 +52,11 @@ class LearntTransport:
     def prepare(self, out: Exit, active: Any) -> PreparedExit:
         return self.model.prepare(SurfacePoint(out.p, out.n_face, out.n, out.w), active)
 
-    def alpha(self, out: Exit, active: Any) -> tuple[Any, Any]:
-        return self.model.alpha(SurfacePoint(out.p, out.n_face, out.n, out.w), active)
+    @property
+    def alpha(self) -> Callable[[Exit, Any], tuple[Any, Any]]:
+        """See `Transport`; AttributeError where the model does not know it."""
+        known = self.model.alpha
+        return lambda out, active: known(SurfacePoint(out.p, out.n_face, out.n, out.w), active)
 
     def S_mu(self, prepared: PreparedExit, entry: Entry, w_i: Any, active: Any) -> Any:
         n_out, mu_i = entry.seen(w_i)
