@@ -46,7 +46,7 @@ class Recipe:
         width, depth: hidden layers of the network.
         batch: walks, and proposals, of a step.
         rate: largest learning rate.
-        chunk: walks, and proposals, that are made at once.
+        chunk: walks that are kept of those made at once, with twice as many proposals.
         reuse: times that each is used.
         start: what is corrected: the name of a half-space model, or `neural_shape`.
     """

@@ -49,7 +49,7 @@ class Even(NamedTuple):
 
 
 class Pairs(NamedTuple):
-    """Pairs as columns: features (inputs, n), values (channels, n); `drawn` were drawn, those left out have value 0."""
+    """Pairs as columns: features (inputs, n), values (channels, n), whose sum over `drawn` is the mean of all drawn."""
 
     features: np.ndarray
     values: np.ndarray
