@@ -147,8 +147,7 @@ class Fitting:
                 for i, j in zip(order.permutation(n_x), order.integers(0, n_y, n_x)):
                     a, b, e = (slice(k * m, (k + 1) * m) for k, m in ((i, batch), (j, batch), (i, n_even)))
                     loss = likelihood((S(x[:, a], back), T[:, a]), (S(y[:, b], back), W[:, b]), kept)
-                    if not back:
-                        loss = loss + mean_likelihood(self.modules["alpha"](exits[:, e]), even[:, e], self.even_scale)
+                    loss = loss + mean_likelihood(self.modules["alpha"](exits[:, e]), even[:, e], self.even_scale)
                     if patch is not None and not back:
                         loss = loss + self._patch_loss(x[:, a], T[:, a], patch[a])
                     self._advance(loss, steps)

@@ -138,6 +138,7 @@ def test_a_killed_run_ends_with_the_same_weights(mesh: bool, tmp_path: Path, mon
     again = train(shape, WAX, folder=tmp_path / "b", work=tmp_path / "killed", **arguments)
     assert again.steps == whole.steps
     assert all(np.array_equal(v, again.model.weights[name]) for name, v in whole.model.weights.items())
+    assert all(np.array_equal(v, again.model.alpha.weights[name]) for name, v in whole.model.alpha.weights.items())
     if mesh:
         assert all(np.array_equal(v, again.sampler.weights[name]) for name, v in whole.sampler.weights.items())
 

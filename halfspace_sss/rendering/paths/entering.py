@@ -57,7 +57,7 @@ def entering_light(world: World, body: Body, out: Exit, prim_index: Any, sampler
     def draw(aims: Any = None) -> Candidate:
         return _candidate(world, body, _Exit(out, prim_index, prepared, where), aims, sampler, active)
 
-    n, kept = body.entries, draw()
+    n, kept = world.entries(body), draw()
     if n == 1:
         return kept
     total = dr.detach(kept.hope)

@@ -12,7 +12,7 @@ from halfspace_sss.rendering.paths.lights import Lights
 from halfspace_sss.rendering.paths.sky import Sky, sky_of
 from halfspace_sss.rendering.surface.derivatives import detached
 from halfspace_sss.rendering.transport.body import Body
-from halfspace_sss.rendering.transport.settings import Settings
+from halfspace_sss.rendering.transport.settings import AUTOMATIC, Settings
 
 __all__ = ["World", "sampled_light"]
 
@@ -46,6 +46,11 @@ class World:
     def evens(self, body: Body) -> bool:
         """Whether the mean light of the sky serves a body."""
         return self.sky is not None and hasattr(body.transport, "alpha")
+
+    def entries(self, body: Body) -> int:
+        """How many an exit draws: one where the mean light of the sky is nearly all, and the settings do not say."""
+        alone = self.evens(body) and not self.lights.some_local
+        return 1 if alone and self.settings.entries == AUTOMATIC else body.entries
 
 
 def sampled_light(world: World, ref: Any, u: Any, test_visibility: bool, active: Any) -> tuple[Any, Any]:

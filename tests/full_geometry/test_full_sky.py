@@ -1,0 +1,100 @@
+"""What an object is under the same light from everywhere, learnt beside S: its error, its file, its images."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from halfspace_sss import Medium
+
+mi = pytest.importorskip("mitsuba")
+pytest.importorskip("torch")
+
+from full_geometry import storing  # noqa: E402
+from full_geometry.first_event import first_event  # noqa: E402
+from full_geometry.learning.exits import trace_exits  # noqa: E402
+from full_geometry.learning.fitting import Recipe  # noqa: E402
+from full_geometry.learning.model_errors import LIGHTS  # noqa: E402
+from full_geometry.learning.training import Trained, train  # noqa: E402
+from full_geometry.scene import LearntTransport  # noqa: E402
+from full_geometry.subject import Subject  # noqa: E402
+from halfspace_sss import rendering  # noqa: E402
+from halfspace_sss.neural import trained as known_weights  # noqa: E402
+from halfspace_sss.neural.store import load_weights, save_weights  # noqa: E402
+from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
+
+BUNNY = Path(__file__).parents[2] / "figures" / "assets" / "bunny.ply"
+QUICK = Recipe(width=32, depth=2, batch=1024, chunk=2**15, reuse=4)
+WAX = Medium(np.array([0.95, 0.0, 0.6]), np.array([0.05, 0.2, 0.4]), 0.0, 1.4)
+SURFACE = {"type": "translucent", "sigma_s": "0.95,0,0.6", "sigma_a": "0.05,0.2,0.4", "eta": 1.4}
+
+
+@pytest.fixture(autouse=True)
+def variant() -> None:
+    mi.set_variant("llvm_ad_rgb")
+    rendering.register()
+
+
+def shape(**more) -> dict:
+    """About 4 mean free paths across; G does not scatter."""
+    at = mi.ScalarTransform4f().scale(0.4)
+    return {"type": "ply", "filename": str(BUNNY), "to_world": at, **more}
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory):
+    mi.set_variant("llvm_ad_rgb")
+    rendering.register()
+    folder = tmp_path_factory.mktemp("weights")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(known_weights.ENVIRONMENT_VARIABLE, str(folder))
+        yield train(mi.load_dict(shape()), WAX, chunks=12, recipe=QUICK, folder=folder)
+
+
+def test_orders_below_two_and_the_others_agree_with_walks(trained: Trained) -> None:
+    subject, n = trained.model.subject, 2**19
+    at = subject.random_points(generator(mi, n, pass_seed(3)))
+    T = [trace_exits(subject, at, (4,), fewest=fewest).T for fewest in (0, 2)]
+    few, more = (np.array(v) for v in trained.model.alpha(at))
+    walked = np.array(T[0] - T[1]), np.array(T[1])
+    for learnt, walk in zip((few, more), walked):
+        error = (learnt - walk).std(axis=1) / np.sqrt(n)
+        assert np.all(np.abs((learnt - walk).mean(axis=1)) <= 4 * error + 0.01 * walk.mean(axis=1))
+    P = np.array(first_event(subject, at).P)
+    assert np.all(more[1] == 0) and np.all(more >= 0) and np.all(more <= P + 1e-5)
+
+
+def test_weights_without_it_are_refused_by_name(trained: Trained, tmp_path: Path) -> None:
+    arrays, record = load_weights(trained.path, storing.KIND)
+    path = tmp_path / trained.path.name
+    save_weights(path, storing.KIND, {k: v for k, v in arrays.items() if not k.startswith(("A_", "a_"))}, record)
+    subject = Subject.of(mi.load_dict(shape()), WAX)
+    with pytest.raises(ValueError, match="alpha must be there.*to be trained again"):
+        storing.find_weights(subject, tmp_path)
+    with pytest.raises(ValueError, match="to be trained again"):
+        storing.load(path, subject)
+
+
+def test_an_even_sky_has_the_same_light_and_a_fifth_of_the_variance(
+    trained: Trained, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    view = mi.ScalarTransform4f().look_at([0, 2, 9], [-0.2, 1.9, 0], [0, 1, 0]).scale(1.0)
+    film = {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}}
+    surface = {**SURFACE, "model": "full_geometry"}
+    scene = mi.load_dict({
+        "type": "scene", "integrator": {"type": "bssrdf", "train_seconds": 0.0}, "sky": {"type": "constant"},
+        "bunny": shape(bsdf=surface), "sensor": {"type": "orthographic", "to_world": view, "film": film},
+    })  # fmt: skip
+    means, variances = [], []
+    for knows in (True, False):
+        if not knows:
+            monkeypatch.delattr(LearntTransport, "alpha")
+        runs = np.array([np.array(mi.render(scene, spp=32, seed=k)) for k in range(8)])
+        means.append(runs.mean(axis=(0, 1, 2)))
+        variances.append(runs.var(axis=0, ddof=1).mean())
+    error = np.sqrt(sum(variances) / 8) / 16
+    worst = max(row.error for row in trained.errors if row.light == LIGHTS[0])
+    assert np.all(np.abs(means[0] - means[1]) < 4 * error + worst * means[1])
+    assert variances[0] < 0.2 * variances[1]
