@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from figures.beyond.objects import VIEWS, View, scene
-from figures.computing.contenders import ENTRIES, OF_OBJECTS
+from figures.computing.contenders import OF_OBJECTS
 from figures.computing.denoise import guides
 from figures.computing.environments import environment_file
 from figures.computing.model_inputs import weight_files
@@ -51,7 +51,7 @@ def parts(quality: str) -> list[Part]:
         for model in (TRUTH, *MODELS):
             spp = SPP[quality].get(model, SPP[quality]["model"])
             params = {"object": name, "model": model, "size": size, "spp": spp, "resolution": RESOLUTION[quality]}
-            params |= {"entries": ENTRIES.get(model, 1), "view": list(_view(name)), "seed": 0}
+            params |= {"view": list(_view(name)), "seed": 0}
             needs = (training_of(name),) if model == FULL_GEOMETRY else ()
             weights = weight_files(model, tissue("candle wax").medium)
             inputs = (environment_file(LIGHT), TISSUES, *weights)
@@ -76,7 +76,7 @@ def shown(task: Task) -> dict[str, Any]:
     alone = {key: description[key] for key in ("type", "sensor", name)}
     cover = guides(mi.load_dict({**alone, "integrator": {"type": "path"}}))[0][..., 0]
     if p["model"] != TRUTH:
-        description["integrator"] = {"type": "bssrdf", "entries": p["entries"]}
+        description["integrator"] = {"type": "bssrdf"}
     each = min(SPP_PER_PASS, p["spp"])
     passes = p["spp"] // each
     with with_weights(task.folder, task.needed):

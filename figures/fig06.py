@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from figures.computing.contenders import ENTRIES
 from figures.computing.environments import ENVIRONMENTS, environment, environment_file
 from figures.computing.scenes import BUNNY, bunny_scene, prepare
 from figures.computing.tone import stops_of
@@ -53,7 +52,7 @@ def parts(quality: str) -> list[Part]:
                 "spp": spp,
                 "seed": 0,
             }
-            params |= {"model": model, "entries": ENTRIES.get(model, 1)}
+            params["model"] = model
             needs = (training_of(MATERIAL),) if model == FULL_GEOMETRY else ()
             name = _name(light, view, model)
             found.append(Part(name, seen, params, spp * size**2, needs, (BUNNY, *files), model))
@@ -84,8 +83,6 @@ def seen(task: Task) -> dict[str, Any]:
     about = mi.ScalarTransform4f().translate([AXIS[0], 0, AXIS[1]])
     turn = about @ mi.ScalarTransform4f().rotate([0, 1, 0], p["view"]) @ about.inverse()
     description["sensor"]["to_world"] = turn @ description["sensor"]["to_world"]
-    if p["model"] != PATH_TRACED:
-        description["integrator"]["entries"] = p["entries"]
     with with_weights(task.folder, task.needed):
         scene = load_scene(description, p["model"])
         image = np.array(mi.render(scene, spp=p["spp"], seed=p["seed"] + (p["model"] == PATH_TRACED)))

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from figures.computing import contenders
-from figures.computing.contenders import ENTRIES
 from figures.computing.long_render import long_render
 from figures.computing.model_inputs import weight_files
 from figures.computing.scenes import BUNNY, MATERIALS, bunny_scene, prepare
@@ -57,7 +56,7 @@ def parts(quality: str) -> list[Part]:
         for model in MODELS:
             learnt = model == FULL_GEOMETRY
             found += [train_scan(material, material, TRAIN_SECONDS[quality])] if learnt else []
-            params = {**common, "spp": spp, "model": model, "entries": ENTRIES.get(model, 1)}
+            params = {**common, "spp": spp, "model": model}
             inputs = (BUNNY, *weight_files(model, materials.load(material).medium))
             needs = (training_of(material),) if learnt else ()
             found.append(Part(f"{material}, {model}", rendered, params, 2 * spp * size**2, needs, inputs, model))
@@ -83,7 +82,6 @@ def rendered(task: Task) -> dict[str, Any]:
     prepare()
     p = task.params
     description = bunny_scene(p["material"], p["size"], sampler="multijitter")
-    description["integrator"]["entries"] = p["entries"]
     with with_weights(task.folder, task.needed):
         scene = load_scene(description, p["model"])
         first = np.array(mi.render(scene, spp=p["spp"], seed=p["seed"] + 1))  # compiles

@@ -14,13 +14,12 @@ from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.surface.transports import model_names
 
 __all__ = [
-    "ENTRIES", "MODELS", "OF_OBJECTS", "RR_DEPTHS", "VOLUMES", "WALK", "contender", "long_passes", "long_walk", "ready",
+    "MODELS", "OF_OBJECTS", "RR_DEPTHS", "VOLUMES", "WALK", "contender", "long_passes", "long_walk", "ready",
     "volume",
 ]  # fmt: skip
 
 MODELS = ("standard_dipole", "better_dipole", "directional_dipole", "photon_beam_diffusion", "neural")
 OF_OBJECTS = tuple(name for name in ("neural_shape", "full_geometry") if name in model_names())
-ENTRIES = {"full_geometry": 2}  # of an exit; 1 for the others
 WALK = "translucent_walk"
 RR_DEPTHS = (5, 64, 200, 1024)
 LONG_PASS = 32  # samples per pixel of a pass of the long render
@@ -76,7 +75,6 @@ def ready(method: str, description: dict[str, Any], name: str, medium: Medium, b
         return _volume_scene(description, name, medium, int(method.split()[1]))
     if method == WALK:
         return load_scene(description, PATH_TRACED)
-    description["integrator"]["entries"] = ENTRIES.get(method, 1)
     if not bare:
         return load_scene(description, method)
     description[name]["bsdf"]["reflection"] = False

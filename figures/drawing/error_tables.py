@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from figures.computing.contenders import ENTRIES, VOLUMES, WALK, volume
+from figures.computing.contenders import VOLUMES, WALK, volume
 from figures.drawing.style import look
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ __all__ = ["equal_error", "furnace", "in_markdown", "label", "markdown", "sampli
 LATE_ROULETTE = volume(200)  # the usual setting of volpathmis for media that hardly absorb
 WANTED = 0.02  # noise of an image, root mean square over that of the image, at which a training is held against time
 CERTAIN = 2.0  # standard errors by which an error must stand out of the noise of the truth
-NOTES = f"""\
+NOTES = """\
 Cost is mean squared error of the pixels of the object times CPU seconds, compilation left out; a ratio is the cost of
 `volpathmis` at the best of its settings over that of the method: how many times less time the method needs for the
 same error. *Variance*: the error is that about a long independent render by the same method. *With bias*: it is that
@@ -29,8 +29,8 @@ truth.
 Russian roulette only adds variance: where a setting of `volpathmis` seems to have less than one whose roulette begins
 later, it has not met its rare bright paths yet, and counts with the variance of the other. `volpathmis` renders the
 channels of a medium whose mean cosine differs between them one by one. Ratios do not count the *training* of
-`full_geometry`, which draws {ENTRIES["full_geometry"]} entries an exit; with it counted, it has *paid after* so many
-images of 2 % noise."""
+`full_geometry`, which draws two entries an exit, and one under an even sky; with it counted, it has *paid after* so
+many images of 2 % noise."""
 BARE_NOTES = """\
 The models without surface reflection and without the single scattering that they lack, against `volpathmis` at its
 best setting and at rr_depth 200."""
