@@ -32,7 +32,7 @@ from halfspace_sss.rendering.transport.settings import AUTOMATIC, Settings
 __all__ = ["LearntTransport", "learnt_means"]
 
 FINE = 2.5  # transport mean free paths of the radius of a patch, up to which patches do without probes
-PATCH_SHARE = 0.5  # of the entries where patches are larger
+PATCH_SHARE = 0.2  # of the entries where patches are larger: they reach what probes miss
 ENTRIES = 2  # of an exit: its own work is done once, and patches draw without a ray
 
 
