@@ -32,6 +32,7 @@ __all__ = ["STANDARD", "Fitting", "Recipe"]
 
 BETAS, CLIP, LAST_RATE, WARM_UP = (0.9, 0.99), 1.0, 0.01, 100
 AVERAGE = 0.998  # of the numbers, each step
+BLOCK = 4096  # pairs whose layers stay in the cache
 LEAST = 0.05  # chance of a proposal: f moves while the chunk is used
 PATCH_HIDDEN, PATCH_BATCH = (64, 32), 1024
 ALPHA_HIDDEN = (32, 32)
@@ -156,7 +157,8 @@ class Fitting:
         """Features and values of some proposals, kept by chance as walks are: by W exp f as the fit has it now."""
         y, W = torch.from_numpy(proposals.features), torch.from_numpy(proposals.values)
         with torch.no_grad(), one_thread():
-            value = (W * self.scale * torch.exp(self.modules["S"](y))).mean(dim=0)
+            f = [self.modules["S"](part) for part in y.split(BLOCK, dim=1)]
+            value = (W * self.scale * torch.exp(torch.cat(f, dim=1))).mean(dim=0)
             p = (value / (ENOUGH * value.mean().clamp_min(1e-30))).clamp(LEAST, 1.0)
             kept = torch.nonzero(torch.from_numpy(order.random(len(p), np.float32)) < p)[:, 0]
             return y[:, kept], W[:, kept] * (len(kept) / len(p)) / p[kept]

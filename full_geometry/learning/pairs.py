@@ -23,6 +23,7 @@ from halfspace_sss.tracing.walk import generator, pass_seed
 __all__ = ["Pairs", "PairSource", "Proposals", "shuffled"]
 
 PATCH_SHARE = 0.6  # of those by patches, where they are learnt
+EVEN_EVERY = 4  # walks, one tells what even light brings: that is simpler than S
 ENOUGH = 1.5  # over the mean: pairs of less value are kept by chance, and then with more
 
 
@@ -42,7 +43,7 @@ class Numbers:
 
 
 class Even(NamedTuple):
-    """Exits of all walks as columns, features (inputs, n), and T, (2 channels, n): of order one, then of the others."""
+    """Exits of walks as columns, features (inputs, n), and T, (2 channels, n): of order one, then of the others."""
 
     features: np.ndarray
     T: np.ndarray
@@ -55,7 +56,7 @@ class Pairs(NamedTuple):
     values: np.ndarray
     drawn: int
     faces: np.ndarray | None = None  # where walks left
-    even: Even | None = None  # of walks
+    even: Even | None = None  # of some of the walks
 
 
 def shuffled(parts: list[Pairs], order: np.random.Generator) -> Pairs:
@@ -168,27 +169,31 @@ class PairSource:
         import drjit as dr
         import mitsuba as mi
 
-        n, exit = dr.width(starts.p), Side(starts, first_event(self.subject, starts))
-        once, columns = exits.order == 1, side_features(self.frame, exit)
-        T = dr.select(once, 0, exits.T)
-        both = [*dr.select(once, exits.T, 0), *T]
+        n, even = dr.width(starts.p), self._even(starts, exits)
+        T = dr.select(exits.order == 1, 0, exits.T)
         if self.scale is not None:
             p = dr.minimum(dr.mean(T * self.scale) / ENOUGH, 1)
             stays = generator(mi, n, pass_seed(*seed, 4)).next_float32() < p
             T = dr.select(stays, T / dr.maximum(p, 1e-20), 0)
-        dr.eval(columns, exit.event.y, both, T)
-        even = Even(_stacked(columns, n), _stacked(both, n))
         kept = dr.compress(dr.max(T) > 0)
         if dr.width(kept) == 0:
             nothing = self._columns(starts, starts, dr.zeros(mi.Spectrum, n))
             return nothing._replace(faces=np.zeros(n, np.uint32), even=even)
-        y, ends = dr.gather(mi.Point3f, exit.event.y, kept), exits.at.gather(kept)
-        exit = Side(starts.gather(kept), exit.event._replace(y=y))  # pairs ask for no more of it
-        entry = Side(ends, first_event(self.subject, ends))
-        columns = [*side_features(self.frame, entry), *pair_features(self.frame, exit, entry)]
-        features = np.concatenate([even.features[:, kept.numpy()], _stacked(columns, dr.width(kept))])
+        ends, T = exits.at.gather(kept), dr.gather(mi.Spectrum, T, kept)
         faces = np.array(dr.gather(mi.UInt32, exits.face, kept))
-        return Pairs(features, _stacked(list(dr.gather(mi.Spectrum, T, kept)), dr.width(kept)), n, faces, even)
+        return self._columns(starts.gather(kept), ends, T)._replace(drawn=n, faces=faces, even=even)
+
+    def _even(self, starts: SurfacePoint, exits: Exits) -> Even:
+        """What walks bring under the same light from everywhere, of every fourth walk."""
+        import drjit as dr
+        import mitsuba as mi
+
+        n = max(dr.width(starts.p) // EVEN_EVERY, 1)
+        lanes = dr.arange(mi.UInt32, n) * EVEN_EVERY
+        at, T = starts.gather(lanes), dr.gather(mi.Spectrum, exits.T, lanes)
+        once = dr.gather(mi.UInt32, exits.order, lanes) == 1
+        columns = side_features(self.frame, Side(at, first_event(self.subject, at)))
+        return Even(_stacked(columns, n), _stacked([*dr.select(once, T, 0), *dr.select(once, 0, T)], n))
 
     def proposed(self, n: int, seed: tuple[int, ...], starts: SurfacePoint | None = None) -> Pairs:
         """n proposals, S mu_i at the start over their density as values.
