@@ -103,7 +103,7 @@ def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
 
     images, scenes, rows = results["bunny"].images, {}, []
     for light in LIGHTS:
-        reference = images[_key(light, "converged")]
+        reference = np.maximum(images[_key(light, "converged")], 0)
         mask = reference.max(axis=2) > 0
         gain = np.float32(2.0 ** stops_of(reference, mask))
         shots = [Shot("Converged", gain * reference, {})]
