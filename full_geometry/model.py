@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from full_geometry.features import N_PAIR, Frame, Side, pair_features, side_features
-from full_geometry.reflectance import Reflectance
+from full_geometry.learning.reflectance import Reflectance
 from full_geometry.subject import Subject, SurfacePoint
 from halfspace_sss.interface.model import BSSRDF
 

@@ -137,8 +137,8 @@ def test_a_killed_run_ends_with_the_same_weights(mesh: bool, tmp_path: Path, mon
         train(shape, WAX, folder=tmp_path / "b", work=tmp_path / "killed", progress=kill, **arguments)
     again = train(shape, WAX, folder=tmp_path / "b", work=tmp_path / "killed", **arguments)
     assert again.steps == whole.steps
-    assert all(np.array_equal(v, again.model.weights[name]) for name, v in whole.model.weights.items())
-    assert all(np.array_equal(v, again.model.alpha.weights[name]) for name, v in whole.model.alpha.weights.items())
+    for one, other in ((whole.model, again.model), (whole.model.alpha, again.model.alpha)):
+        assert all(np.array_equal(v, other.weights[name]) for name, v in one.weights.items())
     if mesh:
         assert all(np.array_equal(v, again.sampler.weights[name]) for name, v in whole.sampler.weights.items())
 
@@ -223,8 +223,7 @@ def test_the_error_leaves_noise_out() -> None:
 
 
 def test_the_truth_has_no_error_against_itself() -> None:
-    subject = Subject.of(ball(), WAX)
-    a, b = (reference(subject, 64, 2048, seed=1), reference(subject, 64, 2048, seed=1))
+    a, b = (reference(Subject.of(ball(), WAX), 64, 2048, seed=1) for _ in range(2))
     assert np.array_equal(a.truth.mean, b.truth.mean)
 
 
