@@ -108,6 +108,6 @@ def _shots(results: Mapping[str, Result], name: str) -> list[Shot]:
     gain = np.float32(2.0 ** stops_of(reference, mask))
     shots = [Shot("Path traced", gain * reference, {})]
     for model in MODELS:
-        image = np.maximum(results[f"{name}, {model}"].images["image"], 0)
+        image = results[f"{name}, {model}"].images["image"]
         shots.append(compared(label(model), gain * image, gain * reference, mask=mask, numbers={}))
     return shots

@@ -103,8 +103,7 @@ def _errors(scene: str, truth: Result, ways: Result) -> list[dict[str, Any]]:
     mask, rows = reference.max(axis=2) > 0, []
     for way, about in ways.numbers["ways"].items():
         for k, (seconds, spp) in enumerate(zip(about["seconds"], about["spp"])):
-            image = np.maximum(ways.images[f"{way}-{k}"], 0)
-            shot = compared(way, gain * image, gain * reference, mask=mask)
+            shot = compared(way, gain * ways.images[f"{way}-{k}"], gain * reference, mask=mask)
             learning = way == "online" and seconds < ways.numbers["switch"]
             row = {"scene": scene, "way": way, "phase": "learning" if learning else "rendering"}
             rows.append({**row, "seconds": seconds, "spp": spp, **shot.numbers})

@@ -113,7 +113,7 @@ def _pair(results: Mapping[str, Result], light: str, view: int) -> tuple[Shot, S
     mask = reference.max(axis=2) > 0
     gain = np.float32(2.0 ** stops_of(reference, mask))
     image = results[_name(light, view, FULL_GEOMETRY)].images["image"]
-    model = compared("Full geometry", gain * np.maximum(image, 0), gain * reference, mask=mask, numbers={})
+    model = compared("Full geometry", gain * image, gain * reference, mask=mask, numbers={})
     return Shot("Path traced", gain * reference, {}), model
 
 

@@ -23,7 +23,7 @@ TITLE = "one sample a pixel, with and without sampling that has learnt"
 SIZES = {"draft": 128, "paper": 512}
 SECONDS = {"draft": 15, "paper": 600}  # CPU time of the training, and of the flow
 REFERENCE_SPP = {"draft": 256, "paper": 16384}
-LIGHTS = ("even sky", "small light")
+LIGHTS = {"both": "lamp and windows", "small light": "small light"}  # under an even sky little is left to be drawn
 SAMPLERS = ("probes", "patches", "flow")
 ENTRIES = (1, 8)  # points of entry of an exit
 SPP_PER_PASS = 64
@@ -103,7 +103,7 @@ def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
 
     images, scenes, rows = results["bunny"].images, {}, []
     for light in LIGHTS:
-        reference = images[_key(light, "converged")]
+        reference = np.maximum(images[_key(light, "converged")], 0)
         mask = reference.max(axis=2) > 0
         gain = np.float32(2.0 ** stops_of(reference, mask))
         shots = [Shot("Converged", gain * reference, {})]
@@ -113,7 +113,7 @@ def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
                 label = f"{sampler.capitalize()}, N = {n}"
                 shots.append(compared(label, gain * image, gain * reference, mask=mask, numbers={}))
                 rows.append({"light": light, "sampler": sampler, "N": n, **shots[-1].numbers})
-        scenes[light] = shots
+        scenes[LIGHTS[light]] = shots
     with paper():
         files: dict[str, bytes | str] = {f"fig12.{end}": data for end, data in saved(image_grid(scenes)).items()}
     files["fig12.csv"] = pandas.DataFrame(rows).to_csv(index=False, lineterminator="\n")

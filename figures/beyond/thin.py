@@ -152,5 +152,5 @@ def _shots(results: Mapping[str, Result], name: str) -> list[Shot]:
     for model in MODELS:
         image = results[f"{name}, {model}"].images["image"]
         numbers = {"mean over path traced": float(image[mask].mean() / reference[mask].mean())}
-        shots.append(compared(label(model), gain * np.maximum(image, 0), gain * reference, mask=mask, numbers=numbers))
+        shots.append(compared(label(model), gain * image, gain * reference, mask=mask, numbers=numbers))
     return shots

@@ -57,7 +57,7 @@ def compared(
 
     Args:
         label: of the model or method.
-        image, reference: linear radiance (H, W, 3).
+        image, reference: linear radiance (H, W, 3); of the image, what noise has brought below 0 counts as 0.
         exposure: stops, those at which the images are shown.
         mask: (H, W), true for the pixels that count for the means, e.g. those of the object.
         numbers: further columns, e.g. {"time, s": 12.5}; they come after FLIP and relMSE.
@@ -65,6 +65,7 @@ def compared(
     Raises:
         ValueError: the images cannot be compared; see `figures.computing.metrics`.
     """
+    image = np.maximum(image, 0)
     relative = relative_mse(reference, image, mask=mask, floor=FLOOR)
     flip = flip_ldr(srgb(reference, exposure), srgb(image, exposure), mask=mask)
     a, b = luminance(reference), luminance(image)

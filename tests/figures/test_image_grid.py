@@ -110,3 +110,11 @@ def test_images_without_maps_or_crops_make_a_figure(scenes: dict[str, list[Shot]
 def test_bad_input_is_refused(arguments: Any, options: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         image_grid(arguments, **options)
+
+
+def test_what_noise_brings_below_zero_counts_as_zero() -> None:
+    reference = np.full((16, 16, 3), 0.2)
+    noisy = reference.copy()
+    noisy[::2] = -0.1
+    found, zero = compared("a", noisy, reference), compared("b", np.maximum(noisy, 0), reference)
+    assert found.numbers == zero.numbers and found.image.min() == 0
