@@ -58,6 +58,11 @@ class LearntTransport:
         known = self.model.alpha
         return lambda out, active: known(SurfacePoint(out.p, out.n_face, out.n, out.w), active)
 
+    @property
+    def evened(self) -> tuple[Any, Any]:
+        """See `Transport`."""
+        return self.model.alpha.evened
+
     def S_mu(self, prepared: PreparedExit, entry: Entry, w_i: Any, active: Any) -> Any:
         n_out, mu_i = entry.seen(w_i)
         return self.model.S(prepared, SurfacePoint(entry.p, entry.n_face, n_out, w_i), active) * mu_i

@@ -35,7 +35,7 @@ __all__ = [
 KIND = "full_geometry"
 CHECKSUMS = "start_checksums"  # of a record
 S_LAYERS, ALPHA_LAYERS, PATCH_LAYERS, FLOW_LAYERS = ("W_", "b_"), ("A_", "a_"), ("V_", "c_"), ("F_", "h_")
-CENTRES = "centres"
+CENTRES, EVEN = "centres", "even"
 
 
 class Learnt(NamedTuple):
@@ -98,8 +98,8 @@ def _trained(path: Path) -> tuple[Identity, dict[str, np.ndarray], dict[str, Any
     if record.get("reflections") != REFLECTIONS:
         known = f"reflections must be {REFLECTIONS}, got {record.get('reflections')}"
         raise ValueError(f"{path.with_suffix('.json')}: {known}: of another version, to be trained again")
-    if not any(name.startswith(ALPHA_LAYERS) for name in arrays):
-        raise ValueError(f"{path}: layers of alpha must be there, got none: of another version, to be trained again")
+    if EVEN not in arrays:
+        raise ValueError(f"{path}: even light must be learnt, got none: of another version, to be trained again")
     try:
         anchors, grids = arrays.pop("anchors"), record.get("grids", "")
         probes = arrays.pop("probes") if grids else None
@@ -184,7 +184,8 @@ def assemble(
     def layers(names: tuple[str, ...]) -> dict[str, np.ndarray]:
         return {name: value for name, value in arrays.items() if name.startswith(names)}
 
-    model = FullGeometry(subject, frame, start, layers(S_LAYERS), Reflectance(subject, frame, layers(ALPHA_LAYERS)))
+    alpha = Reflectance(subject, frame, layers(ALPHA_LAYERS), arrays[EVEN])
+    model = FullGeometry(subject, frame, start, layers(S_LAYERS), alpha)
     if CENTRES not in arrays:
         return Learnt(model, None)
     patches = patches or Patches(subject, frame, arrays[CENTRES].astype(np.float32))

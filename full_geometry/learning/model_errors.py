@@ -27,7 +27,10 @@ from halfspace_sss.physics.medium import Medium
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.tracing.walk import generator, pass_seed
 
-__all__ = ["LIGHTS", "ModelError", "Reference", "Transport", "compare", "errors", "errors_of", "measure", "reference"]
+__all__ = [
+    "LIGHTS", "ModelError", "Reference", "Transport", "compare", "errors", "errors_of", "measure",
+    "reference", "traced",
+]  # fmt: skip
 
 LIGHTS = ("constant", "lobes")
 LOBES = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / np.sqrt(3.0)
@@ -113,9 +116,7 @@ def reference(subject: Subject, exits: int = 256, walks: int = 8192, seed: int =
     """Exits and their radiance by walks.
 
     Args:
-        exits: number of exits.
-        walks: of each.
-        seed: of the exits and the walks.
+        exits, walks: number of exits, and of walks of each; seed: of both.
         fewest: scattering events that count.
     """
     import drjit as dr
@@ -125,12 +126,18 @@ def reference(subject: Subject, exits: int = 256, walks: int = 8192, seed: int =
         check_count(name, value, least)
     points = subject.random_points(generator(mi, exits, pass_seed(seed, 17)))
     dr.eval(points)
-    sums = _Sums(exits)
-    for k, per_exit in enumerate(_passes(exits, walks)):
-        starts = _repeated(points, per_exit)
-        found = trace_exits(subject, starts, (seed, 18, k), fewest=fewest)
+    return Reference(points, traced(subject, points, walks, (seed, 18), fewest=fewest))
+
+
+def traced(subject: Subject, exits: SurfacePoint, walks: int, seed: tuple[int, ...], **orders: int) -> Estimate:
+    """Radiance of exits by so many walks of each; `orders` as for `trace_exits`."""
+    import drjit as dr
+
+    sums = _Sums(dr.width(exits.p))
+    for k, per_exit in enumerate(_passes(sums.n_exits, walks)):
+        found = trace_exits(subject, _repeated(exits, per_exit), (*seed, k), **orders)
         sums.add(found.T, found.at.w, per_exit)
-    return Reference(points, sums.estimate())
+    return sums.estimate()
 
 
 def _repeated(points: SurfacePoint, times: int) -> SurfacePoint:
@@ -147,8 +154,7 @@ def modelled(transport: Transport, proposals: Proposals, exits: SurfacePoint, sa
         transport: the model.
         proposals: where its entries are drawn.
         exits: from a reference.
-        samples: entries of each exit.
-        seed: of the entries.
+        samples, seed: entries of each exit; of the entries.
     """
     import drjit as dr
     import mitsuba as mi
@@ -230,9 +236,8 @@ def errors_of(
     Args:
         subject: the object.
         transports: by name.
-        exits: number of exits.
+        exits, seed: number of exits; of everything.
         walks, samples: of each exit, for the truth and for the models.
-        seed: of everything.
         progress: called with (what, done, total).
     """
     check_count("samples", samples, 2)

@@ -148,6 +148,13 @@ class PairSource:
     proposals: Proposals
     scale: Any = None
 
+    def scaled(self, scale: np.ndarray) -> PairSource:
+        """The same with the scale of a fit, so that its mean over channels that have any light is 1."""
+        import mitsuba as mi
+
+        live = max(np.count_nonzero(scale), 1)
+        return replace(self, scale=mi.Spectrum([number(v * len(scale) / live) for v in scale.tolist()]))
+
     def walks(self, n: int, seed: tuple[int, ...]) -> Pairs:
         """n walks of random exits; of those that left at an order that counts some, see `ended`."""
         import mitsuba as mi

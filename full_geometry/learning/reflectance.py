@@ -33,11 +33,13 @@ class Reflectance:
         subject: the object.
         frame: of the features.
         weights: A_k (outputs, inputs) and a_k of the layers.
+        trusted: (2, channels) from `even_light.trusted`.
     """
 
     subject: Subject
     frame: Frame
     weights: Mapping[str, np.ndarray]
+    trusted: np.ndarray
 
     @functools.cached_property
     def _views(self) -> tuple[list, list]:
@@ -50,8 +52,8 @@ class Reflectance:
         views = nn.pack(*tensors, *biases)[-2 * n :]
         return list(views[:n]), list(views[n:])
 
-    def __call__(self, at: SurfacePoint, active: Any = True) -> tuple[Any, Any]:
-        """Orders zero and one, and alpha, per channel."""
+    def parts(self, at: SurfacePoint, active: Any = True) -> tuple[Any, Any, Any]:
+        """What passes unscattered, alpha_1 and alpha, per channel."""
         import drjit as dr
         import mitsuba as mi
         from drjit import nn
@@ -66,4 +68,17 @@ class Reflectance:
         live = mi.Spectrum([number(float(m.sigma_s) > 0) for m in media])
         enters, most = (mi.Spectrum(v) for v in entering(columns, number(self.subject.eta), n))
         once, more = (live * most / (1 + dr.exp(-mi.Spectrum(part))) for part in (x[:n], x[n:]))
-        return dr.select(active, enters - most + once, 0), dr.select(active, more, 0)
+        return tuple(dr.select(active, part, 0) for part in (enters - most, once, more))
+
+    @property
+    def evened(self) -> tuple[Any, Any]:
+        """Channels in which orders below two, and the others, may stand for even light."""
+        import mitsuba as mi
+
+        return tuple(mi.Spectrum([number(float(v)) for v in row]) for row in self.trusted)
+
+    def __call__(self, at: SurfacePoint, active: Any = True) -> tuple[Any, Any]:
+        """Orders zero and one, and alpha, per channel; 0 where they may not stand for even light."""
+        unscattered, once, more = self.parts(at, active)
+        few, others = self.evened
+        return few * (unscattered + once), others * more

@@ -8,7 +8,7 @@ import time
 import warnings
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +17,14 @@ import numpy as np
 from full_geometry import storing
 from full_geometry.features import N_PAIR, n_side
 from full_geometry.identity import frame_of, identify
+from full_geometry.learning.even_light import trusted
 from full_geometry.learning.fitting import STANDARD, Fitting, Recipe
 from full_geometry.learning.model_errors import ModelError, Reference, measure, reference
 from full_geometry.learning.pairs import Pairs, PairSource, Proposals
 from full_geometry.learning.seen import Seen
 from full_geometry.model import FullGeometry
 from full_geometry.patches import Patches, PatchSampler, cluster
-from full_geometry.storing import CENTRES, Learnt, assemble, start_of
+from full_geometry.storing import CENTRES, EVEN, Learnt, assemble, start_of
 from full_geometry.subject import Subject
 from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.neural.store import to_json
@@ -31,7 +32,6 @@ from halfspace_sss.neural.trained import weights_folder
 from halfspace_sss.neural.training.work_folder import CHECKPOINT, claim
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.provenance import check_folder, provenance, write_atomically
-from halfspace_sss.rendering.transport.plane import number
 
 __all__ = ["Trained", "train", "train_by_cpu"]
 
@@ -53,8 +53,7 @@ class Trained:
         sampler: of its entries; None for a shape without faces.
         path: file of its weights; None after 0 seconds.
         errors: per channel and light, at the end.
-        steps: of the fit.
-        seconds: that it took in this process.
+        steps, seconds: of the fit; that it took in this process.
     """
 
     model: FullGeometry
@@ -90,8 +89,7 @@ def train(
 
     Args:
         shape: a closed Mitsuba shape, a scene, or a `Subject`, which has its medium.
-        medium: 1/mm, scalar or with one value per channel of the variant; of a scene it is that of the object's
-            `translucent` surface.
+        medium: 1/mm, scalar or one value per channel; of a scene it is that of the object's `translucent` surface.
         mm_per_unit: length of a scene unit, mm; by default what the integrator of a scene says, and 1 for a shape.
         object: id of the object in a scene; may be left out where there is one.
         seconds: for data, fit and validation, after the kernels are compiled; 0 gives the start, with a warning.
@@ -131,21 +129,22 @@ def train(
 def train_by_cpu(
     subject: Subject, seconds: float, folder: str | Path, *, seed: int = 0, recipe: Recipe = STANDARD
 ) -> tuple[Learnt, Path]:
-    """Learn an object in so many seconds of CPU time, whatever else the machine does; errors are not measured.
+    """Learn an object in so many seconds of CPU time, whatever else the machine does; its errors take more.
 
     Args:
         subject: the object.
         seconds: of CPU time of this process, for data and fit.
         folder: for the weights.
-        seed: of everything.
-        recipe: sizes and rates.
+        seed, recipe: of everything; sizes and rates.
     """
     check_interval("seconds", seconds, 1e-3, 1e7)
     run, began = _Run(subject, recipe, seed, None, None), time.process_time()
     run._prepare()
     while run.done < run.total:
         run._chunk(seconds, time.process_time)
-    record = run._record([], time.process_time() - began)
+    spent = time.process_time() - began
+    found = run._judged(reference(subject, EXITS, WALKS, seed), SAMPLES)
+    record = run._record(found, spent)
     return run.learnt(), storing.save(folder, run.identity, run.arrays(), record)
 
 
@@ -166,6 +165,7 @@ class _Run:
             self.centres = cluster(subject, self.frame, seed=seed).astype(np.float16)
             self.patches = Patches(subject, self.frame, self.centres.astype(np.float32))
         self.fitting = self._new_fitting()
+        self.even = np.ones((2, len(subject.media)), np.float16)
         self.done, self.total, self.walks, self.history = 0, math.inf, recipe.chunk, []
         self.ready: tuple[Pairs, Pairs] | None = None
         self.aside = ThreadPoolExecutor(1)
@@ -178,6 +178,7 @@ class _Run:
     def arrays(self) -> dict[str, np.ndarray]:
         """What is written: everything in half precision."""
         found = {name: value.astype(np.float16) for name, value in self.fitting.arrays().items()}
+        found[EVEN] = self.even
         return found if self.centres is None else {**found, CENTRES: self.centres}
 
     def learnt(self) -> Learnt:
@@ -203,7 +204,7 @@ class _Run:
                 saved = time.monotonic()
             if progress:
                 progress(what, self.done, self.total)
-        found = self._errors(truth, 2 * WALKS)
+        found = self._judged(truth, 2 * WALKS)
         spent = time.monotonic() - started
         self._save_camera()
         path = storing.save(folder, self.identity, self.arrays(), self._record(found, spent))
@@ -213,7 +214,7 @@ class _Run:
         """Scales and shares from a pilot, which compiles all kernels; the work of a run that was killed."""
         seed, n = (self.seed, 2**31), self.recipe.chunk // 4
         self.fitting.set_scale(self.source.walks(n, seed))
-        self.source = replace(self.source, scale=self._scale())
+        self.source = self.source.scaled(self.fitting.scale.numpy()[:, 0])
         pilot, proposed = self.source.walks(n, seed), self.source.proposed(n, seed)
         share = pilot.values.shape[1] / pilot.drawn
         self.walks = int(self.recipe.chunk / min(max(share, 0.05), 1.0))
@@ -230,13 +231,6 @@ class _Run:
                 self.done, self.history = self.fitting.load(self.work / CHECKPOINT)
         if chunks is not None:
             self._plan(chunks)
-
-    def _scale(self) -> Any:
-        """One over the mean of T, per channel that has any, so that the mean over channels is 1."""
-        import mitsuba as mi
-
-        scale = self.fitting.scale.numpy()[:, 0]
-        return mi.Spectrum([number(v * len(scale) / max(np.count_nonzero(scale), 1)) for v in scale.tolist()])
 
     def _plan(self, chunks: int) -> None:
         """Fix the number of chunks, and write it down for a run that goes on after this one."""
@@ -274,8 +268,14 @@ class _Run:
     def _errors(self, truth: Reference, samples: int) -> list[ModelError]:
         """Of the model as it stands; entries follow the patches, which have less noise than probes."""
         model, sampler = self.learnt()[:2]
-        proposals = self.proposals.with_patches(sampler)
-        return measure(self.subject, model, proposals, truth=truth, samples=samples, seed=self.seed)
+        by = self.proposals.with_patches(sampler)
+        return measure(self.subject, model, by, truth=truth, samples=samples, seed=self.seed)
+
+    def _judged(self, truth: Reference, samples: int) -> list[ModelError]:
+        """Errors at the end, and what even light may be used for."""
+        found = self._errors(truth, samples)
+        self.even = trusted(self.learnt().model, truth, found, WALKS, (self.seed, 20))
+        return found
 
     def _validated(self, truth: Reference) -> tuple[int, float, float]:
         """Chunk, largest error under constant light and its standard error."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +15,10 @@ pytest.importorskip("torch")
 
 from full_geometry import storing  # noqa: E402
 from full_geometry.first_event import first_event  # noqa: E402
+from full_geometry.learning.even_light import trusted  # noqa: E402
 from full_geometry.learning.exits import trace_exits  # noqa: E402
 from full_geometry.learning.fitting import Recipe  # noqa: E402
-from full_geometry.learning.model_errors import LIGHTS  # noqa: E402
+from full_geometry.learning.model_errors import LIGHTS, reference  # noqa: E402
 from full_geometry.learning.training import Trained, train  # noqa: E402
 from full_geometry.scene import LearntTransport  # noqa: E402
 from full_geometry.subject import Subject  # noqa: E402
@@ -69,12 +71,30 @@ def test_orders_below_two_and_the_others_agree_with_walks(trained: Trained) -> N
 def test_weights_without_it_are_refused_by_name(trained: Trained, tmp_path: Path) -> None:
     arrays, record = load_weights(trained.path, storing.KIND)
     path = tmp_path / trained.path.name
-    save_weights(path, storing.KIND, {k: v for k, v in arrays.items() if not k.startswith(("A_", "a_"))}, record)
+    save_weights(path, storing.KIND, {k: v for k, v in arrays.items() if k != storing.EVEN}, record)
     subject = Subject.of(mi.load_dict(shape()), WAX)
-    with pytest.raises(ValueError, match="alpha must be there.*to be trained again"):
+    with pytest.raises(ValueError, match="even light must be learnt.*to be trained again"):
         storing.find_weights(subject, tmp_path)
     with pytest.raises(ValueError, match="to be trained again"):
         storing.load(path, subject)
+
+
+def test_only_what_is_wrong_in_a_channel_is_left_to_other_estimates(trained: Trained) -> None:
+    model, alpha = trained.model, trained.model.alpha
+    truth = reference(model.subject, 128, 512, 5)
+
+    def judged(order: int, channel: int) -> np.ndarray:
+        last = f"a_{len(alpha.weights) // 2 - 1}"
+        bias = alpha.weights[last].copy()
+        bias[3 * order + channel] += 1.0
+        wrong = replace(alpha, weights={**alpha.weights, last: bias})
+        found = trusted(replace(model, alpha=wrong), truth, trained.errors, 512, (6,))
+        few, more = (np.array(v) for v in replace(wrong, trusted=found)(truth.exits))
+        assert np.all((few > 0).any(axis=1) == (found[0] > 0)) and np.all(more[found[1] == 0] == 0)
+        return found
+
+    assert judged(0, 2).tolist() == [[1, 1, 0], [1, 1, 1]]
+    assert judged(1, 0).tolist() == [[1, 1, 1], [0, 1, 1]]
 
 
 def test_an_even_sky_has_the_same_light_and_a_fifth_of_the_variance(

@@ -67,6 +67,10 @@ class Known(Even):
         super().__init__(area)
         self.once = mi.Texture1f(mi.TensorXf(once_of_ball((np.arange(KNOTS) + 0.5) / KNOTS)[:, None]))
 
+    @property
+    def evened(self):
+        return mi.Spectrum(1), mi.Spectrum(1)
+
     def alpha(self, out, active):
         return mi.Spectrum(self.once.eval(mi.Point1f(dr.dot(out.w, out.n)))[0]), mi.Spectrum(R)
 

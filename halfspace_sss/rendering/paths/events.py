@@ -82,7 +82,7 @@ def multiple(world: World, body: Body, out: Exit, face: Any, sampler: Any, activ
     Where the body is known under the mean light of the sky, that is left out, see `sky`.
     """
     found = entering_light(world, body, out, face, sampler, active)
-    direct = -found.value * found.sky * world.sky.mean if world.evens(body) else mi.Spectrum(0)
+    direct = -found.value * found.sky * world.even(body)[1] if world.evens(body) else mi.Spectrum(0)
     if world.lights.some_delta:
         shadow = place(found.p, found.n).spawn_ray_to(found.target)
         seen = found.delta & ~world.scene.ray_test(shadow, False, found.delta)
@@ -103,5 +103,5 @@ def few(world: World, body: Body, leg: Leg, sampler: Any, active: Any) -> tuple[
     found = few_orders(world, body, leg, sampler, active)
     zero = mi.Float(0)
     on = Onward(found.p, found.n, found.d, found.weight, mi.Float(1), zero, found.connected, mi.Float(-1))
-    direct = found.direct - found.weight * world.sky.mean if world.evens(body) else found.direct
+    direct = found.direct - found.weight * world.even(body)[0] if world.evens(body) else found.direct
     return on, direct

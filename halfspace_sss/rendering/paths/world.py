@@ -47,6 +47,11 @@ class World:
         """Whether the mean light of the sky serves a body."""
         return self.sky is not None and hasattr(body.transport, "alpha")
 
+    def even(self, body: Body) -> tuple[Any, Any]:
+        """The mean light of the sky in the channels where it serves, for orders below two and for the others."""
+        few, others = body.transport.evened
+        return few * self.sky.mean, others * self.sky.mean
+
     def entries(self, body: Body) -> int:
         """How many an exit draws: one where the mean light of the sky is nearly all, and the settings do not say."""
         alone = self.evens(body) and not self.lights.some_local

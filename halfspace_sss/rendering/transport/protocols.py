@@ -71,8 +71,9 @@ class Transport(Protocol):
     """S of one object, for any exit and entry.
 
     One that knows what it is under the same light from everywhere also has `alpha(out, active)`: the share of it that
-    leaves at an exit, per channel, by orders below two and by those of S, ∫ S mu_i dw_i dA_i. The path loop takes the
-    mean light of the sky so.
+    leaves at an exit, per channel, by orders below two and by those of S, ∫ S mu_i dw_i dA_i, and `evened`, two spectra
+    that are 1 in the channels where these are known; elsewhere they are 0. The path loop takes the mean light of the
+    sky so.
 
     Attributes:
         orders: "multiple" (two or more scattering events) or "total".
