@@ -13,8 +13,8 @@ g = 0), of which <F_t P'> is scattered, k = <F_t P'>/<F_t P>, is spread evenly:
     M = [a² (q - q_d)/sigma_t + a q k² a'² q'/(1 - a' q')/sigma_t'] / (4 pi V eta²).
 
 It holds in what is thin and flat or rugged; in a smooth ball it is up to twice too much, as light that entered does not
-reach what is held near the surface. M, and m_2 = a²/(4 pi eta)² of light of two events (see `backbone`), are divided by
-1 + (sigma_t' c)², as light of thick objects leaves near to where it entered.
+reach what is held near the surface. M is divided by 1 + (sigma_t' c)², as light of thick objects leaves near where it
+entered. m_2 = a²/(4 pi eta)² is that of light of two events, see `backbone`.
 """
 
 from __future__ import annotations
@@ -39,12 +39,15 @@ LEAST_ESCAPE = 1e-6
 
 
 class Mixed(NamedTuple):
-    """Of a channel: M, 1/(scene unit)²; m_2; the mean chord in transport mean free paths; q."""
+    """Of a channel: M, 1/(scene unit)²; m_2; the mean chord in transport mean free paths; q, q', q_d and k."""
 
     M: float
     m_2: float
     chord: float
     q: float
+    q_reduced: float
+    q_direct: float
+    k: float
 
 
 def mean_chord(subject: Subject) -> float:
@@ -78,13 +81,13 @@ def _of(subject: Subject, media: Sequence[Medium], scattered: Sequence[float], c
     m, reduced, _ = media
     thickness, a = float(reduced.sigma_t) * chord, float(m.albedo)
     if not (thickness > 0 and a > 0 and scattered[0] > 0):
-        return Mixed(0.0, 0.0, thickness, 0.0)
+        return Mixed(0.0, 0.0, thickness, 0.0, 0.0, 0.0, 1.0)
     q, q_reduced, q_direct = (_stays(medium, chord, part) for medium, part in zip(media, scattered))
     a_reduced, k, thin = float(reduced.albedo), scattered[1] / scattered[0], 1 / (1 + thickness**2)
     M = a**2 * max(q - q_direct, 0.0) / float(m.sigma_t)
     M += a * q * k**2 * a_reduced**2 * q_reduced / (1 - a_reduced * q_reduced) / float(reduced.sigma_t)
     M /= math.pi * subject.found.area * chord * m.eta**2  # 4 V = c A
-    return Mixed(M * thin, thin * (a / (4 * math.pi * m.eta)) ** 2, thickness, q)
+    return Mixed(M * thin, (a / (4 * math.pi * m.eta)) ** 2, thickness, q, q_reduced, q_direct, k)
 
 
 def _stays(m: Medium, chord: float, scattered: float) -> float:

@@ -16,14 +16,16 @@ from full_geometry.subject import Subject, SurfacePoint
 from halfspace_sss.interface.model import BSSRDF
 from halfspace_sss.rendering.transport.plane import number
 
-__all__ = ["LEAST", "MOST", "NeuralShape"]
+__all__ = ["LEAST", "PLACE_OF_G", "NeuralShape", "most"]
 
-LEAST, MOST = -6.0, 1.5  # of f: what is too bright costs more than what is too dark, and S_0 is seldom that dark
+LEAST, MOST, MOST_FORWARD = -6.0, 3.0, 1.5  # of f: what is too bright costs more than what is too dark
+FORWARD = 0.5  # g from which on the most is that of forward scattering
+PLACE_OF_G = 2  # among the numbers of a medium
 
 
 @dataclass(frozen=True, eq=False)
 class NeuralShape:
-    """S = S_0 P_o P_i exp f, f = b tanh(h . tanh(u) / b), b = 1.5 above 0 and 6 below.
+    """S = S_0 P_o P_i exp f, f = b tanh(h . tanh(u) / b), b = 1.5 to 3 above 0, see `most`, and 6 below.
 
     u = (c_o + c_i, c_oi) is what is 0 on a plane, h a perceptron whose first layer is asked for both ends in turn and
     summed, so that S is reciprocal as far as S_0 is; on a plane f = 0. Orders two and more;
@@ -95,14 +97,13 @@ class NeuralShape:
         import drjit as dr
         import mitsuba as mi
 
-        pairs = describe(self.subject, exit, entry, active)
-        f = mi.Spectrum([self._f(pair, numbers) for pair, numbers in zip(pairs, self._media)])
         S_0 = self.half_space(exit, entry)
+        pairs = describe(self.subject, exit, entry, self.half_space.shares(S_0, exit, entry), active)
+        f = mi.Spectrum([self._f(pair, numbers) for pair, numbers in zip(pairs, self._media)])
         return dr.select(active, S_0 * dr.exp(f), 0)
 
     def _f(self, pair: Pair, numbers: list[Any]) -> Any:
         import drjit as dr
-        import mitsuba as mi
         from drjit import nn
 
         W, b = self._views
@@ -114,8 +115,16 @@ class NeuralShape:
             x = _swish(x) if k < len(b) - 1 else x
         u = [a + b for a, b in zip(pair.exit[CURVED_OWN], pair.entry[CURVED_OWN])] + pair.shared[CURVED_SHARED]
         g = sum(h * dr.tanh(v) for h, v in zip(list(x), u))
-        bound = dr.select(g > 0, mi.Float(MOST), -LEAST)
+        bound = dr.select(g > 0, most(dr, numbers[PLACE_OF_G]), -LEAST)
         return bound * dr.tanh(g / bound)
+
+
+def most(lib: Any, g: Any) -> Any:
+    """The bound of f above: 3 for g <= 0, falling to 1.5 at g = 0.5.
+
+    Light that is scattered forwards comes from few pairs, which too large an f makes far too bright in what is thin.
+    """
+    return MOST - (MOST - MOST_FORWARD) * lib.clip(g / FORWARD, 0, 1)
 
 
 def _swish(x: Any) -> Any:

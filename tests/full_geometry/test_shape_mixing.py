@@ -20,7 +20,7 @@ from full_geometry.learning.model_errors import errors_of  # noqa: E402
 from full_geometry.neural_shape.backbone import Backbone  # noqa: E402
 from full_geometry.neural_shape.mixing import mean_chord, mixed  # noqa: E402
 from full_geometry.neural_shape.shapes.generators import make_shape  # noqa: E402
-from full_geometry.subject import Subject, SurfacePoint  # noqa: E402
+from full_geometry.subject import Subject, SurfacePoint, cosine_direction  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
 
@@ -81,6 +81,26 @@ def test_light_that_is_scattered_twice_is_the_same_both_ways() -> None:
     S_0, (o, i) = Backbone(subject, mixed(subject)), ends(subject)
     there, back = (S_0.twice(*pair)[0].numpy() for pair in ((o, i), (i, o)))
     assert np.allclose(there, back, rtol=1e-4) and there.max() > 0
+
+
+def test_shares_of_what_a_plane_lacks_are_parts_of_one_and_most_of_a_thin_leaf() -> None:
+    subject = Subject.of(make_shape("leaves", 3, 24).mitsuba("leaf"), Medium(0.95, 0.05, 0.0, 1.45).scaled(0.5))
+    S_0, (o, i) = Backbone(subject, mixed(subject)), ends(subject)
+    parts = np.stack([part.numpy() for part in S_0.shares(S_0(o, i), o, i)[0]])
+    assert parts.min() >= 0 and parts.sum(axis=0).max() < 1 + 1e-4
+    assert np.median(parts.sum(axis=0)) > 0.5
+
+
+def test_light_of_two_events_is_that_of_the_half_space_on_a_plane() -> None:
+    box = mi.load_dict({"type": "cube", "to_world": mi.ScalarTransform4f().scale(1000.0)})
+    subject = Subject.of(box, Medium(0.9, 0.1, 0.3, 1.4))
+    S_0 = Backbone(subject, [mixture._replace(m_2=1.0) for mixture in mixed(subject)])
+    rng = generator(mi, 512, pass_seed(3))
+    n = mi.Normal3f(dr.zeros(mi.Float, 512), dr.zeros(mi.Float, 512), dr.full(mi.Float, 1.0, 512))
+    points = [mi.Point3f(6 * rng.next_float32(), 6 * rng.next_float32(), 1000.0) for _ in range(2)]
+    pair = [SurfacePoint(p, n, n, cosine_direction(n, n, rng)) for p in points]
+    o, i = (Side(at, first_event(subject, at)) for at in pair)
+    assert S_0.twice(o, i)[0].numpy().max() < 2e-3
 
 
 def test_a_thick_object_keeps_the_half_space() -> None:

@@ -13,16 +13,19 @@ pytest.importorskip("igl")
 
 from full_geometry.half_space import HalfSpaceTransport  # noqa: E402
 from full_geometry.learning.model_errors import errors_of  # noqa: E402
+from full_geometry.neural_shape.backbone import Backbone  # noqa: E402
 from full_geometry.neural_shape.descriptors import (  # noqa: E402
     CURVED_OWN,
     CURVED_SHARED,
     N_MEDIUM,
     N_OWN,
     N_SHARED,
+    Pair,
     describe,
     end,
 )
-from full_geometry.neural_shape.model import NeuralShape  # noqa: E402
+from full_geometry.neural_shape.mixing import mixed  # noqa: E402
+from full_geometry.neural_shape.model import NeuralShape, most  # noqa: E402
 from full_geometry.neural_shape.shapes.generators import make_shape  # noqa: E402
 from full_geometry.neural_shape.shapes.mesh import Box, surface  # noqa: E402
 from full_geometry.neural_shape.storing import transport  # noqa: E402
@@ -66,6 +69,13 @@ def pairs(subject: Subject, n: int = N, seed: int = 5) -> tuple[SurfacePoint, Su
     return found
 
 
+def told(subject: Subject, o: SurfacePoint, i: SurfacePoint) -> list[Pair]:
+    """Descriptors of pairs for each channel."""
+    exit, entry = end(subject, o), end(subject, i)
+    half_space = Backbone(subject, mixed(subject))
+    return describe(subject, exit, entry, half_space.shares(half_space(exit, entry), exit, entry))
+
+
 def S(model: NeuralShape, o: SurfacePoint, i: SurfacePoint) -> np.ndarray:
     return np.array(model.S(model.prepare(o), i))
 
@@ -90,10 +100,9 @@ def test_on_a_plane_it_is_the_half_space_whatever_the_weights() -> None:
     n = mi.Normal3f(dr.zeros(mi.Float, N), dr.zeros(mi.Float, N), dr.full(mi.Float, 1.0, N))
     o, i = (SurfacePoint(p, n, n, cosine_direction(n, n, rng)) for p in place)
     model = NeuralShape.of(subject, random_weights())
-    entry = end(subject, i)
-    plane = np.array(model.half_space(*(_side(e) for e in (end(subject, o), entry))))
+    plane = np.array(model.half_space(*(_side(end(subject, at)) for at in (o, i))))
     assert np.allclose(S(model, o, i), plane, rtol=2e-3)
-    for pair in describe(subject, end(subject, o), entry):
+    for pair in told(subject, o, i):
         sums = [a + b for a, b in zip(pair.exit[CURVED_OWN], pair.entry[CURVED_OWN])] + pair.shared[CURVED_SHARED]
         assert max(float(np.abs(v.numpy()).max()) for v in sums) < 2e-3
 
@@ -148,7 +157,7 @@ def test_resolution_does_not_count() -> None:
     for resolution in (20, 80):
         subject = Subject.of(surface(ball, Box((-1.1,) * 3, (1.1,) * 3), resolution).mitsuba("ball"), WAX.scaled(5.0))
         o, i = pairs(subject, 2**13)
-        pair = describe(subject, end(subject, o), end(subject, i))[0]
+        pair = told(subject, o, i)[0]
         columns = [np.broadcast_to(v.numpy(), 2**13) for v in (*pair.exit, *pair.shared)]
         found.append(np.array([(c.mean(), c.std()) for c in columns]))
     scatter = np.maximum(found[1][:, 1], 0.02)
@@ -174,8 +183,8 @@ def test_torch_and_drjit_say_the_same() -> None:
     from full_geometry.neural_shape.learning.fitting import Network, Recipe
 
     subject = Subject.of(make_shape("shells", 2, 24).mitsuba("bowl"), WAX.scaled(8.0))
-    weights, (o, i) = random_weights(), pairs(subject)
-    pair = describe(subject, end(subject, o), end(subject, i))[0]
+    weights, (o, i) = random_weights(1), pairs(subject)
+    pair = told(subject, o, i)[0]
     columns = [np.broadcast_to(v.numpy(), N) for v in (*pair.exit, *pair.entry, *pair.shared)]
     x = torch.from_numpy(np.stack(columns, axis=-1).astype(np.float32))
     network, model = Network(Recipe(width=16, depth=2)), NeuralShape.of(subject, weights)
@@ -187,6 +196,11 @@ def test_torch_and_drjit_say_the_same() -> None:
     found = model._f(pair, model._media[0]).numpy()
     assert x.shape[1] == 2 * N_OWN + N_SHARED and len(model.media[0]) == N_MEDIUM
     assert np.allclose(found, wanted, atol=2e-3) and np.std(wanted) > 0.1
+
+
+def test_f_is_bounded_below_by_less_where_light_is_scattered_forwards() -> None:
+    bounds = [float(most(np, g)) for g in (-0.3, 0.0, 0.25, 0.5, 0.95)]
+    assert bounds == [3.0, 3.0, 2.25, 1.5, 1.5]
 
 
 def test_degenerate_triangles_needles_and_points_that_coincide_leave_no_nan() -> None:

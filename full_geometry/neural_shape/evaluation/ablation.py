@@ -26,12 +26,16 @@ OWN = {  # columns of an end
     "log P, way to y": (6, 7), "n.d, n.e": (8, 9), "L_k": tuple(range(10, 10 + K)),
     "V_k": tuple(range(10 + K, 10 + 3 * K)),
 }  # fmt: skip
-SHARED = {"n_o.n_i": (4,), "gap of the y": (5,), "line y_o y_i": (6, 7), "phase functions": (8, 9)}
+SHARED = {
+    "refracted w_o.w_i": (4, 5), "n_o.n_i": (6,), "gap of the y": (7,), "line y_o y_i": (8, 9),
+    "phase functions": (10, 11), "shares of S_0": (12, 13),
+}  # fmt: skip
 WITHOUT: dict[str, tuple[str, ...]] = {
     "all": (), "without log P, way to y": ("log P, way to y",), "without L_k": ("L_k",), "without V_k": ("V_k",),
     "without L_k and V_k": ("L_k", "V_k"), "without the line y_o y_i": ("line y_o y_i",),
     "without phase functions and attenuation": ("phase functions",),
     "without n.d, n.e, n_o.n_i, gap of the y": ("n.d, n.e", "n_o.n_i", "gap of the y"),
+    "without shares of S_0": ("shares of S_0",), "without refracted w_o.w_i and its phase": ("refracted w_o.w_i",),
 }  # fmt: skip
 
 

@@ -13,7 +13,7 @@ from torch import nn
 
 from full_geometry.neural_shape.descriptors import CURVED_OWN, CURVED_SHARED, N_MEDIUM, N_OWN, N_SHARED
 from full_geometry.neural_shape.learning.source import PairData
-from full_geometry.neural_shape.model import LEAST, MOST
+from full_geometry.neural_shape.model import LEAST, PLACE_OF_G, most
 from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.neural.training import checkpoint
 
@@ -68,7 +68,7 @@ class Network(nn.Module):
             self.biases.append(torch.zeros(j))
 
     def forward(self, x: torch.Tensor, medium: torch.Tensor) -> torch.Tensor:
-        """f (n,) of descriptors (n, numbers) and the numbers of media (n, 13)."""
+        """f (n,) of descriptors (n, numbers) and the numbers of media (n, 16)."""
         linear, swish = nn.functional.linear, nn.functional.hardswish
         o, i, shared = x[:, :N_OWN], x[:, N_OWN : 2 * N_OWN], x[:, 2 * N_OWN :]
         W = self.matrices[0]
@@ -79,7 +79,8 @@ class Network(nn.Module):
             h = swish(h) if k < len(self.matrices) - 1 else h
         u = torch.cat((o[:, CURVED_OWN] + i[:, CURVED_OWN], shared[:, CURVED_SHARED]), dim=1)
         g = (h * torch.tanh(u)).sum(dim=1)
-        return torch.where(g > 0, MOST * torch.tanh(g / MOST), -LEAST * torch.tanh(g / -LEAST))
+        bound = torch.where(g > 0, most(torch, medium[:, PLACE_OF_G]), -LEAST)
+        return bound * torch.tanh(g / bound)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Matrices (outputs, inputs) and biases by name."""

@@ -80,37 +80,32 @@ def make_data(subject: Subject, events: float, seed: tuple[int, ...]) -> PairDat
     mean = float(dr.sum(exits.T[0])[0]) / n
     kept = dr.gather(mi.UInt32, kept, dr.arange(mi.UInt32, min(dr.width(kept), KEPT)))
     T = dr.gather(mi.Float, exits.T[0], kept).numpy()
-    walks = _columns(subject, starts.gather(kept), exits.at.gather(kept))
     mixtures = mixed(subject)
     half_space = Backbone(subject, mixtures)
+    walks, _ = _columns(half_space, starts.gather(kept), exits.at.gather(kept))
     rng = generator(mi, KEPT, pass_seed(*seed, 2))
     starts = subject.random_points(rng)
     entries, weight = Proposals(subject, half_space).sample(starts, rng)
-    W = (_half_space(half_space, starts, entries) * weight.numpy() / mean).astype(np.float32)
+    proposals, S_0 = _columns(half_space, starts, entries)
+    W = (S_0 * weight.numpy() / mean).astype(np.float32)
     T = (T / mean).astype(np.float32)
-    return PairData(walks, T, _columns(subject, starts, entries), W, medium(subject, 0, mixtures[0]), share)
+    return PairData(walks, T, proposals, W, medium(subject, 0, mixtures[0]), share)
 
 
-def _columns(subject: Subject, exits: SurfacePoint, entries: SurfacePoint) -> np.ndarray:
-    """Descriptors of pairs, (pairs, numbers)."""
+def _columns(half_space: Backbone, exits: SurfacePoint, entries: SurfacePoint) -> tuple[np.ndarray, np.ndarray]:
+    """Descriptors of pairs, (pairs, numbers), and S_0 P_o P_i of the first channel."""
     import drjit as dr
+    import mitsuba as mi
 
-    pair = describe(subject, end(subject, exits), end(subject, entries))[0]
+    subject = half_space.subject
+    o, i = (end(subject, at) for at in (exits, entries))
+    query, F_t, above = half_space.query(exits, entries)
+    added = F_t * half_space.added(o, i)[0]
+    factor = dr.select(above, o.event.P[0] * i.event.P[0], 0)
+    dr.eval(query, added, factor)
+    S_0 = (half_space.models[0].eval(*(v.numpy() for v in query)) + added.numpy()) * factor.numpy()
+    pair = describe(subject, o, i, half_space.shares([mi.Float(S_0.astype(np.float32))], o, i))[0]
     columns = [*pair.exit, *pair.entry, *pair.shared]
     dr.eval(columns)
-    n = dr.width(exits.p)
-    found = np.stack([np.broadcast_to(c.numpy(), n) for c in columns], axis=-1)
-    return np.nan_to_num(found, posinf=0, neginf=0).astype(np.float16)
-
-
-def _half_space(half_space: Backbone, exits: SurfacePoint, entries: SurfacePoint) -> np.ndarray:
-    """S_0 P_o P_i of the first channel."""
-    import drjit as dr
-
-    query, F_t, above = half_space.query(exits, entries)
-    sides = [half_space.end(at) for at in (exits, entries)]
-    factor = dr.select(above, sides[0].event.P[0] * sides[1].event.P[0], 0)
-    added = F_t * half_space.added(*sides)[0]
-    dr.eval(query, added, factor)
-    S_0 = half_space.models[0].eval(*(v.numpy() for v in query)) + added.numpy()
-    return S_0 * factor.numpy()
+    found = np.stack([np.broadcast_to(c.numpy(), dr.width(exits.p)) for c in columns], axis=-1)
+    return np.nan_to_num(found, posinf=0, neginf=0).astype(np.float16), S_0
