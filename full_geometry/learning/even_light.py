@@ -44,6 +44,6 @@ def trusted(
 
 def _error(found: np.ndarray, truth: Estimate) -> np.ndarray:
     """Relative RMSE of shares (channels, exits) under constant light, without the noise of walks."""
-    shares = np.repeat(found[:, :, None], truth.mean.shape[-1], axis=2)
+    shares = np.repeat(found[:, :, None].astype(float), truth.mean.shape[-1], axis=2)
     rows = compare(Estimate(shares, np.zeros_like(shares)), truth)
     return np.array([row.error for row in rows if row.light == "constant"])
