@@ -3,7 +3,7 @@
 S sees the surface around both its points, alpha is a network of the exit alone, which misses what changes over a mean
 free path. So each channel is judged at the end of a training, as parts of all light that leaves,
 
-    |alpha_1 - E T_1|, |alpha - E T| <= 2.5 % of the mean of E T_0 + E T_1 + E T,   or alpha no worse than S,
+    |alpha_1 - E T_1|, |alpha - E T| <= 5 % of the mean of E T_0 + E T_1 + E T,   or alpha no worse than S,
 
 and where that fails images take even light by S or by the way of one event, as all other light.
 """
@@ -17,7 +17,7 @@ from full_geometry.model import FullGeometry
 
 __all__ = ["trusted"]
 
-MOST = 0.025
+MOST = 0.05
 
 
 def trusted(
