@@ -22,7 +22,9 @@ __all__ = ["N_PAIR", "Frame", "Side", "entering", "n_side", "pair_features", "re
 OCTAVES = 2
 N_PAIR = 21
 LEAST_P, LEAST_LENGTH = 1e-3, 1e-2
-MU, P_0 = 36, 38  # numbers of the features of a side that `entering` reads
+POSITION, DIRECTION = 3 * (1 + 2 * OCTAVES), 3  # numbers of a point with its octaves, and of a direction
+MU = 2 * (POSITION + DIRECTION)  # place among the features of a side, of two points and two directions, of mu,
+P_0 = MU + 2  # after mu and the log of a length, of the first channel of P
 
 
 class Side(NamedTuple):
@@ -62,7 +64,7 @@ class Frame:
 
 def n_side(channels: int, local: int = 0) -> int:
     """Number of features of a side, of which twice `local` are what varies where light enters and at y."""
-    return 2 * 3 * (1 + 2 * OCTAVES) + 3 + 3 + 2 + channels + 2 * local
+    return P_0 + channels + 2 * local
 
 
 def _octaves(x: Any) -> list[Any]:

@@ -10,9 +10,10 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from full_geometry.features import N_PAIR, Frame, Side, pair_features, side_features
-from full_geometry.learning.reflectance import Reflectance
+from full_geometry.reflectance import Reflectance
 from full_geometry.subject import Subject, SurfacePoint
 from halfspace_sss.interface.model import BSSRDF
+from halfspace_sss.neural.perceptron import Perceptron
 
 __all__ = ["BOUND", "FullGeometry", "PreparedExit", "Start"]
 
@@ -64,33 +65,16 @@ class FullGeometry:
     alpha: Reflectance
     orders = "multiple"
 
-    @property
-    def depth(self) -> int:
-        """Number of layers."""
-        return len(self.weights) // 2
-
     @functools.cached_property
-    def _views(self) -> dict[str, tuple]:
-        """Matrix and bias of each layer as Dr.Jit's views, the first one split into exit and the rest."""
-        import mitsuba as mi
-        from drjit import nn
-
+    def _network(self) -> Perceptron:
+        """The first layer in two parts, exit and the rest."""
         split = (self.weights["W_0"].shape[1] - N_PAIR) // 2
-        layers = [(f"W_{k}", f"b_{k}") for k in range(self.depth)]
-        matrices = [self.weights[W] for W, _ in layers]
-        matrices = [matrices[0][:, :split], matrices[0][:, split:], *matrices[1:]]
-        tensors = [mi.TensorXf(np.ascontiguousarray(W, dtype=np.float32)) for W in matrices]
-        biases = [mi.Float(self.weights[b].astype(np.float32)) for _, b in layers]
-        views = nn.pack(*tensors, *biases)[-len(tensors) - len(biases) :]
-        return {"W": tuple(views[: len(tensors)]), "b": tuple(views[len(tensors) :])}
+        return Perceptron.named(self.weights, "W", "b", splits=[split])
 
     def prepare(self, at: SurfacePoint, active: Any = True) -> PreparedExit:
         """The exit's side, for as many entries as are asked for."""
-        from drjit import nn
-
-        side = self.start.end(at, active)
-        x = nn.CoopVec(*side_features(self.frame, side))
-        return PreparedExit(side, list(nn.matvec(self._views["W"][0], x, self._views["b"][0])))
+        side, net = self.start.end(at, active), self._network
+        return PreparedExit(side, net.numbers(net.first(0, side_features(self.frame, side), biased=True)))
 
     def S(self, exit: PreparedExit, at: SurfacePoint, active: Any = True) -> Any:
         """S(x_i, w_i; x_o, w_o) per channel, 1/((scene unit)² sr); 0 below the horizons.
@@ -103,19 +87,8 @@ class FullGeometry:
         import drjit as dr
         import mitsuba as mi
 
-        entry = self.start.end(at, active)
-        f = mi.Spectrum(self._network(exit, entry))
+        entry, net = self.start.end(at, active), self._network
+        features = [*side_features(self.frame, entry), *pair_features(self.frame, exit.side, entry)]
+        f = mi.Spectrum(net.rest(net.activation(net.first(1, features) + net.vector(exit.hidden))))
         S_0 = self.start(exit.side, entry, active)
         return dr.select(active, S_0 * dr.exp(BOUND * dr.tanh(f / BOUND)), 0)
-
-    def _network(self, exit: PreparedExit, entry: Side) -> list[Any]:
-        import drjit as dr
-        from drjit import nn
-
-        W, b = self._views["W"], self._views["b"]
-        x = nn.CoopVec(*side_features(self.frame, entry), *pair_features(self.frame, exit.side, entry))
-        x = nn.matvec(W[1], x) + nn.CoopVec(*exit.hidden)
-        for k in range(1, self.depth):
-            x = x * dr.clip(x * (1 / 6) + 0.5, 0, 1)  # hard swish: a fifth of SiLU's time
-            x = nn.matvec(W[k + 1], x, b[k])
-        return list(x)

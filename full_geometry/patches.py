@@ -20,6 +20,7 @@ import numpy as np
 
 from full_geometry.features import Frame, Side, side_features
 from full_geometry.subject import Subject
+from halfspace_sss.neural.perceptron import Perceptron
 from halfspace_sss.rendering.transport.area_points import Point
 
 __all__ = ["LEARNT_SHARE", "PATCHES", "PatchSampler", "PatchWeights", "Patches", "cluster", "mesh_faces"]
@@ -150,30 +151,19 @@ class PatchSampler:
     weights: Mapping[str, np.ndarray]
 
     @functools.cached_property
-    def _views(self) -> tuple:
-        import mitsuba as mi
-        from drjit import nn
-
-        n = len(self.weights) // 2
-        biases = [self.weights[f"c_{k}"].astype(np.float32) for k in range(n)]
-        areas = self.patches.areas
-        biases[-1] = biases[-1] + np.log(np.maximum(areas / areas.sum(), 1e-30)).astype(np.float32)
-        matrices = [np.ascontiguousarray(self.weights[f"V_{k}"], dtype=np.float32) for k in range(n)]
-        return nn.pack(*map(mi.TensorXf, matrices), *map(mi.Float, biases))[-2 * n :]
+    def _network(self) -> Perceptron:
+        """Layers with the log of the areas in the last bias."""
+        last, areas = f"c_{len(self.weights) // 2 - 1}", self.patches.areas
+        shares = np.log(np.maximum(areas / areas.sum(), 1e-30)).astype(np.float32)
+        return Perceptron.named({**self.weights, last: self.weights[last].astype(np.float32) + shares}, "V", "c")
 
     def prepare(self, exit: Side) -> PatchWeights:
         """Weights of all patches for an exit."""
         import drjit as dr
         import mitsuba as mi
-        from drjit import nn
 
-        n, x = len(self.weights) // 2, nn.CoopVec(*side_features(self.frame, exit))
-        for k in range(n):
-            x = nn.matvec(self._views[k], x, self._views[n + k])
-            if k < n - 1:
-                x = x * dr.clip(x * (1 / 6) + 0.5, 0, 1)
         sums = dr.alloc_local(mi.Float, self.patches.n)
-        for k, logit in enumerate(x):
+        for k, logit in enumerate(self._network(side_features(self.frame, exit))):
             sums[mi.UInt32(k)] = dr.minimum(logit, HIGHEST)
 
         def add(k: Any, total: Any, sums: Any) -> tuple:

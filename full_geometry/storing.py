@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from full_geometry.added import AddedTransport
 from full_geometry.features import N_PAIR, Frame, n_side
 from full_geometry.first_event import REFLECTIONS
 from full_geometry.flow.chart import Chart
@@ -17,10 +16,11 @@ from full_geometry.flow.conditional import ConditionalFlow
 from full_geometry.flow.sampler import FlowSampler
 from full_geometry.half_space import HalfSpace, HalfSpaceTransport
 from full_geometry.identity import Identity, frame_of, identify
-from full_geometry.learning.reflectance import Reflectance
 from full_geometry.model import FullGeometry, Start
 from full_geometry.neural_shape import storing as shapes
 from full_geometry.patches import Patches, PatchSampler
+from full_geometry.reflectance import Reflectance
+from full_geometry.rivals.added import AddedTransport
 from full_geometry.subject import Subject
 from halfspace_sss.interface.model import bssrdf
 from halfspace_sss.neural.store import load_weights, save_weights

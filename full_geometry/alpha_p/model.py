@@ -23,6 +23,7 @@ from full_geometry.flow.context import context, direction_square
 from full_geometry.flow.sampler import FlowSampler
 from full_geometry.patches import PatchWeights
 from full_geometry.subject import Subject, SurfacePoint
+from halfspace_sss.neural.perceptron import Perceptron
 from halfspace_sss.rendering.transport.plane import number
 
 __all__ = ["AlphaP", "PreparedAlphaP"]
@@ -67,30 +68,13 @@ class AlphaP:
         hit = self.subject.found.scene.ray_intersect_preliminary(ray, False, active=mi.Bool(active))
         return dr.select(hit.is_valid(), mi.UInt32(hit.prim_index), 0), active & hit.is_valid()
 
-    def _network(self, matrix: str, bias: str, x: list[Any]) -> list[Any]:
-        import drjit as dr
-        from drjit import nn
-
-        layers, v = self._views[matrix], nn.CoopVec(*x)
-        for k, (W, b) in enumerate(layers):
-            v = nn.matvec(W, v, b)
-            if k < len(layers) - 1:
-                v = v * dr.clip(v * (1 / 6) + 0.5, 0, 1)
-        return list(v)
+    @functools.cached_property
+    def _log_alpha(self) -> Perceptron:
+        return Perceptron.named(self.weights, "A", "a")
 
     @functools.cached_property
-    def _views(self) -> dict[str, list[tuple[Any, Any]]]:
-        import mitsuba as mi
-        from drjit import nn
-
-        found = {}
-        for matrix, bias in (("A", "a"), ("P", "p")):
-            n = sum(name.startswith(f"{matrix}_") for name in self.weights)
-            W = [mi.TensorXf(np.ascontiguousarray(self.weights[f"{matrix}_{k}"], np.float32)) for k in range(n)]
-            b = [mi.Float(self.weights[f"{bias}_{k}"].astype(np.float32)) for k in range(n)]
-            views = nn.pack(*W, *b)[-2 * n :]
-            found[matrix] = list(zip(views[:n], views[n:]))
-        return found
+    def _shares(self) -> Perceptron:
+        return Perceptron.named(self.weights, "P", "p")
 
     def prepare(self, at: SurfacePoint, active: Any = True) -> PreparedAlphaP:
         """alpha and the weights of patches of an exit."""
@@ -98,7 +82,7 @@ class AlphaP:
 
         side = Side(at, first_event(self.subject, at, active))
         features = side_features(self.sampler.frame, side)
-        alpha = dr.exp(self._network("A", "a", features)[0])
+        alpha = dr.exp(self._log_alpha(features)[0])
         return PreparedAlphaP(side, features, alpha, self.sampler.patches.prepare(side))
 
     def S(self, exit: PreparedAlphaP, at: SurfacePoint, active: Any = True, face: Any = None) -> Any:
@@ -122,7 +106,7 @@ class AlphaP:
         towards = direction_square(at.n_out, exit.side.at.p - at.p, at.w)
         p = sampler.patches.density(exit.weights, face) * sampler.flow.density(told, [*u, *towards]) / dr.pi
         entry = side_features(sampler.frame, Side(at, first_event(self.subject, at, active)))
-        logits = self._network("P", "p", [*exit.features, *entry, *told])
+        logits = self._shares([*exit.features, *entry, *told])
         most = functools.reduce(dr.maximum, logits)
         shares = [dr.exp(v - most) for v in logits]
         total = sum(shares)

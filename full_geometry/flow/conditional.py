@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from full_geometry.flow.spline import PARAMETERS, Spline
+from halfspace_sss.neural.perceptron import Perceptron, relu
 
 __all__ = ["ConditionalFlow"]
 
@@ -32,27 +33,11 @@ class ConditionalFlow:
     weights: Mapping[str, np.ndarray]
 
     @functools.cached_property
-    def _views(self) -> tuple:
-        import mitsuba as mi
-        from drjit import nn
-
-        depth = len(self.weights) // 2
-        matrices = [mi.TensorXf(np.ascontiguousarray(self.weights[f"F_{k}"], np.float32)) for k in range(depth)]
-        biases = [mi.Float(self.weights[f"h_{k}"].astype(np.float32)) for k in range(depth)]
-        return nn.pack(*matrices, *biases)[-2 * depth :]
+    def _network(self) -> Perceptron:
+        return Perceptron.named(self.weights, "F", "h", activation=relu)
 
     def _splines(self, x: Sequence[Any], context: Sequence[Any]) -> list[Any]:
-        import drjit as dr
-        import mitsuba as mi
-        from drjit import nn
-
-        depth = len(self.weights) // 2
-        v = nn.CoopVec(*(mi.Float(a) for a in x), *context)
-        for k in range(depth):
-            v = nn.matvec(self._views[k], v, self._views[depth + k])
-            if k < depth - 1:
-                v = nn.CoopVec(*(dr.maximum(a, 0) for a in v))
-        return list(v)
+        return self._network([*x, *context])
 
     def _spline(self, raw: list[Any], j: int) -> Spline:
         return Spline(raw[j * PARAMETERS : (j + 1) * PARAMETERS])

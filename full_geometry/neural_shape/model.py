@@ -14,6 +14,7 @@ from full_geometry.neural_shape.descriptors import CURVED_OWN, CURVED_SHARED, N_
 from full_geometry.neural_shape.mixing import mixed
 from full_geometry.subject import Subject, SurfacePoint
 from halfspace_sss.interface.model import BSSRDF
+from halfspace_sss.neural.perceptron import Perceptron
 from halfspace_sss.rendering.transport.plane import number
 
 __all__ = ["LEAST", "PLACE_OF_G", "NeuralShape", "most"]
@@ -52,18 +53,9 @@ class NeuralShape:
         return cls(subject, Backbone(subject, mixtures), weights, numbers)
 
     @functools.cached_property
-    def _views(self) -> tuple[list[Any], list[Any]]:
-        """Matrices and biases as Dr.Jit's views; the first layer is split into own and the rest."""
-        import mitsuba as mi
-        from drjit import nn
-
-        depth = len(self.weights) // 2
-        matrices = [self.weights[f"W_{k}"] for k in range(depth)]
-        matrices = [matrices[0][:, :N_OWN], matrices[0][:, N_OWN:], *matrices[1:]]
-        tensors = [mi.TensorXf(np.ascontiguousarray(W, dtype=np.float32)) for W in matrices]
-        biases = [mi.Float(self.weights[f"b_{k}"].astype(np.float32)) for k in range(depth)]
-        views = nn.pack(*tensors, *biases)[-len(tensors) - len(biases) :]
-        return list(views[: len(tensors)]), list(views[len(tensors) :])
+    def _network(self) -> Perceptron:
+        """The first layer in two parts, own and the rest."""
+        return Perceptron.named(self.weights, "W", "b", splits=[N_OWN])
 
     @functools.cached_property
     def _media(self) -> list[list[Any]]:
@@ -104,17 +96,13 @@ class NeuralShape:
 
     def _f(self, pair: Pair, numbers: list[Any]) -> Any:
         import drjit as dr
-        from drjit import nn
 
-        W, b = self._views
-        rest = nn.matvec(W[1], nn.CoopVec(*pair.shared, *numbers), b[0])
-        ends = [_swish(nn.matvec(W[0], nn.CoopVec(*own)) + rest) for own in (pair.exit, pair.entry)]
-        x = ends[0] + ends[1]
-        for k in range(1, len(b)):
-            x = nn.matvec(W[k + 1], x, b[k])
-            x = _swish(x) if k < len(b) - 1 else x
+        net = self._network
+        rest = net.first(1, [*pair.shared, *numbers], biased=True)
+        ends = [net.activation(net.first(0, own) + rest) for own in (pair.exit, pair.entry)]
+        x = net.rest(ends[0] + ends[1])
         u = [a + b for a, b in zip(pair.exit[CURVED_OWN], pair.entry[CURVED_OWN])] + pair.shared[CURVED_SHARED]
-        g = sum(h * dr.tanh(v) for h, v in zip(list(x), u))
+        g = sum(h * dr.tanh(v) for h, v in zip(x, u))
         bound = dr.select(g > 0, most(dr, numbers[PLACE_OF_G]), -LEAST)
         return bound * dr.tanh(g / bound)
 
@@ -125,10 +113,3 @@ def most(lib: Any, g: Any) -> Any:
     Light that is scattered forwards comes from few pairs, which too large an f makes far too bright in what is thin.
     """
     return MOST - (MOST - MOST_FORWARD) * lib.clip(g / FORWARD, 0, 1)
-
-
-def _swish(x: Any) -> Any:
-    """Hard swish, x clip(x/6 + 1/2, 0, 1)."""
-    import drjit as dr
-
-    return x * dr.clip(x * (1 / 6) + 0.5, 0, 1)

@@ -10,6 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from halfspace_sss.neural.perceptron import Perceptron, relu, silu
+
 __all__ = ["RELU", "SILU", "Activation", "Network", "layer_shapes"]
 
 NUMPY_BLOCK = 4096  # queries whose activations stay in the cache
@@ -38,20 +40,8 @@ def _silu_torch(h: Any) -> Any:
     return torch.nn.functional.silu(h)
 
 
-def _silu_drjit(h: Any) -> Any:
-    import drjit as dr
-
-    return h * (0.5 + 0.5 * dr.tanh(0.5 * h))
-
-
-def _relu_drjit(h: Any) -> Any:
-    import drjit as dr
-
-    return dr.maximum(h, 0)
-
-
-SILU = Activation(_silu_numpy, _silu_torch, _silu_drjit)  # x / (1 + exp(-x))
-RELU = Activation(lambda h: np.maximum(h, 0, out=h), lambda h: h.clamp_min(0), _relu_drjit)
+SILU = Activation(_silu_numpy, _silu_torch, silu)  # x / (1 + exp(-x))
+RELU = Activation(lambda h: np.maximum(h, 0, out=h), lambda h: h.clamp_min(0), relu)
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,31 +119,17 @@ class Network:
         return torch.nn.functional.linear(x, W, b)[..., 0]
 
     @functools.cached_property
-    def _views(self) -> dict:
-        return {}
+    def _perceptron(self) -> Perceptron:
+        return Perceptron([W.T for W in self.matrices], self.biases, self.activation.drjit)
 
     def _drjit(self, features: Sequence[Any]) -> Any:
-        """By cooperative vectors in single precision, half precision on CUDA, which has no other; else by loops."""
+        """By cooperative vectors, see `Perceptron`; in double precision, which they lack, by loops."""
         import drjit as dr
-        from drjit import nn
 
-        kind = type(sum(features[1:], features[0]))
+        kind = dr.expr_t(*features)
         if dr.type_v(kind) == dr.VarType.Float64:
             return self._drjit_loops(features, kind)
-        inner = dr.float16_array_t(kind) if dr.backend_v(kind) == dr.JitBackend.CUDA else kind
-        packed = self._views
-        if inner not in packed:
-            tensor = dr.tensor_t(inner)
-            parts = [tensor(np.ascontiguousarray(W.T)) for W in self.matrices] + [inner(b) for b in self.biases]
-            packed[inner] = nn.pack(*parts)
-        n = len(self.matrices)
-        views = packed[inner][-2 * n :]
-        x = nn.CoopVec(*(inner(f) for f in features))
-        for k in range(n):
-            x = nn.matvec(views[k], x, views[n + k])
-            if k < n - 1:
-                x = self.activation.drjit(x)
-        return kind(list(x)[0])
+        return self._perceptron(features)[0]
 
     def _drjit_loops(self, features: Sequence[Any], kind: type) -> Any:
         """One symbolic loop over the outputs of each layer and one over its inputs: slow, in any precision."""

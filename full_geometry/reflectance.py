@@ -20,6 +20,7 @@ import numpy as np
 from full_geometry.features import Frame, Side, entering, side_features
 from full_geometry.first_event import first_event
 from full_geometry.subject import Subject, SurfacePoint
+from halfspace_sss.neural.perceptron import Perceptron
 from halfspace_sss.rendering.transport.plane import number
 
 __all__ = ["Reflectance"]
@@ -42,29 +43,17 @@ class Reflectance:
     trusted: np.ndarray
 
     @functools.cached_property
-    def _views(self) -> tuple[list, list]:
-        import mitsuba as mi
-        from drjit import nn
-
-        n = len(self.weights) // 2
-        tensors = [mi.TensorXf(np.ascontiguousarray(self.weights[f"A_{k}"], dtype=np.float32)) for k in range(n)]
-        biases = [mi.Float(self.weights[f"a_{k}"].astype(np.float32)) for k in range(n)]
-        views = nn.pack(*tensors, *biases)[-2 * n :]
-        return list(views[:n]), list(views[n:])
+    def _network(self) -> Perceptron:
+        return Perceptron.named(self.weights, "A", "a")
 
     def parts(self, at: SurfacePoint, active: Any = True) -> tuple[Any, Any, Any]:
         """What passes unscattered, alpha_1 and alpha, per channel."""
         import drjit as dr
         import mitsuba as mi
-        from drjit import nn
 
         columns = side_features(self.frame, Side(at, first_event(self.subject, at, active)))
-        media, (A, a) = self.subject.media, self._views
-        x = nn.CoopVec(*columns)
-        for k, (matrix, bias) in enumerate(zip(A, a)):
-            x = x if k == 0 else x * dr.clip(x * (1 / 6) + 0.5, 0, 1)
-            x = nn.matvec(matrix, x, bias)
-        x, n = list(x), len(media)
+        media = self.subject.media
+        x, n = self._network(columns), len(media)
         live = mi.Spectrum([number(float(m.sigma_s) > 0) for m in media])
         enters, most = (mi.Spectrum(v) for v in entering(columns, number(self.subject.eta), n))
         once, more = (live * most / (1 + dr.exp(-mi.Spectrum(part))) for part in (x[:n], x[n:]))
