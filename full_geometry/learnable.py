@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from halfspace_sss.rendering.surface.object import Object
+from halfspace_sss.rendering.surface.sharing import name_of
 
 __all__ = ["check_geometry", "check_surface", "object_of"]
 
@@ -13,7 +14,7 @@ def check_geometry(found: Object) -> None:
     """ValueError if the faces of an object do not all point to the same side: one sign stands for all of them."""
     if found.signs is not None:
         raise ValueError(
-            f"normals of {found.shape.id()!r} must all point to the same side to be learnt, got pieces that disagree"
+            f"normals of {found.name} must all point to the same side to be learnt, got pieces that disagree"
         )
 
 
@@ -38,6 +39,7 @@ def object_of(scene: Any, name: str | None) -> Any:
     if name is None and len(known) == 1:
         name = next(iter(known))
     if name not in known:
-        raise ValueError(f"object must be one of {', '.join(known) or 'none'}, got {name!r}")
+        names = ", ".join(id or name_of(shape) for id, shape in known.items())
+        raise ValueError(f"object must be one of {names or 'none'}, got {name!r}")
     check_surface(name, known[name].bsdf())
     return known[name]

@@ -78,7 +78,7 @@ def _weights(subject: Subject, settings: Settings) -> Path:
     from full_geometry.learning.training import train
 
     warnings.warn(
-        f"object {subject.found.shape.id()!r} has no weights: it is learnt first, for {settings.train_seconds:g} s",
+        f"object {subject.found.name} has no weights: it is learnt first, for {settings.train_seconds:g} s",
         stacklevel=2,
     )
     return train(subject, seconds=settings.train_seconds, target_error=settings.train_error).path

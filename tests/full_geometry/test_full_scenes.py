@@ -153,6 +153,13 @@ def test_objects_with_the_same_surface_are_not_merged(tmp_path: Path) -> None:
     assert sorted(s.id() for s in load_objects(tmp_path / "two.xml").shapes()) == ["one", "two"]
 
 
+def test_objects_that_mitsuba_merged_are_refused_by_what_they_are(folder: Path) -> None:
+    both = {name: bunny(bsdf=SURFACE) for name in ("one", "two")}
+    loaded = mi.load_dict(scene(both, "full_geometry", train_seconds=0))
+    with pytest.raises(ValueError, match="object without an id .Mitsuba merges meshes that have the same surface"):
+        loaded.integrator().prepare(loaded)
+
+
 def refused(objects: dict, message: str, folder: Path) -> None:
     """Refused by what learns and by what renders, before either has traced anything."""
     whole = scene(objects, "full_geometry")

@@ -8,7 +8,9 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["RAYS", "Object", "is_inside", "same_objects", "scene_of", "survey", "turned"]
+from halfspace_sss.rendering.surface.sharing import name_of, rays_into, scene_of
+
+__all__ = ["RAYS", "Object", "is_inside", "same_objects", "survey", "turned"]
 
 RAYS = 4096  # of the survey
 MOST_HITS = 64  # that one ray counts
@@ -42,6 +44,11 @@ class Object:
     size: float
     area: float
     geometry: Any
+
+    @property
+    def name(self) -> str:
+        """What messages call it."""
+        return name_of(self.shape)
 
     def is_current(self) -> bool:
         """Whether the shape still is as it was surveyed."""
@@ -100,8 +107,12 @@ def same_objects(a: list[Any], b: list[Any]) -> bool:
     return len(a) == len(b) and all(x is y for x, y in zip(a, b))
 
 
-def survey(shape: Any) -> Object:
+def survey(shape: Any, world: Any = None) -> Object:
     """Look at a shape from outside with rays; warns if it is not closed.
+
+    Args:
+        shape: of Mitsuba.
+        world: the scene that it stands in, if rays are traced in both by one kernel.
 
     Raises:
         ValueError: the shape is an instance, whose geometry belongs to several objects.
@@ -109,20 +120,20 @@ def survey(shape: Any) -> Object:
 
     if "nstance" in shape.class_name():
         raise ValueError(f"a translucent object must not be an instance, got {shape.id() or shape}")
-    name, scene = shape.id(), scene_of([shape])
+    scene = scene_of([shape], world)
     box = scene.bbox()
     low, high = np.array(box.min, dtype=float), np.array(box.max, dtype=float)
     size = float(np.linalg.norm(high - low))
     pieces = _pieces(shape)
     votes = _Votes(pieces)
-    sides, odd = _outside_view(scene, 0.5 * (low + high), 0.5 * size, votes)
+    sides, odd = _outside_view(scene, votes)
     outward = sides[sides != 0]
     share = float((outward > 0).mean()) if len(outward) else 1.0
     sheet = 1 - MAJORITY < share < MAJORITY and not votes.agree()
     if odd > 0 or sheet:
         warnings.warn(
-            f"object {name!r} is not closed: {100 * odd:.3g} % of the rays that enter it do not leave it again; "
-            "light that enters or leaves at the gap is lost",
+            f"object {name_of(shape)} is not closed: {100 * odd:.3g} % of the rays that enter it do not leave it "
+            "again; light that enters or leaves at the gap is lost",
             stacklevel=2,
         )
     area = float(np.sum(np.array(shape.surface_area())))
@@ -193,30 +204,9 @@ class _Votes:
         return mi.Float(sign[np.array(self.pieces)].astype(np.float32)) if mixed else None
 
 
-def scene_of(shapes: list[Any]) -> Any:
-    """A Mitsuba scene that holds these shapes, which keep their ids."""
-    import mitsuba as mi
-
-    names = [shape.id() for shape in shapes]
-    scene = mi.load_dict({"type": "scene", **{f"shape{k}": shape for k, shape in enumerate(shapes)}})
-    for shape, name in zip(shapes, names):
-        shape.set_id(name)
-    return scene
-
-
-def _outside_view(scene: Any, centre: np.ndarray, radius: float, votes: _Votes) -> tuple[np.ndarray, float]:
+def _outside_view(scene: Any, votes: _Votes) -> tuple[np.ndarray, float]:
     """Per ray the side of the normal at the first hit (1 towards the ray, 0 no hit); share of rays with odd hits."""
-    import mitsuba as mi
-
-    rng = np.random.default_rng(7)
-    ends = rng.standard_normal((2, 3, RAYS))
-    ends /= np.linalg.norm(ends, axis=1, keepdims=True)
-    start = centre[:, None] + 1.1 * radius * ends[0]
-    target = centre[:, None] + 0.9 * radius * ends[1] * rng.random(RAYS) ** (1 / 3)
-    along = target - start
-    along /= np.linalg.norm(along, axis=0)
-    ray = mi.Ray3f(mi.Point3f(start), mi.Vector3f(along))
-    side, count = crossings(scene, ray, votes)
+    side, count = crossings(scene, rays_into(scene.bbox(), RAYS), votes)
     side, count = np.array(side), np.array(count)
     hit = count > 0
     return side, float((count[hit] % 2).mean()) if hit.any() else 0.0

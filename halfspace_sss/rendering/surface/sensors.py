@@ -23,7 +23,7 @@ def check_sensors(scene: Any, objects: list[Object]) -> None:
     for sensor in scene.sensors():
         for found in objects:
             if is_inside(found, _starts(sensor, found.size)).any():
-                raise ValueError(f"the camera must be outside of every object, got it inside {found.shape.id()!r}")
+                raise ValueError(f"the camera must be outside of every object, got it inside {found.name}")
 
 
 def _starts(sensor: Any, size: float) -> np.ndarray:

@@ -175,7 +175,7 @@ def warn_of_means(inside: Any, obj: Object) -> None:
     """Warn that models of the half-space take the medium of `equivalent`, if it stands for one that varies."""
     if inside.varying is not None:
         warnings.warn(
-            f"object {obj.shape.id()!r} varies in space: models of the half-space take its mean sigma_s "
+            f"object {obj.name} varies in space: models of the half-space take its mean sigma_s "
             f"{inside.medium.sigma_s} and sigma_a {inside.medium.sigma_a} 1/mm",
             stacklevel=2,
         )

@@ -12,6 +12,7 @@ from halfspace_sss.rendering.surface.inside import Inside
 from halfspace_sss.rendering.surface.object import Object, same_objects, survey
 from halfspace_sss.rendering.surface.placement import translucent_shapes
 from halfspace_sss.rendering.surface.sensors import check_sensors
+from halfspace_sss.rendering.surface.sharing import check_together, number_of
 from halfspace_sss.rendering.surface.transports import AUTO, choose_models, knows_objects, object_transport
 from halfspace_sss.rendering.surface.varying import equivalent, warn_of_means
 from halfspace_sss.rendering.transport.expected import Expected, expected_of
@@ -66,15 +67,16 @@ class Bodies:
 
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
-        self._made: tuple[list, list[Body]] = ([], [])
+        self._made: tuple[int, list, list[Body]] = (0, [], [])
 
     def of(self, scene: Any) -> list[Body]:
         """The bodies of a scene; errors as in `make_bodies`."""
         shapes = scene.shapes()  # the scene itself, which holds its integrator, would never be freed
-        before, bodies = self._made
-        if not bodies or not same_objects(before, shapes) or not all(body.is_current() for body in bodies):
-            self._made = shapes, make_bodies(scene, self.settings)
-        return self._made[1]
+        world, before, bodies = self._made
+        same = world == number_of(scene) and same_objects(before, shapes)
+        if not bodies or not same or not all(body.is_current() for body in bodies):
+            self._made = number_of(scene), shapes, make_bodies(scene, self.settings)
+        return self._made[2]
 
 
 def make_bodies(scene: Any, settings: Settings, without: Collection[str] = ()) -> list[Body]:
@@ -89,13 +91,14 @@ def make_bodies(scene: Any, settings: Settings, without: Collection[str] = ()) -
         raise ValueError("the scene must have an object with a translucent BSDF, got none")
     if any(shape.bsdf().inside.model == AUTO for shape in shapes):
         choose_models(scene, settings)
-    bodies = [_make_body(shape, settings) for shape in shapes if shape.id() not in without]
+    bodies = [_make_body(shape, settings, scene) for shape in shapes if shape.id() not in without]
+    check_together([scene, *(body.found.scene for body in bodies)])
     check_sensors(scene, [body.found for body in bodies])
     return bodies
 
 
-def _make_body(shape: Any, settings: Settings) -> Body:
-    found, surface = survey(shape), shape.bsdf()
+def _make_body(shape: Any, settings: Settings, scene: Any) -> Body:
+    found, surface = survey(shape, scene), shape.bsdf()
     inside = equivalent(surface.inside, found)
     media = [m.scaled(settings.mm_per_unit) for m in inside.channels()]
     check_size(found, media, settings.mm_per_unit)
@@ -135,7 +138,7 @@ def check_size(found: Object, media: Sequence[Medium], mm_per_unit: float) -> No
     thickness = [found.size * float(m.sigma_t) for m in media]
     if min(thickness) < SMALL or max(thickness) > LARGE:
         warnings.warn(
-            f"object {found.shape.id()!r} is {min(thickness):.3g} to {max(thickness):.3g} mean free paths across, "
+            f"object {found.name} is {min(thickness):.3g} to {max(thickness):.3g} mean free paths across, "
             f"{found.size * mm_per_unit:.3g} mm: check mm_per_unit = {mm_per_unit:g}",
             stacklevel=2,
         )

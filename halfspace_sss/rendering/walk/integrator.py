@@ -14,6 +14,7 @@ import numpy as np
 from halfspace_sss.rendering.surface.object import same_objects
 from halfspace_sss.rendering.surface.parameters import OF_MITSUBA, check_parameters
 from halfspace_sss.rendering.surface.sensors import check_sensors
+from halfspace_sss.rendering.surface.sharing import number_of
 from halfspace_sss.rendering.walk.connect import find_joins
 from halfspace_sss.rendering.walk.first_exits import FirstExits
 from halfspace_sss.rendering.walk.guide import Guide
@@ -49,12 +50,12 @@ def walk_integrator_class() -> type:
             self.rr_depth = _depth("rr_depth", int(props.get("rr_depth", 5)))
             self.hidden = bool(props.get("hide_emitters", False))
             self.join_share = _share("join_share", float(props.get("join_share", 0.5)))
-            self._prepared: tuple[Any, Any, Any] = ([], None, None)
+            self._prepared: tuple[int, list, Any, Any] = (0, [], None, None)
 
         def tracer(self, scene: Any) -> PathTracer:
             """What paths through a scene need; the costly part is made ready once."""
             self._prepared = _prepared(scene, self._prepared, self.mm_per_unit, self.join_share)
-            _, media, joins = self._prepared
+            *_, media, joins = self._prepared
             joins = joins and replace(joins, scene=scene)
             guide = joins and Guide(scene, media, joins)
             visitor = LightVisitor(scene, media, joins, guide)
@@ -82,15 +83,16 @@ def walk_integrator_class() -> type:
     return TranslucentWalk
 
 
-def _prepared(scene: Any, before: tuple, mm_per_unit: float, join_share: float) -> tuple[list, Any, Any]:
-    """Shapes, media and joins of a scene: those of before, unless its objects, their shape or media changed."""
+def _prepared(scene: Any, before: tuple, mm_per_unit: float, join_share: float) -> tuple[int, list, Any, Any]:
+    """Number, shapes, media and joins of a scene: those of before, unless its objects, their shape or media changed."""
     shapes = scene.shapes()  # the scene itself, which holds its integrator, would never be freed
-    if before[1] is not None and same_objects(before[0], shapes) and before[1].is_current():
+    same = before[0] == number_of(scene) and same_objects(before[1], shapes)
+    if before[2] is not None and same and before[2].is_current():
         return before
     media = WalkMedia.of(scene, mm_per_unit)
     check_sensors(scene, media.objects)
     joins = find_joins(scene, media, join_share)
-    return shapes, media, joins and replace(joins, scene=None)
+    return number_of(scene), shapes, media, joins and replace(joins, scene=None)
 
 
 def _refuse_derivatives(*_: Any, **__: Any) -> None:

@@ -10,8 +10,9 @@ import mitsuba as mi
 import numpy as np
 
 from halfspace_sss.rendering.surface.horizon import lift
-from halfspace_sss.rendering.surface.object import Object, scene_of, survey
+from halfspace_sss.rendering.surface.object import Object, survey
 from halfspace_sss.rendering.surface.placement import translucent_shapes
+from halfspace_sss.rendering.surface.sharing import check_together, scene_of
 from halfspace_sss.rendering.walk.grids import Grids, per_channel
 
 __all__ = ["Coefficients", "WalkMedia", "by_pointer", "pointer_numbers"]
@@ -203,10 +204,11 @@ class WalkMedia:
         if not (np.isfinite(mm_per_unit) and mm_per_unit > 0):
             raise ValueError(f"mm_per_unit must be finite and > 0, got {mm_per_unit!r}")
         shapes = translucent_shapes(scene)
-        inner = scene_of(shapes)
+        inner, objects = scene_of(shapes, scene), [survey(shape, scene) for shape in shapes]
+        check_together([scene, inner, *(obj.scene for obj in objects)])
         surfaces = [shape.bsdf() for shape in shapes]
         return cls(
-            [survey(shape) for shape in shapes],
+            objects,
             [surface.inside for surface in surfaces],
             inner,
             [surface.boundary for surface in surfaces],

@@ -1,0 +1,72 @@
+"""Perceptrons in Dr.Jit: against NumPy, in parts as a whole, and in half precision."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from halfspace_sss.backend import prepare_llvm
+
+pytest.importorskip("drjit")
+prepare_llvm()
+
+import drjit as dr  # noqa: E402
+from drjit import nn  # noqa: E402
+from drjit.llvm.ad import Float, Float16  # noqa: E402
+
+from halfspace_sss.neural.perceptron import Perceptron, relu  # noqa: E402
+
+SIZES, SPLIT, N = (7, 16, 12, 3), 4, 500
+ROUNDING = {np.float32: 2e-6, np.float16: 1e-2}  # of outputs of order one
+
+
+def layers(seed: int = 3) -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    found = {}
+    for k, (i, j) in enumerate(zip(SIZES, SIZES[1:])):
+        found |= {f"W_{k}": rng.standard_normal((j, i)) / np.sqrt(i), f"b_{k}": 0.3 * rng.standard_normal(j)}
+    return found
+
+
+def inputs(seed: int = 4) -> np.ndarray:
+    return np.random.default_rng(seed).standard_normal((SIZES[0], N)).astype(np.float32)
+
+
+def by_numpy(weights: dict, x: np.ndarray, activation: object) -> np.ndarray:
+    for k in range(len(SIZES) - 1):
+        x = weights[f"W_{k}"] @ (activation(x) if k else x) + weights[f"b_{k}"][:, None]
+    return x
+
+
+def hard(x: np.ndarray) -> np.ndarray:
+    return x * np.clip(x / 6 + 0.5, 0, 1)
+
+
+@pytest.mark.parametrize(("more", "activation"), [({}, hard), ({"activation": relu}, lambda x: np.maximum(x, 0))])
+def test_outputs_are_those_of_numpy(more: dict, activation: object) -> None:
+    weights, x = layers(), inputs()
+    found = Perceptron.named(weights, "W", "b", **more)([Float(row) for row in x])
+    assert np.allclose(np.array(found), by_numpy(weights, x, activation), atol=ROUNDING[np.float32])
+
+
+def test_parts_of_the_first_layer_make_the_whole() -> None:
+    weights, x = layers(), [Float(row) for row in inputs()]
+    whole, net = Perceptron.named(weights, "W", "b"), Perceptron.named(weights, "W", "b", splits=[SPLIT])
+    kept = net.numbers(net.first(0, x[:SPLIT], biased=True))
+    found = net.rest(net.activation(net.first(1, x[SPLIT:]) + net.vector(kept)))
+    assert np.allclose(np.array(found), np.array(whole(x)), atol=ROUNDING[np.float32])
+
+
+def test_layers_in_half_precision_give_single_precision_up_to_their_rounding() -> None:
+    weights, h = layers(), np.random.default_rng(5).random((SIZES[1], N)).astype(np.float32)
+    net = Perceptron.named(weights, "W", "b")
+    single, half = (net.rest(nn.CoopVec(*(kind(row) for row in h))) for kind in (Float, Float16))
+    assert all(dr.type_v(v) == dr.VarType.Float32 for v in half)
+    off = np.abs(np.array(half) - np.array(single)).max()
+    assert 0 < off < ROUNDING[np.float16]
+
+
+def test_one_layer_has_no_activation() -> None:
+    weights, x = layers(), inputs()
+    (found, *_) = Perceptron([weights["W_0"]], [weights["b_0"]])([Float(row) for row in x])
+    assert np.allclose(np.array(found), weights["W_0"][0] @ x + weights["b_0"][0], atol=ROUNDING[np.float32])
