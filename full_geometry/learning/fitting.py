@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from full_geometry.features import N_PAIR
+from full_geometry.learning.device import device_of_walks, tensor
 from full_geometry.learning.learner import (
     Correction,
     EvenLight,
@@ -86,7 +87,7 @@ def one_thread() -> Iterator[None]:
 
 
 class Fitting:
-    """The state of a fit, which follows from recipe, seed, number of steps and data.
+    """The state of a fit, which follows from recipe, seed, number of steps, data and device, see `device_of_walks`.
 
     Args:
         n_in: features of a pair.
@@ -107,17 +108,18 @@ class Fitting:
         }
         if patches is not None:
             parts["patches"] = PatchLogits(self.n_side, patches.areas, PATCH_HIDDEN, seed)
-        self.modules = torch.nn.ModuleDict(parts)
+        self.device = device_of_walks()
+        self.modules = torch.nn.ModuleDict(parts).to(self.device)
         self.average = copy.deepcopy(self.modules)
         self.parameters = list(self.modules.parameters())
         self.adam = torch.optim.Adam(self.parameters, lr=recipe.rate, betas=BETAS, fused=True)
-        self.step, self.scale, self.even_scale = 0, torch.ones(channels, 1), torch.ones(2 * channels, 1)
+        ones = torch.ones(2 * channels, 1, device=self.device)
+        self.step, self.scale, self.even_scale = 0, ones[:channels].clone(), ones
 
     def set_scale(self, walks: Pairs) -> None:
         """Divide each channel by its mean throughput, so that all count alike; alpha begins with the mean."""
-        mean = torch.from_numpy(walks.values.sum(axis=1) / walks.drawn)
-        self.scale = _inverse(mean)
-        exits, T = (torch.from_numpy(v) for v in walks.even)
+        self.scale = _inverse(self._tensor(walks.values.sum(axis=1) / walks.drawn))
+        exits, T = (self._tensor(v) for v in walks.even)
         self.even_scale = _inverse(T.mean(dim=1))
         for networks in (self.modules, self.average):
             networks["alpha"].begin(exits, T.mean(dim=1))
@@ -133,12 +135,12 @@ class Fitting:
             order: of the batches, in which walks meet other proposals each time, and of the proposals that are used.
         """
         batch = self.recipe.batch
-        x, T = (torch.from_numpy(v) for v in (walks.features, walks.values))
+        x, T = (self._tensor(v) for v in (walks.features, walks.values))
         y, W = self._worthy(proposals, order)
-        exits, even = (torch.from_numpy(v) for v in walks.even)
+        exits, even = (self._tensor(v) for v in walks.even)
         patch = None
         if self.patches is not None:
-            patch = torch.from_numpy(self.patches.of_face[walks.faces].astype(np.int64))
+            patch = self._tensor(self.patches.of_face[walks.faces].astype(np.int64))
         n_x, n_y = max(T.shape[1] // batch, 1), max(W.shape[1] // batch, 1)
         kept, n_even = T.shape[1] / walks.drawn, max(even.shape[1] // n_x, 1)
         T, W, S = T * self.scale, W * self.scale, self.modules["S"]
@@ -153,14 +155,17 @@ class Fitting:
                         loss = loss + self._patch_loss(x[:, a], T[:, a], patch[a])
                     self._advance(loss, steps)
 
+    def _tensor(self, array: np.ndarray) -> torch.Tensor:
+        return tensor(array, self.device)
+
     def _worthy(self, proposals: Pairs, order: np.random.Generator) -> tuple[torch.Tensor, torch.Tensor]:
         """Features and values of some proposals, kept by chance as walks are: by W exp f as the fit has it now."""
-        y, W = torch.from_numpy(proposals.features), torch.from_numpy(proposals.values)
+        y, W = self._tensor(proposals.features), self._tensor(proposals.values)
         with torch.no_grad(), one_thread():
             f = [self.modules["S"](part) for part in y.split(BLOCK, dim=1)]
             value = (W * self.scale * torch.exp(torch.cat(f, dim=1))).mean(dim=0)
             p = (value / (ENOUGH * value.mean().clamp_min(1e-30))).clamp(LEAST, 1.0)
-            kept = torch.nonzero(torch.from_numpy(order.random(len(p), np.float32)) < p)[:, 0]
+            kept = torch.nonzero(self._tensor(order.random(len(p), np.float32)) < p)[:, 0]
             return y[:, kept], W[:, kept] * (len(kept) / len(p)) / p[kept]
 
     def _patch_loss(self, x: torch.Tensor, T: torch.Tensor, patch: torch.Tensor) -> torch.Tensor:

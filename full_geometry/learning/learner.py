@@ -41,7 +41,8 @@ class Layers(nn.Module):
     def arrays(self, matrix: str, bias: str) -> dict[str, np.ndarray]:
         found: dict[str, Any] = {}
         for k, (W, b) in enumerate(zip(self.matrices, self.biases)):
-            found |= {f"{matrix}_{k}": W.detach().numpy().copy(), f"{bias}_{k}": b.detach().numpy()[:, 0].copy()}
+            W, b = (v.detach().cpu().numpy().copy() for v in (W, b))
+            found |= {f"{matrix}_{k}": W, f"{bias}_{k}": b[:, 0].copy()}
         return found
 
 

@@ -214,7 +214,7 @@ class _Run:
         """Scales and shares from a pilot, which compiles all kernels; the work of a run that was killed."""
         seed, n = (self.seed, 2**31), self.recipe.chunk // 4
         self.fitting.set_scale(self.source.walks(n, seed))
-        self.source = self.source.scaled(self.fitting.scale.numpy()[:, 0])
+        self.source = self.source.scaled(self.fitting.scale.cpu().numpy()[:, 0])
         pilot, proposed = self.source.walks(n, seed), self.source.proposed(n, seed)
         share = pilot.values.shape[1] / pilot.drawn
         self.walks = int(self.recipe.chunk / min(max(share, 0.05), 1.0))

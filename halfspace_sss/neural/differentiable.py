@@ -10,6 +10,7 @@ from halfspace_sss.arrays import broadcast_query, library
 from halfspace_sss.interface.query import Query
 from halfspace_sss.neural.features import medium_features, symmetric_features, travel
 from halfspace_sss.neural.hypernetwork import Hypernetwork
+from halfspace_sss.neural.perceptron import Perceptron, silu
 from halfspace_sss.neural.universal import load_hypernetwork, shipped_weights
 from halfspace_sss.physics.backbone import backbone_shape, length_scale
 from halfspace_sss.physics.fresnel import F_t
@@ -19,6 +20,8 @@ __all__ = ["neural_S"]
 
 def neural_S(sigma_t: Any, albedo: Any, g: Any, eta: Any, r: Any, mu_i: Any, phi_i: Any, mu_o: Any, phi_o: Any) -> Any:
     """S of order >= 2 of the model `neural` in 1/(mm² sr), differentiable in all arguments, torch or Dr.Jit.
+
+    On CUDA, Dr.Jit evaluates the layers, and adds up their derivatives, in half precision.
 
     Args:
         sigma_t: extinction, 1/mm; one number as a torch tensor or Dr.Jit array, as the next three.
@@ -89,11 +92,11 @@ def _drjit_network(hyper: Hypernetwork, c: list, features: list) -> Any:
         parts.append(tensor(dr.gather(kind, numbers, index(transposed)), (j, i)))
         parts.append(dr.gather(kind, numbers, index(np.arange(j) + at + i * j)))
         at += i * j + j
-    views = nn.pack(*parts, layout="training")[-len(parts) :]
     zero = dr.zeros(kind, max(dr.width(f) for f in features))  # cooperative vectors do not sum over what they broadcast
-    x = nn.CoopVec(*(f + zero for f in features))
+    x = Perceptron.vector([f + zero for f in features])
+    parts = [(dr.tensor_t(x.type) if k % 2 == 0 else x.type)(part) for k, part in enumerate(parts)]
+    views = nn.pack(*parts, layout="training")[-len(parts) :]
     for k in range(len(hyper.shapes)):
         x = nn.matvec(views[2 * k], x, views[2 * k + 1])
-        if k < len(hyper.shapes) - 1:
-            x = x * (0.5 + 0.5 * dr.tanh(0.5 * x))
-    return kind(list(x)[0])
+        x = silu(x) if k < len(hyper.shapes) - 1 else x
+    return Perceptron.numbers(x)[0]

@@ -23,16 +23,17 @@ def tensors_of(adam: torch.optim.Adam, parameters: Iterable[torch.Tensor]) -> Te
         tensors[f"{k}.value"] = p.data
         state = adam.state[p]
         if not state:
-            state.update(step=torch.tensor(0.0), exp_avg=torch.zeros_like(p), exp_avg_sq=torch.zeros_like(p))
+            at = p.device if adam.defaults["fused"] else None  # where a fused step counts
+            state.update(step=torch.tensor(0.0, device=at), exp_avg=torch.zeros_like(p), exp_avg_sq=torch.zeros_like(p))
         tensors |= {f"{k}.{name}": state[name] for name in ("step", "exp_avg", "exp_avg_sq")}
     return tensors
 
 
 def write(path: Path, tensors: Tensors, **more: torch.Tensor) -> None:
-    """A checkpoint of tensors, and of others that are read back by name."""
+    """A checkpoint of tensors on any device, and of others that are read back by name."""
     from safetensors.torch import save
 
-    state = {name: tensor.clone() for name, tensor in {**tensors, **more}.items()}
+    state = {name: tensor.to("cpu", copy=True) for name, tensor in {**tensors, **more}.items()}
     write_atomically(path, save({**state, "checksum": _checksum(state)}))
 
 
