@@ -83,5 +83,5 @@ def check_together(scenes: list[Any]) -> None:
     dr.eval(together)
     if any((a != np.array(b)).any() for a, b in zip(alone, together)):
         raise RuntimeError(
-            "rays of an object and of the scene around it must be traced by one kernel, got none that met"
+            "rays of an object and of the scene around it must be traced by one kernel, got some lost"
         )

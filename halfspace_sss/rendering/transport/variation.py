@@ -92,9 +92,18 @@ class Variation:
 
 
 def _slope(stencil: Stencil, S: Any, query: tuple) -> Any:
-    sides = [(S if model is None else model.eval(*query), number(c)) for model, c in stencil]
+    precise = _precise(query)
+    sides = [(S if model is None else type(S)(model.eval(*precise)), number(c)) for model, c in stencil]
     least = sides[0][0]
     for value, _ in sides[1:]:
         least = dr.minimum(least, value)
     by_logarithm = S * sum(c * dr.log(dr.maximum(value, 1e-37)) for value, c in sides)
     return dr.select((least > 1e-35) & (S > 0), by_logarithm, sum(c * value for value, c in sides))
+
+
+def _precise(query: tuple) -> tuple:
+    """In double precision on CUDA: to single, networks answer there in half, which a difference would enlarge."""
+    kind = dr.expr_t(*query)
+    if dr.backend_v(kind) != dr.JitBackend.CUDA:
+        return query
+    return tuple(dr.float64_array_t(kind)(v) for v in query)
