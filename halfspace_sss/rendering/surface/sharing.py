@@ -82,6 +82,4 @@ def check_together(scenes: list[Any]) -> None:
     together = [scene.ray_test(ray) for scene, ray in zip(scenes, rays)]
     dr.eval(together)
     if any((a != np.array(b)).any() for a, b in zip(alone, together)):
-        raise RuntimeError(
-            "rays of an object and of the scene around it must be traced by one kernel, got some lost"
-        )
+        raise RuntimeError("rays of an object and of the scene around it must be traced by one kernel, got some lost")
