@@ -91,13 +91,13 @@ class Perceptron:
 
     @staticmethod
     def vector(x: Sequence[Any]) -> Any:
-        """Numbers as a cooperative vector in the precision of the layers."""
+        """Numbers as a cooperative vector in the precision of the layers: half where the numbers have it, or on CUDA."""
         import drjit as dr
         from drjit import nn
 
         kind = dr.expr_t(*x)
-        cuda = dr.backend_v(kind) == dr.JitBackend.CUDA
-        inner = dr.float16_array_t(kind) if cuda else dr.float32_array_t(kind)
+        half = dr.type_v(kind) == dr.VarType.Float16 or dr.backend_v(kind) == dr.JitBackend.CUDA
+        inner = dr.float16_array_t(kind) if half else dr.float32_array_t(kind)
         return nn.CoopVec(*(inner(v) for v in x))
 
     @staticmethod

@@ -11,7 +11,6 @@ pytest.importorskip("drjit")
 prepare_llvm()
 
 import drjit as dr  # noqa: E402
-from drjit import nn  # noqa: E402
 from drjit.llvm.ad import Float, Float16  # noqa: E402
 
 from halfspace_sss.neural.perceptron import Perceptron, relu  # noqa: E402
@@ -58,9 +57,8 @@ def test_parts_of_the_first_layer_make_the_whole() -> None:
 
 
 def test_layers_in_half_precision_give_single_precision_up_to_their_rounding() -> None:
-    weights, h = layers(), np.random.default_rng(5).random((SIZES[1], N)).astype(np.float32)
-    net = Perceptron.named(weights, "W", "b")
-    single, half = (net.rest(nn.CoopVec(*(kind(row) for row in h))) for kind in (Float, Float16))
+    net, x = Perceptron.named(layers(), "W", "b"), inputs()
+    single, half = (net([kind(row) for row in x]) for kind in (Float, Float16))
     assert all(dr.type_v(v) == dr.VarType.Float32 for v in half)
     off = np.abs(np.array(half) - np.array(single)).max()
     assert 0 < off < ROUNDING[np.float16]
