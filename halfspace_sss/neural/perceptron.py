@@ -91,7 +91,7 @@ class Perceptron:
 
     @staticmethod
     def vector(x: Sequence[Any]) -> Any:
-        """Numbers as a cooperative vector in the precision of the layers: half where the numbers have it, or on CUDA."""
+        """Numbers as a cooperative vector in the precision of the layers: half on CUDA, or where numbers have it."""
         import drjit as dr
         from drjit import nn
 
