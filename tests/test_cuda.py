@@ -80,9 +80,9 @@ def test_scenes_that_do_not_belong_together_are_refused() -> None:
             mi.load_dict({"type": "scene", "ball": {"type": "sphere"}, "floor": {"type": "rectangle"}})
             for _ in range(2)
         )
-        check_together([world, *(scene_of([shape], world) for shape in world.shapes())])
+        check_together(world, [scene_of([shape], world) for shape in world.shapes()])
         with pytest.raises(RuntimeError, match="must be traced by one kernel"):
-            check_together([world, scene_of(other.shapes())])
+            check_together(world, [scene_of(other.shapes())])
 
     on(CUDA, ask)
 

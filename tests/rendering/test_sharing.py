@@ -7,7 +7,6 @@ import pytest
 from rendered import render, surface
 
 mi = pytest.importorskip("mitsuba")
-import drjit as dr  # noqa: E402
 
 from halfspace_sss.rendering.surface import sharing  # noqa: E402
 
@@ -71,17 +70,30 @@ def test_rays_that_are_lost_beside_others_are_told(by_optix: None) -> None:
 
         def __init__(self) -> None:
             self.inner, self.asked = sharing.scene_of(world.shapes()[:1], world), 0
+            self.bbox, self.shapes = self.inner.bbox, self.inner.shapes
 
-        def bbox(self) -> object:
-            return self.inner.bbox()
-
-        def ray_test(self, ray: object) -> object:
+        def ray_intersect_preliminary(self, ray: object, coherent: bool) -> object:
             self.asked += 1
-            return self.inner.ray_test(ray, True) if self.asked == 1 else dr.zeros(mi.Bool, dr.width(ray))
+            return self.inner.ray_intersect_preliminary(ray, coherent, active=mi.Bool(self.asked == 1))
 
-    sharing.check_together([world, sharing.scene_of(world.shapes()[:1], world)])
+    sharing.check_together(world, [sharing.scene_of(world.shapes()[:1], world)])
     with pytest.raises(RuntimeError, match="must be traced by one kernel, got some lost"):
-        sharing.check_together([world, Lost()])
+        sharing.check_together(world, [Lost()])
+
+
+def test_rays_that_meet_shapes_of_others_are_told(by_optix: None) -> None:
+    world, strange = mi.load_dict(scene()), sharing.scene_of([mi.load_dict({"type": "sphere"})])
+
+    class Strange:
+        """Says that it holds the floor, but holds a ball."""
+
+        bbox, ray_intersect_preliminary = strange.bbox, strange.ray_intersect_preliminary
+
+        def shapes(self) -> list:
+            return [s for s in world.shapes() if s.id() == "floor"]
+
+    with pytest.raises(RuntimeError, match="must be traced by one kernel, got some lost"):
+        sharing.check_together(world, [Strange()])
 
 
 def test_a_shape_without_an_id_is_called_what_it_may_be() -> None:

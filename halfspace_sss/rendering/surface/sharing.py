@@ -65,21 +65,39 @@ def rays_into(box: Any, n: int) -> Any:
     return mi.Ray3f(mi.Point3f(start), mi.Vector3f(along))
 
 
-def check_together(scenes: list[Any]) -> None:
-    """Try rays of several scenes in one kernel, where that may fail.
+def check_together(world: Any, scenes: list[Any]) -> None:
+    """Try rays in a scene and in those of objects in it by one kernel, where that may fail.
+
+    Args:
+        world: the scene around all.
+        scenes: from `scene_of`.
 
     Raises:
-        RuntimeError: they meet other things than in kernels of their own.
+        RuntimeError: rays meet other things than by kernels of their own, or shapes that are not in their scene.
     """
     if not _by_optix():
         return
     import drjit as dr
+    import mitsuba as mi
 
-    scenes = [scene for scene in scenes if scene.bbox().valid()]
-    rays = [rays_into(scene.bbox(), TRIALS) for scene in scenes]
+    tried = [scene for scene in (world, *scenes) if scene.bbox().valid()]
+    rays = [rays_into(scene.bbox(), TRIALS) for scene in tried]
     dr.eval(rays)
-    alone = [np.array(scene.ray_test(ray)) for scene, ray in zip(scenes, rays)]
-    together = [scene.ray_test(ray) for scene, ray in zip(scenes, rays)]
+    alone = [np.array(_met(scene, ray)) for scene, ray in zip(tried, rays)]
+    together = [_met(scene, ray) for scene, ray in zip(tried, rays)]
     dr.eval(together)
-    if any((a != np.array(b)).any() for a, b in zip(alone, together)):
-        raise RuntimeError("rays of an object and of the scene around it must be traced by one kernel, got some lost")
+    for scene, by_itself, beside in zip(tried, alone, map(np.array, together)):
+        own = [0, *(int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0]) for shape in scene.shapes())]
+        if (by_itself != beside).any() or (scene is not world and not np.isin(beside, own).all()):
+            raise RuntimeError(
+                "rays of objects and of the scene around them must be traced by one kernel, got some lost"
+            )
+
+
+def _met(scene: Any, ray: Any) -> Any:
+    """The numbers of the shapes that rays meet in Dr.Jit's registry, 0 for none."""
+    import drjit as dr
+    import mitsuba as mi
+
+    hit = scene.ray_intersect_preliminary(ray, False)
+    return dr.select(hit.is_valid(), dr.reinterpret_array(mi.UInt32, hit.shape), 0)

@@ -92,7 +92,7 @@ def make_bodies(scene: Any, settings: Settings, without: Collection[str] = ()) -
     if any(shape.bsdf().inside.model == AUTO for shape in shapes):
         choose_models(scene, settings)
     bodies = [_make_body(shape, settings, scene) for shape in shapes if shape.id() not in without]
-    check_together([scene, *(body.found.scene for body in bodies)])
+    check_together(scene, [body.found.scene for body in bodies])
     check_sensors(scene, [body.found for body in bodies])
     return bodies
 

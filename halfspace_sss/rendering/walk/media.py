@@ -205,7 +205,7 @@ class WalkMedia:
             raise ValueError(f"mm_per_unit must be finite and > 0, got {mm_per_unit!r}")
         shapes = translucent_shapes(scene)
         inner, objects = scene_of(shapes, scene), [survey(shape, scene) for shape in shapes]
-        check_together([scene, inner, *(obj.scene for obj in objects)])
+        check_together(scene, [inner, *(obj.scene for obj in objects)])
         surfaces = [shape.bsdf() for shape in shapes]
         return cls(
             objects,
