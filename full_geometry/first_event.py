@@ -49,8 +49,8 @@ def flight(subject: Subject, o: Any, d: Any, l: Any) -> tuple[Any, Any]:  # noqa
     import mitsuba as mi
 
     def add(sigma_t: Any, T: Any, inner: Any, s: Any, h: Any) -> tuple[Any, Any]:
-        through = dr.exp(-sigma_t * h)
-        mean = (1 - through) / dr.maximum(sigma_t, 1e-20) - h * through
+        through = dr.minimum(dr.exp(-sigma_t * h), 1)
+        mean = dr.maximum((1 - through) / dr.maximum(sigma_t, 1e-20) - h * through, 0)  # rounding, of short ways
         return T * through, inner + T * (mean + s * (1 - through))
 
     T, inner = mi.Spectrum(1), mi.Spectrum(0)

@@ -48,15 +48,20 @@ def on(variant: str, ask: Callable[[], Any]) -> Any:
     return found
 
 
-def both(ask: Callable[[], Any]) -> tuple[Any, Any]:
-    """By CUDA, then by LLVM."""
-    return on(CUDA, ask), on(LLVM, ask)
+def both(ask: Callable[..., Any], *args: tuple) -> tuple[Any, Any]:
+    """By CUDA, then by LLVM; what they are asked may differ, as by a seed."""
+    there, here = args or ((), ())
+    return on(CUDA, lambda: ask(*there)), on(LLVM, lambda: ask(*here))
 
 
-def agree(image: np.ndarray, reference: np.ndarray, rounding: float, z: float = 4.0) -> None:
-    """The means over pixels are the same up to z standard errors of the difference and a part of the mean."""
+def agree(image: np.ndarray, reference: np.ndarray, rounding: float = 0.0, z: float = 4.0) -> None:
+    """The means over pixels are the same up to z standard errors of the difference and a part of the mean.
+
+    Images are finite, and of different seeds.
+    """
+    assert np.isfinite(image).all(), f"{(~np.isfinite(image)).sum(axis=(0, 1))} pixels are not finite"
     off = (image - reference).reshape(-1, image.shape[-1])
     error = off.std(axis=0, ddof=1) / np.sqrt(len(off))
     bound = z * error + rounding * np.abs(reference.reshape(off.shape).mean(axis=0))
     assert np.all(np.abs(off.mean(axis=0)) <= bound), (off.mean(axis=0), error, reference.mean(axis=(0, 1)))
-    assert np.all(error < 0.02 * np.abs(reference).max())  # it can fail
+    assert np.all(error < 0.02 * np.abs(reference).max()), (error, np.abs(reference).max())  # it can fail

@@ -49,25 +49,36 @@ def test_every_model_gives_the_value_of_numpy(name: str, queries: object) -> Non
         off = np.abs(np.log(np.maximum(S, 1e-30) / np.maximum(wanted, 1e-30)))[wanted > 1e-6 * wanted.max()]
         assert np.median(off) < 5e-3 and np.quantile(off, 0.99) < 0.1
         S = model.eval(*map(dr.cuda.Float64, query)).numpy()
-        assert np.allclose(S, wanted, rtol=1e-9, atol=1e-12 * wanted.max())
+        assert np.allclose(S, wanted, rtol=1e-6, atol=1e-9 * wanted.max())  # far from half precision
     else:
-        assert np.allclose(S, wanted, rtol=1e-3, atol=1e-6 * wanted.max())
+        off = np.abs(S - wanted)
+        worst = np.argmax(off - 1e-3 * wanted)
+        assert np.allclose(S, wanted, rtol=1e-3, atol=1e-6 * wanted.max()), (S[worst], wanted[worst])
 
 
-def test_the_universal_network_is_differentiated_by_the_medium_as_on_llvm() -> None:
+def test_the_universal_network_is_differentiated_by_the_medium_as_by_torch() -> None:
+    torch = pytest.importorskip("torch")
     import drjit as dr
 
     from halfspace_sss.neural.differentiable import neural_S
 
-    def slopes(types: object) -> np.ndarray:
-        medium = [types.Float(v) for v in (1.2, 0.8, 0.2, 1.4)]
-        dr.enable_grad(*medium)
-        rest = (types.Float(np.full(256, v, np.float32)) for v in (0.8, 0.3, 0.7, 0.1))
-        S = neural_S(*medium, types.Float(np.linspace(0.2, 2.0, 256, dtype=np.float32)), *rest)
-        dr.backward(dr.mean(S))
-        return np.array([dr.grad(v)[0] for v in medium])
+    given, Float = [np.full(64, v, np.float32) for v in (0.8, 0.3, 0.7, 0.1)], dr.cuda.ad.Float
+    r, medium = np.linspace(0.2, 2.0, 64, dtype=np.float32), (1.2, 0.8, 0.2, 1.4)
+    here = [torch.tensor(v, dtype=torch.float64) for v in medium]
+    rest = [torch.from_numpy(v.astype(float)) for v in (r, *given)]
+    for k in range(2):
+        there = [Float(v) for v in medium]
+        dr.enable_grad(there[k])
+        S = neural_S(*there, Float(r), *map(Float, given))
+        dr.set_grad(there[k], 1.0)
+        dr.forward_to(S)
 
-    assert np.allclose(slopes(dr.cuda.ad), slopes(dr.llvm.ad), rtol=0.03)
+        def of(value: object, k: int = k) -> object:
+            return neural_S(*here[:k], value, *here[k + 1 :], *rest)
+
+        values, slopes = torch.autograd.functional.jvp(of, here[k], torch.ones_like(here[k]))
+        assert np.allclose(S.numpy(), values.numpy(), rtol=0.03), (S, values)
+        assert np.allclose(dr.grad(S).numpy(), slopes.numpy(), rtol=0.03, atol=0.03 * slopes.abs().max())
 
 
 def test_scenes_that_do_not_belong_together_are_refused() -> None:

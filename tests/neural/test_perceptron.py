@@ -68,3 +68,10 @@ def test_one_layer_has_no_activation() -> None:
     weights, x = layers(), inputs()
     (found, *_) = Perceptron([weights["W_0"]], [weights["b_0"]])([Float(row) for row in x])
     assert np.allclose(np.array(found), weights["W_0"][0] @ x + weights["b_0"][0], atol=ROUNDING[np.float32])
+
+
+@pytest.mark.parametrize("far", [1e3, 1e6, np.inf])
+def test_inputs_out_of_all_bounds_leave_outputs_in_half_precision_finite(far: float) -> None:
+    x = [Float16(row) for row in inputs()]
+    x[2], x[5] = (Float16(Float(np.full(N, v, np.float32))) for v in (far, -far))
+    assert np.isfinite(np.array(Perceptron.named(layers(), "W", "b")(x))).all()
