@@ -10,16 +10,13 @@ from a grid in the frame of the object, interpolated linearly; inside of it thei
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from full_geometry.subject import Subject
 from halfspace_sss.rendering.transport.plane import number
-
-if TYPE_CHECKING:
-    from full_geometry.features import Frame
 
 __all__ = ["FIELDS", "Surroundings", "insides", "surroundings"]
 
@@ -52,8 +49,13 @@ class Surroundings:
         return self.texture.eval((mi.Point3f(q) - self.low) * self.scale)
 
 
-def surroundings(subject: Subject, frame: Frame) -> Surroundings:
-    """The fields of an object, in the frame of its features."""
+def surroundings(subject: Subject, frame: Any) -> Surroundings:
+    """The fields of an object.
+
+    Args:
+        subject: the object.
+        frame: a `Frame` of its features.
+    """
     import drjit as dr
     import mitsuba as mi
 
@@ -68,7 +70,7 @@ def surroundings(subject: Subject, frame: Frame) -> Surroundings:
     return Surroundings(texture, mi.Point3f(*map(number, low)), mi.Vector3f(*map(number, 1 / (cell * cells))))
 
 
-def insides(subject: Subject, frame: Frame, low: np.ndarray, cell: float, cells: np.ndarray) -> np.ndarray:
+def insides(subject: Subject, frame: Any, low: np.ndarray, cell: float, cells: np.ndarray) -> np.ndarray:
     """1 where the middle of a cell lies inside, (z, y, x): where most of three rays meet the surface from within."""
     import drjit as dr
     import mitsuba as mi
@@ -94,7 +96,7 @@ def _fields(inside: np.ndarray, path: float) -> np.ndarray:
     return ((found - within.mean(axis=0)) / (within.std(axis=0) + LEAST_SPREAD)).astype(np.float32)
 
 
-def _bounds(subject: Subject, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
+def _bounds(subject: Subject, frame: Any) -> tuple[np.ndarray, np.ndarray]:
     """Of the object in its frame."""
     import mitsuba as mi
 
