@@ -14,6 +14,7 @@ import numpy as np
 
 from full_geometry.first_event import FirstEvent
 from full_geometry.subject import SurfacePoint
+from full_geometry.surroundings import FIELDS, Surroundings
 from halfspace_sss.arrays import library
 from halfspace_sss.physics import fresnel
 
@@ -43,12 +44,14 @@ class Frame:
         radius: half the diagonal of its bounding box, scene units.
         sigma_t: 1/(scene unit), geometric mean over channels.
         turn: 3 x 3 rows that turn world directions into the frame; None where it is the identity.
+        around: how much of the object surrounds a position in the frame.
     """
 
     centre: Any
     radius: Any
     sigma_t: Any
     turn: Any = None
+    around: Surroundings | None = None
 
     def position(self, p: Any) -> Any:
         """In the frame, of order one."""
@@ -61,10 +64,17 @@ class Frame:
 
         return mi.Vector3f(w) if self.turn is None else mi.Vector3f(*(dr.dot(row, w) for row in self.turn))
 
+    def back(self, q: Any, d: Any) -> tuple[Any, Any]:
+        """A position and a direction of the frame in the world."""
+        import mitsuba as mi
+
+        q, d = (v if self.turn is None else sum(row * x for row, x in zip(self.turn, v)) for v in (q, d))
+        return mi.Point3f(self.centre + mi.Vector3f(q) * self.radius), mi.Vector3f(d)
+
 
 def n_side(channels: int, local: int = 0) -> int:
     """Number of features of a side, of which twice `local` are what varies where light enters and at y."""
-    return P_0 + channels + 2 * local
+    return P_0 + channels + 2 * local + 2 * FIELDS
 
 
 def _octaves(x: Any) -> list[Any]:
@@ -78,14 +88,18 @@ def _octaves(x: Any) -> list[Any]:
 
 
 def side_features(frame: Frame, side: Side) -> list[Any]:
-    """Position and y with two octaves of sine and cosine, normal, w, mu, log of the way to y, log P, what varies."""
+    """Position and y with two octaves of sine and cosine, normal, w, mu, log of the way to y, log P, what varies, and
+    how much of the object surrounds the position and y.
+    """
     import drjit as dr
 
     at, event = side.at, side.event
     n, w = frame.direction(at.n_out), frame.direction(at.w)
+    p, y = frame.position(at.p), frame.position(event.y)
     return [
-        *_octaves(frame.position(at.p)), *_octaves(frame.position(event.y)), *n, *w, dr.dot(n, w),
+        *_octaves(p), *_octaves(y), *n, *w, dr.dot(n, w),
         _log(frame, event.length), *(0.5 * dr.log(P + LEAST_P) for P in event.P), *event.local,
+        *frame.around(p), *frame.around(y),
     ]  # fmt: skip
 
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from full_geometry.features import Frame
 from full_geometry.subject import Subject
+from full_geometry.surroundings import surroundings
 from halfspace_sss.rendering.surface.varying import grid_values
 from halfspace_sss.rendering.transport.plane import number
 
@@ -186,4 +187,5 @@ def frame_of(subject: Subject, trained: Identity | None = None) -> Frame:
     radius = 0.5 * float(np.linalg.norm(high - low))
     sigma_t = float(np.exp(np.mean([np.log(float(m.sigma_t)) for m in subject.media])))
     turn = None if np.allclose(R, np.eye(3), atol=1e-6) else [mi.Vector3f(*map(number, row)) for row in R.T]
-    return Frame(mi.Point3f(*map(number, centre)), number(radius), number(sigma_t), turn)
+    frame = Frame(mi.Point3f(*map(number, centre)), number(radius), number(sigma_t), turn)
+    return replace(frame, around=surroundings(subject, frame))

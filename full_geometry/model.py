@@ -46,7 +46,8 @@ class PreparedExit(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class FullGeometry:
-    """S = S_start exp f, f = 6 tanh(g/6), g a perceptron of the features of exit, entry and pair.
+    """S = S_start exp f, f = 6 tanh(g/6), g a perceptron of the features of exit, entry and pair, and of what
+    alpha's makes of exit and entry.
 
     Orders two and more; positive; reciprocal as far as it has been learnt.
 
@@ -74,7 +75,7 @@ class FullGeometry:
     def prepare(self, at: SurfacePoint, active: Any = True) -> PreparedExit:
         """The exit's side, for as many entries as are asked for."""
         side, net = self.start.end(at, active), self._network
-        return PreparedExit(side, net.numbers(net.first(0, side_features(self.frame, side), biased=True)))
+        return PreparedExit(side, net.numbers(net.first(0, self._end(side), biased=True)))
 
     def S(self, exit: PreparedExit, at: SurfacePoint, active: Any = True) -> Any:
         """S(x_i, w_i; x_o, w_o) per channel, 1/((scene unit)² sr); 0 below the horizons.
@@ -88,7 +89,12 @@ class FullGeometry:
         import mitsuba as mi
 
         entry, net = self.start.end(at, active), self._network
-        features = [*side_features(self.frame, entry), *pair_features(self.frame, exit.side, entry)]
+        features = [*self._end(entry), *pair_features(self.frame, exit.side, entry)]
         f = mi.Spectrum(net.rest(net.activation(net.first(1, features) + net.vector(exit.hidden))))
         S_0 = self.start(exit.side, entry, active)
         return dr.select(active, S_0 * dr.exp(BOUND * dr.tanh(f / BOUND)), 0)
+
+    def _end(self, side: Side) -> list[Any]:
+        """Features of one end, and what even light makes of them."""
+        columns = side_features(self.frame, side)
+        return [*columns, *self.alpha.units(columns)]

@@ -5,7 +5,8 @@ Of the light that F_t lets in, 1 - P leaves without an event; the rest leaves af
     alpha = ∫ S mu_i dw_i dA_i,    alpha_1, alpha = F_t(mu_o) P_o sigmoid(a),
 
 a a small network of the exit alone: positive, and no more than is scattered. As control variates they leave an even
-sky no noise but that of what blocks it.
+sky no noise but that of what blocks it. The units before its last layer are further inputs of the network of S, of exit
+and entry: what is simple in S walks teach alpha sooner.
 """
 
 from __future__ import annotations
@@ -43,8 +44,16 @@ class Reflectance:
     trusted: np.ndarray
 
     @functools.cached_property
-    def _network(self) -> Perceptron:
-        return Perceptron.named(self.weights, "A", "a")
+    def _networks(self) -> tuple[Perceptron, Perceptron]:
+        """All layers but the last, and that."""
+        n = len(self.weights) // 2
+        layers = [[self.weights[f"{name}_{k}"] for k in range(n)] for name in ("A", "a")]
+        return Perceptron(*(arrays[:-1] for arrays in layers)), Perceptron(*(arrays[-1:] for arrays in layers))
+
+    def units(self, columns: list[Any]) -> list[Any]:
+        """What the last layer is told of a side with these features."""
+        net = self._networks[0]
+        return net.numbers(net.activation(net.vector(net(columns))))
 
     def parts(self, at: SurfacePoint, active: Any = True) -> tuple[Any, Any, Any]:
         """What passes unscattered, alpha_1 and alpha, per channel."""
@@ -53,7 +62,7 @@ class Reflectance:
 
         columns = side_features(self.frame, Side(at, first_event(self.subject, at, active)))
         media = self.subject.media
-        x, n = self._network(columns), len(media)
+        x, n = self._networks[1](self.units(columns)), len(media)
         live = mi.Spectrum([number(float(m.sigma_s) > 0) for m in media])
         enters, most = (mi.Spectrum(v) for v in entering(columns, number(self.subject.eta), n))
         once, more = (live * most / (1 + dr.exp(-mi.Spectrum(part))) for part in (x[:n], x[n:]))

@@ -13,11 +13,10 @@ import numpy as np
 
 from full_geometry.entries import AREA_SHARE, LearntProposals
 from full_geometry.flow.sampler import FlowProposals
-from full_geometry.learnable import check_surface
 from full_geometry.model import FullGeometry, PreparedExit
 from full_geometry.patch_table import PatchTable
 from full_geometry.storing import CHECKSUMS, KIND, find_weights, load
-from full_geometry.subject import Subject, SurfacePoint
+from full_geometry.subject import Subject, SurfacePoint, check_surface
 from halfspace_sss.neural.store import checksum_of, load_weights
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.surface.inside import Inside

@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from full_geometry.learnable import check_geometry, object_of
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.scenes.scene_files import millimetres
 from halfspace_sss.rendering.surface.horizon import cosine_above, lifted
@@ -21,7 +20,7 @@ from halfspace_sss.rendering.transport.body import check_size
 from halfspace_sss.rendering.transport.plane import number
 from halfspace_sss.rendering.walk.media import WalkMedia
 
-__all__ = ["Subject", "SurfacePoint", "cosine_direction", "refract_in", "surface_point"]
+__all__ = ["Subject", "SurfacePoint", "check_surface", "cosine_direction", "refract_in", "surface_point"]
 
 LEAST_RATIO = 1e-3  # in logarithms of what varies
 
@@ -92,7 +91,7 @@ class Subject:
         """
         import mitsuba as mi
 
-        check_geometry(found)
+        _check_geometry(found)
         boundary = mi.load_dict({"type": "dielectric", "int_ior": media[0].eta, "ext_ior": 1.0})
         if varying is not None:
             varying = replace(varying, factor=varying.factor * mm_per_unit)
@@ -117,7 +116,7 @@ class Subject:
 
         if not isinstance(shape, mi.Scene):
             return cls.of(shape, medium, 1.0 if mm_per_unit is None else mm_per_unit)
-        found = survey(object_of(shape, name))
+        found = survey(_object_of(shape, name))
         unit = millimetres(shape) if mm_per_unit is None else mm_per_unit
         inside = equivalent(found.shape.bsdf().inside, found)
         subject = cls.surveyed(found, _in_scene_units(inside.medium, unit), inside.varying, unit)
@@ -253,3 +252,37 @@ def refract_in(at: SurfacePoint, eta: Any) -> tuple[Any, Any, Any]:
     F = mi.fresnel(dr.maximum(mu, 0), eta)[0]
     valid = (mu > 0) & (inner > 0) & (dr.dot(at.w, at.n) > 0) & (dr.dot(d, at.n) < 0)
     return mi.Vector3f(dr.normalize(d)), dr.select(valid, 1 - F, 0), valid
+
+
+def _check_geometry(found: Object) -> None:
+    """ValueError if the faces of an object do not all point to the same side: one sign stands for all of them."""
+    if found.signs is not None:
+        raise ValueError(
+            f"normals of {found.shape.id()!r} must all point to the same side to be learnt, got pieces that disagree"
+        )
+
+
+def check_surface(name: str, surface: Any) -> None:
+    """ValueError if the `translucent` surface of an object has what cannot be learnt."""
+    import mitsuba as mi
+
+    if surface.boundary.flags() & int(mi.BSDFFlags.Smooth):
+        raise ValueError(f"the boundary of {name!r} must be smooth to be learnt, got a rough one")
+
+
+def _object_of(scene: Any, name: str | None) -> Any:
+    """The translucent shape called `name` in a scene, or the only one.
+
+    Raises:
+        ValueError: there is none, there are several and none is named, or it cannot be learnt.
+    """
+    known = {s.id(): s for s in scene.shapes() if hasattr(s.bsdf(), "inside")}
+    instances = [s.id() for s in scene.shapes() if "nstance" in s.class_name()]
+    if name in instances or (name is None and instances and not known):
+        raise ValueError(f"object must not be an instance to be learnt, got {name or instances[0]!r}")
+    if name is None and len(known) == 1:
+        name = next(iter(known))
+    if name not in known:
+        raise ValueError(f"object must be one of {', '.join(known) or 'none'}, got {name!r}")
+    check_surface(name, known[name].bsdf())
+    return known[name]

@@ -29,14 +29,14 @@ from halfspace_sss.checks import check_choice, check_count, check_interval
 from halfspace_sss.interface.model import models
 from halfspace_sss.neural.training import checkpoint
 
-__all__ = ["STANDARD", "Fitting", "Recipe"]
+__all__ = ["ALPHA_HIDDEN", "STANDARD", "Fitting", "Recipe"]
 
 BETAS, CLIP, LAST_RATE, WARM_UP = (0.9, 0.99), 1.0, 0.01, 100
 AVERAGE = 0.998  # of the numbers, each step
 BLOCK = 4096  # pairs whose layers stay in the cache
 LEAST = 0.05  # chance of a proposal: f moves while the chunk is used
 PATCH_HIDDEN, PATCH_BATCH = (64, 32), 1024
-ALPHA_HIDDEN = (32, 32)
+ALPHA_HIDDEN = (32, 16)
 RATES = {SHAPES: 1.5e-3}  # by start: noise of walks leads large steps away from a near one
 
 
@@ -103,7 +103,7 @@ class Fitting:
     ) -> None:
         self.recipe, self.patches, self.n_side = recipe, patches, (n_in - N_PAIR) // 2
         parts = {
-            "S": Correction(n_in, channels, recipe.width, recipe.depth, seed),
+            "S": Correction(n_in + 2 * ALPHA_HIDDEN[-1], channels, recipe.width, recipe.depth, seed),
             "alpha": EvenLight(self.n_side, channels, ALPHA_HIDDEN, eta, seed),
         }
         if patches is not None:
@@ -143,13 +143,13 @@ class Fitting:
             patch = self._tensor(self.patches.of_face[walks.faces].astype(np.int64))
         n_x, n_y = max(T.shape[1] // batch, 1), max(W.shape[1] // batch, 1)
         kept, n_even = T.shape[1] / walks.drawn, max(even.shape[1] // n_x, 1)
-        T, W, S = T * self.scale, W * self.scale, self.modules["S"]
+        T, W = T * self.scale, W * self.scale
         with one_thread():
             for k in range(self.recipe.reuse):
                 back = k % 2 == 1
                 for i, j in zip(order.permutation(n_x), order.integers(0, n_y, n_x)):
                     a, b, e = (slice(k * m, (k + 1) * m) for k, m in ((i, batch), (j, batch), (i, n_even)))
-                    loss = likelihood((S(x[:, a], back), T[:, a]), (S(y[:, b], back), W[:, b]), kept)
+                    loss = likelihood((self._f(x[:, a], back), T[:, a]), (self._f(y[:, b], back), W[:, b]), kept)
                     loss = loss + mean_likelihood(self.modules["alpha"](exits[:, e]), even[:, e], self.even_scale)
                     if patch is not None and not back:
                         loss = loss + self._patch_loss(x[:, a], T[:, a], patch[a])
@@ -158,11 +158,15 @@ class Fitting:
     def _tensor(self, array: np.ndarray) -> torch.Tensor:
         return tensor(array, self.device)
 
+    def _f(self, x: torch.Tensor, back: bool = False) -> torch.Tensor:
+        """Of features of pairs: S knows what even light makes of both ends."""
+        return self.modules["S"](self.modules["alpha"].joined(x), back)
+
     def _worthy(self, proposals: Pairs, order: np.random.Generator) -> tuple[torch.Tensor, torch.Tensor]:
         """Features and values of some proposals, kept by chance as walks are: by W exp f as the fit has it now."""
         y, W = self._tensor(proposals.features), self._tensor(proposals.values)
         with torch.no_grad(), one_thread():
-            f = [self.modules["S"](part) for part in y.split(BLOCK, dim=1)]
+            f = [self._f(part) for part in y.split(BLOCK, dim=1)]
             value = (W * self.scale * torch.exp(torch.cat(f, dim=1))).mean(dim=0)
             p = (value / (ENOUGH * value.mean().clamp_min(1e-30))).clamp(LEAST, 1.0)
             kept = torch.nonzero(self._tensor(order.random(len(p), np.float32)) < p)[:, 0]

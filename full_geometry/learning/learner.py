@@ -31,11 +31,13 @@ class Layers(nn.Module):
 
     def forward(self, x: torch.Tensor, first: torch.Tensor | None = None) -> torch.Tensor:
         """Of columns x; `first` takes the place of the first matrix."""
+        return torch.addmm(self.biases[-1], self.matrices[-1], self.units(x, first))
+
+    def units(self, x: torch.Tensor, first: torch.Tensor | None = None) -> torch.Tensor:
+        """What the last layer is told."""
         matrices = list(self.matrices) if first is None else [first, *self.matrices[1:]]
-        for k, (W, b) in enumerate(zip(matrices, self.biases)):
-            x = torch.addmm(b, W, x)
-            if k < len(self.matrices) - 1:
-                x = nn.functional.hardswish(x)
+        for W, b in list(zip(matrices, self.biases))[:-1]:
+            x = nn.functional.hardswish(torch.addmm(b, W, x))
         return x
 
     def arrays(self, matrix: str, bias: str) -> dict[str, np.ndarray]:
@@ -115,6 +117,13 @@ class EvenLight(nn.Module):
         """Shares (2 channels, n) of features (inputs, n), and their logarithms up to that of F_t P."""
         a = self.layers(x)
         return self._most(x) * torch.sigmoid(a), nn.functional.logsigmoid(a)
+
+    def joined(self, x: torch.Tensor) -> torch.Tensor:
+        """Features of pairs, with the units before the last layer behind those of exit and entry."""
+        n, lanes = self.layers.matrices[0].shape[1], x.shape[1]
+        exit, entry, pair = x.split([n, n, len(x) - 2 * n])
+        units = self.layers.units(torch.cat([exit, entry], dim=1)).split(lanes, dim=1)
+        return torch.cat([exit, units[0], entry, units[1], pair])
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Matrices (outputs, inputs) and biases by name."""

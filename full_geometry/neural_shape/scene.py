@@ -6,11 +6,10 @@ import math
 import warnings
 from dataclasses import replace
 
-from full_geometry.learnable import check_surface
 from full_geometry.neural_shape.ranges import ALBEDO, ETA, SIZE, G
 from full_geometry.neural_shape.storing import checksums, transport
 from full_geometry.scene import LearntTransport
-from full_geometry.subject import Subject
+from full_geometry.subject import Subject, check_surface
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.surface.inside import Inside
 from halfspace_sss.rendering.surface.object import Object

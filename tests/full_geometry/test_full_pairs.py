@@ -80,7 +80,7 @@ def test_walks_that_are_kept_by_chance_carry_the_light_of_all(shape: str, medium
     every = source.ended(starts, exits, (3,))
     mean = every.values.sum(axis=1, keepdims=True) / every.drawn
     p = np.minimum((every.values / mean).mean(axis=0) / ENOUGH, 1)
-    kept = with_scale(source, every).ended(starts, exits, (3,))
+    kept = with_scale(source, every).ended(starts, exits, (5,))
     assert kept.drawn == every.drawn and kept.values.shape[1] < every.values.shape[1] == len(p)
     check_sums(every, kept, p)
 
@@ -102,7 +102,7 @@ def test_proposals_that_are_used_have_the_sums_of_all_and_less_noise() -> None:
     fitting.use(walks, source.proposed(N // 8, (6,)), None, np.random.default_rng(0))  # f is no more 0
     y, W = (v.numpy() for v in fitting._worthy(proposals, np.random.default_rng(1)))
     with torch.no_grad():
-        f = fitting.modules["S"](torch.from_numpy(proposals.features)).numpy()
+        f = fitting.modules["S"](fitting.modules["alpha"].joined(torch.from_numpy(proposals.features))).numpy()
     value = (proposals.values * fitting.scale.numpy() * np.exp(f)).mean(axis=0)
     p = np.clip(value / (ENOUGH * value.mean()), 0.05, 1)
     used = Pairs(y, W, W.shape[1])

@@ -11,13 +11,14 @@ import pytest
 from halfspace_sss import Medium
 
 mi = pytest.importorskip("mitsuba")
-pytest.importorskip("torch")
+torch = pytest.importorskip("torch")
 
 from full_geometry import storing  # noqa: E402
 from full_geometry.first_event import first_event  # noqa: E402
+from full_geometry.learning import training  # noqa: E402
 from full_geometry.learning.even_light import trusted  # noqa: E402
 from full_geometry.learning.exits import trace_exits  # noqa: E402
-from full_geometry.learning.fitting import Recipe  # noqa: E402
+from full_geometry.learning.fitting import ALPHA_HIDDEN, Recipe  # noqa: E402
 from full_geometry.learning.model_errors import LIGHTS, reference  # noqa: E402
 from full_geometry.learning.training import Trained, train  # noqa: E402
 from full_geometry.scene import LearntTransport  # noqa: E402
@@ -66,6 +67,25 @@ def test_orders_below_two_and_the_others_agree_with_walks(trained: Trained) -> N
         assert np.all(np.abs((learnt - walk).mean(axis=1)) <= 4 * error + 0.01 * walk.mean(axis=1))
     P = np.array(first_event(subject, at).P)
     assert np.all(more[1] == 0) and np.all(more >= 0) and np.all(more <= P + 1e-5)
+
+
+def test_S_of_training_and_of_images_know_the_same_of_even_light(trained: Trained) -> None:
+    subject, n = trained.model.subject, 4096
+    run = training._Run(subject, QUICK, 0, None, None)
+    networks, generator_ = run.fitting.average, torch.Generator().manual_seed(1)
+    with torch.no_grad():
+        for p in networks.parameters():
+            p.normal_(std=0.2, generator=generator_)
+    model = storing.assemble(subject, run.frame, run.start, run.arrays()).model
+    rng = generator(mi, n, pass_seed(6))
+    exits, entries = subject.random_points(rng), subject.random_points(rng)
+    pairs = run.source._columns(exits, entries, mi.Float(1) + 0 * entries.p.x)
+    with torch.no_grad():
+        joined = networks["alpha"].joined(torch.from_numpy(pairs.features))
+        f = networks["S"](joined).numpy()
+    assert f.std() > 0.1 and len(joined) == len(pairs.features) + 2 * ALPHA_HIDDEN[-1]
+    S = np.array(model.S(model.prepare(exits), entries))
+    assert np.allclose(S, pairs.values * np.exp(f), rtol=0.02, atol=1e-4 * S.max())  # weights in half precision
 
 
 def test_weights_without_it_are_refused_by_name(trained: Trained, tmp_path: Path) -> None:

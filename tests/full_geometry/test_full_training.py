@@ -193,7 +193,7 @@ def test_weights_of_other_inputs_are_refused(trained: Trained, tmp_path: Path) -
     arrays, record = load_weights(trained.path, storing.KIND)
     path = tmp_path / trained.path.name
     save_weights(path, storing.KIND, {**arrays, "W_0": arrays["W_0"][:, :-6]}, record)
-    with pytest.raises(ValueError, match="W_0 must have 103 inputs, got 97"):
+    with pytest.raises(ValueError, match="W_0 must have 163 inputs, got 157"):
         storing.load(path, trained.model.subject)
 
 
