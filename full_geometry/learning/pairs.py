@@ -157,11 +157,14 @@ class PairSource:
 
     def walks(self, n: int, seed: tuple[int, ...]) -> Pairs:
         """n walks of random exits; of those that left at an order that counts some, see `ended`."""
+        return self.ended(*self.traced(n, seed), seed)
+
+    def traced(self, n: int, seed: tuple[int, ...]) -> tuple[SurfacePoint, Exits]:
+        """Starts and ends of n walks of random exits."""
         import mitsuba as mi
 
-        rng = generator(mi, n, pass_seed(*seed, 0))
-        starts = self.subject.random_points(rng)
-        return self.ended(starts, trace_exits(self.subject, starts, (*seed, 1), fewest=1), seed)
+        starts = self.subject.random_points(generator(mi, n, pass_seed(*seed, 0)))
+        return starts, trace_exits(self.subject, starts, (*seed, 1), fewest=1)
 
     def ended(self, starts: SurfacePoint, exits: Exits, seed: tuple[int, ...]) -> Pairs:
         """The pairs of walks whose ends and orders from one on are known, those of two and more, T as values.

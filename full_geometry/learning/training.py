@@ -213,11 +213,11 @@ class _Run:
     def _prepare(self, chunks: int | None = None) -> None:
         """Scales and shares from a pilot, which compiles all kernels; the work of a run that was killed."""
         seed, n = (self.seed, 2**31), self.recipe.chunk // 4
-        self.fitting.set_scale(self.source.walks(n, seed))
+        traced = self.source.traced(n, seed)
+        self.fitting.set_scale(self.source.ended(*traced, seed))
         self.source = self.source.scaled(self.fitting.scale.cpu().numpy()[:, 0])
-        pilot, proposed = self.source.walks(n, seed), self.source.proposed(n, seed)
-        share = pilot.values.shape[1] / pilot.drawn
-        self.walks = int(self.recipe.chunk / min(max(share, 0.05), 1.0))
+        pilot, proposed = self.source.ended(*traced, seed), self.source.proposed(n, seed)
+        self.walks = int(self.recipe.chunk / min(max(pilot.values.shape[1] / pilot.drawn, 0.05), 1.0))
         self._new_fitting().use(pilot, proposed, None, np.random.default_rng(0))
         run = {"object": self.identity.record(), "recipe": asdict(self.recipe), "seed": self.seed}
         if self.camera:
