@@ -103,6 +103,7 @@ class NeuralShape:
         x = net.rest(ends[0] + ends[1])
         u = [a + b for a, b in zip(pair.exit[CURVED_OWN], pair.entry[CURVED_OWN])] + pair.shared[CURVED_SHARED]
         g = sum(h * dr.tanh(v) for h, v in zip(x, u))
+        g = dr.select(dr.isfinite(g), g, 0)  # S_0 alone rather than a hole in the picture
         bound = dr.select(g > 0, most(dr, numbers[PLACE_OF_G]), -LEAST)
         return bound * dr.tanh(g / bound)
 
