@@ -137,7 +137,7 @@ def load(path: str | os.PathLike, subject: Subject) -> Learnt:
         subject = subject.as_trained(identity.medium)
         frame = frame_of(subject, identity)
         first, bias = ALPHA_LAYERS
-        units = arrays[f"{first}{sum(name.startswith(bias) for name in arrays) - 1}"].shape[1]
+        units = arrays[f"{first}{max(sum(name.startswith(bias) for name in arrays) - 1, 0)}"].shape[1]
         n, known = 2 * (n_side(len(subject.media), subject.n_local) + units) + N_PAIR, arrays["W_0"].shape[1]
         if n != known:
             raise ValueError(f"W_0 must have {n} inputs, got {known}: of another version, to be trained again")

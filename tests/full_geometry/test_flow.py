@@ -16,7 +16,7 @@ dr = pytest.importorskip("drjit")
 torch = pytest.importorskip("torch")
 pytest.importorskip("zuko")
 
-from waxen import random_patches, wax_bunny  # noqa: E402
+from waxen import random_layers, random_patches, wax_bunny  # noqa: E402
 
 from full_geometry.entries import LearntProposals  # noqa: E402
 from full_geometry.features import N_PAIR, Side, n_side  # noqa: E402
@@ -217,9 +217,9 @@ def test_proposals_of_the_flow_and_of_patches_give_the_same_estimate(sampler: Fl
 
 def test_weights_with_a_flow_are_drawn_from_by_it(sampler: FlowSampler, tmp_path: Path) -> None:
     subject, frame = sampler.chart.subject, sampler.frame
-    rng, n = np.random.default_rng(6), 2 * n_side(3) + N_PAIR
+    rng, n = np.random.default_rng(6), 2 * (n_side(3) + 5) + N_PAIR
     arrays = {"W_0": rng.standard_normal((3, n)), "b_0": np.zeros(3), CENTRES: cluster(subject, frame, N_PATCHES)}
-    arrays[EVEN] = np.ones((2, 3))
+    arrays |= {EVEN: np.ones((2, 3)), **random_layers(rng, "A", "a", [n_side(3), 5, 6])}
     arrays = {name: value.astype(np.float16) for name, value in {**arrays, **sampler.patches.weights}.items()}
     path = save(tmp_path, identify(subject), arrays, {"recipe": {"start": "better_dipole"}, CHECKSUMS: []})
     assert load(path, subject).flow is None

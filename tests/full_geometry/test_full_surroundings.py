@@ -11,6 +11,8 @@ import mitsuba as mi  # noqa: E402
 
 mi.set_variant("llvm_ad_rgb")
 
+from waxen import BUNNY, WAX, wax_bunny  # noqa: E402
+
 from full_geometry.features import Side, n_side, side_features  # noqa: E402
 from full_geometry.first_event import first_event  # noqa: E402
 from full_geometry.identity import frame_of, identify  # noqa: E402
@@ -18,7 +20,6 @@ from full_geometry.subject import Subject, surface_point  # noqa: E402
 from full_geometry.surroundings import FIELDS, WIDTHS, insides  # noqa: E402
 from halfspace_sss import Medium  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
-from tests.waxen import BUNNY, WAX, wax_bunny  # noqa: E402
 
 DENSE = Medium(np.array([9.5, 9.0, 8.0]), np.array([0.5, 1.0, 2.0]), 0.0, 1.4)  # 10 / mm
 
