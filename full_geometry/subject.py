@@ -14,6 +14,7 @@ from halfspace_sss.rendering.scenes.scene_files import millimetres
 from halfspace_sss.rendering.surface.horizon import cosine_above, lifted
 from halfspace_sss.rendering.surface.inside import Inside
 from halfspace_sss.rendering.surface.object import Object, survey, turned
+from halfspace_sss.rendering.surface.sharing import name_of
 from halfspace_sss.rendering.surface.varying import VaryingMedium, equivalent, grid_values
 from halfspace_sss.rendering.transport.area_points import AreaPoints
 from halfspace_sss.rendering.transport.body import check_size
@@ -258,7 +259,7 @@ def _check_geometry(found: Object) -> None:
     """ValueError if the faces of an object do not all point to the same side: one sign stands for all of them."""
     if found.signs is not None:
         raise ValueError(
-            f"normals of {found.shape.id()!r} must all point to the same side to be learnt, got pieces that disagree"
+            f"normals of {found.name} must all point to the same side to be learnt, got pieces that disagree"
         )
 
 
@@ -283,6 +284,7 @@ def _object_of(scene: Any, name: str | None) -> Any:
     if name is None and len(known) == 1:
         name = next(iter(known))
     if name not in known:
-        raise ValueError(f"object must be one of {', '.join(known) or 'none'}, got {name!r}")
+        names = ", ".join(id or name_of(shape) for id, shape in known.items())
+        raise ValueError(f"object must be one of {names or 'none'}, got {name!r}")
     check_surface(name, known[name].bsdf())
     return known[name]
