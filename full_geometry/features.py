@@ -18,10 +18,10 @@ from full_geometry.surroundings import FIELDS, Surroundings
 from halfspace_sss.arrays import library
 from halfspace_sss.physics import fresnel
 
-__all__ = ["N_PAIR", "Frame", "Side", "entering", "n_side", "pair_features", "reverse", "side_features"]
+__all__ = ["Frame", "Side", "entering", "n_pair", "n_side", "pair_features", "reverse", "side_features"]
 
 OCTAVES = 2
-N_PAIR = 21
+PAIR = 21  # numbers of a pair before those of each channel
 LEAST_P, LEAST_LENGTH = 1e-3, 1e-2
 POSITION, DIRECTION = 3 * (1 + 2 * OCTAVES), 3  # numbers of a point with its octaves, and of a direction
 MU = 2 * (POSITION + DIRECTION)  # place among the features of a side, of two points and two directions, of mu,
@@ -43,6 +43,7 @@ class Frame:
         centre: of the object, scene units.
         radius: half the diagonal of its bounding box, scene units.
         sigma_t: 1/(scene unit), geometric mean over channels.
+        each: 1/(scene unit), sigma_t of each channel.
         turn: 3 x 3 rows that turn world directions into the frame; None where it is the identity.
         around: how much of the object surrounds a position in the frame.
     """
@@ -50,6 +51,7 @@ class Frame:
     centre: Any
     radius: Any
     sigma_t: Any
+    each: tuple[Any, ...]
     turn: Any = None
     around: Surroundings | None = None
 
@@ -77,6 +79,11 @@ def n_side(channels: int, local: int = 0) -> int:
     return P_0 + channels + 2 * local + 2 * FIELDS
 
 
+def n_pair(channels: int) -> int:
+    """Number of features of a pair beside those of its sides."""
+    return PAIR + channels
+
+
 def _octaves(x: Any) -> list[Any]:
     import drjit as dr
 
@@ -98,7 +105,7 @@ def side_features(frame: Frame, side: Side) -> list[Any]:
     p, y = frame.position(at.p), frame.position(event.y)
     return [
         *_octaves(p), *_octaves(y), *n, *w, dr.dot(n, w),
-        _log(frame, event.length), *(0.5 * dr.log(P + LEAST_P) for P in event.P), *event.local,
+        _log(frame.sigma_t, event.length), *(0.5 * dr.log(P + LEAST_P) for P in event.P), *event.local,
         *frame.around(p), *frame.around(y),
     ]  # fmt: skip
 
@@ -120,7 +127,7 @@ def entering(columns: Any, eta: Any, channels: int) -> tuple[list[Any], list[Any
 def pair_features(frame: Frame, exit: Side, entry: Side) -> list[Any]:
     """x_i - x_o as direction and length, log r, log |y_i - y_o|, dot products of directions and normals, and what the
     surface at one end says of y at the other: its depth below the plane there, its distance from the point, and the
-    cosine between the way to y and the way on to the other y.
+    cosine between the way to y and the way on to the other y; log of the distance between the two y of each channel.
     """
     import drjit as dr
 
@@ -132,19 +139,20 @@ def pair_features(frame: Frame, exit: Side, entry: Side) -> list[Any]:
     gap = dr.norm(between)
     between = between / dr.maximum(gap, 1e-6 * frame.radius)
     return [
-        *frame.direction(d), r / frame.radius, _log(frame, r), _log(frame, gap), gap / frame.radius,
+        *frame.direction(d), r / frame.radius, _log(frame.sigma_t, r), _log(frame.sigma_t, gap), gap / frame.radius,
         dr.dot(o.n_out, i.n_out), dr.dot(o.w, i.w), dr.dot(o.n_out, d), dr.dot(i.n_out, d), dr.dot(o.w, d),
         dr.dot(i.w, d), dr.dot(o.n_out, i.w), dr.dot(i.n_out, o.w),
         _depth(frame, i, exit.event.y), _depth(frame, o, entry.event.y),
-        _log(frame, dr.norm(exit.event.y - i.p)), _log(frame, dr.norm(entry.event.y - o.p)),
+        _log(frame.sigma_t, dr.norm(exit.event.y - i.p)), _log(frame.sigma_t, dr.norm(entry.event.y - o.p)),
         _cosine(frame, exit, between), _cosine(frame, entry, -between),
+        *(_log(t, dr.norm(a - b)) for t, a, b in zip(frame.each, exit.event.ys, entry.event.ys)),
     ]  # fmt: skip
 
 
-def _log(frame: Frame, length: Any) -> Any:
+def _log(sigma_t: Any, length: Any) -> Any:
     import drjit as dr
 
-    return 0.5 * dr.log(length * frame.sigma_t + LEAST_LENGTH)
+    return 0.5 * dr.log(length * sigma_t + LEAST_LENGTH)
 
 
 def _depth(frame: Frame, at: SurfacePoint, y: Any) -> Any:
@@ -163,9 +171,10 @@ def _cosine(frame: Frame, side: Side, onward: Any) -> Any:
     return dr.dot(way, onward) / dr.maximum(dr.norm(way), 1e-6 * frame.radius)
 
 
-def reverse(n: int) -> tuple[np.ndarray, np.ndarray]:
+def reverse(n: int, channels: int) -> tuple[np.ndarray, np.ndarray]:
     """Order and signs that turn the features of (exit, entry, pair), n of each side, into those of the way back."""
-    pair = np.array([0, 1, 2, 3, 4, 5, 6, 7, 8, 10, 9, 12, 11, 14, 13, 16, 15, 18, 17, 20, 19])
-    signs = np.ones(2 * n + N_PAIR, dtype=np.float32)
+    pair = np.arange(n_pair(channels))
+    pair[:PAIR] = np.array([0, 1, 2, 3, 4, 5, 6, 7, 8, 10, 9, 12, 11, 14, 13, 16, 15, 18, 17, 20, 19])
+    signs = np.ones(2 * n + n_pair(channels), dtype=np.float32)
     signs[2 * n + np.array([0, 1, 2, 9, 10, 11, 12])] = -1
     return np.concatenate([np.arange(n, 2 * n), np.arange(n), 2 * n + pair]), signs

@@ -185,7 +185,8 @@ def frame_of(subject: Subject, trained: Identity | None = None) -> Frame:
     low, high = anchors.min(axis=0).astype(float), anchors.max(axis=0).astype(float)
     centre = R @ (0.5 * (low + high)) + t
     radius = 0.5 * float(np.linalg.norm(high - low))
-    sigma_t = float(np.exp(np.mean([np.log(float(m.sigma_t)) for m in subject.media])))
+    each = [float(m.sigma_t) for m in subject.media]
+    sigma_t = float(np.exp(np.mean(np.log(each))))
     turn = None if np.allclose(R, np.eye(3), atol=1e-6) else [mi.Vector3f(*map(number, row)) for row in R.T]
-    frame = Frame(mi.Point3f(*map(number, centre)), number(radius), number(sigma_t), turn)
+    frame = Frame(mi.Point3f(*map(number, centre)), number(radius), number(sigma_t), tuple(map(number, each)), turn)
     return replace(frame, around=surroundings(subject, frame))

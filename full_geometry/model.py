@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from full_geometry.features import N_PAIR, Frame, Side, pair_features, side_features
+from full_geometry.features import Frame, Side, n_pair, pair_features, side_features
 from full_geometry.reflectance import Reflectance
 from full_geometry.subject import Subject, SurfacePoint
 from halfspace_sss.interface.model import BSSRDF
@@ -69,7 +69,7 @@ class FullGeometry:
     @functools.cached_property
     def _network(self) -> Perceptron:
         """The first layer in two parts, exit and the rest."""
-        split = (self.weights["W_0"].shape[1] - N_PAIR) // 2
+        split = (self.weights["W_0"].shape[1] - n_pair(len(self.subject.media))) // 2
         return Perceptron.named(self.weights, "W", "b", splits=[split])
 
     def prepare(self, at: SurfacePoint, active: Any = True) -> PreparedExit:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from full_geometry.features import N_PAIR, Frame, n_side
+from full_geometry.features import Frame, n_pair, n_side
 from full_geometry.first_event import REFLECTIONS
 from full_geometry.flow.chart import Chart
 from full_geometry.flow.conditional import ConditionalFlow
@@ -138,7 +138,8 @@ def load(path: str | os.PathLike, subject: Subject) -> Learnt:
         frame = frame_of(subject, identity)
         first, bias = ALPHA_LAYERS
         units = arrays[f"{first}{max(sum(name.startswith(bias) for name in arrays) - 1, 0)}"].shape[1]
-        n, known = 2 * (n_side(len(subject.media), subject.n_local) + units) + N_PAIR, arrays["W_0"].shape[1]
+        channels, known = len(subject.media), arrays["W_0"].shape[1]
+        n = 2 * (n_side(channels, subject.n_local) + units) + n_pair(channels)
         if n != known:
             raise ValueError(f"W_0 must have {n} inputs, got {known}: of another version, to be trained again")
         start = start_of(subject, _start(path, record, subject))

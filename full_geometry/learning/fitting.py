@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from full_geometry.features import N_PAIR
+from full_geometry.features import n_pair
 from full_geometry.learning.device import device_of_walks, tensor
 from full_geometry.learning.learner import (
     Correction,
@@ -101,7 +101,7 @@ class Fitting:
     def __init__(
         self, n_in: int, channels: int, eta: float, recipe: Recipe, seed: int, patches: Patches | None = None
     ) -> None:
-        self.recipe, self.patches, self.n_side = recipe, patches, (n_in - N_PAIR) // 2
+        self.recipe, self.patches, self.n_side = recipe, patches, (n_in - n_pair(channels)) // 2
         parts = {
             "S": Correction(n_in + 2 * ALPHA_HIDDEN[-1], channels, recipe.width, recipe.depth, seed),
             "alpha": EvenLight(self.n_side, channels, ALPHA_HIDDEN, eta, seed),

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from full_geometry.features import N_PAIR, entering, reverse
+from full_geometry.features import entering, n_pair, reverse
 from full_geometry.model import BOUND
 
 __all__ = ["Correction", "EvenLight", "PatchLogits", "likelihood", "mean_likelihood", "patch_likelihood"]
@@ -61,7 +61,7 @@ class Correction(nn.Module):
     def __init__(self, n_in: int, channels: int, width: int = 64, depth: int = 3, seed: int = 0) -> None:
         super().__init__()
         self.layers = Layers([n_in, *[width] * depth, channels], torch.Generator().manual_seed(seed))
-        order, signs = reverse((n_in - N_PAIR) // 2)
+        order, signs = reverse((n_in - n_pair(channels)) // 2, channels)
         back = np.argsort(order)
         self.register_buffer("order", torch.from_numpy(back), persistent=False)
         self.register_buffer("signs", torch.from_numpy(signs[back]), persistent=False)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from full_geometry import storing
-from full_geometry.features import N_PAIR, n_side
+from full_geometry.features import n_pair, n_side
 from full_geometry.identity import frame_of, identify
 from full_geometry.learning.even_light import trusted
 from full_geometry.learning.fitting import STANDARD, Fitting, Recipe
@@ -172,7 +172,7 @@ class _Run:
 
     def _new_fitting(self) -> Fitting:
         channels = len(self.subject.media)
-        n_in = 2 * n_side(channels, self.subject.n_local) + N_PAIR
+        n_in = 2 * n_side(channels, self.subject.n_local) + n_pair(channels)
         return Fitting(n_in, channels, self.subject.eta, self.recipe, self.seed, self.patches)
 
     def arrays(self) -> dict[str, np.ndarray]:

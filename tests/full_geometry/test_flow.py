@@ -19,7 +19,7 @@ pytest.importorskip("zuko")
 from waxen import random_layers, random_patches, wax_bunny  # noqa: E402
 
 from full_geometry.entries import LearntProposals  # noqa: E402
-from full_geometry.features import N_PAIR, Side, n_side  # noqa: E402
+from full_geometry.features import Side, n_pair, n_side  # noqa: E402
 from full_geometry.first_event import first_event  # noqa: E402
 from full_geometry.flow.chart import Chart  # noqa: E402
 from full_geometry.flow.conditional import ConditionalFlow  # noqa: E402
@@ -217,7 +217,7 @@ def test_proposals_of_the_flow_and_of_patches_give_the_same_estimate(sampler: Fl
 
 def test_weights_with_a_flow_are_drawn_from_by_it(sampler: FlowSampler, tmp_path: Path) -> None:
     subject, frame = sampler.chart.subject, sampler.frame
-    rng, n = np.random.default_rng(6), 2 * (n_side(3) + 5) + N_PAIR
+    rng, n = np.random.default_rng(6), 2 * (n_side(3) + 5) + n_pair(3)
     arrays = {"W_0": rng.standard_normal((3, n)), "b_0": np.zeros(3), CENTRES: cluster(subject, frame, N_PATCHES)}
     arrays |= {EVEN: np.ones((2, 3)), **random_layers(rng, "A", "a", [n_side(3), 5, 6])}
     arrays = {name: value.astype(np.float16) for name, value in {**arrays, **sampler.patches.weights}.items()}

@@ -16,7 +16,7 @@ from halfspace_sss import Medium
 mi = pytest.importorskip("mitsuba")
 torch = pytest.importorskip("torch")
 
-from full_geometry.features import N_PAIR  # noqa: E402
+from full_geometry.features import n_pair, n_side  # noqa: E402
 from full_geometry.half_space import HalfSpace  # noqa: E402
 from full_geometry.identity import frame_of  # noqa: E402
 from full_geometry.learning.exits import trace_exits  # noqa: E402
@@ -97,7 +97,7 @@ def test_proposals_that_are_used_have_the_sums_of_all_and_less_noise() -> None:
     walks, proposals = source.walks(N // 8, (5,)), source.proposed(N, (5,))
     n_in = len(proposals.features)
     fitting = Fitting(n_in, 3, source.subject.eta, STANDARD, 0)
-    assert n_in > N_PAIR
+    assert n_in == 2 * n_side(3) + n_pair(3)
     fitting.set_scale(walks)
     fitting.use(walks, source.proposed(N // 8, (6,)), None, np.random.default_rng(0))  # f is no more 0
     y, W = (v.numpy() for v in fitting._worthy(proposals, np.random.default_rng(1)))

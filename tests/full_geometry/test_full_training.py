@@ -18,7 +18,7 @@ torch = pytest.importorskip("torch")
 
 import full_geometry  # noqa: E402
 from full_geometry import storing  # noqa: E402
-from full_geometry.features import N_PAIR, Side, n_side, pair_features, reverse, side_features  # noqa: E402
+from full_geometry.features import Side, n_pair, n_side, pair_features, reverse, side_features  # noqa: E402
 from full_geometry.first_event import first_event  # noqa: E402
 from full_geometry.half_space import HalfSpace, HalfSpaceTransport  # noqa: E402
 from full_geometry.identity import frame_of  # noqa: E402
@@ -101,17 +101,26 @@ def test_features_of_the_way_back_are_those_of_exit_and_entry_exchanged() -> Non
         columns = [*side_features(frame, exit), *side_features(frame, entry), *pair_features(frame, exit, entry)]
         return np.stack([np.array(column) for column in columns])
 
-    order, signs = reverse(n_side(3))
+    order, signs = reverse(n_side(3), 3)
     assert np.allclose(features(a, b)[order] * signs[:, None], features(b, a), atol=1e-5)
+
+
+def test_a_pair_is_told_how_far_apart_both_first_events_of_each_channel_are() -> None:
+    subject = Subject.of(mi.load_dict(bunny()), WAX)
+    frame, rng = frame_of(subject), generator(mi, 256, pass_seed(9))
+    a, b = (Side(at, first_event(subject, at)) for at in (subject.random_points(rng), subject.random_points(rng)))
+    for m, told, y_o, y_i in zip(subject.media, pair_features(frame, a, b)[-3:], a.event.ys, b.event.ys):
+        gap = np.linalg.norm(np.array(y_o) - np.array(y_i), axis=0)
+        assert np.allclose(np.exp(2 * np.array(told)), gap * float(m.sigma_t) + 1e-2, rtol=1e-3)
 
 
 def test_a_network_reads_pairs_backwards_as_it_reads_pairs_that_are_turned_round() -> None:
     n = n_side(3)
-    net = Correction(2 * n + N_PAIR, 3, width=16, depth=2)
+    net = Correction(2 * n + n_pair(3), 3, width=16, depth=2)
     with torch.no_grad():
         net.layers.matrices[-1].normal_()
-    x = torch.from_numpy(np.random.default_rng(2).standard_normal((2 * n + N_PAIR, 64)).astype(np.float32))
-    order, signs = reverse(n)
+    x = torch.from_numpy(np.random.default_rng(2).standard_normal((2 * n + n_pair(3), 64)).astype(np.float32))
+    order, signs = reverse(n, 3)
     turned = x[order] * torch.from_numpy(signs)[:, None]
     assert torch.allclose(net(x, back=True), net(turned), atol=1e-5)
     assert not torch.allclose(net(x), net(turned), atol=1e-2)
@@ -193,7 +202,7 @@ def test_weights_of_other_inputs_are_refused(trained: Trained, tmp_path: Path) -
     arrays, record = load_weights(trained.path, storing.KIND)
     path = tmp_path / trained.path.name
     save_weights(path, storing.KIND, {**arrays, "W_0": arrays["W_0"][:, :-6]}, record)
-    with pytest.raises(ValueError, match="W_0 must have 163 inputs, got 157"):
+    with pytest.raises(ValueError, match="W_0 must have 166 inputs, got 160"):
         storing.load(path, trained.model.subject)
 
 
