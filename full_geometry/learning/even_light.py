@@ -12,7 +12,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from full_geometry.learning.model_errors import Estimate, ModelError, Reference, compare, traced
+from full_geometry.learning.model_errors import ModelError, compare
+from full_geometry.learning.radiance import Estimate, Reference, traced
 from full_geometry.model import FullGeometry
 
 __all__ = ["trusted"]

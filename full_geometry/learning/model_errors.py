@@ -1,57 +1,35 @@
 """How wrong a model of one object is: radiance of random exits against walks, with the noise of both taken out.
 
-Exits are uniform over the area with w_o by the cosine. Light is 1 from everywhere, or one of four lobes
-max(0, w . l)^16; nothing blocks it. With the estimates a of the model and b of the walks and their variances,
+With the estimates a of the model and b of the walks of `radiance` and their variances,
 
     error² = mean_k[(a_k - b_k)² - var a_k - var b_k] / (mean_k b_k)²,
 
-for lobes the mean of the four; its standard error by the jackknife over exits.
+for lobes the mean of the four; its standard error by the jackknife over exits. Under an even sky images take what a
+model knows of even light, where that is trusted, and no S: the error of that is the third kind.
 """
 
 from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from full_geometry.half_space import HalfSpace
-from full_geometry.learning.exits import trace_exits
 from full_geometry.learning.pairs import Proposals
-from full_geometry.patch_table import ExitTable
-from full_geometry.subject import Subject, SurfacePoint
+from full_geometry.learning.radiance import Estimate, Reference, Transport, modelled, reference
+from full_geometry.subject import Subject
 from halfspace_sss.checks import check_count
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.progress import NamedProgress
-from halfspace_sss.tracing.walk import generator, pass_seed
 
-__all__ = [
-    "LIGHTS", "ModelError", "Reference", "Transport", "compare", "errors", "errors_of", "measure",
-    "reference", "traced",
-]  # fmt: skip
+__all__ = ["EVEN_SKY", "LIGHTS", "ModelError", "compare", "errors", "errors_of", "measure"]
 
 LIGHTS = ("constant", "lobes")
-LOBES = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / np.sqrt(3.0)
-POWER = 16
-LANES = 2**20  # of one pass
+EVEN_SKY = "even sky"  # as images show it
 FEWEST = {"multiple": 2, "total": 1}  # scattering events of what a model contains
 PROBES = "better_dipole"  # whose radial density entries follow
-
-
-class Transport(Protocol):
-    """A model of what light that enters an object is worth where it leaves.
-
-    Attributes:
-        orders: "multiple" (two or more scattering events) or "total" (one or more).
-    """
-
-    orders: str
-
-    def prepare(self, at: SurfacePoint, active: Any = True) -> Any: ...
-
-    def S(self, exit: Any, at: SurfacePoint, active: Any = True) -> Any: ...
 
 
 class ModelError(NamedTuple):
@@ -64,123 +42,16 @@ class ModelError(NamedTuple):
     ratio: float
 
 
-@dataclass(frozen=True, eq=False)
-class Estimate:
-    """Radiance of exits under all lights and its variance, (channels, exits, lights)."""
-
-    mean: np.ndarray
-    variance: np.ndarray
-
-
-@dataclass(frozen=True, eq=False)
-class Reference:
-    """Exits and what walks say of them."""
-
-    exits: SurfacePoint
-    truth: Estimate
-
-
-class _Sums:
-    """Sums of value and square over the samples of each exit."""
-
-    def __init__(self, n_exits: int) -> None:
-        self.n_exits, self.n, self.sums = n_exits, 0, 0.0
-
-    def add(self, value: Any, w: Any, per_exit: int) -> None:
-        """Samples of all exits, `per_exit` neighbouring lanes for each: value per channel of unit light from w."""
-        import drjit as dr
-        import mitsuba as mi
-
-        lights = [mi.Float(1)] + [dr.maximum(dr.dot(w, mi.Vector3f(*axis.tolist())), 0) ** POWER for axis in LOBES]
-        rows = []
-        for v in value:
-            products = [v * light for light in lights]
-            parts = [dr.block_sum(p + 0 * v, per_exit) for p in (*products, *(p * p for p in products))]
-            dr.eval(parts)
-            rows.append(np.stack([p.numpy() for p in parts], axis=-1).astype(float))
-        self.sums = self.sums + np.stack(rows)
-        self.n += per_exit
-
-    def estimate(self) -> Estimate:
-        first, second = np.split(self.sums / self.n, 2, axis=-1)
-        return Estimate(first, (second - first**2) / (self.n - 1))
-
-
-def _passes(n_exits: int, per_exit: int) -> list[int]:
-    """Samples of each exit in each pass."""
-    most = max(LANES // n_exits, 1)
-    return [min(most, per_exit - done) for done in range(0, per_exit, most)]
-
-
-def reference(subject: Subject, exits: int = 256, walks: int = 8192, seed: int = 0, fewest: int = 2) -> Reference:
-    """Exits and their radiance by walks.
-
-    Args:
-        exits, walks: number of exits, and of walks of each; seed: of both.
-        fewest: scattering events that count.
-    """
-    import drjit as dr
-    import mitsuba as mi
-
-    for name, value, least in (("exits", exits, 2), ("walks", walks, 2), ("seed", seed, 0)):
-        check_count(name, value, least)
-    points = subject.random_points(generator(mi, exits, pass_seed(seed, 17)))
-    dr.eval(points)
-    return Reference(points, traced(subject, points, walks, (seed, 18), fewest=fewest))
-
-
-def traced(subject: Subject, exits: SurfacePoint, walks: int, seed: tuple[int, ...], **orders: int) -> Estimate:
-    """Radiance of exits by so many walks of each; `orders` as for `trace_exits`."""
-    import drjit as dr
-
-    sums = _Sums(dr.width(exits.p))
-    for k, per_exit in enumerate(_passes(sums.n_exits, walks)):
-        found = trace_exits(subject, _repeated(exits, per_exit), (*seed, k), **orders)
-        sums.add(found.T, found.at.w, per_exit)
-    return sums.estimate()
-
-
-def _repeated(points: SurfacePoint, times: int) -> SurfacePoint:
-    import drjit as dr
-    import mitsuba as mi
-
-    return points.gather(dr.arange(mi.UInt32, dr.width(points.p) * times) // times)
-
-
-def modelled(transport: Transport, proposals: Proposals, exits: SurfacePoint, samples: int, seed: int = 0) -> Estimate:
-    """Radiance of exits by a model.
-
-    Args:
-        transport: the model.
-        proposals: where its entries are drawn.
-        exits: from a reference.
-        samples, seed: entries of each exit; of the entries.
-    """
-    import drjit as dr
-    import mitsuba as mi
-
-    n = dr.width(exits.p)
-    sums = _Sums(n)
-    table = ExitTable(proposals.patches, exits) if proposals.patches else None
-    for k, per_exit in enumerate(_passes(n, samples)):
-        points, lanes = _repeated(exits, per_exit), dr.arange(mi.UInt32, n * per_exit)
-        rng = generator(mi, n * per_exit, pass_seed(seed, 19, k))
-        entries, weight = proposals.sample(points, rng, table, lanes // per_exit)
-        value = transport.S(transport.prepare(points), entries, weight > 0) * weight
-        dr.eval(value, entries)
-        sums.add(value, entries.w, per_exit)
-    return sums.estimate()
-
-
 def compare(model: Estimate, truth: Estimate) -> list[ModelError]:
     """The errors of all channels under both kinds of light."""
-    found = []
-    for c in range(len(truth.mean)):
-        for light, columns in zip(LIGHTS, (slice(0, 1), slice(1, None))):
-            a, b = model.mean[c][:, columns], truth.mean[c][:, columns]
-            square = (a - b) ** 2 - model.variance[c][:, columns] - truth.variance[c][:, columns]
-            found.append(ModelError(c, light, *_jackknife(square, b), float(a.mean() / max(b.mean(), 1e-300))))
-    return found
+    kinds = tuple(zip(LIGHTS, (slice(0, 1), slice(1, None))))
+    return [_error(c, light, columns, model, truth) for c in range(len(truth.mean)) for light, columns in kinds]
+
+
+def _error(c: int, light: str, columns: slice, model: Estimate, truth: Estimate) -> ModelError:
+    a, b = model.mean[c][:, columns], truth.mean[c][:, columns]
+    square = (a - b) ** 2 - model.variance[c][:, columns] - truth.variance[c][:, columns]
+    return ModelError(c, light, *_jackknife(square, b), float(a.mean() / max(b.mean(), 1e-300)))
 
 
 def _jackknife(square: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
@@ -221,6 +92,17 @@ def measure(
     return compare(modelled(transport, proposals, truth.exits, samples, seed), truth.truth)
 
 
+def _even_sky(transport: Transport, by_S: Estimate, truth: Reference) -> list[ModelError]:
+    """The errors of images under an even sky: those of alpha where it is trusted, elsewhere of S."""
+    alpha, n = getattr(transport, "alpha", None), len(by_S.mean)
+    if alpha is None:
+        return []
+    known = np.array(alpha.evened[1]).reshape(n, 1, 1) > 0
+    mean = np.where(known, np.array(alpha(truth.exits)[1]).reshape(n, -1, 1), by_S.mean[..., :1])
+    shown = Estimate(mean, np.where(known, 0, by_S.variance[..., :1]))
+    return [_error(c, EVEN_SKY, slice(0, 1), shown, truth.truth) for c in range(n)]
+
+
 def errors_of(
     subject: Subject,
     transports: Mapping[str, Transport],
@@ -232,6 +114,8 @@ def errors_of(
     progress: NamedProgress | None = None,
 ) -> dict[str, list[ModelError]]:
     """The errors of several transports of an object, by name; the truth is traced once for all of the same orders.
+
+    Of those that have learnt what even light leaves also the error of images under an even sky.
 
     Args:
         subject: the object.
@@ -256,7 +140,9 @@ def errors_of(
             truths[model.orders] = reference(subject, exits, walks, seed, FEWEST[model.orders])
             done += 1
         tell(name, done)
-        found[name] = measure(subject, model, proposals, truth=truths[model.orders], samples=samples, seed=seed)
+        truth = truths[model.orders]
+        by_S = modelled(model, proposals, truth.exits, samples, seed)
+        found[name] = [*compare(by_S, truth.truth), *_even_sky(model, by_S, truth)]
         done += 1
     tell("models", total)
     return found

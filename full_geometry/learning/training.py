@@ -19,8 +19,9 @@ from full_geometry.features import n_pair, n_side
 from full_geometry.identity import frame_of, identify
 from full_geometry.learning.even_light import trusted
 from full_geometry.learning.fitting import STANDARD, Fitting, Recipe
-from full_geometry.learning.model_errors import ModelError, Reference, measure, reference
+from full_geometry.learning.model_errors import ModelError, measure
 from full_geometry.learning.pairs import Pairs, PairSource, Proposals
+from full_geometry.learning.radiance import Reference, reference
 from full_geometry.learning.seen import Seen
 from full_geometry.model import FullGeometry
 from full_geometry.patches import Patches, PatchSampler, cluster

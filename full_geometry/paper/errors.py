@@ -13,7 +13,8 @@ import numpy as np
 
 from full_geometry.features import Frame
 from full_geometry.identity import frame_of
-from full_geometry.learning.model_errors import Estimate, ModelError, Reference, compare
+from full_geometry.learning.model_errors import ModelError, compare
+from full_geometry.learning.radiance import Estimate, Reference
 from full_geometry.paper.lights import measured_lights
 from full_geometry.paper.network import PaperNetwork, Samples, placed, walk_samples
 from full_geometry.subject import Subject, SurfacePoint

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from full_geometry.identity import Identity, identify
-from full_geometry.learning.model_errors import ModelError, reference
+from full_geometry.learning.model_errors import ModelError
+from full_geometry.learning.radiance import reference
 from full_geometry.paper.errors import paper_errors
 from full_geometry.paper.network import PaperNetwork, PaperRecipe, fit_paper
 from full_geometry.subject import Subject

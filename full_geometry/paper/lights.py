@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from full_geometry.learning.model_errors import LOBES, POWER
+from full_geometry.learning.radiance import LOBES, POWER
 
 __all__ = ["Light", "measured_lights", "random_lights"]
 

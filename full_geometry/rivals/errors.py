@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from full_geometry.alpha_p.training import fit_alpha_p
 from full_geometry.flow.training import FlowRecipe
 from full_geometry.half_space import HalfSpace, HalfSpaceTransport
-from full_geometry.learning import model_errors
+from full_geometry.learning import model_errors, radiance
 from full_geometry.learning.pairs import Proposals
 from full_geometry.learning.training import train_by_cpu
 from full_geometry.paper.errors import POINTS, paper_errors
@@ -45,7 +45,7 @@ def error_table(
     import pandas
 
     subject, rows = Subject.given(scene, None, None, name), []
-    truth = model_errors.reference(subject, exits, walks, seed)
+    truth = radiance.reference(subject, exits, walks, seed)
 
     def tell(what: str, done: int) -> None:
         if progress:

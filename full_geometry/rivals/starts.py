@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 from full_geometry.half_space import HalfSpace
 from full_geometry.learning.fitting import STANDARD
-from full_geometry.learning.model_errors import measure, reference
+from full_geometry.learning.model_errors import measure
 from full_geometry.learning.pairs import Proposals
+from full_geometry.learning.radiance import reference
 from full_geometry.learning.training import train, train_by_cpu
 from full_geometry.storing import KIND, Learnt
 from full_geometry.subject import Subject

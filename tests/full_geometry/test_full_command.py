@@ -71,7 +71,8 @@ def test_an_object_is_trained_measured_and_rendered(monkeypatch: Any) -> None:
     assert result.exit_code == 0, result.output
     table = pandas.read_csv("errors/errors.csv")
     assert list(table.columns) == ["object", "channel", "model", "light", "error", "standard_error", "ratio"]
-    assert len(table) == 18 and len(traced) == 1  # three models, one truth
+    assert len(table) == 21 and len(traced) == 1  # three models, one truth; images of an even sky of one
+    assert set(table[table.light == "even sky"].model) == {"full_geometry"}
     mean = table.groupby("model")["error"].mean()
     assert mean["full_geometry"] < 0.5 * mean["better_dipole"]
     result = _invoke("render", "ball.xml", "--model", "full_geometry", "--spp", "4")

@@ -198,7 +198,7 @@ def test_a_mesh_with_a_hole_is_warned_of_in_a_sentence() -> None:
 
 
 def test_vertex_normals_against_their_faces_give_the_same_exits() -> None:
-    from full_geometry.learning.model_errors import reference
+    from full_geometry.learning.radiance import reference
 
     upright, turned = (mi.load_dict({"type": "ply", "filename": str(BUNNY)}) for _ in range(2))
     parameters = mi.traverse(turned)

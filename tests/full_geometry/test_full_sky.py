@@ -19,7 +19,8 @@ from full_geometry.learning import training  # noqa: E402
 from full_geometry.learning.even_light import trusted  # noqa: E402
 from full_geometry.learning.exits import trace_exits  # noqa: E402
 from full_geometry.learning.fitting import ALPHA_HIDDEN, Recipe  # noqa: E402
-from full_geometry.learning.model_errors import LIGHTS, reference  # noqa: E402
+from full_geometry.learning.model_errors import EVEN_SKY, LIGHTS, errors_of  # noqa: E402
+from full_geometry.learning.radiance import reference  # noqa: E402
 from full_geometry.learning.training import Trained, train  # noqa: E402
 from full_geometry.scene import LearntTransport  # noqa: E402
 from full_geometry.subject import Subject  # noqa: E402
@@ -115,6 +116,23 @@ def test_only_what_is_wrong_in_a_channel_is_left_to_other_estimates(trained: Tra
 
     assert judged(0, 2).tolist() == [[1, 1, 0], [1, 1, 1]]
     assert judged(1, 0).tolist() == [[1, 1, 1], [0, 1, 1]]
+
+
+def test_errors_of_images_of_an_even_sky_are_those_of_alpha_where_it_is_trusted_and_of_S_elsewhere(
+    trained: Trained,
+) -> None:
+    model = trained.model
+
+    def rows(known: list[float]) -> dict[str, list[tuple]]:
+        alpha = replace(model.alpha, trusted=np.array([[1.0, 1.0, 1.0], known]))
+        found = errors_of(model.subject, {"it": replace(model, alpha=alpha)}, exits=64, walks=1024, samples=512)["it"]
+        return {kind: [row[2:] for row in found if row.light == kind] for kind in (EVEN_SKY, *LIGHTS)}
+
+    by_alpha, by_S = rows([1.0, 0.0, 1.0]), rows([0.0, 0.0, 0.0])
+    assert by_S[EVEN_SKY] == by_S["constant"] == by_alpha["constant"]
+    changed = [a != b for a, b in zip(by_alpha[EVEN_SKY], by_S[EVEN_SKY])]
+    assert changed == [True, False, True]
+    assert all(abs(by_alpha[EVEN_SKY][c][0] - by_S[EVEN_SKY][c][0]) < 0.1 for c in (0, 2))
 
 
 def test_an_even_sky_has_the_same_light_and_a_fifth_of_the_variance(

@@ -16,8 +16,9 @@ from full_geometry import storing  # noqa: E402
 from full_geometry.half_space import HalfSpace  # noqa: E402
 from full_geometry.learning import training  # noqa: E402
 from full_geometry.learning.fitting import Recipe  # noqa: E402
-from full_geometry.learning.model_errors import LIGHTS, measure, reference  # noqa: E402
+from full_geometry.learning.model_errors import LIGHTS, measure  # noqa: E402
 from full_geometry.learning.pairs import Proposals  # noqa: E402
+from full_geometry.learning.radiance import reference  # noqa: E402
 from full_geometry.learning.training import Trained, train  # noqa: E402
 from full_geometry.neural_shape import storing as shapes  # noqa: E402
 from full_geometry.rivals import starts  # noqa: E402

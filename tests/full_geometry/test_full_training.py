@@ -25,8 +25,9 @@ from full_geometry.identity import frame_of  # noqa: E402
 from full_geometry.learning import training  # noqa: E402
 from full_geometry.learning.fitting import Recipe  # noqa: E402
 from full_geometry.learning.learner import Correction  # noqa: E402
-from full_geometry.learning.model_errors import LIGHTS, Estimate, compare, measure, reference  # noqa: E402
+from full_geometry.learning.model_errors import LIGHTS, compare, measure  # noqa: E402
 from full_geometry.learning.pairs import Proposals  # noqa: E402
+from full_geometry.learning.radiance import Estimate, reference  # noqa: E402
 from full_geometry.learning.training import Trained, train  # noqa: E402
 from full_geometry.model import FullGeometry  # noqa: E402
 from full_geometry.subject import Subject, SurfacePoint  # noqa: E402

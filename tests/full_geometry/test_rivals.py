@@ -32,7 +32,7 @@ from full_geometry.flow.lights import LIGHTINGS, lighting  # noqa: E402
 from full_geometry.flow.sampler import FlowSampler  # noqa: E402
 from full_geometry.flow.training import FlowRecipe  # noqa: E402
 from full_geometry.identity import frame_of  # noqa: E402
-from full_geometry.learning.model_errors import reference  # noqa: E402
+from full_geometry.learning.radiance import reference  # noqa: E402
 from full_geometry.paper import learner  # noqa: E402
 from full_geometry.paper import network as paper  # noqa: E402
 from full_geometry.paper.errors import paper_errors  # noqa: E402
