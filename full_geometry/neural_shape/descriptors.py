@@ -43,7 +43,6 @@ __all__ = [
     "N_SHARED",
     "End",
     "Pair",
-    "chord_of",
     "describe",
     "end",
     "medium",
@@ -55,7 +54,6 @@ N_OWN, N_SHARED, N_MEDIUM = 10 + N_LOOK, 14, 16
 LEAST_P, LEAST_LENGTH = 1e-3, 1e-2
 MOST_G = 0.85  # of a phase function of g²
 MOST_RATIO = 4.0  # of phase functions: what is not bounded runs away outside of what was seen
-LOG_CHORD, PLACE_OF_CHORD = 0.3, 11  # of the numbers of a medium
 GRAZES = 0.999  # of the line between two points, from which on nothing is in between
 
 
@@ -89,13 +87,8 @@ def medium(subject: Subject, channel: int, mixed: Mixed) -> np.ndarray:
     albedo, g, eta = (np.float64(v) for v in (m.albedo, m.g, m.eta))
     size = float(m.sigma_t_prime) * math.sqrt(subject.found.area)
     found = medium_features(np, albedo, g, eta, length_scale(albedo, g))
-    sizes = [1 / (1 + 0.1 * size), 0.2 * math.log1p(size), LOG_CHORD * math.log(mixed.chord + LEAST_LENGTH)]
+    sizes = [1 / (1 + 0.1 * size), 0.2 * math.log1p(size), 0.3 * math.log(mixed.chord + 1e-2)]
     return np.array([*found, *sizes, mixed.q, mixed.q_reduced, mixed.q_direct, mixed.k], dtype=np.float32)
-
-
-def chord_of(numbers: np.ndarray) -> float:
-    """The mean chord in transport mean free paths, from the numbers of a medium."""
-    return max(math.exp(float(numbers[PLACE_OF_CHORD]) / LOG_CHORD) - LEAST_LENGTH, 0.0)
 
 
 def describe(

@@ -4,9 +4,9 @@ The likelihood of pairs cares little for what leaves in sum: where things are th
 between entries, and the sum over them is off by some percent. So for a group of exits, B the mean throughput of its
 walks, Z and Z' the means of (S_0 mu_i / q) exp f of two halves of its proposals, whose product has no bias,
 
-    alpha w (Z/B - 1)(Z'/B - 1)/2,    alpha = 2 + 14 c/(c + 60),    w = 1/(1 + v/0.03),
+    w (Z/B - 1)(Z'/B - 1)/2,    w = 4/(1 + v/0.03),
 
-stands beside the likelihood: c the mean chord in transport mean free paths, v the noise of Z/B, squared.
+stands beside the likelihood, v the squared noise of Z/B.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from full_geometry.neural_shape.descriptors import chord_of
 from full_geometry.neural_shape.learning.source import PairData
 from full_geometry.neural_shape.surroundings import N_LENGTHS
 
@@ -27,7 +26,7 @@ HALVINGS = 4
 GROUPS = 2**HALVINGS
 SEEN = [0, 1, 5, 6, 7, *range(10, 10 + 2 * N_LENGTHS)]  # columns of an exit that do not depend on the entry
 AXIS_FROM = 512  # exits
-EMPHASIS, MORE_EMPHASIS, THICK = 2.0, 14.0, 60.0  # of thin, added for thick; mean chord, transport mean free paths
+EMPHASIS = 4.0  # 16 is better for what is thick and worse for what is not
 NOISE, PAIRS = 0.03, 64  # squared, of the mean of so many proposals
 LEAST_LIGHT, FEWEST_PROPOSALS, FEWEST_WALKS = 1e-3, 128, 32
 
@@ -42,7 +41,7 @@ class Part(NamedTuple):
         medium: its numbers.
         share: of the mean of W in the mean over the whole object.
         light: B of the group.
-        weight: alpha w.
+        weight: w.
     """
 
     walks: np.ndarray
@@ -64,7 +63,7 @@ class Grouped:
         proposals, walks: where groups begin and end among them, (GROUPS + 1,).
         share: of the exits that a group has, (GROUPS,).
         light: B over the mean of all walks, (GROUPS,).
-        weight: alpha w, (GROUPS,); 0 where too little is known.
+        weight: w, (GROUPS,); 0 where too little is known.
     """
 
     data: PairData
@@ -102,9 +101,7 @@ def grouped(data: PairData) -> Grouped:
     light = T[0] * counts[1] * data.share / len(data.T) / np.maximum(share, 1e-9)
     known = (light > LEAST_LIGHT) & (counts[0] >= FEWEST_PROPOSALS) & (counts[1] >= FEWEST_WALKS)
     noise = W[1] / PAIRS + (1 + T[1]) / np.maximum(counts[1], 1)
-    chord = chord_of(data.medium)
-    emphasis = EMPHASIS + MORE_EMPHASIS * chord / (chord + THICK)
-    weight = np.where(known, emphasis / (1 + noise / NOISE), 0.0)
+    weight = np.where(known, EMPHASIS / (1 + noise / NOISE), 0.0)
     return Grouped(data, *bounds, share, np.where(known, light, 1.0), weight)
 
 
