@@ -26,7 +26,7 @@ PLACE_OF_G = 2  # among the numbers of a medium
 
 @dataclass(frozen=True, eq=False)
 class NeuralShape:
-    """S = S_0 P_o P_i exp f, f = b tanh(h . tanh(u) / b), b = 1.5 to 3 above 0, see `most`, and 6 below.
+    """S = s S_0 P_o P_i exp f, f = b tanh(h . tanh(u) / b), b = 1.5 to 3 above 0, see `most`, and 6 below.
 
     u = (c_o + c_i, c_oi) is what is 0 on a plane, h a perceptron whose first layer is asked for both ends in turn and
     summed, so that S is reciprocal as far as S_0 is; on a plane f = 0. Orders two and more;
@@ -37,17 +37,19 @@ class NeuralShape:
         half_space: S_0 P_o P_i.
         weights: W_k (outputs, inputs) and b_k of the layers.
         media: numbers of each channel.
+        scales: s of each channel, see `balance`; 1 if there are none.
     """
 
     subject: Subject
     half_space: Backbone
     weights: Mapping[str, np.ndarray]
     media: Sequence[np.ndarray]
+    scales: Sequence[float] = ()
     orders = "multiple"
 
     @classmethod
     def of(cls, subject: Subject, weights: Mapping[str, np.ndarray]) -> NeuralShape:
-        """The model of an object from the arrays of a file."""
+        """The model of an object from the arrays of a file, not held to walks."""
         mixtures = mixed(subject)
         numbers = [medium(subject, c, mixture) for c, mixture in enumerate(mixtures)]
         return cls(subject, Backbone(subject, mixtures), weights, numbers)
@@ -60,6 +62,12 @@ class NeuralShape:
     @functools.cached_property
     def _media(self) -> list[list[Any]]:
         return [[number(v) for v in numbers] for numbers in self.media]
+
+    @functools.cached_property
+    def _scale(self) -> Any:
+        import mitsuba as mi
+
+        return mi.Spectrum([number(s) for s in self.scales or [1.0] * len(self.media)])
 
     @property
     def models(self) -> list[BSSRDF]:
@@ -92,7 +100,7 @@ class NeuralShape:
         S_0 = self.half_space(exit, entry)
         pairs = describe(self.subject, exit, entry, self.half_space.shares(S_0, exit, entry), active)
         f = mi.Spectrum([self._f(pair, numbers) for pair, numbers in zip(pairs, self._media)])
-        return dr.select(active, S_0 * dr.exp(f), 0)
+        return dr.select(active, S_0 * dr.exp(f) * self._scale, 0)
 
     def _f(self, pair: Pair, numbers: list[Any]) -> Any:
         import drjit as dr

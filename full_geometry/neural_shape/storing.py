@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from full_geometry.neural_shape.backbone import MODEL
+from full_geometry.neural_shape.balance import held
 from full_geometry.neural_shape.descriptors import CURVED_OWN, CURVED_SHARED, N_MEDIUM, N_OWN, N_SHARED
 from full_geometry.neural_shape.model import NeuralShape
 from full_geometry.subject import Subject
@@ -56,7 +57,7 @@ def checksums(subject: Subject, path: str | os.PathLike | None = None) -> tuple[
 
 
 def transport(subject: Subject, path: str | os.PathLike | None = None) -> NeuralShape:
-    """The model of an object, by the shipped weights or others.
+    """The model of an object, by the shipped weights or others, held to the light that leaves by walks.
 
     Raises:
         ValueError: the file cannot be used, or the medium varies or is out of the range of `neural`.
@@ -64,4 +65,4 @@ def transport(subject: Subject, path: str | os.PathLike | None = None) -> Neural
     if subject.varying is not None:
         name = subject.found.shape.id()
         raise ValueError(f"the medium of {name!r} must be the same everywhere for {KIND}, got one that varies")
-    return NeuralShape.of(subject, load(Path(path) if path is not None else shipped_weights()))
+    return held(NeuralShape.of(subject, load(Path(path) if path is not None else shipped_weights())))

@@ -16,7 +16,8 @@ torch = pytest.importorskip("torch")
 from full_geometry.neural_shape.learning import training  # noqa: E402
 from full_geometry.neural_shape.learning.drawing import draw_medium, draw_subject, mean_events  # noqa: E402
 from full_geometry.neural_shape.learning.fitting import Fitting, Recipe  # noqa: E402
-from full_geometry.neural_shape.learning.source import make_data  # noqa: E402
+from full_geometry.neural_shape.learning.groups import GROUPS, Grouped, grouped  # noqa: E402
+from full_geometry.neural_shape.learning.source import PairData, make_data  # noqa: E402
 from full_geometry.neural_shape.ranges import ALBEDO, ETA, SIZE, G  # noqa: E402
 from full_geometry.neural_shape.shapes.generators import HELD_OUT, TRAINING, make_shape  # noqa: E402
 from full_geometry.neural_shape.storing import WEIGHTS, load, shipped_weights  # noqa: E402
@@ -80,9 +81,60 @@ def test_a_run_that_was_killed_ends_with_the_same_weights(tmp_path: Path, monkey
         training.train_shapes(tmp_path / "b", work=tmp_path / "work", **{**how, "seed": 3})
 
 
-def test_a_step_lowers_the_likelihood_that_is_left() -> None:
-    subjects = [draw_subject((1, k)).subject for k in range(2)]
-    pool = [d for k, s in enumerate(subjects) if (d := make_data(s, mean_events(s), (1, k))) is not None]
+def data_of(k: int) -> PairData:
+    """Of object k of seed 1."""
+    subject = draw_subject((1, k)).subject
+    return make_data(subject, mean_events(subject), (1, k))
+
+
+def test_groups_hold_every_pair_once_and_their_light_sums_up_to_that_of_the_object() -> None:
+    data = data_of(0)
+    groups = grouped(data)
+    for found, wanted in ((groups.data.W, data.W), (groups.data.T, data.T)):
+        assert np.array_equal(np.sort(found), np.sort(wanted))
+    assert groups.proposals[-1] == len(data.W) and groups.walks[-1] == len(data.T)
+    known = groups.weight > 0
+    assert known.sum() >= GROUPS / 2 and np.isclose(groups.share.sum(), 1)
+    light = (groups.share * groups.light)[known].sum()
+    walks = [data.share * groups.data.T[a:b].sum() / len(data.T) for a, b in zip(groups.walks, groups.walks[1:])]
+    assert np.isclose(light, np.array(walks)[known].sum(), rtol=1e-5)
+
+
+def test_exits_of_a_group_are_more_alike_than_those_of_the_object() -> None:
+    groups = grouped(data_of(0))
+    depth = groups.data.proposals[:, 5].astype(float)
+    within = [depth[a:b].var() for a, b in zip(groups.proposals, groups.proposals[1:])]
+    assert np.mean(within) < 0.7 * depth.var()
+
+
+def test_parts_of_groups_are_samples_of_the_means_over_the_object() -> None:
+    data, rng = data_of(0), np.random.default_rng(5)
+    groups = grouped(data)
+    parts = [groups.part(64, rng) for _ in range(4000)]
+    for found, wanted in (
+        (np.array([p.share * p.W.mean() for p in parts]), data.W.mean()),
+        (np.array([p.T.sum() for p in parts]), data.T.mean() * data.share),
+    ):
+        assert abs(found.mean() - wanted) < 4 * found.std() / np.sqrt(len(found))  # z-test, 6e-5
+
+
+def test_a_fit_follows_the_light_of_groups() -> None:
+    def brightness(weight: float) -> float:
+        own = grouped(data_of(0))
+        pool = [Grouped(own.data, own.proposals, own.walks, own.share, 1.5 * own.light, weight * (own.weight > 0))]
+        fitting, rng = Fitting(QUICK, 0), np.random.default_rng(0)
+        for k in range(150):
+            fitting.advance(pool, rng, k / 150)
+        with torch.no_grad():
+            x = torch.from_numpy(own.data.proposals).float()
+            f = fitting.average(x, torch.from_numpy(own.data.medium).expand(len(x), -1)).numpy()
+        return float((own.data.W * np.exp(f)).mean())
+
+    assert brightness(50.0) > 1.15 * brightness(0.0)
+
+
+def test_a_step_lowers_the_loss() -> None:
+    pool = [grouped(data_of(k)) for k in range(2)]
     fitting, rng = Fitting(QUICK, 0), np.random.default_rng(0)
     losses = [fitting.advance(pool, rng, k / 150) for k in range(150)]
     assert np.mean(losses[-20:]) < np.mean(losses[:20]) - 0.02

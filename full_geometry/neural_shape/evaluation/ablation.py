@@ -13,6 +13,7 @@ import torch
 from full_geometry.neural_shape.descriptors import N_OWN
 from full_geometry.neural_shape.learning.drawing import draw_subject, mean_events
 from full_geometry.neural_shape.learning.fitting import STANDARD, Fitting
+from full_geometry.neural_shape.learning.groups import grouped
 from full_geometry.neural_shape.learning.source import PairData, make_data
 from full_geometry.neural_shape.shapes.generators import HELD_OUT
 from full_geometry.neural_shape.surroundings import N_LENGTHS
@@ -96,9 +97,10 @@ def _without(data: PairData, missing: Sequence[str]) -> PairData:
 
 def _fit(pool: list[PairData], held: list[PairData], seconds: float) -> tuple[int, np.ndarray, np.ndarray]:
     """Steps, and on every held-out object the likelihood and the ratio of the mean radiances."""
+    groups = [grouped(data) for data in pool]
     fitting, rng, at = Fitting(STANDARD, 0), np.random.default_rng(0), time.process_time()
     while (part := (time.process_time() - at) / seconds) < 1:
-        fitting.advance(pool, rng, part)
+        fitting.advance(groups, rng, part)
     losses, ratios = [], []
     with torch.no_grad():
         for data in held:

@@ -1,4 +1,7 @@
-"""Fitting the network of all shapes by the likelihood of exits: Adam by a cosine, a running average, checkpoints."""
+"""Fitting the network of all shapes by the likelihood of exits and the light of groups of them.
+
+Adam by a cosine, a running average, checkpoints.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,7 @@ import torch
 from torch import nn
 
 from full_geometry.neural_shape.descriptors import CURVED_OWN, CURVED_SHARED, N_MEDIUM, N_OWN, N_SHARED
-from full_geometry.neural_shape.learning.source import PairData
+from full_geometry.neural_shape.learning.groups import Grouped
 from full_geometry.neural_shape.model import LEAST, PLACE_OF_G, most
 from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.neural.training import checkpoint
@@ -20,6 +23,7 @@ from halfspace_sss.neural.training import checkpoint
 __all__ = ["STANDARD", "Fitting", "Network", "Recipe"]
 
 BETAS, CLIP, LAST_RATE, WARM_UP, AVERAGE = (0.9, 0.99), 1.0, 0.01, 100, 0.9985
+MOST_OFF = 3.0  # of the light of a group: what is far too bright has its say by the likelihood
 
 
 @dataclass(frozen=True)
@@ -29,7 +33,7 @@ class Recipe:
     Args:
         width, depth: hidden layers.
         objects: of a batch.
-        pairs: walks, and proposals, of each.
+        pairs: walks, and proposals, of each; at least two.
         rate: largest learning rate.
     """
 
@@ -40,8 +44,8 @@ class Recipe:
     rate: float = 4e-3
 
     def __post_init__(self) -> None:
-        for name in ("width", "depth", "objects", "pairs"):
-            check_count(name, getattr(self, name), 1)
+        for name, least in (("width", 1), ("depth", 1), ("objects", 1), ("pairs", 2)):
+            check_count(name, getattr(self, name), least)
         check_interval("rate", self.rate, 1e-8, 1.0)
 
 
@@ -88,6 +92,14 @@ class Network(nn.Module):
         return found | {f"b_{k}": b.detach().numpy().copy() for k, b in enumerate(self.biases)}
 
 
+def _halves(values: torch.Tensor, counts: list[int]) -> torch.Tensor:
+    """Means of every second one of so many values, and of the others, (len(counts), 2)."""
+    place = np.concatenate([2 * k + np.arange(n) % 2 for k, n in enumerate(counts)])
+    size = np.maximum(np.bincount(place, minlength=2 * len(counts)), 1)
+    sums = torch.zeros(len(size)).index_add(0, torch.from_numpy(place), values)
+    return (sums / torch.from_numpy(size).float()).view(-1, 2)
+
+
 class Fitting:
     """The state of a fit, which follows from recipe, seed, number of steps and data.
 
@@ -105,7 +117,7 @@ class Fitting:
         self.adam = torch.optim.Adam(self.parameters, lr=recipe.rate, betas=BETAS, foreach=True)
         self.step = 0
 
-    def advance(self, pool: list[PairData], rng: np.random.Generator, part: float) -> float:
+    def advance(self, pool: list[Grouped], rng: np.random.Generator, part: float) -> float:
         """One step on random parts of random objects; returns the loss.
 
         Args:
@@ -127,23 +139,22 @@ class Fitting:
             torch._foreach_lerp_(list(self.average.parameters()), self.parameters, share)
         return float(loss.detach())
 
-    def loss(self, batch: list[PairData], rng: np.random.Generator) -> torch.Tensor:
-        """E_q[(S_0 mu_i / q) exp f] - E_walks[T f] over the mean of T, a mean over objects, of parts of their data."""
-        n = self.recipe.pairs
-        walks, proposals, T, W = [], [], [], []
-        for data in batch:
-            a, b = (int(rng.integers(0, max(len(v) - n, 0) + 1)) for v in (data.T, data.W))
-            taken = data.T[a : a + n]
-            walks.append(data.walks[a : a + n])
-            T.append(taken * (data.share / len(taken)))
-            proposals.append(data.proposals[b : b + n])
-            W.append(data.W[b : b + n] / min(n, len(data.W)))
-        counts = [len(v) for v in (*T, *W)]
-        media = np.repeat(np.stack([data.medium for data in batch] * 2), counts, axis=0)
-        x = torch.from_numpy(np.concatenate((*walks, *proposals))).float()
-        f = self.network(x, torch.from_numpy(media))
-        T, W = (torch.from_numpy(np.concatenate(v)).float() for v in (T, W))
-        return ((W * torch.exp(f[len(T) :])).sum() - (T * f[: len(T)]).sum()) / len(batch)
+    def loss(self, batch: list[Grouped], rng: np.random.Generator) -> torch.Tensor:
+        """E_q[(S_0 mu_i / q) exp f] - E_walks[T f] over the mean of T, and what `groups` adds; a mean over objects.
+
+        Of each object a part of one group of its exits is taken.
+        """
+        parts = [data.part(self.recipe.pairs, rng) for data in batch]
+        T, W = (torch.from_numpy(np.concatenate(v)).float() for v in zip(*((p.T, p.W) for p in parts)))
+        counts = [len(p.T) for p in parts] + [len(p.W) for p in parts]
+        media = np.repeat(np.stack([p.medium for p in parts] * 2), counts, axis=0)
+        x = np.concatenate([p.walks for p in parts] + [p.proposals for p in parts])
+        f = self.network(torch.from_numpy(x).float(), torch.from_numpy(media))
+        Z = _halves(W * torch.exp(f[len(T) :]), [len(p.W) for p in parts])
+        share, light, weight = torch.tensor([(p.share, p.light, p.weight) for p in parts]).float().T
+        off = torch.clamp(Z / light[:, None] - 1, max=MOST_OFF)
+        likelihood = (share * Z.mean(dim=1)).sum() - (T * f[: len(T)]).sum()
+        return (likelihood + (0.5 * weight * off[:, 0] * off[:, 1]).sum()) / len(batch)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """The averaged numbers."""

@@ -14,6 +14,7 @@ import numpy as np
 
 from full_geometry.neural_shape.learning.drawing import draw_subject, mean_events
 from full_geometry.neural_shape.learning.fitting import STANDARD, Fitting, Recipe
+from full_geometry.neural_shape.learning.groups import Grouped, grouped
 from full_geometry.neural_shape.learning.source import PairData, make_data
 from full_geometry.neural_shape.ranges import ALBEDO, ETA, SIZE, G
 from full_geometry.neural_shape.storing import KIND, WEIGHTS
@@ -91,7 +92,7 @@ class _Run:
     def __init__(self, recipe: Recipe, seed: int, meshes: list[Path], work: Path | None) -> None:
         self.recipe, self.seed, self.meshes, self.work = recipe, seed, meshes, work
         self.fitting = Fitting(recipe, seed)
-        self.pool: list[PairData] = []
+        self.pool: list[Grouped] = []
         self.seen: list[dict[str, Any]] = []
 
     def claim(self) -> None:
@@ -143,7 +144,7 @@ class _Run:
         data, record = self.object(k)
         self.seen.append(record)
         if data is not None:
-            self.pool.append(data)
+            self.pool.append(grouped(data))
 
     def _fit(self, k: int, first: int, objects: int, steps: int) -> None:
         """The steps between object k and the next one."""
@@ -164,10 +165,11 @@ class _Run:
             for k in range(1, 1 + TRIAL_OBJECTS):
                 drawn = draw_subject((self.seed, 2**31 + k), meshes=self.meshes)
                 pool += [make_data(drawn.subject, mean_events(drawn.subject), (self.seed, k))]
+            pool = [grouped(data) for data in pool if data]
             each = (time.monotonic() - at) / TRIAL_OBJECTS
             trial, rng, at = Fitting(self.recipe, 0), np.random.default_rng(0), time.monotonic()
             for _ in range(TRIAL_STEPS):
-                trial.advance([data for data in pool if data], rng, 0.0)
+                trial.advance(pool, rng, 0.0)
             step = (time.monotonic() - at) / TRIAL_STEPS
             plan = max(int(DATA_SHARE * seconds / each), 2), max(int((1 - DATA_SHARE) * seconds / step), 1)
         if place:

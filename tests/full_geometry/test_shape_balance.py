@@ -1,0 +1,100 @@
+"""S of any shape is held to the light that leaves by walks, by one number for each channel."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from halfspace_sss import Medium
+
+dr = pytest.importorskip("drjit")
+mi = pytest.importorskip("mitsuba")
+pytest.importorskip("igl")
+
+from full_geometry.learning.model_errors import errors_of  # noqa: E402
+from full_geometry.neural_shape.balance import held, weight  # noqa: E402
+from full_geometry.neural_shape.mixing import Mixed, mixed  # noqa: E402
+from full_geometry.neural_shape.model import NeuralShape  # noqa: E402
+from full_geometry.neural_shape.storing import load, shipped_weights, transport  # noqa: E402
+from full_geometry.subject import Subject  # noqa: E402
+from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
+
+WAX = Medium(0.95, 0.05, 0.0, 1.3)
+
+
+@pytest.fixture(autouse=True)
+def variant() -> None:
+    mi.set_variant("llvm_ad_mono")
+
+
+def ball(radius: float, medium: Medium = WAX) -> Subject:
+    return Subject.of(mi.load_dict({"type": "sphere", "radius": radius}), medium)
+
+
+def free(subject: Subject) -> NeuralShape:
+    """By the shipped weights, not held."""
+    return NeuralShape.of(subject, load(shipped_weights()))
+
+
+def halved(subject: Subject) -> NeuralShape:
+    """S of half its size, so that there is something to hold."""
+    model = free(subject)
+    return NeuralShape(model.subject, model.half_space, model.weights, model.media, [0.5] * len(model.media))
+
+
+@pytest.mark.parametrize("radius", [1.0, 3.0])
+def test_as_much_light_leaves_a_sphere_as_by_walks(radius: float) -> None:
+    # the noise of the ratio is below 1 %; the tolerance is three times that
+    found = errors_of(ball(radius), {"held": transport(ball(radius))}, exits=64, walks=4096, samples=2048)
+    assert abs(found["held"][0].ratio - 1) < 0.03
+
+
+def test_what_is_too_dark_is_made_as_bright_as_what_is_not() -> None:
+    subject = ball(3.0)
+    one, other = (held(model(subject)).scales[0] for model in (free, halved))
+    assert np.isclose(one, other, rtol=0.01) and not np.isclose(other, 0.5, rtol=0.5)
+
+
+def test_it_is_the_same_number_for_every_pair_so_that_light_may_take_the_way_back() -> None:
+    subject = ball(3.0)
+    model, bare = transport(subject), free(subject)
+    rng = generator(mi, 512, pass_seed(7))
+    o, i = subject.random_points(rng), subject.random_points(rng)
+    there, back, unheld = (np.array(m.S(m.prepare(a), b)) for m, a, b in ((model, o, i), (model, i, o), (bare, o, i)))
+    assert np.allclose(there, model.scales[0] * unheld, rtol=1e-5)
+    assert np.allclose(there, back, rtol=5e-3, atol=1e-6 * there.max())
+
+
+def test_each_channel_is_held_to_its_own_light() -> None:
+    mi.set_variant("llvm_ad_rgb")
+    medium = Medium(np.array([0.99, 0.5, 0.1]), np.array([0.01, 0.5, 0.9]), np.zeros(3), 1.3)
+    subject = ball(2.0, medium)
+    found = errors_of(subject, {"held": transport(subject)}, exits=64, walks=16384, samples=4096)
+    ratios = [row.ratio for row in found["held"] if row.light == "constant"]
+    assert len(ratios) == 3 and np.abs(np.array(ratios) - 1).max() < 0.04  # four times the noise of the darkest
+
+
+def test_the_same_object_is_held_by_the_same_numbers() -> None:
+    one, other = (transport(ball(3.0)).scales for _ in range(2))
+    assert one == other
+
+
+def test_what_is_as_good_as_flat_is_left_as_it_is() -> None:
+    assert weight(mixed(ball(800.0))[0]) == 0 and transport(ball(800.0)).scales == ()
+    chords = [weight(Mixed(0.0, 1.0, chord, 0.0, 0.0, 0.0, 1.0)) for chord in (0.0, 500.0, 1000.0, 1e6)]
+    assert chords == [1.0, 0.5, 0.0, 0.0]
+
+
+@pytest.mark.parametrize("medium", [Medium(0.0, 1.0, 0.0, 1.3), Medium(1e-6, 1.0, 0.0, 1.3)])
+def test_where_nothing_or_next_to_nothing_leaves_it_stays_finite(medium: Medium) -> None:
+    subject = ball(3.0, medium)
+    model = transport(subject)
+    rng = generator(mi, 512, pass_seed(7))
+    value = np.array(model.S(model.prepare(subject.random_points(rng)), subject.random_points(rng)))
+    assert np.isfinite(value).all() and (value >= 0).all() and all(0.25 <= s <= 4 for s in model.scales)
+
+
+def test_what_is_open_is_left_as_it_is() -> None:
+    with pytest.warns(UserWarning):
+        subject = Subject.of(mi.load_dict({"type": "rectangle"}), WAX)
+    assert transport(subject).scales == ()
