@@ -27,7 +27,7 @@ __all__ = ["held", "weight"]
 
 SEED = 37
 FLAT = 1000.0  # mean chord in transport mean free paths
-FEWEST, MOST_WALKS, MOST_PAIRS = 2**15, 2**18, 2**16
+WALKS, PAIRS = (2**15, 2**18), (2**17, 2**18)  # fewest, most: few pairs miss what is rare and bright
 ENOUGH = 5e-3  # relative standard error
 MOST_SCALE = 4.0
 
@@ -42,8 +42,8 @@ def held(model: NeuralShape) -> NeuralShape:
     if not weights.any():
         return model
     proposals = Proposals(model.subject, model.half_space)
-    B = _mean(lambda n, k: _walks(model.subject, n, k), MOST_WALKS)
-    S = _mean(lambda n, k: _pairs(model, proposals, n, k), MOST_PAIRS)
+    B = _mean(lambda n, k: _walks(model.subject, n, k), *WALKS)
+    S = _mean(lambda n, k: _pairs(model, proposals, n, k), *PAIRS)
     known = (B > 0) & (S > 0)
     ratio = np.clip(np.where(known, B, 1) / np.where(known, S, 1), 1 / MOST_SCALE, MOST_SCALE)
     return replace(model, scales=tuple((np.array(model.scales or 1.0) * ratio**weights).tolist()))
@@ -54,9 +54,9 @@ def weight(mixture: Mixed) -> float:
     return max(1 - mixture.chord / FLAT, 0.0) if mixture.m_2 > 0 else 0.0
 
 
-def _mean(sample: Callable[[int, int], np.ndarray], most: int) -> np.ndarray:
+def _mean(sample: Callable[[int, int], np.ndarray], fewest: int, most: int) -> np.ndarray:
     """Mean of each channel of samples (channels, n), n doubled until it is known well enough."""
-    found, k = sample(FEWEST, 0), 0
+    found, k = sample(fewest, 0), 0
     while found.shape[1] < most and (_relative_error(found) > ENOUGH).any():
         k += 1
         found = np.concatenate([found, sample(found.shape[1], k)], axis=1)
