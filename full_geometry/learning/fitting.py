@@ -117,12 +117,17 @@ class Fitting:
         self.step, self.scale, self.even_scale = 0, ones[:channels].clone(), ones
 
     def set_scale(self, walks: Pairs) -> None:
-        """Divide each channel by its mean throughput, so that all count alike; alpha begins with the mean."""
+        """Divide each channel by its mean throughput, so that all count alike; alpha begins with the mean.
+
+        Order one counts as a part of all light: where it hardly leaves, its few large values would drown the rest.
+        """
         self.scale = _inverse(self._tensor(walks.values.sum(axis=1) / walks.drawn))
         exits, T = (self._tensor(v) for v in walks.even)
-        self.even_scale = _inverse(T.mean(dim=1))
+        mean = T.mean(dim=1)
+        once, more = mean.split(len(mean) // 2)
+        self.even_scale = _inverse(torch.cat([once + more, more]))
         for networks in (self.modules, self.average):
-            networks["alpha"].begin(exits, T.mean(dim=1))
+            networks["alpha"].begin(exits, mean)
 
     def use(self, walks: Pairs, proposals: Pairs, steps: int | None, order: np.random.Generator) -> None:
         """Steps on all batches of a chunk, `reuse` times over, every other time with exit and entry exchanged.

@@ -21,7 +21,7 @@ from full_geometry.half_space import HalfSpace  # noqa: E402
 from full_geometry.identity import frame_of  # noqa: E402
 from full_geometry.learning.exits import trace_exits  # noqa: E402
 from full_geometry.learning.fitting import STANDARD, Fitting  # noqa: E402
-from full_geometry.learning.pairs import ENOUGH, Pairs, PairSource, Proposals  # noqa: E402
+from full_geometry.learning.pairs import ENOUGH, Even, Pairs, PairSource, Proposals  # noqa: E402
 from full_geometry.subject import Subject  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
@@ -110,3 +110,12 @@ def test_proposals_that_are_used_have_the_sums_of_all_and_less_noise() -> None:
     # the share that is kept, which the values are multiplied by, is known and has no spread of its own
     check_sums(proposals, used, p)
     assert np.all(noise(used) < noise(proposals))
+
+
+def test_order_one_of_even_light_counts_as_a_part_of_all_light_and_more_orders_by_themselves() -> None:
+    n, rng = n_side(2), np.random.default_rng(3)
+    features = rng.random((2 * n + n_pair(2), 64), dtype=np.float32)
+    T = np.repeat(np.array([[0.001], [0.3], [0.599], [0.1]], np.float32), 64, axis=1)
+    fitting = Fitting(len(features), 2, 1.3, STANDARD, 0)
+    fitting.set_scale(Pairs(features, np.ones((2, 64), np.float32), 64, None, Even(features[:n], T)))
+    assert np.allclose(fitting.even_scale.numpy()[:, 0], [1 / 0.6, 1 / 0.4, 1 / 0.599, 1 / 0.1], rtol=1e-5)
