@@ -282,8 +282,7 @@ class _Run:
         """Chunk, largest error under constant light and its standard error."""
         rows = self._errors(truth, SAMPLES)
         live = [r for r in rows if r.light == "constant" and float(self.subject.media[r.channel].sigma_s) > 0]
-        worst = max(live, key=lambda r: r.error, default=rows[0])
-        return self.done, worst.error, worst.standard_error
+        return self.done, *max(live, key=lambda r: r.error, default=rows[0])[2:4]
 
     def _reached(self, target: float | None) -> bool:
         return target is not None and bool(self.history) and self.history[-1][1] <= target

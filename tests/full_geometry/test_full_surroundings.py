@@ -1,4 +1,5 @@
-"""How much of an object surrounds a point: balls of known volume, their surface, what is moved, what is large."""
+"""How much of an object surrounds a point: balls of known volume, their surface, what is moved, what is large; and how
+far apart first events are."""
 
 from __future__ import annotations
 
@@ -13,7 +14,7 @@ mi.set_variant("llvm_ad_rgb")
 
 from waxen import BUNNY, WAX, wax_bunny  # noqa: E402
 
-from full_geometry.features import Side, n_side, side_features  # noqa: E402
+from full_geometry.features import Side, n_side, pair_features, side_features  # noqa: E402
 from full_geometry.first_event import first_event  # noqa: E402
 from full_geometry.identity import frame_of, identify  # noqa: E402
 from full_geometry.subject import Subject, surface_point  # noqa: E402
@@ -89,3 +90,12 @@ def test_widths_of_an_object_of_many_mean_free_paths_are_those_of_cells() -> Non
     share = fields / fields[0]
     assert np.all(np.diff(share[:, -1]) < 0)  # 4 cells of 3 / 96 see what lies within 0.08 of the surface
     assert 0.05 < share[3, -1] < 0.45 < 0.55 < share[1, -1] < 0.95
+
+
+def test_a_pair_is_told_how_far_apart_both_first_events_of_each_channel_are() -> None:
+    subject = wax_bunny()
+    frame, rng = frame_of(subject), generator(mi, 256, pass_seed(9))
+    a, b = (Side(at, first_event(subject, at)) for at in (subject.random_points(rng), subject.random_points(rng)))
+    for m, told, y_o, y_i in zip(subject.media, pair_features(frame, a, b)[-3:], a.event.ys, b.event.ys):
+        gap = np.linalg.norm(np.array(y_o) - np.array(y_i), axis=0)
+        assert np.allclose(np.exp(2 * np.array(told)), gap * float(m.sigma_t) + 1e-2, rtol=1e-3)
