@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from full_geometry.learning.model_errors import ModelError, compare
+from full_geometry.learning.model_errors import ModelError, of_even_light
 from full_geometry.learning.radiance import Estimate, Reference, traced
 from full_geometry.model import FullGeometry
 
@@ -45,6 +45,5 @@ def trusted(
 
 def _error(found: np.ndarray, truth: Estimate) -> np.ndarray:
     """Relative RMSE of shares (channels, exits) under constant light, without the noise of walks."""
-    shares = np.repeat(found[:, :, None].astype(float), truth.mean.shape[-1], axis=2)
-    rows = compare(Estimate(shares, np.zeros_like(shares)), truth)
-    return np.array([row.error for row in rows if row.light == "constant"])
+    shares = found[:, :, None].astype(float)
+    return np.array([row.error for row in of_even_light(Estimate(shares, np.zeros_like(shares)), truth)])

@@ -24,7 +24,7 @@ from halfspace_sss.checks import check_count
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.progress import NamedProgress
 
-__all__ = ["EVEN_SKY", "LIGHTS", "ModelError", "compare", "errors", "errors_of", "measure"]
+__all__ = ["EVEN_SKY", "LIGHTS", "ModelError", "compare", "errors", "errors_of", "measure", "of_even_light"]
 
 LIGHTS = ("constant", "lobes")
 EVEN_SKY = "even sky"  # as images show it
@@ -46,6 +46,11 @@ def compare(model: Estimate, truth: Estimate) -> list[ModelError]:
     """The errors of all channels under both kinds of light."""
     kinds = tuple(zip(LIGHTS, (slice(0, 1), slice(1, None))))
     return [_error(c, light, columns, model, truth) for c in range(len(truth.mean)) for light, columns in kinds]
+
+
+def of_even_light(model: Estimate, truth: Estimate) -> list[ModelError]:
+    """The errors of all channels under an even sky, the first of the lights of both."""
+    return [_error(c, EVEN_SKY, slice(0, 1), model, truth) for c in range(len(truth.mean))]
 
 
 def _error(c: int, light: str, columns: slice, model: Estimate, truth: Estimate) -> ModelError:
@@ -99,8 +104,7 @@ def _even_sky(transport: Transport, by_S: Estimate, truth: Reference) -> list[Mo
         return []
     known = np.array(alpha.evened[1]).reshape(n, 1, 1) > 0
     mean = np.where(known, np.array(alpha(truth.exits)[1]).reshape(n, -1, 1), by_S.mean[..., :1])
-    shown = Estimate(mean, np.where(known, 0, by_S.variance[..., :1]))
-    return [_error(c, EVEN_SKY, slice(0, 1), shown, truth.truth) for c in range(n)]
+    return of_even_light(Estimate(mean, np.where(known, 0, by_S.variance[..., :1])), truth.truth)
 
 
 def errors_of(

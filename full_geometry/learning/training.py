@@ -25,7 +25,6 @@ from full_geometry.learning.radiance import Reference, reference
 from full_geometry.learning.seen import Seen
 from full_geometry.model import FullGeometry
 from full_geometry.patches import Patches, PatchSampler, cluster
-from full_geometry.storing import CENTRES, EVEN, Learnt, assemble, start_of
 from full_geometry.subject import Subject
 from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.neural.store import to_json
@@ -129,7 +128,7 @@ def train(
 
 def train_by_cpu(
     subject: Subject, seconds: float, folder: str | Path, *, seed: int = 0, recipe: Recipe = STANDARD
-) -> tuple[Learnt, Path]:
+) -> tuple[storing.Learnt, Path]:
     """Learn an object in so many seconds of CPU time, whatever else the machine does; its errors take more.
 
     Args:
@@ -157,7 +156,7 @@ class _Run:
 
         self.subject, self.recipe, self.seed, self.work, self.camera = subject, recipe, seed, work, camera
         self.identity, self.frame = identify(subject), frame_of(subject)
-        self.start = start_of(subject, recipe.start)
+        self.start = storing.start_of(subject, recipe.start)
         self.proposals = Proposals(subject, self.start)
         self.source = PairSource(subject, self.frame, self.start, self.proposals)
         self.seen: Seen | None = None
@@ -179,12 +178,12 @@ class _Run:
     def arrays(self) -> dict[str, np.ndarray]:
         """What is written: everything in half precision."""
         found = {name: value.astype(np.float16) for name, value in self.fitting.arrays().items()}
-        found[EVEN] = self.even
-        return found if self.centres is None else {**found, CENTRES: self.centres}
+        found[storing.EVEN] = self.even
+        return found if self.centres is None else {**found, storing.CENTRES: self.centres}
 
-    def learnt(self) -> Learnt:
+    def learnt(self) -> storing.Learnt:
         """Model and sampler as they stand."""
-        return assemble(self.subject, self.frame, self.start, self.arrays(), self.patches)
+        return storing.assemble(self.subject, self.frame, self.start, self.arrays(), self.patches)
 
     def go(
         self, seconds: float, chunks: int | None, target: float | None, folder: Path, progress: Progress | None
@@ -282,7 +281,8 @@ class _Run:
         """Chunk, largest error under constant light and its standard error."""
         rows = self._errors(truth, SAMPLES)
         live = [r for r in rows if r.light == "constant" and float(self.subject.media[r.channel].sigma_s) > 0]
-        return self.done, *max(live, key=lambda r: r.error, default=rows[0])[2:4]
+        worst = max(live, key=lambda r: r.error, default=rows[0])
+        return self.done, worst.error, worst.standard_error
 
     def _reached(self, target: float | None) -> bool:
         return target is not None and bool(self.history) and self.history[-1][1] <= target
