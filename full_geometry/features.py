@@ -14,7 +14,7 @@ import numpy as np
 
 from full_geometry.first_event import FirstEvent
 from full_geometry.subject import SurfacePoint
-from full_geometry.surroundings import FIELDS, Surroundings
+from full_geometry.surroundings import EVENT, FIELDS, POINT, Surroundings
 from halfspace_sss.arrays import library
 from halfspace_sss.physics import fresnel
 
@@ -106,7 +106,7 @@ def side_features(frame: Frame, side: Side) -> list[Any]:
     return [
         *_octaves(p), *_octaves(y), *n, *w, dr.dot(n, w),
         _log(frame.sigma_t, event.length), *(0.5 * dr.log(P + LEAST_P) for P in event.P), *event.local,
-        *frame.around(p), *frame.around(y),
+        *frame.around(p, POINT), *frame.around(y, EVENT),
     ]  # fmt: skip
 
 

@@ -171,8 +171,13 @@ def _check_same(trained: np.ndarray, here: np.ndarray) -> None:
     raise ValueError(f"coefficients must be known at {trained.shape} points, as trained, got {here.shape}")
 
 
-def frame_of(subject: Subject, trained: Identity | None = None) -> Frame:
+def frame_of(subject: Subject, trained: Identity | None = None, turns: np.ndarray | None = None) -> Frame:
     """The frame of the features; that of training for an object that has been moved since.
+
+    Args:
+        subject: the object.
+        trained: as it was trained.
+        turns: of its surroundings then.
 
     Raises:
         ValueError: the object is not the one that was trained.
@@ -189,4 +194,4 @@ def frame_of(subject: Subject, trained: Identity | None = None) -> Frame:
     sigma_t = float(np.exp(np.mean(np.log(each))))
     turn = None if np.allclose(R, np.eye(3), atol=1e-6) else [mi.Vector3f(*map(number, row)) for row in R.T]
     frame = Frame(mi.Point3f(*map(number, centre)), number(radius), number(sigma_t), tuple(map(number, each)), turn)
-    return replace(frame, around=surroundings(subject, frame))
+    return replace(frame, around=surroundings(subject, frame, turns))

@@ -35,7 +35,7 @@ __all__ = [
 KIND = "full_geometry"
 CHECKSUMS = "start_checksums"  # of a record
 S_LAYERS, ALPHA_LAYERS, PATCH_LAYERS, FLOW_LAYERS = ("W_", "b_"), ("A_", "a_"), ("V_", "c_"), ("F_", "h_")
-CENTRES, EVEN = "centres", "even"
+CENTRES, EVEN, TURNS = "centres", "even", "turns"
 
 
 class Learnt(NamedTuple):
@@ -98,8 +98,9 @@ def _trained(path: Path) -> tuple[Identity, dict[str, np.ndarray], dict[str, Any
     if record.get("reflections") != REFLECTIONS:
         known = f"reflections must be {REFLECTIONS}, got {record.get('reflections')}"
         raise ValueError(f"{path.with_suffix('.json')}: {known}: of another version, to be trained again")
-    if EVEN not in arrays:
-        raise ValueError(f"{path}: even light must be learnt, got none: of another version, to be trained again")
+    for name, what in ((EVEN, "even light must be learnt"), (TURNS, "turns of what surrounds a point must be known")):
+        if name not in arrays:
+            raise ValueError(f"{path}: {what}, got none: of another version, to be trained again")
     try:
         anchors, grids = arrays.pop("anchors"), record.get("grids", "")
         probes = arrays.pop("probes") if grids else None
@@ -135,7 +136,7 @@ def load(path: str | os.PathLike, subject: Subject) -> Learnt:
     identity, arrays, record = _trained(path)
     try:
         subject = subject.as_trained(identity.medium)
-        frame = frame_of(subject, identity)
+        frame = frame_of(subject, identity, arrays[TURNS])
         first, bias = ALPHA_LAYERS
         units = arrays[f"{first}{max(sum(name.startswith(bias) for name in arrays) - 1, 0)}"].shape[1]
         channels, known = len(subject.media), arrays["W_0"].shape[1]

@@ -176,9 +176,9 @@ class _Run:
         return Fitting(n_in, channels, self.subject.eta, self.recipe, self.seed, self.patches)
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """What is written: everything in half precision."""
+        """What is written: in half precision, but for what turns the inputs."""
         found = {name: value.astype(np.float16) for name, value in self.fitting.arrays().items()}
-        found[storing.EVEN] = self.even
+        found |= {storing.EVEN: self.even, storing.TURNS: self.frame.around.turns}
         return found if self.centres is None else {**found, storing.CENTRES: self.centres}
 
     def learnt(self) -> storing.Learnt:

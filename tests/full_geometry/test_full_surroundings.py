@@ -18,7 +18,7 @@ from full_geometry.features import Side, n_side, pair_features, side_features  #
 from full_geometry.first_event import first_event  # noqa: E402
 from full_geometry.identity import frame_of, identify  # noqa: E402
 from full_geometry.subject import Subject, surface_point  # noqa: E402
-from full_geometry.surroundings import FIELDS, WIDTHS, insides  # noqa: E402
+from full_geometry.surroundings import EVENT, FIELDS, POINT, WIDTHS, insides  # noqa: E402
 from halfspace_sss import Medium  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
@@ -31,11 +31,14 @@ def ball() -> Subject:
 
 
 def _along_a_radius(subject: Subject, radii: list[float], way: tuple[float, float, float]) -> np.ndarray:
-    """Fields (n, FIELDS) at distances from the middle of the ball less those in a corner of its box: none is inside."""
+    """Fields (n, FIELDS) as they were before they were turned, at distances from the middle of the ball."""
     frame, way = frame_of(subject), np.array(way) / np.linalg.norm(way)
-    p = np.concatenate([np.array(radii)[:, None] * way, [[3, 3, 3]]]) + [0.3, -0.2, 0.1]
-    fields = np.array(frame.around(frame.position(mi.Point3f(p.T.astype(np.float32))))).T
-    return fields[:-1] - fields[-1]
+    p = np.array(radii)[:, None] * way + [0.3, -0.2, 0.1]
+    fields, turn = (
+        np.array(frame.around(frame.position(mi.Point3f(p.T.astype(np.float32))), POINT)),
+        frame.around.turns[POINT],
+    )
+    return np.linalg.solve(turn[:, :-1].astype(float), fields - turn[:, -1:]).T
 
 
 def test_cells_inside_of_a_ball_have_its_volume(ball: Subject) -> None:
@@ -63,6 +66,16 @@ def test_slopes_point_inwards_and_are_largest_at_the_surface(ball: Subject) -> N
     assert along[2] < along[1] < 0
     assert np.linalg.norm(slopes[0]) < 0.1 * abs(along[2])
     assert np.linalg.norm(slopes[2] - along[2] * way / np.linalg.norm(way)) < 0.15 * abs(along[2])
+
+
+def test_fields_have_mean_zero_and_no_direction_of_larger_spread_over_points_and_over_first_events() -> None:
+    subject = wax_bunny()
+    frame, at = frame_of(subject), subject.random_points(generator(mi, 2**14, pass_seed(4)))
+    for kind, place in ((POINT, at.p), (EVENT, first_event(subject, at).y)):
+        fields = np.array(frame.around(frame.position(place), kind))
+        spread = np.linalg.eigvalsh(np.cov(fields))
+        assert np.all(np.abs(fields.mean(axis=1)) < 0.05)
+        assert spread[-1] < 1.1 and np.all(spread[2:] > 0.7)  # what hardly varies stays small
 
 
 def test_what_surrounds_a_point_is_the_same_where_the_object_has_been_moved() -> None:
