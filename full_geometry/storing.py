@@ -28,7 +28,7 @@ from halfspace_sss.neural.trained import weights_folder
 from halfspace_sss.rendering.surface.transports import knows_objects
 
 __all__ = [
-    "CENTRES", "CHECKSUMS", "KIND", "Learnt", "add_flow", "assemble", "find_weights", "load", "save",
+    "CENTRES", "CHECKSUMS", "EVEN", "KIND", "Learnt", "TURNS", "add_flow", "assemble", "find_weights", "load", "save",
     "start_checksums", "start_of", "trained", "transport", "weights_name",
 ]  # fmt: skip
 

@@ -89,12 +89,15 @@ def test_S_of_training_and_of_images_know_the_same_of_even_light(trained: Traine
     assert np.allclose(S, pairs.values * np.exp(f), rtol=0.02, atol=1e-4 * S.max())  # weights in half precision
 
 
-def test_weights_without_it_are_refused_by_name(trained: Trained, tmp_path: Path) -> None:
+@pytest.mark.parametrize("missing, what", [(storing.EVEN, "even light must be learnt"), (storing.TURNS, "turns of")])
+def test_weights_of_before_it_was_known_are_refused_by_name(
+    trained: Trained, missing: str, what: str, tmp_path: Path
+) -> None:
     arrays, record = load_weights(trained.path, storing.KIND)
     path = tmp_path / trained.path.name
-    save_weights(path, storing.KIND, {k: v for k, v in arrays.items() if k != storing.EVEN}, record)
+    save_weights(path, storing.KIND, {k: v for k, v in arrays.items() if k != missing}, record)
     subject = Subject.of(mi.load_dict(shape()), WAX)
-    with pytest.raises(ValueError, match="even light must be learnt.*to be trained again"):
+    with pytest.raises(ValueError, match=f"{what}.*to be trained again"):
         storing.find_weights(subject, tmp_path)
     with pytest.raises(ValueError, match="to be trained again"):
         storing.load(path, subject)
