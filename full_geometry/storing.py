@@ -14,22 +14,20 @@ from full_geometry.first_event import REFLECTIONS
 from full_geometry.flow.chart import Chart
 from full_geometry.flow.conditional import ConditionalFlow
 from full_geometry.flow.sampler import FlowSampler
-from full_geometry.half_space import HalfSpace, HalfSpaceTransport
+from full_geometry.half_space import HalfSpace
 from full_geometry.identity import Identity, frame_of, identify
 from full_geometry.model import FullGeometry, Start
 from full_geometry.neural_shape import storing as shapes
 from full_geometry.patches import Patches, PatchSampler
 from full_geometry.reflectance import Reflectance
-from full_geometry.rivals.added import AddedTransport
 from full_geometry.subject import Subject
 from halfspace_sss.interface.model import bssrdf
 from halfspace_sss.neural.store import load_weights, save_weights
 from halfspace_sss.neural.trained import weights_folder
-from halfspace_sss.rendering.surface.transports import knows_objects
 
 __all__ = [
     "CENTRES", "CHECKSUMS", "EVEN", "KIND", "Learnt", "TURNS", "add_flow", "assemble", "find_weights", "load", "save",
-    "start_checksums", "start_of", "trained", "transport", "weights_name",
+    "start_checksums", "start_of", "trained", "weights_name",
 ]  # fmt: skip
 
 KIND = "full_geometry"
@@ -149,19 +147,6 @@ def load(path: str | os.PathLike, subject: Subject) -> Learnt:
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
     return assemble(subject, frame, start, arrays)
-
-
-def transport(subject: Subject, model: str, folder: str | os.PathLike | None = None) -> Any:
-    """The transport called `model` of an object: "full_geometry", one that a package adds, or a half-space model.
-
-    Raises:
-        ValueError: the object has not been trained, or there is no such model.
-    """
-    if model == KIND:
-        return load(find_weights(subject, folder), subject).model
-    if knows_objects(model):
-        return AddedTransport.of(subject, model)
-    return HalfSpaceTransport(subject, model)
 
 
 def start_of(subject: Subject, name: str) -> Start:

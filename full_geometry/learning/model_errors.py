@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from full_geometry.half_space import HalfSpace
+from full_geometry.learning.added import transport
 from full_geometry.learning.pairs import Proposals
 from full_geometry.learning.radiance import Estimate, Reference, Transport, modelled, reference
 from full_geometry.subject import Subject
@@ -183,8 +184,6 @@ def errors(
     Raises:
         ValueError: an argument is out of range, the object has not been trained, or there is no such model.
     """
-    from full_geometry.storing import transport
-
     subject = Subject.given(shape, medium, mm_per_unit, object)
     found = {model: transport(subject, model, folder)}
     return errors_of(subject, found, exits=exits, walks=walks, samples=samples, seed=seed)[model]

@@ -36,6 +36,7 @@ from halfspace_sss.physics.backbone import length_scale
 from halfspace_sss.rendering.transport.plane import number
 
 __all__ = [
+    "ALONE",
     "CURVED_OWN",
     "CURVED_SHARED",
     "N_MEDIUM",
@@ -51,6 +52,7 @@ __all__ = [
 N_LOOK = 3 * N_LENGTHS
 CURVED_OWN, CURVED_SHARED = slice(6, 10 + N_LOOK), slice(6, 14)  # which are 0 on a plane
 N_OWN, N_SHARED, N_MEDIUM = 10 + N_LOOK, 14, 16
+ALONE = [0, 1, 5, 6, 7, *range(10, 10 + 2 * N_LENGTHS)]  # own numbers that do not depend on the other end
 LEAST_P, LEAST_LENGTH = 1e-3, 1e-2
 MOST_G = 0.85  # of a phase function of g²
 MOST_RATIO = 4.0  # of phase functions: what is not bounded runs away outside of what was seen

@@ -17,14 +17,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from full_geometry.neural_shape.descriptors import ALONE
 from full_geometry.neural_shape.learning.source import PairData
-from full_geometry.neural_shape.surroundings import N_LENGTHS
 
 __all__ = ["GROUPS", "Grouped", "Part", "grouped"]
 
 HALVINGS = 4
 GROUPS = 2**HALVINGS
-SEEN = [0, 1, 5, 6, 7, *range(10, 10 + 2 * N_LENGTHS)]  # columns of an exit that do not depend on the entry
 AXIS_FROM = 512  # exits
 EMPHASIS = 4.0  # 16 is better for what is thick and worse for what is not
 NOISE, PAIRS = 0.03, 64  # squared, of the mean of so many proposals
@@ -86,7 +85,7 @@ class Grouped:
 
 def grouped(data: PairData) -> Grouped:
     """The data of an object in 16 groups of exits, halved four times at the median of their first principal axis."""
-    exits = [v[:, SEEN].astype(np.float32) for v in (data.proposals, data.walks)]
+    exits = [v[:, ALONE].astype(np.float32) for v in (data.proposals, data.walks)]
     mean, spread = exits[0].mean(axis=0), exits[0].std(axis=0) + 1e-6
     labels = [np.zeros(len(v), np.int16) for v in exits]
     _halve([(v - mean) / spread for v in exits], labels, [np.arange(len(v)) for v in exits], HALVINGS, 0)
@@ -112,7 +111,7 @@ def _halve(exits: list[np.ndarray], labels: list[np.ndarray], kept: list[np.ndar
             label[k] = first
         return
     own = exits[0][kept[0]]
-    axis = np.linalg.eigh(np.cov(own[:AXIS_FROM].T))[1][:, -1] if len(own) > 1 else np.ones(len(SEEN))
+    axis = np.linalg.eigh(np.cov(own[:AXIS_FROM].T))[1][:, -1] if len(own) > 1 else np.ones(len(ALONE))
     along = [v[k] @ axis for v, k in zip(exits, kept)]
     middle = float(np.median(along[0])) if len(own) else math.inf
     lower, upper = ([k[side] for k, side in zip(kept, sides)]

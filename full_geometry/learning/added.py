@@ -1,18 +1,21 @@
-"""Transports that packages add for renders, asked as those of objects are."""
+"""The transport of an object by the name of its model; those that packages add for renders are asked alike."""
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from typing import Any
 
+from full_geometry.half_space import HalfSpaceTransport
+from full_geometry.storing import KIND, find_weights, load
 from full_geometry.subject import Subject, SurfacePoint
 from halfspace_sss.rendering.surface.inside import Inside
-from halfspace_sss.rendering.surface.transports import object_transport
+from halfspace_sss.rendering.surface.transports import knows_objects, object_transport
 from halfspace_sss.rendering.transport.plane import Exit, number
 from halfspace_sss.rendering.transport.protocols import Entry, Transport
 from halfspace_sss.rendering.transport.settings import Settings
 
-__all__ = ["AddedTransport"]
+__all__ = ["AddedTransport", "transport"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,3 +61,16 @@ class AddedTransport:
         entry = Entry(at.p, mi.Normal3f(at.n * number(self.subject.found.sign)), at.n_out, mi.Float(1), mi.UInt32(0))
         value = self.inner.S_mu(exit, entry, at.w, active)
         return dr.select(mu > 0, value / dr.maximum(mu, 1e-6), 0)
+
+
+def transport(subject: Subject, model: str, folder: str | os.PathLike | None = None) -> Any:
+    """The transport called `model` of an object: "full_geometry", one that a package adds, or a half-space model.
+
+    Raises:
+        ValueError: the object has not been trained, or there is no such model.
+    """
+    if model == KIND:
+        return load(find_weights(subject, folder), subject).model
+    if knows_objects(model):
+        return AddedTransport.of(subject, model)
+    return HalfSpaceTransport(subject, model)
