@@ -74,6 +74,7 @@ def errors(
     models: Sequence[str] = (),
     *,
     object: str | None = None,
+    exits: int = 256,
     seed: int = 0,
     progress: NamedProgress | None = None,
 ) -> list[ObjectError]:
@@ -84,6 +85,7 @@ def errors(
         models: "full_geometry", whose weights must have been trained, others that know objects, and half-space models;
             by default all of them that have learnt the object or take its medium.
         object: its id; may be left out where there is one.
+        exits: how many, at random.
         seed: of everything.
         progress: called with (what, done, total).
 
@@ -91,10 +93,11 @@ def errors(
         ValueError: there is no such model or object, or a model that is named refuses it.
     """
     check_count("seed", seed, 0)
+    check_count("exits", exits, 2)
     subject = Subject.given(scene, None, None, object)
     transports = {name: transport(subject, name) for name in models} or _that_take(subject)
     name = subject.found.shape.id()
-    found = errors_of(subject, transports, seed=seed, progress=progress)
+    found = errors_of(subject, transports, exits=exits, seed=seed, progress=progress)
     return [row for model, rows in found.items() for row in _rows(name, model, rows)]
 
 

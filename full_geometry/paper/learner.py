@@ -87,15 +87,15 @@ def train(
 
 
 def errors(
-    scene: Any, models: Sequence[str] = (KIND,), *, object: str | None = None, seed: int = 0,
+    scene: Any, models: Sequence[str] = (KIND,), *, object: str | None = None, exits: int = EXITS, seed: int = 0,
     progress: NamedProgress | None = None,
 ) -> list[ObjectError]:  # fmt: skip
-    """The errors of the network of an object, its points from walks as it was trained."""
+    """The errors of the network of an object over so many exits, its points from walks as it was trained."""
     for name in models:
         check_choice("model", name, (KIND,))
     subject = Subject.given(scene, None, None, object)
     net = load_network(subject)
-    found = paper_errors(subject, net, reference(subject, EXITS, WALKS, seed), seed=seed)
+    found = paper_errors(subject, net, reference(subject, exits, WALKS, seed), seed=seed)
     return _rows(subject.found.shape.id(), found)
 
 

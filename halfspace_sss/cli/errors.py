@@ -44,6 +44,7 @@ if TYPE_CHECKING:
 __all__ = ["OBJECT_DEFINITION", "errors_command", "object_table"]
 
 EVENTS, BLOCK, BACKEND, VARIANT = 2e7, 4, "llvm", "llvm_ad_rgb"  # events for each medium
+EXITS = 256  # of an object
 HIDDEN = 0.3  # of the noise: an error below it raised the spread by less than 5 %, which may be chance
 DEFINITION = (
     "error: sum |E_model - E_traced| / sum E_traced over unseen pairs of directions, E = ∫ S mu_i mu_o dA over "
@@ -51,8 +52,8 @@ DEFINITION = (
 )
 
 OBJECT_DEFINITION = (
-    "error: relative RMSE of the radiance of random exits under constant light, or of four lobes cos^16, against "
-    "walks; noise of both taken out; orders of each model"
+    "error: relative RMSE of the radiance of random exits under constant light, of four lobes cos^16, or as images "
+    "of an even sky show it, against walks; noise of both taken out; orders of each model"
 )
 
 
@@ -73,6 +74,7 @@ def errors_command(
         Path | None, typer.Option(help="Mitsuba XML file: radiance of an object of it against walks instead.")
     ] = None,
     object: ObjectId = None,
+    exits: Annotated[int, typer.Option(help="Random exits of an object.", parser=whole)] = EXITS,
     sigma_t: SigmaT = None,
     albedo: Albedo = None,
     g: MeanCosine = None,
@@ -95,10 +97,10 @@ def errors_command(
         others = {"material": material, "channel": channel, "registry": registry, "held_out": held_out,
                   "as_trained": as_trained, "truths": truths, **given}  # fmt: skip
         check_left_out({**others, **{k: None if a == b else a for k, (a, b) in changed.items()}}, "with --scene")
-        _object(scene, model or [], {"object": object, "seed": seed}, variant, define, out)
+        _object(scene, model or [], {"object": object, "seed": seed, "exits": exits}, variant, define, out)
         return
-    of_scenes = {"object": object, "define": define, "variant": None if variant == VARIANT else variant}
-    check_left_out(of_scenes, "without --scene")
+    changed = {"variant": None if variant == VARIANT else variant, "exits": None if exits == EXITS else exits}
+    check_left_out({"object": object, "define": define, **changed}, "without --scene")
     if truths:
         _truths(material or registry or held_out is not None, model, out)
         return

@@ -96,10 +96,18 @@ def test_a_model_with_single_scattering_is_held_against_walks_with_it(monkeypatc
     assert fewest == [1, 2]
 
 
+def test_as_many_exits_are_traced_as_are_asked_for(monkeypatch: Any) -> None:
+    asked = []
+    monkeypatch.setattr(model_errors, "reference", lambda *a: asked.append(a[1]) or REFERENCE(a[0], 8, 64, *a[3:]))
+    for more in ((), ("--exits", "1024")):
+        assert _invoke("errors", "--scene", "ball.xml", "--model", "better_dipole", *more).exit_code == 0
+    assert asked == [256, 1024]
+
+
 def test_all_models_that_take_an_object_are_measured_where_none_is_named(monkeypatch: Any) -> None:
     monkeypatch.setattr(model_errors, "reference", lambda *a: REFERENCE(a[0], 8, 64, *a[3:]))
-    monkeypatch.setattr(command, "errors_of", functools.partial(command.errors_of, exits=8, walks=64, samples=64))
-    result = _invoke("errors", "--scene", "ball.xml")
+    monkeypatch.setattr(command, "errors_of", functools.partial(command.errors_of, walks=64, samples=64))
+    result = _invoke("errors", "--scene", "ball.xml", "--exits", "8")
     assert result.exit_code == 0, result.output
     measured = set(pandas.read_csv("errors/errors.csv")["model"])
     assert measured >= {"neural", "neural_shape", "better_dipole", "photon_beam_diffusion"}
@@ -193,6 +201,8 @@ REFUSED = [
     (["errors", "--scene", "ball.xml", "--model", "full_geometry"], "object 'ball' must be trained for full_geometry"),
     (["errors", "--scene", "ball.xml", "--model", "auto"], "has S for two points of a surface, got 'auto'"),
     (["errors", "--scene", "ball.xml", "--model", "lambert"], "has S for two points of a surface, got 'lambert'"),
+    (["errors", "--exits", "512"], "exits must be left out without --scene, got 512"),
+    (["errors", "--scene", "ball.xml", "--exits", "1"], "exits must be a whole number >= 2, got 1"),
     (["errors", "--scene", "ball.xml", "--seed", "-1"], "seed must be a whole number >= 0, got -1"),
 ]
 

@@ -82,9 +82,16 @@ class Learner(Protocol):
         """Ids of the objects that have the model and no weights; a learner without it has none."""
 
     def errors(
-        self, scene: Any, models: Sequence[str], *, object: str | None, seed: int, progress: NamedProgress | None
+        self,
+        scene: Any,
+        models: Sequence[str],
+        *,
+        object: str | None,
+        exits: int,
+        seed: int,
+        progress: NamedProgress | None,
     ) -> list[ObjectError]:
-        """The errors of models of an object; of all that can be asked where none is named."""
+        """The errors of models of an object, over so many exits; of all that can be asked where none is named."""
 
 
 class ShapeLearner(Protocol):
@@ -121,13 +128,19 @@ def learner(name: str | None = None) -> Learner:
 
 
 def object_errors(
-    scene: Any, models: Sequence[str], *, object: str | None, seed: int, progress: NamedProgress | None
+    scene: Any,
+    models: Sequence[str],
+    *,
+    object: str | None,
+    exits: int,
+    seed: int,
+    progress: NamedProgress | None,
 ) -> list[ObjectError]:
     """The errors of models of an object: a learner measures the model of its name, the first one all others."""
     first, known = learner(), learners()
     own = [name for name in models if known.get(name, first) is not first]
     others = [name for name in models if name not in own]
-    how = {"object": object, "seed": seed, "progress": progress}
+    how = {"object": object, "exits": exits, "seed": seed, "progress": progress}
     found = first.errors(scene, others, **how) if others or not own else []
     return [*found, *(row for name in own for row in known[name].errors(scene, [name], **how))]
 
