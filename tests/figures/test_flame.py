@@ -34,7 +34,7 @@ from halfspace_sss.rendering.transport.protocols import Entry  # noqa: E402
 SIZE, BLOCKS, PASSES, SPP, LANES = 24, 3, 16, 64, 2**16
 SIGNIFICANCE = 1e-3
 WALK = "path_traced"
-QUICK, CHUNKS = Recipe(width=32, depth=2, batch=1024, chunk=2**15, reuse=4), 3
+QUICK, CHUNKS = Recipe(width=32, depth=2, batch=1024, chunk=2**15, reuse=4), 6
 WAX = Medium(np.array([0.095, 0.08, 0.06]), np.array([0.005, 0.02, 0.04]), 0.0, 1.4)  # 1/mm: 5.6 mean free paths wide
 SURFACE = {"type": "translucent", "sigma_s": "0.095,0.08,0.06", "sigma_a": "0.005,0.02,0.04", "eta": 1.4}
 
