@@ -34,10 +34,8 @@ def _along_a_radius(subject: Subject, radii: list[float], way: tuple[float, floa
     """Fields (n, FIELDS) as they were before they were turned, at distances from the middle of the ball."""
     frame, way = frame_of(subject), np.array(way) / np.linalg.norm(way)
     p = np.array(radii)[:, None] * way + [0.3, -0.2, 0.1]
-    fields, turn = (
-        np.array(frame.around(frame.position(mi.Point3f(p.T.astype(np.float32))), POINT)),
-        frame.around.turns[POINT],
-    )
+    turn = frame.around.turns[POINT]
+    fields = np.array(frame.around(frame.position(mi.Point3f(p.T.astype(np.float32))), POINT))
     return np.linalg.solve(turn[:, :-1].astype(float), fields - turn[:, -1:]).T
 
 

@@ -127,20 +127,15 @@ def learner(name: str | None = None) -> Learner:
     return known[name] if name is not None else next(iter(known.values()))
 
 
-def object_errors(
-    scene: Any,
-    models: Sequence[str],
-    *,
-    object: str | None,
-    exits: int,
-    seed: int,
-    progress: NamedProgress | None,
-) -> list[ObjectError]:
-    """The errors of models of an object: a learner measures the model of its name, the first one all others."""
+def object_errors(scene: Any, models: Sequence[str], **how: Any) -> list[ObjectError]:
+    """The errors of models of an object: a learner measures the model of its name, the first one all others.
+
+    Args:
+        scene, models, how: as for `Learner.errors`.
+    """
     first, known = learner(), learners()
     own = [name for name in models if known.get(name, first) is not first]
     others = [name for name in models if name not in own]
-    how = {"object": object, "exits": exits, "seed": seed, "progress": progress}
     found = first.errors(scene, others, **how) if others or not own else []
     return [*found, *(row for name in own for row in known[name].errors(scene, [name], **how))]
 
