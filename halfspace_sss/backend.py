@@ -12,7 +12,10 @@ from typing import Any
 
 from halfspace_sss.once import once
 
-__all__ = ["BACKENDS", "BackendError", "array_types", "kernel_seconds", "prefer_bundled_llvm", "prepare_llvm"]
+__all__ = [
+    "BACKENDS", "BackendError", "array_types", "busy_threads", "kernel_seconds", "prefer_bundled_llvm", "prepare_llvm",
+    "two_threads",
+]  # fmt: skip
 
 BACKENDS = ("llvm", "cuda")
 OLDEST_LLVM = 17  # 14 and 15 abort the process ("Cannot select: fminimum")
@@ -102,6 +105,22 @@ def prepare_llvm() -> None:
         f"no LLVM library of version {OLDEST_LLVM} or newer was found: `pip install karellen-llvm-core` "
         "(Linux x86-64), install your system's LLVM, or set DRJIT_LIBLLVM_PATH"
     )
+
+
+def two_threads() -> None:
+    """Give Dr.Jit a second thread on a machine with one core: Mitsuba waits forever for EXR files with a single one."""
+    import drjit as dr
+
+    if dr.thread_count() < 2:
+        dr.set_thread_count(2)
+
+
+def busy_threads() -> int:
+    """Threads of Dr.Jit that can run at once."""
+    import drjit as dr
+
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return min(dr.thread_count(), cores)
 
 
 @once

@@ -97,3 +97,28 @@ def test_an_old_llvm_of_the_system_does_not_abort(use: str) -> None:
 def test_an_old_llvm_that_the_user_set_is_told_from_a_damaged_one() -> None:
     line = run(USES["trace"], DRJIT_LIBLLVM_PATH=_old_of_the_system()[0])
     assert "DRJIT_LIBLLVM_PATH = " in line and " is LLVM " in line
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="cores cannot be chosen here")
+@pytest.mark.parametrize(
+    "use",
+    [
+        "from halfspace_sss import rendering\nrendering.register()\nimport mitsuba as mi\n"
+        "mi.Bitmap(image).write('a.exr')\nassert np.array_equal(np.array(mi.Bitmap('a.exr')), image)",
+        "from figures.parts.exr import exr_bytes, read_exr\nopen('a.exr', 'wb').write(exr_bytes(image, 'a', 'test'))\n"
+        "assert np.array_equal(read_exr('a.exr'), image)",
+    ],
+    ids=["rendering", "figures"],
+)
+def test_a_machine_with_one_core_writes_and_reads_images(use: str, tmp_path: Path) -> None:
+    code = (
+        "import os\nos.sched_setaffinity(0, {min(os.sched_getaffinity(0))})\nimport numpy as np\nimport halfspace_sss\n"
+        "from halfspace_sss.backend import busy_threads, prepare_llvm\nprepare_llvm()\nimport mitsuba as mi\n"
+        f"mi.set_variant('llvm_ad_rgb')\nimage = np.ones((300, 300, 3), np.float32)\n{use}\nassert busy_threads() == 1"
+    )
+    path = os.pathsep.join([str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")])
+    env = {**os.environ, "PYTHONPATH": path}
+    found = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, env=env, cwd=tmp_path, timeout=60
+    )
+    assert found.returncode == 0, found.stderr

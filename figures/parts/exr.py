@@ -6,7 +6,7 @@ import os
 
 import numpy as np
 
-from halfspace_sss.backend import BackendError
+from halfspace_sss.backend import BackendError, two_threads
 
 __all__ = ["exr_bytes", "read_exr"]
 
@@ -17,6 +17,7 @@ def _mitsuba() -> tuple[type, type]:
         from mitsuba import Bitmap, MemoryStream
     except ModuleNotFoundError as error:
         raise BackendError('images need Mitsuba 3: pip install "halfspace-sss[render]"') from error
+    two_threads()
     return Bitmap, MemoryStream
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 
-from halfspace_sss.backend import BackendError, prepare_llvm
+from halfspace_sss.backend import BackendError, prepare_llvm, two_threads
 from halfspace_sss.rendering.surface.variants import VARIANTS, variant_channels
 
 __all__ = ["register"]
@@ -43,6 +43,7 @@ def _register_all() -> None:
 
     if mi.variant().startswith("llvm"):
         prepare_llvm()
+    two_threads()
 
     from halfspace_sss.rendering.paths.integrator import integrator_class
     from halfspace_sss.rendering.surface.translucent import translucent_class

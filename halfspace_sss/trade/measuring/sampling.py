@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from halfspace_sss.backend import busy_threads
 from halfspace_sss.rendering.surface.variants import variant_channels
 from halfspace_sss.trade.measuring.exits import Exits
 from halfspace_sss.trade.measuring.seeds import seeded
@@ -53,10 +54,9 @@ class Sampled:
 
 def clock() -> float:
     """Seconds: on a CPU those of all threads over their number, on which what else runs has little influence."""
-    import drjit as dr
     import mitsuba as mi
 
-    return time.process_time() / dr.thread_count() if mi.variant().startswith("llvm") else time.perf_counter()
+    return time.process_time() / busy_threads() if mi.variant().startswith("llvm") else time.perf_counter()
 
 
 def first_sample(stage: Stage, way: Way, exits: Exits, seed: int, object: int = 0) -> Sampled:
