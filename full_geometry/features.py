@@ -16,9 +16,12 @@ from full_geometry.first_event import FirstEvent
 from full_geometry.subject import SurfacePoint
 from full_geometry.surroundings import EVENT, FIELDS, POINT, Surroundings
 from halfspace_sss.arrays import library
+from halfspace_sss.neural.perceptron import Perceptron
 from halfspace_sss.physics import fresnel
 
-__all__ = ["Frame", "Side", "entering", "n_pair", "n_side", "pair_features", "reverse", "side_features"]
+__all__ = [
+    "Frame", "Quadratic", "Side", "Terms", "entering", "n_pair", "n_side", "pair_features", "reverse", "side_features",
+]  # fmt: skip
 
 OCTAVES = 2
 PAIR = 21  # numbers of a pair before those of each channel
@@ -82,6 +85,57 @@ def n_side(channels: int, local: int = 0) -> int:
 def n_pair(channels: int) -> int:
     """Number of features of a pair beside those of its sides."""
     return PAIR + channels
+
+
+class Terms(NamedTuple):
+    """Products of two of (1, features of a side): all features, and those of two that are no octaves.
+
+    Attributes:
+        heads: places of the first factors among (1, features), no octaves.
+        rows, cols: of each product the first factor among the heads, and the second among (1, features).
+    """
+
+    heads: np.ndarray
+    rows: np.ndarray
+    cols: np.ndarray
+
+    @classmethod
+    def of(cls, n: int) -> Terms:
+        """For n features of a side."""
+        octaves = np.r_[3:POSITION, POSITION + 3 : 2 * POSITION]
+        heads = np.concatenate([[0], 1 + np.setdiff1d(np.arange(n), octaves)])
+        rows, cols = np.triu_indices(len(heads) - 1)
+        rows, cols = np.append(np.zeros(n + 1, int), 1 + rows), np.append(np.arange(n + 1), heads[1:][cols])
+        return cls(heads, rows, cols)
+
+    def matrix(self, numbers: Any) -> Any:
+        """Numbers (..., products) as matrices (..., heads, 1 + features)."""
+        found = np.zeros((*numbers.shape[:-1], len(self.heads), int(self.cols.max()) + 1), numbers.dtype)
+        found[..., self.rows, self.cols] = numbers
+        return found
+
+
+class Quadratic:
+    """h = x_h . Q x of an end, x = (1, features), x_h its heads.
+
+    Args:
+        numbers: (outputs, products) of `Terms`.
+        n: features of a side.
+    """
+
+    def __init__(self, numbers: np.ndarray, n: int) -> None:
+        self.terms = Terms.of(n)
+        Q = self.terms.matrix(numbers.astype(np.float32))
+        self.outputs = len(Q)
+        Q = Q.reshape(-1, n + 1)
+        self._product = Perceptron([Q[:, 1:]], [Q[:, 0]])
+
+    def __call__(self, columns: list[Any]) -> list[Any]:
+        """Of the features of a side."""
+        heads = [None, *(columns[k - 1] for k in self.terms.heads[1:])]
+        y, m = self._product(columns), len(heads)
+        rows = (y[k * m : (k + 1) * m] for k in range(self.outputs))
+        return [sum((a * b for a, b in zip(heads[1:], row[1:])), row[0]) for row in rows]
 
 
 def _octaves(x: Any) -> list[Any]:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from full_geometry.features import Frame, Side, n_pair, pair_features, side_features
+from full_geometry.features import Frame, Quadratic, Side, n_pair, n_side, pair_features, side_features
 from full_geometry.reflectance import Reflectance
 from full_geometry.subject import Subject, SurfacePoint
 from halfspace_sss.interface.model import BSSRDF
@@ -38,16 +38,17 @@ class Start(Protocol):
 
 
 class PreparedExit(NamedTuple):
-    """What is done once for all entries of an exit: its end of the start, and its share of the first layer."""
+    """What is done once for all entries of an exit: its end of the start, its share of the first layer, and h."""
 
     side: Side
     hidden: list[Any]
+    h: Any = ()
 
 
 @dataclass(frozen=True, eq=False)
 class FullGeometry:
-    """S = S_start exp f, f = 6 tanh(g/6), g a perceptron of the features of exit, entry and pair, and of what
-    alpha's makes of exit and entry.
+    """S = S_start exp f, f = 6 tanh((g + h_o + h_i)/6), g a perceptron of the features of exit, entry and pair, and of
+    what alpha's makes of exit and entry, h a quadratic function of those of one end.
 
     Orders two and more; positive; reciprocal as far as it has been learnt.
 
@@ -55,7 +56,7 @@ class FullGeometry:
         subject: the object.
         frame: of the features.
         start: S_start.
-        weights: W_k (outputs, inputs) and b_k of the layers.
+        weights: W_k (outputs, inputs) and b_k of the layers, Q of h.
         alpha: ∫ S mu_i of an exit, learnt beside S.
     """
 
@@ -72,10 +73,16 @@ class FullGeometry:
         split = (self.weights["W_0"].shape[1] - n_pair(len(self.subject.media))) // 2
         return Perceptron.named(self.weights, "W", "b", splits=[split])
 
+    @functools.cached_property
+    def _h(self) -> Quadratic:
+        return Quadratic(self.weights["Q"], n_side(len(self.subject.media), self.subject.n_local))
+
     def prepare(self, at: SurfacePoint, active: Any = True) -> PreparedExit:
         """The exit's side, for as many entries as are asked for."""
         side, net = self.start.end(at, active), self._network
-        return PreparedExit(side, net.numbers(net.first(0, self._end(side), biased=True)))
+        columns = side_features(self.frame, side)
+        hidden = net.numbers(net.first(0, [*columns, *self.alpha.units(columns)], biased=True))
+        return PreparedExit(side, hidden, self._h(columns))
 
     def S(self, exit: PreparedExit, at: SurfacePoint, active: Any = True) -> Any:
         """S(x_i, w_i; x_o, w_o) per channel, 1/((scene unit)² sr); 0 below the horizons.
@@ -89,12 +96,9 @@ class FullGeometry:
         import mitsuba as mi
 
         entry, net = self.start.end(at, active), self._network
-        features = [*self._end(entry), *pair_features(self.frame, exit.side, entry)]
+        columns = side_features(self.frame, entry)
+        features = [*columns, *self.alpha.units(columns), *pair_features(self.frame, exit.side, entry)]
         f = mi.Spectrum(net.rest(net.activation(net.first(1, features) + net.vector(exit.hidden))))
+        f += mi.Spectrum(exit.h) + mi.Spectrum(self._h(columns))
         S_0 = self.start(exit.side, entry, active)
         return dr.select(active, S_0 * dr.exp(BOUND * dr.tanh(f / BOUND)), 0)
-
-    def _end(self, side: Side) -> list[Any]:
-        """Features of one end, and what even light makes of them."""
-        columns = side_features(self.frame, side)
-        return [*columns, *self.alpha.units(columns)]

@@ -26,14 +26,18 @@ from halfspace_sss.neural.store import load_weights, save_weights
 from halfspace_sss.neural.trained import weights_folder
 
 __all__ = [
-    "CENTRES", "CHECKSUMS", "EVEN", "KIND", "Learnt", "TURNS", "add_flow", "assemble", "find_weights", "load", "save",
-    "start_checksums", "start_of", "trained", "weights_name",
+    "CENTRES", "CHECKSUMS", "ENDS", "EVEN", "KIND", "Learnt", "TURNS", "add_flow", "assemble", "find_weights", "load",
+    "save", "start_checksums", "start_of", "trained", "weights_name",
 ]  # fmt: skip
 
 KIND = "full_geometry"
 CHECKSUMS = "start_checksums"  # of a record
-S_LAYERS, ALPHA_LAYERS, PATCH_LAYERS, FLOW_LAYERS = ("W_", "b_"), ("A_", "a_"), ("V_", "c_"), ("F_", "h_")
-CENTRES, EVEN, TURNS = "centres", "even", "turns"
+CENTRES, EVEN, TURNS, ENDS = "centres", "even", "turns", "Q"
+S_LAYERS, ALPHA_LAYERS, PATCH_LAYERS, FLOW_LAYERS = ("W_", "b_", ENDS), ("A_", "a_"), ("V_", "c_"), ("F_", "h_")
+NEEDED = (
+    (EVEN, "even light must be learnt"), (TURNS, "turns of what surrounds a point must be known"),
+    (ENDS, "functions of ends must be solved for"),
+)  # fmt: skip
 
 
 class Learnt(NamedTuple):
@@ -96,7 +100,7 @@ def _trained(path: Path) -> tuple[Identity, dict[str, np.ndarray], dict[str, Any
     if record.get("reflections") != REFLECTIONS:
         known = f"reflections must be {REFLECTIONS}, got {record.get('reflections')}"
         raise ValueError(f"{path.with_suffix('.json')}: {known}: of another version, to be trained again")
-    for name, what in ((EVEN, "even light must be learnt"), (TURNS, "turns of what surrounds a point must be known")):
+    for name, what in NEEDED:
         if name not in arrays:
             raise ValueError(f"{path}: {what}, got none: of another version, to be trained again")
     try:

@@ -14,6 +14,7 @@ import torch
 
 from full_geometry.features import n_pair
 from full_geometry.learning.device import device_of_walks, tensor
+from full_geometry.learning.ends import Ends
 from full_geometry.learning.learner import (
     Correction,
     EvenLight,
@@ -22,17 +23,20 @@ from full_geometry.learning.learner import (
     mean_likelihood,
     patch_likelihood,
 )
-from full_geometry.learning.pairs import ENOUGH, Pairs
+from full_geometry.learning.pairs import ENOUGH, Pairs, PairSource
 from full_geometry.neural_shape.storing import KIND as SHAPES
 from full_geometry.patches import Patches
 from halfspace_sss.checks import check_choice, check_count, check_interval
 from halfspace_sss.interface.model import models
 from halfspace_sss.neural.training import checkpoint
 
-__all__ = ["ALPHA_HIDDEN", "STANDARD", "Fitting", "Recipe"]
+__all__ = ["ALPHA_HIDDEN", "PROPOSED", "STANDARD", "Fitting", "Recipe"]
 
 BETAS, CLIP, LAST_RATE, WARM_UP = (0.9, 0.99), 1.0, 0.01, 100
 AVERAGE = 0.998  # of the numbers, each step
+PROPOSED = 2  # proposals for a walk that is kept
+SOLVED = 0.5  # chunks of proposals, of those of a training, by which functions of ends are solved for
+BEYOND = 2**30  # number of the first of these chunks
 BLOCK = 4096  # pairs whose layers stay in the cache
 LEAST = 0.05  # chance of a proposal: f moves while the chunk is used
 PATCH_HIDDEN, PATCH_BATCH = (64, 32), 1024
@@ -109,6 +113,7 @@ class Fitting:
         if patches is not None:
             parts["patches"] = PatchLogits(self.n_side, patches.areas, PATCH_HIDDEN, seed)
         self.device = device_of_walks()
+        self.ends = Ends(channels, self.n_side, self.device)
         self.modules = torch.nn.ModuleDict(parts).to(self.device)
         self.average = copy.deepcopy(self.modules)
         self.parameters = list(self.modules.parameters())
@@ -149,6 +154,8 @@ class Fitting:
         n_x, n_y = max(T.shape[1] // batch, 1), max(W.shape[1] // batch, 1)
         kept, n_even = T.shape[1] / walks.drawn, max(even.shape[1] // n_x, 1)
         T, W = T * self.scale, W * self.scale
+        with torch.no_grad(), one_thread():
+            self.ends.add_walks(*walks.of_random_exits(x, T))
         with one_thread():
             for k in range(self.recipe.reuse):
                 back = k % 2 == 1
@@ -160,12 +167,28 @@ class Fitting:
                         loss = loss + self._patch_loss(x[:, a], T[:, a], patch[a])
                     self._advance(loss, steps)
 
+    def solve(self, source: PairSource, chunks: int, seed: int) -> None:
+        """Find what the averaged fit lacks of exits and entries, see `Ends`, by proposals that it has not seen.
+
+        Args:
+            source: of the proposals.
+            chunks: of the training, half as many of which are made.
+            seed: of the training.
+        """
+        for k in range(max(round(SOLVED * chunks), 1)):
+            made = source.proposed(PROPOSED * self.recipe.chunk, (seed, BEYOND + k))
+            y, W = self._tensor(made.features), self._tensor(made.values)
+            with torch.no_grad(), one_thread():
+                f = [self._f(part, of=self.average) for part in y.split(BLOCK, dim=1)]
+                self.ends.add_proposals(y, W * self.scale * torch.exp(torch.cat(f, dim=1)))
+
     def _tensor(self, array: np.ndarray) -> torch.Tensor:
         return tensor(array, self.device)
 
-    def _f(self, x: torch.Tensor, back: bool = False) -> torch.Tensor:
+    def _f(self, x: torch.Tensor, back: bool = False, of: torch.nn.ModuleDict | None = None) -> torch.Tensor:
         """Of features of pairs: S knows what even light makes of both ends."""
-        return self.modules["S"](self.modules["alpha"].joined(x), back)
+        of = of or self.modules
+        return of["S"](of["alpha"].joined(x), back)
 
     def _worthy(self, proposals: Pairs, order: np.random.Generator) -> tuple[torch.Tensor, torch.Tensor]:
         """Features and values of some proposals, kept by chance as walks are: by W exp f as the fit has it now."""
@@ -183,8 +206,9 @@ class Fitting:
         return patch_likelihood(self.modules["patches"](x[: self.n_side, :PATCH_BATCH]), T, patch[:PATCH_BATCH])
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """The averaged numbers of all networks by name."""
-        return {name: value for module in self.average.values() for name, value in module.arrays().items()}
+        """The averaged numbers of all networks by name, and what is solved for beside them."""
+        found = {name: value for module in self.average.values() for name, value in module.arrays().items()}
+        return {**found, "Q": self.ends.solved()}
 
     def _advance(self, loss: torch.Tensor, steps: int | None) -> None:
         at = min(self.step / max(steps, 1), 1.0) if steps is not None else 0.0
@@ -204,7 +228,7 @@ class Fitting:
     def _tensors(self) -> dict[str, torch.Tensor]:
         """Everything the next step depends on, by name; changing the tensors in place changes the fit."""
         means = {f"{k}.mean": mean.data for k, mean in enumerate(self.average.parameters())}
-        scales = {"scale": self.scale, "even_scale": self.even_scale}
+        scales = {"scale": self.scale, "even_scale": self.even_scale, **self.ends.tensors()}
         return {**scales, **checkpoint.tensors_of(self.adam, self.parameters), **means}
 
     def save(self, path: Path, done: int, history: list) -> None:

@@ -57,15 +57,25 @@ class Pairs(NamedTuple):
     drawn: int
     faces: np.ndarray | None = None  # where walks left
     even: Even | None = None  # of some of the walks
+    random: tuple[np.ndarray, int] | None = None  # where not all exits are random: which are, and how many were drawn
+
+    def of_random_exits(self, x: Any, values: Any) -> tuple[Any, Any, int]:
+        """Columns of features and values of random exits alone, and how many were drawn."""
+        if self.random is None:
+            return x, values, self.drawn
+        places, drawn = self.random
+        return x[:, places], values[:, places], drawn
 
 
 def shuffled(parts: list[Pairs], order: np.random.Generator) -> Pairs:
-    """The pairs of several sources as those of one: exits then are distributed as those of all together."""
+    """The pairs of several sources, the last of random exits, as those of one: exits then are as those of all."""
     features = np.concatenate([part.features for part in parts], axis=1)
     values = np.concatenate([part.values for part in parts], axis=1)
     places = order.permutation(values.shape[1])
     faces = None if parts[0].faces is None else np.concatenate([part.faces for part in parts])[places]
-    found = Pairs(features[:, places], values[:, places], sum(part.drawn for part in parts), faces)
+    random = np.flatnonzero(places >= values.shape[1] - parts[-1].values.shape[1]), parts[-1].drawn
+    drawn = sum(part.drawn for part in parts)
+    found = Pairs(features[:, places], values[:, places], drawn, faces, random=random)
     if parts[0].even is None:
         return found
     exits, T = (np.concatenate(columns, axis=1) for columns in zip(*(part.even for part in parts)))

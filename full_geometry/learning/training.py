@@ -18,7 +18,7 @@ from full_geometry import storing
 from full_geometry.features import n_pair, n_side
 from full_geometry.identity import frame_of, identify
 from full_geometry.learning.even_light import trusted
-from full_geometry.learning.fitting import STANDARD, Fitting, Recipe
+from full_geometry.learning.fitting import PROPOSED, STANDARD, Fitting, Recipe
 from full_geometry.learning.model_errors import ModelError, measure
 from full_geometry.learning.pairs import Pairs, PairSource, Proposals
 from full_geometry.learning.radiance import Reference, reference
@@ -40,8 +40,7 @@ VALIDATIONS = 4  # in a run
 EXITS, WALKS, SAMPLES = 256, 2048, 512  # of a validation
 CHECKPOINT_EVERY = 15.0  # seconds
 PLAN = "plan.json"
-PROPOSED = 2  # proposals for a walk that is kept
-LOOP_SHARE = 0.9  # of the seconds for data and steps, the rest for the pilot, the truth and the errors
+LOOP_SHARE = 0.83  # of the seconds for data and steps, the rest for pilot, solving and errors
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,9 +82,8 @@ def train(
 ) -> Trained:
     """Learn S of an object and write its weights.
 
-    The number of chunks is planned once, from the time of the first one, so that a run that was killed and is started
-    again with the same `work` ends with the same weights; a machine that slows down on the way takes longer. The data
-    of a chunk are made beside the steps on the one before it.
+    The number of chunks is planned once, by the time of the first one, so that a run that was killed and goes on with
+    the same `work` ends with the same weights. The data of a chunk are made beside the steps on the one before it.
 
     Args:
         shape: a closed Mitsuba shape, a scene, or a `Subject`, which has its medium.
@@ -101,7 +99,7 @@ def train(
         work: folder for unfinished work.
         camera: a `CameraWalks`, whose walks join those of random exits.
         progress: called with (what, done, total).
-        start: model that it begins with, `neural_shape` or a half-space model, with its rate; by default the recipe's.
+        start: that it begins with, `neural_shape` or a half-space model, with its rate; by default the recipe's.
 
     Raises:
         ValueError: an argument is out of range, or `work` is of another run; nothing has been traced then.
@@ -142,6 +140,7 @@ def train_by_cpu(
     run._prepare()
     while run.done < run.total:
         run._chunk(seconds, time.process_time)
+    run.fitting.solve(run.source, run.done, seed)
     spent = time.process_time() - began
     found = run._judged(reference(subject, EXITS, WALKS, seed), SAMPLES)
     record = run._record(found, spent)
@@ -204,6 +203,7 @@ class _Run:
                 saved = time.monotonic()
             if progress:
                 progress(what, self.done, self.total)
+        self.fitting.solve(self.source, self.done, self.seed)
         found = self._judged(truth, 2 * WALKS)
         spent = time.monotonic() - started
         self._save_camera()

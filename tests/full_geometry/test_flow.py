@@ -19,7 +19,7 @@ pytest.importorskip("zuko")
 from waxen import random_layers, random_patches, wax_bunny  # noqa: E402
 
 from full_geometry.entries import LearntProposals  # noqa: E402
-from full_geometry.features import Side, n_pair, n_side  # noqa: E402
+from full_geometry.features import Side, Terms, n_pair, n_side  # noqa: E402
 from full_geometry.first_event import first_event  # noqa: E402
 from full_geometry.flow.chart import Chart  # noqa: E402
 from full_geometry.flow.conditional import ConditionalFlow  # noqa: E402
@@ -30,7 +30,7 @@ from full_geometry.identity import identify  # noqa: E402
 from full_geometry.model import PreparedExit  # noqa: E402
 from full_geometry.patch_table import PatchTable  # noqa: E402
 from full_geometry.patches import cluster, mesh_faces  # noqa: E402
-from full_geometry.storing import CENTRES, CHECKSUMS, EVEN, TURNS, add_flow, load, save  # noqa: E402
+from full_geometry.storing import CENTRES, CHECKSUMS, ENDS, EVEN, TURNS, add_flow, load, save  # noqa: E402
 from full_geometry.subject import SurfacePoint  # noqa: E402
 from halfspace_sss.rendering.transport.plane import Exit  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
@@ -221,7 +221,7 @@ def test_weights_with_a_flow_are_drawn_from_by_it(sampler: FlowSampler, tmp_path
     arrays = {"W_0": rng.standard_normal((3, n)), "b_0": np.zeros(3), CENTRES: cluster(subject, frame, N_PATCHES)}
     arrays |= {EVEN: np.ones((2, 3)), **random_layers(rng, "A", "a", [n_side(3), 5, 6])}
     arrays = {name: value.astype(np.float16) for name, value in {**arrays, **sampler.patches.weights}.items()}
-    arrays[TURNS] = frame.around.turns
+    arrays |= {TURNS: frame.around.turns, ENDS: np.zeros((3, len(Terms.of(n_side(3)).rows)))}
     path = save(tmp_path, identify(subject), arrays, {"recipe": {"start": "better_dipole"}, CHECKSUMS: []})
     assert load(path, subject).flow is None
     add_flow(path, sampler)

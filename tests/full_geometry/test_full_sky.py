@@ -14,6 +14,7 @@ mi = pytest.importorskip("mitsuba")
 torch = pytest.importorskip("torch")
 
 from full_geometry import storing  # noqa: E402
+from full_geometry.features import Quadratic, n_side  # noqa: E402
 from full_geometry.first_event import first_event  # noqa: E402
 from full_geometry.learning import training  # noqa: E402
 from full_geometry.learning.even_light import trusted  # noqa: E402
@@ -22,6 +23,7 @@ from full_geometry.learning.fitting import ALPHA_HIDDEN, Recipe  # noqa: E402
 from full_geometry.learning.model_errors import EVEN_SKY, LIGHTS, errors_of  # noqa: E402
 from full_geometry.learning.radiance import reference  # noqa: E402
 from full_geometry.learning.training import Trained, train  # noqa: E402
+from full_geometry.model import BOUND  # noqa: E402
 from full_geometry.scene import LearntTransport  # noqa: E402
 from full_geometry.subject import Subject  # noqa: E402
 from halfspace_sss import rendering  # noqa: E402
@@ -77,19 +79,31 @@ def test_S_of_training_and_of_images_know_the_same_of_even_light(trained: Traine
     with torch.no_grad():
         for p in networks.parameters():
             p.normal_(std=0.2, generator=generator_)
-    model = storing.assemble(subject, run.frame, run.start, run.arrays()).model
+    arrays = run.arrays()
+    arrays[storing.ENDS] = 0.01 * np.random.default_rng(2).standard_normal(arrays[storing.ENDS].shape)
+    model = storing.assemble(subject, run.frame, run.start, arrays).model
     rng = generator(mi, n, pass_seed(6))
     exits, entries = subject.random_points(rng), subject.random_points(rng)
     pairs = run.source._columns(exits, entries, mi.Float(1) + 0 * entries.p.x)
     with torch.no_grad():
         joined = networks["alpha"].joined(torch.from_numpy(pairs.features))
-        f = networks["S"](joined).numpy()
-    assert f.std() > 0.1 and len(joined) == len(pairs.features) + 2 * ALPHA_HIDDEN[-1]
+        g = BOUND * np.arctanh(networks["S"](joined).numpy() / BOUND)
+    ends = [[mi.Float(v) for v in side] for side in np.split(pairs.features[: 2 * n_side(3)], 2)]
+    h = sum(np.array([v.numpy() for v in Quadratic(arrays[storing.ENDS], n_side(3))(side)]) for side in ends)
+    f = BOUND * np.tanh((g + h) / BOUND)
+    assert h.std() > 0.02 and f.std() > 0.1 and len(joined) == len(pairs.features) + 2 * ALPHA_HIDDEN[-1]
     S = np.array(model.S(model.prepare(exits), entries))
     assert np.allclose(S, pairs.values * np.exp(f), rtol=0.02, atol=1e-4 * S.max())  # weights in half precision
 
 
-@pytest.mark.parametrize("missing, what", [(storing.EVEN, "even light must be learnt"), (storing.TURNS, "turns of")])
+MISSING = [
+    (storing.EVEN, "even light must be learnt"),
+    (storing.TURNS, "turns of"),
+    (storing.ENDS, "functions of ends"),
+]
+
+
+@pytest.mark.parametrize("missing, what", MISSING)
 def test_weights_of_before_it_was_known_are_refused_by_name(
     trained: Trained, missing: str, what: str, tmp_path: Path
 ) -> None:
