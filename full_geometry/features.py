@@ -116,7 +116,7 @@ class Terms(NamedTuple):
 
 
 class Quadratic:
-    """h = x_h . Q x of an end, x = (1, features), x_h its heads.
+    """h = l . x + x_h . Q x_h of an end, x = (1, features), x_h those of them that are no octaves.
 
     Args:
         numbers: (outputs, products) of `Terms`.
@@ -124,18 +124,18 @@ class Quadratic:
     """
 
     def __init__(self, numbers: np.ndarray, n: int) -> None:
-        self.terms = Terms.of(n)
-        Q = self.terms.matrix(numbers.astype(np.float32))
-        self.outputs = len(Q)
-        Q = Q.reshape(-1, n + 1)
-        self._product = Perceptron([Q[:, 1:]], [Q[:, 0]])
+        terms = Terms.of(n)
+        matrix, self.heads = terms.matrix(numbers.astype(np.float32)), terms.heads[1:]
+        line, square = matrix[:, 0], matrix[:, 1:, self.heads].reshape(-1, len(self.heads))
+        self._line = Perceptron([line[:, 1:]], [line[:, 0]])
+        self._square = Perceptron([square], [np.zeros(len(square), np.float32)])
 
     def __call__(self, columns: list[Any]) -> list[Any]:
         """Of the features of a side."""
-        heads = [None, *(columns[k - 1] for k in self.terms.heads[1:])]
-        y, m = self._product(columns), len(heads)
-        rows = (y[k * m : (k + 1) * m] for k in range(self.outputs))
-        return [sum((a * b for a, b in zip(heads[1:], row[1:])), row[0]) for row in rows]
+        heads = [columns[k - 1] for k in self.heads]
+        y = self._square(heads)
+        rows = (y[k : k + len(heads)] for k in range(0, len(y), len(heads)))
+        return [sum((a * b for a, b in zip(heads, row)), first) for row, first in zip(rows, self._line(columns))]
 
 
 def _octaves(x: Any) -> list[Any]:
