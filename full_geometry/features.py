@@ -108,7 +108,7 @@ class Terms(NamedTuple):
         rows, cols = np.append(np.zeros(n + 1, int), 1 + rows), np.append(np.arange(n + 1), heads[1:][cols])
         return cls(heads, rows, cols)
 
-    def matrix(self, numbers: Any) -> Any:
+    def matrix(self, numbers: np.ndarray) -> np.ndarray:
         """Numbers (..., products) as matrices (..., heads, 1 + features)."""
         found = np.zeros((*numbers.shape[:-1], len(self.heads), int(self.cols.max()) + 1), numbers.dtype)
         found[..., self.rows, self.cols] = numbers

@@ -80,9 +80,8 @@ class FullGeometry:
     def prepare(self, at: SurfacePoint, active: Any = True) -> PreparedExit:
         """The exit's side, for as many entries as are asked for."""
         side, net = self.start.end(at, active), self._network
-        columns = side_features(self.frame, side)
-        hidden = net.numbers(net.first(0, [*columns, *self.alpha.units(columns)], biased=True))
-        return PreparedExit(side, hidden, self._h(columns))
+        features, h = self._end(side)
+        return PreparedExit(side, net.numbers(net.first(0, features, biased=True)), h)
 
     def S(self, exit: PreparedExit, at: SurfacePoint, active: Any = True) -> Any:
         """S(x_i, w_i; x_o, w_o) per channel, 1/((scene unit)² sr); 0 below the horizons.
@@ -96,9 +95,14 @@ class FullGeometry:
         import mitsuba as mi
 
         entry, net = self.start.end(at, active), self._network
-        columns = side_features(self.frame, entry)
-        features = [*columns, *self.alpha.units(columns), *pair_features(self.frame, exit.side, entry)]
+        features, h = self._end(entry)
+        features += pair_features(self.frame, exit.side, entry)
         f = mi.Spectrum(net.rest(net.activation(net.first(1, features) + net.vector(exit.hidden))))
-        f += mi.Spectrum(exit.h) + mi.Spectrum(self._h(columns))
+        f += mi.Spectrum(exit.h) + mi.Spectrum(h)
         S_0 = self.start(exit.side, entry, active)
         return dr.select(active, S_0 * dr.exp(BOUND * dr.tanh(f / BOUND)), 0)
+
+    def _end(self, side: Side) -> tuple[list[Any], list[Any]]:
+        """Features of one end and what even light makes of them; h."""
+        columns = side_features(self.frame, side)
+        return [*columns, *self.alpha.units(columns)], self._h(columns)

@@ -177,10 +177,9 @@ class Fitting:
         """
         for k in range(max(round(SOLVED * chunks), 1)):
             made = source.proposed(PROPOSED * self.recipe.chunk, (seed, BEYOND + k))
-            y, W = self._tensor(made.features), self._tensor(made.values)
             with torch.no_grad(), one_thread():
-                f = [self._f(part, of=self.average) for part in y.split(BLOCK, dim=1)]
-                self.ends.add_proposals(y, W * self.scale * torch.exp(torch.cat(f, dim=1)))
+                y, _, V = self._light(made, self.average)
+                self.ends.add_proposals(y, V)
 
     def _tensor(self, array: np.ndarray) -> torch.Tensor:
         return tensor(array, self.device)
@@ -190,12 +189,17 @@ class Fitting:
         of = of or self.modules
         return of["S"](of["alpha"].joined(x), back)
 
+    def _light(self, proposals: Pairs, of: torch.nn.ModuleDict) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Features and values W of proposals, and their light W exp f by some networks, scaled."""
+        y, W = self._tensor(proposals.features), self._tensor(proposals.values)
+        f = [self._f(part, of=of) for part in y.split(BLOCK, dim=1)]
+        return y, W, W * self.scale * torch.exp(torch.cat(f, dim=1))
+
     def _worthy(self, proposals: Pairs, order: np.random.Generator) -> tuple[torch.Tensor, torch.Tensor]:
         """Features and values of some proposals, kept by chance as walks are: by W exp f as the fit has it now."""
-        y, W = self._tensor(proposals.features), self._tensor(proposals.values)
         with torch.no_grad(), one_thread():
-            f = [self._f(part) for part in y.split(BLOCK, dim=1)]
-            value = (W * self.scale * torch.exp(torch.cat(f, dim=1))).mean(dim=0)
+            y, W, V = self._light(proposals, self.modules)
+            value = V.mean(dim=0)
             p = (value / (ENOUGH * value.mean().clamp_min(1e-30))).clamp(LEAST, 1.0)
             kept = torch.nonzero(self._tensor(order.random(len(p), np.float32)) < p)[:, 0]
             return y[:, kept], W[:, kept] * (len(kept) / len(p)) / p[kept]
