@@ -127,8 +127,8 @@ class Quadratic:
         terms = Terms.of(n)
         matrix, self.heads = terms.matrix(numbers.astype(np.float32)), terms.heads[1:]
         line, square = matrix[:, 0], matrix[:, 1:, self.heads].reshape(-1, len(self.heads))
-        self._line = Perceptron([line[:, 1:]], [line[:, 0]])
-        self._square = Perceptron([square], [np.zeros(len(square), np.float32)])
+        self._line = Perceptron([line[:, 1:]], [line[:, 0]], looped=True)
+        self._square = Perceptron([square], [np.zeros(len(square), np.float32)], looped=True)
 
     def __call__(self, columns: list[Any]) -> list[Any]:
         """Of the features of a side."""

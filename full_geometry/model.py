@@ -71,7 +71,7 @@ class FullGeometry:
     def _network(self) -> Perceptron:
         """The first layer in two parts, exit and the rest."""
         split = (self.weights["W_0"].shape[1] - n_pair(len(self.subject.media))) // 2
-        return Perceptron.named(self.weights, "W", "b", splits=[split])
+        return Perceptron.named(self.weights, "W", "b", splits=[split], looped=True)
 
     @functools.cached_property
     def _h(self) -> Quadratic:

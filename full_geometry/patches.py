@@ -155,7 +155,9 @@ class PatchSampler:
         """Layers with the log of the areas in the last bias."""
         last, areas = f"c_{len(self.weights) // 2 - 1}", self.patches.areas
         shares = np.log(np.maximum(areas / areas.sum(), 1e-30)).astype(np.float32)
-        return Perceptron.named({**self.weights, last: self.weights[last].astype(np.float32) + shares}, "V", "c")
+        return Perceptron.named(
+            {**self.weights, last: self.weights[last].astype(np.float32) + shares}, "V", "c", looped=True
+        )
 
     def prepare(self, exit: Side) -> PatchWeights:
         """Weights of all patches for an exit."""

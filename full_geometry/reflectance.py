@@ -48,7 +48,8 @@ class Reflectance:
         """All layers but the last, and that."""
         n = len(self.weights) // 2
         layers = [[self.weights[f"{name}_{k}"] for k in range(n)] for name in ("A", "a")]
-        return Perceptron(*(arrays[:-1] for arrays in layers)), Perceptron(*(arrays[-1:] for arrays in layers))
+        parts = ([arrays[:-1] for arrays in layers], [arrays[-1:] for arrays in layers])
+        return tuple(Perceptron(*part, looped=True) for part in parts)
 
     def units(self, columns: list[Any]) -> list[Any]:
         """What the last layer is told of a side with these features."""

@@ -70,11 +70,11 @@ class AlphaP:
 
     @functools.cached_property
     def _log_alpha(self) -> Perceptron:
-        return Perceptron.named(self.weights, "A", "a")
+        return Perceptron.named(self.weights, "A", "a", looped=True)
 
     @functools.cached_property
     def _shares(self) -> Perceptron:
-        return Perceptron.named(self.weights, "P", "p")
+        return Perceptron.named(self.weights, "P", "p", looped=True)
 
     def prepare(self, at: SurfacePoint, active: Any = True) -> PreparedAlphaP:
         """alpha and the weights of patches of an exit."""

@@ -34,7 +34,7 @@ class ConditionalFlow:
 
     @functools.cached_property
     def _network(self) -> Perceptron:
-        return Perceptron.named(self.weights, "F", "h", activation=relu)
+        return Perceptron.named(self.weights, "F", "h", activation=relu, looped=True)
 
     def _splines(self, x: Sequence[Any], context: Sequence[Any]) -> list[Any]:
         return self._network([*x, *context])

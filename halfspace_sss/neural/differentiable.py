@@ -10,7 +10,7 @@ from halfspace_sss.arrays import broadcast_query, library
 from halfspace_sss.interface.query import Query
 from halfspace_sss.neural.features import medium_features, symmetric_features, travel
 from halfspace_sss.neural.hypernetwork import Hypernetwork
-from halfspace_sss.neural.perceptron import Perceptron, silu
+from halfspace_sss.neural.perceptron import Perceptron, cooperative, silu
 from halfspace_sss.neural.universal import load_hypernetwork, shipped_weights
 from halfspace_sss.physics.backbone import backbone_shape, length_scale
 from halfspace_sss.physics.fresnel import F_t
@@ -93,7 +93,7 @@ def _drjit_network(hyper: Hypernetwork, c: list, features: list) -> Any:
         parts.append(dr.gather(kind, numbers, index(np.arange(j) + at + i * j)))
         at += i * j + j
     zero = dr.zeros(kind, max(dr.width(f) for f in features))  # cooperative vectors do not sum over what they broadcast
-    x = Perceptron.vector([f + zero for f in features])
+    x = cooperative([f + zero for f in features])
     parts = [(dr.tensor_t(x.type) if k % 2 == 0 else x.type)(part) for k, part in enumerate(parts)]
     views = nn.pack(*parts, layout="training")[-len(parts) :]
     for k in range(len(hyper.shapes)):

@@ -123,36 +123,4 @@ class Network:
         return Perceptron([W.T for W in self.matrices], self.biases, self.activation.drjit)
 
     def _drjit(self, features: Sequence[Any]) -> Any:
-        """By cooperative vectors, see `Perceptron`; in double precision, which they lack, by loops."""
-        import drjit as dr
-
-        kind = dr.expr_t(*features)
-        if dr.type_v(kind) == dr.VarType.Float64:
-            return self._drjit_loops(features, kind)
         return self._perceptron(features)[0]
-
-    def _drjit_loops(self, features: Sequence[Any], kind: type) -> Any:
-        """One symbolic loop over the outputs of each layer and one over its inputs: slow, in any precision."""
-        import drjit as dr
-
-        UInt32 = dr.uint32_array_t(kind)
-        h = dr.alloc_local(kind, len(features))
-        for k, f in enumerate(features):
-            h[UInt32(k)] = f
-        for k, (W, b) in enumerate(zip(self.matrices, self.biases)):
-            n_in, n_out = W.shape
-            weights, bias, out = kind(W.T.ravel()), kind(b), dr.alloc_local(kind, n_out)
-
-            def sum_inputs(j: Any, h: Any = h, n_in: int = n_in, weights: Any = weights, bias: Any = bias) -> Any:
-                return dr.while_loop(
-                    (UInt32(0), dr.gather(kind, bias, j)), lambda i, _: i < n_in,
-                    lambda i, a: (i + 1, dr.fma(dr.gather(kind, weights, j * n_in + i), h[i], a)),
-                )[1]  # fmt: skip
-
-            def output(j: Any, out: Any, last: bool = k == len(self.matrices) - 1, rows: Any = sum_inputs) -> tuple:
-                a = rows(j)
-                out[j] = a if last else self.activation.drjit(a)
-                return j + 1, out
-
-            _, h = dr.while_loop((UInt32(0), out), lambda j, _, n=n_out: j < n, output)
-        return h[UInt32(0)]

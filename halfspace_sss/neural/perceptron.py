@@ -1,18 +1,23 @@
-"""The one way by which perceptrons are evaluated in Dr.Jit: cooperative vectors, inside of the kernel that asks.
+"""The one way by which perceptrons are evaluated in Dr.Jit, inside of the kernel that asks.
 
-CUDA has them in half precision only, so there the layers, and nothing else, are in half precision; LLVM keeps single.
+By cooperative vectors: in single precision on LLVM, in half precision on CUDA, which has no other. In double precision,
+which these lack, layers are loops over outputs. So they are on CUDA where a network says so: OptiX takes 5 to 10 s for
+a product in the path tracer of a model that is large by itself. Loops are slower and have no derivatives; where these
+are asked for it is cooperative vectors.
 """
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-__all__ = ["Perceptron", "hard_swish", "relu", "silu"]
+__all__ = ["Perceptron", "cooperative", "hard_swish", "relu", "silu"]
 
 MOST_IN_HALF = 256.0  # of an input, which are of order one: a layer with weights of order one stays below 65504
+PACKET = 4  # numbers of a row that loops read at once
 
 
 def hard_swish(x: Any) -> Any:
@@ -47,8 +52,9 @@ class Perceptron:
     Args:
         matrices: W_k (outputs, inputs).
         biases: b_k (outputs,).
-        activation: a, of a cooperative vector.
+        activation: a, of a vector.
         splits: columns of W_0 at which its parts begin, but for the first part.
+        looped: layers are loops on CUDA.
     """
 
     def __init__(
@@ -57,10 +63,12 @@ class Perceptron:
         biases: Sequence[np.ndarray],
         activation: Callable[[Any], Any] = hard_swish,
         splits: Sequence[int] = (),
+        looped: bool = False,
     ) -> None:
+        self.looped = looped
         self.parts = np.split(np.asarray(matrices[0]), list(splits), axis=1)
         self.matrices, self.biases, self.activation = [*self.parts, *matrices[1:]], list(biases), activation
-        self._packed: dict[type, tuple[list, list]] = {}  # by type of array, so that of each backend
+        self._packed: dict[type, tuple[list, list]] = {}  # by type of vector, so of each backend
 
     @classmethod
     def named(cls, weights: Mapping[str, np.ndarray], matrix: str, bias: str, **more: Any) -> Perceptron:
@@ -74,53 +82,113 @@ class Perceptron:
         return self.rest(self.activation(first)) if len(self.biases) > 1 else self.numbers(first)
 
     def first(self, part: int, x: Sequence[Any], biased: bool = False) -> Any:
-        """U_part x, with b_0 if it is `biased`, as a cooperative vector."""
-        from drjit import nn
-
+        """U_part x, with b_0 if it is `biased`, as a vector."""
         x = self.vector(x)
-        matrices, biases = self._views(x.type)
-        return nn.matvec(matrices[part], x, biases[0]) if biased else nn.matvec(matrices[part], x)
+        matrices, biases = self._views(x)
+        return _product(matrices[part], x, biases[0] if biased else None)
 
     def rest(self, x: Any) -> list[Any]:
-        """The outputs in single precision, of a(x_1) as a cooperative vector; one layer follows at least."""
-        from drjit import nn
-
-        matrices, biases = self._views(x.type)
+        """The outputs, of a(x_1) as a vector; one layer follows at least."""
+        matrices, biases = self._views(x)
         layers = list(zip(matrices[len(self.parts) :], biases[1:]))
         for k, (W, b) in enumerate(layers):
-            x = nn.matvec(W, self.activation(x) if k else x, b)
+            x = _product(W, self.activation(x) if k else x, b)
         return self.numbers(x)
 
-    @staticmethod
-    def vector(x: Sequence[Any]) -> Any:
-        """Numbers as a cooperative vector in the precision of the layers: half on CUDA, or where numbers have it."""
+    def vector(self, x: Sequence[Any]) -> Any:
+        """Numbers as a vector that layers are asked with."""
         import drjit as dr
-        from drjit import nn
 
         kind = dr.expr_t(*x)
-        half = dr.type_v(kind) == dr.VarType.Float16 or dr.backend_v(kind) == dr.JitBackend.CUDA
-        if not half:
-            return nn.CoopVec(*(dr.float32_array_t(kind)(v) for v in x))
-        return nn.CoopVec(*(dr.float16_array_t(kind)(dr.clip(v, -MOST_IN_HALF, MOST_IN_HALF)) for v in x))
+        by_loops = self.looped and dr.backend_v(kind) == dr.JitBackend.CUDA and not any(dr.grad_enabled(v) for v in x)
+        if by_loops or dr.type_v(kind) == dr.VarType.Float64:
+            return _kin(kind, "X")([kind(v) for v in x])
+        return cooperative(x)
 
     @staticmethod
     def numbers(x: Any) -> list[Any]:
-        """A cooperative vector as numbers in single precision."""
+        """A vector as numbers, in single precision at least."""
         import drjit as dr
 
-        single = dr.float32_array_t(x.type)
-        return [single(v) for v in x]
+        kind = x.type if hasattr(x, "type") else dr.value_t(type(x))
+        precise = kind if dr.type_v(kind) == dr.VarType.Float64 else dr.float32_array_t(kind)
+        return [precise(v) for v in x]
 
-    def _views(self, inner: type) -> tuple[list, list]:
-        """Matrices and biases as Dr.Jit wants them, in the precision and on the backend of a type of array."""
-        import drjit as dr
-        from drjit import nn
+    def _views(self, x: Any) -> tuple[list, list]:
+        """Matrices and biases for products with a vector."""
+        key = x.type if hasattr(x, "type") else type(x)
+        if key not in self._packed:
+            make = _packed if hasattr(x, "type") else _rows
+            self._packed[key] = make(key, self.matrices, self.biases)
+        return self._packed[key]
 
-        if inner not in self._packed:
-            half, tensor = dr.type_v(inner) == dr.VarType.Float16, dr.tensor_t(inner)
-            precision, n = np.float16 if half else np.float32, len(self.matrices)
-            parts = [tensor(np.ascontiguousarray(W, dtype=precision)) for W in self.matrices]
-            parts += [inner(np.ascontiguousarray(b, dtype=precision)) for b in self.biases]
-            views = nn.pack(*parts)[-len(parts) :]
-            self._packed[inner] = list(views[:n]), list(views[n:])
-        return self._packed[inner]
+
+def cooperative(x: Sequence[Any]) -> Any:
+    """Numbers as a cooperative vector: in half precision on CUDA or where they have it, else in single precision."""
+    import drjit as dr
+    from drjit import nn
+
+    kind = dr.expr_t(*x)
+    half = dr.type_v(kind) == dr.VarType.Float16 or dr.backend_v(kind) == dr.JitBackend.CUDA
+    if not half:
+        return nn.CoopVec(*(dr.float32_array_t(kind)(v) for v in x))
+    return nn.CoopVec(*(dr.float16_array_t(kind)(dr.clip(v, -MOST_IN_HALF, MOST_IN_HALF)) for v in x))
+
+
+def _kin(kind: type, size: int | str) -> type:
+    """Arrays of so many lanes' numbers of a kind, X for any number of them."""
+    import drjit as dr
+
+    bits = {dr.VarType.Float16: "16", dr.VarType.Float64: "64"}.get(dr.type_v(kind), "")
+    return getattr(sys.modules[kind.__module__], f"Array{size}f{bits}")
+
+
+def _packed(inner: type, matrices: list[np.ndarray], biases: list[np.ndarray]) -> tuple[list, list]:
+    """As cooperative vectors of a kind of numbers want them."""
+    import drjit as dr
+    from drjit import nn
+
+    tensor, n = dr.tensor_t(inner), len(matrices)
+    precision = np.float16 if dr.type_v(inner) == dr.VarType.Float16 else np.float32
+    parts = [tensor(np.ascontiguousarray(W, dtype=precision)) for W in matrices]
+    parts += [inner(np.ascontiguousarray(b, dtype=precision)) for b in biases]
+    views = nn.pack(*parts)[-len(parts) :]
+    return list(views[:n]), list(views[n:])
+
+
+def _rows(vector: type, matrices: list[np.ndarray], biases: list[np.ndarray]) -> tuple[list, list]:
+    """As loops want them: rows filled up to packets."""
+    import drjit as dr
+
+    kind, found = dr.value_t(vector), []
+    precision = np.float64 if dr.type_v(kind) == dr.VarType.Float64 else np.float32
+    for W in matrices:
+        W = np.pad(W, ((0, 0), (0, -W.shape[1] % PACKET)))
+        found.append((len(W), kind(np.ascontiguousarray(W.ravel(), dtype=precision))))
+    return found, [kind(np.ascontiguousarray(b, dtype=precision)) for b in biases]
+
+
+def _product(W: Any, x: Any, bias: Any) -> Any:
+    """W x, with a bias if there is one."""
+    import drjit as dr
+    from drjit import nn
+
+    if hasattr(x, "type"):
+        return nn.matvec(W, x) if bias is None else nn.matvec(W, x, bias)
+    n, rows = W
+    kind = dr.value_t(type(x))
+    UInt32, Packet = dr.uint32_array_t(kind), _kin(kind, PACKET)
+    x = [*x, *[kind(0)] * (-len(x) % PACKET)]
+
+    def output(j: Any, out: Any) -> tuple:
+        total, k = kind(0) if bias is None else dr.gather(kind, bias, j), 0
+        for k in range(0, len(x), PACKET):
+            row = dr.gather(Packet, rows, j * (len(x) // PACKET) + k // PACKET)
+            for a, b in zip(row, x[k : k + PACKET]):
+                total = dr.fma(a, b, total)
+        out[j] = total
+        return j + 1, out
+
+    state = (UInt32(0), dr.alloc_local(kind, n))
+    _, out = dr.while_loop(state, lambda j, _: j < n, output, label="layer")
+    return _kin(kind, "X")([out[UInt32(j)] for j in range(n)])

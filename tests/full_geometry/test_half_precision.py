@@ -14,12 +14,12 @@ mi = pytest.importorskip("mitsuba")
 
 from full_geometry.neural_shape.storing import transport  # noqa: E402
 from full_geometry.subject import Subject  # noqa: E402
-from halfspace_sss.neural.perceptron import Perceptron  # noqa: E402
+from halfspace_sss.neural import perceptron  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
 MARBLE = Medium([2.19, 2.62, 3.0], [0.0021, 0.0041, 0.0071], 0.0, 1.5)
 N = 2**15
-SINGLE = Perceptron.vector
+SINGLE = perceptron.cooperative
 
 
 def in_half(x: Any) -> Any:
@@ -39,7 +39,7 @@ def test_the_network_of_all_shapes_is_off_by_less_than_its_noise(
     exit, entry = subject.random_points(rng), subject.random_points(rng)
     dr.eval(exit, entry)
     single = np.array(model.S(model.prepare(exit), entry), dtype=float)
-    monkeypatch.setattr(Perceptron, "vector", staticmethod(in_half))
+    monkeypatch.setattr(perceptron, "cooperative", in_half)
     half = np.array(model.S(model.prepare(exit), entry), dtype=float)
     off = np.abs(half / single - 1)
     assert np.isfinite(half).all() and half.min() > 0

@@ -11,7 +11,7 @@ pytest.importorskip("drjit")
 prepare_llvm()
 
 import drjit as dr  # noqa: E402
-from drjit.llvm.ad import Float, Float16  # noqa: E402
+from drjit.llvm.ad import Float, Float16, Float64  # noqa: E402
 
 from halfspace_sss.neural.perceptron import Perceptron, relu  # noqa: E402
 
@@ -46,6 +46,17 @@ def test_outputs_are_those_of_numpy(more: dict, activation: object) -> None:
     weights, x = layers(), inputs()
     found = Perceptron.named(weights, "W", "b", **more)([Float(row) for row in x])
     assert np.allclose(np.array(found), by_numpy(weights, x, activation), atol=ROUNDING[np.float32])
+
+
+def test_loops_of_any_precision_give_what_cooperative_vectors_give() -> None:
+    weights, x = layers(), inputs()
+    net = Perceptron.named(weights, "W", "b", splits=[SPLIT])
+    single, double = ([kind(row) for row in x] for kind in (Float, Float64))
+    kept = net.first(0, double[:SPLIT], biased=True)
+    found = net.rest(net.activation(net.first(1, double[SPLIT:]) + kept))
+    assert all(dr.type_v(v) == dr.VarType.Float64 for v in found)
+    assert np.allclose(np.array(found), by_numpy(weights, x.astype(float), hard), atol=1e-13)
+    assert np.allclose(np.array(found), np.array(Perceptron.named(weights, "W", "b")(single)), atol=2e-6)
 
 
 def test_parts_of_the_first_layer_make_the_whole() -> None:
