@@ -9,8 +9,9 @@ from typing import Any
 from full_geometry.half_space import HalfSpaceTransport
 from full_geometry.storing import KIND, find_weights, load
 from full_geometry.subject import Subject, SurfacePoint
+from halfspace_sss.checks import check_choice
 from halfspace_sss.rendering.surface.inside import Inside
-from halfspace_sss.rendering.surface.transports import knows_objects, object_transport
+from halfspace_sss.rendering.surface.transports import knows_objects, model_names, object_transport
 from halfspace_sss.rendering.transport.plane import Exit, number
 from halfspace_sss.rendering.transport.protocols import Entry, Transport
 from halfspace_sss.rendering.transport.settings import Settings
@@ -69,6 +70,7 @@ def transport(subject: Subject, model: str, folder: str | os.PathLike | None = N
     Raises:
         ValueError: the object has not been trained, or there is no such model.
     """
+    check_choice("model", model, model_names())
     if model == KIND:
         return load(find_weights(subject, folder), subject).model
     if knows_objects(model):

@@ -100,10 +100,12 @@ class Perceptron:
         import drjit as dr
 
         kind = dr.expr_t(*x)
+        double = dr.type_v(kind) == dr.VarType.Float64
         by_loops = self.looped and dr.backend_v(kind) == dr.JitBackend.CUDA and not any(dr.grad_enabled(v) for v in x)
-        if by_loops or dr.type_v(kind) == dr.VarType.Float64:
-            return _kin(kind, "X")([kind(v) for v in x])
-        return cooperative(x)
+        if not double and not by_loops:
+            return cooperative(x)
+        kind = kind if double else dr.float32_array_t(kind)
+        return _kin(kind, "X")([kind(v) for v in x])
 
     @staticmethod
     def numbers(x: Any) -> list[Any]:
@@ -139,7 +141,7 @@ def _kin(kind: type, size: int | str) -> type:
     """Arrays of so many lanes' numbers of a kind, X for any number of them."""
     import drjit as dr
 
-    bits = {dr.VarType.Float16: "16", dr.VarType.Float64: "64"}.get(dr.type_v(kind), "")
+    bits = "64" if dr.type_v(kind) == dr.VarType.Float64 else ""
     return getattr(sys.modules[kind.__module__], f"Array{size}f{bits}")
 
 
@@ -181,7 +183,7 @@ def _product(W: Any, x: Any, bias: Any) -> Any:
     x = [*x, *[kind(0)] * (-len(x) % PACKET)]
 
     def output(j: Any, out: Any) -> tuple:
-        total, k = kind(0) if bias is None else dr.gather(kind, bias, j), 0
+        total = kind(0) if bias is None else dr.gather(kind, bias, j)
         for k in range(0, len(x), PACKET):
             row = dr.gather(Packet, rows, j * (len(x) // PACKET) + k // PACKET)
             for a, b in zip(row, x[k : k + PACKET]):

@@ -198,6 +198,7 @@ REFUSED = [
     (["errors", "--object", "ball"], "object must be left out without --scene, got 'ball'"),
     (["errors", "--scene", "ball.xml", "--events", "1e5"], "events must be left out with --scene, got 100000.0"),
     (["errors", "--scene", "ball.xml", "--model", "no_model"], "model must be one of"),
+    (["errors", "--scene", "ball.xml", "--model", "neural_shap"], "did you mean 'neural_shape'?"),
     (["errors", "--scene", "ball.xml", "--model", "full_geometry"], "object 'ball' must be trained for full_geometry"),
     (["errors", "--scene", "ball.xml", "--model", "auto"], "has S for two points of a surface, got 'auto'"),
     (["errors", "--scene", "ball.xml", "--model", "lambert"], "has S for two points of a surface, got 'lambert'"),
