@@ -82,6 +82,8 @@ def rendered(task: Task) -> dict[str, Any]:
     prepare()
     p = task.params
     description = bunny_scene(p["material"], p["size"], sampler="multijitter")
+    if "entries" in p:  # else as many as the model says
+        description["integrator"] |= {"entries": p["entries"]}
     with with_weights(task.folder, task.needed):
         scene = load_scene(description, p["model"])
         first = np.array(mi.render(scene, spp=p["spp"], seed=p["seed"] + 1))  # compiles

@@ -44,7 +44,7 @@ SPP = {  # of a pass; one that is much shorter would show what a render costs be
     "paper": {"volume": 64, WALK: 64, "model": 1024},
 }
 BARE_MODELS = {"draft": (MODELS[0], MODELS[-1]), "paper": MODELS}  # most of the time of a draft goes into compiling
-TRAIN_SECONDS = {"draft": 20.0, "paper": 240.0}  # CPU time for each object: half of it on two cores
+TRAIN_SECONDS = {"draft": 24, "paper": 240}  # CPU time for each object: half of it on two cores
 RESOLUTION = {"draft": 64, "paper": 192}  # of modelled objects
 LANES = {"draft": 2**18, "paper": 2**22}
 FURNACE = {"draft": {"size": 16, "spp": 256}, "paper": {"size": 32, "spp": 16384}}

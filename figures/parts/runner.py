@@ -33,7 +33,7 @@ class Plan:
         parts, keys: in the order of computing; the hash of what each depends on, by name.
         damaged: by name of a part that must be computed again because its files are not sound, what is wrong with them.
         missing: names of the parts to be computed, those included.
-        seconds: projected for each missing part, by name.
+        seconds: projected for each missing part that no other figure has, by name.
     """
 
     name: str
@@ -94,7 +94,8 @@ def plan(name: str, quality: str, out: str | Path) -> Plan:
         if not sound:
             missing.append(part.name)
     measured = [(q, PartStore(folder / q / "parts")) for q in sorted(QUALITIES, key=lambda q: q != quality)]
-    seconds = projected([part for part in parts if part.name in missing], measured)
+    ahead = [part for part in parts if part.name in missing and not _elsewhere(folder / quality, part, keys[part.name])]
+    seconds = projected(ahead, measured)
     return Plan(name, quality, folder / quality, parts, keys, damaged, tuple(missing), seconds)
 
 
@@ -168,11 +169,26 @@ def _weights(todo: Plan) -> dict[str, float]:
     parts = [part for part in todo.parts if part.name in todo.missing]
     if todo.unmeasured:
         return {part.name: part.work for part in parts}
-    return {part.name: max(todo.seconds[part.name].seconds, 1e-3) for part in parts}
+    return {part.name: max(todo.seconds[part.name].seconds if part.name in todo.seconds else 0, 1e-3) for part in parts}
+
+
+def _elsewhere(folder: Path, part: Part, key: str) -> Result | None:
+    """The same part of another figure in the same quality: keys agree only where all that it depends on does."""
+    for place in sorted(folder.parent.parent.glob(f"*/{folder.name}/parts")):
+        try:
+            found = PartStore(place).load(part, key)
+        except DamagedPartError:
+            continue
+        if found:
+            return found
+    return None
 
 
 def _computed(todo: Plan, part: Part, results: Mapping[str, Result], show: Callable[[int, int], None]) -> Result:
     key = todo.keys[part.name]
+    found = _elsewhere(todo.folder, part, key)
+    if found:
+        return todo.store.save(part, key, {**found.images, **found.numbers}, found.seconds)
     folder = todo.store.unfinished(part, key)
     folder.mkdir(parents=True, exist_ok=True)
     needed = {name: results[name] for name in part.needs}

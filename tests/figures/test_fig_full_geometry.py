@@ -96,7 +96,9 @@ def test_fig_6_renders_all_lights_and_views_by_one_training(small: None, tmp_pat
 
 
 def test_table_1_tells_time_samples_and_size_with_the_papers_beside(small: None, tmp_path: Path) -> None:
-    _, files = drawn("table1", tmp_path)
+    results, files = drawn("table1", tmp_path)
+    one, four = (results[f"ketchup, full_geometry, N = {n}"].images["image"] for n in (1, 4))
+    assert (one != four).any()
     table = rows(files["table1.csv"])
     assert list(table["N"]) == [1, 4] and (table["samples"] == 8 * 12**2).all()
     assert (table[["training, CPU s", "render, s", "weights, kB", "steps", "walks"]] > 0).all(axis=None)
