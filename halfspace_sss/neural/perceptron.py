@@ -112,15 +112,14 @@ class Perceptron:
         """A vector as numbers, in single precision at least."""
         import drjit as dr
 
-        kind = x.type if hasattr(x, "type") else dr.value_t(type(x))
+        kind = x.type if _is_cooperative(x) else dr.value_t(type(x))
         precise = kind if dr.type_v(kind) == dr.VarType.Float64 else dr.float32_array_t(kind)
         return [precise(v) for v in x]
 
     def _views(self, x: Any) -> tuple[list, list]:
         """Matrices and biases for products with a vector."""
-        key = x.type if hasattr(x, "type") else type(x)
+        key, make = (x.type, _packed) if _is_cooperative(x) else (type(x), _rows)
         if key not in self._packed:
-            make = _packed if hasattr(x, "type") else _rows
             self._packed[key] = make(key, self.matrices, self.biases)
         return self._packed[key]
 
@@ -135,6 +134,12 @@ def cooperative(x: Sequence[Any]) -> Any:
     if not half:
         return nn.CoopVec(*(dr.float32_array_t(kind)(v) for v in x))
     return nn.CoopVec(*(dr.float16_array_t(kind)(dr.clip(v, -MOST_IN_HALF, MOST_IN_HALF)) for v in x))
+
+
+def _is_cooperative(x: Any) -> bool:
+    from drjit import nn
+
+    return isinstance(x, nn.CoopVec)
 
 
 def _kin(kind: type, size: int | str) -> type:
@@ -175,7 +180,7 @@ def _product(W: Any, x: Any, bias: Any) -> Any:
     import drjit as dr
     from drjit import nn
 
-    if hasattr(x, "type"):
+    if _is_cooperative(x):
         return nn.matvec(W, x) if bias is None else nn.matvec(W, x, bias)
     n, rows = W
     kind = dr.value_t(type(x))
