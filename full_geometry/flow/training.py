@@ -18,6 +18,7 @@ from full_geometry.flow.fitting import FlowNetwork
 from full_geometry.flow.lights import Lighting
 from full_geometry.flow.sampler import FlowSampler
 from full_geometry.flow.walks import Walks, flow_walks
+from full_geometry.learning.device import one_thread
 from full_geometry.learning.learner import PatchLogits, patch_likelihood
 from full_geometry.patches import PatchSampler
 from full_geometry.storing import Learnt
@@ -77,6 +78,7 @@ class Schedule:
             return min(self.steps / self.recipe.steps, 1.0)
         return min((time.process_time() - self.started) / self.recipe.seconds, 1.0)
 
+    @one_thread()
     def run(self, data: Callable[[int], Walks], loss: Callable[[Walks, np.ndarray], torch.Tensor], seed: int) -> None:
         """Go through chunks of data."""
         chunk, batch = 0, self.recipe.batch

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import numpy as np
 import torch
 
-__all__ = ["device_of_walks", "tensor"]
+__all__ = ["device_of_walks", "one_thread", "tensor"]
 
 
 def device_of_walks() -> torch.device:
@@ -19,3 +22,14 @@ def device_of_walks() -> torch.device:
 def tensor(array: np.ndarray, device: torch.device) -> torch.Tensor:
     """An array where networks are fitted; on the CPU without a copy."""
     return torch.from_numpy(array).to(device)
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Torch with one thread: layers this small gain little by being shared, and threads that wait spin."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -13,7 +11,7 @@ import numpy as np
 import torch
 
 from full_geometry.features import n_pair
-from full_geometry.learning.device import device_of_walks, tensor
+from full_geometry.learning.device import device_of_walks, one_thread, tensor
 from full_geometry.learning.ends import Ends
 from full_geometry.learning.learner import (
     Correction,
@@ -77,17 +75,6 @@ class Recipe:
 
 
 STANDARD = Recipe()
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Torch with one thread: layers this small gain little by being shared, and threads that wait spin."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 class Fitting:

@@ -16,6 +16,7 @@ import torch
 import zuko
 
 from full_geometry.features import Frame
+from full_geometry.learning.device import one_thread
 from full_geometry.model import FullGeometry
 from full_geometry.paper.network import placed
 from full_geometry.subject import Subject, SurfacePoint, surface_point
@@ -77,6 +78,7 @@ def incidence(model: FullGeometry, exits: SurfacePoint, points: SurfacePoint) ->
     return np.array(total) * np.pi / (rows * columns)
 
 
+@one_thread()
 def fit_space_flow(model: FullGeometry, frame: Frame, seconds: float = 60.0, seed: int = 0) -> SpaceFlow:
     """The flow after so many CPU seconds.
 

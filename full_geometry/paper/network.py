@@ -17,6 +17,7 @@ from torch import nn
 
 from full_geometry.features import Frame
 from full_geometry.identity import frame_of
+from full_geometry.learning.device import one_thread
 from full_geometry.learning.exits import trace_exits
 from full_geometry.paper.lights import Light, random_lights
 from full_geometry.subject import Subject, SurfacePoint
@@ -129,6 +130,7 @@ def walk_samples(subject: Subject, frame: Frame, exits: SurfacePoint, n: int, se
     return Samples(placed(frame, exits, m), points, w, np.ascontiguousarray(T))
 
 
+@one_thread()
 def fit_paper(
     subject: Subject, recipe: PaperRecipe | None = None, seed: int = 0,
     progress: Callable[[str, int, int], Any] | None = None,
