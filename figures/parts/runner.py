@@ -172,22 +172,22 @@ def _weights(todo: Plan) -> dict[str, float]:
     return {part.name: max(todo.seconds[part.name].seconds if part.name in todo.seconds else 0, 1e-3) for part in parts}
 
 
-def _elsewhere(folder: Path, part: Part, key: str) -> Result | None:
-    """The same part of another figure in the same quality: keys agree only where all that it depends on does."""
+def _elsewhere(folder: Path, part: Part, key: str) -> PartStore | None:
+    """Where another figure has the same part in the same quality: keys agree only where all that it depends on does."""
     for place in sorted(folder.parent.parent.glob(f"*/{folder.name}/parts")):
         try:
-            found = PartStore(place).load(part, key)
+            if PartStore(place).holds(part, key):
+                return PartStore(place)
         except DamagedPartError:
             continue
-        if found:
-            return found
     return None
 
 
 def _computed(todo: Plan, part: Part, results: Mapping[str, Result], show: Callable[[int, int], None]) -> Result:
     key = todo.keys[part.name]
-    found = _elsewhere(todo.folder, part, key)
-    if found:
+    other = _elsewhere(todo.folder, part, key)
+    if other:
+        found = other.load(part, key)
         return todo.store.save(part, key, {**found.images, **found.numbers}, found.seconds)
     folder = todo.store.unfinished(part, key)
     folder.mkdir(parents=True, exist_ok=True)
