@@ -19,7 +19,7 @@ from figures.drawing.image_grid import image_grid
 from figures.drawing.page import page
 from figures.drawing.shot import Shot, compared
 from figures.drawing.style import paper, saved
-from figures.learnt.training import object_parts, train_modelled
+from figures.learnt.training import TRAIN_SECONDS, object_parts, train_modelled
 from figures.learnt.weights import FULL_GEOMETRY, training_of, with_weights
 from figures.modelling.grid import TISSUES, tissue
 from figures.parts.part import Part, Result, Task
@@ -34,7 +34,6 @@ SIZES = {"draft": 72, "paper": 448}
 SPP = {"draft": {TRUTH: 256, "model": 64}, "paper": {TRUTH: 8192, "model": 1024}}
 SPP_PER_PASS = 16
 RESOLUTION = {"draft": 64, "paper": 240}  # of surfaces; grids have half of it
-TRAIN_SECONDS = {"draft": 24, "paper": 240}  # CPU time: half of it on two cores
 LIGHT = "sunset"  # the small lamps of the studio are hardly found by walks
 NOTES = (
     "The candle is homogeneous wax with its flame as a small emitter in the bowl; mandarin and croissant are grid "

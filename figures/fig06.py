@@ -14,7 +14,7 @@ from figures.drawing.image_grid import image_grid
 from figures.drawing.page import page
 from figures.drawing.shot import Shot, compared
 from figures.drawing.style import paper, saved
-from figures.learnt.training import train_scan
+from figures.learnt.training import TRAIN_SECONDS, train_scan
 from figures.learnt.weights import FULL_GEOMETRY, training_of, with_weights
 from figures.parts.part import Part, Result, Task
 
@@ -30,7 +30,6 @@ VIEWS = (0, 90, 180, 270)  # degrees about the bunny
 VIEWS_LIGHT = LIGHTS[0]
 SIZES = {"draft": 72, "paper": 384}
 SPP = {"draft": {"path_traced": 256, FULL_GEOMETRY: 64}, "paper": {"path_traced": 8192, FULL_GEOMETRY: 1024}}
-TRAIN_SECONDS = {"draft": 24, "paper": 240}  # CPU time: half of it on two cores
 AXIS = (-0.17, 0.15)  # x and z of the axis that the camera goes about
 NOTES = (
     "Trained once, without any of these lights: the same weights in all images. All scattering orders. FLIP and "

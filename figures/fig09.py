@@ -19,7 +19,7 @@ from figures.drawing.image_grid import image_grid
 from figures.drawing.page import page
 from figures.drawing.shot import FLIP, Shot, compared
 from figures.drawing.style import paper, saved
-from figures.learnt.training import train_scan
+from figures.learnt.training import TRAIN_SECONDS, train_scan
 from figures.learnt.weights import FULL_GEOMETRY, training_of, with_weights
 from figures.parts.part import Part, Result, Task
 from halfspace_sss import materials
@@ -32,7 +32,6 @@ SIZES = {"draft": 96, "paper": 384}
 MODEL_SPP = {"draft": 100, "paper": 576}  # of each of two passes; square numbers, for the sampler
 TRUTH_SPP = {"draft": 192, "paper": 8192}
 SPP_PER_PASS = 16
-TRAIN_SECONDS = {"draft": 24, "paper": 240}  # CPU time for each material: half of it on two cores
 AGAIN_SEED = 10_000  # of the second path traced image; passes count up from the first seed
 NOTES = (
     "All images contain all scattering orders: to the models without single scattering it is added, path traced. "

@@ -18,7 +18,7 @@ from figures.drawing.image_grid import image_grid
 from figures.drawing.page import page
 from figures.drawing.shot import FLIP, RELATIVE_MSE, Shot, compared
 from figures.drawing.style import paper, saved
-from figures.learnt.training import train_scan
+from figures.learnt.training import TRAIN_SECONDS, train_scan
 from figures.learnt.weights import FULL_GEOMETRY, training_of, with_weights
 from figures.parts.part import Part, Result, Task
 from halfspace_sss import materials
@@ -32,7 +32,6 @@ OURS = MODELS[-1]
 METHODS = (*VOLUMES, WALK, OURS, *OF_OBJECTS)
 SIZES = {"draft": 96, "paper": 384}
 SECONDS = {"draft": 2.0, "paper": 60.0}  # for an image
-TRAIN_SECONDS = {"draft": 24, "paper": 240}  # CPU time for each material: half of it on two cores
 TRUTH_SPP = {"draft": 256, "paper": 16384}
 PASSES, SHORTEST = 8, 1.0  # of an image, about; seconds, of a pass: a render has a cost of its own
 NOTES = (

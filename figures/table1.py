@@ -11,7 +11,7 @@ from figures.computing.model_inputs import weight_files
 from figures.computing.scenes import BUNNY, MATERIALS
 from figures.drawing.error_tables import in_markdown, label
 from figures.fig09 import rendered
-from figures.learnt.training import train_scan
+from figures.learnt.training import TRAIN_SECONDS, train_scan
 from figures.learnt.weights import FULL_GEOMETRY, training_of
 from figures.parts.part import Part, Result
 from halfspace_sss import materials
@@ -23,7 +23,6 @@ SUBJECTS = {"draft": ("potato", "ketchup"), "paper": MATERIALS}
 MODELS = ("neural", *OF_OBJECTS)
 SIZES = {"draft": 64, "paper": 384}
 SPP = {"draft": 64, "paper": 1024}  # of each of two passes
-TRAIN_SECONDS = {"draft": 24, "paper": 240}  # CPU time for each material: half of it on two cores
 SEVERAL = 4  # entries of an exit, beside 1, of models of objects
 NOTES = """\
 The bunny of Fig. 9 on this machine, LLVM backend. *Training* in CPU seconds, compilation of kernels included where they

@@ -17,7 +17,7 @@ from figures.computing.sampling_cost import split
 from figures.computing.scenes import BUNNY, MATERIALS, SCANS, prepare
 from figures.computing.timed import Timed, alternating, rendered
 from figures.drawing import error_tables
-from figures.learnt.training import train_modelled, train_scan
+from figures.learnt.training import TRAIN_SECONDS, train_modelled, train_scan
 from figures.learnt.weights import FULL_GEOMETRY, TRAINING, training_of, with_weights
 from figures.modelling.grid import TISSUES, tissue
 from figures.modelling.scene_parts import VARYING
@@ -44,7 +44,6 @@ SPP = {  # of a pass; one that is much shorter would show what a render costs be
     "paper": {"volume": 64, WALK: 64, "model": 1024},
 }
 BARE_MODELS = {"draft": (MODELS[0], MODELS[-1]), "paper": MODELS}  # most of the time of a draft goes into compiling
-TRAIN_SECONDS = {"draft": 24, "paper": 240}  # CPU time for each object: half of it on two cores
 RESOLUTION = {"draft": 64, "paper": 192}  # of modelled objects
 LANES = {"draft": 2**18, "paper": 2**22}
 FURNACE = {"draft": {"size": 16, "spp": 256}, "paper": {"size": 32, "spp": 16384}}

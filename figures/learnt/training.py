@@ -13,8 +13,9 @@ from figures.modelling.scene_parts import candle_parts, learnable_parts, make_va
 from figures.parts.part import Part, Task
 from halfspace_sss.provenance import check_folder
 
-__all__ = ["object_parts", "train_modelled", "train_scan"]
+__all__ = ["TRAIN_SECONDS", "object_parts", "train_modelled", "train_scan"]
 
+TRAIN_SECONDS = {"draft": 24, "paper": 240}  # CPU time: half of it on two cores; one for all figures, which share parts
 GRID = 0.5  # cells of a medium along an object over cubes of its surface
 
 
