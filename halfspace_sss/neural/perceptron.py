@@ -77,7 +77,7 @@ class Perceptron:
         return cls(*([weights[f"{name}_{k}"] for k in range(n)] for name in (matrix, bias)), **more)
 
     def __call__(self, x: Sequence[Any]) -> list[Any]:
-        """The outputs in single precision; the first layer has one part."""
+        """The outputs, in single precision at least; the first layer has one part."""
         first = self.first(0, x, biased=True)
         return self.rest(self.activation(first)) if len(self.biases) > 1 else self.numbers(first)
 
@@ -100,21 +100,16 @@ class Perceptron:
         import drjit as dr
 
         kind = dr.expr_t(*x)
-        double = dr.type_v(kind) == dr.VarType.Float64
         by_loops = self.looped and dr.backend_v(kind) == dr.JitBackend.CUDA and not any(dr.grad_enabled(v) for v in x)
-        if not double and not by_loops:
-            return cooperative(x)
-        kind = kind if double else dr.float32_array_t(kind)
-        return _kin(kind, "X")([kind(v) for v in x])
+        return _listed(x) if by_loops or _is_double(kind) else cooperative(x)
 
     @staticmethod
     def numbers(x: Any) -> list[Any]:
         """A vector as numbers, in single precision at least."""
         import drjit as dr
 
-        kind = x.type if _is_cooperative(x) else dr.value_t(type(x))
-        precise = kind if dr.type_v(kind) == dr.VarType.Float64 else dr.float32_array_t(kind)
-        return [precise(v) for v in x]
+        kind = _precise(x.type if _is_cooperative(x) else dr.value_t(type(x)))
+        return [kind(v) for v in x]
 
     def _views(self, x: Any) -> tuple[list, list]:
         """Matrices and biases for products with a vector."""
@@ -136,17 +131,36 @@ def cooperative(x: Sequence[Any]) -> Any:
     return nn.CoopVec(*(dr.float16_array_t(kind)(dr.clip(v, -MOST_IN_HALF, MOST_IN_HALF)) for v in x))
 
 
+def _listed(x: Sequence[Any]) -> Any:
+    """Numbers as a vector that loops take."""
+    import drjit as dr
+
+    kind = _precise(dr.expr_t(*x))
+    return _kin(kind, "X")([kind(v) for v in x])
+
+
 def _is_cooperative(x: Any) -> bool:
     from drjit import nn
 
     return isinstance(x, nn.CoopVec)
 
 
-def _kin(kind: type, size: int | str) -> type:
-    """Arrays of so many lanes' numbers of a kind, X for any number of them."""
+def _is_double(kind: type) -> bool:
     import drjit as dr
 
-    bits = "64" if dr.type_v(kind) == dr.VarType.Float64 else ""
+    return dr.type_v(kind) == dr.VarType.Float64
+
+
+def _precise(kind: type) -> type:
+    """A kind of numbers in single precision at least."""
+    import drjit as dr
+
+    return kind if _is_double(kind) else dr.float32_array_t(kind)
+
+
+def _kin(kind: type, size: int | str) -> type:
+    """Arrays of so many lanes' numbers of a kind, X for any number of them."""
+    bits = "64" if _is_double(kind) else ""
     return getattr(sys.modules[kind.__module__], f"Array{size}f{bits}")
 
 
@@ -168,7 +182,7 @@ def _rows(vector: type, matrices: list[np.ndarray], biases: list[np.ndarray]) ->
     import drjit as dr
 
     kind, found = dr.value_t(vector), []
-    precision = np.float64 if dr.type_v(kind) == dr.VarType.Float64 else np.float32
+    precision = np.float64 if _is_double(kind) else np.float32
     for W in matrices:
         W = np.pad(W, ((0, 0), (0, -W.shape[1] % PACKET)))
         found.append((len(W), kind(np.ascontiguousarray(W.ravel(), dtype=precision))))
@@ -198,4 +212,4 @@ def _product(W: Any, x: Any, bias: Any) -> Any:
 
     state = (UInt32(0), dr.alloc_local(kind, n))
     _, out = dr.while_loop(state, lambda j, _: j < n, output, label="layer")
-    return _kin(kind, "X")([out[UInt32(j)] for j in range(n)])
+    return _listed([out[UInt32(j)] for j in range(n)])

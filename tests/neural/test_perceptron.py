@@ -13,6 +13,7 @@ prepare_llvm()
 import drjit as dr  # noqa: E402
 from drjit.llvm.ad import Float, Float16, Float64  # noqa: E402
 
+from halfspace_sss.neural import perceptron  # noqa: E402
 from halfspace_sss.neural.perceptron import Perceptron, relu  # noqa: E402
 
 SIZES, SPLIT, N = (7, 16, 12, 3), 4, 500
@@ -48,7 +49,7 @@ def test_outputs_are_those_of_numpy(more: dict, activation: object) -> None:
     assert np.allclose(np.array(found), by_numpy(weights, x, activation), atol=ROUNDING[np.float32])
 
 
-def test_loops_of_any_precision_give_what_cooperative_vectors_give() -> None:
+def test_loops_in_double_precision_give_what_cooperative_vectors_give() -> None:
     weights, x = layers(), inputs()
     net = Perceptron.named(weights, "W", "b", splits=[SPLIT])
     single, double = ([kind(row) for row in x] for kind in (Float, Float64))
@@ -57,6 +58,18 @@ def test_loops_of_any_precision_give_what_cooperative_vectors_give() -> None:
     assert all(dr.type_v(v) == dr.VarType.Float64 for v in found)
     assert np.allclose(np.array(found), by_numpy(weights, x.astype(float), hard), atol=1e-13)
     assert np.allclose(np.array(found), np.array(Perceptron.named(weights, "W", "b")(single)), atol=2e-6)
+
+
+def test_loops_in_single_precision_as_on_cuda_give_what_cooperative_vectors_give(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    weights, x = layers(), [Float(row) for row in inputs()]
+    cooperative = np.array(Perceptron.named(weights, "W", "b")(x))
+    monkeypatch.setattr(perceptron, "cooperative", perceptron._listed)
+    net = Perceptron.named(weights, "W", "b")
+    found = net(x)
+    assert not perceptron._is_cooperative(net.first(0, x)) and dr.type_v(found[0]) == dr.VarType.Float32
+    assert np.allclose(np.array(found), cooperative, atol=ROUNDING[np.float32])
 
 
 def test_parts_of_the_first_layer_make_the_whole() -> None:
