@@ -99,7 +99,7 @@ class Perceptron:
         """Numbers as a vector that layers are asked with."""
         import drjit as dr
 
-        kind = dr.expr_t(*x)
+        kind = dr.expr_t(*map(type, x))
         by_loops = self.looped and dr.backend_v(kind) == dr.JitBackend.CUDA and not any(dr.grad_enabled(v) for v in x)
         return _listed(x) if by_loops or _is_double(kind) else cooperative(x)
 
@@ -124,7 +124,7 @@ def cooperative(x: Sequence[Any]) -> Any:
     import drjit as dr
     from drjit import nn
 
-    kind = dr.expr_t(*x)
+    kind = dr.expr_t(*map(type, x))
     half = dr.type_v(kind) == dr.VarType.Float16 or dr.backend_v(kind) == dr.JitBackend.CUDA
     if not half:
         return nn.CoopVec(*(dr.float32_array_t(kind)(v) for v in x))
@@ -135,7 +135,7 @@ def _listed(x: Sequence[Any]) -> Any:
     """Numbers as a vector that loops take."""
     import drjit as dr
 
-    kind = _precise(dr.expr_t(*x))
+    kind = _precise(dr.expr_t(*map(type, x)))
     return _kin(kind, "X")([kind(v) for v in x])
 
 

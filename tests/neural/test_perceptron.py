@@ -72,6 +72,13 @@ def test_loops_in_single_precision_as_on_cuda_give_what_cooperative_vectors_give
     assert np.allclose(np.array(found), cooperative, atol=ROUNDING[np.float32])
 
 
+@pytest.mark.parametrize("kind", [Float, Float64])
+def test_one_input_and_one_output_are_taken_in_any_precision(kind: type) -> None:
+    weights = {"W_0": np.full((3, 1), 0.5), "b_0": np.zeros(3), "W_1": np.ones((1, 3)), "b_1": np.full(1, 0.25)}
+    (found,) = Perceptron.named(weights, "W", "b", activation=relu)([kind([1, 2, -1])])
+    assert type(found) is kind and np.allclose(found.numpy(), [1.75, 3.25, 0.25])
+
+
 def test_parts_of_the_first_layer_make_the_whole() -> None:
     weights, x = layers(), [Float(row) for row in inputs()]
     whole, net = Perceptron.named(weights, "W", "b"), Perceptron.named(weights, "W", "b", splits=[SPLIT])
