@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 from full_geometry.subject import Subject, SurfacePoint, refract_in
 from halfspace_sss.rendering.surface.horizon import lifted, mirrored
 from halfspace_sss.rendering.surface.object import turned
+from halfspace_sss.rendering.surface.variants import channel_mean
 from halfspace_sss.rendering.transport.plane import number
 
 __all__ = ["REFLECTIONS", "FirstEvent", "first_event"]
@@ -114,8 +115,8 @@ def first_event(subject: Subject, at: SurfacePoint, active: Any = True) -> First
         (mi.Spectrum(0), [mi.Vector3f(0) for _ in subject.media], mi.Spectrum(0)), valid & active,
     )  # fmt: skip
     P, moments, length = dr.while_loop(state, lambda *s: s[-1], step, label="first event")[-2]
-    total, each = dr.maximum(dr.mean(P), 1e-20), dr.maximum(P, 1e-20)
-    y = dr.select(dr.mean(P) > 0, mi.Point3f(sum(moments) / (len(moments) * total)), at.p)
+    total, each = dr.maximum(channel_mean(P), 1e-20), dr.maximum(P, 1e-20)
+    y = dr.select(channel_mean(P) > 0, mi.Point3f(sum(moments) / (len(moments) * total)), at.p)
     ys = [dr.select(p > 0, mi.Point3f(moment / e), at.p) for moment, p, e in zip(moments, P, each)]
     local = (*subject.local(at.p), *subject.local(y))
-    return FirstEvent(P, y, dr.mean(length) / total, ys, length / each, local)
+    return FirstEvent(P, y, channel_mean(length) / total, ys, length / each, local)

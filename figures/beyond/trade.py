@@ -10,12 +10,17 @@ from typing import Any
 
 import numpy as np
 
+from figures.computing.contenders import OF_OBJECTS
+from figures.computing.model_inputs import weight_files
 from figures.computing.scenes import BUNNY, MATERIALS, bunny_scene, prepare
 from figures.drawing import trade_tables
 from figures.drawing.page import page
 from figures.drawing.style import paper, saved
 from figures.drawing.trade_plot import image_shots, multiples
+from figures.learnt.training import TRAIN_SECONDS, train_scan
+from figures.learnt.weights import FULL_GEOMETRY, training_of, with_weights
 from figures.parts.part import Part, Result, Task
+from halfspace_sss import materials
 from halfspace_sss.trade.checking.random_scenes import RandomScene, mesh_file
 from halfspace_sss.trade.measuring.results import Assessment
 
@@ -24,25 +29,32 @@ __all__ = ["TITLE", "draw", "measured", "parts"]
 TITLE = "bias against time to a given noise, for every way of rendering"
 SHAPES = ("bunny", "spikes")
 LIGHTS = {"sky": "even sky", "small light": "small light"}
-SECONDS = {"draft": 2.0, "paper": 120.0}
-SIZE = {"draft": 64, "paper": 256}
-SPP = {"draft": 16, "paper": 1024}
+SECONDS = {"draft": 2.0, "paper": 60.0}
+SIZE = {"draft": 64, "paper": 128}
+SPP = {"draft": 16, "paper": 64}
 SPIKES = RandomScene(0, 0, "spikes", "sky", (), (), 0.0, 1.3, 0.0, (), 0.05, 1)
 MM_PER_UNIT = 3.8
 TOLERANCE = 0.05
+NETWORKS = ("neural", "neural_material", "neural_shape")
 KNOB_MATERIALS = ("marble", "ketchup")
 KNOB_WAYS = ("better_dipole", "neural")
 
 
 def parts(quality: str) -> list[Part]:
-    """A scene each."""
+    """The bunny's training for each material, then a scene each; the spikes are not learnt, as a new object."""
     found = []
     for material in MATERIALS:
+        medium = materials.load(material).medium
+        inputs = (BUNNY, *(f for model in NETWORKS for f in weight_files(model, medium)))
+        learns = FULL_GEOMETRY in OF_OBJECTS
+        if learns:
+            found.append(train_scan(material, material, TRAIN_SECONDS[quality]))
         for shape in SHAPES:
+            needs = (training_of(material),) if learns and shape == "bunny" else ()
             for light in LIGHTS:
                 params = {"material": material, "shape": shape, "light": light, "seconds": SECONDS[quality]}
                 params |= {"size": SIZE[quality], "spp": SPP[quality], "seed": 0}
-                found.append(Part(_name(material, shape, light), measured, params, SECONDS[quality], inputs=(BUNNY,)))
+                found.append(Part(_name(material, shape, light), measured, params, SECONDS[quality], needs, inputs))
     for material in KNOB_MATERIALS:
         params = {"material": material, "shape": "bunny", "light": "small light", "seconds": SECONDS[quality]}
         params |= {"seed": 0, "names": list(KNOB_WAYS)}
@@ -61,8 +73,8 @@ def measured(task: Task) -> dict[str, Any]:
     from halfspace_sss.trade.measuring.ways import stage, ways
 
     prepare()
-    p = task.params
-    with TemporaryDirectory() as folder, warnings.catch_warnings():
+    p, learnt = task.params, with_weights(task.folder, task.needed)
+    with TemporaryDirectory() as folder, learnt, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # they are in the notes of the assessment
         on = stage(_scene(p, Path(folder)))
         chosen = ways()
@@ -81,7 +93,6 @@ def measured(task: Task) -> dict[str, Any]:
 
 def turned(task: Task) -> dict[str, Any]:
     """What the knobs bring on a scene."""
-    from halfspace_sss import materials
     from halfspace_sss.neural.symmetric import channels
     from halfspace_sss.trade.knobs import channel_settings, entry_settings, node_settings, precision_settings
     from halfspace_sss.trade.measuring.ways import stage

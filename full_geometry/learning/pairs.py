@@ -15,6 +15,7 @@ from full_geometry.model import PreparedExit, Start
 from full_geometry.patch_table import ExitTable
 from full_geometry.patches import PatchSampler
 from full_geometry.subject import Subject, SurfacePoint, cosine_direction, surface_point
+from halfspace_sss.rendering.surface.variants import channel_mean
 from halfspace_sss.rendering.transport.plane import Exit, number
 from halfspace_sss.rendering.transport.positions import PositionSampler
 from halfspace_sss.rendering.transport.radial_table import RadialTable
@@ -192,7 +193,7 @@ class PairSource:
         n, even = dr.width(starts.p), self._even(starts, exits)
         T = dr.select(exits.order == 1, 0, exits.T)
         if self.scale is not None:
-            p = dr.minimum(dr.mean(T * self.scale) / ENOUGH, 1)
+            p = dr.minimum(channel_mean(T * self.scale) / ENOUGH, 1)
             stays = generator(mi, n, pass_seed(*seed, 4)).next_float32() < p
             T = dr.select(stays, T / dr.maximum(p, 1e-20), 0)
         kept = dr.compress(dr.max(T) > 0)

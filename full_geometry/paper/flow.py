@@ -22,6 +22,7 @@ from full_geometry.paper.network import placed
 from full_geometry.subject import Subject, SurfacePoint, surface_point
 from halfspace_sss.checks import check_interval
 from halfspace_sss.rendering.surface.horizon import cosine_above
+from halfspace_sss.rendering.surface.variants import channel_mean
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 __all__ = ["SpaceFlow", "fit_space_flow", "incidence", "mesh_arrays", "on_surface", "rmsd"]
@@ -72,7 +73,7 @@ def incidence(model: FullGeometry, exits: SurfacePoint, points: SurfacePoint) ->
     def add(k: Any, total: Any) -> tuple:
         u = mi.Point2f((mi.Float(k % rows) + 0.5) / rows, (mi.Float(k // rows) + 0.5) / columns)
         w, _ = cosine_above(points.n_out, points.n, u)
-        return k + 1, total + dr.mean(model.S(prepared, surface_point(points.p, points.n, points.n_out, w)))
+        return k + 1, total + channel_mean(model.S(prepared, surface_point(points.p, points.n, points.n_out, w)))
 
     k, total = dr.while_loop((k, total + dr.zeros(mi.Float, n)), lambda k, _: k < rows * columns, add)
     return np.array(total) * np.pi / (rows * columns)

@@ -11,6 +11,7 @@ import numpy as np
 from halfspace_sss.extensions import renderer
 from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED
 from halfspace_sss.trade.measuring.results import Assessment
+from halfspace_sss.trade.measuring.sampling import radiance
 from halfspace_sss.trade.measuring.seeds import seeded
 from halfspace_sss.trade.measuring.ways import Stage, Way
 
@@ -67,11 +68,9 @@ def _rendered(
     inverse = mi.Vector2f(dr.opaque(mi.Float, 1 / size[0]), dr.opaque(mi.Float, 1 / size[1]))
     position = (mi.Vector2f(x, y) + sampler.next_2d()) * inverse
     ray, weight = camera.sample_ray_differential(camera.shutter_open(), 0.5, mi.Point2f(position), sampler.next_2d())
-    ray = mi.Ray3f(ray)
-    ray.o, ray.d = ray.o + dr.zeros(mi.Point3f, n), ray.d + dr.zeros(mi.Vector3f, n)
-    dr.eval(ray)
-    L = weight * integrator.sample(scene, sampler, ray, None, mi.Bool(True))[0]
-    columns = [dr.block_sum(v + dr.zeros(mi.Float, n), spp).numpy() / spp for v in L]
+    ray = mi.Ray3f(ray.o + dr.zeros(mi.Point3f, n), ray.d + dr.zeros(mi.Vector3f, n))
+    L = radiance(scene, integrator, sampler, ray, n)
+    columns = [dr.block_sum(w * c, spp).numpy() / spp for w, c in zip(weight, L)]
     image = np.stack(columns * (3 if len(columns) == 1 else 1), axis=1)
     return np.maximum(image, 0).reshape(size[1], size[0], 3).astype(np.float32)
 

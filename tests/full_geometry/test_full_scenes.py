@@ -16,6 +16,7 @@ from halfspace_sss import Medium
 
 mi = pytest.importorskip("mitsuba")
 pytest.importorskip("torch")
+import drjit as dr  # noqa: E402
 
 from full_geometry import storing  # noqa: E402
 from full_geometry.learning.fitting import Recipe  # noqa: E402
@@ -100,6 +101,16 @@ def agree(objects: dict, trained: Trained) -> None:
 
 def test_an_image_has_the_light_of_walks_within_the_stated_error(trained: Trained) -> None:
     agree({"bunny": bunny(bsdf=SURFACE)}, trained)
+
+
+def test_other_numbers_of_samples_need_no_new_kernel(trained: Trained) -> None:
+    loaded = load_scene(scene({"bunny": bunny(bsdf=SURFACE)}, "full_geometry"), "full_geometry")
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        for spp in (5, 7):
+            dr.kernel_history_clear()
+            np.array(mi.render(loaded, spp=spp))
+    kernels = dr.kernel_history([dr.KernelType.JIT])
+    assert kernels and all(kernel["cache_hit"] and not kernel["cache_disk"] for kernel in kernels)
 
 
 def test_a_coarse_ball_with_vertex_normals_has_the_light_of_walks(folder: Path, tmp_path: Path) -> None:

@@ -36,11 +36,11 @@ def loaded(material: str, model: str, mm_per_unit: float = 3.0):
         return load_scene(description, model)
 
 
-def largest_kernel(scene) -> str:
+def largest_kernel(scene, spp: int = 1) -> str:
     """Hash of the largest kernel of a render."""
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
-        np.array(mi.render(scene, spp=1))
+        np.array(mi.render(scene, spp=spp))
         return max(dr.kernel_history([dr.KernelType.JIT]), key=lambda kernel: kernel["operation_count"])["hash"]
 
 
@@ -51,6 +51,20 @@ def test_a_kernel_serves_other_materials_of_the_same_index_and_other_units(model
         gc.collect()
         kernels.add(largest_kernel(loaded(material, model, mm_per_unit)))
     assert len(kernels) == 1
+
+
+@pytest.mark.parametrize("model", ["neural", "neural_shape", "path_traced"])
+def test_a_kernel_serves_other_numbers_of_samples(model):
+    scene = loaded("potato", model)
+    # powers of two, and less than 4, have kernels of their own in Mitsuba
+    assert largest_kernel(scene, 5) == largest_kernel(scene, 7)
+
+
+def test_the_mean_over_channels_is_that_of_numbers():
+    from halfspace_sss.rendering.surface.variants import channel_mean
+
+    assert np.array(channel_mean(mi.Color3f(1, 2, 6))) == pytest.approx([3])
+    assert np.array(channel_mean(mi.Color1f(mi.Float(4, 5)))) == pytest.approx([4, 5])
 
 
 @pytest.mark.parametrize("model", ["standard_dipole", "path_traced"])

@@ -16,6 +16,10 @@ from halfspace_sss.physics.fresnel import F_r
 from halfspace_sss.rendering.surface.transports import model_names
 from halfspace_sss.trade import assess, recommend
 from halfspace_sss.trade.checking.random_scenes import random_scene, write_scene
+from halfspace_sss.trade.images import small_images
+from halfspace_sss.trade.measuring.exits import visible_exits
+from halfspace_sss.trade.measuring.sampling import first_sample, sample_more
+from halfspace_sss.trade.measuring.ways import Way, stage
 
 mi = pytest.importorskip("mitsuba")
 QUICK = {"seconds": 0.4, "flip": False, "exits": 64}
@@ -102,6 +106,21 @@ def test_without_light_every_way_shows_it_black() -> None:
 
 
 QUICK_ASSESS = {"assess_seconds": 0.4, "exits": 64}
+
+
+def test_all_channels_of_exits_and_images_are_traced_once_and_by_one_kernel() -> None:
+    import drjit as dr
+
+    on, way = stage(scene()), Way.of("better_dipole")
+    (exits,) = visible_exits(on.scene, on.shapes, 0, 32, 0)
+    found = first_sample(on, way, exits, 0)
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        sample_more(on, way, exits, found, 0, samples=66)
+        small_images(on, [way], 0, 0, side=8, spp=4)
+        kernels = dr.kernel_history([dr.KernelType.JIT])
+    paths = [kernel["hash"] for kernel in kernels if "Symbolic loop: bssrdf" in kernel["ir"].getvalue()]
+    assert len(paths) == len(found.launches) + 1 == 2 and len(set(paths)) == 1
 
 
 def test_ten_objects_are_assessed_one_by_one() -> None:

@@ -26,6 +26,7 @@ import mitsuba as mi
 import numpy as np
 
 from halfspace_sss.rendering.surface.horizon import sided
+from halfspace_sss.rendering.surface.variants import channel_mean
 from halfspace_sss.rendering.walk.inside import eval_phase, fly, free_path, pick, turn
 from halfspace_sss.rendering.walk.media import WalkMedia, by_pointer, pointer_numbers
 from halfspace_sss.rendering.walk.steps import Event, Walk, draw, start_walk
@@ -247,7 +248,7 @@ def _draw_across(event: Event, aim: Aim, rng: Any) -> tuple[Any, Any]:
     wide = sigma_t * dr.rsqrt(1 + sigma_t * aim.depth)
     rate = dr.select(rng.next_float32() < 0.5, RATES[0], RATES[1]) * pick(wide, draw(len(wide), rng))
     r = dr.maximum(-dr.log(1 - rng.next_float32()) / rate, 1e-20)
-    density = sum(dr.mean(c * wide * dr.exp(-c * wide * r)) for c in RATES) / (len(RATES) * 2 * dr.pi * r)
+    density = sum(channel_mean(c * wide * dr.exp(-c * wide * r)) for c in RATES) / (len(RATES) * 2 * dr.pi * r)
     sin_phi, cos_phi = dr.sincos(2 * dr.pi * rng.next_float32())
     s, t = mi.coordinate_system(aim.w_0)
     at = dr.zeros(mi.Interaction3f)

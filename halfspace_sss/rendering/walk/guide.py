@@ -16,6 +16,7 @@ import drjit as dr
 import mitsuba as mi
 
 from halfspace_sss.rendering.surface.horizon import opposed
+from halfspace_sss.rendering.surface.variants import channel_mean
 from halfspace_sss.rendering.walk.connect import DEEPEST, Joins
 from halfspace_sss.rendering.walk.inside import eval_phase
 from halfspace_sss.rendering.walk.media import Coefficients, WalkMedia
@@ -90,7 +91,7 @@ class Guide:
         valid &= outside.is_valid() & (self.joins.index_of(emitter) == which)
         phase = eval_phase(m, dr.dot(event.along, d))
         # radiance shrinks by eta² on its way out, as the weight of the walk has when it came in
-        factor = (1 - F) * dr.square(eta_ti) / (pdf / n + dr.mean(phase))
+        factor = (1 - F) * dr.square(eta_ti) / (pdf / n + channel_mean(phase))
         T = self.media.transmittance(k, ray, dr.select(valid, si.t, 0), rng)
         value = phase * T * factor
         return dr.select(valid, value * emitter.eval(outside, valid), 0)
@@ -101,7 +102,7 @@ class Guide:
         which = self.joins.index_of(emitter)
         guess, concentration, valid = self._guess(way.p, k, type(k)(dr.maximum(which, 0)), m, active & (which >= 0))
         lobes = _lobes(dr.dot(guess, way.ahead), concentration) / len(self.joins.emitters)
-        phase = dr.mean(eval_phase(m, dr.dot(way.along, way.ahead)))
+        phase = channel_mean(eval_phase(m, dr.dot(way.along, way.ahead)))
         return phase / (phase + dr.select(active & valid, lobes, 0))
 
 

@@ -16,6 +16,7 @@ import drjit as dr
 import mitsuba as mi
 
 from halfspace_sss.physics.phase import eval_hg, sample_hg
+from halfspace_sss.rendering.surface.variants import channel_mean
 from halfspace_sss.rendering.walk.media import Coefficients
 from halfspace_sss.tracing.walk import ROULETTE_BOOST, ROULETTE_WEIGHT
 
@@ -44,7 +45,7 @@ def weigh(weight: Any, density: Any, value: Any, pdf: Any) -> tuple[Any, Any]:
     if len(weight) == 1:
         return weight * value / pdf, density
     grown = density * pdf
-    scale = 1 / dr.maximum(dr.mean(grown), 1e-37)
+    scale = 1 / dr.maximum(channel_mean(grown), 1e-37)
     return weight * value * scale, grown * scale
 
 

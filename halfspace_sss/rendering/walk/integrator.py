@@ -153,8 +153,8 @@ def camera_rays(sensor: Any, spp: int, seed: tuple[int, int]) -> tuple[Any, Any,
     n = int(dr.prod(size)) * spp
     sampler.set_samples_per_wavefront(spp)
     sampler.seed(int(np.random.SeedSequence(list(seed)).generate_state(1)[0]), n)
-    index = dr.arange(mi.UInt32, n) // mi.UInt32(spp)
-    pixel = mi.Vector2i(index % int(size[0]), index // int(size[0])) - border + mi.Vector2i(film.crop_offset())
+    index, width = dr.arange(mi.UInt32, n) // dr.opaque(mi.UInt32, spp), dr.opaque(mi.UInt32, int(size[0]))
+    pixel = mi.Vector2i(index % width, index // width) - border + mi.Vector2i(film.crop_offset())
     position = mi.Vector2f(pixel) + sampler.next_2d()
     scale = 1 / mi.ScalarVector2f(film.crop_size())
     offset = -mi.ScalarVector2f(film.crop_offset()) * scale

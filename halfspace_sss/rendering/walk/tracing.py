@@ -52,7 +52,7 @@ class PathTracer:
         L, seen = dr.zeros(mi.Spectrum, n), dr.zeros(mi.Bool, n)
         dr.eval(L, seen)
         walker = Walker(self.visitor.media, FirstExitVisitor(self.visitor, exits) if exits else self.visitor)
-        total = dr.opaque(mi.UInt32, n)
+        total, step = (dr.opaque(mi.UInt32, v) for v in (n, lanes))  # kernels then serve images of any size
 
         def inside(p: Path) -> Path:
             record = Watched(p.light, p.index, p.depth == 1) if exits else p.light
@@ -62,7 +62,7 @@ class PathTracer:
         def renew(p: Path) -> Path:
             dr.scatter(L, p.light.L, p.index)
             dr.scatter(seen, p.seen, p.index)
-            return _begin(rays, p.index + lanes, p.walk.rng)
+            return _begin(rays, total, p.index + step, p.walk.rng)
 
         def body(p: Path) -> tuple[Path]:
             p = dr.if_stmt((p,), p.walk.object >= 0, inside, _same, label="inside")
@@ -70,7 +70,7 @@ class PathTracer:
             p = dr.if_stmt((p,), outside, self._outside, _same, label="outside")
             return (dr.if_stmt((p,), ~p.walk.alive, renew, _same),)
 
-        start = _begin(rays, dr.arange(mi.UInt32, lanes), generator(mi, lanes, pass_seed(*seed)))
+        start = _begin(rays, total, dr.arange(mi.UInt32, lanes), generator(mi, lanes, pass_seed(*seed)))
         dr.while_loop((start,), lambda p: p.index < total, body, label="paths")
         dr.eval(L, seen)
         return L, seen
@@ -129,8 +129,8 @@ def _same(p: Path) -> Path:
     return p
 
 
-def _begin(rays: Any, index: Any, rng: Any) -> Path:
-    lanes, known = dr.width(index), index < dr.width(rays)
+def _begin(rays: Any, total: Any, index: Any, rng: Any) -> Path:
+    lanes, known = dr.width(index), index < total
     o, d = dr.gather(mi.Point3f, rays.o, index, known), dr.gather(mi.Vector3f, rays.d, index, known)
     no, first = dr.full(mi.Bool, False, lanes), dr.full(mi.UInt32, 0, lanes)
     return Path(index, start_walk(o, d, rng), start_light(lanes), no, first)

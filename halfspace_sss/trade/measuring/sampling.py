@@ -17,7 +17,7 @@ from halfspace_sss.trade.measuring.seeds import seeded
 from halfspace_sss.trade.measuring.statistics import Estimate
 from halfspace_sss.trade.measuring.ways import Stage, Way
 
-__all__ = ["Sampled", "clock", "first_sample", "sample_more", "warm_up"]
+__all__ = ["Sampled", "clock", "first_sample", "radiance", "sample_more", "warm_up"]
 
 LANES = 2**18  # of a launch
 PILOT, FEWEST = 64, 8  # samples of each exit by which the time is foreseen, and of a launch that is worth it
@@ -144,8 +144,8 @@ def _launch(stage: Stage, integrator: Any, exits: Exits, estimate: Estimate, eac
     dr.detail.malloc_clear_statistics()
     started = clock()
     sampler.seed(seed, exits.n * each)
-    L = integrator.sample(stage.scene, sampler, rays, None, mi.Bool(True))[0]
-    sums = [dr.block_sum(v + dr.zeros(mi.Float, exits.n * each), each) for c in L for v in (c, c * c)]
+    L = radiance(stage.scene, integrator, sampler, rays, exits.n * each)
+    sums = [dr.block_sum(v, each) for c in L for v in (c, c * c)]
     dr.eval(sums)
     dr.sync_thread()
     took = clock() - started
@@ -154,5 +154,29 @@ def _launch(stage: Stage, integrator: Any, exits: Exits, estimate: Estimate, eac
     if not np.isfinite(rows).all():
         raise ValueError(f"samples must be finite, got {int((~np.isfinite(rows)).sum())} exits that are not")
     estimate.add(rows[0::2], rows[1::2], each)
-    estimate.add_bright(np.array([np.broadcast_to(c.numpy(), exits.n * each) for c in L]), each)
+    estimate.add_bright(np.array([c.numpy() for c in L]), each)
     return memory, took
+
+
+def radiance(scene: Any, integrator: Any, sampler: Any, ray: Any, n: int) -> list[Any]:
+    """Radiance of n rays, by channel, by one kernel for all that it is asked for.
+
+    It is evaluated at once, as sums evaluate what they are given and would trace all paths for each channel anew.
+
+    Args:
+        scene: to look at.
+        integrator: of a way.
+        sampler: of n numbers at a time.
+        ray: n of them.
+        n: how many.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    sampler.schedule_state()
+    dr.schedule(ray.o, ray.d)
+    dr.eval()
+    ray = mi.Ray3f(ray.o, ray.d)
+    L = [c + dr.zeros(mi.Float, n) for c in integrator.sample(scene, sampler, ray, None, mi.Bool(True))[0]]
+    dr.eval(L)
+    return L
