@@ -52,5 +52,6 @@ class BetterDipole(Separable):
         decay, fluence, _ = safe_differences(lib, sigma_tr, d_r, d_v, delta)
         irradiance = z_r * (1 + sigma_tr * d_r) / (d_r * d_r * d_r)
         irradiance = irradiance + z_v * (1 + sigma_tr * d_v) * decay / (d_v * d_v * d_v)
-        exitance = self._boundary.C_phi / D * fluence + self._boundary.C_E * irradiance
+        C_phi, C_E = q.constant(self._boundary.C_phi), q.constant(self._boundary.C_E)
+        exitance = C_phi / D * fluence + C_E * irradiance
         return q.constant(c.albedo_prime**2 / (4 * math.pi)) * exitance * lib.exp(-sigma_tr * d_r)

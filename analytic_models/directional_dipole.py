@@ -64,7 +64,8 @@ class DirectionalDipole(BSSRDF):
 
     def G_unclamped(self, q: Query) -> Any:
         q = q.in_float64()
-        lib, c, C_phi, C_E = q.lib, self._c, self._boundary.C_phi, self._boundary.C_E
+        lib, c = q.lib, self._c
+        C_phi, C_E = q.constant(self._boundary.C_phi), q.constant(self._boundary.C_E)
         D, a, d_e, h, scale = (q.constant(v) for v in (c.D, c.sigma_tr, c.d_e, c.h, c.scale))
         mu, r = q.mu_i_in, lib.maximum(q.r, R_MIN)
         x_w = -r * q.sin_i * lib.cos(q.phi_i)  # x.w_12

@@ -72,7 +72,8 @@ class PhotonBeamDiffusion(BSSRDF):
         irradiance = z * (1 + sigma_tr * d_r) / (d_r * d_r)
         irradiance = irradiance + (z + 2 * z_b) * (1 + sigma_tr * d_v) * decay * (d_r / d_v) / (d_v * d_v)
         # C_phi phi + C_E E, times exp(-sigma_t' t)
-        exitance = self._boundary.C_phi / D * (fluence * d_r) + self._boundary.C_E * irradiance
+        C_phi, C_E = q.constant(self._boundary.C_phi), q.constant(self._boundary.C_E)
+        exitance = C_phi / D * (fluence * d_r) + C_E * irradiance
         exitance = exitance * lib.exp(-sigma_tr * d_r - sigma_t_prime * t)
         if self.kappa != "none":  # kappa = 1 - exp(-2 sigma_t (d_r + t))
             exitance = -lib.expm1(-q.constant(self._kappa_rate) * (d_r + t)) * exitance

@@ -11,6 +11,7 @@ import numpy as np
 
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.scenes.scene_files import millimetres
+from halfspace_sss.rendering.surface.boundary import smooth_boundary
 from halfspace_sss.rendering.surface.horizon import cosine_above, lifted
 from halfspace_sss.rendering.surface.inside import Inside
 from halfspace_sss.rendering.surface.object import Object, survey, turned
@@ -90,10 +91,9 @@ class Subject:
         Raises:
             ValueError: its normals point to both sides.
         """
-        import mitsuba as mi
 
         _check_geometry(found)
-        boundary = mi.load_dict({"type": "dielectric", "int_ior": media[0].eta, "ext_ior": 1.0})
+        boundary = smooth_boundary(media[0].eta)
         if varying is not None:
             varying = replace(varying, factor=varying.factor * mm_per_unit)
         return cls(found, media, boundary, AreaPoints(found.shape), varying)

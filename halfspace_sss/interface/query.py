@@ -30,12 +30,17 @@ class Query:
     sigma_t: Any = None  # r = sigma_t r_mm, kept so that `in_float64` does not inherit the rounding of r
 
     @functools.cached_property
+    def index(self) -> Any:
+        """eta as a constant; matched media, which are answered without Fresnel's equations, keep the number 1."""
+        return self.constant(self.eta) if isinstance(self.eta, (int, float)) and self.eta != 1 else self.eta
+
+    @functools.cached_property
     def mu_i_in(self) -> Any:
-        return mu_internal(self.mu_i, self.eta)
+        return mu_internal(self.mu_i, self.index)
 
     @functools.cached_property
     def mu_o_in(self) -> Any:
-        return mu_internal(self.mu_o, self.eta)
+        return mu_internal(self.mu_o, self.index)
 
     @functools.cached_property
     def sin_i(self) -> Any:
@@ -48,7 +53,7 @@ class Query:
 
     def _sine(self, mu: Any) -> Any:
         lib = self.lib
-        return lib.minimum(lib.sqrt(lib.maximum((1 - mu) * (1 + mu), 0.0)) / self.eta, 1.0)
+        return lib.minimum(lib.sqrt(lib.maximum((1 - mu) * (1 + mu), 0.0)) / self.index, 1.0)
 
     def constant(self, value: Any) -> Any:
         """A constant of the model (number, or one per channel) in the library and precision of the query."""

@@ -39,4 +39,4 @@ class Separable(BSSRDF):
         """Exit normaliser: 1 as in Jensen et al. 2001, or `exit_normaliser(eta)`, which conserves the flux."""
 
     def G(self, q: Query) -> Any:
-        return self.R_d(q) / (math.pi * self.N)
+        return self.R_d(q) / q.constant(math.pi * self.N)

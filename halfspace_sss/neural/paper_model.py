@@ -88,7 +88,7 @@ class NeuralPaper(BSSRDF):
     def _one(self, query: Query, m: Medium, trained: tuple[Network, float]) -> Any:
         network, scale = trained
         q = query.in_float64()  # the raw output crosses zero, where float32 has no digits
-        lib, L = q.lib, length_scale(m.albedo, m.g)
-        S = scale * network(query_inputs(q, L))
-        G = S / lib.maximum(F_t(q.mu_i, m.eta) * F_t(q.mu_o, m.eta), T_SMALLEST)
+        lib, L = q.lib, q.constant(length_scale(m.albedo, m.g))
+        S = q.constant(scale) * network(query_inputs(q, L))
+        G = S / lib.maximum(F_t(q.mu_i, q.index) * F_t(q.mu_o, q.index), T_SMALLEST)
         return lib.like(lib.where(q.r > U_MAX * L, 0 * G, G), query.r)

@@ -185,8 +185,9 @@ def _rows(vector: type, matrices: list[np.ndarray], biases: list[np.ndarray]) ->
     precision = np.float64 if _is_double(kind) else np.float32
     for W in matrices:
         W = np.pad(W, ((0, 0), (0, -W.shape[1] % PACKET)))
-        found.append((len(W), kind(np.ascontiguousarray(W.ravel(), dtype=precision))))
-    return found, [kind(np.ascontiguousarray(b, dtype=precision)) for b in biases]
+        found.append((len(W), kind(W.ravel().astype(precision).tolist())))
+    # lists, not NumPy arrays: memory in any alignment would need kernels of its own
+    return found, [kind(np.asarray(b, dtype=precision).tolist()) for b in biases]
 
 
 def _product(W: Any, x: Any, bias: Any) -> Any:

@@ -37,9 +37,8 @@ def choose(body: Body, si: Any, active: Any) -> Choice:
     (1 - T) (R_1 + (a - R_1) T) of order 1 and (1 - T) R_2 of the rest.
     """
     out = exit_at(body, si)
-    eta = body.surface.inside.medium.eta
     mu = dr.dot(out.w, out.n)
-    F, mu_in, _, into = mi.fresnel(dr.maximum(mu, 0), eta)
+    F, mu_in, _, into = mi.fresnel(dr.maximum(mu, 0), body.eta)
     along = mi.Vector3f(dr.normalize(-into * out.w + out.n * (into * mu - dr.abs(mu_in))))
     valid = active & (mu > 0) & (dr.dot(along, out.n_face) < 0)
     reflection = dr.clip(F, LEAST_REFLECTION, 0.95) if body.surface.inside.reflection else mi.Float(0)

@@ -169,7 +169,7 @@ def _meet_boundary(of: tuple[Body, Media], walk: _Walk, met: tuple[Any, Any, Any
     survival = dr.select(walk.order == 1, dr.minimum(size / FAINT, 1), 1)
     frame = mi.Frame3f(lifted(n_out, n, walk.d))
     w = frame.to_local(-walk.d)
-    F, cos_t, _, eta_ti = mi.fresnel(mi.Frame3f.cos_theta(w), body.surface.inside.medium.eta)
+    F, cos_t, _, eta_ti = mi.fresnel(mi.Frame3f.cos_theta(w), body.eta)
     reflects = sampler.next_1d() < F
     back, on = -mirrored(-frame.to_world(mi.reflect(w)), n), opposed(frame.to_world(mi.refract(w, cos_t, eta_ti)), n)
     d, out = mi.Vector3f(dr.select(reflects, back, on)), ~reflects

@@ -47,7 +47,7 @@ def meet(body: Body, p: Any, d: Any, flags: Any, active: Any) -> tuple[Any, Any,
 
 def _refract(body: Body, d: Any, n: Any) -> tuple[Any, Any, Any]:
     """Direction outside, Fresnel reflectance, and whether light passes, for a ray inside along d."""
-    eta = body.surface.inside.medium.eta
+    eta = body.eta
     c = dr.dot(d, n)
     c_t2 = 1 - eta * eta * (1 - c * c)
     F = mi.fresnel(dr.maximum(c, 0), 1 / eta)[0]
@@ -89,7 +89,7 @@ def refracted_connection(body: Body, p: Any, target: Any, active: Any) -> Connec
 def _first_guess(body: Body, p: Any, w: Any, active: Any) -> Any:
     """The direction inside of light that arrives along -w where the straight ray along w meets the boundary."""
     _, n_out, _ = meet(body, p, w, mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame, active)
-    across = (w - n_out * dr.dot(w, n_out)) / body.surface.inside.medium.eta
+    across = (w - n_out * dr.dot(w, n_out)) / body.eta
     return dr.normalize(across + n_out * dr.sqrt(dr.maximum(1 - dr.squared_norm(across), 1e-4)))
 
 
@@ -101,7 +101,7 @@ def _aim(body: Body, p: Any, d: Any, target: Any, active: Any) -> tuple[tuple, t
     flags = mi.RayFlags.All | mi.RayFlags.dNSdUV
     si, n_out, n = meet(body, p, d, flags, active)
     w, F, valid = _refract(body, d, n_out)
-    eta, c = body.surface.inside.medium.eta, dr.dot(d, n_out)
+    eta, c = body.eta, dr.dot(d, n_out)
     c_t = dr.sqrt(dr.maximum(1 - eta * eta * (1 - c * c), 1e-6))
     flip = dr.select(dr.dot(si.sh_frame.n, n_out) > 0, 1.0, -1.0) * body.found.curvature_sign
     D = dr.dot(target - si.p, w)

@@ -12,6 +12,8 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from halfspace_sss.rendering.surface.boundary import is_smooth_boundary
+
 __all__ = ["with_media"]
 
 FAR = 1e5  # scene units within which objects lie
@@ -62,7 +64,8 @@ def _fill(config: Any, state: Any, shape: Any, mm_per_unit: float) -> None:
         if state.nodes[index].props.plugin_name() != "translucent":
             continue
         surface = _instance(config, state, index)
-        shape[key] = surface.boundary
+        plain = {"type": "dielectric", "int_ior": float(surface.inside.medium.eta), "ext_ior": 1.0}
+        shape[key] = mi.load_dict(plain) if is_smooth_boundary(surface.boundary) else surface.boundary
         shape["interior"] = medium(surface.inside, mm_per_unit)
         return
 

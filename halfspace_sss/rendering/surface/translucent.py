@@ -42,6 +42,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from halfspace_sss.rendering.surface.boundary import boundary_of, check_eta
 from halfspace_sss.rendering.surface.inside import PARAMETERS, read_inside
 from halfspace_sss.rendering.surface.parameters import check_parameters
 from halfspace_sss.rendering.surface.reflection import Reflection
@@ -62,7 +63,7 @@ def translucent_class() -> type:
             check_parameters("translucent", props, (*PARAMETERS, *(key for key, _ in _boundaries(props))))
             self.inside = read_inside(props)
             self.choice = ""  # why "auto" became the model that it is
-            self.boundary = _boundary(props, self.inside.medium.eta)
+            self.boundary = boundary_of([inner for _, inner in _boundaries(props)], self.inside.medium.eta)
             self.reflection = Reflection.of(self.boundary)
             self.m_components = [self.boundary.flags(self.reflection.lobe)]
             self.m_flags = self.m_components[0]
@@ -105,24 +106,3 @@ def translucent_class() -> type:
 def _boundaries(props: Any) -> list[tuple[str, Any]]:
     """Names and surfaces of what stands inside."""
     return [(key, found) for key, found in props.objects() if isinstance(found, mi.BSDF)]
-
-
-def _boundary(props: Any, eta: float) -> Any:
-    """The dielectric of the surface."""
-    inner = [boundary for _, boundary in _boundaries(props)]
-    if len(inner) > 1:
-        raise ValueError(f"a translucent surface must have at most one BSDF inside, got {len(inner)}")
-    if not inner:
-        return mi.load_dict({"type": "dielectric", "int_ior": float(eta), "ext_ior": 1.0})
-    check_eta(inner[0], eta)
-    return inner[0]
-
-
-def check_eta(boundary: Any, eta: float) -> None:
-    """Refuse a boundary of another index than the medium's."""
-    found = mi.traverse(boundary).get("eta")
-    found = None if found is None else float(np.max(np.array(found)))
-    if found is None or abs(found - eta) > 2e-3 * eta:
-        raise ValueError(
-            f"the boundary must be a dielectric with eta {eta:g} of the medium (int_ior/ext_ior), got {found}"
-        )

@@ -17,6 +17,7 @@ from halfspace_sss.rendering.surface.transports import AUTO, choose_models, know
 from halfspace_sss.rendering.surface.varying import equivalent, warn_of_means
 from halfspace_sss.rendering.transport.expected import Expected, expected_of
 from halfspace_sss.rendering.transport.half_space import half_space_means
+from halfspace_sss.rendering.transport.plane import number
 from halfspace_sss.rendering.transport.protocols import Means, Proposals, Transport
 from halfspace_sss.rendering.transport.settings import AUTOMATIC, Settings
 from halfspace_sss.rendering.transport.variation import Variation
@@ -51,6 +52,11 @@ class Body:
     few: tuple[int, ...]
     expected: Expected
     variation: Variation
+
+    @property
+    def eta(self) -> Any:
+        """Relative index of the media, as data of kernels."""
+        return number(self.media[0].eta)
 
     @property
     def splits(self) -> bool:

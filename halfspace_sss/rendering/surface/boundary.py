@@ -1,0 +1,112 @@
+"""The smooth dielectric boundary of an object; its index is data of kernels, which then serve media of any index."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+__all__ = ["boundary_of", "check_eta", "is_smooth_boundary", "smooth_boundary"]
+
+FACES = int(mi.BSDFFlags.FrontSide) | int(mi.BSDFFlags.BackSide)
+REFLECTED, REFRACTED = 0, 1  # components
+
+
+def smooth_boundary(eta: float) -> mi.BSDF:
+    """The plain dielectric of a relative index under the current variant of Mitsuba.
+
+    The same events, weights and densities as Mitsuba's `dielectric` without tints, whose index is part of the code of
+    every kernel: each other index would compile them all anew.
+
+    Args:
+        eta: index inside over index outside.
+    """
+    props = mi.Properties("smooth_boundary")
+    props["eta"] = float(eta)
+    return _class(mi.variant())(props)
+
+
+def is_smooth_boundary(boundary: Any) -> bool:
+    """Whether a boundary is one of `smooth_boundary`."""
+    return isinstance(boundary, _class(mi.variant()))
+
+
+@functools.cache
+def _class(variant: str) -> type:
+    """The class of a variant, which must be the current one."""
+
+    class SmoothBoundary(mi.BSDF):
+        """Reflection by Fresnel's equations, and refraction into the cone by Snell's law."""
+
+        def __init__(self, props: Any) -> None:
+            mi.BSDF.__init__(self, props)
+            self.eta = dr.opaque(mi.Float, float(props["eta"]))
+            reflects = int(mi.BSDFFlags.DeltaReflection) | FACES
+            refracts = int(mi.BSDFFlags.DeltaTransmission) | int(mi.BSDFFlags.NonSymmetric) | FACES
+            self.m_components = [reflects, refracts]
+            self.m_flags = reflects | refracts
+
+        def traverse(self, callback: Any) -> None:
+            callback.put("eta", self.eta, mi.ParamFlags.NonDifferentiable)
+
+        def sample(self, ctx: Any, si: Any, u: Any, v: Any, active: Any = True) -> tuple[Any, Any]:
+            reflects = ctx.is_enabled(mi.BSDFFlags.DeltaReflection, REFLECTED)
+            refracts = ctx.is_enabled(mi.BSDFFlags.DeltaTransmission, REFRACTED)
+            bs = dr.zeros(mi.BSDFSample3f)
+            if not (reflects or refracts):
+                return bs, mi.Spectrum(0)
+            F, cos_t, eta_it, eta_ti = mi.fresnel(mi.Frame3f.cos_theta(si.wi), self.eta)
+            chosen = u <= F if reflects and refracts else mi.Bool(reflects)
+            share = dr.select(chosen, F, 1 - F)
+            bs.pdf = share if reflects and refracts else mi.Float(1)
+            weight = mi.Float(1) if reflects and refracts else share
+            bs.sampled_component = dr.select(chosen, mi.UInt32(REFLECTED), REFRACTED)
+            kinds = (mi.UInt32(int(f)) for f in (mi.BSDFFlags.DeltaReflection, mi.BSDFFlags.DeltaTransmission))
+            bs.sampled_type = dr.select(chosen, *kinds)
+            bs.wo = dr.select(chosen, mi.reflect(si.wi), mi.refract(si.wi, cos_t, eta_ti))
+            bs.eta = dr.select(chosen, 1, eta_it)
+            if ctx.mode == mi.TransportMode.Radiance:  # radiance, unlike importance, grows with the index
+                weight = weight * dr.select(chosen, 1, dr.square(eta_ti))
+            return bs, mi.Spectrum(dr.select(active, weight, 0))
+
+        def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+            return mi.Spectrum(0)
+
+        def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+            return mi.Float(0)
+
+        def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> tuple[Any, Any]:
+            return mi.Spectrum(0), mi.Float(0)
+
+        def to_string(self) -> str:
+            return f"SmoothBoundary[eta = {float(np.max(np.array(self.eta))):.7g}]"
+
+    return SmoothBoundary
+
+
+def boundary_of(surfaces: list[Any], eta: float) -> Any:
+    """The boundary of a medium from the BSDFs inside a surface: at most one, a dielectric of the same index.
+
+    Raises:
+        ValueError: there are several, or it is of another index.
+    """
+    if len(surfaces) > 1:
+        raise ValueError(f"a translucent surface must have at most one BSDF inside, got {len(surfaces)}")
+    for boundary in surfaces:
+        check_eta(boundary, eta)
+        if boundary.class_name() != "SmoothDielectric" or mi.traverse(boundary).keys() != {"eta"}:  # rough, or tinted
+            return boundary
+    return smooth_boundary(eta)
+
+
+def check_eta(boundary: Any, eta: float) -> None:
+    """Refuse a boundary of another index than the medium's."""
+    found = mi.traverse(boundary).get("eta")
+    found = None if found is None else float(np.max(np.array(found)))
+    if found is None or abs(found - eta) > 2e-3 * eta:
+        raise ValueError(
+            f"the boundary must be a dielectric with eta {eta:g} of the medium (int_ior/ext_ior), got {found}"
+        )
