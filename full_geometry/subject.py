@@ -91,7 +91,6 @@ class Subject:
         Raises:
             ValueError: its normals point to both sides.
         """
-
         _check_geometry(found)
         boundary = smooth_boundary(media[0].eta)
         if varying is not None:
