@@ -26,6 +26,7 @@ from full_geometry.learning.seen import Seen
 from full_geometry.model import FullGeometry
 from full_geometry.patches import Patches, PatchSampler, cluster
 from full_geometry.subject import Subject
+from halfspace_sss.backend import busy_threads
 from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.neural.store import to_json
 from halfspace_sss.neural.trained import weights_folder
@@ -141,9 +142,8 @@ def train_by_cpu(
     while run.done < run.total:
         run._chunk(seconds, time.process_time)
     run.fitting.solve(run.source, run.done, seed)
-    spent = time.process_time() - began
-    found = run._judged(reference(subject, EXITS, WALKS, seed), SAMPLES)
-    record = run._record(found, spent)
+    spent = (time.process_time() - began) / busy_threads()  # of all cores, as the trade counts
+    record = run._record(run._judged(reference(subject, EXITS, WALKS, seed), SAMPLES), spent)
     return run.learnt(), storing.save(folder, run.identity, run.arrays(), record)
 
 
