@@ -12,7 +12,7 @@ import numpy as np
 
 from figures.computing.contenders import OF_OBJECTS
 from figures.computing.model_inputs import weight_files
-from figures.computing.scenes import BUNNY, MATERIALS, bunny_scene, prepare
+from figures.computing.scenes import BUNNY, MATERIALS, MM_PER_UNIT, bunny_scene, prepare
 from figures.drawing import trade_tables
 from figures.drawing.page import page
 from figures.drawing.style import paper, saved
@@ -33,7 +33,6 @@ SECONDS = {"draft": 2.0, "paper": 40.0}
 SIZE = {"draft": 64, "paper": 128}
 SPP = {"draft": 16, "paper": 32}
 SPIKES = RandomScene(0, 0, "spikes", "sky", (), (), 0.0, 1.3, 0.0, (), 0.05, 1)
-MM_PER_UNIT = 3.8
 TOLERANCE = 0.05
 NETWORKS = ("neural", "neural_material", "neural_shape")
 KNOB_MATERIALS = ("marble", "ketchup")

@@ -69,7 +69,7 @@ def _rendered(
     position = (mi.Vector2f(x, y) + sampler.next_2d()) * inverse
     ray, weight = camera.sample_ray_differential(camera.shutter_open(), 0.5, mi.Point2f(position), sampler.next_2d())
     ray = mi.Ray3f(ray.o + dr.zeros(mi.Point3f, n), ray.d + dr.zeros(mi.Vector3f, n))
-    L = radiance(scene, integrator, sampler, ray, n)
+    L = radiance(scene, integrator, sampler, ray)
     columns = [dr.block_sum(w * c, spp).numpy() / spp for w, c in zip(weight, L)]
     image = np.stack(columns * (3 if len(columns) == 1 else 1), axis=1)
     return np.maximum(image, 0).reshape(size[1], size[0], 3).astype(np.float32)

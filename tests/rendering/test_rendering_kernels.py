@@ -48,7 +48,7 @@ def largest_kernel(scene, spp: int = 1) -> str:
 
 @pytest.mark.parametrize("model", [*halfspace_sss.models(), "neural_shape", "path_traced"])
 def test_a_kernel_serves_other_materials_and_units(model):
-    """Of another index, too; where light is scattered evenly there is a kernel that spares the phase function."""
+    """Of another index, too; walks have a kernel of their own where light is scattered evenly, as in all of these."""
     kernels = set()
     for material, mm_per_unit in (("potato", 3.0), ("marble", 3.0), ("apple", 6.0)):
         gc.collect()

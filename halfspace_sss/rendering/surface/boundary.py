@@ -55,14 +55,13 @@ def _class(variant: str) -> type:
         def sample(self, ctx: Any, si: Any, u: Any, v: Any, active: Any = True) -> tuple[Any, Any]:
             reflects = ctx.is_enabled(mi.BSDFFlags.DeltaReflection, REFLECTED)
             refracts = ctx.is_enabled(mi.BSDFFlags.DeltaTransmission, REFRACTED)
-            bs = dr.zeros(mi.BSDFSample3f)
+            bs, both = dr.zeros(mi.BSDFSample3f), reflects and refracts
             if not (reflects or refracts):
                 return bs, mi.Spectrum(0)
             F, cos_t, eta_it, eta_ti = mi.fresnel(mi.Frame3f.cos_theta(si.wi), self.eta)
-            chosen = u <= F if reflects and refracts else mi.Bool(reflects)
+            chosen = u <= F if both else mi.Bool(reflects)
             share = dr.select(chosen, F, 1 - F)
-            bs.pdf = share if reflects and refracts else mi.Float(1)
-            weight = mi.Float(1) if reflects and refracts else share
+            bs.pdf, weight = (share, mi.Float(1)) if both else (mi.Float(1), share)
             bs.sampled_component = dr.select(chosen, mi.UInt32(REFLECTED), REFRACTED)
             kinds = (mi.UInt32(int(f)) for f in (mi.BSDFFlags.DeltaReflection, mi.BSDFFlags.DeltaTransmission))
             bs.sampled_type = dr.select(chosen, *kinds)

@@ -144,7 +144,7 @@ def _launch(stage: Stage, integrator: Any, exits: Exits, estimate: Estimate, eac
     dr.detail.malloc_clear_statistics()
     started = clock()
     sampler.seed(seed, exits.n * each)
-    L = radiance(stage.scene, integrator, sampler, rays, exits.n * each)
+    L = radiance(stage.scene, integrator, sampler, rays)
     sums = [dr.block_sum(v, each) for c in L for v in (c, c * c)]
     dr.eval(sums)
     dr.sync_thread()
@@ -158,17 +158,16 @@ def _launch(stage: Stage, integrator: Any, exits: Exits, estimate: Estimate, eac
     return memory, took
 
 
-def radiance(scene: Any, integrator: Any, sampler: Any, ray: Any, n: int) -> list[Any]:
-    """Radiance of n rays, by channel, by one kernel for all that it is asked for.
+def radiance(scene: Any, integrator: Any, sampler: Any, ray: Any) -> list[Any]:
+    """Radiance of rays, by channel, by one kernel for all that it is asked for.
 
     It is evaluated at once, as sums evaluate what they are given and would trace all paths for each channel anew.
 
     Args:
         scene: to look at.
         integrator: of a way.
-        sampler: of n numbers at a time.
-        ray: n of them.
-        n: how many.
+        sampler: of a number for each ray at a time.
+        ray: all of them.
     """
     import drjit as dr
     import mitsuba as mi
@@ -176,7 +175,7 @@ def radiance(scene: Any, integrator: Any, sampler: Any, ray: Any, n: int) -> lis
     sampler.schedule_state()
     dr.schedule(ray.o, ray.d)
     dr.eval()
-    ray = mi.Ray3f(ray.o, ray.d)
-    L = [c + dr.zeros(mi.Float, n) for c in integrator.sample(scene, sampler, ray, None, mi.Bool(True))[0]]
+    ray, nothing = mi.Ray3f(ray.o, ray.d), dr.zeros(mi.Float, sampler.wavefront_size())
+    L = [c + nothing for c in integrator.sample(scene, sampler, ray, None, mi.Bool(True))[0]]
     dr.eval(L)
     return L
