@@ -14,7 +14,7 @@ mi = pytest.importorskip("mitsuba")
 
 import drjit as dr  # noqa: E402
 
-from halfspace_sss.rendering.walk.connect import find_joins  # noqa: E402
+from halfspace_sss.rendering.light.small import SmallEmitters  # noqa: E402
 from halfspace_sss.rendering.walk.guide import Departure, Guide  # noqa: E402
 from halfspace_sss.rendering.walk.media import WalkMedia  # noqa: E402
 from halfspace_sss.rendering.walk.steps import Event  # noqa: E402
@@ -46,7 +46,7 @@ def guide() -> Guide:
     }
     scene = mi.load_dict({"type": "scene", "slab": slab, **lamps})
     media = WalkMedia.of(scene, 1.0)
-    return Guide(scene, media, find_joins(scene, media, 1.0))
+    return Guide(scene, media, SmallEmitters.of(scene))
 
 
 def event(media: WalkMedia, lanes: int) -> Event:
@@ -83,9 +83,9 @@ def test_the_guide_and_chance_share_the_light_of_lamps_between_them() -> None:
     at = event(found.media, d.shape[1])
     way = Departure(at.p, at.along, mi.Vector3f(d), at.object)
     whole = left = 0.0
-    for lamp, emitter in zip(LAMPS, found.joins.emitters):
+    for k, lamp in enumerate(LAMPS):
         value = light_along(d, lamp)
-        chance = np.array(found.share(mi.EmitterPtr(emitter), way, mi.Bool(True)))
+        chance = np.array(found.share(dr.full(mi.Int32, k, d.shape[1]), way, mi.Bool(True)))
         assert ((chance > 0) & (chance < 1)).all()
         whole, left = whole + solid * value.sum(axis=1), left + solid * (value * (1 - chance)).sum(axis=1)
     L = np.array(found.light(event(found.media, LANES), generator(mi, LANES, pass_seed(1))))

@@ -18,6 +18,7 @@ mi = pytest.importorskip("mitsuba")
 
 import drjit as dr  # noqa: E402
 
+from halfspace_sss.rendering.light.small import SmallEmitters  # noqa: E402
 from halfspace_sss.rendering.walk.connect import STEEPEST, Joins, find_joins  # noqa: E402
 from halfspace_sss.rendering.walk.media import WalkMedia  # noqa: E402
 from halfspace_sss.rendering.walk.steps import Event  # noqa: E402
@@ -51,7 +52,7 @@ def joins_of(lights: dict, g: float = 0.0, eta: float = 1.0, albedo: Any = ALBED
     slab = {"type": "cube", "to_world": at.translate([0, 0, -height / 2]).scale([60, 60, height / 2])}
     bsdf = {"type": "translucent", "sigma_s": sigma_s, "sigma_a": sigma_a, "g": g, "eta": eta}
     scene = mi.load_dict({"type": "scene", "slab": {**(shape or slab), "bsdf": bsdf}, **lights})
-    return find_joins(scene, WalkMedia.of(scene, 1.0), share)
+    return find_joins(scene, WalkMedia.of(scene, 1.0), SmallEmitters.of(scene), share)
 
 
 def slab_of_normal(path: Path, n: np.ndarray) -> dict:
@@ -196,18 +197,18 @@ def test_joins_cover_the_rays_that_come_steeply_from_an_emitter_that_looks_small
         return {"type": "sphere", "center": [x, 0, 10], "radius": radius, "emitter": {"type": "area"}}
 
     joins = joins_of({"a": lamp(0.0, 1.0), "b": lamp(20.0, 12.0), "sky": {"type": "constant"}})
-    small, large = (mi.EmitterPtr(emitter) for emitter in joins.emitters)
+    assert len(joins.small.emitters) == 2
+    small, large, none = 0, 1, -1
     pivot = mi.Point3f(0, 0, -1)
 
-    def covered(emitter: Any, y: list, w: list) -> bool:
-        return bool(joins.covers(emitter, mi.Point3f(y), dr.normalize(mi.Vector3f(w)), pivot)[0])
+    def covered(k: int, y: list, w: list) -> bool:
+        return bool(joins.covers(mi.Int32(k), mi.Point3f(y), dr.normalize(mi.Vector3f(w)), pivot)[0])
 
-    assert len(joins.emitters) == 2
     assert covered(small, [0, 0, 9], [0, 0, 1]) and covered(small, [0, 0, 9], [1.5, 0, 1])
     assert not covered(small, [0, 0, 9], [2, 0, 1])  # 63 degrees from the direction to the emitter
     assert not covered(small, [0, 0, 9], [0, 0, -1])  # arrives from beyond the event
     assert not covered(large, [20, 0, 2], [20, 0, 11])  # looks larger than half its distance
-    assert not covered(mi.EmitterPtr(None), [0, 0, 9], [0, 0, 1])
+    assert not covered(none, [0, 0, 9], [0, 0, 1])
 
 
 def test_scenes_without_small_emitters_or_smooth_objects_have_no_joins() -> None:

@@ -30,16 +30,24 @@ class Onward(NamedTuple):
     weight: Any  # spectrum
     pdf: Any
     emitter_share: Any  # of directions sampled by emitters at the vertex, 1 for a second sample beside d; for weights
-    sky_only: Any  # all emitters but the environment have been counted
+    sky_only: Any  # all emitters but the environment, and its suns, have been counted
     aim: Any  # distance of the emitter that d was sampled for, and nothing else counts; negative: d goes anywhere
+    mirrored: Any  # d was the only direction, so that emitter sampling had none
+    scattered: Any  # it was not
+
+    @property
+    def previous(self) -> tuple:
+        """What the next vertex has to know of this one, see `vertex.emitted`."""
+        return self.p, self.n, self.pdf, self.emitter_share, self.sky_only, self.aim, self.mirrored
 
 
 def nothing() -> Onward:
     """A path that ends."""
     zero = mi.Float(0)
     return Onward(
-        mi.Point3f(0), mi.Normal3f(0), mi.Vector3f(0), mi.Spectrum(0), zero, zero, mi.Bool(False), mi.Float(-1)
-    )
+        mi.Point3f(0), mi.Normal3f(0), mi.Vector3f(0), mi.Spectrum(0), zero, zero, mi.Bool(False), mi.Float(-1),
+        mi.Bool(False), mi.Bool(False),
+    )  # fmt: skip
 
 
 def surface(world: World, u: tuple[Any, Any, Any], ray: Any, si: Any, active: Any) -> tuple[Onward, Any]:
@@ -58,7 +66,7 @@ def surface(world: World, u: tuple[Any, Any, Any], ray: Any, si: Any, active: An
     delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
     on = Onward(
         mi.Point3f(si.p), mi.Normal3f(si.n), si.to_world(bs.wo), weight, dr.select(delta, 1, bs.pdf),
-        dr.select(delta, mi.Float(0), 1), mi.Bool(False), mi.Float(-1),
+        dr.select(delta, mi.Float(0), 1), mi.Bool(False), mi.Float(-1), delta, ~delta,
     )  # fmt: skip
     return on, direct
 
@@ -90,18 +98,19 @@ def multiple(world: World, body: Body, out: Exit, face: Any, sampler: Any, activ
     anywhere = found.aim < 0
     on = Onward(
         found.p, found.n, found.d, dr.select(found.delta, 0, found.value), dr.select(anywhere, found.pdf, 1),
-        dr.select(anywhere, mi.Float(world.lights.share), 0), mi.Bool(False), found.aim,
+        dr.select(anywhere, mi.Float(world.lights.share), 0), mi.Bool(False), found.aim, mi.Bool(False), mi.Bool(True),
     )  # fmt: skip
     return on, direct
 
 
-def few(world: World, body: Body, leg: Leg, sampler: Any, active: Any) -> tuple[Onward, Any]:
+def few(world: World, body: Body, leg: Leg, sampler: Any, scattered: Any, active: Any) -> tuple[Onward, Any]:
     """Light that was scattered at most once inside the body, and that of emitters that came the same way.
 
     The mean light of the sky as in `multiple`.
     """
-    found = few_orders(world, body, leg, sampler, active)
+    found = few_orders(world, body, leg, sampler, scattered, active)
     zero = mi.Float(0)
-    on = Onward(found.p, found.n, found.d, found.weight, mi.Float(1), zero, found.connected, mi.Float(-1))
+    on = Onward(found.p, found.n, found.d, found.weight, mi.Float(1), zero, found.connected, mi.Float(-1),
+                mi.Bool(False), mi.Bool(found.once))  # fmt: skip
     direct = found.direct - found.weight * world.even(body)[0] if world.evens(body) else found.direct
     return on, direct

@@ -8,10 +8,9 @@ reflected at the boundary by Fresnel as often as it takes, and leaves. After k =
 p the density of the walk; the factors eta² of radiance cancel, and Fresnel's inside with the chance to be reflected.
 Whether a leg is passed, and where and how the walk is scattered, is drawn for the channels by their weights f_c so far.
 
-Light of emitters that reaches the event without reflection is found by the ray that is refracted towards a sampled
-point of them, see `refracted_connection`, where there is one that it finds; all other light by chance. The boundary
-refracts as if it were smooth. Lights that no ray can hit are missed where they pass unscattered, or are reflected
-inside before they are scattered.
+Light of emitters and suns that reaches the event without reflection is found by the ray that is refracted towards a
+sampled point of them, see `refracted_connection`, where there is one that it finds; all other light by chance, that of
+delta lights spread over a cone, see `light.small`. The boundary refracts as if it were smooth.
 """
 
 from __future__ import annotations
@@ -23,6 +22,7 @@ import drjit as dr
 import mitsuba as mi
 
 from halfspace_sss.physics.phase import eval_hg, sample_hg
+from halfspace_sss.rendering.light.small import WIDE
 from halfspace_sss.rendering.paths.refraction import Connection, meet, refracted_connection
 from halfspace_sss.rendering.paths.world import World, sampled_light
 from halfspace_sss.rendering.surface.derivatives import detached
@@ -63,6 +63,7 @@ class Few(NamedTuple):
     weight: Any  # spectrum
     connected: Any  # whether light of emitters on this way is in `direct`
     direct: Any  # spectrum
+    once: Any  # whether it was scattered
 
 
 @dataclass
@@ -86,8 +87,11 @@ class _Walk:
     alive: Any
 
 
-def few_orders(world: World, body: Body, leg: Leg, sampler: Any, active: Any) -> Few:
-    """Light that leaves at the exit of `leg` after at most one scattering event."""
+def few_orders(world: World, body: Body, leg: Leg, sampler: Any, scattered: Any, active: Any) -> Few:
+    """Light that leaves at the exit of `leg` after at most one scattering event.
+
+    What passes unscattered shows delta lights only if the path has `scattered` before.
+    """
     with detached():
         walk = _walk(body, leg, sampler, active & leg.valid)
         once = walk.order == 1
@@ -97,12 +101,14 @@ def few_orders(world: World, body: Body, leg: Leg, sampler: Any, active: Any) ->
     f = _value(coefficients, walk.way, walk.order, walk.cosine)
     weight = dr.select(counts, f * (walk.inverse * leg.T), 0)
     direct = mi.Spectrum(0)
-    if world.lights.some_local:
+    if world.lights.some_local or world.suns:
         value = _value(coefficients, walk.event_way, mi.UInt32(1), None) * (walk.event_inverse * leg.T)
         direct = _connected(world, (body, coefficients), walk, dr.select(once, value, 0), sampler, once)
-    if world.lights.some_shaped:
+    if world.lights.some_shaped or world.suns:
         direct = direct + weight * _met_by_chance(world, body, walk, counts & straight)
-    return Few(walk.o, walk.n, walk.d, weight, straight, direct)
+    if world.lights.some_delta:
+        direct = direct + weight * _spread_lights(world, body, walk, sampler, counts & (once | scattered))
+    return Few(walk.o, walk.n, walk.d, weight, straight, direct, once)
 
 
 def _walk(body: Body, leg: Leg, sampler: Any, active: Any) -> _Walk:
@@ -187,7 +193,7 @@ def _connected(world: World, of: tuple[Body, Media], walk: _Walk, weight: Any, s
     ds, light = sampled_light(world, at, sampler.next_2d(), False, active)
     with detached():
         distant = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
-        active = active & (ds.pdf > 0) & ~ds.emitter.is_environment()
+        active = active & (ds.pdf > 0) & _aimed_at(world, ds.emitter, ds.d)
         reach = dr.select(distant, number(1e4 * body.found.size), ds.dist)
         target = walk.event + ds.d * reach
         met = refracted_connection(body, walk.event, target, active)
@@ -218,11 +224,35 @@ def _met_by_chance(world: World, body: Body, walk: _Walk, active: Any) -> Any:
         ray = place(walk.o, walk.n).spawn_ray(walk.d)
         si = world.scene.ray_intersect(ray, mi.RayFlags.All, False, active)
         emitter = si.emitter(world.scene, active)
-        active = active & si.is_valid() & (emitter != None)  # noqa: E711
-        met = refracted_connection(body, walk.event, mi.Point3f(si.p), active)
-        apart = dr.norm(mi.Point3f(met.p) - walk.o) > SAME_WAY * dr.norm(walk.o - walk.event)
-        sampled = met.valid & ~apart & _is_sampled(walk.event, si.p, si.n, met)
+        active = active & (emitter != None) & _aimed_at(world, emitter, walk.d)  # noqa: E711
+        target = dr.select(si.is_valid(), si.p, walk.event + walk.d * number(1e4 * body.found.size))
+        met = refracted_connection(body, walk.event, mi.Point3f(target), active)
+        n = dr.select(si.is_valid(), si.n, 0)
+        sampled = _is_same(walk, met, SAME_WAY) & _is_sampled(walk.event, target, n, met)
     return dr.select(active & ~sampled, emitter.eval(si, active), 0)
+
+
+def _spread_lights(world: World, body: Body, walk: _Walk, sampler: Any, active: Any) -> Any:
+    """Light of a delta light whose cone holds a walk's way out, which no connection with it would find."""
+    n, small = world.small.n_delta, world.small
+    which = mi.UInt32(dr.minimum(sampler.next_1d() * n, n - 1)) if n > 1 else mi.UInt32(0)
+    L = n * small.spread(which, place(walk.o, walk.n).spawn_ray(walk.d), mi.Float(WIDE), active)
+    with detached():
+        connects = active & (dr.max(L) > 0) & walk.straight & (walk.order == 1)
+        target = small.point(which, walk.event, 1e4 * body.found.size)
+        met = refracted_connection(body, walk.event, target, connects)
+    return dr.select(connects & _is_same(walk, met, 3 * WIDE), 0, L)
+
+
+def _aimed_at(world: World, emitter: Any, d: Any) -> Any:
+    """Whether events are connected with an emitter in the direction d: with any but a sky that has no sun there."""
+    found = ~emitter.is_environment()
+    return found | (world.small.index_of(emitter, d) >= 0) if world.suns else found
+
+
+def _is_same(walk: _Walk, met: Connection, tolerance: float) -> Any:
+    """Whether a walk has left its event by the connection, up to a share of the distance."""
+    return met.valid & (dr.norm(mi.Point3f(met.p) - walk.o) <= tolerance * dr.norm(walk.o - walk.event))
 
 
 def _is_sampled(event: Any, p: Any, n: Any, met: Connection) -> Any:

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
-import mitsuba as mi
+
+from halfspace_sss.rendering.light.small import is_delta
 
 __all__ = ["Lights", "balance"]
 
@@ -35,7 +36,7 @@ class Lights:
         """The lights of a scene."""
         emitters = scene.emitters()
         even = all("Constant" in emitter.class_name() for emitter in emitters)
-        delta = any(emitter.flags() & int(mi.EmitterFlags.Delta) for emitter in emitters)
+        delta = any(map(is_delta, emitters))
         local = any(not emitter.is_environment() for emitter in emitters)
         shaped = any(emitter.get_shape() is not None for emitter in emitters)
         return cls(0.0 if even else EMITTER_SHARE, local, shaped, delta)

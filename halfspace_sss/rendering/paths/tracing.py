@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from halfspace_sss.rendering.paths.books import Books, Replay, Tally
+from halfspace_sss.rendering.paths.events import nothing
 from halfspace_sss.rendering.paths.vertex import Vertex, emitted, vertex
 from halfspace_sss.rendering.paths.world import World
 from halfspace_sss.rendering.surface.derivatives import detached, tracking
@@ -54,18 +55,19 @@ def _trace(world: World, sampler: Any, camera: Any, books: tuple, active: Any) -
     """
     scene, settings, (parts, more) = world.scene, world.settings, books
     camera = mi.Ray3f(camera)
-    unlinked = (mi.Point3f(0), mi.Normal3f(0), mi.Float(1), mi.Float(0), mi.Bool(False), mi.Float(-1))
+    unlinked = nothing()._replace(pdf=mi.Float(1)).previous
 
     def step(sampler: Any, ray: Any, books: Books, throughput: Any, last: tuple, depth: Any, turn: tuple, active: Any):
-        (second, splits, kept, seen), first = turn, depth == 0
+        (second, splits, kept, seen, scattered), first = turn, depth == 0
         si = scene.ray_intersect(ray, mi.RayFlags.All, first, active)
         with tracking(world.books.tracks):
-            light = emitted(world, si, last, depth, active & ~(first & second))
+            shown = ~first if settings.hide_emitters else mi.Bool(True)
+            light = emitted(world, sampler, ray, si, last, shown, scattered, active & ~(first & second))
             books = world.books.add(books, throughput * light)
         seen = seen | (first & si.is_valid())
-        active = active & si.is_valid() & (last[-1] < 0) & (depth + 1 < _unsigned(settings.max_depth))
+        active = active & si.is_valid() & (last[5] < 0) & (depth + 1 < _unsigned(settings.max_depth))
         splits = splits | (active & first & _on_splitting(world, si))
-        on, books = vertex(world, sampler, Vertex(si, ray, throughput, first, second, active), books)
+        on, books = vertex(world, sampler, Vertex(si, ray, throughput, first, second, scattered, active), books)
         throughput = dr.select(active, throughput * on.weight, throughput)
         best = dr.max(throughput)
         active = active & (best > 0)
@@ -74,23 +76,20 @@ def _trace(world: World, sampler: Any, camera: Any, books: tuple, active: Any) -
         active = active & (sampler.next_1d() < survival)
         throughput = throughput / survival
         ray = dr.select(active, place(on.p, on.n).spawn_ray(on.d), ray)
-        last = (on.p, on.n, on.pdf, on.emitter_share, on.sky_only, on.aim)
+        last, scattered = on.previous, scattered | on.scattered
         again = ~active & splits & ~second
         kept, books = dr.select(again, books[0], kept), (dr.select(again, parts[1], books[0]), books[1])
-        ray, throughput, depth = (
-            dr.select(again, camera, ray),
-            dr.select(again, 1, throughput),
-            dr.select(again, 0, depth),
-        )
-        last = tuple(dr.select(again, a, b) for a, b in zip(unlinked, last))
-        return sampler, ray, books, throughput, last, depth, (second | again, splits, kept, seen), active | again
+        begun = (camera, mi.Spectrum(1), unlinked, mi.UInt32(0))
+        ray, throughput, last, depth = dr.select(again, begun, (ray, throughput, last, depth))
+        turn = (second | again, splits, kept, seen, scattered & ~again)
+        return sampler, ray, books, throughput, last, depth, turn, active | again
 
     no, one = mi.Bool(False), mi.Spectrum(1)
-    turn = (mi.Bool(no), mi.Bool(no), mi.Spectrum(0), mi.Bool(no))
+    turn = (mi.Bool(no), mi.Bool(no), mi.Spectrum(0), mi.Bool(no), mi.Bool(no))
     state = (sampler, camera, (parts[0], more), one, unlinked, mi.UInt32(0), turn, mi.Bool(active))
     with detached():
         out = dr.while_loop(state, lambda *state: state[-1], step, label="bssrdf")
-    (L, more), (second, _, kept, seen) = out[2], out[6]
+    (L, more), (second, _, kept, seen, _) = out[2], out[6]
     return ((dr.select(second, kept, L), dr.select(second, L, 0)), more), seen
 
 

@@ -13,7 +13,7 @@ from halfspace_sss.rendering.paths.books import Books
 from halfspace_sss.rendering.paths.choice import choose
 from halfspace_sss.rendering.paths.events import Onward, few, multiple, nothing, surface
 from halfspace_sss.rendering.paths.lights import balance
-from halfspace_sss.rendering.paths.world import World
+from halfspace_sss.rendering.paths.world import World, delta_light
 from halfspace_sss.rendering.surface.derivatives import detached, tracking
 from halfspace_sss.rendering.transport.body import Body
 from halfspace_sss.rendering.transport.plane import Exit, place
@@ -24,7 +24,8 @@ __all__ = ["Vertex", "emitted", "vertex"]
 class Vertex(NamedTuple):
     """Where a path is: interaction, the ray that led there, its throughput, whether this is the first, a second time.
 
-    The second time stands for the orders below two of a body, the first time for the rest.
+    The second time stands for the orders below two of a body, the first time for the rest. `scattered` says whether a
+    vertex before had more than one direction.
     """
 
     si: Any
@@ -32,23 +33,32 @@ class Vertex(NamedTuple):
     throughput: Any
     first: Any
     second: Any
+    scattered: Any
     active: Any
 
 
-def emitted(world: World, si: Any, last: tuple, depth: Any, active: Any) -> Any:
-    """Emitted light where the path arrives, weighted against the sampling of emitters at the last vertex."""
-    p, n, pdf, emitter_share, sky_only, aim = last
+def emitted(world: World, sampler: Any, ray: Any, si: Any, last: tuple, shown: Any, scattered: Any, active: Any) -> Any:
+    """Emitted light where a path arrives, weighted against the sampling of emitters at the last vertex.
+
+    Emitters count where they are `shown`; delta lights behind what mirrors them if the path has `scattered` before.
+    """
+    p, n, pdf, emitter_share, sky_only, aim, mirrored = last
     with detached():
-        emitter = si.emitter(world.scene, active)
-        active = active & (emitter != None) & ~(sky_only & ~emitter.is_environment())  # noqa: E711
+        emitter, mirrored = si.emitter(world.scene, active), active & mirrored & scattered
+        active = active & shown & (emitter != None) & ~(sky_only & _counted(world, emitter, ray.d))  # noqa: E711
         active &= (aim < 0) | dr.select(si.is_valid(), dr.abs(si.t - aim) < 1e-3 * aim, aim == dr.inf)
-        if world.settings.hide_emitters:
-            active = active & (depth > 0)
         before = place(p, n)
         ds = mi.DirectionSample3f(world.scene, si, before)
         pdf_emitter = emitter_share * world.scene.pdf_emitter_direction(before, ds, active & (emitter_share > 0))
         share = balance(pdf, pdf_emitter)
-    return dr.select(active, share * emitter.eval(si, active), 0)
+    light = dr.select(active, share * emitter.eval(si, active), 0)
+    return light + delta_light(world, sampler, ray, mirrored) if world.lights.some_delta else light
+
+
+def _counted(world: World, emitter: Any, d: Any) -> Any:
+    """Whether light of an emitter in the direction d was found by connections with the last event."""
+    counted = ~emitter.is_environment()
+    return counted | (world.small.index_of(emitter, d) >= 0) if world.suns else counted
 
 
 def vertex(world: World, sampler: Any, at: Vertex, books: Books) -> tuple[Onward, Books]:
@@ -75,7 +85,7 @@ def vertex(world: World, sampler: Any, at: Vertex, books: Books) -> tuple[Onward
             more = partial(multiple, world, body, choice.leg.out, si.prim_index, sampler, by_more)
             events.append((by_more, more))
         if body.few:
-            events.append((by_few, partial(few, world, body, choice.leg, sampler, by_few)))
+            events.append((by_few, partial(few, world, body, choice.leg, sampler, at.scattered, by_few)))
     for mask, event in events:
 
         def below(books: Books, mask: Any = mask, event: Callable = event) -> tuple[Onward, Books]:
@@ -125,7 +135,7 @@ def _outside(world: World, sampler: Any, at: Vertex, books: Books, choices: list
         u = sampler.next_2d(), sampler.next_1d(), sampler.next_2d()
         with detached():
             on, direct = surface(world, u, ray, si, plain | glossy)
-        shown, meets, books = _mirrored(world, sampler, on, throughput, books, glossy)
+        shown, meets, books = _mirrored(world, sampler, on, at, books, glossy)
         reflects = glossy & meets & (u_event < reflection)
         if world.books.tracks:  # again: no derivatives may be pending while others are passed on
             on, direct = surface(world, u, ray, si, plain | glossy)
@@ -142,18 +152,16 @@ def _outside(world: World, sampler: Any, at: Vertex, books: Books, choices: list
     return on, books, _Taken(reflects, share, u)
 
 
-def _mirrored(
-    world: World, sampler: Any, on: Onward, throughput: Any, books: Books, active: Any
-) -> tuple[Any, Any, Books]:
+def _mirrored(world: World, sampler: Any, on: Onward, at: Vertex, books: Books, active: Any) -> tuple[Any, Any, Books]:
     """Light of emitters that a body mirrors, which the reflected path leaves out; over the weight of the reflection.
 
     With it, whether the reflected ray meets a surface, from which more light may come.
     """
-    last = (on.p, on.n, on.pdf, on.emitter_share, on.sky_only, on.aim)
 
     def look(books: Books) -> tuple[Any, Any, Books]:
-        si = world.scene.ray_intersect(place(on.p, on.n).spawn_ray(on.d), mi.RayFlags.All, False, active)
-        light = throughput * emitted(world, si, last, mi.UInt32(1), active)
+        ray = place(on.p, on.n).spawn_ray(on.d)
+        si = world.scene.ray_intersect(ray, mi.RayFlags.All, False, active)
+        light = at.throughput * emitted(world, sampler, ray, si, on.previous, mi.Bool(True), at.scattered, active)
         return light, active & si.is_valid(), world.books.add(books, on.weight * light)
 
     return _where(active, sampler, (mi.Spectrum(0), mi.Bool(False), books), world, look)
@@ -161,7 +169,7 @@ def _mirrored(
 
 def _unlit(on: Onward) -> Onward:
     """The same path, to which no emitter counts at its next vertex."""
-    return on._replace(pdf=mi.Float(0), emitter_share=mi.Float(0))
+    return on._replace(pdf=mi.Float(0), emitter_share=mi.Float(0), mirrored=mi.Bool(False))
 
 
 def _where(mask: Any, sampler: Any, otherwise: tuple, world: World, event: Callable[[Books], tuple]) -> tuple:

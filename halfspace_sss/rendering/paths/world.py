@@ -6,7 +6,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
+import mitsuba as mi
 
+from halfspace_sss.rendering.light.small import WIDE, SmallEmitters
 from halfspace_sss.rendering.paths.books import Replay, Tally
 from halfspace_sss.rendering.paths.lights import Lights
 from halfspace_sss.rendering.paths.sky import Sky, sky_of
@@ -14,7 +16,7 @@ from halfspace_sss.rendering.surface.derivatives import detached
 from halfspace_sss.rendering.transport.body import Body
 from halfspace_sss.rendering.transport.settings import AUTOMATIC, Settings
 
-__all__ = ["World", "sampled_light"]
+__all__ = ["World", "delta_light", "sampled_light"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,6 +30,7 @@ class World:
         settings: those of the integrator.
         books: what is written down.
         sky: its mean light, where it serves.
+        small: its emitters that look small, if there are any.
     """
 
     scene: Any
@@ -36,12 +39,20 @@ class World:
     settings: Settings
     books: Tally | Replay
     sky: Sky | None = None
+    small: SmallEmitters | None = None
 
     @classmethod
     def of(cls, scene: Any, bodies: list[Body], settings: Settings, books: Tally | Replay) -> World:
         """That of a scene and its bodies."""
         lights = Lights.of(scene)
-        return cls(scene, lights, bodies, settings, books, sky_of(scene, lights, bodies))
+        with detached():
+            small = SmallEmitters.of(scene)
+        return cls(scene, lights, bodies, settings, books, sky_of(scene, lights, bodies), small)
+
+    @property
+    def suns(self) -> bool:
+        """Whether the environment has suns, which are aimed at."""
+        return self.small is not None and len(self.small.suns) > 0
 
     def evens(self, body: Body) -> bool:
         """Whether the mean light of the sky serves a body."""
@@ -67,3 +78,10 @@ def sampled_light(world: World, ref: Any, u: Any, test_visibility: bool, active:
         return ds, light
     shines = active & (ds.pdf > 0)
     return ds, dr.replace_grad(light, world.scene.eval_emitter_direction(ref, ds, shines) * inverse)
+
+
+def delta_light(world: World, sampler: Any, ray: Any, active: Any) -> Any:
+    """Light of the delta lights along a ray, spread over a wide cone, by one of them."""
+    n = world.small.n_delta
+    which = mi.UInt32(dr.minimum(sampler.next_1d() * n, n - 1)) if n > 1 else mi.UInt32(0)
+    return n * world.small.spread(which, ray, mi.Float(WIDE), active)

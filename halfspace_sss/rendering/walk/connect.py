@@ -23,18 +23,17 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
+from halfspace_sss.rendering.light.small import SmallEmitters
 from halfspace_sss.rendering.surface.horizon import sided
 from halfspace_sss.rendering.surface.variants import channel_mean
 from halfspace_sss.rendering.walk.inside import eval_phase, fly, free_path, pick, turn
-from halfspace_sss.rendering.walk.media import WalkMedia, by_pointer, pointer_numbers
+from halfspace_sss.rendering.walk.media import WalkMedia
 from halfspace_sss.rendering.walk.steps import Event, Walk, draw, start_walk
 
 __all__ = ["DEEPEST", "Joins", "find_joins"]
 
 DEEPEST = 12.0  # mean free paths up to which the boundary in front of an event is looked for
-LARGEST = 0.5  # radius of an emitter over its distance
 STEEPEST = 0.5  # least cosine of a ray with w_0
 # Rates of fall about the aimed point, in 1/mfp: as light does around an event below a flat boundary, and one that
 # falls no faster than any light at the least cosine, so that weights stay bounded.
@@ -64,67 +63,36 @@ class LightWalk:
 
 @dataclass(frozen=True, eq=False)
 class Joins:
-    """The emitters whose light is found by joins.
+    """How light of small emitters is found by joins.
 
     Args:
         scene: the Mitsuba scene.
         media: its translucent objects.
-        emitters: the small emitters.
-        centres: three tables, of a point of each emitter or of the direction to it.
-        distant: table of whether each is infinitely far.
-        radii: table of the radius of the sphere about each emitter.
+        small: its small emitters.
         share: probability of a join at an event near the boundary.
-        indices: table from what Dr.Jit's registry calls an emitter to its place in `emitters`.
-        pointers: table of what the registry calls each.
     """
 
     scene: Any
     media: WalkMedia
-    emitters: list[Any]
-    centres: list[Any]
-    distant: Any
-    radii: Any
+    small: SmallEmitters
     share: float
-    indices: Any
-    pointers: Any
 
-    def _centre(self, k: Any) -> Any:
-        return mi.Vector3f(*(dr.gather(mi.Float, column, k) for column in self.centres))
-
-    def direction(self, k: Any, p: Any) -> tuple[Any, Any]:
-        """w_0 from p to emitter k, and whether the emitter looks small from there."""
-        centre, distant = self._centre(k), dr.gather(mi.Bool, self.distant, k)
-        way = dr.select(distant, centre, centre - mi.Vector3f(p))
-        size = dr.norm(way)
-        small = distant | (dr.gather(mi.Float, self.radii, k) < LARGEST * size)
-        return way / dr.maximum(size, 1e-20), small
-
-    def angle2(self, k: Any, p: Any) -> Any:
-        """Square of the angle under which the radius of emitter k is seen from p."""
-        way = self._centre(k) - mi.Vector3f(p)
-        return dr.square(dr.gather(mi.Float, self.radii, k)) / dr.squared_norm(way)
-
-    def index_of(self, emitter: Any) -> Any:
-        """The place of an emitter in `emitters`, or -1."""
-        pointer = dr.reinterpret_array(mi.UInt32, emitter)
-        known = pointer < dr.width(self.indices)
-        return dr.select(known, dr.gather(mi.Int32, self.indices, pointer, known), -1)
-
-    def covers(self, emitter: Any, y: Any, w: Any, pivot: Any) -> Any:
-        """Whether joins at `pivot` find light that arrives from the point y of an emitter along -w.
+    def covers(self, k: Any, y: Any, w: Any, pivot: Any) -> Any:
+        """Whether joins at `pivot` find light that arrives from the point y of emitter k along -w; none has k < 0.
 
         The line must cross the plane through the pivot steeply on its way from the emitter.
         """
-        k = self.index_of(emitter)
-        w_0, small = self.direction(dr.maximum(k, 0), pivot)
+        near = dr.maximum(k, 0)
+        w_0, small = self.small.direction(near, pivot)
         cosine = dr.dot(w, w_0)
-        return (k >= 0) & small & (dr.abs(cosine) > STEEPEST) & (dr.dot(y - pivot, w_0) * cosine > 0)
+        ahead = self.small.distant(near) | (dr.dot(y - pivot, w_0) * cosine > 0)
+        return (k >= 0) & small & (dr.abs(cosine) > STEEPEST) & ahead
 
     def light(self, event: Event, rng: Any) -> tuple[Any, Any]:
         """An estimate of what joins at an event bring per weight of the walk from the camera, and the generator."""
-        n = len(self.emitters)
+        n = len(self.small)
         which = draw(n, rng)
-        w_0, small = self.direction(which, event.p)
+        w_0, small = self.small.direction(which, event.p)
         aim, survive = self._aim(which, w_0, event)
         chosen = small & (rng.next_float32() < self.share * survive)
         L = mi.Spectrum(0) + dr.zeros(mi.Spectrum, dr.width(event.p))
@@ -153,20 +121,20 @@ class Joins:
         k, m = event.object, event.m
         at, density = _draw_across(event, aim, rng)
         which = aim.emitter
-        ds, light = self._emitter(which).sample_direction(at, mi.Point2f(rng.next_float32(), rng.next_float32()))
-        flux = light * (dr.abs(dr.dot(ds.d, aim.w_0)) / density)
-        distant = dr.gather(mi.Bool, self.distant, which)
-        away = dr.select(distant, 4 * dr.norm(self.scene.bbox().extents()), ds.dist * (1 - 1e-4))
-        si = self.scene.ray_intersect(mi.Ray3f(mi.Point3f(at.p + ds.d * away), -ds.d), mi.RayFlags.All, coherent=False)
-        steep = dr.abs(dr.dot(ds.d, aim.w_0)) > STEEPEST
-        enters = si.is_valid() & (ds.pdf > 0) & steep & (self.media.index_of(si.shape) == mi.Int32(k))
-        si = self.media.face_outwards(si, dr.select(enters, mi.Int32(k), -1), -ds.d)
+        w, distance, light = self.small.sample(which, at, mi.Point2f(rng.next_float32(), rng.next_float32()))
+        flux = light * (dr.abs(dr.dot(w, aim.w_0)) / density)
+        distant = self.small.distant(which)
+        away = dr.select(distant, 4 * dr.norm(self.scene.bbox().extents()), distance * (1 - 1e-4))
+        si = self.scene.ray_intersect(mi.Ray3f(mi.Point3f(at.p + w * away), -w), mi.RayFlags.All, coherent=False)
+        steep = dr.abs(dr.dot(w, aim.w_0)) > STEEPEST
+        enters = si.is_valid() & (dr.max(light) > 0) & steep & (self.media.index_of(si.shape) == mi.Int32(k))
+        si = self.media.face_outwards(si, dr.select(enters, mi.Int32(k), -1), -w)
         si.wi = dr.select(mi.Frame3f.cos_theta(si.wi) < 0, -si.wi, si.wi)  # below its horizon, see `surface.horizon`
         F, cos_t, _, eta_ti = mi.fresnel(mi.Frame3f.cos_theta(si.wi), self.media.row("eta", k))
         d = si.to_world(mi.refract(si.wi, cos_t, eta_ti))
-        enters &= (dr.dot(si.n, ds.d) > 0) & (mi.Frame3f.cos_theta(si.wi) > 0) & (dr.dot(si.n, d) < 0)
+        enters &= (dr.dot(si.n, w) > 0) & (mi.Frame3f.cos_theta(si.wi) > 0) & (dr.dot(si.n, d) < 0)
         # shading normals bend the ray, geometric ones hold its width
-        bend = dr.dot(d, si.n) * mi.Frame3f.cos_theta(si.wi) / (dr.dot(d, si.sh_frame.n) * dr.dot(ds.d, si.n))
+        bend = dr.dot(d, si.n) * mi.Frame3f.cos_theta(si.wi) / (dr.dot(d, si.sh_frame.n) * dr.dot(w, si.n))
         weight = dr.select(enters, flux * ((1 - F) * bend), 0)
         enters &= dr.max(weight) > 0
         walk = start_walk(mi.Point3f(si.p), d, rng)
@@ -175,11 +143,6 @@ class Joins:
         state = (LightWalk(walk, mi.Bool(enters), mi.Bool(enters), L), event)
         s, event = dr.while_loop(state, lambda s, event: s.walk.alive, self._follow, label="light")
         return s.walk.rng, s.L, event, aim
-
-    def _emitter(self, k: Any) -> Any:
-        if len(self.emitters) == 1:
-            return self.emitters[0]
-        return dr.reinterpret_array(mi.EmitterPtr, dr.gather(mi.UInt32, self.pointers, k))
 
     def _follow(self, s: LightWalk, event: Event) -> tuple[LightWalk, Event]:
         """One flight of the walk from the light, and a join on its ray if that may have one."""
@@ -267,25 +230,8 @@ def _on_ray(walk: Walk, event: Event, u: Any) -> tuple[Any, Any]:
     return t, dr.select(dr.isfinite(t), width / D, 0)
 
 
-def find_joins(scene: Any, media: WalkMedia, share: float) -> Joins | None:
-    """The small emitters of a scene, or None if there are none, or no object whose boundary is smooth."""
-    at = mi.Interaction3f()
-    at.p = mi.Point3f(0)
-    emitters, centres, distant, radii = [], [], [], []
-    for emitter in scene.emitters():
-        shape = emitter.get_shape()
-        if emitter.is_environment() or (shape is not None and hasattr(shape.bsdf(), "inside")):
-            continue
-        ds, _ = emitter.sample_direction(at, mi.Point2f(0.5))
-        far = mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite)
-        centre = shape.bbox().center() if shape is not None else ds.d if far else ds.p
-        emitters.append(emitter)
-        centres.append(np.ravel(np.array(centre)).tolist())
-        distant.append(bool(far))
-        radii.append(0.0 if shape is None else 0.5 * float(np.linalg.norm(np.array(shape.bbox().extents()))))
-    if not emitters or not media.objects or media.all_rough or share == 0:
+def find_joins(scene: Any, media: WalkMedia, small: SmallEmitters | None, share: float) -> Joins | None:
+    """Joins with the small emitters of a scene; None without any, or without an object whose boundary is smooth."""
+    if small is None or not media.objects or media.all_rough or share == 0:
         return None
-    pointers = [mi.EmitterPtr(emitter) for emitter in emitters]
-    tables = [mi.Float([c[axis] for c in centres]) for axis in range(3)], mi.Bool(distant), mi.Float(radii)
-    dr.make_opaque(tables)
-    return Joins(scene, media, emitters, *tables, share, by_pointer(pointers), pointer_numbers(pointers))
+    return Joins(scene, media, small, share)

@@ -15,9 +15,10 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from halfspace_sss.rendering.light.small import SmallEmitters
 from halfspace_sss.rendering.surface.horizon import opposed
 from halfspace_sss.rendering.surface.variants import channel_mean
-from halfspace_sss.rendering.walk.connect import DEEPEST, Joins
+from halfspace_sss.rendering.walk.connect import DEEPEST
 from halfspace_sss.rendering.walk.inside import eval_phase
 from halfspace_sss.rendering.walk.media import Coefficients, WalkMedia
 from halfspace_sss.rendering.walk.steps import Event, draw
@@ -46,16 +47,16 @@ class Guide:
     Args:
         scene: the Mitsuba scene.
         media: its translucent objects.
-        joins: the small emitters.
+        small: its small emitters.
     """
 
     scene: Any
     media: WalkMedia
-    joins: Joins
+    small: SmallEmitters
 
     def _guess(self, v: Any, k: Any, which: Any, m: Coefficients, active: Any) -> tuple[Any, Any, Any]:
         """The direction from v by which an emitter sees it through the boundary, its concentration, and if any."""
-        toward, small = self.joins.direction(which, v)
+        toward, small = self.small.direction(which, v)
         eta = self.media.row("eta", k)
         valid, d, w = active & small, toward, toward
         for _ in range(GUESSES):
@@ -64,17 +65,17 @@ class Guide:
             si = self.media.scene.ray_intersect(ray, mi.RayFlags.Minimal, coherent=False, active=valid)
             valid &= si.is_valid()
             n = si.n * self.media.side(k, si.prim_index)
-            w, _ = self.joins.direction(which, si.p)
+            w, _ = self.small.direction(which, si.p)
             cosine = dr.dot(w, n)
             _, cos_t, _, eta_ti = mi.fresnel(dr.clip(cosine, 0, 1), eta)
             refracted = w * eta_ti + n * (dr.abs(cos_t) - eta_ti * cosine)
             d = dr.normalize(dr.select(cosine > 0, refracted, d))
-        return d, dr.minimum(dr.square(eta) / dr.maximum(self.joins.angle2(which, v), 1e-6), 1e6), valid
+        return d, dr.minimum(dr.square(eta) / dr.maximum(self.small.angle2(which, v), 1e-6), 1e6), valid
 
     def light(self, event: Event, rng: Any) -> Any:
         """An estimate of the light of small emitters that leaves from an event, per weight of the walk."""
         v, k, m = event.p, event.object, event.m
-        n = len(self.joins.emitters)
+        n = len(self.small)
         which = mi.Int32(draw(n, rng))
         guess, concentration, valid = self._guess(v, k, which, m, True)
         d, pdf = _draw_lobe(guess, concentration, rng)
@@ -86,22 +87,20 @@ class Guide:
         F, cos_t, eta_it, eta_ti = mi.fresnel(mi.Frame3f.cos_theta(si.wi), self.media.row("eta", k))
         w = opposed(si.to_world(mi.refract(si.wi, cos_t, eta_ti)), si.n)
         valid &= (dr.dot(d, si.n) > 0) & (dr.dot(w, si.n) > 0) & (F < 1)
-        outside = self.scene.ray_intersect(si.spawn_ray(w), mi.RayFlags.All, coherent=False, active=valid)
-        emitter = outside.emitter(self.scene, valid)
-        valid &= outside.is_valid() & (self.joins.index_of(emitter) == which)
+        way = si.spawn_ray(w)
+        outside = self.scene.ray_intersect(way, mi.RayFlags.All, coherent=False, active=valid)
         phase = eval_phase(m, dr.dot(event.along, d))
         # radiance shrinks by eta² on its way out, as the weight of the walk has when it came in
         factor = (1 - F) * dr.square(eta_ti) / (pdf / n + channel_mean(phase))
         T = self.media.transmittance(k, ray, dr.select(valid, si.t, 0), rng)
         value = phase * T * factor
-        return dr.select(valid, value * emitter.eval(outside, valid), 0)
+        return dr.select(valid, value * self.small.along(which, way, outside, valid), 0)
 
-    def share(self, emitter: Any, way: Departure, active: Any) -> Any:
-        """Weight of having hit an emitter by the phase function (balance heuristic against `light`)."""
+    def share(self, which: Any, way: Departure, active: Any) -> Any:
+        """Weight of having hit emitter `which`, if >= 0, by the phase function (balance heuristic against `light`)."""
         k, m = way.object, self.media.coefficients(way.object, way.p)
-        which = self.joins.index_of(emitter)
         guess, concentration, valid = self._guess(way.p, k, type(k)(dr.maximum(which, 0)), m, active & (which >= 0))
-        lobes = _lobes(dr.dot(guess, way.ahead), concentration) / len(self.joins.emitters)
+        lobes = _lobes(dr.dot(guess, way.ahead), concentration) / len(self.small)
         phase = channel_mean(eval_phase(m, dr.dot(way.along, way.ahead)))
         return phase / (phase + dr.select(active & valid, lobes, 0))
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from halfspace_sss.rendering.light.small import SmallEmitters
 from halfspace_sss.rendering.surface.object import same_objects
 from halfspace_sss.rendering.surface.parameters import OF_MITSUBA, check_parameters
 from halfspace_sss.rendering.surface.sensors import check_sensors
@@ -50,15 +50,15 @@ def walk_integrator_class() -> type:
             self.rr_depth = _depth("rr_depth", int(props.get("rr_depth", 5)))
             self.hidden = bool(props.get("hide_emitters", False))
             self.join_share = _share("join_share", float(props.get("join_share", 0.5)))
-            self._prepared: tuple[int, list, Any, Any] = (0, [], None, None)
+            self._prepared: tuple[int, list, Any] = (0, [], None)
 
         def tracer(self, scene: Any) -> PathTracer:
-            """What paths through a scene need; the costly part is made ready once."""
-            self._prepared = _prepared(scene, self._prepared, self.mm_per_unit, self.join_share)
-            *_, media, joins = self._prepared
-            joins = joins and replace(joins, scene=scene)
-            guide = joins and Guide(scene, media, joins)
-            visitor = LightVisitor(scene, media, joins, guide)
+            """What paths through a scene need; its objects are made ready once, its emitters may have been edited."""
+            self._prepared = _prepared(scene, self._prepared, self.mm_per_unit)
+            media, small = self._prepared[-1], SmallEmitters.of(scene)
+            joins = find_joins(scene, media, small, self.join_share)
+            guide = joins and Guide(scene, media, small)
+            visitor = LightVisitor(scene, media, small, joins, guide)
             return PathTracer(visitor, self.max_depth, self.rr_depth, self.hidden)
 
         def render(
@@ -83,16 +83,15 @@ def walk_integrator_class() -> type:
     return TranslucentWalk
 
 
-def _prepared(scene: Any, before: tuple, mm_per_unit: float, join_share: float) -> tuple[int, list, Any, Any]:
-    """Number, shapes, media and joins of a scene: those of before, unless its objects, their shape or media changed."""
+def _prepared(scene: Any, before: tuple, mm_per_unit: float) -> tuple[int, list, Any]:
+    """Number, shapes and media of a scene: those of before, unless its objects, their shape or media changed."""
     shapes = scene.shapes()  # the scene itself, which holds its integrator, would never be freed
     same = before[0] == number_of(scene) and same_objects(before[1], shapes)
     if before[2] is not None and same and before[2].is_current():
         return before
     media = WalkMedia.of(scene, mm_per_unit)
     check_sensors(scene, media.objects)
-    joins = find_joins(scene, media, join_share)
-    return number_of(scene), shapes, media, joins and replace(joins, scene=None)
+    return number_of(scene), shapes, media
 
 
 def _refuse_derivatives(*_: Any, **__: Any) -> None:

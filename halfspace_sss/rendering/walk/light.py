@@ -1,7 +1,8 @@
 """Light that paths from the camera gather inside objects: the visitor of walks for images.
 
 Emitters that a path meets are weighted against those that were sampled at its last vertex (power heuristic), against
-joins and against the guide, which find small emitters (`walk_connect`, `walk_guide`).
+joins and against the guide, which find small emitters (`connect`, `guide`). Delta lights, which no ray meets, are
+spread over a cone where a path leaves a vertex that could not be lit by emitter sampling (`light.small`).
 """
 
 from __future__ import annotations
@@ -12,10 +13,11 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from halfspace_sss.rendering.light.small import NARROW, WIDE, SmallEmitters
 from halfspace_sss.rendering.walk.connect import Joins
 from halfspace_sss.rendering.walk.guide import Departure, Guide
 from halfspace_sss.rendering.walk.media import WalkMedia
-from halfspace_sss.rendering.walk.steps import Crossing, Event, Walk
+from halfspace_sss.rendering.walk.steps import Crossing, Event, Walk, draw
 
 __all__ = ["Light", "LightVisitor", "power_heuristic", "start_light"]
 
@@ -33,6 +35,7 @@ class Light:
     pivot: mi.Point3f  # the event at the end of that edge
     guided: mi.Bool  # the guide looked for small emitters from the last event, and nothing has reflected since
     departure: Departure  # from the last event
+    scattered: mi.Bool  # whether a vertex has scattered into a solid angle: delta lights then are no longer hidden
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,16 +45,19 @@ class LightVisitor:
     Args:
         scene: the Mitsuba scene.
         media: its translucent objects.
-        joins: how light of small emitters enters objects, if there are any.
+        small: its small emitters, if there are any.
+        joins: how light of small emitters enters objects, if it is looked for.
         guide: how it leaves them where joins cannot find it.
     """
 
     scene: Any
     media: WalkMedia
+    small: SmallEmitters | None
     joins: Joins | None
     guide: Guide | None
 
     def event(self, walk: Walk, record: Light, event: Event) -> tuple[Walk, Light]:
+        record = replace(record, scattered=mi.Bool(True))
         if self.joins is None:
             return walk, record
         smooth = ~self.media.row("rough", walk.object)
@@ -98,15 +104,39 @@ class LightVisitor:
         sampled = active & ~record.delta
         pdf = dr.select(sampled, self.scene.pdf_emitter_direction(last, ds, sampled), 0)
         share = dr.select(record.delta, 1, power_heuristic(record.pdf, pdf))
-        if self.joins is not None:
-            active &= ~(record.joined & self.joins.covers(emitter, si.p, walk.d, record.pivot))
+        if self.joins is not None and self.small.some_met:
+            which = self.small.index_of(emitter, walk.d)
+            active &= ~(record.joined & self.joins.covers(which, si.p, walk.d, record.pivot))
             guided = active & record.guided
-            state = (emitter, record.departure, share, guided)
+            state = (which, record.departure, share, guided)
             _, _, share, _ = dr.if_stmt(state, guided, self._against_guide, lambda *state: state)
         return dr.select(active, walk.weight * emitter.eval(si, active) * share, 0)
 
-    def _against_guide(self, emitter: Any, departure: Departure, share: Any, guided: Any) -> tuple:
-        return emitter, departure, self.guide.share(emitter, departure, guided), guided
+    def _against_guide(self, which: Any, departure: Departure, share: Any, guided: Any) -> tuple:
+        return which, departure, self.guide.share(which, departure, guided), guided
+
+    def spread_lights(self, walk: Walk, record: Light, active: Any) -> Any:
+        """Light of a delta light whose cone holds the ray, where neither emitter sampling nor joins find it."""
+        if self.small is None or self.small.n_delta == 0:
+            return mi.Spectrum(0)
+        n = self.small.n_delta
+        which = mi.Int32(draw(n, walk.rng)) if n > 1 else dr.zeros(mi.Int32, dr.width(walk.o))
+        active = active & record.scattered & record.delta
+        guided = mi.Bool(False)
+        if self.joins is not None:
+            w_0, _ = self.small.direction(which, walk.o)
+            lamp = walk.o + w_0 * dr.norm(self.scene.bbox().extents())
+            active &= ~(record.joined & self.joins.covers(which, lamp, w_0, record.pivot))
+            guided = active & record.guided
+        radius = dr.select(guided, NARROW, WIDE)
+        ray = mi.Ray3f(walk.o, walk.d)
+        L = self.small.spread(which, ray, radius, active)
+        if self.joins is not None:
+            guided &= dr.max(L) > 0
+            state = (which, record.departure, mi.Float(1), guided)
+            _, _, share, _ = dr.if_stmt(state, guided, self._against_guide, lambda *state: state)
+            L = L * share
+        return dr.select(active, walk.weight * L * n, 0)
 
     def sampled_emitter(self, walk: Walk, si: Any, bsdf: Any, active: Any, outwards: Any = True) -> Any:
         """Light of a sampled emitter by the surface at `si`; by a boundary only from its outer side."""
@@ -139,6 +169,7 @@ def start_light(lanes: int) -> Light:
         straight=full(mi.Bool, False), joined=full(mi.Bool, False), pivot=mi.Point3f(point),
         guided=full(mi.Bool, False),
         departure=Departure(mi.Point3f(point), along, mi.Vector3f(along), full(mi.Int32, 0)),
+        scattered=full(mi.Bool, False),
     )  # fmt: skip
 
 

@@ -82,6 +82,7 @@ class PathTracer:
         first = p.depth == 0
         shown = ~first if self.hide_emitters else mi.Bool(True)
         L = p.light.L + self.visitor.met_emitter(p.walk, p.light, si, shown)
+        L = L + self.visitor.spread_lights(p.walk, p.light, p.walk.alive)
         light = replace(p.light, L=L, joined=mi.Bool(False), guided=mi.Bool(False))
         depth = p.depth + 1
         alive = si.is_valid() & (depth < mi.UInt32(self.max_depth))
@@ -118,7 +119,9 @@ class PathTracer:
                        object=dr.select(alive & enters, k, OUTSIDE), weight=weight, scale=scale,
                        channel=channel)  # fmt: skip
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta) | turned
-        return replace(p, walk=walk, light=replace(light, L=L, last=si.p, pdf=bs.pdf, delta=delta))
+        scattered = light.scattered | ~delta
+        light = replace(light, L=L, last=si.p, pdf=bs.pdf, delta=delta, scattered=scattered)
+        return replace(p, walk=walk, light=light)
 
 
 def _channel(u: Any, n: int) -> Any:

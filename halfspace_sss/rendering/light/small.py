@@ -1,0 +1,225 @@
+"""Emitters that look small, which paths aim at: lamps, delta lights and suns of the environment.
+
+No ray meets a delta light (point, spot, projector, directional). Where emitter sampling cannot reach one either, as
+behind a refracting boundary, its light E d(w - w_l) is spread over a cone of solid angle Ω about the direction w_l to
+it (path space regularization, Kaplanyan and Dachsbacher 2013),
+
+    L(w) = E / Ω where the angle between w and w_l is below a radius, else 0,
+
+while visibility is that of the light itself. The irradiance stays what it is; the angle of incidence is blurred by the
+radius, which changes what an object makes of it by the order of the square of the radius.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from halfspace_sss.rendering.light.suns import Sun, suns_of
+
+__all__ = ["NARROW", "WIDE", "SmallEmitters", "is_delta", "spread"]
+
+LARGEST = 0.5  # radius of an emitter over its distance
+NARROW = 0.01  # radius of the cone of a delta light that paths aim at, radians
+WIDE = 0.05  # and of one that is left to chance
+
+
+@dataclass(frozen=True, eq=False)
+class SmallEmitters:
+    """The emitters of a scene that may look small from an object, each addressed by its number.
+
+    Args:
+        scene: the Mitsuba scene.
+        emitters: those with a place of their own or a direction: delta lights first.
+        n_delta: how many are delta lights.
+        suns: cones of the environment; their numbers follow.
+        tables: by number: a point of the emitter or the direction to it (`x`, `y`, `z`), whether it is `distant`, the
+            `radius` of the sphere about it or the angle of its cone; `pointer`, what Dr.Jit's registry calls each
+            emitter; and from that number to its place, `index`.
+    """
+
+    scene: Any
+    emitters: list[Any]
+    n_delta: int
+    suns: list[Sun]
+    tables: dict[str, Any]
+
+    @classmethod
+    def of(cls, scene: Any) -> SmallEmitters | None:
+        """Those of a scene; None if there are none.
+
+        Raises:
+            ValueError: an emitter that Mitsuba's own path tracers cannot evaluate either.
+        """
+        _check(scene)
+        emitters = sorted((e for e in scene.emitters() if _has_place(e)), key=lambda e: not is_delta(e))
+        sky = scene.environment()
+        suns = [] if sky is None or "Constant" in sky.class_name() else suns_of(sky)
+        if not (emitters or suns):
+            return None
+        rows = [_place(emitter) for emitter in emitters] + [(*sun.direction, True, sun.radius) for sun in suns]
+        x, y, z, distant, radius = zip(*rows)
+        pointers = [int(dr.reinterpret_array(mi.UInt32, mi.EmitterPtr(emitter))[0]) for emitter in emitters]
+        index = [-1] * (max(pointers, default=0) + 1)
+        for k, pointer in enumerate(pointers):
+            index[pointer] = k
+        tables = {
+            "x": mi.Float(x), "y": mi.Float(y), "z": mi.Float(z), "distant": mi.Bool(distant),
+            "radius": mi.Float(radius), "pointer": mi.UInt32(pointers or [0]), "index": mi.Int32(index),
+        }  # fmt: skip
+        dr.make_opaque(tables)
+        return cls(scene, emitters, sum(map(is_delta, emitters)), suns, tables)
+
+    def __len__(self) -> int:
+        return len(self.emitters) + len(self.suns)
+
+    @property
+    def some_met(self) -> bool:
+        """Whether rays can meet one."""
+        return len(self) > self.n_delta
+
+    def _row(self, key: str, k: Any) -> Any:
+        return dr.gather(type(self.tables[key]), self.tables[key], k)
+
+    def _centre(self, k: Any) -> Any:
+        return mi.Vector3f(*(self._row(axis, k) for axis in "xyz"))
+
+    def distant(self, k: Any) -> Any:
+        """Whether emitter k is infinitely far."""
+        return self._row("distant", k)
+
+    def direction(self, k: Any, p: Any) -> tuple[Any, Any]:
+        """w_0 from p to emitter k, and whether the emitter looks small from there."""
+        centre, distant = self._centre(k), self.distant(k)
+        way = dr.select(distant, centre, centre - mi.Vector3f(p))
+        size = dr.norm(way)
+        small = distant | (self._row("radius", k) < LARGEST * size)
+        return way / dr.maximum(size, 1e-20), small
+
+    def point(self, k: Any, p: Any, far: Any) -> Any:
+        """A point of emitter k; as far as said from p where that is distant."""
+        centre = self._centre(k)
+        return mi.Point3f(dr.select(self.distant(k), p + centre * far, centre))
+
+    def angle2(self, k: Any, p: Any) -> Any:
+        """Square of the angle under which the radius of emitter k is seen from p."""
+        seen = dr.square(self._row("radius", k)) / dr.squared_norm(self._centre(k) - mi.Vector3f(p))
+        if self.suns:
+            seen = dr.select(self.distant(k), dr.square(self._row("radius", k)), seen)
+        return dr.select(mi.UInt32(k) < self.n_delta, NARROW**2, seen) if self.n_delta else seen
+
+    def index_of(self, emitter: Any, w: Any) -> Any:
+        """The number of an emitter that a ray along w meets, or -1."""
+        pointer = dr.reinterpret_array(mi.UInt32, emitter)
+        known = pointer < dr.width(self.tables["index"])
+        k = dr.select(known, dr.gather(mi.Int32, self.tables["index"], pointer, known), -1)
+        sky = emitter.is_environment() if self.suns else None
+        for number in range(len(self.emitters), len(self)):
+            sun = dr.opaque(mi.UInt32, number)
+            inside = sky & (k < 0) & _within(w, self._centre(sun), self._row("radius", sun))
+            k = dr.select(inside, mi.Int32(sun), k)
+        return k
+
+    def sample(self, k: Any, at: Any, u: Any) -> tuple[Any, Any, Any]:
+        """A direction from `at` to emitter k, its distance, and light over the density of the direction; 0 if none."""
+        d, distance, light = mi.Vector3f(0, 0, 1), mi.Float(0), mi.Spectrum(0)
+        n = len(self.emitters)
+        if n:
+            emitter = self._emitter(dr.minimum(k, n - 1) if self.suns else k)
+            ds, weight = emitter.sample_direction(at, u, mi.UInt32(k) < n if self.suns else True)
+            d, distance, light = ds.d, ds.dist, dr.select(ds.pdf > 0, weight, 0)
+        if self.suns:
+            axis, radius, sun = self._centre(k), self._row("radius", k), mi.UInt32(k) >= n
+            x = u.x * 2 * dr.square(dr.sin(0.5 * radius))  # 1 - cos
+            sine, (sin_phi, cos_phi) = dr.safe_sqrt(x * (2 - x)), dr.sincos(2 * dr.pi * u.y)
+            way = mi.Frame3f(axis).to_world(mi.Vector3f(sine * cos_phi, sine * sin_phi, 1 - x))
+            si = dr.zeros(mi.SurfaceInteraction3f)
+            si.wi = -way
+            L = self.scene.environment().eval(si, sun) * _solid_angle(radius)
+            d, light = dr.select(sun, way, d), dr.select(sun, L, light)
+        return d, distance, light
+
+    def _emitter(self, k: Any) -> Any:
+        if len(self.emitters) == 1:
+            return self.emitters[0]
+        return dr.reinterpret_array(mi.EmitterPtr, self._row("pointer", k))
+
+    def along(self, k: Any, ray: Any, si: Any, active: Any) -> Any:
+        """Radiance of emitter k along a ray that meets `si`; of a delta light, spread over its narrow cone."""
+        L = mi.Spectrum(0)
+        if self.some_met:
+            emitter = si.emitter(self.scene, active)
+            met = active & (self.index_of(emitter, ray.d) == mi.Int32(k))
+            L = dr.select(met, emitter.eval(si, met), 0)
+        if self.n_delta:
+            delta = active & (mi.UInt32(k) < self.n_delta)
+            L = L + self.spread(k, ray, mi.Float(NARROW), delta)
+        return L
+
+    def spread(self, k: Any, ray: Any, radius: Any, active: Any) -> Any:
+        """Radiance of delta light k along a ray, spread over a cone of the given radius, where nothing is before it."""
+        emitter = self._emitter(dr.minimum(k, self.n_delta - 1))
+        return spread(self.scene, emitter, ray, radius, active)
+
+
+def spread(scene: Any, emitter: Any, ray: Any, radius: Any, active: Any) -> Any:
+    """E / Ω of a delta light, for a ray whose angle with the direction to it is below the radius of Ω."""
+    at = dr.zeros(mi.Interaction3f)
+    at.p = ray.o
+    ds, E = emitter.sample_direction(at, mi.Point2f(0.5), active)
+    seen = active & (ds.pdf > 0) & _within(ray.d, ds.d, radius) & (dr.max(E) > 0)
+    shadow = mi.Ray3f(ray.o, ds.d)
+    shadow.maxt = ds.dist * (1 - 1e-4)
+    seen &= ~scene.ray_test(shadow, False, seen)
+    return dr.select(seen, E / _solid_angle(radius), 0)
+
+
+def is_delta(emitter: Any) -> bool:
+    """Whether no ray can meet an emitter, though it can be sampled."""
+    return bool(emitter.flags() & int(mi.EmitterFlags.Delta)) and emitter.get_shape() is None
+
+
+def _check(scene: Any) -> None:
+    """Refuse emitters that do not work, and name those that no path from a camera finds."""
+    for emitter in scene.emitters():
+        kind = emitter.class_name()
+        if kind.startswith("TimedSunsky"):
+            raise ValueError(
+                "emitters must work in symbolic loops, got timed_sunsky, which fails in Mitsuba too: use sunsky"
+            )
+        if emitter.flags() & int(mi.EmitterFlags.Delta) and not is_delta(emitter):
+            message = f"light of a {kind} is left out: it can neither be sampled nor met, as by path tracers of Mitsuba"
+            warnings.warn(message, stacklevel=2)
+
+
+def _has_place(emitter: Any) -> bool:
+    """Whether an emitter is neither the environment nor out of reach nor the surface of a translucent object."""
+    shape = emitter.get_shape()
+    met = not emitter.flags() & int(mi.EmitterFlags.Delta)
+    return not emitter.is_environment() and (shape is None or (met and not hasattr(shape.bsdf(), "inside")))
+
+
+def _place(emitter: Any) -> tuple[float, float, float, bool, float]:
+    """A point of an emitter or the direction to it, whether it is distant, and the radius of the sphere about it."""
+    shape, at = emitter.get_shape(), dr.zeros(mi.Interaction3f)
+    if shape is not None:
+        box = shape.bbox()
+        centre, radius = box.center(), 0.5 * float(np.linalg.norm(np.array(box.extents())))
+        return (*np.ravel(np.array(centre)).tolist(), False, radius)
+    ds, _ = emitter.sample_direction(at, mi.Point2f(0.5))
+    far = bool(mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite))
+    return (*np.ravel(np.array(ds.d if far else ds.p)).tolist(), far, 0.0)
+
+
+def _within(d: Any, axis: Any, radius: Any) -> Any:
+    """Whether the angle of two directions is below a radius; by their distance, which float32 keeps."""
+    return dr.squared_norm(d - axis) < dr.square(2 * dr.sin(0.5 * mi.Float(radius)))
+
+
+def _solid_angle(radius: Any) -> Any:
+    return 4 * dr.pi * dr.square(dr.sin(0.5 * radius))

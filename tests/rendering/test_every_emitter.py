@@ -1,0 +1,160 @@
+"""Every emitter plugin of Mitsuba, by walks and models, against what rays find by chance.
+
+No ray finds a delta light or a sun: their references are spheres of the same flux, seen under 0.15 radians, and a sky
+without the sun. References look for no emitter (`join_share` 0); walks that do are held against Mitsuba's volume path
+tracer in `test_translucent_walk.py`. Every comparison states its orders, and the error that it could still miss.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+
+import numpy as np
+import pytest
+
+import halfspace_sss.rendering as rendering
+
+mi = pytest.importorskip("mitsuba")
+
+import drjit as dr  # noqa: E402
+
+from halfspace_sss.rendering.light.small import SmallEmitters  # noqa: E402
+
+WIDEST_Z = 4.0
+LARGEST_ERROR = 0.02  # of the mean of an image: what a comparison could still miss
+RUNS, PIXELS = 24, 6
+PLACE, RADIANS = np.array([1.5, 3.0, 2.5]), 0.15
+FAR = 300.0
+
+
+@pytest.fixture(autouse=True)
+def variant() -> None:
+    mi.set_variant("llvm_ad_rgb")
+    rendering.register()
+
+
+def _looking(origin: np.ndarray) -> mi.ScalarTransform4f:
+    return mi.ScalarTransform4f().look_at(np.asarray(origin).tolist(), [0, 0, 0], [0, 1, 0])
+
+
+def _ball(place: np.ndarray, irradiance: np.ndarray | float) -> dict:
+    """A sphere of light that brings an irradiance to the origin."""
+    radius = float(np.sin(RADIANS) * np.linalg.norm(place))
+    radiance = (np.ones(3) * irradiance / (np.pi * np.sin(RADIANS) ** 2)).tolist()
+    return {"type": "sphere", "center": place.tolist(), "radius": radius,
+            "emitter": {"type": "area", "radiance": {"type": "rgb", "value": radiance}}}  # fmt: skip
+
+
+def _irradiance(emitter: dict, place: np.ndarray) -> np.ndarray:
+    """What a delta light brings to the origin."""
+    light = mi.load_dict({"type": "scene", "emitter": emitter}).emitters()[0]
+    _, E = light.sample_direction(dr.zeros(mi.Interaction3f), mi.Point2f(0.5))
+    return np.ravel(np.array(E, dtype=float))
+
+
+def _sky(**more: float) -> dict:
+    return {"type": "sunsky", "sun_direction": [0.3, 0.6, 0.742], **more}
+
+
+def _of_same_flux(emitter: dict, place: np.ndarray) -> dict:
+    return {"ball": _ball(place, _irradiance(emitter, place))}
+
+
+def _sun_as_ball(sky: dict, without: dict) -> dict:
+    """The sky without its sun, and a ball in its place."""
+    small = SmallEmitters.of(mi.load_dict({"type": "scene", "sky": sky}))
+    k = dr.full(mi.UInt32, 0, 4096)
+    u = mi.Point2f(*np.random.default_rng(1).random((2, 4096)).astype(np.float32))
+    _, _, light = small.sample(k, dr.zeros(mi.Interaction3f, 4096), u)
+    place = FAR * np.array(small.suns[0].direction)
+    return {"sky": without, "ball": _ball(place, np.array(light, dtype=float).mean(axis=1))}
+
+
+def _texels(hot: float) -> mi.Bitmap:
+    texels = np.full((64, 128, 3), 0.3, dtype=np.float32)
+    texels[20, 50] = hot
+    return mi.Bitmap(texels)
+
+
+def _spot(kind: str) -> dict:
+    at = {"to_world": _looking(4 * PLACE)}
+    if kind == "projector":
+        return {"type": kind, **at, "fov": 40.0, "irradiance": {"type": "rgb", "value": [40.0, 50.0, 60.0]}}
+    return {"type": kind, **at, "cutoff_angle": 40.0, "beam_width": 30.0, "intensity": 100.0}
+
+
+def _delta(emitter: dict, place: np.ndarray) -> tuple[dict, dict]:
+    return {"lamp": emitter}, _of_same_flux(emitter, place)
+
+
+# name: the emitters, and those of the reference
+EMITTERS: dict[str, Callable[[], tuple[dict, dict]]] = {
+    "area": lambda: ({"ball": _ball(PLACE, 1.0)},) * 2,
+    "constant": lambda: ({"sky": {"type": "constant"}},) * 2,
+    "envmap": lambda: ({"sky": {"type": "envmap", "bitmap": _texels(300.0)}},) * 2,
+    "point": lambda: _delta({"type": "point", "position": PLACE.tolist(), "intensity": 10.0}, PLACE),
+    "spot": lambda: _delta(_spot("spot"), 4 * PLACE),
+    "projector": lambda: _delta(_spot("projector"), 4 * PLACE),
+    "directional": lambda: _delta({"type": "directional", "to_world": _looking(PLACE)}, FAR * PLACE),
+    "sunsky": lambda: ({"sky": _sky()}, _sun_as_ball(_sky(), _sky(sun_scale=0.0))),
+}
+
+
+def _scene(integrator: dict, lights: dict, **surface: str) -> dict:
+    """A sphere of 3 to 7 mean free paths, which reflects and passes what enters."""
+    medium = {"sigma_s": "1,1.5,2", "sigma_a": ".02,.1,.3", "g": 0.3, "eta": 1.4, "reflection": False}
+    film = {"type": "hdrfilm", "width": PIXELS, "height": PIXELS, "rfilter": {"type": "box"}, "pixel_format": "rgb",
+            "component_format": "float32"}  # fmt: skip
+    view = mi.ScalarTransform4f().look_at([0, 0, 8], [0, 0, 0], [0, 1, 0])
+    return {
+        "type": "scene",
+        "integrator": {"mm_per_unit": 3.0, **integrator},
+        "sensor": {"type": "perspective", "fov": 12.0, "to_world": view, "film": film},
+        "object": {"type": "sphere", "bsdf": {"type": "translucent", **medium, **surface}},
+        **lights,
+    }
+
+
+def _means(scene: dict, spp: int, seed: int) -> np.ndarray:
+    scene = mi.load_dict(scene)
+    return np.array([np.array(mi.render(scene, spp=spp, seed=seed + k)).mean(axis=(0, 1)) for k in range(RUNS)])
+
+
+@cache
+def _reference(kind: str, orders: str) -> np.ndarray:
+    """Means of images by walks that look for no emitter."""
+    scene = _scene({"type": "translucent_walk", "join_share": 0.0}, EMITTERS[kind]()[1], orders=orders)
+    return _means(scene, 2**14, 1001)
+
+
+def _agree(found: np.ndarray, wanted: np.ndarray, known_to: float = LARGEST_ERROR) -> None:
+    mean = wanted.mean(axis=0)
+    error = np.hypot(*(x.std(axis=0, ddof=1) / np.sqrt(len(x)) for x in (found, wanted)))
+    assert np.abs((found.mean(axis=0) - mean) / error).max() < WIDEST_Z
+    assert (error < known_to * mean).all()
+
+
+@pytest.mark.parametrize("kind", EMITTERS)
+def test_walks_find_the_light_of_every_emitter(kind: str) -> None:
+    """All orders."""
+    scene = _scene({"type": "translucent_walk"}, EMITTERS[kind]()[0])
+    _agree(_means(scene, 2**11, 1), _reference(kind, "total"))
+
+
+@pytest.mark.parametrize("kind", EMITTERS)
+def test_the_single_order_beside_models_is_that_of_walks_for_every_emitter(kind: str) -> None:
+    scene = _scene({"type": "bssrdf"}, EMITTERS[kind]()[0], orders="single", model="better_dipole")
+    _agree(_means(scene, 2**13, 1), _reference(kind, "single"))
+
+
+@pytest.mark.parametrize("integrator", ["translucent_walk", "bssrdf"])
+def test_emitters_that_path_tracers_cannot_find_are_named(integrator: str) -> None:
+    lamp = {"type": "rectangle", "to_world": _looking(PLACE), "emitter": {"type": "directionalarea"}}
+    scene = mi.load_dict(_scene({"type": integrator}, {"lamp": lamp}, model="better_dipole"))
+    with pytest.warns(UserWarning, match="light of a DirectionalArea is left out"):
+        assert np.array(mi.render(scene, spp=1)).max() == 0
+    scene = mi.load_dict(_scene({"type": integrator}, {"sky": {"type": "timed_sunsky"}}, model="better_dipole"))
+    with pytest.raises((RuntimeError, ValueError)) as refused:
+        mi.render(scene, spp=1)
+    assert "got timed_sunsky" in str(refused.value.__cause__ or refused.value)
