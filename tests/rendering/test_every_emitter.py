@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,7 +21,9 @@ mi = pytest.importorskip("mitsuba")
 import drjit as dr  # noqa: E402
 
 from halfspace_sss.rendering.light.small import SmallEmitters  # noqa: E402
+from halfspace_sss.trade import recommend  # noqa: E402
 
+BUNNY = Path(__file__).parents[2] / "figures" / "assets" / "bunny.ply"
 WIDEST_Z = 4.0
 LARGEST_ERROR = 0.02  # of the mean of an image: what a comparison could still miss
 RUNS, PIXELS = 24, 6
@@ -38,11 +41,11 @@ def _looking(origin: np.ndarray) -> mi.ScalarTransform4f:
     return mi.ScalarTransform4f().look_at(np.asarray(origin).tolist(), [0, 0, 0], [0, 1, 0])
 
 
-def _ball(place: np.ndarray, irradiance: np.ndarray | float) -> dict:
+def _ball(place: np.ndarray, irradiance: np.ndarray | float, radians: float = RADIANS) -> dict:
     """A sphere of light that brings an irradiance to the origin."""
-    radius = float(np.sin(RADIANS) * np.linalg.norm(place))
-    radiance = (np.ones(3) * irradiance / (np.pi * np.sin(RADIANS) ** 2)).tolist()
-    return {"type": "sphere", "center": place.tolist(), "radius": radius,
+    sine = np.sin(radians)
+    radiance = (np.ones(3) * irradiance / (np.pi * sine**2)).tolist()
+    return {"type": "sphere", "center": place.tolist(), "radius": float(sine * np.linalg.norm(place)),
             "emitter": {"type": "area", "radiance": {"type": "rgb", "value": radiance}}}  # fmt: skip
 
 
@@ -158,3 +161,34 @@ def test_emitters_that_path_tracers_cannot_find_are_named(integrator: str) -> No
     with pytest.raises((RuntimeError, ValueError)) as refused:
         mi.render(scene, spp=1)
     assert "got timed_sunsky" in str(refused.value.__cause__ or refused.value)
+
+
+def _shape(name: str) -> dict:
+    at = mi.ScalarTransform4f()
+    if name == "cube":
+        return {"type": "cube", "to_world": at.rotate([1, 1, 0], 30).scale(0.7)}
+    if name == "bunny":
+        return {"type": "ply", "filename": str(BUNNY), "to_world": at.scale(0.2).translate([0, -4.8, 0])}
+    return {"type": "sphere"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("shape", ["sphere", "cube", "bunny"])
+def test_what_is_advised_as_exact_under_a_point_light_is_within_a_percent_of_a_ball_of_light(shape: str) -> None:
+    """All orders; the object is 20 to 46 mean free paths across."""
+    found = []
+    lamp, _ = EMITTERS["point"]()
+    ball = {"ball": _ball(PLACE, _irradiance(lamp["lamp"], PLACE), 0.05)}
+    for k, lights in enumerate((lamp, ball)):
+        scene = _scene({"type": "translucent_walk", "mm_per_unit": 10.0}, lights)
+        scene["object"] |= _shape(shape)
+        found.append(_means(scene, 2**13 if shape == "bunny" else 2**12, 1 + 100 * k).mean(axis=1))
+        if k == 0:
+            advice = recommend(
+                mi.load_dict(scene), tolerance=0.05, assess_seconds=0.4, only=["lambert"], flip=False
+            ).objects[0]
+            exact = [option.way for option in advice.options if "exact" in option.why]
+            assert exact == ["path_traced"]
+    mean, error = found[1].mean(), np.hypot(*(x.std(ddof=1) / np.sqrt(len(x)) for x in found))
+    assert error < 0.005 * mean
+    assert abs(found[0].mean() / mean - 1) < 0.01
