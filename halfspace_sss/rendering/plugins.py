@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 
 from halfspace_sss.backend import BackendError, prepare_llvm, two_threads
+from halfspace_sss.rendering.scenes.causes import plainly
 from halfspace_sss.rendering.surface.variants import VARIANTS, variant_channels
 
 __all__ = ["register"]
@@ -15,6 +16,9 @@ _lock = threading.Lock()
 
 def register() -> None:
     """Register the plugins with the current variant of Mitsuba, and with every variant that is set later.
+
+    What the plugins refuse is from then on the message of the error of `mitsuba.load_dict`, `load_file`, `load_string`
+    and `render`, which without it begins with "unknown plugin" and a traceback.
 
     Raises:
         ValueError: no variant is set, or the plugins do not run under it (scalar, spectral or polarised ones).
@@ -30,6 +34,8 @@ def register() -> None:
         _register_all()
         if not _active:
             mi.detail.add_variant_callback(_on_variant)
+            for name in ("load_dict", "load_file", "load_string", "render"):
+                setattr(mi, name, plainly(getattr(mi, name)))
             _active = True
 
 

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import functools
 import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
-__all__ = ["first_cause"]
+__all__ = ["SceneError", "first_cause", "plainly"]
 
-_PLACE = re.compile(r"(?:At|While loading) (.+? \(line \d+, col \d+\)|\S+): ")
+_HERE = str(Path(__file__).parents[3])
+
+_PLACE = re.compile(r"(?:At|While loading) (?:dictionary node )?(.+? \(line \d+, col \d+\)|\S+): ")
 _SOURCE = re.compile(r"^\[[\w.]+:\d+\] ")
 _PLUGIN = re.compile(r'failed to instantiate \w+ plugin of type "[^"]*": ')
 _RAISED = re.compile(r"^(?:[\w.]*\.)?(\w+): (.*)", re.MULTILINE | re.DOTALL)
@@ -28,4 +34,39 @@ def first_cause(error: BaseException) -> str:
         text = _PLUGIN.sub("", _PLACE.sub("", _SOURCE.sub("", text)))
         text = _SOURCE.sub("", text)
     line = " ".join(text.split()) or type(error).__name__
-    return f"{place[1]}: {line}" if place else line
+    return f"{place[1]}: {line}" if place and place[1] != '"root"' else line
+
+
+class SceneError(ValueError, RuntimeError):
+    """What a plugin of this project refuses, in place of the RuntimeError by which Mitsuba hands that on."""
+
+
+def plainly(function: Callable) -> Callable:
+    """A function of Mitsuba whose errors say first what a plugin of this project refused, as a `SceneError`."""
+
+    @functools.wraps(function)
+    def found(*args: Any, **more: Any) -> Any:
+        try:
+            return function(*args, **more)
+        except RuntimeError as error:
+            if not _is_ours(error):
+                raise
+            refused = SceneError(first_cause(error))
+        raise refused
+
+    found.__wrapped__ = function
+    return found
+
+
+def _is_ours(error: BaseException) -> bool:
+    """Whether a plugin of this project raised a ValueError: by the files of its traceback, or of that in the text."""
+    while error.__cause__ is not None or error.__context__ is not None:
+        error = error.__cause__ or error.__context__
+    if isinstance(error, ValueError):
+        files, place = [], error.__traceback__
+        while place is not None:
+            files.append(place.tb_frame.f_code.co_filename)
+            place = place.tb_next
+        return bool(files) and files[-1].startswith(_HERE)
+    text = str(error)
+    return _TRACEBACK in text and "ValueError: " in text and _HERE in text[text.rindex(_TRACEBACK) :]

@@ -145,9 +145,12 @@ def _for_variant(label: str, medium: Medium, names: Any, props: Any) -> tuple[st
 
 def _numbers(key: str, value: Any) -> Any:
     """A number, or one per channel, from a parameter."""
+    import mitsuba as mi
+
     try:
         parts = value.split(",") if isinstance(value, str) else np.ravel(np.array(value, dtype=float)).tolist()
         found = np.array([float(part) for part in parts])
     except (TypeError, ValueError):
-        raise ValueError(f"{key} must be a number, rgb, or numbers separated by commas, got {value!r}") from None
+        got = f"a {value.class_name().partition('Impl')[0]}" if isinstance(value, mi.Object) else repr(value)
+        raise ValueError(f"{key} must be a number, rgb, or numbers separated by commas, got {got}") from None
     return float(found[0]) if len(found) == 1 else found

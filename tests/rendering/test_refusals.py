@@ -1,0 +1,71 @@
+"""What plugins refuse is the message of the error of Mitsuba's own functions."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import halfspace_sss.rendering as rendering
+
+mi = pytest.importorskip("mitsuba")
+
+XML = '<scene version="3.0.0"><integrator type="{}"><float name="{}" value="{}"/></integrator></scene>'
+
+
+@pytest.fixture(autouse=True)
+def variant() -> None:
+    mi.set_variant("llvm_ad_rgb")
+    rendering.register()
+
+
+def _bitmap() -> dict:
+    return {"type": "bitmap", "bitmap": mi.Bitmap(np.full((4, 4, 3), 0.5, dtype=np.float32))}
+
+
+PLUGINS = [
+    (
+        {"type": "translucent", "material": "marble", "modle": "x"},
+        "parameter of translucent must be .*got 'modle'; did",
+    ),
+    ({"type": "translucent", "material": "marbel"}, "material must be .*, got 'marbel'; did you mean 'marble'?"),
+    ({"type": "translucent", "sigma_t": 1.0}, "a translucent surface must have material"),
+    ({"type": "translucent", "sigma_s": -1.0, "sigma_a": 1.0}, "sigma_s must be .*got -1.0"),
+    ({"type": "bssrdf", "entrys": 3}, "parameter of bssrdf must be .*got 'entrys'"),
+    ({"type": "bssrdf", "mm_per_unit": -1.0}, "mm_per_unit must be .*got -1.0"),
+    ({"type": "translucent_walk", "entries": 3}, "parameter of translucent_walk must be .*got 'entries'"),
+    ({"type": "translucent_walk", "join_share": 2.0}, "join_share must be .*got 2.0"),
+]
+
+
+@pytest.mark.parametrize(("plugin", "reason"), PLUGINS)
+def test_the_reason_is_the_message_of_load_dict(plugin: dict, reason: str) -> None:
+    with pytest.raises(ValueError, match=f"^{reason}"):
+        mi.load_dict(plugin)
+
+
+def test_a_bitmap_for_a_number_is_refused_in_a_sentence() -> None:
+    with pytest.raises(ValueError, match="^albedo must be .*, got a BitmapTexture$"):
+        mi.load_dict({"type": "translucent", "sigma_t": 1.0, "albedo": _bitmap()})
+
+
+@pytest.mark.parametrize("integrator", ["bssrdf", "translucent_walk"])
+def test_the_reason_is_the_message_of_files_and_strings(integrator: str, tmp_path) -> None:
+    text = XML.format(integrator, "mm_per_unit", -2)
+    (tmp_path / "scene.xml").write_text(text)
+    for load in (lambda: mi.load_string(text), lambda: mi.load_file(str(tmp_path / "scene.xml"))):
+        with pytest.raises(ValueError, match=r"^\S* ?\(line 1, col \d+\): mm_per_unit must be .*got -2.0"):
+            load()
+
+
+@pytest.mark.parametrize("integrator", ["bssrdf", "translucent_walk"])
+def test_the_reason_is_the_message_of_render(integrator: str) -> None:
+    ball = {"type": "sphere", "bsdf": {"type": "translucent", "material": "marble", "model": "better_dipole"}}
+    scene = {"type": "scene", "integrator": {"type": integrator}, "ball": ball, "sensor": {"type": "perspective"}}
+    with pytest.raises(ValueError, match="^the camera must be outside of every object, got it inside 'ball'"):
+        mi.render(mi.load_dict(scene), spp=1)
+
+
+def test_errors_of_other_plugins_stay_those_of_mitsuba() -> None:
+    with pytest.raises(RuntimeError, match="unreferenced property") as error:
+        mi.load_dict({"type": "sphere", "flop": 1})
+    assert type(error.value) is RuntimeError
