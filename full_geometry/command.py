@@ -16,9 +16,8 @@ from full_geometry.subject import Subject
 from halfspace_sss.checks import check_count
 from halfspace_sss.interface.model import models as half_space_models
 from halfspace_sss.neural.store import load_weights
-from halfspace_sss.neural.trained import weights_folder
+from halfspace_sss.neural.trained import check_weights_folder
 from halfspace_sss.progress import NamedProgress
-from halfspace_sss.provenance import check_folder
 from halfspace_sss.rendering.scenes.learners import LearntObject, ObjectError
 from halfspace_sss.rendering.surface.transports import model_names
 
@@ -41,7 +40,7 @@ def untrained(scene: Any) -> list[str]:
         if not trained(subject):
             found.append(shape.id())
     if found:
-        check_folder(weights_folder())
+        check_weights_folder()
     return found
 
 

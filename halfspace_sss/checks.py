@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import math
 import numbers
+import warnings
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -12,7 +13,7 @@ import numpy as np
 
 __all__ = [
     "check_choice", "check_cosine", "check_count", "check_edges", "check_finite", "check_interval", "check_query",
-    "did_you_mean", "rounding",
+    "did_you_mean", "renamed", "rounding",
 ]  # fmt: skip
 
 ROUNDING_ULPS = 4
@@ -115,3 +116,11 @@ def check_query(lib: Any, args: tuple, given: tuple) -> tuple:
             wrong = smallest if not smallest >= low else largest
             raise ValueError(f"{name} must be {what}, got {wrong!r}")
     return tuple(checked)
+
+
+def renamed(value: Any, before: Any, name: str, old: str) -> Any:
+    """An argument by its present name, or with a DeprecationWarning by the one that it had before."""
+    if before is None:
+        return value
+    warnings.warn(f"{old} is called {name} now", DeprecationWarning, stacklevel=3)
+    return before if value is None else value

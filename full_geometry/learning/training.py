@@ -29,7 +29,7 @@ from full_geometry.subject import Subject
 from halfspace_sss.backend import busy_threads
 from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.neural.store import to_json
-from halfspace_sss.neural.trained import weights_folder
+from halfspace_sss.neural.trained import check_weights_folder
 from halfspace_sss.neural.training.work_folder import CHECKPOINT, claim
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.provenance import check_folder, provenance, write_atomically
@@ -112,9 +112,9 @@ def train(
         check_interval("target_error", target_error, 1e-4, 1.0)
     if chunks is not None:
         check_count("chunks", chunks, 1)
-    for place in (folder or weights_folder(), work):
-        if place is not None:
-            check_folder(place)
+    folder = check_weights_folder(folder)
+    if work is not None:
+        check_folder(work)
     if not any(float(m.sigma_s) > 0 for m in subject.media):
         raise ValueError("medium must scatter in at least one channel to be learnt, got sigma_s 0 in all")
     recipe = recipe if start is None else recipe.begun(start)
@@ -122,7 +122,7 @@ def train(
     if seconds == 0:
         warnings.warn(f"an object that is trained for 0 seconds is rendered by {recipe.start}", stacklevel=2)
         return Trained(*run.learnt()[:2], None, [], 0, 0.0)
-    return run.go(seconds, chunks, target_error, Path(folder or weights_folder()), progress)
+    return run.go(seconds, chunks, target_error, folder, progress)
 
 
 def train_by_cpu(

@@ -17,9 +17,9 @@ from full_geometry.paper.network import PaperNetwork, PaperRecipe, fit_paper
 from full_geometry.subject import Subject
 from halfspace_sss.checks import check_choice, check_count, check_interval
 from halfspace_sss.neural.store import load_weights, save_weights
-from halfspace_sss.neural.trained import weights_folder
+from halfspace_sss.neural.trained import check_weights_folder, weights_folder
 from halfspace_sss.progress import NamedProgress
-from halfspace_sss.provenance import check_folder, provenance
+from halfspace_sss.provenance import provenance
 from halfspace_sss.rendering.scenes.learners import LearntObject, ObjectError
 
 __all__ = ["KIND", "errors", "load_network", "save_network", "train"]
@@ -76,7 +76,7 @@ def train(
     for name, value in (("target_error", target_error), ("work", work), ("start", start)):
         if value is not None:
             raise ValueError(f"{name} must be left out for {KIND}, got {value!r}")
-    folder = check_folder(folder or weights_folder())
+    folder = check_weights_folder(folder)
     subject, began = Subject.given(scene, None, None, object), time.monotonic()
     net, steps = fit_paper(subject, PaperRecipe(seconds=seconds), seed, progress)
     found = paper_errors(subject, net, reference(subject, EXITS, WALKS, seed), seed=seed)

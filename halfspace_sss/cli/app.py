@@ -107,6 +107,9 @@ def _check_command(name: str, function: Any) -> None:
 
 def main() -> None:
     """Run the command line; the entry point of `halfspace-sss`."""
+    for stream in (sys.stdout, sys.stderr):  # a terminal without ± shows ? there, and nothing is lost
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="replace")
     with interrupts:
         try:
             _app()()

@@ -59,7 +59,9 @@ def maps_command(
     seed: Annotated[int, typer.Option(help="Seed of directions and walks.", parser=whole)] = 0,
     backend: Backend = "llvm",
     share: Annotated[str, typer.Option(help="k/n: of n processes that fill one folder, this is number k < n.")] = "0/1",
-    out: Annotated[Path, typer.Option(help="Folder of the stores; what is there is continued.")] = Path("maps"),
+    out: Annotated[Path, typer.Option(help="Folder of the stores; a run with the same options is continued.")] = Path(
+        "maps"
+    ),
 ) -> None:
     """Trace training maps into Zarr stores; an interrupted run goes on when it is started again."""
     from halfspace_sss.maps.store import make_maps
@@ -113,7 +115,10 @@ def _grid(text: str) -> MapGrid:
     values = numbers("grid", text)
     if len(values) != 4 or not all(value.is_integer() for value in values):
         raise ValueError(f"grid must be four whole numbers separated by commas, got {text!r}")
-    return MapGrid(*(int(value) for value in values))
+    try:
+        return MapGrid(*(int(value) for value in values))
+    except ValueError as error:
+        raise ValueError(f"grid {text}: {error}") from None
 
 
 def _report(stores: dict[str, Path], share: tuple[int, int]) -> None:

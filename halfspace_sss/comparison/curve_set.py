@@ -6,11 +6,13 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from halfspace_sss.backend import BackendError
 from halfspace_sss.extensions import FAILURES, FIGURES, renderer, warn_left_out
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.provenance import check_folder, provenance, write_together
@@ -62,7 +64,7 @@ class Curve:
     reflectance: Mapping[str, tuple[float, float]]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class CurveSet:
     """What `curves` measured: S along a line for several directions of incidence, path traced and by models.
 
@@ -96,6 +98,27 @@ class CurveSet:
     backend: str
     seconds: float
     notes: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        angles = ", ".join(f"{theta:g}" for theta in self.theta_i_deg)
+        r = f"r {self.r_edges[0]:.3g} to {self.r_edges[-1]:.3g} mm"
+        return f"<CurveSet of {', '.join(self.series)}; theta_i {angles} degrees, {r}; {self.medium}>"
+
+    def _repr_html_(self) -> str:
+        columns = ["theta_i_deg", "series", "r_from_mm", "r_to_mm", "L1", "noise", "bias", "bias_standard_error"]
+        table = self.errors()[columns].to_html(index=False, float_format="{:.3g}".format)
+        return f"<p>{escape(repr(self).strip('<>'))}</p>{table}"
+
+    def plot(self) -> Any:
+        """A `matplotlib.figure.Figure`: S over r for each direction of incidence, and its ratio to the traced curve.
+
+        Raises:
+            BackendError: matplotlib is not installed.
+        """
+        draw = renderer("curves_figure")
+        if draw is None:
+            raise BackendError('plot needs matplotlib: pip install "halfspace-sss[figures]"')
+        return draw(self)
 
     @property
     def r(self) -> np.ndarray:
@@ -152,7 +175,7 @@ class CurveSet:
             R, R_error = c.reflectance[order]
             R_t, R_t_error = traced.reflectance[order]
             common = {"reflectance_orders": order, "reflectance": R, "reflectance_traced": R_t}
-            common["reflectance_standard_error"] = R_error if c is traced else R_t_error
+            common |= {"reflectance_standard_error": R_error, "reflectance_traced_standard_error": R_t_error}
             common["evaluations_per_s"] = self.evaluations_per_s.get(c.series, math.nan)
             edges = range_edges(self.r_edges)
             ranges = [(edges[0], edges[-1]), *zip(edges[:-1], edges[1:])] if len(edges) > 2 else [tuple(edges)]

@@ -12,6 +12,7 @@ import numpy as np
 
 from halfspace_sss.arrays import broadcast_query
 from halfspace_sss.checks import check_choice, check_query
+from halfspace_sss.extensions import TRANSPORTS, offered
 from halfspace_sss.interface.blocks import recorded_in_blocks
 from halfspace_sss.interface.model_lists import check_model_class, listed_models
 from halfspace_sss.interface.query import Query
@@ -76,6 +77,9 @@ class BSSRDF(abc.ABC):
         if not isinstance(medium, Medium):
             raise ValueError(f"medium must be a Medium, got {type(medium).__name__}")
         self.medium = medium
+
+    def __repr__(self) -> str:
+        return f"<{self.name}, orders {self.orders}: {self.medium}>"
 
     @abc.abstractmethod
     def G(self, q: Query) -> Any:
@@ -259,5 +263,15 @@ def bssrdf(name: str, medium: Medium) -> BSSRDF:
 def model_class(name: str) -> type[BSSRDF]:
     """The class of a model; ValueError with the nearest name if there is none."""
     known = {**_installed(), **_registered}
+    if name not in known and name in _of_objects():
+        raise ValueError(
+            f"model must be one of the half-space here, got {name!r}, which is one of objects in a scene: "
+            "`halfspace-sss errors --scene` and `render` take it"
+        )
     check_choice("model", name, known)
     return known[name]
+
+
+def _of_objects() -> set[str]:
+    """Names of models that know whole objects; they are no BSSRDF of the half-space."""
+    return {name for _, names in offered(TRANSPORTS) if isinstance(names, Mapping) for name in names}

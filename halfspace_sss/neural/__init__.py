@@ -10,8 +10,9 @@ torch, evaluation does not.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from halfspace_sss.backend import BackendError
 from halfspace_sss.lazy import lazy_names
 from halfspace_sss.neural.material_model import NeuralMaterial
 from halfspace_sss.neural.paper_model import NeuralPaper
@@ -24,4 +25,13 @@ __all__ = ["MODELS", "Neural", "NeuralMaterial", "NeuralPaper", "train", "train_
 
 MODELS = [Neural, NeuralMaterial, NeuralPaper]
 
-__getattr__, __dir__ = lazy_names(__name__, {"train": "training.recipes", "train_universal": "training.recipes"})
+_found, __dir__ = lazy_names(__name__, {"train": "training.recipes", "train_universal": "training.recipes"})
+
+
+def __getattr__(name: str) -> Any:
+    try:
+        return _found(name)
+    except ModuleNotFoundError as error:
+        if error.name != "torch":
+            raise
+        raise BackendError(f'{name} needs torch: pip install "halfspace-sss[train]"') from error

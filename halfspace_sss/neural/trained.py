@@ -9,8 +9,16 @@ from pathlib import Path
 from typing import Any
 
 from halfspace_sss.physics.medium import Medium
+from halfspace_sss.provenance import check_folder
 
-__all__ = ["ENVIRONMENT_VARIABLE", "check_medium", "find_weights", "weights_folder", "weights_name"]
+__all__ = [
+    "ENVIRONMENT_VARIABLE",
+    "check_medium",
+    "check_weights_folder",
+    "find_weights",
+    "weights_folder",
+    "weights_name",
+]
 
 ENVIRONMENT_VARIABLE = "HALFSPACE_SSS_WEIGHTS"
 RATIOS = ("albedo", "g", "eta")
@@ -22,6 +30,16 @@ def weights_folder() -> Path:
         return Path(os.environ[ENVIRONMENT_VARIABLE])
     variable, default = ("LOCALAPPDATA", "AppData/Local") if os.name == "nt" else ("XDG_DATA_HOME", ".local/share")
     return Path(os.environ.get(variable) or Path.home() / default) / "halfspace-sss" / "weights"
+
+
+def check_weights_folder(folder: str | Path | None = None) -> Path:
+    """A folder for trained weights, by default `weights_folder`; ValueError if it cannot be written to."""
+    if folder is not None:
+        return check_folder(folder)
+    try:
+        return check_folder(weights_folder())
+    except ValueError as error:
+        raise ValueError(f"{error}; {ENVIRONMENT_VARIABLE} names another folder") from None
 
 
 def weights_name(kind: str, medium: Medium) -> str:

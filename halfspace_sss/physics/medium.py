@@ -213,6 +213,26 @@ class Medium:
         s, a, g = (np.atleast_1d(v)[index] for v in (self.sigma_s, self.sigma_a, self.g))
         return Medium(float(s), float(a), float(g), self.eta)
 
+    def __str__(self) -> str:
+        """sigma_t (1/mm), albedo, g and eta; one number for each channel where they differ."""
+        parts = (
+            ("sigma_t", self.sigma_t, "/mm"),
+            ("albedo", self.albedo, ""),
+            ("g", self.g, ""),
+            ("eta", self.eta, ""),
+        )
+        return ", ".join(f"{name} {_short(value)}{unit}" for name, value, unit in parts)
+
+    def _repr_html_(self) -> str:
+        names = ("sigma_s", "sigma_a", "sigma_t", "albedo", "g", "mfp")
+        units = {"sigma_s": "1/mm", "sigma_a": "1/mm", "sigma_t": "1/mm", "mfp": "mm"}
+        head = "".join(f"<th>{name} {units.get(name, '')}</th>" for name in names)
+        rows = "".join(
+            "<tr>" + "".join(f"<td>{_short(getattr(m, name))}</td>" for name in names) + "</tr>"
+            for m in ([self] if self.n_channels is None else [self.channel(k) for k in range(self.n_channels)])
+        )
+        return f"<table><caption>medium, eta {self.eta:.4g}</caption><tr>{head}</tr>{rows}</table>"
+
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Medium):
             return NotImplemented
@@ -220,6 +240,12 @@ class Medium:
 
     def __hash__(self) -> int:
         return hash(tuple(np.asarray(getattr(self, n)).tobytes() for n in ("sigma_s", "sigma_a", "g", "eta")))
+
+
+def _short(value: Any) -> str:
+    """To four digits; one number where all are the same."""
+    found = [f"{x:.4g}" for x in np.atleast_1d(value).tolist()]
+    return found[0] if len(set(found)) == 1 else " ".join(found)
 
 
 def check_scalar_medium(medium: Any) -> None:

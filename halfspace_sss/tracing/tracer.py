@@ -28,7 +28,7 @@ def _order_sum(order: str, single: np.ndarray, multiple: np.ndarray) -> np.ndarr
     return {"single": single, "multiple": multiple, "total": single + multiple}[order]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Trace:
     """What `trace` measured; every method returns an `Estimate` (value, standard_error) by scattering order.
 
@@ -50,6 +50,11 @@ class Trace:
     _rings: np.ndarray | None
     _n_directions: int
     _T_o: np.ndarray | None
+
+    def __repr__(self) -> str:
+        R, error = self.reflectance()
+        mu = self.mu_i if isinstance(self.mu_i, str) else f"{self.mu_i:.4g}"
+        return f"<Trace of {self.n_paths:,} walks, mu_i {mu}: reflectance {R:.5g} ± {error:.2g}; {self.medium}>"
 
     def _pair(self, single: int) -> tuple[np.ndarray, np.ndarray]:
         return self._lanes[:, single], self._lanes[:, single + 1]

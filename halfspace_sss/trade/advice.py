@@ -19,6 +19,7 @@ from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED
 from halfspace_sss.trade.assessing import assess
+from halfspace_sss.trade.html import html_table
 from halfspace_sss.trade.measuring.results import Assessment, ObjectTrade, WayTrade, samples_for
 
 __all__ = ["Advice", "ObjectAdvice", "Option", "Job", "advise", "recommend"]
@@ -75,7 +76,7 @@ class ObjectAdvice:
         return "\n".join(f"{self.object}: {option.why}" for option in self.options)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Advice:
     """The ways for a scene.
 
@@ -92,6 +93,16 @@ class Advice:
     seconds: float
     assessment: Assessment
     tolerance: float
+
+    def __repr__(self) -> str:
+        ways = ", ".join(f"{found.object}: {found.way}" for found in self.objects)
+        return f"<{self.integrator} for a tolerance of {self.tolerance:.3g}; {ways}>"
+
+    def _repr_html_(self) -> str:
+        return html_table(("object", "way", "error", "seconds", ""), [
+            (found.object, o.way, f"{o.error:.3g}", f"{o.seconds:.3g}", o.why)
+            for found in self.objects for o in found.options
+        ])  # fmt: skip
 
     def __str__(self) -> str:
         text = [str(found) for found in self.objects]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from halfspace_sss.checks import check_count, check_interval
+from halfspace_sss.checks import check_count, check_interval, renamed
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED
 from halfspace_sss.trade.images import with_flip
@@ -21,7 +21,7 @@ def assess(
     scene: Any,
     *,
     seconds: float = 4.0,
-    only: Sequence[str] | None = None,
+    models: Sequence[str] | None = None,
     sensor: int = 0,
     seed: int = 0,
     flip: bool = True,
@@ -29,6 +29,7 @@ def assess(
     exits: int = EXITS,
     parameters: dict[str, str] | None = None,
     progress: NamedProgress | None = None,
+    only: Sequence[str] | None = None,
 ) -> Assessment:
     """Measure each way of rendering a scene on each of its translucent objects.
 
@@ -39,7 +40,7 @@ def assess(
     Args:
         scene: a Mitsuba scene, a dict as for `mitsuba.load_dict`, or the path of an XML file.
         seconds: for each object, shared by all ways; compilation comes on top, and a little for many ways.
-        only: names of ways, by default all; "path_traced" is always among them.
+        models: names of ways, such as "neural", by default all; "path_traced" is always among them.
         sensor: number of the sensor.
         seed: of everything; what depends on the clock is how many samples are taken.
         flip: whether to render small images for FLIP, if the evaluator is installed.
@@ -47,6 +48,7 @@ def assess(
         exits: points of each object.
         parameters: values of the parameters $name of an XML file.
         progress: called with (what, done, total).
+        only: what `models` was called before.
 
     Left out: what lies behind glass or in mirrors, the mirror images of lamps on the objects, and the errors of fine
     detail between the points.
@@ -59,7 +61,7 @@ def assess(
     check_count("exits", exits, 32)
     if tolerance is not None:
         check_interval("tolerance", tolerance, 1e-4, 10.0)
-    chosen = _chosen(only)
+    chosen = _chosen(renamed(models, only, "models", "only"))
     on = stage(scene, parameters)
     check_count("sensor", sensor, 0)
     if sensor >= len(on.scene.sensors()):
@@ -74,8 +76,8 @@ def assess(
     return found
 
 
-def _chosen(only: Sequence[str] | None) -> list[Way]:
-    if only is None:
+def _chosen(models: Sequence[str] | None) -> list[Way]:
+    if models is None:
         return ways()
-    named = [Way.of(name) for name in only]
-    return [Way(PATH_TRACED), *(way for way in dict.fromkeys(named) if way.model != PATH_TRACED)]
+    chosen = [Way.of(name) for name in models]
+    return [Way(PATH_TRACED), *(way for way in dict.fromkeys(chosen) if way.model != PATH_TRACED)]

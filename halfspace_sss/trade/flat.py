@@ -13,12 +13,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from halfspace_sss.checks import check_choice, check_count, check_interval
+from halfspace_sss.checks import check_choice, check_count, check_interval, renamed
 from halfspace_sss.comparison.held_out import references
 from halfspace_sss.comparison.model_errors import Reference, model_error
-from halfspace_sss.interface.model import BSSRDF, bssrdf, models
+from halfspace_sss.interface.model import BSSRDF, bssrdf
+from halfspace_sss.interface.model import models as registered
 from halfspace_sss.neural.symmetric import channels
 from halfspace_sss.physics.medium import Medium, medium_of
+from halfspace_sss.trade.html import html_table
 
 __all__ = ["FlatAdvice", "FlatOption", "recommend_flat"]
 
@@ -39,7 +41,7 @@ class FlatOption:
     why: str
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class FlatAdvice:
     """The model for a medium, and all that were compared, the chosen one first."""
 
@@ -47,6 +49,14 @@ class FlatAdvice:
     tolerance: float
     r: tuple[float, float]
     options: tuple[FlatOption, ...]
+
+    def __repr__(self) -> str:
+        return f"<{self.model} for a tolerance of {self.tolerance:.3g}, of {len(self.options)} ways>"
+
+    def _repr_html_(self) -> str:
+        return html_table(("way", "error", "seconds a million", ""), [
+            (o.model, f"{o.error:.3g}", f"{o.seconds_per_million:.3g}", o.why) for o in self.options
+        ])  # fmt: skip
 
     def __str__(self) -> str:
         return "\n".join(option.why for option in self.options)
@@ -57,9 +67,10 @@ def recommend_flat(
     r: tuple[float, float] | None = None,
     *,
     tolerance: float = 0.05,
-    only: Sequence[str] | None = None,
+    models: Sequence[str] | None = None,
     events: float = EVENTS,
     seed: int = 0,
+    only: Sequence[str] | None = None,
 ) -> FlatAdvice:
     """The cheapest model of the half-space that keeps a tolerance over a range of distances.
 
@@ -67,9 +78,10 @@ def recommend_flat(
         medium: or a material; of several channels the worst counts.
         r: smallest and largest distance, mm; by default 0.02 to 60 mean free paths.
         tolerance: relative error of S mu_i mu_o, summed over cells of the range and pairs of directions.
-        only: names of models, by default all.
+        models: names, by default all.
         events: scattering events of the walks, for each channel.
         seed: of the walks.
+        only: what `models` was called before.
 
     Raises:
         ValueError: an argument is out of range, or no light comes back within the distances.
@@ -78,8 +90,9 @@ def recommend_flat(
     check_interval("tolerance", tolerance, 1e-4, 10.0)
     check_interval("events", events, 1e4, 1e12)
     check_count("seed", seed, 0)
-    for name in only or ():
-        check_choice("model", name, models())
+    chosen = renamed(models, only, "models", "only")
+    for name in chosen or ():
+        check_choice("model", name, registered())
     parts = [m for m in channels(medium) if float(m.sigma_s) > 0]
     if not parts:
         raise ValueError("medium must scatter, got albedo 0: S of order 2 and more is 0, no model is needed")
@@ -90,7 +103,7 @@ def recommend_flat(
     within = [(r[0] * float(m.sigma_t), r[1] * float(m.sigma_t)) if r else REACH for m in parts]
     for m, one, bounds in zip(parts, found, within):
         _check_light(m, one, bounds)
-    rows = [_row(name, parts, found, within) for name in only or models()]
+    rows = [_row(name, parts, found, within) for name in chosen or registered()]
     noise = max((row[2] for row in rows if row[2] < math.inf), default=math.inf)
     rows.append((PATH_TRACED, 0.0, tolerance, tracing * (noise / tolerance) ** 2, ""))
     return _advice(rows, tolerance, r or REACH, "mm" if r else "mean free paths")

@@ -26,7 +26,7 @@ SMALL = {  # a small run of each command, and what it refuses
     "render": (["ball.xml", "--spp", "4", "--out", "o"], ["none.xml"]),
     "rivals": (["--scene", "ball.xml", "--out", "o"], ["--scene", "none.xml"]),
     "shapes": (["--objects", "1", "--out", "o/shapes.md"], ["--objects", "-1"]),
-    "trade": (["ball.xml", "--way", "better_dipole", "--assess", "0.2", "--out", "o"], ["marbel"]),
+    "trade": (["ball.xml", "--model", "better_dipole", "--assess", "0.2", "--out", "o"], ["marbel"]),
     "trade-check": (["--scenes", "1", "--out", "o"], ["--scenes", "-1"]),
     "train": (["--out", "o", "--work", "o/work"], ["marbel"]),
     "validate": (["--rows", "thirdparty", "--quick", "--out", "o"], ["--rows", "nope"]),

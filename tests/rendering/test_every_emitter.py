@@ -185,7 +185,7 @@ def test_what_is_advised_as_exact_under_a_point_light_is_within_a_percent_of_a_b
         found.append(_means(scene, 2**13 if shape == "bunny" else 2**12, 1 + 100 * k).mean(axis=1))
         if k == 0:
             advice = recommend(
-                mi.load_dict(scene), tolerance=0.05, assess_seconds=0.4, only=["lambert"], flip=False
+                mi.load_dict(scene), tolerance=0.05, assess_seconds=0.4, models=["lambert"], flip=False
             ).objects[0]
             exact = [option.way for option in advice.options if "exact" in option.why]
             assert exact == ["path_traced"]

@@ -58,7 +58,7 @@ def scene(medium: dict | None = None, light: dict | None = None, n: int = 1, **m
 
 
 def test_a_ball_of_ten_mean_free_paths_is_as_dark_by_a_half_space_as_images_say() -> None:
-    found = assess(scene({"sigma_s": 9.5, "sigma_a": 0.5, "eta": 1.3}), only=["neural"], **{**QUICK, "seconds": 1.0})
+    found = assess(scene({"sigma_s": 9.5, "sigma_a": 0.5, "eta": 1.3}), models=["neural"], **{**QUICK, "seconds": 1.0})
     row = found.objects[0].way("neural")
     # of light from inside 0.85 is left (README, spheres); about a quarter of the radiance is reflected or single
     assert row.ratio[0] == pytest.approx(0.9, abs=0.05) and row.bias > 0.05
@@ -70,12 +70,12 @@ def test_a_ball_of_ten_mean_free_paths_is_as_dark_by_a_half_space_as_images_say(
 def test_the_scene_is_as_it_was_after_an_assessment() -> None:
     loaded = mi.load_dict(scene(model="standard_dipole"))
     before = loaded.shapes()[0].bsdf().inside
-    assess(loaded, only=FEW, **QUICK)
+    assess(loaded, models=FEW, **QUICK)
     assert loaded.shapes()[0].bsdf().inside is before
 
 
 def test_a_diffuse_surface_is_right_for_a_large_object_under_an_even_sky() -> None:
-    found = assess(scene({"sigma_s": 950, "sigma_a": 50}), only=["lambert"], **QUICK)
+    found = assess(scene({"sigma_s": 950, "sigma_a": 50}), models=["lambert"], **QUICK)
     row = found.objects[0].way("lambert")
     assert row.bias_bound < 0.15
     assert all(abs(r - 1) < 0.06 for r in row.ratio)
@@ -93,7 +93,7 @@ EXTREMES = {
 
 @pytest.mark.parametrize("extreme", EXTREMES)
 def test_an_extreme_object_is_assessed(extreme: str) -> None:
-    assessed = assess(scene(EXTREMES[extreme]), only=FEW, **QUICK)
+    assessed = assess(scene(EXTREMES[extreme]), models=FEW, **QUICK)
     found, advice = assessed.objects[0], recommend(assessed, tolerance=0.5).objects[0]
     assert all(not row.refusal and row.seconds > 0 for row in found.ways)
     assert advice.way is not None and len(advice.options) == 3
@@ -101,7 +101,7 @@ def test_an_extreme_object_is_assessed(extreme: str) -> None:
 
 
 def test_without_light_every_way_shows_it_black() -> None:
-    found = recommend(scene(light={"type": "constant", "radiance": 0.0}), only=FEW, **QUICK_ASSESS)
+    found = recommend(scene(light={"type": "constant", "radiance": 0.0}), models=FEW, **QUICK_ASSESS)
     assert "no light comes from it, every way shows it black" in str(found)
 
 
@@ -124,7 +124,7 @@ def test_all_channels_of_exits_and_images_are_traced_once_and_by_one_kernel() ->
 
 
 def test_ten_objects_are_assessed_one_by_one() -> None:
-    found = assess(scene(n=10), only=["lambert"], **{**QUICK, "seconds": 0.05, "exits": 32})
+    found = assess(scene(n=10), models=["lambert"], **{**QUICK, "seconds": 0.05, "exits": 32})
     assert [o.object for o in found.objects] == [f"ball{k}" for k in range(10)]
     assert all(o.ways for o in found.objects)
 
@@ -132,7 +132,7 @@ def test_ten_objects_are_assessed_one_by_one() -> None:
 def test_an_object_behind_another_is_refused_in_a_sentence() -> None:
     hidden = scene()
     hidden["ball1"] = {**hidden["ball0"], "center": [0, 0, -1.0], "radius": 0.3}
-    found = recommend(hidden, only=["lambert"], **QUICK_ASSESS).objects[1]
+    found = recommend(hidden, models=["lambert"], **QUICK_ASSESS).objects[1]
     assert found.way is None and "hardly seen by the camera" in str(found)
 
 
@@ -140,7 +140,7 @@ def test_an_instance_is_refused_in_a_sentence() -> None:
     group = {"type": "shapegroup", "ball": scene()["ball0"]}
     instanced = {**scene(), "group": group, "one": {"type": "instance", "g": {"type": "ref", "id": "group"}}}
     with pytest.raises(ValueError, match="a translucent object must stand in the scene itself"):
-        assess(instanced, only=FEW, **QUICK)
+        assess(instanced, models=FEW, **QUICK)
 
 
 def test_a_point_through_which_a_lamp_would_be_seen_is_left_out() -> None:
@@ -158,13 +158,13 @@ def test_a_point_through_which_a_lamp_would_be_seen_is_left_out() -> None:
 
 def test_a_way_that_refuses_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HALFSPACE_SSS_WEIGHTS", str(tmp_path))
-    found = assess(scene(), only=["full_geometry"], **QUICK).objects[0]
+    found = assess(scene(), models=["full_geometry"], **QUICK).objects[0]
     assert "must be trained" in found.way("full_geometry").refusal
 
 
 def test_an_unknown_way_is_refused_with_the_nearest() -> None:
     with pytest.raises(ValueError, match="did you mean 'neural'"):
-        assess(scene(), only=["nural"], **QUICK)
+        assess(scene(), models=["nural"], **QUICK)
 
 
 def test_auto_is_chosen_of_all_models_once_kept_and_found_again(tmp_path: Path) -> None:
@@ -236,7 +236,7 @@ def test_the_command_measures_a_scene_and_writes_files(tmp_path: Path, monkeypat
 
     monkeypatch.setattr(extensions, "renderer", lambda kind: None)  # neither figure nor page
     file = write_scene(random_scene(0, 0), tmp_path)
-    arguments = ["--way", "lambert", "--tolerance", "0.4", "--assess", "0.3", "--out", str(tmp_path / "out")]
+    arguments = ["--model", "lambert", "--tolerance", "0.4", "--assess", "0.3", "--out", str(tmp_path / "out")]
     result = CliRunner().invoke(cli.app, ["trade", str(file), *arguments])
     assert result.exit_code == 0, result.stderr
     names = sorted(path.name for path in (tmp_path / "out").iterdir())
@@ -263,7 +263,7 @@ def test_the_check_goes_on_where_it_stopped(tmp_path: Path, monkeypatch: pytest.
 
 def test_a_medium_without_a_scene_gets_a_model_of_the_half_space() -> None:
     medium = Medium.from_albedo(0.75, 0.241, 0.0, 1.3)
-    found = recommend(medium=medium, r=(1.0, 40.0), tolerance=0.2, events=2e5, only=["better_dipole", "neural"])
+    found = recommend(medium=medium, r=(1.0, 40.0), tolerance=0.2, events=2e5, models=["better_dipole", "neural"])
     assert found.model == "neural"
     assert [option.model for option in found.options] == ["neural", "path_traced", "better_dipole"]
     assert found.options[-1].why.endswith("asked 20 %")

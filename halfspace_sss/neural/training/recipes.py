@@ -8,7 +8,7 @@ from pathlib import Path
 from halfspace_sss.backend import array_types
 from halfspace_sss.checks import check_choice, check_count, check_interval
 from halfspace_sss.neural.symmetric import channels
-from halfspace_sss.neural.trained import weights_folder
+from halfspace_sss.neural.trained import check_weights_folder
 from halfspace_sss.neural.training.subjects import SUBJECTS
 from halfspace_sss.neural.training.train_material import FAST, STANDARD, MaterialRecipe, TrainedChannel, train_channel
 from halfspace_sss.neural.training.train_universal import UniversalRecipe, train_universal
@@ -54,9 +54,9 @@ def train(
     if target_error is not None:
         check_interval("target_error", target_error, 1e-4, 1.0)
     media = channels(_medium(material))
-    for place in (folder or weights_folder(), work):
-        if place is not None:
-            check_folder(place)
+    check_weights_folder(folder)
+    if work is not None:
+        check_folder(work)
     array_types(backend)
     return [
         train_channel(

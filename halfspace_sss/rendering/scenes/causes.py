@@ -16,6 +16,7 @@ _PLACE = re.compile(r"(?:At|While loading) (?:dictionary node )?(.+? \(line \d+,
 _SOURCE = re.compile(r"^\[[\w.]+:\d+\] ")
 _PLUGIN = re.compile(r'failed to instantiate \w+ plugin of type "[^"]*": ')
 _RAISED = re.compile(r"^(?:[\w.]*\.)?(\w+): (.*)", re.MULTILINE | re.DOTALL)
+_EMPTY = re.compile(r'shape plugin of type "\w+": .*operands have incompatible sizes! \(sizes: 0,')
 _TRACEBACK = "Traceback (most recent call last):"
 
 
@@ -25,7 +26,9 @@ def first_cause(error: BaseException) -> str:
         error = error.__cause__ or error.__context__
     text = str(error)
     place = _PLACE.search(text)
-    if _TRACEBACK in text:
+    if _EMPTY.search(text):
+        text = "a mesh must have faces, got none"
+    elif _TRACEBACK in text:
         frames = text[text.rindex(_TRACEBACK) :].splitlines()[1:]
         said = next((k for k, line in enumerate(frames) if line[:1].strip()), len(frames))  # frames are indented
         raised = _RAISED.match("\n".join(frames[said:]).strip())
@@ -59,7 +62,10 @@ def plainly(function: Callable) -> Callable:
 
 
 def _is_ours(error: BaseException) -> bool:
-    """Whether a plugin of this project raised a ValueError: by the files of its traceback, or of that in the text."""
+    """Whether a plugin of this project raised a ValueError: by the files of its traceback, or of that in the text.
+
+    A mesh without faces counts too: what Mitsuba says of it says nothing.
+    """
     while error.__cause__ is not None or error.__context__ is not None:
         error = error.__cause__ or error.__context__
     if isinstance(error, ValueError):
@@ -69,4 +75,6 @@ def _is_ours(error: BaseException) -> bool:
             place = place.tb_next
         return bool(files) and files[-1].startswith(_HERE)
     text = str(error)
+    if _EMPTY.search(text):
+        return True
     return _TRACEBACK in text and "ValueError: " in text and _HERE in text[text.rindex(_TRACEBACK) :]

@@ -120,6 +120,8 @@ def survey(shape: Any, world: Any = None) -> Object:
 
     if "nstance" in shape.class_name():
         raise ValueError(f"a translucent object must not be an instance, got {shape.id() or shape}")
+    if shape.is_mesh() and shape.face_count() == 0:
+        raise ValueError(f"a mesh must have faces, got none in {name_of(shape)}")
     scene = scene_of([shape], world)
     box = scene.bbox()
     low, high = np.array(box.min, dtype=float), np.array(box.max, dtype=float)

@@ -107,7 +107,7 @@ def _make_body(shape: Any, settings: Settings, scene: Any) -> Body:
     found, surface = survey(shape, scene), shape.bsdf()
     inside = equivalent(surface.inside, found)
     media = [m.scaled(settings.mm_per_unit) for m in inside.channels()]
-    check_size(found, media, settings.mm_per_unit)
+    check_size(found, [float(m.sigma_t) for m in media], settings.mm_per_unit)
     single_only = inside.orders == "single" or not any(float(m.sigma_s) > 0 for m in media)
     variation = Variation(surface, settings.mm_per_unit)
     none = Means(None, None)
@@ -139,9 +139,15 @@ def _means(inside: Inside, found: Object, media: list[Medium], settings: Setting
     return half_space_means(inside.model, found, media, settings, variation)
 
 
-def check_size(found: Object, media: Sequence[Medium], mm_per_unit: float) -> None:
-    """Warn of an object whose size in mean free paths speaks of another unit of length."""
-    thickness = [found.size * float(m.sigma_t) for m in media]
+def check_size(found: Object, sigma_t: Sequence[float], mm_per_unit: float) -> None:
+    """Warn of an object whose size in mean free paths speaks of another unit of length.
+
+    Args:
+        found: the object.
+        sigma_t: of each channel, 1/(scene unit).
+        mm_per_unit: length of a scene unit, mm.
+    """
+    thickness = [found.size * value for value in sigma_t]
     if min(thickness) < SMALL or max(thickness) > LARGE:
         warnings.warn(
             f"object {found.name} is {min(thickness):.3g} to {max(thickness):.3g} mean free paths across, "

@@ -15,6 +15,7 @@ from halfspace_sss.rendering.surface.object import same_objects
 from halfspace_sss.rendering.surface.parameters import OF_MITSUBA, check_parameters
 from halfspace_sss.rendering.surface.sensors import check_sensors
 from halfspace_sss.rendering.surface.sharing import number_of
+from halfspace_sss.rendering.transport.body import check_size
 from halfspace_sss.rendering.walk.connect import find_joins
 from halfspace_sss.rendering.walk.first_exits import FirstExits
 from halfspace_sss.rendering.walk.guide import Guide
@@ -91,6 +92,8 @@ def _prepared(scene: Any, before: tuple, mm_per_unit: float) -> tuple[int, list,
         return before
     media = WalkMedia.of(scene, mm_per_unit)
     check_sensors(scene, media.objects)
+    for found, inside in zip(media.objects, media.insides):
+        check_size(found, [mm_per_unit * float(m.sigma_t) for m in inside.channels()], mm_per_unit)
     return number_of(scene), shapes, media
 
 

@@ -44,9 +44,10 @@ def trade_command(
     tolerance: Annotated[float, typer.Option(help="Relative error, bias and noise together.")] = TOLERANCE,
     images: Annotated[int, typer.Option(help="How many are to be rendered.", parser=whole)] = IMAGES,
     seconds: Annotated[float | None, typer.Option(help="That the whole job may take.", show_default="no limit")] = None,
-    way: Annotated[
-        list[str] | None, typer.Option(help="A way, e.g. neural; repeat for more.", show_default="all")
+    model: Annotated[
+        list[str] | None, typer.Option(help="A model or path_traced; repeat for more.", show_default="all")
     ] = None,
+    way: Annotated[list[str] | None, typer.Option(hidden=True)] = None,  # what --model was called before
     assess: Annotated[float, typer.Option(help="Seconds of measuring for each object.")] = ASSESS,
     r: Annotated[str | None, typer.Option(help="Of a material: smallest and largest distance, mm, as 0.1,20.")] = None,
     sensor: SensorNumber = 0,
@@ -59,8 +60,9 @@ def trade_command(
     check_interval("tolerance", tolerance, 1e-4, 10.0)
     check_count("images", images, 1)
     check_count("seed", seed, 0)
+    models = [*(model or ()), *(way or ())] or None
     if what is None:
-        given = {"seconds": seconds, "way": way, "r": r, "define": define}
+        given = {"seconds": seconds, "model": models, "r": r, "define": define}
         check_left_out(given, "without a scene or a material")
         _shipped()
     elif Path(what).suffix == ".xml" or Path(what).is_file():
@@ -70,11 +72,11 @@ def trade_command(
         use_mitsuba(variant)
         from halfspace_sss.trade.advice import Job
 
-        how = {"seconds": assess, "only": way, "sensor": sensor, "seed": seed, "parameters": parameters}
+        how = {"seconds": assess, "models": models, "sensor": sensor, "seed": seed, "parameters": parameters}
         _scene(Path(what), Job(tolerance, images, seconds), how, out)
     else:
-        check_left_out({"seconds": seconds, "way": way, "define": define}, "with a material")
-        _material(what, r, tolerance, seed)
+        check_left_out({"seconds": seconds, "define": define}, "with a material")
+        _material(what, r, tolerance, models, seed)
 
 
 def _shipped() -> None:
@@ -98,12 +100,12 @@ def _shipped_row(row: Any) -> list[str]:
 _HEADINGS = ("way", "bias, %", "variance", "s a million", "cost", "FLIP")
 
 
-def _material(name: str, r: str | None, tolerance: float, seed: int) -> None:
+def _material(name: str, r: str | None, tolerance: float, models: list[str] | None, seed: int) -> None:
     from halfspace_sss import materials
     from halfspace_sss.trade.flat import recommend_flat
 
     limits = None if r is None else tuple(numbers("r", r))
-    found = recommend_flat(materials.load(name).medium, limits, tolerance=tolerance, seed=seed)
+    found = recommend_flat(materials.load(name).medium, limits, tolerance=tolerance, models=models, seed=seed)
     console().print(str(found), highlight=False, markup=False, soft_wrap=True)
 
 

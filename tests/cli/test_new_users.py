@@ -1,0 +1,147 @@
+"""What people meet who are new to the library: names, messages, terminals, and what objects show of themselves."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+import halfspace_sss as sss
+from halfspace_sss.cli import app as cli
+from halfspace_sss.trade import recommend
+
+MEDIUM = sss.Medium.from_albedo(0.75, 0.241)
+QUICK = {"models": ["better_dipole"], "n_paths": 2000, "theta_i_deg": [0.0]}
+
+
+def _run(*arguments: str, program: tuple[str, ...] = ("-m", "halfspace_sss"), **environment: str):
+    environment = {**os.environ, **environment}
+    return subprocess.run([sys.executable, *program, *arguments], capture_output=True, env=environment, timeout=300)
+
+
+def _refused(*arguments: str) -> str:
+    found = CliRunner().invoke(cli._app(), list(arguments))
+    assert found.exit_code != 0
+    return found.output + found.stderr
+
+
+@pytest.fixture(scope="module")
+def curve_set() -> sss.comparison.curve_set.CurveSet:
+    return sss.curves(MEDIUM, **QUICK)
+
+
+def test_the_package_runs_as_a_module() -> None:
+    assert b"curves" in _run("--help").stdout
+
+
+def test_a_terminal_without_unicode_shows_every_table() -> None:
+    found = _run("trade", PYTHONIOENCODING="ascii", LC_ALL="C")
+    assert found.returncode == 0, found.stderr
+    assert b"path_traced" in found.stdout
+
+
+def test_help_of_the_surface_works_before_it_is_registered() -> None:
+    pytest.importorskip("mitsuba")
+    code = (
+        "import halfspace_sss; from halfspace_sss import rendering; help(halfspace_sss.rendering.surface.translucent)"
+    )
+    assert b"The Mitsuba surface `translucent`" in _run(program=("-c", code)).stdout
+
+
+def test_models_have_one_option_in_all_commands() -> None:
+    for command in ("curves", "errors", "trade"):
+        shown = CliRunner().invoke(cli._app(), [command, "--help"]).output
+        assert "--model" in shown and "--way" not in shown
+
+
+def test_the_keyword_of_before_still_chooses_models() -> None:
+    how = {"medium": MEDIUM, "tolerance": 0.5, "events": 1e5}
+    with pytest.warns(DeprecationWarning, match="only is called models now"):
+        found = recommend(**how, only=["better_dipole"])
+    assert [o.model for o in found.options] == [o.model for o in recommend(**how, models=["better_dipole"]).options]
+
+
+def test_a_model_of_objects_is_named_as_one_where_half_spaces_are_asked_for() -> None:
+    with pytest.raises(ValueError, match="got 'neural_shape', which is one of objects in a scene"):
+        sss.curves(MEDIUM, models=["neural_shape"])
+
+
+def test_a_grid_of_maps_is_refused_by_its_option() -> None:
+    assert "grid 2,4,12,8: n_phi must be" in _refused("maps", "--grid", "2,4,12,8")
+
+
+def test_an_unknown_material_is_refused_with_the_command_that_lists_them() -> None:
+    with pytest.raises(ValueError, match="`halfspace-sss materials` lists them"):
+        sss.materials.load("nonsense")
+
+
+def test_a_folder_of_weights_that_cannot_be_written_is_refused_with_the_variable(monkeypatch, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("HALFSPACE_SSS_WEIGHTS", str(tmp_path / "file" / "weights"))
+    with pytest.raises(ValueError, match="HALFSPACE_SSS_WEIGHTS names another folder"):
+        sss.neural.train(MEDIUM)
+
+
+def test_training_without_torch_says_what_to_install() -> None:
+    code = "import sys; sys.modules['torch'] = None; import halfspace_sss; halfspace_sss.neural.train"
+    assert b'train needs torch: pip install "halfspace-sss[train]"' in _run(program=("-c", code)).stderr
+
+
+def test_errors_of_reflectance_are_those_of_the_series(curve_set) -> None:
+    table = curve_set.errors().set_index("series")
+    assert (table.loc["better_dipole", "reflectance_standard_error"] < 1e-4).all()
+    assert (table["reflectance_traced_standard_error"] > 1e-4).all()
+
+
+def test_objects_show_medium_and_unit_in_a_line(curve_set) -> None:
+    advice = recommend(medium=MEDIUM, tolerance=0.5, events=1e5, models=["better_dipole"])
+    trace = sss.trace(MEDIUM, 0.5, n_paths=1000)
+    for found in (sss.bssrdf("neural", MEDIUM), trace, curve_set, advice):
+        assert "\n" not in repr(found) and len(repr(found)) < 200
+    for found in (sss.bssrdf("neural", MEDIUM), trace, curve_set):
+        assert "sigma_t 0.241/mm, albedo 0.75, g 0, eta 1.3" in repr(found)
+    for found in (MEDIUM, sss.materials.load("marble").medium, curve_set, advice):
+        assert "<table" in found._repr_html_()
+
+
+def test_curves_are_drawn_by_themselves(curve_set) -> None:
+    figure = pytest.importorskip("matplotlib.figure")
+    assert isinstance(curve_set.plot(), figure.Figure)
+
+
+def test_both_integrators_warn_of_a_size_that_speaks_of_another_unit() -> None:
+    mi = pytest.importorskip("mitsuba")
+    from halfspace_sss import rendering
+
+    mi.set_variant("llvm_ad_rgb")
+    rendering.register()
+    ball = {"type": "sphere", "bsdf": {"type": "translucent", "sigma_s": 0.1, "sigma_a": 0.1, "model": "lambert"}}
+    view = mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0])
+    film = {"type": "hdrfilm", "width": 2, "height": 2}
+    sensor = {"type": "perspective", "to_world": view, "film": film}
+    for kind in ("bssrdf", "translucent_walk"):
+        scene = mi.load_dict({"type": "scene", "integrator": {"type": kind}, "ball": ball, "sensor": sensor})
+        with pytest.warns(UserWarning, match="0.693 to 0.693 mean free paths across"):
+            mi.render(scene, spp=1)
+
+
+@pytest.mark.parametrize("integrator", ["bssrdf", "translucent_walk"])
+def test_a_mesh_without_faces_is_refused_in_a_sentence(integrator: str, tmp_path: Path) -> None:
+    mi = pytest.importorskip("mitsuba")
+    from halfspace_sss import rendering
+
+    mi.set_variant("llvm_ad_rgb")
+    rendering.register()
+    (tmp_path / "empty.ply").write_text(
+        "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+        "element face 0\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n1 0 0\n0 1 0\n"
+    )
+    surface = {"type": "translucent", "material": "marble"}
+    mesh = {"type": "ply", "filename": str(tmp_path / "empty.ply"), "bsdf": surface}
+    with pytest.raises(ValueError, match="a mesh must have faces, got none"):
+        scene = mi.load_dict({"type": "scene", "integrator": {"type": integrator}, "mesh": mesh})
+        mi.render(scene, spp=1)
