@@ -115,7 +115,7 @@ def profile(model: BSSRDF, r: Any, mu_i: float = 1.0, quadrature: Quadrature = D
 
 
 def moments(model: BSSRDF, mu_i: float = 1.0, quadrature: Quadrature = DEFAULT) -> Moments:
-    """Where the exitant flux leaves on average: <r²> = ∫ r² M dA / ∫ M dA in mm², <x> likewise in mm.
+    """Where the exitant flux leaves on average: ⟨r²⟩ = ∫ r² M dA / ∫ M dA in mm², ⟨x⟩ likewise in mm.
 
     x runs along the horizontal direction of travel of the incident light. A moment that diverges (no absorption: the
     profile falls as r^-3) is inf; NaN where nothing comes out. mu_i: one number in [0, 1]; ValueError otherwise.

@@ -138,7 +138,7 @@ def _mean_hg(g: Any, mu: Any, sine: Any, nu: Any, nu_sine: Any) -> tuple[Any, An
 
 
 def _exit_moments(medium: Medium, mu_i: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """R, R <x> and R <r²> (per mean free path) for mu_i of shape (n, 1), scalar or channel medium; shape (n, channels).
+    """R, R ⟨x⟩ and R ⟨r²⟩ (per mean free path) for mu_i of shape (n, 1), scalar or channel medium; shape (n, channels).
 
     Over u, the cosine on the thinner side (external for eta >= 1), which has no kink at the critical angle; the panels
     halve towards u = 0, 1 and the backward peak of the phase function.
@@ -190,10 +190,10 @@ def reflectance(medium: Medium, mu_i: Any = 1.0) -> Any:
 
 
 def moments(medium: Medium, mu_i: Any = 1.0) -> tuple[Any, Any]:
-    """<r²> (mm²) and <x> (mm) of the flux that leaves after one scattering event, x along the light that enters.
+    """⟨r²⟩ (mm²) and ⟨x⟩ (mm) of the flux that leaves after one scattering event, x along the light that enters.
 
-    In mean free paths <x> = <(nu sin_i + a sin_o cos)/(a + nu)> and <r²> = 2 <(nu² sin_i² + 2 a nu sin_i sin_o cos +
-    a² sin_o²)/(a + nu)²>, a and nu the cosines inside of entry and exit: distances along both rays are exponential.
+    In mean free paths ⟨x⟩ = ⟨(nu sin_i + a sin_o cos)/(a + nu)⟩ and ⟨r²⟩ = 2 ⟨(nu² sin_i² + 2 a nu sin_i sin_o cos +
+    a² sin_o²)/(a + nu)²⟩, a and nu the cosines inside of entry and exit: distances along both rays are exponential.
     Arguments, shapes and errors as `reflectance`, without "diffuse"; NaN where nothing enters or scatters.
     """
     if isinstance(mu_i, str):
