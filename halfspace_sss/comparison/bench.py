@@ -21,9 +21,10 @@ from halfspace_sss.backend import array_types
 from halfspace_sss.interface.model import bssrdf, models
 from halfspace_sss.maps.grid import MapGrid
 from halfspace_sss.maps.map_tracing import MapUnit, trace_unit
-from halfspace_sss.measure import weight_variance
+from halfspace_sss.measure import reflectance, weight_variance
 from halfspace_sss.physics.fresnel import F_r, F_t
 from halfspace_sss.physics.medium import Medium
+from halfspace_sss.physics.reflectance import _inverse
 from halfspace_sss.tracing.tallies import AngularTally, FluxTally
 from halfspace_sss.tracing.walk import pass_seed, walk
 
@@ -135,6 +136,12 @@ def _rate(call: Callable[[], Any], n: int, least_seconds: float) -> float:
     return statistics.median(rates)
 
 
+def _cpu_seconds(call: Callable[[], Any]) -> float:
+    started = time.process_time()
+    call()
+    return time.process_time() - started
+
+
 def _queries(n: int) -> list[np.ndarray]:
     rng = np.random.default_rng(0)
     r = np.exp(rng.uniform(math.log(0.01), math.log(10), n))
@@ -146,7 +153,8 @@ def _queries(n: int) -> list[np.ndarray]:
 def bench_models(names: tuple[str, ...] | None = None, n: int = 1 << 15, least_seconds: float = 0.2) -> Iterator[Row]:
     """Evaluations of S per second in float32, batches of `n`: NumPy, torch (if installed) and Dr.Jit on the CPU.
 
-    With them the relative variance of the weight of the model's own samples, `measure.weight_variance`.
+    With them the relative variance of the weight of the model's own samples, `measure.weight_variance`, and the CPU
+    seconds of one `measure.reflectance`, warm, and of one `Medium.from_reflectance`, cold (no model is in it).
 
     Dr.Jit is given batches 16 times as large, since a kernel launch has a fixed cost; the sum of S is evaluated.
     """
@@ -158,6 +166,8 @@ def bench_models(names: tuple[str, ...] | None = None, n: int = 1 << 15, least_s
     except ImportError:
         torch = None
     medium = _medium(0.75, 0.0, 1.3)
+    _inverse.cache_clear()
+    colour_seconds = _cpu_seconds(lambda: Medium.from_reflectance(0.5, 1.0, 0.3, 1.37))
     for name in names or models():
         try:
             model = bssrdf(name, medium)
@@ -168,6 +178,11 @@ def bench_models(names: tuple[str, ...] | None = None, n: int = 1 << 15, least_s
         arrays, many = _queries(n), [types.Float(a) for a in _queries(16 * n)]
         dr.eval(many)
         row: Row = {"model": name, "orders": model.orders, "weight_variance": weight_variance(model)}
+        reflectance(model, 0.9)
+        row["reflectance_s"] = statistics.median(
+            _cpu_seconds(lambda m=model: reflectance(m, 0.9)) for _ in range(REPEATS)
+        )
+        row["from_reflectance_s"] = colour_seconds
         row["numpy"] = _rate(lambda m=model, q=arrays: m.eval(*q), n, least_seconds)
         if torch is not None:
             tensors = [torch.from_numpy(a) for a in arrays]

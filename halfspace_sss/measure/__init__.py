@@ -1,6 +1,7 @@
 """Measures of one model by quadrature: reflectance, profile, moments of the exit, reciprocity."""
 
 from halfspace_sss.measure.integrals import (
+    Estimate,
     Moments,
     Quadrature,
     ReciprocityGap,
@@ -10,10 +11,11 @@ from halfspace_sss.measure.integrals import (
     profile,
     reciprocity_gap,
     reflectance,
+    reflectance_estimate,
     weight_variance,
 )
 
 __all__ = [
-    "Moments", "Quadrature", "ReciprocityGap", "clamped_energy", "energy_table", "moments", "profile",
-    "reciprocity_gap", "reflectance", "weight_variance",
+    "Estimate", "Moments", "Quadrature", "ReciprocityGap", "clamped_energy", "energy_table", "moments", "profile",
+    "reciprocity_gap", "reflectance", "reflectance_estimate", "weight_variance",
 ]  # fmt: skip

@@ -2,7 +2,7 @@
 
 Everything is an integral of S by a quadrature whose numbers are open (`Quadrature`): a trapezoid in ln r over the
 distances that carry flux, periodic trapezoids in both azimuths with the mirror symmetry, Gauss-Legendre in mu_o.
-Smooth models come out to 1e-6 relative or better; a model that clamps has kinks, there finer numbers tell the error.
+Where S depends on both azimuths, the reflectance is summed on a shifted lattice instead, which tells its error.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import numpy as np
 
 from halfspace_sss.checks import check_cosine, check_count, rounding
 from halfspace_sss.interface.model import BSSRDF, bssrdf, models
+from halfspace_sss.measure.lattice import lattice_reflectance
 from halfspace_sss.measure.quadrature import Angles, Quadrature, cosine_nodes, distances, flux, log_sum
 from halfspace_sss.physics import single_scattering
 from halfspace_sss.physics.fresnel import C_1, F_t, mu_external
@@ -24,11 +25,19 @@ if TYPE_CHECKING:
     import pandas
 
 __all__ = [
-    "Moments", "Quadrature", "ReciprocityGap", "clamped_energy", "energy_table", "moments", "profile",
-    "reciprocity_gap", "reflectance", "weight_variance",
+    "Estimate", "Moments", "Quadrature", "ReciprocityGap", "clamped_energy", "energy_table", "moments", "profile",
+    "reciprocity_gap", "reflectance", "reflectance_estimate", "weight_variance",
 ]  # fmt: skip
 
 DEFAULT = Quadrature()
+DIFFUSE_COSINES = 10  # of incidence, on the lattice
+
+
+class Estimate(NamedTuple):
+    """A value and its error."""
+
+    value: Any
+    error: Any
 
 
 class Moments(NamedTuple):
@@ -48,9 +57,8 @@ class ReciprocityGap(NamedTuple):
 
 def _over_incidence(angles: Angles, mu_i: Any, q: Quadrature) -> np.ndarray:
     """`flux` for a number, an array or "diffuse", with the channel axis last if the medium has one."""
+    _check_diffuse(mu_i)
     if isinstance(mu_i, str):
-        if mu_i != "diffuse":
-            raise ValueError(f'mu_i must be cosines in [0, 1] or "diffuse", got {mu_i!r}')
         mu, w = cosine_nodes(angles.medium.eta, q.n_mu)
         R = 2 * w @ np.stack([flux(angles, m, q) for m in mu])
     else:
@@ -71,7 +79,7 @@ def _cosines(mu_i: Any) -> np.ndarray:
     return mu
 
 
-def reflectance(model: BSSRDF, mu_i: Any = 1.0, order: str | None = None, quadrature: Quadrature = DEFAULT) -> Any:
+def reflectance(model: BSSRDF, mu_i: Any = 1.0, order: str | None = None, quadrature: Quadrature | None = None) -> Any:
     """Fraction of incident flux that comes back out of the medium, R(mu_i) = ∫∫ S mu_o dw_o dA_o.
 
     Args:
@@ -80,7 +88,8 @@ def reflectance(model: BSSRDF, mu_i: Any = 1.0, order: str | None = None, quadra
             above, 2 ∫ R(mu_i) mu_i dmu_i.
         order: None for the orders the model contains, or "multiple", or "total", which adds the exact single order to
             a model of "multiple".
-        quadrature: see `Quadrature`; the defaults give 1e-6 relative for smooth models.
+        quadrature: see `Quadrature`. None: its defaults where S does not depend on both azimuths (1e-6 relative for
+            smooth models), else a lattice; `reflectance_estimate` tells the error.
 
     Returns:
         Array of the shape of mu_i, with the channel axis last if the medium has channels; a number for numbers.
@@ -88,14 +97,56 @@ def reflectance(model: BSSRDF, mu_i: Any = 1.0, order: str | None = None, quadra
     Raises:
         ValueError: mu_i is out of range, or the model cannot form the order.
     """
+    _check_order(model, order)
+    angles = Angles(model.eval, model.medium, quadrature or DEFAULT)
+    on_lattice = quadrature is None and angles.both_azimuths
+    R = _lattice(model, mu_i).value if on_lattice else _over_incidence(angles, mu_i, quadrature or DEFAULT)
+    return R + _single(model, mu_i, order)
+
+
+def reflectance_estimate(model: BSSRDF, mu_i: Any = 1.0, order: str | None = None) -> Estimate:
+    """`reflectance` with its error: on a lattice the standard error, else the difference from a rule of half as many.
+
+    Arguments, shapes and errors as `reflectance`.
+    """
+    _check_order(model, order)
+    angles = Angles(model.eval, model.medium, DEFAULT)
+    if angles.both_azimuths:
+        R = _lattice(model, mu_i)
+    else:
+        half = Quadrature(DEFAULT.per_decade // 2, DEFAULT.n_azimuth // 2, DEFAULT.n_mu // 2)
+        value = _over_incidence(angles, mu_i, DEFAULT)
+        R = Estimate(value, abs(value - _over_incidence(Angles(model.eval, model.medium, half), mu_i, half)))
+    return Estimate(R.value + _single(model, mu_i, order), R.error)
+
+
+def _check_order(model: BSSRDF, order: str | None) -> None:
     if order not in (None, model.orders) and (order, model.orders) != ("total", "multiple"):
         raise ValueError(
             f'order must be {model.orders!r} or None for {model.name!r}, or "total" if "multiple", got {order!r}'
         )
-    R = _over_incidence(Angles(model.eval, model.medium, quadrature), mu_i, quadrature)
-    if order == "total" and model.orders == "multiple":
-        R = R + single_scattering.reflectance(model.medium, mu_i)
-    return R
+
+
+def _single(model: BSSRDF, mu_i: Any, order: str | None) -> Any:
+    added = order == "total" and model.orders == "multiple"
+    return single_scattering.reflectance(model.medium, mu_i) if added else 0.0
+
+
+def _lattice(model: BSSRDF, mu_i: Any) -> Estimate:
+    """By the lattice, for a number, an array or "diffuse", with the channel axis last if the medium has one."""
+    _check_diffuse(mu_i)
+    m = model.medium
+    parts = [model] if m.n_channels is None else [model.for_medium(m.channel(k)) for k in range(m.n_channels)]
+    diffuse = isinstance(mu_i, str)
+    mu, w = cosine_nodes(m.eta, DIFFUSE_COSINES) if diffuse else (_cosines(mu_i), None)
+    found = np.array([[lattice_reflectance(part, one) for part in parts] for one in mu.ravel().tolist()])
+    found = 2 * np.tensordot(w, found, 1) if diffuse else found.reshape(*mu.shape, len(parts), 2)
+    return Estimate(*(v if m.n_channels is not None else v[..., 0][()] for v in (found[..., 0], found[..., 1])))
+
+
+def _check_diffuse(mu_i: Any) -> None:
+    if isinstance(mu_i, str) and mu_i != "diffuse":
+        raise ValueError(f'mu_i must be cosines in [0, 1] or "diffuse", got {mu_i!r}')
 
 
 def profile(model: BSSRDF, r: Any, mu_i: float = 1.0, quadrature: Quadrature = DEFAULT) -> np.ndarray:
@@ -176,7 +227,7 @@ def clamped_energy(model: BSSRDF, mu_i: Any = 1.0, quadrature: Quadrature = DEFA
 
 def energy_table(
     media: Mapping[str, Medium], names: Iterable[str] | None = None, mu_i: Iterable[Any] = (1.0, 0.3, "diffuse"),
-    quadrature: Quadrature = DEFAULT,
+    quadrature: Quadrature | None = None,
 ) -> pandas.DataFrame:  # fmt: skip
     """Reflectance of models over media against what can enter, where models leave [0, 1].
 
@@ -200,7 +251,7 @@ def energy_table(
     return pandas.DataFrame(rows)
 
 
-def _energy_rows(medium_name: str, medium: Medium, name: str, mu_i: Any, quadrature: Quadrature) -> list[dict]:
+def _energy_rows(medium_name: str, medium: Medium, name: str, mu_i: Any, quadrature: Quadrature | None) -> list[dict]:
     n = medium.n_channels or 1
     try:
         model = bssrdf(name, medium)

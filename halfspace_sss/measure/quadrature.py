@@ -30,7 +30,7 @@ class Quadrature:
 
     per_decade: int = 20
     n_azimuth: int = 32
-    n_mu: int = 24
+    n_mu: int = 20
 
     def __post_init__(self) -> None:
         for name, least in (("per_decade", 4), ("n_azimuth", 4), ("n_mu", 2)):
@@ -55,6 +55,7 @@ class Angles:
         self.w_i = np.r_[0.5, np.ones(half - 1), 0.5] / half
         self.w_x = -self.w_i * np.cos(self.phi_i)
         free_i, free_o = self._unused_azimuths(probe or evaluate)
+        self.both_azimuths = not (free_i or free_o)
         if free_i:
             self.phi_i, self.w_i, self.w_x = np.array([0.5 * math.pi]), np.ones(1), np.zeros(1)
         if free_o:

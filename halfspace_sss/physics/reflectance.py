@@ -9,6 +9,11 @@ E and O the even and odd terms of sum_l beta_l P_l(mu) P_l(mu'), beta_l = (2 l +
 as e^(-k tau) has (A + B)(A - B) s = k² s and k d = (A - B) s. Inside, the boundary reflects by Fresnel. The forward
 peak is cut off by delta-M (Wiscombe 1977).
 
+That product is not symmetric, and near albedo 1 it loses 1 - a. Both factors are squares, though: with V = diag(W mu),
+A - B = V^-½ F F^T V^½ and A + B = V^-½ G G^T V^½. Then k are the singular values of G^T F = X diag(k) Y^T,
+s = V^-½ G X and d = V^-½ F Y: nothing is divided by k. What is the same in all directions is split off in F, where
+1 - a stands as it is given; on the nodes all other orders are made orthogonal to it.
+
 Source: Chandrasekhar 1960, chapter II; the reduction of the order is that of Stamnes et al. 1988.
 """
 
@@ -27,20 +32,30 @@ __all__ = ["DIFFUSE", "albedo_of_reflectance", "half_space_reflectance"]
 
 DIFFUSE = "diffuse"
 NODES = 96
-SLOWEST = 1e-7  # k below which a mode does not decay, at albedo 1
-DEGREE = 40  # of R as a polynomial of s = sqrt(1 - albedo'), albedo = (1 - s²)/(1 - g s²)
+DEGREE = 64  # of ln(R / albedo) as a polynomial of x, s = x / (c + (1 - c) x), s² = 1 - albedo'
 DENSE = 8192  # values of it between which its inverse is looked up
 STEPS = 2  # of Newton's method after that
 
 
+class _Basis(NamedTuple):
+    """Nodes of an index with sqrt(w) P_l on them, P_l of even order without their mean over the nodes."""
+
+    mu: np.ndarray
+    w: np.ndarray
+    even: np.ndarray  # of orders 2, 4, ...
+    odd: np.ndarray
+    mean: np.ndarray  # of those even orders
+    alike: np.ndarray  # sqrt(w), of length 1: the same in all directions
+    others: np.ndarray  # orthonormal, across it
+    turned: np.ndarray  # the even orders in those
+
+
 class _Modes(NamedTuple):
-    """Solutions that decay downwards: s and d at the nodes, one a column, with k; cosines, weights, and beta_l."""
+    """Solutions that decay downwards: s and d at the nodes, one a column, with k, and a beta_l of delta-M."""
 
     s: np.ndarray
     d: np.ndarray
     k: np.ndarray
-    mu: np.ndarray
-    w: np.ndarray
     a_beta: np.ndarray
 
 
@@ -56,17 +71,18 @@ def half_space_reflectance(albedo: float, g: float, eta: float, mu_i: float | st
     Left out: what the boundary reflects from outside. Relative error 1e-5 at most for |g| <= 0.99.
     """
     _check_direction(mu_i)
-    m = _modes(albedo, g, eta)
+    m, basis = _modes(albedo, g, eta), _basis(eta)
     down, up = (m.s + m.d) / 2, (m.s - m.d) / 2
-    T = F_t(m.mu, 1 / eta)
-    share = np.linalg.solve(down - F_r(m.mu, 1 / eta)[:, None] * up, T * eta**2)  # under radiance 1 from everywhere
+    T = F_t(basis.mu, 1 / eta)
+    share = np.linalg.solve(down - F_r(basis.mu, 1 / eta)[:, None] * up, T * eta**2)  # radiance 1 from everywhere
     if mu_i == DIFFUSE:
-        return float(2 * np.sum(m.w * m.mu * T * (up @ share)))
+        return float(2 * np.sum(basis.w * basis.mu * T * (up @ share)))
     # reciprocity: what comes out towards mu_i then is R(mu_i)
     inside = mu_internal(mu_i, eta)
     P = np.polynomial.legendre.legvander(np.array([inside]), len(m.a_beta) - 1)[0] * m.a_beta
-    nodes = np.polynomial.legendre.legvander(m.mu, len(m.a_beta) - 1)
-    even, odd = ((P[k::2] @ nodes[:, k::2].T) * m.w for k in (0, 1))
+    root = np.sqrt(basis.w)
+    even = P[0] * basis.w + ((P[2::2] - basis.mean * m.a_beta[2::2]) @ basis.even.T) * root
+    odd = (P[1::2] @ basis.odd.T) * root
     upwards = (even @ m.s - odd @ m.d) / (2 * (m.k * inside + 1))
     return float(F_t(mu_i, eta) * (upwards @ share) / eta**2)
 
@@ -77,19 +93,29 @@ def _check_direction(mu_i: float | str) -> None:
 
 
 def _modes(albedo: float, g: float, eta: float) -> _Modes:
-    mu, w = _nodes(NODES, eta)
-    n = len(mu)
+    basis = _basis(eta)
+    n = len(basis.mu)
     peak = g**n
-    a = albedo * (1 - peak) / (1 - albedo * peak)
+    lost = (1 - albedo) / (1 - albedo * peak)  # 1 - a
     order = np.arange(n)
-    a_beta = a * (2 * order + 1) * (float(g) ** order - peak) / (1 - peak)
-    P = np.polynomial.legendre.legvander(mu, n - 1)
-    even, odd = ((P[:, k::2] * a_beta[k::2]) @ P[:, k::2].T * w for k in (0, 1))
-    minus, plus = ((np.eye(len(mu)) - term) / mu[:, None] for term in (even, odd))
-    k2, s = np.linalg.eig(plus @ minus)
-    k, s = np.sqrt(np.maximum(k2.real, 0)), s.real
-    d = np.where(k > SLOWEST, minus @ s / np.maximum(k, SLOWEST), 0)
-    return _Modes(s, d, k, mu, w, a_beta)
+    a_beta = (1 - lost) * (2 * order + 1) * (float(g) ** order - peak) / (1 - peak)
+    root = 1 / np.sqrt(basis.mu)[:, None]
+    C = np.linalg.cholesky(np.eye(n - 1) - (basis.turned * a_beta[2::2]) @ basis.turned.T)
+    F = root * np.column_stack([math.sqrt(lost) * basis.alike, basis.others @ C])
+    G = root * np.linalg.cholesky(np.eye(n) - (basis.odd * a_beta[1::2]) @ basis.odd.T)
+    X, k, Y = np.linalg.svd(G.T @ F)
+    scale = 1 / np.sqrt(basis.w * basis.mu)[:, None]
+    return _Modes(scale * (G @ X), scale * (F @ Y.T), k, a_beta)
+
+
+@functools.lru_cache(maxsize=16)
+def _basis(eta: float) -> _Basis:
+    mu, w = _nodes(NODES, eta)
+    P = np.polynomial.legendre.legvander(mu, len(mu) - 1)
+    root, mean = np.sqrt(w)[:, None], w @ P[:, 2::2]
+    turn = np.linalg.qr(np.column_stack([root, np.eye(len(mu))[:, 1:]]))[0]
+    even, others = root * (P[:, 2::2] - mean), turn[:, 1:]
+    return _Basis(mu, w, even, root * P[:, 1::2], mean, turn[:, 0], others, others.T @ even)
 
 
 def _nodes(n: int, eta: float) -> tuple[np.ndarray, np.ndarray]:
@@ -114,7 +140,7 @@ def albedo_of_reflectance(reflectance: np.ndarray, g: float, eta: float, mu_i: f
     """
     _check_direction(mu_i)
     R = np.asarray(reflectance, dtype=np.float64)
-    s, values, polynomial = _inverse(float(g), float(eta), mu_i if mu_i == DIFFUSE else float(mu_i))
+    x, values, polynomial = _inverse(float(g), float(eta), mu_i if mu_i == DIFFUSE else float(mu_i))
     most = half_space_reflectance(1.0, g, eta, mu_i)
     reached = (R >= 0) & (R <= most * (1 + 1e-9))
     if not reached.all():
@@ -123,24 +149,36 @@ def albedo_of_reflectance(reflectance: np.ndarray, g: float, eta: float, mu_i: f
             f"reflectance must be in [0, {most:.4g}], what a medium without absorption reflects at eta {eta:g}, "
             f"got {float(wrong)!r}"
         )
-    found, slope = np.interp(R, values, s), polynomial.deriv()
+    found, slope = np.interp(R, values, x), polynomial.deriv()
     for _ in range(STEPS):
-        found = np.clip(found - (polynomial(found) - R) / np.minimum(slope(found), -1e-12), 0, 1)
-    return _albedo(found, g)
+        albedo, growth = _albedo(found, g)
+        value = albedo * np.exp(polynomial(found))
+        change = (growth + albedo * slope(found)) * np.exp(polynomial(found))
+        found = np.clip(found - (value - R) / np.minimum(change, -1e-12), 0, 1)
+    return _albedo(found, g)[0]
 
 
 @functools.lru_cache(maxsize=64)
 def _inverse(g: float, eta: float, mu_i: float | str) -> tuple[np.ndarray, np.ndarray, np.polynomial.Chebyshev]:
-    """s falling from 1 to 0, the reflectance there, and that as a polynomial."""
+    """x falling from 1 to 0, the reflectance there, and ln(R / albedo) as a polynomial of x."""
 
-    def R(s: np.ndarray) -> np.ndarray:
-        return np.array([half_space_reflectance(_albedo(v, g), g, eta, mu_i) for v in np.atleast_1d(s)])
+    def log_ratio(x: np.ndarray) -> np.ndarray:
+        albedo = _albedo(x, g)[0]
+        return np.log([half_space_reflectance(a, g, eta, mu_i) / a for a in albedo])
 
-    polynomial = np.polynomial.Chebyshev.interpolate(R, DEGREE, domain=[0, 1])
-    s = np.linspace(1, 0, DENSE)
-    return s, np.maximum.accumulate(polynomial(s)), polynomial
+    polynomial = np.polynomial.Chebyshev.interpolate(log_ratio, DEGREE, domain=[0, 1])
+    x = np.linspace(1, 0, DENSE)
+    return x, np.maximum.accumulate(_albedo(x, g)[0] * np.exp(polynomial(x))), polynomial
 
 
-def _albedo(s: np.ndarray, g: float) -> np.ndarray:
-    """The albedo whose reduced one is 1 - s²."""
-    return (1 - s) * (1 + s) / (1 - g * s * s)
+def _albedo(x: np.ndarray, g: float) -> tuple[np.ndarray, np.ndarray]:
+    """The albedo whose reduced one is 1 - s², and its derivative by x.
+
+    The albedo (1 - s²)/(1 - g s²) has its pole close to s = 1 for g near 1; c = (1 - g)^(1/3) moves it away in x.
+    """
+    c = (1 - max(g, 0.0)) ** (1 / 3)
+    below = c + (1 - c) * x
+    s = x / below
+    rest = 1 - g * s * s
+    # 1 - s = c (1 - x) / below
+    return c * (1 - x) / below * (1 + s) / rest, -2 * s * (1 - g) / rest**2 * c / below**2

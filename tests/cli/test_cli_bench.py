@@ -66,6 +66,7 @@ def test_every_rate_is_positive(finished: tuple[Any, Path]) -> None:
     assert [row["model"] for row in models] == list(halfspace_sss.models())
     for row in models:
         assert min(float(row[library]) for library in ("numpy", "torch", "drjit")) > 0
+        assert min(float(row[what]) for what in ("reflectance_s", "from_reflectance_s")) > 0
 
 
 def test_without_mitsuba_volpath_is_left_out_with_a_sentence(tmp_path: Path, monkeypatch: Any) -> None:
