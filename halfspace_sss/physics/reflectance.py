@@ -22,9 +22,11 @@ from __future__ import annotations
 import functools
 import math
 import numbers
+from contextlib import AbstractContextManager
 from typing import NamedTuple
 
 import numpy as np
+from threadpoolctl import ThreadpoolController
 
 from halfspace_sss.physics.fresnel import F_r, F_t, mu_internal
 
@@ -71,6 +73,21 @@ def half_space_reflectance(albedo: float, g: float, eta: float, mu_i: float | st
     Left out: what the boundary reflects from outside. Relative error 1e-5 at most for |g| <= 0.99.
     """
     _check_direction(mu_i)
+    with _one_thread():
+        return _reflectance(albedo, g, eta, mu_i)
+
+
+def _one_thread() -> AbstractContextManager:
+    """One thread of the BLAS: matrices of 96 are slower with more, many times so on a machine that has other work."""
+    return _controller().limit(limits=1, user_api="blas")
+
+
+@functools.lru_cache(maxsize=1)
+def _controller() -> ThreadpoolController:
+    return ThreadpoolController()
+
+
+def _reflectance(albedo: float, g: float, eta: float, mu_i: float | str) -> float:
     m, basis = _modes(albedo, g, eta), _basis(eta)
     down, up = (m.s + m.d) / 2, (m.s - m.d) / 2
     T = F_t(basis.mu, 1 / eta)
@@ -164,9 +181,10 @@ def _inverse(g: float, eta: float, mu_i: float | str) -> tuple[np.ndarray, np.nd
 
     def log_ratio(x: np.ndarray) -> np.ndarray:
         albedo = _albedo(x, g)[0]
-        return np.log([half_space_reflectance(a, g, eta, mu_i) / a for a in albedo])
+        return np.log([_reflectance(a, g, eta, mu_i) / a for a in albedo])
 
-    polynomial = np.polynomial.Chebyshev.interpolate(log_ratio, DEGREE, domain=[0, 1])
+    with _one_thread():
+        polynomial = np.polynomial.Chebyshev.interpolate(log_ratio, DEGREE, domain=[0, 1])
     x = np.linspace(1, 0, DENSE)
     return x, np.maximum.accumulate(_albedo(x, g)[0] * np.exp(polynomial(x))), polynomial
 
