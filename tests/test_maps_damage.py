@@ -67,3 +67,30 @@ def test_checksums_of_coordinates_are_those_of_their_numbers(tmp_path: Path) -> 
     maps = load_maps(make_maps(MEDIA, tmp_path, **HOW)["m"])
     written = json.loads(maps.attrs["checksums_of_coordinates"])
     assert written == {name: zlib.crc32(maps[name].values.tobytes()) for name in COORDINATES}
+
+
+@pytest.mark.parametrize("kept", [0, 7, 40])
+@pytest.mark.parametrize("array", ["S", "checksum"])
+def test_a_chunk_that_was_cut_off_is_made_again(array: str, kept: int, tmp_path: Path) -> None:
+    path = make_maps(MEDIA, tmp_path, **HOW)["m"]
+    whole = load_maps(path)
+    (chunk,) = (file for file in (path / array).iterdir() if file.name.startswith("1.0"))
+    chunk.write_bytes(chunk.read_bytes()[:kept] if kept < chunk.stat().st_size else b"")
+    with pytest.raises(ValueError, match="m.zarr is damaged"):
+        load_maps(path)
+    done = []
+    make_maps(MEDIA, tmp_path, **HOW, progress=lambda *step: done.append(step[0]))
+    again = load_maps(path)
+    assert len(done) == 2  # of the four units one was left
+    np.testing.assert_array_equal(again.S, whole.S)
+
+
+def test_an_edited_medium_is_refused(tmp_path: Path) -> None:
+    path = make_maps(MEDIA, tmp_path, **HOW)["m"]
+    for name in (".zattrs", ".zmetadata"):
+        text = (path / name).read_text()
+        assert "sigma_a" in text
+        (path / name).write_text(text.replace('\\"sigma_a\\": [0.1, 0.1]', '\\"sigma_a\\": [0.2, 0.1]'))
+    for read in (lambda: load_maps(path), lambda: make_maps(MEDIA, tmp_path, **HOW)):
+        with pytest.raises(ValueError, match="attribute halfspace_sss_maps does not match its checksum"):
+            read()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import zlib
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -15,7 +14,8 @@ import numpy as np
 
 from halfspace_sss.backend import array_types
 from halfspace_sss.checks import check_count, check_interval
-from halfspace_sss.maps.chunks import check_chunks
+from halfspace_sss.maps.checksums import ASKED, check_written, unit_checksum, written_checksums
+from halfspace_sss.maps.chunks import check_chunks, drop_cut_off
 from halfspace_sss.maps.grid import MapGrid, cell_edges, map_directions
 from halfspace_sss.maps.map_tracing import MapUnit, UnitResult, trace_unit
 from halfspace_sss.physics.medium import Medium
@@ -30,7 +30,6 @@ __all__ = ["load_maps", "make_maps"]
 FORMAT = 1
 MOST_PATHS = 2**33
 DATA = ("S", "variance")
-COORDINATES = "checksums_of_coordinates"  # an attribute
 
 
 def make_maps(
@@ -74,14 +73,15 @@ def make_maps(
     array_types(backend)
     paths = {name: Path(folder) / f"{name}.zarr" for name in media}
     asked = {name: _parameters(m, grid, target_error, n_paths, seed, backend) for name, m in media.items()}
+    units = _units(media, grid, target_error, n_paths or MOST_PATHS, seed, backend)[share[0] :: share[1]]
     for name in media:
         if paths[name].exists():
+            drop_cut_off(paths[name], {(channel, u.theta_index) for of, channel, u in units if of == name})
             _open_same(paths[name], asked[name])
     for name, medium in media.items():
         if not paths[name].exists():
             _create(paths[name], medium, grid, seed, asked[name])
     stores = {name: _open_same(path, asked[name]) for name, path in paths.items()}
-    units = _units(media, grid, target_error, n_paths or MOST_PATHS, seed, backend)[share[0] :: share[1]]
     left = [u for u in units if not _done(paths[u[0]], stores[u[0]], u[1], u[2].theta_index)]
     before = len(units) - len(left)
     if progress:
@@ -163,23 +163,7 @@ def _template(medium: Medium, grid: MapGrid, seed: int) -> xr.Dataset:
         "mfp": ("channel", np.atleast_1d(medium.mfp), {"units": "mm"}),
     }
     dataset = xr.Dataset(data, coords)
-    dataset.attrs[COORDINATES] = json.dumps(_coordinate_checksums(dataset), sort_keys=True)
     return dataset
-
-
-def _coordinate_checksums(dataset: xr.Dataset) -> dict[str, int]:
-    """Of every coordinate, in float64."""
-    return {str(name): zlib.crc32(np.asarray(c.values, "<f8").tobytes()) for name, c in dataset.coords.items()}
-
-
-def _check_coordinates(dataset: xr.Dataset) -> None:
-    """ValueError names a coordinate that is not as it was written; stores of before have no checksums of them."""
-    if COORDINATES not in dataset.attrs:
-        return
-    written, found = json.loads(dataset.attrs[COORDINATES]), _coordinate_checksums(dataset)
-    for name in sorted(written.keys() | found.keys()):
-        if written.get(name) != found.get(name):
-            raise ValueError(f"coordinate {name} does not match its checksum")
 
 
 def _create(path: Path, medium: Medium, grid: MapGrid, seed: int, asked: dict[str, Any]) -> None:
@@ -190,7 +174,8 @@ def _create(path: Path, medium: Medium, grid: MapGrid, seed: int, asked: dict[st
     from zarr.storage import MemoryStore
 
     dataset, memory = _template(medium, grid, seed), {}
-    dataset.attrs |= {"halfspace_sss_maps": json.dumps(asked, sort_keys=True), "provenance": json.dumps(provenance())}
+    dataset.attrs |= {ASKED: json.dumps(asked, sort_keys=True), "provenance": json.dumps(provenance())}
+    dataset.attrs |= written_checksums(dataset)
     chunks = {name: {"chunks": (1, 1, *dataset[name].shape[2:])} for name in dataset.data_vars}
     dataset.to_zarr(MemoryStore(memory), mode="w", zarr_format=2, encoding=chunks)
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
@@ -214,11 +199,11 @@ def _open(path: Path) -> xr.Dataset:
     try:
         check_chunks(path)
         dataset = xr.open_zarr(path, chunks=None)
-        asked = json.loads(dataset.attrs["halfspace_sss_maps"])
+        asked = json.loads(dataset.attrs[ASKED])
         missing = {*DATA, "checksum", "n_paths", "n_events"} - set(dataset.data_vars)
         if missing:
             raise KeyError(f"arrays {', '.join(sorted(missing))}")
-        _check_coordinates(dataset)
+        check_written(dataset)
     except Exception as error:  # zarr, JSON and xarray each raise their own kinds
         raise ValueError(f"map store {path} is damaged or not a map store: {error}") from error
     if asked.get("format") != FORMAT:
@@ -229,7 +214,7 @@ def _open(path: Path) -> xr.Dataset:
 def _open_same(path: Path, asked: dict[str, Any]) -> xr.Dataset:
     """The store at a path, which must have been made with the same parameters."""
     dataset = _open(path)
-    found = json.loads(dataset.attrs["halfspace_sss_maps"])
+    found = json.loads(dataset.attrs[ASKED])
     wanted = json.loads(json.dumps(asked))
     for key, value in wanted.items():
         if found.get(key) != value:
@@ -238,18 +223,12 @@ def _open_same(path: Path, asked: dict[str, Any]) -> xr.Dataset:
     return dataset
 
 
-def _checksum(S: np.ndarray, variance: np.ndarray) -> int:
-    """Never 0, which marks a unit not done."""
-    data = np.ascontiguousarray(S, np.float32).tobytes(), np.ascontiguousarray(variance, np.float32).tobytes()
-    return (1 << 32) | zlib.crc32(data[1], zlib.crc32(data[0]))
-
-
 def _done(path: Path, dataset: xr.Dataset, channel: int, theta: int) -> bool:
     """Whether a unit is whole; one whose data do not fit its checksum was cut off and is made again."""
     at = {"channel": channel, "theta": theta}
     try:
         stored = int(dataset["checksum"].isel(at).values)
-        return stored != 0 and stored == _checksum(*(dataset[name].isel(at).values for name in DATA))
+        return stored != 0 and stored == unit_checksum(*(dataset[name].isel(at).values for name in DATA))
     except Exception as error:
         raise ValueError(f"map store {path} is damaged in channel {channel}, theta {theta}: {error}") from error
 
@@ -265,7 +244,7 @@ def _write(path: Path, channel: int, theta: int, result: UnitResult) -> None:
     region = {"channel": slice(channel, channel + 1), "theta": slice(theta, theta + 1)}
     with naming(path):
         xr.Dataset(data).to_zarr(path, region=region, mode="r+")
-    checksum = np.full((1, 1), _checksum(result.S, result.variance), np.uint64)
+    checksum = np.full((1, 1), unit_checksum(result.S, result.variance), np.uint64)
     with naming(path):
         xr.Dataset({"checksum": (dims[:2], checksum)}).to_zarr(path, region=region, mode="r+")
 
@@ -294,6 +273,6 @@ def load_maps(path: str | os.PathLike) -> xr.Dataset:
             where = f"channel {channel}, direction {theta}"
             if int(part["checksum"]) == 0:
                 raise ValueError(f"map store {path} is unfinished at {where}: run the same command again to resume")
-            if int(part["checksum"]) != _checksum(part["S"].values, part["variance"].values):
+            if int(part["checksum"]) != unit_checksum(part["S"].values, part["variance"].values):
                 raise ValueError(f"map store {path} is damaged at {where}: the checksum does not match")
     return dataset.drop_encoding()  # codecs of the store, which another format does not take
