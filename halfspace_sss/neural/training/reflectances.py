@@ -18,6 +18,7 @@ from torch import nn
 
 from halfspace_sss.comparison.exits import exits
 from halfspace_sss.maps.media import draw_media
+from halfspace_sss.maps.noisy_maps import load_maps
 from halfspace_sss.neural.balance import N_TERMS, chebyshev
 from halfspace_sss.neural.features import N_MEDIUM, medium_features
 from halfspace_sss.neural.hypernetwork import Hypernetwork, Layers
@@ -68,12 +69,13 @@ def collect(
     mu_i[:, -1] = np.where(rng.random(n) < 0.5, 1.0, mu_i[:, -1])  # normal incidence is asked for most
     found = []
     for at in range(0, n, CHUNK):
+        media = range(at, min(at + CHUNK, n))
         place = folder / f"reflectances-{at // CHUNK:05d}.npy" if folder else None
         if place and place.exists():
-            rows = np.load(place, allow_pickle=False)
+            rows = load_maps(place, (len(media), COSINES, 2 + INTERVALS))
         else:
-            media = range(at, min(at + CHUNK, n))
             rows = np.stack([_row(hyper, ratios[k], mu_i[k], (seed, 3, k)) for k in media])  # no scramble is shared
+            rows = rows.astype(np.float32)
             if place:
                 file = io.BytesIO()
                 np.save(file, rows)
@@ -81,7 +83,7 @@ def collect(
         found.append(rows)
         if progress:
             progress("reflectances", min(at + CHUNK, n), n)
-    exact, error, flux = np.split(np.concatenate(found), [1, 2], axis=2)
+    exact, error, flux = np.split(np.concatenate(found).astype(np.float64), [1, 2], axis=2)
     return Fluxes(ratios, mu_i, exact[..., 0], flux, error[..., 0])
 
 
