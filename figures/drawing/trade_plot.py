@@ -214,5 +214,4 @@ def _page(picture: TradePicture) -> str:
 
 
 def _numbers(row: WayTrade) -> dict[str, float | str]:
-    bias = "exact" if row.way == TRACED else f"{100 * row.bias:.3g}"
-    return {"bias, %": bias, "variance": f"{row.variance:.3g}", "s a million": f"{1e6 * row.seconds:.3g}"}
+    return {"bias, %": row.told_bias, "variance": f"{row.variance:.3g}", "s a million": f"{1e6 * row.seconds:.3g}"}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from figures.drawing.style import TRACED
+from halfspace_sss.noise_free import short
 from halfspace_sss.trade.advice import Job, advise
 from halfspace_sss.trade.measuring.results import Assessment, ObjectTrade, WayTrade
 
@@ -16,7 +16,6 @@ __all__ = ["JOBS", "markdown", "trade_table"]
 
 Scenes = Mapping[tuple[str, str, str], ObjectTrade]
 JOBS = ((0.02, 1), (0.05, 1), (0.05, 100), (0.1, 1), (0.2, 1))  # tolerance, images
-CERTAIN = 2.0  # standard errors
 INTRODUCTION = """\
 # Speed against accuracy on scenes
 
@@ -50,7 +49,8 @@ def trade_table(found: Scenes) -> pandas.DataFrame:
             if w.refusal:
                 continue
             row: dict[str, Any] = {"material": material, "shape": shape, "light": light, "way": w.way, "bias": w.bias}
-            row |= {"bias_standard_error": w.bias_error, "variance": w.variance}
+            row |= {"bias_standard_error": w.bias_error, "bias2": w.bias2, "bias2_standard_error": w.bias2_error}
+            row["variance"] = w.variance
             row |= {"seconds_per_million": 1e6 * w.seconds, "cost": 1e6 * w.seconds * w.variance}
             rows.append(row | {"flip": w.flip, "flip_noise": w.flip_noise})
     return pandas.DataFrame(rows)
@@ -66,7 +66,7 @@ def markdown(found: Scenes, table: pandas.DataFrame, seconds: float, settings: S
         told = []
         for tolerance, images in JOBS:
             option = advise(Assessment((o,), 0.0, 0.0, 0), Job(tolerance, images)).objects[0].options[0]
-            told.append(f"{option.way} ({_short(option.seconds)})")
+            told.append(f"{option.way} ({short(option.seconds)})")
         lines.append(f"| {' | '.join(scene)} | {' | '.join(told)} |")
     lines += ["", "## Bias", "", "Relative error of radiance over visible points, %.", ""]
     lines += _grid(found, _bias)
@@ -83,8 +83,8 @@ def markdown(found: Scenes, table: pandas.DataFrame, seconds: float, settings: S
         lines += ["| material | knob | setting | way | cost | error, % |", "|---|---|---:|---|---:|---:|"]
         for s in settings:
             words = " | ".join(str(s[key]) for key in ("material", "knob", "value", "way"))
-            error = _short(100 * s["error"]) if s["knob"] in ("nodes", "precision") else "–"  # the others change none
-            lines.append(f"| {words} | {_short(s['cost'])} | {error} |")
+            error = short(100 * s["error"]) if s["knob"] in ("nodes", "precision") else "–"  # the others change none
+            lines.append(f"| {words} | {short(s['cost'])} | {error} |")
     return "\n".join(lines) + "\n"
 
 
@@ -93,16 +93,7 @@ def _job(tolerance: float, images: int) -> str:
 
 
 def _bias(w: WayTrade, o: ObjectTrade) -> str:
-    if w.way == TRACED:
-        return "exact"
-    if w.bias2 < CERTAIN * w.bias2_error:
-        return f"< {_short(100 * w.bias_bound)}"
-    return f"{_short(100 * w.bias)} ± {_short(100 * w.bias_error, 1)}"
-
-
-def _short(value: float, digits: int = 2) -> str:
-    """A number with few digits and without an exponent."""
-    return f"{float(f'{value:.{digits}g}'):.6g}"
+    return w.told_bias
 
 
 def _grid(found: Scenes, cell: Any) -> list[str]:

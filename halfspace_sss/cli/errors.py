@@ -33,6 +33,7 @@ from halfspace_sss.cli.shared import (
     use_mitsuba,
     whole,
 )
+from halfspace_sss.noise_free import NoiseFree
 from halfspace_sss.provenance import check_folder
 
 if TYPE_CHECKING:
@@ -45,7 +46,7 @@ __all__ = ["OBJECT_DEFINITION", "errors_command", "object_table"]
 
 EVENTS, BLOCK, BACKEND, VARIANT = 2e7, 4, "llvm", "llvm_ad_rgb"  # events for each medium
 EXITS = 256  # of an object
-HIDDEN = 0.3  # of the noise: an error below it raised the spread by less than 5 %, which may be chance
+SQUARE = ("error_square", "error_square_standard_error")  # what a printed error is made of
 DEFINITION = (
     "error: sum |E_model - E_traced| / sum E_traced over unseen pairs of directions, E = ∫ S mu_i mu_o dA over "
     "blocks of {0} x {0} cells of 40 x 16 from r = 0.02 mfp on; noise of the reference taken out; orders of each model"
@@ -260,14 +261,14 @@ def _write(
 def _report(table: pandas.DataFrame, tables: Any, n_media: int, block: int) -> None:
     screen = console()
     if n_media <= 3:
-        columns = ["medium", "model", "error", "noise", "bias", *(c for c in table if c.startswith("r "))]
+        columns = ["medium", "model", "error", *SQUARE, "noise", "bias", *(c for c in table if c.startswith("r "))]
         screen.print(_rich(table[columns], "errors, %"))
     else:
         screen.print(_rich(tables.percentiles(table), "errors over the media, %"))
         for name in ("neural",):
             if (table["model"] == name).any():
                 screen.print(_rich(tables.bands(table, name), f"{name} over ranges of media, %"))
-                lost = tables.losses(table, name)[["medium", "error", "noise", "model_best", "error_best"]]
+                lost = tables.losses(table, name)[["medium", "error", *SQUARE, "noise", "model_best", "error_best"]]
                 title = f"media on which an analytic model has a smaller error than {name}: {len(lost)}"
                 screen.print(_rich(lost, title) if len(lost) else title)
     screen.print(DEFINITION.format(block), highlight=False, markup=False)
@@ -278,16 +279,17 @@ def _rich(table: pandas.DataFrame, title: str) -> Any:
     from rich.table import Table
 
     out = Table(title=title, box=SIMPLE_HEAD, pad_edge=False)
-    for name in table.columns:
+    columns = [name for name in table if name not in SQUARE]
+    for name in columns:
         out.add_column(str(name), justify="left" if table[name].dtype.kind == "O" else "right", overflow="fold")
     for row in table.to_dict("records"):
-        out.add_row(*(_error(row) if name == "error" and "noise" in row else _cell(row[name]) for name in table))
+        out.add_row(*(_error(row) if name == "error" and SQUARE[0] in row else _cell(row[name]) for name in columns))
     return out
 
 
 def _error(row: dict[str, Any]) -> str:
-    """Of errors that noise hides, the noise as their bound."""
-    return f"< {_cell(row['noise'])}" if row["error"] < HIDDEN * row["noise"] else _cell(row["error"])
+    """With its standard error, or what it is below."""
+    return NoiseFree(*(row[name] for name in SQUARE)).told()
 
 
 def _cell(value: Any) -> str:

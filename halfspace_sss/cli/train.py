@@ -69,7 +69,9 @@ def train_command(
     steps: Annotated[
         int | None, typer.Option(help="Steps of the optimiser.", parser=whole, show_default="from the recipe")
     ] = None,
-    target_error: Annotated[float | None, typer.Option(help="Stop early at this validation error.")] = None,
+    target_error: Annotated[
+        float | None, typer.Option(help="Stop early once the validation error is below this in 95 % of cases.")
+    ] = None,
     start: Annotated[
         str | None,
         typer.Option(
@@ -244,7 +246,7 @@ def _report(rows: list[tuple[str, Any]]) -> None:
         table.add_column(heading, justify="left" if heading == "material" else "right")
     for name, r in rows:
         ratios = (f"{float(getattr(r.medium, key)):.4g}" for key in ("albedo", "g", "eta"))
-        errors = (f"{100 * r.error.error:.2f}", f"{100 * r.error.noise:.2f}", f"{100 * r.error.bias:+.2f}")
+        errors = (r.error.known.told(), f"{100 * r.error.noise:.2f}", f"{100 * r.error.bias:+.2f}")
         table.add_row(name, *ratios, *errors, f"{r.data_seconds:.0f}", f"{r.fit_seconds:.0f}")
     screen = console()
     screen.print(table)

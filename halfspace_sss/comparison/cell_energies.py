@@ -11,7 +11,7 @@ from halfspace_sss.interface.model import BSSRDF
 from halfspace_sss.maps.noisy_maps import CellGrid, Groups, radial_edges
 from halfspace_sss.physics.backbone import unwarp
 
-__all__ = ["cell_energies"]
+__all__ = ["cell_energies", "evaluated"]
 
 N_U, FIRST_N_PSI, LAST_N_PSI = 2, 6, 48  # Gauss points of a cell
 BRIGHT = 4  # directions of observation, of 16, on which convergence is tried
@@ -66,12 +66,13 @@ def _part(
     area = (r * L / (1 + np.exp(-u)) * u_weight)[:, None, :, None] * psi_weight
     mu_i, mu_o = groups.mu_i[rows][..., None, None], groups.mu_o[rows, columns][..., None, None]
     phi_o = groups.delta_phi[rows, columns][..., None, None] - psi
-    S = _evaluated(model, (r[:, None, :, None], mu_i, math.pi - psi, mu_o, phi_o))
+    S = evaluated(model, (r[:, None, :, None], mu_i, math.pi - psi, mu_o, phi_o))
     E = S * area * mu_i * mu_o
     return E.reshape(*E.shape[:2], grid.n_u, N_U, grid.n_psi, n_psi).sum(axis=(3, 5))
 
 
-def _evaluated(model: BSSRDF, query: tuple[np.ndarray, ...]) -> np.ndarray:
+def evaluated(model: BSSRDF, query: tuple[np.ndarray, ...]) -> np.ndarray:
+    """S of NumPy arrays in single precision, in the library that is fastest for the model; the result in double."""
     query = np.broadcast_arrays(*(np.asarray(v, np.float32) for v in query))
     if model.fast_in == "drjit":
         from drjit.llvm import Float

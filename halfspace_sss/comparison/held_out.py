@@ -69,7 +69,8 @@ def error_table(
                 continue  # the model refuses this medium
             e = model_error(model, reference)
             row = {"medium": label, "albedo": float(m.albedo), "g": float(m.g), "eta": m.eta, "model": name}
-            row |= {"orders": model.orders, "error": e.error, "raw": e.raw, "noise": e.noise, "bias": e.bias}
+            row |= {"orders": model.orders, "error": e.error, "error_square": e.square}
+            row |= {"error_square_standard_error": e.square_error, "raw": e.raw, "noise": e.noise, "bias": e.bias}
             rows.append(row | {"bias_noise": e.bias_noise} | {f"r {d}": v for d, v in e.by_decade.items()})
         if progress:
             progress("models", k + 1, len(found))

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from halfspace_sss.arrays import library
 from halfspace_sss.comparison.cell_energies import cell_energies
 from halfspace_sss.interface.model import BSSRDF
 from halfspace_sss.maps.noisy_maps import LEAST_ALBEDO, CellGrid, Groups, make_pool, radial_edges
+from halfspace_sss.noise_free import NoiseFree
 from halfspace_sss.physics.backbone import unwarp
 from halfspace_sss.physics.fresnel import F_t, mu_internal
 from halfspace_sss.physics.medium import Medium
@@ -29,7 +30,11 @@ SET = 8  # directions of a set, each towards each at two azimuths
 
 
 class ModelError(NamedTuple):
-    """Relative errors: noise removed, as measured, the noise, the signed error of the energy and its own noise."""
+    """Relative errors: noise removed, as measured, the noise, the signed error of the energy and its own noise.
+
+    `square` is that of the error before it is cut off at 0, with the standard error of what other directions of
+    incidence and other walks would have given.
+    """
 
     error: float
     raw: float
@@ -37,6 +42,13 @@ class ModelError(NamedTuple):
     bias: float
     bias_noise: float
     by_decade: dict[str, float]
+    square: float
+    square_error: float
+
+    @property
+    def known(self) -> NoiseFree:
+        """The error with all that is known of it."""
+        return NoiseFree(self.square, self.square_error)
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +144,27 @@ def model_error(model: BSSRDF, reference: Reference, within: tuple[float, float]
             decades[f"{10.0**d:g}-{10.0 ** (d + 1):g}"] = float(
                 _denoised(deviation[rows].sum(), noise[rows].sum()) / share
             )
-    return ModelError(_denoised(raw, blur), raw, blur, float((E.sum() - traced.sum()) / total), bias_noise, decades)
+    bias, parts = float((E.sum() - traced.sum()) / total), (deviation, noise, traced if traced.any() else E)
+    known = _known(*(np.asarray(part.sum(axis=(1, 2, 3)), np.float64) for part in parts))
+    return ModelError(known.value, raw, blur, bias, bias_noise, decades, *known)
+
+
+def _known(deviation: np.ndarray, noise: np.ndarray, energy: np.ndarray) -> NoiseFree:
+    """(sum deviation / sum energy)² - (sum noise / sum energy)² of directions of incidence, and its standard error.
+
+    By the jackknife over the directions; twice the variance, as each pair of them stands in the maps of both.
+    """
+
+    def square(*sums: Any) -> Any:
+        a, b, total = sums
+        return (a * a - b * b) / np.where(total > 0, total, 1.0) ** 2
+
+    sums, n = [v.sum() for v in (deviation, noise, energy)], len(energy)
+    if n < 2:
+        return NoiseFree(float(square(*sums)), math.inf)
+    left_out = square(*(total - v for total, v in zip(sums, (deviation, noise, energy))))
+    spread = 2 * (n - 1) / n * np.sum((left_out - left_out.mean()) ** 2)
+    return NoiseFree(float(square(*sums)), math.sqrt(float(spread)))
 
 
 def _denoised(raw: float, noise: float) -> float:

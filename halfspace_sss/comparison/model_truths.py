@@ -6,8 +6,7 @@ import math
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
-import numpy as np
-
+from halfspace_sss.comparison.exits import exits
 from halfspace_sss.comparison.truths import Truth, read_truths
 from halfspace_sss.interface.model import BSSRDF, bssrdf, models
 from halfspace_sss.physics import single_scattering
@@ -20,7 +19,7 @@ if TYPE_CHECKING:
 __all__ = ["reflectance_truths", "sampled_reflectance", "truth_summary"]
 
 MEASURES = ("R_d", "R_total")
-POINTS, REPEATS = 2**15, 4  # scrambled Sobol points, for models whose S has ridges in azimuth
+POINTS, REPEATS = 2**13, 4  # of each proposal; scrambles
 
 
 def reflectance_truths(names: Iterable[str] | None = None, progress: NamedProgress | None = None) -> pandas.DataFrame:
@@ -68,22 +67,12 @@ def _reflectance(name: str, t: Truth) -> tuple[float, float] | None:
 
 
 def sampled_reflectance(model: BSSRDF, mu_i: float | str, seed: int = 0, points: int = POINTS) -> tuple[float, float]:
-    """R(mu_i) = ∫∫ S mu_o dw_o dA of a scalar medium by quasi Monte Carlo, and its error.
+    """R(mu_i) = ∫∫ S mu_o dw_o dA of a scalar medium by quasi Monte Carlo (`exits`), and its error.
 
-    R = mean of pi S / pdf_position with mu_o dw_o / pi sampled; mu_i is a cosine or "diffuse". The error is that of the
-    mean of independent scrambles.
+    mu_i is a cosine or "diffuse". The error is that of the mean of independent scrambles.
     """
-    from scipy.stats import qmc
-
-    values = []
-    for k in range(REPEATS):
-        u = qmc.Sobol(5, seed=np.random.default_rng([seed, k])).random(points).T
-        mu_o, phi_o = np.sqrt(u[2]), 2 * math.pi * u[3]
-        at = model.sample_position(mu_o, (u[0], u[1]))
-        mu = np.sqrt(u[4]) if mu_i == "diffuse" else np.full(points, float(mu_i))
-        S = model.eval(at.r, mu, 2 * math.pi * u[1], mu_o, phi_o)
-        values.append(float(np.mean(math.pi * S / at.pdf)))
-    return float(np.mean(values)), float(np.std(values, ddof=1) / math.sqrt(REPEATS))
+    values = exits(model, [mu_i] * REPEATS, points, (seed,)).flux.sum(axis=1)
+    return float(values.mean()), float(values.std(ddof=1) / math.sqrt(REPEATS))
 
 
 def truth_summary(table: pandas.DataFrame) -> pandas.DataFrame:

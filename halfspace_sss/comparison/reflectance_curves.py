@@ -29,7 +29,7 @@ from halfspace_sss.tracing.tracer import Trace, trace
 __all__ = ["FIG10_THETA_I", "curves"]
 
 FIG10_THETA_I = (0.0, 30.0, 60.0, 75.0)
-REFLECTANCE_POINTS = 2**14
+REFLECTANCE_POINTS = 2**12
 REFLECTANCE_PATHS = 4_000_000
 
 

@@ -27,7 +27,7 @@ def check_chunks(path: Path) -> None:
 
 
 def drop_cut_off(path: Path, units: set[tuple[int, int]]) -> None:
-    """Remove chunks of units, by (channel, direction), that are shorter than their heads tell: they then are missing."""
+    """Remove chunks of units, by (channel, direction), shorter than their heads tell: they then are missing."""
     for array in sorted(path.glob("*/.zarray")):
         about = json.loads(array.read_text(encoding="utf-8"))
         if (about.get("compressor") or {}).get("id") != "blosc":

@@ -33,6 +33,7 @@ __all__ = [
     "Launch",
     "backbone_mass",
     "draw_directions",
+    "load_maps",
     "looking_back",
     "make_pool",
     "radial_edges",
@@ -243,7 +244,7 @@ def trace_groups(
     ]
 
 
-def _load_maps(place: Path, shape: tuple[int, ...]) -> np.ndarray:
+def load_maps(place: Path, shape: tuple[int, ...]) -> np.ndarray:
     """Maps of a launch as an earlier run left them."""
     try:
         maps = np.load(place, allow_pickle=False)
@@ -278,7 +279,7 @@ def make_pool(
     for k, launch in enumerate(launches):
         place = folder / f"maps-{'-'.join(map(str, seed))}-{k:05d}.npy" if folder else None
         if place and place.exists():
-            maps = _load_maps(place, (len(launch.index), *halves.shape[1:]))
+            maps = load_maps(place, (len(launch.index), *halves.shape[1:]))
         else:
             maps = launch.trace()
             if place:

@@ -8,8 +8,9 @@ import numpy as np
 
 from halfspace_sss.arrays import broadcast_query, library
 from halfspace_sss.interface.query import Query
+from halfspace_sss.neural.balance import N_TERMS, log_balance
 from halfspace_sss.neural.features import medium_features, symmetric_features, travel
-from halfspace_sss.neural.hypernetwork import Hypernetwork
+from halfspace_sss.neural.hypernetwork import Hypernetwork, Layers
 from halfspace_sss.neural.perceptron import Perceptron, cooperative, silu
 from halfspace_sss.neural.universal import load_hypernetwork, shipped_weights
 from halfspace_sss.physics.backbone import backbone_shape, length_scale
@@ -42,8 +43,9 @@ def neural_S(sigma_t: Any, albedo: Any, g: Any, eta: Any, r: Any, mu_i: Any, phi
     c = medium_features(lib, albedo, g, eta, L)
     q = Query(lib, sigma_t * r, mu_i, phi_i, mu_o, phi_o, eta)
     features = symmetric_features(lib, q.r, *travel(q), L)
-    evaluate = _torch_network if hasattr(lib, "torch") else _drjit_network
-    factor = lib.exp(evaluate(hyper, c, features))
+    evaluate, layered = (_torch_network, _torch_terms) if hasattr(lib, "torch") else (_drjit_network, _drjit_terms)
+    terms = layered(hyper, c, q.r)
+    factor = lib.exp(evaluate(hyper, c, features) + log_balance(terms, q.mu_i) + log_balance(terms, q.mu_o))
     G = albedo * albedo * (backbone_shape(q.r, albedo, g, eta) * factor)
     return sigma_t * sigma_t * F_t(mu_i, eta) * F_t(mu_o, eta) * G
 
@@ -52,16 +54,8 @@ def _torch_network(hyper: Hypernetwork, c: list, features: list) -> Any:
     import torch
 
     x = torch.stack(torch.broadcast_tensors(*features), dim=-1)
-
-    def tensor(array: np.ndarray) -> torch.Tensor:
-        return torch.from_numpy(np.asarray(array, np.float64)).to(x)
-
-    h = torch.stack([torch.as_tensor(v).to(x).reshape(()) for v in c])
-    for k, (W, b) in enumerate(hyper.medium_layers):
-        h = h @ tensor(W) + tensor(b)
-        if k < len(hyper.medium_layers) - 1:
-            h = torch.nn.functional.silu(h)
-    numbers, at = tensor(hyper.base) + h @ tensor(hyper.basis), 0
+    numbers = _torch(hyper.base, x) + _torch_layers(hyper.medium_layers, c, x) @ _torch(hyper.basis, x)
+    at = 0
     for k, (i, j) in enumerate(hyper.shapes):
         x = x @ numbers[at : at + i * j].reshape(i, j) + numbers[at + i * j : at + i * j + j]
         at += i * j + j
@@ -70,22 +64,63 @@ def _torch_network(hyper: Hypernetwork, c: list, features: list) -> Any:
     return x[..., 0]
 
 
+def _torch_terms(hyper: Hypernetwork, c: list, like: Any) -> Any:
+    """Coefficients of `log_balance`."""
+    return _torch_layers(hyper.balance_layers, c, like)
+
+
+def _torch_layers(layers: Layers, c: list, like: Any) -> Any:
+    import torch
+
+    h = torch.stack([torch.as_tensor(v).to(like).reshape(()) for v in c])
+    for k, (W, b) in enumerate(layers):
+        h = h @ _torch(W, like) + _torch(b, like)
+        if k < len(layers) - 1:
+            h = torch.nn.functional.silu(h)
+    return h
+
+
+def _torch(array: np.ndarray, like: Any) -> Any:
+    import torch
+
+    return torch.from_numpy(np.asarray(array, np.float64)).to(like)
+
+
+def _drjit_terms(hyper: Hypernetwork, c: list, like: Any) -> list:
+    """Coefficients of `log_balance`."""
+    import drjit as dr
+
+    kind = type(like)
+    h = _drjit_layers(hyper.balance_layers, c, kind).array
+    index = dr.uint32_array_t(kind)
+    return [dr.gather(kind, h, index(k)) for k in range(N_TERMS)]
+
+
+def _drjit_layers(layers: Layers, c: list, kind: type) -> Any:
+    import drjit as dr
+
+    h = dr.tensor_t(kind)(dr.concat([kind(v) for v in c]), (1, len(c)))
+    for k, (W, b) in enumerate(layers):
+        h = h @ _drjit(W, kind) + _drjit(b[None], kind)
+        if k < len(layers) - 1:
+            h = h / (1 + dr.exp(-h))
+    return h
+
+
+def _drjit(array: np.ndarray, kind: type) -> Any:
+    import drjit as dr
+
+    return dr.tensor_t(kind)(np.ascontiguousarray(array, np.float32))
+
+
 def _drjit_network(hyper: Hypernetwork, c: list, features: list) -> Any:
     import drjit as dr
     from drjit import nn
 
     kind = type(sum(features[1:], features[0]))
     tensor = dr.tensor_t(kind)
-
-    def of(array: np.ndarray) -> Any:
-        return tensor(np.ascontiguousarray(array, np.float32))
-
-    h = tensor(dr.concat([kind(v) for v in c]), (1, len(c)))
-    for k, (W, b) in enumerate(hyper.medium_layers):
-        h = h @ of(W) + of(b[None])
-        if k < len(hyper.medium_layers) - 1:
-            h = h / (1 + dr.exp(-h))
-    numbers, at, parts = (of(hyper.base[None]) + h @ of(hyper.basis)).array, 0, []
+    h = _drjit_layers(hyper.medium_layers, c, kind)
+    numbers, at, parts = (_drjit(hyper.base[None], kind) + h @ _drjit(hyper.basis, kind)).array, 0, []
     for i, j in hyper.shapes:
         transposed = (np.arange(i * j).reshape(i, j).T + at).ravel()
         index = dr.uint32_array_t(kind)

@@ -14,7 +14,9 @@ from halfspace_sss.neural.network import Network, layer_shapes
 from halfspace_sss.physics.backbone import length_scale
 from halfspace_sss.physics.medium import Medium
 
-__all__ = ["Hypernetwork", "check_range", "in_range"]
+__all__ = ["Hypernetwork", "Layers", "check_range", "in_range", "named_layers"]
+
+Layers = tuple[tuple[np.ndarray, np.ndarray], ...]  # matrix (inputs, outputs) and bias of each
 
 
 def check_range(medium: Medium) -> None:
@@ -47,24 +49,25 @@ class Hypernetwork:
         base: theta_0, shape (P,).
         basis: Theta, shape (rank, P).
         width, depth: hidden layers of the small network.
+        balance_layers: matrices and biases that map medium features to the coefficients of `balance`; none while they
+            are not fitted yet.
     """
 
-    medium_layers: tuple[tuple[np.ndarray, np.ndarray], ...]
+    medium_layers: Layers
     base: np.ndarray
     basis: np.ndarray
     width: int
     depth: int
+    balance_layers: Layers = ()
 
     def network(self, albedo: float, g: float, eta: float) -> Network:
         """The small network of a medium; takes numbers."""
-        lib = library(0.0)
-        h = np.array(medium_features(lib, albedo, g, eta, length_scale(albedo, g)))
-        for k, (W, b) in enumerate(self.medium_layers):
-            h = h @ W.astype(np.float64) + b
-            if k < len(self.medium_layers) - 1:
-                h = h / (1 + np.exp(-h))
-        vector = self.base + h @ self.basis.astype(np.float64)
-        return Network.from_vector(vector, self.shapes)
+        h = _layered(self.medium_layers, albedo, g, eta)
+        return Network.from_vector(self.base + h @ self.basis.astype(np.float64), self.shapes)
+
+    def balance(self, albedo: float, g: float, eta: float) -> tuple[float, ...]:
+        """The coefficients of log a of a medium, see `balance`; takes numbers."""
+        return tuple(_layered(self.balance_layers, albedo, g, eta).tolist()) if self.balance_layers else ()
 
     @property
     def shapes(self) -> list[tuple[int, int]]:
@@ -72,5 +75,19 @@ class Hypernetwork:
 
     def parameters(self) -> dict[str, Any]:
         """Arrays by name, for the file of weights."""
-        layers = {f"medium_{k}_{n}": v for k, pair in enumerate(self.medium_layers) for n, v in zip("Wb", pair)}
+        layers = {**named_layers("medium", self.medium_layers), **named_layers("balance", self.balance_layers)}
         return {**layers, "base": self.base, "basis": self.basis}
+
+
+def named_layers(name: str, layers: Layers) -> dict[str, np.ndarray]:
+    """Matrices and biases by name, for the file of weights."""
+    return {f"{name}_{k}_{n}": v for k, pair in enumerate(layers) for n, v in zip("Wb", pair)}
+
+
+def _layered(layers: Layers, albedo: float, g: float, eta: float) -> np.ndarray:
+    h = np.array(medium_features(library(0.0), albedo, g, eta, length_scale(albedo, g)))
+    for k, (W, b) in enumerate(layers):
+        h = h @ W.astype(np.float64) + b
+        if k < len(layers) - 1:
+            h = h / (1 + np.exp(-h))
+    return h

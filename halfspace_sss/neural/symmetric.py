@@ -1,12 +1,15 @@
-"""What the two small learnt models share: S = T_12 T_21 B(r) exp(network of symmetric features)."""
+"""What the two small learnt models share: S = T_12 T_21 B(r) exp(network of symmetric features) a(mu_i) a(mu_o)."""
 
 from __future__ import annotations
 
 import dataclasses
+import hashlib
+from collections.abc import Sequence
 from typing import Any
 
 from halfspace_sss.interface.model import BSSRDF
 from halfspace_sss.interface.query import Query
+from halfspace_sss.neural.balance import log_balance
 from halfspace_sss.neural.features import symmetric_features, travel
 from halfspace_sss.neural.network import Network
 from halfspace_sss.physics.backbone import backbone_shape, length_scale
@@ -17,10 +20,16 @@ __all__ = ["LOG_RANGE", "SymmetricModel", "channel_queries", "channels", "factor
 LOG_RANGE = 30.0  # bound of the logarithm of the learnt factor
 
 
-def factored_G(network: Network, q: Query, albedo: Any, g: Any, eta: Any) -> Any:
-    """G = B(r) exp(network(features)) for a query of one channel: positive, reciprocal and mirror-invariant."""
+def factored_G(network: Network, q: Query, albedo: Any, g: Any, eta: Any, balance: Sequence[float] = ()) -> Any:
+    """G = B(r) exp(network(features)) a(mu_i) a(mu_o) of one channel: positive, reciprocal and mirror-invariant.
+
+    `balance` are the coefficients of log a, see `balance`; without them a is 1.
+    """
     lib, L = q.lib, q.constant(length_scale(albedo, g))
     log_factor = network(symmetric_features(lib, q.r, *travel(q), L))
+    if len(balance):
+        c = [q.constant(v) for v in balance]
+        log_factor = log_factor + (log_balance(c, q.mu_i) + log_balance(c, q.mu_o))
     factor = lib.exp(lib.minimum(lib.maximum(log_factor, -LOG_RANGE), LOG_RANGE))
     return q.constant(albedo * albedo) * (backbone_shape(q.r, albedo, g, eta) * factor)
 
@@ -28,23 +37,27 @@ def factored_G(network: Network, q: Query, albedo: Any, g: Any, eta: Any) -> Any
 class SymmetricModel(BSSRDF):
     """A learnt BSSRDF of order >= 2 that is positive, reciprocal and mirror-invariant by construction.
 
-    A model gives `networks`, the small network of each channel of its medium.
+    A model gives `networks`, the small network of each channel of its medium, and may give their `balances`.
     """
 
     orders = "multiple"
     reciprocal = True
     networks: list[Network]
+    balances: Sequence[Sequence[float]] = ()
 
     @property
     def checksums(self) -> tuple[str, ...]:
-        return tuple(network.checksum for network in self.networks)
+        if not self.balances:
+            return tuple(network.checksum for network in self.networks)
+        pairs = zip(self.networks, self.balances)
+        return tuple(hashlib.sha256(f"{n.checksum} {tuple(c)}".encode()).hexdigest() for n, c in pairs)
 
     def G(self, q: Query) -> Any:
-        m = self.medium
+        m, balances = self.medium, self.balances or [()] * len(self.networks)
         if m.n_channels is None:
-            return factored_G(self.networks[0], q, m.albedo, m.g, m.eta)
-        parts = zip(self.networks, channels(m), channel_queries(q, m))
-        return q.lib.stack([factored_G(network, one, c.albedo, c.g, c.eta) for network, c, one in parts])
+            return factored_G(self.networks[0], q, m.albedo, m.g, m.eta, balances[0])
+        parts = zip(self.networks, balances, channels(m), channel_queries(q, m))
+        return q.lib.stack([factored_G(n, one, c.albedo, c.g, c.eta, balance) for n, balance, c, one in parts])
 
 
 def channel_queries(q: Query, medium: Medium) -> list[Query]:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
 
 import numpy as np
 
+from halfspace_sss.neural.balance import N_TERMS
 from halfspace_sss.neural.features import N_FEATURES, N_MEDIUM
 from halfspace_sss.neural.hypernetwork import Hypernetwork, check_range
 from halfspace_sss.neural.network import layer_shapes
@@ -15,7 +17,7 @@ from halfspace_sss.neural.symmetric import SymmetricModel, channels
 from halfspace_sss.once import once
 from halfspace_sss.physics.medium import Medium
 
-__all__ = ["Neural", "load_hypernetwork", "shipped_weights"]
+__all__ = ["Neural", "hypernetwork_of", "load_hypernetwork", "shipped_weights"]
 
 KIND = "neural"
 
@@ -31,25 +33,48 @@ def load_hypernetwork(path: Path) -> Hypernetwork:
     arrays, record = load_weights(path, KIND)
     width, depth = record_count(path, record, "width"), record_count(path, record, "depth", 64)
     size = sum(i * o + o for i, o in layer_shapes(N_FEATURES, width, depth))
-    sizes = [N_MEDIUM]
-    while f"medium_{len(sizes) - 1}_b" in arrays:
-        sizes.append(arrays[f"medium_{len(sizes) - 1}_b"].size)
-    layers = range(len(sizes) - 1)
-    wanted = {"base": (size,), "basis": (sizes[-1], size), **{f"medium_{k}_b": (sizes[k + 1],) for k in layers}}
-    wanted |= {f"medium_{k}_W": (sizes[k], sizes[k + 1]) for k in layers}
+    medium, balance = _sizes(arrays, "medium"), _sizes(arrays, "balance")
+    wanted = {"base": (size,), "basis": (medium[-1], size)}
+    wanted |= _layer_shapes("medium", medium) | _layer_shapes("balance", [*balance[:-1], N_TERMS])
     found = {name: array.shape for name, array in arrays.items()}
-    if found != wanted or not layers:
+    if found != wanted:
         raise ValueError(f"{path}: shapes must be {wanted}, got {found}")
-    pairs = tuple((arrays[f"medium_{k}_W"], arrays[f"medium_{k}_b"]) for k in layers)
-    return Hypernetwork(pairs, arrays["base"], arrays["basis"], width, depth)
+    return hypernetwork_of(arrays, width, depth)
+
+
+def hypernetwork_of(arrays: Mapping[str, np.ndarray], width: int, depth: int) -> Hypernetwork:
+    """The network of arrays by name, as they stand in a file of weights."""
+    medium, balance = (
+        tuple((arrays[f"{name}_{k}_W"], arrays[f"{name}_{k}_b"]) for k in range(_count(arrays, name)))
+        for name in ("medium", "balance")
+    )
+    return Hypernetwork(medium, arrays["base"], arrays["basis"], width, depth, balance)
+
+
+def _count(arrays: Mapping[str, np.ndarray], name: str) -> int:
+    return sum(key.startswith(f"{name}_") and key.endswith("_b") for key in arrays)
+
+
+def _sizes(arrays: Mapping[str, np.ndarray], name: str) -> list[int]:
+    """Inputs of the layers of a name, and outputs of the last; of one layer if there is none."""
+    sizes = [N_MEDIUM]
+    while f"{name}_{len(sizes) - 1}_b" in arrays:
+        sizes.append(arrays[f"{name}_{len(sizes) - 1}_b"].size)
+    return sizes if len(sizes) > 1 else [N_MEDIUM, 1]
+
+
+def _layer_shapes(name: str, sizes: list[int]) -> dict[str, tuple[int, ...]]:
+    pairs = list(enumerate(zip(sizes, sizes[1:])))
+    return {f"{name}_{k}_W": pair for k, pair in pairs} | {f"{name}_{k}_b": (pair[1],) for k, pair in pairs}
 
 
 class Neural(SymmetricModel):
-    """One network for all media: S = T_12 T_21 B(r) exp(MLP(features; theta(albedo, g, eta))), order >= 2.
+    """One network for all media: S = T_12 T_21 B(r) exp(MLP(features; theta)) a(mu_i) a(mu_o), order >= 2.
 
-    A second network maps the medium to the numbers theta of a small one, once; evaluation costs that of the small
-    one. Positive, reciprocal and mirror-invariant by construction. Trained on path tracing over albedo [0, 1],
-    g [-0.5, 0.98], eta [1, 2]; other media are refused. Single scattering is left out.
+    A second network maps albedo, g and eta to the numbers theta of the small one, a third to those of a, which holds S
+    to the exact reflectance (`balance`): both once, so that evaluation costs that of the small one. Positive,
+    reciprocal and mirror-invariant by construction. Trained on path tracing over albedo [0, 1], g [-0.5, 0.98],
+    eta [1, 2]; other media are refused. Single scattering is left out.
     """
 
     name = "neural"
@@ -59,4 +84,6 @@ class Neural(SymmetricModel):
         super().__init__(medium)
         check_range(medium)
         hyper = load_hypernetwork(weights or shipped_weights())
-        self.networks = [hyper.network(float(m.albedo), float(np.float64(m.g)), m.eta) for m in channels(medium)]
+        ratios = [(float(m.albedo), float(np.float64(m.g)), m.eta) for m in channels(medium)]
+        self.networks = [hyper.network(*one) for one in ratios]
+        self.balances = [hyper.balance(*one) for one in ratios]

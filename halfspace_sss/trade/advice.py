@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from halfspace_sss.checks import check_count, check_interval
+from halfspace_sss.noise_free import short
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED
 from halfspace_sss.trade.assessing import assess
@@ -225,7 +226,7 @@ def _told(found: ObjectTrade, option: _Raw, best: _Raw, job: Job) -> Option:
     elif took < math.inf:
         over = job.seconds is not None and took > job.seconds
         why = f"{row.way} takes {_time(took)}"
-        why += f", allowed {_time(job.seconds)}" if over else f", {_short(took / best[0])} times as long" + f" ({off})"
+        why += f", allowed {_time(job.seconds)}" if over else f", {short(took / best[0])} times as long" + f" ({off})"
         why += _training(row, job)
     elif row.bias2 - 2 * row.bias2_error < job.tolerance**2:
         why = f"{row.way} is {off}: whether it keeps {job.tolerance:.3g} cannot be told from so few samples"
@@ -253,11 +254,7 @@ def _training(row: WayTrade, job: Job) -> str:
 
 def _off(row: WayTrade) -> str:
     """What is known of a bias, in words."""
-    if row.way == PATH_TRACED:
-        return "exact"
-    if row.bias2 < 2 * row.bias2_error:
-        return f"less than {_short(100 * row.bias_bound)} % off"
-    return f"{_short(100 * row.bias)} ± {_short(100 * row.bias_error, 1)} % off"
+    return "exact" if row.way == PATH_TRACED else f"{row.told_bias} % off"
 
 
 def _time(seconds: float) -> str:
@@ -266,9 +263,4 @@ def _time(seconds: float) -> str:
     for unit, length in (("h", 3600.0), ("min", 60.0)):
         if seconds >= 1.6 * length:
             return f"{seconds / length:.3g} {unit}"
-    return f"{_short(seconds)} s"
-
-
-def _short(value: float, digits: int = 2) -> str:
-    """A number with few digits and without an exponent."""
-    return f"{float(f'{value:.{digits}g}'):.6g}"
+    return f"{short(seconds)} s"

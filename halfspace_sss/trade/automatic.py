@@ -127,10 +127,10 @@ def picked(found: ObjectTrade, tolerance: float) -> tuple[str, str]:
     keeping = [row for row in rows if row.bias_bound <= tolerance]
     if keeping:
         best = min(keeping, key=_cost)
-        why = f"{100 * best.bias:.2g} ± {100 * best.bias_error:.1g} % off, asked {100 * tolerance:.3g} %"
+        why = f"{best.told_bias} % off, asked {100 * tolerance:.3g} %"
     else:
         best = min(rows, key=lambda row: (row.bias_bound, _cost(row)))
-        why = f"the least wrong, {100 * best.bias:.2g} ± {100 * best.bias_error:.1g} % off"
+        why = f"the least wrong, {best.told_bias} % off"
         why += f"; no model is known to keep {100 * tolerance:.3g} %"
     walks = not keeping or _cost(found.traced) < _cost(best)
     if walks:

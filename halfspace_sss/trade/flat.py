@@ -10,6 +10,7 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from halfspace_sss.comparison.model_errors import Reference, model_error
 from halfspace_sss.interface.model import BSSRDF, bssrdf
 from halfspace_sss.interface.model import models as registered
 from halfspace_sss.neural.symmetric import channels
+from halfspace_sss.noise_free import NoiseFree
 from halfspace_sss.physics.medium import Medium, medium_of
 from halfspace_sss.trade.html import html_table
 
@@ -32,11 +34,12 @@ PATH_TRACED = "path_traced"
 
 @dataclass(frozen=True)
 class FlatOption:
-    """A model for a medium: largest error of its channels, its noise, seconds for a million values, one sentence."""
+    """A model for a medium: largest error of its channels, what that is below in 95 % of cases, seconds for a million
+    values, one sentence."""
 
     model: str
     error: float
-    noise: float
+    bound: float
     seconds_per_million: float
     why: str
 
@@ -104,8 +107,8 @@ def recommend_flat(
     for m, one, bounds in zip(parts, found, within):
         _check_light(m, one, bounds)
     rows = [_row(name, parts, found, within) for name in chosen or registered()]
-    noise = max((row[2] for row in rows if row[2] < math.inf), default=math.inf)
-    rows.append((PATH_TRACED, 0.0, tolerance, tracing * (noise / tolerance) ** 2, ""))
+    noise = max((row.noise for row in rows if row.noise < math.inf), default=math.inf)
+    rows.append(_Row(PATH_TRACED, NoiseFree(0.0, 0.0), tolerance, tracing * (noise / tolerance) ** 2))
     return _advice(rows, tolerance, r or REACH, "mm" if r else "mean free paths")
 
 
@@ -131,7 +134,14 @@ def _check_light(m: Medium, found: Reference, within: tuple[float, float]) -> No
         )
 
 
-_Row = tuple[str, float, float, float, str]  # model, error, noise, seconds, refusal
+class _Row(NamedTuple):
+    """Largest error of the channels of a model, noise of the walks, seconds of a value, why it refuses."""
+
+    name: str
+    error: NoiseFree
+    noise: float
+    seconds: float
+    refusal: str = ""
 
 
 def _row(name: str, media: list[Medium], found: list[Reference], within: list[tuple[float, float]]) -> _Row:
@@ -140,12 +150,12 @@ def _row(name: str, media: list[Medium], found: list[Reference], within: list[tu
         try:
             model = bssrdf(name, m.in_mfp())
         except ValueError as error:
-            return name, math.inf, math.inf, math.inf, str(error)
+            return _Row(name, NoiseFree(math.inf, 0.0), math.inf, math.inf, str(error))
         e = model_error(model, one, bounds)
-        errors.append(e.error)
+        errors.append(e.known)
         noises.append(e.noise)
         seconds += _seconds(model)
-    return name, max(errors), max(noises), seconds / len(media), ""
+    return _Row(name, max(errors, key=lambda e: e.bound), max(noises), seconds / len(media))
 
 
 def _seconds(model: BSSRDF) -> float:
@@ -161,12 +171,12 @@ def _seconds(model: BSSRDF) -> float:
 
 
 def _advice(rows: list[_Row], tolerance: float, r: tuple[float, float], unit: str) -> FlatAdvice:
-    keeping = [row for row in rows if row[1] + row[2] <= tolerance and row[0] != PATH_TRACED]
-    best = min(keeping, key=lambda row: row[3]) if keeping else rows[-1]
+    keeping = [row for row in rows if row.error.bound <= tolerance and row.name != PATH_TRACED]
+    best = min(keeping, key=lambda row: row.seconds) if keeping else rows[-1]
     options = []
-    for row in sorted(rows, key=lambda row: (row is not best, row[1])):
-        name, error, noise, seconds, refusal = row
-        off = f"{100 * error:.3g} % off (noise of the walks {100 * noise:.2g} %)"
+    for row in sorted(rows, key=lambda row: (row is not best, row.error.value)):
+        name, error, _, seconds, refusal = row
+        off = f"{error.told()} % off"
         cost = f"{1e6 * seconds:.3g} s for a million values"
         if name == PATH_TRACED:
             why = f"{name} takes {seconds:.3g} s until its noise is {100 * tolerance:.3g} %"
@@ -176,10 +186,10 @@ def _advice(rows: list[_Row], tolerance: float, r: tuple[float, float], unit: st
             why = f"{name} is the cheapest that keeps {100 * tolerance:.3g} %, r {r[0]:.3g} to {r[1]:.3g} {unit}: "
             why += f"{off}, {cost}"
         elif row in keeping:
-            why = f"{name} is {seconds / best[3]:.2g} times dearer: {off}, {cost}"
-        elif error - noise > tolerance:
+            why = f"{name} is {seconds / best.seconds:.2g} times dearer: {off}, {cost}"
+        elif error.square - 2 * error.square_error > tolerance**2:
             why = f"{name} is {off}, asked {100 * tolerance:.3g} %"
         else:
             why = f"{name} is {off}: whether it keeps {100 * tolerance:.3g} % takes more events to tell"
-        options.append(FlatOption(name, error, noise, 1e6 * seconds, why))
-    return FlatAdvice(best[0], tolerance, r, tuple(options))
+        options.append(FlatOption(name, error.value, error.bound, 1e6 * seconds, why))
+    return FlatAdvice(best.name, tolerance, r, tuple(options))

@@ -15,6 +15,7 @@ from safetensors.numpy import save
 
 from halfspace_sss import Medium
 from halfspace_sss.neural import paper_model
+from halfspace_sss.neural.balance import N_TERMS
 from halfspace_sss.neural.features import N_FEATURES, N_MEDIUM
 from halfspace_sss.neural.material_model import load_network
 from halfspace_sss.neural.network import layer_shapes
@@ -41,6 +42,7 @@ def _universal() -> dict[str, np.ndarray]:
     size = sum(i * j + j for i, j in layer_shapes(N_FEATURES, WIDTH, DEPTH))
     medium = {"medium_0_W": _numbers(N_MEDIUM, 3), "medium_0_b": _numbers(3)}
     medium |= {"medium_1_W": _numbers(3, 2), "medium_1_b": _numbers(2)}
+    medium |= {"balance_0_W": _numbers(N_MEDIUM, N_TERMS), "balance_0_b": _numbers(N_TERMS)}
     return {**medium, "base": _numbers(size), "basis": _numbers(2, size)}
 
 
@@ -276,7 +278,8 @@ def test_an_entry_that_the_universal_network_needs_is_refused(universal: Path, k
 
 @pytest.mark.parametrize(
     "change", [{"width": 5}, {"base": None}, {"basis": None}, {"basis": (3, 9)}, {"medium_0_b": None},
-               {"medium_1_W": (4, 2)}, {"medium_0_W": (N_MEDIUM + 1, 3)}, {"medium_2_b": (2,)}, {"c": (2,)}], ids=str,
+               {"medium_1_W": (4, 2)}, {"medium_0_W": (N_MEDIUM + 1, 3)}, {"medium_2_b": (2,)}, {"c": (2,)},
+               {"balance_0_W": None}, {"balance_0_W": None, "balance_0_b": None}, {"balance_0_b": (3,)}], ids=str,
 )  # fmt: skip
 def test_arrays_that_do_not_fit_the_universal_network_are_refused(universal: Path, change: dict) -> None:
     _replaced(universal, _universal(), change)

@@ -10,6 +10,7 @@ import pytest
 from halfspace_sss.trade import recommend
 from halfspace_sss.trade.advice import Job, advise
 from halfspace_sss.trade.automatic import picked
+from halfspace_sss.trade.commands import trade
 from halfspace_sss.trade.measuring.results import Assessment, ObjectTrade, WayTrade, samples_for
 from halfspace_sss.trade.measuring.statistics import FIREFLIES, Estimate, mean_square, relative_variance
 from halfspace_sss.trade.refining import contenders
@@ -104,6 +105,15 @@ def test_a_square_that_noise_put_far_below_zero_keeps_no_tolerance_below_its_sta
     lucky = WayTrade("standard_dipole", -1.0, 0.1, (1.0,), (0.0,), 1.0, 0.0, 1e-9, 100)
     assert lucky.bias == 0.0 and lucky.bias_bound == pytest.approx(math.sqrt(1.645 * 0.1))
     assert recommend(_assessment(lucky), tolerance=0.3).objects[0].way == "path_traced"
+
+
+def test_a_bias_that_noise_hides_is_told_as_a_bound_and_never_as_0() -> None:
+    lucky = WayTrade("standard_dipole", -1e-3, 1e-4, (1.0,), (0.0,), 1.0, 0.0, 1e-9, 100)
+    (walks, row), found = _assessment(lucky).objects[0].ways, _assessment(lucky)
+    assert lucky.told_bias == "< 1.3" and trade._row(row)[1] == "< 1.3" and trade._row(walks)[1] == "exact"
+    why = {option.way: option.why for option in recommend(found, tolerance=0.011).objects[0].options}
+    assert "< 1.3 % off" in why["standard_dipole"]
+    assert picked(found.objects[0], 0.05)[1] == ("object 'ball': standard_dipole, < 1.3 % off, asked 5 %")
 
 
 def test_every_way_gets_one_sentence() -> None:

@@ -56,7 +56,7 @@ def fit(
         seed: of the batches.
         checkpoint: file to go on from if it is there, and to write as time goes by.
         validate: error of the learner as it is; called every `schedule.validate_every` steps and at the end.
-        target_error: stop once the validation error has come down to it.
+        target_error: stop once what `validate` gives has come down to it.
         progress: called with ("training", steps done, steps in all), for a schedule of steps.
         threads: of torch, None for as many as it has; batches of small networks lose by being shared, and with one
             thread sums keep their order.

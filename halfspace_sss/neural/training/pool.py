@@ -14,7 +14,7 @@ from halfspace_sss.maps.noisy_maps import CellGrid, Groups, backbone_mass, radia
 from halfspace_sss.neural.features import medium_features, symmetric_features
 from halfspace_sss.physics.backbone import length_scale, unwarp
 
-__all__ = ["Batch", "MapPool"]
+__all__ = ["Batch", "MapPool", "torch_library"]
 
 ENERGY_SHARE = 0.5  # of the queries of a batch follow the energy over u, the others are uniform in u
 TINY = 1e-30
@@ -40,7 +40,7 @@ class Batch:
     def features(self) -> torch.Tensor:
         """Symmetric features (B, 2 S, N_FEATURES)."""
         incoming, outgoing = _ray(self.mu_i, -self.psi), _ray(self.mu_o, self.delta_phi - self.psi)
-        lib = _torch_library()
+        lib = torch_library()
         return torch.stack(torch.broadcast_tensors(*symmetric_features(lib, self.r, incoming, outgoing, self.L)), -1)
 
 
@@ -49,7 +49,8 @@ def _ray(mu: torch.Tensor, azimuth: torch.Tensor) -> tuple[torch.Tensor, ...]:
     return sine * torch.cos(azimuth), sine * torch.sin(azimuth), mu
 
 
-def _torch_library() -> Any:
+def torch_library() -> Any:
+    """The array library of torch."""
     from halfspace_sss.arrays import library
 
     return library(torch.empty(0))
@@ -84,7 +85,7 @@ class MapPool:
         albedo, g, eta = (_float(v) for v in (groups.albedo, groups.g, groups.eta))
         L = length_scale(albedo, g)
         self.L = L[:, None]
-        self.medium = torch.stack(medium_features(_torch_library(), albedo, g, eta, L), -1)
+        self.medium = torch.stack(medium_features(torch_library(), albedo, g, eta, L), -1)
 
     def batches(self, n_groups: int, n_queries: int) -> Callable[[torch.Generator], Batch]:
         """The source of a fit: `batch` of one size."""
@@ -114,7 +115,7 @@ class MapPool:
         psi = (2 * math.pi / n_psi) * (torch.cat((p, p), dim=1) + uniform(2)) - math.pi
         twice = torch.cat((k, k), dim=1)
         L = self.L[j]
-        r = L * unwarp(_torch_library(), u)
+        r = L * unwarp(torch_library(), u)
         return Batch(
             y, self.hit[row, i], u, r, psi, self.mu_i[j], self.mu_o[row, twice], self.delta_phi[row, twice], L, j,
             self.medium[j],

@@ -40,7 +40,7 @@ def train(
         seed: results repeat for the same seed, backend, version and number of threads.
         folder: for the weights; by default HALFSPACE_SSS_WEIGHTS or the user's data folder.
         work: folder for unfinished work; a killed run that is started again with it ends with the same weights.
-        target_error: stop early at this validation error.
+        target_error: stop early once the validation error is below this in 95 % of cases.
         backend: of the maps, "llvm" or "cuda".
         progress: called with (what, done, total).
 

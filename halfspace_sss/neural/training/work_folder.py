@@ -13,6 +13,7 @@ from halfspace_sss.provenance import read_text, write_atomically
 __all__ = ["CHECKPOINT", "RUN", "claim"]
 
 RUN, CHECKPOINT = "run.json", "checkpoint.safetensors"
+WORK = ("maps-*.npy", "reflectances-*.npy", CHECKPOINT)
 
 
 def claim(folder: Path, **run: Any) -> None:
@@ -28,7 +29,7 @@ def claim(folder: Path, **run: Any) -> None:
     run = {"version": halfspace_sss.__version__, **run}
     place = folder / RUN
     if not place.exists():
-        left = sorted(path.name for pattern in ("maps-*.npy", CHECKPOINT) for path in folder.glob(pattern))
+        left = sorted(path.name for pattern in WORK for path in folder.glob(pattern))
         if left:
             raise ValueError(f"{folder}: work must be that of a known run, got {left[0]} without {RUN}; remove it")
         write_atomically(place, to_json(run))

@@ -24,6 +24,7 @@ from halfspace_sss.cli.shared import (
     use_mitsuba,
     whole,
 )
+from halfspace_sss.noise_free import NoiseFree
 from halfspace_sss.provenance import check_folder
 
 if TYPE_CHECKING:
@@ -92,7 +93,7 @@ def _shipped() -> None:
 
 
 def _shipped_row(row: Any) -> list[str]:
-    bias = f"{100 * row.bias:.3g} ± {100 * row.bias_standard_error:.1g}" if row.way != "path_traced" else "exact"
+    bias = "exact" if row.way == "path_traced" else NoiseFree(row.bias2, row.bias2_standard_error).told()
     cost = (f"{row.variance:.3g}", f"{row.seconds_per_million:.3g}", f"{row.cost:.3g}")
     return [row.material, row.shape, row.light, row.way, bias, *cost, f"{row.flip:.3f}"]
 
@@ -158,11 +159,10 @@ def object_table(found: ObjectTrade) -> Any:
 
 
 def _row(row: WayTrade) -> list[str]:
-    bias = "exact" if row.way == "path_traced" else f"{100 * row.bias:.3g} ± {100 * row.bias_error:.1g}"
     cost = (f"{row.variance:.3g}", f"{1e6 * row.seconds:.3g}", f"{1e6 * row.seconds * row.variance:.3g}")
     means = " ".join(f"{value:.3f}" for value in row.ratio)
     flip = "–" if row.flip is None else f"{row.flip:.3f}"
-    return [row.way, bias, *cost, means, f"{row.preparation:.2g}", f"{row.memory / 1e6:.3g}", flip]
+    return [row.way, row.told_bias, *cost, means, f"{row.preparation:.2g}", f"{row.memory / 1e6:.3g}", flip]
 
 
 def _rich(headings: Any, rows: list[list[str]], title: str | None = None) -> Any:

@@ -6,14 +6,13 @@ import math
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
+from halfspace_sss.noise_free import Z_UPPER, NoiseFree
 from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED
 
 if TYPE_CHECKING:
     import pandas
 
 __all__ = ["Z_UPPER", "Assessment", "ObjectTrade", "WayTrade", "samples_for"]
-
-Z_UPPER = 1.645  # a bound that holds in 95 % of cases
 
 
 @dataclass(frozen=True)
@@ -56,20 +55,29 @@ class WayTrade:
     refusal: str = ""
 
     @property
+    def off(self) -> NoiseFree:
+        """The bias with all that is known of it."""
+        return NoiseFree(self.bias2, self.bias2_error)
+
+    @property
+    def told_bias(self) -> str:
+        """The bias in percent, with its standard error or as a bound; walks have none."""
+        return "exact" if self.way == PATH_TRACED else self.off.told()
+
+    @property
     def bias(self) -> float:
         """Relative error of radiance that no number of samples removes."""
-        return math.sqrt(max(self.bias2, 0.0)) if not math.isnan(self.bias2) else math.nan
+        return self.off.value
 
     @property
     def bias_error(self) -> float:
         """Standard error of the bias; where that is lost in noise, of its bound."""
-        scale = max(self.bias, math.sqrt(self.bias2_error), 1e-12) if self.bias2_error > 0 else 1.0
-        return self.bias2_error / (2 * scale)
+        return self.off.standard_error
 
     @property
     def bias_bound(self) -> float:
         """What the bias is below in 95 % of cases; a square that came out below 0 counts as 0."""
-        return math.sqrt(max(self.bias2, 0.0) + Z_UPPER * self.bias2_error)
+        return self.off.bound
 
     def time_to(self, noise: float) -> float:
         """Seconds for each pixel of the object until its noise is so much of the mean radiance."""
