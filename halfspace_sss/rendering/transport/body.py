@@ -10,8 +10,7 @@ from typing import Any
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.surface.inside import Inside
 from halfspace_sss.rendering.surface.object import Object, same_objects, survey
-from halfspace_sss.rendering.surface.placement import translucent_shapes
-from halfspace_sss.rendering.surface.sensors import check_sensors
+from halfspace_sss.rendering.surface.placement import check_sensors, translucent_shapes
 from halfspace_sss.rendering.surface.sharing import check_together, number_of
 from halfspace_sss.rendering.surface.transports import AUTO, choose_models, knows_objects, object_transport
 from halfspace_sss.rendering.surface.varying import equivalent, warn_of_means
