@@ -15,6 +15,7 @@ from test_rendering_normals import ellipsoid
 mi = pytest.importorskip("mitsuba")
 
 from halfspace_sss.rendering.surface.object import survey  # noqa: E402
+from halfspace_sss.rendering.surface.placement import contents  # noqa: E402
 
 INTEGRATORS = ("bssrdf", "translucent_walk")
 
@@ -138,3 +139,66 @@ def test_a_surface_of_one_side_is_refused(tmp_path: Path) -> None:
     strip = np.array([[0, 1, 2], [2, 1, 3], [2, 3, 4], [4, 3, 5], [4, 5, 1], [1, 5, 0]])  # of Möbius
     with pytest.raises(ValueError, match="must have two sides, got a one-sided strip"):
         survey(mi.load_dict(mesh(tmp_path, strip)))
+
+
+def _stone(**more: Any) -> dict:
+    return {"type": "sphere", "radius": 2.0, "bsdf": {"type": "diffuse"}, **more}
+
+
+def _glow() -> dict:
+    return {"type": "area", "radiance": 5.0}
+
+
+INSIDE: dict[str, Callable[[], tuple[dict, str]]] = {
+    "stone": lambda: ({"stone": _stone()}, "'stone' inside 'wax'"),
+    "bubble": lambda: ({"air": _stone(bsdf={"type": "dielectric"})}, "'air' inside 'wax'"),
+    "translucent": lambda: ({"seed": _stone(bsdf=surface(orders="total"))}, "'seed' inside 'wax'"),
+    "led": lambda: ({"led": _stone(radius=0.1, emitter=_glow())}, "'led' inside 'wax'"),
+    "point": lambda: ({"lamp": {"type": "point"}}, "'lamp' inside 'wax'"),
+    "spot": lambda: ({"lamp": {"type": "spot"}}, "'lamp' inside 'wax'"),
+    "wick": lambda: ({"wick": {"type": "cylinder", "p1": [0, 6, 0], "radius": 0.3}}, "'wick' partly inside 'wax'"),
+    "wall": lambda: ({"wall": {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(400)}}, "'wall' partly"),
+}
+
+
+@pytest.mark.parametrize("kind", INSIDE)
+def test_models_refuse_by_name_what_lies_inside_an_object(kind: str) -> None:
+    objects, named = INSIDE[kind]()
+    refused(f"must be empty for models of their light, got {named}", view("bssrdf", wax=ball(), **objects))
+
+
+@pytest.mark.parametrize("model", ["full_geometry", "neural_shape", "lambert", "auto"])
+def test_models_of_whole_objects_refuse_it_too(model: str) -> None:
+    pytest.importorskip("torch")
+    wax = ball(bsdf=surface(model, orders="total"))
+    refused("must be empty for .*, got 'stone' inside 'wax'", view("bssrdf", wax=wax, stone=_stone()))
+
+
+def test_objects_with_something_inside_are_not_learnt() -> None:
+    subject = pytest.importorskip("full_geometry.subject").Subject
+    scene = mi.load_dict(view("bssrdf", wax=ball(), stone=_stone()))
+    with pytest.raises(ValueError, match="must be empty for learning, got 'stone' inside 'wax'"):
+        subject.given(scene, None)
+
+
+def test_what_stands_at_the_surface_of_an_object_is_not_inside() -> None:
+    floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, -3.999]).scale(400)}
+    lamp = {"type": "point", "position": [0, 0, 4.1]}
+    scene = mi.load_dict(view("bssrdf", wax=ball(), floor=floor, lamp=lamp, near=_stone(center=[0, 6, 0])))
+    assert contents(scene, [survey(shape) for shape in scene.shapes() if shape.id() == "wax"]) == []
+
+
+def test_what_is_moved_into_an_object_is_refused_at_the_next_render() -> None:
+    lamp = {"type": "point", "position": [0, 9, 0]}
+    scene = mi.load_dict(view("bssrdf", wax=ball(), stone=_stone(center=[0, 8, 0]), lamp=lamp))
+    scene.integrator().render(scene, spp=1)
+    parameters = mi.traverse(scene)
+    parameters["lamp.position"] = [0, 0, 0]
+    parameters.update()
+    with pytest.raises(ValueError, match="got 'lamp' inside 'wax'"):
+        scene.integrator().render(scene, spp=1)
+    parameters["lamp.position"] = [0, 9, 0]
+    parameters["stone.to_world"] = mi.Transform4f().scale(1.0)
+    parameters.update()
+    with pytest.raises(ValueError, match="got 'stone' inside 'wax'"):
+        scene.integrator().render(scene, spp=1)

@@ -11,7 +11,7 @@ import numpy as np
 from halfspace_sss.rendering.surface.mesh import Faces, check_copies, face_normals_agree, faces_of
 from halfspace_sss.rendering.surface.sharing import name_of, rays_into, scene_of
 
-__all__ = ["RAYS", "Object", "is_inside", "same_objects", "survey", "turned"]
+__all__ = ["RAYS", "Object", "geometry_of", "is_inside", "same_objects", "survey", "turned"]
 
 RAYS = 4096  # of the survey
 MOST_HITS = 64  # that one ray counts
@@ -32,7 +32,7 @@ class Object:
         pieces: UInt32 array of the connected piece of each face, or None if there is one piece.
         size: diagonal of the bounding box, scene units.
         area: scene units squared.
-        geometry: what it was surveyed with, from `_geometry`.
+        geometry: what it was surveyed with, from `geometry_of`.
     """
 
     shape: Any
@@ -53,7 +53,7 @@ class Object:
 
     def is_current(self) -> bool:
         """Whether the shape still is as it was surveyed."""
-        return _geometry(self.shape)[0] == self.geometry[0]
+        return geometry_of(self.shape)[0] == self.geometry[0]
 
     def piece(self, prim_index: Any, active: Any) -> Any:
         """The number of the piece that a face belongs to."""
@@ -154,10 +154,10 @@ def survey(shape: Any, world: Any = None) -> Object:
     closed, sign = odd == 0 and not sheet, -1.0 if share <= 1 - MAJORITY else 1.0
     signs = votes.signs() if closed else None
     return Object(shape, scene, sign, signs, float(votes.opposed[0]) == 0, closed, votes.pieces, size,
-                  area, _geometry(shape))  # fmt: skip
+                  area, geometry_of(shape))  # fmt: skip
 
 
-def _geometry(shape: Any) -> tuple[list, list]:
+def geometry_of(shape: Any) -> tuple[list, list]:
     """What tells one geometry of a shape from the next; the arrays with it are kept so that no number is reused."""
     import drjit as dr
     import mitsuba as mi
