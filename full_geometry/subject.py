@@ -15,6 +15,7 @@ from halfspace_sss.rendering.surface.boundary import smooth_boundary
 from halfspace_sss.rendering.surface.horizon import cosine_above, lifted
 from halfspace_sss.rendering.surface.inside import Inside
 from halfspace_sss.rendering.surface.object import Object, survey, turned
+from halfspace_sss.rendering.surface.placement import check_empty
 from halfspace_sss.rendering.surface.sharing import name_of
 from halfspace_sss.rendering.surface.varying import VaryingMedium, equivalent, grid_values
 from halfspace_sss.rendering.transport.area_points import AreaPoints
@@ -117,6 +118,7 @@ class Subject:
         if not isinstance(shape, mi.Scene):
             return cls.of(shape, medium, 1.0 if mm_per_unit is None else mm_per_unit)
         found = survey(_object_of(shape, name))
+        check_empty(shape, [found], "learning")
         unit = millimetres(shape) if mm_per_unit is None else mm_per_unit
         inside = equivalent(found.shape.bsdf().inside, found)
         subject = cls.surveyed(found, _in_scene_units(inside.medium, unit), inside.varying, unit)

@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from halfspace_sss.rendering.surface.mesh import Faces, check_copies, face_normals_agree, faces_of
 from halfspace_sss.rendering.surface.sharing import name_of, rays_into, scene_of
 
-__all__ = ["RAYS", "Object", "is_inside", "same_objects", "survey", "turned"]
+__all__ = ["RAYS", "Object", "geometry_of", "is_inside", "same_objects", "survey", "turned"]
 
 RAYS = 4096  # of the survey
 MOST_HITS = 64  # that one ray counts
@@ -31,7 +32,7 @@ class Object:
         pieces: UInt32 array of the connected piece of each face, or None if there is one piece.
         size: diagonal of the bounding box, scene units.
         area: scene units squared.
-        geometry: what it was surveyed with, from `_geometry`.
+        geometry: what it was surveyed with, from `geometry_of`.
     """
 
     shape: Any
@@ -52,7 +53,7 @@ class Object:
 
     def is_current(self) -> bool:
         """Whether the shape still is as it was surveyed."""
-        return _geometry(self.shape)[0] == self.geometry[0]
+        return geometry_of(self.shape)[0] == self.geometry[0]
 
     def piece(self, prim_index: Any, active: Any) -> Any:
         """The number of the piece that a face belongs to."""
@@ -108,14 +109,17 @@ def same_objects(a: list[Any], b: list[Any]) -> bool:
 
 
 def survey(shape: Any, world: Any = None) -> Object:
-    """Look at a shape from outside with rays; warns if it is not closed.
+    """Look at a shape from outside with rays; warns if it is not closed, or if its faces point to both sides.
+
+    Faces of a closed mesh that point to both sides are taken the right way round.
 
     Args:
         shape: of Mitsuba.
         world: the scene that it stands in, if rays are traced in both by one kernel.
 
     Raises:
-        ValueError: the shape is an instance, whose geometry belongs to several objects.
+        ValueError: the shape is an instance, whose geometry belongs to several objects; faces of a mesh exist twice; or
+            they point to both sides of a surface that has one side or is not closed.
     """
 
     if "nstance" in shape.class_name():
@@ -126,12 +130,22 @@ def survey(shape: Any, world: Any = None) -> Object:
     box = scene.bbox()
     low, high = np.array(box.min, dtype=float), np.array(box.max, dtype=float)
     size = float(np.linalg.norm(high - low))
-    pieces = _pieces(shape)
-    votes = _Votes(pieces)
+    faces = faces_of(shape, name_of(shape))
+    if faces is not None:
+        check_copies(faces, name_of(shape))
+    votes = _Votes(faces)
     sides, odd = _outside_view(scene, votes)
     outward = sides[sides != 0]
     share = float((outward > 0).mean()) if len(outward) else 1.0
     sheet = 1 - MAJORITY < share < MAJORITY and not votes.agree()
+    mixed = faces is not None and faces.sides is not None
+    if mixed and (odd > 0 or sheet):
+        raise ValueError(
+            f"faces of object {name_of(shape)} point to both sides, and the object must be closed to tell its inside, "
+            f"got {100 * odd:.3g} % of the rays that enter it and do not leave it again"
+        )
+    if mixed:
+        face_normals_agree(shape, faces, name_of(shape))
     if odd > 0 or sheet:
         warnings.warn(
             f"object {name_of(shape)} is not closed: {100 * odd:.3g} % of the rays that enter it do not leave it "
@@ -141,11 +155,11 @@ def survey(shape: Any, world: Any = None) -> Object:
     area = float(np.sum(np.array(shape.surface_area())))
     closed, sign = odd == 0 and not sheet, -1.0 if share <= 1 - MAJORITY else 1.0
     signs = votes.signs() if closed else None
-    return Object(shape, scene, sign, signs, float(votes.opposed[0]) == 0, closed, pieces, size, area,
-                  _geometry(shape))  # fmt: skip
+    return Object(shape, scene, sign, signs, float(votes.opposed[0]) == 0, closed, votes.pieces, size,
+                  area, geometry_of(shape))  # fmt: skip
 
 
-def _geometry(shape: Any) -> tuple[list, list]:
+def geometry_of(shape: Any) -> tuple[list, list]:
     """What tells one geometry of a shape from the next; the arrays with it are kept so that no number is reused."""
     import drjit as dr
     import mitsuba as mi
@@ -166,12 +180,15 @@ class _Votes:
     A ray from outside enters a closed object with its first, third, ... hit, whatever hides the piece.
     """
 
-    def __init__(self, pieces: Any) -> None:
+    def __init__(self, faces: Faces | None) -> None:
         import drjit as dr
         import mitsuba as mi
 
-        self.pieces = pieces
-        n = 0 if pieces is None else int(dr.max(pieces)[0]) + 1
+        n = 0 if faces is None else int(faces.pieces.max()) + 1
+        mixed = faces is not None and faces.sides is not None
+        n = n if n > 1 or mixed else 0
+        self.pieces = mi.UInt32(faces.pieces.astype(np.uint32)) if n else None
+        self.sides = mi.Float(faces.sides.astype(np.float32)) if mixed else None
         self.hits, self.outward = dr.zeros(mi.Float, n), dr.zeros(mi.Float, n)
         self.opposed = dr.zeros(mi.Float, 1)
 
@@ -184,7 +201,8 @@ class _Votes:
         if self.pieces is None:
             return
         piece = dr.gather(mi.UInt32, self.pieces, si.prim_index, active)
-        agrees = (dr.dot(si.n, along) < 0) == entering
+        n = si.n if self.sides is None else si.n * dr.gather(mi.Float, self.sides, si.prim_index, active)
+        agrees = (dr.dot(n, along) < 0) == entering
         dr.scatter_add(self.hits, mi.Float(1), piece, active)
         dr.scatter_add(self.outward, dr.select(agrees, mi.Float(1), 0), piece, active)
 
@@ -201,9 +219,11 @@ class _Votes:
         """Of each face, or None if all pieces have the same."""
         import mitsuba as mi
 
-        sign = np.where(self._shares() < 0.5, -1.0, 1.0)
-        mixed = len(sign) > 0 and np.ptp(sign) > 0
-        return mi.Float(sign[np.array(self.pieces)].astype(np.float32)) if mixed else None
+        if self.pieces is None:
+            return None
+        sign = np.where(self._shares() < 0.5, -1.0, 1.0)[np.array(self.pieces)]
+        sign = sign if self.sides is None else sign * np.array(self.sides)
+        return mi.Float(sign.astype(np.float32)) if np.ptp(sign) > 0 else None
 
 
 def _outside_view(scene: Any, votes: _Votes) -> tuple[np.ndarray, float]:
@@ -247,22 +267,3 @@ def is_inside(found: Object, points: Any) -> np.ndarray:
     ends = np.tile(along, points.shape[1])
     _, count = crossings(found.scene, mi.Ray3f(mi.Point3f(start), mi.Vector3f(ends)))
     return (np.array(count) % 2).reshape(-1, along.shape[1]).mean(axis=1) > 0.5
-
-
-def _pieces(shape: Any) -> Any:
-    """Connected pieces of a mesh over shared positions: Mitsuba merges meshes that have the same BSDF."""
-    import mitsuba as mi
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    parameters = mi.traverse(shape)
-    if "faces" not in parameters:
-        return None
-    faces = np.array(parameters["faces"]).reshape(-1, 3)
-    positions = np.array(parameters["vertex_positions"]).reshape(-1, 3)
-    _, vertex = np.unique(positions, axis=0, return_inverse=True)
-    faces = vertex.reshape(-1)[faces]
-    ends = np.concatenate([faces[:, :2], faces[:, 1:]])
-    graph = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(vertex.max() + 1,) * 2)
-    n, label = connected_components(graph, directed=False)
-    return mi.UInt32(label[faces[:, 0]].astype(np.uint32)) if n > 1 else None

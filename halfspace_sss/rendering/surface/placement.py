@@ -1,10 +1,131 @@
-"""Which shapes of a scene are translucent, and what a `translucent` surface may not be part of."""
+"""Which shapes of a scene are translucent, what lies inside them, and where cameras and media may not be."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
-__all__ = ["choices", "translucent_shapes"]
+import numpy as np
+
+from halfspace_sss.rendering.surface.object import Object, geometry_of, is_inside
+from halfspace_sss.rendering.surface.sharing import name_of, rays_into, scene_of
+
+__all__ = ["Content", "check_empty", "check_sensors", "choices", "contents", "places_of", "translucent_shapes"]
+
+STARTS = 64  # rays of each sensor that are looked at
+LOOKS = 512  # rays that look for parts of a shape in an object
+DEEP = 1e-3  # of the size of an object: what reaches less deep stands at its surface
+
+
+@dataclass(frozen=True, eq=False)
+class Content:
+    """What lies inside an object.
+
+    Args:
+        thing: a shape, or an emitter that has none.
+        name: what messages call it.
+        object: the number of the object.
+        whole: whether all of it lies inside.
+    """
+
+    thing: Any
+    name: str
+    object: int
+    whole: bool
+
+
+def contents(scene: Any, objects: list[Object]) -> list[Content]:
+    """What lies inside each closed object of a scene: of every shape a part that is deeper than `DEEP`, and lamps."""
+    found = []
+    for shape in scene.shapes():
+        alone = None
+        for k, holder in enumerate(objects):
+            shared = _shared(shape, holder)
+            if holder.shape is shape or shared is None:
+                continue
+            alone = alone or scene_of([shape], scene)
+            if _deep(holder, _points_on(alone, shared)).any():
+                found.append(Content(shape, name_of(shape), k, _holds(holder, shape, alone)))
+    for emitter in scene.emitters():
+        place = _place(emitter)
+        for k, holder in enumerate(objects):
+            if place is not None and is_inside(holder, place[:, None]).all():
+                found.append(Content(emitter, repr(emitter.id()), k, True))
+    return found
+
+
+def check_empty(scene: Any, objects: list[Object], what: str) -> None:
+    """Refuse objects with something inside, for `what` does not see it.
+
+    Raises:
+        ValueError: names what lies in which object, or partly in it.
+    """
+    for found in contents(scene, objects)[:1]:
+        raise ValueError(
+            f"objects must be empty for {what}, got {found.name} {'' if found.whole else 'partly '}inside "
+            f"{objects[found.object].name}: the integrator translucent_walk traces it"
+        )
+
+
+def places_of(scene: Any) -> tuple[list, list]:
+    """What tells whether shapes or lamps of a scene have been moved; what is kept so that no number is reused."""
+    found = [geometry_of(shape) for shape in scene.shapes()]
+    lamps = [_place(emitter) for emitter in scene.emitters()]
+    places = [None if place is None else place.tolist() for place in lamps]
+    return [*(key for key, _ in found), *places], [kept for _, kept in found]
+
+
+def _shared(shape: Any, holder: Object) -> Any:
+    """The box that a shape shares with an object; None if it reaches less deep."""
+    import mitsuba as mi
+
+    (a, b), (c, d), deep = _corners(shape.bbox()), _corners(holder.scene.bbox()), DEEP * holder.size
+    low, high = np.maximum(a, c + deep), np.minimum(b, d - deep)
+    return mi.ScalarBoundingBox3f(low.tolist(), high.tolist()) if (low <= high).all() else None
+
+
+def _corners(box: Any) -> tuple[np.ndarray, np.ndarray]:
+    return tuple(np.ravel(np.array(corner, dtype=float)) for corner in (box.min, box.max))
+
+
+def _points_on(alone: Any, box: Any) -> np.ndarray:
+    """Points of the shape in a scene of its own that rays into a box meet first, in the box: shape (3, n)."""
+    si = alone.ray_intersect(rays_into(box, LOOKS))
+    p, met = np.array(si.p), np.array(si.is_valid())
+    low, high = _corners(box)
+    return p[:, met & (p.T >= low).all(axis=1) & (p.T <= high).all(axis=1)]
+
+
+def _deep(holder: Object, points: np.ndarray) -> np.ndarray:
+    """Which points lie inside an object, and deep."""
+    import mitsuba as mi
+
+    inside = np.flatnonzero(is_inside(holder, points)) if points.shape[1] else np.zeros(0, dtype=int)
+    if not len(inside):
+        return np.zeros(0, dtype=bool)
+    along = np.random.default_rng(17).standard_normal((3, 128))
+    along /= np.linalg.norm(along, axis=0)
+    start, ends = np.repeat(points[:, inside], 128, axis=1), np.tile(along, len(inside))
+    hit = holder.scene.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(start), mi.Vector3f(ends)))
+    return np.array(hit.t).reshape(-1, 128).min(axis=1) > DEEP * holder.size
+
+
+def _holds(holder: Object, shape: Any, alone: Any) -> bool:
+    """Whether all of a shape lies inside an object."""
+    (a, b), (c, d) = _corners(shape.bbox()), _corners(holder.scene.bbox())
+    return bool((a >= c).all() and (b <= d).all() and is_inside(holder, _points_on(alone, alone.bbox())).all())
+
+
+def _place(emitter: Any) -> np.ndarray | None:
+    """Where an emitter without a shape is; None where it is nowhere or has a shape."""
+    import drjit as dr
+    import mitsuba as mi
+
+    far = emitter.flags() & int(mi.EmitterFlags.Infinite)
+    if far or emitter.is_environment() or emitter.get_shape() is not None:
+        return None
+    ds, _ = emitter.sample_direction(dr.zeros(mi.Interaction3f), mi.Point2f(0.5))
+    return np.ravel(np.array(ds.p))
 
 
 def translucent_shapes(scene: Any) -> list[Any]:
@@ -12,7 +133,7 @@ def translucent_shapes(scene: Any) -> list[Any]:
 
     Raises:
         ValueError: such a surface is inside of another BSDF, which would show its reflection only, or its shape belongs
-            to a shape group, whose instances are several objects.
+            to a shape group, whose instances are several objects; or the scene has media of Mitsuba.
     """
     import mitsuba as mi
 
@@ -29,7 +150,53 @@ def translucent_shapes(scene: Any) -> list[Any]:
             raise ValueError(
                 f"a translucent surface must stand alone, got one inside the {bsdf.class_name()} of {shape.id()!r}"
             )
+    _check_media(scene)
     return [shape for shape in shapes if hasattr(shape.bsdf(), "inside")]
+
+
+def _check_media(scene: Any) -> None:
+    """ValueError if light would be scattered outside of the objects, or by a second medium in one."""
+    found = [
+        (side, shape)
+        for shape in scene.shapes()
+        for side, medium in (("interior", shape.interior_medium()), ("exterior", shape.exterior_medium()))
+        if medium is not None
+    ]
+    for side, shape in found:
+        if hasattr(shape.bsdf(), "inside"):
+            raise ValueError(
+                f"a translucent object must be without {side}, as its surface says what is inside, got the {side} "
+                f"of {shape.id()!r}"
+            )
+    if found:
+        side, shape = found[0]
+        raise ValueError(f"the scene must be without media of Mitsuba, such as fog, got the {side} of {shape.id()!r}")
+    for place in (*scene.sensors(), *scene.emitters()):
+        if place.get_medium() is not None:
+            raise ValueError(f"the scene must be without media of Mitsuba, such as fog, got one around {place.id()!r}")
+
+
+def check_sensors(scene: Any, objects: list[Object]) -> None:
+    """Refuse sensors inside of objects, of any kind: they may have several places, or a surface.
+
+    Raises:
+        ValueError: rays of a sensor begin inside an object, whose id is named.
+    """
+    for sensor in scene.sensors():
+        for found in objects:
+            if is_inside(found, _starts(sensor, found.size)).any():
+                raise ValueError(f"the camera must be outside of every object, got it inside {found.name}")
+
+
+def _starts(sensor: Any, size: float) -> np.ndarray:
+    """Shape (3, n); off a surface that the rays leave by a little of the size of an object."""
+    import mitsuba as mi
+
+    u = np.random.default_rng(13).random((5, STARTS)).astype(np.float32)
+    numbers = [mi.Float(row.tolist()) for row in u]
+    # not sample_ray, which some sensors lack
+    ray, _ = sensor.sample_ray_differential(0.0, numbers[0], mi.Point2f(*numbers[1:3]), mi.Point2f(*numbers[3:]))
+    return np.array(mi.Point3f(ray.o + ray.d * (1e-4 * size))).reshape(3, -1)
 
 
 def choices(scene: Any) -> dict[str, str]:

@@ -10,8 +10,7 @@ from typing import Any
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.surface.inside import Inside
 from halfspace_sss.rendering.surface.object import Object, same_objects, survey
-from halfspace_sss.rendering.surface.placement import translucent_shapes
-from halfspace_sss.rendering.surface.sensors import check_sensors
+from halfspace_sss.rendering.surface.placement import check_empty, check_sensors, places_of, translucent_shapes
 from halfspace_sss.rendering.surface.sharing import check_together, number_of
 from halfspace_sss.rendering.surface.transports import AUTO, choose_models, knows_objects, object_transport
 from halfspace_sss.rendering.surface.varying import equivalent, warn_of_means
@@ -24,6 +23,7 @@ from halfspace_sss.rendering.transport.variation import Variation
 
 __all__ = ["Bodies", "Body", "check_size", "make_bodies"]
 
+_MODELS = "models of their light"
 SMALL, LARGE = 1.0, 5e3  # mean free paths across an object, beyond which the units of the scene are doubted
 
 
@@ -74,6 +74,7 @@ class Bodies:
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
         self._made: tuple[int, list, list[Body]] = (0, [], [])
+        self._places: tuple[list, list] = ([], [])
 
     def of(self, scene: Any) -> list[Body]:
         """The bodies of a scene; errors as in `make_bodies`."""
@@ -82,6 +83,10 @@ class Bodies:
         same = world == number_of(scene) and same_objects(before, shapes)
         if not bodies or not same or not all(body.is_current() for body in bodies):
             self._made = number_of(scene), shapes, make_bodies(scene, self.settings)
+            self._places = places_of(scene)
+        elif (places := places_of(scene))[0] != self._places[0]:
+            check_empty(scene, [body.found for body in bodies], _MODELS)
+            self._places = places
         return self._made[2]
 
 
@@ -89,22 +94,23 @@ def make_bodies(scene: Any, settings: Settings, without: Collection[str] = ()) -
     """All objects of a scene that have a `translucent` surface, but for those with the ids in `without`.
 
     Raises:
-        ValueError: there is none, a camera is inside one, a model refuses its medium, or the orders that are asked for
-            are not those of the model.
+        ValueError: there is none, a camera or anything else is inside one, a model refuses its medium, or the orders
+            that are asked for are not those of the model.
     """
     shapes = translucent_shapes(scene)
     if not shapes:
         raise ValueError("the scene must have an object with a translucent BSDF, got none")
+    objects = [survey(shape, scene) for shape in shapes]
+    check_together(scene, [found.scene for found in objects])
+    check_sensors(scene, objects)
+    check_empty(scene, objects, _MODELS)
     if any(shape.bsdf().inside.model == AUTO for shape in shapes):
         choose_models(scene, settings)
-    bodies = [_make_body(shape, settings, scene) for shape in shapes if shape.id() not in without]
-    check_together(scene, [body.found.scene for body in bodies])
-    check_sensors(scene, [body.found for body in bodies])
-    return bodies
+    return [_make_body(found, settings) for found in objects if found.shape.id() not in without]
 
 
-def _make_body(shape: Any, settings: Settings, scene: Any) -> Body:
-    found, surface = survey(shape, scene), shape.bsdf()
+def _make_body(found: Object, settings: Settings) -> Body:
+    surface = found.shape.bsdf()
     inside = equivalent(surface.inside, found)
     media = [m.scaled(settings.mm_per_unit) for m in inside.channels()]
     check_size(found, [float(m.sigma_t) for m in media], settings.mm_per_unit)

@@ -133,7 +133,8 @@ class PositionSampler:
             si = self.found.scene.ray_intersect(ray, _FLAGS(), False, active)
             active &= si.is_valid() & (left > 0)
             same = self.found.piece(si.prim_index, active) == piece
-            at = (si.p, si.n, turned(si.sh_frame.n, si.n) * out.sign, si.prim_index)
+            side = self.found.side(si.prim_index, active & same)
+            at = (si.p, si.n, turned(si.sh_frame.n, si.n) * side, si.prim_index)
             kept = self._offer(_Kept(*kept), at, out, axes, active & same)
             onward = si.spawn_ray(ray.d)
             onward.maxt = ray.maxt - si.t
@@ -150,7 +151,8 @@ class PositionSampler:
             v = mi.Point2f(*(_wrapped(x + k * ratio) for x, ratio in zip((u.x, u.y), LATTICE)))
             at = self.points.sample(_wrapped(u_face + k * inverse), v, active)
             same = self.found.piece(at.prim_index, active) == piece
-            point = (at.p, at.n, turned(at.n_shading, at.n) * out.sign, at.prim_index)
+            side = self.found.side(at.prim_index, active & same)
+            point = (at.p, at.n, turned(at.n_shading, at.n) * side, at.prim_index)
             return k + 1, tuple(self._offer(_Kept(*kept), point, out, axes, active & same))
 
         state = (mi.Float(0), tuple(kept))

@@ -13,7 +13,7 @@ import numpy as np
 from halfspace_sss.rendering.light.small import SmallEmitters
 from halfspace_sss.rendering.surface.object import same_objects
 from halfspace_sss.rendering.surface.parameters import OF_MITSUBA, check_parameters
-from halfspace_sss.rendering.surface.sensors import check_sensors
+from halfspace_sss.rendering.surface.placement import check_sensors
 from halfspace_sss.rendering.surface.sharing import number_of
 from halfspace_sss.rendering.transport.body import check_size
 from halfspace_sss.rendering.walk.connect import find_joins
