@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from types import ModuleType
@@ -19,6 +20,8 @@ from halfspace_sss.tracing.walk import Tally, pass_seed, walk
 __all__ = ["PATHS_PER_LANE", "Estimate", "Pass", "estimate", "launch_shape", "walk_passes"]
 
 PATHS_PER_LANE, MAX_LANES = 64, 131072
+LAUNCH_SECONDS = 0.7  # of a kernel, in which Python hears no interrupt
+FIRST_LANES, FEWEST_LANES = 2048, 512  # of a launch
 
 
 class Estimate(NamedTuple):
@@ -101,10 +104,29 @@ def walk_passes(
     """
     lanes, per_lane, passes = launch_shape(n_paths)
     for done in range(1, passes + 1):
-        mu = _incidence(mu_i, lanes, np.random.default_rng([*seed, done]))
-        mu_in, recorded = types.Float(mu_internal(mu, medium.eta)), tallies()
-        sums, events = walk(types, medium, mu_in, per_lane, pass_seed(*seed, done), recorded)
-        n_events = int(events.numpy().astype(np.int64).sum())
+        mu, recorded = _incidence(mu_i, lanes, np.random.default_rng([*seed, done])), tallies()
+        sums, n_events = _launches(types, medium, mu, per_lane, pass_seed(*seed, done), recorded)
         if progress:
             progress(done, passes)
         yield Pass(recorded, sums, F_t(mu, medium.eta), per_lane, n_events)
+
+
+def _launches(
+    types: ModuleType, medium: Medium, mu: np.ndarray, per_lane: int, seed: tuple[int, int], tallies: list[Tally]
+) -> tuple[tuple, int]:
+    """Sums of the tallies by lane, and events, of a pass in launches of about `LAUNCH_SECONDS`.
+
+    A lane walks the same whatever launch it is in: the sums are those of one launch, to the last bit.
+    """
+    import drjit as dr
+
+    mu_in, parts, n_events, first, size = mu_internal(mu, medium.eta), [], 0, 0, FIRST_LANES
+    while first < len(mu):
+        started, lanes = time.perf_counter(), types.Float(np.ascontiguousarray(mu_in[first : first + size]))
+        sums, events = walk(types, medium, lanes, per_lane, seed, tallies, first=first)
+        parts.append(sums)
+        n_events += int(events.numpy().astype(np.int64).sum())
+        first += size
+        size = int(max(size * min(LAUNCH_SECONDS / (time.perf_counter() - started), 16), FEWEST_LANES))
+    whole = tuple(tuple(map(dr.concat, zip(*of_tally))) for of_tally in zip(*parts))
+    return whole, n_events

@@ -138,19 +138,15 @@ class RingTally:
     def __init__(self, types: ModuleType, edges: np.ndarray) -> None:
         self.n = len(edges) - 1
         self.edges2 = types.Float(np.asarray(edges, dtype=np.float64) ** 2)
-        self.lanes = types.UInt32
         self.cells = CellSums(types, 2 * self.n)
 
     def start(self, lanes: int) -> tuple:
-        import drjit as dr
-
-        self.lane = dr.arange(self.lanes, lanes)
         return ()
 
     def boundary(self, sums: tuple, event: Boundary) -> tuple:
         ring, inside = find_cell(self.edges2, event.x * event.x + event.y * event.y)
         cell = ring + (event.order > 1) * type(ring)(self.n)
-        self.cells.add(event.weight, cell, self.lane, inside & (event.weight > 0))
+        self.cells.add(event.weight, cell, event.lane, inside & (event.weight > 0))
         return sums
 
     def scatter(self, sums: tuple, event: Scatter) -> tuple:

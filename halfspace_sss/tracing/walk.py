@@ -42,6 +42,7 @@ class Boundary:
     y: Any
     mu: Any  # internal cosine
     length: Any  # path length inside, mean free paths
+    lane: Any
 
 
 @dataclass
@@ -128,7 +129,7 @@ def pass_seed(seed: int, *indices: int) -> tuple[int, int]:
     return int(state), int(stream >> np.uint64(1))
 
 
-def generator(types: ModuleType, lanes: int, seed: tuple[int, int]) -> Any:
+def generator(types: ModuleType, lanes: int, seed: tuple[int, int], first: int = 0) -> Any:
     """A generator whose lanes are independent: state and stream of each are hashed (SplitMix64).
 
     Lanes of PCG32 whose states and streams differ in a few low bits only are correlated: the variance of the mean of
@@ -137,17 +138,18 @@ def generator(types: ModuleType, lanes: int, seed: tuple[int, int]) -> Any:
     Args:
         types: a module of Dr.Jit array types, or Mitsuba.
         seed: from `pass_seed`.
+        first: number of the first lane.
     """
     import drjit as dr
 
     UInt64 = types.UInt64
-    lane = dr.arange(UInt64, lanes)
+    lane = dr.arange(UInt64, lanes) + dr.opaque(UInt64, first)
 
     def hashed(start: int) -> Any:
         z = dr.opaque(UInt64, start) + lane * UInt64(0x9E3779B97F4A7C15)
         z = (z ^ (z >> 30)) * UInt64(0xBF58476D1CE4E5B9)
         z = (z ^ (z >> 27)) * UInt64(0x94D049BB133111EB)
-        return z ^ (z >> 31)
+        return (z ^ (z >> 31)) + dr.opaque(UInt64, first)  # PCG32 adds the place of a lane among these
 
     return types.PCG32(lanes, *map(hashed, seed))
 
@@ -177,6 +179,7 @@ def walk(
     seed: tuple[int, int],
     tallies: Sequence[Tally],
     weight: Any = 1.0,
+    first: int = 0,
 ) -> tuple[tuple, Any]:
     """Trace `paths_per_lane` walks one after another in each lane and return the tallies' sums and event counts.
 
@@ -192,6 +195,7 @@ def walk(
         tallies: what to record.
         weight: of a walk at its start, a number or one per lane. Above one it keeps roulette away for longer: with
             albedo^-n all walks get to order n.
+        first: number of the first lane, of which its random numbers depend.
 
     Returns:
         The sums of each tally, one entry per lane and summed over its walks, and scattering events per lane.
@@ -209,12 +213,12 @@ def walk(
     sin_in = dr.sqrt(dr.maximum((1 - mu_in) * (1 + mu_in), 0.0))
     dr.eval(mu_in, sin_in, constants.albedo, constants.g, constants.inverse_eta)
     last = dr.opaque(UInt32, paths_per_lane)
-    lane = dr.arange(UInt32, lanes)
+    lane = dr.arange(UInt32, lanes) + dr.opaque(UInt32, first)
     zero = dr.zeros(Float, lanes)
     count = dr.zeros(UInt32, lanes)
     begin = dr.opaque(Float, weight) if isinstance(weight, float) else weight
     state = {
-        "rng": generator(types, lanes, seed),
+        "rng": generator(types, lanes, seed, first),
         "x": zero, "y": zero, "z": zero, "dx": sin_in, "dy": zero, "dz": mu_in, "length": zero,
         "weight": zero + begin, "first": zero + 1, "order": count, "path": count, "events": count,
     }  # fmt: skip
@@ -257,7 +261,7 @@ def _step(s: dict, sums: tuple, m: WalkConstants, start: tuple, lane: Any, talli
     F = Float(0) if m.matched else F_r(mu, m.inverse_eta)
     leaving = dr.select(crosses, s["weight"] * (1 - F), 0.0)
     t = z / dr.maximum(mu, 1e-12)
-    event = Boundary(s["order"], leaving, x + dx * t, y + dy * t, mu, s["length"] + t)
+    event = Boundary(s["order"], leaving, x + dx * t, y + dy * t, mu, s["length"] + t, lane)
     sums = tuple(tally.boundary(state, event) for tally, state in zip(tallies, sums))
 
     # a reflected free path goes on downwards by what is left of it: the mirror image of the straight one

@@ -129,6 +129,22 @@ for _ in range(2):
     assert messages == "interrupted; waits for a kernel that cannot be, the next one ends it\n"
 
 
+def test_long_walks_of_a_slow_medium_end_within_two_seconds(tmp_path: Path) -> None:
+    body = """
+import halfspace_sss as sss
+medium = sss.Medium.from_albedo(0.999, 1.0, 0.9, 1.5)
+sss.trace(medium, n_paths=256)
+print('ready', flush=True)
+sss.trace(medium, n_paths=10**8)"""
+    process = _started(body, tmp_path)
+    time.sleep(4)  # launches have found their size
+    started = time.monotonic()
+    process.send_signal(signal.SIGINT)
+    _, messages = process.communicate(timeout=60)
+    assert process.returncode == 130 and time.monotonic() - started < 4  # on cores with other work too
+    assert messages == LINE
+
+
 def test_a_signal_to_terminate_ends_in_order_too(tmp_path: Path) -> None:
     process = _started("print('ready', flush=True)\ntime.sleep(9)", tmp_path)
     time.sleep(0.2)

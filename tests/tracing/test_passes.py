@@ -5,8 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from halfspace_sss import Medium
+from halfspace_sss.tracing import passes
 from halfspace_sss.tracing.passes import MAX_LANES, PATHS_PER_LANE, estimate, launch_shape
 from halfspace_sss.tracing.tallies import BATCHES
+from halfspace_sss.tracing.tracer import trace
 
 
 @pytest.mark.parametrize("n_paths", [256, 1000, 16_384, 32_769, 10**6, 8_388_609, 10**9])
@@ -22,3 +25,17 @@ def test_an_estimate_is_the_mean_and_the_error_of_the_mean() -> None:
     columns = estimate(np.array([[1.0, 0.0], [2.0, 4.0], [6.0, 8.0]]))
     np.testing.assert_allclose(columns.value, [3.0, 4.0])
     np.testing.assert_allclose(columns.standard_error, np.sqrt([7 / 3, 16 / 3]))
+
+
+@pytest.mark.parametrize("lanes", [512, 700])
+def test_launches_of_other_sizes_trace_the_same_walks(lanes: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    medium = Medium.from_albedo(0.9, 1.0, 0.5, 1.4)
+    how = {"mu_i": 0.7, "n_paths": 2**15, "seed": 3, "radii": [0.0, 1.0, 2.0], "directions": [(1.0, 0.0)]}
+    whole = trace(medium, **how)
+    monkeypatch.setattr(passes, "FIRST_LANES", lanes)
+    monkeypatch.setattr(passes, "FEWEST_LANES", lanes)
+    monkeypatch.setattr(passes, "LAUNCH_SECONDS", 0.0)
+    parts = trace(medium, **how)
+    np.testing.assert_array_equal(parts._lanes, whole._lanes)
+    assert parts.exitance()[0].tolist() == whole.exitance()[0].tolist()
+    assert parts.n_events == whole.n_events
