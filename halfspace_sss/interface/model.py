@@ -13,7 +13,7 @@ import numpy as np
 from halfspace_sss.arrays import broadcast_query
 from halfspace_sss.checks import check_choice, check_query
 from halfspace_sss.interface.blocks import recorded_in_blocks
-from halfspace_sss.interface.model_lists import check_model_class, listed_models
+from halfspace_sss.interface.model_lists import check_allowed, check_model_class, listed_models
 from halfspace_sss.interface.query import Query
 from halfspace_sss.interface.radial import RadialSampler
 from halfspace_sss.once import once
@@ -258,6 +258,7 @@ def bssrdf(name: str, medium: Medium) -> BSSRDF:
 
 def model_class(name: str) -> type[BSSRDF]:
     """The class of a model; ValueError with the nearest name if there is none."""
+    check_allowed(name)
     known = {**_installed(), **_registered}
     check_choice("model", name, known)
     return known[name]
