@@ -21,7 +21,7 @@ from figures.drawing.shot import FLIP, Shot, compared
 from figures.drawing.style import paper, saved
 from figures.learnt.training import TRAIN_SECONDS, train_scan
 from figures.learnt.weights import FULL_GEOMETRY, training_of, with_weights
-from figures.parts.part import Part, Result, Task
+from figures.parts.part import Part, Result, Task, unmodelled
 from halfspace_sss import materials
 
 __all__ = ["TITLE", "draw", "parts", "path_traced", "rendered"]
@@ -62,6 +62,7 @@ def parts(quality: str) -> list[Part]:
     return found
 
 
+@unmodelled
 def path_traced(task: Task) -> dict[str, Any]:
     """The image by random walks, in passes that survive an interruption."""
     from halfspace_sss.rendering.scenes.scene_files import load_scene

@@ -20,7 +20,7 @@ from figures.drawing.shot import FLIP, RELATIVE_MSE, Shot, compared
 from figures.drawing.style import paper, saved
 from figures.learnt.training import TRAIN_SECONDS, train_scan
 from figures.learnt.weights import FULL_GEOMETRY, training_of, with_weights
-from figures.parts.part import Part, Result, Task
+from figures.parts.part import Part, Result, Task, unmodelled
 from halfspace_sss import materials
 
 __all__ = ["TITLE", "draw", "parts", "rivals", "truth"]
@@ -62,6 +62,7 @@ def parts(quality: str) -> list[Part]:
     return found
 
 
+@unmodelled
 def truth(task: Task) -> dict[str, Any]:
     """The long image, if its rivals can be denoised."""
     check_denoiser()  # before time is spent

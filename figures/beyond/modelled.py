@@ -11,7 +11,7 @@ from figures.computing.contenders import WALK, long_passes, ready
 from figures.computing.scenes import prepare
 from figures.learnt.training import object_parts
 from figures.modelling.grid import tissue
-from figures.parts.part import Task
+from figures.parts.part import Task, unmodelled
 from halfspace_sss.checks import check_choice
 from halfspace_sss.provenance import check_folder
 
@@ -73,6 +73,7 @@ def modelled_contender(method: str, p: Mapping[str, Any], folder: Path, sampler:
     return ready(method, found, p["object"], tissue("candle wax").medium)  # all tissues scatter isotropically
 
 
+@unmodelled
 def long_modelled(task: Task) -> dict[str, Any]:
     """A long image by our walk, for the parameters of `modelled_contender` and "spp" and "seed"."""
     prepare()

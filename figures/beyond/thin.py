@@ -17,7 +17,7 @@ from figures.drawing.image_grid import image_grid
 from figures.drawing.page import page
 from figures.drawing.shot import Shot, compared
 from figures.drawing.style import paper, saved
-from figures.parts.part import Part, Result, Task
+from figures.parts.part import Part, Result, Task, unmodelled
 from full_geometry.neural_shape.shapes.generators import make_shape
 from halfspace_sss import materials
 from halfspace_sss.provenance import check_folder
@@ -74,6 +74,7 @@ def parts(quality: str) -> list[Part]:
     return found
 
 
+@unmodelled
 def path_traced(task: Task) -> dict[str, Any]:
     """The image by random walks, in passes that survive an interruption."""
     prepare()

@@ -8,7 +8,7 @@ import numpy as np
 
 from figures.computing.long_render import long_render
 from figures.computing.scenes import prepare, scan_scene
-from figures.parts.part import Task
+from figures.parts.part import Task, unmodelled
 from halfspace_sss.neural.symmetric import channels
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.surface.transports import model_names
@@ -96,6 +96,7 @@ def _volume_scene(description: dict[str, Any], name: str, medium: Medium, rr_dep
     return tuple(found)
 
 
+@unmodelled
 def long_walk(task: Task) -> dict[str, Any]:
     """A long image by our walk, in passes that survive an interruption: what the other images are compared with.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 import os
@@ -13,11 +14,12 @@ from typing import Any
 
 import numpy as np
 
-from figures.parts.sources import code_hash, models_named
+from figures.parts.sources import code_hash
 from halfspace_sss.checks import check_choice, check_interval
+from halfspace_sss.interface.model_lists import no_models
 from halfspace_sss.progress import Progress
 
-__all__ = ["QUALITIES", "Part", "Result", "Task", "canonical", "check_quality", "keys_of"]
+__all__ = ["QUALITIES", "Part", "Result", "Task", "canonical", "check_quality", "keys_of", "unmodelled"]
 
 QUALITIES = ("draft", "paper")
 
@@ -61,6 +63,9 @@ class Task:
     progress: Progress = _no_progress
 
 
+Function = Callable[[Task], Mapping[str, Any]]
+
+
 @dataclass(frozen=True)
 class Part:
     """One piece of the work of a figure, kept under the hash of what it depends on.
@@ -79,7 +84,7 @@ class Part:
     """
 
     name: str
-    function: Callable[[Task], Mapping[str, Any]]
+    function: Function
     params: Mapping[str, Any]
     work: float
     needs: tuple[str, ...] = ()
@@ -102,6 +107,24 @@ class Part:
         """Name of the function and what the part is like: parts of a kind take the same time for the same work."""
         name = f"{self.function.__module__}.{self.function.__qualname__}"
         return f"{name}, {self.like}" if self.like else name
+
+
+def unmodelled(function: Function) -> Function:
+    """Declare that a function of parts finds no model by name, as path tracing does not; one that does is stopped.
+
+    Its result then does not depend on the code of models.
+
+    Raises:
+        RuntimeError: from the function, when it asks for a model.
+    """
+
+    @functools.wraps(function)
+    def closed(task: Task) -> Mapping[str, Any]:
+        with no_models(f"{function.__module__}.{function.__qualname__}"):
+            return function(task)
+
+    closed.unmodelled = True
+    return closed
 
 
 def canonical(value: Any, what: str) -> str:
@@ -137,7 +160,8 @@ def keys_of(parts: Sequence[Part]) -> dict[str, str]:
                 raise ValueError(f"part {part.name!r} must need parts that stand before it, got {name!r}")
         params = canonical(part.params, f"params of part {part.name!r}")
         about = {"function": part.function.__qualname__, "params": part.params}
-        about |= {"code": code_hash(part.function.__module__, part.function.__qualname__, models_named(params))}
+        unmodelled = getattr(part.function, "unmodelled", False)
+        about |= {"code": code_hash(part.function.__module__, part.function.__qualname__, params, unmodelled)}
         about |= {"inputs": [_file_hash(part, path) for path in part.inputs]}
         about |= {"needs": {name: keys[name] for name in part.needs}}
         keys[part.name] = hashlib.sha256(canonical(about, part.name).encode()).hexdigest()

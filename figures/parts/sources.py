@@ -1,4 +1,10 @@
-"""The code that a part runs: its function, what that uses of its file, and the files of this project it imports."""
+"""The code that a part runs: its function, what that uses of its file, and what it comes to from there.
+
+It comes to the files of this project that are imported, to those whose address stands as a text in them, and to models,
+transports and learners, which are found by name. What is rendered may find any of these by name: in a scene, as a
+default, as a start of a training, one after another. It comes to all of them, unless it is declared `unmodelled`.
+Code that renders nothing comes to those named in its parameters or in a text of its files.
+"""
 
 from __future__ import annotations
 
@@ -11,59 +17,97 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import NamedTuple
 
-from halfspace_sss.interface.model import model_class
-from halfspace_sss.rendering.surface.transports import model_names, object_transport
+from figures import figure_modules
+from halfspace_sss.extensions import LEARNERS, offered
+from halfspace_sss.interface.model import model_class, models
+from halfspace_sss.rendering.surface.transports import AUTO, model_names, object_transport
 
-__all__ = ["PACKAGES", "code_hash", "models_named", "modules_of"]
+__all__ = ["PACKAGES", "code_hash", "found_by_name", "modules_of", "modules_reached"]
 
 PACKAGES = ("figures", "full_geometry", "analytic_models", "halfspace_sss")
 MACHINERY = "figures.parts"  # keeps and orders what parts compute, and computes nothing of it
+RENDERS = "halfspace_sss.rendering.surface.transports"  # is imported by all that finds models of objects
+NAMES = "halfspace_sss.extensions"  # knows the names of packages, and asks for none of what they offer
+ADDRESS = re.compile(r"[a-z_]\w*(?:\.\w+)+(?::\w+)?")  # "package.module" or "package.module:function"
 
 
 class _Source(NamedTuple):
-    """Code: its hash, what it imports by dotted name, and the lazy names of a package."""
+    """Code: its hash, what it imports by dotted name, its texts, and the lazy names of a package."""
 
     digest: str
     imports: tuple[str, ...]
+    texts: frozenset[str]
     doors: dict[str, str]
 
 
-def code_hash(module: str, function: str, named: Iterable[str] = ()) -> str:
-    """SHA-256 of the code of a function and of all that it imports from this project.
+def code_hash(module: str, function: str, params: str = "", unmodelled: bool = False) -> str:
+    """SHA-256 of the code of a function and of all that it comes to in this project.
 
     Of its own file only those definitions count that it uses, so that what draws a figure may change. Comments,
-    docstrings and layout do not count. A name that a package imports when it is asked for counts with its module;
-    models, which are found by name, count where they are named.
+    docstrings and layout do not count. A name that a package imports when it is asked for counts with its module.
 
     Args:
         module, function: dotted name of a module, and name of a function at its top.
-        named: models that the code asks for.
+        params: text in which models may be named.
+        unmodelled: the function finds nothing by name.
     """
     path = _path(module)
     if path is None:  # of nobody's file, as in a notebook: only its name is known
         return hashlib.sha256(f"{module} {function}".encode()).hexdigest()
-    own = _digested(_used_by(function, _parsed(path)))
-    roots = [*_resolved(own), *(_module_of_model(name) for name in named)]
-    lines = [f"{name} {_source(path, path.stat().st_mtime_ns).digest}" for name, path in modules_of(roots).items()]
-    return hashlib.sha256("\n".join([own.digest, *lines]).encode()).hexdigest()
+    lines = [f"{name} {_found(name).digest}" for name in modules_reached(module, function, params, unmodelled)]
+    return hashlib.sha256("\n".join([_found(f"{module}:{function}").digest, *lines]).encode()).hexdigest()
 
 
-def modules_of(roots: Iterable[str]) -> dict[str, Path]:
-    """Files of this project that modules import, themselves included, sorted by dotted name."""
-    found: dict[str, Path] = {}
+def modules_reached(module: str, function: str, params: str = "", unmodelled: bool = False) -> list[str]:
+    """What a function comes to, as `modules_of`; arguments as for `code_hash`."""
+    own = _found(f"{module}:{function}")
+    found = modules_of(_resolved(own))
+    if unmodelled:
+        return found
+    sources = [own, *(_found(name) for name in found if name != NAMES and _path(name).stem != "__init__")]
+    texts = {text for source in sources for text in source.texts}
+    named = {name: homes for name, homes in found_by_name().items() if RENDERS in found or name in texts}
+    named |= {name: homes for name, homes in found_by_name().items() if name in re.findall(r"\w+", params)}
+    addressed = {text.partition(":")[0] for text in texts if ADDRESS.fullmatch(text)}
+    return modules_of([*found, *(home for homes in named.values() for home in homes), *addressed])
+
+
+@functools.cache
+def found_by_name() -> dict[str, tuple[str, ...]]:
+    """Modules of models, of the half-space and of objects, and of what learns them, by name."""
+    found: dict[str, tuple[str, ...]] = {name: (model_class(name).__module__,) for name in models()}
+    for name in [name for name in model_names() if name not in found and name != AUTO]:
+        found[name] = (object_transport(name).__module__,)
+    for name, learner in offered(LEARNERS):
+        home = getattr(learner, "__name__", None) or type(learner).__module__
+        found[name] = (*found.get(name, ()), home)
+    return found
+
+
+def modules_of(roots: Iterable[str]) -> list[str]:
+    """Modules of this project that modules import, themselves included, sorted.
+
+    Of a figure only that counts which is imported from it, as "module:name", for it draws too.
+    """
+    found: set[str] = set()
     ahead = list(roots)
     while ahead:
         name = ahead.pop()
-        path = _path(name)
-        if path is None or name in found:
-            continue
-        found[name] = path
-        ahead += _resolved(_source(path, path.stat().st_mtime_ns))
-    return dict(sorted(found.items()))
+        if name not in found and _path(name):
+            found.add(name)
+            ahead += _resolved(_found(name))
+    return sorted(found)
+
+
+def _found(name: str) -> _Source:
+    """The code of a module, or of "module:name" what that definition uses of it."""
+    path = _path(name)
+    return _source(path, path.stat().st_mtime_ns, name.partition(":")[2])
 
 
 def _path(name: str) -> Path | None:
     """The file of a module of this project; None for any other name, and for the machinery of parts itself."""
+    name = name.partition(":")[0]
     if name.partition(".")[0] not in PACKAGES or name.startswith(MACHINERY):
         return None
     return _located(name)
@@ -87,16 +131,23 @@ def _resolved(source: _Source) -> Iterator[str]:
         package, _, last = name.rpartition(".")
         path = _path(package)
         if path:
-            yield package
-            door = _source(path, path.stat().st_mtime_ns).doors.get(last)
+            yield f"{package}:{last}" if package in _figures() else package
+            door = _found(package).doors.get(last)
             if door:
                 yield door if _path(door) else door.rpartition(".")[0]
 
 
+@functools.cache
+def _figures() -> frozenset[str]:
+    return frozenset(figure_modules().values())
+
+
 @functools.lru_cache(maxsize=1024)
-def _source(path: Path, changed: int) -> _Source:
+def _source(path: Path, changed: int, definition: str) -> _Source:
     """The file as it is; `changed`, when it was written last, lets an edited one be read again."""
-    tree, doors = _parsed(path), {}
+    tree, doors = ast.parse(path.read_text(encoding="utf-8")), {}
+    if definition:
+        return _digested(_used_by(definition, tree))
     if path.name == "__init__.py":
         for node in [n for n in tree.body if isinstance(n, ast.If) and ast.unparse(n.test) == "TYPE_CHECKING"]:
             for found in [n for n in node.body if isinstance(n, ast.ImportFrom)]:
@@ -105,13 +156,11 @@ def _source(path: Path, changed: int) -> _Source:
     return _digested(tree)._replace(doors=doors)
 
 
-def _parsed(path: Path) -> ast.Module:
-    return ast.parse(path.read_text(encoding="utf-8"))
-
-
 def _digested(tree: ast.Module) -> _Source:
     imports = tuple(dict.fromkeys(_imported(tree)))
-    return _Source(hashlib.sha256(_bare(tree).encode()).hexdigest(), imports, {})
+    digest = hashlib.sha256(_bare(tree).encode()).hexdigest()
+    texts = [node.value for node in ast.walk(tree) if isinstance(node, ast.Constant) and isinstance(node.value, str)]
+    return _Source(digest, imports, frozenset(texts), {})
 
 
 def _used_by(function: str, tree: ast.Module) -> ast.Module:
@@ -165,13 +214,3 @@ def _bare(tree: ast.Module) -> str:
             if ast.get_docstring(node, clean=False) is not None:
                 node.body = node.body[1:] or [ast.Pass()]
     return ast.unparse(tree)
-
-
-def models_named(text: str) -> list[str]:
-    """The models, of the half-space and of objects, whose names stand in a text."""
-    words = set(re.findall(r"\w+", text))
-    return [name for name in model_names() if name in words]
-
-
-def _module_of_model(name: str) -> str:
-    return (object_transport(name) or model_class(name)).__module__

@@ -14,7 +14,7 @@ from halfspace_sss.arrays import broadcast_query
 from halfspace_sss.checks import check_choice, check_query
 from halfspace_sss.extensions import TRANSPORTS, offered
 from halfspace_sss.interface.blocks import recorded_in_blocks
-from halfspace_sss.interface.model_lists import check_model_class, listed_models
+from halfspace_sss.interface.model_lists import check_allowed, check_model_class, listed_models
 from halfspace_sss.interface.query import Query
 from halfspace_sss.interface.radial import RadialSampler
 from halfspace_sss.once import once
@@ -262,6 +262,7 @@ def bssrdf(name: str, medium: Medium) -> BSSRDF:
 
 def model_class(name: str) -> type[BSSRDF]:
     """The class of a model; ValueError with the nearest name if there is none."""
+    check_allowed(name)
     known = {**_installed(), **_registered}
     if name not in known and name in _of_objects():
         raise ValueError(

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from halfspace_sss.extensions import FAILURES, MODELS, offered, warn_left_out
 
-__all__ = ["check_model_class", "listed_models"]
+__all__ = ["check_allowed", "check_model_class", "listed_models", "no_models"]
+
+_closed_for: list[str] = []
 
 
 def check_model_class(cls: Any, base: type) -> None:
@@ -19,6 +22,22 @@ def check_model_class(cls: Any, base: type) -> None:
         raise ValueError(f"name of a model must be a text that is not empty, got {name!r}")
     if orders not in ("multiple", "total"):
         raise ValueError(f"orders of a model must be multiple or total, got {orders!r}")
+
+
+@contextmanager
+def no_models(who: str) -> Iterator[None]:
+    """Within it, in every thread, asking for a model by its name is an error: `who` is known to need none."""
+    _closed_for.append(who)
+    try:
+        yield
+    finally:
+        _closed_for.pop()
+
+
+def check_allowed(name: str) -> None:
+    """RuntimeError within `no_models`."""
+    if _closed_for:
+        raise RuntimeError(f"{_closed_for[-1]} is declared to find no model by name, and asks for {name!r}")
 
 
 def listed_models(base: type) -> dict[str, type]:

@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 import figures
+from figures.computing.contenders import long_walk
+from figures.parts.part import Task, unmodelled
 from figures.parts.sources import PACKAGES, modules_of
+from halfspace_sss.interface.model import model_class
+from halfspace_sss.rendering.surface.transports import object_transport
 
 ROOT = Path(figures.__file__).resolve().parent.parent
 
@@ -19,12 +26,14 @@ ROOT = Path(figures.__file__).resolve().parent.parent
 KEYS = """
 import json, sys
 from pathlib import Path
-from figures import fig09, fig10
+from figures import figure_modules
 from figures.parts.part import keys_of
+from figures.parts.runner import figure
+
+parts = {name: figure(name).parts("draft") for name in figure_modules()}
 
 def keys():
-    fig09.MATERIALS = ("marble",)
-    return keys_of(fig09.parts("draft")) | keys_of(fig10.parts("draft"))
+    return {f"{name}: {part}": key for name, each in parts.items() for part, key in keys_of(each).items()}
 
 found = [keys()]
 for file, text in json.loads(sys.argv[1]):
@@ -35,19 +44,28 @@ for file, text in json.loads(sys.argv[1]):
     path.write_text(before, encoding="utf-8")
 print(json.dumps([*found, keys()]))
 """
+EDIT = "\nEDITED = 1\n"
 EDITS = {
-    "walk": ("halfspace_sss/rendering/walk/tracing.py", "\nEDITED = 1\n"),
+    "walk": ("halfspace_sss/rendering/walk/tracing.py", EDIT),
     "comment": ("halfspace_sss/rendering/walk/tracing.py", "\n# edited\n"),
-    "dipoles": ("analytic_models/_diffusion.py", "\nEDITED = 1\n"),
-    "drawing": ("figures/drawing/style.py", "\nEDITED = 1\n"),
-    "figure": ("figures/fig09.py", "\nEDITED = 1\n"),
-    "far": ("halfspace_sss/physics/fresnel.py", "\nEDITED = 1\n"),
+    "dipole": ("analytic_models/better_dipole.py", EDIT),
+    "dipoles": ("analytic_models/_diffusion.py", EDIT),
+    "network": ("halfspace_sss/neural/universal.py", EDIT),
+    "full geometry": ("full_geometry/scene.py", "\nENTRIES, FINE = 3, 9.5\n"),
+    "shapes": ("full_geometry/neural_shape/scene.py", EDIT),
+    "learner": ("full_geometry/learning/fitting.py", EDIT),
+    "lambert": ("halfspace_sss/rendering/transport/lambert.py", EDIT),
+    "choice": ("halfspace_sss/trade/automatic.py", EDIT),
+    "drawing": ("figures/drawing/style.py", EDIT),
+    "figure": ("figures/fig09.py", EDIT),
+    "far": ("halfspace_sss/physics/fresnel.py", EDIT),
 }
+OF_MODELS = ("dipole", "dipoles", "network", "full geometry", "shapes", "learner", "lambert", "choice")
 
 
 @pytest.fixture(scope="module")
 def changed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, set[str]]:
-    """Names of the parts whose key is another one after each edit."""
+    """ "FIGURE: PART" of the parts whose key is another one after each edit; "all" holds every one."""
     copy = tmp_path_factory.mktemp("project")
     for package in PACKAGES:
         shutil.copytree(ROOT / package, copy / package, ignore=shutil.ignore_patterns("__pycache__"))
@@ -56,21 +74,47 @@ def changed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, set[str]]:
     run = subprocess.run(command, capture_output=True, text=True, check=True)
     before, *after, last = json.loads(run.stdout)
     assert last == before
-    return {name: {part for part in before if keys[part] != before[part]} for name, keys in zip(EDITS, after)}
+    found = {name: {part for part in before if keys[part] != before[part]} for name, keys in zip(EDITS, after)}
+    return found | {"all": set(before)}
+
+
+def _of(parts: set[str], *figures: str) -> set[str]:
+    return {part for part in parts if part.split(":")[0] in figures}
 
 
 def test_a_change_of_the_walk_changes_what_is_rendered_and_no_curve(changed: dict[str, set[str]]) -> None:
-    assert "marble, path traced" in changed["walk"]
-    assert not any("degrees" in name for name in changed["walk"])
+    assert "fig09: marble, path traced" in changed["walk"]
+    assert not _of(changed["walk"], "fig10")
 
 
 def test_a_comment_changes_nothing(changed: dict[str, set[str]]) -> None:
     assert not changed["comment"]
 
 
-def test_a_change_of_a_model_changes_its_parts_alone(changed: dict[str, set[str]]) -> None:
-    assert {"marble, better_dipole", "better_dipole"} <= changed["dipoles"]
-    assert not changed["dipoles"] & {"marble, path traced", "marble, neural", "neural", "path traced, 30 degrees"}
+@pytest.mark.parametrize("edit", OF_MODELS)
+def test_a_change_of_what_is_found_by_name_changes_all_that_may_find_it(
+    edit: str, changed: dict[str, set[str]]
+) -> None:
+    """Trainings start from a model, defaults and rivals are models, the trade tries all of them."""
+    truths = {part for part in changed["all"] if re.search("path traced|truth|walk, surface", part)}
+    rendered = changed["all"] - truths - _of(changed["all"], "fig10")
+    assert len(rendered) > 100
+    assert rendered <= changed[edit]
+
+
+@pytest.mark.parametrize("edit", OF_MODELS)
+def test_what_is_traced_without_models_outlives_a_change_of_one(edit: str, changed: dict[str, set[str]]) -> None:
+    traced = {"fig09: marble, path traced", "thin: dragon, path traced", "fig11: marble, truth"}
+    traced |= {"fig05: potato, small light: truth", "fig10: path traced, 30 degrees"}
+    assert traced <= changed["all"]
+    assert not traced & changed[edit]
+
+
+def test_curves_of_a_model_outlive_a_change_of_another(changed: dict[str, set[str]]) -> None:
+    assert {"fig10: better_dipole"} == _of(changed["dipole"], "fig10")
+    assert "fig10: better_dipole" in changed["dipoles"]
+    assert {"fig10: neural"} == _of(changed["network"], "fig10")
+    assert not _of(changed["full geometry"] | changed["lambert"], "fig10")
 
 
 def test_what_draws_is_not_what_computes(changed: dict[str, set[str]]) -> None:
@@ -78,7 +122,20 @@ def test_what_draws_is_not_what_computes(changed: dict[str, set[str]]) -> None:
 
 
 def test_a_change_far_below_changes_everything(changed: dict[str, set[str]]) -> None:
-    assert {"marble, path traced", "marble, neural", "better_dipole", "path traced, 30 degrees"} <= changed["far"]
+    assert changed["far"] == changed["all"]
+
+
+@pytest.mark.parametrize("ask", [lambda: model_class("neural"), lambda: object_transport("lambert")])
+def test_a_part_that_is_declared_to_find_no_model_cannot(ask: Callable[[], Any], tmp_path: Path) -> None:
+    with pytest.raises(RuntimeError, match="is declared to find no model by name, and asks for '(neural|lambert)'"):
+        unmodelled(lambda task: ask())(Task({}, tmp_path))
+    assert ask()
+
+
+def test_path_tracing_finds_no_model(tmp_path: Path) -> None:
+    pytest.importorskip("mitsuba")
+    params = {"material": "marble", "size": 4, "lights": "small light", "spp": 2, "seed": 0}
+    assert long_walk(Task(params, tmp_path))["image"].shape == (4, 4, 3)
 
 
 def test_a_name_that_a_package_imports_late_counts_with_its_module() -> None:

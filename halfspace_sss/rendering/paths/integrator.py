@@ -10,7 +10,9 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from halfspace_sss.rendering.light.interruptible import interruptible
 from halfspace_sss.rendering.paths.differentiable import check_outermost, check_parameters, replayer
+from halfspace_sss.rendering.paths.launches import launches
 from halfspace_sss.rendering.paths.tracing import trace_paths
 from halfspace_sss.rendering.transport.body import Bodies, make_bodies
 from halfspace_sss.rendering.transport.settings import read_settings
@@ -33,6 +35,7 @@ def integrator_class() -> type:
 
         def __init__(self, props: Any) -> None:
             mi.SamplingIntegrator.__init__(self, props)
+            self.timed = float(props.get("timeout", -1.0)) > 0
             self.settings = read_settings(props)
             self._bodies = Bodies(self.settings)
 
@@ -48,10 +51,16 @@ def integrator_class() -> type:
             with dr.suspend_grad():
                 make_bodies(scene, self.settings, without)
 
-        def render(self, scene: Any, *args: Any, **more: Any) -> Any:
-            self.prepare(scene)
-            with undisturbed(), dr.suspend_grad():
-                return super().render(scene, *args, **more)
+        def render(
+            self, scene: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0, develop: bool = True, evaluate: bool = True
+        ) -> Any:
+            """The image, in launches; KeyboardInterrupt between two if one was interrupted."""
+            sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+            with interruptible(), undisturbed(), dr.suspend_grad():
+                self.prepare(scene)
+                for launch in launches(sensor, seed, spp, lambda: not self.timed and self.should_stop()):
+                    super().render(scene, sensor=sensor, seed=launch.seed, spp=launch.spp, develop=True)
+                return sensor.film().develop() if develop else None
 
         def render_forward(self, scene: Any, *args: Any, **more: Any) -> Any:
             bodies = self.prepare(scene)

@@ -14,6 +14,7 @@ from typing import Any
 
 from halfspace_sss.extensions import TRANSPORTS, offered, warn_left_out
 from halfspace_sss.interface.model import models
+from halfspace_sss.interface.model_lists import check_allowed
 from halfspace_sss.once import once
 
 __all__ = ["AUTO", "choose_models", "knows_objects", "model_names", "object_transport"]
@@ -48,6 +49,7 @@ def object_transport(name: str) -> Callable | None:
     """The function that makes the transport of that name for an object; None for a half-space model."""
     if name not in _added() or name in models():
         return None
+    check_allowed(name)
     module, _, function = _added()[name].partition(":")
     return getattr(importlib.import_module(module), function)
 

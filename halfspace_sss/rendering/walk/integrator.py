@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from halfspace_sss.rendering.light.interruptible import interruptible
 from halfspace_sss.rendering.light.small import SmallEmitters
 from halfspace_sss.rendering.surface.object import same_objects
 from halfspace_sss.rendering.surface.parameters import OF_MITSUBA, check_parameters
@@ -26,7 +27,7 @@ from halfspace_sss.rendering.walk.tracing import PathTracer
 __all__ = ["camera_rays", "walk_integrator_class"]
 
 PARAMETERS = ("mm_per_unit", "max_depth", "rr_depth", "hide_emitters", "join_share")
-SAMPLES_PER_LAUNCH = 2**21
+SAMPLES_PER_LAUNCH = 2**19
 LANES = 2**14  # fastest of 2**12 to 2**18 on 2 cores
 FOREVER = 2**31 - 1
 Keep = Callable[[FirstExits], None]
@@ -69,7 +70,7 @@ def walk_integrator_class() -> type:
             """The image; `keep` is called with the first exits of each launch, which are stored for it."""
             sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
             spp = spp or sensor.sampler().sample_count()
-            with dr.suspend_grad():
+            with interruptible(), dr.suspend_grad():
                 _render(self.tracer(scene), sensor, int(mi.UInt32(seed)[0]), spp, keep)
                 return sensor.film().develop() if develop else None
 
@@ -102,7 +103,7 @@ def _refuse_derivatives(*_: Any, **__: Any) -> None:
 
 
 def _render(tracer: PathTracer, sensor: Any, seed: int, spp: int, keep: Keep | None) -> None:
-    """Fill the film of a sensor, in launches that fit into memory."""
+    """Fill the film of a sensor, in launches between which an interrupt is heard."""
     sensor.film().prepare([])
     most = max(1, SAMPLES_PER_LAUNCH // int(dr.prod(_sampled_size(sensor.film()))))
     for launch, start in enumerate(range(0, spp, most)):

@@ -1,0 +1,89 @@
+"""Ctrl-C in `mitsuba.render`: heard within about a second, with Python's handler in place afterwards."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import threading
+
+import numpy as np
+import pytest
+
+from halfspace_sss.rendering.paths import launches
+
+mi = pytest.importorskip("mitsuba")
+pytestmark = pytest.mark.skipif(os.name == "nt", reason="POSIX signals")
+
+CODE = """
+import os, signal, sys, threading, time
+from tests.rendering.test_render_interrupts import scene_of
+import mitsuba as mi
+scene = scene_of(sys.argv[1], 128)
+mi.render(scene, spp=1)
+sent = []
+def send():
+    time.sleep(float(sys.argv[2]))
+    sent.append(time.monotonic())
+    os.kill(os.getpid(), signal.SIGINT)
+threading.Thread(target=send, daemon=True).start()
+try:
+    mi.render(scene, spp=2**13).numpy()
+except KeyboardInterrupt:
+    print("heard after", time.monotonic() - sent[0])
+try:
+    os.kill(os.getpid(), signal.SIGINT)
+    time.sleep(5)
+except KeyboardInterrupt:
+    print("heard again")
+print(sys.getprofile(), mi.render(scene, spp=1).numpy().mean() > 0)
+"""
+
+
+def scene_of(integrator: str, size: int):
+    import halfspace_sss.rendering
+
+    mi.set_variant("llvm_ad_rgb")
+    halfspace_sss.rendering.register()
+    camera = mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0])
+    film = {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "gaussian"}}
+    medium = {"albedo": 0.9, "sigma_t": 2.0, "g": 0.3, "eta": 1.4}
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": integrator, "mm_per_unit": 10.0},
+            "sensor": {"type": "perspective", "to_world": camera, "film": film},
+            "object": {"type": "sphere", "bsdf": {"type": "translucent", "model": "better_dipole", **medium}},
+            "light": {"type": "constant"},
+        }
+    )
+
+
+@pytest.mark.parametrize("integrator", ["bssrdf", "translucent_walk"])
+@pytest.mark.parametrize("wait", [0.1, 1.5])
+def test_an_interrupt_is_heard_in_a_launch_and_so_is_the_next_one(integrator: str, wait: float) -> None:
+    run = [sys.executable, "-c", CODE, integrator, str(wait)]
+    done = subprocess.run(run, capture_output=True, text=True, timeout=120, cwd=os.getcwd())
+    assert done.returncode == 0, done.stderr
+    lines = [line for line in done.stdout.splitlines() if "WARN" not in line]
+    assert float(next(line for line in lines if "heard after" in line).split()[-1]) < 3  # 0.4 s alone on two cores
+    assert any("heard again" in line for line in lines) and any("None True" in line for line in lines)
+
+
+def test_images_in_many_launches_have_the_mean_of_images_in_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = scene_of("bssrdf", 16)
+    whole = np.array([mi.render(scene, spp=128, seed=k).numpy() for k in range(8)])
+    monkeypatch.setattr(launches, "SAMPLES_PER_LAUNCH", 16**2 * 32)
+    parts = np.array([mi.render(scene, spp=128, seed=100 + k).numpy() for k in range(8)])
+    means = [images.mean(axis=(1, 2, 3)) for images in (whole, parts)]
+    error = np.sqrt(sum(mean.var(ddof=1) / len(mean) for mean in means))
+    assert abs(means[0].mean() - means[1].mean()) < 4 * error  # significance 0.1 % of 14 degrees of freedom
+    assert parts.std(axis=0).mean() == pytest.approx(whole.std(axis=0).mean(), rel=0.15)  # as many samples
+
+
+def test_a_render_in_another_thread_leaves_signals_alone() -> None:
+    scene, found = scene_of("bssrdf", 8), []
+    thread = threading.Thread(target=lambda: found.append(mi.render(scene, spp=4).numpy()))
+    thread.start()
+    thread.join()
+    assert found[0].mean() > 0
