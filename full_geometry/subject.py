@@ -122,7 +122,7 @@ class Subject:
         unit = millimetres(shape) if mm_per_unit is None else mm_per_unit
         inside = equivalent(found.shape.bsdf().inside, found)
         subject = cls.surveyed(found, _in_scene_units(inside.medium, unit), inside.varying, unit)
-        check_size(subject.found, subject.media, unit)
+        check_size(subject.found, [float(m.sigma_t) for m in subject.media], unit)
         return subject
 
     def as_trained(self, medium: dict[str, Any]) -> Subject:

@@ -8,6 +8,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from halfspace_sss.rendering.light.interruptible import is_interrupt
+
 __all__ = ["SceneError", "first_cause", "plainly"]
 
 _HERE = str(Path(__file__).parents[3])
@@ -45,17 +47,23 @@ class SceneError(ValueError, RuntimeError):
 
 
 def plainly(function: Callable) -> Callable:
-    """A function of Mitsuba whose errors say first what a plugin of this project refused, as a `SceneError`."""
+    """A function of Mitsuba whose errors say first what a plugin of this project refused, as a `SceneError`.
+
+    An interrupt that Dr.Jit has wrapped is a KeyboardInterrupt again.
+    """
 
     @functools.wraps(function)
     def found(*args: Any, **more: Any) -> Any:
         try:
             return function(*args, **more)
         except RuntimeError as error:
-            if not _is_ours(error):
+            if is_interrupt(error):
+                end: BaseException = KeyboardInterrupt()
+            elif _is_ours(error):
+                end = SceneError(first_cause(error))
+            else:
                 raise
-            refused = SceneError(first_cause(error))
-        raise refused
+        raise end
 
     found.__wrapped__ = function
     return found
