@@ -55,6 +55,9 @@ class _Store:
     def boundary(self, walk: Walk, record: Any, si: Any, active: Any) -> tuple[Walk, Any]:
         return walk, record
 
+    def surface(self, walk: Walk, record: Any, si: Any, bsdf: Any, k: Any) -> tuple[Walk, Any]:
+        return walk, record
+
     def crossing(self, walk: Walk, record: Any, crossing: Crossing) -> tuple[Walk, Any]:
         import drjit as dr
 

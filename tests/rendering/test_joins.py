@@ -193,10 +193,10 @@ def test_light_behind_another_object_is_not_brought() -> None:
 
 
 def test_joins_cover_the_rays_that_come_steeply_from_an_emitter_that_looks_small() -> None:
-    def lamp(x: float, radius: float) -> dict:
-        return {"type": "sphere", "center": [x, 0, 10], "radius": radius, "emitter": {"type": "area"}}
+    def lamp(x: float, z: float, radius: float) -> dict:
+        return {"type": "sphere", "center": [x, 0, z], "radius": radius, "emitter": {"type": "area"}}
 
-    joins = joins_of({"a": lamp(0.0, 1.0), "b": lamp(20.0, 12.0), "sky": {"type": "constant"}})
+    joins = joins_of({"a": lamp(0.0, 10.0, 1.0), "b": lamp(20.0, 13.0, 12.5), "sky": {"type": "constant"}})
     assert len(joins.small.emitters) == 2
     small, large, none = 0, 1, -1
     pivot = mi.Point3f(0, 0, -1)

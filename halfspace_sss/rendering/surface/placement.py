@@ -45,12 +45,12 @@ def contents(scene: Any, objects: list[Object]) -> list[Content]:
                 continue
             alone = alone or scene_of([shape], scene)
             if _deep(holder, _points_on(alone, shared)).any():
-                found.append(Content(shape, name_of(shape), k, _holds(holder, shape, alone)))
+                found.append(Content(shape, f"the shape {name_of(shape)}", k, _holds(holder, shape, alone)))
     for emitter in scene.emitters():
         place = _place(emitter)
         for k, holder in enumerate(objects):
             if place is not None and is_inside(holder, place[:, None]).all():
-                found.append(Content(emitter, repr(emitter.id()), k, True))
+                found.append(Content(emitter, f"the emitter {emitter.id()!r}", k, True))
     return found
 
 
@@ -63,7 +63,7 @@ def check_empty(scene: Any, objects: list[Object], what: str) -> None:
     for found in contents(scene, objects)[:1]:
         raise ValueError(
             f"objects must be empty for {what}, got {found.name} {'' if found.whole else 'partly '}inside "
-            f"{objects[found.object].name}: the integrator translucent_walk traces it"
+            f"object {objects[found.object].name}: the integrator translucent_walk traces it"
         )
 
 
@@ -93,6 +93,8 @@ def _points_on(alone: Any, box: Any) -> np.ndarray:
     si = alone.ray_intersect(rays_into(box, LOOKS))
     p, met = np.array(si.p), np.array(si.is_valid())
     low, high = _corners(box)
+    slack = DEEP * np.linalg.norm(high - low)  # of flat boxes
+    low, high = low - slack, high + slack
     return p[:, met & (p.T >= low).all(axis=1) & (p.T <= high).all(axis=1)]
 
 

@@ -23,6 +23,7 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from halfspace_sss.rendering.light.small import SmallEmitters
 from halfspace_sss.rendering.surface.horizon import sided
@@ -233,5 +234,7 @@ def _on_ray(walk: Walk, event: Event, u: Any) -> tuple[Any, Any]:
 def find_joins(scene: Any, media: WalkMedia, small: SmallEmitters | None, share: float) -> Joins | None:
     """Joins with the small emitters of a scene; None without any, or without an object whose boundary is smooth."""
     if small is None or not media.objects or media.all_rough or share == 0:
+        return None
+    if media.inner is not None and not np.array(media.inner.tables["alone"]).any():
         return None
     return Joins(scene, media, small, share)

@@ -58,6 +58,9 @@ class ExitVisitor:
     def boundary(self, walk: Walk, record: Any, si: Any, active: Any) -> tuple[Walk, Any]:
         return walk, record
 
+    def surface(self, walk: Walk, record: Any, si: Any, bsdf: Any, k: Any) -> tuple[Walk, Any]:
+        return walk, record
+
     def crossing(self, walk: Walk, record: Any, crossing: Crossing) -> tuple[Walk, Any]:
         leaves = walk.alive & crossing.leaves
         to, si = self.exits, crossing.si

@@ -94,6 +94,10 @@ class FirstExitVisitor:
         walk, light = self.light.boundary(walk, record.light, si, active)
         return walk, replace(record, light=light)
 
+    def surface(self, walk: Walk, record: Watched, si: Any, bsdf: Any, k: Any) -> tuple[Walk, Watched]:
+        walk, light = self.light.surface(walk, record.light, si, bsdf, k)
+        return walk, replace(record, light=light)
+
     def crossing(self, walk: Walk, record: Watched, crossing: Crossing) -> tuple[Walk, Watched]:
         walk, light = self.light.crossing(walk, record.light, crossing)
         to, si = self.exits, crossing.si

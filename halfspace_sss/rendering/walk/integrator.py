@@ -14,12 +14,13 @@ from halfspace_sss.rendering.light.interruptible import interruptible
 from halfspace_sss.rendering.light.small import SmallEmitters
 from halfspace_sss.rendering.surface.object import same_objects
 from halfspace_sss.rendering.surface.parameters import OF_MITSUBA, check_parameters
-from halfspace_sss.rendering.surface.placement import check_sensors
+from halfspace_sss.rendering.surface.placement import check_sensors, places_of
 from halfspace_sss.rendering.surface.sharing import number_of
 from halfspace_sss.rendering.transport.body import check_size
 from halfspace_sss.rendering.walk.connect import find_joins
 from halfspace_sss.rendering.walk.first_exits import FirstExits
 from halfspace_sss.rendering.walk.guide import Guide
+from halfspace_sss.rendering.walk.lamps import Lamps
 from halfspace_sss.rendering.walk.light import LightVisitor
 from halfspace_sss.rendering.walk.media import WalkMedia
 from halfspace_sss.rendering.walk.tracing import PathTracer
@@ -52,7 +53,7 @@ def walk_integrator_class() -> type:
             self.rr_depth = _depth("rr_depth", int(props.get("rr_depth", 5)))
             self.hidden = bool(props.get("hide_emitters", False))
             self.join_share = _share("join_share", float(props.get("join_share", 0.5)))
-            self._prepared: tuple[int, list, Any] = (0, [], None)
+            self._prepared: tuple[int, list, tuple, Any] = (0, [], ([], []), None)
 
         def tracer(self, scene: Any) -> PathTracer:
             """What paths through a scene need; its objects are made ready once, its emitters may have been edited."""
@@ -60,7 +61,7 @@ def walk_integrator_class() -> type:
             media, small = self._prepared[-1], SmallEmitters.of(scene)
             joins = find_joins(scene, media, small, self.join_share)
             guide = joins and Guide(scene, media, small)
-            visitor = LightVisitor(scene, media, small, joins, guide)
+            visitor = LightVisitor(scene, media, small, joins, guide, Lamps.of(media))
             return PathTracer(visitor, self.max_depth, self.rr_depth, self.hidden)
 
         def render(
@@ -85,17 +86,18 @@ def walk_integrator_class() -> type:
     return TranslucentWalk
 
 
-def _prepared(scene: Any, before: tuple, mm_per_unit: float) -> tuple[int, list, Any]:
-    """Number, shapes and media of a scene: those of before, unless its objects, their shape or media changed."""
+def _prepared(scene: Any, before: tuple, mm_per_unit: float) -> tuple[int, list, tuple, Any]:
+    """Number, shapes, places and media of a scene: those of before, unless shapes, lamps or media changed."""
     shapes = scene.shapes()  # the scene itself, which holds its integrator, would never be freed
-    same = before[0] == number_of(scene) and same_objects(before[1], shapes)
-    if before[2] is not None and same and before[2].is_current():
+    places = places_of(scene)
+    same = before[0] == number_of(scene) and same_objects(before[1], shapes) and before[2][0] == places[0]
+    if before[3] is not None and same and before[3].is_current():
         return before
     media = WalkMedia.of(scene, mm_per_unit)
     check_sensors(scene, media.objects)
     for found, inside in zip(media.objects, media.insides):
         check_size(found, [mm_per_unit * float(m.sigma_t) for m in inside.channels()], mm_per_unit)
-    return number_of(scene), shapes, media
+    return number_of(scene), shapes, places, media
 
 
 def _refuse_derivatives(*_: Any, **__: Any) -> None:

@@ -16,6 +16,8 @@ import mitsuba as mi
 from halfspace_sss.rendering.light.small import NARROW, WIDE, SmallEmitters
 from halfspace_sss.rendering.walk.connect import Joins
 from halfspace_sss.rendering.walk.guide import Departure, Guide
+from halfspace_sss.rendering.walk.inside import eval_phase
+from halfspace_sss.rendering.walk.lamps import Lamps
 from halfspace_sss.rendering.walk.media import WalkMedia
 from halfspace_sss.rendering.walk.steps import Crossing, Event, Walk, draw
 
@@ -48,6 +50,7 @@ class LightVisitor:
         small: its small emitters, if there are any.
         joins: how light of small emitters enters objects, if it is looked for.
         guide: how it leaves them where joins cannot find it.
+        lamps: delta lights inside objects, if there are any.
     """
 
     scene: Any
@@ -55,12 +58,18 @@ class LightVisitor:
     small: SmallEmitters | None
     joins: Joins | None
     guide: Guide | None
+    lamps: Lamps | None = None
 
     def event(self, walk: Walk, record: Light, event: Event) -> tuple[Walk, Light]:
         record = replace(record, scattered=mi.Bool(True))
+        if self.lamps is not None:
+            at = dr.zeros(mi.Interaction3f)
+            at.p = event.p
+            d, E = self.lamps.light(walk.object, at, walk.rng, True)
+            record = replace(record, L=record.L + walk.weight * eval_phase(event.m, dr.dot(event.along, d)) * E)
         if self.joins is None:
             return walk, record
-        smooth = ~self.media.row("rough", walk.object)
+        smooth = self.media.connects(walk.object)
         edge = record.straight & smooth & (walk.order > 0)  # this event ends one
         joined = record.joined | edge
         record = replace(record, joined=joined, pivot=dr.select(edge, event.p, record.pivot))
@@ -86,8 +95,23 @@ class LightVisitor:
         light = self.sampled_emitter(walk, si, self.media.boundary(walk.object), active)
         return walk, replace(record, L=record.L + light)
 
+    def surface(self, walk: Walk, record: Light, si: Any, bsdf: Any, k: Any) -> tuple[Walk, Light]:
+        """Light that the surface emits, of which nothing was sampled, and of the lamps that light it."""
+        emitter = si.emitter(self.scene)
+        shines = si.is_valid() & (k != walk.object) & (emitter != None)  # noqa: E711
+        L = record.L + dr.select(shines, walk.weight * emitter.eval(si, shines), 0)
+        if self.lamps is not None:
+            lit = (k < 0) & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+            d, E = self.lamps.light(walk.object, si, walk.rng, lit)
+            L = L + dr.select(lit, walk.weight * bsdf.eval(mi.BSDFContext(), si, si.to_local(d), lit) * E, 0)
+        return walk, replace(record, L=L)
+
     def crossing(self, walk: Walk, record: Light, crossing: Crossing) -> tuple[Walk, Light]:
         record = replace(record, last=crossing.si.p, pdf=crossing.pdf, delta=crossing.delta)
+        if self.media.inner is not None:
+            sampled = (self.media.index_of(crossing.si.shape) < 0) & ~crossing.delta
+            record = replace(record, delta=crossing.delta | ~crossing.leaves, scattered=record.scattered | sampled,
+                             L=record.L + self.spread_lamps(walk, record.scattered & ~sampled))  # fmt: skip
         if self.joins is None:
             return walk, record
         straight = record.straight & crossing.leaves
@@ -137,6 +161,14 @@ class LightVisitor:
             _, _, share, _ = dr.if_stmt(state, guided, self._against_guide, lambda *state: state)
             L = L * share
         return dr.select(active, walk.weight * L * n, 0)
+
+    def spread_lamps(self, walk: Walk, active: Any) -> Any:
+        """Light of a lamp inside an object whose cone holds the ray, from a vertex that it was not sampled at."""
+        if self.lamps is None:
+            return mi.Spectrum(0)
+        ray = mi.Ray3f(walk.o + walk.d * walk.skip, walk.d)
+        active = active & walk.alive & (walk.object >= 0)
+        return dr.select(active, walk.weight * self.lamps.spread(walk.object, ray, walk.rng, active), 0)
 
     def sampled_emitter(self, walk: Walk, si: Any, bsdf: Any, active: Any, outwards: Any = True) -> Any:
         """Light of a sampled emitter by the surface at `si`; by a boundary only from its outer side."""

@@ -14,6 +14,7 @@ from halfspace_sss.rendering.surface.object import Object, survey
 from halfspace_sss.rendering.surface.placement import translucent_shapes
 from halfspace_sss.rendering.surface.sharing import check_together, scene_of
 from halfspace_sss.rendering.walk.grids import Grids, per_channel
+from halfspace_sss.rendering.walk.inner import Inner
 
 __all__ = ["Coefficients", "WalkMedia", "by_pointer", "pointer_numbers"]
 
@@ -41,6 +42,7 @@ class WalkMedia:
         scene: a Mitsuba scene that holds these objects only.
         boundaries: dielectric BSDF of each.
         mm_per_unit: length of a scene unit, mm.
+        inner: what lies inside the objects, if anything does.
     """
 
     objects: list[Object]
@@ -48,6 +50,7 @@ class WalkMedia:
     scene: Any
     boundaries: list[Any]
     mm_per_unit: float
+    inner: Inner | None = None
 
     def __post_init__(self) -> None:
         media = [inside.medium for inside in self.insides]
@@ -98,6 +101,13 @@ class WalkMedia:
     def all_rough(self) -> bool:
         """Whether no boundary is smooth."""
         return all(is_rough(b) for b in self.boundaries)
+
+    def connects(self, k: Any) -> Any:
+        """Whether emitters can be connected to events in object k through its boundary: smooth, and nothing inside."""
+        smooth = ~self.row("rough", k)
+        if self.inner is None:
+            return smooth
+        return smooth & dr.gather(mi.Bool, self.inner.tables["alone"], self._place(k))
 
     def row(self, key: str, k: Any) -> Any:
         """An entry of a table for object k."""
@@ -199,13 +209,14 @@ class WalkMedia:
         """The objects of a scene whose surface is `translucent`.
 
         Raises:
-            ValueError: mm_per_unit is not a finite number > 0, or an object is an instance.
+            ValueError: mm_per_unit is not a finite number > 0, an object is an instance, or as `Inner.of`.
         """
         if not (np.isfinite(mm_per_unit) and mm_per_unit > 0):
             raise ValueError(f"mm_per_unit must be finite and > 0, got {mm_per_unit!r}")
         shapes = translucent_shapes(scene)
         inner, objects = scene_of(shapes, scene), [survey(shape, scene) for shape in shapes]
-        check_together(scene, [inner, *(obj.scene for obj in objects)])
+        found = Inner.of(scene, objects)
+        check_together(scene, [inner, *([found.scene] if found else []), *(obj.scene for obj in objects)])
         surfaces = [shape.bsdf() for shape in shapes]
         return cls(
             objects,
@@ -213,6 +224,7 @@ class WalkMedia:
             inner,
             [surface.boundary for surface in surfaces],
             float(mm_per_unit),
+            found,
         )
 
 

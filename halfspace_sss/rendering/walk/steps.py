@@ -62,7 +62,7 @@ class Crossing:
 
     si: mi.SurfaceInteraction3f  # with the normals outwards
     along: mi.Vector3f  # direction of arrival
-    leaves: mi.Bool  # or is reflected
+    leaves: mi.Bool  # all objects, or is reflected
     pdf: mi.Float  # density of the new direction, 1/sr
     delta: mi.Bool  # whether that direction was the only one
 
@@ -75,6 +75,9 @@ class Visitor(Protocol):
 
     def boundary(self, walk: Walk, record: Any, si: Any, active: Any) -> tuple[Walk, Any]:
         """At the boundary from inside, where the walk may leave if `active`."""
+
+    def surface(self, walk: Walk, record: Any, si: Any, bsdf: Any, k: Any) -> tuple[Walk, Any]:
+        """At a surface inside an object: that of object k, or of something else if k < 0."""
 
     def crossing(self, walk: Walk, record: Any, crossing: Crossing) -> tuple[Walk, Any]:
         """After reflection at the boundary or refraction through it; `walk` is on its way again."""
@@ -100,7 +103,7 @@ class Walker:
         m, u = media.coefficients(walk.object, walk.o), None
         t = free_path(m, walk.channel, rng.next_float32())
         ray, p = walk.ray(t), mi.Point3f(walk.o + walk.d * t)
-        hit = media.scene.ray_intersect_preliminary(ray, coherent=False)
+        hit = (media.inner or media).scene.ray_intersect_preliminary(ray, coherent=False)
         if media.varies:
             m, u = media.coefficients(walk.object, p), rng.next_float32()
         flight = fly(m, walk.weight, walk.density, walk.channel, t, hit.t + walk.skip, u)
@@ -112,7 +115,8 @@ class Walker:
             walk = replace(walk, o=o, skip=skip, alive=walk.alive & (~flight.null | media.box.contains(o)))
             walk.object = dr.select(walk.alive, walk.object, OUTSIDE)
         walk, record = dr.if_stmt((walk, record, event), flight.scatters, self._scatter, _pass, label="scatter")
-        return dr.if_stmt((walk, record, ray, hit), meets, self._meet, _pass, label="boundary")
+        meet = self._meet if media.inner is None else self._meet_inside
+        return dr.if_stmt((walk, record, ray, hit), meets, meet, _pass, label="boundary")
 
     def _scatter(self, walk: Walk, record: Any, event: Event) -> tuple[Walk, Any]:
         walk, record = self.visitor.event(walk, record, event)
@@ -149,6 +153,38 @@ class Walker:
                        scale=walk.scale * dr.select(foreign, 1, dr.square(bs.eta)))  # fmt: skip
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta) | turned
         return self.visitor.crossing(walk, record, Crossing(si, mi.Vector3f(ray.d), out, bs.pdf, delta))
+
+    def _meet_inside(self, walk: Walk, record: Any, ray: Any, hit: Any) -> tuple[Walk, Any]:
+        """The same where something lies inside: reflection or refraction at any surface, into what is on that side."""
+        media, inner, k = self.media, self.media.inner, walk.object
+        si = hit.compute_surface_interaction(ray, mi.RayFlags.All)
+        met, around = media.index_of(si.shape, si.is_valid()), inner.around(si.shape)
+        own, nested, plain = met == k, (met >= 0) & (met != k), met < 0
+        si = media.seen(si, met, ray.d)
+        refracts = plain & inner.displaces(si.shape)
+        inwards = dr.dot(si.n, ray.d) < 0
+        leaked = (own & inwards) | ((nested | refracts) & (~inwards | (around != k)))  # rounding has put the walk there
+        boundary = media.boundary(dr.maximum(met, 0))
+        boundary = boundary if isinstance(boundary, mi.BSDFPtr) else mi.BSDFPtr(boundary)
+        bsdf = dr.select(plain, si.bsdf(), boundary)
+        walk, record = self.visitor.surface(walk, record, si, bsdf, met)
+        walk, record = self.visitor.boundary(walk, record, si, own & (around < 0))
+        bs, value = sample_bsdf(bsdf, si, walk.rng)
+        d, turned = sided(si, bs.wo)
+        d = dr.select(plain, si.to_world(bs.wo), d)
+        through = (mi.Frame3f.cos_theta(bs.wo) * mi.Frame3f.cos_theta(si.wi) < 0) & ~mi.has_flag(
+            bs.sampled_type, mi.BSDFFlags.Null
+        )
+        to = dr.select(own, around, dr.select(nested, met, dr.select(refracts, OUTSIDE, k)))
+        to = dr.select(through, to, k)
+        alive = si.is_valid() & ~leaked & (bs.pdf > 0) & (dr.max(value) > 0)
+        o, skip = media.depart(k, si, d, to >= 0)
+        walk = replace(walk, o=o, d=d, skip=skip, alive=alive, object=dr.select(alive, to, OUTSIDE),
+                       weight=walk.weight * value, scale=walk.scale * dr.square(bs.eta),
+                       order=dr.select(through & nested, 0, walk.order))  # fmt: skip
+        delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta) | (turned & ~plain)
+        leaves = own & through & (around < 0)
+        return self.visitor.crossing(walk, record, Crossing(si, mi.Vector3f(ray.d), leaves, bs.pdf, delta))
 
 
 def _pass(walk: Walk, record: Any, *rest: Any) -> tuple[Walk, Any]:

@@ -100,7 +100,12 @@ class PathTracer:
             boundary = media.boundary(near)
             bsdf = dr.select(translucent, boundary if isinstance(boundary, mi.BSDFPtr) else mi.BSDFPtr(boundary), bsdf)
         mute = translucent & ~media.row("reflects", near) if media.objects else mi.Bool(False)
-        L = light.L + self.visitor.sampled_emitter(walk, si, bsdf, ~mute, translucent)
+        lit = ~mute
+        if media.inner is not None:
+            around = media.inner.around(si.shape)
+            encloses = ~translucent & (around >= 0) & media.inner.displaces(si.shape) & (dr.dot(walk.d, si.n) > 0)
+            lit &= ~encloses  # emitters on its other side are behind a medium
+        L = light.L + self.visitor.sampled_emitter(walk, si, bsdf, lit, translucent)
         bs, value = sample_bsdf(bsdf, si, rng)
         d, turned = sided(si, bs.wo)
         d, turned = dr.select(translucent, d, si.to_world(bs.wo)), turned & translucent
@@ -114,6 +119,9 @@ class PathTracer:
         channel = walk.channel
         if len(weight) > 1:  # drawn once in a path, whose densities are counted from there
             channel = dr.select(p.depth == 1, _channel(u, len(weight)), channel)
+        if media.inner is not None:  # from glass inside an object
+            returns = encloses & (dr.dot(d, si.n) > 0)
+            k, enters = dr.select(returns, around, k), enters | returns
         o, skip = media.depart(near, si, d, enters) if media.objects else (si.spawn_ray(d).o, walk.skip)
         walk = replace(walk, o=o, d=d, skip=skip, alive=alive, order=dr.select(enters, 0, walk.order),
                        object=dr.select(alive & enters, k, OUTSIDE), weight=weight, scale=scale,
@@ -121,6 +129,10 @@ class PathTracer:
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta) | turned
         scattered = light.scattered | ~delta
         light = replace(light, L=L, last=si.p, pdf=bs.pdf, delta=delta, scattered=scattered)
+        if media.inner is not None:
+            light = replace(
+                light, delta=delta | enters | encloses, L=L + self.visitor.spread_lamps(walk, scattered & enters)
+            )
         return replace(p, walk=walk, light=light)
 
 
