@@ -160,6 +160,10 @@ INSIDE: dict[str, Callable[[], tuple[dict, str]]] = {
         {"wick": {"type": "cylinder", "p1": [0, 6, 0], "radius": 0.3}},
         "'wick' partly inside object 'wax'",
     ),
+    "blade": lambda: (
+        {"blade": {"type": "rectangle", "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], 80).scale([2, 0.004, 1])}},
+        "'blade' inside object 'wax'",
+    ),
     "wall": lambda: ({"wall": {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(400)}}, "'wall' partly"),
 }
 

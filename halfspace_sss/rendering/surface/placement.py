@@ -89,13 +89,31 @@ def _corners(box: Any) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _points_on(alone: Any, box: Any) -> np.ndarray:
-    """Points of the shape in a scene of its own that rays into a box meet first, in the box: shape (3, n)."""
+    """Points in a box, of the shape in a scene of its own: shape (3, n).
+
+    Points that rays into the box meet first, and points by area, without which wires are missed.
+    """
     si = alone.ray_intersect(rays_into(box, LOOKS))
-    p, met = np.array(si.p), np.array(si.is_valid())
+    p = np.concatenate([np.array(si.p)[:, np.array(si.is_valid())], _points_by_area(alone)], axis=1)
     low, high = _corners(box)
     slack = DEEP * np.linalg.norm(high - low)  # of flat boxes
     low, high = low - slack, high + slack
-    return p[:, met & (p.T >= low).all(axis=1) & (p.T <= high).all(axis=1)]
+    return p[:, (p.T >= low).all(axis=1) & (p.T <= high).all(axis=1)]
+
+
+def _points_by_area(alone: Any) -> np.ndarray:
+    """Points drawn by area, shape (3, n); none of shapes that cannot be drawn from, such as curves and instances."""
+    import mitsuba as mi
+
+    u = np.random.default_rng(19).random((2, LOOKS)).astype(np.float32)
+    points = []
+    for shape in alone.shapes():
+        try:
+            drawn = shape.sample_position(0.0, mi.Point2f(u))
+        except (RuntimeError, NotImplementedError):
+            continue
+        points.append(np.array(drawn.p).reshape(3, -1))
+    return np.concatenate(points or [np.zeros((3, 0))], axis=1)
 
 
 def _deep(holder: Object, points: np.ndarray) -> np.ndarray:
