@@ -254,7 +254,7 @@ def test_errors_of_models_are_asked_by_name(trained: Trained) -> None:
 def test_an_object_of_a_scene_is_found_by_its_id() -> None:
     rendering.register()
     surface = {"type": "translucent", "sigma_s": "0.95,0.8,0.6", "sigma_a": "0.05,0.2,0.4", "eta": 1.4}
-    one, two = ({"type": "sphere", "radius": r, "bsdf": surface} for r in (1.0, 2.0))
+    one, two = ({"type": "sphere", "radius": r, "center": [4 * r, 0, 0], "bsdf": surface} for r in (1.0, 2.0))
     scene = mi.load_dict({"type": "scene", "one": one, "two": two})
     with pytest.raises(ValueError, match="one of one, two, got None"):
         Subject.given(scene, None)

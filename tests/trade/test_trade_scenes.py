@@ -131,7 +131,7 @@ def test_ten_objects_are_assessed_one_by_one() -> None:
 
 def test_an_object_behind_another_is_refused_in_a_sentence() -> None:
     hidden = scene()
-    hidden["ball1"] = {**hidden["ball0"], "center": [0, 0, -1.0], "radius": 0.3}
+    hidden["ball1"] = {**hidden["ball0"], "center": [0, 0, -1.5], "radius": 0.3}
     found = recommend(hidden, models=["lambert"], **QUICK_ASSESS).objects[1]
     assert found.way is None and "hardly seen by the camera" in str(found)
 

@@ -52,7 +52,7 @@ def faces_of(shape: Any, name: str) -> Faces | None:
     corners = place.reshape(-1)[faces]
     a, b, c = positions[faces].transpose(1, 0, 2)
     normals = 0.5 * np.cross(b - a, c - a)
-    first, second, same = _neighbours(corners)
+    first, second, same = _neighbours(corners, np.linalg.norm(normals, axis=1) > 0)
     if same.all():
         return Faces(corners, normals, _pieces(corners), None)
     pieces, sides = _turned(len(faces), first, second, same, name)
@@ -116,8 +116,11 @@ def _vertex_normals(positions: np.ndarray, vertex: np.ndarray, normals: np.ndarr
     return unit(found)
 
 
-def _neighbours(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pairs of faces that share an edge which no third one has, and whether they run along it in opposite ways."""
+def _neighbours(corners: np.ndarray, solid: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pairs of faces that share an edge which no third one has, and whether they run along it in opposite ways.
+
+    Faces without area, which are not `solid`, have no side to agree with.
+    """
     start, end = corners.ravel(), np.roll(corners, -1, axis=1).ravel()
     face = np.repeat(np.arange(len(corners)), 3)
     low, high = np.minimum(start, end), np.maximum(start, end)
@@ -127,6 +130,7 @@ def _neighbours(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray
     new[1:-1] = (np.diff(low) != 0) | (np.diff(high) != 0)
     edge = np.flatnonzero(new)
     pair = order[edge[:-1][(np.diff(edge) == 2) & (low[edge[:-1]] != high[edge[:-1]])][:, None] + [0, 1]]
+    pair = pair[solid[face[pair]].all(axis=1)]
     return face[pair[:, 0]], face[pair[:, 1]], start[pair[:, 0]] != start[pair[:, 1]]
 
 

@@ -65,6 +65,10 @@ class PositionSampler:
         """Number of probes."""
         return int(self.area_share < 1)
 
+    def _side(self, out: Exit, prim_index: Any, active: Any) -> Any:
+        """What turns the normal of a face outwards: of a sheet, to the side of the exit."""
+        return self.found.side(prim_index, active) if self.found.closed else out.sign
+
     def density(self, p: Any, n: Any, out: Exit, axes: Any) -> Any:
         """Density of candidates over the surface at p with normal n, for each that is drawn, 1/(scene unit)²."""
         return self._candidates(p, n, out, axes) * number(1 / (self.probes + self.area_points))
@@ -133,7 +137,7 @@ class PositionSampler:
             si = self.found.scene.ray_intersect(ray, _FLAGS(), False, active)
             active &= si.is_valid() & (left > 0)
             same = self.found.piece(si.prim_index, active) == piece
-            side = self.found.side(si.prim_index, active & same)
+            side = self._side(out, si.prim_index, active & same)
             at = (si.p, si.n, turned(si.sh_frame.n, si.n) * side, si.prim_index)
             kept = self._offer(_Kept(*kept), at, out, axes, active & same)
             onward = si.spawn_ray(ray.d)
@@ -151,7 +155,7 @@ class PositionSampler:
             v = mi.Point2f(*(_wrapped(x + k * ratio) for x, ratio in zip((u.x, u.y), LATTICE)))
             at = self.points.sample(_wrapped(u_face + k * inverse), v, active)
             same = self.found.piece(at.prim_index, active) == piece
-            side = self.found.side(at.prim_index, active & same)
+            side = self._side(out, at.prim_index, active & same)
             point = (at.p, at.n, turned(at.n_shading, at.n) * side, at.prim_index)
             return k + 1, tuple(self._offer(_Kept(*kept), point, out, axes, active & same))
 
