@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 from full_geometry.subject import Subject, SurfacePoint, surface_point
 from halfspace_sss.checks import check_count
 from halfspace_sss.rendering.walk.exits import Start, walk_from
-from halfspace_sss.rendering.walk.steps import Crossing, Event, Walk
+from halfspace_sss.rendering.walk.random_walk import Crossing, Event, Walk
 
 __all__ = ["LANES", "Exits", "trace_exits"]
 
