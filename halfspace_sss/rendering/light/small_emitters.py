@@ -23,7 +23,7 @@ import numpy as np
 __all__ = ["NARROW", "SmallEmitters", "Sun", "WIDE", "is_delta", "spread", "suns_of"]
 
 
-# Suns of an environment: small cones of directions from which much of its light comes
+# ---- Suns of an environment map ------------------------------------------------------------------------------------
 
 SAMPLES = 160  # squared
 MOST = 8  # suns

@@ -108,7 +108,7 @@ def undisturbed() -> Iterator[None]:
             gc.enable()
 
 
-# An image in launches that last about a second at most, between which an interrupt is heard
+# ---- Launches of an image, between which an interrupt is heard -----------------------------------------------------
 
 SAMPLES_PER_LAUNCH = 2**20  # half a second on 2 cores
 
@@ -151,7 +151,7 @@ def _seed(seed: int, k: int) -> int:
     return seed if k == 0 else int(np.random.SeedSequence([seed, k]).generate_state(1)[0])
 
 
-# What a render can be differentiated by, and Mitsuba's machinery of forward and backward passes around a replay
+# ---- Derivatives: Mitsuba's radiative backpropagation around a replay of the paths ---------------------------------
 
 GEOMETRY = ("to_world", "vertex_positions", "vertex_normals", "vertex_texcoords")
 

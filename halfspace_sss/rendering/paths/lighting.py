@@ -54,7 +54,7 @@ def balance(pdf: Any, other: Any) -> Any:
     return dr.select(total > 0, pdf / dr.maximum(total, 1e-30), 0)
 
 
-# The mean light of the sky as a control variate, for transports that know what they are under even light
+# ---- Mean radiance of the sky as a control variate -----------------------------------------------------------------
 
 DIRECTIONS = 128  # squared
 MOST_LEFT = 0.5  # of the mean square of the radiance, once c is taken from it
@@ -99,7 +99,7 @@ def _towards(emitter: Any, d: Any) -> Any:
     return ds
 
 
-# What is written down along a path: its light, or, when it is gone through again, what derivatives its light has
+# ---- Path tally, and its replay for derivatives --------------------------------------------------------------------
 
 Books = tuple[Any, Any]  # radiance so far, or in a replay still to come; its derivative, or adjoint; spectra
 
@@ -159,7 +159,7 @@ class Replay:
         return L, d + dr.forward_to(value)
 
 
-# What every path needs to know: the scene, its lights and bodies, the settings, and how its light is written down
+# ---- What every path needs -----------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)

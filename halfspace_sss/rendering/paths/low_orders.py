@@ -139,7 +139,7 @@ def _surface_steps(si: Any, dx: Any) -> tuple[Any, Any]:
     return (c * p - b * q) * inverse, (a * q - b * p) * inverse
 
 
-# Orders 0 and 1 of the light inside an object, exactly: a walk that is scattered at most once
+# ---- Scattering orders 0 and 1 -------------------------------------------------------------------------------------
 
 MOST_LEGS = 256
 FAINT = 0.1  # weight below which a scattered walk may end

@@ -37,7 +37,7 @@ __all__ = [
 ]
 
 
-# Which events are taken at the surface of a translucent object: by what each is expected to bring
+# ---- Choice of event at a translucent surface ----------------------------------------------------------------------
 
 LEAST_REFLECTION = 0.05  # probability of reflection where there is light to come; Fresnel's is 0.04 face on
 LEAST_FEW, MOST_FEW = 0.03, 0.95
@@ -101,7 +101,7 @@ def exit_at(body: Body, si: Any) -> Exit:
     return Exit(mi.Point3f(si.p), n * sign, w, sign, n_face * sign)
 
 
-# Light that entered a body elsewhere and comes out here by its transport: N entries are drawn, and one is followed
+# ---- BSSRDF: entry points by resampled importance sampling ---------------------------------------------------------
 
 
 class _Exit(NamedTuple):
@@ -184,7 +184,7 @@ def _candidate(world: World, body: Body, exit: _Exit, aims: Any, sampler: Any, a
     return Candidate(p, n, d, value, pdf, aim, delta, target, light, hope, aims, sky)
 
 
-# What may happen at a surface point: its BSDF, or in a translucent object light that entered elsewhere
+# ---- Events at a vertex --------------------------------------------------------------------------------------------
 
 
 class Onward(NamedTuple):
@@ -282,7 +282,7 @@ def few(world: World, body: Body, leg: Leg, sampler: Any, scattered: Any, active
     return on, direct
 
 
-# What happens at a vertex of a path: which events are taken, and what each of them brings
+# ---- One vertex ----------------------------------------------------------------------------------------------------
 
 
 class Vertex(NamedTuple):

@@ -250,7 +250,7 @@ def find_joins(scene: Any, media: WalkMedia, small: SmallEmitters | None, share:
     return Joins(scene, media, small, share)
 
 
-# Light of small emitters that leaves an object right after an event: directions drawn about the one that hits
+# ---- Connections from inside to small emitters ---------------------------------------------------------------------
 
 GUESSES = 3
 SHARES = (0.5, 0.3, 0.2)  # of the lobes
@@ -350,7 +350,7 @@ def _draw_lobe(guess: Any, concentration: Any, rng: Any) -> tuple[Any, Any]:
     return d, _lobes(1 - x, concentration)
 
 
-# Delta lights in the medium of an object, by which scattering events and surfaces there are lit
+# ---- Delta lights inside objects -----------------------------------------------------------------------------------
 
 NEAREST = 0.2  # mean free paths, r
 CONE = 0.15  # radius of the cone, radians; light that a medium scatters beside it hides more

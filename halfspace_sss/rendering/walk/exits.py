@@ -186,7 +186,7 @@ def _enter(media: WalkMedia, k: Any, start: Start, index: Any, rng: Any) -> Walk
                    skip=media.clear(k, si.n, d), scale=dr.square(bs.eta), channel=channel)  # fmt: skip
 
 
-# First exits of paths from the camera: while walks gather light for an image, where they leave is kept for learning
+# ---- First exits of paths from the camera --------------------------------------------------------------------------
 
 
 @dataclass

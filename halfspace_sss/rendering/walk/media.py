@@ -19,7 +19,7 @@ from halfspace_sss.rendering.surface.varying import VaryingMedium, eval_volume
 __all__ = ["Coefficients", "Grids", "Inner", "WalkMedia", "by_pointer", "per_channel", "pointer_numbers"]
 
 
-# What lies inside translucent objects, as walks meet it: which medium is on either side of a surface there
+# ---- Shapes, media and lights inside objects -----------------------------------------------------------------------
 
 REFRACTS = int(mi.BSDFFlags.DeltaTransmission) | int(mi.BSDFFlags.GlossyTransmission)
 
@@ -125,7 +125,7 @@ def _check(found: list[Content], objects: list[Object]) -> None:
                 )
 
 
-# Media that vary in space, as walks see them: coefficients at a point, majorants, transmittance
+# ---- Heterogeneous media -------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)

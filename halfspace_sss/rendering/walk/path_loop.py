@@ -29,7 +29,7 @@ from halfspace_sss.tracing.walk import generator, pass_seed
 __all__ = ["Light", "LightVisitor", "PathTracer", "power_heuristic", "start_light"]
 
 
-# Light that paths from the camera gather inside objects: the visitor of walks for images
+# ---- Light gathered along a path -----------------------------------------------------------------------------------
 
 
 @dataclass

@@ -39,7 +39,7 @@ __all__ = [
 ]
 
 
-# One step of the random walk inside an object, with spectral multiple importance sampling
+# ---- Free flight, scattering and roulette with spectral MIS --------------------------------------------------------
 
 
 class Flight(NamedTuple):
