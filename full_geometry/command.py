@@ -20,8 +20,6 @@ from halfspace_sss.progress import NamedProgress
 from halfspace_sss.rendering.scenes.learners import LearntObject, ObjectError
 from halfspace_sss.rendering.surface.transports import model_names
 
-__all__ = ["cost", "errors", "train", "untrained"]
-
 
 def untrained(scene: Any) -> list[str]:
     """Ids of the objects of a scene that have this model and no weights yet; none without torch, which learns them.

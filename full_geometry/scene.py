@@ -31,9 +31,6 @@ from halfspace_sss.rendering.transport.protocols import Entry, Means
 from halfspace_sss.rendering.transport.radial_table import RadialTable
 from halfspace_sss.rendering.transport.settings import AUTOMATIC, Settings
 
-__all__ = ["LearntTransport", "learnt_means", "shape_means", "warn_out_of_range"]
-
-
 FINE = 2.5  # transport mean free paths of the radius of a patch, up to which patches do without probes
 PATCH_SHARE = 0.2  # of the entries where patches are larger: they reach what probes miss
 SAMPLERS = "halfspace_sss.samplers"  # entry points: a function of `Learnt`, with arrays of its own, and a sign

@@ -15,6 +15,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import torch
 
@@ -29,9 +31,6 @@ from full_geometry.object.patches import Patches, PatchSampler, PatchWeights, cl
 from full_geometry.object.subject import Subject, SurfacePoint
 from halfspace_sss.neural.perceptron import Perceptron
 from halfspace_sss.rendering.transport.plane import number
-
-__all__ = ["AlphaP", "PreparedAlphaP", "fit_alpha_p"]
-
 
 CLEAR = 1e-4  # of the size of the object: where the ray that finds a face begins
 
@@ -64,9 +63,6 @@ class AlphaP:
 
     def _face(self, at: SurfacePoint, active: Any) -> tuple[Any, Any]:
         """The face that a point lies on, as a short ray from outside meets it, and where there is one."""
-        import drjit as dr
-        import mitsuba as mi
-
         clear = number(CLEAR * self.subject.found.size)
         ray = mi.Ray3f(mi.Point3f(at.p + at.n * clear), mi.Vector3f(-at.n))
         ray.maxt = 2 * clear
@@ -83,8 +79,6 @@ class AlphaP:
 
     def prepare(self, at: SurfacePoint, active: Any = True) -> PreparedAlphaP:
         """alpha and the weights of patches of an exit."""
-        import drjit as dr
-
         side = Side(at, first_event(self.subject, at, active))
         features = side_features(self.sampler.frame, side)
         alpha = dr.exp(self._log_alpha(features)[0])
@@ -99,9 +93,6 @@ class AlphaP:
             active: mask of lanes.
                 face: of the entry; found by a ray if it is not given.
         """
-        import drjit as dr
-        import mitsuba as mi
-
         if face is None:
             face, active = self._face(at, active)
         sampler = self.sampler

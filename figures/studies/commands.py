@@ -15,8 +15,6 @@ from halfspace_sss.provenance import check_folder, write_atomically, write_toget
 if TYPE_CHECKING:
     import pandas
 
-__all__ = ["TABLES", "markdown", "rivals_command", "shapes_command"]
-
 
 # ---- Tables of samplers, of models and of base models of one object --------------------------------
 

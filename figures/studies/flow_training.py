@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import torch
 import zuko
@@ -28,21 +30,6 @@ from halfspace_sss.rendering.surface.horizon import cosine_above
 from halfspace_sss.rendering.transport.plane import number, place
 from halfspace_sss.rendering.transport.protocols import Entry
 from halfspace_sss.tracing.walk import generator, pass_seed
-
-__all__ = [
-    "HIDDEN",
-    "LIGHTINGS",
-    "FlowNetwork",
-    "FlowRecipe",
-    "Lighting",
-    "Schedule",
-    "Walks",
-    "fit_flow",
-    "fit_patches",
-    "flow_walks",
-    "lighting",
-]
-
 
 # ---- Training of conditional flows by zuko: -E[T log p(x | context)] over walks --------------------
 
@@ -113,9 +100,6 @@ class Lighting:
 
     def sample(self, entry: Any, u: Any, active: Any) -> tuple[Any, Any]:
         """w_i at an entry, and the light from there over its density: 0 in the shadow."""
-        import drjit as dr
-        import mitsuba as mi
-
         w, value, distance = self.aim(entry, u)
         ray = place(entry.p, mi.Normal3f(entry.n * number(self.subject.found.sign))).spawn_ray(w)
         ray.maxt = distance
@@ -129,9 +113,6 @@ def lighting(name: str, subject: Subject) -> Lighting:
     Raises:
         ValueError: there is no such kind.
     """
-    import drjit as dr
-    import mitsuba as mi
-
     if name not in LIGHTINGS:
         raise ValueError(f"lighting must be one of {', '.join(LIGHTINGS)}, got {name!r}")
     towards = mi.Vector3f(*TOWARDS.tolist())
@@ -154,8 +135,6 @@ def lighting(name: str, subject: Subject) -> Lighting:
 
 def _above(subject: Subject) -> np.ndarray:
     """A point near the part of the surface that lies farthest towards the light."""
-    import mitsuba as mi
-
     from halfspace_sss.tracing.walk import generator, pass_seed
 
     p = np.array(subject.random_points(generator(mi, 4096, pass_seed(23))).p)
@@ -204,9 +183,6 @@ def flow_walks(
         seed: of the pass.
         light: that falls on the object: one sample of it at each end, times mu_i, is multiplied to T.
     """
-    import drjit as dr
-    import mitsuba as mi
-
     rng = generator(mi, n, pass_seed(*seed, 0))
     starts = subject.random_points(rng)
     exits = trace_exits(subject, starts, (*seed, 1))
@@ -235,8 +211,6 @@ def flow_walks(
 
 def _rows(columns: list[Any], n: int) -> np.ndarray:
     """(n, columns) float32."""
-    import drjit as dr
-
     dr.eval(columns)
     return np.ascontiguousarray(np.stack([np.broadcast_to(c.numpy(), n) for c in columns], axis=1))
 

@@ -7,8 +7,6 @@ import numpy as np
 from full_geometry.learning.meshes import Box, Distance, capsule, cut, join, length, overlap, rotated, smoothstep
 from full_geometry.learning.shapes import margin
 
-__all__ = ["HELD_OUT"]
-
 Made = tuple[Distance, Box]
 STROKES = {  # of letters, in a square
     "A": [((0, 0), (0.5, 1)), ((0.5, 1), (1, 0)), ((0.2, 0.4), (0.8, 0.4))],

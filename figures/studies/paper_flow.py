@@ -11,6 +11,8 @@ import time
 from dataclasses import dataclass
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import torch
 import zuko
@@ -24,9 +26,6 @@ from halfspace_sss.checks import check_interval
 from halfspace_sss.rendering.surface.horizon import cosine_above
 from halfspace_sss.rendering.surface.variants import channel_mean
 from halfspace_sss.tracing.walk import generator, pass_seed
-
-__all__ = ["SpaceFlow", "fit_space_flow", "incidence", "mesh_arrays", "on_surface", "rmsd"]
-
 
 HIDDEN, LAYERS = (128, 128), 6
 GRID = (16, 64)  # directions
@@ -48,8 +47,6 @@ class SpaceFlow:
 
     def sample(self, exits: SurfacePoint, n: int, seed: int = 0) -> np.ndarray:
         """n points in space of each of m exits, (m, n, 3), in the frame of the object over its radius."""
-        import drjit as dr
-
         told = torch.from_numpy(placed(self.frame, exits, dr.width(exits.p)))
         with torch.no_grad(), torch.random.fork_rng():
             torch.manual_seed(seed)
@@ -64,9 +61,6 @@ def incidence(model: FullGeometry, exits: SurfacePoint, points: SurfacePoint) ->
         exits: one for each point.
         points: of entry, with interpolated normals, see `Subject.random_places`.
     """
-    import drjit as dr
-    import mitsuba as mi
-
     n, (rows, columns) = dr.width(exits.p), GRID
     prepared = model.prepare(exits)
     total, k = mi.Float(0), mi.UInt32(0)
@@ -110,9 +104,6 @@ def fit_space_flow(model: FullGeometry, frame: Frame, seconds: float = 60.0, see
 
 def _pairs(model: FullGeometry, frame: Frame, seed: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Exits (n, 5), uniform points (n, 3) and t over its mean."""
-    import drjit as dr
-    import mitsuba as mi
-
     n = PAIRS * POINTS
     exits = model.subject.random_points(generator(mi, PAIRS, pass_seed(*seed, 0)))
     exits = exits.gather(dr.arange(mi.UInt32, n) // POINTS)
@@ -123,8 +114,6 @@ def _pairs(model: FullGeometry, frame: Frame, seed: tuple[int, ...]) -> tuple[np
 
 def mesh_arrays(subject: Subject, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
     """Vertices, in the frame over the radius, and faces, as libigl takes them."""
-    import mitsuba as mi
-
     parameters = mi.traverse(subject.found.shape)
     vertices = np.array(parameters["vertex_positions"], dtype=np.float64).reshape(-1, 3)
     turn = np.eye(3) if frame.turn is None else np.array([np.array(row).ravel() for row in frame.turn])

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import torch
 from torch import nn
@@ -26,26 +28,6 @@ from halfspace_sss.progress import NamedProgress
 from halfspace_sss.provenance import provenance
 from halfspace_sss.rendering.scenes.learners import LearntObject, ObjectError
 from halfspace_sss.tracing.walk import generator, pass_seed
-
-__all__ = [
-    "KIND",
-    "POINTS",
-    "Light",
-    "PaperNetwork",
-    "PaperRecipe",
-    "Samples",
-    "errors",
-    "estimate",
-    "fit_paper",
-    "load_network",
-    "measured_lights",
-    "paper_errors",
-    "random_lights",
-    "save_network",
-    "train",
-    "walk_samples",
-]
-
 
 # ----------------------------------------------------------------------------------------------------
 # The network: 5 + 8 N inputs, three layers of 256 with LeakyReLU, radiance as output, fitted by the MSE.
@@ -182,9 +164,6 @@ class PaperNetwork(nn.Module):
 
 def placed(frame: Frame, at: SurfacePoint, n: int) -> np.ndarray:
     """Position over the radius and the angles of w, over pi: (n, 5)."""
-    import drjit as dr
-    import mitsuba as mi
-
     p, w = frame.position(at.p), mi.Vector3f(frame.direction(at.w))
     columns = [*p, dr.acos(dr.clip(w.z, -1, 1)) / dr.pi, dr.atan2(w.y, w.x) / dr.pi]
     dr.eval(columns)
@@ -193,9 +172,6 @@ def placed(frame: Frame, at: SurfacePoint, n: int) -> np.ndarray:
 
 def walk_samples(subject: Subject, frame: Frame, exits: SurfacePoint, n: int, seed: tuple[int, ...]) -> Samples:
     """N walks of each exit, as the paper's samples; walks that end inside keep T = 0 and a place of their own."""
-    import drjit as dr
-    import mitsuba as mi
-
     m = dr.width(exits.p)
     starts = exits.gather(dr.arange(mi.UInt32, m * n) // n)
     ends = trace_exits(subject, starts, seed)
@@ -219,8 +195,6 @@ def fit_paper(
         seed: of everything.
         progress: called with (what, done, total).
     """
-    import mitsuba as mi
-
     recipe, frame, channels = recipe or PaperRecipe(), frame_of(subject), len(subject.media)
     net = PaperNetwork(recipe.n, channels, seed)
     adam = torch.optim.Adam(net.parameters(), lr=recipe.rate)
@@ -292,8 +266,6 @@ def estimate(
     subject: Subject, net: PaperNetwork, exits: SurfacePoint, points: str, repeats: int, seed: int = 0
 ) -> Estimate:
     """Mean radiance of exits over repeats with new points, and its variance."""
-    import drjit as dr
-
     frame, m, found = frame_of(subject), dr.width(exits.p), []
     for k in range(repeats):
         if points == "walks":
@@ -308,9 +280,6 @@ def estimate(
 
 def uniform_samples(subject: Subject, frame: Frame, exits: SurfacePoint, n: int, seed: tuple[int, ...]) -> Samples:
     """N points uniform over the area for each exit; the throughputs are left out."""
-    import drjit as dr
-    import mitsuba as mi
-
     m: Any = dr.width(exits.p)
     at = subject.random_points(generator(mi, m * n, pass_seed(*seed)))
     w = np.array(at.w, dtype=np.float32).T.reshape(m, n, 3)

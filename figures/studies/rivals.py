@@ -26,8 +26,6 @@ from halfspace_sss.neural.store import load_weights
 if TYPE_CHECKING:
     import pandas
 
-__all__ = ["BACKBONE", "STARTS", "error_table", "start_table"]
-
 
 # ---- The table of models: errors of one object after equal CPU time, data included -----------------
 # `full_geometry`, S = alpha p, and the paper's network with its points from walks (as it was trained) and uniform.

@@ -6,6 +6,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from figures.studies.flow import FlowProposals
@@ -27,8 +29,6 @@ from halfspace_sss.tracing.walk import generator, pass_seed
 
 if TYPE_CHECKING:
     import pandas
-
-__all__ = ["SAMPLERS", "Cost", "Spread", "costs", "sampler_table", "samplers", "spread"]
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -75,9 +75,6 @@ class _Exits:
 
 def _exits(subject: Subject, n: int, repeated: int, seed: int) -> _Exits:
     """n random exits, `repeated` neighbouring lanes for each."""
-    import drjit as dr
-    import mitsuba as mi
-
     rng = Numbers(generator(mi, n, pass_seed(seed, 31)))
     at = subject.points.sample(rng.next_1d(), rng.next_2d(), True)
     sign = number(subject.found.sign)
@@ -94,8 +91,6 @@ def _exits(subject: Subject, n: int, repeated: int, seed: int) -> _Exits:
 
 def _estimates(means: Means, light: Lighting, exits: _Exits, rng: Any, n: int) -> Any:
     """Sum of n samples of each exit, per channel."""
-    import mitsuba as mi
-
     on = mi.Bool(True)
     prepared = means.transport.prepare(exits.out, on)
     where = means.proposals.prepare(exits.out, prepared, on)
@@ -119,9 +114,6 @@ def spread(
         exits, samples: random exits, and samples of each.
         seed: of both.
     """
-    import drjit as dr
-    import mitsuba as mi
-
     sums, per_pass = 0.0, max(min(LANES // exits, samples), 1)
     passes = max(samples // per_pass, 1)
     lanes = _exits(subject, exits, per_pass, seed)
@@ -140,9 +132,6 @@ def spread(
 
 def costs(subject: Subject, all_means: Mapping[str, Means], light: Lighting) -> dict[str, Cost]:
     """Time of each; they take turns, and of the repeats the fastest counts, which is the one that least delayed."""
-    import drjit as dr
-    import mitsuba as mi
-
     lanes = _exits(subject, TIMED_LANES, 1, 5)
     rng = generator(mi, TIMED_LANES, pass_seed(6))
     dr.eval(rng.state, rng.inc)

@@ -16,9 +16,6 @@ from full_geometry.learning.shape_training import STANDARD, Fitting
 from full_geometry.models.descriptors import N_LENGTHS, N_OWN
 from halfspace_sss.progress import NamedProgress
 
-__all__ = ["ablation_table"]
-
-
 OBJECTS, HELD_OUT_OBJECTS, SEED = 300, 28, 79
 K = N_LENGTHS
 OWN = {  # columns of an end

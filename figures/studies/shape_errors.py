@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from figures.studies.held_out import HELD_OUT
@@ -22,22 +24,6 @@ from halfspace_sss.materials import load as load_material
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.tracing.walk import generator, pass_seed
-
-__all__ = [
-    "HALF_SPACES",
-    "Case",
-    "Row",
-    "by_property",
-    "case_table",
-    "evaluate",
-    "held_out",
-    "of_mesh",
-    "seconds_per_million",
-    "speed_table",
-    "spheres",
-    "summary",
-]
-
 
 # ----------------------------------------------------------------------------------------------------
 # Errors of the network of all shapes on held-out shapes and media, a mesh, spheres; and what an evaluation costs.
@@ -96,8 +82,6 @@ def held_out(n: int) -> Iterator[Case]:
 
 def of_mesh(path: str | Path, materials: Sequence[str], mm_per_unit: float) -> Iterator[Case]:
     """A mesh of each channel of materials of the registry."""
-    import mitsuba as mi
-
     for material in materials:
         medium = load_material(material).medium
         for k, channel in enumerate("RGB"):
@@ -107,8 +91,6 @@ def of_mesh(path: str | Path, materials: Sequence[str], mm_per_unit: float) -> I
 
 def spheres(albedo: float = 0.95, eta: float = 1.3) -> Iterator[Case]:
     """Spheres of 1, 3, 10 and 30 mean free paths."""
-    import mitsuba as mi
-
     for radius in RADII:
         shape = mi.load_dict({"type": "sphere", "radius": radius})
         yield Case(f"sphere of {radius:g} mfp", Subject.of(shape, Medium(albedo, 1 - albedo, 0.0, eta)))
@@ -161,9 +143,6 @@ def _row(case: Case, found: Mapping[str, list[ModelError]]) -> Row:
 
 def seconds_per_million(subject: Subject, path: Path | None = None) -> dict[str, float]:
     """Seconds for a million evaluations, entry and exit prepared anew, of the network and of half-space models."""
-    import drjit as dr
-    import mitsuba as mi
-
     models: dict[str, Any] = {"neural_shape": transport(subject, path)}
     models |= {name: HalfSpaceTransport(subject, name) for name in HALF_SPACES}
     rng = generator(mi, LANES, pass_seed(29))

@@ -29,9 +29,6 @@ from halfspace_sss.checks import check_choice, check_count, check_interval
 from halfspace_sss.interface.model import models
 from halfspace_sss.neural.training import checkpoint
 
-__all__ = ["ALPHA_HIDDEN", "PROPOSED", "STANDARD", "Ends", "Fitting", "Recipe"]
-
-
 BETAS, CLIP, LAST_RATE, WARM_UP = (0.9, 0.99), 1.0, 0.01, 100
 AVERAGE = 0.998  # of the numbers, each step
 PROPOSED = 2  # proposals for a walk that is kept

@@ -13,29 +13,6 @@ import numpy as np
 from halfspace_sss.checks import check_count
 from halfspace_sss.provenance import write_atomically
 
-__all__ = [
-    "LEAST_RESOLUTION",
-    "Box",
-    "Mesh",
-    "capsule",
-    "cells",
-    "cut",
-    "ellipsoid",
-    "fbm",
-    "in_chunks",
-    "join",
-    "length",
-    "noise",
-    "overlap",
-    "ridges",
-    "ring_noise",
-    "rotated",
-    "smoothstep",
-    "surface",
-    "twisted",
-]
-
-
 # ----------------------------------------------------------------------------------------------------
 # Signed distances: primitives, how they are joined, bent and made rough; points (..., 3) in mm, y up, inside < 0.
 # Most are bounds rather than distances where primitives were joined or displaced; the surface is where they are zero.

@@ -15,6 +15,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from full_geometry.models.half_space import HalfSpace, HalfSpaceTransport
@@ -30,20 +32,6 @@ from halfspace_sss.rendering.surface.transports import knows_objects, model_name
 from halfspace_sss.rendering.transport.plane import Exit, number
 from halfspace_sss.rendering.transport.protocols import Entry, Transport
 from halfspace_sss.rendering.transport.settings import Settings
-
-__all__ = [
-    "EVEN_SKY",
-    "LIGHTS",
-    "AddedTransport",
-    "ModelError",
-    "compare",
-    "errors",
-    "errors_of",
-    "measure",
-    "of_even_light",
-    "transport",
-]
-
 
 LIGHTS = ("constant", "lobes")
 EVEN_SKY = "even sky"  # as images show it
@@ -247,9 +235,6 @@ class AddedTransport:
 
     def S(self, exit: Any, at: SurfacePoint, active: Any = True) -> Any:
         """S per channel, 1/((scene unit)² sr); 0 below the horizons."""
-        import drjit as dr
-        import mitsuba as mi
-
         mu = dr.dot(at.w, at.n_out)
         entry = Entry(at.p, mi.Normal3f(at.n * number(self.subject.found.sign)), at.n_out, mi.Float(1), mi.UInt32(0))
         value = self.inner.S_mu(exit, entry, at.w, active)

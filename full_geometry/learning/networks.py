@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 import torch
 from torch import nn
@@ -14,26 +15,11 @@ from torch import nn
 from full_geometry.models.object_model import BOUND
 from full_geometry.object.features import entering, n_pair, reverse
 
-__all__ = [
-    "Correction",
-    "EvenLight",
-    "PatchLogits",
-    "device_of_walks",
-    "likelihood",
-    "mean_likelihood",
-    "one_thread",
-    "patch_likelihood",
-    "tensor",
-]
-
-
 # ---- Where networks are fitted: beside the walks that are their data -------------------------------
 
 
 def device_of_walks() -> torch.device:
     """The GPU if Mitsuba's variant runs there and torch can, else the CPU."""
-    import mitsuba as mi
-
     there = (mi.variant() or "").startswith("cuda") and torch.cuda.is_available()
     return torch.device("cuda" if there else "cpu")
 

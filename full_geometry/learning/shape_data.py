@@ -9,6 +9,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from full_geometry.learning.shapes import TRAINING, Family, make_shape
@@ -19,20 +21,6 @@ from full_geometry.object.subject import Subject, SurfacePoint
 from full_geometry.object.walks import trace_exits
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.tracing.walk import generator, pass_seed
-
-__all__ = [
-    "GROUPS",
-    "Drawn",
-    "Grouped",
-    "PairData",
-    "Part",
-    "draw_medium",
-    "draw_subject",
-    "grouped",
-    "make_data",
-    "mean_events",
-]
-
 
 # ---- Which shapes and media the network is trained on: drawn at random, each from its own seed -----
 
@@ -85,8 +73,6 @@ def draw_subject(
         families: generators by name; by default those of training, with spheres and the meshes among them.
         meshes: PLY files that some of the shapes are taken from.
     """
-    import mitsuba as mi
-
     rng = np.random.default_rng(list(seed))
     u, path = rng.random(2), meshes[int(rng.integers(len(meshes)))] if meshes else None
     made = TRAINING if families is None else families
@@ -166,9 +152,6 @@ def make_data(subject: Subject, events: float, seed: tuple[int, ...]) -> PairDat
         events: of a walk, about, which limits the number of walks.
         seed: of all of it.
     """
-    import drjit as dr
-    import mitsuba as mi
-
     n = int(np.clip(EVENTS / events, FEWEST_WALKS, WALKS))
     starts = subject.random_points(generator(mi, n, pass_seed(*seed, 0)))
     exits = trace_exits(subject, starts, (*seed, 1), roulette_from=ROULETTE_FROM)
@@ -193,9 +176,6 @@ def make_data(subject: Subject, events: float, seed: tuple[int, ...]) -> PairDat
 
 def _columns(half_space: Backbone, exits: SurfacePoint, entries: SurfacePoint) -> tuple[np.ndarray, np.ndarray]:
     """Descriptors of pairs, (pairs, numbers), and S_0 P_o P_i of the first channel."""
-    import drjit as dr
-    import mitsuba as mi
-
     subject = half_space.subject
     o, i = (end(subject, at) for at in (exits, entries))
     query, F_t, above = half_space.query(exits, entries)

@@ -27,9 +27,6 @@ from halfspace_sss.progress import NamedProgress
 from halfspace_sss.provenance import check_folder, provenance, write_atomically
 from halfspace_sss.rendering.scenes.learners import LearntShapes
 
-__all__ = ["STANDARD", "Fitting", "Network", "Recipe", "make_objects", "train_shapes"]
-
-
 BETAS, CLIP, LAST_RATE, WARM_UP, AVERAGE = (0.9, 0.99), 1.0, 0.01, 100, 0.9985
 MOST_OFF = 3.0  # of the light of a group: what is far too bright has its say by the likelihood
 

@@ -27,9 +27,6 @@ from full_geometry.learning.meshes import (
 )
 from halfspace_sss.checks import check_choice, check_count
 
-__all__ = ["TRAINING", "make_shape", "box", "margin", "turned_points"]
-
-
 Made = tuple[Distance, Box]
 Family = Callable[[np.random.Generator], Made]
 

@@ -12,6 +12,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from full_geometry.learning.fitting import PROPOSED, STANDARD, Fitting, Recipe
@@ -33,9 +35,6 @@ from halfspace_sss.neural.training.work_folder import CHECKPOINT, claim
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.provenance import check_folder, provenance, write_atomically
 from halfspace_sss.rendering.scenes.camera_walks import TRIAL
-
-__all__ = ["Schedule", "Seen", "Trained", "train", "train_by_cpu", "trusted"]
-
 
 # ---- Where what was learnt of even light is good enough to stand for it ----------------------------
 # S sees the surface around both its points, alpha is a network of the exit alone, which misses what changes over a mean
@@ -138,8 +137,6 @@ class Seen:
             k: number of the chunk.
             proposed: number of proposals.
         """
-        import drjit as dr
-
         seed, order = (self.seed, k), np.random.default_rng([self.seed, k, 1])
         parts = []
         if self.schedule:
@@ -159,8 +156,6 @@ class Seen:
 
     def _exits(self, numbers: list[int], order: np.random.Generator) -> list[tuple[SurfacePoint, Exits]]:
         """Starts and ends of walks from the camera, launch by launch; of too many a random choice."""
-        import drjit as dr
-
         launches = [part for number in numbers for part in self.camera.exits(self.shape, number, self.schedule.spp)]
         found = [part for part in launches if dr.width(part.object)]
         ends = np.cumsum([0, *(dr.width(part.object) for part in found)])
@@ -176,16 +171,12 @@ class Seen:
 
 def _points(part: Any) -> tuple[SurfacePoint, Exits]:
     """First exits of the camera as walks of this package, of the orders from one on."""
-    import drjit as dr
-
     starts = SurfacePoint(part.x_o, part.n_o, part.n_o_shading, part.w_o)
     ends = SurfacePoint(part.x_i, part.n_i, part.n_i_shading, part.w_i)
     return starts, Exits(ends, dr.select(part.order >= 1, part.throughput, 0), part.order, part.face)
 
 
 def _lanes(numbers: np.ndarray) -> Any:
-    import mitsuba as mi
-
     return mi.UInt32(numbers.astype(np.uint32))
 
 
@@ -304,8 +295,6 @@ class _Run:
     """A training on its way."""
 
     def __init__(self, subject: Subject, recipe: Recipe, seed: int, work: Path | None, camera: Any) -> None:
-        import mitsuba as mi
-
         self.subject, self.recipe, self.seed, self.work, self.camera = subject, recipe, seed, work, camera
         self.identity, self.frame = identify(subject), frame_of(subject)
         self.start = storing.start_of(subject, recipe.start)

@@ -10,6 +10,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from full_geometry.object.first_event import FirstEvent, first_event
@@ -19,32 +21,6 @@ from halfspace_sss.physics.backbone import length_scale
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.transport.plane import number
 from halfspace_sss.tracing.walk import generator, pass_seed
-
-__all__ = [
-    "ALONE",
-    "CURVED_OWN",
-    "CURVED_SHARED",
-    "N_LENGTHS",
-    "N_MEDIUM",
-    "N_OWN",
-    "N_SHARED",
-    "RAYS",
-    "End",
-    "Line",
-    "Mixed",
-    "Pair",
-    "Surroundings",
-    "describe",
-    "directions",
-    "end",
-    "look",
-    "mean_chord",
-    "medium",
-    "mixed",
-    "on_a_plane",
-    "phases",
-]
-
 
 # ----------------------------------------------------------------------------------------------------
 # Light that has forgotten where it entered: what an object holds as a whole, where it is thin and reflects inside.
@@ -149,8 +125,6 @@ class Line(NamedTuple):
     @classmethod
     def between(cls, a: Any, b: Any) -> Line:
         """From a to b."""
-        import drjit as dr
-
         way = b - a
         length = dr.norm(way)
         return cls(way / dr.maximum(length, LEAST_R), length)
@@ -166,8 +140,6 @@ def on_a_plane(n_o: Any, inner_o: Any, n_i: Any, inner_i: Any, line: Line) -> tu
 
     There both y lie a mean free path along them.
     """
-    import drjit as dr
-    import mitsuba as mi
 
     def inside(n: Any, along: Any) -> Any:
         flat = mi.Vector3f(line.d - n * dr.dot(n, line.d))
@@ -180,8 +152,6 @@ def on_a_plane(n_o: Any, inner_o: Any, n_i: Any, inner_i: Any, line: Line) -> tu
 
 def phases(g: float, d_o: Any, d_i: Any, d: Any) -> Any:
     """Both phase functions of light that goes along d from one end to the other, times (4 pi)²."""
-    import drjit as dr
-
     a, b = number(1 + g * g), number(2 * g)
     c_o, c_i = dr.dot(d_o, d), -dr.dot(d_i, d)
     base = dr.maximum(a - b * c_o, LEAST_PHASE) * dr.maximum(a - b * c_i, LEAST_PHASE)
@@ -244,9 +214,6 @@ def look(subject: Subject, at: SurfacePoint, event: FirstEvent, active: Any = Tr
 
 def _from(subject: Subject, at: SurfacePoint, y: Any, extinctions: tuple[float, float], active: Any) -> Surroundings:
     """Surroundings of the points y below the points of a surface, for sigma_t and sigma_t'."""
-    import drjit as dr
-    import mitsuba as mi
-
     tables = [mi.Float(row.astype(np.float32)) for row in directions()]
     sigma_t, sigma_t_prime = extinctions
     decays = [number(v) for v in (sigma_t, *(sigma_t_prime / length for length in LENGTHS))]
@@ -272,9 +239,6 @@ def _from(subject: Subject, at: SurfacePoint, y: Any, extinctions: tuple[float, 
 
 def _tangents(at: SurfacePoint) -> tuple[Any, Any]:
     """Two axes across the normal, the first one along w."""
-    import drjit as dr
-    import mitsuba as mi
-
     n = at.n_out
     along = at.w - n * dr.dot(n, at.w)
     spare, _ = mi.coordinate_system(n)
@@ -364,9 +328,6 @@ def describe(
 def _channel(
     subject: Subject, c: int, exit: End, entry: End, line: Line, clear: tuple[Any, Any], shares: Sequence[Any]
 ) -> Pair:
-    import drjit as dr
-    import mitsuba as mi
-
     m = subject.media[c]
     s, t, g = number(float(m.sigma_t_prime)), number(float(m.sigma_t)), float(m.g)
     gap = Line.between(exit.event.ys[c], entry.event.ys[c])
@@ -389,16 +350,12 @@ def _channel(
 
 def _onward(g: float, exit: End, entry: End) -> Any:
     """0.3 log of a phase function of g², of light that two events turn from one end into the other."""
-    import drjit as dr
-
     g = min(g * abs(g), MOST_G)
     c = -dr.dot(exit.inner, entry.inner)
     return 0.3 * dr.log(number(1 - g * g) / (number(1 + g * g) - number(2 * g) * c))
 
 
 def _own(c: int, sigma_t: Any, here: End, there: End, line: Line, gap: Line) -> list[Any]:
-    import drjit as dr
-
     at, event, n, around = here.at, here.event, here.at.n_out, here.around[c]
     return [
         dr.dot(at.w, n), -dr.dot(here.inner, n), dr.dot(at.w, line.d), dr.dot(at.w, there.at.n_out),
@@ -412,9 +369,6 @@ def _own(c: int, sigma_t: Any, here: End, there: End, line: Line, gap: Line) -> 
 
 def _clearance(subject: Subject, a: Any, b: Any, active: Any) -> tuple[Any, Any]:
     """Of the line between two points inside: 1 if it leaves the object, else 0; the length that it is outside for."""
-    import drjit as dr
-    import mitsuba as mi
-
     line = Line.between(a, b)
 
     def reach(start: Any, d: Any, needed: Any) -> Any:

@@ -6,15 +6,15 @@ import functools
 import math
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
+
 from full_geometry.object.features import Side
 from full_geometry.object.first_event import first_event
 from full_geometry.object.subject import Subject, SurfacePoint
 from halfspace_sss.interface.model import BSSRDF, bssrdf
 from halfspace_sss.physics import fresnel
 from halfspace_sss.rendering.transport.plane import Exit, number, plane_query
-
-__all__ = ["FLOOR", "HalfSpace", "HalfSpaceTransport"]
-
 
 FLOOR = 1e-2  # reflectance of the floor, over that of the half-space
 
@@ -50,9 +50,6 @@ class HalfSpace:
 
     def __call__(self, exit: Side, entry: Side, active: Any = True) -> Any:
         """1/((scene unit)² sr), 0 below the horizons."""
-        import drjit as dr
-        import mitsuba as mi
-
         query, F_t, above = self.query(exit.at, entry.at)
         S_0 = mi.Spectrum([m.eval(*query) + F_t * G for m, G in zip(self.models, self.added(exit, entry))])
         return dr.select(above, S_0 * exit.event.P * entry.event.P, 0)
@@ -63,8 +60,6 @@ class HalfSpace:
 
     def query(self, o: SurfacePoint, i: SurfacePoint) -> tuple[tuple, Any, Any]:
         """The query of the models, both Fresnel transmittances, and whether both directions are above the horizons."""
-        import drjit as dr
-
         query = plane_query(i.p, i.n_out, i.w, Exit(o.p, o.n_out, o.w, None), "distance")
         mu_i, mu_o, eta = query[1], query[3], number(self.subject.eta)
         F_t = fresnel.F_t(mu_i, eta) * fresnel.F_t(mu_o, eta)
@@ -90,9 +85,6 @@ class HalfSpaceTransport:
 
     def S(self, exit: SurfacePoint, at: SurfacePoint, active: Any = True) -> Any:
         """S per channel, 1/((scene unit)² sr)."""
-        import drjit as dr
-        import mitsuba as mi
-
         query = plane_query(at.p, at.n_out, at.w, Exit(exit.p, exit.n_out, exit.w, None), "distance")
         above = active & (query[1] > 0) & (query[3] > 0)
         return dr.select(above, mi.Spectrum([m.eval(*query) for m in self.models]), 0)

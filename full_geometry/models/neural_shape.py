@@ -14,6 +14,8 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from full_geometry.models.descriptors import (
@@ -45,28 +47,6 @@ from halfspace_sss.once import once
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.transport.plane import number
 from halfspace_sss.tracing.walk import generator, pass_seed
-
-__all__ = [
-    "ALBEDO",
-    "ETA",
-    "G",
-    "KIND",
-    "LEAST",
-    "MODEL",
-    "PLACE_OF_G",
-    "SIZE",
-    "WEIGHTS",
-    "Backbone",
-    "NeuralShape",
-    "checksums",
-    "held",
-    "load",
-    "most",
-    "shipped_weights",
-    "transport",
-    "weight",
-]
-
 
 # ---- What the network of all shapes is trained on, and warns outside of ----------------------------
 
@@ -110,8 +90,6 @@ class Backbone(HalfSpace):
 
     def shares(self, S_0: Any, exit: Side, entry: Side) -> list[tuple[Any, Any]]:
         """Per channel the parts of S_0, of this pair, that are mixed and that are scattered twice; 0 on a plane."""
-        import drjit as dr
-
         F_t = self.query(exit.at, entry.at)[1]
         found = []
         for c, (mixture, twice) in enumerate(zip(self.mixtures, self.twice(exit, entry))):
@@ -123,9 +101,6 @@ class Backbone(HalfSpace):
 
     def twice(self, exit: Side, entry: Side) -> Any:
         """S_twice/(F_t(w_o) P_o F_t(w_i) P_i) per channel, that of a plane taken off."""
-        import drjit as dr
-        import mitsuba as mi
-
         eta = number(self.subject.eta)
         o, i = (refract_in(side.at, eta)[0] for side in (exit, entry))
         line = Line.between(exit.at.p, entry.at.p)
@@ -144,8 +119,6 @@ class Backbone(HalfSpace):
 
 def _twice(m: Medium, d_o: Any, d_i: Any, line: Line, spread: Any) -> Any:
     """Both phase functions and the attenuation along a line over its squared length, times (4 pi)²."""
-    import drjit as dr
-
     t = number(float(m.sigma_t))
     apart = dr.square(line.length) + spread / 12 + LEAST_LENGTH2 / dr.square(dr.maximum(t, 1e-20))
     return phases(min(max(float(m.g), -MOST_G), MOST_G), d_o, d_i, line.d) * dr.exp(-t * line.length) / apart
@@ -200,8 +173,6 @@ class NeuralShape:
 
     @functools.cached_property
     def _scale(self) -> Any:
-        import mitsuba as mi
-
         return mi.Spectrum([number(s) for s in self.scales or [1.0] * len(self.media)])
 
     @property
@@ -229,17 +200,12 @@ class NeuralShape:
 
     def __call__(self, exit: End, entry: End, active: Any = True) -> Any:
         """S of two ends, as `S`."""
-        import drjit as dr
-        import mitsuba as mi
-
         S_0 = self.half_space(exit, entry)
         pairs = describe(self.subject, exit, entry, self.half_space.shares(S_0, exit, entry), active)
         f = mi.Spectrum([self._f(pair, numbers) for pair, numbers in zip(pairs, self._media)])
         return dr.select(active, S_0 * dr.exp(f) * self._scale, 0)
 
     def _f(self, pair: Pair, numbers: list[Any]) -> Any:
-        import drjit as dr
-
         net = self._network
         rest = net.first(1, [*pair.shared, *numbers], biased=True)
         ends = [net.activation(net.first(0, own) + rest) for own in (pair.exit, pair.entry)]
@@ -312,17 +278,12 @@ def _relative_error(found: np.ndarray) -> np.ndarray:
 
 def _walks(subject: Subject, n: int, k: int) -> np.ndarray:
     """Throughputs of n walks."""
-    import mitsuba as mi
-
     starts = subject.random_points(generator(mi, n, pass_seed(SEED, 0, k)))
     return _rows(trace_exits(subject, starts, (SEED, 1, k)).T)
 
 
 def _pairs(model: NeuralShape, proposals: Proposals, n: int, k: int) -> np.ndarray:
     """S mu_i over the density of the entries of n random exits."""
-    import drjit as dr
-    import mitsuba as mi
-
     exits = model.subject.random_points(generator(mi, n, pass_seed(SEED, 2, k)))
     entries, over = proposals.sample(exits, generator(mi, n, pass_seed(SEED, 3, k)))
     dr.eval(exits, entries, over)

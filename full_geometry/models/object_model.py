@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from full_geometry.object.features import (
@@ -25,9 +27,6 @@ from full_geometry.object.first_event import first_event
 from full_geometry.object.subject import Subject, SurfacePoint
 from halfspace_sss.neural.perceptron import Perceptron
 from halfspace_sss.rendering.transport.plane import number
-
-__all__ = ["BOUND", "FullGeometry", "Reflectance"]
-
 
 # ---- S of one object: a start, times what a small network has learnt, evaluated in Dr.Jit ----------
 
@@ -73,9 +72,6 @@ class Reflectance:
 
     def parts(self, at: SurfacePoint, active: Any = True) -> tuple[Any, Any, Any]:
         """What passes unscattered, alpha_1 and alpha, per channel."""
-        import drjit as dr
-        import mitsuba as mi
-
         columns = side_features(self.frame, Side(at, first_event(self.subject, at, active)))
         media = self.subject.media
         x, n = self._networks[1](self.units(columns)), len(media)
@@ -87,8 +83,6 @@ class Reflectance:
     @property
     def evened(self) -> tuple[Any, Any]:
         """Channels in which orders below two, and the others, may stand for even light."""
-        import mitsuba as mi
-
         return tuple(mi.Spectrum([number(float(v)) for v in row]) for row in self.trusted)
 
     def __call__(self, at: SurfacePoint, active: Any = True) -> tuple[Any, Any]:
@@ -147,9 +141,6 @@ class FullGeometry:
             at: entry, with w_i.
             active: mask of lanes.
         """
-        import drjit as dr
-        import mitsuba as mi
-
         entry, net = self.start.end(at, active), self._network
         features, h = self._end(entry)
         features += pair_features(self.frame, exit.side, entry)

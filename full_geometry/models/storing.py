@@ -22,25 +22,6 @@ from halfspace_sss.interface.model import bssrdf
 from halfspace_sss.neural.store import load_weights, save_weights
 from halfspace_sss.neural.trained import weights_folder
 
-__all__ = [
-    "CENTRES",
-    "CHECKSUMS",
-    "ENDS",
-    "EVEN",
-    "KIND",
-    "TURNS",
-    "Learnt",
-    "assemble",
-    "find_weights",
-    "load",
-    "save",
-    "start_checksums",
-    "start_of",
-    "trained",
-    "weights_name",
-]
-
-
 KIND = "full_geometry"
 CHECKSUMS = "start_checksums"  # of a record
 CENTRES, EVEN, TURNS, ENDS = "centres", "even", "turns", "Q"

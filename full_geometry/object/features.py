@@ -11,6 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
@@ -22,28 +24,6 @@ from halfspace_sss.neural.perceptron import Perceptron
 from halfspace_sss.physics import fresnel
 from halfspace_sss.rendering.transport.plane import number
 from halfspace_sss.tracing.walk import generator, pass_seed
-
-__all__ = [
-    "EVENT",
-    "FIELDS",
-    "POINT",
-    "Frame",
-    "PreparedExit",
-    "Quadratic",
-    "Side",
-    "Start",
-    "Surroundings",
-    "Terms",
-    "entering",
-    "insides",
-    "n_pair",
-    "n_side",
-    "pair_features",
-    "reverse",
-    "side_features",
-    "surroundings",
-]
-
 
 # ----------------------------------------------------------------------------------------------------
 # How much of an object surrounds a point: what the network of one object is told of fins, rims and folds.
@@ -84,8 +64,6 @@ class Surroundings:
 
     def __call__(self, q: Any, kind: int) -> list[Any]:
         """Of a position in the frame, a `POINT` or an `EVENT`."""
-        import mitsuba as mi
-
         return self.textures[kind].eval((mi.Point3f(q) - self.low) * self.scale)
 
 
@@ -97,9 +75,6 @@ def surroundings(subject: Subject, frame: Any, turns: np.ndarray | None = None) 
         frame: a `Frame` of its features.
         turns: those of training; by default made from random points.
     """
-    import drjit as dr
-    import mitsuba as mi
-
     low, high = _bounds(subject, frame)
     longest = float((high - low).max())
     low, high = low - MARGIN * longest, high + MARGIN * longest
@@ -120,8 +95,6 @@ def surroundings(subject: Subject, frame: Any, turns: np.ndarray | None = None) 
 
 def _turns(subject: Subject, frame: Any, fields: Surroundings) -> np.ndarray:
     """C^(-1/2) of the fields over random points and over their first events, with what takes their means off."""
-    import mitsuba as mi
-
     at = subject.random_points(generator(mi, POINTS, pass_seed(SEED)))
     found = []
     for kind, place in ((POINT, at.p), (EVENT, first_event(subject, at).y)):
@@ -134,9 +107,6 @@ def _turns(subject: Subject, frame: Any, fields: Surroundings) -> np.ndarray:
 
 def insides(subject: Subject, frame: Any, low: np.ndarray, cell: float, cells: np.ndarray) -> np.ndarray:
     """1 where the middle of a cell lies inside, (z, y, x): where most of three rays meet the surface from within."""
-    import drjit as dr
-    import mitsuba as mi
-
     nx, ny, _ = (int(n) for n in cells)
     k = dr.arange(mi.UInt32, int(np.prod(cells)))
     index = (k % nx, (k // nx) % ny, k // (nx * ny))
@@ -158,8 +128,6 @@ def _fields(inside: np.ndarray, path: float) -> np.ndarray:
 
 def _bounds(subject: Subject, frame: Any) -> tuple[np.ndarray, np.ndarray]:
     """Of the object in its frame."""
-    import mitsuba as mi
-
     parameters = mi.traverse(subject.found.shape)
     if "vertex_positions" in parameters:
         corners = mi.Point3f(np.array(parameters["vertex_positions"]).reshape(-1, 3).T)
@@ -212,15 +180,10 @@ class Frame:
 
     def direction(self, w: Any) -> Any:
         """In the frame."""
-        import drjit as dr
-        import mitsuba as mi
-
         return mi.Vector3f(w) if self.turn is None else mi.Vector3f(*(dr.dot(row, w) for row in self.turn))
 
     def back(self, q: Any, d: Any) -> tuple[Any, Any]:
         """A position and a direction of the frame in the world."""
-        import mitsuba as mi
-
         q, d = (v if self.turn is None else sum(row * x for row, x in zip(self.turn, v)) for v in (q, d))
         return mi.Point3f(self.centre + mi.Vector3f(q) * self.radius), mi.Vector3f(d)
 
@@ -287,8 +250,6 @@ class Quadratic:
 
 
 def _octaves(x: Any) -> list[Any]:
-    import drjit as dr
-
     found = list(x)
     for k in range(OCTAVES):
         for component in x:
@@ -300,8 +261,6 @@ def side_features(frame: Frame, side: Side) -> list[Any]:
     """Position and y with two octaves of sine and cosine, normal, w, mu, log of the way to y, log P, what varies, and
     how much of the object surrounds the position and y.
     """
-    import drjit as dr
-
     at, event = side.at, side.event
     n, w = frame.direction(at.n_out), frame.direction(at.w)
     p, y = frame.position(at.p), frame.position(event.y)
@@ -331,8 +290,6 @@ def pair_features(frame: Frame, exit: Side, entry: Side) -> list[Any]:
     surface at one end says of y at the other: its depth below the plane there, its distance from the point, and the
     cosine between the way to y and the way on to the other y; log of the distance between the two y of each channel.
     """
-    import drjit as dr
-
     o, i = exit.at, entry.at
     d = i.p - o.p
     r = dr.norm(d)
@@ -352,23 +309,17 @@ def pair_features(frame: Frame, exit: Side, entry: Side) -> list[Any]:
 
 
 def _log(sigma_t: Any, length: Any) -> Any:
-    import drjit as dr
-
     return 0.5 * dr.log(length * sigma_t + LEAST_LENGTH)
 
 
 def _depth(frame: Frame, at: SurfacePoint, y: Any) -> Any:
     """t/(1 + |t|) of the depth t below the plane of a point, in mean free paths."""
-    import drjit as dr
-
     t = dr.dot(at.n_out, at.p - y) * frame.sigma_t
     return t / (1 + dr.abs(t))
 
 
 def _cosine(frame: Frame, side: Side, onward: Any) -> Any:
     """Between the way from a point to its y and a direction."""
-    import drjit as dr
-
     way = side.event.y - side.at.p
     return dr.dot(way, onward) / dr.maximum(dr.norm(way), 1e-6 * frame.radius)
 

@@ -6,14 +6,13 @@ import hashlib
 from dataclasses import dataclass, replace
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
 from full_geometry.object.features import Frame, surroundings
 from full_geometry.object.subject import Subject
 from halfspace_sss.rendering.surface.varying import grid_values
 from halfspace_sss.rendering.transport.plane import number
-
-__all__ = ["Identity", "frame_of", "identify"]
 
 ANCHORS = 256
 CLOSE = 1e-4  # positions over the size of the object, coefficients relative
@@ -103,8 +102,6 @@ def _kabsch(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray, float
 
 def identify(subject: Subject) -> Identity:
     """The identity of an object as it stands."""
-    import mitsuba as mi
-
     shape = subject.found.shape
     parameters = mi.traverse(shape)
     topology = ""
@@ -146,8 +143,6 @@ def _probed(subject: Subject, anchors: np.ndarray) -> np.ndarray:
 
     They tell grids that lie elsewhere in the object, or are interpolated in another way.
     """
-    import mitsuba as mi
-
     if subject.varying is None:
         return np.zeros((0, 0), dtype=np.float32)
     centre, some = anchors.mean(axis=0), anchors[:: max(len(anchors) // PROBED, 1)]
@@ -181,8 +176,6 @@ def frame_of(subject: Subject, trained: Identity | None = None, turns: np.ndarra
     Raises:
         ValueError: the object is not the one that was trained.
     """
-    import mitsuba as mi
-
     here = identify(subject)
     R, t = (np.eye(3), np.zeros(3)) if trained is None else trained.pose(here)
     anchors = here.anchors if trained is None else trained.anchors

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from full_geometry.object.features import Frame, PreparedExit, Side, Start, pair_features, side_features
@@ -17,8 +19,6 @@ from halfspace_sss.rendering.transport.plane import Exit, number
 from halfspace_sss.rendering.transport.positions import PositionSampler
 from halfspace_sss.rendering.transport.radial_table import RadialTable
 from halfspace_sss.tracing.walk import generator, pass_seed
-
-__all__ = ["Pairs", "PairSource", "Proposals", "shuffled"]
 
 PATCH_SHARE = 0.6  # of those by patches, where they are learnt
 EVEN_EVERY = 4  # walks, one tells what even light brings: that is simpler than S
@@ -35,8 +35,6 @@ class Numbers:
         return self.rng.next_float32()
 
     def next_2d(self) -> Any:
-        import mitsuba as mi
-
         return mi.Point2f(self.rng.next_float32(), self.rng.next_float32())
 
 
@@ -118,9 +116,6 @@ class Proposals:
             table: of weights of patches, which are asked of the network otherwise.
             k: of each exit, its number in the table.
         """
-        import drjit as dr
-        import mitsuba as mi
-
         out = Exit(exit.p, exit.n_out, exit.w, number(self.subject.found.sign))
         known = (out, mi.UInt32(k))
         if self.patches is None:
@@ -158,8 +153,6 @@ class PairSource:
 
     def scaled(self, scale: np.ndarray) -> PairSource:
         """The same with the scale of a fit, so that its mean over channels that have any light is 1."""
-        import mitsuba as mi
-
         live = max(np.count_nonzero(scale), 1)
         return replace(self, scale=mi.Spectrum([number(v * len(scale) / live) for v in scale.tolist()]))
 
@@ -169,8 +162,6 @@ class PairSource:
 
     def traced(self, n: int, seed: tuple[int, ...]) -> tuple[SurfacePoint, Exits]:
         """Starts and ends of n walks of random exits."""
-        import mitsuba as mi
-
         starts = self.subject.random_points(generator(mi, n, pass_seed(*seed, 0)))
         return starts, trace_exits(self.subject, starts, (*seed, 1), fewest=1)
 
@@ -184,9 +175,6 @@ class PairSource:
             starts, exits: of the walks.
             seed: of what is kept.
         """
-        import drjit as dr
-        import mitsuba as mi
-
         n, even = dr.width(starts.p), self._even(starts, exits)
         T = dr.select(exits.order == 1, 0, exits.T)
         if self.scale is not None:
@@ -203,9 +191,6 @@ class PairSource:
 
     def _even(self, starts: SurfacePoint, exits: Exits) -> Even:
         """What walks bring under the same light from everywhere, of every fourth walk."""
-        import drjit as dr
-        import mitsuba as mi
-
         n = max(dr.width(starts.p) // EVEN_EVERY, 1)
         lanes = dr.arange(mi.UInt32, n) * EVEN_EVERY
         at, T = starts.gather(lanes), dr.gather(mi.Spectrum, exits.T, lanes)
@@ -221,8 +206,6 @@ class PairSource:
             seed: of them.
             starts: n exits that they are of; by default random ones.
         """
-        import mitsuba as mi
-
         rng = generator(mi, n, pass_seed(*seed, 2))
         starts = starts or self.subject.random_points(rng)
         entries, weight = self.proposals.sample(starts, rng)
@@ -230,9 +213,6 @@ class PairSource:
 
     def _columns(self, exits: SurfacePoint, entries: SurfacePoint, value: Any) -> Pairs:
         """Features of pairs; `value` is a spectrum, or a weight that S_0 at the start is to be multiplied by."""
-        import drjit as dr
-        import mitsuba as mi
-
         exit, entry = (self.start.end(at) for at in (exits, entries))
         if isinstance(value, mi.Float):
             value = self.start(exit, entry) * value
@@ -246,7 +226,5 @@ class PairSource:
 
 def _stacked(columns: list[Any], n: int) -> np.ndarray:
     """Columns of n lanes as rows."""
-    import drjit as dr
-
     dr.eval(columns)
     return np.stack([np.broadcast_to(c.numpy(), n) for c in columns])

@@ -16,6 +16,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from full_geometry.object.features import Frame, PreparedExit, Side, side_features
@@ -28,22 +30,6 @@ from halfspace_sss.rendering.transport.plane import Exit, number
 from halfspace_sss.rendering.transport.positions import PositionSampler
 from halfspace_sss.rendering.transport.protocols import CosineProposals, Entry
 from halfspace_sss.tracing.walk import generator, pass_seed
-
-__all__ = [
-    "AREA_SHARE",
-    "CELLS",
-    "LEARNT_SHARE",
-    "PATCHES",
-    "ExitTable",
-    "LearntProposals",
-    "PatchSampler",
-    "PatchTable",
-    "PatchWeights",
-    "Patches",
-    "cluster",
-    "mesh_faces",
-]
-
 
 PATCHES = 512
 LEARNT_SHARE = 0.9
@@ -58,8 +44,6 @@ def mesh_faces(subject: Subject) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     Raises:
         ValueError: the shape is no mesh.
     """
-    import mitsuba as mi
-
     parameters = mi.traverse(subject.found.shape)
     if "faces" not in parameters:
         raise ValueError(f"shape must be a mesh to be cut into patches, got {subject.found.shape.class_name()}")
@@ -105,8 +89,6 @@ class Patches:
     """
 
     def __init__(self, subject: Subject, frame: Frame, centres: np.ndarray) -> None:
-        import drjit as dr
-        import mitsuba as mi
         from scipy.spatial import cKDTree
 
         x, areas = _places(subject, frame)
@@ -129,15 +111,10 @@ class Patches:
 
     def row(self, key: str, k: Any) -> Any:
         """An entry of a table."""
-        import drjit as dr
-
         return dr.gather(type(self.tables[key]), self.tables[key], k)
 
     def point(self, patch: Any, u_face: Any, u: Any) -> Point:
         """A uniform point of a patch."""
-        import drjit as dr
-        import mitsuba as mi
-
         low, high = self.row("start", patch), self.row("start", patch + 1)
         goal = u_face * self.row("area", patch)
 
@@ -181,9 +158,6 @@ class PatchSampler:
 
     def prepare(self, exit: Side) -> PatchWeights:
         """Weights of all patches for an exit."""
-        import drjit as dr
-        import mitsuba as mi
-
         sums = dr.alloc_local(mi.Float, self.patches.n)
         for k, logit in enumerate(self._network(side_features(self.frame, exit))):
             sums[mi.UInt32(k)] = dr.minimum(logit, HIGHEST)
@@ -204,9 +178,6 @@ class PatchSampler:
 
     def patch(self, exit: PatchWeights, u: Any) -> tuple[Any, Any]:
         """A patch for a uniform number, and the density of uniform points in a patch that is drawn so."""
-        import drjit as dr
-        import mitsuba as mi
-
         learnt, last = u < LEARNT_SHARE, self.patches.n - 1
         u_1, u_2 = u / LEARNT_SHARE * exit.total, (u - LEARNT_SHARE) / (1 - LEARNT_SHARE)
         by_weight = dr.binary_search(0, last, lambda i: exit.cumulative[mi.UInt32(i)] <= u_1)
@@ -220,9 +191,6 @@ class PatchSampler:
         return self._share(exit, patch) / self.patches.row("area", patch)
 
     def _share(self, exit: PatchWeights, patch: Any) -> Any:
-        import drjit as dr
-        import mitsuba as mi
-
         before = dr.select(patch > 0, exit.cumulative[dr.maximum(patch, 1) - 1], mi.Float(0))
         learnt = (exit.cumulative[patch] - before) / exit.total
         return LEARNT_SHARE * learnt + (1 - LEARNT_SHARE) * self.patches.row("share", patch)
@@ -246,8 +214,6 @@ class _Row:
     start: Any
 
     def __getitem__(self, k: Any) -> Any:
-        import drjit as dr
-
         return dr.gather(type(self.table), self.table, self.start + k)
 
 
@@ -260,17 +226,12 @@ class ExitTable:
     """
 
     def __init__(self, sampler: PatchSampler, exits: SurfacePoint) -> None:
-        import drjit as dr
-        import mitsuba as mi
-
         side = Side(exits, first_event(sampler.patches.subject, exits))
         rows = np.cumsum(_weights(sampler, side, dr.width(exits.p)), axis=1).astype(np.float32)
         self.n, self.table, self.last = rows.shape[1], mi.Float(rows.ravel()), mi.Float(rows[:, -1].copy())
 
     def weights(self, k: Any) -> PatchWeights:
         """Of exit k."""
-        import drjit as dr
-
         return PatchWeights(_Row(self.table, k * self.n), dr.gather(type(self.last), self.last, k))
 
 
@@ -283,9 +244,6 @@ class PatchTable:
     """
 
     def __init__(self, sampler: PatchSampler, cells: int = CELLS) -> None:
-        import drjit as dr
-        import mitsuba as mi
-
         subject, n = sampler.patches.subject, len(sampler.patches.of_face)
         of_face = np.arange(n, dtype=np.uint32)
         if n > cells:
@@ -310,16 +268,12 @@ class PatchTable:
 
     def weights(self, face: Any) -> PatchWeights:
         """Of an exit on a face."""
-        import drjit as dr
-
         cell = dr.gather(type(self.of_face), self.of_face, face)
         return PatchWeights(_Row(self.table, cell * self.n), dr.gather(type(self.last), self.last, cell))
 
 
 def _weights(sampler: PatchSampler, exit: Side, n: int) -> np.ndarray:
     """Weights of all patches for n exits, (n, patches), rows of sum 1."""
-    import drjit as dr
-
     columns = side_features(sampler.frame, exit)
     dr.eval(columns)
     x = np.stack([np.broadcast_to(c.numpy(), n) for c in columns])
@@ -367,15 +321,10 @@ class LearntProposals(CosineProposals):
     table: PatchTable | None = None
 
     def prepare(self, out: Exit, prepared: PreparedExit, active: Any) -> _Prepared:
-        import mitsuba as mi
-
         weights = self.patches.prepare(prepared.side) if self.table is None else None
         return _Prepared(weights, (out.n, *mi.coordinate_system(out.n)))
 
     def sample(self, out: Exit, prim_index: Any, prepared: _Prepared, sampler: Any, active: Any) -> Entry:
-        import drjit as dr
-        import mitsuba as mi
-
         by_patch = active & (sampler.next_1d() < number(self.patch_share))
         weights = prepared.weights if self.table is None else self.table.weights(prim_index)
         at, _ = self.patches.sample(weights, sampler.next_1d(), sampler.next_1d(), sampler.next_2d())

@@ -9,6 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from full_geometry.object.pairs import Proposals
@@ -17,8 +19,6 @@ from full_geometry.object.subject import Subject, SurfacePoint
 from full_geometry.object.walks import trace_exits
 from halfspace_sss.checks import check_count
 from halfspace_sss.tracing.walk import generator, pass_seed
-
-__all__ = ["LOBES", "POWER", "Estimate", "Reference", "ObjectModel", "modelled", "reference", "traced"]
 
 LOBES = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / np.sqrt(3.0)
 POWER = 16
@@ -63,9 +63,6 @@ class _Sums:
 
     def add(self, value: Any, w: Any, per_exit: int) -> None:
         """Samples of all exits, `per_exit` neighbouring lanes for each: value per channel of unit light from w."""
-        import drjit as dr
-        import mitsuba as mi
-
         lights = [mi.Float(1)] + [dr.maximum(dr.dot(w, mi.Vector3f(*axis.tolist())), 0) ** POWER for axis in LOBES]
         rows = []
         for v in value:
@@ -94,9 +91,6 @@ def reference(subject: Subject, exits: int = 256, walks: int = 8192, seed: int =
         exits, walks: number of exits, and of walks of each; seed: of both.
         fewest: scattering events that count.
     """
-    import drjit as dr
-    import mitsuba as mi
-
     for name, value, least in (("exits", exits, 2), ("walks", walks, 2), ("seed", seed, 0)):
         check_count(name, value, least)
     points = subject.random_points(generator(mi, exits, pass_seed(seed, 17)))
@@ -106,8 +100,6 @@ def reference(subject: Subject, exits: int = 256, walks: int = 8192, seed: int =
 
 def traced(subject: Subject, exits: SurfacePoint, walks: int, seed: tuple[int, ...], **orders: int) -> Estimate:
     """Radiance of exits by so many walks of each; `orders` as for `trace_exits`."""
-    import drjit as dr
-
     sums = _Sums(dr.width(exits.p))
     for k, per_exit in enumerate(_passes(sums.n_exits, walks)):
         found = trace_exits(subject, _repeated(exits, per_exit), (*seed, k), **orders)
@@ -116,9 +108,6 @@ def traced(subject: Subject, exits: SurfacePoint, walks: int, seed: tuple[int, .
 
 
 def _repeated(points: SurfacePoint, times: int) -> SurfacePoint:
-    import drjit as dr
-    import mitsuba as mi
-
     return points.gather(dr.arange(mi.UInt32, dr.width(points.p) * times) // times)
 
 
@@ -133,9 +122,6 @@ def modelled(
         exits: from a reference.
         samples, seed: entries of each exit; of the entries.
     """
-    import drjit as dr
-    import mitsuba as mi
-
     n = dr.width(exits.p)
     sums = _Sums(n)
     table = ExitTable(proposals.patches, exits) if proposals.patches else None

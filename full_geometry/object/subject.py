@@ -7,6 +7,8 @@ import math
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from halfspace_sss.physics.medium import Medium
@@ -23,8 +25,6 @@ from halfspace_sss.rendering.transport.body import check_size
 from halfspace_sss.rendering.transport.plane import number
 from halfspace_sss.rendering.walk.media import WalkMedia
 
-__all__ = ["Subject", "SurfacePoint", "check_surface", "cosine_direction", "refract_in", "surface_point"]
-
 LEAST_RATIO = 1e-3  # in logarithms of what varies
 
 
@@ -39,8 +39,6 @@ class SurfacePoint(NamedTuple):
 
     def gather(self, k: Any) -> SurfacePoint:
         """The points of the lanes k."""
-        import drjit as dr
-
         return SurfacePoint(*(dr.gather(type(v), v, k) for v in self))
 
 
@@ -113,8 +111,6 @@ class Subject:
         Raises:
             ValueError: a scene has no such object, or one that cannot be learnt; a medium is missing; or as `of`.
         """
-        import mitsuba as mi
-
         if not isinstance(shape, mi.Scene):
             return cls.of(shape, medium, 1.0 if mm_per_unit is None else mm_per_unit)
         found = survey(_object_of(shape, name))
@@ -145,8 +141,6 @@ class Subject:
     @functools.cached_property
     def sigma_t(self) -> Any:
         """Extinction of each channel, 1/(scene unit), as data of kernels: one kernel serves all media."""
-        import mitsuba as mi
-
         return mi.Spectrum([number(m.sigma_t) for m in self.media])
 
     @functools.cached_property
@@ -173,9 +167,6 @@ class Subject:
 
     def local(self, p: Any) -> tuple[Any, ...]:
         """What varies, at the point p: log of sigma_t over its mean, and half the log of 1 - albedo."""
-        import drjit as dr
-        import mitsuba as mi
-
         if self.varying is None:
             return ()
         n_t, n_albedo = self._local_channels
@@ -193,8 +184,6 @@ class Subject:
 
     def random_places(self, rng: Any) -> SurfacePoint:
         """Points uniform over the area, seen along geometric normals: `n_out` is the interpolated one itself."""
-        import mitsuba as mi
-
         u_face, u = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
         at = self.points.sample(u_face, u, True)
         n = at.n * self.found.sign
@@ -207,8 +196,6 @@ class Subject:
 
 def _in_scene_units(medium: Medium, mm_per_unit: float) -> tuple[Medium, ...]:
     """The scalar medium of each channel, 1/(scene unit)."""
-    import mitsuba as mi
-
     if not (math.isfinite(mm_per_unit) and mm_per_unit > 0):
         raise ValueError(f"mm_per_unit must be finite and > 0, got {mm_per_unit!r}")
     if not isinstance(medium, Medium):
@@ -222,8 +209,6 @@ def _in_scene_units(medium: Medium, mm_per_unit: float) -> tuple[Medium, ...]:
 
 def cosine_direction(n_out: Any, n: Any, rng: Any) -> Any:
     """A direction by the cosine to the shading normal, above the surface, see `surface.horizon`."""
-    import mitsuba as mi
-
     return cosine_above(n_out, n, mi.Point2f(rng.next_float32(), rng.next_float32()))[0]
 
 
@@ -235,8 +220,6 @@ def surface_point(p: Any, n: Any, n_out: Any, w: Any) -> SurfacePoint:
         n, n_out: outward geometric and shading normal.
         w: direction outside.
     """
-    import mitsuba as mi
-
     return SurfacePoint(mi.Point3f(p), mi.Normal3f(n), lifted(n_out, n, w), mi.Vector3f(w))
 
 
@@ -245,9 +228,6 @@ def refract_in(at: SurfacePoint, eta: Any) -> tuple[Any, Any, Any]:
 
     mu' = sqrt(1 - (1 - mu²)/eta²), d = -w/eta + n (mu/eta - mu').
     """
-    import drjit as dr
-    import mitsuba as mi
-
     mu = dr.dot(at.w, at.n_out)
     inner = 1 - (1 - mu * mu) / (eta * eta)
     d = at.n_out * (mu / eta - dr.safe_sqrt(inner)) - at.w / eta
@@ -266,8 +246,6 @@ def _check_geometry(found: Object) -> None:
 
 def check_surface(name: str, surface: Any) -> None:
     """ValueError if the `translucent` surface of an object has what cannot be learnt."""
-    import mitsuba as mi
-
     if surface.boundary.flags() & int(mi.BSDFFlags.Smooth):
         raise ValueError(f"the boundary of {name!r} must be smooth to be learnt, got a rough one")
 

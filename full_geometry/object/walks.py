@@ -11,12 +11,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
+import drjit as dr
+import mitsuba as mi
+
 from full_geometry.object.subject import Subject, SurfacePoint, surface_point
 from halfspace_sss.checks import check_count
 from halfspace_sss.rendering.walk import exits as walk_exits
 from halfspace_sss.rendering.walk.steps import Crossing, Event, Walk
-
-__all__ = ["LANES", "Exits", "trace_exits"]
 
 LANES = 2**15
 ROULETTE_FROM = 8  # scattering events: from 2 on weak channels of ketchup have 10 times the variance, for no time less
@@ -41,9 +42,6 @@ class _Store:
 
     @classmethod
     def of(cls, n: int, fewest: int, most: int) -> _Store:
-        import drjit as dr
-        import mitsuba as mi
-
         at = SurfacePoint(*(dr.zeros(kind, n) for kind in (mi.Point3f, mi.Normal3f, mi.Normal3f, mi.Vector3f)))
         exits = Exits(at, dr.zeros(mi.Spectrum, n), dr.zeros(mi.UInt32, n), dr.zeros(mi.UInt32, n))
         dr.eval(exits)
@@ -59,8 +57,6 @@ class _Store:
         return walk, record
 
     def crossing(self, walk: Walk, record: Any, crossing: Crossing) -> tuple[Walk, Any]:
-        import drjit as dr
-
         leaves, si = walk.alive & crossing.leaves, crossing.si
         at = surface_point(si.p, si.n, si.sh_frame.n, walk.d)
         kept = leaves & (walk.order >= self.fewest) & (walk.order <= self.most)
@@ -90,8 +86,6 @@ def trace_exits(
     Raises:
         ValueError: fewest is not a whole number >= 0.
     """
-    import drjit as dr
-
     check_count("fewest", fewest, 0)
     store = _Store.of(dr.width(starts.p), fewest, most)
     start = walk_exits.Start(starts.p, starts.n, starts.w, starts.n_out)
