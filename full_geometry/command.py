@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from full_geometry.learning.model_errors import ModelError, errors_of, transport
+from full_geometry.learning.model_errors import RadianceError, errors_of, transport
 from full_geometry.models.storing import KIND, find_weights, trained
 from full_geometry.object.subject import Subject
 from halfspace_sss.checks import check_count
@@ -114,7 +114,7 @@ def _that_take(subject: Subject) -> dict[str, Any]:
     return found
 
 
-def _rows(name: str, model: str, errors: list[ModelError]) -> list[ObjectError]:
+def _rows(name: str, model: str, errors: list[RadianceError]) -> list[ObjectError]:
     n = 1 + max((row.channel for row in errors), default=0)
     channels = "RGB" if n == 3 else ["mono"]
     return [ObjectError(name, channels[e.channel], model, e.light, e.error, e.standard_error, e.ratio) for e in errors]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -43,7 +42,7 @@ class LearntTransport:
 
     Args:
         model: what was learnt.
-        checksums: of the file of weights, and of those of its start.
+        checksums: of the file of weights, and of those of its base model.
     """
 
     model: FullGeometry
@@ -53,20 +52,23 @@ class LearntTransport:
     def prepare(self, out: Exit, active: Any) -> PreparedExit:
         return self.model.prepare(SurfacePoint(out.p, out.n_face, out.n, out.w), active)
 
-    @property
-    def alpha(self) -> Callable[[Exit, Any], tuple[Any, Any]]:
-        """See `Transport`; AttributeError where the model does not know it."""
-        known = self.model.alpha
-        return lambda out, active: known(SurfacePoint(out.p, out.n_face, out.n, out.w), active)
+    def S_mu(self, prepared: PreparedExit, entry: Entry, w_i: Any, active: Any) -> Any:
+        n_out, mu_i = entry.seen(w_i)
+        return self.model.S(prepared, SurfacePoint(entry.p, entry.n_face, n_out, w_i), active) * mu_i
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectTransport(LearntTransport):
+    """S of an object together with its directional albedo under uniform illumination."""
+
+    def alpha(self, out: Exit, active: Any) -> tuple[Any, Any]:
+        """See `Transport`."""
+        return self.model.alpha(SurfacePoint(out.p, out.n_face, out.n, out.w), active)
 
     @property
     def evened(self) -> tuple[Any, Any]:
         """See `Transport`."""
         return self.model.alpha.evened
-
-    def S_mu(self, prepared: PreparedExit, entry: Entry, w_i: Any, active: Any) -> Any:
-        n_out, mu_i = entry.seen(w_i)
-        return self.model.S(prepared, SurfacePoint(entry.p, entry.n_face, n_out, w_i), active) * mu_i
 
 
 def _weights(subject: Subject, settings: Settings) -> Path:
@@ -96,8 +98,8 @@ def learnt_means(found: Object, inside: Inside, media: list[Medium], settings: S
     path = _weights(subject, settings)
     learnt = load(path, subject)
     model, sampler, _ = learnt
-    backbone = model.start.models
-    transport = LearntTransport(model, (checksum_of(path, KIND), *load_weights(path, KIND)[1][CHECKSUMS]))
+    backbone = model.base.models
+    transport = ObjectTransport(model, (checksum_of(path, KIND), *load_weights(path, KIND)[1][CHECKSUMS]))
     table = RadialTable([m for m in backbone if float(m.medium.sigma_s) > 0], found.size)
     by_itself = AREA_SHARE if sampler is None else 0.0  # patches reach everywhere
     share = by_itself if settings.area_share == AUTOMATIC else settings.area_share

@@ -22,7 +22,7 @@ import torch
 
 from figures.studies.flow import ConditionalFlow, FlowSampler
 from figures.studies.flow_chart import N_CONTEXT, Chart, context, direction_square
-from figures.studies.flow_training import FlowNetwork, FlowRecipe, Schedule, Walks, flow_walks
+from figures.studies.flow_training import FlowNetwork, FlowRecipe, TimedFit, Walks, flow_walks
 from full_geometry.learning.networks import Layers, PatchLogits
 from full_geometry.object.features import Side, n_side, side_features
 from full_geometry.object.first_event import first_event
@@ -141,7 +141,7 @@ def fit_alpha_p(subject: Subject, recipe: FlowRecipe | None = None, seed: int = 
     pilot = flow_walks(subject, frame, patches, chart, recipe.chunk, (seed, 70))
     mean = pilot.total.mean(axis=0).astype(np.float64)
     scale = np.where(mean > 0, 1 / np.maximum(mean, 1e-30), 0.0).astype(np.float32)
-    schedule = Schedule(list(nets.parameters()), recipe)
+    schedule = TimedFit(list(nets.parameters()), recipe)
     order = np.random.default_rng([seed, 71])
 
     def loss(walks: Walks, rows: np.ndarray) -> torch.Tensor:

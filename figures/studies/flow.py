@@ -16,7 +16,7 @@ import numpy as np
 
 from figures.studies.flow_chart import Chart, context
 from full_geometry.models.storing import KIND, Learnt
-from full_geometry.object.features import Frame, PreparedExit, Side
+from full_geometry.object.features import ObjectFrame, PreparedExit, Side
 from full_geometry.object.patches import PatchSampler, PatchTable, PatchWeights
 from halfspace_sss.neural.perceptron import Perceptron, relu
 from halfspace_sss.neural.store import load_weights, save_weights
@@ -177,7 +177,7 @@ class FlowSampler:
     flow: ConditionalFlow
 
     @property
-    def frame(self) -> Frame:
+    def frame(self) -> ObjectFrame:
         """Of the object."""
         return self.patches.frame
 
@@ -195,7 +195,7 @@ class FlowSampler:
         return self.patches.density(weights, face) * self.flow.density(told, self.chart.coordinates(face, p))
 
 
-class _Prepared(NamedTuple):
+class _FlowOfExit(NamedTuple):
     side: Side
     weights: PatchWeights | None
 
@@ -214,11 +214,11 @@ class FlowProposals(CosineProposals):
     sign: float
     table: PatchTable | None = None
 
-    def prepare(self, out: Exit, prepared: PreparedExit, active: Any) -> _Prepared:
+    def prepare(self, out: Exit, prepared: PreparedExit, active: Any) -> _FlowOfExit:
         weights = self.sampler.patches.prepare(prepared.side) if self.table is None else None
-        return _Prepared(prepared.side, weights)
+        return _FlowOfExit(prepared.side, weights)
 
-    def sample(self, out: Exit, prim_index: Any, prepared: _Prepared, sampler: Any, active: Any) -> Entry:
+    def sample(self, out: Exit, prim_index: Any, prepared: _FlowOfExit, sampler: Any, active: Any) -> Entry:
         u = sampler.next_1d(), tuple(sampler.next_2d())
         weights = prepared.weights if self.table is None else self.table.weights(prim_index)
         at, density = self.sampler.sample(prepared.side, weights, *u)

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from full_geometry.object.features import Frame, Side
+from full_geometry.object.features import ObjectFrame, Side
 from full_geometry.object.patches import Patches, mesh_faces
 from full_geometry.object.subject import Subject
 from halfspace_sss.rendering.transport.area_points import Point
@@ -41,7 +41,7 @@ class Chart:
         patches: of its surface.
     """
 
-    def __init__(self, subject: Subject, frame: Frame, patches: Patches) -> None:
+    def __init__(self, subject: Subject, frame: ObjectFrame, patches: Patches) -> None:
         self.subject = subject
         centroids, normals, areas = mesh_faces(subject)
         turn = np.eye(3) if frame.turn is None else np.array([np.array(row).ravel() for row in frame.turn])
@@ -185,7 +185,7 @@ def _within(order: np.ndarray, of_face: np.ndarray, areas: np.ndarray, n: int) -
 N_CONTEXT = 18
 
 
-def context(frame: Frame, exit: Side, patch: PatchFrame) -> list[Any]:
+def context(frame: ObjectFrame, exit: Side, patch: PatchFrame) -> list[Any]:
     """The numbers of `N_CONTEXT`.
 
     x_o and y_o in the frame of the patch as v / (|v| + radius), the logarithms of both distances over the radius, n_o

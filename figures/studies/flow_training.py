@@ -20,7 +20,7 @@ from figures.studies.flow import BINS, LEAST_SLOPE, ConditionalFlow, FlowSampler
 from figures.studies.flow_chart import N_CONTEXT, Chart, context, direction_square
 from full_geometry.learning.networks import PatchLogits, one_thread, patch_likelihood
 from full_geometry.models.storing import Learnt
-from full_geometry.object.features import Frame, Side, n_side, side_features
+from full_geometry.object.features import ObjectFrame, Side, n_side, side_features
 from full_geometry.object.first_event import first_event
 from full_geometry.object.patches import Patches, PatchSampler
 from full_geometry.object.subject import Subject
@@ -172,7 +172,7 @@ class Walks(NamedTuple):
 
 
 def flow_walks(
-    subject: Subject, frame: Frame, patches: Patches, chart: Chart, n: int, seed: tuple[int, ...],
+    subject: Subject, frame: ObjectFrame, patches: Patches, chart: Chart, n: int, seed: tuple[int, ...],
     light: Lighting | None = None,
 ) -> Walks:  # fmt: skip
     """n walks of random exits.
@@ -250,7 +250,7 @@ class FlowRecipe:
         check_count("steps", 1 if self.steps is None else self.steps, 1)
 
 
-class Schedule:
+class TimedFit:
     """Steps of Adam until the CPU seconds are spent, the rate falling by a cosine.
 
     Args:
@@ -319,7 +319,7 @@ def fit_patches(
     recipe, (model, sampler, _) = recipe or FlowRecipe(), learnt
     chart = Chart(model.subject, sampler.frame, sampler.patches)
     net = PatchLogits(n_side(len(model.subject.media)), sampler.patches.areas, recipe.patch_hidden, seed)
-    schedule = Schedule(list(net.parameters()), recipe)
+    schedule = TimedFit(list(net.parameters()), recipe)
 
     def loss(walks: Walks, rows: np.ndarray) -> torch.Tensor:
         x, patch = torch.from_numpy(walks.exit[rows].T.copy()), torch.from_numpy(walks.patch[rows])
@@ -341,7 +341,7 @@ def fit_flow(
     recipe, (model, sampler, _) = recipe or FlowRecipe(), learnt
     chart = Chart(model.subject, sampler.frame, sampler.patches)
     net = FlowNetwork(2, N_CONTEXT, recipe.hidden, seed)
-    schedule = Schedule(list(net.parameters()), recipe)
+    schedule = TimedFit(list(net.parameters()), recipe)
 
     def loss(walks: Walks, rows: np.ndarray) -> torch.Tensor:
         told, u = torch.from_numpy(walks.told[rows]), torch.from_numpy(walks.u[rows, :2])

@@ -20,7 +20,7 @@ import zuko
 from figures.studies.paper_network import placed
 from full_geometry.learning.networks import one_thread
 from full_geometry.models.object_model import FullGeometry
-from full_geometry.object.features import Frame
+from full_geometry.object.features import ObjectFrame
 from full_geometry.object.subject import Subject, SurfacePoint, surface_point
 from halfspace_sss.checks import check_interval
 from halfspace_sss.rendering.surface.horizon import cosine_above
@@ -43,7 +43,7 @@ class SpaceFlow:
     """
 
     flow: Any
-    frame: Frame
+    frame: ObjectFrame
 
     def sample(self, exits: SurfacePoint, n: int, seed: int = 0) -> np.ndarray:
         """n points in space of each of m exits, (m, n, 3), in the frame of the object over its radius."""
@@ -75,7 +75,7 @@ def incidence(model: FullGeometry, exits: SurfacePoint, points: SurfacePoint) ->
 
 
 @one_thread()
-def fit_space_flow(model: FullGeometry, frame: Frame, seconds: float = 60.0, seed: int = 0) -> SpaceFlow:
+def fit_space_flow(model: FullGeometry, frame: ObjectFrame, seconds: float = 60.0, seed: int = 0) -> SpaceFlow:
     """The flow after so many CPU seconds.
 
     Args:
@@ -102,7 +102,7 @@ def fit_space_flow(model: FullGeometry, frame: Frame, seconds: float = 60.0, see
     return SpaceFlow(flow, frame)
 
 
-def _pairs(model: FullGeometry, frame: Frame, seed: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _pairs(model: FullGeometry, frame: ObjectFrame, seed: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Exits (n, 5), uniform points (n, 3) and t over its mean."""
     n = PAIRS * POINTS
     exits = model.subject.random_points(generator(mi, PAIRS, pass_seed(*seed, 0)))
@@ -112,7 +112,7 @@ def _pairs(model: FullGeometry, frame: Frame, seed: tuple[int, ...]) -> tuple[np
     return placed(frame, exits, n), placed(frame, points, n)[:, :3], (t / t.mean()).astype(np.float32)
 
 
-def mesh_arrays(subject: Subject, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
+def mesh_arrays(subject: Subject, frame: ObjectFrame) -> tuple[np.ndarray, np.ndarray]:
     """Vertices, in the frame over the radius, and faces, as libigl takes them."""
     parameters = mi.traverse(subject.found.shape)
     vertices = np.array(parameters["vertex_positions"], dtype=np.float64).reshape(-1, 3)

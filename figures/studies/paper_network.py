@@ -14,11 +14,11 @@ import numpy as np
 import torch
 from torch import nn
 
-from full_geometry.learning.model_errors import ModelError, compare
+from full_geometry.learning.model_errors import RadianceError, compare
 from full_geometry.learning.networks import one_thread
-from full_geometry.object.features import Frame
+from full_geometry.object.features import ObjectFrame
 from full_geometry.object.identity import Identity, frame_of, identify
-from full_geometry.object.radiance import LOBES, POWER, Estimate, Reference, reference
+from full_geometry.object.radiance import LOBES, POWER, ExitRadiance, ExitTruth, reference
 from full_geometry.object.subject import Subject, SurfacePoint
 from full_geometry.object.walks import trace_exits
 from halfspace_sss.checks import check_choice, check_count, check_interval
@@ -42,7 +42,7 @@ FACTORS = (0.125, 8.0)  # of the augmentation by scale
 
 
 @dataclass(frozen=True, eq=False)
-class Light:
+class PaperLight:
     """Light of m exits, one for each.
 
     Args:
@@ -63,7 +63,7 @@ class Light:
         return (self.base[:, None, :] + np.einsum("mnk,mkc->mnc", c, self.colours)).astype(np.float32)
 
 
-def random_lights(m: int, channels: int, rng: np.random.Generator) -> Light:
+def random_lights(m: int, channels: int, rng: np.random.Generator) -> PaperLight:
     """Lights of random lobes and colours, each times a random factor (augmentation by scale)."""
     axes = rng.standard_normal((m, MOST_LOBES, 3))
     axes /= np.linalg.norm(axes, axis=2, keepdims=True)
@@ -71,16 +71,16 @@ def random_lights(m: int, channels: int, rng: np.random.Generator) -> Light:
     factor = np.exp(rng.uniform(*np.log(FACTORS), (m, 1)))
     on = rng.random((m, MOST_LOBES, 1)) < 0.6
     colours = on * rng.random((m, MOST_LOBES, channels)) * factor[:, :, None]
-    return Light(rng.random((m, channels)) * factor, axes, powers, colours)
+    return PaperLight(rng.random((m, channels)) * factor, axes, powers, colours)
 
 
-def measured_lights(m: int, channels: int) -> list[Light]:
+def measured_lights(m: int, channels: int) -> list[PaperLight]:
     """Constant light and the four lobes of the measured errors, the same for m exits."""
     none = np.zeros((m, 1, 3))
-    found = [Light(np.ones((m, channels)), none, np.ones((m, 1)), np.zeros((m, 1, channels)))]
+    found = [PaperLight(np.ones((m, channels)), none, np.ones((m, 1)), np.zeros((m, 1, channels)))]
     for axis in LOBES:
         axes = np.broadcast_to(axis, (m, 1, 3))
-        found.append(Light(np.zeros((m, channels)), axes, np.full((m, 1), POWER), np.ones((m, 1, channels))))
+        found.append(PaperLight(np.zeros((m, channels)), axes, np.full((m, 1), POWER), np.ones((m, 1, channels))))
     return found
 
 
@@ -116,7 +116,7 @@ class PaperRecipe:
 
 
 @dataclass(frozen=True, eq=False)
-class Samples:
+class PaperSamples:
     """m exits with N incident samples each.
 
     Args:
@@ -155,14 +155,14 @@ class PaperNetwork(nn.Module):
         both = torch.cat((points, L), dim=2).flatten(1)
         return self.layers(torch.cat((exit, both), dim=1))
 
-    def radiance(self, samples: Samples, light: Light) -> np.ndarray:
+    def radiance(self, samples: PaperSamples, light: PaperLight) -> np.ndarray:
         """Radiance (m, channels) of samples in a light."""
         with torch.no_grad():
             L = torch.from_numpy(light(samples.w))
             return self(torch.from_numpy(samples.exit), torch.from_numpy(samples.points), L).numpy()
 
 
-def placed(frame: Frame, at: SurfacePoint, n: int) -> np.ndarray:
+def placed(frame: ObjectFrame, at: SurfacePoint, n: int) -> np.ndarray:
     """Position over the radius and the angles of w, over pi: (n, 5)."""
     p, w = frame.position(at.p), mi.Vector3f(frame.direction(at.w))
     columns = [*p, dr.acos(dr.clip(w.z, -1, 1)) / dr.pi, dr.atan2(w.y, w.x) / dr.pi]
@@ -170,7 +170,9 @@ def placed(frame: Frame, at: SurfacePoint, n: int) -> np.ndarray:
     return np.stack([np.broadcast_to(c.numpy(), n) for c in columns], axis=1).astype(np.float32)
 
 
-def walk_samples(subject: Subject, frame: Frame, exits: SurfacePoint, n: int, seed: tuple[int, ...]) -> Samples:
+def walk_samples(
+    subject: Subject, frame: ObjectFrame, exits: SurfacePoint, n: int, seed: tuple[int, ...]
+) -> PaperSamples:
     """N walks of each exit, as the paper's samples; walks that end inside keep T = 0 and a place of their own."""
     m = dr.width(exits.p)
     starts = exits.gather(dr.arange(mi.UInt32, m * n) // n)
@@ -179,7 +181,7 @@ def walk_samples(subject: Subject, frame: Frame, exits: SurfacePoint, n: int, se
     here = SurfacePoint(*(dr.select(lost, a, b) for a, b in zip(starts, ends.at)))
     points = placed(frame, here, m * n).reshape(m, n, 5)
     w, T = (np.array(v, dtype=np.float32).T.reshape(m, n, -1) for v in (here.w, ends.T))
-    return Samples(placed(frame, exits, m), points, w, np.ascontiguousarray(T))
+    return PaperSamples(placed(frame, exits, m), points, w, np.ascontiguousarray(T))
 
 
 @one_thread()
@@ -220,7 +222,7 @@ def fit_paper(
     return net, steps
 
 
-def _step(net: PaperNetwork, adam: Any, samples: Samples, rows: np.ndarray, rng: np.random.Generator) -> float:
+def _step(net: PaperNetwork, adam: Any, samples: PaperSamples, rows: np.ndarray, rng: np.random.Generator) -> float:
     """One step under random light; returns the MSE."""
     light = random_lights(len(rows), samples.T.shape[2], rng)
     L = light(samples.w[rows])
@@ -242,8 +244,8 @@ POINTS = ("walks", "uniform")
 
 
 def paper_errors(
-    subject: Subject, net: PaperNetwork, truth: Reference, *, points: str = "walks", repeats: int = 16, seed: int = 0
-) -> list[ModelError]:
+    subject: Subject, net: PaperNetwork, truth: ExitTruth, *, points: str = "walks", repeats: int = 16, seed: int = 0
+) -> list[RadianceError]:
     """Errors per channel, under constant light and lobes.
 
     Args:
@@ -264,7 +266,7 @@ def paper_errors(
 
 def estimate(
     subject: Subject, net: PaperNetwork, exits: SurfacePoint, points: str, repeats: int, seed: int = 0
-) -> Estimate:
+) -> ExitRadiance:
     """Mean radiance of exits over repeats with new points, and its variance."""
     frame, m, found = frame_of(subject), dr.width(exits.p), []
     for k in range(repeats):
@@ -275,16 +277,18 @@ def estimate(
         lights = measured_lights(m, len(subject.media))
         found.append(np.stack([net.radiance(samples, light) for light in lights], axis=-1))
     values = np.array(found, dtype=float).transpose(0, 2, 1, 3)
-    return Estimate(values.mean(axis=0), values.var(axis=0, ddof=1) / repeats)
+    return ExitRadiance(values.mean(axis=0), values.var(axis=0, ddof=1) / repeats)
 
 
-def uniform_samples(subject: Subject, frame: Frame, exits: SurfacePoint, n: int, seed: tuple[int, ...]) -> Samples:
+def uniform_samples(
+    subject: Subject, frame: ObjectFrame, exits: SurfacePoint, n: int, seed: tuple[int, ...]
+) -> PaperSamples:
     """N points uniform over the area for each exit; the throughputs are left out."""
     m: Any = dr.width(exits.p)
     at = subject.random_points(generator(mi, m * n, pass_seed(*seed)))
     w = np.array(at.w, dtype=np.float32).T.reshape(m, n, 3)
     points = placed(frame, at, m * n).reshape(m, n, 5)
-    return Samples(placed(frame, exits, m), points, w, np.zeros((m, n, len(subject.media)), np.float32))
+    return PaperSamples(placed(frame, exits, m), points, w, np.zeros((m, n, len(subject.media)), np.float32))
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -365,6 +369,6 @@ def errors(
     return _rows(subject.found.shape.id(), found)
 
 
-def _rows(name: str, found: list[ModelError]) -> list[ObjectError]:
+def _rows(name: str, found: list[RadianceError]) -> list[ObjectError]:
     channels = "RGB" if max(row.channel for row in found) == 2 else ["mono"]
     return [ObjectError(name, channels[e.channel], KIND, e.light, e.error, e.standard_error, e.ratio) for e in found]

@@ -168,7 +168,7 @@ def samplers(learnt: Learnt, recipe: FlowRecipe, light: Lighting, flow: Any, see
     """
     model, patches, _ = learnt
     found, sign = model.subject.found, model.subject.found.sign
-    backbone = model.start.models
+    backbone = model.base.models
     table = RadialTable([m for m in backbone if float(m.medium.sigma_s) > 0], found.size)
     probes = PositionSampler(replace(found, pieces=None), table, model.subject.points, AREA_SHARE)
     lit = fit_patches(learnt, recipe, light=light, seed=seed)

@@ -12,7 +12,7 @@ import torch
 
 from figures.studies.held_out import HELD_OUT
 from full_geometry.learning.shape_data import PairData, draw_subject, grouped, make_data, mean_events
-from full_geometry.learning.shape_training import STANDARD, Fitting
+from full_geometry.learning.shape_training import STANDARD, ShapeFit
 from full_geometry.models.descriptors import N_LENGTHS, N_OWN
 from halfspace_sss.progress import NamedProgress
 
@@ -94,7 +94,7 @@ def _without(data: PairData, missing: Sequence[str]) -> PairData:
 def _fit(pool: list[PairData], held: list[PairData], seconds: float) -> tuple[int, np.ndarray, np.ndarray]:
     """Steps, and on every held-out object the likelihood and the ratio of the mean radiances."""
     groups = [grouped(data) for data in pool]
-    fitting, rng, at = Fitting(STANDARD, 0), np.random.default_rng(0), time.process_time()
+    fitting, rng, at = ShapeFit(STANDARD, 0), np.random.default_rng(0), time.process_time()
     while (part := (time.process_time() - at) / seconds) < 1:
         fitting.advance(groups, rng, part)
     losses, ratios = [], []

@@ -13,10 +13,10 @@ import mitsuba as mi
 import numpy as np
 
 from figures.studies.held_out import HELD_OUT
-from full_geometry.learning.model_errors import LIGHTS, ModelError, errors_of
+from full_geometry.learning.model_errors import LIGHTS, RadianceError, errors_of
 from full_geometry.learning.shape_data import draw_subject
 from full_geometry.models.descriptors import mean_chord
-from full_geometry.models.half_space import HalfSpaceTransport
+from full_geometry.models.half_space import PlanarModel
 from full_geometry.models.neural_shape import transport
 from full_geometry.object.subject import Subject
 from halfspace_sss.interface.model import bssrdf
@@ -114,7 +114,7 @@ def evaluate(
             progress(case.name, k, n)
         subject = case.subject
         models: dict[str, Any] = {"neural_shape": transport(subject, path)}
-        models |= {name: HalfSpaceTransport(subject, name) for name in HALF_SPACES if _takes(name, subject)}
+        models |= {name: PlanarModel(subject, name) for name in HALF_SPACES if _takes(name, subject)}
         walks = WALKS * (MORE if float(subject.media[0].albedo_prime) < DARK else 1)
         found = errors_of(subject, models, exits=EXITS, walks=walks, samples=SAMPLES, seed=seed)
         rows.append(_row(case, found))
@@ -129,7 +129,7 @@ def _takes(name: str, subject: Subject) -> bool:
         return False
 
 
-def _row(case: Case, found: Mapping[str, list[ModelError]]) -> Row:
+def _row(case: Case, found: Mapping[str, list[RadianceError]]) -> Row:
     m = case.subject.media[0]
     errors = {
         model: {light: next((r.error, r.standard_error) for r in rows if r.light == light and r.channel == 0)
@@ -144,7 +144,7 @@ def _row(case: Case, found: Mapping[str, list[ModelError]]) -> Row:
 def seconds_per_million(subject: Subject, path: Path | None = None) -> dict[str, float]:
     """Seconds for a million evaluations, entry and exit prepared anew, of the network and of half-space models."""
     models: dict[str, Any] = {"neural_shape": transport(subject, path)}
-    models |= {name: HalfSpaceTransport(subject, name) for name in HALF_SPACES}
+    models |= {name: PlanarModel(subject, name) for name in HALF_SPACES}
     rng = generator(mi, LANES, pass_seed(29))
     exits, entries = subject.random_points(rng), subject.random_points(rng)
     dr.eval(exits, entries)

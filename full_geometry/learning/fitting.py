@@ -11,8 +11,8 @@ import numpy as np
 import torch
 
 from full_geometry.learning.networks import (
+    AlbedoNetwork,
     Correction,
-    EvenLight,
     PatchLogits,
     device_of_walks,
     likelihood,
@@ -76,7 +76,7 @@ class Recipe:
 STANDARD = Recipe()
 
 
-class Fitting:
+class ObjectFit:
     """The state of a fit, which follows from recipe, seed, number of steps, data and device, see `device_of_walks`.
 
     Args:
@@ -94,7 +94,7 @@ class Fitting:
         self.recipe, self.patches, self.n_side = recipe, patches, (n_in - n_pair(channels)) // 2
         parts = {
             "S": Correction(n_in + 2 * ALPHA_HIDDEN[-1], channels, recipe.width, recipe.depth, seed),
-            "alpha": EvenLight(self.n_side, channels, ALPHA_HIDDEN, eta, seed),
+            "alpha": AlbedoNetwork(self.n_side, channels, ALPHA_HIDDEN, eta, seed),
         }
         if patches is not None:
             parts["patches"] = PatchLogits(self.n_side, patches.areas, PATCH_HIDDEN, seed)

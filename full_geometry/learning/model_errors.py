@@ -19,10 +19,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from full_geometry.models.half_space import HalfSpace, HalfSpaceTransport
+from full_geometry.models.half_space import HalfSpace, PlanarModel
 from full_geometry.models.storing import KIND, find_weights, load
-from full_geometry.object.pairs import Proposals
-from full_geometry.object.radiance import Estimate, ObjectModel, Reference, modelled, reference
+from full_geometry.object.pairs import EntryProposals
+from full_geometry.object.radiance import ExitRadiance, ExitTruth, ObjectModel, modelled, reference
 from full_geometry.object.subject import Subject, SurfacePoint
 from halfspace_sss.checks import check_choice, check_count
 from halfspace_sss.physics.medium import Medium
@@ -39,7 +39,7 @@ FEWEST = {"multiple": 2, "total": 1}  # scattering events of what a model contai
 PROBES = "better_dipole"  # whose radial density entries follow
 
 
-class ModelError(NamedTuple):
+class RadianceError(NamedTuple):
     """Relative RMSE of one channel under one kind of light, its standard error, and the ratio of the means."""
 
     channel: int
@@ -49,21 +49,21 @@ class ModelError(NamedTuple):
     ratio: float
 
 
-def compare(model: Estimate, truth: Estimate) -> list[ModelError]:
+def compare(model: ExitRadiance, truth: ExitRadiance) -> list[RadianceError]:
     """The errors of all channels under both kinds of light."""
     kinds = tuple(zip(LIGHTS, (slice(0, 1), slice(1, None))))
     return [_error(c, light, columns, model, truth) for c in range(len(truth.mean)) for light, columns in kinds]
 
 
-def of_even_light(model: Estimate, truth: Estimate) -> list[ModelError]:
+def of_even_light(model: ExitRadiance, truth: ExitRadiance) -> list[RadianceError]:
     """The errors of all channels under an even sky, the first of the lights of both."""
     return [_error(c, EVEN_SKY, slice(0, 1), model, truth) for c in range(len(truth.mean))]
 
 
-def _error(c: int, light: str, columns: slice, model: Estimate, truth: Estimate) -> ModelError:
+def _error(c: int, light: str, columns: slice, model: ExitRadiance, truth: ExitRadiance) -> RadianceError:
     a, b = model.mean[c][:, columns], truth.mean[c][:, columns]
     square = (a - b) ** 2 - model.variance[c][:, columns] - truth.variance[c][:, columns]
-    return ModelError(c, light, *_jackknife(square, b), float(a.mean() / max(b.mean(), 1e-300)))
+    return RadianceError(c, light, *_jackknife(square, b), float(a.mean() / max(b.mean(), 1e-300)))
 
 
 def _jackknife(square: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
@@ -83,17 +83,17 @@ def _jackknife(square: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
 def measure(
     subject: Subject,
     transport: ObjectModel,
-    proposals: Proposals,
+    proposals: EntryProposals,
     *,
-    truth: Reference | None = None,
+    truth: ExitTruth | None = None,
     samples: int = 8192,
     seed: int = 0,
-) -> list[ModelError]:
+) -> list[RadianceError]:
     """The error of a transport of an object, per channel, under constant light and lobes.
 
     Args:
         subject: the object.
-        transport: `FullGeometry` or `HalfSpaceTransport`.
+        transport: `FullGeometry` or `PlanarModel`.
         proposals: where entries are drawn.
         truth: from `reference`, of the orders of the transport; made anew by default.
         samples: entries of each exit.
@@ -104,14 +104,14 @@ def measure(
     return compare(modelled(transport, proposals, truth.exits, samples, seed), truth.truth)
 
 
-def _even_sky(transport: ObjectModel, by_S: Estimate, truth: Reference) -> list[ModelError]:
+def _even_sky(transport: ObjectModel, by_S: ExitRadiance, truth: ExitTruth) -> list[RadianceError]:
     """The errors of images under an even sky: those of alpha where it is trusted, elsewhere of S."""
     alpha, n = getattr(transport, "alpha", None), len(by_S.mean)
     if alpha is None:
         return []
     known = np.array(alpha.evened[1]).reshape(n, 1, 1) > 0
     mean = np.where(known, np.array(alpha(truth.exits)[1]).reshape(n, -1, 1), by_S.mean[..., :1])
-    return of_even_light(Estimate(mean, np.where(known, 0, by_S.variance[..., :1])), truth.truth)
+    return of_even_light(ExitRadiance(mean, np.where(known, 0, by_S.variance[..., :1])), truth.truth)
 
 
 def errors_of(
@@ -123,7 +123,7 @@ def errors_of(
     samples: int = 8192,
     seed: int = 0,
     progress: NamedProgress | None = None,
-) -> dict[str, list[ModelError]]:
+) -> dict[str, list[RadianceError]]:
     """The errors of several transports of an object, by name; the truth is traced once for all of the same orders.
 
     Of those that have learnt what even light leaves also the error of images under an even sky.
@@ -136,8 +136,8 @@ def errors_of(
         progress: called with (what, done, total).
     """
     check_count("samples", samples, 2)
-    proposals = Proposals(subject, HalfSpace(subject, PROBES))
-    truths: dict[str, Reference] = {}
+    proposals = EntryProposals(subject, HalfSpace(subject, PROBES))
+    truths: dict[str, ExitTruth] = {}
     found, done = {}, 0
     total = len(transports) + len({t.orders for t in transports.values()})
 
@@ -171,7 +171,7 @@ def errors(
     walks: int = 8192,
     samples: int = 8192,
     seed: int = 0,
-) -> list[ModelError]:
+) -> list[RadianceError]:
     """The error of a model of an object, by name: what a user is to expect of images before the first one.
 
     The truth has the orders of the model: two and more, or for a model that says "total" one and more.
@@ -252,4 +252,4 @@ def transport(subject: Subject, model: str, folder: str | os.PathLike | None = N
         return load(find_weights(subject, folder), subject).model
     if knows_objects(model):
         return AddedTransport.of(subject, model)
-    return HalfSpaceTransport(subject, model)
+    return PlanarModel(subject, model)

@@ -114,7 +114,7 @@ def likelihood(walks: tuple, proposals: tuple, kept: float) -> torch.Tensor:
     return ((W * torch.exp(g)).mean(dim=1) - kept * (T * f).mean(dim=1)).sum()
 
 
-class EvenLight(nn.Module):
+class AlbedoNetwork(nn.Module):
     """F_t P sigmoid(a) of orders one, then two and more, per channel, a a perceptron of the exit.
 
     Args:
@@ -160,7 +160,7 @@ def mean_likelihood(found: tuple, T: torch.Tensor, scale: torch.Tensor) -> torch
     """E[alpha - T log alpha] over walks, sum over channels times their scale; its minimum is alpha = E[T | exit].
 
     Args:
-        found: from `EvenLight`.
+        found: from `AlbedoNetwork`.
         T: (2 channels, n).
         scale: (2 channels, 1).
     """

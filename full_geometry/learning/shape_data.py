@@ -16,7 +16,7 @@ import numpy as np
 from full_geometry.learning.shapes import TRAINING, Family, make_shape
 from full_geometry.models.descriptors import ALONE, describe, end, medium, mixed
 from full_geometry.models.neural_shape import ALBEDO, ETA, SIZE, Backbone, G
-from full_geometry.object.pairs import Proposals
+from full_geometry.object.pairs import EntryProposals
 from full_geometry.object.subject import Subject, SurfacePoint
 from full_geometry.object.walks import trace_exits
 from halfspace_sss.physics.medium import Medium
@@ -167,7 +167,7 @@ def make_data(subject: Subject, events: float, seed: tuple[int, ...]) -> PairDat
     walks, _ = _columns(half_space, starts.gather(kept), exits.at.gather(kept))
     rng = generator(mi, KEPT, pass_seed(*seed, 2))
     starts = subject.random_points(rng)
-    entries, weight = Proposals(subject, half_space).sample(starts, rng)
+    entries, weight = EntryProposals(subject, half_space).sample(starts, rng)
     proposals, S_0 = _columns(half_space, starts, entries)
     W = (S_0 * weight.numpy() / mean).astype(np.float32)
     T = (T / mean).astype(np.float32)
@@ -207,7 +207,7 @@ NOISE, PAIRS = 0.03, 64  # squared, of the mean of so many proposals
 LEAST_LIGHT, FEWEST_PROPOSALS, FEWEST_WALKS_OF_GROUP = 1e-3, 128, 32
 
 
-class Part(NamedTuple):
+class GroupPart(NamedTuple):
     """Some pairs of one group.
 
     Args:
@@ -231,7 +231,7 @@ class Part(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Grouped:
+class GroupedPairs:
     """Data in the order of groups.
 
     Args:
@@ -249,7 +249,7 @@ class Grouped:
     light: np.ndarray
     weight: np.ndarray
 
-    def part(self, n: int, rng: np.random.Generator) -> Part:
+    def part(self, n: int, rng: np.random.Generator) -> GroupPart:
         """n walks and proposals, or all there are, of a random group."""
         data, u = self.data, rng.random(3)
         k = int(u[0] * GROUPS)
@@ -257,10 +257,10 @@ class Grouped:
         among = data.share * (self.walks[k + 1] - self.walks[k]) / len(data.T)
         T = data.T[j] * (among * GROUPS / max(len(j), 1))
         numbers = float(self.share[k] * GROUPS), float(self.light[k]), float(self.weight[k])
-        return Part(data.walks[j], T, data.proposals[i], data.W[i], data.medium, *numbers)
+        return GroupPart(data.walks[j], T, data.proposals[i], data.W[i], data.medium, *numbers)
 
 
-def grouped(data: PairData) -> Grouped:
+def grouped(data: PairData) -> GroupedPairs:
     """The data of an object in 16 groups of exits, halved four times at the median of their first principal axis."""
     exits = [v[:, ALONE].astype(np.float32) for v in (data.proposals, data.walks)]
     mean, spread = exits[0].mean(axis=0), exits[0].std(axis=0) + 1e-6
@@ -278,7 +278,7 @@ def grouped(data: PairData) -> Grouped:
     known = (light > LEAST_LIGHT) & (counts[0] >= FEWEST_PROPOSALS) & (counts[1] >= FEWEST_WALKS_OF_GROUP)
     noise = W[1] / PAIRS + (1 + T[1]) / np.maximum(counts[1], 1)
     weight = np.where(known, EMPHASIS / (1 + noise / NOISE), 0.0)
-    return Grouped(data, *bounds, share, np.where(known, light, 1.0), weight)
+    return GroupedPairs(data, *bounds, share, np.where(known, light, 1.0), weight)
 
 
 def _halve(exits: list[np.ndarray], labels: list[np.ndarray], kept: list[np.ndarray], times: int, first: int) -> None:

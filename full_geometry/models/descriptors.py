@@ -179,7 +179,7 @@ FAR = 1e30
 LEAST_SINE2 = 1e-8  # below it w has no azimuth
 
 
-class Surroundings(NamedTuple):
+class RaySurroundings(NamedTuple):
     """L and V for each length, and the depth z in scene units."""
 
     L: list[Any]
@@ -195,7 +195,7 @@ def directions(n: int = RAYS) -> np.ndarray:
     return np.stack([s * np.cos(phi), s * np.sin(phi), z])
 
 
-def look(subject: Subject, at: SurfacePoint, event: FirstEvent, active: Any = True) -> list[Surroundings]:
+def look(subject: Subject, at: SurfacePoint, event: FirstEvent, active: Any = True) -> list[RaySurroundings]:
     """Surroundings of the first events of each channel; channels of the same extinction share them.
 
     Args:
@@ -204,7 +204,7 @@ def look(subject: Subject, at: SurfacePoint, event: FirstEvent, active: Any = Tr
         event: their first events.
         active: mask of lanes.
     """
-    known: dict[tuple[float, float], Surroundings] = {}
+    known: dict[tuple[float, float], RaySurroundings] = {}
     for m, y in zip(subject.media, event.ys):
         key = float(m.sigma_t), float(m.sigma_t_prime)
         if key not in known:
@@ -212,7 +212,7 @@ def look(subject: Subject, at: SurfacePoint, event: FirstEvent, active: Any = Tr
     return [known[float(m.sigma_t), float(m.sigma_t_prime)] for m in subject.media]
 
 
-def _from(subject: Subject, at: SurfacePoint, y: Any, extinctions: tuple[float, float], active: Any) -> Surroundings:
+def _from(subject: Subject, at: SurfacePoint, y: Any, extinctions: tuple[float, float], active: Any) -> RaySurroundings:
     """Surroundings of the points y below the points of a surface, for sigma_t and sigma_t'."""
     tables = [mi.Float(row.astype(np.float32)) for row in directions()]
     sigma_t, sigma_t_prime = extinctions
@@ -234,7 +234,7 @@ def _from(subject: Subject, at: SurfacePoint, y: Any, extinctions: tuple[float, 
     C, C_plane, M, M_plane = ([v / RAYS for v in each] for each in sums)
     L = [0.5 * dr.log((a + LEAST_CHANCE) / (b + LEAST_CHANCE)) for a, b in zip(C, C_plane)]
     V = [m_p / (b + LEAST_CHANCE) - m / (a + LEAST_CHANCE) for a, b, m, m_p in zip(C, C_plane, M, M_plane)]
-    return Surroundings(L, V, depth)
+    return RaySurroundings(L, V, depth)
 
 
 def _tangents(at: SurfacePoint) -> tuple[Any, Any]:
@@ -281,7 +281,7 @@ class End(NamedTuple):
 
     at: SurfacePoint
     event: FirstEvent
-    around: list[Surroundings]
+    around: list[RaySurroundings]
     inner: Any
 
 

@@ -66,7 +66,7 @@ class HalfSpace:
         return query, F_t, (mu_i > 0) & (mu_o > 0) & (dr.dot(o.w, o.n) > 0) & (dr.dot(i.w, i.n) > 0)
 
 
-class HalfSpaceTransport:
+class PlanarModel:
     """A half-space model as renders lay it onto a surface today: no P, no floor.
 
     Args:

@@ -37,7 +37,7 @@ from full_geometry.models.descriptors import (
 )
 from full_geometry.models.half_space import HalfSpace
 from full_geometry.object.features import Side
-from full_geometry.object.pairs import Proposals
+from full_geometry.object.pairs import EntryProposals
 from full_geometry.object.subject import Subject, SurfacePoint, refract_in
 from full_geometry.object.walks import trace_exits
 from halfspace_sss.interface.model import BSSRDF, bssrdf
@@ -241,16 +241,16 @@ ENOUGH = 5e-3  # relative standard error
 MOST_SCALE = 4.0
 
 
-def held(model: NeuralShape) -> NeuralShape:
+def calibrated(model: NeuralShape) -> NeuralShape:
     """The same S with such scales that as much light leaves as by walks; of what is flat or does not scatter as it is.
 
     Args:
         model: of an object, any weights.
     """
-    weights = np.array([weight(mixture) for mixture in model.half_space.mixtures])
+    weights = np.array([calibration_weight(mixture) for mixture in model.half_space.mixtures])
     if not weights.any():
         return model
-    proposals = Proposals(model.subject, model.half_space)
+    proposals = EntryProposals(model.subject, model.half_space)
     B = _mean(lambda n, k: _walks(model.subject, n, k), *WALKS)
     S = _mean(lambda n, k: _pairs(model, proposals, n, k), *PAIRS)
     known = (B > 0) & (S > 0)
@@ -258,7 +258,7 @@ def held(model: NeuralShape) -> NeuralShape:
     return replace(model, scales=tuple((np.array(model.scales or 1.0) * ratio**weights).tolist()))
 
 
-def weight(mixture: Mixed) -> float:
+def calibration_weight(mixture: Mixed) -> float:
     """w of a channel; 0 where there is no scattering or no volume."""
     return max(1 - mixture.chord / FLAT, 0.0) if mixture.m_2 > 0 else 0.0
 
@@ -282,7 +282,7 @@ def _walks(subject: Subject, n: int, k: int) -> np.ndarray:
     return _rows(trace_exits(subject, starts, (SEED, 1, k)).T)
 
 
-def _pairs(model: NeuralShape, proposals: Proposals, n: int, k: int) -> np.ndarray:
+def _pairs(model: NeuralShape, proposals: EntryProposals, n: int, k: int) -> np.ndarray:
     """S mu_i over the density of the entries of n random exits."""
     exits = model.subject.random_points(generator(mi, n, pass_seed(SEED, 2, k)))
     entries, over = proposals.sample(exits, generator(mi, n, pass_seed(SEED, 3, k)))
@@ -342,4 +342,4 @@ def transport(subject: Subject, path: str | os.PathLike | None = None) -> Neural
     if subject.varying is not None:
         name = subject.found.shape.id()
         raise ValueError(f"the medium of {name!r} must be the same everywhere for {KIND}, got one that varies")
-    return held(NeuralShape.of(subject, load(Path(path) if path is not None else shipped_weights())))
+    return calibrated(NeuralShape.of(subject, load(Path(path) if path is not None else shipped_weights())))

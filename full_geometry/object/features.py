@@ -72,7 +72,7 @@ def surroundings(subject: Subject, frame: Any, turns: np.ndarray | None = None) 
 
     Args:
         subject: the object.
-        frame: a `Frame` of its features.
+        frame: a `ObjectFrame` of its features.
         turns: those of training; by default made from random points.
     """
     low, high = _bounds(subject, frame)
@@ -155,7 +155,7 @@ class Side(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
+class ObjectFrame:
     """The object's own frame and scales.
 
     Args:
@@ -257,7 +257,7 @@ def _octaves(x: Any) -> list[Any]:
     return found
 
 
-def side_features(frame: Frame, side: Side) -> list[Any]:
+def side_features(frame: ObjectFrame, side: Side) -> list[Any]:
     """Position and y with two octaves of sine and cosine, normal, w, mu, log of the way to y, log P, what varies, and
     how much of the object surrounds the position and y.
     """
@@ -285,7 +285,7 @@ def entering(columns: Any, eta: Any, channels: int) -> tuple[list[Any], list[Any
     return [F_t] * channels, [F_t * lib.maximum(p, 0 * mu) for p in P]
 
 
-def pair_features(frame: Frame, exit: Side, entry: Side) -> list[Any]:
+def pair_features(frame: ObjectFrame, exit: Side, entry: Side) -> list[Any]:
     """x_i - x_o as direction and length, log r, log |y_i - y_o|, dot products of directions and normals, and what the
     surface at one end says of y at the other: its depth below the plane there, its distance from the point, and the
     cosine between the way to y and the way on to the other y; log of the distance between the two y of each channel.
@@ -312,13 +312,13 @@ def _log(sigma_t: Any, length: Any) -> Any:
     return 0.5 * dr.log(length * sigma_t + LEAST_LENGTH)
 
 
-def _depth(frame: Frame, at: SurfacePoint, y: Any) -> Any:
+def _depth(frame: ObjectFrame, at: SurfacePoint, y: Any) -> Any:
     """t/(1 + |t|) of the depth t below the plane of a point, in mean free paths."""
     t = dr.dot(at.n_out, at.p - y) * frame.sigma_t
     return t / (1 + dr.abs(t))
 
 
-def _cosine(frame: Frame, side: Side, onward: Any) -> Any:
+def _cosine(frame: ObjectFrame, side: Side, onward: Any) -> Any:
     """Between the way from a point to its y and a direction."""
     way = side.event.y - side.at.p
     return dr.dot(way, onward) / dr.maximum(dr.norm(way), 1e-6 * frame.radius)
@@ -333,7 +333,7 @@ def reverse(n: int, channels: int) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate([np.arange(n, 2 * n), np.arange(n), 2 * n + pair]), signs
 
 
-class Start(Protocol):
+class BaseModel(Protocol):
     """What the network of one object begins with and multiplies: `HalfSpace`, or the network of all shapes.
 
     Attributes:

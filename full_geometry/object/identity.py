@@ -9,7 +9,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from full_geometry.object.features import Frame, surroundings
+from full_geometry.object.features import ObjectFrame, surroundings
 from full_geometry.object.subject import Subject
 from halfspace_sss.rendering.surface.varying import grid_values
 from halfspace_sss.rendering.transport.plane import number
@@ -165,7 +165,7 @@ def _check_same(trained: np.ndarray, here: np.ndarray) -> None:
     raise ValueError(f"coefficients must be known at {trained.shape} points, as trained, got {here.shape}")
 
 
-def frame_of(subject: Subject, trained: Identity | None = None, turns: np.ndarray | None = None) -> Frame:
+def frame_of(subject: Subject, trained: Identity | None = None, turns: np.ndarray | None = None) -> ObjectFrame:
     """The frame of the features; that of training for an object that has been moved since.
 
     Args:
@@ -185,5 +185,7 @@ def frame_of(subject: Subject, trained: Identity | None = None, turns: np.ndarra
     each = [float(m.sigma_t) for m in subject.media]
     sigma_t = float(np.exp(np.mean(np.log(each))))
     turn = None if np.allclose(R, np.eye(3), atol=1e-6) else [mi.Vector3f(*map(number, row)) for row in R.T]
-    frame = Frame(mi.Point3f(*map(number, centre)), number(radius), number(sigma_t), tuple(map(number, each)), turn)
+    frame = ObjectFrame(
+        mi.Point3f(*map(number, centre)), number(radius), number(sigma_t), tuple(map(number, each)), turn
+    )
     return replace(frame, around=surroundings(subject, frame, turns))

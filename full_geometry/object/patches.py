@@ -20,7 +20,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from full_geometry.object.features import Frame, PreparedExit, Side, side_features
+from full_geometry.object.features import ObjectFrame, PreparedExit, Side, side_features
 from full_geometry.object.first_event import first_event
 from full_geometry.object.subject import Subject, SurfacePoint, cosine_direction, surface_point
 from halfspace_sss.neural.perceptron import Perceptron
@@ -54,7 +54,7 @@ def mesh_faces(subject: Subject) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return (a + b + c) / 3, cross / np.maximum(double, 1e-30)[:, None], 0.5 * double
 
 
-def _places(subject: Subject, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
+def _places(subject: Subject, frame: ObjectFrame) -> tuple[np.ndarray, np.ndarray]:
     """What faces are clustered by, (n, 6) in the object's frame over its radius, and their areas."""
     centroids, normals, areas = mesh_faces(subject)
     turn = np.eye(3) if frame.turn is None else np.array([np.array(row).ravel() for row in frame.turn])
@@ -63,7 +63,7 @@ def _places(subject: Subject, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate([(centroids - centre) @ turn.T / radius, length * normals @ turn.T], axis=1), areas
 
 
-def cluster(subject: Subject, frame: Frame, n: int = PATCHES, seed: int = 0, rounds: int = ROUNDS) -> np.ndarray:
+def cluster(subject: Subject, frame: ObjectFrame, n: int = PATCHES, seed: int = 0, rounds: int = ROUNDS) -> np.ndarray:
     """Centres of at most n patches, (n, 6), in the frame of the object."""
     from scipy.spatial import cKDTree
 
@@ -88,7 +88,7 @@ class Patches:
         centres: from `cluster`, of this object or of the one that was trained.
     """
 
-    def __init__(self, subject: Subject, frame: Frame, centres: np.ndarray) -> None:
+    def __init__(self, subject: Subject, frame: ObjectFrame, centres: np.ndarray) -> None:
         from scipy.spatial import cKDTree
 
         x, areas = _places(subject, frame)
@@ -143,7 +143,7 @@ class PatchSampler:
         weights: V_k (outputs, inputs) and c_k of the layers; the last has one output for each patch.
     """
 
-    frame: Frame
+    frame: ObjectFrame
     patches: Patches
     weights: Mapping[str, np.ndarray]
 
@@ -207,7 +207,7 @@ EXITS = 4  # of a cell
 
 
 @dataclass(frozen=True, eq=False)
-class _Row:
+class _CumulativeRow:
     """The cumulative weights of a cell, as a lane asks for them."""
 
     table: Any
@@ -232,7 +232,7 @@ class ExitTable:
 
     def weights(self, k: Any) -> PatchWeights:
         """Of exit k."""
-        return PatchWeights(_Row(self.table, k * self.n), dr.gather(type(self.last), self.last, k))
+        return PatchWeights(_CumulativeRow(self.table, k * self.n), dr.gather(type(self.last), self.last, k))
 
 
 class PatchTable:
@@ -269,7 +269,7 @@ class PatchTable:
     def weights(self, face: Any) -> PatchWeights:
         """Of an exit on a face."""
         cell = dr.gather(type(self.of_face), self.of_face, face)
-        return PatchWeights(_Row(self.table, cell * self.n), dr.gather(type(self.last), self.last, cell))
+        return PatchWeights(_CumulativeRow(self.table, cell * self.n), dr.gather(type(self.last), self.last, cell))
 
 
 def _weights(sampler: PatchSampler, exit: Side, n: int) -> np.ndarray:
@@ -295,7 +295,7 @@ def _weights(sampler: PatchSampler, exit: Side, n: int) -> np.ndarray:
 AREA_SHARE = 0.75  # of the candidates for entries without patches that are uniform over the area
 
 
-class _Prepared(NamedTuple):
+class _PatchesOfExit(NamedTuple):
     """Of an exit: the weights of patches, and the axes of probes."""
 
     weights: PatchWeights | None
@@ -320,11 +320,11 @@ class LearntProposals(CosineProposals):
     sign: float
     table: PatchTable | None = None
 
-    def prepare(self, out: Exit, prepared: PreparedExit, active: Any) -> _Prepared:
+    def prepare(self, out: Exit, prepared: PreparedExit, active: Any) -> _PatchesOfExit:
         weights = self.patches.prepare(prepared.side) if self.table is None else None
-        return _Prepared(weights, (out.n, *mi.coordinate_system(out.n)))
+        return _PatchesOfExit(weights, (out.n, *mi.coordinate_system(out.n)))
 
-    def sample(self, out: Exit, prim_index: Any, prepared: _Prepared, sampler: Any, active: Any) -> Entry:
+    def sample(self, out: Exit, prim_index: Any, prepared: _PatchesOfExit, sampler: Any, active: Any) -> Entry:
         by_patch = active & (sampler.next_1d() < number(self.patch_share))
         weights = prepared.weights if self.table is None else self.table.weights(prim_index)
         at, _ = self.patches.sample(weights, sampler.next_1d(), sampler.next_1d(), sampler.next_2d())

@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from full_geometry.object.pairs import Proposals
+from full_geometry.object.pairs import EntryProposals
 from full_geometry.object.patches import ExitTable
 from full_geometry.object.subject import Subject, SurfacePoint
 from full_geometry.object.walks import trace_exits
@@ -40,7 +40,7 @@ class ObjectModel(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Estimate:
+class ExitRadiance:
     """Radiance of exits under all lights and its variance, (channels, exits, lights)."""
 
     mean: np.ndarray
@@ -48,11 +48,11 @@ class Estimate:
 
 
 @dataclass(frozen=True, eq=False)
-class Reference:
+class ExitTruth:
     """Exits and what walks say of them."""
 
     exits: SurfacePoint
-    truth: Estimate
+    truth: ExitRadiance
 
 
 class _Sums:
@@ -73,9 +73,9 @@ class _Sums:
         self.sums = self.sums + np.stack(rows)
         self.n += per_exit
 
-    def estimate(self) -> Estimate:
+    def estimate(self) -> ExitRadiance:
         first, second = np.split(self.sums / self.n, 2, axis=-1)
-        return Estimate(first, (second - first**2) / (self.n - 1))
+        return ExitRadiance(first, (second - first**2) / (self.n - 1))
 
 
 def _passes(n_exits: int, per_exit: int) -> list[int]:
@@ -84,7 +84,7 @@ def _passes(n_exits: int, per_exit: int) -> list[int]:
     return [min(most, per_exit - done) for done in range(0, per_exit, most)]
 
 
-def reference(subject: Subject, exits: int = 256, walks: int = 8192, seed: int = 0, fewest: int = 2) -> Reference:
+def reference(subject: Subject, exits: int = 256, walks: int = 8192, seed: int = 0, fewest: int = 2) -> ExitTruth:
     """Exits and their radiance by walks.
 
     Args:
@@ -95,10 +95,10 @@ def reference(subject: Subject, exits: int = 256, walks: int = 8192, seed: int =
         check_count(name, value, least)
     points = subject.random_points(generator(mi, exits, pass_seed(seed, 17)))
     dr.eval(points)
-    return Reference(points, traced(subject, points, walks, (seed, 18), fewest=fewest))
+    return ExitTruth(points, traced(subject, points, walks, (seed, 18), fewest=fewest))
 
 
-def traced(subject: Subject, exits: SurfacePoint, walks: int, seed: tuple[int, ...], **orders: int) -> Estimate:
+def traced(subject: Subject, exits: SurfacePoint, walks: int, seed: tuple[int, ...], **orders: int) -> ExitRadiance:
     """Radiance of exits by so many walks of each; `orders` as for `trace_exits`."""
     sums = _Sums(dr.width(exits.p))
     for k, per_exit in enumerate(_passes(sums.n_exits, walks)):
@@ -112,8 +112,8 @@ def _repeated(points: SurfacePoint, times: int) -> SurfacePoint:
 
 
 def modelled(
-    transport: ObjectModel, proposals: Proposals, exits: SurfacePoint, samples: int, seed: int = 0
-) -> Estimate:
+    transport: ObjectModel, proposals: EntryProposals, exits: SurfacePoint, samples: int, seed: int = 0
+) -> ExitRadiance:
     """Radiance of exits by a model.
 
     Args:

@@ -23,7 +23,7 @@ LANES = 2**15
 ROULETTE_FROM = 8  # scattering events: from 2 on weak channels of ketchup have 10 times the variance, for no time less
 
 
-class Exits(NamedTuple):
+class WalkEnds(NamedTuple):
     """Ends of walks, one lane for each: T is 0 where it ended inside or left at an order that is not kept."""
 
     at: SurfacePoint
@@ -36,14 +36,14 @@ class Exits(NamedTuple):
 class _Store:
     """A visitor that keeps the end of every walk at its number, and ends it there."""
 
-    exits: Exits
+    exits: WalkEnds
     fewest: Any
     most: Any
 
     @classmethod
     def of(cls, n: int, fewest: int, most: int) -> _Store:
         at = SurfacePoint(*(dr.zeros(kind, n) for kind in (mi.Point3f, mi.Normal3f, mi.Normal3f, mi.Vector3f)))
-        exits = Exits(at, dr.zeros(mi.Spectrum, n), dr.zeros(mi.UInt32, n), dr.zeros(mi.UInt32, n))
+        exits = WalkEnds(at, dr.zeros(mi.Spectrum, n), dr.zeros(mi.UInt32, n), dr.zeros(mi.UInt32, n))
         dr.eval(exits)
         return cls(exits, *(dr.opaque(mi.UInt32, order) for order in (fewest, most)))
 
@@ -74,7 +74,7 @@ def trace_exits(
     fewest: int = 2,
     most: int = 2**31 - 1,
     roulette_from: int = ROULETTE_FROM,
-) -> Exits:
+) -> WalkEnds:
     """One walk from each start.
 
     Args:

@@ -23,7 +23,7 @@ from full_geometry.models.half_space import HalfSpace  # noqa: E402
 from full_geometry.object.features import Side  # noqa: E402
 from full_geometry.object.first_event import first_event  # noqa: E402
 from full_geometry.object.identity import frame_of  # noqa: E402
-from full_geometry.object.pairs import Proposals  # noqa: E402
+from full_geometry.object.pairs import EntryProposals  # noqa: E402
 from full_geometry.object.patches import (  # noqa: E402
     Patches,
     PatchSampler,
@@ -173,7 +173,7 @@ def entry_at(subject: Subject, point, rng):
 
 def test_probes_and_patches_together_give_the_estimate_of_each_alone(subject: Subject, sampler: PatchSampler) -> None:
     half_space = HalfSpace(subject, "better_dipole")
-    alone = Proposals(subject, half_space, 0.4)
+    alone = EntryProposals(subject, half_space, 0.4)
     exits = subject.random_points(generator(mi, 2**17, pass_seed(12)))
     means, errors = [], []
     for k, proposals in enumerate((alone, alone.with_patches(sampler))):

@@ -28,7 +28,7 @@ from full_geometry.object.first_event import first_event  # noqa: E402
 from full_geometry.object.radiance import reference  # noqa: E402
 from full_geometry.object.subject import Subject  # noqa: E402
 from full_geometry.object.walks import trace_exits  # noqa: E402
-from full_geometry.scene import LearntTransport  # noqa: E402
+from full_geometry.scene import ObjectTransport  # noqa: E402
 from halfspace_sss import rendering  # noqa: E402
 from halfspace_sss.neural import trained as known_weights  # noqa: E402
 from halfspace_sss.neural.store import load_weights, save_weights  # noqa: E402
@@ -77,14 +77,14 @@ def test_orders_below_two_and_the_others_agree_with_walks(trained: Trained) -> N
 
 def test_S_of_training_and_of_images_know_the_same_of_even_light(trained: Trained) -> None:
     subject, n = trained.model.subject, 4096
-    run = training._Run(subject, QUICK, 0, None, None)
+    run = training._ObjectTraining(subject, QUICK, 0, None, None)
     networks, generator_ = run.fitting.average, torch.Generator().manual_seed(1)
     with torch.no_grad():
         for p in networks.parameters():
             p.normal_(std=0.2, generator=generator_)
     arrays = run.arrays()
     arrays[storing.ENDS] = 0.01 * np.random.default_rng(2).standard_normal(arrays[storing.ENDS].shape)
-    model = storing.assemble(subject, run.frame, run.start, arrays).model
+    model = storing.assemble(subject, run.frame, run.base, arrays).model
     rng = generator(mi, n, pass_seed(6))
     exits, entries = subject.random_points(rng), subject.random_points(rng)
     pairs = run.source._columns(exits, entries, mi.Float(1) + 0 * entries.p.x)
@@ -168,7 +168,7 @@ def test_an_even_sky_has_the_same_light_and_a_fifth_of_the_variance(
     means, variances = [], []
     for knows in (True, False):
         if not knows:
-            monkeypatch.delattr(LearntTransport, "alpha")
+            monkeypatch.delattr(ObjectTransport, "alpha")
         runs = np.array([np.array(mi.render(scene, spp=32, seed=k)) for k in range(8)])
         means.append(runs.mean(axis=(0, 1, 2)))
         variances.append(runs.var(axis=0, ddof=1).mean())

@@ -20,7 +20,7 @@ from full_geometry.learning.training import Trained, train  # noqa: E402
 from full_geometry.models import neural_shape as shapes  # noqa: E402
 from full_geometry.models import storing  # noqa: E402
 from full_geometry.models.half_space import HalfSpace  # noqa: E402
-from full_geometry.object.pairs import Proposals  # noqa: E402
+from full_geometry.object.pairs import EntryProposals  # noqa: E402
 from full_geometry.object.radiance import reference  # noqa: E402
 from full_geometry.object.subject import Subject, SurfacePoint  # noqa: E402
 from full_geometry.scene import learnt_means  # noqa: E402
@@ -76,7 +76,7 @@ def test_before_any_step_it_is_the_network_of_all_shapes(tmp_path: Path) -> None
 
 def test_few_steps_from_it_are_worth_more_than_from_the_half_space(trained: Trained, tmp_path: Path) -> None:
     truth = reference(subject(), 128, 8192, seed=5)
-    proposals = Proposals(subject(), HalfSpace(subject(), "better_dipole"))
+    proposals = EntryProposals(subject(), HalfSpace(subject(), "better_dipole"))
     models = {SHAPE: trained.model, "better_dipole": learnt(tmp_path, "better_dipole").model}
     constant = {}
     for name, model in models.items():

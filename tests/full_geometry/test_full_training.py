@@ -23,13 +23,13 @@ from full_geometry.learning.model_errors import EVEN_SKY, LIGHTS, compare, measu
 from full_geometry.learning.networks import Correction  # noqa: E402
 from full_geometry.learning.training import Trained, train  # noqa: E402
 from full_geometry.models import storing  # noqa: E402
-from full_geometry.models.half_space import HalfSpace, HalfSpaceTransport  # noqa: E402
+from full_geometry.models.half_space import HalfSpace, PlanarModel  # noqa: E402
 from full_geometry.models.object_model import FullGeometry  # noqa: E402
 from full_geometry.object.features import Side, n_pair, n_side, pair_features, reverse, side_features  # noqa: E402
 from full_geometry.object.first_event import first_event  # noqa: E402
 from full_geometry.object.identity import frame_of  # noqa: E402
-from full_geometry.object.pairs import Proposals  # noqa: E402
-from full_geometry.object.radiance import Estimate, reference  # noqa: E402
+from full_geometry.object.pairs import EntryProposals  # noqa: E402
+from full_geometry.object.radiance import ExitRadiance, reference  # noqa: E402
 from full_geometry.object.subject import Subject, SurfacePoint  # noqa: E402
 from halfspace_sss import rendering  # noqa: E402
 from halfspace_sss.neural.store import load_weights, save_weights  # noqa: E402
@@ -69,8 +69,8 @@ def constant(found: list) -> np.ndarray:
 
 def test_training_halves_the_error_of_the_half_space(trained: Trained) -> None:
     subject = trained.model.subject
-    proposals = Proposals(subject, HalfSpace(subject, "better_dipole"))
-    plane = measure(subject, HalfSpaceTransport(subject, "better_dipole"), proposals, samples=1024)
+    proposals = EntryProposals(subject, HalfSpace(subject, "better_dipole"))
+    plane = measure(subject, PlanarModel(subject, "better_dipole"), proposals, samples=1024)
     assert np.all(constant(trained.errors) < 0.5 * constant(plane))
     assert all(abs(row.ratio - 1) < 0.03 for row in trained.errors)
 
@@ -159,7 +159,7 @@ def test_no_training_gives_the_half_space_with_a_warning(tmp_path: Path) -> None
     with pytest.warns(UserWarning, match="rendered by better_dipole"):
         found = train(ball(200.0), WAX, seconds=0, folder=tmp_path)
     assert found.path is None and not list(tmp_path.iterdir())
-    plane = HalfSpaceTransport(found.model.subject, "better_dipole")
+    plane = PlanarModel(found.model.subject, "better_dipole")
     exits, entries = (found.model.subject.random_points(generator(mi, 64, pass_seed(k))) for k in (1, 2))
     near = entries._replace(p=exits.p + 0.5 * mi.Vector3f(mi.coordinate_system(exits.n)[0]), n=exits.n, n_out=exits.n)
     near = near._replace(w=exits.n)
@@ -217,7 +217,7 @@ def test_the_error_leaves_noise_out() -> None:
     found = []
     for bias in (0.0, 0.1):
         noisy = [truth * (1 + bias * k) + 0.05 * rng.standard_normal(truth.shape) for k in (1, 0)]
-        found.append(compare(*(Estimate(value, np.full(truth.shape, 0.05**2)) for value in noisy)))
+        found.append(compare(*(ExitRadiance(value, np.full(truth.shape, 0.05**2)) for value in noisy)))
     assert all(row.error < max(4 * row.standard_error, 0.01) for row in found[0])
     expected = 0.1 * np.sqrt(np.mean(truth[0] ** 2)) / truth[0].mean()
     assert all(abs(row.error - expected) < 4 * row.standard_error for row in found[1])

@@ -20,9 +20,9 @@ from full_geometry.learning.fitting import Recipe  # noqa: E402
 from full_geometry.learning.model_errors import LIGHTS, measure  # noqa: E402
 from full_geometry.learning.training import Trained, train  # noqa: E402
 from full_geometry.models import storing  # noqa: E402
-from full_geometry.models.half_space import HalfSpace, HalfSpaceTransport  # noqa: E402
+from full_geometry.models.half_space import HalfSpace, PlanarModel  # noqa: E402
 from full_geometry.object.first_event import first_event, flight  # noqa: E402
-from full_geometry.object.pairs import Proposals  # noqa: E402
+from full_geometry.object.pairs import EntryProposals  # noqa: E402
 from full_geometry.object.subject import Subject, SurfacePoint  # noqa: E402
 from halfspace_sss import rendering  # noqa: E402
 from halfspace_sss.neural import trained as known_weights  # noqa: E402
@@ -116,8 +116,8 @@ def test_a_grid_of_one_value_gives_the_first_event_of_the_homogeneous_medium() -
 
 def test_training_halves_the_error_of_the_half_space_in_a_medium_that_varies(trained: Trained) -> None:
     subject = trained.model.subject
-    proposals = Proposals(subject, HalfSpace(subject, "better_dipole"))
-    plane = measure(subject, HalfSpaceTransport(subject, "better_dipole"), proposals, samples=1024)
+    proposals = EntryProposals(subject, HalfSpace(subject, "better_dipole"))
+    plane = measure(subject, PlanarModel(subject, "better_dipole"), proposals, samples=1024)
     assert np.all(constant(trained.errors) < 0.5 * constant(plane))
 
 
