@@ -34,10 +34,10 @@ def parts(quality: str) -> list[Part]:
 
 def sampled(task: Task) -> dict[str, Any]:
     """Points in the object's frame over its radius, and their RMSD to the nearest barycentre."""
-    from full_geometry.identity import frame_of
+    from figures.studies.paper_flow import fit_space_flow, mesh_arrays, on_surface, rmsd
     from full_geometry.learning.training import train_by_cpu
-    from full_geometry.paper.flow import fit_space_flow, mesh_arrays, on_surface, rmsd
-    from full_geometry.subject import Subject
+    from full_geometry.object.identity import frame_of
+    from full_geometry.object.subject import Subject
 
     prepare()
     p, n = task.params, task.params["points"]
@@ -92,8 +92,8 @@ def _by_patches(learnt: Any, exit: Any, n: int) -> Any:
     import drjit as dr
     import mitsuba as mi
 
-    from full_geometry.features import Side
-    from full_geometry.first_event import first_event
+    from full_geometry.object.features import Side
+    from full_geometry.object.first_event import first_event
 
     rng = _lanes(n, 42)
     at = exit.gather(dr.zeros(mi.UInt32, n))

@@ -15,7 +15,7 @@ from figures.computing.tone import srgb
 from figures.drawing.shot import FLIP, RELATIVE_MSE, compared
 from figures.drawing.style import TEXT, Look, paper, saved
 from figures.parts.part import Part, Result, Task
-from full_geometry.storing import KIND
+from full_geometry.models.storing import KIND
 from halfspace_sss.provenance import check_folder
 
 __all__ = ["TITLE", "draw", "parts", "rivals"]

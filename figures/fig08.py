@@ -38,7 +38,7 @@ def parts(quality: str) -> list[Part]:
 
 def truth_of(subject: Any, p: Mapping[str, Any]) -> Any:
     """Exits and their radiance."""
-    from full_geometry.learning.radiance import reference
+    from full_geometry.object.radiance import reference
 
     return reference(subject, p["exits"], p["walks"], p["seed"])
 
@@ -63,12 +63,12 @@ def _rmse(found: Any, truth: Any, per_estimate: float) -> dict[str, float]:
 
 def ours(task: Task) -> dict[str, Any]:
     """Errors of `full_geometry` with N entries by patches."""
-    from full_geometry.half_space import HalfSpace
-    from full_geometry.learning.pairs import Proposals
-    from full_geometry.learning.radiance import modelled
+    from figures.studies.rivals import BACKBONE
     from full_geometry.learning.training import train_by_cpu
-    from full_geometry.rivals.errors import BACKBONE
-    from full_geometry.subject import Subject
+    from full_geometry.models.half_space import HalfSpace
+    from full_geometry.object.pairs import Proposals
+    from full_geometry.object.radiance import modelled
+    from full_geometry.object.subject import Subject
 
     prepare()
     p = task.params
@@ -83,9 +83,8 @@ def ours(task: Task) -> dict[str, Any]:
 
 def papers(task: Task) -> dict[str, Any]:
     """Errors of the paper's network for one N, its points from walks and uniform."""
-    from full_geometry.paper.errors import estimate
-    from full_geometry.paper.network import PaperRecipe, fit_paper
-    from full_geometry.subject import Subject
+    from figures.studies.paper_network import PaperRecipe, estimate, fit_paper
+    from full_geometry.object.subject import Subject
 
     prepare()
     p, repeats = task.params, 8

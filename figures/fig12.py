@@ -66,10 +66,11 @@ def _key(*words: object) -> str:
 
 def _weights(task: Task) -> dict[str, Path]:
     """A folder of weights for each sampler: of one training, without patches, with them, and with a flow beside."""
-    from full_geometry.flow.training import FlowRecipe, fit_flow
+    from figures.studies.flow import add_flow
+    from figures.studies.flow_training import FlowRecipe, fit_flow
     from full_geometry.learning.training import train_by_cpu
-    from full_geometry.storing import CENTRES, KIND, add_flow
-    from full_geometry.subject import Subject
+    from full_geometry.models.storing import CENTRES, KIND
+    from full_geometry.object.subject import Subject
     from halfspace_sss.neural.store import load_weights, save_weights
 
     p, folders = task.params, {name: task.folder / name for name in SAMPLERS}

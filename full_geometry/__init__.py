@@ -10,17 +10,17 @@ from halfspace_sss.lazy import lazy_names
 
 TRANSPORTS = {
     "full_geometry": "full_geometry.scene:learnt_means",
-    "neural_shape": "full_geometry.neural_shape.scene:shape_means",
+    "neural_shape": "full_geometry.scene:shape_means",
 }
 __all__ = ["TRANSPORTS", "Recipe", "Subject", "errors", "load", "train", "transport"]
 __getattr__, __dir__ = lazy_names(
     __name__,
     {
         "Recipe": "learning.fitting",
-        "Subject": "subject",
+        "Subject": "object.subject",
         "errors": "learning.model_errors",
-        "load": "storing",
+        "load": "models.storing",
         "train": "learning.training",
-        "transport": "storing",
+        "transport": "learning.model_errors",
     },
 )

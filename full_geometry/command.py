@@ -9,10 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from full_geometry.learning.added import transport
-from full_geometry.learning.model_errors import ModelError, errors_of
-from full_geometry.storing import KIND, find_weights, trained
-from full_geometry.subject import Subject
+from full_geometry.learning.model_errors import ModelError, errors_of, transport
+from full_geometry.models.storing import KIND, find_weights, trained
+from full_geometry.object.subject import Subject
 from halfspace_sss.checks import check_count
 from halfspace_sss.interface.model import models as half_space_models
 from halfspace_sss.neural.store import load_weights

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -11,27 +12,31 @@ from typing import Any
 
 import numpy as np
 
-from full_geometry.entries import AREA_SHARE, LearntProposals
-from full_geometry.flow.sampler import FlowProposals
-from full_geometry.model import FullGeometry, PreparedExit
-from full_geometry.patch_table import PatchTable
-from full_geometry.storing import CHECKSUMS, KIND, find_weights, load
-from full_geometry.subject import Subject, SurfacePoint, check_surface
+from full_geometry.models.neural_shape import ALBEDO, ETA, SIZE, G, checksums, transport
+from full_geometry.models.object_model import FullGeometry
+from full_geometry.models.storing import CHECKSUMS, KIND, find_weights, load
+from full_geometry.object.features import PreparedExit
+from full_geometry.object.patches import AREA_SHARE, LearntProposals, PatchTable
+from full_geometry.object.subject import Subject, SurfacePoint, check_surface
+from halfspace_sss.extensions import offered
 from halfspace_sss.neural.store import checksum_of, load_weights
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.surface.inside import Inside
 from halfspace_sss.rendering.surface.object import Object
-from halfspace_sss.rendering.transport.half_space import HalfSpaceProposals
+from halfspace_sss.rendering.transport.area_points import AreaPoints
+from halfspace_sss.rendering.transport.half_space import HalfSpaceProposals, area_share
 from halfspace_sss.rendering.transport.plane import Exit
 from halfspace_sss.rendering.transport.positions import PositionSampler
 from halfspace_sss.rendering.transport.protocols import Entry, Means
 from halfspace_sss.rendering.transport.radial_table import RadialTable
 from halfspace_sss.rendering.transport.settings import AUTOMATIC, Settings
 
-__all__ = ["LearntTransport", "learnt_means"]
+__all__ = ["LearntTransport", "learnt_means", "shape_means", "warn_out_of_range"]
+
 
 FINE = 2.5  # transport mean free paths of the radius of a patch, up to which patches do without probes
 PATCH_SHARE = 0.2  # of the entries where patches are larger: they reach what probes miss
+SAMPLERS = "halfspace_sss.samplers"  # entry points: a function of `Learnt`, with arrays of its own, and a sign
 ENTRIES = 2  # of an exit: its own work is done once, and patches draw without a ray
 
 
@@ -92,7 +97,8 @@ def learnt_means(found: Object, inside: Inside, media: list[Medium], settings: S
     check_surface(found.shape.id(), found.shape.bsdf())
     subject = Subject.surveyed(found, tuple(media), inside.varying, settings.mm_per_unit)
     path = _weights(subject, settings)
-    model, sampler, flow = load(path, subject)
+    learnt = load(path, subject)
+    model, sampler, _ = learnt
     backbone = model.start.models
     transport = LearntTransport(model, (checksum_of(path, KIND), *load_weights(path, KIND)[1][CHECKSUMS]))
     table = RadialTable([m for m in backbone if float(m.medium.sigma_s) > 0], found.size)
@@ -101,10 +107,59 @@ def learnt_means(found: Object, inside: Inside, media: list[Medium], settings: S
     positions = PositionSampler(replace(found, pieces=None), table, subject.points, share)
     if sampler is None:
         return Means(transport, HalfSpaceProposals(positions, backbone[0]))
-    if flow is not None:
-        return Means(transport, FlowProposals(flow, found.sign, PatchTable(flow.patches)), ENTRIES)
+    for _, refine in offered(SAMPLERS) if learnt.others else ():
+        return Means(transport, refine(learnt, found.sign), ENTRIES)
     radius = np.sqrt(found.area / (np.pi * sampler.patches.n))
     sigma_t_prime = np.mean([float(m.sigma_t_prime) for m in media])
     patch_share = 1.0 if radius * sigma_t_prime < FINE else PATCH_SHARE
     proposals = LearntProposals(sampler, positions, patch_share, found.sign, PatchTable(sampler))
     return Means(transport, proposals, ENTRIES)
+
+
+# ----------------------------------------------------------------------------------------------------
+# The network of all shapes in a scene: transport, entries by probes and over the area, and warnings out of range.
+
+SLACK = 1e-3  # of the bounds, for rounding
+
+
+def warn_out_of_range(found: Object, media: tuple[Medium, ...]) -> None:
+    """Warn, by name and number, of what the network was not trained on: size, medium, or an object that is open."""
+    name, reasons = found.shape.id(), []
+    scattering = [m for m in media if float(m.sigma_s) > 0]
+    numbers = {
+        "sigma_t sqrt(area)": (SIZE, [float(m.sigma_t) * math.sqrt(found.area) for m in scattering]),
+        "reduced albedo": (ALBEDO, [float(m.albedo_prime) for m in scattering]),
+        "g": (G, [float(m.g) for m in scattering]),
+        "eta": (ETA, [float(m.eta) for m in scattering]),
+    }
+    for what, ((low, high), values) in numbers.items():
+        outside = [v for v in values if not low - SLACK * abs(low) <= v <= high + SLACK * abs(high)]
+        if outside:
+            reasons.append(f"{what} {', '.join(f'{v:.4g}' for v in outside)} is not in [{low:g}, {high:g}]")
+    if not found.closed:
+        reasons.append("it is not closed")
+    if reasons:
+        warnings.warn(
+            f"object {name!r} is out of the range that neural_shape was trained on: {'; '.join(reasons)}", stacklevel=2
+        )
+
+
+def shape_means(found: Object, inside: Inside, media: list[Medium], settings: Settings) -> Means:
+    """Transport and proposals of any object with a homogeneous medium and a smooth boundary.
+
+    Raises:
+        ValueError: the boundary is rough, the medium varies or is out of the range of `neural`, or normals of pieces
+            of the object disagree.
+    """
+    surface = found.shape.bsdf()
+    if hasattr(surface, "inside"):
+        check_surface(found.shape.id(), surface)
+    subject = Subject.surveyed(found, tuple(media), inside.varying, settings.mm_per_unit)
+    warn_out_of_range(found, subject.media)
+    model = transport(subject)
+    live = [m for m in model.half_space.models if float(m.medium.sigma_s) > 0]
+    table = RadialTable(live, found.size)
+    share = area_share(found, table.mean / found.size, settings.area_share)
+    # light may leave by another piece of the surface than it entered by
+    positions = PositionSampler(replace(found, pieces=None), table, AreaPoints(found.shape), share)
+    return Means(LearntTransport(model, checksums(subject)), HalfSpaceProposals(positions, live[0]))

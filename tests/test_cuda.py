@@ -103,9 +103,9 @@ def test_a_fit_on_the_gpu_is_that_on_the_cpu_and_goes_on_there(tmp_path: object)
     torch = pytest.importorskip("torch")
     if not torch.cuda.is_available():
         pytest.skip("torch sees no GPU")
-    from full_geometry.features import n_pair, n_side
     from full_geometry.learning.fitting import Fitting, Recipe
-    from full_geometry.learning.pairs import Even, Pairs
+    from full_geometry.object.features import n_pair, n_side
+    from full_geometry.object.pairs import Even, Pairs
 
     n_in, n = 2 * n_side(1) + n_pair(1), 4096
     rng = np.random.default_rng(1)

@@ -7,10 +7,10 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-from full_geometry.features import n_side
-from full_geometry.identity import frame_of
-from full_geometry.patches import Patches, PatchSampler, cluster
-from full_geometry.subject import Subject
+from full_geometry.object.features import n_side
+from full_geometry.object.identity import frame_of
+from full_geometry.object.patches import Patches, PatchSampler, cluster
+from full_geometry.object.subject import Subject
 from halfspace_sss import Medium
 
 BUNNY = Path(__file__).parents[1] / "figures" / "assets" / "bunny.ply"

@@ -18,7 +18,8 @@ from figures.drawing.page import page
 from figures.drawing.shot import Shot, compared
 from figures.drawing.style import paper, saved
 from figures.parts.part import Part, Result, Task, unmodelled
-from full_geometry.neural_shape.shapes.generators import make_shape
+from figures.studies.held_out import HELD_OUT
+from full_geometry.learning.shapes import TRAINING, make_shape
 from halfspace_sss import materials
 from halfspace_sss.provenance import check_folder
 
@@ -124,7 +125,7 @@ def _mesh(thing: Thing, resolution: int, folder: Path) -> Path:
     """The PLY file of a thing."""
     if not thing.family:
         return DRAGON
-    return make_shape(thing.family, thing.seed, resolution).write_ply(folder / "thing.ply")
+    return make_shape(thing.family, thing.seed, resolution, {**TRAINING, **HELD_OUT}).write_ply(folder / "thing.ply")
 
 
 def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:

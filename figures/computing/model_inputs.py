@@ -36,7 +36,7 @@ def weight_files(model: str, medium: Medium) -> tuple[Path, ...]:
     if model in trained:
         return tuple(dict.fromkeys(trained[model].find_weights(model, m) for m in channels(medium)))
     if model == "neural_shape":
-        from full_geometry.neural_shape import storing
+        from full_geometry.models import neural_shape
 
-        return (storing.shipped_weights(),)
+        return (neural_shape.shipped_weights(),)
     return (shipped_weights(),) if model == "neural" else ()

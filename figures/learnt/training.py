@@ -77,8 +77,8 @@ def _modelled(task: Task) -> dict[str, Any]:
 def _trained(task: Task, scene: dict[str, Any], name: str) -> dict[str, Any]:
     """Weights of an object, with what they took."""
     from full_geometry.learning.training import train_by_cpu
-    from full_geometry.storing import KIND
-    from full_geometry.subject import Subject
+    from full_geometry.models.storing import KIND
+    from full_geometry.object.subject import Subject
     from halfspace_sss.neural.store import load_weights
     from halfspace_sss.rendering.scenes.scene_files import open_scene
 

@@ -9,7 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from full_geometry.neural_shape.shapes.distance import (
+from full_geometry.learning.meshes import (
+    Box,
+    Mesh,
     capsule,
     cut,
     fbm,
@@ -19,8 +21,8 @@ from full_geometry.neural_shape.shapes.distance import (
     overlap,
     ring_noise,
     smoothstep,
+    surface,
 )
-from full_geometry.neural_shape.shapes.mesh import Box, Mesh, surface
 
 __all__ = ["FLAME", "Candle", "make_candle"]
 

@@ -7,8 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from full_geometry.neural_shape.shapes.distance import cells, cut, fbm, length, noise, overlap, smoothstep
-from full_geometry.neural_shape.shapes.mesh import Box
+from full_geometry.learning.meshes import Box, cells, cut, fbm, length, noise, overlap, smoothstep
 
 __all__ = ["BOX", "Croissant"]
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from full_geometry.neural_shape.shapes.mesh import Box, in_chunks
+from full_geometry.learning.meshes import Box, in_chunks
 from halfspace_sss.materials.files import parse
 from halfspace_sss.materials.material import Material
 from halfspace_sss.provenance import write_atomically

@@ -11,7 +11,8 @@ from functools import cached_property
 
 import numpy as np
 
-from full_geometry.neural_shape.shapes.distance import (
+from full_geometry.learning.meshes import (
+    Box,
     cells,
     ellipsoid,
     fbm,
@@ -25,7 +26,6 @@ from full_geometry.neural_shape.shapes.distance import (
     smoothstep,
     twisted,
 )
-from full_geometry.neural_shape.shapes.mesh import Box
 
 __all__ = ["BOX", "Mandarin"]
 

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from full_geometry.neural_shape.shapes.distance import cells, fbm, length, noise, overlap, rotated, smoothstep
-from full_geometry.neural_shape.shapes.mesh import Box
+from full_geometry.learning.meshes import Box, cells, fbm, length, noise, overlap, rotated, smoothstep
 
 __all__ = ["BOX", "Meat"]
 

@@ -9,7 +9,7 @@ from typing import Any
 from figures.modelling import croissant, mandarin, meat
 from figures.modelling.candle import make_candle
 from figures.modelling.grid import Grid, mixed, tissue
-from full_geometry.neural_shape.shapes.mesh import Mesh, surface
+from full_geometry.learning.meshes import Mesh, surface
 
 __all__ = [
     "FLAME_RADIANCE", "OBJECTS", "VARYING", "Varying", "candle_parts", "learnable_parts", "make_varying",

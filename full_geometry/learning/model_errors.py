@@ -12,20 +12,38 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from full_geometry.half_space import HalfSpace
-from full_geometry.learning.added import transport
-from full_geometry.learning.pairs import Proposals
-from full_geometry.learning.radiance import Estimate, Reference, Transport, modelled, reference
-from full_geometry.subject import Subject
-from halfspace_sss.checks import check_count
+from full_geometry.models.half_space import HalfSpace, HalfSpaceTransport
+from full_geometry.models.storing import KIND, find_weights, load
+from full_geometry.object.pairs import Proposals
+from full_geometry.object.radiance import Estimate, ObjectModel, Reference, modelled, reference
+from full_geometry.object.subject import Subject, SurfacePoint
+from halfspace_sss.checks import check_choice, check_count
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.progress import NamedProgress
+from halfspace_sss.rendering.surface.inside import Inside
+from halfspace_sss.rendering.surface.transports import knows_objects, model_names, object_transport
+from halfspace_sss.rendering.transport.plane import Exit, number
+from halfspace_sss.rendering.transport.protocols import Entry, Transport
+from halfspace_sss.rendering.transport.settings import Settings
 
-__all__ = ["EVEN_SKY", "LIGHTS", "ModelError", "compare", "errors", "errors_of", "measure", "of_even_light"]
+__all__ = [
+    "EVEN_SKY",
+    "LIGHTS",
+    "AddedTransport",
+    "ModelError",
+    "compare",
+    "errors",
+    "errors_of",
+    "measure",
+    "of_even_light",
+    "transport",
+]
+
 
 LIGHTS = ("constant", "lobes")
 EVEN_SKY = "even sky"  # as images show it
@@ -76,7 +94,7 @@ def _jackknife(square: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
 
 def measure(
     subject: Subject,
-    transport: Transport,
+    transport: ObjectModel,
     proposals: Proposals,
     *,
     truth: Reference | None = None,
@@ -98,7 +116,7 @@ def measure(
     return compare(modelled(transport, proposals, truth.exits, samples, seed), truth.truth)
 
 
-def _even_sky(transport: Transport, by_S: Estimate, truth: Reference) -> list[ModelError]:
+def _even_sky(transport: ObjectModel, by_S: Estimate, truth: Reference) -> list[ModelError]:
     """The errors of images under an even sky: those of alpha where it is trusted, elsewhere of S."""
     alpha, n = getattr(transport, "alpha", None), len(by_S.mean)
     if alpha is None:
@@ -110,7 +128,7 @@ def _even_sky(transport: Transport, by_S: Estimate, truth: Reference) -> list[Mo
 
 def errors_of(
     subject: Subject,
-    transports: Mapping[str, Transport],
+    transports: Mapping[str, ObjectModel],
     *,
     exits: int = 256,
     walks: int = 8192,
@@ -187,3 +205,66 @@ def errors(
     subject = Subject.given(shape, medium, mm_per_unit, object)
     found = {model: transport(subject, model, folder)}
     return errors_of(subject, found, exits=exits, walks=walks, samples=samples, seed=seed)[model]
+
+
+# ----------------------------------------------------------------------------------------------------
+# The transport of an object by the name of its model; those that packages add for renders are asked alike.
+
+
+@dataclass(frozen=True, eq=False)
+class AddedTransport:
+    """A transport of an entry point of `halfspace_sss.transports`.
+
+    Args:
+        subject: the object.
+        inner: what renders would use.
+    """
+
+    subject: Subject
+    inner: Transport
+
+    @classmethod
+    def of(cls, subject: Subject, name: str) -> AddedTransport:
+        """The one of that name, of an object.
+
+        Raises:
+            ValueError: as it raises, or it has no S for two points of a surface.
+        """
+        make = object_transport(name)
+        inside = Inside("medium", subject.media[0], name, "total", True)
+        inner = make(subject.found, inside, list(subject.media), Settings()).transport if make else None
+        if inner is None or getattr(inner, "is_delta", False):
+            raise ValueError(f"model must be one that has S for two points of a surface, got {name!r}")
+        return cls(subject, inner)
+
+    @property
+    def orders(self) -> str:
+        return self.inner.orders
+
+    def prepare(self, at: SurfacePoint, active: Any = True) -> Any:
+        """What is done for the exit alone."""
+        return self.inner.prepare(Exit(at.p, at.n_out, at.w, number(self.subject.found.sign), at.n), active)
+
+    def S(self, exit: Any, at: SurfacePoint, active: Any = True) -> Any:
+        """S per channel, 1/((scene unit)² sr); 0 below the horizons."""
+        import drjit as dr
+        import mitsuba as mi
+
+        mu = dr.dot(at.w, at.n_out)
+        entry = Entry(at.p, mi.Normal3f(at.n * number(self.subject.found.sign)), at.n_out, mi.Float(1), mi.UInt32(0))
+        value = self.inner.S_mu(exit, entry, at.w, active)
+        return dr.select(mu > 0, value / dr.maximum(mu, 1e-6), 0)
+
+
+def transport(subject: Subject, model: str, folder: str | os.PathLike | None = None) -> Any:
+    """The transport called `model` of an object: "full_geometry", one that a package adds, or a half-space model.
+
+    Raises:
+        ValueError: the object has not been trained, or there is no such model.
+    """
+    check_choice("model", model, model_names())
+    if model == KIND:
+        return load(find_weights(subject, folder), subject).model
+    if knows_objects(model):
+        return AddedTransport.of(subject, model)
+    return HalfSpaceTransport(subject, model)

@@ -1,4 +1,4 @@
-"""Learning S of one object: walks and steps in turn, with the error measured as it falls."""
+"""Learning S of one object: walks of random exits and of the camera, steps in turn, with the error as it falls."""
 
 from __future__ import annotations
 
@@ -10,22 +10,21 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from full_geometry import storing
-from full_geometry.features import n_pair, n_side
-from full_geometry.identity import frame_of, identify
-from full_geometry.learning.even_light import trusted
 from full_geometry.learning.fitting import PROPOSED, STANDARD, Fitting, Recipe
-from full_geometry.learning.model_errors import ModelError, measure
-from full_geometry.learning.pairs import Pairs, PairSource, Proposals
-from full_geometry.learning.radiance import Reference, reference
-from full_geometry.learning.seen import Seen
-from full_geometry.model import FullGeometry
-from full_geometry.patches import Patches, PatchSampler, cluster
-from full_geometry.subject import Subject
+from full_geometry.learning.model_errors import ModelError, measure, of_even_light
+from full_geometry.models import storing
+from full_geometry.models.object_model import FullGeometry
+from full_geometry.object.features import n_pair, n_side
+from full_geometry.object.identity import frame_of, identify
+from full_geometry.object.pairs import Pairs, PairSource, Proposals, shuffled
+from full_geometry.object.patches import Patches, PatchSampler, cluster
+from full_geometry.object.radiance import Estimate, Reference, reference, traced
+from full_geometry.object.subject import Subject, SurfacePoint
+from full_geometry.object.walks import Exits
 from halfspace_sss.backend import busy_threads
 from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.neural.store import to_json
@@ -33,8 +32,162 @@ from halfspace_sss.neural.trained import check_weights_folder
 from halfspace_sss.neural.training.work_folder import CHECKPOINT, claim
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.provenance import check_folder, provenance, write_atomically
+from halfspace_sss.rendering.scenes.camera_walks import TRIAL
 
-__all__ = ["Trained", "train", "train_by_cpu"]
+__all__ = ["Schedule", "Seen", "Trained", "train", "train_by_cpu", "trusted"]
+
+
+# ---- Where what was learnt of even light is good enough to stand for it ----------------------------
+# S sees the surface around both its points, alpha is a network of the exit alone, which misses what changes over a mean
+# free path. So each channel is judged at the end of a training, as parts of all light that leaves,
+#
+#     |alpha_1 - E T_1|, |alpha - E T| <= 5 % of the mean of E T_0 + E T_1 + E T,   or alpha no worse than S,
+#
+# and where that fails images take even light by S or by the way of one event, as all other light.
+
+MOST = 0.05
+
+
+def trusted(
+    model: FullGeometry, truth: Reference, errors: list[ModelError], walks: int, seed: tuple[int, ...]
+) -> np.ndarray:
+    """1 where even light may be used and 0 where not, (2, channels): orders below two, then the others.
+
+    Args:
+        model: S and alpha.
+        truth: exits and walks of orders from two on.
+        errors: of S there.
+        walks: of each exit, for order one.
+        seed: of them.
+    """
+    once = traced(model.subject, truth.exits, walks, seed, fewest=1, most=1)
+    unscattered, *alphas = (np.array(part).reshape(len(once.mean), -1) for part in model.alpha.parts(truth.exits))
+    known = (once, truth.truth)
+    means = [part.mean[:, :, 0].mean(axis=1) for part in known]
+    light = np.maximum(unscattered.mean(axis=1) + sum(means), 1e-30)
+    wrong = np.stack([_error(a, b) * mean / light for a, b, mean in zip(alphas, known, means)])
+    by_S = np.array([row.error for row in errors if row.light == "constant"]) * means[1] / light
+    return (wrong <= np.stack([0 * by_S + MOST, np.maximum(by_S, MOST)])).astype(np.float16)
+
+
+def _error(found: np.ndarray, truth: Estimate) -> np.ndarray:
+    """Relative RMSE of shares (channels, exits) under constant light, without the noise of walks."""
+    shares = found[:, :, None].astype(float)
+    return np.array([row.error for row in of_even_light(Estimate(shares, np.zeros_like(shares)), truth)])
+
+
+# ---- Exits that the camera sees, beside random ones: its walks are data for the fit as they come ---
+# The likelihood holds for any distribution of exits, as long as proposals begin at the same ones: where walks begin in
+# shares of two kinds, proposals do so too. Random exits stay half of them or more, so that all of an object is learnt.
+
+SHARE = 0.5  # of the walks of a chunk, at most, that the camera begins
+PASSES = 4  # of a chunk
+MOST_RAYS = 4  # times that share: where an object is small in the picture, its paths would take all of the time
+
+
+class Schedule(NamedTuple):
+    """Samples per pixel of a pass, passes of a chunk that has them, and of how many chunks one has."""
+
+    spp: int
+    passes: int
+    every: int
+
+    def numbers(self, k: int) -> list[int]:
+        """Of the passes of chunk k."""
+        return [] if k % self.every else [k // self.every * self.passes + j for j in range(self.passes)]
+
+    @classmethod
+    def of(cls, walks: float, hits: int, pixels: int) -> Schedule | None:
+        """For so many walks of a chunk, where `hits` of `pixels` paths meet the object; None if none do."""
+        if hits == 0:
+            return None
+        spp = min(SHARE * walks / hits, MOST_RAYS * SHARE * walks / pixels)
+        if spp >= PASSES:  # more than one, whose spread is the variance of their image
+            return cls(int(spp / PASSES), PASSES, 1)
+        return cls(1, 1, math.ceil(1 / spp))
+
+
+class Seen:
+    """The part of each chunk that comes from the camera.
+
+    Args:
+        source: of the pairs.
+        camera: a `CameraWalks`.
+        walks: of a chunk, those of the camera included.
+        seed: of the run.
+    """
+
+    def __init__(self, source: PairSource, camera: Any, walks: int, seed: int) -> None:
+        self.source, self.camera, self.walks, self.seed = source, camera, walks, seed
+        self.shape = source.subject.found.shape
+        self.schedule = Schedule.of(walks, camera.hits(self.shape), camera.pixels)
+
+    def seconds_more(self) -> float:
+        """Of a chunk in the mean, by the second one; compiles what passes need."""
+        if self.schedule is None or self.schedule.every == 1:
+            return 0.0
+        for _ in range(2):
+            started = time.monotonic()
+            self.camera.exits(self.shape, TRIAL, self.schedule.spp)
+        return (time.monotonic() - started) * self.schedule.passes / self.schedule.every
+
+    def data(self, k: int, proposed: int) -> tuple[Pairs, Pairs]:
+        """Walks and proposals of chunk k.
+
+        Args:
+            k: number of the chunk.
+            proposed: number of proposals.
+        """
+        import drjit as dr
+
+        seed, order = (self.seed, k), np.random.default_rng([self.seed, k, 1])
+        parts = []
+        if self.schedule:
+            parts = self._exits(self.schedule.numbers(k), order)
+        walks, proposals = [], []
+        for j, (starts, ends) in enumerate(parts):
+            n = dr.width(starts.p)
+            m = round(proposed * n / self.walks)
+            at = starts.gather(_lanes(order.integers(0, n, m)))
+            walks.append(self.source.ended(starts, ends, (*seed, 5, j)))
+            proposals.append(self.source.proposed(m, (*seed, 3, j), at))
+        wanted = (self.walks, walks), (proposed, proposals)
+        left = [total - sum(part.drawn for part in done) for total, done in wanted]
+        walks.append(self.source.walks(left[0], seed))
+        proposals.append(self.source.proposed(left[1], seed))
+        return (shuffled(walks, order), shuffled(proposals, order)) if parts else (walks[0], proposals[0])
+
+    def _exits(self, numbers: list[int], order: np.random.Generator) -> list[tuple[SurfacePoint, Exits]]:
+        """Starts and ends of walks from the camera, launch by launch; of too many a random choice."""
+        import drjit as dr
+
+        launches = [part for number in numbers for part in self.camera.exits(self.shape, number, self.schedule.spp)]
+        found = [part for part in launches if dr.width(part.object)]
+        ends = np.cumsum([0, *(dr.width(part.object) for part in found)])
+        chosen = np.sort(order.permutation(int(ends[-1]))[: int(SHARE * self.walks)])
+        parts = []
+        for part, a, b in zip(found, ends, ends[1:]):
+            own = chosen[(chosen >= a) & (chosen < b)] - a
+            if len(own):
+                parts.append(_points(part.gather(_lanes(own))))
+        dr.eval(parts)
+        return parts
+
+
+def _points(part: Any) -> tuple[SurfacePoint, Exits]:
+    """First exits of the camera as walks of this package, of the orders from one on."""
+    import drjit as dr
+
+    starts = SurfacePoint(part.x_o, part.n_o, part.n_o_shading, part.w_o)
+    ends = SurfacePoint(part.x_i, part.n_i, part.n_i_shading, part.w_i)
+    return starts, Exits(ends, dr.select(part.order >= 1, part.throughput, 0), part.order, part.face)
+
+
+def _lanes(numbers: np.ndarray) -> Any:
+    import mitsuba as mi
+
+    return mi.UInt32(numbers.astype(np.uint32))
+
 
 Progress = Callable[[str, int, int], None]
 VALIDATIONS = 4  # in a run

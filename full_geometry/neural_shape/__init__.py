@@ -7,16 +7,24 @@ the weights that come with the package.
 
 from __future__ import annotations
 
+from typing import Any
+
 from halfspace_sss.lazy import lazy_names
 
 __all__ = ["Recipe", "make_shape", "shipped_weights", "train_shapes", "transport"]
 __getattr__, __dir__ = lazy_names(
-    __name__,
+    "full_geometry",
     {
-        "Recipe": "learning.fitting",
-        "make_shape": "shapes.generators",
-        "shipped_weights": "storing",
-        "train_shapes": "learning.training",
-        "transport": "storing",
+        "Recipe": "learning.shape_training",
+        "make_shape": "learning.shapes",
+        "shipped_weights": "models.neural_shape",
+        "transport": "models.neural_shape",
     },
 )
+
+
+def train_shapes(*arguments: Any, **options: Any) -> Any:
+    """As `learning.shape_training.train_shapes`, which loads torch: the learner of the command `train --shapes`."""
+    from full_geometry.learning.shape_training import train_shapes as learn
+
+    return learn(*arguments, **options)

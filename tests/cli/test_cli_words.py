@@ -32,8 +32,9 @@ COMMANDS = {info.name: info.callback for info in cli.app.registered_commands}
 def _helps(command: str) -> list[str]:
     """The help of every option and argument."""
     parameters = inspect.signature(COMMANDS[command], eval_str=True).parameters.values()
-    infos = [info for p in parameters for info in get_args(p.annotation)[1:] if hasattr(info, "help")]
-    infos = [info for info in infos if not info.hidden]
+    infos = [
+        info for p in parameters for info in get_args(p.annotation)[1:] if hasattr(info, "help") and not info.hidden
+    ]
     assert infos or command == "models"
     return [info.help for info in infos]
 

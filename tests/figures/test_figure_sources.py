@@ -52,7 +52,7 @@ EDITS = {
     "dipoles": ("analytic_models/_diffusion.py", EDIT),
     "network": ("halfspace_sss/neural/universal.py", EDIT),
     "full geometry": ("full_geometry/scene.py", "\nENTRIES, FINE = 3, 9.5\n"),
-    "shapes": ("full_geometry/neural_shape/scene.py", EDIT),
+    "shapes": ("full_geometry/models/neural_shape.py", EDIT),
     "learner": ("full_geometry/learning/fitting.py", EDIT),
     "lambert": ("halfspace_sss/rendering/transport/lambert.py", EDIT),
     "choice": ("halfspace_sss/trade/automatic.py", EDIT),

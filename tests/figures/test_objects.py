@@ -14,14 +14,14 @@ from figures.beyond import objects as pictures  # noqa: E402
 from figures.computing import environments  # noqa: E402
 from figures.modelling import candle, grid, scene_parts  # noqa: E402
 from figures.parts import runner  # noqa: E402
-from full_geometry.neural_shape.shapes import mesh  # noqa: E402
+from full_geometry.learning import meshes  # noqa: E402
 
 LOW, HIGH = 32, 64
 CELLS = 24
 
 
 @pytest.fixture(scope="module")
-def made() -> dict[str, mesh.Mesh]:
+def made() -> dict[str, meshes.Mesh]:
     found = {name: scene_parts.make_varying(name, LOW, 8).mesh for name in scene_parts.VARYING}
     return {**found, "candle": candle.make_candle(LOW).wax}
 
@@ -41,41 +41,41 @@ def sphere(p: np.ndarray) -> np.ndarray:
     return np.linalg.norm(p, axis=-1) - 1.0
 
 
-BALL = mesh.Box((-1.2, -1.2, -1.2), (1.2, 1.2, 1.2))
+BALL = meshes.Box((-1.2, -1.2, -1.2), (1.2, 1.2, 1.2))
 
 
 def test_the_mesh_of_a_sphere_has_its_volume() -> None:
-    assert mesh.surface(sphere, BALL, 48).volume == pytest.approx(4 / 3 * np.pi, rel=5e-3)
+    assert meshes.surface(sphere, BALL, 48).volume == pytest.approx(4 / 3 * np.pi, rel=5e-3)
 
 
 def test_a_surface_through_corners_of_the_grid_has_no_degenerate_triangle() -> None:
-    found = mesh.surface(lambda p: np.abs(p).max(axis=-1) - 0.9, mesh.Box((-1.2,) * 3, (1.2,) * 3), 16)
+    found = meshes.surface(lambda p: np.abs(p).max(axis=-1) - 0.9, meshes.Box((-1.2,) * 3, (1.2,) * 3), 16)
     assert found.areas.min() > 0 and found.volume == pytest.approx(1.8**3, rel=0.05)
 
 
 def test_a_surface_that_reaches_the_edge_of_its_box_is_refused() -> None:
     with pytest.raises(ValueError, match="box must hold the surface"):
-        mesh.surface(sphere, mesh.Box((-1.2, -0.9, -1.2), (1.2, 1.2, 1.2)), 16)
+        meshes.surface(sphere, meshes.Box((-1.2, -0.9, -1.2), (1.2, 1.2, 1.2)), 16)
 
 
 def test_a_mesh_with_a_hole_is_refused() -> None:
-    ball = mesh.surface(sphere, BALL, 8)
+    ball = meshes.surface(sphere, BALL, 8)
     with pytest.raises(ValueError, match="share each edge"):
-        mesh.Mesh(ball.vertices, ball.faces[1:])
+        meshes.Mesh(ball.vertices, ball.faces[1:])
 
 
 def test_a_mesh_wound_inwards_is_refused() -> None:
-    ball = mesh.surface(sphere, BALL, 8)
+    ball = meshes.surface(sphere, BALL, 8)
     with pytest.raises(ValueError, match="volume must be > 0"):
-        mesh.Mesh(ball.vertices, ball.faces[:, ::-1])
+        meshes.Mesh(ball.vertices, ball.faces[:, ::-1])
 
 
 def test_a_mesh_with_a_triangle_without_area_is_refused() -> None:
-    ball = mesh.surface(sphere, BALL, 8)
+    ball = meshes.surface(sphere, BALL, 8)
     vertices = ball.vertices.copy()
     vertices[ball.faces[0, 0]] = vertices[ball.faces[0, 1]]
     with pytest.raises(ValueError, match="areas of triangles"):
-        mesh.Mesh(vertices, ball.faces)
+        meshes.Mesh(vertices, ball.faces)
 
 
 def test_a_resolution_below_the_least_is_refused() -> None:

@@ -8,10 +8,10 @@ import pytest
 mi = pytest.importorskip("mitsuba")
 torch = pytest.importorskip("torch")
 
-from full_geometry.features import Quadratic, Terms, n_side  # noqa: E402
-from full_geometry.learning import ends  # noqa: E402
-from full_geometry.learning.ends import Ends  # noqa: E402
-from full_geometry.learning.pairs import Even, Pairs, shuffled  # noqa: E402
+from full_geometry.learning import fitting as ends  # noqa: E402
+from full_geometry.learning.fitting import Ends  # noqa: E402
+from full_geometry.object.features import Quadratic, Terms, n_side  # noqa: E402
+from full_geometry.object.pairs import Even, Pairs, shuffled  # noqa: E402
 
 N = n_side(1)
 

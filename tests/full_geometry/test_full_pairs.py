@@ -16,13 +16,13 @@ from halfspace_sss import Medium
 mi = pytest.importorskip("mitsuba")
 torch = pytest.importorskip("torch")
 
-from full_geometry.features import n_pair, n_side  # noqa: E402
-from full_geometry.half_space import HalfSpace  # noqa: E402
-from full_geometry.identity import frame_of  # noqa: E402
-from full_geometry.learning.exits import trace_exits  # noqa: E402
 from full_geometry.learning.fitting import STANDARD, Fitting  # noqa: E402
-from full_geometry.learning.pairs import ENOUGH, Even, Pairs, PairSource, Proposals  # noqa: E402
-from full_geometry.subject import Subject  # noqa: E402
+from full_geometry.models.half_space import HalfSpace  # noqa: E402
+from full_geometry.object.features import n_pair, n_side  # noqa: E402
+from full_geometry.object.identity import frame_of  # noqa: E402
+from full_geometry.object.pairs import ENOUGH, Even, Pairs, PairSource, Proposals  # noqa: E402
+from full_geometry.object.subject import Subject  # noqa: E402
+from full_geometry.object.walks import trace_exits  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
 N = 2**16

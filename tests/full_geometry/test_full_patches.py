@@ -17,16 +17,21 @@ pytest.importorskip("torch")
 
 from waxen import WAX, random_patches, wax_bunny  # noqa: E402
 
-from full_geometry.features import Side  # noqa: E402
-from full_geometry.first_event import first_event  # noqa: E402
-from full_geometry.half_space import HalfSpace  # noqa: E402
-from full_geometry.identity import frame_of  # noqa: E402
 from full_geometry.learning.fitting import Recipe  # noqa: E402
-from full_geometry.learning.pairs import Proposals  # noqa: E402
 from full_geometry.learning.training import train  # noqa: E402
-from full_geometry.patch_table import PatchTable  # noqa: E402
-from full_geometry.patches import Patches, PatchSampler, cluster, mesh_faces  # noqa: E402
-from full_geometry.subject import Subject, SurfacePoint, cosine_direction, surface_point  # noqa: E402
+from full_geometry.models.half_space import HalfSpace  # noqa: E402
+from full_geometry.object.features import Side  # noqa: E402
+from full_geometry.object.first_event import first_event  # noqa: E402
+from full_geometry.object.identity import frame_of  # noqa: E402
+from full_geometry.object.pairs import Proposals  # noqa: E402
+from full_geometry.object.patches import (  # noqa: E402
+    Patches,
+    PatchSampler,
+    PatchTable,  # noqa: E402
+    cluster,
+    mesh_faces,
+)
+from full_geometry.object.subject import Subject, SurfacePoint, cosine_direction, surface_point  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
 N_PATCHES = 64

@@ -18,11 +18,11 @@ mi = pytest.importorskip("mitsuba")
 pytest.importorskip("torch")
 import drjit as dr  # noqa: E402
 
-from full_geometry import storing  # noqa: E402
 from full_geometry.learning.fitting import Recipe  # noqa: E402
 from full_geometry.learning.model_errors import LIGHTS  # noqa: E402
 from full_geometry.learning.training import Trained, train  # noqa: E402
-from full_geometry.subject import Subject  # noqa: E402
+from full_geometry.models import storing  # noqa: E402
+from full_geometry.object.subject import Subject  # noqa: E402
 from halfspace_sss import rendering  # noqa: E402
 from halfspace_sss.neural import trained as known_weights  # noqa: E402
 from halfspace_sss.rendering.scenes.scene_files import load_objects, load_scene  # noqa: E402
@@ -209,7 +209,7 @@ def test_a_mesh_with_a_hole_is_warned_of_in_a_sentence() -> None:
 
 
 def test_vertex_normals_against_their_faces_give_the_same_exits() -> None:
-    from full_geometry.learning.radiance import reference
+    from full_geometry.object.radiance import reference
 
     upright, turned = (mi.load_dict({"type": "ply", "filename": str(BUNNY)}) for _ in range(2))
     parameters = mi.traverse(turned)

@@ -13,19 +13,22 @@ from halfspace_sss import Medium
 mi = pytest.importorskip("mitsuba")
 torch = pytest.importorskip("torch")
 
-from full_geometry import storing  # noqa: E402
-from full_geometry.features import Quadratic, n_side  # noqa: E402
-from full_geometry.first_event import first_event  # noqa: E402
 from full_geometry.learning import training  # noqa: E402
-from full_geometry.learning.even_light import trusted  # noqa: E402
-from full_geometry.learning.exits import trace_exits  # noqa: E402
 from full_geometry.learning.fitting import ALPHA_HIDDEN, Recipe  # noqa: E402
 from full_geometry.learning.model_errors import EVEN_SKY, LIGHTS, errors_of  # noqa: E402
-from full_geometry.learning.radiance import reference  # noqa: E402
-from full_geometry.learning.training import Trained, train  # noqa: E402
-from full_geometry.model import BOUND  # noqa: E402
+from full_geometry.learning.training import (  # noqa: E402
+    Trained,
+    train,
+    trusted,  # noqa: E402
+)
+from full_geometry.models import storing  # noqa: E402
+from full_geometry.models.object_model import BOUND  # noqa: E402
+from full_geometry.object.features import Quadratic, n_side  # noqa: E402
+from full_geometry.object.first_event import first_event  # noqa: E402
+from full_geometry.object.radiance import reference  # noqa: E402
+from full_geometry.object.subject import Subject  # noqa: E402
+from full_geometry.object.walks import trace_exits  # noqa: E402
 from full_geometry.scene import LearntTransport  # noqa: E402
-from full_geometry.subject import Subject  # noqa: E402
 from halfspace_sss import rendering  # noqa: E402
 from halfspace_sss.neural import trained as known_weights  # noqa: E402
 from halfspace_sss.neural.store import load_weights, save_weights  # noqa: E402

@@ -12,18 +12,18 @@ from waxen import WAX
 mi = pytest.importorskip("mitsuba")
 pytest.importorskip("torch")
 
-from full_geometry import storing  # noqa: E402
-from full_geometry.half_space import HalfSpace  # noqa: E402
+from figures.studies import rivals as starts  # noqa: E402
 from full_geometry.learning import training  # noqa: E402
 from full_geometry.learning.fitting import Recipe  # noqa: E402
 from full_geometry.learning.model_errors import LIGHTS, measure  # noqa: E402
-from full_geometry.learning.pairs import Proposals  # noqa: E402
-from full_geometry.learning.radiance import reference  # noqa: E402
 from full_geometry.learning.training import Trained, train  # noqa: E402
-from full_geometry.neural_shape import storing as shapes  # noqa: E402
-from full_geometry.rivals import starts  # noqa: E402
+from full_geometry.models import neural_shape as shapes  # noqa: E402
+from full_geometry.models import storing  # noqa: E402
+from full_geometry.models.half_space import HalfSpace  # noqa: E402
+from full_geometry.object.pairs import Proposals  # noqa: E402
+from full_geometry.object.radiance import reference  # noqa: E402
+from full_geometry.object.subject import Subject, SurfacePoint  # noqa: E402
 from full_geometry.scene import learnt_means  # noqa: E402
-from full_geometry.subject import Subject, SurfacePoint  # noqa: E402
 from halfspace_sss import Medium, rendering  # noqa: E402
 from halfspace_sss.neural import trained as known_weights  # noqa: E402
 from halfspace_sss.neural.store import load_weights, save_weights  # noqa: E402

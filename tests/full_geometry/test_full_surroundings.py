@@ -14,11 +14,20 @@ mi.set_variant("llvm_ad_rgb")
 
 from waxen import BUNNY, WAX, wax_bunny  # noqa: E402
 
-from full_geometry.features import Side, n_side, pair_features, side_features  # noqa: E402
-from full_geometry.first_event import first_event  # noqa: E402
-from full_geometry.identity import frame_of, identify  # noqa: E402
-from full_geometry.subject import Subject, surface_point  # noqa: E402
-from full_geometry.surroundings import EVENT, FIELDS, POINT, WIDTHS, insides  # noqa: E402
+from full_geometry.object.features import (  # noqa: E402
+    EVENT,
+    FIELDS,
+    POINT,
+    WIDTHS,
+    Side,
+    insides,
+    n_side,
+    pair_features,
+    side_features,
+)
+from full_geometry.object.first_event import first_event  # noqa: E402
+from full_geometry.object.identity import frame_of, identify  # noqa: E402
+from full_geometry.object.subject import Subject, surface_point  # noqa: E402
 from halfspace_sss import Medium  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 

@@ -17,20 +17,20 @@ mi = pytest.importorskip("mitsuba")
 torch = pytest.importorskip("torch")
 
 import full_geometry  # noqa: E402
-from full_geometry import storing  # noqa: E402
-from full_geometry.features import Side, n_pair, n_side, pair_features, reverse, side_features  # noqa: E402
-from full_geometry.first_event import first_event  # noqa: E402
-from full_geometry.half_space import HalfSpace, HalfSpaceTransport  # noqa: E402
-from full_geometry.identity import frame_of  # noqa: E402
 from full_geometry.learning import training  # noqa: E402
 from full_geometry.learning.fitting import Recipe  # noqa: E402
-from full_geometry.learning.learner import Correction  # noqa: E402
 from full_geometry.learning.model_errors import EVEN_SKY, LIGHTS, compare, measure  # noqa: E402
-from full_geometry.learning.pairs import Proposals  # noqa: E402
-from full_geometry.learning.radiance import Estimate, reference  # noqa: E402
+from full_geometry.learning.networks import Correction  # noqa: E402
 from full_geometry.learning.training import Trained, train  # noqa: E402
-from full_geometry.model import FullGeometry  # noqa: E402
-from full_geometry.subject import Subject, SurfacePoint  # noqa: E402
+from full_geometry.models import storing  # noqa: E402
+from full_geometry.models.half_space import HalfSpace, HalfSpaceTransport  # noqa: E402
+from full_geometry.models.object_model import FullGeometry  # noqa: E402
+from full_geometry.object.features import Side, n_pair, n_side, pair_features, reverse, side_features  # noqa: E402
+from full_geometry.object.first_event import first_event  # noqa: E402
+from full_geometry.object.identity import frame_of  # noqa: E402
+from full_geometry.object.pairs import Proposals  # noqa: E402
+from full_geometry.object.radiance import Estimate, reference  # noqa: E402
+from full_geometry.object.subject import Subject, SurfacePoint  # noqa: E402
 from halfspace_sss import rendering  # noqa: E402
 from halfspace_sss.neural.store import load_weights, save_weights  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402

@@ -15,15 +15,15 @@ dr = pytest.importorskip("drjit")
 mi = pytest.importorskip("mitsuba")
 pytest.importorskip("torch")
 
-from full_geometry import storing  # noqa: E402
-from full_geometry.first_event import first_event, flight  # noqa: E402
-from full_geometry.half_space import HalfSpace, HalfSpaceTransport  # noqa: E402
 from full_geometry.learning import training  # noqa: E402
 from full_geometry.learning.fitting import Recipe  # noqa: E402
 from full_geometry.learning.model_errors import LIGHTS, measure  # noqa: E402
-from full_geometry.learning.pairs import Proposals  # noqa: E402
 from full_geometry.learning.training import Trained, train  # noqa: E402
-from full_geometry.subject import Subject, SurfacePoint  # noqa: E402
+from full_geometry.models import storing  # noqa: E402
+from full_geometry.models.half_space import HalfSpace, HalfSpaceTransport  # noqa: E402
+from full_geometry.object.first_event import first_event, flight  # noqa: E402
+from full_geometry.object.pairs import Proposals  # noqa: E402
+from full_geometry.object.subject import Subject, SurfacePoint  # noqa: E402
 from halfspace_sss import rendering  # noqa: E402
 from halfspace_sss.neural import trained as known_weights  # noqa: E402
 from halfspace_sss.rendering.scenes.scene_files import load_objects, load_scene  # noqa: E402

@@ -12,8 +12,8 @@ from halfspace_sss import Medium
 dr = pytest.importorskip("drjit")
 mi = pytest.importorskip("mitsuba")
 
-from full_geometry.neural_shape.storing import transport  # noqa: E402
-from full_geometry.subject import Subject  # noqa: E402
+from full_geometry.models.neural_shape import transport  # noqa: E402
+from full_geometry.object.subject import Subject  # noqa: E402
 from halfspace_sss.neural import perceptron  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 

@@ -12,11 +12,16 @@ mi = pytest.importorskip("mitsuba")
 pytest.importorskip("igl")
 
 from full_geometry.learning.model_errors import errors_of  # noqa: E402
-from full_geometry.neural_shape.balance import held, weight  # noqa: E402
-from full_geometry.neural_shape.mixing import Mixed, mixed  # noqa: E402
-from full_geometry.neural_shape.model import NeuralShape  # noqa: E402
-from full_geometry.neural_shape.storing import load, shipped_weights, transport  # noqa: E402
-from full_geometry.subject import Subject  # noqa: E402
+from full_geometry.models.descriptors import Mixed, mixed  # noqa: E402
+from full_geometry.models.neural_shape import (  # noqa: E402
+    NeuralShape,  # noqa: E402
+    held,
+    load,
+    shipped_weights,
+    transport,
+    weight,
+)
+from full_geometry.object.subject import Subject  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
 WAX = Medium(0.95, 0.05, 0.0, 1.3)

@@ -13,14 +13,15 @@ dr = pytest.importorskip("drjit")
 mi = pytest.importorskip("mitsuba")
 pytest.importorskip("igl")
 
-from full_geometry.features import Side  # noqa: E402
-from full_geometry.first_event import first_event  # noqa: E402
-from full_geometry.half_space import HalfSpace  # noqa: E402
+from figures.studies.held_out import HELD_OUT  # noqa: E402
 from full_geometry.learning.model_errors import errors_of  # noqa: E402
-from full_geometry.neural_shape.backbone import Backbone  # noqa: E402
-from full_geometry.neural_shape.mixing import mean_chord, mixed  # noqa: E402
-from full_geometry.neural_shape.shapes.generators import make_shape  # noqa: E402
-from full_geometry.subject import Subject, SurfacePoint, cosine_direction  # noqa: E402
+from full_geometry.learning.shapes import make_shape  # noqa: E402
+from full_geometry.models.descriptors import mean_chord, mixed  # noqa: E402
+from full_geometry.models.half_space import HalfSpace  # noqa: E402
+from full_geometry.models.neural_shape import Backbone  # noqa: E402
+from full_geometry.object.features import Side  # noqa: E402
+from full_geometry.object.first_event import first_event  # noqa: E402
+from full_geometry.object.subject import Subject, SurfacePoint, cosine_direction  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
 
@@ -77,14 +78,16 @@ def test_they_are_most_of_the_light_of_a_thin_sheet(g: float, least: float) -> N
 
 
 def test_light_that_is_scattered_twice_is_the_same_both_ways() -> None:
-    subject = Subject.of(make_shape("leaves", 3, 24).mitsuba("leaf"), Medium(0.95, 0.05, 0.6, 1.45))
+    subject = Subject.of(make_shape("leaves", 3, 24, HELD_OUT).mitsuba("leaf"), Medium(0.95, 0.05, 0.6, 1.45))
     S_0, (o, i) = Backbone(subject, mixed(subject)), ends(subject)
     there, back = (S_0.twice(*pair)[0].numpy() for pair in ((o, i), (i, o)))
     assert np.allclose(there, back, rtol=1e-4) and there.max() > 0
 
 
 def test_shares_of_what_a_plane_lacks_are_parts_of_one_and_most_of_a_thin_leaf() -> None:
-    subject = Subject.of(make_shape("leaves", 3, 24).mitsuba("leaf"), Medium(0.95, 0.05, 0.0, 1.45).scaled(0.5))
+    subject = Subject.of(
+        make_shape("leaves", 3, 24, HELD_OUT).mitsuba("leaf"), Medium(0.95, 0.05, 0.0, 1.45).scaled(0.5)
+    )
     S_0, (o, i) = Backbone(subject, mixed(subject)), ends(subject)
     parts = np.stack([part.numpy() for part in S_0.shares(S_0(o, i), o, i)[0]])
     assert parts.min() >= 0 and parts.sum(axis=0).max() < 1 + 1e-4

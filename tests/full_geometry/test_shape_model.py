@@ -11,10 +11,10 @@ dr = pytest.importorskip("drjit")
 mi = pytest.importorskip("mitsuba")
 pytest.importorskip("igl")
 
-from full_geometry.half_space import HalfSpaceTransport  # noqa: E402
+from full_geometry.learning.meshes import Box, surface  # noqa: E402
 from full_geometry.learning.model_errors import errors_of  # noqa: E402
-from full_geometry.neural_shape.backbone import Backbone  # noqa: E402
-from full_geometry.neural_shape.descriptors import (  # noqa: E402
+from full_geometry.learning.shapes import make_shape  # noqa: E402
+from full_geometry.models.descriptors import (  # noqa: E402
     CURVED_OWN,
     CURVED_SHARED,
     N_MEDIUM,
@@ -23,13 +23,16 @@ from full_geometry.neural_shape.descriptors import (  # noqa: E402
     Pair,
     describe,
     end,
+    mixed,  # noqa: E402
 )
-from full_geometry.neural_shape.mixing import mixed  # noqa: E402
-from full_geometry.neural_shape.model import NeuralShape, most  # noqa: E402
-from full_geometry.neural_shape.shapes.generators import make_shape  # noqa: E402
-from full_geometry.neural_shape.shapes.mesh import Box, surface  # noqa: E402
-from full_geometry.neural_shape.storing import transport  # noqa: E402
-from full_geometry.subject import Subject, SurfacePoint, cosine_direction  # noqa: E402
+from full_geometry.models.half_space import HalfSpaceTransport  # noqa: E402
+from full_geometry.models.neural_shape import (  # noqa: E402
+    Backbone,  # noqa: E402
+    NeuralShape,
+    most,
+    transport,  # noqa: E402
+)
+from full_geometry.object.subject import Subject, SurfacePoint, cosine_direction  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
 WAX = Medium(0.95, 0.05, 0.3, 1.4)
@@ -44,7 +47,7 @@ def variant() -> None:
 def random_weights(seed: int = 0, width: int = 16) -> dict[str, np.ndarray]:
     """Numbers with which f is of order one."""
     pytest.importorskip("torch")
-    from full_geometry.neural_shape.learning.fitting import Network, Recipe
+    from full_geometry.learning.shape_training import Network, Recipe
 
     rng = np.random.default_rng(seed)
     arrays = Network(Recipe(width=width, depth=2), seed).arrays()
@@ -108,7 +111,7 @@ def test_on_a_plane_it_is_the_half_space_whatever_the_weights() -> None:
 
 
 def _side(e: object) -> object:
-    from full_geometry.features import Side
+    from full_geometry.object.features import Side
 
     return Side(e.at, e.event)
 
@@ -180,7 +183,7 @@ def test_a_channel_is_what_its_medium_is_alone() -> None:
 
 def test_torch_and_drjit_say_the_same() -> None:
     torch = pytest.importorskip("torch")
-    from full_geometry.neural_shape.learning.fitting import Network, Recipe
+    from full_geometry.learning.shape_training import Network, Recipe
 
     subject = Subject.of(make_shape("shells", 2, 24).mitsuba("bowl"), WAX.scaled(8.0))
     weights, (o, i) = random_weights(1), pairs(subject)

@@ -13,14 +13,21 @@ mi = pytest.importorskip("mitsuba")
 pytest.importorskip("igl")
 torch = pytest.importorskip("torch")
 
-from full_geometry.neural_shape.learning import training  # noqa: E402
-from full_geometry.neural_shape.learning.drawing import draw_medium, draw_subject, mean_events  # noqa: E402
-from full_geometry.neural_shape.learning.fitting import Fitting, Recipe  # noqa: E402
-from full_geometry.neural_shape.learning.groups import GROUPS, Grouped, grouped  # noqa: E402
-from full_geometry.neural_shape.learning.source import PairData, make_data  # noqa: E402
-from full_geometry.neural_shape.ranges import ALBEDO, ETA, SIZE, G  # noqa: E402
-from full_geometry.neural_shape.shapes.generators import HELD_OUT, TRAINING, make_shape  # noqa: E402
-from full_geometry.neural_shape.storing import WEIGHTS, load, shipped_weights  # noqa: E402
+from figures.studies.held_out import HELD_OUT  # noqa: E402
+from full_geometry.learning import shape_training as training  # noqa: E402
+from full_geometry.learning.shape_data import (  # noqa: E402  # noqa: E402
+    GROUPS,
+    Grouped,
+    PairData,
+    draw_medium,
+    draw_subject,
+    grouped,
+    make_data,
+    mean_events,
+)
+from full_geometry.learning.shape_training import Fitting, Recipe  # noqa: E402
+from full_geometry.learning.shapes import TRAINING, make_shape  # noqa: E402
+from full_geometry.models.neural_shape import ALBEDO, ETA, SIZE, WEIGHTS, G, load, shipped_weights  # noqa: E402
 from halfspace_sss.cli import app as cli  # noqa: E402
 
 QUICK = Recipe(width=16, depth=2, objects=4, pairs=64)
@@ -34,7 +41,9 @@ def variant() -> None:
 
 @pytest.mark.parametrize("family", [*TRAINING, *HELD_OUT])
 def test_shapes_are_closed_differ_by_seed_and_repeat(family: str) -> None:
-    one, same, other = (make_shape(family, seed, 20) for seed in (1, 1, 2))  # a mesh that is not closed is refused
+    one, same, other = (
+        make_shape(family, seed, 20, {**TRAINING, **HELD_OUT}) for seed in (1, 1, 2)
+    )  # a mesh that is not closed is refused
     assert np.array_equal(one.vertices, same.vertices) and np.array_equal(one.faces, same.faces)
     assert one.vertices.shape != other.vertices.shape or not np.allclose(one.vertices, other.vertices)
 

@@ -185,7 +185,7 @@ def test_models_of_whole_objects_refuse_it_too(model: str) -> None:
 
 
 def test_objects_with_something_inside_are_not_learnt() -> None:
-    subject = pytest.importorskip("full_geometry.subject").Subject
+    subject = pytest.importorskip("full_geometry.object.subject").Subject
     scene = mi.load_dict(view("bssrdf", wax=ball(), stone=_stone()))
     with pytest.raises(ValueError, match="must be empty for learning, got the shape 'stone' inside object 'wax'"):
         subject.given(scene, None)

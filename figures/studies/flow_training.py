@@ -1,0 +1,384 @@
+"""Learning flows and weights of patches by zuko, from walks alone or times a light."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+import zuko
+from torch import nn
+
+from figures.studies.flow import BINS, LEAST_SLOPE, ConditionalFlow, FlowSampler
+from figures.studies.flow_chart import N_CONTEXT, Chart, context, direction_square
+from full_geometry.learning.networks import PatchLogits, one_thread, patch_likelihood
+from full_geometry.models.storing import Learnt
+from full_geometry.object.features import Frame, Side, n_side, side_features
+from full_geometry.object.first_event import first_event
+from full_geometry.object.patches import Patches, PatchSampler
+from full_geometry.object.subject import Subject
+from full_geometry.object.walks import trace_exits
+from halfspace_sss.checks import check_count, check_interval
+from halfspace_sss.rendering.surface.horizon import cosine_above
+from halfspace_sss.rendering.transport.plane import number, place
+from halfspace_sss.rendering.transport.protocols import Entry
+from halfspace_sss.tracing.walk import generator, pass_seed
+
+__all__ = [
+    "HIDDEN",
+    "LIGHTINGS",
+    "FlowNetwork",
+    "FlowRecipe",
+    "Lighting",
+    "Schedule",
+    "Walks",
+    "fit_flow",
+    "fit_patches",
+    "flow_walks",
+    "lighting",
+]
+
+
+# ---- Training of conditional flows by zuko: -E[T log p(x | context)] over walks --------------------
+
+
+HIDDEN = (32, 32)
+
+
+class FlowNetwork(nn.Module):
+    """One masked autoregressive transform of splines onto a uniform square.
+
+    Args:
+        n: dimensions.
+        context: numbers that it is told.
+        hidden: widths of the hidden layers.
+        seed: of the numbers at the start.
+    """
+
+    def __init__(self, n: int, context: int, hidden: tuple[int, ...] = HIDDEN, seed: int = 0) -> None:
+        super().__init__()
+        spline = partial(zuko.transforms.MonotonicRQSTransform, bound=1.0, slope=LEAST_SLOPE)
+        with torch.random.fork_rng():
+            torch.manual_seed(seed)
+            self.transform = zuko.flows.MaskedAutoregressiveTransform(
+                features=n, context=context, univariate=spline, shapes=[(BINS,), (BINS,), (BINS - 1,)],
+                hidden_features=hidden,
+            )  # fmt: skip
+        last = self.transform.hyper[-1]
+        with torch.no_grad():  # uniform at the start
+            last.weight.zero_()
+            last.bias.zero_()
+
+    def log_density(self, context: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
+        """Of x (m, n) in [0, 1)^n, given context (m, inputs)."""
+        return self.transform(context).call_and_ladj(2 * x - 1)[1]
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Matrices F_k with their masks multiplied in, and biases h_k."""
+        found, layers = {}, [m for m in self.transform.hyper if hasattr(m, "weight")]
+        for k, layer in enumerate(layers):
+            found[f"F_{k}"] = (layer.mask * layer.weight).detach().numpy().copy()
+            found[f"h_{k}"] = layer.bias.detach().numpy().copy()
+        return found
+
+
+# ----------------------------------------------------------------------------------------------------
+# Light that samplers of entries are fitted to and compared under: a sky, a direction, a small light near the object.
+# Each gives for an entry a direction of incidence and the light from there over its density. The object itself casts
+# shadows.
+
+LIGHTINGS = ("sky", "direction", "near light")
+TOWARDS = np.array([0.48, 0.8, 0.36])  # the direction, and where the near light stands
+GAP = 0.08  # of the near light from the surface, over the size of the object
+
+
+@dataclass(frozen=True, eq=False)
+class Lighting:
+    """Light of one kind.
+
+    Args:
+        name: one of `LIGHTINGS`.
+        subject: the object, which casts shadows.
+        aim: (entry, pair of uniforms) -> direction towards the light, its value over the density, and its distance.
+    """
+
+    name: str
+    subject: Subject
+    aim: Callable[[Any, Any], tuple[Any, Any, Any]]
+
+    def sample(self, entry: Any, u: Any, active: Any) -> tuple[Any, Any]:
+        """w_i at an entry, and the light from there over its density: 0 in the shadow."""
+        import drjit as dr
+        import mitsuba as mi
+
+        w, value, distance = self.aim(entry, u)
+        ray = place(entry.p, mi.Normal3f(entry.n * number(self.subject.found.sign))).spawn_ray(w)
+        ray.maxt = distance
+        lit = active & (dr.dot(w, entry.n_face) > 0)
+        return w, dr.select(lit & ~self.subject.found.scene.ray_test(ray, False, lit), value, 0)
+
+
+def lighting(name: str, subject: Subject) -> Lighting:
+    """A kind of light about an object: radiance 1 from everywhere, irradiance 1 from a direction, or intensity 1.
+
+    Raises:
+        ValueError: there is no such kind.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    if name not in LIGHTINGS:
+        raise ValueError(f"lighting must be one of {', '.join(LIGHTINGS)}, got {name!r}")
+    towards = mi.Vector3f(*TOWARDS.tolist())
+    place_of_light = mi.Point3f(*map(number, _above(subject)))
+
+    def sky(entry: Any, u: Any) -> tuple:
+        w, density = cosine_above(entry.n_out, entry.n_face, u)
+        return w, 1 / dr.maximum(density, 1e-6), mi.Float(dr.inf)
+
+    def direction(entry: Any, u: Any) -> tuple:
+        return mi.Vector3f(towards), mi.Float(1), mi.Float(dr.inf)
+
+    def near(entry: Any, u: Any) -> tuple:
+        d = place_of_light - entry.p
+        r = dr.norm(d)
+        return mi.Vector3f(d / r), 1 / (r * r), r
+
+    return Lighting(name, subject, {"sky": sky, "direction": direction, "near light": near}[name])
+
+
+def _above(subject: Subject) -> np.ndarray:
+    """A point near the part of the surface that lies farthest towards the light."""
+    import mitsuba as mi
+
+    from halfspace_sss.tracing.walk import generator, pass_seed
+
+    p = np.array(subject.random_points(generator(mi, 4096, pass_seed(23))).p)
+    return p[:, np.argmax(TOWARDS @ p)] + GAP * float(subject.found.size) * TOWARDS
+
+
+# ---- Training data of flows: exits of walks as patches and coordinates in them, with their throughput
+
+
+class Walks(NamedTuple):
+    """Rows of walks that left; `drawn` were begun.
+
+    Attributes:
+        exit: features of the exit (n, inputs).
+        told: of the exit as seen from the patch where the walk left (n, N_CONTEXT).
+        entry: features of the point and direction where it left (n, inputs).
+        u: its coordinates in the patch and of its direction (n, 4).
+        patch: where it left (n,).
+        T: throughput, times the light there if one is given (n, channels).
+        starts: features of the exits of all walks (drawn, inputs). total: T of all walks (drawn, channels).
+    """
+
+    exit: np.ndarray
+    told: np.ndarray
+    entry: np.ndarray
+    u: np.ndarray
+    patch: np.ndarray
+    T: np.ndarray
+    starts: np.ndarray
+    total: np.ndarray
+
+    @property
+    def drawn(self) -> int:
+        return len(self.total)
+
+
+def flow_walks(
+    subject: Subject, frame: Frame, patches: Patches, chart: Chart, n: int, seed: tuple[int, ...],
+    light: Lighting | None = None,
+) -> Walks:  # fmt: skip
+    """n walks of random exits.
+
+    Args:
+        subject, frame, patches, chart: of the object.
+        n: walks.
+        seed: of the pass.
+        light: that falls on the object: one sample of it at each end, times mu_i, is multiplied to T.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    rng = generator(mi, n, pass_seed(*seed, 0))
+    starts = subject.random_points(rng)
+    exits = trace_exits(subject, starts, (*seed, 1))
+    T = exits.T
+    if light is not None:
+        n_mesh = mi.Normal3f(exits.at.n * subject.found.sign)
+        entry = Entry(exits.at.p, n_mesh, exits.at.n_out, mi.Float(1), exits.face)
+        w, value = light.sample(entry, mi.Point2f(rng.next_float32(), rng.next_float32()), dr.max(T) > 0)
+        T = T * (value * entry.seen(w)[1])
+    from_all = side_features(frame, Side(starts, first_event(subject, starts)))
+    total = _rows(list(T), n)
+    starts_rows = _rows(from_all, n)
+    kept = dr.compress(dr.max(T) > 0)
+    m = dr.width(kept)
+    k = np.array(kept, dtype=np.int64)
+    at, out = exits.at.gather(kept), starts.gather(kept)
+    face = dr.gather(mi.UInt32, exits.face, kept)
+    patch = patches.row("patch", face)
+    side = Side(out, first_event(subject, out))
+    told = _rows(context(frame, side, chart.frame(patch)), m)
+    back = direction_square(at.n_out, out.p - at.p, at.w)
+    u = _rows([*chart.coordinates(face, at.p), *back], m)
+    entry = _rows(side_features(frame, Side(at, first_event(subject, at))), m)
+    return Walks(starts_rows[k], told, entry, u, np.array(patch).astype(np.int64), total[k], starts_rows, total)
+
+
+def _rows(columns: list[Any], n: int) -> np.ndarray:
+    """(n, columns) float32."""
+    import drjit as dr
+
+    dr.eval(columns)
+    return np.ascontiguousarray(np.stack([np.broadcast_to(c.numpy(), n) for c in columns], axis=1))
+
+
+# ----------------------------------------------------------------------------------------------------
+# Learning a flow, or weights of patches, from the exits of walks; for any light or for a given one.
+
+
+@dataclass(frozen=True)
+class FlowRecipe:
+    """How a sampler is fitted.
+
+    Args:
+        seconds: of CPU time of this process, data included.
+        steps: instead of the seconds, where the end is to be the same every time.
+        batch, rate: of a step.
+        chunk: walks that are made at once.
+        reuse: times that each is used.
+        hidden: widths of the flow's network.
+        patch_hidden: of the network of patches.
+    """
+
+    seconds: float = 30.0
+    steps: int | None = None
+    batch: int = 2048
+    rate: float = 4e-3
+    chunk: int = 2**16
+    reuse: int = 4
+    hidden: tuple[int, ...] = (32, 32)
+    patch_hidden: tuple[int, ...] = (64, 32)
+
+    def __post_init__(self) -> None:
+        check_interval("seconds", self.seconds, 1e-3, 1e6)
+        check_interval("rate", self.rate, 1e-8, 1.0)
+        for name in ("batch", "chunk", "reuse"):
+            check_count(name, getattr(self, name), 1)
+        check_count("steps", 1 if self.steps is None else self.steps, 1)
+
+
+class Schedule:
+    """Steps of Adam until the CPU seconds are spent, the rate falling by a cosine.
+
+    Args:
+        parameters: of the networks.
+        recipe: seconds and rates.
+    """
+
+    def __init__(self, parameters: list, recipe: FlowRecipe) -> None:
+        self.parameters, self.recipe = parameters, recipe
+        self.adam = torch.optim.Adam(parameters, lr=recipe.rate, betas=(0.9, 0.99))
+        self.started, self.steps = time.process_time(), 0
+
+    @property
+    def spent(self) -> float:
+        """Share of the seconds, or steps, in [0, 1]."""
+        if self.recipe.steps is not None:
+            return min(self.steps / self.recipe.steps, 1.0)
+        return min((time.process_time() - self.started) / self.recipe.seconds, 1.0)
+
+    @one_thread()
+    def run(self, data: Callable[[int], Walks], loss: Callable[[Walks, np.ndarray], torch.Tensor], seed: int) -> None:
+        """Go through chunks of data."""
+        chunk, batch = 0, self.recipe.batch
+        while self.spent < 1:
+            walks, order = data(chunk), np.random.default_rng([seed, chunk])
+            n = len(walks.T)
+            for _ in range(self.recipe.reuse if n else 0):
+                shuffled = order.permutation(n)
+                for k in range(max(n // batch, 1)):
+                    self._step(loss(walks, shuffled[k * batch : (k + 1) * batch]))
+                    if self.spent >= 1:
+                        return
+            chunk += 1
+
+    def _step(self, loss: torch.Tensor) -> None:
+        for group in self.adam.param_groups:
+            decay = 0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * self.spent))
+            group["lr"] = self.recipe.rate * min(1.0, (self.steps + 1) / 50) * decay
+        self.adam.zero_grad(set_to_none=True)
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(self.parameters, 1.0)
+        self.adam.step()
+        self.steps += 1
+
+
+def _weights(walks: Walks, rows: np.ndarray) -> torch.Tensor:
+    """T of rows over the mean of all, mean over the channels that carry light."""
+    mean = walks.total.mean(axis=0)
+    live = mean > 0
+    scaled = walks.T[rows][:, live] / mean[live]
+    # a light leaves a few walks with very large values; the rest of them is noise to the fit
+    return torch.from_numpy(np.minimum(scaled.mean(axis=1), 50.0).astype(np.float32))
+
+
+def fit_patches(
+    learnt: Learnt, recipe: FlowRecipe | None = None, *, light: Lighting | None = None, seed: int = 0
+) -> PatchSampler:
+    """Weights of the patches of a trained object by walks alone, or by walks times the light where they left.
+
+    Args:
+        learnt: the object.
+        recipe: sizes and rates.
+        light: that falls on the object; None fits to S itself.
+        seed: of everything.
+    """
+    recipe, (model, sampler, _) = recipe or FlowRecipe(), learnt
+    chart = Chart(model.subject, sampler.frame, sampler.patches)
+    net = PatchLogits(n_side(len(model.subject.media)), sampler.patches.areas, recipe.patch_hidden, seed)
+    schedule = Schedule(list(net.parameters()), recipe)
+
+    def loss(walks: Walks, rows: np.ndarray) -> torch.Tensor:
+        x, patch = torch.from_numpy(walks.exit[rows].T.copy()), torch.from_numpy(walks.patch[rows])
+        return patch_likelihood(net(x), _weights(walks, rows), patch)
+
+    schedule.run(_source(learnt, chart, recipe, light, seed), loss, seed)
+    return PatchSampler(sampler.frame, sampler.patches, net.arrays())
+
+
+def fit_flow(
+    learnt: Learnt, recipe: FlowRecipe | None = None, *, light: Lighting | None = None, seed: int = 0
+) -> FlowSampler:
+    """A flow inside the patches of a trained object, by -E[T log p(u | exit, patch)].
+
+    Args:
+        learnt: the object, with its patches; their weights stay as they are.
+        recipe, light, seed: as for `fit_patches`.
+    """
+    recipe, (model, sampler, _) = recipe or FlowRecipe(), learnt
+    chart = Chart(model.subject, sampler.frame, sampler.patches)
+    net = FlowNetwork(2, N_CONTEXT, recipe.hidden, seed)
+    schedule = Schedule(list(net.parameters()), recipe)
+
+    def loss(walks: Walks, rows: np.ndarray) -> torch.Tensor:
+        told, u = torch.from_numpy(walks.told[rows]), torch.from_numpy(walks.u[rows, :2])
+        return -(_weights(walks, rows) * net.log_density(told, u)).mean()
+
+    schedule.run(_source(learnt, chart, recipe, light, seed), loss, seed)
+    return FlowSampler(sampler, chart, ConditionalFlow(2, net.arrays()))
+
+
+def _source(
+    learnt: Learnt, chart: Chart, recipe: FlowRecipe, light: Lighting | None, seed: int
+) -> Callable[[int], Walks]:
+    subject, sampler = learnt.model.subject, learnt.sampler
+    return lambda k: flow_walks(subject, sampler.frame, sampler.patches, chart, recipe.chunk, (seed, 61, k), light)

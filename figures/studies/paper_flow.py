@@ -1,0 +1,151 @@
+"""The paper's flow: coupling layers over a Gaussian in space, given an exit; its samples are laid onto the surface.
+
+The target is read as t(x_i) = ∫ S(x_i, w_i; x_o, w_o) mu_i dw_i, by a grid of 16 x 64 directions, and fitted at points
+uniform over the area: -E[t log p(x_i | x_o, w_o)]. S is that of a trained model of the object. A sample in space is
+taken to a random point of the nearest triangle.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+import zuko
+
+from figures.studies.paper_network import placed
+from full_geometry.learning.networks import one_thread
+from full_geometry.models.object_model import FullGeometry
+from full_geometry.object.features import Frame
+from full_geometry.object.subject import Subject, SurfacePoint, surface_point
+from halfspace_sss.checks import check_interval
+from halfspace_sss.rendering.surface.horizon import cosine_above
+from halfspace_sss.rendering.surface.variants import channel_mean
+from halfspace_sss.tracing.walk import generator, pass_seed
+
+__all__ = ["SpaceFlow", "fit_space_flow", "incidence", "mesh_arrays", "on_surface", "rmsd"]
+
+
+HIDDEN, LAYERS = (128, 128), 6
+GRID = (16, 64)  # directions
+PAIRS, POINTS = 2**10, 4  # exits of a chunk, and points of each
+BATCH, RATE, REUSE = 512, 1e-3, 8
+
+
+@dataclass(frozen=True, eq=False)
+class SpaceFlow:
+    """The flow of an object.
+
+    Args:
+        flow: of zuko.
+        frame: of the object.
+    """
+
+    flow: Any
+    frame: Frame
+
+    def sample(self, exits: SurfacePoint, n: int, seed: int = 0) -> np.ndarray:
+        """n points in space of each of m exits, (m, n, 3), in the frame of the object over its radius."""
+        import drjit as dr
+
+        told = torch.from_numpy(placed(self.frame, exits, dr.width(exits.p)))
+        with torch.no_grad(), torch.random.fork_rng():
+            torch.manual_seed(seed)
+            return self.flow(told).sample((n,)).transpose(0, 1).numpy()
+
+
+def incidence(model: FullGeometry, exits: SurfacePoint, points: SurfacePoint) -> np.ndarray:
+    """t of pairs of exits and points, mean over channels: S mu over a grid of directions, uniform by the cosine.
+
+    Args:
+        model: of the object.
+        exits: one for each point.
+        points: of entry, with interpolated normals, see `Subject.random_places`.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    n, (rows, columns) = dr.width(exits.p), GRID
+    prepared = model.prepare(exits)
+    total, k = mi.Float(0), mi.UInt32(0)
+
+    def add(k: Any, total: Any) -> tuple:
+        u = mi.Point2f((mi.Float(k % rows) + 0.5) / rows, (mi.Float(k // rows) + 0.5) / columns)
+        w, _ = cosine_above(points.n_out, points.n, u)
+        return k + 1, total + channel_mean(model.S(prepared, surface_point(points.p, points.n, points.n_out, w)))
+
+    k, total = dr.while_loop((k, total + dr.zeros(mi.Float, n)), lambda k, _: k < rows * columns, add)
+    return np.array(total) * np.pi / (rows * columns)
+
+
+@one_thread()
+def fit_space_flow(model: FullGeometry, frame: Frame, seconds: float = 60.0, seed: int = 0) -> SpaceFlow:
+    """The flow after so many CPU seconds.
+
+    Args:
+        model: of the object.
+        frame: of the object.
+        seconds: of CPU time of this process, data included.
+        seed: of everything.
+    """
+    check_interval("seconds", seconds, 1e-3, 1e6)
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        flow = zuko.flows.NICE(features=3, context=5, transforms=LAYERS, hidden_features=HIDDEN)
+    adam, began, chunk = torch.optim.Adam(flow.parameters(), lr=RATE), time.process_time(), 0
+    while time.process_time() - began < seconds:
+        told, x, t = _pairs(model, frame, (seed, 90, chunk))
+        order = np.random.default_rng([seed, 91, chunk])
+        for rows in [r for _ in range(REUSE) for r in np.array_split(order.permutation(len(t)), len(t) // BATCH)]:
+            loss = -(torch.from_numpy(t[rows]) * flow(torch.from_numpy(told[rows])).log_prob(torch.from_numpy(x[rows])))
+            adam.zero_grad(set_to_none=True)
+            loss.mean().backward()
+            torch.nn.utils.clip_grad_norm_(flow.parameters(), 1.0)
+            adam.step()
+        chunk += 1
+    return SpaceFlow(flow, frame)
+
+
+def _pairs(model: FullGeometry, frame: Frame, seed: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Exits (n, 5), uniform points (n, 3) and t over its mean."""
+    import drjit as dr
+    import mitsuba as mi
+
+    n = PAIRS * POINTS
+    exits = model.subject.random_points(generator(mi, PAIRS, pass_seed(*seed, 0)))
+    exits = exits.gather(dr.arange(mi.UInt32, n) // POINTS)
+    points = model.subject.random_places(generator(mi, n, pass_seed(*seed, 1)))
+    t = incidence(model, exits, points)
+    return placed(frame, exits, n), placed(frame, points, n)[:, :3], (t / t.mean()).astype(np.float32)
+
+
+def mesh_arrays(subject: Subject, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices, in the frame over the radius, and faces, as libigl takes them."""
+    import mitsuba as mi
+
+    parameters = mi.traverse(subject.found.shape)
+    vertices = np.array(parameters["vertex_positions"], dtype=np.float64).reshape(-1, 3)
+    turn = np.eye(3) if frame.turn is None else np.array([np.array(row).ravel() for row in frame.turn])
+    centre, radius = np.array(frame.centre, dtype=float).ravel(), float(np.array(frame.radius).item())
+    faces = np.array(parameters["faces"], dtype=np.int64).reshape(-1, 3)
+    return np.ascontiguousarray((vertices - centre) @ turn.T / radius), faces
+
+
+def on_surface(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray, seed: int = 0) -> np.ndarray:
+    """A random point of the triangle that is nearest to each point (n, 3)."""
+    import igl
+
+    nearest = np.asarray(igl.point_mesh_squared_distance(np.asarray(points, np.float64), vertices, faces)[1]).ravel()
+    u, v = np.random.default_rng(seed).random((2, len(points)))
+    root = np.sqrt(u)
+    a, b, c = vertices[faces[nearest]].transpose(1, 0, 2)
+    return a * (1 - root)[:, None] + b * (root * (1 - v))[:, None] + c * (root * v)[:, None]
+
+
+def rmsd(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> float:
+    """Root mean square distance of points (n, 3) to the nearest barycentre of a triangle."""
+    from scipy.spatial import cKDTree
+
+    return float(np.sqrt(np.mean(cKDTree(vertices[faces].mean(axis=1)).query(points)[0] ** 2)))

@@ -1,0 +1,401 @@
+"""The paper's network of one object: lights, network, fit, errors, and the learner `full_geometry_paper`."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import nn
+
+from full_geometry.learning.model_errors import ModelError, compare
+from full_geometry.learning.networks import one_thread
+from full_geometry.object.features import Frame
+from full_geometry.object.identity import Identity, frame_of, identify
+from full_geometry.object.radiance import LOBES, POWER, Estimate, Reference, reference
+from full_geometry.object.subject import Subject, SurfacePoint
+from full_geometry.object.walks import trace_exits
+from halfspace_sss.checks import check_choice, check_count, check_interval
+from halfspace_sss.neural.store import load_weights, save_weights
+from halfspace_sss.neural.trained import check_weights_folder, weights_folder
+from halfspace_sss.progress import NamedProgress
+from halfspace_sss.provenance import provenance
+from halfspace_sss.rendering.scenes.learners import LearntObject, ObjectError
+from halfspace_sss.tracing.walk import generator, pass_seed
+
+__all__ = [
+    "KIND",
+    "POINTS",
+    "Light",
+    "PaperNetwork",
+    "PaperRecipe",
+    "Samples",
+    "errors",
+    "estimate",
+    "fit_paper",
+    "load_network",
+    "measured_lights",
+    "paper_errors",
+    "random_lights",
+    "save_network",
+    "train",
+    "walk_samples",
+]
+
+
+# ----------------------------------------------------------------------------------------------------
+# The network: 5 + 8 N inputs, three layers of 256 with LeakyReLU, radiance as output, fitted by the MSE.
+# Inputs: x_o and the two angles of w_o, and for each of N samples x_i, the two angles of w_i and the light L_i from
+# there; target mean_j T_j L_j over N walks that end at (x_j, w_j).
+
+
+# Incident light for the paper's network: a constant and lobes max(0, w
+
+MOST_LOBES = 3
+FACTORS = (0.125, 8.0)  # of the augmentation by scale
+
+
+@dataclass(frozen=True, eq=False)
+class Light:
+    """Light of m exits, one for each.
+
+    Args:
+        base: constant part (m, channels).
+        axes: of lobes (m, k, 3).
+        powers: of the lobes (m, k).
+        colours: of the lobes (m, k, channels).
+    """
+
+    base: np.ndarray
+    axes: np.ndarray
+    powers: np.ndarray
+    colours: np.ndarray
+
+    def __call__(self, w: np.ndarray) -> np.ndarray:
+        """Radiance (m, n, channels) from directions w (m, n, 3)."""
+        c = np.maximum(np.einsum("mni,mki->mnk", w, self.axes), 0) ** self.powers[:, None, :]
+        return (self.base[:, None, :] + np.einsum("mnk,mkc->mnc", c, self.colours)).astype(np.float32)
+
+
+def random_lights(m: int, channels: int, rng: np.random.Generator) -> Light:
+    """Lights of random lobes and colours, each times a random factor (augmentation by scale)."""
+    axes = rng.standard_normal((m, MOST_LOBES, 3))
+    axes /= np.linalg.norm(axes, axis=2, keepdims=True)
+    powers = 2.0 ** rng.uniform(0, 6, (m, MOST_LOBES))
+    factor = np.exp(rng.uniform(*np.log(FACTORS), (m, 1)))
+    on = rng.random((m, MOST_LOBES, 1)) < 0.6
+    colours = on * rng.random((m, MOST_LOBES, channels)) * factor[:, :, None]
+    return Light(rng.random((m, channels)) * factor, axes, powers, colours)
+
+
+def measured_lights(m: int, channels: int) -> list[Light]:
+    """Constant light and the four lobes of the measured errors, the same for m exits."""
+    none = np.zeros((m, 1, 3))
+    found = [Light(np.ones((m, channels)), none, np.ones((m, 1)), np.zeros((m, 1, channels)))]
+    for axis in LOBES:
+        axes = np.broadcast_to(axis, (m, 1, 3))
+        found.append(Light(np.zeros((m, channels)), axes, np.full((m, 1), POWER), np.ones((m, 1, channels))))
+    return found
+
+
+WIDTH, DEPTH = 256, 3
+ENOUGH, FOR_STEPS = 1e-3, 100  # the stop: MSE below it for so many steps
+
+
+@dataclass(frozen=True)
+class PaperRecipe:
+    """How it is fitted.
+
+    Args:
+        n: incident samples N of an exit.
+        seconds: of CPU time of this process, data included.
+        steps: instead of the seconds, where the end is to be the same every time.
+        batch, rate: of a step.
+        exits: that are made at once, N walks each. reuse: times that each is used, under new light.
+    """
+
+    n: int = 16
+    seconds: float = 60.0
+    steps: int | None = None
+    batch: int = 256
+    rate: float = 1e-3
+    exits: int = 2**12
+    reuse: int = 4
+
+    def __post_init__(self) -> None:
+        check_interval("seconds", self.seconds, 1e-3, 1e6)
+        for name in ("n", "batch", "exits", "reuse"):
+            check_count(name, getattr(self, name), 1)
+        check_count("steps", 1 if self.steps is None else self.steps, 1)
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """m exits with N incident samples each.
+
+    Args:
+        exit: x_o over the object's radius and two angles of w_o (m, 5).
+        points: x_i likewise and two angles of w_i (m, N, 5).
+        w: w_i in the world (m, N, 3).
+        T: throughputs of the walks (m, N, channels).
+    """
+
+    exit: np.ndarray
+    points: np.ndarray
+    w: np.ndarray
+    T: np.ndarray
+
+
+class PaperNetwork(nn.Module):
+    """The network of an object for N samples.
+
+    Args:
+        n: N.
+        channels: of the light.
+        seed: of the numbers at the start.
+    """
+
+    def __init__(self, n: int, channels: int = 3, seed: int = 0) -> None:
+        super().__init__()
+        self.n = n
+        sizes = [5 + (5 + channels) * n, *[WIDTH] * DEPTH]
+        with torch.random.fork_rng():
+            torch.manual_seed(seed)
+            hidden = [m for i, j in zip(sizes, sizes[1:]) for m in (nn.Linear(i, j), nn.LeakyReLU())]
+            self.layers = nn.Sequential(*hidden, nn.Linear(WIDTH, channels))
+
+    def forward(self, exit: torch.Tensor, points: torch.Tensor, L: torch.Tensor) -> torch.Tensor:
+        """Radiance (m, channels) of exits (m, 5) with points (m, N, 5) and light L (m, N, channels)."""
+        both = torch.cat((points, L), dim=2).flatten(1)
+        return self.layers(torch.cat((exit, both), dim=1))
+
+    def radiance(self, samples: Samples, light: Light) -> np.ndarray:
+        """Radiance (m, channels) of samples in a light."""
+        with torch.no_grad():
+            L = torch.from_numpy(light(samples.w))
+            return self(torch.from_numpy(samples.exit), torch.from_numpy(samples.points), L).numpy()
+
+
+def placed(frame: Frame, at: SurfacePoint, n: int) -> np.ndarray:
+    """Position over the radius and the angles of w, over pi: (n, 5)."""
+    import drjit as dr
+    import mitsuba as mi
+
+    p, w = frame.position(at.p), mi.Vector3f(frame.direction(at.w))
+    columns = [*p, dr.acos(dr.clip(w.z, -1, 1)) / dr.pi, dr.atan2(w.y, w.x) / dr.pi]
+    dr.eval(columns)
+    return np.stack([np.broadcast_to(c.numpy(), n) for c in columns], axis=1).astype(np.float32)
+
+
+def walk_samples(subject: Subject, frame: Frame, exits: SurfacePoint, n: int, seed: tuple[int, ...]) -> Samples:
+    """N walks of each exit, as the paper's samples; walks that end inside keep T = 0 and a place of their own."""
+    import drjit as dr
+    import mitsuba as mi
+
+    m = dr.width(exits.p)
+    starts = exits.gather(dr.arange(mi.UInt32, m * n) // n)
+    ends = trace_exits(subject, starts, seed)
+    lost = dr.max(ends.T) <= 0
+    here = SurfacePoint(*(dr.select(lost, a, b) for a, b in zip(starts, ends.at)))
+    points = placed(frame, here, m * n).reshape(m, n, 5)
+    w, T = (np.array(v, dtype=np.float32).T.reshape(m, n, -1) for v in (here.w, ends.T))
+    return Samples(placed(frame, exits, m), points, w, np.ascontiguousarray(T))
+
+
+@one_thread()
+def fit_paper(
+    subject: Subject, recipe: PaperRecipe | None = None, seed: int = 0,
+    progress: Callable[[str, int, int], Any] | None = None,
+) -> tuple[PaperNetwork, int]:  # fmt: skip
+    """The network of an object after the recipe's CPU seconds, or when it stops; and its steps.
+
+    Args:
+        subject: the object.
+        recipe: N, seconds and sizes.
+        seed: of everything.
+        progress: called with (what, done, total).
+    """
+    import mitsuba as mi
+
+    recipe, frame, channels = recipe or PaperRecipe(), frame_of(subject), len(subject.media)
+    net = PaperNetwork(recipe.n, channels, seed)
+    adam = torch.optim.Adam(net.parameters(), lr=recipe.rate)
+    rng, began, steps, below, chunk = np.random.default_rng([seed, 80]), time.process_time(), 0, 0, 0
+
+    def ends() -> bool:
+        spent = time.process_time() - began > recipe.seconds if recipe.steps is None else steps >= recipe.steps
+        return spent or below >= FOR_STEPS
+
+    while not ends():
+        exits = subject.random_points(generator(mi, recipe.exits, pass_seed(seed, 81, chunk)))
+        samples = walk_samples(subject, frame, exits, recipe.n, (seed, 82, chunk))
+        for _ in range(recipe.reuse):
+            for rows in np.array_split(rng.permutation(recipe.exits), max(recipe.exits // recipe.batch, 1)):
+                error = _step(net, adam, samples, rows, rng)
+                below = below + 1 if error < ENOUGH else 0
+                steps += 1
+                if ends():
+                    return net, steps
+        chunk += 1
+        if progress:
+            progress("training", min(int(time.process_time() - began), int(recipe.seconds)), int(recipe.seconds))
+    return net, steps
+
+
+def _step(net: PaperNetwork, adam: Any, samples: Samples, rows: np.ndarray, rng: np.random.Generator) -> float:
+    """One step under random light; returns the MSE."""
+    light = random_lights(len(rows), samples.T.shape[2], rng)
+    L = light(samples.w[rows])
+    target = torch.from_numpy((samples.T[rows] * L).mean(axis=1))
+    exit, points = torch.from_numpy(samples.exit[rows]), torch.from_numpy(samples.points[rows])
+    loss = nn.functional.mse_loss(net(exit, points, torch.from_numpy(L)), target)
+    adam.zero_grad(set_to_none=True)
+    loss.backward()
+    adam.step()
+    return float(loss.detach())
+
+
+# ---- How wrong the paper's network is, by the error measure of all models of an object -------------
+# Its N points come from walks, as in training, or are uniform over the area with directions by the cosine: what a
+# renderer has that knows nothing. Each exit is asked several times with new points, and the noise of their mean is
+# taken out.
+
+POINTS = ("walks", "uniform")
+
+
+def paper_errors(
+    subject: Subject, net: PaperNetwork, truth: Reference, *, points: str = "walks", repeats: int = 16, seed: int = 0
+) -> list[ModelError]:
+    """Errors per channel, under constant light and lobes.
+
+    Args:
+        subject: the object.
+        net: its network.
+        truth: exits and their radiance.
+        points: "walks" or "uniform".
+        repeats: of each exit.
+        seed: of the points.
+
+    Raises:
+        ValueError: an argument is out of range.
+    """
+    check_choice("points", points, POINTS)
+    check_count("repeats", repeats, 2)
+    return compare(estimate(subject, net, truth.exits, points, repeats, seed), truth.truth)
+
+
+def estimate(
+    subject: Subject, net: PaperNetwork, exits: SurfacePoint, points: str, repeats: int, seed: int = 0
+) -> Estimate:
+    """Mean radiance of exits over repeats with new points, and its variance."""
+    import drjit as dr
+
+    frame, m, found = frame_of(subject), dr.width(exits.p), []
+    for k in range(repeats):
+        if points == "walks":
+            samples = walk_samples(subject, frame, exits, net.n, (seed, 95, k))
+        else:
+            samples = uniform_samples(subject, frame, exits, net.n, (seed, 96, k))
+        lights = measured_lights(m, len(subject.media))
+        found.append(np.stack([net.radiance(samples, light) for light in lights], axis=-1))
+    values = np.array(found, dtype=float).transpose(0, 2, 1, 3)
+    return Estimate(values.mean(axis=0), values.var(axis=0, ddof=1) / repeats)
+
+
+def uniform_samples(subject: Subject, frame: Frame, exits: SurfacePoint, n: int, seed: tuple[int, ...]) -> Samples:
+    """N points uniform over the area for each exit; the throughputs are left out."""
+    import drjit as dr
+    import mitsuba as mi
+
+    m: Any = dr.width(exits.p)
+    at = subject.random_points(generator(mi, m * n, pass_seed(*seed)))
+    w = np.array(at.w, dtype=np.float32).T.reshape(m, n, 3)
+    points = placed(frame, at, m * n).reshape(m, n, 5)
+    return Samples(placed(frame, exits, m), points, w, np.zeros((m, n, len(subject.media)), np.float32))
+
+
+# ----------------------------------------------------------------------------------------------------
+# The learner `full_geometry_paper`: the paper's network of an object of a scene, trained, kept and measured.
+
+KIND = "full_geometry_paper"
+EXITS, WALKS = 256, 4096  # of the truth
+
+
+def save_network(folder: Path, identity: Identity, net: PaperNetwork, record: dict[str, Any]) -> Path:
+    """Write the network of an object; returns the path."""
+    arrays = {name: value.numpy().astype(np.float16) for name, value in net.state_dict().items()}
+    whole = {"orders": "multiple", **identity.record(), "n": net.n, **record}
+    path = Path(folder) / f"{KIND}-{identity.digest()}.safetensors"
+    return save_weights(path, KIND, {**arrays, "anchors": identity.anchors.astype(np.float32)}, whole)
+
+
+def load_network(subject: Subject, folder: Path | None = None) -> PaperNetwork:
+    """The network of an object as it stands where it was trained.
+
+    Raises:
+        ValueError: the object has not been trained or has been moved since, or the file is damaged.
+    """
+    import torch
+
+    here = identify(subject)
+    path = (Path(folder) if folder else weights_folder()) / f"{KIND}-{here.digest()}.safetensors"
+    if not path.exists():
+        raise ValueError(
+            f"object {subject.found.shape.id()!r} must be trained for {KIND}, got one that is not in {path.parent}; "
+            f"`halfspace-sss train --scene --model {KIND}` does it"
+        )
+    arrays, record = load_weights(path, KIND)
+    anchors = arrays.pop("anchors")
+    R, t = Identity(record["kind_of_shape"], record["topology"], anchors, dict(record["medium"])).pose(here)
+    if not (np.allclose(R, np.eye(3), atol=1e-5) and np.allclose(t, 0, atol=1e-4 * np.ptp(anchors))):
+        raise ValueError(f"{path}: object must stand where it was trained, got it moved or turned")
+    net = PaperNetwork(record["n"], len(subject.media))
+    net.load_state_dict({name: torch.from_numpy(value.astype(np.float32)) for name, value in arrays.items()})
+    return net
+
+
+def train(
+    scene: Any, *, object: str | None = None, seconds: float = 60.0, target_error: float | None = None, seed: int = 0,
+    folder: Path | None = None, work: Path | None = None, progress: NamedProgress | None = None,
+    start: str | None = None,
+) -> LearntObject:  # fmt: skip
+    """The network of an object after so many seconds of CPU time, or where the paper's stop is met.
+
+    Raises:
+        ValueError: an argument is out of range, or one is given that this learner does not know.
+    """
+    check_interval("seconds", seconds, 1e-3, 1e7)
+    check_count("seed", seed, 0)
+    for name, value in (("target_error", target_error), ("work", work), ("start", start)):
+        if value is not None:
+            raise ValueError(f"{name} must be left out for {KIND}, got {value!r}")
+    folder = check_weights_folder(folder)
+    subject, began = Subject.given(scene, None, None, object), time.monotonic()
+    net, steps = fit_paper(subject, PaperRecipe(seconds=seconds), seed, progress)
+    found = paper_errors(subject, net, reference(subject, EXITS, WALKS, seed), seed=seed)
+    record = {"steps": steps, "seconds": seconds, "seed": seed, "errors": [row._asdict() for row in found]}
+    path = save_network(folder, identify(subject), net, {**record, "provenance": provenance(seed=seed)})
+    name = subject.found.shape.id()
+    return LearntObject(name, path, _rows(name, found), steps, time.monotonic() - began)
+
+
+def errors(
+    scene: Any, models: Sequence[str] = (KIND,), *, object: str | None = None, exits: int = EXITS, seed: int = 0,
+    progress: NamedProgress | None = None,
+) -> list[ObjectError]:  # fmt: skip
+    """The errors of the network of an object over so many exits, its points from walks as it was trained."""
+    for name in models:
+        check_choice("model", name, (KIND,))
+    subject = Subject.given(scene, None, None, object)
+    net = load_network(subject)
+    found = paper_errors(subject, net, reference(subject, exits, WALKS, seed), seed=seed)
+    return _rows(subject.found.shape.id(), found)
+
+
+def _rows(name: str, found: list[ModelError]) -> list[ObjectError]:
+    channels = "RGB" if max(row.channel for row in found) == 2 else ["mono"]
+    return [ObjectError(name, channels[e.channel], KIND, e.light, e.error, e.standard_error, e.ratio) for e in found]

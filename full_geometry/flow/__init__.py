@@ -1,1 +1,0 @@
-"""A normalizing flow inside patches of a surface: trained by zuko, evaluated in Dr.Jit, with exact densities."""

@@ -1,0 +1,164 @@
+"""S of one object: a base model times what a small network has learnt, and its directional albedo, in Dr.Jit."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from full_geometry.object.features import (
+    Frame,
+    PreparedExit,
+    Quadratic,
+    Side,
+    Start,
+    entering,
+    n_pair,
+    n_side,
+    pair_features,
+    side_features,
+)
+from full_geometry.object.first_event import first_event
+from full_geometry.object.subject import Subject, SurfacePoint
+from halfspace_sss.neural.perceptron import Perceptron
+from halfspace_sss.rendering.transport.plane import number
+
+__all__ = ["BOUND", "FullGeometry", "Reflectance"]
+
+
+# ---- S of one object: a start, times what a small network has learnt, evaluated in Dr.Jit ----------
+
+
+# ---- What leaves at an exit under the same light from everywhere, learnt beside S ------------------
+# Of the light that F_t lets in, 1 - P leaves without an event; the rest leaves after one, alpha_1, or after more,
+#
+#     alpha = ∫ S mu_i dw_i dA_i,    alpha_1, alpha = F_t(mu_o) P_o sigmoid(a),
+#
+# a a small network of the exit alone: positive, and no more than is scattered. As control variates they leave an even
+# sky no noise but that of what blocks it. The units before its last layer are further inputs of the network of S, of
+# exit and entry: what is simple in S walks teach alpha sooner.
+
+
+@dataclass(frozen=True, eq=False)
+class Reflectance:
+    """Of one object.
+
+    Args:
+        subject: the object.
+        frame: of the features.
+        weights: A_k (outputs, inputs) and a_k of the layers.
+        trusted: (2, channels) from `even_light.trusted`.
+    """
+
+    subject: Subject
+    frame: Frame
+    weights: Mapping[str, np.ndarray]
+    trusted: np.ndarray
+
+    @functools.cached_property
+    def _networks(self) -> tuple[Perceptron, Perceptron]:
+        """All layers but the last, and that."""
+        n = len(self.weights) // 2
+        layers = [[self.weights[f"{name}_{k}"] for k in range(n)] for name in ("A", "a")]
+        parts = ([arrays[:-1] for arrays in layers], [arrays[-1:] for arrays in layers])
+        return tuple(Perceptron(*part, looped=True) for part in parts)
+
+    def units(self, columns: list[Any]) -> list[Any]:
+        """What the last layer is told of a side with these features."""
+        net = self._networks[0]
+        return net.numbers(net.activation(net.vector(net(columns))))
+
+    def parts(self, at: SurfacePoint, active: Any = True) -> tuple[Any, Any, Any]:
+        """What passes unscattered, alpha_1 and alpha, per channel."""
+        import drjit as dr
+        import mitsuba as mi
+
+        columns = side_features(self.frame, Side(at, first_event(self.subject, at, active)))
+        media = self.subject.media
+        x, n = self._networks[1](self.units(columns)), len(media)
+        live = mi.Spectrum([number(float(m.sigma_s) > 0) for m in media])
+        enters, most = (mi.Spectrum(v) for v in entering(columns, number(self.subject.eta), n))
+        once, more = (live * most / (1 + dr.exp(-mi.Spectrum(part))) for part in (x[:n], x[n:]))
+        return tuple(dr.select(active, part, 0) for part in (enters - most, once, more))
+
+    @property
+    def evened(self) -> tuple[Any, Any]:
+        """Channels in which orders below two, and the others, may stand for even light."""
+        import mitsuba as mi
+
+        return tuple(mi.Spectrum([number(float(v)) for v in row]) for row in self.trusted)
+
+    def __call__(self, at: SurfacePoint, active: Any = True) -> tuple[Any, Any]:
+        """Orders zero and one, and alpha, per channel; 0 where they may not stand for even light."""
+        unscattered, once, more = self.parts(at, active)
+        few, others = self.evened
+        return few * (unscattered + once), others * more
+
+
+BOUND = 6.0  # of f: where walks leave but no proposal comes, nothing else would hold it
+
+
+@dataclass(frozen=True, eq=False)
+class FullGeometry:
+    """S = S_start exp f, f = 6 tanh((g + h_o + h_i)/6), g a perceptron of the features of exit, entry and pair, and of
+    what alpha's makes of exit and entry, h a quadratic function of those of one end.
+
+    Orders two and more; positive; reciprocal as far as it has been learnt.
+
+    Args:
+        subject: the object.
+        frame: of the features.
+        start: S_start.
+        weights: W_k (outputs, inputs) and b_k of the layers, Q of h.
+        alpha: ∫ S mu_i of an exit, learnt beside S.
+    """
+
+    subject: Subject
+    frame: Frame
+    start: Start
+    weights: Mapping[str, np.ndarray]
+    alpha: Reflectance
+    orders = "multiple"
+
+    @functools.cached_property
+    def _network(self) -> Perceptron:
+        """The first layer in two parts, exit and the rest."""
+        split = (self.weights["W_0"].shape[1] - n_pair(len(self.subject.media))) // 2
+        return Perceptron.named(self.weights, "W", "b", splits=[split], looped=True)
+
+    @functools.cached_property
+    def _h(self) -> Quadratic:
+        return Quadratic(self.weights["Q"], n_side(len(self.subject.media), self.subject.n_local))
+
+    def prepare(self, at: SurfacePoint, active: Any = True) -> PreparedExit:
+        """The exit's side, for as many entries as are asked for."""
+        side, net = self.start.end(at, active), self._network
+        features, h = self._end(side)
+        return PreparedExit(side, net.numbers(net.first(0, features, biased=True)), h)
+
+    def S(self, exit: PreparedExit, at: SurfacePoint, active: Any = True) -> Any:
+        """S(x_i, w_i; x_o, w_o) per channel, 1/((scene unit)² sr); 0 below the horizons.
+
+        Args:
+            exit: from `prepare`.
+            at: entry, with w_i.
+            active: mask of lanes.
+        """
+        import drjit as dr
+        import mitsuba as mi
+
+        entry, net = self.start.end(at, active), self._network
+        features, h = self._end(entry)
+        features += pair_features(self.frame, exit.side, entry)
+        f = mi.Spectrum(net.rest(net.activation(net.first(1, features) + net.vector(exit.hidden))))
+        f += mi.Spectrum(exit.h) + mi.Spectrum(h)
+        S_0 = self.start(exit.side, entry, active)
+        return dr.select(active, S_0 * dr.exp(BOUND * dr.tanh(f / BOUND)), 0)
+
+    def _end(self, side: Side) -> tuple[list[Any], list[Any]]:
+        """Features of one end and what even light makes of them; h."""
+        columns = side_features(self.frame, side)
+        return [*columns, *self.alpha.units(columns)], self._h(columns)

@@ -1,0 +1,407 @@
+"""What the network of one object is told about an exit, an entry and the pair of them.
+
+One definition in Dr.Jit, for training data and for rendering. Lengths and positions are over half the diagonal of the
+object, in its own frame; logarithms of lengths are in mean free paths of the mean over channels.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from scipy.ndimage import gaussian_filter
+
+from full_geometry.object.first_event import FirstEvent, first_event
+from full_geometry.object.subject import Subject, SurfacePoint
+from halfspace_sss.arrays import library
+from halfspace_sss.interface.model import BSSRDF
+from halfspace_sss.neural.perceptron import Perceptron
+from halfspace_sss.physics import fresnel
+from halfspace_sss.rendering.transport.plane import number
+from halfspace_sss.tracing.walk import generator, pass_seed
+
+__all__ = [
+    "EVENT",
+    "FIELDS",
+    "POINT",
+    "Frame",
+    "PreparedExit",
+    "Quadratic",
+    "Side",
+    "Start",
+    "Surroundings",
+    "Terms",
+    "entering",
+    "insides",
+    "n_pair",
+    "n_side",
+    "pair_features",
+    "reverse",
+    "side_features",
+    "surroundings",
+]
+
+
+# ----------------------------------------------------------------------------------------------------
+# How much of an object surrounds a point: what the network of one object is told of fins, rims and folds.
+# For some widths s the share of a Gaussian ball that lies inside of the object, and for one of them its slope,
+#
+#     O_s(p) = ∫ inside(q) exp(-|p - q|² / 2s²) / (2 pi s²)^(3/2) dq,    s grad O_s(p),
+#
+# from a grid in the frame of the object, interpolated linearly. Widths say nearly the same, and what sets them apart,
+# how the surface bends, is small: over random points of the surface, and apart from these over their first events, the
+# fields have mean 0, spread 1 and no correlation, turned by C^(-1/2) of their covariance C.
+
+POINT, EVENT = 0, 1  # kinds of places: of the surface, and of first events
+
+WIDTHS, SLOPED = (0.5, 1.0, 2.0, 4.0), 1  # mean free paths, or cells where those are larger; which has a slope
+FIELDS = len(WIDTHS) + 3
+CELL, MOST = 0.3, 96  # mean free paths; cells along the longest side
+MARGIN = 0.02  # of that side, around the object
+TRUNCATED = 3.0  # standard deviations
+LEAST_SPREAD = 5e-3
+POINTS, SEED = 8192, 11  # of the surface, that the covariance is taken over
+RAYS = ((0.013, 0.027, 1.0), (1.0, 0.021, -0.017), (-0.015, -1.0, 0.031))  # along no axis: faces often are
+
+
+@dataclass(frozen=True, eq=False)
+class Surroundings:
+    """The fields of one object.
+
+    Args:
+        textures: their values, turned for points and for first events.
+        low, scale: of a position in the frame, that turn it into one of a texture: (q - low) scale.
+        turns: (2, fields, fields + 1), C^(-1/2) and -C^(-1/2) of the mean for points and for first events.
+    """
+
+    textures: tuple[Any, Any]
+    low: Any
+    scale: Any
+    turns: np.ndarray
+
+    def __call__(self, q: Any, kind: int) -> list[Any]:
+        """Of a position in the frame, a `POINT` or an `EVENT`."""
+        import mitsuba as mi
+
+        return self.textures[kind].eval((mi.Point3f(q) - self.low) * self.scale)
+
+
+def surroundings(subject: Subject, frame: Any, turns: np.ndarray | None = None) -> Surroundings:
+    """The fields of an object.
+
+    Args:
+        subject: the object.
+        frame: a `Frame` of its features.
+        turns: those of training; by default made from random points.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    low, high = _bounds(subject, frame)
+    longest = float((high - low).max())
+    low, high = low - MARGIN * longest, high + MARGIN * longest
+    path = 1 / float(np.array(frame.sigma_t * frame.radius).ravel()[0])
+    cell = max(CELL * path, longest / MOST)
+    cells = np.maximum(np.ceil((high - low) / cell).astype(int), 2)
+    values = _fields(insides(subject, frame, low, cell, cells), max(path / cell, 1.0))
+    places = mi.Point3f(*map(number, low)), mi.Vector3f(*map(number, 1 / (cell * cells)))
+
+    def turned(turns: np.ndarray) -> Surroundings:
+        every = (values @ turn[:, :-1].T + turn[:, -1] for turn in turns.astype(np.float32))
+        textures = (mi.Texture3f(mi.TensorXf(v), use_accel=False, wrap_mode=dr.WrapMode.Clamp) for v in every)
+        return Surroundings(tuple(textures), *places, turns)
+
+    straight = np.eye(FIELDS, FIELDS + 1, dtype=np.float32)
+    return turned(_turns(subject, frame, turned(np.stack([straight] * 2))) if turns is None else turns)
+
+
+def _turns(subject: Subject, frame: Any, fields: Surroundings) -> np.ndarray:
+    """C^(-1/2) of the fields over random points and over their first events, with what takes their means off."""
+    import mitsuba as mi
+
+    at = subject.random_points(generator(mi, POINTS, pass_seed(SEED)))
+    found = []
+    for kind, place in ((POINT, at.p), (EVENT, first_event(subject, at).y)):
+        values = np.stack([v.numpy() for v in fields(frame.position(place), kind)]).astype(float)
+        spread, axes = np.linalg.eigh(np.cov(values))
+        turn = (axes / np.sqrt(np.maximum(spread, 0) + LEAST_SPREAD**2)) @ axes.T
+        found.append(np.column_stack([turn, -turn @ values.mean(axis=1)]))
+    return np.array(found, dtype=np.float32)
+
+
+def insides(subject: Subject, frame: Any, low: np.ndarray, cell: float, cells: np.ndarray) -> np.ndarray:
+    """1 where the middle of a cell lies inside, (z, y, x): where most of three rays meet the surface from within."""
+    import drjit as dr
+    import mitsuba as mi
+
+    nx, ny, _ = (int(n) for n in cells)
+    k = dr.arange(mi.UInt32, int(np.prod(cells)))
+    index = (k % nx, (k // nx) % ny, k // (nx * ny))
+    q = [number(a) + number(cell) * (mi.Float(i) + 0.5) for a, i in zip(low, index)]
+    votes = mi.UInt32(0)
+    for ray in RAYS:
+        p, d = frame.back(mi.Vector3f(*q), dr.normalize(mi.Vector3f(*ray)))
+        si = subject.found.scene.ray_intersect(mi.Ray3f(p, d))
+        votes += dr.select(si.is_valid() & (dr.dot(d, si.n) * number(subject.found.sign) > 0), mi.UInt32(1), 0)
+    return (votes >= 2).numpy().astype(np.float32).reshape(cells[::-1])
+
+
+def _fields(inside: np.ndarray, path: float) -> np.ndarray:
+    """All fields, (z, y, x, fields), for widths over `path` cells."""
+    balls = [gaussian_filter(inside, s * path, mode="constant", truncate=TRUNCATED) for s in WIDTHS]
+    slope = np.gradient(balls[SLOPED])[::-1]
+    return np.stack([*balls, *(WIDTHS[SLOPED] * path * part for part in slope)], axis=-1)
+
+
+def _bounds(subject: Subject, frame: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Of the object in its frame."""
+    import mitsuba as mi
+
+    parameters = mi.traverse(subject.found.shape)
+    if "vertex_positions" in parameters:
+        corners = mi.Point3f(np.array(parameters["vertex_positions"]).reshape(-1, 3).T)
+    else:
+        box = subject.found.shape.bbox()
+        low, high = (np.array(v, dtype=np.float32).ravel() for v in (box.min, box.max))
+        corners = mi.Point3f(np.where(np.indices((2, 2, 2)).reshape(3, 8) > 0, high[:, None], low[:, None]))
+    q = np.array(frame.position(corners)).reshape(3, -1).astype(float)
+    return q.min(axis=1), q.max(axis=1)
+
+
+OCTAVES = 2
+PAIR = 21  # numbers of a pair before those of each channel
+LEAST_P, LEAST_LENGTH = 1e-3, 1e-2
+POSITION, DIRECTION = 3 * (1 + 2 * OCTAVES), 3  # numbers of a point with its octaves, and of a direction
+MU = 2 * (POSITION + DIRECTION)  # place among the features of a side, of two points and two directions, of mu,
+P_0 = MU + 2  # after mu and the log of a length, of the first channel of P
+
+
+class Side(NamedTuple):
+    """Exit or entry: its point and its first event."""
+
+    at: SurfacePoint
+    event: FirstEvent
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """The object's own frame and scales.
+
+    Args:
+        centre: of the object, scene units.
+        radius: half the diagonal of its bounding box, scene units.
+        sigma_t: 1/(scene unit), geometric mean over channels.
+        each: 1/(scene unit), sigma_t of each channel.
+        turn: 3 x 3 rows that turn world directions into the frame; None where it is the identity.
+        around: how much of the object surrounds a position in the frame.
+    """
+
+    centre: Any
+    radius: Any
+    sigma_t: Any
+    each: tuple[Any, ...]
+    turn: Any = None
+    around: Surroundings | None = None
+
+    def position(self, p: Any) -> Any:
+        """In the frame, of order one."""
+        return self.direction(p - self.centre) / self.radius
+
+    def direction(self, w: Any) -> Any:
+        """In the frame."""
+        import drjit as dr
+        import mitsuba as mi
+
+        return mi.Vector3f(w) if self.turn is None else mi.Vector3f(*(dr.dot(row, w) for row in self.turn))
+
+    def back(self, q: Any, d: Any) -> tuple[Any, Any]:
+        """A position and a direction of the frame in the world."""
+        import mitsuba as mi
+
+        q, d = (v if self.turn is None else sum(row * x for row, x in zip(self.turn, v)) for v in (q, d))
+        return mi.Point3f(self.centre + mi.Vector3f(q) * self.radius), mi.Vector3f(d)
+
+
+def n_side(channels: int, local: int = 0) -> int:
+    """Number of features of a side, of which twice `local` are what varies where light enters and at y."""
+    return P_0 + channels + 2 * local + 2 * FIELDS
+
+
+def n_pair(channels: int) -> int:
+    """Number of features of a pair beside those of its sides."""
+    return PAIR + channels
+
+
+class Terms(NamedTuple):
+    """Products of two of (1, features of a side): all features, and those of two that are no octaves.
+
+    Attributes:
+        heads: places of the first factors among (1, features), no octaves.
+        rows, cols: of each product the first factor among the heads, and the second among (1, features).
+    """
+
+    heads: np.ndarray
+    rows: np.ndarray
+    cols: np.ndarray
+
+    @classmethod
+    def of(cls, n: int) -> Terms:
+        """For n features of a side."""
+        octaves = np.r_[3:POSITION, POSITION + 3 : 2 * POSITION]
+        heads = np.concatenate([[0], 1 + np.setdiff1d(np.arange(n), octaves)])
+        rows, cols = np.triu_indices(len(heads) - 1)
+        rows, cols = np.append(np.zeros(n + 1, int), 1 + rows), np.append(np.arange(n + 1), heads[1:][cols])
+        return cls(heads, rows, cols)
+
+    def matrix(self, numbers: np.ndarray) -> np.ndarray:
+        """Numbers (..., products) as matrices (..., heads, 1 + features)."""
+        found = np.zeros((*numbers.shape[:-1], len(self.heads), int(self.cols.max()) + 1), numbers.dtype)
+        found[..., self.rows, self.cols] = numbers
+        return found
+
+
+class Quadratic:
+    """h = l . x + x_h . Q x_h of an end, x = (1, features), x_h those of them that are no octaves.
+
+    Args:
+        numbers: (outputs, products) of `Terms`.
+        n: features of a side.
+    """
+
+    def __init__(self, numbers: np.ndarray, n: int) -> None:
+        terms = Terms.of(n)
+        matrix, self.heads = terms.matrix(numbers.astype(np.float32)), terms.heads[1:]
+        line, square = matrix[:, 0], matrix[:, 1:, self.heads].reshape(-1, len(self.heads))
+        self._line = Perceptron([line[:, 1:]], [line[:, 0]], looped=True)
+        self._square = Perceptron([square], [np.zeros(len(square), np.float32)], looped=True)
+
+    def __call__(self, columns: list[Any]) -> list[Any]:
+        """Of the features of a side."""
+        heads = [columns[k - 1] for k in self.heads]
+        y = self._square(heads)
+        rows = (y[k : k + len(heads)] for k in range(0, len(y), len(heads)))
+        return [sum((a * b for a, b in zip(heads, row)), first) for row, first in zip(rows, self._line(columns))]
+
+
+def _octaves(x: Any) -> list[Any]:
+    import drjit as dr
+
+    found = list(x)
+    for k in range(OCTAVES):
+        for component in x:
+            found += dr.sincos(math.pi * 2**k * component)
+    return found
+
+
+def side_features(frame: Frame, side: Side) -> list[Any]:
+    """Position and y with two octaves of sine and cosine, normal, w, mu, log of the way to y, log P, what varies, and
+    how much of the object surrounds the position and y.
+    """
+    import drjit as dr
+
+    at, event = side.at, side.event
+    n, w = frame.direction(at.n_out), frame.direction(at.w)
+    p, y = frame.position(at.p), frame.position(event.y)
+    return [
+        *_octaves(p), *_octaves(y), *n, *w, dr.dot(n, w),
+        _log(frame.sigma_t, event.length), *(0.5 * dr.log(P + LEAST_P) for P in event.P), *event.local,
+        *frame.around(p, POINT), *frame.around(y, EVENT),
+    ]  # fmt: skip
+
+
+def entering(columns: Any, eta: Any, channels: int) -> tuple[list[Any], list[Any]]:
+    """F_t(mu), and F_t(mu) P, per channel: the shares of light along w that enter, and are scattered or absorbed.
+
+    Args:
+        columns: features of a side, of NumPy, torch or Dr.Jit.
+        eta: relative index.
+        channels: of the medium.
+    """
+    lib, mu = library(columns[MU]), columns[MU]
+    F_t = fresnel.F_t(lib.maximum(mu, 0 * mu), eta)
+    P = [lib.exp(2 * columns[P_0 + c]) - LEAST_P for c in range(channels)]
+    return [F_t] * channels, [F_t * lib.maximum(p, 0 * mu) for p in P]
+
+
+def pair_features(frame: Frame, exit: Side, entry: Side) -> list[Any]:
+    """x_i - x_o as direction and length, log r, log |y_i - y_o|, dot products of directions and normals, and what the
+    surface at one end says of y at the other: its depth below the plane there, its distance from the point, and the
+    cosine between the way to y and the way on to the other y; log of the distance between the two y of each channel.
+    """
+    import drjit as dr
+
+    o, i = exit.at, entry.at
+    d = i.p - o.p
+    r = dr.norm(d)
+    d = d / dr.maximum(r, 1e-6 * frame.radius)
+    between = entry.event.y - exit.event.y
+    gap = dr.norm(between)
+    between = between / dr.maximum(gap, 1e-6 * frame.radius)
+    return [
+        *frame.direction(d), r / frame.radius, _log(frame.sigma_t, r), _log(frame.sigma_t, gap), gap / frame.radius,
+        dr.dot(o.n_out, i.n_out), dr.dot(o.w, i.w), dr.dot(o.n_out, d), dr.dot(i.n_out, d), dr.dot(o.w, d),
+        dr.dot(i.w, d), dr.dot(o.n_out, i.w), dr.dot(i.n_out, o.w),
+        _depth(frame, i, exit.event.y), _depth(frame, o, entry.event.y),
+        _log(frame.sigma_t, dr.norm(exit.event.y - i.p)), _log(frame.sigma_t, dr.norm(entry.event.y - o.p)),
+        _cosine(frame, exit, between), _cosine(frame, entry, -between),
+        *(_log(t, dr.norm(a - b)) for t, a, b in zip(frame.each, exit.event.ys, entry.event.ys)),
+    ]  # fmt: skip
+
+
+def _log(sigma_t: Any, length: Any) -> Any:
+    import drjit as dr
+
+    return 0.5 * dr.log(length * sigma_t + LEAST_LENGTH)
+
+
+def _depth(frame: Frame, at: SurfacePoint, y: Any) -> Any:
+    """t/(1 + |t|) of the depth t below the plane of a point, in mean free paths."""
+    import drjit as dr
+
+    t = dr.dot(at.n_out, at.p - y) * frame.sigma_t
+    return t / (1 + dr.abs(t))
+
+
+def _cosine(frame: Frame, side: Side, onward: Any) -> Any:
+    """Between the way from a point to its y and a direction."""
+    import drjit as dr
+
+    way = side.event.y - side.at.p
+    return dr.dot(way, onward) / dr.maximum(dr.norm(way), 1e-6 * frame.radius)
+
+
+def reverse(n: int, channels: int) -> tuple[np.ndarray, np.ndarray]:
+    """Order and signs that turn the features of (exit, entry, pair), n of each side, into those of the way back."""
+    pair = np.arange(n_pair(channels))
+    pair[:PAIR] = np.array([0, 1, 2, 3, 4, 5, 6, 7, 8, 10, 9, 12, 11, 14, 13, 16, 15, 18, 17, 20, 19])
+    signs = np.ones(2 * n + n_pair(channels), dtype=np.float32)
+    signs[2 * n + np.array([0, 1, 2, 9, 10, 11, 12])] = -1
+    return np.concatenate([np.arange(n, 2 * n), np.arange(n), 2 * n + pair]), signs
+
+
+class Start(Protocol):
+    """What the network of one object begins with and multiplies: `HalfSpace`, or the network of all shapes.
+
+    Attributes:
+        models: half-space model of each channel, whose radial densities probes follow.
+    """
+
+    @property
+    def models(self) -> Sequence[BSSRDF]: ...
+
+    def end(self, at: SurfacePoint, active: Any = True) -> Side:
+        """What belongs to one end alone, its point and its first event among it."""
+
+    def __call__(self, exit: Side, entry: Side, active: Any = True) -> Any:
+        """S of two ends per channel, 1/((scene unit)² sr); 0 below the horizons."""
+
+
+class PreparedExit(NamedTuple):
+    """What is done once for all entries of an exit: its end of the start, its share of the first layer, and h."""
+
+    side: Side
+    hidden: list[Any]
+    h: Any = ()

@@ -1,1 +1,0 @@
-"""Rivals at equal time: ways of drawing entries, and models of one object."""

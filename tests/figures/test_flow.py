@@ -1,0 +1,241 @@
+"""The flow inside patches: its chart, round trips, densities, and that they are those of zuko.
+
+Chi-square tests fail at 1e-3, with fixed seeds.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import stats
+
+mi = pytest.importorskip("mitsuba")
+dr = pytest.importorskip("drjit")
+torch = pytest.importorskip("torch")
+pytest.importorskip("zuko")
+
+from waxen import random_layers, random_patches, wax_bunny  # noqa: E402
+
+from figures.studies.flow import (  # noqa: E402  # noqa: E402
+    ConditionalFlow,  # noqa: E402
+    FlowProposals,
+    FlowSampler,
+    add_flow,
+    flow_of,
+)
+from figures.studies.flow_chart import (  # noqa: E402
+    N_CONTEXT,
+    Chart,  # noqa: E402
+    direction_square,
+    from_square,
+)
+from figures.studies.flow_training import FlowNetwork  # noqa: E402
+from full_geometry.models.storing import CENTRES, CHECKSUMS, ENDS, EVEN, TURNS, load, save  # noqa: E402
+from full_geometry.object.features import PreparedExit, Side, Terms, n_pair, n_side  # noqa: E402
+from full_geometry.object.first_event import first_event  # noqa: E402
+from full_geometry.object.identity import identify  # noqa: E402
+from full_geometry.object.patches import (  # noqa: E402
+    LearntProposals,  # noqa: E402
+    PatchTable,  # noqa: E402
+    cluster,
+    mesh_faces,
+)
+from full_geometry.object.subject import SurfacePoint  # noqa: E402
+from halfspace_sss.rendering.transport.plane import Exit  # noqa: E402
+from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
+
+N_PATCHES = 24
+
+
+@pytest.fixture(autouse=True)
+def variant() -> None:
+    mi.set_variant("llvm_ad_rgb")
+
+
+@pytest.fixture(scope="module")
+def sampler() -> FlowSampler:
+    """With random weights: densities hold for any."""
+    subject = wax_bunny()
+    points = random_patches(subject, N_PATCHES, np.random.default_rng(2))
+    flow = ConditionalFlow(2, shaken(2).arrays())
+    return FlowSampler(points, Chart(subject, points.frame, points.patches), flow)
+
+
+def shaken(n: int, strength: float = 2.0) -> FlowNetwork:
+    """A flow far from the uniform one that it starts as."""
+    net, numbers = FlowNetwork(n, N_CONTEXT, (16, 16), 1), torch.Generator().manual_seed(3)
+    with torch.no_grad():
+        layer = net.transform.hyper[-1]
+        layer.weight.copy_(strength * torch.randn(layer.weight.shape, generator=numbers))
+        layer.bias.copy_(torch.randn(layer.bias.shape, generator=numbers))
+    return net
+
+
+def uniform(n: int, d: int, seed: int) -> np.ndarray:
+    return np.random.default_rng(seed).random((d, n)).astype(np.float32)
+
+
+def told(n: int, seed: int = 0, same: bool = False) -> np.ndarray:
+    rows = np.random.default_rng(seed).standard_normal((N_CONTEXT, 1 if same else n))
+    return np.broadcast_to(0.5 * rows, (N_CONTEXT, n)).astype(np.float32)
+
+
+def floats(rows: np.ndarray) -> list:
+    return [mi.Float(np.ascontiguousarray(row)) for row in rows]
+
+
+@pytest.mark.parametrize("d", [2, 4])
+def test_densities_are_those_of_zuko(d: int) -> None:
+    net, x, c = shaken(d), uniform(4096, d, 5), told(4096)
+    with torch.no_grad():
+        wanted = net.log_density(torch.from_numpy(c.T.copy()), torch.from_numpy(x.T.copy())).exp().numpy()
+    found = np.array(ConditionalFlow(d, net.arrays()).density(floats(c), floats(x)))
+    assert np.allclose(found, wanted, rtol=2e-3)
+    assert wanted.max() > 3 and wanted.min() < 0.3  # far from uniform
+
+
+@pytest.mark.parametrize("d", [2, 4])
+def test_a_sample_comes_back_to_its_uniform_numbers(d: int) -> None:
+    flow, c, u = ConditionalFlow(d, shaken(d, 6.0).arrays()), floats(told(2**15)), uniform(2**15, d, 7)
+    x, density = flow.sample(c, floats(u))
+    assert np.abs(np.stack(flow.uniforms(c, x)) - u).max() < 1e-4
+    ratio = np.array(flow.density(c, x)) / np.array(density)
+    assert np.quantile(np.abs(ratio - 1), 0.999) < 1e-2
+
+
+def test_samples_of_a_flow_follow_its_density() -> None:
+    flow, n, m = ConditionalFlow(2, shaken(2).arrays()), 2**17, 16
+    x, _ = flow.sample(floats(told(n, same=True)), floats(uniform(n, 2, 8)))
+    counts, _, _ = np.histogram2d(*(np.array(v) for v in x), bins=m, range=[[0, 1], [0, 1]])
+    fine = (np.indices((8 * m, 8 * m)).reshape(2, -1) + 0.5) / (8 * m)
+    density = np.array(flow.density(floats(told(fine.shape[1], same=True)), floats(fine.astype(np.float32))))
+    expected = n * density.reshape(m, 8, m, 8).mean(axis=(1, 3)) / m**2
+    assert abs(density.mean() - 1) < 1e-2
+    chi2 = np.sum((counts - expected) ** 2 / expected)
+    assert stats.chi2.sf(chi2 * expected.sum() / n, m * m - 1) > 1e-3
+
+
+def test_no_slope_leaves_its_bounds() -> None:
+    density = np.array(
+        ConditionalFlow(2, shaken(2, 1e4).arrays()).density(floats(told(4096)), floats(uniform(4096, 2, 9)))
+    )
+    assert np.isfinite(density).all() and density.min() > 0
+
+
+def test_coordinates_of_a_patch_come_back(sampler: FlowSampler) -> None:
+    n = 2**15
+    patch = dr.arange(mi.UInt32, n) % N_PATCHES
+    u = uniform(n, 2, 10)
+    at = sampler.chart.point(patch, tuple(floats(u)))
+    assert np.array_equal(np.array(sampler.patches.patches.row("patch", at.prim_index)), np.array(patch))
+    back = np.stack([np.array(v) for v in sampler.chart.coordinates(at.prim_index, at.p)])
+    assert np.quantile(np.abs(back - u).max(axis=0), 0.999) < 2e-3
+
+
+def test_uniform_coordinates_are_uniform_over_a_patch(sampler: FlowSampler) -> None:
+    n, k = 2**17, 5
+    at = sampler.chart.point(mi.UInt32(k), tuple(floats(uniform(n, 2, 11))))
+    faces = np.flatnonzero(sampler.patches.patches.of_face == k)
+    areas = mesh_faces(sampler.chart.subject)[2][faces]
+    counts = np.bincount(np.array(at.prim_index), minlength=len(sampler.patches.patches.of_face))
+    assert counts.sum() == counts[faces].sum()
+    expected = n * areas / areas.sum()
+    assert stats.chi2.sf(np.sum((counts[faces] - expected) ** 2 / expected), len(faces) - 1) > 1e-3
+
+
+def draws(sampler: FlowSampler, n: int) -> tuple:
+    subject = sampler.chart.subject
+    at = subject.random_points(generator(mi, 1, pass_seed(4))).gather(dr.zeros(mi.UInt32, n))
+    side = Side(at, first_event(subject, at))
+    weights = sampler.patches.prepare(side)
+    u = floats(uniform(n, 3, 12))
+    return side, weights, *sampler.sample(side, weights, u[0], (u[1], u[2]))
+
+
+def test_the_density_of_an_entry_can_be_asked_for(sampler: FlowSampler) -> None:
+    side, weights, at, density = draws(sampler, 2**14)
+    again = np.array(sampler.density(side, weights, at.prim_index, at.p))
+    assert np.quantile(np.abs(again / np.array(density) - 1), 0.99) < 2e-2
+
+
+REGIONS = {
+    "everywhere": lambda p, n: np.ones(p.shape[1]),
+    "above": lambda p, n: p[1] > 5.0,
+    "to one side": lambda p, n: n[0] > 0,
+}
+
+
+@pytest.mark.parametrize("region", REGIONS)
+def test_entries_weighted_by_their_density_cover_the_area(sampler: FlowSampler, region: str) -> None:
+    subject, n = sampler.chart.subject, 2**18
+    _, _, at, density = draws(sampler, n)
+    flat = subject.points.sample(floats(uniform(n, 1, 15))[0], mi.Point2f(uniform(n, 2, 16)), True)
+    weight = REGIONS[region](np.array(at.p), np.array(at.n)) / np.array(density, dtype=float)
+    wanted = subject.found.area * REGIONS[region](np.array(flat.p), np.array(flat.n))
+    assert abs(weight.mean() - wanted.mean()) < 4 * np.hypot(weight.std(), wanted.std()) / np.sqrt(n) + 1e-6
+
+
+def test_directions_come_back_from_their_square() -> None:
+    n = 4096
+    rng = generator(mi, n, pass_seed(13))
+    normal = mi.warp.square_to_uniform_sphere(mi.Point2f(rng.next_float32(), rng.next_float32()))
+    towards = mi.warp.square_to_uniform_sphere(mi.Point2f(rng.next_float32(), rng.next_float32()))
+    u = floats(uniform(n, 2, 14))
+    w = from_square(normal, towards, tuple(u))
+    back = direction_square(normal, towards, w)
+    assert np.quantile(np.abs(np.stack([np.array(v) for v in back]) - np.stack([np.array(v) for v in u])), 0.995) < 1e-2
+    assert np.all(np.array(dr.dot(w, normal)) > -1e-6)
+
+
+class Numbers:
+    """Uniform numbers as Mitsuba's samplers name them."""
+
+    def __init__(self, n: int, seed: int) -> None:
+        self.rng = generator(mi, n, pass_seed(seed))
+
+    def next_1d(self):
+        return self.rng.next_float32()
+
+    def next_2d(self):
+        return mi.Point2f(self.rng.next_float32(), self.rng.next_float32())
+
+
+def test_proposals_of_the_flow_and_of_patches_give_the_same_estimate(sampler: FlowSampler) -> None:
+    subject, n = sampler.chart.subject, 2**18
+    at = subject.points.sample(floats(uniform(n, 1, 20))[0], mi.Point2f(uniform(n, 2, 21)), True)
+    sign = subject.found.sign
+    n_out = mi.Normal3f(at.n_shading * sign)
+    exit = Side(SurfacePoint(at.p, mi.Normal3f(at.n * sign), n_out, mi.Vector3f(n_out)), None)
+    exit = exit._replace(event=first_event(subject, exit.at))
+    out, on, table = Exit(at.p, n_out, mi.Vector3f(n_out), mi.Float(sign)), mi.Bool(True), PatchTable(sampler.patches)
+    means, errors = [], []
+    for k, proposals in enumerate(
+        (FlowProposals(sampler, sign), FlowProposals(sampler, sign, table),
+         LearntProposals(sampler.patches, None, 1.0, sign, table))
+    ):  # fmt: skip
+        where = proposals.prepare(out, PreparedExit(exit, []), on)
+        entry = proposals.sample(out, at.prim_index, where, Numbers(n, 22 + k), on)
+        near = dr.exp(-0.05 * dr.squared_norm(entry.p - at.p))
+        values = np.array(near * entry.weight, dtype=float)
+        means.append(values.mean())
+        errors.append(values.std() / np.sqrt(n))
+    for a, b in ((0, 1), (0, 2), (1, 2)):
+        assert abs(means[a] - means[b]) < 4 * np.hypot(errors[a], errors[b])
+    assert max(errors) < 0.03 * means[0]
+
+
+def test_weights_with_a_flow_are_drawn_from_by_it(sampler: FlowSampler, tmp_path: Path) -> None:
+    subject, frame = sampler.chart.subject, sampler.frame
+    rng, n = np.random.default_rng(6), 2 * (n_side(3) + 5) + n_pair(3)
+    arrays = {"W_0": rng.standard_normal((3, n)), "b_0": np.zeros(3), CENTRES: cluster(subject, frame, N_PATCHES)}
+    arrays |= {EVEN: np.ones((2, 3)), **random_layers(rng, "A", "a", [n_side(3), 5, 6])}
+    arrays = {name: value.astype(np.float16) for name, value in {**arrays, **sampler.patches.weights}.items()}
+    arrays |= {TURNS: frame.around.turns, ENDS: np.zeros((3, len(Terms.of(n_side(3)).rows)))}
+    path = save(tmp_path, identify(subject), arrays, {"recipe": {"start": "better_dipole"}, CHECKSUMS: []})
+    assert not load(path, subject).others
+    add_flow(path, sampler)
+    found = flow_of(load(path, subject))
+    told_, x = floats(told(512)), floats(uniform(512, 2, 23))
+    assert np.allclose(np.array(found.flow.density(told_, x)), np.array(sampler.flow.density(told_, x)), rtol=5e-2)

@@ -1,0 +1,61 @@
+"""Pictures of the worst held-out shapes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+mi = pytest.importorskip("mitsuba")
+pytest.importorskip("igl")
+
+from figures.studies import shape_pictures as pictures  # noqa: E402
+from figures.studies.shape_errors import Row  # noqa: E402
+from halfspace_sss import rendering  # noqa: E402
+from halfspace_sss.cli import app as cli  # noqa: E402
+
+
+@pytest.fixture(autouse=True)
+def variant() -> None:
+    mi.set_variant("llvm_ad_mono")
+    rendering.register()
+
+
+def row(error: float) -> Row:
+    errors = {"neural_shape": {"constant": (error, 0.0)}, "better_dipole": {"constant": (2 * error, 0.0)}}
+    return Row("", 1.0, 0.5, 0.0, 1.3, 1.0, errors)
+
+
+def test_the_worst_shapes_come_first_each_with_walks_network_and_half_space(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+
+    def picture(case: object, model: str) -> np.ndarray:
+        asked.append((case.name, model))
+        return np.full((4, 4), len(asked) / 10)
+
+    monkeypatch.setattr(pictures, "picture", picture)
+    monkeypatch.setattr(pictures, "WORST", 2)
+    found = pictures.worst_pictures([row(0.1), row(0.5), row(0.3)])
+    models = ("path_traced", "neural_shape", "better_dipole")
+    assert asked == [(name, model) for name in ("leaves", "hourglasses") for model in models]
+    assert found.shape == (2 * (4 + pictures.GAP), 3 * (4 + pictures.GAP)) and found.max() == 1
+
+
+def test_a_picture_shows_the_object_on_black(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pictures, "SPP", 16)
+    (case,) = [case for k, case in enumerate(pictures.held_out(3)) if k == 2]
+    image = pictures.picture(case, "better_dipole", 24)
+    assert image.shape == (24, 24) and 0.05 < (image > 0).mean() < 0.8
+    assert (image[[0, -1]] == 0).all() and (image[:, [0, -1]] == 0).all()
+
+
+@pytest.mark.parametrize(
+    ("place", "message"), [("worst.jpg", "pictures must end in .png"), ("", "pictures must be a file")]
+)
+def test_a_place_for_pictures_is_checked_before_anything_is_measured(tmp_path: Path, place: str, message: str) -> None:
+    words = ["shapes", "--out", str(tmp_path / "x.md"), "--pictures", str(tmp_path / place)]
+    result = CliRunner().invoke(cli.app, words)
+    assert result.exit_code == 2 and message in " ".join(result.stderr.split())
+    assert list(tmp_path.iterdir()) == []
