@@ -1,4 +1,4 @@
-"""Training data of one object: walks with their throughput, and proposals with S of the base model over their density."""
+"""Training data of one object: walks with their throughput, and proposals with S_0 over their density."""
 
 from __future__ import annotations
 

@@ -144,7 +144,7 @@ def test_another_object_beside_it_keeps_its_own_model(trained: Trained) -> None:
     ball = {"type": "sphere", "center": [5, 0, 0], "radius": 1.0, "bsdf": {**SURFACE, "model": "better_dipole"}}
     loaded = load_scene(scene({"bunny": bunny(bsdf=SURFACE), "ball": ball}, "mixed"))
     kinds = {b.found.shape.id(): type(b.transport).__name__ for b in loaded.integrator().prepare(loaded)}
-    assert kinds["bunny"] == "LearntTransport" and kinds["ball"] != "LearntTransport"
+    assert kinds["bunny"] == "ObjectTransport" and kinds["ball"] != "ObjectTransport"
 
 
 def test_the_mirrored_object_is_another_one_and_can_be_learnt(trained: Trained, folder: Path) -> None:

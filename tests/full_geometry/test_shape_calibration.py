@@ -14,7 +14,9 @@ pytest.importorskip("igl")
 from full_geometry.learning.model_errors import errors_of  # noqa: E402
 from full_geometry.models.descriptors import Mixed, mixed  # noqa: E402
 from full_geometry.models.neural_shape import (  # noqa: E402
-    NeuralShape,  # noqa: E402
+    NeuralShape,
+    calibrated,
+    calibration_weight,
     load,
     shipped_weights,
     transport,
