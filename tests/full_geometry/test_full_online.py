@@ -33,7 +33,7 @@ from halfspace_sss.neural import trained as known_weights  # noqa: E402
 from halfspace_sss.neural.store import load_weights  # noqa: E402
 from halfspace_sss.rendering.scenes import camera_walks, online, reference  # noqa: E402
 from halfspace_sss.rendering.scenes.combined import combined  # noqa: E402
-from halfspace_sss.rendering.scenes.reference_store import ExitTruth  # noqa: E402
+from halfspace_sss.rendering.scenes.reference_store import Reference  # noqa: E402
 from halfspace_sss.rendering.scenes.scene_files import open_scene  # noqa: E402
 
 QUICK = Recipe(width=24, depth=2, batch=1024, chunk=2**13, reuse=4)
@@ -267,9 +267,9 @@ def test_passes_of_the_camera_are_at_most_half_of_the_walks_and_few_where_the_ob
     assert CameraSchedule(1, 1, 5).numbers(3) == [] and CameraSchedule(2, 4, 1).numbers(1) == [4, 5, 6, 7]
 
 
-def _noisy(rng: np.random.Generator, passes: int, spread: float) -> ExitTruth:
+def _noisy(rng: np.random.Generator, passes: int, spread: float) -> Reference:
     """Passes of an image of 1 with a heavy tail."""
-    found = ExitTruth(np.zeros((32, 32, 3)), np.zeros((32, 32, 3)), 0, 0, 0.0)
+    found = Reference(np.zeros((32, 32, 3)), np.zeros((32, 32, 3)), 0, 0, 0.0)
     for _ in range(passes):
         image = rng.lognormal(-0.5 * spread**2, spread, (32, 32, 3))
         found = found.add(image, 4, 1.0)
