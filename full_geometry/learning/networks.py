@@ -67,11 +67,11 @@ class Layers(nn.Module):
         return x
 
     def arrays(self, matrix: str, bias: str) -> dict[str, np.ndarray]:
-        found: dict[str, Any] = {}
+        arrays: dict[str, Any] = {}
         for k, (W, b) in enumerate(zip(self.matrices, self.biases)):
             W, b = (v.detach().cpu().numpy().copy() for v in (W, b))
-            found |= {f"{matrix}_{k}": W, f"{bias}_{k}": b[:, 0].copy()}
-        return found
+            arrays |= {f"{matrix}_{k}": W, f"{bias}_{k}": b[:, 0].copy()}
+        return arrays
 
 
 class Correction(nn.Module):
@@ -156,15 +156,15 @@ class AlbedoNetwork(nn.Module):
         return self.layers.arrays("A", "a")
 
 
-def mean_likelihood(found: tuple, T: torch.Tensor, scale: torch.Tensor) -> torch.Tensor:
+def mean_likelihood(both: tuple, T: torch.Tensor, scale: torch.Tensor) -> torch.Tensor:
     """E[alpha - T log alpha] over walks, sum over channels times their scale; its minimum is alpha = E[T | exit].
 
     Args:
-        found: from `AlbedoNetwork`.
+        both: from `AlbedoNetwork`.
         T: (2 channels, n).
         scale: (2 channels, 1).
     """
-    alpha, log_alpha = found
+    alpha, log_alpha = both
     return (scale * (alpha - T * log_alpha)).mean(dim=1).sum()
 
 

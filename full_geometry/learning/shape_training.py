@@ -94,8 +94,8 @@ class ShapeNetwork(nn.Module):
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Matrices (outputs, inputs) and biases by name."""
-        found = {f"W_{k}": W.detach().numpy().copy() for k, W in enumerate(self.matrices)}
-        return found | {f"b_{k}": b.detach().numpy().copy() for k, b in enumerate(self.biases)}
+        arrays = {f"W_{k}": W.detach().numpy().copy() for k, W in enumerate(self.matrices)}
+        return arrays | {f"b_{k}": b.detach().numpy().copy() for k, b in enumerate(self.biases)}
 
 
 def _halves(values: torch.Tensor, counts: list[int]) -> torch.Tensor:
