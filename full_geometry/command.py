@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from importlib.util import find_spec
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -41,26 +40,11 @@ def untrained(scene: Any) -> list[str]:
     return missing
 
 
-def train(
-    scene: Any,
-    *,
-    object: str | None = None,
-    seconds: float = 60.0,
-    target_error: float | None = None,
-    seed: int = 0,
-    folder: Path | None = None,
-    work: Path | None = None,
-    progress: NamedProgress | None = None,
-    camera: Any = None,
-    start: str | None = None,
-) -> LearntObject:
-    """As `learning.training.train`, of which the rows of errors are told with the names of object and channels."""
+def train(scene: Any, **how: Any) -> LearntObject:
+    """As `learning.training.train`; rows of errors have the names of object and channels."""
     from full_geometry.learning.training import train as learn
 
-    learnt = learn(
-        scene, object=object, seconds=seconds, target_error=target_error, seed=seed, folder=folder, work=work,
-        progress=progress, camera=camera, start=start,
-    )  # fmt: skip
+    learnt = learn(scene, **how)
     name = learnt.model.subject.object.shape.id()
     return LearntObject(name, learnt.path, _rows(name, KIND, learnt.errors), learnt.steps, learnt.seconds)
 

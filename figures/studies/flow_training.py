@@ -44,7 +44,7 @@ class FlowNetwork(nn.Module):
         n: dimensions.
         context: numbers that it is told.
         hidden: widths of the hidden layers.
-        seed: of the numbers at the start.
+        seed: of the initial weights.
     """
 
     def __init__(self, n: int, context: int, hidden: tuple[int, ...] = HIDDEN, seed: int = 0) -> None:

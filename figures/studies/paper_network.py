@@ -138,7 +138,7 @@ class PaperNetwork(nn.Module):
     Args:
         n: N.
         channels: of the light.
-        seed: of the numbers at the start.
+        seed: of the initial weights.
     """
 
     def __init__(self, n: int, channels: int = 3, seed: int = 0) -> None:

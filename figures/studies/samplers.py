@@ -38,8 +38,7 @@ if TYPE_CHECKING:
 #     V = mean_k var(X_k) / (mean_k E[X_k])²,    mean over channels,
 #
 # is what one sample contributes to the squared relative error of an image; V t, t its time, is what counts. An exit's
-# own
-# work is shared by its N samples: V (t_exit/N + t_sample).
+# own work is shared by its N samples: V (t_exit/N + t_sample).
 
 
 TIMED_LANES, MANY = 2**14, 8

@@ -84,7 +84,7 @@ class ObjectFit:
         channels: of the medium.
         eta: relative index.
         recipe: sizes and rates.
-        seed: of the numbers at the start and of the order of the data.
+        seed: of the initial weights and of the order of the data.
         patches: of the surface, for whose weights a network is fitted beside; None for a shape without faces.
     """
 

@@ -44,7 +44,7 @@ LEAST_SHARE = 1e-5  # of F_t P that comes back
 
 
 class Layers(nn.Module):
-    """A perceptron with hard swish between its layers; 0 at the start."""
+    """A perceptron with hard swish between its layers; 0 initially."""
 
     def __init__(self, sizes: list[int], generator: torch.Generator) -> None:
         super().__init__()
@@ -75,13 +75,13 @@ class Layers(nn.Module):
 
 
 class Correction(nn.Module):
-    """f = 6 tanh(g/6) per channel, g a perceptron; 0 at the start.
+    """f = 6 tanh(g/6) per channel, g a perceptron; 0 initially.
 
     Args:
         n_in: features.
         channels: outputs.
         width, depth: hidden layers.
-        seed: of the numbers at the start.
+        seed: of the initial weights.
     """
 
     def __init__(self, n_in: int, channels: int, width: int = 64, depth: int = 3, seed: int = 0) -> None:
@@ -122,7 +122,7 @@ class AlbedoNetwork(nn.Module):
         channels: of the medium.
         hidden: widths of the hidden layers.
         eta: relative index.
-        seed: of the numbers at the start.
+        seed: of the initial weights.
     """
 
     def __init__(self, n_in: int, channels: int, hidden: tuple[int, ...], eta: float, seed: int = 0) -> None:
@@ -169,13 +169,13 @@ def mean_likelihood(both: tuple, T: torch.Tensor, scale: torch.Tensor) -> torch.
 
 
 class PatchLogits(nn.Module):
-    """log p(patch | exit) up to a constant; shares of the area at the start.
+    """log p(patch | exit) up to a constant; initially the shares of the area.
 
     Args:
         n_in: features of an exit.
         areas: of the patches.
         hidden: widths of the hidden layers.
-        seed: of the numbers at the start.
+        seed: of the initial weights.
     """
 
     def __init__(self, n_in: int, areas: np.ndarray, hidden: tuple[int, ...], seed: int = 0) -> None:

@@ -39,7 +39,7 @@ from halfspace_sss.tracing.walk import generator, pass_seed
 # It holds in what is thin and flat or rugged; in a smooth ball it is up to twice too much, as light that entered does
 # not
 # reach what is held near the surface. M is divided by 1 + (sigma_t' c)², as light of thick objects leaves near where it
-# entered. m_2 = a²/(4 pi eta)² is that of light of two events, see `backbone`.
+# entered. m_2 = a²/(4 pi eta)² is that of light of two events, see `neural_shape.Backbone`.
 
 
 POINTS, SEED = 2**15, 31
@@ -250,7 +250,7 @@ def _tangents(at: SurfacePoint) -> tuple[Any, Any]:
 # ----------------------------------------------------------------------------------------------------
 # What the network is told of a pair of points: the medium, the pair as on a plane, and how far it is from a plane.
 # For a channel with l' = 1/sigma_t' and each end of the pair (exit and entry; d is the direction to the other end, e
-# that from y to the other y; L_k and V_k are those of `surroundings`):
+# that from y to the other y; L_k and V_k are those of `RaySurroundings`):
 #
 #     own:     mu, mu', w.d, w.n of the other end, refracted w.e, log of the depth of y in mean free paths;
 #              log P, log of the way to y in mean free paths, n.d, n.e, L_k, -V_k.n, V_k.e
@@ -261,7 +261,7 @@ def _tangents(at: SurfacePoint) -> tuple[Any, Any]:
 # the
 #              two, over those of a plane, within 1/4 and 4, exp(-sigma_t |y_i - y_o|) less that of a plane, and the
 #              shares of S_0 that are mixed and scattered twice
-#     medium:  nine functions of albedo, g and eta, two of sigma_t' sqrt(area), five of what `mixing` says
+#     medium:  nine functions of albedo, g and eta, two of sigma_t' sqrt(area), five of `Mixed`
 #
 # What stands behind a semicolon, own numbers summed over both ends, is 0 on a plane. All are free of scale, place and
 # turn, and exchanged with the ends.

@@ -61,7 +61,7 @@ ALBEDO, G, ETA = (0.02, 1.0), (-0.3, 0.95), (1.0, 1.7)  # the albedo reduced
 #     S_twice = F_t(w_o) P_o F_t(w_i) P_i m_2 max(v - v', 0),    v = (4 pi)² p_o p_i exp(-sigma_t d)/(d² + e²),
 #
 # v' the same of a plane, whose light of two events the half-space has; e² a twelfth of the squared ways to both y, as
-# these are places in the mean; p of |g| <= 0.6, as so are directions. Light of more events is that of `mixing`.
+# these are places in the mean; p of |g| <= 0.6, as so are directions. Light of more events: `Mixed`.
 
 
 MODEL = "neural"
@@ -145,7 +145,7 @@ class NeuralShape:
         half_space: S_0 P_o P_i.
         weights: W_k (outputs, inputs) and b_k of the layers.
         media: numbers of each channel.
-        scales: s of each channel, see `balance`; 1 if there are none.
+        scales: s of each channel, see `calibrated`; 1 if there are none.
     """
 
     subject: Subject
