@@ -63,10 +63,10 @@ class AlphaP:
 
     def _face(self, at: SurfacePoint, active: Any) -> tuple[Any, Any]:
         """The face that a point lies on, as a short ray from outside meets it, and where there is one."""
-        clear = number(CLEAR * self.subject.found.size)
+        clear = number(CLEAR * self.subject.object.size)
         ray = mi.Ray3f(mi.Point3f(at.p + at.n * clear), mi.Vector3f(-at.n))
         ray.maxt = 2 * clear
-        hit = self.subject.found.scene.ray_intersect_preliminary(ray, False, active=mi.Bool(active))
+        hit = self.subject.object.scene.ray_intersect_preliminary(ray, False, active=mi.Bool(active))
         return dr.select(hit.is_valid(), mi.UInt32(hit.prim_index), 0), active & hit.is_valid()
 
     @functools.cached_property

@@ -63,14 +63,14 @@ class Spline:
 
     def _bin(self, at: Any, by_y: bool) -> _Bin:
         """The bin in which x, or y, lies."""
-        found = _Bin(*map(mi.Float, (-1, -1, self.widths[0], self.heights[0], self.slopes[0], self.slopes[1])))
+        bin = _Bin(*map(mi.Float, (-1, -1, self.widths[0], self.heights[0], self.slopes[0], self.slopes[1])))
         x, y = mi.Float(-1), mi.Float(-1)
         for k in range(1, BINS):
             x, y = x + self.widths[k - 1], y + self.heights[k - 1]
             here = _Bin(x, y, self.widths[k], self.heights[k], self.slopes[k], self.slopes[k + 1])
             beyond = at >= (y if by_y else x)
-            found = _Bin(*(dr.select(beyond, a, b) for a, b in zip(here, found)))
-        return found
+            bin = _Bin(*(dr.select(beyond, a, b) for a, b in zip(here, bin)))
+        return bin
 
     def forward(self, x: Any) -> tuple[Any, Any]:
         """y and dy/dx."""
@@ -90,9 +90,9 @@ class Spline:
 
 def _shares(raw: Sequence[Any], bound: float) -> list[Any]:
     """2 softmax of bounded numbers."""
-    found = [dr.exp(a / (1 + 2 * dr.abs(a) / bound)) for a in raw]
-    scale = 2 / sum(found)
-    return [v * scale for v in found]
+    logits = [dr.exp(a / (1 + 2 * dr.abs(a) / bound)) for a in raw]
+    scale = 2 / sum(logits)
+    return [v * scale for v in logits]
 
 
 def _rational(b: _Bin, z: Any) -> Any:

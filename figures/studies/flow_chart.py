@@ -45,7 +45,7 @@ class Chart:
         self.subject = subject
         centroids, normals, areas = mesh_faces(subject)
         turn = np.eye(3) if frame.turn is None else np.array([np.array(row).ravel() for row in frame.turn])
-        centres, axes = _axes(centroids, normals * subject.found.sign, areas, patches, turn)
+        centres, axes = _axes(centroids, normals * subject.object.sign, areas, patches, turn)
         along, across = (np.einsum("fi,fi->f", centroids - centres[patches.of_face], axes[patches.of_face, k])
                          for k in (0, 1))  # fmt: skip
         strips = _strips(along, areas, patches)
@@ -86,8 +86,8 @@ class Chart:
 
     def coordinates(self, face: Any, p: Any) -> tuple[Any, Any]:
         """Coordinates in its patch of a point of a face."""
-        index = self.subject.found.shape.face_indices(face)
-        a, b, c = (self.subject.found.shape.vertex_position(i) for i in (index.x, index.y, index.z))
+        index = self.subject.object.shape.face_indices(face)
+        a, b, c = (self.subject.object.shape.vertex_position(i) for i in (index.x, index.y, index.z))
         ab, ac, ap = b - a, c - a, p - a
         n = dr.cross(ab, ac)
         square = dr.maximum(dr.squared_norm(n), 1e-38)
@@ -159,10 +159,10 @@ def _strips(along: np.ndarray, areas: np.ndarray, patches: Patches) -> _Strips:
     number = np.maximum(np.sqrt(faces).astype(int), 1)
     wanted = np.minimum((np.clip(middle, 0, 1) * number[of]).astype(int), number[of] - 1)
     keys = of.astype(np.int64) * (number.max() + 1) + wanted
-    found, first, strip = np.unique(keys, return_index=True, return_inverse=True)
+    strips, first, strip = np.unique(keys, return_index=True, return_inverse=True)
     owner = of[first]
     ends = np.searchsorted(owner, np.arange(n + 1))
-    mass = np.bincount(strip, areas[order], len(found))
+    mass = np.bincount(strip, areas[order], len(strips))
     upto = np.concatenate([[0.0], np.cumsum(mass)])
     low = (upto[:-1] - upto[ends[:-1]][owner]) / patches.areas[owner]
     of_face = np.empty(len(of), dtype=np.uint32)
@@ -195,14 +195,14 @@ def context(frame: ObjectFrame, exit: Side, patch: PatchFrame) -> list[Any]:
     def local(v: Any) -> list[Any]:
         return [dr.dot(v, axis) for axis in patch.axes]
 
-    found: list[Any] = []
+    told: list[Any] = []
     for p in (exit.at.p, exit.event.y):
         d = p - patch.centre
         r = dr.norm(d)
-        found += [*local(d / (r + patch.radius)), 0.5 * dr.log(r / patch.radius + 0.05)]
-    found += [*local(exit.at.n_out), *local(exit.at.w), dr.dot(exit.at.n_out, exit.at.w)]
-    found += [0.5 * dr.log(patch.radius * frame.sigma_t + 1e-3), 0.5 * dr.log(exit.event.length * frame.sigma_t + 1e-2)]
-    return [*found, 1 / (1 + patch.radius * frame.sigma_t)]
+        told += [*local(d / (r + patch.radius)), 0.5 * dr.log(r / patch.radius + 0.05)]
+    told += [*local(exit.at.n_out), *local(exit.at.w), dr.dot(exit.at.n_out, exit.at.w)]
+    told += [0.5 * dr.log(patch.radius * frame.sigma_t + 1e-3), 0.5 * dr.log(exit.event.length * frame.sigma_t + 1e-2)]
+    return [*told, 1 / (1 + patch.radius * frame.sigma_t)]
 
 
 def _tangents(n: Any, towards: Any) -> tuple[Any, Any]:

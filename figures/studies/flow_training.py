@@ -44,7 +44,7 @@ class FlowNetwork(nn.Module):
         n: dimensions.
         context: numbers that it is told.
         hidden: widths of the hidden layers.
-        seed: of the numbers at the start.
+        seed: of the initial weights.
     """
 
     def __init__(self, n: int, context: int, hidden: tuple[int, ...] = HIDDEN, seed: int = 0) -> None:
@@ -67,11 +67,11 @@ class FlowNetwork(nn.Module):
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Matrices F_k with their masks multiplied in, and biases h_k."""
-        found, layers = {}, [m for m in self.transform.hyper if hasattr(m, "weight")]
+        arrays, layers = {}, [m for m in self.transform.hyper if hasattr(m, "weight")]
         for k, layer in enumerate(layers):
-            found[f"F_{k}"] = (layer.mask * layer.weight).detach().numpy().copy()
-            found[f"h_{k}"] = layer.bias.detach().numpy().copy()
-        return found
+            arrays[f"F_{k}"] = (layer.mask * layer.weight).detach().numpy().copy()
+            arrays[f"h_{k}"] = layer.bias.detach().numpy().copy()
+        return arrays
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -101,10 +101,10 @@ class Lighting:
     def sample(self, entry: Any, u: Any, active: Any) -> tuple[Any, Any]:
         """w_i at an entry, and the light from there over its density: 0 in the shadow."""
         w, value, distance = self.aim(entry, u)
-        ray = place(entry.p, mi.Normal3f(entry.n * number(self.subject.found.sign))).spawn_ray(w)
+        ray = place(entry.p, mi.Normal3f(entry.n * number(self.subject.object.sign))).spawn_ray(w)
         ray.maxt = distance
         lit = active & (dr.dot(w, entry.n_face) > 0)
-        return w, dr.select(lit & ~self.subject.found.scene.ray_test(ray, False, lit), value, 0)
+        return w, dr.select(lit & ~self.subject.object.scene.ray_test(ray, False, lit), value, 0)
 
 
 def lighting(name: str, subject: Subject) -> Lighting:
@@ -138,7 +138,7 @@ def _above(subject: Subject) -> np.ndarray:
     from halfspace_sss.tracing.walk import generator, pass_seed
 
     p = np.array(subject.random_points(generator(mi, 4096, pass_seed(23))).p)
-    return p[:, np.argmax(TOWARDS @ p)] + GAP * float(subject.found.size) * TOWARDS
+    return p[:, np.argmax(TOWARDS @ p)] + GAP * float(subject.object.size) * TOWARDS
 
 
 # ---- Training data of flows: exits of walks as patches and coordinates in them, with their throughput
@@ -188,7 +188,7 @@ def flow_walks(
     exits = trace_exits(subject, starts, (*seed, 1))
     T = exits.T
     if light is not None:
-        n_mesh = mi.Normal3f(exits.at.n * subject.found.sign)
+        n_mesh = mi.Normal3f(exits.at.n * subject.object.sign)
         entry = Entry(exits.at.p, n_mesh, exits.at.n_out, mi.Float(1), exits.face)
         w, value = light.sample(entry, mi.Point2f(rng.next_float32(), rng.next_float32()), dr.max(T) > 0)
         T = T * (value * entry.seen(w)[1])

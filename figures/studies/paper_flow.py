@@ -114,7 +114,7 @@ def _pairs(model: FullGeometry, frame: ObjectFrame, seed: tuple[int, ...]) -> tu
 
 def mesh_arrays(subject: Subject, frame: ObjectFrame) -> tuple[np.ndarray, np.ndarray]:
     """Vertices, in the frame over the radius, and faces, as libigl takes them."""
-    parameters = mi.traverse(subject.found.shape)
+    parameters = mi.traverse(subject.object.shape)
     vertices = np.array(parameters["vertex_positions"], dtype=np.float64).reshape(-1, 3)
     turn = np.eye(3) if frame.turn is None else np.array([np.array(row).ravel() for row in frame.turn])
     centre, radius = np.array(frame.centre, dtype=float).ravel(), float(np.array(frame.radius).item())

@@ -77,11 +77,11 @@ def random_lights(m: int, channels: int, rng: np.random.Generator) -> PaperLight
 def measured_lights(m: int, channels: int) -> list[PaperLight]:
     """Constant light and the four lobes of the measured errors, the same for m exits."""
     none = np.zeros((m, 1, 3))
-    found = [PaperLight(np.ones((m, channels)), none, np.ones((m, 1)), np.zeros((m, 1, channels)))]
+    lights = [PaperLight(np.ones((m, channels)), none, np.ones((m, 1)), np.zeros((m, 1, channels)))]
     for axis in LOBES:
         axes = np.broadcast_to(axis, (m, 1, 3))
-        found.append(PaperLight(np.zeros((m, channels)), axes, np.full((m, 1), POWER), np.ones((m, 1, channels))))
-    return found
+        lights.append(PaperLight(np.zeros((m, channels)), axes, np.full((m, 1), POWER), np.ones((m, 1, channels))))
+    return lights
 
 
 WIDTH, DEPTH = 256, 3
@@ -138,7 +138,7 @@ class PaperNetwork(nn.Module):
     Args:
         n: N.
         channels: of the light.
-        seed: of the numbers at the start.
+        seed: of the initial weights.
     """
 
     def __init__(self, n: int, channels: int = 3, seed: int = 0) -> None:
@@ -268,15 +268,15 @@ def estimate(
     subject: Subject, net: PaperNetwork, exits: SurfacePoint, points: str, repeats: int, seed: int = 0
 ) -> ExitRadiance:
     """Mean radiance of exits over repeats with new points, and its variance."""
-    frame, m, found = frame_of(subject), dr.width(exits.p), []
+    frame, m, means = frame_of(subject), dr.width(exits.p), []
     for k in range(repeats):
         if points == "walks":
             samples = walk_samples(subject, frame, exits, net.n, (seed, 95, k))
         else:
             samples = uniform_samples(subject, frame, exits, net.n, (seed, 96, k))
         lights = measured_lights(m, len(subject.media))
-        found.append(np.stack([net.radiance(samples, light) for light in lights], axis=-1))
-    values = np.array(found, dtype=float).transpose(0, 2, 1, 3)
+        means.append(np.stack([net.radiance(samples, light) for light in lights], axis=-1))
+    values = np.array(means, dtype=float).transpose(0, 2, 1, 3)
     return ExitRadiance(values.mean(axis=0), values.var(axis=0, ddof=1) / repeats)
 
 
@@ -318,7 +318,7 @@ def load_network(subject: Subject, folder: Path | None = None) -> PaperNetwork:
     path = (Path(folder) if folder else weights_folder()) / f"{KIND}-{here.digest()}.safetensors"
     if not path.exists():
         raise ValueError(
-            f"object {subject.found.shape.id()!r} must be trained for {KIND}, got one that is not in {path.parent}; "
+            f"object {subject.object.shape.id()!r} must be trained for {KIND}, got one that is not in {path.parent}; "
             f"`halfspace-sss train --scene --model {KIND}` does it"
         )
     arrays, record = load_weights(path, KIND)
@@ -349,11 +349,11 @@ def train(
     folder = check_weights_folder(folder)
     subject, began = Subject.given(scene, None, None, object), time.monotonic()
     net, steps = fit_paper(subject, PaperRecipe(seconds=seconds), seed, progress)
-    found = paper_errors(subject, net, reference(subject, EXITS, WALKS, seed), seed=seed)
-    record = {"steps": steps, "seconds": seconds, "seed": seed, "errors": [row._asdict() for row in found]}
+    rows = paper_errors(subject, net, reference(subject, EXITS, WALKS, seed), seed=seed)
+    record = {"steps": steps, "seconds": seconds, "seed": seed, "errors": [row._asdict() for row in rows]}
     path = save_network(folder, identify(subject), net, {**record, "provenance": provenance(seed=seed)})
-    name = subject.found.shape.id()
-    return LearntObject(name, path, _rows(name, found), steps, time.monotonic() - began)
+    name = subject.object.shape.id()
+    return LearntObject(name, path, _rows(name, rows), steps, time.monotonic() - began)
 
 
 def errors(
@@ -365,10 +365,10 @@ def errors(
         check_choice("model", name, (KIND,))
     subject = Subject.given(scene, None, None, object)
     net = load_network(subject)
-    found = paper_errors(subject, net, reference(subject, exits, WALKS, seed), seed=seed)
-    return _rows(subject.found.shape.id(), found)
+    rows = paper_errors(subject, net, reference(subject, exits, WALKS, seed), seed=seed)
+    return _rows(subject.object.shape.id(), rows)
 
 
-def _rows(name: str, found: list[RadianceError]) -> list[ObjectError]:
-    channels = "RGB" if max(row.channel for row in found) == 2 else ["mono"]
-    return [ObjectError(name, channels[e.channel], KIND, e.light, e.error, e.standard_error, e.ratio) for e in found]
+def _rows(name: str, rows: list[RadianceError]) -> list[ObjectError]:
+    channels = "RGB" if max(row.channel for row in rows) == 2 else ["mono"]
+    return [ObjectError(name, channels[e.channel], KIND, e.light, e.error, e.standard_error, e.ratio) for e in rows]

@@ -66,13 +66,13 @@ def error_table(
     models = {BACKBONE: PlanarModel(subject, BACKBONE), "full_geometry": learnt.model}
     models["S = alpha p"] = fit_alpha_p(subject, FlowRecipe(seconds=seconds), seed)
     for key, model in models.items():
-        found = model_errors.measure(subject, model, proposals, truth=truth, samples=samples, seed=seed)
-        rows += [{"model": key, **row._asdict()} for row in found]
+        errors = model_errors.measure(subject, model, proposals, truth=truth, samples=samples, seed=seed)
+        rows += [{"model": key, **row._asdict()} for row in errors]
     tell("full_geometry_paper", 2)
     net, _ = fit_paper(subject, PaperRecipe(n=n, seconds=seconds), seed)
     for points in POINTS:
-        found = paper_errors(subject, net, truth, points=points, seed=seed)
-        rows += [{"model": f"full_geometry_paper, points {points}", **row._asdict()} for row in found]
+        errors = paper_errors(subject, net, truth, points=points, seed=seed)
+        rows += [{"model": f"full_geometry_paper, points {points}", **row._asdict()} for row in errors]
     tell("models", 4)
     return pandas.DataFrame(rows)
 
@@ -111,8 +111,8 @@ def start_table(
         learnt, about = _learnt(subject, start, share * seconds, part, seed)
         proposals = EntryProposals(subject, HalfSpace(subject, STANDARD.start))
         proposals = proposals.with_patches(learnt.sampler if share else None)
-        found = measure(subject, learnt.model, proposals, truth=truth, samples=samples, seed=seed)
-        rows += [{"start": start, "planned": share * seconds, **about, **row._asdict()} for row in found]
+        errors = measure(subject, learnt.model, proposals, truth=truth, samples=samples, seed=seed)
+        rows += [{"start": start, "planned": share * seconds, **about, **row._asdict()} for row in errors]
     return pandas.DataFrame(rows)
 
 

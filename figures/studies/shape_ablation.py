@@ -70,14 +70,14 @@ def ablation_table(work: Path, seconds: float, progress: NamedProgress | None = 
 
 
 def _objects(work: Path) -> list[PairData]:
-    found = []
+    objects = []
     for path in sorted(work.glob("object-*.npz"))[:OBJECTS]:
         with np.load(path) as stored:
             if "walks" in stored:
-                found.append(PairData.from_arrays(stored))
-    if not found:
+                objects.append(PairData.from_arrays(stored))
+    if not objects:
         raise ValueError(f"work must hold objects of `train --shapes`, got none in {work}")
-    return found
+    return objects
 
 
 def _without(data: PairData, missing: Sequence[str]) -> PairData:

@@ -116,8 +116,8 @@ def evaluate(
         models: dict[str, Any] = {"neural_shape": transport(subject, path)}
         models |= {name: PlanarModel(subject, name) for name in HALF_SPACES if _takes(name, subject)}
         walks = WALKS * (MORE if float(subject.media[0].albedo_prime) < DARK else 1)
-        found = errors_of(subject, models, exits=EXITS, walks=walks, samples=SAMPLES, seed=seed)
-        rows.append(_row(case, found))
+        errors = errors_of(subject, models, exits=EXITS, walks=walks, samples=SAMPLES, seed=seed)
+        rows.append(_row(case, errors))
     return rows
 
 
@@ -129,12 +129,12 @@ def _takes(name: str, subject: Subject) -> bool:
         return False
 
 
-def _row(case: Case, found: Mapping[str, list[RadianceError]]) -> Row:
+def _row(case: Case, by_model: Mapping[str, list[RadianceError]]) -> Row:
     m = case.subject.media[0]
     errors = {
         model: {light: next((r.error, r.standard_error) for r in rows if r.light == light and r.channel == 0)
                 for light in LIGHTS}
-        for model, rows in found.items()
+        for model, rows in by_model.items()
     }  # fmt: skip
     size = float(case.subject.mean_free_paths()[0])
     thickness = mean_chord(case.subject) * float(m.sigma_t)
@@ -148,7 +148,7 @@ def seconds_per_million(subject: Subject, path: Path | None = None) -> dict[str,
     rng = generator(mi, LANES, pass_seed(29))
     exits, entries = subject.random_points(rng), subject.random_points(rng)
     dr.eval(exits, entries)
-    found = {}
+    seconds = {}
     for name, model in models.items():
         times = []
         for _ in range(3):  # the first one compiles
@@ -157,8 +157,8 @@ def seconds_per_million(subject: Subject, path: Path | None = None) -> dict[str,
             dr.eval(model.S(model.prepare(exits), entries))
             dr.sync_thread()
             times.append(time.perf_counter() - at)
-        found[name] = 1e6 / LANES * min(times[1:])
-    return found
+        seconds[name] = 1e6 / LANES * min(times[1:])
+    return seconds
 
 
 # ---- Tables of errors as text of Markdown ----------------------------------------------------------
@@ -184,31 +184,31 @@ def _percent(pair: tuple[float, float]) -> str:
 def case_table(rows: Sequence[Row]) -> str:
     """Every case: what it is, the best half-space model under constant light, and both errors of the network, %."""
     head = ["object", "size, mfp", "albedo", "g", "eta", "half-space", "its error", "its lobes", "constant", "lobes"]
-    found = []
+    cells = []
     for r in rows:
         name, _ = r.best()
-        found.append([
+        cells.append([
             r.name, f"{r.size:.3g}", f"{r.albedo:.4g}", f"{r.g:.2g}", f"{r.eta:.3g}", name,
             *(_percent(r.errors[model][light]) for model in (name, MODEL) for light in LIGHTS),
         ])  # fmt: skip
-    return _table(head, found)
+    return _table(head, cells)
 
 
 def summary(rows: Sequence[Row]) -> str:
     """Median and 90th percentile of the errors, and how they compare with the best half-space model of each case, %."""
-    found = []
+    cells = []
     for light in LIGHTS:
         own = np.array([r.of(MODEL, light) for r in rows])
         best = np.array([r.best(light)[1] for r in rows])
         ratio = best / np.maximum(own, 1e-9)
-        found.append([
+        cells.append([
             light, f"{100 * np.median(own):.1f}", f"{100 * np.quantile(own, 0.9):.1f}",
             f"{100 * np.median(best):.1f}", f"{100 * np.quantile(best, 0.9):.1f}", f"{np.median(ratio):.1f}",
             f"{(ratio >= 4).sum()} of {len(rows)}", f"{(ratio < 1).sum()} of {len(rows)}",
         ])  # fmt: skip
     head = ["light", "median", "90th percentile", "best half-space: median", "90th percentile", "median ratio",
             "4 times better", "worse"]  # fmt: skip
-    return _table(head, found)
+    return _table(head, cells)
 
 
 def by_property(rows: Sequence[Row]) -> str:

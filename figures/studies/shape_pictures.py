@@ -60,7 +60,7 @@ def picture(case: Case, model: str, size: int = SIZE) -> np.ndarray:
 
 
 def _scene(case: Case, path: Path, size: int) -> dict[str, Any]:
-    shape, m = case.subject.found.shape, case.subject.media[0]
+    shape, m = case.subject.object.shape, case.subject.media[0]
     shape.write_ply(str(path))
     box = shape.bbox()
     centre, radius = np.array(box.center()).ravel(), 0.5 * float(np.linalg.norm(np.array(box.extents()).ravel()))

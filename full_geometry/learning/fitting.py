@@ -84,7 +84,7 @@ class ObjectFit:
         channels: of the medium.
         eta: relative index.
         recipe: sizes and rates.
-        seed: of the numbers at the start and of the order of the data.
+        seed: of the initial weights and of the order of the data.
         patches: of the surface, for whose weights a network is fitted beside; None for a shape without faces.
     """
 
@@ -197,8 +197,8 @@ class ObjectFit:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """The averaged numbers of all networks by name, and what is solved for beside them."""
-        found = {name: value for module in self.average.values() for name, value in module.arrays().items()}
-        return {**found, "Q": self.ends.solved()}
+        arrays = {name: value for module in self.average.values() for name, value in module.arrays().items()}
+        return {**arrays, "Q": self.ends.solved()}
 
     def _advance(self, loss: torch.Tensor, steps: int | None) -> None:
         at = min(self.step / max(steps, 1), 1.0) if steps is not None else 0.0
@@ -317,12 +317,12 @@ class Ends:
 
     def _sums(self, x: torch.Tensor, value: torch.Tensor) -> torch.Tensor:
         """Sums over columns of value times the terms of both ends, (channels, products)."""
-        found = torch.zeros(len(value), len(self.heads), self.n + 1, device=x.device)
+        sums = torch.zeros(len(value), len(self.heads), self.n + 1, device=x.device)
         for part, v in zip(x.split(COLUMNS, dim=1), value.split(COLUMNS, dim=1)):
             for s in self._sides(part):
                 for k, w in enumerate(v):
-                    found[k].addmm_(s[self.heads] * w, s.T)
-        return found[:, self.rows, self.cols]
+                    sums[k].addmm_(s[self.heads] * w, s.T)
+        return sums[:, self.rows, self.cols]
 
     def _curve(self, x: torch.Tensor, V: torch.Tensor) -> None:
         """H of each channel."""

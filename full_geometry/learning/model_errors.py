@@ -138,7 +138,7 @@ def errors_of(
     check_count("samples", samples, 2)
     proposals = EntryProposals(subject, HalfSpace(subject, PROBES))
     truths: dict[str, ExitTruth] = {}
-    found, done = {}, 0
+    rows, done = {}, 0
     total = len(transports) + len({t.orders for t in transports.values()})
 
     def tell(what: str, steps: int) -> None:
@@ -153,10 +153,10 @@ def errors_of(
         tell(name, done)
         truth = truths[model.orders]
         by_S = modelled(model, proposals, truth.exits, samples, seed)
-        found[name] = [*compare(by_S, truth.truth), *_even_sky(model, by_S, truth)]
+        rows[name] = [*compare(by_S, truth.truth), *_even_sky(model, by_S, truth)]
         done += 1
     tell("models", total)
-    return found
+    return rows
 
 
 def errors(
@@ -191,8 +191,8 @@ def errors(
         ValueError: an argument is out of range, the object has not been trained, or there is no such model.
     """
     subject = Subject.given(shape, medium, mm_per_unit, object)
-    found = {model: transport(subject, model, folder)}
-    return errors_of(subject, found, exits=exits, walks=walks, samples=samples, seed=seed)[model]
+    transports = {model: transport(subject, model, folder)}
+    return errors_of(subject, transports, exits=exits, walks=walks, samples=samples, seed=seed)[model]
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -220,7 +220,7 @@ class AddedTransport:
         """
         make = object_transport(name)
         inside = Inside("medium", subject.media[0], name, "total", True)
-        inner = make(subject.found, inside, list(subject.media), Settings()).transport if make else None
+        inner = make(subject.object, inside, list(subject.media), Settings()).transport if make else None
         if inner is None or getattr(inner, "is_delta", False):
             raise ValueError(f"model must be one that has S for two points of a surface, got {name!r}")
         return cls(subject, inner)
@@ -231,12 +231,12 @@ class AddedTransport:
 
     def prepare(self, at: SurfacePoint, active: Any = True) -> Any:
         """What is done for the exit alone."""
-        return self.inner.prepare(Exit(at.p, at.n_out, at.w, number(self.subject.found.sign), at.n), active)
+        return self.inner.prepare(Exit(at.p, at.n_out, at.w, number(self.subject.object.sign), at.n), active)
 
     def S(self, exit: Any, at: SurfacePoint, active: Any = True) -> Any:
         """S per channel, 1/((scene unit)² sr); 0 below the horizons."""
         mu = dr.dot(at.w, at.n_out)
-        entry = Entry(at.p, mi.Normal3f(at.n * number(self.subject.found.sign)), at.n_out, mi.Float(1), mi.UInt32(0))
+        entry = Entry(at.p, mi.Normal3f(at.n * number(self.subject.object.sign)), at.n_out, mi.Float(1), mi.UInt32(0))
         value = self.inner.S_mu(exit, entry, at.w, active)
         return dr.select(mu > 0, value / dr.maximum(mu, 1e-6), 0)
 

@@ -44,7 +44,7 @@ LEAST_SHARE = 1e-5  # of F_t P that comes back
 
 
 class Layers(nn.Module):
-    """A perceptron with hard swish between its layers; 0 at the start."""
+    """A perceptron with hard swish between its layers; 0 initially."""
 
     def __init__(self, sizes: list[int], generator: torch.Generator) -> None:
         super().__init__()
@@ -67,21 +67,21 @@ class Layers(nn.Module):
         return x
 
     def arrays(self, matrix: str, bias: str) -> dict[str, np.ndarray]:
-        found: dict[str, Any] = {}
+        arrays: dict[str, Any] = {}
         for k, (W, b) in enumerate(zip(self.matrices, self.biases)):
             W, b = (v.detach().cpu().numpy().copy() for v in (W, b))
-            found |= {f"{matrix}_{k}": W, f"{bias}_{k}": b[:, 0].copy()}
-        return found
+            arrays |= {f"{matrix}_{k}": W, f"{bias}_{k}": b[:, 0].copy()}
+        return arrays
 
 
 class Correction(nn.Module):
-    """f = 6 tanh(g/6) per channel, g a perceptron; 0 at the start.
+    """f = 6 tanh(g/6) per channel, g a perceptron; 0 initially.
 
     Args:
         n_in: features.
         channels: outputs.
         width, depth: hidden layers.
-        seed: of the numbers at the start.
+        seed: of the initial weights.
     """
 
     def __init__(self, n_in: int, channels: int, width: int = 64, depth: int = 3, seed: int = 0) -> None:
@@ -122,7 +122,7 @@ class AlbedoNetwork(nn.Module):
         channels: of the medium.
         hidden: widths of the hidden layers.
         eta: relative index.
-        seed: of the numbers at the start.
+        seed: of the initial weights.
     """
 
     def __init__(self, n_in: int, channels: int, hidden: tuple[int, ...], eta: float, seed: int = 0) -> None:
@@ -156,26 +156,26 @@ class AlbedoNetwork(nn.Module):
         return self.layers.arrays("A", "a")
 
 
-def mean_likelihood(found: tuple, T: torch.Tensor, scale: torch.Tensor) -> torch.Tensor:
+def mean_likelihood(both: tuple, T: torch.Tensor, scale: torch.Tensor) -> torch.Tensor:
     """E[alpha - T log alpha] over walks, sum over channels times their scale; its minimum is alpha = E[T | exit].
 
     Args:
-        found: from `AlbedoNetwork`.
+        both: from `AlbedoNetwork`.
         T: (2 channels, n).
         scale: (2 channels, 1).
     """
-    alpha, log_alpha = found
+    alpha, log_alpha = both
     return (scale * (alpha - T * log_alpha)).mean(dim=1).sum()
 
 
 class PatchLogits(nn.Module):
-    """log p(patch | exit) up to a constant; shares of the area at the start.
+    """log p(patch | exit) up to a constant; initially the shares of the area.
 
     Args:
         n_in: features of an exit.
         areas: of the patches.
         hidden: widths of the hidden layers.
-        seed: of the numbers at the start.
+        seed: of the initial weights.
     """
 
     def __init__(self, n_in: int, areas: np.ndarray, hidden: tuple[int, ...], seed: int = 0) -> None:

@@ -140,8 +140,8 @@ class PairData:
     @classmethod
     def from_arrays(cls, arrays: Any) -> PairData:
         """From a file; KeyError if it is another one."""
-        found = {name: arrays[name] for name in NAMES}
-        return cls(**{**found, "share": float(found["share"])})
+        stored = {name: arrays[name] for name in NAMES}
+        return cls(**{**stored, "share": float(stored["share"])})
 
 
 def make_data(subject: Subject, events: float, seed: tuple[int, ...]) -> PairData | None:
@@ -186,8 +186,8 @@ def _columns(half_space: Backbone, exits: SurfacePoint, entries: SurfacePoint) -
     pair = describe(subject, o, i, half_space.shares([mi.Float(S_0.astype(np.float32))], o, i))[0]
     columns = [*pair.exit, *pair.entry, *pair.shared]
     dr.eval(columns)
-    found = np.stack([np.broadcast_to(c.numpy(), dr.width(exits.p)) for c in columns], axis=-1)
-    return np.nan_to_num(found, posinf=0, neginf=0).astype(np.float16), S_0
+    rows = np.stack([np.broadcast_to(c.numpy(), dr.width(exits.p)) for c in columns], axis=-1)
+    return np.nan_to_num(rows, posinf=0, neginf=0).astype(np.float16), S_0
 
 
 # ---- Exits of one object in groups of those that look alike, whose light a fit holds to that of walks

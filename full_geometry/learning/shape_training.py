@@ -59,11 +59,11 @@ STANDARD = Recipe()
 
 
 class ShapeNetwork(nn.Module):
-    """f of `model.NeuralShape` in torch; 0 at the start.
+    """f of `NeuralShape` in torch; 0 initially.
 
     Args:
         recipe: its size.
-        seed: of the numbers at the start.
+        seed: of the initial weights.
     """
 
     def __init__(self, recipe: ShapeRecipe, seed: int = 0) -> None:
@@ -94,8 +94,8 @@ class ShapeNetwork(nn.Module):
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Matrices (outputs, inputs) and biases by name."""
-        found = {f"W_{k}": W.detach().numpy().copy() for k, W in enumerate(self.matrices)}
-        return found | {f"b_{k}": b.detach().numpy().copy() for k, b in enumerate(self.biases)}
+        arrays = {f"W_{k}": W.detach().numpy().copy() for k, W in enumerate(self.matrices)}
+        return arrays | {f"b_{k}": b.detach().numpy().copy() for k, b in enumerate(self.biases)}
 
 
 def _halves(values: torch.Tensor, counts: list[int]) -> torch.Tensor:
@@ -111,7 +111,7 @@ class ShapeFit:
 
     Args:
         recipe: sizes and rates.
-        seed: of the numbers at the start.
+        seed: of the initial weights.
         network: another network to fit, for comparisons.
     """
 
@@ -146,7 +146,7 @@ class ShapeFit:
         return float(loss.detach())
 
     def loss(self, batch: list[GroupedPairs], rng: np.random.Generator) -> torch.Tensor:
-        """E_q[(S_0 mu_i / q) exp f] - E_walks[T f] over the mean of T, and what `groups` adds; a mean over objects.
+        """E_q[(S_0 mu_i / q) exp f] - E_walks[T f] over the mean of T, and the light of groups; a mean over objects.
 
         Of each object a part of one group of its exits is taken.
         """

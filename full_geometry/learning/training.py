@@ -69,9 +69,9 @@ def trusted(
     return (wrong <= np.stack([0 * by_S + MOST, np.maximum(by_S, MOST)])).astype(np.float16)
 
 
-def _error(found: np.ndarray, truth: ExitRadiance) -> np.ndarray:
+def _error(alpha: np.ndarray, truth: ExitRadiance) -> np.ndarray:
     """Relative RMSE of shares (channels, exits) under constant light, without the noise of walks."""
-    shares = found[:, :, None].astype(float)
+    shares = alpha[:, :, None].astype(float)
     return np.array([row.error for row in of_even_light(ExitRadiance(shares, np.zeros_like(shares)), truth)])
 
 
@@ -118,7 +118,7 @@ class CameraExits:
 
     def __init__(self, source: PairSource, camera: Any, walks: int, seed: int) -> None:
         self.source, self.camera, self.walks, self.seed = source, camera, walks, seed
-        self.shape = source.subject.found.shape
+        self.shape = source.subject.object.shape
         self.schedule = CameraSchedule.of(walks, camera.hits(self.shape), camera.pixels)
 
     def seconds_more(self) -> float:
@@ -157,11 +157,11 @@ class CameraExits:
     def _exits(self, numbers: list[int], order: np.random.Generator) -> list[tuple[SurfacePoint, WalkEnds]]:
         """Starts and ends of walks from the camera, launch by launch; of too many a random choice."""
         launches = [part for number in numbers for part in self.camera.exits(self.shape, number, self.schedule.spp)]
-        found = [part for part in launches if dr.width(part.object)]
-        ends = np.cumsum([0, *(dr.width(part.object) for part in found)])
+        with_exits = [part for part in launches if dr.width(part.object)]
+        ends = np.cumsum([0, *(dr.width(part.object) for part in with_exits)])
         chosen = np.sort(order.permutation(int(ends[-1]))[: int(SHARE * self.walks)])
         parts = []
-        for part, a, b in zip(found, ends, ends[1:]):
+        for part, a, b in zip(with_exits, ends, ends[1:]):
             own = chosen[(chosen >= a) & (chosen < b)] - a
             if len(own):
                 parts.append(_points(part.gather(_lanes(own))))
@@ -302,7 +302,7 @@ class _ObjectTraining:
         self.source = PairSource(subject, self.frame, self.base, self.proposals)
         self.seen: CameraExits | None = None
         self.patches = self.centres = None
-        if "faces" in mi.traverse(subject.found.shape):
+        if "faces" in mi.traverse(subject.object.shape):
             self.centres = cluster(subject, self.frame, seed=seed).astype(np.float16)
             self.patches = Patches(subject, self.frame, self.centres.astype(np.float32))
         self.fitting = self._new_fitting()
@@ -318,9 +318,9 @@ class _ObjectTraining:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """What is written: in half precision, but for what turns the inputs."""
-        found = {name: value.astype(np.float16) for name, value in self.fitting.arrays().items()}
-        found |= {storing.EVEN: self.even, storing.TURNS: self.frame.around.turns}
-        return found if self.centres is None else {**found, storing.CENTRES: self.centres}
+        arrays = {name: value.astype(np.float16) for name, value in self.fitting.arrays().items()}
+        arrays |= {storing.EVEN: self.even, storing.TURNS: self.frame.around.turns}
+        return arrays if self.centres is None else {**arrays, storing.CENTRES: self.centres}
 
     def learnt(self) -> storing.Learnt:
         """Model and sampler as they stand."""
@@ -346,11 +346,11 @@ class _ObjectTraining:
             if progress:
                 progress(what, self.done, self.total)
         self.fitting.solve(self.source, self.done, self.seed)
-        found = self._judged(truth, 2 * WALKS)
+        errors = self._judged(truth, 2 * WALKS)
         spent = time.monotonic() - started
         self._save_camera()
-        path = storing.save(folder, self.identity, self.arrays(), self._record(found, spent))
-        return Trained(*self.learnt()[:2], path, found, self.fitting.step, spent)
+        path = storing.save(folder, self.identity, self.arrays(), self._record(errors, spent))
+        return Trained(*self.learnt()[:2], path, errors, self.fitting.step, spent)
 
     def _prepare(self, chunks: int | None = None) -> None:
         """Scales and shares from a pilot, which compiles all kernels; the work of a run that was killed."""
@@ -415,9 +415,9 @@ class _ObjectTraining:
 
     def _judged(self, truth: ExitTruth, samples: int) -> list[RadianceError]:
         """Errors at the end, and what even light may be used for."""
-        found = self._errors(truth, samples)
-        self.even = trusted(self.learnt().model, truth, found, WALKS, (self.seed, 20))
-        return found
+        errors = self._errors(truth, samples)
+        self.even = trusted(self.learnt().model, truth, errors, WALKS, (self.seed, 20))
+        return errors
 
     def _validated(self, truth: ExitTruth) -> tuple[int, float, float]:
         """Chunk, largest error under constant light and its standard error."""
@@ -433,10 +433,10 @@ class _ObjectTraining:
         if self.camera:
             self.camera.save()
 
-    def _record(self, found: list[RadianceError], seconds: float) -> dict[str, Any]:
+    def _record(self, errors: list[RadianceError], seconds: float) -> dict[str, Any]:
         return {
             "recipe": asdict(self.recipe), "seed": self.seed, "steps": self.fitting.step, "chunks": self.done,
             storing.CHECKSUMS: storing.base_checksums(self.subject, self.recipe.start),
             "walks": self.walks * self.done, "seconds": seconds, "history": self.history,
-            "errors": [row._asdict() for row in found], "provenance": provenance(seed=self.seed),
+            "errors": [row._asdict() for row in errors], "provenance": provenance(seed=self.seed),
         }  # fmt: skip

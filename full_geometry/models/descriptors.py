@@ -39,7 +39,7 @@ from halfspace_sss.tracing.walk import generator, pass_seed
 # It holds in what is thin and flat or rugged; in a smooth ball it is up to twice too much, as light that entered does
 # not
 # reach what is held near the surface. M is divided by 1 + (sigma_t' c)², as light of thick objects leaves near where it
-# entered. m_2 = a²/(4 pi eta)² is that of light of two events, see `backbone`.
+# entered. m_2 = a²/(4 pi eta)² is that of light of two events, see `neural_shape.Backbone`.
 
 
 POINTS, SEED = 2**15, 31
@@ -94,7 +94,7 @@ def _of(subject: Subject, media: Sequence[Medium], scattered: Sequence[float], c
     a_reduced, k, thin = float(reduced.albedo), scattered[1] / scattered[0], 1 / (1 + thickness**2)
     M = a**2 * max(q - q_direct, 0.0) / float(m.sigma_t)
     M += a * q * k**2 * a_reduced**2 * q_reduced / (1 - a_reduced * q_reduced) / float(reduced.sigma_t)
-    M /= math.pi * subject.found.area * chord * m.eta**2  # 4 V = c A
+    M /= math.pi * subject.object.area * chord * m.eta**2  # 4 V = c A
     return Mixed(M * thin, (a / (4 * math.pi * m.eta)) ** 2, thickness, q, q_reduced, q_direct, k)
 
 
@@ -223,7 +223,7 @@ def _from(subject: Subject, at: SurfacePoint, y: Any, extinctions: tuple[float, 
     def step(j: Any, *sums: list) -> tuple:
         u, v, w = (dr.gather(mi.Float, table, j) for table in tables)
         d = mi.Vector3f(t * u + b * v + n * w)
-        hit = subject.found.scene.ray_intersect_preliminary(mi.Ray3f(y, d), False, active)
+        hit = subject.object.scene.ray_intersect_preliminary(mi.Ray3f(y, d), False, active)
         ways = dr.select(hit.is_valid(), hit.t, FAR), dr.select(w > 0, depth / dr.maximum(w, 1e-6), FAR)
         c, c_plane = ([1 - dr.exp(-way * decay) for decay in decays] for way in ways)
         new = c, c_plane, [d * v for v in c], [d * v for v in c_plane]
@@ -250,7 +250,7 @@ def _tangents(at: SurfacePoint) -> tuple[Any, Any]:
 # ----------------------------------------------------------------------------------------------------
 # What the network is told of a pair of points: the medium, the pair as on a plane, and how far it is from a plane.
 # For a channel with l' = 1/sigma_t' and each end of the pair (exit and entry; d is the direction to the other end, e
-# that from y to the other y; L_k and V_k are those of `surroundings`):
+# that from y to the other y; L_k and V_k are those of `RaySurroundings`):
 #
 #     own:     mu, mu', w.d, w.n of the other end, refracted w.e, log of the depth of y in mean free paths;
 #              log P, log of the way to y in mean free paths, n.d, n.e, L_k, -V_k.n, V_k.e
@@ -261,7 +261,7 @@ def _tangents(at: SurfacePoint) -> tuple[Any, Any]:
 # the
 #              two, over those of a plane, within 1/4 and 4, exp(-sigma_t |y_i - y_o|) less that of a plane, and the
 #              shares of S_0 that are mixed and scattered twice
-#     medium:  nine functions of albedo, g and eta, two of sigma_t' sqrt(area), five of what `mixing` says
+#     medium:  nine functions of albedo, g and eta, two of sigma_t' sqrt(area), five of `Mixed`
 #
 # What stands behind a semicolon, own numbers summed over both ends, is 0 on a plane. All are free of scale, place and
 # turn, and exchanged with the ends.
@@ -304,10 +304,10 @@ def medium(subject: Subject, channel: int, mixed: Mixed) -> np.ndarray:
     """The numbers of the medium of a channel and of the object as a whole, (16,)."""
     m = subject.media[channel]
     albedo, g, eta = (np.float64(v) for v in (m.albedo, m.g, m.eta))
-    size = float(m.sigma_t_prime) * math.sqrt(subject.found.area)
-    found = medium_features(np, albedo, g, eta, length_scale(albedo, g))
+    size = float(m.sigma_t_prime) * math.sqrt(subject.object.area)
+    of_medium = medium_features(np, albedo, g, eta, length_scale(albedo, g))
     sizes = [1 / (1 + 0.1 * size), 0.2 * math.log1p(size), 0.3 * math.log(mixed.chord + 1e-2)]
-    return np.array([*found, *sizes, mixed.q, mixed.q_reduced, mixed.q_direct, mixed.k], dtype=np.float32)
+    return np.array([*of_medium, *sizes, mixed.q, mixed.q_reduced, mixed.q_direct, mixed.k], dtype=np.float32)
 
 
 def describe(
@@ -316,13 +316,13 @@ def describe(
     """The descriptors of pairs for each channel, with the shares of `Backbone`; those of one extinction share rays."""
     line = Line.between(exit.at.p, entry.at.p)
     clear: dict[float, tuple[Any, Any]] = {}
-    found = []
+    pairs = []
     for c, m in enumerate(subject.media):
         key = float(m.sigma_t)
         if key not in clear:
             clear[key] = _clearance(subject, exit.event.ys[c], entry.event.ys[c], active)
-        found.append(_channel(subject, c, exit, entry, line, clear[key], shares[c]))
-    return found
+        pairs.append(_channel(subject, c, exit, entry, line, clear[key], shares[c]))
+    return pairs
 
 
 def _channel(
@@ -372,7 +372,7 @@ def _clearance(subject: Subject, a: Any, b: Any, active: Any) -> tuple[Any, Any]
     line = Line.between(a, b)
 
     def reach(start: Any, d: Any, needed: Any) -> Any:
-        hit = subject.found.scene.ray_intersect_preliminary(mi.Ray3f(start, d), False, needed)
+        hit = subject.object.scene.ray_intersect_preliminary(mi.Ray3f(start, d), False, needed)
         return dr.select(hit.is_valid() & (hit.t < line.length), hit.t, line.length)
 
     one = reach(a, line.d, active)

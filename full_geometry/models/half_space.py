@@ -35,14 +35,14 @@ class HalfSpace:
     @functools.cached_property
     def floors(self) -> list[float]:
         """Per channel floor of G: floor R_d / (A N), N = 4 pi C_phi(1/eta) normalises F_t over exit directions."""
-        found = []
+        floors = []
         for m in self.subject.media:
             N = 4 * math.pi * fresnel.C_phi(1 / m.eta)
             albedo = float(m.albedo_prime)
             R_d = albedo**2 * math.exp(-2 * math.sqrt(max(1 - albedo, 0.0)))
             share = self.floor * max(R_d, 1e-6) if float(m.sigma_s) > 0 else 0.0
-            found.append(share / (self.subject.found.area * N))
-        return found
+            floors.append(share / (self.subject.object.area * N))
+        return floors
 
     def end(self, at: SurfacePoint, active: Any = True) -> Side:
         """What belongs to one end alone."""

@@ -61,7 +61,7 @@ ALBEDO, G, ETA = (0.02, 1.0), (-0.3, 0.95), (1.0, 1.7)  # the albedo reduced
 #     S_twice = F_t(w_o) P_o F_t(w_i) P_i m_2 max(v - v', 0),    v = (4 pi)² p_o p_i exp(-sigma_t d)/(d² + e²),
 #
 # v' the same of a plane, whose light of two events the half-space has; e² a twelfth of the squared ways to both y, as
-# these are places in the mean; p of |g| <= 0.6, as so are directions. Light of more events is that of `mixing`.
+# these are places in the mean; p of |g| <= 0.6, as so are directions. Light of more events: `Mixed`.
 
 
 MODEL = "neural"
@@ -91,13 +91,13 @@ class Backbone(HalfSpace):
     def shares(self, S_0: Any, exit: Side, entry: Side) -> list[tuple[Any, Any]]:
         """Per channel the parts of S_0, of this pair, that are mixed and that are scattered twice; 0 on a plane."""
         F_t = self.query(exit.at, entry.at)[1]
-        found = []
+        parts = []
         for c, (mixture, twice) in enumerate(zip(self.mixtures, self.twice(exit, entry))):
             over = dr.select(
                 S_0[c] > LEAST_S, F_t * exit.event.P[c] * entry.event.P[c] / dr.maximum(S_0[c], LEAST_S), 0
             )
-            found.append((number(mixture.M) * over, twice * over))
-        return found
+            parts.append((number(mixture.M) * over, twice * over))
+        return parts
 
     def twice(self, exit: Side, entry: Side) -> Any:
         """S_twice/(F_t(w_o) P_o F_t(w_i) P_i) per channel, that of a plane taken off."""
@@ -105,7 +105,7 @@ class Backbone(HalfSpace):
         o, i = (refract_in(side.at, eta)[0] for side in (exit, entry))
         line = Line.between(exit.at.p, entry.at.p)
         d_o, d_i = on_a_plane(exit.at.n_out, o, entry.at.n_out, i, line)
-        found = []
+        channels = []
         for c, (m, mixture) in enumerate(zip(self.subject.media, self.mixtures)):
             t = number(max(float(m.sigma_t), 1e-20))
             ys = exit.event.ys[c], entry.event.ys[c]
@@ -113,8 +113,8 @@ class Backbone(HalfSpace):
             flat = Line.between(d_o / t, mi.Vector3f(line.length, 0, 0) + d_i / t)
             here = _twice(m, o, i, Line.between(*ys), spread)
             plane = _twice(m, d_o, d_i, flat, 2 / dr.square(t))
-            found.append(number(mixture.m_2) * dr.maximum(here - plane, 0))
-        return mi.Spectrum(found)
+            channels.append(number(mixture.m_2) * dr.maximum(here - plane, 0))
+        return mi.Spectrum(channels)
 
 
 def _twice(m: Medium, d_o: Any, d_i: Any, line: Line, spread: Any) -> Any:
@@ -145,7 +145,7 @@ class NeuralShape:
         half_space: S_0 P_o P_i.
         weights: W_k (outputs, inputs) and b_k of the layers.
         media: numbers of each channel.
-        scales: s of each channel, see `balance`; 1 if there are none.
+        scales: s of each channel, see `calibrated`; 1 if there are none.
     """
 
     subject: Subject
@@ -265,15 +265,15 @@ def calibration_weight(mixture: Mixed) -> float:
 
 def _mean(sample: Callable[[int, int], np.ndarray], fewest: int, most: int) -> np.ndarray:
     """Mean of each channel of samples (channels, n), n doubled until it is known well enough."""
-    found, k = sample(fewest, 0), 0
-    while found.shape[1] < most and (_relative_error(found) > ENOUGH).any():
+    samples, k = sample(fewest, 0), 0
+    while samples.shape[1] < most and (_relative_error(samples) > ENOUGH).any():
         k += 1
-        found = np.concatenate([found, sample(found.shape[1], k)], axis=1)
-    return found.mean(axis=1)
+        samples = np.concatenate([samples, sample(samples.shape[1], k)], axis=1)
+    return samples.mean(axis=1)
 
 
-def _relative_error(found: np.ndarray) -> np.ndarray:
-    return found.std(axis=1) / np.maximum(found.mean(axis=1), 1e-30) / np.sqrt(found.shape[1])
+def _relative_error(samples: np.ndarray) -> np.ndarray:
+    return samples.std(axis=1) / np.maximum(samples.mean(axis=1), 1e-30) / np.sqrt(samples.shape[1])
 
 
 def _walks(subject: Subject, n: int, k: int) -> np.ndarray:
@@ -320,9 +320,9 @@ def load(path: Path) -> dict[str, np.ndarray]:
         raise ValueError(f"{path}: arrays must be W_k and b_k of two layers or more, got {sorted(arrays)}")
     widths = [inputs, *(arrays[f"b_{k}"].size for k in range(depth))]
     for k in range(depth):
-        found, wanted = (arrays[f"W_{k}"].shape, arrays[f"b_{k}"].shape), (widths[k + 1], widths[k])
-        if found != (wanted, wanted[:1]) or widths[-1] != outputs:
-            raise ValueError(f"{path}: layer {k} must go from {widths[k]} to {widths[k + 1]} numbers, got {found}")
+        shapes, wanted = (arrays[f"W_{k}"].shape, arrays[f"b_{k}"].shape), (widths[k + 1], widths[k])
+        if shapes != (wanted, wanted[:1]) or widths[-1] != outputs:
+            raise ValueError(f"{path}: layer {k} must go from {widths[k]} to {widths[k + 1]} numbers, got {shapes}")
     return {name: value.astype(np.float32) for name, value in arrays.items()}
 
 
@@ -340,6 +340,6 @@ def transport(subject: Subject, path: str | os.PathLike | None = None) -> Neural
         ValueError: the file cannot be used, or the medium varies or is out of the range of `neural`.
     """
     if subject.varying is not None:
-        name = subject.found.shape.id()
+        name = subject.object.shape.id()
         raise ValueError(f"the medium of {name!r} must be the same everywhere for {KIND}, got one that varies")
     return calibrated(NeuralShape.of(subject, load(Path(path) if path is not None else shipped_weights())))

@@ -28,7 +28,7 @@ from full_geometry.object.subject import Subject, SurfacePoint
 from halfspace_sss.neural.perceptron import Perceptron
 from halfspace_sss.rendering.transport.plane import number
 
-# ---- S of one object: a start, times what a small network has learnt, evaluated in Dr.Jit ----------
+# ---- S of one object: a base model times what a small network has learnt, evaluated in Dr.Jit ----------
 
 
 # ---- What leaves at an exit under the same light from everywhere, learnt beside S ------------------
@@ -49,7 +49,7 @@ class DirectionalAlbedo:
         subject: the object.
         frame: of the features.
         weights: A_k (outputs, inputs) and a_k of the layers.
-        trusted: (2, channels) from `even_light.trusted`.
+        trusted: (2, channels) from `learning.training.trusted`.
     """
 
     subject: Subject

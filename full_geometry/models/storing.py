@@ -74,7 +74,7 @@ def find_weights(subject: Subject, folder: str | os.PathLike | None = None) -> P
             reasons.append(f"{path.name}: {error}")
     why = f" ({'; '.join(reasons)})" if reasons else ""
     raise ValueError(
-        f"object {subject.found.name} must be trained for {KIND}, got one that is not in {place}{why}; "
+        f"object {subject.object.name} must be trained for {KIND}, got one that is not in {place}{why}; "
         "`halfspace-sss train --scene` does it"
     )
 

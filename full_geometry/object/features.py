@@ -96,13 +96,13 @@ def surroundings(subject: Subject, frame: Any, turns: np.ndarray | None = None) 
 def _turns(subject: Subject, frame: Any, fields: Surroundings) -> np.ndarray:
     """C^(-1/2) of the fields over random points and over their first events, with what takes their means off."""
     at = subject.random_points(generator(mi, POINTS, pass_seed(SEED)))
-    found = []
+    turns = []
     for kind, place in ((POINT, at.p), (EVENT, first_event(subject, at).y)):
         values = np.stack([v.numpy() for v in fields(frame.position(place), kind)]).astype(float)
         spread, axes = np.linalg.eigh(np.cov(values))
         turn = (axes / np.sqrt(np.maximum(spread, 0) + LEAST_SPREAD**2)) @ axes.T
-        found.append(np.column_stack([turn, -turn @ values.mean(axis=1)]))
-    return np.array(found, dtype=np.float32)
+        turns.append(np.column_stack([turn, -turn @ values.mean(axis=1)]))
+    return np.array(turns, dtype=np.float32)
 
 
 def insides(subject: Subject, frame: Any, low: np.ndarray, cell: float, cells: np.ndarray) -> np.ndarray:
@@ -114,8 +114,8 @@ def insides(subject: Subject, frame: Any, low: np.ndarray, cell: float, cells: n
     votes = mi.UInt32(0)
     for ray in RAYS:
         p, d = frame.back(mi.Vector3f(*q), dr.normalize(mi.Vector3f(*ray)))
-        si = subject.found.scene.ray_intersect(mi.Ray3f(p, d))
-        votes += dr.select(si.is_valid() & (dr.dot(d, si.n) * number(subject.found.sign) > 0), mi.UInt32(1), 0)
+        si = subject.object.scene.ray_intersect(mi.Ray3f(p, d))
+        votes += dr.select(si.is_valid() & (dr.dot(d, si.n) * number(subject.object.sign) > 0), mi.UInt32(1), 0)
     return (votes >= 2).numpy().astype(np.float32).reshape(cells[::-1])
 
 
@@ -128,11 +128,11 @@ def _fields(inside: np.ndarray, path: float) -> np.ndarray:
 
 def _bounds(subject: Subject, frame: Any) -> tuple[np.ndarray, np.ndarray]:
     """Of the object in its frame."""
-    parameters = mi.traverse(subject.found.shape)
+    parameters = mi.traverse(subject.object.shape)
     if "vertex_positions" in parameters:
         corners = mi.Point3f(np.array(parameters["vertex_positions"]).reshape(-1, 3).T)
     else:
-        box = subject.found.shape.bbox()
+        box = subject.object.shape.bbox()
         low, high = (np.array(v, dtype=np.float32).ravel() for v in (box.min, box.max))
         corners = mi.Point3f(np.where(np.indices((2, 2, 2)).reshape(3, 8) > 0, high[:, None], low[:, None]))
     q = np.array(frame.position(corners)).reshape(3, -1).astype(float)
@@ -221,9 +221,9 @@ class Terms(NamedTuple):
 
     def matrix(self, numbers: np.ndarray) -> np.ndarray:
         """Numbers (..., products) as matrices (..., heads, 1 + features)."""
-        found = np.zeros((*numbers.shape[:-1], len(self.heads), int(self.cols.max()) + 1), numbers.dtype)
-        found[..., self.rows, self.cols] = numbers
-        return found
+        symmetric = np.zeros((*numbers.shape[:-1], len(self.heads), int(self.cols.max()) + 1), numbers.dtype)
+        symmetric[..., self.rows, self.cols] = numbers
+        return symmetric
 
 
 class Quadratic:
@@ -250,11 +250,11 @@ class Quadratic:
 
 
 def _octaves(x: Any) -> list[Any]:
-    found = list(x)
+    columns = list(x)
     for k in range(OCTAVES):
         for component in x:
-            found += dr.sincos(math.pi * 2**k * component)
-    return found
+            columns += dr.sincos(math.pi * 2**k * component)
+    return columns
 
 
 def side_features(frame: ObjectFrame, side: Side) -> list[Any]:

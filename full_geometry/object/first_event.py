@@ -81,14 +81,14 @@ def _growth(ratio: Any) -> Any:
 
 def first_event(subject: Subject, at: SurfacePoint, active: Any = True) -> FirstEvent:
     """Of light that goes in or out along w at a point of the surface."""
-    sigma_t, eta, sign = subject.sigma_t, number(subject.eta), number(subject.found.sign)
+    sigma_t, eta, sign = subject.sigma_t, number(subject.eta), number(subject.object.sign)
     media = subject.walk_media
     d, _, valid = refract_in(at, eta)
     flags = mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame
 
-    def step(k: Any, o: Any, d: Any, skip: Any, v: Any, way: Any, found: tuple, active: Any) -> tuple:
-        P, moments, length = found
-        si = subject.found.scene.ray_intersect(mi.Ray3f(o + d * skip, d), flags, False, active)
+    def step(k: Any, o: Any, d: Any, skip: Any, v: Any, way: Any, sums: tuple, active: Any) -> tuple:
+        P, moments, length = sums
+        si = subject.object.scene.ray_intersect(mi.Ray3f(o + d * skip, d), flags, False, active)
         l = dr.select(si.is_valid(), si.t + skip, 1e4 / dr.min(sigma_t))  # noqa: E741
         through, inner = flight(subject, o, d, l)
         part, inner = v * (1 - through), v * inner

@@ -102,7 +102,7 @@ def _kabsch(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray, float
 
 def identify(subject: Subject) -> Identity:
     """The identity of an object as it stands."""
-    shape = subject.found.shape
+    shape = subject.object.shape
     parameters = mi.traverse(shape)
     topology = ""
     if "faces" in parameters:
@@ -129,13 +129,13 @@ def _digest_of_grids(subject: Subject) -> str:
     medium = subject.varying
     if medium is None:
         return ""
-    found = hashlib.sha256()
+    digest = hashlib.sha256()
     for volume in (medium.density, medium.albedo_volume):
         voxels = np.zeros(0) if volume is None else np.ascontiguousarray(grid_values(volume), dtype=np.float32)
-        found.update(str(voxels.shape).encode() + voxels.tobytes())
+        digest.update(str(voxels.shape).encode() + voxels.tobytes())
     ratios = (*medium.factor / medium.factor.max(), *medium.albedo)
-    found.update("|".join(f"{v:.6g}" for v in ratios).encode())
-    return found.hexdigest()[:16]
+    digest.update("|".join(f"{v:.6g}" for v in ratios).encode())
+    return digest.hexdigest()[:16]
 
 
 def _probed(subject: Subject, anchors: np.ndarray) -> np.ndarray:
@@ -148,7 +148,7 @@ def _probed(subject: Subject, anchors: np.ndarray) -> np.ndarray:
     centre, some = anchors.mean(axis=0), anchors[:: max(len(anchors) // PROBED, 1)]
     points = np.concatenate([centre + depth * (some - centre) for depth in DEPTHS])
     values = np.concatenate(subject.varying.coefficients(mi.Point3f(points.T.astype(np.float32))))
-    return (values * np.sqrt(subject.found.area)).astype(np.float32)
+    return (values * np.sqrt(subject.object.area)).astype(np.float32)
 
 
 def _check_same(trained: np.ndarray, here: np.ndarray) -> None:

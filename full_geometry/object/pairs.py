@@ -71,12 +71,12 @@ def shuffled(parts: list[Pairs], order: np.random.Generator) -> Pairs:
     faces = None if parts[0].faces is None else np.concatenate([part.faces for part in parts])[places]
     random = np.flatnonzero(places >= values.shape[1] - parts[-1].values.shape[1]), parts[-1].drawn
     drawn = sum(part.drawn for part in parts)
-    found = Pairs(features[:, places], values[:, places], drawn, faces, random=random)
+    pairs = Pairs(features[:, places], values[:, places], drawn, faces, random=random)
     if parts[0].even is None:
-        return found
+        return pairs
     exits, T = (np.concatenate(columns, axis=1) for columns in zip(*(part.even for part in parts)))
     places = order.permutation(T.shape[1])
-    return found._replace(even=AlbedoSamples(exits[:, places], T[:, places]))
+    return pairs._replace(even=AlbedoSamples(exits[:, places], T[:, places]))
 
 
 class EntryProposals:
@@ -100,10 +100,10 @@ class EntryProposals:
         patches: PatchSampler | None = None,
     ) -> None:
         live = [m for m in base.models if float(m.medium.sigma_s) > 0]
-        table = RadialTable(live or base.models, subject.found.size)
+        table = RadialTable(live or base.models, subject.object.size)
         self.subject, self.base, self.patches = subject, base, patches
         # light may leave by another piece of the surface than it entered by
-        self.positions = PositionSampler(replace(subject.found, pieces=None), table, subject.points, area_share)
+        self.positions = PositionSampler(replace(subject.object, pieces=None), table, subject.points, area_share)
 
     def sample(
         self, exit: SurfacePoint, rng: Any, table: ExitTable | None = None, k: Any = 0
@@ -116,12 +116,12 @@ class EntryProposals:
             table: of weights of patches, which are asked of the network otherwise.
             k: of each exit, its number in the table.
         """
-        out = Exit(exit.p, exit.n_out, exit.w, number(self.subject.found.sign))
+        out = Exit(exit.p, exit.n_out, exit.w, number(self.subject.object.sign))
         known = (out, mi.UInt32(k))
         if self.patches is None:
             entry = self.positions.sample(*known, Numbers(rng), mi.Bool(True))
         else:
-            drawn = LearntProposals(self.patches, self.positions, PATCH_SHARE, self.subject.found.sign, table)
+            drawn = LearntProposals(self.patches, self.positions, PATCH_SHARE, self.subject.object.sign, table)
             where = drawn.prepare(out, PreparedExit(Side(exit, first_event(self.subject, exit)), []), mi.Bool(True))
             entry = drawn.sample(*known, where, Numbers(rng), mi.Bool(True))
         n = entry.n_face

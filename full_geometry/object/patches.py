@@ -44,9 +44,9 @@ def mesh_faces(subject: Subject) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     Raises:
         ValueError: the shape is no mesh.
     """
-    parameters = mi.traverse(subject.found.shape)
+    parameters = mi.traverse(subject.object.shape)
     if "faces" not in parameters:
-        raise ValueError(f"shape must be a mesh to be cut into patches, got {subject.found.shape.class_name()}")
+        raise ValueError(f"shape must be a mesh to be cut into patches, got {subject.object.shape.class_name()}")
     faces = np.array(parameters["faces"]).reshape(-1, 3)
     a, b, c = np.array(parameters["vertex_positions"], dtype=float).reshape(-1, 3)[faces].transpose(1, 0, 2)
     cross = np.cross(b - a, c - a)
@@ -257,8 +257,8 @@ class PatchTable:
             u_face, u = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
             cell = dr.arange(mi.UInt32, n)
             at = subject.points.on_face(cell, u) if n == len(of_face) else parts.point(cell, u_face, u)
-            n_out = mi.Normal3f(turned(at.n_shading, at.n) * subject.found.sign)
-            normal = mi.Normal3f(at.n * subject.found.sign)
+            n_out = mi.Normal3f(turned(at.n_shading, at.n) * subject.object.sign)
+            normal = mi.Normal3f(at.n * subject.object.sign)
             exit = surface_point(at.p, normal, n_out, cosine_direction(n_out, normal, rng))
             total = total + _weights(sampler, Side(exit, first_event(subject, exit)), n)
         rows = np.cumsum(total / EXITS, axis=1).astype(np.float32)

@@ -102,8 +102,8 @@ def traced(subject: Subject, exits: SurfacePoint, walks: int, seed: tuple[int, .
     """Radiance of exits by so many walks of each; `orders` as for `trace_exits`."""
     sums = _Sums(dr.width(exits.p))
     for k, per_exit in enumerate(_passes(sums.n_exits, walks)):
-        found = trace_exits(subject, _repeated(exits, per_exit), (*seed, k), **orders)
-        sums.add(found.T, found.at.w, per_exit)
+        ends = trace_exits(subject, _repeated(exits, per_exit), (*seed, k), **orders)
+        sums.add(ends.T, ends.at.w, per_exit)
     return sums.estimate()
 
 

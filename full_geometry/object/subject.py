@@ -47,14 +47,14 @@ class Subject:
     """One translucent object on its own.
 
     Args:
-        found: its geometry.
+        object: its geometry.
         media: scalar medium of each channel of the variant, 1/(scene unit).
         boundary: its smooth dielectric.
         points: uniform points of its surface.
         varying: how its medium varies in space, 1/(scene unit); `media` are then a homogeneous equivalent.
     """
 
-    found: Object
+    object: Object
     media: tuple[Medium, ...]
     boundary: Any
     points: AreaPoints
@@ -77,12 +77,12 @@ class Subject:
 
     @classmethod
     def surveyed(
-        cls, found: Object, media: tuple[Medium, ...], varying: VaryingMedium | None = None, mm_per_unit: float = 1.0
+        cls, object: Object, media: tuple[Medium, ...], varying: VaryingMedium | None = None, mm_per_unit: float = 1.0
     ) -> Subject:
         """The object of a known geometry and the scalar medium of each channel, 1/(scene unit).
 
         Args:
-            found: geometry.
+            object: geometry.
             media: of each channel; of a medium that varies the homogeneous equivalent.
             varying: how the medium varies, 1/mm.
             mm_per_unit: length of a scene unit, mm.
@@ -90,11 +90,11 @@ class Subject:
         Raises:
             ValueError: its normals point to both sides.
         """
-        _check_geometry(found)
+        _check_geometry(object)
         boundary = smooth_boundary(media[0].eta)
         if varying is not None:
             varying = replace(varying, factor=varying.factor * mm_per_unit)
-        return cls(found, media, boundary, AreaPoints(found.shape), varying)
+        return cls(object, media, boundary, AreaPoints(object.shape), varying)
 
     @classmethod
     def given(
@@ -113,12 +113,12 @@ class Subject:
         """
         if not isinstance(shape, mi.Scene):
             return cls.of(shape, medium, 1.0 if mm_per_unit is None else mm_per_unit)
-        found = survey(_object_of(shape, name))
-        check_empty(shape, [found], "learning")
+        object = survey(_object_of(shape, name))
+        check_empty(shape, [object], "learning")
         unit = millimetres(shape) if mm_per_unit is None else mm_per_unit
-        inside = equivalent(found.shape.bsdf().inside, found)
-        subject = cls.surveyed(found, _in_scene_units(inside.medium, unit), inside.varying, unit)
-        check_size(subject.found, [float(m.sigma_t) for m in subject.media], unit)
+        inside = equivalent(object.shape.bsdf().inside, object)
+        subject = cls.surveyed(object, _in_scene_units(inside.medium, unit), inside.varying, unit)
+        check_size(subject.object, [float(m.sigma_t) for m in subject.media], unit)
         return subject
 
     def as_trained(self, medium: dict[str, Any]) -> Subject:
@@ -129,7 +129,7 @@ class Subject:
         if self.varying is None or len(medium["albedo"]) != len(self.media):
             return self
         known = zip(medium["albedo"], medium["size_in_mfp"], medium["g"])
-        length = math.sqrt(self.found.area)
+        length = math.sqrt(self.object.area)
         media = tuple(Medium.from_albedo(albedo, size / length, g, self.eta) for albedo, size, g in known)
         return replace(self, media=media)
 
@@ -151,7 +151,7 @@ class Subject:
             values = {key: np.array([getattr(m, key) for m in self.media]) for key in ("sigma_s", "sigma_a", "g")}
             medium = Medium(**values, eta=self.eta)
         inside = Inside("medium", medium, "", "total", True, self.varying)
-        return WalkMedia([self.found], [inside], self.found.scene, [self.boundary], 1.0)
+        return WalkMedia([self.object], [inside], self.object.scene, [self.boundary], 1.0)
 
     @functools.cached_property
     def _local_channels(self) -> tuple[int, int]:
@@ -186,12 +186,12 @@ class Subject:
         """Points uniform over the area, seen along geometric normals: `n_out` is the interpolated one itself."""
         u_face, u = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
         at = self.points.sample(u_face, u, True)
-        n = at.n * self.found.sign
-        return surface_point(at.p, n, turned(at.n_shading, at.n) * self.found.sign, n)
+        n = at.n * self.object.sign
+        return surface_point(at.p, n, turned(at.n_shading, at.n) * self.object.sign, n)
 
     def mean_free_paths(self) -> np.ndarray:
         """sigma_t sqrt(area) of each channel: the size of the object in mean free paths."""
-        return np.array([float(m.sigma_t) for m in self.media]) * math.sqrt(self.found.area)
+        return np.array([float(m.sigma_t) for m in self.media]) * math.sqrt(self.object.area)
 
 
 def _in_scene_units(medium: Medium, mm_per_unit: float) -> tuple[Medium, ...]:
@@ -236,11 +236,11 @@ def refract_in(at: SurfacePoint, eta: Any) -> tuple[Any, Any, Any]:
     return mi.Vector3f(dr.normalize(d)), dr.select(valid, 1 - F, 0), valid
 
 
-def _check_geometry(found: Object) -> None:
+def _check_geometry(object: Object) -> None:
     """ValueError if the faces of an object do not all point to the same side: one sign stands for all of them."""
-    if found.signs is not None:
+    if object.signs is not None:
         raise ValueError(
-            f"normals of {found.name} must all point to the same side to be learnt, got pieces that disagree"
+            f"normals of {object.name} must all point to the same side to be learnt, got pieces that disagree"
         )
 
 

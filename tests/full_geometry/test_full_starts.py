@@ -101,9 +101,9 @@ def test_renders_ask_the_model_that_was_trained(trained: Trained, monkeypatch: p
     shape = mi.load_dict({"type": "sphere", "radius": 3.0, "bsdf": surface})
     here = Subject.of(shape, WAX.channel(1))
     inside = Inside("medium", here.media[0], "full_geometry", "multiple", True)
-    transport = learnt_means(here.found, inside, list(here.media), Settings()).transport
+    transport = learnt_means(here.object, inside, list(here.media), Settings()).transport
     o, i = points(here)
-    out = Exit(o.p, o.n_out, o.w, mi.Float(here.found.sign), o.n)
+    out = Exit(o.p, o.n_out, o.w, mi.Float(here.object.sign), o.n)
     entry = Entry(i.p, i.n, i.n_out, mi.Float(1), mi.UInt32(0))
     mu = np.array(mi.Float(sum(a * b for a, b in zip(i.w, i.n_out))))
     rendered = np.array(transport.S_mu(transport.prepare(out, True), entry, i.w, True))

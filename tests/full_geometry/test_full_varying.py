@@ -15,7 +15,6 @@ dr = pytest.importorskip("drjit")
 mi = pytest.importorskip("mitsuba")
 pytest.importorskip("torch")
 
-from full_geometry.learning import training  # noqa: E402
 from full_geometry.learning.fitting import Recipe  # noqa: E402
 from full_geometry.learning.model_errors import LIGHTS, measure  # noqa: E402
 from full_geometry.learning.training import Trained, train  # noqa: E402
@@ -45,10 +44,9 @@ def variant() -> None:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory):
-    """Where weights are kept and looked for; the truth of validations is noisier than by default."""
+    """Where weights are kept and looked for."""
     found = tmp_path_factory.mktemp("weights")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(training, "WALKS", 512)
         patch.setenv(known_weights.ENVIRONMENT_VARIABLE, str(found))
         yield found
 
@@ -190,6 +188,7 @@ def test_nobody_is_told_of_means_where_the_medium_is_learnt(trained: Trained) ->
     assert not any("varies in space" in str(warning.message) for warning in found)
 
 
+@pytest.mark.slow
 def test_an_object_of_the_figures_can_be_learnt_and_rendered(folder: Path, tmp_path: Path) -> None:
     from figures.modelling.scene_parts import learnable_parts, make_varying
 
