@@ -66,7 +66,7 @@ def ours(task: Task) -> dict[str, Any]:
     from figures.studies.rivals import BACKBONE
     from full_geometry.learning.training import train_by_cpu
     from full_geometry.models.half_space import HalfSpace
-    from full_geometry.object.pairs import Proposals
+    from full_geometry.object.pairs import EntryProposals
     from full_geometry.object.radiance import modelled
     from full_geometry.object.subject import Subject
 
@@ -75,7 +75,7 @@ def ours(task: Task) -> dict[str, Any]:
     subject = Subject.of(*shape_of("bunny", task.folder))
     learnt, _ = train_by_cpu(subject, p["seconds"], task.folder, seed=p["seed"])
     truth = truth_of(subject, p)
-    proposals = Proposals(subject, HalfSpace(subject, BACKBONE)).with_patches(learnt.sampler)
+    proposals = EntryProposals(subject, HalfSpace(subject, BACKBONE)).with_patches(learnt.sampler)
     found = modelled(learnt.model, proposals, truth.exits, p["walks"], p["seed"])
     rows = [{"method": OURS, "N": n, **_rmse(found, truth, p["walks"] / n)} for n in p["numbers"]]
     return {"rows": rows}

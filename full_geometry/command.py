@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from importlib.util import find_spec
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from full_geometry.learning.model_errors import ModelError, errors_of, transport
+from full_geometry.learning.model_errors import RadianceError, errors_of, transport
 from full_geometry.models.storing import KIND, find_weights, trained
 from full_geometry.object.subject import Subject
 from halfspace_sss.checks import check_count
@@ -20,8 +19,6 @@ from halfspace_sss.progress import NamedProgress
 from halfspace_sss.rendering.scenes.learners import LearntObject, ObjectError
 from halfspace_sss.rendering.surface.transports import model_names
 
-__all__ = ["cost", "errors", "train", "untrained"]
-
 
 def untrained(scene: Any) -> list[str]:
     """Ids of the objects of a scene that have this model and no weights yet; none without torch, which learns them.
@@ -29,7 +26,7 @@ def untrained(scene: Any) -> list[str]:
     Raises:
         ValueError: one cannot be learnt, or the folder of weights cannot be written to.
     """
-    found = []
+    missing = []
     for shape in scene.shapes() if find_spec("torch") else ():
         inside = getattr(shape.bsdf(), "inside", None)
         asked = inside is not None and inside.model == KIND and inside.orders != "single"
@@ -37,34 +34,19 @@ def untrained(scene: Any) -> list[str]:
             continue
         subject = Subject.given(scene, None, None, shape.id())
         if not trained(subject):
-            found.append(shape.id())
-    if found:
+            missing.append(shape.id())
+    if missing:
         check_weights_folder()
-    return found
+    return missing
 
 
-def train(
-    scene: Any,
-    *,
-    object: str | None = None,
-    seconds: float = 60.0,
-    target_error: float | None = None,
-    seed: int = 0,
-    folder: Path | None = None,
-    work: Path | None = None,
-    progress: NamedProgress | None = None,
-    camera: Any = None,
-    start: str | None = None,
-) -> LearntObject:
-    """As `learning.training.train`, of which the rows of errors are told with the names of object and channels."""
+def train(scene: Any, **how: Any) -> LearntObject:
+    """As `learning.training.train`; rows of errors have the names of object and channels."""
     from full_geometry.learning.training import train as learn
 
-    found = learn(
-        scene, object=object, seconds=seconds, target_error=target_error, seed=seed, folder=folder, work=work,
-        progress=progress, camera=camera, start=start,
-    )  # fmt: skip
-    name = found.model.subject.found.shape.id()
-    return LearntObject(name, found.path, _rows(name, KIND, found.errors), found.steps, found.seconds)
+    learnt = learn(scene, **how)
+    name = learnt.model.subject.object.shape.id()
+    return LearntObject(name, learnt.path, _rows(name, KIND, learnt.errors), learnt.steps, learnt.seconds)
 
 
 def errors(
@@ -94,29 +76,29 @@ def errors(
     check_count("exits", exits, 2)
     subject = Subject.given(scene, None, None, object)
     transports = {name: transport(subject, name) for name in models} or _that_take(subject)
-    name = subject.found.shape.id()
-    found = errors_of(subject, transports, exits=exits, seed=seed, progress=progress)
-    return [row for model, rows in found.items() for row in _rows(name, model, rows)]
+    name = subject.object.shape.id()
+    by_model = errors_of(subject, transports, exits=exits, seed=seed, progress=progress)
+    return [row for model, rows in by_model.items() for row in _rows(name, model, rows)]
 
 
 def cost(scene: Any, object: str) -> float:
     """Seconds that the weights of an object of a scene took to learn; ValueError if it has not been trained."""
-    found = find_weights(Subject.given(scene, None, None, object))
-    return float(load_weights(found, KIND)[1].get("seconds", 0.0))
+    path = find_weights(Subject.given(scene, None, None, object))
+    return float(load_weights(path, KIND)[1].get("seconds", 0.0))
 
 
 def _that_take(subject: Subject) -> dict[str, Any]:
     """All transports of an object that can be asked."""
-    found = {}
+    transports = {}
     for name in sorted(model_names(), key=half_space_models().__contains__):
         try:
-            found[name] = transport(subject, name)
+            transports[name] = transport(subject, name)
         except ValueError:
             continue
-    return found
+    return transports
 
 
-def _rows(name: str, model: str, errors: list[ModelError]) -> list[ObjectError]:
+def _rows(name: str, model: str, errors: list[RadianceError]) -> list[ObjectError]:
     n = 1 + max((row.channel for row in errors), default=0)
     channels = "RGB" if n == 3 else ["mono"]
     return [ObjectError(name, channels[e.channel], model, e.light, e.error, e.standard_error, e.ratio) for e in errors]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -31,9 +30,6 @@ from halfspace_sss.rendering.transport.protocols import Entry, Means
 from halfspace_sss.rendering.transport.radial_table import RadialTable
 from halfspace_sss.rendering.transport.settings import AUTOMATIC, Settings
 
-__all__ = ["LearntTransport", "learnt_means", "shape_means", "warn_out_of_range"]
-
-
 FINE = 2.5  # transport mean free paths of the radius of a patch, up to which patches do without probes
 PATCH_SHARE = 0.2  # of the entries where patches are larger: they reach what probes miss
 SAMPLERS = "halfspace_sss.samplers"  # entry points: a function of `Learnt`, with arrays of its own, and a sign
@@ -46,7 +42,7 @@ class LearntTransport:
 
     Args:
         model: what was learnt.
-        checksums: of the file of weights, and of those of its start.
+        checksums: of the file of weights, and of those of its base model.
     """
 
     model: FullGeometry
@@ -56,20 +52,23 @@ class LearntTransport:
     def prepare(self, out: Exit, active: Any) -> PreparedExit:
         return self.model.prepare(SurfacePoint(out.p, out.n_face, out.n, out.w), active)
 
-    @property
-    def alpha(self) -> Callable[[Exit, Any], tuple[Any, Any]]:
-        """See `Transport`; AttributeError where the model does not know it."""
-        known = self.model.alpha
-        return lambda out, active: known(SurfacePoint(out.p, out.n_face, out.n, out.w), active)
+    def S_mu(self, prepared: PreparedExit, entry: Entry, w_i: Any, active: Any) -> Any:
+        n_out, mu_i = entry.seen(w_i)
+        return self.model.S(prepared, SurfacePoint(entry.p, entry.n_face, n_out, w_i), active) * mu_i
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectTransport(LearntTransport):
+    """S of an object together with its directional albedo under uniform illumination."""
+
+    def alpha(self, out: Exit, active: Any) -> tuple[Any, Any]:
+        """See `Transport`."""
+        return self.model.alpha(SurfacePoint(out.p, out.n_face, out.n, out.w), active)
 
     @property
     def evened(self) -> tuple[Any, Any]:
         """See `Transport`."""
         return self.model.alpha.evened
-
-    def S_mu(self, prepared: PreparedExit, entry: Entry, w_i: Any, active: Any) -> Any:
-        n_out, mu_i = entry.seen(w_i)
-        return self.model.S(prepared, SurfacePoint(entry.p, entry.n_face, n_out, w_i), active) * mu_i
 
 
 def _weights(subject: Subject, settings: Settings) -> Path:
@@ -82,37 +81,37 @@ def _weights(subject: Subject, settings: Settings) -> Path:
     from full_geometry.learning.training import train
 
     warnings.warn(
-        f"object {subject.found.name} has no weights: it is learnt first, for {settings.train_seconds:g} s",
+        f"object {subject.object.name} has no weights: it is learnt first, for {settings.train_seconds:g} s",
         stacklevel=2,
     )
     return train(subject, seconds=settings.train_seconds, target_error=settings.train_error).path
 
 
-def learnt_means(found: Object, inside: Inside, media: list[Medium], settings: Settings) -> Means:
+def learnt_means(object: Object, inside: Inside, media: list[Medium], settings: Settings) -> Means:
     """Transport and proposals of an object that was trained, or is now for `train_seconds` of the settings.
 
     Raises:
         ValueError: the object cannot be trained, was not and has no time for it, or weights are damaged.
     """
-    check_surface(found.shape.id(), found.shape.bsdf())
-    subject = Subject.surveyed(found, tuple(media), inside.varying, settings.mm_per_unit)
+    check_surface(object.shape.id(), object.shape.bsdf())
+    subject = Subject.surveyed(object, tuple(media), inside.varying, settings.mm_per_unit)
     path = _weights(subject, settings)
     learnt = load(path, subject)
     model, sampler, _ = learnt
-    backbone = model.start.models
-    transport = LearntTransport(model, (checksum_of(path, KIND), *load_weights(path, KIND)[1][CHECKSUMS]))
-    table = RadialTable([m for m in backbone if float(m.medium.sigma_s) > 0], found.size)
+    backbone = model.base.models
+    transport = ObjectTransport(model, (checksum_of(path, KIND), *load_weights(path, KIND)[1][CHECKSUMS]))
+    table = RadialTable([m for m in backbone if float(m.medium.sigma_s) > 0], object.size)
     by_itself = AREA_SHARE if sampler is None else 0.0  # patches reach everywhere
     share = by_itself if settings.area_share == AUTOMATIC else settings.area_share
-    positions = PositionSampler(replace(found, pieces=None), table, subject.points, share)
+    positions = PositionSampler(replace(object, pieces=None), table, subject.points, share)
     if sampler is None:
         return Means(transport, HalfSpaceProposals(positions, backbone[0]))
     for _, refine in offered(SAMPLERS) if learnt.others else ():
-        return Means(transport, refine(learnt, found.sign), ENTRIES)
-    radius = np.sqrt(found.area / (np.pi * sampler.patches.n))
+        return Means(transport, refine(learnt, object.sign), ENTRIES)
+    radius = np.sqrt(object.area / (np.pi * sampler.patches.n))
     sigma_t_prime = np.mean([float(m.sigma_t_prime) for m in media])
     patch_share = 1.0 if radius * sigma_t_prime < FINE else PATCH_SHARE
-    proposals = LearntProposals(sampler, positions, patch_share, found.sign, PatchTable(sampler))
+    proposals = LearntProposals(sampler, positions, patch_share, object.sign, PatchTable(sampler))
     return Means(transport, proposals, ENTRIES)
 
 
@@ -122,12 +121,12 @@ def learnt_means(found: Object, inside: Inside, media: list[Medium], settings: S
 SLACK = 1e-3  # of the bounds, for rounding
 
 
-def warn_out_of_range(found: Object, media: tuple[Medium, ...]) -> None:
+def warn_out_of_range(object: Object, media: tuple[Medium, ...]) -> None:
     """Warn, by name and number, of what the network was not trained on: size, medium, or an object that is open."""
-    name, reasons = found.shape.id(), []
+    name, reasons = object.shape.id(), []
     scattering = [m for m in media if float(m.sigma_s) > 0]
     numbers = {
-        "sigma_t sqrt(area)": (SIZE, [float(m.sigma_t) * math.sqrt(found.area) for m in scattering]),
+        "sigma_t sqrt(area)": (SIZE, [float(m.sigma_t) * math.sqrt(object.area) for m in scattering]),
         "reduced albedo": (ALBEDO, [float(m.albedo_prime) for m in scattering]),
         "g": (G, [float(m.g) for m in scattering]),
         "eta": (ETA, [float(m.eta) for m in scattering]),
@@ -136,7 +135,7 @@ def warn_out_of_range(found: Object, media: tuple[Medium, ...]) -> None:
         outside = [v for v in values if not low - SLACK * abs(low) <= v <= high + SLACK * abs(high)]
         if outside:
             reasons.append(f"{what} {', '.join(f'{v:.4g}' for v in outside)} is not in [{low:g}, {high:g}]")
-    if not found.closed:
+    if not object.closed:
         reasons.append("it is not closed")
     if reasons:
         warnings.warn(
@@ -144,22 +143,22 @@ def warn_out_of_range(found: Object, media: tuple[Medium, ...]) -> None:
         )
 
 
-def shape_means(found: Object, inside: Inside, media: list[Medium], settings: Settings) -> Means:
+def shape_means(object: Object, inside: Inside, media: list[Medium], settings: Settings) -> Means:
     """Transport and proposals of any object with a homogeneous medium and a smooth boundary.
 
     Raises:
         ValueError: the boundary is rough, the medium varies or is out of the range of `neural`, or normals of pieces
             of the object disagree.
     """
-    surface = found.shape.bsdf()
+    surface = object.shape.bsdf()
     if hasattr(surface, "inside"):
-        check_surface(found.shape.id(), surface)
-    subject = Subject.surveyed(found, tuple(media), inside.varying, settings.mm_per_unit)
-    warn_out_of_range(found, subject.media)
+        check_surface(object.shape.id(), surface)
+    subject = Subject.surveyed(object, tuple(media), inside.varying, settings.mm_per_unit)
+    warn_out_of_range(object, subject.media)
     model = transport(subject)
     live = [m for m in model.half_space.models if float(m.medium.sigma_s) > 0]
-    table = RadialTable(live, found.size)
-    share = area_share(found, table.mean / found.size, settings.area_share)
+    table = RadialTable(live, object.size)
+    share = area_share(object, table.mean / object.size, settings.area_share)
     # light may leave by another piece of the surface than it entered by
-    positions = PositionSampler(replace(found, pieces=None), table, AreaPoints(found.shape), share)
+    positions = PositionSampler(replace(object, pieces=None), table, AreaPoints(object.shape), share)
     return Means(LearntTransport(model, checksums(subject)), HalfSpaceProposals(positions, live[0]))

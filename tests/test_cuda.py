@@ -103,22 +103,24 @@ def test_a_fit_on_the_gpu_is_that_on_the_cpu_and_goes_on_there(tmp_path: object)
     torch = pytest.importorskip("torch")
     if not torch.cuda.is_available():
         pytest.skip("torch sees no GPU")
-    from full_geometry.learning.fitting import Fitting, Recipe
+    from full_geometry.learning.fitting import ObjectFit, Recipe
     from full_geometry.object.features import n_pair, n_side
-    from full_geometry.object.pairs import Even, Pairs
+    from full_geometry.object.pairs import AlbedoSamples, Pairs
 
     n_in, n = 2 * n_side(1) + n_pair(1), 4096
     rng = np.random.default_rng(1)
 
     def pairs() -> Pairs:
-        even = Even(np.abs(rng.standard_normal((n_side(1), n))).astype(np.float32), np.full((2, n), 0.2, np.float32))
+        even = AlbedoSamples(
+            np.abs(rng.standard_normal((n_side(1), n))).astype(np.float32), np.full((2, n), 0.2, np.float32)
+        )
         features = rng.standard_normal((n_in, n)).astype(np.float32)
         return Pairs(features, rng.random((1, n), dtype=np.float32), n, None, even)
 
     walks, proposals = pairs(), pairs()
 
-    def fit() -> Fitting:
-        found = Fitting(n_in, 1, 1.4, Recipe(width=16, depth=2, batch=512, reuse=2), 3)
+    def fit() -> ObjectFit:
+        found = ObjectFit(n_in, 1, 1.4, Recipe(width=16, depth=2, batch=512, reuse=2), 3)
         found.set_scale(walks)
         found.use(walks, proposals, 16, np.random.default_rng(2))
         return found
@@ -128,6 +130,6 @@ def test_a_fit_on_the_gpu_is_that_on_the_cpu_and_goes_on_there(tmp_path: object)
     for name, value in here.arrays().items():
         assert np.allclose(there.arrays()[name], value, atol=2e-3 * max(np.abs(value).max(), 0.05))
     there.save(tmp_path / "state", 1, [])
-    fresh = on(LLVM, lambda: Fitting(n_in, 1, 1.4, Recipe(width=16, depth=2, batch=512, reuse=2), 4))
+    fresh = on(LLVM, lambda: ObjectFit(n_in, 1, 1.4, Recipe(width=16, depth=2, batch=512, reuse=2), 4))
     assert fresh.load(tmp_path / "state") == (1, [])
     assert all(np.array_equal(fresh.arrays()[name], value) for name, value in there.arrays().items())

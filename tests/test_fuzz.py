@@ -37,7 +37,7 @@ COMPUTES = [  # what is replaced: the properties are of what comes before the co
     "halfspace_sss.trade.flat.references", "halfspace_sss.trade.assessing.assess_stage",
     "halfspace_sss.trade.assessing.assess_for", "halfspace_sss.trade.checking.check.check_scene",
     "halfspace_sss.trade.checking.random_scenes.write_scene", "figures.studies.shape_errors.evaluate",
-    "full_geometry.learning.shape_training._Run", "full_geometry.learning.training._Run",
+    "full_geometry.learning.shape_training._ShapeTraining", "full_geometry.learning.training._ObjectTraining",
     "full_geometry.command.errors_of", "figures.studies.paper_network.fit_paper",
     "figures.studies.rivals.error_table", "figures.studies.rivals.start_table",
 ]  # fmt: skip

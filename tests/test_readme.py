@@ -1,4 +1,4 @@
-"""README.md says what is true: its snippets run, its commands are understood, and the check runs its test command."""
+"""README.md and the guide say what is true: snippets run, commands are understood, the check runs the test command."""
 
 from __future__ import annotations
 
@@ -14,32 +14,70 @@ import typer
 from halfspace_sss.cli import app as cli
 
 ROOT = Path(__file__).resolve().parent.parent
-README = (ROOT / "README.md").read_text(encoding="utf-8")
-BLOCKS = re.findall(r"^```(\w+)\n(.*?)^```", README, flags=re.MULTILINE | re.DOTALL)
-SNIPPETS = [text for language, text in BLOCKS if language == "python"]
-COMMANDS = [
-    part.strip()
-    for language, text in BLOCKS
-    if language == "bash"
-    for line in text.splitlines()
-    for part in line.split("#")[0].split("&&")
-    if part.strip().startswith("halfspace-sss")
+LINES, WORDS = 170, 25  # most of README.md, and of a sentence on average
+PAGES = [
+    "README.md",
+    *(
+        f"docs/{name}.md"
+        for name in (
+            "index",
+            "curves",
+            "materials",
+            "tracing",
+            "rendering",
+            "learnt_models",
+            "choosing",
+            "figures",
+            "conventions",
+            "formats",
+            "limits",
+        )
+    ),
 ]
+TEXTS = {page: (ROOT / page).read_text(encoding="utf-8") for page in PAGES}
+BLOCKS = {page: re.findall(r"^```(\w+)\n(.*?)^```", text, flags=re.M | re.S) for page, text in TEXTS.items()}
+SNIPPETS = {
+    page: [text for language, text in blocks if language == "python"]
+    for page, blocks in BLOCKS.items()
+    if any(language == "python" for language, _ in blocks)
+}
+COMMANDS = list(
+    dict.fromkeys(
+        part.strip()
+        for blocks in BLOCKS.values()
+        for language, text in blocks
+        if language == "bash"
+        for line in text.splitlines()
+        for part in line.split("#")[0].split("&&")
+        if part.strip().startswith("halfspace-sss")
+    )
+)
+RUN = """
+import sys
+
+for number, text in enumerate(sys.argv[1:]):
+    exec(compile(text, f"snippet {number}", "exec"), {"__name__": "__main__"})
+    print(f"\\nend of {number}", flush=True)
+"""
 
 
-@pytest.mark.parametrize("number", range(len(SNIPPETS)))
-def test_a_snippet_runs(number: int, tmp_path: Path) -> None:
-    run = subprocess.run([sys.executable, "-c", SNIPPETS[number]], cwd=tmp_path, capture_output=True, text=True)
+@pytest.mark.parametrize("page", SNIPPETS)
+def test_snippets_run_and_print(page: str, tmp_path: Path) -> None:
+    command = [sys.executable, "-c", RUN, *SNIPPETS[page]]  # one process: imports and kernels are shared
+    run = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert run.returncode == 0, run.stderr
-    assert run.stdout
+    printed = re.split(r"\nend of \d+\n", run.stdout)[:-1]
+    assert len(printed) == len(SNIPPETS[page])
+    assert all(text.strip() for text in printed)
 
 
 @pytest.mark.parametrize("line", COMMANDS)
 def test_a_command_is_understood(line: str) -> None:
-    _, name, *arguments = shlex.split(line)
-    group = typer.main.get_command(cli.app)
-    command = group.get_command(None, name)
-    assert command is not None, name
+    name, arguments, command = "halfspace-sss", shlex.split(line)[1:], typer.main.get_command(cli.app)
+    while hasattr(command, "get_command"):  # groups, down to the command itself
+        name, *arguments = arguments
+        command = command.get_command(None, name)
+        assert command is not None, name
     command.make_context(name, arguments)
 
 
@@ -47,13 +85,33 @@ def test_every_command_is_shown() -> None:
     assert set(cli._OWN) <= {line.split()[1] for line in COMMANDS}
 
 
-def test_links_to_files_hold() -> None:
-    for target in re.findall(r"\]\(([^)#:]+)\)", README):
-        assert (ROOT / target).is_file(), target
+def test_links_to_files_and_headings_hold() -> None:
+    for page, text in TEXTS.items():
+        for target, heading in re.findall(r"\]\(([^)#:\s]*)(?:#([^)]+))?\)", text):
+            file = (ROOT / page).parent / target if target else ROOT / page
+            assert file.is_file(), (page, target)
+            if heading:
+                titles = re.findall(r"^#+ (.*)$", file.read_text(encoding="utf-8"), flags=re.M)
+                slugs = [re.sub(r"[\s-]+", "-", re.sub(r"[^\w\s-]", "", title).strip().lower()) for title in titles]
+                assert heading in slugs, (page, target, heading)
+
+
+def test_the_guide_is_short_to_read() -> None:
+    assert len(TEXTS["README.md"].splitlines()) <= LINES
+    for page, text in TEXTS.items():
+        lengths = [len(sentence.split()) for sentence in _sentences(text)]
+        assert sum(lengths) <= WORDS * len(lengths), page
+
+
+def _sentences(text: str) -> list[str]:
+    """Sentences of the paragraphs and list items of a page, without code, tables, pictures and headings."""
+    prose = re.sub(r"^```.*?^```", "", text, flags=re.M | re.S)
+    prose = re.sub(r"^(?:\||#|!| {4}[^ -]).*$", "", prose, flags=re.M)
+    return [part for part in re.split(r"(?<=[.!?])\s+|\n\s*\n|\n\s*[-*] ", prose) if part.strip()]
 
 
 def test_the_check_installs_and_tests_as_the_readme_says() -> None:
-    (line,) = [line for _, text in BLOCKS for line in text.splitlines() if line.endswith("&& pytest")]
+    (line,) = [line for _, text in BLOCKS["README.md"] for line in text.splitlines() if line.endswith("&& pytest")]
     check = (ROOT / ".ci" / "run").read_text(encoding="utf-8").splitlines()
     for command in line.split(" && "):
         assert any(line == command or line.startswith(f"{command} ||") for line in check), command

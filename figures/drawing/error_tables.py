@@ -19,18 +19,24 @@ LATE_ROULETTE = volume(200)  # the usual setting of volpathmis for media that ha
 WANTED = 0.02  # noise of an image, root mean square over that of the image, at which a training is held against time
 CERTAIN = 2.0  # standard errors by which an error must stand out of the noise of the truth
 NOTES = """\
-Cost is mean squared error of the pixels of the object times CPU seconds, compilation left out; a ratio is the cost of
-`volpathmis` at the best of its settings over that of the method: how many times less time the method needs for the
-same error. *Variance*: the error is that about a long independent render by the same method. *With bias*: it is that
-about the path traced image, at the number of samples of this run; bias does not fall with time, so this ratio does.
-*Bias* is the root mean square of what the model would still be off after any time, over that of the image, and
-*until* the CPU seconds after which `volpathmis` is as near to the truth as that. A dash: lost in the noise of the
-truth.
-Russian roulette only adds variance: where a setting of `volpathmis` seems to have less than one whose roulette begins
-later, it has not met its rare bright paths yet, and counts with the variance of the other. `volpathmis` renders the
-channels of a medium whose mean cosine differs between them one by one. Ratios do not count the *training* of
-`full_geometry`, which draws two entries an exit, and one under an even sky; with it counted, it has *paid after* so
-many images of 2 % noise."""
+Cost is the mean squared error of the pixels of the object times CPU seconds, without compilation. A ratio is the cost
+of `volpathmis`, at the best of its settings, over that of the method: how many times less time the method needs for
+equal error.
+
+| column | meaning |
+|---|---|
+| variance | ratio with the error about a long independent render by the same method |
+| with bias | ratio with the error about the path traced image at this number of samples; bias makes it fall with time |
+| bias | root mean square of the error after infinite time, over that of the image |
+| until | CPU seconds after which `volpathmis` is as near to the truth as that bias |
+| training | of `full_geometry`, not counted in the ratios |
+| paid after | images of 2 % noise after which the training has paid |
+| a dash | lost in the noise of the truth |
+
+Russian roulette only adds variance. A setting of `volpathmis` with seemingly less variance than one of later roulette
+has not met its rare bright paths yet, and counts with the variance of the other. `volpathmis` renders the channels of
+a medium one by one if their mean cosines differ. `full_geometry` draws two entries an exit, and one under an even
+sky."""
 BARE_NOTES = """\
 The models without surface reflection and without the single scattering that they lack, against `volpathmis` at its
 best setting and at rr_depth 200."""

@@ -19,23 +19,32 @@ JOBS = ((0.02, 1), (0.05, 1), (0.05, 100), (0.1, 1), (0.2, 1))  # tolerance, ima
 INTRODUCTION = """\
 # Speed against accuracy on scenes
 
-Made by `halfspace-sss figures all trade`: this page, the figure, its data (`halfspace-sss trade` shows them) and the
-page to flip between the images. The bunny is 37 mm tall; the spikes, a ball with bumps and thorns, are about as large
-across. The small light stands behind the object, so that what the camera sees of it came through.
+`halfspace-sss figures all trade` makes this page, the figure, its data (shown by `halfspace-sss trade`) and the page
+to flip between the images. The bunny is 37 mm tall; the spikes, a ball with bumps and thorns, are about as large
+across. The small light stands behind the object: what the camera sees of it was transmitted.
 
-*Bias* is the relative error of radiance that no number of samples removes: root mean square over visible points and
-channels, noise of both sides taken out, with its standard error; after < stands what it is below in 95 % of cases,
-where it is lost in noise. *Cost* is variance of a sample times its seconds, which is the time to a given noise. Times
-are those of the processor, all cores together, compilation left out; variances are without the brightest of 10⁴
-samples, as filters take fireflies better than samples do. What cannot be told in {seconds:g} s for a scene and all
-ways is left open. The bunny was learnt by `full_geometry`, the spikes were not, as an object that is new. Light that
-passes unscattered is in the walks and not in the models of half-spaces, which is most of their bias of ketchup.
+| term | meaning |
+|---|---|
+| bias | relative error of radiance at any number of samples, noise of both sides subtracted, ± standard error |
+| points | root mean square over visible points and channels |
+| < x | bias lost in noise, below x in 95 % of cases |
+| cost | variance of a sample times its seconds: the time to a given noise |
+| seconds | of the processor, all cores together, without compilation |
+| variance | without the brightest of 10⁴ samples, as filters take fireflies better than samples do |
+
+What cannot be told in {seconds:g} s for a scene and all ways is left open. `full_geometry` learnt the bunny but not
+the spikes, which stand for a new object. Unscattered light is in the walks and not in the half-space models: most of
+their bias of ketchup.
 """
 KNOBS = """\
-Bunny, small light; cost over that of the usual setting, error where the setting has one. *Entries* is the parameter of
-`bssrdf`. *Channels in one walk* is no setting: walks for each channel are what one walk for all spares. *Nodes*
-of photon beam diffusion (`n_samples`) and *precision* of a network: time of S alone, error against walks of the
-half-space. Precision is no setting either: networks run in single precision, in half on CUDA, which has no other.
+Bunny, small light; cost over that of the usual setting, error where the setting has one.
+
+| knob | meaning |
+|---|---|
+| entries | parameter of `bssrdf` |
+| channels in one walk | no setting: the cost of a walk for each channel, which one walk for all saves |
+| nodes | `n_samples` of photon beam diffusion: time of S alone, error against walks of the half-space |
+| precision | of a network, measured as nodes; no setting: single precision, on CUDA half |
 """
 
 

@@ -15,12 +15,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import torch
 
 from figures.studies.flow import ConditionalFlow, FlowSampler
 from figures.studies.flow_chart import N_CONTEXT, Chart, context, direction_square
-from figures.studies.flow_training import FlowNetwork, FlowRecipe, Schedule, Walks, flow_walks
+from figures.studies.flow_training import FlowNetwork, FlowRecipe, TimedFit, Walks, flow_walks
 from full_geometry.learning.networks import Layers, PatchLogits
 from full_geometry.object.features import Side, n_side, side_features
 from full_geometry.object.first_event import first_event
@@ -29,9 +31,6 @@ from full_geometry.object.patches import Patches, PatchSampler, PatchWeights, cl
 from full_geometry.object.subject import Subject, SurfacePoint
 from halfspace_sss.neural.perceptron import Perceptron
 from halfspace_sss.rendering.transport.plane import number
-
-__all__ = ["AlphaP", "PreparedAlphaP", "fit_alpha_p"]
-
 
 CLEAR = 1e-4  # of the size of the object: where the ray that finds a face begins
 
@@ -64,13 +63,10 @@ class AlphaP:
 
     def _face(self, at: SurfacePoint, active: Any) -> tuple[Any, Any]:
         """The face that a point lies on, as a short ray from outside meets it, and where there is one."""
-        import drjit as dr
-        import mitsuba as mi
-
-        clear = number(CLEAR * self.subject.found.size)
+        clear = number(CLEAR * self.subject.object.size)
         ray = mi.Ray3f(mi.Point3f(at.p + at.n * clear), mi.Vector3f(-at.n))
         ray.maxt = 2 * clear
-        hit = self.subject.found.scene.ray_intersect_preliminary(ray, False, active=mi.Bool(active))
+        hit = self.subject.object.scene.ray_intersect_preliminary(ray, False, active=mi.Bool(active))
         return dr.select(hit.is_valid(), mi.UInt32(hit.prim_index), 0), active & hit.is_valid()
 
     @functools.cached_property
@@ -83,8 +79,6 @@ class AlphaP:
 
     def prepare(self, at: SurfacePoint, active: Any = True) -> PreparedAlphaP:
         """alpha and the weights of patches of an exit."""
-        import drjit as dr
-
         side = Side(at, first_event(self.subject, at, active))
         features = side_features(self.sampler.frame, side)
         alpha = dr.exp(self._log_alpha(features)[0])
@@ -99,9 +93,6 @@ class AlphaP:
             active: mask of lanes.
                 face: of the entry; found by a ray if it is not given.
         """
-        import drjit as dr
-        import mitsuba as mi
-
         if face is None:
             face, active = self._face(at, active)
         sampler = self.sampler
@@ -150,7 +141,7 @@ def fit_alpha_p(subject: Subject, recipe: FlowRecipe | None = None, seed: int = 
     pilot = flow_walks(subject, frame, patches, chart, recipe.chunk, (seed, 70))
     mean = pilot.total.mean(axis=0).astype(np.float64)
     scale = np.where(mean > 0, 1 / np.maximum(mean, 1e-30), 0.0).astype(np.float32)
-    schedule = Schedule(list(nets.parameters()), recipe)
+    schedule = TimedFit(list(nets.parameters()), recipe)
     order = np.random.default_rng([seed, 71])
 
     def loss(walks: Walks, rows: np.ndarray) -> torch.Tensor:

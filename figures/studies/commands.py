@@ -15,8 +15,6 @@ from halfspace_sss.provenance import check_folder, write_atomically, write_toget
 if TYPE_CHECKING:
     import pandas
 
-__all__ = ["TABLES", "markdown", "rivals_command", "shapes_command"]
-
 
 # ---- Tables of samplers, of models and of base models of one object --------------------------------
 
@@ -54,9 +52,9 @@ def rivals_command(
     loaded, files = load_objects(scene, parameters), {}
     for name in chosen:
         with Bar(name) as bar:
-            found = _made(name, loaded, object, seconds, samples, seed, bar)
-        files[out / f"{name}.csv"] = found.to_csv(index=False, lineterminator="\n")
-        files[out / f"{name}.md"] = markdown(_errors_wide(found, KEYS[name]) if name in KEYS else found)
+            frame = _made(name, loaded, object, seconds, samples, seed, bar)
+        files[out / f"{name}.csv"] = frame.to_csv(index=False, lineterminator="\n")
+        files[out / f"{name}.md"] = markdown(_errors_wide(frame, KEYS[name]) if name in KEYS else frame)
     write_together(files)
     for path, text in files.items():
         if path.suffix == ".md":
@@ -146,21 +144,21 @@ def shapes_command(
     use_mitsuba(VARIANT)
     from figures.studies import shape_errors
 
-    found: dict[str, str] = {}
+    tables: dict[str, str] = {}
     with Bar("shapes") as bar:
 
         def show(what: str, done: int, total: int) -> None:
             bar.show(done, total, what)
 
         balls = shape_errors.evaluate(shape_errors.spheres(), len(shape_errors.RADII), progress=show)
-        found[f"Spheres: {SPHERE_NOTE}"] = shape_errors.case_table(balls)
+        tables[f"Spheres: {SPHERE_NOTE}"] = shape_errors.case_table(balls)
         if mesh is not None:
             bunny = list(shape_errors.of_mesh(mesh, MATERIALS, mm_per_unit))
-            found["speed"] = shape_errors.speed_table(shape_errors.seconds_per_million(bunny[6].subject))
+            tables["speed"] = shape_errors.speed_table(shape_errors.seconds_per_million(bunny[6].subject))
             rows = shape_errors.evaluate(iter(bunny), len(bunny), progress=show)
-            found[f"{mesh.stem}"] = shape_errors.summary(rows) + "\n" + shape_errors.case_table(rows)
+            tables[f"{mesh.stem}"] = shape_errors.summary(rows) + "\n" + shape_errors.case_table(rows)
         rows = shape_errors.evaluate(shape_errors.held_out(objects), objects, progress=show)
-        found["held-out"] = (
+        tables["held-out"] = (
             shape_errors.summary(rows) + "\n" + shape_errors.by_property(rows) + "\n" + shape_errors.case_table(rows)
         )
         if pictures is not None:
@@ -171,15 +169,15 @@ def shapes_command(
         if work is not None:
             from figures.studies.shape_ablation import ablation_table
 
-            found["ablation"] = ablation_table(work, seconds, show)
-    _write(out, found)
+            tables["ablation"] = ablation_table(work, seconds, show)
+    _write(out, tables)
     typer.echo(f"written: {out}")
 
 
-def _write(out: Path, found: dict[str, str]) -> None:
+def _write(out: Path, tables: dict[str, str]) -> None:
     """Replace what stands between the marks of each table; what has no marks is put at the end."""
     text = out.read_text(encoding="utf-8") if out.exists() else ""
-    for name, table in found.items():
+    for name, table in tables.items():
         key = name.split(":")[0].lower()
         marks = f"<!-- {key} -->\n", f"<!-- end of {key} -->\n"
         block = f"{marks[0]}{table}{marks[1]}"

@@ -10,11 +10,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from figures.studies.flow_chart import Chart, context
 from full_geometry.models.storing import KIND, Learnt
-from full_geometry.object.features import Frame, PreparedExit, Side
+from full_geometry.object.features import ObjectFrame, PreparedExit, Side
 from full_geometry.object.patches import PatchSampler, PatchTable, PatchWeights
 from halfspace_sss.neural.perceptron import Perceptron, relu
 from halfspace_sss.neural.store import load_weights, save_weights
@@ -22,20 +24,6 @@ from halfspace_sss.rendering.surface.object import turned
 from halfspace_sss.rendering.transport.area_points import Point
 from halfspace_sss.rendering.transport.plane import Exit, number
 from halfspace_sss.rendering.transport.protocols import CosineProposals, Entry
-
-__all__ = [
-    "BINS",
-    "LEAST_SLOPE",
-    "PARAMETERS",
-    "ConditionalFlow",
-    "FlowProposals",
-    "FlowSampler",
-    "add_flow",
-    "flow_of",
-    "flow_proposals",
-    "Spline",
-]
-
 
 # ----------------------------------------------------------------------------------------------------
 # Monotonic rational-quadratic splines of [-1, 1] onto itself, in Dr.Jit (Durkan, Bekasov, Murray, Papamakarios 2019).
@@ -68,8 +56,6 @@ class Spline:
     """
 
     def __init__(self, raw: Sequence[Any]) -> None:
-        import drjit as dr
-
         bound = -math.log(LEAST_SLOPE)
         slopes = [dr.exp(a / (1 + dr.abs(a) / bound)) for a in raw[2 * BINS :]]
         self.widths, self.heights = (_shares(part, bound) for part in (raw[:BINS], raw[BINS : 2 * BINS]))
@@ -77,30 +63,23 @@ class Spline:
 
     def _bin(self, at: Any, by_y: bool) -> _Bin:
         """The bin in which x, or y, lies."""
-        import drjit as dr
-        import mitsuba as mi
-
-        found = _Bin(*map(mi.Float, (-1, -1, self.widths[0], self.heights[0], self.slopes[0], self.slopes[1])))
+        bin = _Bin(*map(mi.Float, (-1, -1, self.widths[0], self.heights[0], self.slopes[0], self.slopes[1])))
         x, y = mi.Float(-1), mi.Float(-1)
         for k in range(1, BINS):
             x, y = x + self.widths[k - 1], y + self.heights[k - 1]
             here = _Bin(x, y, self.widths[k], self.heights[k], self.slopes[k], self.slopes[k + 1])
             beyond = at >= (y if by_y else x)
-            found = _Bin(*(dr.select(beyond, a, b) for a, b in zip(here, found)))
-        return found
+            bin = _Bin(*(dr.select(beyond, a, b) for a, b in zip(here, bin)))
+        return bin
 
     def forward(self, x: Any) -> tuple[Any, Any]:
         """y and dy/dx."""
-        import drjit as dr
-
         b = self._bin(x, False)
         z = dr.clip((x - b.x) / b.dx, 0, 1)
         return b.y + b.dy * _rational(b, z), _slope(b, z)
 
     def inverse(self, y: Any) -> tuple[Any, Any]:
         """x and dy/dx there."""
-        import drjit as dr
-
         b = self._bin(y, True)
         s, t = b.dy / b.dx, dr.clip((y - b.y) / b.dy, 0, 1)
         bend = t * (b.d + b.d_next - 2 * s)
@@ -111,11 +90,9 @@ class Spline:
 
 def _shares(raw: Sequence[Any], bound: float) -> list[Any]:
     """2 softmax of bounded numbers."""
-    import drjit as dr
-
-    found = [dr.exp(a / (1 + 2 * dr.abs(a) / bound)) for a in raw]
-    scale = 2 / sum(found)
-    return [v * scale for v in found]
+    logits = [dr.exp(a / (1 + 2 * dr.abs(a) / bound)) for a in raw]
+    scale = 2 / sum(logits)
+    return [v * scale for v in logits]
 
 
 def _rational(b: _Bin, z: Any) -> Any:
@@ -200,7 +177,7 @@ class FlowSampler:
     flow: ConditionalFlow
 
     @property
-    def frame(self) -> Frame:
+    def frame(self) -> ObjectFrame:
         """Of the object."""
         return self.patches.frame
 
@@ -218,7 +195,7 @@ class FlowSampler:
         return self.patches.density(weights, face) * self.flow.density(told, self.chart.coordinates(face, p))
 
 
-class _Prepared(NamedTuple):
+class _FlowOfExit(NamedTuple):
     side: Side
     weights: PatchWeights | None
 
@@ -237,14 +214,11 @@ class FlowProposals(CosineProposals):
     sign: float
     table: PatchTable | None = None
 
-    def prepare(self, out: Exit, prepared: PreparedExit, active: Any) -> _Prepared:
+    def prepare(self, out: Exit, prepared: PreparedExit, active: Any) -> _FlowOfExit:
         weights = self.sampler.patches.prepare(prepared.side) if self.table is None else None
-        return _Prepared(prepared.side, weights)
+        return _FlowOfExit(prepared.side, weights)
 
-    def sample(self, out: Exit, prim_index: Any, prepared: _Prepared, sampler: Any, active: Any) -> Entry:
-        import drjit as dr
-        import mitsuba as mi
-
+    def sample(self, out: Exit, prim_index: Any, prepared: _FlowOfExit, sampler: Any, active: Any) -> Entry:
         u = sampler.next_1d(), tuple(sampler.next_2d())
         weights = prepared.weights if self.table is None else self.table.weights(prim_index)
         at, density = self.sampler.sample(prepared.side, weights, *u)

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
-from full_geometry.object.features import Frame, Side
+from full_geometry.object.features import ObjectFrame, Side
 from full_geometry.object.patches import Patches, mesh_faces
 from full_geometry.object.subject import Subject
 from halfspace_sss.rendering.transport.area_points import Point
-
-__all__ = ["N_CONTEXT", "Chart", "PatchFrame", "context", "direction_square", "from_square"]
-
 
 # ---- The square [0, 1)² laid onto each patch of a surface, so that equal areas stay equal ----------
 # A patch has two axes, the principal ones of its faces. Along the first its faces are put together to strips; u_1
@@ -42,14 +41,11 @@ class Chart:
         patches: of its surface.
     """
 
-    def __init__(self, subject: Subject, frame: Frame, patches: Patches) -> None:
-        import drjit as dr
-        import mitsuba as mi
-
+    def __init__(self, subject: Subject, frame: ObjectFrame, patches: Patches) -> None:
         self.subject = subject
         centroids, normals, areas = mesh_faces(subject)
         turn = np.eye(3) if frame.turn is None else np.array([np.array(row).ravel() for row in frame.turn])
-        centres, axes = _axes(centroids, normals * subject.found.sign, areas, patches, turn)
+        centres, axes = _axes(centroids, normals * subject.object.sign, areas, patches, turn)
         along, across = (np.einsum("fi,fi->f", centroids - centres[patches.of_face], axes[patches.of_face, k])
                          for k in (0, 1))  # fmt: skip
         strips = _strips(along, areas, patches)
@@ -69,23 +65,16 @@ class Chart:
         self.n_faces, self.n_strips = len(order), len(strips.first)
 
     def _row(self, key: str, k: Any) -> Any:
-        import drjit as dr
-
         return dr.gather(type(self.tables[key]), self.tables[key], k)
 
     def frame(self, patch: Any) -> PatchFrame:
         """The frame of a patch."""
-        import mitsuba as mi
-
         v = [self._row("frames", patch * 13 + k) for k in range(13)]
         axes = tuple(mi.Vector3f(*v[k : k + 3]) for k in (3, 6, 9))
         return PatchFrame(mi.Point3f(*v[:3]), axes, v[12])
 
     def point(self, patch: Any, u: tuple[Any, Any]) -> Point:
         """The point of a patch with coordinates u."""
-        import drjit as dr
-        import mitsuba as mi
-
         first, end = self._row("strips", patch), self._row("strips", patch + 1)
         strip = self._last_below("low_1", first, end, u[0], self.n_strips)
         face = self._last_below("ordered_low", self._row("start", strip), self._row("start", strip + 1), u[1],
@@ -97,11 +86,8 @@ class Chart:
 
     def coordinates(self, face: Any, p: Any) -> tuple[Any, Any]:
         """Coordinates in its patch of a point of a face."""
-        import drjit as dr
-        import mitsuba as mi
-
-        index = self.subject.found.shape.face_indices(face)
-        a, b, c = (self.subject.found.shape.vertex_position(i) for i in (index.x, index.y, index.z))
+        index = self.subject.object.shape.face_indices(face)
+        a, b, c = (self.subject.object.shape.vertex_position(i) for i in (index.x, index.y, index.z))
         ab, ac, ap = b - a, c - a, p - a
         n = dr.cross(ab, ac)
         square = dr.maximum(dr.squared_norm(n), 1e-38)
@@ -115,8 +101,6 @@ class Chart:
 
     def _last_below(self, key: str, first: Any, end: Any, u: Any, n: int) -> Any:
         """The last of the entries first ... end - 1 of a table that rises that is not above u."""
-        import drjit as dr
-        import mitsuba as mi
 
         def before(i: Any) -> Any:
             i = mi.UInt32(i)
@@ -175,10 +159,10 @@ def _strips(along: np.ndarray, areas: np.ndarray, patches: Patches) -> _Strips:
     number = np.maximum(np.sqrt(faces).astype(int), 1)
     wanted = np.minimum((np.clip(middle, 0, 1) * number[of]).astype(int), number[of] - 1)
     keys = of.astype(np.int64) * (number.max() + 1) + wanted
-    found, first, strip = np.unique(keys, return_index=True, return_inverse=True)
+    strips, first, strip = np.unique(keys, return_index=True, return_inverse=True)
     owner = of[first]
     ends = np.searchsorted(owner, np.arange(n + 1))
-    mass = np.bincount(strip, areas[order], len(found))
+    mass = np.bincount(strip, areas[order], len(strips))
     upto = np.concatenate([[0.0], np.cumsum(mass)])
     low = (upto[:-1] - upto[ends[:-1]][owner]) / patches.areas[owner]
     of_face = np.empty(len(of), dtype=np.uint32)
@@ -201,32 +185,28 @@ def _within(order: np.ndarray, of_face: np.ndarray, areas: np.ndarray, n: int) -
 N_CONTEXT = 18
 
 
-def context(frame: Frame, exit: Side, patch: PatchFrame) -> list[Any]:
+def context(frame: ObjectFrame, exit: Side, patch: PatchFrame) -> list[Any]:
     """The numbers of `N_CONTEXT`.
 
     x_o and y_o in the frame of the patch as v / (|v| + radius), the logarithms of both distances over the radius, n_o
     and w_o in that frame, and the radius, in mean free paths, and the way to y_o, as logarithms.
     """
-    import drjit as dr
 
     def local(v: Any) -> list[Any]:
         return [dr.dot(v, axis) for axis in patch.axes]
 
-    found: list[Any] = []
+    told: list[Any] = []
     for p in (exit.at.p, exit.event.y):
         d = p - patch.centre
         r = dr.norm(d)
-        found += [*local(d / (r + patch.radius)), 0.5 * dr.log(r / patch.radius + 0.05)]
-    found += [*local(exit.at.n_out), *local(exit.at.w), dr.dot(exit.at.n_out, exit.at.w)]
-    found += [0.5 * dr.log(patch.radius * frame.sigma_t + 1e-3), 0.5 * dr.log(exit.event.length * frame.sigma_t + 1e-2)]
-    return [*found, 1 / (1 + patch.radius * frame.sigma_t)]
+        told += [*local(d / (r + patch.radius)), 0.5 * dr.log(r / patch.radius + 0.05)]
+    told += [*local(exit.at.n_out), *local(exit.at.w), dr.dot(exit.at.n_out, exit.at.w)]
+    told += [0.5 * dr.log(patch.radius * frame.sigma_t + 1e-3), 0.5 * dr.log(exit.event.length * frame.sigma_t + 1e-2)]
+    return [*told, 1 / (1 + patch.radius * frame.sigma_t)]
 
 
 def _tangents(n: Any, towards: Any) -> tuple[Any, Any]:
     """Tangents of a normal, the first towards a point as seen from there; any where that is along the normal."""
-    import drjit as dr
-    import mitsuba as mi
-
     flat = towards - n * dr.dot(towards, n)
     length = dr.norm(flat)
     s = dr.select(length > 1e-4 * dr.norm(towards), flat / dr.maximum(length, 1e-30), mi.coordinate_system(n)[0])
@@ -235,9 +215,6 @@ def _tangents(n: Any, towards: Any) -> tuple[Any, Any]:
 
 def direction_square(n: Any, towards: Any, w: Any) -> tuple[Any, Any]:
     """Coordinates in [0, 1)² of a direction above a surface, uniform where it follows the cosine."""
-    import drjit as dr
-    import mitsuba as mi
-
     s, t = _tangents(n, towards)
     u = mi.warp.cosine_hemisphere_to_square(mi.Vector3f(dr.dot(w, s), dr.dot(w, t), dr.maximum(dr.dot(w, n), 0)))
     return tuple(dr.clip(v, 0, 1 - 2.0**-20) for v in u)
@@ -245,8 +222,6 @@ def direction_square(n: Any, towards: Any, w: Any) -> tuple[Any, Any]:
 
 def from_square(n: Any, towards: Any, u: tuple[Any, Any]) -> Any:
     """The direction of coordinates u."""
-    import mitsuba as mi
-
     s, t = _tangents(n, towards)
     v = mi.warp.square_to_cosine_hemisphere(mi.Point2f(*u))
     return s * v.x + t * v.y + n * v.z

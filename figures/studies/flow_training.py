@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import torch
 import zuko
@@ -18,7 +20,7 @@ from figures.studies.flow import BINS, LEAST_SLOPE, ConditionalFlow, FlowSampler
 from figures.studies.flow_chart import N_CONTEXT, Chart, context, direction_square
 from full_geometry.learning.networks import PatchLogits, one_thread, patch_likelihood
 from full_geometry.models.storing import Learnt
-from full_geometry.object.features import Frame, Side, n_side, side_features
+from full_geometry.object.features import ObjectFrame, Side, n_side, side_features
 from full_geometry.object.first_event import first_event
 from full_geometry.object.patches import Patches, PatchSampler
 from full_geometry.object.subject import Subject
@@ -28,21 +30,6 @@ from halfspace_sss.rendering.surface.horizon import cosine_above
 from halfspace_sss.rendering.transport.plane import number, place
 from halfspace_sss.rendering.transport.protocols import Entry
 from halfspace_sss.tracing.walk import generator, pass_seed
-
-__all__ = [
-    "HIDDEN",
-    "LIGHTINGS",
-    "FlowNetwork",
-    "FlowRecipe",
-    "Lighting",
-    "Schedule",
-    "Walks",
-    "fit_flow",
-    "fit_patches",
-    "flow_walks",
-    "lighting",
-]
-
 
 # ---- Training of conditional flows by zuko: -E[T log p(x | context)] over walks --------------------
 
@@ -57,7 +44,7 @@ class FlowNetwork(nn.Module):
         n: dimensions.
         context: numbers that it is told.
         hidden: widths of the hidden layers.
-        seed: of the numbers at the start.
+        seed: of the initial weights.
     """
 
     def __init__(self, n: int, context: int, hidden: tuple[int, ...] = HIDDEN, seed: int = 0) -> None:
@@ -80,11 +67,11 @@ class FlowNetwork(nn.Module):
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Matrices F_k with their masks multiplied in, and biases h_k."""
-        found, layers = {}, [m for m in self.transform.hyper if hasattr(m, "weight")]
+        arrays, layers = {}, [m for m in self.transform.hyper if hasattr(m, "weight")]
         for k, layer in enumerate(layers):
-            found[f"F_{k}"] = (layer.mask * layer.weight).detach().numpy().copy()
-            found[f"h_{k}"] = layer.bias.detach().numpy().copy()
-        return found
+            arrays[f"F_{k}"] = (layer.mask * layer.weight).detach().numpy().copy()
+            arrays[f"h_{k}"] = layer.bias.detach().numpy().copy()
+        return arrays
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -113,14 +100,11 @@ class Lighting:
 
     def sample(self, entry: Any, u: Any, active: Any) -> tuple[Any, Any]:
         """w_i at an entry, and the light from there over its density: 0 in the shadow."""
-        import drjit as dr
-        import mitsuba as mi
-
         w, value, distance = self.aim(entry, u)
-        ray = place(entry.p, mi.Normal3f(entry.n * number(self.subject.found.sign))).spawn_ray(w)
+        ray = place(entry.p, mi.Normal3f(entry.n * number(self.subject.object.sign))).spawn_ray(w)
         ray.maxt = distance
         lit = active & (dr.dot(w, entry.n_face) > 0)
-        return w, dr.select(lit & ~self.subject.found.scene.ray_test(ray, False, lit), value, 0)
+        return w, dr.select(lit & ~self.subject.object.scene.ray_test(ray, False, lit), value, 0)
 
 
 def lighting(name: str, subject: Subject) -> Lighting:
@@ -129,9 +113,6 @@ def lighting(name: str, subject: Subject) -> Lighting:
     Raises:
         ValueError: there is no such kind.
     """
-    import drjit as dr
-    import mitsuba as mi
-
     if name not in LIGHTINGS:
         raise ValueError(f"lighting must be one of {', '.join(LIGHTINGS)}, got {name!r}")
     towards = mi.Vector3f(*TOWARDS.tolist())
@@ -154,12 +135,10 @@ def lighting(name: str, subject: Subject) -> Lighting:
 
 def _above(subject: Subject) -> np.ndarray:
     """A point near the part of the surface that lies farthest towards the light."""
-    import mitsuba as mi
-
     from halfspace_sss.tracing.walk import generator, pass_seed
 
     p = np.array(subject.random_points(generator(mi, 4096, pass_seed(23))).p)
-    return p[:, np.argmax(TOWARDS @ p)] + GAP * float(subject.found.size) * TOWARDS
+    return p[:, np.argmax(TOWARDS @ p)] + GAP * float(subject.object.size) * TOWARDS
 
 
 # ---- Training data of flows: exits of walks as patches and coordinates in them, with their throughput
@@ -193,7 +172,7 @@ class Walks(NamedTuple):
 
 
 def flow_walks(
-    subject: Subject, frame: Frame, patches: Patches, chart: Chart, n: int, seed: tuple[int, ...],
+    subject: Subject, frame: ObjectFrame, patches: Patches, chart: Chart, n: int, seed: tuple[int, ...],
     light: Lighting | None = None,
 ) -> Walks:  # fmt: skip
     """n walks of random exits.
@@ -204,15 +183,12 @@ def flow_walks(
         seed: of the pass.
         light: that falls on the object: one sample of it at each end, times mu_i, is multiplied to T.
     """
-    import drjit as dr
-    import mitsuba as mi
-
     rng = generator(mi, n, pass_seed(*seed, 0))
     starts = subject.random_points(rng)
     exits = trace_exits(subject, starts, (*seed, 1))
     T = exits.T
     if light is not None:
-        n_mesh = mi.Normal3f(exits.at.n * subject.found.sign)
+        n_mesh = mi.Normal3f(exits.at.n * subject.object.sign)
         entry = Entry(exits.at.p, n_mesh, exits.at.n_out, mi.Float(1), exits.face)
         w, value = light.sample(entry, mi.Point2f(rng.next_float32(), rng.next_float32()), dr.max(T) > 0)
         T = T * (value * entry.seen(w)[1])
@@ -235,8 +211,6 @@ def flow_walks(
 
 def _rows(columns: list[Any], n: int) -> np.ndarray:
     """(n, columns) float32."""
-    import drjit as dr
-
     dr.eval(columns)
     return np.ascontiguousarray(np.stack([np.broadcast_to(c.numpy(), n) for c in columns], axis=1))
 
@@ -276,7 +250,7 @@ class FlowRecipe:
         check_count("steps", 1 if self.steps is None else self.steps, 1)
 
 
-class Schedule:
+class TimedFit:
     """Steps of Adam until the CPU seconds are spent, the rate falling by a cosine.
 
     Args:
@@ -345,7 +319,7 @@ def fit_patches(
     recipe, (model, sampler, _) = recipe or FlowRecipe(), learnt
     chart = Chart(model.subject, sampler.frame, sampler.patches)
     net = PatchLogits(n_side(len(model.subject.media)), sampler.patches.areas, recipe.patch_hidden, seed)
-    schedule = Schedule(list(net.parameters()), recipe)
+    schedule = TimedFit(list(net.parameters()), recipe)
 
     def loss(walks: Walks, rows: np.ndarray) -> torch.Tensor:
         x, patch = torch.from_numpy(walks.exit[rows].T.copy()), torch.from_numpy(walks.patch[rows])
@@ -367,7 +341,7 @@ def fit_flow(
     recipe, (model, sampler, _) = recipe or FlowRecipe(), learnt
     chart = Chart(model.subject, sampler.frame, sampler.patches)
     net = FlowNetwork(2, N_CONTEXT, recipe.hidden, seed)
-    schedule = Schedule(list(net.parameters()), recipe)
+    schedule = TimedFit(list(net.parameters()), recipe)
 
     def loss(walks: Walks, rows: np.ndarray) -> torch.Tensor:
         told, u = torch.from_numpy(walks.told[rows]), torch.from_numpy(walks.u[rows, :2])

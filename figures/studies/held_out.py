@@ -7,8 +7,6 @@ import numpy as np
 from full_geometry.learning.meshes import Box, Distance, capsule, cut, join, length, overlap, rotated, smoothstep
 from full_geometry.learning.shapes import margin
 
-__all__ = ["HELD_OUT"]
-
 Made = tuple[Distance, Box]
 STROKES = {  # of letters, in a square
     "A": [((0, 0), (0.5, 1)), ((0.5, 1), (1, 0)), ((0.2, 0.4), (0.8, 0.4))],
@@ -28,14 +26,14 @@ def letters(rng: np.random.Generator) -> Made:
     def distance(p: np.ndarray) -> np.ndarray:
         flat = np.array(p)
         flat[..., 2] = 0
-        found = np.full(p.shape[:-1], 10.0)
+        d = np.full(p.shape[:-1], 10.0)
         for a, b in strokes:
-            found = join(found, capsule(flat, (*a, 0), (*b, 0), wide, wide))
-        found = overlap(found, np.abs(p[..., 2]) - deep, 0.02)
+            d = join(d, capsule(flat, (*a, 0), (*b, 0), wide, wide))
+        d = overlap(d, np.abs(p[..., 2]) - deep, 0.02)
         if plate:
             q = np.abs(p - (0.5, 0.5, -deep)) - (0.65, 0.7, plate)
-            found = join(found, np.max(q, axis=-1), 0.02)
-        return found
+            d = join(d, np.max(q, axis=-1), 0.02)
+        return d
 
     return distance, margin((-0.25, -0.3, -deep - plate - 0.03), (1.25, 1.3, deep + 0.03))
 
@@ -77,10 +75,10 @@ def springs(rng: np.random.Generator) -> Made:
     line = np.stack([radius * np.cos(2 * np.pi * t), pitch * t, radius * np.sin(2 * np.pi * t)], -1)
 
     def distance(p: np.ndarray) -> np.ndarray:
-        found = np.full(p.shape[:-1], 10.0)
+        d = np.full(p.shape[:-1], 10.0)
         for a, b in zip(line, line[1:]):
-            found = np.minimum(found, capsule(p, a, b, wire, wire))
-        return found
+            d = np.minimum(d, capsule(p, a, b, wire, wire))
+        return d
 
     return distance, margin(line.min(0) - wire, line.max(0) + wire)
 
@@ -111,10 +109,10 @@ def trees(rng: np.random.Generator) -> Made:
         tips = onward
 
     def distance(p: np.ndarray) -> np.ndarray:
-        found = np.full(p.shape[:-1], 10.0)
+        d = np.full(p.shape[:-1], 10.0)
         for a, b, r_a, r_b in rods:
-            found = join(found, capsule(p, a, b, r_a, r_b), 0.04)
-        return found
+            d = join(d, capsule(p, a, b, r_a, r_b), 0.04)
+        return d
 
     ends = np.array([v for a, b, *_ in rods for v in (a, b)])
     return distance, margin(ends.min(0) - 0.2, ends.max(0) + 0.2)

@@ -11,6 +11,8 @@ import time
 from dataclasses import dataclass
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import torch
 import zuko
@@ -18,15 +20,12 @@ import zuko
 from figures.studies.paper_network import placed
 from full_geometry.learning.networks import one_thread
 from full_geometry.models.object_model import FullGeometry
-from full_geometry.object.features import Frame
+from full_geometry.object.features import ObjectFrame
 from full_geometry.object.subject import Subject, SurfacePoint, surface_point
 from halfspace_sss.checks import check_interval
 from halfspace_sss.rendering.surface.horizon import cosine_above
 from halfspace_sss.rendering.surface.variants import channel_mean
 from halfspace_sss.tracing.walk import generator, pass_seed
-
-__all__ = ["SpaceFlow", "fit_space_flow", "incidence", "mesh_arrays", "on_surface", "rmsd"]
-
 
 HIDDEN, LAYERS = (128, 128), 6
 GRID = (16, 64)  # directions
@@ -44,12 +43,10 @@ class SpaceFlow:
     """
 
     flow: Any
-    frame: Frame
+    frame: ObjectFrame
 
     def sample(self, exits: SurfacePoint, n: int, seed: int = 0) -> np.ndarray:
         """n points in space of each of m exits, (m, n, 3), in the frame of the object over its radius."""
-        import drjit as dr
-
         told = torch.from_numpy(placed(self.frame, exits, dr.width(exits.p)))
         with torch.no_grad(), torch.random.fork_rng():
             torch.manual_seed(seed)
@@ -64,9 +61,6 @@ def incidence(model: FullGeometry, exits: SurfacePoint, points: SurfacePoint) ->
         exits: one for each point.
         points: of entry, with interpolated normals, see `Subject.random_places`.
     """
-    import drjit as dr
-    import mitsuba as mi
-
     n, (rows, columns) = dr.width(exits.p), GRID
     prepared = model.prepare(exits)
     total, k = mi.Float(0), mi.UInt32(0)
@@ -81,7 +75,7 @@ def incidence(model: FullGeometry, exits: SurfacePoint, points: SurfacePoint) ->
 
 
 @one_thread()
-def fit_space_flow(model: FullGeometry, frame: Frame, seconds: float = 60.0, seed: int = 0) -> SpaceFlow:
+def fit_space_flow(model: FullGeometry, frame: ObjectFrame, seconds: float = 60.0, seed: int = 0) -> SpaceFlow:
     """The flow after so many CPU seconds.
 
     Args:
@@ -108,11 +102,8 @@ def fit_space_flow(model: FullGeometry, frame: Frame, seconds: float = 60.0, see
     return SpaceFlow(flow, frame)
 
 
-def _pairs(model: FullGeometry, frame: Frame, seed: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _pairs(model: FullGeometry, frame: ObjectFrame, seed: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Exits (n, 5), uniform points (n, 3) and t over its mean."""
-    import drjit as dr
-    import mitsuba as mi
-
     n = PAIRS * POINTS
     exits = model.subject.random_points(generator(mi, PAIRS, pass_seed(*seed, 0)))
     exits = exits.gather(dr.arange(mi.UInt32, n) // POINTS)
@@ -121,11 +112,9 @@ def _pairs(model: FullGeometry, frame: Frame, seed: tuple[int, ...]) -> tuple[np
     return placed(frame, exits, n), placed(frame, points, n)[:, :3], (t / t.mean()).astype(np.float32)
 
 
-def mesh_arrays(subject: Subject, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
+def mesh_arrays(subject: Subject, frame: ObjectFrame) -> tuple[np.ndarray, np.ndarray]:
     """Vertices, in the frame over the radius, and faces, as libigl takes them."""
-    import mitsuba as mi
-
-    parameters = mi.traverse(subject.found.shape)
+    parameters = mi.traverse(subject.object.shape)
     vertices = np.array(parameters["vertex_positions"], dtype=np.float64).reshape(-1, 3)
     turn = np.eye(3) if frame.turn is None else np.array([np.array(row).ravel() for row in frame.turn])
     centre, radius = np.array(frame.centre, dtype=float).ravel(), float(np.array(frame.radius).item())

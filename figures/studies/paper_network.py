@@ -8,15 +8,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import torch
 from torch import nn
 
-from full_geometry.learning.model_errors import ModelError, compare
+from full_geometry.learning.model_errors import RadianceError, compare
 from full_geometry.learning.networks import one_thread
-from full_geometry.object.features import Frame
+from full_geometry.object.features import ObjectFrame
 from full_geometry.object.identity import Identity, frame_of, identify
-from full_geometry.object.radiance import LOBES, POWER, Estimate, Reference, reference
+from full_geometry.object.radiance import LOBES, POWER, ExitRadiance, ExitTruth, reference
 from full_geometry.object.subject import Subject, SurfacePoint
 from full_geometry.object.walks import trace_exits
 from halfspace_sss.checks import check_choice, check_count, check_interval
@@ -26,26 +28,6 @@ from halfspace_sss.progress import NamedProgress
 from halfspace_sss.provenance import provenance
 from halfspace_sss.rendering.scenes.learners import LearntObject, ObjectError
 from halfspace_sss.tracing.walk import generator, pass_seed
-
-__all__ = [
-    "KIND",
-    "POINTS",
-    "Light",
-    "PaperNetwork",
-    "PaperRecipe",
-    "Samples",
-    "errors",
-    "estimate",
-    "fit_paper",
-    "load_network",
-    "measured_lights",
-    "paper_errors",
-    "random_lights",
-    "save_network",
-    "train",
-    "walk_samples",
-]
-
 
 # ----------------------------------------------------------------------------------------------------
 # The network: 5 + 8 N inputs, three layers of 256 with LeakyReLU, radiance as output, fitted by the MSE.
@@ -60,7 +42,7 @@ FACTORS = (0.125, 8.0)  # of the augmentation by scale
 
 
 @dataclass(frozen=True, eq=False)
-class Light:
+class PaperLight:
     """Light of m exits, one for each.
 
     Args:
@@ -81,7 +63,7 @@ class Light:
         return (self.base[:, None, :] + np.einsum("mnk,mkc->mnc", c, self.colours)).astype(np.float32)
 
 
-def random_lights(m: int, channels: int, rng: np.random.Generator) -> Light:
+def random_lights(m: int, channels: int, rng: np.random.Generator) -> PaperLight:
     """Lights of random lobes and colours, each times a random factor (augmentation by scale)."""
     axes = rng.standard_normal((m, MOST_LOBES, 3))
     axes /= np.linalg.norm(axes, axis=2, keepdims=True)
@@ -89,17 +71,17 @@ def random_lights(m: int, channels: int, rng: np.random.Generator) -> Light:
     factor = np.exp(rng.uniform(*np.log(FACTORS), (m, 1)))
     on = rng.random((m, MOST_LOBES, 1)) < 0.6
     colours = on * rng.random((m, MOST_LOBES, channels)) * factor[:, :, None]
-    return Light(rng.random((m, channels)) * factor, axes, powers, colours)
+    return PaperLight(rng.random((m, channels)) * factor, axes, powers, colours)
 
 
-def measured_lights(m: int, channels: int) -> list[Light]:
+def measured_lights(m: int, channels: int) -> list[PaperLight]:
     """Constant light and the four lobes of the measured errors, the same for m exits."""
     none = np.zeros((m, 1, 3))
-    found = [Light(np.ones((m, channels)), none, np.ones((m, 1)), np.zeros((m, 1, channels)))]
+    lights = [PaperLight(np.ones((m, channels)), none, np.ones((m, 1)), np.zeros((m, 1, channels)))]
     for axis in LOBES:
         axes = np.broadcast_to(axis, (m, 1, 3))
-        found.append(Light(np.zeros((m, channels)), axes, np.full((m, 1), POWER), np.ones((m, 1, channels))))
-    return found
+        lights.append(PaperLight(np.zeros((m, channels)), axes, np.full((m, 1), POWER), np.ones((m, 1, channels))))
+    return lights
 
 
 WIDTH, DEPTH = 256, 3
@@ -134,7 +116,7 @@ class PaperRecipe:
 
 
 @dataclass(frozen=True, eq=False)
-class Samples:
+class PaperSamples:
     """m exits with N incident samples each.
 
     Args:
@@ -156,7 +138,7 @@ class PaperNetwork(nn.Module):
     Args:
         n: N.
         channels: of the light.
-        seed: of the numbers at the start.
+        seed: of the initial weights.
     """
 
     def __init__(self, n: int, channels: int = 3, seed: int = 0) -> None:
@@ -173,29 +155,25 @@ class PaperNetwork(nn.Module):
         both = torch.cat((points, L), dim=2).flatten(1)
         return self.layers(torch.cat((exit, both), dim=1))
 
-    def radiance(self, samples: Samples, light: Light) -> np.ndarray:
+    def radiance(self, samples: PaperSamples, light: PaperLight) -> np.ndarray:
         """Radiance (m, channels) of samples in a light."""
         with torch.no_grad():
             L = torch.from_numpy(light(samples.w))
             return self(torch.from_numpy(samples.exit), torch.from_numpy(samples.points), L).numpy()
 
 
-def placed(frame: Frame, at: SurfacePoint, n: int) -> np.ndarray:
+def placed(frame: ObjectFrame, at: SurfacePoint, n: int) -> np.ndarray:
     """Position over the radius and the angles of w, over pi: (n, 5)."""
-    import drjit as dr
-    import mitsuba as mi
-
     p, w = frame.position(at.p), mi.Vector3f(frame.direction(at.w))
     columns = [*p, dr.acos(dr.clip(w.z, -1, 1)) / dr.pi, dr.atan2(w.y, w.x) / dr.pi]
     dr.eval(columns)
     return np.stack([np.broadcast_to(c.numpy(), n) for c in columns], axis=1).astype(np.float32)
 
 
-def walk_samples(subject: Subject, frame: Frame, exits: SurfacePoint, n: int, seed: tuple[int, ...]) -> Samples:
+def walk_samples(
+    subject: Subject, frame: ObjectFrame, exits: SurfacePoint, n: int, seed: tuple[int, ...]
+) -> PaperSamples:
     """N walks of each exit, as the paper's samples; walks that end inside keep T = 0 and a place of their own."""
-    import drjit as dr
-    import mitsuba as mi
-
     m = dr.width(exits.p)
     starts = exits.gather(dr.arange(mi.UInt32, m * n) // n)
     ends = trace_exits(subject, starts, seed)
@@ -203,7 +181,7 @@ def walk_samples(subject: Subject, frame: Frame, exits: SurfacePoint, n: int, se
     here = SurfacePoint(*(dr.select(lost, a, b) for a, b in zip(starts, ends.at)))
     points = placed(frame, here, m * n).reshape(m, n, 5)
     w, T = (np.array(v, dtype=np.float32).T.reshape(m, n, -1) for v in (here.w, ends.T))
-    return Samples(placed(frame, exits, m), points, w, np.ascontiguousarray(T))
+    return PaperSamples(placed(frame, exits, m), points, w, np.ascontiguousarray(T))
 
 
 @one_thread()
@@ -219,8 +197,6 @@ def fit_paper(
         seed: of everything.
         progress: called with (what, done, total).
     """
-    import mitsuba as mi
-
     recipe, frame, channels = recipe or PaperRecipe(), frame_of(subject), len(subject.media)
     net = PaperNetwork(recipe.n, channels, seed)
     adam = torch.optim.Adam(net.parameters(), lr=recipe.rate)
@@ -246,7 +222,7 @@ def fit_paper(
     return net, steps
 
 
-def _step(net: PaperNetwork, adam: Any, samples: Samples, rows: np.ndarray, rng: np.random.Generator) -> float:
+def _step(net: PaperNetwork, adam: Any, samples: PaperSamples, rows: np.ndarray, rng: np.random.Generator) -> float:
     """One step under random light; returns the MSE."""
     light = random_lights(len(rows), samples.T.shape[2], rng)
     L = light(samples.w[rows])
@@ -268,8 +244,8 @@ POINTS = ("walks", "uniform")
 
 
 def paper_errors(
-    subject: Subject, net: PaperNetwork, truth: Reference, *, points: str = "walks", repeats: int = 16, seed: int = 0
-) -> list[ModelError]:
+    subject: Subject, net: PaperNetwork, truth: ExitTruth, *, points: str = "walks", repeats: int = 16, seed: int = 0
+) -> list[RadianceError]:
     """Errors per channel, under constant light and lobes.
 
     Args:
@@ -290,32 +266,29 @@ def paper_errors(
 
 def estimate(
     subject: Subject, net: PaperNetwork, exits: SurfacePoint, points: str, repeats: int, seed: int = 0
-) -> Estimate:
+) -> ExitRadiance:
     """Mean radiance of exits over repeats with new points, and its variance."""
-    import drjit as dr
-
-    frame, m, found = frame_of(subject), dr.width(exits.p), []
+    frame, m, means = frame_of(subject), dr.width(exits.p), []
     for k in range(repeats):
         if points == "walks":
             samples = walk_samples(subject, frame, exits, net.n, (seed, 95, k))
         else:
             samples = uniform_samples(subject, frame, exits, net.n, (seed, 96, k))
         lights = measured_lights(m, len(subject.media))
-        found.append(np.stack([net.radiance(samples, light) for light in lights], axis=-1))
-    values = np.array(found, dtype=float).transpose(0, 2, 1, 3)
-    return Estimate(values.mean(axis=0), values.var(axis=0, ddof=1) / repeats)
+        means.append(np.stack([net.radiance(samples, light) for light in lights], axis=-1))
+    values = np.array(means, dtype=float).transpose(0, 2, 1, 3)
+    return ExitRadiance(values.mean(axis=0), values.var(axis=0, ddof=1) / repeats)
 
 
-def uniform_samples(subject: Subject, frame: Frame, exits: SurfacePoint, n: int, seed: tuple[int, ...]) -> Samples:
+def uniform_samples(
+    subject: Subject, frame: ObjectFrame, exits: SurfacePoint, n: int, seed: tuple[int, ...]
+) -> PaperSamples:
     """N points uniform over the area for each exit; the throughputs are left out."""
-    import drjit as dr
-    import mitsuba as mi
-
     m: Any = dr.width(exits.p)
     at = subject.random_points(generator(mi, m * n, pass_seed(*seed)))
     w = np.array(at.w, dtype=np.float32).T.reshape(m, n, 3)
     points = placed(frame, at, m * n).reshape(m, n, 5)
-    return Samples(placed(frame, exits, m), points, w, np.zeros((m, n, len(subject.media)), np.float32))
+    return PaperSamples(placed(frame, exits, m), points, w, np.zeros((m, n, len(subject.media)), np.float32))
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -345,7 +318,7 @@ def load_network(subject: Subject, folder: Path | None = None) -> PaperNetwork:
     path = (Path(folder) if folder else weights_folder()) / f"{KIND}-{here.digest()}.safetensors"
     if not path.exists():
         raise ValueError(
-            f"object {subject.found.shape.id()!r} must be trained for {KIND}, got one that is not in {path.parent}; "
+            f"object {subject.object.shape.id()!r} must be trained for {KIND}, got one that is not in {path.parent}; "
             f"`halfspace-sss train --scene --model {KIND}` does it"
         )
     arrays, record = load_weights(path, KIND)
@@ -376,11 +349,11 @@ def train(
     folder = check_weights_folder(folder)
     subject, began = Subject.given(scene, None, None, object), time.monotonic()
     net, steps = fit_paper(subject, PaperRecipe(seconds=seconds), seed, progress)
-    found = paper_errors(subject, net, reference(subject, EXITS, WALKS, seed), seed=seed)
-    record = {"steps": steps, "seconds": seconds, "seed": seed, "errors": [row._asdict() for row in found]}
+    rows = paper_errors(subject, net, reference(subject, EXITS, WALKS, seed), seed=seed)
+    record = {"steps": steps, "seconds": seconds, "seed": seed, "errors": [row._asdict() for row in rows]}
     path = save_network(folder, identify(subject), net, {**record, "provenance": provenance(seed=seed)})
-    name = subject.found.shape.id()
-    return LearntObject(name, path, _rows(name, found), steps, time.monotonic() - began)
+    name = subject.object.shape.id()
+    return LearntObject(name, path, _rows(name, rows), steps, time.monotonic() - began)
 
 
 def errors(
@@ -392,10 +365,10 @@ def errors(
         check_choice("model", name, (KIND,))
     subject = Subject.given(scene, None, None, object)
     net = load_network(subject)
-    found = paper_errors(subject, net, reference(subject, exits, WALKS, seed), seed=seed)
-    return _rows(subject.found.shape.id(), found)
+    rows = paper_errors(subject, net, reference(subject, exits, WALKS, seed), seed=seed)
+    return _rows(subject.object.shape.id(), rows)
 
 
-def _rows(name: str, found: list[ModelError]) -> list[ObjectError]:
-    channels = "RGB" if max(row.channel for row in found) == 2 else ["mono"]
-    return [ObjectError(name, channels[e.channel], KIND, e.light, e.error, e.standard_error, e.ratio) for e in found]
+def _rows(name: str, rows: list[RadianceError]) -> list[ObjectError]:
+    channels = "RGB" if max(row.channel for row in rows) == 2 else ["mono"]
+    return [ObjectError(name, channels[e.channel], KIND, e.light, e.error, e.standard_error, e.ratio) for e in rows]

@@ -15,18 +15,16 @@ from full_geometry.learning import model_errors
 from full_geometry.learning.fitting import STANDARD
 from full_geometry.learning.model_errors import measure
 from full_geometry.learning.training import train, train_by_cpu
-from full_geometry.models.half_space import HalfSpace, HalfSpaceTransport
+from full_geometry.models.half_space import HalfSpace, PlanarModel
 from full_geometry.models.storing import KIND, Learnt
 from full_geometry.object import radiance
-from full_geometry.object.pairs import Proposals
+from full_geometry.object.pairs import EntryProposals
 from full_geometry.object.radiance import reference
 from full_geometry.object.subject import Subject
 from halfspace_sss.neural.store import load_weights
 
 if TYPE_CHECKING:
     import pandas
-
-__all__ = ["BACKBONE", "STARTS", "error_table", "start_table"]
 
 
 # ---- The table of models: errors of one object after equal CPU time, data included -----------------
@@ -63,18 +61,18 @@ def error_table(
     tell("full_geometry", 0)
     with TemporaryDirectory() as folder:
         learnt, _ = train_by_cpu(subject, seconds, folder, seed=seed)
-    proposals = Proposals(subject, HalfSpace(subject, BACKBONE)).with_patches(learnt.sampler)
+    proposals = EntryProposals(subject, HalfSpace(subject, BACKBONE)).with_patches(learnt.sampler)
     tell("S = alpha p", 1)
-    models = {BACKBONE: HalfSpaceTransport(subject, BACKBONE), "full_geometry": learnt.model}
+    models = {BACKBONE: PlanarModel(subject, BACKBONE), "full_geometry": learnt.model}
     models["S = alpha p"] = fit_alpha_p(subject, FlowRecipe(seconds=seconds), seed)
     for key, model in models.items():
-        found = model_errors.measure(subject, model, proposals, truth=truth, samples=samples, seed=seed)
-        rows += [{"model": key, **row._asdict()} for row in found]
+        errors = model_errors.measure(subject, model, proposals, truth=truth, samples=samples, seed=seed)
+        rows += [{"model": key, **row._asdict()} for row in errors]
     tell("full_geometry_paper", 2)
     net, _ = fit_paper(subject, PaperRecipe(n=n, seconds=seconds), seed)
     for points in POINTS:
-        found = paper_errors(subject, net, truth, points=points, seed=seed)
-        rows += [{"model": f"full_geometry_paper, points {points}", **row._asdict()} for row in found]
+        errors = paper_errors(subject, net, truth, points=points, seed=seed)
+        rows += [{"model": f"full_geometry_paper, points {points}", **row._asdict()} for row in errors]
     tell("models", 4)
     return pandas.DataFrame(rows)
 
@@ -111,10 +109,10 @@ def start_table(
         if progress:
             progress(f"{start}, {share * seconds:.3g} s", k, len(runs))
         learnt, about = _learnt(subject, start, share * seconds, part, seed)
-        proposals = Proposals(subject, HalfSpace(subject, STANDARD.start))
+        proposals = EntryProposals(subject, HalfSpace(subject, STANDARD.start))
         proposals = proposals.with_patches(learnt.sampler if share else None)
-        found = measure(subject, learnt.model, proposals, truth=truth, samples=samples, seed=seed)
-        rows += [{"start": start, "planned": share * seconds, **about, **row._asdict()} for row in found]
+        errors = measure(subject, learnt.model, proposals, truth=truth, samples=samples, seed=seed)
+        rows += [{"start": start, "planned": share * seconds, **about, **row._asdict()} for row in errors]
     return pandas.DataFrame(rows)
 
 

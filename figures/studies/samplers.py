@@ -6,6 +6,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from figures.studies.flow import FlowProposals
@@ -28,8 +30,6 @@ from halfspace_sss.tracing.walk import generator, pass_seed
 if TYPE_CHECKING:
     import pandas
 
-__all__ = ["SAMPLERS", "Cost", "Spread", "costs", "sampler_table", "samplers", "spread"]
-
 
 # ----------------------------------------------------------------------------------------------------
 # Variance of a sample of an object's light, over the squared mean, and its time, for ways of drawing entries.
@@ -38,8 +38,7 @@ __all__ = ["SAMPLERS", "Cost", "Spread", "costs", "sampler_table", "samplers", "
 #     V = mean_k var(X_k) / (mean_k E[X_k])²,    mean over channels,
 #
 # is what one sample contributes to the squared relative error of an image; V t, t its time, is what counts. An exit's
-# own
-# work is shared by its N samples: V (t_exit/N + t_sample).
+# own work is shared by its N samples: V (t_exit/N + t_sample).
 
 
 TIMED_LANES, MANY = 2**14, 8
@@ -75,27 +74,22 @@ class _Exits:
 
 def _exits(subject: Subject, n: int, repeated: int, seed: int) -> _Exits:
     """n random exits, `repeated` neighbouring lanes for each."""
-    import drjit as dr
-    import mitsuba as mi
-
     rng = Numbers(generator(mi, n, pass_seed(seed, 31)))
     at = subject.points.sample(rng.next_1d(), rng.next_2d(), True)
-    sign = number(subject.found.sign)
+    sign = number(subject.object.sign)
     n_out = mi.Normal3f(turned(at.n_shading, at.n) * sign)
     n_face = mi.Normal3f(at.n * sign)
     w, _ = cosine_above(n_out, n_face, rng.next_2d())
-    found = (mi.Point3f(at.p), lifted(n_out, n_face, w), w, n_face, mi.UInt32(at.prim_index))
-    dr.eval(found)
+    points = (mi.Point3f(at.p), lifted(n_out, n_face, w), w, n_face, mi.UInt32(at.prim_index))
+    dr.eval(points)
     k = dr.arange(mi.UInt32, n * repeated) // repeated
-    p, n_out, w, n_face, face = (dr.gather(type(v), v, k) for v in found)
+    p, n_out, w, n_face, face = (dr.gather(type(v), v, k) for v in points)
     dr.eval(p, n_out, w, n_face, face)
     return _Exits(Exit(p, n_out, w, mi.Float(sign), n_face), face)
 
 
 def _estimates(means: Means, light: Lighting, exits: _Exits, rng: Any, n: int) -> Any:
     """Sum of n samples of each exit, per channel."""
-    import mitsuba as mi
-
     on = mi.Bool(True)
     prepared = means.transport.prepare(exits.out, on)
     where = means.proposals.prepare(exits.out, prepared, on)
@@ -119,18 +113,15 @@ def spread(
         exits, samples: random exits, and samples of each.
         seed: of both.
     """
-    import drjit as dr
-    import mitsuba as mi
-
     sums, per_pass = 0.0, max(min(LANES // exits, samples), 1)
     passes = max(samples // per_pass, 1)
     lanes = _exits(subject, exits, per_pass, seed)
     for k in range(passes):
         rng = Numbers(generator(mi, exits * per_pass, pass_seed(seed, 32, k)))
-        found = _estimates(means, light, lanes, rng, 1)
-        rows = [dr.block_sum(v, per_pass) for x in found for v in (x, x * x)]
+        estimates = _estimates(means, light, lanes, rng, 1)
+        rows = [dr.block_sum(v, per_pass) for x in estimates for v in (x, x * x)]
         dr.eval(rows)
-        sums = sums + np.stack([r.numpy().astype(float) for r in rows]).reshape(len(found), 2, exits)
+        sums = sums + np.stack([r.numpy().astype(float) for r in rows]).reshape(len(estimates), 2, exits)
     mean, square = np.moveaxis(sums / (passes * per_pass), 1, 0)
     total = mean.mean(axis=1)
     live = total > 0
@@ -140,9 +131,6 @@ def spread(
 
 def costs(subject: Subject, all_means: Mapping[str, Means], light: Lighting) -> dict[str, Cost]:
     """Time of each; they take turns, and of the repeats the fastest counts, which is the one that least delayed."""
-    import drjit as dr
-    import mitsuba as mi
-
     lanes = _exits(subject, TIMED_LANES, 1, 5)
     rng = generator(mi, TIMED_LANES, pass_seed(6))
     dr.eval(rng.state, rng.inc)
@@ -152,11 +140,11 @@ def costs(subject: Subject, all_means: Mapping[str, Means], light: Lighting) -> 
             numbers = Numbers(mi.PCG32(rng))
             seconds = kernel_seconds(lambda: _estimates(all_means[name], light, lanes, numbers, n))  # noqa: B023
             best[name, n] = min(best[name, n], seconds) if k else np.inf
-    scale, found = 1e6 / TIMED_LANES, {}
+    scale, cost = 1e6 / TIMED_LANES, {}
     for name in all_means:
         each = max(best[name, MANY] - best[name, 1], 0.0) / (MANY - 1)
-        found[name] = Cost(scale * max(best[name, 1] - each, 0.0), scale * each)
-    return found
+        cost[name] = Cost(scale * max(best[name, 1] - each, 0.0), scale * each)
+    return cost
 
 
 # ---- The table of samplers: variance of a sample, its time and their product, under each light -----
@@ -178,10 +166,10 @@ def samplers(learnt: Learnt, recipe: FlowRecipe, light: Lighting, flow: Any, see
         seed: of the fits.
     """
     model, patches, _ = learnt
-    found, sign = model.subject.found, model.subject.found.sign
-    backbone = model.start.models
-    table = RadialTable([m for m in backbone if float(m.medium.sigma_s) > 0], found.size)
-    probes = PositionSampler(replace(found, pieces=None), table, model.subject.points, AREA_SHARE)
+    object, sign = model.subject.object, model.subject.object.sign
+    backbone = model.base.models
+    table = RadialTable([m for m in backbone if float(m.medium.sigma_s) > 0], object.size)
+    probes = PositionSampler(replace(object, pieces=None), table, model.subject.points, AREA_SHARE)
     lit = fit_patches(learnt, recipe, light=light, seed=seed)
     lit_flow = fit_flow(learnt._replace(sampler=lit), recipe, light=light, seed=seed)
     by_face, lit_by_face = PatchTable(patches), PatchTable(lit)

@@ -12,12 +12,9 @@ import torch
 
 from figures.studies.held_out import HELD_OUT
 from full_geometry.learning.shape_data import PairData, draw_subject, grouped, make_data, mean_events
-from full_geometry.learning.shape_training import STANDARD, Fitting
+from full_geometry.learning.shape_training import STANDARD, ShapeFit
 from full_geometry.models.descriptors import N_LENGTHS, N_OWN
 from halfspace_sss.progress import NamedProgress
-
-__all__ = ["ablation_table"]
-
 
 OBJECTS, HELD_OUT_OBJECTS, SEED = 300, 28, 79
 K = N_LENGTHS
@@ -73,14 +70,14 @@ def ablation_table(work: Path, seconds: float, progress: NamedProgress | None = 
 
 
 def _objects(work: Path) -> list[PairData]:
-    found = []
+    objects = []
     for path in sorted(work.glob("object-*.npz"))[:OBJECTS]:
         with np.load(path) as stored:
             if "walks" in stored:
-                found.append(PairData.from_arrays(stored))
-    if not found:
+                objects.append(PairData.from_arrays(stored))
+    if not objects:
         raise ValueError(f"work must hold objects of `train --shapes`, got none in {work}")
-    return found
+    return objects
 
 
 def _without(data: PairData, missing: Sequence[str]) -> PairData:
@@ -97,7 +94,7 @@ def _without(data: PairData, missing: Sequence[str]) -> PairData:
 def _fit(pool: list[PairData], held: list[PairData], seconds: float) -> tuple[int, np.ndarray, np.ndarray]:
     """Steps, and on every held-out object the likelihood and the ratio of the mean radiances."""
     groups = [grouped(data) for data in pool]
-    fitting, rng, at = Fitting(STANDARD, 0), np.random.default_rng(0), time.process_time()
+    fitting, rng, at = ShapeFit(STANDARD, 0), np.random.default_rng(0), time.process_time()
     while (part := (time.process_time() - at) / seconds) < 1:
         fitting.advance(groups, rng, part)
     losses, ratios = [], []

@@ -8,13 +8,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from figures.studies.held_out import HELD_OUT
-from full_geometry.learning.model_errors import LIGHTS, ModelError, errors_of
+from full_geometry.learning.model_errors import LIGHTS, RadianceError, errors_of
 from full_geometry.learning.shape_data import draw_subject
 from full_geometry.models.descriptors import mean_chord
-from full_geometry.models.half_space import HalfSpaceTransport
+from full_geometry.models.half_space import PlanarModel
 from full_geometry.models.neural_shape import transport
 from full_geometry.object.subject import Subject
 from halfspace_sss.interface.model import bssrdf
@@ -22,22 +24,6 @@ from halfspace_sss.materials import load as load_material
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.tracing.walk import generator, pass_seed
-
-__all__ = [
-    "HALF_SPACES",
-    "Case",
-    "Row",
-    "by_property",
-    "case_table",
-    "evaluate",
-    "held_out",
-    "of_mesh",
-    "seconds_per_million",
-    "speed_table",
-    "spheres",
-    "summary",
-]
-
 
 # ----------------------------------------------------------------------------------------------------
 # Errors of the network of all shapes on held-out shapes and media, a mesh, spheres; and what an evaluation costs.
@@ -96,8 +82,6 @@ def held_out(n: int) -> Iterator[Case]:
 
 def of_mesh(path: str | Path, materials: Sequence[str], mm_per_unit: float) -> Iterator[Case]:
     """A mesh of each channel of materials of the registry."""
-    import mitsuba as mi
-
     for material in materials:
         medium = load_material(material).medium
         for k, channel in enumerate("RGB"):
@@ -107,8 +91,6 @@ def of_mesh(path: str | Path, materials: Sequence[str], mm_per_unit: float) -> I
 
 def spheres(albedo: float = 0.95, eta: float = 1.3) -> Iterator[Case]:
     """Spheres of 1, 3, 10 and 30 mean free paths."""
-    import mitsuba as mi
-
     for radius in RADII:
         shape = mi.load_dict({"type": "sphere", "radius": radius})
         yield Case(f"sphere of {radius:g} mfp", Subject.of(shape, Medium(albedo, 1 - albedo, 0.0, eta)))
@@ -132,10 +114,10 @@ def evaluate(
             progress(case.name, k, n)
         subject = case.subject
         models: dict[str, Any] = {"neural_shape": transport(subject, path)}
-        models |= {name: HalfSpaceTransport(subject, name) for name in HALF_SPACES if _takes(name, subject)}
+        models |= {name: PlanarModel(subject, name) for name in HALF_SPACES if _takes(name, subject)}
         walks = WALKS * (MORE if float(subject.media[0].albedo_prime) < DARK else 1)
-        found = errors_of(subject, models, exits=EXITS, walks=walks, samples=SAMPLES, seed=seed)
-        rows.append(_row(case, found))
+        errors = errors_of(subject, models, exits=EXITS, walks=walks, samples=SAMPLES, seed=seed)
+        rows.append(_row(case, errors))
     return rows
 
 
@@ -147,12 +129,12 @@ def _takes(name: str, subject: Subject) -> bool:
         return False
 
 
-def _row(case: Case, found: Mapping[str, list[ModelError]]) -> Row:
+def _row(case: Case, by_model: Mapping[str, list[RadianceError]]) -> Row:
     m = case.subject.media[0]
     errors = {
         model: {light: next((r.error, r.standard_error) for r in rows if r.light == light and r.channel == 0)
                 for light in LIGHTS}
-        for model, rows in found.items()
+        for model, rows in by_model.items()
     }  # fmt: skip
     size = float(case.subject.mean_free_paths()[0])
     thickness = mean_chord(case.subject) * float(m.sigma_t)
@@ -161,15 +143,12 @@ def _row(case: Case, found: Mapping[str, list[ModelError]]) -> Row:
 
 def seconds_per_million(subject: Subject, path: Path | None = None) -> dict[str, float]:
     """Seconds for a million evaluations, entry and exit prepared anew, of the network and of half-space models."""
-    import drjit as dr
-    import mitsuba as mi
-
     models: dict[str, Any] = {"neural_shape": transport(subject, path)}
-    models |= {name: HalfSpaceTransport(subject, name) for name in HALF_SPACES}
+    models |= {name: PlanarModel(subject, name) for name in HALF_SPACES}
     rng = generator(mi, LANES, pass_seed(29))
     exits, entries = subject.random_points(rng), subject.random_points(rng)
     dr.eval(exits, entries)
-    found = {}
+    seconds = {}
     for name, model in models.items():
         times = []
         for _ in range(3):  # the first one compiles
@@ -178,8 +157,8 @@ def seconds_per_million(subject: Subject, path: Path | None = None) -> dict[str,
             dr.eval(model.S(model.prepare(exits), entries))
             dr.sync_thread()
             times.append(time.perf_counter() - at)
-        found[name] = 1e6 / LANES * min(times[1:])
-    return found
+        seconds[name] = 1e6 / LANES * min(times[1:])
+    return seconds
 
 
 # ---- Tables of errors as text of Markdown ----------------------------------------------------------
@@ -205,31 +184,31 @@ def _percent(pair: tuple[float, float]) -> str:
 def case_table(rows: Sequence[Row]) -> str:
     """Every case: what it is, the best half-space model under constant light, and both errors of the network, %."""
     head = ["object", "size, mfp", "albedo", "g", "eta", "half-space", "its error", "its lobes", "constant", "lobes"]
-    found = []
+    cells = []
     for r in rows:
         name, _ = r.best()
-        found.append([
+        cells.append([
             r.name, f"{r.size:.3g}", f"{r.albedo:.4g}", f"{r.g:.2g}", f"{r.eta:.3g}", name,
             *(_percent(r.errors[model][light]) for model in (name, MODEL) for light in LIGHTS),
         ])  # fmt: skip
-    return _table(head, found)
+    return _table(head, cells)
 
 
 def summary(rows: Sequence[Row]) -> str:
     """Median and 90th percentile of the errors, and how they compare with the best half-space model of each case, %."""
-    found = []
+    cells = []
     for light in LIGHTS:
         own = np.array([r.of(MODEL, light) for r in rows])
         best = np.array([r.best(light)[1] for r in rows])
         ratio = best / np.maximum(own, 1e-9)
-        found.append([
+        cells.append([
             light, f"{100 * np.median(own):.1f}", f"{100 * np.quantile(own, 0.9):.1f}",
             f"{100 * np.median(best):.1f}", f"{100 * np.quantile(best, 0.9):.1f}", f"{np.median(ratio):.1f}",
             f"{(ratio >= 4).sum()} of {len(rows)}", f"{(ratio < 1).sum()} of {len(rows)}",
         ])  # fmt: skip
     head = ["light", "median", "90th percentile", "best half-space: median", "90th percentile", "median ratio",
             "4 times better", "worse"]  # fmt: skip
-    return _table(head, found)
+    return _table(head, cells)
 
 
 def by_property(rows: Sequence[Row]) -> str:

@@ -8,13 +8,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
 from figures.studies.shape_errors import Case, Row, held_out
 from halfspace_sss.progress import NamedProgress
-
-__all__ = ["WORST", "picture", "worst_pictures"]
-
 
 WORST = 10
 SIZE, SPP, WALKED_SPP, GAP = 96, 64, 256, 4
@@ -52,8 +50,6 @@ def worst_pictures(rows: Sequence[Row], progress: NamedProgress | None = None) -
 
 def picture(case: Case, model: str, size: int = SIZE) -> np.ndarray:
     """Radiance (size, size) of an object by a model, or "path_traced", under half a sky from the left."""
-    import mitsuba as mi
-
     from halfspace_sss.rendering.scenes.scene_files import load_scene
 
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
@@ -64,9 +60,7 @@ def picture(case: Case, model: str, size: int = SIZE) -> np.ndarray:
 
 
 def _scene(case: Case, path: Path, size: int) -> dict[str, Any]:
-    import mitsuba as mi
-
-    shape, m = case.subject.found.shape, case.subject.media[0]
+    shape, m = case.subject.object.shape, case.subject.media[0]
     shape.write_ply(str(path))
     box = shape.bbox()
     centre, radius = np.array(box.center()).ravel(), 0.5 * float(np.linalg.norm(np.array(box.extents()).ravel()))

@@ -11,8 +11,8 @@ import numpy as np
 import torch
 
 from full_geometry.learning.networks import (
+    AlbedoNetwork,
     Correction,
-    EvenLight,
     PatchLogits,
     device_of_walks,
     likelihood,
@@ -28,9 +28,6 @@ from full_geometry.object.patches import Patches
 from halfspace_sss.checks import check_choice, check_count, check_interval
 from halfspace_sss.interface.model import models
 from halfspace_sss.neural.training import checkpoint
-
-__all__ = ["ALPHA_HIDDEN", "PROPOSED", "STANDARD", "Ends", "Fitting", "Recipe"]
-
 
 BETAS, CLIP, LAST_RATE, WARM_UP = (0.9, 0.99), 1.0, 0.01, 100
 AVERAGE = 0.998  # of the numbers, each step
@@ -79,7 +76,7 @@ class Recipe:
 STANDARD = Recipe()
 
 
-class Fitting:
+class ObjectFit:
     """The state of a fit, which follows from recipe, seed, number of steps, data and device, see `device_of_walks`.
 
     Args:
@@ -87,7 +84,7 @@ class Fitting:
         channels: of the medium.
         eta: relative index.
         recipe: sizes and rates.
-        seed: of the numbers at the start and of the order of the data.
+        seed: of the initial weights and of the order of the data.
         patches: of the surface, for whose weights a network is fitted beside; None for a shape without faces.
     """
 
@@ -97,7 +94,7 @@ class Fitting:
         self.recipe, self.patches, self.n_side = recipe, patches, (n_in - n_pair(channels)) // 2
         parts = {
             "S": Correction(n_in + 2 * ALPHA_HIDDEN[-1], channels, recipe.width, recipe.depth, seed),
-            "alpha": EvenLight(self.n_side, channels, ALPHA_HIDDEN, eta, seed),
+            "alpha": AlbedoNetwork(self.n_side, channels, ALPHA_HIDDEN, eta, seed),
         }
         if patches is not None:
             parts["patches"] = PatchLogits(self.n_side, patches.areas, PATCH_HIDDEN, seed)
@@ -200,8 +197,8 @@ class Fitting:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """The averaged numbers of all networks by name, and what is solved for beside them."""
-        found = {name: value for module in self.average.values() for name, value in module.arrays().items()}
-        return {**found, "Q": self.ends.solved()}
+        arrays = {name: value for module in self.average.values() for name, value in module.arrays().items()}
+        return {**arrays, "Q": self.ends.solved()}
 
     def _advance(self, loss: torch.Tensor, steps: int | None) -> None:
         at = min(self.step / max(steps, 1), 1.0) if steps is not None else 0.0
@@ -320,12 +317,12 @@ class Ends:
 
     def _sums(self, x: torch.Tensor, value: torch.Tensor) -> torch.Tensor:
         """Sums over columns of value times the terms of both ends, (channels, products)."""
-        found = torch.zeros(len(value), len(self.heads), self.n + 1, device=x.device)
+        sums = torch.zeros(len(value), len(self.heads), self.n + 1, device=x.device)
         for part, v in zip(x.split(COLUMNS, dim=1), value.split(COLUMNS, dim=1)):
             for s in self._sides(part):
                 for k, w in enumerate(v):
-                    found[k].addmm_(s[self.heads] * w, s.T)
-        return found[:, self.rows, self.cols]
+                    sums[k].addmm_(s[self.heads] * w, s.T)
+        return sums[:, self.rows, self.cols]
 
     def _curve(self, x: torch.Tensor, V: torch.Tensor) -> None:
         """H of each channel."""

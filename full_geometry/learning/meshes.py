@@ -13,29 +13,6 @@ import numpy as np
 from halfspace_sss.checks import check_count
 from halfspace_sss.provenance import write_atomically
 
-__all__ = [
-    "LEAST_RESOLUTION",
-    "Box",
-    "Mesh",
-    "capsule",
-    "cells",
-    "cut",
-    "ellipsoid",
-    "fbm",
-    "in_chunks",
-    "join",
-    "length",
-    "noise",
-    "overlap",
-    "ridges",
-    "ring_noise",
-    "rotated",
-    "smoothstep",
-    "surface",
-    "twisted",
-]
-
-
 # ----------------------------------------------------------------------------------------------------
 # Signed distances: primitives, how they are joined, bent and made rough; points (..., 3) in mm, y up, inside < 0.
 # Most are bounds rather than distances where primitives were joined or displaced; the surface is where they are zero.
@@ -77,10 +54,10 @@ def capsule(p: np.ndarray, a: np.ndarray, b: np.ndarray, radius_a: float, radius
 
 def join(a: np.ndarray, b: np.ndarray, blend: float = 0.0) -> np.ndarray:
     """Union; with blend > 0 (mm) the crease is filled: min(a, b) - h²/(4 blend), h = max(blend - |a - b|, 0)."""
-    found = np.minimum(a, b)
+    distance = np.minimum(a, b)
     if blend > 0:
-        found = found - np.maximum(blend - np.abs(a - b), 0) ** 2 / (4 * blend)
-    return found
+        distance = distance - np.maximum(blend - np.abs(a - b), 0) ** 2 / (4 * blend)
+    return distance
 
 
 def overlap(a: np.ndarray, b: np.ndarray, blend: float = 0.0) -> np.ndarray:
@@ -96,9 +73,9 @@ def cut(a: np.ndarray, b: np.ndarray, blend: float = 0.0) -> np.ndarray:
 def rotated(p: np.ndarray, axis: int, angle: float) -> np.ndarray:
     """Points turned about an axis (0 x, 1 y, 2 z) by an angle, radians, right-handed."""
     i, j = [(1, 2), (2, 0), (0, 1)][axis]
-    found, c, s = np.array(p), np.cos(angle), np.sin(angle)
-    found[..., i], found[..., j] = c * p[..., i] - s * p[..., j], s * p[..., i] + c * p[..., j]
-    return found
+    turned, c, s = np.array(p), np.cos(angle), np.sin(angle)
+    turned[..., i], turned[..., j] = c * p[..., i] - s * p[..., j], s * p[..., i] + c * p[..., j]
+    return turned
 
 
 def twisted(p: np.ndarray, per_mm: float) -> np.ndarray:
@@ -125,13 +102,13 @@ def noise(p: np.ndarray, seed: int) -> np.ndarray:
     f = (p - corner).astype(np.float32)
     lattice = corner.astype(np.int64)
     fade = f * f * f * (f * (f * 6 - 15) + 10)
-    found = np.zeros(p.shape[:-1], np.float32)
+    total = np.zeros(p.shape[:-1], np.float32)
     for corner_index in range(8):
         d = np.array([corner_index & 1, corner_index >> 1 & 1, corner_index >> 2 & 1])
         gradient = _GRADIENTS[_hash(*np.moveaxis(lattice + d, -1, 0), seed) & np.uint32(15)]
         weight = np.prod(np.where(d, fade, 1 - fade), axis=-1)
-        found += weight * np.sum(gradient * (f - d.astype(np.float32)), axis=-1)
-    return found
+        total += weight * np.sum(gradient * (f - d.astype(np.float32)), axis=-1)
+    return total
 
 
 def fbm(p: np.ndarray, seed: int, octaves: int = 3) -> np.ndarray:
@@ -250,15 +227,15 @@ class Mesh:
         props = mi.Properties()
         if bsdf is not None:
             props["mesh_bsdf"] = bsdf
-        found = mi.Mesh(name, len(self.vertices), len(self.faces), props=props, has_vertex_normals=True)
-        parameters = mi.traverse(found)
+        mesh = mi.Mesh(name, len(self.vertices), len(self.faces), props=props, has_vertex_normals=True)
+        parameters = mi.traverse(mesh)
         parameters["vertex_positions"] = self.vertices.astype(np.float32).ravel()
         parameters["faces"] = self.faces.astype(np.uint32).ravel()
         parameters.update()
         normals = igl.per_vertex_normals(self.vertices, self.faces, igl.PER_VERTEX_NORMALS_WEIGHTING_TYPE_ANGLE)
         parameters["vertex_normals"] = normals.astype(np.float32).ravel()
         parameters.update()
-        return found
+        return mesh
 
     def write_ply(self, path: str | os.PathLike) -> Path:
         """Write the mesh as a binary PLY file, whole or not at all; the same mesh gives the same bytes."""

@@ -15,12 +15,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
-from full_geometry.models.half_space import HalfSpace, HalfSpaceTransport
+from full_geometry.models.half_space import HalfSpace, PlanarModel
 from full_geometry.models.storing import KIND, find_weights, load
-from full_geometry.object.pairs import Proposals
-from full_geometry.object.radiance import Estimate, ObjectModel, Reference, modelled, reference
+from full_geometry.object.pairs import EntryProposals
+from full_geometry.object.radiance import ExitRadiance, ExitTruth, ObjectModel, modelled, reference
 from full_geometry.object.subject import Subject, SurfacePoint
 from halfspace_sss.checks import check_choice, check_count
 from halfspace_sss.physics.medium import Medium
@@ -31,27 +33,13 @@ from halfspace_sss.rendering.transport.plane import Exit, number
 from halfspace_sss.rendering.transport.protocols import Entry, Transport
 from halfspace_sss.rendering.transport.settings import Settings
 
-__all__ = [
-    "EVEN_SKY",
-    "LIGHTS",
-    "AddedTransport",
-    "ModelError",
-    "compare",
-    "errors",
-    "errors_of",
-    "measure",
-    "of_even_light",
-    "transport",
-]
-
-
 LIGHTS = ("constant", "lobes")
 EVEN_SKY = "even sky"  # as images show it
 FEWEST = {"multiple": 2, "total": 1}  # scattering events of what a model contains
 PROBES = "better_dipole"  # whose radial density entries follow
 
 
-class ModelError(NamedTuple):
+class RadianceError(NamedTuple):
     """Relative RMSE of one channel under one kind of light, its standard error, and the ratio of the means."""
 
     channel: int
@@ -61,21 +49,21 @@ class ModelError(NamedTuple):
     ratio: float
 
 
-def compare(model: Estimate, truth: Estimate) -> list[ModelError]:
+def compare(model: ExitRadiance, truth: ExitRadiance) -> list[RadianceError]:
     """The errors of all channels under both kinds of light."""
     kinds = tuple(zip(LIGHTS, (slice(0, 1), slice(1, None))))
     return [_error(c, light, columns, model, truth) for c in range(len(truth.mean)) for light, columns in kinds]
 
 
-def of_even_light(model: Estimate, truth: Estimate) -> list[ModelError]:
+def of_even_light(model: ExitRadiance, truth: ExitRadiance) -> list[RadianceError]:
     """The errors of all channels under an even sky, the first of the lights of both."""
     return [_error(c, EVEN_SKY, slice(0, 1), model, truth) for c in range(len(truth.mean))]
 
 
-def _error(c: int, light: str, columns: slice, model: Estimate, truth: Estimate) -> ModelError:
+def _error(c: int, light: str, columns: slice, model: ExitRadiance, truth: ExitRadiance) -> RadianceError:
     a, b = model.mean[c][:, columns], truth.mean[c][:, columns]
     square = (a - b) ** 2 - model.variance[c][:, columns] - truth.variance[c][:, columns]
-    return ModelError(c, light, *_jackknife(square, b), float(a.mean() / max(b.mean(), 1e-300)))
+    return RadianceError(c, light, *_jackknife(square, b), float(a.mean() / max(b.mean(), 1e-300)))
 
 
 def _jackknife(square: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
@@ -95,17 +83,17 @@ def _jackknife(square: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
 def measure(
     subject: Subject,
     transport: ObjectModel,
-    proposals: Proposals,
+    proposals: EntryProposals,
     *,
-    truth: Reference | None = None,
+    truth: ExitTruth | None = None,
     samples: int = 8192,
     seed: int = 0,
-) -> list[ModelError]:
+) -> list[RadianceError]:
     """The error of a transport of an object, per channel, under constant light and lobes.
 
     Args:
         subject: the object.
-        transport: `FullGeometry` or `HalfSpaceTransport`.
+        transport: `FullGeometry` or `PlanarModel`.
         proposals: where entries are drawn.
         truth: from `reference`, of the orders of the transport; made anew by default.
         samples: entries of each exit.
@@ -116,14 +104,14 @@ def measure(
     return compare(modelled(transport, proposals, truth.exits, samples, seed), truth.truth)
 
 
-def _even_sky(transport: ObjectModel, by_S: Estimate, truth: Reference) -> list[ModelError]:
+def _even_sky(transport: ObjectModel, by_S: ExitRadiance, truth: ExitTruth) -> list[RadianceError]:
     """The errors of images under an even sky: those of alpha where it is trusted, elsewhere of S."""
     alpha, n = getattr(transport, "alpha", None), len(by_S.mean)
     if alpha is None:
         return []
     known = np.array(alpha.evened[1]).reshape(n, 1, 1) > 0
     mean = np.where(known, np.array(alpha(truth.exits)[1]).reshape(n, -1, 1), by_S.mean[..., :1])
-    return of_even_light(Estimate(mean, np.where(known, 0, by_S.variance[..., :1])), truth.truth)
+    return of_even_light(ExitRadiance(mean, np.where(known, 0, by_S.variance[..., :1])), truth.truth)
 
 
 def errors_of(
@@ -135,7 +123,7 @@ def errors_of(
     samples: int = 8192,
     seed: int = 0,
     progress: NamedProgress | None = None,
-) -> dict[str, list[ModelError]]:
+) -> dict[str, list[RadianceError]]:
     """The errors of several transports of an object, by name; the truth is traced once for all of the same orders.
 
     Of those that have learnt what even light leaves also the error of images under an even sky.
@@ -148,9 +136,9 @@ def errors_of(
         progress: called with (what, done, total).
     """
     check_count("samples", samples, 2)
-    proposals = Proposals(subject, HalfSpace(subject, PROBES))
-    truths: dict[str, Reference] = {}
-    found, done = {}, 0
+    proposals = EntryProposals(subject, HalfSpace(subject, PROBES))
+    truths: dict[str, ExitTruth] = {}
+    rows, done = {}, 0
     total = len(transports) + len({t.orders for t in transports.values()})
 
     def tell(what: str, steps: int) -> None:
@@ -165,10 +153,10 @@ def errors_of(
         tell(name, done)
         truth = truths[model.orders]
         by_S = modelled(model, proposals, truth.exits, samples, seed)
-        found[name] = [*compare(by_S, truth.truth), *_even_sky(model, by_S, truth)]
+        rows[name] = [*compare(by_S, truth.truth), *_even_sky(model, by_S, truth)]
         done += 1
     tell("models", total)
-    return found
+    return rows
 
 
 def errors(
@@ -183,7 +171,7 @@ def errors(
     walks: int = 8192,
     samples: int = 8192,
     seed: int = 0,
-) -> list[ModelError]:
+) -> list[RadianceError]:
     """The error of a model of an object, by name: what a user is to expect of images before the first one.
 
     The truth has the orders of the model: two and more, or for a model that says "total" one and more.
@@ -203,8 +191,8 @@ def errors(
         ValueError: an argument is out of range, the object has not been trained, or there is no such model.
     """
     subject = Subject.given(shape, medium, mm_per_unit, object)
-    found = {model: transport(subject, model, folder)}
-    return errors_of(subject, found, exits=exits, walks=walks, samples=samples, seed=seed)[model]
+    transports = {model: transport(subject, model, folder)}
+    return errors_of(subject, transports, exits=exits, walks=walks, samples=samples, seed=seed)[model]
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -232,7 +220,7 @@ class AddedTransport:
         """
         make = object_transport(name)
         inside = Inside("medium", subject.media[0], name, "total", True)
-        inner = make(subject.found, inside, list(subject.media), Settings()).transport if make else None
+        inner = make(subject.object, inside, list(subject.media), Settings()).transport if make else None
         if inner is None or getattr(inner, "is_delta", False):
             raise ValueError(f"model must be one that has S for two points of a surface, got {name!r}")
         return cls(subject, inner)
@@ -243,15 +231,12 @@ class AddedTransport:
 
     def prepare(self, at: SurfacePoint, active: Any = True) -> Any:
         """What is done for the exit alone."""
-        return self.inner.prepare(Exit(at.p, at.n_out, at.w, number(self.subject.found.sign), at.n), active)
+        return self.inner.prepare(Exit(at.p, at.n_out, at.w, number(self.subject.object.sign), at.n), active)
 
     def S(self, exit: Any, at: SurfacePoint, active: Any = True) -> Any:
         """S per channel, 1/((scene unit)² sr); 0 below the horizons."""
-        import drjit as dr
-        import mitsuba as mi
-
         mu = dr.dot(at.w, at.n_out)
-        entry = Entry(at.p, mi.Normal3f(at.n * number(self.subject.found.sign)), at.n_out, mi.Float(1), mi.UInt32(0))
+        entry = Entry(at.p, mi.Normal3f(at.n * number(self.subject.object.sign)), at.n_out, mi.Float(1), mi.UInt32(0))
         value = self.inner.S_mu(exit, entry, at.w, active)
         return dr.select(mu > 0, value / dr.maximum(mu, 1e-6), 0)
 
@@ -267,4 +252,4 @@ def transport(subject: Subject, model: str, folder: str | os.PathLike | None = N
         return load(find_weights(subject, folder), subject).model
     if knows_objects(model):
         return AddedTransport.of(subject, model)
-    return HalfSpaceTransport(subject, model)
+    return PlanarModel(subject, model)

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 import torch
 from torch import nn
@@ -14,26 +15,11 @@ from torch import nn
 from full_geometry.models.object_model import BOUND
 from full_geometry.object.features import entering, n_pair, reverse
 
-__all__ = [
-    "Correction",
-    "EvenLight",
-    "PatchLogits",
-    "device_of_walks",
-    "likelihood",
-    "mean_likelihood",
-    "one_thread",
-    "patch_likelihood",
-    "tensor",
-]
-
-
 # ---- Where networks are fitted: beside the walks that are their data -------------------------------
 
 
 def device_of_walks() -> torch.device:
     """The GPU if Mitsuba's variant runs there and torch can, else the CPU."""
-    import mitsuba as mi
-
     there = (mi.variant() or "").startswith("cuda") and torch.cuda.is_available()
     return torch.device("cuda" if there else "cpu")
 
@@ -58,7 +44,7 @@ LEAST_SHARE = 1e-5  # of F_t P that comes back
 
 
 class Layers(nn.Module):
-    """A perceptron with hard swish between its layers; 0 at the start."""
+    """A perceptron with hard swish between its layers; 0 initially."""
 
     def __init__(self, sizes: list[int], generator: torch.Generator) -> None:
         super().__init__()
@@ -81,21 +67,21 @@ class Layers(nn.Module):
         return x
 
     def arrays(self, matrix: str, bias: str) -> dict[str, np.ndarray]:
-        found: dict[str, Any] = {}
+        arrays: dict[str, Any] = {}
         for k, (W, b) in enumerate(zip(self.matrices, self.biases)):
             W, b = (v.detach().cpu().numpy().copy() for v in (W, b))
-            found |= {f"{matrix}_{k}": W, f"{bias}_{k}": b[:, 0].copy()}
-        return found
+            arrays |= {f"{matrix}_{k}": W, f"{bias}_{k}": b[:, 0].copy()}
+        return arrays
 
 
 class Correction(nn.Module):
-    """f = 6 tanh(g/6) per channel, g a perceptron; 0 at the start.
+    """f = 6 tanh(g/6) per channel, g a perceptron; 0 initially.
 
     Args:
         n_in: features.
         channels: outputs.
         width, depth: hidden layers.
-        seed: of the numbers at the start.
+        seed: of the initial weights.
     """
 
     def __init__(self, n_in: int, channels: int, width: int = 64, depth: int = 3, seed: int = 0) -> None:
@@ -128,7 +114,7 @@ def likelihood(walks: tuple, proposals: tuple, kept: float) -> torch.Tensor:
     return ((W * torch.exp(g)).mean(dim=1) - kept * (T * f).mean(dim=1)).sum()
 
 
-class EvenLight(nn.Module):
+class AlbedoNetwork(nn.Module):
     """F_t P sigmoid(a) of orders one, then two and more, per channel, a a perceptron of the exit.
 
     Args:
@@ -136,7 +122,7 @@ class EvenLight(nn.Module):
         channels: of the medium.
         hidden: widths of the hidden layers.
         eta: relative index.
-        seed: of the numbers at the start.
+        seed: of the initial weights.
     """
 
     def __init__(self, n_in: int, channels: int, hidden: tuple[int, ...], eta: float, seed: int = 0) -> None:
@@ -170,26 +156,26 @@ class EvenLight(nn.Module):
         return self.layers.arrays("A", "a")
 
 
-def mean_likelihood(found: tuple, T: torch.Tensor, scale: torch.Tensor) -> torch.Tensor:
+def mean_likelihood(both: tuple, T: torch.Tensor, scale: torch.Tensor) -> torch.Tensor:
     """E[alpha - T log alpha] over walks, sum over channels times their scale; its minimum is alpha = E[T | exit].
 
     Args:
-        found: from `EvenLight`.
+        both: from `AlbedoNetwork`.
         T: (2 channels, n).
         scale: (2 channels, 1).
     """
-    alpha, log_alpha = found
+    alpha, log_alpha = both
     return (scale * (alpha - T * log_alpha)).mean(dim=1).sum()
 
 
 class PatchLogits(nn.Module):
-    """log p(patch | exit) up to a constant; shares of the area at the start.
+    """log p(patch | exit) up to a constant; initially the shares of the area.
 
     Args:
         n_in: features of an exit.
         areas: of the patches.
         hidden: widths of the hidden layers.
-        seed: of the numbers at the start.
+        seed: of the initial weights.
     """
 
     def __init__(self, n_in: int, areas: np.ndarray, hidden: tuple[int, ...], seed: int = 0) -> None:

@@ -9,30 +9,18 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from full_geometry.learning.shapes import TRAINING, Family, make_shape
 from full_geometry.models.descriptors import ALONE, describe, end, medium, mixed
 from full_geometry.models.neural_shape import ALBEDO, ETA, SIZE, Backbone, G
-from full_geometry.object.pairs import Proposals
+from full_geometry.object.pairs import EntryProposals
 from full_geometry.object.subject import Subject, SurfacePoint
 from full_geometry.object.walks import trace_exits
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.tracing.walk import generator, pass_seed
-
-__all__ = [
-    "GROUPS",
-    "Drawn",
-    "Grouped",
-    "PairData",
-    "Part",
-    "draw_medium",
-    "draw_subject",
-    "grouped",
-    "make_data",
-    "mean_events",
-]
-
 
 # ---- Which shapes and media the network is trained on: drawn at random, each from its own seed -----
 
@@ -85,8 +73,6 @@ def draw_subject(
         families: generators by name; by default those of training, with spheres and the meshes among them.
         meshes: PLY files that some of the shapes are taken from.
     """
-    import mitsuba as mi
-
     rng = np.random.default_rng(list(seed))
     u, path = rng.random(2), meshes[int(rng.integers(len(meshes)))] if meshes else None
     made = TRAINING if families is None else families
@@ -154,8 +140,8 @@ class PairData:
     @classmethod
     def from_arrays(cls, arrays: Any) -> PairData:
         """From a file; KeyError if it is another one."""
-        found = {name: arrays[name] for name in NAMES}
-        return cls(**{**found, "share": float(found["share"])})
+        stored = {name: arrays[name] for name in NAMES}
+        return cls(**{**stored, "share": float(stored["share"])})
 
 
 def make_data(subject: Subject, events: float, seed: tuple[int, ...]) -> PairData | None:
@@ -166,9 +152,6 @@ def make_data(subject: Subject, events: float, seed: tuple[int, ...]) -> PairDat
         events: of a walk, about, which limits the number of walks.
         seed: of all of it.
     """
-    import drjit as dr
-    import mitsuba as mi
-
     n = int(np.clip(EVENTS / events, FEWEST_WALKS, WALKS))
     starts = subject.random_points(generator(mi, n, pass_seed(*seed, 0)))
     exits = trace_exits(subject, starts, (*seed, 1), roulette_from=ROULETTE_FROM)
@@ -184,7 +167,7 @@ def make_data(subject: Subject, events: float, seed: tuple[int, ...]) -> PairDat
     walks, _ = _columns(half_space, starts.gather(kept), exits.at.gather(kept))
     rng = generator(mi, KEPT, pass_seed(*seed, 2))
     starts = subject.random_points(rng)
-    entries, weight = Proposals(subject, half_space).sample(starts, rng)
+    entries, weight = EntryProposals(subject, half_space).sample(starts, rng)
     proposals, S_0 = _columns(half_space, starts, entries)
     W = (S_0 * weight.numpy() / mean).astype(np.float32)
     T = (T / mean).astype(np.float32)
@@ -193,9 +176,6 @@ def make_data(subject: Subject, events: float, seed: tuple[int, ...]) -> PairDat
 
 def _columns(half_space: Backbone, exits: SurfacePoint, entries: SurfacePoint) -> tuple[np.ndarray, np.ndarray]:
     """Descriptors of pairs, (pairs, numbers), and S_0 P_o P_i of the first channel."""
-    import drjit as dr
-    import mitsuba as mi
-
     subject = half_space.subject
     o, i = (end(subject, at) for at in (exits, entries))
     query, F_t, above = half_space.query(exits, entries)
@@ -206,8 +186,8 @@ def _columns(half_space: Backbone, exits: SurfacePoint, entries: SurfacePoint) -
     pair = describe(subject, o, i, half_space.shares([mi.Float(S_0.astype(np.float32))], o, i))[0]
     columns = [*pair.exit, *pair.entry, *pair.shared]
     dr.eval(columns)
-    found = np.stack([np.broadcast_to(c.numpy(), dr.width(exits.p)) for c in columns], axis=-1)
-    return np.nan_to_num(found, posinf=0, neginf=0).astype(np.float16), S_0
+    rows = np.stack([np.broadcast_to(c.numpy(), dr.width(exits.p)) for c in columns], axis=-1)
+    return np.nan_to_num(rows, posinf=0, neginf=0).astype(np.float16), S_0
 
 
 # ---- Exits of one object in groups of those that look alike, whose light a fit holds to that of walks
@@ -227,7 +207,7 @@ NOISE, PAIRS = 0.03, 64  # squared, of the mean of so many proposals
 LEAST_LIGHT, FEWEST_PROPOSALS, FEWEST_WALKS_OF_GROUP = 1e-3, 128, 32
 
 
-class Part(NamedTuple):
+class GroupPart(NamedTuple):
     """Some pairs of one group.
 
     Args:
@@ -251,7 +231,7 @@ class Part(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Grouped:
+class GroupedPairs:
     """Data in the order of groups.
 
     Args:
@@ -269,7 +249,7 @@ class Grouped:
     light: np.ndarray
     weight: np.ndarray
 
-    def part(self, n: int, rng: np.random.Generator) -> Part:
+    def part(self, n: int, rng: np.random.Generator) -> GroupPart:
         """n walks and proposals, or all there are, of a random group."""
         data, u = self.data, rng.random(3)
         k = int(u[0] * GROUPS)
@@ -277,10 +257,10 @@ class Grouped:
         among = data.share * (self.walks[k + 1] - self.walks[k]) / len(data.T)
         T = data.T[j] * (among * GROUPS / max(len(j), 1))
         numbers = float(self.share[k] * GROUPS), float(self.light[k]), float(self.weight[k])
-        return Part(data.walks[j], T, data.proposals[i], data.W[i], data.medium, *numbers)
+        return GroupPart(data.walks[j], T, data.proposals[i], data.W[i], data.medium, *numbers)
 
 
-def grouped(data: PairData) -> Grouped:
+def grouped(data: PairData) -> GroupedPairs:
     """The data of an object in 16 groups of exits, halved four times at the median of their first principal axis."""
     exits = [v[:, ALONE].astype(np.float32) for v in (data.proposals, data.walks)]
     mean, spread = exits[0].mean(axis=0), exits[0].std(axis=0) + 1e-6
@@ -298,7 +278,7 @@ def grouped(data: PairData) -> Grouped:
     known = (light > LEAST_LIGHT) & (counts[0] >= FEWEST_PROPOSALS) & (counts[1] >= FEWEST_WALKS_OF_GROUP)
     noise = W[1] / PAIRS + (1 + T[1]) / np.maximum(counts[1], 1)
     weight = np.where(known, EMPHASIS / (1 + noise / NOISE), 0.0)
-    return Grouped(data, *bounds, share, np.where(known, light, 1.0), weight)
+    return GroupedPairs(data, *bounds, share, np.where(known, light, 1.0), weight)
 
 
 def _halve(exits: list[np.ndarray], labels: list[np.ndarray], kept: list[np.ndarray], times: int, first: int) -> None:

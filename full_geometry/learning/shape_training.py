@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from full_geometry.learning.shape_data import Grouped, PairData, draw_subject, grouped, make_data, mean_events
+from full_geometry.learning.shape_data import GroupedPairs, PairData, draw_subject, grouped, make_data, mean_events
 from full_geometry.models.descriptors import CURVED_OWN, CURVED_SHARED, N_MEDIUM, N_OWN, N_SHARED
 from full_geometry.models.neural_shape import ALBEDO, ETA, KIND, LEAST, PLACE_OF_G, SIZE, WEIGHTS, G, most
 from halfspace_sss.checks import check_count, check_interval
@@ -27,15 +27,12 @@ from halfspace_sss.progress import NamedProgress
 from halfspace_sss.provenance import check_folder, provenance, write_atomically
 from halfspace_sss.rendering.scenes.learners import LearntShapes
 
-__all__ = ["STANDARD", "Fitting", "Network", "Recipe", "make_objects", "train_shapes"]
-
-
 BETAS, CLIP, LAST_RATE, WARM_UP, AVERAGE = (0.9, 0.99), 1.0, 0.01, 100, 0.9985
 MOST_OFF = 3.0  # of the light of a group: what is far too bright has its say by the likelihood
 
 
 @dataclass(frozen=True)
-class Recipe:
+class ShapeRecipe:
     """How the network is fitted.
 
     Args:
@@ -57,18 +54,19 @@ class Recipe:
         check_interval("rate", self.rate, 1e-8, 1.0)
 
 
+Recipe = ShapeRecipe  # its name in `full_geometry.neural_shape`
 STANDARD = Recipe()
 
 
-class Network(nn.Module):
-    """f of `model.NeuralShape` in torch; 0 at the start.
+class ShapeNetwork(nn.Module):
+    """f of `NeuralShape` in torch; 0 initially.
 
     Args:
         recipe: its size.
-        seed: of the numbers at the start.
+        seed: of the initial weights.
     """
 
-    def __init__(self, recipe: Recipe, seed: int = 0) -> None:
+    def __init__(self, recipe: ShapeRecipe, seed: int = 0) -> None:
         super().__init__()
         generator = torch.Generator().manual_seed(seed)
         curved = len(range(N_OWN)[CURVED_OWN]) + len(range(N_SHARED)[CURVED_SHARED])
@@ -96,8 +94,8 @@ class Network(nn.Module):
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Matrices (outputs, inputs) and biases by name."""
-        found = {f"W_{k}": W.detach().numpy().copy() for k, W in enumerate(self.matrices)}
-        return found | {f"b_{k}": b.detach().numpy().copy() for k, b in enumerate(self.biases)}
+        arrays = {f"W_{k}": W.detach().numpy().copy() for k, W in enumerate(self.matrices)}
+        return arrays | {f"b_{k}": b.detach().numpy().copy() for k, b in enumerate(self.biases)}
 
 
 def _halves(values: torch.Tensor, counts: list[int]) -> torch.Tensor:
@@ -108,24 +106,24 @@ def _halves(values: torch.Tensor, counts: list[int]) -> torch.Tensor:
     return (sums / torch.from_numpy(size).float()).view(-1, 2)
 
 
-class Fitting:
+class ShapeFit:
     """The state of a fit, which follows from recipe, seed, number of steps and data.
 
     Args:
         recipe: sizes and rates.
-        seed: of the numbers at the start.
+        seed: of the initial weights.
         network: another network to fit, for comparisons.
     """
 
-    def __init__(self, recipe: Recipe, seed: int, network: nn.Module | None = None) -> None:
+    def __init__(self, recipe: ShapeRecipe, seed: int, network: nn.Module | None = None) -> None:
         self.recipe = recipe
-        self.network = network or Network(recipe, seed)
+        self.network = network or ShapeNetwork(recipe, seed)
         self.average = copy.deepcopy(self.network)
         self.parameters = list(self.network.parameters())
         self.adam = torch.optim.Adam(self.parameters, lr=recipe.rate, betas=BETAS, foreach=True)
         self.step = 0
 
-    def advance(self, pool: list[Grouped], rng: np.random.Generator, part: float) -> float:
+    def advance(self, pool: list[GroupedPairs], rng: np.random.Generator, part: float) -> float:
         """One step on random parts of random objects; returns the loss.
 
         Args:
@@ -147,8 +145,8 @@ class Fitting:
             torch._foreach_lerp_(list(self.average.parameters()), self.parameters, share)
         return float(loss.detach())
 
-    def loss(self, batch: list[Grouped], rng: np.random.Generator) -> torch.Tensor:
-        """E_q[(S_0 mu_i / q) exp f] - E_walks[T f] over the mean of T, and what `groups` adds; a mean over objects.
+    def loss(self, batch: list[GroupedPairs], rng: np.random.Generator) -> torch.Tensor:
+        """E_q[(S_0 mu_i / q) exp f] - E_walks[T f] over the mean of T, and the light of groups; a mean over objects.
 
         Of each object a part of one group of its exits is taken.
         """
@@ -202,7 +200,7 @@ def train_shapes(
     seconds: float = 600.0,
     seed: int = 0,
     meshes: Sequence[str | Path] = (),
-    recipe: Recipe = STANDARD,
+    recipe: ShapeRecipe = STANDARD,
     plan: tuple[int, int] | None = None,
     work: str | Path | None = None,
     progress: NamedProgress | None = None,
@@ -236,26 +234,26 @@ def train_shapes(
     for place in (folder, work):
         if place is not None:
             check_folder(place)
-    run = _Run(recipe, int(seed), [Path(m) for m in meshes], Path(work) if work else None)
+    run = _ShapeTraining(recipe, int(seed), [Path(m) for m in meshes], Path(work) if work else None)
     return run.go(Path(folder), seconds, plan, progress)
 
 
 def make_objects(
-    seed: int, first: int, last: int, meshes: Sequence[str | Path], work: str | Path, recipe: Recipe = STANDARD
+    seed: int, first: int, last: int, meshes: Sequence[str | Path], work: str | Path, recipe: ShapeRecipe = STANDARD
 ) -> None:
     """Make the data of objects ahead, as another process: a run with the same seed, meshes and work takes them over."""
-    run = _Run(recipe, seed, [Path(m) for m in meshes], Path(work))
+    run = _ShapeTraining(recipe, seed, [Path(m) for m in meshes], Path(work))
     for k in range(first, last):
         run.object(k)
 
 
-class _Run:
+class _ShapeTraining:
     """A training on its way."""
 
-    def __init__(self, recipe: Recipe, seed: int, meshes: list[Path], work: Path | None) -> None:
+    def __init__(self, recipe: ShapeRecipe, seed: int, meshes: list[Path], work: Path | None) -> None:
         self.recipe, self.seed, self.meshes, self.work = recipe, seed, meshes, work
-        self.fitting = Fitting(recipe, seed)
-        self.pool: list[Grouped] = []
+        self.fitting = ShapeFit(recipe, seed)
+        self.pool: list[GroupedPairs] = []
         self.seen: list[dict[str, Any]] = []
 
     def claim(self) -> None:
@@ -330,7 +328,7 @@ class _Run:
                 pool += [make_data(drawn.subject, mean_events(drawn.subject), (self.seed, k))]
             pool = [grouped(data) for data in pool if data]
             each = (time.monotonic() - at) / TRIAL_OBJECTS
-            trial, rng, at = Fitting(self.recipe, 0), np.random.default_rng(0), time.monotonic()
+            trial, rng, at = ShapeFit(self.recipe, 0), np.random.default_rng(0), time.monotonic()
             for _ in range(TRIAL_STEPS):
                 trial.advance(pool, rng, 0.0)
             step = (time.monotonic() - at) / TRIAL_STEPS

@@ -27,9 +27,6 @@ from full_geometry.learning.meshes import (
 )
 from halfspace_sss.checks import check_choice, check_count
 
-__all__ = ["TRAINING", "make_shape", "box", "margin", "turned_points"]
-
-
 Made = tuple[Distance, Box]
 Family = Callable[[np.random.Generator], Made]
 
@@ -67,12 +64,12 @@ def blobs(rng: np.random.Generator) -> Made:
     thin = rng.uniform(0.06, 0.25, (len(rods), 2))
 
     def distance(p: np.ndarray) -> np.ndarray:
-        found = np.full(p.shape[:-1], 10.0)
+        d = np.full(p.shape[:-1], 10.0)
         for c, r, a in zip(centres, radii, angles):
-            found = join(found, ellipsoid(turned_points(p - c, a), tuple(r)), blend)
+            d = join(d, ellipsoid(turned_points(p - c, a), tuple(r)), blend)
         for (a, b), (r_a, r_b) in zip(rods, thin):
-            found = join(found, capsule(p, a, b, r_a, r_b), blend)
-        return found
+            d = join(d, capsule(p, a, b, r_a, r_b), blend)
+        return d
 
     points = np.concatenate([centres - radii.max(1, keepdims=True), centres + radii.max(1, keepdims=True)])
     ends = rods.reshape(-1, 3)
@@ -89,11 +86,11 @@ def boxes(rng: np.random.Generator) -> Made:
     centres[0], away[0] = 0, False
 
     def distance(p: np.ndarray) -> np.ndarray:
-        found = np.full(p.shape[:-1], 10.0)
+        d = np.full(p.shape[:-1], 10.0)
         for c, h, a, gone in zip(centres, halves, angles, away):
             part = box(turned_points(p - c, a), h, min(rounding, 0.9 * h.min()))
-            found = cut(found, part, blend) if gone else join(found, part, blend)
-        return found
+            d = cut(d, part, blend) if gone else join(d, part, blend)
+        return d
 
     reach = np.linalg.norm(halves, axis=1, keepdims=True)
     return distance, margin((centres - reach).min(0) - blend, (centres + reach).max(0) + blend)
@@ -156,11 +153,11 @@ def tori(rng: np.random.Generator) -> Made:
     ball = rng.uniform(0.15, 0.5) if rng.random() < 0.4 else 0.0
 
     def distance(p: np.ndarray) -> np.ndarray:
-        found = length(*np.moveaxis(p, -1, 0)) - ball if ball else np.full(p.shape[:-1], 10.0)
+        d = length(*np.moveaxis(p, -1, 0)) - ball if ball else np.full(p.shape[:-1], 10.0)
         for R, r, a, c in zip(major, minor, angles, centres):
             x, y, z = np.moveaxis(turned_points(p - c, a), -1, 0)
-            found = join(found, length(length(x, y) - R, z) - r, blend)
-        return found
+            d = join(d, length(length(x, y) - R, z) - r, blend)
+        return d
 
     reach = (np.abs(centres) + (major + minor)[:, None]).max(0) + blend
     return distance, margin(-np.maximum(reach, ball), np.maximum(reach, ball))
@@ -176,10 +173,10 @@ def combs(rng: np.random.Generator) -> Made:
     blend = rng.uniform(0, 0.1)
 
     def distance(p: np.ndarray) -> np.ndarray:
-        found = box(p, base, 0.8 * base.min())
+        d = box(p, base, 0.8 * base.min())
         for foot, tip, (a, b) in zip(feet, tips, radii):
-            found = join(found, capsule(p, foot, tip, a, b), blend)
-        return found
+            d = join(d, capsule(p, foot, tip, a, b), blend)
+        return d
 
     points = np.concatenate([feet - 0.2, tips + 0.2, tips - 0.2, [base, -base]])
     return distance, margin(points.min(0) - blend, points.max(0) + blend)
@@ -193,10 +190,10 @@ def rocks(rng: np.random.Generator) -> Made:
     sizes = rng.uniform(0.1, 0.35, len(holes))
 
     def distance(p: np.ndarray) -> np.ndarray:
-        found = (ellipsoid(p, tuple(radii)) + rough * radii.min() * fbm(waves * p, seed, 3)) / (1 + rough)
+        d = (ellipsoid(p, tuple(radii)) + rough * radii.min() * fbm(waves * p, seed, 3)) / (1 + rough)
         for c, r in zip(holes, sizes):
-            found = cut(found, length(*np.moveaxis(p - c, -1, 0)) - r, 0.03)
-        return found
+            d = cut(d, length(*np.moveaxis(p - c, -1, 0)) - r, 0.03)
+        return d
 
     return distance, margin(-radii - rough, radii + rough)
 

@@ -12,19 +12,21 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
-from full_geometry.learning.fitting import PROPOSED, STANDARD, Fitting, Recipe
-from full_geometry.learning.model_errors import ModelError, measure, of_even_light
+from full_geometry.learning.fitting import PROPOSED, STANDARD, ObjectFit, Recipe
+from full_geometry.learning.model_errors import RadianceError, measure, of_even_light
 from full_geometry.models import storing
 from full_geometry.models.object_model import FullGeometry
 from full_geometry.object.features import n_pair, n_side
 from full_geometry.object.identity import frame_of, identify
-from full_geometry.object.pairs import Pairs, PairSource, Proposals, shuffled
+from full_geometry.object.pairs import EntryProposals, Pairs, PairSource, shuffled
 from full_geometry.object.patches import Patches, PatchSampler, cluster
-from full_geometry.object.radiance import Estimate, Reference, reference, traced
+from full_geometry.object.radiance import ExitRadiance, ExitTruth, reference, traced
 from full_geometry.object.subject import Subject, SurfacePoint
-from full_geometry.object.walks import Exits
+from full_geometry.object.walks import WalkEnds
 from halfspace_sss.backend import busy_threads
 from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.neural.store import to_json
@@ -33,9 +35,6 @@ from halfspace_sss.neural.training.work_folder import CHECKPOINT, claim
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.provenance import check_folder, provenance, write_atomically
 from halfspace_sss.rendering.scenes.camera_walks import TRIAL
-
-__all__ = ["Schedule", "Seen", "Trained", "train", "train_by_cpu", "trusted"]
-
 
 # ---- Where what was learnt of even light is good enough to stand for it ----------------------------
 # S sees the surface around both its points, alpha is a network of the exit alone, which misses what changes over a mean
@@ -49,7 +48,7 @@ MOST = 0.05
 
 
 def trusted(
-    model: FullGeometry, truth: Reference, errors: list[ModelError], walks: int, seed: tuple[int, ...]
+    model: FullGeometry, truth: ExitTruth, errors: list[RadianceError], walks: int, seed: tuple[int, ...]
 ) -> np.ndarray:
     """1 where even light may be used and 0 where not, (2, channels): orders below two, then the others.
 
@@ -70,10 +69,10 @@ def trusted(
     return (wrong <= np.stack([0 * by_S + MOST, np.maximum(by_S, MOST)])).astype(np.float16)
 
 
-def _error(found: np.ndarray, truth: Estimate) -> np.ndarray:
+def _error(alpha: np.ndarray, truth: ExitRadiance) -> np.ndarray:
     """Relative RMSE of shares (channels, exits) under constant light, without the noise of walks."""
-    shares = found[:, :, None].astype(float)
-    return np.array([row.error for row in of_even_light(Estimate(shares, np.zeros_like(shares)), truth)])
+    shares = alpha[:, :, None].astype(float)
+    return np.array([row.error for row in of_even_light(ExitRadiance(shares, np.zeros_like(shares)), truth)])
 
 
 # ---- Exits that the camera sees, beside random ones: its walks are data for the fit as they come ---
@@ -85,7 +84,7 @@ PASSES = 4  # of a chunk
 MOST_RAYS = 4  # times that share: where an object is small in the picture, its paths would take all of the time
 
 
-class Schedule(NamedTuple):
+class CameraSchedule(NamedTuple):
     """Samples per pixel of a pass, passes of a chunk that has them, and of how many chunks one has."""
 
     spp: int
@@ -97,7 +96,7 @@ class Schedule(NamedTuple):
         return [] if k % self.every else [k // self.every * self.passes + j for j in range(self.passes)]
 
     @classmethod
-    def of(cls, walks: float, hits: int, pixels: int) -> Schedule | None:
+    def of(cls, walks: float, hits: int, pixels: int) -> CameraSchedule | None:
         """For so many walks of a chunk, where `hits` of `pixels` paths meet the object; None if none do."""
         if hits == 0:
             return None
@@ -107,7 +106,7 @@ class Schedule(NamedTuple):
         return cls(1, 1, math.ceil(1 / spp))
 
 
-class Seen:
+class CameraExits:
     """The part of each chunk that comes from the camera.
 
     Args:
@@ -119,8 +118,8 @@ class Seen:
 
     def __init__(self, source: PairSource, camera: Any, walks: int, seed: int) -> None:
         self.source, self.camera, self.walks, self.seed = source, camera, walks, seed
-        self.shape = source.subject.found.shape
-        self.schedule = Schedule.of(walks, camera.hits(self.shape), camera.pixels)
+        self.shape = source.subject.object.shape
+        self.schedule = CameraSchedule.of(walks, camera.hits(self.shape), camera.pixels)
 
     def seconds_more(self) -> float:
         """Of a chunk in the mean, by the second one; compiles what passes need."""
@@ -138,8 +137,6 @@ class Seen:
             k: number of the chunk.
             proposed: number of proposals.
         """
-        import drjit as dr
-
         seed, order = (self.seed, k), np.random.default_rng([self.seed, k, 1])
         parts = []
         if self.schedule:
@@ -157,16 +154,14 @@ class Seen:
         proposals.append(self.source.proposed(left[1], seed))
         return (shuffled(walks, order), shuffled(proposals, order)) if parts else (walks[0], proposals[0])
 
-    def _exits(self, numbers: list[int], order: np.random.Generator) -> list[tuple[SurfacePoint, Exits]]:
+    def _exits(self, numbers: list[int], order: np.random.Generator) -> list[tuple[SurfacePoint, WalkEnds]]:
         """Starts and ends of walks from the camera, launch by launch; of too many a random choice."""
-        import drjit as dr
-
         launches = [part for number in numbers for part in self.camera.exits(self.shape, number, self.schedule.spp)]
-        found = [part for part in launches if dr.width(part.object)]
-        ends = np.cumsum([0, *(dr.width(part.object) for part in found)])
+        with_exits = [part for part in launches if dr.width(part.object)]
+        ends = np.cumsum([0, *(dr.width(part.object) for part in with_exits)])
         chosen = np.sort(order.permutation(int(ends[-1]))[: int(SHARE * self.walks)])
         parts = []
-        for part, a, b in zip(found, ends, ends[1:]):
+        for part, a, b in zip(with_exits, ends, ends[1:]):
             own = chosen[(chosen >= a) & (chosen < b)] - a
             if len(own):
                 parts.append(_points(part.gather(_lanes(own))))
@@ -174,18 +169,14 @@ class Seen:
         return parts
 
 
-def _points(part: Any) -> tuple[SurfacePoint, Exits]:
+def _points(part: Any) -> tuple[SurfacePoint, WalkEnds]:
     """First exits of the camera as walks of this package, of the orders from one on."""
-    import drjit as dr
-
     starts = SurfacePoint(part.x_o, part.n_o, part.n_o_shading, part.w_o)
     ends = SurfacePoint(part.x_i, part.n_i, part.n_i_shading, part.w_i)
-    return starts, Exits(ends, dr.select(part.order >= 1, part.throughput, 0), part.order, part.face)
+    return starts, WalkEnds(ends, dr.select(part.order >= 1, part.throughput, 0), part.order, part.face)
 
 
 def _lanes(numbers: np.ndarray) -> Any:
-    import mitsuba as mi
-
     return mi.UInt32(numbers.astype(np.uint32))
 
 
@@ -212,7 +203,7 @@ class Trained:
     model: FullGeometry
     sampler: PatchSampler | None
     path: Path | None
-    errors: list[ModelError]
+    errors: list[RadianceError]
     steps: int
     seconds: float
 
@@ -244,7 +235,7 @@ def train(
         medium: 1/mm, scalar or one value per channel; of a scene it is that of the object's `translucent` surface.
         mm_per_unit: length of a scene unit, mm; by default what the integrator of a scene says, and 1 for a shape.
         object: id of the object in a scene; may be left out where there is one.
-        seconds: for data, fit and validation, after the kernels are compiled; 0 gives the start, with a warning.
+        seconds: for data, fit and validation, after the kernels are compiled; 0 gives the base model, with a warning.
         target_error: stop once the largest error under constant light has come down to it.
         seed: of everything.
         recipe: sizes and rates.
@@ -253,7 +244,7 @@ def train(
         work: folder for unfinished work.
         camera: a `CameraWalks`, whose walks join those of random exits.
         progress: called with (what, done, total).
-        start: that it begins with, `neural_shape` or a half-space model, with its rate; by default the recipe's.
+        start: base model,  `neural_shape` or a half-space model, with its rate; by default the recipe's.
 
     Raises:
         ValueError: an argument is out of range, or `work` is of another run; nothing has been traced then.
@@ -271,7 +262,7 @@ def train(
     if not any(float(m.sigma_s) > 0 for m in subject.media):
         raise ValueError("medium must scatter in at least one channel to be learnt, got sigma_s 0 in all")
     recipe = recipe if start is None else recipe.begun(start)
-    run = _Run(subject, recipe, int(seed), Path(work) if work else None, camera)
+    run = _ObjectTraining(subject, recipe, int(seed), Path(work) if work else None, camera)
     if seconds == 0:
         warnings.warn(f"an object that is trained for 0 seconds is rendered by {recipe.start}", stacklevel=2)
         return Trained(*run.learnt()[:2], None, [], 0, 0.0)
@@ -290,7 +281,7 @@ def train_by_cpu(
         seed, recipe: of everything; sizes and rates.
     """
     check_interval("seconds", seconds, 1e-3, 1e7)
-    run, began = _Run(subject, recipe, seed, None, None), time.process_time()
+    run, began = _ObjectTraining(subject, recipe, seed, None, None), time.process_time()
     run._prepare()
     while run.done < run.total:
         run._chunk(seconds, time.process_time)
@@ -300,20 +291,18 @@ def train_by_cpu(
     return run.learnt(), storing.save(folder, run.identity, run.arrays(), record)
 
 
-class _Run:
+class _ObjectTraining:
     """A training on its way."""
 
     def __init__(self, subject: Subject, recipe: Recipe, seed: int, work: Path | None, camera: Any) -> None:
-        import mitsuba as mi
-
         self.subject, self.recipe, self.seed, self.work, self.camera = subject, recipe, seed, work, camera
         self.identity, self.frame = identify(subject), frame_of(subject)
-        self.start = storing.start_of(subject, recipe.start)
-        self.proposals = Proposals(subject, self.start)
-        self.source = PairSource(subject, self.frame, self.start, self.proposals)
-        self.seen: Seen | None = None
+        self.base = storing.base_model(subject, recipe.start)
+        self.proposals = EntryProposals(subject, self.base)
+        self.source = PairSource(subject, self.frame, self.base, self.proposals)
+        self.seen: CameraExits | None = None
         self.patches = self.centres = None
-        if "faces" in mi.traverse(subject.found.shape):
+        if "faces" in mi.traverse(subject.object.shape):
             self.centres = cluster(subject, self.frame, seed=seed).astype(np.float16)
             self.patches = Patches(subject, self.frame, self.centres.astype(np.float32))
         self.fitting = self._new_fitting()
@@ -322,20 +311,20 @@ class _Run:
         self.ready: tuple[Pairs, Pairs] | None = None
         self.aside = ThreadPoolExecutor(1)
 
-    def _new_fitting(self) -> Fitting:
+    def _new_fitting(self) -> ObjectFit:
         channels = len(self.subject.media)
         n_in = 2 * n_side(channels, self.subject.n_local) + n_pair(channels)
-        return Fitting(n_in, channels, self.subject.eta, self.recipe, self.seed, self.patches)
+        return ObjectFit(n_in, channels, self.subject.eta, self.recipe, self.seed, self.patches)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """What is written: in half precision, but for what turns the inputs."""
-        found = {name: value.astype(np.float16) for name, value in self.fitting.arrays().items()}
-        found |= {storing.EVEN: self.even, storing.TURNS: self.frame.around.turns}
-        return found if self.centres is None else {**found, storing.CENTRES: self.centres}
+        arrays = {name: value.astype(np.float16) for name, value in self.fitting.arrays().items()}
+        arrays |= {storing.EVEN: self.even, storing.TURNS: self.frame.around.turns}
+        return arrays if self.centres is None else {**arrays, storing.CENTRES: self.centres}
 
     def learnt(self) -> storing.Learnt:
         """Model and sampler as they stand."""
-        return storing.assemble(self.subject, self.frame, self.start, self.arrays(), self.patches)
+        return storing.assemble(self.subject, self.frame, self.base, self.arrays(), self.patches)
 
     def go(
         self, seconds: float, chunks: int | None, target: float | None, folder: Path, progress: Progress | None
@@ -357,11 +346,11 @@ class _Run:
             if progress:
                 progress(what, self.done, self.total)
         self.fitting.solve(self.source, self.done, self.seed)
-        found = self._judged(truth, 2 * WALKS)
+        errors = self._judged(truth, 2 * WALKS)
         spent = time.monotonic() - started
         self._save_camera()
-        path = storing.save(folder, self.identity, self.arrays(), self._record(found, spent))
-        return Trained(*self.learnt()[:2], path, found, self.fitting.step, spent)
+        path = storing.save(folder, self.identity, self.arrays(), self._record(errors, spent))
+        return Trained(*self.learnt()[:2], path, errors, self.fitting.step, spent)
 
     def _prepare(self, chunks: int | None = None) -> None:
         """Scales and shares from a pilot, which compiles all kernels; the work of a run that was killed."""
@@ -374,7 +363,7 @@ class _Run:
         self._new_fitting().use(pilot, proposed, None, np.random.default_rng(0))
         run = {"object": self.identity.record(), "recipe": asdict(self.recipe), "seed": self.seed}
         if self.camera:
-            self.seen = Seen(self.source, self.camera, self.walks, self.seed)
+            self.seen = CameraExits(self.source, self.camera, self.walks, self.seed)
             run["camera"] = {"scene": self.camera.about.get("scene"), "schedule": self.seen.schedule}
         if self.work:
             claim(self.work, **run)
@@ -418,19 +407,19 @@ class _Run:
             each = clock() - at + (self.seen.seconds_more() if self.seen else 0.0)
             self._plan(max(int(LOOP_SHARE * seconds / each), 2))
 
-    def _errors(self, truth: Reference, samples: int) -> list[ModelError]:
+    def _errors(self, truth: ExitTruth, samples: int) -> list[RadianceError]:
         """Of the model as it stands; entries follow the patches, which have less noise than probes."""
         model, sampler = self.learnt()[:2]
         by = self.proposals.with_patches(sampler)
         return measure(self.subject, model, by, truth=truth, samples=samples, seed=self.seed)
 
-    def _judged(self, truth: Reference, samples: int) -> list[ModelError]:
+    def _judged(self, truth: ExitTruth, samples: int) -> list[RadianceError]:
         """Errors at the end, and what even light may be used for."""
-        found = self._errors(truth, samples)
-        self.even = trusted(self.learnt().model, truth, found, WALKS, (self.seed, 20))
-        return found
+        errors = self._errors(truth, samples)
+        self.even = trusted(self.learnt().model, truth, errors, WALKS, (self.seed, 20))
+        return errors
 
-    def _validated(self, truth: Reference) -> tuple[int, float, float]:
+    def _validated(self, truth: ExitTruth) -> tuple[int, float, float]:
         """Chunk, largest error under constant light and its standard error."""
         rows = self._errors(truth, SAMPLES)
         live = [r for r in rows if r.light == "constant" and float(self.subject.media[r.channel].sigma_s) > 0]
@@ -444,10 +433,10 @@ class _Run:
         if self.camera:
             self.camera.save()
 
-    def _record(self, found: list[ModelError], seconds: float) -> dict[str, Any]:
+    def _record(self, errors: list[RadianceError], seconds: float) -> dict[str, Any]:
         return {
             "recipe": asdict(self.recipe), "seed": self.seed, "steps": self.fitting.step, "chunks": self.done,
-            storing.CHECKSUMS: storing.start_checksums(self.subject, self.recipe.start),
+            storing.CHECKSUMS: storing.base_checksums(self.subject, self.recipe.start),
             "walks": self.walks * self.done, "seconds": seconds, "history": self.history,
-            "errors": [row._asdict() for row in found], "provenance": provenance(seed=self.seed),
+            "errors": [row._asdict() for row in errors], "provenance": provenance(seed=self.seed),
         }  # fmt: skip

@@ -10,6 +10,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from full_geometry.object.first_event import FirstEvent, first_event
@@ -19,32 +21,6 @@ from halfspace_sss.physics.backbone import length_scale
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.transport.plane import number
 from halfspace_sss.tracing.walk import generator, pass_seed
-
-__all__ = [
-    "ALONE",
-    "CURVED_OWN",
-    "CURVED_SHARED",
-    "N_LENGTHS",
-    "N_MEDIUM",
-    "N_OWN",
-    "N_SHARED",
-    "RAYS",
-    "End",
-    "Line",
-    "Mixed",
-    "Pair",
-    "Surroundings",
-    "describe",
-    "directions",
-    "end",
-    "look",
-    "mean_chord",
-    "medium",
-    "mixed",
-    "on_a_plane",
-    "phases",
-]
-
 
 # ----------------------------------------------------------------------------------------------------
 # Light that has forgotten where it entered: what an object holds as a whole, where it is thin and reflects inside.
@@ -63,7 +39,7 @@ __all__ = [
 # It holds in what is thin and flat or rugged; in a smooth ball it is up to twice too much, as light that entered does
 # not
 # reach what is held near the surface. M is divided by 1 + (sigma_t' c)², as light of thick objects leaves near where it
-# entered. m_2 = a²/(4 pi eta)² is that of light of two events, see `backbone`.
+# entered. m_2 = a²/(4 pi eta)² is that of light of two events, see `neural_shape.Backbone`.
 
 
 POINTS, SEED = 2**15, 31
@@ -118,7 +94,7 @@ def _of(subject: Subject, media: Sequence[Medium], scattered: Sequence[float], c
     a_reduced, k, thin = float(reduced.albedo), scattered[1] / scattered[0], 1 / (1 + thickness**2)
     M = a**2 * max(q - q_direct, 0.0) / float(m.sigma_t)
     M += a * q * k**2 * a_reduced**2 * q_reduced / (1 - a_reduced * q_reduced) / float(reduced.sigma_t)
-    M /= math.pi * subject.found.area * chord * m.eta**2  # 4 V = c A
+    M /= math.pi * subject.object.area * chord * m.eta**2  # 4 V = c A
     return Mixed(M * thin, (a / (4 * math.pi * m.eta)) ** 2, thickness, q, q_reduced, q_direct, k)
 
 
@@ -149,8 +125,6 @@ class Line(NamedTuple):
     @classmethod
     def between(cls, a: Any, b: Any) -> Line:
         """From a to b."""
-        import drjit as dr
-
         way = b - a
         length = dr.norm(way)
         return cls(way / dr.maximum(length, LEAST_R), length)
@@ -166,8 +140,6 @@ def on_a_plane(n_o: Any, inner_o: Any, n_i: Any, inner_i: Any, line: Line) -> tu
 
     There both y lie a mean free path along them.
     """
-    import drjit as dr
-    import mitsuba as mi
 
     def inside(n: Any, along: Any) -> Any:
         flat = mi.Vector3f(line.d - n * dr.dot(n, line.d))
@@ -180,8 +152,6 @@ def on_a_plane(n_o: Any, inner_o: Any, n_i: Any, inner_i: Any, line: Line) -> tu
 
 def phases(g: float, d_o: Any, d_i: Any, d: Any) -> Any:
     """Both phase functions of light that goes along d from one end to the other, times (4 pi)²."""
-    import drjit as dr
-
     a, b = number(1 + g * g), number(2 * g)
     c_o, c_i = dr.dot(d_o, d), -dr.dot(d_i, d)
     base = dr.maximum(a - b * c_o, LEAST_PHASE) * dr.maximum(a - b * c_i, LEAST_PHASE)
@@ -209,7 +179,7 @@ FAR = 1e30
 LEAST_SINE2 = 1e-8  # below it w has no azimuth
 
 
-class Surroundings(NamedTuple):
+class RaySurroundings(NamedTuple):
     """L and V for each length, and the depth z in scene units."""
 
     L: list[Any]
@@ -225,7 +195,7 @@ def directions(n: int = RAYS) -> np.ndarray:
     return np.stack([s * np.cos(phi), s * np.sin(phi), z])
 
 
-def look(subject: Subject, at: SurfacePoint, event: FirstEvent, active: Any = True) -> list[Surroundings]:
+def look(subject: Subject, at: SurfacePoint, event: FirstEvent, active: Any = True) -> list[RaySurroundings]:
     """Surroundings of the first events of each channel; channels of the same extinction share them.
 
     Args:
@@ -234,7 +204,7 @@ def look(subject: Subject, at: SurfacePoint, event: FirstEvent, active: Any = Tr
         event: their first events.
         active: mask of lanes.
     """
-    known: dict[tuple[float, float], Surroundings] = {}
+    known: dict[tuple[float, float], RaySurroundings] = {}
     for m, y in zip(subject.media, event.ys):
         key = float(m.sigma_t), float(m.sigma_t_prime)
         if key not in known:
@@ -242,11 +212,8 @@ def look(subject: Subject, at: SurfacePoint, event: FirstEvent, active: Any = Tr
     return [known[float(m.sigma_t), float(m.sigma_t_prime)] for m in subject.media]
 
 
-def _from(subject: Subject, at: SurfacePoint, y: Any, extinctions: tuple[float, float], active: Any) -> Surroundings:
+def _from(subject: Subject, at: SurfacePoint, y: Any, extinctions: tuple[float, float], active: Any) -> RaySurroundings:
     """Surroundings of the points y below the points of a surface, for sigma_t and sigma_t'."""
-    import drjit as dr
-    import mitsuba as mi
-
     tables = [mi.Float(row.astype(np.float32)) for row in directions()]
     sigma_t, sigma_t_prime = extinctions
     decays = [number(v) for v in (sigma_t, *(sigma_t_prime / length for length in LENGTHS))]
@@ -256,7 +223,7 @@ def _from(subject: Subject, at: SurfacePoint, y: Any, extinctions: tuple[float, 
     def step(j: Any, *sums: list) -> tuple:
         u, v, w = (dr.gather(mi.Float, table, j) for table in tables)
         d = mi.Vector3f(t * u + b * v + n * w)
-        hit = subject.found.scene.ray_intersect_preliminary(mi.Ray3f(y, d), False, active)
+        hit = subject.object.scene.ray_intersect_preliminary(mi.Ray3f(y, d), False, active)
         ways = dr.select(hit.is_valid(), hit.t, FAR), dr.select(w > 0, depth / dr.maximum(w, 1e-6), FAR)
         c, c_plane = ([1 - dr.exp(-way * decay) for decay in decays] for way in ways)
         new = c, c_plane, [d * v for v in c], [d * v for v in c_plane]
@@ -267,14 +234,11 @@ def _from(subject: Subject, at: SurfacePoint, y: Any, extinctions: tuple[float, 
     C, C_plane, M, M_plane = ([v / RAYS for v in each] for each in sums)
     L = [0.5 * dr.log((a + LEAST_CHANCE) / (b + LEAST_CHANCE)) for a, b in zip(C, C_plane)]
     V = [m_p / (b + LEAST_CHANCE) - m / (a + LEAST_CHANCE) for a, b, m, m_p in zip(C, C_plane, M, M_plane)]
-    return Surroundings(L, V, depth)
+    return RaySurroundings(L, V, depth)
 
 
 def _tangents(at: SurfacePoint) -> tuple[Any, Any]:
     """Two axes across the normal, the first one along w."""
-    import drjit as dr
-    import mitsuba as mi
-
     n = at.n_out
     along = at.w - n * dr.dot(n, at.w)
     spare, _ = mi.coordinate_system(n)
@@ -286,7 +250,7 @@ def _tangents(at: SurfacePoint) -> tuple[Any, Any]:
 # ----------------------------------------------------------------------------------------------------
 # What the network is told of a pair of points: the medium, the pair as on a plane, and how far it is from a plane.
 # For a channel with l' = 1/sigma_t' and each end of the pair (exit and entry; d is the direction to the other end, e
-# that from y to the other y; L_k and V_k are those of `surroundings`):
+# that from y to the other y; L_k and V_k are those of `RaySurroundings`):
 #
 #     own:     mu, mu', w.d, w.n of the other end, refracted w.e, log of the depth of y in mean free paths;
 #              log P, log of the way to y in mean free paths, n.d, n.e, L_k, -V_k.n, V_k.e
@@ -297,7 +261,7 @@ def _tangents(at: SurfacePoint) -> tuple[Any, Any]:
 # the
 #              two, over those of a plane, within 1/4 and 4, exp(-sigma_t |y_i - y_o|) less that of a plane, and the
 #              shares of S_0 that are mixed and scattered twice
-#     medium:  nine functions of albedo, g and eta, two of sigma_t' sqrt(area), five of what `mixing` says
+#     medium:  nine functions of albedo, g and eta, two of sigma_t' sqrt(area), five of `Mixed`
 #
 # What stands behind a semicolon, own numbers summed over both ends, is 0 on a plane. All are free of scale, place and
 # turn, and exchanged with the ends.
@@ -317,7 +281,7 @@ class End(NamedTuple):
 
     at: SurfacePoint
     event: FirstEvent
-    around: list[Surroundings]
+    around: list[RaySurroundings]
     inner: Any
 
 
@@ -340,10 +304,10 @@ def medium(subject: Subject, channel: int, mixed: Mixed) -> np.ndarray:
     """The numbers of the medium of a channel and of the object as a whole, (16,)."""
     m = subject.media[channel]
     albedo, g, eta = (np.float64(v) for v in (m.albedo, m.g, m.eta))
-    size = float(m.sigma_t_prime) * math.sqrt(subject.found.area)
-    found = medium_features(np, albedo, g, eta, length_scale(albedo, g))
+    size = float(m.sigma_t_prime) * math.sqrt(subject.object.area)
+    of_medium = medium_features(np, albedo, g, eta, length_scale(albedo, g))
     sizes = [1 / (1 + 0.1 * size), 0.2 * math.log1p(size), 0.3 * math.log(mixed.chord + 1e-2)]
-    return np.array([*found, *sizes, mixed.q, mixed.q_reduced, mixed.q_direct, mixed.k], dtype=np.float32)
+    return np.array([*of_medium, *sizes, mixed.q, mixed.q_reduced, mixed.q_direct, mixed.k], dtype=np.float32)
 
 
 def describe(
@@ -352,21 +316,18 @@ def describe(
     """The descriptors of pairs for each channel, with the shares of `Backbone`; those of one extinction share rays."""
     line = Line.between(exit.at.p, entry.at.p)
     clear: dict[float, tuple[Any, Any]] = {}
-    found = []
+    pairs = []
     for c, m in enumerate(subject.media):
         key = float(m.sigma_t)
         if key not in clear:
             clear[key] = _clearance(subject, exit.event.ys[c], entry.event.ys[c], active)
-        found.append(_channel(subject, c, exit, entry, line, clear[key], shares[c]))
-    return found
+        pairs.append(_channel(subject, c, exit, entry, line, clear[key], shares[c]))
+    return pairs
 
 
 def _channel(
     subject: Subject, c: int, exit: End, entry: End, line: Line, clear: tuple[Any, Any], shares: Sequence[Any]
 ) -> Pair:
-    import drjit as dr
-    import mitsuba as mi
-
     m = subject.media[c]
     s, t, g = number(float(m.sigma_t_prime)), number(float(m.sigma_t)), float(m.g)
     gap = Line.between(exit.event.ys[c], entry.event.ys[c])
@@ -389,16 +350,12 @@ def _channel(
 
 def _onward(g: float, exit: End, entry: End) -> Any:
     """0.3 log of a phase function of g², of light that two events turn from one end into the other."""
-    import drjit as dr
-
     g = min(g * abs(g), MOST_G)
     c = -dr.dot(exit.inner, entry.inner)
     return 0.3 * dr.log(number(1 - g * g) / (number(1 + g * g) - number(2 * g) * c))
 
 
 def _own(c: int, sigma_t: Any, here: End, there: End, line: Line, gap: Line) -> list[Any]:
-    import drjit as dr
-
     at, event, n, around = here.at, here.event, here.at.n_out, here.around[c]
     return [
         dr.dot(at.w, n), -dr.dot(here.inner, n), dr.dot(at.w, line.d), dr.dot(at.w, there.at.n_out),
@@ -412,13 +369,10 @@ def _own(c: int, sigma_t: Any, here: End, there: End, line: Line, gap: Line) -> 
 
 def _clearance(subject: Subject, a: Any, b: Any, active: Any) -> tuple[Any, Any]:
     """Of the line between two points inside: 1 if it leaves the object, else 0; the length that it is outside for."""
-    import drjit as dr
-    import mitsuba as mi
-
     line = Line.between(a, b)
 
     def reach(start: Any, d: Any, needed: Any) -> Any:
-        hit = subject.found.scene.ray_intersect_preliminary(mi.Ray3f(start, d), False, needed)
+        hit = subject.object.scene.ray_intersect_preliminary(mi.Ray3f(start, d), False, needed)
         return dr.select(hit.is_valid() & (hit.t < line.length), hit.t, line.length)
 
     one = reach(a, line.d, active)

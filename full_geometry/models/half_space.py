@@ -6,15 +6,15 @@ import functools
 import math
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
+
 from full_geometry.object.features import Side
 from full_geometry.object.first_event import first_event
 from full_geometry.object.subject import Subject, SurfacePoint
 from halfspace_sss.interface.model import BSSRDF, bssrdf
 from halfspace_sss.physics import fresnel
 from halfspace_sss.rendering.transport.plane import Exit, number, plane_query
-
-__all__ = ["FLOOR", "HalfSpace", "HalfSpaceTransport"]
-
 
 FLOOR = 1e-2  # reflectance of the floor, over that of the half-space
 
@@ -35,14 +35,14 @@ class HalfSpace:
     @functools.cached_property
     def floors(self) -> list[float]:
         """Per channel floor of G: floor R_d / (A N), N = 4 pi C_phi(1/eta) normalises F_t over exit directions."""
-        found = []
+        floors = []
         for m in self.subject.media:
             N = 4 * math.pi * fresnel.C_phi(1 / m.eta)
             albedo = float(m.albedo_prime)
             R_d = albedo**2 * math.exp(-2 * math.sqrt(max(1 - albedo, 0.0)))
             share = self.floor * max(R_d, 1e-6) if float(m.sigma_s) > 0 else 0.0
-            found.append(share / (self.subject.found.area * N))
-        return found
+            floors.append(share / (self.subject.object.area * N))
+        return floors
 
     def end(self, at: SurfacePoint, active: Any = True) -> Side:
         """What belongs to one end alone."""
@@ -50,9 +50,6 @@ class HalfSpace:
 
     def __call__(self, exit: Side, entry: Side, active: Any = True) -> Any:
         """1/((scene unit)² sr), 0 below the horizons."""
-        import drjit as dr
-        import mitsuba as mi
-
         query, F_t, above = self.query(exit.at, entry.at)
         S_0 = mi.Spectrum([m.eval(*query) + F_t * G for m, G in zip(self.models, self.added(exit, entry))])
         return dr.select(above, S_0 * exit.event.P * entry.event.P, 0)
@@ -63,15 +60,13 @@ class HalfSpace:
 
     def query(self, o: SurfacePoint, i: SurfacePoint) -> tuple[tuple, Any, Any]:
         """The query of the models, both Fresnel transmittances, and whether both directions are above the horizons."""
-        import drjit as dr
-
         query = plane_query(i.p, i.n_out, i.w, Exit(o.p, o.n_out, o.w, None), "distance")
         mu_i, mu_o, eta = query[1], query[3], number(self.subject.eta)
         F_t = fresnel.F_t(mu_i, eta) * fresnel.F_t(mu_o, eta)
         return query, F_t, (mu_i > 0) & (mu_o > 0) & (dr.dot(o.w, o.n) > 0) & (dr.dot(i.w, i.n) > 0)
 
 
-class HalfSpaceTransport:
+class PlanarModel:
     """A half-space model as renders lay it onto a surface today: no P, no floor.
 
     Args:
@@ -90,9 +85,6 @@ class HalfSpaceTransport:
 
     def S(self, exit: SurfacePoint, at: SurfacePoint, active: Any = True) -> Any:
         """S per channel, 1/((scene unit)² sr)."""
-        import drjit as dr
-        import mitsuba as mi
-
         query = plane_query(at.p, at.n_out, at.w, Exit(exit.p, exit.n_out, exit.w, None), "distance")
         above = active & (query[1] > 0) & (query[3] > 0)
         return dr.select(above, mi.Spectrum([m.eval(*query) for m in self.models]), 0)

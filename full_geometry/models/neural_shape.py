@@ -14,6 +14,8 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from full_geometry.models.descriptors import (
@@ -35,7 +37,7 @@ from full_geometry.models.descriptors import (
 )
 from full_geometry.models.half_space import HalfSpace
 from full_geometry.object.features import Side
-from full_geometry.object.pairs import Proposals
+from full_geometry.object.pairs import EntryProposals
 from full_geometry.object.subject import Subject, SurfacePoint, refract_in
 from full_geometry.object.walks import trace_exits
 from halfspace_sss.interface.model import BSSRDF, bssrdf
@@ -45,28 +47,6 @@ from halfspace_sss.once import once
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.transport.plane import number
 from halfspace_sss.tracing.walk import generator, pass_seed
-
-__all__ = [
-    "ALBEDO",
-    "ETA",
-    "G",
-    "KIND",
-    "LEAST",
-    "MODEL",
-    "PLACE_OF_G",
-    "SIZE",
-    "WEIGHTS",
-    "Backbone",
-    "NeuralShape",
-    "checksums",
-    "held",
-    "load",
-    "most",
-    "shipped_weights",
-    "transport",
-    "weight",
-]
-
 
 # ---- What the network of all shapes is trained on, and warns outside of ----------------------------
 
@@ -81,7 +61,7 @@ ALBEDO, G, ETA = (0.02, 1.0), (-0.3, 0.95), (1.0, 1.7)  # the albedo reduced
 #     S_twice = F_t(w_o) P_o F_t(w_i) P_i m_2 max(v - v', 0),    v = (4 pi)² p_o p_i exp(-sigma_t d)/(d² + e²),
 #
 # v' the same of a plane, whose light of two events the half-space has; e² a twelfth of the squared ways to both y, as
-# these are places in the mean; p of |g| <= 0.6, as so are directions. Light of more events is that of `mixing`.
+# these are places in the mean; p of |g| <= 0.6, as so are directions. Light of more events: `Mixed`.
 
 
 MODEL = "neural"
@@ -110,27 +90,22 @@ class Backbone(HalfSpace):
 
     def shares(self, S_0: Any, exit: Side, entry: Side) -> list[tuple[Any, Any]]:
         """Per channel the parts of S_0, of this pair, that are mixed and that are scattered twice; 0 on a plane."""
-        import drjit as dr
-
         F_t = self.query(exit.at, entry.at)[1]
-        found = []
+        parts = []
         for c, (mixture, twice) in enumerate(zip(self.mixtures, self.twice(exit, entry))):
             over = dr.select(
                 S_0[c] > LEAST_S, F_t * exit.event.P[c] * entry.event.P[c] / dr.maximum(S_0[c], LEAST_S), 0
             )
-            found.append((number(mixture.M) * over, twice * over))
-        return found
+            parts.append((number(mixture.M) * over, twice * over))
+        return parts
 
     def twice(self, exit: Side, entry: Side) -> Any:
         """S_twice/(F_t(w_o) P_o F_t(w_i) P_i) per channel, that of a plane taken off."""
-        import drjit as dr
-        import mitsuba as mi
-
         eta = number(self.subject.eta)
         o, i = (refract_in(side.at, eta)[0] for side in (exit, entry))
         line = Line.between(exit.at.p, entry.at.p)
         d_o, d_i = on_a_plane(exit.at.n_out, o, entry.at.n_out, i, line)
-        found = []
+        channels = []
         for c, (m, mixture) in enumerate(zip(self.subject.media, self.mixtures)):
             t = number(max(float(m.sigma_t), 1e-20))
             ys = exit.event.ys[c], entry.event.ys[c]
@@ -138,14 +113,12 @@ class Backbone(HalfSpace):
             flat = Line.between(d_o / t, mi.Vector3f(line.length, 0, 0) + d_i / t)
             here = _twice(m, o, i, Line.between(*ys), spread)
             plane = _twice(m, d_o, d_i, flat, 2 / dr.square(t))
-            found.append(number(mixture.m_2) * dr.maximum(here - plane, 0))
-        return mi.Spectrum(found)
+            channels.append(number(mixture.m_2) * dr.maximum(here - plane, 0))
+        return mi.Spectrum(channels)
 
 
 def _twice(m: Medium, d_o: Any, d_i: Any, line: Line, spread: Any) -> Any:
     """Both phase functions and the attenuation along a line over its squared length, times (4 pi)²."""
-    import drjit as dr
-
     t = number(float(m.sigma_t))
     apart = dr.square(line.length) + spread / 12 + LEAST_LENGTH2 / dr.square(dr.maximum(t, 1e-20))
     return phases(min(max(float(m.g), -MOST_G), MOST_G), d_o, d_i, line.d) * dr.exp(-t * line.length) / apart
@@ -172,7 +145,7 @@ class NeuralShape:
         half_space: S_0 P_o P_i.
         weights: W_k (outputs, inputs) and b_k of the layers.
         media: numbers of each channel.
-        scales: s of each channel, see `balance`; 1 if there are none.
+        scales: s of each channel, see `calibrated`; 1 if there are none.
     """
 
     subject: Subject
@@ -200,8 +173,6 @@ class NeuralShape:
 
     @functools.cached_property
     def _scale(self) -> Any:
-        import mitsuba as mi
-
         return mi.Spectrum([number(s) for s in self.scales or [1.0] * len(self.media)])
 
     @property
@@ -229,17 +200,12 @@ class NeuralShape:
 
     def __call__(self, exit: End, entry: End, active: Any = True) -> Any:
         """S of two ends, as `S`."""
-        import drjit as dr
-        import mitsuba as mi
-
         S_0 = self.half_space(exit, entry)
         pairs = describe(self.subject, exit, entry, self.half_space.shares(S_0, exit, entry), active)
         f = mi.Spectrum([self._f(pair, numbers) for pair, numbers in zip(pairs, self._media)])
         return dr.select(active, S_0 * dr.exp(f) * self._scale, 0)
 
     def _f(self, pair: Pair, numbers: list[Any]) -> Any:
-        import drjit as dr
-
         net = self._network
         rest = net.first(1, [*pair.shared, *numbers], biased=True)
         ends = [net.activation(net.first(0, own) + rest) for own in (pair.exit, pair.entry)]
@@ -275,16 +241,16 @@ ENOUGH = 5e-3  # relative standard error
 MOST_SCALE = 4.0
 
 
-def held(model: NeuralShape) -> NeuralShape:
+def calibrated(model: NeuralShape) -> NeuralShape:
     """The same S with such scales that as much light leaves as by walks; of what is flat or does not scatter as it is.
 
     Args:
         model: of an object, any weights.
     """
-    weights = np.array([weight(mixture) for mixture in model.half_space.mixtures])
+    weights = np.array([calibration_weight(mixture) for mixture in model.half_space.mixtures])
     if not weights.any():
         return model
-    proposals = Proposals(model.subject, model.half_space)
+    proposals = EntryProposals(model.subject, model.half_space)
     B = _mean(lambda n, k: _walks(model.subject, n, k), *WALKS)
     S = _mean(lambda n, k: _pairs(model, proposals, n, k), *PAIRS)
     known = (B > 0) & (S > 0)
@@ -292,37 +258,32 @@ def held(model: NeuralShape) -> NeuralShape:
     return replace(model, scales=tuple((np.array(model.scales or 1.0) * ratio**weights).tolist()))
 
 
-def weight(mixture: Mixed) -> float:
+def calibration_weight(mixture: Mixed) -> float:
     """w of a channel; 0 where there is no scattering or no volume."""
     return max(1 - mixture.chord / FLAT, 0.0) if mixture.m_2 > 0 else 0.0
 
 
 def _mean(sample: Callable[[int, int], np.ndarray], fewest: int, most: int) -> np.ndarray:
     """Mean of each channel of samples (channels, n), n doubled until it is known well enough."""
-    found, k = sample(fewest, 0), 0
-    while found.shape[1] < most and (_relative_error(found) > ENOUGH).any():
+    samples, k = sample(fewest, 0), 0
+    while samples.shape[1] < most and (_relative_error(samples) > ENOUGH).any():
         k += 1
-        found = np.concatenate([found, sample(found.shape[1], k)], axis=1)
-    return found.mean(axis=1)
+        samples = np.concatenate([samples, sample(samples.shape[1], k)], axis=1)
+    return samples.mean(axis=1)
 
 
-def _relative_error(found: np.ndarray) -> np.ndarray:
-    return found.std(axis=1) / np.maximum(found.mean(axis=1), 1e-30) / np.sqrt(found.shape[1])
+def _relative_error(samples: np.ndarray) -> np.ndarray:
+    return samples.std(axis=1) / np.maximum(samples.mean(axis=1), 1e-30) / np.sqrt(samples.shape[1])
 
 
 def _walks(subject: Subject, n: int, k: int) -> np.ndarray:
     """Throughputs of n walks."""
-    import mitsuba as mi
-
     starts = subject.random_points(generator(mi, n, pass_seed(SEED, 0, k)))
     return _rows(trace_exits(subject, starts, (SEED, 1, k)).T)
 
 
-def _pairs(model: NeuralShape, proposals: Proposals, n: int, k: int) -> np.ndarray:
+def _pairs(model: NeuralShape, proposals: EntryProposals, n: int, k: int) -> np.ndarray:
     """S mu_i over the density of the entries of n random exits."""
-    import drjit as dr
-    import mitsuba as mi
-
     exits = model.subject.random_points(generator(mi, n, pass_seed(SEED, 2, k)))
     entries, over = proposals.sample(exits, generator(mi, n, pass_seed(SEED, 3, k)))
     dr.eval(exits, entries, over)
@@ -359,9 +320,9 @@ def load(path: Path) -> dict[str, np.ndarray]:
         raise ValueError(f"{path}: arrays must be W_k and b_k of two layers or more, got {sorted(arrays)}")
     widths = [inputs, *(arrays[f"b_{k}"].size for k in range(depth))]
     for k in range(depth):
-        found, wanted = (arrays[f"W_{k}"].shape, arrays[f"b_{k}"].shape), (widths[k + 1], widths[k])
-        if found != (wanted, wanted[:1]) or widths[-1] != outputs:
-            raise ValueError(f"{path}: layer {k} must go from {widths[k]} to {widths[k + 1]} numbers, got {found}")
+        shapes, wanted = (arrays[f"W_{k}"].shape, arrays[f"b_{k}"].shape), (widths[k + 1], widths[k])
+        if shapes != (wanted, wanted[:1]) or widths[-1] != outputs:
+            raise ValueError(f"{path}: layer {k} must go from {widths[k]} to {widths[k + 1]} numbers, got {shapes}")
     return {name: value.astype(np.float32) for name, value in arrays.items()}
 
 
@@ -379,6 +340,6 @@ def transport(subject: Subject, path: str | os.PathLike | None = None) -> Neural
         ValueError: the file cannot be used, or the medium varies or is out of the range of `neural`.
     """
     if subject.varying is not None:
-        name = subject.found.shape.id()
+        name = subject.object.shape.id()
         raise ValueError(f"the medium of {name!r} must be the same everywhere for {KIND}, got one that varies")
-    return held(NeuralShape.of(subject, load(Path(path) if path is not None else shipped_weights())))
+    return calibrated(NeuralShape.of(subject, load(Path(path) if path is not None else shipped_weights())))

@@ -7,14 +7,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from full_geometry.object.features import (
-    Frame,
+    BaseModel,
+    ObjectFrame,
     PreparedExit,
     Quadratic,
     Side,
-    Start,
     entering,
     n_pair,
     n_side,
@@ -26,10 +28,7 @@ from full_geometry.object.subject import Subject, SurfacePoint
 from halfspace_sss.neural.perceptron import Perceptron
 from halfspace_sss.rendering.transport.plane import number
 
-__all__ = ["BOUND", "FullGeometry", "Reflectance"]
-
-
-# ---- S of one object: a start, times what a small network has learnt, evaluated in Dr.Jit ----------
+# ---- S of one object: a base model times what a small network has learnt, evaluated in Dr.Jit ----------
 
 
 # ---- What leaves at an exit under the same light from everywhere, learnt beside S ------------------
@@ -43,18 +42,18 @@ __all__ = ["BOUND", "FullGeometry", "Reflectance"]
 
 
 @dataclass(frozen=True, eq=False)
-class Reflectance:
+class DirectionalAlbedo:
     """Of one object.
 
     Args:
         subject: the object.
         frame: of the features.
         weights: A_k (outputs, inputs) and a_k of the layers.
-        trusted: (2, channels) from `even_light.trusted`.
+        trusted: (2, channels) from `learning.training.trusted`.
     """
 
     subject: Subject
-    frame: Frame
+    frame: ObjectFrame
     weights: Mapping[str, np.ndarray]
     trusted: np.ndarray
 
@@ -73,9 +72,6 @@ class Reflectance:
 
     def parts(self, at: SurfacePoint, active: Any = True) -> tuple[Any, Any, Any]:
         """What passes unscattered, alpha_1 and alpha, per channel."""
-        import drjit as dr
-        import mitsuba as mi
-
         columns = side_features(self.frame, Side(at, first_event(self.subject, at, active)))
         media = self.subject.media
         x, n = self._networks[1](self.units(columns)), len(media)
@@ -87,8 +83,6 @@ class Reflectance:
     @property
     def evened(self) -> tuple[Any, Any]:
         """Channels in which orders below two, and the others, may stand for even light."""
-        import mitsuba as mi
-
         return tuple(mi.Spectrum([number(float(v)) for v in row]) for row in self.trusted)
 
     def __call__(self, at: SurfacePoint, active: Any = True) -> tuple[Any, Any]:
@@ -103,7 +97,7 @@ BOUND = 6.0  # of f: where walks leave but no proposal comes, nothing else would
 
 @dataclass(frozen=True, eq=False)
 class FullGeometry:
-    """S = S_start exp f, f = 6 tanh((g + h_o + h_i)/6), g a perceptron of the features of exit, entry and pair, and of
+    """S = S_0 exp f, f = 6 tanh((g + h_o + h_i)/6), g a perceptron of the features of exit, entry and pair, and of
     what alpha's makes of exit and entry, h a quadratic function of those of one end.
 
     Orders two and more; positive; reciprocal as far as it has been learnt.
@@ -111,16 +105,16 @@ class FullGeometry:
     Args:
         subject: the object.
         frame: of the features.
-        start: S_start.
+        base: S_0.
         weights: W_k (outputs, inputs) and b_k of the layers, Q of h.
         alpha: ∫ S mu_i of an exit, learnt beside S.
     """
 
     subject: Subject
-    frame: Frame
-    start: Start
+    frame: ObjectFrame
+    base: BaseModel
     weights: Mapping[str, np.ndarray]
-    alpha: Reflectance
+    alpha: DirectionalAlbedo
     orders = "multiple"
 
     @functools.cached_property
@@ -135,7 +129,7 @@ class FullGeometry:
 
     def prepare(self, at: SurfacePoint, active: Any = True) -> PreparedExit:
         """The exit's side, for as many entries as are asked for."""
-        side, net = self.start.end(at, active), self._network
+        side, net = self.base.end(at, active), self._network
         features, h = self._end(side)
         return PreparedExit(side, net.numbers(net.first(0, features, biased=True)), h)
 
@@ -147,15 +141,12 @@ class FullGeometry:
             at: entry, with w_i.
             active: mask of lanes.
         """
-        import drjit as dr
-        import mitsuba as mi
-
-        entry, net = self.start.end(at, active), self._network
+        entry, net = self.base.end(at, active), self._network
         features, h = self._end(entry)
         features += pair_features(self.frame, exit.side, entry)
         f = mi.Spectrum(net.rest(net.activation(net.first(1, features) + net.vector(exit.hidden))))
         f += mi.Spectrum(exit.h) + mi.Spectrum(h)
-        S_0 = self.start(exit.side, entry, active)
+        S_0 = self.base(exit.side, entry, active)
         return dr.select(active, S_0 * dr.exp(BOUND * dr.tanh(f / BOUND)), 0)
 
     def _end(self, side: Side) -> tuple[list[Any], list[Any]]:

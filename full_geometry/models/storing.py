@@ -12,8 +12,8 @@ import numpy as np
 
 from full_geometry.models import neural_shape as shapes
 from full_geometry.models.half_space import HalfSpace
-from full_geometry.models.object_model import FullGeometry, Reflectance
-from full_geometry.object.features import Frame, Start, n_pair, n_side
+from full_geometry.models.object_model import DirectionalAlbedo, FullGeometry
+from full_geometry.object.features import BaseModel, ObjectFrame, n_pair, n_side
 from full_geometry.object.first_event import REFLECTIONS
 from full_geometry.object.identity import Identity, frame_of, identify
 from full_geometry.object.patches import Patches, PatchSampler
@@ -21,25 +21,6 @@ from full_geometry.object.subject import Subject
 from halfspace_sss.interface.model import bssrdf
 from halfspace_sss.neural.store import load_weights, save_weights
 from halfspace_sss.neural.trained import weights_folder
-
-__all__ = [
-    "CENTRES",
-    "CHECKSUMS",
-    "ENDS",
-    "EVEN",
-    "KIND",
-    "TURNS",
-    "Learnt",
-    "assemble",
-    "find_weights",
-    "load",
-    "save",
-    "start_checksums",
-    "start_of",
-    "trained",
-    "weights_name",
-]
-
 
 KIND = "full_geometry"
 CHECKSUMS = "start_checksums"  # of a record
@@ -87,13 +68,13 @@ def find_weights(subject: Subject, folder: str | os.PathLike | None = None) -> P
         try:
             identity, _, record = _trained(path)
             identity.pose(here)
-            _start(path, record, subject.as_trained(identity.medium))
+            _checked_base(path, record, subject.as_trained(identity.medium))
             return path
         except ValueError as error:
             reasons.append(f"{path.name}: {error}")
     why = f" ({'; '.join(reasons)})" if reasons else ""
     raise ValueError(
-        f"object {subject.found.name} must be trained for {KIND}, got one that is not in {place}{why}; "
+        f"object {subject.object.name} must be trained for {KIND}, got one that is not in {place}{why}; "
         "`halfspace-sss train --scene` does it"
     )
 
@@ -126,14 +107,14 @@ def _trained(path: Path) -> tuple[Identity, dict[str, np.ndarray], dict[str, Any
     return identity, arrays, record
 
 
-def _start(path: Path, record: dict[str, Any], subject: Subject) -> str:
+def _checked_base(path: Path, record: dict[str, Any], subject: Subject) -> str:
     """Name of the model that weights multiply; ValueError if they were fitted to others of it than are here now."""
     place = path.with_suffix(".json")
     try:
         name, fitted = record["recipe"]["start"], tuple(record[CHECKSUMS])
     except (KeyError, TypeError) as error:
         raise ValueError(f"{place}: start must be recorded: of another version, to be trained again") from error
-    if fitted != start_checksums(subject, name):
+    if fitted != base_checksums(subject, name):
         raise ValueError(
             f"{place}: weights of the start {name} must be those of training, got others: to be trained again"
         )
@@ -157,15 +138,15 @@ def load(path: str | os.PathLike, subject: Subject) -> Learnt:
         n = 2 * (n_side(channels, subject.n_local) + units) + n_pair(channels)
         if n != known:
             raise ValueError(f"W_0 must have {n} inputs, got {known}: of another version, to be trained again")
-        start = start_of(subject, _start(path, record, subject))
+        base = base_model(subject, _checked_base(path, record, subject))
     except KeyError as error:
         raise ValueError(f"{path}: layers must be those of {KIND}, {error} is missing") from error
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
-    return assemble(subject, frame, start, arrays)
+    return assemble(subject, frame, base, arrays)
 
 
-def start_of(subject: Subject, name: str) -> Start:
+def base_model(subject: Subject, name: str) -> BaseModel:
     """What the network of an object begins with: the network of all shapes, or a half-space model.
 
     Raises:
@@ -174,7 +155,7 @@ def start_of(subject: Subject, name: str) -> Start:
     return shapes.transport(subject) if name == shapes.KIND else HalfSpace(subject, name)
 
 
-def start_checksums(subject: Subject, name: str) -> tuple[str, ...]:
+def base_checksums(subject: Subject, name: str) -> tuple[str, ...]:
     """Of the weights that a start has."""
     if name == shapes.KIND:
         return shapes.checksums(subject)
@@ -182,15 +163,15 @@ def start_checksums(subject: Subject, name: str) -> tuple[str, ...]:
 
 
 def assemble(
-    subject: Subject, frame: Frame, start: Start, arrays: Mapping[str, np.ndarray], patches: Any = None
+    subject: Subject, frame: ObjectFrame, base: BaseModel, arrays: Mapping[str, np.ndarray], patches: Any = None
 ) -> Learnt:
     """Model and sampler from the arrays of a file; `patches` are made from their centres if they are not given."""
 
     def layers(names: tuple[str, ...]) -> dict[str, np.ndarray]:
         return {name: value for name, value in arrays.items() if name.startswith(names)}
 
-    alpha = Reflectance(subject, frame, layers(ALPHA_LAYERS), arrays[EVEN])
-    model = FullGeometry(subject, frame, start, layers(S_LAYERS), alpha)
+    alpha = DirectionalAlbedo(subject, frame, layers(ALPHA_LAYERS), arrays[EVEN])
+    model = FullGeometry(subject, frame, base, layers(S_LAYERS), alpha)
     if CENTRES not in arrays:
         return Learnt(model, None)
     others = {name: value for name, value in arrays.items() if not name.startswith(OWN)}

@@ -11,6 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
@@ -22,28 +24,6 @@ from halfspace_sss.neural.perceptron import Perceptron
 from halfspace_sss.physics import fresnel
 from halfspace_sss.rendering.transport.plane import number
 from halfspace_sss.tracing.walk import generator, pass_seed
-
-__all__ = [
-    "EVENT",
-    "FIELDS",
-    "POINT",
-    "Frame",
-    "PreparedExit",
-    "Quadratic",
-    "Side",
-    "Start",
-    "Surroundings",
-    "Terms",
-    "entering",
-    "insides",
-    "n_pair",
-    "n_side",
-    "pair_features",
-    "reverse",
-    "side_features",
-    "surroundings",
-]
-
 
 # ----------------------------------------------------------------------------------------------------
 # How much of an object surrounds a point: what the network of one object is told of fins, rims and folds.
@@ -84,8 +64,6 @@ class Surroundings:
 
     def __call__(self, q: Any, kind: int) -> list[Any]:
         """Of a position in the frame, a `POINT` or an `EVENT`."""
-        import mitsuba as mi
-
         return self.textures[kind].eval((mi.Point3f(q) - self.low) * self.scale)
 
 
@@ -94,12 +72,9 @@ def surroundings(subject: Subject, frame: Any, turns: np.ndarray | None = None) 
 
     Args:
         subject: the object.
-        frame: a `Frame` of its features.
+        frame: a `ObjectFrame` of its features.
         turns: those of training; by default made from random points.
     """
-    import drjit as dr
-    import mitsuba as mi
-
     low, high = _bounds(subject, frame)
     longest = float((high - low).max())
     low, high = low - MARGIN * longest, high + MARGIN * longest
@@ -120,23 +95,18 @@ def surroundings(subject: Subject, frame: Any, turns: np.ndarray | None = None) 
 
 def _turns(subject: Subject, frame: Any, fields: Surroundings) -> np.ndarray:
     """C^(-1/2) of the fields over random points and over their first events, with what takes their means off."""
-    import mitsuba as mi
-
     at = subject.random_points(generator(mi, POINTS, pass_seed(SEED)))
-    found = []
+    turns = []
     for kind, place in ((POINT, at.p), (EVENT, first_event(subject, at).y)):
         values = np.stack([v.numpy() for v in fields(frame.position(place), kind)]).astype(float)
         spread, axes = np.linalg.eigh(np.cov(values))
         turn = (axes / np.sqrt(np.maximum(spread, 0) + LEAST_SPREAD**2)) @ axes.T
-        found.append(np.column_stack([turn, -turn @ values.mean(axis=1)]))
-    return np.array(found, dtype=np.float32)
+        turns.append(np.column_stack([turn, -turn @ values.mean(axis=1)]))
+    return np.array(turns, dtype=np.float32)
 
 
 def insides(subject: Subject, frame: Any, low: np.ndarray, cell: float, cells: np.ndarray) -> np.ndarray:
     """1 where the middle of a cell lies inside, (z, y, x): where most of three rays meet the surface from within."""
-    import drjit as dr
-    import mitsuba as mi
-
     nx, ny, _ = (int(n) for n in cells)
     k = dr.arange(mi.UInt32, int(np.prod(cells)))
     index = (k % nx, (k // nx) % ny, k // (nx * ny))
@@ -144,8 +114,8 @@ def insides(subject: Subject, frame: Any, low: np.ndarray, cell: float, cells: n
     votes = mi.UInt32(0)
     for ray in RAYS:
         p, d = frame.back(mi.Vector3f(*q), dr.normalize(mi.Vector3f(*ray)))
-        si = subject.found.scene.ray_intersect(mi.Ray3f(p, d))
-        votes += dr.select(si.is_valid() & (dr.dot(d, si.n) * number(subject.found.sign) > 0), mi.UInt32(1), 0)
+        si = subject.object.scene.ray_intersect(mi.Ray3f(p, d))
+        votes += dr.select(si.is_valid() & (dr.dot(d, si.n) * number(subject.object.sign) > 0), mi.UInt32(1), 0)
     return (votes >= 2).numpy().astype(np.float32).reshape(cells[::-1])
 
 
@@ -158,13 +128,11 @@ def _fields(inside: np.ndarray, path: float) -> np.ndarray:
 
 def _bounds(subject: Subject, frame: Any) -> tuple[np.ndarray, np.ndarray]:
     """Of the object in its frame."""
-    import mitsuba as mi
-
-    parameters = mi.traverse(subject.found.shape)
+    parameters = mi.traverse(subject.object.shape)
     if "vertex_positions" in parameters:
         corners = mi.Point3f(np.array(parameters["vertex_positions"]).reshape(-1, 3).T)
     else:
-        box = subject.found.shape.bbox()
+        box = subject.object.shape.bbox()
         low, high = (np.array(v, dtype=np.float32).ravel() for v in (box.min, box.max))
         corners = mi.Point3f(np.where(np.indices((2, 2, 2)).reshape(3, 8) > 0, high[:, None], low[:, None]))
     q = np.array(frame.position(corners)).reshape(3, -1).astype(float)
@@ -187,7 +155,7 @@ class Side(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
+class ObjectFrame:
     """The object's own frame and scales.
 
     Args:
@@ -212,15 +180,10 @@ class Frame:
 
     def direction(self, w: Any) -> Any:
         """In the frame."""
-        import drjit as dr
-        import mitsuba as mi
-
         return mi.Vector3f(w) if self.turn is None else mi.Vector3f(*(dr.dot(row, w) for row in self.turn))
 
     def back(self, q: Any, d: Any) -> tuple[Any, Any]:
         """A position and a direction of the frame in the world."""
-        import mitsuba as mi
-
         q, d = (v if self.turn is None else sum(row * x for row, x in zip(self.turn, v)) for v in (q, d))
         return mi.Point3f(self.centre + mi.Vector3f(q) * self.radius), mi.Vector3f(d)
 
@@ -258,9 +221,9 @@ class Terms(NamedTuple):
 
     def matrix(self, numbers: np.ndarray) -> np.ndarray:
         """Numbers (..., products) as matrices (..., heads, 1 + features)."""
-        found = np.zeros((*numbers.shape[:-1], len(self.heads), int(self.cols.max()) + 1), numbers.dtype)
-        found[..., self.rows, self.cols] = numbers
-        return found
+        symmetric = np.zeros((*numbers.shape[:-1], len(self.heads), int(self.cols.max()) + 1), numbers.dtype)
+        symmetric[..., self.rows, self.cols] = numbers
+        return symmetric
 
 
 class Quadratic:
@@ -287,21 +250,17 @@ class Quadratic:
 
 
 def _octaves(x: Any) -> list[Any]:
-    import drjit as dr
-
-    found = list(x)
+    columns = list(x)
     for k in range(OCTAVES):
         for component in x:
-            found += dr.sincos(math.pi * 2**k * component)
-    return found
+            columns += dr.sincos(math.pi * 2**k * component)
+    return columns
 
 
-def side_features(frame: Frame, side: Side) -> list[Any]:
+def side_features(frame: ObjectFrame, side: Side) -> list[Any]:
     """Position and y with two octaves of sine and cosine, normal, w, mu, log of the way to y, log P, what varies, and
     how much of the object surrounds the position and y.
     """
-    import drjit as dr
-
     at, event = side.at, side.event
     n, w = frame.direction(at.n_out), frame.direction(at.w)
     p, y = frame.position(at.p), frame.position(event.y)
@@ -326,13 +285,11 @@ def entering(columns: Any, eta: Any, channels: int) -> tuple[list[Any], list[Any
     return [F_t] * channels, [F_t * lib.maximum(p, 0 * mu) for p in P]
 
 
-def pair_features(frame: Frame, exit: Side, entry: Side) -> list[Any]:
+def pair_features(frame: ObjectFrame, exit: Side, entry: Side) -> list[Any]:
     """x_i - x_o as direction and length, log r, log |y_i - y_o|, dot products of directions and normals, and what the
     surface at one end says of y at the other: its depth below the plane there, its distance from the point, and the
     cosine between the way to y and the way on to the other y; log of the distance between the two y of each channel.
     """
-    import drjit as dr
-
     o, i = exit.at, entry.at
     d = i.p - o.p
     r = dr.norm(d)
@@ -352,23 +309,17 @@ def pair_features(frame: Frame, exit: Side, entry: Side) -> list[Any]:
 
 
 def _log(sigma_t: Any, length: Any) -> Any:
-    import drjit as dr
-
     return 0.5 * dr.log(length * sigma_t + LEAST_LENGTH)
 
 
-def _depth(frame: Frame, at: SurfacePoint, y: Any) -> Any:
+def _depth(frame: ObjectFrame, at: SurfacePoint, y: Any) -> Any:
     """t/(1 + |t|) of the depth t below the plane of a point, in mean free paths."""
-    import drjit as dr
-
     t = dr.dot(at.n_out, at.p - y) * frame.sigma_t
     return t / (1 + dr.abs(t))
 
 
-def _cosine(frame: Frame, side: Side, onward: Any) -> Any:
+def _cosine(frame: ObjectFrame, side: Side, onward: Any) -> Any:
     """Between the way from a point to its y and a direction."""
-    import drjit as dr
-
     way = side.event.y - side.at.p
     return dr.dot(way, onward) / dr.maximum(dr.norm(way), 1e-6 * frame.radius)
 
@@ -382,7 +333,7 @@ def reverse(n: int, channels: int) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate([np.arange(n, 2 * n), np.arange(n), 2 * n + pair]), signs
 
 
-class Start(Protocol):
+class BaseModel(Protocol):
     """What the network of one object begins with and multiplies: `HalfSpace`, or the network of all shapes.
 
     Attributes:

@@ -14,13 +14,14 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import drjit as dr
+import mitsuba as mi
+
 from full_geometry.object.subject import Subject, SurfacePoint, refract_in
 from halfspace_sss.rendering.surface.horizon import lifted, mirrored
 from halfspace_sss.rendering.surface.object import turned
 from halfspace_sss.rendering.surface.variants import channel_mean
 from halfspace_sss.rendering.transport.plane import number
-
-__all__ = ["REFLECTIONS", "FirstEvent", "first_event"]
 
 REFLECTIONS = 32
 NEGLIGIBLE = 1e-3  # weight of what is still inside
@@ -46,8 +47,6 @@ def flight(subject: Subject, o: Any, d: Any, l: Any) -> tuple[Any, Any]:  # noqa
 
     A medium that varies is marched in cells that grow from a part of a mean free path on, each homogeneous.
     """
-    import drjit as dr
-    import mitsuba as mi
 
     def add(sigma_t: Any, T: Any, inner: Any, s: Any, h: Any) -> tuple[Any, Any]:
         through = dr.minimum(dr.exp(-sigma_t * h), 1)
@@ -71,8 +70,6 @@ def flight(subject: Subject, o: Any, d: Any, l: Any) -> tuple[Any, Any]:  # noqa
 
 def _growth(ratio: Any) -> Any:
     """q with 1 + q + ... + q^(CELLS-1) = ratio >= CELLS, by a few steps of Newton on its logarithm."""
-    import drjit as dr
-
     x = dr.maximum(dr.log(ratio) / CELLS, 1e-3)
     for _ in range(5):
         top, bottom = dr.exp(CELLS * x) - 1, dr.exp(x) - 1
@@ -84,17 +81,14 @@ def _growth(ratio: Any) -> Any:
 
 def first_event(subject: Subject, at: SurfacePoint, active: Any = True) -> FirstEvent:
     """Of light that goes in or out along w at a point of the surface."""
-    import drjit as dr
-    import mitsuba as mi
-
-    sigma_t, eta, sign = subject.sigma_t, number(subject.eta), number(subject.found.sign)
+    sigma_t, eta, sign = subject.sigma_t, number(subject.eta), number(subject.object.sign)
     media = subject.walk_media
     d, _, valid = refract_in(at, eta)
     flags = mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame
 
-    def step(k: Any, o: Any, d: Any, skip: Any, v: Any, way: Any, found: tuple, active: Any) -> tuple:
-        P, moments, length = found
-        si = subject.found.scene.ray_intersect(mi.Ray3f(o + d * skip, d), flags, False, active)
+    def step(k: Any, o: Any, d: Any, skip: Any, v: Any, way: Any, sums: tuple, active: Any) -> tuple:
+        P, moments, length = sums
+        si = subject.object.scene.ray_intersect(mi.Ray3f(o + d * skip, d), flags, False, active)
         l = dr.select(si.is_valid(), si.t + skip, 1e4 / dr.min(sigma_t))  # noqa: E741
         through, inner = flight(subject, o, d, l)
         part, inner = v * (1 - through), v * inner

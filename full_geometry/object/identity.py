@@ -6,14 +6,13 @@ import hashlib
 from dataclasses import dataclass, replace
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
-from full_geometry.object.features import Frame, surroundings
+from full_geometry.object.features import ObjectFrame, surroundings
 from full_geometry.object.subject import Subject
 from halfspace_sss.rendering.surface.varying import grid_values
 from halfspace_sss.rendering.transport.plane import number
-
-__all__ = ["Identity", "frame_of", "identify"]
 
 ANCHORS = 256
 CLOSE = 1e-4  # positions over the size of the object, coefficients relative
@@ -103,9 +102,7 @@ def _kabsch(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray, float
 
 def identify(subject: Subject) -> Identity:
     """The identity of an object as it stands."""
-    import mitsuba as mi
-
-    shape = subject.found.shape
+    shape = subject.object.shape
     parameters = mi.traverse(shape)
     topology = ""
     if "faces" in parameters:
@@ -132,13 +129,13 @@ def _digest_of_grids(subject: Subject) -> str:
     medium = subject.varying
     if medium is None:
         return ""
-    found = hashlib.sha256()
+    digest = hashlib.sha256()
     for volume in (medium.density, medium.albedo_volume):
         voxels = np.zeros(0) if volume is None else np.ascontiguousarray(grid_values(volume), dtype=np.float32)
-        found.update(str(voxels.shape).encode() + voxels.tobytes())
+        digest.update(str(voxels.shape).encode() + voxels.tobytes())
     ratios = (*medium.factor / medium.factor.max(), *medium.albedo)
-    found.update("|".join(f"{v:.6g}" for v in ratios).encode())
-    return found.hexdigest()[:16]
+    digest.update("|".join(f"{v:.6g}" for v in ratios).encode())
+    return digest.hexdigest()[:16]
 
 
 def _probed(subject: Subject, anchors: np.ndarray) -> np.ndarray:
@@ -146,14 +143,12 @@ def _probed(subject: Subject, anchors: np.ndarray) -> np.ndarray:
 
     They tell grids that lie elsewhere in the object, or are interpolated in another way.
     """
-    import mitsuba as mi
-
     if subject.varying is None:
         return np.zeros((0, 0), dtype=np.float32)
     centre, some = anchors.mean(axis=0), anchors[:: max(len(anchors) // PROBED, 1)]
     points = np.concatenate([centre + depth * (some - centre) for depth in DEPTHS])
     values = np.concatenate(subject.varying.coefficients(mi.Point3f(points.T.astype(np.float32))))
-    return (values * np.sqrt(subject.found.area)).astype(np.float32)
+    return (values * np.sqrt(subject.object.area)).astype(np.float32)
 
 
 def _check_same(trained: np.ndarray, here: np.ndarray) -> None:
@@ -170,7 +165,7 @@ def _check_same(trained: np.ndarray, here: np.ndarray) -> None:
     raise ValueError(f"coefficients must be known at {trained.shape} points, as trained, got {here.shape}")
 
 
-def frame_of(subject: Subject, trained: Identity | None = None, turns: np.ndarray | None = None) -> Frame:
+def frame_of(subject: Subject, trained: Identity | None = None, turns: np.ndarray | None = None) -> ObjectFrame:
     """The frame of the features; that of training for an object that has been moved since.
 
     Args:
@@ -181,8 +176,6 @@ def frame_of(subject: Subject, trained: Identity | None = None, turns: np.ndarra
     Raises:
         ValueError: the object is not the one that was trained.
     """
-    import mitsuba as mi
-
     here = identify(subject)
     R, t = (np.eye(3), np.zeros(3)) if trained is None else trained.pose(here)
     anchors = here.anchors if trained is None else trained.anchors
@@ -192,5 +185,7 @@ def frame_of(subject: Subject, trained: Identity | None = None, turns: np.ndarra
     each = [float(m.sigma_t) for m in subject.media]
     sigma_t = float(np.exp(np.mean(np.log(each))))
     turn = None if np.allclose(R, np.eye(3), atol=1e-6) else [mi.Vector3f(*map(number, row)) for row in R.T]
-    frame = Frame(mi.Point3f(*map(number, centre)), number(radius), number(sigma_t), tuple(map(number, each)), turn)
+    frame = ObjectFrame(
+        mi.Point3f(*map(number, centre)), number(radius), number(sigma_t), tuple(map(number, each)), turn
+    )
     return replace(frame, around=surroundings(subject, frame, turns))

@@ -1,24 +1,24 @@
-"""Training data of one object: walks with their throughput, and proposals with S at the start over their density."""
+"""Training data of one object: walks with their throughput, and proposals with S_0 over their density."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
-from full_geometry.object.features import Frame, PreparedExit, Side, Start, pair_features, side_features
+from full_geometry.object.features import BaseModel, ObjectFrame, PreparedExit, Side, pair_features, side_features
 from full_geometry.object.first_event import first_event
 from full_geometry.object.patches import AREA_SHARE, ExitTable, LearntProposals, PatchSampler
 from full_geometry.object.subject import Subject, SurfacePoint, cosine_direction, surface_point
-from full_geometry.object.walks import Exits, trace_exits
+from full_geometry.object.walks import WalkEnds, trace_exits
 from halfspace_sss.rendering.surface.variants import channel_mean
 from halfspace_sss.rendering.transport.plane import Exit, number
 from halfspace_sss.rendering.transport.positions import PositionSampler
 from halfspace_sss.rendering.transport.radial_table import RadialTable
 from halfspace_sss.tracing.walk import generator, pass_seed
-
-__all__ = ["Pairs", "PairSource", "Proposals", "shuffled"]
 
 PATCH_SHARE = 0.6  # of those by patches, where they are learnt
 EVEN_EVERY = 4  # walks, one tells what even light brings: that is simpler than S
@@ -35,12 +35,10 @@ class Numbers:
         return self.rng.next_float32()
 
     def next_2d(self) -> Any:
-        import mitsuba as mi
-
         return mi.Point2f(self.rng.next_float32(), self.rng.next_float32())
 
 
-class Even(NamedTuple):
+class AlbedoSamples(NamedTuple):
     """Exits of walks as columns, features (inputs, n), and T, (2 channels, n): of order one, then of the others."""
 
     features: np.ndarray
@@ -54,7 +52,7 @@ class Pairs(NamedTuple):
     values: np.ndarray
     drawn: int
     faces: np.ndarray | None = None  # where walks left
-    even: Even | None = None  # of some of the walks
+    even: AlbedoSamples | None = None  # of some of the walks
     random: tuple[np.ndarray, int] | None = None  # where not all exits are random: which are, and how many were drawn
 
     def of_random_exits(self, x: Any, values: Any) -> tuple[Any, Any, int]:
@@ -73,15 +71,15 @@ def shuffled(parts: list[Pairs], order: np.random.Generator) -> Pairs:
     faces = None if parts[0].faces is None else np.concatenate([part.faces for part in parts])[places]
     random = np.flatnonzero(places >= values.shape[1] - parts[-1].values.shape[1]), parts[-1].drawn
     drawn = sum(part.drawn for part in parts)
-    found = Pairs(features[:, places], values[:, places], drawn, faces, random=random)
+    pairs = Pairs(features[:, places], values[:, places], drawn, faces, random=random)
     if parts[0].even is None:
-        return found
+        return pairs
     exits, T = (np.concatenate(columns, axis=1) for columns in zip(*(part.even for part in parts)))
     places = order.permutation(T.shape[1])
-    return found._replace(even=Even(exits[:, places], T[:, places]))
+    return pairs._replace(even=AlbedoSamples(exits[:, places], T[:, places]))
 
 
-class Proposals:
+class EntryProposals:
     """Entries for given exits: probes and uniform points, and learnt patches beside them; directions by the cosine.
 
     Probes have the density D of all their hits, patches q; with a share s of patches (balance heuristic) a point of
@@ -89,7 +87,7 @@ class Proposals:
 
     Args:
         subject: the object.
-        start: whose radial densities the probes follow.
+        base: whose radial densities the probes follow.
         area_share: of the candidates that are uniform over the area, without patches.
         patches: learnt weights, or None.
     """
@@ -97,15 +95,15 @@ class Proposals:
     def __init__(
         self,
         subject: Subject,
-        start: Start,
+        base: BaseModel,
         area_share: float = AREA_SHARE,
         patches: PatchSampler | None = None,
     ) -> None:
-        live = [m for m in start.models if float(m.medium.sigma_s) > 0]
-        table = RadialTable(live or start.models, subject.found.size)
-        self.subject, self.start, self.patches = subject, start, patches
+        live = [m for m in base.models if float(m.medium.sigma_s) > 0]
+        table = RadialTable(live or base.models, subject.object.size)
+        self.subject, self.base, self.patches = subject, base, patches
         # light may leave by another piece of the surface than it entered by
-        self.positions = PositionSampler(replace(subject.found, pieces=None), table, subject.points, area_share)
+        self.positions = PositionSampler(replace(subject.object, pieces=None), table, subject.points, area_share)
 
     def sample(
         self, exit: SurfacePoint, rng: Any, table: ExitTable | None = None, k: Any = 0
@@ -118,24 +116,21 @@ class Proposals:
             table: of weights of patches, which are asked of the network otherwise.
             k: of each exit, its number in the table.
         """
-        import drjit as dr
-        import mitsuba as mi
-
-        out = Exit(exit.p, exit.n_out, exit.w, number(self.subject.found.sign))
+        out = Exit(exit.p, exit.n_out, exit.w, number(self.subject.object.sign))
         known = (out, mi.UInt32(k))
         if self.patches is None:
             entry = self.positions.sample(*known, Numbers(rng), mi.Bool(True))
         else:
-            drawn = LearntProposals(self.patches, self.positions, PATCH_SHARE, self.subject.found.sign, table)
+            drawn = LearntProposals(self.patches, self.positions, PATCH_SHARE, self.subject.object.sign, table)
             where = drawn.prepare(out, PreparedExit(Side(exit, first_event(self.subject, exit)), []), mi.Bool(True))
             entry = drawn.sample(*known, where, Numbers(rng), mi.Bool(True))
         n = entry.n_face
         w = cosine_direction(entry.n_out, n, rng)
         return surface_point(entry.p, n, entry.n_out, w), dr.pi * entry.weight
 
-    def with_patches(self, patches: PatchSampler | None) -> Proposals:
+    def with_patches(self, patches: PatchSampler | None) -> EntryProposals:
         """The same with learnt weights of patches, which take the place of uniform points."""
-        return Proposals(self.subject, self.start, 0.0, patches) if patches is not None else self
+        return EntryProposals(self.subject, self.base, 0.0, patches) if patches is not None else self
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,21 +140,19 @@ class PairSource:
     Args:
         subject: the object.
         frame: of its features.
-        start: S at the start, which values of proposals have.
+        base: base model S_0, which values of proposals have.
         proposals: where they come from.
         scale: of T of each channel, one over its mean; without it every walk that left is kept.
     """
 
     subject: Subject
-    frame: Frame
-    start: Start
-    proposals: Proposals
+    frame: ObjectFrame
+    base: BaseModel
+    proposals: EntryProposals
     scale: Any = None
 
     def scaled(self, scale: np.ndarray) -> PairSource:
         """The same with the scale of a fit, so that its mean over channels that have any light is 1."""
-        import mitsuba as mi
-
         live = max(np.count_nonzero(scale), 1)
         return replace(self, scale=mi.Spectrum([number(v * len(scale) / live) for v in scale.tolist()]))
 
@@ -167,14 +160,12 @@ class PairSource:
         """n walks of random exits; of those that left at an order that counts some, see `ended`."""
         return self.ended(*self.traced(n, seed), seed)
 
-    def traced(self, n: int, seed: tuple[int, ...]) -> tuple[SurfacePoint, Exits]:
+    def traced(self, n: int, seed: tuple[int, ...]) -> tuple[SurfacePoint, WalkEnds]:
         """Starts and ends of n walks of random exits."""
-        import mitsuba as mi
-
         starts = self.subject.random_points(generator(mi, n, pass_seed(*seed, 0)))
         return starts, trace_exits(self.subject, starts, (*seed, 1), fewest=1)
 
-    def ended(self, starts: SurfacePoint, exits: Exits, seed: tuple[int, ...]) -> Pairs:
+    def ended(self, starts: SurfacePoint, exits: WalkEnds, seed: tuple[int, ...]) -> Pairs:
         """The pairs of walks whose ends and orders from one on are known, those of two and more, T as values.
 
         With t the mean over channels of T over its mean, a walk is kept with the chance p = min(1, t / 1.5), as T / p:
@@ -184,9 +175,6 @@ class PairSource:
             starts, exits: of the walks.
             seed: of what is kept.
         """
-        import drjit as dr
-        import mitsuba as mi
-
         n, even = dr.width(starts.p), self._even(starts, exits)
         T = dr.select(exits.order == 1, 0, exits.T)
         if self.scale is not None:
@@ -201,41 +189,33 @@ class PairSource:
         faces = np.array(dr.gather(mi.UInt32, exits.face, kept))
         return self._columns(starts.gather(kept), ends, T)._replace(drawn=n, faces=faces, even=even)
 
-    def _even(self, starts: SurfacePoint, exits: Exits) -> Even:
+    def _even(self, starts: SurfacePoint, exits: WalkEnds) -> AlbedoSamples:
         """What walks bring under the same light from everywhere, of every fourth walk."""
-        import drjit as dr
-        import mitsuba as mi
-
         n = max(dr.width(starts.p) // EVEN_EVERY, 1)
         lanes = dr.arange(mi.UInt32, n) * EVEN_EVERY
         at, T = starts.gather(lanes), dr.gather(mi.Spectrum, exits.T, lanes)
         once = dr.gather(mi.UInt32, exits.order, lanes) == 1
         columns = side_features(self.frame, Side(at, first_event(self.subject, at)))
-        return Even(_stacked(columns, n), _stacked([*dr.select(once, T, 0), *dr.select(once, 0, T)], n))
+        return AlbedoSamples(_stacked(columns, n), _stacked([*dr.select(once, T, 0), *dr.select(once, 0, T)], n))
 
     def proposed(self, n: int, seed: tuple[int, ...], starts: SurfacePoint | None = None) -> Pairs:
-        """n proposals, S mu_i at the start over their density as values.
+        """n proposals, S mu_i of the base model over their density as values.
 
         Args:
             n: how many.
             seed: of them.
             starts: n exits that they are of; by default random ones.
         """
-        import mitsuba as mi
-
         rng = generator(mi, n, pass_seed(*seed, 2))
         starts = starts or self.subject.random_points(rng)
         entries, weight = self.proposals.sample(starts, rng)
         return self._columns(starts, entries, weight)
 
     def _columns(self, exits: SurfacePoint, entries: SurfacePoint, value: Any) -> Pairs:
-        """Features of pairs; `value` is a spectrum, or a weight that S_0 at the start is to be multiplied by."""
-        import drjit as dr
-        import mitsuba as mi
-
-        exit, entry = (self.start.end(at) for at in (exits, entries))
+        """Features of pairs; `value` is a spectrum, or a weight that S_0 is to be multiplied by."""
+        exit, entry = (self.base.end(at) for at in (exits, entries))
         if isinstance(value, mi.Float):
-            value = self.start(exit, entry) * value
+            value = self.base(exit, entry) * value
         columns = [*side_features(self.frame, exit), *side_features(self.frame, entry)]
         columns += pair_features(self.frame, exit, entry)
         dr.eval(columns, value)
@@ -246,7 +226,5 @@ class PairSource:
 
 def _stacked(columns: list[Any], n: int) -> np.ndarray:
     """Columns of n lanes as rows."""
-    import drjit as dr
-
     dr.eval(columns)
     return np.stack([np.broadcast_to(c.numpy(), n) for c in columns])

@@ -16,9 +16,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
-from full_geometry.object.features import Frame, PreparedExit, Side, side_features
+from full_geometry.object.features import ObjectFrame, PreparedExit, Side, side_features
 from full_geometry.object.first_event import first_event
 from full_geometry.object.subject import Subject, SurfacePoint, cosine_direction, surface_point
 from halfspace_sss.neural.perceptron import Perceptron
@@ -28,22 +30,6 @@ from halfspace_sss.rendering.transport.plane import Exit, number
 from halfspace_sss.rendering.transport.positions import PositionSampler
 from halfspace_sss.rendering.transport.protocols import CosineProposals, Entry
 from halfspace_sss.tracing.walk import generator, pass_seed
-
-__all__ = [
-    "AREA_SHARE",
-    "CELLS",
-    "LEARNT_SHARE",
-    "PATCHES",
-    "ExitTable",
-    "LearntProposals",
-    "PatchSampler",
-    "PatchTable",
-    "PatchWeights",
-    "Patches",
-    "cluster",
-    "mesh_faces",
-]
-
 
 PATCHES = 512
 LEARNT_SHARE = 0.9
@@ -58,11 +44,9 @@ def mesh_faces(subject: Subject) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     Raises:
         ValueError: the shape is no mesh.
     """
-    import mitsuba as mi
-
-    parameters = mi.traverse(subject.found.shape)
+    parameters = mi.traverse(subject.object.shape)
     if "faces" not in parameters:
-        raise ValueError(f"shape must be a mesh to be cut into patches, got {subject.found.shape.class_name()}")
+        raise ValueError(f"shape must be a mesh to be cut into patches, got {subject.object.shape.class_name()}")
     faces = np.array(parameters["faces"]).reshape(-1, 3)
     a, b, c = np.array(parameters["vertex_positions"], dtype=float).reshape(-1, 3)[faces].transpose(1, 0, 2)
     cross = np.cross(b - a, c - a)
@@ -70,7 +54,7 @@ def mesh_faces(subject: Subject) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return (a + b + c) / 3, cross / np.maximum(double, 1e-30)[:, None], 0.5 * double
 
 
-def _places(subject: Subject, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
+def _places(subject: Subject, frame: ObjectFrame) -> tuple[np.ndarray, np.ndarray]:
     """What faces are clustered by, (n, 6) in the object's frame over its radius, and their areas."""
     centroids, normals, areas = mesh_faces(subject)
     turn = np.eye(3) if frame.turn is None else np.array([np.array(row).ravel() for row in frame.turn])
@@ -79,7 +63,7 @@ def _places(subject: Subject, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate([(centroids - centre) @ turn.T / radius, length * normals @ turn.T], axis=1), areas
 
 
-def cluster(subject: Subject, frame: Frame, n: int = PATCHES, seed: int = 0, rounds: int = ROUNDS) -> np.ndarray:
+def cluster(subject: Subject, frame: ObjectFrame, n: int = PATCHES, seed: int = 0, rounds: int = ROUNDS) -> np.ndarray:
     """Centres of at most n patches, (n, 6), in the frame of the object."""
     from scipy.spatial import cKDTree
 
@@ -104,9 +88,7 @@ class Patches:
         centres: from `cluster`, of this object or of the one that was trained.
     """
 
-    def __init__(self, subject: Subject, frame: Frame, centres: np.ndarray) -> None:
-        import drjit as dr
-        import mitsuba as mi
+    def __init__(self, subject: Subject, frame: ObjectFrame, centres: np.ndarray) -> None:
         from scipy.spatial import cKDTree
 
         x, areas = _places(subject, frame)
@@ -129,15 +111,10 @@ class Patches:
 
     def row(self, key: str, k: Any) -> Any:
         """An entry of a table."""
-        import drjit as dr
-
         return dr.gather(type(self.tables[key]), self.tables[key], k)
 
     def point(self, patch: Any, u_face: Any, u: Any) -> Point:
         """A uniform point of a patch."""
-        import drjit as dr
-        import mitsuba as mi
-
         low, high = self.row("start", patch), self.row("start", patch + 1)
         goal = u_face * self.row("area", patch)
 
@@ -166,7 +143,7 @@ class PatchSampler:
         weights: V_k (outputs, inputs) and c_k of the layers; the last has one output for each patch.
     """
 
-    frame: Frame
+    frame: ObjectFrame
     patches: Patches
     weights: Mapping[str, np.ndarray]
 
@@ -181,9 +158,6 @@ class PatchSampler:
 
     def prepare(self, exit: Side) -> PatchWeights:
         """Weights of all patches for an exit."""
-        import drjit as dr
-        import mitsuba as mi
-
         sums = dr.alloc_local(mi.Float, self.patches.n)
         for k, logit in enumerate(self._network(side_features(self.frame, exit))):
             sums[mi.UInt32(k)] = dr.minimum(logit, HIGHEST)
@@ -204,9 +178,6 @@ class PatchSampler:
 
     def patch(self, exit: PatchWeights, u: Any) -> tuple[Any, Any]:
         """A patch for a uniform number, and the density of uniform points in a patch that is drawn so."""
-        import drjit as dr
-        import mitsuba as mi
-
         learnt, last = u < LEARNT_SHARE, self.patches.n - 1
         u_1, u_2 = u / LEARNT_SHARE * exit.total, (u - LEARNT_SHARE) / (1 - LEARNT_SHARE)
         by_weight = dr.binary_search(0, last, lambda i: exit.cumulative[mi.UInt32(i)] <= u_1)
@@ -220,9 +191,6 @@ class PatchSampler:
         return self._share(exit, patch) / self.patches.row("area", patch)
 
     def _share(self, exit: PatchWeights, patch: Any) -> Any:
-        import drjit as dr
-        import mitsuba as mi
-
         before = dr.select(patch > 0, exit.cumulative[dr.maximum(patch, 1) - 1], mi.Float(0))
         learnt = (exit.cumulative[patch] - before) / exit.total
         return LEARNT_SHARE * learnt + (1 - LEARNT_SHARE) * self.patches.row("share", patch)
@@ -239,15 +207,13 @@ EXITS = 4  # of a cell
 
 
 @dataclass(frozen=True, eq=False)
-class _Row:
+class _CumulativeRow:
     """The cumulative weights of a cell, as a lane asks for them."""
 
     table: Any
     start: Any
 
     def __getitem__(self, k: Any) -> Any:
-        import drjit as dr
-
         return dr.gather(type(self.table), self.table, self.start + k)
 
 
@@ -260,18 +226,13 @@ class ExitTable:
     """
 
     def __init__(self, sampler: PatchSampler, exits: SurfacePoint) -> None:
-        import drjit as dr
-        import mitsuba as mi
-
         side = Side(exits, first_event(sampler.patches.subject, exits))
         rows = np.cumsum(_weights(sampler, side, dr.width(exits.p)), axis=1).astype(np.float32)
         self.n, self.table, self.last = rows.shape[1], mi.Float(rows.ravel()), mi.Float(rows[:, -1].copy())
 
     def weights(self, k: Any) -> PatchWeights:
         """Of exit k."""
-        import drjit as dr
-
-        return PatchWeights(_Row(self.table, k * self.n), dr.gather(type(self.last), self.last, k))
+        return PatchWeights(_CumulativeRow(self.table, k * self.n), dr.gather(type(self.last), self.last, k))
 
 
 class PatchTable:
@@ -283,9 +244,6 @@ class PatchTable:
     """
 
     def __init__(self, sampler: PatchSampler, cells: int = CELLS) -> None:
-        import drjit as dr
-        import mitsuba as mi
-
         subject, n = sampler.patches.subject, len(sampler.patches.of_face)
         of_face = np.arange(n, dtype=np.uint32)
         if n > cells:
@@ -299,8 +257,8 @@ class PatchTable:
             u_face, u = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
             cell = dr.arange(mi.UInt32, n)
             at = subject.points.on_face(cell, u) if n == len(of_face) else parts.point(cell, u_face, u)
-            n_out = mi.Normal3f(turned(at.n_shading, at.n) * subject.found.sign)
-            normal = mi.Normal3f(at.n * subject.found.sign)
+            n_out = mi.Normal3f(turned(at.n_shading, at.n) * subject.object.sign)
+            normal = mi.Normal3f(at.n * subject.object.sign)
             exit = surface_point(at.p, normal, n_out, cosine_direction(n_out, normal, rng))
             total = total + _weights(sampler, Side(exit, first_event(subject, exit)), n)
         rows = np.cumsum(total / EXITS, axis=1).astype(np.float32)
@@ -310,16 +268,12 @@ class PatchTable:
 
     def weights(self, face: Any) -> PatchWeights:
         """Of an exit on a face."""
-        import drjit as dr
-
         cell = dr.gather(type(self.of_face), self.of_face, face)
-        return PatchWeights(_Row(self.table, cell * self.n), dr.gather(type(self.last), self.last, cell))
+        return PatchWeights(_CumulativeRow(self.table, cell * self.n), dr.gather(type(self.last), self.last, cell))
 
 
 def _weights(sampler: PatchSampler, exit: Side, n: int) -> np.ndarray:
     """Weights of all patches for n exits, (n, patches), rows of sum 1."""
-    import drjit as dr
-
     columns = side_features(sampler.frame, exit)
     dr.eval(columns)
     x = np.stack([np.broadcast_to(c.numpy(), n) for c in columns])
@@ -341,7 +295,7 @@ def _weights(sampler: PatchSampler, exit: Side, n: int) -> np.ndarray:
 AREA_SHARE = 0.75  # of the candidates for entries without patches that are uniform over the area
 
 
-class _Prepared(NamedTuple):
+class _PatchesOfExit(NamedTuple):
     """Of an exit: the weights of patches, and the axes of probes."""
 
     weights: PatchWeights | None
@@ -366,16 +320,11 @@ class LearntProposals(CosineProposals):
     sign: float
     table: PatchTable | None = None
 
-    def prepare(self, out: Exit, prepared: PreparedExit, active: Any) -> _Prepared:
-        import mitsuba as mi
-
+    def prepare(self, out: Exit, prepared: PreparedExit, active: Any) -> _PatchesOfExit:
         weights = self.patches.prepare(prepared.side) if self.table is None else None
-        return _Prepared(weights, (out.n, *mi.coordinate_system(out.n)))
+        return _PatchesOfExit(weights, (out.n, *mi.coordinate_system(out.n)))
 
-    def sample(self, out: Exit, prim_index: Any, prepared: _Prepared, sampler: Any, active: Any) -> Entry:
-        import drjit as dr
-        import mitsuba as mi
-
+    def sample(self, out: Exit, prim_index: Any, prepared: _PatchesOfExit, sampler: Any, active: Any) -> Entry:
         by_patch = active & (sampler.next_1d() < number(self.patch_share))
         weights = prepared.weights if self.table is None else self.table.weights(prim_index)
         at, _ = self.patches.sample(weights, sampler.next_1d(), sampler.next_1d(), sampler.next_2d())

@@ -9,16 +9,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
-from full_geometry.object.pairs import Proposals
+from full_geometry.object.pairs import EntryProposals
 from full_geometry.object.patches import ExitTable
 from full_geometry.object.subject import Subject, SurfacePoint
 from full_geometry.object.walks import trace_exits
 from halfspace_sss.checks import check_count
 from halfspace_sss.tracing.walk import generator, pass_seed
-
-__all__ = ["LOBES", "POWER", "Estimate", "Reference", "ObjectModel", "modelled", "reference", "traced"]
 
 LOBES = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / np.sqrt(3.0)
 POWER = 16
@@ -40,7 +40,7 @@ class ObjectModel(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Estimate:
+class ExitRadiance:
     """Radiance of exits under all lights and its variance, (channels, exits, lights)."""
 
     mean: np.ndarray
@@ -48,11 +48,11 @@ class Estimate:
 
 
 @dataclass(frozen=True, eq=False)
-class Reference:
+class ExitTruth:
     """Exits and what walks say of them."""
 
     exits: SurfacePoint
-    truth: Estimate
+    truth: ExitRadiance
 
 
 class _Sums:
@@ -63,9 +63,6 @@ class _Sums:
 
     def add(self, value: Any, w: Any, per_exit: int) -> None:
         """Samples of all exits, `per_exit` neighbouring lanes for each: value per channel of unit light from w."""
-        import drjit as dr
-        import mitsuba as mi
-
         lights = [mi.Float(1)] + [dr.maximum(dr.dot(w, mi.Vector3f(*axis.tolist())), 0) ** POWER for axis in LOBES]
         rows = []
         for v in value:
@@ -76,9 +73,9 @@ class _Sums:
         self.sums = self.sums + np.stack(rows)
         self.n += per_exit
 
-    def estimate(self) -> Estimate:
+    def estimate(self) -> ExitRadiance:
         first, second = np.split(self.sums / self.n, 2, axis=-1)
-        return Estimate(first, (second - first**2) / (self.n - 1))
+        return ExitRadiance(first, (second - first**2) / (self.n - 1))
 
 
 def _passes(n_exits: int, per_exit: int) -> list[int]:
@@ -87,44 +84,36 @@ def _passes(n_exits: int, per_exit: int) -> list[int]:
     return [min(most, per_exit - done) for done in range(0, per_exit, most)]
 
 
-def reference(subject: Subject, exits: int = 256, walks: int = 8192, seed: int = 0, fewest: int = 2) -> Reference:
+def reference(subject: Subject, exits: int = 256, walks: int = 8192, seed: int = 0, fewest: int = 2) -> ExitTruth:
     """Exits and their radiance by walks.
 
     Args:
         exits, walks: number of exits, and of walks of each; seed: of both.
         fewest: scattering events that count.
     """
-    import drjit as dr
-    import mitsuba as mi
-
     for name, value, least in (("exits", exits, 2), ("walks", walks, 2), ("seed", seed, 0)):
         check_count(name, value, least)
     points = subject.random_points(generator(mi, exits, pass_seed(seed, 17)))
     dr.eval(points)
-    return Reference(points, traced(subject, points, walks, (seed, 18), fewest=fewest))
+    return ExitTruth(points, traced(subject, points, walks, (seed, 18), fewest=fewest))
 
 
-def traced(subject: Subject, exits: SurfacePoint, walks: int, seed: tuple[int, ...], **orders: int) -> Estimate:
+def traced(subject: Subject, exits: SurfacePoint, walks: int, seed: tuple[int, ...], **orders: int) -> ExitRadiance:
     """Radiance of exits by so many walks of each; `orders` as for `trace_exits`."""
-    import drjit as dr
-
     sums = _Sums(dr.width(exits.p))
     for k, per_exit in enumerate(_passes(sums.n_exits, walks)):
-        found = trace_exits(subject, _repeated(exits, per_exit), (*seed, k), **orders)
-        sums.add(found.T, found.at.w, per_exit)
+        ends = trace_exits(subject, _repeated(exits, per_exit), (*seed, k), **orders)
+        sums.add(ends.T, ends.at.w, per_exit)
     return sums.estimate()
 
 
 def _repeated(points: SurfacePoint, times: int) -> SurfacePoint:
-    import drjit as dr
-    import mitsuba as mi
-
     return points.gather(dr.arange(mi.UInt32, dr.width(points.p) * times) // times)
 
 
 def modelled(
-    transport: ObjectModel, proposals: Proposals, exits: SurfacePoint, samples: int, seed: int = 0
-) -> Estimate:
+    transport: ObjectModel, proposals: EntryProposals, exits: SurfacePoint, samples: int, seed: int = 0
+) -> ExitRadiance:
     """Radiance of exits by a model.
 
     Args:
@@ -133,9 +122,6 @@ def modelled(
         exits: from a reference.
         samples, seed: entries of each exit; of the entries.
     """
-    import drjit as dr
-    import mitsuba as mi
-
     n = dr.width(exits.p)
     sums = _Sums(n)
     table = ExitTable(proposals.patches, exits) if proposals.patches else None

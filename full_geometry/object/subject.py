@@ -7,6 +7,8 @@ import math
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from halfspace_sss.physics.medium import Medium
@@ -23,8 +25,6 @@ from halfspace_sss.rendering.transport.body import check_size
 from halfspace_sss.rendering.transport.plane import number
 from halfspace_sss.rendering.walk.media import WalkMedia
 
-__all__ = ["Subject", "SurfacePoint", "check_surface", "cosine_direction", "refract_in", "surface_point"]
-
 LEAST_RATIO = 1e-3  # in logarithms of what varies
 
 
@@ -39,8 +39,6 @@ class SurfacePoint(NamedTuple):
 
     def gather(self, k: Any) -> SurfacePoint:
         """The points of the lanes k."""
-        import drjit as dr
-
         return SurfacePoint(*(dr.gather(type(v), v, k) for v in self))
 
 
@@ -49,14 +47,14 @@ class Subject:
     """One translucent object on its own.
 
     Args:
-        found: its geometry.
+        object: its geometry.
         media: scalar medium of each channel of the variant, 1/(scene unit).
         boundary: its smooth dielectric.
         points: uniform points of its surface.
         varying: how its medium varies in space, 1/(scene unit); `media` are then a homogeneous equivalent.
     """
 
-    found: Object
+    object: Object
     media: tuple[Medium, ...]
     boundary: Any
     points: AreaPoints
@@ -79,12 +77,12 @@ class Subject:
 
     @classmethod
     def surveyed(
-        cls, found: Object, media: tuple[Medium, ...], varying: VaryingMedium | None = None, mm_per_unit: float = 1.0
+        cls, object: Object, media: tuple[Medium, ...], varying: VaryingMedium | None = None, mm_per_unit: float = 1.0
     ) -> Subject:
         """The object of a known geometry and the scalar medium of each channel, 1/(scene unit).
 
         Args:
-            found: geometry.
+            object: geometry.
             media: of each channel; of a medium that varies the homogeneous equivalent.
             varying: how the medium varies, 1/mm.
             mm_per_unit: length of a scene unit, mm.
@@ -92,11 +90,11 @@ class Subject:
         Raises:
             ValueError: its normals point to both sides.
         """
-        _check_geometry(found)
+        _check_geometry(object)
         boundary = smooth_boundary(media[0].eta)
         if varying is not None:
             varying = replace(varying, factor=varying.factor * mm_per_unit)
-        return cls(found, media, boundary, AreaPoints(found.shape), varying)
+        return cls(object, media, boundary, AreaPoints(object.shape), varying)
 
     @classmethod
     def given(
@@ -113,16 +111,14 @@ class Subject:
         Raises:
             ValueError: a scene has no such object, or one that cannot be learnt; a medium is missing; or as `of`.
         """
-        import mitsuba as mi
-
         if not isinstance(shape, mi.Scene):
             return cls.of(shape, medium, 1.0 if mm_per_unit is None else mm_per_unit)
-        found = survey(_object_of(shape, name))
-        check_empty(shape, [found], "learning")
+        object = survey(_object_of(shape, name))
+        check_empty(shape, [object], "learning")
         unit = millimetres(shape) if mm_per_unit is None else mm_per_unit
-        inside = equivalent(found.shape.bsdf().inside, found)
-        subject = cls.surveyed(found, _in_scene_units(inside.medium, unit), inside.varying, unit)
-        check_size(subject.found, [float(m.sigma_t) for m in subject.media], unit)
+        inside = equivalent(object.shape.bsdf().inside, object)
+        subject = cls.surveyed(object, _in_scene_units(inside.medium, unit), inside.varying, unit)
+        check_size(subject.object, [float(m.sigma_t) for m in subject.media], unit)
         return subject
 
     def as_trained(self, medium: dict[str, Any]) -> Subject:
@@ -133,7 +129,7 @@ class Subject:
         if self.varying is None or len(medium["albedo"]) != len(self.media):
             return self
         known = zip(medium["albedo"], medium["size_in_mfp"], medium["g"])
-        length = math.sqrt(self.found.area)
+        length = math.sqrt(self.object.area)
         media = tuple(Medium.from_albedo(albedo, size / length, g, self.eta) for albedo, size, g in known)
         return replace(self, media=media)
 
@@ -145,8 +141,6 @@ class Subject:
     @functools.cached_property
     def sigma_t(self) -> Any:
         """Extinction of each channel, 1/(scene unit), as data of kernels: one kernel serves all media."""
-        import mitsuba as mi
-
         return mi.Spectrum([number(m.sigma_t) for m in self.media])
 
     @functools.cached_property
@@ -157,7 +151,7 @@ class Subject:
             values = {key: np.array([getattr(m, key) for m in self.media]) for key in ("sigma_s", "sigma_a", "g")}
             medium = Medium(**values, eta=self.eta)
         inside = Inside("medium", medium, "", "total", True, self.varying)
-        return WalkMedia([self.found], [inside], self.found.scene, [self.boundary], 1.0)
+        return WalkMedia([self.object], [inside], self.object.scene, [self.boundary], 1.0)
 
     @functools.cached_property
     def _local_channels(self) -> tuple[int, int]:
@@ -173,9 +167,6 @@ class Subject:
 
     def local(self, p: Any) -> tuple[Any, ...]:
         """What varies, at the point p: log of sigma_t over its mean, and half the log of 1 - albedo."""
-        import drjit as dr
-        import mitsuba as mi
-
         if self.varying is None:
             return ()
         n_t, n_albedo = self._local_channels
@@ -193,22 +184,18 @@ class Subject:
 
     def random_places(self, rng: Any) -> SurfacePoint:
         """Points uniform over the area, seen along geometric normals: `n_out` is the interpolated one itself."""
-        import mitsuba as mi
-
         u_face, u = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
         at = self.points.sample(u_face, u, True)
-        n = at.n * self.found.sign
-        return surface_point(at.p, n, turned(at.n_shading, at.n) * self.found.sign, n)
+        n = at.n * self.object.sign
+        return surface_point(at.p, n, turned(at.n_shading, at.n) * self.object.sign, n)
 
     def mean_free_paths(self) -> np.ndarray:
         """sigma_t sqrt(area) of each channel: the size of the object in mean free paths."""
-        return np.array([float(m.sigma_t) for m in self.media]) * math.sqrt(self.found.area)
+        return np.array([float(m.sigma_t) for m in self.media]) * math.sqrt(self.object.area)
 
 
 def _in_scene_units(medium: Medium, mm_per_unit: float) -> tuple[Medium, ...]:
     """The scalar medium of each channel, 1/(scene unit)."""
-    import mitsuba as mi
-
     if not (math.isfinite(mm_per_unit) and mm_per_unit > 0):
         raise ValueError(f"mm_per_unit must be finite and > 0, got {mm_per_unit!r}")
     if not isinstance(medium, Medium):
@@ -222,8 +209,6 @@ def _in_scene_units(medium: Medium, mm_per_unit: float) -> tuple[Medium, ...]:
 
 def cosine_direction(n_out: Any, n: Any, rng: Any) -> Any:
     """A direction by the cosine to the shading normal, above the surface, see `surface.horizon`."""
-    import mitsuba as mi
-
     return cosine_above(n_out, n, mi.Point2f(rng.next_float32(), rng.next_float32()))[0]
 
 
@@ -235,8 +220,6 @@ def surface_point(p: Any, n: Any, n_out: Any, w: Any) -> SurfacePoint:
         n, n_out: outward geometric and shading normal.
         w: direction outside.
     """
-    import mitsuba as mi
-
     return SurfacePoint(mi.Point3f(p), mi.Normal3f(n), lifted(n_out, n, w), mi.Vector3f(w))
 
 
@@ -245,9 +228,6 @@ def refract_in(at: SurfacePoint, eta: Any) -> tuple[Any, Any, Any]:
 
     mu' = sqrt(1 - (1 - mu²)/eta²), d = -w/eta + n (mu/eta - mu').
     """
-    import drjit as dr
-    import mitsuba as mi
-
     mu = dr.dot(at.w, at.n_out)
     inner = 1 - (1 - mu * mu) / (eta * eta)
     d = at.n_out * (mu / eta - dr.safe_sqrt(inner)) - at.w / eta
@@ -256,18 +236,16 @@ def refract_in(at: SurfacePoint, eta: Any) -> tuple[Any, Any, Any]:
     return mi.Vector3f(dr.normalize(d)), dr.select(valid, 1 - F, 0), valid
 
 
-def _check_geometry(found: Object) -> None:
+def _check_geometry(object: Object) -> None:
     """ValueError if the faces of an object do not all point to the same side: one sign stands for all of them."""
-    if found.signs is not None:
+    if object.signs is not None:
         raise ValueError(
-            f"normals of {found.name} must all point to the same side to be learnt, got pieces that disagree"
+            f"normals of {object.name} must all point to the same side to be learnt, got pieces that disagree"
         )
 
 
 def check_surface(name: str, surface: Any) -> None:
     """ValueError if the `translucent` surface of an object has what cannot be learnt."""
-    import mitsuba as mi
-
     if surface.boundary.flags() & int(mi.BSDFFlags.Smooth):
         raise ValueError(f"the boundary of {name!r} must be smooth to be learnt, got a rough one")
 

@@ -11,18 +11,19 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
+import drjit as dr
+import mitsuba as mi
+
 from full_geometry.object.subject import Subject, SurfacePoint, surface_point
 from halfspace_sss.checks import check_count
 from halfspace_sss.rendering.walk import exits as walk_exits
 from halfspace_sss.rendering.walk.random_walk import Crossing, Event, Walk
 
-__all__ = ["LANES", "Exits", "trace_exits"]
-
 LANES = 2**15
 ROULETTE_FROM = 8  # scattering events: from 2 on weak channels of ketchup have 10 times the variance, for no time less
 
 
-class Exits(NamedTuple):
+class WalkEnds(NamedTuple):
     """Ends of walks, one lane for each: T is 0 where it ended inside or left at an order that is not kept."""
 
     at: SurfacePoint
@@ -35,17 +36,14 @@ class Exits(NamedTuple):
 class _Store:
     """A visitor that keeps the end of every walk at its number, and ends it there."""
 
-    exits: Exits
+    exits: WalkEnds
     fewest: Any
     most: Any
 
     @classmethod
     def of(cls, n: int, fewest: int, most: int) -> _Store:
-        import drjit as dr
-        import mitsuba as mi
-
         at = SurfacePoint(*(dr.zeros(kind, n) for kind in (mi.Point3f, mi.Normal3f, mi.Normal3f, mi.Vector3f)))
-        exits = Exits(at, dr.zeros(mi.Spectrum, n), dr.zeros(mi.UInt32, n), dr.zeros(mi.UInt32, n))
+        exits = WalkEnds(at, dr.zeros(mi.Spectrum, n), dr.zeros(mi.UInt32, n), dr.zeros(mi.UInt32, n))
         dr.eval(exits)
         return cls(exits, *(dr.opaque(mi.UInt32, order) for order in (fewest, most)))
 
@@ -59,8 +57,6 @@ class _Store:
         return walk, record
 
     def crossing(self, walk: Walk, record: Any, crossing: Crossing) -> tuple[Walk, Any]:
-        import drjit as dr
-
         leaves, si = walk.alive & crossing.leaves, crossing.si
         at = surface_point(si.p, si.n, si.sh_frame.n, walk.d)
         kept = leaves & (walk.order >= self.fewest) & (walk.order <= self.most)
@@ -78,7 +74,7 @@ def trace_exits(
     fewest: int = 2,
     most: int = 2**31 - 1,
     roulette_from: int = ROULETTE_FROM,
-) -> Exits:
+) -> WalkEnds:
     """One walk from each start.
 
     Args:
@@ -90,8 +86,6 @@ def trace_exits(
     Raises:
         ValueError: fewest is not a whole number >= 0.
     """
-    import drjit as dr
-
     check_count("fewest", fewest, 0)
     store = _Store.of(dr.width(starts.p), fewest, most)
     start = walk_exits.Start(starts.p, starts.n, starts.w, starts.n_out)

@@ -65,6 +65,13 @@ def render_command(
     train_error: Annotated[
         float | None, typer.Option(help="Error at which it has learnt enough.", show_default="0.03, or the scene's")
     ] = None,
+    light: Annotated[
+        str | None,
+        typer.Option(
+            help="sampled (no bias), or gathered once for all samples (little bias, no noise of orders from two on).",
+            show_default="sampled, or the scene's",
+        ),
+    ] = None,
     denoise: Annotated[bool, typer.Option("--denoise", help="An image without noise beside the other.")] = False,
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on with the unfinished or finished render of the same settings.")
@@ -87,15 +94,18 @@ def render_command(
     check_count("seed", seed, 0)
     parameters, draw = defined(define), _renderer(denoise)
     check_folder(out)
-    settings = {"train_seconds": train_seconds, "train_error": train_error}
+    settings = {"train_seconds": train_seconds, "train_error": train_error, "light": light}
     settings = {name: value for name, value in settings.items() if value is not None}
     loaded = open_scene(scene, model, orders, parameters, settings)
     for sentence in chosen(loaded, loaded.integrator()).get("choices", {}).values():
         console().print(sentence, highlight=False, markup=False, soft_wrap=True)
-    file = out / f"{scene.stem}_{model or 'scene'}{f'_sensor{sensor}' if sensor else ''}.exr"
+    name = [scene.stem, model or "scene", light or "", f"sensor{sensor}" if sensor else ""]
+    file = out / f"{'_'.join(filter(None, name))}.exr"
     found = _rendered(loaded, file, limits, {"seed": seed, "sensor": sensor}, resume)
     picture = Picture(file.stem, _colours(found.mean), _numbers(found), _error(found), loaded, sensor, denoise)
     _report(found, _publish(picture, file, draw))
+    for sentence in getattr(loaded.integrator(), "gathered", []):
+        console().print(sentence, highlight=False, markup=False, soft_wrap=True)
 
 
 def _renderer(denoise: bool) -> Renderer | None:

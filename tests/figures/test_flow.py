@@ -173,7 +173,7 @@ def test_entries_weighted_by_their_density_cover_the_area(sampler: FlowSampler, 
     _, _, at, density = draws(sampler, n)
     flat = subject.points.sample(floats(uniform(n, 1, 15))[0], mi.Point2f(uniform(n, 2, 16)), True)
     weight = REGIONS[region](np.array(at.p), np.array(at.n)) / np.array(density, dtype=float)
-    wanted = subject.found.area * REGIONS[region](np.array(flat.p), np.array(flat.n))
+    wanted = subject.object.area * REGIONS[region](np.array(flat.p), np.array(flat.n))
     assert abs(weight.mean() - wanted.mean()) < 4 * np.hypot(weight.std(), wanted.std()) / np.sqrt(n) + 1e-6
 
 
@@ -205,7 +205,7 @@ class Numbers:
 def test_proposals_of_the_flow_and_of_patches_give_the_same_estimate(sampler: FlowSampler) -> None:
     subject, n = sampler.chart.subject, 2**18
     at = subject.points.sample(floats(uniform(n, 1, 20))[0], mi.Point2f(uniform(n, 2, 21)), True)
-    sign = subject.found.sign
+    sign = subject.object.sign
     n_out = mi.Normal3f(at.n_shading * sign)
     exit = Side(SurfacePoint(at.p, mi.Normal3f(at.n * sign), n_out, mi.Vector3f(n_out)), None)
     exit = exit._replace(event=first_event(subject, exit.at))

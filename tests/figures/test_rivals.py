@@ -88,7 +88,7 @@ def test_alpha_is_the_light_that_comes_back_from_everywhere(subject: Subject, sh
     entries = subject.random_points(generator(mi, n, pass_seed(5)))
     prepared = shaken.prepare(exit)
     S = np.array(shaken.S(prepared, entries), dtype=float) / np.array(shaken.scale)[:, None]
-    values = S.mean(axis=0) * np.pi * subject.found.area
+    values = S.mean(axis=0) * np.pi * subject.object.area
     alpha = np.array(prepared.alpha)[0]
     assert abs(values.mean() - alpha) < 4 * values.std() / np.sqrt(n)
     assert values.std() / np.sqrt(n) < 0.05 * alpha
@@ -166,7 +166,7 @@ def test_an_even_S_takes_pi_from_all_directions_also_below_interpolated_horizons
 @pytest.mark.parametrize("kind", LIGHTINGS)
 def test_no_light_comes_from_below_the_surface(subject: Subject, kind: str) -> None:
     at = subject.random_points(generator(mi, 4096, pass_seed(6)))
-    n = mi.Normal3f(at.n * subject.found.sign)
+    n = mi.Normal3f(at.n * subject.object.sign)
     entry = Entry(at.p, n, at.n_out, mi.Float(1), dr.zeros(mi.UInt32, 4096))
     w, value = lighting(kind, subject).sample(entry, mi.Point2f(0.3, 0.6), mi.Bool(True))
     value, mu = np.array(value), np.array(dr.dot(w, at.n))

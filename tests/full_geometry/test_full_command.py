@@ -128,7 +128,7 @@ def test_no_seconds_write_nothing_and_say_so() -> None:
 
 def _stops(monkeypatch: Any, error: BaseException) -> None:
     """Training is struck once, after its second chunk."""
-    chunk, left = training._Run._chunk, [1]
+    chunk, left = training._ObjectTraining._chunk, [1]
 
     def strike(run: Any, total: int) -> None:
         if run.done == 2 and left:
@@ -136,7 +136,7 @@ def _stops(monkeypatch: Any, error: BaseException) -> None:
             raise error
         chunk(run, total)
 
-    monkeypatch.setattr(training._Run, "_chunk", strike)
+    monkeypatch.setattr(training._ObjectTraining, "_chunk", strike)
 
 
 def _same(a: str, b: str) -> bool:

@@ -11,7 +11,7 @@ torch = pytest.importorskip("torch")
 from full_geometry.learning import fitting as ends  # noqa: E402
 from full_geometry.learning.fitting import Ends  # noqa: E402
 from full_geometry.object.features import Quadratic, Terms, n_side  # noqa: E402
-from full_geometry.object.pairs import Even, Pairs, shuffled  # noqa: E402
+from full_geometry.object.pairs import AlbedoSamples, Pairs, shuffled  # noqa: E402
 
 N = n_side(1)
 
@@ -78,7 +78,7 @@ def test_renders_evaluate_what_was_solved_for() -> None:
 
 def test_of_several_sources_only_random_exits_are_solved_by() -> None:
     def pairs(n: int, value: float) -> Pairs:
-        even = Even(np.zeros((N, n), np.float32), np.zeros((2, n), np.float32))
+        even = AlbedoSamples(np.zeros((N, n), np.float32), np.zeros((2, n), np.float32))
         return Pairs(np.full((2 * N, n), value, np.float32), np.full((1, n), value, np.float32), 3 * n, None, even)
 
     both = shuffled([pairs(30, 1.0), pairs(20, 2.0)], np.random.default_rng(5))

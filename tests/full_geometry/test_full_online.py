@@ -23,7 +23,7 @@ import drjit as dr  # noqa: E402
 
 from full_geometry.learning import training  # noqa: E402
 from full_geometry.learning.fitting import Recipe  # noqa: E402
-from full_geometry.learning.training import Schedule  # noqa: E402
+from full_geometry.learning.training import CameraSchedule  # noqa: E402
 from full_geometry.object.subject import Subject, SurfacePoint  # noqa: E402
 from full_geometry.object.walks import trace_exits  # noqa: E402
 from halfspace_sss import rendering  # noqa: E402
@@ -139,7 +139,7 @@ def _stops(monkeypatch: Any, error: BaseException, owner: Any, name: str, when: 
     monkeypatch.setattr(owner, name, strike)
 
 
-PHASES = {"learning": (training._Run, "_chunk", 3), "rendering": (reference, "_pass", 3)}
+PHASES = {"learning": (training._ObjectTraining, "_chunk", 3), "rendering": (reference, "_pass", 3)}
 
 
 @pytest.mark.parametrize("phase", PHASES)
@@ -260,11 +260,11 @@ def test_first_exits_of_paths_from_the_camera_are_those_of_walks_from_where_they
 
 
 def test_passes_of_the_camera_are_at_most_half_of_the_walks_and_few_where_the_object_is_small() -> None:
-    assert Schedule.of(1000, 0, 100) is None
-    assert Schedule.of(8000, 100, 200) == (10, 4, 1)  # 40 x 100 of 8000
-    assert Schedule.of(8000, 1, 200) == (20, 4, 1)  # 4 x 20 x 200 = 2 x 8000 rays at most
-    assert Schedule.of(1000, 2000, 10000) == (1, 1, 5)
-    assert Schedule(1, 1, 5).numbers(3) == [] and Schedule(2, 4, 1).numbers(1) == [4, 5, 6, 7]
+    assert CameraSchedule.of(1000, 0, 100) is None
+    assert CameraSchedule.of(8000, 100, 200) == (10, 4, 1)  # 40 x 100 of 8000
+    assert CameraSchedule.of(8000, 1, 200) == (20, 4, 1)  # 4 x 20 x 200 = 2 x 8000 rays at most
+    assert CameraSchedule.of(1000, 2000, 10000) == (1, 1, 5)
+    assert CameraSchedule(1, 1, 5).numbers(3) == [] and CameraSchedule(2, 4, 1).numbers(1) == [4, 5, 6, 7]
 
 
 def _noisy(rng: np.random.Generator, passes: int, spread: float) -> Reference:

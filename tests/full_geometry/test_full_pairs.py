@@ -16,11 +16,11 @@ from halfspace_sss import Medium
 mi = pytest.importorskip("mitsuba")
 torch = pytest.importorskip("torch")
 
-from full_geometry.learning.fitting import STANDARD, Fitting  # noqa: E402
+from full_geometry.learning.fitting import STANDARD, ObjectFit  # noqa: E402
 from full_geometry.models.half_space import HalfSpace  # noqa: E402
 from full_geometry.object.features import n_pair, n_side  # noqa: E402
 from full_geometry.object.identity import frame_of  # noqa: E402
-from full_geometry.object.pairs import ENOUGH, Even, Pairs, PairSource, Proposals  # noqa: E402
+from full_geometry.object.pairs import ENOUGH, AlbedoSamples, EntryProposals, Pairs, PairSource  # noqa: E402
 from full_geometry.object.subject import Subject  # noqa: E402
 from full_geometry.object.walks import trace_exits  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
@@ -42,7 +42,7 @@ def variant() -> None:
 def source_of(shape: str, medium: str) -> PairSource:
     subject = Subject.of(mi.load_dict(SHAPES[shape]), MEDIA[medium])
     start = HalfSpace(subject, "better_dipole")
-    return PairSource(subject, frame_of(subject), start, Proposals(subject, start))
+    return PairSource(subject, frame_of(subject), start, EntryProposals(subject, start))
 
 
 def with_scale(source: PairSource, pairs: Pairs) -> PairSource:
@@ -96,7 +96,7 @@ def test_proposals_that_are_used_have_the_sums_of_all_and_less_noise() -> None:
     source = source_of("bunny", "dark")
     walks, proposals = source.walks(N // 8, (5,)), source.proposed(N, (5,))
     n_in = len(proposals.features)
-    fitting = Fitting(n_in, 3, source.subject.eta, STANDARD, 0)
+    fitting = ObjectFit(n_in, 3, source.subject.eta, STANDARD, 0)
     assert n_in == 2 * n_side(3) + n_pair(3)
     fitting.set_scale(walks)
     fitting.use(walks, source.proposed(N // 8, (6,)), None, np.random.default_rng(0))  # f is no more 0
@@ -116,6 +116,6 @@ def test_order_one_of_even_light_counts_as_a_part_of_all_light_and_more_orders_b
     n, rng = n_side(2), np.random.default_rng(3)
     features = rng.random((2 * n + n_pair(2), 64), dtype=np.float32)
     T = np.repeat(np.array([[0.001], [0.3], [0.599], [0.1]], np.float32), 64, axis=1)
-    fitting = Fitting(len(features), 2, 1.3, STANDARD, 0)
-    fitting.set_scale(Pairs(features, np.ones((2, 64), np.float32), 64, None, Even(features[:n], T)))
+    fitting = ObjectFit(len(features), 2, 1.3, STANDARD, 0)
+    fitting.set_scale(Pairs(features, np.ones((2, 64), np.float32), 64, None, AlbedoSamples(features[:n], T)))
     assert np.allclose(fitting.even_scale.numpy()[:, 0], [1 / 0.6, 1 / 0.4, 1 / 0.599, 1 / 0.1], rtol=1e-5)

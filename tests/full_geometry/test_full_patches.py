@@ -23,7 +23,7 @@ from full_geometry.models.half_space import HalfSpace  # noqa: E402
 from full_geometry.object.features import Side  # noqa: E402
 from full_geometry.object.first_event import first_event  # noqa: E402
 from full_geometry.object.identity import frame_of  # noqa: E402
-from full_geometry.object.pairs import Proposals  # noqa: E402
+from full_geometry.object.pairs import EntryProposals  # noqa: E402
 from full_geometry.object.patches import (  # noqa: E402
     Patches,
     PatchSampler,
@@ -101,7 +101,7 @@ def test_samples_lie_on_their_face(subject: Subject, sampler: PatchSampler) -> N
     centroids, normals, _ = mesh_faces(subject)
     face = np.array(point.prim_index)
     off = np.sum((np.array(point.p).T - centroids[face]) * normals[face], axis=1)
-    assert np.abs(off).max() < 1e-4 * subject.found.size
+    assert np.abs(off).max() < 1e-4 * subject.object.size
     assert np.allclose(np.array(point.n).T, normals[face], atol=1e-3)
 
 
@@ -121,8 +121,8 @@ def test_a_table_is_near_the_network(subject: Subject, sampler: PatchSampler) ->
     n = len(mesh_faces(subject)[2])
     by_table = np.array(sampler.density(PatchTable(sampler).weights(mi.UInt32(0)), dr.arange(mi.UInt32, n)))
     at = subject.points.on_face(mi.UInt32(0), mi.Point2f(0.5, 0.5))
-    n_out = mi.Normal3f(at.n_shading * subject.found.sign)
-    exit = SurfacePoint(at.p, mi.Normal3f(at.n * subject.found.sign), n_out, mi.Vector3f(n_out))
+    n_out = mi.Normal3f(at.n_shading * subject.object.sign)
+    exit = SurfacePoint(at.p, mi.Normal3f(at.n * subject.object.sign), n_out, mi.Vector3f(n_out))
     weights = sampler.prepare(Side(exit, first_event(subject, exit)))
     by_network = np.array(sampler.density(weights, dr.arange(mi.UInt32, n)))
     assert np.corrcoef(np.log(by_table), np.log(by_network))[0, 1] > 0.8
@@ -146,7 +146,7 @@ def test_a_shape_without_faces_has_no_patches() -> None:
 
 def test_learnt_weights_lower_the_variance_below_that_of_uniform_points(subject: Subject, tmp_path: Path) -> None:
     recipe = Recipe(width=24, depth=2, batch=1024, chunk=2**14, reuse=4)
-    found = train(subject.found.shape, WAX.scaled(1.5), chunks=6, recipe=recipe, folder=tmp_path)
+    found = train(subject.object.shape, WAX.scaled(1.5), chunks=6, recipe=recipe, folder=tmp_path)
     assert sum(path.stat().st_size for path in tmp_path.glob("*.safetensors")) < 100_000
     inside, n = found.model.subject, 2**15
     rng = generator(mi, n, pass_seed(5))
@@ -158,7 +158,7 @@ def test_learnt_weights_lower_the_variance_below_that_of_uniform_points(subject:
     at = entry_at(inside, point, rng)
     estimates = [np.array(found.model.S(prepared, at))[0] * np.pi / np.array(density)]
     uniform = inside.random_points(rng)
-    estimates.append(np.array(found.model.S(prepared, uniform))[0] * np.pi * inside.found.area)
+    estimates.append(np.array(found.model.S(prepared, uniform))[0] * np.pi * inside.object.area)
     learnt, flat = (v.reshape(64, -1) for v in estimates)
     spread = [np.mean(v.var(axis=1) / v.mean(axis=1).clip(1e-9) ** 2) for v in (learnt, flat)]
     assert spread[0] < 0.5 * spread[1]
@@ -166,14 +166,14 @@ def test_learnt_weights_lower_the_variance_below_that_of_uniform_points(subject:
 
 
 def entry_at(subject: Subject, point, rng):
-    n_out = point.n_shading * subject.found.sign
-    n = mi.Normal3f(point.n * subject.found.sign)
+    n_out = point.n_shading * subject.object.sign
+    n = mi.Normal3f(point.n * subject.object.sign)
     return surface_point(point.p, n, n_out, cosine_direction(n_out, n, rng))
 
 
 def test_probes_and_patches_together_give_the_estimate_of_each_alone(subject: Subject, sampler: PatchSampler) -> None:
     half_space = HalfSpace(subject, "better_dipole")
-    alone = Proposals(subject, half_space, 0.4)
+    alone = EntryProposals(subject, half_space, 0.4)
     exits = subject.random_points(generator(mi, 2**17, pass_seed(12)))
     means, errors = [], []
     for k, proposals in enumerate((alone, alone.with_patches(sampler))):

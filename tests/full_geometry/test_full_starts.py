@@ -20,7 +20,7 @@ from full_geometry.learning.training import Trained, train  # noqa: E402
 from full_geometry.models import neural_shape as shapes  # noqa: E402
 from full_geometry.models import storing  # noqa: E402
 from full_geometry.models.half_space import HalfSpace  # noqa: E402
-from full_geometry.object.pairs import Proposals  # noqa: E402
+from full_geometry.object.pairs import EntryProposals  # noqa: E402
 from full_geometry.object.radiance import reference  # noqa: E402
 from full_geometry.object.subject import Subject, SurfacePoint  # noqa: E402
 from full_geometry.scene import learnt_means  # noqa: E402
@@ -76,7 +76,7 @@ def test_before_any_step_it_is_the_network_of_all_shapes(tmp_path: Path) -> None
 
 def test_few_steps_from_it_are_worth_more_than_from_the_half_space(trained: Trained, tmp_path: Path) -> None:
     truth = reference(subject(), 128, 8192, seed=5)
-    proposals = Proposals(subject(), HalfSpace(subject(), "better_dipole"))
+    proposals = EntryProposals(subject(), HalfSpace(subject(), "better_dipole"))
     models = {SHAPE: trained.model, "better_dipole": learnt(tmp_path, "better_dipole").model}
     constant = {}
     for name, model in models.items():
@@ -101,9 +101,9 @@ def test_renders_ask_the_model_that_was_trained(trained: Trained, monkeypatch: p
     shape = mi.load_dict({"type": "sphere", "radius": 3.0, "bsdf": surface})
     here = Subject.of(shape, WAX.channel(1))
     inside = Inside("medium", here.media[0], "full_geometry", "multiple", True)
-    transport = learnt_means(here.found, inside, list(here.media), Settings()).transport
+    transport = learnt_means(here.object, inside, list(here.media), Settings()).transport
     o, i = points(here)
-    out = Exit(o.p, o.n_out, o.w, mi.Float(here.found.sign), o.n)
+    out = Exit(o.p, o.n_out, o.w, mi.Float(here.object.sign), o.n)
     entry = Entry(i.p, i.n, i.n_out, mi.Float(1), mi.UInt32(0))
     mu = np.array(mi.Float(sum(a * b for a, b in zip(i.w, i.n_out))))
     rendered = np.array(transport.S_mu(transport.prepare(out, True), entry, i.w, True))

@@ -15,14 +15,13 @@ dr = pytest.importorskip("drjit")
 mi = pytest.importorskip("mitsuba")
 pytest.importorskip("torch")
 
-from full_geometry.learning import training  # noqa: E402
 from full_geometry.learning.fitting import Recipe  # noqa: E402
 from full_geometry.learning.model_errors import LIGHTS, measure  # noqa: E402
 from full_geometry.learning.training import Trained, train  # noqa: E402
 from full_geometry.models import storing  # noqa: E402
-from full_geometry.models.half_space import HalfSpace, HalfSpaceTransport  # noqa: E402
+from full_geometry.models.half_space import HalfSpace, PlanarModel  # noqa: E402
 from full_geometry.object.first_event import first_event, flight  # noqa: E402
-from full_geometry.object.pairs import Proposals  # noqa: E402
+from full_geometry.object.pairs import EntryProposals  # noqa: E402
 from full_geometry.object.subject import Subject, SurfacePoint  # noqa: E402
 from halfspace_sss import rendering  # noqa: E402
 from halfspace_sss.neural import trained as known_weights  # noqa: E402
@@ -45,10 +44,9 @@ def variant() -> None:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory):
-    """Where weights are kept and looked for; the truth of validations is noisier than by default."""
+    """Where weights are kept and looked for."""
     found = tmp_path_factory.mktemp("weights")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(training, "WALKS", 512)
         patch.setenv(known_weights.ENVIRONMENT_VARIABLE, str(found))
         yield found
 
@@ -116,8 +114,8 @@ def test_a_grid_of_one_value_gives_the_first_event_of_the_homogeneous_medium() -
 
 def test_training_halves_the_error_of_the_half_space_in_a_medium_that_varies(trained: Trained) -> None:
     subject = trained.model.subject
-    proposals = Proposals(subject, HalfSpace(subject, "better_dipole"))
-    plane = measure(subject, HalfSpaceTransport(subject, "better_dipole"), proposals, samples=1024)
+    proposals = EntryProposals(subject, HalfSpace(subject, "better_dipole"))
+    plane = measure(subject, PlanarModel(subject, "better_dipole"), proposals, samples=1024)
     assert np.all(constant(trained.errors) < 0.5 * constant(plane))
 
 
@@ -190,6 +188,7 @@ def test_nobody_is_told_of_means_where_the_medium_is_learnt(trained: Trained) ->
     assert not any("varies in space" in str(warning.message) for warning in found)
 
 
+@pytest.mark.slow
 def test_an_object_of_the_figures_can_be_learnt_and_rendered(folder: Path, tmp_path: Path) -> None:
     from figures.modelling.scene_parts import learnable_parts, make_varying
 

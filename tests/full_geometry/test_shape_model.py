@@ -25,7 +25,7 @@ from full_geometry.models.descriptors import (  # noqa: E402
     end,
     mixed,  # noqa: E402
 )
-from full_geometry.models.half_space import HalfSpaceTransport  # noqa: E402
+from full_geometry.models.half_space import PlanarModel  # noqa: E402
 from full_geometry.models.neural_shape import (  # noqa: E402
     Backbone,  # noqa: E402
     NeuralShape,
@@ -47,10 +47,10 @@ def variant() -> None:
 def random_weights(seed: int = 0, width: int = 16) -> dict[str, np.ndarray]:
     """Numbers with which f is of order one."""
     pytest.importorskip("torch")
-    from full_geometry.learning.shape_training import Network, Recipe
+    from full_geometry.learning.shape_training import ShapeNetwork, ShapeRecipe
 
     rng = np.random.default_rng(seed)
-    arrays = Network(Recipe(width=width, depth=2), seed).arrays()
+    arrays = ShapeNetwork(ShapeRecipe(width=width, depth=2), seed).arrays()
     return arrays | {"W_2": rng.normal(0, 1, arrays["W_2"].shape).astype(np.float32)}
 
 
@@ -183,14 +183,14 @@ def test_a_channel_is_what_its_medium_is_alone() -> None:
 
 def test_torch_and_drjit_say_the_same() -> None:
     torch = pytest.importorskip("torch")
-    from full_geometry.learning.shape_training import Network, Recipe
+    from full_geometry.learning.shape_training import ShapeNetwork, ShapeRecipe
 
     subject = Subject.of(make_shape("shells", 2, 24).mitsuba("bowl"), WAX.scaled(8.0))
     weights, (o, i) = random_weights(1), pairs(subject)
     pair = told(subject, o, i)[0]
     columns = [np.broadcast_to(v.numpy(), N) for v in (*pair.exit, *pair.entry, *pair.shared)]
     x = torch.from_numpy(np.stack(columns, axis=-1).astype(np.float32))
-    network, model = Network(Recipe(width=16, depth=2)), NeuralShape.of(subject, weights)
+    network, model = ShapeNetwork(ShapeRecipe(width=16, depth=2)), NeuralShape.of(subject, weights)
     with torch.no_grad():
         for k, (W, b) in enumerate(zip(network.matrices, network.biases)):
             W.copy_(torch.from_numpy(weights[f"W_{k}"]))
@@ -229,7 +229,7 @@ def test_media_at_the_ends_of_the_range_stay_finite(ratios: tuple[float, ...]) -
 @pytest.mark.parametrize("radius", [3.0, 10.0])
 def test_shipped_weights_are_several_times_better_than_the_half_space_on_a_sphere(radius: float) -> None:
     subject = Subject.of(mi.load_dict({"type": "sphere", "radius": radius}), Medium(0.95, 0.05, 0.0, 1.3))
-    models = {"neural_shape": transport(subject), "neural": HalfSpaceTransport(subject, "neural")}
+    models = {"neural_shape": transport(subject), "neural": PlanarModel(subject, "neural")}
     found = errors_of(subject, models, exits=64, walks=2048, samples=1024)
     own, plane = (found[name][0].error for name in models)
     assert own < plane / 3

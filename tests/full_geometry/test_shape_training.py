@@ -17,7 +17,7 @@ from figures.studies.held_out import HELD_OUT  # noqa: E402
 from full_geometry.learning import shape_training as training  # noqa: E402
 from full_geometry.learning.shape_data import (  # noqa: E402  # noqa: E402
     GROUPS,
-    Grouped,
+    GroupedPairs,
     PairData,
     draw_medium,
     draw_subject,
@@ -25,12 +25,12 @@ from full_geometry.learning.shape_data import (  # noqa: E402  # noqa: E402
     make_data,
     mean_events,
 )
-from full_geometry.learning.shape_training import Fitting, Recipe  # noqa: E402
+from full_geometry.learning.shape_training import ShapeFit, ShapeRecipe  # noqa: E402
 from full_geometry.learning.shapes import TRAINING, make_shape  # noqa: E402
 from full_geometry.models.neural_shape import ALBEDO, ETA, SIZE, WEIGHTS, G, load, shipped_weights  # noqa: E402
 from halfspace_sss.cli import app as cli  # noqa: E402
 
-QUICK = Recipe(width=16, depth=2, objects=4, pairs=64)
+QUICK = ShapeRecipe(width=16, depth=2, objects=4, pairs=64)
 PLAN = (4, 12)
 
 
@@ -130,8 +130,8 @@ def test_parts_of_groups_are_samples_of_the_means_over_the_object() -> None:
 def test_a_fit_follows_the_light_of_groups() -> None:
     def brightness(weight: float) -> float:
         own = grouped(data_of(0))
-        pool = [Grouped(own.data, own.proposals, own.walks, own.share, 1.5 * own.light, weight * (own.weight > 0))]
-        fitting, rng = Fitting(QUICK, 0), np.random.default_rng(0)
+        pool = [GroupedPairs(own.data, own.proposals, own.walks, own.share, 1.5 * own.light, weight * (own.weight > 0))]
+        fitting, rng = ShapeFit(QUICK, 0), np.random.default_rng(0)
         for k in range(150):
             fitting.advance(pool, rng, k / 150)
         with torch.no_grad():
@@ -144,7 +144,7 @@ def test_a_fit_follows_the_light_of_groups() -> None:
 
 def test_a_step_lowers_the_loss() -> None:
     pool = [grouped(data_of(k)) for k in range(2)]
-    fitting, rng = Fitting(QUICK, 0), np.random.default_rng(0)
+    fitting, rng = ShapeFit(QUICK, 0), np.random.default_rng(0)
     losses = [fitting.advance(pool, rng, k / 150) for k in range(150)]
     assert np.mean(losses[-20:]) < np.mean(losses[:20]) - 0.02
 
@@ -152,7 +152,7 @@ def test_a_step_lowers_the_loss() -> None:
 def test_the_command_writes_weights_with_their_record(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(training, "STANDARD", QUICK)
-    monkeypatch.setattr(training._Run, "_plan", lambda run, seconds, plan: (3, 4))
+    monkeypatch.setattr(training._ShapeTraining, "_plan", lambda run, seconds, plan: (3, 4))
     result = CliRunner().invoke(cli.app, ["train", "--shapes", "--seconds", "5", "--seed", "1"])
     assert result.exit_code == 0, result.output
     record = json.loads(Path("shapes", WEIGHTS).with_suffix(".json").read_text(encoding="utf-8"))

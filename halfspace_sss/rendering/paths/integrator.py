@@ -13,6 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from halfspace_sss.interrupts import hear_again, interruptible
+from halfspace_sss.rendering.paths.gathering import Gathering
 from halfspace_sss.rendering.paths.path_loop import replay_paths, trace_paths
 from halfspace_sss.rendering.transport.body import Bodies, Body, make_bodies
 from halfspace_sss.rendering.transport.settings import Settings, read_settings
@@ -46,12 +47,19 @@ def integrator_class() -> type:
             self.timed = float(props.get("timeout", -1.0)) > 0
             self.settings = read_settings(props)
             self._bodies = Bodies(self.settings)
+            self._gathering = Gathering()
 
         def prepare(self, scene: Any) -> list[Any]:
             """The translucent objects of a scene, made ready once; ValueError if the scene cannot be rendered."""
             check_parameters(scene)
             with dr.suspend_grad():
-                return self._bodies.of(scene)
+                return self._prepared(scene)
+
+        def _prepared(self, scene: Any) -> list[Any]:
+            bodies = self._bodies.of(scene)
+            if self.settings.light == "sampled":
+                return bodies
+            return self._gathering.of(scene, bodies, self.settings)
 
         def check(self, scene: Any, without: Collection[str] = ()) -> None:
             """ValueError if the scene cannot be rendered, as far as can be told without the objects `without`."""
@@ -71,20 +79,30 @@ def integrator_class() -> type:
                 return sensor.film().develop() if develop else None
 
         def render_forward(self, scene: Any, *args: Any, **more: Any) -> Any:
-            bodies = self.prepare(scene)
+            bodies = self._differentiable(scene)
             with undisturbed():
                 return replayer(bodies, self.settings).render_forward(scene, *args, **more)
 
         def render_backward(self, scene: Any, *args: Any, **more: Any) -> None:
-            bodies = self.prepare(scene)
+            bodies = self._differentiable(scene)
             with undisturbed():
                 replayer(bodies, self.settings).render_backward(scene, *args, **more)
+
+        def _differentiable(self, scene: Any) -> list[Any]:
+            if self.settings.light != "sampled":
+                raise ValueError(f"light must be sampled for derivatives, got {self.settings.light}")
+            return self.prepare(scene)
 
         def sample(self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Any = True) -> tuple:
             check_outermost(scene)
             with undisturbed(), dr.suspend_grad():
-                parts, seen = trace_paths(scene, self._bodies.of(scene), self.settings, sampler, ray, active)
+                parts, seen = trace_paths(scene, self._prepared(scene), self.settings, sampler, ray, active)
             return parts[0] + parts[1], seen, []
+
+        @property
+        def gathered(self) -> list[str]:
+            """A sentence on the light that was gathered for each object, with its noise."""
+            return self._gathering.told()
 
         def to_string(self) -> str:
             return f"BSSRDFIntegrator[{self.settings}]"

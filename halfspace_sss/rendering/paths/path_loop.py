@@ -338,6 +338,7 @@ def vertex(world: World, sampler: Any, at: Vertex, books: Books) -> tuple[Onward
                 choice = choice._replace(few=chance, reflection=dr.select(once, 0, choice.reflection))
             choices.append((body, here, choice))
     books = _evened(world, sampler, at, books, choices)
+    books = _gathered(world, sampler, at, books, choices)
     on, books, taken = _outside(world, sampler, at, books, choices)
     share, events = taken.share, []
     for body, here, choice in choices:
@@ -371,6 +372,19 @@ def _evened(world: World, sampler: Any, at: Vertex, books: Books, choices: list)
             few = dr.select(at.first & ~at.second, 0, few) if body.few else mi.Spectrum(0)
             light = (few + dr.select(at.first & at.second, 0, more)) * world.sky.mean
             return (world.books.add(books, at.throughput * light),)
+
+        (books,) = _where(here, sampler, (books,), world, known)
+    return books
+
+
+def _gathered(world: World, sampler: Any, at: Vertex, books: Books, choices: list) -> Books:
+    """Adds what leaves by light that was gathered."""
+    for body, here, choice in choices:
+        if body.gathered is None:
+            continue
+
+        def known(books: Books, body: Body = body, here: Any = here, out: Exit = choice.leg.out) -> tuple[Books]:
+            return (world.books.add(books, at.throughput * body.gathered.radiance(out, here)),)
 
         (books,) = _where(here, sampler, (books,), world, known)
     return books

@@ -41,6 +41,7 @@ class Body:
         few: the orders below two that are traced beside it: (0, 1), (1,) or none.
         expected: what each kind of light is expected to bring.
         variation: how its light varies with its medium.
+        gathered: what leaves by orders from two on, in place of a transport, see `paths.gathering`.
     """
 
     found: Object
@@ -52,6 +53,7 @@ class Body:
     few: tuple[int, ...]
     expected: Expected
     variation: Variation
+    gathered: Any = None
 
     @property
     def eta(self) -> Any:

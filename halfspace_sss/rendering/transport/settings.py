@@ -5,13 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from halfspace_sss.checks import check_interval
+from halfspace_sss.checks import check_choice, check_interval
 from halfspace_sss.rendering.surface.parameters import OF_MITSUBA, check_parameters
 from halfspace_sss.rendering.transport.plane import GEOMETRIES
 
 __all__ = ["AUTOMATIC", "SHARED", "Settings", "read_settings"]
 
 AUTOMATIC = -1.0
+LIGHTS = ("sampled", "gathered")
 SHARED = ("mm_per_unit", "max_depth", "rr_depth", "hide_emitters")  # what `translucent_walk` understands too
 OF_MODELS = ("geometry", "area_share", "entries")
 
@@ -30,6 +31,8 @@ class Settings:
             object.
         entries: points of entry that an exit draws, of which one is followed, chosen by what it may bring; AUTOMATIC
             leaves it to the model.
+        light: "sampled", without bias; or "gathered" once for all samples, see `paths.gathering`: orders from two on
+            have a little bias and no noise.
         hide_emitters: whether directly visible emitters are left out.
         train_seconds: time for each object whose model has to learn it first; 0 refuses objects without weights.
         train_error: relative error under constant light, measured on the way, from which on it has learnt enough.
@@ -45,6 +48,7 @@ class Settings:
     area_share: float = AUTOMATIC
     entries: int = int(AUTOMATIC)
     hide_emitters: bool = False
+    light: str = "sampled"
     train_seconds: float = 60.0
     train_error: float = 0.03
     tolerance: float = 0.05
@@ -60,6 +64,7 @@ class Settings:
             raise ValueError(f"rr_depth must be at least 1, got {self.rr_depth}")
         if self.entries < 1 and self.entries != AUTOMATIC:
             raise ValueError(f"entries must be at least 1, got {self.entries}")
+        check_choice("light", self.light, LIGHTS)
         if self.geometry not in GEOMETRIES:
             raise ValueError(f"geometry must be one of {', '.join(GEOMETRIES)}, got {self.geometry!r}")
         if self.area_share != AUTOMATIC:

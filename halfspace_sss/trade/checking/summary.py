@@ -65,12 +65,12 @@ def _always(table: pandas.DataFrame, name: str) -> dict[str, Any]:
 INTRODUCTION = """\
 # What the advice of the trade is worth
 
-Written by `halfspace-sss trade-check` ({arguments}): random scenes of shape x medium x light x
-size x tolerance, each with {assess:g} s for a recommendation among {ways} ways, and up to {truth:g} s of long runs with
-exits and samples of their own, which end when bias² is known to a fifth of the squared tolerance and variances to 15 %.
-Times are those of the processor, all cores together. *Always*: what one fixed choice costs where it can keep the
-tolerance, with as many samples as the long runs say; `auto` is what the model of that name takes for the tolerance of
-the scene.
+Written by `halfspace-sss trade-check` ({arguments}): random scenes of shape x medium x light x size x tolerance. Each
+has {assess:g} s for a recommendation among {ways} ways, and up to {truth:g} s of long runs with exits and samples of
+their own. A long run ends when bias² is known to a fifth of the squared tolerance and variances to 15 %. Times are
+those of the processor, all cores together. *Always* is the cost of one fixed choice where it can keep the tolerance,
+with as many samples as the long runs say. `auto` is the choice of the model of that name for the tolerance of the
+scene.
 """
 
 

@@ -14,12 +14,12 @@ pytest.importorskip("igl")
 from full_geometry.learning.model_errors import errors_of  # noqa: E402
 from full_geometry.models.descriptors import Mixed, mixed  # noqa: E402
 from full_geometry.models.neural_shape import (  # noqa: E402
-    NeuralShape,  # noqa: E402
-    held,
+    NeuralShape,
+    calibrated,
+    calibration_weight,
     load,
     shipped_weights,
     transport,
-    weight,
 )
 from full_geometry.object.subject import Subject  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
@@ -56,7 +56,7 @@ def test_as_much_light_leaves_a_sphere_as_by_walks(radius: float) -> None:
 
 def test_what_is_too_dark_is_made_as_bright_as_what_is_not() -> None:
     subject = ball(3.0)
-    one, other = (held(model(subject)).scales[0] for model in (free, halved))
+    one, other = (calibrated(model(subject)).scales[0] for model in (free, halved))
     assert np.isclose(one, other, rtol=0.01) and not np.isclose(other, 0.5, rtol=0.5)
 
 
@@ -85,8 +85,8 @@ def test_the_same_object_is_held_by_the_same_numbers() -> None:
 
 
 def test_what_is_as_good_as_flat_is_left_as_it_is() -> None:
-    assert weight(mixed(ball(800.0))[0]) == 0 and transport(ball(800.0)).scales == ()
-    chords = [weight(Mixed(0.0, 1.0, chord, 0.0, 0.0, 0.0, 1.0)) for chord in (0.0, 500.0, 1000.0, 1e6)]
+    assert calibration_weight(mixed(ball(800.0))[0]) == 0 and transport(ball(800.0)).scales == ()
+    chords = [calibration_weight(Mixed(0.0, 1.0, chord, 0.0, 0.0, 0.0, 1.0)) for chord in (0.0, 500.0, 1000.0, 1e6)]
     assert chords == [1.0, 0.5, 0.0, 0.0]
 
 

@@ -1,0 +1,158 @@
+"""Points of a surface that hold what varies slowly over it, and a lookup that blends those near any place.
+
+Points are a low-discrepancy set over the area. Between them a value is blended with the weights
+
+    w_j = (1 - d_j² / h²)² max(n_j.n, 0)²,    d_j < h,
+
+d_j the distance and n_j the normal of point j, so that the two sides of something thin stay apart. A uniform grid with
+cells of the size h lists for each cell all points that some place in it can reach.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from halfspace_sss.rendering.surface.horizon import cosine_above, lifted
+from halfspace_sss.rendering.surface.object import Object, turned
+from halfspace_sss.rendering.transport.area_points import AreaPoints
+from halfspace_sss.rendering.transport.plane import Exit, number
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+__all__ = ["SurfacePoints"]
+
+REACH = 2.0  # h over the mean distance of points
+MOST_CELLS = 2**22
+R_3 = (
+    0.8191725133961645,
+    0.6710436067037893,
+    0.5497004779019703,
+)  # of three dimensions (Roberts 2018)
+
+
+@dataclass(frozen=True, eq=False)
+class SurfacePoints:
+    """Points of one object, and their grid.
+
+    Args:
+        p, n, n_out, face: positions, outward geometric and shading normals, faces.
+        h: radius of the lookup, scene units.
+        low: corner of the grid.
+        cells: of the grid along each axis.
+        first: of each cell the place in `members` of its first point; one more than cells.
+        members: numbers of the points, cell by cell.
+    """
+
+    p: mi.Point3f
+    n: mi.Normal3f
+    n_out: mi.Normal3f
+    face: mi.UInt32
+    h: float
+    low: np.ndarray
+    cells: np.ndarray
+    first: mi.UInt32
+    members: mi.UInt32
+
+    @classmethod
+    def of(cls, found: Object, count: int) -> SurfacePoints:
+        """`count` points of an object."""
+        k = dr.arange(mi.UInt32, count)
+        u = [mi.Float(((np.arange(1, count + 1) * r + 0.5) % 1.0).astype(np.float32)) for r in R_3]
+        at = AreaPoints(found.shape).sample(u[0], mi.Point2f(u[1], u[2]), mi.Bool(True))
+        face = mi.UInt32(at.prim_index) + dr.zeros(mi.UInt32, count)
+        sign = found.side(face)
+        n = mi.Normal3f(at.n) * sign
+        n_out = mi.Normal3f(turned(mi.Normal3f(at.n_shading), mi.Normal3f(at.n))) * sign
+        p = mi.Point3f(at.p)
+        dr.eval(p, n, n_out, face, k)
+        h = REACH * float(np.sqrt(found.area / count))
+        return cls(p, n, n_out, face, *_grid(np.array(p).T, h))
+
+    def __len__(self) -> int:
+        return dr.width(self.p)
+
+    def exit(self, k: mi.UInt32, u: mi.Point2f) -> tuple[Exit, mi.UInt32]:
+        """Point k as an exit in a direction by the cosine, for a pair of uniforms, and its face."""
+        n, n_out = dr.gather(mi.Normal3f, self.n, k), dr.gather(mi.Normal3f, self.n_out, k)
+        w, _ = cosine_above(n_out, n, u)
+        out = Exit(dr.gather(mi.Point3f, self.p, k), lifted(n_out, n, w), w, mi.Float(1), n)
+        return out, dr.gather(mi.UInt32, self.face, k)
+
+    def blend(self, values: mi.Float, size: int, p: mi.Point3f, n: mi.Normal3f, active: mi.Bool) -> list[mi.Float]:
+        """Values of all points, `size` for each, one after the other, at places with outward normals."""
+
+        def add(j: mi.UInt32, w: mi.Float, total: list[mi.Float]) -> list[mi.Float]:
+            return [dr.fma(w, dr.gather(mi.Float, values, j * size + c), v) for c, v in enumerate(total)]
+
+        weight, total = self._near(p, n, active, [mi.Float(0)] * size, add)
+        scale = dr.select(weight > 0, dr.rcp(dr.maximum(weight, 1e-30)), 0)
+        return [v * scale for v in total]
+
+    def smoothed(self, values: np.ndarray) -> np.ndarray:
+        """Values (points, ...) blended at the points themselves."""
+        rows = values.reshape(len(self), -1)
+        found = self.blend(mi.Float(rows.astype(np.float32).ravel()), rows.shape[1], self.p, self.n, mi.Bool(True))
+        return np.stack([np.array(v) for v in found], axis=1).reshape(values.shape)
+
+    def nearest(self, p: mi.Point3f, n: mi.Normal3f, active: mi.Bool) -> tuple[mi.UInt32, mi.Bool]:
+        """The point of the largest weight at a place, and whether there is one."""
+
+        def larger(j: mi.UInt32, w: mi.Float, best: tuple) -> tuple:
+            found = w > best[1]
+            return dr.select(found, j, best[0]), dr.select(found, w, best[1])
+
+        _, (j, w) = self._near(p, n, active, (mi.UInt32(0), mi.Float(0)), larger)
+        return j, w > 0
+
+    def _near(self, p: mi.Point3f, n: mi.Normal3f, active: mi.Bool, state: object, visit: Callable) -> tuple:
+        """The sum of weights, and the state after `visit(j, w_j, state)` for all points in reach."""
+        h = number(self.h)
+        cell = [mi.Int32(dr.floor((p[a] - number(self.low[a])) / h)) for a in range(3)]
+        counts = [dr.opaque(mi.Int32, int(c)) for c in self.cells]
+        valid = active
+        for index, count in zip(cell, counts):
+            valid = valid & (index >= 0) & (index < count)
+        index = mi.UInt32(dr.select(valid, (cell[2] * counts[1] + cell[1]) * counts[0] + cell[0], 0))
+        begin = dr.gather(mi.UInt32, self.first, index, valid)
+        end = dr.gather(mi.UInt32, self.first, index + 1, valid)
+
+        def step(i: mi.UInt32, weight: mi.Float, state: object) -> tuple:
+            j = dr.gather(mi.UInt32, self.members, i)
+            d2 = dr.squared_norm(dr.gather(mi.Point3f, self.p, j) - p) / (h * h)
+            facing = dr.maximum(dr.dot(dr.gather(mi.Normal3f, self.n, j), n), 0)
+            w = dr.square(dr.maximum(1 - d2, 0) * facing)
+            return i + 1, weight + w, visit(j, w, state)
+
+        loop = (mi.UInt32(begin), mi.Float(0), state)
+        out = dr.while_loop(loop, lambda i, *_: i < end, step, label="points in reach")
+        return out[1], out[2]
+
+
+def _grid(p: np.ndarray, h: float) -> tuple[float, np.ndarray, np.ndarray, mi.UInt32, mi.UInt32]:
+    """h, corner, cells, and the lists of points by cell; h grows where the grid would be too fine for its memory."""
+    while True:
+        low = p.min(axis=0) - 1.01 * h
+        cells = np.maximum(np.ceil((p.max(axis=0) + 1.01 * h - low) / h).astype(int), 1)
+        if cells.prod() <= MOST_CELLS:
+            break
+        h *= 1.26
+    own = np.floor((p - low) / h).astype(int)
+    place, point = [], []
+    for dz in (-1, 0, 1):
+        for dy in (-1, 0, 1):
+            for dx in (-1, 0, 1):
+                cell = own + (dx, dy, dz)
+                near = low + (cell + np.clip((p - low) / h - cell, 0, 1)) * h  # of the cell, to the point
+                kept = ((cell >= 0) & (cell < cells)).all(axis=1) & (((near - p) ** 2).sum(axis=1) < h * h)
+                place.append((cell[kept, 2] * cells[1] + cell[kept, 1]) * cells[0] + cell[kept, 0])
+                point.append(np.flatnonzero(kept))
+    place, point = np.concatenate(place), np.concatenate(point)
+    order = np.argsort(place, kind="stable")
+    first = np.searchsorted(place[order], np.arange(cells.prod() + 1))
+    return h, low, cells, mi.UInt32(first.astype(np.uint32)), mi.UInt32(point[order].astype(np.uint32))

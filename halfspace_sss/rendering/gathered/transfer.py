@@ -1,0 +1,184 @@
+"""What light that is gathered at points of an object is worth where it leaves: the rows of a transfer matrix.
+
+Directions are taken apart: with the directional albedo a(mu) of the model,
+
+    S(x_i, w_i; x_o, w_o) ~ a(w_o) q(x_i, x_o) a(w_i),    L_o(x_o, w_o) = a(w_o) B(x_o),    B_j = Σ_s t_js L_k(j,s),
+
+L_k the mean of the incident radiance at point k, weighted by a(mu_i) mu_i. Of each point j the entries s are drawn by
+the proposals of the model, with directions at both ends, so that under the same light from everywhere the sum is an
+unbiased estimate of what the model gives. Where the model knows its directional albedo there (`alpha`), the row is
+normalised by that.
+
+a(mu) = F_t(mu) (c_0 + c_1 mu + c_2 mu²) per channel is fitted to all samples.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from halfspace_sss.physics.fresnel import F_t
+from halfspace_sss.rendering.gathered.points import SurfacePoints
+from halfspace_sss.rendering.transport.plane import Exit, number
+
+if TYPE_CHECKING:
+    from halfspace_sss.rendering.transport.body import Body
+
+__all__ = ["Albedo", "Incident", "Transfer", "transfer"]
+
+PER_LENGTH = 2.0  # points over a transport mean free path
+FEWEST, MOST = 1024, 8192  # points
+SAMPLES = 2**21  # entries of all points
+R_2 = 0.7548776662466927, 0.5698402909980532
+
+
+@dataclass(frozen=True)
+class Albedo:
+    """a(mu) = F_t(mu) (c_0 + c_1 mu + c_2 mu²), c per channel, shape (channels, 3)."""
+
+    c: np.ndarray
+    eta: float
+
+    def __call__(self, mu: mi.Float) -> mi.Spectrum:
+        F = F_t(mu, number(self.eta))
+        rows = [[number(v) for v in row] for row in self.c]
+        return mi.Spectrum([F * dr.maximum(a + mu * (b + mu * c), 0) for a, b, c in rows])
+
+
+@dataclass(frozen=True, eq=False)
+class Incident:
+    """Radiance at points, linear in its direction: L_i(w) = mean + slope.(w - middle), as weighted by a(mu) mu.
+
+    Args:
+        mean: (points, channels).
+        slope: (points, channels, 3).
+        middle: (points, 3).
+    """
+
+    mean: np.ndarray
+    slope: np.ndarray
+    middle: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Transfer:
+    """Of one object.
+
+    Args:
+        points: where light is gathered and where it leaves.
+        entry: (points, samples) numbers of the points that entries are at.
+        t: (points, samples, channels).
+        w_i: (points, samples, 3) directions of entries.
+        d_o: (points, samples, 3) directions of exits less their `middle`, (points, 3), both weighted by a.
+        inverse: (points, 3, 3) of the covariance of d_o.
+        albedo: a.
+        error: standard error of the sums of rows over their mean, worst channel, root mean square.
+    """
+
+    points: SurfacePoints
+    entry: np.ndarray
+    t: np.ndarray
+    w_i: np.ndarray
+    d_o: np.ndarray
+    middle: np.ndarray
+    inverse: np.ndarray
+    albedo: Albedo
+    error: float
+
+    def __matmul__(self, L: Incident) -> np.ndarray:
+        """B for incident radiance, linear in w_o: constant and slope, (points, channels, 4)."""
+        away = self.w_i - L.middle[self.entry]
+        arriving = L.mean[self.entry]
+        for axis in range(3):
+            arriving += L.slope[self.entry, :, axis] * away[:, :, axis, None]
+        B = np.einsum("jsc,jsc->jc", self.t, arriving)
+        even = self.t.sum(axis=1)
+        left = self.t * (arriving - (B / np.maximum(even, 1e-30))[:, None])  # 0 in even light, where a(w_o) is all
+        slope = np.stack([np.einsum("jsc,js->jc", left, self.d_o[:, :, axis]) for axis in range(3)], axis=2)
+        slope = self.points.smoothed(np.einsum("jci,jik->jck", slope, self.inverse))
+        return np.concatenate([(B - np.einsum("jck,jk->jc", slope, self.middle))[:, :, None], slope], axis=2)
+
+
+def count_of(body: Body) -> int:
+    """How many points an object gets: so many that their distance is half a transport mean free path."""
+    sigma = np.mean([float(m.sigma_t_prime) for m in body.media])
+    return int(np.clip(body.found.area * (PER_LENGTH * sigma) ** 2, FEWEST, MOST))
+
+
+def transfer(body: Body, count: int | None = None, samples: int = SAMPLES) -> Transfer:
+    """The transfer of an object, by its model and the proposals of that."""
+    points = SurfacePoints.of(body.found, count or count_of(body))
+    n = max(samples // len(points), 16)
+    k = dr.arange(mi.UInt32, len(points) * n)
+    j, s = k // n, k % n
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(7, dr.width(k))
+    shift, active = sampler.next_2d(), mi.Bool(True)
+    jitter = dr.gather(mi.Point2f, shift, j * n)
+    u = [dr.fma(mi.Float(s), r, x) for r, x in zip(R_2, (jitter.x, jitter.y))]
+    out, face = points.exit(j, mi.Point2f(*(x - dr.floor(x) for x in u)))
+    S, entry, w_i = _sample(body, out, face, sampler, active)
+    near, known = points.nearest(entry.p, entry.n_face, entry.weight > 0)
+    mu = dr.dot(out.w, out.n)
+    trusted = _trusted(body)
+    dr.eval(S, near, known, mu, w_i)
+    shape = (len(points), n)
+    S = np.array(S, dtype=np.float32).reshape(-1, *shape).transpose(1, 2, 0)
+    S = np.nan_to_num(S, nan=0.0, posinf=0.0, neginf=0.0)
+    albedo = _fitted(body, np.array(mu), S.reshape(-1, S.shape[2]))
+    a = np.array(albedo(mu)).T.reshape(S.shape)
+    t, error = _rows(points, S, trusted, a)
+    near = np.where(np.array(known), np.array(near), np.array(j)).reshape(shape)
+    w_i, w_o = (np.array(w, dtype=np.float32).T.reshape(*shape, 3) for w in (w_i, out.w))
+    return Transfer(points, near, t, w_i, *_centred(w_o, a.mean(axis=2)), albedo, error)
+
+
+def _centred(w: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Directions less their mean by the weights a, the mean, and the inverse of their covariance."""
+    a = a / a.sum(axis=1, keepdims=True)
+    middle = np.einsum("js,jsi->ji", a, w)
+    d = w - middle[:, None]
+    return d, middle, np.linalg.inv(np.einsum("js,jsi,jsk->jik", a, d, d) + 1e-3 * np.eye(3))
+
+
+def _sample(body: Body, out: Exit, face: mi.UInt32, sampler: mi.Sampler, active: mi.Bool) -> tuple:
+    """S mu_i over the density of an entry and its direction, and both."""
+    prepared = body.transport.prepare(out, active)
+    where = body.proposals.prepare(out, prepared, active)
+    entry = body.proposals.sample(out, face, where, sampler, active)
+    active = active & (entry.weight > 0)
+    w_i, pdf = body.proposals.sample_direction(entry, out, sampler.next_2d())
+    S = body.transport.S_mu(prepared, entry, w_i, active & (pdf > 0)) * (entry.weight / dr.maximum(pdf, 1e-8))
+    return mi.Spectrum(dr.select(active & (pdf > 0), S, 0)), entry, mi.Vector3f(w_i)
+
+
+def _trusted(body: Body) -> np.ndarray:
+    """The channels in which the model knows its directional albedo at every exit."""
+    if not hasattr(body.transport, "alpha"):
+        return np.zeros(dr.size_v(mi.Spectrum), dtype=bool)
+    return np.ravel(np.array(body.transport.evened[1])) > 0
+
+
+def _fitted(body: Body, mu: np.ndarray, S: np.ndarray) -> Albedo:
+    """a(mu), by least squares over all samples."""
+    eta = float(body.media[0].eta)
+    basis = F_t(mu.astype(float), eta)[:, None] * mu[:, None] ** np.arange(3)
+    normal = basis.T @ basis + 1e-9 * len(mu) * np.eye(3)
+    return Albedo(np.linalg.solve(normal, basis.T @ S.astype(float)).T, eta)
+
+
+def _rows(points: SurfacePoints, S: np.ndarray, trusted: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, float]:
+    """t of all rows: S over a at the exit, both summed over the directions of a row; and the error of the sums.
+
+    A row has the sum 1 where alpha is the directional albedo, and that of its neighbours elsewhere.
+    """
+    n = S.shape[1]
+    sums = S.sum(axis=1, keepdims=True)
+    even = points.smoothed(points.smoothed(sums / np.maximum(a.sum(axis=1, keepdims=True), 1e-30)))
+    t = S * (np.where(trusted, 1, even) / np.maximum(sums, 1e-30))
+    deviation = (S - sums / n).std(axis=1) / np.sqrt(n) / np.maximum(sums[:, 0].mean(axis=0) / n, 1e-30)
+    return t.astype(np.float32), float(np.sqrt((deviation**2).mean(axis=0)).max())

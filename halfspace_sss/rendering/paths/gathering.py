@@ -1,0 +1,236 @@
+"""Light that arrives at the points of an object, gathered once, and what leaves by it.
+
+At each point the mean of the incident radiance, weighted by a(mu) mu, is estimated per channel by emitter sampling and
+by directions of the cosine (balance heuristic); what other surfaces send is traced along the latter, by the path loop.
+B = T L follows, see `gathered.transfer`, and at an exit L_o(x_o, w_o) = a(w_o) B(x_o), blended between points. Jensen
+and Buhler (2002) take two passes so with a dipole; here the second is a sparse matrix that outlives the light.
+
+What is not known: light of directions apart from its a(mu)-weighted mean, so that a model's dependence on the azimuth
+between light and view is lost; detail of light below the distance of the points. Its noise is that of the gathering.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from halfspace_sss.rendering.gathered.transfer import Incident, Transfer, transfer
+from halfspace_sss.rendering.paths.lighting import balance
+from halfspace_sss.rendering.paths.path_loop import trace_paths
+from halfspace_sss.rendering.surface.horizon import cosine_above
+from halfspace_sss.rendering.transport.plane import place
+
+if TYPE_CHECKING:
+    from halfspace_sss.rendering.transport.body import Body
+    from halfspace_sss.rendering.transport.plane import Exit
+    from halfspace_sss.rendering.transport.settings import Settings
+
+__all__ = ["Gathered", "Gathering"]
+
+DIRECTIONS = 2**20  # of all points of an object, by emitters, and as many by the cosine
+FEWEST, MOST = 64, 1024  # of a point
+TRACED = 8  # one of so many directions by the cosine is traced further, where it meets a surface
+
+
+@dataclass(frozen=True, eq=False)
+class Gathered:
+    """Radiance of orders from two on that leaves an object in the light of a scene.
+
+    Args:
+        body: the object.
+        transfer: of its model.
+        values: B of all points, for each channel the constant and the slope over w_o.
+        error: standard error of B by the gathering of light, over its mean.
+    """
+
+    body: Body
+    transfer: Transfer
+    values: mi.Float
+    error: float
+
+    def radiance(self, out: Exit, active: mi.Bool) -> mi.Spectrum:
+        """L_o of an exit; 0 below the horizon."""
+        size = dr.size_v(mi.Spectrum)
+        B = self.transfer.points.blend(self.values, 4 * size, out.p, out.n_face, active)
+        rows = [B[4 * c : 4 * c + 4] for c in range(size)]
+        B = mi.Spectrum([b + x * out.w.x + y * out.w.y + z * out.w.z for b, x, y, z in rows])
+        mu = dr.dot(out.w, out.n)
+        a = self.transfer.albedo(dr.maximum(mu, 0))
+        known = getattr(self.body.transport, "alpha", None)
+        if known is not None:
+            trusted = self.body.transport.evened[1]
+            a = trusted * known(out, active)[1] + (1 - trusted) * a
+        return dr.select(active & (mu > 0), a * dr.maximum(B, 0), 0)
+
+
+class Gathering:
+    """Gathered light of the objects of a scene, kept until something in the scene changes."""
+
+    def __init__(self) -> None:
+        self._bodies: list[Body] = []
+        self._transfers: list[Transfer] = []
+        self._light: tuple[list, list] = ([], [])
+        self._found: list[Body] = []
+
+    def of(self, scene: mi.Scene, bodies: list[Body], settings: Settings) -> list[Body]:
+        """The objects, each with what leaves it in place of its transport.
+
+        Raises:
+            ValueError: an object is open or has no known area, or light that arrives is not finite.
+        """
+        if len(bodies) != len(self._bodies) or any(a is not b for a, b in zip(bodies, self._bodies)):
+            spread = [_spreads(body) for body in bodies]
+            for body, spreads in zip(bodies, spread):
+                if spreads:
+                    _check(body)
+            self._transfers = [transfer(body) if spreads else None for body, spreads in zip(bodies, spread)]
+            self._bodies, self._light = bodies, ([], [])
+        state = _state(scene)
+        if state[0] != self._light[0] or not self._found:
+            gathered = [
+                body if T is None else _leaving(scene, bodies, k, T, settings)
+                for k, (body, T) in enumerate(zip(bodies, self._transfers))
+            ]
+            self._found = [
+                g if isinstance(g, type(body)) else replace(body, transport=None, proposals=None, gathered=g)
+                for g, body in zip(gathered, bodies)
+            ]
+            self._light = state
+        return self._found
+
+    def told(self) -> list[str]:
+        """Of each object: points, and the noise of transfer and light."""
+        found = [body.gathered for body in self._found if body.gathered is not None]
+        return [
+            f"light of {g.body.found.name} gathered at {len(g.transfer.points)} points: noise of the transfer "
+            f"{g.transfer.error:.1%} a point, of the light {g.error:.1%}"
+            for g in found
+        ]
+
+
+def _spreads(body: Body) -> bool:
+    """Whether light leaves elsewhere than it entered, by orders that a transport has."""
+    return body.transport is not None and not getattr(body.transport, "is_delta", False)
+
+
+def _check(body: Body) -> None:
+    found = body.found
+    if not found.closed or not found.area > 0:
+        lacks = "is not closed" if not found.closed else f"is a {found.shape.class_name()} without known area"
+        raise ValueError(f"light must be sampled for object {found.name}, which {lacks}, got gathered")
+    if body.surface.inside.varying is not None:
+        raise ValueError(f"light must be sampled for object {found.name}, whose medium varies, got gathered")
+
+
+def _state(scene: mi.Scene) -> tuple[list, list]:
+    """What tells whether anything that sends, blocks or scatters light has changed; what is kept for its numbers."""
+    keys, kept = [], []
+    for node in (*scene.emitters(), *scene.shapes()):
+        keys.append(id(node))
+        kept.append(node)
+        parameters = mi.traverse(node)
+        for key in parameters.keys():
+            value = parameters[key]
+            index = getattr(value, "index", None)
+            keys.append((key, index if isinstance(index, int) and index else repr(value)))
+            kept.append(value)
+    return keys, kept
+
+
+def _leaving(scene: mi.Scene, bodies: list[Body], k: int, T: Transfer, settings: Settings) -> Gathered:
+    """B of object k, in two halves whose difference tells the noise."""
+    halves = [T @ _incident(scene, bodies, T, settings, seed) for seed in (2 * k, 2 * k + 1)]
+    B = (halves[0] + halves[1]) / 2
+    if not np.isfinite(B).all():
+        raise ValueError(f"light at object {bodies[k].found.name} must be finite, got NaN or infinity")
+    error = np.sqrt(((halves[0] - halves[1])[..., 0] ** 2).mean()) / 2 / max(float(B[..., 0].mean()), 1e-30)
+    return Gathered(bodies[k], T, mi.Float(B.astype(np.float32).ravel()), float(error))
+
+
+def _incident(scene: mi.Scene, bodies: list[Body], T: Transfer, settings: Settings, seed: int) -> Incident:
+    """Incident radiance at all points."""
+    count = len(T.points)
+    n = int(np.clip(DIRECTIONS // (2 * count), FEWEST, MOST))
+    lane = dr.arange(mi.UInt32, count * n)
+    j, s = lane // n, lane % n
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(100 + seed, dr.width(lane))
+    at = _Point(*(dr.gather(type(v), v, j) for v in (T.points.p, T.points.n, T.points.n_out)))
+    u, v = (_stratified(sampler, j, s, n) for _ in range(2))
+    aimed, w_e = _by_emitters(scene, T, at, u)
+    met, more, a, w_c = _by_cosine(scene, bodies, T, settings, at, v, s % TRACED == 0, sampler)
+    arriving = met + TRACED * more
+    weight = dr.mean(a) + dr.zeros(mi.Float, count * n)
+    dr.eval(aimed, arriving, a, weight, w_e, w_c)
+
+    def total(value: Any) -> np.ndarray:
+        """Sums over the directions of each point, (points, components)."""
+        return np.stack([np.array(dr.block_sum(part + dr.zeros(mi.Float, count * n), n)) for part in value], axis=1)
+
+    norm, whole = total(a), total([weight])
+    middle = total(weight * w_c) / np.maximum(whole, 1e-30)
+    mean = total(aimed + arriving) / np.maximum(norm, 1e-30)
+    centre = dr.gather(mi.Vector3f, mi.Vector3f(*(mi.Float(c) for c in middle.T.astype(np.float32))), j)
+    d_e, d_c = w_e - centre, w_c - centre
+    pairs = [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]
+    second = total([weight * d_c[i] * d_c[k] for i, k in pairs]) / np.maximum(whole, 1e-30)
+    C = np.empty((count, 3, 3))
+    for column, (i, k) in zip(second.T, pairs):
+        C[:, i, k] = C[:, k, i] = column
+    first = np.stack([total(aimed * d_e[i] + arriving * d_c[i]) for i in range(3)], axis=2)
+    slope = np.einsum("jci,jik->jck", first, np.linalg.inv(C + 1e-3 * np.eye(3)))
+    slope = slope / np.maximum(norm, 1e-30)[:, :, None]
+    return Incident(*(part.astype(np.float32) for part in (mean, slope, middle)))
+
+
+class _Point(NamedTuple):
+    """Position, outward geometric and shading normal."""
+
+    p: mi.Point3f
+    n: mi.Normal3f
+    n_out: mi.Normal3f
+
+
+def _stratified(sampler: mi.Sampler, j: mi.UInt32, s: mi.UInt32, n: int) -> mi.Point2f:
+    """Pairs of uniforms for n directions of each point, a lattice shifted for each point."""
+    shift = dr.gather(mi.Point2f, sampler.next_2d(), j * n)
+    x = mi.Point2f((mi.Float(s) + shift.x) / n, dr.fma(mi.Float(s), 0.6180339887498949, shift.y))
+    return x - dr.floor(x)
+
+
+def _weight(T: Transfer, at: _Point, w: mi.Vector3f) -> tuple[mi.Spectrum, mi.Float]:
+    """a(mu) mu over the density of the cosine, and that density."""
+    mu = dr.select(dr.dot(w, at.n) > 0, dr.abs(dr.dot(w, at.n_out)), 0)
+    return T.albedo(mu) * dr.pi, mu * dr.inv_pi
+
+
+def _by_emitters(scene: mi.Scene, T: Transfer, at: _Point, u: mi.Point2f) -> tuple[mi.Spectrum, mi.Vector3f]:
+    """Light of sampled emitters, and its direction."""
+    ds, light = scene.sample_emitter_direction(place(at.p, at.n), u, True)
+    a, pdf = _weight(T, at, ds.d)
+    share = dr.select(ds.delta, 1, balance(ds.pdf, pdf))
+    return dr.select((ds.pdf > 0) & (pdf > 0), a * pdf * light * share, 0), ds.d
+
+
+def _by_cosine(
+    scene: mi.Scene, bodies: list[Body], T: Transfer, settings: Settings, at: _Point, u: mi.Point2f, traced: mi.Bool,
+    sampler: mi.Sampler,
+) -> tuple[mi.Spectrum, mi.Spectrum, mi.Spectrum, mi.Vector3f]:  # fmt: skip
+    """By directions of the cosine: light of emitters that they meet, what other surfaces send along some, a, and w."""
+    w, _ = cosine_above(at.n_out, at.n, u)
+    a, pdf = _weight(T, at, w)
+    here = place(at.p, at.n)
+    ray = here.spawn_ray(w)
+    si = scene.ray_intersect(ray, mi.RayFlags.All, True)
+    emitter = si.emitter(scene)
+    shines = emitter != None  # noqa: E711
+    density = scene.pdf_emitter_direction(here, mi.DirectionSample3f(scene, si, here), shines)
+    met = dr.select(shines, balance(pdf, density) * emitter.eval(si, shines), 0)
+    hidden = replace(settings, hide_emitters=True, light="sampled")
+    on = si.is_valid() & traced
+    parts, _ = trace_paths(scene, bodies, hidden, sampler, ray, on)
+    return a * met, dr.select(on, a * (parts[0] + parts[1]), 0), a, w

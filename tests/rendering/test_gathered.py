@@ -1,0 +1,145 @@
+"""Light gathered once: means, bias and noise against the same models sampled, what makes it gather anew, refusals."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+from halfspace_sss import rendering
+
+mi = pytest.importorskip("mitsuba")
+
+MODELS = ("better_dipole", "neural")
+MEDIUM = {"sigma_s": "1,1.5,2", "sigma_a": ".02,.1,.3", "g": 0.3, "eta": 1.4}
+
+
+@pytest.fixture(autouse=True)
+def variant() -> None:
+    mi.set_variant("llvm_ad_rgb")
+    rendering.register()
+
+
+def _lights(name: str) -> dict:
+    lamp = {"type": "sphere", "center": [1.5, 3, 2.5], "radius": 0.5, "emitter": {"type": "area", "radiance": 20.0}}
+    point = {"type": "point", "position": [1.5, 3, 2.5], "intensity": 20.0}
+    floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, -1.05, 0]).rotate([1, 0, 0], -90)}
+    sky = {"type": "constant", "radiance": 0.5}
+    return {
+        "sky": {"sky": sky},
+        "lamp": {"lamp": lamp},
+        "point": {"lamp": point},
+        "floor": {"floor": floor, "sky": sky},
+    }[name]
+
+
+def _scene(
+    light: str, model: str = "better_dipole", lights: dict | None = None, shape: dict | None = None, **more: Any
+):
+    film = {"type": "hdrfilm", "width": 12, "height": 12, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
+    view = mi.ScalarTransform4f().look_at([0, 0, 8], [0, 0, 0], [0, 1, 0])
+    surface = {"type": "translucent", **MEDIUM, "model": model, "orders": "multiple", "reflection": False, **more}
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "bssrdf", "mm_per_unit": 6.0, "hide_emitters": True, "light": light},
+            "sensor": {"type": "perspective", "fov": 11.0, "to_world": view, "film": film},
+            "wax": {**(shape or {"type": "sphere"}), "bsdf": surface},
+            **(lights or {}),
+        }
+    )
+
+
+def _image(scene: Any, spp: int = 64, seed: int = 0) -> np.ndarray:
+    return np.array(mi.render(scene, spp=spp, seed=seed), dtype=float)
+
+
+@cache
+def _pictures(model: str, light: str) -> tuple[np.ndarray, ...]:
+    """Two independent images sampled, two gathered."""
+    sampled, gathered = (_scene(kind, model, _lights(light)) for kind in ("sampled", "gathered"))
+    return tuple(_image(scene, spp, seed) for scene, spp in ((sampled, 2**11), (gathered, 64)) for seed in (1, 2))
+
+
+@pytest.mark.parametrize("light", ["sky", "lamp", "point", "floor"])
+@pytest.mark.parametrize("model", MODELS)
+def test_it_is_as_bright_as_the_model_sampled_within_3_percent(model: str, light: str) -> None:
+    a, b, one, two = (image.mean(axis=(0, 1)) for image in _pictures(model, light))
+    noise = np.abs(a - b) / 2
+    assert (np.abs((one + two) / (a + b) - 1) < 0.03 + 4 * noise / (a + b)).all()
+
+
+@pytest.mark.parametrize("light", ["sky", "lamp", "point"])
+@pytest.mark.parametrize("model", MODELS)
+def test_its_pixels_differ_from_the_model_sampled_by_8_percent_at_most(model: str, light: str) -> None:
+    a, b, one, two = _pictures(model, light)
+    square = ((one - a) * (two - b)).mean(axis=(0, 1))  # noise of the two is independent
+    assert (np.sqrt(np.maximum(square, 0)) / a.mean(axis=(0, 1)) < 0.08).all()
+
+
+def test_a_sample_has_a_fiftieth_of_the_variance_at_most() -> None:
+    a, b, one, two = _pictures("better_dipole", "lamp")
+    inner = np.s_[3:9, 3:9]
+    sampled, gathered = ((x[inner] - y[inner]) ** 2 * spp for x, y, spp in ((a, b, 2**11), (one, two, 64)))
+    assert np.median(gathered / np.median(sampled)) < 1 / 50
+
+
+def test_the_same_seed_gives_the_same_image() -> None:
+    images = [_image(_scene("gathered", lights=_lights("lamp")), 16, 3) for _ in range(2)]
+    assert (images[0] == images[1]).all()
+
+
+def test_light_is_gathered_anew_when_an_emitter_was_edited() -> None:
+    edited = _scene("gathered", lights=_lights("lamp"))
+    before = _image(edited, 16)
+    parameters = mi.traverse(edited)
+    parameters["lamp.emitter.radiance.value"] = mi.Color3f(5.0)
+    parameters.update()
+    after = _image(edited, 16)
+    assert np.allclose(after, before / 4, rtol=1e-4)
+    assert "gathered at" in edited.integrator().gathered[0]
+
+
+def test_transfer_is_made_anew_when_the_medium_was_edited() -> None:
+    edited = _scene("gathered", lights=_lights("sky"))
+    _image(edited, 4)
+    parameters = mi.traverse(edited)
+    key = next(k for k in parameters.keys() if k.endswith("sigma_t"))
+    parameters[key] = type(parameters[key])(np.array(parameters[key]) * 2)
+    parameters.update()
+    fresh = _scene("gathered", lights=_lights("sky"), sigma_s="2,3,4", sigma_a=".04,.2,.6")
+    assert np.allclose(_image(edited, 16), _image(fresh, 16), rtol=1e-3)
+
+
+def _refused(message: str, scene: Any) -> None:
+    with pytest.raises((ValueError, RuntimeError), match=message):
+        mi.render(scene, spp=1)
+
+
+def test_an_open_object_is_refused_by_name() -> None:
+    with pytest.warns(UserWarning, match="not closed"):
+        _refused("'wax', which is not closed, got gathered", _scene("gathered", shape={"type": "rectangle"}))
+
+
+def test_light_that_is_not_finite_is_refused_by_name() -> None:
+    bitmap = mi.Bitmap(np.full((8, 16, 3), np.nan, dtype=np.float32))
+    _refused(
+        "light at object 'wax' must be finite", _scene("gathered", lights={"sky": {"type": "envmap", "bitmap": bitmap}})
+    )
+
+
+def test_derivatives_are_refused() -> None:
+    import drjit as dr
+
+    scene = _scene("gathered", lights=_lights("lamp"))
+    parameters = mi.traverse(scene)
+    dr.enable_grad(parameters["lamp.emitter.radiance.value"])
+    with pytest.raises((ValueError, RuntimeError), match="light must be sampled for derivatives|custom"):
+        dr.backward(dr.mean(mi.render(scene, parameters, spp=1)))
+
+
+def test_a_typing_mistake_is_named() -> None:
+    with pytest.raises((ValueError, RuntimeError), match="light must be one of sampled, gathered, got 'gatherd'"):
+        _scene("gatherd")
