@@ -19,7 +19,7 @@ import mitsuba as mi
 import numpy as np
 
 from halfspace_sss.rendering.gathered.transfer import Incident, Transfer, transfer
-from halfspace_sss.rendering.paths.lighting import balance
+from halfspace_sss.rendering.paths.lighting import mis_weight
 from halfspace_sss.rendering.paths.path_loop import trace_paths
 from halfspace_sss.rendering.surface.horizon import cosine_above
 from halfspace_sss.rendering.transport.plane import place
@@ -212,7 +212,7 @@ def _by_emitters(scene: mi.Scene, T: Transfer, at: _Point, u: mi.Point2f) -> tup
     """Light of sampled emitters, and its direction."""
     ds, light = scene.sample_emitter_direction(place(at.p, at.n), u, True)
     a, pdf = _weight(T, at, ds.d)
-    share = dr.select(ds.delta, 1, balance(ds.pdf, pdf))
+    share = dr.select(ds.delta, 1, mis_weight(ds.pdf, pdf))
     return dr.select((ds.pdf > 0) & (pdf > 0), a * pdf * light * share, 0), ds.d
 
 
@@ -229,7 +229,7 @@ def _by_cosine(
     emitter = si.emitter(scene)
     shines = emitter != None  # noqa: E711
     density = scene.pdf_emitter_direction(here, mi.DirectionSample3f(scene, si, here), shines)
-    met = dr.select(shines, balance(pdf, density) * emitter.eval(si, shines), 0)
+    met = dr.select(shines, mis_weight(pdf, density) * emitter.eval(si, shines), 0)
     hidden = replace(settings, hide_emitters=True, light="sampled")
     on = si.is_valid() & traced
     parts, _ = trace_paths(scene, bodies, hidden, sampler, ray, on)

@@ -1,230 +1,184 @@
-"""What kinds of emitters a scene has, and so how directions of incidence are sampled."""
+"""What every path needs to know of a scene: its emitters, the mean radiance of its sky, and its translucent objects."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from halfspace_sss.rendering.light.small_emitters import WIDE, SmallEmitters, is_delta
+from halfspace_sss.rendering.paths.path_tally import Primal, Replay
 from halfspace_sss.rendering.surface.derivatives import detached
 from halfspace_sss.rendering.transport.body import Body
 from halfspace_sss.rendering.transport.settings import AUTOMATIC, Settings
 
-__all__ = ["Books", "Lights", "Replay", "Sky", "Tally", "World", "balance", "delta_light", "sampled_light", "sky_of"]
+__all__ = ["Lights", "RenderContext", "Sky", "delta_light", "mis_weight", "sample_emitter"]
+
+NEE_SHARE = 0.5
+SKY_DIRECTIONS = 128  # squared
+MOST_LEFT = 0.5  # of the mean square of the radiance of the sky, once its mean is taken away
 
 
-EMITTER_SHARE = 0.5
+def mis_weight(pdf: mi.Float, other: mi.Float) -> mi.Float:
+    """MIS weight of a sample of density `pdf` against a strategy of density `other`, by the balance heuristic."""
+    total = pdf + other
+    return dr.select(total > 0, pdf / dr.maximum(total, 1e-30), 0)
 
 
 @dataclass(frozen=True)
 class Lights:
-    """Kinds of emitters.
+    """Kinds of emitters of a scene.
 
     Args:
-        share: share of the directions into an object that are sampled by emitters; 0 where all light is the same from
-            everywhere, which the model's own directions find better.
+        nee_share: share of the directions at points of entry that next-event estimation draws; 0 for a constant
+            environment alone, which the directions of the proposals find better.
         some_local: whether there is an emitter beside the environment.
         some_shaped: whether there is one with a shape, which rays can hit.
         some_delta: whether there is one that no ray can hit (point, spot, directional).
     """
 
-    share: float
+    nee_share: float
     some_local: bool
     some_shaped: bool
     some_delta: bool
 
     @classmethod
-    def of(cls, scene: Any) -> Lights:
-        """The lights of a scene."""
+    def of(cls, scene: mi.Scene) -> Lights:
+        """The kinds of emitters of a scene."""
         emitters = scene.emitters()
         even = all("Constant" in emitter.class_name() for emitter in emitters)
         delta = any(map(is_delta, emitters))
         local = any(not emitter.is_environment() for emitter in emitters)
         shaped = any(emitter.get_shape() is not None for emitter in emitters)
-        return cls(0.0 if even else EMITTER_SHARE, local, shaped, delta)
-
-
-def balance(pdf: Any, other: Any) -> Any:
-    """The balance heuristic."""
-    total = pdf + other
-    return dr.select(total > 0, pdf / dr.maximum(total, 1e-30), 0)
-
-
-# ---- Mean radiance of the sky as a control variate -----------------------------------------------------------------
-
-DIRECTIONS = 128  # squared
-MOST_LEFT = 0.5  # of the mean square of the radiance, once c is taken from it
+        return cls(0.0 if even else NEE_SHARE, local, shaped, delta)
 
 
 class Sky(NamedTuple):
-    """The environment of a scene, and its mean radiance c, a spectrum."""
+    """The environment of a scene with its mean radiance c, a control variate for transports of known albedo.
 
-    emitter: Any
-    mean: Any
+    With the directional albedo alpha = ∫ S mu_i dw_i dA_i of a point of an object
 
-    def density(self, scene: Any, at: Any, d: Any, active: Any) -> Any:
-        """Of a direction, when emitters are sampled, 1/sr."""
+        L_o = alpha c + ∫ S mu_i (L_i - c) dw_i dA_i,
+
+    so that nothing is left to be random where L_i = c. c is the mean over directions with the inverse of the sampling
+    density as weight: bright directions, which are sampled often, have little noise of their own.
+    """
+
+    emitter: mi.Emitter
+    mean: mi.Spectrum  # c
+
+    @classmethod
+    def of(cls, scene: mi.Scene, lights: Lights, objects: list[Body]) -> Sky | None:
+        """The sky of a scene; None without one, without an object that has `alpha`, or where c is of little use.
+
+        c is left out where it is not most of the light in the square, as under a sun: it costs time there and takes
+        no noise away.
+        """
+        emitter = scene.environment()
+        if emitter is None or not any(hasattr(obj.transport, "alpha") for obj in objects):
+            return None
+        with detached():
+            k = dr.arange(mi.UInt32, SKY_DIRECTIONS**2)
+            u = mi.Point2f(k % SKY_DIRECTIONS + 0.5, k // SKY_DIRECTIONS + 0.5) / SKY_DIRECTIONS
+            si = dr.zeros(mi.SurfaceInteraction3f, SKY_DIRECTIONS**2)
+            si.wi = -mi.warp.square_to_uniform_sphere(u)
+            pdf = (1 - lights.nee_share) * mi.warp.square_to_uniform_sphere_pdf(si.wi)
+            if lights.nee_share > 0:
+                pdf += lights.nee_share * scene.pdf_emitter_direction(si, _towards(emitter, -si.wi))
+            L, weight = np.array(mi.Spectrum(emitter.eval(si)) + 0 * pdf), 1 / np.array(pdf)
+            c = np.average(L, axis=1, weights=weight)
+            left = np.average((L - c[:, None]) ** 2, axis=1, weights=weight).sum()
+            if left > MOST_LEFT * np.average(L**2, axis=1, weights=weight).sum():
+                return None
+            return cls(emitter, dr.opaque(mi.Spectrum, c.tolist()))
+
+    def pdf(self, scene: mi.Scene, at: mi.Interaction3f, d: mi.Vector3f, active: mi.Bool) -> mi.Float:
+        """Density of next-event estimation for a direction of the sky, 1/sr."""
         return scene.pdf_emitter_direction(at, _towards(self.emitter, d), active)
 
 
-def sky_of(scene: Any, lights: Lights, bodies: list[Body]) -> Sky | None:
-    """The sky of a scene; None where there is none, it is uneven, or no body knows what it is under even light."""
-    emitter = scene.environment()
-    if emitter is None or not any(hasattr(body.transport, "alpha") for body in bodies):
-        return None
-    with detached():
-        k = dr.arange(mi.UInt32, DIRECTIONS**2)
-        u = mi.Point2f(k % DIRECTIONS + 0.5, k // DIRECTIONS + 0.5) / DIRECTIONS
-        si = dr.zeros(mi.SurfaceInteraction3f, DIRECTIONS**2)
-        si.wi = -mi.warp.square_to_uniform_sphere(u)
-        density = (1 - lights.share) * mi.warp.square_to_uniform_sphere_pdf(si.wi)
-        if lights.share > 0:
-            density += lights.share * scene.pdf_emitter_direction(si, _towards(emitter, -si.wi))
-        L, weight = np.array(mi.Spectrum(emitter.eval(si)) + 0 * density), 1 / np.array(density)
-        c = np.average(L, axis=1, weights=weight)
-        left = np.average((L - c[:, None]) ** 2, axis=1, weights=weight).sum()
-        if left > MOST_LEFT * np.average(L**2, axis=1, weights=weight).sum():
-            return None
-        return Sky(emitter, dr.opaque(mi.Spectrum, c.tolist()))
-
-
-def _towards(emitter: Any, d: Any) -> Any:
+def _towards(emitter: mi.Emitter, d: mi.Vector3f) -> mi.DirectionSample3f:
     """A direction of the environment."""
     ds = dr.zeros(mi.DirectionSample3f)
     ds.d, ds.emitter = d, mi.EmitterPtr(emitter)
     return ds
 
 
-# ---- Path tally, and its replay for derivatives --------------------------------------------------------------------
-
-Books = tuple[Any, Any]  # radiance so far, or in a replay still to come; its derivative, or adjoint; spectra
-
-
-@dataclass(frozen=True)
-class Tally:
-    """Adds up the light of a path."""
-
-    tracks = False
-
-    def add(self, books: Books, light: Any) -> Books:
-        """Light that the path brings."""
-        return books[0] + light, books[1]
-
-    def settle(self, books: Books, light: Any, weight: Any, goes_on: Any, shown: Any) -> Books:
-        """A vertex: its light, and the weight of what comes after it where the path goes on.
-
-        Args:
-            light: spectrum, to be added.
-            weight: spectrum that scales all light after the vertex.
-            goes_on: where it does.
-            shown: light that the weight scales too, over the weight, and that is in the books already.
-        """
-        return self.add(books, light)
-
-
-@dataclass(frozen=True)
-class Replay:
-    """Takes the light of a path away again, and differentiates it.
-
-    Args:
-        backward: whether derivatives of light are handed to the parameters, or those of the parameters to the light.
-    """
-
-    backward: bool
-    tracks = True
-
-    def add(self, books: Books, light: Any) -> Books:
-        """Light that the path brings."""
-        L, d = self._vary(books, light)
-        return L - dr.detach(light), d
-
-    def settle(self, books: Books, light: Any, weight: Any, goes_on: Any, shown: Any) -> Books:
-        """As in `Tally`."""
-        L = books[0] - dr.detach(light)
-        fixed = dr.detach(weight)
-        after = dr.select(goes_on & (fixed != 0), L / dr.select(fixed != 0, fixed, 1), 0)
-        return self._vary((L, books[1]), light + weight * (after + shown))
-
-    def _vary(self, books: Books, value: Any) -> Books:
-        L, d = books
-        if not dr.grad_enabled(value):
-            return books
-        if self.backward:
-            dr.backward_from(d * value)
-            return books
-        return L, d + dr.forward_to(value)
-
-
-# ---- What every path needs -----------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, eq=False)
-class World:
+class RenderContext:
     """What every path needs.
 
     Args:
         scene: the Mitsuba scene.
         lights: its kinds of emitters.
-        bodies: its translucent objects.
+        objects: its translucent objects.
         settings: those of the integrator.
-        books: what is written down.
-        sky: its mean light, where it serves.
+        mode: whether paths are traced or replayed.
+        sky: its mean radiance, where that serves.
         small: its emitters that look small, if there are any.
     """
 
-    scene: Any
+    scene: mi.Scene
     lights: Lights
-    bodies: list[Body]
+    objects: list[Body]
     settings: Settings
-    books: Tally | Replay
+    mode: Primal | Replay
     sky: Sky | None = None
     small: SmallEmitters | None = None
 
     @classmethod
-    def of(cls, scene: Any, bodies: list[Body], settings: Settings, books: Tally | Replay) -> World:
-        """That of a scene and its bodies."""
+    def of(cls, scene: mi.Scene, objects: list[Body], settings: Settings, mode: Primal | Replay) -> RenderContext:
+        """The context of a scene and its translucent objects."""
         lights = Lights.of(scene)
         with detached():
             small = SmallEmitters.of(scene)
-        return cls(scene, lights, bodies, settings, books, sky_of(scene, lights, bodies), small)
+        return cls(scene, lights, objects, settings, mode, Sky.of(scene, lights, objects), small)
 
     @property
     def suns(self) -> bool:
-        """Whether the environment has suns, which are aimed at."""
+        """Whether the environment has suns, which are sampled like small emitters."""
         return self.small is not None and len(self.small.suns) > 0
 
-    def evens(self, body: Body) -> bool:
-        """Whether the mean light of the sky serves a body."""
-        return self.sky is not None and hasattr(body.transport, "alpha")
+    def uses_sky(self, obj: Body) -> bool:
+        """Whether the mean radiance of the sky is a control variate for an object."""
+        return self.sky is not None and hasattr(obj.transport, "alpha")
 
-    def even(self, body: Body) -> tuple[Any, Any]:
-        """The mean light of the sky in the channels where it serves, for orders below two and for the others."""
-        few, others = body.transport.evened
-        return few * self.sky.mean, others * self.sky.mean
+    def sky_means(self, obj: Body) -> tuple[mi.Spectrum, mi.Spectrum]:
+        """c in the channels where alpha is known, else 0: for orders below two and for the others."""
+        low_orders, others = obj.transport.evened
+        return low_orders * self.sky.mean, others * self.sky.mean
 
-    def entries(self, body: Body) -> int:
-        """How many an exit draws: one where the mean light of the sky is nearly all, and the settings do not say."""
-        alone = self.evens(body) and not self.lights.some_local
-        return 1 if alone and self.settings.entries == AUTOMATIC else body.entries
+    def entries(self, obj: Body) -> int:
+        """Candidates of resampling for an exit: one where c is nearly all light and the settings leave it open."""
+        alone = self.uses_sky(obj) and not self.lights.some_local
+        return 1 if alone and self.settings.entries == AUTOMATIC else obj.entries
+
+    def sampled_by_nee(self, emitter: mi.EmitterPtr, d: mi.Vector3f) -> mi.Bool:
+        """Whether emitter connections find an emitter in the direction d: any but a sky without a sun there."""
+        local = ~emitter.is_environment()
+        return local | (self.small.index_of(emitter, d) >= 0) if self.suns else local
 
 
-def sampled_light(world: World, ref: Any, u: Any, test_visibility: bool, active: Any) -> tuple[Any, Any]:
-    """A direction sampled by the emitters, and their light over its density; derivatives are those of the light."""
+def sample_emitter(
+    context: RenderContext, ref: mi.Interaction3f, u: mi.Point2f, test_visibility: bool, active: mi.Bool
+) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
+    """A direction of next-event estimation, and light over its density; derivatives are those of the light."""
     with detached():
-        ds, light = world.scene.sample_emitter_direction(ref, u, test_visibility, active)
+        ds, light = context.scene.sample_emitter_direction(ref, u, test_visibility, active)
         inverse = dr.select(ds.pdf > 0, dr.rcp(ds.pdf), 0)
-    if not world.books.tracks:
+    if not context.mode.tracks:
         return ds, light
     shines = active & (ds.pdf > 0)
-    return ds, dr.replace_grad(light, world.scene.eval_emitter_direction(ref, ds, shines) * inverse)
+    return ds, dr.replace_grad(light, context.scene.eval_emitter_direction(ref, ds, shines) * inverse)
 
 
-def delta_light(world: World, sampler: Any, ray: Any, active: Any) -> Any:
-    """Light of the delta lights along a ray, spread over a wide cone, by one of them."""
-    n = world.small.n_delta
+def delta_light(
+    context: RenderContext, sampler: mi.Sampler, ray: mi.Ray3f, active: mi.Bool
+) -> tuple[mi.UInt32, mi.Spectrum]:
+    """One of the delta lights, and its light along a ray, spread over a wide cone, over its probability."""
+    n = context.small.n_delta
     which = mi.UInt32(dr.minimum(sampler.next_1d() * n, n - 1)) if n > 1 else mi.UInt32(0)
-    return n * world.small.spread(which, ray, mi.Float(WIDE), active)
+    return which, n * context.small.spread(which, ray, mi.Float(WIDE), active)

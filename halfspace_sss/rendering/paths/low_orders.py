@@ -1,118 +1,408 @@
-"""Where rays inside an object meet its boundary, and the one ray that is refracted towards a given point.
+"""Scattering orders 0 and 1 inside an object, exactly: a walk that is scattered at most once.
 
-The connection follows Walter, Zhao, Holzschuch and Bala 2009 in spirit: the direction at the event is moved by Newton's
-method until the refracted ray meets the target; the derivative of the refracted ray (Igehy 1999) contains the curvature
-of the shading normals. One solution is looked for, from where the straight ray meets the boundary: light that reaches
-the event along several refracted rays is counted once, and where Newton's method fails the light is lost.
+From the exit the walk is refracted inwards, passes or is scattered by the phase function, then never again; it is
+reflected at the boundary by Fresnel as often as it takes, and leaves. After k = 0, 1 events and a path length Λ
+
+    L_o = T_o L_i f / p,    f = sigma_s^k p(cos)^k exp(-sigma_t Λ),
+
+p the density of the walk; the factors eta² of radiance cancel, and Fresnel's inside with the chance to be reflected.
+Whether a segment is passed, and where and how the walk is scattered, is drawn for the channels by their weights f_c so
+far.
+
+Light of emitters and suns that reaches the event without reflection is found by emitter connections: the ray that is
+refracted towards a sampled point of them, where there is one that `refracted_connection` finds. All other light is left
+to chance, that of delta lights spread over a cone, see `light.small_emitters`. The boundary refracts as if it were
+smooth.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
 
 from halfspace_sss.physics.phase import eval_hg, sample_hg
 from halfspace_sss.rendering.light.small_emitters import WIDE
-from halfspace_sss.rendering.paths.lighting import World, sampled_light
+from halfspace_sss.rendering.paths.lighting import RenderContext, delta_light, sample_emitter
 from halfspace_sss.rendering.surface.derivatives import detached
 from halfspace_sss.rendering.surface.horizon import lifted, mirrored, opposed
 from halfspace_sss.rendering.surface.object import turned
 from halfspace_sss.rendering.transport.body import Body
 from halfspace_sss.rendering.transport.plane import Exit, number, place
 
-__all__ = ["Connection", "Few", "Leg", "few_orders", "meet", "refracted_connection"]
+__all__ = ["Connection", "LowOrderSample", "RefractedRay", "refracted_connection", "sample_low_orders"]
 
+MOST_SEGMENTS = 256
+FAINT = 0.1  # weight below which a scattered walk may end
+GRAZES = 0.05  # cosine at an emitter up to which its points are left to chance: their density over the area goes to 0
+FOCUS = 10.0  # of the straight way into solid angle at the event; points of caustics beyond are left to chance
+SAME_WAY = 1e-2  # by which points of exit may differ, over their distance from the event
+FAR = 1e4  # distance of what is infinitely far, over the size of the object
 
-ITERATIONS = 6
+NEWTON_STEPS = 6
 LONGEST_STEP = 0.5  # of the direction, radians
 TOLERANCE = 1e-3  # distance by which the target may be missed, over its distance
 
-
-class Connection(NamedTuple):
-    """A refracted connection; `d` is its direction inside, `density` the solid angle inside per area across the ray."""
-
-    p: Any
-    n: Any
-    d: Any
-    w: Any
-    T: Any
-    length: Any
-    density: Any
-    valid: Any
+Media = list["tuple[mi.Float, mi.Float, mi.Float]"]  # sigma_s, sigma_t and g of each channel
 
 
-def meet(body: Body, p: Any, d: Any, flags: Any, active: Any) -> tuple[Any, Any, Any]:
+class RefractedRay(NamedTuple):
+    """The ray from an exit into the object."""
+
+    out: Exit
+    d: mi.Vector3f
+    T: mi.Float  # Fresnel transmittance
+    valid: mi.Bool  # whether there is one
+    passing: mi.Float  # probability to go along it to the boundary
+
+
+class LowOrderSample(NamedTuple):
+    """Where a walk leaves the object, and light of emitter connections at its event."""
+
+    p: mi.Point3f
+    n: mi.Normal3f
+    d: mi.Vector3f
+    weight: mi.Spectrum
+    connected: mi.Bool  # whether light of emitters along d is in `direct`
+    direct: mi.Spectrum
+    once: mi.Bool  # whether it was scattered
+
+
+@dataclass
+class _Walk:
+    """Loop variables of a walk; once it has `left`, o, d and n are those of the ray outside."""
+
+    o: mi.Point3f
+    d: mi.Vector3f
+    n: mi.Normal3f  # geometric, outwards
+    skip: mi.Float  # length after which a ray is clear of the boundary
+    length: mi.Float  # Λ
+    inverse_pdf: mi.Float  # 1 / p
+    order: mi.UInt32  # k
+    cosine: mi.Float  # of the scattering angle
+    event: mi.Point3f  # the scattering event
+    event_d: mi.Vector3f  # direction of arrival there
+    event_length: mi.Float  # Λ there
+    event_inverse_pdf: mi.Float  # 1 / p there, before the phase function
+    straight: mi.Bool  # nothing has reflected since the event
+    left: mi.Bool
+    alive: mi.Bool
+
+
+# ---- The estimator ---------------------------------------------------------------------------------------------------
+
+
+def sample_low_orders(
+    context: RenderContext, obj: Body, refracted: RefractedRay, sampler: mi.Sampler, scattered: mi.Bool, active: mi.Bool
+) -> LowOrderSample:
+    """Light that leaves at an exit after at most one scattering event.
+
+    What passes unscattered shows delta lights only if the path has `scattered` before.
+    """
+    with detached():
+        walk = _walk(obj, refracted, sampler, active & refracted.valid)
+        once = walk.order == 1
+        counts = walk.left & (once if 0 not in obj.few else mi.Bool(True))
+        straight = once & walk.straight
+
+    # ---- throughput f / p
+    media = obj.variation.coefficients(obj.media)
+    f = _contribution(media, walk.length, walk.order, walk.cosine)
+    weight = dr.select(counts, f * (walk.inverse_pdf * refracted.T), 0)
+
+    # ---- emitter connections, emission met by chance, delta lights
+    direct, lights = mi.Spectrum(0), context.lights
+    if lights.some_local or context.suns:
+        at_event = _contribution(media, walk.event_length, mi.UInt32(1), None) * (walk.event_inverse_pdf * refracted.T)
+        direct = _connected(context, (obj, media), walk, dr.select(once, at_event, 0), sampler, once)
+    if lights.some_shaped or context.suns:
+        direct = direct + weight * _met_by_chance(context, obj, walk, counts & straight)
+    if lights.some_delta:
+        direct = direct + weight * _spread_lights(context, obj, walk, sampler, counts & (once | scattered))
+    return LowOrderSample(walk.o, walk.n, walk.d, weight, straight, direct, once)
+
+
+# ---- The walk --------------------------------------------------------------------------------------------------------
+
+
+def _walk(obj: Body, refracted: RefractedRay, sampler: mi.Sampler, active: mi.Bool) -> _Walk:
+    """The walk from an exit until it leaves."""
+    zero, p = mi.Float(0), mi.Point3f(refracted.out.p)
+    media = [tuple(number(v) for v in (m.sigma_s, m.sigma_t, m.g)) for m in obj.media]
+    skip = _clear(obj, refracted.out.n_face, refracted.d)
+    start = _Walk(
+        p, mi.Vector3f(refracted.d), mi.Normal3f(refracted.out.n_face), mi.Float(skip), zero, mi.Float(1), mi.UInt32(0),
+        zero, mi.Point3f(p), mi.Vector3f(refracted.d), zero, zero, mi.Bool(True), mi.Bool(False), mi.Bool(active),
+    )  # fmt: skip
+
+    def step(k: mi.UInt32, sampler: mi.Sampler, passing: mi.Float, walk: _Walk) -> tuple:
+        return k + 1, sampler, passing, _step((obj, media), k, sampler, passing, walk)
+
+    state = (mi.UInt32(0), sampler, mi.Float(refracted.passing), start)
+    return dr.while_loop(state, lambda k, sampler, passing, walk: walk.alive, step, label="low orders")[3]
+
+
+def _step(of: tuple[Body, Media], k: mi.UInt32, sampler: mi.Sampler, passing: mi.Float, walk: _Walk) -> _Walk:
+    """One segment: to the event, or to the boundary and what happens there."""
+    (obj, media), flags = of, mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame
+    si, n_out, n = meet(obj, walk.o + walk.d * walk.skip, walk.d, flags, walk.alive)
+    length = si.t + walk.skip
+    W = _contribution(media, walk.length, walk.order, walk.cosine) * walk.inverse_pdf
+    T = dr.select(si.is_valid(), dr.exp(-_column(media, 1) * length), 0)
+    passing = dr.select(k == 0, passing, dr.sum(W * T) / dr.maximum(dr.sum(W), 1e-30))
+    first = walk.order == 0
+    scatters = first & (sampler.next_1d() >= passing)
+    scattered = _scatter(media, walk, (W, 1 - T), dr.maximum(1 - passing, 1e-7), sampler)
+    met = replace(
+        walk, length=walk.length + length, inverse_pdf=walk.inverse_pdf / dr.select(first, passing, 1)
+    )  # fmt: skip
+    met = _meet_boundary(of, met, (si, n_out, n), sampler)
+    met.alive &= ~walk.left & (k + 1 < MOST_SEGMENTS)
+    return dr.select(scatters, scattered, met)
+
+
+def _scatter(
+    media: Media, walk: _Walk, weights: tuple[mi.Spectrum, mi.Spectrum], scattering: mi.Float, sampler: mi.Sampler
+) -> _Walk:
+    """The event on this segment, which happens with the probability `scattering`.
+
+    `weights` are f_c / p and the chance of channel c to be scattered on the segment.
+    """
+    # ---- distance s by the coefficient of a channel; density by the mean over channels
+    sigma_t, g, (W, ends) = _column(media, 1), _column(media, 2), weights
+    u, v, channel, chance = sampler.next_1d(), sampler.next_2d(), sampler.next_2d(), W * ends
+    rate = dr.maximum(_pick(sigma_t, chance, channel.x), 1e-12)
+    s = -dr.log(1 - u * dr.minimum(_pick(ends, chance, channel.x), 1 - 1e-7)) / rate
+    density = dr.sum(W * sigma_t * dr.exp(-sigma_t * s)) / dr.maximum(dr.sum(chance), 1e-30)
+    inverse_pdf = walk.inverse_pdf / dr.maximum(density * scattering, 1e-30)
+
+    # ---- direction by the phase function of a channel; density likewise
+    W = _contribution(media, walk.length + s, mi.UInt32(1), None) * inverse_pdf
+    cosine = sample_hg(v.x, _pick(g, W, channel.y))
+    phase = dr.sum(W * _spectrum([eval_hg(cosine, m[2]) for m in media])) / dr.maximum(dr.sum(W), 1e-30)
+    sine, (sin_phi, cos_phi) = dr.safe_sqrt((1 - cosine) * (1 + cosine)), dr.sincos(2 * dr.pi * v.y)
+    d = mi.Frame3f(walk.d).to_world(mi.Vector3f(sine * cos_phi, sine * sin_phi, cosine))
+    p, length = mi.Point3f(walk.o + walk.d * s), walk.length + s
+    return replace(
+        walk, o=p, d=mi.Vector3f(d), skip=mi.Float(0), length=length,
+        inverse_pdf=inverse_pdf / dr.maximum(phase, 1e-30), order=mi.UInt32(1), cosine=mi.Float(cosine), event=p,
+        event_d=mi.Vector3f(walk.d), event_length=length, event_inverse_pdf=inverse_pdf, straight=mi.Bool(True),
+        alive=walk.alive & (dr.sum(W) > 0) & (dr.sum(chance) > 0),
+    )  # fmt: skip
+
+
+def _meet_boundary(of: tuple[Body, Media], walk: _Walk, met: tuple, sampler: mi.Sampler) -> _Walk:
+    """Reflection by Fresnel, or the way out; Russian roulette for what is faint."""
+    (obj, media), (si, n_out, n) = of, met
+    size = dr.max(_contribution(media, walk.length, walk.order, walk.cosine) * walk.inverse_pdf)
+    survival = dr.select(walk.order == 1, dr.minimum(size / FAINT, 1), 1)
+    frame = mi.Frame3f(lifted(n_out, n, walk.d))
+    w = frame.to_local(-walk.d)
+    F, cos_t, _, eta_ti = mi.fresnel(mi.Frame3f.cos_theta(w), obj.eta)
+    reflects = sampler.next_1d() < F
+    back = -mirrored(-frame.to_world(mi.reflect(w)), n)
+    onward = opposed(frame.to_world(mi.refract(w, cos_t, eta_ti)), n)
+    d, leaves = mi.Vector3f(dr.select(reflects, back, onward)), ~reflects
+    alive = walk.alive & si.is_valid() & (dr.dot(n, walk.d) > 0) & (sampler.next_1d() < survival)
+    return replace(
+        walk, o=mi.Point3f(si.p), d=d, n=mi.Normal3f(n), skip=mi.Float(_clear(obj, n, d)), left=alive & leaves,
+        straight=walk.straight & leaves, alive=alive & ~leaves,
+        inverse_pdf=walk.inverse_pdf / dr.maximum(survival, 1e-30),
+    )  # fmt: skip
+
+
+def meet(
+    obj: Body, p: mi.Point3f, d: mi.Vector3f, flags: int, active: mi.Bool
+) -> tuple[mi.SurfaceInteraction3f, mi.Normal3f, mi.Normal3f]:
     """Interaction with the boundary, shading normal and geometric normal, both outwards (along d for a sheet)."""
-    si = body.found.scene.ray_intersect(mi.Ray3f(p, d), flags, False, active)
-    sign = body.found.side(si.prim_index, active & si.is_valid())
-    if not body.found.closed:
+    si = obj.found.scene.ray_intersect(mi.Ray3f(p, d), flags, False, active)
+    sign = obj.found.side(si.prim_index, active & si.is_valid())
+    if not obj.found.closed:
         sign = dr.select(dr.dot(si.n, d) > 0, 1.0, -1.0)
     return si, turned(si.sh_frame.n, si.n) * sign, si.n * sign
 
 
-def _refract(body: Body, d: Any, n: Any) -> tuple[Any, Any, Any]:
-    """Direction outside, Fresnel reflectance, and whether light passes, for a ray inside along d."""
-    eta = body.eta
-    c = dr.dot(d, n)
-    c_t2 = 1 - eta * eta * (1 - c * c)
-    F = mi.fresnel(dr.maximum(c, 0), 1 / eta)[0]
-    w = eta * d + n * (dr.safe_sqrt(c_t2) - eta * c)
-    return dr.normalize(w), F, (c > 0) & (c_t2 > 0)
+def _clear(obj: Body, n: mi.Normal3f, d: mi.Vector3f) -> mi.Float:
+    """Length along d after which a ray from the surface is clear of it; an origin moved instead lies deeper."""
+    return number(obj.found.rounding) / dr.maximum(dr.abs(dr.dot(n, d)), 0.1)
 
 
-def refracted_connection(body: Body, p: Any, target: Any, active: Any) -> Connection:
-    """The ray from p inside the body that is refracted towards `target` outside."""
+def _contribution(media: Media, length: mi.Float, order: mi.UInt32, cosine: mi.Float | None) -> mi.Spectrum:
+    """f = sigma_s^k p(cos)^k exp(-sigma_t Λ); without the phase function where there is no cosine."""
+    values = []
+    for sigma_s, sigma_t, g in media:
+        once = sigma_s if cosine is None else sigma_s * eval_hg(cosine, g)
+        values.append(dr.select(order == 1, once, 1) * dr.exp(-sigma_t * length))
+    return _spectrum(values)
 
-    def step(k: Any, d: Any, found: tuple, active: Any) -> tuple:
-        e, J, met, valid = _aim(body, p, d, target, active)
+
+def _pick(values: mi.Spectrum, weights: mi.Spectrum, u: mi.Float) -> mi.Float:
+    """The value of a channel drawn by its weight, for a uniform number."""
+    u, value = u * dr.sum(weights), values[0]
+    for k in range(1, len(values)):
+        u = u - weights[k - 1]
+        value = dr.select(u >= 0, values[k], value)
+    return value
+
+
+def _column(media: Media, k: int) -> mi.Spectrum:
+    return _spectrum([m[k] for m in media])
+
+
+def _spectrum(values: list[mi.Float]) -> mi.Spectrum:
+    return mi.Spectrum(*values) if len(values) > 1 else mi.Spectrum(values[0])
+
+
+# ---- Light: emitter connections, and what they do not find -----------------------------------------------------------
+
+
+def _connected(
+    context: RenderContext, of: tuple[Body, Media], walk: _Walk, weight: mi.Spectrum, sampler: mi.Sampler,
+    active: mi.Bool,
+) -> mi.Spectrum:  # fmt: skip
+    """Light of a sampled emitter that is refracted at the boundary into the event, which has a weight."""
+    obj, media = of
+    at = place(walk.event, mi.Normal3f(0, 0, 0))
+    ds, light = sample_emitter(context, at, sampler.next_2d(), False, active)
+    with detached():
+        distant = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
+        active = active & (ds.pdf > 0) & context.sampled_by_nee(ds.emitter, ds.d)
+        reach = dr.select(distant, number(FAR * obj.found.size), ds.dist)
+        target = walk.event + ds.d * reach
+        met = refracted_connection(obj, walk.event, target, active)
+        # solid angle at the event per solid angle of the straight direction, over which the emitter was sampled
+        facing = dr.select(dr.squared_norm(ds.n) > 0, dr.abs(dr.dot(ds.n, met.w)) / dr.abs(dr.dot(ds.n, ds.d)), 1)
+        valid = met.valid & (ds.delta | _is_sampled(walk.event, target, ds.n, met))
+        spread = dr.select(ds.delta, 1, facing) * reach * reach * met.density
+        cosine, passed = dr.dot(walk.event_d, met.d), met.T * spread
+    phase = _spectrum([eval_hg(cosine, g) for _, _, g in media])
+    value = weight * phase * _contribution(media, met.length, mi.UInt32(0), None) * passed * light
+    edge = place(met.p, met.n)
+    blocked = context.scene.ray_test(edge.spawn_ray_to(target), False, valid)
+    return dr.select(valid & ~blocked, value, 0)
+
+
+def _met_by_chance(context: RenderContext, obj: Body, walk: _Walk, active: mi.Bool) -> mi.Spectrum:
+    """Emission that a walk meets from its event, which no connection with that point of an emitter would find."""
+    with detached():
+        ray = place(walk.o, walk.n).spawn_ray(walk.d)
+        si = context.scene.ray_intersect(ray, mi.RayFlags.All, False, active)
+        emitter = si.emitter(context.scene, active)
+        active = active & (emitter != None) & context.sampled_by_nee(emitter, walk.d)  # noqa: E711
+        target = dr.select(si.is_valid(), si.p, walk.event + walk.d * number(FAR * obj.found.size))
+        met = refracted_connection(obj, walk.event, mi.Point3f(target), active)
+        n = dr.select(si.is_valid(), si.n, 0)
+        sampled = _is_same(walk, met, SAME_WAY) & _is_sampled(walk.event, target, n, met)
+    return dr.select(active & ~sampled, emitter.eval(si, active), 0)
+
+
+def _spread_lights(context: RenderContext, obj: Body, walk: _Walk, sampler: mi.Sampler, active: mi.Bool) -> mi.Spectrum:
+    """Light of a delta light whose cone holds a walk's way out, which no connection with it would find."""
+    which, L = delta_light(context, sampler, place(walk.o, walk.n).spawn_ray(walk.d), active)
+    with detached():
+        connects = active & (dr.max(L) > 0) & walk.straight & (walk.order == 1)
+        target = context.small.point(which, walk.event, FAR * obj.found.size)
+        met = refracted_connection(obj, walk.event, target, connects)
+    return dr.select(connects & _is_same(walk, met, 3 * WIDE), 0, L)
+
+
+def _is_same(walk: _Walk, met: Connection, tolerance: float) -> mi.Bool:
+    """Whether a walk has left its event by the connection, up to a share of the distance."""
+    return met.valid & (dr.norm(mi.Point3f(met.p) - walk.o) <= tolerance * dr.norm(walk.o - walk.event))
+
+
+def _is_sampled(event: mi.Point3f, p: mi.Point3f, n: mi.Normal3f, met: Connection) -> mi.Bool:
+    """Whether light of the point p of an emitter, with the normal n, comes by its connection with the event."""
+    way = p - event
+    return _faces(n, dr.normalize(way)) & (dr.squared_norm(way) * met.density < FOCUS)
+
+
+def _faces(n: mi.Normal3f, d: mi.Vector3f) -> mi.Bool:
+    """Whether a point of an emitter with the normal n is seen along d straight from the front; all are without n."""
+    return (dr.dot(n, d) < -GRAZES) | (dr.squared_norm(n) == 0)
+
+
+# ---- Refracted connection: Newton's method ---------------------------------------------------------------------------
+#
+# In the spirit of Walter, Zhao, Holzschuch and Bala 2009: the direction at the event is moved by Newton's method until
+# the refracted ray meets the target. The derivative of the refracted ray (Igehy 1999) contains the curvature of the
+# shading normals. One solution is looked for, from where the straight ray meets the boundary: light that reaches the
+# event along several refracted rays is counted once, and where Newton's method fails the light is lost.
+
+
+@dataclass
+class Connection:
+    """A refracted connection of a point inside with a point outside."""
+
+    p: mi.Point3f  # on the boundary
+    n: mi.Normal3f  # geometric, outwards
+    d: mi.Vector3f  # direction inside
+    w: mi.Vector3f  # direction outside
+    T: mi.Float  # Fresnel transmittance
+    length: mi.Float  # inside
+    density: mi.Float  # solid angle inside per area across the ray at the target
+    valid: mi.Bool
+
+
+def refracted_connection(obj: Body, p: mi.Point3f, target: mi.Point3f, active: mi.Bool) -> Connection:
+    """The ray from p inside the object that is refracted towards `target` outside."""
+
+    def step(k: mi.UInt32, d: mi.Vector3f, best: Connection, active: mi.Bool) -> tuple:
+        # ---- J step = e in two axes
+        e, J, met, valid = _miss(obj, p, d, target, active)
         (a, b), (c, f) = J
         det = a * f - b * c
         inverse = dr.rcp(dr.select(dr.abs(det) > 1e-12, det, 1e-12))
         step_1, step_2 = (f * e[0] - b * e[1]) * inverse, (a * e[1] - c * e[0]) * inverse
         size = dr.sqrt(step_1 * step_1 + step_2 * step_2)
         shrink = dr.minimum(1, LONGEST_STEP / dr.maximum(size, 1e-9))
+
+        # ---- keep it where it is close; go on where it is not exact
         miss = dr.sqrt(e[0] * e[0] + e[1] * e[1])
         close = valid & (miss < TOLERANCE * dr.norm(target - mi.Point3f(met[0])))
-        found = tuple(
-            dr.select(active & close, x, y) for x, y in zip((*met, 1 / dr.maximum(dr.abs(det), 1e-12), d, close), found)
-        )
+        at, n, w, T, length = met
+        new = Connection(at, n, d, w, T, length, 1 / dr.maximum(dr.abs(det), 1e-12), close)
+        best = dr.select(active & close, new, best)
         e_1, e_2 = mi.coordinate_system(d)
-        onward = dr.normalize(d + (e_1 * step_1 + e_2 * step_2) * shrink)
-        active = active & valid & (~close | (miss > 1e-5 * dr.norm(target - p))) & (k + 1 < ITERATIONS)
-        return k + 1, dr.select(active, onward, d), found, active
+        moved = dr.normalize(d + (e_1 * step_1 + e_2 * step_2) * shrink)
+        active = active & valid & (~close | (miss > 1e-5 * dr.norm(target - p))) & (k + 1 < NEWTON_STEPS)
+        return k + 1, dr.select(active, moved, d), best, active
 
-    start = _first_guess(body, p, dr.normalize(target - p), active)
-    nothing = (
-        mi.Point3f(0), mi.Normal3f(0, 0, 1), mi.Vector3f(0, 0, 1), mi.Float(0), mi.Float(0),
-        mi.Float(0), mi.Vector3f(0, 0, 1), mi.Bool(False),
+    start = _first_guess(obj, p, dr.normalize(target - p), active)
+    none = Connection(
+        mi.Point3f(0), mi.Normal3f(0, 0, 1), mi.Vector3f(0, 0, 1), mi.Vector3f(0, 0, 1), mi.Float(0), mi.Float(0),
+        mi.Float(0), mi.Bool(False),
     )  # fmt: skip
-    state = (mi.UInt32(0), mi.Vector3f(start), nothing, mi.Bool(active))
-    at, n, w, T, length, density, d, valid = dr.while_loop(state, lambda *s: s[-1], step, label="refraction")[2]
-    return Connection(at, n, d, w, T, length, density, valid & active)
+    state = (mi.UInt32(0), mi.Vector3f(start), none, mi.Bool(active))
+    best = dr.while_loop(state, lambda k, d, best, active: active, step, label="refraction")[2]
+    return replace(best, valid=best.valid & active)
 
 
-def _first_guess(body: Body, p: Any, w: Any, active: Any) -> Any:
+def _first_guess(obj: Body, p: mi.Point3f, w: mi.Vector3f, active: mi.Bool) -> mi.Vector3f:
     """The direction inside of light that arrives along -w where the straight ray along w meets the boundary."""
-    _, n_out, _ = meet(body, p, w, mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame, active)
-    across = (w - n_out * dr.dot(w, n_out)) / body.eta
+    _, n_out, _ = meet(obj, p, w, mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame, active)
+    across = (w - n_out * dr.dot(w, n_out)) / obj.eta
     return dr.normalize(across + n_out * dr.sqrt(dr.maximum(1 - dr.squared_norm(across), 1e-4)))
 
 
-def _aim(body: Body, p: Any, d: Any, target: Any, active: Any) -> tuple[tuple, tuple, tuple, Any]:
+def _miss(
+    obj: Body, p: mi.Point3f, d: mi.Vector3f, target: mi.Point3f, active: mi.Bool
+) -> tuple[tuple, tuple, tuple, mi.Bool]:
     """Miss of the target in two axes across the refracted ray, its derivative by d, the passage, and its validity.
 
     With dw across d: dx = s (dw - d (dw.n)/(d.n)); dn = n_u du + n_v dv; refracted w = eta d + (c_t - eta c) n.
     """
-    flags = mi.RayFlags.All | mi.RayFlags.dNSdUV
-    si, n_out, n = meet(body, p, d, flags, active)
-    w, F, valid = _refract(body, d, n_out)
-    eta, c = body.eta, dr.dot(d, n_out)
+    # ---- refracted ray
+    si, n_out, n = meet(obj, p, d, mi.RayFlags.All | mi.RayFlags.dNSdUV, active)
+    w, F, valid = _refract(obj, d, n_out)
+    eta, c = obj.eta, dr.dot(d, n_out)
     c_t = dr.sqrt(dr.maximum(1 - eta * eta * (1 - c * c), 1e-6))
-    flip = dr.select(dr.dot(si.sh_frame.n, n_out) > 0, 1.0, -1.0) * body.found.curvature_sign
+    flip = dr.select(dr.dot(si.sh_frame.n, n_out) > 0, 1.0, -1.0) * obj.found.curvature_sign
     D = dr.dot(target - si.p, w)
+
+    # ---- its differentials by the two axes across d
     f = mi.coordinate_system(w)
     columns = []
     for e in mi.coordinate_system(d):
@@ -130,268 +420,20 @@ def _aim(body: Body, p: Any, d: Any, target: Any, active: Any) -> tuple[tuple, t
     return e, J, (mi.Point3f(si.p), mi.Normal3f(n), mi.Vector3f(w), 1 - F, si.t), valid
 
 
-def _surface_steps(si: Any, dx: Any) -> tuple[Any, Any]:
+def _refract(obj: Body, d: mi.Vector3f, n: mi.Normal3f) -> tuple[mi.Vector3f, mi.Float, mi.Bool]:
+    """Direction outside, Fresnel reflectance, and whether light passes, for a ray inside along d."""
+    eta = obj.eta
+    c = dr.dot(d, n)
+    c_t2 = 1 - eta * eta * (1 - c * c)
+    F = mi.fresnel(dr.maximum(c, 0), 1 / eta)[0]
+    w = eta * d + n * (dr.safe_sqrt(c_t2) - eta * c)
+    return dr.normalize(w), F, (c > 0) & (c_t2 > 0)
+
+
+def _surface_steps(si: mi.SurfaceInteraction3f, dx: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
     """(du, dv) with dp_du du + dp_dv dv = dx; 0 where the shape has no parametrisation."""
     a, b, c = dr.dot(si.dp_du, si.dp_du), dr.dot(si.dp_du, si.dp_dv), dr.dot(si.dp_dv, si.dp_dv)
     p, q = dr.dot(si.dp_du, dx), dr.dot(si.dp_dv, dx)
     det = a * c - b * b
     inverse = dr.select(det > 1e-14 * a * c, dr.rcp(det), 0)
     return (c * p - b * q) * inverse, (a * q - b * p) * inverse
-
-
-# ---- Scattering orders 0 and 1 -------------------------------------------------------------------------------------
-
-MOST_LEGS = 256
-FAINT = 0.1  # weight below which a scattered walk may end
-GRAZES = 0.05  # cosine at an emitter up to which its points are left to chance: their density over the area goes to 0
-FOCUS = 10.0  # of the straight way into solid angle at the event; points of caustics beyond are left to chance
-SAME_WAY = 1e-2  # by which points of exit may differ, over their distance from the event
-
-Media = list[tuple[Any, Any, Any]]  # sigma_s, sigma_t and g of each channel
-
-
-class Leg(NamedTuple):
-    """The way from an exit into the body: direction, Fresnel transmittance, whether there is one.
-
-    `passing` is the probability to go along it to the boundary.
-    """
-
-    out: Exit
-    along: Any
-    T: Any
-    valid: Any
-    passing: Any
-
-
-class Few(NamedTuple):
-    """Where a walk leaves the body, and light of emitters that came to its event."""
-
-    p: Any
-    n: Any
-    d: Any
-    weight: Any  # spectrum
-    connected: Any  # whether light of emitters on this way is in `direct`
-    direct: Any  # spectrum
-    once: Any  # whether it was scattered
-
-
-@dataclass
-class _Walk:
-    """State of a walk; after it is `out`, o, d and n are those of the way outside."""
-
-    o: Any
-    d: Any
-    n: Any
-    skip: Any  # length after which a ray is clear of the boundary
-    way: Any
-    inverse: Any  # 1 / p
-    order: Any
-    cosine: Any
-    event: Any
-    along: Any
-    event_way: Any
-    event_inverse: Any  # 1 / p before the phase function
-    straight: Any  # nothing has reflected since the event
-    out: Any
-    alive: Any
-
-
-def few_orders(world: World, body: Body, leg: Leg, sampler: Any, scattered: Any, active: Any) -> Few:
-    """Light that leaves at the exit of `leg` after at most one scattering event.
-
-    What passes unscattered shows delta lights only if the path has `scattered` before.
-    """
-    with detached():
-        walk = _walk(body, leg, sampler, active & leg.valid)
-        once = walk.order == 1
-        counts = walk.out & (once if 0 not in body.few else mi.Bool(True))
-        straight = once & walk.straight
-    coefficients = body.variation.coefficients(body.media)
-    f = _value(coefficients, walk.way, walk.order, walk.cosine)
-    weight = dr.select(counts, f * (walk.inverse * leg.T), 0)
-    direct = mi.Spectrum(0)
-    if world.lights.some_local or world.suns:
-        value = _value(coefficients, walk.event_way, mi.UInt32(1), None) * (walk.event_inverse * leg.T)
-        direct = _connected(world, (body, coefficients), walk, dr.select(once, value, 0), sampler, once)
-    if world.lights.some_shaped or world.suns:
-        direct = direct + weight * _met_by_chance(world, body, walk, counts & straight)
-    if world.lights.some_delta:
-        direct = direct + weight * _spread_lights(world, body, walk, sampler, counts & (once | scattered))
-    return Few(walk.o, walk.n, walk.d, weight, straight, direct, once)
-
-
-def _walk(body: Body, leg: Leg, sampler: Any, active: Any) -> _Walk:
-    zero, point = mi.Float(0), mi.Point3f(leg.out.p)
-    media = [tuple(number(v) for v in (m.sigma_s, m.sigma_t, m.g)) for m in body.media]
-    skip = _clear(body, leg.out.n_face, leg.along)
-    start = _Walk(
-        point, mi.Vector3f(leg.along), mi.Normal3f(leg.out.n_face), mi.Float(skip), zero, mi.Float(1), mi.UInt32(0),
-        zero, mi.Point3f(point), mi.Vector3f(leg.along), zero, zero, mi.Bool(True), mi.Bool(False), mi.Bool(active),
-    )  # fmt: skip
-
-    def step(k: Any, sampler: Any, passing: Any, walk: _Walk) -> tuple:
-        return k + 1, sampler, passing, _step((body, media), k, sampler, passing, walk)
-
-    state = (mi.UInt32(0), sampler, mi.Float(leg.passing), start)
-    return dr.while_loop(state, lambda k, sampler, passing, walk: walk.alive, step, label="few orders")[3]
-
-
-def _step(of: tuple[Body, Media], k: Any, sampler: Any, passing: Any, walk: _Walk) -> _Walk:
-    """To the event, or to the boundary and what happens there."""
-    (body, media), flags = of, mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame
-    si, n_out, n = meet(body, walk.o + walk.d * walk.skip, walk.d, flags, walk.alive)
-    length = si.t + walk.skip
-    W = _value(media, walk.way, walk.order, walk.cosine) * walk.inverse
-    T = dr.select(si.is_valid(), dr.exp(-_row(media, 1) * length), 0)
-    passing = dr.select(k == 0, passing, dr.sum(W * T) / dr.maximum(dr.sum(W), 1e-30))
-    first = walk.order == 0
-    scatters = first & (sampler.next_1d() >= passing)
-    scattered = _scatter(media, walk, (W, 1 - T), dr.maximum(1 - passing, 1e-7), sampler)
-    met = replace(walk, way=walk.way + length, inverse=walk.inverse / dr.select(first, passing, 1))
-    met = _meet_boundary(of, met, (si, n_out, n), sampler)
-    met.alive &= ~walk.out & (k + 1 < MOST_LEGS)
-    return dr.select(scatters, scattered, met)
-
-
-def _scatter(media: Media, walk: _Walk, weights: tuple[Any, Any], scattering: Any, sampler: Any) -> _Walk:
-    """The event on this leg, which happens with the probability `scattering`.
-
-    `weights` are f_c / p and the chance of channel c to be scattered on the leg.
-    """
-    sigma_t, g, (W, ends) = _row(media, 1), _row(media, 2), weights
-    u, v, channel, chance = sampler.next_1d(), sampler.next_2d(), sampler.next_2d(), W * ends
-    rate = dr.maximum(_pick(sigma_t, chance, channel.x), 1e-12)
-    s = -dr.log(1 - u * dr.minimum(_pick(ends, chance, channel.x), 1 - 1e-7)) / rate
-    density = dr.sum(W * sigma_t * dr.exp(-sigma_t * s)) / dr.maximum(dr.sum(chance), 1e-30)
-    inverse = walk.inverse / dr.maximum(density * scattering, 1e-30)
-    W = _value(media, walk.way + s, mi.UInt32(1), None) * inverse
-    cosine = sample_hg(v.x, _pick(g, W, channel.y))
-    phase = dr.sum(W * _spectrum([eval_hg(cosine, m[2]) for m in media])) / dr.maximum(dr.sum(W), 1e-30)
-    sine, (sin_phi, cos_phi) = dr.safe_sqrt((1 - cosine) * (1 + cosine)), dr.sincos(2 * dr.pi * v.y)
-    d = mi.Frame3f(walk.d).to_world(mi.Vector3f(sine * cos_phi, sine * sin_phi, cosine))
-    p = mi.Point3f(walk.o + walk.d * s)
-    return replace(
-        walk, o=p, d=mi.Vector3f(d), skip=mi.Float(0), way=walk.way + s, inverse=inverse / dr.maximum(phase, 1e-30),
-        order=mi.UInt32(1), cosine=mi.Float(cosine), event=p, along=mi.Vector3f(walk.d), event_way=walk.way + s,
-        event_inverse=inverse, straight=mi.Bool(True), alive=walk.alive & (dr.sum(W) > 0) & (dr.sum(chance) > 0),
-    )  # fmt: skip
-
-
-def _meet_boundary(of: tuple[Body, Media], walk: _Walk, met: tuple[Any, Any, Any], sampler: Any) -> _Walk:
-    """Reflection by Fresnel, or the way out; what is faint may end."""
-    (body, media), (si, n_out, n) = of, met
-    size = dr.max(_value(media, walk.way, walk.order, walk.cosine) * walk.inverse)
-    survival = dr.select(walk.order == 1, dr.minimum(size / FAINT, 1), 1)
-    frame = mi.Frame3f(lifted(n_out, n, walk.d))
-    w = frame.to_local(-walk.d)
-    F, cos_t, _, eta_ti = mi.fresnel(mi.Frame3f.cos_theta(w), body.eta)
-    reflects = sampler.next_1d() < F
-    back, on = -mirrored(-frame.to_world(mi.reflect(w)), n), opposed(frame.to_world(mi.refract(w, cos_t, eta_ti)), n)
-    d, out = mi.Vector3f(dr.select(reflects, back, on)), ~reflects
-    alive = walk.alive & si.is_valid() & (dr.dot(n, walk.d) > 0) & (sampler.next_1d() < survival)
-    return replace(
-        walk, o=mi.Point3f(si.p), d=d, n=mi.Normal3f(n), skip=mi.Float(_clear(body, n, d)), out=alive & out,
-        straight=walk.straight & out, alive=alive & ~out, inverse=walk.inverse / dr.maximum(survival, 1e-30),
-    )  # fmt: skip
-
-
-def _connected(world: World, of: tuple[Body, Media], walk: _Walk, weight: Any, sampler: Any, active: Any) -> Any:
-    """Light of a sampled emitter that is refracted at the boundary into the event, which has a weight."""
-    body, media = of
-    at = place(walk.event, mi.Normal3f(0, 0, 0))
-    ds, light = sampled_light(world, at, sampler.next_2d(), False, active)
-    with detached():
-        distant = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
-        active = active & (ds.pdf > 0) & _aimed_at(world, ds.emitter, ds.d)
-        reach = dr.select(distant, number(1e4 * body.found.size), ds.dist)
-        target = walk.event + ds.d * reach
-        met = refracted_connection(body, walk.event, target, active)
-        # solid angle at the event per solid angle of the straight direction, over which the emitter was sampled
-        facing = dr.select(dr.squared_norm(ds.n) > 0, dr.abs(dr.dot(ds.n, met.w)) / dr.abs(dr.dot(ds.n, ds.d)), 1)
-        found = met.valid & (ds.delta | _is_sampled(walk.event, target, ds.n, met))
-        spread = dr.select(ds.delta, 1, facing) * reach * reach * met.density
-        cosine, passed = dr.dot(walk.along, met.d), met.T * spread
-    phase = _spectrum([eval_hg(cosine, g) for _, _, g in media])
-    value = weight * phase * _value(media, met.length, mi.UInt32(0), None) * passed * light
-    edge = place(met.p, met.n)
-    blocked = world.scene.ray_test(edge.spawn_ray_to(target), False, found)
-    return dr.select(found & ~blocked, value, 0)
-
-
-def _clear(body: Body, n: Any, d: Any) -> Any:
-    """Length along d after which a ray from the surface is clear of it; an origin moved instead lies deeper."""
-    return number(body.found.rounding) / dr.maximum(dr.abs(dr.dot(n, d)), 0.1)
-
-
-def _row(media: Media, k: int) -> Any:
-    return _spectrum([m[k] for m in media])
-
-
-def _met_by_chance(world: World, body: Body, walk: _Walk, active: Any) -> Any:
-    """Light of an emitter that a walk meets from its event, which no connection with that point of it would find."""
-    with detached():
-        ray = place(walk.o, walk.n).spawn_ray(walk.d)
-        si = world.scene.ray_intersect(ray, mi.RayFlags.All, False, active)
-        emitter = si.emitter(world.scene, active)
-        active = active & (emitter != None) & _aimed_at(world, emitter, walk.d)  # noqa: E711
-        target = dr.select(si.is_valid(), si.p, walk.event + walk.d * number(1e4 * body.found.size))
-        met = refracted_connection(body, walk.event, mi.Point3f(target), active)
-        n = dr.select(si.is_valid(), si.n, 0)
-        sampled = _is_same(walk, met, SAME_WAY) & _is_sampled(walk.event, target, n, met)
-    return dr.select(active & ~sampled, emitter.eval(si, active), 0)
-
-
-def _spread_lights(world: World, body: Body, walk: _Walk, sampler: Any, active: Any) -> Any:
-    """Light of a delta light whose cone holds a walk's way out, which no connection with it would find."""
-    n, small = world.small.n_delta, world.small
-    which = mi.UInt32(dr.minimum(sampler.next_1d() * n, n - 1)) if n > 1 else mi.UInt32(0)
-    L = n * small.spread(which, place(walk.o, walk.n).spawn_ray(walk.d), mi.Float(WIDE), active)
-    with detached():
-        connects = active & (dr.max(L) > 0) & walk.straight & (walk.order == 1)
-        target = small.point(which, walk.event, 1e4 * body.found.size)
-        met = refracted_connection(body, walk.event, target, connects)
-    return dr.select(connects & _is_same(walk, met, 3 * WIDE), 0, L)
-
-
-def _aimed_at(world: World, emitter: Any, d: Any) -> Any:
-    """Whether events are connected with an emitter in the direction d: with any but a sky that has no sun there."""
-    found = ~emitter.is_environment()
-    return found | (world.small.index_of(emitter, d) >= 0) if world.suns else found
-
-
-def _is_same(walk: _Walk, met: Connection, tolerance: float) -> Any:
-    """Whether a walk has left its event by the connection, up to a share of the distance."""
-    return met.valid & (dr.norm(mi.Point3f(met.p) - walk.o) <= tolerance * dr.norm(walk.o - walk.event))
-
-
-def _is_sampled(event: Any, p: Any, n: Any, met: Connection) -> Any:
-    """Whether light of the point p of an emitter, with the normal n, comes by its connection with the event."""
-    way = p - event
-    return _faces(n, dr.normalize(way)) & (dr.squared_norm(way) * met.density < FOCUS)
-
-
-def _faces(n: Any, d: Any) -> Any:
-    """Whether a point of an emitter with the normal n is seen along d straight from the front; all are without n."""
-    return (dr.dot(n, d) < -GRAZES) | (dr.squared_norm(n) == 0)
-
-
-def _value(media: Media, way: Any, order: Any, cosine: Any) -> Any:
-    """sigma_s^k p(cos)^k exp(-sigma_t Λ); without the phase function where there is no cosine."""
-    found = []
-    for sigma_s, sigma_t, g in media:
-        once = sigma_s if cosine is None else sigma_s * eval_hg(cosine, g)
-        found.append(dr.select(order == 1, once, 1) * dr.exp(-sigma_t * way))
-    return _spectrum(found)
-
-
-def _pick(values: Any, weights: Any, u: Any) -> Any:
-    """The value of a channel drawn by its weight, for a uniform number."""
-    u, value = u * dr.sum(weights), values[0]
-    for k in range(1, len(values)):
-        u = u - weights[k - 1]
-        value = dr.select(u >= 0, values[k], value)
-    return value
-
-
-def _spectrum(values: list[Any]) -> Any:
-    return mi.Spectrum(*values) if len(values) > 1 else mi.Spectrum(values[0])

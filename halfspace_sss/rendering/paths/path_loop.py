@@ -1,16 +1,24 @@
-"""The path loop of the integrator: surfaces by their BSDFs, and inside the translucent ones by the BSSRDF."""
+"""The path loop of the integrator `bssrdf`: a path tracer whose paths enter translucent objects through their BSSRDF.
+
+At every vertex, as in Mitsuba's `prb_volpath`: emission with its MIS weight, choice of an event, next-event estimation,
+throughput, Russian roulette. At a translucent object the events are reflection, the scattering orders below two
+(`low_orders`), and all others by the BSSRDF of the object. In a replay (`path_tally`) what decides where the path goes
+is `detached` from what its light is multiplied with.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
 
-from halfspace_sss.rendering.paths.lighting import Books, Replay, Tally, World, balance, delta_light, sampled_light
-from halfspace_sss.rendering.paths.low_orders import Leg, few_orders
+from halfspace_sss.rendering.paths.lighting import RenderContext, delta_light, mis_weight, sample_emitter
+from halfspace_sss.rendering.paths.low_orders import RefractedRay, sample_low_orders
+from halfspace_sss.rendering.paths.path_tally import PathTally, Primal, Replay
 from halfspace_sss.rendering.surface.derivatives import detached, tracking
 from halfspace_sss.rendering.surface.horizon import lifted
 from halfspace_sss.rendering.surface.object import turned
@@ -18,226 +26,484 @@ from halfspace_sss.rendering.transport.body import Body
 from halfspace_sss.rendering.transport.plane import Exit, number, place
 from halfspace_sss.rendering.transport.settings import Settings
 
-__all__ = [
-    "Candidate",
-    "Choice",
-    "Onward",
-    "Vertex",
-    "choose",
-    "emitted",
-    "entering_light",
-    "exit_at",
-    "few",
-    "multiple",
-    "nothing",
-    "replay_paths",
-    "surface",
-    "trace_paths",
-    "vertex",
-]
-
-
-# ---- Choice of event at a translucent surface ----------------------------------------------------------------------
+__all__ = ["exit_at", "replay_paths", "trace_paths"]
 
 LEAST_REFLECTION = 0.05  # probability of reflection where there is light to come; Fresnel's is 0.04 face on
-LEAST_FEW, MOST_FEW = 0.03, 0.95
-FEW_BOOST = 2.0  # as its light varies more from one walk to the next
+LEAST_LOW, MOST_LOW = 0.03, 0.95  # probability of orders below two
+LOW_BOOST = 2.0  # as their light varies more from one sample to the next
 LEAST_PASSING = 0.3  # of T, where order 0 does not count: reflected back, a walk may be scattered yet
 
 
-class Choice(NamedTuple):
-    """At a point of a body: probability of reflection and, of the events inside, of orders below two; their way in."""
-
-    reflection: Any
-    few: Any
-    leg: Leg
+# ---- Loop state ------------------------------------------------------------------------------------------------------
 
 
-def choose(body: Body, si: Any, active: Any) -> Choice:
-    """Probabilities of the events.
+@dataclass
+class PreviousVertex:
+    """What the MIS weight of emission needs to know of the vertex before."""
+
+    p: mi.Point3f
+    n: mi.Normal3f  # geometric
+    pdf: mi.Float  # density of the sampled direction, 1/sr; 1 for the only one, 0 if no emission counts
+    emitter_share: mi.Float  # share of directions that next-event estimation drew, 1 for a second sample, 0 for none
+    sky_only: mi.Bool  # emitter connections have counted all emission but that of the sky beside its suns
+    emitter_distance: mi.Float  # of the emitter that the direction was drawn for, alone counted; < 0: any direction
+    mirrored: mi.Bool  # the direction was the only one, so that next-event estimation had none
+
+
+@dataclass
+class NextVertex:
+    """Where a path goes on: the ray that leaves a vertex, and what it is worth."""
+
+    previous: PreviousVertex  # the origin of the ray
+    d: mi.Vector3f  # direction of the ray
+    weight: mi.Spectrum  # factor of the throughput: value * cosine / density
+    scattered: mi.Bool  # the direction was one of many
+
+
+@dataclass
+class PathState:
+    """Loop variables of a path from the camera."""
+
+    ray: mi.Ray3f  # from the previous vertex
+    tally: PathTally  # radiance so far and its derivative; in a replay radiance still to come
+    throughput: mi.Spectrum  # product of the weights of all vertices
+    previous: PreviousVertex
+    depth: mi.UInt32  # vertices so far
+    scattered: mi.Bool  # whether a vertex had more than one direction
+    second_pass: mi.Bool  # traces the orders below two of the first object, from the camera again
+    needs_second: mi.Bool  # whether the first vertex is on an object that has orders below two beside others
+    L_first: mi.Spectrum  # the tally at the end of the first pass
+    hit: mi.Bool  # whether the camera ray meets anything
+    active: mi.Bool
+
+
+def trace_paths(
+    scene: mi.Scene, objects: list[Body], settings: Settings, sampler: mi.Sampler, ray: mi.Ray3f, active: mi.Bool
+) -> tuple[tuple[mi.Spectrum, mi.Spectrum], mi.Bool]:
+    """Radiance along a camera ray in two parts for a replay, and whether the ray hits anything.
+
+    The second part is light of orders below two of the object that the ray meets first.
+    """
+    context = RenderContext.of(scene, objects, settings, Primal())
+    L, _, hit = _loop(context, sampler, ray, (mi.Spectrum(0), mi.Spectrum(0)), (), active)
+    return L, hit
+
+
+def replay_paths(
+    scene: mi.Scene, objects: list[Body], settings: Settings, sampler: mi.Sampler, ray: mi.Ray3f,
+    L: tuple[mi.Spectrum, mi.Spectrum], d: mi.Spectrum | None, backward: bool,
+) -> mi.Spectrum:  # fmt: skip
+    """The derivative of the radiance of traced paths.
+
+    Args:
+        sampler: as it was before the paths were traced.
+        ray: rays of the paths.
+        L: radiance of the paths, in two parts.
+        d: backward: adjoint of the radiance, which is handed on to the parameters of the scene.
+        backward: otherwise the derivative of the radiance is returned, for the derivatives that the parameters carry.
+    """
+    context = RenderContext.of(scene, objects, settings, Replay(backward))
+    return _loop(context, sampler, ray, L, mi.Spectrum(0 if d is None else d), mi.Bool(True))[1]
+
+
+# ---- The loop --------------------------------------------------------------------------------------------------------
+
+
+def _loop(
+    context: RenderContext, sampler: mi.Sampler, camera_ray: mi.Ray3f, L: tuple[mi.Spectrum, mi.Spectrum],
+    derivative: mi.Spectrum | tuple[()], active: mi.Bool,
+) -> tuple[tuple[mi.Spectrum, mi.Spectrum], mi.Spectrum | tuple[()], mi.Bool]:  # fmt: skip
+    """All vertices of a path, in one or two passes: L, its derivative, and whether the camera ray hits anything.
+
+    Where the first vertex is on an object with orders below two beside others, the path begins there a second time for
+    the orders below two: the choice between both was most of the variance under a sky.
+    """
+    scene, settings, mode = context.scene, context.settings, context.mode
+    camera_ray = mi.Ray3f(camera_ray)
+    max_depth = 0xFFFFFFFF if settings.max_depth < 0 else settings.max_depth
+
+    def step(sampler: mi.Sampler, path: PathState) -> tuple[mi.Sampler, PathState]:
+        # ---- intersection
+        first, active = path.depth == 0, path.active
+        si = scene.ray_intersect(path.ray, mi.RayFlags.All, first, active)
+
+        # ---- emission, with its MIS weight against next-event estimation at the previous vertex
+        with tracking(mode.tracks):
+            shown = ~first if settings.hide_emitters else mi.Bool(True)
+            counts = active & ~(first & path.second_pass)
+            L_e = emission(context, sampler, path.ray, si, path.previous, shown, path.scattered, counts)
+            tally = mode.add(path.tally, path.throughput * L_e)
+        hit = path.hit | (first & si.is_valid())
+        active = active & si.is_valid() & (path.previous.emitter_distance < 0) & (path.depth + 1 < max_depth)
+        needs_second = path.needs_second | (active & first & _on_splitting(context, si))
+
+        # ---- event: its next-event estimation goes to the tally, its ray to the next vertex
+        vertex = Vertex(si, path.ray, path.throughput, first & path.second_pass, first & ~path.second_pass,
+                        path.scattered, active)  # fmt: skip
+        following, tally = sample_event(context, sampler, vertex, tally)
+        throughput = dr.select(active, path.throughput * following.weight, path.throughput)
+
+        # ---- Russian roulette by the throughput
+        largest = dr.max(throughput)
+        active = active & (largest > 0)
+        depth = dr.select(active, path.depth + 1, path.depth)
+        survival = dr.select(depth >= settings.rr_depth, dr.minimum(largest, 0.95), 1.0)
+        active = active & (sampler.next_1d() < survival)
+        throughput = throughput / survival
+        origin = place(following.previous.p, following.previous.n)
+        ray = dr.select(active, origin.spawn_ray(following.d), path.ray)
+
+        # ---- second pass: from the camera again, where the first pass has ended
+        again = ~active & needs_second & ~path.second_pass
+        return sampler, PathState(
+            ray=dr.select(again, camera_ray, ray),
+            tally=PathTally(dr.select(again, L[1], tally.L), tally.derivative),
+            throughput=dr.select(again, mi.Spectrum(1), throughput),
+            previous=dr.select(again, _camera_vertex(), following.previous),
+            depth=dr.select(again, mi.UInt32(0), depth),
+            scattered=(path.scattered | following.scattered) & ~again,
+            second_pass=path.second_pass | again,
+            needs_second=needs_second,
+            L_first=dr.select(again, tally.L, path.L_first),
+            hit=hit,
+            active=active | again,
+        )
+
+    start = PathState(
+        camera_ray, PathTally(L[0], derivative), mi.Spectrum(1), _camera_vertex(), mi.UInt32(0), mi.Bool(False),
+        mi.Bool(False), mi.Bool(False), mi.Spectrum(0), mi.Bool(False), mi.Bool(active),
+    )  # fmt: skip
+    with detached():
+        _, path = dr.while_loop((sampler, start), lambda sampler, path: path.active, step, label="bssrdf")
+    two = path.second_pass
+    parts = dr.select(two, path.L_first, path.tally.L), dr.select(two, path.tally.L, 0)
+    return parts, path.tally.derivative, path.hit
+
+
+def _camera_vertex() -> PreviousVertex:
+    """The camera: all emission counts."""
+    return replace(_path_end().previous, pdf=mi.Float(1))
+
+
+def _path_end() -> NextVertex:
+    """No next vertex."""
+    zero, no = mi.Float(0), mi.Bool(False)
+    previous = PreviousVertex(mi.Point3f(0), mi.Normal3f(0), zero, mi.Float(0), no, mi.Float(-1), mi.Bool(False))
+    return NextVertex(previous, mi.Vector3f(0), mi.Spectrum(0), mi.Bool(False))
+
+
+def _on_splitting(context: RenderContext, si: mi.SurfaceInteraction3f) -> mi.Bool:
+    """Whether a point is on an object with orders below two beside others."""
+    on_one = mi.Bool(False)
+    for obj in context.objects:
+        if obj.splits:
+            on_one |= si.shape == mi.ShapePtr(obj.found.shape)
+    return on_one
+
+
+# ---- Emission --------------------------------------------------------------------------------------------------------
+
+
+def emission(
+    context: RenderContext, sampler: mi.Sampler, ray: mi.Ray3f, si: mi.SurfaceInteraction3f, previous: PreviousVertex,
+    shown: mi.Bool, scattered: mi.Bool, active: mi.Bool,
+) -> mi.Spectrum:  # fmt: skip
+    """Emitted light where a ray arrives, with its MIS weight against next-event estimation at the previous vertex.
+
+    Emitters count where they are `shown`; delta lights behind a mirror if the path has `scattered` before.
+    """
+    with detached():
+        emitter, mirrored = si.emitter(context.scene, active), active & previous.mirrored & scattered
+        active = active & shown & (emitter != None)  # noqa: E711
+        active &= ~(previous.sky_only & context.sampled_by_nee(emitter, ray.d))
+        # a direction drawn for one emitter counts that emitter only: at its distance
+        distance = previous.emitter_distance
+        there = dr.select(si.is_valid(), dr.abs(si.t - distance) < 1e-3 * distance, distance == dr.inf)
+        active &= (distance < 0) | there
+        origin = place(previous.p, previous.n)
+        ds = mi.DirectionSample3f(context.scene, si, origin)
+        share = previous.emitter_share
+        pdf_emitter = share * context.scene.pdf_emitter_direction(origin, ds, active & (share > 0))
+        weight = mis_weight(previous.pdf, pdf_emitter)
+    light = dr.select(active, weight * emitter.eval(si, active), 0)
+    return light + delta_light(context, sampler, ray, mirrored)[1] if context.lights.some_delta else light
+
+
+# ---- Events at a vertex ----------------------------------------------------------------------------------------------
+
+
+class Vertex(NamedTuple):
+    """A surface point of a path, and what it has brought there."""
+
+    si: mi.SurfaceInteraction3f
+    ray: mi.Ray3f
+    throughput: mi.Spectrum
+    low_only: mi.Bool  # first vertex of the second pass: orders below two only
+    others_only: mi.Bool  # first vertex of the first pass: no orders below two, where the object has a second pass
+    scattered: mi.Bool
+    active: mi.Bool
+
+
+class EventChoice(NamedTuple):
+    """Probabilities of the events at a point of an object."""
+
+    reflection: mi.Float
+    low_orders: mi.Float  # among the events inside
+    refracted: RefractedRay
+
+
+class Taken(NamedTuple):
+    """Whether a path goes on outside, the probability of that, and a uniform number for the events inside."""
+
+    outside: mi.Bool
+    probability: mi.Float
+    u: mi.Float
+
+
+def sample_event(
+    context: RenderContext, sampler: mi.Sampler, at: Vertex, tally: PathTally
+) -> tuple[NextVertex, PathTally]:
+    """One event: the BSDF of a surface, or at an object one of reflection, orders below two and the BSSRDF."""
+    # ---- probabilities of the events
+    choices = []
+    with detached():
+        for obj in context.objects:
+            here = at.active & (at.si.shape == mi.ShapePtr(obj.found.shape))
+            choice = choose_event(obj, at.si, here)
+            if obj.splits:
+                low = dr.select(at.low_only, mi.Float(1), dr.select(at.others_only, 0, choice.low_orders))
+                choice = choice._replace(low_orders=low, reflection=dr.select(at.low_only, 0, choice.reflection))
+            choices.append((obj, here, choice))
+
+    # ---- light that is known without sampling, then BSDF or reflection
+    tally = _add_sky_means(context, sampler, at, tally, choices)
+    tally = _add_gathered(context, sampler, at, tally, choices)
+    following, tally, taken = _scatter_outside(context, sampler, at, tally, choices)
+
+    # ---- events inside each object
+    probability, events = taken.probability, []
+    for obj, here, choice in choices:
+        inside = here & ~taken.outside
+        low = inside & (taken.u < choice.low_orders)
+        chance = dr.select(low, choice.low_orders, 1 - choice.low_orders)
+        probability = dr.select(inside, probability * chance, probability)
+        if obj.transport is not None:
+            more = inside & ~low
+            out, face = choice.refracted.out, at.si.prim_index
+            events.append((more, partial(bssrdf_event, context, obj, out, face, sampler, more)))
+        if obj.few:
+            events.append((low, partial(low_order_event, context, obj, choice.refracted, sampler, at.scattered, low)))
+    for mask, event in events:
+
+        def below(
+            _: NextVertex, tally: PathTally, mask: mi.Bool = mask, event: Callable = event
+        ) -> tuple[NextVertex, PathTally]:
+            new, direct = event()
+            light = at.throughput / probability * direct
+            return new, context.mode.settle(tally, light, new.weight, mask, mi.Spectrum(0))
+
+        following, tally = _where(context, sampler, mask, (following, tally), below)
+    return replace(following, weight=following.weight / probability), tally
+
+
+def choose_event(obj: Body, si: mi.SurfaceInteraction3f, active: mi.Bool) -> EventChoice:
+    """Probabilities of the events by the light that is expected of each.
 
     With T the mean transmittance along the refracted ray to the other side, R_1 and R_2 the reflectances of the
     half-space by single scattering and more, and albedo a, the expected light is T of order 0,
     (1 - T) (R_1 + (a - R_1) T) of order 1 and (1 - T) R_2 of the rest.
     """
-    out = exit_at(body, si)
+    # ---- the ray refracted into the object
+    out = exit_at(obj, si)
     mu = dr.dot(out.w, out.n)
-    F, mu_in, _, into = mi.fresnel(dr.maximum(mu, 0), body.eta)
-    along = mi.Vector3f(dr.normalize(-into * out.w + out.n * (into * mu - dr.abs(mu_in))))
-    valid = active & (mu > 0) & (dr.dot(along, out.n_face) < 0)
-    reflection = dr.clip(F, LEAST_REFLECTION, 0.95) if body.surface.inside.reflection else mi.Float(0)
-    if not body.few:
-        return Choice(reflection, mi.Float(0), Leg(out, along, 1 - F, valid, mi.Float(0)))
-    T = _transmittance(body, out, along, valid)
-    expected = body.expected
-    passing = T if 0 in body.few else LEAST_PASSING * T
-    albedo, single, multiple = (number(v) for v in (expected.albedo, expected.single, expected.multiple))
-    scattered = FEW_BOOST * (1 - T) * (single + (albedo - single) * T)
+    F, mu_in, _, into = mi.fresnel(dr.maximum(mu, 0), obj.eta)
+    d = mi.Vector3f(dr.normalize(-into * out.w + out.n * (into * mu - dr.abs(mu_in))))
+    valid = active & (mu > 0) & (dr.dot(d, out.n_face) < 0)
+
+    # ---- probabilities
+    reflection = dr.clip(F, LEAST_REFLECTION, 0.95) if obj.surface.inside.reflection else mi.Float(0)
+    if not obj.few:
+        return EventChoice(reflection, mi.Float(0), RefractedRay(out, d, 1 - F, valid, mi.Float(0)))
+    T = _transmittance(obj, out, d, valid)
+    passing = T if 0 in obj.few else LEAST_PASSING * T
+    albedo, single, multiple = (number(v) for v in (obj.expected.albedo, obj.expected.single, obj.expected.multiple))
+    scattered = LOW_BOOST * (1 - T) * (single + (albedo - single) * T)
     both = passing + scattered
-    few = mi.Float(1)
-    if body.transport is not None:
-        few = dr.clip(both / dr.maximum(both + (1 - T) * multiple, 1e-20), LEAST_FEW, MOST_FEW)
+    low = mi.Float(1)
+    if obj.transport is not None:
+        low = dr.clip(both / dr.maximum(both + (1 - T) * multiple, 1e-20), LEAST_LOW, MOST_LOW)
     passing = dr.select(both > 0, passing / dr.maximum(both, 1e-20), 1)
-    return Choice(reflection, few, Leg(out, along, 1 - F, valid, passing))
+    return EventChoice(reflection, low, RefractedRay(out, d, 1 - F, valid, passing))
 
 
-def _transmittance(body: Body, out: Exit, along: Any, active: Any) -> Any:
+def _transmittance(obj: Body, out: Exit, d: mi.Vector3f, active: mi.Bool) -> mi.Float:
     """To the other side, mean over channels; light of the path does not count, as choices hold in derivatives."""
-    ray = place(out.p, out.n_face).spawn_ray(along)
-    wall = body.found.scene.ray_intersect(ray, mi.RayFlags.Minimal, False, active)
+    ray = place(out.p, out.n_face).spawn_ray(d)
+    wall = obj.found.scene.ray_intersect(ray, mi.RayFlags.Minimal, False, active)
     T = mi.Float(0)
-    for m in body.media:
-        T = T + dr.exp(-number(m.sigma_t) * wall.t) / len(body.media)
+    for medium in obj.media:
+        T = T + dr.exp(-number(medium.sigma_t) * wall.t) / len(obj.media)
     return dr.select(active & wall.is_valid(), T, 0)
 
 
-def exit_at(body: Body, si: Any) -> Exit:
+def exit_at(obj: Body, si: mi.SurfaceInteraction3f) -> Exit:
     """The exit of light towards `si.wi`, with the normal that points outwards, as `si.wi` sees it."""
     w, n_face = si.to_world(si.wi), mi.Normal3f(si.n)
-    sign = body.found.side(si.prim_index)
-    if not body.found.closed:  # a sheet is a half-space from both sides
+    sign = obj.found.side(si.prim_index)
+    if not obj.found.closed:  # a sheet is a half-space from both sides
         sign = dr.select(dr.dot(n_face, w) > 0, 1.0, -1.0)
     n = lifted(turned(si.sh_frame.n, n_face), n_face, w)
     return Exit(mi.Point3f(si.p), n * sign, w, sign, n_face * sign)
 
 
-# ---- BSSRDF: entry points by resampled importance sampling ---------------------------------------------------------
+def _where(context: RenderContext, sampler: mi.Sampler, mask: mi.Bool, otherwise: tuple, event: Callable) -> tuple:
+    """`event(*otherwise)` where the mask holds, elsewhere `otherwise`.
 
+    An event that no neighbouring lane asks for is not computed. Derivatives do not leave the event.
+    """
 
-class _Exit(NamedTuple):
-    """An exit, its face, and what transport and proposals have made of it."""
+    def happens(sampler: mi.Sampler, otherwise: tuple) -> tuple:
+        with tracking(context.mode.tracks):
+            return sampler, dr.detach(tuple(event(*otherwise)))
 
-    out: Exit
-    prim_index: Any
-    prepared: Any
-    where: Any
-
-
-class Candidate(NamedTuple):
-    """An entry with a direction of light."""
-
-    p: Any
-    n: Any
-    d: Any
-    value: Any  # spectrum: S mu_i over the density
-    pdf: Any  # of d
-    aim: Any  # distance of the emitter that d was sampled for; negative: d goes anywhere
-    delta: Any  # whether no ray can hit that emitter
-    target: Any  # point of it
-    light: Any  # spectrum: its light over the density, where delta
-    hope: Any  # that it is chosen by
-    aims: Any  # whether d is drawn by emitters, where there is an entry
-    sky: Any  # weight of d among the ways to draw directions of the sky
-
-
-def entering_light(world: World, body: Body, out: Exit, prim_index: Any, sampler: Any, active: Any) -> Candidate:
-    """One entry for light that leaves at `out`, drawn among as many as the settings or the model say."""
     with detached():
-        prepared = body.transport.prepare(out, active)
-        where = body.proposals.prepare(out, prepared, active)
-
-    def draw(aims: Any = None) -> Candidate:
-        return _candidate(world, body, _Exit(out, prim_index, prepared, where), aims, sampler, active)
-
-    n, kept = world.entries(body), draw()
-    if n == 1:
-        return kept
-    total = dr.detach(kept.hope)
-    for _ in range(n - 1):
-        other = draw(kept.aims)
-        total = total + dr.detach(other.hope)
-        take = sampler.next_1d() * total < dr.detach(other.hope)
-        kept = Candidate(*(dr.select(take, a, b) for a, b in zip(other, kept)))
-    hope = dr.detach(kept.hope)
-    return kept._replace(value=kept.value * dr.select(hope > 0, total / (n * dr.maximum(hope, 1e-30)), 0))
+        return dr.if_stmt((sampler, otherwise), mask, happens, lambda s, other: (s, other))[1]
 
 
-def _candidate(world: World, body: Body, exit: _Exit, aims: Any, sampler: Any, active: Any) -> Candidate:
-    share, proposals = world.lights.share, body.proposals
-    with detached():
-        entry = proposals.sample(exit.out, exit.prim_index, exit.where, sampler, active)
-        active = active & (entry.weight > 0)
-        d, pdf = proposals.sample_direction(entry, exit.out, sampler.next_2d())
-        at, pdf, aim = place(entry.p, entry.n), (1 - share) * pdf, mi.Float(-1)
-    delta, target, light, bright = mi.Bool(False), mi.Point3f(0), mi.Spectrum(0), mi.Float(1)
-    sky = mi.Float(1) if world.evens(body) else mi.Float(0)
-    aims = mi.Bool(False) if share == 0 else sampler.next_1d() < share if aims is None else aims
-    if share > 0:
-        by_emitter = active & aims
-        ds, light = sampled_light(world, at, sampler.next_2d(), False, by_emitter)
+# ---- Light known without sampling: alpha c of the sky, gathered light ------------------------------------------------
+
+
+def _add_sky_means(
+    context: RenderContext, sampler: mi.Sampler, at: Vertex, tally: PathTally, choices: list
+) -> PathTally:
+    """Adds alpha c of each object, which the events inside leave out, see `lighting.Sky`."""
+    for obj, here, choice in choices:
+        if not context.uses_sky(obj):
+            continue
+
+        def known(
+            tally: PathTally, obj: Body = obj, here: mi.Bool = here, out: Exit = choice.refracted.out
+        ) -> tuple[PathTally]:
+            low, others = obj.transport.alpha(out, here)
+            low = dr.select(at.others_only, 0, low) if obj.few else mi.Spectrum(0)
+            light = (low + dr.select(at.low_only, 0, others)) * context.sky.mean
+            return (context.mode.add(tally, at.throughput * light),)
+
+        (tally,) = _where(context, sampler, here, (tally,), known)
+    return tally
+
+
+def _add_gathered(
+    context: RenderContext, sampler: mi.Sampler, at: Vertex, tally: PathTally, choices: list
+) -> PathTally:
+    """Adds what leaves each object by light that was gathered, see `gathering`."""
+    for obj, here, choice in choices:
+        if obj.gathered is None:
+            continue
+
+        def known(
+            tally: PathTally, obj: Body = obj, here: mi.Bool = here, out: Exit = choice.refracted.out
+        ) -> tuple[PathTally]:
+            return (context.mode.add(tally, at.throughput * obj.gathered.radiance(out, here)),)
+
+        (tally,) = _where(context, sampler, here, (tally,), known)
+    return tally
+
+
+# ---- BSDFs, and reflection at the boundary of an object --------------------------------------------------------------
+
+
+def _scatter_outside(
+    context: RenderContext, sampler: mi.Sampler, at: Vertex, tally: PathTally, choices: list
+) -> tuple[NextVertex, PathTally, Taken]:
+    """The BSDF. At an object, emission that it mirrors is added whatever is chosen, as highlights are bright.
+
+    The path goes on from there if the mirrored ray meets a surface and reflection is chosen.
+    """
+    u_event = sampler.next_1d()
+    inside, glossy, reflection = mi.Bool(False), mi.Bool(False), mi.Float(0)
+    for obj, here, choice in choices:
+        inside |= here
+        reflection = dr.select(here, choice.reflection, reflection)
+        if obj.surface.inside.reflection:
+            glossy |= here & ~at.low_only
+    plain = at.active & ~inside
+
+    def scatter(_: NextVertex, __: mi.Bool, tally: PathTally) -> tuple:
+        u = sampler.next_2d(), sampler.next_1d(), sampler.next_2d()
         with detached():
-            delta, target = by_emitter & ds.delta, mi.Point3f(ds.p)
-            if world.evens(body):
-                of_sky = share * world.sky.density(world.scene, at, d, active & ~aims)
-                sky = dr.select(by_emitter, dr.select(ds.emitter.is_environment(), 1, 0), balance(pdf, of_sky))
-            by_model = proposals.pdf_direction(entry, exit.out, ds.d)
-            d = dr.select(by_emitter, ds.d, d)
-            pdf = dr.select(by_emitter, share * ds.pdf + dr.select(ds.delta, 0, (1 - share) * by_model), pdf)
-            far = dr.select(ds.emitter.is_environment(), dr.inf, ds.dist)
-            aim = dr.select(by_emitter, far, aim)
-            active = active & (pdf > 0)
-            bright = dr.select(by_emitter, dr.max(light) * dr.select(ds.delta, 1, ds.pdf), 1)
-    S_mu = body.transport.S_mu(exit.prepared, entry, d, active)
-    value = dr.select(active, S_mu * (entry.weight / dr.maximum(pdf, 1e-8)), 0)
-    hope = dr.detach(dr.max(value)) * bright
-    p, n = mi.Point3f(entry.p), mi.Normal3f(entry.n)
-    return Candidate(p, n, d, value, pdf, aim, delta, target, light, hope, aims, sky)
+            following, direct = bsdf_event(context, u, at.ray, at.si, plain | glossy)
+        shown, meets, tally = _add_mirrored(context, sampler, following, at, tally, glossy)
+        reflects = glossy & meets & (u_event < reflection)
+        if context.mode.tracks:  # again: no derivatives may be pending while others are passed on
+            following, direct = bsdf_event(context, u, at.ray, at.si, plain | glossy)
+        tally = context.mode.settle(tally, at.throughput * direct, following.weight, plain | reflects, shown)
+        return following, meets, tally
+
+    nothing = (_path_end(), mi.Bool(False), tally)
+    following, meets, tally = _where(context, sampler, plain | glossy, nothing, scatter)
+    reflection = dr.select(glossy & meets, reflection, 0)
+    # emission that a mirrored ray meets has been added
+    unlit = replace(following.previous, pdf=mi.Float(0), emitter_share=mi.Float(0), mirrored=mi.Bool(False))
+    outside = plain | (u_event < reflection)
+    following = replace(following, previous=dr.select(glossy, unlit, following.previous),
+                        weight=dr.select(outside, following.weight, 0))  # fmt: skip
+    probability = dr.select(plain, 1, dr.select(outside, reflection, 1 - reflection))
+    u = dr.select(outside, 0, (u_event - reflection) / dr.maximum(1 - reflection, 1e-6))
+    return following, tally, Taken(outside, probability, u)
 
 
-# ---- Events at a vertex --------------------------------------------------------------------------------------------
+def _add_mirrored(
+    context: RenderContext, sampler: mi.Sampler, reflected: NextVertex, at: Vertex, tally: PathTally, active: mi.Bool
+) -> tuple[mi.Spectrum, mi.Bool, PathTally]:
+    """Adds emission that an object mirrors.
+
+    Returns:
+        Emission over the weight of the reflection, whether the ray meets a surface, and the tally.
+    """
+
+    def look(_: mi.Spectrum, __: mi.Bool, tally: PathTally) -> tuple[mi.Spectrum, mi.Bool, PathTally]:
+        origin = reflected.previous
+        ray = place(origin.p, origin.n).spawn_ray(reflected.d)
+        si = context.scene.ray_intersect(ray, mi.RayFlags.All, False, active)
+        L_e = emission(context, sampler, ray, si, origin, mi.Bool(True), at.scattered, active)
+        light = at.throughput * L_e
+        return light, active & si.is_valid(), context.mode.add(tally, reflected.weight * light)
+
+    return _where(context, sampler, active, (mi.Spectrum(0), mi.Bool(False), tally), look)
 
 
-class Onward(NamedTuple):
-    """Where a path goes on after a vertex: the point it leaves from, the direction, and what that is worth."""
-
-    p: Any
-    n: Any
-    d: Any
-    weight: Any  # spectrum
-    pdf: Any
-    emitter_share: Any  # of directions sampled by emitters at the vertex, 1 for a second sample beside d; for weights
-    sky_only: Any  # all emitters but the environment, and its suns, have been counted
-    aim: Any  # distance of the emitter that d was sampled for, and nothing else counts; negative: d goes anywhere
-    mirrored: Any  # d was the only direction, so that emitter sampling had none
-    scattered: Any  # it was not
-
-    @property
-    def previous(self) -> tuple:
-        """What the next vertex has to know of this one, see `vertex.emitted`."""
-        return self.p, self.n, self.pdf, self.emitter_share, self.sky_only, self.aim, self.mirrored
-
-
-def nothing() -> Onward:
-    """A path that ends."""
-    zero = mi.Float(0)
-    return Onward(
-        mi.Point3f(0), mi.Normal3f(0), mi.Vector3f(0), mi.Spectrum(0), zero, zero, mi.Bool(False), mi.Float(-1),
-        mi.Bool(False), mi.Bool(False),
-    )  # fmt: skip
-
-
-def surface(world: World, u: tuple[Any, Any, Any], ray: Any, si: Any, active: Any) -> tuple[Onward, Any]:
-    """A direction sampled by the BSDF, and light sampled by emitters, for uniform numbers u: a pair, one, a pair."""
+def bsdf_event(
+    context: RenderContext, u: tuple[mi.Point2f, mi.Float, mi.Point2f], ray: mi.Ray3f, si: mi.SurfaceInteraction3f,
+    active: mi.Bool,
+) -> tuple[NextVertex, mi.Spectrum]:  # fmt: skip
+    """BSDF sampling and next-event estimation, weighted against each other by the balance heuristic."""
+    # ---- next-event estimation
     bsdf, ctx = si.bsdf(ray), mi.BSDFContext()
     smooth = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-    ds, light = sampled_light(world, si, u[0], True, smooth)
+    ds, light = sample_emitter(context, si, u[0], True, smooth)
     smooth &= ds.pdf != 0
     value, pdf = bsdf.eval_pdf(ctx, si, si.to_local(ds.d), smooth)
-    share = dr.select(ds.delta, 1, balance(ds.pdf, dr.detach(pdf)))
-    direct = mi.Spectrum(dr.select(smooth, value * light * share, 0))
+    weight = dr.select(ds.delta, 1, mis_weight(ds.pdf, dr.detach(pdf)))
+    direct = mi.Spectrum(dr.select(smooth, value * light * weight, 0))
+
+    # ---- BSDF sampling
     bs, weight = bsdf.sample(ctx, si, u[1], u[2], active)
-    if world.books.tracks:
+    if context.mode.tracks:
         weight = _differentiable(bsdf, ctx, si, bs, weight, active)
     bs = dr.detach(bs)
     delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-    on = Onward(
-        mi.Point3f(si.p), mi.Normal3f(si.n), si.to_world(bs.wo), weight, dr.select(delta, 1, bs.pdf),
-        dr.select(delta, mi.Float(0), 1), mi.Bool(False), mi.Float(-1), delta, ~delta,
+    previous = PreviousVertex(
+        mi.Point3f(si.p), mi.Normal3f(si.n), dr.select(delta, 1, bs.pdf), dr.select(delta, mi.Float(0), 1),
+        mi.Bool(False), mi.Float(-1), delta,
     )  # fmt: skip
-    return on, direct
+    return NextVertex(previous, si.to_world(bs.wo), weight, ~delta), direct
 
 
-def _differentiable(bsdf: Any, ctx: Any, si: Any, bs: Any, weight: Any, active: Any) -> Any:
+def _differentiable(
+    bsdf: mi.BSDFPtr, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, bs: mi.BSDFSample3f, weight: mi.Spectrum,
+    active: mi.Bool,
+) -> mi.Spectrum:  # fmt: skip
     """The weight of a sampled direction with the derivative of the BSDF there, the density held.
 
     A delta lobe has no value to ask for: its weight times the probability of the lobe has the derivative.
@@ -250,313 +516,147 @@ def _differentiable(bsdf: Any, ctx: Any, si: Any, bs: Any, weight: Any, active: 
     return dr.replace_grad(dr.detach(weight), dr.select(delta, lobe, value))
 
 
-def multiple(world: World, body: Body, out: Exit, face: Any, sampler: Any, active: Any) -> tuple[Onward, Any]:
-    """Light that entered the body elsewhere and comes out here by its model, and what is seen of point lights so.
+# ---- Scattering orders below two -------------------------------------------------------------------------------------
 
-    Where the body is known under the mean light of the sky, that is left out, see `sky`.
+
+def low_order_event(
+    context: RenderContext, obj: Body, refracted: RefractedRay, sampler: mi.Sampler, scattered: mi.Bool, active: mi.Bool
+) -> tuple[NextVertex, mi.Spectrum]:
+    """Light that was scattered at most once inside, and emitter connections of that event; c taken off as below."""
+    sample = sample_low_orders(context, obj, refracted, sampler, scattered, active)
+    zero, no = mi.Float(0), mi.Bool(False)
+    previous = PreviousVertex(sample.p, sample.n, mi.Float(1), zero, sample.connected, mi.Float(-1), no)
+    direct = sample.direct
+    if context.uses_sky(obj):
+        direct = direct - sample.weight * context.sky_means(obj)[0]
+    return NextVertex(previous, sample.d, sample.weight, mi.Bool(sample.once)), direct
+
+
+# ---- BSSRDF: light that entered the object elsewhere -----------------------------------------------------------------
+
+
+def bssrdf_event(
+    context: RenderContext, obj: Body, out: Exit, face: mi.UInt32, sampler: mi.Sampler, active: mi.Bool
+) -> tuple[NextVertex, mi.Spectrum]:
+    """Light that entered elsewhere and leaves at `out` by the transport of the object.
+
+    Delta lights are its next-event estimation. c of `lighting.Sky` is taken off where `_add_sky_means` has added it.
     """
-    found = entering_light(world, body, out, face, sampler, active)
-    direct = -found.value * found.sky * world.even(body)[1] if world.evens(body) else mi.Spectrum(0)
-    if world.lights.some_delta:
-        shadow = place(found.p, found.n).spawn_ray_to(found.target)
-        seen = found.delta & ~world.scene.ray_test(shadow, False, found.delta)
-        direct = direct + dr.select(seen, found.value * found.light, 0)
-    anywhere = found.aim < 0
-    on = Onward(
-        found.p, found.n, found.d, dr.select(found.delta, 0, found.value), dr.select(anywhere, found.pdf, 1),
-        dr.select(anywhere, mi.Float(world.lights.share), 0), mi.Bool(False), found.aim, mi.Bool(False), mi.Bool(True),
+    entry = resample_entry(context, obj, out, face, sampler, active)
+    direct = mi.Spectrum(0)
+    if context.uses_sky(obj):
+        direct = -entry.weight * entry.sky_weight * context.sky_means(obj)[1]
+    if context.lights.some_delta:
+        shadow = place(entry.p, entry.n).spawn_ray_to(entry.emitter_point)
+        lit = entry.delta & ~context.scene.ray_test(shadow, False, entry.delta)
+        direct = direct + dr.select(lit, entry.weight * entry.light, 0)
+    anywhere, no = entry.emitter_distance < 0, mi.Bool(False)
+    previous = PreviousVertex(
+        entry.p, entry.n, dr.select(anywhere, entry.pdf, 1),
+        dr.select(anywhere, mi.Float(context.lights.nee_share), 0), no, entry.emitter_distance, mi.Bool(False),
     )  # fmt: skip
-    return on, direct
+    return NextVertex(previous, entry.d, dr.select(entry.delta, 0, entry.weight), mi.Bool(True)), direct
 
 
-def few(world: World, body: Body, leg: Leg, sampler: Any, scattered: Any, active: Any) -> tuple[Onward, Any]:
-    """Light that was scattered at most once inside the body, and that of emitters that came the same way.
+@dataclass
+class Candidate:
+    """A candidate of resampling: a point of entry with a direction of incidence."""
 
-    The mean light of the sky as in `multiple`.
+    p: mi.Point3f
+    n: mi.Normal3f  # geometric
+    d: mi.Vector3f
+    weight: mi.Spectrum  # S mu_i / density
+    pdf: mi.Float  # of d, 1/sr
+    emitter_distance: mi.Float  # of the emitter that d was drawn for; < 0: drawn by the proposals
+    delta: mi.Bool  # whether no ray can hit that emitter
+    emitter_point: mi.Point3f
+    light: mi.Spectrum  # light of the emitter over the density, where delta
+    target: mi.Float  # resampling target
+    by_emitter: mi.Bool  # whether d is drawn by next-event estimation, where there is an entry
+    sky_weight: mi.Float  # MIS weight of d among the ways to draw directions of the sky
+
+
+class _ExitPoint(NamedTuple):
+    """An exit, its face, and what transport and proposals have made of it."""
+
+    out: Exit
+    face: mi.UInt32
+    transport: Any
+    proposals: Any
+
+
+def resample_entry(
+    context: RenderContext, obj: Body, out: Exit, face: mi.UInt32, sampler: mi.Sampler, active: mi.Bool
+) -> Candidate:
+    """One entry for light that leaves at `out`, by resampled importance sampling (Talbot, Cline and Egbert 2005).
+
+    Of N candidates with weights W_k = S mu_i / density, one is kept with the probability w_k / Σ w, with w_k the
+    resampling target: the largest channel of W_k times the light of a sampled emitter. Its weight is W_k Σ w / (N w_k),
+    the mean of all candidates. The ray that goes on tests the visibility of the one kept.
     """
-    found = few_orders(world, body, leg, sampler, scattered, active)
-    zero = mi.Float(0)
-    on = Onward(found.p, found.n, found.d, found.weight, mi.Float(1), zero, found.connected, mi.Float(-1),
-                mi.Bool(False), mi.Bool(found.once))  # fmt: skip
-    direct = found.direct - found.weight * world.even(body)[0] if world.evens(body) else found.direct
-    return on, direct
-
-
-# ---- One vertex ----------------------------------------------------------------------------------------------------
-
-
-class Vertex(NamedTuple):
-    """Where a path is: interaction, the ray that led there, its throughput, whether this is the first, a second time.
-
-    The second time stands for the orders below two of a body, the first time for the rest. `scattered` says whether a
-    vertex before had more than one direction.
-    """
-
-    si: Any
-    ray: Any
-    throughput: Any
-    first: Any
-    second: Any
-    scattered: Any
-    active: Any
-
-
-def emitted(world: World, sampler: Any, ray: Any, si: Any, last: tuple, shown: Any, scattered: Any, active: Any) -> Any:
-    """Emitted light where a path arrives, weighted against the sampling of emitters at the last vertex.
-
-    Emitters count where they are `shown`; delta lights behind what mirrors them if the path has `scattered` before.
-    """
-    p, n, pdf, emitter_share, sky_only, aim, mirrored = last
     with detached():
-        emitter, mirrored = si.emitter(world.scene, active), active & mirrored & scattered
-        active = active & shown & (emitter != None) & ~(sky_only & _counted(world, emitter, ray.d))  # noqa: E711
-        active &= (aim < 0) | dr.select(si.is_valid(), dr.abs(si.t - aim) < 1e-3 * aim, aim == dr.inf)
-        before = place(p, n)
-        ds = mi.DirectionSample3f(world.scene, si, before)
-        pdf_emitter = emitter_share * world.scene.pdf_emitter_direction(before, ds, active & (emitter_share > 0))
-        share = balance(pdf, pdf_emitter)
-    light = dr.select(active, share * emitter.eval(si, active), 0)
-    return light + delta_light(world, sampler, ray, mirrored) if world.lights.some_delta else light
+        prepared = obj.transport.prepare(out, active)
+        exit_point = _ExitPoint(out, face, prepared, obj.proposals.prepare(out, prepared, active))
+
+    def draw(by_emitter: mi.Bool | None = None) -> Candidate:
+        return _draw_candidate(context, obj, exit_point, by_emitter, sampler, active)
+
+    n, kept = context.entries(obj), draw()
+    if n == 1:
+        return kept
+    total = dr.detach(kept.target)
+    for _ in range(n - 1):
+        other = draw(kept.by_emitter)
+        total = total + dr.detach(other.target)
+        take = sampler.next_1d() * total < dr.detach(other.target)
+        kept = dr.select(take, other, kept)
+    target = dr.detach(kept.target)
+    return replace(kept, weight=kept.weight * dr.select(target > 0, total / (n * dr.maximum(target, 1e-30)), 0))
 
 
-def _counted(world: World, emitter: Any, d: Any) -> Any:
-    """Whether light of an emitter in the direction d was found by connections with the last event."""
-    counted = ~emitter.is_environment()
-    return counted | (world.small.index_of(emitter, d) >= 0) if world.suns else counted
+def _draw_candidate(
+    context: RenderContext, obj: Body, exit_point: _ExitPoint, by_emitter: mi.Bool | None, sampler: mi.Sampler,
+    active: mi.Bool,
+) -> Candidate:  # fmt: skip
+    """A point of entry by the proposals, and a direction by emitters or by the proposals (one-sample MIS).
 
+    The choice between both is the same for all candidates of an exit: `by_emitter`, drawn where it is None.
+    """
+    share, proposals, out = context.lights.nee_share, obj.proposals, exit_point.out
 
-def vertex(world: World, sampler: Any, at: Vertex, books: Books) -> tuple[Onward, Books]:
-    """What happens at a surface point: its BSDF, or for the bodies the light that entered elsewhere."""
-    (si, _, throughput, *_), choices = at, []
+    # ---- point of entry, and a direction by the proposals
     with detached():
-        for body in world.bodies:
-            here = at.active & (si.shape == mi.ShapePtr(body.found.shape))
-            choice = choose(body, si, here)
-            if body.splits:
-                once = at.first & at.second
-                chance = dr.select(at.first, dr.select(at.second, mi.Float(1), 0), choice.few)
-                choice = choice._replace(few=chance, reflection=dr.select(once, 0, choice.reflection))
-            choices.append((body, here, choice))
-    books = _evened(world, sampler, at, books, choices)
-    books = _gathered(world, sampler, at, books, choices)
-    on, books, taken = _outside(world, sampler, at, books, choices)
-    share, events = taken.share, []
-    for body, here, choice in choices:
-        inside = here & ~taken.reflects
-        by_few = inside & (taken.u < choice.few)
-        share = dr.select(inside, share * dr.select(by_few, choice.few, 1 - choice.few), share)
-        if body.transport is not None:
-            by_more = inside & ~by_few
-            more = partial(multiple, world, body, choice.leg.out, si.prim_index, sampler, by_more)
-            events.append((by_more, more))
-        if body.few:
-            events.append((by_few, partial(few, world, body, choice.leg, sampler, at.scattered, by_few)))
-    for mask, event in events:
+        entry = proposals.sample(out, exit_point.face, exit_point.proposals, sampler, active)
+        active = active & (entry.weight > 0)
+        d, pdf = proposals.sample_direction(entry, out, sampler.next_2d())
+        at, pdf, distance = place(entry.p, entry.n), (1 - share) * pdf, mi.Float(-1)
+    delta, emitter_point, light, brightness = mi.Bool(False), mi.Point3f(0), mi.Spectrum(0), mi.Float(1)
+    sky_weight = mi.Float(1) if context.uses_sky(obj) else mi.Float(0)
+    if share == 0:
+        by_emitter = mi.Bool(False)
+    elif by_emitter is None:
+        by_emitter = sampler.next_1d() < share
 
-        def below(books: Books, mask: Any = mask, event: Callable = event) -> tuple[Onward, Books]:
-            on, direct = event()
-            return on, world.books.settle(books, throughput / share * direct, on.weight, mask, mi.Spectrum(0))
-
-        on, books = _instead(mask, sampler, on, books, world, below)
-    return on._replace(weight=on.weight / share), books
-
-
-def _evened(world: World, sampler: Any, at: Vertex, books: Books, choices: list) -> Books:
-    """Adds what bodies are under the mean light of the sky, which the events inside leave out, see `sky`."""
-    for body, here, choice in choices:
-        if not world.evens(body):
-            continue
-
-        def known(books: Books, body: Body = body, here: Any = here, out: Exit = choice.leg.out) -> tuple[Books]:
-            few, more = body.transport.alpha(out, here)
-            few = dr.select(at.first & ~at.second, 0, few) if body.few else mi.Spectrum(0)
-            light = (few + dr.select(at.first & at.second, 0, more)) * world.sky.mean
-            return (world.books.add(books, at.throughput * light),)
-
-        (books,) = _where(here, sampler, (books,), world, known)
-    return books
-
-
-def _gathered(world: World, sampler: Any, at: Vertex, books: Books, choices: list) -> Books:
-    """Adds what leaves by light that was gathered."""
-    for body, here, choice in choices:
-        if body.gathered is None:
-            continue
-
-        def known(books: Books, body: Body = body, here: Any = here, out: Exit = choice.leg.out) -> tuple[Books]:
-            return (world.books.add(books, at.throughput * body.gathered.radiance(out, here)),)
-
-        (books,) = _where(here, sampler, (books,), world, known)
-    return books
-
-
-class _Taken(NamedTuple):
-    """Whether a path goes on outside, the probability of that, and a uniform number for what comes next."""
-
-    reflects: Any
-    share: Any
-    u: Any
-
-
-def _outside(world: World, sampler: Any, at: Vertex, books: Books, choices: list) -> tuple[Onward, Books, _Taken]:
-    """The BSDF. Of a body, light of emitters that it mirrors is added, and the path goes on if there may be more."""
-    (si, ray, throughput, *_), u_event = at, sampler.next_1d()
-    inside, glossy, reflection = mi.Bool(False), mi.Bool(False), mi.Float(0)
-    for body, here, choice in choices:
-        inside |= here
-        reflection = dr.select(here, choice.reflection, reflection)
-        if body.surface.inside.reflection:
-            glossy |= here & ~(at.first & at.second)
-    plain = at.active & ~inside
-
-    def scatter(books: Books) -> tuple:
-        u = sampler.next_2d(), sampler.next_1d(), sampler.next_2d()
+    # ---- or a direction by next-event estimation; density of the mixture
+    if share > 0:
+        nee = active & by_emitter
+        ds, light = sample_emitter(context, at, sampler.next_2d(), False, nee)
         with detached():
-            on, direct = surface(world, u, ray, si, plain | glossy)
-        shown, meets, books = _mirrored(world, sampler, on, at, books, glossy)
-        reflects = glossy & meets & (u_event < reflection)
-        if world.books.tracks:  # again: no derivatives may be pending while others are passed on
-            on, direct = surface(world, u, ray, si, plain | glossy)
-        books = world.books.settle(books, throughput * direct, on.weight, plain | reflects, shown)
-        return tuple(on), meets, books
+            delta, emitter_point = nee & ds.delta, mi.Point3f(ds.p)
+            if context.uses_sky(obj):
+                pdf_sky = share * context.sky.pdf(context.scene, at, d, active & ~by_emitter)
+                of_sky = dr.select(ds.emitter.is_environment(), 1, 0)
+                sky_weight = dr.select(nee, of_sky, mis_weight(pdf, pdf_sky))
+            pdf_proposal = proposals.pdf_direction(entry, out, ds.d)
+            d = dr.select(nee, ds.d, d)
+            pdf = dr.select(nee, share * ds.pdf + dr.select(ds.delta, 0, (1 - share) * pdf_proposal), pdf)
+            distance = dr.select(nee, dr.select(ds.emitter.is_environment(), dr.inf, ds.dist), distance)
+            active = active & (pdf > 0)
+            brightness = dr.select(nee, dr.max(light) * dr.select(ds.delta, 1, ds.pdf), 1)
 
-    found, meets, books = _where(plain | glossy, sampler, (tuple(nothing()), mi.Bool(False), books), world, scatter)
-    on, reflection = Onward(*found), dr.select(glossy & meets, reflection, 0)
-    on = Onward(*(dr.select(glossy, a, b) for a, b in zip(_unlit(on), on)))
-    reflects = plain | (u_event < reflection)
-    on = on._replace(weight=dr.select(reflects, on.weight, 0))
-    share = dr.select(plain, 1, dr.select(reflects, reflection, 1 - reflection))
-    u = dr.select(reflects, 0, (u_event - reflection) / dr.maximum(1 - reflection, 1e-6))
-    return on, books, _Taken(reflects, share, u)
-
-
-def _mirrored(world: World, sampler: Any, on: Onward, at: Vertex, books: Books, active: Any) -> tuple[Any, Any, Books]:
-    """Light of emitters that a body mirrors, which the reflected path leaves out; over the weight of the reflection.
-
-    With it, whether the reflected ray meets a surface, from which more light may come.
-    """
-
-    def look(books: Books) -> tuple[Any, Any, Books]:
-        ray = place(on.p, on.n).spawn_ray(on.d)
-        si = world.scene.ray_intersect(ray, mi.RayFlags.All, False, active)
-        light = at.throughput * emitted(world, sampler, ray, si, on.previous, mi.Bool(True), at.scattered, active)
-        return light, active & si.is_valid(), world.books.add(books, on.weight * light)
-
-    return _where(active, sampler, (mi.Spectrum(0), mi.Bool(False), books), world, look)
-
-
-def _unlit(on: Onward) -> Onward:
-    """The same path, to which no emitter counts at its next vertex."""
-    return on._replace(pdf=mi.Float(0), emitter_share=mi.Float(0), mirrored=mi.Bool(False))
-
-
-def _where(mask: Any, sampler: Any, otherwise: tuple, world: World, event: Callable[[Books], tuple]) -> tuple:
-    """`event(books)` where the mask holds, and `otherwise`, which ends with the books, elsewhere.
-
-    What no neighbouring lane asks for is not computed; derivatives do not leave the event.
-    """
-
-    def happens(sampler: Any, otherwise: tuple) -> tuple:
-        with tracking(world.books.tracks):
-            return sampler, dr.detach(tuple(event(otherwise[-1])))
-
-    with detached():
-        return dr.if_stmt((sampler, otherwise), mask, happens, lambda s, other: (s, other))[1]
-
-
-def _instead(
-    mask: Any, sampler: Any, on: Onward, books: Books, world: World, event: Callable[[Books], tuple[Onward, Books]]
-) -> tuple[Onward, Books]:
-    def happens(books: Books) -> tuple:
-        found, books = event(books)
-        return tuple(found), books
-
-    found, books = _where(mask, sampler, (tuple(on), books), world, happens)
-    return Onward(*found), books
-
-
-def trace_paths(scene: Any, bodies: list[Body], settings: Settings, sampler: Any, ray: Any, active: Any) -> tuple:
-    """Radiance along a ray, in two parts for a replay, and whether it hits anything.
-
-    The second part is light of orders below two of the object that the ray meets first.
-    """
-    world = World.of(scene, bodies, settings, Tally())
-    (parts, _), seen = _trace(world, sampler, ray, ((mi.Spectrum(0), mi.Spectrum(0)), ()), active)
-    return parts, seen
-
-
-def replay_paths(
-    scene: Any, bodies: list[Body], settings: Settings, sampler: Any, ray: Any, L: tuple, d: Any, backward: bool
-) -> Any:
-    """The derivative of the radiance of traced paths.
-
-    Args:
-        sampler: as it was before the paths were traced.
-        ray: rays of the paths.
-        L: radiance that they brought, in two parts.
-        d: backward: derivative of the outcome by the radiance, which is handed on to the parameters of the scene.
-        backward: otherwise the derivative of the radiance is returned, for the derivatives that the parameters carry.
-    """
-    world = World.of(scene, bodies, settings, Replay(backward))
-    return _trace(world, sampler, ray, (L, mi.Spectrum(0 if d is None else d)), mi.Bool(True))[0][1]
-
-
-def _trace(world: World, sampler: Any, camera: Any, books: tuple, active: Any) -> tuple[tuple, Any]:
-    """One loop over the vertices. At each, emitters are sampled and the direction goes on by the surface (balance
-    heuristic between the two). At a translucent surface one of reflection, orders below two and the rest is chosen;
-    light of emitters that it mirrors is added whatever is chosen, as highlights are bright.
-
-    Where the first vertex is on a body, the path begins there a second time for its orders below two: choosing between
-    them and the rest was most of the variance under a sky.
-    """
-    scene, settings, (parts, more) = world.scene, world.settings, books
-    camera = mi.Ray3f(camera)
-    unlinked = nothing()._replace(pdf=mi.Float(1)).previous
-
-    def step(sampler: Any, ray: Any, books: Books, throughput: Any, last: tuple, depth: Any, turn: tuple, active: Any):
-        (second, splits, kept, seen, scattered), first = turn, depth == 0
-        si = scene.ray_intersect(ray, mi.RayFlags.All, first, active)
-        with tracking(world.books.tracks):
-            shown = ~first if settings.hide_emitters else mi.Bool(True)
-            light = emitted(world, sampler, ray, si, last, shown, scattered, active & ~(first & second))
-            books = world.books.add(books, throughput * light)
-        seen = seen | (first & si.is_valid())
-        active = active & si.is_valid() & (last[5] < 0) & (depth + 1 < _unsigned(settings.max_depth))
-        splits = splits | (active & first & _on_splitting(world, si))
-        on, books = vertex(world, sampler, Vertex(si, ray, throughput, first, second, scattered, active), books)
-        throughput = dr.select(active, throughput * on.weight, throughput)
-        best = dr.max(throughput)
-        active = active & (best > 0)
-        depth = dr.select(active, depth + 1, depth)
-        survival = dr.select(depth >= settings.rr_depth, dr.minimum(best, 0.95), 1.0)
-        active = active & (sampler.next_1d() < survival)
-        throughput = throughput / survival
-        ray = dr.select(active, place(on.p, on.n).spawn_ray(on.d), ray)
-        last, scattered = on.previous, scattered | on.scattered
-        again = ~active & splits & ~second
-        kept, books = dr.select(again, books[0], kept), (dr.select(again, parts[1], books[0]), books[1])
-        begun = (camera, mi.Spectrum(1), unlinked, mi.UInt32(0))
-        ray, throughput, last, depth = dr.select(again, begun, (ray, throughput, last, depth))
-        turn = (second | again, splits, kept, seen, scattered & ~again)
-        return sampler, ray, books, throughput, last, depth, turn, active | again
-
-    no, one = mi.Bool(False), mi.Spectrum(1)
-    turn = (mi.Bool(no), mi.Bool(no), mi.Spectrum(0), mi.Bool(no), mi.Bool(no))
-    state = (sampler, camera, (parts[0], more), one, unlinked, mi.UInt32(0), turn, mi.Bool(active))
-    with detached():
-        out = dr.while_loop(state, lambda *state: state[-1], step, label="bssrdf")
-    (L, more), (second, _, kept, seen, _) = out[2], out[6]
-    return ((dr.select(second, kept, L), dr.select(second, L, 0)), more), seen
-
-
-def _on_splitting(world: World, si: Any) -> Any:
-    """Whether a point is on a body with orders below two beside others."""
-    found = mi.Bool(False)
-    for body in world.bodies:
-        if body.splits:
-            found |= si.shape == mi.ShapePtr(body.found.shape)
-    return found
-
-
-def _unsigned(max_depth: int) -> int:
-    return 0xFFFFFFFF if max_depth < 0 else max_depth
+    # ---- transport and resampling target
+    S_mu = obj.transport.S_mu(exit_point.transport, entry, d, active)
+    weight = dr.select(active, S_mu * (entry.weight / dr.maximum(pdf, 1e-8)), 0)
+    target = dr.detach(dr.max(weight)) * brightness
+    return Candidate(mi.Point3f(entry.p), mi.Normal3f(entry.n), d, weight, pdf, distance, delta, emitter_point, light,
+                     target, by_emitter, sky_weight)  # fmt: skip
