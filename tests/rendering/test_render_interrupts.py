@@ -40,7 +40,7 @@ print(sys.getprofile(), mi.render(scene, spp=1).numpy().mean() > 0)
 """
 
 
-def scene_of(integrator: str, size: int):
+def scene_of(kind: str, size: int, sampler: str = "independent"):
     import halfspace_sss.rendering
 
     mi.set_variant("llvm_ad_rgb")
@@ -51,8 +51,8 @@ def scene_of(integrator: str, size: int):
     return mi.load_dict(
         {
             "type": "scene",
-            "integrator": {"type": integrator, "mm_per_unit": 10.0},
-            "sensor": {"type": "perspective", "to_world": camera, "film": film},
+            "integrator": {"type": kind, "mm_per_unit": 10.0},
+            "sensor": {"type": "perspective", "to_world": camera, "film": film, "sampler": {"type": sampler}},
             "object": {"type": "sphere", "bsdf": {"type": "translucent", "model": "better_dipole", **medium}},
             "light": {"type": "constant"},
         }
@@ -79,6 +79,22 @@ def test_images_in_many_launches_have_the_mean_of_images_in_one(monkeypatch: pyt
     error = np.sqrt(sum(mean.var(ddof=1) / len(mean) for mean in means))
     assert abs(means[0].mean() - means[1].mean()) < 4 * error  # significance 0.1 % of 14 degrees of freedom
     assert parts.std(axis=0).mean() == pytest.approx(whole.std(axis=0).mean(), rel=0.15)  # as many samples
+
+
+@pytest.mark.parametrize("kind", ["independent", "stratified", "multijitter", "orthogonal", "ldsampler"])
+def test_only_independent_samples_are_split_into_launches(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Others keep their stratification, and the number of samples that they round up once."""
+    sensor = scene_of("bssrdf", 16, kind).sensors()[0]
+    monkeypatch.setattr(integrator, "SAMPLES_PER_LAUNCH", 16**2 * 32)
+    first = next(integrator.launches(sensor, 3, 128, lambda: False))
+    assert first == (3, 32 if kind == "independent" else 128)
+
+
+def test_stratified_samples_make_the_image_of_one_launch(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = scene_of("bssrdf", 16, "stratified")
+    whole = mi.render(scene, spp=64, seed=1).numpy()
+    monkeypatch.setattr(integrator, "SAMPLES_PER_LAUNCH", 16**2 * 16)
+    np.testing.assert_array_equal(mi.render(scene, spp=64, seed=1).numpy(), whole)
 
 
 def test_a_render_in_another_thread_leaves_signals_alone() -> None:

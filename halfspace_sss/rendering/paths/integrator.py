@@ -18,15 +18,13 @@ from halfspace_sss.rendering.paths.path_loop import replay_paths, trace_paths
 from halfspace_sss.rendering.transport.body import Bodies, Body, make_bodies
 from halfspace_sss.rendering.transport.settings import Settings, read_settings
 
-__all__ = [
-    "Launch",
-    "SAMPLES_PER_LAUNCH",
-    "check_outermost",
-    "check_parameters",
-    "integrator_class",
-    "launches",
-    "replayer",
-]
+__all__ = ["check_outermost", "check_parameters", "integrator_class", "launches", "replayer"]
+
+SAMPLES_PER_LAUNCH = 2**20  # half a second on 2 cores
+GEOMETRY = ("to_world", "vertex_positions", "vertex_normals", "vertex_texcoords")
+
+
+# ---- The plugin -----------------------------------------------------------------------------------------------------
 
 
 def integrator_class() -> type:
@@ -42,34 +40,35 @@ def integrator_class() -> type:
         `g`), forward and backward; where paths go is held, and derivatives by geometry are refused.
         """
 
-        def __init__(self, props: Any) -> None:
+        def __init__(self, props: mi.Properties) -> None:
             mi.SamplingIntegrator.__init__(self, props)
             self.timed = float(props.get("timeout", -1.0)) > 0
             self.settings = read_settings(props)
             self._bodies = Bodies(self.settings)
             self._gathering = Gathering()
 
-        def prepare(self, scene: Any) -> list[Any]:
+        def prepare(self, scene: mi.Scene) -> list[Body]:
             """The translucent objects of a scene, made ready once; ValueError if the scene cannot be rendered."""
             check_parameters(scene)
             with dr.suspend_grad():
                 return self._prepared(scene)
 
-        def _prepared(self, scene: Any) -> list[Any]:
-            bodies = self._bodies.of(scene)
+        def _prepared(self, scene: mi.Scene) -> list[Body]:
+            objects = self._bodies.of(scene)
             if self.settings.light == "sampled":
-                return bodies
-            return self._gathering.of(scene, bodies, self.settings)
+                return objects
+            return self._gathering.of(scene, objects, self.settings)
 
-        def check(self, scene: Any, without: Collection[str] = ()) -> None:
+        def check(self, scene: mi.Scene, without: Collection[str] = ()) -> None:
             """ValueError if the scene cannot be rendered, as far as can be told without the objects `without`."""
             check_parameters(scene)
             with dr.suspend_grad():
                 make_bodies(scene, self.settings, without)
 
         def render(
-            self, scene: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0, develop: bool = True, evaluate: bool = True
-        ) -> Any:
+            self, scene: mi.Scene, sensor: mi.Sensor | int = 0, seed: mi.UInt32 | int = 0, spp: int = 0,
+            develop: bool = True, evaluate: bool = True,
+        ) -> mi.TensorXf | None:  # fmt: skip
             """The image, in launches; KeyboardInterrupt between two if one was interrupted."""
             sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
             with interruptible(), undisturbed(), dr.suspend_grad():
@@ -78,26 +77,29 @@ def integrator_class() -> type:
                     super().render(scene, sensor=sensor, seed=launch.seed, spp=launch.spp, develop=True)
                 return sensor.film().develop() if develop else None
 
-        def render_forward(self, scene: Any, *args: Any, **more: Any) -> Any:
-            bodies = self._differentiable(scene)
+        def render_forward(self, scene: mi.Scene, *args: Any, **more: Any) -> mi.TensorXf:
+            objects = self._differentiable(scene)
             with undisturbed():
-                return replayer(bodies, self.settings).render_forward(scene, *args, **more)
+                return replayer(objects, self.settings).render_forward(scene, *args, **more)
 
-        def render_backward(self, scene: Any, *args: Any, **more: Any) -> None:
-            bodies = self._differentiable(scene)
+        def render_backward(self, scene: mi.Scene, *args: Any, **more: Any) -> None:
+            objects = self._differentiable(scene)
             with undisturbed():
-                replayer(bodies, self.settings).render_backward(scene, *args, **more)
+                replayer(objects, self.settings).render_backward(scene, *args, **more)
 
-        def _differentiable(self, scene: Any) -> list[Any]:
+        def _differentiable(self, scene: mi.Scene) -> list[Body]:
             if self.settings.light != "sampled":
                 raise ValueError(f"light must be sampled for derivatives, got {self.settings.light}")
             return self.prepare(scene)
 
-        def sample(self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Any = True) -> tuple:
+        def sample(
+            self, scene: mi.Scene, sampler: mi.Sampler, ray: mi.RayDifferential3f, medium: mi.Medium | None = None,
+            active: mi.Bool = True,
+        ) -> tuple[mi.Spectrum, mi.Bool, list]:  # fmt: skip
             check_outermost(scene)
             with undisturbed(), dr.suspend_grad():
-                parts, seen = trace_paths(scene, self._prepared(scene), self.settings, sampler, ray, active)
-            return parts[0] + parts[1], seen, []
+                parts, hit = trace_paths(scene, self._prepared(scene), self.settings, sampler, ray, active)
+            return parts[0] + parts[1], hit, []
 
         @property
         def gathered(self) -> list[str]:
@@ -128,8 +130,6 @@ def undisturbed() -> Iterator[None]:
 
 # ---- Launches of an image, between which an interrupt is heard -----------------------------------------------------
 
-SAMPLES_PER_LAUNCH = 2**20  # half a second on 2 cores
-
 
 class Launch(NamedTuple):
     """Seed and samples per pixel."""
@@ -138,8 +138,12 @@ class Launch(NamedTuple):
     spp: int
 
 
-def launches(sensor: Any, seed: Any, spp: int, stopped: Callable[[], bool]) -> Iterator[Launch]:
+def launches(sensor: mi.Sensor, seed: mi.UInt32 | int, spp: int, stopped: Callable[[], bool]) -> Iterator[Launch]:
     """Launches of equally many samples, each to be rendered to the film of a sensor, which holds their mean in the end.
+
+    Only samples of the sampler `independent` are split. Other samplers round the samples of each launch up to a square
+    or another number of strata, and would stratify each launch alone: they have one launch, at whose end an interrupt
+    is heard.
 
     Args:
         sensor, seed, spp: what is rendered; the first launch has the seed itself.
@@ -151,6 +155,7 @@ def launches(sensor: Any, seed: Any, spp: int, stopped: Callable[[], bool]) -> I
     film, total = sensor.film(), None
     spp, seed = spp or sensor.sampler().sample_count(), int(mi.UInt32(seed)[0])
     n = min(math.ceil(spp * int(dr.prod(film.crop_size())) / SAMPLES_PER_LAUNCH), spp)
+    n = n if sensor.sampler().class_name() == "IndependentSampler" else 1
     for k in range(n):
         yield Launch(_seed(seed, k), (spp * (k + 1)) // n - (spp * k) // n)
         raw = film.develop(raw=True)
@@ -171,10 +176,8 @@ def _seed(seed: int, k: int) -> int:
 
 # ---- Derivatives: Mitsuba's radiative backpropagation around a replay of the paths ---------------------------------
 
-GEOMETRY = ("to_world", "vertex_positions", "vertex_normals", "vertex_texcoords")
 
-
-def check_parameters(scene: Any) -> None:
+def check_parameters(scene: mi.Scene) -> None:
     """Refuse derivatives that a replay with fixed paths does not have.
 
     Raises:
@@ -195,7 +198,7 @@ def check_parameters(scene: Any) -> None:
             )
 
 
-def check_outermost(scene: Any) -> None:
+def check_outermost(scene: mi.Scene) -> None:
     """Refuse derivatives of another integrator that asks this one for samples: they would be missing in silence.
 
     Raises:
@@ -208,14 +211,14 @@ def check_outermost(scene: Any) -> None:
         )
 
 
-def _moves(owner: Any, name: str) -> bool:
+def _moves(owner: mi.Object, name: str) -> bool:
     """Whether a parameter moves a shape or a sensor; attributes of vertices and faces are textures."""
     if isinstance(owner, mi.Shape):
         return not name.startswith(("vertex_", "face_"))
     return isinstance(owner, (mi.Sensor, mi.Film))
 
 
-def _selects(parameters: Any, owner: Any, name: str) -> bool:
+def _selects(parameters: mi.SceneParameters, owner: mi.Object | None, name: str) -> bool:
     """Whether a parameter does more than scale light: the share of a mirror in a blend, the index that a medium has."""
     while owner is not None:
         if isinstance(owner, mi.BSDF) and owner.class_name() == "BlendBSDF":
@@ -226,26 +229,26 @@ def _selects(parameters: Any, owner: Any, name: str) -> bool:
     return False
 
 
-def replayer(bodies: list[Body], settings: Settings) -> Any:
-    """An integrator of Mitsuba's radiative backpropagation around the paths through a scene with these bodies.
+def replayer(objects: list[Body], settings: Settings) -> mi.Integrator:
+    """An integrator of Mitsuba's radiative backpropagation around the paths through a scene with these objects.
 
     Raises:
         ValueError: gradients are enabled for a medium, and the model knows no other.
     """
     from mitsuba.python.ad.integrators.common import RBIntegrator
 
-    for body in bodies:
-        body.variation.prepare()
+    for obj in objects:
+        obj.variation.prepare()
 
     class Replayer(RBIntegrator):
         """Mitsuba's camera rays and films, this project's paths."""
 
-        def sample(self, mode: Any, scene: Any, sampler: Any, ray: Any, **given: Any) -> tuple:
+        def sample(self, mode: dr.ADMode, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f, **given: Any) -> tuple:
             if mode == dr.ADMode.Primal:
-                parts, seen = trace_paths(scene, bodies, settings, sampler, ray, given["active"])
-                return parts[0] + parts[1], seen, [], parts
+                parts, hit = trace_paths(scene, objects, settings, sampler, ray, given["active"])
+                return parts[0] + parts[1], hit, [], parts
             parts, backward = given["state_in"], mode == dr.ADMode.Backward
-            d = replay_paths(scene, bodies, settings, sampler, ray, parts, given["δL"], backward)
+            d = replay_paths(scene, objects, settings, sampler, ray, parts, given["δL"], backward)
             return d, mi.Bool(True), [], parts
 
     return Replayer(mi.Properties())
