@@ -88,7 +88,7 @@ def trace_exits(
     """
     check_count("fewest", fewest, 0)
     store = _Store.of(dr.width(starts.p), fewest, most)
-    start = walk_exits.Start(starts.p, starts.n, starts.w, starts.n_out)
+    start = walk_exits.WalkStarts(starts.p, starts.n, starts.w, starts.n_out)
     walk_exits.walk_from(subject.walk_media, 0, start, store, seed, LANES, roulette_from)
     dr.eval(store.exits)
     return store.exits

@@ -167,7 +167,7 @@ def _small_lamp() -> dict:
             "bsdf": {"type": "diffuse", "reflectance": 0.0}}  # fmt: skip
 
 
-def test_joins_bring_the_light_that_chance_brings_with_less_noise() -> None:
+def test_connections_bring_the_light_that_chance_brings_with_less_noise() -> None:
     surface = {"sigma_s": 0.5, "sigma_a": 0.02, "eta": 1.5, "reflection": False, "orders": "multiple"}
     joined, left_to_chance = (
         _runs(mi.load_dict(_scene(surface, _small_lamp(), _cube(), join_share=share)), 12, spp, 1)

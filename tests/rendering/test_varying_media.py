@@ -91,7 +91,7 @@ def test_null_collisions_change_nothing() -> None:
     assert np.abs(_z(a, b)).max() < WIDEST_Z
 
 
-def test_joins_and_guide_bring_the_light_that_chance_brings() -> None:
+def test_connections_and_directions_bring_the_light_that_chance_brings() -> None:
     surface = _varying(reflection=False, g=0.0)
     joined, left_to_chance = (
         _runs(mi.load_dict(_scene(surface, _small_lamp(), _cube(), join_share=share)), 12, spp, 1)
@@ -114,13 +114,13 @@ def _layers(values: list, thickness: float, **more: Any) -> dict:
 
 
 def _exits(surface: dict, thickness: float, mu: float, seed: int) -> Any:
-    from halfspace_sss.rendering.walk.exits import Start, exits
+    from halfspace_sss.rendering.walk.exits import WalkStarts, exits
     from halfspace_sss.rendering.walk.media import WalkMedia
 
     scene = {"type": "scene", "object": {**_slab(thickness), "bsdf": {"type": "translucent", **surface}}}
     w = np.repeat([[np.sqrt(1 - mu * mu)], [0.0], [mu]], N, axis=1)
     up = np.repeat([[0.0], [0.0], [1.0]], N, axis=1)
-    start = Start(mi.Point3f(np.zeros((3, N))), mi.Normal3f(up), mi.Vector3f(w))
+    start = WalkStarts(mi.Point3f(np.zeros((3, N))), mi.Normal3f(up), mi.Vector3f(w))
     return exits(WalkMedia.of(mi.load_dict(scene), 1.0), 0, start, seed)
 
 

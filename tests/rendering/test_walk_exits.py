@@ -39,16 +39,16 @@ def _slab() -> dict:
 
 def _start(mu: float, n: int = N):
     """Walks that enter at the origin with the cosine mu."""
-    from halfspace_sss.rendering.walk.exits import Start
+    from halfspace_sss.rendering.walk.exits import WalkStarts
 
     w = np.repeat([[np.sqrt(1 - mu * mu)], [0.0], [mu]], n, axis=1)
     up = np.repeat([[0.0], [0.0], [1.0]], n, axis=1)
-    return Start(mi.Point3f(np.zeros((3, n))), mi.Normal3f(up), mi.Vector3f(w))
+    return WalkStarts(mi.Point3f(np.zeros((3, n))), mi.Normal3f(up), mi.Vector3f(w))
 
 
 def _on_sphere(radius: float, n: int, diffuse: bool = False):
     """Random points of a sphere about the origin; directions within 70 degrees of its normals, or by the cosine."""
-    from halfspace_sss.rendering.walk.exits import Start
+    from halfspace_sss.rendering.walk.exits import WalkStarts
 
     rng = np.random.default_rng(3)
     up = rng.standard_normal((3, n))
@@ -56,7 +56,7 @@ def _on_sphere(radius: float, n: int, diffuse: bool = False):
     w = rng.standard_normal((3, n))
     w = (1.0 if diffuse else 1.05) * up + w / np.linalg.norm(w, axis=0)
     w /= np.linalg.norm(w, axis=0)
-    return Start(mi.Point3f(radius * up), mi.Normal3f(up), mi.Vector3f(w)), (up * w).sum(axis=0)
+    return WalkStarts(mi.Point3f(radius * up), mi.Normal3f(up), mi.Vector3f(w)), (up * w).sum(axis=0)
 
 
 def _exits(*arguments: object, **options: object):

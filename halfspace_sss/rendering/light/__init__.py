@@ -1,1 +1,1 @@
-"""Emitters of a scene that have to be aimed at: lamps, delta lights, and suns in the sky."""
+"""Emitters of a scene that are sampled one by one: lamps, delta lights, and suns in the sky."""

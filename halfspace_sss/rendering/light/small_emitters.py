@@ -1,4 +1,4 @@
-"""Emitters that look small, which paths aim at: lamps, delta lights and suns of the environment.
+"""Emitters that look small, which paths connect with or sample: lamps, delta lights and suns of the environment.
 
 No ray meets a delta light (point, spot, projector, directional). Where emitter sampling cannot reach one either, as
 behind a refracting boundary, its light E d(w - w_l) is spread over a cone of solid angle Ω about the direction w_l to
@@ -23,7 +23,10 @@ import numpy as np
 __all__ = ["NARROW", "SmallEmitters", "Sun", "WIDE", "is_delta", "spread", "suns_of"]
 
 
-# ---- Suns of an environment map ------------------------------------------------------------------------------------
+# ---- Suns of an environment map -------------------------------------------------------------------------------------
+#
+# A path that meets the environment by chance finds a sun of solid angle Ω, which brings the share e of all light, with
+# the probability Ω / 4 pi only, and so with the relative variance e² 4 pi / Ω. Where that is large, a cone is sampled.
 
 SAMPLES = 160  # squared
 MOST = 8  # suns
@@ -40,7 +43,7 @@ class Sun(NamedTuple):
     radius: float  # half of its opening angle, radians
 
 
-def suns_of(environment: Any) -> list[Sun]:
+def suns_of(environment: mi.Emitter) -> list[Sun]:
     """Suns of an environment emitter, brightest first."""
     d, L, energy = _light(environment)
     suns, left = [], np.ones(len(L), dtype=bool)
@@ -53,7 +56,7 @@ def suns_of(environment: Any) -> list[Sun]:
     return suns
 
 
-def _light(environment: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _light(environment: mi.Emitter) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Directions (n, 3) that the environment draws, its radiance there, and their part of its light."""
     k = dr.arange(mi.UInt32, SAMPLES**2)
     u = mi.Point2f(k % SAMPLES + 0.5, k // SAMPLES + 0.5) / SAMPLES
@@ -68,7 +71,7 @@ def _angles(d: np.ndarray, c: np.ndarray) -> np.ndarray:
 
 
 def _about(k: int, d: np.ndarray, energy: np.ndarray, total: float) -> Sun | None:
-    """The smallest cone about direction k that holds a region brighter than its ring, if it is worth aiming at."""
+    """The smallest cone about direction k that holds a region brighter than its ring, if it is worth sampling."""
     if not total > 0:
         return None
     c = d[k]
@@ -85,8 +88,10 @@ def _about(k: int, d: np.ndarray, energy: np.ndarray, total: float) -> Sun | Non
     return None
 
 
+# ---- Small emitters --------------------------------------------------------------------------------------------------
+
 LARGEST = 0.5  # radius of an emitter over its distance
-NARROW = 0.01  # radius of the cone of a delta light that paths aim at, radians
+NARROW = 0.01  # radius of the cone of a delta light that directions are sampled about, radians
 WIDE = 0.05  # and of one that is left to chance
 
 
@@ -104,14 +109,14 @@ class SmallEmitters:
             emitter; and from that number to its place, `index`.
     """
 
-    scene: Any
-    emitters: list[Any]
+    scene: mi.Scene
+    emitters: list[mi.Emitter]
     n_delta: int
     suns: list[Sun]
     tables: dict[str, Any]
 
     @classmethod
-    def of(cls, scene: Any) -> SmallEmitters | None:
+    def of(cls, scene: mi.Scene) -> SmallEmitters | None:
         """Those of a scene; None if there are none.
 
         Raises:
@@ -144,17 +149,17 @@ class SmallEmitters:
         """Whether rays can meet one."""
         return len(self) > self.n_delta
 
-    def _row(self, key: str, k: Any) -> Any:
+    def _row(self, key: str, k: mi.UInt32) -> mi.Float | mi.UInt32 | mi.Int32 | mi.Bool:
         return dr.gather(type(self.tables[key]), self.tables[key], k)
 
-    def _centre(self, k: Any) -> Any:
+    def _centre(self, k: mi.UInt32) -> mi.Vector3f:
         return mi.Vector3f(*(self._row(axis, k) for axis in "xyz"))
 
-    def distant(self, k: Any) -> Any:
+    def distant(self, k: mi.UInt32) -> mi.Bool:
         """Whether emitter k is infinitely far."""
         return self._row("distant", k)
 
-    def direction(self, k: Any, p: Any) -> tuple[Any, Any]:
+    def direction(self, k: mi.UInt32, p: mi.Point3f) -> tuple[mi.Vector3f, mi.Bool]:
         """w_0 from p to emitter k, and whether the emitter looks small from there."""
         centre, distant = self._centre(k), self.distant(k)
         way = dr.select(distant, centre, centre - mi.Vector3f(p))
@@ -162,19 +167,19 @@ class SmallEmitters:
         small = distant | (self._row("radius", k) < LARGEST * size)
         return way / dr.maximum(size, 1e-20), small
 
-    def point(self, k: Any, p: Any, far: Any) -> Any:
+    def point(self, k: mi.UInt32, p: mi.Point3f, far: mi.Float | float) -> mi.Point3f:
         """A point of emitter k; as far as said from p where that is distant."""
         centre = self._centre(k)
         return mi.Point3f(dr.select(self.distant(k), p + centre * far, centre))
 
-    def angle2(self, k: Any, p: Any) -> Any:
+    def angle2(self, k: mi.UInt32, p: mi.Point3f) -> mi.Float:
         """Square of the angle under which the radius of emitter k is seen from p."""
         seen = dr.square(self._row("radius", k)) / dr.squared_norm(self._centre(k) - mi.Vector3f(p))
         if self.suns:
             seen = dr.select(self.distant(k), dr.square(self._row("radius", k)), seen)
         return dr.select(mi.UInt32(k) < self.n_delta, NARROW**2, seen) if self.n_delta else seen
 
-    def index_of(self, emitter: Any, w: Any) -> Any:
+    def index_of(self, emitter: mi.EmitterPtr, w: mi.Vector3f) -> mi.Int32:
         """The number of an emitter that a ray along w meets, or -1."""
         pointer = dr.reinterpret_array(mi.UInt32, emitter)
         known = pointer < dr.width(self.tables["index"])
@@ -186,7 +191,7 @@ class SmallEmitters:
             k = dr.select(inside, mi.Int32(sun), k)
         return k
 
-    def sample(self, k: Any, at: Any, u: Any) -> tuple[Any, Any, Any]:
+    def sample(self, k: mi.UInt32, at: mi.Interaction3f, u: mi.Point2f) -> tuple[mi.Vector3f, mi.Float, mi.Spectrum]:
         """A direction from `at` to emitter k, its distance, and light over the density of the direction; 0 if none."""
         d, distance, light = mi.Vector3f(0, 0, 1), mi.Float(0), mi.Spectrum(0)
         n = len(self.emitters)
@@ -205,12 +210,12 @@ class SmallEmitters:
             d, light = dr.select(sun, way, d), dr.select(sun, L, light)
         return d, distance, light
 
-    def _emitter(self, k: Any) -> Any:
+    def _emitter(self, k: mi.UInt32) -> mi.Emitter | mi.EmitterPtr:
         if len(self.emitters) == 1:
             return self.emitters[0]
         return dr.reinterpret_array(mi.EmitterPtr, self._row("pointer", k))
 
-    def along(self, k: Any, ray: Any, si: Any, active: Any) -> Any:
+    def along(self, k: mi.UInt32, ray: mi.Ray3f, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Spectrum:
         """Radiance of emitter k along a ray that meets `si`; of a delta light, spread over its narrow cone."""
         L = mi.Spectrum(0)
         if self.some_met:
@@ -222,13 +227,13 @@ class SmallEmitters:
             L = L + self.spread(k, ray, mi.Float(NARROW), delta)
         return L
 
-    def spread(self, k: Any, ray: Any, radius: Any, active: Any) -> Any:
+    def spread(self, k: mi.UInt32, ray: mi.Ray3f, radius: mi.Float, active: mi.Bool) -> mi.Spectrum:
         """Radiance of delta light k along a ray, spread over a cone of the given radius, where nothing is before it."""
         emitter = self._emitter(dr.minimum(k, self.n_delta - 1))
         return spread(self.scene, emitter, ray, radius, active)
 
 
-def spread(scene: Any, emitter: Any, ray: Any, radius: Any, active: Any) -> Any:
+def spread(scene: mi.Scene, emitter: mi.EmitterPtr, ray: mi.Ray3f, radius: mi.Float, active: mi.Bool) -> mi.Spectrum:
     """E / Ω of a delta light, for a ray whose angle with the direction to it is below the radius of Ω."""
     at = dr.zeros(mi.Interaction3f)
     at.p = ray.o
@@ -240,12 +245,12 @@ def spread(scene: Any, emitter: Any, ray: Any, radius: Any, active: Any) -> Any:
     return dr.select(seen, E / _solid_angle(radius), 0)
 
 
-def is_delta(emitter: Any) -> bool:
+def is_delta(emitter: mi.Emitter) -> bool:
     """Whether no ray can meet an emitter, though it can be sampled."""
     return bool(emitter.flags() & int(mi.EmitterFlags.Delta)) and emitter.get_shape() is None
 
 
-def _check(scene: Any) -> None:
+def _check(scene: mi.Scene) -> None:
     """Refuse emitters that do not work, and name those that no path from a camera finds."""
     for emitter in scene.emitters():
         kind = emitter.class_name()
@@ -258,14 +263,14 @@ def _check(scene: Any) -> None:
             warnings.warn(message, stacklevel=2)
 
 
-def _has_place(emitter: Any) -> bool:
+def _has_place(emitter: mi.Emitter) -> bool:
     """Whether an emitter is neither the environment nor out of reach nor the surface of a translucent object."""
     shape = emitter.get_shape()
     met = not emitter.flags() & int(mi.EmitterFlags.Delta)
     return not emitter.is_environment() and (shape is None or (met and not hasattr(shape.bsdf(), "inside")))
 
 
-def _place(emitter: Any) -> tuple[float, float, float, bool, float]:
+def _place(emitter: mi.Emitter) -> tuple[float, float, float, bool, float]:
     """A point of an emitter or the direction to it, whether it is distant, and the radius of the sphere about it."""
     shape, at = emitter.get_shape(), dr.zeros(mi.Interaction3f)
     if shape is not None:
@@ -277,10 +282,10 @@ def _place(emitter: Any) -> tuple[float, float, float, bool, float]:
     return (*np.ravel(np.array(ds.d if far else ds.p)).tolist(), far, 0.0)
 
 
-def _within(d: Any, axis: Any, radius: Any) -> Any:
+def _within(d: mi.Vector3f, axis: mi.Vector3f, radius: mi.Float | float) -> mi.Bool:
     """Whether the angle of two directions is below a radius; by their distance, which float32 keeps."""
     return dr.squared_norm(d - axis) < dr.square(2 * dr.sin(0.5 * mi.Float(radius)))
 
 
-def _solid_angle(radius: Any) -> Any:
+def _solid_angle(radius: mi.Float) -> mi.Float:
     return 4 * dr.pi * dr.square(dr.sin(0.5 * radius))

@@ -1,25 +1,23 @@
-"""Light of small emitters by joins: a walk from the camera and one from an emitter meet inside the object.
+"""Light of small emitters inside objects: connections with light subpaths, directions to emitters, inner lights.
 
-A path inside an object has scattering events v_1 ... v_n from the camera's side. An edge v_k v_{k+1} is straight if
-nothing reflects between them. A path with a straight edge is split at the last one, v_k v_{k+1}: v_k is an event of
-the walk from the camera, v_{k+1} lies on a ray of light. That ray enters from an emitter, or it follows a reflection
-at the boundary; between its events the walk from the light is reflected at least once, for else an edge nearer to
-the emitter would be straight. Thus each path from a small emitter with a straight edge is found by joins in one way,
-and every other path (no straight edge, one event or none, light that other surfaces reflect) by walks from the
-camera. Those also find what comes from emitters that look large from v_k, or at a large angle to w_0, where aiming is
-no good.
+Three strategies find what random walks from the camera rarely hit through a refracting boundary:
 
-The entering ray is aimed: a point a on the plane through p = v_k across the direction w_0 to the emitter, near the
-place where a plane boundary would refract light towards p, and a point of the emitter seen from a. Flux through the
-plane is L |w.w_0| dA dw. On the ray at distance t the event has the density D / (dtheta (D² + (t - t_0)²)) (Kulla and
-Fajardo 2012), with D the distance of p from the ray, so that 1/|p - q|² cancels; the density of a, e^(-r) / r, makes up
-for 1/D.
+- `SubpathConnections`: a light subpath from an emitter enters the object and is connected with an event of the walk;
+- `EmitterDirections`: from an event, directions about the one that is refracted towards an emitter;
+- `InnerLights`: delta lights in the medium of an object, sampled at events and surfaces there.
+
+Paths of connections. A path inside an object has scattering events v_1 ... v_n from the camera's side. An edge
+v_k v_{k+1} is straight if nothing reflects between them. A path with a straight edge is split at the last one: v_k is
+an event of the walk from the camera, v_{k+1} lies on a ray of the light subpath. That ray enters from an emitter, or it
+follows a reflection at the boundary. Between its events the light subpath is reflected at least once, for else an edge
+nearer to the emitter would be straight. So connections find each path from a small emitter with a straight edge in one
+way. Every other path is left to walks from the camera: no straight edge, one event or none, light that other surfaces
+reflect, emitters that look large from v_k, or directions at a large angle to w_0.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -41,55 +39,63 @@ from halfspace_sss.rendering.walk.random_walk import (
     turn,
 )
 
-__all__ = ["DEEPEST", "Departure", "Guide", "Joins", "Lamps", "find_joins"]
+__all__ = ["DEEPEST", "Departure", "EmitterDirections", "InnerLights", "SubpathConnections", "find_connections"]
 
+
+# ---- Connections with light subpaths --------------------------------------------------------------------------------
+#
+# The entering ray is sampled through a point a of the plane through p = v_k across the direction w_0 to the emitter,
+# near the place where a plane boundary would refract light towards p, and a point of the emitter seen from a. Flux
+# through the plane is L |w.w_0| dA dw. On the ray at distance t the event has the density
+# D / (dtheta (D² + (t - t_0)²)) (equiangular sampling, Kulla and Fajardo 2012), with D the distance of p from the ray,
+# so that 1/|p - q|² cancels; the density of a, e^(-r) / r, makes up for 1/D.
 
 DEEPEST = 12.0  # mean free paths up to which the boundary in front of an event is looked for
 STEEPEST = 0.5  # least cosine of a ray with w_0
-# Rates of fall about the aimed point, in 1/mfp: as light does around an event below a flat boundary, and one that
+# Rates of fall about the sampled point, in 1/mfp: as light does around an event below a flat boundary, and one that
 # falls no faster than any light at the least cosine, so that weights stay bounded.
 RATES = (1.0, 0.4)
 LEAST_PROMISE = 0.1  # of an event far below the boundary: light may enter nearer on another side
 
 
 @dataclass
-class Aim:
-    """How a ray of light is aimed at an event."""
+class EmitterSample:
+    """An emitter as seen from an event, and where its light enters towards the event."""
 
     emitter: mi.UInt32
     w_0: mi.Vector3f  # direction to it
-    shift: mi.Vector3f  # from the event to the place aimed at, across w_0
+    shift: mi.Vector3f  # from the event to the middle of the points a, across w_0
     depth: mi.Float  # of the event below the boundary
 
 
 @dataclass
-class LightWalk:
-    """State of a walk from an emitter."""
+class LightSubpath:
+    """Loop variables of a walk from an emitter."""
 
     walk: Walk
-    lit: mi.Bool  # whether its ray comes from an emitter or a reflection, so that it may be joined to the event
-    fresh: mi.Bool  # whether it begins there, rather than at a null collision
-    L: mi.Spectrum  # what the joins so far bring
+    lit: mi.Bool  # whether its ray comes from an emitter or a reflection, so that it may be connected with the event
+    fresh: mi.Bool  # whether the ray begins there, rather than at a null collision
+    L: mi.Spectrum  # light of the connections so far
 
 
 @dataclass(frozen=True, eq=False)
-class Joins:
-    """How light of small emitters is found by joins.
+class SubpathConnections:
+    """Connections of events with light subpaths of small emitters.
 
     Args:
         scene: the Mitsuba scene.
         media: its translucent objects.
         small: its small emitters.
-        share: probability of a join at an event near the boundary.
+        share: probability of a light subpath at an event near the boundary.
     """
 
-    scene: Any
+    scene: mi.Scene
     media: WalkMedia
     small: SmallEmitters
     share: float
 
-    def covers(self, k: Any, y: Any, w: Any, pivot: Any) -> Any:
-        """Whether joins at `pivot` find light that arrives from the point y of emitter k along -w; none has k < 0.
+    def covers(self, k: mi.Int32, y: mi.Point3f, w: mi.Vector3f, pivot: mi.Point3f) -> mi.Bool:
+        """Whether connections at `pivot` find light from the point y of emitter k along -w; no emitter has k < 0.
 
         The line must cross the plane through the pivot steeply on its way from the emitter.
         """
@@ -99,19 +105,19 @@ class Joins:
         ahead = self.small.distant(near) | (dr.dot(y - pivot, w_0) * cosine > 0)
         return (k >= 0) & small & (dr.abs(cosine) > STEEPEST) & ahead
 
-    def light(self, event: Event, rng: Any) -> tuple[Any, Any]:
-        """An estimate of what joins at an event bring per weight of the walk from the camera, and the generator."""
+    def light(self, event: Event, rng: mi.PCG32) -> tuple[mi.Spectrum, mi.PCG32]:
+        """Light of connections at an event per weight of the walk from the camera, and the generator."""
         n = len(self.small)
         which = draw(n, rng)
         w_0, small = self.small.direction(which, event.p)
-        aim, survive = self._aim(which, w_0, event)
+        sample, survive = self._sample_emitter(which, w_0, event)
         chosen = small & (rng.next_float32() < self.share * survive)
         L = mi.Spectrum(0) + dr.zeros(mi.Spectrum, dr.width(event.p))
-        rng, L, *_ = dr.if_stmt((rng, L, event, aim), chosen, self._enter, lambda *state: state, label="join")
+        rng, L, *_ = dr.if_stmt((rng, L, event, sample), chosen, self._enter, lambda *state: state, label="connection")
         return L * (n / (self.share * survive)), rng
 
-    def _aim(self, which: Any, w_0: Any, event: Event) -> tuple[Aim, Any]:
-        """Where to aim so that light gets to an event, and how promising that is, (0, 1]."""
+    def _sample_emitter(self, which: mi.UInt32, w_0: mi.Vector3f, event: Event) -> tuple[EmitterSample, mi.Float]:
+        """Where light of an emitter enters towards an event, and the probability to look for it, (0, 1]."""
         p, k, m = event.p, event.object, event.m
         ray = mi.Ray3f(p, w_0)
         ray.maxt = DEEPEST / dr.min(m.mean_t)
@@ -125,20 +131,23 @@ class Joins:
         shift = dr.select(facing, entry - w_0 * dr.dot(entry, w_0), 0)
         depth = dr.select(facing, dr.minimum(dr.norm(entry), far), far)
         promise = dr.maximum(dr.exp(-0.5 * dr.min(m.mean_t) * depth), LEAST_PROMISE)
-        return Aim(which, w_0, mi.Vector3f(shift), depth), promise
+        return EmitterSample(which, w_0, mi.Vector3f(shift), depth), promise
 
-    def _enter(self, rng: Any, L: Any, event: Event, aim: Aim) -> tuple:
-        """Aim a ray of light, refract it into the object and follow it."""
+    def _enter(self, rng: mi.PCG32, L: mi.Spectrum, event: Event, sample: EmitterSample) -> tuple:
+        """Sample a ray of light, refract it into the object and follow it."""
+        # ---- a ray from the emitter to a point near the event
         k, m = event.object, event.m
-        at, density = _draw_across(event, aim, rng)
-        which = aim.emitter
+        at, density = _draw_across(event, sample, rng)
+        which = sample.emitter
         w, distance, light = self.small.sample(which, at, mi.Point2f(rng.next_float32(), rng.next_float32()))
-        flux = light * (dr.abs(dr.dot(w, aim.w_0)) / density)
+        flux = light * (dr.abs(dr.dot(w, sample.w_0)) / density)
         distant = self.small.distant(which)
         away = dr.select(distant, 4 * dr.norm(self.scene.bbox().extents()), distance * (1 - 1e-4))
         si = self.scene.ray_intersect(mi.Ray3f(mi.Point3f(at.p + w * away), -w), mi.RayFlags.All, coherent=False)
-        steep = dr.abs(dr.dot(w, aim.w_0)) > STEEPEST
+        steep = dr.abs(dr.dot(w, sample.w_0)) > STEEPEST
         enters = si.is_valid() & (dr.max(light) > 0) & steep & (self.media.index_of(si.shape) == mi.Int32(k))
+
+        # ---- refraction at the boundary
         si = self.media.face_outwards(si, dr.select(enters, mi.Int32(k), -1), -w)
         si.wi = dr.select(mi.Frame3f.cos_theta(si.wi) < 0, -si.wi, si.wi)  # below its horizon, see `surface.horizon`
         F, cos_t, _, eta_ti = mi.fresnel(mi.Frame3f.cos_theta(si.wi), self.media.row("eta", k))
@@ -148,25 +157,30 @@ class Joins:
         bend = dr.dot(d, si.n) * mi.Frame3f.cos_theta(si.wi) / (dr.dot(d, si.sh_frame.n) * dr.dot(w, si.n))
         weight = dr.select(enters, flux * ((1 - F) * bend), 0)
         enters &= dr.max(weight) > 0
+
+        # ---- the walk from there
         walk = start_walk(mi.Point3f(si.p), d, rng)
         walk = replace(walk, skip=self.media.clear(k, si.n, d), alive=enters, object=k, weight=weight,
                        channel=draw(len(m.sigma_t), rng))  # fmt: skip
-        state = (LightWalk(walk, mi.Bool(enters), mi.Bool(enters), L), event)
+        state = (LightSubpath(walk, mi.Bool(enters), mi.Bool(enters), L), event)
         s, event = dr.while_loop(state, lambda s, event: s.walk.alive, self._follow, label="light")
-        return s.walk.rng, s.L, event, aim
+        return s.walk.rng, s.L, event, sample
 
-    def _follow(self, s: LightWalk, event: Event) -> tuple[LightWalk, Event]:
-        """One flight of the walk from the light, and a join on its ray if that may have one."""
+    def _follow(self, s: LightSubpath, event: Event) -> tuple[LightSubpath, Event]:
+        """One flight of the light subpath, and a connection on its ray if that may have one."""
         media, walk, rng = self.media, s.walk, s.walk.rng
+        # ---- connection of an event q on the ray
         m = media.coefficients(event.object, walk.o)
-        joinable = s.lit & s.fresh
+        connectable = s.lit & s.fresh
         t, over = _on_ray(walk, event, rng.next_float32())
-        t = dr.select(joinable, t, 0)
+        t = dr.select(connectable, t, 0)
         flight = free_path(m, walk.channel, rng.next_float32())
         ray = walk.ray(dr.maximum(t, flight))
         hit = media.scene.ray_intersect_preliminary(ray, coherent=False)
         reach = hit.t + walk.skip
-        L = s.L + self._joined(walk, event, t, dr.select(joinable & (t < reach), over, 0))
+        L = s.L + self._connect(walk, event, t, dr.select(connectable & (t < reach), over, 0))
+
+        # ---- free flight, to a scattering event after which the subpath must reflect, or to the boundary
         u, p = None, mi.Point3f(walk.o + walk.d * flight)
         if media.varies:
             m, u = media.coefficients(event.object, p), rng.next_float32()
@@ -184,10 +198,10 @@ class Joins:
         walk, *_ = dr.if_stmt((walk, ray, hit), ~collided, self._reflect, lambda *state: state)
         scattered.rng = walk.rng
         lit = ~ended.scatters & (s.lit | ~collided)
-        return LightWalk(dr.select(ended.scatters, scattered, walk), lit, ~ended.null, L), event
+        return LightSubpath(dr.select(ended.scatters, scattered, walk), lit, ~ended.null, L), event
 
-    def _joined(self, walk: Walk, event: Event, t: Any, over: Any) -> Any:
-        """What a join at the distance t on a ray of light brings; `over` is one over its density."""
+    def _connect(self, walk: Walk, event: Event, t: mi.Float, over: mi.Float) -> mi.Spectrum:
+        """Light of a connection at the distance t on a ray of light; `over` is one over its density."""
         media, q = self.media, mi.Point3f(walk.o + walk.d * t)
         to_p = mi.Ray3f(q, dr.normalize(event.p - q))
         to_p.maxt = dr.norm(event.p - q)
@@ -200,7 +214,7 @@ class Joins:
         T *= media.transmittance(event.object, to_p, dr.select(bright, to_p.maxt, 0), walk.rng)
         return dr.select(bright, value * T, 0)
 
-    def _reflect(self, walk: Walk, ray: Any, hit: Any) -> tuple:
+    def _reflect(self, walk: Walk, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f) -> tuple:
         """Reflection at the boundary from inside with the probability of its reflectance."""
         k, d = mi.Int32(walk.object), walk.d
         si = hit.compute_surface_interaction(ray)
@@ -216,21 +230,21 @@ class Joins:
         return walk, ray, hit
 
 
-def _draw_across(event: Event, aim: Aim, rng: Any) -> tuple[Any, Any]:
+def _draw_across(event: Event, sample: EmitterSample, rng: mi.PCG32) -> tuple[mi.Interaction3f, mi.Float]:
     """A point of the plane across w_0 through the event, and its density per area."""
     sigma_t = event.m.mean_t
-    wide = sigma_t * dr.rsqrt(1 + sigma_t * aim.depth)
+    wide = sigma_t * dr.rsqrt(1 + sigma_t * sample.depth)
     rate = dr.select(rng.next_float32() < 0.5, RATES[0], RATES[1]) * pick(wide, draw(len(wide), rng))
     r = dr.maximum(-dr.log(1 - rng.next_float32()) / rate, 1e-20)
     density = sum(channel_mean(c * wide * dr.exp(-c * wide * r)) for c in RATES) / (len(RATES) * 2 * dr.pi * r)
     sin_phi, cos_phi = dr.sincos(2 * dr.pi * rng.next_float32())
-    s, t = mi.coordinate_system(aim.w_0)
+    s, t = mi.coordinate_system(sample.w_0)
     at = dr.zeros(mi.Interaction3f)
-    at.p = mi.Point3f(event.p + aim.shift + (s * cos_phi + t * sin_phi) * r)
+    at.p = mi.Point3f(event.p + sample.shift + (s * cos_phi + t * sin_phi) * r)
     return at, density
 
 
-def _on_ray(walk: Walk, event: Event, u: Any) -> tuple[Any, Any]:
+def _on_ray(walk: Walk, event: Event, u: mi.Float) -> tuple[mi.Float, mi.Float]:
     """Distance of an event q on a ray of light, and 1 / (its density |p - q|²)."""
     v = event.p - walk.o
     t_0 = dr.dot(v, walk.d)
@@ -241,16 +255,24 @@ def _on_ray(walk: Walk, event: Event, u: Any) -> tuple[Any, Any]:
     return t, dr.select(dr.isfinite(t), width / D, 0)
 
 
-def find_joins(scene: Any, media: WalkMedia, small: SmallEmitters | None, share: float) -> Joins | None:
-    """Joins with the small emitters of a scene; None without any, or without an object whose boundary is smooth."""
+def find_connections(
+    scene: mi.Scene, media: WalkMedia, small: SmallEmitters | None, share: float
+) -> SubpathConnections | None:
+    """Connections with the small emitters of a scene; None without any, or without an object of smooth boundary."""
     if small is None or not media.objects or media.all_rough or share == 0:
         return None
     if media.inner is not None and not np.array(media.inner.tables["alone"]).any():
         return None
-    return Joins(scene, media, small, share)
+    return SubpathConnections(scene, media, small, share)
 
 
-# ---- Connections from inside to small emitters ---------------------------------------------------------------------
+# ---- Directions from events to emitters -----------------------------------------------------------------------------
+#
+# Where no connection finds a path, the walk from the camera has to hit the emitter through the refracting boundary.
+# The direction from the event v that does so is guessed: w_0 is refracted at the normal of the place where the last
+# guess meets the boundary, three times. Directions are then sampled about the guess, from a narrow lobe as wide as the
+# emitter and from wider ones for guesses that are wrong. They are weighted against those of the phase function by the
+# balance heuristic, so that no guess has to be right.
 
 GUESSES = 3
 SHARES = (0.5, 0.3, 0.2)  # of the lobes
@@ -268,7 +290,7 @@ class Departure:
 
 
 @dataclass(frozen=True, eq=False)
-class Guide:
+class EmitterDirections:
     """Directions from events to small emitters.
 
     Args:
@@ -277,11 +299,13 @@ class Guide:
         small: its small emitters.
     """
 
-    scene: Any
+    scene: mi.Scene
     media: WalkMedia
     small: SmallEmitters
 
-    def _guess(self, v: Any, k: Any, which: Any, m: Coefficients, active: Any) -> tuple[Any, Any, Any]:
+    def _guess(
+        self, v: mi.Point3f, k: mi.Int32, which: mi.Int32, m: Coefficients, active: mi.Bool
+    ) -> tuple[mi.Vector3f, mi.Float, mi.Bool]:
         """The direction from v by which an emitter sees it through the boundary, its concentration, and if any."""
         toward, small = self.small.direction(which, v)
         eta = self.media.row("eta", k)
@@ -299,7 +323,7 @@ class Guide:
             d = dr.normalize(dr.select(cosine > 0, refracted, d))
         return d, dr.minimum(dr.square(eta) / dr.maximum(self.small.angle2(which, v), 1e-6), 1e6), valid
 
-    def light(self, event: Event, rng: Any) -> Any:
+    def light(self, event: Event, rng: mi.PCG32) -> mi.Spectrum:
         """An estimate of the light of small emitters that leaves from an event, per weight of the walk."""
         v, k, m = event.p, event.object, event.m
         n = len(self.small)
@@ -323,7 +347,7 @@ class Guide:
         value = phase * T * factor
         return dr.select(valid, value * self.small.along(which, way, outside, valid), 0)
 
-    def share(self, which: Any, way: Departure, active: Any) -> Any:
+    def share(self, which: mi.Int32, way: Departure, active: mi.Bool) -> mi.Float:
         """Weight of having hit emitter `which`, if >= 0, by the phase function (balance heuristic against `light`)."""
         k, m = way.object, self.media.coefficients(way.object, way.p)
         guess, concentration, valid = self._guess(way.p, k, type(k)(dr.maximum(which, 0)), m, active & (which >= 0))
@@ -332,14 +356,14 @@ class Guide:
         return phase / (phase + dr.select(active & valid, lobes, 0))
 
 
-def _lobes(cosine: Any, concentration: Any) -> Any:
+def _lobes(cosine: mi.Float, concentration: mi.Float) -> mi.Float:
     """Density of the sum of lobes c e^(-c (1 - cos)) / (2 pi), 1/sr; what falls beyond cos = -1 is left out."""
     x = dr.maximum(1 - cosine, 0)
     parts = zip(SHARES, (concentration, *WIDER))
     return sum(a * c * dr.exp(-c * x) for a, c in parts) / (2 * dr.pi)
 
 
-def _draw_lobe(guess: Any, concentration: Any, rng: Any) -> tuple[Any, Any]:
+def _draw_lobe(guess: mi.Vector3f, concentration: mi.Float, rng: mi.PCG32) -> tuple[mi.Vector3f, mi.Float]:
     """A direction about the guess, and its density."""
     u = rng.next_float32()
     c = dr.select(u < SHARES[0], concentration, dr.select(u < SHARES[0] + SHARES[1], WIDER[0], WIDER[1]))
@@ -350,14 +374,24 @@ def _draw_lobe(guess: Any, concentration: Any, rng: Any) -> tuple[Any, Any]:
     return d, _lobes(1 - x, concentration)
 
 
-# ---- Delta lights inside objects -----------------------------------------------------------------------------------
+# ---- Delta lights inside objects ------------------------------------------------------------------------------------
+#
+# The irradiance I / d² of a light is unbounded at events close to it. Within a radius r below a mean free path it is
+# even, which keeps all light and blurs it by r:
+#
+#     E(d) = I / d² for d > r,    3 I / r² (1 + sigma_t r / 4) for d < r,
+#
+#     ∫_0^r E(d) e^(-sigma_t d) d² dd = I ∫_0^r e^(-sigma_t d) dd    to the order (sigma_t r)³.
+#
+# After reflection or refraction at a smooth boundary no event sees a light; it is spread over a cone
+# (`light.small_emitters`).
 
 NEAREST = 0.2  # mean free paths, r
 CONE = 0.15  # radius of the cone, radians; light that a medium scatters beside it hides more
 
 
 @dataclass(frozen=True, eq=False)
-class Lamps:
+class InnerLights:
     """The delta lights inside objects.
 
     Args:
@@ -367,21 +401,21 @@ class Lamps:
     """
 
     media: WalkMedia
-    emitters: list[Any]
-    tables: dict[str, Any]
+    emitters: list[mi.Emitter]
+    tables: dict[str, mi.UInt32 | mi.Int32]
 
     @classmethod
-    def of(cls, media: WalkMedia) -> Lamps | None:
+    def of(cls, media: WalkMedia) -> InnerLights | None:
         """Those of the objects of a scene; None if there are none."""
-        if media.inner is None or not media.inner.lamps:
+        if media.inner is None or not media.inner.lights:
             return None
-        emitters, around = zip(*media.inner.lamps)
+        emitters, around = zip(*media.inner.lights)
         pointers = [int(dr.reinterpret_array(mi.UInt32, mi.EmitterPtr(emitter))[0]) for emitter in emitters]
         tables = {"pointer": mi.UInt32(pointers), "around": mi.Int32(around)}
         dr.make_opaque(tables)
         return cls(media, list(emitters), tables)
 
-    def _drawn(self, k: Any, rng: Any, active: Any) -> tuple[Any, Any]:
+    def _drawn(self, k: mi.Int32, rng: mi.PCG32, active: mi.Bool) -> tuple[mi.Emitter | mi.EmitterPtr, mi.Bool]:
         """One of the lights, and whether it is in object k."""
         which = draw(len(self.emitters), rng)
         here = active & (dr.gather(mi.Int32, self.tables["around"], which) == k)
@@ -389,7 +423,7 @@ class Lamps:
             return self.emitters[0], here
         return dr.reinterpret_array(mi.EmitterPtr, dr.gather(mi.UInt32, self.tables["pointer"], which)), here
 
-    def light(self, k: Any, at: Any, rng: Any, active: Any) -> tuple[Any, Any]:
+    def light(self, k: mi.Int32, at: mi.Interaction3f, rng: mi.PCG32, active: mi.Bool) -> tuple:
         """The direction to a light from an interaction in object k, and its irradiance across, over its probability."""
         emitter, here = self._drawn(k, rng, active)
         ds, E = emitter.sample_direction(at, mi.Point2f(0.5), here)
@@ -400,7 +434,7 @@ class Lamps:
         near = dr.select(ds.dist < r, 3 * dr.square(ds.dist / r) * (1 + 0.25 * r * sigma_t), 1)
         return ds.d, dr.select(lit, self._passed(k, ray, ds.dist, rng, lit) * E * (near * len(self.emitters)), 0)
 
-    def spread(self, k: Any, ray: Any, rng: Any, active: Any) -> Any:
+    def spread(self, k: mi.Int32, ray: mi.Ray3f, rng: mi.PCG32, active: mi.Bool) -> mi.Spectrum:
         """Radiance of a light along a ray in object k, spread over a wide cone, over its probability."""
         emitter, here = self._drawn(k, rng, active)
         L = spread(self.media.inner.scene, emitter, ray, mi.Float(CONE), here)
@@ -411,7 +445,7 @@ class Lamps:
         T = self.media.transmittance(k, ray, dr.select(lit, ds.dist, 0), rng)
         return dr.select(lit, T * L * len(self.emitters), 0)
 
-    def _passed(self, k: Any, ray: Any, distance: Any, rng: Any, active: Any) -> Any:
+    def _passed(self, k: mi.Int32, ray: mi.Ray3f, distance: mi.Float, rng: mi.PCG32, active: mi.Bool) -> mi.Spectrum:
         """The transmittance of what is between: 0 behind any surface."""
         shadow = mi.Ray3f(ray)
         shadow.maxt = distance * (1 - 1e-4)

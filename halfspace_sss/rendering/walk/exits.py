@@ -28,14 +28,23 @@ from halfspace_sss.rendering.walk.random_walk import (
 )
 from halfspace_sss.tracing.walk import generator, pass_seed
 
-__all__ = ["ExitVisitor", "Exits", "FirstExitVisitor", "FirstExits", "Start", "Watched", "exits", "walk_from"]
+__all__ = [
+    "ExitVisitor",
+    "WalkExits",
+    "FirstExitVisitor",
+    "FirstExits",
+    "WalkStarts",
+    "FirstExitRecord",
+    "exits",
+    "walk_from",
+]
 
 
 LANES = 2**13
 
 
 @dataclass
-class Start:
+class WalkStarts:
     """Where walks begin, one entry per walk."""
 
     x_o: mi.Point3f  # on the surface
@@ -45,7 +54,7 @@ class Start:
 
 
 @dataclass
-class Exits:
+class WalkExits:
     """Where walks leave, in the order of their starts."""
 
     left: mi.Bool  # whether the walk left, rather than ended inside; the rest is 0 if not
@@ -60,18 +69,22 @@ class Exits:
 class ExitVisitor:
     """Stores each exit at the number of its walk, which is the record, and ends the walk there."""
 
-    exits: Exits
+    exits: WalkExits
 
-    def event(self, walk: Walk, record: Any, event: Event) -> tuple[Walk, Any]:
+    def event(self, walk: Walk, record: mi.UInt32, event: Event) -> tuple[Walk, mi.UInt32]:
         return walk, record
 
-    def boundary(self, walk: Walk, record: Any, si: Any, active: Any) -> tuple[Walk, Any]:
+    def boundary(
+        self, walk: Walk, record: mi.UInt32, si: mi.SurfaceInteraction3f, active: mi.Bool
+    ) -> tuple[Walk, mi.UInt32]:
         return walk, record
 
-    def surface(self, walk: Walk, record: Any, si: Any, bsdf: Any, k: Any) -> tuple[Walk, Any]:
+    def surface(
+        self, walk: Walk, record: mi.UInt32, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, k: mi.Int32
+    ) -> tuple[Walk, mi.UInt32]:
         return walk, record
 
-    def crossing(self, walk: Walk, record: Any, crossing: Crossing) -> tuple[Walk, Any]:
+    def crossing(self, walk: Walk, record: mi.UInt32, crossing: Crossing) -> tuple[Walk, mi.UInt32]:
         leaves = walk.alive & crossing.leaves
         to, si = self.exits, crossing.si
         dr.scatter(to.left, mi.Bool(True), record, leaves)
@@ -83,7 +96,7 @@ class ExitVisitor:
         return replace(walk, alive=walk.alive & ~leaves), record
 
 
-def exits(media: WalkMedia, k: int, start: Start, seed: int | tuple[int, ...], lanes: int = LANES) -> Exits:
+def exits(media: WalkMedia, k: int, start: WalkStarts, seed: int | tuple[int, ...], lanes: int = LANES) -> WalkExits:
     """Where walks from points on object k leave it.
 
     Args:
@@ -105,7 +118,7 @@ def exits(media: WalkMedia, k: int, start: Start, seed: int | tuple[int, ...], l
 def walk_from(
     media: WalkMedia,
     k: int,
-    start: Start,
+    start: WalkStarts,
     visitor: Visitor,
     seed: int | tuple[int, ...],
     lanes: int = LANES,
@@ -132,10 +145,10 @@ def walk_from(
     lanes = min(lanes, n)
     walker, total, k = Walker(media, visitor, roulette_from), dr.opaque(mi.UInt32, n), dr.opaque(mi.UInt32, k)
 
-    def renew(walk: Walk, index: Any) -> tuple[Walk, Any]:
+    def renew(walk: Walk, index: mi.UInt32) -> tuple[Walk, mi.UInt32]:
         return _enter(media, k, start, index + lanes, walk.rng), index + lanes
 
-    def body(walk: Walk, index: Any) -> tuple[Walk, Any]:
+    def body(walk: Walk, index: mi.UInt32) -> tuple[Walk, mi.UInt32]:
         walk, index = dr.if_stmt((walk, index), walk.alive, walker.step, lambda *s: s, label="inside")
         return dr.if_stmt((walk, index), ~walk.alive, renew, lambda *s: s, label="renew")
 
@@ -146,12 +159,12 @@ def walk_from(
     dr.eval()
 
 
-def _nowhere(n: int) -> Exits:
+def _nowhere(n: int) -> WalkExits:
     kinds = mi.Bool, mi.Point3f, mi.Normal3f, mi.Vector3f, mi.Spectrum, mi.UInt32
-    return Exits(*(dr.zeros(kind, n) for kind in kinds))
+    return WalkExits(*(dr.zeros(kind, n) for kind in kinds))
 
 
-def _check(media: WalkMedia, k: int, start: Start) -> int:
+def _check(media: WalkMedia, k: int, start: WalkStarts) -> int:
     """The number of starts."""
     if not 0 <= k < len(media.objects):
         raise ValueError(f"k must be a whole number in [0, {len(media.objects) - 1}], got {k!r}")
@@ -163,7 +176,7 @@ def _check(media: WalkMedia, k: int, start: Start) -> int:
     return widths[0]
 
 
-def _enter(media: WalkMedia, k: Any, start: Start, index: Any, rng: Any) -> Walk:
+def _enter(media: WalkMedia, k: mi.UInt32, start: WalkStarts, index: mi.UInt32, rng: mi.PCG32) -> Walk:
     """The walk of a start, refracted into the object."""
     known = index < dr.width(start.x_o)
     si = dr.zeros(mi.SurfaceInteraction3f, dr.width(index))
@@ -186,7 +199,13 @@ def _enter(media: WalkMedia, k: Any, start: Start, index: Any, rng: Any) -> Walk
                    skip=media.clear(k, si.n, d), scale=dr.square(bs.eta), channel=channel)  # fmt: skip
 
 
-# ---- First exits of paths from the camera --------------------------------------------------------------------------
+# ---- First exits of paths from the camera ------------------------------------------------------------------------
+#
+# While walks gather light for an image, where they leave is kept for learning. A path that meets an object first goes
+# in at x_o against the direction w_o of the eye, or is reflected there, and leaves at x_i into w_i with the throughput
+# T. Over all such paths, those included that do not enter,
+#
+#     ∫∫ S(x_i, w_i; x_o, w_o) mu_i f(x_i, w_i) dw_i dA_i = E[T f(x_i, w_i)].
 
 
 @dataclass
@@ -207,7 +226,7 @@ class FirstExits:
     face: mi.UInt32  # at x_i
 
     @classmethod
-    def of(cls, scene: Any, media: WalkMedia, rays: Any) -> FirstExits:
+    def of(cls, scene: mi.Scene, media: WalkMedia, rays: mi.Ray3f) -> FirstExits:
         """What rays of the camera meet first, and room for where their walks leave."""
         si = scene.ray_intersect(rays, mi.RayFlags.All, coherent=True)
         k = media.index_of(si.shape, si.is_valid())
@@ -227,13 +246,13 @@ class FirstExits:
         dr.eval(found)
         return found
 
-    def gather(self, lanes: Any) -> FirstExits:
+    def gather(self, lanes: mi.UInt32) -> FirstExits:
         """The paths of the given lanes."""
         return FirstExits(**{name: dr.gather(type(value), value, lanes) for name, value in vars(self).items()})
 
 
 @dataclass
-class Watched:
+class FirstExitRecord:
     """What a visitor keeps of a path, the number of the path, and whether it is inside the object it met first."""
 
     record: Any
@@ -253,19 +272,23 @@ class FirstExitVisitor:
     visitor: Visitor
     exits: FirstExits
 
-    def event(self, walk: Walk, record: Watched, event: Event) -> tuple[Walk, Watched]:
+    def event(self, walk: Walk, record: FirstExitRecord, event: Event) -> tuple[Walk, FirstExitRecord]:
         walk, kept = self.visitor.event(walk, record.record, event)
         return walk, replace(record, record=kept)
 
-    def boundary(self, walk: Walk, record: Watched, si: Any, active: Any) -> tuple[Walk, Watched]:
+    def boundary(
+        self, walk: Walk, record: FirstExitRecord, si: mi.SurfaceInteraction3f, active: mi.Bool
+    ) -> tuple[Walk, FirstExitRecord]:
         walk, kept = self.visitor.boundary(walk, record.record, si, active)
         return walk, replace(record, record=kept)
 
-    def surface(self, walk: Walk, record: Watched, si: Any, bsdf: Any, k: Any) -> tuple[Walk, Watched]:
+    def surface(
+        self, walk: Walk, record: FirstExitRecord, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, k: mi.Int32
+    ) -> tuple[Walk, FirstExitRecord]:
         walk, kept = self.visitor.surface(walk, record.record, si, bsdf, k)
         return walk, replace(record, record=kept)
 
-    def crossing(self, walk: Walk, record: Watched, crossing: Crossing) -> tuple[Walk, Watched]:
+    def crossing(self, walk: Walk, record: FirstExitRecord, crossing: Crossing) -> tuple[Walk, FirstExitRecord]:
         walk, kept = self.visitor.crossing(walk, record.record, crossing)
         to, si = self.exits, crossing.si
         leaves, n_shading = walk.alive & crossing.leaves & record.first, lifted(si.sh_frame.n, si.n, walk.d)

@@ -17,7 +17,7 @@ from halfspace_sss.rendering.surface.parameters import OF_MITSUBA, check_paramet
 from halfspace_sss.rendering.surface.placement import check_sensors, places_of
 from halfspace_sss.rendering.surface.sharing import number_of
 from halfspace_sss.rendering.transport.body import check_size
-from halfspace_sss.rendering.walk.emitter_connections import Guide, Lamps, find_joins
+from halfspace_sss.rendering.walk.emitter_connections import EmitterDirections, InnerLights, find_connections
 from halfspace_sss.rendering.walk.exits import FirstExits
 from halfspace_sss.rendering.walk.media import WalkMedia
 from halfspace_sss.rendering.walk.path_loop import LightVisitor, PathTracer
@@ -42,7 +42,7 @@ def walk_integrator_class() -> type:
         event near the boundary, 0 leaves all light to chance).
         """
 
-        def __init__(self, props: Any) -> None:
+        def __init__(self, props: mi.Properties) -> None:
             check_parameters("translucent_walk", props, (*PARAMETERS, *OF_MITSUBA))
             mi.SamplingIntegrator.__init__(self, props)
             self.mm_per_unit = _positive("mm_per_unit", float(props.get("mm_per_unit", 1.0)))
@@ -52,19 +52,19 @@ def walk_integrator_class() -> type:
             self.join_share = _share("join_share", float(props.get("join_share", 0.5)))
             self._prepared: tuple[int, list, tuple, Any] = (0, [], ([], []), None)
 
-        def tracer(self, scene: Any) -> PathTracer:
+        def tracer(self, scene: mi.Scene) -> PathTracer:
             """What paths through a scene need; its objects are made ready once, its emitters may have been edited."""
             self._prepared = _prepared(scene, self._prepared, self.mm_per_unit)
             media, small = self._prepared[-1], SmallEmitters.of(scene)
-            joins = find_joins(scene, media, small, self.join_share)
-            guide = joins and Guide(scene, media, small)
-            visitor = LightVisitor(scene, media, small, joins, guide, Lamps.of(media))
+            connections = find_connections(scene, media, small, self.join_share)
+            directions = connections and EmitterDirections(scene, media, small)
+            visitor = LightVisitor(scene, media, small, connections, directions, InnerLights.of(media))
             return PathTracer(visitor, self.max_depth, self.rr_depth, self.hidden)
 
         def render(
-            self, scene: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0, develop: bool = True, evaluate: bool = True,
-            keep: Keep | None = None,
-        ) -> Any:  # fmt: skip
+            self, scene: mi.Scene, sensor: mi.Sensor | int = 0, seed: mi.UInt32 | int = 0, spp: int = 0,
+            develop: bool = True, evaluate: bool = True, keep: Keep | None = None,
+        ) -> mi.TensorXf | None:  # fmt: skip
             """The image; `keep` is called with the first exits of each launch, which are stored for it."""
             sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
             spp = spp or sensor.sampler().sample_count()
@@ -72,7 +72,14 @@ def walk_integrator_class() -> type:
                 _render(self.tracer(scene), sensor, int(mi.UInt32(seed)[0]), spp, keep)
                 return sensor.film().develop() if develop else None
 
-        def sample(self, scene: Any, sampler: Any, ray: Any, medium: Any = None, active: Any = True) -> tuple:
+        def sample(
+            self,
+            scene: mi.Scene,
+            sampler: mi.Sampler,
+            ray: mi.Ray3f,
+            medium: mi.Medium | None = None,
+            active: mi.Bool = True,
+        ) -> tuple:
             return _samples(self.tracer(scene), sampler, ray, active)
 
         render_forward = render_backward = _refuse_derivatives
@@ -83,8 +90,8 @@ def walk_integrator_class() -> type:
     return TranslucentWalk
 
 
-def _prepared(scene: Any, before: tuple, mm_per_unit: float) -> tuple[int, list, tuple, Any]:
-    """Number, shapes, places and media of a scene: those of before, unless shapes, lamps or media changed."""
+def _prepared(scene: mi.Scene, before: tuple, mm_per_unit: float) -> tuple[int, list, tuple, Any]:
+    """Number, shapes, places and media of a scene: those of before, unless shapes, inner lights or media changed."""
     shapes = scene.shapes()  # the scene itself, which holds its integrator, would never be freed
     places = places_of(scene)
     same = before[0] == number_of(scene) and same_objects(before[1], shapes) and before[2][0] == places[0]
@@ -101,7 +108,7 @@ def _refuse_derivatives(*_: Any, **__: Any) -> None:
     raise ValueError("the integrator of a derivative of light must be bssrdf, got translucent_walk")
 
 
-def _render(tracer: PathTracer, sensor: Any, seed: int, spp: int, keep: Keep | None) -> None:
+def _render(tracer: PathTracer, sensor: mi.Sensor, seed: int, spp: int, keep: Keep | None) -> None:
     """Fill the film of a sensor, in launches between which an interrupt is heard."""
     sensor.film().prepare([])
     most = max(1, SAMPLES_PER_LAUNCH // int(dr.prod(_sampled_size(sensor.film()))))
@@ -109,7 +116,9 @@ def _render(tracer: PathTracer, sensor: Any, seed: int, spp: int, keep: Keep | N
         _launch(tracer, sensor, min(most, spp - start), (seed, launch), keep)
 
 
-def _samples(tracer: PathTracer, sampler: Any, ray: Any, active: Any) -> tuple[Any, Any, list]:
+def _samples(
+    tracer: PathTracer, sampler: mi.Sampler, ray: mi.Ray3f, active: mi.Bool
+) -> tuple[mi.Spectrum, mi.Bool, list]:
     """Radiance along rays of another integrator around this one."""
     with dr.suspend_grad():
         seed = tuple(int(2**24 * sampler.next_1d()[0]) for _ in range(2))
@@ -117,7 +126,7 @@ def _samples(tracer: PathTracer, sampler: Any, ray: Any, active: Any) -> tuple[A
     return dr.select(active, L, 0), active & seen, []
 
 
-def _launch(tracer: PathTracer, sensor: Any, spp: int, seed: tuple[int, int], keep: Keep | None) -> None:
+def _launch(tracer: PathTracer, sensor: mi.Sensor, spp: int, seed: tuple[int, int], keep: Keep | None) -> None:
     """Trace spp rays through each pixel and add them to the film."""
     film = sensor.film()
     rays, weight, position = camera_rays(sensor, spp, seed)
@@ -140,12 +149,12 @@ def _launch(tracer: PathTracer, sensor: Any, spp: int, seed: tuple[int, int], ke
     dr.eval(block.tensor())
 
 
-def _sampled_size(film: Any) -> Any:
+def _sampled_size(film: mi.Film) -> mi.ScalarVector2u:
     size = film.crop_size()
     return size + 2 * film.rfilter().border_size() if film.sample_border() else size
 
 
-def camera_rays(sensor: Any, spp: int, seed: tuple[int, int]) -> tuple[Any, Any, Any]:
+def camera_rays(sensor: mi.Sensor, spp: int, seed: tuple[int, int]) -> tuple[mi.Ray3f, mi.Spectrum, mi.Vector2f]:
     """Rays of spp samples of each pixel, their weights, and their positions on the film."""
     film, size = sensor.film(), _sampled_size(sensor.film())
     border = film.rfilter().border_size() if film.sample_border() else 0
@@ -169,7 +178,7 @@ def camera_rays(sensor: Any, spp: int, seed: tuple[int, int]) -> tuple[Any, Any,
     return _widened(ray, n), weight, mi.Vector2f(pixel) if film.rfilter().is_box_filter() else position
 
 
-def _widened(ray: Any, n: int) -> Any:
+def _widened(ray: mi.Ray3f, n: int) -> mi.Ray3f:
     """n rays; those of a sensor that knows one ray only are one."""
     found = mi.Ray3f(ray)
     found.o, found.d = found.o + dr.zeros(mi.Point3f, n), found.d + dr.zeros(mi.Vector3f, n)

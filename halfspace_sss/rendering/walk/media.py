@@ -9,23 +9,38 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.light.small_emitters import is_delta
 from halfspace_sss.rendering.surface.horizon import lift
+from halfspace_sss.rendering.surface.inside import Inside
 from halfspace_sss.rendering.surface.object import Object, survey
 from halfspace_sss.rendering.surface.placement import Content, contents, translucent_shapes
 from halfspace_sss.rendering.surface.sharing import check_together, scene_of
 from halfspace_sss.rendering.surface.varying import VaryingMedium, eval_volume
 
-__all__ = ["Coefficients", "Grids", "Inner", "WalkMedia", "by_pointer", "per_channel", "pointer_numbers"]
+__all__ = [
+    "Coefficients",
+    "HeterogeneousMedia",
+    "InnerShapes",
+    "WalkMedia",
+    "by_pointer",
+    "per_channel",
+    "pointer_numbers",
+]
 
 
-# ---- Shapes, media and lights inside objects -----------------------------------------------------------------------
+# ---- Shapes, media and lights inside objects ------------------------------------------------------------------------
+#
+# Indices are relative, as Mitsuba's path tracers take them: int_ior / ext_ior of a `dielectric` inside, and eta of an
+# object inside another, are those of its inside over what is around it. A bubble in wax of eta 1.4 is a `dielectric`
+# with int_ior 1 and ext_ior 1.4. What refracts displaces the medium around it; what passes light straight (`null`,
+# `mask`, `thindielectric`) stands in it.
 
 REFRACTS = int(mi.BSDFFlags.DeltaTransmission) | int(mi.BSDFFlags.GlossyTransmission)
 
 
 @dataclass(frozen=True, eq=False)
-class Inner:
+class InnerShapes:
     """What lies inside the objects of a scene.
 
     Args:
@@ -33,15 +48,15 @@ class Inner:
         tables: by what Dr.Jit's registry calls a shape, the number of the object `around` it or -1, and whether it
             `displaces` that; by the number of an object, whether it stands `alone`, neither in another nor around
             anything.
-        lamps: the delta lights in the medium of an object, and its number.
+        lights: the delta lights in the medium of an object, and its number.
     """
 
-    scene: Any
+    scene: mi.Scene
     tables: dict[str, Any]
-    lamps: list[tuple[Any, int]]
+    lights: list[tuple[mi.Emitter, int]]
 
     @classmethod
-    def of(cls, scene: Any, objects: list[Object]) -> Inner | None:
+    def of(cls, scene: mi.Scene, objects: list[Object]) -> InnerShapes | None:
         """What lies inside; None if nothing does.
 
         Raises:
@@ -72,29 +87,29 @@ class Inner:
         alone = [k not in holding and id(shape) not in things for k, shape in enumerate(own)]
         tables = {"around": mi.Int32(at.tolist()), "displaces": mi.Bool(displaces.tolist()), "alone": mi.Bool(alone)}
         dr.make_opaque(tables)
-        lamps = [(thing, around[key]) for key, thing in things.items() if isinstance(thing, mi.Emitter)]
-        lamps = [(lamp, k) for lamp, k in lamps if is_delta(lamp) and k >= 0]
-        return cls(scene_of(shapes, scene), tables, lamps)
+        lights = [(thing, around[key]) for key, thing in things.items() if isinstance(thing, mi.Emitter)]
+        lights = [(light, k) for light, k in lights if is_delta(light) and k >= 0]
+        return cls(scene_of(shapes, scene), tables, lights)
 
-    def around(self, shape: Any) -> Any:
+    def around(self, shape: mi.ShapePtr) -> mi.Int32:
         """The number of the object around a shape, or -1."""
         return self._of_shape("around", shape, -1)
 
-    def displaces(self, shape: Any) -> Any:
+    def displaces(self, shape: mi.ShapePtr) -> mi.Bool:
         """Whether a shape, which is no translucent object, displaces the medium around it."""
         return self._of_shape("displaces", shape, False)
 
-    def _of_shape(self, key: str, shape: Any, otherwise: Any) -> Any:
+    def _of_shape(self, key: str, shape: mi.ShapePtr, otherwise: int | bool) -> mi.Int32 | mi.Bool:
         pointer, table = dr.reinterpret_array(mi.UInt32, shape), self.tables[key]
         known = pointer < dr.width(table)
         return dr.select(known, dr.gather(type(table), table, pointer, known), otherwise)
 
 
-def _shapes(found: list[Content]) -> list[Any]:
+def _shapes(found: list[Content]) -> list[mi.Shape]:
     return list({id(c.thing): c.thing for c in found if isinstance(c.thing, mi.Shape)}.values())
 
 
-def _displaces(shape: Any) -> bool:
+def _displaces(shape: mi.Shape) -> bool:
     return not hasattr(shape.bsdf(), "inside") and bool(shape.bsdf().flags() & REFRACTS)
 
 
@@ -129,7 +144,7 @@ def _check(found: list[Content], objects: list[Object]) -> None:
 
 
 @dataclass(frozen=True, eq=False)
-class Grids:
+class HeterogeneousMedia:
     """The media of all objects, of which at least one varies.
 
     Args:
@@ -140,14 +155,14 @@ class Grids:
         majorants: likewise, 1/(scene unit).
     """
 
-    densities: list[Any]
-    albedos: list[Any]
-    factor: list[Any]
-    albedo: list[Any]
-    majorants: list[Any]
+    densities: list[mi.Volume | None]
+    albedos: list[mi.Volume | None]
+    factor: list[mi.Float]
+    albedo: list[mi.Float]
+    majorants: list[mi.Float]
 
     @classmethod
-    def of(cls, insides: list[Any], mm_per_unit: float) -> Grids:
+    def of(cls, insides: list[Inside], mm_per_unit: float) -> HeterogeneousMedia:
         """Of the insides of objects."""
         media = [inside.varying or _homogeneous(inside.medium) for inside in insides]
         tables = (
@@ -158,20 +173,20 @@ class Grids:
         dr.make_opaque(tables)
         return cls([m.density for m in media], [m.albedo_volume for m in media], *tables)
 
-    def majorant(self, k: Any) -> Any:
+    def majorant(self, k: mi.Int32) -> mi.Spectrum:
         """Of object k, 1/(scene unit)."""
         return _row(self.majorants, k)
 
-    def sigma_t(self, k: Any, p: Any) -> Any:
+    def sigma_t(self, k: mi.Int32, p: mi.Point3f) -> mi.Spectrum:
         """Extinction of object k at the point p, 1/(scene unit)."""
         return _row(self.factor, k) * _eval(self.densities, k, p)
 
-    def coefficients(self, k: Any, p: Any) -> tuple[Any, Any]:
+    def coefficients(self, k: mi.Int32, p: mi.Point3f) -> tuple[Any, Any]:
         """sigma_t and sigma_s of object k at the point p, 1/(scene unit)."""
         sigma_t = self.sigma_t(k, p)
         return sigma_t, sigma_t * _row(self.albedo, k) * _eval(self.albedos, k, p)
 
-    def transmittance(self, k: Any, ray: Any, distance: Any, rng: Any) -> Any:
+    def transmittance(self, k: mi.Int32, ray: mi.Ray3f, distance: mi.Float, rng: mi.PCG32) -> mi.Spectrum:
         """An unbiased estimate of exp(-∫ sigma_t) over a distance along a ray inside object k: ratio tracking.
 
         Collisions are drawn by the largest majorant M of the channels; each is null, with the weight
@@ -182,7 +197,16 @@ class Grids:
         T = dr.full(mi.Spectrum, 1, dr.width(o))
         t = -dr.log(1 - rng.next_float32()) / M
 
-        def collide(t: Any, T: Any, rng: Any, o: Any, d: Any, k: Any, M: Any, distance: Any) -> tuple:
+        def collide(
+            t: mi.Float,
+            T: mi.Spectrum,
+            rng: mi.PCG32,
+            o: mi.Point3f,
+            d: mi.Vector3f,
+            k: mi.Int32,
+            M: mi.Float,
+            distance: mi.Float,
+        ) -> tuple:
             T = T * dr.maximum(1 - self.sigma_t(k, dr.fma(d, t, o)) / M, 0)
             return t - dr.log(1 - rng.next_float32()) / M, T, rng, o, d, k, M, distance
 
@@ -191,22 +215,22 @@ class Grids:
         return dr.while_loop(state, going, collide, label="ratio tracking")[1]
 
 
-def per_channel(rows: list[Any], scale: float) -> list[Any]:
+def per_channel(rows: list[float | np.ndarray], scale: float) -> list[mi.Float]:
     """A table with one column per channel from a number, or one per channel, of each object."""
     n = len(mi.Spectrum(0))
     values = np.array([np.broadcast_to(row, n) for row in rows], dtype=float) * scale
     return [mi.Float(values[:, c].tolist()) for c in range(n)] if len(rows) else []
 
 
-def _homogeneous(medium: Any) -> VaryingMedium:
+def _homogeneous(medium: Medium) -> VaryingMedium:
     return VaryingMedium(None, np.atleast_1d(medium.sigma_t), None, np.atleast_1d(medium.albedo))
 
 
-def _row(table: list[Any], k: Any) -> Any:
+def _row(table: list[mi.Float], k: mi.Int32) -> mi.Spectrum:
     return mi.Spectrum([dr.gather(mi.Float, column, k) for column in table])
 
 
-def _eval(volumes: list[Any], k: Any, p: Any) -> Any:
+def _eval(volumes: list[mi.Volume | None], k: mi.Int32, p: mi.Point3f) -> mi.Spectrum:
     """The value of the volume of object k, 1 where it has none; Mitsuba's volumes cannot be called by pointers."""
     if len(volumes) == 1:
         return eval_volume(volumes[0], p)
@@ -246,11 +270,11 @@ class WalkMedia:
     """
 
     objects: list[Object]
-    insides: list[Any]
-    scene: Any
-    boundaries: list[Any]
+    insides: list[Inside]
+    scene: mi.Scene
+    boundaries: list[mi.BSDF]
     mm_per_unit: float
-    inner: Inner | None = None
+    inner: InnerShapes | None = None
 
     def __post_init__(self) -> None:
         media = [inside.medium for inside in self.insides]
@@ -274,7 +298,9 @@ class WalkMedia:
         object.__setattr__(self, "tables", tables)
         object.__setattr__(self, "box", _bounds(self.scene))
         varies = any(inside.varying is not None for inside in self.insides)
-        object.__setattr__(self, "grids", Grids.of(self.insides, self.mm_per_unit) if varies else None)
+        object.__setattr__(
+            self, "heterogeneous", HeterogeneousMedia.of(self.insides, self.mm_per_unit) if varies else None
+        )
 
     def is_current(self) -> bool:
         """Whether the objects still have the shapes and the media that this was made of."""
@@ -292,7 +318,7 @@ class WalkMedia:
         return any(is_rough(b) for b in self.boundaries)
 
     @property
-    def needed(self) -> Any:
+    def needed(self) -> int:
         """What boundaries have to know of a point that a walk meets: derivatives of positions where one is rough."""
         few = mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame | mi.RayFlags.UV
         return mi.RayFlags.All if self.any_rough else few
@@ -302,67 +328,67 @@ class WalkMedia:
         """Whether no boundary is smooth."""
         return all(is_rough(b) for b in self.boundaries)
 
-    def connects(self, k: Any) -> Any:
+    def connects(self, k: mi.Int32) -> mi.Bool:
         """Whether emitters can be connected to events in object k through its boundary: smooth, and nothing inside."""
         smooth = ~self.row("rough", k)
         if self.inner is None:
             return smooth
         return smooth & dr.gather(mi.Bool, self.inner.tables["alone"], self._place(k))
 
-    def row(self, key: str, k: Any) -> Any:
+    def row(self, key: str, k: mi.Int32) -> mi.Float | mi.UInt32 | mi.Bool:
         """An entry of a table for object k."""
         table = self.tables[key]
         return dr.gather(type(table), table, self._place(k))
 
-    def _place(self, k: Any) -> Any:
+    def _place(self, k: mi.Int32) -> mi.UInt32 | mi.Int32:
         """Of object k in tables: the same in all lanes, which is faster, where there is one object."""
         return mi.UInt32(0) if len(self.objects) == 1 else k
 
-    def counts(self, k: Any, order: Any) -> Any:
+    def counts(self, k: mi.Int32, order: mi.UInt32) -> mi.Bool:
         """Whether a walk that leaves object k after so many events counts."""
         return (order >= self.row("fewest", k)) & (order <= self.row("most", k))
 
     @property
     def varies(self) -> bool:
         """Whether a medium varies in space, so that collisions may be null."""
-        return self.grids is not None
+        return self.heterogeneous is not None
 
-    def spectrum(self, key: str, k: Any) -> Any:
+    def spectrum(self, key: str, k: mi.Int32) -> mi.Spectrum:
         """An entry of a table with one column per channel."""
         return mi.Spectrum([dr.gather(mi.Float, column, self._place(k)) for column in self.tables[key]])
 
-    def coefficients(self, k: Any, p: Any) -> Coefficients:
+    def coefficients(self, k: mi.Int32, p: mi.Point3f) -> Coefficients:
         """Of object k at the point p."""
         mean, g = self.spectrum("sigma_t", k), self.spectrum("g", k)
-        if self.grids is None:
+        if self.heterogeneous is None:
             return Coefficients(mean, self.spectrum("sigma_s", k), g, mean, mean)
-        sigma_t, sigma_s = self.grids.coefficients(k, p)
-        return Coefficients(sigma_t, sigma_s, g, self.grids.majorant(k), mean)
+        sigma_t, sigma_s = self.heterogeneous.coefficients(k, p)
+        return Coefficients(sigma_t, sigma_s, g, self.heterogeneous.majorant(k), mean)
 
-    def transmittance(self, k: Any, ray: Any, distance: Any, rng: Any) -> Any:
+    def transmittance(self, k: mi.Int32, ray: mi.Ray3f, distance: mi.Float, rng: mi.PCG32) -> mi.Spectrum:
         """exp(-∫ sigma_t) over a distance along a ray inside object k; by ratio tracking where a medium varies."""
-        if self.grids is None:
+        if self.heterogeneous is None:
             return dr.exp(-self.spectrum("sigma_t", k) * distance)
-        return self.grids.transmittance(k, ray, distance, rng)
+        return self.heterogeneous.transmittance(k, ray, distance, rng)
 
-    def index_of(self, shape: Any, active: Any = True) -> Any:
+    def index_of(self, shape: mi.ShapePtr, active: mi.Bool | bool = True) -> mi.Int32:
         """The number of the object that a shape is, or -1."""
         pointer = dr.reinterpret_array(mi.UInt32, shape)
         table = self.tables["shape"]
         known = active & (pointer < dr.width(table))
         return dr.select(known, dr.gather(mi.Int32, table, pointer, known), -1)
 
-    def met(self, shape: Any, k: Any) -> Any:
+    def met(self, shape: mi.ShapePtr, k: mi.Int32) -> mi.Int32:
         """The number of the object whose boundary, the given shape, a ray inside object k has met."""
         return k if len(self.objects) == 1 else self.index_of(shape)
 
-    def boundary(self, k: Any) -> Any:
+    def boundary(self, k: mi.Int32) -> mi.BSDF | mi.BSDFPtr:
         """The dielectric of object k: one BSDF, or a pointer in each lane."""
         if len(self.boundaries) == 1:
             return self.boundaries[0]
         return dr.reinterpret_array(mi.BSDFPtr, dr.gather(mi.UInt32, self.tables["boundary"], k))
 
-    def side(self, k: Any, prim_index: Any) -> Any:
+    def side(self, k: mi.Int32, prim_index: mi.UInt32) -> mi.Float:
         """1 where the geometric normal of a face of object k points outwards, -1 where it points inwards."""
         if all(obj.signs is None for obj in self.objects):
             return self.row("side", k)
@@ -370,7 +396,7 @@ class WalkMedia:
         index = self.row("first", k) + prim_index * self.row("step", k)
         return dr.gather(mi.Float, table, dr.minimum(index, dr.width(table) - 1))
 
-    def clear(self, k: Any, n: Any, d: Any) -> Any:
+    def clear(self, k: mi.Int32, n: mi.Normal3f, d: mi.Vector3f) -> mi.Float:
         """Length along d after which a ray from the surface of object k is clear of it; n is the normal there.
 
         Mitsuba moves the origin along the normal instead, which lays the walk deeper: at 1000 mean free paths from the
@@ -378,7 +404,9 @@ class WalkMedia:
         """
         return self.row("rounding", k) / dr.maximum(dr.abs(dr.dot(n, d)), 0.1)
 
-    def depart(self, k: Any, si: Any, d: Any, inside: Any) -> tuple[Any, Any]:
+    def depart(
+        self, k: mi.Int32, si: mi.SurfaceInteraction3f, d: mi.Vector3f, inside: mi.Bool
+    ) -> tuple[mi.Point3f, mi.Float]:
         """Where a ray along d from the surface of object k begins, and the length that it skips if it runs inside."""
         skip = self.clear(dr.maximum(mi.Int32(k), 0), si.n, d)
         return dr.select(inside, si.p, si.spawn_ray(d).o), dr.select(inside, skip, 0)
@@ -388,12 +416,14 @@ class WalkMedia:
         """Whether normals of an object are not those of its surface."""
         return any(obj.shape.is_mesh() and obj.shape.has_vertex_normals() for obj in self.objects)
 
-    def seen(self, si: Any, k: Any, direction: Any) -> Any:
+    def seen(self, si: mi.SurfaceInteraction3f, k: mi.Int32, direction: mi.Vector3f) -> mi.SurfaceInteraction3f:
         """The interaction as a ray along `direction` sees it: normals outwards, none on the other side of the ray."""
         si = self.face_outwards(si, k, direction)
         return lift(si, -direction, k >= 0) if self.interpolates else si
 
-    def face_outwards(self, si: Any, k: Any, direction: Any) -> Any:
+    def face_outwards(
+        self, si: mi.SurfaceInteraction3f, k: mi.Int32, direction: mi.Vector3f
+    ) -> mi.SurfaceInteraction3f:
         """The interaction with its normals turned to the outside of object k; `direction` is that of the ray."""
         if all(obj.upright for obj in self.objects):
             return si
@@ -405,17 +435,17 @@ class WalkMedia:
         return si
 
     @classmethod
-    def of(cls, scene: Any, mm_per_unit: float) -> WalkMedia:
+    def of(cls, scene: mi.Scene, mm_per_unit: float) -> WalkMedia:
         """The objects of a scene whose surface is `translucent`.
 
         Raises:
-            ValueError: mm_per_unit is not a finite number > 0, an object is an instance, or as `Inner.of`.
+            ValueError: mm_per_unit is not a finite number > 0, an object is an instance, or as `InnerShapes.of`.
         """
         if not (np.isfinite(mm_per_unit) and mm_per_unit > 0):
             raise ValueError(f"mm_per_unit must be finite and > 0, got {mm_per_unit!r}")
         shapes = translucent_shapes(scene)
         inner, objects = scene_of(shapes, scene), [survey(shape, scene) for shape in shapes]
-        found = Inner.of(scene, objects)
+        found = InnerShapes.of(scene, objects)
         check_together(scene, [inner, *([found.scene] if found else []), *(obj.scene for obj in objects)])
         surfaces = [shape.bsdf() for shape in shapes]
         return cls(
@@ -428,7 +458,7 @@ class WalkMedia:
         )
 
 
-def _bounds(scene: Any) -> Any:
+def _bounds(scene: mi.Scene) -> mi.BoundingBox3f:
     """The bounding box, a little larger; what is outside has leaked through the boundary by rounding."""
     box = scene.bbox()
     if not box.valid():
@@ -437,17 +467,17 @@ def _bounds(scene: Any) -> Any:
     return mi.BoundingBox3f(mi.Point3f(box.min - margin), mi.Point3f(box.max + margin))
 
 
-def is_rough(boundary: Any) -> bool:
+def is_rough(boundary: mi.BSDF) -> bool:
     """Whether a boundary scatters into a solid angle."""
     return bool(boundary.flags() & int(mi.BSDFFlags.Smooth))
 
 
-def pointer_numbers(pointers: list[Any]) -> Any:
+def pointer_numbers(pointers: list[mi.ShapePtr | mi.BSDFPtr]) -> mi.UInt32:
     """What Dr.Jit's registry calls each."""
     return mi.UInt32([int(dr.reinterpret_array(mi.UInt32, pointer)[0]) for pointer in pointers])
 
 
-def by_pointer(pointers: list[Any]) -> Any:
+def by_pointer(pointers: list[mi.ShapePtr]) -> mi.Int32:
     """Table from the number of a pointer in Dr.Jit's registry to its place in the list, -1 for others."""
     ids = np.array(pointer_numbers(pointers), dtype=int).tolist()
     table = np.full(max(ids, default=0) + 1, -1, dtype=np.int32)

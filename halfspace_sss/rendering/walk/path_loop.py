@@ -1,4 +1,10 @@
-"""Paths through a scene with translucent objects, as one symbolic loop whose lanes begin a new path when one ends."""
+"""The path loop of `translucent_walk`: surfaces by their BSDFs, objects by random walks, emitters by MIS.
+
+One symbolic loop whose lanes begin a new path when one ends. A step is a segment inside an object (`random_walk`) or a
+ray outside with the surface that it meets. Emission is weighted against next-event estimation at the previous vertex
+(power heuristic) and against the strategies of `emitter_connections`. Delta lights, which no ray meets, are spread over
+a cone where a path leaves a vertex that next-event estimation could not light (`light.small_emitters`).
+"""
 
 from __future__ import annotations
 
@@ -10,8 +16,13 @@ import mitsuba as mi
 
 from halfspace_sss.rendering.light.small_emitters import NARROW, WIDE, SmallEmitters
 from halfspace_sss.rendering.surface.horizon import sided
-from halfspace_sss.rendering.walk.emitter_connections import Departure, Guide, Joins, Lamps
-from halfspace_sss.rendering.walk.exits import FirstExits, FirstExitVisitor, Watched
+from halfspace_sss.rendering.walk.emitter_connections import (
+    Departure,
+    EmitterDirections,
+    InnerLights,
+    SubpathConnections,
+)
+from halfspace_sss.rendering.walk.exits import FirstExitRecord, FirstExits, FirstExitVisitor
 from halfspace_sss.rendering.walk.media import WalkMedia
 from halfspace_sss.rendering.walk.random_walk import (
     OUTSIDE,
@@ -26,26 +37,40 @@ from halfspace_sss.rendering.walk.random_walk import (
 )
 from halfspace_sss.tracing.walk import generator, pass_seed
 
-__all__ = ["Light", "LightVisitor", "PathTracer", "power_heuristic", "start_light"]
+__all__ = ["LightRecord", "LightVisitor", "PathTracer", "power_heuristic", "start_record"]
 
 
-# ---- Light gathered along a path -----------------------------------------------------------------------------------
+# ---- Loop state ------------------------------------------------------------------------------------------------------
 
 
 @dataclass
-class Light:
-    """What a path has gathered, and what weighs the next emitter that it meets."""
+class LightRecord:
+    """Light of a path so far, and what the MIS weight of the next emission needs to know."""
 
     L: mi.Spectrum  # radiance
-    last: mi.Point3f  # vertex that the ray comes from
+    previous: mi.Point3f  # vertex that the ray comes from
     pdf: mi.Float  # density of the ray's direction there, 1/sr
     delta: mi.Bool  # whether that direction was the only one
     straight: mi.Bool  # nothing has reflected since the last event
-    joined: mi.Bool  # there was a straight edge: joins find what small emitters send along this path
+    connected: mi.Bool  # there was a straight edge: connections find what small emitters send along this path
     pivot: mi.Point3f  # the event at the end of that edge
-    guided: mi.Bool  # the guide looked for small emitters from the last event, and nothing has reflected since
+    directed: mi.Bool  # directions to emitters were sampled at the last event, and nothing has reflected since
     departure: Departure  # from the last event
     scattered: mi.Bool  # whether a vertex has scattered into a solid angle: delta lights then are no longer hidden
+
+
+@dataclass
+class CameraPath:
+    """Loop variables of a path from the camera."""
+
+    index: mi.UInt32  # which ray it began with
+    walk: Walk  # the ray it is on, outside or inside an object
+    light: LightRecord  # what it has gathered
+    hit: mi.Bool  # whether its first ray hit anything
+    depth: mi.UInt32  # vertices on surfaces met from outside
+
+
+# ---- Light gathered along a path -------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,129 +81,145 @@ class LightVisitor:
         scene: the Mitsuba scene.
         media: its translucent objects.
         small: its small emitters, if there are any.
-        joins: how light of small emitters enters objects, if it is looked for.
-        guide: how it leaves them where joins cannot find it.
-        lamps: delta lights inside objects, if there are any.
+        connections: of events with light subpaths of small emitters, if there are any.
+        directions: from events to small emitters, where connections cannot find their light.
+        inner_lights: delta lights inside objects, if there are any.
     """
 
-    scene: Any
+    scene: mi.Scene
     media: WalkMedia
     small: SmallEmitters | None
-    joins: Joins | None
-    guide: Guide | None
-    lamps: Lamps | None = None
+    connections: SubpathConnections | None
+    directions: EmitterDirections | None
+    inner_lights: InnerLights | None = None
 
-    def event(self, walk: Walk, record: Light, event: Event) -> tuple[Walk, Light]:
+    def event(self, walk: Walk, record: LightRecord, event: Event) -> tuple[Walk, LightRecord]:
+        # ---- inner lights
         record = replace(record, scattered=mi.Bool(True))
-        if self.lamps is not None:
+        if self.inner_lights is not None:
             at = dr.zeros(mi.Interaction3f)
             at.p = event.p
-            d, E = self.lamps.light(walk.object, at, walk.rng, True)
+            d, E = self.inner_lights.light(walk.object, at, walk.rng, True)
             record = replace(record, L=record.L + walk.weight * eval_phase(event.m, dr.dot(event.along, d)) * E)
-        if self.joins is None:
+        if self.connections is None:
             return walk, record
+
+        # ---- connections with light subpaths
         smooth = self.media.connects(walk.object)
         edge = record.straight & smooth & (walk.order > 0)  # this event ends one
-        joined = record.joined | edge
-        record = replace(record, joined=joined, pivot=dr.select(edge, event.p, record.pivot))
-        joins = smooth & (walk.order + 2 <= self.media.row("most", walk.object))
-        walk, record, _ = dr.if_stmt((walk, record, event), joins, self._join, _same_state, label="joins")
-        guided = smooth & ~joined & self.media.counts(walk.object, walk.order + 1)
-        record = replace(record, straight=mi.Bool(True), guided=guided)
-        walk, record, _ = dr.if_stmt((walk, record, event), guided, self._guide, _same_state, label="guide")
+        connected = record.connected | edge
+        record = replace(record, connected=connected, pivot=dr.select(edge, event.p, record.pivot))
+        connects = smooth & (walk.order + 2 <= self.media.row("most", walk.object))
+        walk, record, _ = dr.if_stmt((walk, record, event), connects, self._connect, _same_state, label="connections")
+
+        # ---- directions to emitters, where no connection finds their light
+        directed = smooth & ~connected & self.media.counts(walk.object, walk.order + 1)
+        record = replace(record, straight=mi.Bool(True), directed=directed)
+        walk, record, _ = dr.if_stmt((walk, record, event), directed, self._direct, _same_state, label="directions")
         departure = Departure(event.p, event.along, record.departure.ahead, walk.object)
         return walk, replace(record, departure=departure)
 
-    def _join(self, walk: Walk, record: Light, event: Event) -> tuple[Walk, Light, Event]:
-        light, rng = self.joins.light(event, walk.rng)
+    def _connect(self, walk: Walk, record: LightRecord, event: Event) -> tuple[Walk, LightRecord, Event]:
+        light, rng = self.connections.light(event, walk.rng)
         return replace(walk, rng=rng), replace(record, L=record.L + walk.weight * light), event
 
-    def _guide(self, walk: Walk, record: Light, event: Event) -> tuple[Walk, Light, Event]:
-        light = self.guide.light(event, walk.rng)
+    def _direct(self, walk: Walk, record: LightRecord, event: Event) -> tuple[Walk, LightRecord, Event]:
+        light = self.directions.light(event, walk.rng)
         return walk, replace(record, L=record.L + walk.weight * light), event
 
-    def boundary(self, walk: Walk, record: Light, si: Any, active: Any) -> tuple[Walk, Light]:
+    def boundary(
+        self, walk: Walk, record: LightRecord, si: mi.SurfaceInteraction3f, active: mi.Bool
+    ) -> tuple[Walk, LightRecord]:
         if not self.media.any_rough:
             return walk, record
         light = self.sampled_emitter(walk, si, self.media.boundary(walk.object), active)
         return walk, replace(record, L=record.L + light)
 
-    def surface(self, walk: Walk, record: Light, si: Any, bsdf: Any, k: Any) -> tuple[Walk, Light]:
-        """Light that the surface emits, of which nothing was sampled, and of the lamps that light it."""
+    def surface(
+        self, walk: Walk, record: LightRecord, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, k: mi.Int32
+    ) -> tuple[Walk, LightRecord]:
+        """Light that the surface emits, of which nothing was sampled, and of inner lights at it."""
         emitter = si.emitter(self.scene)
         shines = si.is_valid() & (k != walk.object) & (emitter != None)  # noqa: E711
         L = record.L + dr.select(shines, walk.weight * emitter.eval(si, shines), 0)
-        if self.lamps is not None:
+        if self.inner_lights is not None:
             lit = (k < 0) & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-            d, E = self.lamps.light(walk.object, si, walk.rng, lit)
+            d, E = self.inner_lights.light(walk.object, si, walk.rng, lit)
             L = L + dr.select(lit, walk.weight * bsdf.eval(mi.BSDFContext(), si, si.to_local(d), lit) * E, 0)
         return walk, replace(record, L=L)
 
-    def crossing(self, walk: Walk, record: Light, crossing: Crossing) -> tuple[Walk, Light]:
-        record = replace(record, last=crossing.si.p, pdf=crossing.pdf, delta=crossing.delta)
+    def crossing(self, walk: Walk, record: LightRecord, crossing: Crossing) -> tuple[Walk, LightRecord]:
+        record = replace(record, previous=crossing.si.p, pdf=crossing.pdf, delta=crossing.delta)
         if self.media.inner is not None:
             sampled = (self.media.index_of(crossing.si.shape) < 0) & ~crossing.delta
             record = replace(record, delta=crossing.delta | ~crossing.leaves, scattered=record.scattered | sampled,
-                             L=record.L + self.spread_lamps(walk, record.scattered & ~sampled))  # fmt: skip
-        if self.joins is None:
+                             L=record.L + self.spread_inner_lights(walk, record.scattered & ~sampled))  # fmt: skip
+        if self.connections is None:
             return walk, record
         straight = record.straight & crossing.leaves
         departure = replace(record.departure, ahead=crossing.along)
-        return walk, replace(record, straight=straight, guided=record.guided & straight, departure=departure)
+        return walk, replace(record, straight=straight, directed=record.directed & straight, departure=departure)
 
-    def met_emitter(self, walk: Walk, record: Light, si: Any, active: Any) -> Any:
+    def met_emitter(self, walk: Walk, record: LightRecord, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Spectrum:
         """Light of an emitter that the ray meets, weighted against sampling it from the last vertex."""
         emitter = si.emitter(self.scene)
         active = active & (emitter != None)  # noqa: E711
-        last = dr.zeros(mi.Interaction3f)
-        last.p = record.last
-        ds = mi.DirectionSample3f(self.scene, si, last)
+        previous = dr.zeros(mi.Interaction3f)
+        previous.p = record.previous
+        ds = mi.DirectionSample3f(self.scene, si, previous)
         sampled = active & ~record.delta
-        pdf = dr.select(sampled, self.scene.pdf_emitter_direction(last, ds, sampled), 0)
+        pdf = dr.select(sampled, self.scene.pdf_emitter_direction(previous, ds, sampled), 0)
         share = dr.select(record.delta, 1, power_heuristic(record.pdf, pdf))
-        if self.joins is not None and self.small.some_met:
+        if self.connections is not None and self.small.some_met:
             which = self.small.index_of(emitter, walk.d)
-            active &= ~(record.joined & self.joins.covers(which, si.p, walk.d, record.pivot))
-            guided = active & record.guided
-            state = (which, record.departure, share, guided)
-            _, _, share, _ = dr.if_stmt(state, guided, self._against_guide, lambda *state: state)
+            active &= ~(record.connected & self.connections.covers(which, si.p, walk.d, record.pivot))
+            directed = active & record.directed
+            state = (which, record.departure, share, directed)
+            _, _, share, _ = dr.if_stmt(state, directed, self._against_directions, lambda *state: state)
         return dr.select(active, walk.weight * emitter.eval(si, active) * share, 0)
 
-    def _against_guide(self, which: Any, departure: Departure, share: Any, guided: Any) -> tuple:
-        return which, departure, self.guide.share(which, departure, guided), guided
+    def _against_directions(self, which: mi.Int32, departure: Departure, share: mi.Float, directed: mi.Bool) -> tuple:
+        return which, departure, self.directions.share(which, departure, directed), directed
 
-    def spread_lights(self, walk: Walk, record: Light, active: Any) -> Any:
-        """Light of a delta light whose cone holds the ray, where neither emitter sampling nor joins find it."""
+    def spread_lights(self, walk: Walk, record: LightRecord, active: mi.Bool) -> mi.Spectrum:
+        """Light of a delta light whose cone holds the ray, where no other strategy finds it."""
         if self.small is None or self.small.n_delta == 0:
             return mi.Spectrum(0)
         n = self.small.n_delta
         which = mi.Int32(draw(n, walk.rng)) if n > 1 else dr.zeros(mi.Int32, dr.width(walk.o))
         active = active & record.scattered & record.delta
-        guided = mi.Bool(False)
-        if self.joins is not None:
+        directed = mi.Bool(False)
+        if self.connections is not None:
             w_0, _ = self.small.direction(which, walk.o)
-            lamp = walk.o + w_0 * dr.norm(self.scene.bbox().extents())
-            active &= ~(record.joined & self.joins.covers(which, lamp, w_0, record.pivot))
-            guided = active & record.guided
-        radius = dr.select(guided, NARROW, WIDE)
+            emitter = walk.o + w_0 * dr.norm(self.scene.bbox().extents())
+            active &= ~(record.connected & self.connections.covers(which, emitter, w_0, record.pivot))
+            directed = active & record.directed
+        radius = dr.select(directed, NARROW, WIDE)
         ray = mi.Ray3f(walk.o, walk.d)
         L = self.small.spread(which, ray, radius, active)
-        if self.joins is not None:
-            guided &= dr.max(L) > 0
-            state = (which, record.departure, mi.Float(1), guided)
-            _, _, share, _ = dr.if_stmt(state, guided, self._against_guide, lambda *state: state)
+        if self.connections is not None:
+            directed &= dr.max(L) > 0
+            state = (which, record.departure, mi.Float(1), directed)
+            _, _, share, _ = dr.if_stmt(state, directed, self._against_directions, lambda *state: state)
             L = L * share
         return dr.select(active, walk.weight * L * n, 0)
 
-    def spread_lamps(self, walk: Walk, active: Any) -> Any:
-        """Light of a lamp inside an object whose cone holds the ray, from a vertex that it was not sampled at."""
-        if self.lamps is None:
+    def spread_inner_lights(self, walk: Walk, active: mi.Bool) -> mi.Spectrum:
+        """Light of an inner light whose cone holds the ray, from a vertex that it was not sampled at."""
+        if self.inner_lights is None:
             return mi.Spectrum(0)
         ray = mi.Ray3f(walk.o + walk.d * walk.skip, walk.d)
         active = active & walk.alive & (walk.object >= 0)
-        return dr.select(active, walk.weight * self.lamps.spread(walk.object, ray, walk.rng, active), 0)
+        return dr.select(active, walk.weight * self.inner_lights.spread(walk.object, ray, walk.rng, active), 0)
 
-    def sampled_emitter(self, walk: Walk, si: Any, bsdf: Any, active: Any, outwards: Any = True) -> Any:
+    def sampled_emitter(
+        self,
+        walk: Walk,
+        si: mi.SurfaceInteraction3f,
+        bsdf: mi.BSDFPtr,
+        active: mi.Bool,
+        outwards: mi.Bool | bool = True,
+    ) -> mi.Spectrum:
         """Light of a sampled emitter by the surface at `si`; by a boundary only from its outer side."""
         rng = walk.rng
         u = mi.Point2f(rng.next_float32(), rng.next_float32())
@@ -197,37 +238,29 @@ def _same_state(*state: Any) -> tuple:
     return state
 
 
-def start_light(lanes: int) -> Light:
+def start_record(lanes: int) -> LightRecord:
     """Of a path that begins at the camera."""
 
-    def full(kind: type, value: Any) -> Any:
+    def full(kind: type, value: float | bool | int) -> Any:
         return dr.full(kind, value, lanes)
 
     point, along = full(mi.Point3f, 0), full(mi.Vector3f, 0)
-    return Light(
-        L=full(mi.Spectrum, 0), last=point, pdf=full(mi.Float, 1), delta=full(mi.Bool, True),
-        straight=full(mi.Bool, False), joined=full(mi.Bool, False), pivot=mi.Point3f(point),
-        guided=full(mi.Bool, False),
+    return LightRecord(
+        L=full(mi.Spectrum, 0), previous=point, pdf=full(mi.Float, 1), delta=full(mi.Bool, True),
+        straight=full(mi.Bool, False), connected=full(mi.Bool, False), pivot=mi.Point3f(point),
+        directed=full(mi.Bool, False),
         departure=Departure(mi.Point3f(point), along, mi.Vector3f(along), full(mi.Int32, 0)),
         scattered=full(mi.Bool, False),
     )  # fmt: skip
 
 
-def power_heuristic(a: Any, b: Any) -> Any:
+def power_heuristic(a: mi.Float, b: mi.Float) -> mi.Float:
     """Weight of a sample of density a against another of density b: a² / (a² + b²)."""
     share = dr.square(a) / (dr.square(a) + dr.square(b))
     return dr.select(dr.isfinite(share), share, 0)
 
 
-@dataclass
-class Path:
-    """State of a path from the camera."""
-
-    index: mi.UInt32  # which ray it began with
-    walk: Walk  # the ray it is on, outside or inside an object
-    light: Light  # what it has gathered
-    seen: mi.Bool  # whether its first ray hit anything
-    depth: mi.UInt32  # vertices on surfaces seen from outside
+# ---- The loop --------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,7 +269,7 @@ class PathTracer:
 
     Args:
         visitor: how light is gathered; it knows the scene and its objects.
-        max_depth: most vertices on surfaces seen from outside; what happens inside an object does not count.
+        max_depth: most vertices on surfaces met from outside; what happens inside an object does not count.
         rr_depth: vertices outside after which roulette may end a path.
         hide_emitters: whether the camera sees no emitters.
     """
@@ -246,27 +279,29 @@ class PathTracer:
     rr_depth: int
     hide_emitters: bool
 
-    def trace(self, rays: Any, lanes: int, seed: tuple[int, ...], exits: FirstExits | None = None) -> tuple[Any, Any]:
+    def trace(
+        self, rays: mi.Ray3f, lanes: int, seed: tuple[int, ...], exits: FirstExits | None = None
+    ) -> tuple[mi.Spectrum, mi.Bool]:
         """Radiance along each ray, and whether it hits anything; `exits`, if given, stores the first exits."""
         n = dr.width(rays)
         dr.eval(rays)
         lanes = min(lanes, n)
-        L, seen = dr.zeros(mi.Spectrum, n), dr.zeros(mi.Bool, n)
-        dr.eval(L, seen)
+        L, hit = dr.zeros(mi.Spectrum, n), dr.zeros(mi.Bool, n)
+        dr.eval(L, hit)
         walker = Walker(self.visitor.media, FirstExitVisitor(self.visitor, exits) if exits else self.visitor)
         total, step = (dr.opaque(mi.UInt32, v) for v in (n, lanes))  # kernels then serve images of any size
 
-        def inside(p: Path) -> Path:
-            record = Watched(p.light, p.index, p.depth == 1) if exits else p.light
+        def inside(p: CameraPath) -> CameraPath:
+            record = FirstExitRecord(p.light, p.index, p.depth == 1) if exits else p.light
             walk, record = walker.step(p.walk, record)
             return replace(p, walk=walk, light=record.record if exits else record)
 
-        def renew(p: Path) -> Path:
+        def renew(p: CameraPath) -> CameraPath:
             dr.scatter(L, p.light.L, p.index)
-            dr.scatter(seen, p.seen, p.index)
+            dr.scatter(hit, p.hit, p.index)
             return _begin(rays, total, p.index + step, p.walk.rng)
 
-        def body(p: Path) -> tuple[Path]:
+        def body(p: CameraPath) -> tuple[CameraPath]:
             p = dr.if_stmt((p,), p.walk.object >= 0, inside, _same, label="inside")
             outside = p.walk.alive & (p.walk.object < 0)
             p = dr.if_stmt((p,), outside, self._outside, _same, label="outside")
@@ -274,25 +309,31 @@ class PathTracer:
 
         start = _begin(rays, total, dr.arange(mi.UInt32, lanes), generator(mi, lanes, pass_seed(*seed)))
         dr.while_loop((start,), lambda p: p.index < total, body, label="paths")
-        dr.eval(L, seen)
-        return L, seen
+        dr.eval(L, hit)
+        return L, hit
 
-    def _outside(self, p: Path) -> Path:
+    def _outside(self, p: CameraPath) -> CameraPath:
         """A ray outside all objects, and the surface that it meets."""
         ray = mi.Ray3f(p.walk.o, p.walk.d)
         si = self.visitor.scene.ray_intersect(ray, mi.RayFlags.All, coherent=False)
+
+        # ---- emission, with its MIS weight
         first = p.depth == 0
         shown = ~first if self.hide_emitters else mi.Bool(True)
         L = p.light.L + self.visitor.met_emitter(p.walk, p.light, si, shown)
         L = L + self.visitor.spread_lights(p.walk, p.light, p.walk.alive)
-        light = replace(p.light, L=L, joined=mi.Bool(False), guided=mi.Bool(False))
+        light = replace(p.light, L=L, connected=mi.Bool(False), directed=mi.Bool(False))
+
+        # ---- the surface
         depth = p.depth + 1
         alive = si.is_valid() & (depth < mi.UInt32(self.max_depth))
         walk = replace(p.walk, alive=alive)
-        p = replace(p, walk=walk, light=light, seen=p.seen | (first & si.is_valid()), depth=depth)
+        p = replace(p, walk=walk, light=light, hit=p.hit | (first & si.is_valid()), depth=depth)
         return dr.if_stmt((p, si), alive, self._bounce, lambda p, si: p, label="bounce")
 
-    def _bounce(self, p: Path, si: Any) -> Path:
+    def _bounce(self, p: CameraPath, si: mi.SurfaceInteraction3f) -> CameraPath:
+        """A surface met from outside: next-event estimation, BSDF sampling, Russian roulette, the way on or in."""
+        # ---- BSDF or boundary
         walk, light, media = p.walk, p.light, self.visitor.media
         rng, k = walk.rng, media.index_of(si.shape)
         translucent, near = k >= 0, dr.maximum(k, 0)
@@ -307,16 +348,24 @@ class PathTracer:
             around = media.inner.around(si.shape)
             encloses = ~translucent & (around >= 0) & media.inner.displaces(si.shape) & (dr.dot(walk.d, si.n) > 0)
             lit &= ~encloses  # emitters on its other side are behind a medium
+
+        # ---- next-event estimation
         L = light.L + self.visitor.sampled_emitter(walk, si, bsdf, lit, translucent)
+
+        # ---- BSDF sampling
         bs, value = sample_bsdf(bsdf, si, rng)
         d, turned = sided(si, bs.wo)
         d, turned = dr.select(translucent, d, si.to_world(bs.wo)), turned & translucent
         enters = translucent & (dr.dot(d, si.n) < 0)
         weight, scale = walk.weight * value, walk.scale * dr.square(bs.eta)
+
+        # ---- Russian roulette
         size = dr.max(weight) * scale
         survive = dr.select(p.depth >= self.rr_depth, dr.minimum(size, 0.95), 1)
         weight = weight / dr.maximum(survive, 1e-30)
         alive = (bs.pdf > 0) & (size > 0) & (rng.next_float32() < survive) & ~(mute & ~enters)
+
+        # ---- the way on, or into an object
         u = rng.next_float32()
         channel = walk.channel
         if len(weight) > 1:  # drawn once in a path, whose densities are counted from there
@@ -330,24 +379,24 @@ class PathTracer:
                        channel=channel)  # fmt: skip
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta) | turned
         scattered = light.scattered | ~delta
-        light = replace(light, L=L, last=si.p, pdf=bs.pdf, delta=delta, scattered=scattered)
+        light = replace(light, L=L, previous=si.p, pdf=bs.pdf, delta=delta, scattered=scattered)
         if media.inner is not None:
             light = replace(
-                light, delta=delta | enters | encloses, L=L + self.visitor.spread_lamps(walk, scattered & enters)
+                light, delta=delta | enters | encloses, L=L + self.visitor.spread_inner_lights(walk, scattered & enters)
             )
         return replace(p, walk=walk, light=light)
 
 
-def _channel(u: Any, n: int) -> Any:
+def _channel(u: mi.Float, n: int) -> mi.UInt32:
     return dr.minimum(mi.UInt32(u * n), n - 1)
 
 
-def _same(p: Path) -> Path:
+def _same(p: CameraPath) -> CameraPath:
     return p
 
 
-def _begin(rays: Any, total: Any, index: Any, rng: Any) -> Path:
+def _begin(rays: mi.Ray3f, total: mi.UInt32, index: mi.UInt32, rng: mi.PCG32) -> CameraPath:
     lanes, known = dr.width(index), index < total
     o, d = dr.gather(mi.Point3f, rays.o, index, known), dr.gather(mi.Vector3f, rays.d, index, known)
     no, first = dr.full(mi.Bool, False, lanes), dr.full(mi.UInt32, 0, lanes)
-    return Path(index, start_walk(o, d, rng), start_light(lanes), no, first)
+    return CameraPath(index, start_walk(o, d, rng), start_record(lanes), no, first)

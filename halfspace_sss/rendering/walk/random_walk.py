@@ -7,7 +7,7 @@ Dr.Jit, which goes through the loop beside the walk: light for images, exits for
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import drjit as dr
 import mitsuba as mi
@@ -39,7 +39,13 @@ __all__ = [
 ]
 
 
-# ---- Free flight, scattering and roulette with spectral MIS --------------------------------------------------------
+# ---- Free flight, scattering and roulette with spectral MIS ---------------------------------------------------------
+#
+# A walk draws distances and angles with the coefficients of one channel, chosen at its start. Every channel c gets a
+# value: with f_c the measured contribution and p_k the density of the whole walk under channel k, the weight is
+# w_c = f_c / mean_k p_k (balance heuristic over channels). State are w_c and q_k = p_k / mean_j p_j; both stay in range
+# whatever the length of the walk. Absorption is part of w. Hero wavelength sampling (Wilkie et al. 2014); Miller,
+# Georgiev and Jarosz 2019 for volumes.
 
 
 class Flight(NamedTuple):
@@ -51,7 +57,7 @@ class Flight(NamedTuple):
     density: mi.Spectrum
 
 
-def pick(values: Any, channel: Any) -> Any:
+def pick(values: mi.Spectrum, channel: mi.UInt32) -> mi.Float:
     """The value of one channel."""
     value = values[0]
     for c in range(1, len(values)):
@@ -59,7 +65,9 @@ def pick(values: Any, channel: Any) -> Any:
     return value
 
 
-def weigh(weight: Any, density: Any, value: Any, pdf: Any) -> tuple[Any, Any]:
+def weigh(
+    weight: mi.Spectrum, density: mi.Spectrum, value: mi.Spectrum, pdf: mi.Spectrum
+) -> tuple[mi.Spectrum, mi.Spectrum]:
     """w and q after a step with the value f_c and the density p_c, each up to one factor that they share."""
     if len(weight) == 1:
         return weight * value / pdf, density
@@ -68,12 +76,20 @@ def weigh(weight: Any, density: Any, value: Any, pdf: Any) -> tuple[Any, Any]:
     return weight * value * scale, grown * scale
 
 
-def free_path(m: Coefficients, channel: Any, u: Any) -> Any:
+def free_path(m: Coefficients, channel: mi.UInt32, u: mi.Float) -> mi.Float:
     """Distance to the next collision, scene units; where the medium is homogeneous, that is a scattering event."""
     return -dr.log(1 - u) / pick(m.majorant, channel)
 
 
-def fly(m: Coefficients, weight: Any, density: Any, channel: Any, t: Any, reach: Any, u: Any = None) -> Flight:
+def fly(
+    m: Coefficients,
+    weight: mi.Spectrum,
+    density: mi.Spectrum,
+    channel: mi.UInt32,
+    t: mi.Float,
+    reach: mi.Float,
+    u: mi.Float | None = None,
+) -> Flight:
     """A free flight of length t, cut short by the boundary where that is at a distance `reach` < t.
 
     Collisions are drawn by the majorant M_k of the channel of the walk. With M_c - sigma_t,c of null matter added, all
@@ -106,12 +122,20 @@ def fly(m: Coefficients, weight: Any, density: Any, channel: Any, t: Any, reach:
     return Flight(scatters, null, *weigh(weight, density, value, pdf))
 
 
-def eval_phase(m: Coefficients, cosine: Any) -> Any:
+def eval_phase(m: Coefficients, cosine: mi.Float) -> mi.Spectrum:
     """Henyey-Greenstein phase function of each channel, 1/sr."""
     return mi.Spectrum([eval_hg(cosine, g) for g in m.g])
 
 
-def turn(m: Coefficients, weight: Any, density: Any, channel: Any, d: Any, u: Any, same_g: bool) -> tuple:
+def turn(
+    m: Coefficients,
+    weight: mi.Spectrum,
+    density: mi.Spectrum,
+    channel: mi.UInt32,
+    d: mi.Vector3f,
+    u: mi.Point2f,
+    same_g: bool,
+) -> tuple:
     """A new direction by the phase function, and w and q after it."""
     cosine = sample_hg(u.x, pick(m.g, channel))
     sine = dr.safe_sqrt((1 - cosine) * (1 + cosine))
@@ -124,7 +148,7 @@ def turn(m: Coefficients, weight: Any, density: Any, channel: Any, d: Any, u: An
     return new, *weigh(weight, density, phase, phase)
 
 
-def roulette(weight: Any, scale: Any, u: Any) -> tuple[Any, Any]:
+def roulette(weight: mi.Spectrum, scale: mi.Float, u: mi.Float) -> tuple[mi.Bool, mi.Spectrum]:
     """Whether a walk goes on, and its weight if it does; `scale` is the square of the relative index passed so far."""
     size = dr.max(weight) * scale
     survive = dr.select(size < ROULETTE_WEIGHT, size / (ROULETTE_WEIGHT * ROULETTE_BOOST), 1)
@@ -132,6 +156,7 @@ def roulette(weight: Any, scale: Any, u: Any) -> tuple[Any, Any]:
 
 
 OUTSIDE = -1
+Record = TypeVar("Record")  # of a visitor, any PyTree of Dr.Jit
 
 
 @dataclass
@@ -150,7 +175,7 @@ class Walk:
     order: mi.UInt32  # scattering events since it entered the object
     rng: mi.PCG32
 
-    def ray(self, t: Any) -> Any:
+    def ray(self, t: mi.Float) -> mi.Ray3f:
         """Looks for the boundary on a flight of length t; its distances begin after `skip`."""
         ray = mi.Ray3f(self.o + self.d * self.skip, self.d)
         ray.maxt = dr.maximum(t - self.skip, 0)
@@ -181,16 +206,18 @@ class Crossing:
 class Visitor(Protocol):
     """What is recorded of a walk. Each method returns the walk, whose random numbers it may use up, and its record."""
 
-    def event(self, walk: Walk, record: Any, event: Event) -> tuple[Walk, Any]:
+    def event(self, walk: Walk, record: Record, event: Event) -> tuple[Walk, Record]:
         """At a scattering event, of which `walk.order` came before."""
 
-    def boundary(self, walk: Walk, record: Any, si: Any, active: Any) -> tuple[Walk, Any]:
+    def boundary(self, walk: Walk, record: Record, si: mi.SurfaceInteraction3f, active: mi.Bool) -> tuple[Walk, Record]:
         """At the boundary from inside, where the walk may leave if `active`."""
 
-    def surface(self, walk: Walk, record: Any, si: Any, bsdf: Any, k: Any) -> tuple[Walk, Any]:
+    def surface(
+        self, walk: Walk, record: Record, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, k: mi.Int32
+    ) -> tuple[Walk, Record]:
         """At a surface inside an object: that of object k, or of something else if k < 0."""
 
-    def crossing(self, walk: Walk, record: Any, crossing: Crossing) -> tuple[Walk, Any]:
+    def crossing(self, walk: Walk, record: Record, crossing: Crossing) -> tuple[Walk, Record]:
         """After reflection at the boundary or refraction through it; `walk` is on its way again."""
 
 
@@ -208,7 +235,7 @@ class Walker:
     visitor: Visitor
     roulette_from: int = 1
 
-    def step(self, walk: Walk, record: Any) -> tuple[Walk, Any]:
+    def step(self, walk: Walk, record: Record) -> tuple[Walk, Record]:
         """A free flight, and the scattering event, the null collision or the boundary at its end."""
         media, rng = self.media, walk.rng
         m, u = media.coefficients(walk.object, walk.o), None
@@ -229,7 +256,7 @@ class Walker:
         meet = self._meet if media.inner is None else self._meet_inside
         return dr.if_stmt((walk, record, ray, hit), meets, meet, _pass, label="boundary")
 
-    def _scatter(self, walk: Walk, record: Any, event: Event) -> tuple[Walk, Any]:
+    def _scatter(self, walk: Walk, record: Record, event: Event) -> tuple[Walk, Record]:
         walk, record = self.visitor.event(walk, record, event)
         rng, media = walk.rng, self.media
         u = mi.Point2f(rng.next_float32(), rng.next_float32())
@@ -242,7 +269,9 @@ class Walker:
                        alive=alive, object=dr.select(alive, walk.object, OUTSIDE))  # fmt: skip
         return walk, record
 
-    def _meet(self, walk: Walk, record: Any, ray: Any, hit: Any) -> tuple[Walk, Any]:
+    def _meet(
+        self, walk: Walk, record: Record, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f
+    ) -> tuple[Walk, Record]:
         """Reflection at the boundary seen from inside, or the way out."""
         media, k = self.media, walk.object
         si = hit.compute_surface_interaction(ray, media.needed)
@@ -265,7 +294,9 @@ class Walker:
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta) | turned
         return self.visitor.crossing(walk, record, Crossing(si, mi.Vector3f(ray.d), out, bs.pdf, delta))
 
-    def _meet_inside(self, walk: Walk, record: Any, ray: Any, hit: Any) -> tuple[Walk, Any]:
+    def _meet_inside(
+        self, walk: Walk, record: Record, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f
+    ) -> tuple[Walk, Record]:
         """The same where something lies inside: reflection or refraction at any surface, into what is on that side."""
         media, inner, k = self.media, self.media.inner, walk.object
         si = hit.compute_surface_interaction(ray, mi.RayFlags.All)
@@ -298,11 +329,11 @@ class Walker:
         return self.visitor.crossing(walk, record, Crossing(si, mi.Vector3f(ray.d), leaves, bs.pdf, delta))
 
 
-def _pass(walk: Walk, record: Any, *rest: Any) -> tuple[Walk, Any]:
+def _pass(walk: Walk, record: Record, *rest: Any) -> tuple[Walk, Record]:
     return walk, record
 
 
-def start_walk(o: Any, d: Any, rng: Any) -> Walk:
+def start_walk(o: mi.Point3f, d: mi.Vector3f, rng: mi.PCG32) -> Walk:
     """A walk that begins outside."""
     lanes = dr.width(o)
     return Walk(
@@ -313,12 +344,14 @@ def start_walk(o: Any, d: Any, rng: Any) -> Walk:
     )  # fmt: skip
 
 
-def sample_bsdf(bsdf: Any, si: Any, rng: Any, ctx: Any = None) -> tuple[Any, Any]:
+def sample_bsdf(
+    bsdf: mi.BSDFPtr, si: mi.SurfaceInteraction3f, rng: mi.PCG32, ctx: mi.BSDFContext | None = None
+) -> tuple[mi.BSDFSample3f, mi.Spectrum]:
     """A direction by a BSDF, and its weight."""
     u, v = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
     return bsdf.sample(ctx or mi.BSDFContext(), si, u, v)
 
 
-def draw(n: int, rng: Any) -> Any:
+def draw(n: int, rng: mi.PCG32) -> mi.UInt32:
     """A whole number below n."""
     return dr.minimum(mi.UInt32(rng.next_float32() * n), n - 1)

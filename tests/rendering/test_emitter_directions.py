@@ -15,7 +15,7 @@ mi = pytest.importorskip("mitsuba")
 import drjit as dr  # noqa: E402
 
 from halfspace_sss.rendering.light.small_emitters import SmallEmitters  # noqa: E402
-from halfspace_sss.rendering.walk.emitter_connections import Departure, Guide  # noqa: E402
+from halfspace_sss.rendering.walk.emitter_connections import Departure, EmitterDirections  # noqa: E402
 from halfspace_sss.rendering.walk.media import WalkMedia  # noqa: E402
 from halfspace_sss.rendering.walk.random_walk import Event  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
@@ -34,7 +34,7 @@ def variant() -> None:
     rendering.register()
 
 
-def guide() -> Guide:
+def directions() -> EmitterDirections:
     """Over a slab whose top is z = 0."""
     at = mi.ScalarTransform4f()
     sigma_s, sigma_a = (",".join(f"{x:.9g}" for x in part * SIGMA_T) for part in (0.5, 0.5))
@@ -46,7 +46,7 @@ def guide() -> Guide:
     }
     scene = mi.load_dict({"type": "scene", "slab": slab, **lamps})
     media = WalkMedia.of(scene, 1.0)
-    return Guide(scene, media, SmallEmitters.of(scene))
+    return EmitterDirections(scene, media, SmallEmitters.of(scene))
 
 
 def event(media: WalkMedia, lanes: int) -> Event:
@@ -77,9 +77,9 @@ def light_along(d: np.ndarray, lamp: tuple) -> np.ndarray:
     return value * np.exp(-SIGMA_T[:, None] * DEPTH / d[2])
 
 
-def test_the_guide_and_chance_share_the_light_of_lamps_between_them() -> None:
-    """What the guide brings is what the weights of directions drawn by chance, in (0, 1), leave to it."""
-    found, (d, solid) = guide(), upwards()
+def test_sampled_directions_and_chance_share_the_light_of_lamps_between_them() -> None:
+    """What sampled directions bring is what the weights of directions drawn by chance, in (0, 1), leave to it."""
+    found, (d, solid) = directions(), upwards()
     at = event(found.media, d.shape[1])
     way = Departure(at.p, at.along, mi.Vector3f(d), at.object)
     whole = left = 0.0
@@ -95,7 +95,7 @@ def test_the_guide_and_chance_share_the_light_of_lamps_between_them() -> None:
 
 
 def test_directions_to_lamps_are_guessed_so_well_that_little_is_left_to_chance() -> None:
-    found = guide()
+    found = directions()
     at = event(found.media, 1)
     for k, (centre, _, _) in enumerate(LAMPS):
         d, _, valid = found._guess(at.p, at.object, mi.UInt32(k), at.m, mi.Bool(True))

@@ -1,4 +1,4 @@
-"""What joins bring to an event in a slab, against single scattering there, by quadrature of its formula."""
+"""What connections bring to an event in a slab, against single scattering there, by quadrature of its formula."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ mi = pytest.importorskip("mitsuba")
 import drjit as dr  # noqa: E402
 
 from halfspace_sss.rendering.light.small_emitters import SmallEmitters  # noqa: E402
-from halfspace_sss.rendering.walk.emitter_connections import STEEPEST, Joins, find_joins  # noqa: E402
+from halfspace_sss.rendering.walk.emitter_connections import STEEPEST, SubpathConnections, find_connections  # noqa: E402
 from halfspace_sss.rendering.walk.media import WalkMedia  # noqa: E402
 from halfspace_sss.rendering.walk.random_walk import Event  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
@@ -44,15 +44,15 @@ class Beam(NamedTuple):
     E: np.ndarray
 
 
-def joins_of(lights: dict, g: float = 0.0, eta: float = 1.0, albedo: Any = ALBEDO, height: float = HEIGHT,
-             share: float = 1.0, shape: dict | None = None) -> Joins:  # fmt: skip
+def connections_of(lights: dict, g: float = 0.0, eta: float = 1.0, albedo: Any = ALBEDO, height: float = HEIGHT,
+             share: float = 1.0, shape: dict | None = None) -> SubpathConnections:  # fmt: skip
     """Of lights over a wide slab."""
     sigma_s, sigma_a = (",".join(f"{x:.9g}" for x in part) for part in (albedo * SIGMA_T, (1 - albedo) * SIGMA_T))
     at = mi.ScalarTransform4f()
     slab = {"type": "cube", "to_world": at.translate([0, 0, -height / 2]).scale([60, 60, height / 2])}
     bsdf = {"type": "translucent", "sigma_s": sigma_s, "sigma_a": sigma_a, "g": g, "eta": eta}
     scene = mi.load_dict({"type": "scene", "slab": {**(shape or slab), "bsdf": bsdf}, **lights})
-    return find_joins(scene, WalkMedia.of(scene, 1.0), SmallEmitters.of(scene), share)
+    return find_connections(scene, WalkMedia.of(scene, 1.0), SmallEmitters.of(scene), share)
 
 
 def slab_of_normal(path: Path, n: np.ndarray) -> dict:
@@ -67,12 +67,12 @@ def slab_of_normal(path: Path, n: np.ndarray) -> dict:
     return {"type": "obj", "filename": str(path)}
 
 
-def brought(joins: Joins, depth: float, lanes: int = LANES) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and standard error, per channel, of what joins bring to an event at a depth."""
+def brought(connections: SubpathConnections, depth: float, lanes: int = LANES) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and standard error, per channel, of what connections bring to an event at a depth."""
     k = dr.full(mi.Int32, 0, lanes)
     p = mi.Point3f(dr.full(mi.Float, 0, lanes), 0, -depth)
-    event = Event(p, mi.Vector3f(*ALONG.tolist()), k, joins.media.coefficients(k, p))
-    L = np.array(joins.light(event, generator(mi, lanes, pass_seed(1)))[0])
+    event = Event(p, mi.Vector3f(*ALONG.tolist()), k, connections.media.coefficients(k, p))
+    L = np.array(connections.light(event, generator(mi, lanes, pass_seed(1)))[0])
     return L.mean(axis=1), L.std(axis=1, ddof=1) / np.sqrt(lanes)
 
 
@@ -122,9 +122,11 @@ def agree(found: tuple[np.ndarray, np.ndarray], wanted: np.ndarray, known_to: fl
 @pytest.mark.parametrize(
     ("g", "theta", "depth"), [(0.0, 0.0, 1.0), (0.0, 60.0, 0.1), (0.6, 40.0, 2.0), (-0.5, 75.0, 0.5)]
 )
-def test_joins_bring_the_light_that_scatters_once_on_its_way_to_the_event(g: float, theta: float, depth: float) -> None:
-    joins = joins_of({"sun": sun(theta, 0.9)}, g)
-    agree(brought(joins, depth), scattered(refracted(theta, 0.9, depth), depth, g))
+def test_connections_bring_light_that_scatters_once_on_its_way_to_the_event(
+    g: float, theta: float, depth: float
+) -> None:
+    connections = connections_of({"sun": sun(theta, 0.9)}, g)
+    agree(brought(connections, depth), scattered(refracted(theta, 0.9, depth), depth, g))
 
 
 def test_light_from_above_is_met_in_closed_form() -> None:
@@ -132,18 +134,18 @@ def test_light_from_above_is_met_in_closed_form() -> None:
     t = SIGMA_T * 0.8
     wanted = ALBEDO / (8 * np.pi) * (exp1(t) + np.exp(-t) * (np.log(t) + np.euler_gamma + np.log(2)))
     np.testing.assert_allclose(scattered(refracted(0.0, 0.0, 0.8), 0.8, 0.0), wanted, rtol=1e-3)
-    agree(brought(joins_of({"sun": sun(0.0, 0.0)}), 0.8), wanted)
+    agree(brought(connections_of({"sun": sun(0.0, 0.0)}), 0.8), wanted)
 
 
 @pytest.mark.parametrize(("eta", "theta"), [(1.5, 78.0), (0.8, 52.0)])
-def test_joins_follow_the_light_that_the_boundary_reflects(eta: float, theta: float) -> None:
+def test_connections_follow_the_light_that_the_boundary_reflects(eta: float, theta: float) -> None:
     """A thin slab, in which beams go up and down, of a medium that hardly scatters, so that nothing scatters twice."""
     depth, height, albedo = 0.2, 0.25, np.array([1e-4, 2e-4, 3e-4])
     beams = refracted(theta, 0.9, depth, eta, height)
     wanted = scattered(beams, depth, 0.4, albedo, height)
     assert (scattered(beams[1:], depth, 0.4, albedo, height) > 0.05 * wanted).all()
-    joins = joins_of({"sun": sun(theta, 0.9)}, 0.4, eta, albedo, height)
-    agree(brought(joins, depth), wanted, known_to=0.025)
+    connections = connections_of({"sun": sun(theta, 0.9)}, 0.4, eta, albedo, height)
+    agree(brought(connections, depth), wanted, known_to=0.025)
 
 
 @pytest.mark.parametrize("theta, tilt", [(35.0, 20.0), (80.0, 15.0)], ids=["above", "below its horizon"])
@@ -159,13 +161,15 @@ def test_shading_normals_bend_the_light_and_geometric_ones_hold_its_width(theta,
     d = (mu_i / eta - mu) * n - side * w / eta
     beam = Beam(d, mu_i / mu * (1 - F) * np.exp(SIGMA_T * depth / d[2]))
     albedo = 1e-4 * ALBEDO
-    joins = joins_of({"sun": sun(theta, 0.9)}, g, eta, albedo, shape=slab_of_normal(tmp_path / "slab.obj", n))
-    agree(brought(joins, depth), scattered([beam], depth, g, albedo), known_to=0.02)
+    connections = connections_of(
+        {"sun": sun(theta, 0.9)}, g, eta, albedo, shape=slab_of_normal(tmp_path / "slab.obj", n)
+    )
+    agree(brought(connections, depth), scattered([beam], depth, g, albedo), known_to=0.02)
 
 
-def test_joins_bring_the_light_of_a_point_that_comes_steeply() -> None:
+def test_connections_bring_the_light_of_a_point_that_comes_steeply() -> None:
     depth, g, intensity, lamp = 0.7, 0.3, 200.0, np.array([0.3, 0.2, 0.3])
-    joins = joins_of({"lamp": {"type": "point", "position": lamp.tolist(), "intensity": intensity}}, g)
+    connections = connections_of({"lamp": {"type": "point", "position": lamp.tolist(), "intensity": intensity}}, g)
     u, solid = about_the_event()
     t = (np.arange(300) + 0.5) / 300
     R, dR = 8 * t * t, 16 * t / 300  # beyond which little comes
@@ -177,32 +181,32 @@ def test_joins_bring_the_light_of_a_point_that_comes_steeply() -> None:
     value = np.where(reaches, intensity / far**2, 0) * eval_hg(u @ ALONG, g) * eval_hg((way * -u).sum(axis=-1) / far, g)
     weights, lengths = dR[:, None, None] * solid * value, R[:, None, None] - q[..., 2] / down
     wanted = [a * sigma * np.sum(weights * np.exp(-sigma * lengths)) for a, sigma in zip(ALBEDO, SIGMA_T)]
-    agree(brought(joins, depth, 4 * LANES), np.array(wanted), known_to=0.006)
+    agree(brought(connections, depth, 4 * LANES), np.array(wanted), known_to=0.006)
 
 
-def test_lights_add_up_whatever_the_share_of_events_that_are_joined() -> None:
+def test_lights_add_up_whatever_the_share_of_events_that_are_connected() -> None:
     lights = {"a": sun(20.0, 0.9), "b": {**sun(60.0, 3.0), "irradiance": 3.0}}
     beams = refracted(20.0, 0.9, 0.6) + [Beam(d, 3 * E) for d, E in refracted(60.0, 3.0, 0.6)]
-    agree(brought(joins_of(lights, share=0.4), 0.6), scattered(beams, 0.6, 0.0), known_to=0.02)
+    agree(brought(connections_of(lights, share=0.4), 0.6), scattered(beams, 0.6, 0.0), known_to=0.02)
 
 
 def test_light_behind_another_object_is_not_brought() -> None:
     screen = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, 5]).scale(100)}
-    mean, _ = brought(joins_of({"sun": sun(30.0, 0.0), "screen": screen}), 0.5)
+    mean, _ = brought(connections_of({"sun": sun(30.0, 0.0), "screen": screen}), 0.5)
     assert (mean == 0).all()
 
 
-def test_joins_cover_the_rays_that_come_steeply_from_an_emitter_that_looks_small() -> None:
+def test_connections_cover_the_rays_that_come_steeply_from_an_emitter_that_looks_small() -> None:
     def lamp(x: float, z: float, radius: float) -> dict:
         return {"type": "sphere", "center": [x, 0, z], "radius": radius, "emitter": {"type": "area"}}
 
-    joins = joins_of({"a": lamp(0.0, 10.0, 1.0), "b": lamp(20.0, 13.0, 12.5), "sky": {"type": "constant"}})
-    assert len(joins.small.emitters) == 2
+    connections = connections_of({"a": lamp(0.0, 10.0, 1.0), "b": lamp(20.0, 13.0, 12.5), "sky": {"type": "constant"}})
+    assert len(connections.small.emitters) == 2
     small, large, none = 0, 1, -1
     pivot = mi.Point3f(0, 0, -1)
 
     def covered(k: int, y: list, w: list) -> bool:
-        return bool(joins.covers(mi.Int32(k), mi.Point3f(y), dr.normalize(mi.Vector3f(w)), pivot)[0])
+        return bool(connections.covers(mi.Int32(k), mi.Point3f(y), dr.normalize(mi.Vector3f(w)), pivot)[0])
 
     assert covered(small, [0, 0, 9], [0, 0, 1]) and covered(small, [0, 0, 9], [1.5, 0, 1])
     assert not covered(small, [0, 0, 9], [2, 0, 1])  # 63 degrees from the direction to the emitter
@@ -211,6 +215,6 @@ def test_joins_cover_the_rays_that_come_steeply_from_an_emitter_that_looks_small
     assert not covered(none, [0, 0, 9], [0, 0, 1])
 
 
-def test_scenes_without_small_emitters_or_smooth_objects_have_no_joins() -> None:
-    assert joins_of({"sky": {"type": "constant"}}) is None
-    assert joins_of({"sun": sun(0.0, 0.0)}, share=0.0) is None
+def test_scenes_without_small_emitters_or_smooth_objects_have_no_connections() -> None:
+    assert connections_of({"sky": {"type": "constant"}}) is None
+    assert connections_of({"sun": sun(0.0, 0.0)}, share=0.0) is None
