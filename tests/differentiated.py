@@ -57,7 +57,7 @@ def envmap() -> dict:
 
 def image(scene, bodies: list | None = None) -> np.ndarray:
     """The image whose derivative the replay gives for the same seed."""
-    from halfspace_sss.rendering.paths.differentiable import replayer
+    from halfspace_sss.rendering.paths.integrator import replayer
 
     integrator = scene.integrator()
     tracer = replayer(bodies or integrator.prepare(scene), integrator.settings)

@@ -43,7 +43,7 @@ def _steps(scene: Any, n: int) -> dict[str, Callable[[], Any]]:
     import drjit as dr
     import mitsuba as mi
 
-    from halfspace_sss.rendering.paths.choice import exit_at
+    from halfspace_sss.rendering.paths.path_loop import exit_at
     from halfspace_sss.rendering.surface.horizon import cosine_above
     from halfspace_sss.rendering.transport.plane import place
 

@@ -17,7 +17,7 @@ import mitsuba as mi
 from full_geometry.object.subject import Subject, SurfacePoint, surface_point
 from halfspace_sss.checks import check_count
 from halfspace_sss.rendering.walk import exits as walk_exits
-from halfspace_sss.rendering.walk.steps import Crossing, Event, Walk
+from halfspace_sss.rendering.walk.random_walk import Crossing, Event, Walk
 
 LANES = 2**15
 ROULETTE_FROM = 8  # scattering events: from 2 on weak channels of ketchup have 10 times the variance, for no time less

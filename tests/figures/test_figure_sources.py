@@ -46,8 +46,8 @@ print(json.dumps([*found, keys()]))
 """
 EDIT = "\nEDITED = 1\n"
 EDITS = {
-    "walk": ("halfspace_sss/rendering/walk/tracing.py", EDIT),
-    "comment": ("halfspace_sss/rendering/walk/tracing.py", "\n# edited\n"),
+    "walk": ("halfspace_sss/rendering/walk/path_loop.py", EDIT),
+    "comment": ("halfspace_sss/rendering/walk/path_loop.py", "\n# edited\n"),
     "dipole": ("analytic_models/better_dipole.py", EDIT),
     "dipoles": ("analytic_models/_diffusion.py", EDIT),
     "network": ("halfspace_sss/neural/universal.py", EDIT),

@@ -21,7 +21,7 @@ mi = pytest.importorskip("mitsuba")
 
 import drjit as dr  # noqa: E402
 
-from halfspace_sss.rendering.light.small import SmallEmitters  # noqa: E402
+from halfspace_sss.rendering.light.small_emitters import SmallEmitters  # noqa: E402
 from halfspace_sss.trade import recommend  # noqa: E402
 
 BUNNY = Path(__file__).parents[2] / "figures" / "assets" / "bunny.ply"

@@ -18,10 +18,10 @@ mi = pytest.importorskip("mitsuba")
 
 import drjit as dr  # noqa: E402
 
-from halfspace_sss.rendering.light.small import SmallEmitters  # noqa: E402
-from halfspace_sss.rendering.walk.connect import STEEPEST, Joins, find_joins  # noqa: E402
+from halfspace_sss.rendering.light.small_emitters import SmallEmitters  # noqa: E402
+from halfspace_sss.rendering.walk.emitter_connections import STEEPEST, Joins, find_joins  # noqa: E402
 from halfspace_sss.rendering.walk.media import WalkMedia  # noqa: E402
-from halfspace_sss.rendering.walk.steps import Event  # noqa: E402
+from halfspace_sss.rendering.walk.random_walk import Event  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
 WIDEST_Z = 4.4  # two-sided 1e-5

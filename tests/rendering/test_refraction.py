@@ -15,7 +15,7 @@ mi = pytest.importorskip("mitsuba")
 import drjit as dr  # noqa: E402
 
 from halfspace_sss.physics.fresnel import F_t, mu_external  # noqa: E402
-from halfspace_sss.rendering.paths.refraction import refracted_connection  # noqa: E402
+from halfspace_sss.rendering.paths.low_orders import refracted_connection  # noqa: E402
 
 ETA, RADIUS, N = 1.4, 2.0, 400
 

@@ -10,7 +10,7 @@ import threading
 import numpy as np
 import pytest
 
-from halfspace_sss.rendering.paths import launches
+from halfspace_sss.rendering.paths import integrator
 
 mi = pytest.importorskip("mitsuba")
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="POSIX signals")
@@ -73,7 +73,7 @@ def test_an_interrupt_is_heard_in_a_launch_and_so_is_the_next_one(integrator: st
 def test_images_in_many_launches_have_the_mean_of_images_in_one(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = scene_of("bssrdf", 16)
     whole = np.array([mi.render(scene, spp=128, seed=k).numpy() for k in range(8)])
-    monkeypatch.setattr(launches, "SAMPLES_PER_LAUNCH", 16**2 * 32)
+    monkeypatch.setattr(integrator, "SAMPLES_PER_LAUNCH", 16**2 * 32)
     parts = np.array([mi.render(scene, spp=128, seed=100 + k).numpy() for k in range(8)])
     means = [images.mean(axis=(1, 2, 3)) for images in (whole, parts)]
     error = np.sqrt(sum(mean.var(ddof=1) / len(mean) for mean in means))

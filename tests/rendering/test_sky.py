@@ -15,8 +15,7 @@ mi = pytest.importorskip("mitsuba")
 from rendered import surface  # noqa: E402
 
 from halfspace_sss import rendering  # noqa: E402
-from halfspace_sss.rendering.paths import sky  # noqa: E402
-from halfspace_sss.rendering.paths.lights import Lights  # noqa: E402
+from halfspace_sss.rendering.paths.lighting import Lights, sky_of  # noqa: E402
 from halfspace_sss.rendering.transport import body as bodies  # noqa: E402
 from halfspace_sss.rendering.transport.half_space import half_space_means  # noqa: E402
 from halfspace_sss.rendering.transport.protocols import Means  # noqa: E402
@@ -154,6 +153,6 @@ def test_a_sky_with_a_sun_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None
         map = np.full((16, 32, 3), 0.2, np.float32)
         map[4, 5] = sun
         loaded = mi.load_dict(scene(Known, monkeypatch, {"sky": {"type": "envmap", "bitmap": mi.Bitmap(map)}}))
-        return sky.sky_of(loaded, Lights.of(loaded), loaded.integrator().prepare(loaded))
+        return sky_of(loaded, Lights.of(loaded), loaded.integrator().prepare(loaded))
 
     assert np.allclose(np.array(mean(0.2).mean), 0.2, rtol=1e-3) and mean(500.0) is None

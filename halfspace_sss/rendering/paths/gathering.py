@@ -19,8 +19,8 @@ import mitsuba as mi
 import numpy as np
 
 from halfspace_sss.rendering.gathered.transfer import Incident, Transfer, transfer
-from halfspace_sss.rendering.paths.lights import balance
-from halfspace_sss.rendering.paths.tracing import trace_paths
+from halfspace_sss.rendering.paths.lighting import balance
+from halfspace_sss.rendering.paths.path_loop import trace_paths
 from halfspace_sss.rendering.surface.horizon import cosine_above
 from halfspace_sss.rendering.transport.plane import place
 

@@ -3,22 +3,30 @@
 from __future__ import annotations
 
 import gc
-from collections.abc import Collection, Iterator
+import math
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
-from halfspace_sss.rendering.light.interruptible import interruptible
-from halfspace_sss.rendering.paths.differentiable import check_outermost, check_parameters, replayer
+from halfspace_sss.interrupts import hear_again, interruptible
 from halfspace_sss.rendering.paths.gathering import Gathering
-from halfspace_sss.rendering.paths.launches import launches
-from halfspace_sss.rendering.paths.tracing import trace_paths
-from halfspace_sss.rendering.transport.body import Bodies, make_bodies
-from halfspace_sss.rendering.transport.settings import read_settings
+from halfspace_sss.rendering.paths.path_loop import replay_paths, trace_paths
+from halfspace_sss.rendering.transport.body import Bodies, Body, make_bodies
+from halfspace_sss.rendering.transport.settings import Settings, read_settings
 
-__all__ = ["integrator_class"]
+__all__ = [
+    "Launch",
+    "SAMPLES_PER_LAUNCH",
+    "check_outermost",
+    "check_parameters",
+    "integrator_class",
+    "launches",
+    "replayer",
+]
 
 
 def integrator_class() -> type:
@@ -116,3 +124,128 @@ def undisturbed() -> Iterator[None]:
     finally:
         if collects:
             gc.enable()
+
+
+# ---- Launches of an image, between which an interrupt is heard -----------------------------------------------------
+
+SAMPLES_PER_LAUNCH = 2**20  # half a second on 2 cores
+
+
+class Launch(NamedTuple):
+    """Seed and samples per pixel."""
+
+    seed: int
+    spp: int
+
+
+def launches(sensor: Any, seed: Any, spp: int, stopped: Callable[[], bool]) -> Iterator[Launch]:
+    """Launches of equally many samples, each to be rendered to the film of a sensor, which holds their mean in the end.
+
+    Args:
+        sensor, seed, spp: what is rendered; the first launch has the seed itself.
+        stopped: whether Mitsuba, whose handler takes signals while it renders, was told to stop.
+
+    Raises:
+        KeyboardInterrupt: a launch was interrupted.
+    """
+    film, total = sensor.film(), None
+    spp, seed = spp or sensor.sampler().sample_count(), int(mi.UInt32(seed)[0])
+    n = min(math.ceil(spp * int(dr.prod(film.crop_size())) / SAMPLES_PER_LAUNCH), spp)
+    for k in range(n):
+        yield Launch(_seed(seed, k), (spp * (k + 1)) // n - (spp * k) // n)
+        raw = film.develop(raw=True)
+        total = raw if total is None else total + raw
+        dr.eval(total)
+        dr.sync_thread()
+        hear_again()
+        if stopped():
+            raise KeyboardInterrupt
+    if n > 1:
+        film.prepare([])
+        film.put_block(mi.ImageBlock(total, film.crop_offset(), film.rfilter(), False))
+
+
+def _seed(seed: int, k: int) -> int:
+    return seed if k == 0 else int(np.random.SeedSequence([seed, k]).generate_state(1)[0])
+
+
+# ---- Derivatives: Mitsuba's radiative backpropagation around a replay of the paths ---------------------------------
+
+GEOMETRY = ("to_world", "vertex_positions", "vertex_normals", "vertex_texcoords")
+
+
+def check_parameters(scene: Any) -> None:
+    """Refuse derivatives that a replay with fixed paths does not have.
+
+    Raises:
+        ValueError: gradients are enabled for the geometry of a shape, for a sensor or film, or for what Mitsuba does
+            not differentiate by, such as the index of a smooth dielectric.
+    """
+    parameters = mi.traverse(scene)
+    for key, (_, _, owner, flags) in parameters.properties.items():
+        with dr.resume_grad():
+            if not dr.grad_enabled(parameters[key]):
+                continue
+        name = key.rsplit(".", 1)[-1]
+        fixed = bool(flags & int(mi.ParamFlags.NonDifferentiable))
+        if fixed or name in GEOMETRY or _moves(owner, name) or _selects(parameters, owner, name):
+            raise ValueError(
+                f"{key} must not have gradients enabled: bssrdf differentiates light by emitters, surfaces, textures "
+                "and media, with paths held where they are"
+            )
+
+
+def check_outermost(scene: Any) -> None:
+    """Refuse derivatives of another integrator that asks this one for samples: they would be missing in silence.
+
+    Raises:
+        ValueError: gradients are enabled for a parameter of the scene, and followed.
+    """
+    followed = [key for key, value in mi.traverse(scene).items() if dr.grad_enabled(value)]
+    if followed:
+        raise ValueError(
+            f"bssrdf must be the outermost integrator for derivatives, got one around it for {followed[0]}"
+        )
+
+
+def _moves(owner: Any, name: str) -> bool:
+    """Whether a parameter moves a shape or a sensor; attributes of vertices and faces are textures."""
+    if isinstance(owner, mi.Shape):
+        return not name.startswith(("vertex_", "face_"))
+    return isinstance(owner, (mi.Sensor, mi.Film))
+
+
+def _selects(parameters: Any, owner: Any, name: str) -> bool:
+    """Whether a parameter does more than scale light: the share of a mirror in a blend, the index that a medium has."""
+    while owner is not None:
+        if isinstance(owner, mi.BSDF) and owner.class_name() == "BlendBSDF":
+            return bool(owner.flags() & int(mi.BSDFFlags.Delta))
+        owner = parameters.hierarchy[owner][0]
+        if hasattr(owner, "inside") and name == "eta":
+            return True
+    return False
+
+
+def replayer(bodies: list[Body], settings: Settings) -> Any:
+    """An integrator of Mitsuba's radiative backpropagation around the paths through a scene with these bodies.
+
+    Raises:
+        ValueError: gradients are enabled for a medium, and the model knows no other.
+    """
+    from mitsuba.python.ad.integrators.common import RBIntegrator
+
+    for body in bodies:
+        body.variation.prepare()
+
+    class Replayer(RBIntegrator):
+        """Mitsuba's camera rays and films, this project's paths."""
+
+        def sample(self, mode: Any, scene: Any, sampler: Any, ray: Any, **given: Any) -> tuple:
+            if mode == dr.ADMode.Primal:
+                parts, seen = trace_paths(scene, bodies, settings, sampler, ray, given["active"])
+                return parts[0] + parts[1], seen, [], parts
+            parts, backward = given["state_in"], mode == dr.ADMode.Backward
+            d = replay_paths(scene, bodies, settings, sampler, ray, parts, given["δL"], backward)
+            return d, mi.Bool(True), [], parts
+
+    return Replayer(mi.Properties())

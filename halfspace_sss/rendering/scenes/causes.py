@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from halfspace_sss.rendering.light.interruptible import is_interrupt
+from halfspace_sss.interrupts import is_interrupt
 
 __all__ = ["SceneError", "first_cause", "plainly"]
 

@@ -16,10 +16,20 @@ import mitsuba as mi
 
 from halfspace_sss.rendering.surface.horizon import lift, lifted, sided
 from halfspace_sss.rendering.walk.media import WalkMedia
-from halfspace_sss.rendering.walk.steps import Crossing, Event, Visitor, Walk, Walker, draw, sample_bsdf, start_walk
+from halfspace_sss.rendering.walk.random_walk import (
+    Crossing,
+    Event,
+    Visitor,
+    Walk,
+    Walker,
+    draw,
+    sample_bsdf,
+    start_walk,
+)
 from halfspace_sss.tracing.walk import generator, pass_seed
 
-__all__ = ["ExitVisitor", "Exits", "Start", "exits", "walk_from"]
+__all__ = ["ExitVisitor", "Exits", "FirstExitVisitor", "FirstExits", "Start", "Watched", "exits", "walk_from"]
+
 
 LANES = 2**13
 
@@ -174,3 +184,93 @@ def _enter(media: WalkMedia, k: Any, start: Start, index: Any, rng: Any) -> Walk
     channel = draw(len(value), rng) if len(value) > 1 else walk.channel
     return replace(walk, alive=enters, object=mi.Int32(k) + dr.zeros(mi.Int32, dr.width(index)), weight=value,
                    skip=media.clear(k, si.n, d), scale=dr.square(bs.eta), channel=channel)  # fmt: skip
+
+
+# ---- First exits of paths from the camera --------------------------------------------------------------------------
+
+
+@dataclass
+class FirstExits:
+    """One lane for each path; normals point outwards, directions away from the surface, which see shading normals."""
+
+    object: mi.Int32  # the number of the object that the path meets first, or -1
+    x_o: mi.Point3f
+    n_o: mi.Normal3f  # geometric
+    n_o_shading: mi.Normal3f
+    w_o: mi.Vector3f
+    throughput: mi.Spectrum  # T; 0 where no walk left
+    x_i: mi.Point3f
+    n_i: mi.Normal3f  # geometric
+    n_i_shading: mi.Normal3f
+    w_i: mi.Vector3f
+    order: mi.UInt32  # scattering events
+    face: mi.UInt32  # at x_i
+
+    @classmethod
+    def of(cls, scene: Any, media: WalkMedia, rays: Any) -> FirstExits:
+        """What rays of the camera meet first, and room for where their walks leave."""
+        si = scene.ray_intersect(rays, mi.RayFlags.All, coherent=True)
+        k = media.index_of(si.shape, si.is_valid())
+        si = media.seen(si, k, rays.d)
+        n = dr.width(rays)
+        kinds = mi.Spectrum, mi.Point3f, mi.Normal3f, mi.Normal3f, mi.Vector3f, mi.UInt32, mi.UInt32
+        found = cls(k, mi.Point3f(si.p), mi.Normal3f(si.n), mi.Normal3f(si.sh_frame.n), mi.Vector3f(-rays.d),
+                    *(dr.zeros(kind, n) for kind in kinds))  # fmt: skip
+        dr.eval(found)
+        return found
+
+    def of_object(self, k: int) -> FirstExits:
+        """The lanes of paths that meet object k first."""
+        kept = dr.compress(self.object == k)
+        lanes = {name: dr.gather(type(value), value, kept) for name, value in vars(self).items()}
+        found = FirstExits(**lanes)
+        dr.eval(found)
+        return found
+
+    def gather(self, lanes: Any) -> FirstExits:
+        """The paths of the given lanes."""
+        return FirstExits(**{name: dr.gather(type(value), value, lanes) for name, value in vars(self).items()})
+
+
+@dataclass
+class Watched:
+    """What a visitor keeps of a path, the number of the path, and whether it is inside the object it met first."""
+
+    record: Any
+    index: mi.UInt32
+    first: mi.Bool
+
+
+@dataclass(frozen=True, eq=False)
+class FirstExitVisitor:
+    """Another visitor, beside which the first exit of each path is stored at the number of the path.
+
+    Args:
+        visitor: the other one.
+        exits: where they are stored.
+    """
+
+    visitor: Visitor
+    exits: FirstExits
+
+    def event(self, walk: Walk, record: Watched, event: Event) -> tuple[Walk, Watched]:
+        walk, kept = self.visitor.event(walk, record.record, event)
+        return walk, replace(record, record=kept)
+
+    def boundary(self, walk: Walk, record: Watched, si: Any, active: Any) -> tuple[Walk, Watched]:
+        walk, kept = self.visitor.boundary(walk, record.record, si, active)
+        return walk, replace(record, record=kept)
+
+    def surface(self, walk: Walk, record: Watched, si: Any, bsdf: Any, k: Any) -> tuple[Walk, Watched]:
+        walk, kept = self.visitor.surface(walk, record.record, si, bsdf, k)
+        return walk, replace(record, record=kept)
+
+    def crossing(self, walk: Walk, record: Watched, crossing: Crossing) -> tuple[Walk, Watched]:
+        walk, kept = self.visitor.crossing(walk, record.record, crossing)
+        to, si = self.exits, crossing.si
+        leaves, n_shading = walk.alive & crossing.leaves & record.first, lifted(si.sh_frame.n, si.n, walk.d)
+        pairs = ((to.throughput, walk.weight), (to.x_i, si.p), (to.n_i, si.n), (to.n_i_shading, n_shading),
+                 (to.w_i, walk.d), (to.order, walk.order), (to.face, si.prim_index))  # fmt: skip
+        for target, value in pairs:
+            dr.scatter(target, type(target)(value), record.index, leaves)
+        return walk, replace(record, record=kept)

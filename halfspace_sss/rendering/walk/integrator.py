@@ -10,20 +10,17 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from halfspace_sss.rendering.light.interruptible import interruptible
-from halfspace_sss.rendering.light.small import SmallEmitters
+from halfspace_sss.interrupts import interruptible
+from halfspace_sss.rendering.light.small_emitters import SmallEmitters
 from halfspace_sss.rendering.surface.object import same_objects
 from halfspace_sss.rendering.surface.parameters import OF_MITSUBA, check_parameters
 from halfspace_sss.rendering.surface.placement import check_sensors, places_of
 from halfspace_sss.rendering.surface.sharing import number_of
 from halfspace_sss.rendering.transport.body import check_size
-from halfspace_sss.rendering.walk.connect import find_joins
-from halfspace_sss.rendering.walk.first_exits import FirstExits
-from halfspace_sss.rendering.walk.guide import Guide
-from halfspace_sss.rendering.walk.lamps import Lamps
-from halfspace_sss.rendering.walk.light import LightVisitor
+from halfspace_sss.rendering.walk.emitter_connections import Guide, Lamps, find_joins
+from halfspace_sss.rendering.walk.exits import FirstExits
 from halfspace_sss.rendering.walk.media import WalkMedia
-from halfspace_sss.rendering.walk.tracing import PathTracer
+from halfspace_sss.rendering.walk.path_loop import LightVisitor, PathTracer
 
 __all__ = ["camera_rays", "walk_integrator_class"]
 

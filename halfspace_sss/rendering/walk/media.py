@@ -9,14 +9,214 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from halfspace_sss.rendering.light.small_emitters import is_delta
 from halfspace_sss.rendering.surface.horizon import lift
 from halfspace_sss.rendering.surface.object import Object, survey
-from halfspace_sss.rendering.surface.placement import translucent_shapes
+from halfspace_sss.rendering.surface.placement import Content, contents, translucent_shapes
 from halfspace_sss.rendering.surface.sharing import check_together, scene_of
-from halfspace_sss.rendering.walk.grids import Grids, per_channel
-from halfspace_sss.rendering.walk.inner import Inner
+from halfspace_sss.rendering.surface.varying import VaryingMedium, eval_volume
 
-__all__ = ["Coefficients", "WalkMedia", "by_pointer", "pointer_numbers"]
+__all__ = ["Coefficients", "Grids", "Inner", "WalkMedia", "by_pointer", "per_channel", "pointer_numbers"]
+
+
+# ---- Shapes, media and lights inside objects -----------------------------------------------------------------------
+
+REFRACTS = int(mi.BSDFFlags.DeltaTransmission) | int(mi.BSDFFlags.GlossyTransmission)
+
+
+@dataclass(frozen=True, eq=False)
+class Inner:
+    """What lies inside the objects of a scene.
+
+    Args:
+        scene: a Mitsuba scene that holds the objects, and the shapes inside or partly inside them.
+        tables: by what Dr.Jit's registry calls a shape, the number of the object `around` it or -1, and whether it
+            `displaces` that; by the number of an object, whether it stands `alone`, neither in another nor around
+            anything.
+        lamps: the delta lights in the medium of an object, and its number.
+    """
+
+    scene: Any
+    tables: dict[str, Any]
+    lamps: list[tuple[Any, int]]
+
+    @classmethod
+    def of(cls, scene: Any, objects: list[Object]) -> Inner | None:
+        """What lies inside; None if nothing does.
+
+        Raises:
+            ValueError: something that refracts lies partly inside, is not closed, or objects count some orders only.
+        """
+        found = contents(scene, objects)
+        if not found:
+            return None
+        _check(found, objects)
+        glass = [survey(thing, scene) for thing in _shapes(found) if _displaces(thing)]
+        for piece in glass:
+            if not piece.closed:
+                raise ValueError(f"what refracts inside an object must be closed, got the shape {piece.name}")
+        if glass:
+            found = contents(scene, [*objects, *glass])
+        holders = [*objects, *glass]
+        inside = [content for content in found if content.object < len(objects)]
+        things = {id(content.thing): content.thing for content in inside}
+        around = {key: _innermost(key, found, holders, len(objects)) for key in things}
+        own = [obj.shape for obj in objects]
+        shapes = [*own, *(thing for thing in _shapes(inside) if not any(thing is shape for shape in own))]
+        numbers = [int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0]) for shape in shapes]
+        at = np.full(max(numbers) + 1, -1, dtype=np.int32)
+        displaces = np.zeros(len(at), dtype=bool)
+        for number, shape in zip(numbers, shapes):
+            at[number], displaces[number] = around.get(id(shape), -1), _displaces(shape)
+        holding = {content.object for content in inside}
+        alone = [k not in holding and id(shape) not in things for k, shape in enumerate(own)]
+        tables = {"around": mi.Int32(at.tolist()), "displaces": mi.Bool(displaces.tolist()), "alone": mi.Bool(alone)}
+        dr.make_opaque(tables)
+        lamps = [(thing, around[key]) for key, thing in things.items() if isinstance(thing, mi.Emitter)]
+        lamps = [(lamp, k) for lamp, k in lamps if is_delta(lamp) and k >= 0]
+        return cls(scene_of(shapes, scene), tables, lamps)
+
+    def around(self, shape: Any) -> Any:
+        """The number of the object around a shape, or -1."""
+        return self._of_shape("around", shape, -1)
+
+    def displaces(self, shape: Any) -> Any:
+        """Whether a shape, which is no translucent object, displaces the medium around it."""
+        return self._of_shape("displaces", shape, False)
+
+    def _of_shape(self, key: str, shape: Any, otherwise: Any) -> Any:
+        pointer, table = dr.reinterpret_array(mi.UInt32, shape), self.tables[key]
+        known = pointer < dr.width(table)
+        return dr.select(known, dr.gather(type(table), table, pointer, known), otherwise)
+
+
+def _shapes(found: list[Content]) -> list[Any]:
+    return list({id(c.thing): c.thing for c in found if isinstance(c.thing, mi.Shape)}.values())
+
+
+def _displaces(shape: Any) -> bool:
+    return not hasattr(shape.bsdf(), "inside") and bool(shape.bsdf().flags() & REFRACTS)
+
+
+def _innermost(key: int, found: list[Content], holders: list[Object], n: int) -> int:
+    """The smallest holder of a thing if that is an object, by its number; -1 if it is of glass."""
+    numbers = [content.object for content in found if id(content.thing) == key]
+    smallest = min(numbers, key=lambda k: holders[k].size)
+    return smallest if smallest < n else -1
+
+
+def _check(found: list[Content], objects: list[Object]) -> None:
+    for content in found:
+        holder = objects[content.object]
+        surfaces = [holder.shape.bsdf()]
+        if isinstance(content.thing, mi.Shape):
+            translucent = hasattr(content.thing.bsdf(), "inside")
+            if not content.whole and (translucent or _displaces(content.thing)):
+                raise ValueError(
+                    f"what refracts must lie inside an object or outside, got {content.name} partly inside "
+                    f"object {holder.name}"
+                )
+            surfaces += [content.thing.bsdf()] if translucent else []
+        for surface in surfaces:
+            if surface.inside.orders != "total":
+                raise ValueError(
+                    f"orders must be 'total' of objects with something inside, got {surface.inside.orders!r} where "
+                    f"{content.name} lies inside object {holder.name}"
+                )
+
+
+# ---- Heterogeneous media -------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Grids:
+    """The media of all objects, of which at least one varies.
+
+    Args:
+        densities: volume of each object, or None, see `VaryingMedium`.
+        albedos: likewise.
+        factor: table with one column per channel, 1/(scene unit).
+        albedo: likewise, without a unit.
+        majorants: likewise, 1/(scene unit).
+    """
+
+    densities: list[Any]
+    albedos: list[Any]
+    factor: list[Any]
+    albedo: list[Any]
+    majorants: list[Any]
+
+    @classmethod
+    def of(cls, insides: list[Any], mm_per_unit: float) -> Grids:
+        """Of the insides of objects."""
+        media = [inside.varying or _homogeneous(inside.medium) for inside in insides]
+        tables = (
+            per_channel([m.factor for m in media], mm_per_unit),
+            per_channel([m.albedo for m in media], 1.0),
+            per_channel([m.majorant for m in media], mm_per_unit),
+        )
+        dr.make_opaque(tables)
+        return cls([m.density for m in media], [m.albedo_volume for m in media], *tables)
+
+    def majorant(self, k: Any) -> Any:
+        """Of object k, 1/(scene unit)."""
+        return _row(self.majorants, k)
+
+    def sigma_t(self, k: Any, p: Any) -> Any:
+        """Extinction of object k at the point p, 1/(scene unit)."""
+        return _row(self.factor, k) * _eval(self.densities, k, p)
+
+    def coefficients(self, k: Any, p: Any) -> tuple[Any, Any]:
+        """sigma_t and sigma_s of object k at the point p, 1/(scene unit)."""
+        sigma_t = self.sigma_t(k, p)
+        return sigma_t, sigma_t * _row(self.albedo, k) * _eval(self.albedos, k, p)
+
+    def transmittance(self, k: Any, ray: Any, distance: Any, rng: Any) -> Any:
+        """An unbiased estimate of exp(-∫ sigma_t) over a distance along a ray inside object k: ratio tracking.
+
+        Collisions are drawn by the largest majorant M of the channels; each is null, with the weight
+        1 - sigma_t,c / M (Novak, Selle and Jarosz 2014).
+        """
+        M = dr.max(self.majorant(k))
+        o, d = mi.Point3f(ray.o), mi.Vector3f(ray.d)
+        T = dr.full(mi.Spectrum, 1, dr.width(o))
+        t = -dr.log(1 - rng.next_float32()) / M
+
+        def collide(t: Any, T: Any, rng: Any, o: Any, d: Any, k: Any, M: Any, distance: Any) -> tuple:
+            T = T * dr.maximum(1 - self.sigma_t(k, dr.fma(d, t, o)) / M, 0)
+            return t - dr.log(1 - rng.next_float32()) / M, T, rng, o, d, k, M, distance
+
+        state = (t, T, rng, o, d, k, M, mi.Float(distance))
+        going = lambda t, T, rng, o, d, k, M, distance: (t < distance) & (dr.max(T) > 0)  # noqa: E731
+        return dr.while_loop(state, going, collide, label="ratio tracking")[1]
+
+
+def per_channel(rows: list[Any], scale: float) -> list[Any]:
+    """A table with one column per channel from a number, or one per channel, of each object."""
+    n = len(mi.Spectrum(0))
+    values = np.array([np.broadcast_to(row, n) for row in rows], dtype=float) * scale
+    return [mi.Float(values[:, c].tolist()) for c in range(n)] if len(rows) else []
+
+
+def _homogeneous(medium: Any) -> VaryingMedium:
+    return VaryingMedium(None, np.atleast_1d(medium.sigma_t), None, np.atleast_1d(medium.albedo))
+
+
+def _row(table: list[Any], k: Any) -> Any:
+    return mi.Spectrum([dr.gather(mi.Float, column, k) for column in table])
+
+
+def _eval(volumes: list[Any], k: Any, p: Any) -> Any:
+    """The value of the volume of object k, 1 where it has none; Mitsuba's volumes cannot be called by pointers."""
+    if len(volumes) == 1:
+        return eval_volume(volumes[0], p)
+    value = mi.Spectrum(1)
+    for number, volume in enumerate(volumes):
+        if volume is not None:
+            here = k == number
+            value = dr.select(here, eval_volume(volume, p, here), value)
+    return value
+
 
 _FEWEST = {"total": 0, "multiple": 2, "single": 1}
 _MOST = {"total": 2**31 - 1, "multiple": 2**31 - 1, "single": 1}

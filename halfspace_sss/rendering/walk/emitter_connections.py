@@ -25,14 +25,24 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from halfspace_sss.rendering.light.small import SmallEmitters
-from halfspace_sss.rendering.surface.horizon import sided
+from halfspace_sss.rendering.light.small_emitters import SmallEmitters, spread
+from halfspace_sss.rendering.surface.horizon import opposed, sided
 from halfspace_sss.rendering.surface.variants import channel_mean
-from halfspace_sss.rendering.walk.inside import eval_phase, fly, free_path, pick, turn
-from halfspace_sss.rendering.walk.media import WalkMedia
-from halfspace_sss.rendering.walk.steps import Event, Walk, draw, start_walk
+from halfspace_sss.rendering.walk.media import Coefficients, WalkMedia
+from halfspace_sss.rendering.walk.random_walk import (
+    Event,
+    Walk,
+    draw,
+    eval_phase,
+    fly,
+    free_path,
+    pick,
+    start_walk,
+    turn,
+)
 
-__all__ = ["DEEPEST", "Joins", "find_joins"]
+__all__ = ["DEEPEST", "Departure", "Guide", "Joins", "Lamps", "find_joins"]
+
 
 DEEPEST = 12.0  # mean free paths up to which the boundary in front of an event is looked for
 STEEPEST = 0.5  # least cosine of a ray with w_0
@@ -238,3 +248,172 @@ def find_joins(scene: Any, media: WalkMedia, small: SmallEmitters | None, share:
     if media.inner is not None and not np.array(media.inner.tables["alone"]).any():
         return None
     return Joins(scene, media, small, share)
+
+
+# ---- Connections from inside to small emitters ---------------------------------------------------------------------
+
+GUESSES = 3
+SHARES = (0.5, 0.3, 0.2)  # of the lobes
+WIDER = (131.0, 8.0)  # concentrations of the others: 5 and 20 degrees
+
+
+@dataclass
+class Departure:
+    """A walk's last event and its way out from there, by which it left the object straight."""
+
+    p: mi.Point3f
+    along: mi.Vector3f  # direction of arrival at the event
+    ahead: mi.Vector3f  # direction from it
+    object: mi.Int32
+
+
+@dataclass(frozen=True, eq=False)
+class Guide:
+    """Directions from events to small emitters.
+
+    Args:
+        scene: the Mitsuba scene.
+        media: its translucent objects.
+        small: its small emitters.
+    """
+
+    scene: Any
+    media: WalkMedia
+    small: SmallEmitters
+
+    def _guess(self, v: Any, k: Any, which: Any, m: Coefficients, active: Any) -> tuple[Any, Any, Any]:
+        """The direction from v by which an emitter sees it through the boundary, its concentration, and if any."""
+        toward, small = self.small.direction(which, v)
+        eta = self.media.row("eta", k)
+        valid, d, w = active & small, toward, toward
+        for _ in range(GUESSES):
+            ray = mi.Ray3f(v, d)
+            ray.maxt = DEEPEST / dr.min(m.mean_t)
+            si = self.media.scene.ray_intersect(ray, mi.RayFlags.Minimal, coherent=False, active=valid)
+            valid &= si.is_valid()
+            n = si.n * self.media.side(k, si.prim_index)
+            w, _ = self.small.direction(which, si.p)
+            cosine = dr.dot(w, n)
+            _, cos_t, _, eta_ti = mi.fresnel(dr.clip(cosine, 0, 1), eta)
+            refracted = w * eta_ti + n * (dr.abs(cos_t) - eta_ti * cosine)
+            d = dr.normalize(dr.select(cosine > 0, refracted, d))
+        return d, dr.minimum(dr.square(eta) / dr.maximum(self.small.angle2(which, v), 1e-6), 1e6), valid
+
+    def light(self, event: Event, rng: Any) -> Any:
+        """An estimate of the light of small emitters that leaves from an event, per weight of the walk."""
+        v, k, m = event.p, event.object, event.m
+        n = len(self.small)
+        which = mi.Int32(draw(n, rng))
+        guess, concentration, valid = self._guess(v, k, which, m, True)
+        d, pdf = _draw_lobe(guess, concentration, rng)
+        ray = mi.Ray3f(v, d)
+        ray.maxt = 2 * DEEPEST / dr.min(m.mean_t)
+        si = self.media.scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=valid)
+        valid &= si.is_valid() & (self.media.index_of(si.shape) == k)
+        si = self.media.seen(si, k, d)
+        F, cos_t, eta_it, eta_ti = mi.fresnel(mi.Frame3f.cos_theta(si.wi), self.media.row("eta", k))
+        w = opposed(si.to_world(mi.refract(si.wi, cos_t, eta_ti)), si.n)
+        valid &= (dr.dot(d, si.n) > 0) & (dr.dot(w, si.n) > 0) & (F < 1)
+        way = si.spawn_ray(w)
+        outside = self.scene.ray_intersect(way, mi.RayFlags.All, coherent=False, active=valid)
+        phase = eval_phase(m, dr.dot(event.along, d))
+        # radiance shrinks by eta² on its way out, as the weight of the walk has when it came in
+        factor = (1 - F) * dr.square(eta_ti) / (pdf / n + channel_mean(phase))
+        T = self.media.transmittance(k, ray, dr.select(valid, si.t, 0), rng)
+        value = phase * T * factor
+        return dr.select(valid, value * self.small.along(which, way, outside, valid), 0)
+
+    def share(self, which: Any, way: Departure, active: Any) -> Any:
+        """Weight of having hit emitter `which`, if >= 0, by the phase function (balance heuristic against `light`)."""
+        k, m = way.object, self.media.coefficients(way.object, way.p)
+        guess, concentration, valid = self._guess(way.p, k, type(k)(dr.maximum(which, 0)), m, active & (which >= 0))
+        lobes = _lobes(dr.dot(guess, way.ahead), concentration) / len(self.small)
+        phase = channel_mean(eval_phase(m, dr.dot(way.along, way.ahead)))
+        return phase / (phase + dr.select(active & valid, lobes, 0))
+
+
+def _lobes(cosine: Any, concentration: Any) -> Any:
+    """Density of the sum of lobes c e^(-c (1 - cos)) / (2 pi), 1/sr; what falls beyond cos = -1 is left out."""
+    x = dr.maximum(1 - cosine, 0)
+    parts = zip(SHARES, (concentration, *WIDER))
+    return sum(a * c * dr.exp(-c * x) for a, c in parts) / (2 * dr.pi)
+
+
+def _draw_lobe(guess: Any, concentration: Any, rng: Any) -> tuple[Any, Any]:
+    """A direction about the guess, and its density."""
+    u = rng.next_float32()
+    c = dr.select(u < SHARES[0], concentration, dr.select(u < SHARES[0] + SHARES[1], WIDER[0], WIDER[1]))
+    x = dr.minimum(-dr.log(1 - rng.next_float32()) / c, 2)
+    sine = dr.safe_sqrt(x * (2 - x))
+    sin_phi, cos_phi = dr.sincos(2 * dr.pi * rng.next_float32())
+    d = mi.Frame3f(guess).to_world(mi.Vector3f(sine * cos_phi, sine * sin_phi, 1 - x))
+    return d, _lobes(1 - x, concentration)
+
+
+# ---- Delta lights inside objects -----------------------------------------------------------------------------------
+
+NEAREST = 0.2  # mean free paths, r
+CONE = 0.15  # radius of the cone, radians; light that a medium scatters beside it hides more
+
+
+@dataclass(frozen=True, eq=False)
+class Lamps:
+    """The delta lights inside objects.
+
+    Args:
+        media: the objects.
+        emitters: the lights.
+        tables: of each, what Dr.Jit's registry calls it, `pointer`, and the object `around` it.
+    """
+
+    media: WalkMedia
+    emitters: list[Any]
+    tables: dict[str, Any]
+
+    @classmethod
+    def of(cls, media: WalkMedia) -> Lamps | None:
+        """Those of the objects of a scene; None if there are none."""
+        if media.inner is None or not media.inner.lamps:
+            return None
+        emitters, around = zip(*media.inner.lamps)
+        pointers = [int(dr.reinterpret_array(mi.UInt32, mi.EmitterPtr(emitter))[0]) for emitter in emitters]
+        tables = {"pointer": mi.UInt32(pointers), "around": mi.Int32(around)}
+        dr.make_opaque(tables)
+        return cls(media, list(emitters), tables)
+
+    def _drawn(self, k: Any, rng: Any, active: Any) -> tuple[Any, Any]:
+        """One of the lights, and whether it is in object k."""
+        which = draw(len(self.emitters), rng)
+        here = active & (dr.gather(mi.Int32, self.tables["around"], which) == k)
+        if len(self.emitters) == 1:
+            return self.emitters[0], here
+        return dr.reinterpret_array(mi.EmitterPtr, dr.gather(mi.UInt32, self.tables["pointer"], which)), here
+
+    def light(self, k: Any, at: Any, rng: Any, active: Any) -> tuple[Any, Any]:
+        """The direction to a light from an interaction in object k, and its irradiance across, over its probability."""
+        emitter, here = self._drawn(k, rng, active)
+        ds, E = emitter.sample_direction(at, mi.Point2f(0.5), here)
+        lit = here & (ds.pdf > 0) & (dr.max(E) > 0)
+        ray = at.spawn_ray(ds.d)
+        sigma_t = self.media.spectrum("sigma_t", k)
+        r = NEAREST / dr.max(sigma_t)
+        near = dr.select(ds.dist < r, 3 * dr.square(ds.dist / r) * (1 + 0.25 * r * sigma_t), 1)
+        return ds.d, dr.select(lit, self._passed(k, ray, ds.dist, rng, lit) * E * (near * len(self.emitters)), 0)
+
+    def spread(self, k: Any, ray: Any, rng: Any, active: Any) -> Any:
+        """Radiance of a light along a ray in object k, spread over a wide cone, over its probability."""
+        emitter, here = self._drawn(k, rng, active)
+        L = spread(self.media.inner.scene, emitter, ray, mi.Float(CONE), here)
+        at = dr.zeros(mi.Interaction3f)
+        at.p = ray.o
+        ds, _ = emitter.sample_direction(at, mi.Point2f(0.5), here)
+        lit = here & (dr.max(L) > 0)
+        T = self.media.transmittance(k, ray, dr.select(lit, ds.dist, 0), rng)
+        return dr.select(lit, T * L * len(self.emitters), 0)
+
+    def _passed(self, k: Any, ray: Any, distance: Any, rng: Any, active: Any) -> Any:
+        """The transmittance of what is between: 0 behind any surface."""
+        shadow = mi.Ray3f(ray)
+        shadow.maxt = distance * (1 - 1e-4)
+        clear = active & ~self.media.inner.scene.ray_test(shadow, False, active)
+        return dr.select(clear, self.media.transmittance(k, ray, dr.select(clear, distance, 0), rng), 0)
