@@ -183,28 +183,32 @@ def test_all_light_of_a_point_light_in_a_medium_without_absorption_leaves_it(kin
     scene = _scene({**AROUND[kind](), **_lamp((0, 0, 0.5))}, {}, _wax(sigma_a=0.0, sigma_s=1.0))
     del scene["sensor"]
     loaded = mi.load_dict({**scene, **_all_around(nodes, width)})
-    images = np.array([[np.array(mi.render(loaded, sensor=k, spp=256, seed=10 * run + k), dtype=float).mean(axis=(0, 1))
-                        for k in range(len(nodes))] for run in range(RUNS)])  # fmt: skip
+    seeds = [[(k, 10 * run + k) for k in range(len(nodes))] for run in range(RUNS)]
+    images = np.array([[np.array(mi.render(loaded, sensor=k, spp=1024, seed=seed), dtype=float).mean(axis=(0, 1))
+                        for k, seed in row] for row in seeds])  # fmt: skip
     found = width**2 * np.einsum("k,rkc->rc", weights / 2, images)
     scattered = 1 - _unscattered(0.5, 1.0 * UNIT, MEDIUM["eta"])
-    _agree(found, np.tile(scattered * np.array([3.0, 2.0, 1.0]), (RUNS, 1)), 0.03)
+    _agree(found, np.tile(scattered * np.array([3.0, 2.0, 1.0]), (RUNS, 1)))
 
 
 def test_a_stone_is_lit_by_a_point_light_beside_it() -> None:
-    """In a medium without a boundary, whose reflections `volpathmis` does not follow to the point."""
+    """In a medium without a boundary, whose reflections `volpathmis` does not follow to the point.
+
+    Most of the noise is that of `volpathmis`: the variance of light at events near the point is unbounded.
+    """
     inside = {"stone": _ball(0.5, (-0.3, 0, 0.1), bsdf=GREY), **_lamp((0.4, 0.2, 0.5))}
     scene = _scene(inside, {}, _wax(eta=1.0))
-    _agree(_means(mi.load_dict(scene), 1024, 1), _means(_theirs(scene, {}), 1024, 1001), 0.05)
+    _agree(_means(mi.load_dict(scene), 4096, 1), _means(_theirs(scene, {}), 8192, 1001), 0.02)
 
 
 @pytest.mark.parametrize("kind", ["coloured stone", "second medium"])
-def test_lamps_outside_are_found_by_chance_and_for_empty_objects_beside_by_joins(kind: str) -> None:
+def test_lamps_outside_are_found_by_chance_and_for_empty_objects_beside_by_connections(kind: str) -> None:
     inside, holders = INSIDE[kind]()
     inside["beside"] = {"type": "cube", "to_world": mi.ScalarTransform4f().translate([0, 0, 2]).scale(0.2),
                         "bsdf": _wax()}  # fmt: skip
     lamp = {"light": _ball(1.6, (1.5, 3, 2.5), emitter={"type": "area", "radiance": 10.0})}
     scene = _scene(inside, lamp)
-    _agree(_means(mi.load_dict(scene), 256, 1), _means(_theirs(scene, holders), 256, 1001), 0.03)
+    _agree(_means(mi.load_dict(scene), 1024, 1), _means(_theirs(scene, holders), 1024, 1001), 0.02)
 
 
 def test_a_medium_that_varies_has_a_stone_inside() -> None:
