@@ -139,7 +139,11 @@ def _agree(found: np.ndarray, wanted: np.ndarray, known_to: float = LARGEST_ERRO
     assert (error < known_to * mean).all()
 
 
-@pytest.mark.parametrize("kind", EMITTERS)
+ALIKE = ("spot", "projector")  # sampled as a point light is
+DAILY = [pytest.param(kind, marks=pytest.mark.slow) if kind in ALIKE else kind for kind in EMITTERS]
+
+
+@pytest.mark.parametrize("kind", DAILY)
 def test_walks_find_the_light_of_every_emitter(kind: str) -> None:
     """All orders."""
     scene = _scene({"type": "translucent_walk"}, EMITTERS[kind]()[0])

