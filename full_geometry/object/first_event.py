@@ -60,7 +60,7 @@ def flight(subject: Subject, o: Any, d: Any, l: Any) -> tuple[Any, Any]:  # noqa
     growth = _growth(l / h)
 
     def cell(k: Any, s: Any, h: Any, T: Any, inner: Any) -> tuple:
-        sigma_t = subject.walk_media.grids.sigma_t(mi.UInt32(0), o + d * (s + 0.5 * h))
+        sigma_t = subject.walk_media.heterogeneous.sigma_t(mi.UInt32(0), o + d * (s + 0.5 * h))
         T, inner = add(sigma_t, T, inner, s, h)
         return k + 1, s + h, h * growth, T, inner
 

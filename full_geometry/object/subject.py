@@ -170,7 +170,7 @@ class Subject:
         if self.varying is None:
             return ()
         n_t, n_albedo = self._local_channels
-        sigma_t, sigma_s = self.walk_media.grids.coefficients(mi.UInt32(0), p)
+        sigma_t, sigma_s = self.walk_media.heterogeneous.coefficients(mi.UInt32(0), p)
         ratio, albedo = sigma_t / self.sigma_t, sigma_s / dr.maximum(sigma_t, 1e-20)
         return (
             *(dr.log(ratio[c] + LEAST_RATIO) for c in range(n_t)),

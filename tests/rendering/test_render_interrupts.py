@@ -94,7 +94,8 @@ def test_stratified_samples_make_the_image_of_one_launch(monkeypatch: pytest.Mon
     scene = scene_of("bssrdf", 16, "stratified")
     whole = mi.render(scene, spp=64, seed=1).numpy()
     monkeypatch.setattr(integrator, "SAMPLES_PER_LAUNCH", 16**2 * 16)
-    np.testing.assert_array_equal(mi.render(scene, spp=64, seed=1).numpy(), whole)
+    # sums into pixels are atomic, so their order, and the last bits, may differ
+    np.testing.assert_allclose(mi.render(scene, spp=64, seed=1).numpy(), whole, rtol=1e-4, atol=1e-6)
 
 
 def test_a_render_in_another_thread_leaves_signals_alone() -> None:
