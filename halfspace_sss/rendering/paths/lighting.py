@@ -156,6 +156,10 @@ class RenderContext:
         alone = self.uses_sky(obj) and not self.lights.some_local
         return 1 if alone and self.settings.entries == AUTOMATIC else obj.entries
 
+    def connects_sky(self, obj: Body) -> bool:
+        """Whether scattering events are connected with the sky: where it varies and c does not take its noise away."""
+        return self.scene.environment() is not None and self.lights.nee_share > 0 and not self.uses_sky(obj)
+
     def sampled_by_nee(self, emitter: mi.EmitterPtr, d: mi.Vector3f) -> mi.Bool:
         """Whether emitter connections find an emitter in the direction d: any but a sky without a sun there."""
         local = ~emitter.is_environment()

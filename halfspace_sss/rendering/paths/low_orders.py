@@ -10,9 +10,9 @@ Whether a segment is passed, and where and how the walk is scattered, is drawn f
 far.
 
 Light of emitters and suns that reaches the event without reflection is found by emitter connections: the ray that is
-refracted towards a sampled point of them, where there is one that `refracted_connection` finds. All other light is left
-to chance, that of delta lights spread over a cone, see `light.small_emitters`. The boundary refracts as if it were
-smooth.
+refracted towards a sampled point of them, where there is one that `refracted_connection` finds. Connections with an
+uneven sky have MIS weights against the phase function. All other light is left to chance, that of delta lights spread
+over a cone, see `light.small_emitters`. The boundary refracts as if it were smooth.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ import mitsuba as mi
 
 from halfspace_sss.physics.phase import eval_hg, sample_hg
 from halfspace_sss.rendering.light.small_emitters import WIDE
-from halfspace_sss.rendering.paths.lighting import RenderContext, delta_light, sample_emitter
+from halfspace_sss.rendering.paths.lighting import RenderContext, delta_light, mis_weight, sample_emitter
 from halfspace_sss.rendering.surface.derivatives import detached
 from halfspace_sss.rendering.surface.horizon import lifted, mirrored, opposed
 from halfspace_sss.rendering.surface.object import turned
@@ -66,6 +66,8 @@ class LowOrderSample(NamedTuple):
     d: mi.Vector3f
     weight: mi.Spectrum
     connected: mi.Bool  # whether light of emitters along d is in `direct`
+    pdf: mi.Float  # of d by the phase function, for the MIS weight of the sky; 1 where no connection leads along d
+    emitter_share: mi.Float  # 1 where one does, else 0
     direct: mi.Spectrum
     once: mi.Bool  # whether it was scattered
 
@@ -114,14 +116,17 @@ def sample_low_orders(
 
     # ---- emitter connections, emission met by chance, delta lights
     direct, lights = mi.Spectrum(0), context.lights
-    if lights.some_local or context.suns:
+    pdf, share, sky = mi.Float(1), mi.Float(0), context.connects_sky(obj)
+    if lights.some_local or context.suns or sky:
         at_event = _contribution(media, walk.event_length, mi.UInt32(1), None) * (walk.event_inverse_pdf * refracted.T)
         direct = _connected(context, (obj, media), walk, dr.select(once, at_event, 0), sampler, once)
     if lights.some_shaped or context.suns:
         direct = direct + weight * _met_by_chance(context, obj, walk, counts & straight)
     if lights.some_delta:
         direct = direct + weight * _spread_lights(context, obj, walk, sampler, counts & (once | scattered))
-    return LowOrderSample(walk.o, walk.n, walk.d, weight, straight, direct, once)
+    if sky:
+        pdf, share = _sky_pdf(obj, walk, counts & straight)
+    return LowOrderSample(walk.o, walk.n, walk.d, weight, straight, pdf, share, direct, once)
 
 
 # ---- The walk --------------------------------------------------------------------------------------------------------
@@ -268,20 +273,40 @@ def _connected(
     ds, light = sample_emitter(context, at, sampler.next_2d(), False, active)
     with detached():
         distant = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
-        active = active & (ds.pdf > 0) & context.sampled_by_nee(ds.emitter, ds.d)
+        alone = context.sampled_by_nee(ds.emitter, ds.d)  # no other strategy counts this light
+        active = active & (ds.pdf > 0) & (alone | mi.Bool(context.connects_sky(obj)))
         reach = dr.select(distant, number(FAR * obj.found.size), ds.dist)
         target = walk.event + ds.d * reach
         met = refracted_connection(obj, walk.event, target, active)
         # solid angle at the event per solid angle of the straight direction, over which the emitter was sampled
         facing = dr.select(dr.squared_norm(ds.n) > 0, dr.abs(dr.dot(ds.n, met.w)) / dr.abs(dr.dot(ds.n, ds.d)), 1)
-        valid = met.valid & (ds.delta | _is_sampled(walk.event, target, ds.n, met))
-        spread = dr.select(ds.delta, 1, facing) * reach * reach * met.density
-        cosine, passed = dr.dot(walk.event_d, met.d), met.T * spread
+        valid = met.valid & (ds.delta | ~alone | _is_sampled(walk.event, target, ds.n, met))
+        spread = dr.select(ds.delta | ~alone, 1, facing) * reach * reach * met.density
+        weight_sky = mis_weight(ds.pdf, _phase_pdf(obj, walk, met) * met.T * spread)
+        cosine, passed = dr.dot(walk.event_d, met.d), met.T * spread * dr.select(alone, 1, weight_sky)
     phase = _spectrum([eval_hg(cosine, g) for _, _, g in media])
     value = weight * phase * _contribution(media, met.length, mi.UInt32(0), None) * passed * light
     edge = place(met.p, met.n)
     blocked = context.scene.ray_test(edge.spawn_ray_to(target), False, valid)
     return dr.select(valid & ~blocked, value, 0)
+
+
+def _phase_pdf(obj: Body, walk: _Walk, met: Connection) -> mi.Float:
+    """Density of the direction of a connection by the phase function, 1/sr inside, see `_scatter`."""
+    media = [tuple(number(v) for v in (m.sigma_s, m.sigma_t, m.g)) for m in obj.media]
+    W = _contribution(media, walk.event_length, mi.UInt32(1), None)
+    cosine = dr.dot(walk.event_d, met.d)
+    return dr.sum(W * _spectrum([eval_hg(cosine, m[2]) for m in media])) / dr.maximum(dr.sum(W), 1e-30)
+
+
+def _sky_pdf(obj: Body, walk: _Walk, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
+    """Density of a walk's direction outside, 1/sr, and 1, where a sky connection leads along it; elsewhere 1, 0."""
+    with detached():
+        reach = number(FAR * obj.found.size)
+        met = refracted_connection(obj, walk.event, walk.event + walk.d * reach, active)
+        same = active & _is_same(walk, met, SAME_WAY)
+        pdf = _phase_pdf(obj, walk, met) * met.T * reach * reach * met.density
+    return dr.select(same, pdf, 1), dr.select(same, mi.Float(1), 0)
 
 
 def _met_by_chance(context: RenderContext, obj: Body, walk: _Walk, active: mi.Bool) -> mi.Spectrum:

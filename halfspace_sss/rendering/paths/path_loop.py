@@ -524,8 +524,8 @@ def low_order_event(
 ) -> tuple[NextVertex, mi.Spectrum]:
     """Light that was scattered at most once inside, and emitter connections of that event; c taken off as below."""
     sample = sample_low_orders(context, obj, refracted, sampler, scattered, active)
-    zero, no = mi.Float(0), mi.Bool(False)
-    previous = PreviousVertex(sample.p, sample.n, mi.Float(1), zero, sample.connected, mi.Float(-1), no)
+    no = mi.Bool(False)
+    previous = PreviousVertex(sample.p, sample.n, sample.pdf, sample.emitter_share, sample.connected, mi.Float(-1), no)
     direct = sample.direct
     if context.uses_sky(obj):
         direct = direct - sample.weight * context.sky_means(obj)[0]
