@@ -22,7 +22,7 @@ import torch
 
 from figures.studies.flow import ConditionalFlow, FlowSampler
 from figures.studies.flow_chart import N_CONTEXT, Chart, context, direction_square
-from figures.studies.flow_training import FlowNetwork, FlowRecipe, TimedFit, Walks, flow_walks
+from figures.studies.flow_training import FlowBatch, FlowNetwork, FlowRecipe, Walks, flow_walks, walk_batches
 from full_geometry.learning.networks import Layers, PatchLogits
 from full_geometry.object.features import Side, n_side, side_features
 from full_geometry.object.first_event import first_event
@@ -30,6 +30,7 @@ from full_geometry.object.identity import frame_of
 from full_geometry.object.patches import Patches, PatchSampler, PatchWeights, cluster
 from full_geometry.object.subject import Subject, SurfacePoint
 from halfspace_sss.neural.perceptron import Perceptron
+from halfspace_sss.neural.training.fit import Objective, fit
 from halfspace_sss.rendering.transport.plane import number
 
 CLEAR = 1e-4  # of the size of the object: where the ray that finds a face begins
@@ -141,10 +142,10 @@ def fit_alpha_p(subject: Subject, recipe: FlowRecipe | None = None, seed: int = 
     pilot = flow_walks(subject, frame, patches, chart, recipe.chunk, (seed, 70))
     mean = pilot.total.mean(axis=0).astype(np.float64)
     scale = np.where(mean > 0, 1 / np.maximum(mean, 1e-30), 0.0).astype(np.float32)
-    schedule = TimedFit(list(nets.parameters()), recipe)
     order = np.random.default_rng([seed, 71])
 
-    def loss(walks: Walks, rows: np.ndarray) -> torch.Tensor:
+    def loss(batch: FlowBatch) -> torch.Tensor:
+        walks, rows = batch
         begun = order.integers(0, walks.drawn, len(rows))
         return _density_loss(nets, walks, rows, scale) * (len(walks.T) / walks.drawn) + _alpha_loss(
             nets, walks, begun, scale
@@ -153,7 +154,7 @@ def fit_alpha_p(subject: Subject, recipe: FlowRecipe | None = None, seed: int = 
     def data(k: int) -> Walks:
         return flow_walks(subject, frame, patches, chart, recipe.chunk, (seed, 72, k))
 
-    schedule.run(data, loss, seed)
+    fit(Objective(nets, loss), walk_batches(data, recipe, seed), recipe.schedule, seed)
     sampler = FlowSampler(
         PatchSampler(frame, patches, nets["patches"].arrays()), chart, ConditionalFlow(4, nets["flow"].arrays())
     )

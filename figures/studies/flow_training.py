@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import math
-import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
+from itertools import count
 from typing import Any, NamedTuple
 
 import drjit as dr
@@ -18,14 +17,16 @@ from torch import nn
 
 from figures.studies.flow import BINS, LEAST_SLOPE, ConditionalFlow, FlowSampler
 from figures.studies.flow_chart import N_CONTEXT, Chart, context, direction_square
-from full_geometry.learning.networks import PatchLogits, one_thread, patch_likelihood
+from full_geometry.learning.networks import PatchLogits, patch_likelihood
 from full_geometry.models.storing import Learnt
 from full_geometry.object.features import ObjectFrame, Side, n_side, side_features
 from full_geometry.object.first_event import first_event
 from full_geometry.object.patches import Patches, PatchSampler
 from full_geometry.object.subject import Subject
 from full_geometry.object.walks import trace_exits
-from halfspace_sss.checks import check_count, check_interval
+from halfspace_sss.checks import check_count
+from halfspace_sss.neural.training.fit import Objective, Source, fit
+from halfspace_sss.neural.training.schedules import Timed
 from halfspace_sss.rendering.surface.horizon import cosine_above
 from halfspace_sss.rendering.transport.plane import number, place
 from halfspace_sss.rendering.transport.protocols import Entry
@@ -243,61 +244,49 @@ class FlowRecipe:
     patch_hidden: tuple[int, ...] = (64, 32)
 
     def __post_init__(self) -> None:
-        check_interval("seconds", self.seconds, 1e-3, 1e6)
-        check_interval("rate", self.rate, 1e-8, 1.0)
         for name in ("batch", "chunk", "reuse"):
             check_count(name, getattr(self, name), 1)
-        check_count("steps", 1 if self.steps is None else self.steps, 1)
-
-
-class TimedFit:
-    """Steps of Adam until the CPU seconds are spent, the rate falling by a cosine.
-
-    Args:
-        parameters: of the networks.
-        recipe: seconds and rates.
-    """
-
-    def __init__(self, parameters: list, recipe: FlowRecipe) -> None:
-        self.parameters, self.recipe = parameters, recipe
-        self.adam = torch.optim.Adam(parameters, lr=recipe.rate, betas=(0.9, 0.99))
-        self.started, self.steps = time.process_time(), 0
+        _ = self.schedule  # which refuses seconds, steps and rates out of range
 
     @property
-    def spent(self) -> float:
-        """Share of the seconds, or steps, in [0, 1]."""
-        if self.recipe.steps is not None:
-            return min(self.steps / self.recipe.steps, 1.0)
-        return min((time.process_time() - self.started) / self.recipe.seconds, 1.0)
+    def schedule(self) -> Timed:
+        return Timed(self.seconds, self.steps, self.rate, warm_up=50, last=0.02)
 
-    @one_thread()
-    def run(self, data: Callable[[int], Walks], loss: Callable[[Walks, np.ndarray], torch.Tensor], seed: int) -> None:
-        """Go through chunks of data."""
-        chunk, batch = 0, self.recipe.batch
-        while self.spent < 1:
+
+class FlowBatch(NamedTuple):
+    """Rows of walks."""
+
+    walks: Walks
+    rows: np.ndarray
+
+
+def walk_batches(data: Callable[[int], Walks], recipe: FlowRecipe, seed: int) -> Source:
+    """Batches of chunks of walks, each chunk shuffled and used `reuse` times.
+
+    Args:
+        data: gives the walks of chunk k.
+        recipe: sizes.
+        seed: of the order.
+    """
+
+    def batches() -> Iterator[FlowBatch]:
+        for chunk in count():
             walks, order = data(chunk), np.random.default_rng([seed, chunk])
             n = len(walks.T)
-            for _ in range(self.recipe.reuse if n else 0):
+            if n == 0:
+                raise ValueError(f"object must scatter light out of it, got none of {walks.drawn} walks that leaves")
+            for _ in range(recipe.reuse):
                 shuffled = order.permutation(n)
-                for k in range(max(n // batch, 1)):
-                    self._step(loss(walks, shuffled[k * batch : (k + 1) * batch]))
-                    if self.spent >= 1:
-                        return
-            chunk += 1
+                for k in range(max(n // recipe.batch, 1)):
+                    yield FlowBatch(walks, shuffled[k * recipe.batch : (k + 1) * recipe.batch])
 
-    def _step(self, loss: torch.Tensor) -> None:
-        for group in self.adam.param_groups:
-            decay = 0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * self.spent))
-            group["lr"] = self.recipe.rate * min(1.0, (self.steps + 1) / 50) * decay
-        self.adam.zero_grad(set_to_none=True)
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(self.parameters, 1.0)
-        self.adam.step()
-        self.steps += 1
+    source = batches()
+    return lambda _: next(source)
 
 
-def _weights(walks: Walks, rows: np.ndarray) -> torch.Tensor:
+def _weights(batch: FlowBatch) -> torch.Tensor:
     """T of rows over the mean of all, mean over the channels that carry light."""
+    walks, rows = batch
     mean = walks.total.mean(axis=0)
     live = mean > 0
     scaled = walks.T[rows][:, live] / mean[live]
@@ -319,13 +308,13 @@ def fit_patches(
     recipe, (model, sampler, _) = recipe or FlowRecipe(), learnt
     chart = Chart(model.subject, sampler.frame, sampler.patches)
     net = PatchLogits(n_side(len(model.subject.media)), sampler.patches.areas, recipe.patch_hidden, seed)
-    schedule = TimedFit(list(net.parameters()), recipe)
 
-    def loss(walks: Walks, rows: np.ndarray) -> torch.Tensor:
+    def loss(batch: FlowBatch) -> torch.Tensor:
+        walks, rows = batch
         x, patch = torch.from_numpy(walks.exit[rows].T.copy()), torch.from_numpy(walks.patch[rows])
-        return patch_likelihood(net(x), _weights(walks, rows), patch)
+        return patch_likelihood(net(x), _weights(batch), patch)
 
-    schedule.run(_source(learnt, chart, recipe, light, seed), loss, seed)
+    fit(Objective(net, loss), _source(learnt, chart, recipe, light, seed), recipe.schedule, seed)
     return PatchSampler(sampler.frame, sampler.patches, net.arrays())
 
 
@@ -341,18 +330,20 @@ def fit_flow(
     recipe, (model, sampler, _) = recipe or FlowRecipe(), learnt
     chart = Chart(model.subject, sampler.frame, sampler.patches)
     net = FlowNetwork(2, N_CONTEXT, recipe.hidden, seed)
-    schedule = TimedFit(list(net.parameters()), recipe)
 
-    def loss(walks: Walks, rows: np.ndarray) -> torch.Tensor:
+    def loss(batch: FlowBatch) -> torch.Tensor:
+        walks, rows = batch
         told, u = torch.from_numpy(walks.told[rows]), torch.from_numpy(walks.u[rows, :2])
-        return -(_weights(walks, rows) * net.log_density(told, u)).mean()
+        return -(_weights(batch) * net.log_density(told, u)).mean()
 
-    schedule.run(_source(learnt, chart, recipe, light, seed), loss, seed)
+    fit(Objective(net, loss), _source(learnt, chart, recipe, light, seed), recipe.schedule, seed)
     return FlowSampler(sampler, chart, ConditionalFlow(2, net.arrays()))
 
 
-def _source(
-    learnt: Learnt, chart: Chart, recipe: FlowRecipe, light: Lighting | None, seed: int
-) -> Callable[[int], Walks]:
+def _source(learnt: Learnt, chart: Chart, recipe: FlowRecipe, light: Lighting | None, seed: int) -> Source:
     subject, sampler = learnt.model.subject, learnt.sampler
-    return lambda k: flow_walks(subject, sampler.frame, sampler.patches, chart, recipe.chunk, (seed, 61, k), light)
+
+    def data(k: int) -> Walks:
+        return flow_walks(subject, sampler.frame, sampler.patches, chart, recipe.chunk, (seed, 61, k), light)
+
+    return walk_batches(data, recipe, seed)

@@ -7,8 +7,9 @@ taken to a random point of the nearest triangle.
 
 from __future__ import annotations
 
-import time
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import count
 from typing import Any
 
 import drjit as dr
@@ -18,11 +19,11 @@ import torch
 import zuko
 
 from figures.studies.paper_network import placed
-from full_geometry.learning.networks import one_thread
 from full_geometry.models.object_model import FullGeometry
 from full_geometry.object.features import ObjectFrame
 from full_geometry.object.subject import Subject, SurfacePoint, surface_point
-from halfspace_sss.checks import check_interval
+from halfspace_sss.neural.training.fit import ADAM, Descent, Objective, fit
+from halfspace_sss.neural.training.schedules import Timed
 from halfspace_sss.rendering.surface.horizon import cosine_above
 from halfspace_sss.rendering.surface.variants import channel_mean
 from halfspace_sss.tracing.walk import generator, pass_seed
@@ -74,7 +75,6 @@ def incidence(model: FullGeometry, exits: SurfacePoint, points: SurfacePoint) ->
     return np.array(total) * np.pi / (rows * columns)
 
 
-@one_thread()
 def fit_space_flow(model: FullGeometry, frame: ObjectFrame, seconds: float = 60.0, seed: int = 0) -> SpaceFlow:
     """The flow after so many CPU seconds.
 
@@ -84,21 +84,24 @@ def fit_space_flow(model: FullGeometry, frame: ObjectFrame, seconds: float = 60.
         seconds: of CPU time of this process, data included.
         seed: of everything.
     """
-    check_interval("seconds", seconds, 1e-3, 1e6)
+    schedule = Timed(seconds, rate=RATE)
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         flow = zuko.flows.NICE(features=3, context=5, transforms=LAYERS, hidden_features=HIDDEN)
-    adam, began, chunk = torch.optim.Adam(flow.parameters(), lr=RATE), time.process_time(), 0
-    while time.process_time() - began < seconds:
-        told, x, t = _pairs(model, frame, (seed, 90, chunk))
-        order = np.random.default_rng([seed, 91, chunk])
-        for rows in [r for _ in range(REUSE) for r in np.array_split(order.permutation(len(t)), len(t) // BATCH)]:
-            loss = -(torch.from_numpy(t[rows]) * flow(torch.from_numpy(told[rows])).log_prob(torch.from_numpy(x[rows])))
-            adam.zero_grad(set_to_none=True)
-            loss.mean().backward()
-            torch.nn.utils.clip_grad_norm_(flow.parameters(), 1.0)
-            adam.step()
-        chunk += 1
+
+    def batches() -> Iterator[list[torch.Tensor]]:
+        for chunk in count():
+            pairs, order = _pairs(model, frame, (seed, 90, chunk)), np.random.default_rng([seed, 91, chunk])
+            n = len(pairs[0])
+            for rows in [r for _ in range(REUSE) for r in np.array_split(order.permutation(n), n // BATCH)]:
+                yield [torch.from_numpy(values[rows]) for values in pairs]
+
+    def loss(batch: list[torch.Tensor]) -> torch.Tensor:
+        told, x, t = batch
+        return -(t * flow(told).log_prob(x)).mean()
+
+    learner, source = Objective(flow, loss), batches()
+    fit(learner, lambda _: next(source), schedule, seed, descent=Descent(learner, betas=ADAM))
     return SpaceFlow(flow, frame)
 
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections import deque
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +17,6 @@ import torch
 from torch import nn
 
 from full_geometry.learning.model_errors import RadianceError, compare
-from full_geometry.learning.networks import one_thread
 from full_geometry.object.features import ObjectFrame
 from full_geometry.object.identity import Identity, frame_of, identify
 from full_geometry.object.radiance import LOBES, POWER, ExitRadiance, ExitTruth, reference
@@ -24,6 +25,8 @@ from full_geometry.object.walks import trace_exits
 from halfspace_sss.checks import check_choice, check_count, check_interval
 from halfspace_sss.neural.store import load_weights, save_weights
 from halfspace_sss.neural.trained import check_weights_folder, weights_folder
+from halfspace_sss.neural.training.fit import ADAM, Descent, Objective, Source, fit
+from halfspace_sss.neural.training.schedules import Timed
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.provenance import provenance
 from halfspace_sss.rendering.scenes.learners import LearntObject, ObjectError
@@ -109,10 +112,13 @@ class PaperRecipe:
     reuse: int = 4
 
     def __post_init__(self) -> None:
-        check_interval("seconds", self.seconds, 1e-3, 1e6)
         for name in ("n", "batch", "exits", "reuse"):
             check_count(name, getattr(self, name), 1)
-        check_count("steps", 1 if self.steps is None else self.steps, 1)
+        _ = self.schedule  # which refuses seconds, steps and rates out of range
+
+    @property
+    def schedule(self) -> Timed:
+        return Timed(self.seconds, self.steps, self.rate)
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,11 +190,9 @@ def walk_samples(
     return PaperSamples(placed(frame, exits, m), points, w, np.ascontiguousarray(T))
 
 
-@one_thread()
 def fit_paper(
-    subject: Subject, recipe: PaperRecipe | None = None, seed: int = 0,
-    progress: Callable[[str, int, int], Any] | None = None,
-) -> tuple[PaperNetwork, int]:  # fmt: skip
+    subject: Subject, recipe: PaperRecipe | None = None, seed: int = 0, progress: NamedProgress | None = None
+) -> tuple[PaperNetwork, int]:
     """The network of an object after the recipe's CPU seconds, or when it stops; and its steps.
 
     Args:
@@ -197,42 +201,39 @@ def fit_paper(
         seed: of everything.
         progress: called with (what, done, total).
     """
-    recipe, frame, channels = recipe or PaperRecipe(), frame_of(subject), len(subject.media)
-    net = PaperNetwork(recipe.n, channels, seed)
-    adam = torch.optim.Adam(net.parameters(), lr=recipe.rate)
-    rng, began, steps, below, chunk = np.random.default_rng([seed, 80]), time.process_time(), 0, 0, 0
+    recipe = recipe or PaperRecipe()
+    net, last = PaperNetwork(recipe.n, len(subject.media), seed), deque([np.inf] * FOR_STEPS, FOR_STEPS)
 
-    def ends() -> bool:
-        spent = time.process_time() - began > recipe.seconds if recipe.steps is None else steps >= recipe.steps
-        return spent or below >= FOR_STEPS
+    def loss(batch: tuple[torch.Tensor, ...]) -> torch.Tensor:
+        *told, target = batch
+        error = nn.functional.mse_loss(net(*told), target)
+        last.append(float(error.detach()))
+        return error
 
-    while not ends():
-        exits = subject.random_points(generator(mi, recipe.exits, pass_seed(seed, 81, chunk)))
-        samples = walk_samples(subject, frame, exits, recipe.n, (seed, 82, chunk))
-        for _ in range(recipe.reuse):
-            for rows in np.array_split(rng.permutation(recipe.exits), max(recipe.exits // recipe.batch, 1)):
-                error = _step(net, adam, samples, rows, rng)
-                below = below + 1 if error < ENOUGH else 0
-                steps += 1
-                if ends():
-                    return net, steps
-        chunk += 1
-        if progress:
-            progress("training", min(int(time.process_time() - began), int(recipe.seconds)), int(recipe.seconds))
-    return net, steps
+    learner = Objective(net, loss)
+    fitted = fit(
+        learner, _lit_batches(subject, recipe, seed), recipe.schedule, seed, validate=lambda: max(last),
+        target_error=ENOUGH, progress=progress, descent=Descent(learner, betas=ADAM, clip=np.inf),
+    )  # fmt: skip
+    return net, fitted.spent.steps
 
 
-def _step(net: PaperNetwork, adam: Any, samples: PaperSamples, rows: np.ndarray, rng: np.random.Generator) -> float:
-    """One step under random light; returns the MSE."""
-    light = random_lights(len(rows), samples.T.shape[2], rng)
-    L = light(samples.w[rows])
-    target = torch.from_numpy((samples.T[rows] * L).mean(axis=1))
-    exit, points = torch.from_numpy(samples.exit[rows]), torch.from_numpy(samples.points[rows])
-    loss = nn.functional.mse_loss(net(exit, points, torch.from_numpy(L)), target)
-    adam.zero_grad(set_to_none=True)
-    loss.backward()
-    adam.step()
-    return float(loss.detach())
+def _lit_batches(subject: Subject, recipe: PaperRecipe, seed: int) -> Source:
+    """Exits, their points and their light, each time a random one, and the radiance that walks give."""
+    rng, frame = np.random.default_rng([seed, 80]), frame_of(subject)
+
+    def batches() -> Iterator[tuple[torch.Tensor, ...]]:
+        for chunk in count():
+            exits = subject.random_points(generator(mi, recipe.exits, pass_seed(seed, 81, chunk)))
+            samples = walk_samples(subject, frame, exits, recipe.n, (seed, 82, chunk))
+            for _ in range(recipe.reuse):
+                for rows in np.array_split(rng.permutation(recipe.exits), max(recipe.exits // recipe.batch, 1)):
+                    L = random_lights(len(rows), samples.T.shape[2], rng)(samples.w[rows])
+                    target = (samples.T[rows] * L).mean(axis=1)
+                    yield tuple(map(torch.from_numpy, (samples.exit[rows], samples.points[rows], L, target)))
+
+    source = batches()
+    return lambda _: next(source)
 
 
 # ---- How wrong the paper's network is, by the error measure of all models of an object -------------

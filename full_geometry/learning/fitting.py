@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import copy
-import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,7 +15,6 @@ from full_geometry.learning.networks import (
     device_of_walks,
     likelihood,
     mean_likelihood,
-    one_thread,
     patch_likelihood,
     tensor,
 )
@@ -28,8 +25,10 @@ from full_geometry.object.patches import Patches
 from halfspace_sss.checks import check_choice, check_count, check_interval
 from halfspace_sss.interface.model import models
 from halfspace_sss.neural.training import checkpoint
+from halfspace_sss.neural.training.fit import Descent, torch_threads
+from halfspace_sss.neural.training.schedules import cosine, warm_up
 
-BETAS, CLIP, LAST_RATE, WARM_UP = (0.9, 0.99), 1.0, 0.01, 100
+LAST_RATE, WARM_UP = 0.01, 100
 AVERAGE = 0.998  # of the numbers, each step
 PROPOSED = 2  # proposals for a walk that is kept
 SOLVED = 0.5  # chunks of proposals, of those of a training, by which functions of ends are solved for
@@ -101,11 +100,15 @@ class ObjectFit:
         self.device = device_of_walks()
         self.ends = Ends(channels, self.n_side, self.device)
         self.modules = torch.nn.ModuleDict(parts).to(self.device)
-        self.average = copy.deepcopy(self.modules)
-        self.parameters = list(self.modules.parameters())
-        self.adam = torch.optim.Adam(self.parameters, lr=recipe.rate, betas=BETAS, fused=True)
+        self.descent = Descent(self.modules, parts=list(self.modules.values()), average=AVERAGE, fused=True)
+        self.average: torch.nn.ModuleDict = self.descent.average
         ones = torch.ones(2 * channels, 1, device=self.device)
-        self.step, self.scale, self.even_scale = 0, ones[:channels].clone(), ones
+        self.scale, self.even_scale = ones[:channels].clone(), ones
+
+    @property
+    def step(self) -> int:
+        """Steps that were taken."""
+        return self.descent.steps
 
     def set_scale(self, walks: Pairs) -> None:
         """Divide each channel by its mean throughput, so that all count alike; alpha begins with the mean.
@@ -140,9 +143,9 @@ class ObjectFit:
         n_x, n_y = max(T.shape[1] // batch, 1), max(W.shape[1] // batch, 1)
         kept, n_even = T.shape[1] / walks.drawn, max(even.shape[1] // n_x, 1)
         T, W = T * self.scale, W * self.scale
-        with torch.no_grad(), one_thread():
+        with torch.no_grad(), torch_threads():
             self.ends.add_walks(*walks.of_random_exits(x, T))
-        with one_thread():
+        with torch_threads():
             for k in range(self.recipe.reuse):
                 back = k % 2 == 1
                 for i, j in zip(order.permutation(n_x), order.integers(0, n_y, n_x)):
@@ -163,7 +166,7 @@ class ObjectFit:
         """
         for k in range(max(round(SOLVED * chunks), 1)):
             made = source.proposed(PROPOSED * self.recipe.chunk, (seed, BEYOND + k))
-            with torch.no_grad(), one_thread():
+            with torch.no_grad(), torch_threads():
                 y, _, V = self._light(made, self.average)
                 self.ends.add_proposals(y, V)
 
@@ -183,7 +186,7 @@ class ObjectFit:
 
     def _worthy(self, proposals: Pairs, order: np.random.Generator) -> tuple[torch.Tensor, torch.Tensor]:
         """Features and values of some proposals, kept by chance as walks are: by W exp f as the fit has it now."""
-        with torch.no_grad(), one_thread():
+        with torch.no_grad(), torch_threads():
             y, W, V = self._light(proposals, self.modules)
             value = V.mean(dim=0)
             p = (value / (ENOUGH * value.mean().clamp_min(1e-30))).clamp(LEAST, 1.0)
@@ -202,24 +205,12 @@ class ObjectFit:
 
     def _advance(self, loss: torch.Tensor, steps: int | None) -> None:
         at = min(self.step / max(steps, 1), 1.0) if steps is not None else 0.0
-        decay = LAST_RATE + (1 - LAST_RATE) * 0.5 * (1 + math.cos(math.pi * at))
-        for group in self.adam.param_groups:
-            group["lr"] = self.recipe.rate * min(1.0, (self.step + 1) / WARM_UP) * decay
-        self.adam.zero_grad(set_to_none=True)
-        loss.backward()
-        for module in self.modules.values():
-            torch.nn.utils.clip_grad_norm_(module.parameters(), CLIP)
-        self.adam.step()
-        self.step += 1
-        with torch.no_grad():
-            share = 1 - min(AVERAGE, (1 + self.step) / (10 + self.step))
-            torch._foreach_lerp_(list(self.average.parameters()), self.parameters, share)
+        self.descent.step(loss, cosine(self.recipe.rate * warm_up(self.step, WARM_UP), at, LAST_RATE))
 
     def _tensors(self) -> dict[str, torch.Tensor]:
         """Everything the next step depends on, by name; changing the tensors in place changes the fit."""
-        means = {f"{k}.mean": mean.data for k, mean in enumerate(self.average.parameters())}
         scales = {"scale": self.scale, "even_scale": self.even_scale, **self.ends.tensors()}
-        return {**scales, **checkpoint.tensors_of(self.adam, self.parameters), **means}
+        return {**scales, **self.descent.tensors()}
 
     def save(self, path: Path, done: int, history: list) -> None:
         """Write a checkpoint after `done` chunks."""
@@ -234,7 +225,7 @@ class ObjectFit:
             ValueError: it is damaged or of another recipe.
         """
         with checkpoint.gone_on_with(path, self._tensors()) as stored:
-            self.step, done = (int(v) for v in stored["counters"].tolist())
+            self.descent.steps, done = (int(v) for v in stored["counters"].tolist())
             history = [(int(k), error, spread) for k, error, spread in stored["history"].tolist()]
         return done, history
 

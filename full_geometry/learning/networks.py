@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import mitsuba as mi
@@ -27,17 +25,6 @@ def device_of_walks() -> torch.device:
 def tensor(array: np.ndarray, device: torch.device) -> torch.Tensor:
     """An array where networks are fitted; on the CPU without a copy."""
     return torch.from_numpy(array).to(device)
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Torch with one thread: layers this small gain little by being shared, and threads that wait spin."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 LEAST_SHARE = 1e-5  # of F_t P that comes back

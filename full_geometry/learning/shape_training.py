@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import io
 import json
 import math
@@ -22,12 +21,14 @@ from full_geometry.models.neural_shape import ALBEDO, ETA, KIND, LEAST, PLACE_OF
 from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.neural.store import save_weights, to_json
 from halfspace_sss.neural.training import checkpoint
+from halfspace_sss.neural.training.fit import Descent
+from halfspace_sss.neural.training.schedules import cosine, warm_up
 from halfspace_sss.neural.training.work_folder import CHECKPOINT, claim
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.provenance import check_folder, provenance, write_atomically
 from halfspace_sss.rendering.scenes.learners import LearntShapes
 
-BETAS, CLIP, LAST_RATE, WARM_UP, AVERAGE = (0.9, 0.99), 1.0, 0.01, 100, 0.9985
+LAST_RATE, WARM_UP, AVERAGE = 0.01, 100, 0.9985
 MOST_OFF = 3.0  # of the light of a group: what is far too bright has its say by the likelihood
 
 
@@ -118,10 +119,13 @@ class ShapeFit:
     def __init__(self, recipe: ShapeRecipe, seed: int, network: nn.Module | None = None) -> None:
         self.recipe = recipe
         self.network = network or ShapeNetwork(recipe, seed)
-        self.average = copy.deepcopy(self.network)
-        self.parameters = list(self.network.parameters())
-        self.adam = torch.optim.Adam(self.parameters, lr=recipe.rate, betas=BETAS, foreach=True)
-        self.step = 0
+        self.descent = Descent(self.network, average=AVERAGE)
+        self.average: nn.Module = self.descent.average
+
+    @property
+    def step(self) -> int:
+        """Steps that were taken."""
+        return self.descent.steps
 
     def advance(self, pool: list[GroupedPairs], rng: np.random.Generator, part: float) -> float:
         """One step on random parts of random objects; returns the loss.
@@ -131,19 +135,8 @@ class ShapeFit:
             rng: that draws.
             part: of the whole fit that is done, for the decay of the rate.
         """
-        rate = LAST_RATE + (1 - LAST_RATE) * 0.5 * (1 + math.cos(math.pi * min(part, 1.0)))
-        for group in self.adam.param_groups:
-            group["lr"] = self.recipe.rate * min(1.0, (self.step + 1) / WARM_UP) * rate
         loss = self.loss([pool[k] for k in rng.integers(0, len(pool), self.recipe.objects)], rng)
-        self.adam.zero_grad(set_to_none=True)
-        loss.backward()
-        nn.utils.clip_grad_norm_(self.parameters, CLIP)
-        self.adam.step()
-        self.step += 1
-        with torch.no_grad():
-            share = 1 - min(AVERAGE, (1 + self.step) / (10 + self.step))
-            torch._foreach_lerp_(list(self.average.parameters()), self.parameters, share)
-        return float(loss.detach())
+        return self.descent.step(loss, cosine(self.recipe.rate * warm_up(self.step, WARM_UP), part, LAST_RATE))
 
     def loss(self, batch: list[GroupedPairs], rng: np.random.Generator) -> torch.Tensor:
         """E_q[(S_0 mu_i / q) exp f] - E_walks[T f] over the mean of T, and the light of groups; a mean over objects.
@@ -166,14 +159,10 @@ class ShapeFit:
         """The averaged numbers."""
         return self.average.arrays()
 
-    def _tensors(self) -> dict[str, torch.Tensor]:
-        """Everything the next step depends on, by name; changing the tensors in place changes the fit."""
-        means = {f"{k}.mean": mean.data for k, mean in enumerate(self.average.parameters())}
-        return {**checkpoint.tensors_of(self.adam, self.parameters), **means}
-
     def save(self, path: Path, done: int) -> None:
         """Write a checkpoint after `done` chunks."""
-        checkpoint.write(path, self._tensors(), counters=torch.tensor([self.step, done], dtype=torch.float64))
+        counters = torch.tensor([self.step, done], dtype=torch.float64)
+        checkpoint.write(path, self.descent.tensors(), counters=counters)
 
     def load(self, path: Path) -> int:
         """Go on from a checkpoint; returns its chunks.
@@ -181,8 +170,8 @@ class ShapeFit:
         Raises:
             ValueError: it is damaged or of another recipe.
         """
-        with checkpoint.gone_on_with(path, self._tensors()) as stored:
-            self.step, done = (int(v) for v in stored["counters"].tolist())
+        with checkpoint.gone_on_with(path, self.descent.tensors()) as stored:
+            self.descent.steps, done = (int(v) for v in stored["counters"].tolist())
         return done
 
 

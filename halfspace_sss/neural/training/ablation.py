@@ -153,7 +153,8 @@ def _row(
     source = pool.batches(how.n_groups, how.n_queries)
     spent = fit(learner, source, Within(budget, how), seed, threads=None).spent
     e = model_error(model_of(learner, reference.medium), reference)
-    row = {"kB": 4e-3 * sum(p.numel() for p in learner.parameters()), **spent._asdict()}
+    row = {"kB": 4e-3 * sum(p.numel() for p in learner.parameters())}
+    row |= {key: getattr(spent, key) for key in ("steps", "samples", "seconds")}
     row |= {"error": e.error, "raw": e.raw, "noise": e.noise, "bias": e.bias}
     return row | {f"r {d}": v for d, v in e.by_decade.items()}
 

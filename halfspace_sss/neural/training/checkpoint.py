@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -11,22 +11,9 @@ import torch
 
 from halfspace_sss.provenance import write_atomically
 
-__all__ = ["gone_on_with", "tensors_of", "write"]
+__all__ = ["gone_on_with", "write"]
 
 Tensors = dict[str, torch.Tensor]
-
-
-def tensors_of(adam: torch.optim.Adam, parameters: Iterable[torch.Tensor]) -> Tensors:
-    """Parameters and the state of Adam by name; changing the tensors in place changes the run."""
-    tensors = {}
-    for k, p in enumerate(parameters):
-        tensors[f"{k}.value"] = p.data
-        state = adam.state[p]
-        if not state:
-            at = p.device if adam.defaults["fused"] else None  # where a fused step counts
-            state.update(step=torch.tensor(0.0, device=at), exp_avg=torch.zeros_like(p), exp_avg_sq=torch.zeros_like(p))
-        tensors |= {f"{k}.{name}": state[name] for name in ("step", "exp_avg", "exp_avg_sq")}
-    return tensors
 
 
 def write(path: Path, tensors: Tensors, **more: torch.Tensor) -> None:

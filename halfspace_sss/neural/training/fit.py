@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -14,9 +17,10 @@ from halfspace_sss.neural.training import checkpoint
 from halfspace_sss.neural.training.schedules import Schedule, Spent
 from halfspace_sss.progress import NamedProgress
 
-__all__ = ["Fitted", "Learner", "Source", "fit"]
+__all__ = ["ADAM", "Descent", "Fitted", "Learner", "Objective", "Source", "fit", "torch_threads"]
 
 BETAS, CLIP = (0.9, 0.99), 1.0
+ADAM = (0.9, 0.999)  # the betas of Kingma and Ba 2015, which published networks are fitted with
 Source = Callable[[torch.Generator], Any]  # the next batch; all chance in it is drawn from the generator
 
 
@@ -26,6 +30,91 @@ class Learner(Protocol):
     def parameters(self) -> Any: ...
 
     def loss(self, batch: Any) -> torch.Tensor: ...
+
+
+@dataclass(frozen=True, eq=False)
+class Objective:
+    """A module as a learner, with its loss for a batch."""
+
+    module: torch.nn.Module
+    loss: Callable[[Any], torch.Tensor]
+
+    def parameters(self) -> Any:
+        return self.module.parameters()
+
+
+@contextmanager
+def torch_threads(n: int | None = 1) -> Iterator[None]:
+    """Torch with so many threads, None for as many as it has.
+
+    Layers of small networks gain little by being shared, and threads that wait spin.
+    """
+    before = torch.get_num_threads()
+    torch.set_num_threads(n or before)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+class Descent:
+    """Steps of Adam with clipped gradients, and a running mean of the numbers.
+
+    Args:
+        learner: what is fitted; a module where there is a mean.
+        betas: of Adam.
+        clip: largest norm of the gradient.
+        parts: modules whose gradients are clipped each by its own norm; by default all together.
+        average: share of the running mean that a step keeps, less in the first steps; None for no mean.
+        fused: the fused kernels of torch.
+    """
+
+    def __init__(
+        self,
+        learner: Any,
+        *,
+        betas: tuple[float, float] = BETAS,
+        clip: float = CLIP,
+        parts: Sequence[torch.nn.Module] | None = None,
+        average: float | None = None,
+        fused: bool = False,
+    ) -> None:
+        self.parameters = [p for p in learner.parameters() if p.requires_grad]
+        self.clipped = [list(part.parameters()) for part in parts] if parts else [self.parameters]
+        self.clip, self.kept = clip, average
+        self.average = None if average is None else copy.deepcopy(learner)
+        self.adam = torch.optim.Adam(self.parameters, betas=betas, fused=fused or None)
+        self.steps = 0
+
+    def step(self, loss: torch.Tensor, rate: float) -> float:
+        """One step down a loss, at a learning rate; returns the loss."""
+        for group in self.adam.param_groups:
+            group["lr"] = rate
+        self.adam.zero_grad(set_to_none=True)
+        loss.backward()
+        for parameters in self.clipped:
+            torch.nn.utils.clip_grad_norm_(parameters, self.clip)
+        self.adam.step()
+        self.steps += 1
+        if self.average is not None:
+            share = 1 - min(self.kept, (1 + self.steps) / (10 + self.steps))
+            with torch.no_grad():
+                torch._foreach_lerp_(list(self.average.parameters()), self.parameters, share)
+        return float(loss.detach())
+
+    def tensors(self) -> dict[str, torch.Tensor]:
+        """Numbers, moments and means by name; changing the tensors in place changes the fit."""
+        tensors = {}
+        for k, p in enumerate(self.parameters):
+            state = self.adam.state[p]
+            if not state:
+                at = p.device if self.adam.defaults["fused"] else None  # where a fused step counts
+                zeros = {name: torch.zeros_like(p) for name in ("exp_avg", "exp_avg_sq")}
+                state.update(step=torch.tensor(0.0, device=at), **zeros)
+            tensors[f"{k}.value"] = p.data
+            tensors |= {f"{k}.{name}": state[name] for name in ("step", "exp_avg", "exp_avg_sq")}
+        means = self.average.parameters() if self.average is not None else ()
+        return tensors | {f"{k}.mean": mean.data for k, mean in enumerate(means)}
 
 
 class Fitted(NamedTuple):
@@ -46,6 +135,7 @@ def fit(
     target_error: float | None = None,
     progress: NamedProgress | None = None,
     threads: int | None = 1,
+    descent: Descent | None = None,
 ) -> Fitted:
     """Fit in place.
 
@@ -57,46 +147,49 @@ def fit(
         checkpoint: file to go on from if it is there, and to write as time goes by.
         validate: error of the learner as it is; called every `schedule.validate_every` steps and at the end.
         target_error: stop once what `validate` gives has come down to it.
-        progress: called with ("training", steps done, steps in all), for a schedule of steps.
+        progress: called with ("training", done, total) of the schedule: steps, or seconds.
         threads: of torch, None for as many as it has; batches of small networks lose by being shared, and with one
             thread sums keep their order.
+        descent: of the learner, where it is not the usual one.
 
     Raises:
         ValueError: the checkpoint is damaged.
     """
-    run = _Run(learner, schedule, seed)
+    run = _FitState(learner, schedule, seed, descent or Descent(learner))
     if checkpoint and checkpoint.exists():
         run.load(checkpoint, target_error)
-    saved, before = time.monotonic(), torch.get_num_threads()
-    torch.set_num_threads(threads or before)
-    while not run.over:
-        run.advance(source)
-        if validate and (run.step % schedule.validate_every == 0 or run.over):
-            run.validated(validate(), target_error)
-        if progress and (run.step % 50 == 0 or run.over):
-            progress("training", run.step, schedule.steps)
-        if checkpoint and (time.monotonic() - saved > schedule.checkpoint_every or run.done):
-            run.save(checkpoint)
-            saved = time.monotonic()
-    torch.set_num_threads(before)
+    saved = time.monotonic()
+    with torch_threads(threads):
+        while not run.over:
+            run.advance(source)
+            if validate and (run.step % schedule.validate_every == 0 or run.over):
+                run.validated(validate(), target_error)
+            if progress and (run.step % 50 == 0 or run.over):
+                progress("training", *schedule.done(run.spent))
+            if checkpoint and (time.monotonic() - saved > schedule.checkpoint_every or run.done):
+                run.save(checkpoint)
+                saved = time.monotonic()
     return Fitted(run.history, run.spent)
 
 
-class _Run:
-    """State of a fit: the numbers, Adam's moments, the generator, the history."""
+class _FitState:
+    """The numbers, Adam's moments, the generator, the history."""
 
-    def __init__(self, learner: Any, schedule: Schedule, seed: int) -> None:
-        self.learner, self.schedule = learner, schedule
-        self.parameters = [p for p in learner.parameters() if p.requires_grad]
-        self.adam = torch.optim.Adam(self.parameters, lr=schedule.rate_at(Spent(0, 0, 0.0)), betas=BETAS)
+    def __init__(self, learner: Any, schedule: Schedule, seed: int, descent: Descent) -> None:
+        self.learner, self.schedule, self.descent = learner, schedule, descent
         self.generator = torch.Generator().manual_seed(seed)
-        self.step, self.loss, self.done = 0, math.nan, False
+        self.loss, self.done = math.nan, False
         self.history: list[dict[str, float]] = []
         self.started, self.seconds = time.monotonic(), 0.0
+        self.cpu_started, self.cpu_seconds = time.process_time(), 0.0
+
+    @property
+    def step(self) -> int:
+        return self.descent.steps
 
     @property
     def spent(self) -> Spent:
-        return Spent(self.step, self.step * self.schedule.per_step, self.seconds)
+        return Spent(self.step, self.step * self.schedule.per_step, self.seconds, self.cpu_seconds)
 
     @property
     def over(self) -> bool:
@@ -104,15 +197,9 @@ class _Run:
 
     def advance(self, source: Source) -> None:
         """One step."""
-        for group in self.adam.param_groups:
-            group["lr"] = self.schedule.rate_at(self.spent)
-        loss = self.learner.loss(source(self.generator))
-        self.adam.zero_grad(set_to_none=True)
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(self.parameters, CLIP)
-        self.adam.step()
-        self.step, self.seconds = self.step + 1, time.monotonic() - self.started
-        value = float(loss.detach())
+        rate = self.schedule.rate_at(self.spent)
+        value = self.descent.step(self.learner.loss(source(self.generator)), rate)
+        self.seconds, self.cpu_seconds = time.monotonic() - self.started, time.process_time() - self.cpu_started
         self.loss = value if math.isnan(self.loss) else 0.99 * self.loss + 0.01 * value
 
     def validated(self, error: float, target_error: float | None) -> None:
@@ -126,18 +213,18 @@ class _Run:
     def save(self, path: Path) -> None:
         rows = [[h[k] for k in ("step", "loss", "error", "seconds")] for h in self.history]
         checkpoint.write(
-            path, checkpoint.tensors_of(self.adam, self.parameters),
+            path, self.descent.tensors(),
             generator=self.generator.get_state(), counter=torch.tensor([self.step, self.loss], dtype=torch.float64),
             history=torch.tensor(rows, dtype=torch.float64).reshape(-1, 4),
         )  # fmt: skip
 
     def load(self, path: Path, target_error: float | None) -> None:
         """Go on from a checkpoint; ValueError if it is damaged or of another architecture."""
-        with checkpoint.gone_on_with(path, checkpoint.tensors_of(self.adam, self.parameters)) as stored:
+        with checkpoint.gone_on_with(path, self.descent.tensors()) as stored:
             self.generator.set_state(stored["generator"])
             step, self.loss = stored["counter"].tolist()
             rows = stored["history"].tolist()
-        self.step = int(step)
+        self.descent.steps = int(step)
         self.history = [{"step": int(step), "loss": a, "error": b, "seconds": c} for step, a, b, c in rows]
         self.done = self._reached(target_error)
         self.started -= self.history[-1]["seconds"] if self.history else 0.0

@@ -8,18 +8,29 @@ from typing import NamedTuple, Protocol
 
 from halfspace_sss.checks import check_count, check_interval
 
-__all__ = ["Budget", "Fit", "Samples", "Schedule", "Seconds", "Spent", "Within"]
+__all__ = ["Budget", "Fit", "Samples", "Schedule", "Seconds", "Spent", "Timed", "Within", "cosine", "warm_up"]
 
 LAST_RATE = 0.002  # of the largest
 WARM_UP_STEPS, WARM_UP_SHARE = 200, 0.02  # of a number of steps, of a budget
 
 
+def warm_up(steps: int, over: int = WARM_UP_STEPS) -> float:
+    """What the rate is multiplied by after some steps: it rises evenly over the first ones."""
+    return min(1.0, (steps + 1) / over)
+
+
+def cosine(rate: float, share: float, last: float = LAST_RATE) -> float:
+    """A rate that falls by a cosine to a part `last` of it, when a share of the fit is done."""
+    return rate * (last + (1 - last) * 0.5 * (1 + math.cos(math.pi * min(share, 1.0))))
+
+
 class Spent(NamedTuple):
-    """Steps of the optimiser, samples (cells seen, of which each shows two points) and seconds of a training."""
+    """Steps of the optimiser, samples (cells seen, of which each shows two points), seconds and CPU seconds."""
 
     steps: int
     samples: int
     seconds: float
+    cpu_seconds: float
 
 
 class Schedule(Protocol):
@@ -35,10 +46,8 @@ class Schedule(Protocol):
     def rate_at(self, spent: Spent) -> float:
         """Learning rate of the next step."""
 
-
-def _decay(angle: float) -> float:
-    """A cosine from 1 down to `LAST_RATE` over angles from 0 to pi."""
-    return LAST_RATE + (1 - LAST_RATE) * 0.5 * (1 + math.cos(angle))
+    def done(self, spent: Spent) -> tuple[int, int]:
+        """What is done, and what there is to do."""
 
 
 @dataclass(frozen=True)
@@ -74,8 +83,10 @@ class Fit:
         return spent.steps / self.steps
 
     def rate_at(self, spent: Spent) -> float:
-        warm = min(1.0, (spent.steps + 1) / WARM_UP_STEPS)
-        return self.rate * warm * _decay(math.pi * spent.steps / self.steps)
+        return cosine(self.rate * warm_up(spent.steps), self.share(spent))
+
+    def done(self, spent: Spent) -> tuple[int, int]:
+        return spent.steps, self.steps
 
 
 class Budget(Protocol):
@@ -155,4 +166,49 @@ class Within:
 
     def rate_at(self, spent: Spent) -> float:
         share = self.share(spent)
-        return self.how.rate * max(min(1.0, share / WARM_UP_SHARE), 0.01) * _decay(math.pi * share)
+        return cosine(self.how.rate * max(min(1.0, share / WARM_UP_SHARE), 0.01), share)
+
+    def done(self, spent: Spent) -> tuple[int, int]:
+        return round(100 * self.share(spent)), 100
+
+
+@dataclass(frozen=True)
+class Timed:
+    """CPU seconds of this process, data included, or a number of steps where the end is to be the same every time.
+
+    Args:
+        seconds: of CPU time.
+        steps: instead of them.
+        rate: largest learning rate.
+        warm_up: steps over which it rises.
+        last: part of it at the end of a cosine; 1 for a rate that stays.
+
+    Raises:
+        ValueError: an argument is out of range.
+    """
+
+    seconds: float
+    steps: int | None = None
+    rate: float = 4e-3
+    warm_up: int = 1
+    last: float = 1.0
+
+    per_step = 1
+    checkpoint_every = math.inf
+    validate_every = 1
+
+    def __post_init__(self) -> None:
+        check_interval("seconds", self.seconds, 1e-3, 1e6)
+        check_interval("rate", self.rate, 1e-8, 1.0)
+        check_count("steps", 1 if self.steps is None else self.steps, 1)
+
+    def share(self, spent: Spent) -> float:
+        return spent.cpu_seconds / self.seconds if self.steps is None else spent.steps / self.steps
+
+    def rate_at(self, spent: Spent) -> float:
+        return cosine(self.rate * warm_up(spent.steps, self.warm_up), self.share(spent), self.last)
+
+    def done(self, spent: Spent) -> tuple[int, int]:
+        if self.steps is not None:
+            return spent.steps, self.steps
+        return min(int(spent.cpu_seconds), int(self.seconds)), int(self.seconds)
