@@ -16,8 +16,8 @@ from halfspace_sss.interface.model import models as half_space_models
 from halfspace_sss.neural.store import load_weights
 from halfspace_sss.neural.trained import check_weights_folder
 from halfspace_sss.progress import NamedProgress
+from halfspace_sss.rendering.object.registry import model_names
 from halfspace_sss.rendering.scenes.learners import LearntObject, ObjectError
-from halfspace_sss.rendering.surface.transports import model_names
 
 
 def untrained(scene: Any) -> list[str]:

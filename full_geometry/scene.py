@@ -20,15 +20,12 @@ from full_geometry.object.subject import Subject, SurfacePoint, check_surface
 from halfspace_sss.extensions import offered
 from halfspace_sss.neural.store import checksum_of, load_weights
 from halfspace_sss.physics.medium import Medium
-from halfspace_sss.rendering.surface.inside import Inside
-from halfspace_sss.rendering.surface.object import Object
-from halfspace_sss.rendering.transport.area_points import AreaPoints
-from halfspace_sss.rendering.transport.half_space import HalfSpaceProposals, area_share
-from halfspace_sss.rendering.transport.plane import Exit
-from halfspace_sss.rendering.transport.positions import PositionSampler
-from halfspace_sss.rendering.transport.protocols import Entry, Means
-from halfspace_sss.rendering.transport.radial_table import RadialTable
-from halfspace_sss.rendering.transport.settings import AUTOMATIC, Settings
+from halfspace_sss.rendering.object.entries import AreaPoints, PositionSampler, RadialTable
+from halfspace_sss.rendering.object.half_space import HalfSpaceProposals, area_share
+from halfspace_sss.rendering.object.points import Entry, Exit, Means
+from halfspace_sss.rendering.object.settings import AUTOMATIC, Settings
+from halfspace_sss.rendering.object.shape import Object
+from halfspace_sss.rendering.object.translucent import Inside
 
 FINE = 2.5  # transport mean free paths of the radius of a patch, up to which patches do without probes
 PATCH_SHARE = 0.2  # of the entries where patches are larger: they reach what probes miss

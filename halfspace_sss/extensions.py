@@ -3,7 +3,7 @@
 - `halfspace_sss.models`: list of model classes.
 - `halfspace_sss.materials`: path of a material file or folder, or an iterable of `Material`.
 - `halfspace_sss.commands`: name -> function with typer annotations, a further command of `halfspace-sss`.
-- `halfspace_sss.transports`: mapping of names to "module:function", see `rendering.surface.transports`.
+- `halfspace_sss.transports`: mapping of names to "module:function", see `rendering.object.registry`.
 - `halfspace_sss.learners`: name of a model -> what learns it, see `rendering.scenes.learners`.
 - `halfspace_sss.figures`: kind of result -> function that takes the result and returns {file ending: bytes}.
 

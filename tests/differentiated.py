@@ -127,7 +127,7 @@ class Shifted:
         return [model.eval(*query) for model in self.models]
 
     def coefficients(self, media: list) -> list:
-        from halfspace_sss.rendering.transport.plane import number
+        from halfspace_sss.rendering.object.points import number
 
         return [tuple(number(v) for v in (m.sigma_s, m.sigma_t, m.g)) for m in self.media]
 

@@ -16,7 +16,7 @@ HEAVY = ["torch", "mitsuba", "matplotlib", "drjit", "pandas", "xarray"]
 FLOORS = {  # of each package, a room may import those to its left; "" is what lies beside the rooms
     "halfspace_sss": [
         "", "physics", "interface", "tracing", "maps", "measure", "materials", "comparison", "neural",
-        "neural.training", "rendering.surface", "rendering.light", "rendering.transport", "rendering.gathered",
+        "neural.training", "rendering.object", "rendering.light", "rendering.gathered",
         "rendering.walk", "rendering.paths", "rendering.scenes", "rendering", "trade.measuring", "trade",
         "trade.checking", "cli", "trade.commands",
     ],

@@ -86,7 +86,7 @@ def test_scenes_that_do_not_belong_together_are_refused() -> None:
     def ask() -> None:
         import mitsuba as mi
 
-        from halfspace_sss.rendering.surface.sharing import check_together, scene_of
+        from halfspace_sss.rendering.object.shape import check_together, scene_of
 
         world, other = (
             mi.load_dict({"type": "scene", "ball": {"type": "sphere"}, "floor": {"type": "rectangle"}})

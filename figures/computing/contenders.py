@@ -11,7 +11,7 @@ from figures.computing.scenes import prepare, scan_scene
 from figures.parts.part import Task, unmodelled
 from halfspace_sss.neural.symmetric import channels
 from halfspace_sss.physics.medium import Medium
-from halfspace_sss.rendering.surface.transports import model_names
+from halfspace_sss.rendering.object.registry import model_names
 
 __all__ = [
     "MODELS", "OF_OBJECTS", "RR_DEPTHS", "VOLUMES", "WALK", "contender", "long_passes", "long_walk", "ready",

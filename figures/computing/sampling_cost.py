@@ -43,9 +43,8 @@ def _steps(scene: Any, n: int) -> dict[str, Callable[[], Any]]:
     import drjit as dr
     import mitsuba as mi
 
+    from halfspace_sss.rendering.object.points import cosine_above, place
     from halfspace_sss.rendering.paths.path_loop import exit_at
-    from halfspace_sss.rendering.surface.horizon import cosine_above
-    from halfspace_sss.rendering.transport.plane import place
 
     (body,) = scene.integrator().prepare(scene)
     si, sampler = _seen(scene, n), mi.load_dict({"type": "independent"})

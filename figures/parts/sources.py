@@ -20,13 +20,13 @@ from typing import NamedTuple
 from figures import figure_modules
 from halfspace_sss.extensions import LEARNERS, offered
 from halfspace_sss.interface.model import model_class, models
-from halfspace_sss.rendering.surface.transports import AUTO, model_names, object_transport
+from halfspace_sss.rendering.object.registry import AUTO, model_names, object_transport
 
 __all__ = ["PACKAGES", "code_hash", "found_by_name", "modules_of", "modules_reached"]
 
 PACKAGES = ("figures", "full_geometry", "analytic_models", "halfspace_sss")
 MACHINERY = "figures.parts"  # keeps and orders what parts compute, and computes nothing of it
-RENDERS = "halfspace_sss.rendering.surface.transports"  # is imported by all that finds models of objects
+RENDERS = "halfspace_sss.rendering.object.registry"  # is imported by all that finds models of objects
 NAMES = "halfspace_sss.extensions"  # knows the names of packages, and asks for none of what they offer
 ADDRESS = re.compile(r"[a-z_]\w*(?:\.\w+)+(?::\w+)?")  # "package.module" or "package.module:function"
 

@@ -31,7 +31,7 @@ from full_geometry.object.patches import Patches, PatchSampler, PatchWeights, cl
 from full_geometry.object.subject import Subject, SurfacePoint
 from halfspace_sss.neural.perceptron import Perceptron
 from halfspace_sss.neural.training.fit import Objective, fit
-from halfspace_sss.rendering.transport.plane import number
+from halfspace_sss.rendering.object.points import number
 
 CLEAR = 1e-4  # of the size of the object: where the ray that finds a face begins
 

@@ -20,10 +20,8 @@ from full_geometry.object.features import ObjectFrame, PreparedExit, Side
 from full_geometry.object.patches import PatchSampler, PatchTable, PatchWeights
 from halfspace_sss.neural.perceptron import Perceptron, relu
 from halfspace_sss.neural.store import load_weights, save_weights
-from halfspace_sss.rendering.surface.object import turned
-from halfspace_sss.rendering.transport.area_points import Point
-from halfspace_sss.rendering.transport.plane import Exit, number
-from halfspace_sss.rendering.transport.protocols import CosineProposals, Entry
+from halfspace_sss.rendering.object.entries import Point
+from halfspace_sss.rendering.object.points import CosineProposals, Entry, Exit, number, turned
 
 # ----------------------------------------------------------------------------------------------------
 # Monotonic rational-quadratic splines of [-1, 1] onto itself, in Dr.Jit (Durkan, Bekasov, Murray, Papamakarios 2019).

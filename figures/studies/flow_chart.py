@@ -11,7 +11,7 @@ import numpy as np
 from full_geometry.object.features import ObjectFrame, Side
 from full_geometry.object.patches import Patches, mesh_faces
 from full_geometry.object.subject import Subject
-from halfspace_sss.rendering.transport.area_points import Point
+from halfspace_sss.rendering.object.entries import Point
 
 # ---- The square [0, 1)² laid onto each patch of a surface, so that equal areas stay equal ----------
 # A patch has two axes, the principal ones of its faces. Along the first its faces are put together to strips; u_1

@@ -27,9 +27,7 @@ from full_geometry.object.walks import trace_exits
 from halfspace_sss.checks import check_count
 from halfspace_sss.neural.training.fit import Objective, Source, fit
 from halfspace_sss.neural.training.schedules import Timed
-from halfspace_sss.rendering.surface.horizon import cosine_above
-from halfspace_sss.rendering.transport.plane import number, place
-from halfspace_sss.rendering.transport.protocols import Entry
+from halfspace_sss.rendering.object.points import Entry, cosine_above, number, place
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 # ---- Training of conditional flows by zuko: -E[T log p(x | context)] over walks --------------------

@@ -24,8 +24,7 @@ from full_geometry.object.features import ObjectFrame
 from full_geometry.object.subject import Subject, SurfacePoint, surface_point
 from halfspace_sss.neural.training.fit import ADAM, Descent, Objective, fit
 from halfspace_sss.neural.training.schedules import Timed
-from halfspace_sss.rendering.surface.horizon import cosine_above
-from halfspace_sss.rendering.surface.variants import channel_mean
+from halfspace_sss.rendering.object.points import channel_mean, cosine_above
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 HIDDEN, LAYERS = (128, 128), 6

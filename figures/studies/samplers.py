@@ -18,13 +18,9 @@ from full_geometry.object.patches import AREA_SHARE, LearntProposals, PatchTable
 from full_geometry.object.subject import Subject
 from full_geometry.scene import LearntTransport
 from halfspace_sss.backend import kernel_seconds
-from halfspace_sss.rendering.surface.horizon import cosine_above, lifted
-from halfspace_sss.rendering.surface.object import turned
-from halfspace_sss.rendering.transport.half_space import HalfSpaceProposals
-from halfspace_sss.rendering.transport.plane import Exit, number
-from halfspace_sss.rendering.transport.positions import PositionSampler
-from halfspace_sss.rendering.transport.protocols import Means, Proposals
-from halfspace_sss.rendering.transport.radial_table import RadialTable
+from halfspace_sss.rendering.object.entries import PositionSampler, RadialTable
+from halfspace_sss.rendering.object.half_space import HalfSpaceProposals
+from halfspace_sss.rendering.object.points import Exit, Means, Proposals, cosine_above, lifted, number, turned
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 if TYPE_CHECKING:

@@ -27,11 +27,10 @@ from full_geometry.object.subject import Subject, SurfacePoint
 from halfspace_sss.checks import check_choice, check_count
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.progress import NamedProgress
-from halfspace_sss.rendering.surface.inside import Inside
-from halfspace_sss.rendering.surface.transports import knows_objects, model_names, object_transport
-from halfspace_sss.rendering.transport.plane import Exit, number
-from halfspace_sss.rendering.transport.protocols import Entry, Transport
-from halfspace_sss.rendering.transport.settings import Settings
+from halfspace_sss.rendering.object.points import Entry, Exit, Transport, number
+from halfspace_sss.rendering.object.registry import knows_objects, model_names, object_transport
+from halfspace_sss.rendering.object.settings import Settings
+from halfspace_sss.rendering.object.translucent import Inside
 
 LIGHTS = ("constant", "lobes")
 EVEN_SKY = "even sky"  # as images show it

@@ -14,7 +14,7 @@ from full_geometry.object.first_event import first_event
 from full_geometry.object.subject import Subject, SurfacePoint
 from halfspace_sss.interface.model import BSSRDF, bssrdf
 from halfspace_sss.physics import fresnel
-from halfspace_sss.rendering.transport.plane import Exit, number, plane_query
+from halfspace_sss.rendering.object.points import Exit, number, plane_query
 
 FLOOR = 1e-2  # reflectance of the floor, over that of the half-space
 

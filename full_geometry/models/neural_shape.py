@@ -45,7 +45,7 @@ from halfspace_sss.neural.perceptron import Perceptron
 from halfspace_sss.neural.store import checksum_of, load_weights
 from halfspace_sss.once import once
 from halfspace_sss.physics.medium import Medium
-from halfspace_sss.rendering.transport.plane import number
+from halfspace_sss.rendering.object.points import number
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 # ---- What the network of all shapes is trained on, and warns outside of ----------------------------

@@ -26,7 +26,7 @@ from full_geometry.object.features import (
 from full_geometry.object.first_event import first_event
 from full_geometry.object.subject import Subject, SurfacePoint
 from halfspace_sss.neural.perceptron import Perceptron
-from halfspace_sss.rendering.transport.plane import number
+from halfspace_sss.rendering.object.points import number
 
 # ---- S of one object: a base model times what a small network has learnt, evaluated in Dr.Jit ----------
 

@@ -22,7 +22,7 @@ from halfspace_sss.arrays import library
 from halfspace_sss.interface.model import BSSRDF
 from halfspace_sss.neural.perceptron import Perceptron
 from halfspace_sss.physics import fresnel
-from halfspace_sss.rendering.transport.plane import number
+from halfspace_sss.rendering.object.points import number
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 # ----------------------------------------------------------------------------------------------------

@@ -18,10 +18,7 @@ import drjit as dr
 import mitsuba as mi
 
 from full_geometry.object.subject import Subject, SurfacePoint, refract_in
-from halfspace_sss.rendering.surface.horizon import lifted, mirrored
-from halfspace_sss.rendering.surface.object import turned
-from halfspace_sss.rendering.surface.variants import channel_mean
-from halfspace_sss.rendering.transport.plane import number
+from halfspace_sss.rendering.object.points import channel_mean, lifted, mirrored, number, turned
 
 REFLECTIONS = 32
 NEGLIGIBLE = 1e-3  # weight of what is still inside

@@ -11,8 +11,8 @@ import numpy as np
 
 from full_geometry.object.features import ObjectFrame, surroundings
 from full_geometry.object.subject import Subject
-from halfspace_sss.rendering.surface.varying import grid_values
-from halfspace_sss.rendering.transport.plane import number
+from halfspace_sss.rendering.object.points import number
+from halfspace_sss.rendering.object.varying import grid_values
 
 ANCHORS = 256
 CLOSE = 1e-4  # positions over the size of the object, coefficients relative

@@ -14,10 +14,8 @@ from full_geometry.object.first_event import first_event
 from full_geometry.object.patches import AREA_SHARE, ExitTable, LearntProposals, PatchSampler
 from full_geometry.object.subject import Subject, SurfacePoint, cosine_direction, surface_point
 from full_geometry.object.walks import WalkEnds, trace_exits
-from halfspace_sss.rendering.surface.variants import channel_mean
-from halfspace_sss.rendering.transport.plane import Exit, number
-from halfspace_sss.rendering.transport.positions import PositionSampler
-from halfspace_sss.rendering.transport.radial_table import RadialTable
+from halfspace_sss.rendering.object.entries import PositionSampler, RadialTable
+from halfspace_sss.rendering.object.points import Exit, channel_mean, number
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 PATCH_SHARE = 0.6  # of those by patches, where they are learnt

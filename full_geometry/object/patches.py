@@ -24,11 +24,8 @@ from full_geometry.object.features import ObjectFrame, PreparedExit, Side, side_
 from full_geometry.object.first_event import first_event
 from full_geometry.object.subject import Subject, SurfacePoint, cosine_direction, surface_point
 from halfspace_sss.neural.perceptron import Perceptron
-from halfspace_sss.rendering.surface.object import turned
-from halfspace_sss.rendering.transport.area_points import Point
-from halfspace_sss.rendering.transport.plane import Exit, number
-from halfspace_sss.rendering.transport.positions import PositionSampler
-from halfspace_sss.rendering.transport.protocols import CosineProposals, Entry
+from halfspace_sss.rendering.object.entries import Point, PositionSampler
+from halfspace_sss.rendering.object.points import CosineProposals, Entry, Exit, number, turned
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 PATCHES = 512

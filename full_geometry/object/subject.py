@@ -12,17 +12,15 @@ import mitsuba as mi
 import numpy as np
 
 from halfspace_sss.physics.medium import Medium
+from halfspace_sss.rendering.object.body import check_size
+from halfspace_sss.rendering.object.boundary import smooth_boundary
+from halfspace_sss.rendering.object.entries import AreaPoints
+from halfspace_sss.rendering.object.placement import check_empty
+from halfspace_sss.rendering.object.points import cosine_above, lifted, number, turned
+from halfspace_sss.rendering.object.shape import Object, name_of, survey
+from halfspace_sss.rendering.object.translucent import Inside
+from halfspace_sss.rendering.object.varying import VaryingMedium, equivalent, grid_values
 from halfspace_sss.rendering.scenes.scene_files import millimetres
-from halfspace_sss.rendering.surface.boundary import smooth_boundary
-from halfspace_sss.rendering.surface.horizon import cosine_above, lifted
-from halfspace_sss.rendering.surface.inside import Inside
-from halfspace_sss.rendering.surface.object import Object, survey, turned
-from halfspace_sss.rendering.surface.placement import check_empty
-from halfspace_sss.rendering.surface.sharing import name_of
-from halfspace_sss.rendering.surface.varying import VaryingMedium, equivalent, grid_values
-from halfspace_sss.rendering.transport.area_points import AreaPoints
-from halfspace_sss.rendering.transport.body import check_size
-from halfspace_sss.rendering.transport.plane import number
 from halfspace_sss.rendering.walk.media import WalkMedia
 
 LEAST_RATIO = 1e-3  # in logarithms of what varies
@@ -208,7 +206,7 @@ def _in_scene_units(medium: Medium, mm_per_unit: float) -> tuple[Medium, ...]:
 
 
 def cosine_direction(n_out: Any, n: Any, rng: Any) -> Any:
-    """A direction by the cosine to the shading normal, above the surface, see `surface.horizon`."""
+    """A direction by the cosine to the shading normal, above the surface, see `object.points`."""
     return cosine_above(n_out, n, mi.Point2f(rng.next_float32(), rng.next_float32()))[0]
 
 

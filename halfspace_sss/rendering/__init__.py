@@ -19,4 +19,4 @@ if TYPE_CHECKING:
 
 __all__ = ["register"]
 
-__getattr__, __dir__ = lazy_names(__name__, {"register": "plugins", "surface": ""})
+__getattr__, __dir__ = lazy_names(__name__, {"register": "plugins", "object": ""})

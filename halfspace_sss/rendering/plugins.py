@@ -5,8 +5,8 @@ from __future__ import annotations
 import threading
 
 from halfspace_sss.backend import BackendError, prepare_llvm, two_threads
+from halfspace_sss.rendering.object.settings import VARIANTS, variant_channels
 from halfspace_sss.rendering.scenes.causes import plainly
-from halfspace_sss.rendering.surface.variants import VARIANTS, variant_channels
 
 __all__ = ["register"]
 
@@ -51,8 +51,8 @@ def _register_all() -> None:
         prepare_llvm()
     two_threads()
 
+    from halfspace_sss.rendering.object.translucent import translucent_class
     from halfspace_sss.rendering.paths.integrator import integrator_class
-    from halfspace_sss.rendering.surface.translucent import translucent_class
     from halfspace_sss.rendering.walk.integrator import walk_integrator_class
 
     mi.register_bsdf("translucent", translucent_class())

@@ -17,9 +17,9 @@ from typing import Any
 
 from halfspace_sss.neural.trained import weights_folder
 from halfspace_sss.provenance import provenance, write_atomically
+from halfspace_sss.rendering.object.registry import AUTO, model_names
 from halfspace_sss.rendering.scenes.identity import scene_hash
 from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED
-from halfspace_sss.rendering.surface.transports import AUTO, model_names
 from halfspace_sss.trade.measuring.objects import assess_stage
 from halfspace_sss.trade.measuring.results import ObjectTrade, WayTrade
 from halfspace_sss.trade.measuring.ways import Stage, Way
@@ -70,7 +70,7 @@ def choose(scene: Any, settings: Any) -> None:
 
 
 def _stage(scene: Any, settings: Any) -> Stage:
-    from halfspace_sss.rendering.surface.placement import translucent_shapes
+    from halfspace_sss.rendering.object.placement import translucent_shapes
 
     return Stage(scene, translucent_shapes(scene), settings.shared(), settings.of_models())
 

@@ -46,9 +46,7 @@ def test_a_terminal_without_unicode_shows_every_table() -> None:
 
 def test_help_of_the_surface_works_before_it_is_registered() -> None:
     pytest.importorskip("mitsuba")
-    code = (
-        "import halfspace_sss; from halfspace_sss import rendering; help(halfspace_sss.rendering.surface.translucent)"
-    )
+    code = "import halfspace_sss; from halfspace_sss import rendering; help(halfspace_sss.rendering.object.translucent)"
     assert b"The Mitsuba surface `translucent`" in _run(program=("-c", code)).stdout
 
 

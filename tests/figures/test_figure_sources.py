@@ -18,7 +18,7 @@ from figures.computing.contenders import long_walk
 from figures.parts.part import Task, unmodelled
 from figures.parts.sources import PACKAGES, modules_of
 from halfspace_sss.interface.model import model_class
-from halfspace_sss.rendering.surface.transports import object_transport
+from halfspace_sss.rendering.object.registry import object_transport
 
 ROOT = Path(figures.__file__).resolve().parent.parent
 
@@ -54,7 +54,7 @@ EDITS = {
     "full geometry": ("full_geometry/scene.py", "\nENTRIES, FINE = 3, 9.5\n"),
     "shapes": ("full_geometry/models/neural_shape.py", EDIT),
     "learner": ("full_geometry/learning/fitting.py", EDIT),
-    "lambert": ("halfspace_sss/rendering/transport/lambert.py", EDIT),
+    "lambert": ("halfspace_sss/rendering/object/lambert.py", EDIT),
     "choice": ("halfspace_sss/trade/automatic.py", EDIT),
     "drawing": ("figures/drawing/style.py", EDIT),
     "figure": ("figures/fig09.py", EDIT),

@@ -24,12 +24,10 @@ from full_geometry.learning.model_errors import LIGHTS  # noqa: E402
 from full_geometry.learning.training import Trained, train  # noqa: E402
 from halfspace_sss import Medium, rendering  # noqa: E402
 from halfspace_sss.neural.trained import ENVIRONMENT_VARIABLE  # noqa: E402
+from halfspace_sss.rendering.object.entries import AreaPoints  # noqa: E402
+from halfspace_sss.rendering.object.points import Entry, place, turned  # noqa: E402
 from halfspace_sss.rendering.paths.path_loop import exit_at  # noqa: E402
 from halfspace_sss.rendering.scenes.scene_files import load_scene  # noqa: E402
-from halfspace_sss.rendering.surface.object import turned  # noqa: E402
-from halfspace_sss.rendering.transport.area_points import AreaPoints  # noqa: E402
-from halfspace_sss.rendering.transport.plane import place  # noqa: E402
-from halfspace_sss.rendering.transport.protocols import Entry  # noqa: E402
 
 SIZE, BLOCKS, PASSES, SPP, LANES = 24, 3, 16, 64, 2**16
 SIGNIFICANCE = 1e-3

@@ -43,7 +43,7 @@ from full_geometry.object.patches import (  # noqa: E402
     mesh_faces,
 )
 from full_geometry.object.subject import SurfacePoint  # noqa: E402
-from halfspace_sss.rendering.transport.plane import Exit  # noqa: E402
+from halfspace_sss.rendering.object.points import Exit  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
 N_PATCHES = 24

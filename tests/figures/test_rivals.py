@@ -52,7 +52,7 @@ from full_geometry.object.identity import frame_of  # noqa: E402
 from full_geometry.object.radiance import reference  # noqa: E402
 from full_geometry.object.subject import Subject, SurfacePoint  # noqa: E402
 from halfspace_sss.cli import app as cli  # noqa: E402
-from halfspace_sss.rendering.transport.protocols import Entry  # noqa: E402
+from halfspace_sss.rendering.object.points import Entry  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
 N_PATCHES = 24

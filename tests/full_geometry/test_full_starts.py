@@ -27,10 +27,9 @@ from full_geometry.scene import learnt_means  # noqa: E402
 from halfspace_sss import Medium, rendering  # noqa: E402
 from halfspace_sss.neural import trained as known_weights  # noqa: E402
 from halfspace_sss.neural.store import load_weights, save_weights  # noqa: E402
-from halfspace_sss.rendering.surface.inside import Inside  # noqa: E402
-from halfspace_sss.rendering.transport.plane import Exit  # noqa: E402
-from halfspace_sss.rendering.transport.protocols import Entry  # noqa: E402
-from halfspace_sss.rendering.transport.settings import Settings  # noqa: E402
+from halfspace_sss.rendering.object.points import Entry, Exit  # noqa: E402
+from halfspace_sss.rendering.object.settings import Settings  # noqa: E402
+from halfspace_sss.rendering.object.translucent import Inside  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
 QUICK, CHUNKS = Recipe(width=24, depth=2, batch=1024, chunk=2**13, reuse=2), 4

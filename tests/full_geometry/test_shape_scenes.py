@@ -17,8 +17,8 @@ mi = pytest.importorskip("mitsuba")
 from full_geometry.learning import model_errors  # noqa: E402
 from halfspace_sss import rendering  # noqa: E402
 from halfspace_sss.cli import app as cli  # noqa: E402
+from halfspace_sss.rendering.object.registry import knows_objects, model_names  # noqa: E402
 from halfspace_sss.rendering.scenes.scene_files import load_scene  # noqa: E402
-from halfspace_sss.rendering.surface.transports import knows_objects, model_names  # noqa: E402
 
 REFERENCE = model_errors.reference
 SURFACE = {"type": "translucent", "sigma_s": 0.95, "sigma_a": 0.05, "g": 0.0, "eta": 1.3, "model": "neural_shape"}

@@ -43,7 +43,7 @@ def medium(**values) -> dict:
 
 
 def test_a_direction_below_the_horizon_sees_a_normal_as_far_above_it():
-    from halfspace_sss.rendering.surface.horizon import lifted
+    from halfspace_sss.rendering.object.points import lifted
 
     m, n, w = mi.Normal3f(0.6, 0, 0.8), mi.Normal3f(0, 0, 1), dr.normalize(mi.Vector3f(-0.9, 0.1, 0.3))
     found = lifted(m, n, w)
@@ -54,7 +54,7 @@ def test_a_direction_below_the_horizon_sees_a_normal_as_far_above_it():
 
 def test_directions_are_above_the_surface_and_of_the_density_that_is_stated():
     """Mean of 1/density is the solid angle 2 pi of all directions above, of cos²/density its integral 2 pi / 3."""
-    from halfspace_sss.rendering.surface.horizon import cosine_above, cosine_density
+    from halfspace_sss.rendering.object.points import cosine_above, cosine_density
 
     rng, n = mi.PCG32(2**20), mi.Normal3f(0, 0, 1)
     w, pdf = cosine_above(mi.Normal3f(0.6, 0, 0.8), n, mi.Point2f(rng.next_float32(), rng.next_float32()))

@@ -12,9 +12,9 @@ import pytest
 from test_translucent_walk import COLOURED, _agree, _lamp, _runs, _scene, _small_lamp, _z
 
 import halfspace_sss.rendering as rendering
+from halfspace_sss.rendering.object import body as bodies
+from halfspace_sss.rendering.object.points import Means
 from halfspace_sss.rendering.paths import low_orders
-from halfspace_sss.rendering.transport import body as bodies
-from halfspace_sss.rendering.transport.protocols import Means
 from halfspace_sss.rendering.walk import media as walks
 
 mi = pytest.importorskip("mitsuba")

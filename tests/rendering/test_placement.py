@@ -14,8 +14,8 @@ from test_rendering_normals import ellipsoid
 
 mi = pytest.importorskip("mitsuba")
 
-from halfspace_sss.rendering.surface.object import survey  # noqa: E402
-from halfspace_sss.rendering.surface.placement import contents  # noqa: E402
+from halfspace_sss.rendering.object.placement import contents  # noqa: E402
+from halfspace_sss.rendering.object.shape import survey  # noqa: E402
 
 INTEGRATORS = ("bssrdf", "translucent_walk")
 

@@ -64,7 +64,7 @@ def test_a_kernel_serves_other_numbers_of_samples(model):
 
 
 def test_the_mean_over_channels_is_that_of_numbers():
-    from halfspace_sss.rendering.surface.variants import channel_mean
+    from halfspace_sss.rendering.object.points import channel_mean
 
     assert np.array(channel_mean(mi.Color3f(1, 2, 6))) == pytest.approx([3])
     assert np.array(channel_mean(mi.Color1f(mi.Float(4, 5)))) == pytest.approx([4, 5])

@@ -18,10 +18,8 @@ pytestmark = pytest.mark.usefixtures("quiet_rgb")
 
 
 def position_sampler(shape: dict, share: float):
-    from halfspace_sss.rendering.surface.object import survey
-    from halfspace_sss.rendering.transport.area_points import AreaPoints
-    from halfspace_sss.rendering.transport.positions import PositionSampler
-    from halfspace_sss.rendering.transport.radial_table import RadialTable
+    from halfspace_sss.rendering.object.entries import AreaPoints, PositionSampler, RadialTable
+    from halfspace_sss.rendering.object.shape import survey
 
     scene = mi.load_dict({"type": "scene", "object": shape})
     found = survey(scene.shapes()[0])
@@ -30,7 +28,7 @@ def position_sampler(shape: dict, share: float):
 
 
 def entries(positions, origin, along, n: int = N, seed: int = 1):
-    from halfspace_sss.rendering.transport.plane import Exit
+    from halfspace_sss.rendering.object.points import Exit
 
     ray = mi.Ray3f(mi.Point3f(*origin), mi.Vector3f(*along))
     si = positions.found.scene.ray_intersect(ray)
@@ -187,7 +185,7 @@ def test_light_does_not_cross_from_one_object_to_another_of_the_same_surface():
 
 
 def test_the_radial_table_gives_back_its_own_density():
-    from halfspace_sss.rendering.transport.radial_table import RadialTable
+    from halfspace_sss.rendering.object.entries import RadialTable
 
     table = RadialTable([bssrdf("standard_dipole", m) for m in MODELS], 50.0)
     u = mi.Float((np.arange(N) + 0.5) / N)

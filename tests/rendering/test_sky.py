@@ -15,10 +15,10 @@ mi = pytest.importorskip("mitsuba")
 from rendered import surface  # noqa: E402
 
 from halfspace_sss import rendering  # noqa: E402
+from halfspace_sss.rendering.object import body as bodies  # noqa: E402
+from halfspace_sss.rendering.object.half_space import half_space_means  # noqa: E402
+from halfspace_sss.rendering.object.points import Means  # noqa: E402
 from halfspace_sss.rendering.paths.lighting import Lights, Sky  # noqa: E402
-from halfspace_sss.rendering.transport import body as bodies  # noqa: E402
-from halfspace_sss.rendering.transport.half_space import half_space_means  # noqa: E402
-from halfspace_sss.rendering.transport.protocols import Means  # noqa: E402
 
 R, SIGMA_S, SIGMA_A = 0.5, 1.2, 0.3
 MEDIUM = {"sigma_s": SIGMA_S, "sigma_a": SIGMA_A, "g": 0.0, "eta": 1.0}

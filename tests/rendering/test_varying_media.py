@@ -201,8 +201,8 @@ def test_a_mono_variant_takes_grids_of_one_channel() -> None:
 
 
 def test_models_of_the_half_space_take_the_means_over_the_object() -> None:
-    from halfspace_sss.rendering.transport.body import make_bodies
-    from halfspace_sss.rendering.transport.settings import Settings
+    from halfspace_sss.rendering.object.body import make_bodies
+    from halfspace_sss.rendering.object.settings import Settings
 
     layers = np.array([[1.0, 2.0, 4.0], [3.0, 2.0, 8.0], [50.0, 50.0, 50.0], [50.0, 50.0, 50.0]])
     where = mi.ScalarTransform4f().translate([-10, -10, -10]).scale([20, 20, 40])  # the object is in the lower half
@@ -252,7 +252,7 @@ def test_grids_that_are_no_media_are_refused(parameters: dict, message: str) -> 
 
 
 def test_volumes_that_are_no_grids_are_refused() -> None:
-    from halfspace_sss.rendering.surface.varying import varying_medium
+    from halfspace_sss.rendering.object.varying import varying_medium
 
     class Ramp(mi.Volume):
         pass

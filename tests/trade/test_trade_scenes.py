@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from halfspace_sss import Medium
 from halfspace_sss.cli import app as cli
 from halfspace_sss.physics.fresnel import F_r
-from halfspace_sss.rendering.surface.transports import model_names
+from halfspace_sss.rendering.object.registry import model_names
 from halfspace_sss.trade import assess, recommend
 from halfspace_sss.trade.checking.random_scenes import random_scene, write_scene
 from halfspace_sss.trade.images import small_images
@@ -222,8 +222,8 @@ def test_random_scenes_come_again_by_their_number(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("number", range(6))
 def test_a_random_scene_is_closed_and_faces_outwards(number: int, tmp_path: Path) -> None:
+    from halfspace_sss.rendering.object.shape import survey
     from halfspace_sss.rendering.scenes.scene_files import load_objects
-    from halfspace_sss.rendering.surface.object import survey
 
     loaded = load_objects(write_scene(random_scene(number, 5), tmp_path))
     (shape,) = (s for s in loaded.shapes() if s.id() == "object")

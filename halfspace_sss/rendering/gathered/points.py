@@ -17,10 +17,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from halfspace_sss.rendering.surface.horizon import cosine_above, lifted
-from halfspace_sss.rendering.surface.object import Object, turned
-from halfspace_sss.rendering.transport.area_points import AreaPoints
-from halfspace_sss.rendering.transport.plane import Exit, number
+from halfspace_sss.rendering.object.entries import AreaPoints
+from halfspace_sss.rendering.object.points import Exit, cosine_above, lifted, number, turned
+from halfspace_sss.rendering.object.shape import Object
 
 if TYPE_CHECKING:
     from collections.abc import Callable

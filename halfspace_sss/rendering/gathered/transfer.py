@@ -23,10 +23,10 @@ import numpy as np
 
 from halfspace_sss.physics.fresnel import F_t
 from halfspace_sss.rendering.gathered.points import SurfacePoints
-from halfspace_sss.rendering.transport.plane import Exit, number
+from halfspace_sss.rendering.object.points import Exit, number
 
 if TYPE_CHECKING:
-    from halfspace_sss.rendering.transport.body import Body
+    from halfspace_sss.rendering.object.body import Body
 
 __all__ = ["Albedo", "Incident", "Transfer", "transfer"]
 

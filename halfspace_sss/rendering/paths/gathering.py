@@ -19,15 +19,14 @@ import mitsuba as mi
 import numpy as np
 
 from halfspace_sss.rendering.gathered.transfer import Incident, Transfer, transfer
+from halfspace_sss.rendering.object.points import cosine_above, place
 from halfspace_sss.rendering.paths.lighting import mis_weight
 from halfspace_sss.rendering.paths.path_loop import trace_paths
-from halfspace_sss.rendering.surface.horizon import cosine_above
-from halfspace_sss.rendering.transport.plane import place
 
 if TYPE_CHECKING:
-    from halfspace_sss.rendering.transport.body import Body
-    from halfspace_sss.rendering.transport.plane import Exit
-    from halfspace_sss.rendering.transport.settings import Settings
+    from halfspace_sss.rendering.object.body import Body
+    from halfspace_sss.rendering.object.points import Exit
+    from halfspace_sss.rendering.object.settings import Settings
 
 __all__ = ["Gathered", "Gathering"]
 

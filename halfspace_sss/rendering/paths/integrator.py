@@ -13,10 +13,10 @@ import mitsuba as mi
 import numpy as np
 
 from halfspace_sss.interrupts import hear_again, interruptible
+from halfspace_sss.rendering.object.body import Bodies, Body, make_bodies
+from halfspace_sss.rendering.object.settings import Settings, read_settings
 from halfspace_sss.rendering.paths.gathering import Gathering
 from halfspace_sss.rendering.paths.path_loop import replay_paths, trace_paths
-from halfspace_sss.rendering.transport.body import Bodies, Body, make_bodies
-from halfspace_sss.rendering.transport.settings import Settings, read_settings
 
 __all__ = ["check_outermost", "check_parameters", "integrator_class", "launches", "replayer"]
 

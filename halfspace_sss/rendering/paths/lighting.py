@@ -10,10 +10,9 @@ import mitsuba as mi
 import numpy as np
 
 from halfspace_sss.rendering.light.small_emitters import WIDE, SmallEmitters, is_delta
+from halfspace_sss.rendering.object.body import Body
+from halfspace_sss.rendering.object.settings import AUTOMATIC, Settings
 from halfspace_sss.rendering.paths.path_tally import Primal, Replay
-from halfspace_sss.rendering.surface.derivatives import detached
-from halfspace_sss.rendering.transport.body import Body
-from halfspace_sss.rendering.transport.settings import AUTOMATIC, Settings
 
 __all__ = ["Lights", "RenderContext", "Sky", "delta_light", "mis_weight", "sample_emitter"]
 
@@ -80,7 +79,7 @@ class Sky(NamedTuple):
         emitter = scene.environment()
         if emitter is None or not any(hasattr(obj.transport, "alpha") for obj in objects):
             return None
-        with detached():
+        with dr.suspend_grad():
             k = dr.arange(mi.UInt32, SKY_DIRECTIONS**2)
             u = mi.Point2f(k % SKY_DIRECTIONS + 0.5, k // SKY_DIRECTIONS + 0.5) / SKY_DIRECTIONS
             si = dr.zeros(mi.SurfaceInteraction3f, SKY_DIRECTIONS**2)
@@ -133,7 +132,7 @@ class RenderContext:
     def of(cls, scene: mi.Scene, objects: list[Body], settings: Settings, mode: Primal | Replay) -> RenderContext:
         """The context of a scene and its translucent objects."""
         lights = Lights.of(scene)
-        with detached():
+        with dr.suspend_grad():
             small = SmallEmitters.of(scene)
         return cls(scene, lights, objects, settings, mode, Sky.of(scene, lights, objects), small)
 
@@ -170,7 +169,7 @@ def sample_emitter(
     context: RenderContext, ref: mi.Interaction3f, u: mi.Point2f, test_visibility: bool, active: mi.Bool
 ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
     """A direction of next-event estimation, and light over its density; derivatives are those of the light."""
-    with detached():
+    with dr.suspend_grad():
         ds, light = context.scene.sample_emitter_direction(ref, u, test_visibility, active)
         inverse = dr.select(ds.pdf > 0, dr.rcp(ds.pdf), 0)
     if not context.mode.tracks:

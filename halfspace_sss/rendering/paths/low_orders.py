@@ -25,12 +25,9 @@ import mitsuba as mi
 
 from halfspace_sss.physics.phase import eval_hg, sample_hg
 from halfspace_sss.rendering.light.small_emitters import WIDE
+from halfspace_sss.rendering.object.body import Body
+from halfspace_sss.rendering.object.points import Exit, lifted, mirrored, number, opposed, place, turned
 from halfspace_sss.rendering.paths.lighting import RenderContext, delta_light, mis_weight, sample_emitter
-from halfspace_sss.rendering.surface.derivatives import detached
-from halfspace_sss.rendering.surface.horizon import lifted, mirrored, opposed
-from halfspace_sss.rendering.surface.object import turned
-from halfspace_sss.rendering.transport.body import Body
-from halfspace_sss.rendering.transport.plane import Exit, number, place
 
 __all__ = ["Connection", "LowOrderSample", "RefractedRay", "refracted_connection", "sample_low_orders"]
 
@@ -103,7 +100,7 @@ def sample_low_orders(
 
     What passes unscattered shows delta lights only if the path has `scattered` before.
     """
-    with detached():
+    with dr.suspend_grad():
         walk = _walk(obj, refracted, sampler, active & refracted.valid)
         once = walk.order == 1
         counts = walk.left & (once if 0 not in obj.few else mi.Bool(True))
@@ -271,7 +268,7 @@ def _connected(
     obj, media = of
     at = place(walk.event, mi.Normal3f(0, 0, 0))
     ds, light = sample_emitter(context, at, sampler.next_2d(), False, active)
-    with detached():
+    with dr.suspend_grad():
         distant = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
         alone = context.sampled_by_nee(ds.emitter, ds.d)  # no other strategy counts this light
         active = active & (ds.pdf > 0) & (alone | mi.Bool(context.connects_sky(obj)))
@@ -301,7 +298,7 @@ def _phase_pdf(obj: Body, walk: _Walk, met: Connection) -> mi.Float:
 
 def _sky_pdf(obj: Body, walk: _Walk, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
     """Density of a walk's direction outside, 1/sr, and 1, where a sky connection leads along it; elsewhere 1, 0."""
-    with detached():
+    with dr.suspend_grad():
         reach = number(FAR * obj.found.size)
         met = refracted_connection(obj, walk.event, walk.event + walk.d * reach, active)
         same = active & _is_same(walk, met, SAME_WAY)
@@ -311,7 +308,7 @@ def _sky_pdf(obj: Body, walk: _Walk, active: mi.Bool) -> tuple[mi.Float, mi.Floa
 
 def _met_by_chance(context: RenderContext, obj: Body, walk: _Walk, active: mi.Bool) -> mi.Spectrum:
     """Emission that a walk meets from its event, which no connection with that point of an emitter would find."""
-    with detached():
+    with dr.suspend_grad():
         ray = place(walk.o, walk.n).spawn_ray(walk.d)
         si = context.scene.ray_intersect(ray, mi.RayFlags.All, False, active)
         emitter = si.emitter(context.scene, active)
@@ -326,7 +323,7 @@ def _met_by_chance(context: RenderContext, obj: Body, walk: _Walk, active: mi.Bo
 def _spread_lights(context: RenderContext, obj: Body, walk: _Walk, sampler: mi.Sampler, active: mi.Bool) -> mi.Spectrum:
     """Light of a delta light whose cone holds a walk's way out, which no connection with it would find."""
     which, L = delta_light(context, sampler, place(walk.o, walk.n).spawn_ray(walk.d), active)
-    with detached():
+    with dr.suspend_grad():
         connects = active & (dr.max(L) > 0) & walk.straight & (walk.order == 1)
         target = context.small.point(which, walk.event, FAR * obj.found.size)
         met = refracted_connection(obj, walk.event, target, connects)

@@ -16,15 +16,12 @@ from typing import Any, NamedTuple
 import drjit as dr
 import mitsuba as mi
 
+from halfspace_sss.rendering.object.body import Body
+from halfspace_sss.rendering.object.points import Exit, lifted, number, place, turned
+from halfspace_sss.rendering.object.settings import Settings
 from halfspace_sss.rendering.paths.lighting import RenderContext, delta_light, mis_weight, sample_emitter
 from halfspace_sss.rendering.paths.low_orders import RefractedRay, sample_low_orders
 from halfspace_sss.rendering.paths.path_tally import PathTally, Primal, Replay
-from halfspace_sss.rendering.surface.derivatives import detached, tracking
-from halfspace_sss.rendering.surface.horizon import lifted
-from halfspace_sss.rendering.surface.object import turned
-from halfspace_sss.rendering.transport.body import Body
-from halfspace_sss.rendering.transport.plane import Exit, number, place
-from halfspace_sss.rendering.transport.settings import Settings
 
 __all__ = ["exit_at", "replay_paths", "trace_paths"]
 
@@ -128,7 +125,7 @@ def _loop(
         si = scene.ray_intersect(path.ray, mi.RayFlags.All, first, active)
 
         # ---- emission, with its MIS weight against next-event estimation at the previous vertex
-        with tracking(mode.tracks):
+        with dr.resume_grad(when=mode.tracks):
             shown = ~first if settings.hide_emitters else mi.Bool(True)
             counts = active & ~(first & path.second_pass)
             L_e = emission(context, sampler, path.ray, si, path.previous, shown, path.scattered, counts)
@@ -173,7 +170,7 @@ def _loop(
         camera_ray, PathTally(L[0], derivative), mi.Spectrum(1), _camera_vertex(), mi.UInt32(0), mi.Bool(False),
         mi.Bool(False), mi.Bool(False), mi.Spectrum(0), mi.Bool(False), mi.Bool(active),
     )  # fmt: skip
-    with detached():
+    with dr.suspend_grad():
         _, path = dr.while_loop((sampler, start), lambda sampler, path: path.active, step, label="bssrdf")
     two = path.second_pass
     parts = dr.select(two, path.L_first, path.tally.L), dr.select(two, path.tally.L, 0)
@@ -212,7 +209,7 @@ def emission(
 
     Emitters count where they are `shown`; delta lights behind a mirror if the path has `scattered` before.
     """
-    with detached():
+    with dr.suspend_grad():
         emitter, mirrored = si.emitter(context.scene, active), active & previous.mirrored & scattered
         active = active & shown & (emitter != None)  # noqa: E711
         active &= ~(previous.sky_only & context.sampled_by_nee(emitter, ray.d))
@@ -266,7 +263,7 @@ def sample_event(
     """One event: the BSDF of a surface, or at an object one of reflection, orders below two and the BSSRDF."""
     # ---- probabilities of the events
     choices = []
-    with detached():
+    with dr.suspend_grad():
         for obj in context.objects:
             here = at.active & (at.si.shape == mi.ShapePtr(obj.found.shape))
             choice = choose_event(obj, at.si, here)
@@ -363,10 +360,10 @@ def _where(context: RenderContext, sampler: mi.Sampler, mask: mi.Bool, otherwise
     """
 
     def happens(sampler: mi.Sampler, otherwise: tuple) -> tuple:
-        with tracking(context.mode.tracks):
+        with dr.resume_grad(when=context.mode.tracks):
             return sampler, dr.detach(tuple(event(*otherwise)))
 
-    with detached():
+    with dr.suspend_grad():
         return dr.if_stmt((sampler, otherwise), mask, happens, lambda s, other: (s, other))[1]
 
 
@@ -431,7 +428,7 @@ def _scatter_outside(
 
     def scatter(_: NextVertex, __: mi.Bool, tally: PathTally) -> tuple:
         u = sampler.next_2d(), sampler.next_1d(), sampler.next_2d()
-        with detached():
+        with dr.suspend_grad():
             following, direct = bsdf_event(context, u, at.ray, at.si, plain | glossy)
         shown, meets, tally = _add_mirrored(context, sampler, following, at, tally, glossy)
         reflects = glossy & meets & (u_event < reflection)
@@ -594,7 +591,7 @@ def resample_entry(
     resampling target: the largest channel of W_k times the light of a sampled emitter. Its weight is W_k Σ w / (N w_k),
     the mean of all candidates. The ray that goes on tests the visibility of the one kept.
     """
-    with detached():
+    with dr.suspend_grad():
         prepared = obj.transport.prepare(out, active)
         exit_point = _ExitPoint(out, face, prepared, obj.proposals.prepare(out, prepared, active))
 
@@ -625,7 +622,7 @@ def _draw_candidate(
     share, proposals, out = context.lights.nee_share, obj.proposals, exit_point.out
 
     # ---- point of entry, and a direction by the proposals
-    with detached():
+    with dr.suspend_grad():
         entry = proposals.sample(out, exit_point.face, exit_point.proposals, sampler, active)
         active = active & (entry.weight > 0)
         d, pdf = proposals.sample_direction(entry, out, sampler.next_2d())
@@ -641,7 +638,7 @@ def _draw_candidate(
     if share > 0:
         nee = active & by_emitter
         ds, light = sample_emitter(context, at, sampler.next_2d(), False, nee)
-        with detached():
+        with dr.suspend_grad():
             delta, emitter_point = nee & ds.delta, mi.Point3f(ds.p)
             if context.uses_sky(obj):
                 pdf_sky = share * context.sky.pdf(context.scene, at, d, active & ~by_emitter)

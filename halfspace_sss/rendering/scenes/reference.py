@@ -21,11 +21,11 @@ import numpy as np
 
 from halfspace_sss.checks import check_count
 from halfspace_sss.provenance import check_folder, provenance
+from halfspace_sss.rendering.object.placement import choices
+from halfspace_sss.rendering.object.registry import AUTO
 from halfspace_sss.rendering.scenes.causes import first_cause
 from halfspace_sss.rendering.scenes.identity import learnt, scene_hash, words
 from halfspace_sss.rendering.scenes.reference_store import Reference, load, save
-from halfspace_sss.rendering.surface.placement import choices
-from halfspace_sss.rendering.surface.transports import AUTO
 
 __all__ = ["Limits", "Progress", "Reference", "about_render", "check_same", "chosen", "load", "loaded", "render"]
 

@@ -8,10 +8,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from halfspace_sss.rendering.object.registry import knows_objects, model_names
+from halfspace_sss.rendering.object.settings import ORDERS, SHARED
 from halfspace_sss.rendering.scenes.causes import first_cause
-from halfspace_sss.rendering.surface.inside import ORDERS
-from halfspace_sss.rendering.surface.transports import knows_objects, model_names
-from halfspace_sss.rendering.transport.settings import SHARED
 
 __all__ = ["PATH_TRACED", "load_objects", "load_scene", "millimetres", "open_scene"]
 

@@ -24,8 +24,7 @@ import mitsuba as mi
 import numpy as np
 
 from halfspace_sss.rendering.light.small_emitters import SmallEmitters, spread
-from halfspace_sss.rendering.surface.horizon import opposed, sided
-from halfspace_sss.rendering.surface.variants import channel_mean
+from halfspace_sss.rendering.object.points import channel_mean, opposed, sided
 from halfspace_sss.rendering.walk.media import Coefficients, WalkMedia
 from halfspace_sss.rendering.walk.random_walk import (
     Event,
@@ -149,7 +148,7 @@ class SubpathConnections:
 
         # ---- refraction at the boundary
         si = self.media.face_outwards(si, dr.select(enters, mi.Int32(k), -1), -w)
-        si.wi = dr.select(mi.Frame3f.cos_theta(si.wi) < 0, -si.wi, si.wi)  # below its horizon, see `surface.horizon`
+        si.wi = dr.select(mi.Frame3f.cos_theta(si.wi) < 0, -si.wi, si.wi)  # below its horizon, see `object.points`
         F, cos_t, _, eta_ti = mi.fresnel(mi.Frame3f.cos_theta(si.wi), self.media.row("eta", k))
         d = si.to_world(mi.refract(si.wi, cos_t, eta_ti))
         enters &= (dr.dot(si.n, w) > 0) & (mi.Frame3f.cos_theta(si.wi) > 0) & (dr.dot(si.n, d) < 0)

@@ -14,7 +14,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from halfspace_sss.rendering.surface.horizon import lift, lifted, sided
+from halfspace_sss.rendering.object.points import lift, lifted, sided
 from halfspace_sss.rendering.walk.media import WalkMedia
 from halfspace_sss.rendering.walk.random_walk import (
     Crossing,

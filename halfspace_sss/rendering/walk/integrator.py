@@ -12,11 +12,10 @@ import numpy as np
 
 from halfspace_sss.interrupts import interruptible
 from halfspace_sss.rendering.light.small_emitters import SmallEmitters
-from halfspace_sss.rendering.surface.object import same_objects
-from halfspace_sss.rendering.surface.parameters import OF_MITSUBA, check_parameters
-from halfspace_sss.rendering.surface.placement import check_sensors, places_of
-from halfspace_sss.rendering.surface.sharing import number_of
-from halfspace_sss.rendering.transport.body import check_size
+from halfspace_sss.rendering.object.body import check_size
+from halfspace_sss.rendering.object.placement import check_sensors, places_of
+from halfspace_sss.rendering.object.settings import OF_MITSUBA, check_parameters
+from halfspace_sss.rendering.object.shape import number_of, same_objects
 from halfspace_sss.rendering.walk.emitter_connections import EmitterDirections, InnerLights, find_connections
 from halfspace_sss.rendering.walk.exits import FirstExits
 from halfspace_sss.rendering.walk.media import WalkMedia

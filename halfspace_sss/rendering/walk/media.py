@@ -11,12 +11,11 @@ import numpy as np
 
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.light.small_emitters import is_delta
-from halfspace_sss.rendering.surface.horizon import lift
-from halfspace_sss.rendering.surface.inside import Inside
-from halfspace_sss.rendering.surface.object import Object, survey
-from halfspace_sss.rendering.surface.placement import Content, contents, translucent_shapes
-from halfspace_sss.rendering.surface.sharing import check_together, scene_of
-from halfspace_sss.rendering.surface.varying import VaryingMedium, eval_volume
+from halfspace_sss.rendering.object.placement import Content, contents, translucent_shapes
+from halfspace_sss.rendering.object.points import lift
+from halfspace_sss.rendering.object.shape import Object, check_together, scene_of, survey
+from halfspace_sss.rendering.object.translucent import Inside
+from halfspace_sss.rendering.object.varying import VaryingMedium, eval_volume
 
 __all__ = [
     "Coefficients",

@@ -15,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 
 from halfspace_sss.rendering.light.small_emitters import NARROW, WIDE, SmallEmitters
-from halfspace_sss.rendering.surface.horizon import sided
+from halfspace_sss.rendering.object.points import sided
 from halfspace_sss.rendering.walk.emitter_connections import (
     Departure,
     EmitterDirections,

@@ -13,8 +13,7 @@ import drjit as dr
 import mitsuba as mi
 
 from halfspace_sss.physics.phase import eval_hg, sample_hg
-from halfspace_sss.rendering.surface.horizon import sided
-from halfspace_sss.rendering.surface.variants import channel_mean
+from halfspace_sss.rendering.object.points import channel_mean, sided
 from halfspace_sss.rendering.walk.media import Coefficients, WalkMedia
 from halfspace_sss.tracing.walk import ROULETTE_BOOST, ROULETTE_WEIGHT
 

@@ -8,9 +8,9 @@ from dataclasses import replace
 from typing import Any
 
 from halfspace_sss.progress import NamedProgress
+from halfspace_sss.rendering.object.shape import survey
 from halfspace_sss.rendering.scenes.causes import first_cause
 from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED
-from halfspace_sss.rendering.surface.object import survey
 from halfspace_sss.trade.measuring.exits import Exits, visible_exits
 from halfspace_sss.trade.measuring.results import Assessment, ObjectTrade, WayTrade
 from halfspace_sss.trade.measuring.sampling import Sampled, clock, first_sample, sample_more, warm_up

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from halfspace_sss.backend import busy_threads
-from halfspace_sss.rendering.surface.variants import variant_channels
+from halfspace_sss.rendering.object.settings import variant_channels
 from halfspace_sss.trade.measuring.exits import Exits
 from halfspace_sss.trade.measuring.seeds import seeded
 from halfspace_sss.trade.measuring.statistics import Estimate

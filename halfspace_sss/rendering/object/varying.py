@@ -17,7 +17,7 @@ import mitsuba as mi
 import numpy as np
 
 from halfspace_sss.physics.medium import Medium
-from halfspace_sss.rendering.surface.object import Object, crossings
+from halfspace_sss.rendering.object.shape import Object, crossings
 
 __all__ = [
     "VaryingMedium", "constant_value", "equivalent", "eval_volume", "grid_values", "mean_of_grids", "varying_medium",

@@ -6,6 +6,7 @@ import warnings
 from dataclasses import dataclass
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
@@ -41,7 +42,6 @@ def faces_of(shape: Any, name: str) -> Faces | None:
     Raises:
         ValueError: a surface of the mesh, called `name`, has one side only, as a Möbius strip has.
     """
-    import mitsuba as mi
 
     parameters = mi.traverse(shape)
     if "faces" not in parameters:
@@ -80,7 +80,6 @@ def check_copies(faces: Faces, name: str) -> None:
 
 def face_normals_agree(shape: Any, faces: Faces, name: str) -> None:
     """Warn that faces were turned, and make vertex normals anew that were averaged over faces of both sides."""
-    import mitsuba as mi
 
     parameters = mi.traverse(shape)
     turned = int(min((faces.sides < 0).sum(), (faces.sides > 0).sum()))

@@ -9,11 +9,10 @@ import drjit as dr
 import mitsuba as mi
 
 from halfspace_sss.physics.medium import Medium
-from halfspace_sss.rendering.surface.inside import Inside
-from halfspace_sss.rendering.surface.object import Object
-from halfspace_sss.rendering.transport.plane import Exit, number
-from halfspace_sss.rendering.transport.protocols import CosineProposals, Entry, Means
-from halfspace_sss.rendering.transport.settings import Settings
+from halfspace_sss.rendering.object.points import CosineProposals, Entry, Exit, Means, number
+from halfspace_sss.rendering.object.settings import Settings
+from halfspace_sss.rendering.object.shape import Object
+from halfspace_sss.rendering.object.translucent import Inside
 
 __all__ = ["LambertProposals", "LambertTransport", "lambert_means"]
 

@@ -20,7 +20,7 @@ from halfspace_sss.once import once
 __all__ = ["AUTO", "choose_models", "knows_objects", "model_names", "object_transport"]
 
 AUTO = "auto"
-_OWN = {"lambert": "halfspace_sss.rendering.transport.lambert:lambert_means"}
+_OWN = {"lambert": "halfspace_sss.rendering.object.lambert:lambert_means"}
 _CHOICE = "halfspace_sss.trade.automatic"  # imported when it is asked for, as it renders
 
 

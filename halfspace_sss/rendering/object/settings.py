@@ -2,16 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any
 
 from halfspace_sss.checks import check_choice, check_interval
-from halfspace_sss.rendering.surface.parameters import OF_MITSUBA, check_parameters
-from halfspace_sss.rendering.transport.plane import GEOMETRIES
 
-__all__ = ["AUTOMATIC", "SHARED", "Settings", "read_settings"]
+__all__ = [
+    "AUTOMATIC",
+    "GEOMETRIES",
+    "ORDERS",
+    "OF_MITSUBA",
+    "SHARED",
+    "Settings",
+    "VARIANTS",
+    "check_parameters",
+    "read_settings",
+    "variant_channels",
+]
 
 AUTOMATIC = -1.0
+ORDERS = ("total", "multiple", "single")
+GEOMETRIES = ("distance", "tangent")
 LIGHTS = ("sampled", "gathered")
 SHARED = ("mm_per_unit", "max_depth", "rr_depth", "hide_emitters")  # what `translucent_walk` understands too
 OF_MODELS = ("geometry", "area_share", "entries")
@@ -25,7 +37,7 @@ class Settings:
         mm_per_unit: millimetres in one unit of the scene.
         max_depth: vertices of a path after the camera, an entry and its exit counting as one; -1 for no limit.
         rr_depth: vertices after which Russian roulette begins.
-        geometry: "distance" or "tangent", see `plane.separation`.
+        geometry: "distance" or "tangent", see `points.separation`.
         area_share: share of the candidates for an entry that are drawn uniformly over the area, the others by a probe
             near the exit, 0 to 1; AUTOMATIC chooses by the ratio of the distance that light travels to the size of the
             object.
@@ -87,3 +99,37 @@ def read_settings(props: Any) -> Settings:
     check_parameters("bssrdf", props, (*Settings.__dataclass_fields__, *OF_MITSUBA))
     given = {key: props[key] for key in Settings.__dataclass_fields__ if key in props}
     return Settings(**given)
+
+
+# --------------------------------------------------------------------------------------------------
+# The variants of Mitsuba under which the plugins run.
+
+
+VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb", "llvm_ad_mono", "cuda_ad_mono")
+
+
+def variant_channels() -> int:
+    """3 under an RGB variant of Mitsuba, 1 under a mono one.
+
+    Raises:
+        ValueError: no variant is set, or another kind is.
+    """
+    import mitsuba as mi
+
+    variant = mi.variant()
+    if variant not in VARIANTS:
+        raise ValueError(f"variant must be llvm_ad_ or cuda_ad_ with rgb or mono, got {variant!r}")
+    return 3 if variant.endswith("rgb") else 1
+
+
+# --------------------------------------------------------------------------------------------------
+# The names of parameters that plugins take: one that none takes is refused.
+
+
+OF_MITSUBA = ("block_size", "samples_per_pass", "timeout")  # read by its `SamplingIntegrator`
+
+
+def check_parameters(plugin: str, props: Any, known: Collection[str]) -> None:
+    """ValueError names the first parameter of a plugin that it does not know."""
+    for key in props.keys():
+        check_choice(f"parameter of {plugin}", key, known)

@@ -5,23 +5,24 @@ from __future__ import annotations
 import warnings
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
+
+from halfspace_sss import measure
+from halfspace_sss.interface.model import bssrdf
+from halfspace_sss.physics import single_scattering
 from halfspace_sss.physics.medium import Medium
-from halfspace_sss.rendering.surface.inside import Inside
-from halfspace_sss.rendering.surface.object import Object, same_objects, survey
-from halfspace_sss.rendering.surface.placement import check_empty, check_sensors, places_of, translucent_shapes
-from halfspace_sss.rendering.surface.sharing import check_together, number_of
-from halfspace_sss.rendering.surface.transports import AUTO, choose_models, knows_objects, object_transport
-from halfspace_sss.rendering.surface.varying import equivalent, warn_of_means
-from halfspace_sss.rendering.transport.expected import Expected, expected_of
-from halfspace_sss.rendering.transport.half_space import half_space_means
-from halfspace_sss.rendering.transport.plane import number
-from halfspace_sss.rendering.transport.protocols import Means, Proposals, Transport
-from halfspace_sss.rendering.transport.settings import AUTOMATIC, Settings
-from halfspace_sss.rendering.transport.variation import Variation
+from halfspace_sss.rendering.object.half_space import Variation, half_space_means
+from halfspace_sss.rendering.object.placement import check_empty, check_sensors, places_of, translucent_shapes
+from halfspace_sss.rendering.object.points import Means, Proposals, Transport, number
+from halfspace_sss.rendering.object.registry import AUTO, choose_models, knows_objects, object_transport
+from halfspace_sss.rendering.object.settings import AUTOMATIC, Settings
+from halfspace_sss.rendering.object.shape import Object, check_together, number_of, same_objects, survey
+from halfspace_sss.rendering.object.translucent import Inside
+from halfspace_sss.rendering.object.varying import equivalent, warn_of_means
 
-__all__ = ["Bodies", "Body", "check_size", "make_bodies"]
+__all__ = ["Bodies", "Body", "Expected", "check_size", "expected_of", "make_bodies"]
 
 _MODELS = "models of their light"
 SMALL, LARGE = 1.0, 5e3  # mean free paths across an object, beyond which the units of the scene are doubted
@@ -162,3 +163,30 @@ def check_size(found: Object, sigma_t: Sequence[float], mm_per_unit: float) -> N
             f"{found.size * mm_per_unit:.3g} mm: check mm_per_unit = {mm_per_unit:g}",
             stacklevel=2,
         )
+
+
+# --------------------------------------------------------------------------------------------------
+# What the kinds of light that leave an object are expected to bring, by which the path loop chooses among them.
+
+
+class Expected(NamedTuple):
+    """Means over channels.
+
+    Args:
+        single: reflectance of the half-space at normal incidence by single scattering.
+        multiple: by the orders from two on.
+        albedo: of single scattering, which nearly all leaves something thin.
+    """
+
+    single: float
+    multiple: float
+    albedo: float
+
+
+def expected_of(media: Sequence[Medium]) -> Expected:
+    """Of the media of the channels."""
+    rows = []
+    for m in media:
+        multiple = float(measure.reflectance(bssrdf("better_dipole", m), 1.0)) if float(m.sigma_s) > 0 else 0.0
+        rows.append((float(single_scattering.reflectance(m, 1.0)), multiple, float(m.albedo)))
+    return Expected(*np.mean(rows, axis=0).tolist())

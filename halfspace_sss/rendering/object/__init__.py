@@ -1,4 +1,4 @@
-"""What a scene says of a translucent object: its material and model, its shape."""
+"""Translucent objects: shape, surface and medium, points of the surface, and the transports laid onto it."""
 
 from __future__ import annotations
 

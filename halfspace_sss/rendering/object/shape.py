@@ -6,12 +6,25 @@ import warnings
 from dataclasses import dataclass
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
-from halfspace_sss.rendering.surface.mesh import Faces, check_copies, face_normals_agree, faces_of
-from halfspace_sss.rendering.surface.sharing import name_of, rays_into, scene_of
+from halfspace_sss.rendering.object.mesh import Faces, check_copies, face_normals_agree, faces_of
 
-__all__ = ["RAYS", "Object", "geometry_of", "is_inside", "same_objects", "survey", "turned"]
+__all__ = [
+    "Object",
+    "RAYS",
+    "check_together",
+    "geometry_of",
+    "is_inside",
+    "name_of",
+    "number_of",
+    "rays_into",
+    "same_objects",
+    "scene_of",
+    "survey",
+]
 
 RAYS = 4096  # of the survey
 MOST_HITS = 64  # that one ray counts
@@ -57,8 +70,6 @@ class Object:
 
     def piece(self, prim_index: Any, active: Any) -> Any:
         """The number of the piece that a face belongs to."""
-        import drjit as dr
-        import mitsuba as mi
 
         if self.pieces is None:
             return mi.UInt32(0)
@@ -71,7 +82,6 @@ class Object:
         The largest coordinate counts, not that of the point: those of a large face or ball near the origin are no
         better.
         """
-        import mitsuba as mi
 
         box = self.scene.bbox()
         return float(np.max(np.abs([box.min, box.max]))) * mi.math.RayEpsilon if box.valid() else 0.0
@@ -88,19 +98,10 @@ class Object:
 
     def side(self, prim_index: Any, active: Any = True) -> Any:
         """1 where the geometric normal of a face points outwards, -1 where it points inwards."""
-        import drjit as dr
-        import mitsuba as mi
 
         if self.signs is None:
             return mi.Float(self.sign)
         return dr.gather(mi.Float, self.signs, prim_index, active)
-
-
-def turned(n_shading: Any, n: Any) -> Any:
-    """The shading normal on the side of the geometric one: vertex normals need not agree with the winding of a face."""
-    import drjit as dr
-
-    return dr.select(dr.dot(n_shading, n) < 0, -n_shading, n_shading)
 
 
 def same_objects(a: list[Any], b: list[Any]) -> bool:
@@ -161,8 +162,6 @@ def survey(shape: Any, world: Any = None) -> Object:
 
 def geometry_of(shape: Any) -> tuple[list, list]:
     """What tells one geometry of a shape from the next; the arrays with it are kept so that no number is reused."""
-    import drjit as dr
-    import mitsuba as mi
 
     found, kept = [], []
     for key, value in mi.traverse(shape).items():
@@ -181,8 +180,6 @@ class _Votes:
     """
 
     def __init__(self, faces: Faces | None) -> None:
-        import drjit as dr
-        import mitsuba as mi
 
         n = 0 if faces is None else int(faces.pieces.max()) + 1
         mixed = faces is not None and faces.sides is not None
@@ -194,8 +191,6 @@ class _Votes:
 
     def add(self, si: Any, along: Any, entering: Any, active: Any) -> None:
         """Count a hit."""
-        import drjit as dr
-        import mitsuba as mi
 
         dr.scatter_add(self.opposed, mi.Float(1), 0, active & (dr.dot(si.sh_frame.n, si.n) < 0))
         if self.pieces is None:
@@ -217,7 +212,6 @@ class _Votes:
 
     def signs(self) -> Any:
         """Of each face, or None if all pieces have the same."""
-        import mitsuba as mi
 
         if self.pieces is None:
             return None
@@ -236,8 +230,6 @@ def _outside_view(scene: Any, votes: _Votes) -> tuple[np.ndarray, float]:
 
 def crossings(scene: Any, ray: Any, votes: _Votes | None = None) -> tuple[Any, Any]:
     """Side of the first hit of each ray (1: the normal points to the ray, 0: no hit) and the number of hits."""
-    import drjit as dr
-    import mitsuba as mi
 
     def step(ray: Any, side: Any, count: Any, active: Any) -> tuple:
         si = scene.ray_intersect(ray, mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame, False, active)
@@ -256,7 +248,6 @@ def crossings(scene: Any, ray: Any, votes: _Votes | None = None) -> tuple[Any, A
 
 def is_inside(found: Object, points: Any) -> np.ndarray:
     """Which points (array of shape (3, n)) lie inside a closed object, by the parity of the hits of rays from them."""
-    import mitsuba as mi
 
     points = np.asarray(points, dtype=float)
     if not found.closed:
@@ -267,3 +258,94 @@ def is_inside(found: Object, points: Any) -> np.ndarray:
     ends = np.tile(along, points.shape[1])
     _, count = crossings(found.scene, mi.Ray3f(mi.Point3f(start), mi.Vector3f(ends)))
     return (np.array(count) % 2).reshape(-1, along.shape[1]).mean(axis=1) > 0.5
+
+
+# --------------------------------------------------------------------------------------------------
+# Scenes of single objects beside the scene that they stand in, whose rays are traced in one kernel.
+#
+# OptiX knows one table of shaders in a kernel. Dr.Jit does no more than log that a ray needs another one, and the ray
+# then meets nothing. Mitsuba adds the shapes of a scene to the table of another that it is given at its making.
+
+
+TRIALS = 256  # rays
+
+
+def name_of(shape: Any) -> str:
+    """The id of a shape in quotes; what it may be, where it has none."""
+    return repr(shape.id()) if shape.id() else "without an id (Mitsuba merges meshes that have the same surface)"
+
+
+def _by_optix() -> bool:
+
+    return mi.variant().startswith("cuda")
+
+
+def number_of(scene: Any) -> int:
+    """What tells the scenes apart that objects may stand in; only OptiX has to know."""
+    return scene.ptr if _by_optix() else 0
+
+
+def scene_of(shapes: list[Any], world: Any = None) -> Any:
+    """A Mitsuba scene that holds these shapes, which keep their ids.
+
+    Args:
+        shapes: of Mitsuba.
+        world: the scene that they stand in, if rays are traced in both by one kernel. It is not kept alive, and must
+            not be one that this function made.
+    """
+
+    named = [*shapes, world] if world is not None and _by_optix() else shapes
+    names = [known.id() for known in named]
+    scene = mi.load_dict({"type": "scene", **{f"shape{k}": known for k, known in enumerate(named)}})
+    for known, name in zip(named, names):
+        known.set_id(name)
+    return scene
+
+
+def rays_into(box: Any, n: int) -> Any:
+    """Rays from about a bounding box to places in it."""
+
+    low, high = np.array(box.min, dtype=float), np.array(box.max, dtype=float)
+    centre, radius = 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low))
+    rng = np.random.default_rng(7)
+    ends = rng.standard_normal((2, 3, n))
+    ends /= np.linalg.norm(ends, axis=1, keepdims=True)
+    start = centre[:, None] + 1.1 * radius * ends[0]
+    target = centre[:, None] + 0.9 * radius * ends[1] * rng.random(n) ** (1 / 3)
+    along = target - start
+    along /= np.linalg.norm(along, axis=0)
+    return mi.Ray3f(mi.Point3f(start), mi.Vector3f(along))
+
+
+def check_together(world: Any, scenes: list[Any]) -> None:
+    """Try rays in a scene and in those of objects in it by one kernel, where that may fail.
+
+    Args:
+        world: the scene around all.
+        scenes: from `scene_of`.
+
+    Raises:
+        RuntimeError: rays meet other things than by kernels of their own, or shapes that are not in their scene.
+    """
+    if not _by_optix():
+        return
+
+    tried = [scene for scene in (world, *scenes) if scene.bbox().valid()]
+    rays = [rays_into(scene.bbox(), TRIALS) for scene in tried]
+    dr.eval(rays)
+    alone = [np.array(_met(scene, ray)) for scene, ray in zip(tried, rays)]
+    together = [_met(scene, ray) for scene, ray in zip(tried, rays)]
+    dr.eval(together)
+    for scene, by_itself, beside in zip(tried, alone, map(np.array, together)):
+        own = [0, *(int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0]) for shape in scene.shapes())]
+        if (by_itself != beside).any() or (scene is not world and not np.isin(beside, own).all()):
+            raise RuntimeError(
+                "rays of objects and of the scene around them must be traced by one kernel, got some lost"
+            )
+
+
+def _met(scene: Any, ray: Any) -> Any:
+    """The numbers of the shapes that rays meet in Dr.Jit's registry, 0 for none."""
+
+    hit = scene.ray_intersect_preliminary(ray, False)
+    return dr.select(hit.is_valid(), dr.reinterpret_array(mi.UInt32, hit.shape), 0)

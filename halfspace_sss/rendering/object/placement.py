@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
-from halfspace_sss.rendering.surface.object import Object, geometry_of, is_inside
-from halfspace_sss.rendering.surface.sharing import name_of, rays_into, scene_of
+from halfspace_sss.rendering.object.shape import Object, geometry_of, is_inside, name_of, rays_into, scene_of
 
 __all__ = ["Content", "check_empty", "check_sensors", "choices", "contents", "places_of", "translucent_shapes"]
 
@@ -77,7 +78,6 @@ def places_of(scene: Any) -> tuple[list, list]:
 
 def _shared(shape: Any, holder: Object) -> Any:
     """The box that a shape shares with an object; None if it reaches less deep."""
-    import mitsuba as mi
 
     (a, b), (c, d), deep = _corners(shape.bbox()), _corners(holder.scene.bbox()), DEEP * holder.size
     low, high = np.maximum(a, c + deep), np.minimum(b, d - deep)
@@ -103,7 +103,6 @@ def _points_on(alone: Any, box: Any) -> np.ndarray:
 
 def _points_by_area(alone: Any) -> np.ndarray:
     """Points drawn by area, shape (3, n); none of shapes that cannot be drawn from, such as curves and instances."""
-    import mitsuba as mi
 
     u = np.random.default_rng(19).random((2, LOOKS)).astype(np.float32)
     points = []
@@ -118,7 +117,6 @@ def _points_by_area(alone: Any) -> np.ndarray:
 
 def _deep(holder: Object, points: np.ndarray) -> np.ndarray:
     """Which points lie inside an object, and deep."""
-    import mitsuba as mi
 
     inside = np.flatnonzero(is_inside(holder, points)) if points.shape[1] else np.zeros(0, dtype=int)
     if not len(inside):
@@ -138,8 +136,6 @@ def _holds(holder: Object, shape: Any, alone: Any) -> bool:
 
 def _place(emitter: Any) -> np.ndarray | None:
     """Where an emitter without a shape is; None where it is nowhere or has a shape."""
-    import drjit as dr
-    import mitsuba as mi
 
     far = emitter.flags() & int(mi.EmitterFlags.Infinite)
     if far or emitter.is_environment() or emitter.get_shape() is not None:
@@ -155,7 +151,6 @@ def translucent_shapes(scene: Any) -> list[Any]:
         ValueError: such a surface is inside of another BSDF, which would show its reflection only, or its shape belongs
             to a shape group, whose instances are several objects; or the scene has media of Mitsuba.
     """
-    import mitsuba as mi
 
     shapes = scene.shapes()
     for node in mi.traverse(scene).hierarchy:
@@ -210,7 +205,6 @@ def check_sensors(scene: Any, objects: list[Object]) -> None:
 
 def _starts(sensor: Any, size: float) -> np.ndarray:
     """Shape (3, n); off a surface that the rays leave by a little of the size of an object."""
-    import mitsuba as mi
 
     u = np.random.default_rng(13).random((5, STARTS)).astype(np.float32)
     numbers = [mi.Float(row.tolist()) for row in u]
@@ -226,6 +220,5 @@ def choices(scene: Any) -> dict[str, str]:
 
 def _inside(bsdf: Any) -> bool:
     """Whether a BSDF is `translucent` or has such a one in it."""
-    import mitsuba as mi
 
     return bsdf is not None and any(hasattr(node, "inside") for node in mi.traverse(bsdf).hierarchy)

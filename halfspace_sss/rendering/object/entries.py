@@ -18,14 +18,12 @@ from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
-from halfspace_sss.rendering.surface.object import Object, turned
-from halfspace_sss.rendering.transport.area_points import AreaPoints
-from halfspace_sss.rendering.transport.plane import Exit, number
-from halfspace_sss.rendering.transport.protocols import Entry
-from halfspace_sss.rendering.transport.radial_table import RadialTable
+from halfspace_sss.rendering.object.points import Entry, Exit, number, turned
+from halfspace_sss.rendering.object.shape import Object
 
-__all__ = ["PositionSampler"]
+__all__ = ["AreaPoints", "Point", "PositionSampler", "RadialTable"]
 
 MOST_HITS = 64
 NORMAL_SHARE = 0.8
@@ -185,3 +183,120 @@ def _FLAGS() -> int:
 
 def _nowhere() -> tuple:
     return mi.Point3f(0), mi.Normal3f(0, 0, 1), mi.Normal3f(0, 0, 1), mi.UInt32(0)
+
+
+# --------------------------------------------------------------------------------------------------
+# Points uniform over the area of an object, with its geometric and its shading normal.
+
+
+class Point(NamedTuple):
+    """Position, geometric normal, shading normal (as the shape has them) and face of a point."""
+
+    p: Any
+    n: Any
+    n_shading: Any
+    prim_index: Any
+
+
+class AreaPoints:
+    """Uniform points of a shape; for a mesh by its faces, as Mitsuba gives one of the two normals only.
+
+    Args:
+        shape: the Mitsuba shape.
+    """
+
+    def __init__(self, shape: Any) -> None:
+        self.shape = shape
+        self.faces = self.centre = None
+        parameters = mi.traverse(shape)
+        if shape.class_name() == "Sphere":  # Mitsuba's normals of sampled points are wrong where it is mirrored
+            self.centre = np.array(parameters["to_world"].matrix, dtype=np.float64).reshape(4, 4)[:3, 3]
+        if "faces" in parameters:
+            faces = np.array(parameters["faces"]).reshape(-1, 3)
+            a, b, c = np.array(parameters["vertex_positions"]).reshape(-1, 3)[faces].transpose(1, 0, 2)
+            areas = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+            self.faces = mi.DiscreteDistribution(mi.Float(areas.astype(np.float32)))
+
+    def sample(self, u_face: Any, u: Any, active: Any) -> Point:
+        """A point for uniform numbers u_face and the pair u."""
+        if self.faces is None:
+            ps = self.shape.sample_position(0.0, u, active)
+            n = ps.n if self.centre is None else self._radial(ps.p)
+            return Point(ps.p, n, n, mi.UInt32(0))
+        return self.on_face(self.faces.sample(u_face, active), u, active)
+
+    def _radial(self, p: Any) -> Any:
+        n = dr.normalize(p - mi.Point3f(*(number(c) for c in self.centre)))
+        return mi.Normal3f(-n if self.shape.has_flipped_normals() else n)
+
+    def on_face(self, face: Any, u: Any, active: Any = True) -> Point:
+        """A uniform point of a face of a mesh."""
+        index = self.shape.face_indices(face, active)
+        corners = [self.shape.vertex_position(i, active) for i in (index.x, index.y, index.z)]
+        b = mi.warp.square_to_uniform_triangle(u)
+        weights = (1 - b.x - b.y, b.x, b.y)
+        n = dr.normalize(dr.cross(corners[1] - corners[0], corners[2] - corners[0]))
+        n = -n if self.shape.has_flipped_normals() else n
+        n_shading = n
+        if self.shape.has_vertex_normals():
+            normals = [self.shape.vertex_normal(i, active) for i in (index.x, index.y, index.z)]
+            n_shading = dr.normalize(sum(w * v for w, v in zip(weights, normals)))
+        p = sum(w * c for w, c in zip(weights, corners))
+        return Point(mi.Point3f(p), mi.Normal3f(n), mi.Normal3f(n_shading), face)
+
+
+# --------------------------------------------------------------------------------------------------
+# A radial density about the exit for rendering: one table for all channels of a model, covering the whole object.
+
+
+N_CELLS = 512
+FLOOR = 1e-3  # share of the probability that is spread evenly over log r, so that no point is out of reach
+SHORTEST = 1e-4  # mean free paths of the densest channel; the first cell reaches from 0 to there
+
+
+class RadialTable:
+    """Mixture over the channels of the models' `pdf_position`, piecewise constant in r over cells even in log r.
+
+    Args:
+        models: one scalar model per channel, in scene units.
+        reach: largest distance, scene units.
+    """
+
+    def __init__(self, models: list[Any], reach: float) -> None:
+        densest = max(float(m.medium.sigma_t) for m in models)
+        r_min = min(SHORTEST / densest, 1e-3 * reach)
+        edges = np.concatenate([[0.0], np.geomspace(r_min, reach, N_CELLS)])
+        middle = np.concatenate([[0.5 * r_min], np.sqrt(edges[1:-1] * edges[2:])])
+        density = sum(np.asarray(m.pdf_position(middle, 0.0, 0.9)) for m in models)
+        mass = density * middle * np.diff(edges)
+        mass /= max(mass.sum(), 1e-300)
+        probability = (1 - FLOOR) * mass + FLOOR / N_CELLS
+        probability /= probability.sum()
+        self.r_min, self.reach = r_min, reach
+        self.per_log = (N_CELLS - 1) / math.log(reach / r_min)
+        self.mean = float(np.sum(probability * middle))
+        self._numpy = (np.cumsum(probability), probability, edges, probability / (2 * math.pi * np.diff(edges)))
+        self._lanes: dict[str, Any] = {}
+
+    def _arrays(self) -> tuple[Any, ...]:
+        if mi.variant() not in self._lanes:
+            numbers = (number(v) for v in (self.r_min, self.per_log, self.reach))
+            self._lanes[mi.variant()] = (*(mi.Float(v.astype(np.float32)) for v in self._numpy), *numbers)
+            dr.eval(self._lanes[mi.variant()])
+        return self._lanes[mi.variant()]
+
+    def sample(self, u: Any) -> Any:
+        """Distance r for uniform u in [0, 1)."""
+        cdf, probability, edges, *_ = self._arrays()
+        k = dr.binary_search(0, N_CELLS - 1, lambda i: dr.gather(mi.Float, cdf, i) <= u)
+        share = 1 - (dr.gather(mi.Float, cdf, k) - u) / dr.gather(mi.Float, probability, k)
+        low, high = dr.gather(mi.Float, edges, k), dr.gather(mi.Float, edges, k + 1)
+        return dr.lerp(low, high, dr.clip(share, 0, 1))
+
+    def pdf(self, r: Any) -> Any:
+        """Density over the plane at distance r, 1/(scene unit)²; 0 beyond the reach."""
+        *_, times_r, r_min, per_log, reach = self._arrays()
+        steps = dr.log(dr.maximum(r, r_min) / r_min) * per_log
+        k = dr.select(r < r_min, 0, dr.minimum(mi.UInt32(steps) + 1, N_CELLS - 1))
+        density = dr.gather(mi.Float, times_r, k) / dr.maximum(r, 1e-3 * r_min)
+        return dr.select(r < reach, density, 0)

@@ -1,0 +1,281 @@
+"""From a pair of surface points to a query of the half-space: the one place where directions are translated."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, Protocol
+
+import drjit as dr
+import mitsuba as mi
+
+__all__ = [
+    "CosineProposals",
+    "Entry",
+    "Exit",
+    "Frame",
+    "Means",
+    "Proposals",
+    "Transport",
+    "channel_mean",
+    "cosine_above",
+    "cosine_density",
+    "lift",
+    "lifted",
+    "local_frame",
+    "mirrored",
+    "number",
+    "opposed",
+    "place",
+    "plane_query",
+    "separation",
+    "sided",
+    "turned",
+]
+
+
+class Exit(NamedTuple):
+    """Where light leaves: position, outward normal, w_o, which points away from the surface (Mitsuba's wi)."""
+
+    p: Any
+    n: Any
+    w: Any
+    sign: Any = None  # that turns the normals of the shape outwards
+    n_face: Any = None  # outward geometric normal
+
+
+class Frame(NamedTuple):
+    """Tangents and normal at a point; `t` follows x_i -> x_o."""
+
+    t: Any
+    b: Any
+    n: Any
+
+    def azimuth(self, w: Any) -> Any:
+        """Azimuth of w about the normal from t, radians."""
+
+        return dr.atan2(dr.dot(w, self.b), dr.dot(w, self.t))
+
+    def direction(self, mu: Any, phi: Any) -> Any:
+        """The unit vector with cosine mu and azimuth phi."""
+
+        sine, (s, c) = dr.safe_sqrt((1 - mu) * (1 + mu)), dr.sincos(phi)
+        return self.t * (sine * c) + self.b * (sine * s) + self.n * mu
+
+
+def number(value: float) -> Any:
+    """A number of a scene as data of a kernel, which then serves other materials and sizes too."""
+
+    return dr.opaque(mi.Float, float(value))
+
+
+def channel_mean(value: Any) -> Any:
+    """Mean over the channels of a colour.
+
+    By `drjit.mean` the number of lanes is part of a kernel, which is then compiled anew for every size of an image.
+    """
+    return dr.sum(value) / len(value)
+
+
+def place(p: Any, n: Any) -> Any:
+    """A point with its geometric normal, from which rays start clear of the surface."""
+
+    found = dr.zeros(mi.Interaction3f)
+    found.p, found.n = mi.Point3f(p), mi.Normal3f(n)
+    return found
+
+
+def local_frame(n: Any, d: Any) -> Frame:
+    """The frame of normal n whose first axis is d = x_o - x_i without its normal part; any axis where that is 0."""
+
+    flat = d - n * dr.dot(n, d)
+    length2 = dr.squared_norm(flat)
+    spare, _ = mi.coordinate_system(n)
+    t = dr.select(length2 > 1e-12 * dr.squared_norm(d), flat * dr.rsqrt(dr.maximum(length2, 1e-30)), spare)
+    t = dr.normalize(t - n * dr.dot(n, t))
+    return Frame(t, dr.cross(n, t), n)
+
+
+def separation(p_i: Any, n_i: Any, p_o: Any, n_o: Any, geometry: str) -> Any:
+    """Distance r of the half-space query, in scene units.
+
+    "distance" takes |d|, d = x_o - x_i. "tangent" takes sqrt(d² - c (d.n)²), n along n_i + n_o and c = max(n_i.n_o, 0):
+    the length of d in the common tangent plane where the normals are parallel, |d| where they are at right angles or
+    turn away from each other, as on the two sides of something thin.
+    """
+
+    d = p_o - p_i
+    if geometry == "distance":
+        return dr.norm(d)
+    middle = n_i + n_o
+    along = dr.square(dr.dot(d, middle)) / dr.maximum(dr.squared_norm(middle), 1e-12)
+    return dr.sqrt(dr.maximum(dr.squared_norm(d) - dr.maximum(dr.dot(n_i, n_o), 0) * along, 0))
+
+
+def plane_query(p_i: Any, n_i: Any, w_i: Any, out: Exit, geometry: str) -> tuple[Any, Any, Any, Any, Any]:
+    """(r, mu_i, phi_i, mu_o, phi_o) of the half-space for light from w_i at p_i that leaves at `out`.
+
+    r as in `separation`; each direction is taken against the normal of its own point, its azimuth from x_i -> x_o
+    projected there. Cosines below the horizon come out as 0, at which every model is 0.
+    """
+
+    d = out.p - p_i
+    at_i, at_o = local_frame(n_i, d), local_frame(out.n, d)
+    mu_i, mu_o = (dr.clip(dr.dot(w, n), 0, 1) for w, n in ((w_i, n_i), (out.w, out.n)))
+    r = separation(p_i, n_i, out.p, out.n, geometry)
+    return r, mu_i, at_i.azimuth(w_i), mu_o, at_o.azimuth(out.w)
+
+
+# --------------------------------------------------------------------------------------------------
+# Directions above a surface but below the horizon of its interpolated normal, so that light there is not lost.
+#
+# With the geometric normal n and the interpolated one m, a direction w with (m.w)(n.w) < 0 sees the normal
+#
+#     m' = m - 2 (m.w) w,    |m'| = 1,    m'.w = -m.w,
+#
+# which is bent just so far that w is as high above its horizon as it was below. What is drawn about m and refracted to
+# below the surface leaves along -w instead: as w runs over those directions, -w runs over the ones that m does not
+# reach, with the same |m.w|. So every direction above the surface counts once, and
+#
+#     ∫_{n.w > 0} f(|m.w|) dw = ∫_{m.w > 0} f(m.w) dw    for every f.
+#
+# What is reflected to below the surface is reflected once more, at the surface.
+
+
+def turned(n_shading: Any, n: Any) -> Any:
+    """The shading normal on the side of the geometric one: vertex normals need not agree with the winding of a face."""
+
+    return dr.select(dr.dot(n_shading, n) < 0, -n_shading, n_shading)
+
+
+def lifted(m: Any, n: Any, w: Any) -> Any:
+    """The interpolated normal m that w sees, on the side of w that the geometric normal n is on."""
+    c = dr.dot(m, w)
+    return mi.Normal3f(dr.select(c * dr.dot(n, w) < 0, m - 2 * c * w, m))
+
+
+def lift(si: Any, w: Any, active: Any = True) -> Any:
+    """The interaction with the frame that w sees, a direction in the world that becomes its `wi`."""
+    c = dr.dot(si.sh_frame.n, w)
+    below = active & (c * dr.dot(si.n, w) < 0)
+    frame = mi.Frame3f(dr.select(below, si.sh_frame.n - 2 * c * w, si.sh_frame.n))
+    si.sh_frame = dr.select(below, frame, si.sh_frame)
+    si.wi = dr.select(below, frame.to_local(w), si.wi)
+    return si
+
+
+def opposed(w: Any, n: Any) -> Any:
+    """w, or -w where that is the one above the surface of the normal n."""
+    return dr.select(dr.dot(w, n) < 0, -w, w)
+
+
+def mirrored(w: Any, n: Any) -> Any:
+    """w, mirrored at the surface of the normal n where it is below."""
+    return w - n * (2 * dr.minimum(dr.dot(w, n), 0))
+
+
+def sided(si: Any, wo: Any) -> tuple[Any, Any]:
+    """A direction of a boundary in the world, on the side of the surface that it has in the frame; if it was turned."""
+    d = si.to_world(wo)
+    side = dr.select(wo.z > 0, 1.0, -1.0)
+    n = si.n * side
+    wrong = dr.dot(d, n) < 0
+    reflects = wo.z * mi.Frame3f.cos_theta(si.wi) > 0
+    return mi.Vector3f(dr.select(wrong, dr.select(reflects, mirrored(d, n), -d), d)), wrong & reflects
+
+
+def cosine_above(m: Any, n: Any, u: Any) -> tuple[Any, Any]:
+    """A direction above the surface by the cosine to m, for a pair of uniforms, and its density |m.w| / pi."""
+    w = opposed(mi.Frame3f(m).to_world(mi.warp.square_to_cosine_hemisphere(u)), n)
+    return mi.Vector3f(w), cosine_density(m, n, w)
+
+
+def cosine_density(m: Any, n: Any, w: Any) -> Any:
+    """The density of `cosine_above`, 1/sr; 0 below the surface."""
+    return dr.select(dr.dot(w, n) > 0, dr.abs(dr.dot(w, m)) * dr.inv_pi, 0)
+
+
+# --------------------------------------------------------------------------------------------------
+# The two words the path loop knows of a model: where light may enter for an exit, and what it is worth there.
+#
+# A *proposal* draws an entry and the direction that light comes from, with densities; a *transport* gives S for an exit
+# and an entry. A half-space model laid onto the surface is one transport, a network that knows the object another.
+
+
+class Entry(NamedTuple):
+    """A point of entry: position, geometric and outward shading normal, weight 1/density (0: none was found), face."""
+
+    p: Any
+    n: Any
+    n_out: Any
+    weight: Any
+    face: Any
+
+    @property
+    def n_face(self) -> Any:
+        """The geometric normal, outwards."""
+        return turned(self.n, self.n_out)
+
+    def seen(self, w: Any) -> tuple[Any, Any]:
+        """The outward shading normal that w sees, see `object.points`, and the cosine to it; 0 below the surface."""
+        n_face = self.n_face
+        n_out = lifted(self.n_out, n_face, w)
+        return n_out, dr.select(dr.dot(w, n_face) > 0, dr.maximum(dr.dot(w, n_out), 0), 0)
+
+
+class Proposals(Protocol):
+    """Where light that leaves at an exit may have entered."""
+
+    def prepare(self, out: Exit, prepared: Any, active: Any) -> Any:
+        """What is done once for all entries of an exit; `prepared` is what the transport has made of it."""
+
+    def sample(self, out: Exit, prim_index: Any, prepared: Any, sampler: Any, active: Any) -> Entry:
+        """A point of entry; its weight is the inverse of the density of such points over the surface, (scene unit)²."""
+
+    def sample_direction(self, entry: Entry, out: Exit, u: Any) -> tuple[Any, Any]:
+        """A direction w_i that points away from the surface at the entry, for a pair of uniforms, and its density.
+
+        The density is over solid angle, 1/sr.
+        """
+
+    def pdf_direction(self, entry: Entry, out: Exit, w_i: Any) -> Any:
+        """The density of `sample_direction`, 1/sr; 0 below the surface."""
+
+
+class CosineProposals(Proposals, Protocol):
+    """Proposals whose directions are by the cosine to the interpolated normal, above the surface."""
+
+    def sample_direction(self, entry: Entry, out: Exit, u: Any) -> tuple[Any, Any]:
+        return cosine_above(entry.n_out, entry.n_face, u)
+
+    def pdf_direction(self, entry: Entry, out: Exit, w_i: Any) -> Any:
+        return cosine_density(entry.n_out, entry.n_face, w_i)
+
+
+class Transport(Protocol):
+    """S of one object, for any exit and entry.
+
+    One that knows what it is under the same light from everywhere also has `alpha(out, active)`: the share of it that
+    leaves at an exit, per channel, by orders below two and by those of S, ∫ S mu_i dw_i dA_i, and `evened`, two spectra
+    that are 1 in the channels where these are known; elsewhere they are 0. The path loop takes the mean light of the
+    sky so.
+
+    Attributes:
+        orders: "multiple" (two or more scattering events) or "total".
+        checksums: of what it has learnt, which are part of a render's identity; empty where nothing is.
+    """
+
+    orders: str
+    checksums: tuple[str, ...]
+
+    def prepare(self, out: Exit, active: Any) -> Any:
+        """What is done once for all entries of an exit, handed to `S_mu` as it is."""
+
+    def S_mu(self, prepared: Any, entry: Entry, w_i: Any, active: Any) -> Any:
+        """S(x_i, w_i; x_o, w_o) mu_i for each channel, 1/((scene unit)² sr); 0 below the horizons."""
+
+
+class Means(NamedTuple):
+    """What renders an object inside: a transport, the proposals that suit it, and how many entries an exit draws."""
+
+    transport: Transport
+    proposals: Proposals
+    entries: int = 1

@@ -1,1 +1,0 @@
-"""Where light enters an object for an exit, and what it is worth there."""
