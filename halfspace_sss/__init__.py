@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from halfspace_sss.comparison.reflectance_curves import curves
     from halfspace_sss.interface.model import BSSRDF, bssrdf, models, register_model
     from halfspace_sss.maps.store import make_maps
+    from halfspace_sss.physics.layers import Layers
     from halfspace_sss.physics.medium import Medium
     from halfspace_sss.tracing.tracer import trace
 
@@ -45,6 +46,7 @@ prefer_bundled_llvm()
 
 __all__ = [
     "BSSRDF",
+    "Layers",
     "Medium",
     "bssrdf",
     "curves",
@@ -61,6 +63,7 @@ __getattr__, __dir__ = lazy_names(
     __name__,
     {
         "BSSRDF": "interface.model",
+        "Layers": "physics.layers",
         "Medium": "physics.medium",
         "bssrdf": "interface.model",
         "curves": "comparison.reflectance_curves",

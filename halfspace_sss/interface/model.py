@@ -19,6 +19,7 @@ from halfspace_sss.interface.query import Query
 from halfspace_sss.interface.radial import RadialSampler
 from halfspace_sss.once import once
 from halfspace_sss.physics.fresnel import F_t
+from halfspace_sss.physics.layers import Layers
 from halfspace_sss.physics.medium import Medium, medium_of
 
 __all__ = ["BSSRDF", "DirectionSample", "PositionSample", "bssrdf", "model_class", "models", "register_model"]
@@ -255,8 +256,10 @@ def bssrdf(name: str, medium: Medium) -> BSSRDF:
     """The model called `name` for a medium, or for that of a material.
 
     Raises:
-        ValueError: no such model (the nearest name is given), or the model refuses the medium.
+        ValueError: no such model (the nearest name is given), or the model refuses the medium, as all refuse `Layers`.
     """
+    if isinstance(medium, Layers):
+        raise ValueError(f"medium must be one Medium for {name}, got Layers of {len(medium)}; `trace` takes those")
     return model_class(name)(medium_of(medium))
 
 

@@ -11,13 +11,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from halfspace_sss.checks import check_edges
 from halfspace_sss.physics.fresnel import F_t, mu_internal
+from halfspace_sss.physics.layers import Layers
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.progress import Progress
 from halfspace_sss.tracing.tallies import BATCHES, CellSums
 from halfspace_sss.tracing.walk import Tally, pass_seed, walk
 
-__all__ = ["PATHS_PER_LANE", "Estimate", "Pass", "estimate", "launch_shape", "walk_passes"]
+__all__ = ["PATHS_PER_LANE", "Estimate", "Pass", "checked_radii", "estimate", "launch_shape", "walk_passes"]
 
 PATHS_PER_LANE, MAX_LANES = 64, 131072
 LAUNCH_SECONDS = 0.7  # of a kernel, in which Python hears no interrupt
@@ -36,6 +38,16 @@ def estimate(samples: np.ndarray) -> Estimate:
     n = len(samples)
     value, error = samples.mean(axis=0), samples.std(axis=0, ddof=1) / math.sqrt(n)
     return Estimate(float(value), float(error)) if samples.ndim == 1 else Estimate(value, error)
+
+
+def checked_radii(radii: Sequence[float] | None, mu_i: float | str) -> np.ndarray | None:
+    """The edges of the rings as an array; ValueError if they are none or light is diffuse."""
+    if radii is None:
+        return None
+    edges = check_edges("radii", radii)
+    if mu_i == "diffuse":
+        raise ValueError("radii must be None for diffuse light, which enters everywhere, got radii")
+    return edges
 
 
 def launch_shape(n_paths: int) -> tuple[int, int, int]:
@@ -85,34 +97,42 @@ def _incidence(mu_i: float | str, lanes: int, rng: np.random.Generator) -> np.nd
 
 def walk_passes(
     types: ModuleType,
-    medium: Medium,
+    medium: Medium | Layers,
     mu_i: float | str,
     n_paths: int,
     seed: Sequence[int],
     tallies: Callable[[], list[Tally]],
     progress: Progress | None = None,
+    trace: Callable[..., tuple] = walk,
 ) -> Iterator[Pass]:
     """Trace at least `n_paths` walks, one pass after another for as long as passes are asked for.
 
     Args:
         types: Dr.Jit array module, from `backend.array_types`.
-        medium: scalar medium.
+        medium: scalar medium, or what `trace` walks in.
         mu_i: cosine of incidence outside, [0, 1], or "diffuse".
         seed: whole numbers that name this run; each pass has a stream of its own.
         tallies: makes the tallies of a pass.
         progress: called with (passes done, passes in all).
+        trace: the walk in the medium, with the arguments of `walk`.
     """
     lanes, per_lane, passes = launch_shape(n_paths)
     for done in range(1, passes + 1):
         mu, recorded = _incidence(mu_i, lanes, np.random.default_rng([*seed, done])), tallies()
-        sums, n_events = _launches(types, medium, mu, per_lane, pass_seed(*seed, done), recorded)
+        sums, n_events = _launches(types, medium, mu, per_lane, pass_seed(*seed, done), recorded, trace)
         if progress:
             progress(done, passes)
         yield Pass(recorded, sums, F_t(mu, medium.eta), per_lane, n_events)
 
 
 def _launches(
-    types: ModuleType, medium: Medium, mu: np.ndarray, per_lane: int, seed: tuple[int, int], tallies: list[Tally]
+    types: ModuleType,
+    medium: Medium | Layers,
+    mu: np.ndarray,
+    per_lane: int,
+    seed: tuple[int, int],
+    tallies: list[Tally],
+    trace: Callable[..., tuple],
 ) -> tuple[tuple, int]:
     """Sums of the tallies by lane, and events, of a pass in launches of about `LAUNCH_SECONDS`.
 
@@ -123,7 +143,7 @@ def _launches(
     mu_in, parts, n_events, first, size = mu_internal(mu, medium.eta), [], 0, 0, FIRST_LANES
     while first < len(mu):
         started, lanes = time.perf_counter(), types.Float(np.ascontiguousarray(mu_in[first : first + size]))
-        sums, events = walk(types, medium, lanes, per_lane, seed, tallies, first=first)
+        sums, events = trace(types, medium, lanes, per_lane, seed, tallies, first=first)
         parts.append(sums)
         n_events += int(events.numpy().astype(np.int64).sum())
         first += size

@@ -6,15 +6,18 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any, overload
 
 import numpy as np
 
 from halfspace_sss.backend import array_types
-from halfspace_sss.checks import check_choice, check_cosine, check_count, check_edges, check_finite, check_interval
+from halfspace_sss.checks import check_choice, check_cosine, check_count, check_finite, check_interval
 from halfspace_sss.physics.fresnel import F_t
+from halfspace_sss.physics.layers import Layers
 from halfspace_sss.physics.medium import Medium, check_scalar_medium, medium_of
 from halfspace_sss.progress import Progress
-from halfspace_sss.tracing.passes import Estimate, estimate, walk_passes
+from halfspace_sss.tracing.layers import LayerTrace, trace_layers
+from halfspace_sss.tracing.passes import Estimate, checked_radii, estimate, walk_passes
 from halfspace_sss.tracing.tallies import AngularTally, FluxTally, MomentTally, RingTally
 from halfspace_sss.tracing.walk import Tally
 
@@ -98,8 +101,16 @@ class Trace:
         return estimate(_order_sum(order, self._rings[:, 0], self._rings[:, 1]))
 
 
+@overload
+def trace(medium: Medium, *arguments: Any, **options: Any) -> Trace: ...
+
+
+@overload
+def trace(medium: Layers, *arguments: Any, **options: Any) -> LayerTrace: ...
+
+
 def trace(
-    medium: Medium,
+    medium: Medium | Layers,
     mu_i: float | str = 1.0,
     n_paths: int = 1_000_000,
     seed: int = 0,
@@ -109,15 +120,16 @@ def trace(
     backend: str = "llvm",
     relative_error: float | None = None,
     progress: Progress | None = None,
-) -> Trace:
-    """Trace walks of a beam in a half-space and return what leaves it, by scattering order.
+) -> Trace | LayerTrace:
+    """Trace walks of a beam in a half-space or in layers and return what leaves, by scattering order.
 
     Walks are in float32, so that an albedo is rounded to a multiple of 6e-8. At albedo 1 exactly, where walks of any
     length occur (P(order > N) ~ N^-1/2), few walks miss the longest and state standard errors slightly too small: over
     120 runs of 8192 walks the reflectance was 0.6 standard errors low on average, 1.4 off rms, at worst 3.6.
 
     Args:
-        medium: scalar medium (take `medium.channel(k)` of a coloured one), or a material with one channel.
+        medium: scalar medium (take `medium.channel(k)` of a coloured one), or a material with one channel; or
+            `Layers`, for a `LayerTrace`.
         mu_i: cosine of incidence outside, [0, 1], or "diffuse" for uniform radiance from above.
         n_paths: number of walks, at least 256; rounded up to whole batches of lanes.
         seed: results repeat for the same seed, backend and version.
@@ -132,6 +144,13 @@ def trace(
     Raises:
         ValueError: an argument is out of range; nothing has been traced then.
     """
+    if isinstance(medium, Layers):
+        if directions is not None:
+            raise ValueError(f"directions must be left out for layers, got {directions!r}")
+        return trace_layers(
+            medium, mu_i, n_paths, seed,
+            radii=radii, backend=backend, relative_error=relative_error, progress=progress,
+        )  # fmt: skip
     medium = medium_of(medium)
     check_scalar_medium(medium)
     check_count("n_paths", n_paths, 256)
@@ -140,7 +159,7 @@ def trace(
         mu_i = check_cosine("mu_i", mu_i)
     if relative_error is not None:
         check_interval("relative_error", relative_error, 0.0, 1.0)
-    edges = _checked_radii(radii, mu_i)
+    edges = checked_radii(radii, mu_i)
     pairs = _checked_directions(directions, mu_i)
     types, started = array_types(backend), time.perf_counter()
 
@@ -168,15 +187,6 @@ def _is_certain(rows: list[np.ndarray], relative_error: float) -> bool:
     """Whether the total reflectance of all passes so far has this relative standard error."""
     R = estimate(np.concatenate(rows)[:, :2].sum(axis=1))
     return R.standard_error <= relative_error * R.value
-
-
-def _checked_radii(radii: Sequence[float] | None, mu_i: float | str) -> np.ndarray | None:
-    if radii is None:
-        return None
-    edges = check_edges("radii", radii)
-    if mu_i == "diffuse":
-        raise ValueError("radii must be None for diffuse light, which enters everywhere, got radii")
-    return edges
 
 
 def _checked_directions(directions: Sequence[tuple[float, float]] | None, mu_i: float | str) -> np.ndarray | None:

@@ -19,7 +19,9 @@ from halfspace_sss.physics.fresnel import F_r
 from halfspace_sss.physics.medium import Medium, check_ratios
 from halfspace_sss.physics.phase import sample_hg
 
-__all__ = ["Boundary", "Scatter", "Tally", "WalkConstants", "generator", "pass_seed", "walk"]
+__all__ = [
+    "Boundary", "Scatter", "Tally", "WalkConstants", "generator", "pass_seed", "roulette", "turn", "walk",
+]  # fmt: skip
 
 # least variance x time over the media (albedo, g, eta) = (0.75, 0, 1.3), (0.99, 0, 1.5), (0.999, 0.9, 1.3)
 ROULETTE_WEIGHT, ROULETTE_BOOST = 0.3, 3.0
@@ -154,7 +156,7 @@ def generator(types: ModuleType, lanes: int, seed: tuple[int, int], first: int =
     return types.PCG32(lanes, *map(hashed, seed))
 
 
-def _turn(dx: Any, dy: Any, dz: Any, cosine: Any, azimuth: Any) -> tuple[Any, Any, Any]:
+def turn(dx: Any, dy: Any, dz: Any, cosine: Any, azimuth: Any) -> tuple[Any, Any, Any]:
     """Direction at the given polar cosine and azimuth about (dx, dy, dz); frame of Duff et al. 2017."""
     import drjit as dr
 
@@ -232,7 +234,7 @@ def walk(
     return sums, s["events"]
 
 
-def _roulette(weight: Any, order: Any) -> tuple[Any, Any]:
+def roulette(weight: Any, order: Any) -> tuple[Any, Any]:
     """Probability that a walk goes on, and its weight if it does."""
     import drjit as dr
 
@@ -274,9 +276,9 @@ def _step(s: dict, sums: tuple, m: WalkConstants, start: tuple, lane: Any, talli
     u, azimuth = rng.next_float32(), 2 * math.pi * rng.next_float32()
     cosine = 2 * u - 1 if m.isotropic else sample_hg(u, m.g)
     first = dr.select(order == 1, cosine, s["first"])
-    dx, dy, dz = _turn(dx, dy, dz, cosine, azimuth)
+    dx, dy, dz = turn(dx, dy, dz, cosine, azimuth)
 
-    survive, weight = _roulette(weight, order)
+    survive, weight = roulette(weight, order)
     ends = rng.next_float32() >= survive
 
     def renew(begin: Any, value: Any) -> Any:
