@@ -22,7 +22,7 @@ from figures.learnt.weights import FULL_GEOMETRY, training_of, with_weights
 from figures.parts.part import Part, Result, Task
 from halfspace_sss import materials
 from halfspace_sss.trade.checking.random_scenes import RandomScene, mesh_file
-from halfspace_sss.trade.measuring.results import Assessment
+from halfspace_sss.trade.results import Assessment
 
 __all__ = ["TITLE", "draw", "measured", "parts"]
 
@@ -67,9 +67,9 @@ def _name(material: str, shape: str, light: str) -> str:
 
 def measured(task: Task) -> dict[str, Any]:
     """The assessment of a scene, and an image by each way."""
+    from halfspace_sss.trade.assessing import assess_stage
     from halfspace_sss.trade.images import small_images, with_flip
-    from halfspace_sss.trade.measuring.objects import assess_stage
-    from halfspace_sss.trade.measuring.ways import stage, ways
+    from halfspace_sss.trade.ways import stage, ways
 
     prepare()
     p, learnt = task.params, with_weights(task.folder, task.needed)
@@ -92,9 +92,9 @@ def measured(task: Task) -> dict[str, Any]:
 
 def turned(task: Task) -> dict[str, Any]:
     """What the knobs bring on a scene."""
+    from figures.computing.knobs import channel_settings, entry_settings, node_settings, precision_settings
     from halfspace_sss.neural.symmetric import channels
-    from halfspace_sss.trade.knobs import channel_settings, entry_settings, node_settings, precision_settings
-    from halfspace_sss.trade.measuring.ways import stage
+    from halfspace_sss.trade.ways import stage
 
     prepare()
     p = task.params

@@ -12,9 +12,9 @@ from matplotlib.figure import Figure
 from figures.drawing.page import page
 from figures.drawing.shot import Shot, compared
 from figures.drawing.style import TEXT, TRACED, Look, look, paper, saved
-from halfspace_sss.trade.measuring.results import Assessment, ObjectTrade, WayTrade
-from halfspace_sss.trade.measuring.ways import NO_SINGLE
-from halfspace_sss.trade.picture import TradePicture
+from halfspace_sss.trade.images import TradePicture
+from halfspace_sss.trade.results import Assessment, ObjectTrade, WayTrade
+from halfspace_sss.trade.ways import NO_SINGLE
 
 __all__ = ["draw", "image_shots", "multiples", "render", "trade_panels"]
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from halfspace_sss.noise_free import short
 from halfspace_sss.trade.advice import Job, advise
-from halfspace_sss.trade.measuring.results import Assessment, ObjectTrade, WayTrade
+from halfspace_sss.trade.results import Assessment, ObjectTrade, WayTrade
 
 if TYPE_CHECKING:
     import pandas

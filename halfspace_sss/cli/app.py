@@ -30,6 +30,7 @@ _OWN = {
     "materials": "materials_command",
     "models": "models_command",
     "render": "render_command",
+    "trade": "trade_command",
     "train": "train_command",
     "validate": "validate_command",
 }

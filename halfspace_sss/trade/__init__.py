@@ -14,16 +14,16 @@ if TYPE_CHECKING:
     from halfspace_sss.trade.advice import recommend
     from halfspace_sss.trade.assessing import assess
     from halfspace_sss.trade.flat import recommend_flat
-    from halfspace_sss.trade.measuring.results import Assessment, ObjectTrade, WayTrade
+    from halfspace_sss.trade.results import Assessment, ObjectTrade, WayTrade
 
 __all__ = ["Assessment", "ObjectTrade", "WayTrade", "assess", "recommend", "recommend_flat"]
 
 __getattr__, __dir__ = lazy_names(
     __name__,
     {
-        "Assessment": "measuring.results",
-        "ObjectTrade": "measuring.results",
-        "WayTrade": "measuring.results",
+        "Assessment": "results",
+        "ObjectTrade": "results",
+        "WayTrade": "results",
         "assess": "assessing",
         "recommend": "advice",
         "recommend_flat": "flat",

@@ -20,8 +20,7 @@ from halfspace_sss.noise_free import short
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED
 from halfspace_sss.trade.assessing import assess
-from halfspace_sss.trade.html import html_table
-from halfspace_sss.trade.measuring.results import Assessment, ObjectTrade, WayTrade, samples_for
+from halfspace_sss.trade.results import Assessment, ObjectTrade, WayTrade, html_table, samples_for
 
 __all__ = ["Advice", "ObjectAdvice", "Option", "Job", "advise", "recommend"]
 

@@ -2,19 +2,34 @@
 
 from __future__ import annotations
 
+import math
+import warnings
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 from halfspace_sss.checks import check_count, check_interval, renamed
+from halfspace_sss.extensions import LEARNERS, offered
 from halfspace_sss.progress import NamedProgress
+from halfspace_sss.rendering.object.shape import survey
+from halfspace_sss.rendering.scenes.causes import first_cause
 from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED
+from halfspace_sss.trade.exits import Exits, visible_exits
 from halfspace_sss.trade.images import with_flip
-from halfspace_sss.trade.measuring.objects import EXITS, assess_stage
-from halfspace_sss.trade.measuring.results import Assessment
-from halfspace_sss.trade.measuring.ways import Way, stage, ways
-from halfspace_sss.trade.refining import assess_for
+from halfspace_sss.trade.results import Assessment, ObjectTrade, WayTrade, samples_for
+from halfspace_sss.trade.sampling import Sampled, clock, first_sample, sample_more, warm_up
+from halfspace_sss.trade.statistics import mean_square, ratio_of_means, relative_variance, seeded
+from halfspace_sss.trade.ways import Stage, Way, stage, ways
 
-__all__ = ["assess"]
+__all__ = ["EXITS", "assess", "assess_for", "assess_stage", "contenders", "training_seconds"]
+
+EXITS = 160  # few: their choice makes 6 % of a bias uncertain, and each gets the more samples
+TRACED_SHARE = 0.4  # of the time, for the walks that all ways are compared with
+FIRST_SHARE = 0.3  # of the time, for the look at all ways
+LEAST_SHARE = 0.25  # of the time, for the second look, however long the first one took
+DOUBT = 2.0  # standard errors
+CLOSE = 1.3  # times the cost of the cheapest way, up to which another may turn out cheaper
+TRACED = (0.3, 0.85)  # least and most of the time of the second look for walks
 
 
 def assess(
@@ -81,3 +96,196 @@ def _chosen(models: Sequence[str] | None) -> list[Way]:
         return ways()
     chosen = [Way.of(name) for name in models]
     return [Way(PATH_TRACED), *(way for way in dict.fromkeys(chosen) if way.model != PATH_TRACED)]
+
+
+# --------------------------------------------------------------------------------------------------
+# All ways on all objects of a scene that is made ready.
+
+
+def assess_stage(
+    on: Stage,
+    chosen: Sequence[Way],
+    *,
+    seconds: float = 4.0,
+    samples: int | None = None,
+    sensor: int = 0,
+    seed: int = 0,
+    exits: int = EXITS,
+    traced: float = TRACED_SHARE,
+    progress: NamedProgress | None = None,
+) -> Assessment:
+    """As `assessing.assess`, of a scene that is made ready.
+
+    With `samples` of each exit instead of seconds; `traced` is the share of the time for walks.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # they are heard when the ways are made ready again
+        for walks in (True, False):
+            warm_up(on, [way for way in chosen if (way.model == PATH_TRACED) == walks])
+    started = clock()
+    seen = visible_exits(on.scene, on.shapes, sensor, exits, seeded(seed, 41))
+    objects, compiled, compiling = [], 0.0, 0.0
+    for k, points in enumerate(seen):
+        if points is None:
+            objects.append(_unseen(on, k))
+            continue
+
+        def tell(way: str, done: int, k: int = k) -> None:
+            if progress:
+                progress(f"{on.names[k]}, {way}", k * len(chosen) + done, len(seen) * len(chosen))
+
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            sampled = _object(on, k, points, chosen, (seconds, samples, traced), seeded(seed, 42, k), tell)
+            heard = [" ".join(str(w.message).split()) for w in caught]
+        walks = sampled[chosen[0]]
+        rows = tuple(_row(on, k, way, found, walks) for way, found in sampled.items())
+        compiled += sum(row.compilation for row in rows)
+        compiling += sum(found.compiling for found in sampled.values() if isinstance(found, Sampled))
+        radiance = tuple(float(v) for v in walks.estimate.mean.mean(axis=1))
+        notes = tuple(dict.fromkeys(heard))
+        objects.append(ObjectTrade(on.names[k], _mfp(on, k), points.share, points.pixels, radiance, rows, notes))
+    return Assessment(tuple(objects), clock() - started - compiling, compiled, seed)
+
+
+def _unseen(on: Stage, k: int) -> ObjectTrade:
+    note = f"object {on.names[k]!r} is hardly seen by the camera, if at all: nothing can be told of it"
+    return ObjectTrade(on.names[k], _mfp(on, k), 0.0, 0.0, (), (), (note,))
+
+
+def _mfp(on: Stage, k: int) -> tuple[float, float]:
+    """Mean free paths across an object."""
+    size = survey(on.shapes[k]).size * on.mm_per_unit
+    thickness = [size * float(m.sigma_t) for m in on.shapes[k].bsdf().inside.channels()]
+    return min(thickness), max(thickness)
+
+
+def _object(
+    on: Stage,
+    k: int,
+    points: Exits,
+    chosen: Sequence[Way],
+    budget: tuple[float, int | None, float],
+    seed: int,
+    tell: Any,
+) -> dict[Way, Sampled | str]:
+    """What all ways say of an object, or why they refuse it."""
+    seconds, samples, traced = budget
+    sampled: dict[Way, Sampled | str] = {}
+    end = clock() + seconds
+    for done, way in enumerate(chosen):
+        tell(way.name, done)
+        started = clock()
+        share = traced if way.model == PATH_TRACED and len(chosen) > 1 else 1 / (len(chosen) - done)
+        try:
+            found = first_sample(on, way, points, seeded(seed, done), k)
+            end, started = end + found.compiling, started + found.compiling
+            left = share * (end - started) - (clock() - started)
+            sample_more(on, way, points, found, seeded(seed, done), seconds=left, samples=samples)
+            sampled[way] = found
+        except (ValueError, RuntimeError) as error:
+            if way.model == PATH_TRACED:
+                raise ValueError(first_cause(error)) from error
+            sampled[way] = first_cause(error)
+    return sampled
+
+
+def _row(on: Stage, k: int, way: Way, found: Sampled | str, traced: Sampled) -> WayTrade:
+    if isinstance(found, str):
+        return WayTrade(way.name, refusal=found)
+    a, b = found.estimate, traced.estimate
+    exact = way.model == PATH_TRACED
+    bias2 = (0.0, 0.0) if exact else mean_square(a, b)
+    ratios = [(1.0, 0.0) if exact else ratio_of_means(a, b, c) for c in range(len(b.mean))]
+    variance = relative_variance(a, b)
+    row = WayTrade(
+        way.name, *bias2, tuple(r[0] for r in ratios), tuple(r[1] for r in ratios), *variance, found.seconds,
+        a.samples * a.mean.shape[1], found.preparation, found.compilation, 0.0, found.memory,
+    )  # fmt: skip
+    return replace(row, training=training_seconds(on.scene, on.shapes[k].id(), way.model))
+
+
+def training_seconds(scene: Any, object: str, model: str) -> float:
+    """Seconds that the weights of a model of an object took to learn; 0 for what needs no training.
+
+    A learner of the group `halfspace_sss.learners` tells them by a function `cost(scene, object)`.
+    """
+    for name, found in offered(LEARNERS):
+        if name == model and callable(getattr(found, "cost", None)):
+            return float(found.cost(scene, object))
+    return 0.0
+
+
+# --------------------------------------------------------------------------------------------------
+# A second look at the ways on which the choice hangs: those that might be the cheapest to keep a tolerance.
+
+
+def assess_for(
+    on: Stage,
+    chosen: Sequence[Way],
+    tolerance: float,
+    *,
+    seconds: float = 4.0,
+    sensor: int = 0,
+    seed: int = 0,
+    exits: int = EXITS,
+    progress: NamedProgress | None = None,
+) -> Assessment:
+    """As `assess_stage`, with most of the time for ways that could be the cheapest to keep a tolerance."""
+    how = {"sensor": sensor, "exits": exits, "progress": progress}
+    first = assess_stage(on, chosen, seconds=FIRST_SHARE * seconds, seed=seed, **how)
+    seen = [o for o in first.objects if o.ways and not o.is_dark]
+    if not seen:
+        return first
+    names = {name for o in seen for name in contenders(o, tolerance)}
+    few = [way for way in chosen if way.name in names or way.model == PATH_TRACED]
+    traced = sum(_traced_share(o, names) for o in seen) / len(seen)
+    left = max(seconds - first.seconds / len(seen), LEAST_SHARE * seconds)
+    again = assess_stage(on, few, seconds=left, seed=seeded(seed, 71), traced=traced, **how)
+    objects = tuple(_merged(a, b) for a, b in zip(first.objects, again.objects))
+    spent = (first.seconds + again.seconds, first.compilation + again.compilation)
+    return Assessment(objects, *spent, first.seed)
+
+
+def contenders(found: ObjectTrade, tolerance: float) -> list[str]:
+    """Ways beside walks that may keep the tolerance, and may be the cheapest that does."""
+    rows = [row for row in found.ways if not row.refusal and row.variance >= 0]
+    best = min((samples_for(row, tolerance) * row.seconds for row in rows), default=math.inf)
+    return [row.way for row in rows if row.way != PATH_TRACED and _at_best(row, tolerance) < CLOSE * best]
+
+
+def _at_best(row: WayTrade, tolerance: float) -> float:
+    """Seconds for a pixel if the bias is as small as it may be."""
+    left = tolerance**2 - max(row.bias2 - DOUBT * row.bias2_error, 0.0)
+    return max(row.variance / left, 1.0) * row.seconds if left > 0 else math.inf
+
+
+def _traced_share(found: ObjectTrade, names: set[str]) -> float:
+    """Of the time, by which noise of differences is least: each way has sqrt(V t), walks serve all others at once."""
+    noise = [math.sqrt(r.variance * r.seconds) for r in found.ways if r.way in names and not r.refusal]
+    walks = math.sqrt(len(noise) * found.traced.variance * found.traced.seconds)
+    return min(max(walks / (walks + sum(noise)), TRACED[0]), TRACED[1]) if noise and walks > 0 else TRACED[1]
+
+
+def _merged(a: ObjectTrade, b: ObjectTrade) -> ObjectTrade:
+    """Both looks as one; they have exits and samples of their own."""
+    if not a.ways or not b.ways:
+        return a
+    second = {row.way: row for row in b.ways if not row.refusal}
+    walks = (a.traced, b.traced)
+    rows = [_mean(row, second[row.way], walks) if row.way in second and not row.refusal else row for row in a.ways]
+    return replace(a, ways=tuple(rows))
+
+
+def _mean(a: WayTrade, b: WayTrade, walks: tuple[WayTrade, WayTrade]) -> WayTrade:
+    """The mean of two rows, weighed by what noise their samples leave: errors grow with values, which they'd favour."""
+    V, V_walks = a.variance + b.variance, walks[0].variance + walks[1].variance
+    noise = [V / row.samples + V_walks / walk.samples for row, walk in zip((a, b), walks)]
+    u = noise[1] / (noise[0] + noise[1]) if sum(noise) > 0 else 0.5
+    ratio = tuple(u * x + (1 - u) * y for x, y in zip(a.ratio, b.ratio))
+    return replace(
+        a, bias2=u * a.bias2 + (1 - u) * b.bias2, bias2_error=math.hypot(u * a.bias2_error, (1 - u) * b.bias2_error),
+        ratio=ratio, ratio_error=tuple(math.hypot(u * x, (1 - u) * y) for x, y in zip(a.ratio_error, b.ratio_error)),
+        variance=0.5 * V, variance_error=0.5 * math.hypot(a.variance_error, b.variance_error),
+        seconds=min(a.seconds, b.seconds), samples=a.samples + b.samples, memory=max(a.memory, b.memory),
+    )  # fmt: skip

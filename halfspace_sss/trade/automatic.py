@@ -20,9 +20,9 @@ from halfspace_sss.provenance import provenance, write_atomically
 from halfspace_sss.rendering.object.registry import AUTO, model_names
 from halfspace_sss.rendering.scenes.identity import scene_hash
 from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED
-from halfspace_sss.trade.measuring.objects import assess_stage
-from halfspace_sss.trade.measuring.results import ObjectTrade, WayTrade
-from halfspace_sss.trade.measuring.ways import Stage, Way
+from halfspace_sss.trade.assessing import assess_stage
+from halfspace_sss.trade.results import ObjectTrade, WayTrade
+from halfspace_sss.trade.ways import Stage, Way
 
 __all__ = ["ENVIRONMENT_VARIABLE", "choices_folder", "choose", "picked"]
 

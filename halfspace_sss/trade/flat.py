@@ -22,7 +22,7 @@ from halfspace_sss.interface.model import models as registered
 from halfspace_sss.neural.symmetric import channels
 from halfspace_sss.noise_free import NoiseFree
 from halfspace_sss.physics.medium import Medium, medium_of
-from halfspace_sss.trade.html import html_table
+from halfspace_sss.trade.results import html_table
 
 __all__ = ["FlatAdvice", "FlatOption", "recommend_flat"]
 

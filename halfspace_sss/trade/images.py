@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from halfspace_sss.extensions import renderer
 from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED
-from halfspace_sss.trade.measuring.results import Assessment
-from halfspace_sss.trade.measuring.sampling import radiance
-from halfspace_sss.trade.measuring.seeds import seeded
-from halfspace_sss.trade.measuring.ways import Stage, Way
+from halfspace_sss.trade.results import Assessment
+from halfspace_sss.trade.sampling import radiance
+from halfspace_sss.trade.statistics import seeded
+from halfspace_sss.trade.ways import Stage, Way, stage
 
-__all__ = ["small_images", "with_flip"]
+__all__ = ["TradePicture", "picture_of", "small_images", "with_flip"]
 
 SIDE, SPP = 40, 32
 
@@ -108,3 +109,49 @@ def with_flip(
         rows = tuple(replace(w, flip=values.get(w.way), flip_noise=noise) if not w.refusal else w for w in o.ways)
         objects.append(replace(o, ways=rows))
     return replace(found, objects=tuple(objects))
+
+
+# --------------------------------------------------------------------------------------------------
+# What the figure of a trade is drawn from: an entry point "trade" of `halfspace_sss.figures` takes it.
+
+
+PAGE_SIDE = 128  # of the images of the page
+
+
+@dataclass(frozen=True, eq=False)
+class TradePicture:
+    """A trade to be drawn.
+
+    Args:
+        title: of the scene.
+        found: what was measured.
+        tolerance: that was asked.
+        sentences: of the recommendation.
+        images: linear radiance (H, W, 3) by name of the way, path traced first.
+    """
+
+    title: str
+    found: Assessment
+    tolerance: float
+    sentences: tuple[str, ...] = ()
+    images: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+
+def picture_of(
+    file: Path, found: Assessment, tolerance: float, sentences: Sequence[str], how: Mapping[str, Any]
+) -> TradePicture:
+    """The picture of a recommendation for a scene file, whose images are rendered for it.
+
+    Args:
+        file: the scene.
+        found: what was measured.
+        tolerance: that was asked.
+        sentences: of the recommendation.
+        how: sensor, seed and parameters, as for `assess`.
+    """
+    names = dict.fromkeys(w.way for o in found.objects for w in o.ways if not w.refusal)
+    images: Mapping[str, np.ndarray] = {}
+    if names:
+        on = stage(file, how["parameters"])
+        images = small_images(on, [Way.of(name) for name in names], how["sensor"], how["seed"], PAGE_SIDE, SPP)
+    return TradePicture(file.stem, found, tolerance, tuple(sentences), images)

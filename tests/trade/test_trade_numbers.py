@@ -7,13 +7,13 @@ import math
 import numpy as np
 import pytest
 
+from halfspace_sss.cli import trade
 from halfspace_sss.trade import recommend
 from halfspace_sss.trade.advice import Job, advise
+from halfspace_sss.trade.assessing import contenders
 from halfspace_sss.trade.automatic import picked
-from halfspace_sss.trade.commands import trade
-from halfspace_sss.trade.measuring.results import Assessment, ObjectTrade, WayTrade, samples_for
-from halfspace_sss.trade.measuring.statistics import FIREFLIES, Estimate, mean_square, relative_variance
-from halfspace_sss.trade.refining import contenders
+from halfspace_sss.trade.results import Assessment, ObjectTrade, WayTrade, samples_for
+from halfspace_sss.trade.statistics import FIREFLIES, Estimate, mean_square, relative_variance
 
 SEEDS, EXITS, SAMPLES = 400, 48, 12
 

@@ -16,10 +16,10 @@ from halfspace_sss.physics.fresnel import F_r
 from halfspace_sss.rendering.object.registry import model_names
 from halfspace_sss.trade import assess, recommend
 from halfspace_sss.trade.checking.random_scenes import random_scene, write_scene
+from halfspace_sss.trade.exits import visible_exits
 from halfspace_sss.trade.images import small_images
-from halfspace_sss.trade.measuring.exits import visible_exits
-from halfspace_sss.trade.measuring.sampling import first_sample, sample_more
-from halfspace_sss.trade.measuring.ways import Way, stage
+from halfspace_sss.trade.sampling import first_sample, sample_more
+from halfspace_sss.trade.ways import Way, stage
 
 mi = pytest.importorskip("mitsuba")
 QUICK = {"seconds": 0.4, "flip": False, "exits": 64}
@@ -144,8 +144,8 @@ def test_an_instance_is_refused_in_a_sentence() -> None:
 
 
 def test_a_point_through_which_a_lamp_would_be_seen_is_left_out() -> None:
-    from halfspace_sss.trade.measuring.exits import visible_exits
-    from halfspace_sss.trade.measuring.ways import stage
+    from halfspace_sss.trade.exits import visible_exits
+    from halfspace_sss.trade.ways import stage
 
     lit = scene({"sigma_s": 9.5, "sigma_a": 0.5, "eta": 1.0})
     lamp = {"type": "sphere", "center": [0, 0, -5.0], "radius": 0.4}
@@ -192,7 +192,7 @@ def test_auto_is_chosen_of_all_models_once_kept_and_found_again(tmp_path: Path) 
 @pytest.mark.parametrize(("share", "spp", "samples"), [(0.0, 4, 64), (0.5, 256, 1365), (1.0, 1024, 2048)])
 def test_the_choice_takes_its_share_of_the_samples_of_an_image(share: float, spp: int, samples: int) -> None:
     from halfspace_sss.trade.automatic import _samples
-    from halfspace_sss.trade.measuring.ways import stage
+    from halfspace_sss.trade.ways import stage
 
     asked = scene(model="auto")
     asked["sensor"]["sampler"] = {"type": "independent", "sample_count": spp}
@@ -200,7 +200,7 @@ def test_the_choice_takes_its_share_of_the_samples_of_an_image(share: float, spp
 
 
 def test_half_precision_of_a_network_is_measured_beside_single() -> None:
-    from halfspace_sss.trade.knobs import precision_settings
+    from figures.computing.knobs import precision_settings
 
     single, half = precision_settings(Medium.from_albedo(0.9, 1.0, 0.0, 1.3), events=2e5)
     assert (single.value, single.cost, half.value) == ("float32", 1.0, "float16")
@@ -287,8 +287,8 @@ def test_without_an_argument_the_shipped_table_is_shown() -> None:
 def test_the_figure_and_the_page_are_drawn() -> None:
     pytest.importorskip("matplotlib")
     from figures.drawing.trade_plot import multiples, render
-    from halfspace_sss.trade.measuring.results import Assessment, ObjectTrade, WayTrade
-    from halfspace_sss.trade.picture import TradePicture
+    from halfspace_sss.trade.images import TradePicture
+    from halfspace_sss.trade.results import Assessment, ObjectTrade, WayTrade
 
     numbers = {"ratio": (1.0,), "ratio_error": (0.0,), "variance": 1.0, "variance_error": 0.1, "samples": 9}
     ways = [WayTrade("path_traced", 0.0, 0.0, seconds=1e-5, **numbers)]

@@ -10,13 +10,13 @@ from typing import Any
 from halfspace_sss.provenance import provenance, write_atomically
 from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED
 from halfspace_sss.trade.advice import Job, advise
+from halfspace_sss.trade.assessing import assess_for
 from halfspace_sss.trade.automatic import picked
 from halfspace_sss.trade.checking.random_scenes import RandomScene, random_scene, write_scene
 from halfspace_sss.trade.checking.truth import long_run
-from halfspace_sss.trade.measuring.results import Assessment, WayTrade
-from halfspace_sss.trade.measuring.seeds import seeded
-from halfspace_sss.trade.measuring.ways import Stage, Way, stage
-from halfspace_sss.trade.refining import assess_for
+from halfspace_sss.trade.results import Assessment, WayTrade
+from halfspace_sss.trade.statistics import seeded
+from halfspace_sss.trade.ways import Stage, Way, stage
 
 __all__ = ["WAYS", "check_scene", "outcome", "z_values"]
 

@@ -14,10 +14,10 @@ from typing import Any
 
 from halfspace_sss.provenance import provenance, write_atomically
 from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED
-from halfspace_sss.trade.measuring.objects import assess_stage
-from halfspace_sss.trade.measuring.results import Assessment, ObjectTrade, WayTrade
-from halfspace_sss.trade.measuring.seeds import seeded
-from halfspace_sss.trade.measuring.ways import Stage, Way
+from halfspace_sss.trade.assessing import assess_stage
+from halfspace_sss.trade.results import Assessment, ObjectTrade, WayTrade
+from halfspace_sss.trade.statistics import seeded
+from halfspace_sss.trade.ways import Stage, Way
 
 __all__ = ["long_run", "mean_of"]
 

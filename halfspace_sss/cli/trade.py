@@ -29,7 +29,7 @@ from halfspace_sss.provenance import check_folder
 
 if TYPE_CHECKING:
     from halfspace_sss.trade.advice import Advice, Job
-    from halfspace_sss.trade.measuring.results import ObjectTrade, WayTrade
+    from halfspace_sss.trade.results import ObjectTrade, WayTrade
 
 __all__ = ["SHIPPED", "object_table", "trade_command"]
 
@@ -144,10 +144,12 @@ def _scene(file: Path, job: Job, how: dict[str, Any], out: Path) -> None:
 def _drawn(file: Path, advice: Advice, how: dict[str, Any]) -> dict[str, bytes]:
     """The figure and the page, if what draws them is installed."""
     from halfspace_sss.extensions import renderer
-    from halfspace_sss.trade.picture import picture_of
+    from halfspace_sss.trade.images import picture_of
 
     draw = renderer("trade")
-    return draw(picture_of(file, advice, how)) if draw else {}
+    if not draw:
+        return {}
+    return draw(picture_of(file, advice.assessment, advice.tolerance, str(advice).splitlines(), how))
 
 
 def object_table(found: ObjectTrade) -> Any:

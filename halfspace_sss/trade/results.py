@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
+from html import escape
 from typing import TYPE_CHECKING, Any
 
 from halfspace_sss.noise_free import Z_UPPER, NoiseFree
@@ -12,7 +14,7 @@ from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED
 if TYPE_CHECKING:
     import pandas
 
-__all__ = ["Z_UPPER", "Assessment", "ObjectTrade", "WayTrade", "samples_for"]
+__all__ = ["Z_UPPER", "Assessment", "ObjectTrade", "WayTrade", "html_table", "samples_for"]
 
 
 @dataclass(frozen=True)
@@ -199,3 +201,12 @@ def _known(key: str, value: Any) -> Any:
     if key in ("ratio", "ratio_error"):
         return tuple(math.nan if v is None else v for v in value)
     return math.nan if value is None and key not in ("flip", "flip_noise") else value
+
+
+def html_table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table of plain text."""
+
+    def row(cells: Sequence[str], kind: str) -> str:
+        return "<tr>" + "".join(f"<{kind}>{escape(str(cell))}</{kind}>" for cell in cells) + "</tr>"
+
+    return "<table>" + row(headings, "th") + "".join(row(cells, "td") for cells in rows) + "</table>"

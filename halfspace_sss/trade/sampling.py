@@ -12,10 +12,9 @@ import numpy as np
 
 from halfspace_sss.backend import busy_threads
 from halfspace_sss.rendering.object.settings import variant_channels
-from halfspace_sss.trade.measuring.exits import Exits
-from halfspace_sss.trade.measuring.seeds import seeded
-from halfspace_sss.trade.measuring.statistics import Estimate
-from halfspace_sss.trade.measuring.ways import Stage, Way
+from halfspace_sss.trade.exits import Exits
+from halfspace_sss.trade.statistics import Estimate, seeded
+from halfspace_sss.trade.ways import Stage, Way
 
 __all__ = ["Sampled", "clock", "first_sample", "radiance", "sample_more", "warm_up"]
 
