@@ -28,5 +28,6 @@ tank_ml (the published dilution), note, and a table [sources] that tells for eac
 
 from halfspace_sss.materials.material import Material
 from halfspace_sss.materials.registry import load, names, register, table
+from halfspace_sss.materials.spectra import RGBMedium, SpectralMedium, read_spectra
 
-__all__ = ["Material", "load", "names", "register", "table"]
+__all__ = ["Material", "RGBMedium", "SpectralMedium", "load", "names", "read_spectra", "register", "table"]
