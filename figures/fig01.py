@@ -9,19 +9,23 @@ import numpy as np
 
 from figures.beyond.objects import VIEWS, View, scene
 from figures.computing.contenders import OF_OBJECTS
-from figures.computing.denoise import guides
-from figures.computing.environments import environment_file
-from figures.computing.model_inputs import weight_files
-from figures.computing.scenes import prepare
-from figures.computing.tone import stops_of
+from figures.computing.images import guides, stops_of
+from figures.computing.learnt import (
+    FULL_GEOMETRY,
+    TRAIN_SECONDS,
+    object_parts,
+    train_modelled,
+    training_of,
+    weight_files,
+    with_weights,
+)
+from figures.computing.scenes import environment_file, prepare
 from figures.drawing.error_tables import label
 from figures.drawing.image_grid import image_grid
 from figures.drawing.page import page
 from figures.drawing.shot import Shot, compared
 from figures.drawing.style import paper, saved
-from figures.learnt.training import TRAIN_SECONDS, object_parts, train_modelled
-from figures.learnt.weights import FULL_GEOMETRY, training_of, with_weights
-from figures.modelling.grid import TISSUES, tissue
+from figures.modelling.objects import TISSUES, tissue
 from figures.parts.part import Part, Result, Task
 
 __all__ = ["TITLE", "draw", "parts", "shown"]

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from figures.computing.learnt_objects import SHAPES, shape_of
+from figures.computing.learnt import SHAPES, shape_of
 from figures.computing.scenes import BUNNY, prepare
 from figures.drawing.style import TEXT, paper, saved
 from figures.parts.part import Part, Result, Task

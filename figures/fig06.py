@@ -7,15 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from figures.computing.environments import ENVIRONMENTS, environment, environment_file
-from figures.computing.scenes import BUNNY, bunny_scene, prepare
-from figures.computing.tone import stops_of
+from figures.computing.images import stops_of
+from figures.computing.learnt import FULL_GEOMETRY, TRAIN_SECONDS, train_scan, training_of, with_weights
+from figures.computing.scenes import BUNNY, ENVIRONMENTS, bunny_scene, environment, environment_file, prepare
 from figures.drawing.image_grid import image_grid
 from figures.drawing.page import page
 from figures.drawing.shot import Shot, compared
 from figures.drawing.style import paper, saved
-from figures.learnt.training import TRAIN_SECONDS, train_scan
-from figures.learnt.weights import FULL_GEOMETRY, training_of, with_weights
 from figures.parts.part import Part, Result, Task
 
 __all__ = ["TITLE", "draw", "parts", "seen"]

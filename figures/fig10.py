@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from figures.computing.model_inputs import accepting, weight_files
+from figures.computing.learnt import accepting, weight_files
 from figures.parts.part import Part, Result, Task
 from halfspace_sss.comparison.curve_set import Curve, CurveSet
 from halfspace_sss.comparison.reflectance_curves import FIG10_THETA_I, curves

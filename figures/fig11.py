@@ -8,18 +8,15 @@ from typing import Any
 import numpy as np
 
 from figures.computing.contenders import MODELS, OF_OBJECTS, VOLUMES, WALK, contender, long_walk
-from figures.computing.denoise import check_denoiser, denoised, guides
-from figures.computing.model_inputs import weight_files
+from figures.computing.images import check_denoiser, denoised, guides, noise_of, stops_of
+from figures.computing.learnt import FULL_GEOMETRY, TRAIN_SECONDS, train_scan, training_of, weight_files, with_weights
 from figures.computing.scenes import BUNNY, prepare
 from figures.computing.timed import Timed, alternating, pass_size
-from figures.computing.tone import noise_of, stops_of
 from figures.drawing.error_tables import label
 from figures.drawing.image_grid import image_grid
 from figures.drawing.page import page
 from figures.drawing.shot import FLIP, RELATIVE_MSE, Shot, compared
 from figures.drawing.style import paper, saved
-from figures.learnt.training import TRAIN_SECONDS, train_scan
-from figures.learnt.weights import FULL_GEOMETRY, training_of, with_weights
 from figures.parts.part import Part, Result, Task, unmodelled
 from halfspace_sss import materials
 

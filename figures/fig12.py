@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from figures.computing.learnt_objects import shape_of, weights_in
+from figures.computing.images import stops_of
+from figures.computing.learnt import shape_of, weights_in
 from figures.computing.scenes import BUNNY, bunny_scene, prepare
-from figures.computing.tone import stops_of
 from figures.drawing.image_grid import image_grid
 from figures.drawing.page import page
 from figures.drawing.shot import Shot, compared

@@ -7,12 +7,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from figures.computing.contenders import OF_OBJECTS
-from figures.computing.model_inputs import weight_files
+from figures.computing.learnt import FULL_GEOMETRY, TRAIN_SECONDS, train_scan, training_of, weight_files
 from figures.computing.scenes import BUNNY, MATERIALS
 from figures.drawing.error_tables import in_markdown, label
 from figures.fig09 import rendered
-from figures.learnt.training import TRAIN_SECONDS, train_scan
-from figures.learnt.weights import FULL_GEOMETRY, training_of
 from figures.parts.part import Part, Result
 from halfspace_sss import materials
 

@@ -21,7 +21,7 @@ FLOORS = {  # of each package, a room may import those to its left; "" is what l
         "trade.checking", "cli", "trade.commands",
     ],
     "full_geometry": ["object", "models", "learning", "neural_shape", ""],
-    "figures": ["parts", "studies", "modelling", "computing", "learnt", "drawing", "beyond", ""],
+    "figures": ["parts", "studies", "modelling", "computing", "drawing", "beyond", ""],
 }  # fmt: skip
 HIDING = {"bssrdf", "curves", "models", "trace"}  # public functions: a folder of that name would hide one
 LONGEST_BODY = 60

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,22 +10,29 @@ import numpy as np
 
 from figures.beyond.modelled import MODELLED, long_modelled, modelled_contender
 from figures.computing.contenders import MODELS, OF_OBJECTS, VOLUMES, WALK, contender, long_walk
-from figures.computing.denoise import guides
-from figures.computing.furnace import furnace, furnace_models
-from figures.computing.model_inputs import weight_files
-from figures.computing.sampling_cost import split
+from figures.computing.images import guides
+from figures.computing.learnt import (
+    FULL_GEOMETRY,
+    TRAIN_SECONDS,
+    TRAINING,
+    accepting,
+    train_modelled,
+    train_scan,
+    training_of,
+    weight_files,
+    with_weights,
+)
 from figures.computing.scenes import BUNNY, MATERIALS, SCANS, prepare
 from figures.computing.timed import Timed, alternating, rendered
 from figures.drawing import error_tables
-from figures.learnt.training import TRAIN_SECONDS, train_modelled, train_scan
-from figures.learnt.weights import FULL_GEOMETRY, TRAINING, training_of, with_weights
-from figures.modelling.grid import TISSUES, tissue
-from figures.modelling.scene_parts import VARYING
+from figures.modelling.objects import TISSUES, VARYING, tissue
 from figures.parts.part import Part, Result, Task
 from halfspace_sss import materials
+from halfspace_sss.backend import kernel_seconds
 from halfspace_sss.physics.medium import Medium
 
-__all__ = ["TITLE", "draw", "errors", "measured", "parts"]
+__all__ = ["TITLE", "draw", "errors", "furnace", "furnace_models", "furnace_scene", "measured", "parts", "split"]
+
 
 TITLE = "time to equal error against Mitsuba's volume path tracer, time per sample, white furnace"
 OBJECTS = MODELLED
@@ -204,3 +211,123 @@ def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
     }
     files["equal_error.md"] = error_tables.markdown(tables["errors"], tables["sampling"], tables["furnace"])
     return files
+
+
+ALBEDO, ETA = 1 - 1e-6, 1.5
+RADIUS = 1000.0  # mean free paths: what a half-space lets out farther away than the sphere is wide is below 1 %
+WALK_SPP = 4  # nearly every walk comes back with weight 1
+
+
+def furnace_models() -> list[str]:
+    """Names of the models that there are for the medium of the furnace."""
+    return accepting(Medium.from_albedo(ALBEDO, 1.0, 0.0, ETA))
+
+
+def furnace_scene(model: str, size: int, radius: float = RADIUS) -> Any:
+    """The Mitsuba scene of the furnace: the middle of the sphere fills the image.
+
+    Args:
+        model: of the BSSRDF, or "translucent_walk".
+        size: pixels of the square image.
+        radius: of the sphere, mean free paths.
+    """
+    import mitsuba as mi
+
+    from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED, load_scene
+
+    at = mi.ScalarTransform4f()
+    view = at.look_at([0, 0, 2 * radius], [0, 0, 0], [0, 1, 0]) @ at.scale([0.9 * radius, 0.9 * radius, 1])
+    film = {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}}
+    surface = {"type": "translucent", "sigma_s": ALBEDO, "sigma_a": 1 - ALBEDO, "g": 0.0, "eta": ETA}
+    scene = {
+        "type": "scene",
+        "integrator": {"type": "bssrdf"},
+        "sensor": {"type": "orthographic", "to_world": view, "film": film},
+        "sky": {"type": "constant", "radiance": 1.0},
+        "sphere": {"type": "sphere", "radius": radius, "bsdf": surface},
+    }
+    return load_scene(scene, PATH_TRACED if model == WALK else model)
+
+
+def furnace(task: Task) -> dict[str, Any]:
+    """Mean radiance of the sphere and its standard error."""
+    import mitsuba as mi
+
+    prepare()
+    p = task.params
+    spp = min(p["spp"], WALK_SPP) if p["model"] == WALK else p["spp"]
+    image = np.array(mi.render(furnace_scene(p["model"], p["size"]), spp=spp, seed=3), dtype=np.float64)[..., :3]
+    pixels = image.mean(axis=2).ravel()
+    return {"mean": float(pixels.mean()), "standard error": float(pixels.std(ddof=1) / np.sqrt(pixels.size))}
+
+
+STEPS = ("entries", "visibility", "evaluation")
+
+
+def split(task: Task) -> dict[str, Any]:
+    """Seconds per million samples of each step and model, each step as a kernel of its own over the same lanes.
+
+    The models take turns; of the repeats the fastest counts, which is the one that nothing else delayed.
+    """
+    prepare()
+    p = task.params
+    steps = {model: _steps(contender(model, p["material"], 64, "small light"), p["lanes"]) for model in p["models"]}
+    best = {(model, step): np.inf for model in p["models"] for step in STEPS}
+    for k in range(p["repeats"] + 1):  # the first compiles
+        for model, step in best:
+            seconds = kernel_seconds(steps[model][step])
+            best[model, step] = min(best[model, step], seconds) if k else np.inf
+        task.progress(k + 1, p["repeats"] + 1)
+    scale = 1e6 / p["lanes"]
+    return {
+        "rows": [{"model": model, **{step: scale * best[model, step] for step in STEPS}} for model in p["models"]],
+        "lanes": p["lanes"],
+    }
+
+
+def _steps(scene: Any, n: int) -> dict[str, Callable[[], Any]]:
+    """For each step what it computes, from inputs that are in memory."""
+    import drjit as dr
+    import mitsuba as mi
+
+    from halfspace_sss.rendering.object.points import cosine_above, place
+    from halfspace_sss.rendering.paths.path_loop import exit_at
+
+    (body,) = scene.integrator().prepare(scene)
+    si, sampler = _seen(scene, n), mi.load_dict({"type": "independent"})
+    sampler.seed(11, n)
+    out, face = exit_at(body, si), mi.UInt32(si.prim_index)
+    prepared = body.transport.prepare(out, mi.Bool(True))
+    where = body.proposals.prepare(out, prepared, mi.Bool(True))
+    entry = body.proposals.sample(out, face, where, sampler, mi.Bool(True))
+    direction, _ = cosine_above(entry.n_out, entry.n_face, sampler.next_2d())  # the same for all models
+    dr.eval(tuple(out), face, tuple(entry), direction, sampler)  # named tuples are passed over
+    ray = place(entry.p, entry.n).spawn_ray(direction)
+    dr.eval(ray)
+    found = entry.weight > 0
+    dr.eval(found)
+
+    def evaluated() -> Any:
+        return body.transport.S_mu(prepared, entry, direction, found)
+
+    return {
+        "entries": lambda: tuple(body.proposals.sample(out, face, where, sampler.clone(), mi.Bool(True))),
+        "visibility": lambda: scene.ray_intersect_preliminary(ray, coherent=False, active=found),
+        "evaluation": evaluated,
+    }
+
+
+def _seen(scene: Any, n: int) -> Any:
+    """Points of the object where n rays of the camera meet it."""
+    import drjit as dr
+    import mitsuba as mi
+
+    rng, sensor, found = np.random.default_rng(5), scene.sensors()[0], np.zeros((2, 0), dtype=np.float32)
+    while found.shape[1] < n:
+        place = rng.random((2, 2 * n)).astype(np.float32)
+        ray, _ = sensor.sample_ray(0.0, 0.5, mi.Point2f(place), mi.Point2f(0.5))
+        found = np.hstack([found, place[:, np.array(scene.ray_intersect_preliminary(ray).is_valid())]])
+    ray, _ = sensor.sample_ray(0.0, 0.5, mi.Point2f(found[:, :n]), mi.Point2f(0.5))
+    si = scene.ray_intersect(ray)
+    dr.eval(si)
+    return si

@@ -8,9 +8,9 @@ from typing import Any
 
 from figures.beyond.objects import VIEWS
 from figures.computing.contenders import WALK, long_passes, ready
+from figures.computing.learnt import object_parts
 from figures.computing.scenes import prepare
-from figures.learnt.training import object_parts
-from figures.modelling.grid import tissue
+from figures.modelling.objects import tissue
 from figures.parts.part import Task, unmodelled
 from halfspace_sss.checks import check_choice
 from halfspace_sss.provenance import check_folder
@@ -29,7 +29,7 @@ def modelled_scene(
     """A modelled object on its own, as a dict for `scene_files.load_scene`, under its name.
 
     Args:
-        name: a name in `scene_parts.OBJECTS`.
+        name: a name in `modelling.objects.OBJECTS`.
         resolution, seed: of its surface.
         size: pixels of the square image.
         lights: "even sky", radiance 1 from everywhere, or "small light": of the candle its flame, else a lamp.

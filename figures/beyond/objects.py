@@ -7,16 +7,22 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from figures.computing.denoise import check_denoiser, denoised, guides
-from figures.computing.environments import environment, environment_file
-from figures.computing.long_render import long_render
-from figures.computing.scenes import prepare
+from figures.computing.images import check_denoiser, denoised, guides
+from figures.computing.scenes import environment, environment_file, long_render, prepare
 from figures.drawing.image_grid import image_grid
 from figures.drawing.page import page
 from figures.drawing.shot import Shot
 from figures.drawing.style import paper, saved
-from figures.modelling.grid import TISSUES, Grid
-from figures.modelling.scene_parts import OBJECTS, VARYING, Varying, candle_parts, make_varying, varying_parts
+from figures.modelling.objects import (
+    OBJECTS,
+    TISSUES,
+    VARYING,
+    Grid,
+    Varying,
+    candle_parts,
+    make_varying,
+    varying_parts,
+)
 from figures.parts.part import Part, Result, Task
 from halfspace_sss.provenance import check_folder
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from figures.computing import contenders
-from figures.computing.model_inputs import weight_files
+from figures.computing.learnt import weight_files
 from figures.computing.scenes import prepare
 from figures.drawing.style import COLUMN, look, paper, saved
 from figures.parts.part import Part, Result, Task

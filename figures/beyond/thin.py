@@ -8,10 +8,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from figures.computing.long_render import long_render
-from figures.computing.model_inputs import weight_files
-from figures.computing.scenes import DRAGON, SCANS, prepare
-from figures.computing.tone import noise_of, stops_of
+from figures.computing.images import noise_of, stops_of
+from figures.computing.learnt import weight_files
+from figures.computing.scenes import DRAGON, SCANS, long_render, prepare
 from figures.drawing.error_tables import label
 from figures.drawing.image_grid import image_grid
 from figures.drawing.page import page

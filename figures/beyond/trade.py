@@ -11,14 +11,12 @@ from typing import Any
 import numpy as np
 
 from figures.computing.contenders import OF_OBJECTS
-from figures.computing.model_inputs import weight_files
+from figures.computing.learnt import FULL_GEOMETRY, TRAIN_SECONDS, train_scan, training_of, weight_files, with_weights
 from figures.computing.scenes import BUNNY, MATERIALS, MM_PER_UNIT, bunny_scene, prepare
 from figures.drawing import trade_tables
 from figures.drawing.page import page
 from figures.drawing.style import paper, saved
 from figures.drawing.trade_plot import image_shots, multiples
-from figures.learnt.training import TRAIN_SECONDS, train_scan
-from figures.learnt.weights import FULL_GEOMETRY, training_of, with_weights
 from figures.parts.part import Part, Result, Task
 from halfspace_sss import materials
 from halfspace_sss.trade.checking.random_scenes import RandomScene, mesh_file

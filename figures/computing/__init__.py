@@ -1,1 +1,1 @@
-"""What figures compute: scenes, contenders in equal time, images and their errors."""
+"""What figures compute: scenes, contenders in equal time, trainings, images and their errors."""

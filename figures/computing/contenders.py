@@ -6,17 +6,18 @@ from typing import Any
 
 import numpy as np
 
-from figures.computing.long_render import long_render
-from figures.computing.scenes import prepare, scan_scene
+from figures.computing.scenes import long_render, prepare, scan_scene
 from figures.parts.part import Task, unmodelled
+from halfspace_sss import bssrdf
 from halfspace_sss.neural.symmetric import channels
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.object.registry import model_names
 
 __all__ = [
-    "MODELS", "OF_OBJECTS", "RR_DEPTHS", "VOLUMES", "WALK", "contender", "long_passes", "long_walk", "ready",
-    "volume",
+    "MODELS", "OF_OBJECTS", "RR_DEPTHS", "VOLUMES", "WALK", "contender", "long_passes", "long_walk",
+    "ready", "volume",
 ]  # fmt: skip
+
 
 MODELS = ("standard_dipole", "better_dipole", "directional_dipole", "photon_beam_diffusion", "neural")
 OF_OBJECTS = tuple(name for name in ("neural_shape", "full_geometry") if name in model_names())
@@ -68,7 +69,6 @@ def ready(method: str, description: dict[str, Any], name: str, medium: Medium, b
     Raises:
         ValueError: no such method.
     """
-    from halfspace_sss import bssrdf
     from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED, load_scene
 
     if method in VOLUMES:

@@ -1,4 +1,4 @@
-"""The scenes of the figures: one object, a small light and surroundings, for any material and model."""
+"""The scenes of the figures: one object, a small light and surroundings; environment maps; long renders of them."""
 
 from __future__ import annotations
 
@@ -8,12 +8,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from figures.parts.part import Task
+from figures.parts.store import read_exr
 from halfspace_sss.checks import check_choice
+from halfspace_sss.provenance import check_folder
 
 __all__ = [
-    "BUNNY", "DRAGON", "MATERIALS", "MM_PER_UNIT", "SCANS", "Scan", "bunny_scene", "prepare", "scan_scene",
-    "surroundings",
+    "BUNNY", "DRAGON", "ENVIRONMENTS", "MATERIALS", "MM_PER_UNIT", "SCANS", "Scan", "bunny_scene", "environment",
+    "environment_file", "long_render", "prepare", "scan_scene", "surroundings",
 ]  # fmt: skip
+
 
 BUNNY = Path(__file__).parent.parent / "assets" / "bunny.ply"
 DRAGON = BUNNY.with_name("dragon.ply")
@@ -125,3 +129,50 @@ def surroundings(height: int = 64) -> np.ndarray:
 def _soft(x: np.ndarray, centre: float, half: float) -> np.ndarray:
     """1 inside, 0 outside, with an edge of 0.1."""
     return np.clip((half - np.abs(x - centre)) / 0.1 + 0.5, 0, 1)
+
+
+ENVIRONMENTS = ("studio", "sunset", "forest")
+
+
+def environment_file(name: str) -> Path:
+    """The file of an environment map, for `Part.inputs`; ValueError if there is none of that name."""
+    if name not in ENVIRONMENTS:
+        raise ValueError(f"environment must be one of {', '.join(ENVIRONMENTS)}, got {name!r}")
+    return Path(__file__).parents[1] / "assets" / f"{name}.exr"
+
+
+def environment(name: str, scale: float = 1.0, turn: float = 0.0) -> dict[str, Any]:
+    """An environment map as an emitter for `mitsuba.load_dict`.
+
+    Args:
+        name: "studio" (two lamps in a dark hall), "sunset" (a square by the sea, the sun just below the horizon) or
+            "forest" (a clearing by day).
+        scale: of its radiance.
+        turn: about y, degrees.
+
+    Raises:
+        ValueError: there is none of that name.
+    """
+    import mitsuba as mi
+
+    image = np.maximum(read_exr(environment_file(name))[..., :3], 0)  # the file has negative pixels
+    to_world = mi.ScalarTransform4f().rotate([0, 1, 0], turn)
+    return {"type": "envmap", "bitmap": mi.Bitmap(image), "scale": scale, "to_world": to_world}
+
+
+def long_render(task: Task, scene: Any, spp_per_pass: int, passes: int) -> dict[str, Any]:
+    """The image of a scene with its variance, seconds and samples; what is done of it is kept in the task's folder.
+
+    Args:
+        task: whose parameter "seed" is that of the first pass.
+        scene: Mitsuba scene.
+        spp_per_pass, passes: samples per pixel of each pass, and their number.
+    """
+    from halfspace_sss.rendering.scenes import reference
+
+    found = reference.render(
+        scene, check_folder(task.folder) / "passes.exr", spp_per_pass=spp_per_pass, seed=task.params["seed"],
+        passes=passes, progress=lambda so_far: task.progress(so_far.passes, passes),
+    )  # fmt: skip
+    image, variance = (v[..., :3].astype(np.float32) for v in (found.mean, found.variance))
+    return {"image": image, "variance": variance, "seconds": found.seconds, "spp": found.spp}

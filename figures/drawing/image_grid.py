@@ -16,7 +16,7 @@ from matplotlib.font_manager import FontProperties
 from matplotlib.patches import Rectangle
 from matplotlib.textpath import TextPath
 
-from figures.computing.tone import srgb
+from figures.computing.images import srgb
 from figures.drawing.shot import FLIP, Shot, absent
 from figures.drawing.style import TEXT
 

@@ -9,14 +9,19 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from importlib import resources
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from matplotlib import colormaps  # without it there is no page, which must be known before one is drawn
 
-from figures.computing.tone import srgb
+from figures.computing.images import denoised, guides, srgb
 from figures.drawing.shot import FLIP, RELATIVE_MSE, Shot
 
-__all__ = ["page"]
+if TYPE_CHECKING:
+    from halfspace_sss.rendering.scenes.picture import Picture
+
+__all__ = ["page", "render"]
+
 
 DIFFERENCE_SPAN = 1.0  # relative difference at the ends of the colours
 MAPS = {
@@ -113,8 +118,6 @@ def _shot(shot: Shot, exposure: float) -> dict[str, Any]:
 
 def _colors(name: str) -> np.ndarray:
     """The 256 colours of a colour map, (256, 3) bytes."""
-    from matplotlib import colormaps
-
     return np.round(255 * colormaps[name](np.arange(256))[:, :3]).astype(np.uint8)
 
 
@@ -134,3 +137,20 @@ def _png(pixels: np.ndarray, palette: np.ndarray | None = None) -> str:
         image.putpalette(palette.tobytes())
     image.save(buffer, "PNG", optimize=True)
     return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode()
+
+
+def render(picture: Picture) -> dict[str, bytes]:
+    """{"html": page}, and with `denoise` {"denoised.exr", "denoised.png"}; on the page both images can be flipped.
+
+    Raises:
+        ValueError: the image is not finite or below 0.
+        BackendError: the denoiser is not installed.
+    """
+    image = np.maximum(picture.image, 0.0)  # filters with negative lobes
+    shots, files = [Shot("rendered", image, dict(picture.numbers))], {}
+    if picture.denoise:
+        clean, seconds = denoised(image, *guides(picture.scene, sensor=picture.sensor))
+        shots.append(Shot("denoised", clean, {"denoising, s": f"{seconds:.2g}"}))
+        files = {"denoised.exr": picture.exr(clean), "denoised.png": picture.png(clean)}
+    text = page(picture.title, {picture.title: shots}, caption=picture.caption, lower_is_better=())
+    return {"html": text.encode(), **files}

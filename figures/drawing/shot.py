@@ -7,8 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from figures.computing.metrics import flip_ldr, relative_mse
-from figures.computing.tone import check_image, luminance, srgb
+from figures.computing.images import check_image, flip_ldr, luminance, relative_mse, srgb
 
 __all__ = ["FLIP", "RELATIVE_MSE", "Shot", "absent", "compared"]
 
@@ -63,7 +62,7 @@ def compared(
         numbers: further columns, e.g. {"time, s": 12.5}; they come after FLIP and relMSE.
 
     Raises:
-        ValueError: the images cannot be compared; see `figures.computing.metrics`.
+        ValueError: the images cannot be compared; see `figures.computing.images`.
     """
     image = np.maximum(image, 0)
     relative = relative_mse(reference, image, mask=mask, floor=FLOOR)

@@ -99,7 +99,7 @@ def _list(plans: list[Plan], out: Path) -> None:
 
 def _time(p: Plan) -> str:
     """What the missing parts will take, and how many of them nobody has measured."""
-    from figures.parts.projection import duration
+    from figures.parts.runner import duration
 
     if not p.missing:
         return "none"
@@ -129,7 +129,7 @@ def _compute(plans: list[Plan], out: Path) -> None:
 
 
 def _announce_all(plans: list[Plan]) -> None:
-    from figures.parts.projection import duration
+    from figures.parts.runner import duration
 
     for p in plans:
         _announce(p)
@@ -140,8 +140,7 @@ def _announce_all(plans: list[Plan]) -> None:
 
 
 def _compute_one(p: Plan, out: Path) -> None:
-    from figures.parts.projection import duration
-    from figures.parts.runner import compute
+    from figures.parts.runner import compute, duration
 
     started = time.perf_counter()
     with Bar(p.name) as bar:

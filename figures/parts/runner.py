@@ -1,24 +1,68 @@
-"""Computes the parts of a figure that changed, keeps them, and draws the figure from them."""
+"""Computes the parts of a figure that changed, tells how long that will take, and draws the figure from them."""
 
 from __future__ import annotations
 
 import importlib
 import json
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import median
 from types import ModuleType
+from typing import NamedTuple
 
 import figures
 from figures.parts.part import QUALITIES, Part, Result, Task, check_quality, keys_of
-from figures.parts.projection import Projected, projected
 from figures.parts.store import DamagedPartError, PartStore
 from halfspace_sss.checks import check_choice
 from halfspace_sss.progress import ProgressText
 from halfspace_sss.provenance import check_folder, provenance, write_together
 
-__all__ = ["Plan", "compute", "draw", "figure", "plan"]
+__all__ = ["Plan", "Projected", "compute", "draw", "duration", "figure", "plan", "projected"]
+
+
+class Projected(NamedTuple):
+    """Seconds that a part will take and where that is known from; None and "" if nothing like it was measured."""
+
+    seconds: float | None
+    source: str
+
+
+def projected(parts: Sequence[Part], stores: Sequence[tuple[str, PartStore]]) -> dict[str, Projected]:
+    """Seconds of each part, scaled by its work, by name.
+
+    Args:
+        parts: whose time is asked for.
+        stores: (what it is called, where parts were measured), the most telling one first. A part of the same name is
+            taken before others of the same function, of which the median counts.
+    """
+    same: dict[tuple[str, str], tuple[float, str]] = {}
+    kinds: dict[str, list[float]] = {}
+    for label, store in stores:
+        for slug, kind, work, seconds in store.seconds():
+            same.setdefault((slug, kind), (seconds / work, f"the same part in {label}"))
+            kinds.setdefault(kind, []).append(seconds / work)
+    found = {}
+    for part in parts:
+        if (part.slug, part.kind) in same:
+            rate, source = same[part.slug, part.kind]
+            found[part.name] = Projected(rate * part.work, source)
+        elif part.kind in kinds:
+            found[part.name] = Projected(median(kinds[part.kind]) * part.work, "like parts")
+        else:
+            found[part.name] = Projected(None, "")
+    return found
+
+
+def duration(seconds: float) -> str:
+    """Seconds as people say them: "40 s", "12 min", "3.5 h"."""
+    if seconds < 99.5:
+        return f"{seconds:.2g} s" if seconds < 9.95 else f"{seconds:.0f} s"
+    if seconds < 99.5 * 60:
+        return f"{seconds / 60:.0f} min"
+    return f"{seconds / 3600:.1f} h"
+
 
 STEPS = 10_000  # of the bar
 Say = Callable[[str], None]

@@ -11,10 +11,9 @@ import pandas
 import pytest
 
 from figures.beyond import equal_error
+from figures.beyond.equal_error import STEPS, furnace, furnace_models
 from figures.beyond.modelled import MODELLED, modelled_contender, modelled_scene
 from figures.computing.contenders import MODELS, VOLUMES, WALK, contender
-from figures.computing.furnace import furnace, furnace_models
-from figures.computing.sampling_cost import STEPS
 from figures.computing.scenes import MM_PER_UNIT, prepare
 from figures.computing.timed import Timed, rendered
 from figures.drawing import error_tables

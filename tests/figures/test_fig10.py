@@ -10,7 +10,7 @@ import pytest
 
 import halfspace_sss
 from figures import fig10
-from figures.computing.model_inputs import accepting, weight_files
+from figures.computing.learnt import accepting, weight_files
 from figures.parts.part import Result, Task
 
 WALKS, MODELS = 8192, ["better_dipole", "neural"]

@@ -14,7 +14,7 @@ import pytest
 from figures import fig11
 from figures.computing import timed
 from figures.computing.contenders import VOLUMES, contender
-from figures.computing.denoise import denoised, guides
+from figures.computing.images import denoised, guides
 from figures.computing.timed import alternating, pass_size
 from figures.drawing.error_tables import label
 from figures.parts.part import Part, Result, Task

@@ -13,9 +13,8 @@ pytest.importorskip("torch")
 pytest.importorskip("flip_evaluator")
 
 from figures import fig01, fig06, fig09, fig11, table1  # noqa: E402
-from figures.computing import scenes  # noqa: E402
+from figures.computing import learnt, scenes  # noqa: E402
 from figures.computing.contenders import OF_OBJECTS, VOLUMES  # noqa: E402
-from figures.learnt import weights  # noqa: E402
 from figures.parts import runner  # noqa: E402
 from figures.parts.part import Result, keys_of  # noqa: E402
 from full_geometry.learning import training  # noqa: E402
@@ -119,7 +118,7 @@ def test_weights_of_another_training_are_not_found(small: None, tmp_path: Path) 
     scenes.prepare()
     scene = scenes.bunny_scene("ketchup", 8)
     scene["integrator"]["train_seconds"] = 0.0
-    with weights.with_weights(tmp_path, {}), pytest.raises(ValueError, match="must be trained for full_geometry"):
+    with learnt.with_weights(tmp_path, {}), pytest.raises(ValueError, match="must be trained for full_geometry"):
         load_scene(scene, MODEL)
 
 

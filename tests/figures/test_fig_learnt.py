@@ -13,7 +13,7 @@ import pytest
 pytest.importorskip("matplotlib")
 
 from figures import fig03, fig08, fig12  # noqa: E402
-from figures.computing.learnt_objects import SHAPES, weights_in  # noqa: E402
+from figures.computing.learnt import SHAPES, weights_in  # noqa: E402
 from figures.parts.part import Result, keys_of  # noqa: E402
 from halfspace_sss.neural.trained import weights_folder  # noqa: E402
 

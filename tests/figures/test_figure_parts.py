@@ -15,10 +15,9 @@ from figures.drawing.image_grid import image_grid
 from figures.drawing.page import page
 from figures.drawing.shot import Shot, absent, compared
 from figures.drawing.style import paper, saved
-from figures.parts.exr import exr_bytes, read_exr
 from figures.parts.part import Part, Result, Task, keys_of
-from figures.parts.projection import duration
-from figures.parts.runner import compute, draw
+from figures.parts.runner import compute, draw, duration
+from figures.parts.store import exr_bytes, read_exr
 
 
 def shade(task: Task) -> dict[str, Any]:

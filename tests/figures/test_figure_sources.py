@@ -15,8 +15,7 @@ import pytest
 
 import figures
 from figures.computing.contenders import long_walk
-from figures.parts.part import Task, unmodelled
-from figures.parts.sources import PACKAGES, modules_of
+from figures.parts.part import PACKAGES, Task, modules_of, unmodelled
 from halfspace_sss.interface.model import model_class
 from halfspace_sss.rendering.object.registry import object_transport
 

@@ -18,7 +18,7 @@ pytest.importorskip("torch")
 pytest.importorskip("igl")
 
 from figures.modelling.candle import make_candle  # noqa: E402
-from figures.modelling.scene_parts import FLAME_RADIANCE  # noqa: E402
+from figures.modelling.objects import FLAME_RADIANCE  # noqa: E402
 from full_geometry.learning.fitting import Recipe  # noqa: E402
 from full_geometry.learning.model_errors import LIGHTS  # noqa: E402
 from full_geometry.learning.training import Trained, train  # noqa: E402

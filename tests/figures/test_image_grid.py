@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from figures.computing.tone import srgb
+from figures.computing.images import srgb
 from figures.drawing.image_grid import Crop, image_grid
 from figures.drawing.shot import Shot, absent, compared
 from figures.drawing.style import paper, saved

@@ -10,8 +10,7 @@ import flip_evaluator
 import numpy as np
 import pytest
 
-from figures.computing.metrics import TONE_CURVES, exposure_range, flip_hdr, flip_ldr, relative_mse
-from figures.computing.tone import srgb
+from figures.computing.images import TONE_CURVES, exposure_range, flip_hdr, flip_ldr, relative_mse, srgb
 
 METRICS = [flip_ldr, flip_hdr, relative_mse]
 
@@ -142,7 +141,7 @@ def test_what_ends_the_process_in_the_evaluator_is_only_a_refusal_here() -> None
         "print('alive')"
     )
     ended = code.format(module="flip_evaluator", name="evaluate", more=", 'HDR'")
-    refused = code.format(module="figures.computing.metrics", name="flip_hdr", more="")
+    refused = code.format(module="figures.computing.images", name="flip_hdr", more="")
     runs = [subprocess.run([sys.executable, "-c", c], capture_output=True, text=True) for c in (ended, refused)]
     assert "alive" not in runs[0].stdout
     assert runs[1].stdout == "alive\n", runs[1].stderr

@@ -11,8 +11,8 @@ igl = pytest.importorskip("igl")
 import mitsuba as mi  # noqa: E402
 
 from figures.beyond import objects as pictures  # noqa: E402
-from figures.computing import environments  # noqa: E402
-from figures.modelling import candle, grid, scene_parts  # noqa: E402
+from figures.computing import scenes  # noqa: E402
+from figures.modelling import candle, objects  # noqa: E402
 from figures.parts import runner  # noqa: E402
 from full_geometry.learning import meshes  # noqa: E402
 
@@ -22,19 +22,19 @@ CELLS = 24
 
 @pytest.fixture(scope="module")
 def made() -> dict[str, meshes.Mesh]:
-    found = {name: scene_parts.make_varying(name, LOW, 8).mesh for name in scene_parts.VARYING}
+    found = {name: objects.make_varying(name, LOW, 8).mesh for name in objects.VARYING}
     return {**found, "candle": candle.make_candle(LOW).wax}
 
 
 @pytest.fixture(scope="module")
-def media() -> dict[str, grid.Grid]:
-    return {name: scene_parts.make_varying(name, 24, CELLS).grid for name in scene_parts.VARYING}
+def media() -> dict[str, objects.Grid]:
+    return {name: objects.make_varying(name, 24, CELLS).grid for name in objects.VARYING}
 
 
 def fingerprint(name: str, seed: int, resolution: int = 24) -> np.ndarray:
     if name == "candle":
         return candle.make_candle(resolution, seed).wax.vertices
-    return scene_parts.make_varying(name, resolution, 8, seed).mesh.vertices
+    return objects.make_varying(name, resolution, 8, seed).mesh.vertices
 
 
 def sphere(p: np.ndarray) -> np.ndarray:
@@ -80,15 +80,15 @@ def test_a_mesh_with_a_triangle_without_area_is_refused() -> None:
 
 def test_a_resolution_below_the_least_is_refused() -> None:
     with pytest.raises(ValueError, match="resolution must be a whole number >= 8"):
-        scene_parts.make_varying("meat", 4)
+        objects.make_varying("meat", 4)
 
 
 def test_an_unknown_object_is_refused() -> None:
     with pytest.raises(ValueError, match="object must be one of"):
-        scene_parts.make_varying("teapot")
+        objects.make_varying("teapot")
 
 
-@pytest.mark.parametrize("chosen", scene_parts.OBJECTS)
+@pytest.mark.parametrize("chosen", objects.OBJECTS)
 def test_points_inside_and_outside_are_told_apart_by_the_winding_of_the_mesh(chosen: str, made: dict) -> None:
     found = made[chosen]
     rng = np.random.default_rng(3)
@@ -97,15 +97,15 @@ def test_points_inside_and_outside_are_told_apart_by_the_winding_of_the_mesh(cho
     assert np.abs(winding - np.round(winding)).max() < 1e-6 and {0, 1} == set(np.round(winding))
 
 
-@pytest.mark.parametrize("chosen", scene_parts.OBJECTS)
+@pytest.mark.parametrize("chosen", objects.OBJECTS)
 def test_an_object_is_the_same_for_the_same_seed_and_another_for_another(chosen: str) -> None:
     first, again, other = fingerprint(chosen, 1), fingerprint(chosen, 1), fingerprint(chosen, 2)
     assert np.array_equal(first, again) and (first.shape != other.shape or not np.array_equal(first, other))
 
 
-@pytest.mark.parametrize("chosen", scene_parts.OBJECTS)
+@pytest.mark.parametrize("chosen", objects.OBJECTS)
 def test_another_resolution_changes_the_volume_by_less_than_2_percent(chosen: str, made: dict) -> None:
-    fine = candle.make_candle(HIGH).wax if chosen == "candle" else scene_parts.make_varying(chosen, HIGH, 8).mesh
+    fine = candle.make_candle(HIGH).wax if chosen == "candle" else objects.make_varying(chosen, HIGH, 8).mesh
     assert made[chosen].volume == pytest.approx(fine.volume, rel=0.02)
 
 
@@ -125,11 +125,11 @@ def test_the_wick_does_not_touch_the_wax() -> None:
     assert candle.wax_distance(found.wick.vertices, 0, drips).min() > 0.02
 
 
-@pytest.mark.parametrize("chosen", scene_parts.VARYING)
+@pytest.mark.parametrize("chosen", objects.VARYING)
 def test_a_grid_holds_no_value_beyond_those_of_its_tissues(chosen: str, media: dict) -> None:
     found = media[chosen]
-    known = scene_parts._MODELS[chosen][0](0).tissues(np.zeros((1, 3)))
-    tissues = [grid.tissue(t).medium for t in known]
+    known = objects._MODELS[chosen][0](0).tissues(np.zeros((1, 3)))
+    tissues = [objects.tissue(t).medium for t in known]
     low, high = (pick([m.sigma_t[0] for m in tissues]) for pick in (min, max))
     assert low * (1 - 1e-5) <= found.sigma_t.min() and found.sigma_t.max() <= high * (1 + 1e-5)
     for k in range(3):
@@ -161,10 +161,10 @@ def test_a_ply_file_holds_the_mesh_that_mitsuba_is_given(made: dict, tmp_path) -
         assert np.allclose(a, b, atol=1e-5)
 
 
-@pytest.mark.parametrize("chosen", environments.ENVIRONMENTS)
+@pytest.mark.parametrize("chosen", scenes.ENVIRONMENTS)
 def test_an_environment_has_no_negative_pixel(chosen: str) -> None:
     mi.set_variant("llvm_ad_rgb")
-    assert np.array(environments.environment(chosen)["bitmap"]).min() >= 0
+    assert np.array(scenes.environment(chosen)["bitmap"]).min() >= 0
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from figures.computing.tone import srgb
+from figures.computing.images import srgb
 from figures.drawing.page import page
 from figures.drawing.shot import Shot, absent, compared
 

@@ -190,7 +190,7 @@ def test_nobody_is_told_of_means_where_the_medium_is_learnt(trained: Trained) ->
 
 @pytest.mark.slow
 def test_an_object_of_the_figures_can_be_learnt_and_rendered(folder: Path, tmp_path: Path) -> None:
-    from figures.modelling.scene_parts import learnable_parts, make_varying
+    from figures.modelling.objects import learnable_parts, make_varying
 
     parts = learnable_parts(make_varying("meat", 16, 16), tmp_path)
     parts["meat"]["bsdf"] |= {"orders": "multiple", "reflection": False}

@@ -1,4 +1,4 @@
-"""How far an image is from its reference: FLIP for displayed and for linear images, and relative squared error.
+"""Images of figures: exposure and sRGB encoding, FLIP and relative squared error, denoising.
 
 Everything is checked here before the evaluator of FLIP is called, because it ends the whole process on bad input.
 """
@@ -6,16 +6,74 @@ Everything is checked here before the evaluator of FLIP is called, because it en
 from __future__ import annotations
 
 import math
+import time
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from figures.computing.tone import check_image, luminance
-from halfspace_sss.checks import check_choice, check_count, check_interval
+from halfspace_sss.backend import BackendError
+from halfspace_sss.checks import check_choice, check_count, check_finite, check_interval
 
 __all__ = [
-    "PIXELS_PER_DEGREE", "Difference", "exposure_range", "flip_hdr", "flip_ldr", "relative_mse",
+    "LARGEST", "PIXELS_PER_DEGREE", "Difference", "check_denoiser", "check_image", "denoised", "exposure_range",
+    "flip_hdr", "flip_ldr", "guides", "luminance", "mean_flip", "noise_of", "relative_mse", "srgb", "stops_of",
 ]  # fmt: skip
+
+
+LARGEST = 1e12  # radiance; squares of it, as tone mapping takes them, still fit float32
+
+
+def srgb(image: np.ndarray, exposure: float = 0.0) -> np.ndarray:
+    """A linear image as a display shows it: times 2^exposure, clipped to [0, 1], encoded by the sRGB curve.
+
+    Args:
+        image: linear radiance, any shape, finite and >= 0.
+        exposure: stops.
+
+    Raises:
+        ValueError: exposure is not finite.
+    """
+    check_finite("exposure", exposure)
+    x = np.clip(np.asarray(image, dtype=np.float32) * np.float32(2.0**exposure), 0.0, 1.0)
+    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 1e-9) ** (1 / 2.4) - 0.055).astype(np.float32)
+
+
+def stops_of(reference: np.ndarray, mask: np.ndarray) -> float:
+    """Stops, to a tenth, at which the 97th percentile of the pixels of a mask comes to 1."""
+    return float(np.round(-np.log2(np.percentile(reference[mask], 97)), 1))
+
+
+def noise_of(image: np.ndarray, variance: np.ndarray, mask: np.ndarray) -> float:
+    """Root mean square of the standard error of the pixels of a mask, over that of the image."""
+    return float(np.sqrt(variance[mask].sum() / np.sum(image[mask] ** 2)))
+
+
+def luminance(image: np.ndarray) -> np.ndarray:
+    """Luminance (H, W) of a linear image (H, W, 3) with the primaries of sRGB."""
+    return np.asarray(image, dtype=np.float64) @ np.array([0.2126, 0.7152, 0.0722])
+
+
+def check_image(name: str, image: np.ndarray, largest: float = LARGEST) -> np.ndarray:
+    """The image as contiguous float32 of shape (H, W, 3).
+
+    Raises:
+        ValueError: the shape is another, a value is not finite, below 0 or above `largest`.
+    """
+    try:
+        pixels = np.asarray(image, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name} must be an array of numbers, got {type(image).__name__}") from error
+    if pixels.ndim != 3 or pixels.shape[2] != 3 or 0 in pixels.shape:
+        raise ValueError(f"{name} must have the shape (height, width, 3), got {pixels.shape}")
+    bad = ~((pixels >= 0) & (pixels <= largest))
+    if bad.any():
+        y, x, channel = (int(k) for k in np.argwhere(bad)[0])
+        raise ValueError(
+            f"{name} must be finite and in [0, {largest:g}], got {float(pixels[y, x, channel])!r} "
+            f"at row {y}, column {x}, channel {channel} ({int(bad.sum())} such values)"
+        )
+    return np.ascontiguousarray(pixels, dtype=np.float32)
+
 
 PIXELS_PER_DEGREE = 67.0206  # FLIP's own: a 0.69 m wide display of 3840 pixels seen from 0.7 m
 SMALLEST_SIDE = 4  # pixels
@@ -43,7 +101,7 @@ def flip_ldr(
     """FLIP between two images as displayed: what an observer sees when flipping between them, 0 to 1.
 
     Args:
-        reference, test: sRGB-encoded images (H, W, 3) in [0, 1], as `figures.computing.tone.srgb` makes them.
+        reference, test: sRGB-encoded images (H, W, 3) in [0, 1], as `figures.computing.images.srgb` makes them.
         mask: (H, W), true where a pixel counts for the mean; the map covers all.
         pixels_per_degree: of visual angle; the default is FLIP's.
 
@@ -180,3 +238,60 @@ def _checked_range(exposures: tuple[float, float]) -> tuple[float, float]:
 
 def _check_tone_mapper(tone_mapper: str) -> None:
     check_choice("tone_mapper", tone_mapper, TONE_CURVES)
+
+
+GUIDE_SPP = 64
+
+
+def check_denoiser() -> Any:
+    """The package `mitsuba_oidn`; BackendError with what to install where there is none."""
+    try:
+        import mitsuba_oidn
+    except ImportError as error:
+        raise BackendError('denoising needs mitsuba-oidn: pip install "halfspace-sss[figures]"') from error
+    return mitsuba_oidn
+
+
+def guides(scene: Any, spp: int = GUIDE_SPP, sensor: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Cover of each pixel by objects, as an albedo (H, W, 3), and mean shading normal (H, W, 3), both float32.
+
+    What is below a translucent surface has no albedo of its own: covered pixels get 1.
+    """
+    import mitsuba as mi
+
+    aov = mi.load_dict({"type": "aov", "aovs": "n:sh_normal"})
+    normal = np.array(mi.render(scene, integrator=aov, sensor=sensor, spp=spp, seed=7), dtype=np.float32)[..., :3]
+    cover = np.clip(np.linalg.norm(normal, axis=2), 0, 1)
+    return np.repeat(cover[..., None], 3, axis=2), np.clip(normal, -1, 1)
+
+
+def denoised(image: np.ndarray, albedo: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, float]:
+    """The image without its noise, float32, and the seconds it took.
+
+    Args:
+        image: linear radiance (H, W, 3).
+        albedo, normal: as `guides` makes them.
+
+    Raises:
+        ValueError: the image is not finite or below 0, or the sizes differ.
+        BackendError: the denoiser is not installed.
+    """
+    oidn, pixels = check_denoiser(), check_image("image", image)
+    for name, guide in (("albedo", albedo), ("normal", normal)):
+        if np.shape(guide) != pixels.shape:
+            raise ValueError(f"{name} must have the shape of the image {pixels.shape}, got {np.shape(guide)}")
+    albedo, normal = (np.ascontiguousarray(guide, dtype=np.float32) for guide in (albedo, normal))
+    started = time.perf_counter()
+    found = oidn.denoise(pixels, albedo=albedo, normal=normal, hdr=True)
+    return np.maximum(np.asarray(found), 0.0), time.perf_counter() - started
+
+
+WHITE = 0.9  # encoded luminance of the bright end
+BRIGHT = 99.0  # percentile that comes out there
+
+
+def mean_flip(reference: np.ndarray, test: np.ndarray) -> float:
+    """Mean LDR-FLIP of two images, both exposed so that the bright end of the reference is nearly white."""
+    level = float(np.percentile(luminance(reference), BRIGHT))
+    exposure = float(np.log2(WHITE / level)) if level > 0 else 0.0
+    return flip_ldr(srgb(reference, exposure), srgb(test, exposure)).mean

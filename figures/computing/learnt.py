@@ -1,0 +1,192 @@
+"""Objects that figures learn: a training is a part whose weights are its result, which renders find and no others."""
+
+from __future__ import annotations
+
+import base64
+import os
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from figures.computing.scenes import BUNNY, MM_PER_UNIT, SCANS, prepare, scan_scene
+from figures.modelling.candle import make_candle
+from figures.modelling.objects import candle_parts, learnable_parts, make_varying, tissue
+from figures.parts.part import Part, Result, Task
+from halfspace_sss import bssrdf, materials, models
+from halfspace_sss.neural.symmetric import channels
+from halfspace_sss.neural.trained import ENVIRONMENT_VARIABLE
+from halfspace_sss.physics.medium import Medium
+from halfspace_sss.provenance import check_folder
+
+__all__ = [
+    "FULL_GEOMETRY", "SHAPES", "TRAINING", "TRAIN_SECONDS", "accepting", "object_parts", "shape_of", "train_modelled",
+    "train_scan", "training_of", "weight_files", "weights_in", "with_weights",
+]  # fmt: skip
+
+
+SHAPES = ("bunny", "candle")
+
+
+def shape_of(name: str, folder: Path, resolution: int = 96, seed: int = 0) -> tuple[Any, Medium, float]:
+    """A Mitsuba shape, its medium and millimetres of a unit: the bunny of potato, or the candle of wax.
+
+    Args:
+        name: "bunny" or "candle".
+        folder: where the mesh of the candle is written.
+        resolution, seed: of the candle.
+    """
+    import mitsuba as mi
+
+    if name == "bunny":
+        return mi.load_dict({"type": "ply", "filename": str(BUNNY)}), materials.load("potato").medium, MM_PER_UNIT
+    path = make_candle(resolution, seed).wax.write_ply(folder / "wax.ply")
+    return mi.load_dict({"type": "ply", "filename": str(path)}), tissue("candle wax").medium, 1.0
+
+
+@contextmanager
+def weights_in(folder: Path) -> Iterator[None]:
+    """Weights are kept and looked for in a folder, and nowhere else."""
+    before = os.environ.get(ENVIRONMENT_VARIABLE)
+    os.environ[ENVIRONMENT_VARIABLE] = str(folder)
+    try:
+        yield
+    finally:
+        os.environ.pop(ENVIRONMENT_VARIABLE)
+        if before is not None:
+            os.environ[ENVIRONMENT_VARIABLE] = before
+
+
+FULL_GEOMETRY = "full_geometry"
+TRAINING = "training"
+
+
+def training_of(name: str) -> str:
+    """The name of the part in which an object is learnt."""
+    return f"{name}, {TRAINING}"
+
+
+@contextmanager
+def with_weights(folder: Path, needed: Mapping[str, Result]) -> Iterator[None]:
+    """Renders find what was learnt in the parts of training among the needed ones, and no other weights.
+
+    Args:
+        folder: of the task, where the files are put.
+        needed: results that the task was given.
+    """
+    place = check_folder(folder) / "weights"
+    place.mkdir(parents=True, exist_ok=True)
+    for name, result in needed.items():
+        for file, data in result.numbers["files"].items() if name.endswith(f", {TRAINING}") else ():
+            (place / file).write_bytes(base64.b64decode(data))
+    with weights_in(place):
+        yield
+
+
+TRAIN_SECONDS = {"draft": 24, "paper": 240}  # CPU time: half of it on two cores; one for all figures, which share parts
+GRID = 0.5  # cells of a medium along an object over cubes of its surface
+
+
+def train_scan(name: str, material: str, seconds: float, seed: int = 0, scan: str = "bunny") -> Part:
+    """The part in which a scanned object of a material is learnt, for so many seconds of CPU time.
+
+    Args:
+        name: of what is learnt, by which `training_of` finds it.
+        material: in the registry.
+        seconds: of CPU time.
+        seed: of the training.
+        scan: name in `scenes.SCANS`.
+    """
+    params = {"scan": scan, "material": material, "seconds": seconds, "seed": seed, "model": FULL_GEOMETRY}
+    return Part(training_of(name), _scanned, params, seconds, inputs=(SCANS[scan].file,))
+
+
+def train_modelled(name: str, resolution: int, seconds: float, seed: int = 0) -> Part:
+    """The part in which a modelled object is learnt.
+
+    Args:
+        name: a name in `modelling.objects.OBJECTS`.
+        resolution: of its surface.
+        seconds: of CPU time.
+        seed: of the object and its training.
+    """
+    params = {"object": name, "resolution": resolution, "seconds": seconds, "seed": seed, "model": FULL_GEOMETRY}
+    return Part(training_of(name), _modelled, params, seconds)
+
+
+def object_parts(name: str, resolution: int, folder: Path, seed: int = 0, model: str = "neural") -> dict[str, Any]:
+    """A modelled object with a smooth boundary, and what belongs to it, for a scene in mm.
+
+    Args:
+        name, resolution, seed: as in `train_modelled`.
+        folder: for its files.
+        model: of light in it.
+    """
+    if name == "candle":
+        return candle_parts(folder, resolution, seed, model)
+    found = make_varying(name, resolution, max(round(GRID * resolution), 8), seed)
+    return learnable_parts(found, folder, model)
+
+
+def _scanned(task: Task) -> dict[str, Any]:
+    prepare()
+    p = task.params
+    return _trained(task, scan_scene(p["scan"], p["material"], 16, "even sky"), p["scan"])
+
+
+def _modelled(task: Task) -> dict[str, Any]:
+    prepare()
+    p, name = task.params, task.params["object"]
+    shown = object_parts(name, p["resolution"], check_folder(task.folder), p["seed"])
+    scene = {"type": "scene", "integrator": {"type": "bssrdf"}, **shown}
+    return _trained(task, scene, name)
+
+
+def _trained(task: Task, scene: dict[str, Any], name: str) -> dict[str, Any]:
+    """Weights of an object, with what they took."""
+    from full_geometry.learning.training import train_by_cpu
+    from full_geometry.models.storing import KIND
+    from full_geometry.object.subject import Subject
+    from halfspace_sss.neural.store import load_weights
+    from halfspace_sss.rendering.scenes.scene_files import open_scene
+
+    subject = Subject.given(open_scene(scene, KIND), None, None, name)
+    started, of_cpu = time.perf_counter(), time.process_time()
+    _, path = train_by_cpu(subject, task.params["seconds"], task.folder / "weights", seed=task.params["seed"])
+    took = {"seconds": time.perf_counter() - started, "cpu seconds": time.process_time() - of_cpu}
+    record = load_weights(path, KIND)[1]
+    files = {file.name: file.read_bytes() for file in (path, path.with_suffix(".json"))}
+    about = {key: record[key] for key in ("steps", "walks")} | {"kB": len(files[path.name]) / 1000}
+    return {**took, **about, "files": {file: base64.b64encode(data).decode() for file, data in files.items()}}
+
+
+def accepting(medium: Medium) -> list[str]:
+    """Names of the models that can be made for the medium: a learnt one without weights for it is not among them."""
+    found = []
+    for name in models():
+        try:
+            bssrdf(name, medium)
+        except ValueError:
+            continue
+        found.append(name)
+    return found
+
+
+def weight_files(model: str, medium: Medium) -> tuple[Path, ...]:
+    """The files of weights that a model reads for a medium, for `Part.inputs`; none for an analytic model.
+
+    Raises:
+        ValueError: the model is not trained for the medium.
+    """
+    from halfspace_sss.neural import material_model, paper_model
+    from halfspace_sss.neural.universal import shipped_weights
+
+    trained = {module.KIND: module for module in (material_model, paper_model)}
+    if model in trained:
+        return tuple(dict.fromkeys(trained[model].find_weights(model, m) for m in channels(medium)))
+    if model == "neural_shape":
+        from full_geometry.models import neural_shape
+
+        return (neural_shape.shipped_weights(),)
+    return (shipped_weights(),) if model == "neural" else ()
