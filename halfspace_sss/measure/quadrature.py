@@ -56,6 +56,8 @@ class Angles:
         self.w_x = -self.w_i * np.cos(self.phi_i)
         free_i, free_o = self._unused_azimuths(probe or evaluate)
         self.both_azimuths = not (free_i or free_o)
+        if not self.both_azimuths:
+            self._merge_exits(probe or evaluate)
         if free_i:
             self.phi_i, self.w_i, self.w_x = np.array([0.5 * math.pi]), np.ones(1), np.zeros(1)
         if free_o:
@@ -68,9 +70,25 @@ class Angles:
         r = np.exp(rng.uniform(math.log(0.01), math.log(20.0), n)) * rng.choice(np.atleast_1d(self.medium.mfp), n)
         mu_i, mu_o = (mu_external(np.sqrt(rng.uniform(0, 1, n)), min(self.medium.eta, 1.0)) for _ in range(2))
         phi_i, phi_o, other_i, other_o = rng.uniform(-math.pi, math.pi, (4, n))
-        S = evaluate(r, mu_i, phi_i, mu_o, phi_o)
-        others = evaluate(r, mu_i, other_i, mu_o, phi_o), evaluate(r, mu_i, phi_i, mu_o, other_o)
+        queries = ((phi_i, phi_o), (other_i, phi_o), (phi_i, other_o))
+        phi_i, phi_o = (np.concatenate(columns) for columns in zip(*queries))
+        S, *others = np.split(np.asarray(evaluate(np.tile(r, 3), np.tile(mu_i, 3), phi_i, np.tile(mu_o, 3), phi_o)), 3)
         return tuple(bool(np.all(np.abs(S - other) <= 1e-10 * np.abs(S))) for other in others)
+
+    def _merge_exits(self, evaluate: Callable) -> None:
+        """One exit cosine with the weight of all where S is a product with a function of mu_o."""
+        rng = np.random.default_rng(2)
+        n, last, mfp = 8, len(self.mu_o) - 1, np.atleast_1d(self.medium.mfp)
+        r = np.exp(rng.uniform(math.log(0.01), math.log(20.0), (n, 1))) * rng.choice(mfp, (n, 1))
+        phi_i, phi_o = rng.uniform(-math.pi, math.pi, (2, n, 1))
+        S = np.asarray(evaluate(r, rng.uniform(0.1, 1, (n, 1)), phi_i, self.mu_o, phi_o), dtype=np.float64)
+        S = np.moveaxis(S.reshape(n, last + 1, -1), 1, 0)
+        lit = S[last] > 0
+        if not lit.any():
+            return
+        ratio = S[:, lit] / S[last, lit]
+        if np.ptp(ratio, axis=1).max() <= 1e-10 and not S[:, ~lit].any():
+            self.mu_o, self.w_mu = self.mu_o[last:], np.array([self.w_mu @ ratio[:, 0]])
 
     def exitance(self, r: np.ndarray, mu_i: float) -> tuple[np.ndarray, np.ndarray]:
         """∫ S mu_o dw_o, averaged over azimuth, plain and times cos(azimuth from the far side); shape (r, channels)."""
