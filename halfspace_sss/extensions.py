@@ -3,6 +3,7 @@
 - `halfspace_sss.models`: list of model classes.
 - `halfspace_sss.materials`: path of a material file or folder, or an iterable of `Material`.
 - `halfspace_sss.commands`: name -> function with typer annotations, a further command of `halfspace-sss`.
+- `halfspace_sss.studies`: the same for `halfspace-sss study`.
 - `halfspace_sss.transports`: mapping of names to "module:function", see `rendering.object.registry`.
 - `halfspace_sss.learners`: name of a model -> what learns it, see `rendering.scenes.learners`.
 - `halfspace_sss.figures`: kind of result -> function that takes the result and returns {file ending: bytes}.
@@ -23,6 +24,7 @@ __all__ = [
     "FIGURES",
     "LEARNERS",
     "MODELS",
+    "STUDIES",
     "TRANSPORTS",
     "commands",
     "offered",
@@ -31,6 +33,7 @@ __all__ = [
 ]
 
 COMMANDS, FIGURES, MODELS = "halfspace_sss.commands", "halfspace_sss.figures", "halfspace_sss.models"
+STUDIES = "halfspace_sss.studies"
 LEARNERS, TRANSPORTS = "halfspace_sss.learners", "halfspace_sss.transports"
 FAILURES = (Exception, SystemExit)  # what code of somebody else may end with
 OWN = ("analytic_models", "figures", "full_geometry", "halfspace_sss")
@@ -55,13 +58,13 @@ def offered(group: str) -> Iterator[tuple[str, Any]]:
         yield entry.name, found
 
 
-def commands() -> Iterator[tuple[str, Callable]]:
-    """Name and function of every command that a package adds."""
-    for name, found in offered(COMMANDS):
+def commands(group: str = COMMANDS) -> Iterator[tuple[str, Callable]]:
+    """Name and function of every command, or study, that a package adds."""
+    for name, found in offered(group):
         if callable(found):
             yield name, found
         else:
-            warn_left_out(COMMANDS, name, f"it must be a function, got {found!r}")
+            warn_left_out(group, name, f"it must be a function, got {found!r}")
 
 
 def renderer(kind: str) -> Renderer | None:

@@ -15,6 +15,7 @@ from typing import Any, get_args
 
 import numpy as np
 import pytest
+from command_list import COMMANDS
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from render_files import XML
@@ -49,9 +50,8 @@ VALUES = st.sampled_from(ODD) | st.integers().map(str) | st.floats().map(str) | 
 
 def _options(command: str) -> list[tuple[str, bool]]:
     """Every option of a command, and whether it is a switch."""
-    function = next(info.callback for info in cli.app.registered_commands if info.name == command)
     found = []
-    for name, parameter in inspect.signature(function, eval_str=True).parameters.items():
+    for name, parameter in inspect.signature(COMMANDS[command], eval_str=True).parameters.items():
         kind, *rest = get_args(parameter.annotation)
         if name not in ("out", "work") and not any(type(info).__name__ == "ArgumentInfo" for info in rest):
             found.append((f"--{name.replace('_', '-')}", kind is bool))
@@ -60,14 +60,14 @@ def _options(command: str) -> list[tuple[str, bool]]:
 
 @st.composite
 def _lines(draw: st.DrawFn, command: str) -> list[str]:
-    arguments = [command, "--out", draw(st.sampled_from(["o", "o/deep", "file", "file/o"]))]
+    arguments = [*command.split(), "--out", draw(st.sampled_from(["o", "o/deep", "file", "file/o"]))]
     arguments += draw(st.lists(VALUES.filter(lambda text: not text.startswith("-")), max_size=2))
     for option, switch in draw(st.lists(st.sampled_from(_options(command)), max_size=4)):
         arguments += [option] if switch else [f"{option}={draw(VALUES)}"]
     return arguments
 
 
-WRITING = [info.name for info in cli.app.registered_commands if info.name not in ("materials", "models")]
+WRITING = [name for name in COMMANDS if name not in ("materials", "models")]
 
 
 @pytest.mark.parametrize("command", WRITING)

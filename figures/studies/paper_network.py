@@ -320,7 +320,7 @@ def load_network(subject: Subject, folder: Path | None = None) -> PaperNetwork:
     if not path.exists():
         raise ValueError(
             f"object {subject.object.shape.id()!r} must be trained for {KIND}, got one that is not in {path.parent}; "
-            f"`halfspace-sss train --scene --model {KIND}` does it"
+            f"`halfspace-sss train object --scene --model {KIND}` does it"
         )
     arrays, record = load_weights(path, KIND)
     anchors = arrays.pop("anchors")

@@ -76,7 +76,7 @@ def _objects(work: Path) -> list[PairData]:
             if "walks" in stored:
                 objects.append(PairData.from_arrays(stored))
     if not objects:
-        raise ValueError(f"work must hold objects of `train --shapes`, got none in {work}")
+        raise ValueError(f"work must hold objects of `train shapes`, got none in {work}")
     return objects
 
 

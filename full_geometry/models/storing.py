@@ -75,7 +75,7 @@ def find_weights(subject: Subject, folder: str | os.PathLike | None = None) -> P
     why = f" ({'; '.join(reasons)})" if reasons else ""
     raise ValueError(
         f"object {subject.object.name} must be trained for {KIND}, got one that is not in {place}{why}; "
-        "`halfspace-sss train --scene` does it"
+        "`halfspace-sss train object --scene` does it"
     )
 
 

@@ -24,7 +24,7 @@ __getattr__, __dir__ = lazy_names(
 
 
 def train_shapes(*arguments: Any, **options: Any) -> Any:
-    """As `learning.shape_training.train_shapes`, which loads torch: the learner of the command `train --shapes`."""
+    """As `learning.shape_training.train_shapes`, which loads torch: the learner of the command `train shapes`."""
     from full_geometry.learning.shape_training import train_shapes as learn
 
     return learn(*arguments, **options)

@@ -1,4 +1,4 @@
-"""The command `halfspace-sss ablation`: what each choice of the learnt model brings, against the paper's set-up."""
+"""The command `halfspace-sss study ablation`: what each choice of a network brings, against the paper's set-up."""
 
 from __future__ import annotations
 

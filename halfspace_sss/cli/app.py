@@ -1,7 +1,8 @@
 """The command `halfspace-sss`: what it can do.
 
 A command is a function with typer annotations in a file of this folder; it joins by one line in `_OWN`. Packages above
-add theirs by an entry point of the group `halfspace_sss.commands`. How commands end is in `endings`.
+add theirs by an entry point of the group `halfspace_sss.commands`, or of `halfspace_sss.studies` for comparisons that
+ship no product. How commands end is in `endings`.
 """
 
 from __future__ import annotations
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
 __all__ = ["app", "main"]
 
 _OWN = {
-    "ablation": "ablation_command",
     "bench": "bench_command",
     "curves": "curves_command",
     "errors": "errors_command",
@@ -31,7 +31,6 @@ _OWN = {
     "models": "models_command",
     "render": "render_command",
     "trade": "trade_command",
-    "train": "train_command",
     "validate": "validate_command",
 }
 _LISTS = ("materials", "models")  # which are asked for what they print
@@ -51,6 +50,8 @@ def _app() -> Any:
 
     from halfspace_sss.cli.endings import Commands
     from halfspace_sss.cli.shared import with_quiet
+    from halfspace_sss.cli.train import trainings
+    from halfspace_sss.extensions import COMMANDS, STUDIES
 
     app = typer.Typer(
         cls=Commands, no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
@@ -62,7 +63,11 @@ def _app() -> Any:
         module = importlib.import_module(f"halfspace_sss.cli.{_FILES.get(name, name)}")
         found = getattr(module, function)
         app.command(name)(found if name in _LISTS else with_quiet(found))
-    _add_commands(app)
+    _add_commands(app, COMMANDS)
+    app.add_typer(trainings(), name="train")
+    studies = typer.Typer(no_args_is_help=True, help="Compare choices and rivals of the models: tables for the docs.")
+    _add_commands(studies, STUDIES)
+    app.add_typer(studies, name="study")
     return app
 
 
@@ -81,16 +86,16 @@ def _options(typer: Any) -> Any:
     return options
 
 
-def _add_commands(app: Any) -> None:
-    """The commands of other packages."""
+def _add_commands(app: Any, group: str) -> None:
+    """The commands, or studies, of an entry-point group."""
     from halfspace_sss.cli.shared import with_quiet
-    from halfspace_sss.extensions import COMMANDS, FAILURES, commands, warn_left_out
+    from halfspace_sss.extensions import FAILURES, commands, warn_left_out
 
-    for name, function in commands():
+    for name, function in commands(group):
         try:
             _check_command(name, function)
         except FAILURES as error:
-            warn_left_out(COMMANDS, name, error)
+            warn_left_out(group, name, error)
         else:
             app.command(name)(with_quiet(function))
 
@@ -99,7 +104,7 @@ def _check_command(name: str, function: Any) -> None:
     """Raises, in whichever way typer does, if the function cannot be a command beside the others."""
     import typer
 
-    if name in _OWN:
+    if name in (*_OWN, "study", "train"):
         raise ValueError(f"name must be new, got {name!r}")
     alone = typer.Typer()
     alone.command(name)(function)

@@ -1,12 +1,14 @@
-"""The command `halfspace-sss train`: networks of materials, for all media, for all shapes, of an object of a scene."""
+"""The commands `halfspace-sss train`: networks of materials, for all media, for all shapes, of an object of a scene."""
 
 from __future__ import annotations
 
+import shlex
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 from halfspace_sss.cli.shared import (
     Albedo,
@@ -17,115 +19,91 @@ from halfspace_sss.cli.shared import (
     Materials,
     MeanCosine,
     ObjectId,
+    OutFolder,
     SigmaT,
     Variant,
     by_channel,
     check_channel,
-    check_left_out,
     console,
     defined,
     stated_medium,
     use_mitsuba,
     whole,
+    with_quiet,
 )
 
 if TYPE_CHECKING:
     from halfspace_sss.physics.medium import Medium
     from halfspace_sss.rendering.scenes.learners import LearntObject
 
-__all__ = ["train_command"]
+__all__ = ["trainings"]
 
-MODEL, BACKEND, VARIANT = "neural_material", "llvm", "llvm_ad_rgb"
-SECONDS, SHAPE_SECONDS = 60.0, 600.0  # for an object, for all shapes
-SHAPE_VARIANT = "llvm_ad_mono"
+HELP = "Train networks on path tracing: models find them by the medium, and by the shape of an object."
+SWITCHES = {"--scene": "object", "--shapes": "shapes", "--universal": "universal"}  # of one command for all
+
+Seconds = Annotated[float, typer.Option(help="Time for data and fit, without compiling.")]
+TargetError = Annotated[
+    float | None, typer.Option(help="Stop early once the validation error is below this in 95 % of cases.")
+]
+Steps = Annotated[
+    int | None, typer.Option(help="Steps of the optimiser.", parser=whole, show_default="from the recipe")
+]
+TrainingSeed = Annotated[int, typer.Option(help="Seed of data, batches and first numbers.", parser=whole)]
+MapsBackend = Annotated[str, typer.Option(help="llvm or cuda, for the maps.")]
+WeightsFolder = Annotated[
+    Path | None, typer.Option(help="Folder for the weights.", show_default="where models find them")
+]
+Work = Annotated[Path | None, typer.Option(help="Folder for unfinished work, which an interrupted run continues.")]
 
 
-def train_command(
+class _Trainings(TyperGroup):
+    """The commands of `train`; how they were asked for when they were one is refused with how they are now."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        if not args or args[0] not in (*self.commands, *ctx.help_option_names):
+            given = {word.split("=")[0] for word in args}
+            kind = next((kind for switch, kind in SWITCHES.items() if switch in given), "material")
+            rest = [word for word in args if word not in ("--shapes", "--universal")]
+            asked = shlex.join(["halfspace-sss", "train", kind, *rest])
+            raise ValueError(f"train must be followed by {', '.join(sorted(self.commands))}: `{asked}`")
+        return super().parse_args(ctx, args)
+
+
+def trainings() -> typer.Typer:
+    """The command `train` with what it trains as commands of its own."""
+    app = typer.Typer(cls=_Trainings, help=HELP)
+    for name, function in (
+        ("material", material_command), ("object", object_command), ("shapes", shapes_command),
+        ("universal", universal_command),
+    ):  # fmt: skip
+        app.command(name)(with_quiet(function))
+    return app
+
+
+def _need_torch() -> None:
+    if find_spec("torch") is None:
+        raise ValueError("training needs torch: `pip install halfspace-sss[train]`")
+
+
+def material_command(
     material: Materials = None,
     channel: Channels = None,
-    universal: Annotated[bool, typer.Option("--universal", help="Train the network for all media instead.")] = False,
-    shapes: Annotated[
-        bool, typer.Option("--shapes", help="Train the network for all shapes and media instead.")
-    ] = False,
-    mesh: Annotated[
-        list[Path] | None, typer.Option(help="With --shapes: a closed PLY file among the shapes; repeat for more.")
-    ] = None,
-    scene: Annotated[
-        Path | None, typer.Option(help="Mitsuba XML file: train an object of it instead, which `render` then knows.")
-    ] = None,
-    object: ObjectId = None,
-    seconds: Annotated[
-        float | None,
-        typer.Option(help="Time for an object or all shapes, without compiling.", show_default="60, 600"),
-    ] = None,
-    model: Annotated[
-        str, typer.Option(help="neural_material or neural_paper; of an object full_geometry.", show_default=False)
-    ] = MODEL,
+    model: Annotated[str, typer.Option(help="neural_material or neural_paper.")] = "neural_material",
     sigma_t: SigmaT = None,
     albedo: Albedo = None,
     g: MeanCosine = None,
     eta: Eta = None,
     fast: Annotated[bool, typer.Option("--fast", help="A quarter of the time, about twice the error.")] = False,
-    steps: Annotated[
-        int | None, typer.Option(help="Steps of the optimiser.", parser=whole, show_default="from the recipe")
-    ] = None,
-    target_error: Annotated[
-        float | None, typer.Option(help="Stop early once the validation error is below this in 95 % of cases.")
-    ] = None,
-    start: Annotated[
-        str | None,
-        typer.Option(
-            help="With --scene: neural_shape or the half-space model that the object's network begins with.",
-            show_default="better_dipole",
-        ),
-    ] = None,
-    seed: Annotated[int, typer.Option(help="Seed of maps, batches and first numbers.", parser=whole)] = 0,
-    backend: Annotated[str, typer.Option(help="llvm or cuda, for the maps.")] = BACKEND,
-    define: Define = None,
-    variant: Variant = VARIANT,
-    out: Annotated[
-        Path | None, typer.Option(help="Folder for the weights.", show_default="where models find them")
-    ] = None,
-    work: Annotated[
-        Path | None, typer.Option(help="Folder for unfinished work, which an interrupted run continues.")
-    ] = None,
+    steps: Steps = None,
+    target_error: TargetError = None,
+    seed: TrainingSeed = 0,
+    backend: MapsBackend = "llvm",
+    out: WeightsFolder = None,
+    work: Work = None,
 ) -> None:
-    """Train networks on path tracing; trained materials are then found by their medium, objects by their shape too."""
-    if find_spec("torch") is None:
-        raise ValueError("training needs torch: `pip install halfspace-sss[train]`")
-    given = {"sigma_t": sigma_t, "albedo": albedo, "g": g, "eta": eta}
-    if shapes:
-        others = {"material": material, "channel": channel, "universal": universal, "scene": scene, "object": object,
-                  **given, "fast": fast, "steps": steps, "target_error": target_error, "start": start, "define": define,
-                  "model": None if model == MODEL else model, "variant": None if variant == VARIANT else variant,
-                  "backend": None if backend == BACKEND else backend}  # fmt: skip
-        check_left_out(others, "with --shapes")
-        _shapes(out or Path("shapes"), SHAPE_SECONDS if seconds is None else seconds, seed, mesh or [], work)
-        return
-    check_left_out({"mesh": mesh}, "without --shapes")
-    if scene is not None:
-        others = {"material": material, "channel": channel, "universal": universal, **given, "fast": fast,
-                  "steps": steps, "backend": None if backend == BACKEND else backend}  # fmt: skip
-        check_left_out(others, "with --scene")
-        how = {"object": object, "seconds": SECONDS if seconds is None else seconds, "target_error": target_error}
-        files = {"seed": seed, "folder": out, "work": work} | ({"start": start} if start is not None else {})
-        _object(scene, None if model == MODEL else model, {**how, **files}, variant, define)
-        return
-    of_scenes = {"object": object, "seconds": seconds, "start": start, "define": define}
-    check_left_out({**of_scenes, "variant": None if variant == VARIANT else variant}, "without --scene")
-    if universal:
-        others = {
-            "material": material,
-            "channel": channel,
-            **given,
-            "fast": fast,
-            "target_error": target_error,
-            "work": work,
-        }
-        check_left_out({**others, "model": None if model == MODEL else model}, "with --universal")
-        _universal(out or Path("universal"), seed, steps, backend)
-        return
-    media = _media(material or [], channel, given)
+    """Train the network of a medium, for each channel of materials or of the coefficients that are given."""
+    _need_torch()
+    media = _media(material or [], channel, {"sigma_t": sigma_t, "albedo": albedo, "g": g, "eta": eta})
     recipe = _recipe(fast, steps)
     rows = []
     with Bar("training") as bar:
@@ -134,6 +112,92 @@ def train_command(
                 (name, r) for r in _train(name, medium, bar, model, recipe, seed, out, work, target_error, backend)
             ]
     _report(rows)
+
+
+def object_command(
+    scene: Annotated[Path, typer.Option(help="Mitsuba XML file with the object.")],
+    object: ObjectId = None,
+    seconds: Seconds = 60.0,
+    model: Annotated[
+        str | None, typer.Option(help="Name of a model that learns objects.", show_default="full_geometry")
+    ] = None,
+    target_error: TargetError = None,
+    start: Annotated[
+        str | None,
+        typer.Option(
+            help="neural_shape or the half-space model that the network begins with.", show_default="better_dipole"
+        ),
+    ] = None,
+    seed: TrainingSeed = 0,
+    define: Define = None,
+    variant: Variant = "llvm_ad_rgb",
+    out: WeightsFolder = None,
+    work: Work = None,
+) -> None:
+    """Train the network of an object of a scene, which `render` then knows, and say how wrong it is."""
+    _need_torch()
+    parameters = defined(define)
+    use_mitsuba(variant)
+    from halfspace_sss.rendering.scenes.learners import learner
+    from halfspace_sss.rendering.scenes.scene_files import load_objects
+
+    learns = learner(model)
+    loaded = load_objects(scene, parameters)
+    how = {"object": object, "seconds": seconds, "target_error": target_error, "seed": seed, "folder": out}
+    how |= {"start": start} if start is not None else {}
+    with Bar("training") as bar:
+        found = learns.train(loaded, **how, work=work, progress=lambda what, done, total: bar.show(done, total, what))
+    _report_object(found)
+
+
+def universal_command(
+    steps: Steps = None,
+    seed: TrainingSeed = 0,
+    backend: MapsBackend = "llvm",
+    out: OutFolder = Path("universal"),
+) -> None:
+    """Train the network for all media, in half an hour; the folder also holds what a killed run goes on with."""
+    _need_torch()
+    from dataclasses import replace
+
+    from halfspace_sss.checks import check_count
+    from halfspace_sss.neural.training.recipes import UniversalRecipe, train_universal
+
+    recipe = UniversalRecipe()
+    if steps is not None:
+        check_count("steps", steps, 1)
+        recipe = replace(recipe, how=replace(recipe.how, steps=steps))
+    with Bar("universal") as bar:
+        path = train_universal(
+            out, seed, recipe, backend=backend, progress=lambda what, done, total: bar.show(done, total, what)
+        )
+    console().print(f"written: {path}", highlight=False, markup=False, soft_wrap=True)
+
+
+def shapes_command(
+    mesh: Annotated[
+        list[Path] | None, typer.Option(help="A closed PLY file among the shapes; repeat for more.")
+    ] = None,
+    seconds: Seconds = 600.0,
+    seed: TrainingSeed = 0,
+    out: OutFolder = Path("shapes"),
+    work: Work = None,
+) -> None:
+    """Train the network for all shapes and media, on objects that are drawn without end."""
+    _need_torch()
+    if find_spec("igl") is None:
+        raise ValueError("training on shapes needs libigl: `pip install halfspace-sss[train]`")
+    use_mitsuba("llvm_ad_mono")
+    from halfspace_sss.rendering.scenes.learners import shape_learner
+
+    with Bar("shapes") as bar:
+        found = shape_learner().train_shapes(
+            out, seconds=seconds, seed=seed, meshes=mesh or [], work=work,
+            progress=lambda what, done, total: bar.show(done, total, what),
+        )  # fmt: skip
+    screen = console()
+    told = f"{found.objects} objects, {found.steps} steps in {found.seconds:.0f} s; written:"
+    screen.print(told, f"  {found.path}", highlight=False, markup=False, soft_wrap=True, sep="\n")
 
 
 def _media(names: list[str], channel: str | None, given: dict[str, float | None]) -> dict[str, Medium]:
@@ -176,20 +240,6 @@ def _train(
     )  # fmt: skip
 
 
-def _object(scene: Path, model: str | None, how: dict[str, Any], variant: str, define: list[str] | None) -> None:
-    """Train an object of a scene and say how wrong the result is."""
-    parameters = defined(define)
-    use_mitsuba(variant)
-    from halfspace_sss.rendering.scenes.learners import learner
-    from halfspace_sss.rendering.scenes.scene_files import load_objects
-
-    learns = learner(model)
-    loaded = load_objects(scene, parameters)
-    with Bar("training") as bar:
-        found = learns.train(loaded, **how, progress=lambda what, done, total: bar.show(done, total, what))
-    _report_object(found)
-
-
 def _report_object(found: LearntObject) -> None:
     from halfspace_sss.cli.errors import OBJECT_DEFINITION, object_table
 
@@ -200,40 +250,6 @@ def _report_object(found: LearntObject) -> None:
     screen.print(object_table(found.errors), OBJECT_DEFINITION, highlight=False, sep="\n")
     told = f"{found.steps} steps in {found.seconds:.0f} s; written:"
     screen.print(told, f"  {found.path}", highlight=False, markup=False, soft_wrap=True, sep="\n")
-
-
-def _shapes(folder: Path, seconds: float, seed: int, meshes: list[Path], work: Path | None) -> None:
-    """Train the network of all shapes."""
-    if find_spec("igl") is None:
-        raise ValueError("training on shapes needs libigl: `pip install halfspace-sss[train]`")
-    use_mitsuba(SHAPE_VARIANT)
-    from halfspace_sss.rendering.scenes.learners import shape_learner
-
-    with Bar("shapes") as bar:
-        found = shape_learner().train_shapes(
-            folder, seconds=seconds, seed=seed, meshes=meshes, work=work,
-            progress=lambda what, done, total: bar.show(done, total, what),
-        )  # fmt: skip
-    screen = console()
-    told = f"{found.objects} objects, {found.steps} steps in {found.seconds:.0f} s; written:"
-    screen.print(told, f"  {found.path}", highlight=False, markup=False, soft_wrap=True, sep="\n")
-
-
-def _universal(folder: Path, seed: int, steps: int | None, backend: str) -> None:
-    from dataclasses import replace
-
-    from halfspace_sss.checks import check_count
-    from halfspace_sss.neural.training.recipes import UniversalRecipe, train_universal
-
-    recipe = UniversalRecipe()
-    if steps is not None:
-        check_count("steps", steps, 1)
-        recipe = replace(recipe, how=replace(recipe.how, steps=steps))
-    with Bar("universal") as bar:
-        path = train_universal(
-            folder, seed, recipe, backend=backend, progress=lambda what, done, total: bar.show(done, total, what)
-        )
-    console().print(f"written: {path}", highlight=False, markup=False, soft_wrap=True)
 
 
 def _report(rows: list[tuple[str, Any]]) -> None:

@@ -41,8 +41,8 @@ class NeuralMaterial(SymmetricModel):
     """A small network per medium: S = T_12 T_21 B(r) exp(MLP(features)), 3 x 32 SiLU, order >= 2.
 
     Positive, reciprocal and mirror-invariant by construction; B is the analytic backbone. The weights are those that
-    `halfspace_sss.neural.train` or `halfspace-sss train` made for each channel of the medium; media that were not
-    trained are refused. Single scattering is left out.
+    `halfspace_sss.neural.train` or `halfspace-sss train material` made for each channel of the medium; media that were
+    not trained are refused. Single scattering is left out.
     """
 
     name = KIND

@@ -55,9 +55,9 @@ class NeuralPaper(BSSRDF):
     """The paper's setting: S ~ MLP(x, y, w_i, w_o), 3 hidden layers of 256 with ReLU, from the squared error of S.
 
     Neither reciprocal nor rotation-invariant nor positive: negative values are clamped (`measure.clamped_energy` tells
-    how much), and it is asked in the frame in which w_i has azimuth 0. The weights come from `halfspace-sss train
-    MATERIAL --model neural_paper`, for as long as asked; they are not the authors' and not their converged result
-    unless trained as long. Zero beyond 12 L, where it was not trained. Single scattering is left out.
+    how much), and it is asked in the frame in which w_i has azimuth 0. The weights come from
+    `halfspace-sss train material --model neural_paper`, for as long as asked; they are not the authors' and not their
+    converged result unless trained as long. Zero beyond 12 L, where it was not trained. Single scattering is left out.
     """
 
     name = KIND

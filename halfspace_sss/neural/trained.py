@@ -80,5 +80,5 @@ def find_weights(kind: str, medium: Medium) -> Path:
     ratios = ", ".join(f"{n} {float(getattr(medium, n)):.4g}" for n in RATIOS)
     raise ValueError(
         f"medium must be trained for {kind}, got one that is not ({ratios}); "
-        f"`halfspace-sss train` does it, the model `neural` needs no training"
+        f"`halfspace-sss train material` does it, the model `neural` needs no training"
     )

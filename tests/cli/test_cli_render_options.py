@@ -130,7 +130,7 @@ def test_a_mono_render_has_a_page_too(scene: Path) -> None:
     assert _names(scene.parent / "out") == SET
 
 
-@pytest.mark.parametrize("command", ["errors", "train"])
+@pytest.mark.parametrize("command", ["errors", "train material"])
 def test_only_the_chosen_channels_are_taken(command: str, monkeypatch: Any, tmp_path: Path) -> None:
     seen = []
 
@@ -142,11 +142,13 @@ def test_only_the_chosen_channels_are_taken(command: str, monkeypatch: Any, tmp_
 
     monkeypatch.setattr("halfspace_sss.comparison.held_out.references", stop)
     monkeypatch.setattr("halfspace_sss.neural.train", stop)
-    result = CliRunner().invoke(cli.app, [command, "marble", "ketchup", "--channel", "B,R", "--out", str(tmp_path)])
+    result = CliRunner().invoke(
+        cli.app, [*command.split(), "marble", "ketchup", "--channel", "B,R", "--out", str(tmp_path)]
+    )
     assert result.stderr.endswith("error: enough\n")
     from halfspace_sss import materials
 
     marble, ketchup = (materials.load(name).medium for name in ("marble", "ketchup"))
     assert seen == [marble.channel(2), marble.channel(0), ketchup.channel(2), ketchup.channel(0)]
-    refused = CliRunner().invoke(cli.app, [command, "--channel", "B"])
+    refused = CliRunner().invoke(cli.app, [*command.split(), "--channel", "B"])
     assert refused.exit_code == 2 and "channel must be left out unless materials are named" in refused.stderr

@@ -51,7 +51,7 @@ def _weights(folder: str = "weights") -> list[Path]:
 
 
 def test_training_a_material_writes_weights_where_its_model_finds_them() -> None:
-    result = _invoke("train", "fig10")
+    result = _invoke("train", "material", "fig10")
     assert result.exit_code == 0, result.output
     (path,) = _weights()
     assert path.name == trained.weights_name("neural_material", FIG10) and path.name in result.stdout
@@ -59,12 +59,12 @@ def test_training_a_material_writes_weights_where_its_model_finds_them() -> None
 
 
 def test_without_arguments_the_material_is_fig10() -> None:
-    assert _invoke("train").exit_code == 0
+    assert _invoke("train", "material").exit_code == 0
     assert _record(_weights()[0])["medium"] == {"albedo": 0.75, "g": 0.0, "eta": 1.3}
 
 
 def test_every_channel_of_every_material_has_its_row_and_weights() -> None:
-    result = _invoke("train", "ketchup", "fig10", "--fast", "--out", "mine")
+    result = _invoke("train", "material", "ketchup", "fig10", "--fast", "--out", "mine")
     assert result.exit_code == 0 and len(_weights("mine")) == 4 and not _weights()
     rows = [line.split() for line in result.stdout.splitlines() if line.strip().startswith(("ketchup", "fig10"))]
     assert [row[0] for row in rows] == ["ketchup"] * 3 + ["fig10"]
@@ -72,31 +72,33 @@ def test_every_channel_of_every_material_has_its_row_and_weights() -> None:
 
 
 def test_given_coefficients_are_trained() -> None:
-    assert _invoke("train", "--albedo", "0.6", "--g", "0.2", "--eta", "1.1", "--sigma-t", "3").exit_code == 0
+    assert (
+        _invoke("train", "material", "--albedo", "0.6", "--g", "0.2", "--eta", "1.1", "--sigma-t", "3").exit_code == 0
+    )
     assert _record(_weights()[0])["medium"] == {"albedo": pytest.approx(0.6), "g": 0.2, "eta": 1.1}
 
 
 def test_the_network_of_the_paper_is_trained_by_name() -> None:
-    assert _invoke("train", "--model", "neural_paper", "--steps", "2").exit_code == 0
+    assert _invoke("train", "material", "--model", "neural_paper", "--steps", "2").exit_code == 0
     (path,) = _weights()
     assert load_weights(path, "neural_paper")[1]["recipe"]["how"]["steps"] == 2
 
 
 def test_training_stops_at_the_target_error_that_is_given() -> None:
-    assert _invoke("train", "--target-error", "1", "--seed", "4").exit_code == 0
+    assert _invoke("train", "material", "--target-error", "1", "--seed", "4").exit_code == 0
     record = _record(_weights()[0])
     assert [h["step"] for h in record["history"]] == [5] and record["seed"] == 4
 
 
 def test_the_target_error_is_held_against_the_upper_end_of_the_error() -> None:
-    assert _invoke("train", "fig10", "--fast").exit_code == 0
+    assert _invoke("train", "material", "fig10", "--fast").exit_code == 0
     record = _record(_weights()[0])
     found = record["validation"]
     assert record["history"][-1]["error"] == found["bound"] > found["error"] >= 0
 
 
 def test_unfinished_work_lies_in_a_folder_of_each_material_and_channel() -> None:
-    assert _invoke("train", "fig10", "--work", "unfinished").exit_code == 0
+    assert _invoke("train", "material", "fig10", "--work", "unfinished").exit_code == 0
     assert (Path("unfinished") / "fig10" / "channel-0" / "run.json").is_file()
 
 
@@ -107,13 +109,13 @@ def test_the_name_of_a_material_cannot_lead_out_of_the_work_folder(
     (tmp_path / "mine.toml").write_text(f'set = "mine"\nunit = "1/mm"\neta = 1.3\nsource = "mine"\n{entry}')
     monkeypatch.setenv(registry.ENVIRONMENT_VARIABLE, str(tmp_path / "mine.toml"))
     monkeypatch.setattr(registry, "_registry", registry.Registry())
-    result = _invoke("train", "../../x", "--work", "a/b/ww")
+    result = _invoke("train", "material", "../../x", "--work", "a/b/ww")
     assert result.exit_code == 2 and "name must be without '/', as folders are called by it" in result.stderr
     assert not (Path("a") / "x").exists() and not Path("x").exists()
 
 
 def test_the_universal_network_is_trained_into_a_folder() -> None:
-    result = _invoke("train", "--universal", "--steps", "3", "--out", "all")
+    result = _invoke("train", "universal", "--steps", "3", "--out", "all")
     assert result.exit_code == 0 and "neural.safetensors" in result.stdout
     assert load_weights(Path("all") / "neural.safetensors", "neural")[1]["recipe"]["how"]["steps"] == 3
 
@@ -124,21 +126,17 @@ REFUSED_BY_TRAIN = [
     (["--albedo", "1.5"], "albedo must be in [0, 1], got 1.5"),
     (["--model", "neural"], "model must be one of neural_material, neural_paper, got 'neural'"),
     (["--steps", "0"], "steps must be a whole number >= 1, got 0"),
-    (["--universal", "--steps", "-1"], "steps must be a whole number >= 1, got -1"),
     (["--seed", "-1"], "seed must be a whole number >= 0, got -1"),
-    (["--universal", "--seed", "-1"], "seed must be a whole number >= 0, got -1"),
     (["--target-error", "2"], "target_error must be a number in [0.0001, 1], got 2.0"),
     (["--backend", "opencl"], "backend must be one of llvm, cuda, got 'opencl'"),
-    (["--universal", "--backend", "opencl"], "backend must be one of llvm, cuda, got 'opencl'"),
     (["--out", "file"], "folder must be a folder or new, got 'file'"),
     (["--work", "file"], "folder must be a folder or new, got 'file"),
-    (["--universal", "--out", "file"], "folder must be a folder or new, got 'file'"),
-    (["fig10", "--universal"], "material must be left out with --universal, got ['fig10']"),
-    (["--universal", "--albedo", "0.5"], "albedo must be left out with --universal, got 0.5"),
-    (["--universal", "--fast"], "fast must be left out with --universal, got True"),
-    (["--universal", "--target-error", "0.1"], "target_error must be left out with --universal, got 0.1"),
-    (["--universal", "--work", "w"], "work must be left out with --universal"),
-    (["--universal", "--model", "neural_paper"], "model must be left out with --universal, got 'neural_paper'"),
+]
+REFUSED_BY_UNIVERSAL = [
+    (["--steps", "-1"], "steps must be a whole number >= 1, got -1"),
+    (["--seed", "-1"], "seed must be a whole number >= 0, got -1"),
+    (["--backend", "opencl"], "backend must be one of llvm, cuda, got 'opencl'"),
+    (["--out", "file"], "folder must be a folder or new, got 'file'"),
 ]
 REFUSED_BY_ERRORS = [
     (["no such material"], "material must be one of"),
@@ -155,7 +153,30 @@ REFUSED_BY_ERRORS = [
     (["--backend", "opencl"], "backend must be one of llvm, cuda, got 'opencl'"),
     (["--out", "file"], "folder must be a folder or new, got 'file'"),
 ]
-REFUSED = [("train", *case) for case in REFUSED_BY_TRAIN] + [("errors", *case) for case in REFUSED_BY_ERRORS]
+REFUSED = [
+    *(("train material", *case) for case in REFUSED_BY_TRAIN),
+    *(("train universal", *case) for case in REFUSED_BY_UNIVERSAL),
+    *(("errors", *case) for case in REFUSED_BY_ERRORS),
+]
+OLD = {
+    "train": "halfspace-sss train material",
+    "train ketchup --fast": "halfspace-sss train material ketchup --fast",
+    "train --scene a.xml --object x": "halfspace-sss train object --scene a.xml --object x",
+    "train --scene=a.xml": "halfspace-sss train object --scene=a.xml",
+    "train --universal --steps 3": "halfspace-sss train universal --steps 3",
+    "train --mesh a.ply --shapes": "halfspace-sss train shapes --mesh a.ply",
+    "ablation --seeds 1": "halfspace-sss study ablation --seeds 1",
+    "rivals --scene a.xml": "halfspace-sss study rivals --scene a.xml",
+    "shapes": "halfspace-sss study shapes",
+    "trade-check --scenes 2": "halfspace-sss study trade-check --scenes 2",
+}
+
+
+@pytest.mark.parametrize("old", OLD)
+def test_commands_that_were_renamed_are_refused_with_their_new_words(old: str) -> None:
+    result = _invoke(*old.split())
+    assert result.exit_code == 2 and result.stderr.startswith("error: ") and f"`{OLD[old]}`" in result.stderr
+    assert len(result.stderr.splitlines()) == 1
 
 
 @pytest.mark.parametrize(
@@ -166,7 +187,7 @@ def test_bad_input_is_refused_before_any_work(
 ) -> None:
     monkeypatch.setattr(noisy_maps, "_launch", None)
     (tmp_path / "file").touch()
-    result = _invoke(command, *arguments)
+    result = _invoke(*command.split(), *arguments)
     assert result.exit_code == 2, result.output
     assert result.stderr.startswith("error: ") and message in result.stderr and len(result.stderr.splitlines()) == 1
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
@@ -207,7 +228,7 @@ def test_errors_are_repeated_by_their_seed() -> None:
 
 
 def test_a_trained_material_is_among_the_errors() -> None:
-    assert _invoke("train", "--albedo", "0.6").exit_code == 0
+    assert _invoke("train", "material", "--albedo", "0.6").exit_code == 0
     result = _invoke("errors", "--albedo", "0.6", "--events", "2e4", "--model", "neural_material")
     assert result.exit_code == 0 and "neural_material" in result.stdout
 

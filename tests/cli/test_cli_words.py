@@ -10,6 +10,7 @@ from typing import Any, get_args
 
 import pytest
 import typer
+from command_list import COMMANDS
 from typer.testing import CliRunner
 
 import halfspace_sss
@@ -26,9 +27,6 @@ def _invoke(*arguments: str) -> Any:
     return CliRunner().invoke(cli.app, list(arguments), env={"COLUMNS": "300"})
 
 
-COMMANDS = {info.name: info.callback for info in cli.app.registered_commands}
-
-
 def _helps(command: str) -> list[str]:
     """The help of every option and argument."""
     parameters = inspect.signature(COMMANDS[command], eval_str=True).parameters.values()
@@ -41,14 +39,14 @@ def _helps(command: str) -> list[str]:
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_help_shows_every_word(command: str) -> None:
-    shown = " ".join(re.sub(r"[│\s]+", " ", _invoke(command, "--help").stdout).split())
+    shown = " ".join(re.sub(r"[│\s]+", " ", _invoke(*command.split(), "--help").stdout).split())
     for text in _helps(command):
         assert " ".join(text.split()) in shown
 
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_h_is_help(command: str) -> None:
-    assert _invoke(command, "-h").stdout == _invoke(command, "--help").stdout != ""
+    assert _invoke(*command.split(), "-h").stdout == _invoke(*command.split(), "--help").stdout != ""
 
 
 @pytest.mark.parametrize(("text", "number"), [("1e6", 10**6), ("7", 7), ("9007199254740993", 2**53 + 1), (5, 5)])

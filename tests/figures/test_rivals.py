@@ -196,7 +196,9 @@ def test_the_papers_network_is_trained_and_measured_by_the_commands(
     monkeypatch.setattr(paper, "EXITS", 32)
     monkeypatch.setattr(paper, "WALKS", 64)
     name = "full_geometry_paper"
-    run = CliRunner().invoke(cli.app, ["train", "--scene", str(scene_file), "--model", name, "--seconds", "1"])
+    run = CliRunner().invoke(
+        cli.app, ["train", "object", "--scene", str(scene_file), "--model", name, "--seconds", "1"]
+    )
     assert run.exit_code == 0 and name in run.stdout, run.output
     run = CliRunner().invoke(cli.app, ["errors", "--scene", str(scene_file), "--model", name])
     assert run.exit_code == 0 and "constant" in run.stdout, run.output
@@ -211,7 +213,7 @@ def test_the_papers_network_is_trained_and_measured_by_the_commands(
     ],
 )
 def test_tables_refuse_bad_input_before_anything_is_traced(scene_file: Path, bad: list[str], message: str) -> None:
-    run = CliRunner().invoke(cli.app, ["rivals", "--scene", str(scene_file), *bad])
+    run = CliRunner().invoke(cli.app, ["study", "rivals", "--scene", str(scene_file), *bad])
     assert run.exit_code != 0 and message in run.output
 
 

@@ -55,7 +55,7 @@ def test_a_picture_shows_the_object_on_black(monkeypatch: pytest.MonkeyPatch) ->
     ("place", "message"), [("worst.jpg", "pictures must end in .png"), ("", "pictures must be a file")]
 )
 def test_a_place_for_pictures_is_checked_before_anything_is_measured(tmp_path: Path, place: str, message: str) -> None:
-    words = ["shapes", "--out", str(tmp_path / "x.md"), "--pictures", str(tmp_path / place)]
+    words = ["study", "shapes", "--out", str(tmp_path / "x.md"), "--pictures", str(tmp_path / place)]
     result = CliRunner().invoke(cli.app, words)
     assert result.exit_code == 2 and message in " ".join(result.stderr.split())
     assert list(tmp_path.iterdir()) == []

@@ -1,4 +1,4 @@
-"""The commands `train --scene` and `errors --scene`: files, exit codes, what they refuse, and how they go on."""
+"""The commands `train object` and `errors --scene`: files, exit codes, what they refuse, and how they go on."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def _weights(folder: str = "weights") -> list[Path]:
 
 
 def test_an_object_is_trained_measured_and_rendered(monkeypatch: Any) -> None:
-    result = _invoke("train", "--scene", "ball.xml", "--seconds", "2")
+    result = _invoke("train", "object", "--scene", "ball.xml", "--seconds", "2")
     assert result.exit_code == 0, result.output
     (record, path) = _weights()
     assert path.name in result.stdout and record.suffix == ".json"
@@ -80,7 +80,7 @@ def test_an_object_is_trained_measured_and_rendered(monkeypatch: Any) -> None:
 
 
 def test_an_object_begins_with_the_network_of_all_shapes_and_is_rendered() -> None:
-    result = _invoke("train", "--scene", "ball.xml", "--start", "neural_shape")
+    result = _invoke("train", "object", "--scene", "ball.xml", "--start", "neural_shape")
     assert result.exit_code == 0, result.output
     (_, path) = _weights()
     assert load_weights(path, "full_geometry")[1]["recipe"]["start"] == "neural_shape"
@@ -117,11 +117,11 @@ def test_all_models_that_take_an_object_are_measured_where_none_is_named(monkeyp
 def test_a_render_says_what_trains_an_object() -> None:
     result = _invoke("render", "ball.xml", "--model", "full_geometry", "--train-seconds", "0")
     assert result.exit_code == 2 and "object 'ball' must be trained for full_geometry" in result.stderr
-    assert "halfspace-sss train --scene" in result.stderr and result.stderr.count("\n") == 1
+    assert "halfspace-sss train object --scene" in result.stderr and result.stderr.count("\n") == 1
 
 
 def test_no_seconds_write_nothing_and_say_so() -> None:
-    result = _invoke("train", "--scene", "ball.xml", "--seconds", "0")
+    result = _invoke("train", "object", "--scene", "ball.xml", "--seconds", "0")
     assert result.exit_code == 0 and "no weights are written" in result.stdout
     assert "is rendered by better_dipole" in result.stderr and not _weights()
 
@@ -146,7 +146,7 @@ def _same(a: str, b: str) -> bool:
 
 
 def test_an_interrupted_training_goes_on_to_the_same_weights(monkeypatch: Any) -> None:
-    arguments = ("train", "--scene", "ball.xml", "--seed", "3")
+    arguments = ("train", "object", "--scene", "ball.xml", "--seed", "3")
     assert _invoke(*arguments, "--out", "whole").exit_code == 0
     _stops(monkeypatch, KeyboardInterrupt())
     again = (*arguments, "--work", "work", "--out", "parts")
@@ -155,7 +155,7 @@ def test_an_interrupted_training_goes_on_to_the_same_weights(monkeypatch: Any) -
 
 
 def test_a_disk_that_fills_up_leaves_no_half_weights_and_work_to_go_on_from(monkeypatch: Any) -> None:
-    arguments = ("train", "--scene", "ball.xml", "--work", "work")
+    arguments = ("train", "object", "--scene", "ball.xml", "--work", "work")
     sync = os.fsync
 
     def full(handle: int) -> None:
@@ -171,30 +171,28 @@ def test_a_disk_that_fills_up_leaves_no_half_weights_and_work_to_go_on_from(monk
     assert _invoke(*arguments).exit_code == 0 and len(_weights()) == 2
 
 
+TRAIN_BALL = ("train", "object", "--scene", "ball.xml")
 REFUSED = [
-    (["train", "--scene", "no.xml"], "scene must be an XML file, got 'no.xml'"),
-    (["train", "--scene", "ball.xml", "--object", "cube"], "object must be one of ball, got 'cube'"),
-    (["train", "--scene", "two.xml"], "object must be one of ball, other, got None"),
-    (["train", "--scene", "ball.xml", "--seconds", "-1"], "seconds must be a number in [0, 1e+07], got -1.0"),
-    (["train", "--scene", "ball.xml", "--target-error", "2"], "target_error must be a number in [0.0001, 1], got 2.0"),
-    (["train", "--scene", "ball.xml", "--seed", "-1"], "seed must be a whole number >= 0, got -1"),
+    (["train", "object", "--scene", "no.xml"], "scene must be an XML file, got 'no.xml'"),
+    ([*TRAIN_BALL, "--object", "cube"], "object must be one of ball, got 'cube'"),
+    (["train", "object", "--scene", "two.xml"], "object must be one of ball, other, got None"),
+    ([*TRAIN_BALL, "--seconds", "-1"], "seconds must be a number in [0, 1e+07], got -1.0"),
     (
-        ["train", "--scene", "ball.xml", "--model", "neural"],
+        [*TRAIN_BALL, "--target-error", "2"],
+        "target_error must be a number in [0.0001, 1], got 2.0",
+    ),
+    ([*TRAIN_BALL, "--seed", "-1"], "seed must be a whole number >= 0, got -1"),
+    (
+        [*TRAIN_BALL, "--model", "neural"],
         "model must be one of full_geometry, full_geometry_paper, got 'neural'",
     ),
-    (["train", "--scene", "ball.xml", "--fast"], "fast must be left out with --scene, got True"),
-    (["train", "ketchup", "--scene", "ball.xml"], "material must be left out with --scene, got ['ketchup']"),
-    (["train", "--scene", "ball.xml", "--out", "ball.xml"], "folder must be a folder or new, got 'ball.xml'"),
-    (["train", "--scene", "ball.xml", "--define", "x"], "define must be NAME=VALUE, got 'x'"),
-    (["train", "--scene", "ball.xml", "--start", "neural_shap"], "start must be one of neural_shape,"),
-    (["train", "--start", "neural_shape"], "start must be left out without --scene, got 'neural_shape'"),
-    (["train", "--shapes", "--start", "neural_shape"], "start must be left out with --shapes, got 'neural_shape'"),
+    ([*TRAIN_BALL, "--out", "ball.xml"], "folder must be a folder or new, got 'ball.xml'"),
+    ([*TRAIN_BALL, "--define", "x"], "define must be NAME=VALUE, got 'x'"),
+    ([*TRAIN_BALL, "--start", "neural_shap"], "start must be one of neural_shape,"),
     (
-        ["train", "--scene", "ball.xml", "--model", "full_geometry_paper", "--start", "neural_shape"],
+        [*TRAIN_BALL, "--model", "full_geometry_paper", "--start", "neural_shape"],
         "start must be left out for full_geometry_paper, got 'neural_shape'",
     ),
-    (["train", "--seconds", "3"], "seconds must be left out without --scene, got 3.0"),
-    (["train", "--object", "ball"], "object must be left out without --scene, got 'ball'"),
     (["errors", "--object", "ball"], "object must be left out without --scene, got 'ball'"),
     (["errors", "--scene", "ball.xml", "--events", "1e5"], "events must be left out with --scene, got 100000.0"),
     (["errors", "--scene", "ball.xml", "--model", "no_model"], "model must be one of"),

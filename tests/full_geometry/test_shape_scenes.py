@@ -133,5 +133,5 @@ def test_tables_without_a_place_or_with_wrong_numbers_are_refused_before_anythin
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path("file").write_text("")
-    result = CliRunner().invoke(cli.app, ["shapes", *words])
+    result = CliRunner().invoke(cli.app, ["study", "shapes", *words])
     assert result.exit_code == 2 and message in result.stderr and result.stderr.count("\n") == 1

@@ -199,7 +199,7 @@ def small(monkeypatch: Any, tmp_path: Path) -> Path:
 
 
 def _invoke(*arguments: str) -> Any:
-    return CliRunner().invoke(cli.app, ["ablation", *arguments])
+    return CliRunner().invoke(cli.app, ["study", "ablation", *arguments])
 
 
 def test_the_command_writes_and_prints_both_tables_and_the_caption(small: Path) -> None:

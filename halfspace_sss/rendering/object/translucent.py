@@ -21,7 +21,7 @@ Parameters, all optional but the medium:
         first two. For a medium that varies in space `albedo` and one of `sigma_t` and `scale` may be a `gridvolume`.
     model: name of a model of the library, by default "neural"; "neural_shape", which sees the shape and needs no
         training; "full_geometry", S of this very object, which is learnt before its first render, or by
-        `halfspace-sss train --scene`; "lambert", a diffuse surface of the same reflectance; or "auto", the cheapest of
+        `halfspace-sss train object`; "lambert", a diffuse surface of the same reflectance; or "auto", the cheapest of
         them that is within the `tolerance` of the integrator, by a measurement before the first render.
     orders: "total" (what the model lacks of the orders below two is traced; order 0 only beside a model that knows
         the object), "multiple" or "single".

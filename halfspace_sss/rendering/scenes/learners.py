@@ -1,7 +1,7 @@
-"""What learns an object of a scene and says how wrong models of it are: the commands `train --scene`, `errors --scene`.
+"""What learns an object of a scene and says how wrong models of it are: the commands `train object`, `errors --scene`.
 
 An entry point of the group `halfspace_sss.learners` has the name of the model that it learns, and is a module or an
-object with the functions of `Learner`, or with `train_shapes` of `ShapeLearner`, for `train --shapes`.
+object with the functions of `Learner`, or with `train_shapes` of `ShapeLearner`, for `train shapes`.
 """
 
 from __future__ import annotations

@@ -65,9 +65,9 @@ def _always(table: pandas.DataFrame, name: str) -> dict[str, Any]:
 INTRODUCTION = """\
 # What the advice of the trade is worth
 
-Written by `halfspace-sss trade-check` ({arguments}): random scenes of shape x medium x light x size x tolerance. Each
-has {assess:g} s for a recommendation among {ways} ways, and up to {truth:g} s of long runs with exits and samples of
-their own. A long run ends when bias² is known to a fifth of the squared tolerance and variances to 15 %. Times are
+Written by `halfspace-sss study trade-check` ({arguments}): random scenes of shape x medium x light x size x tolerance.
+Each has {assess:g} s for a recommendation among {ways} ways, and up to {truth:g} s of long runs with exits and samples
+of their own. A long run ends when bias² is known to a fifth of the squared tolerance and variances to 15 %. Times are
 those of the processor, all cores together. *Always* is the cost of one fixed choice where it can keep the tolerance,
 with as many samples as the long runs say. `auto` is the choice of the model of that name for the tolerance of the
 scene.

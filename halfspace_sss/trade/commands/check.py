@@ -1,4 +1,4 @@
-"""The command `halfspace-sss trade-check`: recommendations for random scenes, held against long runs."""
+"""The command `halfspace-sss study trade-check`: recommendations for random scenes, held against long runs."""
 
 from __future__ import annotations
 
