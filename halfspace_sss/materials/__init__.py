@@ -29,5 +29,9 @@ tank_ml (the published dilution), note, and a table [sources] that tells for eac
 from halfspace_sss.materials.material import Material
 from halfspace_sss.materials.registry import load, names, register, table
 from halfspace_sss.materials.spectra import RGBMedium, SpectralMedium, read_spectra
+from halfspace_sss.materials.tissues import Skin, Tissue, published_tissue, skin, tissue
 
-__all__ = ["Material", "RGBMedium", "SpectralMedium", "load", "names", "read_spectra", "register", "table"]
+__all__ = [
+    "Material", "RGBMedium", "Skin", "SpectralMedium", "Tissue", "load", "names", "published_tissue", "read_spectra",
+    "register", "skin", "table", "tissue",
+]  # fmt: skip
