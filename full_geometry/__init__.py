@@ -9,8 +9,8 @@ from __future__ import annotations
 from halfspace_sss.lazy import lazy_names
 
 TRANSPORTS = {
-    "full_geometry": "full_geometry.scene:learnt_means",
-    "neural_shape": "full_geometry.scene:shape_means",
+    "full_geometry": "full_geometry.scene:learnt_model",
+    "neural_shape": "full_geometry.scene:shape_model",
 }
 __all__ = ["TRANSPORTS", "Recipe", "Subject", "errors", "load", "train", "transport"]
 __getattr__, __dir__ = lazy_names(

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from full_geometry.learning.model_errors import RadianceError, errors_of, transport
+from full_geometry.learning.model_errors import RadianceError, errors_of, transport_of
 from full_geometry.models.storing import KIND, find_weights, trained
 from full_geometry.object.subject import Subject
 from halfspace_sss.checks import check_count
@@ -75,7 +75,7 @@ def errors(
     check_count("seed", seed, 0)
     check_count("exits", exits, 2)
     subject = Subject.given(scene, None, None, object)
-    transports = {name: transport(subject, name) for name in models} or _that_take(subject)
+    transports = {name: transport_of(subject, name) for name in models} or _that_take(subject)
     name = subject.object.shape.id()
     by_model = errors_of(subject, transports, exits=exits, seed=seed, progress=progress)
     return [row for model, rows in by_model.items() for row in _rows(name, model, rows)]
@@ -92,7 +92,7 @@ def _that_take(subject: Subject) -> dict[str, Any]:
     transports = {}
     for name in sorted(model_names(), key=half_space_models().__contains__):
         try:
-            transports[name] = transport(subject, name)
+            transports[name] = transport_of(subject, name)
         except ValueError:
             continue
     return transports

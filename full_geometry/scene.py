@@ -4,25 +4,22 @@ from __future__ import annotations
 
 import math
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from full_geometry.models.neural_shape import ALBEDO, ETA, SIZE, G, checksums, transport
-from full_geometry.models.object_model import FullGeometry
+from full_geometry.models.neural_shape import ALBEDO, ETA, SIZE, G, transport
 from full_geometry.models.storing import CHECKSUMS, KIND, find_weights, load
-from full_geometry.object.features import PreparedExit
 from full_geometry.object.patches import AREA_SHARE, LearntProposals, PatchTable
-from full_geometry.object.subject import Subject, SurfacePoint, check_surface
+from full_geometry.object.subject import Subject, check_surface
 from halfspace_sss.extensions import offered
 from halfspace_sss.neural.store import checksum_of, load_weights
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.object.entries import AreaPoints, PositionSampler, RadialTable
 from halfspace_sss.rendering.object.half_space import HalfSpaceProposals, area_share
-from halfspace_sss.rendering.object.points import Entry, Exit, Means
+from halfspace_sss.rendering.object.points import ObjectModel
 from halfspace_sss.rendering.object.settings import AUTOMATIC, Settings
 from halfspace_sss.rendering.object.shape import Object
 from halfspace_sss.rendering.object.translucent import Inside
@@ -31,41 +28,6 @@ FINE = 2.5  # transport mean free paths of the radius of a patch, up to which pa
 PATCH_SHARE = 0.2  # of the entries where patches are larger: they reach what probes miss
 SAMPLERS = "halfspace_sss.samplers"  # entry points: a function of `Learnt`, with arrays of its own, and a sign
 ENTRIES = 2  # of an exit: its own work is done once, and patches draw without a ray
-
-
-@dataclass(frozen=True, eq=False)
-class LearntTransport:
-    """S of one object, orders two and more.
-
-    Args:
-        model: what was learnt.
-        checksums: of the file of weights, and of those of its base model.
-    """
-
-    model: FullGeometry
-    checksums: tuple[str, ...]
-    orders = "multiple"
-
-    def prepare(self, out: Exit, active: Any) -> PreparedExit:
-        return self.model.prepare(SurfacePoint(out.p, out.n_face, out.n, out.w), active)
-
-    def S_mu(self, prepared: PreparedExit, entry: Entry, w_i: Any, active: Any) -> Any:
-        n_out, mu_i = entry.seen(w_i)
-        return self.model.S(prepared, SurfacePoint(entry.p, entry.n_face, n_out, w_i), active) * mu_i
-
-
-@dataclass(frozen=True, eq=False)
-class ObjectTransport(LearntTransport):
-    """S of an object together with its directional albedo under uniform illumination."""
-
-    def alpha(self, out: Exit, active: Any) -> tuple[Any, Any]:
-        """See `Transport`."""
-        return self.model.alpha(SurfacePoint(out.p, out.n_face, out.n, out.w), active)
-
-    @property
-    def evened(self) -> tuple[Any, Any]:
-        """See `Transport`."""
-        return self.model.alpha.evened
 
 
 def _weights(subject: Subject, settings: Settings) -> Path:
@@ -84,7 +46,7 @@ def _weights(subject: Subject, settings: Settings) -> Path:
     return train(subject, seconds=settings.train_seconds, target_error=settings.train_error).path
 
 
-def learnt_means(object: Object, inside: Inside, media: list[Medium], settings: Settings) -> Means:
+def learnt_model(object: Object, inside: Inside, media: list[Medium], settings: Settings) -> ObjectModel:
     """Transport and proposals of an object that was trained, or is now for `train_seconds` of the settings.
 
     Raises:
@@ -96,20 +58,20 @@ def learnt_means(object: Object, inside: Inside, media: list[Medium], settings: 
     learnt = load(path, subject)
     model, sampler, _ = learnt
     backbone = model.base.models
-    transport = ObjectTransport(model, (checksum_of(path, KIND), *load_weights(path, KIND)[1][CHECKSUMS]))
+    transport = replace(model, checksums=(checksum_of(path, KIND), *load_weights(path, KIND)[1][CHECKSUMS]))
     table = RadialTable([m for m in backbone if float(m.medium.sigma_s) > 0], object.size)
     by_itself = AREA_SHARE if sampler is None else 0.0  # patches reach everywhere
     share = by_itself if settings.area_share == AUTOMATIC else settings.area_share
     positions = PositionSampler(replace(object, pieces=None), table, subject.points, share)
     if sampler is None:
-        return Means(transport, HalfSpaceProposals(positions, backbone[0]))
+        return ObjectModel(transport, HalfSpaceProposals(positions, backbone[0]))
     for _, refine in offered(SAMPLERS) if learnt.others else ():
-        return Means(transport, refine(learnt, object.sign), ENTRIES)
+        return ObjectModel(transport, refine(learnt, object.sign), ENTRIES)
     radius = np.sqrt(object.area / (np.pi * sampler.patches.n))
     sigma_t_prime = np.mean([float(m.sigma_t_prime) for m in media])
     patch_share = 1.0 if radius * sigma_t_prime < FINE else PATCH_SHARE
     proposals = LearntProposals(sampler, positions, patch_share, object.sign, PatchTable(sampler))
-    return Means(transport, proposals, ENTRIES)
+    return ObjectModel(transport, proposals, ENTRIES)
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -140,7 +102,7 @@ def warn_out_of_range(object: Object, media: tuple[Medium, ...]) -> None:
         )
 
 
-def shape_means(object: Object, inside: Inside, media: list[Medium], settings: Settings) -> Means:
+def shape_model(object: Object, inside: Inside, media: list[Medium], settings: Settings) -> ObjectModel:
     """Transport and proposals of any object with a homogeneous medium and a smooth boundary.
 
     Raises:
@@ -158,4 +120,4 @@ def shape_means(object: Object, inside: Inside, media: list[Medium], settings: S
     share = area_share(object, table.mean / object.size, settings.area_share)
     # light may leave by another piece of the surface than it entered by
     positions = PositionSampler(replace(object, pieces=None), table, AreaPoints(object.shape), share)
-    return Means(LearntTransport(model, checksums(subject)), HalfSpaceProposals(positions, live[0]))
+    return ObjectModel(model, HalfSpaceProposals(positions, live[0]))

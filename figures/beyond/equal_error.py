@@ -300,7 +300,7 @@ def _steps(scene: Any, n: int) -> dict[str, Callable[[], Any]]:
     prepared = body.transport.prepare(out, mi.Bool(True))
     where = body.proposals.prepare(out, prepared, mi.Bool(True))
     entry = body.proposals.sample(out, face, where, sampler, mi.Bool(True))
-    direction, _ = cosine_above(entry.n_out, entry.n_face, sampler.next_2d())  # the same for all models
+    direction, _ = cosine_above(entry.n_out, entry.n, sampler.next_2d())  # the same for all models
     dr.eval(tuple(out), face, tuple(entry), direction, sampler)  # named tuples are passed over
     ray = place(entry.p, entry.n).spawn_ray(direction)
     dr.eval(ray)
@@ -308,7 +308,8 @@ def _steps(scene: Any, n: int) -> dict[str, Callable[[], Any]]:
     dr.eval(found)
 
     def evaluated() -> Any:
-        return body.transport.S_mu(prepared, entry, direction, found)
+        at = entry.facing(direction)
+        return body.transport.S(prepared, at, found) * at.mu
 
     return {
         "entries": lambda: tuple(body.proposals.sample(out, face, where, sampler.clone(), mi.Bool(True))),

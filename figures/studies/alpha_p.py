@@ -28,10 +28,10 @@ from full_geometry.object.features import Side, n_side, side_features
 from full_geometry.object.first_event import first_event
 from full_geometry.object.identity import frame_of
 from full_geometry.object.patches import Patches, PatchSampler, PatchWeights, cluster
-from full_geometry.object.subject import Subject, SurfacePoint
+from full_geometry.object.subject import Subject
 from halfspace_sss.neural.perceptron import Perceptron
 from halfspace_sss.neural.training.fit import Objective, fit
-from halfspace_sss.rendering.object.points import number
+from halfspace_sss.rendering.object.points import SurfacePoint, number
 
 CLEAR = 1e-4  # of the size of the object: where the ray that finds a face begins
 

@@ -21,7 +21,7 @@ from full_geometry.object.patches import PatchSampler, PatchTable, PatchWeights
 from halfspace_sss.neural.perceptron import Perceptron, relu
 from halfspace_sss.neural.store import load_weights, save_weights
 from halfspace_sss.rendering.object.entries import Point
-from halfspace_sss.rendering.object.points import CosineProposals, Entry, Exit, number, turned
+from halfspace_sss.rendering.object.points import CosineProposals, EntrySample, SurfacePoint, number, turned
 
 # ----------------------------------------------------------------------------------------------------
 # Monotonic rational-quadratic splines of [-1, 1] onto itself, in Dr.Jit (Durkan, Bekasov, Murray, Papamakarios 2019).
@@ -212,17 +212,20 @@ class FlowProposals(CosineProposals):
     sign: float
     table: PatchTable | None = None
 
-    def prepare(self, out: Exit, prepared: PreparedExit, active: Any) -> _FlowOfExit:
+    def prepare(self, out: SurfacePoint, prepared: PreparedExit, active: Any) -> _FlowOfExit:
         weights = self.sampler.patches.prepare(prepared.side) if self.table is None else None
         return _FlowOfExit(prepared.side, weights)
 
-    def sample(self, out: Exit, prim_index: Any, prepared: _FlowOfExit, sampler: Any, active: Any) -> Entry:
+    def sample(
+        self, out: SurfacePoint, prim_index: Any, prepared: _FlowOfExit, sampler: Any, active: Any
+    ) -> EntrySample:
         u = sampler.next_1d(), tuple(sampler.next_2d())
         weights = prepared.weights if self.table is None else self.table.weights(prim_index)
         at, density = self.sampler.sample(prepared.side, weights, *u)
         n_out = turned(at.n_shading, at.n) * number(self.sign)
         weight = dr.select(active & (density > 0), 1 / density, 0)
-        return Entry(mi.Point3f(at.p), mi.Normal3f(at.n), mi.Normal3f(n_out), weight, mi.UInt32(at.prim_index))
+        n = mi.Normal3f(at.n * number(self.sign))
+        return EntrySample(mi.Point3f(at.p), n, mi.Normal3f(n_out), weight, mi.UInt32(at.prim_index))
 
 
 def flow_of(learnt: Learnt) -> FlowSampler:

@@ -27,7 +27,7 @@ from full_geometry.object.walks import trace_exits
 from halfspace_sss.checks import check_count
 from halfspace_sss.neural.training.fit import Objective, Source, fit
 from halfspace_sss.neural.training.schedules import Timed
-from halfspace_sss.rendering.object.points import Entry, cosine_above, number, place
+from halfspace_sss.rendering.object.points import EntrySample, cosine_above, number, place
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 # ---- Training of conditional flows by zuko: -E[T log p(x | context)] over walks --------------------
@@ -100,9 +100,9 @@ class Lighting:
     def sample(self, entry: Any, u: Any, active: Any) -> tuple[Any, Any]:
         """w_i at an entry, and the light from there over its density: 0 in the shadow."""
         w, value, distance = self.aim(entry, u)
-        ray = place(entry.p, mi.Normal3f(entry.n * number(self.subject.object.sign))).spawn_ray(w)
+        ray = place(entry.p, entry.n).spawn_ray(w)
         ray.maxt = distance
-        lit = active & (dr.dot(w, entry.n_face) > 0)
+        lit = active & (dr.dot(w, entry.n) > 0)
         return w, dr.select(lit & ~self.subject.object.scene.ray_test(ray, False, lit), value, 0)
 
 
@@ -118,7 +118,7 @@ def lighting(name: str, subject: Subject) -> Lighting:
     place_of_light = mi.Point3f(*map(number, _above(subject)))
 
     def sky(entry: Any, u: Any) -> tuple:
-        w, density = cosine_above(entry.n_out, entry.n_face, u)
+        w, density = cosine_above(entry.n_out, entry.n, u)
         return w, 1 / dr.maximum(density, 1e-6), mi.Float(dr.inf)
 
     def direction(entry: Any, u: Any) -> tuple:
@@ -187,10 +187,9 @@ def flow_walks(
     exits = trace_exits(subject, starts, (*seed, 1))
     T = exits.T
     if light is not None:
-        n_mesh = mi.Normal3f(exits.at.n * subject.object.sign)
-        entry = Entry(exits.at.p, n_mesh, exits.at.n_out, mi.Float(1), exits.face)
+        entry = EntrySample(exits.at.p, exits.at.n, exits.at.n_out, mi.Float(1), exits.face)
         w, value = light.sample(entry, mi.Point2f(rng.next_float32(), rng.next_float32()), dr.max(T) > 0)
-        T = T * (value * entry.seen(w)[1])
+        T = T * (value * entry.facing(w).mu)
     from_all = side_features(frame, Side(starts, first_event(subject, starts)))
     total = _rows(list(T), n)
     starts_rows = _rows(from_all, n)

@@ -21,10 +21,10 @@ import zuko
 from figures.studies.paper_network import placed
 from full_geometry.models.object_model import FullGeometry
 from full_geometry.object.features import ObjectFrame
-from full_geometry.object.subject import Subject, SurfacePoint, surface_point
+from full_geometry.object.subject import Subject, surface_point
 from halfspace_sss.neural.training.fit import ADAM, Descent, Objective, fit
 from halfspace_sss.neural.training.schedules import Timed
-from halfspace_sss.rendering.object.points import channel_mean, cosine_above
+from halfspace_sss.rendering.object.points import SurfacePoint, channel_mean, cosine_above
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 HIDDEN, LAYERS = (128, 128), 6

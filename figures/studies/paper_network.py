@@ -20,7 +20,7 @@ from full_geometry.learning.model_errors import RadianceError, compare
 from full_geometry.object.features import ObjectFrame
 from full_geometry.object.identity import Identity, frame_of, identify
 from full_geometry.object.radiance import LOBES, POWER, ExitRadiance, ExitTruth, reference
-from full_geometry.object.subject import Subject, SurfacePoint
+from full_geometry.object.subject import Subject
 from full_geometry.object.walks import trace_exits
 from halfspace_sss.checks import check_choice, check_count, check_interval
 from halfspace_sss.neural.store import load_weights, save_weights
@@ -29,6 +29,7 @@ from halfspace_sss.neural.training.fit import ADAM, Descent, Objective, Source, 
 from halfspace_sss.neural.training.schedules import Timed
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.provenance import provenance
+from halfspace_sss.rendering.object.points import SurfacePoint
 from halfspace_sss.rendering.scenes.learners import LearntObject, ObjectError
 from halfspace_sss.tracing.walk import generator, pass_seed
 

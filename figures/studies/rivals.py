@@ -13,9 +13,9 @@ from figures.studies.flow_training import FlowRecipe
 from figures.studies.paper_network import POINTS, PaperRecipe, fit_paper, paper_errors
 from full_geometry.learning import model_errors
 from full_geometry.learning.fitting import STANDARD
-from full_geometry.learning.model_errors import measure
+from full_geometry.learning.model_errors import measure, transport_of
 from full_geometry.learning.training import train, train_by_cpu
-from full_geometry.models.half_space import HalfSpace, PlanarModel
+from full_geometry.models.half_space import HalfSpace
 from full_geometry.models.storing import KIND, Learnt
 from full_geometry.object import radiance
 from full_geometry.object.pairs import EntryProposals
@@ -63,7 +63,7 @@ def error_table(
         learnt, _ = train_by_cpu(subject, seconds, folder, seed=seed)
     proposals = EntryProposals(subject, HalfSpace(subject, BACKBONE)).with_patches(learnt.sampler)
     tell("S = alpha p", 1)
-    models = {BACKBONE: PlanarModel(subject, BACKBONE), "full_geometry": learnt.model}
+    models = {BACKBONE: transport_of(subject, BACKBONE), "full_geometry": learnt.model}
     models["S = alpha p"] = fit_alpha_p(subject, FlowRecipe(seconds=seconds), seed)
     for key, model in models.items():
         errors = model_errors.measure(subject, model, proposals, truth=truth, samples=samples, seed=seed)

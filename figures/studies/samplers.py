@@ -16,11 +16,18 @@ from full_geometry.models.storing import Learnt
 from full_geometry.object.pairs import Numbers
 from full_geometry.object.patches import AREA_SHARE, LearntProposals, PatchTable
 from full_geometry.object.subject import Subject
-from full_geometry.scene import LearntTransport
 from halfspace_sss.backend import kernel_seconds
 from halfspace_sss.rendering.object.entries import PositionSampler, RadialTable
 from halfspace_sss.rendering.object.half_space import HalfSpaceProposals
-from halfspace_sss.rendering.object.points import Exit, Means, Proposals, cosine_above, lifted, number, turned
+from halfspace_sss.rendering.object.points import (
+    ObjectModel,
+    Proposals,
+    SurfacePoint,
+    cosine_above,
+    lifted,
+    number,
+    turned,
+)
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 if TYPE_CHECKING:
@@ -64,7 +71,7 @@ class Cost(NamedTuple):
 class _Exits:
     """Exits as a renderer has them, with their faces."""
 
-    out: Exit
+    out: SurfacePoint
     face: Any
 
 
@@ -81,30 +88,31 @@ def _exits(subject: Subject, n: int, repeated: int, seed: int) -> _Exits:
     k = dr.arange(mi.UInt32, n * repeated) // repeated
     p, n_out, w, n_face, face = (dr.gather(type(v), v, k) for v in points)
     dr.eval(p, n_out, w, n_face, face)
-    return _Exits(Exit(p, n_out, w, mi.Float(sign), n_face), face)
+    return _Exits(SurfacePoint(p, n_face, n_out, w, mi.Float(sign)), face)
 
 
-def _estimates(means: Means, light: Lighting, exits: _Exits, rng: Any, n: int) -> Any:
+def _estimates(model: ObjectModel, light: Lighting, exits: _Exits, rng: Any, n: int) -> Any:
     """Sum of n samples of each exit, per channel."""
     on = mi.Bool(True)
-    prepared = means.transport.prepare(exits.out, on)
-    where = means.proposals.prepare(exits.out, prepared, on)
+    prepared = model.transport.prepare(exits.out, on)
+    where = model.proposals.prepare(exits.out, prepared, on)
     total = mi.Spectrum(0)
     for _ in range(n):
-        entry = means.proposals.sample(exits.out, exits.face, where, rng, on)
+        entry = model.proposals.sample(exits.out, exits.face, where, rng, on)
         w, value = light.sample(entry, rng.next_2d(), entry.weight > 0)
-        total += means.transport.S_mu(prepared, entry, w, value > 0) * (entry.weight * value)
+        at = entry.facing(w)
+        total += model.transport.S(prepared, at, value > 0) * at.mu * (entry.weight * value)
     return total
 
 
 def spread(
-    subject: Subject, means: Means, light: Lighting, *, exits: int = 256, samples: int = 2048, seed: int = 0
+    subject: Subject, model: ObjectModel, light: Lighting, *, exits: int = 256, samples: int = 2048, seed: int = 0
 ) -> Spread:
     """The variance of one sample of a transport by its proposals.
 
     Args:
         subject: the object.
-        means: transport and proposals.
+        model: transport and proposals.
         light: that falls on it.
         exits, samples: random exits, and samples of each.
         seed: of both.
@@ -114,7 +122,7 @@ def spread(
     lanes = _exits(subject, exits, per_pass, seed)
     for k in range(passes):
         rng = Numbers(generator(mi, exits * per_pass, pass_seed(seed, 32, k)))
-        estimates = _estimates(means, light, lanes, rng, 1)
+        estimates = _estimates(model, light, lanes, rng, 1)
         rows = [dr.block_sum(v, per_pass) for x in estimates for v in (x, x * x)]
         dr.eval(rows)
         sums = sums + np.stack([r.numpy().astype(float) for r in rows]).reshape(len(estimates), 2, exits)
@@ -125,19 +133,19 @@ def spread(
     return Spread(float(variance.mean()), total)
 
 
-def costs(subject: Subject, all_means: Mapping[str, Means], light: Lighting) -> dict[str, Cost]:
+def costs(subject: Subject, models: Mapping[str, ObjectModel], light: Lighting) -> dict[str, Cost]:
     """Time of each; they take turns, and of the repeats the fastest counts, which is the one that least delayed."""
     lanes = _exits(subject, TIMED_LANES, 1, 5)
     rng = generator(mi, TIMED_LANES, pass_seed(6))
     dr.eval(rng.state, rng.inc)
-    best = {(name, n): np.inf for name in all_means for n in (1, MANY)}
+    best = {(name, n): np.inf for name in models for n in (1, MANY)}
     for k in range(REPEATS + 1):  # the first compiles
         for name, n in best:
             numbers = Numbers(mi.PCG32(rng))
-            seconds = kernel_seconds(lambda: _estimates(all_means[name], light, lanes, numbers, n))  # noqa: B023
+            seconds = kernel_seconds(lambda: _estimates(models[name], light, lanes, numbers, n))  # noqa: B023
             best[name, n] = min(best[name, n], seconds) if k else np.inf
     scale, cost = 1e6 / TIMED_LANES, {}
-    for name in all_means:
+    for name in models:
         each = max(best[name, MANY] - best[name, 1], 0.0) / (MANY - 1)
         cost[name] = Cost(scale * max(best[name, 1] - each, 0.0), scale * each)
     return cost
@@ -197,13 +205,13 @@ def sampler_table(
     import pandas
 
     subject, rows = learnt.model.subject, []
-    transport = LearntTransport(learnt.model, ())
+    transport = learnt.model
     flow, total = fit_flow(learnt, recipe, seed=seed), len(LIGHTINGS) * len(SAMPLERS)
     for name in LIGHTINGS:
         light = lighting(name, subject)
-        means = {key: Means(transport, p) for key, p in samplers(learnt, recipe, light, flow, seed).items()}
-        spent = costs(subject, means, light)
-        for key, each in means.items():
+        models = {key: ObjectModel(transport, p) for key, p in samplers(learnt, recipe, light, flow, seed).items()}
+        spent = costs(subject, models, light)
+        for key, each in models.items():
             V = spread(subject, each, light, exits=exits, samples=samples, seed=seed)
             row = {"light": name, "sampler": key, "V": V.variance, "t exit": spent[key].exit, "t": spent[key].sample}
             row |= {f"V t, {n} of an exit": V.variance * spent[key].of(n) for n in SAMPLES_OF_AN_EXIT}

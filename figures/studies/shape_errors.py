@@ -13,10 +13,9 @@ import mitsuba as mi
 import numpy as np
 
 from figures.studies.held_out import HELD_OUT
-from full_geometry.learning.model_errors import LIGHTS, RadianceError, errors_of
+from full_geometry.learning.model_errors import LIGHTS, RadianceError, errors_of, transport_of
 from full_geometry.learning.shape_data import draw_subject
 from full_geometry.models.descriptors import mean_chord
-from full_geometry.models.half_space import PlanarModel
 from full_geometry.models.neural_shape import transport
 from full_geometry.object.subject import Subject
 from halfspace_sss.interface.model import bssrdf
@@ -114,7 +113,7 @@ def evaluate(
             progress(case.name, k, n)
         subject = case.subject
         models: dict[str, Any] = {"neural_shape": transport(subject, path)}
-        models |= {name: PlanarModel(subject, name) for name in HALF_SPACES if _takes(name, subject)}
+        models |= {name: transport_of(subject, name) for name in HALF_SPACES if _takes(name, subject)}
         walks = WALKS * (MORE if float(subject.media[0].albedo_prime) < DARK else 1)
         errors = errors_of(subject, models, exits=EXITS, walks=walks, samples=SAMPLES, seed=seed)
         rows.append(_row(case, errors))
@@ -144,7 +143,7 @@ def _row(case: Case, by_model: Mapping[str, list[RadianceError]]) -> Row:
 def seconds_per_million(subject: Subject, path: Path | None = None) -> dict[str, float]:
     """Seconds for a million evaluations, entry and exit prepared anew, of the network and of half-space models."""
     models: dict[str, Any] = {"neural_shape": transport(subject, path)}
-    models |= {name: PlanarModel(subject, name) for name in HALF_SPACES}
+    models |= {name: transport_of(subject, name) for name in HALF_SPACES}
     rng = generator(mi, LANES, pass_seed(29))
     exits, entries = subject.random_points(rng), subject.random_points(rng)
     dr.eval(exits, entries)

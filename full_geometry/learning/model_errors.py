@@ -12,22 +12,21 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 
-from full_geometry.models.half_space import HalfSpace, PlanarModel
+from full_geometry.models.half_space import HalfSpace
 from full_geometry.models.storing import KIND, find_weights, load
 from full_geometry.object.pairs import EntryProposals
-from full_geometry.object.radiance import ExitRadiance, ExitTruth, ObjectModel, modelled, reference
-from full_geometry.object.subject import Subject, SurfacePoint
+from full_geometry.object.radiance import ExitRadiance, ExitTruth, modelled, reference
+from full_geometry.object.subject import Subject
 from halfspace_sss.checks import check_choice, check_count
+from halfspace_sss.interface.model import bssrdf
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.progress import NamedProgress
-from halfspace_sss.rendering.object.points import Entry, Exit, Transport, number
+from halfspace_sss.rendering.object.half_space import HalfSpaceTransport
+from halfspace_sss.rendering.object.points import Transport
 from halfspace_sss.rendering.object.registry import knows_objects, model_names, object_transport
 from halfspace_sss.rendering.object.settings import Settings
 from halfspace_sss.rendering.object.translucent import Inside
@@ -81,7 +80,7 @@ def _jackknife(square: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
 
 def measure(
     subject: Subject,
-    transport: ObjectModel,
+    transport: Transport,
     proposals: EntryProposals,
     *,
     truth: ExitTruth | None = None,
@@ -92,7 +91,7 @@ def measure(
 
     Args:
         subject: the object.
-        transport: `FullGeometry` or `PlanarModel`.
+        transport: its S.
         proposals: where entries are drawn.
         truth: from `reference`, of the orders of the transport; made anew by default.
         samples: entries of each exit.
@@ -103,19 +102,19 @@ def measure(
     return compare(modelled(transport, proposals, truth.exits, samples, seed), truth.truth)
 
 
-def _even_sky(transport: ObjectModel, by_S: ExitRadiance, truth: ExitTruth) -> list[RadianceError]:
+def _even_sky(transport: Transport, by_S: ExitRadiance, truth: ExitTruth) -> list[RadianceError]:
     """The errors of images under an even sky: those of alpha where it is trusted, elsewhere of S."""
-    alpha, n = getattr(transport, "alpha", None), len(by_S.mean)
+    alpha, n = transport.alpha, len(by_S.mean)
     if alpha is None:
         return []
-    known = np.array(alpha.evened[1]).reshape(n, 1, 1) > 0
+    known = np.array(alpha.known[1]).reshape(n, 1, 1) > 0
     mean = np.where(known, np.array(alpha(truth.exits)[1]).reshape(n, -1, 1), by_S.mean[..., :1])
     return of_even_light(ExitRadiance(mean, np.where(known, 0, by_S.variance[..., :1])), truth.truth)
 
 
 def errors_of(
     subject: Subject,
-    transports: Mapping[str, ObjectModel],
+    transports: Mapping[str, Transport],
     *,
     exits: int = 256,
     walks: int = 8192,
@@ -190,65 +189,25 @@ def errors(
         ValueError: an argument is out of range, the object has not been trained, or there is no such model.
     """
     subject = Subject.given(shape, medium, mm_per_unit, object)
-    transports = {model: transport(subject, model, folder)}
+    transports = {model: transport_of(subject, model, folder)}
     return errors_of(subject, transports, exits=exits, walks=walks, samples=samples, seed=seed)[model]
 
 
-# ----------------------------------------------------------------------------------------------------
-# The transport of an object by the name of its model; those that packages add for renders are asked alike.
-
-
-@dataclass(frozen=True, eq=False)
-class AddedTransport:
-    """A transport of an entry point of `halfspace_sss.transports`.
-
-    Args:
-        subject: the object.
-        inner: what renders would use.
-    """
-
-    subject: Subject
-    inner: Transport
-
-    @classmethod
-    def of(cls, subject: Subject, name: str) -> AddedTransport:
-        """The one of that name, of an object.
-
-        Raises:
-            ValueError: as it raises, or it has no S for two points of a surface.
-        """
-        make = object_transport(name)
-        inside = Inside("medium", subject.media[0], name, "total", True)
-        inner = make(subject.object, inside, list(subject.media), Settings()).transport if make else None
-        if inner is None or getattr(inner, "is_delta", False):
-            raise ValueError(f"model must be one that has S for two points of a surface, got {name!r}")
-        return cls(subject, inner)
-
-    @property
-    def orders(self) -> str:
-        return self.inner.orders
-
-    def prepare(self, at: SurfacePoint, active: Any = True) -> Any:
-        """What is done for the exit alone."""
-        return self.inner.prepare(Exit(at.p, at.n_out, at.w, number(self.subject.object.sign), at.n), active)
-
-    def S(self, exit: Any, at: SurfacePoint, active: Any = True) -> Any:
-        """S per channel, 1/((scene unit)² sr); 0 below the horizons."""
-        mu = dr.dot(at.w, at.n_out)
-        entry = Entry(at.p, mi.Normal3f(at.n * number(self.subject.object.sign)), at.n_out, mi.Float(1), mi.UInt32(0))
-        value = self.inner.S_mu(exit, entry, at.w, active)
-        return dr.select(mu > 0, value / dr.maximum(mu, 1e-6), 0)
-
-
-def transport(subject: Subject, model: str, folder: str | os.PathLike | None = None) -> Any:
+def transport_of(subject: Subject, model: str, folder: str | os.PathLike | None = None) -> Transport:
     """The transport called `model` of an object: "full_geometry", one that a package adds, or a half-space model.
 
     Raises:
-        ValueError: the object has not been trained, or there is no such model.
+        ValueError: the object has not been trained, there is no such model, it refuses the object as renders would, or
+            it has no S for two points of a surface.
     """
     check_choice("model", model, model_names())
     if model == KIND:
         return load(find_weights(subject, folder), subject).model
-    if knows_objects(model):
-        return AddedTransport.of(subject, model)
-    return PlanarModel(subject, model)
+    if not knows_objects(model):
+        return HalfSpaceTransport([bssrdf(model, m) for m in subject.media])
+    make = object_transport(model)
+    inside = Inside("medium", subject.media[0], model, "total", True, subject.varying)
+    found = make(subject.object, inside, list(subject.media), Settings()).transport if make else None
+    if found is None or found.is_delta:
+        raise ValueError(f"model must be one that has S for two points of a surface, got {model!r}")
+    return found

@@ -25,7 +25,7 @@ from full_geometry.object.identity import frame_of, identify
 from full_geometry.object.pairs import EntryProposals, Pairs, PairSource, shuffled
 from full_geometry.object.patches import Patches, PatchSampler, cluster
 from full_geometry.object.radiance import ExitRadiance, ExitTruth, reference, traced
-from full_geometry.object.subject import Subject, SurfacePoint
+from full_geometry.object.subject import Subject
 from full_geometry.object.walks import WalkEnds
 from halfspace_sss.backend import busy_threads
 from halfspace_sss.checks import check_count, check_interval
@@ -34,6 +34,7 @@ from halfspace_sss.neural.trained import check_weights_folder
 from halfspace_sss.neural.training.work_folder import CHECKPOINT, claim
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.provenance import check_folder, provenance, write_atomically
+from halfspace_sss.rendering.object.points import SurfacePoint
 from halfspace_sss.rendering.scenes.camera_walks import TRIAL
 
 # ---- Where what was learnt of even light is good enough to stand for it ----------------------------

@@ -15,11 +15,11 @@ import mitsuba as mi
 import numpy as np
 
 from full_geometry.object.first_event import FirstEvent, first_event
-from full_geometry.object.subject import Subject, SurfacePoint, refract_in
+from full_geometry.object.subject import Subject, refract_in
 from halfspace_sss.neural.features import medium_features
 from halfspace_sss.physics.backbone import length_scale
 from halfspace_sss.physics.medium import Medium
-from halfspace_sss.rendering.object.points import number
+from halfspace_sss.rendering.object.points import SurfacePoint, number
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 # ----------------------------------------------------------------------------------------------------

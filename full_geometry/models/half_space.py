@@ -11,10 +11,10 @@ import mitsuba as mi
 
 from full_geometry.object.features import Side
 from full_geometry.object.first_event import first_event
-from full_geometry.object.subject import Subject, SurfacePoint
+from full_geometry.object.subject import Subject
 from halfspace_sss.interface.model import BSSRDF, bssrdf
 from halfspace_sss.physics import fresnel
-from halfspace_sss.rendering.object.points import Exit, number, plane_query
+from halfspace_sss.rendering.object.points import SurfacePoint, number, plane_query
 
 FLOOR = 1e-2  # reflectance of the floor, over that of the half-space
 
@@ -60,31 +60,7 @@ class HalfSpace:
 
     def query(self, o: SurfacePoint, i: SurfacePoint) -> tuple[tuple, Any, Any]:
         """The query of the models, both Fresnel transmittances, and whether both directions are above the horizons."""
-        query = plane_query(i.p, i.n_out, i.w, Exit(o.p, o.n_out, o.w, None), "distance")
+        query = plane_query(i, o, "distance")
         mu_i, mu_o, eta = query[1], query[3], number(self.subject.eta)
         F_t = fresnel.F_t(mu_i, eta) * fresnel.F_t(mu_o, eta)
         return query, F_t, (mu_i > 0) & (mu_o > 0) & (dr.dot(o.w, o.n) > 0) & (dr.dot(i.w, i.n) > 0)
-
-
-class PlanarModel:
-    """A half-space model as renders lay it onto a surface today: no P, no floor.
-
-    Args:
-        subject: the object.
-        model: name of a half-space model.
-    """
-
-    def __init__(self, subject: Subject, model: str) -> None:
-        self.name = model
-        self.models: list[BSSRDF] = [bssrdf(model, m) for m in subject.media]
-        self.orders = self.models[0].orders
-
-    def prepare(self, at: SurfacePoint, active: Any = True) -> SurfacePoint:
-        """Nothing is done for the exit alone."""
-        return at
-
-    def S(self, exit: SurfacePoint, at: SurfacePoint, active: Any = True) -> Any:
-        """S per channel, 1/((scene unit)² sr)."""
-        query = plane_query(at.p, at.n_out, at.w, Exit(exit.p, exit.n_out, exit.w, None), "distance")
-        above = active & (query[1] > 0) & (query[3] > 0)
-        return dr.select(above, mi.Spectrum([m.eval(*query) for m in self.models]), 0)

@@ -38,14 +38,14 @@ from full_geometry.models.descriptors import (
 from full_geometry.models.half_space import HalfSpace
 from full_geometry.object.features import Side
 from full_geometry.object.pairs import EntryProposals
-from full_geometry.object.subject import Subject, SurfacePoint, refract_in
+from full_geometry.object.subject import Subject, refract_in
 from full_geometry.object.walks import trace_exits
 from halfspace_sss.interface.model import BSSRDF, bssrdf
 from halfspace_sss.neural.perceptron import Perceptron
 from halfspace_sss.neural.store import checksum_of, load_weights
 from halfspace_sss.once import once
 from halfspace_sss.physics.medium import Medium
-from halfspace_sss.rendering.object.points import number
+from halfspace_sss.rendering.object.points import SurfacePoint, number
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 # ---- What the network of all shapes is trained on, and warns outside of ----------------------------
@@ -146,6 +146,7 @@ class NeuralShape:
         weights: W_k (outputs, inputs) and b_k of the layers.
         media: numbers of each channel.
         scales: s of each channel, see `calibrated`; 1 if there are none.
+        checksums: of the weights, and of those of the half-space models that they correct.
     """
 
     subject: Subject
@@ -153,7 +154,10 @@ class NeuralShape:
     weights: Mapping[str, np.ndarray]
     media: Sequence[np.ndarray]
     scales: Sequence[float] = ()
+    checksums: tuple[str, ...] = ()
     orders = "multiple"
+    alpha = None
+    is_delta = False
 
     @classmethod
     def of(cls, subject: Subject, weights: Mapping[str, np.ndarray]) -> NeuralShape:
@@ -342,4 +346,5 @@ def transport(subject: Subject, path: str | os.PathLike | None = None) -> Neural
     if subject.varying is not None:
         name = subject.object.shape.id()
         raise ValueError(f"the medium of {name!r} must be the same everywhere for {KIND}, got one that varies")
-    return calibrated(NeuralShape.of(subject, load(Path(path) if path is not None else shipped_weights())))
+    model = NeuralShape.of(subject, load(Path(path) if path is not None else shipped_weights()))
+    return replace(calibrated(model), checksums=checksums(subject, path))

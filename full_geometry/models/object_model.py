@@ -24,9 +24,9 @@ from full_geometry.object.features import (
     side_features,
 )
 from full_geometry.object.first_event import first_event
-from full_geometry.object.subject import Subject, SurfacePoint
+from full_geometry.object.subject import Subject
 from halfspace_sss.neural.perceptron import Perceptron
-from halfspace_sss.rendering.object.points import number
+from halfspace_sss.rendering.object.points import SurfacePoint, number
 
 # ---- S of one object: a base model times what a small network has learnt, evaluated in Dr.Jit ----------
 
@@ -81,14 +81,14 @@ class DirectionalAlbedo:
         return tuple(dr.select(active, part, 0) for part in (enters - most, once, more))
 
     @property
-    def evened(self) -> tuple[Any, Any]:
-        """Channels in which orders below two, and the others, may stand for even light."""
+    def known(self) -> tuple[Any, Any]:
+        """See `rendering.object.points.DirectionalAlbedo`."""
         return tuple(mi.Spectrum([number(float(v)) for v in row]) for row in self.trusted)
 
     def __call__(self, at: SurfacePoint, active: Any = True) -> tuple[Any, Any]:
         """Orders zero and one, and alpha, per channel; 0 where they may not stand for even light."""
         unscattered, once, more = self.parts(at, active)
-        few, others = self.evened
+        few, others = self.known
         return few * (unscattered + once), others * more
 
 
@@ -108,6 +108,7 @@ class FullGeometry:
         base: S_0.
         weights: W_k (outputs, inputs) and b_k of the layers, Q of h.
         alpha: ∫ S mu_i of an exit, learnt beside S.
+        checksums: of the file of weights, and of those of its base model.
     """
 
     subject: Subject
@@ -115,7 +116,9 @@ class FullGeometry:
     base: BaseModel
     weights: Mapping[str, np.ndarray]
     alpha: DirectionalAlbedo
+    checksums: tuple[str, ...] = ()
     orders = "multiple"
+    is_delta = False
 
     @functools.cached_property
     def _network(self) -> Perceptron:

@@ -17,12 +17,12 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from full_geometry.object.first_event import FirstEvent, first_event
-from full_geometry.object.subject import Subject, SurfacePoint
+from full_geometry.object.subject import Subject
 from halfspace_sss.arrays import library
 from halfspace_sss.interface.model import BSSRDF
 from halfspace_sss.neural.perceptron import Perceptron
 from halfspace_sss.physics import fresnel
-from halfspace_sss.rendering.object.points import number
+from halfspace_sss.rendering.object.points import SurfacePoint, number
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 # ----------------------------------------------------------------------------------------------------

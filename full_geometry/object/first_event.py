@@ -17,8 +17,8 @@ from typing import Any, NamedTuple
 import drjit as dr
 import mitsuba as mi
 
-from full_geometry.object.subject import Subject, SurfacePoint, refract_in
-from halfspace_sss.rendering.object.points import channel_mean, lifted, mirrored, number, turned
+from full_geometry.object.subject import Subject, refract_in
+from halfspace_sss.rendering.object.points import SurfacePoint, channel_mean, lifted, mirrored, number, turned
 
 REFLECTIONS = 32
 NEGLIGIBLE = 1e-3  # weight of what is still inside

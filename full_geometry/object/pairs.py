@@ -12,10 +12,10 @@ import numpy as np
 from full_geometry.object.features import BaseModel, ObjectFrame, PreparedExit, Side, pair_features, side_features
 from full_geometry.object.first_event import first_event
 from full_geometry.object.patches import AREA_SHARE, ExitTable, LearntProposals, PatchSampler
-from full_geometry.object.subject import Subject, SurfacePoint, cosine_direction, surface_point
+from full_geometry.object.subject import Subject, cosine_direction
 from full_geometry.object.walks import WalkEnds, trace_exits
 from halfspace_sss.rendering.object.entries import PositionSampler, RadialTable
-from halfspace_sss.rendering.object.points import Exit, channel_mean, number
+from halfspace_sss.rendering.object.points import SurfacePoint, channel_mean, number
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 PATCH_SHARE = 0.6  # of those by patches, where they are learnt
@@ -114,7 +114,7 @@ class EntryProposals:
             table: of weights of patches, which are asked of the network otherwise.
             k: of each exit, its number in the table.
         """
-        out = Exit(exit.p, exit.n_out, exit.w, number(self.subject.object.sign))
+        out = exit._replace(sign=number(self.subject.object.sign))
         known = (out, mi.UInt32(k))
         if self.patches is None:
             entry = self.positions.sample(*known, Numbers(rng), mi.Bool(True))
@@ -122,9 +122,7 @@ class EntryProposals:
             drawn = LearntProposals(self.patches, self.positions, PATCH_SHARE, self.subject.object.sign, table)
             where = drawn.prepare(out, PreparedExit(Side(exit, first_event(self.subject, exit)), []), mi.Bool(True))
             entry = drawn.sample(*known, where, Numbers(rng), mi.Bool(True))
-        n = entry.n_face
-        w = cosine_direction(entry.n_out, n, rng)
-        return surface_point(entry.p, n, entry.n_out, w), dr.pi * entry.weight
+        return entry.facing(cosine_direction(entry.n_out, entry.n, rng)), dr.pi * entry.weight
 
     def with_patches(self, patches: PatchSampler | None) -> EntryProposals:
         """The same with learnt weights of patches, which take the place of uniform points."""

@@ -22,10 +22,10 @@ import numpy as np
 
 from full_geometry.object.features import ObjectFrame, PreparedExit, Side, side_features
 from full_geometry.object.first_event import first_event
-from full_geometry.object.subject import Subject, SurfacePoint, cosine_direction, surface_point
+from full_geometry.object.subject import Subject, cosine_direction, surface_point
 from halfspace_sss.neural.perceptron import Perceptron
 from halfspace_sss.rendering.object.entries import Point, PositionSampler
-from halfspace_sss.rendering.object.points import CosineProposals, Entry, Exit, number, turned
+from halfspace_sss.rendering.object.points import CosineProposals, EntrySample, SurfacePoint, number, turned
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 PATCHES = 512
@@ -317,19 +317,22 @@ class LearntProposals(CosineProposals):
     sign: float
     table: PatchTable | None = None
 
-    def prepare(self, out: Exit, prepared: PreparedExit, active: Any) -> _PatchesOfExit:
+    def prepare(self, out: SurfacePoint, prepared: PreparedExit, active: Any) -> _PatchesOfExit:
         weights = self.patches.prepare(prepared.side) if self.table is None else None
-        return _PatchesOfExit(weights, (out.n, *mi.coordinate_system(out.n)))
+        return _PatchesOfExit(weights, (out.n_out, *mi.coordinate_system(out.n_out)))
 
-    def sample(self, out: Exit, prim_index: Any, prepared: _PatchesOfExit, sampler: Any, active: Any) -> Entry:
+    def sample(
+        self, out: SurfacePoint, prim_index: Any, prepared: _PatchesOfExit, sampler: Any, active: Any
+    ) -> EntrySample:
         by_patch = active & (sampler.next_1d() < number(self.patch_share))
         weights = prepared.weights if self.table is None else self.table.weights(prim_index)
         at, _ = self.patches.sample(weights, sampler.next_1d(), sampler.next_1d(), sampler.next_2d())
         n_out = turned(at.n_shading, at.n) * number(self.sign)
-        entry = Entry(mi.Point3f(at.p), mi.Normal3f(at.n), mi.Normal3f(n_out), mi.Float(1), mi.UInt32(at.prim_index))
+        n = mi.Normal3f(at.n * number(self.sign))
+        entry = EntrySample(mi.Point3f(at.p), n, mi.Normal3f(n_out), mi.Float(1), mi.UInt32(at.prim_index))
         if self.patch_share < 1:
             probed = self.positions.sample(out, prim_index, sampler, active & ~by_patch)
-            entry = Entry(*(dr.select(by_patch, a, b) for a, b in zip(entry, probed)))
+            entry = EntrySample(*(dr.select(by_patch, a, b) for a, b in zip(entry, probed)))
         learnt = self.patches.density(weights, entry.face)
         if self.patch_share == 1:
             return entry._replace(weight=dr.select(by_patch, 1 / learnt, 0))

@@ -7,7 +7,7 @@ max(0, w . l)^16; nothing blocks it.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -15,28 +15,15 @@ import numpy as np
 
 from full_geometry.object.pairs import EntryProposals
 from full_geometry.object.patches import ExitTable
-from full_geometry.object.subject import Subject, SurfacePoint
+from full_geometry.object.subject import Subject
 from full_geometry.object.walks import trace_exits
 from halfspace_sss.checks import check_count
+from halfspace_sss.rendering.object.points import SurfacePoint, Transport
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 LOBES = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / np.sqrt(3.0)
 POWER = 16
 LANES = 2**20  # of one pass
-
-
-class ObjectModel(Protocol):
-    """A model of what light that enters an object is worth where it leaves.
-
-    Attributes:
-        orders: "multiple" (two or more scattering events) or "total" (one or more).
-    """
-
-    orders: str
-
-    def prepare(self, at: SurfacePoint, active: Any = True) -> Any: ...
-
-    def S(self, exit: Any, at: SurfacePoint, active: Any = True) -> Any: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +99,7 @@ def _repeated(points: SurfacePoint, times: int) -> SurfacePoint:
 
 
 def modelled(
-    transport: ObjectModel, proposals: EntryProposals, exits: SurfacePoint, samples: int, seed: int = 0
+    transport: Transport, proposals: EntryProposals, exits: SurfacePoint, samples: int, seed: int = 0
 ) -> ExitRadiance:
     """Radiance of exits by a model.
 

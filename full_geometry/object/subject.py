@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -16,7 +16,7 @@ from halfspace_sss.rendering.object.body import check_size
 from halfspace_sss.rendering.object.boundary import smooth_boundary
 from halfspace_sss.rendering.object.entries import AreaPoints
 from halfspace_sss.rendering.object.placement import check_empty
-from halfspace_sss.rendering.object.points import cosine_above, lifted, number, turned
+from halfspace_sss.rendering.object.points import SurfacePoint, cosine_above, lifted, number, turned
 from halfspace_sss.rendering.object.shape import Object, name_of, survey
 from halfspace_sss.rendering.object.translucent import Inside
 from halfspace_sss.rendering.object.varying import VaryingMedium, equivalent, grid_values
@@ -24,20 +24,6 @@ from halfspace_sss.rendering.scenes.scene_files import millimetres
 from halfspace_sss.rendering.walk.media import WalkMedia
 
 LEAST_RATIO = 1e-3  # in logarithms of what varies
-
-
-class SurfacePoint(NamedTuple):
-    """A point of the surface and a direction outside: position, outward geometric normal, the shading normal that w
-    sees, w."""
-
-    p: Any
-    n: Any
-    n_out: Any
-    w: Any
-
-    def gather(self, k: Any) -> SurfacePoint:
-        """The points of the lanes k."""
-        return SurfacePoint(*(dr.gather(type(v), v, k) for v in self))
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,8 +14,9 @@ from typing import Any, NamedTuple
 import drjit as dr
 import mitsuba as mi
 
-from full_geometry.object.subject import Subject, SurfacePoint, surface_point
+from full_geometry.object.subject import Subject, surface_point
 from halfspace_sss.checks import check_count
+from halfspace_sss.rendering.object.points import SurfacePoint
 from halfspace_sss.rendering.walk import exits as walk_exits
 from halfspace_sss.rendering.walk.random_walk import Crossing, Event, Walk
 
@@ -60,7 +61,7 @@ class _Store:
         leaves, si = walk.alive & crossing.leaves, crossing.si
         at = surface_point(si.p, si.n, si.sh_frame.n, walk.d)
         kept = leaves & (walk.order >= self.fewest) & (walk.order <= self.most)
-        targets, values = (*self.exits.at, *self.exits[1:]), (*at, walk.weight, walk.order, si.prim_index)
+        targets, values = (*self.exits.at[:4], *self.exits[1:]), (*at[:4], walk.weight, walk.order, si.prim_index)
         for target, value in zip(targets, values):
             dr.scatter(target, type(target)(value), record, kept)
         return replace(walk, alive=walk.alive & ~leaves), record
@@ -88,7 +89,6 @@ def trace_exits(
     """
     check_count("fewest", fewest, 0)
     store = _Store.of(dr.width(starts.p), fewest, most)
-    start = walk_exits.WalkStarts(starts.p, starts.n, starts.w, starts.n_out)
-    walk_exits.walk_from(subject.walk_media, 0, start, store, seed, LANES, roulette_from)
+    walk_exits.walk_from(subject.walk_media, 0, starts, store, seed, LANES, roulette_from)
     dr.eval(store.exits)
     return store.exits

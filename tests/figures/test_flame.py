@@ -25,7 +25,7 @@ from full_geometry.learning.training import Trained, train  # noqa: E402
 from halfspace_sss import Medium, rendering  # noqa: E402
 from halfspace_sss.neural.trained import ENVIRONMENT_VARIABLE  # noqa: E402
 from halfspace_sss.rendering.object.entries import AreaPoints  # noqa: E402
-from halfspace_sss.rendering.object.points import Entry, place, turned  # noqa: E402
+from halfspace_sss.rendering.object.points import EntrySample, place, turned  # noqa: E402
 from halfspace_sss.rendering.paths.path_loop import exit_at  # noqa: E402
 from halfspace_sss.rendering.scenes.scene_files import load_scene  # noqa: E402
 
@@ -93,13 +93,15 @@ def summed(scene, seed: int) -> np.ndarray:
     prepared = body.transport.prepare(exit_at(body, si), seen)
     at, lamp = AreaPoints(body.found.shape).sample(one(), two(), True), flame.sample_position(0.0, two())
     n_out = turned(at.n_shading, at.n) * float(body.found.sign)
-    entry = Entry(mi.Point3f(at.p), mi.Normal3f(at.n), mi.Normal3f(n_out), mi.Float(body.found.area), at.prim_index)
+    n = mi.Normal3f(turned(at.n, n_out))
+    entry = EntrySample(mi.Point3f(at.p), n, mi.Normal3f(n_out), mi.Float(body.found.area), at.prim_index)
     way = lamp.p - at.p
     w = mi.Vector3f(dr.normalize(way))
     facing = dr.maximum(-dr.dot(w, lamp.n), 0) / (dr.squared_norm(way) * lamp.pdf)
-    lit = seen & (facing > 0) & (dr.dot(w, entry.n_face) > 0)
+    lit = seen & (facing > 0) & (dr.dot(w, entry.n) > 0)
     lit &= ~scene.ray_test(place(at.p, at.n).spawn_ray_to(lamp.p), lit)
-    value = body.transport.S_mu(prepared, entry, w, lit) * (facing * entry.weight)
+    at_entry = entry.facing(w)
+    value = body.transport.S(prepared, at_entry, lit) * (at_entry.mu * facing * entry.weight)
     value = np.array(dr.select(lit, value * mi.Spectrum(list(FLAME_RADIANCE)), 0)).T
     row, column = (np.minimum((np.array(c) * BLOCKS).astype(int), BLOCKS - 1) for c in (film.y, film.x))
     found = np.zeros((BLOCKS, BLOCKS, 3))

@@ -25,25 +25,14 @@ from figures.studies.flow import (  # noqa: E402  # noqa: E402
     add_flow,
     flow_of,
 )
-from figures.studies.flow_chart import (  # noqa: E402
-    N_CONTEXT,
-    Chart,  # noqa: E402
-    direction_square,
-    from_square,
-)
+from figures.studies.flow_chart import N_CONTEXT, Chart, direction_square, from_square  # noqa: E402
 from figures.studies.flow_training import FlowNetwork  # noqa: E402
 from full_geometry.models.storing import CENTRES, CHECKSUMS, ENDS, EVEN, TURNS, load, save  # noqa: E402
 from full_geometry.object.features import PreparedExit, Side, Terms, n_pair, n_side  # noqa: E402
 from full_geometry.object.first_event import first_event  # noqa: E402
 from full_geometry.object.identity import identify  # noqa: E402
-from full_geometry.object.patches import (  # noqa: E402
-    LearntProposals,  # noqa: E402
-    PatchTable,  # noqa: E402
-    cluster,
-    mesh_faces,
-)
-from full_geometry.object.subject import SurfacePoint  # noqa: E402
-from halfspace_sss.rendering.object.points import Exit  # noqa: E402
+from full_geometry.object.patches import LearntProposals, PatchTable, cluster, mesh_faces  # noqa: E402
+from halfspace_sss.rendering.object.points import SurfacePoint  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
 N_PATCHES = 24
@@ -209,7 +198,7 @@ def test_proposals_of_the_flow_and_of_patches_give_the_same_estimate(sampler: Fl
     n_out = mi.Normal3f(at.n_shading * sign)
     exit = Side(SurfacePoint(at.p, mi.Normal3f(at.n * sign), n_out, mi.Vector3f(n_out)), None)
     exit = exit._replace(event=first_event(subject, exit.at))
-    out, on, table = Exit(at.p, n_out, mi.Vector3f(n_out), mi.Float(sign)), mi.Bool(True), PatchTable(sampler.patches)
+    out, on, table = exit.at._replace(sign=mi.Float(sign)), mi.Bool(True), PatchTable(sampler.patches)
     means, errors = [], []
     for k, proposals in enumerate(
         (FlowProposals(sampler, sign), FlowProposals(sampler, sign, table),

@@ -22,37 +22,19 @@ from coarse import coarse_ball  # noqa: E402
 from waxen import BUNNY, WAX, random_layers, random_patches, wax_bunny  # noqa: E402
 
 from figures.studies import paper_network as paper  # noqa: E402
-from figures.studies.alpha_p import (  # noqa: E402
-    AlphaP,  # noqa: E402
-    fit_alpha_p,  # noqa: E402
-)
+from figures.studies.alpha_p import AlphaP, fit_alpha_p  # noqa: E402
 from figures.studies.commands import _errors_wide, markdown  # noqa: E402
-from figures.studies.flow import (  # noqa: E402
-    ConditionalFlow,  # noqa: E402
-    FlowSampler,  # noqa: E402
-)
-from figures.studies.flow_chart import (  # noqa: E402
-    N_CONTEXT,  # noqa: E402
-    Chart,  # noqa: E402
-)
-from figures.studies.flow_training import (  # noqa: E402
-    LIGHTINGS,
-    FlowNetwork,  # noqa: E402
-    FlowRecipe,  # noqa: E402
-    lighting,
-)
+from figures.studies.flow import ConditionalFlow, FlowSampler  # noqa: E402
+from figures.studies.flow_chart import N_CONTEXT, Chart  # noqa: E402
+from figures.studies.flow_training import LIGHTINGS, FlowNetwork, FlowRecipe, lighting  # noqa: E402
 from figures.studies.paper_flow import incidence, mesh_arrays, on_surface, rmsd  # noqa: E402
-from figures.studies.paper_network import (  # noqa: E402
-    measured_lights,
-    paper_errors,  # noqa: E402
-    random_lights,
-)
+from figures.studies.paper_network import measured_lights, paper_errors, random_lights  # noqa: E402
 from full_geometry.object.features import n_side  # noqa: E402
 from full_geometry.object.identity import frame_of  # noqa: E402
 from full_geometry.object.radiance import reference  # noqa: E402
-from full_geometry.object.subject import Subject, SurfacePoint  # noqa: E402
+from full_geometry.object.subject import Subject  # noqa: E402
 from halfspace_sss.cli import app as cli  # noqa: E402
-from halfspace_sss.rendering.object.points import Entry  # noqa: E402
+from halfspace_sss.rendering.object.points import EntrySample, SurfacePoint  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
 N_PATCHES = 24
@@ -166,8 +148,7 @@ def test_an_even_S_takes_pi_from_all_directions_also_below_interpolated_horizons
 @pytest.mark.parametrize("kind", LIGHTINGS)
 def test_no_light_comes_from_below_the_surface(subject: Subject, kind: str) -> None:
     at = subject.random_points(generator(mi, 4096, pass_seed(6)))
-    n = mi.Normal3f(at.n * subject.object.sign)
-    entry = Entry(at.p, n, at.n_out, mi.Float(1), dr.zeros(mi.UInt32, 4096))
+    entry = EntrySample(at.p, at.n, at.n_out, mi.Float(1), dr.zeros(mi.UInt32, 4096))
     w, value = lighting(kind, subject).sample(entry, mi.Point2f(0.3, 0.6), mi.Bool(True))
     value, mu = np.array(value), np.array(dr.dot(w, at.n))
     assert np.all(value[mu <= 0] == 0) and np.all(value >= 0) and (value > 0).mean() > 0.1

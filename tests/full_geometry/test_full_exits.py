@@ -15,8 +15,9 @@ from halfspace_sss.tracing.walk import generator, pass_seed
 mi = pytest.importorskip("mitsuba")
 
 from full_geometry.object.first_event import first_event  # noqa: E402
-from full_geometry.object.subject import Subject, SurfacePoint, refract_in  # noqa: E402
+from full_geometry.object.subject import Subject, refract_in  # noqa: E402
 from full_geometry.object.walks import trace_exits  # noqa: E402
+from halfspace_sss.rendering.object.points import SurfacePoint  # noqa: E402
 
 N = 2**16
 COLOURS = Medium(np.array([0.99, 0.75, 0.3]), np.array([0.01, 0.25, 0.7]), np.array([0.0, 0.3, 0.0]), 1.4)

@@ -24,14 +24,9 @@ from full_geometry.object.features import Side  # noqa: E402
 from full_geometry.object.first_event import first_event  # noqa: E402
 from full_geometry.object.identity import frame_of  # noqa: E402
 from full_geometry.object.pairs import EntryProposals  # noqa: E402
-from full_geometry.object.patches import (  # noqa: E402
-    Patches,
-    PatchSampler,
-    PatchTable,  # noqa: E402
-    cluster,
-    mesh_faces,
-)
-from full_geometry.object.subject import Subject, SurfacePoint, cosine_direction, surface_point  # noqa: E402
+from full_geometry.object.patches import Patches, PatchSampler, PatchTable, cluster, mesh_faces  # noqa: E402
+from full_geometry.object.subject import Subject, cosine_direction, surface_point  # noqa: E402
+from halfspace_sss.rendering.object.points import SurfacePoint  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
 N_PATCHES = 64

@@ -22,11 +22,7 @@ import drjit as dr  # noqa: E402
 from full_geometry.learning import training  # noqa: E402
 from full_geometry.learning.fitting import ALPHA_HIDDEN, Recipe  # noqa: E402
 from full_geometry.learning.model_errors import EVEN_SKY, LIGHTS, errors_of  # noqa: E402
-from full_geometry.learning.training import (  # noqa: E402
-    Trained,
-    train,
-    trusted,  # noqa: E402
-)
+from full_geometry.learning.training import Trained, train, trusted  # noqa: E402
 from full_geometry.models import storing  # noqa: E402
 from full_geometry.models.object_model import BOUND  # noqa: E402
 from full_geometry.object.features import Quadratic, n_side  # noqa: E402
@@ -34,7 +30,6 @@ from full_geometry.object.first_event import first_event  # noqa: E402
 from full_geometry.object.radiance import reference  # noqa: E402
 from full_geometry.object.subject import Subject  # noqa: E402
 from full_geometry.object.walks import trace_exits  # noqa: E402
-from full_geometry.scene import ObjectTransport  # noqa: E402
 from halfspace_sss import rendering  # noqa: E402
 from halfspace_sss.neural import trained as known_weights  # noqa: E402
 from halfspace_sss.neural.store import load_weights, save_weights  # noqa: E402
@@ -159,7 +154,7 @@ def test_another_object_beside_it_keeps_its_own_model(trained: Trained) -> None:
     ball = {"type": "sphere", "center": [5, 0, 0], "radius": 1.0, "bsdf": {**SURFACE, "model": "better_dipole"}}
     loaded = load_scene(scene({"bunny": bunny(bsdf=SURFACE), "ball": ball}, "mixed"))
     kinds = {b.found.shape.id(): type(b.transport).__name__ for b in loaded.integrator().prepare(loaded)}
-    assert kinds["bunny"] == "ObjectTransport" and kinds["ball"] != "ObjectTransport"
+    assert kinds["bunny"] == "FullGeometry" and kinds["ball"] == "HalfSpaceTransport"
 
 
 def test_the_mirrored_object_is_another_one(trained: Trained) -> None:
@@ -375,7 +370,8 @@ def test_an_even_sky_has_the_same_light_and_a_fifth_of_the_variance(
     means, variances = [], []
     for knows in (True, False):
         if not knows:
-            monkeypatch.delattr(ObjectTransport, "alpha")
+            for body in scene.integrator().prepare(scene):
+                object.__setattr__(body.transport, "alpha", None)
         runs = np.array([np.array(mi.render(scene, spp=32, seed=k)) for k in range(8)])
         means.append(runs.mean(axis=(0, 1, 2)))
         variances.append(runs.var(axis=0, ddof=1).mean())

@@ -22,12 +22,12 @@ from full_geometry.models import storing  # noqa: E402
 from full_geometry.models.half_space import HalfSpace  # noqa: E402
 from full_geometry.object.pairs import EntryProposals  # noqa: E402
 from full_geometry.object.radiance import reference  # noqa: E402
-from full_geometry.object.subject import Subject, SurfacePoint  # noqa: E402
-from full_geometry.scene import learnt_means  # noqa: E402
+from full_geometry.object.subject import Subject  # noqa: E402
+from full_geometry.scene import learnt_model  # noqa: E402
 from halfspace_sss import Medium, rendering  # noqa: E402
 from halfspace_sss.neural import trained as known_weights  # noqa: E402
 from halfspace_sss.neural.store import load_weights, save_weights  # noqa: E402
-from halfspace_sss.rendering.object.points import Entry, Exit  # noqa: E402
+from halfspace_sss.rendering.object.points import SurfacePoint  # noqa: E402
 from halfspace_sss.rendering.object.settings import Settings  # noqa: E402
 from halfspace_sss.rendering.object.translucent import Inside  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
@@ -100,13 +100,10 @@ def test_renders_ask_the_model_that_was_trained(trained: Trained, monkeypatch: p
     shape = mi.load_dict({"type": "sphere", "radius": 3.0, "bsdf": surface})
     here = Subject.of(shape, WAX.channel(1))
     inside = Inside("medium", here.media[0], "full_geometry", "multiple", True)
-    transport = learnt_means(here.object, inside, list(here.media), Settings()).transport
+    transport = learnt_model(here.object, inside, list(here.media), Settings()).transport
     o, i = points(here)
-    out = Exit(o.p, o.n_out, o.w, mi.Float(here.object.sign), o.n)
-    entry = Entry(i.p, i.n, i.n_out, mi.Float(1), mi.UInt32(0))
-    mu = np.array(mi.Float(sum(a * b for a, b in zip(i.w, i.n_out))))
-    rendered = np.array(transport.S_mu(transport.prepare(out, True), entry, i.w, True))
-    assert np.allclose(rendered, S_of(trained.model, here) * mu, rtol=1e-5)
+    rendered = np.array(transport.S(transport.prepare(o), i))
+    assert np.allclose(rendered, S_of(trained.model, here), rtol=1e-5)
     assert set(shapes.checksums(here)) < set(transport.checksums)
 
 

@@ -19,20 +19,21 @@ torch = pytest.importorskip("torch")
 import full_geometry  # noqa: E402
 from full_geometry.learning import training  # noqa: E402
 from full_geometry.learning.fitting import Recipe  # noqa: E402
-from full_geometry.learning.model_errors import EVEN_SKY, LIGHTS, compare, measure  # noqa: E402
+from full_geometry.learning.model_errors import EVEN_SKY, LIGHTS, compare, measure, transport_of  # noqa: E402
 from full_geometry.learning.networks import Correction  # noqa: E402
 from full_geometry.learning.training import Trained, train  # noqa: E402
 from full_geometry.models import storing  # noqa: E402
-from full_geometry.models.half_space import HalfSpace, PlanarModel  # noqa: E402
+from full_geometry.models.half_space import HalfSpace  # noqa: E402
 from full_geometry.models.object_model import FullGeometry  # noqa: E402
 from full_geometry.object.features import Side, n_pair, n_side, pair_features, reverse, side_features  # noqa: E402
 from full_geometry.object.first_event import first_event  # noqa: E402
 from full_geometry.object.identity import frame_of  # noqa: E402
 from full_geometry.object.pairs import EntryProposals  # noqa: E402
 from full_geometry.object.radiance import ExitRadiance, reference  # noqa: E402
-from full_geometry.object.subject import Subject, SurfacePoint  # noqa: E402
+from full_geometry.object.subject import Subject  # noqa: E402
 from halfspace_sss import rendering  # noqa: E402
 from halfspace_sss.neural.store import load_weights, save_weights  # noqa: E402
+from halfspace_sss.rendering.object.points import SurfacePoint  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
 QUICK, CHUNKS = Recipe(width=24, depth=2, batch=1024, chunk=2**14, reuse=4), 12
@@ -70,7 +71,7 @@ def constant(found: list) -> np.ndarray:
 def test_training_halves_the_error_of_the_half_space(trained: Trained) -> None:
     subject = trained.model.subject
     proposals = EntryProposals(subject, HalfSpace(subject, "better_dipole"))
-    plane = measure(subject, PlanarModel(subject, "better_dipole"), proposals, samples=1024)
+    plane = measure(subject, transport_of(subject, "better_dipole"), proposals, samples=1024)
     assert np.all(constant(trained.errors) < 0.5 * constant(plane))
     assert all(abs(row.ratio - 1) < 0.03 for row in trained.errors)
 
@@ -159,7 +160,7 @@ def test_no_training_gives_the_half_space_with_a_warning(tmp_path: Path) -> None
     with pytest.warns(UserWarning, match="rendered by better_dipole"):
         found = train(ball(200.0), WAX, seconds=0, folder=tmp_path)
     assert found.path is None and not list(tmp_path.iterdir())
-    plane = PlanarModel(found.model.subject, "better_dipole")
+    plane = transport_of(found.model.subject, "better_dipole")
     exits, entries = (found.model.subject.random_points(generator(mi, 64, pass_seed(k))) for k in (1, 2))
     near = entries._replace(p=exits.p + 0.5 * mi.Vector3f(mi.coordinate_system(exits.n)[0]), n=exits.n, n_out=exits.n)
     near = near._replace(w=exits.n)
@@ -203,7 +204,7 @@ def test_a_moved_and_turned_mesh_is_the_same_object(tmp_path: Path) -> None:
     moved = Subject.of(mi.load_dict(bunny(turn=40.0, shift=3.0)), WAX)
     again = storing.load(storing.find_weights(moved, tmp_path), moved).model
     turn = mi.Transform4f().translate([3, 0, -3]).rotate([0.6, 0.8, 0], 40)
-    turned = [SurfacePoint(*(turn @ v for v in point)) for point in points_of(model)]
+    turned = [SurfacePoint(*(turn @ v for v in point[:4])) for point in points_of(model)]
     a, b = S_of(model), S_of(again, turned)
     seen = a > 1e-3 * a.max()
     assert np.median(np.abs(b[seen] / a[seen] - 1)) < 1e-3

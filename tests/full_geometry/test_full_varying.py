@@ -16,15 +16,16 @@ mi = pytest.importorskip("mitsuba")
 pytest.importorskip("torch")
 
 from full_geometry.learning.fitting import Recipe  # noqa: E402
-from full_geometry.learning.model_errors import LIGHTS, measure  # noqa: E402
+from full_geometry.learning.model_errors import LIGHTS, measure, transport_of  # noqa: E402
 from full_geometry.learning.training import Trained, train  # noqa: E402
 from full_geometry.models import storing  # noqa: E402
-from full_geometry.models.half_space import HalfSpace, PlanarModel  # noqa: E402
+from full_geometry.models.half_space import HalfSpace  # noqa: E402
 from full_geometry.object.first_event import first_event, flight  # noqa: E402
 from full_geometry.object.pairs import EntryProposals  # noqa: E402
-from full_geometry.object.subject import Subject, SurfacePoint  # noqa: E402
+from full_geometry.object.subject import Subject  # noqa: E402
 from halfspace_sss import rendering  # noqa: E402
 from halfspace_sss.neural import trained as known_weights  # noqa: E402
+from halfspace_sss.rendering.object.points import SurfacePoint  # noqa: E402
 from halfspace_sss.rendering.scenes.scene_files import load_objects, load_scene  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
@@ -115,7 +116,7 @@ def test_a_grid_of_one_value_gives_the_first_event_of_the_homogeneous_medium() -
 def test_training_halves_the_error_of_the_half_space_in_a_medium_that_varies(trained: Trained) -> None:
     subject = trained.model.subject
     proposals = EntryProposals(subject, HalfSpace(subject, "better_dipole"))
-    plane = measure(subject, PlanarModel(subject, "better_dipole"), proposals, samples=1024)
+    plane = measure(subject, transport_of(subject, "better_dipole"), proposals, samples=1024)
     assert np.all(constant(trained.errors) < 0.5 * constant(plane))
 
 
@@ -130,7 +131,7 @@ def test_an_object_moved_with_its_grids_is_the_same_one(trained: Trained, folder
     rng = generator(mi, 4096, pass_seed(7))
     points = [trained.model.subject.random_points(rng) for _ in range(2)]
     turn = mi.Transform4f().translate([3, 0, 0]).rotate([0.6, 0.8, 0], 40)
-    a, b = S_of(trained.model, points), S_of(again, [SurfacePoint(*(turn @ v for v in point)) for point in points])
+    a, b = S_of(trained.model, points), S_of(again, [SurfacePoint(*(turn @ v for v in point[:4])) for point in points])
     seen = a > 1e-3 * a.max()
     assert np.median(np.abs(b[seen] / a[seen] - 1)) < 2e-3
 

@@ -21,7 +21,8 @@ from full_geometry.models.half_space import HalfSpace  # noqa: E402
 from full_geometry.models.neural_shape import Backbone  # noqa: E402
 from full_geometry.object.features import Side  # noqa: E402
 from full_geometry.object.first_event import first_event  # noqa: E402
-from full_geometry.object.subject import Subject, SurfacePoint, cosine_direction  # noqa: E402
+from full_geometry.object.subject import Subject, cosine_direction  # noqa: E402
+from halfspace_sss.rendering.object.points import SurfacePoint  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
 

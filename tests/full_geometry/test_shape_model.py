@@ -12,7 +12,7 @@ mi = pytest.importorskip("mitsuba")
 pytest.importorskip("igl")
 
 from full_geometry.learning.meshes import Box, surface  # noqa: E402
-from full_geometry.learning.model_errors import errors_of  # noqa: E402
+from full_geometry.learning.model_errors import errors_of, transport_of  # noqa: E402
 from full_geometry.learning.shapes import make_shape  # noqa: E402
 from full_geometry.models.descriptors import (  # noqa: E402
     CURVED_OWN,
@@ -23,16 +23,11 @@ from full_geometry.models.descriptors import (  # noqa: E402
     Pair,
     describe,
     end,
-    mixed,  # noqa: E402
+    mixed,
 )
-from full_geometry.models.half_space import PlanarModel  # noqa: E402
-from full_geometry.models.neural_shape import (  # noqa: E402
-    Backbone,  # noqa: E402
-    NeuralShape,
-    most,
-    transport,  # noqa: E402
-)
-from full_geometry.object.subject import Subject, SurfacePoint, cosine_direction  # noqa: E402
+from full_geometry.models.neural_shape import Backbone, NeuralShape, most, transport  # noqa: E402
+from full_geometry.object.subject import Subject, cosine_direction  # noqa: E402
+from halfspace_sss.rendering.object.points import SurfacePoint  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
 WAX = Medium(0.95, 0.05, 0.3, 1.4)
@@ -91,7 +86,7 @@ def moved(at: SurfacePoint, turn: mi.ScalarTransform4f, scale: float) -> Surface
     def turned(v: object) -> object:
         return type(v)(*(dr.dot(row, mi.Vector3f(v)) for row in rows))
 
-    p, n, n_out, w = (turned(v) for v in at)
+    p, n, n_out, w = (turned(v) for v in at[:4])
     return SurfacePoint(p * scale, n, n_out, w)
 
 
@@ -229,7 +224,7 @@ def test_media_at_the_ends_of_the_range_stay_finite(ratios: tuple[float, ...]) -
 @pytest.mark.parametrize("radius", [3.0, 10.0])
 def test_shipped_weights_are_several_times_better_than_the_half_space_on_a_sphere(radius: float) -> None:
     subject = Subject.of(mi.load_dict({"type": "sphere", "radius": radius}), Medium(0.95, 0.05, 0.0, 1.3))
-    models = {"neural_shape": transport(subject), "neural": PlanarModel(subject, "neural")}
+    models = {"neural_shape": transport(subject), "neural": transport_of(subject, "neural")}
     found = errors_of(subject, models, exits=64, walks=2048, samples=1024)
     own, plane = (found[name][0].error for name in models)
     assert own < plane / 3

@@ -13,7 +13,7 @@ from test_translucent_walk import COLOURED, _agree, _lamp, _runs, _scene, _small
 
 import halfspace_sss.rendering as rendering
 from halfspace_sss.rendering.object import body as bodies
-from halfspace_sss.rendering.object.points import Means
+from halfspace_sss.rendering.object.points import ObjectModel
 from halfspace_sss.rendering.paths import low_orders
 from halfspace_sss.rendering.walk import media as walks
 
@@ -33,7 +33,7 @@ def variant() -> None:
 @pytest.fixture
 def only_few(monkeypatch: pytest.MonkeyPatch) -> None:
     """No order from two on: neither in walks nor by a model."""
-    monkeypatch.setattr(bodies, "_means", lambda *_: Means(None, None))
+    monkeypatch.setattr(bodies, "_model_of", lambda *_: ObjectModel(None, None))
     monkeypatch.setitem(walks._MOST, "total", 1)
 
 

@@ -10,14 +10,7 @@ from halfspace_sss import Medium
 
 mi = pytest.importorskip("mitsuba")
 import drjit as dr  # noqa: E402
-from differentiated import (  # noqa: E402
-    LIGHTS,
-    ROUGH,
-    backward,
-    image,
-    make,
-    weights,
-)  # fmt: skip
+from differentiated import LIGHTS, ROUGH, backward, image, make, weights  # noqa: E402  # fmt: skip
 
 pytestmark = pytest.mark.usefixtures("quiet_rgb")
 

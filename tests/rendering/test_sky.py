@@ -16,8 +16,8 @@ from rendered import surface  # noqa: E402
 
 from halfspace_sss import rendering  # noqa: E402
 from halfspace_sss.rendering.object import body as bodies  # noqa: E402
-from halfspace_sss.rendering.object.half_space import half_space_means  # noqa: E402
-from halfspace_sss.rendering.object.points import Means  # noqa: E402
+from halfspace_sss.rendering.object.half_space import half_space_model  # noqa: E402
+from halfspace_sss.rendering.object.points import ObjectModel  # noqa: E402
 from halfspace_sss.rendering.paths.lighting import Lights, Sky  # noqa: E402
 
 R, SIGMA_S, SIGMA_A = 0.5, 1.2, 0.3
@@ -45,9 +45,9 @@ def once_of_ball(mu: np.ndarray) -> np.ndarray:
 
 
 class Even:
-    """S mu_i = R mu_i / (pi A), which has the share R of even light."""
+    """S = R / (pi A), which has the share R of even light."""
 
-    orders, checksums = "multiple", ()
+    orders, checksums, alpha, is_delta = "multiple", (), None, False
 
     def __init__(self, area: float) -> None:
         self.scale = R / (np.pi * area)
@@ -55,8 +55,8 @@ class Even:
     def prepare(self, out, active):
         return None
 
-    def S_mu(self, prepared, entry, w_i, active):
-        return mi.Spectrum(self.scale * entry.seen(w_i)[1])
+    def S(self, exit, at, active):
+        return mi.Spectrum(self.scale)
 
 
 class Known(Even):
@@ -65,23 +65,24 @@ class Known(Even):
     def __init__(self, area: float) -> None:
         super().__init__(area)
         self.once = mi.Texture1f(mi.TensorXf(once_of_ball((np.arange(KNOTS) + 0.5) / KNOTS)[:, None]))
+        self.alpha = self
 
     @property
-    def evened(self):
+    def known(self):
         return mi.Spectrum(1), mi.Spectrum(1)
 
-    def alpha(self, out, active):
-        return mi.Spectrum(self.once.eval(mi.Point1f(dr.dot(out.w, out.n)))[0]), mi.Spectrum(R)
+    def __call__(self, at, active):
+        return mi.Spectrum(self.once.eval(mi.Point1f(dr.dot(at.w, at.n_out)))[0]), mi.Spectrum(R)
 
 
 def scene(kind: type, patch: pytest.MonkeyPatch, light: dict, **integrator) -> dict:
     """A ball with a transport, in light."""
 
     def means(inside, found, media, settings, variation):
-        proposals = half_space_means("better_dipole", found, media, settings, variation).proposals
-        return Means(kind(found.area), proposals, 2)
+        proposals = half_space_model("better_dipole", found, media, settings, variation).proposals
+        return ObjectModel(kind(found.area), proposals, 2)
 
-    patch.setattr(bodies, "_means", means)
+    patch.setattr(bodies, "_model_of", means)
     patch.setattr(bodies, "knows_objects", lambda name: True)
     film = {"type": "hdrfilm", "width": 12, "height": 12, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
     view = mi.ScalarTransform4f().look_at([0, 1, 5], [0, 0, 0], [0, 1, 0]).scale(0.6)

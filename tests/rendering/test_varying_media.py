@@ -114,13 +114,14 @@ def _layers(values: list, thickness: float, **more: Any) -> dict:
 
 
 def _exits(surface: dict, thickness: float, mu: float, seed: int) -> Any:
-    from halfspace_sss.rendering.walk.exits import WalkStarts, exits
+    from halfspace_sss.rendering.object.points import SurfacePoint
+    from halfspace_sss.rendering.walk.exits import exits
     from halfspace_sss.rendering.walk.media import WalkMedia
 
     scene = {"type": "scene", "object": {**_slab(thickness), "bsdf": {"type": "translucent", **surface}}}
     w = np.repeat([[np.sqrt(1 - mu * mu)], [0.0], [mu]], N, axis=1)
     up = np.repeat([[0.0], [0.0], [1.0]], N, axis=1)
-    start = WalkStarts(mi.Point3f(np.zeros((3, N))), mi.Normal3f(up), mi.Vector3f(w))
+    start = SurfacePoint(mi.Point3f(np.zeros((3, N))), mi.Normal3f(up), mi.Normal3f(up), mi.Vector3f(w))
     return exits(WalkMedia.of(mi.load_dict(scene), 1.0), 0, start, seed)
 
 

@@ -39,16 +39,16 @@ def _slab() -> dict:
 
 def _start(mu: float, n: int = N):
     """Walks that enter at the origin with the cosine mu."""
-    from halfspace_sss.rendering.walk.exits import WalkStarts
+    from halfspace_sss.rendering.object.points import SurfacePoint
 
     w = np.repeat([[np.sqrt(1 - mu * mu)], [0.0], [mu]], n, axis=1)
     up = np.repeat([[0.0], [0.0], [1.0]], n, axis=1)
-    return WalkStarts(mi.Point3f(np.zeros((3, n))), mi.Normal3f(up), mi.Vector3f(w))
+    return SurfacePoint(mi.Point3f(np.zeros((3, n))), mi.Normal3f(up), mi.Normal3f(up), mi.Vector3f(w))
 
 
 def _on_sphere(radius: float, n: int, diffuse: bool = False):
     """Random points of a sphere about the origin; directions within 70 degrees of its normals, or by the cosine."""
-    from halfspace_sss.rendering.walk.exits import WalkStarts
+    from halfspace_sss.rendering.object.points import SurfacePoint
 
     rng = np.random.default_rng(3)
     up = rng.standard_normal((3, n))
@@ -56,7 +56,7 @@ def _on_sphere(radius: float, n: int, diffuse: bool = False):
     w = rng.standard_normal((3, n))
     w = (1.0 if diffuse else 1.05) * up + w / np.linalg.norm(w, axis=0)
     w /= np.linalg.norm(w, axis=0)
-    return WalkStarts(mi.Point3f(radius * up), mi.Normal3f(up), mi.Vector3f(w)), (up * w).sum(axis=0)
+    return SurfacePoint(mi.Point3f(radius * up), mi.Normal3f(up), mi.Normal3f(up), mi.Vector3f(w)), (up * w).sum(axis=0)
 
 
 def _exits(*arguments: object, **options: object):
@@ -106,7 +106,7 @@ def test_a_ball_of_many_mean_free_paths_reflects_diffuse_light_as_the_half_space
     colours = {"sigma_s": "0.99,0.75,0.3", "sigma_a": "0.01,0.25,0.7", "g": "0,0.3,0", "eta": 1.4}
     media = _media({"type": "sphere", "radius": radius, "center": [away, 0, 0]}, scale, **colours)
     start, _ = _on_sphere(radius, N, diffuse=True)
-    start.x_o = mi.Point3f(start.x_o + mi.Vector3f(away, 0, 0))
+    start = start._replace(p=mi.Point3f(start.p + mi.Vector3f(away, 0, 0)))
     out = _exits(media, 0, start, 9)
     order = np.array(out.order)
     for values, s, a, g in zip(np.array(out.throughput), (0.99, 0.75, 0.3), (0.01, 0.25, 0.7), (0.0, 0.3, 0.0)):
@@ -154,7 +154,7 @@ def test_an_object_of_multiple_scattering_has_no_exits_of_lower_orders() -> None
 
 def test_a_walk_whose_direction_is_below_the_surface_never_enters() -> None:
     start = _start(0.6, 8)
-    start.w_o = -start.w_o
+    start = start._replace(w=-start.w)
     out = _exits(_media(_slab(), sigma_s=1.0, sigma_a=0.1), 0, start, 5)
     assert not np.array(out.left).any()
     assert not np.array(out.throughput).any()
@@ -187,6 +187,6 @@ def test_numbers_of_objects_and_lengths_that_do_not_fit_are_refused() -> None:
     with pytest.raises(ValueError, match=r"k must be a whole number in \[0, 0\], got 1"):
         _exits(media, 1, _start(0.6, 8), 1)
     start = _start(0.6, 8)
-    start.n_o = mi.Normal3f(0, 0, 1)
-    with pytest.raises(ValueError, match=r"x_o, n_o and w_o must be of one length, got \[8, 1, 8\]"):
+    start = start._replace(n=mi.Normal3f(0, 0, 1))
+    with pytest.raises(ValueError, match=r"p, n, n_out and w of the starts must be of one length, got \[8, 1, 8, 8\]"):
         _exits(media, 0, start, 1)

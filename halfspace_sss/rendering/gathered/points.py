@@ -18,7 +18,7 @@ import mitsuba as mi
 import numpy as np
 
 from halfspace_sss.rendering.object.entries import AreaPoints
-from halfspace_sss.rendering.object.points import Exit, cosine_above, lifted, number, turned
+from halfspace_sss.rendering.object.points import SurfacePoint, cosine_above, lifted, number, turned
 from halfspace_sss.rendering.object.shape import Object
 
 if TYPE_CHECKING:
@@ -76,11 +76,11 @@ class SurfacePoints:
     def __len__(self) -> int:
         return dr.width(self.p)
 
-    def exit(self, k: mi.UInt32, u: mi.Point2f) -> tuple[Exit, mi.UInt32]:
+    def exit(self, k: mi.UInt32, u: mi.Point2f) -> tuple[SurfacePoint, mi.UInt32]:
         """Point k as an exit in a direction by the cosine, for a pair of uniforms, and its face."""
         n, n_out = dr.gather(mi.Normal3f, self.n, k), dr.gather(mi.Normal3f, self.n_out, k)
         w, _ = cosine_above(n_out, n, u)
-        out = Exit(dr.gather(mi.Point3f, self.p, k), lifted(n_out, n, w), w, mi.Float(1), n)
+        out = SurfacePoint(dr.gather(mi.Point3f, self.p, k), n, lifted(n_out, n, w), w, mi.Float(1))
         return out, dr.gather(mi.UInt32, self.face, k)
 
     def blend(self, values: mi.Float, size: int, p: mi.Point3f, n: mi.Normal3f, active: mi.Bool) -> list[mi.Float]:

@@ -23,7 +23,7 @@ import numpy as np
 
 from halfspace_sss.physics.fresnel import F_t
 from halfspace_sss.rendering.gathered.points import SurfacePoints
-from halfspace_sss.rendering.object.points import Exit, number
+from halfspace_sss.rendering.object.points import SurfacePoint, number
 
 if TYPE_CHECKING:
     from halfspace_sss.rendering.object.body import Body
@@ -122,8 +122,8 @@ def transfer(body: Body, count: int | None = None, samples: int = SAMPLES) -> Tr
     u = [dr.fma(mi.Float(s), r, x) for r, x in zip(R_2, (jitter.x, jitter.y))]
     out, face = points.exit(j, mi.Point2f(*(x - dr.floor(x) for x in u)))
     S, entry, w_i = _sample(body, out, face, sampler, active)
-    near, known = points.nearest(entry.p, entry.n_face, entry.weight > 0)
-    mu = dr.dot(out.w, out.n)
+    near, known = points.nearest(entry.p, entry.n, entry.weight > 0)
+    mu = dr.dot(out.w, out.n_out)
     trusted = _trusted(body)
     dr.eval(S, near, known, mu, w_i)
     shape = (len(points), n)
@@ -145,22 +145,23 @@ def _centred(w: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.n
     return d, middle, np.linalg.inv(np.einsum("js,jsi,jsk->jik", a, d, d) + 1e-3 * np.eye(3))
 
 
-def _sample(body: Body, out: Exit, face: mi.UInt32, sampler: mi.Sampler, active: mi.Bool) -> tuple:
+def _sample(body: Body, out: SurfacePoint, face: mi.UInt32, sampler: mi.Sampler, active: mi.Bool) -> tuple:
     """S mu_i over the density of an entry and its direction, and both."""
     prepared = body.transport.prepare(out, active)
     where = body.proposals.prepare(out, prepared, active)
     entry = body.proposals.sample(out, face, where, sampler, active)
     active = active & (entry.weight > 0)
     w_i, pdf = body.proposals.sample_direction(entry, out, sampler.next_2d())
-    S = body.transport.S_mu(prepared, entry, w_i, active & (pdf > 0)) * (entry.weight / dr.maximum(pdf, 1e-8))
+    at = entry.facing(w_i)
+    S = body.transport.S(prepared, at, active & (pdf > 0)) * at.mu * (entry.weight / dr.maximum(pdf, 1e-8))
     return mi.Spectrum(dr.select(active & (pdf > 0), S, 0)), entry, mi.Vector3f(w_i)
 
 
 def _trusted(body: Body) -> np.ndarray:
     """The channels in which the model knows its directional albedo at every exit."""
-    if not hasattr(body.transport, "alpha"):
+    if body.transport.alpha is None:
         return np.zeros(dr.size_v(mi.Spectrum), dtype=bool)
-    return np.ravel(np.array(body.transport.evened[1])) > 0
+    return np.ravel(np.array(body.transport.alpha.known[1])) > 0
 
 
 def _fitted(body: Body, mu: np.ndarray, S: np.ndarray) -> Albedo:

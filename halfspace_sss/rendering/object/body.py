@@ -13,9 +13,9 @@ from halfspace_sss import measure
 from halfspace_sss.interface.model import bssrdf
 from halfspace_sss.physics import single_scattering
 from halfspace_sss.physics.medium import Medium
-from halfspace_sss.rendering.object.half_space import Variation, half_space_means
+from halfspace_sss.rendering.object.half_space import Variation, half_space_model
 from halfspace_sss.rendering.object.placement import check_empty, check_sensors, places_of, translucent_shapes
-from halfspace_sss.rendering.object.points import Means, Proposals, Transport, number
+from halfspace_sss.rendering.object.points import DirectionalAlbedo, ObjectModel, Proposals, Transport, number
 from halfspace_sss.rendering.object.registry import AUTO, choose_models, knows_objects, object_transport
 from halfspace_sss.rendering.object.settings import AUTOMATIC, Settings
 from halfspace_sss.rendering.object.shape import Object, check_together, number_of, same_objects, survey
@@ -60,6 +60,11 @@ class Body:
     def eta(self) -> Any:
         """Relative index of the media, as data of kernels."""
         return number(self.media[0].eta)
+
+    @property
+    def alpha(self) -> DirectionalAlbedo | None:
+        """Its directional albedo, where its transport knows one."""
+        return None if self.transport is None else self.transport.alpha
 
     @property
     def splits(self) -> bool:
@@ -119,8 +124,8 @@ def _make_body(found: Object, settings: Settings) -> Body:
     check_size(found, [float(m.sigma_t) for m in media], settings.mm_per_unit)
     single_only = inside.orders == "single" or not any(float(m.sigma_s) > 0 for m in media)
     variation = Variation(surface, settings.mm_per_unit)
-    none = Means(None, None)
-    transport, proposals, entries = none if single_only else _means(inside, found, media, settings, variation)
+    none = ObjectModel(None, None)
+    transport, proposals, entries = none if single_only else _model_of(inside, found, media, settings, variation)
     if transport and transport.orders == "total" and inside.orders == "multiple":
         raise ValueError(f"orders must be total for the model {inside.model!r}, which contains them all, got multiple")
     few = _few(inside, transport)
@@ -140,12 +145,14 @@ def _few(inside: Inside, transport: Transport | None) -> tuple[int, ...]:
     return (0, 1) if transport is None or knows_objects(inside.model) else (1,)
 
 
-def _means(inside: Inside, found: Object, media: list[Medium], settings: Settings, variation: Variation) -> Means:
+def _model_of(
+    inside: Inside, found: Object, media: list[Medium], settings: Settings, variation: Variation
+) -> ObjectModel:
     of_object = object_transport(inside.model)
     if of_object is not None:
         return of_object(found, inside, media, settings)
     warn_of_means(inside, found)
-    return half_space_means(inside.model, found, media, settings, variation)
+    return half_space_model(inside.model, found, media, settings, variation)
 
 
 def check_size(found: Object, sigma_t: Sequence[float], mm_per_unit: float) -> None:

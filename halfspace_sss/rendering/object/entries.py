@@ -20,7 +20,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from halfspace_sss.rendering.object.points import Entry, Exit, number, turned
+from halfspace_sss.rendering.object.points import EntrySample, SurfacePoint, number, turned
 from halfspace_sss.rendering.object.shape import Object
 
 __all__ = ["AreaPoints", "Point", "PositionSampler", "RadialTable"]
@@ -63,15 +63,15 @@ class PositionSampler:
         """Number of probes."""
         return int(self.area_share < 1)
 
-    def _side(self, out: Exit, prim_index: Any, active: Any) -> Any:
+    def _side(self, out: SurfacePoint, prim_index: Any, active: Any) -> Any:
         """What turns the normal of a face outwards: of a sheet, to the side of the exit."""
         return self.found.side(prim_index, active) if self.found.closed else out.sign
 
-    def density(self, p: Any, n: Any, out: Exit, axes: Any) -> Any:
+    def density(self, p: Any, n: Any, out: SurfacePoint, axes: Any) -> Any:
         """Density of candidates over the surface at p with normal n, for each that is drawn, 1/(scene unit)²."""
         return self._candidates(p, n, out, axes) * number(1 / (self.probes + self.area_points))
 
-    def _candidates(self, p: Any, n: Any, out: Exit, axes: Any) -> Any:
+    def _candidates(self, p: Any, n: Any, out: SurfacePoint, axes: Any) -> Any:
         """c = D + m/A, 1/(scene unit)²."""
         uniform = number(self.area_points / self.found.area if self.area_points else 0.0)
         if not self.probes:
@@ -84,9 +84,9 @@ class PositionSampler:
             total += share * reached * dr.abs(dr.dot(n, axis)) * self.table.pdf(across)
         return total + uniform
 
-    def sample(self, out: Exit, prim_index: Any, sampler: Any, active: Any) -> Entry:
+    def sample(self, out: SurfacePoint, prim_index: Any, sampler: Any, active: Any) -> EntrySample:
         """A point of entry for light that leaves at `out` on the face `prim_index`."""
-        axes = (out.n, *mi.coordinate_system(out.n))
+        axes = (out.n_out, *mi.coordinate_system(out.n_out))
         piece = self.found.piece(prim_index, active)
         u_axis, u_length, u_face, u_choice = (sampler.next_1d() for _ in range(4))
         u = sampler.next_2d()
@@ -97,12 +97,12 @@ class PositionSampler:
             kept = self._uniform(out, axes, piece, u_face, u, kept, active)
         total, p = kept.total, self.table.pdf(dr.norm(kept.p - out.p))
         weight = dr.select(total > 0, total / dr.maximum(p, 1e-30), 0)
-        return Entry(kept.p, kept.n, kept.n_out, weight, kept.face)
+        return EntrySample(kept.p, turned(kept.n, kept.n_out), kept.n_out, weight, kept.face)
 
     def _reach(self, across: Any) -> Any:
         return REACH * across + number(LEAST_REACH * self.found.size + NEAR * self.table.mean)
 
-    def _probe(self, out: Exit, axes: Any, u_axis: Any, u_length: Any, u: Any) -> Any:
+    def _probe(self, out: SurfacePoint, axes: Any, u_axis: Any, u_length: Any, u: Any) -> Any:
         n, s, t = axes
         to_n, to_s = u_axis < NORMAL_SHARE, u_axis < 0.5 * (1 + NORMAL_SHARE)
         along = dr.select(to_n, n, dr.select(to_s, s, t))
@@ -116,7 +116,7 @@ class PositionSampler:
         ray.maxt = 2 * reach
         return ray
 
-    def _offer(self, kept: _Kept, at: tuple, out: Exit, axes: Any, active: Any) -> _Kept:
+    def _offer(self, kept: _Kept, at: tuple, out: SurfacePoint, axes: Any, active: Any) -> _Kept:
         """Take a candidate (point, normal, outward shading normal, face) instead with the probability h / sum of h."""
         p, n, n_out, face = at
         c = self._candidates(p, n, out, axes)
@@ -128,7 +128,7 @@ class PositionSampler:
         found = (dr.select(take, a, b) for a, b in zip((p, n, n_out, face), kept[2:]))
         return _Kept(dr.clip(u, 0, 1), total, *found)
 
-    def _hits(self, ray: Any, out: Exit, axes: Any, piece: Any, kept: _Kept, active: Any) -> _Kept:
+    def _hits(self, ray: Any, out: SurfacePoint, axes: Any, piece: Any, kept: _Kept, active: Any) -> _Kept:
         """All hits of a probe as candidates."""
 
         def step(ray: Any, left: Any, kept: tuple, active: Any) -> tuple:
@@ -145,7 +145,9 @@ class PositionSampler:
         state = (ray, mi.UInt32(MOST_HITS), tuple(kept), mi.Bool(active))
         return _Kept(*dr.while_loop(state, lambda *state: state[-1], step, label="probe")[2])
 
-    def _uniform(self, out: Exit, axes: Any, piece: Any, u_face: Any, u: Any, kept: _Kept, active: Any) -> _Kept:
+    def _uniform(
+        self, out: SurfacePoint, axes: Any, piece: Any, u_face: Any, u: Any, kept: _Kept, active: Any
+    ) -> _Kept:
         """Points over the area as candidates."""
         m, inverse = number(float(self.area_points)), number(1 / self.area_points)
 

@@ -9,13 +9,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from halfspace_sss.interface.model import bssrdf
+from halfspace_sss.interface.model import BSSRDF, bssrdf
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.object.entries import AreaPoints, PositionSampler, RadialTable
 from halfspace_sss.rendering.object.points import (
-    Entry,
-    Exit,
-    Means,
+    EntrySample,
+    ObjectModel,
+    SurfacePoint,
     local_frame,
     number,
     opposed,
@@ -30,7 +30,7 @@ __all__ = [
     "HalfSpaceTransport",
     "Variation",
     "area_share",
-    "half_space_means",
+    "half_space_model",
 ]
 
 POINTS_PER_RATIO, MOST_POINTS = 60.0, 9  # candidates over the area
@@ -43,12 +43,14 @@ class HalfSpaceTransport:
     Args:
         models: one per channel, in scene units.
         geometry: "distance" or "tangent", see `points.separation`.
-        variation: how they vary with the medium.
+        variation: how they vary with the medium, where derivatives may be asked for.
     """
 
-    models: list[Any]
-    geometry: str
-    variation: Variation
+    models: list[BSSRDF]
+    geometry: str = "distance"
+    variation: Variation | None = None
+    alpha = None
+    is_delta = False
 
     @property
     def orders(self) -> str:
@@ -58,18 +60,18 @@ class HalfSpaceTransport:
     def checksums(self) -> tuple[str, ...]:
         return tuple(checksum for model in self.models for checksum in model.checksums)
 
-    def prepare(self, out: Exit, active: Any) -> Exit:
+    def prepare(self, at: SurfacePoint, active: mi.Bool = True) -> SurfacePoint:
         """Nothing is done for the exit alone."""
-        return out
+        return at
 
-    def S_mu(self, prepared: Exit, entry: Entry, w_i: Any, active: Any) -> Any:
+    def S(self, exit: SurfacePoint, at: SurfacePoint, active: mi.Bool = True) -> mi.Spectrum:
+        """See `Transport`."""
         with dr.suspend_grad():
-            n_i, mu_i = entry.seen(w_i)
-            query = plane_query(entry.p, n_i, w_i, prepared, self.geometry)
-            lit = active & (mu_i > 0) & (query[3] > 0)
+            query = plane_query(at, exit, self.geometry)
+            above = active & (at.mu > 0) & (query[3] > 0)
             values = [model.eval(*query) for model in self.models]
-        values = [value * mu_i for value in self.variation.S(values, query)]
-        return dr.select(lit, mi.Spectrum(*values) if len(values) > 1 else mi.Spectrum(values[0]), 0)
+        values = values if self.variation is None else self.variation.S(values, query)
+        return dr.select(above, mi.Spectrum(*values) if len(values) > 1 else mi.Spectrum(values[0]), 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,23 +86,25 @@ class HalfSpaceProposals:
     positions: PositionSampler
     model: Any
 
-    def prepare(self, out: Exit, prepared: Any, active: Any) -> None:
+    def prepare(self, out: SurfacePoint, prepared: Any, active: Any) -> None:
         """Nothing is done for the exit alone."""
 
-    def sample(self, out: Exit, prim_index: Any, prepared: None, sampler: Any, active: Any) -> Entry:
+    def sample(self, out: SurfacePoint, prim_index: Any, prepared: None, sampler: Any, active: Any) -> EntrySample:
         return self.positions.sample(out, prim_index, sampler, active)
 
-    def sample_direction(self, entry: Entry, out: Exit, u: Any) -> tuple[Any, Any]:
+    def sample_direction(self, entry: EntrySample, out: SurfacePoint, u: Any) -> tuple[Any, Any]:
         frame = local_frame(entry.n_out, out.p - entry.p)
         drawn = self.model.sample_direction(mi.Float(0), mi.Float(1), mi.Float(0), (u.x, u.y))
-        return opposed(mi.Vector3f(frame.direction(drawn.mu_i, drawn.phi_i)), entry.n_face), drawn.pdf
+        return opposed(mi.Vector3f(frame.direction(drawn.mu_i, drawn.phi_i)), entry.n), drawn.pdf
 
-    def pdf_direction(self, entry: Entry, out: Exit, w_i: Any) -> Any:
-        mu_i = dr.clip(entry.seen(w_i)[1], 0, 1)
+    def pdf_direction(self, entry: EntrySample, out: SurfacePoint, w_i: Any) -> Any:
+        mu_i = dr.clip(entry.facing(w_i).mu, 0, 1)
         return self.model.pdf_direction(mu_i, mi.Float(0), mi.Float(0), mi.Float(1), mi.Float(0))
 
 
-def half_space_means(name: str, found: Object, media: list[Medium], settings: Settings, variation: Variation) -> Means:
+def half_space_model(
+    name: str, found: Object, media: list[Medium], settings: Settings, variation: Variation
+) -> ObjectModel:
     """The transport and the proposals of a half-space model on an object.
 
     Args:
@@ -115,7 +119,7 @@ def half_space_means(name: str, found: Object, media: list[Medium], settings: Se
     share = area_share(found, table.mean / found.size, settings.area_share)
     positions = PositionSampler(found, table, AreaPoints(found.shape), share)
     transport = HalfSpaceTransport(models, settings.geometry, variation)
-    return Means(transport, HalfSpaceProposals(positions, models[0]))
+    return ObjectModel(transport, HalfSpaceProposals(positions, models[0]))
 
 
 def area_share(found: Object, ratio: float, wanted: float) -> float:

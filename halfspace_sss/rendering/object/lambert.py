@@ -9,12 +9,12 @@ import drjit as dr
 import mitsuba as mi
 
 from halfspace_sss.physics.medium import Medium
-from halfspace_sss.rendering.object.points import CosineProposals, Entry, Exit, Means, number
+from halfspace_sss.rendering.object.points import CosineProposals, EntrySample, ObjectModel, SurfacePoint, number
 from halfspace_sss.rendering.object.settings import Settings
 from halfspace_sss.rendering.object.shape import Object
 from halfspace_sss.rendering.object.translucent import Inside
 
-__all__ = ["LambertProposals", "LambertTransport", "lambert_means"]
+__all__ = ["LambertProposals", "LambertTransport", "lambert_model"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,32 +27,34 @@ class LambertTransport:
 
     reflectance: list[float]
     orders = "total"
+    checksums = ()
+    alpha = None
     is_delta = True
 
-    def prepare(self, out: Exit, active: Any) -> Exit:
+    def prepare(self, at: SurfacePoint, active: mi.Bool = True) -> SurfacePoint:
         """Nothing is done for the exit alone."""
-        return out
+        return at
 
-    def S_mu(self, prepared: Exit, entry: Entry, w_i: Any, active: Any) -> Any:
+    def S(self, exit: SurfacePoint, at: SurfacePoint, active: mi.Bool = True) -> mi.Spectrum:
         """Over the density of `LambertProposals.sample`, whose point is the only one."""
         R = [number(value) for value in self.reflectance]
-        _, mu_i = entry.seen(w_i)
-        lit = active & (dr.dot(prepared.w, prepared.n) > 0)
-        return dr.select(lit, (mi.Spectrum(*R) if len(R) > 1 else mi.Spectrum(R[0])) * (mu_i * dr.inv_pi), 0)
+        above = active & (dr.dot(exit.w, exit.n_out) > 0)
+        return dr.select(above, (mi.Spectrum(*R) if len(R) > 1 else mi.Spectrum(R[0])) * dr.inv_pi, 0)
 
 
 @dataclass(frozen=True, eq=False)
 class LambertProposals(CosineProposals):
     """The exit itself, directions by the cosine."""
 
-    def prepare(self, out: Exit, prepared: Any, active: Any) -> None:
+    def prepare(self, out: SurfacePoint, prepared: Any, active: Any) -> None:
         """Nothing is done for the exit alone."""
 
-    def sample(self, out: Exit, prim_index: Any, prepared: None, sampler: Any, active: Any) -> Entry:
-        n = mi.Normal3f(out.n_face * out.sign)
-        return Entry(mi.Point3f(out.p), n, mi.Normal3f(out.n), dr.select(active, mi.Float(1), 0), prim_index)
+    def sample(self, out: SurfacePoint, prim_index: Any, prepared: None, sampler: Any, active: Any) -> EntrySample:
+        return EntrySample(
+            mi.Point3f(out.p), mi.Normal3f(out.n), mi.Normal3f(out.n_out), dr.select(active, mi.Float(1), 0), prim_index
+        )
 
 
-def lambert_means(found: Object, inside: Inside, media: list[Medium], settings: Settings) -> Means:
+def lambert_model(found: Object, inside: Inside, media: list[Medium], settings: Settings) -> ObjectModel:
     """The transport of a diffuse surface: what a half-space tends to as its mean free path goes to 0."""
-    return Means(LambertTransport([float(m.reflectance()) for m in media]), LambertProposals())
+    return ObjectModel(LambertTransport([float(m.reflectance()) for m in media]), LambertProposals())

@@ -1,4 +1,4 @@
-"""From a pair of surface points to a query of the half-space: the one place where directions are translated."""
+"""Points of a surface with a direction, the query of the half-space for a pair of them, and transports between them."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ import mitsuba as mi
 
 __all__ = [
     "CosineProposals",
-    "Entry",
-    "Exit",
+    "DirectionalAlbedo",
+    "EntrySample",
     "Frame",
-    "Means",
+    "ObjectModel",
     "Proposals",
+    "SurfacePoint",
     "Transport",
     "channel_mean",
     "cosine_above",
@@ -32,14 +33,31 @@ __all__ = [
 ]
 
 
-class Exit(NamedTuple):
-    """Where light leaves: position, outward normal, w_o, which points away from the surface (Mitsuba's wi)."""
+class SurfacePoint(NamedTuple):
+    """A point of a surface and a direction outside, which points away from it: an exit with w_o or an entry with w_i.
 
-    p: Any
-    n: Any
-    w: Any
-    sign: Any = None  # that turns the normals of the shape outwards
-    n_face: Any = None  # outward geometric normal
+    Args:
+        p: position.
+        n: outward geometric normal.
+        n_out: outward shading normal, as w sees it: see `lifted`.
+        w: direction.
+        sign: that turns geometric normals of the shape outwards.
+    """
+
+    p: mi.Point3f
+    n: mi.Normal3f
+    n_out: mi.Normal3f
+    w: mi.Vector3f
+    sign: mi.Float | float = 1.0
+
+    @property
+    def mu(self) -> mi.Float:
+        """The cosine of w to the shading normal; 0 below the surface."""
+        return dr.select(dr.dot(self.w, self.n) > 0, dr.maximum(dr.dot(self.w, self.n_out), 0), 0)
+
+    def gather(self, k: mi.UInt32) -> SurfacePoint:
+        """The points of the lanes k."""
+        return SurfacePoint(*(v if isinstance(v, float) else dr.gather(type(v), v, k) for v in self))
 
 
 class Frame(NamedTuple):
@@ -110,18 +128,18 @@ def separation(p_i: Any, n_i: Any, p_o: Any, n_o: Any, geometry: str) -> Any:
     return dr.sqrt(dr.maximum(dr.squared_norm(d) - dr.maximum(dr.dot(n_i, n_o), 0) * along, 0))
 
 
-def plane_query(p_i: Any, n_i: Any, w_i: Any, out: Exit, geometry: str) -> tuple[Any, Any, Any, Any, Any]:
-    """(r, mu_i, phi_i, mu_o, phi_o) of the half-space for light from w_i at p_i that leaves at `out`.
+def plane_query(at: SurfacePoint, out: SurfacePoint, geometry: str) -> tuple[mi.Float, ...]:
+    """(r, mu_i, phi_i, mu_o, phi_o) of the half-space for light that enters at `at` and leaves at `out`.
 
     r as in `separation`; each direction is taken against the normal of its own point, its azimuth from x_i -> x_o
     projected there. Cosines below the horizon come out as 0, at which every model is 0.
     """
 
-    d = out.p - p_i
-    at_i, at_o = local_frame(n_i, d), local_frame(out.n, d)
-    mu_i, mu_o = (dr.clip(dr.dot(w, n), 0, 1) for w, n in ((w_i, n_i), (out.w, out.n)))
-    r = separation(p_i, n_i, out.p, out.n, geometry)
-    return r, mu_i, at_i.azimuth(w_i), mu_o, at_o.azimuth(out.w)
+    d = out.p - at.p
+    frame_i, frame_o = local_frame(at.n_out, d), local_frame(out.n_out, d)
+    mu_i, mu_o = (dr.clip(dr.dot(point.w, point.n_out), 0, 1) for point in (at, out))
+    r = separation(at.p, at.n_out, out.p, out.n_out, geometry)
+    return r, mu_i, frame_i.azimuth(at.w), mu_o, frame_o.azimuth(out.w)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -200,82 +218,100 @@ def cosine_density(m: Any, n: Any, w: Any) -> Any:
 # and an entry. A half-space model laid onto the surface is one transport, a network that knows the object another.
 
 
-class Entry(NamedTuple):
-    """A point of entry: position, geometric and outward shading normal, weight 1/density (0: none was found), face."""
+class EntrySample(NamedTuple):
+    """A sampled point of entry, whose direction is still to be drawn.
 
-    p: Any
-    n: Any
-    n_out: Any
-    weight: Any
-    face: Any
+    Args:
+        p: position.
+        n, n_out: outward geometric and shading normal.
+        weight: 1/density over the area, (scene unit)²; 0 where none was found.
+        face: its number.
+    """
 
-    @property
-    def n_face(self) -> Any:
-        """The geometric normal, outwards."""
-        return turned(self.n, self.n_out)
+    p: mi.Point3f
+    n: mi.Normal3f
+    n_out: mi.Normal3f
+    weight: mi.Float
+    face: mi.UInt32
 
-    def seen(self, w: Any) -> tuple[Any, Any]:
-        """The outward shading normal that w sees, see `object.points`, and the cosine to it; 0 below the surface."""
-        n_face = self.n_face
-        n_out = lifted(self.n_out, n_face, w)
-        return n_out, dr.select(dr.dot(w, n_face) > 0, dr.maximum(dr.dot(w, n_out), 0), 0)
+    def facing(self, w: mi.Vector3f) -> SurfacePoint:
+        """The entry with light from w, with the shading normal that w sees."""
+        return SurfacePoint(self.p, self.n, lifted(self.n_out, self.n, w), w)
 
 
 class Proposals(Protocol):
     """Where light that leaves at an exit may have entered."""
 
-    def prepare(self, out: Exit, prepared: Any, active: Any) -> Any:
+    def prepare(self, out: SurfacePoint, prepared: Any, active: Any) -> Any:
         """What is done once for all entries of an exit; `prepared` is what the transport has made of it."""
 
-    def sample(self, out: Exit, prim_index: Any, prepared: Any, sampler: Any, active: Any) -> Entry:
+    def sample(self, out: SurfacePoint, prim_index: Any, prepared: Any, sampler: Any, active: Any) -> EntrySample:
         """A point of entry; its weight is the inverse of the density of such points over the surface, (scene unit)²."""
 
-    def sample_direction(self, entry: Entry, out: Exit, u: Any) -> tuple[Any, Any]:
+    def sample_direction(self, entry: EntrySample, out: SurfacePoint, u: Any) -> tuple[Any, Any]:
         """A direction w_i that points away from the surface at the entry, for a pair of uniforms, and its density.
 
         The density is over solid angle, 1/sr.
         """
 
-    def pdf_direction(self, entry: Entry, out: Exit, w_i: Any) -> Any:
+    def pdf_direction(self, entry: EntrySample, out: SurfacePoint, w_i: Any) -> Any:
         """The density of `sample_direction`, 1/sr; 0 below the surface."""
 
 
 class CosineProposals(Proposals, Protocol):
     """Proposals whose directions are by the cosine to the interpolated normal, above the surface."""
 
-    def sample_direction(self, entry: Entry, out: Exit, u: Any) -> tuple[Any, Any]:
-        return cosine_above(entry.n_out, entry.n_face, u)
+    def sample_direction(self, entry: EntrySample, out: SurfacePoint, u: Any) -> tuple[Any, Any]:
+        return cosine_above(entry.n_out, entry.n, u)
 
-    def pdf_direction(self, entry: Entry, out: Exit, w_i: Any) -> Any:
-        return cosine_density(entry.n_out, entry.n_face, w_i)
+    def pdf_direction(self, entry: EntrySample, out: SurfacePoint, w_i: Any) -> Any:
+        return cosine_density(entry.n_out, entry.n, w_i)
+
+
+class DirectionalAlbedo(Protocol):
+    """The directional albedo of an object under uniform illumination, alpha = ∫ S mu_i dw_i dA_i.
+
+    Attributes:
+        known: two spectra, 1 in the channels where it may stand for even light: of orders below two, and of S.
+    """
+
+    known: tuple[mi.Spectrum, mi.Spectrum]
+
+    def __call__(self, at: SurfacePoint, active: mi.Bool) -> tuple[mi.Spectrum, mi.Spectrum]:
+        """Of orders below two and of S at an exit, per channel; 0 where it is not known."""
 
 
 class Transport(Protocol):
     """S of one object, for any exit and entry.
 
-    One that knows what it is under the same light from everywhere also has `alpha(out, active)`: the share of it that
-    leaves at an exit, per channel, by orders below two and by those of S, ∫ S mu_i dw_i dA_i, and `evened`, two spectra
-    that are 1 in the channels where these are known; elsewhere they are 0. The path loop takes the mean light of the
-    sky so.
-
     Attributes:
         orders: "multiple" (two or more scattering events) or "total".
         checksums: of what it has learnt, which are part of a render's identity; empty where nothing is.
+        alpha: its directional albedo, the control variate of an even sky; None where it is not known.
+        is_delta: whether light leaves where it enters, so that S has no value for two points.
     """
 
     orders: str
     checksums: tuple[str, ...]
+    alpha: DirectionalAlbedo | None
+    is_delta: bool
 
-    def prepare(self, out: Exit, active: Any) -> Any:
-        """What is done once for all entries of an exit, handed to `S_mu` as it is."""
+    def prepare(self, at: SurfacePoint, active: mi.Bool = True) -> Any:
+        """What is done once for all entries of an exit, handed to `S` as it is."""
 
-    def S_mu(self, prepared: Any, entry: Entry, w_i: Any, active: Any) -> Any:
-        """S(x_i, w_i; x_o, w_o) mu_i for each channel, 1/((scene unit)² sr); 0 below the horizons."""
+    def S(self, exit: Any, at: SurfacePoint, active: mi.Bool = True) -> mi.Spectrum:
+        """S(x_i, w_i; x_o, w_o) per channel, 1/((scene unit)² sr); 0 below the horizons.
+
+        Args:
+            exit: from `prepare`.
+            at: entry, with w_i.
+            active: mask of lanes.
+        """
 
 
-class Means(NamedTuple):
+class ObjectModel(NamedTuple):
     """What renders an object inside: a transport, the proposals that suit it, and how many entries an exit draws."""
 
-    transport: Transport
-    proposals: Proposals
+    transport: Transport | None
+    proposals: Proposals | None
     entries: int = 1

@@ -2,7 +2,7 @@
 
 An entry point of the group `halfspace_sss.transports` is a mapping of names to "module:function"; the function takes
 (found, inside, media, settings), the `Object`, the `Inside`, the medium of each channel in 1/(scene unit) and the
-`Settings` of the integrator, and returns `Means`: a transport and its proposals. It is imported when it is asked for.
+`Settings` of the integrator, and returns an `ObjectModel`. It is imported when it is asked for.
 "auto" stands for the cheapest of these that is good enough, which `halfspace_sss.trade` finds at the first render.
 """
 
@@ -20,7 +20,7 @@ from halfspace_sss.once import once
 __all__ = ["AUTO", "choose_models", "knows_objects", "model_names", "object_transport"]
 
 AUTO = "auto"
-_OWN = {"lambert": "halfspace_sss.rendering.object.lambert:lambert_means"}
+_OWN = {"lambert": "halfspace_sss.rendering.object.lambert:lambert_model"}
 _CHOICE = "halfspace_sss.trade.automatic"  # imported when it is asked for, as it renders
 
 

@@ -25,7 +25,7 @@ from halfspace_sss.rendering.paths.path_loop import trace_paths
 
 if TYPE_CHECKING:
     from halfspace_sss.rendering.object.body import Body
-    from halfspace_sss.rendering.object.points import Exit
+    from halfspace_sss.rendering.object.points import SurfacePoint
     from halfspace_sss.rendering.object.settings import Settings
 
 __all__ = ["Gathered", "Gathering"]
@@ -51,18 +51,18 @@ class Gathered:
     values: mi.Float
     error: float
 
-    def radiance(self, out: Exit, active: mi.Bool) -> mi.Spectrum:
+    def radiance(self, out: SurfacePoint, active: mi.Bool) -> mi.Spectrum:
         """L_o of an exit; 0 below the horizon."""
         size = dr.size_v(mi.Spectrum)
-        B = self.transfer.points.blend(self.values, 4 * size, out.p, out.n_face, active)
+        B = self.transfer.points.blend(self.values, 4 * size, out.p, out.n, active)
         rows = [B[4 * c : 4 * c + 4] for c in range(size)]
         B = mi.Spectrum([b + x * out.w.x + y * out.w.y + z * out.w.z for b, x, y, z in rows])
-        mu = dr.dot(out.w, out.n)
+        mu = dr.dot(out.w, out.n_out)
         a = self.transfer.albedo(dr.maximum(mu, 0))
-        known = getattr(self.body.transport, "alpha", None)
-        if known is not None:
-            trusted = self.body.transport.evened[1]
-            a = trusted * known(out, active)[1] + (1 - trusted) * a
+        alpha = self.body.transport.alpha
+        if alpha is not None:
+            known = alpha.known[1]
+            a = known * alpha(out, active)[1] + (1 - known) * a
         return dr.select(active & (mu > 0), a * dr.maximum(B, 0), 0)
 
 
@@ -113,7 +113,7 @@ class Gathering:
 
 def _spreads(body: Body) -> bool:
     """Whether light leaves elsewhere than it entered, by orders that a transport has."""
-    return body.transport is not None and not getattr(body.transport, "is_delta", False)
+    return body.transport is not None and not body.transport.is_delta
 
 
 def _check(body: Body) -> None:

@@ -77,7 +77,7 @@ class Sky(NamedTuple):
         no noise away.
         """
         emitter = scene.environment()
-        if emitter is None or not any(hasattr(obj.transport, "alpha") for obj in objects):
+        if emitter is None or all(obj.alpha is None for obj in objects):
             return None
         with dr.suspend_grad():
             k = dr.arange(mi.UInt32, SKY_DIRECTIONS**2)
@@ -143,11 +143,11 @@ class RenderContext:
 
     def uses_sky(self, obj: Body) -> bool:
         """Whether the mean radiance of the sky is a control variate for an object."""
-        return self.sky is not None and hasattr(obj.transport, "alpha")
+        return self.sky is not None and obj.alpha is not None
 
     def sky_means(self, obj: Body) -> tuple[mi.Spectrum, mi.Spectrum]:
         """c in the channels where alpha is known, else 0: for orders below two and for the others."""
-        low_orders, others = obj.transport.evened
+        low_orders, others = obj.alpha.known
         return low_orders * self.sky.mean, others * self.sky.mean
 
     def entries(self, obj: Body) -> int:

@@ -26,7 +26,7 @@ import mitsuba as mi
 from halfspace_sss.physics.phase import eval_hg, sample_hg
 from halfspace_sss.rendering.light.small_emitters import WIDE
 from halfspace_sss.rendering.object.body import Body
-from halfspace_sss.rendering.object.points import Exit, lifted, mirrored, number, opposed, place, turned
+from halfspace_sss.rendering.object.points import SurfacePoint, lifted, mirrored, number, opposed, place, turned
 from halfspace_sss.rendering.paths.lighting import RenderContext, delta_light, mis_weight, sample_emitter
 
 __all__ = ["Connection", "LowOrderSample", "RefractedRay", "refracted_connection", "sample_low_orders"]
@@ -48,7 +48,7 @@ Media = list["tuple[mi.Float, mi.Float, mi.Float]"]  # sigma_s, sigma_t and g of
 class RefractedRay(NamedTuple):
     """The ray from an exit into the object."""
 
-    out: Exit
+    out: SurfacePoint
     d: mi.Vector3f
     T: mi.Float  # Fresnel transmittance
     valid: mi.Bool  # whether there is one
@@ -133,9 +133,9 @@ def _walk(obj: Body, refracted: RefractedRay, sampler: mi.Sampler, active: mi.Bo
     """The walk from an exit until it leaves."""
     zero, p = mi.Float(0), mi.Point3f(refracted.out.p)
     media = [tuple(number(v) for v in (m.sigma_s, m.sigma_t, m.g)) for m in obj.media]
-    skip = _clear(obj, refracted.out.n_face, refracted.d)
+    skip = _clear(obj, refracted.out.n, refracted.d)
     start = _Walk(
-        p, mi.Vector3f(refracted.d), mi.Normal3f(refracted.out.n_face), mi.Float(skip), zero, mi.Float(1), mi.UInt32(0),
+        p, mi.Vector3f(refracted.d), mi.Normal3f(refracted.out.n), mi.Float(skip), zero, mi.Float(1), mi.UInt32(0),
         zero, mi.Point3f(p), mi.Vector3f(refracted.d), zero, zero, mi.Bool(True), mi.Bool(False), mi.Bool(active),
     )  # fmt: skip
 

@@ -17,7 +17,7 @@ import drjit as dr
 import mitsuba as mi
 
 from halfspace_sss.rendering.object.body import Body
-from halfspace_sss.rendering.object.points import Exit, lifted, number, place, turned
+from halfspace_sss.rendering.object.points import SurfacePoint, lifted, number, place, turned
 from halfspace_sss.rendering.object.settings import Settings
 from halfspace_sss.rendering.paths.lighting import RenderContext, delta_light, mis_weight, sample_emitter
 from halfspace_sss.rendering.paths.low_orders import RefractedRay, sample_low_orders
@@ -312,10 +312,10 @@ def choose_event(obj: Body, si: mi.SurfaceInteraction3f, active: mi.Bool) -> Eve
     """
     # ---- the ray refracted into the object
     out = exit_at(obj, si)
-    mu = dr.dot(out.w, out.n)
+    mu = dr.dot(out.w, out.n_out)
     F, mu_in, _, into = mi.fresnel(dr.maximum(mu, 0), obj.eta)
-    d = mi.Vector3f(dr.normalize(-into * out.w + out.n * (into * mu - dr.abs(mu_in))))
-    valid = active & (mu > 0) & (dr.dot(d, out.n_face) < 0)
+    d = mi.Vector3f(dr.normalize(-into * out.w + out.n_out * (into * mu - dr.abs(mu_in))))
+    valid = active & (mu > 0) & (dr.dot(d, out.n) < 0)
 
     # ---- probabilities
     reflection = dr.clip(F, LEAST_REFLECTION, 0.95) if obj.surface.inside.reflection else mi.Float(0)
@@ -333,9 +333,9 @@ def choose_event(obj: Body, si: mi.SurfaceInteraction3f, active: mi.Bool) -> Eve
     return EventChoice(reflection, low, RefractedRay(out, d, 1 - F, valid, passing))
 
 
-def _transmittance(obj: Body, out: Exit, d: mi.Vector3f, active: mi.Bool) -> mi.Float:
+def _transmittance(obj: Body, out: SurfacePoint, d: mi.Vector3f, active: mi.Bool) -> mi.Float:
     """To the other side, mean over channels; light of the path does not count, as choices hold in derivatives."""
-    ray = place(out.p, out.n_face).spawn_ray(d)
+    ray = place(out.p, out.n).spawn_ray(d)
     wall = obj.found.scene.ray_intersect(ray, mi.RayFlags.Minimal, False, active)
     T = mi.Float(0)
     for medium in obj.media:
@@ -343,14 +343,14 @@ def _transmittance(obj: Body, out: Exit, d: mi.Vector3f, active: mi.Bool) -> mi.
     return dr.select(active & wall.is_valid(), T, 0)
 
 
-def exit_at(obj: Body, si: mi.SurfaceInteraction3f) -> Exit:
+def exit_at(obj: Body, si: mi.SurfaceInteraction3f) -> SurfacePoint:
     """The exit of light towards `si.wi`, with the normal that points outwards, as `si.wi` sees it."""
     w, n_face = si.to_world(si.wi), mi.Normal3f(si.n)
     sign = obj.found.side(si.prim_index)
     if not obj.found.closed:  # a sheet is a half-space from both sides
         sign = dr.select(dr.dot(n_face, w) > 0, 1.0, -1.0)
     n = lifted(turned(si.sh_frame.n, n_face), n_face, w)
-    return Exit(mi.Point3f(si.p), n * sign, w, sign, n_face * sign)
+    return SurfacePoint(mi.Point3f(si.p), n_face * sign, n * sign, w, sign)
 
 
 def _where(context: RenderContext, sampler: mi.Sampler, mask: mi.Bool, otherwise: tuple, event: Callable) -> tuple:
@@ -379,9 +379,9 @@ def _add_sky_means(
             continue
 
         def known(
-            tally: PathTally, obj: Body = obj, here: mi.Bool = here, out: Exit = choice.refracted.out
+            tally: PathTally, obj: Body = obj, here: mi.Bool = here, out: SurfacePoint = choice.refracted.out
         ) -> tuple[PathTally]:
-            low, others = obj.transport.alpha(out, here)
+            low, others = obj.alpha(out, here)
             low = dr.select(at.others_only, 0, low) if obj.few else mi.Spectrum(0)
             light = (low + dr.select(at.low_only, 0, others)) * context.sky.mean
             return (context.mode.add(tally, at.throughput * light),)
@@ -399,7 +399,7 @@ def _add_gathered(
             continue
 
         def known(
-            tally: PathTally, obj: Body = obj, here: mi.Bool = here, out: Exit = choice.refracted.out
+            tally: PathTally, obj: Body = obj, here: mi.Bool = here, out: SurfacePoint = choice.refracted.out
         ) -> tuple[PathTally]:
             return (context.mode.add(tally, at.throughput * obj.gathered.radiance(out, here)),)
 
@@ -533,7 +533,7 @@ def low_order_event(
 
 
 def bssrdf_event(
-    context: RenderContext, obj: Body, out: Exit, face: mi.UInt32, sampler: mi.Sampler, active: mi.Bool
+    context: RenderContext, obj: Body, out: SurfacePoint, face: mi.UInt32, sampler: mi.Sampler, active: mi.Bool
 ) -> tuple[NextVertex, mi.Spectrum]:
     """Light that entered elsewhere and leaves at `out` by the transport of the object.
 
@@ -576,14 +576,14 @@ class Candidate:
 class _ExitPoint(NamedTuple):
     """An exit, its face, and what transport and proposals have made of it."""
 
-    out: Exit
+    out: SurfacePoint
     face: mi.UInt32
     transport: Any
     proposals: Any
 
 
 def resample_entry(
-    context: RenderContext, obj: Body, out: Exit, face: mi.UInt32, sampler: mi.Sampler, active: mi.Bool
+    context: RenderContext, obj: Body, out: SurfacePoint, face: mi.UInt32, sampler: mi.Sampler, active: mi.Bool
 ) -> Candidate:
     """One entry for light that leaves at `out`, by resampled importance sampling (Talbot, Cline and Egbert 2005).
 
@@ -652,7 +652,10 @@ def _draw_candidate(
             brightness = dr.select(nee, dr.max(light) * dr.select(ds.delta, 1, ds.pdf), 1)
 
     # ---- transport and resampling target
-    S_mu = obj.transport.S_mu(exit_point.transport, entry, d, active)
+    with dr.suspend_grad():
+        at_entry = entry.facing(d)
+        mu_i = at_entry.mu
+    S_mu = obj.transport.S(exit_point.transport, at_entry, active) * mu_i
     weight = dr.select(active, S_mu * (entry.weight / dr.maximum(pdf, 1e-8)), 0)
     target = dr.detach(dr.max(weight)) * brightness
     return Candidate(mi.Point3f(entry.p), mi.Normal3f(entry.n), d, weight, pdf, distance, delta, emitter_point, light,

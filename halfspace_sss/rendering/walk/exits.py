@@ -14,7 +14,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from halfspace_sss.rendering.object.points import lift, lifted, sided
+from halfspace_sss.rendering.object.points import SurfacePoint, lift, lifted, sided
 from halfspace_sss.rendering.walk.media import WalkMedia
 from halfspace_sss.rendering.walk.random_walk import (
     Crossing,
@@ -33,7 +33,6 @@ __all__ = [
     "WalkExits",
     "FirstExitVisitor",
     "FirstExits",
-    "WalkStarts",
     "FirstExitRecord",
     "exits",
     "walk_from",
@@ -41,16 +40,6 @@ __all__ = [
 
 
 LANES = 2**13
-
-
-@dataclass
-class WalkStarts:
-    """Where walks begin, one entry per walk."""
-
-    x_o: mi.Point3f  # on the surface
-    n_o: mi.Normal3f  # outward normal there
-    w_o: mi.Vector3f  # direction outside, away from the surface
-    n_shading: mi.Normal3f | None = None  # outward shading normal, if it is not n_o
 
 
 @dataclass
@@ -96,7 +85,7 @@ class ExitVisitor:
         return replace(walk, alive=walk.alive & ~leaves), record
 
 
-def exits(media: WalkMedia, k: int, start: WalkStarts, seed: int | tuple[int, ...], lanes: int = LANES) -> WalkExits:
+def exits(media: WalkMedia, k: int, start: SurfacePoint, seed: int | tuple[int, ...], lanes: int = LANES) -> WalkExits:
     """Where walks from points on object k leave it.
 
     Args:
@@ -108,7 +97,7 @@ def exits(media: WalkMedia, k: int, start: WalkStarts, seed: int | tuple[int, ..
     Raises:
         ValueError: there is no object k, or the arrays of `start` are of different lengths.
     """
-    result = _nowhere(dr.width(start.x_o))
+    result = _nowhere(dr.width(start.p))
     dr.eval(result)
     walk_from(media, k, start, ExitVisitor(result), seed, lanes)
     dr.eval(result)
@@ -118,7 +107,7 @@ def exits(media: WalkMedia, k: int, start: WalkStarts, seed: int | tuple[int, ..
 def walk_from(
     media: WalkMedia,
     k: int,
-    start: WalkStarts,
+    start: SurfacePoint,
     visitor: Visitor,
     seed: int | tuple[int, ...],
     lanes: int = LANES,
@@ -129,7 +118,7 @@ def walk_from(
     Args:
         media: the translucent objects of a scene, see `WalkMedia.of`.
         k: number of the object.
-        start: x_o, n_o and w_o, arrays of one length; where w_o is below the surface, no walk enters.
+        start: p, n, n_out and w, arrays of one length; where w is below the surface, no walk enters.
         visitor: what is recorded; its record is the number of the walk. It has to end walks that leave.
         seed: one whole number or more.
         lanes: walks at a time; another number gives other walks.
@@ -164,27 +153,24 @@ def _nowhere(n: int) -> WalkExits:
     return WalkExits(*(dr.zeros(kind, n) for kind in kinds))
 
 
-def _check(media: WalkMedia, k: int, start: WalkStarts) -> int:
+def _check(media: WalkMedia, k: int, start: SurfacePoint) -> int:
     """The number of starts."""
     if not 0 <= k < len(media.objects):
         raise ValueError(f"k must be a whole number in [0, {len(media.objects) - 1}], got {k!r}")
-    widths = [dr.width(start.x_o), dr.width(start.n_o), dr.width(start.w_o)]
-    if start.n_shading is not None:
-        widths.append(dr.width(start.n_shading))
+    widths = [dr.width(v) for v in start[:4]]
     if len(set(widths)) > 1:
-        raise ValueError(f"x_o, n_o and w_o must be of one length, got {widths}")
+        raise ValueError(f"p, n, n_out and w of the starts must be of one length, got {widths}")
     return widths[0]
 
 
-def _enter(media: WalkMedia, k: mi.UInt32, start: WalkStarts, index: mi.UInt32, rng: mi.PCG32) -> Walk:
+def _enter(media: WalkMedia, k: mi.UInt32, start: SurfacePoint, index: mi.UInt32, rng: mi.PCG32) -> Walk:
     """The walk of a start, refracted into the object."""
-    known = index < dr.width(start.x_o)
+    known = index < dr.width(start.p)
     si = dr.zeros(mi.SurfaceInteraction3f, dr.width(index))
-    si.p = dr.gather(mi.Point3f, start.x_o, index, known)
-    si.n = dr.gather(mi.Normal3f, start.n_o, index, known)
-    shading = start.n_o if start.n_shading is None else start.n_shading
-    si.sh_frame = mi.Frame3f(dr.gather(mi.Normal3f, shading, index, known))
-    w = dr.gather(mi.Vector3f, start.w_o, index, known)
+    si.p = dr.gather(mi.Point3f, start.p, index, known)
+    si.n = dr.gather(mi.Normal3f, start.n, index, known)
+    si.sh_frame = mi.Frame3f(dr.gather(mi.Normal3f, start.n_out, index, known))
+    w = dr.gather(mi.Vector3f, start.w, index, known)
     si.wi = si.to_local(w)
     si = lift(si, w)
     ctx = mi.BSDFContext()
