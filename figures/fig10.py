@@ -19,7 +19,6 @@ __all__ = ["TITLE", "draw", "parts"]
 
 TITLE = "S over distance, path traced and by every model"
 WALKS = {"draft": 4_000_000, "paper": 64_000_000}  # for each angle of incidence
-FEWEST_WALKS = 256  # what `curves` asks for where only the models are looked at
 
 
 def parts(quality: str) -> list[Part]:
@@ -44,14 +43,13 @@ def traced_curves(task: Task) -> dict[str, Any]:
         "fig10", theta_i_deg=[p["theta_i_deg"]], models=[], n_paths=p["n_paths"], seed=p["seed"],
         progress=task.progress,
     )  # fmt: skip
-    return _as_numbers(result, result.curves)
+    return _as_numbers(result)
 
 
 def model_curves(task: Task) -> dict[str, Any]:
     """The curves of one model for all angles."""
     name, angles = task.params["model"], task.params["theta_i_deg"]
-    result = curves("fig10", theta_i_deg=angles, models=[name], n_paths=FEWEST_WALKS, progress=task.progress)
-    return _as_numbers(result, [c for c in result.curves if c.series == name])
+    return _as_numbers(curves("fig10", theta_i_deg=angles, models=[name], n_paths=0, progress=task.progress))
 
 
 def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
@@ -60,9 +58,7 @@ def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
 
     result = curve_set(results)
     files: dict[str, bytes | str] = {f"fig10.{ending}": data for ending, data in render(result).items()}
-    files["fig10.csv"] = result.to_dataframe().to_csv(index=False, lineterminator="\n")
-    files["fig10_errors.csv"] = result.errors().to_csv(index=False, lineterminator="\n")
-    return files
+    return files | result.tables("fig10")
 
 
 def curve_set(results: Mapping[str, Result]) -> CurveSet:
@@ -82,7 +78,7 @@ def _traced_name(theta_i_deg: float) -> str:
     return f"path traced, {theta_i_deg:g} degrees"
 
 
-def _as_numbers(result: CurveSet, chosen: Any) -> dict[str, Any]:
+def _as_numbers(result: CurveSet) -> dict[str, Any]:
     """What `curve_set` needs, ready for JSON."""
     plain = ("title", "theta_o_deg", "delta_phi_deg", "line_deg", "half_width", "orders", "n_paths", "seed", "backend")
     common = {name: getattr(result, name) for name in plain}
@@ -92,7 +88,7 @@ def _as_numbers(result: CurveSet, chosen: Any) -> dict[str, Any]:
         "common": common,
         "curves": [
             {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in dataclasses.asdict(c).items()}
-            for c in chosen
+            for c in result.curves
         ],
         "evaluations_per_s": dict(result.evaluations_per_s),
         "seconds": result.seconds,

@@ -25,33 +25,41 @@ def render(curves: CurveSet) -> dict[str, bytes]:
 
 
 def draw(curves: CurveSet) -> Figure:
-    """One column for each direction of incidence: above S(r) with 2 standard errors, below S over path-traced S."""
-    angles = curves.theta_i_deg
+    """One column for each direction of incidence: above S(r) with 2 standard errors, below S over path-traced S.
+
+    Without a path-traced curve there is nothing below.
+    """
+    angles, rows = curves.theta_i_deg, 2 if TRACED in curves.series else 1
     blocks = -(-len(angles) // MOST_COLUMNS)
     columns = -(-len(angles) // blocks)
     legend_rows = -(-len(curves.series) // 4)
-    heights, width = [2.0, 1.15] * blocks, TEXT if columns > 2 else 0.5 * TEXT * max(columns, 1.3)
-    figure = Figure(figsize=(width, 3.0 * blocks + 0.6 + 0.17 * legend_rows), layout="constrained")
+    heights, width = [2.0, 1.15][:rows] * blocks, TEXT if columns > 2 else 0.5 * TEXT * max(columns, 1.3)
+    figure = Figure(figsize=(width, (1 + rows) * blocks + 0.6 + 0.17 * legend_rows), layout="constrained")
     figure.get_layout_engine().set(w_pad=0.015, h_pad=0.015, wspace=0.0, hspace=0.02)
-    grid = figure.subplots(2 * blocks, columns, squeeze=False, sharex=True, sharey="row", height_ratios=heights)
+    grid = figure.subplots(rows * blocks, columns, squeeze=False, sharex=True, sharey="row", height_ratios=heights)
     limits = _limits(curves)
     for k, theta in enumerate(angles):
         block, column = divmod(k, columns)
-        above, below = grid[2 * block, column], grid[2 * block + 1, column]
+        above, below = grid[rows * block, column], grid[rows * (block + 1) - 1, column]
         _draw_radiance(above, curves, theta)
-        _draw_ratio(below, curves, theta)
         above.set_ylim(*limits)
         above.set_title(_title(theta, k), pad=3)
         if column == 0:
             above.set_ylabel(r"$S$ [mm$^{-2}$ sr$^{-1}$]")
-            below.set_ylabel("model / traced")
+        if rows == 2:
+            _draw_ratio(below, curves, theta)
+            below.set_ylabel("model / traced" if column == 0 else "")
         below.set_xlabel(r"$r$ [mm]", labelpad=1)
         below.tick_params(labelbottom=True)
-    for spare in grid[2 * (blocks - 1) :, len(angles) - columns * (blocks - 1) :].flat:
+    for spare in grid[rows * (blocks - 1) :, len(angles) - columns * (blocks - 1) :].flat:
         spare.set_visible(False)
     _legend(figure, curves, columns)
     figure.suptitle(_caption(curves), fontsize=8)
     return figure
+
+
+def _models(curves: CurveSet) -> list[str]:
+    return [series for series in curves.series if series != TRACED]
 
 
 def _title(theta: float, k: int) -> str:
@@ -76,7 +84,8 @@ def _positive(values: np.ndarray) -> np.ndarray:
 
 def _limits(curves: CurveSet) -> tuple[float, float]:
     """About the path-traced curves and, up to a factor of 30 above and 10 below, the models."""
-    traced = np.concatenate([c.S[c.S > 3 * c.standard_error] for c in curves.curves if c.series == TRACED])
+    known = [c for c in curves.curves if c.series == TRACED] or curves.curves
+    traced = np.concatenate([c.S[c.S > 3 * c.standard_error] for c in known])
     if not traced.size:
         return 1e-6, 1.0
     every = np.concatenate([c.S for c in curves.curves])
@@ -87,13 +96,14 @@ def _limits(curves: CurveSet) -> tuple[float, float]:
 
 def _draw_radiance(ax: Axes, curves: CurveSet, theta: float) -> None:
     ax.set(xscale="log", yscale="log", xlim=(curves.r_edges[0], curves.r_edges[-1]))
-    traced = curves.curve(TRACED, theta)
-    for series in curves.series[1:]:
+    for series in _models(curves):
         style = look(series)
         ax.plot(curves.r, _positive(curves.curve(series, theta).S), color=style.color, ls=style.dash, zorder=2)
-    low, high = traced.S - 2 * traced.standard_error, traced.S + 2 * traced.standard_error
-    ax.fill_between(curves.r, np.maximum(low, 1e-300), _positive(high), color="0.72", lw=0, zorder=1)
-    ax.plot(curves.r, _positive(traced.S), "k-", lw=0.7, marker="o", ms=1.9, mew=0, zorder=3)
+    if TRACED in curves.series:
+        traced = curves.curve(TRACED, theta)
+        low, high = traced.S - 2 * traced.standard_error, traced.S + 2 * traced.standard_error
+        ax.fill_between(curves.r, np.maximum(low, 1e-300), _positive(high), color="0.72", lw=0, zorder=1)
+        ax.plot(curves.r, _positive(traced.S), "k-", lw=0.7, marker="o", ms=1.9, mew=0, zorder=3)
     _ticks(ax)
 
 
@@ -103,7 +113,7 @@ def _draw_ratio(ax: Axes, curves: CurveSet, theta: float) -> None:
     noise = 2 * traced.standard_error / S
     ax.fill_between(curves.r, np.maximum(1 - noise, 1e-3), 1 + noise, color="0.72", lw=0, zorder=1)
     ax.axhline(1, color="k", lw=0.7, zorder=1.5)
-    for series in curves.series[1:]:
+    for series in _models(curves):
         style = look(series)
         ax.plot(curves.r, curves.curve(series, theta).S / S, color=style.color, ls=style.dash, zorder=2)
     ax.set(xscale="log", yscale="log", ylim=(1 / RATIO_SPAN, RATIO_SPAN))
@@ -125,8 +135,10 @@ def _ticks(ax: Axes) -> None:
 def _legend(figure: Figure, curves: CurveSet, columns: int) -> None:
     from matplotlib.lines import Line2D
 
-    handles = [Line2D([], [], color="k", lw=0.7, marker="o", ms=2.2, mew=0, label=_label(curves.curves[0]))]
-    firsts: Sequence[Curve] = [curves.curve(s, curves.theta_i_deg[0]) for s in curves.series[1:]]
+    first = curves.curves[0]
+    dots = {"color": "k", "lw": 0.7, "marker": "o", "ms": 2.2, "mew": 0}
+    handles = [Line2D([], [], label=_label(first), **dots)] if first.series == TRACED else []
+    firsts: Sequence[Curve] = [curves.curve(s, curves.theta_i_deg[0]) for s in _models(curves)]
     for c in firsts:
         style = look(c.series)
         handles.append(Line2D([], [], color=style.color, ls=style.dash, label=_label(c)))

@@ -51,7 +51,8 @@ def curves_command(
         str, typer.Option(help="multiple: reflectance at the orders of each model; total: with single.")
     ] = ("multiple"),
     paths: Annotated[
-        int | None, typer.Option(help="Walks for each theta_i.", parser=whole, show_default="from the medium")
+        int | None,
+        typer.Option(help="Walks for each theta_i; 0: models alone.", parser=whole, show_default="from the medium"),
     ] = None,
     seed: Annotated[int, typer.Option(help="Seed of the tracer.", parser=whole)] = 0,
     backend: Backend = "llvm",
@@ -124,7 +125,7 @@ def _report(result: CurveSet, files: list[Path]) -> None:
         screen.print(note, highlight=False, markup=False)
     if not any(file.suffix == ".pdf" for file in files):
         screen.print("no figure: it needs `pip install halfspace-sss[figures]`", highlight=False, markup=False)
-    walks = f"{result.n_paths:,} walks for each direction, {result.seconds:.0f} s"
+    walks = f"{result.n_paths:,} walks for each direction, {result.seconds:.0f} s" if result.n_paths else "no walks"
     screen.print(f"{walks}; written:", highlight=False, markup=False)
     for file in files:
         screen.print(f"  {file}", highlight=False, markup=False, soft_wrap=True)

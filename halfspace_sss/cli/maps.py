@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from halfspace_sss.cli.shared import (
-    FIG10,
     Albedo,
     Backend,
     Bar,
@@ -20,6 +19,7 @@ from halfspace_sss.cli.shared import (
     by_channel,
     check_channel,
     console,
+    fig10_medium,
     numbers,
     stated_medium,
     whole,
@@ -83,14 +83,14 @@ def _media(
     names: list[str], channels: str | None, given: dict[str, float | None], name: str | None
 ) -> dict[str, Medium]:
     """Media by the name of their store."""
-    from halfspace_sss import Medium, materials
+    from halfspace_sss import materials
 
     stated = stated_medium(names, given)
     if name is not None and stated is None:
         raise ValueError(f"name must be left out unless coefficients are given, got {name!r}")
     check_channel(channels, names)
     if not names:
-        return {"fig10": Medium.from_albedo(**FIG10)} if stated is None else {name or "medium": stated}
+        return {"fig10": fig10_medium()} if stated is None else {name or "medium": stated}
     if channels is None:
         chosen = [(material.name, material.medium) for material in map(materials.load, names)]
     else:

@@ -20,12 +20,10 @@ if TYPE_CHECKING:
     from halfspace_sss.physics.medium import Medium
 
 __all__ = [
-    "FIG10", "Albedo", "Backend", "Bar", "Channels", "Define", "Eta", "Materials", "MeanCosine", "ObjectId",
+    "Albedo", "Backend", "Bar", "Channels", "Define", "Eta", "Materials", "MeanCosine", "ObjectId",
     "OutFolder", "SampleSeed", "SensorNumber", "SigmaT", "Variant", "by_channel", "check_channel", "check_left_out",
-    "console", "defined", "numbers", "stated_medium", "tell", "use_mitsuba", "whole", "with_quiet",
+    "console", "defined", "fig10_medium", "numbers", "stated_medium", "tell", "use_mitsuba", "whole", "with_quiet",
 ]  # fmt: skip
-
-FIG10 = {"sigma_t": 0.241, "albedo": 0.75, "g": 0.0, "eta": 1.3}
 
 
 def whole(text: str | int) -> int:
@@ -76,13 +74,21 @@ def stated_medium(materials: list[str], given: dict[str, float | None]) -> Mediu
     Raises:
         ValueError: coefficients were given beside the name of a material, or are out of range.
     """
-    from halfspace_sss.physics.medium import Medium
-
     stated = {name: value for name, value in given.items() if value is not None}
     for name, value in stated.items():
         if materials:
             raise ValueError(f"{name} must be left out for a named material, got {value!r} with {materials[0]!r}")
-    return Medium.from_albedo(**{**FIG10, **stated}) if stated else None
+    return fig10_medium(**stated) if stated else None
+
+
+def fig10_medium(**stated: float) -> Medium:
+    """The medium of Fig. 10 with other coefficients where they are stated."""
+    from halfspace_sss.materials import load
+    from halfspace_sss.physics.medium import Medium
+
+    fig10 = load("fig10").medium
+    known = {name: round(float(getattr(fig10, name)), 12) for name in ("sigma_t", "albedo", "g", "eta")}
+    return Medium.from_albedo(**{**known, **stated})
 
 
 def by_channel(names: list[str], channels: str) -> list[tuple[str, Medium]]:

@@ -132,7 +132,7 @@ class CurveSet:
 
     @property
     def series(self) -> tuple[str, ...]:
-        """Names of the series, "path_traced" first."""
+        """Names of the series, "path_traced" first if it was traced."""
         return tuple(dict.fromkeys(c.series for c in self.curves))
 
     def curve(self, series: str, theta_i_deg: float) -> Curve:
@@ -168,12 +168,12 @@ class CurveSet:
         """
         import pandas
 
-        rows = []
+        rows, is_traced = [], TRACED in self.series
         for c in self.curves:
-            traced = self.curve(TRACED, c.theta_i_deg)
+            traced = self.curve(TRACED, c.theta_i_deg) if is_traced else None
             order = "total" if "total" in (self.orders, c.orders) else "multiple"
             R, R_error = c.reflectance[order]
-            R_t, R_t_error = traced.reflectance[order]
+            R_t, R_t_error = traced.reflectance[order] if traced else (math.nan, math.nan)
             common = {"reflectance_orders": order, "reflectance": R, "reflectance_traced": R_t}
             common |= {"reflectance_standard_error": R_error, "reflectance_traced_standard_error": R_t_error}
             common["evaluations_per_s"] = self.evaluations_per_s.get(c.series, math.nan)
@@ -185,7 +185,9 @@ class CurveSet:
                 rows.append(row | common)
         return pandas.DataFrame(rows)
 
-    def _error(self, c: Curve, traced: Curve, low: float, high: float) -> dict[str, float]:
+    def _error(self, c: Curve, traced: Curve | None, low: float, high: float) -> dict[str, float]:
+        if traced is None:
+            return dict.fromkeys(("L1", "bias", "noise", "bias_standard_error"), math.nan)
         inside = (self.r >= low) & (self.r <= high)
         area = np.diff(self.r_edges**2)[inside]
         S_t, error = traced.S[inside] * area, traced.standard_error[inside] * area
@@ -223,16 +225,18 @@ class CurveSet:
             ValueError: folder exists and is a file.
         """
         folder = check_folder(folder)
-        content: dict[str, bytes | str] = {
-            f"{name}.csv": self.to_dataframe().to_csv(index=False, lineterminator="\n"),
-            f"{name}_errors.csv": self.errors().to_csv(index=False, lineterminator="\n"),
-        }
+        content: dict[str, bytes | str] = dict(self.tables(name))
         try:
             figures = self._figures()
         except BaseException:  # an interrupt while it was drawn
             self._write(folder, name, content)
             raise
         return self._write(folder, name, content | {f"{name}.{ending}": data for ending, data in figures.items()})
+
+    def tables(self, name: str = "curves") -> dict[str, str]:
+        """NAME.csv, of every series, and NAME_errors.csv."""
+        found = {f"{name}.csv": self.to_dataframe(), f"{name}_errors.csv": self.errors()}
+        return {file: table.to_csv(index=False, lineterminator="\n") for file, table in found.items()}
 
     def _figures(self) -> dict[str, bytes]:
         """The figure by file ending; none, with a warning, if it cannot be drawn."""

@@ -6,12 +6,11 @@ import math
 import numbers
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
+from halfspace_sss.backend import array_types
 from halfspace_sss.checks import check_count, check_interval
-from halfspace_sss.comparison.curve_defaults import default_paths, default_range
 from halfspace_sss.comparison.curve_set import TRACED, Curve, CurveSet
 from halfspace_sss.comparison.model_truths import sampled_reflectance
 from halfspace_sss.interface.model import BSSRDF, bssrdf
@@ -22,66 +21,73 @@ from halfspace_sss.physics import single_scattering
 from halfspace_sss.physics.fresnel import mu_internal
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.progress import Progress
-from halfspace_sss.tracing.curve_tracing import CurveTrace, trace_curve
+from halfspace_sss.tracing.curve_tracing import Line, trace_curve
 from halfspace_sss.tracing.passes import launch_shape
-from halfspace_sss.tracing.tracer import Trace, trace
+from halfspace_sss.tracing.tracer import trace
 
-__all__ = ["FIG10_THETA_I", "curves"]
+__all__ = ["FIG10_THETA_I", "curves", "default_paths", "default_range"]
 
 FIG10_THETA_I = (0.0, 30.0, 60.0, 75.0)
 REFLECTANCE_POINTS = 2**12
-REFLECTANCE_PATHS = 4_000_000
+MOST_MFP = 100.0  # transport mean free paths, end of the range where nothing is absorbed
+EVENTS = 360_000_000  # scattering events, those of 64 million walks in the medium of Fig. 10
+FEWEST, MOST, PILOT = 250_000, 64_000_000, 4096  # walks
 
 
-@dataclass(frozen=True)
-class _Line:
-    """Where curves are measured: cells along a line, directions, all angles in radians."""
+def default_range(medium: Medium) -> tuple[float, float]:
+    """Distances (mm) of a curve: 0.012 to 6 transport mean free paths, or to 4/sigma_tr if light gets farther.
 
-    theta_o: float
-    delta_phi: float
-    line_phi: float
-    half_width: float
-    r_edges: np.ndarray
+    sigma_tr = sqrt(3 sigma_a sigma_t'), at most 100 transport mean free paths; two digits. Fig. 10: 0.05 to 25 mm.
+    """
+    mfp, sigma_tr = 1 / medium.sigma_t_prime, math.sqrt(3 * medium.sigma_a * medium.sigma_t_prime)
+    far = max(6.025 * mfp, min(4 / max(sigma_tr, 1e-300), MOST_MFP * mfp))
+    return float(f"{0.01205 * mfp:.2g}"), float(f"{far:.2g}")
 
-    @property
-    def mu_o(self) -> float:
-        return math.cos(self.theta_o)
 
-    @property
-    def r(self) -> np.ndarray:
-        return np.sqrt(self.r_edges[:-1] * self.r_edges[1:])
+def default_paths(medium: Medium, backend: str = "llvm") -> int:
+    """Walks that take about as long in any medium: 64 million in Fig. 10, fewer where a walk is longer.
 
-    def at_middle(self, model: BSSRDF, mu_i: float) -> np.ndarray:
-        """S of a model at the middle of each cell, 1/(mm² sr)."""
-        return self._S(model, self.r, mu_i, self.line_phi)
+    Events per walk are counted in 4096 walks at normal incidence; at least 250 000 walks, two digits.
+    """
+    pilot = trace(medium, n_paths=PILOT, seed=0, backend=backend)
+    paths = EVENTS * pilot.n_paths / max(pilot.n_events, 1)
+    return int(min(max(float(f"{paths:.2g}"), FEWEST), MOST))
 
-    def cell_mean(self, model: BSSRDF, mu_i: float) -> np.ndarray:
-        """S of a model as a mean over each cell, which is what the tracer measures: 4 x 5 Gauss nodes."""
-        x, w = np.polynomial.legendre.leggauss(4)
-        y, v = np.polynomial.legendre.leggauss(5)
-        low, high = self.r_edges[:-1, None], self.r_edges[1:, None]
-        r = 0.5 * (low + high) + 0.5 * (high - low) * x
-        w_r = w * r / (w * r).sum(axis=1, keepdims=True)
-        S = self._S(model, r[..., None], mu_i, self.line_phi + self.half_width * y)
-        return np.einsum("krs,kr,s->k", S, w_r, 0.5 * v)
 
-    def _S(self, model: BSSRDF, r: np.ndarray, mu_i: float, psi: np.ndarray | float) -> np.ndarray:
-        """The query for a line at azimuth psi from the forward direction: w_i lies at pi, w_o at delta_phi."""
-        return np.asarray(model.eval(r, mu_i, math.pi - psi, self.mu_o, self.delta_phi - psi), dtype=np.float64)
+def _at_middle(line: Line, model: BSSRDF, mu_i: float) -> np.ndarray:
+    """S of a model at the middle of each cell, 1/(mm² sr)."""
+    return _S(line, model, np.sqrt(line.r_edges[:-1] * line.r_edges[1:]), mu_i, line.phi)
 
-    def meets_single_order(self, theta_i: float, eta: float) -> bool:
-        """Whether the cells hold points where the two refracted rays meet, which carry the single order."""
-        tan_i, tan_o = (self._tan_inside(theta, eta) for theta in (theta_i, self.theta_o))
-        x, y = tan_i + tan_o * math.cos(self.delta_phi), tan_o * math.sin(self.delta_phi)
-        if math.hypot(x, y) < 1e-9:
-            return False  # they meet at the entry point alone
-        gap = math.remainder(math.atan2(y, x) - self.line_phi, 2 * math.pi)
-        return abs(gap) <= self.half_width
 
-    @staticmethod
-    def _tan_inside(theta: float, eta: float) -> float:
-        mu = float(mu_internal(math.cos(theta), eta))
-        return math.sqrt((1 - mu) * (1 + mu)) / max(mu, 1e-12)
+def _cell_mean(line: Line, model: BSSRDF, mu_i: float) -> np.ndarray:
+    """S of a model as a mean over each cell, which is what the tracer measures: 4 x 5 Gauss nodes."""
+    x, w = np.polynomial.legendre.leggauss(4)
+    y, v = np.polynomial.legendre.leggauss(5)
+    low, high = line.r_edges[:-1, None], line.r_edges[1:, None]
+    r = 0.5 * (low + high) + 0.5 * (high - low) * x
+    w_r = w * r / (w * r).sum(axis=1, keepdims=True)
+    S = _S(line, model, r[..., None], mu_i, line.phi + line.half_width * y)
+    return np.einsum("krs,kr,s->k", S, w_r, 0.5 * v)
+
+
+def _S(line: Line, model: BSSRDF, r: np.ndarray, mu_i: float, psi: np.ndarray | float) -> np.ndarray:
+    """The query for a line at azimuth psi from the forward direction: w_i lies at pi, w_o at delta_phi."""
+    return np.asarray(model.eval(r, mu_i, math.pi - psi, line.mu_o, line.delta_phi - psi), dtype=np.float64)
+
+
+def _meets_single_order(line: Line, theta_i: float, eta: float) -> bool:
+    """Whether the cells hold points where the two refracted rays meet, which carry the single order."""
+    tan_i, tan_o = (_tan_inside(mu, eta) for mu in (math.cos(theta_i), line.mu_o))
+    x, y = tan_i + tan_o * math.cos(line.delta_phi), tan_o * math.sin(line.delta_phi)
+    if math.hypot(x, y) < 1e-9:
+        return False  # they meet at the entry point alone
+    gap = math.remainder(math.atan2(y, x) - line.phi, 2 * math.pi)
+    return abs(gap) <= line.half_width
+
+
+def _tan_inside(mu_outside: float, eta: float) -> float:
+    mu = float(mu_internal(mu_outside, eta))
+    return math.sqrt((1 - mu) * (1 + mu)) / max(mu, 1e-12)
 
 
 def curves(
@@ -122,7 +128,8 @@ def curves(
         orders: "multiple" compares reflectances at the orders that each model contains; "total" adds the exact single
             order to models that leave it out. The curve is the same, since the single order has no radiance off the
             line where the two refracted rays meet; on that line "total" is refused.
-        n_paths: walks for each angle of incidence; by default `default_paths(medium)`.
+        n_paths: walks for each angle of incidence; by default `default_paths(medium)`. 0 leaves out the path-traced
+            curve, and with it errors.
         seed, backend: as in `halfspace_sss.trace`; the same seed gives the same result.
         progress: called with (steps done, steps in all).
 
@@ -134,22 +141,25 @@ def curves(
     title, medium = one_channel(medium, channel)
     angles = _checked_angles(theta_i_deg, theta_o_deg, delta_phi_deg, line_deg)
     check_count("n_r", n_r, 2)
-    check_count("n_paths", 256 if n_paths is None else n_paths, 256)
+    if n_paths not in (None, 0):
+        check_count("n_paths", n_paths, 256)
     check_count("seed", seed, 0)
-    check_interval("half_width", half_width, 1e-6, math.pi)
-    low, high = _checked_range(r_min, r_max, medium)
-    theta_o, delta_phi, line_phi = (math.radians(a) for a in (theta_o_deg, delta_phi_deg, line_deg))
-    line = _Line(theta_o, delta_phi, line_phi, half_width, np.geomspace(low, high, n_r + 1))
+    array_types(backend)
+    edges = np.geomspace(*_checked_range(r_min, r_max, medium), n_r + 1)
+    theta_o, delta_phi, phi = (math.radians(a) for a in (theta_o_deg, delta_phi_deg, line_deg))
+    line = Line(edges, math.cos(theta_o), delta_phi, phi, half_width)
     _check_orders(orders, line, angles, medium.eta)
     chosen, notes = _chosen_models(models, medium)
     n_paths = default_paths(medium, backend) if n_paths is None else n_paths
-    steps = _Steps(progress, len(angles) * (launch_shape(n_paths)[2] + 1 + len(chosen)) + len(chosen))
+    passes = launch_shape(n_paths)[2] if n_paths else 0
+    steps = _Steps(progress, len(angles) * (passes + len(chosen)) + len(chosen))
     found, walks, seconds = [], 0, 0.0
     for k, theta in enumerate(angles):
-        traced, flux = _traced(medium, theta, line, n_paths, seed + k, backend, steps)
-        walks, seconds = traced.n_paths, seconds + traced.seconds + flux.seconds
-        R = {order: tuple(flux.reflectance(order)) for order in ("multiple", "total")}
-        found.append(Curve(TRACED, "multiple", theta, traced.S, traced.S, traced.standard_error, R))
+        if n_paths:
+            traced = trace_curve(medium, math.cos(math.radians(theta)), line, n_paths, seed + k, backend, steps.advance)
+            walks, seconds = traced.n_paths, seconds + traced.seconds
+            R = {order: tuple(traced.reflectance(order)) for order in ("multiple", "total")}
+            found.append(Curve(TRACED, "multiple", theta, traced.S, traced.S, traced.standard_error, R))
         for model in chosen:
             found.append(_modelled(model, theta, line, orders))
             steps.advance()
@@ -176,30 +186,17 @@ class _Steps:
             self.progress(self.done, self.total)
 
 
-def _traced(
-    medium: Medium, theta_deg: float, line: _Line, n_paths: int, seed: int, backend: str, steps: _Steps
-) -> tuple[CurveTrace, Trace]:
-    mu_i = math.cos(math.radians(theta_deg))
-    angles = (line.delta_phi, line.line_phi)
-    S = trace_curve(
-        medium, mu_i, line.mu_o, *angles, line.r_edges, line.half_width, n_paths, seed, backend, steps.advance
-    )
-    flux = trace(medium, mu_i=mu_i, n_paths=min(n_paths, REFLECTANCE_PATHS), seed=seed, backend=backend)
-    steps.advance()
-    return S, flux
-
-
-def _modelled(model: BSSRDF, theta_deg: float, line: _Line, orders: str) -> Curve:
+def _modelled(model: BSSRDF, theta_deg: float, line: Line, orders: str) -> Curve:
     mu_i = math.cos(math.radians(theta_deg))
     order = "total" if orders == "total" else model.orders
     R, error = sampled_reflectance(model, mu_i, points=REFLECTANCE_POINTS)
     if order != model.orders:
         R += float(single_scattering.reflectance(model.medium, mu_i))
-    S, S_at_r = line.cell_mean(model, mu_i), line.at_middle(model, mu_i)
+    S, S_at_r = _cell_mean(line, model, mu_i), _at_middle(line, model, mu_i)
     return Curve(model.name, model.orders, theta_deg, S, S_at_r, np.zeros_like(S), {order: (R, error)})
 
 
-def _evaluations_per_s(model: BSSRDF, line: _Line, n: int = 4096, least_seconds: float = 0.1) -> float:
+def _evaluations_per_s(model: BSSRDF, line: Line, n: int = 4096, least_seconds: float = 0.1) -> float:
     """Evaluations of S per second in batches of n, NumPy, float64, at random queries within the range of r."""
     rng = np.random.default_rng(0)
     r = np.exp(rng.uniform(*np.log(line.r_edges[[0, -1]]), n))
@@ -236,16 +233,16 @@ def _checked_range(r_min: float | None, r_max: float | None, medium: Medium) -> 
     return low, high
 
 
-def _check_orders(orders: str, line: _Line, angles: list[float], eta: float) -> None:
+def _check_orders(orders: str, line: Line, angles: list[float], eta: float) -> None:
     if orders not in ("multiple", "total"):
         raise ValueError(f"orders must be 'multiple' or 'total', got {orders!r}")
     if orders == "multiple":
         return
     for theta in angles:
-        if line.meets_single_order(math.radians(theta), eta):
+        if _meets_single_order(line, math.radians(theta), eta):
             raise ValueError(
                 "orders must be 'multiple' on a line where the refracted rays meet and the single order is not a "
-                f"function, got 'total' with the line at {math.degrees(line.line_phi):g} and theta_i {theta:g} degrees"
+                f"function, got 'total' with the line at {math.degrees(line.phi):g} and theta_i {theta:g} degrees"
             )
 
 

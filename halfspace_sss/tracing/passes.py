@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from halfspace_sss.checks import check_edges
+from halfspace_sss.checks import check_choice, check_edges
 from halfspace_sss.physics.fresnel import F_t, mu_internal
 from halfspace_sss.physics.layers import Layers
 from halfspace_sss.physics.medium import Medium
@@ -19,8 +19,12 @@ from halfspace_sss.progress import Progress
 from halfspace_sss.tracing.tallies import BATCHES, CellSums
 from halfspace_sss.tracing.walk import Tally, pass_seed, walk
 
-__all__ = ["PATHS_PER_LANE", "Estimate", "Pass", "checked_radii", "estimate", "launch_shape", "walk_passes"]
+__all__ = [
+    "ORDERS", "PATHS_PER_LANE", "Estimate", "Pass", "checked_radii", "estimate", "launch_shape", "order_sum",
+    "walk_passes",
+]  # fmt: skip
 
+ORDERS = ("single", "multiple", "total")
 PATHS_PER_LANE, MAX_LANES = 64, 131072
 LAUNCH_SECONDS = 0.7  # of a kernel, in which Python hears no interrupt
 FIRST_LANES, FEWEST_LANES = 2048, 512  # of a launch
@@ -38,6 +42,12 @@ def estimate(samples: np.ndarray) -> Estimate:
     n = len(samples)
     value, error = samples.mean(axis=0), samples.std(axis=0, ddof=1) / math.sqrt(n)
     return Estimate(float(value), float(error)) if samples.ndim == 1 else Estimate(value, error)
+
+
+def order_sum(order: str, single: np.ndarray, multiple: np.ndarray) -> np.ndarray:
+    """What was recorded of an order, "single", "multiple" or their "total"."""
+    check_choice("order", order, ORDERS)
+    return {"single": single, "multiple": multiple, "total": single + multiple}[order]
 
 
 def checked_radii(radii: Sequence[float] | None, mu_i: float | str) -> np.ndarray | None:

@@ -11,24 +11,17 @@ from typing import Any, overload
 import numpy as np
 
 from halfspace_sss.backend import array_types
-from halfspace_sss.checks import check_choice, check_cosine, check_count, check_finite, check_interval
+from halfspace_sss.checks import check_cosine, check_count, check_finite, check_interval
 from halfspace_sss.physics.fresnel import F_t
 from halfspace_sss.physics.layers import Layers
 from halfspace_sss.physics.medium import Medium, check_scalar_medium, medium_of
 from halfspace_sss.progress import Progress
 from halfspace_sss.tracing.layers import LayerTrace, trace_layers
-from halfspace_sss.tracing.passes import Estimate, checked_radii, estimate, walk_passes
+from halfspace_sss.tracing.passes import ORDERS, Estimate, checked_radii, estimate, order_sum, walk_passes
 from halfspace_sss.tracing.tallies import AngularTally, FluxTally, MomentTally, RingTally
 from halfspace_sss.tracing.walk import Tally
 
 __all__ = ["ORDERS", "Estimate", "Trace", "trace"]
-
-ORDERS = ("single", "multiple", "total")
-
-
-def _order_sum(order: str, single: np.ndarray, multiple: np.ndarray) -> np.ndarray:
-    check_choice("order", order, ORDERS)
-    return {"single": single, "multiple": multiple, "total": single + multiple}[order]
 
 
 @dataclass(frozen=True, repr=False)
@@ -64,11 +57,11 @@ class Trace:
 
     def reflectance(self, order: str = "total") -> Estimate:
         """Fraction of incident flux that leaves the medium after `order` scattering; surface reflection excluded."""
-        return estimate(_order_sum(order, *self._pair(0)))
+        return estimate(order_sum(order, *self._pair(0)))
 
     def _ratio(self, order: str, column: int, unit: float) -> Estimate:
-        flux = _order_sum(order, *self._pair(0))
-        moment = _order_sum(order, *self._pair(column))
+        flux = order_sum(order, *self._pair(0))
+        moment = order_sum(order, *self._pair(column))
         if not flux.mean() > 0:
             return Estimate(math.nan, math.nan)
         ratio = moment.mean() / flux.mean()
@@ -92,13 +85,13 @@ class Trace:
         if self._T_o is None:
             raise ValueError("directions must be given to trace() for angular_reflectance, got None")
         pairs = self._lanes[:, 8:].reshape(len(self._lanes), self._n_directions, 2)
-        return estimate(_order_sum(order, pairs[..., 0], pairs[..., 1]) * self._T_o)
+        return estimate(order_sum(order, pairs[..., 0], pairs[..., 1]) * self._T_o)
 
     def exitance(self, order: str = "total") -> Estimate:
         """Mean exitance over each ring between consecutive `radii`, 1/mm² per incident flux."""
         if self._rings is None:
             raise ValueError("radii must be given to trace() for exitance, got None")
-        return estimate(_order_sum(order, self._rings[:, 0], self._rings[:, 1]))
+        return estimate(order_sum(order, self._rings[:, 0], self._rings[:, 1]))
 
 
 @overload

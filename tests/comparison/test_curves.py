@@ -10,8 +10,8 @@ import pytest
 
 import halfspace_sss
 from halfspace_sss import Medium, measure
-from halfspace_sss.comparison.curve_defaults import default_paths, default_range
 from halfspace_sss.comparison.curve_set import TRACED, CurveSet
+from halfspace_sss.comparison.reflectance_curves import default_paths, default_range
 from halfspace_sss.interface.model import BSSRDF
 from halfspace_sss.interface.query import Query
 from halfspace_sss.physics import single_scattering
@@ -162,6 +162,23 @@ def test_progress_counts_to_the_end() -> None:
         FIG10, theta_i_deg=[0, 30], models=["better_dipole"], n_paths=256, progress=lambda *p: seen.append(p)
     )
     assert [done for done, _ in seen] == list(range(seen[-1][1] + 1))
+
+
+def test_models_alone_are_asked_without_a_walk(monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:
+    monkeypatch.setattr("halfspace_sss.comparison.reflectance_curves.trace_curve", None)
+    found = halfspace_sss.curves(FIG10, theta_i_deg=[0, 30], models=["better_dipole"], n_paths=0)
+    assert found.series == ("better_dipole",) and found.n_paths == 0
+    errors = found.errors()
+    assert errors["L1"].isna().all() and (errors["reflectance"] > 0.09).all()
+    assert {path.suffix for path in found.save(tmp_path)} >= {".csv", ".json", ".pdf"}
+
+
+def test_the_flux_of_a_curve_is_that_of_a_trace_of_the_same_seed() -> None:
+    """Both walk the same."""
+    theta, seed = 60.0, 3
+    curve = halfspace_sss.curves(FIG10, theta_i_deg=[theta], models=[], n_paths=20_000, seed=seed).curve(TRACED, theta)
+    trace = halfspace_sss.trace(FIG10, math.cos(math.radians(theta)), 20_000, seed)
+    assert curve.reflectance["multiple"] == tuple(trace.reflectance("multiple"))
 
 
 def test_bright_media_get_fewer_walks_by_default() -> None:

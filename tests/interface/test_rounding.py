@@ -11,7 +11,7 @@ import halfspace_sss
 from halfspace_sss import Medium, measure, trace
 from halfspace_sss.comparison.validate import trace_order
 from halfspace_sss.physics import single_scattering
-from halfspace_sss.tracing.curve_tracing import trace_curve
+from halfspace_sss.tracing.curve_tracing import Line, trace_curve
 
 MEDIUM = Medium(1.8075, 0.6025, 0.0, 1.3)
 LOSSLESS = Medium(2.0, 0.0, 0.0, 1.3)  # S falls as r⁻³ only
@@ -52,7 +52,7 @@ ASKED = {
     "single radiance": lambda mu: single_scattering.brdf(MEDIUM, mu, mu, 0.3),
     "trace": lambda mu: trace(MEDIUM, mu, 256).reflectance().value,
     "trace, directions": lambda mu: trace(MEDIUM, 1.0, 256, directions=[(mu, 0.0)]).angular_reflectance().value,
-    "curve": lambda mu: trace_curve(MEDIUM, mu, mu, 0.0, 0.0, np.array([0.1, 1.0]), n_paths=256).S,
+    "curve": lambda mu: trace_curve(MEDIUM, mu, Line(np.array([0.1, 1.0]), mu, 0.0, 0.0), n_paths=256).S,
     "orders": lambda mu: trace_order(MEDIUM, mu, 1, 256)[0].value,
 }
 

@@ -15,7 +15,7 @@ from halfspace_sss import Medium, make_maps, trace
 from halfspace_sss.maps.grid import MapGrid, cell_edges, map_directions, radial_scale
 from halfspace_sss.maps.map_tracing import MapUnit, trace_unit
 from halfspace_sss.maps.store import _template, load_maps
-from halfspace_sss.tracing.curve_tracing import trace_curve
+from halfspace_sss.tracing.curve_tracing import Line, trace_curve
 
 FIG10 = Medium.from_albedo(0.75, 1.0, 0.0, 1.3)
 FORWARD = Medium.from_albedo(0.99, 1.0, 0.8, 1.5)
@@ -47,7 +47,8 @@ def test_a_cell_agrees_with_a_curve_traced_through_it():
     r, psi = cell_edges(FIG10, grid)
     k, j = 5, 8
     middle, half = 0.5 * (psi[j] + psi[j + 1]), 0.5 * (psi[j + 1] - psi[j])
-    curve = trace_curve(FIG10, float(mu_i[0]), float(mu_o[0, k]), float(delta_phi[0, k]), middle, r, half, 4_000_000, 5)
+    line = Line(r, float(mu_o[0, k]), float(delta_phi[0, k]), middle, half)
+    curve = trace_curve(FIG10, float(mu_i[0]), line, 4_000_000, 5)
     error = np.hypot(np.sqrt(result.variance[k, :, j]), curve.standard_error)
     assert np.all(np.abs(result.S[k, :, j] - curve.S) < 4.5 * error)
 

@@ -9,8 +9,12 @@ import pytest
 from traced import MEDIA, check_spread, z
 
 from halfspace_sss import Medium, trace
-from halfspace_sss.tracing.curve_tracing import trace_curve
+from halfspace_sss.tracing.curve_tracing import CurveTrace, Line, trace_curve
 from halfspace_sss.tracing.passes import Estimate
+
+
+def curve_of(medium, mu_i, mu_o, delta_phi, phi, edges, half_width, n_paths, seed) -> CurveTrace:
+    return trace_curve(medium, mu_i, Line(edges, mu_o, delta_phi, phi, half_width), n_paths, seed)
 
 
 @pytest.fixture(scope="module", params=MEDIA)
@@ -21,7 +25,7 @@ def medium(request) -> Medium:
 @pytest.mark.parametrize(("mu_i", "mu_o", "delta_phi"), [(1.0, 1.0, 0.0), (0.8, 0.9, math.pi), (0.8, 0.9, 1.1)])
 def test_curves_integrate_to_the_angular_reflectance_of_the_multiple_order(medium, mu_i, mu_o, delta_phi):
     edges = np.concatenate([[0.0], np.geomspace(1e-2, 200, 12)]) * medium.mfp
-    curve = trace_curve(medium, mu_i, mu_o, delta_phi, 0.0, edges, math.pi, 200_000, 81)
+    curve = curve_of(medium, mu_i, mu_o, delta_phi, 0.0, edges, math.pi, 200_000, 81)
     area = np.pi * np.diff(edges**2)
     whole = Estimate(np.sum(curve.S * area), np.sum(curve.standard_error * area))  # the cells share their walks
     angular = trace(medium, mu_i, 200_000, 82, directions=[(mu_o, delta_phi)]).angular_reflectance("multiple")
@@ -30,8 +34,8 @@ def test_curves_integrate_to_the_angular_reflectance_of_the_multiple_order(mediu
 
 def test_curves_on_both_sides_of_the_plane_of_incidence_agree(medium):
     edges = np.array([0.2, 0.5, 1.0, 2.0]) * medium.mfp
-    a = trace_curve(medium, 0.8, 0.9, 1.0, 0.7, edges, 0.4, 200_000, 83)
-    b = trace_curve(medium, 0.8, 0.9, -1.0, -0.7, edges, 0.4, 200_000, 84)
+    a = curve_of(medium, 0.8, 0.9, 1.0, 0.7, edges, 0.4, 200_000, 83)
+    b = curve_of(medium, 0.8, 0.9, -1.0, -0.7, edges, 0.4, 200_000, 84)
     assert np.all(np.abs(z((a.S, a.standard_error), (b.S, b.standard_error))) < 4)
 
 
@@ -47,7 +51,7 @@ def test_sectors_of_a_ring_add_up_to_it(delta_phi):
     """Of the same walks."""
 
     def curve(line_phi, half_width):
-        return trace_curve(MEDIA["denser"], 0.7, 0.6, delta_phi, line_phi, [0.05, 0.3, 1.0], half_width, 50_000, 5).S
+        return curve_of(MEDIA["denser"], 0.7, 0.6, delta_phi, line_phi, [0.05, 0.3, 1.0], half_width, 50_000, 5).S
 
     parts = sum(angle * curve(line_phi, half_width) for line_phi, half_width, angle in SECTORS[delta_phi])
     np.testing.assert_allclose(parts, 2 * PI * curve(0.0, PI), rtol=1e-5)
@@ -58,7 +62,7 @@ def test_one_oblique_direction_tells_forward_from_backward_whichever_it_is():
     edges = np.array([0.2, 0.6]) * MEDIA["denser"].mfp
 
     def curve(mu_i, mu_o, line_phi, seed):
-        found = trace_curve(MEDIA["denser"], mu_i, mu_o, 0.0, line_phi, edges, 0.4, 200_000, seed)
+        found = curve_of(MEDIA["denser"], mu_i, mu_o, 0.0, line_phi, edges, 0.4, 200_000, seed)
         return found.S, found.standard_error
 
     for line_phi in (0.0, math.pi):
@@ -67,13 +71,13 @@ def test_one_oblique_direction_tells_forward_from_backward_whichever_it_is():
 
 
 def test_the_same_seed_gives_the_same_curve_and_another_seed_another_one():
-    a, b, c = (trace_curve(MEDIA["denser"], 0.6, 0.5, 0.3, 1.0, [0.1, 1.0, 2.0], 0.3, 30_000, s) for s in (1, 1, 2))
+    a, b, c = (curve_of(MEDIA["denser"], 0.6, 0.5, 0.3, 1.0, [0.1, 1.0, 2.0], 0.3, 30_000, s) for s in (1, 1, 2))
     assert a.S.tobytes() == b.S.tobytes() and a.S.tobytes() != c.S.tobytes()
 
 
 def test_standard_errors_of_curves_are_the_spread_of_independent_runs():
     edges = [0.05, 0.2, 1.0]
-    runs = [trace_curve(MEDIA["denser"], 0.7, 0.6, 1.0, 2.0, edges, 0.5, 32_768, k) for k in range(20)]
+    runs = [curve_of(MEDIA["denser"], 0.7, 0.6, 1.0, 2.0, edges, 0.5, 32_768, k) for k in range(20)]
     check_spread(tuple(r.S for r in runs), tuple(r.standard_error for r in runs))
 
 
@@ -82,12 +86,13 @@ def test_standard_errors_of_curves_are_the_spread_of_independent_runs():
     [
         ({"half_width": 4.0}, "half_width", "3.14", "4.0"),
         ({"mu_o": -0.1}, "mu_o", r"\[0, 1\]", "-0.1"),
-        ({"line_phi": math.inf}, "line_phi", "finite", "inf"),
+        ({"phi": math.inf}, "phi", "finite", "inf"),
         ({"delta_phi": math.nan}, "delta_phi", "finite", "nan"),
         ({"mu_i": "diffuse"}, "mu_i", r"\[0, 1\]", "diffuse"),
     ],
 )
 def test_bad_input_to_a_curve_is_refused_with_name_bound_and_value(arguments, parameter, bound, value):
-    given = {"mu_i": 0.5, "mu_o": 0.5, "delta_phi": 0.0, "line_phi": 0.0, "r_edges": [0.1, 1.0], "n_paths": 1024}
+    given = {"mu_o": 0.5, "delta_phi": 0.0, "phi": 0.0, "r_edges": [0.1, 1.0]}
     with pytest.raises(ValueError, match=f"{parameter} must be.*({bound}).*{value}"):
-        trace_curve(MEDIA["matched"], **(given | arguments))
+        mu_i = arguments.pop("mu_i", 0.5)
+        trace_curve(MEDIA["matched"], mu_i, Line(**(given | arguments)), 1024)
