@@ -45,7 +45,7 @@ def rendered(task: Task) -> dict[str, Any]:
     """The images of all samplers and numbers of entries under all lights, and the converged ones."""
     prepare()
     p, found, done = task.params, {}, 0
-    folders = _weights(task)
+    folders, flow = _weights(task)
     total = len(p["lights"]) * (1 + len(SAMPLERS) * len(ENTRIES))
     for light in p["lights"]:
         passes = max(p["spp"] // SPP_PER_PASS, 1)
@@ -53,7 +53,8 @@ def rendered(task: Task) -> dict[str, Any]:
         found[_key(light, "converged")] = np.mean(images, axis=0).astype(np.float32)
         for sampler in SAMPLERS:
             for n in ENTRIES:
-                found[_key(light, sampler, n)] = _image(folders[sampler], p, light, n, 1, 7)
+                drawn = flow if sampler == "flow" else None
+                found[_key(light, sampler, n)] = _image(folders[sampler], p, light, n, 1, 7, drawn)
                 done += 1
                 task.progress(done, total)
     return found
@@ -64,30 +65,33 @@ def _key(*words: object) -> str:
     return "-".join(str(word).replace(" ", "_") for word in words)
 
 
-def _weights(task: Task) -> dict[str, Path]:
-    """A folder of weights for each sampler: of one training, without patches, with them, and with a flow beside."""
-    from figures.studies.flow import add_flow
+def _weights(task: Task) -> tuple[dict[str, Path], dict[str, np.ndarray]]:
+    """A folder of weights for each sampler, of one training, without patches and with them; and those of a flow."""
     from figures.studies.flow_training import FlowRecipe, fit_flow
     from full_geometry.learning.training import train_by_cpu
     from full_geometry.models.storing import CENTRES, KIND
     from full_geometry.object.subject import Subject
     from halfspace_sss.neural.store import load_weights, save_weights
 
-    p, folders = task.params, {name: task.folder / name for name in SAMPLERS}
+    p, folders = task.params, {name: task.folder / name for name in ("probes", "patches")}
     subject = Subject.of(*shape_of("bunny", task.folder))
     learnt, path = train_by_cpu(subject, p["seconds"], folders["patches"], seed=p["seed"])
     arrays, record = load_weights(path, KIND)
-    save_weights(folders["flow"] / path.name, KIND, arrays, record)
-    add_flow(folders["flow"] / path.name, fit_flow(learnt, FlowRecipe(seconds=p["seconds"]), seed=p["seed"]))
+    flow = fit_flow(learnt, FlowRecipe(seconds=p["seconds"]), seed=p["seed"]).flow.weights
     of_patches = {CENTRES} | {name for name in arrays if name.startswith(("V_", "c_"))}
     bare = {name: value for name, value in arrays.items() if name not in of_patches}
     save_weights(folders["probes"] / path.name, KIND, bare, record)
-    return folders
+    halves = {name: value.astype(np.float16) for name, value in flow.items()}  # as weights are kept
+    return {**folders, "flow": folders["patches"]}, halves
 
 
-def _image(folder: Path, p: Mapping[str, Any], light: str, entries: int, spp: int, seed: int) -> np.ndarray:
+def _image(
+    folder: Path, p: Mapping[str, Any], light: str, entries: int, spp: int, seed: int, flow: Any = None
+) -> np.ndarray:
+    """The image with the weights of a folder; entries by a flow if its weights are given."""
     import mitsuba as mi
 
+    from figures.studies.flow import draw_by
     from halfspace_sss.rendering.scenes.scene_files import load_scene
 
     description = bunny_scene("potato", p["size"], light)
@@ -95,6 +99,8 @@ def _image(folder: Path, p: Mapping[str, Any], light: str, entries: int, spp: in
     description["bunny"]["bsdf"]["orders"] = "multiple"
     with weights_in(folder):
         scene = load_scene(description, "full_geometry")
+        if flow is not None:
+            draw_by(scene, flow)
         return np.array(mi.render(scene, spp=spp, seed=seed), dtype=np.float32)
 
 

@@ -14,7 +14,6 @@ from full_geometry.models.neural_shape import ALBEDO, ETA, SIZE, G, transport
 from full_geometry.models.storing import CHECKSUMS, KIND, find_weights, load
 from full_geometry.object.patches import AREA_SHARE, LearntProposals, PatchTable
 from full_geometry.object.subject import Subject, check_surface
-from halfspace_sss.extensions import offered
 from halfspace_sss.neural.store import checksum_of, load_weights
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.object.entries import AreaPoints, PositionSampler, RadialTable
@@ -26,7 +25,6 @@ from halfspace_sss.rendering.object.translucent import Inside
 
 FINE = 2.5  # transport mean free paths of the radius of a patch, up to which patches do without probes
 PATCH_SHARE = 0.2  # of the entries where patches are larger: they reach what probes miss
-SAMPLERS = "halfspace_sss.samplers"  # entry points: a function of `Learnt`, with arrays of its own, and a sign
 ENTRIES = 2  # of an exit: its own work is done once, and patches draw without a ray
 
 
@@ -55,8 +53,7 @@ def learnt_model(object: Object, inside: Inside, media: list[Medium], settings: 
     check_surface(object.shape.id(), object.shape.bsdf())
     subject = Subject.surveyed(object, tuple(media), inside.varying, settings.mm_per_unit)
     path = _weights(subject, settings)
-    learnt = load(path, subject)
-    model, sampler, _ = learnt
+    model, sampler = load(path, subject)
     backbone = model.base.models
     transport = replace(model, checksums=(checksum_of(path, KIND), *load_weights(path, KIND)[1][CHECKSUMS]))
     table = RadialTable([m for m in backbone if float(m.medium.sigma_s) > 0], object.size)
@@ -65,8 +62,6 @@ def learnt_model(object: Object, inside: Inside, media: list[Medium], settings: 
     positions = PositionSampler(replace(object, pieces=None), table, subject.points, share)
     if sampler is None:
         return ObjectModel(transport, HalfSpaceProposals(positions, backbone[0]))
-    for _, refine in offered(SAMPLERS) if learnt.others else ():
-        return ObjectModel(transport, refine(learnt, object.sign), ENTRIES)
     radius = np.sqrt(object.area / (np.pi * sampler.patches.n))
     sigma_t_prime = np.mean([float(m.sigma_t_prime) for m in media])
     patch_share = 1.0 if radius * sigma_t_prime < FINE else PATCH_SHARE

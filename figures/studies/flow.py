@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import functools
 import math
-import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import drjit as dr
@@ -15,11 +13,9 @@ import mitsuba as mi
 import numpy as np
 
 from figures.studies.flow_chart import Chart, context
-from full_geometry.models.storing import KIND, Learnt
 from full_geometry.object.features import ObjectFrame, PreparedExit, Side
 from full_geometry.object.patches import PatchSampler, PatchTable, PatchWeights
 from halfspace_sss.neural.perceptron import Perceptron, relu
-from halfspace_sss.neural.store import load_weights, save_weights
 from halfspace_sss.rendering.object.entries import Point
 from halfspace_sss.rendering.object.points import CosineProposals, EntrySample, SurfacePoint, number, turned
 
@@ -228,20 +224,16 @@ class FlowProposals(CosineProposals):
         return EntrySample(mi.Point3f(at.p), n, mi.Normal3f(n_out), weight, mi.UInt32(at.prim_index))
 
 
-def flow_of(learnt: Learnt) -> FlowSampler:
-    """The flow that weights of an object hold beside its patches."""
-    sampler = learnt.sampler
-    chart = Chart(learnt.model.subject, sampler.frame, sampler.patches)
-    return FlowSampler(sampler, chart, ConditionalFlow(2, learnt.others))
+def draw_by(scene: mi.Scene, flow: Mapping[str, np.ndarray]) -> None:
+    """Let the entries of the learnt object of a scene be drawn by a flow inside its patches.
 
-
-def flow_proposals(learnt: Learnt, sign: float) -> FlowProposals:
-    """Entries of renders where weights hold a flow: the entry point of `full_geometry.scene.SAMPLERS`."""
-    return FlowProposals(flow_of(learnt), sign, PatchTable(learnt.sampler))
-
-
-def add_flow(path: str | os.PathLike, flow: FlowSampler) -> None:
-    """Write the numbers of a flow into the weights of an object: renders draw its entries by it from then on."""
-    arrays, record = load_weights(Path(path), KIND)
-    arrays |= {name: value.astype(np.float16) for name, value in flow.flow.weights.items()}
-    save_weights(Path(path), KIND, arrays, record)
+    Args:
+        scene: with one `translucent` object, of the model `full_geometry`.
+        flow: weights of a `ConditionalFlow`, those of `fit_flow` for the object.
+    """
+    bodies = scene.integrator().prepare(scene)
+    (body,) = bodies
+    patches: PatchSampler = body.proposals.patches
+    chart = Chart(body.transport.subject, patches.frame, patches.patches)
+    sampler = FlowSampler(patches, chart, ConditionalFlow(2, flow))
+    bodies[0] = replace(body, proposals=FlowProposals(sampler, body.found.sign, PatchTable(patches)))

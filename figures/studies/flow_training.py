@@ -302,7 +302,7 @@ def fit_patches(
         light: that falls on the object; None fits to S itself.
         seed: of everything.
     """
-    recipe, (model, sampler, _) = recipe or FlowRecipe(), learnt
+    recipe, (model, sampler) = recipe or FlowRecipe(), learnt
     chart = Chart(model.subject, sampler.frame, sampler.patches)
     net = PatchLogits(n_side(len(model.subject.media)), sampler.patches.areas, recipe.patch_hidden, seed)
 
@@ -324,7 +324,7 @@ def fit_flow(
         learnt: the object, with its patches; their weights stay as they are.
         recipe, light, seed: as for `fit_patches`.
     """
-    recipe, (model, sampler, _) = recipe or FlowRecipe(), learnt
+    recipe, (model, sampler) = recipe or FlowRecipe(), learnt
     chart = Chart(model.subject, sampler.frame, sampler.patches)
     net = FlowNetwork(2, N_CONTEXT, recipe.hidden, seed)
 

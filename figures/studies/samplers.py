@@ -169,7 +169,7 @@ def samplers(learnt: Learnt, recipe: FlowRecipe, light: Lighting, flow: Any, see
         flow: fitted to S alone.
         seed: of the fits.
     """
-    model, patches, _ = learnt
+    model, patches = learnt
     object, sign = model.subject.object, model.subject.object.sign
     backbone = model.base.models
     table = RadialTable([m for m in backbone if float(m.medium.sigma_s) > 0], object.size)

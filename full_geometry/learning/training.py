@@ -266,7 +266,7 @@ def train(
     run = _ObjectTraining(subject, recipe, int(seed), Path(work) if work else None, camera)
     if seconds == 0:
         warnings.warn(f"an object that is trained for 0 seconds is rendered by {recipe.start}", stacklevel=2)
-        return Trained(*run.learnt()[:2], None, [], 0, 0.0)
+        return Trained(*run.learnt(), None, [], 0, 0.0)
     return run.go(seconds, chunks, target_error, folder, progress)
 
 
@@ -351,7 +351,7 @@ class _ObjectTraining:
         spent = time.monotonic() - started
         self._save_camera()
         path = storing.save(folder, self.identity, self.arrays(), self._record(errors, spent))
-        return Trained(*self.learnt()[:2], path, errors, self.fitting.step, spent)
+        return Trained(*self.learnt(), path, errors, self.fitting.step, spent)
 
     def _prepare(self, chunks: int | None = None) -> None:
         """Scales and shares from a pilot, which compiles all kernels; the work of a run that was killed."""
@@ -410,7 +410,7 @@ class _ObjectTraining:
 
     def _errors(self, truth: ExitTruth, samples: int) -> list[RadianceError]:
         """Of the model as it stands; entries follow the patches, which have less noise than probes."""
-        model, sampler = self.learnt()[:2]
+        model, sampler = self.learnt()
         by = self.proposals.with_patches(sampler)
         return measure(self.subject, model, by, truth=truth, samples=samples, seed=self.seed)
 

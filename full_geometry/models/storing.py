@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,7 +25,6 @@ KIND = "full_geometry"
 CHECKSUMS = "start_checksums"  # of a record
 CENTRES, EVEN, TURNS, ENDS = "centres", "even", "turns", "Q"
 S_LAYERS, ALPHA_LAYERS, PATCH_LAYERS = ("W_", "b_", ENDS), ("A_", "a_"), ("V_", "c_")
-OWN = (*S_LAYERS, *ALPHA_LAYERS, *PATCH_LAYERS, CENTRES, EVEN, TURNS)
 NEEDED = (
     (EVEN, "even light must be learnt"), (TURNS, "turns of what surrounds a point must be known"),
     (ENDS, "functions of ends must be solved for"),
@@ -34,11 +32,10 @@ NEEDED = (
 
 
 class Learnt(NamedTuple):
-    """What weights give: the model, the sampler of its entries, None for a shape without faces, and further arrays."""
+    """What weights give: the model, and the sampler of its entries, None for a shape without faces."""
 
     model: FullGeometry
     sampler: PatchSampler | None
-    others: Mapping[str, np.ndarray] = MappingProxyType({})
 
 
 def weights_name(identity: Identity) -> str:
@@ -174,6 +171,5 @@ def assemble(
     model = FullGeometry(subject, frame, base, layers(S_LAYERS), alpha)
     if CENTRES not in arrays:
         return Learnt(model, None)
-    others = {name: value for name, value in arrays.items() if not name.startswith(OWN)}
     patches = patches or Patches(subject, frame, arrays[CENTRES].astype(np.float32))
-    return Learnt(model, PatchSampler(frame, patches, layers(PATCH_LAYERS)), others)
+    return Learnt(model, PatchSampler(frame, patches, layers(PATCH_LAYERS)))

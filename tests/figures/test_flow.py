@@ -6,6 +6,7 @@ Chi-square tests fail at 1e-3, with fixed seeds.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,23 +17,24 @@ dr = pytest.importorskip("drjit")
 torch = pytest.importorskip("torch")
 pytest.importorskip("zuko")
 
-from waxen import random_layers, random_patches, wax_bunny  # noqa: E402
+from waxen import BUNNY, random_layers, random_patches, wax_bunny  # noqa: E402
 
 from figures.studies.flow import (  # noqa: E402  # noqa: E402
     ConditionalFlow,  # noqa: E402
     FlowProposals,
     FlowSampler,
-    add_flow,
-    flow_of,
+    draw_by,
 )
 from figures.studies.flow_chart import N_CONTEXT, Chart, direction_square, from_square  # noqa: E402
 from figures.studies.flow_training import FlowNetwork  # noqa: E402
-from full_geometry.models.storing import CENTRES, CHECKSUMS, ENDS, EVEN, TURNS, load, save  # noqa: E402
+from full_geometry.models.storing import CENTRES, CHECKSUMS, ENDS, EVEN, TURNS, save  # noqa: E402
 from full_geometry.object.features import PreparedExit, Side, Terms, n_pair, n_side  # noqa: E402
 from full_geometry.object.first_event import first_event  # noqa: E402
 from full_geometry.object.identity import identify  # noqa: E402
 from full_geometry.object.patches import LearntProposals, PatchTable, cluster, mesh_faces  # noqa: E402
+from halfspace_sss import rendering  # noqa: E402
 from halfspace_sss.rendering.object.points import SurfacePoint  # noqa: E402
+from halfspace_sss.rendering.scenes.scene_files import load_scene  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
 N_PATCHES = 24
@@ -41,6 +43,7 @@ N_PATCHES = 24
 @pytest.fixture(autouse=True)
 def variant() -> None:
     mi.set_variant("llvm_ad_rgb")
+    rendering.register()
 
 
 @pytest.fixture(scope="module")
@@ -215,16 +218,36 @@ def test_proposals_of_the_flow_and_of_patches_give_the_same_estimate(sampler: Fl
     assert max(errors) < 0.03 * means[0]
 
 
-def test_weights_with_a_flow_are_drawn_from_by_it(sampler: FlowSampler, tmp_path: Path) -> None:
+def test_a_scene_draws_by_a_flow(sampler: FlowSampler, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = load_scene(_wax_scene(sampler, tmp_path, monkeypatch), "full_geometry")
+    by_patches = np.array(mi.render(scene, spp=64, seed=1)).mean()
+    draw_by(scene, sampler.flow.weights)
+    (body,) = scene.integrator().prepare(scene)
+    assert isinstance(body.proposals, FlowProposals)
+    assert np.array(mi.render(scene, spp=64, seed=1)).mean() == pytest.approx(by_patches, rel=0.2)
+
+
+def _wax_scene(sampler: FlowSampler, folder: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """The bunny under a sky, with random weights of its own where renders find them."""
     subject, frame = sampler.chart.subject, sampler.frame
     rng, n = np.random.default_rng(6), 2 * (n_side(3) + 5) + n_pair(3)
-    arrays = {"W_0": rng.standard_normal((3, n)), "b_0": np.zeros(3), CENTRES: cluster(subject, frame, N_PATCHES)}
-    arrays |= {EVEN: np.ones((2, 3)), **random_layers(rng, "A", "a", [n_side(3), 5, 6])}
+    arrays = {
+        "W_0": 0.01 * rng.standard_normal((3, n)),
+        "b_0": np.zeros(3),
+        CENTRES: cluster(subject, frame, N_PATCHES),
+    }
+    arrays |= {EVEN: np.zeros((2, 3)), **random_layers(rng, "A", "a", [n_side(3), 5, 6])}
     arrays = {name: value.astype(np.float16) for name, value in {**arrays, **sampler.patches.weights}.items()}
     arrays |= {TURNS: frame.around.turns, ENDS: np.zeros((3, len(Terms.of(n_side(3)).rows)))}
-    path = save(tmp_path, identify(subject), arrays, {"recipe": {"start": "better_dipole"}, CHECKSUMS: []})
-    assert not load(path, subject).others
-    add_flow(path, sampler)
-    found = flow_of(load(path, subject))
-    told_, x = floats(told(512)), floats(uniform(512, 2, 23))
-    assert np.allclose(np.array(found.flow.density(told_, x)), np.array(sampler.flow.density(told_, x)), rtol=5e-2)
+    save(folder, identify(subject), arrays, {"recipe": {"start": "better_dipole"}, CHECKSUMS: []})
+    monkeypatch.setenv("HALFSPACE_SSS_WEIGHTS", str(folder))
+    box = subject.object.shape.bbox()
+    centre, radius = np.array(box.center()).ravel(), np.linalg.norm(np.array(box.extents()).ravel()) / 2
+    view = mi.ScalarTransform4f().look_at(list(centre + [0, 0, 4 * radius]), list(centre), [0, 1, 0])
+    film = {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}}
+    wax = {"type": "translucent", "sigma_s": "0.95,0.8,0.6", "sigma_a": "0.05,0.2,0.4", "g": 0.0, "eta": 1.4}
+    return {
+        "type": "scene", "light": {"type": "constant"}, "integrator": {"type": "bssrdf", "hide_emitters": True},
+        "sensor": {"type": "perspective", "fov": 28.0, "to_world": view, "film": film},
+        "bunny": {"type": "ply", "filename": str(BUNNY), "bsdf": {**wax, "model": "neural"}},
+    }  # fmt: skip
