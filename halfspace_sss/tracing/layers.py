@@ -24,7 +24,7 @@ from halfspace_sss.physics.phase import sample_hg
 from halfspace_sss.progress import Progress
 from halfspace_sss.tracing.passes import Estimate, checked_radii, estimate, walk_passes
 from halfspace_sss.tracing.tallies import BATCHES, CellSums, find_cell
-from halfspace_sss.tracing.walk import Boundary, generator, roulette, turn
+from halfspace_sss.tracing.walk import Boundary, generator, in_launches, roulette, turn
 
 __all__ = ["LAYER_ORDERS", "LayerTrace", "trace_layers"]
 
@@ -206,7 +206,7 @@ class _Constants:
         self.last = dr.opaque(types.UInt32, len(media) - 1)
 
 
-def _walk(types, layers: Layers, mu_in, paths_per_lane: int, seed, tallies, first: int = 0, *, diffuse: bool) -> tuple:
+def _walk(types, layers: Layers, mu_in, paths_per_lane: int, seed, tallies, *, diffuse: bool) -> tuple:
     """Trace walks one after another in each lane, as `walk.walk`; diffuse light begins with the weight T_12."""
     import drjit as dr
 
@@ -217,10 +217,10 @@ def _walk(types, layers: Layers, mu_in, paths_per_lane: int, seed, tallies, firs
     begin = 1 - F_r(mu_in, dr.gather(Float, m.eta_up, dr.zeros(UInt32, lanes))) if diffuse else Float(1)
     dr.eval(mu_in, sin_in, begin)
     last = dr.opaque(UInt32, paths_per_lane)
-    lane = dr.arange(UInt32, lanes) + dr.opaque(UInt32, first)
+    lane = dr.arange(UInt32, lanes)
     zero, count = dr.zeros(Float, lanes), dr.zeros(UInt32, lanes)
     state = {
-        "rng": generator(types, lanes, seed, first), "layer": count, "deepest": count,
+        "rng": generator(types, lanes, seed), "layer": count, "deepest": count,
         "x": zero, "y": zero, "z": zero, "dx": sin_in, "dy": zero, "dz": mu_in,
         "weight": zero + begin, "order": count, "step": count, "path": count, "events": count,
     }  # fmt: skip
@@ -228,8 +228,7 @@ def _walk(types, layers: Layers, mu_in, paths_per_lane: int, seed, tallies, firs
     def body(s: dict) -> tuple[dict]:
         return (_step(s, m, (sin_in, mu_in, begin), lane, tally),)
 
-    (s,) = dr.while_loop((state,), lambda s: s["path"] < last, body, mode="symbolic", label="layers")
-    dr.eval(s["events"])
+    (s,) = in_launches((state,), lambda s: s["path"] < last, body, "layers")
     return ((),), s["events"]
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from types import ModuleType
@@ -26,8 +25,6 @@ __all__ = [
 
 ORDERS = ("single", "multiple", "total")
 PATHS_PER_LANE, MAX_LANES = 64, 131072
-LAUNCH_SECONDS = 0.7  # of a kernel, in which Python hears no interrupt
-FIRST_LANES, FEWEST_LANES = 2048, 512  # of a launch
 
 
 class Estimate(NamedTuple):
@@ -129,34 +126,8 @@ def walk_passes(
     lanes, per_lane, passes = launch_shape(n_paths)
     for done in range(1, passes + 1):
         mu, recorded = _incidence(mu_i, lanes, np.random.default_rng([*seed, done])), tallies()
-        sums, n_events = _launches(types, medium, mu, per_lane, pass_seed(*seed, done), recorded, trace)
+        mu_in = types.Float(mu_internal(mu, medium.eta))
+        sums, events = trace(types, medium, mu_in, per_lane, pass_seed(*seed, done), recorded)
         if progress:
             progress(done, passes)
-        yield Pass(recorded, sums, F_t(mu, medium.eta), per_lane, n_events)
-
-
-def _launches(
-    types: ModuleType,
-    medium: Medium | Layers,
-    mu: np.ndarray,
-    per_lane: int,
-    seed: tuple[int, int],
-    tallies: list[Tally],
-    trace: Callable[..., tuple],
-) -> tuple[tuple, int]:
-    """Sums of the tallies by lane, and events, of a pass in launches of about `LAUNCH_SECONDS`.
-
-    A lane walks the same whatever launch it is in: the sums are those of one launch, to the last bit.
-    """
-    import drjit as dr
-
-    mu_in, parts, n_events, first, size = mu_internal(mu, medium.eta), [], 0, 0, FIRST_LANES
-    while first < len(mu):
-        started, lanes = time.perf_counter(), types.Float(np.ascontiguousarray(mu_in[first : first + size]))
-        sums, events = trace(types, medium, lanes, per_lane, seed, tallies, first=first)
-        parts.append(sums)
-        n_events += int(events.numpy().astype(np.int64).sum())
-        first += size
-        size = int(max(size * min(LAUNCH_SECONDS / (time.perf_counter() - started), 16), FEWEST_LANES))
-    whole = tuple(tuple(map(dr.concat, zip(*of_tally))) for of_tally in zip(*parts))
-    return whole, n_events
+        yield Pass(recorded, sums, F_t(mu, medium.eta), per_lane, int(events.numpy().astype(np.int64).sum()))

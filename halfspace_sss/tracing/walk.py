@@ -8,7 +8,8 @@ light enters at the origin and travels towards +x ("forward").
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any, Protocol
@@ -20,7 +21,8 @@ from halfspace_sss.physics.medium import Medium, check_ratios
 from halfspace_sss.physics.phase import sample_hg
 
 __all__ = [
-    "Boundary", "Scatter", "Tally", "WalkConstants", "generator", "pass_seed", "roulette", "turn", "walk",
+    "Boundary", "Scatter", "Tally", "WalkConstants", "generator", "in_launches", "pass_seed", "roulette", "turn",
+    "walk",
 ]  # fmt: skip
 
 # least variance x time over the media (albedo, g, eta) = (0.75, 0, 1.3), (0.99, 0, 1.5), (0.999, 0.9, 1.3)
@@ -32,6 +34,8 @@ ROULETTE_WEIGHT, ROULETTE_BOOST = 0.3, 3.0
 # with 1/2 from the start 1.7, -7.2; with sqrt(1/2) to the end 1.2, -2.6 in up to ten times the wall time.
 LONG_PATH, VERY_LONG_PATH = 4096, 2**18
 LONG_SURVIVAL, VERY_LONG_SURVIVAL = math.sqrt(0.5), 0.5
+LAUNCH_SECONDS = 0.7  # of a kernel, in which Python hears no interrupt
+FIRST_TURNS, FEWEST_TURNS = 64, 16  # of the loop in a launch
 
 
 @dataclass
@@ -131,7 +135,7 @@ def pass_seed(seed: int, *indices: int) -> tuple[int, int]:
     return int(state), int(stream >> np.uint64(1))
 
 
-def generator(types: ModuleType, lanes: int, seed: tuple[int, int], first: int = 0) -> Any:
+def generator(types: ModuleType, lanes: int, seed: tuple[int, int]) -> Any:
     """A generator whose lanes are independent: state and stream of each are hashed (SplitMix64).
 
     Lanes of PCG32 whose states and streams differ in a few low bits only are correlated: the variance of the mean of
@@ -140,18 +144,17 @@ def generator(types: ModuleType, lanes: int, seed: tuple[int, int], first: int =
     Args:
         types: a module of Dr.Jit array types, or Mitsuba.
         seed: from `pass_seed`.
-        first: number of the first lane.
     """
     import drjit as dr
 
     UInt64 = types.UInt64
-    lane = dr.arange(UInt64, lanes) + dr.opaque(UInt64, first)
+    lane = dr.arange(UInt64, lanes)
 
     def hashed(start: int) -> Any:
         z = dr.opaque(UInt64, start) + lane * UInt64(0x9E3779B97F4A7C15)
         z = (z ^ (z >> 30)) * UInt64(0xBF58476D1CE4E5B9)
         z = (z ^ (z >> 27)) * UInt64(0x94D049BB133111EB)
-        return (z ^ (z >> 31)) + dr.opaque(UInt64, first)  # PCG32 adds the place of a lane among these
+        return z ^ (z >> 31)
 
     return types.PCG32(lanes, *map(hashed, seed))
 
@@ -173,6 +176,37 @@ def turn(dx: Any, dy: Any, dz: Any, cosine: Any, azimuth: Any) -> tuple[Any, Any
     return nx * shrink, ny * shrink, nz * shrink
 
 
+def in_launches(state: tuple, going: Callable[..., Any], body: Callable[..., tuple], label: str) -> tuple:
+    """A symbolic loop in launches of about `LAUNCH_SECONDS`; lanes go on where they were, to the last bit.
+
+    Args:
+        state: of the loop, arrays or trees of them.
+        going: of the state, which lanes go on.
+        body: of the state, the next one.
+        label: of the kernel.
+    """
+    import drjit as dr
+
+    UInt32 = dr.uint32_array_t(type(going(*state)))
+
+    def launch(state: tuple, most: Any) -> tuple:
+        loop = (UInt32(0), *state)
+        loop = dr.while_loop(
+            loop, lambda k, *s: going(*s) & (k < most), lambda k, *s: (k + 1, *body(*s)), mode="symbolic", label=label
+        )
+        dr.eval(loop[1:])
+        return loop[1:]
+
+    dr.make_opaque(state)  # as they are in later launches: one kernel
+    turns = FIRST_TURNS
+    while True:
+        started = time.perf_counter()
+        state = launch(state, dr.opaque(UInt32, turns))
+        if not dr.any(going(*state)):
+            return state
+        turns = int(max(turns * min(LAUNCH_SECONDS / (time.perf_counter() - started), 16), FEWEST_TURNS))
+
+
 def walk(
     types: ModuleType,
     medium: Medium | WalkConstants,
@@ -181,7 +215,6 @@ def walk(
     seed: tuple[int, int],
     tallies: Sequence[Tally],
     weight: Any = 1.0,
-    first: int = 0,
 ) -> tuple[tuple, Any]:
     """Trace `paths_per_lane` walks one after another in each lane and return the tallies' sums and event counts.
 
@@ -197,7 +230,6 @@ def walk(
         tallies: what to record.
         weight: of a walk at its start, a number or one per lane. Above one it keeps roulette away for longer: with
             albedo^-n all walks get to order n.
-        first: number of the first lane, of which its random numbers depend.
 
     Returns:
         The sums of each tally, one entry per lane and summed over its walks, and scattering events per lane.
@@ -215,12 +247,12 @@ def walk(
     sin_in = dr.sqrt(dr.maximum((1 - mu_in) * (1 + mu_in), 0.0))
     dr.eval(mu_in, sin_in, constants.albedo, constants.g, constants.inverse_eta)
     last = dr.opaque(UInt32, paths_per_lane)
-    lane = dr.arange(UInt32, lanes) + dr.opaque(UInt32, first)
+    lane = dr.arange(UInt32, lanes)
     zero = dr.zeros(Float, lanes)
     count = dr.zeros(UInt32, lanes)
     begin = dr.opaque(Float, weight) if isinstance(weight, float) else weight
     state = {
-        "rng": generator(types, lanes, seed, first),
+        "rng": generator(types, lanes, seed),
         "x": zero, "y": zero, "z": zero, "dx": sin_in, "dy": zero, "dz": mu_in, "length": zero,
         "weight": zero + begin, "first": zero + 1, "order": count, "path": count, "events": count,
     }  # fmt: skip
@@ -229,8 +261,7 @@ def walk(
         return _step(s, sums, constants, (sin_in, mu_in, begin), lane, tallies)
 
     start = tuple(t.start(lanes) for t in tallies)
-    s, sums = dr.while_loop((state, start), lambda s, sums: s["path"] < last, body, mode="symbolic", label="walk")
-    dr.eval(sums, s["events"])
+    s, sums = in_launches((state, start), lambda s, sums: s["path"] < last, body, "walk")
     return sums, s["events"]
 
 

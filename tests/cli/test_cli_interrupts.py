@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from halfspace_sss.maps.store import load_maps
+
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="POSIX signals")
 
 START = """
@@ -143,6 +145,28 @@ sss.trace(medium, n_paths=10**8)"""
     _, messages = process.communicate(timeout=60)
     assert process.returncode == 130 and time.monotonic() - started < 4  # on cores with other work too
     assert messages == LINE
+
+
+def test_maps_of_a_slow_medium_end_within_two_seconds_and_keep_what_is_finished(tmp_path: Path) -> None:
+    body = """
+import halfspace_sss as sss
+from halfspace_sss.maps.grid import MapGrid
+from halfspace_sss.maps.store import make_maps
+media = {"quick": sss.Medium.from_albedo(0.1, 1.0, 0.0, 1.5), "slow": sss.Medium.from_albedo(0.9999, 1.0, 0.9, 1.5)}
+def told(done, total, what):
+    if done == 2:
+        print('ready', flush=True)
+make_maps(media, "maps", grid=MapGrid(2, 16, 6, 4), target_error=None, n_paths=2**21, progress=told)"""
+    process = _started(body, tmp_path)
+    time.sleep(4)  # into a kernel of long walks
+    started = time.monotonic()
+    process.send_signal(signal.SIGINT)
+    _, messages = process.communicate(timeout=60)
+    assert process.returncode == 130 and time.monotonic() - started < 4  # on cores with other work too
+    assert messages == LINE
+    assert (load_maps(tmp_path / "maps" / "quick.zarr")["n_paths"] >= 2**21).all()
+    with pytest.raises(ValueError, match="unfinished"):
+        load_maps(tmp_path / "maps" / "slow.zarr")
 
 
 def test_a_signal_to_terminate_ends_in_order_too(tmp_path: Path) -> None:

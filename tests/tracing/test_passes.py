@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from halfspace_sss import Medium
-from halfspace_sss.tracing import passes
+from halfspace_sss.tracing import walk
 from halfspace_sss.tracing.passes import MAX_LANES, PATHS_PER_LANE, estimate, launch_shape
 from halfspace_sss.tracing.tallies import BATCHES
 from halfspace_sss.tracing.tracer import trace
@@ -27,14 +27,14 @@ def test_an_estimate_is_the_mean_and_the_error_of_the_mean() -> None:
     np.testing.assert_allclose(columns.standard_error, np.sqrt([7 / 3, 16 / 3]))
 
 
-@pytest.mark.parametrize("lanes", [512, 700])
-def test_launches_of_other_sizes_trace_the_same_walks(lanes: int, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("turns", [1, 7])
+def test_launches_of_other_lengths_trace_the_same_walks(turns: int, monkeypatch: pytest.MonkeyPatch) -> None:
     medium = Medium.from_albedo(0.9, 1.0, 0.5, 1.4)
     how = {"mu_i": 0.7, "n_paths": 2**15, "seed": 3, "radii": [0.0, 1.0, 2.0], "directions": [(1.0, 0.0)]}
     whole = trace(medium, **how)
-    monkeypatch.setattr(passes, "FIRST_LANES", lanes)
-    monkeypatch.setattr(passes, "FEWEST_LANES", lanes)
-    monkeypatch.setattr(passes, "LAUNCH_SECONDS", 0.0)
+    monkeypatch.setattr(walk, "FIRST_TURNS", turns)
+    monkeypatch.setattr(walk, "FEWEST_TURNS", turns)
+    monkeypatch.setattr(walk, "LAUNCH_SECONDS", 0.0)
     parts = trace(medium, **how)
     np.testing.assert_array_equal(parts._lanes, whole._lanes)
     assert parts.exitance()[0].tolist() == whole.exitance()[0].tolist()
