@@ -2,23 +2,47 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from halfspace_sss.cli.shared import console
+from halfspace_sss.cli.shared import check_left_out, console
 
 __all__ = ["materials_command", "models_command"]
 
 
 def materials_command(
-    name: Annotated[str | None, typer.Argument(help="A material, to show everything about it.")] = None,
+    name: Annotated[str | None, typer.Argument(help="A material, to show all of it; or the word `import`.")] = None,
+    file: Annotated[Path | None, typer.Argument(help="To import: OpenPBR in .mtlx, or .glb and .gltf.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Material file to write.", show_default="FILE.toml, here")] = None,
+    mm_per_unit: Annotated[
+        float | None, typer.Option(help="Unit of FILE in mm.", show_default="1 in .mtlx, 1000 in glTF")
+    ] = None,
 ) -> None:
-    """List the materials with their coefficients by channel in 1/mm, or show one with the source of its numbers."""
+    """List materials with coefficients by channel in 1/mm, show one with its sources, or import those of a file."""
+    if name == "import":
+        _import(file, out, mm_per_unit)
+        return
+    beside = "unless the word import stands before"
+    check_left_out({"file": file, "out": out, "mm_per_unit": mm_per_unit}, beside)
     if name is None:
         _print_materials()
     else:
         _print_material(name)
+
+
+def _import(file: Path | None, out: Path | None, mm_per_unit: float | None) -> None:
+    from halfspace_sss.materials.imports import import_materials, to_toml
+    from halfspace_sss.provenance import write_atomically
+
+    if file is None:
+        raise ValueError("file must be given to import, got None")
+    found, out = import_materials(file, mm_per_unit), out or Path(f"{file.stem}.toml")
+    write_atomically(out, to_toml(found))
+    for material in found:
+        typer.echo(f"{material.name}: {material.medium}")
+    typer.echo(f"wrote {out}")
 
 
 def _print_materials() -> None:

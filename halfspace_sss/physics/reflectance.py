@@ -172,7 +172,7 @@ def albedo_of_reflectance(reflectance: np.ndarray, g: float, eta: float, mu_i: f
         value = albedo * np.exp(polynomial(found))
         change = (growth + albedo * slope(found)) * np.exp(polynomial(found))
         found = np.clip(found - (value - R) / np.minimum(change, -1e-12), 0, 1)
-    return _albedo(found, g)[0]
+    return np.minimum(_albedo(found, g)[0], 1.0)  # rounding gives 1 + 2e-16 too
 
 
 @functools.lru_cache(maxsize=64)

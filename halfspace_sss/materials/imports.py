@@ -1,0 +1,145 @@
+"""Materials from files of other standards: OpenPBR in MaterialX, volume scattering in glTF."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from halfspace_sss.backend import BackendError
+from halfspace_sss.checks import check_choice
+from halfspace_sss.materials.material import Material
+from halfspace_sss.physics.medium import Medium
+
+__all__ = ["import_materials", "to_toml"]
+
+CHANNELS = ("R", "G", "B")
+OPENPBR = {  # defaults of OpenPBR 1.1
+    "subsurface_weight": 0.0, "subsurface_color": (0.8, 0.8, 0.8), "subsurface_radius": 1.0,
+    "subsurface_radius_scale": (1.0, 0.5, 0.25), "subsurface_scatter_anisotropy": 0.0, "specular_ior": 1.5,
+    "specular_weight": 1.0,
+}  # fmt: skip
+TO_REC709 = {  # linear, by the name of a colour space in MaterialX
+    "": np.eye(3),
+    "lin_rec709": np.eye(3),
+    "acescg": np.array(  # AP1 with the white of ACES to Rec. 709 with D65, Bradford adaptation
+        [[1.70505, -0.62179, -0.08326], [-0.13026, 1.14080, -0.01055], [-0.02400, -0.12897, 1.15297]]
+    ),
+}
+
+
+def import_materials(path: str | os.PathLike, mm_per_unit: float | None = None) -> list[Material]:
+    """The materials of a MaterialX file (.mtlx) with OpenPBR surfaces, or of a glTF file (.glb, .gltf) that scatter.
+
+    Args:
+        path: the file; surfaces without subsurface scattering are left out.
+        mm_per_unit: length of a unit of the file, by default 1 mm in MaterialX and a metre in glTF.
+
+    Raises:
+        ValueError: the file cannot be read, holds no subsurface scattering, or has values that no medium has; file,
+            material and value are named.
+        BackendError: the package that reads the file is not installed.
+    """
+    path = Path(path)
+    readers = {".mtlx": (_of_materialx, 1.0), ".glb": (_of_gltf, 1000.0), ".gltf": (_of_gltf, 1000.0)}
+    check_choice("suffix of path", path.suffix.lower(), readers)
+    if mm_per_unit is not None and not 0 < mm_per_unit < math.inf:
+        raise ValueError(f"mm_per_unit must be finite and > 0, got {mm_per_unit!r}")
+    if not path.is_file():
+        raise ValueError(f"path must be a file, got {str(path)!r}")
+    reader, unit = readers[path.suffix.lower()]
+    found = list(reader(path, mm_per_unit or unit))
+    if not found:
+        raise ValueError(f"{path}: must hold a material with subsurface scattering, got none")
+    return found
+
+
+def _of_materialx(path: Path, unit: float) -> Iterator[Material]:
+    try:
+        import MaterialX as mx  # noqa: N813
+    except ImportError as error:
+        raise BackendError('.mtlx needs MaterialX: pip install "halfspace-sss[import]"') from error
+    document = mx.createDocument()
+    try:
+        mx.readFromXmlFile(document, str(path))
+    except mx.ExceptionParseError as error:
+        raise ValueError(f"{path}: must be a MaterialX document, got {error}") from error
+    names = {s.getNodeName(): m.getName() for m in document.getMaterialNodes() for s in m.getActiveInputs()}
+    for node in document.getNodes("open_pbr_surface"):
+        name = names.get(node.getName(), node.getName())
+        try:
+            values = {key: _value(node, key, default) for key, default in OPENPBR.items()}
+            if values.pop("subsurface_weight") > 0:
+                values["specular_ior"] = _modulated(values["specular_ior"], values.pop("specular_weight"))
+                medium = Medium.from_openpbr(**values, mm_per_unit=unit)
+                yield Material(name, medium, CHANNELS, set="OpenPBR", source=str(path))
+        except ValueError as error:
+            raise ValueError(f"{path}: material {name!r}: {error}") from error
+
+
+def _value(node: Any, key: str, default: Any) -> Any:
+    """The value of an input, colours in linear Rec. 709."""
+    found = node.getInput(key)
+    if found is None:
+        return default
+    if found.getNodeName() or found.getNodeGraphString():
+        raise ValueError(f"{key} must be a value, got a connection")
+    value = found.getValue()
+    if not hasattr(value, "asTuple"):
+        return value
+    space = found.getActiveColorSpace()
+    check_choice(f"colour space of {key}", space, TO_REC709)
+    return TO_REC709[space] @ np.array(value.asTuple())
+
+
+def _modulated(ior: float, weight: float) -> float:
+    """The index whose normal reflectance is `weight` times that of `ior`; OpenPBR 1.1, section dielectric base."""
+    amplitude = abs(ior - 1) / (ior + 1)
+    amplitude = math.copysign(min(math.sqrt(max(weight, 0.0)) * amplitude, 0.999), ior - 1)
+    return (1 + amplitude) / (1 - amplitude)
+
+
+def _of_gltf(path: Path, unit: float) -> Iterator[Material]:
+    try:
+        import pygltflib
+    except ImportError as error:
+        raise BackendError(f'{path.suffix} needs pygltflib: pip install "halfspace-sss[import]"') from error
+    try:
+        materials = pygltflib.GLTF2().load(str(path)).materials
+    except Exception as error:  # pygltflib raises what json, struct and dataclasses_json raise
+        raise ValueError(f"{path}: must be a glTF file, got {type(error).__name__}: {error}") from error
+    for k, material in enumerate(materials):
+        parts, name = material.extensions or {}, material.name or f"{path.stem} {k}"
+        scatter, volume = parts.get("KHR_materials_volume_scatter"), parts.get("KHR_materials_volume", {})
+        if scatter is None:
+            continue
+        color = scatter.get("multiscatterColor", scatter.get("multiscatterColorFactor", (0.0, 0.0, 0.0)))
+        distance = volume.get("attenuationDistance", math.inf) * unit / 1000
+        tint = volume.get("attenuationColor", (1.0, 1.0, 1.0))
+        ior = parts.get("KHR_materials_ior", {}).get("ior", 1.5)
+        try:
+            medium = Medium.from_gltf(color, distance, tint, scatter.get("scatterAnisotropy", 0.0), ior)
+            yield Material(name, medium, CHANNELS, set="glTF", source=str(path))
+        except ValueError as error:
+            raise ValueError(f"{path}: material {name!r}: {error}") from error
+
+
+def to_toml(materials: list[Material]) -> str:
+    """A material file, as the registry reads it, with the RGB materials of one import."""
+    first = materials[0]
+    lines = [f"set = {_quoted(first.set)}", 'unit = "1/mm"', f"source = {_quoted(first.source)}"]
+    lines.append('channels = ["R", "G", "B"]')
+    for material in materials:
+        m = material.medium
+        lines += ["", "[[material]]", f"name = {_quoted(material.name)}", f"eta = {m.eta!r}"]
+        lines += [f"{key} = {np.asarray(getattr(m, key)).tolist()!r}" for key in ("sigma_s", "sigma_a", "g")]
+    return "\n".join(lines) + "\n"
+
+
+def _quoted(text: str) -> str:
+    """A basic string of TOML."""
+    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
