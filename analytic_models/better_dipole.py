@@ -6,8 +6,8 @@ import math
 from typing import Any
 
 from analytic_models._diffusion import Boundary, Grosjean, safe_differences
+from halfspace_sss.interface.model import Separable
 from halfspace_sss.interface.query import Query
-from halfspace_sss.interface.separable import Separable
 from halfspace_sss.physics.medium import Medium
 
 __all__ = ["BetterDipole"]

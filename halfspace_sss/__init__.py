@@ -22,7 +22,7 @@ from __future__ import annotations
 import sys
 
 if getattr(sys, "argv", [""])[0].endswith(("halfspace-sss", "halfspace-sss.exe", "halfspace-sss-script.py")):
-    from halfspace_sss.first_moments import end_in_a_line  # the command line, before anything takes its time
+    from halfspace_sss.interrupts import end_in_a_line  # the command line, before anything takes its time
 
     end_in_a_line()
 

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from halfspace_sss.backend import prepare_llvm
-from halfspace_sss.once import once
+from halfspace_sss.lazy import once
 
 __all__ = ["broadcast_query", "library"]
 

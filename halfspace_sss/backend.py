@@ -10,7 +10,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from halfspace_sss.once import once
+from halfspace_sss.lazy import once
 
 __all__ = [
     "BACKENDS", "BackendError", "array_types", "busy_threads", "kernel_seconds", "prefer_bundled_llvm", "prepare_llvm",

@@ -1,13 +1,15 @@
-"""Public names of a package that are imported when they are first asked for, so that the package stays light."""
+"""What is imported or computed when it is first asked for, once, whoever asks and from however many threads."""
 
 from __future__ import annotations
 
+import functools
 import importlib
 import sys
+import threading
 from collections.abc import Callable, Mapping
 from typing import Any
 
-__all__ = ["lazy_names"]
+__all__ = ["lazy_names", "once"]
 
 
 def lazy_names(package: str, homes: Mapping[str, str]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
@@ -28,3 +30,18 @@ def lazy_names(package: str, homes: Mapping[str, str]) -> tuple[Callable[[str], 
         return sorted({*vars(sys.modules[package]), *homes})
 
     return get, names
+
+
+def once(f: Callable) -> Callable:
+    """`functools.cache` under a lock: threads that ask while f runs wait for its result and do not run it again.
+
+    Mitsuba makes the objects of a scene in parallel, each of which asks for materials and models.
+    """
+    cached, lock = functools.cache(f), threading.RLock()
+
+    @functools.wraps(f)
+    def answer(*args: Any) -> Any:
+        with lock:
+            return cached(*args)
+
+    return answer

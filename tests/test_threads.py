@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from halfspace_sss.once import once
+from halfspace_sss.lazy import once
 
 THREADS = 8
 OBJECTS = ["marble", "skin1", "apple", "ketchup", "skin2", "cream", "potato", "chicken1", "chicken2", "spectralon"]

@@ -41,9 +41,9 @@ from full_geometry.object.pairs import EntryProposals
 from full_geometry.object.subject import Subject, refract_in
 from full_geometry.object.walks import trace_exits
 from halfspace_sss.interface.model import BSSRDF, bssrdf
+from halfspace_sss.lazy import once
 from halfspace_sss.neural.perceptron import Perceptron
 from halfspace_sss.neural.store import checksum_of, load_weights
-from halfspace_sss.once import once
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.object.points import SurfacePoint, number
 from halfspace_sss.tracing.walk import generator, pass_seed

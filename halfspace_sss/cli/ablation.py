@@ -87,7 +87,7 @@ def ablation_command(
 
 def _medium(name: str | None, channel: str | None, given: dict[str, float | None]) -> tuple[str, Medium]:
     """A title and a scalar medium."""
-    from halfspace_sss.materials.channels import one_channel
+    from halfspace_sss.materials.registry import one_channel
 
     stated = stated_medium([name] if name else [], given)
     if stated is None:

@@ -2,7 +2,7 @@
 
 A command is a function with typer annotations in a file of this folder; it joins by one line in `_OWN`. Packages above
 add theirs by an entry point of the group `halfspace_sss.commands`, or of `halfspace_sss.studies` for comparisons that
-ship no product. How commands end is in `endings`.
+ship no product. How commands end is in `shared`.
 """
 
 from __future__ import annotations
@@ -48,8 +48,7 @@ def _app() -> Any:
     """The commands; made when they are needed, so that an interrupt is heard from the first moment on."""
     import typer
 
-    from halfspace_sss.cli.endings import Commands
-    from halfspace_sss.cli.shared import with_quiet
+    from halfspace_sss.cli.shared import Commands, with_quiet
     from halfspace_sss.cli.train import trainings
     from halfspace_sss.extensions import COMMANDS, STUDIES
 
@@ -128,7 +127,7 @@ def main() -> None:
 def _leave(end: BaseException) -> None:
     """End at once: Mitsuba's and Dr.Jit's own ends are not made for the middle of work."""
     if not interrupts.told:
-        from halfspace_sss.cli.endings import tell_interrupt
+        from halfspace_sss.cli.shared import tell_interrupt
 
         tell_interrupt(end)
     for stream in (sys.stdout, sys.stderr):

@@ -1,29 +1,199 @@
-"""What several commands share: reading numbers and media, a bar of progress, a console for tables, and --quiet."""
+"""What several commands share: numbers and media, progress on stderr, tables on stdout, --quiet, and how commands end.
+
+Errors become a line on stderr and an exit code: 0 done, 1 failed, 2 bad input, 130 interrupted (143 terminated).
+"""
 
 from __future__ import annotations
 
 import functools
 import inspect
 import math
+import shlex
 import signal
+import time
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 from halfspace_sss.backend import BackendError, prepare_llvm
 from halfspace_sss.cli.interrupts import interrupts
-from halfspace_sss.cli.progress import Bar, console, set_quiet, tell
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from halfspace_sss.physics.medium import Medium
 
 __all__ = [
-    "Albedo", "Backend", "Bar", "Channels", "Define", "Eta", "Materials", "MeanCosine", "ObjectId",
+    "Albedo", "Backend", "Bar", "Channels", "Commands", "Define", "Eta", "Materials", "MeanCosine", "ObjectId",
     "OutFolder", "SampleSeed", "SensorNumber", "SigmaT", "Variant", "by_channel", "check_channel", "check_left_out",
-    "console", "defined", "fig10_medium", "numbers", "stated_medium", "tell", "use_mitsuba", "whole", "with_quiet",
+    "console", "defined", "fig10_medium", "numbers", "set_quiet", "stated_medium", "tell", "tell_interrupt",
+    "use_mitsuba", "whole", "with_quiet",
 ]  # fmt: skip
+
+
+def _end(message: str, code: int) -> typer.Exit:
+    """The exit that ends the command, after one line on stderr."""
+    typer.echo(" ".join(message.split()), err=True)
+    return typer.Exit(code)
+
+
+def tell_interrupt(error: BaseException) -> typer.Exit:
+    """The exit after an interrupt, whatever the libraries made of it."""
+    interrupts.told = True
+    detail = str(error) if isinstance(error, KeyboardInterrupt) else ""
+    return _end(f"interrupted; {detail or 'files that were being written are whole or absent'}", interrupts.exit_code)
+
+
+def _show_warning(message: Any, *_: Any) -> None:
+    typer.echo(f"warning: {' '.join(str(message).split())}", err=True)
+
+
+STUDIES = ("ablation", "rivals", "shapes", "trade-check")  # which were commands of their own
+
+
+class Commands(TyperGroup):
+    """The commands; what the library refuses, and interrupts, end them in a line."""
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        if args[0] in STUDIES and self.get_command(ctx, args[0]) is None:
+            raise ValueError(f"{args[0]} must be asked for as a study: `halfspace-sss study {shlex.join(args)}`")
+        return super().resolve_command(ctx, args)
+
+    def invoke(self, ctx: Any) -> Any:
+        with interrupts, warnings.catch_warnings():
+            warnings.showwarning = _show_warning
+            try:
+                return self._refuse_in_a_line(ctx)
+            except BaseException as error:
+                if interrupts.received is None or getattr(error, "exit_code", None) == interrupts.exit_code:
+                    raise
+                raise tell_interrupt(error) from None
+
+    def _refuse_in_a_line(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt as error:
+            raise tell_interrupt(error) from None
+        except ValueError as error:
+            interrupts.check()
+            raise _end(f"error: {error}", 2) from error
+        except BrokenPipeError:
+            raise  # the reader, `head` for instance, has what it wanted: typer ends in silence
+        except (BackendError, OSError) as error:
+            interrupts.check()
+            raise _end(f"error: {error}", 1) from error
+
+
+TABLE_WIDTH = 132  # where the output is no terminal
+LINE_EVERY = 30.0  # seconds
+MEMORY = 3600.0  # seconds; steps may take minutes, and the time left is estimated from several of them
+_quiet = False
+
+
+def set_quiet(quiet: bool) -> None:
+    """Whether progress and results are left out."""
+    global _quiet
+    _quiet = quiet
+
+
+def console() -> Console:
+    """A console that does not fold lines at 80 columns where the output is a file."""
+    from rich.console import Console
+
+    found = Console(quiet=_quiet)
+    return found if found.is_terminal else Console(width=TABLE_WIDTH, quiet=_quiet)
+
+
+def tell(sentence: str) -> None:
+    """A sentence on stderr, before work starts."""
+    if not _quiet:
+        typer.echo(sentence, err=True)
+
+
+class Bar:
+    """Progress with the time left, on stderr; appears with the first step, so that refused input leaves no trace.
+
+    A bar in a terminal, elsewhere a line now and then.
+    """
+
+    def __init__(self, title: str) -> None:
+        self._title = title
+        self._shown: _Moving | _Lines | None = None
+        self._total = 0
+
+    def __enter__(self) -> Bar:
+        return self
+
+    def show(self, done: int, total: int, text: str = "") -> None:
+        """Move the bar; `text` says what was just done.
+
+        Raises:
+            KeyboardInterrupt: an interrupt came while nothing could hear it.
+        """
+        interrupts.check()
+        if _quiet:
+            return
+        if self._shown is None:
+            from rich.console import Console
+
+            screen = Console(stderr=True)
+            self._shown = _Moving(self._title, screen, done) if screen.is_terminal else _Lines(self._title)
+        self._total = total
+        self._shown.show(done, total, text)
+
+    def __exit__(self, kind: type | None, *_: object) -> None:
+        if self._shown is not None:
+            self._shown.stop(self._total if kind is None else None)
+
+
+class _Moving:
+    """A bar that moves."""
+
+    def __init__(self, title: str, screen: Console, done: int) -> None:
+        from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+        from rich.table import Column
+
+        steps = (TextColumn(title), BarColumn(30), TextColumn("{task.percentage:.0f} %"))
+        times = (TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn())
+        text = TextColumn("{task.fields[text]}", markup=False, table_column=Column(ratio=1, no_wrap=True))
+        self._progress = Progress(*steps, *times, text, console=screen, expand=True, speed_estimate_period=MEMORY)
+        self._progress.start()
+        self._task = self._progress.add_task("", completed=done, text="")
+
+    def show(self, done: int, total: int, text: str) -> None:
+        self._progress.update(self._task, completed=done, total=total, text=text)
+
+    def stop(self, total: int | None) -> None:
+        if total is not None:
+            self._progress.update(self._task, completed=total)
+        self._progress.stop()
+
+
+class _Lines:
+    """One line every half minute and one at the end."""
+
+    def __init__(self, title: str) -> None:
+        self._title = title
+        self._started = self._last = time.monotonic()
+        self._first: float | None = None
+
+    def show(self, done: int, total: int, text: str) -> None:
+        now, share = time.monotonic(), done / max(total, 1)
+        self._first = share if self._first is None else self._first
+        if now - self._last < LINE_EVERY:
+            return
+        self._last, passed = now, now - self._started
+        rate = (share - self._first) / passed
+        left = f", about {(1 - share) / rate:.0f} s left" if rate > 0 else ""
+        typer.echo(f"{self._title} {100 * share:.0f} % after {passed:.0f} s{left}  {text}".rstrip(), err=True)
+
+    def stop(self, total: int | None) -> None:
+        if total is not None:
+            typer.echo(f"{self._title} 100 % after {time.monotonic() - self._started:.0f} s", err=True)
 
 
 def whole(text: str | int) -> int:
@@ -93,7 +263,7 @@ def fig10_medium(**stated: float) -> Medium:
 
 def by_channel(names: list[str], channels: str) -> list[tuple[str, Medium]]:
     """A title and a scalar medium for each of the channels, as in "R,B", of each material."""
-    from halfspace_sss.materials.channels import one_channel
+    from halfspace_sss.materials.registry import one_channel
 
     return [one_channel(name, channel.strip()) for name in names for channel in channels.split(",")]
 

@@ -15,8 +15,7 @@ import typer
 
 from halfspace_sss.checks import check_count
 from halfspace_sss.cli.shared import Bar, console, whole
-from halfspace_sss.comparison.truths import MEASURES, Truth
-from halfspace_sss.comparison.validate import Z_LIMIT, Comparison, Validation, validate
+from halfspace_sss.comparison.truths import MEASURES, Z_LIMIT, Comparison, Truth, Validation, validate
 from halfspace_sss.provenance import check_folder, provenance, write_together
 
 __all__ = ["row_filter", "summary", "validate_command", "write_results"]

@@ -9,7 +9,7 @@ import numpy as np
 
 from halfspace_sss.comparison.model_errors import Reference, model_error, reference_maps
 from halfspace_sss.interface.model import bssrdf, models
-from halfspace_sss.maps.media import draw_media
+from halfspace_sss.maps.grid import draw_media
 from halfspace_sss.maps.noisy_maps import CellGrid
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.progress import NamedProgress

@@ -16,14 +16,13 @@ from halfspace_sss.comparison.model_truths import sampled_reflectance
 from halfspace_sss.interface.model import BSSRDF, bssrdf
 from halfspace_sss.interface.model import models as all_models
 from halfspace_sss.materials import Material
-from halfspace_sss.materials.channels import one_channel
+from halfspace_sss.materials.registry import one_channel
 from halfspace_sss.physics import single_scattering
 from halfspace_sss.physics.fresnel import mu_internal
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.progress import Progress
-from halfspace_sss.tracing.curve_tracing import Line, trace_curve
 from halfspace_sss.tracing.passes import launch_shape
-from halfspace_sss.tracing.tracer import trace
+from halfspace_sss.tracing.tracer import Line, trace, trace_curve
 
 __all__ = ["FIG10_THETA_I", "curves", "default_paths", "default_range"]
 

@@ -1,16 +1,31 @@
-"""The table of published, third-party and exact half-space numbers, and what of it a half-space tracer can answer."""
+"""Published, third-party and exact numbers of half-spaces, and the path tracer held against them by z-tests."""
 
 from __future__ import annotations
 
 import csv
 import math
 import re
+import time
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from halfspace_sss.physics.medium import Medium
+import numpy as np
 
-__all__ = ["MEASURES", "NotCovered", "Truth", "read_truths"]
+from halfspace_sss.backend import array_types
+from halfspace_sss.checks import check_cosine, check_count
+from halfspace_sss.physics.fresnel import F_r
+from halfspace_sss.physics.medium import Medium
+from halfspace_sss.progress import Progress
+from halfspace_sss.tracing.passes import Estimate, estimate, walk_passes
+from halfspace_sss.tracing.tracer import Trace, trace
+from halfspace_sss.tracing.walk import Boundary, Scatter
+
+__all__ = [
+    "MEASURES", "Z_LIMIT", "Comparison", "NotCovered", "Truth", "Validation", "read_truths", "trace_order",
+    "validate",
+]  # fmt: skip
+
 
 TABLE = Path(__file__).parent / "data" / "truths.csv"
 MEASURES = {
@@ -162,3 +177,235 @@ def _uncertainty(row: dict[str, str]) -> float:
     if unit not in ("", "rel") or not size >= 0:
         raise ValueError(f"uncertainty must be a number >= 0 or 'number rel', got {row['uncertainty']!r}")
     return size * abs(_number(row, "value")) if unit else size
+
+
+Z_LIMIT = 4.0
+PILOT, MOST_PATHS, RING_PATHS = 65536, 1_500_000_000, 64_000_000
+REFLECTANCE_ERROR, DIM_ERROR, OTHER_ERROR = 1e-3, 3e-3, 2e-3  # relative: albedo >= 0.5, below it, other quantities
+LEAST_CERTAIN = 0.2  # relative: beyond it a standard error rests on too few walks to be trusted
+SHARE = 0.3  # of the row's own uncertainty: a smaller error would not sharpen the test
+DIRECTION_COUNTS = (1, 2, 4, 8)  # kernels are compiled for these numbers of directions
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """One row: traced value with its standard error, and z = (traced - truth) / sqrt(error² + uncertainty²)."""
+
+    truth: Truth
+    traced: float
+    standard_error: float
+    n_paths: int
+    n_events: int
+    seed: int
+
+    @property
+    def reflected(self) -> float:
+        """The traced value without the surface reflection that R_total adds to it."""
+        truth = self.truth
+        return self.traced - (float(F_r(truth.mu_i, truth.medium.eta)) if truth.measure == "R_total" else 0.0)
+
+    @property
+    def z(self) -> float:
+        """Distance from the truth in units of the two errors together; inf if both are 0 and the values differ."""
+        distance = self.traced - self.truth.value
+        error = math.hypot(self.standard_error, self.truth.uncertainty)
+        if error == 0:
+            return 0.0 if distance == 0 else math.copysign(math.inf, distance)
+        return distance / error if math.isfinite(distance) else math.inf
+
+
+@dataclass(frozen=True)
+class Validation:
+    """What `validate` found: a comparison for each row covered, the rows not covered, and the wall time."""
+
+    comparisons: list[Comparison]
+    not_covered: list[NotCovered]
+    seed: int
+    quick: bool
+    seconds: float
+
+    @property
+    def failures(self) -> list[Comparison]:
+        """Rows with |z| of `Z_LIMIT` or more."""
+        return [c for c in self.comparisons if not abs(c.z) < Z_LIMIT]
+
+
+class OrderTally:
+    """Flux through the boundary after exactly `order` scattering events."""
+
+    def __init__(self, types: object, order: int) -> None:
+        self.types, self.order = types, order
+
+    def start(self, lanes: int) -> tuple:
+        import drjit as dr
+
+        return (dr.zeros(self.types.Float, lanes),)
+
+    def boundary(self, sums: tuple, event: Boundary) -> tuple:
+        import drjit as dr
+
+        return (sums[0] + dr.select(event.order == self.order, event.weight, 0.0),)
+
+    def scatter(self, sums: tuple, event: Scatter) -> tuple:
+        return sums
+
+
+def trace_order(
+    medium: Medium, mu_i: float | str, order: int, n_paths: int, seed: int = 0, backend: str = "llvm"
+) -> tuple[Estimate, int, int]:
+    """Trace the fraction of incident flux that leaves after exactly `order` scattering events.
+
+    Args:
+        medium: scalar medium.
+        mu_i: external cosine of incidence, [0, 1], or "diffuse".
+        order: number of scattering events, at least 1.
+        n_paths, seed, backend: as in `trace`.
+
+    Returns:
+        The estimate, the number of walks and the number of scattering events traced.
+
+    Raises:
+        ValueError: an argument is out of range.
+    """
+    check_count("order", order, 1)
+    check_count("n_paths", n_paths, 256)
+    if mu_i != "diffuse":
+        mu_i = check_cosine("mu_i", mu_i)
+    types = array_types(backend)
+    samples, events, paths = [], 0, 0
+    for done in walk_passes(types, medium, mu_i, n_paths, (seed, order), lambda: [OrderTally(types, order)]):
+        samples.append(done.lanes()[:, 0])
+        events, paths = events + done.n_events, paths + done.n_paths
+    return estimate(np.concatenate(samples)), paths, events
+
+
+def validate(
+    rows: Callable[[Truth], bool] | None = None,
+    seed: int = 0,
+    quick: bool = False,
+    *,
+    progress: Progress | None = None,
+) -> Validation:
+    """Trace every row of the packaged table of half-space numbers and compare.
+
+    Rows of the same medium and incidence share one run. Walks are added until the standard error is 0.1 % of a
+    reflectance for albedo >= 0.5; 0.3 % of it below, and 0.2 % of other quantities, or 0.3 times the row's own
+    uncertainty if that is more. Rings take what 64 million walks give. `quick` asks for errors ten times as large.
+
+    Args:
+        rows: which rows to take, all if None.
+        seed: each group of rows has its own seed, derived from this one.
+        quick: looser errors.
+        progress: called with (groups done, groups in all).
+
+    Raises:
+        ValueError: seed is negative, or no row is left.
+    """
+    check_count("seed", seed, 0)
+    truths, not_covered = read_truths()
+    if rows is not None:
+        truths = [t for t in truths if rows(t)]
+    if not truths:
+        raise ValueError("rows must leave at least one row that the tracer covers, got none")
+    started, comparisons = time.perf_counter(), {}
+    groups = _groups(truths)
+    for done, group in enumerate(groups, 1):
+        for comparison in _compare(group, _group_seed(seed, group[0]), 10.0 if quick else 1.0):
+            comparisons[comparison.truth.id] = comparison
+        if progress:
+            progress(done, len(groups))
+    ordered = [comparisons[t.id] for t in truths]
+    return Validation(ordered, not_covered, seed, quick, time.perf_counter() - started)
+
+
+def _groups(truths: Iterable[Truth]) -> list[list[Truth]]:
+    """Rows that one run answers: the same medium and incidence, order 2 apart."""
+    groups: dict[tuple, list[Truth]] = {}
+    for truth in truths:
+        groups.setdefault((truth.medium, truth.mu_i, truth.measure == "double"), []).append(truth)
+    return list(groups.values())
+
+
+def _group_seed(seed: int, first: Truth) -> int:
+    """A seed of its own for each group, the same whichever other rows are traced."""
+    return int(np.random.SeedSequence([seed, int(first.id[1:])]).generate_state(1)[0])
+
+
+def _compare(group: Sequence[Truth], seed: int, loosen: float) -> list[Comparison]:
+    """Trace a group until its errors are small enough, each attempt with walks of its own."""
+    n = int(PILOT / min(loosen, 4.0))
+    if any(t.ring for t in group):
+        n = max(n, int(RING_PATHS / loosen**2))
+    for attempt in range(6):
+        results = _run(group, n, seed + attempt)
+        excess = max(_excess(c, loosen) for c in results)
+        if excess <= 1 or n >= MOST_PATHS:
+            break
+        n = min(int(n * 1.3 * min(excess**2, 300.0)) + 1, MOST_PATHS)
+    return results
+
+
+def _run(group: Sequence[Truth], n_paths: int, seed: int) -> list[Comparison]:
+    medium, mu_i = group[0].medium, group[0].mu_i
+    if group[0].measure == "double":
+        (value, error), n, events = trace_order(medium, mu_i, 2, n_paths, seed)
+        return [Comparison(t, t.factor * value, t.factor * error, n, events, seed) for t in group]
+    directions = list(dict.fromkeys(t.direction for t in group if t.direction))
+    edges = sorted({r for t in group if t.ring for r in t.ring})
+    padded = directions + directions[:1] * (_padded(len(directions)) - len(directions))
+    result = trace(medium, mu_i, n_paths, seed, directions=padded or None, radii=edges or None)
+    comparisons = []
+    for truth in group:
+        value, error = _answer(truth, result, directions, edges)
+        comparisons.append(Comparison(truth, float(value), float(error), result.n_paths, result.n_events, seed))
+    return comparisons
+
+
+def _padded(count: int) -> int:
+    return next((n for n in DIRECTION_COUNTS if n >= count), count)
+
+
+def _answer(truth: Truth, result: Trace, directions: list, edges: list[float]) -> Estimate:
+    """The row's quantity from a run, with its standard error."""
+    medium, measure = truth.medium, truth.measure
+    if measure in ("BRDF", "ring"):
+        at = directions.index(truth.direction) if truth.direction else edges.index(truth.ring[0])
+        values, errors = result.angular_reflectance() if truth.direction else result.exitance()
+        value, error = values[at], errors[at]
+    elif measure == "R_total":
+        value, error = result.reflectance()
+        value += F_r(truth.mu_i, medium.eta)
+    elif measure == "H":
+        return _h_function(truth, result, directions)
+    else:
+        method = {"r2": "mean_r2", "x": "mean_x", "length": "mean_path_length"}.get(measure, "reflectance")
+        value, error = getattr(result, method)("single" if measure == "single" else "total")
+    return Estimate(truth.factor * value, truth.factor * error)
+
+
+def _h_function(truth: Truth, result: Trace, directions: list) -> Estimate:
+    """H(mu) from R = 1 - sqrt(1 - albedo) H(mu), for albedo 1 from BRDF(mu, mu) = H(mu)² / (8 pi mu)."""
+    if truth.medium.albedo < 1:
+        root = math.sqrt(1 - truth.medium.albedo)
+        R, error = result.reflectance()
+        return Estimate((1 - R) / root, error / root)
+    values, errors = result.angular_reflectance()
+    at = directions.index(truth.direction)
+    H = math.sqrt(8 * math.pi * truth.mu_i * values[at])
+    return Estimate(H, H * errors[at] / (2 * values[at]))
+
+
+def _excess(c: Comparison, loosen: float) -> float:
+    """Standard error over the one that is asked for."""
+    truth = c.truth
+    if truth.measure == "ring":
+        return 0.0
+    if truth.measure in ("R_d", "R_total"):
+        bright = truth.medium.albedo >= 0.5
+        wanted = loosen * (REFLECTANCE_ERROR if bright else DIM_ERROR) * abs(c.reflected)
+        wanted = wanted if bright else max(wanted, SHARE * truth.uncertainty)
+    else:
+        wanted = max(loosen * OTHER_ERROR * abs(c.traced), SHARE * truth.uncertainty)
+    if not c.reflected or not c.standard_error or not wanted:
+        return math.inf if truth.value else 0.0  # too few walks to see anything
+    return max(c.standard_error / wanted, c.standard_error / abs(c.reflected) / LEAST_CERTAIN)

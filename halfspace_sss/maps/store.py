@@ -1,10 +1,17 @@
-"""Training maps of half-spaces: made in units that can be killed, resumed and spread; stored as labelled Zarr."""
+"""Training maps of half-spaces: made in units that can be killed, resumed and spread; stored as labelled Zarr.
+
+Units, coordinates and attributes have checksums; chunks are checked by the sizes in their heads before Blosc, which
+trusts them, reads them.
+"""
 
 from __future__ import annotations
 
 import json
+import math
 import os
 import shutil
+import struct
+import zlib
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -14,8 +21,6 @@ import numpy as np
 
 from halfspace_sss.backend import array_types
 from halfspace_sss.checks import check_count, check_interval
-from halfspace_sss.maps.checksums import ASKED, check_written, unit_checksum, written_checksums
-from halfspace_sss.maps.chunks import check_chunks, drop_cut_off
 from halfspace_sss.maps.grid import MapGrid, cell_edges, map_directions
 from halfspace_sss.maps.map_tracing import MapUnit, UnitResult, trace_unit
 from halfspace_sss.physics.medium import Medium
@@ -25,7 +30,92 @@ from halfspace_sss.provenance import naming, provenance
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = ["load_maps", "make_maps"]
+__all__ = [
+    "ASKED", "check_chunks", "check_written", "drop_cut_off", "load_maps", "make_maps", "unit_checksum",
+    "written_checksums",
+]  # fmt: skip
+
+
+ASKED = "halfspace_sss_maps"  # the attribute with medium, grid and numbers of walks
+COORDINATES, ATTRIBUTE = "checksums_of_coordinates", "checksum_of_halfspace_sss_maps"
+
+
+def unit_checksum(S: np.ndarray, variance: np.ndarray) -> int:
+    """Of the data of a unit; never 0, which marks a unit not done."""
+    data = np.ascontiguousarray(S, np.float32).tobytes(), np.ascontiguousarray(variance, np.float32).tobytes()
+    return (1 << 32) | zlib.crc32(data[1], zlib.crc32(data[0]))
+
+
+def written_checksums(dataset: xr.Dataset) -> dict[str, str | int]:
+    """Attributes: of every coordinate, in float64, and of the attribute `ASKED`."""
+    coordinates = json.dumps(_coordinates(dataset), sort_keys=True)
+    return {COORDINATES: coordinates, ATTRIBUTE: zlib.crc32(dataset.attrs[ASKED].encode())}
+
+
+def check_written(dataset: xr.Dataset) -> None:
+    """ValueError names what is not as it was written; stores of before have no checksums, or fewer."""
+    if ATTRIBUTE in dataset.attrs and dataset.attrs[ATTRIBUTE] != zlib.crc32(dataset.attrs[ASKED].encode()):
+        raise ValueError(f"attribute {ASKED} does not match its checksum")
+    if COORDINATES not in dataset.attrs:
+        return
+    written, found = json.loads(dataset.attrs[COORDINATES]), _coordinates(dataset)
+    for name in sorted(written.keys() | found.keys()):
+        if written.get(name) != found.get(name):
+            raise ValueError(f"coordinate {name} does not match its checksum")
+
+
+def _coordinates(dataset: xr.Dataset) -> dict[str, int]:
+    return {str(name): zlib.crc32(np.asarray(c.values, "<f8").tobytes()) for name, c in dataset.coords.items()}
+
+
+HEAD = struct.Struct("<4B3I")  # versions, flags, size of a number; bytes, bytes of a block, compressed bytes
+
+
+def check_chunks(path: Path) -> None:
+    """ValueError if a chunk of a Zarr store that Blosc compressed has not the sizes that its head tells."""
+    for array in sorted(path.glob("*/.zarray")):
+        about = json.loads(array.read_text(encoding="utf-8"))
+        if (about.get("compressor") or {}).get("id") != "blosc":
+            continue
+        size = math.prod(about["chunks"]) * np.dtype(about["dtype"]).itemsize
+        for chunk in array.parent.iterdir():
+            if not chunk.name.startswith("."):
+                _check_chunk(chunk, size)
+
+
+def drop_cut_off(path: Path, units: set[tuple[int, int]]) -> None:
+    """Remove chunks of units, by (channel, direction), shorter than their heads tell: they then are missing."""
+    for array in sorted(path.glob("*/.zarray")):
+        about = json.loads(array.read_text(encoding="utf-8"))
+        if (about.get("compressor") or {}).get("id") != "blosc":
+            continue
+        for chunk in array.parent.iterdir():
+            place = chunk.name.split(".")
+            if len(place) < 2 or not all(part.isdecimal() for part in place[:2]):
+                continue
+            if about["chunks"][:2] == [1, 1] and (int(place[0]), int(place[1])) in units and _is_cut_off(chunk):
+                chunk.unlink()
+
+
+def _is_cut_off(chunk: Path) -> bool:
+    told, length = _told(chunk)
+    return length < max(told[2], HEAD.size)
+
+
+def _told(chunk: Path) -> tuple[tuple[int, int, int], int]:
+    """What the head of a chunk tells, 0 if there is none, and the length of the file."""
+    with chunk.open("rb") as file:
+        head = file.read(HEAD.size)
+    return HEAD.unpack(head)[4:] if len(head) == HEAD.size else (0, 0, 0), chunk.stat().st_size
+
+
+def _check_chunk(chunk: Path, size: int) -> None:
+    told, length = _told(chunk)
+    if told[0] != size or not 0 < told[1] <= size or told[2] != length:
+        raise ValueError(
+            f"chunk {chunk.parent.name}/{chunk.name} must be of {size} bytes, {length} compressed, got {told}"
+        )
+
 
 FORMAT = 1
 MOST_PATHS = 2**33

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from halfspace_sss.arrays import library
-from halfspace_sss.maps.media import RANGES
+from halfspace_sss.maps.grid import RANGES
 from halfspace_sss.neural.features import N_FEATURES, medium_features
 from halfspace_sss.neural.network import Network, layer_shapes
 from halfspace_sss.physics.backbone import length_scale

@@ -18,7 +18,7 @@ from halfspace_sss import materials
 from halfspace_sss.cli import app as cli
 from halfspace_sss.cli import errors as cli_errors
 from halfspace_sss.cli import interrupts as cli_interrupts
-from halfspace_sss.cli import progress as cli_progress
+from halfspace_sss.cli import shared
 from halfspace_sss.materials import Material
 from halfspace_sss.physics.medium import Medium
 
@@ -87,9 +87,9 @@ def test_quiet_still_says_what_is_wrong() -> None:
 def _progress(steps: list[tuple[float, int]], monkeypatch: Any, capsys: Any, error: bool = False) -> list[str]:
     """Lines on stderr of a bar that is moved at given seconds to given parts of 10."""
     now = [0.0]
-    monkeypatch.setattr(cli_progress.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(shared.time, "monotonic", lambda: now[0])
     try:
-        with cli_progress.Bar("work") as bar:
+        with shared.Bar("work") as bar:
             for now[0], done in steps:
                 bar.show(done, 10, f"step {done}")
             if error:
@@ -126,7 +126,7 @@ def test_progress_passes_every_part_of_the_work_and_ends_with_it(
     arguments: list[str], tmp_path: Path, monkeypatch: Any
 ) -> None:
     seen = []
-    monkeypatch.setattr(cli_progress.Bar, "show", lambda self, done, total, text="": seen.append((done / total, text)))
+    monkeypatch.setattr(shared.Bar, "show", lambda self, done, total, text="": seen.append((done / total, text)))
     assert _invoke(*arguments, "--out", str(tmp_path)).exit_code == 0
     shares = [share for share, _ in seen]
     assert shares == sorted(shares) and shares[-1] == 1

@@ -46,7 +46,7 @@ module.ablation, module.summary = stub, lambda table: table
 """
 HARNESS = """
 import os, signal, sys
-from halfspace_sss.cli import progress as cli_progress
+from halfspace_sss.cli import shared
 from halfspace_sss.cli import app as cli
 moment, stub = sys.argv[1:3]
 del sys.argv[1:3]
@@ -60,7 +60,7 @@ if moment == "start":
     made = cli._app()
     cli._app = before(lambda: made)
 elif moment == "progress":
-    cli_progress.Bar.show = before(cli_progress.Bar.show)
+    shared.Bar.show = before(shared.Bar.show)
 elif moment == "file":
     os.fsync, os.replace = before(os.fsync), before(os.replace)
 cli.main()

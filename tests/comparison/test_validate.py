@@ -12,8 +12,7 @@ from typer.testing import CliRunner
 from halfspace_sss import Medium, trace
 from halfspace_sss.cli.app import app
 from halfspace_sss.cli.validate import row_filter, summary
-from halfspace_sss.comparison.truths import read_truths
-from halfspace_sss.comparison.validate import Comparison, trace_order, validate
+from halfspace_sss.comparison.truths import Comparison, read_truths, trace_order, validate
 from halfspace_sss.physics import single_scattering
 
 HEADER = "id,kind,quantity,geometry,albedo,g,eta,mu_i,mu_o,phi_deg,other,value,uncertainty,source,note\n"

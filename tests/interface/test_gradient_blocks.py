@@ -12,7 +12,7 @@ import torch
 import halfspace_sss
 from halfspace_sss import Medium
 from halfspace_sss.arrays import library
-from halfspace_sss.interface import blocks
+from halfspace_sss.interface import model as interface
 
 MEDIUM = Medium(1.8075, 0.6025, 0.0, 1.3)
 RGB = Medium([1.0, 2.0, 0.5], [0.1, 0.01, 0.2], 0.3, 1.4)
@@ -24,7 +24,7 @@ def gradients(queries, monkeypatch):
     """`gradients(model, n_bytes)`: S and its derivatives by all arguments, and into how many blocks they were split."""
 
     def of(model, n_bytes: int) -> tuple:
-        monkeypatch.setattr(blocks, "BLOCK_BYTES", n_bytes)
+        monkeypatch.setattr(interface, "BLOCK_BYTES", n_bytes)
         shaped = [v.reshape(3, -1) for v in queries(N, model.medium)]
         args = [torch.from_numpy(v).requires_grad_() for v in shaped]
         S = model.eval(*args)
@@ -39,7 +39,7 @@ def test_values_and_derivatives_of_blocks_are_those_of_the_whole(name, gradients
     model = halfspace_sss.bssrdf(name, MEDIUM)
     S, derivatives, _ = gradients(model, 1 << 40)
     in_blocks, by_blocks, joined = gradients(model, 1)
-    assert len(joined.next_functions) == -(-N // blocks.PROBE)
+    assert len(joined.next_functions) == -(-N // interface.PROBE)
     assert torch.equal(S, in_blocks)
     for one, other in zip(derivatives, by_blocks):
         assert (one is None and other is None) or torch.equal(one, other)
@@ -64,14 +64,14 @@ def test_second_derivatives_go_through_blocks(monkeypatch):
     model = halfspace_sss.bssrdf("directional_dipole", MEDIUM)
     r, second = torch.linspace(0.1, 3, 400, dtype=torch.float64, requires_grad=True), []
     for n_bytes in (1 << 40, 1):
-        monkeypatch.setattr(blocks, "BLOCK_BYTES", n_bytes)
+        monkeypatch.setattr(interface, "BLOCK_BYTES", n_bytes)
         first = torch.autograd.grad(model.eval(r, 0.8, 0.2, 0.7, 0.4).sum(), r, create_graph=True)[0]
         second.append(torch.autograd.grad(first.sum(), r)[0])
     assert torch.equal(*second) and second[0].abs().min() > 0
 
 
 def test_transforms_of_functions_and_forward_derivatives_are_answered_at_once(monkeypatch):
-    monkeypatch.setattr(blocks, "BLOCK_BYTES", 1)
+    monkeypatch.setattr(interface, "BLOCK_BYTES", 1)
     model = halfspace_sss.bssrdf("directional_dipole", MEDIUM)
     r = torch.linspace(0.1, 3, 400, dtype=torch.float64, requires_grad=True)
 
@@ -87,10 +87,10 @@ def test_transforms_of_functions_and_forward_derivatives_are_answered_at_once(mo
 
 
 def test_what_depends_on_further_tensors_keeps_their_derivatives(monkeypatch):
-    monkeypatch.setattr(blocks, "BLOCK_BYTES", 1)
+    monkeypatch.setattr(interface, "BLOCK_BYTES", 1)
     strength = torch.tensor(2.0, requires_grad=True)
     r = torch.linspace(0.1, 3, 400, requires_grad=True)
-    value = blocks.recorded_in_blocks(library(r), lambda r: strength * r * r, (r,))
+    value = interface.recorded_in_blocks(library(r), lambda r: strength * r * r, (r,))
     value.sum().backward()
     assert strength.grad == pytest.approx(float((r.detach() ** 2).sum()), rel=1e-6)
 

@@ -9,9 +9,9 @@ import pytest
 
 import halfspace_sss
 from halfspace_sss import Medium, measure, trace
-from halfspace_sss.comparison.validate import trace_order
+from halfspace_sss.comparison.truths import trace_order
 from halfspace_sss.physics import single_scattering
-from halfspace_sss.tracing.curve_tracing import Line, trace_curve
+from halfspace_sss.tracing.tracer import Line, trace_curve
 
 MEDIUM = Medium(1.8075, 0.6025, 0.0, 1.3)
 LOSSLESS = Medium(2.0, 0.0, 0.0, 1.3)  # S falls as r⁻³ only

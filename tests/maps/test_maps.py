@@ -15,7 +15,7 @@ from halfspace_sss import Medium, make_maps, trace
 from halfspace_sss.maps.grid import MapGrid, cell_edges, map_directions, radial_scale
 from halfspace_sss.maps.map_tracing import MapUnit, trace_unit
 from halfspace_sss.maps.store import _template, load_maps
-from halfspace_sss.tracing.curve_tracing import Line, trace_curve
+from halfspace_sss.tracing.tracer import Line, trace_curve
 
 FIG10 = Medium.from_albedo(0.75, 1.0, 0.0, 1.3)
 FORWARD = Medium.from_albedo(0.99, 1.0, 0.8, 1.5)

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from halfspace_sss import Medium, bssrdf, trace
-from halfspace_sss.comparison.exits import exits
-from halfspace_sss.comparison.model_truths import sampled_reflectance
+from halfspace_sss.comparison.model_truths import exits, sampled_reflectance
 from halfspace_sss.comparison.truths import Truth, read_truths
 from halfspace_sss.neural.balance import N_TERMS, log_balance
 from halfspace_sss.neural.universal import load_hypernetwork, shipped_weights

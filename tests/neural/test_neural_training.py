@@ -17,7 +17,7 @@ import torch
 import halfspace_sss
 from halfspace_sss import Medium, materials
 from halfspace_sss.comparison.model_errors import Reference, model_error, reference_maps
-from halfspace_sss.maps.media import draw_media
+from halfspace_sss.maps.grid import draw_media
 from halfspace_sss.maps.noisy_maps import CellGrid, draw_directions, make_pool
 from halfspace_sss.neural.hypernetwork import Hypernetwork
 from halfspace_sss.neural.training.fit import Source, fit

@@ -9,8 +9,8 @@ import pytest
 from traced import MEDIA, check_spread, z
 
 from halfspace_sss import Medium, trace
-from halfspace_sss.tracing.curve_tracing import CurveTrace, Line, trace_curve
 from halfspace_sss.tracing.passes import Estimate
+from halfspace_sss.tracing.tracer import CurveTrace, Line, trace_curve
 
 
 def curve_of(medium, mu_i, mu_o, delta_phi, phi, edges, half_width, n_paths, seed) -> CurveTrace:

@@ -16,8 +16,8 @@ import numpy as np
 import torch
 from torch import nn
 
-from halfspace_sss.comparison.exits import exits
-from halfspace_sss.maps.media import draw_media
+from halfspace_sss.comparison.model_truths import exits
+from halfspace_sss.maps.grid import draw_media
 from halfspace_sss.maps.noisy_maps import load_maps
 from halfspace_sss.neural.balance import N_TERMS, chebyshev
 from halfspace_sss.neural.features import N_MEDIUM, medium_features

@@ -13,7 +13,7 @@ import numpy as np
 
 from halfspace_sss.backend import array_types
 from halfspace_sss.checks import check_count, check_interval
-from halfspace_sss.maps.media import RANGES, draw_media
+from halfspace_sss.maps.grid import RANGES, draw_media
 from halfspace_sss.maps.noisy_maps import CellGrid, draw_directions, looking_back, make_pool
 from halfspace_sss.neural.hypernetwork import named_layers
 from halfspace_sss.neural.store import save_weights

@@ -15,7 +15,7 @@ from typing import Any
 from halfspace_sss.extensions import TRANSPORTS, offered, warn_left_out
 from halfspace_sss.interface.model import models
 from halfspace_sss.interface.model_lists import check_allowed
-from halfspace_sss.once import once
+from halfspace_sss.lazy import once
 
 __all__ = ["AUTO", "choose_models", "knows_objects", "model_names", "object_transport"]
 

@@ -45,7 +45,7 @@ import numpy as np
 
 from halfspace_sss import materials
 from halfspace_sss.checks import check_choice
-from halfspace_sss.materials.channels import one_channel
+from halfspace_sss.materials.registry import one_channel
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.object.boundary import Reflection, boundary_of, check_eta
 from halfspace_sss.rendering.object.registry import model_names
