@@ -78,6 +78,7 @@ def test_given_coefficients_are_trained() -> None:
     assert _record(_weights()[0])["medium"] == {"albedo": pytest.approx(0.6), "g": 0.2, "eta": 1.1}
 
 
+@pytest.mark.slow
 def test_the_network_of_the_paper_is_trained_by_name() -> None:
     assert _invoke("train", "material", "--model", "neural_paper", "--steps", "2").exit_code == 0
     (path,) = _weights()

@@ -119,7 +119,10 @@ def test_work_that_fails_does_not_end_at_100_per_cent(monkeypatch: Any, capsys: 
 
 @pytest.mark.parametrize(
     "arguments",
-    [["errors", "--model", "better_dipole", "--events", "1e4"], ["bench", "--quick", "--only", "models,walk"]],
+    [
+        ["errors", "--model", "better_dipole", "--events", "1e4"],
+        pytest.param(["bench", "--quick", "--only", "models,walk"], marks=pytest.mark.slow),
+    ],
     ids=["errors", "bench"],
 )
 def test_progress_passes_every_part_of_the_work_and_ends_with_it(

@@ -81,15 +81,18 @@ def _of(parts: set[str], *figures: str) -> set[str]:
     return {part for part in parts if part.split(":")[0] in figures}
 
 
+@pytest.mark.slow
 def test_a_change_of_the_walk_changes_what_is_rendered_and_no_curve(changed: dict[str, set[str]]) -> None:
     assert "fig09: marble, path traced" in changed["walk"]
     assert not _of(changed["walk"], "fig10")
 
 
+@pytest.mark.slow
 def test_a_comment_changes_nothing(changed: dict[str, set[str]]) -> None:
     assert not changed["comment"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("edit", OF_MODELS)
 def test_a_change_of_what_is_found_by_name_changes_all_that_may_find_it(
     edit: str, changed: dict[str, set[str]]
@@ -101,6 +104,7 @@ def test_a_change_of_what_is_found_by_name_changes_all_that_may_find_it(
     assert rendered <= changed[edit]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("edit", OF_MODELS)
 def test_what_is_traced_without_models_outlives_a_change_of_one(edit: str, changed: dict[str, set[str]]) -> None:
     traced = {"fig09: marble, path traced", "thin: dragon, path traced", "fig11: marble, truth"}
@@ -109,6 +113,7 @@ def test_what_is_traced_without_models_outlives_a_change_of_one(edit: str, chang
     assert not traced & changed[edit]
 
 
+@pytest.mark.slow
 def test_curves_of_a_model_outlive_a_change_of_another(changed: dict[str, set[str]]) -> None:
     assert {"fig10: better_dipole"} == _of(changed["dipole"], "fig10")
     assert "fig10: better_dipole" in changed["dipoles"]
@@ -116,10 +121,12 @@ def test_curves_of_a_model_outlive_a_change_of_another(changed: dict[str, set[st
     assert not _of(changed["full geometry"] | changed["lambert"], "fig10")
 
 
+@pytest.mark.slow
 def test_what_draws_is_not_what_computes(changed: dict[str, set[str]]) -> None:
     assert not changed["drawing"] and not changed["figure"]
 
 
+@pytest.mark.slow
 def test_a_change_far_below_changes_everything(changed: dict[str, set[str]]) -> None:
     assert changed["far"] == changed["all"]
 

@@ -57,6 +57,7 @@ def _weights(folder: str = "weights") -> list[Path]:
     return sorted(Path(folder).glob("*"))
 
 
+@pytest.mark.slow
 def test_an_object_is_trained_measured_and_rendered(monkeypatch: Any) -> None:
     result = _invoke("train", "object", "--scene", "ball.xml", "--seconds", "2")
     assert result.exit_code == 0, result.output
@@ -79,6 +80,7 @@ def test_an_object_is_trained_measured_and_rendered(monkeypatch: Any) -> None:
     assert result.exit_code == 0 and Path("render/ball_full_geometry.exr").exists(), result.output
 
 
+@pytest.mark.slow
 def test_an_object_begins_with_the_network_of_all_shapes_and_is_rendered() -> None:
     result = _invoke("train", "object", "--scene", "ball.xml", "--start", "neural_shape")
     assert result.exit_code == 0, result.output
@@ -104,6 +106,7 @@ def test_as_many_exits_are_traced_as_are_asked_for(monkeypatch: Any) -> None:
     assert asked == [256, 1024]
 
 
+@pytest.mark.slow
 def test_all_models_that_take_an_object_are_measured_where_none_is_named(monkeypatch: Any) -> None:
     monkeypatch.setattr(model_errors, "reference", lambda *a: REFERENCE(a[0], 8, 64, *a[3:]))
     monkeypatch.setattr(command, "errors_of", functools.partial(command.errors_of, walks=64, samples=64))

@@ -143,6 +143,7 @@ def _stops(monkeypatch: Any, error: BaseException, owner: Any, name: str, when: 
 PHASES = {"learning": (training._ObjectTraining, "_chunk", 3), "rendering": (reference, "_pass", 3)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("phase", PHASES)
 def test_an_interrupted_render_goes_on_to_the_same_weights_and_image(phase: str, whole: Path, monkeypatch: Any) -> None:
     with monkeypatch.context() as patch:
@@ -162,6 +163,7 @@ def _same_image(whole: Path) -> None:
     assert np.allclose(found.mean, wanted.mean, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_disk_that_fills_up_while_learning_leaves_no_half_weights_and_work_to_go_on_from() -> None:
     sync = os.fsync
 
@@ -214,6 +216,7 @@ def test_a_black_scene_is_learnt_and_stays_black() -> None:
     assert result.exit_code == 0 and "every pixel is black" in result.stdout and _weights()
 
 
+@pytest.mark.slow
 def test_two_objects_are_learnt_one_after_the_other_and_copies_share_what_was_learnt(monkeypatch: Any) -> None:
     others = "".join(
         BALL.replace('id="ball"', f'id="{name}"').replace("<float", f'<point name="center" value="{x},0,0"/><float')
@@ -229,6 +232,7 @@ def test_two_objects_are_learnt_one_after_the_other_and_copies_share_what_was_le
     )
 
 
+@pytest.mark.slow
 def test_an_object_with_a_model_of_the_half_space_keeps_walks_out_of_the_image() -> None:
     other = BALL.replace('id="ball"', 'id="plane"').replace("full_geometry", "better_dipole")
     other = other.replace("<float", '<point name="center" value="3,0,0"/><float')
@@ -290,6 +294,7 @@ def test_the_combination_of_two_images_is_not_biased_and_has_less_variance_than_
     assert found.spp == 40 and found.passes == 10
 
 
+@pytest.mark.slow
 def test_the_library_function_renders_what_the_command_does(whole: Path) -> None:
     said: list[str] = []
     IMAGE.parent.mkdir()

@@ -108,10 +108,12 @@ def agree(objects: dict, trained: Trained) -> None:
     assert np.all(stated < 0.1) and np.all(np.hypot(*errors) < 0.02)
 
 
+@pytest.mark.slow
 def test_an_image_has_the_light_of_walks_within_the_stated_error(trained: Trained) -> None:
     agree({"bunny": bunny(bsdf=SURFACE)}, trained)
 
 
+@pytest.mark.slow
 def test_other_numbers_of_samples_need_no_new_kernel(trained: Trained) -> None:
     loaded = load_scene(scene({"bunny": bunny(bsdf=SURFACE)}, "full_geometry"), "full_geometry")
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
@@ -137,6 +139,7 @@ def test_a_coarse_ball_with_vertex_normals_has_the_light_of_walks(folder: Path, 
     )
 
 
+@pytest.mark.slow
 def test_the_half_space_misses_that_light_by_more(trained: Trained) -> None:
     objects = {"bunny": bunny(bsdf=SURFACE)}
     plane, walked = (halves(objects, model).mean(axis=0) for model in ("better_dipole", "path_traced"))
@@ -144,12 +147,14 @@ def test_the_half_space_misses_that_light_by_more(trained: Trained) -> None:
     assert np.all(np.abs(plane / walked - 1) > 2 * stated)
 
 
+@pytest.mark.slow
 def test_two_objects_of_one_mesh_are_both_known_moved_and_turned_inside_out(trained: Trained) -> None:
     shared = {"type": "ref", "id": "wax"}
     one, two = bunny(shift=-2.5, bsdf=shared), bunny(shift=2.5, turn=130.0, flip=True, bsdf=shared)
     agree({"wax": {**SURFACE, "id": "wax"}, "one": one, "two": two}, trained)
 
 
+@pytest.mark.slow
 def test_another_object_beside_it_keeps_its_own_model(trained: Trained) -> None:
     ball = {"type": "sphere", "center": [5, 0, 0], "radius": 1.0, "bsdf": {**SURFACE, "model": "better_dipole"}}
     loaded = load_scene(scene({"bunny": bunny(bsdf=SURFACE), "ball": ball}, "mixed"))
@@ -157,6 +162,7 @@ def test_another_object_beside_it_keeps_its_own_model(trained: Trained) -> None:
     assert kinds["bunny"] == "FullGeometry" and kinds["ball"] == "HalfSpaceTransport"
 
 
+@pytest.mark.slow
 def test_the_mirrored_object_is_another_one(trained: Trained) -> None:
     mirrored = {"bunny": bunny(mirror=True, bsdf=SURFACE)}
     with pytest.raises(ValueError, match="must be trained for full_geometry"):
@@ -197,6 +203,7 @@ def refused(objects: dict, message: str, folder: Path) -> None:
             load_scene(whole)
 
 
+@pytest.mark.slow
 def test_a_rough_boundary_is_refused(trained: Trained, folder: Path) -> None:
     rough = {"type": "roughdielectric", "alpha": 0.2, "int_ior": 1.4, "ext_ior": 1.0}
     refused({"bunny": bunny(bsdf={**SURFACE, "boundary": rough})}, "boundary of 'bunny' must be smooth", folder)
@@ -247,6 +254,7 @@ def test_pieces_that_are_wound_differently_are_refused() -> None:
         Subject.of(both, WAX)
 
 
+@pytest.mark.slow
 def test_weights_of_another_version_are_left_aside_by_name(trained: Trained, tmp_path: Path) -> None:
     for path in (trained.path, trained.path.with_suffix(".json")):
         (tmp_path / path.name).write_bytes(path.read_bytes())
@@ -256,6 +264,7 @@ def test_weights_of_another_version_are_left_aside_by_name(trained: Trained, tmp
         storing.find_weights(trained.model.subject, tmp_path)
 
 
+@pytest.mark.slow
 def test_a_scene_of_another_unit_is_another_object(trained: Trained) -> None:
     with pytest.raises(ValueError, match="size_in_mfp of the medium"):
         load_scene(scene({"bunny": bunny(bsdf=SURFACE)}, "full_geometry", mm_per_unit=1.1, train_seconds=0))
@@ -264,6 +273,7 @@ def test_a_scene_of_another_unit_is_another_object(trained: Trained) -> None:
 # ---- Directional albedo under uniform illumination: its error, its file, its images ----------------
 
 
+@pytest.mark.slow
 def test_orders_below_two_and_the_others_agree_with_walks(trained: Trained) -> None:
     subject, n = trained.model.subject, 2**19
     at = subject.random_points(generator(mi, n, pass_seed(3)))
@@ -277,6 +287,7 @@ def test_orders_below_two_and_the_others_agree_with_walks(trained: Trained) -> N
     assert np.all(more >= 0) and np.all(more <= P + 1e-5)
 
 
+@pytest.mark.slow
 def test_S_of_training_and_of_images_know_the_same_of_even_light(trained: Trained) -> None:
     subject, n = trained.model.subject, 4096
     run = training._ObjectTraining(subject, QUICK, 0, None, None)
@@ -308,6 +319,7 @@ MISSING = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("missing, what", MISSING)
 def test_weights_of_before_it_was_known_are_refused_by_name(
     trained: Trained, missing: str, what: str, tmp_path: Path
@@ -322,6 +334,7 @@ def test_weights_of_before_it_was_known_are_refused_by_name(
         storing.load(path, subject)
 
 
+@pytest.mark.slow
 def test_only_what_is_wrong_in_a_channel_is_left_to_other_estimates(trained: Trained) -> None:
     model, alpha = trained.model, trained.model.alpha
     truth = reference(model.subject, 128, 512, 5)
@@ -340,6 +353,7 @@ def test_only_what_is_wrong_in_a_channel_is_left_to_other_estimates(trained: Tra
     assert judged(1, 0).tolist() == [[1, 1, 1], [0, 1, 1]]
 
 
+@pytest.mark.slow
 def test_errors_of_images_of_an_even_sky_are_those_of_alpha_where_it_is_trusted_and_of_S_elsewhere(
     trained: Trained,
 ) -> None:
@@ -357,6 +371,7 @@ def test_errors_of_images_of_an_even_sky_are_those_of_alpha_where_it_is_trusted_
     assert all(abs(by_alpha[EVEN_SKY][c][0] - by_S[EVEN_SKY][c][0]) < 0.1 for c in (0, 2))
 
 
+@pytest.mark.slow
 def test_an_even_sky_has_the_same_light_and_a_fifth_of_the_variance(
     trained: Trained, monkeypatch: pytest.MonkeyPatch
 ) -> None:

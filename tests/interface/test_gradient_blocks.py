@@ -35,6 +35,7 @@ def gradients(queries, monkeypatch):
     return of
 
 
+@pytest.mark.slow
 def test_values_and_derivatives_of_blocks_are_those_of_the_whole(name, gradients):
     model = halfspace_sss.bssrdf(name, MEDIUM)
     S, derivatives, _ = gradients(model, 1 << 40)
@@ -52,6 +53,7 @@ def test_blocks_of_a_medium_with_channels_are_joined(gradients):
     assert all(torch.equal(one, other) for one, other in zip(derivatives[:3], by_blocks[:3]))
 
 
+@pytest.mark.slow
 def test_a_block_holds_as_many_queries_as_the_graph_of_the_model_allows(gradients):
     counts = {}
     for name in ("better_dipole", "forward_scattering_dipole"):
@@ -111,6 +113,7 @@ print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024)
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="ru_maxrss is in kB on Linux")
 @pytest.mark.parametrize(("model", "n"), [("forward_scattering_dipole", 12_000), ("photon_beam_diffusion", 100_000)])
 def test_derivatives_take_bounded_memory(model, n):

@@ -39,6 +39,7 @@ def _with_single(R: float, t: Truth) -> float:
     return R + float(single_scattering.reflectance(t.medium, t.mu_i)) + mirrored
 
 
+@pytest.mark.slow
 def test_every_reflectance_of_the_table_is_met_within_1_5_percent() -> None:
     models, known, off = {}, {}, {}
     for t in _bright(("R_d", "R_total")):
@@ -79,6 +80,7 @@ def test_radial_profiles_of_the_table_are_met() -> None:
     assert len(off) > 60 and np.median(off) < 0.01 and np.quantile(off, 0.9) < 0.03
 
 
+@pytest.mark.slow
 def test_radial_profiles_of_walks_are_met_also_where_the_boundary_is_matched() -> None:
     off = []
     for albedo, g, mu_i, eta in [(*ratios, eta) for ratios in TRACED for eta in (1.0, 1.4)]:

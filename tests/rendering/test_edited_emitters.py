@@ -66,8 +66,11 @@ def _image(scene: mi.Scene) -> np.ndarray:
     return np.array(mi.render(scene, spp=64, seed=1))
 
 
+DAILY = [kind if kind == "constant" else pytest.param(kind, marks=pytest.mark.slow) for kind in EMITTERS]
+
+
 @pytest.mark.parametrize("integrator", ["translucent_walk", "bssrdf"])
-@pytest.mark.parametrize("kind", EMITTERS)
+@pytest.mark.parametrize("kind", DAILY)
 def test_an_edited_emitter_is_that_of_a_fresh_scene(kind: str, integrator: str) -> None:
     before, after = (mi.load_dict(_scene(integrator, {"lamp": EMITTERS[kind](b)})) for b in (False, True))
     first, wanted = _image(before), _image(after)

@@ -139,8 +139,7 @@ def _agree(found: np.ndarray, wanted: np.ndarray, known_to: float = LARGEST_ERRO
     assert (error < known_to * mean).all()
 
 
-ALIKE = ("spot", "projector")  # sampled as a point light is
-DAILY = [pytest.param(kind, marks=pytest.mark.slow) if kind in ALIKE else kind for kind in EMITTERS]
+DAILY = [kind if kind == "constant" else pytest.param(kind, marks=pytest.mark.slow) for kind in EMITTERS]
 
 
 @pytest.mark.parametrize("kind", DAILY)
@@ -150,7 +149,7 @@ def test_walks_find_the_light_of_every_emitter(kind: str) -> None:
     _agree(_means(scene, 2**11, 1), _reference(kind, "total"))
 
 
-@pytest.mark.parametrize("kind", EMITTERS)
+@pytest.mark.parametrize("kind", DAILY)
 def test_the_single_order_beside_models_is_that_of_walks_for_every_emitter(kind: str) -> None:
     scene = _scene({"type": "bssrdf"}, EMITTERS[kind]()[0], orders="single", model="better_dipole")
     _agree(_means(scene, 2**13, 1), _reference(kind, "single"))

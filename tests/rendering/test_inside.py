@@ -191,6 +191,7 @@ def test_all_light_of_a_point_light_in_a_medium_without_absorption_leaves_it(kin
     _agree(found, np.tile(scattered * np.array([3.0, 2.0, 1.0]), (RUNS, 1)))
 
 
+@pytest.mark.slow
 def test_a_stone_is_lit_by_a_point_light_beside_it() -> None:
     """In a medium without a boundary, whose reflections `volpathmis` does not follow to the point.
 
@@ -201,6 +202,7 @@ def test_a_stone_is_lit_by_a_point_light_beside_it() -> None:
     _agree(_means(mi.load_dict(scene), 4096, 1), _means(_theirs(scene, {}), 8192, 1001), 0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["coloured stone", "second medium"])
 def test_lamps_outside_are_found_by_chance_and_for_empty_objects_beside_by_connections(kind: str) -> None:
     inside, holders = INSIDE[kind]()

@@ -106,6 +106,7 @@ def test_passes_of_any_size_count_by_their_samples(tmp_path: Path) -> None:
     assert (found.passes, found.spp) == (4, 10)
 
 
+@pytest.mark.slow
 def test_the_error_of_passes_that_grow_is_the_error(tmp_path: Path) -> None:
     """Over seeds and pixels, the squared distance from a long run is the variance that is told, to 15 %."""
     truth = reference.render(_scene(), tmp_path / "long.exr", spp=8192, seed=99).mean

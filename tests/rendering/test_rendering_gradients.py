@@ -30,6 +30,7 @@ from differentiated import (  # noqa: E402
 pytestmark = pytest.mark.usefixtures("quiet_rgb")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("parameter", ["albedo", "sigma_t", "g"])
 def test_derivatives_by_the_medium_agree_with_finite_differences_for_every_model(name, parameter):
     if name in UNTRAINED and parameter != "sigma_t":
@@ -40,7 +41,7 @@ def test_derivatives_by_the_medium_agree_with_finite_differences_for_every_model
     assert backward(scene, f"ball.bsdf.{parameter}").sum() == pytest.approx(expected, abs=2e-3 * size)
 
 
-@pytest.mark.parametrize("light", [*LIGHTS, "envmap"])
+@pytest.mark.parametrize("light", [*LIGHTS, pytest.param("envmap", marks=pytest.mark.slow)])
 def test_derivatives_by_each_channel_agree_with_finite_differences_under_every_light(light):
     scene = make(envmap() if light == "envmap" else light)
     for parameter in ("albedo", "sigma_t", "g"):

@@ -46,7 +46,11 @@ def largest_kernel(scene, spp: int = 1) -> str:
         return max(dr.kernel_history([dr.KernelType.JIT]), key=lambda kernel: kernel["operation_count"])["hash"]
 
 
-@pytest.mark.parametrize("model", [*halfspace_sss.models(), "neural_shape", "path_traced"])
+OTHERS = [*halfspace_sss.models(), "neural_shape", "path_traced"]
+DAILY = [model if model == "better_dipole" else pytest.param(model, marks=pytest.mark.slow) for model in OTHERS]
+
+
+@pytest.mark.parametrize("model", DAILY)
 def test_a_kernel_serves_other_materials_and_units(model):
     """Of another index, too; walks have a kernel of their own where light is scattered evenly, as in all of these."""
     kernels = set()
@@ -56,6 +60,7 @@ def test_a_kernel_serves_other_materials_and_units(model):
     assert len(kernels) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", ["neural", "neural_shape", "path_traced"])
 def test_a_kernel_serves_other_numbers_of_samples(model):
     scene = loaded("potato", model)

@@ -89,10 +89,10 @@ def test_a_medium_without_absorption_is_invisible_in_uniform_light() -> None:
     ("surface", "shape", "uniform"),
     [
         ({"material": "marble"}, None, True),
-        ({**COLOURED, "g": 0.7, "eta": 1.3}, None, False),
+        pytest.param({**COLOURED, "g": 0.7, "eta": 1.3}, None, False, marks=pytest.mark.slow),
         ({**COLOURED, "g": -0.5, "eta": 1.0}, "cube", False),
         ({"sigma_s": 0.05, "sigma_a": "0.01,0.01,0.05", "g": 0.9, "eta": 1.5}, "cube", False),
-        ({**COLOURED, "g": 0.3, "eta": 1.5, "b": "rough"}, None, False),
+        pytest.param({**COLOURED, "g": 0.3, "eta": 1.5, "b": "rough"}, None, False, marks=pytest.mark.slow),
     ],
     ids=["marble", "forward", "matched cube", "thin cube", "rough"],
 )
@@ -142,6 +142,7 @@ def test_a_large_ball_far_from_the_origin_shows_the_reflectance_of_the_half_spac
         assert error < 0.012 * expected.value
 
 
+@pytest.mark.slow
 def test_light_that_joins_bring_does_not_depend_on_the_origin_of_the_scene() -> None:
     sun = {"type": "directional", "direction": [0.5, 0.3, -0.8], "irradiance": 3.0}
     near, far = (
@@ -167,6 +168,7 @@ def _small_lamp() -> dict:
             "bsdf": {"type": "diffuse", "reflectance": 0.0}}  # fmt: skip
 
 
+@pytest.mark.slow
 def test_connections_bring_the_light_that_chance_brings_with_less_noise() -> None:
     surface = {"sigma_s": 0.5, "sigma_a": 0.02, "eta": 1.5, "reflection": False, "orders": "multiple"}
     joined, left_to_chance = (
@@ -177,6 +179,7 @@ def test_connections_bring_the_light_that_chance_brings_with_less_noise() -> Non
     assert 64 * np.median(joined.var(axis=0)) < 0.05 * 1024 * left_to_chance.var(axis=0).mean()
 
 
+@pytest.mark.slow
 def test_a_point_light_is_seen_as_a_small_lamp_of_the_same_power() -> None:
     surface = {"sigma_s": 0.5, "sigma_a": 0.02, "eta": 1.0, "orders": "multiple"}
     place, radius = [20.0, 30.0, 40.0], 0.5

@@ -167,6 +167,7 @@ def test_an_unknown_way_is_refused_with_the_nearest() -> None:
         assess(scene(), models=["nural"], **QUICK)
 
 
+@pytest.mark.slow
 def test_auto_is_chosen_of_all_models_once_kept_and_found_again(tmp_path: Path) -> None:
     names = []
     for _ in range(2):
