@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from halfspace_sss import Medium, trace
+from halfspace_sss.backend import BackendError
 from halfspace_sss.cli.app import app
 from halfspace_sss.materials.files import read
 from halfspace_sss.materials.imports import import_materials
@@ -190,6 +192,14 @@ def test_files_of_other_kinds_and_broken_ones_are_refused(tmp_path: Path) -> Non
     broken.write_text("{")
     with pytest.raises(ValueError, match="broken.gltf: must be a glTF file"):
         import_materials(broken)
+
+
+@pytest.mark.parametrize(("suffix", "module"), [(".mtlx", "MaterialX"), (".glb", "pygltflib")])
+def test_a_missing_package_is_named_with_its_extra(suffix: str, module: str, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, module, None)
+    (tmp_path / f"wax{suffix}").write_bytes(b"")
+    with pytest.raises(BackendError, match=rf'{suffix} needs {module}: pip install "halfspace-sss\[import\]"'):
+        import_materials(tmp_path / f"wax{suffix}")
 
 
 def test_the_command_writes_a_material_file_that_the_registry_reads(tmp_path: Path) -> None:

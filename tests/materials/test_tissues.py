@@ -63,6 +63,16 @@ def test_skin_gets_darker_from_type_to_type_most_in_the_blue() -> None:
     assert R[0, 2] > 0.4 and R[5, 2] < 0.2
 
 
+@pytest.mark.parametrize("kind", ["I", "II"])
+def test_melanin_of_light_skin_absorbs_at_694_nm_as_was_measured(kind: str) -> None:
+    """300 to 1200 / m (to one digit) in the epidermis of Caucasian and Asian skin.
+
+    Source: Skin pigmentation characterized by visible reflectance measurements, UC Irvine.
+    """
+    found = tissue(1.0, 0.0, 1.0, melanosomes=MELANOSOMES[kind], wavelengths=[694.0, 700.0]).sigma_a[0]
+    assert 0.29 < found < 1.2
+
+
 def test_skin_without_melanosomes_would_be_its_dermis() -> None:
     """A thin epidermis of nearly the same medium changes little: the layers meet the exact half-space."""
     kind = skin("I", thickness=1e-6)
