@@ -223,8 +223,9 @@ def skin(kind: str, *, blood: float = 0.002, oxygenation: float = 0.75, thicknes
 
     Scattering of epidermis (6.67 / mm, f 0.29, b 0.689) and dermis (4.36 / mm, f 0.41, b 0.562): Salomatina et al. 2006
     in table 1 of Jacques 2013; g: van Gemert et al. 1989; blood of the dermis (0.2 %) and baseline: Jacques 1998.
-    Melanosomes of the epidermis: ends and middles of the ranges of Jacques 1998, spread over the types. At 694 nm types I
-    and II absorb the 0.3 to 1.2 / mm that was measured in light skin; V and VI have 4 and 10 / mm, where 2.5 was measured.
+    Melanosomes of the epidermis: ends and middles of the ranges of Jacques 1998, spread over the types. At 694 nm types
+    I and II absorb the 0.3 to 1.2 / mm that was measured in light skin; V and VI have 4 and 10 / mm, while 2.5 was
+    measured in dark skin.
 
     Args:
         kind: "I" to "VI".
