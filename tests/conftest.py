@@ -67,15 +67,30 @@ def truths() -> list[dict[str, str]]:
     return list(csv.DictReader(line for line in text.splitlines() if not line.startswith("#")))
 
 
-@pytest.fixture
-def quiet_rgb():
-    """Our plugins under the variant llvm_ad_rgb of Mitsuba, without warnings."""
+def _set_variant(name: str) -> None:
     import mitsuba as mi
 
     from halfspace_sss import rendering
 
-    mi.set_variant("llvm_ad_rgb")
+    mi.set_variant(name)
     rendering.register()
+
+
+@pytest.fixture
+def rgb() -> None:
+    """Our plugins under the variant llvm_ad_rgb of Mitsuba."""
+    _set_variant("llvm_ad_rgb")
+
+
+@pytest.fixture
+def mono() -> None:
+    """Our plugins under the variant llvm_ad_mono of Mitsuba."""
+    _set_variant("llvm_ad_mono")
+
+
+@pytest.fixture
+def quiet_rgb(rgb: None):
+    """As `rgb`, without warnings."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         yield

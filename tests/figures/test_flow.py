@@ -32,18 +32,13 @@ from full_geometry.object.features import PreparedExit, Side, Terms, n_pair, n_s
 from full_geometry.object.first_event import first_event  # noqa: E402
 from full_geometry.object.identity import identify  # noqa: E402
 from full_geometry.object.patches import LearntProposals, PatchTable, cluster, mesh_faces  # noqa: E402
-from halfspace_sss import rendering  # noqa: E402
 from halfspace_sss.rendering.object.points import SurfacePoint  # noqa: E402
 from halfspace_sss.rendering.scenes.scene_files import load_scene  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
+pytestmark = pytest.mark.usefixtures("rgb")
+
 N_PATCHES = 24
-
-
-@pytest.fixture(autouse=True)
-def variant() -> None:
-    mi.set_variant("llvm_ad_rgb")
-    rendering.register()
 
 
 @pytest.fixture(scope="module")

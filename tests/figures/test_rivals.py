@@ -37,12 +37,9 @@ from halfspace_sss.cli import app as cli  # noqa: E402
 from halfspace_sss.rendering.object.points import EntrySample, SurfacePoint  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
+pytestmark = pytest.mark.usefixtures("rgb")
+
 N_PATCHES = 24
-
-
-@pytest.fixture(autouse=True)
-def variant() -> None:
-    mi.set_variant("llvm_ad_rgb")
 
 
 @pytest.fixture(scope="module")

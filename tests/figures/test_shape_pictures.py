@@ -13,14 +13,9 @@ pytest.importorskip("igl")
 
 from figures.studies import shape_pictures as pictures  # noqa: E402
 from figures.studies.shape_errors import Row  # noqa: E402
-from halfspace_sss import rendering  # noqa: E402
 from halfspace_sss.cli import app as cli  # noqa: E402
 
-
-@pytest.fixture(autouse=True)
-def variant() -> None:
-    mi.set_variant("llvm_ad_mono")
-    rendering.register()
+pytestmark = pytest.mark.usefixtures("mono")
 
 
 def row(error: float) -> Row:

@@ -19,13 +19,10 @@ from full_geometry.object.subject import Subject, refract_in  # noqa: E402
 from full_geometry.object.walks import trace_exits  # noqa: E402
 from halfspace_sss.rendering.object.points import SurfacePoint  # noqa: E402
 
+pytestmark = pytest.mark.usefixtures("rgb")
+
 N = 2**16
 COLOURS = Medium(np.array([0.99, 0.75, 0.3]), np.array([0.01, 0.25, 0.7]), np.array([0.0, 0.3, 0.0]), 1.4)
-
-
-@pytest.fixture(autouse=True)
-def variant() -> None:
-    mi.set_variant("llvm_ad_rgb")
 
 
 def ball(medium: Medium, radius: float) -> Subject:

@@ -25,6 +25,8 @@ from full_geometry.object.subject import Subject  # noqa: E402
 from full_geometry.object.walks import trace_exits  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
+pytestmark = pytest.mark.usefixtures("rgb")
+
 N = 2**16
 BUNNY = Path(__file__).parents[2] / "figures" / "assets" / "bunny.ply"
 SHAPES = {"ball": {"type": "sphere", "radius": 3.0}, "bunny": {"type": "ply", "filename": str(BUNNY)}}
@@ -32,11 +34,6 @@ MEDIA = {
     "dark": Medium(np.array([0.9, 0.2, 0.1]), np.array([0.1, 1.8, 3.9]), 0.0, 1.3),
     "forward": Medium(np.array([0.99, 0.9, 0.6]), np.array([0.01, 0.1, 0.4]), 0.8, 1.0),
 }
-
-
-@pytest.fixture(autouse=True)
-def variant() -> None:
-    mi.set_variant("llvm_ad_rgb")
 
 
 def source_of(shape: str, medium: str) -> PairSource:

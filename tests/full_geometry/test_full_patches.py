@@ -29,12 +29,9 @@ from full_geometry.object.subject import Subject, cosine_direction, surface_poin
 from halfspace_sss.rendering.object.points import SurfacePoint  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
+pytestmark = pytest.mark.usefixtures("rgb")
+
 N_PATCHES = 64
-
-
-@pytest.fixture(autouse=True)
-def variant() -> None:
-    mi.set_variant("llvm_ad_rgb")
 
 
 @pytest.fixture(scope="module")

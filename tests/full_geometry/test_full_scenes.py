@@ -36,18 +36,14 @@ from halfspace_sss.neural.store import load_weights, save_weights  # noqa: E402
 from halfspace_sss.rendering.scenes.scene_files import load_objects, load_scene  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
+pytestmark = pytest.mark.usefixtures("rgb")
+
 BUNNY = Path(__file__).parents[2] / "figures" / "assets" / "bunny.ply"
 QUICK = Recipe(width=32, depth=2, batch=1024, chunk=2**15, reuse=4)
 CHUNKS, PASSES = 16, 6
 COLOURS = {"sigma_s": "0.95,0.8,0.6", "sigma_a": "0.05,0.2,0.4", "eta": 1.4}
 WAX = Medium(np.array([0.95, 0.8, 0.6]), np.array([0.05, 0.2, 0.4]), 0.0, 1.4)
 SURFACE = {"type": "translucent", **COLOURS, "model": "full_geometry", "orders": "multiple", "reflection": False}
-
-
-@pytest.fixture(autouse=True)
-def variant() -> None:
-    mi.set_variant("llvm_ad_rgb")
-    rendering.register()
 
 
 @pytest.fixture(scope="module")

@@ -24,7 +24,7 @@ from full_geometry.object.pairs import EntryProposals  # noqa: E402
 from full_geometry.object.radiance import reference  # noqa: E402
 from full_geometry.object.subject import Subject  # noqa: E402
 from full_geometry.scene import learnt_model  # noqa: E402
-from halfspace_sss import Medium, rendering  # noqa: E402
+from halfspace_sss import Medium  # noqa: E402
 from halfspace_sss.neural import trained as known_weights  # noqa: E402
 from halfspace_sss.neural.store import load_weights, save_weights  # noqa: E402
 from halfspace_sss.rendering.object.points import SurfacePoint  # noqa: E402
@@ -32,14 +32,10 @@ from halfspace_sss.rendering.object.settings import Settings  # noqa: E402
 from halfspace_sss.rendering.object.translucent import Inside  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
+pytestmark = pytest.mark.usefixtures("mono")
+
 QUICK, CHUNKS = Recipe(width=24, depth=2, batch=1024, chunk=2**13, reuse=2), 4
 SHAPE = shapes.KIND
-
-
-@pytest.fixture(autouse=True)
-def variant() -> None:
-    mi.set_variant("llvm_ad_mono")
-    rendering.register()
 
 
 def subject(radius: float = 3.0) -> Subject:

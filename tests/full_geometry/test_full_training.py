@@ -36,13 +36,10 @@ from halfspace_sss.neural.store import load_weights, save_weights  # noqa: E402
 from halfspace_sss.rendering.object.points import SurfacePoint  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
+pytestmark = pytest.mark.usefixtures("rgb")
+
 QUICK, CHUNKS = Recipe(width=24, depth=2, batch=1024, chunk=2**14, reuse=4), 12
 WAX = Medium([0.95, 0.8, 0.6], [0.05, 0.2, 0.4], 0.0, 1.4)
-
-
-@pytest.fixture(autouse=True)
-def variant() -> None:
-    mi.set_variant("llvm_ad_rgb")
 
 
 def bunny(scale: float = 1.0, turn: float = 0.0, shift: float = 0.0) -> dict:

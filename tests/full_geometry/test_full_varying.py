@@ -29,18 +29,14 @@ from halfspace_sss.rendering.object.points import SurfacePoint  # noqa: E402
 from halfspace_sss.rendering.scenes.scene_files import load_objects, load_scene  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
+pytestmark = pytest.mark.usefixtures("rgb")
+
 BUNNY = Path(__file__).parents[2] / "figures" / "assets" / "bunny.ply"
 QUICK = Recipe(width=32, depth=2, batch=1024, chunk=2**15, reuse=4)
 CHUNKS, PASSES = 8, 6
 RNG = np.random.default_rng(3)
 DENSITY = 8.0 ** -RNG.random((4, 4, 4, 1))
 ALBEDO = 0.9 + 0.095 * RNG.random((4, 4, 4, 3))
-
-
-@pytest.fixture(autouse=True)
-def variant() -> None:
-    mi.set_variant("llvm_ad_rgb")
-    rendering.register()
 
 
 @pytest.fixture(scope="module")

@@ -24,12 +24,9 @@ from full_geometry.models.neural_shape import (  # noqa: E402
 from full_geometry.object.subject import Subject  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
+pytestmark = pytest.mark.usefixtures("mono")
+
 WAX = Medium(0.95, 0.05, 0.0, 1.3)
-
-
-@pytest.fixture(autouse=True)
-def variant() -> None:
-    mi.set_variant("llvm_ad_mono")
 
 
 def ball(radius: float, medium: Medium = WAX) -> Subject:

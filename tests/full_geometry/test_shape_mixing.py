@@ -25,16 +25,13 @@ from full_geometry.object.subject import Subject, cosine_direction  # noqa: E402
 from halfspace_sss.rendering.object.points import SurfacePoint  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
-
-@pytest.fixture(autouse=True)
-def variant() -> None:
-    mi.set_variant("llvm_ad_mono")
+pytestmark = pytest.mark.usefixtures("mono")
 
 
 class Alone:
     """S_0 P_o P_i alone, f = 0."""
 
-    orders = "multiple"
+    orders, alpha = "multiple", None
 
     def __init__(self, subject: Subject, S_0: HalfSpace) -> None:
         self.subject, self.S_0 = subject, S_0

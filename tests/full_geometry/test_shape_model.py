@@ -30,13 +30,10 @@ from full_geometry.object.subject import Subject, cosine_direction  # noqa: E402
 from halfspace_sss.rendering.object.points import SurfacePoint  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
+pytestmark = pytest.mark.usefixtures("mono")
+
 WAX = Medium(0.95, 0.05, 0.3, 1.4)
 N = 512
-
-
-@pytest.fixture(autouse=True)
-def variant() -> None:
-    mi.set_variant("llvm_ad_mono")
 
 
 def random_weights(seed: int = 0, width: int = 16) -> dict[str, np.ndarray]:

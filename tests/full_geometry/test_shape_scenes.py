@@ -15,10 +15,11 @@ dr = pytest.importorskip("drjit")
 mi = pytest.importorskip("mitsuba")
 
 from full_geometry.learning import model_errors  # noqa: E402
-from halfspace_sss import rendering  # noqa: E402
 from halfspace_sss.cli import app as cli  # noqa: E402
 from halfspace_sss.rendering.object.registry import knows_objects, model_names  # noqa: E402
 from halfspace_sss.rendering.scenes.scene_files import load_scene  # noqa: E402
+
+pytestmark = pytest.mark.usefixtures("rgb")
 
 REFERENCE = model_errors.reference
 SURFACE = {"type": "translucent", "sigma_s": 0.95, "sigma_a": 0.05, "g": 0.0, "eta": 1.3, "model": "neural_shape"}
@@ -37,12 +38,6 @@ XML = """<scene version="3.0.0">
     </shape>
 </scene>
 """
-
-
-@pytest.fixture(autouse=True)
-def variant() -> None:
-    mi.set_variant("llvm_ad_rgb")
-    rendering.register()
 
 
 def scene(ball: dict | None = None, **surface: object) -> dict:

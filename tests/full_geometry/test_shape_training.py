@@ -30,13 +30,10 @@ from full_geometry.learning.shapes import TRAINING, make_shape  # noqa: E402
 from full_geometry.models.neural_shape import ALBEDO, ETA, SIZE, WEIGHTS, G, load, shipped_weights  # noqa: E402
 from halfspace_sss.cli import app as cli  # noqa: E402
 
+pytestmark = pytest.mark.usefixtures("mono")
+
 QUICK = ShapeRecipe(width=16, depth=2, objects=4, pairs=64)
 PLAN = (4, 12)
-
-
-@pytest.fixture(autouse=True)
-def variant() -> None:
-    mi.set_variant("llvm_ad_mono")
 
 
 @pytest.mark.parametrize("family", [*TRAINING, *HELD_OUT])

@@ -7,15 +7,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-import halfspace_sss.rendering as rendering
+pytestmark = pytest.mark.usefixtures("rgb")
 
 mi = pytest.importorskip("mitsuba")
-
-
-@pytest.fixture(autouse=True)
-def variant() -> None:
-    mi.set_variant("llvm_ad_rgb")
-    rendering.register()
 
 
 def _looking(origin: list) -> mi.ScalarTransform4f:

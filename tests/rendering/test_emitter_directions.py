@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from rendered import direction
 
-import halfspace_sss.rendering as rendering
 from halfspace_sss.physics.fresnel import F_t
 from halfspace_sss.physics.phase import eval_hg
 
@@ -20,18 +19,14 @@ from halfspace_sss.rendering.walk.media import WalkMedia  # noqa: E402
 from halfspace_sss.rendering.walk.random_walk import Event  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
+pytestmark = pytest.mark.usefixtures("rgb")
+
 WIDEST_Z = 4.4  # two-sided 1e-5
 LANES, GRID = 2**17, 1200
 ETA, G, DEPTH = 1.4, 0.7, 0.8
 SIGMA_T = np.array([0.7, 1.0, 1.5])
 ALONG = direction(25.0, 0.8)  # of arrival at the event
 LAMPS = [(np.array([1.6, 0.2, 2.5]), 0.9, 5.0), (np.array([-0.7, 1.5, 2.2]), 0.8, 8.0)]  # centre, radius, radiance
-
-
-@pytest.fixture(autouse=True)
-def variant() -> None:
-    mi.set_variant("llvm_ad_rgb")
-    rendering.register()
 
 
 def directions() -> EmitterDirections:

@@ -15,8 +15,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import halfspace_sss.rendering as rendering
-
 mi = pytest.importorskip("mitsuba")
 
 import drjit as dr  # noqa: E402
@@ -24,18 +22,14 @@ import drjit as dr  # noqa: E402
 from halfspace_sss.rendering.light.small_emitters import SmallEmitters  # noqa: E402
 from halfspace_sss.trade import recommend  # noqa: E402
 
+pytestmark = pytest.mark.usefixtures("rgb")
+
 BUNNY = Path(__file__).parents[2] / "figures" / "assets" / "bunny.ply"
 WIDEST_Z = 4.0
 LARGEST_ERROR = 0.02  # of the mean of an image: what a comparison could still miss
 RUNS, PIXELS = 24, 6
 PLACE, RADIANS = np.array([1.5, 3.0, 2.5]), 0.15
 FAR = 300.0
-
-
-@pytest.fixture(autouse=True)
-def variant() -> None:
-    mi.set_variant("llvm_ad_rgb")
-    rendering.register()
 
 
 def _looking(origin: np.ndarray) -> mi.ScalarTransform4f:

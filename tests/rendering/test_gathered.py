@@ -8,18 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from halfspace_sss import rendering
+pytestmark = pytest.mark.usefixtures("rgb")
 
 mi = pytest.importorskip("mitsuba")
 
 MODELS = ("better_dipole", "neural")
 MEDIUM = {"sigma_s": "1,1.5,2", "sigma_a": ".02,.1,.3", "g": 0.3, "eta": 1.4}
-
-
-@pytest.fixture(autouse=True)
-def variant() -> None:
-    mi.set_variant("llvm_ad_rgb")
-    rendering.register()
 
 
 def _lights(name: str) -> dict:

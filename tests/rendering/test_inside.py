@@ -11,23 +11,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-import halfspace_sss.rendering as rendering
-
 mi = pytest.importorskip("mitsuba")
 
 from halfspace_sss.physics.fresnel import F_r  # noqa: E402
 from halfspace_sss.rendering.scenes.mitsuba_scene import medium, with_media  # noqa: E402
 
+pytestmark = pytest.mark.usefixtures("rgb")
+
 WIDEST_Z = 4.0
 LARGEST_ERROR = 0.015  # of the mean of an image: what a comparison could still miss
 RUNS, PIXELS, UNIT = 16, 6, 3.0
 MEDIUM = {"sigma_s": "1,1.5,2", "sigma_a": ".02,.1,.3", "g": 0.3, "eta": 1.4}
-
-
-@pytest.fixture(autouse=True)
-def variant() -> None:
-    mi.set_variant("llvm_ad_rgb")
-    rendering.register()
 
 
 def _wax(**more: Any) -> dict:

@@ -11,23 +11,18 @@ import numpy as np
 import pytest
 from test_translucent_walk import COLOURED, _agree, _lamp, _runs, _scene, _small_lamp, _z
 
-import halfspace_sss.rendering as rendering
 from halfspace_sss.rendering.object import body as bodies
 from halfspace_sss.rendering.object.points import ObjectModel
 from halfspace_sss.rendering.paths import low_orders
 from halfspace_sss.rendering.walk import media as walks
+
+pytestmark = pytest.mark.usefixtures("rgb")
 
 mi = pytest.importorskip("mitsuba")
 
 BUNNY = Path(__file__).parents[2] / "figures" / "assets" / "bunny.ply"
 BRIGHT = {"sigma_s": "0.19,0.1,0.05", "sigma_a": "0.01,0.002,0.001", "g": 0.3, "eta": 1.3}
 DARK = {"sigma_s": "0.02,0.05,0.1", "sigma_a": "0.2,0.1,0.02", "g": -0.2, "eta": 1.5}
-
-
-@pytest.fixture(autouse=True)
-def variant() -> None:
-    mi.set_variant("llvm_ad_rgb")
-    rendering.register()
 
 
 @pytest.fixture

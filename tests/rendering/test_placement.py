@@ -17,15 +17,9 @@ mi = pytest.importorskip("mitsuba")
 from halfspace_sss.rendering.object.placement import contents  # noqa: E402
 from halfspace_sss.rendering.object.shape import survey  # noqa: E402
 
+pytestmark = pytest.mark.usefixtures("rgb")
+
 INTEGRATORS = ("bssrdf", "translucent_walk")
-
-
-@pytest.fixture(autouse=True)
-def variant() -> None:
-    from halfspace_sss import rendering
-
-    mi.set_variant("llvm_ad_rgb")
-    rendering.register()
 
 
 def view(integrator: str, **objects: dict) -> dict:

@@ -8,18 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import halfspace_sss.rendering as rendering
-
 mi = pytest.importorskip("mitsuba")
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "docs"))
 
 import recover_medium as example  # noqa: E402
 
-
-@pytest.fixture(autouse=True)
-def variant() -> None:
-    mi.set_variant("llvm_ad_rgb")
-    rendering.register()
+pytestmark = pytest.mark.usefixtures("rgb")
 
 
 def test_albedo_and_mean_free_path_are_found_from_four_images() -> None:

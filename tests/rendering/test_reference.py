@@ -13,16 +13,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import halfspace_sss.rendering as rendering
 from halfspace_sss.rendering.scenes import reference
 
+pytestmark = pytest.mark.usefixtures("rgb")
+
 mi = pytest.importorskip("mitsuba")
-
-
-@pytest.fixture(autouse=True)
-def variant() -> None:
-    mi.set_variant("llvm_ad_rgb")
-    rendering.register()
 
 
 def _scene(radius: float = 1.0) -> dict:

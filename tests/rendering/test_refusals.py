@@ -5,17 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-import halfspace_sss.rendering as rendering
+pytestmark = pytest.mark.usefixtures("rgb")
 
 mi = pytest.importorskip("mitsuba")
 
 XML = '<scene version="3.0.0"><integrator type="{}"><float name="{}" value="{}"/></integrator></scene>'
-
-
-@pytest.fixture(autouse=True)
-def variant() -> None:
-    mi.set_variant("llvm_ad_rgb")
-    rendering.register()
 
 
 def _bitmap() -> dict:

@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 
 import halfspace_sss
-import halfspace_sss.rendering as rendering
 from halfspace_sss.neural import universal
 from halfspace_sss.neural.store import load_weights, save_weights
 from halfspace_sss.neural.universal import shipped_weights
 from halfspace_sss.rendering.scenes.identity import learnt, scene_hash
 from halfspace_sss.rendering.scenes.scene_files import load_scene
+
+pytestmark = pytest.mark.usefixtures("rgb")
 
 mi = pytest.importorskip("mitsuba")
 
@@ -44,12 +45,6 @@ rendering.register()
 scene = load_scene(sys.argv[1])
 print(scene_hash(scene, scene.integrator()))
 """
-
-
-@pytest.fixture(autouse=True)
-def variant() -> None:
-    mi.set_variant("llvm_ad_rgb")
-    rendering.register()
 
 
 def _hash(text: str, folder: Path) -> str:

@@ -14,21 +14,16 @@ mi = pytest.importorskip("mitsuba")
 
 from rendered import surface  # noqa: E402
 
-from halfspace_sss import rendering  # noqa: E402
 from halfspace_sss.rendering.object import body as bodies  # noqa: E402
 from halfspace_sss.rendering.object.half_space import half_space_model  # noqa: E402
 from halfspace_sss.rendering.object.points import ObjectModel  # noqa: E402
 from halfspace_sss.rendering.paths.lighting import Lights, Sky  # noqa: E402
 
+pytestmark = pytest.mark.usefixtures("rgb")
+
 R, SIGMA_S, SIGMA_A = 0.5, 1.2, 0.3
 MEDIUM = {"sigma_s": SIGMA_S, "sigma_a": SIGMA_A, "g": 0.0, "eta": 1.0}
 KNOTS = 256
-
-
-@pytest.fixture(autouse=True)
-def variant() -> None:
-    mi.set_variant("llvm_ad_rgb")
-    rendering.register()
 
 
 def once_of_ball(mu: np.ndarray) -> np.ndarray:

@@ -10,7 +10,6 @@ import pytest
 from rendered import direction, sun
 from scipy.special import exp1
 
-import halfspace_sss.rendering as rendering
 from halfspace_sss.physics.fresnel import F_r, mu_internal
 from halfspace_sss.physics.phase import eval_hg
 
@@ -24,17 +23,13 @@ from halfspace_sss.rendering.walk.media import WalkMedia  # noqa: E402
 from halfspace_sss.rendering.walk.random_walk import Event  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
+pytestmark = pytest.mark.usefixtures("rgb")
+
 WIDEST_Z = 4.4  # two-sided 1e-5
 LANES = 2**18
 HEIGHT = 50.0  # of the slab, whose top is z = 0
 SIGMA_T, ALBEDO = np.array([0.7, 1.0, 1.5]), np.array([0.9, 0.5, 0.2])
 ALONG = direction(130.0, 0.4)  # of arrival at the event
-
-
-@pytest.fixture(autouse=True)
-def variant() -> None:
-    mi.set_variant("llvm_ad_rgb")
-    rendering.register()
 
 
 class Beam(NamedTuple):

@@ -7,11 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-import halfspace_sss.rendering as rendering
 from halfspace_sss import Medium
 from halfspace_sss.physics.fresnel import F_r
 from halfspace_sss.rendering.scenes.mitsuba_scene import with_media
 from halfspace_sss.tracing.tracer import trace
+
+pytestmark = pytest.mark.usefixtures("rgb")
 
 mi = pytest.importorskip("mitsuba")
 
@@ -19,12 +20,6 @@ WIDEST_Z = 4.4  # two-sided 1e-5, for a few hundred comparisons
 WIDEST_Z_OF_RUNS = 6.0  # Student's t with about 20 degrees of freedom
 LARGEST_ERROR = 0.05  # of the mean of an image
 COLOURED = {"sigma_s": "0.5,1.0,2.0", "sigma_a": "0.01,0.1,0.5"}
-
-
-@pytest.fixture(autouse=True)
-def variant() -> None:
-    mi.set_variant("llvm_ad_rgb")
-    rendering.register()
 
 
 def _scene(surface: dict, light: dict | None = None, shape: dict | None = None, **integrator: Any) -> dict:

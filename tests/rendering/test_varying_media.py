@@ -8,20 +8,15 @@ import numpy as np
 import pytest
 from test_translucent_walk import _cube, _lamp, _runs, _scene, _small_lamp, _z
 
-import halfspace_sss.rendering as rendering
 from halfspace_sss import Medium
 from halfspace_sss.rendering.scenes.mitsuba_scene import with_media
+
+pytestmark = pytest.mark.usefixtures("rgb")
 
 mi = pytest.importorskip("mitsuba")
 
 WIDEST_Z = 6.0  # Student's t with about 20 degrees of freedom
 N = 2**16
-
-
-@pytest.fixture(autouse=True)
-def variant() -> None:
-    mi.set_variant("llvm_ad_rgb")
-    rendering.register()
 
 
 def _box(side: float) -> Any:

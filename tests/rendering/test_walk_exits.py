@@ -7,22 +7,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-import halfspace_sss.rendering as rendering
 from halfspace_sss import Medium
 from halfspace_sss.physics import single_scattering
 from halfspace_sss.physics.fresnel import F_r
 from halfspace_sss.tracing.tracer import trace
 
+pytestmark = pytest.mark.usefixtures("rgb")
+
 mi = pytest.importorskip("mitsuba")
 
 N = 2**17
 WIDEST_Z = 4.4  # two-sided 1e-5
-
-
-@pytest.fixture(autouse=True)
-def variant() -> None:
-    mi.set_variant("llvm_ad_rgb")
-    rendering.register()
 
 
 def _media(shape: dict, mm_per_unit: float = 1.0, **surface: object):
