@@ -18,6 +18,7 @@ from figures.drawing.style import TEXT, Look, paper, saved
 from figures.parts.part import Part, Result, Task
 from full_geometry.models.storing import KIND
 from halfspace_sss.provenance import check_folder
+from halfspace_sss.rendering.paths.integrator import is_bssrdf
 from halfspace_sss.rendering.scenes import online, reference
 from halfspace_sss.rendering.scenes.combined import combined
 from halfspace_sss.rendering.scenes.reference_store import Reference
@@ -245,7 +246,7 @@ def walked(p: dict[str, Any], folder: Path, seconds: float) -> Snapshots:
 
 def _rendered(scene: Any, path: Path, seed: int, seconds: float) -> Snapshots:
     integrator = scene.integrator()
-    if hasattr(integrator, "prepare"):
+    if is_bssrdf(integrator):
         integrator.prepare(scene)
     found = Snapshots()
     image = reference.render(scene, path, seed=seed, seconds=seconds, interval=1e9, resume=False, progress=found.add)

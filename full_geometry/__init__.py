@@ -8,11 +8,7 @@ from __future__ import annotations
 
 from halfspace_sss.lazy import lazy_names
 
-TRANSPORTS = {
-    "full_geometry": "full_geometry.scene:learnt_model",
-    "neural_shape": "full_geometry.scene:shape_model",
-}
-__all__ = ["TRANSPORTS", "Recipe", "Subject", "errors", "load", "train", "transport"]
+__all__ = ["Recipe", "Subject", "errors", "load", "train", "transport_of"]
 __getattr__, __dir__ = lazy_names(
     __name__,
     {
@@ -21,6 +17,6 @@ __getattr__, __dir__ = lazy_names(
         "errors": "learning.model_errors",
         "load": "models.storing",
         "train": "learning.training",
-        "transport": "learning.model_errors",
+        "transport_of": "learning.model_errors",
     },
 )

@@ -17,6 +17,7 @@ from halfspace_sss.neural.store import load_weights
 from halfspace_sss.neural.trained import check_weights_folder
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.rendering.object.registry import model_names
+from halfspace_sss.rendering.object.translucent import is_translucent
 from halfspace_sss.rendering.scenes.learners import LearntObject, ObjectError
 
 
@@ -28,8 +29,10 @@ def untrained(scene: Any) -> list[str]:
     """
     missing = []
     for shape in scene.shapes() if find_spec("torch") else ():
-        inside = getattr(shape.bsdf(), "inside", None)
-        asked = inside is not None and inside.model == KIND and inside.orders != "single"
+        if not is_translucent(shape.bsdf()):
+            continue
+        inside = shape.bsdf().inside
+        asked = inside.model == KIND and inside.orders != "single"
         if not asked or not np.any(inside.medium.sigma_s > 0):
             continue
         subject = Subject.given(scene, None, None, shape.id())

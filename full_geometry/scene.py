@@ -21,7 +21,7 @@ from halfspace_sss.rendering.object.half_space import HalfSpaceProposals, area_s
 from halfspace_sss.rendering.object.points import ObjectModel
 from halfspace_sss.rendering.object.settings import AUTOMATIC, Settings
 from halfspace_sss.rendering.object.shape import Object
-from halfspace_sss.rendering.object.translucent import Inside
+from halfspace_sss.rendering.object.translucent import Inside, is_translucent
 
 FINE = 2.5  # transport mean free paths of the radius of a patch, up to which patches do without probes
 PATCH_SHARE = 0.2  # of the entries where patches are larger: they reach what probes miss
@@ -105,7 +105,7 @@ def shape_model(object: Object, inside: Inside, media: list[Medium], settings: S
             of the object disagree.
     """
     surface = object.shape.bsdf()
-    if hasattr(surface, "inside"):
+    if is_translucent(surface):
         check_surface(object.shape.id(), surface)
     subject = Subject.surveyed(object, tuple(media), inside.varying, settings.mm_per_unit)
     warn_out_of_range(object, subject.media)

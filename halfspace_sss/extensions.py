@@ -4,8 +4,8 @@
 - `halfspace_sss.materials`: path of a material file or folder, or an iterable of `Material`.
 - `halfspace_sss.commands`: name -> function with typer annotations, a further command of `halfspace-sss`.
 - `halfspace_sss.studies`: the same for `halfspace-sss study`.
-- `halfspace_sss.transports`: mapping of names to "module:function", see `rendering.object.registry`.
-- `halfspace_sss.learners`: name of a model -> what learns it, see `rendering.scenes.learners`.
+- `halfspace_sss.transports`, `halfspace_sss.choosers`, `halfspace_sss.learners`: name of a model -> what makes it of an
+  object, what stands for another by name, what learns it; see `rendering.object.registry`.
 - `halfspace_sss.figures`: kind of result -> function that takes the result and returns {file ending: bytes}.
 
 What a package offers may fail in any way: it is left out with a warning in one line that names it, and nothing else is.
@@ -15,10 +15,11 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterator
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
 __all__ = [
+    "CHOOSERS",
     "COMMANDS",
     "FAILURES",
     "FIGURES",
@@ -27,16 +28,18 @@ __all__ = [
     "STUDIES",
     "TRANSPORTS",
     "commands",
+    "loaded",
     "offered",
+    "offers",
     "renderer",
     "warn_left_out",
 ]
 
 COMMANDS, FIGURES, MODELS = "halfspace_sss.commands", "halfspace_sss.figures", "halfspace_sss.models"
 STUDIES = "halfspace_sss.studies"
-LEARNERS, TRANSPORTS = "halfspace_sss.learners", "halfspace_sss.transports"
+CHOOSERS, LEARNERS, TRANSPORTS = "halfspace_sss.choosers", "halfspace_sss.learners", "halfspace_sss.transports"
 FAILURES = (Exception, SystemExit)  # what code of somebody else may end with
-OWN = ("analytic_models", "figures", "full_geometry", "halfspace_sss")
+OWN = "halfspace-sss"  # the distribution whose entry points come first
 Renderer = Callable[[Any], dict[str, bytes]]
 
 
@@ -47,15 +50,32 @@ def warn_left_out(group: str, name: str, error: object) -> None:
     warnings.warn_explicit(message, UserWarning, group, 0)
 
 
+def offers(group: str) -> dict[str, EntryPoint]:
+    """The entry points of a group by name, the first of each, those of this project before others; none is loaded."""
+    found: dict[str, EntryPoint] = {}
+    for entry in _entries(group):
+        found.setdefault(entry.name, entry)
+    return found
+
+
+def _entries(group: str) -> list[EntryPoint]:
+    return sorted(entry_points(group=group), key=lambda e: e.dist is None or e.dist.name != OWN)
+
+
+def loaded(entry: EntryPoint) -> Any:
+    """What an entry point names; None if it does not load, with a warning."""
+    try:
+        return entry.load()
+    except FAILURES as error:
+        warn_left_out(entry.group, entry.name, error)
+        return None
+
+
 def offered(group: str) -> Iterator[tuple[str, Any]]:
     """Name and object of every entry point of a group that loads, those of this project first."""
-    for entry in sorted(entry_points(group=group), key=lambda e: e.value.split(":")[0].split(".")[0] not in OWN):
-        try:
-            found = entry.load()
-        except FAILURES as error:
-            warn_left_out(group, entry.name, error)
-            continue
-        yield entry.name, found
+    for entry in _entries(group):
+        if (found := loaded(entry)) is not None:
+            yield entry.name, found
 
 
 def commands(group: str = COMMANDS) -> Iterator[tuple[str, Callable]]:

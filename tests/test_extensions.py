@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -25,6 +26,7 @@ class Entry:
 
     def __init__(self, name: str, offered: Any, value: str = "other.package:thing") -> None:
         self.name, self.value, self._offered = name, value, offered
+        self.group, self.dist = "other", SimpleNamespace(name="other" if value.startswith("other") else extensions.OWN)
 
     def load(self) -> Any:
         if isinstance(self._offered, BaseException):

@@ -24,11 +24,9 @@ import numpy as np
 
 from figures import figure_modules
 from halfspace_sss.checks import check_choice, check_interval
-from halfspace_sss.extensions import LEARNERS, offered
-from halfspace_sss.interface.model import model_class, models
 from halfspace_sss.interface.model_lists import no_models
 from halfspace_sss.progress import Progress
-from halfspace_sss.rendering.object.registry import AUTO, model_names, object_transport
+from halfspace_sss.rendering.object.registry import learnt_names, lookup, model_names
 
 __all__ = [
     "PACKAGES", "QUALITIES", "Part", "Result", "Task", "canonical", "check_quality", "code_hash", "found_by_name",
@@ -87,13 +85,7 @@ def modules_reached(module: str, function: str, params: str = "", unmodelled: bo
 @functools.cache
 def found_by_name() -> dict[str, tuple[str, ...]]:
     """Modules of models, of the half-space and of objects, and of what learns them, by name."""
-    found: dict[str, tuple[str, ...]] = {name: (model_class(name).__module__,) for name in models()}
-    for name in [name for name in model_names() if name not in found and name != AUTO]:
-        found[name] = (object_transport(name).__module__,)
-    for name, learner in offered(LEARNERS):
-        home = getattr(learner, "__name__", None) or type(learner).__module__
-        found[name] = (*found.get(name, ()), home)
-    return found
+    return {name: lookup(name).modules for name in (*model_names(), *learnt_names())}
 
 
 def modules_of(roots: Iterable[str]) -> list[str]:

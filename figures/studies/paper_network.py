@@ -358,6 +358,11 @@ def train(
     return LearntObject(name, path, _rows(name, rows), steps, time.monotonic() - began)
 
 
+def untrained(scene: Any) -> list[str]:
+    """None: renders do not know this model."""
+    return []
+
+
 def errors(
     scene: Any, models: Sequence[str] = (KIND,), *, object: str | None = None, exits: int = EXITS, seed: int = 0,
     progress: NamedProgress | None = None,

@@ -27,7 +27,7 @@ from halfspace_sss.physics.medium import Medium
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.rendering.object.half_space import HalfSpaceTransport
 from halfspace_sss.rendering.object.points import Transport
-from halfspace_sss.rendering.object.registry import knows_objects, model_names, object_transport
+from halfspace_sss.rendering.object.registry import lookup, model_names
 from halfspace_sss.rendering.object.settings import Settings
 from halfspace_sss.rendering.object.translucent import Inside
 
@@ -203,9 +203,10 @@ def transport_of(subject: Subject, model: str, folder: str | os.PathLike | None 
     check_choice("model", model, model_names())
     if model == KIND:
         return load(find_weights(subject, folder), subject).model
-    if not knows_objects(model):
+    entry = lookup(model)
+    if not entry.knows_objects:
         return HalfSpaceTransport([bssrdf(model, m) for m in subject.media])
-    make = object_transport(model)
+    make = entry.transport
     inside = Inside("medium", subject.media[0], model, "total", True, subject.varying)
     found = make(subject.object, inside, list(subject.media), Settings()).transport if make else None
     if found is None or found.is_delta:

@@ -18,7 +18,7 @@ from halfspace_sss.rendering.object.entries import AreaPoints
 from halfspace_sss.rendering.object.placement import check_empty
 from halfspace_sss.rendering.object.points import SurfacePoint, cosine_above, lifted, number, turned
 from halfspace_sss.rendering.object.shape import Object, name_of, survey
-from halfspace_sss.rendering.object.translucent import Inside
+from halfspace_sss.rendering.object.translucent import Inside, is_translucent
 from halfspace_sss.rendering.object.varying import VaryingMedium, equivalent, grid_values
 from halfspace_sss.rendering.scenes.scene_files import millimetres
 from halfspace_sss.rendering.walk.media import WalkMedia
@@ -240,7 +240,7 @@ def _object_of(scene: Any, name: str | None) -> Any:
     Raises:
         ValueError: there is none, there are several and none is named, or it cannot be learnt.
     """
-    known = {s.id(): s for s in scene.shapes() if hasattr(s.bsdf(), "inside")}
+    known = {s.id(): s for s in scene.shapes() if is_translucent(s.bsdf())}
     instances = [s.id() for s in scene.shapes() if "nstance" in s.class_name()]
     if name in instances or (name is None and instances and not known):
         raise ValueError(f"object must not be an instance to be learnt, got {name or instances[0]!r}")

@@ -12,7 +12,7 @@ import numpy as np
 
 from halfspace_sss.arrays import broadcast_query
 from halfspace_sss.checks import check_choice, check_query
-from halfspace_sss.extensions import TRANSPORTS, offered
+from halfspace_sss.extensions import TRANSPORTS, offers
 from halfspace_sss.interface.model_lists import check_allowed, check_model_class, listed_models
 from halfspace_sss.interface.query import Query
 from halfspace_sss.lazy import once
@@ -410,18 +410,13 @@ def model_class(name: str) -> type[BSSRDF]:
     """The class of a model; ValueError with the nearest name if there is none."""
     check_allowed(name)
     known = {**_installed(), **_registered}
-    if name not in known and name in _of_objects():
+    if name not in known and name in offers(TRANSPORTS):
         raise ValueError(
             f"model must be one of the half-space here, got {name!r}, which is one of objects in a scene: "
             "`halfspace-sss errors --scene` and `render` take it"
         )
     check_choice("model", name, known)
     return known[name]
-
-
-def _of_objects() -> set[str]:
-    """Names of models that know whole objects; they are no BSSRDF of the half-space."""
-    return {name for _, names in offered(TRANSPORTS) if isinstance(names, Mapping) for name in names}
 
 
 def exit_normaliser(eta: float) -> float:

@@ -12,6 +12,7 @@ import numpy as np
 
 from halfspace_sss.backend import busy_threads
 from halfspace_sss.rendering.object.settings import variant_channels
+from halfspace_sss.rendering.paths.integrator import is_bssrdf
 from halfspace_sss.trade.exits import Exits
 from halfspace_sss.trade.statistics import Estimate, seeded
 from halfspace_sss.trade.ways import Stage, Way
@@ -92,7 +93,7 @@ def warm_up(stage: Stage, ways: Sequence[Way]) -> None:
 
 
 def _prepare(stage: Stage, integrator: Any) -> None:
-    (integrator.prepare if hasattr(integrator, "prepare") else integrator.tracer)(stage.scene)
+    (integrator.prepare if is_bssrdf(integrator) else integrator.tracer)(stage.scene)
 
 
 def sample_more(

@@ -17,7 +17,7 @@ import figures
 from figures.computing.contenders import long_walk
 from figures.parts.part import PACKAGES, Task, modules_of, unmodelled
 from halfspace_sss.interface.model import model_class
-from halfspace_sss.rendering.object.registry import object_transport
+from halfspace_sss.rendering.object.registry import lookup
 
 ROOT = Path(figures.__file__).resolve().parent.parent
 
@@ -131,7 +131,7 @@ def test_a_change_far_below_changes_everything(changed: dict[str, set[str]]) -> 
     assert changed["far"] == changed["all"]
 
 
-@pytest.mark.parametrize("ask", [lambda: model_class("neural"), lambda: object_transport("lambert")])
+@pytest.mark.parametrize("ask", [lambda: model_class("neural"), lambda: lookup("lambert").transport])
 def test_a_part_that_is_declared_to_find_no_model_cannot(ask: Callable[[], Any], tmp_path: Path) -> None:
     with pytest.raises(RuntimeError, match="is declared to find no model by name, and asks for '(neural|lambert)'"):
         unmodelled(lambda task: ask())(Task({}, tmp_path))

@@ -17,6 +17,7 @@ from rendered import surface  # noqa: E402
 from halfspace_sss.rendering.object import body as bodies  # noqa: E402
 from halfspace_sss.rendering.object.half_space import half_space_model  # noqa: E402
 from halfspace_sss.rendering.object.points import ObjectModel  # noqa: E402
+from halfspace_sss.rendering.object.registry import ModelEntry  # noqa: E402
 from halfspace_sss.rendering.paths.lighting import Lights, Sky  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("rgb")
@@ -78,7 +79,7 @@ def scene(kind: type, patch: pytest.MonkeyPatch, light: dict, **integrator) -> d
         return ObjectModel(kind(found.area), proposals, 2)
 
     patch.setattr(bodies, "_model_of", means)
-    patch.setattr(bodies, "knows_objects", lambda name: True)
+    patch.setattr(ModelEntry, "knows_objects", True)
     film = {"type": "hdrfilm", "width": 12, "height": 12, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
     view = mi.ScalarTransform4f().look_at([0, 1, 5], [0, 0, 0], [0, 1, 0]).scale(0.6)
     return {

@@ -20,6 +20,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from halfspace_sss.rendering.object.translucent import is_translucent
+
 __all__ = ["NARROW", "SmallEmitters", "Sun", "WIDE", "is_delta", "spread", "suns_of"]
 
 
@@ -267,7 +269,7 @@ def _has_place(emitter: mi.Emitter) -> bool:
     """Whether an emitter is neither the environment nor out of reach nor the surface of a translucent object."""
     shape = emitter.get_shape()
     met = not emitter.flags() & int(mi.EmitterFlags.Delta)
-    return not emitter.is_environment() and (shape is None or (met and not hasattr(shape.bsdf(), "inside")))
+    return not emitter.is_environment() and (shape is None or (met and not is_translucent(shape.bsdf())))
 
 
 def _place(emitter: mi.Emitter) -> tuple[float, float, float, bool, float]:

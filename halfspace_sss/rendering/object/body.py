@@ -16,7 +16,7 @@ from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.object.half_space import Variation, half_space_model
 from halfspace_sss.rendering.object.placement import check_empty, check_sensors, places_of, translucent_shapes
 from halfspace_sss.rendering.object.points import DirectionalAlbedo, ObjectModel, Proposals, Transport, number
-from halfspace_sss.rendering.object.registry import AUTO, choose_models, knows_objects, object_transport
+from halfspace_sss.rendering.object.registry import AUTO, choose_models, lookup
 from halfspace_sss.rendering.object.settings import AUTOMATIC, Settings
 from halfspace_sss.rendering.object.shape import Object, check_together, number_of, same_objects, survey
 from halfspace_sss.rendering.object.translucent import Inside
@@ -142,13 +142,13 @@ def _few(inside: Inside, transport: Transport | None) -> tuple[int, ...]:
         return (1,) if inside.orders == "single" else ()
     if transport is not None and transport.orders == "total":
         return ()
-    return (0, 1) if transport is None or knows_objects(inside.model) else (1,)
+    return (0, 1) if transport is None or lookup(inside.model).knows_objects else (1,)
 
 
 def _model_of(
     inside: Inside, found: Object, media: list[Medium], settings: Settings, variation: Variation
 ) -> ObjectModel:
-    of_object = object_transport(inside.model)
+    of_object = lookup(inside.model).transport
     if of_object is not None:
         return of_object(found, inside, media, settings)
     warn_of_means(inside, found)

@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from halfspace_sss.rendering.object.shape import Object, geometry_of, is_inside, name_of, rays_into, scene_of
+from halfspace_sss.rendering.object.translucent import is_translucent
 
 __all__ = ["Content", "check_empty", "check_sensors", "choices", "contents", "places_of", "translucent_shapes"]
 
@@ -161,12 +162,12 @@ def translucent_shapes(scene: Any) -> list[Any]:
             )
     for shape in shapes:
         bsdf = shape.bsdf()
-        if _inside(bsdf) and not hasattr(bsdf, "inside"):
+        if _inside(bsdf) and not is_translucent(bsdf):
             raise ValueError(
                 f"a translucent surface must stand alone, got one inside the {bsdf.class_name()} of {shape.id()!r}"
             )
     _check_media(scene)
-    return [shape for shape in shapes if hasattr(shape.bsdf(), "inside")]
+    return [shape for shape in shapes if is_translucent(shape.bsdf())]
 
 
 def _check_media(scene: Any) -> None:
@@ -178,7 +179,7 @@ def _check_media(scene: Any) -> None:
         if medium is not None
     ]
     for side, shape in found:
-        if hasattr(shape.bsdf(), "inside"):
+        if is_translucent(shape.bsdf()):
             raise ValueError(
                 f"a translucent object must be without {side}, as its surface says what is inside, got the {side} "
                 f"of {shape.id()!r}"
@@ -215,10 +216,12 @@ def _starts(sensor: Any, size: float) -> np.ndarray:
 
 def choices(scene: Any) -> dict[str, str]:
     """Why the model "auto" of objects became the one that they have, by id; empty before it was chosen."""
-    return {shape.id(): why for shape in scene.shapes() if (why := getattr(shape.bsdf(), "choice", ""))}
+    return {
+        shape.id(): why for shape in scene.shapes() if is_translucent(shape.bsdf()) and (why := shape.bsdf().choice)
+    }
 
 
 def _inside(bsdf: Any) -> bool:
     """Whether a BSDF is `translucent` or has such a one in it."""
 
-    return bsdf is not None and any(hasattr(node, "inside") for node in mi.traverse(bsdf).hierarchy)
+    return bsdf is not None and any(is_translucent(node) for node in mi.traverse(bsdf).hierarchy)

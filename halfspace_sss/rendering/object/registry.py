@@ -1,59 +1,107 @@
-"""The names that `model` may have in a scene: the half-space models, and what packages add that knows whole objects.
+"""Everything that is known of a model by its name: what it is on an object, what learns it, the modules it is made of.
 
-An entry point of the group `halfspace_sss.transports` is a mapping of names to "module:function"; the function takes
-(found, inside, media, settings), the `Object`, the `Inside`, the medium of each channel in 1/(scene unit) and the
-`Settings` of the integrator, and returns an `ObjectModel`. It is imported when it is asked for.
-"auto" stands for the cheapest of these that is good enough, which `halfspace_sss.trade` finds at the first render.
+The half-space models are those of `interface.model`. Packages add others by entry points under the name of the model:
+
+- `halfspace_sss.transports`: a function of (found, inside, media, settings), the `Object`, the `Inside`, the medium of
+  each channel in 1/(scene unit) and the `Settings` of the integrator, that returns an `ObjectModel`;
+- `halfspace_sss.learners`: a module or object that learns the model, see `rendering.scenes.learners`;
+- `halfspace_sss.choosers`: a function of (scene, settings) that gives each surface which has the name a model by
+  another, which it keeps; "auto" stands for the cheapest that is good enough.
+
+None is imported before it is asked for.
 """
 
 from __future__ import annotations
 
-import importlib
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.metadata import EntryPoint
+from typing import TYPE_CHECKING, Any
 
-from halfspace_sss.extensions import TRANSPORTS, offered, warn_left_out
-from halfspace_sss.interface.model import models
+from halfspace_sss.checks import check_choice
+from halfspace_sss.extensions import CHOOSERS, LEARNERS, TRANSPORTS, loaded, offers
+from halfspace_sss.interface.model import model_class, models
 from halfspace_sss.interface.model_lists import check_allowed
 from halfspace_sss.lazy import once
+from halfspace_sss.rendering.object.settings import Settings
 
-__all__ = ["AUTO", "choose_models", "knows_objects", "model_names", "object_transport"]
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+__all__ = ["AUTO", "ModelEntry", "choose_models", "learnt_names", "lookup", "model_names"]
 
 AUTO = "auto"
-_OWN = {"lambert": "halfspace_sss.rendering.object.lambert:lambert_model"}
-_CHOICE = "halfspace_sss.trade.automatic"  # imported when it is asked for, as it renders
+_BY_GROUP = once(offers)
 
 
-@once
-def _added() -> dict[str, str]:
-    found = dict(_OWN)
-    for name, mapping in offered(TRANSPORTS):
-        if not isinstance(mapping, Mapping) or not all(isinstance(v, str) and ":" in v for v in mapping.values()):
-            warn_left_out(TRANSPORTS, name, f"it must map names to 'module:function', got {mapping!r}")
-            continue
-        found |= {key: value for key, value in mapping.items() if key not in found}
-    return found
+@dataclass(frozen=True)
+class ModelEntry:
+    """What is known of one model.
+
+    Args:
+        name: of it.
+        of_half_space: whether it is a model of the half-space.
+        offers: entry points of its name, by group.
+    """
+
+    name: str
+    of_half_space: bool
+    offers: dict[str, EntryPoint]
+
+    @property
+    def knows_objects(self) -> bool:
+        """Whether it knows whole objects, rather than the half-space."""
+        return not self.of_half_space and (TRANSPORTS in self.offers or CHOOSERS in self.offers)
+
+    @property
+    def transport(self) -> Callable | None:
+        """The function that makes an `ObjectModel` of an object; None for a half-space model, which is laid onto it.
+
+        Raises:
+            ValueError: what the entry point names is no function.
+        """
+        if self.of_half_space or TRANSPORTS not in self.offers:
+            return None
+        check_allowed(self.name)
+        make = self.offers[TRANSPORTS].load()
+        if not callable(make):
+            raise ValueError(f"model {self.name!r} must be made by a function, got {make!r}")
+        return make
+
+    @property
+    def learner(self) -> Any:
+        """What learns it; None where nothing does, or where it does not load, which a warning says."""
+        return loaded(self.offers[LEARNERS]) if LEARNERS in self.offers else None
+
+    @property
+    def modules(self) -> tuple[str, ...]:
+        """Dotted names of the modules where it begins, of all its kinds."""
+        own = (model_class(self.name).__module__,) if self.of_half_space else ()
+        return (*own, *(entry.module for entry in self.offers.values()))
+
+
+def lookup(name: str) -> ModelEntry:
+    """All that is known of a model.
+
+    Raises:
+        ValueError: there is none of that name; the message has the nearest.
+    """
+    check_choice("model", name, (*model_names(), *learnt_names()))
+    offered = {group: known[name] for group in (TRANSPORTS, CHOOSERS, LEARNERS) if name in (known := _BY_GROUP(group))}
+    return ModelEntry(name, name in models(), offered)
 
 
 def model_names() -> tuple[str, ...]:
     """All names that the `model` of a surface may have."""
-    return (*models(), *(name for name in _added() if name not in models()), AUTO)
+    added = (*_BY_GROUP(TRANSPORTS), *_BY_GROUP(CHOOSERS))
+    return tuple(dict.fromkeys((*models(), *added)))
 
 
-def knows_objects(name: str) -> bool:
-    """Whether a name is that of a model which knows whole objects, not one of the half-space."""
-    return name not in models() and (name in _added() or name == AUTO)
+def learnt_names() -> tuple[str, ...]:
+    """Names of all models that something learns."""
+    return tuple(_BY_GROUP(LEARNERS))
 
 
-def object_transport(name: str) -> Callable | None:
-    """The function that makes the transport of that name for an object; None for a half-space model."""
-    if name not in _added() or name in models():
-        return None
-    check_allowed(name)
-    module, _, function = _added()[name].partition(":")
-    return getattr(importlib.import_module(module), function)
-
-
-def choose_models(scene: Any, settings: Any) -> None:
+def choose_models(scene: mi.Scene, settings: Settings) -> None:
     """Give every surface of a scene whose model is "auto" one by name, which it keeps."""
-    importlib.import_module(_CHOICE).choose(scene, settings)
+    _BY_GROUP(CHOOSERS)[AUTO].load()(scene, settings)

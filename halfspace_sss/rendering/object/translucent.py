@@ -37,6 +37,7 @@ To an integrator that knows nothing of the inside, the surface shows its reflect
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -52,13 +53,24 @@ from halfspace_sss.rendering.object.registry import model_names
 from halfspace_sss.rendering.object.settings import ORDERS, check_parameters, variant_channels
 from halfspace_sss.rendering.object.varying import constant_value, mean_of_grids, varying_medium
 
-__all__ = ["Inside", "PARAMETERS", "VARIABLE", "read_inside", "translucent_class"]
+__all__ = ["Inside", "PARAMETERS", "VARIABLE", "is_translucent", "read_inside", "translucent_class"]
 
 VARIABLE = ("albedo", "sigma_t", "g")  # by which light can be differentiated
 
 
 def translucent_class() -> type:
     """The class of the surface for the current variant of Mitsuba."""
+    return _class(mi.variant())
+
+
+def is_translucent(bsdf: mi.BSDF | None) -> bool:
+    """Whether a BSDF is a `translucent` surface, and so has an `inside`."""
+    return isinstance(bsdf, translucent_class())
+
+
+@functools.cache
+def _class(variant: str) -> type:
+    """The class of a variant, which must be the current one."""
 
     class Translucent(mi.BSDF):
         """The reflection of the boundary as a BSDF, with an `inside`."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import gc
 import math
 from collections.abc import Callable, Collection, Iterator
@@ -15,10 +16,11 @@ import numpy as np
 from halfspace_sss.interrupts import hear_again, interruptible
 from halfspace_sss.rendering.object.body import Bodies, Body, make_bodies
 from halfspace_sss.rendering.object.settings import Settings, read_settings
+from halfspace_sss.rendering.object.translucent import is_translucent
 from halfspace_sss.rendering.paths.gathering import Gathering
 from halfspace_sss.rendering.paths.path_loop import replay_paths, trace_paths
 
-__all__ = ["check_outermost", "check_parameters", "integrator_class", "launches", "replayer"]
+__all__ = ["check_outermost", "check_parameters", "integrator_class", "launches", "replayer", "is_bssrdf"]
 
 SAMPLES_PER_LAUNCH = 2**20  # half a second on 2 cores
 GEOMETRY = ("to_world", "vertex_positions", "vertex_normals", "vertex_texcoords")
@@ -29,6 +31,17 @@ GEOMETRY = ("to_world", "vertex_positions", "vertex_normals", "vertex_texcoords"
 
 def integrator_class() -> type:
     """The class of the integrator for the current variant of Mitsuba."""
+    return _class(mi.variant())
+
+
+def is_bssrdf(integrator: mi.Integrator | None) -> bool:
+    """Whether an integrator is `bssrdf`, which has settings and makes models of objects before it renders."""
+    return isinstance(integrator, integrator_class())
+
+
+@functools.cache
+def _class(variant: str) -> type:
+    """The class of a variant, which must be the current one."""
 
     class BSSRDFIntegrator(mi.SamplingIntegrator):
         """Renders scenes with `translucent` objects; parameters as in `Settings`.
@@ -224,7 +237,7 @@ def _selects(parameters: mi.SceneParameters, owner: mi.Object | None, name: str)
         if isinstance(owner, mi.BSDF) and owner.class_name() == "BlendBSDF":
             return bool(owner.flags() & int(mi.BSDFFlags.Delta))
         owner = parameters.hierarchy[owner][0]
-        if hasattr(owner, "inside") and name == "eta":
+        if is_translucent(owner) and name == "eta":
             return True
     return False
 

@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from halfspace_sss.rendering.paths.integrator import is_bssrdf
+
 __all__ = ["learnt", "scene_hash", "words"]
 
 # a name says nothing of the image, an address nothing of the scene, and how many samples are taken is told elsewhere
@@ -32,9 +34,9 @@ def learnt(scene: Any, integrator: Any) -> list[str]:
 
     The same scene is another render after a training.
     """
-    if hasattr(integrator, "prepare"):
+    if is_bssrdf(integrator):
         transports = (body.transport for body in integrator.prepare(scene))
-        return sorted(checksum for transport in transports for checksum in getattr(transport, "checksums", ()))
+        return sorted(checksum for transport in transports if transport is not None for checksum in transport.checksums)
     return [checksum for inner in _children(integrator) for checksum in learnt(scene, inner)]
 
 

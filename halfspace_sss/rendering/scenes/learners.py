@@ -8,11 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from halfspace_sss.checks import check_choice
-from halfspace_sss.extensions import LEARNERS, offered, warn_left_out
+from halfspace_sss.extensions import LEARNERS, warn_left_out
 from halfspace_sss.progress import NamedProgress
+from halfspace_sss.rendering.object.registry import learnt_names, lookup
 from halfspace_sss.rendering.scenes.camera_walks import CameraWalks
 
 __all__ = [
@@ -52,6 +53,7 @@ class LearntShapes(NamedTuple):
     seconds: float
 
 
+@runtime_checkable
 class Learner(Protocol):
     """Learns objects of scenes from `scene_files.load_objects`, and measures models of them.
 
@@ -79,7 +81,7 @@ class Learner(Protocol):
         """
 
     def untrained(self, scene: Any) -> list[str]:
-        """Ids of the objects that have the model and no weights; a learner without it has none."""
+        """Ids of the objects that have the model and no weights, and that a render would learn first."""
 
     def errors(
         self,
@@ -94,6 +96,7 @@ class Learner(Protocol):
         """The errors of models of an object, over so many exits; of all that can be asked where none is named."""
 
 
+@runtime_checkable
 class ShapeLearner(Protocol):
     """Learns one network for every shape."""
 
@@ -112,7 +115,11 @@ class ShapeLearner(Protocol):
 
 def learners() -> dict[str, Learner]:
     """All learners of objects by the name of their model."""
-    return _known("train", "errors")
+    found = _found()
+    for name, other in found.items():
+        if not isinstance(other, Learner | ShapeLearner):
+            warn_left_out(LEARNERS, name, f"it must have the functions train, untrained and errors, got {other!r}")
+    return {name: each for name, each in found.items() if isinstance(each, Learner)}
 
 
 def learner(name: str | None = None) -> Learner:
@@ -122,8 +129,10 @@ def learner(name: str | None = None) -> Learner:
         ValueError: there is none.
     """
     known = learners()
-    if name is not None or not known:
-        check_choice("model", name or "full_geometry", tuple(known))
+    if not known:
+        raise ValueError("model must be one that is learnt from a scene, got none installed")
+    if name is not None:
+        check_choice("model", name, tuple(known))
     return known[name] if name is not None else next(iter(known.values()))
 
 
@@ -146,17 +155,13 @@ def shape_learner() -> ShapeLearner:
     Raises:
         ValueError: there is none.
     """
-    known = _known("train_shapes")
-    check_choice("model", next(iter(known), "neural_shape"), tuple(known))
-    return next(iter(known.values()))
+    for each in _found().values():
+        if isinstance(each, ShapeLearner):
+            return each
+    raise ValueError("model must be one that is learnt from shapes, got none installed")
 
 
-def _known(*functions: str) -> dict[str, Any]:
-    """Entry points that have these functions; one that has none of any kind is left out with a warning."""
-    known: dict[str, Any] = {}
-    for key, found in offered(LEARNERS):
-        if all(callable(getattr(found, name, None)) for name in functions):
-            known.setdefault(key, found)
-        elif not callable(getattr(found, "train_shapes", None)) and "train" in functions:
-            warn_left_out(LEARNERS, key, f"it must have the functions train and errors, got {found!r}")
-    return known
+def _found() -> dict[str, Any]:
+    """What learns models, by name; that which does not load is left out with a warning."""
+    known = {name: lookup(name).learner for name in learnt_names()}
+    return {name: each for name, each in known.items() if each is not None}

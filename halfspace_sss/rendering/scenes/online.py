@@ -21,6 +21,8 @@ from halfspace_sss.checks import check_count
 from halfspace_sss.neural.trained import weights_folder
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.provenance import check_folder
+from halfspace_sss.rendering.object.translucent import is_translucent
+from halfspace_sss.rendering.paths.integrator import is_bssrdf
 from halfspace_sss.rendering.scenes import reference
 from halfspace_sss.rendering.scenes.camera_walks import CameraWalks
 from halfspace_sss.rendering.scenes.combined import combined
@@ -43,14 +45,12 @@ def untrained(scene: Any) -> dict[str, list[str]]:
     Raises:
         ValueError: one cannot be learnt, or there is no place for its weights.
     """
-    settings = getattr(scene.integrator(), "settings", None)
-    if not getattr(settings, "train_seconds", 0) > 0:
+    if not is_bssrdf(scene.integrator()) or scene.integrator().settings.train_seconds == 0:
         return {}
-    insides = [shape.bsdf().inside for shape in scene.shapes() if hasattr(shape.bsdf(), "inside")]
+    insides = [shape.bsdf().inside for shape in scene.shapes() if is_translucent(shape.bsdf())]
     names, known, found = sorted({inside.model for inside in insides}), learners(), {}
     for name in names:
-        asked = getattr(known.get(name), "untrained", None)
-        if asked and (ids := asked(scene)):
+        if name in known and (ids := known[name].untrained(scene)):
             found[name] = ids
     return found
 
@@ -107,7 +107,7 @@ def render(
     names = untrained(scene)
     how = {"sensor": sensor, "seed": seed, "progress": progress, **limits}
     if not names and not parts["walks.exr"].exists():
-        if hasattr(integrator, "prepare"):
+        if is_bssrdf(integrator):
             integrator.prepare(scene)  # here, because Mitsuba wraps what is refused while it renders
         return reference.render(scene, path, resume=resume, **how)
     walks = CameraWalks(scene, integrator.settings, sensor, seed, parts["walks.exr"], about, walked)
@@ -154,7 +154,7 @@ def _learnt(
 
 def _join(scene: Any) -> bool:
     """Whether walks show what the models show: all objects are learnt, and paths go farther than to an object."""
-    insides = [shape.bsdf().inside for shape in scene.shapes() if hasattr(shape.bsdf(), "inside")]
+    insides = [shape.bsdf().inside for shape in scene.shapes() if is_translucent(shape.bsdf())]
     return scene.integrator().settings.max_depth != 1 and all(inside.model in learners() for inside in insides)
 
 

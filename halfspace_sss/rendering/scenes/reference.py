@@ -23,6 +23,8 @@ from halfspace_sss.checks import check_count
 from halfspace_sss.provenance import check_folder, provenance
 from halfspace_sss.rendering.object.placement import choices
 from halfspace_sss.rendering.object.registry import AUTO
+from halfspace_sss.rendering.object.translucent import is_translucent
+from halfspace_sss.rendering.paths.integrator import is_bssrdf
 from halfspace_sss.rendering.scenes.causes import first_cause
 from halfspace_sss.rendering.scenes.identity import learnt, scene_hash, words
 from halfspace_sss.rendering.scenes.reference_store import Reference, load, save
@@ -232,8 +234,8 @@ def about_render(scene: Any, integrator: Any, sensor: int, seed: int) -> dict[st
 
 def chosen(scene: Any, integrator: Any) -> dict[str, Any]:
     """The choices of the models "auto", which are made now if they have not been."""
-    if any(getattr(getattr(shape.bsdf(), "inside", None), "model", None) == AUTO for shape in scene.shapes()):
-        if hasattr(integrator, "prepare"):
+    if any(is_translucent(s.bsdf()) and s.bsdf().inside.model == AUTO for s in scene.shapes()):
+        if is_bssrdf(integrator):
             integrator.prepare(scene)
     found = choices(scene)
     return {"choices": found} if found else {}

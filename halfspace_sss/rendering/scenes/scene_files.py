@@ -8,9 +8,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from halfspace_sss.rendering.object.registry import knows_objects, model_names
+from halfspace_sss.rendering.object.registry import lookup, model_names
 from halfspace_sss.rendering.object.settings import ORDERS, SHARED
+from halfspace_sss.rendering.object.translucent import is_translucent
+from halfspace_sss.rendering.paths.integrator import is_bssrdf
 from halfspace_sss.rendering.scenes.causes import first_cause
+from halfspace_sss.rendering.walk.integrator import is_walk
 
 __all__ = ["PATH_TRACED", "load_objects", "load_scene", "millimetres", "open_scene"]
 
@@ -46,7 +49,7 @@ def load_scene(
     """
     loaded = open_scene(scene, model, orders, parameters, settings)
     integrator = loaded.integrator()
-    if hasattr(integrator, "prepare"):
+    if is_bssrdf(integrator):
         integrator.prepare(loaded)  # here, because Mitsuba wraps what is refused while it renders
     return loaded
 
@@ -64,7 +67,7 @@ def open_scene(
     state, config = _parsed(scene, parameters or {})
     # a model that knows whole objects does not know what Mitsuba makes of several with the same BSDF
     names = [str(props.get("model", "")) for props in _surfaces(state)]
-    config.merge_meshes = not any(knows_objects(name) for name in (*names, model or ""))
+    config.merge_meshes = not any(name in model_names() and lookup(name).knows_objects for name in (*names, model))
     _transform(scene, state, config)
     for props in _surfaces(state):  # anew: the nodes have moved
         if model and model != PATH_TRACED:
@@ -74,7 +77,7 @@ def open_scene(
     _choose_integrator(state, model, bool(model or orders), settings or {})
     _set_parameters(state, settings or {})
     loaded = _made(scene, state, config)
-    if not any(hasattr(shape.bsdf(), "inside") for shape in loaded.shapes()):
+    if not any(is_translucent(shape.bsdf()) for shape in loaded.shapes()):
         raise ValueError(_NO_OBJECT)
     return loaded
 
@@ -107,9 +110,10 @@ def load_objects(scene: dict | str | Path, parameters: Mapping[str, str] | None 
 def millimetres(scene: Any) -> float:
     """Millimetres in a unit of a scene, as its integrator says; 1, with a warning, if that is none of ours."""
     integrator = scene.integrator()
-    stated = getattr(integrator, "settings", integrator)
-    if hasattr(stated, "mm_per_unit"):
-        return float(stated.mm_per_unit)
+    if is_bssrdf(integrator):
+        return float(integrator.settings.mm_per_unit)
+    if is_walk(integrator):
+        return float(integrator.mm_per_unit)
     ours = " or ".join(_INTEGRATORS.values())
     warnings.warn(f"a unit of the scene is taken for 1 mm: its integrator is not {ours}", stacklevel=3)
     return 1.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 from typing import Any
@@ -21,7 +22,7 @@ from halfspace_sss.rendering.walk.exits import FirstExits
 from halfspace_sss.rendering.walk.media import WalkMedia
 from halfspace_sss.rendering.walk.path_loop import LightVisitor, PathTracer
 
-__all__ = ["camera_rays", "walk_integrator_class"]
+__all__ = ["camera_rays", "walk_integrator_class", "is_walk"]
 
 PARAMETERS = ("mm_per_unit", "max_depth", "rr_depth", "hide_emitters", "join_share")
 SAMPLES_PER_LAUNCH = 2**19
@@ -32,6 +33,17 @@ Keep = Callable[[FirstExits], None]
 
 def walk_integrator_class() -> type:
     """The class of the integrator for the current variant of Mitsuba."""
+    return _class(mi.variant())
+
+
+def is_walk(integrator: mi.Integrator | None) -> bool:
+    """Whether an integrator is `translucent_walk`."""
+    return isinstance(integrator, walk_integrator_class())
+
+
+@functools.cache
+def _class(variant: str) -> type:
+    """The class of a variant, which must be the current one."""
 
     class TranslucentWalk(mi.SamplingIntegrator):
         """Path tracer whose paths walk through objects with the surface `translucent`.

@@ -14,7 +14,7 @@ from halfspace_sss.rendering.light.small_emitters import is_delta
 from halfspace_sss.rendering.object.placement import Content, contents, translucent_shapes
 from halfspace_sss.rendering.object.points import lift
 from halfspace_sss.rendering.object.shape import Object, check_together, scene_of, survey
-from halfspace_sss.rendering.object.translucent import Inside
+from halfspace_sss.rendering.object.translucent import Inside, is_translucent
 from halfspace_sss.rendering.object.varying import VaryingMedium, eval_volume
 
 __all__ = [
@@ -109,7 +109,7 @@ def _shapes(found: list[Content]) -> list[mi.Shape]:
 
 
 def _displaces(shape: mi.Shape) -> bool:
-    return not hasattr(shape.bsdf(), "inside") and bool(shape.bsdf().flags() & REFRACTS)
+    return not is_translucent(shape.bsdf()) and bool(shape.bsdf().flags() & REFRACTS)
 
 
 def _innermost(key: int, found: list[Content], holders: list[Object], n: int) -> int:
@@ -124,7 +124,7 @@ def _check(found: list[Content], objects: list[Object]) -> None:
         holder = objects[content.object]
         surfaces = [holder.shape.bsdf()]
         if isinstance(content.thing, mi.Shape):
-            translucent = hasattr(content.thing.bsdf(), "inside")
+            translucent = is_translucent(content.thing.bsdf())
             if not content.whole and (translucent or _displaces(content.thing)):
                 raise ValueError(
                     f"what refracts must lie inside an object or outside, got {content.name} partly inside "
