@@ -145,10 +145,10 @@ def _dentine() -> SpectralMedium:
 
 _MAKERS: dict[str, Callable[[], Tissue]] = {
     "blood": lambda: Tissue(
-        tissue(2.34, 0.0, 0.93, blood=1.0, oxygenation=0.98, water=0.55, g=0.98, n=1.4),
+        tissue(2.2, 0.0, 0.66, blood=1.0, oxygenation=0.98, water=0.55, g=0.98, n=1.4),
         {"oxygenation": (0.6, 1.0)},
-        "Jacques 2013, table 1 (Alexandrakis et al. 2005); sigma_s at 500 nm and g as in SIMPA 1.0.0",
-        ("water: plasma, 55 %", "n: 1.4"),
+        "Jacques 2013, table 1 (Alexandrakis et al. 2005)",
+        ("g: 0.98", "water: plasma, 55 %", "n: 1.4"),
     ),
     "fat": lambda: Tissue(
         tissue(1.93, 0.174, 0.447, fat=1.0, g=0.9, n=1.44),
