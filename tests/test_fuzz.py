@@ -34,7 +34,7 @@ COMPUTES = [  # what is replaced: the properties are of what comes before the co
     "halfspace_sss.neural.training.ablation.ablation", "halfspace_sss.neural.training.recipes.train_universal",
     "halfspace_sss.cli.validate.validate",
     "halfspace_sss.cli.bench._measured", "halfspace_sss.rendering.scenes.reference.render",
-    "halfspace_sss.comparison.model_truths.reflectance_truths", "figures.parts.runner.compute",
+    "halfspace_sss.comparison.model_truths.truths_cost", "figures.parts.runner.compute",
     "halfspace_sss.trade.flat.references", "halfspace_sss.trade.assessing.assess_stage",
     "halfspace_sss.trade.assessing.assess_for", "halfspace_sss.trade.checking.check.check_scene",
     "halfspace_sss.trade.checking.random_scenes.write_scene", "figures.studies.shape_errors.evaluate",

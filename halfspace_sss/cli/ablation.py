@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from halfspace_sss.backend import array_types
 from halfspace_sss.cli.shared import (
     Albedo,
     Backend,
@@ -21,6 +22,7 @@ from halfspace_sss.cli.shared import (
     stated_medium,
     whole,
 )
+from halfspace_sss.kept_rows import KeptRows
 from halfspace_sss.provenance import check_folder, provenance, write_together
 
 if TYPE_CHECKING:
@@ -58,7 +60,10 @@ def ablation_command(
     backend: Backend = "llvm",
     out: OutFolder = Path("ablation"),
 ) -> None:
-    """Train the paper's network, `neural_material` and what lies between them, at equal time and at equal data."""
+    """Train the paper's network, `neural_material` and what lies between them, at equal time and at equal data.
+
+    48 trainings by default, about 20 min; one that was ended goes on after the trainings that it has finished.
+    """
     if find_spec("torch") is None:
         raise ValueError("training needs torch: `pip install halfspace-sss[train]`")
     from halfspace_sss.neural.training import ablation as variants
@@ -68,14 +73,20 @@ def ablation_command(
     title, medium = _medium(material, channel, given)
     budgets = _budgets(seconds, samples) or variants.BUDGETS
     check_folder(out)
+    runs = variants.trainings(medium, budgets, seeds, seed)
+    array_types(backend)
+    how = {"medium": repr(medium.in_mfp()), "recipe": repr(STANDARD), "seed": seed, "backend": backend}
+    kept = KeptRows(out / "ablation.part", how)
+    typer.echo(variants.cost(run for name, run in runs.items() if name not in kept), err=True)
     with Bar("ablation") as bar:
         table = variants.ablation(
-            medium, STANDARD, budgets, seeds, seed, backend=backend,
+            medium, STANDARD, budgets, seeds, seed, backend=backend, kept=kept,
             progress=lambda what, done, total: bar.show(done, total, what),
         )  # fmt: skip
     summary, caption = variants.summary(table), variants.caption(budgets)
     how = {"medium": title, "budgets": [str(b) for b in budgets], "seeds": seeds, "seed": seed, "backend": backend}
     files = _write(out, table, summary, caption, how)
+    kept.finish()
     screen = console()
     for budget, rows in summary.groupby("budget", sort=False):
         noise = _number(rows["noise"].mean())

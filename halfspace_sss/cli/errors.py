@@ -69,7 +69,10 @@ def errors_command(
         bool, typer.Option("--as-trained", help="Held-out media as for the training: a third of them with g near 1.")
     ] = False,
     truths: Annotated[
-        bool, typer.Option("--truths", help="Reflectance against published and exact values instead.")
+        bool,
+        typer.Option(
+            "--truths", help="Reflectance against published and exact values instead: minutes; goes on where it was."
+        ),
     ] = False,
     scene: Annotated[
         Path | None, typer.Option(help="Mitsuba XML file: radiance of an object of it against walks instead.")
@@ -163,16 +166,22 @@ def object_table(rows: Sequence[ObjectError]) -> Any:
 
 def _truths(others: bool, names: list[str] | None, out: Path) -> None:
     """Reflectance against the packaged truths: files and a summary."""
-    from halfspace_sss.comparison.model_truths import reflectance_truths, truth_summary
+    from halfspace_sss.comparison.model_truths import reflectance_truths, truth_summary, truths_cost
+    from halfspace_sss.kept_rows import KeptRows
     from halfspace_sss.provenance import write_atomically
 
     if others:
         raise ValueError("truths must stand alone, got it with materials or held-out media")
     _check_models(names)
     check_folder(out)
+    kept = KeptRows(out / "truths.part", {"what": "truths"})
+    before, (number, seconds) = len(kept), truths_cost(names or None, kept)
+    note = f", after {before} that were kept" if before else ""
+    typer.echo(f"{number} reflectances, about {max(seconds, 1):.0f} s{note}", err=True)
     with Bar("truths") as bar:
-        table = reflectance_truths(names or None, lambda what, done, total: bar.show(done, total))
+        table = reflectance_truths(names or None, lambda what, done, total: bar.show(done, total), kept)
     write_atomically(out / "truths.csv", table.to_csv(index=False, lineterminator="\n"))
+    kept.finish()
     console().print(_rich(truth_summary(table), "relative error of the reflectance (single order included), %"))
     console().print(f"  {out / 'truths.csv'}", highlight=False, markup=False, soft_wrap=True)
 

@@ -10,7 +10,8 @@ Veach and Guibas 1995).
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+import time
+from collections.abc import Container, Iterable, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -18,14 +19,15 @@ import numpy as np
 from halfspace_sss.comparison.model_errors import evaluated
 from halfspace_sss.comparison.truths import Truth, read_truths
 from halfspace_sss.interface.model import BSSRDF, bssrdf, models
-from halfspace_sss.physics import single_scattering
+from halfspace_sss.measure import reflectance_estimate
+from halfspace_sss.measure.integrals import DIFFUSE_COSINES
 from halfspace_sss.physics.fresnel import F_r
 from halfspace_sss.progress import NamedProgress
 
 if TYPE_CHECKING:
     import pandas
 
-__all__ = ["Exits", "exits", "reflectance_truths", "sampled_reflectance", "truth_summary"]
+__all__ = ["Exits", "exits", "reflectance_truths", "sampled_reflectance", "truth_summary", "truths_cost"]
 
 
 LOBES = ((0.6, 0.3), (0.95, 0.03))  # mean cosine about the mirrored direction, width in azimuth of the position
@@ -125,28 +127,33 @@ MEASURES = ("R_d", "R_total")
 POINTS, REPEATS = 2**13, 4  # of each proposal; scrambles
 
 
-def reflectance_truths(names: Iterable[str] | None = None, progress: NamedProgress | None = None) -> pandas.DataFrame:
+def reflectance_truths(
+    names: Iterable[str] | None = None,
+    progress: NamedProgress | None = None,
+    kept: dict[str, list[float]] | None = None,
+) -> pandas.DataFrame:
     """One row per true reflectance and model that accepts its medium: truth, model's value at total order, error.
 
     Args:
         names: of models; None for all.
         progress: called with (what, done, total).
+        kept: reflectances found before; new ones are added.
 
     Media without scattering are left out; R_total includes the surface reflection.
     """
     import pandas
 
-    truths = [t for t in read_truths()[0] if t.measure in MEASURES and float(t.medium.albedo) > 0]
-    rows = []
-    known: dict[tuple, tuple[float, float] | None] = {}
+    names, found = list(models() if names is None else names), {} if kept is None else kept
+    truths, rows = _reflectances(), []
     for k, t in enumerate(truths):
-        for name in models() if names is None else names:
-            key = (name, t.medium.albedo, t.medium.g, t.medium.eta, t.mu_i)
-            if key not in known:
-                known[key] = _reflectance(name, t)
-            if known[key] is None:
+        for name in names:
+            model = _model(name, t)
+            if model is None:
                 continue
-            R, error = (t.factor * v for v in known[key])
+            key = _key(model, t)
+            if key not in found:
+                found[key] = _reflectance(model, t.mu_i)
+            R, error = (t.factor * v for v in found[key])
             if t.measure == "R_total":
                 R += float(F_r(t.mu_i, t.medium.eta))
             m = t.medium
@@ -159,14 +166,47 @@ def reflectance_truths(names: Iterable[str] | None = None, progress: NamedProgre
     return pandas.DataFrame(rows)
 
 
-def _reflectance(name: str, t: Truth) -> tuple[float, float] | None:
-    """Total reflectance without the surface reflection and its error; None if the model refuses the medium."""
+def truths_cost(names: Iterable[str] | None = None, kept: Container[str] = ()) -> tuple[int, float]:
+    """How many reflectances `reflectance_truths` has still to find, and about how many seconds that takes.
+
+    By one of each model, warm; light from everywhere is `DIFFUSE_COSINES` of them.
+    """
+    number, seconds = 0, 0.0
+    for name in models() if names is None else names:
+        asked = ((model, t) for t in _reflectances() if (model := _model(name, t)) is not None)
+        left = {key: one for one in asked if (key := _key(*one)) not in kept}
+        if not left:
+            continue
+        model, _ = next(iter(left.values()))
+        _reflectance(model, 1.0)
+        started = time.perf_counter()
+        _reflectance(model, 1.0)
+        each = time.perf_counter() - started
+        seconds += each * sum(DIFFUSE_COSINES if t.mu_i == "diffuse" else 1 for _, t in left.values())
+        number += len(left)
+    return number, seconds
+
+
+def _reflectances() -> list[Truth]:
+    return [t for t in read_truths()[0] if t.measure in MEASURES and float(t.medium.albedo) > 0]
+
+
+def _model(name: str, t: Truth) -> BSSRDF | None:
+    """None if the model refuses the medium."""
     try:
-        model = bssrdf(name, t.medium)
+        return bssrdf(name, t.medium)
     except ValueError:
         return None
-    R, error = sampled_reflectance(model, t.mu_i)
-    return (R, error) if model.orders == "total" else (R + single_scattering.reflectance(t.medium, t.mu_i), error)
+
+
+def _key(model: BSSRDF, t: Truth) -> str:
+    m = t.medium
+    return f"{model.name} {' '.join(model.checksums)} {float(m.albedo)!r} {float(m.g)!r} {m.eta!r} {t.mu_i}"
+
+
+def _reflectance(model: BSSRDF, mu_i: float | str) -> list[float]:
+    """Total reflectance without the surface reflection and its error."""
+    return [float(v) for v in reflectance_estimate(model, mu_i, "total")]
 
 
 def sampled_reflectance(model: BSSRDF, mu_i: float | str, seed: int = 0, points: int = POINTS) -> tuple[float, float]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import TYPE_CHECKING, Any
@@ -28,7 +28,7 @@ from halfspace_sss.progress import NamedProgress
 if TYPE_CHECKING:
     import pandas
 
-__all__ = ["BUDGETS", "VARIANTS", "Variant", "ablation", "caption", "summary"]
+__all__ = ["BUDGETS", "VARIANTS", "Variant", "ablation", "caption", "cost", "summary", "trainings"]
 
 SETS = 2  # of 8 directions to compare with: the wide networks take longer to be asked than to be trained
 BUDGETS = (Seconds(20.0), Samples(1_000_000))
@@ -90,6 +90,7 @@ def ablation(
     *,
     backend: str = "llvm",
     progress: NamedProgress | None = None,
+    kept: dict[str, dict[str, float]] | None = None,
 ) -> pandas.DataFrame:
     """Train every variant within the same budgets on the same maps; one row per seed, budget and variant.
 
@@ -106,31 +107,54 @@ def ablation(
         seed: of the maps; the trainings have the seeds from this one on.
         backend: of the maps, "llvm" or "cuda".
         progress: called with (what comes next, trainings done, trainings in all).
+        kept: rows found before, of the same medium, recipe, seed of maps and backend; new ones are added.
 
     Raises:
         ValueError: an argument is out of range; nothing has been traced then.
     """
     import pandas
 
+    runs = trainings(medium, budgets, seeds, seed)
+    array_types(backend)
+    medium, report = medium.in_mfp(), progress or (lambda what, done, total: None)
+    found = {} if kept is None else kept
+    report("maps", sum(name in found for name in runs), len(runs))
+    data = None if found.keys() >= runs.keys() else _data(medium, recipe, int(seed), backend)
+    rows = []
+    for name, (k, budget, variant) in runs.items():
+        report(f"{budget}: {variant.name}", len(rows), len(runs))
+        if name not in found:
+            found[name] = _row(variant, *data, recipe.how, budget, k)
+        rows.append({"budget": str(budget), "variant": variant.name, "seed": k} | found[name])
+    report("done", len(rows), len(runs))
+    return pandas.DataFrame(rows)
+
+
+def trainings(
+    medium: Medium, budgets: Sequence[Budget], seeds: int, seed: int
+) -> dict[str, tuple[int, Budget, Variant]]:
+    """Seed, budget and variant of every training, by name; seeds outermost, so that other work meets all variants.
+
+    Arguments and errors as `ablation`.
+    """
     check_scalar_medium(medium)
     if not budgets or len(set(map(str, budgets))) < len(budgets):
         raise ValueError(f"budgets must be one or more different ones, got {', '.join(map(str, budgets)) or 'none'}")
     check_count("seeds", seeds, 1)
     check_count("seed", seed, 0)
-    array_types(backend)
-    medium, report = medium.in_mfp(), progress or (lambda what, done, total: None)
-    variants = [v for v in VARIANTS if not v.warm or in_range(medium)]
-    # seeds outermost, so that what else the computer does meets all variants
-    runs = list(product(range(int(seed), int(seed) + seeds), budgets, variants))
-    report("maps", 0, len(runs))
-    pool, reference = _data(medium, recipe, int(seed), backend)
-    rows = []
-    for k, budget, variant in runs:
-        report(f"{budget}: {variant.name}", len(rows), len(runs))
-        row = {"budget": str(budget), "variant": variant.name, "seed": k}
-        rows.append(row | _row(variant, pool, reference, recipe.how, budget, k))
-    report("done", len(rows), len(runs))
-    return pandas.DataFrame(rows)
+    variants = [v for v in VARIANTS if not v.warm or in_range(medium.in_mfp())]
+    runs = product(range(int(seed), int(seed) + seeds), budgets, variants)
+    return {f"{k}, {budget}, {v.name}": (k, budget, v) for k, budget, v in runs}
+
+
+def cost(runs: Iterable[tuple[int, Budget, Variant]]) -> str:
+    """What trainings take, in words."""
+    budgets = [budget for _, budget, _ in runs]
+    seconds = sum(b.seconds for b in budgets if isinstance(b, Seconds))
+    others = sum(not isinstance(b, Seconds) for b in budgets)
+    parts = [f"{seconds / 60:.3g} min at equal time"] if seconds else []
+    parts += [f"{others} as long as their data take"] if others else []
+    return f"{len(budgets)} trainings: {', '.join(parts) or 'none left'}; maps and comparisons besides"
 
 
 def _data(medium: Medium, recipe: MaterialRecipe, seed: int, backend: str) -> tuple[MapPool, Reference]:

@@ -1,0 +1,89 @@
+"""Long tables that are ended in the middle and started again."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from halfspace_sss.cli import app as cli
+from halfspace_sss.comparison import model_truths
+from halfspace_sss.kept_rows import KeptRows
+
+
+def test_rows_of_the_same_run_are_found_again_and_others_dropped(tmp_path: Path) -> None:
+    path = tmp_path / "deep" / "rows.part"
+    first = KeptRows(path, {"seed": 1})
+    assert not path.parent.exists()  # nothing is written before there is a row
+    first["a"], first["b"] = {"R": 0.1}, [1.5, None]
+    assert KeptRows(path, {"seed": 1}) == {"a": {"R": 0.1}, "b": [1.5, None]}
+    assert KeptRows(path, {"seed": 2}) == {}
+    with path.open("a") as file:
+        file.write('["c", {"R": 0.')  # cut off
+    again = KeptRows(path, {"seed": 1})
+    again["d"] = 2
+    assert list(KeptRows(path, {"seed": 1})) == ["a", "b", "d"]
+    again.finish()
+    assert not path.exists()
+
+
+def _truths(out: Path) -> Any:
+    return CliRunner().invoke(cli.app, ["errors", "--truths", "--model", "better_dipole", "--out", str(out)])
+
+
+def test_truths_say_what_they_take_and_go_on_after_what_is_kept(tmp_path: Path, monkeypatch: Any) -> None:
+    found, asked = model_truths._reflectance, []
+
+    def ended(model: Any, mu_i: Any) -> list[float]:
+        asked.append(mu_i)
+        if len(asked) == 20:
+            raise KeyboardInterrupt
+        return found(model, mu_i)
+
+    monkeypatch.setattr(model_truths, "_reflectance", ended)
+    assert _truths(tmp_path).exit_code != 0
+    assert not (tmp_path / "truths.csv").exists()
+    n = len(KeptRows(tmp_path / "truths.part", {"what": "truths"}))
+    assert n == 20 - 1 - 2  # two of them told the time
+    whole = _truths(tmp_path)
+    assert whole.exit_code == 0 and f"s, after {n} that were kept" in whole.stderr
+    left = int(whole.stderr.split(" reflectances")[0])
+    assert len(asked) == 20 + 2 + left
+    assert not (tmp_path / "truths.part").exists()
+    fresh = _truths(tmp_path / "fresh")
+    assert f"{left + n} reflectances, about " in fresh.stderr
+    assert (tmp_path / "fresh" / "truths.csv").read_text() == (tmp_path / "truths.csv").read_text()
+
+
+def test_an_ablation_goes_on_after_the_trainings_that_it_has_finished(tmp_path: Path, monkeypatch: Any) -> None:
+    pytest.importorskip("torch")
+    from halfspace_sss import materials
+    from halfspace_sss.maps.noisy_maps import CellGrid
+    from halfspace_sss.neural.training import ablation as module
+    from halfspace_sss.neural.training.recipes import MaterialRecipe
+    from halfspace_sss.neural.training.schedules import Fit, Samples
+
+    monkeypatch.setattr(module, "SETS", 1)
+    monkeypatch.setattr(module, "VARIANTS", module.VARIANTS[-3:])
+    how = Fit(steps=1, n_groups=4, n_queries=32)
+    tiny = MaterialRecipe(n_groups=8, events=1e5, grid=CellGrid(4, 4), how=how)
+    arguments = (materials.load("fig10").medium, tiny, [Samples(100)], 1)
+
+    def ends(what: str, done: int, total: int) -> None:
+        if done == 1:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        module.ablation(*arguments, progress=ends, kept=KeptRows(tmp_path / "a", {}))
+    kept = KeptRows(tmp_path / "a", {})
+    assert len(kept) == 1
+    left = [run for name, run in module.trainings(*arguments[:1], *arguments[2:], 0).items() if name not in kept]
+    assert module.cost(left).startswith(f"{len(module.VARIANTS) - 1} trainings: {len(left)} as long as their data take")
+    resumed = module.ablation(*arguments, kept=kept)
+    monkeypatch.setattr(module, "_data", None)  # all rows are there
+    again = module.ablation(*arguments, kept=KeptRows(tmp_path / "a", {}))
+    assert again.equals(resumed)
+    whole = KeptRows(tmp_path / "a", {})
+    assert list(whole)[:1] == list(kept)[:1] and len(whole) == len(module.VARIANTS)
