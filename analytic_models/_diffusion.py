@@ -12,13 +12,13 @@ from halfspace_sss.checks import check_choice
 from halfspace_sss.physics import fresnel
 from halfspace_sss.physics.medium import Medium
 
-__all__ = ["MOMENTS", "Boundary", "Grosjean", "safe_differences", "unit_gauss"]
+__all__ = ["MOMENTS", "DiffuseBoundary", "Grosjean", "safe_differences", "unit_gauss"]
 
 MOMENTS = ("exact", "published")
 
 
 @dataclass(frozen=True)
-class Boundary:
+class DiffuseBoundary:
     """Constants of the surface: weights of fluence and irradiance, A of the extrapolation distance, exit normaliser.
 
     A = (1 - C_E) / (2 C_phi), z_b = 2 A D, N = 4 C_phi(1/eta). Source: d'Eon and Irving 2011.
@@ -33,13 +33,13 @@ class Boundary:
         return (1 - self.C_E) / (2 * self.C_phi)
 
     @staticmethod
-    def of(eta: float, moments: str = "exact") -> Boundary:
+    def of(eta: float, moments: str = "exact") -> DiffuseBoundary:
         """With moments by quadrature ("exact"), or by the polynomials printed in papers ("published", eta <= 2.5)."""
         check_choice("moments", moments, MOMENTS)
         if moments == "exact":
-            return Boundary(fresnel.C_phi(eta), fresnel.C_E(eta), 4 * fresnel.C_phi(1 / eta))
+            return DiffuseBoundary(fresnel.C_phi(eta), fresnel.C_E(eta), 4 * fresnel.C_phi(1 / eta))
         two_C_1, three_C_2 = fresnel.published_polynomial_2C_1, fresnel.published_polynomial_3C_2
-        return Boundary((1 - two_C_1(eta)) / 4, (1 - three_C_2(eta)) / 2, 1 - two_C_1(1 / eta))
+        return DiffuseBoundary((1 - two_C_1(eta)) / 4, (1 - three_C_2(eta)) / 2, 1 - two_C_1(1 / eta))
 
 
 @functools.cache
@@ -55,7 +55,7 @@ class Grosjean:
     Source: Grosjean 1956 as used by d'Eon and Irving 2011.
     """
 
-    def __init__(self, medium: Medium, boundary: Boundary) -> None:
+    def __init__(self, medium: Medium, boundary: DiffuseBoundary) -> None:
         m = medium.in_mfp()
         self.albedo_prime = m.albedo_prime
         self.sigma_t_prime = m.sigma_t_prime

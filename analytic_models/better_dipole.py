@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from analytic_models._diffusion import Boundary, Grosjean, safe_differences
+from analytic_models._diffusion import DiffuseBoundary, Grosjean, safe_differences
 from halfspace_sss.interface.model import Separable
 from halfspace_sss.interface.query import Query
 from halfspace_sss.physics.medium import Medium
@@ -36,7 +36,7 @@ class BetterDipole(Separable):
     def __init__(self, medium: Medium, *, moments: str = "exact") -> None:
         super().__init__(medium)
         self.moments = moments
-        self._boundary = Boundary.of(medium.eta, moments)
+        self._boundary = DiffuseBoundary.of(medium.eta, moments)
         self._c = Grosjean(medium, self._boundary)
 
     @property

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from analytic_models._diffusion import Boundary, safe_differences
+from analytic_models._diffusion import DiffuseBoundary, safe_differences
 from halfspace_sss.interface.model import BSSRDF
 from halfspace_sss.interface.query import Query
 from halfspace_sss.physics.medium import Medium
@@ -17,10 +17,10 @@ __all__ = ["DirectionalDipole"]
 R_MIN = 1e-6  # mean free paths
 
 
-class _Constants:
+class _Coefficients:
     """Constants in mean free paths; D = 1/(3 sigma_t'), d_e = 2.131 D / sqrt(albedo'), h = 2 A d_e."""
 
-    def __init__(self, medium: Medium, boundary: Boundary) -> None:
+    def __init__(self, medium: Medium, boundary: DiffuseBoundary) -> None:
         m = medium.in_mfp()
         self.D = 1 / (3 * m.sigma_t_prime)
         self.sigma_tr = np.sqrt(3 * m.sigma_a * m.sigma_t_prime)
@@ -56,8 +56,8 @@ class DirectionalDipole(BSSRDF):
     def __init__(self, medium: Medium, *, moments: str = "exact") -> None:
         super().__init__(medium)
         self.moments = moments
-        self._boundary = Boundary.of(medium.eta, moments)
-        self._c = _Constants(medium, self._boundary)
+        self._boundary = DiffuseBoundary.of(medium.eta, moments)
+        self._c = _Coefficients(medium, self._boundary)
 
     def G(self, q: Query) -> Any:
         return q.lib.maximum(self.G_unclamped(q), 0.0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from analytic_models._diffusion import Boundary, Grosjean, safe_differences, unit_gauss
+from analytic_models._diffusion import DiffuseBoundary, Grosjean, safe_differences, unit_gauss
 from halfspace_sss.checks import check_choice
 from halfspace_sss.interface.model import BSSRDF
 from halfspace_sss.interface.query import Query
@@ -51,7 +51,7 @@ class PhotonBeamDiffusion(BSSRDF):
             raise ValueError(f"n_samples must be an integer in [2, 1000], got {n_samples!r}")
         check_choice("kappa", kappa, KAPPAS)
         self.n_samples, self.kappa, self.moments = n_samples, kappa, moments
-        self._boundary = Boundary.of(medium.eta, moments)
+        self._boundary = DiffuseBoundary.of(medium.eta, moments)
         self._c = Grosjean(medium, self._boundary)
         self._kappa_rate = 2 * (self._c.sigma_t_prime if kappa == "reduced" else 1 + 0 * self._c.sigma_t_prime)
 

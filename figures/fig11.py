@@ -11,7 +11,7 @@ from figures.computing.contenders import MODELS, OF_OBJECTS, VOLUMES, WALK, cont
 from figures.computing.images import check_denoiser, denoised, guides, noise_of, stops_of
 from figures.computing.learnt import FULL_GEOMETRY, TRAIN_SECONDS, train_scan, training_of, weight_files, with_weights
 from figures.computing.scenes import BUNNY, prepare
-from figures.computing.timed import Timed, alternating, pass_size
+from figures.computing.timed import TimedRender, alternating, pass_size
 from figures.drawing.error_tables import label
 from figures.drawing.image_grid import image_grid
 from figures.drawing.page import page
@@ -90,7 +90,7 @@ def _key(name: str, state: str) -> str:
     return f"{name.replace(' ', '_')}-{state}"
 
 
-def _numbers(timed: Timed, seconds: float) -> dict[str, Any]:
+def _numbers(timed: TimedRender, seconds: float) -> dict[str, Any]:
     return {
         "spp": timed.spp,
         "seconds": timed.seconds,

@@ -23,7 +23,7 @@ from figures.computing.learnt import (
     with_weights,
 )
 from figures.computing.scenes import BUNNY, MATERIALS, SCANS, prepare
-from figures.computing.timed import Timed, alternating, rendered
+from figures.computing.timed import TimedRender, alternating, rendered
 from figures.drawing import error_tables
 from figures.modelling.objects import TISSUES, VARYING, tissue
 from figures.parts.part import Part, Result, Task
@@ -156,7 +156,7 @@ def _compiled(task: Task) -> dict[str, Any]:
     return scenes
 
 
-def errors(timed: Timed, truth: Result, mask: np.ndarray, is_exact: bool) -> dict[str, float]:
+def errors(timed: TimedRender, truth: Result, mask: np.ndarray, is_exact: bool) -> dict[str, float]:
     """Mean squared errors of one pass, about a long independent image of the same method and about the truth.
 
     The independent image of a model is the average of all other passes; that of a path tracer is the truth itself.

@@ -12,14 +12,14 @@ import numpy as np
 from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.progress import Progress
 
-__all__ = ["Timed", "alternating", "pass_size", "rendered"]
+__all__ = ["TimedRender", "alternating", "pass_size", "rendered"]
 
 MOST_LANES = 2**22  # camera rays of a pass, for memory
 GROWTH, TOLERANCE, MOST_TRIALS = 16, 0.15, 8  # of the number of samples of a pass that is looked for
 
 
 @dataclass(frozen=True, eq=False)
-class Timed:
+class TimedRender:
     """Passes of a scene.
 
     Attributes:
@@ -105,7 +105,7 @@ def _samples_in(seconds: float, found: list[tuple[int, float]]) -> int:
 def alternating(
     scenes: Mapping[str, Any], spp: Mapping[str, int], seed: int, *, passes: int | None = None,
     seconds: float | None = None, progress: Progress | None = None,
-) -> dict[str, Timed]:  # fmt: skip
+) -> dict[str, TimedRender]:  # fmt: skip
     """Render scenes in turn, a pass of each, until every one has its passes or its seconds.
 
     Args:
@@ -144,6 +144,6 @@ def alternating(
             if progress is not None:
                 progress(int(1000 * sum(min(share(n), 1.0) for n in scenes)), 1000 * len(scenes))
     return {
-        name: Timed(np.stack(images[name]), len(t) * spp[name], tuple(t), tuple(of_cpu[name]))
+        name: TimedRender(np.stack(images[name]), len(t) * spp[name], tuple(t), tuple(of_cpu[name]))
         for name, t in times.items()
     }

@@ -64,7 +64,7 @@ def image_grid(
     columns = _columns(scenes, crops, exposures)
     figure, cell = Figure(), (width - NAME - GAP * (len(columns) - 1)) / len(columns)
     rows = [
-        _Row(name, list(shots), tuple(crops.get(name, ())), exposures.get(name, 0.0), cell)
+        _GridRow(name, list(shots), tuple(crops.get(name, ())), exposures.get(name, 0.0), cell)
         for name, shots in scenes.items()
     ]
     height = TITLE + sum(row.height for row in rows) + ROW_GAP * (len(rows) - 1)
@@ -82,7 +82,7 @@ def image_grid(
 
 
 @dataclass(frozen=True)
-class _Row:
+class _GridRow:
     """A scene, and the sizes of what is drawn of it in a cell of given width, inches."""
 
     name: str
@@ -155,11 +155,11 @@ def _columns(
     return list(dict.fromkeys(shot.label for shots in scenes.values() for shot in shots))
 
 
-def _shot(row: _Row, label: str) -> Shot:
+def _shot(row: _GridRow, label: str) -> Shot:
     return next((shot for shot in row.shots if shot.label == label), absent(label))
 
 
-def _draw_row(page: _Page, row: _Row, columns: Sequence[str], top: float, printed: Sequence[str]) -> None:
+def _draw_row(page: _Page, row: _GridRow, columns: Sequence[str], top: float, printed: Sequence[str]) -> None:
     name = row.name + (f" ({row.exposure:+g} stops)" if row.exposure else "")
     page.text(NAME - 0.05, top + row.pictures_height / 2, name, rotation=90, ha="right", va="center")
     numbers = [shot.numbers[printed[0]] for shot in row.shots if printed and printed[0] in shot.numbers]
@@ -195,14 +195,14 @@ def _draw_absent(ax: Axes, why: str) -> None:
     )
 
 
-def _draw_image(ax: Axes, row: _Row, image: np.ndarray) -> None:
+def _draw_image(ax: Axes, row: _GridRow, image: np.ndarray) -> None:
     ax.imshow(srgb(image, row.exposure), aspect="auto")
     for crop, color in zip(row.crops, CROP_COLORS):
         frame = (crop.x - 0.5, crop.y - 0.5), crop.width, crop.height
         ax.add_patch(Rectangle(*frame, fill=False, edgecolor=color, linewidth=0.7))
 
 
-def _draw_strip(page: _Page, row: _Row, shot: Shot, x: float, top: float) -> None:
+def _draw_strip(page: _Page, row: _GridRow, shot: Shot, x: float, top: float) -> None:
     """The crops, and the FLIP map or, for a reference, the scale of the maps."""
     step = row.slot_width + GAP / 2 if row.slots else 0.0
     for k, (crop, color) in enumerate(zip(row.crops, CROP_COLORS)):

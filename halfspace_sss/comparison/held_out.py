@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from halfspace_sss.comparison.model_errors import Reference, model_error, reference_maps
+from halfspace_sss.comparison.model_errors import TracedMaps, model_error, reference_maps
 from halfspace_sss.interface.model import bssrdf, models
 from halfspace_sss.maps.grid import draw_media
 from halfspace_sss.maps.noisy_maps import CellGrid
@@ -45,14 +45,14 @@ def held_out_media(n: int, seed: int = 0, as_trained: bool = False) -> list[Medi
 def references(
     media: list[Medium], events: float, seed: int = 0, block: int = BLOCK,
     progress: NamedProgress | None = None, backend: str = "llvm",
-) -> list[Reference]:  # fmt: skip
+) -> list[TracedMaps]:  # fmt: skip
     """Traced maps of the media: 128 unseen pairs of directions each, `events` over all."""
     return reference_maps(media, 1, GRID, block, events, (HELD_OUT_SEED, seed), progress, backend)
 
 
 def error_table(
     labels: Iterable[str],
-    found: list[Reference],
+    found: list[TracedMaps],
     names: Iterable[str] | None = None,
     progress: NamedProgress | None = None,
 ) -> pandas.DataFrame:

@@ -23,7 +23,7 @@ from halfspace_sss.physics.medium import Medium
 from halfspace_sss.physics.phase import eval_hg
 from halfspace_sss.progress import NamedProgress
 
-__all__ = ["ModelError", "Reference", "cell_energies", "evaluated", "model_error", "reference_maps"]
+__all__ = ["ModelError", "TracedMaps", "cell_energies", "evaluated", "model_error", "reference_maps"]
 
 
 N_U, FIRST_N_PSI, LAST_N_PSI = 2, 6, 48  # Gauss points of a cell
@@ -131,7 +131,7 @@ class ModelError(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Reference:
+class TracedMaps:
     """Traced maps of one medium: groups of directions, cells, two independent estimates of ∫ G dA per cell.
 
     Args:
@@ -194,7 +194,7 @@ def _weight(mu: np.ndarray, eta: float) -> np.ndarray:
     return mu * F_t(mu, eta)
 
 
-def model_error(model: BSSRDF, reference: Reference, within: tuple[float, float] | None = None) -> ModelError:
+def model_error(model: BSSRDF, reference: TracedMaps, within: tuple[float, float] | None = None) -> ModelError:
     """Error of a model against traced maps of its medium, at the orders of the model; see the module.
 
     Args:
@@ -287,7 +287,7 @@ def reference_maps(
     seed: tuple[int, ...],
     progress: NamedProgress | None = None,
     backend: str = "llvm",
-) -> list[Reference]:
+) -> list[TracedMaps]:
     """Traced maps of scalar media, each with `n_sets` times 8 directions of incidence times 16 of observation.
 
     Args:
@@ -301,4 +301,4 @@ def reference_maps(
     halves = make_pool(Groups(*columns), grid, events, (*seed, 1), None, progress, backend)
     n = n_sets * SET
     maps = [_mean_of_both_ways(p, halves[k * n : (k + 1) * n]) for k, p in enumerate(parts)]
-    return [Reference(m.in_mfp(), p, grid, h, block) for m, p, h in zip(media, parts, maps)]
+    return [TracedMaps(m.in_mfp(), p, grid, h, block) for m, p, h in zip(media, parts, maps)]

@@ -27,7 +27,7 @@ from halfspace_sss.progress import NamedProgress
 if TYPE_CHECKING:
     import pandas
 
-__all__ = ["Exits", "exits", "reflectance_truths", "sampled_reflectance", "truth_summary", "truths_cost"]
+__all__ = ["SampledExits", "exits", "reflectance_truths", "sampled_reflectance", "truth_summary", "truths_cost"]
 
 
 LOBES = ((0.6, 0.3), (0.95, 0.03))  # mean cosine about the mirrored direction, width in azimuth of the position
@@ -35,7 +35,7 @@ NEAR = (1e-3, 50.0)  # mean free paths; their distances are uniform in the logar
 LEAST_MU = 1e-7
 
 
-class Exits(NamedTuple):
+class SampledExits(NamedTuple):
     """Distances r (mm), outside cosines and fluxes of light that leaves, a row for each cosine of incidence.
 
     The fluxes of a row sum up to R(mu_i).
@@ -56,7 +56,7 @@ class _Points(NamedTuple):
     mu_o: np.ndarray
 
 
-def exits(model: BSSRDF, mu_i: Sequence[float | str], points: int, seed: Sequence[int]) -> Exits:
+def exits(model: BSSRDF, mu_i: Sequence[float | str], points: int, seed: Sequence[int]) -> SampledExits:
     """Light that leaves for light that enters at each of the cosines mu_i, or for uniform radiance, "diffuse".
 
     Args:
@@ -68,7 +68,7 @@ def exits(model: BSSRDF, mu_i: Sequence[float | str], points: int, seed: Sequenc
     p = _Points(*(np.stack(values) for values in zip(*rows)))
     S = evaluated(model, (p.r, p.mu_i, math.pi - p.psi, p.mu_o, p.delta - p.psi))
     weight = np.where(np.arange(p.r.shape[1]) < points, 1.0, _weight(p.mu_i))
-    return Exits(p.r, p.mu_o, S * p.mu_o * weight / (_density(model, p) * points))
+    return SampledExits(p.r, p.mu_o, S * p.mu_o * weight / (_density(model, p) * points))
 
 
 def _weight(mu_i: np.ndarray) -> np.ndarray:

@@ -30,7 +30,7 @@ from halfspace_sss.tracing.walk import Scatter, WalkConstants, pass_seed, walk
 __all__ = [
     "CellGrid",
     "Groups",
-    "Launch",
+    "MapLaunch",
     "backbone_mass",
     "draw_directions",
     "load_maps",
@@ -196,7 +196,7 @@ def _launch(
 
 
 @dataclass(frozen=True, eq=False)
-class Launch:
+class MapLaunch:
     """Groups that are traced side by side: `index` says which, `trace` does it.
 
     The number of walks follows from the events of a pilot, so that the result depends on the arguments alone.
@@ -227,7 +227,7 @@ def trace_groups(
     *,
     per_launch: int = 256,
     backend: str = "llvm",
-) -> list[Launch]:
+) -> list[MapLaunch]:
     """Launches of `per_launch` groups that together trace all of them, those of long walks side by side.
 
     Args:
@@ -239,7 +239,7 @@ def trace_groups(
     order = np.argsort((1 - groups.albedo) * (1 - groups.albedo * groups.g), kind="stable")
     parts = [order[at : at + per_launch] for at in range(0, len(order), per_launch)]
     return [
-        Launch(part, groups[part], grid, events * len(part) / len(groups), (*seed, k), backend)
+        MapLaunch(part, groups[part], grid, events * len(part) / len(groups), (*seed, k), backend)
         for k, part in enumerate(parts)
     ]
 

@@ -1,7 +1,7 @@
 """Measures of one model by quadrature: reflectance, profile, moments of the exit, reciprocity."""
 
 from halfspace_sss.measure.integrals import (
-    Estimate,
+    Integral,
     Moments,
     Quadrature,
     ReciprocityGap,
@@ -16,6 +16,6 @@ from halfspace_sss.measure.integrals import (
 )
 
 __all__ = [
-    "Estimate", "Moments", "Quadrature", "ReciprocityGap", "clamped_energy", "energy_table", "moments", "profile",
+    "Integral", "Moments", "Quadrature", "ReciprocityGap", "clamped_energy", "energy_table", "moments", "profile",
     "reciprocity_gap", "reflectance", "reflectance_estimate", "weight_variance",
 ]  # fmt: skip

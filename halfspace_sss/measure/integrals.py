@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     import pandas
 
 __all__ = [
-    "Angles", "Estimate", "Moments", "Quadrature", "ReciprocityGap", "clamped_energy", "cosine_nodes", "distances",
+    "Angles", "Integral", "Moments", "Quadrature", "ReciprocityGap", "clamped_energy", "cosine_nodes", "distances",
     "energy_table", "flux", "lattice_reflectance", "log_sum", "moments", "profile", "reciprocity_gap",
     "reflectance", "reflectance_estimate", "weight_variance",
 ]  # fmt: skip
@@ -257,7 +257,7 @@ DEFAULT = Quadrature()
 DIFFUSE_COSINES = 10  # of incidence, on the lattice
 
 
-class Estimate(NamedTuple):
+class Integral(NamedTuple):
     """A value and its error."""
 
     value: Any
@@ -328,7 +328,7 @@ def reflectance(model: BSSRDF, mu_i: Any = 1.0, order: str | None = None, quadra
     return R + _single(model, mu_i, order)
 
 
-def reflectance_estimate(model: BSSRDF, mu_i: Any = 1.0, order: str | None = None) -> Estimate:
+def reflectance_estimate(model: BSSRDF, mu_i: Any = 1.0, order: str | None = None) -> Integral:
     """`reflectance` with its error: on a lattice the standard error, else the difference from a rule of half as many.
 
     Arguments, shapes and errors as `reflectance`.
@@ -340,8 +340,8 @@ def reflectance_estimate(model: BSSRDF, mu_i: Any = 1.0, order: str | None = Non
     else:
         half = Quadrature(DEFAULT.per_decade // 2, DEFAULT.n_azimuth // 2, DEFAULT.n_mu // 2)
         value = _over_incidence(angles, mu_i, DEFAULT)
-        R = Estimate(value, abs(value - _over_incidence(Angles(model.eval, model.medium, half), mu_i, half)))
-    return Estimate(R.value + _single(model, mu_i, order), R.error)
+        R = Integral(value, abs(value - _over_incidence(Angles(model.eval, model.medium, half), mu_i, half)))
+    return Integral(R.value + _single(model, mu_i, order), R.error)
 
 
 def _check_order(model: BSSRDF, order: str | None) -> None:
@@ -356,7 +356,7 @@ def _single(model: BSSRDF, mu_i: Any, order: str | None) -> Any:
     return single_scattering.reflectance(model.medium, mu_i) if added else 0.0
 
 
-def _lattice(model: BSSRDF, mu_i: Any) -> Estimate:
+def _lattice(model: BSSRDF, mu_i: Any) -> Integral:
     """By the lattice, for a number, an array or "diffuse", with the channel axis last if the medium has one."""
     _check_diffuse(mu_i)
     m = model.medium
@@ -365,7 +365,7 @@ def _lattice(model: BSSRDF, mu_i: Any) -> Estimate:
     mu, w = cosine_nodes(m.eta, DIFFUSE_COSINES) if diffuse else (_cosines(mu_i), None)
     found = np.array([[lattice_reflectance(part, one) for part in parts] for one in mu.ravel().tolist()])
     found = 2 * np.tensordot(w, found, 1) if diffuse else found.reshape(*mu.shape, len(parts), 2)
-    return Estimate(*(v if m.n_channels is not None else v[..., 0][()] for v in (found[..., 0], found[..., 1])))
+    return Integral(*(v if m.n_channels is not None else v[..., 0][()] for v in (found[..., 0], found[..., 1])))
 
 
 def _check_diffuse(mu_i: Any) -> None:

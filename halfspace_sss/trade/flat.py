@@ -16,7 +16,7 @@ import numpy as np
 
 from halfspace_sss.checks import check_choice, check_count, check_interval, renamed
 from halfspace_sss.comparison.held_out import references
-from halfspace_sss.comparison.model_errors import Reference, model_error
+from halfspace_sss.comparison.model_errors import TracedMaps, model_error
 from halfspace_sss.interface.model import BSSRDF, bssrdf
 from halfspace_sss.interface.model import models as registered
 from halfspace_sss.neural.symmetric import channels
@@ -123,7 +123,7 @@ def _check_range(r: tuple[float, float] | None) -> None:
         raise ValueError(f"r must ascend, got {r!r}")
 
 
-def _check_light(m: Medium, found: Reference, within: tuple[float, float]) -> None:
+def _check_light(m: Medium, found: TracedMaps, within: tuple[float, float]) -> None:
     radii = found.block_radii()
     counts = ((radii >= within[0]) & (radii <= within[1]))[:, None, None, :, None]
     if not (found.energies() * counts).sum() > 0:
@@ -144,7 +144,7 @@ class _Row(NamedTuple):
     refusal: str = ""
 
 
-def _row(name: str, media: list[Medium], found: list[Reference], within: list[tuple[float, float]]) -> _Row:
+def _row(name: str, media: list[Medium], found: list[TracedMaps], within: list[tuple[float, float]]) -> _Row:
     errors, noises, seconds = [], [], 0.0
     for m, one, bounds in zip(media, found, within):
         try:

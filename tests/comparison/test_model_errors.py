@@ -10,7 +10,7 @@ import pytest
 
 from halfspace_sss import Medium, bssrdf
 from halfspace_sss.comparison import model_errors
-from halfspace_sss.comparison.model_errors import ModelError, Reference, model_error
+from halfspace_sss.comparison.model_errors import ModelError, TracedMaps, model_error
 from halfspace_sss.maps.noisy_maps import CellGrid, draw_directions
 from halfspace_sss.noise_free import NoiseFree
 
@@ -26,13 +26,13 @@ def _errors(monkeypatch: pytest.MonkeyPatch, off: float) -> list[ModelError]:
     groups = draw_directions(0.9 * one, 0.0 * one, 1.3 * one, rng)
     truth = np.ones((N, 16, GRID.n_u, GRID.n_psi))
     signs = rng.choice([-1.0, 1.0], truth.shape)
-    monkeypatch.setattr(Reference, "model_energies", lambda self, model: truth * (1 + off * signs))
-    monkeypatch.setattr(Reference, "single_energies", lambda self: np.zeros_like(truth))
-    monkeypatch.setattr(Reference, "energies", lambda self: self.halves)
+    monkeypatch.setattr(TracedMaps, "model_energies", lambda self, model: truth * (1 + off * signs))
+    monkeypatch.setattr(TracedMaps, "single_energies", lambda self: np.zeros_like(truth))
+    monkeypatch.setattr(TracedMaps, "energies", lambda self: self.halves)
     found = []
     for _ in range(RUNS):
         halves = truth[:, None] * (1 + rng.standard_normal((N, 2, *truth.shape[1:])) / math.sqrt(FEW_PER_CELL))
-        found.append(model_error(MODEL, Reference(MEDIUM, groups, GRID, halves, 1)))
+        found.append(model_error(MODEL, TracedMaps(MEDIUM, groups, GRID, halves, 1)))
     return found
 
 

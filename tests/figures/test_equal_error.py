@@ -15,7 +15,7 @@ from figures.beyond.equal_error import STEPS, furnace, furnace_models
 from figures.beyond.modelled import MODELLED, modelled_contender, modelled_scene
 from figures.computing.contenders import MODELS, VOLUMES, WALK, contender
 from figures.computing.scenes import MM_PER_UNIT, prepare
-from figures.computing.timed import Timed, rendered
+from figures.computing.timed import TimedRender, rendered
 from figures.drawing import error_tables
 from figures.parts.part import Part, Result, Task
 from full_geometry.learning import training
@@ -94,10 +94,10 @@ def test_the_tables_say_ratios(results: dict[str, Result]) -> None:
     assert "nan" not in files["equal_error.md"]
 
 
-def _noisy(truth: np.ndarray, bias: float, sigma: float, passes: int, spp: int) -> Timed:
+def _noisy(truth: np.ndarray, bias: float, sigma: float, passes: int, spp: int) -> TimedRender:
     rng = np.random.default_rng(spp)
     images = truth + bias + sigma / np.sqrt(spp) * rng.standard_normal((passes, *truth.shape))
-    return Timed(images.astype(np.float32), passes * spp, *[(0.01 * spp,) * passes] * 2)
+    return TimedRender(images.astype(np.float32), passes * spp, *[(0.01 * spp,) * passes] * 2)
 
 
 def test_variance_and_bias_are_told_apart_and_the_noise_of_the_truth_is_taken_off() -> None:

@@ -15,7 +15,7 @@ import pytest
 
 from halfspace_sss import Medium, trace
 from halfspace_sss.comparison import model_errors as errors
-from halfspace_sss.comparison.model_errors import Reference, model_error, reference_maps
+from halfspace_sss.comparison.model_errors import TracedMaps, model_error, reference_maps
 from halfspace_sss.maps.noisy_maps import (
     CellGrid,
     Groups,
@@ -39,15 +39,15 @@ def _joined(parts: list[Groups]) -> Groups:
 
 
 @pytest.fixture(scope="module")
-def references() -> list[Reference]:
+def references() -> list[TracedMaps]:
     """Reciprocal maps of each medium: the same 8 x 16 pairs of directions in all copies."""
     rng = np.random.default_rng(5)
     parts = [_joined([errors._reciprocal_directions(m, 1, GRID.n_psi, rng)] * COPIES) for m in MEDIA]
     halves = make_pool(_joined(parts), GRID, 6e7, (9,)).reshape(len(MEDIA), COPIES * SET, 2, 16, 24, 8)
-    return [Reference(m, p, GRID, errors._mean_of_both_ways(p, h), 1) for m, p, h in zip(MEDIA, parts, halves)]
+    return [TracedMaps(m, p, GRID, errors._mean_of_both_ways(p, h), 1) for m, p, h in zip(MEDIA, parts, halves)]
 
 
-def _copies(reference: Reference, block: int) -> np.ndarray:
+def _copies(reference: TracedMaps, block: int) -> np.ndarray:
     """Energies of blocks, (copy, direction, half, ...)."""
     E = dataclasses.replace(reference, block=block).energies()
     return E.reshape(COPIES, SET, *E.shape[1:])
@@ -55,7 +55,7 @@ def _copies(reference: Reference, block: int) -> np.ndarray:
 
 @over_media
 @pytest.mark.parametrize("i", [0, 4])
-def test_the_sum_over_the_plane_is_the_traced_reflectance(references: list[Reference], k: int, i: int) -> None:
+def test_the_sum_over_the_plane_is_the_traced_reflectance(references: list[TracedMaps], k: int, i: int) -> None:
     """192 pairs of directions, each within 4 standard errors (by luck alone one is not with a chance of 5 %).
 
     What the maps leave out is told by their outermost rows of cells. G grows at most logarithmically towards r = 0, so
@@ -102,7 +102,7 @@ def test_single_energies_are_the_integrals_of_the_exact_single_order(k: int) -> 
     """Cell by cell, but for the points of the quadrature on both sides of an edge."""
     rng, m = np.random.default_rng(k), MEDIA[k]
     groups = draw_directions(*(np.full(8, v) for v in RATIOS[k]), rng)
-    reference = Reference(m, groups, GRID, np.zeros((8, 2, 16, GRID.n_u, GRID.n_psi), np.float32), 1)
+    reference = TracedMaps(m, groups, GRID, np.zeros((8, 2, 16, GRID.n_u, GRID.n_psi), np.float32), 1)
     E = reference.single_energies()
     for pair in [(0, 0), (2, 5), (5, 11), (7, 15)]:
         np.testing.assert_allclose(
@@ -115,7 +115,7 @@ def test_single_energies_sum_to_the_single_reflectance(k: int) -> None:
     """But for r < 0.02 and r > 12 L: nothing is added, and at most a tenth is missing."""
     rng, m = np.random.default_rng(k), MEDIA[k]
     groups = draw_directions(*(np.full(8, v) for v in RATIOS[k]), rng)
-    reference = Reference(m, groups, GRID, np.zeros((8, 2, 16, GRID.n_u, GRID.n_psi), np.float32), 1)
+    reference = TracedMaps(m, groups, GRID, np.zeros((8, 2, 16, GRID.n_u, GRID.n_psi), np.float32), 1)
     mu_i, mu_o = groups.mu_i[:, None], groups.mu_o
     exact = single_scattering.brdf(m, mu_i, mu_o, groups.delta_phi) * mu_i * mu_o
     share = reference.single_energies().sum(axis=(2, 3)) / exact
@@ -124,7 +124,7 @@ def test_single_energies_sum_to_the_single_reflectance(k: int) -> None:
 
 @over_media
 @pytest.mark.parametrize("block", [2, 4])
-def test_the_noise_estimated_from_halves_is_that_over_copies(references: list[Reference], k: int, block: int) -> None:
+def test_the_noise_estimated_from_halves_is_that_over_copies(references: list[TracedMaps], k: int, block: int) -> None:
     """Mean over 16 copies; their spread leaves 1.2 % of uncertainty, cells that few scores meet 3 % of bias."""
     E = _copies(references[k], block)
     mean, total = E.mean(axis=2), E.mean(axis=2).sum() / COPIES
@@ -133,19 +133,19 @@ def test_the_noise_estimated_from_halves_is_that_over_copies(references: list[Re
     assert actual == pytest.approx(estimated, rel=0.07)
 
 
-def _first_copy(reference: Reference, block: int) -> Reference:
+def _first_copy(reference: TracedMaps, block: int) -> TracedMaps:
     return dataclasses.replace(reference, groups=reference.groups[:SET], halves=reference.halves[:SET], block=block)
 
 
 def _answer(monkeypatch: Any, E: np.ndarray) -> Any:
     """A model that has these energies."""
-    monkeypatch.setattr(Reference, "model_energies", lambda self, model: E)
+    monkeypatch.setattr(TracedMaps, "model_energies", lambda self, model: E)
     return type("Model", (), {"orders": "multiple"})()
 
 
 @over_media
 def test_the_error_of_the_mean_of_other_seeds_is_noise_and_is_removed(
-    references: list[Reference], monkeypatch: Any, k: int
+    references: list[TracedMaps], monkeypatch: Any, k: int
 ) -> None:
     """What is left is the noise of the 15 other copies, 0.26 of that of one, and the uncertainty of the noise."""
     E = _copies(references[k], 4)
@@ -171,7 +171,7 @@ def test_what_is_left_of_the_error_of_the_truth_falls_with_the_events(monkeypatc
 
 @pytest.mark.parametrize(("factor", "bias"), [(0.0, -1.0), (2.0, 1.0)])
 def test_a_model_that_is_off_by_all_has_an_error_of_one(
-    references: list[Reference], monkeypatch: Any, factor: float, bias: float
+    references: list[TracedMaps], monkeypatch: Any, factor: float, bias: float
 ) -> None:
     E = factor * _copies(references[1], 4).mean(axis=(0, 2))
     error = model_error(_answer(monkeypatch, E), _first_copy(references[1], 4))

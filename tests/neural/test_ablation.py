@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 from halfspace_sss import Medium, materials
 from halfspace_sss.arrays import library
 from halfspace_sss.cli import app as cli
-from halfspace_sss.comparison.model_errors import Reference, model_error, reference_maps
+from halfspace_sss.comparison.model_errors import TracedMaps, model_error, reference_maps
 from halfspace_sss.maps import noisy_maps
 from halfspace_sss.maps.noisy_maps import CellGrid, draw_directions, make_pool
 from halfspace_sss.neural.paper_model import paper_inputs
@@ -52,7 +52,7 @@ def pool() -> MapPool:
 
 
 @pytest.fixture(scope="module")
-def reference() -> Reference:
+def reference() -> TracedMaps:
     return reference_maps([FIG10], 1, GRID, 2, 1e6, (2,))[0]
 
 
@@ -88,7 +88,7 @@ SQUARED = [v for v in VARIANTS if v.learned == "S"]
 
 
 @pytest.mark.parametrize("variant", RELATIVE, ids=[v.name for v in RELATIVE])
-def test_a_variant_lowers_its_error_against_its_start(variant: Variant, pool: MapPool, reference: Reference) -> None:
+def test_a_variant_lowers_its_error_against_its_start(variant: Variant, pool: MapPool, reference: TracedMaps) -> None:
     def error(learner: Any) -> float:
         return model_error(model_of(learner, reference.medium), reference).error
 
@@ -104,7 +104,7 @@ def test_a_variant_of_squared_error_lowers_it_against_its_start(variant: Variant
     assert after < 0.9 * before
 
 
-def test_the_variant_that_starts_from_the_universal_network_starts_ahead(pool: MapPool, reference: Reference) -> None:
+def test_the_variant_that_starts_from_the_universal_network_starts_ahead(pool: MapPool, reference: TracedMaps) -> None:
     cold, warm = (
         model_error(model_of(v.learner(reference.medium, pool, 0), reference.medium), reference).error
         for v in VARIANTS[-2:]

@@ -16,7 +16,7 @@ import torch
 
 import halfspace_sss
 from halfspace_sss import Medium, materials
-from halfspace_sss.comparison.model_errors import Reference, model_error, reference_maps
+from halfspace_sss.comparison.model_errors import TracedMaps, model_error, reference_maps
 from halfspace_sss.maps.grid import draw_media
 from halfspace_sss.maps.noisy_maps import CellGrid, draw_directions, make_pool
 from halfspace_sss.neural.hypernetwork import Hypernetwork
@@ -68,7 +68,7 @@ def pool() -> MapPool:
 
 
 @pytest.fixture(scope="module")
-def reference() -> Reference:
+def reference() -> TracedMaps:
     return reference_maps([FIG10], 1, GRID, 2, 1e6, (2,))[0]
 
 
@@ -76,7 +76,7 @@ def _batches(pool: MapPool) -> Source:
     return pool.batches(HOW.n_groups, HOW.n_queries)
 
 
-def test_a_trained_network_beats_its_untrained_start(pool: MapPool, reference: Reference) -> None:
+def test_a_trained_network_beats_its_untrained_start(pool: MapPool, reference: TracedMaps) -> None:
     subject = MaterialSubject(warm=False)
     learner = subject.learner(reference.medium, pool, 0)
     before = model_error(subject.model(reference.medium, learner), reference).error
@@ -92,7 +92,7 @@ def test_a_trained_network_of_the_paper_beats_its_untrained_start_by_its_own_los
     assert float(learner.loss(batch).detach()) < 0.8 * before
 
 
-def test_a_trained_universal_network_beats_its_untrained_start(reference: Reference) -> None:
+def test_a_trained_universal_network_beats_its_untrained_start(reference: TracedMaps) -> None:
     def error(learner: Hyper) -> float:
         arrays = learner.parameters_as_arrays()
         layers = tuple((arrays[f"medium_{k}_W"], arrays[f"medium_{k}_b"]) for k in range(3))

@@ -13,7 +13,7 @@ import torch
 
 from halfspace_sss.backend import array_types
 from halfspace_sss.checks import check_count
-from halfspace_sss.comparison.model_errors import Reference, model_error, reference_maps
+from halfspace_sss.comparison.model_errors import TracedMaps, model_error, reference_maps
 from halfspace_sss.maps.noisy_maps import draw_directions, make_pool
 from halfspace_sss.neural.hypernetwork import in_range
 from halfspace_sss.neural.training.ablation_learner import Factored, SharedTurn, drawn_by_area, model_of
@@ -157,7 +157,7 @@ def cost(runs: Iterable[tuple[int, Budget, Variant]]) -> str:
     return f"{len(budgets)} trainings: {', '.join(parts) or 'none left'}; maps and comparisons besides"
 
 
-def _data(medium: Medium, recipe: MaterialRecipe, seed: int, backend: str) -> tuple[MapPool, Reference]:
+def _data(medium: Medium, recipe: MaterialRecipe, seed: int, backend: str) -> tuple[MapPool, TracedMaps]:
     """Maps to learn from, as for `neural.train`, and others to compare with."""
     n = recipe.n_groups
     ratios = (np.full(n, float(v)) for v in (medium.albedo, medium.g, medium.eta))
@@ -169,7 +169,7 @@ def _data(medium: Medium, recipe: MaterialRecipe, seed: int, backend: str) -> tu
 
 
 def _row(
-    variant: Variant, pool: MapPool, reference: Reference, how: Fit, budget: Budget, seed: int
+    variant: Variant, pool: MapPool, reference: TracedMaps, how: Fit, budget: Budget, seed: int
 ) -> dict[str, float]:
     if variant.by_area:
         pool = drawn_by_area(pool)
