@@ -28,7 +28,7 @@ A `Part` is a name, parameters ready for JSON, a function and its estimated work
   the same object are, is taken from there.
 - `needs` names parts that stand before it in the list; their results are in `task.needed`. `task.folder` is kept
   until the part is done: passes of a long render stored there survive an interruption.
-- For images: `figures.drawing.shot.compared` makes shots with FLIP, relMSE and maps from results;
+- For images: `figures.computing.images.compared` makes shots with FLIP, relMSE and maps from results;
   `figures.drawing.image_grid` and `figures.drawing.page` draw the same {scene: [shots]} as PDF and
   PNG, and as a page that flips between them.
 - Seconds for a unit of `work` are measured: what a draft took says what the paper quality will take.

@@ -9,7 +9,7 @@ import numpy as np
 
 from figures.beyond.objects import VIEWS, View, scene
 from figures.computing.contenders import OF_OBJECTS
-from figures.computing.images import guides, stops_of
+from figures.computing.images import Shot, compared, guides, stops_of
 from figures.computing.learnt import (
     FULL_GEOMETRY,
     TRAIN_SECONDS,
@@ -23,7 +23,6 @@ from figures.computing.scenes import environment_file, prepare
 from figures.drawing.error_tables import label
 from figures.drawing.image_grid import image_grid
 from figures.drawing.page import page
-from figures.drawing.shot import Shot, compared
 from figures.drawing.style import paper, saved
 from figures.modelling.objects import TISSUES, tissue
 from figures.parts.part import Part, Result, Task

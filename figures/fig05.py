@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 
 from figures.computing.contenders import long_walk
-from figures.computing.images import srgb
+from figures.computing.images import FLIP, RELATIVE_MSE, compared, srgb
 from figures.computing.learnt import weights_in
 from figures.computing.scenes import BUNNY, bunny_scene, prepare
-from figures.drawing.shot import FLIP, RELATIVE_MSE, compared
 from figures.drawing.style import TEXT, Look, paper, saved
 from figures.parts.part import Part, Result, Task
 from full_geometry.models.storing import KIND

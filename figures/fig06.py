@@ -7,12 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from figures.computing.images import stops_of
+from figures.computing.images import Shot, compared, stops_of
 from figures.computing.learnt import FULL_GEOMETRY, TRAIN_SECONDS, train_scan, training_of, with_weights
 from figures.computing.scenes import BUNNY, ENVIRONMENTS, bunny_scene, environment, environment_file, prepare
 from figures.drawing.image_grid import image_grid
 from figures.drawing.page import page
-from figures.drawing.shot import Shot, compared
 from figures.drawing.style import paper, saved
 from figures.parts.part import Part, Result, Task
 

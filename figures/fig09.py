@@ -10,13 +10,12 @@ from typing import Any
 import numpy as np
 
 from figures.computing import contenders
-from figures.computing.images import noise_of, stops_of
+from figures.computing.images import FLIP, Shot, compared, noise_of, stops_of
 from figures.computing.learnt import FULL_GEOMETRY, TRAIN_SECONDS, train_scan, training_of, weight_files, with_weights
 from figures.computing.scenes import BUNNY, MATERIALS, bunny_scene, long_render, prepare
 from figures.drawing.error_tables import label
 from figures.drawing.image_grid import image_grid
 from figures.drawing.page import page
-from figures.drawing.shot import FLIP, Shot, compared
 from figures.drawing.style import paper, saved
 from figures.parts.part import Part, Result, Task, unmodelled
 from halfspace_sss import materials

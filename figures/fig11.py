@@ -8,14 +8,23 @@ from typing import Any
 import numpy as np
 
 from figures.computing.contenders import MODELS, OF_OBJECTS, VOLUMES, WALK, contender, long_walk
-from figures.computing.images import check_denoiser, denoised, guides, noise_of, stops_of
+from figures.computing.images import (
+    FLIP,
+    RELATIVE_MSE,
+    Shot,
+    check_denoiser,
+    compared,
+    denoised,
+    guides,
+    noise_of,
+    stops_of,
+)
 from figures.computing.learnt import FULL_GEOMETRY, TRAIN_SECONDS, train_scan, training_of, weight_files, with_weights
 from figures.computing.scenes import BUNNY, prepare
 from figures.computing.timed import TimedRender, alternating, pass_size
 from figures.drawing.error_tables import label
 from figures.drawing.image_grid import image_grid
 from figures.drawing.page import page
-from figures.drawing.shot import FLIP, RELATIVE_MSE, Shot, compared
 from figures.drawing.style import paper, saved
 from figures.parts.part import Part, Result, Task, unmodelled
 from halfspace_sss import materials

@@ -8,12 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from figures.computing.images import stops_of
+from figures.computing.images import Shot, compared, stops_of
 from figures.computing.learnt import shape_of, weights_in
 from figures.computing.scenes import BUNNY, bunny_scene, prepare
 from figures.drawing.image_grid import image_grid
 from figures.drawing.page import page
-from figures.drawing.shot import Shot, compared
 from figures.drawing.style import paper, saved
 from figures.parts.part import Part, Result, Task
 

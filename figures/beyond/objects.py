@@ -7,11 +7,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from figures.computing.images import check_denoiser, denoised, guides
+from figures.computing.images import Shot, check_denoiser, denoised, guides
 from figures.computing.scenes import environment, environment_file, long_render, prepare
 from figures.drawing.image_grid import image_grid
 from figures.drawing.page import page
-from figures.drawing.shot import Shot
 from figures.drawing.style import paper, saved
 from figures.modelling.objects import (
     OBJECTS,

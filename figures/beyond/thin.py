@@ -8,13 +8,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from figures.computing.images import noise_of, stops_of
+from figures.computing.images import Shot, compared, noise_of, stops_of
 from figures.computing.learnt import weight_files
 from figures.computing.scenes import DRAGON, SCANS, long_render, prepare
 from figures.drawing.error_tables import label
 from figures.drawing.image_grid import image_grid
 from figures.drawing.page import page
-from figures.drawing.shot import Shot, compared
 from figures.drawing.style import paper, saved
 from figures.parts.part import Part, Result, Task, unmodelled
 from figures.studies.held_out import HELD_OUT

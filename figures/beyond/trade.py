@@ -13,7 +13,7 @@ import numpy as np
 from figures.computing.contenders import OF_OBJECTS
 from figures.computing.learnt import FULL_GEOMETRY, TRAIN_SECONDS, train_scan, training_of, weight_files, with_weights
 from figures.computing.scenes import BUNNY, MATERIALS, MM_PER_UNIT, bunny_scene, prepare
-from figures.drawing import trade_tables
+from figures.drawing import trade_plot
 from figures.drawing.page import page
 from figures.drawing.style import paper, saved
 from figures.drawing.trade_plot import image_shots, multiples
@@ -134,13 +134,13 @@ def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
                 shown = enumerate(results[name].numbers["shown"])
                 images = {way: np.asarray(results[name].images[f"image_{k}"]) for k, way in shown}
                 shots[name] = image_shots(images, assessment)
-    table = trade_tables.trade_table(found)
+    table = trade_plot.trade_table(found)
     with paper():
         figure = multiples(found, TOLERANCE)
         files: dict[str, bytes | str] = {f"trade.{ending}": data for ending, data in saved(figure).items()}
     files["trade.csv"] = table.to_csv(index=False, lineterminator="\n", float_format="%.5g")
     knobs = [results[f"{m}, knobs"].numbers["settings"] for m in KNOB_MATERIALS if f"{m}, knobs" in results]
     seconds = max(results[name].numbers["seconds"] for name in shots)
-    files["trade.md"] = trade_tables.markdown(found, table, seconds, [s for settings in knobs for s in settings])
+    files["trade.md"] = trade_plot.markdown(found, table, seconds, [s for settings in knobs for s in settings])
     files["trade.html"] = page("Speed against accuracy", shots)
     return files

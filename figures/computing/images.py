@@ -1,4 +1,4 @@
-"""Images of figures: exposure and sRGB encoding, FLIP and relative squared error, denoising.
+"""Images of figures: exposure and sRGB encoding, FLIP and relative squared error, denoising, shots.
 
 Everything is checked here before the evaluator of FLIP is called, because it ends the whole process on bad input.
 """
@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,8 +17,9 @@ from halfspace_sss.backend import BackendError
 from halfspace_sss.checks import check_choice, check_count, check_finite, check_interval
 
 __all__ = [
-    "LARGEST", "PIXELS_PER_DEGREE", "Difference", "check_denoiser", "check_image", "denoised", "exposure_range",
-    "flip_hdr", "flip_ldr", "guides", "luminance", "mean_flip", "noise_of", "relative_mse", "srgb", "stops_of",
+    "FLIP", "LARGEST", "PIXELS_PER_DEGREE", "RELATIVE_MSE", "Difference", "Shot", "absent", "check_denoiser",
+    "check_image", "compared", "denoised", "exposure_range", "flip_hdr", "flip_ldr", "guides", "luminance",
+    "mean_flip", "noise_of", "relative_mse", "srgb", "stops_of",
 ]  # fmt: skip
 
 
@@ -295,3 +298,64 @@ def mean_flip(reference: np.ndarray, test: np.ndarray) -> float:
     level = float(np.percentile(luminance(reference), BRIGHT))
     exposure = float(np.log2(WHITE / level)) if level > 0 else 0.0
     return flip_ldr(srgb(reference, exposure), srgb(test, exposure)).mean
+
+
+FLIP, RELATIVE_MSE = "FLIP", "relMSE"
+FLOOR = 0.01  # squared radiance, as in the relative error
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One image of a scene.
+
+    Args:
+        label: of the model or method.
+        image: linear radiance (H, W, 3); None where there is none to be shown.
+        numbers: column of a table -> number or text.
+        flip: FLIP map (H, W) in [0, 1]; None for a reference.
+        difference: signed relative difference of luminance (H, W), > 0 where brighter; None for a reference.
+        why: what stands in the place of an image that is not there.
+    """
+
+    label: str
+    image: np.ndarray | None
+    numbers: Mapping[str, float | str] = field(default_factory=dict)
+    flip: np.ndarray | None = None
+    difference: np.ndarray | None = None
+    why: str = ""
+
+    def __post_init__(self) -> None:
+        if self.image is not None:
+            check_image(f"image {self.label!r}", self.image)
+
+
+def absent(label: str, why: str = "not available") -> Shot:
+    """The place of an image that does not exist yet, in a grid or a page."""
+    return Shot(label, None, why=why)
+
+
+def compared(
+    label: str, image: np.ndarray, reference: np.ndarray, *, exposure: float = 0.0, mask: np.ndarray | None = None,
+    numbers: Mapping[str, float | str] | None = None,
+) -> Shot:  # fmt: skip
+    """An image with its FLIP, its relative squared error and both maps against a reference.
+
+    FLIP is that of the displayed images, `srgb(image, exposure)`. The map of differences is of luminance,
+    (Y - Y_ref) / sqrt(Y_ref² + 0.01).
+
+    Args:
+        label: of the model or method.
+        image, reference: linear radiance (H, W, 3); of the image, what noise has brought below 0 counts as 0.
+        exposure: stops, those at which the images are shown.
+        mask: (H, W), true for the pixels that count for the means, e.g. those of the object.
+        numbers: further columns, e.g. {"time, s": 12.5}; they come after FLIP and relMSE.
+
+    Raises:
+        ValueError: the images cannot be compared; see `figures.computing.images`.
+    """
+    image = np.maximum(image, 0)
+    relative = relative_mse(reference, image, mask=mask, floor=FLOOR)
+    flip = flip_ldr(srgb(reference, exposure), srgb(image, exposure), mask=mask)
+    a, b = luminance(reference), luminance(image)
+    found = {FLIP: flip.mean, RELATIVE_MSE: relative.mean, **(numbers or {})}
+    return Shot(label, image, found, flip.map, (b - a) / np.sqrt(a * a + FLOOR))

@@ -14,8 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from halfspace_sss.comparison.held_out import references
-from halfspace_sss.comparison.model_errors import model_error
+from halfspace_sss.comparison.model_errors import model_error, references
 from halfspace_sss.interface.model import model_class
 from halfspace_sss.neural.network import Network
 from halfspace_sss.physics.medium import Medium

@@ -16,8 +16,7 @@ from matplotlib.font_manager import FontProperties
 from matplotlib.patches import Rectangle
 from matplotlib.textpath import TextPath
 
-from figures.computing.images import srgb
-from figures.drawing.shot import FLIP, Shot, absent
+from figures.computing.images import FLIP, Shot, absent, srgb
 from figures.drawing.style import TEXT
 
 __all__ = ["Crop", "image_grid"]
@@ -48,7 +47,7 @@ def image_grid(
     """The figure; draw it under `figures.drawing.style.paper` and write it with `figures.drawing.style.saved`.
 
     FLIP maps and numbers are drawn as they are: `compared` must have had the exposure of the scene. A model that has no
-    image in a scene (`figures.drawing.shot.absent`, or none at all) gets a pale frame that says so.
+    image in a scene (`figures.computing.images.absent`, or none at all) gets a pale frame that says so.
 
     Args:
         scenes: name of a scene -> its images, the reference first; the columns are their labels in order.

@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib import colormaps  # without it there is no page, which must be known before one is drawn
 
-from figures.computing.images import denoised, guides, srgb
-from figures.drawing.shot import FLIP, RELATIVE_MSE, Shot
+from figures.computing.images import FLIP, RELATIVE_MSE, Shot, denoised, guides, srgb
 
 if TYPE_CHECKING:
     from halfspace_sss.rendering.scenes.picture import Picture
@@ -38,8 +37,8 @@ def page(
 
     Args:
         title: heading, and title of the window.
-        scenes: name of a scene -> its images, the reference first. `figures.drawing.shot.compared` makes those with
-            maps, `figures.drawing.shot.absent` keeps a place for what does not exist yet.
+        scenes: name of a scene -> its images, the reference first. `figures.computing.images.compared` makes those with
+            maps, `figures.computing.images.absent` keeps a place for what does not exist yet.
         exposure: stops at which the images are encoded; the slider of the page starts from there.
         caption: a sentence under the title.
         notes: what the numbers are, below the table.

@@ -1,22 +1,29 @@
-"""Speed against accuracy: each way as a point, time to a given noise over the bias, and total error over time."""
+"""Speed against accuracy: each way as a point, total error over time, and the table of every way on every scene."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from figures.computing.images import Shot, compared
 from figures.drawing.page import page
-from figures.drawing.shot import Shot, compared
 from figures.drawing.style import TEXT, TRACED, Look, look, paper, saved
+from halfspace_sss.noise_free import short
+from halfspace_sss.trade.advice import Job, advise
 from halfspace_sss.trade.images import TradePicture
 from halfspace_sss.trade.results import Assessment, ObjectTrade, WayTrade
 from halfspace_sss.trade.ways import NO_SINGLE
 
-__all__ = ["draw", "image_shots", "multiples", "render", "trade_panels"]
+if TYPE_CHECKING:
+    import pandas
+
+__all__ = ["JOBS", "draw", "image_shots", "markdown", "multiples", "render", "trade_panels", "trade_table"]
+
 
 NOISE = 0.01  # of the mean radiance, to which times are
 LEAST = 0.003  # smallest bias that is drawn; what is below lies there, an arrow down
@@ -215,3 +222,110 @@ def _page(picture: TradePicture) -> str:
 
 def _numbers(row: WayTrade) -> dict[str, float | str]:
     return {"bias, %": row.told_bias, "variance": f"{row.variance:.3g}", "s a million": f"{1e6 * row.seconds:.3g}"}
+
+
+Scenes = Mapping[tuple[str, str, str], ObjectTrade]
+JOBS = ((0.02, 1), (0.05, 1), (0.05, 100), (0.1, 1), (0.2, 1))  # tolerance, images
+INTRODUCTION = """\
+# Speed against accuracy on scenes
+
+`halfspace-sss figures all trade` makes this page, the figure, its data (shown by `halfspace-sss trade`) and the page
+to flip between the images. The bunny is 37 mm tall; the spikes, a ball with bumps and thorns, are about as large
+across. The small light stands behind the object: what the camera sees of it was transmitted.
+
+| term | meaning |
+|---|---|
+| bias | relative error of radiance at any number of samples, noise of both sides subtracted, ± standard error |
+| points | root mean square over visible points and channels |
+| < x | bias lost in noise, below x in 95 % of cases |
+| cost | variance of a sample times its seconds: the time to a given noise |
+| seconds | of the processor, all cores together, without compilation |
+| variance | without the brightest of 10⁴ samples, as filters take fireflies better than samples do |
+
+What cannot be told in {seconds:g} s for a scene and all ways is left open. `full_geometry` learnt the bunny but not
+the spikes, which stand for a new object. Unscattered light is in the walks and not in the half-space models: most of
+their bias of ketchup.
+"""
+KNOBS = """\
+Bunny, small light; cost over that of the usual setting, error where the setting has one.
+
+| knob | meaning |
+|---|---|
+| entries | parameter of `bssrdf` |
+| channels in one walk | no setting: the cost of a walk for each channel, which one walk for all saves |
+| nodes | `n_samples` of photon beam diffusion: time of S alone, error against walks of the half-space |
+| precision | of a network, measured as nodes; no setting: single precision, on CUDA half |
+"""
+
+
+def trade_table(found: Scenes) -> pandas.DataFrame:
+    """A row for each scene and way that renders it."""
+    import pandas
+
+    rows: list[dict[str, Any]] = []
+    for (material, shape, light), o in found.items():
+        for w in o.ways:
+            if w.refusal:
+                continue
+            row: dict[str, Any] = {"material": material, "shape": shape, "light": light, "way": w.way, "bias": w.bias}
+            row |= {"bias_standard_error": w.bias_error, "bias2": w.bias2, "bias2_standard_error": w.bias2_error}
+            row["variance"] = w.variance
+            row |= {"seconds_per_million": 1e6 * w.seconds, "cost": 1e6 * w.seconds * w.variance}
+            rows.append(row | {"flip": w.flip, "flip_noise": w.flip_noise})
+    return pandas.DataFrame(rows)
+
+
+def markdown(found: Scenes, table: pandas.DataFrame, seconds: float, settings: Sequence[Mapping[str, Any]] = ()) -> str:
+    """What is recommended, the bias of every way, and its cost; `seconds` is what each scene had."""
+    lines = [INTRODUCTION.format(seconds=seconds), "## The cheapest way that keeps a tolerance", ""]
+    lines += ["For images of 512 x 512 pixels; in brackets seconds of all cores for all of them, training counted.", ""]
+    lines.append("| material | shape | light | " + " | ".join(_job(*job) for job in JOBS) + " |")
+    lines.append("|---|---|---|" + "---|" * len(JOBS))
+    for scene, o in found.items():
+        told = []
+        for tolerance, images in JOBS:
+            option = advise(Assessment((o,), 0.0, 0.0, 0), Job(tolerance, images)).objects[0].options[0]
+            told.append(f"{option.way} ({short(option.seconds)})")
+        lines.append(f"| {' | '.join(scene)} | {' | '.join(told)} |")
+    lines += ["", "## Bias", "", "Relative error of radiance over visible points, %.", ""]
+    lines += _grid(found, _bias)
+    lines += [
+        "",
+        "## Cost",
+        "",
+        "Variance of a sample times seconds of a million samples, over that of path tracing.",
+        "",
+    ]
+    lines += _grid(found, lambda w, o: f"{w.variance * w.seconds / (o.traced.variance * o.traced.seconds):.2g}")
+    if settings:
+        lines += ["", "## Knobs", "", KNOBS]
+        lines += ["| material | knob | setting | way | cost | error, % |", "|---|---|---:|---|---:|---:|"]
+        for s in settings:
+            words = " | ".join(str(s[key]) for key in ("material", "knob", "value", "way"))
+            error = short(100 * s["error"]) if s["knob"] in ("nodes", "precision") else "–"  # the others change none
+            lines.append(f"| {words} | {short(s['cost'])} | {error} |")
+    return "\n".join(lines) + "\n"
+
+
+def _job(tolerance: float, images: int) -> str:
+    return f"{100 * tolerance:g} %" + (f", {images} images" if images > 1 else "")
+
+
+def _bias(w: WayTrade, o: ObjectTrade) -> str:
+    return w.told_bias
+
+
+def _grid(found: Scenes, cell: Any) -> list[str]:
+    """A row for each way, a column for each scene of a material, a table for each material."""
+    lines: list[str] = []
+    for material in dict.fromkeys(key[0] for key in found):
+        mine = {key: o for key, o in found.items() if key[0] == material}
+        lines.append(f"| {material} | " + " | ".join(f"{shape}, {light}" for _, shape, light in mine) + " |")
+        lines.append("|---|" + "---:|" * len(mine))
+        names = dict.fromkeys(w.way for o in mine.values() for w in o.ways if not w.refusal)
+        for name in names:
+            rows = [next((w for w in o.ways if w.way == name and not w.refusal), None) for o in mine.values()]
+            cells = ["–" if w is None else cell(w, o) for w, o in zip(rows, mine.values())]
+            lines.append(f"| {name} | {' | '.join(cells)} |")
+        lines.append("")
+    return lines[:-1]

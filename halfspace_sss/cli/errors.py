@@ -93,7 +93,7 @@ def errors_command(
     out: OutFolder = Path("errors"),
 ) -> None:
     """Compare models with path tracing over all directions: error, bias, decades of r; written as CSV and JSON."""
-    from halfspace_sss.comparison import held_out as tables
+    from halfspace_sss.comparison import model_errors as tables
 
     given = {"sigma_t": sigma_t, "albedo": albedo, "g": g, "eta": eta}
     if scene is not None:
@@ -196,7 +196,7 @@ def _media(
     """Scalar media by label."""
     from halfspace_sss import materials
     from halfspace_sss.checks import check_count
-    from halfspace_sss.comparison.held_out import held_out_media
+    from halfspace_sss.comparison.model_errors import held_out_media
     from halfspace_sss.neural.symmetric import channels
 
     names, channel = chosen

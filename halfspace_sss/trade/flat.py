@@ -15,8 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from halfspace_sss.checks import check_choice, check_count, check_interval, renamed
-from halfspace_sss.comparison.held_out import references
-from halfspace_sss.comparison.model_errors import TracedMaps, model_error
+from halfspace_sss.comparison.model_errors import TracedMaps, model_error, references
 from halfspace_sss.interface.model import BSSRDF, bssrdf
 from halfspace_sss.interface.model import models as registered
 from halfspace_sss.neural.symmetric import channels

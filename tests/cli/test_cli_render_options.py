@@ -140,7 +140,7 @@ def test_only_the_chosen_channels_are_taken(command: str, monkeypatch: Any, tmp_
             raise ValueError("enough")
         return []
 
-    monkeypatch.setattr("halfspace_sss.comparison.held_out.references", stop)
+    monkeypatch.setattr("halfspace_sss.comparison.model_errors.references", stop)
     monkeypatch.setattr("halfspace_sss.neural.train", stop)
     result = CliRunner().invoke(
         cli.app, [*command.split(), "marble", "ketchup", "--channel", "B,R", "--out", str(tmp_path)]

@@ -11,8 +11,7 @@ import pandas
 import pytest
 
 from figures.beyond import equal_error
-from figures.beyond.equal_error import STEPS, furnace, furnace_models
-from figures.beyond.modelled import MODELLED, modelled_contender, modelled_scene
+from figures.beyond.equal_error import MODELLED, STEPS, furnace, furnace_models, modelled_contender, modelled_scene
 from figures.computing.contenders import MODELS, VOLUMES, WALK, contender
 from figures.computing.scenes import MM_PER_UNIT, prepare
 from figures.computing.timed import TimedRender, rendered

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 import figures
+from figures.computing.images import Shot, absent, compared
 from figures.drawing.image_grid import image_grid
 from figures.drawing.page import page
-from figures.drawing.shot import Shot, absent, compared
 from figures.drawing.style import paper, saved
 from figures.parts.part import Part, Result, Task, keys_of
 from figures.parts.runner import compute, draw, duration

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from figures.computing.images import srgb
+from figures.computing.images import Shot, absent, compared, srgb
 from figures.drawing.image_grid import Crop, image_grid
-from figures.drawing.shot import Shot, absent, compared
 from figures.drawing.style import paper, saved
 
 

@@ -13,9 +13,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from figures.computing.images import srgb
+from figures.computing.images import Shot, absent, compared, srgb
 from figures.drawing.page import page
-from figures.drawing.shot import Shot, absent, compared
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "chrome"))), None)
 DRIVER = shutil.which("chromedriver")
