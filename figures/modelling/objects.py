@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from figures.modelling import croissant, mandarin, meat
+from figures.modelling import varying
 from figures.modelling.candle import make_candle
 from full_geometry.learning.meshes import Box, Mesh, in_chunks, surface
 from halfspace_sss.materials.files import parse
@@ -127,9 +127,9 @@ FLAME_RADIANCE = (60.0, 30.0, 8.5)
 ROUGHNESS = {"mandarin": 0.22, "meat": 0.2, "croissant": 0.5}  # alpha of the boundary, chosen
 ETA = {"mandarin": 1.36, "meat": 1.4, "croissant": 1.3}
 _MODELS = {
-    "mandarin": (mandarin.Mandarin, mandarin.BOX),
-    "meat": (meat.Meat, meat.BOX),
-    "croissant": (croissant.Croissant, croissant.BOX),
+    "mandarin": (varying.Mandarin, varying.MANDARIN_BOX),
+    "meat": (varying.Meat, varying.MEAT_BOX),
+    "croissant": (varying.Croissant, varying.CROISSANT_BOX),
 }
 
 
