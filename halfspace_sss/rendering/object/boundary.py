@@ -31,7 +31,7 @@ def smooth_boundary(eta: float) -> mi.BSDF:
     return _class(mi.variant())(props)
 
 
-def is_smooth_boundary(boundary: Any) -> bool:
+def is_smooth_boundary(boundary: mi.BSDF) -> bool:
     """Whether a boundary is one of `smooth_boundary`."""
     return isinstance(boundary, _class(mi.variant()))
 
@@ -43,7 +43,7 @@ def _class(variant: str) -> type:
     class SmoothBoundary(mi.BSDF):
         """Reflection by Fresnel's equations, and refraction into the cone by Snell's law."""
 
-        def __init__(self, props: Any) -> None:
+        def __init__(self, props: mi.Properties) -> None:
             mi.BSDF.__init__(self, props)
             self.eta = dr.opaque(mi.Float, float(props["eta"]))
             faces = int(mi.BSDFFlags.FrontSide) | int(mi.BSDFFlags.BackSide)
@@ -52,10 +52,12 @@ def _class(variant: str) -> type:
             self.m_components = [reflects, refracts]
             self.m_flags = reflects | refracts
 
-        def traverse(self, callback: Any) -> None:
+        def traverse(self, callback: mi.TraversalCallback) -> None:
             callback.put("eta", self.eta, mi.ParamFlags.NonDifferentiable)
 
-        def sample(self, ctx: Any, si: Any, u: Any, v: Any, active: Any = True) -> tuple[Any, Any]:
+        def sample(
+            self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, u: mi.Float, v: mi.Point2f, active: mi.Bool = True
+        ) -> tuple[Any, Any]:
             reflects = ctx.is_enabled(mi.BSDFFlags.DeltaReflection, REFLECTED)
             refracts = ctx.is_enabled(mi.BSDFFlags.DeltaTransmission, REFRACTED)
             bs, both = dr.zeros(mi.BSDFSample3f), reflects and refracts
@@ -74,13 +76,17 @@ def _class(variant: str) -> type:
                 weight = weight * dr.select(chosen, 1, dr.square(eta_ti))
             return bs, mi.Spectrum(dr.select(active, weight, 0))
 
-        def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+        def eval(
+            self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
+        ) -> Any:
             return mi.Spectrum(0)
 
-        def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+        def pdf(self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True) -> Any:
             return mi.Float(0)
 
-        def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> tuple[Any, Any]:
+        def eval_pdf(
+            self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
+        ) -> tuple[Any, Any]:
             return mi.Spectrum(0), mi.Float(0)
 
         def to_string(self) -> str:
@@ -104,7 +110,7 @@ def boundary_of(surfaces: list[Any], eta: float) -> Any:
     return smooth_boundary(eta)
 
 
-def check_eta(boundary: Any, eta: float) -> None:
+def check_eta(boundary: mi.BSDF, eta: float) -> None:
     """Refuse a boundary of another index than the medium's."""
     found = mi.traverse(boundary).get("eta")
     found = None if found is None else float(np.max(np.array(found)))
@@ -131,14 +137,16 @@ class Reflection:
     lobe: int
 
     @classmethod
-    def of(cls, boundary: Any) -> Reflection:
+    def of(cls, boundary: mi.BSDF) -> Reflection:
         """The reflection of a boundary; ValueError if it does not reflect."""
         for k in range(boundary.component_count()):
             if boundary.flags(k) & int(mi.BSDFFlags.Reflection):
                 return cls(boundary, k)
         raise ValueError(f"the boundary must reflect, got {boundary}")
 
-    def sample(self, ctx: Any, si: Any, u: Any, v: Any, active: Any) -> tuple[Any, Any]:
+    def sample(
+        self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, u: mi.Float, v: mi.Point2f, active: mi.Bool
+    ) -> tuple[Any, Any]:
         """A direction and its weight; one that a smooth boundary reflects to below the surface is reflected again."""
         seen, sign = _from_outside(si)
         bs, weight = self.boundary.sample(self._context(ctx), seen, u, v, active)
@@ -149,21 +157,21 @@ class Reflection:
         bs.sampled_component = 0
         return bs, weight
 
-    def eval(self, ctx: Any, si: Any, wo: Any, active: Any) -> Any:
+    def eval(self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool) -> Any:
         """Value times cosine."""
         seen, sign = _from_outside(si)
         return self.boundary.eval(self._context(ctx), seen, _turned(wo, sign), active)
 
-    def pdf(self, ctx: Any, si: Any, wo: Any, active: Any) -> Any:
+    def pdf(self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool) -> Any:
         """Density of `sample`."""
         seen, sign = _from_outside(si)
         return self.boundary.pdf(self._context(ctx), seen, _turned(wo, sign), active)
 
-    def _context(self, ctx: Any) -> Any:
+    def _context(self, ctx: mi.BSDFContext) -> Any:
         return mi.BSDFContext(ctx.mode, ctx.type_mask, self.lobe)
 
 
-def _from_outside(si: Any) -> tuple[Any, Any]:
+def _from_outside(si: mi.SurfaceInteraction3f) -> tuple[Any, Any]:
     """The interaction with the normal on the side that is seen, and 1, or -1 where it was turned."""
     sign = dr.select(mi.Frame3f.cos_theta(si.wi) < 0, mi.Float(-1), 1)
     seen = mi.SurfaceInteraction3f(si)
@@ -171,6 +179,6 @@ def _from_outside(si: Any) -> tuple[Any, Any]:
     return seen, sign
 
 
-def _turned(w: Any, sign: Any) -> Any:
+def _turned(w: mi.Vector3f, sign: mi.Float) -> Any:
     """A local direction in the frame that is turned about its first axis where the sign is -1."""
     return mi.Vector3f(w.x, w.y * sign, w.z * sign)

@@ -63,15 +63,15 @@ class PositionSampler:
         """Number of probes."""
         return int(self.area_share < 1)
 
-    def _side(self, out: SurfacePoint, prim_index: Any, active: Any) -> Any:
+    def _side(self, out: SurfacePoint, prim_index: mi.UInt32, active: mi.Bool) -> Any:
         """What turns the normal of a face outwards: of a sheet, to the side of the exit."""
         return self.found.side(prim_index, active) if self.found.closed else out.sign
 
-    def density(self, p: Any, n: Any, out: SurfacePoint, axes: Any) -> Any:
+    def density(self, p: mi.Point3f, n: mi.Normal3f, out: SurfacePoint, axes: tuple[mi.Vector3f, ...]) -> Any:
         """Density of candidates over the surface at p with normal n, for each that is drawn, 1/(scene unit)²."""
         return self._candidates(p, n, out, axes) * number(1 / (self.probes + self.area_points))
 
-    def _candidates(self, p: Any, n: Any, out: SurfacePoint, axes: Any) -> Any:
+    def _candidates(self, p: mi.Point3f, n: mi.Normal3f, out: SurfacePoint, axes: tuple[mi.Vector3f, ...]) -> Any:
         """c = D + m/A, 1/(scene unit)²."""
         uniform = number(self.area_points / self.found.area if self.area_points else 0.0)
         if not self.probes:
@@ -84,7 +84,7 @@ class PositionSampler:
             total += share * reached * dr.abs(dr.dot(n, axis)) * self.table.pdf(across)
         return total + uniform
 
-    def sample(self, out: SurfacePoint, prim_index: Any, sampler: Any, active: Any) -> EntrySample:
+    def sample(self, out: SurfacePoint, prim_index: mi.UInt32, sampler: mi.Sampler, active: mi.Bool) -> EntrySample:
         """A point of entry for light that leaves at `out` on the face `prim_index`."""
         axes = (out.n_out, *mi.coordinate_system(out.n_out))
         piece = self.found.piece(prim_index, active)
@@ -99,10 +99,12 @@ class PositionSampler:
         weight = dr.select(total > 0, total / dr.maximum(p, 1e-30), 0)
         return EntrySample(kept.p, turned(kept.n, kept.n_out), kept.n_out, weight, kept.face)
 
-    def _reach(self, across: Any) -> Any:
+    def _reach(self, across: mi.Float) -> Any:
         return REACH * across + number(LEAST_REACH * self.found.size + NEAR * self.table.mean)
 
-    def _probe(self, out: SurfacePoint, axes: Any, u_axis: Any, u_length: Any, u: Any) -> Any:
+    def _probe(
+        self, out: SurfacePoint, axes: tuple[mi.Vector3f, ...], u_axis: mi.Float, u_length: mi.Float, u: mi.Point2f
+    ) -> Any:
         n, s, t = axes
         to_n, to_s = u_axis < NORMAL_SHARE, u_axis < 0.5 * (1 + NORMAL_SHARE)
         along = dr.select(to_n, n, dr.select(to_s, s, t))
@@ -116,7 +118,9 @@ class PositionSampler:
         ray.maxt = 2 * reach
         return ray
 
-    def _offer(self, kept: _Kept, at: tuple, out: SurfacePoint, axes: Any, active: Any) -> _Kept:
+    def _offer(
+        self, kept: _Kept, at: tuple, out: SurfacePoint, axes: tuple[mi.Vector3f, ...], active: mi.Bool
+    ) -> _Kept:
         """Take a candidate (point, normal, outward shading normal, face) instead with the probability h / sum of h."""
         p, n, n_out, face = at
         c = self._candidates(p, n, out, axes)
@@ -128,10 +132,18 @@ class PositionSampler:
         found = (dr.select(take, a, b) for a, b in zip((p, n, n_out, face), kept[2:]))
         return _Kept(dr.clip(u, 0, 1), total, *found)
 
-    def _hits(self, ray: Any, out: SurfacePoint, axes: Any, piece: Any, kept: _Kept, active: Any) -> _Kept:
+    def _hits(
+        self,
+        ray: mi.Ray3f,
+        out: SurfacePoint,
+        axes: tuple[mi.Vector3f, ...],
+        piece: mi.UInt32,
+        kept: _Kept,
+        active: mi.Bool,
+    ) -> _Kept:
         """All hits of a probe as candidates."""
 
-        def step(ray: Any, left: Any, kept: tuple, active: Any) -> tuple:
+        def step(ray: mi.Ray3f, left: Any, kept: tuple, active: mi.Bool) -> tuple:
             si = self.found.scene.ray_intersect(ray, _FLAGS(), False, active)
             active &= si.is_valid() & (left > 0)
             same = self.found.piece(si.prim_index, active) == piece
@@ -146,7 +158,14 @@ class PositionSampler:
         return _Kept(*dr.while_loop(state, lambda *state: state[-1], step, label="probe")[2])
 
     def _uniform(
-        self, out: SurfacePoint, axes: Any, piece: Any, u_face: Any, u: Any, kept: _Kept, active: Any
+        self,
+        out: SurfacePoint,
+        axes: tuple[mi.Vector3f, ...],
+        piece: mi.UInt32,
+        u_face: mi.Float,
+        u: mi.Point2f,
+        kept: _Kept,
+        active: mi.Bool,
     ) -> _Kept:
         """Points over the area as candidates."""
         m, inverse = number(float(self.area_points)), number(1 / self.area_points)
@@ -174,7 +193,7 @@ class _Kept(NamedTuple):
     face: Any
 
 
-def _wrapped(u: Any) -> Any:
+def _wrapped(u: mi.Float) -> mi.Float:
     """u modulo one, below one."""
     return dr.minimum(u - dr.floor(u), 1 - 2**-24)
 
@@ -207,7 +226,7 @@ class AreaPoints:
         shape: the Mitsuba shape.
     """
 
-    def __init__(self, shape: Any) -> None:
+    def __init__(self, shape: mi.Shape) -> None:
         self.shape = shape
         self.faces = self.centre = None
         parameters = mi.traverse(shape)
@@ -219,7 +238,7 @@ class AreaPoints:
             areas = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
             self.faces = mi.DiscreteDistribution(mi.Float(areas.astype(np.float32)))
 
-    def sample(self, u_face: Any, u: Any, active: Any) -> Point:
+    def sample(self, u_face: mi.Float, u: mi.Point2f, active: mi.Bool) -> Point:
         """A point for uniform numbers u_face and the pair u."""
         if self.faces is None:
             ps = self.shape.sample_position(0.0, u, active)
@@ -227,11 +246,11 @@ class AreaPoints:
             return Point(ps.p, n, n, mi.UInt32(0))
         return self.on_face(self.faces.sample(u_face, active), u, active)
 
-    def _radial(self, p: Any) -> Any:
+    def _radial(self, p: mi.Point3f) -> Any:
         n = dr.normalize(p - mi.Point3f(*(number(c) for c in self.centre)))
         return mi.Normal3f(-n if self.shape.has_flipped_normals() else n)
 
-    def on_face(self, face: Any, u: Any, active: Any = True) -> Point:
+    def on_face(self, face: mi.UInt32, u: mi.Point2f, active: mi.Bool = True) -> Point:
         """A uniform point of a face of a mesh."""
         index = self.shape.face_indices(face, active)
         corners = [self.shape.vertex_position(i, active) for i in (index.x, index.y, index.z)]
@@ -287,7 +306,7 @@ class RadialTable:
             dr.eval(self._lanes[mi.variant()])
         return self._lanes[mi.variant()]
 
-    def sample(self, u: Any) -> Any:
+    def sample(self, u: mi.Float) -> Any:
         """Distance r for uniform u in [0, 1)."""
         cdf, probability, edges, *_ = self._arrays()
         k = dr.binary_search(0, N_CELLS - 1, lambda i: dr.gather(mi.Float, cdf, i) <= u)
@@ -295,7 +314,7 @@ class RadialTable:
         low, high = dr.gather(mi.Float, edges, k), dr.gather(mi.Float, edges, k + 1)
         return dr.lerp(low, high, dr.clip(share, 0, 1))
 
-    def pdf(self, r: Any) -> Any:
+    def pdf(self, r: mi.Float) -> Any:
         """Density over the plane at distance r, 1/(scene unit)²; 0 beyond the reach."""
         *_, times_r, r_min, per_log, reach = self._arrays()
         steps = dr.log(dr.maximum(r, r_min) / r_min) * per_log

@@ -86,18 +86,20 @@ class HalfSpaceProposals:
     positions: PositionSampler
     model: Any
 
-    def prepare(self, out: SurfacePoint, prepared: Any, active: Any) -> None:
+    def prepare(self, out: SurfacePoint, prepared: Any, active: mi.Bool) -> None:
         """Nothing is done for the exit alone."""
 
-    def sample(self, out: SurfacePoint, prim_index: Any, prepared: None, sampler: Any, active: Any) -> EntrySample:
+    def sample(
+        self, out: SurfacePoint, prim_index: mi.UInt32, prepared: None, sampler: mi.Sampler, active: mi.Bool
+    ) -> EntrySample:
         return self.positions.sample(out, prim_index, sampler, active)
 
-    def sample_direction(self, entry: EntrySample, out: SurfacePoint, u: Any) -> tuple[Any, Any]:
+    def sample_direction(self, entry: EntrySample, out: SurfacePoint, u: mi.Point2f) -> tuple[Any, Any]:
         frame = local_frame(entry.n_out, out.p - entry.p)
         drawn = self.model.sample_direction(mi.Float(0), mi.Float(1), mi.Float(0), (u.x, u.y))
         return opposed(mi.Vector3f(frame.direction(drawn.mu_i, drawn.phi_i)), entry.n), drawn.pdf
 
-    def pdf_direction(self, entry: EntrySample, out: SurfacePoint, w_i: Any) -> Any:
+    def pdf_direction(self, entry: EntrySample, out: SurfacePoint, w_i: mi.Vector3f) -> Any:
         mu_i = dr.clip(entry.facing(w_i).mu, 0, 1)
         return self.model.pdf_direction(mu_i, mi.Float(0), mi.Float(0), mi.Float(1), mi.Float(0))
 

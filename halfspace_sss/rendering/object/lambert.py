@@ -46,10 +46,12 @@ class LambertTransport:
 class LambertProposals(CosineProposals):
     """The exit itself, directions by the cosine."""
 
-    def prepare(self, out: SurfacePoint, prepared: Any, active: Any) -> None:
+    def prepare(self, out: SurfacePoint, prepared: Any, active: mi.Bool) -> None:
         """Nothing is done for the exit alone."""
 
-    def sample(self, out: SurfacePoint, prim_index: Any, prepared: None, sampler: Any, active: Any) -> EntrySample:
+    def sample(
+        self, out: SurfacePoint, prim_index: mi.UInt32, prepared: None, sampler: mi.Sampler, active: mi.Bool
+    ) -> EntrySample:
         return EntrySample(
             mi.Point3f(out.p), mi.Normal3f(out.n), mi.Normal3f(out.n_out), dr.select(active, mi.Float(1), 0), prim_index
         )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -36,7 +35,7 @@ class Faces:
     sides: np.ndarray | None
 
 
-def faces_of(shape: Any, name: str) -> Faces | None:
+def faces_of(shape: mi.Shape, name: str) -> Faces | None:
     """The faces of a shape that is a mesh; None for others.
 
     Raises:
@@ -78,7 +77,7 @@ def check_copies(faces: Faces, name: str) -> None:
         )
 
 
-def face_normals_agree(shape: Any, faces: Faces, name: str) -> None:
+def face_normals_agree(shape: mi.Shape, faces: Faces, name: str) -> None:
     """Warn that faces were turned, and make vertex normals anew that were averaged over faces of both sides."""
 
     parameters = mi.traverse(shape)

@@ -36,7 +36,7 @@ class Content:
     whole: bool
 
 
-def contents(scene: Any, objects: list[Object]) -> list[Content]:
+def contents(scene: mi.Scene, objects: list[Object]) -> list[Content]:
     """What lies inside each closed object of a scene: of every shape a part that is deeper than `DEEP`, and lamps."""
     found = []
     for shape in scene.shapes():
@@ -56,7 +56,7 @@ def contents(scene: Any, objects: list[Object]) -> list[Content]:
     return found
 
 
-def check_empty(scene: Any, objects: list[Object], what: str) -> None:
+def check_empty(scene: mi.Scene, objects: list[Object], what: str) -> None:
     """Refuse objects with something inside, for `what` does not see it.
 
     Raises:
@@ -69,7 +69,7 @@ def check_empty(scene: Any, objects: list[Object], what: str) -> None:
         )
 
 
-def places_of(scene: Any) -> tuple[list, list]:
+def places_of(scene: mi.Scene) -> tuple[list, list]:
     """What tells whether shapes or lamps of a scene have been moved; what is kept so that no number is reused."""
     found = [geometry_of(shape) for shape in scene.shapes()]
     lamps = [_place(emitter) for emitter in scene.emitters()]
@@ -77,7 +77,7 @@ def places_of(scene: Any) -> tuple[list, list]:
     return [*(key for key, _ in found), *places], [kept for _, kept in found]
 
 
-def _shared(shape: Any, holder: Object) -> Any:
+def _shared(shape: mi.Shape, holder: Object) -> Any:
     """The box that a shape shares with an object; None if it reaches less deep."""
 
     (a, b), (c, d), deep = _corners(shape.bbox()), _corners(holder.scene.bbox()), DEEP * holder.size
@@ -85,11 +85,11 @@ def _shared(shape: Any, holder: Object) -> Any:
     return mi.ScalarBoundingBox3f(low.tolist(), high.tolist()) if (low <= high).all() else None
 
 
-def _corners(box: Any) -> tuple[np.ndarray, np.ndarray]:
+def _corners(box: mi.ScalarBoundingBox3f) -> tuple[np.ndarray, np.ndarray]:
     return tuple(np.ravel(np.array(corner, dtype=float)) for corner in (box.min, box.max))
 
 
-def _points_on(alone: Any, box: Any) -> np.ndarray:
+def _points_on(alone: mi.Scene, box: mi.ScalarBoundingBox3f) -> np.ndarray:
     """Points in a box, of the shape in a scene of its own: shape (3, n).
 
     Points that rays into the box meet first, and points by area, without which wires are missed.
@@ -102,7 +102,7 @@ def _points_on(alone: Any, box: Any) -> np.ndarray:
     return p[:, (p.T >= low).all(axis=1) & (p.T <= high).all(axis=1)]
 
 
-def _points_by_area(alone: Any) -> np.ndarray:
+def _points_by_area(alone: mi.Scene) -> np.ndarray:
     """Points drawn by area, shape (3, n); none of shapes that cannot be drawn from, such as curves and instances."""
 
     u = np.random.default_rng(19).random((2, LOOKS)).astype(np.float32)
@@ -129,13 +129,13 @@ def _deep(holder: Object, points: np.ndarray) -> np.ndarray:
     return np.array(hit.t).reshape(-1, 128).min(axis=1) > DEEP * holder.size
 
 
-def _holds(holder: Object, shape: Any, alone: Any) -> bool:
+def _holds(holder: Object, shape: mi.Shape, alone: mi.Scene) -> bool:
     """Whether all of a shape lies inside an object."""
     (a, b), (c, d) = _corners(shape.bbox()), _corners(holder.scene.bbox())
     return bool((a >= c).all() and (b <= d).all() and is_inside(holder, _points_on(alone, alone.bbox())).all())
 
 
-def _place(emitter: Any) -> np.ndarray | None:
+def _place(emitter: mi.Emitter) -> np.ndarray | None:
     """Where an emitter without a shape is; None where it is nowhere or has a shape."""
 
     far = emitter.flags() & int(mi.EmitterFlags.Infinite)
@@ -145,7 +145,7 @@ def _place(emitter: Any) -> np.ndarray | None:
     return np.ravel(np.array(ds.p))
 
 
-def translucent_shapes(scene: Any) -> list[Any]:
+def translucent_shapes(scene: mi.Scene) -> list[Any]:
     """The shapes whose surface is `translucent`.
 
     Raises:
@@ -170,7 +170,7 @@ def translucent_shapes(scene: Any) -> list[Any]:
     return [shape for shape in shapes if is_translucent(shape.bsdf())]
 
 
-def _check_media(scene: Any) -> None:
+def _check_media(scene: mi.Scene) -> None:
     """ValueError if light would be scattered outside of the objects, or by a second medium in one."""
     found = [
         (side, shape)
@@ -192,7 +192,7 @@ def _check_media(scene: Any) -> None:
             raise ValueError(f"the scene must be without media of Mitsuba, such as fog, got one around {place.id()!r}")
 
 
-def check_sensors(scene: Any, objects: list[Object]) -> None:
+def check_sensors(scene: mi.Scene, objects: list[Object]) -> None:
     """Refuse sensors inside of objects, of any kind: they may have several places, or a surface.
 
     Raises:
@@ -204,7 +204,7 @@ def check_sensors(scene: Any, objects: list[Object]) -> None:
                 raise ValueError(f"the camera must be outside of every object, got it inside {found.name}")
 
 
-def _starts(sensor: Any, size: float) -> np.ndarray:
+def _starts(sensor: mi.Sensor, size: float) -> np.ndarray:
     """Shape (3, n); off a surface that the rays leave by a little of the size of an object."""
 
     u = np.random.default_rng(13).random((5, STARTS)).astype(np.float32)
@@ -214,14 +214,14 @@ def _starts(sensor: Any, size: float) -> np.ndarray:
     return np.array(mi.Point3f(ray.o + ray.d * (1e-4 * size))).reshape(3, -1)
 
 
-def choices(scene: Any) -> dict[str, str]:
+def choices(scene: mi.Scene) -> dict[str, str]:
     """Why the model "auto" of objects became the one that they have, by id; empty before it was chosen."""
     return {
         shape.id(): why for shape in scene.shapes() if is_translucent(shape.bsdf()) and (why := shape.bsdf().choice)
     }
 
 
-def _inside(bsdf: Any) -> bool:
+def _inside(bsdf: mi.BSDF | None) -> bool:
     """Whether a BSDF is `translucent` or has such a one in it."""
 
     return bsdf is not None and any(is_translucent(node) for node in mi.traverse(bsdf).hierarchy)

@@ -67,12 +67,12 @@ class Frame(NamedTuple):
     b: Any
     n: Any
 
-    def azimuth(self, w: Any) -> Any:
+    def azimuth(self, w: mi.Vector3f) -> Any:
         """Azimuth of w about the normal from t, radians."""
 
         return dr.atan2(dr.dot(w, self.b), dr.dot(w, self.t))
 
-    def direction(self, mu: Any, phi: Any) -> Any:
+    def direction(self, mu: mi.Float, phi: mi.Float) -> Any:
         """The unit vector with cosine mu and azimuth phi."""
 
         sine, (s, c) = dr.safe_sqrt((1 - mu) * (1 + mu)), dr.sincos(phi)
@@ -93,7 +93,7 @@ def channel_mean(value: Any) -> Any:
     return dr.sum(value) / len(value)
 
 
-def place(p: Any, n: Any) -> Any:
+def place(p: mi.Point3f, n: mi.Normal3f) -> Any:
     """A point with its geometric normal, from which rays start clear of the surface."""
 
     found = dr.zeros(mi.Interaction3f)
@@ -101,7 +101,7 @@ def place(p: Any, n: Any) -> Any:
     return found
 
 
-def local_frame(n: Any, d: Any) -> Frame:
+def local_frame(n: mi.Normal3f, d: mi.Vector3f) -> Frame:
     """The frame of normal n whose first axis is d = x_o - x_i without its normal part; any axis where that is 0."""
 
     flat = d - n * dr.dot(n, d)
@@ -112,7 +112,7 @@ def local_frame(n: Any, d: Any) -> Frame:
     return Frame(t, dr.cross(n, t), n)
 
 
-def separation(p_i: Any, n_i: Any, p_o: Any, n_o: Any, geometry: str) -> Any:
+def separation(p_i: mi.Point3f, n_i: mi.Normal3f, p_o: mi.Point3f, n_o: mi.Normal3f, geometry: str) -> Any:
     """Distance r of the half-space query, in scene units.
 
     "distance" takes |d|, d = x_o - x_i. "tangent" takes sqrt(d² - c (d.n)²), n along n_i + n_o and c = max(n_i.n_o, 0):
@@ -158,19 +158,19 @@ def plane_query(at: SurfacePoint, out: SurfacePoint, geometry: str) -> tuple[mi.
 # What is reflected to below the surface is reflected once more, at the surface.
 
 
-def turned(n_shading: Any, n: Any) -> Any:
+def turned(n_shading: mi.Normal3f, n: mi.Normal3f) -> Any:
     """The shading normal on the side of the geometric one: vertex normals need not agree with the winding of a face."""
 
     return dr.select(dr.dot(n_shading, n) < 0, -n_shading, n_shading)
 
 
-def lifted(m: Any, n: Any, w: Any) -> Any:
+def lifted(m: mi.Normal3f, n: mi.Normal3f, w: mi.Vector3f) -> Any:
     """The interpolated normal m that w sees, on the side of w that the geometric normal n is on."""
     c = dr.dot(m, w)
     return mi.Normal3f(dr.select(c * dr.dot(n, w) < 0, m - 2 * c * w, m))
 
 
-def lift(si: Any, w: Any, active: Any = True) -> Any:
+def lift(si: mi.SurfaceInteraction3f, w: mi.Vector3f, active: mi.Bool = True) -> Any:
     """The interaction with the frame that w sees, a direction in the world that becomes its `wi`."""
     c = dr.dot(si.sh_frame.n, w)
     below = active & (c * dr.dot(si.n, w) < 0)
@@ -180,17 +180,17 @@ def lift(si: Any, w: Any, active: Any = True) -> Any:
     return si
 
 
-def opposed(w: Any, n: Any) -> Any:
+def opposed(w: mi.Vector3f, n: mi.Normal3f) -> Any:
     """w, or -w where that is the one above the surface of the normal n."""
     return dr.select(dr.dot(w, n) < 0, -w, w)
 
 
-def mirrored(w: Any, n: Any) -> Any:
+def mirrored(w: mi.Vector3f, n: mi.Normal3f) -> Any:
     """w, mirrored at the surface of the normal n where it is below."""
     return w - n * (2 * dr.minimum(dr.dot(w, n), 0))
 
 
-def sided(si: Any, wo: Any) -> tuple[Any, Any]:
+def sided(si: mi.SurfaceInteraction3f, wo: mi.Vector3f) -> tuple[Any, Any]:
     """A direction of a boundary in the world, on the side of the surface that it has in the frame; if it was turned."""
     d = si.to_world(wo)
     side = dr.select(wo.z > 0, 1.0, -1.0)
@@ -200,13 +200,13 @@ def sided(si: Any, wo: Any) -> tuple[Any, Any]:
     return mi.Vector3f(dr.select(wrong, dr.select(reflects, mirrored(d, n), -d), d)), wrong & reflects
 
 
-def cosine_above(m: Any, n: Any, u: Any) -> tuple[Any, Any]:
+def cosine_above(m: mi.Normal3f, n: mi.Normal3f, u: mi.Point2f) -> tuple[Any, Any]:
     """A direction above the surface by the cosine to m, for a pair of uniforms, and its density |m.w| / pi."""
     w = opposed(mi.Frame3f(m).to_world(mi.warp.square_to_cosine_hemisphere(u)), n)
     return mi.Vector3f(w), cosine_density(m, n, w)
 
 
-def cosine_density(m: Any, n: Any, w: Any) -> Any:
+def cosine_density(m: mi.Normal3f, n: mi.Normal3f, w: mi.Vector3f) -> Any:
     """The density of `cosine_above`, 1/sr; 0 below the surface."""
     return dr.select(dr.dot(w, n) > 0, dr.abs(dr.dot(w, m)) * dr.inv_pi, 0)
 
@@ -242,29 +242,31 @@ class EntrySample(NamedTuple):
 class Proposals(Protocol):
     """Where light that leaves at an exit may have entered."""
 
-    def prepare(self, out: SurfacePoint, prepared: Any, active: Any) -> Any:
+    def prepare(self, out: SurfacePoint, prepared: Any, active: mi.Bool) -> Any:
         """What is done once for all entries of an exit; `prepared` is what the transport has made of it."""
 
-    def sample(self, out: SurfacePoint, prim_index: Any, prepared: Any, sampler: Any, active: Any) -> EntrySample:
+    def sample(
+        self, out: SurfacePoint, prim_index: mi.UInt32, prepared: Any, sampler: mi.Sampler, active: mi.Bool
+    ) -> EntrySample:
         """A point of entry; its weight is the inverse of the density of such points over the surface, (scene unit)²."""
 
-    def sample_direction(self, entry: EntrySample, out: SurfacePoint, u: Any) -> tuple[Any, Any]:
+    def sample_direction(self, entry: EntrySample, out: SurfacePoint, u: mi.Point2f) -> tuple[Any, Any]:
         """A direction w_i that points away from the surface at the entry, for a pair of uniforms, and its density.
 
         The density is over solid angle, 1/sr.
         """
 
-    def pdf_direction(self, entry: EntrySample, out: SurfacePoint, w_i: Any) -> Any:
+    def pdf_direction(self, entry: EntrySample, out: SurfacePoint, w_i: mi.Vector3f) -> Any:
         """The density of `sample_direction`, 1/sr; 0 below the surface."""
 
 
 class CosineProposals(Proposals, Protocol):
     """Proposals whose directions are by the cosine to the interpolated normal, above the surface."""
 
-    def sample_direction(self, entry: EntrySample, out: SurfacePoint, u: Any) -> tuple[Any, Any]:
+    def sample_direction(self, entry: EntrySample, out: SurfacePoint, u: mi.Point2f) -> tuple[Any, Any]:
         return cosine_above(entry.n_out, entry.n, u)
 
-    def pdf_direction(self, entry: EntrySample, out: SurfacePoint, w_i: Any) -> Any:
+    def pdf_direction(self, entry: EntrySample, out: SurfacePoint, w_i: mi.Vector3f) -> Any:
         return cosine_density(entry.n_out, entry.n, w_i)
 
 

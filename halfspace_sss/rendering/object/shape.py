@@ -68,7 +68,7 @@ class Object:
         """Whether the shape still is as it was surveyed."""
         return geometry_of(self.shape)[0] == self.geometry[0]
 
-    def piece(self, prim_index: Any, active: Any) -> Any:
+    def piece(self, prim_index: mi.UInt32, active: mi.Bool) -> Any:
         """The number of the piece that a face belongs to."""
 
         if self.pieces is None:
@@ -96,7 +96,7 @@ class Object:
         """-1 for a mesh with flip_normals, whose normals Mitsuba turns, but not their derivatives."""
         return -1.0 if self.shape.is_mesh() and self.shape.has_flipped_normals() else 1.0
 
-    def side(self, prim_index: Any, active: Any = True) -> Any:
+    def side(self, prim_index: mi.UInt32, active: mi.Bool = True) -> Any:
         """1 where the geometric normal of a face points outwards, -1 where it points inwards."""
 
         if self.signs is None:
@@ -109,7 +109,7 @@ def same_objects(a: list[Any], b: list[Any]) -> bool:
     return len(a) == len(b) and all(x is y for x, y in zip(a, b))
 
 
-def survey(shape: Any, world: Any = None) -> Object:
+def survey(shape: mi.Shape, world: mi.Scene | None = None) -> Object:
     """Look at a shape from outside with rays; warns if it is not closed, or if its faces point to both sides.
 
     Faces of a closed mesh that point to both sides are taken the right way round.
@@ -160,7 +160,7 @@ def survey(shape: Any, world: Any = None) -> Object:
                   area, geometry_of(shape))  # fmt: skip
 
 
-def geometry_of(shape: Any) -> tuple[list, list]:
+def geometry_of(shape: mi.Shape) -> tuple[list, list]:
     """What tells one geometry of a shape from the next; the arrays with it are kept so that no number is reused."""
 
     found, kept = [], []
@@ -189,7 +189,7 @@ class _Votes:
         self.hits, self.outward = dr.zeros(mi.Float, n), dr.zeros(mi.Float, n)
         self.opposed = dr.zeros(mi.Float, 1)
 
-    def add(self, si: Any, along: Any, entering: Any, active: Any) -> None:
+    def add(self, si: mi.SurfaceInteraction3f, along: mi.Vector3f, entering: mi.Bool, active: mi.Bool) -> None:
         """Count a hit."""
 
         dr.scatter_add(self.opposed, mi.Float(1), 0, active & (dr.dot(si.sh_frame.n, si.n) < 0))
@@ -220,7 +220,7 @@ class _Votes:
         return mi.Float(sign.astype(np.float32)) if np.ptp(sign) > 0 else None
 
 
-def _outside_view(scene: Any, votes: _Votes) -> tuple[np.ndarray, float]:
+def _outside_view(scene: mi.Scene, votes: _Votes) -> tuple[np.ndarray, float]:
     """Per ray the side of the normal at the first hit (1 towards the ray, 0 no hit); share of rays with odd hits."""
     side, count = crossings(scene, rays_into(scene.bbox(), RAYS), votes)
     side, count = np.array(side), np.array(count)
@@ -228,10 +228,10 @@ def _outside_view(scene: Any, votes: _Votes) -> tuple[np.ndarray, float]:
     return side, float((count[hit] % 2).mean()) if hit.any() else 0.0
 
 
-def crossings(scene: Any, ray: Any, votes: _Votes | None = None) -> tuple[Any, Any]:
+def crossings(scene: mi.Scene, ray: mi.Ray3f, votes: _Votes | None = None) -> tuple[Any, Any]:
     """Side of the first hit of each ray (1: the normal points to the ray, 0: no hit) and the number of hits."""
 
-    def step(ray: Any, side: Any, count: Any, active: Any) -> tuple:
+    def step(ray: mi.Ray3f, side: Any, count: Any, active: mi.Bool) -> tuple:
         si = scene.ray_intersect(ray, mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame, False, active)
         active &= si.is_valid()
         first = dr.select(dr.dot(si.n, ray.d) < 0, 1.0, -1.0)
@@ -270,7 +270,7 @@ def is_inside(found: Object, points: Any) -> np.ndarray:
 TRIALS = 256  # rays
 
 
-def name_of(shape: Any) -> str:
+def name_of(shape: mi.Shape) -> str:
     """The id of a shape in quotes; what it may be, where it has none."""
     return repr(shape.id()) if shape.id() else "without an id (Mitsuba merges meshes that have the same surface)"
 
@@ -280,12 +280,12 @@ def _by_optix() -> bool:
     return mi.variant().startswith("cuda")
 
 
-def number_of(scene: Any) -> int:
+def number_of(scene: mi.Scene) -> int:
     """What tells the scenes apart that objects may stand in; only OptiX has to know."""
     return scene.ptr if _by_optix() else 0
 
 
-def scene_of(shapes: list[Any], world: Any = None) -> Any:
+def scene_of(shapes: list[Any], world: mi.Scene | None = None) -> Any:
     """A Mitsuba scene that holds these shapes, which keep their ids.
 
     Args:
@@ -302,7 +302,7 @@ def scene_of(shapes: list[Any], world: Any = None) -> Any:
     return scene
 
 
-def rays_into(box: Any, n: int) -> Any:
+def rays_into(box: mi.ScalarBoundingBox3f, n: int) -> Any:
     """Rays from about a bounding box to places in it."""
 
     low, high = np.array(box.min, dtype=float), np.array(box.max, dtype=float)
@@ -317,7 +317,7 @@ def rays_into(box: Any, n: int) -> Any:
     return mi.Ray3f(mi.Point3f(start), mi.Vector3f(along))
 
 
-def check_together(world: Any, scenes: list[Any]) -> None:
+def check_together(world: mi.Scene, scenes: list[Any]) -> None:
     """Try rays in a scene and in those of objects in it by one kernel, where that may fail.
 
     Args:
@@ -344,7 +344,7 @@ def check_together(world: Any, scenes: list[Any]) -> None:
             )
 
 
-def _met(scene: Any, ray: Any) -> Any:
+def _met(scene: mi.Scene, ray: mi.Ray3f) -> Any:
     """The numbers of the shapes that rays meet in Dr.Jit's registry, 0 for none."""
 
     hit = scene.ray_intersect_preliminary(ray, False)

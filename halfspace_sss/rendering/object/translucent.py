@@ -75,7 +75,7 @@ def _class(variant: str) -> type:
     class Translucent(mi.BSDF):
         """The reflection of the boundary as a BSDF, with an `inside`."""
 
-        def __init__(self, props: Any) -> None:
+        def __init__(self, props: mi.Properties) -> None:
             mi.BSDF.__init__(self, props)
             check_parameters("translucent", props, (*PARAMETERS, *(key for key, _ in _boundaries(props))))
             self.inside = read_inside(props)
@@ -87,7 +87,7 @@ def _class(variant: str) -> type:
             for name in VARIABLE:
                 setattr(self, name, mi.Spectrum(np.atleast_1d(getattr(self.inside.medium, name)).tolist()))
 
-        def traverse(self, callback: Any) -> None:
+        def traverse(self, callback: mi.TraversalCallback) -> None:
             for name in VARIABLE if self.inside.varying is None else ():
                 callback.put(name, getattr(self, name), mi.ParamFlags.Differentiable)
             callback.put("boundary", self.boundary, mi.ParamFlags.Differentiable)
@@ -98,20 +98,31 @@ def _class(variant: str) -> type:
                 self.inside = self.inside.changed(**{name: np.ravel(getattr(self, name)) for name in VARIABLE})
             check_eta(self.boundary, self.inside.medium.eta)
 
-        def _shown(self, ctx: Any, value: Any) -> Any:
+        def _shown(self, ctx: mi.BSDFContext, value: Any) -> Any:
             return value if self.inside.reflection and ctx.component in (0, 0xFFFFFFFF) else 0 * value
 
-        def sample(self, ctx: Any, si: Any, sample1: Any, sample2: Any, active: Any = True) -> tuple[Any, Any]:
+        def sample(
+            self,
+            ctx: mi.BSDFContext,
+            si: mi.SurfaceInteraction3f,
+            sample1: mi.Float,
+            sample2: mi.Point2f,
+            active: mi.Bool = True,
+        ) -> tuple[Any, Any]:
             bs, weight = self.reflection.sample(ctx, si, sample1, sample2, active)
             return bs, self._shown(ctx, weight)
 
-        def eval(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+        def eval(
+            self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
+        ) -> Any:
             return self._shown(ctx, self.reflection.eval(ctx, si, wo, active))
 
-        def pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> Any:
+        def pdf(self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True) -> Any:
             return self._shown(ctx, self.reflection.pdf(ctx, si, wo, active))
 
-        def eval_pdf(self, ctx: Any, si: Any, wo: Any, active: Any = True) -> tuple[Any, Any]:
+        def eval_pdf(
+            self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
+        ) -> tuple[Any, Any]:
             return self.eval(ctx, si, wo, active), self.pdf(ctx, si, wo, active)
 
         def to_string(self) -> str:
@@ -120,7 +131,7 @@ def _class(variant: str) -> type:
     return Translucent
 
 
-def _boundaries(props: Any) -> list[tuple[str, Any]]:
+def _boundaries(props: mi.Properties) -> list[tuple[str, Any]]:
     """Names and surfaces of what stands inside."""
     return [(key, found) for key, found in props.objects() if isinstance(found, mi.BSDF)]
 
@@ -178,7 +189,7 @@ class Inside:
         return replace(self, label="medium", medium=Medium.from_albedo(**new, eta=m.eta))
 
 
-def read_inside(props: Any) -> Inside:
+def read_inside(props: mi.Properties) -> Inside:
     """The inside from the parameters of a surface.
 
     Raises:
@@ -191,7 +202,7 @@ def read_inside(props: Any) -> Inside:
     return Inside(label, medium, model, orders, bool(props.get("reflection", True)), varying)
 
 
-def _medium(props: Any) -> tuple[str, Medium, Any]:
+def _medium(props: mi.Properties) -> tuple[str, Medium, Any]:
 
     keys = ("sigma_s", "sigma_a", "sigma_t", "albedo", "scale", "g", "eta")
     inline = {key: constant_value(props[key]) for key in keys if key in props}
@@ -233,7 +244,7 @@ def _inline_medium(inline: dict) -> tuple[Medium, Any]:
     return mean_of_grids(varying, g, eta), varying
 
 
-def _for_variant(label: str, medium: Medium, names: Any, props: Any) -> tuple[str, Medium]:
+def _for_variant(label: str, medium: Medium, names: Any, props: mi.Properties) -> tuple[str, Medium]:
     n, wanted = medium.n_channels, variant_channels()
     channel = props["channel"] if "channel" in props else None
     if wanted == 1 and n is not None:

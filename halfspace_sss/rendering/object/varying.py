@@ -51,13 +51,13 @@ class VaryingMedium:
         values = grid_values(self.density)  # Mitsuba's own maxima do not follow changes of the voxels
         return self.factor * values.reshape(-1, values.shape[-1]).max(axis=0)
 
-    def coefficients(self, p: Any) -> tuple[np.ndarray, np.ndarray]:
+    def coefficients(self, p: mi.Point3f) -> tuple[np.ndarray, np.ndarray]:
         """sigma_t and sigma_s at points, arrays of shape (channels, n), 1/mm."""
         sigma_t = self.factor[:, None] * np.array(eval_volume(self.density, p))
         return sigma_t, self.albedo[:, None] * np.array(eval_volume(self.albedo_volume, p)) * sigma_t
 
 
-def eval_volume(volume: Any, p: Any, active: Any = True) -> Any:
+def eval_volume(volume: mi.Volume | None, p: mi.Point3f, active: mi.Bool = True) -> Any:
     """The value of a volume at points, one per channel of the variant."""
     n = dr.width(p)
     if volume is None:
@@ -67,7 +67,7 @@ def eval_volume(volume: Any, p: Any, active: Any = True) -> Any:
     return mi.Spectrum(volume.eval(it, active))
 
 
-def grid_values(volume: Any) -> np.ndarray:
+def grid_values(volume: mi.Volume) -> np.ndarray:
     """The voxels of a grid, shape (z, y, x, channels)."""
     return np.array(mi.traverse(volume)["data"])
 
@@ -126,7 +126,7 @@ def _check_range(name: str, values: np.ndarray, most: float) -> None:
         raise ValueError(f"{name} must be {bound}, got {values[~ok].flat[0].item()!r}")
 
 
-def _check_grid(name: str, volume: Any, channels: int, most: float) -> None:
+def _check_grid(name: str, volume: mi.Volume, channels: int, most: float) -> None:
     if volume.class_name() != "GridVolume":
         raise ValueError(f"{name} must be a number, a constvolume or a gridvolume, got a {volume.class_name()}")
     values = grid_values(volume)
@@ -136,7 +136,7 @@ def _check_grid(name: str, volume: Any, channels: int, most: float) -> None:
     _check_range(name, values, most)
 
 
-def mean_medium(medium: VaryingMedium, p: Any, g: Any, eta: float) -> Medium:
+def mean_medium(medium: VaryingMedium, p: mi.Point3f, g: Any, eta: float) -> Medium:
     """The homogeneous medium with the means of sigma_s and sigma_a over points."""
     sigma_t, sigma_s = (values.astype(float).mean(axis=1) for values in medium.coefficients(p))
     sigma_a = np.maximum(sigma_t - sigma_s, 0)
@@ -181,7 +181,7 @@ def warn_of_means(inside: Any, obj: Object) -> None:
         )
 
 
-def _points(box: Any) -> Any:
+def _points(box: mi.ScalarBoundingBox3f) -> Any:
     """Random points of a box."""
     u = np.random.default_rng(5).random((3, POINTS))
     low, high = (np.array(v, dtype=float)[:, None] for v in (box.min, box.max))
