@@ -149,6 +149,48 @@ def test_the_single_order_beside_models_is_that_of_walks_for_every_emitter(kind:
     _agree(_means(scene, 2**13, 1), _reference(kind, "single"))
 
 
+def _same_light_otherwise(kind: str) -> dict:
+    """Emitters of other plugins or sizes that bring the same light: those of models are sampled, whatever they are."""
+    if kind == "area":
+        return {"ball": _ball(PLACE, 1.0, 0.05)}
+    if kind == "constant":
+        radiance = {"type": "area", "radiance": 1.0}
+        return {"dome": {"type": "sphere", "radius": FAR, "flip_normals": True, "emitter": radiance}}
+    if kind == "envmap":
+        return _sun_of_texels(EMITTERS[kind]()[0]["sky"])
+    return EMITTERS[kind]()[1]
+
+
+def _sun_of_texels(sky: dict) -> dict:
+    """The even sky, and a ball for the flux of what is brighter, by a sum over directions."""
+    emitter = mi.load_dict({"type": "scene", "sky": sky}).emitters()[0]
+    n = 2048
+    mu, phi = np.meshgrid((np.arange(n) + 0.5) / n * 2 - 1, (np.arange(2 * n) + 0.5) / n * np.pi, indexing="ij")
+    w = np.stack([np.sqrt(1 - mu**2) * np.cos(phi), mu, np.sqrt(1 - mu**2) * np.sin(phi)]).reshape(3, -1)
+    si = dr.zeros(mi.SurfaceInteraction3f, w.shape[1])
+    si.wi = mi.Vector3f(-w)
+    more = np.array(emitter.eval(si), dtype=float)[0] - 0.3
+    E = w @ more * (2 * np.pi / n / n)
+    flux = float(np.linalg.norm(E))
+    return {"sky": {"type": "constant", "radiance": 0.3}, "ball": _ball(FAR * E / flux, flux, 0.02)}
+
+
+def _model_finds_all_light(kind: str, model: str) -> None:
+    """The light of a model is linear in what arrives; what the model itself is off by cancels."""
+    surface = {"orders": "multiple", "model": model}
+    found, wanted = (
+        _means(_scene({"type": "bssrdf"}, lights, **surface), 2**9, seed)
+        for lights, seed in ((EMITTERS[kind]()[0], 1), (_same_light_otherwise(kind), 1001))
+    )
+    _agree(found, wanted)
+
+
+@pytest.mark.parametrize("kind", DAILY)
+def test_models_of_the_half_space_find_the_light_of_every_emitter(kind: str) -> None:
+    """Orders from two on."""
+    _model_finds_all_light(kind, "neural")
+
+
 @pytest.mark.parametrize("integrator", ["translucent_walk", "bssrdf"])
 def test_emitters_that_path_tracers_cannot_find_are_named(integrator: str) -> None:
     lamp = {"type": "rectangle", "to_world": _looking(PLACE), "emitter": {"type": "directionalarea"}}
