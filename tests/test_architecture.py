@@ -190,3 +190,12 @@ def test_few_parameters_of_the_renderer_leave_their_type_open() -> None:
         if isinstance(argument, ast.arg) and argument.annotation and ast.unparse(argument.annotation) == "Any"
     ]
     assert len(left_open) <= MOST_ANY, left_open
+
+
+def test_no_class_name_stands_for_two_things() -> None:
+    homes: dict[str, list[str]] = {}
+    for path in SOURCES:
+        for node in ast.walk(_tree(path)):
+            if isinstance(node, ast.ClassDef):
+                homes.setdefault(node.name, []).append(str(path.relative_to(ROOT)))
+    assert not {name: files for name, files in homes.items() if len(files) > 1}

@@ -23,7 +23,7 @@ import torch
 from figures.studies.flow import ConditionalFlow, FlowSampler
 from figures.studies.flow_chart import N_CONTEXT, Chart, context, direction_square
 from figures.studies.flow_training import FlowBatch, FlowNetwork, FlowRecipe, Walks, flow_walks, walk_batches
-from full_geometry.learning.networks import Layers, PatchLogits
+from full_geometry.learning.networks import DenseLayers, PatchLogits
 from full_geometry.object.features import Side, n_side, side_features
 from full_geometry.object.first_event import first_event
 from full_geometry.object.identity import frame_of
@@ -136,8 +136,8 @@ def fit_alpha_p(subject: Subject, recipe: FlowRecipe | None = None, seed: int = 
     nets = torch.nn.ModuleDict({
         "patches": PatchLogits(n, patches.areas, recipe.patch_hidden, seed),
         "flow": FlowNetwork(4, N_CONTEXT, recipe.hidden, seed),
-        "alpha": Layers([n, *HIDDEN, 1], generator),
-        "shares": Layers([2 * n + N_CONTEXT, *HIDDEN, channels], generator),
+        "alpha": DenseLayers([n, *HIDDEN, 1], generator),
+        "shares": DenseLayers([2 * n + N_CONTEXT, *HIDDEN, channels], generator),
     })  # fmt: skip
     pilot = flow_walks(subject, frame, patches, chart, recipe.chunk, (seed, 70))
     mean = pilot.total.mean(axis=0).astype(np.float64)

@@ -30,7 +30,7 @@ def tensor(array: np.ndarray, device: torch.device) -> torch.Tensor:
 LEAST_SHARE = 1e-5  # of F_t P that comes back
 
 
-class Layers(nn.Module):
+class DenseLayers(nn.Module):
     """A perceptron with hard swish between its layers; 0 initially."""
 
     def __init__(self, sizes: list[int], generator: torch.Generator) -> None:
@@ -73,7 +73,7 @@ class Correction(nn.Module):
 
     def __init__(self, n_in: int, channels: int, width: int = 64, depth: int = 3, seed: int = 0) -> None:
         super().__init__()
-        self.layers = Layers([n_in, *[width] * depth, channels], torch.Generator().manual_seed(seed))
+        self.layers = DenseLayers([n_in, *[width] * depth, channels], torch.Generator().manual_seed(seed))
         order, signs = reverse((n_in - n_pair(channels)) // 2, channels)
         back = np.argsort(order)
         self.register_buffer("order", torch.from_numpy(back), persistent=False)
@@ -115,7 +115,7 @@ class AlbedoNetwork(nn.Module):
     def __init__(self, n_in: int, channels: int, hidden: tuple[int, ...], eta: float, seed: int = 0) -> None:
         super().__init__()
         self.eta, self.channels = eta, channels
-        self.layers = Layers([n_in, *hidden, 2 * channels], torch.Generator().manual_seed(seed))
+        self.layers = DenseLayers([n_in, *hidden, 2 * channels], torch.Generator().manual_seed(seed))
 
     def _most(self, x: torch.Tensor) -> torch.Tensor:
         return torch.stack(entering(x, self.eta, self.channels)[1] * 2)
@@ -167,7 +167,7 @@ class PatchLogits(nn.Module):
 
     def __init__(self, n_in: int, areas: np.ndarray, hidden: tuple[int, ...], seed: int = 0) -> None:
         super().__init__()
-        self.layers = Layers([n_in, *hidden, len(areas)], torch.Generator().manual_seed(seed))
+        self.layers = DenseLayers([n_in, *hidden, len(areas)], torch.Generator().manual_seed(seed))
         shares = np.log(np.maximum(areas / areas.sum(), 1e-30))
         self.register_buffer("log_share", torch.from_numpy(shares.astype(np.float32))[:, None])
 

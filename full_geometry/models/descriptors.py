@@ -116,26 +116,26 @@ LEAST_R = 1e-9
 LEAST_PHASE = 1e-4
 
 
-class Line(NamedTuple):
+class Segment(NamedTuple):
     """From one point to another: direction, length."""
 
     d: Any
     length: Any
 
     @classmethod
-    def between(cls, a: Any, b: Any) -> Line:
+    def between(cls, a: Any, b: Any) -> Segment:
         """From a to b."""
         way = b - a
         length = dr.norm(way)
         return cls(way / dr.maximum(length, LEAST_R), length)
 
     @property
-    def back(self) -> Line:
+    def back(self) -> Segment:
         """From the other end."""
-        return Line(-self.d, self.length)
+        return Segment(-self.d, self.length)
 
 
-def on_a_plane(n_o: Any, inner_o: Any, n_i: Any, inner_i: Any, line: Line) -> tuple[Any, Any]:
+def on_a_plane(n_o: Any, inner_o: Any, n_i: Any, inner_i: Any, line: Segment) -> tuple[Any, Any]:
     """The refracted directions as on a plane, x along the line between the points, z along the normals.
 
     There both y lie a mean free path along them.
@@ -314,7 +314,7 @@ def describe(
     subject: Subject, exit: End, entry: End, shares: Sequence[Sequence[Any]], active: Any = True
 ) -> list[Pair]:
     """The descriptors of pairs for each channel, with the shares of `Backbone`; those of one extinction share rays."""
-    line = Line.between(exit.at.p, entry.at.p)
+    line = Segment.between(exit.at.p, entry.at.p)
     clear: dict[float, tuple[Any, Any]] = {}
     pairs = []
     for c, m in enumerate(subject.media):
@@ -326,15 +326,15 @@ def describe(
 
 
 def _channel(
-    subject: Subject, c: int, exit: End, entry: End, line: Line, clear: tuple[Any, Any], shares: Sequence[Any]
+    subject: Subject, c: int, exit: End, entry: End, line: Segment, clear: tuple[Any, Any], shares: Sequence[Any]
 ) -> Pair:
     m = subject.media[c]
     s, t, g = number(float(m.sigma_t_prime)), number(float(m.sigma_t)), float(m.g)
-    gap = Line.between(exit.event.ys[c], entry.event.ys[c])
+    gap = Segment.between(exit.event.ys[c], entry.event.ys[c])
     own_o, own_i = _own(c, t, exit, entry, line, gap), _own(c, t, entry, exit, line.back, gap.back)
     r = line.length * s
     d_o, d_i = on_a_plane(exit.at.n_out, exit.inner, entry.at.n_out, entry.inner, line)
-    flat = Line.between(d_o / t, mi.Vector3f(line.length, 0, 0) + d_i / t)
+    flat = Segment.between(d_o / t, mi.Vector3f(line.length, 0, 0) + d_i / t)
     plane = flat.length * s
     ratio = phases(g, exit.inner, entry.inner, gap.d) / phases(g, d_o, d_i, flat.d)
     blocked, lost = clear
@@ -355,7 +355,7 @@ def _onward(g: float, exit: End, entry: End) -> Any:
     return 0.3 * dr.log(number(1 - g * g) / (number(1 + g * g) - number(2 * g) * c))
 
 
-def _own(c: int, sigma_t: Any, here: End, there: End, line: Line, gap: Line) -> list[Any]:
+def _own(c: int, sigma_t: Any, here: End, there: End, line: Segment, gap: Segment) -> list[Any]:
     at, event, n, around = here.at, here.event, here.at.n_out, here.around[c]
     return [
         dr.dot(at.w, n), -dr.dot(here.inner, n), dr.dot(at.w, line.d), dr.dot(at.w, there.at.n_out),
@@ -369,7 +369,7 @@ def _own(c: int, sigma_t: Any, here: End, there: End, line: Line, gap: Line) -> 
 
 def _clearance(subject: Subject, a: Any, b: Any, active: Any) -> tuple[Any, Any]:
     """Of the line between two points inside: 1 if it leaves the object, else 0; the length that it is outside for."""
-    line = Line.between(a, b)
+    line = Segment.between(a, b)
 
     def reach(start: Any, d: Any, needed: Any) -> Any:
         hit = subject.object.scene.ray_intersect_preliminary(mi.Ray3f(start, d), False, needed)

@@ -25,9 +25,9 @@ from full_geometry.models.descriptors import (
     N_OWN,
     N_SHARED,
     End,
-    Line,
     Mixed,
     Pair,
+    Segment,
     describe,
     end,
     medium,
@@ -103,21 +103,21 @@ class Backbone(HalfSpace):
         """S_twice/(F_t(w_o) P_o F_t(w_i) P_i) per channel, that of a plane taken off."""
         eta = number(self.subject.eta)
         o, i = (refract_in(side.at, eta)[0] for side in (exit, entry))
-        line = Line.between(exit.at.p, entry.at.p)
+        line = Segment.between(exit.at.p, entry.at.p)
         d_o, d_i = on_a_plane(exit.at.n_out, o, entry.at.n_out, i, line)
         channels = []
         for c, (m, mixture) in enumerate(zip(self.subject.media, self.mixtures)):
             t = number(max(float(m.sigma_t), 1e-20))
             ys = exit.event.ys[c], entry.event.ys[c]
             spread = dr.square(exit.event.lengths[c]) + dr.square(entry.event.lengths[c])
-            flat = Line.between(d_o / t, mi.Vector3f(line.length, 0, 0) + d_i / t)
-            here = _twice(m, o, i, Line.between(*ys), spread)
+            flat = Segment.between(d_o / t, mi.Vector3f(line.length, 0, 0) + d_i / t)
+            here = _twice(m, o, i, Segment.between(*ys), spread)
             plane = _twice(m, d_o, d_i, flat, 2 / dr.square(t))
             channels.append(number(mixture.m_2) * dr.maximum(here - plane, 0))
         return mi.Spectrum(channels)
 
 
-def _twice(m: Medium, d_o: Any, d_i: Any, line: Line, spread: Any) -> Any:
+def _twice(m: Medium, d_o: Any, d_i: Any, line: Segment, spread: Any) -> Any:
     """Both phase functions and the attenuation along a line over its squared length, times (4 pi)²."""
     t = number(float(m.sigma_t))
     apart = dr.square(line.length) + spread / 12 + LEAST_LENGTH2 / dr.square(dr.maximum(t, 1e-20))

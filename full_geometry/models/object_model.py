@@ -82,7 +82,7 @@ class DirectionalAlbedo:
 
     @property
     def known(self) -> tuple[Any, Any]:
-        """See `rendering.object.points.DirectionalAlbedo`."""
+        """See `rendering.object.points.ObjectAlbedo`."""
         return tuple(mi.Spectrum([number(float(v)) for v in row]) for row in self.trusted)
 
     def __call__(self, at: SurfacePoint, active: Any = True) -> tuple[Any, Any]:

@@ -14,7 +14,7 @@ from halfspace_sss.backend import busy_threads
 from halfspace_sss.rendering.object.settings import variant_channels
 from halfspace_sss.rendering.paths.integrator import is_bssrdf
 from halfspace_sss.trade.exits import Exits
-from halfspace_sss.trade.statistics import Estimate, seeded
+from halfspace_sss.trade.statistics import RadianceEstimate, seeded
 from halfspace_sss.trade.ways import Stage, Way
 
 __all__ = ["Sampled", "clock", "first_sample", "radiance", "sample_more", "warm_up"]
@@ -38,7 +38,7 @@ class Sampled:
         memory: most bytes that Dr.Jit held while it ran.
     """
 
-    estimate: Estimate
+    estimate: RadianceEstimate
     preparation: float
     compilation: float
     compiling: float
@@ -66,13 +66,13 @@ def first_sample(stage: Stage, way: Way, exits: Exits, seed: int, object: int = 
         ValueError: the way refuses the scene.
     """
     if (object, way) in stage.paces:
-        estimate = Estimate(variant_channels(), exits.n)
+        estimate = RadianceEstimate(variant_channels(), exits.n)
         return replace(stage.paces[object, way], estimate=estimate, compilation=0.0, compiling=0.0)
     with stage.shown_by(way) as integrator:
         started = clock()
         _prepare(stage, integrator)
         preparation, prepared = clock() - started, time.perf_counter()
-        estimate = Estimate(variant_channels(), exits.n)
+        estimate = RadianceEstimate(variant_channels(), exits.n)
         _, first = _launch(stage, integrator, exits, estimate, 2, seeded(seed, 31, 0))
         compiled = time.perf_counter()
         _, overhead = _launch(stage, integrator, exits, estimate, 2, seeded(seed, 31, 1))
@@ -133,7 +133,9 @@ def _affordable(found: Sampled, n: int, left: float) -> int:
     return int(max(left - found.overhead, 0) / (found.seconds * n))
 
 
-def _launch(stage: Stage, integrator: Any, exits: Exits, estimate: Estimate, each: int, seed: int) -> tuple[int, float]:
+def _launch(
+    stage: Stage, integrator: Any, exits: Exits, estimate: RadianceEstimate, each: int, seed: int
+) -> tuple[int, float]:
     """`each` samples of every exit; bytes and seconds that it took."""
     import drjit as dr
     import mitsuba as mi

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-__all__ = ["FIREFLIES", "Estimate", "Number", "mean_square", "ratio_of_means", "relative_variance", "seeded"]
+__all__ = ["FIREFLIES", "RadianceEstimate", "Number", "mean_square", "ratio_of_means", "relative_variance", "seeded"]
 
 FIREFLIES = 1e-4  # share of samples, the brightest, that variances of a sample leave out
 
@@ -27,7 +27,7 @@ class Number(NamedTuple):
     error: float
 
 
-class Estimate:
+class RadianceEstimate:
     """Radiance of exits from sums over samples: (channels, n)."""
 
     def __init__(self, channels: int, n: int) -> None:
@@ -75,18 +75,18 @@ class Estimate:
         return self.sample_variance / self.samples
 
 
-def mean_square(a: Estimate, b: Estimate) -> Number:
+def mean_square(a: RadianceEstimate, b: RadianceEstimate) -> Number:
     """Mean squared difference over the square of the mean radiance of b; may come out below 0 in noise."""
     square = ((a.mean - b.mean) ** 2 - a.variance - b.variance).mean(axis=0)
     return _ratio(square, b.mean.mean(axis=0), 2)
 
 
-def relative_variance(a: Estimate, b: Estimate) -> Number:
+def relative_variance(a: RadianceEstimate, b: RadianceEstimate) -> Number:
     """Variance of one sample of a, mean over exits and channels, over the square of the mean radiance of b."""
     return _ratio(a.steady_variance.mean(axis=0), b.mean.mean(axis=0), 2)
 
 
-def ratio_of_means(a: Estimate, b: Estimate, channel: int) -> Number:
+def ratio_of_means(a: RadianceEstimate, b: RadianceEstimate, channel: int) -> Number:
     """Mean of a over that of b in a channel."""
     return _ratio(a.mean[channel], b.mean[channel], 1)
 

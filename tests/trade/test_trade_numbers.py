@@ -13,14 +13,14 @@ from halfspace_sss.trade.advice import Job, advise
 from halfspace_sss.trade.assessing import contenders
 from halfspace_sss.trade.automatic import picked
 from halfspace_sss.trade.results import Assessment, ObjectTrade, WayTrade, samples_for
-from halfspace_sss.trade.statistics import FIREFLIES, Estimate, mean_square, relative_variance
+from halfspace_sss.trade.statistics import FIREFLIES, RadianceEstimate, mean_square, relative_variance
 
 SEEDS, EXITS, SAMPLES = 400, 48, 12
 
 
-def _estimate(rng: np.random.Generator, mean: np.ndarray, sd: float) -> Estimate:
+def _estimate(rng: np.random.Generator, mean: np.ndarray, sd: float) -> RadianceEstimate:
     values = mean[..., None] + sd * rng.standard_normal((*mean.shape, SAMPLES))
-    found = Estimate(*mean.shape)
+    found = RadianceEstimate(*mean.shape)
     found.add(values.sum(-1), (values**2).sum(-1), SAMPLES)
     return found
 
@@ -54,7 +54,7 @@ def test_the_variance_of_a_sample_is_relative_to_the_mean() -> None:
 
 
 def test_fireflies_are_not_in_the_variance_of_a_sample() -> None:
-    rng, found = np.random.default_rng(5), Estimate(1, 100)
+    rng, found = np.random.default_rng(5), RadianceEstimate(1, 100)
     for _ in range(4):
         values = 2 + 0.6 * rng.standard_normal((1, 100, 500))
         values[0, rng.integers(0, 100, 3), 7] = 1e4  # of 50000, less than the share that is left out

@@ -17,14 +17,14 @@ from halfspace_sss.neural.training import checkpoint
 from halfspace_sss.neural.training.schedules import Schedule, Spent
 from halfspace_sss.progress import NamedProgress
 
-__all__ = ["ADAM", "Descent", "Fitted", "Learner", "Objective", "Source", "fit", "torch_threads"]
+__all__ = ["ADAM", "Descent", "Fitted", "Learnable", "Objective", "Source", "fit", "torch_threads"]
 
 BETAS, CLIP = (0.9, 0.99), 1.0
 ADAM = (0.9, 0.999)  # the betas of Kingma and Ba 2015, which published networks are fitted with
 Source = Callable[[torch.Generator], Any]  # the next batch; all chance in it is drawn from the generator
 
 
-class Learner(Protocol):
+class Learnable(Protocol):
     """A torch module that knows its loss for a batch of its source."""
 
     def parameters(self) -> Any: ...
@@ -125,7 +125,7 @@ class Fitted(NamedTuple):
 
 
 def fit(
-    learner: Learner,
+    learner: Learnable,
     source: Source,
     schedule: Schedule,
     seed: int,

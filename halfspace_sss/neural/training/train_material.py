@@ -25,7 +25,7 @@ from halfspace_sss.physics.medium import Medium
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.provenance import provenance
 
-__all__ = ["FAST", "STANDARD", "MaterialRecipe", "Subject", "TrainedChannel", "train_channel"]
+__all__ = ["FAST", "STANDARD", "MaterialRecipe", "TrainingSubject", "TrainedChannel", "train_channel"]
 
 VALIDATION_SEED = 104729
 VALIDATION_SETS = 4  # of 8 directions
@@ -73,7 +73,7 @@ class TrainedChannel:
     fit_seconds: float
 
 
-class Subject(Protocol):
+class TrainingSubject(Protocol):
     """What is trained: a kind of model, with its learner and how the learner answers as a model."""
 
     kind: str
@@ -90,7 +90,7 @@ class Subject(Protocol):
 
 def train_channel(
     medium: Medium,
-    subject: Subject,
+    subject: TrainingSubject,
     recipe: MaterialRecipe = STANDARD,
     seed: int = 0,
     *,

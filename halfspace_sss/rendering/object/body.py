@@ -15,7 +15,7 @@ from halfspace_sss.physics import single_scattering
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.object.half_space import Variation, half_space_model
 from halfspace_sss.rendering.object.placement import check_empty, check_sensors, places_of, translucent_shapes
-from halfspace_sss.rendering.object.points import DirectionalAlbedo, ObjectModel, Proposals, Transport, number
+from halfspace_sss.rendering.object.points import ObjectAlbedo, ObjectModel, Proposals, Transport, number
 from halfspace_sss.rendering.object.registry import AUTO, choose_models, lookup
 from halfspace_sss.rendering.object.settings import AUTOMATIC, Settings
 from halfspace_sss.rendering.object.shape import Object, check_together, number_of, same_objects, survey
@@ -62,7 +62,7 @@ class Body:
         return number(self.media[0].eta)
 
     @property
-    def alpha(self) -> DirectionalAlbedo | None:
+    def alpha(self) -> ObjectAlbedo | None:
         """Its directional albedo, where its transport knows one."""
         return None if self.transport is None else self.transport.alpha
 

@@ -9,7 +9,7 @@ import mitsuba as mi
 
 __all__ = [
     "CosineProposals",
-    "DirectionalAlbedo",
+    "ObjectAlbedo",
     "EntrySample",
     "Frame",
     "ObjectModel",
@@ -270,7 +270,7 @@ class CosineProposals(Proposals, Protocol):
         return cosine_density(entry.n_out, entry.n, w_i)
 
 
-class DirectionalAlbedo(Protocol):
+class ObjectAlbedo(Protocol):
     """The directional albedo of an object under uniform illumination, alpha = ∫ S mu_i dw_i dA_i.
 
     Attributes:
@@ -295,7 +295,7 @@ class Transport(Protocol):
 
     orders: str
     checksums: tuple[str, ...]
-    alpha: DirectionalAlbedo | None
+    alpha: ObjectAlbedo | None
     is_delta: bool
 
     def prepare(self, at: SurfacePoint, active: mi.Bool = True) -> Any:
