@@ -19,6 +19,7 @@ from figures.drawing.style import paper, saved
 from figures.drawing.trade_plot import image_shots, multiples
 from figures.parts.part import Part, Result, Task
 from halfspace_sss import materials
+from halfspace_sss.physics.medium import Medium
 from halfspace_sss.trade.checking.random_scenes import RandomScene, mesh_file
 from halfspace_sss.trade.results import Assessment
 
@@ -99,16 +100,21 @@ def turned(task: Task) -> dict[str, Any]:
     on = stage(_scene(p, task.folder))
     settings = entry_settings(on, p["names"], p["seconds"], p["seed"])
     task.progress(1, 3)
-    settings += channel_settings(on, p["seconds"], p["seed"])
+    media = channels(materials.load(p["material"]).medium)
+    alone = [stage(_scene(p, task.folder, medium)) for medium in media]
+    settings += channel_settings(on, alone, p["seconds"], p["seed"])
     task.progress(2, 3)
-    medium = channels(materials.load(p["material"]).medium)[0]
-    settings += node_settings(medium, seed=p["seed"]) + precision_settings(medium, seed=p["seed"])
+    settings += node_settings(media[0], seed=p["seed"]) + precision_settings(media[0], seed=p["seed"])
     return {"settings": [{**vars(s), "material": p["material"]} for s in settings]}
 
 
-def _scene(p: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """The bunny, or what stands in its place at the same size."""
+def _scene(p: Mapping[str, Any], folder: Path, medium: Medium | None = None) -> dict[str, Any]:
+    """The bunny, or what stands in its place at the same size; with a scalar medium instead of the material."""
     scene = bunny_scene(p["material"], 512, LIGHTS[p["light"]])
+    if medium is not None:
+        coefficients = {key: float(getattr(medium, key)) for key in ("sigma_s", "sigma_a", "g", "eta")}
+        kept = {key: value for key, value in scene["bunny"]["bsdf"].items() if key != "material"}
+        scene["bunny"]["bsdf"] = kept | coefficients
     if p["shape"] != "bunny":
         import mitsuba as mi
 

@@ -48,7 +48,7 @@ def entry_settings(
     """How many points of entry an exit draws, for models on the first object of a scene."""
     found = []
     for n in entries:
-        stage = replace(on, bssrdf={**on.bssrdf, "entries": n}, paces={}, _integrators={}, _insides={})
+        stage = replace(on, bssrdf={**on.bssrdf, "entries": n}, paces={}, _integrators={})
         chosen = [Way(PATH_TRACED), *map(Way, names)]
         seen = assess_stage(stage, chosen, seconds=seconds, seed=seed).objects[0]
         found += [("entries", str(n), name, _cost(seen, name), seen.way(name).bias) for name in names]
@@ -61,24 +61,24 @@ def _cost(found: ObjectTrade, way: str) -> float:
     return row.time_to(1.0)
 
 
-def channel_settings(on: Stage, seconds: float, seed: int = 0) -> list[Setting]:
+def channel_settings(on: Stage, alone: Sequence[Stage], seconds: float, seed: int = 0) -> list[Setting]:
     """All channels in one walk against walks for each, at equal mean variance over the channels.
 
     With time t_c and variance V_c of channel c alone the least is (Σ sqrt(V_c t_c))².
+
+    Args:
+        on: the scene.
+        alone: for each channel the scene in which all channels have its medium.
+        seconds: of measuring, each.
+        seed: of the samples.
     """
     together = assess_stage(on, [Way(PATH_TRACED)], seconds=seconds, seed=seed).objects[0]
-    n, surface = len(together.radiance), on.shapes[0].bsdf()
+    n, least = len(together.radiance), 0.0
     variance = n * together.traced.variance * np.mean(together.radiance) ** 2
-    before, alone = surface.inside, 0.0
-    try:
-        for m in before.channels():
-            same = {key: np.full(n, float(getattr(m, key))) for key in ("sigma_s", "sigma_a", "g")}
-            surface.inside = replace(before, medium=Medium(**same, eta=m.eta))
-            one = assess_stage(replace(on, paces={}), [Way(PATH_TRACED)], seconds=seconds, seed=seed).objects[0]
-            alone += math.sqrt(one.traced.variance * one.traced.seconds) * one.radiance[0]
-    finally:
-        surface.inside = before
-    ratio = alone**2 / (variance * together.traced.seconds)
+    for stage in alone:
+        one = assess_stage(stage, [Way(PATH_TRACED)], seconds=seconds, seed=seed).objects[0]
+        least += math.sqrt(one.traced.variance * one.traced.seconds) * one.radiance[0]
+    ratio = least**2 / (variance * together.traced.seconds)
     knob = "channels in one walk"
     return [Setting(knob, str(n), PATH_TRACED, 1.0, 0.0), Setting(knob, "1", PATH_TRACED, ratio, 0.0)]
 

@@ -68,7 +68,7 @@ def render_command(
     light: Annotated[
         str | None,
         typer.Option(
-            help="sampled (no bias), or gathered once for all samples (little bias, no noise of orders from two on).",
+            help="sampled (no bias), gathered once (little bias, no noise of orders from two on), or auto.",
             show_default="sampled, or the scene's",
         ),
     ] = None,

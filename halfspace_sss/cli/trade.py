@@ -49,6 +49,7 @@ def trade_command(
         list[str] | None, typer.Option(help="A model or path_traced; repeat for more.", show_default="all")
     ] = None,
     way: Annotated[list[str] | None, typer.Option(hidden=True)] = None,  # what --model was called before
+    every: Annotated[bool, typer.Option("--all", help="Every way, also those that cannot win.")] = False,
     assess: Annotated[float, typer.Option(help="Seconds of measuring for each object.")] = ASSESS,
     r: Annotated[str | None, typer.Option(help="Of a material: smallest and largest distance, mm, as 0.1,20.")] = None,
     sensor: SensorNumber = 0,
@@ -72,7 +73,9 @@ def trade_command(
         check_folder(out)
         use_mitsuba(variant)
         from halfspace_sss.trade.advice import Job
+        from halfspace_sss.trade.ways import ways
 
+        models = [way.name for way in ways()] if every and models is None else models
         how = {"seconds": assess, "models": models, "sensor": sensor, "seed": seed, "parameters": parameters}
         _scene(Path(what), Job(tolerance, images, seconds), how, out)
     else:
@@ -117,7 +120,11 @@ def _scene(file: Path, job: Job, how: dict[str, Any], out: Path) -> None:
 
     with Bar("trade") as bar:
         found = assess(
-            file, **how, tolerance=job.tolerance, progress=lambda what, done, total: bar.show(done, total, what)
+            file,
+            **how,
+            tolerance=job.tolerance,
+            images=job.images,
+            progress=lambda what, done, total: bar.show(done, total, what),
         )
     advice = advise(found, job)
     about = {"provenance": provenance(scene=str(file), tolerance=job.tolerance, images=job.images, **how)}

@@ -21,9 +21,11 @@ from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED
 from halfspace_sss.trade.assessing import assess
 from halfspace_sss.trade.results import Assessment, ObjectTrade, WayTrade, html_table, samples_for
+from halfspace_sss.trade.ways import GATHERED, LAMBERT, Way
 
 __all__ = ["Advice", "ObjectAdvice", "Option", "Job", "advise", "recommend"]
 
+INTEGRATOR = "bssrdf"
 DARK = "no light comes from it, every way shows it black"
 
 
@@ -82,7 +84,7 @@ class Advice:
 
     Attributes:
         objects: for each object alone.
-        integrator: "path_traced" or "bssrdf", which serves all objects at once in the least time.
+        integrator: "path_traced", "bssrdf" or "bssrdf, gathered", which serves all objects at once in the least time.
         seconds: that it takes.
         assessment: what this rests on.
         tolerance: that was asked.
@@ -153,20 +155,28 @@ def recommend(
         return advise(scene, job)
     if "assess_seconds" in assessing:
         assessing["seconds"] = assessing.pop("assess_seconds")
-    return advise(assess(scene, seed=seed, **{"flip": False, "tolerance": tolerance, **assessing}), job)
+    how = {"flip": False, "tolerance": tolerance, "images": images, **assessing}
+    return advise(assess(scene, seed=seed, **how), job)
 
 
 def advise(found: Assessment, job: Job) -> Advice:
     """The ways for a job, from what has been measured."""
     objects = tuple(_object(o, job) for o in found.objects)
     told = [o for o in objects if o.way is not None]
-    times = {kind: sum(_best(o, kind) for o in told) for kind in ("bssrdf", PATH_TRACED)}
+    kinds = (INTEGRATOR, f"{INTEGRATOR}, {GATHERED}", PATH_TRACED)
+    times = {kind: sum(_best(o, kind) for o in told) for kind in kinds}
     integrator = min(times, key=lambda kind: times[kind])
     return Advice(objects, integrator, times[integrator], found, job.tolerance)
 
 
 def _best(advice: ObjectAdvice, kind: str) -> float:
-    return min((o.seconds for o in advice.options if (o.way == PATH_TRACED) == (kind == PATH_TRACED)), default=math.inf)
+    """Least seconds of an object by an integrator; what does not spread is the same in both kinds of light."""
+    served = {
+        way: (way == PATH_TRACED) == (kind == PATH_TRACED)
+        and (way == LAMBERT or way.endswith(GATHERED) == kind.endswith(GATHERED))
+        for way in (o.way for o in advice.options)
+    }
+    return min((o.seconds for o in advice.options if served[o.way]), default=math.inf)
 
 
 def _object(found: ObjectTrade, job: Job) -> ObjectAdvice:
@@ -222,6 +232,7 @@ def _told(found: ObjectTrade, option: _Raw, best: _Raw, job: Job) -> Option:
         images = "an image" if job.images == 1 else f"{job.images} images"
         why = f"{row.way} is the cheapest that keeps {job.tolerance:.3g} ({size}): {off}, {images} in {_time(took)}"
         why += f" with {int(spp)} samples a pixel" + _training(row, job)
+        why += f"; render {Way.of(row.way).flags} --spp {int(spp)}"
     elif took < math.inf:
         over = job.seconds is not None and took > job.seconds
         why = f"{row.way} takes {_time(took)}"

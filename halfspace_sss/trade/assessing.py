@@ -19,7 +19,7 @@ from halfspace_sss.trade.images import with_flip
 from halfspace_sss.trade.results import Assessment, ObjectTrade, WayTrade, samples_for
 from halfspace_sss.trade.sampling import Sampled, clock, first_sample, sample_more, warm_up
 from halfspace_sss.trade.statistics import mean_square, ratio_of_means, relative_variance, seeded
-from halfspace_sss.trade.ways import Stage, Way, stage, ways
+from halfspace_sss.trade.ways import GATHERED, Stage, Way, stage, ways
 
 __all__ = ["EXITS", "assess", "assess_for", "assess_stage", "contenders", "training_seconds"]
 
@@ -28,6 +28,13 @@ TRACED_SHARE = 0.4  # of the time, for the walks that all ways are compared with
 FIRST_SHARE = 0.3  # of the time, for the look at all ways
 LEAST_SHARE = 0.25  # of the time, for the second look, however long the first one took
 DOUBT = 2.0  # standard errors
+CANDIDATES = (
+    PATH_TRACED, "lambert", "better_dipole", "neural", "full_geometry", "neural_shape",
+    *(f"{name}, {GATHERED}" for name in ("better_dipole", "neural", "full_geometry", "neural_shape")),
+)  # fmt: skip
+DEAR, DEAR_SECONDS = ("neural_shape",), 30.0  # to look at, which takes that long
+GATHERING = 2**20  # samples of a model whose time the gathering of its light takes at least
+LONGEST = 1.5  # times the seconds of an assessment that a gathering may take
 CLOSE = 1.3  # times the cost of the cheapest way, up to which another may turn out cheaper
 TRACED = (0.3, 0.85)  # least and most of the time of the second look for walks
 
@@ -41,6 +48,7 @@ def assess(
     seed: int = 0,
     flip: bool = True,
     tolerance: float | None = None,
+    images: int = 1,
     exits: int = EXITS,
     parameters: dict[str, str] | None = None,
     progress: NamedProgress | None = None,
@@ -54,12 +62,15 @@ def assess(
 
     Args:
         scene: a Mitsuba scene, a dict as for `mitsuba.load_dict`, or the path of an XML file.
-        seconds: for each object, shared by all ways; compilation comes on top, and a little for many ways.
-        models: names of ways, such as "neural", by default all; "path_traced" is always among them.
+        seconds: for each object, shared by all ways; compilation and gathering of light come on top.
+        models: names of ways, such as "neural" or "neural, gathered", all of which are measured; by default all, or
+            with a tolerance those of `CANDIDATES` that might be the cheapest to keep it. "path_traced" is always
+            among them.
         sensor: number of the sensor.
         seed: of everything; what depends on the clock is how many samples are taken.
         flip: whether to render small images for FLIP, if the evaluator is installed.
         tolerance: of a job; more than half of the time is then for ways that might be the cheapest to keep it.
+        images: of that job.
         exits: points of each object.
         parameters: values of the parameters $name of an XML file.
         progress: called with (what, done, total).
@@ -76,7 +87,9 @@ def assess(
     check_count("exits", exits, 32)
     if tolerance is not None:
         check_interval("tolerance", tolerance, 1e-4, 10.0)
-    chosen = _chosen(renamed(models, only, "models", "only"))
+    check_count("images", images, 1)
+    named = renamed(models, only, "models", "only")
+    chosen = _chosen(named if named is not None or tolerance is None else CANDIDATES)
     on = stage(scene, parameters)
     check_count("sensor", sensor, 0)
     if sensor >= len(on.scene.sensors()):
@@ -85,7 +98,7 @@ def assess(
     if tolerance is None:
         found = assess_stage(on, chosen, **how)
     else:
-        found = assess_for(on, chosen, tolerance, **how)
+        found = assess_for(on, chosen, tolerance, images=None if named else images, **how)
     if flip:
         found = with_flip(on, chosen, found, sensor, seed)
     return found
@@ -121,7 +134,7 @@ def assess_stage(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # they are heard when the ways are made ready again
         for walks in (True, False):
-            warm_up(on, [way for way in chosen if (way.model == PATH_TRACED) == walks])
+            warm_up(on, [way for way in chosen if (way.model == PATH_TRACED) == walks and way.light != GATHERED])
     started = clock()
     seen = visible_exits(on.scene, on.shapes, sensor, exits, seeded(seed, 41))
     objects, compiled, compiling = [], 0.0, 0.0
@@ -179,7 +192,8 @@ def _object(
         share = traced if way.model == PATH_TRACED and len(chosen) > 1 else 1 / (len(chosen) - done)
         try:
             found = first_sample(on, way, points, seeded(seed, done), k)
-            end, started = end + found.compiling, started + found.compiling
+            beside = found.compiling + (found.preparation if way.light == GATHERED else 0.0)
+            end, started = end + beside, started + beside
             left = share * (end - started) - (clock() - started)
             sample_more(on, way, points, found, seeded(seed, done), seconds=left, samples=samples)
             sampled[way] = found
@@ -225,26 +239,69 @@ def assess_for(
     chosen: Sequence[Way],
     tolerance: float,
     *,
+    images: int | None = 1,
     seconds: float = 4.0,
     sensor: int = 0,
     seed: int = 0,
     exits: int = EXITS,
     progress: NamedProgress | None = None,
 ) -> Assessment:
-    """As `assess_stage`, with most of the time for ways that could be the cheapest to keep a tolerance."""
+    """As `assess_stage`, with most of the time for ways that could be the cheapest to keep a tolerance.
+
+    Ways that cannot be the cheapest for a job of `images` are left out by what the first look at others says; with
+    None all are measured.
+    """
     how = {"sensor": sensor, "exits": exits, "progress": progress}
-    first = assess_stage(on, chosen, seconds=FIRST_SHARE * seconds, seed=seed, **how)
+    dear = DEAR if seconds < DEAR_SECONDS else ()
+    later = [way for way in chosen if images and (way.light == GATHERED or way.model in dear)]
+    ahead = [way for way in chosen if way not in later]
+    first = assess_stage(on, ahead, seconds=FIRST_SHARE * seconds, seed=seed, **how)
     seen = [o for o in first.objects if o.ways and not o.is_dark]
     if not seen:
         return first
     names = {name for o in seen for name in contenders(o, tolerance)}
-    few = [way for way in chosen if way.name in names or way.model == PATH_TRACED]
+    reasons = {way: [_left_out(o, way, tolerance, images, seconds) for o in seen] for way in later}
+    wanted = [way for way in later if "" in reasons[way]]
+    if len(wanted) > 1:
+        nearest = min(wanted, key=lambda way: _promise(seen, way))
+        for way in wanted:
+            reasons[way] = [f"not measured, as {nearest.name} promises less bias"]
+        wanted = [nearest]
+    names -= {way.model for way in wanted}  # what gathers no light cannot win where that is worth its preparation
+    few = [way for way in ahead if way.name in names or way.model == PATH_TRACED] + wanted
     traced = sum(_traced_share(o, names) for o in seen) / len(seen)
     left = max(seconds - first.seconds / len(seen), LEAST_SHARE * seconds)
     again = assess_stage(on, few, seconds=left, seed=seeded(seed, 71), traced=traced, **how)
-    objects = tuple(_merged(a, b) for a, b in zip(first.objects, again.objects))
+    out = tuple(WayTrade(way.name, refusal=reasons[way][0]) for way in later if way not in wanted)
+    objects = tuple(_merged(a, b, out) for a, b in zip(first.objects, again.objects))
     spent = (first.seconds + again.seconds, first.compilation + again.compilation)
     return Assessment(objects, *spent, first.seed)
+
+
+def _left_out(found: ObjectTrade, way: Way, tolerance: float, images: int, seconds: float) -> str:
+    """Why a way is not worth a look for an object, after a look at others; empty where it is."""
+    rows = [row for row in found.ways if not row.refusal and row.variance >= 0]
+    jobs = [samples_for(row, tolerance) * row.seconds * images * found.pixels + row.preparation for row in rows]
+    best = min(jobs, default=math.inf)
+    known = {row.way: row for row in found.ways}
+    if way.model not in known:
+        return f"not measured in less than {DEAR_SECONDS:g} s: ask for it by its name"
+    row = known[way.model]
+    if row.refusal:
+        return row.refusal
+    if row.bias2 - DOUBT * row.bias2_error > tolerance**2:
+        return f"not measured, as {way.model} is {row.told_bias} % off, asked {100 * tolerance:.3g} %"
+    least = row.preparation + GATHERING * row.seconds
+    if least > best:
+        return f"not measured, as another way keeps {tolerance:.3g} in {best:.2g} s, before its light is gathered"
+    if least > LONGEST * seconds:
+        return f"not measured, as its light is gathered for {least:.2g} s or longer: ask for it by its name"
+    return ""
+
+
+def _promise(seen: Sequence[ObjectTrade], way: Way) -> float:
+    """Sum over objects of what the squared bias of a model is below, by the first look."""
+    return sum(max(row.bias2, 0.0) + row.bias2_error for o in seen for row in o.ways if row.way == way.model)
 
 
 def contenders(found: ObjectTrade, tolerance: float) -> list[str]:
@@ -267,14 +324,16 @@ def _traced_share(found: ObjectTrade, names: set[str]) -> float:
     return min(max(walks / (walks + sum(noise)), TRACED[0]), TRACED[1]) if noise and walks > 0 else TRACED[1]
 
 
-def _merged(a: ObjectTrade, b: ObjectTrade) -> ObjectTrade:
-    """Both looks as one; they have exits and samples of their own."""
+def _merged(a: ObjectTrade, b: ObjectTrade, left_out: tuple[WayTrade, ...]) -> ObjectTrade:
+    """Both looks as one, which have exits and samples of their own, and the ways of the second alone."""
     if not a.ways or not b.ways:
         return a
+    known = {row.way for row in a.ways}
+    later = tuple(row for row in b.ways if row.way not in known)
     second = {row.way: row for row in b.ways if not row.refusal}
     walks = (a.traced, b.traced)
     rows = [_mean(row, second[row.way], walks) if row.way in second and not row.refusal else row for row in a.ways]
-    return replace(a, ways=tuple(rows))
+    return replace(a, ways=(*rows, *later, *left_out))
 
 
 def _mean(a: WayTrade, b: WayTrade, walks: tuple[WayTrade, WayTrade]) -> WayTrade:

@@ -1,8 +1,9 @@
 """The model "auto": the cheapest one of each object whose bias keeps the tolerance of the integrator, by measurement.
 
-All models that are installed are candidates. Costs are variance of a sample times seconds. If no model keeps the
-tolerance the least biased is taken. The choice is kept in a file, so that the same scene gets the same model again; the
-file can be deleted, and a model that is named in the scene needs no choice. The integrator cannot mix walks with
+All models that are installed are candidates, with light as the integrator states it: "sampled" by default, "gathered",
+or "auto" for the cheaper of both. Costs are seconds of an image, preparation counted. If no model keeps the tolerance
+the least biased is taken, with sampled light. The choice is kept in a file, so that the same scene gets the same again;
+the file can be deleted, and a model that is named in the scene needs no choice. The integrator cannot mix walks with
 models, and says where walks would be the better way.
 """
 
@@ -11,26 +12,29 @@ from __future__ import annotations
 import json
 import math
 import os
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
+
+import mitsuba as mi
 
 from halfspace_sss.neural.trained import weights_folder
 from halfspace_sss.provenance import provenance, write_atomically
-from halfspace_sss.rendering.object.registry import AUTO, model_names
+from halfspace_sss.rendering.object.placement import translucent_shapes
+from halfspace_sss.rendering.object.registry import AUTO, Choices, model_names
+from halfspace_sss.rendering.object.settings import Settings
 from halfspace_sss.rendering.scenes.identity import scene_hash
 from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED
 from halfspace_sss.trade.assessing import assess_stage
 from halfspace_sss.trade.results import ObjectTrade, WayTrade
-from halfspace_sss.trade.ways import Stage, Way
+from halfspace_sss.trade.ways import GATHERED, LAMBERT, Stage, Way
 
-__all__ = ["ENVIRONMENT_VARIABLE", "choices_folder", "choose", "picked"]
+__all__ = ["ENVIRONMENT_VARIABLE", "Pick", "choices_folder", "choose", "picked"]
 
 ENVIRONMENT_VARIABLE = "HALFSPACE_SSS_CHOICES"
 DEFAULT = "neural"
 EXITS = 96  # of each object
 SAMPLES = (64, 2048)  # fewest and most of each exit by each way; the fewest take some tenths of a second
-FORMAT = "halfspace-sss choice 1"
+FORMAT = "halfspace-sss choice 2"
 
 
 def choices_folder() -> Path:
@@ -39,60 +43,42 @@ def choices_folder() -> Path:
     return Path(stated) if stated else weights_folder().parent / "choices"
 
 
-def choose(scene: Any, settings: Any) -> None:
-    """Give every surface of a scene whose model is "auto" the one that its objects are best rendered by, for good.
+def choose(scene: mi.Scene, settings: Settings) -> Choices:
+    """The model that every object whose model is "auto" is best rendered by, and the light if that is "auto".
 
     Args:
-        scene: the Mitsuba scene, whose surfaces change.
-        settings: `Settings` of the integrator; the tolerance is theirs, and the share of the samples of an image that
-            the choice takes, as far as `SAMPLES` allows.
+        scene: the Mitsuba scene.
+        settings: of the integrator; the tolerance is theirs, and the share of the samples of an image that the choice
+            takes, as far as `SAMPLES` allows.
 
     Raises:
         ValueError: the scene cannot be rendered, or the file of an earlier choice is damaged.
     """
-    import mitsuba as mi
-
-    on = _stage(scene, settings)
-    wanted = [k for k, shape in enumerate(on.shapes) if shape.bsdf().inside.model == AUTO]
+    on = Stage(scene, translucent_shapes(scene), settings.shared(), settings.of_models())
+    named = [settings.model or shape.bsdf().inside.model for shape in on.shapes]
     path = choices_folder() / f"{_identity(on, settings)}.json"
     record = _read(path) if path.is_file() else None
-    if record is None or len(record["models"]) != len(wanted):
-        record = _measured(on, wanted, settings)
+    if record is None or len(record["models"]) != len(named):
+        record = _measured(on, named, settings)
         write_atomically(path, json.dumps(record, indent=1, allow_nan=False) + "\n")
-    given: dict[int, str] = {}
-    for k, model, sentence in zip(wanted, record["models"], record["sentences"]):
-        surface = on.shapes[k].bsdf()
-        if id(surface) in given:  # objects of one surface take the model of the first
-            continue
-        given[id(surface)] = model
-        surface.inside, surface.choice = replace(surface.inside, model=model), sentence
+    for sentence in record["sentences"]:
         mi.Log(mi.LogLevel.Info, sentence)
+    models = {k: model for k, model in enumerate(record["models"]) if named[k] == AUTO}
+    return Choices(models, record["light"], dict(zip(on.names, record["sentences"])))
 
 
-def _stage(scene: Any, settings: Any) -> Stage:
-    from halfspace_sss.rendering.object.placement import translucent_shapes
-
-    return Stage(scene, translucent_shapes(scene), settings.shared(), settings.of_models())
-
-
-def _identity(on: Stage, settings: Any) -> str:
-    import mitsuba as mi
-
+def _identity(on: Stage, settings: Settings) -> str:
     plugin = {"type": "bssrdf", **on.settings, **on.bssrdf, "tolerance": settings.tolerance}
-    plugin |= {"choice_share": settings.choice_share}
+    plugin |= {name: getattr(settings, name) for name in ("choice_share", "light", "model", "orders")}
     return scene_hash(on.scene, mi.load_dict(plugin))[:32]
 
 
 def _read(path: Path) -> dict[str, Any]:
     try:
         record = json.loads(path.read_text(encoding="utf-8"))
-        models = [str(name) for name in record["models"]]
-        known = (
-            len(models) == len(record["sentences"])
-            and record["format"] == FORMAT
-            and all(name in model_names() and name != AUTO for name in models)
-        )
-        sentences = [str(s) for s in record["sentences"]]
+        models, sentences = ([str(name) for name in record[key]] for key in ("models", "sentences"))
+        known = record["format"] == FORMAT and all(name in model_names() and name != AUTO for name in models)
+        known &= record["light"] in ("sampled", GATHERED) and len(models) == len(sentences)
     except (OSError, KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path} must be the record of a choice, got {error!r}; delete it to choose anew") from error
     if not known:
@@ -100,14 +86,29 @@ def _read(path: Path) -> dict[str, Any]:
     return {**record, "models": models, "sentences": sentences}
 
 
-def _measured(on: Stage, wanted: list[int], settings: Any) -> dict[str, Any]:
-    ways = [Way(name) for name in (PATH_TRACED, *model_names()) if name != AUTO]
+def _measured(on: Stage, named: list[str], settings: Settings) -> dict[str, Any]:
+    lights = ("sampled", GATHERED) if settings.light == AUTO else (settings.light,)
+    models = model_names() if AUTO in named else dict.fromkeys(named)
+    ways = [Way(PATH_TRACED)]
+    ways += [Way.of(_way(name, light)) for name in models if name != AUTO for light in lights if _has(name, light)]
     samples = _samples(on, settings.choice_share / len(ways))
     found = assess_stage(on, ways, samples=samples, exits=EXITS)
-    models, sentences = zip(*(picked(found.objects[k], settings.tolerance) for k in wanted))
+    picks = {light: [picked(o, settings.tolerance, light, name) for o, name in zip(found.objects, named)]
+             for light in lights}  # fmt: skip
+    light = min(lights, key=lambda light: _total(picks[light]))
     about = provenance(tolerance=settings.tolerance, samples=samples, exits=EXITS)
-    record = {"format": FORMAT, "models": list(models), "sentences": list(sentences)}
+    record = {"format": FORMAT, "light": light, "models": [pick.model for pick in picks[light]]}
+    record |= {"sentences": [pick.sentence for pick in picks[light]]}
     return {**record, "assessment": found.record(), "provenance": about}
+
+
+def _has(model: str, light: str) -> bool:
+    """Whether a way exists: a diffuse surface gathers nothing, and is the same in both kinds of light."""
+    return model != LAMBERT or light == "sampled"
+
+
+def _way(model: str, light: str) -> str:
+    return f"{model}, {GATHERED}" if light == GATHERED and model != LAMBERT else model
 
 
 def _samples(on: Stage, share: float) -> int:
@@ -119,31 +120,46 @@ def _samples(on: Stage, share: float) -> int:
     return min(max(int(share * image / (EXITS * len(on.shapes))), SAMPLES[0]), SAMPLES[1])
 
 
-def picked(found: ObjectTrade, tolerance: float) -> tuple[str, str]:
-    """The model for an object, and one sentence."""
-    rows = [row for row in found.ways if not row.refusal and row.way in model_names()]
+class Pick(NamedTuple):
+    """A model for an object, seconds of an image by it (infinite if it keeps no tolerance), and one sentence."""
+
+    model: str
+    seconds: float
+    sentence: str
+
+
+def _total(picks: list[Pick]) -> float:
+    return sum(pick.seconds for pick in picks)
+
+
+def picked(found: ObjectTrade, tolerance: float, light: str = "sampled", model: str = AUTO) -> Pick:
+    """The model for an object among those of one kind of light, or what can be said of the one that is named."""
+    names = model_names() if model == AUTO else (model,)
+    ways = {_way(name, light): name for name in names if name != AUTO}
+    rows = [row for row in found.ways if not row.refusal and row.way in ways]
     if not rows or found.is_dark:
-        return _default(rows), f"object {found.object!r}: {_default(rows)}, as nothing is seen that could be compared"
+        name = _default([ways[row.way] for row in rows] or list(ways.values()))
+        why = f"object {found.object!r}: {name}, as nothing is seen that could be compared"
+        return Pick(name, 0.0 if rows else math.inf, why)
     keeping = [row for row in rows if row.bias_bound <= tolerance]
     if keeping:
-        best = min(keeping, key=_cost)
+        best = min(keeping, key=lambda row: _cost(found, row, tolerance))
         why = f"{best.told_bias} % off, asked {100 * tolerance:.3g} %"
     else:
-        best = min(rows, key=lambda row: (row.bias_bound, _cost(row)))
+        best = min(rows, key=lambda row: (row.bias_bound, _cost(found, row, tolerance)))
         why = f"the least wrong, {best.told_bias} % off"
         why += f"; no model is known to keep {100 * tolerance:.3g} %"
-    walks = not keeping or _cost(found.traced) < _cost(best)
-    if walks:
+    cost, walks = _cost(found, best, tolerance), _cost(found, found.traced, tolerance)
+    if not keeping or walks < cost:
         why += "; translucent_walk would be better"
-        why += " and faster" if _cost(found.traced) < _cost(best) else ", which has no bias"
-    return best.way, f"object {found.object!r}: {best.way}, {why}"
+        why += " and faster" if walks < cost else ", which has no bias"
+    return Pick(ways[best.way], cost if keeping else math.inf, f"object {found.object!r}: {best.way}, {why}")
 
 
-def _default(rows: list[WayTrade]) -> str:
-    names = [row.way for row in rows]
+def _default(names: list[str]) -> str:
     return DEFAULT if DEFAULT in names or not names else names[0]
 
 
-def _cost(row: WayTrade) -> float:
-    """Seconds until the noise is that of one: compared between ways."""
-    return row.time_to(1.0) if row.variance >= 0 else math.inf
+def _cost(found: ObjectTrade, row: WayTrade, tolerance: float) -> float:
+    """Seconds of an image until its noise is at the tolerance."""
+    return row.preparation + found.pixels * row.time_to(tolerance) if row.variance >= 0 else math.inf

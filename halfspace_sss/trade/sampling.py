@@ -68,15 +68,14 @@ def first_sample(stage: Stage, way: Way, exits: Exits, seed: int, object: int = 
     if (object, way) in stage.paces:
         estimate = RadianceEstimate(variant_channels(), exits.n)
         return replace(stage.paces[object, way], estimate=estimate, compilation=0.0, compiling=0.0)
-    with stage.shown_by(way) as integrator:
-        started = clock()
-        _prepare(stage, integrator)
-        preparation, prepared = clock() - started, time.perf_counter()
-        estimate = RadianceEstimate(variant_channels(), exits.n)
-        _, first = _launch(stage, integrator, exits, estimate, 2, seeded(seed, 31, 0))
-        compiled = time.perf_counter()
-        _, overhead = _launch(stage, integrator, exits, estimate, 2, seeded(seed, 31, 1))
-        again = time.perf_counter() - compiled
+    integrator, started = stage.integrator(way), clock()
+    _prepare(stage, integrator)
+    preparation, prepared = clock() - started, time.perf_counter()
+    estimate = RadianceEstimate(variant_channels(), exits.n)
+    _, first = _launch(stage, integrator, exits, estimate, 2, seeded(seed, 31, 0))
+    compiled = time.perf_counter()
+    _, overhead = _launch(stage, integrator, exits, estimate, 2, seeded(seed, 31, 1))
+    again = time.perf_counter() - compiled
     waited = max(compiled - prepared - again, 0.0)
     found = Sampled(estimate, preparation, waited, max(first - overhead, 0.0), overhead)
     stage.paces[object, way] = found
@@ -85,9 +84,9 @@ def first_sample(stage: Stage, way: Way, exits: Exits, seed: int, object: int = 
 
 def warm_up(stage: Stage, ways: Sequence[Way]) -> None:
     """Compile what preparation needs, by the first way that does not refuse the scene, and forget that way again."""
-    for way in ways:
-        with stage.shown_by(way) as integrator, contextlib.suppress(ValueError, RuntimeError):
-            _prepare(stage, integrator)
+    for way in () if any(way in [known for _, known in stage.paces] for way in ways) else ways:
+        with contextlib.suppress(ValueError, RuntimeError):
+            _prepare(stage, stage.integrator(way))
             stage.forget(way)
             return
 
@@ -110,22 +109,21 @@ def sample_more(
         seconds: to spend.
         samples: of each exit, instead; the outcome then depends on the seed alone.
     """
-    most, started = max(LANES // exits.n, 2), clock()
-    with stage.shown_by(way) as integrator:
-        while True:
-            if samples:
-                each = samples - found.estimate.samples
-            else:
-                each = _affordable(found, exits.n, seconds - (clock() - started)) if found.launches else PILOT
-            if not found.estimate.samples:
-                each = max(each, PILOT)
-            if each < FEWEST:
-                return
-            each = min(each, most)
-            number = seeded(seed, 32, found.estimate.samples)
-            memory, took = _launch(stage, integrator, exits, found.estimate, each, number)
-            found.memory = max(found.memory, memory)
-            found.launches.append((exits.n * each, took))
+    most, started, integrator = max(LANES // exits.n, 2), clock(), stage.integrator(way)
+    while True:
+        if samples:
+            each = samples - found.estimate.samples
+        else:
+            each = _affordable(found, exits.n, seconds - (clock() - started)) if found.launches else PILOT
+        if not found.estimate.samples:
+            each = max(each, PILOT)
+        if each < FEWEST:
+            return
+        each = min(each, most)
+        number = seeded(seed, 32, found.estimate.samples)
+        memory, took = _launch(stage, integrator, exits, found.estimate, each, number)
+        found.memory = max(found.memory, memory)
+        found.launches.append((exits.n * each, took))
 
 
 def _affordable(found: Sampled, n: int, left: float) -> int:

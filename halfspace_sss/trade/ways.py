@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 from halfspace_sss.checks import check_choice
@@ -13,10 +12,11 @@ from halfspace_sss.rendering.object.placement import translucent_shapes
 from halfspace_sss.rendering.object.registry import AUTO, model_names
 from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED, load_objects, millimetres
 
-__all__ = ["LAMBERT", "NO_SINGLE", "Stage", "Way", "stage", "ways"]
+__all__ = ["GATHERED", "LAMBERT", "NO_SINGLE", "Stage", "Way", "stage", "ways"]
 
 LAMBERT = "lambert"
 NO_SINGLE = "without single scattering"
+GATHERED = "gathered"
 
 
 @dataclass(frozen=True)
@@ -26,37 +26,49 @@ class Way:
     Args:
         model: name of a model, or "path_traced".
         orders: "multiple" leaves single scattering out; None takes the orders of the scene.
+        light: "sampled" or "gathered", see `Settings`.
     """
 
     model: str
     orders: str | None = None
+    light: str = "sampled"
 
     @property
     def name(self) -> str:
         """As tables show it."""
-        return self.model if self.orders is None else f"{self.model}, {NO_SINGLE}"
+        parts = (self.model, NO_SINGLE if self.orders else "", GATHERED if self.light == GATHERED else "")
+        return ", ".join(filter(None, parts))
+
+    @property
+    def flags(self) -> str:
+        """What asks the command `render` for it."""
+        asked = f"--model {self.model}" + (f" --orders {self.orders}" if self.orders else "")
+        return asked + (f" --light {GATHERED}" if self.light == GATHERED else "")
 
     @classmethod
     def of(cls, name: str) -> Way:
         """The way of that name; ValueError if there is none."""
-        model, _, left_out = name.partition(", ")
+        model, *more = name.split(", ")
         check_choice("way", model, (PATH_TRACED, *(m for m in model_names() if m != AUTO)))
-        if left_out:
-            check_choice("orders that are left out", left_out, (NO_SINGLE,))
-        return cls(model, "multiple" if left_out else None)
+        for part in more:
+            known = (NO_SINGLE,) if model in (PATH_TRACED, LAMBERT) else (NO_SINGLE, GATHERED)
+            check_choice(f"what follows {model}", part, known)
+        return cls(model, "multiple" if NO_SINGLE in more else None, GATHERED if GATHERED in more else "sampled")
 
 
 def ways() -> list[Way]:
-    """All of them: path traced first, a diffuse surface, every model, and those without the single scattering."""
-    found = [Way(PATH_TRACED), Way(LAMBERT)]
-    found += [Way(name) for name in model_names() if name not in (AUTO, LAMBERT)]
+    """All of them: path traced first, a diffuse surface, every model with light sampled and gathered, and those without
+    the single scattering."""
+    names = [name for name in model_names() if name not in (AUTO, LAMBERT)]
+    found = [Way(PATH_TRACED), Way(LAMBERT), *map(Way, names)]
+    found += [Way(name, light=GATHERED) for name in names]
     bare = [name for name in models() if model_class(name).orders == "multiple"]
     return found + [Way(name, "multiple") for name in bare if name in ("better_dipole", "neural")]
 
 
 @dataclass(eq=False)
 class Stage:
-    """A loaded scene whose objects take models in turn.
+    """A loaded scene, and the integrators that show it in several ways.
 
     Args:
         scene: the Mitsuba scene.
@@ -72,7 +84,6 @@ class Stage:
     bssrdf: dict[str, Any]
     paces: dict[tuple[int, Way], Any] = field(default_factory=dict)
     _integrators: dict[Way, Any] = field(default_factory=dict)
-    _insides: dict[Way, list[Any]] = field(default_factory=dict)
 
     @property
     def mm_per_unit(self) -> float:
@@ -83,44 +94,22 @@ class Stage:
         """Ids of the objects."""
         return [shape.id() for shape in self.shapes]
 
-    @contextmanager
-    def shown_by(self, way: Way) -> Iterator[Any]:
-        """The integrator of a way, while the surfaces have its model; afterwards they are as they were."""
-        surfaces = [shape.bsdf() for shape in self.shapes]
-        before = [surface.inside for surface in surfaces]
-        for surface, inside in zip(surfaces, self._of(way, before)):
-            surface.inside = inside
-        try:
-            yield self._integrator(way)
-        finally:
-            for surface, inside in zip(surfaces, before):
-                surface.inside = inside
+    def integrator(self, way: Way) -> Any:
+        """The integrator of a way, which keeps what it has made ready; the scene is the same for all."""
+        import mitsuba as mi
+
+        if way not in self._integrators:
+            plugin = {"type": "translucent_walk"} | self.settings
+            if way.model != PATH_TRACED:
+                plugin |= {"type": "bssrdf", **self.bssrdf, "model": way.model, "light": way.light}
+                plugin |= {"orders": way.orders} if way.orders else {}
+                plugin["train_seconds"] = 0.0  # who asks does not wait for the training of an object
+            self._integrators[way] = mi.load_dict(plugin)
+        return self._integrators[way]
 
     def forget(self, way: Way) -> None:
         """What has been made ready for a way."""
         self._integrators.pop(way, None)
-        self._insides.pop(way, None)
-
-    def _of(self, way: Way, before: list[Any]) -> list[Any]:
-        """The same `Inside` each time a way is shown, by which an integrator knows what it has made ready."""
-        if way.model == PATH_TRACED:
-            return before
-        if way not in self._insides:
-            changes = {"model": way.model} | ({"orders": way.orders} if way.orders else {})
-            made: dict[int, Any] = {}  # objects may share a surface
-            self._insides[way] = [made.setdefault(id(i), replace(i, **changes)) for i in before]
-        return self._insides[way]
-
-    def _integrator(self, way: Way) -> Any:
-        import mitsuba as mi
-
-        if way not in self._integrators:
-            walks = way.model == PATH_TRACED
-            plugin = {"type": "translucent_walk" if walks else "bssrdf"} | self.settings
-            # an object that was not learnt is refused: who asks does not wait for its training
-            alone = {} if walks else {**self.bssrdf, "train_seconds": 0.0}
-            self._integrators[way] = mi.load_dict(plugin | alone)
-        return self._integrators[way]
 
 
 def stage(scene: Any, parameters: dict[str, str] | None = None) -> Stage:

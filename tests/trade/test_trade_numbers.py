@@ -14,6 +14,7 @@ from halfspace_sss.trade.assessing import contenders
 from halfspace_sss.trade.automatic import picked
 from halfspace_sss.trade.results import Assessment, ObjectTrade, WayTrade, samples_for
 from halfspace_sss.trade.statistics import FIREFLIES, RadianceEstimate, mean_square, relative_variance
+from halfspace_sss.trade.ways import Way
 
 SEEDS, EXITS, SAMPLES = 400, 48, 12
 
@@ -113,7 +114,7 @@ def test_a_bias_that_noise_hides_is_told_as_a_bound_and_never_as_0() -> None:
     assert lucky.told_bias == "< 1.3" and trade._row(row)[1] == "< 1.3" and trade._row(walks)[1] == "exact"
     why = {option.way: option.why for option in recommend(found, tolerance=0.011).objects[0].options}
     assert "< 1.3 % off" in why["standard_dipole"]
-    assert picked(found.objects[0], 0.05)[1] == ("object 'ball': standard_dipole, < 1.3 % off, asked 5 %")
+    assert picked(found.objects[0], 0.05).sentence == ("object 'ball': standard_dipole, < 1.3 % off, asked 5 %")
 
 
 def test_every_way_gets_one_sentence() -> None:
@@ -160,10 +161,30 @@ def test_several_objects_share_an_integrator() -> None:
 
 def test_auto_takes_the_cheapest_that_keeps_and_says_when_walks_are_better() -> None:
     found = _assessment(CHEAP, GOOD).objects[0]
-    assert picked(found, 0.5)[0] == "lambert"
-    assert picked(found, 0.1)[0] == "neural"
-    model, why = picked(_assessment(CHEAP).objects[0], 0.1)
-    assert model == "lambert" and "translucent_walk would be better" in why
+    assert picked(found, 0.5).model == "lambert"
+    assert picked(found, 0.1).model == "neural"
+    least = picked(_assessment(CHEAP).objects[0], 0.1)
+    assert least.model == "lambert" and "translucent_walk would be better" in least.sentence
+    assert least.seconds == math.inf
+
+
+def test_auto_takes_gathered_light_only_where_it_is_asked_for_and_counts_its_preparation() -> None:
+    gathered = _way("neural, gathered", 0.01, 0.01, 1e-8, preparation=4.0)
+    found = _assessment(GOOD, gathered).objects[0]  # 100 pixels, variance 1
+    assert picked(found, 0.1).seconds == pytest.approx(100 * 100 * 2e-6)
+    assert picked(found, 0.1, "gathered").seconds == pytest.approx(4.0 + 100 * 100 * 1e-8)
+    assert picked(found, 0.1, "gathered").sentence.startswith("object 'ball': neural, gathered, < 1.6 % off")
+
+
+@pytest.mark.parametrize("way", ["path_traced", "neural", "neural, gathered", "neural, without single scattering"])
+def test_a_way_comes_back_by_its_name(way: str) -> None:
+    assert Way.of(way).name == way
+
+
+@pytest.mark.parametrize("unknown", ["path_traced, gathered", "lambert, gathered", "neural, collected"])
+def test_a_way_that_does_not_exist_is_refused(unknown: str) -> None:
+    with pytest.raises(ValueError, match="what follows"):
+        Way.of(unknown)
 
 
 def test_a_record_comes_back_as_it_was() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,7 +16,7 @@ from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.object.half_space import Variation, half_space_model
 from halfspace_sss.rendering.object.placement import check_empty, check_sensors, places_of, translucent_shapes
 from halfspace_sss.rendering.object.points import ObjectAlbedo, ObjectModel, Proposals, Transport, number
-from halfspace_sss.rendering.object.registry import AUTO, choose_models, lookup
+from halfspace_sss.rendering.object.registry import AUTO, Choices, choices, lookup
 from halfspace_sss.rendering.object.settings import AUTOMATIC, Settings
 from halfspace_sss.rendering.object.shape import Object, check_together, number_of, same_objects, survey
 from halfspace_sss.rendering.object.translucent import Inside
@@ -83,6 +83,9 @@ class Bodies:
         self.settings = settings
         self._made: tuple[int, list, list[Body]] = (0, [], [])
         self._places: tuple[list, list] = ([], [])
+        if settings.model:
+            lookup(settings.model)
+        self.choices = Choices({}, settings.light, {})  # for as long as the objects are the same
 
     def of(self, scene: Any) -> list[Body]:
         """The bodies of a scene; errors as in `make_bodies`."""
@@ -90,7 +93,9 @@ class Bodies:
         world, before, bodies = self._made
         same = world == number_of(scene) and same_objects(before, shapes)
         if not bodies or not same or not all(body.is_current() for body in bodies):
-            self._made = number_of(scene), shapes, make_bodies(scene, self.settings)
+            if not (bodies and same):
+                self.choices = _choices(scene, self.settings)
+            self._made = number_of(scene), shapes, make_bodies(scene, self.settings, (), self.choices)
             self._places = places_of(scene)
         elif (places := places_of(scene))[0] != self._places[0]:
             check_empty(scene, [body.found for body in bodies], _MODELS)
@@ -98,8 +103,16 @@ class Bodies:
         return self._made[2]
 
 
-def make_bodies(scene: Any, settings: Settings, without: Collection[str] = ()) -> list[Body]:
+def make_bodies(
+    scene: Any, settings: Settings, without: Collection[str] = (), chosen: Choices | None = None
+) -> list[Body]:
     """All objects of a scene that have a `translucent` surface, but for those with the ids in `without`.
+
+    Args:
+        scene: of Mitsuba.
+        settings: of the integrator.
+        without: ids.
+        chosen: what stands for "auto", by default chosen now.
 
     Raises:
         ValueError: there is none, a camera or anything else is inside one, a model refuses its medium, or the orders
@@ -112,18 +125,33 @@ def make_bodies(scene: Any, settings: Settings, without: Collection[str] = ()) -
     check_together(scene, [found.scene for found in objects])
     check_sensors(scene, objects)
     check_empty(scene, objects, _MODELS)
-    if any(shape.bsdf().inside.model == AUTO for shape in shapes):
-        choose_models(scene, settings)
-    return [_make_body(found, settings) for found in objects if found.shape.id() not in without]
+    chosen = chosen or _choices(scene, settings)
+    insides = [_asked(shape, settings, chosen.models.get(k)) for k, shape in enumerate(shapes)]
+    named = [pair for pair in zip(objects, insides) if pair[0].shape.id() not in without]
+    return [_make_body(found, equivalent(inside, found), settings) for found, inside in named]
 
 
-def _make_body(found: Object, settings: Settings) -> Body:
+def _asked(shape: Any, settings: Settings, model: str | None = None) -> Inside:
+    """What is inside an object, with the model and orders that the integrator asks for."""
+    inside = shape.bsdf().inside
+    asked = {"model": model or settings.model or inside.model, "orders": settings.orders or inside.orders}
+    return inside if asked == {key: getattr(inside, key) for key in asked} else replace(inside, **asked)
+
+
+def _choices(scene: Any, settings: Settings) -> Choices:
+    """What stands for "auto", measured if anything is."""
+    insides = [_asked(shape, settings) for shape in translucent_shapes(scene)]
+    if insides and (settings.light == AUTO or any(inside.model == AUTO for inside in insides)):
+        return choices(scene, settings)
+    return Choices({}, settings.light, {})
+
+
+def _make_body(found: Object, inside: Inside, settings: Settings) -> Body:
     surface = found.shape.bsdf()
-    inside = equivalent(surface.inside, found)
     media = [m.scaled(settings.mm_per_unit) for m in inside.channels()]
     check_size(found, [float(m.sigma_t) for m in media], settings.mm_per_unit)
     single_only = inside.orders == "single" or not any(float(m.sigma_s) > 0 for m in media)
-    variation = Variation(surface, settings.mm_per_unit)
+    variation = Variation(surface, settings.mm_per_unit, inside.model)
     none = ObjectModel(None, None)
     transport, proposals, entries = none if single_only else _model_of(inside, found, media, settings, variation)
     if transport and transport.orders == "total" and inside.orders == "multiple":

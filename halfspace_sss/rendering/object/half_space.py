@@ -159,10 +159,11 @@ class Variation:
     Args:
         surface: its `translucent` BSDF, whose parameters are differentiated by.
         mm_per_unit: length of a scene unit, mm.
+        model: name of the object's model.
     """
 
-    def __init__(self, surface: Any, mm_per_unit: float) -> None:
-        self.surface, self.inside, self.mm_per_unit = surface, surface.inside, mm_per_unit
+    def __init__(self, surface: Any, mm_per_unit: float, model: str) -> None:
+        self.surface, self.inside, self.mm_per_unit, self.model = surface, surface.inside, mm_per_unit, model
         self._stencils: dict[str, list[Stencil]] = {}
 
     def prepare(self) -> None:
@@ -191,11 +192,11 @@ class Variation:
                 return list(zip(models, coefficients))
             except ValueError as error:
                 refusals.append(str(error))
-        raise ValueError(f"model {self.inside.model!r} cannot be differentiated by {name}: {refusals[0]}")
+        raise ValueError(f"model {self.model!r} cannot be differentiated by {name}: {refusals[0]}")
 
     def _model(self, m: Medium, name: str, value: float) -> Any:
         ratios = {key: float(getattr(m, key)) for key in VARIABLE} | {name: value}
-        return bssrdf(self.inside.model, Medium.from_albedo(**ratios, eta=m.eta).scaled(self.mm_per_unit))
+        return bssrdf(self.model, Medium.from_albedo(**ratios, eta=m.eta).scaled(self.mm_per_unit))
 
     def S(self, values: list[Any], query: tuple) -> list[Any]:
         """The S of each channel at a query in scene units, with their derivatives where they are followed."""

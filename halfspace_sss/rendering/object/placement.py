@@ -12,7 +12,7 @@ import numpy as np
 from halfspace_sss.rendering.object.shape import Object, geometry_of, is_inside, name_of, rays_into, scene_of
 from halfspace_sss.rendering.object.translucent import is_translucent
 
-__all__ = ["Content", "check_empty", "check_sensors", "choices", "contents", "places_of", "translucent_shapes"]
+__all__ = ["Content", "check_empty", "check_sensors", "contents", "places_of", "translucent_shapes"]
 
 STARTS = 64  # rays of each sensor that are looked at
 LOOKS = 512  # rays that look for parts of a shape in an object
@@ -212,13 +212,6 @@ def _starts(sensor: mi.Sensor, size: float) -> np.ndarray:
     # not sample_ray, which some sensors lack
     ray, _ = sensor.sample_ray_differential(0.0, numbers[0], mi.Point2f(*numbers[1:3]), mi.Point2f(*numbers[3:]))
     return np.array(mi.Point3f(ray.o + ray.d * (1e-4 * size))).reshape(3, -1)
-
-
-def choices(scene: mi.Scene) -> dict[str, str]:
-    """Why the model "auto" of objects became the one that they have, by id; empty before it was chosen."""
-    return {
-        shape.id(): why for shape in scene.shapes() if is_translucent(shape.bsdf()) and (why := shape.bsdf().choice)
-    }
 
 
 def _inside(bsdf: mi.BSDF | None) -> bool:

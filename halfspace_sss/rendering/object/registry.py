@@ -5,8 +5,8 @@ The half-space models are those of `interface.model`. Packages add others by ent
 - `halfspace_sss.transports`: a function of (found, inside, media, settings), the `Object`, the `Inside`, the medium of
   each channel in 1/(scene unit) and the `Settings` of the integrator, that returns an `ObjectModel`;
 - `halfspace_sss.learners`: a module or object that learns the model, see `rendering.scenes.learners`;
-- `halfspace_sss.choosers`: a function of (scene, settings) that gives each surface which has the name a model by
-  another, which it keeps; "auto" stands for the cheapest that is good enough.
+- `halfspace_sss.choosers`: a function of (scene, settings) that returns `Choices`, what stands for the name in a scene;
+  "auto" stands for the cheapest that is good enough.
 
 None is imported before it is asked for.
 """
@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from halfspace_sss.checks import check_choice
 from halfspace_sss.extensions import CHOOSERS, LEARNERS, TRANSPORTS, loaded, offers
@@ -28,7 +28,7 @@ from halfspace_sss.rendering.object.settings import Settings
 if TYPE_CHECKING:
     import mitsuba as mi
 
-__all__ = ["AUTO", "ModelEntry", "choose_models", "learnt_names", "lookup", "model_names"]
+__all__ = ["AUTO", "Choices", "ModelEntry", "choices", "learnt_names", "lookup", "model_names"]
 
 AUTO = "auto"
 _BY_GROUP = once(offers)
@@ -102,6 +102,20 @@ def learnt_names() -> tuple[str, ...]:
     return tuple(_BY_GROUP(LEARNERS))
 
 
-def choose_models(scene: mi.Scene, settings: Settings) -> None:
-    """Give every surface of a scene whose model is "auto" one by name, which it keeps."""
-    _BY_GROUP(CHOOSERS)[AUTO].load()(scene, settings)
+class Choices(NamedTuple):
+    """What stands for "auto" in a scene.
+
+    Args:
+        models: by number among the translucent objects of the scene, of those whose model is "auto".
+        light: "sampled" or "gathered".
+        sentences: why, by id of the object.
+    """
+
+    models: dict[int, str]
+    light: str
+    sentences: dict[str, str]
+
+
+def choices(scene: mi.Scene, settings: Settings) -> Choices:
+    """A model for every object of a scene whose model is "auto", and the light if that is."""
+    return _BY_GROUP(CHOOSERS)[AUTO].load()(scene, settings)

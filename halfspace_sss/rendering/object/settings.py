@@ -24,7 +24,7 @@ __all__ = [
 AUTOMATIC = -1.0
 ORDERS = ("total", "multiple", "single")
 GEOMETRIES = ("distance", "tangent")
-LIGHTS = ("sampled", "gathered")
+LIGHTS = ("sampled", "gathered", "auto")
 SHARED = ("mm_per_unit", "max_depth", "rr_depth", "hide_emitters")  # what `translucent_walk` understands too
 OF_MODELS = ("geometry", "area_share", "entries")
 
@@ -44,13 +44,14 @@ class Settings:
         entries: points of entry that an exit draws, of which one is followed, chosen by what it may bring; AUTOMATIC
             leaves it to the model.
         light: "sampled", without bias; or "gathered" once for all samples, see `paths.gathering`: orders from two on
-            have a little bias and no noise.
+            have a little bias and no noise; or "auto", the cheaper of both that keeps the tolerance, by measurement.
         hide_emitters: whether directly visible emitters are left out.
         train_seconds: time for each object whose model has to learn it first; 0 refuses objects without weights.
         train_error: relative error under constant light, measured on the way, from which on it has learnt enough.
         tolerance: relative error of the radiance of an object that its model "auto" keeps, if one does.
         choice_share: of the samples of the first sensor's image, that the choice of "auto" may take; see
             `trade.automatic`.
+        model, orders: of all objects, instead of what their surfaces say, where they are given.
     """
 
     mm_per_unit: float = 1.0
@@ -65,6 +66,8 @@ class Settings:
     train_error: float = 0.03
     tolerance: float = 0.05
     choice_share: float = 0.1
+    model: str = ""
+    orders: str = ""
 
     def __post_init__(self) -> None:
         check_interval("mm_per_unit", self.mm_per_unit, 1e-9, 1e9)
@@ -77,6 +80,7 @@ class Settings:
         if self.entries < 1 and self.entries != AUTOMATIC:
             raise ValueError(f"entries must be at least 1, got {self.entries}")
         check_choice("light", self.light, LIGHTS)
+        check_choice("orders", self.orders, ("", *ORDERS))
         if self.geometry not in GEOMETRIES:
             raise ValueError(f"geometry must be one of {', '.join(GEOMETRIES)}, got {self.geometry!r}")
         if self.area_share != AUTOMATIC:
@@ -91,7 +95,8 @@ class Settings:
     def of_models(self) -> dict[str, Any]:
         """How models are laid on and sampled; what is automatic is left to them."""
         given = {name: getattr(self, name) for name in OF_MODELS}
-        return {name: value for name, value in given.items() if value != AUTOMATIC}
+        given = {name: value for name, value in given.items() if value != AUTOMATIC}
+        return given | ({"orders": self.orders} if self.orders else {})
 
 
 def read_settings(props: Any) -> Settings:

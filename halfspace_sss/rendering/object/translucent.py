@@ -79,7 +79,6 @@ def _class(variant: str) -> type:
             mi.BSDF.__init__(self, props)
             check_parameters("translucent", props, (*PARAMETERS, *(key for key, _ in _boundaries(props))))
             self.inside = read_inside(props)
-            self.choice = ""  # why "auto" became the model that it is
             self.boundary = boundary_of([inner for _, inner in _boundaries(props)], self.inside.medium.eta)
             self.reflection = Reflection.of(self.boundary)
             self.m_components = [self.boundary.flags(self.reflection.lobe)]

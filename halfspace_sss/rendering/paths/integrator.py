@@ -15,6 +15,7 @@ import numpy as np
 
 from halfspace_sss.interrupts import hear_again, interruptible
 from halfspace_sss.rendering.object.body import Bodies, Body, make_bodies
+from halfspace_sss.rendering.object.registry import Choices
 from halfspace_sss.rendering.object.settings import Settings, read_settings
 from halfspace_sss.rendering.object.translucent import is_translucent
 from halfspace_sss.rendering.paths.gathering import Gathering
@@ -68,7 +69,7 @@ def _class(variant: str) -> type:
 
         def _prepared(self, scene: mi.Scene) -> list[Body]:
             objects = self._bodies.of(scene)
-            if self.settings.light == "sampled":
+            if self._bodies.choices.light == "sampled":
                 return objects
             return self._gathering.of(scene, objects, self.settings)
 
@@ -113,6 +114,11 @@ def _class(variant: str) -> type:
             with undisturbed(), dr.suspend_grad():
                 parts, hit = trace_paths(scene, self._prepared(scene), self.settings, sampler, ray, active)
             return parts[0] + parts[1], hit, []
+
+        @property
+        def choices(self) -> Choices:
+            """What stands for "auto"; known when a scene has been prepared."""
+            return self._bodies.choices
 
         @property
         def gathered(self) -> list[str]:

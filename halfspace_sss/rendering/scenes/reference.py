@@ -21,7 +21,6 @@ import numpy as np
 
 from halfspace_sss.checks import check_count
 from halfspace_sss.provenance import check_folder, provenance
-from halfspace_sss.rendering.object.placement import choices
 from halfspace_sss.rendering.object.registry import AUTO
 from halfspace_sss.rendering.object.translucent import is_translucent
 from halfspace_sss.rendering.paths.integrator import is_bssrdf
@@ -233,12 +232,15 @@ def about_render(scene: Any, integrator: Any, sensor: int, seed: int) -> dict[st
 
 
 def chosen(scene: Any, integrator: Any) -> dict[str, Any]:
-    """The choices of the models "auto", which are made now if they have not been."""
-    if any(is_translucent(s.bsdf()) and s.bsdf().inside.model == AUTO for s in scene.shapes()):
-        if is_bssrdf(integrator):
-            integrator.prepare(scene)
-    found = choices(scene)
-    return {"choices": found} if found else {}
+    """What was chosen for "auto" and why; it is chosen now if it has not been."""
+    if not is_bssrdf(integrator):
+        return {}
+    models = [shape.bsdf().inside.model for shape in scene.shapes() if is_translucent(shape.bsdf())]
+    if AUTO not in (integrator.settings.model, integrator.settings.light, *models):
+        return {}
+    integrator.prepare(scene)
+    found = integrator.choices
+    return {"choices": found.sentences, "chosen": [found.light, *found.models.values()]}
 
 
 def _start(path: Path, resume: bool | str | os.PathLike, about: dict[str, Any]) -> Reference | None:
@@ -257,7 +259,7 @@ def _start(path: Path, resume: bool | str | os.PathLike, about: dict[str, Any]) 
 
 def check_same(found: Reference, path: Path, about: dict[str, Any]) -> None:
     """ValueError if an image of a file is of another render, so that it cannot be gone on with."""
-    for key in ("scene", "integrator", "sensor", "seed", "variant", "learnt"):
+    for key in ("scene", "integrator", "sensor", "seed", "variant", "learnt", "chosen"):
         there, here = found.about.get(key, []), about.get(key, [])
         if there != here:
             raise ValueError(

@@ -21,10 +21,10 @@ from halfspace_sss.trade.ways import Stage, Way, stage
 __all__ = ["WAYS", "check_scene", "outcome", "z_values"]
 
 WAYS = (
-    PATH_TRACED, "lambert", "standard_dipole", "better_dipole", "directional_dipole", "photon_beam_diffusion", "neural",
-    "better_dipole, without single scattering", "neural, without single scattering",
+    PATH_TRACED, "lambert", "better_dipole", "directional_dipole", "neural", "better_dipole, gathered",
+    "directional_dipole, gathered", "neural, gathered",
 )  # fmt: skip
-FORMAT = "halfspace-sss trade check 2"
+FORMAT = "halfspace-sss trade check 3"
 
 
 def check_scene(number: int, seed: int, folder: Path, seconds: float, truth_seconds: float) -> dict[str, Any]:
@@ -45,7 +45,8 @@ def _quick(scene: RandomScene, on: Stage, ways: list[Way], path: Path, seconds: 
         record = json.loads(path.read_text(encoding="utf-8"))
         if json.loads(json.dumps(how)).items() <= record.items():
             return record["quick"]
-    found = assess_for(on, ways, scene.tolerance, seconds=seconds, seed=seeded(scene.seed, scene.number, 0)).record()
+    number = seeded(scene.seed, scene.number, 0)
+    found = assess_for(on, ways, scene.tolerance, images=scene.images, seconds=seconds, seed=number).record()
     record = {**how, "quick": found, "provenance": provenance(**how)}
     write_atomically(path, json.dumps(record, indent=1) + "\n")
     return found
@@ -71,7 +72,7 @@ def outcome(record: dict[str, Any]) -> dict[str, Any]:
     known = [name for name, w in truth.items() if w.bias2 + 2 * w.bias2_error < scene.tolerance**2]
     sure = min((least[name] for name in known), default=math.inf)
     cost = row.preparation + scene.images * pixels * option.spp * row.seconds
-    automatic = picked(quick.objects[0], scene.tolerance)[0]
+    automatic = picked(quick.objects[0], scene.tolerance).model
     found |= {"way": option.way, "spp": option.spp, "error": math.sqrt(error2)}
     found |= {"error_standard_error": error2_error / (2 * math.sqrt(error2)), "cost_s": cost}
     found |= {"cheapest": cheapest, "cheapest_s": least[cheapest], "ratio": cost / least[cheapest]}
