@@ -99,6 +99,7 @@ def _weights() -> list[Path]:
     return sorted(Path("weights").glob("*.safetensors"))
 
 
+@pytest.mark.slow
 def test_a_render_of_an_object_without_weights_says_so_learns_it_and_makes_one_image_of_both(finished: None) -> None:
     told = "object 'ball' has no weights of full_geometry yet: it is learnt for 60 s"
     assert Path("told").read_text().count(told) == 1
@@ -113,12 +114,14 @@ def test_a_render_of_an_object_without_weights_says_so_learns_it_and_makes_one_i
     assert np.all((low - 1e-6 <= image.mean) & (image.mean <= high + 1e-6))
 
 
+@pytest.mark.slow
 def test_the_second_render_needs_no_training(finished: None) -> None:
     result = _render()
     assert result.exit_code == 0 and "no weights" not in result.stderr
     assert "combined" not in json.loads(IMAGE.with_suffix(".json").read_text()) and not WALKS.exists()
 
 
+@pytest.mark.slow
 def test_a_finished_render_goes_on_to_more_samples_with_its_walks(finished: None) -> None:
     before = reference.load(WALKS)
     assert _render("--spp", "16", "--resume").exit_code == 0
