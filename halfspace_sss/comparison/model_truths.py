@@ -19,8 +19,7 @@ import numpy as np
 from halfspace_sss.comparison.model_errors import evaluated
 from halfspace_sss.comparison.truths import Truth, read_truths
 from halfspace_sss.interface.model import BSSRDF, bssrdf, models
-from halfspace_sss.measure import reflectance_estimate
-from halfspace_sss.measure.integrals import DIFFUSE_COSINES
+from halfspace_sss.measure import DIFFUSE_COSINES, reflectance_estimate
 from halfspace_sss.physics.fresnel import F_r
 from halfspace_sss.progress import NamedProgress
 
