@@ -20,7 +20,7 @@ from halfspace_sss.rendering.object.entries import AreaPoints, PositionSampler, 
 from halfspace_sss.rendering.object.half_space import HalfSpaceProposals, area_share
 from halfspace_sss.rendering.object.points import ObjectModel
 from halfspace_sss.rendering.object.settings import AUTOMATIC, Settings
-from halfspace_sss.rendering.object.shape import Object
+from halfspace_sss.rendering.object.shape import Geometry
 from halfspace_sss.rendering.object.translucent import Inside, is_translucent
 
 FINE = 2.5  # transport mean free paths of the radius of a patch, up to which patches do without probes
@@ -44,7 +44,7 @@ def _weights(subject: Subject, settings: Settings) -> Path:
     return train(subject, seconds=settings.train_seconds, target_error=settings.train_error).path
 
 
-def learnt_model(object: Object, inside: Inside, media: list[Medium], settings: Settings) -> ObjectModel:
+def learnt_model(object: Geometry, inside: Inside, media: list[Medium], settings: Settings) -> ObjectModel:
     """Transport and proposals of an object that was trained, or is now for `train_seconds` of the settings.
 
     Raises:
@@ -75,7 +75,7 @@ def learnt_model(object: Object, inside: Inside, media: list[Medium], settings: 
 SLACK = 1e-3  # of the bounds, for rounding
 
 
-def warn_out_of_range(object: Object, media: tuple[Medium, ...]) -> None:
+def warn_out_of_range(object: Geometry, media: tuple[Medium, ...]) -> None:
     """Warn, by name and number, of what the network was not trained on: size, medium, or an object that is open."""
     name, reasons = object.shape.id(), []
     scattering = [m for m in media if float(m.sigma_s) > 0]
@@ -97,7 +97,7 @@ def warn_out_of_range(object: Object, media: tuple[Medium, ...]) -> None:
         )
 
 
-def shape_model(object: Object, inside: Inside, media: list[Medium], settings: Settings) -> ObjectModel:
+def shape_model(object: Geometry, inside: Inside, media: list[Medium], settings: Settings) -> ObjectModel:
     """Transport and proposals of any object with a homogeneous medium and a smooth boundary.
 
     Raises:

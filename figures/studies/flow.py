@@ -236,4 +236,4 @@ def draw_by(scene: mi.Scene, flow: Mapping[str, np.ndarray]) -> None:
     patches: PatchSampler = body.proposals.patches
     chart = Chart(body.transport.subject, patches.frame, patches.patches)
     sampler = FlowSampler(patches, chart, ConditionalFlow(2, flow))
-    bodies[0] = replace(body, proposals=FlowProposals(sampler, body.found.sign, PatchTable(patches)))
+    bodies[0] = replace(body, proposals=FlowProposals(sampler, body.geometry.sign, PatchTable(patches)))

@@ -17,7 +17,7 @@ from halfspace_sss.rendering.object.boundary import smooth_boundary
 from halfspace_sss.rendering.object.entries import AreaPoints
 from halfspace_sss.rendering.object.placement import check_empty
 from halfspace_sss.rendering.object.points import SurfacePoint, cosine_above, lifted, number, turned
-from halfspace_sss.rendering.object.shape import Object, name_of, survey
+from halfspace_sss.rendering.object.shape import Geometry, name_of, survey
 from halfspace_sss.rendering.object.translucent import Inside, is_translucent
 from halfspace_sss.rendering.object.varying import VaryingMedium, equivalent, grid_values
 from halfspace_sss.rendering.scenes.scene_files import millimetres
@@ -38,7 +38,7 @@ class Subject:
         varying: how its medium varies in space, 1/(scene unit); `media` are then a homogeneous equivalent.
     """
 
-    object: Object
+    object: Geometry
     media: tuple[Medium, ...]
     boundary: Any
     points: AreaPoints
@@ -61,7 +61,7 @@ class Subject:
 
     @classmethod
     def surveyed(
-        cls, object: Object, media: tuple[Medium, ...], varying: VaryingMedium | None = None, mm_per_unit: float = 1.0
+        cls, object: Geometry, media: tuple[Medium, ...], varying: VaryingMedium | None = None, mm_per_unit: float = 1.0
     ) -> Subject:
         """The object of a known geometry and the scalar medium of each channel, 1/(scene unit).
 
@@ -220,7 +220,7 @@ def refract_in(at: SurfacePoint, eta: Any) -> tuple[Any, Any, Any]:
     return mi.Vector3f(dr.normalize(d)), dr.select(valid, 1 - F, 0), valid
 
 
-def _check_geometry(object: Object) -> None:
+def _check_geometry(object: Geometry) -> None:
     """ValueError if the faces of an object do not all point to the same side: one sign stands for all of them."""
     if object.signs is not None:
         raise ValueError(

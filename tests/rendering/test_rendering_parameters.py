@@ -105,7 +105,7 @@ def test_a_moved_object_is_rendered_as_if_the_scene_had_been_made_so():
     parameters = mi.traverse(scene)
     parameters["ball.to_world"] = mi.AffineTransform4f().translate([0.5, 0, 0]) @ parameters["ball.to_world"]
     parameters.update()
-    moved = scene.integrator().prepare(scene)[0].found
+    moved = scene.integrator().prepare(scene)[0].geometry
     assert np.allclose(moved.scene.bbox().center(), [0.5, 0, 0], atol=1e-5)
     assert np.isfinite(image(scene)).all()
 

@@ -31,8 +31,8 @@ def entries(positions, origin, along, n: int = N, seed: int = 1):
     from halfspace_sss.rendering.object.points import SurfacePoint
 
     ray = mi.Ray3f(mi.Point3f(*origin), mi.Vector3f(*along))
-    si = positions.found.scene.ray_intersect(ray)
-    sign = positions.found.sign
+    si = positions.geometry.scene.ray_intersect(ray)
+    sign = positions.geometry.sign
     out = SurfacePoint(mi.Point3f(si.p), mi.Normal3f(si.n) * sign, mi.Normal3f(si.sh_frame.n) * sign, -ray.d, sign)
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(seed, n)

@@ -197,7 +197,7 @@ def test_a_mono_variant_takes_grids_of_one_channel() -> None:
 
 
 def test_models_of_the_half_space_take_the_means_over_the_object() -> None:
-    from halfspace_sss.rendering.object.body import make_bodies
+    from halfspace_sss.rendering.object.body import make_objects
     from halfspace_sss.rendering.object.settings import Settings
 
     layers = np.array([[1.0, 2.0, 4.0], [3.0, 2.0, 8.0], [50.0, 50.0, 50.0], [50.0, 50.0, 50.0]])
@@ -205,7 +205,7 @@ def test_models_of_the_half_space_take_the_means_over_the_object() -> None:
     values = layers.reshape(4, 1, 1, 3)
     surface = {"sigma_t": _grid(values, where, filter_type="nearest"), "albedo": 0.75, "model": "better_dipole"}
     with pytest.warns(UserWarning, match="varies in space: models of the half-space take its mean sigma_s"):
-        bodies = make_bodies(mi.load_dict(_scene(surface)), Settings())
+        bodies = make_objects(mi.load_dict(_scene(surface)), Settings())
     for medium, sigma_t in zip(bodies[0].media, (2.0, 2.0, 6.0)):
         assert medium.sigma_s == pytest.approx(0.75 * sigma_t, rel=0.02)
         assert medium.sigma_a == pytest.approx(0.25 * sigma_t, rel=0.02)

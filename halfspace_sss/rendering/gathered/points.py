@@ -19,7 +19,7 @@ import numpy as np
 
 from halfspace_sss.rendering.object.entries import AreaPoints
 from halfspace_sss.rendering.object.points import SurfacePoint, cosine_above, lifted, number, turned
-from halfspace_sss.rendering.object.shape import Object
+from halfspace_sss.rendering.object.shape import Geometry
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -59,7 +59,7 @@ class SurfacePoints:
     members: mi.UInt32
 
     @classmethod
-    def of(cls, found: Object, count: int) -> SurfacePoints:
+    def of(cls, found: Geometry, count: int) -> SurfacePoints:
         """`count` points of an object."""
         k = dr.arange(mi.UInt32, count)
         u = [mi.Float(((np.arange(1, count + 1) * r + 0.5) % 1.0).astype(np.float32)) for r in R_3]

@@ -26,7 +26,7 @@ from halfspace_sss.rendering.gathered.points import SurfacePoints
 from halfspace_sss.rendering.object.points import SurfacePoint, number
 
 if TYPE_CHECKING:
-    from halfspace_sss.rendering.object.body import Body
+    from halfspace_sss.rendering.object.body import TranslucentObject
 
 __all__ = ["Albedo", "Incident", "Transfer", "transfer"]
 
@@ -103,15 +103,15 @@ class Transfer:
         return np.concatenate([(B - np.einsum("jck,jk->jc", slope, self.middle))[:, :, None], slope], axis=2)
 
 
-def count_of(body: Body) -> int:
+def count_of(body: TranslucentObject) -> int:
     """How many points an object gets: so many that their distance is half a transport mean free path."""
     sigma = np.mean([float(m.sigma_t_prime) for m in body.media])
-    return int(np.clip(body.found.area * (PER_LENGTH * sigma) ** 2, FEWEST, MOST))
+    return int(np.clip(body.geometry.area * (PER_LENGTH * sigma) ** 2, FEWEST, MOST))
 
 
-def transfer(body: Body, count: int | None = None, samples: int = SAMPLES) -> Transfer:
+def transfer(body: TranslucentObject, count: int | None = None, samples: int = SAMPLES) -> Transfer:
     """The transfer of an object, by its model and the proposals of that."""
-    points = SurfacePoints.of(body.found, count or count_of(body))
+    points = SurfacePoints.of(body.geometry, count or count_of(body))
     n = max(samples // len(points), 16)
     k = dr.arange(mi.UInt32, len(points) * n)
     j, s = k // n, k % n
@@ -145,7 +145,7 @@ def _centred(w: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.n
     return d, middle, np.linalg.inv(np.einsum("js,jsi,jsk->jik", a, d, d) + 1e-3 * np.eye(3))
 
 
-def _sample(body: Body, out: SurfacePoint, face: mi.UInt32, sampler: mi.Sampler, active: mi.Bool) -> tuple:
+def _sample(body: TranslucentObject, out: SurfacePoint, face: mi.UInt32, sampler: mi.Sampler, active: mi.Bool) -> tuple:
     """S mu_i over the density of an entry and its direction, and both."""
     prepared = body.transport.prepare(out, active)
     where = body.proposals.prepare(out, prepared, active)
@@ -157,14 +157,14 @@ def _sample(body: Body, out: SurfacePoint, face: mi.UInt32, sampler: mi.Sampler,
     return mi.Spectrum(dr.select(active & (pdf > 0), S, 0)), entry, mi.Vector3f(w_i)
 
 
-def _trusted(body: Body) -> np.ndarray:
+def _trusted(body: TranslucentObject) -> np.ndarray:
     """The channels in which the model knows its directional albedo at every exit."""
     if body.transport.alpha is None:
         return np.zeros(dr.size_v(mi.Spectrum), dtype=bool)
     return np.ravel(np.array(body.transport.alpha.known[1])) > 0
 
 
-def _fitted(body: Body, mu: np.ndarray, S: np.ndarray) -> Albedo:
+def _fitted(body: TranslucentObject, mu: np.ndarray, S: np.ndarray) -> Albedo:
     """a(mu), by least squares over all samples."""
     eta = float(body.media[0].eta)
     basis = F_t(mu.astype(float), eta)[:, None] * mu[:, None] ** np.arange(3)

@@ -18,22 +18,22 @@ from halfspace_sss.rendering.object.placement import check_empty, check_sensors,
 from halfspace_sss.rendering.object.points import ObjectAlbedo, ObjectModel, Proposals, Transport, number
 from halfspace_sss.rendering.object.registry import AUTO, Choices, choices, lookup
 from halfspace_sss.rendering.object.settings import AUTOMATIC, Settings
-from halfspace_sss.rendering.object.shape import Object, check_together, number_of, same_objects, survey
+from halfspace_sss.rendering.object.shape import Geometry, check_together, number_of, same_objects, survey
 from halfspace_sss.rendering.object.translucent import Inside
 from halfspace_sss.rendering.object.varying import equivalent, warn_of_means
 
-__all__ = ["Bodies", "Body", "Expected", "check_size", "expected_of", "make_bodies"]
+__all__ = ["TranslucentObjects", "TranslucentObject", "Expected", "check_size", "expected_of", "make_objects"]
 
 _MODELS = "models of their light"
 SMALL, LARGE = 1.0, 5e3  # mean free paths across an object, beyond which the units of the scene are doubted
 
 
 @dataclass(frozen=True, eq=False)
-class Body:
+class TranslucentObject:
     """One translucent object.
 
     Args:
-        found: its geometry.
+        geometry: of its shape.
         surface: its `translucent` BSDF.
         media: medium of each channel, 1/(scene unit).
         transport: what light that enters elsewhere is worth here; None where no order from two on is asked for.
@@ -45,7 +45,7 @@ class Body:
         gathered: what leaves by orders from two on, in place of a transport, see `paths.gathering`.
     """
 
-    found: Object
+    geometry: Geometry
     surface: Any
     media: list[Medium]
     transport: Transport | None
@@ -73,39 +73,39 @@ class Body:
 
     def is_current(self) -> bool:
         """Whether the object still has the shape and the medium that it was made of."""
-        return self.surface.inside is self.variation.inside and self.found.is_current()
+        return self.surface.inside is self.variation.inside and self.geometry.is_current()
 
 
-class Bodies:
+class TranslucentObjects:
     """The bodies of the scene that was asked for last, made anew when its objects, their shape or media changed."""
 
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
-        self._made: tuple[int, list, list[Body]] = (0, [], [])
+        self._made: tuple[int, list, list[TranslucentObject]] = (0, [], [])
         self._places: tuple[list, list] = ([], [])
         if settings.model:
             lookup(settings.model)
         self.choices = Choices({}, settings.light, {})  # for as long as the objects are the same
 
-    def of(self, scene: Any) -> list[Body]:
-        """The bodies of a scene; errors as in `make_bodies`."""
+    def of(self, scene: Any) -> list[TranslucentObject]:
+        """The bodies of a scene; errors as in `make_objects`."""
         shapes = scene.shapes()  # the scene itself, which holds its integrator, would never be freed
         world, before, bodies = self._made
         same = world == number_of(scene) and same_objects(before, shapes)
         if not bodies or not same or not all(body.is_current() for body in bodies):
             if not (bodies and same):
                 self.choices = _choices(scene, self.settings)
-            self._made = number_of(scene), shapes, make_bodies(scene, self.settings, (), self.choices)
+            self._made = number_of(scene), shapes, make_objects(scene, self.settings, (), self.choices)
             self._places = places_of(scene)
         elif (places := places_of(scene))[0] != self._places[0]:
-            check_empty(scene, [body.found for body in bodies], _MODELS)
+            check_empty(scene, [body.geometry for body in bodies], _MODELS)
             self._places = places
         return self._made[2]
 
 
-def make_bodies(
+def make_objects(
     scene: Any, settings: Settings, without: Collection[str] = (), chosen: Choices | None = None
-) -> list[Body]:
+) -> list[TranslucentObject]:
     """All objects of a scene that have a `translucent` surface, but for those with the ids in `without`.
 
     Args:
@@ -128,7 +128,7 @@ def make_bodies(
     chosen = chosen or _choices(scene, settings)
     insides = [_asked(shape, settings, chosen.models.get(k)) for k, shape in enumerate(shapes)]
     named = [pair for pair in zip(objects, insides) if pair[0].shape.id() not in without]
-    return [_make_body(found, equivalent(inside, found), settings) for found, inside in named]
+    return [_make_object(found, equivalent(inside, found), settings) for found, inside in named]
 
 
 def _asked(shape: Any, settings: Settings, model: str | None = None) -> Inside:
@@ -146,7 +146,7 @@ def _choices(scene: Any, settings: Settings) -> Choices:
     return Choices({}, settings.light, {})
 
 
-def _make_body(found: Object, inside: Inside, settings: Settings) -> Body:
+def _make_object(found: Geometry, inside: Inside, settings: Settings) -> TranslucentObject:
     surface = found.shape.bsdf()
     media = [m.scaled(settings.mm_per_unit) for m in inside.channels()]
     check_size(found, [float(m.sigma_t) for m in media], settings.mm_per_unit)
@@ -158,7 +158,7 @@ def _make_body(found: Object, inside: Inside, settings: Settings) -> Body:
         raise ValueError(f"orders must be total for the model {inside.model!r}, which contains them all, got multiple")
     few = _few(inside, transport)
     entries = entries if settings.entries == AUTOMATIC else settings.entries
-    return Body(found, surface, media, transport, proposals, entries, few, expected_of(media), variation)
+    return TranslucentObject(found, surface, media, transport, proposals, entries, few, expected_of(media), variation)
 
 
 def _few(inside: Inside, transport: Transport | None) -> tuple[int, ...]:
@@ -174,7 +174,7 @@ def _few(inside: Inside, transport: Transport | None) -> tuple[int, ...]:
 
 
 def _model_of(
-    inside: Inside, found: Object, media: list[Medium], settings: Settings, variation: Variation
+    inside: Inside, found: Geometry, media: list[Medium], settings: Settings, variation: Variation
 ) -> ObjectModel:
     of_object = lookup(inside.model).transport
     if of_object is not None:
@@ -183,7 +183,7 @@ def _model_of(
     return half_space_model(inside.model, found, media, settings, variation)
 
 
-def check_size(found: Object, sigma_t: Sequence[float], mm_per_unit: float) -> None:
+def check_size(found: Geometry, sigma_t: Sequence[float], mm_per_unit: float) -> None:
     """Warn of an object whose size in mean free paths speaks of another unit of length.
 
     Args:

@@ -21,7 +21,7 @@ import mitsuba as mi
 import numpy as np
 
 from halfspace_sss.rendering.object.points import EntrySample, SurfacePoint, number, turned
-from halfspace_sss.rendering.object.shape import Object
+from halfspace_sss.rendering.object.shape import Geometry
 
 __all__ = ["AreaPoints", "Point", "PositionSampler", "RadialTable"]
 
@@ -40,14 +40,14 @@ class PositionSampler:
     """Points of entry of one object.
 
     Args:
-        found: the object.
+        geometry: of the object.
         table: radial density about the exit.
         points: uniform points of the object.
         area_share: share s of the candidates that are uniform over the area: s/(1 - s) of them, rounded up, beside a
             probe; with 1 there are no probes.
     """
 
-    found: Object
+    geometry: Geometry
     table: RadialTable
     points: AreaPoints
     area_share: float
@@ -65,7 +65,7 @@ class PositionSampler:
 
     def _side(self, out: SurfacePoint, prim_index: mi.UInt32, active: mi.Bool) -> Any:
         """What turns the normal of a face outwards: of a sheet, to the side of the exit."""
-        return self.found.side(prim_index, active) if self.found.closed else out.sign
+        return self.geometry.side(prim_index, active) if self.geometry.closed else out.sign
 
     def density(self, p: mi.Point3f, n: mi.Normal3f, out: SurfacePoint, axes: tuple[mi.Vector3f, ...]) -> Any:
         """Density of candidates over the surface at p with normal n, for each that is drawn, 1/(scene unit)²."""
@@ -73,7 +73,7 @@ class PositionSampler:
 
     def _candidates(self, p: mi.Point3f, n: mi.Normal3f, out: SurfacePoint, axes: tuple[mi.Vector3f, ...]) -> Any:
         """c = D + m/A, 1/(scene unit)²."""
-        uniform = number(self.area_points / self.found.area if self.area_points else 0.0)
+        uniform = number(self.area_points / self.geometry.area if self.area_points else 0.0)
         if not self.probes:
             return uniform
         d, total = p - out.p, 0.0
@@ -87,7 +87,7 @@ class PositionSampler:
     def sample(self, out: SurfacePoint, prim_index: mi.UInt32, sampler: mi.Sampler, active: mi.Bool) -> EntrySample:
         """A point of entry for light that leaves at `out` on the face `prim_index`."""
         axes = (out.n_out, *mi.coordinate_system(out.n_out))
-        piece = self.found.piece(prim_index, active)
+        piece = self.geometry.piece(prim_index, active)
         u_axis, u_length, u_face, u_choice = (sampler.next_1d() for _ in range(4))
         u = sampler.next_2d()
         kept = _Kept(u_choice, mi.Float(0), *_nowhere())
@@ -100,7 +100,7 @@ class PositionSampler:
         return EntrySample(kept.p, turned(kept.n, kept.n_out), kept.n_out, weight, kept.face)
 
     def _reach(self, across: mi.Float) -> Any:
-        return REACH * across + number(LEAST_REACH * self.found.size + NEAR * self.table.mean)
+        return REACH * across + number(LEAST_REACH * self.geometry.size + NEAR * self.table.mean)
 
     def _probe(
         self, out: SurfacePoint, axes: tuple[mi.Vector3f, ...], u_axis: mi.Float, u_length: mi.Float, u: mi.Point2f
@@ -112,7 +112,7 @@ class PositionSampler:
         second = dr.select(to_n, t, dr.select(to_s, n, s))
         sin_phi, cos_phi = dr.sincos(2 * dr.pi * u.y)
         r = self.table.sample(u.x)
-        reach = dr.select(u_length < LONG_SHARE, number(1.01 * self.found.size), self._reach(r))
+        reach = dr.select(u_length < LONG_SHARE, number(1.01 * self.geometry.size), self._reach(r))
         start = out.p + (first * cos_phi + second * sin_phi) * r - along * reach
         ray = mi.Ray3f(mi.Point3f(start), mi.Vector3f(along))
         ray.maxt = 2 * reach
@@ -144,9 +144,9 @@ class PositionSampler:
         """All hits of a probe as candidates."""
 
         def step(ray: mi.Ray3f, left: Any, kept: tuple, active: mi.Bool) -> tuple:
-            si = self.found.scene.ray_intersect(ray, _FLAGS(), False, active)
+            si = self.geometry.scene.ray_intersect(ray, _FLAGS(), False, active)
             active &= si.is_valid() & (left > 0)
-            same = self.found.piece(si.prim_index, active) == piece
+            same = self.geometry.piece(si.prim_index, active) == piece
             side = self._side(out, si.prim_index, active & same)
             at = (si.p, si.n, turned(si.sh_frame.n, si.n) * side, si.prim_index)
             kept = self._offer(_Kept(*kept), at, out, axes, active & same)
@@ -173,7 +173,7 @@ class PositionSampler:
         def step(k: Any, kept: tuple) -> tuple:
             v = mi.Point2f(*(_wrapped(x + k * ratio) for x, ratio in zip((u.x, u.y), LATTICE)))
             at = self.points.sample(_wrapped(u_face + k * inverse), v, active)
-            same = self.found.piece(at.prim_index, active) == piece
+            same = self.geometry.piece(at.prim_index, active) == piece
             side = self._side(out, at.prim_index, active & same)
             point = (at.p, at.n, turned(at.n_shading, at.n) * side, at.prim_index)
             return k + 1, tuple(self._offer(_Kept(*kept), point, out, axes, active & same))

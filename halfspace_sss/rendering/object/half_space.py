@@ -22,7 +22,7 @@ from halfspace_sss.rendering.object.points import (
     plane_query,
 )
 from halfspace_sss.rendering.object.settings import AUTOMATIC, Settings
-from halfspace_sss.rendering.object.shape import Object
+from halfspace_sss.rendering.object.shape import Geometry
 from halfspace_sss.rendering.object.translucent import VARIABLE
 
 __all__ = [
@@ -105,7 +105,7 @@ class HalfSpaceProposals:
 
 
 def half_space_model(
-    name: str, found: Object, media: list[Medium], settings: Settings, variation: Variation
+    name: str, found: Geometry, media: list[Medium], settings: Settings, variation: Variation
 ) -> ObjectModel:
     """The transport and the proposals of a half-space model on an object.
 
@@ -124,7 +124,7 @@ def half_space_model(
     return ObjectModel(transport, HalfSpaceProposals(positions, models[0]))
 
 
-def area_share(found: Object, ratio: float, wanted: float) -> float:
+def area_share(found: Geometry, ratio: float, wanted: float) -> float:
     """Share of candidates over the area, by default for a ratio of mean distance to object size.
 
     On a dragon of ratio 0.16 nine such points beside a probe bring variance x time to a third of that without, 15 do

@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from halfspace_sss.rendering.object.shape import Object, geometry_of, is_inside, name_of, rays_into, scene_of
+from halfspace_sss.rendering.object.shape import Geometry, geometry_of, is_inside, name_of, rays_into, scene_of
 from halfspace_sss.rendering.object.translucent import is_translucent
 
 __all__ = ["Content", "check_empty", "check_sensors", "contents", "places_of", "translucent_shapes"]
@@ -36,7 +36,7 @@ class Content:
     whole: bool
 
 
-def contents(scene: mi.Scene, objects: list[Object]) -> list[Content]:
+def contents(scene: mi.Scene, objects: list[Geometry]) -> list[Content]:
     """What lies inside each closed object of a scene: of every shape a part that is deeper than `DEEP`, and lamps."""
     found = []
     for shape in scene.shapes():
@@ -56,7 +56,7 @@ def contents(scene: mi.Scene, objects: list[Object]) -> list[Content]:
     return found
 
 
-def check_empty(scene: mi.Scene, objects: list[Object], what: str) -> None:
+def check_empty(scene: mi.Scene, objects: list[Geometry], what: str) -> None:
     """Refuse objects with something inside, for `what` does not see it.
 
     Raises:
@@ -77,7 +77,7 @@ def places_of(scene: mi.Scene) -> tuple[list, list]:
     return [*(key for key, _ in found), *places], [kept for _, kept in found]
 
 
-def _shared(shape: mi.Shape, holder: Object) -> Any:
+def _shared(shape: mi.Shape, holder: Geometry) -> Any:
     """The box that a shape shares with an object; None if it reaches less deep."""
 
     (a, b), (c, d), deep = _corners(shape.bbox()), _corners(holder.scene.bbox()), DEEP * holder.size
@@ -116,7 +116,7 @@ def _points_by_area(alone: mi.Scene) -> np.ndarray:
     return np.concatenate(points or [np.zeros((3, 0))], axis=1)
 
 
-def _deep(holder: Object, points: np.ndarray) -> np.ndarray:
+def _deep(holder: Geometry, points: np.ndarray) -> np.ndarray:
     """Which points lie inside an object, and deep."""
 
     inside = np.flatnonzero(is_inside(holder, points)) if points.shape[1] else np.zeros(0, dtype=int)
@@ -129,7 +129,7 @@ def _deep(holder: Object, points: np.ndarray) -> np.ndarray:
     return np.array(hit.t).reshape(-1, 128).min(axis=1) > DEEP * holder.size
 
 
-def _holds(holder: Object, shape: mi.Shape, alone: mi.Scene) -> bool:
+def _holds(holder: Geometry, shape: mi.Shape, alone: mi.Scene) -> bool:
     """Whether all of a shape lies inside an object."""
     (a, b), (c, d) = _corners(shape.bbox()), _corners(holder.scene.bbox())
     return bool((a >= c).all() and (b <= d).all() and is_inside(holder, _points_on(alone, alone.bbox())).all())
@@ -192,7 +192,7 @@ def _check_media(scene: mi.Scene) -> None:
             raise ValueError(f"the scene must be without media of Mitsuba, such as fog, got one around {place.id()!r}")
 
 
-def check_sensors(scene: mi.Scene, objects: list[Object]) -> None:
+def check_sensors(scene: mi.Scene, objects: list[Geometry]) -> None:
     """Refuse sensors inside of objects, of any kind: they may have several places, or a surface.
 
     Raises:

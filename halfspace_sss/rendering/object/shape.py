@@ -13,7 +13,7 @@ import numpy as np
 from halfspace_sss.rendering.object.mesh import Faces, check_copies, face_normals_agree, faces_of
 
 __all__ = [
-    "Object",
+    "Geometry",
     "RAYS",
     "check_together",
     "geometry_of",
@@ -32,7 +32,7 @@ MAJORITY = 0.75  # of the first hits from outside agree on the side of the norma
 
 
 @dataclass(frozen=True, eq=False)
-class Object:
+class Geometry:
     """A shape with a translucent surface.
 
     Args:
@@ -45,7 +45,7 @@ class Object:
         pieces: UInt32 array of the connected piece of each face, or None if there is one piece.
         size: diagonal of the bounding box, scene units.
         area: scene units squared.
-        geometry: what it was surveyed with, from `geometry_of`.
+        fingerprint: what it was surveyed with, from `geometry_of`.
     """
 
     shape: Any
@@ -57,7 +57,7 @@ class Object:
     pieces: Any
     size: float
     area: float
-    geometry: Any
+    fingerprint: Any
 
     @property
     def name(self) -> str:
@@ -66,7 +66,7 @@ class Object:
 
     def is_current(self) -> bool:
         """Whether the shape still is as it was surveyed."""
-        return geometry_of(self.shape)[0] == self.geometry[0]
+        return geometry_of(self.shape)[0] == self.fingerprint[0]
 
     def piece(self, prim_index: mi.UInt32, active: mi.Bool) -> Any:
         """The number of the piece that a face belongs to."""
@@ -109,7 +109,7 @@ def same_objects(a: list[Any], b: list[Any]) -> bool:
     return len(a) == len(b) and all(x is y for x, y in zip(a, b))
 
 
-def survey(shape: mi.Shape, world: mi.Scene | None = None) -> Object:
+def survey(shape: mi.Shape, world: mi.Scene | None = None) -> Geometry:
     """Look at a shape from outside with rays; warns if it is not closed, or if its faces point to both sides.
 
     Faces of a closed mesh that point to both sides are taken the right way round.
@@ -156,7 +156,7 @@ def survey(shape: mi.Shape, world: mi.Scene | None = None) -> Object:
     area = float(np.sum(np.array(shape.surface_area())))
     closed, sign = odd == 0 and not sheet, -1.0 if share <= 1 - MAJORITY else 1.0
     signs = votes.signs() if closed else None
-    return Object(shape, scene, sign, signs, float(votes.opposed[0]) == 0, closed, votes.pieces, size,
+    return Geometry(shape, scene, sign, signs, float(votes.opposed[0]) == 0, closed, votes.pieces, size,
                   area, geometry_of(shape))  # fmt: skip
 
 
@@ -246,7 +246,7 @@ def crossings(scene: mi.Scene, ray: mi.Ray3f, votes: _Votes | None = None) -> tu
     return dr.while_loop(state, lambda ray, side, count, active: active, step, label="crossings")[1:3]
 
 
-def is_inside(found: Object, points: Any) -> np.ndarray:
+def is_inside(found: Geometry, points: Any) -> np.ndarray:
     """Which points (array of shape (3, n)) lie inside a closed object, by the parity of the hits of rays from them."""
 
     points = np.asarray(points, dtype=float)

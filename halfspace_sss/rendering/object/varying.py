@@ -17,7 +17,7 @@ import mitsuba as mi
 import numpy as np
 
 from halfspace_sss.physics.medium import Medium
-from halfspace_sss.rendering.object.shape import Object, crossings
+from halfspace_sss.rendering.object.shape import Geometry, crossings
 
 __all__ = [
     "VaryingMedium", "constant_value", "equivalent", "eval_volume", "grid_values", "mean_of_grids", "varying_medium",
@@ -155,7 +155,7 @@ def mean_of_grids(medium: VaryingMedium, g: Any, eta: float) -> Medium:
     return Medium.from_albedo(*(v if len(v) > 1 else float(v[0]) for v in (albedo, sigma_t)), g, eta)
 
 
-def equivalent(inside: Any, obj: Object) -> Any:
+def equivalent(inside: Any, obj: Geometry) -> Any:
     """The inside of an object with a homogeneous medium, which models of the half-space take.
 
     Its sigma_s and sigma_a are the means over the volume of the object.
@@ -171,7 +171,7 @@ def equivalent(inside: Any, obj: Object) -> Any:
     return replace(inside, medium=mean_medium(inside.varying, p, inside.medium.g, inside.medium.eta))
 
 
-def warn_of_means(inside: Any, obj: Object) -> None:
+def warn_of_means(inside: Any, obj: Geometry) -> None:
     """Warn that models of the half-space take the medium of `equivalent`, if it stands for one that varies."""
     if inside.varying is not None:
         warnings.warn(

@@ -24,7 +24,7 @@ from halfspace_sss.rendering.paths.lighting import mis_weight
 from halfspace_sss.rendering.paths.path_loop import trace_paths
 
 if TYPE_CHECKING:
-    from halfspace_sss.rendering.object.body import Body
+    from halfspace_sss.rendering.object.body import TranslucentObject
     from halfspace_sss.rendering.object.points import SurfacePoint
     from halfspace_sss.rendering.object.settings import Settings
 
@@ -46,7 +46,7 @@ class Gathered:
         error: standard error of B by the gathering of light, over its mean.
     """
 
-    body: Body
+    body: TranslucentObject
     transfer: Transfer
     values: mi.Float
     error: float
@@ -70,12 +70,12 @@ class Gathering:
     """Gathered light of the objects of a scene, kept until something in the scene changes."""
 
     def __init__(self) -> None:
-        self._bodies: list[Body] = []
+        self._bodies: list[TranslucentObject] = []
         self._transfers: list[Transfer] = []
         self._light: tuple[list, list] = ([], [])
-        self._found: list[Body] = []
+        self._found: list[TranslucentObject] = []
 
-    def of(self, scene: mi.Scene, bodies: list[Body], settings: Settings) -> list[Body]:
+    def of(self, scene: mi.Scene, bodies: list[TranslucentObject], settings: Settings) -> list[TranslucentObject]:
         """The objects, each with what leaves it in place of its transport.
 
         Raises:
@@ -105,19 +105,19 @@ class Gathering:
         """Of each object: points, and the noise of transfer and light."""
         found = [body.gathered for body in self._found if body.gathered is not None]
         return [
-            f"light of {g.body.found.name} gathered at {len(g.transfer.points)} points: noise of the transfer "
+            f"light of {g.body.geometry.name} gathered at {len(g.transfer.points)} points: noise of the transfer "
             f"{g.transfer.error:.1%} a point, of the light {g.error:.1%}"
             for g in found
         ]
 
 
-def _spreads(body: Body) -> bool:
+def _spreads(body: TranslucentObject) -> bool:
     """Whether light leaves elsewhere than it entered, by orders that a transport has."""
     return body.transport is not None and not body.transport.is_delta
 
 
-def _check(body: Body) -> None:
-    found = body.found
+def _check(body: TranslucentObject) -> None:
+    found = body.geometry
     if not found.closed or not found.area > 0:
         lacks = "is not closed" if not found.closed else f"is a {found.shape.class_name()} without known area"
         raise ValueError(f"light must be sampled for object {found.name}, which {lacks}, got gathered")
@@ -140,17 +140,17 @@ def _state(scene: mi.Scene) -> tuple[list, list]:
     return keys, kept
 
 
-def _leaving(scene: mi.Scene, bodies: list[Body], k: int, T: Transfer, settings: Settings) -> Gathered:
+def _leaving(scene: mi.Scene, bodies: list[TranslucentObject], k: int, T: Transfer, settings: Settings) -> Gathered:
     """B of object k, in two halves whose difference tells the noise."""
     halves = [T @ _incident(scene, bodies, T, settings, seed) for seed in (2 * k, 2 * k + 1)]
     B = (halves[0] + halves[1]) / 2
     if not np.isfinite(B).all():
-        raise ValueError(f"light at object {bodies[k].found.name} must be finite, got NaN or infinity")
+        raise ValueError(f"light at object {bodies[k].geometry.name} must be finite, got NaN or infinity")
     error = np.sqrt(((halves[0] - halves[1])[..., 0] ** 2).mean()) / 2 / max(float(B[..., 0].mean()), 1e-30)
     return Gathered(bodies[k], T, mi.Float(B.astype(np.float32).ravel()), float(error))
 
 
-def _incident(scene: mi.Scene, bodies: list[Body], T: Transfer, settings: Settings, seed: int) -> Incident:
+def _incident(scene: mi.Scene, bodies: list[TranslucentObject], T: Transfer, settings: Settings, seed: int) -> Incident:
     """Incident radiance at all points."""
     count = len(T.points)
     n = int(np.clip(DIRECTIONS // (2 * count), FEWEST, MOST))
@@ -216,7 +216,8 @@ def _by_emitters(scene: mi.Scene, T: Transfer, at: _Point, u: mi.Point2f) -> tup
 
 
 def _by_cosine(
-    scene: mi.Scene, bodies: list[Body], T: Transfer, settings: Settings, at: _Point, u: mi.Point2f, traced: mi.Bool,
+    scene: mi.Scene, bodies: list[TranslucentObject], T: Transfer, settings: Settings, at: _Point, u: mi.Point2f,
+    traced: mi.Bool,
     sampler: mi.Sampler,
 ) -> tuple[mi.Spectrum, mi.Spectrum, mi.Spectrum, mi.Vector3f]:  # fmt: skip
     """By directions of the cosine: light of emitters that they meet, what other surfaces send along some, a, and w."""

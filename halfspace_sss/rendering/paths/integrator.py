@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from halfspace_sss.interrupts import hear_again, interruptible
-from halfspace_sss.rendering.object.body import Bodies, Body, make_bodies
+from halfspace_sss.rendering.object.body import TranslucentObject, TranslucentObjects, make_objects
 from halfspace_sss.rendering.object.registry import Choices
 from halfspace_sss.rendering.object.settings import Settings, read_settings
 from halfspace_sss.rendering.object.translucent import is_translucent
@@ -58,16 +58,16 @@ def _class(variant: str) -> type:
             mi.SamplingIntegrator.__init__(self, props)
             self.timed = float(props.get("timeout", -1.0)) > 0
             self.settings = read_settings(props)
-            self._bodies = Bodies(self.settings)
+            self._bodies = TranslucentObjects(self.settings)
             self._gathering = Gathering()
 
-        def prepare(self, scene: mi.Scene) -> list[Body]:
+        def prepare(self, scene: mi.Scene) -> list[TranslucentObject]:
             """The translucent objects of a scene, made ready once; ValueError if the scene cannot be rendered."""
             check_parameters(scene)
             with dr.suspend_grad():
                 return self._prepared(scene)
 
-        def _prepared(self, scene: mi.Scene) -> list[Body]:
+        def _prepared(self, scene: mi.Scene) -> list[TranslucentObject]:
             objects = self._bodies.of(scene)
             if self._bodies.choices.light == "sampled":
                 return objects
@@ -77,7 +77,7 @@ def _class(variant: str) -> type:
             """ValueError if the scene cannot be rendered, as far as can be told without the objects `without`."""
             check_parameters(scene)
             with dr.suspend_grad():
-                make_bodies(scene, self.settings, without)
+                make_objects(scene, self.settings, without)
 
         def render(
             self, scene: mi.Scene, sensor: mi.Sensor | int = 0, seed: mi.UInt32 | int = 0, spp: int = 0,
@@ -101,7 +101,7 @@ def _class(variant: str) -> type:
             with undisturbed():
                 replayer(objects, self.settings).render_backward(scene, *args, **more)
 
-        def _differentiable(self, scene: mi.Scene) -> list[Body]:
+        def _differentiable(self, scene: mi.Scene) -> list[TranslucentObject]:
             if self.settings.light != "sampled":
                 raise ValueError(f"light must be sampled for derivatives, got {self.settings.light}")
             return self.prepare(scene)
@@ -248,7 +248,7 @@ def _selects(parameters: mi.SceneParameters, owner: mi.Object | None, name: str)
     return False
 
 
-def replayer(objects: list[Body], settings: Settings) -> mi.Integrator:
+def replayer(objects: list[TranslucentObject], settings: Settings) -> mi.Integrator:
     """An integrator of Mitsuba's radiative backpropagation around the paths through a scene with these objects.
 
     Raises:

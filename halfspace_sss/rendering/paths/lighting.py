@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from halfspace_sss.rendering.light.small_emitters import WIDE, SmallEmitters, is_delta
-from halfspace_sss.rendering.object.body import Body
+from halfspace_sss.rendering.object.body import TranslucentObject
 from halfspace_sss.rendering.object.settings import AUTOMATIC, Settings
 from halfspace_sss.rendering.paths.path_tally import Primal, Replay
 
@@ -70,7 +70,7 @@ class Sky(NamedTuple):
     mean: mi.Spectrum  # c
 
     @classmethod
-    def of(cls, scene: mi.Scene, lights: Lights, objects: list[Body]) -> Sky | None:
+    def of(cls, scene: mi.Scene, lights: Lights, objects: list[TranslucentObject]) -> Sky | None:
         """The sky of a scene; None without one, without an object that has `alpha`, or where c is of little use.
 
         c is left out where it is not most of the light in the square, as under a sun: it costs time there and takes
@@ -122,14 +122,16 @@ class RenderContext:
 
     scene: mi.Scene
     lights: Lights
-    objects: list[Body]
+    objects: list[TranslucentObject]
     settings: Settings
     mode: Primal | Replay
     sky: Sky | None = None
     small: SmallEmitters | None = None
 
     @classmethod
-    def of(cls, scene: mi.Scene, objects: list[Body], settings: Settings, mode: Primal | Replay) -> RenderContext:
+    def of(
+        cls, scene: mi.Scene, objects: list[TranslucentObject], settings: Settings, mode: Primal | Replay
+    ) -> RenderContext:
         """The context of a scene and its translucent objects."""
         lights = Lights.of(scene)
         with dr.suspend_grad():
@@ -141,21 +143,21 @@ class RenderContext:
         """Whether the environment has suns, which are sampled like small emitters."""
         return self.small is not None and len(self.small.suns) > 0
 
-    def uses_sky(self, obj: Body) -> bool:
+    def uses_sky(self, obj: TranslucentObject) -> bool:
         """Whether the mean radiance of the sky is a control variate for an object."""
         return self.sky is not None and obj.alpha is not None
 
-    def sky_means(self, obj: Body) -> tuple[mi.Spectrum, mi.Spectrum]:
+    def sky_means(self, obj: TranslucentObject) -> tuple[mi.Spectrum, mi.Spectrum]:
         """c in the channels where alpha is known, else 0: for orders below two and for the others."""
         low_orders, others = obj.alpha.known
         return low_orders * self.sky.mean, others * self.sky.mean
 
-    def entries(self, obj: Body) -> int:
+    def entries(self, obj: TranslucentObject) -> int:
         """Candidates of resampling for an exit: one where c is nearly all light and the settings leave it open."""
         alone = self.uses_sky(obj) and not self.lights.some_local
         return 1 if alone and self.settings.entries == AUTOMATIC else obj.entries
 
-    def connects_sky(self, obj: Body) -> bool:
+    def connects_sky(self, obj: TranslucentObject) -> bool:
         """Whether scattering events are connected with the sky: where it varies and c does not take its noise away."""
         return self.scene.environment() is not None and self.lights.nee_share > 0 and not self.uses_sky(obj)
 

@@ -25,7 +25,7 @@ import mitsuba as mi
 
 from halfspace_sss.physics.phase import eval_hg, sample_hg
 from halfspace_sss.rendering.light.small_emitters import WIDE
-from halfspace_sss.rendering.object.body import Body
+from halfspace_sss.rendering.object.body import TranslucentObject
 from halfspace_sss.rendering.object.points import SurfacePoint, lifted, mirrored, number, opposed, place, turned
 from halfspace_sss.rendering.paths.lighting import RenderContext, delta_light, mis_weight, sample_emitter
 
@@ -94,7 +94,12 @@ class _Walk:
 
 
 def sample_low_orders(
-    context: RenderContext, obj: Body, refracted: RefractedRay, sampler: mi.Sampler, scattered: mi.Bool, active: mi.Bool
+    context: RenderContext,
+    obj: TranslucentObject,
+    refracted: RefractedRay,
+    sampler: mi.Sampler,
+    scattered: mi.Bool,
+    active: mi.Bool,
 ) -> LowOrderSample:
     """Light that leaves at an exit after at most one scattering event.
 
@@ -129,7 +134,7 @@ def sample_low_orders(
 # ---- The walk --------------------------------------------------------------------------------------------------------
 
 
-def _walk(obj: Body, refracted: RefractedRay, sampler: mi.Sampler, active: mi.Bool) -> _Walk:
+def _walk(obj: TranslucentObject, refracted: RefractedRay, sampler: mi.Sampler, active: mi.Bool) -> _Walk:
     """The walk from an exit until it leaves."""
     zero, p = mi.Float(0), mi.Point3f(refracted.out.p)
     media = [tuple(number(v) for v in (m.sigma_s, m.sigma_t, m.g)) for m in obj.media]
@@ -146,7 +151,9 @@ def _walk(obj: Body, refracted: RefractedRay, sampler: mi.Sampler, active: mi.Bo
     return dr.while_loop(state, lambda k, sampler, passing, walk: walk.alive, step, label="low orders")[3]
 
 
-def _step(of: tuple[Body, Media], k: mi.UInt32, sampler: mi.Sampler, passing: mi.Float, walk: _Walk) -> _Walk:
+def _step(
+    of: tuple[TranslucentObject, Media], k: mi.UInt32, sampler: mi.Sampler, passing: mi.Float, walk: _Walk
+) -> _Walk:
     """One segment: to the event, or to the boundary and what happens there."""
     (obj, media), flags = of, mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame
     si, n_out, n = meet(obj, walk.o + walk.d * walk.skip, walk.d, flags, walk.alive)
@@ -195,7 +202,7 @@ def _scatter(
     )  # fmt: skip
 
 
-def _meet_boundary(of: tuple[Body, Media], walk: _Walk, met: tuple, sampler: mi.Sampler) -> _Walk:
+def _meet_boundary(of: tuple[TranslucentObject, Media], walk: _Walk, met: tuple, sampler: mi.Sampler) -> _Walk:
     """Reflection by Fresnel, or the way out; Russian roulette for what is faint."""
     (obj, media), (si, n_out, n) = of, met
     size = dr.max(_contribution(media, walk.length, walk.order, walk.cosine) * walk.inverse_pdf)
@@ -216,19 +223,19 @@ def _meet_boundary(of: tuple[Body, Media], walk: _Walk, met: tuple, sampler: mi.
 
 
 def meet(
-    obj: Body, p: mi.Point3f, d: mi.Vector3f, flags: int, active: mi.Bool
+    obj: TranslucentObject, p: mi.Point3f, d: mi.Vector3f, flags: int, active: mi.Bool
 ) -> tuple[mi.SurfaceInteraction3f, mi.Normal3f, mi.Normal3f]:
     """Interaction with the boundary, shading normal and geometric normal, both outwards (along d for a sheet)."""
-    si = obj.found.scene.ray_intersect(mi.Ray3f(p, d), flags, False, active)
-    sign = obj.found.side(si.prim_index, active & si.is_valid())
-    if not obj.found.closed:
+    si = obj.geometry.scene.ray_intersect(mi.Ray3f(p, d), flags, False, active)
+    sign = obj.geometry.side(si.prim_index, active & si.is_valid())
+    if not obj.geometry.closed:
         sign = dr.select(dr.dot(si.n, d) > 0, 1.0, -1.0)
     return si, turned(si.sh_frame.n, si.n) * sign, si.n * sign
 
 
-def _clear(obj: Body, n: mi.Normal3f, d: mi.Vector3f) -> mi.Float:
+def _clear(obj: TranslucentObject, n: mi.Normal3f, d: mi.Vector3f) -> mi.Float:
     """Length along d after which a ray from the surface is clear of it; an origin moved instead lies deeper."""
-    return number(obj.found.rounding) / dr.maximum(dr.abs(dr.dot(n, d)), 0.1)
+    return number(obj.geometry.rounding) / dr.maximum(dr.abs(dr.dot(n, d)), 0.1)
 
 
 def _contribution(media: Media, length: mi.Float, order: mi.UInt32, cosine: mi.Float | None) -> mi.Spectrum:
@@ -261,7 +268,7 @@ def _spectrum(values: list[mi.Float]) -> mi.Spectrum:
 
 
 def _connected(
-    context: RenderContext, of: tuple[Body, Media], walk: _Walk, weight: mi.Spectrum, sampler: mi.Sampler,
+    context: RenderContext, of: tuple[TranslucentObject, Media], walk: _Walk, weight: mi.Spectrum, sampler: mi.Sampler,
     active: mi.Bool,
 ) -> mi.Spectrum:  # fmt: skip
     """Light of a sampled emitter that is refracted at the boundary into the event, which has a weight."""
@@ -272,7 +279,7 @@ def _connected(
         distant = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
         alone = context.sampled_by_nee(ds.emitter, ds.d)  # no other strategy counts this light
         active = active & (ds.pdf > 0) & (alone | mi.Bool(context.connects_sky(obj)))
-        reach = dr.select(distant, number(FAR * obj.found.size), ds.dist)
+        reach = dr.select(distant, number(FAR * obj.geometry.size), ds.dist)
         target = walk.event + ds.d * reach
         met = refracted_connection(obj, walk.event, target, active)
         # solid angle at the event per solid angle of the straight direction, over which the emitter was sampled
@@ -288,7 +295,7 @@ def _connected(
     return dr.select(valid & ~blocked, value, 0)
 
 
-def _phase_pdf(obj: Body, walk: _Walk, met: Connection) -> mi.Float:
+def _phase_pdf(obj: TranslucentObject, walk: _Walk, met: Connection) -> mi.Float:
     """Density of the direction of a connection by the phase function, 1/sr inside, see `_scatter`."""
     media = [tuple(number(v) for v in (m.sigma_s, m.sigma_t, m.g)) for m in obj.media]
     W = _contribution(media, walk.event_length, mi.UInt32(1), None)
@@ -296,36 +303,38 @@ def _phase_pdf(obj: Body, walk: _Walk, met: Connection) -> mi.Float:
     return dr.sum(W * _spectrum([eval_hg(cosine, m[2]) for m in media])) / dr.maximum(dr.sum(W), 1e-30)
 
 
-def _sky_pdf(obj: Body, walk: _Walk, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
+def _sky_pdf(obj: TranslucentObject, walk: _Walk, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
     """Density of a walk's direction outside, 1/sr, and 1, where a sky connection leads along it; elsewhere 1, 0."""
     with dr.suspend_grad():
-        reach = number(FAR * obj.found.size)
+        reach = number(FAR * obj.geometry.size)
         met = refracted_connection(obj, walk.event, walk.event + walk.d * reach, active)
         same = active & _is_same(walk, met, SAME_WAY)
         pdf = _phase_pdf(obj, walk, met) * met.T * reach * reach * met.density
     return dr.select(same, pdf, 1), dr.select(same, mi.Float(1), 0)
 
 
-def _met_by_chance(context: RenderContext, obj: Body, walk: _Walk, active: mi.Bool) -> mi.Spectrum:
+def _met_by_chance(context: RenderContext, obj: TranslucentObject, walk: _Walk, active: mi.Bool) -> mi.Spectrum:
     """Emission that a walk meets from its event, which no connection with that point of an emitter would find."""
     with dr.suspend_grad():
         ray = place(walk.o, walk.n).spawn_ray(walk.d)
         si = context.scene.ray_intersect(ray, mi.RayFlags.All, False, active)
         emitter = si.emitter(context.scene, active)
         active = active & (emitter != None) & context.sampled_by_nee(emitter, walk.d)  # noqa: E711
-        target = dr.select(si.is_valid(), si.p, walk.event + walk.d * number(FAR * obj.found.size))
+        target = dr.select(si.is_valid(), si.p, walk.event + walk.d * number(FAR * obj.geometry.size))
         met = refracted_connection(obj, walk.event, mi.Point3f(target), active)
         n = dr.select(si.is_valid(), si.n, 0)
         sampled = _is_same(walk, met, SAME_WAY) & _is_sampled(walk.event, target, n, met)
     return dr.select(active & ~sampled, emitter.eval(si, active), 0)
 
 
-def _spread_lights(context: RenderContext, obj: Body, walk: _Walk, sampler: mi.Sampler, active: mi.Bool) -> mi.Spectrum:
+def _spread_lights(
+    context: RenderContext, obj: TranslucentObject, walk: _Walk, sampler: mi.Sampler, active: mi.Bool
+) -> mi.Spectrum:
     """Light of a delta light whose cone holds a walk's way out, which no connection with it would find."""
     which, L = delta_light(context, sampler, place(walk.o, walk.n).spawn_ray(walk.d), active)
     with dr.suspend_grad():
         connects = active & (dr.max(L) > 0) & walk.straight & (walk.order == 1)
-        target = context.small.point(which, walk.event, FAR * obj.found.size)
+        target = context.small.point(which, walk.event, FAR * obj.geometry.size)
         met = refracted_connection(obj, walk.event, target, connects)
     return dr.select(connects & _is_same(walk, met, 3 * WIDE), 0, L)
 
@@ -368,7 +377,7 @@ class Connection:
     valid: mi.Bool
 
 
-def refracted_connection(obj: Body, p: mi.Point3f, target: mi.Point3f, active: mi.Bool) -> Connection:
+def refracted_connection(obj: TranslucentObject, p: mi.Point3f, target: mi.Point3f, active: mi.Bool) -> Connection:
     """The ray from p inside the object that is refracted towards `target` outside."""
 
     def step(k: mi.UInt32, d: mi.Vector3f, best: Connection, active: mi.Bool) -> tuple:
@@ -402,7 +411,7 @@ def refracted_connection(obj: Body, p: mi.Point3f, target: mi.Point3f, active: m
     return replace(best, valid=best.valid & active)
 
 
-def _first_guess(obj: Body, p: mi.Point3f, w: mi.Vector3f, active: mi.Bool) -> mi.Vector3f:
+def _first_guess(obj: TranslucentObject, p: mi.Point3f, w: mi.Vector3f, active: mi.Bool) -> mi.Vector3f:
     """The direction inside of light that arrives along -w where the straight ray along w meets the boundary."""
     _, n_out, _ = meet(obj, p, w, mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame, active)
     across = (w - n_out * dr.dot(w, n_out)) / obj.eta
@@ -410,7 +419,7 @@ def _first_guess(obj: Body, p: mi.Point3f, w: mi.Vector3f, active: mi.Bool) -> m
 
 
 def _miss(
-    obj: Body, p: mi.Point3f, d: mi.Vector3f, target: mi.Point3f, active: mi.Bool
+    obj: TranslucentObject, p: mi.Point3f, d: mi.Vector3f, target: mi.Point3f, active: mi.Bool
 ) -> tuple[tuple, tuple, tuple, mi.Bool]:
     """Miss of the target in two axes across the refracted ray, its derivative by d, the passage, and its validity.
 
@@ -421,7 +430,7 @@ def _miss(
     w, F, valid = _refract(obj, d, n_out)
     eta, c = obj.eta, dr.dot(d, n_out)
     c_t = dr.sqrt(dr.maximum(1 - eta * eta * (1 - c * c), 1e-6))
-    flip = dr.select(dr.dot(si.sh_frame.n, n_out) > 0, 1.0, -1.0) * obj.found.curvature_sign
+    flip = dr.select(dr.dot(si.sh_frame.n, n_out) > 0, 1.0, -1.0) * obj.geometry.curvature_sign
     D = dr.dot(target - si.p, w)
 
     # ---- its differentials by the two axes across d
@@ -442,7 +451,7 @@ def _miss(
     return e, J, (mi.Point3f(si.p), mi.Normal3f(n), mi.Vector3f(w), 1 - F, si.t), valid
 
 
-def _refract(obj: Body, d: mi.Vector3f, n: mi.Normal3f) -> tuple[mi.Vector3f, mi.Float, mi.Bool]:
+def _refract(obj: TranslucentObject, d: mi.Vector3f, n: mi.Normal3f) -> tuple[mi.Vector3f, mi.Float, mi.Bool]:
     """Direction outside, Fresnel reflectance, and whether light passes, for a ray inside along d."""
     eta = obj.eta
     c = dr.dot(d, n)

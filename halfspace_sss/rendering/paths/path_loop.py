@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import drjit as dr
 import mitsuba as mi
 
-from halfspace_sss.rendering.object.body import Body
+from halfspace_sss.rendering.object.body import TranslucentObject
 from halfspace_sss.rendering.object.points import SurfacePoint, lifted, number, place, turned
 from halfspace_sss.rendering.object.settings import Settings
 from halfspace_sss.rendering.paths.lighting import RenderContext, delta_light, mis_weight, sample_emitter
@@ -75,7 +75,12 @@ class PathState:
 
 
 def trace_paths(
-    scene: mi.Scene, objects: list[Body], settings: Settings, sampler: mi.Sampler, ray: mi.Ray3f, active: mi.Bool
+    scene: mi.Scene,
+    objects: list[TranslucentObject],
+    settings: Settings,
+    sampler: mi.Sampler,
+    ray: mi.Ray3f,
+    active: mi.Bool,
 ) -> tuple[tuple[mi.Spectrum, mi.Spectrum], mi.Bool]:
     """Radiance along a camera ray in two parts for a replay, and whether the ray hits anything.
 
@@ -87,7 +92,7 @@ def trace_paths(
 
 
 def replay_paths(
-    scene: mi.Scene, objects: list[Body], settings: Settings, sampler: mi.Sampler, ray: mi.Ray3f,
+    scene: mi.Scene, objects: list[TranslucentObject], settings: Settings, sampler: mi.Sampler, ray: mi.Ray3f,
     L: tuple[mi.Spectrum, mi.Spectrum], d: mi.Spectrum | None, backward: bool,
 ) -> mi.Spectrum:  # fmt: skip
     """The derivative of the radiance of traced paths.
@@ -194,7 +199,7 @@ def _on_splitting(context: RenderContext, si: mi.SurfaceInteraction3f) -> mi.Boo
     on_one = mi.Bool(False)
     for obj in context.objects:
         if obj.splits:
-            on_one |= si.shape == mi.ShapePtr(obj.found.shape)
+            on_one |= si.shape == mi.ShapePtr(obj.geometry.shape)
     return on_one
 
 
@@ -265,7 +270,7 @@ def sample_event(
     choices = []
     with dr.suspend_grad():
         for obj in context.objects:
-            here = at.active & (at.si.shape == mi.ShapePtr(obj.found.shape))
+            here = at.active & (at.si.shape == mi.ShapePtr(obj.geometry.shape))
             choice = choose_event(obj, at.si, here)
             if obj.splits:
                 low = dr.select(at.low_only, mi.Float(1), dr.select(at.others_only, 0, choice.low_orders))
@@ -303,7 +308,7 @@ def sample_event(
     return replace(following, weight=following.weight / probability), tally
 
 
-def choose_event(obj: Body, si: mi.SurfaceInteraction3f, active: mi.Bool) -> EventChoice:
+def choose_event(obj: TranslucentObject, si: mi.SurfaceInteraction3f, active: mi.Bool) -> EventChoice:
     """Probabilities of the events by the light that is expected of each.
 
     With T the mean transmittance along the refracted ray to the other side, R_1 and R_2 the reflectances of the
@@ -333,21 +338,21 @@ def choose_event(obj: Body, si: mi.SurfaceInteraction3f, active: mi.Bool) -> Eve
     return EventChoice(reflection, low, RefractedRay(out, d, 1 - F, valid, passing))
 
 
-def _transmittance(obj: Body, out: SurfacePoint, d: mi.Vector3f, active: mi.Bool) -> mi.Float:
+def _transmittance(obj: TranslucentObject, out: SurfacePoint, d: mi.Vector3f, active: mi.Bool) -> mi.Float:
     """To the other side, mean over channels; light of the path does not count, as choices hold in derivatives."""
     ray = place(out.p, out.n).spawn_ray(d)
-    wall = obj.found.scene.ray_intersect(ray, mi.RayFlags.Minimal, False, active)
+    wall = obj.geometry.scene.ray_intersect(ray, mi.RayFlags.Minimal, False, active)
     T = mi.Float(0)
     for medium in obj.media:
         T = T + dr.exp(-number(medium.sigma_t) * wall.t) / len(obj.media)
     return dr.select(active & wall.is_valid(), T, 0)
 
 
-def exit_at(obj: Body, si: mi.SurfaceInteraction3f) -> SurfacePoint:
+def exit_at(obj: TranslucentObject, si: mi.SurfaceInteraction3f) -> SurfacePoint:
     """The exit of light towards `si.wi`, with the normal that points outwards, as `si.wi` sees it."""
     w, n_face = si.to_world(si.wi), mi.Normal3f(si.n)
-    sign = obj.found.side(si.prim_index)
-    if not obj.found.closed:  # a sheet is a half-space from both sides
+    sign = obj.geometry.side(si.prim_index)
+    if not obj.geometry.closed:  # a sheet is a half-space from both sides
         sign = dr.select(dr.dot(n_face, w) > 0, 1.0, -1.0)
     n = lifted(turned(si.sh_frame.n, n_face), n_face, w)
     return SurfacePoint(mi.Point3f(si.p), n_face * sign, n * sign, w, sign)
@@ -379,7 +384,10 @@ def _add_sky_means(
             continue
 
         def known(
-            tally: PathTally, obj: Body = obj, here: mi.Bool = here, out: SurfacePoint = choice.refracted.out
+            tally: PathTally,
+            obj: TranslucentObject = obj,
+            here: mi.Bool = here,
+            out: SurfacePoint = choice.refracted.out,
         ) -> tuple[PathTally]:
             low, others = obj.alpha(out, here)
             low = dr.select(at.others_only, 0, low) if obj.few else mi.Spectrum(0)
@@ -399,7 +407,10 @@ def _add_gathered(
             continue
 
         def known(
-            tally: PathTally, obj: Body = obj, here: mi.Bool = here, out: SurfacePoint = choice.refracted.out
+            tally: PathTally,
+            obj: TranslucentObject = obj,
+            here: mi.Bool = here,
+            out: SurfacePoint = choice.refracted.out,
         ) -> tuple[PathTally]:
             return (context.mode.add(tally, at.throughput * obj.gathered.radiance(out, here)),)
 
@@ -517,7 +528,12 @@ def _differentiable(
 
 
 def low_order_event(
-    context: RenderContext, obj: Body, refracted: RefractedRay, sampler: mi.Sampler, scattered: mi.Bool, active: mi.Bool
+    context: RenderContext,
+    obj: TranslucentObject,
+    refracted: RefractedRay,
+    sampler: mi.Sampler,
+    scattered: mi.Bool,
+    active: mi.Bool,
 ) -> tuple[NextVertex, mi.Spectrum]:
     """Light that was scattered at most once inside, and emitter connections of that event; c taken off as below."""
     sample = sample_low_orders(context, obj, refracted, sampler, scattered, active)
@@ -533,7 +549,12 @@ def low_order_event(
 
 
 def bssrdf_event(
-    context: RenderContext, obj: Body, out: SurfacePoint, face: mi.UInt32, sampler: mi.Sampler, active: mi.Bool
+    context: RenderContext,
+    obj: TranslucentObject,
+    out: SurfacePoint,
+    face: mi.UInt32,
+    sampler: mi.Sampler,
+    active: mi.Bool,
 ) -> tuple[NextVertex, mi.Spectrum]:
     """Light that entered elsewhere and leaves at `out` by the transport of the object.
 
@@ -583,7 +604,12 @@ class _ExitPoint(NamedTuple):
 
 
 def resample_entry(
-    context: RenderContext, obj: Body, out: SurfacePoint, face: mi.UInt32, sampler: mi.Sampler, active: mi.Bool
+    context: RenderContext,
+    obj: TranslucentObject,
+    out: SurfacePoint,
+    face: mi.UInt32,
+    sampler: mi.Sampler,
+    active: mi.Bool,
 ) -> Candidate:
     """One entry for light that leaves at `out`, by resampled importance sampling (Talbot, Cline and Egbert 2005).
 
@@ -612,8 +638,8 @@ def resample_entry(
 
 
 def _draw_candidate(
-    context: RenderContext, obj: Body, exit_point: _ExitPoint, by_emitter: mi.Bool | None, sampler: mi.Sampler,
-    active: mi.Bool,
+    context: RenderContext, obj: TranslucentObject, exit_point: _ExitPoint, by_emitter: mi.Bool | None,
+    sampler: mi.Sampler, active: mi.Bool,
 ) -> Candidate:  # fmt: skip
     """A point of entry by the proposals, and a direction by emitters or by the proposals (one-sample MIS).
 

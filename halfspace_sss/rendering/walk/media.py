@@ -13,7 +13,7 @@ from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.light.small_emitters import is_delta
 from halfspace_sss.rendering.object.placement import Content, contents, translucent_shapes
 from halfspace_sss.rendering.object.points import lift
-from halfspace_sss.rendering.object.shape import Object, check_together, scene_of, survey
+from halfspace_sss.rendering.object.shape import Geometry, check_together, scene_of, survey
 from halfspace_sss.rendering.object.translucent import Inside, is_translucent
 from halfspace_sss.rendering.object.varying import VaryingMedium, eval_volume
 
@@ -55,7 +55,7 @@ class InnerShapes:
     lights: list[tuple[mi.Emitter, int]]
 
     @classmethod
-    def of(cls, scene: mi.Scene, objects: list[Object]) -> InnerShapes | None:
+    def of(cls, scene: mi.Scene, objects: list[Geometry]) -> InnerShapes | None:
         """What lies inside; None if nothing does.
 
         Raises:
@@ -112,14 +112,14 @@ def _displaces(shape: mi.Shape) -> bool:
     return not is_translucent(shape.bsdf()) and bool(shape.bsdf().flags() & REFRACTS)
 
 
-def _innermost(key: int, found: list[Content], holders: list[Object], n: int) -> int:
+def _innermost(key: int, found: list[Content], holders: list[Geometry], n: int) -> int:
     """The smallest holder of a thing if that is an object, by its number; -1 if it is of glass."""
     numbers = [content.object for content in found if id(content.thing) == key]
     smallest = min(numbers, key=lambda k: holders[k].size)
     return smallest if smallest < n else -1
 
 
-def _check(found: list[Content], objects: list[Object]) -> None:
+def _check(found: list[Content], objects: list[Geometry]) -> None:
     for content in found:
         holder = objects[content.object]
         surfaces = [holder.shape.bsdf()]
@@ -268,7 +268,7 @@ class WalkMedia:
         inner: what lies inside the objects, if anything does.
     """
 
-    objects: list[Object]
+    objects: list[Geometry]
     insides: list[Inside]
     scene: mi.Scene
     boundaries: list[mi.BSDF]
