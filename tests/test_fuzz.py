@@ -31,7 +31,7 @@ HOW = {"deadline": None, "derandomize": CASES == 0, "database": None, "suppress_
 COMPUTES = [  # what is replaced: the properties are of what comes before the computation
     "halfspace_sss.comparison.reflectance_curves.trace_curve", "halfspace_sss.maps.store.trace_unit",
     "halfspace_sss.comparison.model_errors.references", "halfspace_sss.neural.train",
-    "halfspace_sss.neural.training.ablation.ablation", "halfspace_sss.neural.training.recipes.train_universal",
+    "halfspace_sss.neural.training.ablation.ablation", "halfspace_sss.neural.training.train_universal.train_universal",
     "halfspace_sss.cli.validate.validate",
     "halfspace_sss.cli.bench._measured", "halfspace_sss.rendering.scenes.reference.render",
     "halfspace_sss.comparison.model_truths.truths_cost", "figures.parts.runner.compute",

@@ -20,10 +20,9 @@ import mitsuba as mi
 import numpy as np
 import torch
 
-from figures.studies.flow import ConditionalFlow, FlowSampler
-from figures.studies.flow_chart import N_CONTEXT, Chart, context, direction_square
+from figures.studies.flow import N_CONTEXT, Chart, ConditionalFlow, FlowSampler, context, direction_square
 from figures.studies.flow_training import FlowBatch, FlowNetwork, FlowRecipe, Walks, flow_walks, walk_batches
-from full_geometry.learning.networks import DenseLayers, PatchLogits
+from full_geometry.learning.fitting import DenseLayers, PatchLogits
 from full_geometry.object.features import Side, n_side, side_features
 from full_geometry.object.first_event import first_event
 from full_geometry.object.identity import frame_of

@@ -69,7 +69,7 @@ def _made(
 
     from figures.studies import rivals
     from figures.studies.flow_training import FlowRecipe
-    from figures.studies.samplers import sampler_table
+    from figures.studies.rivals import sampler_table
     from full_geometry.learning.training import train_by_cpu
     from full_geometry.object.subject import Subject
 
@@ -162,7 +162,7 @@ def shapes_command(
             shape_errors.summary(rows) + "\n" + shape_errors.by_property(rows) + "\n" + shape_errors.case_table(rows)
         )
         if pictures is not None:
-            from figures.studies.shape_pictures import worst_pictures
+            from figures.studies.shape_errors import worst_pictures
             from halfspace_sss.rendering.scenes.picture import as_png
 
             write_atomically(pictures, as_png(worst_pictures(rows, show)[..., None]))

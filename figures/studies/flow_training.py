@@ -15,9 +15,17 @@ import torch
 import zuko
 from torch import nn
 
-from figures.studies.flow import BINS, LEAST_SLOPE, ConditionalFlow, FlowSampler
-from figures.studies.flow_chart import N_CONTEXT, Chart, context, direction_square
-from full_geometry.learning.networks import PatchLogits, patch_likelihood
+from figures.studies.flow import (
+    BINS,
+    LEAST_SLOPE,
+    N_CONTEXT,
+    Chart,
+    ConditionalFlow,
+    FlowSampler,
+    context,
+    direction_square,
+)
+from full_geometry.learning.fitting import PatchLogits, patch_likelihood
 from full_geometry.models.storing import Learnt
 from full_geometry.object.features import ObjectFrame, Side, n_side, side_features
 from full_geometry.object.first_event import first_event
@@ -26,7 +34,7 @@ from full_geometry.object.subject import Subject
 from full_geometry.object.walks import trace_exits
 from halfspace_sss.checks import check_count
 from halfspace_sss.neural.training.fit import Objective, Source, fit
-from halfspace_sss.neural.training.schedules import Timed
+from halfspace_sss.neural.training.schedules import CpuSchedule
 from halfspace_sss.rendering.object.points import EntrySample, cosine_above, number, place
 from halfspace_sss.tracing.walk import generator, pass_seed
 
@@ -246,8 +254,8 @@ class FlowRecipe:
         _ = self.schedule  # which refuses seconds, steps and rates out of range
 
     @property
-    def schedule(self) -> Timed:
-        return Timed(self.seconds, self.steps, self.rate, warm_up=50, last=0.02)
+    def schedule(self) -> CpuSchedule:
+        return CpuSchedule(self.seconds, self.steps, self.rate, warm_up=50, last=0.02)
 
 
 class FlowBatch(NamedTuple):

@@ -23,7 +23,7 @@ from full_geometry.models.object_model import FullGeometry
 from full_geometry.object.features import ObjectFrame
 from full_geometry.object.subject import Subject, surface_point
 from halfspace_sss.neural.training.fit import ADAM, Descent, Objective, fit
-from halfspace_sss.neural.training.schedules import Timed
+from halfspace_sss.neural.training.schedules import CpuSchedule
 from halfspace_sss.rendering.object.points import SurfacePoint, channel_mean, cosine_above
 from halfspace_sss.tracing.walk import generator, pass_seed
 
@@ -83,7 +83,7 @@ def fit_space_flow(model: FullGeometry, frame: ObjectFrame, seconds: float = 60.
         seconds: of CPU time of this process, data included.
         seed: of everything.
     """
-    schedule = Timed(seconds, rate=RATE)
+    schedule = CpuSchedule(seconds, rate=RATE)
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         flow = zuko.flows.NICE(features=3, context=5, transforms=LAYERS, hidden_features=HIDDEN)

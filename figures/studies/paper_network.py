@@ -26,7 +26,7 @@ from halfspace_sss.checks import check_choice, check_count, check_interval
 from halfspace_sss.neural.store import load_weights, save_weights
 from halfspace_sss.neural.trained import check_weights_folder, weights_folder
 from halfspace_sss.neural.training.fit import ADAM, Descent, Objective, Source, fit
-from halfspace_sss.neural.training.schedules import Timed
+from halfspace_sss.neural.training.schedules import CpuSchedule
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.provenance import provenance
 from halfspace_sss.rendering.object.points import SurfacePoint
@@ -118,8 +118,8 @@ class PaperRecipe:
         _ = self.schedule  # which refuses seconds, steps and rates out of range
 
     @property
-    def schedule(self) -> Timed:
-        return Timed(self.seconds, self.steps, self.rate)
+    def schedule(self) -> CpuSchedule:
+        return CpuSchedule(self.seconds, self.steps, self.rate)
 
 
 @dataclass(frozen=True, eq=False)

@@ -67,7 +67,7 @@ def ablation_command(
     if find_spec("torch") is None:
         raise ValueError("training needs torch: `pip install halfspace-sss[train]`")
     from halfspace_sss.neural.training import ablation as variants
-    from halfspace_sss.neural.training.recipes import STANDARD
+    from halfspace_sss.neural.training.train_material import STANDARD
 
     given = {"sigma_t": sigma_t, "albedo": albedo, "g": g, "eta": eta}
     title, medium = _medium(material, channel, given)

@@ -161,7 +161,7 @@ def universal_command(
     from dataclasses import replace
 
     from halfspace_sss.checks import check_count
-    from halfspace_sss.neural.training.recipes import UniversalRecipe, train_universal
+    from halfspace_sss.neural.training.train_universal import UniversalRecipe, train_universal
 
     recipe = UniversalRecipe()
     if steps is not None:
@@ -216,7 +216,7 @@ def _recipe(fast: bool, steps: int | None) -> Any:
     from dataclasses import replace
 
     from halfspace_sss.checks import check_count
-    from halfspace_sss.neural.training.recipes import FAST, STANDARD
+    from halfspace_sss.neural.training.train_material import FAST, STANDARD
 
     recipe = FAST if fast else STANDARD
     if steps is None:

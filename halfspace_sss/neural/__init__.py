@@ -19,13 +19,16 @@ from halfspace_sss.neural.paper_model import NeuralPaper
 from halfspace_sss.neural.universal import Neural
 
 if TYPE_CHECKING:
-    from halfspace_sss.neural.training.recipes import train, train_universal
+    from halfspace_sss.neural.training.train_material import train
+    from halfspace_sss.neural.training.train_universal import train_universal
 
 __all__ = ["MODELS", "Neural", "NeuralMaterial", "NeuralPaper", "train", "train_universal"]
 
 MODELS = [Neural, NeuralMaterial, NeuralPaper]
 
-_found, __dir__ = lazy_names(__name__, {"train": "training.recipes", "train_universal": "training.recipes"})
+_found, __dir__ = lazy_names(
+    __name__, {"train": "training.train_material", "train_universal": "training.train_universal"}
+)
 
 
 def __getattr__(name: str) -> Any:

@@ -8,9 +8,8 @@ import numpy as np
 
 from halfspace_sss.arrays import broadcast_query, library
 from halfspace_sss.interface.query import Query
-from halfspace_sss.neural.balance import N_TERMS, log_balance
 from halfspace_sss.neural.features import medium_features, symmetric_features, travel
-from halfspace_sss.neural.hypernetwork import Hypernetwork, Layers
+from halfspace_sss.neural.hypernetwork import N_TERMS, Hypernetwork, Layers, log_balance
 from halfspace_sss.neural.perceptron import Perceptron, cooperative, silu
 from halfspace_sss.neural.universal import load_hypernetwork, shipped_weights
 from halfspace_sss.physics.backbone import backbone_shape, length_scale

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,7 +15,7 @@ from halfspace_sss.neural.network import Network, layer_shapes
 from halfspace_sss.physics.backbone import length_scale
 from halfspace_sss.physics.medium import Medium
 
-__all__ = ["Hypernetwork", "Layers", "check_range", "in_range", "named_layers"]
+__all__ = ["N_TERMS", "Hypernetwork", "Layers", "chebyshev", "check_range", "in_range", "log_balance", "named_layers"]
 
 Layers = tuple[tuple[np.ndarray, np.ndarray], ...]  # matrix (inputs, outputs) and bias of each
 
@@ -91,3 +92,26 @@ def _layered(layers: Layers, albedo: float, g: float, eta: float) -> np.ndarray:
         if k < len(layers) - 1:
             h = h / (1 + np.exp(-h))
     return h
+
+
+N_TERMS = 4
+
+
+def log_balance(c: Sequence[Any], mu: Any) -> Any:
+    """log a(mu) = sum_k c_k T_k(2 mu - 1) of an outside cosine, by Clenshaw's recurrence; 0 for no terms.
+
+    Args:
+        c: coefficients of a medium, numbers or arrays of the library of mu.
+        mu: outside cosines, [0, 1].
+    """
+    if not len(c):
+        return 0.0 * mu
+    twice, after, last = 4 * mu - 2, 0.0, 0.0 * mu
+    for c_k in reversed(list(c)[1:]):
+        last, after = c_k + twice * last - after, last
+    return c[0] + 0.5 * twice * last - after
+
+
+def chebyshev(mu: np.ndarray) -> np.ndarray:
+    """T_k(2 mu - 1), k the last axis."""
+    return np.polynomial.chebyshev.chebvander(2 * np.asarray(mu) - 1, N_TERMS - 1)

@@ -9,8 +9,8 @@ from typing import Any
 
 from halfspace_sss.interface.model import BSSRDF
 from halfspace_sss.interface.query import Query
-from halfspace_sss.neural.balance import log_balance
 from halfspace_sss.neural.features import symmetric_features, travel
+from halfspace_sss.neural.hypernetwork import log_balance
 from halfspace_sss.neural.network import Network
 from halfspace_sss.physics.backbone import backbone_shape, length_scale
 from halfspace_sss.physics.medium import Medium

@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from halfspace_sss.lazy import once
-from halfspace_sss.neural.balance import N_TERMS
 from halfspace_sss.neural.features import N_FEATURES, N_MEDIUM
-from halfspace_sss.neural.hypernetwork import Hypernetwork, check_range
+from halfspace_sss.neural.hypernetwork import N_TERMS, Hypernetwork, check_range
 from halfspace_sss.neural.network import layer_shapes
 from halfspace_sss.neural.store import load_weights, record_count
 from halfspace_sss.neural.symmetric import SymmetricModel, channels

@@ -17,9 +17,10 @@ from halfspace_sss.maps.noisy_maps import CellGrid
 from halfspace_sss.materials import registry
 from halfspace_sss.neural import material_model, paper_model, trained
 from halfspace_sss.neural.store import load_weights
-from halfspace_sss.neural.training import recipes as training
-from halfspace_sss.neural.training.recipes import MaterialRecipe, UniversalRecipe
+from halfspace_sss.neural.training import train_material, train_universal
 from halfspace_sss.neural.training.schedules import Fit
+from halfspace_sss.neural.training.train_material import MaterialRecipe
+from halfspace_sss.neural.training.train_universal import UniversalRecipe
 
 FIG10 = materials.load("fig10").medium
 HOW = Fit(steps=20, n_groups=4, n_queries=32, validate_every=5)
@@ -34,8 +35,9 @@ def _invoke(*arguments: str) -> Any:
 @pytest.fixture(autouse=True)
 def _small(monkeypatch: Any, tmp_path: Path) -> None:
     """Recipes of a second, in an empty folder, where weights are looked up too."""
-    for name, recipe in {"STANDARD": TINY, "FAST": TINY, "UniversalRecipe": lambda: TINY_UNIVERSAL}.items():
-        monkeypatch.setattr(training, name, recipe)
+    for name in ("STANDARD", "FAST"):
+        monkeypatch.setattr(train_material, name, TINY)
+    monkeypatch.setattr(train_universal, "UniversalRecipe", lambda: TINY_UNIVERSAL)
     for module in (material_model, paper_model):
         monkeypatch.setattr(module, "find_weights", trained.find_weights)
     monkeypatch.setenv(trained.ENVIRONMENT_VARIABLE, str(tmp_path / "weights"))

@@ -19,13 +19,16 @@ pytest.importorskip("zuko")
 
 from waxen import BUNNY, random_layers, random_patches, wax_bunny  # noqa: E402
 
-from figures.studies.flow import (  # noqa: E402  # noqa: E402
+from figures.studies.flow import (  # noqa: E402  # noqa: E402  # noqa: E402
+    N_CONTEXT,
+    Chart,
     ConditionalFlow,  # noqa: E402
     FlowProposals,
     FlowSampler,
+    direction_square,
     draw_by,
+    from_square,
 )
-from figures.studies.flow_chart import N_CONTEXT, Chart, direction_square, from_square  # noqa: E402
 from figures.studies.flow_training import FlowNetwork  # noqa: E402
 from full_geometry.models.storing import CENTRES, CHECKSUMS, ENDS, EVEN, TURNS, save  # noqa: E402
 from full_geometry.object.features import PreparedExit, Side, Terms, n_pair, n_side  # noqa: E402

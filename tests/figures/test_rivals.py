@@ -24,8 +24,7 @@ from waxen import BUNNY, WAX, random_layers, random_patches, wax_bunny  # noqa: 
 from figures.studies import paper_network as paper  # noqa: E402
 from figures.studies.alpha_p import AlphaP, fit_alpha_p  # noqa: E402
 from figures.studies.commands import _errors_wide, markdown  # noqa: E402
-from figures.studies.flow import ConditionalFlow, FlowSampler  # noqa: E402
-from figures.studies.flow_chart import N_CONTEXT, Chart  # noqa: E402
+from figures.studies.flow import N_CONTEXT, Chart, ConditionalFlow, FlowSampler  # noqa: E402  # noqa: E402
 from figures.studies.flow_training import LIGHTINGS, FlowNetwork, FlowRecipe, lighting  # noqa: E402
 from figures.studies.paper_flow import incidence, mesh_arrays, on_surface, rmsd  # noqa: E402
 from figures.studies.paper_network import measured_lights, paper_errors, random_lights  # noqa: E402

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 mi = pytest.importorskip("mitsuba")
 pytest.importorskip("igl")
 
-from figures.studies import shape_pictures as pictures  # noqa: E402
+from figures.studies import shape_errors as pictures  # noqa: E402
 from figures.studies.shape_errors import Row  # noqa: E402
 from halfspace_sss.cli import app as cli  # noqa: E402
 

@@ -18,9 +18,8 @@ torch = pytest.importorskip("torch")
 
 import full_geometry  # noqa: E402
 from full_geometry.learning import training  # noqa: E402
-from full_geometry.learning.fitting import Recipe  # noqa: E402
+from full_geometry.learning.fitting import Correction, Recipe  # noqa: E402
 from full_geometry.learning.model_errors import EVEN_SKY, LIGHTS, compare, measure, transport_of  # noqa: E402
-from full_geometry.learning.networks import Correction  # noqa: E402
 from full_geometry.learning.training import Trained, train  # noqa: E402
 from full_geometry.models import storing  # noqa: E402
 from full_geometry.models.half_space import HalfSpace  # noqa: E402

@@ -22,13 +22,22 @@ from halfspace_sss.maps import noisy_maps
 from halfspace_sss.maps.noisy_maps import CellGrid, draw_directions, make_pool
 from halfspace_sss.neural.paper_model import paper_inputs
 from halfspace_sss.neural.training import ablation as module
-from halfspace_sss.neural.training import recipes as training
-from halfspace_sss.neural.training.ablation import BUDGETS, VARIANTS, Variant, ablation, caption, summary
-from halfspace_sss.neural.training.ablation_learner import SharedTurn, drawn_by_area, model_of
+from halfspace_sss.neural.training import train_material as training
+from halfspace_sss.neural.training.ablation import (
+    BUDGETS,
+    VARIANTS,
+    SharedTurn,
+    Variant,
+    ablation,
+    caption,
+    drawn_by_area,
+    model_of,
+    summary,
+)
 from halfspace_sss.neural.training.fit import fit
 from halfspace_sss.neural.training.pool import MapPool
-from halfspace_sss.neural.training.recipes import MaterialRecipe
 from halfspace_sss.neural.training.schedules import Fit, Samples, Seconds, Within
+from halfspace_sss.neural.training.train_material import MaterialRecipe
 
 FIG10 = materials.load("fig10").medium
 GRID, HOW = CellGrid(8, 4), Fit(steps=1, n_groups=4, n_queries=32)

@@ -11,7 +11,7 @@ import pytest
 from halfspace_sss import Medium, bssrdf, trace
 from halfspace_sss.comparison.model_truths import exits, sampled_reflectance
 from halfspace_sss.comparison.truths import Truth, read_truths
-from halfspace_sss.neural.balance import N_TERMS, log_balance
+from halfspace_sss.neural.hypernetwork import N_TERMS, log_balance
 from halfspace_sss.neural.universal import load_hypernetwork, shipped_weights
 from halfspace_sss.physics import single_scattering
 from halfspace_sss.physics.fresnel import F_r

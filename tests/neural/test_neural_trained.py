@@ -16,9 +16,9 @@ from halfspace_sss.maps import noisy_maps
 from halfspace_sss.maps.noisy_maps import CellGrid
 from halfspace_sss.neural import material_model, paper_model, trained
 from halfspace_sss.neural.store import load_weights
-from halfspace_sss.neural.training.recipes import MaterialRecipe, UniversalRecipe, train, train_universal
 from halfspace_sss.neural.training.schedules import Fit
-from halfspace_sss.neural.training.train_material import TrainedChannel
+from halfspace_sss.neural.training.train_material import MaterialRecipe, TrainedChannel, train
+from halfspace_sss.neural.training.train_universal import UniversalRecipe, train_universal
 
 FIG10 = materials.load("fig10").medium
 HOW = Fit(steps=20, n_groups=4, n_queries=32, validate_every=5)

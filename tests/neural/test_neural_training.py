@@ -21,13 +21,19 @@ from halfspace_sss.maps.grid import draw_media
 from halfspace_sss.maps.noisy_maps import CellGrid, draw_directions, make_pool
 from halfspace_sss.neural.hypernetwork import Hypernetwork
 from halfspace_sss.neural.training.fit import Source, fit
-from halfspace_sss.neural.training.learners import Hyper, Small
-from halfspace_sss.neural.training.paper_learner import PaperLearner
+from halfspace_sss.neural.training.learners import Hyper, PaperLearner, Small
 from halfspace_sss.neural.training.pool import MapPool
-from halfspace_sss.neural.training.recipes import MaterialRecipe, UniversalRecipe, train, train_universal
 from halfspace_sss.neural.training.schedules import Fit
-from halfspace_sss.neural.training.subjects import MaterialSubject, PaperSubject, Trial
-from halfspace_sss.neural.training.train_material import TrainedChannel, train_channel
+from halfspace_sss.neural.training.train_material import (
+    MaterialRecipe,
+    MaterialSubject,
+    PaperSubject,
+    TrainedChannel,
+    Trial,
+    train,
+    train_channel,
+)
+from halfspace_sss.neural.training.train_universal import UniversalRecipe, train_universal
 from halfspace_sss.progress import NamedProgress
 
 FIG10 = materials.load("fig10").medium

@@ -8,7 +8,7 @@ from typing import NamedTuple, Protocol
 
 from halfspace_sss.checks import check_count, check_interval
 
-__all__ = ["Budget", "Fit", "Samples", "Schedule", "Seconds", "Spent", "Timed", "Within", "cosine", "warm_up"]
+__all__ = ["Budget", "Fit", "Samples", "Schedule", "Seconds", "Spent", "CpuSchedule", "Within", "cosine", "warm_up"]
 
 LAST_RATE = 0.002  # of the largest
 WARM_UP_STEPS, WARM_UP_SHARE = 200, 0.02  # of a number of steps, of a budget
@@ -173,7 +173,7 @@ class Within:
 
 
 @dataclass(frozen=True)
-class Timed:
+class CpuSchedule:
     """CPU seconds of this process, data included, or a number of steps where the end is to be the same every time.
 
     Args:

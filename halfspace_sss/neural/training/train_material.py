@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from dataclasses import asdict, dataclass, field
@@ -10,22 +11,42 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from halfspace_sss.checks import check_count, check_interval
+from halfspace_sss.backend import array_types
+from halfspace_sss.checks import check_choice, check_count, check_interval
 from halfspace_sss.comparison.model_errors import ModelError, model_error, reference_maps
 from halfspace_sss.interface.model import BSSRDF
 from halfspace_sss.maps.noisy_maps import CellGrid, Groups, draw_directions, make_pool
+from halfspace_sss.neural import material_model, paper_model
+from halfspace_sss.neural.hypernetwork import in_range
 from halfspace_sss.neural.material_model import network_arrays
+from halfspace_sss.neural.network import Network
+from halfspace_sss.neural.paper_model import NeuralPaper
 from halfspace_sss.neural.store import save_weights
-from halfspace_sss.neural.trained import weights_folder, weights_name
+from halfspace_sss.neural.symmetric import SymmetricModel, channels
+from halfspace_sss.neural.trained import check_weights_folder, weights_folder, weights_name
 from halfspace_sss.neural.training.fit import fit
+from halfspace_sss.neural.training.learners import PaperLearner, Small
 from halfspace_sss.neural.training.pool import MapPool
 from halfspace_sss.neural.training.schedules import Fit
 from halfspace_sss.neural.training.work_folder import CHECKPOINT, claim
+from halfspace_sss.neural.universal import load_hypernetwork, shipped_weights
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.progress import NamedProgress
-from halfspace_sss.provenance import provenance
+from halfspace_sss.provenance import check_folder, provenance
 
-__all__ = ["FAST", "STANDARD", "MaterialRecipe", "TrainingSubject", "TrainedChannel", "train_channel"]
+__all__ = [
+    "FAST",
+    "STANDARD",
+    "SUBJECTS",
+    "MaterialRecipe",
+    "MaterialSubject",
+    "PaperSubject",
+    "TrainingSubject",
+    "TrainedChannel",
+    "Trial",
+    "train",
+    "train_channel",
+]
 
 VALIDATION_SEED = 104729
 VALIDATION_SETS = 4  # of 8 directions
@@ -168,3 +189,128 @@ def _record(
         "orders": "multiple", "seed": seed, "recipe": asdict(recipe), "validation": plain, "history": history,
         "data_seconds": data_seconds, "fit_seconds": fit_seconds, "provenance": provenance(seed=seed),
     }  # fmt: skip
+
+
+WIDEST_IN_DRJIT = 64  # a network 256 wide runs three times as fast in NumPy
+
+
+class Trial(SymmetricModel):
+    """A network under training as a model."""
+
+    name = "trial"
+    source = "under training"
+
+    def __init__(self, medium: Medium, network: Network) -> None:
+        super().__init__(medium)
+        self.networks = [network]
+        if network.matrices[0].shape[1] > WIDEST_IN_DRJIT:
+            self.fast_in = "numpy"
+
+
+class MaterialSubject:
+    """`neural_material`, started from what the universal network says of the medium, where it says anything.
+
+    Args:
+        warm: False to start from random numbers.
+    """
+
+    kind = material_model.KIND
+
+    def __init__(self, warm: bool = True) -> None:
+        self.warm = warm
+
+    def learner(self, medium: Medium, pool: MapPool, seed: int) -> Small:
+        start = None
+        if self.warm and in_range(medium) and shipped_weights().exists():
+            hyper = load_hypernetwork(shipped_weights())
+            start = hyper.network(float(medium.albedo), float(medium.g), medium.eta)
+        return Small(seed=seed, start=start)
+
+    def model(self, medium: Medium, learner: Small) -> Trial:
+        return Trial(medium, learner.network())
+
+    def record(self, learner: Small) -> dict[str, Any]:
+        return {"warm_start": self.warm}
+
+
+class PaperSubject:
+    """`neural_paper`: 3 x 256, raw S, squared error."""
+
+    kind = paper_model.KIND
+
+    def learner(self, medium: Medium, pool: MapPool, seed: int) -> PaperLearner:
+        probe = PaperLearner(medium, 1.0, width=1)
+        batch = pool.batch(64, 1024, _generator())
+        S = probe.S_over_y(batch)[:, : batch.y.shape[1]] * batch.y
+        return PaperLearner(medium, max(math.sqrt(float((S**2).mean())), 1e-20), seed=seed)
+
+    def model(self, medium: Medium, learner: PaperLearner) -> NeuralPaper:
+        return NeuralPaper(medium, [(learner.network(), learner.scale)])
+
+    def record(self, learner: PaperLearner) -> dict[str, Any]:
+        return {"scale": learner.scale}
+
+
+def _generator() -> Any:
+    import torch
+
+    return torch.Generator().manual_seed(0)
+
+
+SUBJECTS = {"neural_material": MaterialSubject(), "neural_paper": PaperSubject()}
+
+
+def train(
+    material: str | Medium,
+    *,
+    model: str = "neural_material",
+    recipe: MaterialRecipe = STANDARD,
+    seed: int = 0,
+    folder: str | os.PathLike | None = None,
+    work: str | os.PathLike | None = None,
+    target_error: float | None = None,
+    backend: str = "llvm",
+    progress: NamedProgress | None = None,
+) -> list[TrainedChannel]:
+    """Train a model for every channel of a material; `halfspace_sss.bssrdf(model, medium)` then finds the weights.
+
+    Args:
+        material: name in the registry, or a medium.
+        model: "neural_material" or "neural_paper".
+        recipe: size of the training, STANDARD or FAST or your own.
+        seed: results repeat for the same seed, backend, version and number of threads.
+        folder: for the weights; by default HALFSPACE_SSS_WEIGHTS or the user's data folder.
+        work: folder for unfinished work; a killed run that is started again with it ends with the same weights.
+        target_error: stop early once the validation error is below this in 95 % of cases.
+        backend: of the maps, "llvm" or "cuda".
+        progress: called with (what, done, total).
+
+    Raises:
+        ValueError: an argument is out of range, or the material is unknown; nothing has been traced then.
+    """
+    check_choice("model", model, SUBJECTS)
+    if not isinstance(recipe, MaterialRecipe):
+        raise ValueError(f"recipe must be a MaterialRecipe, got {recipe!r}")
+    check_count("seed", seed, 0)
+    if target_error is not None:
+        check_interval("target_error", target_error, 1e-4, 1.0)
+    media = channels(_medium(material))
+    check_weights_folder(folder)
+    if work is not None:
+        check_folder(work)
+    array_types(backend)
+    return [
+        train_channel(
+            m, SUBJECTS[model], recipe, int(seed), folder=folder, work=Path(work) / f"channel-{k}" if work else None,
+            target_error=target_error, backend=backend, progress=progress,
+        )
+        for k, m in enumerate(media)
+    ]  # fmt: skip
+
+
+def _medium(material: str | Medium) -> Medium:
+    if isinstance(material, Medium):
+        return material
+    from halfspace_sss.materials import load
+
+    return load(material).medium

@@ -1,33 +1,184 @@
-"""Training of the network for all media: maps of many media, a fit, and one to exact reflectances."""
+"""Training of the network for all media: maps of many media, a fit, and a fit of `balance` to exact reflectances.
+
+Of each medium, at some cosines of incidence, are known the exact R of order >= 2 (discrete ordinates less the exact
+single order) and the flux of the network towards 16 intervals of cosines of exit. The coefficients of a follow from the
+medium by a network whose loss is the squared logarithm of a(mu_i) sum_b flux_b a(mu_b) over R.
+"""
 
 from __future__ import annotations
 
+import io
 import os
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+import torch
+from torch import nn
 
 from halfspace_sss.backend import array_types
 from halfspace_sss.checks import check_count, check_interval
+from halfspace_sss.comparison.model_truths import exits
 from halfspace_sss.maps.grid import RANGES, draw_media
-from halfspace_sss.maps.noisy_maps import CellGrid, draw_directions, looking_back, make_pool
-from halfspace_sss.neural.hypernetwork import named_layers
+from halfspace_sss.maps.noisy_maps import CellGrid, draw_directions, load_maps, looking_back, make_pool
+from halfspace_sss.neural.features import N_MEDIUM, medium_features
+from halfspace_sss.neural.hypernetwork import N_TERMS, Hypernetwork, Layers, chebyshev, named_layers
 from halfspace_sss.neural.store import save_weights
 from halfspace_sss.neural.training.fit import fit
 from halfspace_sss.neural.training.learners import Hyper
-from halfspace_sss.neural.training.pool import MapPool
-from halfspace_sss.neural.training.reflectances import balanced, collect
+from halfspace_sss.neural.training.pool import MapPool, torch_library
 from halfspace_sss.neural.training.schedules import Fit
+from halfspace_sss.neural.training.train_material import Trial
 from halfspace_sss.neural.training.work_folder import CHECKPOINT, claim
 from halfspace_sss.neural.universal import hypernetwork_of
+from halfspace_sss.physics import single_scattering
+from halfspace_sss.physics.backbone import length_scale
+from halfspace_sss.physics.medium import Medium
 from halfspace_sss.progress import NamedProgress
-from halfspace_sss.provenance import check_folder, provenance
+from halfspace_sss.provenance import check_folder, provenance, write_atomically
 
-__all__ = ["UniversalRecipe", "train_universal"]
+__all__ = ["Fluxes", "UniversalRecipe", "balanced", "collect", "train_universal"]
+
+INTERVALS = 16  # of the cosine of exit
+COSINES = 2  # of incidence, of each medium
+MATCHED = 0.25  # of the media at least have eta = 1, where the network is weakest
+LEAST_ALBEDO = 0.05  # below it R of order >= 2 drowns in the rounding of both orders; a goes on as it is there
+POINTS, REPEATS = 2048, 4  # of a proposal; scrambles
+NOISY, MORE = 3e-3, 8  # relative error above which a medium gets more points, and how many times as many
+TRUSTED, EXACT = 2e-3, 2e-5  # relative errors: that counts in full, of the exact reflectance of all orders
+OUTLIER = 0.03  # of a logarithm, from which on it counts linearly
+WIDTH, HIDDEN = 64, 3
+CHUNK = 64  # media of a file
+
+
+class Fluxes(NamedTuple):
+    """Of n media: albedo, g, eta (n, 3); cosines of incidence (n, COSINES); of each the exact R of order >= 2, that of
+    the network towards each interval (n, COSINES, INTERVALS), and the relative error of both together."""
+
+    ratios: np.ndarray
+    mu_i: np.ndarray
+    exact: np.ndarray
+    flux: np.ndarray
+    error: np.ndarray
+
+
+def collect(
+    hyper: Hypernetwork, n: int, seed: int, folder: Path | None = None, progress: NamedProgress | None = None
+) -> Fluxes:
+    """What the fit needs of n media, kept in `folder` as it comes; progress: ("reflectances", media done, media)."""
+    rng = np.random.default_rng([seed, 2])
+    albedo, g, eta = draw_media(n, rng)
+    eta = np.where(rng.random(n) < MATCHED, 1.0, eta)
+    ratios = np.stack([np.maximum(albedo, LEAST_ALBEDO), g, eta], axis=1)
+    mu_i = (np.arange(COSINES) + rng.random((n, COSINES))) / COSINES
+    mu_i[:, -1] = np.where(rng.random(n) < 0.5, 1.0, mu_i[:, -1])  # normal incidence is asked for most
+    found = []
+    for at in range(0, n, CHUNK):
+        media = range(at, min(at + CHUNK, n))
+        place = folder / f"reflectances-{at // CHUNK:05d}.npy" if folder else None
+        if place and place.exists():
+            rows = load_maps(place, (len(media), COSINES, 2 + INTERVALS))
+        else:
+            rows = np.stack([_row(hyper, ratios[k], mu_i[k], (seed, 3, k)) for k in media])  # no scramble is shared
+            rows = rows.astype(np.float32)
+            if place:
+                file = io.BytesIO()
+                np.save(file, rows)
+                write_atomically(place, file.getvalue())
+        found.append(rows)
+        if progress:
+            progress("reflectances", min(at + CHUNK, n), n)
+    exact, error, flux = np.split(np.concatenate(found).astype(np.float64), [1, 2], axis=2)
+    return Fluxes(ratios, mu_i, exact[..., 0], flux, error[..., 0])
+
+
+def _row(hyper: Hypernetwork, ratios: np.ndarray, mu_i: np.ndarray, seed: tuple[int, ...]) -> np.ndarray:
+    """Exact R, relative error and fluxes of a medium, (COSINES, 2 + INTERVALS)."""
+    medium = Medium.from_albedo(ratios[0], 1.0, ratios[1], ratios[2])
+    model = Trial(medium, hyper.network(*ratios.tolist()))
+    total = np.array([medium.reflectance(float(mu)) for mu in mu_i])
+    exact = np.maximum(total - single_scattering.reflectance(medium, mu_i), EXACT * total)
+    flux, spread = _fluxes(model, mu_i, POINTS, seed)
+    if (spread > NOISY * exact).any():
+        flux, spread = _fluxes(model, mu_i, MORE * POINTS, seed)
+    error = np.hypot(spread, EXACT * total) / exact
+    return np.concatenate([exact[:, None], error[:, None], flux], axis=1)
+
+
+def _fluxes(model: Trial, mu_i: np.ndarray, points: int, seed: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Flux towards each interval and the standard error of their sum, for each cosine of incidence."""
+    found = exits(model, np.repeat(mu_i, REPEATS).tolist(), points, seed)
+    interval = np.minimum((found.mu_o * INTERVALS).astype(int), INTERVALS - 1)
+    flux = np.stack([np.bincount(b, f, INTERVALS) for b, f in zip(interval, found.flux)])
+    flux = flux.reshape(len(mu_i), REPEATS, INTERVALS)
+    return flux.mean(axis=1), flux.sum(axis=2).std(axis=1, ddof=1) / np.sqrt(REPEATS)
+
+
+class _Balance(nn.Module):
+    """Coefficients of log a from the features of a medium."""
+
+    def __init__(self, seed: int) -> None:
+        super().__init__()
+        generator = torch.Generator().manual_seed(seed)
+        sizes = [N_MEDIUM, *[WIDTH] * HIDDEN, N_TERMS]
+        gains = [1.0] * HIDDEN + [0.05]
+        self.matrices = nn.ParameterList(
+            gain * torch.randn(i, j, generator=generator) / i**0.5 for gain, i, j in zip(gains, sizes, sizes[1:])
+        )
+        self.biases = nn.ParameterList(torch.zeros(j) for j in sizes[1:])
+
+    def forward(self, h: torch.Tensor) -> torch.Tensor:
+        for k, (W, b) in enumerate(zip(self.matrices, self.biases)):
+            h = torch.addmm(b, h, W)
+            if k < HIDDEN:
+                h = nn.functional.silu(h)
+        return h
+
+    def residual(self, batch: tuple[torch.Tensor, ...]) -> torch.Tensor:
+        """log of the network's R with a over the exact one, (media, COSINES)."""
+        features, T_i, T_o, exact, flux, _ = batch
+        c = self(features)
+        a_o = torch.exp(c @ T_o.T)
+        R = torch.einsum("nib,nb->ni", flux, a_o)
+        return torch.log(R / exact) + torch.einsum("nik,nk->ni", T_i, c)
+
+    def loss(self, batch: tuple[torch.Tensor, ...]) -> torch.Tensor:
+        off = self.residual(batch)
+        return (batch[-1] * nn.functional.huber_loss(off, torch.zeros_like(off), "none", OUTLIER)).mean()
+
+    def layers(self) -> Layers:
+        pairs = zip(self.matrices, self.biases)
+        return tuple(tuple(v.detach().numpy().astype(np.float16) for v in pair) for pair in pairs)
+
+
+def _batches(data: Fluxes, size: int) -> Callable[[torch.Generator], tuple[torch.Tensor, ...]]:
+    """Random media of the data as arguments of `_Balance.residual`."""
+    albedo, g, eta = (torch.from_numpy(v.copy()) for v in data.ratios.T)
+    lib, L = torch_library(), length_scale(albedo, g)
+    features = torch.stack(medium_features(lib, albedo, g, eta, L), -1)
+    usable = np.isfinite(data.error) & (data.flux.sum(axis=2) > 0)
+    weight = np.where(usable, TRUSTED**2 / (TRUSTED**2 + np.where(usable, data.error, 1.0) ** 2), 0.0)
+    flux = np.where(usable[..., None], data.flux, data.exact[..., None] / INTERVALS)
+    middles = (np.arange(INTERVALS) + 0.5) / INTERVALS
+    arrays = (chebyshev(data.mu_i), data.exact, flux, weight)
+    T_i, exact, flux, weight = (torch.from_numpy(np.asarray(v)).float() for v in arrays)
+    features, T_o = features.float(), torch.from_numpy(chebyshev(middles)).float()
+
+    def batch(generator: torch.Generator) -> tuple[torch.Tensor, ...]:
+        n = torch.randint(len(features), (size,), generator=generator)
+        return features[n], T_i[n], T_o, exact[n], flux[n], weight[n]
+
+    return batch
+
+
+def balanced(data: Fluxes, how: Fit, seed: int, progress: NamedProgress | None = None) -> Layers:
+    """The layers that give the coefficients of log a of a medium, fitted to `data`; `n_groups` media a step."""
+    learner = _Balance(seed)
+    fit(learner, _batches(data, how.n_groups), how, seed, progress=progress)
+    return learner.layers()
 
 
 @dataclass(frozen=True)
