@@ -147,6 +147,11 @@ def test_weights_of_another_medium_are_refused(trained: Trained, folder: Path, c
         storing.find_weights(subject_of(**changed), folder)
 
 
+def test_errors_refuse_a_model_of_a_medium_that_varies_as_renders_do() -> None:
+    with pytest.raises(ValueError, match="must be the same everywhere for neural_shape, got one that varies"):
+        transport_of(subject_of(), "neural_shape")
+
+
 def halves(shown: dict, model: str, mm_per_unit: float, spp: int = 128) -> np.ndarray:
     """Mean of the left and of the right half of the picture in every pass under an even sky, (passes, 2, channels)."""
     box = load_objects(objects(**shown)).bbox()
