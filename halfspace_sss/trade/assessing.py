@@ -263,10 +263,10 @@ def assess_for(
     reasons = {way: [_left_out(o, way, tolerance, images, seconds) for o in seen] for way in later}
     wanted = [way for way in later if "" in reasons[way]]
     if len(wanted) > 1:
-        nearest = min(wanted, key=lambda way: _promise(seen, way))
+        best = _most_promising(seen, wanted)
         for way in wanted:
-            reasons[way] = [f"not measured, as {nearest.name} promises less bias"]
-        wanted = [nearest]
+            reasons[way] = [f"not measured, as {best.name} promises more: ask for it by its name"]
+        wanted = [best]
     names -= {way.model for way in wanted}  # what gathers no light cannot win where that is worth its preparation
     few = [way for way in ahead if way.name in names or way.model == PATH_TRACED] + wanted
     traced = sum(_traced_share(o, names) for o in seen) / len(seen)
@@ -299,9 +299,14 @@ def _left_out(found: ObjectTrade, way: Way, tolerance: float, images: int, secon
     return ""
 
 
-def _promise(seen: Sequence[ObjectTrade], way: Way) -> float:
-    """Sum over objects of what the squared bias of a model is below, by the first look."""
-    return sum(max(row.bias2, 0.0) + row.bias2_error for o in seen for row in o.ways if row.way == way.model)
+def _most_promising(seen: Sequence[ObjectTrade], ways: Sequence[Way]) -> Way:
+    """The way whose light is gathered fastest, of those whose model no other beats by more than the doubt in biases."""
+    rows = {way: [row for o in seen for row in o.ways if row.way == way.model] for way in ways}
+    bias2 = {way: sum(max(row.bias2, 0.0) for row in rows[way]) for way in ways}
+    doubt = {way: DOUBT * math.hypot(*(row.bias2_error for row in rows[way])) for way in ways}
+    least = min(bias2[way] + doubt[way] for way in ways)
+    near = [way for way in ways if bias2[way] - doubt[way] <= least]
+    return min(near, key=lambda way: sum(row.seconds for row in rows[way]))
 
 
 def contenders(found: ObjectTrade, tolerance: float) -> list[str]:

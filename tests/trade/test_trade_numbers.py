@@ -10,7 +10,7 @@ import pytest
 from halfspace_sss.cli import trade
 from halfspace_sss.trade import recommend
 from halfspace_sss.trade.advice import Job, advise
-from halfspace_sss.trade.assessing import contenders
+from halfspace_sss.trade.assessing import _left_out, _most_promising, contenders
 from halfspace_sss.trade.automatic import picked
 from halfspace_sss.trade.results import Assessment, ObjectTrade, WayTrade, samples_for
 from halfspace_sss.trade.statistics import FIREFLIES, RadianceEstimate, mean_square, relative_variance
@@ -209,3 +209,28 @@ def test_bad_input_is_refused(given: dict, message: str) -> None:
 def test_a_scene_or_a_medium_must_be_given() -> None:
     with pytest.raises(ValueError, match="a scene must be given"):
         recommend()
+
+
+@pytest.mark.parametrize(
+    ("tolerance", "images", "seconds", "reason"),
+    [
+        (0.1, 10_000, 4.0, ""),
+        (0.1, 1, 4.0, "before its light is gathered"),
+        (0.005, 10_000, 4.0, "asked 0.5 %"),
+        (0.1, 10_000, 1.0, "ask for it by its name"),
+    ],
+)
+def test_light_is_gathered_for_an_assessment_only_where_it_may_win(
+    tolerance: float, images: int, seconds: float, reason: str
+) -> None:
+    found = _assessment(_way("neural", 0.01, 0.001, 2e-6)).objects[0]  # at least 2.1 s of gathering
+    why = _left_out(found, Way.of("neural, gathered"), tolerance, images, seconds)
+    assert why.endswith(reason) and bool(why) == bool(reason)
+
+
+def test_of_models_that_no_bias_tells_apart_the_light_of_the_fastest_is_gathered() -> None:
+    ways = [Way.of("neural, gathered"), Way.of("better_dipole, gathered")]
+    close = _assessment(_way("neural", 0.02, 0.03, 4e-6), _way("better_dipole", 0.03, 0.03, 2e-6)).objects
+    apart = _assessment(_way("neural", 0.02, 0.01, 4e-6), _way("better_dipole", 0.1, 0.01, 2e-6)).objects
+    assert _most_promising(close, ways) == ways[1]
+    assert _most_promising(apart, ways) == ways[0]
