@@ -8,7 +8,7 @@ tracer in `test_translucent_walk.py`. Every comparison states its orders, and th
 from __future__ import annotations
 
 import gc
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
 
@@ -19,6 +19,7 @@ mi = pytest.importorskip("mitsuba")
 
 import drjit as dr  # noqa: E402
 
+from halfspace_sss.rendering import register  # noqa: E402
 from halfspace_sss.rendering.light.small_emitters import SmallEmitters  # noqa: E402
 from halfspace_sss.trade import recommend  # noqa: E402
 
@@ -189,6 +190,32 @@ def _model_finds_all_light(kind: str, model: str) -> None:
 def test_models_of_the_half_space_find_the_light_of_every_emitter(kind: str) -> None:
     """Orders from two on."""
     _model_finds_all_light(kind, "neural")
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """A short training of the sphere."""
+    pytest.importorskip("torch")
+    from full_geometry.learning import training
+    from full_geometry.learning.fitting import Recipe
+
+    mi.set_variant("llvm_ad_rgb")
+    register()
+    folder = tmp_path_factory.mktemp("weights")
+    recipe = Recipe(width=32, depth=2, batch=1024, chunk=2**15, reuse=4)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("HALFSPACE_SSS_WEIGHTS", str(folder))
+        patch.setattr(training, "WALKS", 512)
+        shape = mi.load_dict(_scene({"type": "bssrdf"}, {"sky": {"type": "constant"}}, orders="multiple"))
+        training.train(shape, None, chunks=8, recipe=recipe, folder=folder)
+        yield
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", [kind for kind in EMITTERS if kind != "constant"])
+def test_models_of_an_object_find_the_light_of_every_emitter(kind: str, trained: None) -> None:
+    """Orders from two on. Light of an even sky is learnt beside S, see `full_geometry/test_full_scenes.py`."""
+    _model_finds_all_light(kind, "full_geometry")
 
 
 @pytest.mark.parametrize("integrator", ["translucent_walk", "bssrdf"])
