@@ -17,7 +17,7 @@ from halfspace_sss.noise_free import short
 from halfspace_sss.trade.advice import Job, advise
 from halfspace_sss.trade.images import TradePicture
 from halfspace_sss.trade.results import Assessment, ObjectTrade, WayTrade
-from halfspace_sss.trade.ways import NO_SINGLE
+from halfspace_sss.trade.ways import GATHERED, NO_SINGLE
 
 if TYPE_CHECKING:
     import pandas
@@ -69,9 +69,10 @@ def trade_panels(found: ObjectTrade, left: Axes, right: Axes, tolerance: float) 
 
 
 def _look(way: str) -> Look:
-    model, _, bare = way.partition(", ")
+    model, *more = way.split(", ")
     style = look(model)
-    return style._replace(label=f"{style.label}, no single") if bare else style
+    words = ["no single" if part == NO_SINGLE else part for part in more]
+    return style._replace(label=", ".join([style.label, *words]))
 
 
 def _time(row: WayTrade, pixels: float) -> float:
@@ -87,7 +88,7 @@ def _pareto(
         style, x, exact = _look(row.way), _time(row, pixels), row.way == TRACED
         y = LEAST if exact else max(row.bias, LEAST)
         bare = row.way.endswith(NO_SINGLE)
-        mark = MARKERS.get(row.way, "o")
+        mark = "s" if row.way.endswith(GATHERED) else MARKERS.get(row.way, "o")
         size = (9 if exact else 5) * (0.7 if small else 1)
         (handle,) = ax.plot(
             x, y, mark, color=style.color, mfc="white" if bare else style.color, ms=size, mew=0.7 if small else 0.9,
