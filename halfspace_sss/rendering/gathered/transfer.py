@@ -15,7 +15,8 @@ a(mu) = F_t(mu) (c_0 + c_1 mu + c_2 mu²) per channel is fitted to all samples.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from functools import cached_property
+from typing import TYPE_CHECKING, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -26,14 +27,21 @@ from halfspace_sss.rendering.gathered.points import SurfacePoints
 from halfspace_sss.rendering.object.points import SurfacePoint, number
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from halfspace_sss.rendering.object.body import TranslucentObject
 
-__all__ = ["Albedo", "Incident", "Transfer", "transfer"]
+__all__ = ["Albedo", "Incident", "Transfer", "drawn", "transfer"]
 
 PER_LENGTH = 2.0  # points over a transport mean free path
 FEWEST, MOST = 1024, 8192  # points
 SAMPLES = 2**21  # entries of all points
 R_2 = 0.7548776662466927, 0.5698402909980532
+
+
+def cosine(w: mi.Vector3f, n: mi.Normal3f, n_out: mi.Normal3f) -> mi.Float:
+    """Of a direction to the shading normal; 0 below the surface of geometric normal n."""
+    return dr.select(dr.dot(w, n) > 0, dr.abs(dr.dot(w, n_out)), 0)
 
 
 @dataclass(frozen=True)
@@ -47,6 +55,18 @@ class Albedo:
         F = F_t(mu, number(self.eta))
         rows = [[number(v) for v in row] for row in self.c]
         return mi.Spectrum([F * dr.maximum(a + mu * (b + mu * c), 0) for a, b, c in rows])
+
+    def cosine(self, w: mi.Vector3f, n: mi.Normal3f, n_out: mi.Normal3f) -> mi.Spectrum:
+        """a(mu) mu / ∫ a(mu) mu dw of a direction above a surface of geometric normal n, mu the cosine to n_out."""
+        mu = cosine(w, n, n_out)
+        return self(mu) * mu * mi.Spectrum([number(1 / v) for v in self.whole])
+
+    @cached_property
+    def whole(self) -> np.ndarray:
+        """∫ a(mu) mu dw of each channel."""
+        mu = (np.arange(256) + 0.5) / 256
+        a = np.maximum(self.c @ mu ** np.arange(3)[:, None], 0) * F_t(mu, self.eta)
+        return np.maximum(2 * np.pi * (a * mu).mean(axis=1), 1e-30)
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +132,37 @@ def count_of(body: TranslucentObject) -> int:
 def transfer(body: TranslucentObject, count: int | None = None, samples: int = SAMPLES) -> Transfer:
     """The transfer of an object, by its model and the proposals of that."""
     points = SurfacePoints.of(body.geometry, count or count_of(body))
-    n = max(samples // len(points), 16)
+    found = drawn(body, points, lambda p, n, _, active: points.nearest(p, n, active), max(samples // len(points), 16))
+    t, error = _rows(points, found.S, _trusted(body), found.a)
+    near = np.where(found.known, found.near, np.arange(len(points))[:, None])
+    centred = _centred(found.w_o, found.a.mean(axis=2))
+    return Transfer(points, near, t, found.w_i, *centred, found.albedo, error)
+
+
+class DrawnEntries(NamedTuple):
+    """Entries that the proposals draw for exits at points: n for each, in arrays (points, n) and more.
+
+    Args:
+        S: S mu_i over the density, per channel.
+        h: a(mu_i) mu_i / ∫ a(mu) mu dw over the density, per channel.
+        near, known: the point that the entry is nearest to, and whether there is one.
+        w_i, w_o: directions.
+        a: directional albedo at the exit, per channel.
+        albedo: fitted to all.
+    """
+
+    S: np.ndarray
+    h: np.ndarray
+    near: np.ndarray
+    known: np.ndarray
+    w_i: np.ndarray
+    w_o: np.ndarray
+    a: np.ndarray
+    albedo: Albedo
+
+
+def drawn(body: TranslucentObject, points: SurfacePoints, cell: Callable, n: int) -> DrawnEntries:
+    """n entries for each point; `cell` of position, outward normal, face and mask says which they are near."""
     k = dr.arange(mi.UInt32, len(points) * n)
     j, s = k // n, k % n
     sampler = mi.load_dict({"type": "independent"})
@@ -121,20 +171,18 @@ def transfer(body: TranslucentObject, count: int | None = None, samples: int = S
     jitter = dr.gather(mi.Point2f, shift, j * n)
     u = [dr.fma(mi.Float(s), r, x) for r, x in zip(R_2, (jitter.x, jitter.y))]
     out, face = points.exit(j, mi.Point2f(*(x - dr.floor(x) for x in u)))
-    S, entry, w_i = _sample(body, out, face, sampler, active)
-    near, known = points.nearest(entry.p, entry.n, entry.weight > 0)
-    mu = dr.dot(out.w, out.n_out)
-    trusted = _trusted(body)
-    dr.eval(S, near, known, mu, w_i)
+    S, inverse, entry, w_i = _sample(body, out, face, sampler, active)
+    near, known = cell(entry.p, entry.n, entry.face, entry.weight > 0)
+    mu, mu_i = dr.dot(out.w, out.n_out), cosine(w_i, entry.n, entry.n_out)
+    dr.eval(S, inverse, near, known, mu, mu_i, w_i)
     shape = (len(points), n)
     S = np.array(S, dtype=np.float32).reshape(-1, *shape).transpose(1, 2, 0)
     S = np.nan_to_num(S, nan=0.0, posinf=0.0, neginf=0.0)
     albedo = _fitted(body, np.array(mu), S.reshape(-1, S.shape[2]))
     a = np.array(albedo(mu)).T.reshape(S.shape)
-    t, error = _rows(points, S, trusted, a)
-    near = np.where(np.array(known), np.array(near), np.array(j)).reshape(shape)
+    h = np.array(albedo(mu_i) * (mu_i * inverse)).T.reshape(S.shape) / albedo.whole.astype(np.float32)
     w_i, w_o = (np.array(w, dtype=np.float32).T.reshape(*shape, 3) for w in (w_i, out.w))
-    return Transfer(points, near, t, w_i, *_centred(w_o, a.mean(axis=2)), albedo, error)
+    return DrawnEntries(S, h, np.array(near).reshape(shape), np.array(known).reshape(shape), w_i, w_o, a, albedo)
 
 
 def _centred(w: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -146,15 +194,16 @@ def _centred(w: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.n
 
 
 def _sample(body: TranslucentObject, out: SurfacePoint, face: mi.UInt32, sampler: mi.Sampler, active: mi.Bool) -> tuple:
-    """S mu_i over the density of an entry and its direction, and both."""
+    """S mu_i over the density of an entry and its direction, the inverse of that, and both."""
     prepared = body.transport.prepare(out, active)
     where = body.proposals.prepare(out, prepared, active)
     entry = body.proposals.sample(out, face, where, sampler, active)
     active = active & (entry.weight > 0)
     w_i, pdf = body.proposals.sample_direction(entry, out, sampler.next_2d())
     at = entry.facing(w_i)
-    S = body.transport.S(prepared, at, active & (pdf > 0)) * at.mu * (entry.weight / dr.maximum(pdf, 1e-8))
-    return mi.Spectrum(dr.select(active & (pdf > 0), S, 0)), entry, mi.Vector3f(w_i)
+    inverse = dr.select(active & (pdf > 0), entry.weight / dr.maximum(pdf, 1e-8), 0)
+    S = body.transport.S(prepared, at, active & (pdf > 0)) * (at.mu * inverse)
+    return mi.Spectrum(dr.select(active & (pdf > 0), S, 0)), inverse, entry, mi.Vector3f(w_i)
 
 
 def _trusted(body: TranslucentObject) -> np.ndarray:

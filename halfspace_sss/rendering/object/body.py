@@ -43,6 +43,7 @@ class TranslucentObject:
         expected: what each kind of light is expected to bring.
         variation: how its light varies with its medium.
         gathered: what leaves by orders from two on, in place of a transport, see `paths.gathering`.
+        control: control variate of entries at the first vertex of a path, see `paths.control_variate`.
     """
 
     geometry: Geometry
@@ -55,6 +56,7 @@ class TranslucentObject:
     expected: Expected
     variation: Variation
     gathered: Any = None
+    control: Any = None
 
     @property
     def eta(self) -> Any:

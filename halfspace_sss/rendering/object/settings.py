@@ -24,7 +24,7 @@ __all__ = [
 AUTOMATIC = -1.0
 ORDERS = ("total", "multiple", "single")
 GEOMETRIES = ("distance", "tangent")
-LIGHTS = ("sampled", "gathered", "auto")
+LIGHTS = ("sampled", "corrected", "gathered", "auto")
 SHARED = ("mm_per_unit", "max_depth", "rr_depth", "hide_emitters")  # what `translucent_walk` understands too
 OF_MODELS = ("geometry", "area_share", "entries")
 
@@ -43,7 +43,8 @@ class Settings:
             object.
         entries: points of entry that an exit draws, of which one is followed, chosen by what it may bring; AUTOMATIC
             leaves it to the model.
-        light: "sampled", without bias; or "gathered" once for all samples, see `paths.gathering`: orders from two on
+        light: "sampled", without bias; "corrected", the same with gathered light as control variate, see
+            `paths.control_variate`; or "gathered" once for all samples, see `paths.gathering`: orders from two on
             have a little bias and no noise; or "auto", the cheaper of both that keeps the tolerance, by measurement.
         hide_emitters: whether directly visible emitters are left out.
         train_seconds: time for each object whose model has to learn it first; 0 refuses objects without weights.

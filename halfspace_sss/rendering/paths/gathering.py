@@ -18,7 +18,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from halfspace_sss.rendering.gathered.transfer import Incident, Transfer, transfer
+from halfspace_sss.rendering.gathered.transfer import Albedo, Incident, Transfer, transfer
 from halfspace_sss.rendering.object.points import cosine_above, place
 from halfspace_sss.rendering.paths.lighting import mis_weight
 from halfspace_sss.rendering.paths.path_loop import trace_paths
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from halfspace_sss.rendering.object.points import SurfacePoint
     from halfspace_sss.rendering.object.settings import Settings
 
-__all__ = ["Gathered", "Gathering"]
+__all__ = ["TRACED", "Gathered", "Gathering", "GatheringPoint", "by_cosine", "by_emitters", "spreads"]
 
 DIRECTIONS = 2**20  # of all points of an object, by emitters, and as many by the cosine
 FEWEST, MOST = 64, 1024  # of a point
@@ -82,11 +82,11 @@ class Gathering:
             ValueError: an object is open or has no known area, or light that arrives is not finite.
         """
         if len(bodies) != len(self._bodies) or any(a is not b for a, b in zip(bodies, self._bodies)):
-            spread = [_spreads(body) for body in bodies]
-            for body, spreads in zip(bodies, spread):
-                if spreads:
+            spread = [spreads(body) for body in bodies]
+            for body, one in zip(bodies, spread):
+                if one:
                     _check(body)
-            self._transfers = [transfer(body) if spreads else None for body, spreads in zip(bodies, spread)]
+            self._transfers = [transfer(body) if one else None for body, one in zip(bodies, spread)]
             self._bodies, self._light = bodies, ([], [])
         state = _state(scene)
         if state[0] != self._light[0] or not self._found:
@@ -111,7 +111,7 @@ class Gathering:
         ]
 
 
-def _spreads(body: TranslucentObject) -> bool:
+def spreads(body: TranslucentObject) -> bool:
     """Whether light leaves elsewhere than it entered, by orders that a transport has."""
     return body.transport is not None and not body.transport.is_delta
 
@@ -158,10 +158,10 @@ def _incident(scene: mi.Scene, bodies: list[TranslucentObject], T: Transfer, set
     j, s = lane // n, lane % n
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(100 + seed, dr.width(lane))
-    at = _Point(*(dr.gather(type(v), v, j) for v in (T.points.p, T.points.n, T.points.n_out)))
+    at = GatheringPoint(*(dr.gather(type(v), v, j) for v in (T.points.p, T.points.n, T.points.n_out)))
     u, v = (_stratified(sampler, j, s, n) for _ in range(2))
-    aimed, w_e = _by_emitters(scene, T, at, u)
-    met, more, a, w_c = _by_cosine(scene, bodies, T, settings, at, v, s % TRACED == 0, sampler)
+    aimed, w_e = by_emitters(scene, T.albedo, at, u)
+    met, more, a, w_c = by_cosine(scene, bodies, T.albedo, settings, at, v, s % TRACED == 0, sampler)
     arriving = met + TRACED * more
     weight = dr.mean(a) + dr.zeros(mi.Float, count * n)
     dr.eval(aimed, arriving, a, weight, w_e, w_c)
@@ -186,7 +186,7 @@ def _incident(scene: mi.Scene, bodies: list[TranslucentObject], T: Transfer, set
     return Incident(*(part.astype(np.float32) for part in (mean, slope, middle)))
 
 
-class _Point(NamedTuple):
+class GatheringPoint(NamedTuple):
     """Position, outward geometric and shading normal."""
 
     p: mi.Point3f
@@ -201,28 +201,27 @@ def _stratified(sampler: mi.Sampler, j: mi.UInt32, s: mi.UInt32, n: int) -> mi.P
     return x - dr.floor(x)
 
 
-def _weight(T: Transfer, at: _Point, w: mi.Vector3f) -> tuple[mi.Spectrum, mi.Float]:
+def _weight(albedo: Albedo, at: GatheringPoint, w: mi.Vector3f) -> tuple[mi.Spectrum, mi.Float]:
     """a(mu) mu over the density of the cosine, and that density."""
     mu = dr.select(dr.dot(w, at.n) > 0, dr.abs(dr.dot(w, at.n_out)), 0)
-    return T.albedo(mu) * dr.pi, mu * dr.inv_pi
+    return albedo(mu) * dr.pi, mu * dr.inv_pi
 
 
-def _by_emitters(scene: mi.Scene, T: Transfer, at: _Point, u: mi.Point2f) -> tuple[mi.Spectrum, mi.Vector3f]:
+def by_emitters(scene: mi.Scene, albedo: Albedo, at: GatheringPoint, u: mi.Point2f) -> tuple[mi.Spectrum, mi.Vector3f]:
     """Light of sampled emitters, and its direction."""
     ds, light = scene.sample_emitter_direction(place(at.p, at.n), u, True)
-    a, pdf = _weight(T, at, ds.d)
+    a, pdf = _weight(albedo, at, ds.d)
     share = dr.select(ds.delta, 1, mis_weight(ds.pdf, pdf))
     return dr.select((ds.pdf > 0) & (pdf > 0), a * pdf * light * share, 0), ds.d
 
 
-def _by_cosine(
-    scene: mi.Scene, bodies: list[TranslucentObject], T: Transfer, settings: Settings, at: _Point, u: mi.Point2f,
-    traced: mi.Bool,
-    sampler: mi.Sampler,
+def by_cosine(
+    scene: mi.Scene, bodies: list[TranslucentObject], albedo: Albedo, settings: Settings, at: GatheringPoint,
+    u: mi.Point2f, traced: mi.Bool, sampler: mi.Sampler,
 ) -> tuple[mi.Spectrum, mi.Spectrum, mi.Spectrum, mi.Vector3f]:  # fmt: skip
     """By directions of the cosine: light of emitters that they meet, what other surfaces send along some, a, and w."""
     w, _ = cosine_above(at.n_out, at.n, u)
-    a, pdf = _weight(T, at, w)
+    a, pdf = _weight(albedo, at, w)
     here = place(at.p, at.n)
     ray = here.spawn_ray(w)
     si = scene.ray_intersect(ray, mi.RayFlags.All, True)
@@ -230,7 +229,7 @@ def _by_cosine(
     shines = emitter != None  # noqa: E711
     density = scene.pdf_emitter_direction(here, mi.DirectionSample3f(scene, si, here), shines)
     met = dr.select(shines, mis_weight(pdf, density) * emitter.eval(si, shines), 0)
-    hidden = replace(settings, hide_emitters=True, light="sampled")
+    hidden = replace(settings, hide_emitters=True, light="sampled", max_depth=max(settings.max_depth - 1, -1) or 1)
     on = si.is_valid() & traced
-    parts, _ = trace_paths(scene, bodies, hidden, sampler, ray, on)
+    parts, _ = trace_paths(scene, bodies, hidden, sampler, ray, on, scattered=True)
     return a * met, dr.select(on, a * (parts[0] + parts[1]), 0), a, w

@@ -18,6 +18,7 @@ from halfspace_sss.rendering.object.body import TranslucentObject, TranslucentOb
 from halfspace_sss.rendering.object.registry import Choices
 from halfspace_sss.rendering.object.settings import Settings, read_settings
 from halfspace_sss.rendering.object.translucent import is_translucent
+from halfspace_sss.rendering.paths.control_variate import ControlVariates
 from halfspace_sss.rendering.paths.gathering import Gathering
 from halfspace_sss.rendering.paths.path_loop import replay_paths, trace_paths
 
@@ -60,6 +61,8 @@ def _class(variant: str) -> type:
             self.settings = read_settings(props)
             self._bodies = TranslucentObjects(self.settings)
             self._gathering = Gathering()
+            self._control_variates = ControlVariates()
+            self._controlled: list[TranslucentObject] | None = None  # while an image is rendered
 
         def prepare(self, scene: mi.Scene) -> list[TranslucentObject]:
             """The translucent objects of a scene, made ready once; ValueError if the scene cannot be rendered."""
@@ -69,7 +72,7 @@ def _class(variant: str) -> type:
 
         def _prepared(self, scene: mi.Scene) -> list[TranslucentObject]:
             objects = self._bodies.of(scene)
-            if self._bodies.choices.light == "sampled":
+            if self._bodies.choices.light != "gathered":
                 return objects
             return self._gathering.of(scene, objects, self.settings)
 
@@ -86,10 +89,23 @@ def _class(variant: str) -> type:
             """The image, in launches; KeyboardInterrupt between two if one was interrupted."""
             sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
             with interruptible(), undisturbed(), dr.suspend_grad():
-                self.prepare(scene)
-                for launch in launches(sensor, seed, spp, lambda: not self.timed and self.should_stop()):
-                    super().render(scene, sensor=sensor, seed=launch.seed, spp=launch.spp, develop=True)
+                objects = self.prepare(scene)
+                self._controlled = self._with_control_variates(scene, objects, sensor, seed, spp)
+                try:
+                    for launch in launches(sensor, seed, spp, lambda: not self.timed and self.should_stop()):
+                        super().render(scene, sensor=sensor, seed=launch.seed, spp=launch.spp, develop=True)
+                finally:
+                    self._controlled = None
                 return sensor.film().develop() if develop else None
+
+        def _with_control_variates(
+            self, scene: mi.Scene, objects: list[TranslucentObject], sensor: mi.Sensor, seed: mi.UInt32 | int, spp: int
+        ) -> list[TranslucentObject] | None:
+            """The objects with light gathered as control variate, where that is asked for and pays."""
+            spp, pixels = spp or sensor.sampler().sample_count(), int(dr.prod(sensor.film().crop_size()))
+            if self._bodies.choices.light != "corrected":
+                return None
+            return self._control_variates.of(scene, objects, self.settings, int(mi.UInt32(seed)[0]), spp, pixels)
 
         def render_forward(self, scene: mi.Scene, *args: Any, **more: Any) -> mi.TensorXf:
             objects = self._differentiable(scene)
@@ -112,7 +128,8 @@ def _class(variant: str) -> type:
         ) -> tuple[mi.Spectrum, mi.Bool, list]:  # fmt: skip
             check_outermost(scene)
             with undisturbed(), dr.suspend_grad():
-                parts, hit = trace_paths(scene, self._prepared(scene), self.settings, sampler, ray, active)
+                objects = self._prepared(scene) if self._controlled is None else self._controlled
+                parts, hit = trace_paths(scene, objects, self.settings, sampler, ray, active)
             return parts[0] + parts[1], hit, []
 
         @property

@@ -75,19 +75,16 @@ class PathState:
 
 
 def trace_paths(
-    scene: mi.Scene,
-    objects: list[TranslucentObject],
-    settings: Settings,
-    sampler: mi.Sampler,
-    ray: mi.Ray3f,
-    active: mi.Bool,
-) -> tuple[tuple[mi.Spectrum, mi.Spectrum], mi.Bool]:
+    scene: mi.Scene, objects: list[TranslucentObject], settings: Settings, sampler: mi.Sampler, ray: mi.Ray3f,
+    active: mi.Bool, scattered: bool = False,
+) -> tuple[tuple[mi.Spectrum, mi.Spectrum], mi.Bool]:  # fmt: skip
     """Radiance along a camera ray in two parts for a replay, and whether the ray hits anything.
 
-    The second part is light of orders below two of the object that the ray meets first.
+    The second part is light of orders below two of the object that the ray meets first. `scattered` says whether the
+    ray is one of many that a vertex may have sent, as for a path that goes on.
     """
     context = RenderContext.of(scene, objects, settings, Primal())
-    L, _, hit = _loop(context, sampler, ray, (mi.Spectrum(0), mi.Spectrum(0)), (), active)
+    L, _, hit = _loop(context, sampler, ray, (mi.Spectrum(0), mi.Spectrum(0)), (), active, scattered)
     return L, hit
 
 
@@ -113,7 +110,7 @@ def replay_paths(
 
 def _loop(
     context: RenderContext, sampler: mi.Sampler, camera_ray: mi.Ray3f, L: tuple[mi.Spectrum, mi.Spectrum],
-    derivative: mi.Spectrum | tuple[()], active: mi.Bool,
+    derivative: mi.Spectrum | tuple[()], active: mi.Bool, scattered: bool = False,
 ) -> tuple[tuple[mi.Spectrum, mi.Spectrum], mi.Spectrum | tuple[()], mi.Bool]:  # fmt: skip
     """All vertices of a path, in one or two passes: L, its derivative, and whether the camera ray hits anything.
 
@@ -146,7 +143,7 @@ def _loop(
         throughput = dr.select(active, path.throughput * following.weight, path.throughput)
 
         # ---- Russian roulette by the throughput
-        largest = dr.max(throughput)
+        largest = dr.max(dr.abs(throughput))  # a control variate makes some negative
         active = active & (largest > 0)
         depth = dr.select(active, path.depth + 1, path.depth)
         survival = dr.select(depth >= settings.rr_depth, dr.minimum(largest, 0.95), 1.0)
@@ -163,7 +160,7 @@ def _loop(
             throughput=dr.select(again, mi.Spectrum(1), throughput),
             previous=dr.select(again, _camera_vertex(), following.previous),
             depth=dr.select(again, mi.UInt32(0), depth),
-            scattered=(path.scattered | following.scattered) & ~again,
+            scattered=((path.scattered | following.scattered) & ~again) | scattered,
             second_pass=path.second_pass | again,
             needs_second=needs_second,
             L_first=dr.select(again, tally.L, path.L_first),
@@ -172,7 +169,7 @@ def _loop(
         )
 
     start = PathState(
-        camera_ray, PathTally(L[0], derivative), mi.Spectrum(1), _camera_vertex(), mi.UInt32(0), mi.Bool(False),
+        camera_ray, PathTally(L[0], derivative), mi.Spectrum(1), _camera_vertex(), mi.UInt32(0), mi.Bool(scattered),
         mi.Bool(False), mi.Bool(False), mi.Spectrum(0), mi.Bool(False), mi.Bool(active),
     )  # fmt: skip
     with dr.suspend_grad():
@@ -292,7 +289,7 @@ def sample_event(
         if obj.transport is not None:
             more = inside & ~low
             out, face = choice.refracted.out, at.si.prim_index
-            events.append((more, partial(bssrdf_event, context, obj, out, face, sampler, more)))
+            events.append((more, partial(bssrdf_event, context, obj, out, face, sampler, at.others_only, more)))
         if obj.few:
             events.append((low, partial(low_order_event, context, obj, choice.refracted, sampler, at.scattered, low)))
     for mask, event in events:
@@ -401,16 +398,17 @@ def _add_sky_means(
 def _add_gathered(
     context: RenderContext, sampler: mi.Sampler, at: Vertex, tally: PathTally, choices: list
 ) -> PathTally:
-    """Adds what leaves each object by light that was gathered, see `gathering`."""
+    """Adds what leaves each object by light that was gathered, see `gathering` and `control_variate`."""
     for obj, here, choice in choices:
+        out = choice.refracted.out
+        if obj.control is not None:
+            light = obj.control.radiance(out, at.si.prim_index, here & at.others_only)
+            tally = context.mode.add(tally, at.throughput * light)
         if obj.gathered is None:
             continue
 
         def known(
-            tally: PathTally,
-            obj: TranslucentObject = obj,
-            here: mi.Bool = here,
-            out: SurfacePoint = choice.refracted.out,
+            tally: PathTally, obj: TranslucentObject = obj, here: mi.Bool = here, out: SurfacePoint = out
         ) -> tuple[PathTally]:
             return (context.mode.add(tally, at.throughput * obj.gathered.radiance(out, here)),)
 
@@ -554,13 +552,15 @@ def bssrdf_event(
     out: SurfacePoint,
     face: mi.UInt32,
     sampler: mi.Sampler,
+    first: mi.Bool,
     active: mi.Bool,
 ) -> tuple[NextVertex, mi.Spectrum]:
     """Light that entered elsewhere and leaves at `out` by the transport of the object.
 
-    Delta lights are its next-event estimation. c of `lighting.Sky` is taken off where `_add_sky_means` has added it.
+    Delta lights are its next-event estimation. c of `lighting.Sky` is taken off where `_add_sky_means` has added it,
+    and so is at the `first` vertex of a path what `_add_gathered` has added.
     """
-    entry = resample_entry(context, obj, out, face, sampler, active)
+    entry = resample_entry(context, obj, out, face, sampler, first, active)
     direct = mi.Spectrum(0)
     if context.uses_sky(obj):
         direct = -entry.weight * entry.sky_weight * context.sky_means(obj)[1]
@@ -595,12 +595,13 @@ class Candidate:
 
 
 class _ExitPoint(NamedTuple):
-    """An exit, its face, and what transport and proposals have made of it."""
+    """An exit, its face, and what transport, proposals and control variate have made of it."""
 
     out: SurfacePoint
     face: mi.UInt32
     transport: Any
     proposals: Any
+    control: Any
 
 
 def resample_entry(
@@ -609,6 +610,7 @@ def resample_entry(
     out: SurfacePoint,
     face: mi.UInt32,
     sampler: mi.Sampler,
+    first: mi.Bool,
     active: mi.Bool,
 ) -> Candidate:
     """One entry for light that leaves at `out`, by resampled importance sampling (Talbot, Cline and Egbert 2005).
@@ -619,7 +621,8 @@ def resample_entry(
     """
     with dr.suspend_grad():
         prepared = obj.transport.prepare(out, active)
-        exit_point = _ExitPoint(out, face, prepared, obj.proposals.prepare(out, prepared, active))
+        control = obj.control.transfer.row(out, face, active & first) if obj.control else None
+        exit_point = _ExitPoint(out, face, prepared, obj.proposals.prepare(out, prepared, active), control)
 
     def draw(by_emitter: mi.Bool | None = None) -> Candidate:
         return _draw_candidate(context, obj, exit_point, by_emitter, sampler, active)
@@ -682,7 +685,9 @@ def _draw_candidate(
         at_entry = entry.facing(d)
         mu_i = at_entry.mu
     S_mu = obj.transport.S(exit_point.transport, at_entry, active) * mu_i
+    if exit_point.control is not None:
+        S_mu -= obj.control.transfer.expected(exit_point.control, entry, d, active)
     weight = dr.select(active, S_mu * (entry.weight / dr.maximum(pdf, 1e-8)), 0)
-    target = dr.detach(dr.max(weight)) * brightness
+    target = dr.detach(dr.max(dr.abs(weight))) * brightness
     return Candidate(mi.Point3f(entry.p), mi.Normal3f(entry.n), d, weight, pdf, distance, delta, emitter_point, light,
                      target, by_emitter, sky_weight)  # fmt: skip

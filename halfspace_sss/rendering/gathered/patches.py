@@ -1,0 +1,214 @@
+"""What a model is expected to bring from each part of a surface to each other: a control variate of sampled entries.
+
+The surface is cut into the cells of its points: a place belongs to the point of the largest weight, see `points`; on a
+mesh of many faces all of a face does to that of its centroid. With the directional albedo a(mu) of the model, S mu_i
+is close to
+
+    h = a(w_o) T_jk a(w_i) mu_i / C,    C = ∫ a(mu) mu dw,    j the cell of x_o, k that of x_i,
+
+so that with the light Phi_k = ∫∫ a(w_i) mu_i / C L_i dw_i dA_i that enters each cell
+
+    L_o = a(w_o) Σ_k T_jk Phi_k + ∫∫ (S mu_i - h) L_i dw_i dA_i.
+
+The first term has no noise. The second has no bias whatever T is, as samples and Phi take the same function h.
+T is that of the least squares of S mu_i - h over the density of entries that the proposals draw, held to the mean of S
+between places in the cells where there are few.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, NamedTuple
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from halfspace_sss.rendering.gathered.points import SurfacePoints
+from halfspace_sss.rendering.gathered.transfer import Albedo, drawn
+from halfspace_sss.rendering.object.entries import AreaPoints
+from halfspace_sss.rendering.object.points import EntrySample, SurfacePoint, cosine_above, number, turned
+
+if TYPE_CHECKING:
+    from halfspace_sss.rendering.object.body import TranslucentObject
+
+__all__ = ["PatchTransfer", "TransferRow", "patch_transfer", "uniform_entries"]
+
+PER_LENGTH = 1.0  # points over a transport mean free path
+FEWEST, MOST = 1024, 2048  # points: 13 MB to 50 MB for three channels
+SAMPLES = 2**21  # entries of all points
+PLACES = 2**19  # by which the areas of cells are measured
+FACES = 4  # of a mesh for each cell, from which on none is divided
+PAIRS = 4  # of places for each pair of cells,
+HELD = 4  # which count as so many entries
+CENTROID = 5 / 9, 0.5  # of `square_to_uniform_triangle`
+
+
+class TransferRow(NamedTuple):
+    """The cell of an exit, and a(w_o); 0 where there is none."""
+
+    j: mi.UInt32
+    a: mi.Spectrum
+
+
+@dataclass(frozen=True, eq=False)
+class PatchTransfer:
+    """Of one object.
+
+    Args:
+        cells: of its surface.
+        T: (cells, cells, channels), from k to j, 1/(scene unit)².
+        albedo: a.
+        seen: share of the area whose light leaves at one exit: of uniform points so many tell of it.
+        moments: of S mu_i and h over the density of entries, means over the exits of E[S h], E[h²], E[S] E[h], E[h]²,
+            shape (4, channels).
+    """
+
+    cells: SurfaceCells
+    T: np.ndarray
+    albedo: Albedo
+    seen: float
+    moments: np.ndarray
+
+    def scaled_for(self, v: np.ndarray) -> PatchTransfer:
+        """With the factor that leaves the least variance in light of the relative variance v at an entry, per channel.
+
+        The variance is (1 + v) E[(S - beta h)²] - E[S - beta h]²: in even light entries by S itself are hard to better.
+        """
+        both, square, means, mean = self.moments
+        beta = ((1 + v) * both - means) / np.maximum((1 + v) * square - mean, 1e-30)
+        return replace(self, T=self.T * np.clip(beta, 0, 1).astype(np.float32))
+
+    @cached_property
+    def _lanes(self) -> mi.Float:
+        return mi.Float(self.T.ravel())
+
+    def row(self, out: SurfacePoint, face: mi.UInt32, active: mi.Bool) -> TransferRow:
+        """Of an exit on a face."""
+        mu = dr.dot(out.w, out.n_out)
+        active = active & (mu > 0)
+        j, found = self.cells(out.p, out.n, face, active)
+        return TransferRow(j, dr.select(active & found, self.albedo(dr.maximum(mu, 0)), 0))
+
+    def expected(self, row: TransferRow, entry: EntrySample, w_i: mi.Vector3f, active: mi.Bool) -> mi.Spectrum:
+        """h, 1/((scene unit)² sr)."""
+        k, found = self.cells(entry.p, entry.n, entry.face, active)
+        at = row.j * dr.opaque(mi.UInt32, len(self.cells.points)) + k
+        T = dr.gather(mi.Spectrum, self._lanes, at, active & found)
+        return row.a * T * self.albedo.cosine(w_i, entry.n, entry.n_out)
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceCells:
+    """Of the surface of an object.
+
+    Args:
+        points: in the middle of each.
+        of_face: of each face of a mesh of many, whether there is one, and which; None for others.
+    """
+
+    points: SurfacePoints
+    of_face: tuple[mi.Bool, mi.UInt32] | None
+
+    @classmethod
+    def of(cls, body: TranslucentObject, points: SurfacePoints) -> SurfaceCells:
+        """Those of points."""
+        n = body.geometry.shape.face_count() if body.geometry.shape.is_mesh() else 0
+        if n < FACES * len(points):
+            return cls(points, None)
+        face = dr.arange(mi.UInt32, n)
+        at = AreaPoints(body.geometry.shape).on_face(face, mi.Point2f(*CENTROID))
+        k, found = points.nearest(mi.Point3f(at.p), mi.Normal3f(at.n) * body.geometry.side(face), mi.Bool(True))
+        dr.eval(k, found)
+        return cls(points, (found, k))
+
+    def __call__(self, p: mi.Point3f, n: mi.Normal3f, face: mi.UInt32, active: mi.Bool) -> tuple[mi.UInt32, mi.Bool]:
+        """The cell of places with outward normals on faces, and whether there is one."""
+        if self.of_face is None:
+            return self.points.nearest(p, n, active)
+        found, k = self.of_face
+        return dr.gather(mi.UInt32, k, face, active), active & dr.gather(mi.Bool, found, face, active)
+
+
+def uniform_entries(body: TranslucentObject, u_face: mi.Float, u: mi.Point2f) -> EntrySample:
+    """Points uniform over the area of an object."""
+    at = AreaPoints(body.geometry.shape).sample(u_face, u, mi.Bool(True))
+    face = mi.UInt32(at.prim_index) + dr.zeros(mi.UInt32, dr.width(u))
+    sign = body.geometry.side(face)
+    n_out = mi.Normal3f(turned(mi.Normal3f(at.n_shading), mi.Normal3f(at.n))) * sign
+    n = mi.Normal3f(at.n) * sign
+    return EntrySample(mi.Point3f(at.p), n, mi.Normal3f(n_out), number(body.geometry.area), face)
+
+
+def patch_transfer(body: TranslucentObject, count: int | None = None, samples: int = SAMPLES) -> PatchTransfer:
+    """T of an object, estimated by entries that the proposals of its model draw for exits at all points."""
+    sigma = np.mean([float(m.sigma_t_prime) for m in body.media])
+    count = count or int(np.clip(body.geometry.area * (PER_LENGTH * sigma) ** 2, FEWEST, MOST))
+    points = SurfacePoints.of(body.geometry, count)
+    cells = SurfaceCells.of(body, points)
+    found = drawn(body, points, cells, max(samples // count, 16))
+    areas, places = _areas(body, cells)
+    pair = (np.arange(count)[:, None] * count + found.near)[found.known]
+    across = _evaluated(body, points, places, found.albedo)
+    n = np.bincount(pair, minlength=count**2).reshape(count, count)
+    T, moments = np.empty((count, count, found.S.shape[2]), dtype=np.float32), []
+    for c in range(T.shape[2]):
+        S, h = found.S[found.known, c], (found.a * found.h)[found.known, c]
+        both, square = (np.bincount(pair, x, count**2).reshape(count, count) for x in (S * h, h * h))
+        typical = found.a[:, :, c].mean(axis=1)[:, None] * areas  # h of a cell is drawn with its share of S
+        held = HELD * np.where(n > 0, square / np.maximum(n, 1), typical**2)
+        T[:, :, c] = (both + held * across[:, :, c]) / np.maximum(square + held, 1e-30)
+        expected = found.known * T[np.arange(count)[:, None], found.near, c] * found.a[:, :, c] * found.h[:, :, c]
+        S, S_j, h_j = found.S[:, :, c], found.S[:, :, c].mean(axis=1), expected.mean(axis=1)
+        moments.append([(S * expected).mean(), (expected**2).mean(), (S_j * h_j).mean(), (h_j**2).mean()])
+    flux = np.maximum(T.mean(axis=2) * areas, 0)
+    flux /= np.maximum(flux.sum(axis=1, keepdims=True), 1e-30)
+    seen = 1 / np.maximum((flux**2 / (areas / areas.sum())).sum(axis=1), 1.0)
+    return PatchTransfer(cells, T, found.albedo, float(np.median(seen)), np.array(moments, dtype=float).T)
+
+
+def _evaluated(body: TranslucentObject, points: SurfacePoints, places: EntrySample, albedo: Albedo) -> np.ndarray:
+    """T by S from places in all cells to the points, (points, points, channels)."""
+    count, n = len(points), dr.width(places.p) // len(points)
+    lane = dr.arange(mi.UInt32, count * n)
+    j, s = lane // n, lane % n
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(9, count * n)
+    out, _ = points.exit(j, sampler.next_2d())
+    active, size = mi.Bool(True), dr.size_v(mi.Spectrum)
+    prepared, a = body.transport.prepare(out, active), albedo(dr.dot(out.w, out.n_out))
+    values = dr.zeros(mi.Float, count * count * n * size)
+    dr.eval(out, values, prepared, a)
+
+    def step(k: mi.UInt32, sampler: mi.Sampler) -> tuple[mi.UInt32, mi.Sampler]:
+        entry = EntrySample(*(dr.gather(type(v), v, k * n + s) for v in places))
+        w, pdf = cosine_above(entry.n_out, entry.n, sampler.next_2d())
+        at_entry = entry.facing(w)
+        S = body.transport.S(prepared, at_entry, pdf > 0) * at_entry.mu / (dr.maximum(pdf, 1e-8) * dr.maximum(a, 1e-6))
+        at = ((j * count + k) * n + s) * size
+        for c in range(size):
+            dr.scatter(values, S[c], at + c)
+        return k + 1, sampler
+
+    dr.while_loop((mi.UInt32(0) + dr.zeros(mi.UInt32, count * n), sampler), lambda k, _: k < count, step, label="cells")
+    found = np.nan_to_num(np.array(values).reshape(count, count, n, size), nan=0.0, posinf=0.0)
+    return found.mean(axis=2)
+
+
+def _areas(body: TranslucentObject, cells: SurfaceCells) -> tuple[np.ndarray, EntrySample]:
+    """Of all cells, and `PAIRS` places in each; the middle of those without."""
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(5, PLACES)
+    at = uniform_entries(body, sampler.next_1d(), sampler.next_2d())
+    k, known = cells(at.p, at.n, at.face, mi.Bool(True))
+    k = np.where(np.array(known), np.array(k), len(cells.points))
+    counts = np.bincount(k, minlength=len(cells.points) + 1)[:-1]
+    order = np.argsort(k, kind="stable")
+    first = np.concatenate([[0], np.cumsum(counts)[:-1]])
+    chosen = first[:, None] + np.arange(PAIRS) % np.maximum(counts, 1)[:, None]
+    index = mi.UInt32(order[np.minimum(chosen, PLACES - 1)].ravel().astype(np.uint32))
+    at = at._replace(weight=at.weight + dr.zeros(mi.Float, PLACES))
+    places = EntrySample(*(dr.gather(type(v), v, index) for v in at))
+    dr.eval(places)
+    return np.maximum(counts, 0.5) * (body.geometry.area / PLACES), places

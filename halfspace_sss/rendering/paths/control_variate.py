@@ -1,0 +1,126 @@
+"""Light that enters the cells of an object, gathered for an image: a control variate of sampled entries.
+
+See `gathered.patches`. Phi is an unbiased estimate by points uniform over the object, each with an emitter sample and a
+direction by the cosine. It is drawn anew for each image, by its seed. Its noise is shared by neighbouring pixels; it
+falls as theirs does, by `PER_SAMPLE` points that an exit sees for each sample of a pixel. Where these take too large a
+share of all samples, as on small images of opaque media, there is no control variate.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from halfspace_sss.rendering.gathered.patches import PatchTransfer, patch_transfer, uniform_entries
+from halfspace_sss.rendering.object.points import SurfacePoint, number
+from halfspace_sss.rendering.paths.gathering import TRACED, GatheringPoint, by_cosine, by_emitters, spreads
+from halfspace_sss.rendering.paths.lighting import RenderContext
+from halfspace_sss.rendering.paths.path_tally import Primal
+
+if TYPE_CHECKING:
+    from halfspace_sss.rendering.object.body import TranslucentObject
+    from halfspace_sss.rendering.object.settings import Settings
+
+__all__ = ["ControlVariate", "ControlVariates"]
+
+FEWEST = 2**14  # points of an object at which light is gathered,
+PER_SAMPLE = 32  # of those that an exit sees, over the samples of a pixel: less noise than these leave,
+MOST_SHARE = 1 / 16  # of all samples,
+FIXED = 2**31 - 1  # a seed
+LEAST_PAYING = 0.1  # of the points that are wanted: with fewer there is no control variate
+
+
+@dataclass(frozen=True, eq=False)
+class ControlVariate:
+    """Of one object.
+
+    Args:
+        transfer: T.
+        known: Σ_k T_jk Phi_k of all cells j, channel by channel.
+    """
+
+    transfer: PatchTransfer
+    known: mi.Float
+
+    def radiance(self, out: SurfacePoint, face: mi.UInt32, active: mi.Bool) -> mi.Spectrum:
+        """a(w_o) Σ_k T_jk Phi_k of an exit on a face."""
+        row = self.transfer.row(out, face, active)
+        return row.a * dr.gather(mi.Spectrum, self.known, row.j, active)
+
+
+class ControlVariates:
+    """Those of the objects of a scene; transfers are kept until the objects change."""
+
+    def __init__(self) -> None:
+        self._bodies: list[TranslucentObject] = []
+        self._transfers: list[PatchTransfer | None] = []
+
+    def of(
+        self, scene: mi.Scene, bodies: list[TranslucentObject], settings: Settings, seed: int, spp: int, pixels: int
+    ) -> list[TranslucentObject]:
+        """The objects, each with its control variate where it can have one that pays.
+
+        Args:
+            scene, bodies, settings: what is rendered.
+            seed: of the points at which light is gathered.
+            spp, pixels: samples of a pixel, and pixels.
+        """
+        if len(bodies) != len(self._bodies) or any(a is not b for a, b in zip(bodies, self._bodies)):
+            self._transfers = [patch_transfer(body) if _applies(body) else None for body in bodies]
+            self._bodies = bodies
+        context, found = RenderContext.of(scene, bodies, settings, Primal()), []
+        for body, T in zip(bodies, self._transfers):
+            wanted = 0 if T is None else max(int(PER_SAMPLE * spp / T.seen), FEWEST)
+            count = int(min(wanted, MOST_SHARE * spp * pixels))
+            pays = T is not None and count > LEAST_PAYING * wanted
+            found.append(replace(body, control=_control(context, body, T, seed, count)) if pays else body)
+        return found
+
+
+def _applies(body: TranslucentObject) -> bool:
+    """Whether an object has one surface of known area whose entries are sampled everywhere."""
+    found = body.geometry
+    even = body.surface.inside.varying is None
+    return spreads(body) and found.closed and found.area > 0 and found.pieces is None and even
+
+
+def _control(
+    context: RenderContext, body: TranslucentObject, T: PatchTransfer, seed: int, count: int
+) -> ControlVariate:
+    T = T.scaled_for(_arriving(context, body, T, FIXED, FEWEST)[1])  # of light of its own: a factor must not follow Phi
+    leaving = np.einsum("jkc,ck->jc", T.T, _arriving(context, body, T, seed, count)[0])
+    return ControlVariate(T, mi.Float(leaving.astype(np.float32).ravel()))
+
+
+def _arriving(
+    context: RenderContext, body: TranslucentObject, T: PatchTransfer, seed: int, count: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Phi, (channels, cells), and the relative variance of light in a cell, per channel."""
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(int(np.random.SeedSequence([seed, 28]).generate_state(1)[0]), count)
+    entry = uniform_entries(body, sampler.next_1d(), sampler.next_2d())
+    k, known = T.cells(entry.p, entry.n, entry.face, mi.Bool(True))
+    at = GatheringPoint(entry.p, entry.n, entry.n_out)
+    aimed, _ = by_emitters(context.scene, T.albedo, at, sampler.next_2d())
+    # beside each other, as lanes that wait cost as much
+    traced = dr.arange(mi.UInt32, count) < dr.opaque(mi.UInt32, count // TRACED)
+    met, more, a, _ = by_cosine(
+        context.scene, context.objects, T.albedo, context.settings, at, sampler.next_2d(), traced, sampler
+    )
+    light = aimed + met + number(count / (count // TRACED)) * more
+    if context.uses_sky(body):
+        light -= a * context.sky_means(body)[1]
+    light = mi.Spectrum(light)
+    dr.eval(light, k, known)
+    k, known, rows = np.array(k), np.array(known), np.array(light, dtype=float)
+    k, rows, cells, Phi, v = k[known], rows[:, known], len(T.cells.points), [], []
+    points = np.maximum(np.bincount(k, minlength=cells), 1)
+    for row, whole in zip(rows, T.albedo.whole):
+        total = np.bincount(k, row, cells)
+        Phi.append(total * (body.geometry.area / count / whole))
+        v.append(max((row**2).sum() / max((total**2 / points).sum(), 1e-30) - 1, 0))
+    return np.stack(Phi), np.array(v)
