@@ -16,9 +16,8 @@ from full_geometry.object.patches import AREA_SHARE, LearntProposals, PatchTable
 from full_geometry.object.subject import Subject, check_surface
 from halfspace_sss.neural.store import checksum_of, load_weights
 from halfspace_sss.physics.medium import Medium
-from halfspace_sss.rendering.object.entries import AreaPoints, PositionSampler, RadialTable
 from halfspace_sss.rendering.object.half_space import HalfSpaceProposals, area_share
-from halfspace_sss.rendering.object.points import ObjectModel
+from halfspace_sss.rendering.object.points import AreaPoints, ObjectModel, PositionSampler, RadialTable
 from halfspace_sss.rendering.object.settings import AUTOMATIC, Settings
 from halfspace_sss.rendering.object.shape import Geometry
 from halfspace_sss.rendering.object.translucent import Inside, is_translucent

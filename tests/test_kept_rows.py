@@ -62,7 +62,7 @@ def test_an_ablation_goes_on_after_the_trainings_that_it_has_finished(tmp_path: 
     from halfspace_sss import materials
     from halfspace_sss.maps.noisy_maps import CellGrid
     from halfspace_sss.neural.training import ablation as module
-    from halfspace_sss.neural.training.schedules import Fit, Samples
+    from halfspace_sss.neural.training.fit import Fit, Samples
     from halfspace_sss.neural.training.train_material import MaterialRecipe
 
     monkeypatch.setattr(module, "SETS", 1)

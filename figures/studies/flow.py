@@ -16,8 +16,7 @@ from full_geometry.object.features import ObjectFrame, PreparedExit, Side
 from full_geometry.object.patches import Patches, PatchSampler, PatchTable, PatchWeights, mesh_faces
 from full_geometry.object.subject import Subject
 from halfspace_sss.neural.perceptron import Perceptron, relu
-from halfspace_sss.rendering.object.entries import Point
-from halfspace_sss.rendering.object.points import CosineProposals, EntrySample, SurfacePoint, number, turned
+from halfspace_sss.rendering.object.points import CosineProposals, EntrySample, Point, SurfacePoint, number, turned
 
 # ---- The square [0, 1)² laid onto each patch of a surface, so that equal areas stay equal ----------
 # A patch has two axes, the principal ones of its faces. Along the first its faces are put together to strips; u_1

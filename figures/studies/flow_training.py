@@ -33,8 +33,7 @@ from full_geometry.object.patches import Patches, PatchSampler
 from full_geometry.object.subject import Subject
 from full_geometry.object.walks import trace_exits
 from halfspace_sss.checks import check_count
-from halfspace_sss.neural.training.fit import Objective, Source, fit
-from halfspace_sss.neural.training.schedules import CpuSchedule
+from halfspace_sss.neural.training.fit import CpuSchedule, Objective, Source, fit
 from halfspace_sss.rendering.object.points import EntrySample, cosine_above, number, place
 from halfspace_sss.tracing.walk import generator, pass_seed
 

@@ -25,8 +25,7 @@ from full_geometry.object.walks import trace_exits
 from halfspace_sss.checks import check_choice, check_count, check_interval
 from halfspace_sss.neural.store import load_weights, save_weights
 from halfspace_sss.neural.trained import check_weights_folder, weights_folder
-from halfspace_sss.neural.training.fit import ADAM, Descent, Objective, Source, fit
-from halfspace_sss.neural.training.schedules import CpuSchedule
+from halfspace_sss.neural.training.fit import ADAM, CpuSchedule, Descent, Objective, Source, fit
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.provenance import provenance
 from halfspace_sss.rendering.object.points import SurfacePoint

@@ -29,11 +29,12 @@ from full_geometry.object.radiance import reference
 from full_geometry.object.subject import Subject
 from halfspace_sss.backend import kernel_seconds
 from halfspace_sss.neural.store import load_weights
-from halfspace_sss.rendering.object.entries import PositionSampler, RadialTable
 from halfspace_sss.rendering.object.half_space import HalfSpaceProposals
 from halfspace_sss.rendering.object.points import (
     ObjectModel,
+    PositionSampler,
     Proposals,
+    RadialTable,
     SurfacePoint,
     cosine_above,
     lifted,

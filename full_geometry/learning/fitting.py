@@ -20,8 +20,7 @@ from full_geometry.object.patches import Patches
 from halfspace_sss.checks import check_choice, check_count, check_interval
 from halfspace_sss.interface.model import models
 from halfspace_sss.neural.training import checkpoint
-from halfspace_sss.neural.training.fit import Descent, torch_threads
-from halfspace_sss.neural.training.schedules import cosine, warm_up
+from halfspace_sss.neural.training.fit import Descent, cosine, torch_threads, warm_up
 
 # ---- Where networks are fitted: beside the walks that are their data -------------------------------
 

@@ -21,8 +21,7 @@ from full_geometry.models.neural_shape import ALBEDO, ETA, KIND, LEAST, PLACE_OF
 from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.neural.store import save_weights, to_json
 from halfspace_sss.neural.training import checkpoint
-from halfspace_sss.neural.training.fit import Descent
-from halfspace_sss.neural.training.schedules import cosine, warm_up
+from halfspace_sss.neural.training.fit import Descent, cosine, warm_up
 from halfspace_sss.neural.training.work_folder import CHECKPOINT, claim
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.provenance import check_folder, provenance, write_atomically

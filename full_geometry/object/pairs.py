@@ -14,8 +14,7 @@ from full_geometry.object.first_event import first_event
 from full_geometry.object.patches import AREA_SHARE, ExitTable, LearntProposals, PatchSampler
 from full_geometry.object.subject import Subject, cosine_direction
 from full_geometry.object.walks import WalkEnds, trace_exits
-from halfspace_sss.rendering.object.entries import PositionSampler, RadialTable
-from halfspace_sss.rendering.object.points import SurfacePoint, channel_mean, number
+from halfspace_sss.rendering.object.points import PositionSampler, RadialTable, SurfacePoint, channel_mean, number
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 PATCH_SHARE = 0.6  # of those by patches, where they are learnt

@@ -24,8 +24,15 @@ from full_geometry.object.features import ObjectFrame, PreparedExit, Side, side_
 from full_geometry.object.first_event import first_event
 from full_geometry.object.subject import Subject, cosine_direction, surface_point
 from halfspace_sss.neural.perceptron import Perceptron
-from halfspace_sss.rendering.object.entries import Point, PositionSampler
-from halfspace_sss.rendering.object.points import CosineProposals, EntrySample, SurfacePoint, number, turned
+from halfspace_sss.rendering.object.points import (
+    CosineProposals,
+    EntrySample,
+    Point,
+    PositionSampler,
+    SurfacePoint,
+    number,
+    turned,
+)
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 PATCHES = 512

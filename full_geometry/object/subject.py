@@ -13,12 +13,10 @@ import numpy as np
 
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.object.body import check_size
-from halfspace_sss.rendering.object.boundary import smooth_boundary
-from halfspace_sss.rendering.object.entries import AreaPoints
 from halfspace_sss.rendering.object.placement import check_empty
-from halfspace_sss.rendering.object.points import SurfacePoint, cosine_above, lifted, number, turned
+from halfspace_sss.rendering.object.points import AreaPoints, SurfacePoint, cosine_above, lifted, number, turned
 from halfspace_sss.rendering.object.shape import Geometry, name_of, survey
-from halfspace_sss.rendering.object.translucent import Inside, is_translucent
+from halfspace_sss.rendering.object.translucent import Inside, is_translucent, smooth_boundary
 from halfspace_sss.rendering.object.varying import VaryingMedium, equivalent, grid_values
 from halfspace_sss.rendering.scenes.scene_files import millimetres
 from halfspace_sss.rendering.walk.media import WalkMedia

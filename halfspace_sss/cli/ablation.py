@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     import pandas
     from rich.table import Table
 
-    from halfspace_sss.neural.training.schedules import Budget
+    from halfspace_sss.neural.training.fit import Budget
     from halfspace_sss.physics.medium import Medium
 
 __all__ = ["ablation_command"]
@@ -107,7 +107,7 @@ def _medium(name: str | None, channel: str | None, given: dict[str, float | None
 
 
 def _budgets(seconds: float | None, samples: int | None) -> Sequence[Budget]:
-    from halfspace_sss.neural.training.schedules import Samples, Seconds
+    from halfspace_sss.neural.training.fit import Samples, Seconds
 
     given = [Seconds(seconds)] if seconds is not None else []
     return [*given, Samples(samples)] if samples is not None else given

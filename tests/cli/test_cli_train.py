@@ -18,7 +18,7 @@ from halfspace_sss.materials import registry
 from halfspace_sss.neural import material_model, paper_model, trained
 from halfspace_sss.neural.store import load_weights
 from halfspace_sss.neural.training import train_material, train_universal
-from halfspace_sss.neural.training.schedules import Fit
+from halfspace_sss.neural.training.fit import Fit
 from halfspace_sss.neural.training.train_material import MaterialRecipe
 from halfspace_sss.neural.training.train_universal import UniversalRecipe
 

@@ -24,8 +24,12 @@ from full_geometry.learning.model_errors import LIGHTS  # noqa: E402
 from full_geometry.learning.training import Trained, train  # noqa: E402
 from halfspace_sss import Medium, rendering  # noqa: E402
 from halfspace_sss.neural.trained import ENVIRONMENT_VARIABLE  # noqa: E402
-from halfspace_sss.rendering.object.entries import AreaPoints  # noqa: E402
-from halfspace_sss.rendering.object.points import EntrySample, place, turned  # noqa: E402
+from halfspace_sss.rendering.object.points import (  # noqa: E402
+    AreaPoints,  # noqa: E402
+    EntrySample,
+    place,
+    turned,
+)
 from halfspace_sss.rendering.paths.path_loop import exit_at  # noqa: E402
 from halfspace_sss.rendering.scenes.scene_files import load_scene  # noqa: E402
 

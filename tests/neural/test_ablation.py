@@ -34,9 +34,8 @@ from halfspace_sss.neural.training.ablation import (
     model_of,
     summary,
 )
-from halfspace_sss.neural.training.fit import fit
+from halfspace_sss.neural.training.fit import Fit, Samples, Seconds, Within, fit
 from halfspace_sss.neural.training.pool import MapPool
-from halfspace_sss.neural.training.schedules import Fit, Samples, Seconds, Within
 from halfspace_sss.neural.training.train_material import MaterialRecipe
 
 FIG10 = materials.load("fig10").medium

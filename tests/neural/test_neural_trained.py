@@ -16,7 +16,7 @@ from halfspace_sss.maps import noisy_maps
 from halfspace_sss.maps.noisy_maps import CellGrid
 from halfspace_sss.neural import material_model, paper_model, trained
 from halfspace_sss.neural.store import load_weights
-from halfspace_sss.neural.training.schedules import Fit
+from halfspace_sss.neural.training.fit import Fit
 from halfspace_sss.neural.training.train_material import MaterialRecipe, TrainedChannel, train
 from halfspace_sss.neural.training.train_universal import UniversalRecipe, train_universal
 

@@ -20,10 +20,9 @@ from halfspace_sss.comparison.model_errors import TracedMaps, model_error, refer
 from halfspace_sss.maps.grid import draw_media
 from halfspace_sss.maps.noisy_maps import CellGrid, draw_directions, make_pool
 from halfspace_sss.neural.hypernetwork import Hypernetwork
-from halfspace_sss.neural.training.fit import Source, fit
+from halfspace_sss.neural.training.fit import Fit, Source, fit
 from halfspace_sss.neural.training.learners import Hyper, PaperLearner, Small
 from halfspace_sss.neural.training.pool import MapPool
-from halfspace_sss.neural.training.schedules import Fit
 from halfspace_sss.neural.training.train_material import (
     MaterialRecipe,
     MaterialSubject,

@@ -10,7 +10,7 @@ import pytest
 mi = pytest.importorskip("mitsuba")
 import drjit as dr  # noqa: E402
 
-from halfspace_sss.rendering.object.boundary import is_smooth_boundary, smooth_boundary  # noqa: E402
+from halfspace_sss.rendering.object.translucent import is_smooth_boundary, smooth_boundary  # noqa: E402
 from halfspace_sss.rendering.scenes.mitsuba_scene import with_media  # noqa: E402
 
 N, BOTH = 4000, 0xFFFFFFFF

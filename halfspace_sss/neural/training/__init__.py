@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from halfspace_sss.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from halfspace_sss.neural.training.schedules import Fit
+    from halfspace_sss.neural.training.fit import Fit
     from halfspace_sss.neural.training.train_material import FAST, STANDARD, MaterialRecipe, train
     from halfspace_sss.neural.training.train_universal import UniversalRecipe, train_universal
 
@@ -15,4 +15,4 @@ __all__ = ["FAST", "STANDARD", "Fit", "MaterialRecipe", "UniversalRecipe", "trai
 
 _MATERIAL = dict.fromkeys(("FAST", "STANDARD", "MaterialRecipe", "train"), "train_material")
 _UNIVERSAL = dict.fromkeys(("UniversalRecipe", "train_universal"), "train_universal")
-__getattr__, __dir__ = lazy_names(__name__, {"Fit": "schedules", **_MATERIAL, **_UNIVERSAL})
+__getattr__, __dir__ = lazy_names(__name__, {"Fit": "fit", **_MATERIAL, **_UNIVERSAL})

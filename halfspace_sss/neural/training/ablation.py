@@ -24,10 +24,9 @@ from halfspace_sss.neural.features import N_FEATURES
 from halfspace_sss.neural.hypernetwork import in_range
 from halfspace_sss.neural.network import RELU, SILU, Network, layer_shapes
 from halfspace_sss.neural.paper_model import N_INPUTS, T_SMALLEST, NeuralPaper, query_inputs
-from halfspace_sss.neural.training.fit import fit
+from halfspace_sss.neural.training.fit import Budget, Fit, Samples, Seconds, Within, fit
 from halfspace_sss.neural.training.learners import PaperLearner, apply_networks, initial_numbers, relative_loss
 from halfspace_sss.neural.training.pool import Batch, MapPool
-from halfspace_sss.neural.training.schedules import Budget, Fit, Samples, Seconds, Within
 from halfspace_sss.neural.training.train_material import (
     BLOCK,
     STANDARD,

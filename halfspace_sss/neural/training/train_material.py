@@ -24,10 +24,9 @@ from halfspace_sss.neural.paper_model import NeuralPaper
 from halfspace_sss.neural.store import save_weights
 from halfspace_sss.neural.symmetric import SymmetricModel, channels
 from halfspace_sss.neural.trained import check_weights_folder, weights_folder, weights_name
-from halfspace_sss.neural.training.fit import fit
+from halfspace_sss.neural.training.fit import Fit, fit
 from halfspace_sss.neural.training.learners import PaperLearner, Small
 from halfspace_sss.neural.training.pool import MapPool
-from halfspace_sss.neural.training.schedules import Fit
 from halfspace_sss.neural.training.work_folder import CHECKPOINT, claim
 from halfspace_sss.neural.universal import load_hypernetwork, shipped_weights
 from halfspace_sss.physics.medium import Medium

@@ -27,10 +27,9 @@ from halfspace_sss.maps.noisy_maps import CellGrid, draw_directions, load_maps, 
 from halfspace_sss.neural.features import N_MEDIUM, medium_features
 from halfspace_sss.neural.hypernetwork import N_TERMS, Hypernetwork, Layers, chebyshev, named_layers
 from halfspace_sss.neural.store import save_weights
-from halfspace_sss.neural.training.fit import fit
+from halfspace_sss.neural.training.fit import Fit, fit
 from halfspace_sss.neural.training.learners import Hyper
 from halfspace_sss.neural.training.pool import MapPool, torch_library
-from halfspace_sss.neural.training.schedules import Fit
 from halfspace_sss.neural.training.train_material import Trial
 from halfspace_sss.neural.training.work_folder import CHECKPOINT, claim
 from halfspace_sss.neural.universal import hypernetwork_of

@@ -17,8 +17,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from halfspace_sss.rendering.object.entries import AreaPoints
-from halfspace_sss.rendering.object.points import SurfacePoint, cosine_above, lifted, number, turned
+from halfspace_sss.rendering.object.points import AreaPoints, SurfacePoint, cosine_above, lifted, number, turned
 from halfspace_sss.rendering.object.shape import Geometry
 
 if TYPE_CHECKING:

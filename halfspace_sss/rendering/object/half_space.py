@@ -11,10 +11,12 @@ import numpy as np
 
 from halfspace_sss.interface.model import BSSRDF, bssrdf
 from halfspace_sss.physics.medium import Medium
-from halfspace_sss.rendering.object.entries import AreaPoints, PositionSampler, RadialTable
 from halfspace_sss.rendering.object.points import (
+    AreaPoints,
     EntrySample,
     ObjectModel,
+    PositionSampler,
+    RadialTable,
     SurfacePoint,
     local_frame,
     number,

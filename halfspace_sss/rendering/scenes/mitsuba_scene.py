@@ -12,7 +12,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from halfspace_sss.rendering.object.boundary import is_smooth_boundary
+from halfspace_sss.rendering.object.translucent import is_smooth_boundary
 
 __all__ = ["with_media"]
 
