@@ -27,8 +27,7 @@ import numpy as np
 
 from halfspace_sss.rendering.gathered.points import SurfacePoints
 from halfspace_sss.rendering.gathered.transfer import Albedo, drawn
-from halfspace_sss.rendering.object.entries import AreaPoints
-from halfspace_sss.rendering.object.points import EntrySample, SurfacePoint, cosine_above, number, turned
+from halfspace_sss.rendering.object.points import AreaPoints, EntrySample, SurfacePoint, cosine_above, number, turned
 
 if TYPE_CHECKING:
     from halfspace_sss.rendering.object.body import TranslucentObject
