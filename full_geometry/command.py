@@ -13,8 +13,7 @@ from full_geometry.models.storing import KIND, find_weights, trained
 from full_geometry.object.subject import Subject
 from halfspace_sss.checks import check_count
 from halfspace_sss.interface.model import models as half_space_models
-from halfspace_sss.neural.store import load_weights
-from halfspace_sss.neural.trained import check_weights_folder
+from halfspace_sss.neural.store import check_weights_folder, load_weights
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.rendering.object.registry import model_names
 from halfspace_sss.rendering.object.translucent import is_translucent

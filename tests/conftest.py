@@ -18,7 +18,7 @@ import pytest
 
 import halfspace_sss
 from halfspace_sss.materials import registry
-from halfspace_sss.neural import material_model, paper_model, trained
+from halfspace_sss.neural import material_model, paper_model, store
 from halfspace_sss.neural.features import N_FEATURES
 from halfspace_sss.neural.network import layer_shapes
 from halfspace_sss.neural.store import save_weights
@@ -36,13 +36,13 @@ def stand_ins(tmp_path_factory: pytest.TempPathFactory):
     inputs = {material_model.KIND: (N_FEATURES, 32), paper_model.KIND: (paper_model.N_INPUTS, 256)}
 
     def find(kind: str, medium: halfspace_sss.Medium) -> Path:
-        path = folder / trained.weights_name(kind, medium)
+        path = folder / store.weights_name(kind, medium)
         if not path.exists():
             rng, arrays = np.random.default_rng(7), {}
             for k, shape in enumerate(layer_shapes(inputs[kind][0], inputs[kind][1], 3)):
                 arrays[f"W_{k}"] = (rng.standard_normal(shape) / np.sqrt(shape[0])).astype(np.float32)
                 arrays[f"b_{k}"] = (0.1 * rng.standard_normal(shape[1])).astype(np.float32)
-            ratios = {key: float(getattr(medium, key)) for key in trained.RATIOS}
+            ratios = {key: float(getattr(medium, key)) for key in store.RATIOS}
             record = {"width": inputs[kind][1], "depth": 3, "scale": float(medium.albedo) ** 2, "medium": ratios}
             save_weights(path, kind, arrays, record)
         return path

@@ -74,7 +74,7 @@ def _sample(folder: Path) -> Callable[[], Any]:
     """One camera sample of an object that has been learnt, from the camera ray on: models are made before."""
     import mitsuba as mi
 
-    from halfspace_sss.neural.trained import ENVIRONMENT_VARIABLE
+    from halfspace_sss.neural.store import ENVIRONMENT_VARIABLE
 
     scene = _scene("full_geometry")
     _learn(scene, folder, 0)

@@ -15,8 +15,8 @@ from figures.modelling.candle import make_candle
 from figures.modelling.objects import candle_parts, learnable_parts, make_varying, tissue
 from figures.parts.part import Part, Result, Task
 from halfspace_sss import bssrdf, materials, models
+from halfspace_sss.neural.store import ENVIRONMENT_VARIABLE
 from halfspace_sss.neural.symmetric import channels
-from halfspace_sss.neural.trained import ENVIRONMENT_VARIABLE
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.provenance import check_folder
 

@@ -24,7 +24,7 @@ import numpy as np
 
 from figures import figure_modules
 from halfspace_sss.checks import check_choice, check_interval
-from halfspace_sss.interface.model_lists import no_models
+from halfspace_sss.interface.model import no_models
 from halfspace_sss.progress import Progress
 from halfspace_sss.rendering.object.registry import learnt_names, lookup, model_names
 

@@ -23,8 +23,7 @@ from full_geometry.object.radiance import LOBES, POWER, ExitRadiance, ExitTruth,
 from full_geometry.object.subject import Subject
 from full_geometry.object.walks import trace_exits
 from halfspace_sss.checks import check_choice, check_count, check_interval
-from halfspace_sss.neural.store import load_weights, save_weights
-from halfspace_sss.neural.trained import check_weights_folder, weights_folder
+from halfspace_sss.neural.store import check_weights_folder, load_weights, save_weights, weights_folder
 from halfspace_sss.neural.training.fit import ADAM, CpuSchedule, Descent, Objective, Source, fit
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.provenance import provenance

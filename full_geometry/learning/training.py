@@ -29,8 +29,7 @@ from full_geometry.object.subject import Subject
 from full_geometry.object.walks import WalkEnds
 from halfspace_sss.backend import busy_threads
 from halfspace_sss.checks import check_count, check_interval
-from halfspace_sss.neural.store import to_json
-from halfspace_sss.neural.trained import check_weights_folder
+from halfspace_sss.neural.store import check_weights_folder, to_json
 from halfspace_sss.neural.training.work_folder import CHECKPOINT, claim
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.provenance import check_folder, provenance, write_atomically

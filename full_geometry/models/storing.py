@@ -18,8 +18,7 @@ from full_geometry.object.identity import Identity, frame_of, identify
 from full_geometry.object.patches import Patches, PatchSampler
 from full_geometry.object.subject import Subject
 from halfspace_sss.interface.model import bssrdf
-from halfspace_sss.neural.store import load_weights, save_weights
-from halfspace_sss.neural.trained import weights_folder
+from halfspace_sss.neural.store import load_weights, save_weights, weights_folder
 
 KIND = "full_geometry"
 CHECKSUMS = "start_checksums"  # of a record

@@ -123,7 +123,7 @@ def _unfinished(file: Path) -> Path:
 def _rendered(scene: Any, file: Path, limits: Limits, which: dict[str, int], resume: bool) -> Reference:
     """The render, in files of another name until it is done."""
     from halfspace_sss.rendering.scenes import online
-    from halfspace_sss.rendering.scenes.causes import first_cause
+    from halfspace_sss.rendering.scenes.scene_files import first_cause
 
     part, bars = _unfinished(file), _Bars(limits)
     begun = any(path.exists() for path in (part, *online.files(part).values()))

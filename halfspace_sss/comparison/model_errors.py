@@ -21,8 +21,7 @@ from halfspace_sss.maps.noisy_maps import LEAST_ALBEDO, CellGrid, Groups, make_p
 from halfspace_sss.noise_free import NoiseFree
 from halfspace_sss.physics.backbone import unwarp
 from halfspace_sss.physics.fresnel import F_t, mu_internal
-from halfspace_sss.physics.medium import Medium
-from halfspace_sss.physics.phase import eval_hg
+from halfspace_sss.physics.medium import Medium, eval_hg
 from halfspace_sss.progress import NamedProgress
 
 if TYPE_CHECKING:

@@ -1,29 +1,101 @@
-"""The one interface of all half-space models, with sampling of distances and derivatives in blocks; models by name."""
+"""The one interface of all half-space models: the query, sampling of distances, derivatives in blocks, models by name.
+
+Lists of model classes that installed packages offer are taken each as a whole, or left out with a warning.
+"""
 
 from __future__ import annotations
 
 import abc
 import functools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from halfspace_sss.arrays import broadcast_query
 from halfspace_sss.checks import check_choice, check_query
-from halfspace_sss.extensions import TRANSPORTS, offers
-from halfspace_sss.interface.model_lists import check_allowed, check_model_class, listed_models
-from halfspace_sss.interface.query import Query
+from halfspace_sss.extensions import FAILURES, MODELS, TRANSPORTS, offered, offers, warn_left_out
 from halfspace_sss.lazy import once
-from halfspace_sss.physics.fresnel import C_phi, F_t
+from halfspace_sss.physics.fresnel import C_phi, F_t, mu_internal
 from halfspace_sss.physics.layers import Layers
 from halfspace_sss.physics.medium import Medium, medium_of
 
 __all__ = [
-    "BSSRDF", "DirectionSample", "PositionSample", "RadialSampler", "Separable", "bssrdf", "exit_normaliser",
-    "model_class", "models", "recorded_in_blocks", "register_model",
-]  # fmt: skip
+    "BSSRDF",
+    "DirectionSample",
+    "PositionSample",
+    "Query",
+    "RadialSampler",
+    "Separable",
+    "bssrdf",
+    "check_allowed",
+    "exit_normaliser",
+    "model_class",
+    "models",
+    "no_models",
+    "recorded_in_blocks",
+    "register_model",
+]
+
+
+@dataclass(frozen=True)
+class Query:
+    """A half-space query in mean free paths, with refracted cosines, in one array library.
+
+    The refracted directions of travel, in a frame whose x axis points from x_i to x_o and z outwards, are
+    w_12 = (-sin_i cos phi_i, -sin_i sin phi_i, -mu_i_in) and w_21 = (sin_o cos phi_o, sin_o sin phi_o, mu_o_in).
+    """
+
+    lib: Any
+    r: Any
+    mu_i: Any
+    phi_i: Any
+    mu_o: Any
+    phi_o: Any
+    eta: float
+    r_mm: Any = None
+    sigma_t: Any = None  # r = sigma_t r_mm, kept so that `in_float64` does not inherit the rounding of r
+
+    @functools.cached_property
+    def index(self) -> Any:
+        """eta as a constant; matched media, which are answered without Fresnel's equations, keep the number 1."""
+        return self.constant(self.eta) if isinstance(self.eta, (int, float)) and self.eta != 1 else self.eta
+
+    @functools.cached_property
+    def mu_i_in(self) -> Any:
+        return mu_internal(self.mu_i, self.index)
+
+    @functools.cached_property
+    def mu_o_in(self) -> Any:
+        return mu_internal(self.mu_o, self.index)
+
+    @functools.cached_property
+    def sin_i(self) -> Any:
+        """Sine of the refracted angle, sqrt(1 - mu_i²)/eta, at most 1."""
+        return self._sine(self.mu_i)
+
+    @functools.cached_property
+    def sin_o(self) -> Any:
+        return self._sine(self.mu_o)
+
+    def _sine(self, mu: Any) -> Any:
+        lib = self.lib
+        return lib.minimum(lib.sqrt(lib.maximum((1 - mu) * (1 + mu), 0.0)) / self.index, 1.0)
+
+    def constant(self, value: Any) -> Any:
+        """A constant of the model (number, or one per channel) in the library and precision of the query."""
+        return self.lib.constant(value, self.r)
+
+    def in_float64(self) -> Query:
+        """The same query in float64, for formulas whose terms cancel."""
+        f = self.lib.float64
+        r = f(self.r) if self.r_mm is None else f(self.r_mm)
+        if self.r_mm is not None:
+            r = self.lib.constant(self.sigma_t, r) * r
+        return Query(self.lib, r, f(self.mu_i), f(self.phi_i), f(self.mu_o), f(self.phi_o), self.eta)
 
 
 BLOCK_BYTES = 1 << 27  # that torch keeps of one block
@@ -446,3 +518,54 @@ class Separable(BSSRDF):
 
     def G(self, q: Query) -> Any:
         return self.R_d(q) / q.constant(math.pi * self.N)
+
+
+_closed_for: list[str] = []
+
+
+def check_model_class(cls: Any, base: type) -> None:
+    """ValueError if it is no class of a model, or has no usable name or orders."""
+    if not (isinstance(cls, type) and issubclass(cls, base)):
+        raise ValueError(f"a model must be a subclass of {base.__name__}, got {cls!r}")
+    name, orders = getattr(cls, "name", None), getattr(cls, "orders", None)
+    if not isinstance(name, str) or not name:
+        raise ValueError(f"name of a model must be a text that is not empty, got {name!r}")
+    if orders not in ("multiple", "total"):
+        raise ValueError(f"orders of a model must be multiple or total, got {orders!r}")
+
+
+@contextmanager
+def no_models(who: str) -> Iterator[None]:
+    """Within it, in every thread, asking for a model by its name is an error: `who` is known to need none."""
+    _closed_for.append(who)
+    try:
+        yield
+    finally:
+        _closed_for.pop()
+
+
+def check_allowed(name: str) -> None:
+    """RuntimeError within `no_models`."""
+    if _closed_for:
+        raise RuntimeError(f"{_closed_for[-1]} is declared to find no model by name, and asks for {name!r}")
+
+
+def listed_models(base: type) -> dict[str, type]:
+    """The model classes of all lists by name, those of this project first."""
+    found: dict[str, type] = {}
+    for name, classes in offered(MODELS):
+        try:
+            found |= _new_models(classes, base, found)
+        except FAILURES as error:
+            warn_left_out(MODELS, name, error)
+    return found
+
+
+def _new_models(classes: Any, base: type, known: Collection[str]) -> dict[str, type]:
+    new: dict[str, type] = {}
+    for cls in classes:
+        check_model_class(cls, base)
+        if cls.name in known or cls.name in new:
+            raise ValueError(f"model name must be new, got {cls.name!r}, which is registered already")
+        new[cls.name] = cls
+    return new

@@ -16,8 +16,7 @@ from halfspace_sss.backend import array_types
 from halfspace_sss.maps.grid import MapGrid, cell_edges, map_directions, radial_scale
 from halfspace_sss.physics.backbone import warp
 from halfspace_sss.physics.fresnel import F_t, mu_internal
-from halfspace_sss.physics.medium import Medium
-from halfspace_sss.physics.phase import eval_hg
+from halfspace_sss.physics.medium import Medium, eval_hg
 from halfspace_sss.tracing.passes import PATHS_PER_LANE
 from halfspace_sss.tracing.tallies import CellSums
 from halfspace_sss.tracing.walk import Boundary, Scatter, pass_seed, walk

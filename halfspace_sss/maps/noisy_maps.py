@@ -21,7 +21,7 @@ from halfspace_sss.backend import array_types
 from halfspace_sss.checks import check_count
 from halfspace_sss.maps.map_tracing import GROUP, MapTally
 from halfspace_sss.physics.backbone import U_MAX, backbone, length_scale, unwarp, warp
-from halfspace_sss.physics.phase import eval_hg
+from halfspace_sss.physics.medium import eval_hg
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.provenance import write_atomically
 from halfspace_sss.tracing.tallies import CellSums

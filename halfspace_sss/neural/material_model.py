@@ -8,9 +8,8 @@ import numpy as np
 
 from halfspace_sss.neural.features import N_FEATURES
 from halfspace_sss.neural.network import SILU, Activation, Network, layer_shapes
-from halfspace_sss.neural.store import load_weights, record_count
+from halfspace_sss.neural.store import check_medium, find_weights, load_weights, record_count
 from halfspace_sss.neural.symmetric import SymmetricModel, channels
-from halfspace_sss.neural.trained import check_medium, find_weights
 from halfspace_sss.physics.medium import Medium
 
 __all__ = ["KIND", "NeuralMaterial", "load_network", "network_arrays"]

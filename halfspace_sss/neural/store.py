@@ -1,5 +1,7 @@
 """Weights on disk: a safetensors file of arrays and, beside it, a JSON record of what they are and how they were made.
 
+Weights of single media are found again by the medium that they were trained for.
+
 Loading runs no code of the file. The record names the checksum of the arrays, and both must agree with the format
 version, kind and shapes that are asked for.
 """
@@ -10,15 +12,31 @@ import hashlib
 import json
 import os
 from collections.abc import Mapping
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from halfspace_sss.checks import check_interval
-from halfspace_sss.provenance import read_bytes, read_text, write_together
+from halfspace_sss.physics.medium import Medium
+from halfspace_sss.provenance import check_folder, read_bytes, read_text, write_together
 
-__all__ = ["FORMAT", "checksum_of", "load_weights", "record_count", "record_number", "save_weights", "to_json"]
+__all__ = [
+    "ENVIRONMENT_VARIABLE",
+    "FORMAT",
+    "check_medium",
+    "check_weights_folder",
+    "checksum_of",
+    "find_weights",
+    "load_weights",
+    "record_count",
+    "record_number",
+    "save_weights",
+    "to_json",
+    "weights_folder",
+    "weights_name",
+]
 
 FORMAT = 1
 LARGEST = 1e4  # no weight of a network that works is as large
@@ -146,3 +164,67 @@ def _check_numbers(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
     for name, array in arrays.items():
         if array.dtype.kind != "f" or not np.all(np.abs(array) <= LARGEST):
             raise ValueError(f"{path}: {name} must be floating-point numbers of size <= {LARGEST:g}, got others")
+
+
+ENVIRONMENT_VARIABLE = "HALFSPACE_SSS_WEIGHTS"
+RATIOS = ("albedo", "g", "eta")
+
+
+def weights_folder() -> Path:
+    """Folder for trained weights: HALFSPACE_SSS_WEIGHTS, or the user's data folder."""
+    if os.environ.get(ENVIRONMENT_VARIABLE):
+        return Path(os.environ[ENVIRONMENT_VARIABLE])
+    variable, default = ("LOCALAPPDATA", "AppData/Local") if os.name == "nt" else ("XDG_DATA_HOME", ".local/share")
+    return Path(os.environ.get(variable) or Path.home() / default) / "halfspace-sss" / "weights"
+
+
+def check_weights_folder(folder: str | Path | None = None) -> Path:
+    """A folder for trained weights, by default `weights_folder`; ValueError if it cannot be written to."""
+    if folder is not None:
+        return check_folder(folder)
+    try:
+        return check_folder(weights_folder())
+    except ValueError as error:
+        raise ValueError(f"{error}; {ENVIRONMENT_VARIABLE} names another folder") from None
+
+
+def weights_name(kind: str, medium: Medium) -> str:
+    """File name of the weights of a scalar medium: all that counts is albedo, g and eta, to eight digits."""
+    numbers = (f"{name}{value}" for name, value in _digits(medium).items())
+    return "-".join((kind, *numbers)) + ".safetensors"
+
+
+def _digits(medium: Medium) -> dict[str, str]:
+    """What counts of a scalar medium, to the digits that count."""
+    return {name: f"{float(getattr(medium, name)):.8g}" for name in RATIOS}
+
+
+def check_medium(path: Path, record: Mapping[str, Any], medium: Medium) -> None:
+    """ValueError if the weights of `path` were trained for another medium, whatever the file is called."""
+    found = record.get("medium")
+    if not isinstance(found, dict) or any(type(found.get(name)) not in (int, float) for name in RATIOS):
+        raise ValueError(f"{path.with_suffix('.json')}: medium must have {', '.join(RATIOS)} as numbers, got {found!r}")
+    for name, wanted in _digits(medium).items():
+        if f"{found[name]:.8g}" != wanted:
+            raise ValueError(
+                f"{path.with_suffix('.json')}: {name} of medium must be {wanted} for this medium, got {found[name]!r}: "
+                "the weights are those of another one, renamed"
+            )
+
+
+def find_weights(kind: str, medium: Medium) -> Path:
+    """The file of weights of a scalar medium, the user's before the shipped one.
+
+    Raises:
+        ValueError: there is none; says how to train it.
+    """
+    name = weights_name(kind, medium)
+    shipped = Path(str(resources.files("halfspace_sss.neural").joinpath("data")))
+    for folder in (weights_folder(), shipped):
+        if (folder / name).exists():
+            return folder / name
+    ratios = ", ".join(f"{n} {float(getattr(medium, n)):.4g}" for n in RATIOS)
+    raise ValueError(
+        f"medium must be trained for {kind}, got one that is not ({ratios}); "
+        f"`halfspace-sss train material` does it, the model `neural` needs no training"
+    )

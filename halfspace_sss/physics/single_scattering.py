@@ -20,8 +20,7 @@ import numpy as np
 from halfspace_sss.arrays import broadcast_query, library
 from halfspace_sss.checks import rounding
 from halfspace_sss.physics.fresnel import F_t, mu_external, mu_internal
-from halfspace_sss.physics.medium import Medium
-from halfspace_sss.physics.phase import eval_hg
+from halfspace_sss.physics.medium import Medium, eval_hg
 
 __all__ = [
     "Contribution", "VertexSample", "brdf", "contribution", "exitance", "moments", "reflectance", "sample_vertex",

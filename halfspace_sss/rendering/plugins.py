@@ -6,7 +6,7 @@ import threading
 
 from halfspace_sss.backend import BackendError, prepare_llvm, two_threads
 from halfspace_sss.rendering.object.settings import VARIANTS, variant_channels
-from halfspace_sss.rendering.scenes.causes import plainly
+from halfspace_sss.rendering.scenes.scene_files import plainly
 
 __all__ = ["register"]
 

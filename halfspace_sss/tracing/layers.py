@@ -20,7 +20,7 @@ from halfspace_sss.backend import array_types
 from halfspace_sss.checks import check_choice, check_cosine, check_count, check_interval
 from halfspace_sss.physics.fresnel import F_r, mu_internal
 from halfspace_sss.physics.layers import Layers
-from halfspace_sss.physics.phase import sample_hg
+from halfspace_sss.physics.medium import sample_hg
 from halfspace_sss.progress import Progress
 from halfspace_sss.tracing.passes import Estimate, checked_radii, estimate, walk_passes
 from halfspace_sss.tracing.tallies import BATCHES, CellSums, find_cell

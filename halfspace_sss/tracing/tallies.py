@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from halfspace_sss.physics.fresnel import mu_internal
-from halfspace_sss.physics.phase import eval_hg
+from halfspace_sss.physics.medium import eval_hg
 from halfspace_sss.tracing.walk import Boundary, Scatter
 
 __all__ = ["BATCHES", "AngularTally", "CellSums", "FluxTally", "LineTally", "MomentTally", "RingTally", "find_cell"]

@@ -17,8 +17,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from halfspace_sss.physics.fresnel import F_r
-from halfspace_sss.physics.medium import Medium, check_ratios
-from halfspace_sss.physics.phase import sample_hg
+from halfspace_sss.physics.medium import Medium, check_ratios, sample_hg
 
 __all__ = [
     "Boundary", "Scatter", "Tally", "WalkConstants", "generator", "in_launches", "pass_seed", "roulette", "turn",

@@ -12,8 +12,7 @@ from halfspace_sss.checks import check_count, check_interval, renamed
 from halfspace_sss.extensions import LEARNERS, offered
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.rendering.object.shape import survey
-from halfspace_sss.rendering.scenes.causes import first_cause
-from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED
+from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED, first_cause
 from halfspace_sss.trade.exits import Exits, visible_exits
 from halfspace_sss.trade.images import with_flip
 from halfspace_sss.trade.results import Assessment, ObjectTrade, WayTrade, samples_for

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import mitsuba as mi
 
-from halfspace_sss.neural.trained import weights_folder
+from halfspace_sss.neural.store import weights_folder
 from halfspace_sss.provenance import provenance, write_atomically
 from halfspace_sss.rendering.object.placement import translucent_shapes
 from halfspace_sss.rendering.object.registry import AUTO, Choices, model_names

@@ -15,7 +15,7 @@ from halfspace_sss.cli import app as cli
 from halfspace_sss.maps import noisy_maps
 from halfspace_sss.maps.noisy_maps import CellGrid
 from halfspace_sss.materials import registry
-from halfspace_sss.neural import material_model, paper_model, trained
+from halfspace_sss.neural import material_model, paper_model, store
 from halfspace_sss.neural.store import load_weights
 from halfspace_sss.neural.training import train_material, train_universal
 from halfspace_sss.neural.training.fit import Fit
@@ -39,8 +39,8 @@ def _small(monkeypatch: Any, tmp_path: Path) -> None:
         monkeypatch.setattr(train_material, name, TINY)
     monkeypatch.setattr(train_universal, "UniversalRecipe", lambda: TINY_UNIVERSAL)
     for module in (material_model, paper_model):
-        monkeypatch.setattr(module, "find_weights", trained.find_weights)
-    monkeypatch.setenv(trained.ENVIRONMENT_VARIABLE, str(tmp_path / "weights"))
+        monkeypatch.setattr(module, "find_weights", store.find_weights)
+    monkeypatch.setenv(store.ENVIRONMENT_VARIABLE, str(tmp_path / "weights"))
     monkeypatch.chdir(tmp_path)
 
 
@@ -56,7 +56,7 @@ def test_training_a_material_writes_weights_where_its_model_finds_them() -> None
     result = _invoke("train", "material", "fig10")
     assert result.exit_code == 0, result.output
     (path,) = _weights()
-    assert path.name == trained.weights_name("neural_material", FIG10) and path.name in result.stdout
+    assert path.name == store.weights_name("neural_material", FIG10) and path.name in result.stdout
     assert bssrdf("neural_material", FIG10).eval(1.0, 1.0, 0.0, 1.0, 0.0) > 0
 
 

@@ -23,7 +23,7 @@ from full_geometry.learning.fitting import Recipe  # noqa: E402
 from full_geometry.learning.model_errors import LIGHTS  # noqa: E402
 from full_geometry.learning.training import Trained, train  # noqa: E402
 from halfspace_sss import Medium, rendering  # noqa: E402
-from halfspace_sss.neural.trained import ENVIRONMENT_VARIABLE  # noqa: E402
+from halfspace_sss.neural.store import ENVIRONMENT_VARIABLE  # noqa: E402
 from halfspace_sss.rendering.object.points import (  # noqa: E402
     AreaPoints,  # noqa: E402
     EntrySample,

@@ -20,7 +20,7 @@ from full_geometry import command  # noqa: E402
 from full_geometry.learning import model_errors, training  # noqa: E402
 from full_geometry.learning.fitting import Recipe  # noqa: E402
 from halfspace_sss.cli import app as cli  # noqa: E402
-from halfspace_sss.neural import trained as known_weights  # noqa: E402
+from halfspace_sss.neural import store as known_weights  # noqa: E402
 from halfspace_sss.neural.store import load_weights  # noqa: E402
 
 QUICK = Recipe(width=24, depth=2, batch=1024, chunk=2**13, reuse=4)

@@ -25,7 +25,7 @@ from full_geometry.object.radiance import reference  # noqa: E402
 from full_geometry.object.subject import Subject  # noqa: E402
 from full_geometry.scene import learnt_model  # noqa: E402
 from halfspace_sss import Medium  # noqa: E402
-from halfspace_sss.neural import trained as known_weights  # noqa: E402
+from halfspace_sss.neural import store as known_weights  # noqa: E402
 from halfspace_sss.neural.store import load_weights, save_weights  # noqa: E402
 from halfspace_sss.rendering.object.points import SurfacePoint  # noqa: E402
 from halfspace_sss.rendering.object.settings import Settings  # noqa: E402

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from halfspace_sss import Medium, bssrdf
-from halfspace_sss.neural import material_model, paper_model, trained
+from halfspace_sss.neural import material_model, paper_model, store
 from halfspace_sss.neural.features import N_FEATURES
 from halfspace_sss.neural.material_model import load_network
 from halfspace_sss.neural.network import layer_shapes
@@ -61,10 +61,10 @@ def test_weights_without_end_are_not_read(saved: Path, ending: str) -> None:
 
 @pytest.mark.parametrize("model", [material_model, paper_model])
 def test_a_model_refuses_weights_renamed_to_its_medium(tmp_path: Path, monkeypatch: Any, model: Any) -> None:
-    monkeypatch.setenv(trained.ENVIRONMENT_VARIABLE, str(tmp_path))
-    monkeypatch.setattr(model, "find_weights", trained.find_weights)
+    monkeypatch.setenv(store.ENVIRONMENT_VARIABLE, str(tmp_path))
+    monkeypatch.setattr(model, "find_weights", store.find_weights)
     n_in = {material_model.KIND: N_FEATURES, paper_model.KIND: paper_model.N_INPUTS}[model.KIND]
     other = Medium.from_albedo(0.625, 1.0, 0.0, 1.3)
-    save_weights(tmp_path / trained.weights_name(model.KIND, other), model.KIND, _layers(n_in), RECORD)
+    save_weights(tmp_path / store.weights_name(model.KIND, other), model.KIND, _layers(n_in), RECORD)
     with pytest.raises(ValueError, match="albedo of medium must be 0.625 for this medium, got 0.5"):
         bssrdf(model.KIND, other)

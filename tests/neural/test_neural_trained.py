@@ -14,7 +14,7 @@ import halfspace_sss
 from halfspace_sss import Medium, materials
 from halfspace_sss.maps import noisy_maps
 from halfspace_sss.maps.noisy_maps import CellGrid
-from halfspace_sss.neural import material_model, paper_model, trained
+from halfspace_sss.neural import material_model, paper_model, store
 from halfspace_sss.neural.store import load_weights
 from halfspace_sss.neural.training.fit import Fit
 from halfspace_sss.neural.training.train_material import MaterialRecipe, TrainedChannel, train
@@ -41,8 +41,8 @@ def fig10(folder: Path) -> TrainedChannel:
 def look_in(monkeypatch: Any) -> Callable[[Path], None]:
     """Weights are looked up in a folder, as without the stand-ins of the other tests."""
     for module in (material_model, paper_model):
-        monkeypatch.setattr(module, "find_weights", trained.find_weights)
-    return lambda folder: monkeypatch.setenv(trained.ENVIRONMENT_VARIABLE, str(folder))
+        monkeypatch.setattr(module, "find_weights", store.find_weights)
+    return lambda folder: monkeypatch.setenv(store.ENVIRONMENT_VARIABLE, str(folder))
 
 
 @pytest.mark.parametrize(
@@ -193,7 +193,7 @@ def test_training_a_coloured_medium_trains_its_channels(tmp_path: Path, look_in:
 
 
 def test_weights_lie_in_the_folder_of_the_user_unless_another_is_named(tmp_path: Path, monkeypatch: Any) -> None:
-    monkeypatch.delenv(trained.ENVIRONMENT_VARIABLE, raising=False)
+    monkeypatch.delenv(store.ENVIRONMENT_VARIABLE, raising=False)
     for variable in ("XDG_DATA_HOME", "LOCALAPPDATA"):
         monkeypatch.setenv(variable, str(tmp_path))
-    assert trained.weights_folder() == tmp_path / "halfspace-sss" / "weights"
+    assert store.weights_folder() == tmp_path / "halfspace-sss" / "weights"

@@ -5,7 +5,7 @@ import pytest
 from scipy import integrate, stats
 
 from halfspace_sss.backend import array_types
-from halfspace_sss.physics.phase import eval_hg, sample_hg
+from halfspace_sss.physics.medium import eval_hg, sample_hg
 from halfspace_sss.physics.single_scattering import _mean_hg
 
 GS = [-0.999, -0.9, -0.3, -1e-4, 0.0, 1e-4, 0.5, 0.95, 0.999]

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from halfspace_sss import Medium
 from halfspace_sss.physics.backbone import unwarp, warp
 from halfspace_sss.physics.fresnel import F_r, F_t, mu_internal
-from halfspace_sss.physics.phase import eval_hg, sample_hg
+from halfspace_sss.physics.medium import eval_hg, sample_hg
 
 ALBEDO = st.one_of(st.floats(0, 1), st.floats(0, 7).map(lambda x: 1 - 10**-x))
 G = st.floats(-0.99, 0.999)

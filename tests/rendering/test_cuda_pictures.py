@@ -54,7 +54,7 @@ def weights(tmp_path_factory: pytest.TempPathFactory):
     """A folder with what CUDA has learnt of the bunny, and its errors."""
     pytest.importorskip("torch")
     from full_geometry import Recipe, train
-    from halfspace_sss.neural import trained
+    from halfspace_sss.neural import store
 
     folder = tmp_path_factory.mktemp("weights")
     recipe = Recipe(width=24, depth=2, batch=1024, chunk=2**15, reuse=4)
@@ -65,7 +65,7 @@ def weights(tmp_path_factory: pytest.TempPathFactory):
         return train(mi.load_dict(bunny()), MEDIUM, chunks=6, recipe=recipe, folder=folder).errors
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv(trained.ENVIRONMENT_VARIABLE, str(folder))
+        patch.setenv(store.ENVIRONMENT_VARIABLE, str(folder))
         yield folder, on(CUDA, learn)
 
 

@@ -7,7 +7,7 @@ import pytest
 from rendered import direction
 
 from halfspace_sss.physics.fresnel import F_t
-from halfspace_sss.physics.phase import eval_hg
+from halfspace_sss.physics.medium import eval_hg
 
 mi = pytest.importorskip("mitsuba")
 

@@ -11,7 +11,7 @@ from rendered import direction, sun
 from scipy.special import exp1
 
 from halfspace_sss.physics.fresnel import F_r, mu_internal
-from halfspace_sss.physics.phase import eval_hg
+from halfspace_sss.physics.medium import eval_hg
 
 mi = pytest.importorskip("mitsuba")
 

@@ -21,9 +21,8 @@ from halfspace_sss.neural.hypernetwork import in_range
 from halfspace_sss.neural.material_model import network_arrays
 from halfspace_sss.neural.network import Network
 from halfspace_sss.neural.paper_model import NeuralPaper
-from halfspace_sss.neural.store import save_weights
+from halfspace_sss.neural.store import check_weights_folder, save_weights, weights_folder, weights_name
 from halfspace_sss.neural.symmetric import SymmetricModel, channels
-from halfspace_sss.neural.trained import check_weights_folder, weights_folder, weights_name
 from halfspace_sss.neural.training.fit import Fit, fit
 from halfspace_sss.neural.training.learners import PaperLearner, Small
 from halfspace_sss.neural.training.pool import MapPool

@@ -20,8 +20,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from halfspace_sss.checks import check_choice
 from halfspace_sss.extensions import CHOOSERS, LEARNERS, TRANSPORTS, loaded, offers
-from halfspace_sss.interface.model import model_class, models
-from halfspace_sss.interface.model_lists import check_allowed
+from halfspace_sss.interface.model import check_allowed, model_class, models
 from halfspace_sss.lazy import once
 from halfspace_sss.rendering.object.settings import Settings
 

@@ -23,7 +23,7 @@ from typing import NamedTuple
 import drjit as dr
 import mitsuba as mi
 
-from halfspace_sss.physics.phase import eval_hg, sample_hg
+from halfspace_sss.physics.medium import eval_hg, sample_hg
 from halfspace_sss.rendering.light.small_emitters import WIDE
 from halfspace_sss.rendering.object.body import TranslucentObject
 from halfspace_sss.rendering.object.points import SurfacePoint, lifted, mirrored, number, opposed, place, turned

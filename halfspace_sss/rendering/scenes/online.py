@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from halfspace_sss.checks import check_count
-from halfspace_sss.neural.trained import weights_folder
+from halfspace_sss.neural.store import weights_folder
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.provenance import check_folder
 from halfspace_sss.rendering.object.translucent import is_translucent

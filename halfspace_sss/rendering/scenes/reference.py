@@ -24,9 +24,9 @@ from halfspace_sss.provenance import check_folder, provenance
 from halfspace_sss.rendering.object.registry import AUTO
 from halfspace_sss.rendering.object.translucent import is_translucent
 from halfspace_sss.rendering.paths.integrator import is_bssrdf
-from halfspace_sss.rendering.scenes.causes import first_cause
 from halfspace_sss.rendering.scenes.identity import learnt, scene_hash, words
 from halfspace_sss.rendering.scenes.reference_store import Reference, load, save
+from halfspace_sss.rendering.scenes.scene_files import first_cause
 
 __all__ = ["Limits", "Progress", "Reference", "about_render", "check_same", "chosen", "load", "loaded", "render"]
 

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, Protocol, TypeVar
 import drjit as dr
 import mitsuba as mi
 
-from halfspace_sss.physics.phase import eval_hg, sample_hg
+from halfspace_sss.physics.medium import eval_hg, sample_hg
 from halfspace_sss.rendering.object.points import channel_mean, sided
 from halfspace_sss.rendering.walk.media import Coefficients, WalkMedia
 from halfspace_sss.tracing.walk import ROULETTE_BOOST, ROULETTE_WEIGHT
