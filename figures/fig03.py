@@ -36,7 +36,7 @@ def sampled(task: Task) -> dict[str, Any]:
     """Points in the object's frame over its radius, and their RMSD to the nearest barycentre."""
     from figures.studies.paper_flow import fit_space_flow, mesh_arrays, on_surface, rmsd
     from full_geometry.learning.training import train_by_cpu
-    from full_geometry.object.identity import frame_of
+    from full_geometry.models.storing import frame_of
     from full_geometry.object.subject import Subject
 
     prepare()
@@ -92,8 +92,7 @@ def _by_patches(learnt: Any, exit: Any, n: int) -> Any:
     import drjit as dr
     import mitsuba as mi
 
-    from full_geometry.object.features import Side
-    from full_geometry.object.first_event import first_event
+    from full_geometry.object.features import Side, first_event
 
     rng = _lanes(n, 42)
     at = exit.gather(dr.zeros(mi.UInt32, n))

@@ -38,7 +38,7 @@ def parts(quality: str) -> list[Part]:
 
 def truth_of(subject: Any, p: Mapping[str, Any]) -> Any:
     """Exits and their radiance."""
-    from full_geometry.object.radiance import reference
+    from full_geometry.learning.model_errors import reference
 
     return reference(subject, p["exits"], p["walks"], p["seed"])
 
@@ -64,10 +64,10 @@ def _rmse(found: Any, truth: Any, per_estimate: float) -> dict[str, float]:
 def ours(task: Task) -> dict[str, Any]:
     """Errors of `full_geometry` with N entries by patches."""
     from figures.studies.rivals import BACKBONE
+    from full_geometry.learning.model_errors import modelled
     from full_geometry.learning.training import train_by_cpu
-    from full_geometry.models.half_space import HalfSpace
+    from full_geometry.models.object_model import HalfSpace
     from full_geometry.object.pairs import EntryProposals
-    from full_geometry.object.radiance import modelled
     from full_geometry.object.subject import Subject
 
     prepare()

@@ -7,8 +7,8 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
+from full_geometry.models.storing import frame_of
 from full_geometry.object.features import n_side
-from full_geometry.object.identity import frame_of
 from full_geometry.object.patches import Patches, PatchSampler, cluster
 from full_geometry.object.subject import Subject
 from halfspace_sss import Medium

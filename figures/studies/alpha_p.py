@@ -23,9 +23,8 @@ import torch
 from figures.studies.flow import N_CONTEXT, Chart, ConditionalFlow, FlowSampler, context, direction_square
 from figures.studies.flow_training import FlowBatch, FlowNetwork, FlowRecipe, Walks, flow_walks, walk_batches
 from full_geometry.learning.fitting import DenseLayers, PatchLogits
-from full_geometry.object.features import Side, n_side, side_features
-from full_geometry.object.first_event import first_event
-from full_geometry.object.identity import frame_of
+from full_geometry.models.storing import frame_of
+from full_geometry.object.features import Side, first_event, n_side, side_features
 from full_geometry.object.patches import Patches, PatchSampler, PatchWeights, cluster
 from full_geometry.object.subject import Subject
 from halfspace_sss.neural.perceptron import Perceptron

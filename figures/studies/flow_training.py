@@ -27,11 +27,10 @@ from figures.studies.flow import (
 )
 from full_geometry.learning.fitting import PatchLogits, patch_likelihood
 from full_geometry.models.storing import Learnt
-from full_geometry.object.features import ObjectFrame, Side, n_side, side_features
-from full_geometry.object.first_event import first_event
+from full_geometry.object.features import ObjectFrame, Side, first_event, n_side, side_features
+from full_geometry.object.pairs import trace_exits
 from full_geometry.object.patches import Patches, PatchSampler
 from full_geometry.object.subject import Subject
-from full_geometry.object.walks import trace_exits
 from halfspace_sss.checks import check_count
 from halfspace_sss.neural.training.fit import CpuSchedule, Objective, Source, fit
 from halfspace_sss.rendering.object.points import EntrySample, cosine_above, number, place

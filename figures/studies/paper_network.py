@@ -16,12 +16,11 @@ import numpy as np
 import torch
 from torch import nn
 
-from full_geometry.learning.model_errors import RadianceError, compare
+from full_geometry.learning.model_errors import LOBES, POWER, ExitRadiance, ExitTruth, RadianceError, compare, reference
+from full_geometry.models.storing import Identity, frame_of, identify
 from full_geometry.object.features import ObjectFrame
-from full_geometry.object.identity import Identity, frame_of, identify
-from full_geometry.object.radiance import LOBES, POWER, ExitRadiance, ExitTruth, reference
+from full_geometry.object.pairs import trace_exits
 from full_geometry.object.subject import Subject
-from full_geometry.object.walks import trace_exits
 from halfspace_sss.checks import check_choice, check_count, check_interval
 from halfspace_sss.neural.store import check_weights_folder, load_weights, save_weights, weights_folder
 from halfspace_sss.neural.training.fit import ADAM, CpuSchedule, Descent, Objective, Source, fit

@@ -18,14 +18,12 @@ from figures.studies.flow_training import LIGHTINGS, FlowRecipe, Lighting, fit_f
 from figures.studies.paper_network import POINTS, PaperRecipe, fit_paper, paper_errors
 from full_geometry.learning import model_errors
 from full_geometry.learning.fitting import STANDARD
-from full_geometry.learning.model_errors import measure, transport_of
+from full_geometry.learning.model_errors import measure, reference, transport_of
 from full_geometry.learning.training import train, train_by_cpu
-from full_geometry.models.half_space import HalfSpace
+from full_geometry.models.object_model import HalfSpace
 from full_geometry.models.storing import KIND, Learnt
-from full_geometry.object import radiance
 from full_geometry.object.pairs import EntryProposals, Numbers
 from full_geometry.object.patches import AREA_SHARE, LearntProposals, PatchTable
-from full_geometry.object.radiance import reference
 from full_geometry.object.subject import Subject
 from halfspace_sss.backend import kernel_seconds
 from halfspace_sss.neural.store import load_weights
@@ -71,7 +69,7 @@ def error_table(
     import pandas
 
     subject, rows = Subject.given(scene, None, None, name), []
-    truth = radiance.reference(subject, exits, walks, seed)
+    truth = model_errors.reference(subject, exits, walks, seed)
 
     def tell(what: str, done: int) -> None:
         if progress:

@@ -17,16 +17,22 @@ import mitsuba as mi
 import numpy as np
 
 from full_geometry.learning.fitting import PROPOSED, STANDARD, ObjectFit, Recipe
-from full_geometry.learning.model_errors import RadianceError, measure, of_even_light
+from full_geometry.learning.model_errors import (
+    ExitRadiance,
+    ExitTruth,
+    RadianceError,
+    measure,
+    of_even_light,
+    reference,
+    traced,
+)
 from full_geometry.models import storing
 from full_geometry.models.object_model import FullGeometry
+from full_geometry.models.storing import frame_of, identify
 from full_geometry.object.features import n_pair, n_side
-from full_geometry.object.identity import frame_of, identify
-from full_geometry.object.pairs import EntryProposals, Pairs, PairSource, shuffled
+from full_geometry.object.pairs import EntryProposals, Pairs, PairSource, WalkEnds, shuffled
 from full_geometry.object.patches import Patches, PatchSampler, cluster
-from full_geometry.object.radiance import ExitRadiance, ExitTruth, reference, traced
 from full_geometry.object.subject import Subject
-from full_geometry.object.walks import WalkEnds
 from halfspace_sss.backend import busy_threads
 from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.neural.store import check_weights_folder, to_json

@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from full_geometry.object.first_event import FirstEvent, first_event
+from full_geometry.object.features import FirstEvent, first_event
 from full_geometry.object.subject import Subject, refract_in
 from halfspace_sss.neural.features import medium_features
 from halfspace_sss.physics.backbone import length_scale

@@ -35,11 +35,10 @@ from full_geometry.models.descriptors import (
     on_a_plane,
     phases,
 )
-from full_geometry.models.half_space import HalfSpace
+from full_geometry.models.object_model import HalfSpace
 from full_geometry.object.features import Side
-from full_geometry.object.pairs import EntryProposals
+from full_geometry.object.pairs import EntryProposals, trace_exits
 from full_geometry.object.subject import Subject, refract_in
-from full_geometry.object.walks import trace_exits
 from halfspace_sss.interface.model import BSSRDF, bssrdf
 from halfspace_sss.lazy import once
 from halfspace_sss.neural.perceptron import Perceptron

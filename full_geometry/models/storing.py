@@ -1,24 +1,206 @@
-"""Weights of objects on disk, found again by the object they belong to."""
+"""Weights of objects on disk, found again by the object they belong to.
+
+It is the same shape of the same size in mean free paths, wherever it stands.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import os
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import mitsuba as mi
 import numpy as np
 
 from full_geometry.models import neural_shape as shapes
-from full_geometry.models.half_space import HalfSpace
-from full_geometry.models.object_model import DirectionalAlbedo, FullGeometry
-from full_geometry.object.features import BaseModel, ObjectFrame, n_pair, n_side
-from full_geometry.object.first_event import REFLECTIONS
-from full_geometry.object.identity import Identity, frame_of, identify
+from full_geometry.models.object_model import DirectionalAlbedo, FullGeometry, HalfSpace
+from full_geometry.object.features import REFLECTIONS, BaseModel, ObjectFrame, n_pair, n_side, surroundings
 from full_geometry.object.patches import Patches, PatchSampler
 from full_geometry.object.subject import Subject
 from halfspace_sss.interface.model import bssrdf
 from halfspace_sss.neural.store import load_weights, save_weights, weights_folder
+from halfspace_sss.rendering.object.points import number
+from halfspace_sss.rendering.object.varying import grid_values
+
+ANCHORS = 256
+CLOSE = 1e-4  # positions over the size of the object, coefficients relative
+SAMPLED = 0.05  # of the homogeneous equivalent of a medium that varies, a mean over random points
+PROBED = 64  # anchors towards which a medium that varies is probed,
+DEPTHS = (1.0, 0.7, 0.4)  # at these parts of their distance from the middle
+NEAR, MOST_FAR = 1e-2, 0.03  # of the largest coefficient; share of points, for voxels that are not interpolated
+
+
+@dataclass(frozen=True, eq=False)
+class Identity:
+    """What tells objects apart.
+
+    Args:
+        kind: class of the shape.
+        topology: checksum of its faces, and whether it has normals of its own; empty for a shape without faces.
+        anchors: points that move with the shape, (n, 3), scene units.
+        medium: per channel albedo, g and sigma_t sqrt(area), and eta; of a medium that varies its equivalent.
+        grids: digest of the voxels of a medium that varies.
+        probes: coefficients of a medium that varies, see `_probed`.
+    """
+
+    kind: str
+    topology: str
+    anchors: np.ndarray
+    medium: dict[str, Any]
+    grids: str = ""
+    probes: np.ndarray | None = None
+
+    def digest(self) -> str:
+        """A name for shape, its handedness and ratios of the medium, without sizes."""
+        keys = ("g", "eta") if self.grids else ("albedo", "g", "eta")  # an equivalent is known up to its sampling
+        ratios = [self.grids] * bool(self.grids)
+        ratios += [f"{v:.6g}" for key in keys for v in np.atleast_1d(self.medium[key])]
+        return hashlib.sha256("|".join([self.kind, self.topology, self._hand(), *ratios]).encode()).hexdigest()[:12]
+
+    def _hand(self) -> str:
+        """Which of an object and its mirror image, that have the same faces and size, it is."""
+        x = self.anchors.astype(float)
+        x = (x - x.mean(axis=0)) / max(np.linalg.norm(np.std(x, axis=0)), 1e-30)
+        turns = np.linalg.det(np.random.default_rng(0).standard_normal((3, len(x))) @ x / np.sqrt(len(x)))
+        return "left" if turns < 0 else "right"
+
+    def record(self) -> dict[str, Any]:
+        """Everything but the anchors and probes, ready for JSON."""
+        return {"kind_of_shape": self.kind, "topology": self.topology, "medium": self.medium, "grids": self.grids}
+
+    def pose(self, other: Identity) -> tuple[np.ndarray, np.ndarray]:
+        """R and t with R x + t = y for the points x of this object and y of the other, which is the same one moved.
+
+        Raises:
+            ValueError: it is another object; says in what.
+        """
+        pairs = ("kind", "shape", "without faces"), ("topology", "mesh", "without faces"), ("grids", "grids", "none")
+        for key, name, none in pairs:
+            mine, theirs = getattr(self, key), getattr(other, key)
+            if mine != theirs:
+                raise ValueError(f"{name} must be {mine or none}, as trained, got {theirs or 'none'}")
+        R, t, miss = _kabsch(self.anchors.astype(float), other.anchors.astype(float))
+        spread, others = (float(np.linalg.norm(np.std(v, axis=0))) for v in (self.anchors, other.anchors))
+        if miss > CLOSE * spread:
+            raise ValueError(
+                f"object must be the one that was trained, moved and turned only, got one that differs by "
+                f"{miss / spread:.2g} of its size (about {others / max(spread, 1e-30):.3g} times as large)"
+            )
+        for key, mine in self.medium.items():
+            theirs = other.medium[key]
+            close = SAMPLED if self.grids else CLOSE
+            if np.shape(mine) != np.shape(theirs) or not np.allclose(mine, theirs, rtol=close, atol=1e-7):
+                raise ValueError(f"{key} of the medium must be {mine}, as trained, got {theirs}")
+        if self.grids:
+            _check_same(self.probes, other.probes)
+        return R, t
+
+
+def _kabsch(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    """Rotation and shift that take a to b best, and the largest distance that is left."""
+    if a.shape != b.shape:
+        return np.eye(3), np.zeros(3), np.inf
+    mean_a, mean_b = a.mean(axis=0), b.mean(axis=0)
+    U, _, V = np.linalg.svd((a - mean_a).T @ (b - mean_b))
+    flip = np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ V))])
+    R = (U @ flip @ V).T
+    t = mean_b - R @ mean_a
+    return R, t, float(np.linalg.norm(a @ R.T + t - b, axis=1).max())
+
+
+def identify(subject: Subject) -> Identity:
+    """The identity of an object as it stands."""
+    shape = subject.object.shape
+    parameters = mi.traverse(shape)
+    topology = ""
+    if "faces" in parameters:
+        faces = np.array(parameters["faces"], dtype=np.uint32)
+        positions = np.array(parameters["vertex_positions"], dtype=float).reshape(-1, 3)
+        smooth = "smooth" if shape.has_vertex_normals() else "flat"
+        topology = f"{hashlib.sha256(faces.tobytes()).hexdigest()[:16]} {smooth}"
+        anchors = positions[np.unique(np.linspace(0, len(positions) - 1, ANCHORS).astype(int))]
+    elif "to_world" in parameters:
+        matrix = np.array(parameters["to_world"].matrix, dtype=float).reshape(4, 4)
+        corners = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, 8)
+        anchors = (matrix[:3, :3] @ corners + matrix[:3, 3:]).T
+    else:
+        raise ValueError(f"shape must be a mesh or have a transformation, got {shape.class_name()}")
+    media = subject.media
+    medium = {key: [float(getattr(m, key)) for m in media] for key in ("albedo", "g")}
+    medium |= {"size_in_mfp": subject.mean_free_paths().tolist(), "eta": float(subject.eta)}
+    grids, probes = _digest_of_grids(subject), _probed(subject, anchors)
+    return Identity(shape.class_name(), topology, anchors.astype(np.float32), medium, grids, probes)
+
+
+def _digest_of_grids(subject: Subject) -> str:
+    """Of the voxels and of the ratios of what they are multiplied by; empty for a homogeneous medium."""
+    medium = subject.varying
+    if medium is None:
+        return ""
+    digest = hashlib.sha256()
+    for volume in (medium.density, medium.albedo_volume):
+        voxels = np.zeros(0) if volume is None else np.ascontiguousarray(grid_values(volume), dtype=np.float32)
+        digest.update(str(voxels.shape).encode() + voxels.tobytes())
+    ratios = (*medium.factor / medium.factor.max(), *medium.albedo)
+    digest.update("|".join(f"{v:.6g}" for v in ratios).encode())
+    return digest.hexdigest()[:16]
+
+
+def _probed(subject: Subject, anchors: np.ndarray) -> np.ndarray:
+    """sigma_t and sigma_s times sqrt(area) at points that move with the shape, (2 channels, points); none if constant.
+
+    They tell grids that lie elsewhere in the object, or are interpolated in another way.
+    """
+    if subject.varying is None:
+        return np.zeros((0, 0), dtype=np.float32)
+    centre, some = anchors.mean(axis=0), anchors[:: max(len(anchors) // PROBED, 1)]
+    points = np.concatenate([centre + depth * (some - centre) for depth in DEPTHS])
+    values = np.concatenate(subject.varying.coefficients(mi.Point3f(points.T.astype(np.float32))))
+    return (values * np.sqrt(subject.object.area)).astype(np.float32)
+
+
+def _check_same(trained: np.ndarray, here: np.ndarray) -> None:
+    """ValueError if the coefficients at the points of `_probed` are not those of training."""
+    if trained.shape == here.shape:
+        scale = np.abs(trained.astype(float)).max(initial=1e-30)
+        gap = np.abs(trained.astype(float) - here.astype(float))
+        if trained.size == 0 or np.mean(gap > NEAR * scale) <= MOST_FAR:
+            return
+        raise ValueError(
+            "the medium must vary in the object as trained, got grids placed, scaled or interpolated in another way "
+            f"(coefficients differ by up to {gap.max() / scale:.2g} of the largest)"
+        )
+    raise ValueError(f"coefficients must be known at {trained.shape} points, as trained, got {here.shape}")
+
+
+def frame_of(subject: Subject, trained: Identity | None = None, turns: np.ndarray | None = None) -> ObjectFrame:
+    """The frame of the features; that of training for an object that has been moved since.
+
+    Args:
+        subject: the object.
+        trained: as it was trained.
+        turns: of its surroundings then.
+
+    Raises:
+        ValueError: the object is not the one that was trained.
+    """
+    here = identify(subject)
+    R, t = (np.eye(3), np.zeros(3)) if trained is None else trained.pose(here)
+    anchors = here.anchors if trained is None else trained.anchors
+    low, high = anchors.min(axis=0).astype(float), anchors.max(axis=0).astype(float)
+    centre = R @ (0.5 * (low + high)) + t
+    radius = 0.5 * float(np.linalg.norm(high - low))
+    each = [float(m.sigma_t) for m in subject.media]
+    sigma_t = float(np.exp(np.mean(np.log(each))))
+    turn = None if np.allclose(R, np.eye(3), atol=1e-6) else [mi.Vector3f(*map(number, row)) for row in R.T]
+    frame = ObjectFrame(
+        mi.Point3f(*map(number, centre)), number(radius), number(sigma_t), tuple(map(number, each)), turn
+    )
+    return replace(frame, around=surroundings(subject, frame, turns))
+
 
 KIND = "full_geometry"
 CHECKSUMS = "start_checksums"  # of a record

@@ -20,8 +20,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from full_geometry.object.features import ObjectFrame, PreparedExit, Side, side_features
-from full_geometry.object.first_event import first_event
+from full_geometry.object.features import ObjectFrame, PreparedExit, Side, first_event, side_features
 from full_geometry.object.subject import Subject, cosine_direction, surface_point
 from halfspace_sss.neural.perceptron import Perceptron
 from halfspace_sss.rendering.object.points import (

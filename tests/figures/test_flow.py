@@ -30,10 +30,23 @@ from figures.studies.flow import (  # noqa: E402  # noqa: E402  # noqa: E402
     from_square,
 )
 from figures.studies.flow_training import FlowNetwork  # noqa: E402
-from full_geometry.models.storing import CENTRES, CHECKSUMS, ENDS, EVEN, TURNS, save  # noqa: E402
-from full_geometry.object.features import PreparedExit, Side, Terms, n_pair, n_side  # noqa: E402
-from full_geometry.object.first_event import first_event  # noqa: E402
-from full_geometry.object.identity import identify  # noqa: E402
+from full_geometry.models.storing import (  # noqa: E402
+    CENTRES,
+    CHECKSUMS,
+    ENDS,
+    EVEN,
+    TURNS,
+    identify,  # noqa: E402
+    save,
+)
+from full_geometry.object.features import (  # noqa: E402
+    PreparedExit,
+    Side,
+    Terms,
+    first_event,  # noqa: E402
+    n_pair,
+    n_side,
+)
 from full_geometry.object.patches import LearntProposals, PatchTable, cluster, mesh_faces  # noqa: E402
 from halfspace_sss.rendering.object.points import SurfacePoint  # noqa: E402
 from halfspace_sss.rendering.scenes.scene_files import load_scene  # noqa: E402

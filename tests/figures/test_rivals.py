@@ -28,9 +28,9 @@ from figures.studies.flow import N_CONTEXT, Chart, ConditionalFlow, FlowSampler 
 from figures.studies.flow_training import LIGHTINGS, FlowNetwork, FlowRecipe, lighting  # noqa: E402
 from figures.studies.paper_flow import incidence, mesh_arrays, on_surface, rmsd  # noqa: E402
 from figures.studies.paper_network import measured_lights, paper_errors, random_lights  # noqa: E402
+from full_geometry.learning.model_errors import reference  # noqa: E402
+from full_geometry.models.storing import frame_of  # noqa: E402
 from full_geometry.object.features import n_side  # noqa: E402
-from full_geometry.object.identity import frame_of  # noqa: E402
-from full_geometry.object.radiance import reference  # noqa: E402
 from full_geometry.object.subject import Subject  # noqa: E402
 from halfspace_sss.cli import app as cli  # noqa: E402
 from halfspace_sss.rendering.object.points import EntrySample, SurfacePoint  # noqa: E402

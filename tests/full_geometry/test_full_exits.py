@@ -14,9 +14,9 @@ from halfspace_sss.tracing.walk import generator, pass_seed
 
 mi = pytest.importorskip("mitsuba")
 
-from full_geometry.object.first_event import first_event  # noqa: E402
+from full_geometry.object.features import first_event  # noqa: E402
+from full_geometry.object.pairs import trace_exits  # noqa: E402
 from full_geometry.object.subject import Subject, refract_in  # noqa: E402
-from full_geometry.object.walks import trace_exits  # noqa: E402
 from halfspace_sss.rendering.object.points import SurfacePoint  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("rgb")

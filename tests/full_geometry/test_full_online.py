@@ -24,8 +24,8 @@ import drjit as dr  # noqa: E402
 from full_geometry.learning import training  # noqa: E402
 from full_geometry.learning.fitting import Recipe  # noqa: E402
 from full_geometry.learning.training import CameraSchedule  # noqa: E402
+from full_geometry.object.pairs import trace_exits  # noqa: E402
 from full_geometry.object.subject import Subject  # noqa: E402
-from full_geometry.object.walks import trace_exits  # noqa: E402
 from halfspace_sss import rendering  # noqa: E402
 from halfspace_sss.cli import app as cli  # noqa: E402
 from halfspace_sss.cli import render as cli_render  # noqa: E402

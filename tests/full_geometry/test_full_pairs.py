@@ -17,12 +17,18 @@ mi = pytest.importorskip("mitsuba")
 torch = pytest.importorskip("torch")
 
 from full_geometry.learning.fitting import STANDARD, ObjectFit  # noqa: E402
-from full_geometry.models.half_space import HalfSpace  # noqa: E402
+from full_geometry.models.object_model import HalfSpace  # noqa: E402
+from full_geometry.models.storing import frame_of  # noqa: E402
 from full_geometry.object.features import n_pair, n_side  # noqa: E402
-from full_geometry.object.identity import frame_of  # noqa: E402
-from full_geometry.object.pairs import ENOUGH, AlbedoSamples, EntryProposals, Pairs, PairSource  # noqa: E402
+from full_geometry.object.pairs import (  # noqa: E402
+    ENOUGH,
+    AlbedoSamples,
+    EntryProposals,
+    Pairs,
+    PairSource,
+    trace_exits,  # noqa: E402
+)
 from full_geometry.object.subject import Subject  # noqa: E402
-from full_geometry.object.walks import trace_exits  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("rgb")

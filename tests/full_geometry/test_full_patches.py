@@ -19,10 +19,12 @@ from waxen import WAX, random_patches, wax_bunny  # noqa: E402
 
 from full_geometry.learning.fitting import Recipe  # noqa: E402
 from full_geometry.learning.training import train  # noqa: E402
-from full_geometry.models.half_space import HalfSpace  # noqa: E402
-from full_geometry.object.features import Side  # noqa: E402
-from full_geometry.object.first_event import first_event  # noqa: E402
-from full_geometry.object.identity import frame_of  # noqa: E402
+from full_geometry.models.object_model import HalfSpace  # noqa: E402
+from full_geometry.models.storing import frame_of  # noqa: E402
+from full_geometry.object.features import (  # noqa: E402
+    Side,
+    first_event,
+)
 from full_geometry.object.pairs import EntryProposals  # noqa: E402
 from full_geometry.object.patches import Patches, PatchSampler, PatchTable, cluster, mesh_faces  # noqa: E402
 from full_geometry.object.subject import Subject, cosine_direction, surface_point  # noqa: E402

@@ -21,15 +21,22 @@ import drjit as dr  # noqa: E402
 
 from full_geometry.learning import training  # noqa: E402
 from full_geometry.learning.fitting import ALPHA_HIDDEN, Recipe  # noqa: E402
-from full_geometry.learning.model_errors import EVEN_SKY, LIGHTS, errors_of  # noqa: E402
+from full_geometry.learning.model_errors import (  # noqa: E402
+    EVEN_SKY,
+    LIGHTS,
+    errors_of,
+    reference,  # noqa: E402
+)
 from full_geometry.learning.training import Trained, train, trusted  # noqa: E402
 from full_geometry.models import storing  # noqa: E402
 from full_geometry.models.object_model import BOUND  # noqa: E402
-from full_geometry.object.features import Quadratic, n_side  # noqa: E402
-from full_geometry.object.first_event import first_event  # noqa: E402
-from full_geometry.object.radiance import reference  # noqa: E402
+from full_geometry.object.features import (  # noqa: E402
+    Quadratic,
+    first_event,  # noqa: E402
+    n_side,
+)
+from full_geometry.object.pairs import trace_exits  # noqa: E402
 from full_geometry.object.subject import Subject  # noqa: E402
-from full_geometry.object.walks import trace_exits  # noqa: E402
 from halfspace_sss import rendering  # noqa: E402
 from halfspace_sss.neural import store as known_weights  # noqa: E402
 from halfspace_sss.neural.store import load_weights, save_weights  # noqa: E402
@@ -227,7 +234,7 @@ def test_a_mesh_with_a_hole_is_warned_of_in_a_sentence() -> None:
 
 
 def test_vertex_normals_against_their_faces_give_the_same_exits() -> None:
-    from full_geometry.object.radiance import reference
+    from full_geometry.learning.model_errors import reference
 
     upright, turned = (mi.load_dict({"type": "ply", "filename": str(BUNNY)}) for _ in range(2))
     parameters = mi.traverse(turned)

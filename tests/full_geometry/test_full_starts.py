@@ -15,13 +15,16 @@ pytest.importorskip("torch")
 from figures.studies import rivals as starts  # noqa: E402
 from full_geometry.learning import training  # noqa: E402
 from full_geometry.learning.fitting import Recipe  # noqa: E402
-from full_geometry.learning.model_errors import LIGHTS, measure  # noqa: E402
+from full_geometry.learning.model_errors import (  # noqa: E402
+    LIGHTS,
+    measure,
+    reference,  # noqa: E402
+)
 from full_geometry.learning.training import Trained, train  # noqa: E402
 from full_geometry.models import neural_shape as shapes  # noqa: E402
 from full_geometry.models import storing  # noqa: E402
-from full_geometry.models.half_space import HalfSpace  # noqa: E402
+from full_geometry.models.object_model import HalfSpace  # noqa: E402
 from full_geometry.object.pairs import EntryProposals  # noqa: E402
-from full_geometry.object.radiance import reference  # noqa: E402
 from full_geometry.object.subject import Subject  # noqa: E402
 from full_geometry.scene import learnt_model  # noqa: E402
 from halfspace_sss import Medium  # noqa: E402

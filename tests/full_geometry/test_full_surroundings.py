@@ -14,19 +14,19 @@ mi.set_variant("llvm_ad_rgb")
 
 from waxen import BUNNY, WAX, wax_bunny  # noqa: E402
 
+from full_geometry.models.storing import frame_of, identify  # noqa: E402
 from full_geometry.object.features import (  # noqa: E402
     EVENT,
     FIELDS,
     POINT,
     WIDTHS,
     Side,
+    first_event,  # noqa: E402
     insides,
     n_side,
     pair_features,
     side_features,
 )
-from full_geometry.object.first_event import first_event  # noqa: E402
-from full_geometry.object.identity import frame_of, identify  # noqa: E402
 from full_geometry.object.subject import Subject, surface_point  # noqa: E402
 from halfspace_sss import Medium  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402

@@ -19,16 +19,32 @@ torch = pytest.importorskip("torch")
 import full_geometry  # noqa: E402
 from full_geometry.learning import training  # noqa: E402
 from full_geometry.learning.fitting import Correction, Recipe  # noqa: E402
-from full_geometry.learning.model_errors import EVEN_SKY, LIGHTS, compare, measure, transport_of  # noqa: E402
+from full_geometry.learning.model_errors import (  # noqa: E402  # noqa: E402
+    EVEN_SKY,
+    LIGHTS,
+    ExitRadiance,
+    compare,
+    measure,
+    reference,
+    transport_of,
+)
 from full_geometry.learning.training import Trained, train  # noqa: E402
 from full_geometry.models import storing  # noqa: E402
-from full_geometry.models.half_space import HalfSpace  # noqa: E402
-from full_geometry.models.object_model import FullGeometry  # noqa: E402
-from full_geometry.object.features import Side, n_pair, n_side, pair_features, reverse, side_features  # noqa: E402
-from full_geometry.object.first_event import first_event  # noqa: E402
-from full_geometry.object.identity import frame_of  # noqa: E402
+from full_geometry.models.object_model import (  # noqa: E402
+    FullGeometry,
+    HalfSpace,
+)
+from full_geometry.models.storing import frame_of  # noqa: E402
+from full_geometry.object.features import (  # noqa: E402
+    Side,
+    first_event,  # noqa: E402
+    n_pair,
+    n_side,
+    pair_features,
+    reverse,
+    side_features,
+)
 from full_geometry.object.pairs import EntryProposals  # noqa: E402
-from full_geometry.object.radiance import ExitRadiance, reference  # noqa: E402
 from full_geometry.object.subject import Subject  # noqa: E402
 from halfspace_sss import rendering  # noqa: E402
 from halfspace_sss.neural.store import load_weights, save_weights  # noqa: E402

@@ -19,8 +19,8 @@ from full_geometry.learning.fitting import Recipe  # noqa: E402
 from full_geometry.learning.model_errors import LIGHTS, measure, transport_of  # noqa: E402
 from full_geometry.learning.training import Trained, train  # noqa: E402
 from full_geometry.models import storing  # noqa: E402
-from full_geometry.models.half_space import HalfSpace  # noqa: E402
-from full_geometry.object.first_event import first_event, flight  # noqa: E402
+from full_geometry.models.object_model import HalfSpace  # noqa: E402
+from full_geometry.object.features import first_event, flight  # noqa: E402
 from full_geometry.object.pairs import EntryProposals  # noqa: E402
 from full_geometry.object.subject import Subject  # noqa: E402
 from halfspace_sss import rendering  # noqa: E402

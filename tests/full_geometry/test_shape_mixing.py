@@ -17,10 +17,12 @@ from figures.studies.held_out import HELD_OUT  # noqa: E402
 from full_geometry.learning.model_errors import errors_of  # noqa: E402
 from full_geometry.learning.shapes import make_shape  # noqa: E402
 from full_geometry.models.descriptors import mean_chord, mixed  # noqa: E402
-from full_geometry.models.half_space import HalfSpace  # noqa: E402
 from full_geometry.models.neural_shape import Backbone  # noqa: E402
-from full_geometry.object.features import Side  # noqa: E402
-from full_geometry.object.first_event import first_event  # noqa: E402
+from full_geometry.models.object_model import HalfSpace  # noqa: E402
+from full_geometry.object.features import (  # noqa: E402
+    Side,
+    first_event,
+)
 from full_geometry.object.subject import Subject, cosine_direction  # noqa: E402
 from halfspace_sss.rendering.object.points import SurfacePoint  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
