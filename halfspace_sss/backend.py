@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import os
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
@@ -13,8 +14,8 @@ from typing import Any
 from halfspace_sss.lazy import once
 
 __all__ = [
-    "BACKENDS", "BackendError", "array_types", "busy_threads", "kernel_seconds", "prefer_bundled_llvm", "prepare_llvm",
-    "two_threads",
+    "BACKENDS", "BackendError", "array_types", "busy_threads", "clock", "kernel_seconds", "prefer_bundled_llvm",
+    "prepare_llvm", "two_threads",
 ]  # fmt: skip
 
 BACKENDS = ("llvm", "cuda")
@@ -121,6 +122,13 @@ def busy_threads() -> int:
 
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return min(dr.thread_count(), cores)
+
+
+def clock() -> float:
+    """Seconds: on a CPU those of all threads over their number, on which what else runs has little influence."""
+    import mitsuba as mi
+
+    return time.process_time() / busy_threads() if mi.variant().startswith("llvm") else time.perf_counter()
 
 
 @once

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from halfspace_sss.backend import clock
 from halfspace_sss.comparison.model_errors import model_error, references
 from halfspace_sss.interface.model import model_class
 from halfspace_sss.neural.network import Network
@@ -21,7 +22,6 @@ from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED
 from halfspace_sss.trade.assessing import assess_stage
 from halfspace_sss.trade.results import ObjectTrade
-from halfspace_sss.trade.sampling import clock
 from halfspace_sss.trade.ways import Stage, Way
 
 __all__ = ["Setting", "channel_settings", "entry_settings", "node_settings", "precision_settings"]

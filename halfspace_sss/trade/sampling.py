@@ -10,14 +10,15 @@ from typing import Any
 
 import numpy as np
 
-from halfspace_sss.backend import busy_threads
+from halfspace_sss.backend import clock
 from halfspace_sss.rendering.object.settings import variant_channels
+from halfspace_sss.rendering.paths.gathering import PART
 from halfspace_sss.rendering.paths.integrator import is_bssrdf
 from halfspace_sss.trade.exits import Exits
 from halfspace_sss.trade.statistics import RadianceEstimate, seeded
 from halfspace_sss.trade.ways import Stage, Way
 
-__all__ = ["Sampled", "clock", "first_sample", "radiance", "sample_more", "warm_up"]
+__all__ = ["Sampled", "first_sample", "radiance", "sample_more", "warm_up"]
 
 LANES = 2**18  # of a launch
 PILOT, FEWEST = 64, 8  # samples of each exit by which the time is foreseen, and of a launch that is worth it
@@ -30,7 +31,8 @@ class Sampled:
 
     Attributes:
         estimate: radiance of the exits.
-        preparation: seconds, of tables and surveys, once for a scene.
+        preparation: seconds, of tables, surveys and gathering of all light, once for a scene.
+        preparing: seconds that it took here, where a part of the light is gathered; 0 if it was known.
         compilation: seconds of the first launch beyond those of the next, by the clock on the wall.
         compiling: the same by `clock`.
         overhead: seconds of a launch of hardly any samples.
@@ -40,6 +42,7 @@ class Sampled:
 
     estimate: RadianceEstimate
     preparation: float
+    preparing: float
     compilation: float
     compiling: float
     overhead: float
@@ -52,13 +55,6 @@ class Sampled:
         return min(max(took - self.overhead, LEAST_SHARE * took) / n for n, took in self.launches)
 
 
-def clock() -> float:
-    """Seconds: on a CPU those of all threads over their number, on which what else runs has little influence."""
-    import mitsuba as mi
-
-    return time.process_time() / busy_threads() if mi.variant().startswith("llvm") else time.perf_counter()
-
-
 def first_sample(stage: Stage, way: Way, exits: Exits, seed: int, object: int = 0) -> Sampled:
     """Make a way ready and take few samples, which compiles its kernels; nothing if an earlier look knows its pace.
 
@@ -67,17 +63,21 @@ def first_sample(stage: Stage, way: Way, exits: Exits, seed: int, object: int = 
     """
     if (object, way) in stage.paces:
         estimate = RadianceEstimate(variant_channels(), exits.n)
-        return replace(stage.paces[object, way], estimate=estimate, compilation=0.0, compiling=0.0)
+        return replace(stage.paces[object, way], estimate=estimate, preparing=0.0, compilation=0.0, compiling=0.0)
     integrator, started = stage.integrator(way), clock()
     _prepare(stage, integrator)
-    preparation, prepared = clock() - started, time.perf_counter()
+    preparation = preparing = clock() - started
+    prepared = time.perf_counter()
+    if way.part:  # of all samples, after what is made ready for parts and whole alike
+        made, light = integrator.gathering.seconds
+        preparation += made * (1 / PART - 1) + light
     estimate = RadianceEstimate(variant_channels(), exits.n)
     _, first = _launch(stage, integrator, exits, estimate, 2, seeded(seed, 31, 0))
     compiled = time.perf_counter()
     _, overhead = _launch(stage, integrator, exits, estimate, 2, seeded(seed, 31, 1))
     again = time.perf_counter() - compiled
     waited = max(compiled - prepared - again, 0.0)
-    found = Sampled(estimate, preparation, waited, max(first - overhead, 0.0), overhead)
+    found = Sampled(estimate, preparation, preparing, waited, max(first - overhead, 0.0), overhead)
     stage.paces[object, way] = found
     return found
 

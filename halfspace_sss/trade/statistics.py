@@ -4,18 +4,27 @@ With estimates a of a way and b of walks at n exits and C channels, and their va
 
     bias² = Σ_k,c [(a - b)² - var a - var b] / (n C),  over (mean b)²,
 
-whose mean over all samples is the true one; standard errors are those of the jackknife over exits. Variances of
-a sample are without the brightest of 10⁴ samples: fireflies, whose share of a variance no assessment can tell, and
-which images are rid of by filters rather than by samples.
+whose mean over all samples is the true one. Gathered light has noise of its own, which more samples do not take away:
+from two independent parts a_1 and a_2
+
+    bias² = Σ_k,c [(a_1 - b)(a_2 - b) - var b + kept (a_1 - a_2)² / 2] / (n C),  over (mean b)²,
+
+where `kept` is the share of the variance of a part that gathering with all samples has. Standard errors are those of
+the jackknife over exits. Variances of a sample are without the brightest of 10⁴ samples: fireflies, whose share of a
+variance no assessment can tell, and which images are rid of by filters rather than by samples.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-__all__ = ["FIREFLIES", "RadianceEstimate", "Number", "mean_square", "ratio_of_means", "relative_variance", "seeded"]
+__all__ = [
+    "FIREFLIES", "Number", "RadianceEstimate", "joined", "mean_square", "mean_square_of_parts", "ratio_of_means",
+    "relative_variance", "seeded",
+]  # fmt: skip
 
 FIREFLIES = 1e-4  # share of samples, the brightest, that variances of a sample leave out
 
@@ -79,6 +88,23 @@ def mean_square(a: RadianceEstimate, b: RadianceEstimate) -> Number:
     """Mean squared difference over the square of the mean radiance of b; may come out below 0 in noise."""
     square = ((a.mean - b.mean) ** 2 - a.variance - b.variance).mean(axis=0)
     return _ratio(square, b.mean.mean(axis=0), 2)
+
+
+def mean_square_of_parts(parts: tuple[RadianceEstimate, RadianceEstimate], b: RadianceEstimate, kept: float) -> Number:
+    """Mean squared difference of two independent parts over the square of the mean radiance of b."""
+    one, two = parts
+    left = (one.mean - b.mean) * (two.mean - b.mean) - b.variance
+    noise = 0.5 * ((one.mean - two.mean) ** 2 - one.variance - two.variance)
+    return _ratio((left + kept * noise).mean(axis=0), b.mean.mean(axis=0), 2)
+
+
+def joined(parts: Sequence[RadianceEstimate]) -> RadianceEstimate:
+    """All samples of several estimates at the same exits."""
+    found = RadianceEstimate(*parts[0].first.shape)
+    for part in parts:
+        found.add(part.first, part.second, part.samples)
+        found.bright = [tuple(map(np.concatenate, zip(*both))) for both in zip(found.bright, part.bright)]
+    return found
 
 
 def relative_variance(a: RadianceEstimate, b: RadianceEstimate) -> Number:

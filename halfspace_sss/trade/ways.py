@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from halfspace_sss.checks import check_choice
 from halfspace_sss.interface.model import model_class, models
 from halfspace_sss.rendering.object.placement import translucent_shapes
 from halfspace_sss.rendering.object.registry import AUTO, model_names
+from halfspace_sss.rendering.paths.gathering import Gathering
 from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED, load_objects, millimetres
 
 __all__ = ["GATHERED", "LAMBERT", "NO_SINGLE", "Stage", "Way", "stage", "ways"]
@@ -27,11 +28,18 @@ class Way:
         model: name of a model, or "path_traced".
         orders: "multiple" leaves single scattering out; None takes the orders of the scene.
         light: "sampled" or "gathered", see `Settings`.
+        part: of gathered light, see `Gathering`; 0 for all of it.
     """
 
     model: str
     orders: str | None = None
     light: str = "sampled"
+    part: int = 0
+
+    @property
+    def halves(self) -> tuple[Way, ...]:
+        """What it is measured by: itself, or two independent parts of gathered light."""
+        return (replace(self, part=1), replace(self, part=2)) if self.light == GATHERED else (self,)
 
     @property
     def name(self) -> str:
@@ -105,6 +113,8 @@ class Stage:
                 plugin |= {"orders": way.orders} if way.orders else {}
                 plugin["train_seconds"] = 0.0  # who asks does not wait for the training of an object
             self._integrators[way] = mi.load_dict(plugin)
+            if way.part:
+                self._integrators[way].gathering = Gathering(way.part)
         return self._integrators[way]
 
     def forget(self, way: Way) -> None:

@@ -250,10 +250,10 @@ def test_the_check_goes_on_where_it_stopped(tmp_path: Path, monkeypatch: pytest.
     from halfspace_sss.trade.checking import check, truth
 
     monkeypatch.setattr(check, "WAYS", ("path_traced", "lambert"))
-    first = check.check_scene(1, 0, tmp_path, 0.2, 0.3)
+    first = check.check_scene(random_scene(1, 0), tmp_path, 0.2, 0.3)
     monkeypatch.setattr(check, "assess_for", None)
     monkeypatch.setattr(truth, "assess_stage", None)
-    again = check.check_scene(1, 0, tmp_path, 0.2, 0.3)
+    again = check.check_scene(random_scene(1, 0), tmp_path, 0.2, 0.3)
     assert json.dumps(again) == json.dumps(first)
     found = check.outcome(first)
     assert (

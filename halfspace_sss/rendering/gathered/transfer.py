@@ -36,6 +36,7 @@ __all__ = ["Albedo", "Incident", "Transfer", "drawn", "transfer"]
 PER_LENGTH = 2.0  # points over a transport mean free path
 FEWEST, MOST = 1024, 8192  # points
 SAMPLES = 2**21  # entries of all points
+SEED = 7
 R_2 = 0.7548776662466927, 0.5698402909980532
 
 
@@ -129,10 +130,11 @@ def count_of(body: TranslucentObject) -> int:
     return int(np.clip(body.geometry.area * (PER_LENGTH * sigma) ** 2, FEWEST, MOST))
 
 
-def transfer(body: TranslucentObject, count: int | None = None, samples: int = SAMPLES) -> Transfer:
+def transfer(body: TranslucentObject, count: int | None = None, samples: int = SAMPLES, seed: int = SEED) -> Transfer:
     """The transfer of an object, by its model and the proposals of that."""
     points = SurfacePoints.of(body.geometry, count or count_of(body))
-    found = drawn(body, points, lambda p, n, _, active: points.nearest(p, n, active), max(samples // len(points), 16))
+    each = max(samples // len(points), 16)
+    found = drawn(body, points, lambda p, n, _, active: points.nearest(p, n, active), each, seed)
     t, error = _rows(points, found.S, _trusted(body), found.a)
     near = np.where(found.known, found.near, np.arange(len(points))[:, None])
     centred = _centred(found.w_o, found.a.mean(axis=2))
@@ -161,12 +163,12 @@ class DrawnEntries(NamedTuple):
     albedo: Albedo
 
 
-def drawn(body: TranslucentObject, points: SurfacePoints, cell: Callable, n: int) -> DrawnEntries:
+def drawn(body: TranslucentObject, points: SurfacePoints, cell: Callable, n: int, seed: int = SEED) -> DrawnEntries:
     """n entries for each point; `cell` of position, outward normal, face and mask says which they are near."""
     k = dr.arange(mi.UInt32, len(points) * n)
     j, s = k // n, k % n
     sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(7, dr.width(k))
+    sampler.seed(seed, dr.width(k))
     shift, active = sampler.next_2d(), mi.Bool(True)
     jitter = dr.gather(mi.Point2f, shift, j * n)
     u = [dr.fma(mi.Float(s), r, x) for r, x in zip(R_2, (jitter.x, jitter.y))]

@@ -18,7 +18,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from halfspace_sss.rendering.gathered.transfer import Albedo, Incident, Transfer, transfer
+from halfspace_sss.backend import clock
+from halfspace_sss.rendering.gathered.transfer import SAMPLES, SEED, Albedo, Incident, Transfer, transfer
 from halfspace_sss.rendering.object.points import cosine_above, place
 from halfspace_sss.rendering.paths.lighting import mis_weight
 from halfspace_sss.rendering.paths.path_loop import trace_paths
@@ -28,10 +29,11 @@ if TYPE_CHECKING:
     from halfspace_sss.rendering.object.points import SurfacePoint
     from halfspace_sss.rendering.object.settings import Settings
 
-__all__ = ["TRACED", "Gathered", "Gathering", "GatheringPoint", "by_cosine", "by_emitters", "spreads"]
+__all__ = ["PART", "TRACED", "Gathered", "Gathering", "GatheringPoint", "by_cosine", "by_emitters", "spreads"]
 
 DIRECTIONS = 2**20  # of all points of an object, by emitters, and as many by the cosine
 FEWEST, MOST = 64, 1024  # of a point
+PART = 1 / 8  # of the samples of a transfer
 TRACED = 8  # one of so many directions by the cosine is traced further, where it meets a surface
 
 
@@ -67,9 +69,18 @@ class Gathered:
 
 
 class Gathering:
-    """Gathered light of the objects of a scene, kept until something in the scene changes."""
+    """Gathered light of the objects of a scene, kept until something in the scene changes.
 
-    def __init__(self) -> None:
+    Args:
+        part: 0 for all samples; others are independent of each other, with a share `PART` of the samples of a transfer
+            and half the light.
+
+    Attributes:
+        seconds: by `clock`, of the transfers and of the light, as they were last found.
+    """
+
+    def __init__(self, part: int = 0) -> None:
+        self._part, self.seconds = part, (0.0, 0.0)
         self._bodies: list[TranslucentObject] = []
         self._transfers: list[Transfer] = []
         self._light: tuple[list, list] = ([], [])
@@ -86,19 +97,27 @@ class Gathering:
             for body, one in zip(bodies, spread):
                 if one:
                     _check(body)
-            self._transfers = [transfer(body) if one else None for body, one in zip(bodies, spread)]
-            self._bodies, self._light = bodies, ([], [])
+            started = clock()
+            samples = int(SAMPLES * PART) if self._part else SAMPLES
+            made = [
+                transfer(body, samples=samples, seed=SEED + self._part) if one else None
+                for body, one in zip(bodies, spread)
+            ]
+            self._transfers, self._bodies, self._light = made, bodies, ([], [])
+            self.seconds = (clock() - started, 0.0)
         state = _state(scene)
         if state[0] != self._light[0] or not self._found:
+            started = clock()
+            seeds = (1000 * self._part,) if self._part else (0, 1)
             gathered = [
-                body if T is None else _leaving(scene, bodies, k, T, settings)
+                body if T is None else _leaving(scene, bodies, k, T, settings, seeds)
                 for k, (body, T) in enumerate(zip(bodies, self._transfers))
             ]
             self._found = [
                 g if isinstance(g, type(body)) else replace(body, transport=None, proposals=None, gathered=g)
                 for g, body in zip(gathered, bodies)
             ]
-            self._light = state
+            self._light, self.seconds = state, (self.seconds[0], clock() - started)
         return self._found
 
     def told(self) -> list[str]:
@@ -140,13 +159,16 @@ def _state(scene: mi.Scene) -> tuple[list, list]:
     return keys, kept
 
 
-def _leaving(scene: mi.Scene, bodies: list[TranslucentObject], k: int, T: Transfer, settings: Settings) -> Gathered:
-    """B of object k, in two halves whose difference tells the noise."""
-    halves = [T @ _incident(scene, bodies, T, settings, seed) for seed in (2 * k, 2 * k + 1)]
-    B = (halves[0] + halves[1]) / 2
+def _leaving(
+    scene: mi.Scene, bodies: list[TranslucentObject], k: int, T: Transfer, settings: Settings, seeds: tuple[int, ...]
+) -> Gathered:
+    """B of object k, in parts whose differences tell the noise."""
+    parts = np.stack([T @ _incident(scene, bodies, T, settings, 2 * k + seed) for seed in seeds])
+    B = parts.mean(axis=0)
     if not np.isfinite(B).all():
         raise ValueError(f"light at object {bodies[k].geometry.name} must be finite, got NaN or infinity")
-    error = np.sqrt(((halves[0] - halves[1])[..., 0] ** 2).mean()) / 2 / max(float(B[..., 0].mean()), 1e-30)
+    spread = parts[..., 0].var(axis=0, ddof=1).mean() if len(parts) > 1 else np.nan
+    error = np.sqrt(spread / len(parts)) / max(float(B[..., 0].mean()), 1e-30)
     return Gathered(bodies[k], T, mi.Float(B.astype(np.float32).ravel()), float(error))
 
 

@@ -60,7 +60,7 @@ def _class(variant: str) -> type:
             self.timed = float(props.get("timeout", -1.0)) > 0
             self.settings = read_settings(props)
             self._bodies = TranslucentObjects(self.settings)
-            self._gathering = Gathering()
+            self.gathering = Gathering()
             self._control_variates = ControlVariates()
             self._controlled: list[TranslucentObject] | None = None  # while an image is rendered
 
@@ -74,7 +74,7 @@ def _class(variant: str) -> type:
             objects = self._bodies.of(scene)
             if self._bodies.choices.light != "gathered":
                 return objects
-            return self._gathering.of(scene, objects, self.settings)
+            return self.gathering.of(scene, objects, self.settings)
 
         def check(self, scene: mi.Scene, without: Collection[str] = ()) -> None:
             """ValueError if the scene cannot be rendered, as far as can be told without the objects `without`."""
@@ -140,7 +140,7 @@ def _class(variant: str) -> type:
         @property
         def gathered(self) -> list[str]:
             """A sentence on the light that was gathered for each object, with its noise."""
-            return self._gathering.told()
+            return self.gathering.told()
 
         def to_string(self) -> str:
             return f"BSSRDFIntegrator[{self.settings}]"

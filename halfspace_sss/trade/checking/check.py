@@ -12,7 +12,7 @@ from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED
 from halfspace_sss.trade.advice import Job, advise
 from halfspace_sss.trade.assessing import assess_for
 from halfspace_sss.trade.automatic import picked
-from halfspace_sss.trade.checking.random_scenes import RandomScene, random_scene, write_scene
+from halfspace_sss.trade.checking.random_scenes import RandomScene, write_scene
 from halfspace_sss.trade.checking.truth import long_run
 from halfspace_sss.trade.results import Assessment, WayTrade
 from halfspace_sss.trade.statistics import seeded
@@ -24,17 +24,16 @@ WAYS = (
     PATH_TRACED, "lambert", "better_dipole", "directional_dipole", "neural", "better_dipole, gathered",
     "directional_dipole, gathered", "neural, gathered",
 )  # fmt: skip
-FORMAT = "halfspace-sss trade check 3"
+FORMAT = "halfspace-sss trade check 4"
 
 
-def check_scene(number: int, seed: int, folder: Path, seconds: float, truth_seconds: float) -> dict[str, Any]:
+def check_scene(scene: RandomScene, folder: Path, seconds: float, truth_seconds: float) -> dict[str, Any]:
     """The record of a scene: the assessment, and the mean of long runs; what the folder holds is not run again."""
-    scene = random_scene(number, seed)
     file = write_scene(scene, folder)
     on, ways = stage(file), [Way.of(name) for name in WAYS]
     quick = _quick(scene, on, ways, file.with_suffix(".json"), seconds)
     truth = file.with_suffix(".truth.json")
-    long = long_run(on, ways, scene.tolerance, truth, seeded(seed, number, 1), truth_seconds)
+    long = long_run(on, ways, scene.tolerance, truth, seeded(scene.seed, scene.number, 1), truth_seconds)
     return {"scene": scene.record(), "quick": quick, "long": long.record()}
 
 

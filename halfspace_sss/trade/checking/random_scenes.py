@@ -14,10 +14,11 @@ from halfspace_sss.provenance import write_atomically
 __all__ = ["LIGHTS", "SHAPES", "RandomScene", "mesh_file", "random_scene", "write_scene"]
 
 SHAPES = ("ball", "blob", "slab", "ring", "spikes")
-LIGHTS = ("sky", "lamp", "lamp and sky")
+LIGHTS = ("sky", "lamp", "lamp and sky", "windows")
 SIZE = 100.0  # mm across; sizes in mean free paths come by sigma_t
 COLUMNS, ROWS = 96, 48  # of the mesh
 FILM = 512
+WINDOWS = "windows.pfm"  # an environment map
 
 
 @dataclass(frozen=True)
@@ -51,10 +52,11 @@ class RandomScene:
         return asdict(self)
 
 
-def random_scene(number: int, seed: int = 0) -> RandomScene:
+def random_scene(number: int, seed: int = 0, tolerance: float | None = None) -> RandomScene:
     """The scene of a number, whatever others are drawn.
 
-    Sizes are 2 to 1000 mean free paths, 1 - albedo is log-uniform from 2e-4 to 0.7, tolerances from 0.03 to 0.3.
+    Sizes are 2 to 1000 mean free paths, 1 - albedo is log-uniform from 2e-4 to 0.7, tolerances from 0.03 to 0.3 unless
+    one is given.
     """
     check_count("number", number, 0)
     check_count("seed", seed, 0)
@@ -64,11 +66,11 @@ def random_scene(number: int, seed: int = 0) -> RandomScene:
     sigma_t[1] = mfp / SIZE
     albedo = 1 - 10 ** np.clip(rng.uniform(np.log10(2e-4), np.log10(0.7)) + rng.uniform(-0.5, 0.5, 3), -3.7, -0.15)
     view = rng.standard_normal(3) * (1, 0.4, 1) + (0, 0.5, 0)
+    drawn = float(f"{10 ** rng.uniform(np.log10(0.03), np.log10(0.3)):.3g}")
     return RandomScene(
         seed, number, str(rng.choice(SHAPES)), str(rng.choice(LIGHTS)), _digits(sigma_t), _digits(albedo),
         float(rng.choice([0.0, 0.0, 0.5, 0.8])), float(rng.choice([1.0, 1.3, 1.3, 1.5])), round(mfp, 3),
-        _digits(view / np.linalg.norm(view)), float(f"{10 ** rng.uniform(np.log10(0.03), np.log10(0.3)):.3g}"),
-        int(rng.choice([1, 10, 100])),
+        _digits(view / np.linalg.norm(view)), drawn if tolerance is None else tolerance, int(rng.choice([1, 10, 100])),
     )  # fmt: skip
 
 
@@ -77,10 +79,12 @@ def _digits(values: np.ndarray) -> tuple[float, ...]:
 
 
 def write_scene(scene: RandomScene, folder: Path) -> Path:
-    """Write NAME.xml and its mesh NAME.ply; the path of the first."""
+    """Write NAME.xml, its mesh NAME.ply and the map of its environment, if any; the path of the first."""
     mesh = mesh_file(scene, folder)
     file = mesh.with_suffix(".xml")
     write_atomically(file, _xml(scene, mesh.name))
+    if scene.light == "windows":
+        write_atomically(folder / WINDOWS, _windows())
     return file
 
 
@@ -151,6 +155,16 @@ def _ply(v: np.ndarray, faces: np.ndarray) -> bytes:
     return head.encode() + v.astype("<f4").tobytes() + rows.tobytes()
 
 
+def _windows(height: int = 64) -> bytes:
+    """A dim room with two windows, radiance from all directions as a PFM file."""
+    theta, phi = (np.arange(height) + 0.5) / height * np.pi, (np.arange(2 * height) + 0.5) / height * np.pi
+    image = np.full((height, 2 * height, 3), 0.15, dtype="<f4")
+    for at, size, radiance in (((1.0, 5.2), (0.35, 0.45), (6.4, 6.6, 7.0)), ((1.2, 2.2), (0.5, 0.25), (3.0, 2.8, 2.4))):
+        inside = (abs(theta - at[0]) < size[0])[:, None] & (abs(phi - at[1]) < size[1])
+        image[inside] = radiance
+    return f"PF\n{2 * height} {height}\n-1.0\n".encode() + image[::-1].tobytes()  # from the lowest row up
+
+
 def _xml(scene: RandomScene, mesh: str) -> str:
     numbers = {key: ", ".join(f"{v:.6g}" for v in getattr(scene, key)) for key in ("sigma_t", "albedo")}
     origin = ", ".join(f"{2.2 * SIZE * v:.6g}" for v in scene.view)
@@ -160,6 +174,7 @@ def _xml(scene: RandomScene, mesh: str) -> str:
         '    <emitter type="area"><rgb name="radiance" value="60, 57, 52"/></emitter></shape>\n'
     )
     lights = {"sky": sky.format("1"), "lamp": lamp, "lamp and sky": lamp + sky.format("0.4, 0.45, 0.5")}
+    lights["windows"] = f'  <emitter type="envmap"><string name="filename" value="{WINDOWS}"/></emitter>\n'
     return f"""<scene version="3.0.0">
   <integrator type="bssrdf"><boolean name="hide_emitters" value="true"/></integrator>
 {lights[scene.light]}  <shape type="ply" id="object"><string name="filename" value="{mesh}"/>

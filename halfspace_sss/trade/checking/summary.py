@@ -83,7 +83,9 @@ def markdown(found: dict[str, Any], table: pandas.DataFrame, how: dict[str, Any]
         how: scenes, first, seed, assess, truth: what was asked.
     """
     n, z = found["scenes"], found["z"]
-    arguments = " ".join(f"--{key} {how[key]}" for key in ("scenes", "first", "seed"))
+    arguments = " ".join(
+        f"--{key} {how[key]}" for key in ("scenes", "first", "seed", "tolerance") if how[key] is not None
+    )
     lines = [
         INTRODUCTION.format(arguments=f"`{arguments}`", ways=len(WAYS), **{k: how[k] for k in ("assess", "truth")}),
         f"{found['kept']} of {n} recommendations keep their tolerance (within two standard errors of the long run), "

@@ -19,6 +19,7 @@ def check_command(
     scenes: Annotated[int, typer.Option(help="How many.", parser=whole)] = 60,
     first: Annotated[int, typer.Option(help="Number of the first one.", parser=whole)] = 0,
     seed: Annotated[int, typer.Option(help="Other seeds draw other scenes.", parser=whole)] = 0,
+    tolerance: Annotated[float | None, typer.Option(help="Of all scenes; drawn for each if not given.")] = None,
     assess: Annotated[float, typer.Option(help="Seconds of measuring for a recommendation.")] = 4.0,
     truth: Annotated[float, typer.Option(help="Most seconds of the long runs, with seeds of their own.")] = 24.0,
     write_only: Annotated[bool, typer.Option("--write-only", help="Write the scenes, measure nothing.")] = False,
@@ -31,15 +32,17 @@ def check_command(
     check_count("scenes", scenes, 1)
     check_count("first", first, 0)
     check_count("seed", seed, 0)
+    if tolerance is not None:
+        check_interval("tolerance", tolerance, 1e-4, 10.0)
     check_interval("assess", assess, 0.05, 1e5)
     check_interval("truth", truth, 0.05, 1e6)
     check_folder(out)
     numbers = range(first, first + scenes)
-    if write_only:
-        from halfspace_sss.trade.checking.random_scenes import random_scene, write_scene
+    from halfspace_sss.trade.checking.random_scenes import random_scene, write_scene
 
+    if write_only:
         for k in numbers:
-            console().print(f"  {write_scene(random_scene(k, seed), out)}", highlight=False, soft_wrap=True)
+            console().print(f"  {write_scene(random_scene(k, seed, tolerance), out)}", highlight=False, soft_wrap=True)
         return
     use_mitsuba(variant)
     from halfspace_sss.provenance import provenance, write_together
@@ -49,10 +52,10 @@ def check_command(
     records = []
     with Bar("scenes") as bar:
         for k in numbers:
-            records.append(check_scene(k, seed, out, assess, truth))
+            records.append(check_scene(random_scene(k, seed, tolerance), out, assess, truth))
             bar.show(len(records), scenes, f"scene {k}")
     table, found = outcomes(records), summary(records)
-    how = {"scenes": scenes, "first": first, "seed": seed, "assess": assess, "truth": truth}
+    how = {"scenes": scenes, "first": first, "seed": seed, "tolerance": tolerance, "assess": assess, "truth": truth}
     text = markdown(found, table, how)
     about = {"provenance": provenance(**how), **found}
     write_together(
