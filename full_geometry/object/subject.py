@@ -12,8 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from halfspace_sss.physics.medium import Medium
-from halfspace_sss.rendering.object.body import check_size
-from halfspace_sss.rendering.object.placement import check_empty
+from halfspace_sss.rendering.object.body import check_empty, check_size
 from halfspace_sss.rendering.object.points import AreaPoints, SurfacePoint, cosine_above, lifted, number, turned
 from halfspace_sss.rendering.object.shape import Geometry, name_of, survey
 from halfspace_sss.rendering.object.translucent import Inside, is_translucent, smooth_boundary

@@ -8,7 +8,7 @@ from typing import Any
 
 from halfspace_sss.checks import check_choice
 from halfspace_sss.interface.model import model_class, models
-from halfspace_sss.rendering.object.placement import translucent_shapes
+from halfspace_sss.rendering.object.body import translucent_shapes
 from halfspace_sss.rendering.object.registry import AUTO, model_names
 from halfspace_sss.rendering.paths.gathering import Gathering
 from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED, load_objects, millimetres

@@ -18,8 +18,7 @@ import numpy as np
 from halfspace_sss.rendering.gathered.patches import PatchTransfer, patch_transfer, uniform_entries
 from halfspace_sss.rendering.object.points import SurfacePoint, number
 from halfspace_sss.rendering.paths.gathering import TRACED, GatheringPoint, by_cosine, by_emitters, spreads
-from halfspace_sss.rendering.paths.lighting import RenderContext
-from halfspace_sss.rendering.paths.path_tally import Primal
+from halfspace_sss.rendering.paths.lighting import Primal, RenderContext
 
 if TYPE_CHECKING:
     from halfspace_sss.rendering.object.body import TranslucentObject

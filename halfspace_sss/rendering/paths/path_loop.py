@@ -2,8 +2,8 @@
 
 At every vertex, as in Mitsuba's `prb_volpath`: emission with its MIS weight, choice of an event, next-event estimation,
 throughput, Russian roulette. At a translucent object the events are reflection, the scattering orders below two
-(`low_orders`), and all others by the BSSRDF of the object. In a replay (`path_tally`) what decides where the path goes
-is `detached` from what its light is multiplied with.
+(`low_orders`), and all others by the BSSRDF of the object. In a replay (`lighting.Replay`) what decides where the
+path goes is `detached` from what its light is multiplied with.
 """
 
 from __future__ import annotations
@@ -19,9 +19,16 @@ import mitsuba as mi
 from halfspace_sss.rendering.object.body import TranslucentObject
 from halfspace_sss.rendering.object.points import SurfacePoint, lifted, number, place, turned
 from halfspace_sss.rendering.object.settings import Settings
-from halfspace_sss.rendering.paths.lighting import RenderContext, delta_light, mis_weight, sample_emitter
+from halfspace_sss.rendering.paths.lighting import (
+    PathTally,
+    Primal,
+    RenderContext,
+    Replay,
+    delta_light,
+    mis_weight,
+    sample_emitter,
+)
 from halfspace_sss.rendering.paths.low_orders import RefractedRay, sample_low_orders
-from halfspace_sss.rendering.paths.path_tally import PathTally, Primal, Replay
 
 __all__ = ["exit_at", "replay_paths", "trace_paths"]
 

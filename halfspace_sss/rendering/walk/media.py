@@ -11,7 +11,7 @@ import numpy as np
 
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.light.small_emitters import is_delta
-from halfspace_sss.rendering.object.placement import Content, contents, translucent_shapes
+from halfspace_sss.rendering.object.body import Content, contents, translucent_shapes
 from halfspace_sss.rendering.object.points import lift
 from halfspace_sss.rendering.object.shape import Geometry, check_together, scene_of, survey
 from halfspace_sss.rendering.object.translucent import Inside, is_translucent
