@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperGroup
 
+from halfspace_sss.checks import check_count
 from halfspace_sss.cli.shared import (
     Albedo,
     Bar,
@@ -104,7 +106,9 @@ def material_command(
     """Train the network of a medium, for each channel of materials or of the coefficients that are given."""
     _need_torch()
     media = _media(material or [], channel, {"sigma_t": sigma_t, "albedo": albedo, "g": g, "eta": eta})
-    recipe = _recipe(fast, steps)
+    from halfspace_sss.neural.training.train_material import FAST, STANDARD
+
+    recipe = _of_steps(FAST if fast else STANDARD, steps)
     rows = []
     with Bar("training") as bar:
         for name, medium in media.items():
@@ -158,15 +162,9 @@ def universal_command(
 ) -> None:
     """Train the network for all media, in half an hour; the folder also holds what a killed run goes on with."""
     _need_torch()
-    from dataclasses import replace
-
-    from halfspace_sss.checks import check_count
     from halfspace_sss.neural.training.train_universal import UniversalRecipe, train_universal
 
-    recipe = UniversalRecipe()
-    if steps is not None:
-        check_count("steps", steps, 1)
-        recipe = replace(recipe, how=replace(recipe.how, steps=steps))
+    recipe = _of_steps(UniversalRecipe(), steps)
     with Bar("universal") as bar:
         path = train_universal(
             out, seed, recipe, backend=backend, progress=lambda what, done, total: bar.show(done, total, what)
@@ -212,13 +210,8 @@ def _media(names: list[str], channel: str | None, given: dict[str, float | None]
     return {found.name: found.medium for found in map(materials.load, names)}
 
 
-def _recipe(fast: bool, steps: int | None) -> Any:
-    from dataclasses import replace
-
-    from halfspace_sss.checks import check_count
-    from halfspace_sss.neural.training.train_material import FAST, STANDARD
-
-    recipe = FAST if fast else STANDARD
+def _of_steps(recipe: Any, steps: int | None) -> Any:
+    """A recipe with another number of steps, if one is given."""
     if steps is None:
         return recipe
     check_count("steps", steps, 1)

@@ -10,8 +10,8 @@ from typing import Any
 
 from halfspace_sss.backend import clock
 from halfspace_sss.checks import check_count, check_interval, renamed
-from halfspace_sss.extensions import LEARNERS, offered
 from halfspace_sss.progress import NamedProgress
+from halfspace_sss.rendering.object.registry import learnt_names, lookup
 from halfspace_sss.rendering.object.shape import survey
 from halfspace_sss.rendering.paths.gathering import PART
 from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED, first_cause
@@ -239,10 +239,9 @@ def training_seconds(scene: Any, object: str, model: str) -> float:
 
     A learner of the group `halfspace_sss.learners` tells them by a function `cost(scene, object)`.
     """
-    for name, found in offered(LEARNERS):
-        if name == model and callable(getattr(found, "cost", None)):
-            return float(found.cost(scene, object))
-    return 0.0
+    learner = lookup(model).learner if model in learnt_names() else None
+    cost = getattr(learner, "cost", None)
+    return float(cost(scene, object)) if callable(cost) else 0.0
 
 
 # --------------------------------------------------------------------------------------------------

@@ -90,7 +90,7 @@ def _measured(on: Stage, named: list[str], settings: Settings) -> dict[str, Any]
     lights = ("sampled", GATHERED) if settings.light == AUTO else (settings.light,)
     models = model_names() if AUTO in named else dict.fromkeys(named)
     ways = [Way(PATH_TRACED)]
-    ways += [Way.of(_way(name, light)) for name in models if name != AUTO for light in lights if _has(name, light)]
+    ways += [_way(name, light) for name in models if name != AUTO for light in lights if _has(name, light)]
     samples = _samples(on, settings.choice_share / len(ways))
     found = assess_stage(on, ways, samples=samples, exits=EXITS)
     picks = {light: [picked(o, settings.tolerance, light, name) for o, name in zip(found.objects, named)]
@@ -107,8 +107,8 @@ def _has(model: str, light: str) -> bool:
     return model != LAMBERT or light == "sampled"
 
 
-def _way(model: str, light: str) -> str:
-    return f"{model}, {GATHERED}" if light == GATHERED and model != LAMBERT else model
+def _way(model: str, light: str) -> Way:
+    return Way(model, light=light if _has(model, light) else "sampled")
 
 
 def _samples(on: Stage, share: float) -> int:
@@ -135,7 +135,7 @@ def _total(picks: list[Pick]) -> float:
 def picked(found: ObjectTrade, tolerance: float, light: str = "sampled", model: str = AUTO) -> Pick:
     """The model for an object among those of one kind of light, or what can be said of the one that is named."""
     names = model_names() if model == AUTO else (model,)
-    ways = {_way(name, light): name for name in names if name != AUTO}
+    ways = {_way(name, light).name: name for name in names if name != AUTO}
     rows = [row for row in found.ways if not row.refusal and row.way in ways]
     if not rows or found.is_dark:
         name = _default([ways[row.way] for row in rows] or list(ways.values()))

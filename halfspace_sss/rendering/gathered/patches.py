@@ -25,14 +25,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from halfspace_sss.rendering.gathered.points import SurfacePoints
+from halfspace_sss.rendering.gathered.points import SurfacePoints, uniform_entries
 from halfspace_sss.rendering.gathered.transfer import Albedo, drawn
-from halfspace_sss.rendering.object.points import AreaPoints, EntrySample, SurfacePoint, cosine_above, number, turned
+from halfspace_sss.rendering.object.points import AreaPoints, EntrySample, SurfacePoint, cosine_above
 
 if TYPE_CHECKING:
     from halfspace_sss.rendering.object.body import TranslucentObject
 
-__all__ = ["PatchTransfer", "TransferRow", "patch_transfer", "uniform_entries"]
+__all__ = ["PatchTransfer", "TransferRow", "patch_transfer"]
 
 PER_LENGTH = 1.0  # points over a transport mean free path
 FEWEST, MOST = 1024, 2048  # points: 13 MB to 50 MB for three channels
@@ -130,16 +130,6 @@ class SurfaceCells:
         return dr.gather(mi.UInt32, k, face, active), active & dr.gather(mi.Bool, found, face, active)
 
 
-def uniform_entries(body: TranslucentObject, u_face: mi.Float, u: mi.Point2f) -> EntrySample:
-    """Points uniform over the area of an object."""
-    at = AreaPoints(body.geometry.shape).sample(u_face, u, mi.Bool(True))
-    face = mi.UInt32(at.prim_index) + dr.zeros(mi.UInt32, dr.width(u))
-    sign = body.geometry.side(face)
-    n_out = mi.Normal3f(turned(mi.Normal3f(at.n_shading), mi.Normal3f(at.n))) * sign
-    n = mi.Normal3f(at.n) * sign
-    return EntrySample(mi.Point3f(at.p), n, mi.Normal3f(n_out), number(body.geometry.area), face)
-
-
 def patch_transfer(body: TranslucentObject, count: int | None = None, samples: int = SAMPLES) -> PatchTransfer:
     """T of an object, estimated by entries that the proposals of its model draw for exits at all points."""
     sigma = np.mean([float(m.sigma_t_prime) for m in body.media])
@@ -199,7 +189,7 @@ def _areas(body: TranslucentObject, cells: SurfaceCells) -> tuple[np.ndarray, En
     """Of all cells, and `PAIRS` places in each; the middle of those without."""
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(5, PLACES)
-    at = uniform_entries(body, sampler.next_1d(), sampler.next_2d())
+    at = uniform_entries(body.geometry, sampler.next_1d(), sampler.next_2d())
     k, known = cells(at.p, at.n, at.face, mi.Bool(True))
     k = np.where(np.array(known), np.array(k), len(cells.points))
     counts = np.bincount(k, minlength=len(cells.points) + 1)[:-1]

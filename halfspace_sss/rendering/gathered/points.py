@@ -17,13 +17,21 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from halfspace_sss.rendering.object.points import AreaPoints, SurfacePoint, cosine_above, lifted, number, turned
+from halfspace_sss.rendering.object.points import (
+    AreaPoints,
+    EntrySample,
+    SurfacePoint,
+    cosine_above,
+    lifted,
+    number,
+    turned,
+)
 from halfspace_sss.rendering.object.shape import Geometry
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-__all__ = ["SurfacePoints"]
+__all__ = ["SurfacePoints", "uniform_entries"]
 
 REACH = 2.0  # h over the mean distance of points
 MOST_CELLS = 2**22
@@ -32,6 +40,16 @@ R_3 = (
     0.6710436067037893,
     0.5497004779019703,
 )  # of three dimensions (Roberts 2018)
+
+
+def uniform_entries(geometry: Geometry, u_face: mi.Float, u: mi.Point2f) -> EntrySample:
+    """Points uniform over the area of an object."""
+    at = AreaPoints(geometry.shape).sample(u_face, u, mi.Bool(True))
+    face = mi.UInt32(at.prim_index) + dr.zeros(mi.UInt32, dr.width(u))
+    sign = geometry.side(face)
+    n_out = mi.Normal3f(turned(mi.Normal3f(at.n_shading), mi.Normal3f(at.n))) * sign
+    n = mi.Normal3f(at.n) * sign
+    return EntrySample(mi.Point3f(at.p), n, mi.Normal3f(n_out), number(geometry.area), face)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,15 +78,9 @@ class SurfacePoints:
     @classmethod
     def of(cls, found: Geometry, count: int) -> SurfacePoints:
         """`count` points of an object."""
-        k = dr.arange(mi.UInt32, count)
         u = [mi.Float(((np.arange(1, count + 1) * r + 0.5) % 1.0).astype(np.float32)) for r in R_3]
-        at = AreaPoints(found.shape).sample(u[0], mi.Point2f(u[1], u[2]), mi.Bool(True))
-        face = mi.UInt32(at.prim_index) + dr.zeros(mi.UInt32, count)
-        sign = found.side(face)
-        n = mi.Normal3f(at.n) * sign
-        n_out = mi.Normal3f(turned(mi.Normal3f(at.n_shading), mi.Normal3f(at.n))) * sign
-        p = mi.Point3f(at.p)
-        dr.eval(p, n, n_out, face, k)
+        p, n, n_out, _, face = uniform_entries(found, u[0], mi.Point2f(u[1], u[2]))
+        dr.eval(p, n, n_out, face)
         h = REACH * float(np.sqrt(found.area / count))
         return cls(p, n, n_out, face, *_grid(np.array(p).T, h))
 

@@ -15,8 +15,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from halfspace_sss.rendering.gathered.patches import PatchTransfer, patch_transfer, uniform_entries
+from halfspace_sss.rendering.gathered.patches import PatchTransfer, patch_transfer
+from halfspace_sss.rendering.gathered.points import uniform_entries
 from halfspace_sss.rendering.object.points import SurfacePoint, number
+from halfspace_sss.rendering.object.shape import same_objects
 from halfspace_sss.rendering.paths.gathering import TRACED, GatheringPoint, by_cosine, by_emitters, spreads
 from halfspace_sss.rendering.paths.lighting import Primal, RenderContext
 
@@ -68,7 +70,7 @@ class ControlVariates:
             seed: of the points at which light is gathered.
             spp, pixels: samples of a pixel, and pixels.
         """
-        if len(bodies) != len(self._bodies) or any(a is not b for a, b in zip(bodies, self._bodies)):
+        if not same_objects(bodies, self._bodies):
             self._transfers = [patch_transfer(body) if _applies(body) else None for body in bodies]
             self._bodies = bodies
         context, found = RenderContext.of(scene, bodies, settings, Primal()), []
@@ -101,7 +103,7 @@ def _arriving(
     """Phi, (channels, cells), and the relative variance of light in a cell, per channel."""
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(int(np.random.SeedSequence([seed, 28]).generate_state(1)[0]), count)
-    entry = uniform_entries(body, sampler.next_1d(), sampler.next_2d())
+    entry = uniform_entries(body.geometry, sampler.next_1d(), sampler.next_2d())
     k, known = T.cells(entry.p, entry.n, entry.face, mi.Bool(True))
     at = GatheringPoint(entry.p, entry.n, entry.n_out)
     aimed, _ = by_emitters(context.scene, T.albedo, at, sampler.next_2d())

@@ -19,8 +19,9 @@ import mitsuba as mi
 import numpy as np
 
 from halfspace_sss.backend import clock
-from halfspace_sss.rendering.gathered.transfer import SAMPLES, SEED, Albedo, Incident, Transfer, transfer
+from halfspace_sss.rendering.gathered.transfer import SAMPLES, SEED, Albedo, Incident, Transfer, cosine, transfer
 from halfspace_sss.rendering.object.points import cosine_above, place
+from halfspace_sss.rendering.object.shape import same_objects
 from halfspace_sss.rendering.paths.lighting import mis_weight
 from halfspace_sss.rendering.paths.path_loop import trace_paths
 
@@ -92,7 +93,7 @@ class Gathering:
         Raises:
             ValueError: an object is open or has no known area, or light that arrives is not finite.
         """
-        if len(bodies) != len(self._bodies) or any(a is not b for a, b in zip(bodies, self._bodies)):
+        if not same_objects(bodies, self._bodies):
             spread = [spreads(body) for body in bodies]
             for body, one in zip(bodies, spread):
                 if one:
@@ -225,7 +226,7 @@ def _stratified(sampler: mi.Sampler, j: mi.UInt32, s: mi.UInt32, n: int) -> mi.P
 
 def _weight(albedo: Albedo, at: GatheringPoint, w: mi.Vector3f) -> tuple[mi.Spectrum, mi.Float]:
     """a(mu) mu over the density of the cosine, and that density."""
-    mu = dr.select(dr.dot(w, at.n) > 0, dr.abs(dr.dot(w, at.n_out)), 0)
+    mu = cosine(w, at.n, at.n_out)
     return albedo(mu) * dr.pi, mu * dr.inv_pi
 
 
