@@ -37,22 +37,22 @@ def sampled(task: Task) -> dict[str, Any]:
     from figures.studies.paper_flow import fit_space_flow, mesh_arrays, on_surface, rmsd
     from full_geometry.learning.training import train_by_cpu
     from full_geometry.models.storing import frame_of
-    from full_geometry.object.subject import Subject
+    from full_geometry.object.learnable import object_of
 
     prepare()
     p, n = task.params, task.params["points"]
-    subject = Subject.of(*shape_of(p["object"], task.folder, p["resolution"], p["seed"]))
-    learnt, _ = train_by_cpu(subject, p["seconds"], task.folder, seed=p["seed"])
+    obj = object_of(*shape_of(p["object"], task.folder, p["resolution"], p["seed"]))
+    learnt, _ = train_by_cpu(obj, p["seconds"], task.folder, seed=p["seed"])
     task.progress(1, 3)
-    frame = frame_of(subject)
+    frame = frame_of(obj)
     flow = fit_space_flow(learnt.model, frame, p["seconds"], p["seed"])
     task.progress(2, 3)
-    vertices, faces = mesh_arrays(subject, frame)
-    exit = _exit(subject, p["towards"])
+    vertices, faces = mesh_arrays(obj, frame)
+    exit = _exit(obj, p["towards"])
     in_space = flow.sample(exit, n, p["seed"])[0]
     rng = np.random.default_rng(p["seed"])
     found = {
-        "uniform": _positions(frame, subject.random_points(_lanes(n, 41)).p),
+        "uniform": _positions(frame, obj.random_points(_lanes(n, 41)).p),
         "flow in space": in_space,
         "flow on the surface": on_surface(in_space, vertices, faces, p["seed"]),
         "patches": _positions(frame, _by_patches(learnt, exit, n)),
@@ -75,12 +75,12 @@ def _lanes(n: int, seed: int) -> Any:
     return generator(mi, n, pass_seed(seed))
 
 
-def _exit(subject: Any, towards: list[float]) -> Any:
+def _exit(obj: Any, towards: list[float]) -> Any:
     """The point of the surface that lies farthest towards the eye among those that face it, seen along its normal."""
     import drjit as dr
     import mitsuba as mi
 
-    points = subject.random_points(_lanes(4096, 40))
+    points = obj.random_points(_lanes(4096, 40))
     eye = np.array(towards) / np.linalg.norm(towards)
     faces_it = eye @ np.array(points.n) > 0.8
     k = int(np.argmax(np.where(faces_it, eye @ np.array(points.p), -np.inf)))
@@ -96,7 +96,7 @@ def _by_patches(learnt: Any, exit: Any, n: int) -> Any:
 
     rng = _lanes(n, 42)
     at = exit.gather(dr.zeros(mi.UInt32, n))
-    weights = learnt.sampler.prepare(Side(at, first_event(learnt.model.subject, at)))
+    weights = learnt.sampler.prepare(Side(at, first_event(learnt.model.object, at)))
     u = (rng.next_float32(), rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32()))
     return learnt.sampler.sample(weights, *u)[0].p
 

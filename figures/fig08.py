@@ -36,11 +36,11 @@ def parts(quality: str) -> list[Part]:
     return found
 
 
-def truth_of(subject: Any, p: Mapping[str, Any]) -> Any:
+def truth_of(obj: Any, p: Mapping[str, Any]) -> Any:
     """Exits and their radiance."""
     from full_geometry.learning.model_errors import reference
 
-    return reference(subject, p["exits"], p["walks"], p["seed"])
+    return reference(obj, p["exits"], p["walks"], p["seed"])
 
 
 def _rmse(found: Any, truth: Any, per_estimate: float) -> dict[str, float]:
@@ -67,15 +67,15 @@ def ours(task: Task) -> dict[str, Any]:
     from full_geometry.learning.model_errors import modelled
     from full_geometry.learning.training import train_by_cpu
     from full_geometry.models.object_model import HalfSpace
+    from full_geometry.object.learnable import object_of
     from full_geometry.object.pairs import EntryProposals
-    from full_geometry.object.subject import Subject
 
     prepare()
     p = task.params
-    subject = Subject.of(*shape_of("bunny", task.folder))
-    learnt, _ = train_by_cpu(subject, p["seconds"], task.folder, seed=p["seed"])
-    truth = truth_of(subject, p)
-    proposals = EntryProposals(subject, HalfSpace(subject, BACKBONE)).with_patches(learnt.sampler)
+    obj = object_of(*shape_of("bunny", task.folder))
+    learnt, _ = train_by_cpu(obj, p["seconds"], task.folder, seed=p["seed"])
+    truth = truth_of(obj, p)
+    proposals = EntryProposals(obj, HalfSpace(obj, BACKBONE)).with_patches(learnt.sampler)
     found = modelled(learnt.model, proposals, truth.exits, p["walks"], p["seed"])
     rows = [{"method": OURS, "N": n, **_rmse(found, truth, p["walks"] / n)} for n in p["numbers"]]
     return {"rows": rows}
@@ -84,16 +84,16 @@ def ours(task: Task) -> dict[str, Any]:
 def papers(task: Task) -> dict[str, Any]:
     """Errors of the paper's network for one N, its points from walks and uniform."""
     from figures.studies.paper_network import PaperRecipe, estimate, fit_paper
-    from full_geometry.object.subject import Subject
+    from full_geometry.object.learnable import object_of
 
     prepare()
     p, repeats = task.params, 8
-    subject = Subject.of(*shape_of("bunny", task.folder))
-    truth = truth_of(subject, p)
-    net, steps = fit_paper(subject, PaperRecipe(n=p["n"], seconds=p["seconds"]), p["seed"])
+    obj = object_of(*shape_of("bunny", task.folder))
+    truth = truth_of(obj, p)
+    net, steps = fit_paper(obj, PaperRecipe(n=p["n"], seconds=p["seconds"]), p["seed"])
     rows = []
     for points, name in (("walks", "paper, points of walks"), ("uniform", "paper, uniform points")):
-        found = estimate(subject, net, truth.exits, points, repeats, p["seed"])
+        found = estimate(obj, net, truth.exits, points, repeats, p["seed"])
         rows.append({"method": name, "N": p["n"], **_rmse(found, truth, repeats)})
     return {"rows": rows, "steps": steps}
 

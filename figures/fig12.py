@@ -69,12 +69,12 @@ def _weights(task: Task) -> tuple[dict[str, Path], dict[str, np.ndarray]]:
     from figures.studies.flow_training import FlowRecipe, fit_flow
     from full_geometry.learning.training import train_by_cpu
     from full_geometry.models.storing import CENTRES, KIND
-    from full_geometry.object.subject import Subject
+    from full_geometry.object.learnable import object_of
     from halfspace_sss.neural.store import load_weights, save_weights
 
     p, folders = task.params, {name: task.folder / name for name in ("probes", "patches")}
-    subject = Subject.of(*shape_of("bunny", task.folder))
-    learnt, path = train_by_cpu(subject, p["seconds"], folders["patches"], seed=p["seed"])
+    obj = object_of(*shape_of("bunny", task.folder))
+    learnt, path = train_by_cpu(obj, p["seconds"], folders["patches"], seed=p["seed"])
     arrays, record = load_weights(path, KIND)
     flow = fit_flow(learnt, FlowRecipe(seconds=p["seconds"]), seed=p["seed"]).flow.weights
     of_patches = {CENTRES} | {name for name in arrays if name.startswith(("V_", "c_"))}

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from halfspace_sss.lazy import lazy_names
 
-__all__ = ["Recipe", "Subject", "errors", "load", "train", "transport_of"]
+__all__ = ["Recipe", "errors", "load", "object_of", "train", "transport_of"]
 __getattr__, __dir__ = lazy_names(
     __name__,
     {
         "Recipe": "learning.fitting",
-        "Subject": "object.subject",
         "errors": "learning.model_errors",
         "load": "models.storing",
+        "object_of": "object.learnable",
         "train": "learning.training",
         "transport_of": "learning.model_errors",
     },

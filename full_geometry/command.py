@@ -10,11 +10,12 @@ import numpy as np
 
 from full_geometry.learning.model_errors import RadianceError, errors_of, transport_of
 from full_geometry.models.storing import KIND, find_weights, trained
-from full_geometry.object.subject import Subject
+from full_geometry.object.learnable import object_of
 from halfspace_sss.checks import check_count
 from halfspace_sss.interface.model import models as half_space_models
 from halfspace_sss.neural.store import check_weights_folder, load_weights
 from halfspace_sss.progress import NamedProgress
+from halfspace_sss.rendering.object.body import TranslucentObject
 from halfspace_sss.rendering.object.registry import model_names
 from halfspace_sss.rendering.object.translucent import is_translucent
 from halfspace_sss.rendering.scenes.learners import LearntObject, ObjectError
@@ -34,8 +35,8 @@ def untrained(scene: Any) -> list[str]:
         asked = inside.model == KIND and inside.orders != "single"
         if not asked or not np.any(inside.medium.sigma_s > 0):
             continue
-        subject = Subject.given(scene, None, None, shape.id())
-        if not trained(subject):
+        obj = object_of(scene, None, None, shape.id())
+        if not trained(obj):
             missing.append(shape.id())
     if missing:
         check_weights_folder()
@@ -47,7 +48,7 @@ def train(scene: Any, **how: Any) -> LearntObject:
     from full_geometry.learning.training import train as learn
 
     learnt = learn(scene, **how)
-    name = learnt.model.subject.object.shape.id()
+    name = learnt.model.object.geometry.shape.id()
     return LearntObject(name, learnt.path, _rows(name, KIND, learnt.errors), learnt.steps, learnt.seconds)
 
 
@@ -76,25 +77,25 @@ def errors(
     """
     check_count("seed", seed, 0)
     check_count("exits", exits, 2)
-    subject = Subject.given(scene, None, None, object)
-    transports = {name: transport_of(subject, name) for name in models} or _that_take(subject)
-    name = subject.object.shape.id()
-    by_model = errors_of(subject, transports, exits=exits, seed=seed, progress=progress)
+    obj = object_of(scene, None, None, object)
+    transports = {name: transport_of(obj, name) for name in models} or _that_take(obj)
+    name = obj.geometry.shape.id()
+    by_model = errors_of(obj, transports, exits=exits, seed=seed, progress=progress)
     return [row for model, rows in by_model.items() for row in _rows(name, model, rows)]
 
 
 def cost(scene: Any, object: str) -> float:
     """Seconds that the weights of an object of a scene took to learn; ValueError if it has not been trained."""
-    path = find_weights(Subject.given(scene, None, None, object))
+    path = find_weights(object_of(scene, None, None, object))
     return float(load_weights(path, KIND)[1].get("seconds", 0.0))
 
 
-def _that_take(subject: Subject) -> dict[str, Any]:
+def _that_take(obj: TranslucentObject) -> dict[str, Any]:
     """All transports of an object that can be asked."""
     transports = {}
     for name in sorted(model_names(), key=half_space_models().__contains__):
         try:
-            transports[name] = transport_of(subject, name)
+            transports[name] = transport_of(obj, name)
         except ValueError:
             continue
     return transports

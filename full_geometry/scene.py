@@ -12,59 +12,61 @@ import numpy as np
 
 from full_geometry.models.neural_shape import ALBEDO, ETA, SIZE, G, transport
 from full_geometry.models.storing import CHECKSUMS, KIND, find_weights, load
+from full_geometry.object.learnable import check_geometry, check_surface
 from full_geometry.object.patches import AREA_SHARE, LearntProposals, PatchTable
-from full_geometry.object.subject import Subject, check_surface
 from halfspace_sss.neural.store import checksum_of, load_weights
 from halfspace_sss.physics.medium import Medium
+from halfspace_sss.rendering.object.body import TranslucentObject
 from halfspace_sss.rendering.object.half_space import HalfSpaceProposals, area_share
-from halfspace_sss.rendering.object.points import AreaPoints, ObjectModel, PositionSampler, RadialTable
+from halfspace_sss.rendering.object.points import ObjectModel, PositionSampler, RadialTable
 from halfspace_sss.rendering.object.settings import AUTOMATIC, Settings
 from halfspace_sss.rendering.object.shape import Geometry
-from halfspace_sss.rendering.object.translucent import Inside, is_translucent
+from halfspace_sss.rendering.object.translucent import is_translucent
 
 FINE = 2.5  # transport mean free paths of the radius of a patch, up to which patches do without probes
 PATCH_SHARE = 0.2  # of the entries where patches are larger: they reach what probes miss
 ENTRIES = 2  # of an exit: its own work is done once, and patches draw without a ray
 
 
-def _weights(subject: Subject, settings: Settings) -> Path:
+def _weights(obj: TranslucentObject, settings: Settings) -> Path:
     """The file of its weights, learnt first where there is none and the settings give time for it."""
     try:
-        return find_weights(subject)
+        return find_weights(obj)
     except ValueError:
         if settings.train_seconds == 0 or find_spec("torch") is None:
             raise
     from full_geometry.learning.training import train
 
     warnings.warn(
-        f"object {subject.object.name} has no weights: it is learnt first, for {settings.train_seconds:g} s",
+        f"object {obj.geometry.name} has no weights: it is learnt first, for {settings.train_seconds:g} s",
         stacklevel=2,
     )
-    return train(subject, seconds=settings.train_seconds, target_error=settings.train_error).path
+    return train(obj, seconds=settings.train_seconds, target_error=settings.train_error).path
 
 
-def learnt_model(object: Geometry, inside: Inside, media: list[Medium], settings: Settings) -> ObjectModel:
+def learnt_model(obj: TranslucentObject, settings: Settings) -> ObjectModel:
     """Transport and proposals of an object that was trained, or is now for `train_seconds` of the settings.
 
     Raises:
         ValueError: the object cannot be trained, was not and has no time for it, or weights are damaged.
     """
-    check_surface(object.shape.id(), object.shape.bsdf())
-    subject = Subject.surveyed(object, tuple(media), inside.varying, settings.mm_per_unit)
-    path = _weights(subject, settings)
-    model, sampler = load(path, subject)
+    geometry = obj.geometry
+    check_surface(geometry.shape.id(), obj.surface)
+    check_geometry(geometry)
+    path = _weights(obj, settings)
+    model, sampler = load(path, obj)
     backbone = model.base.models
     transport = replace(model, checksums=(checksum_of(path, KIND), *load_weights(path, KIND)[1][CHECKSUMS]))
-    table = RadialTable([m for m in backbone if float(m.medium.sigma_s) > 0], object.size)
+    table = RadialTable([m for m in backbone if float(m.medium.sigma_s) > 0], geometry.size)
     by_itself = AREA_SHARE if sampler is None else 0.0  # patches reach everywhere
     share = by_itself if settings.area_share == AUTOMATIC else settings.area_share
-    positions = PositionSampler(replace(object, pieces=None), table, subject.points, share)
+    positions = PositionSampler(replace(geometry, pieces=None), table, obj.points, share)
     if sampler is None:
         return ObjectModel(transport, HalfSpaceProposals(positions, backbone[0]))
-    radius = np.sqrt(object.area / (np.pi * sampler.patches.n))
-    sigma_t_prime = np.mean([float(m.sigma_t_prime) for m in media])
+    radius = np.sqrt(geometry.area / (np.pi * sampler.patches.n))
+    sigma_t_prime = np.mean([float(m.sigma_t_prime) for m in obj.media])
     patch_share = 1.0 if radius * sigma_t_prime < FINE else PATCH_SHARE
-    proposals = LearntProposals(sampler, positions, patch_share, object.sign, PatchTable(sampler))
+    proposals = LearntProposals(sampler, positions, patch_share, geometry.sign, PatchTable(sampler))
     return ObjectModel(transport, proposals, ENTRIES)
 
 
@@ -74,12 +76,12 @@ def learnt_model(object: Geometry, inside: Inside, media: list[Medium], settings
 SLACK = 1e-3  # of the bounds, for rounding
 
 
-def warn_out_of_range(object: Geometry, media: tuple[Medium, ...]) -> None:
+def warn_out_of_range(geometry: Geometry, media: tuple[Medium, ...]) -> None:
     """Warn, by name and number, of what the network was not trained on: size, medium, or an object that is open."""
-    name, reasons = object.shape.id(), []
+    name, reasons = geometry.shape.id(), []
     scattering = [m for m in media if float(m.sigma_s) > 0]
     numbers = {
-        "sigma_t sqrt(area)": (SIZE, [float(m.sigma_t) * math.sqrt(object.area) for m in scattering]),
+        "sigma_t sqrt(area)": (SIZE, [float(m.sigma_t) * math.sqrt(geometry.area) for m in scattering]),
         "reduced albedo": (ALBEDO, [float(m.albedo_prime) for m in scattering]),
         "g": (G, [float(m.g) for m in scattering]),
         "eta": (ETA, [float(m.eta) for m in scattering]),
@@ -88,7 +90,7 @@ def warn_out_of_range(object: Geometry, media: tuple[Medium, ...]) -> None:
         outside = [v for v in values if not low - SLACK * abs(low) <= v <= high + SLACK * abs(high)]
         if outside:
             reasons.append(f"{what} {', '.join(f'{v:.4g}' for v in outside)} is not in [{low:g}, {high:g}]")
-    if not object.closed:
+    if not geometry.closed:
         reasons.append("it is not closed")
     if reasons:
         warnings.warn(
@@ -96,22 +98,22 @@ def warn_out_of_range(object: Geometry, media: tuple[Medium, ...]) -> None:
         )
 
 
-def shape_model(object: Geometry, inside: Inside, media: list[Medium], settings: Settings) -> ObjectModel:
+def shape_model(obj: TranslucentObject, settings: Settings) -> ObjectModel:
     """Transport and proposals of any object with a homogeneous medium and a smooth boundary.
 
     Raises:
         ValueError: the boundary is rough, the medium varies or is out of the range of `neural`, or normals of pieces
             of the object disagree.
     """
-    surface = object.shape.bsdf()
-    if is_translucent(surface):
-        check_surface(object.shape.id(), surface)
-    subject = Subject.surveyed(object, tuple(media), inside.varying, settings.mm_per_unit)
-    warn_out_of_range(object, subject.media)
-    model = transport(subject)
+    geometry = obj.geometry
+    if is_translucent(obj.surface):
+        check_surface(geometry.shape.id(), obj.surface)
+    check_geometry(geometry)
+    warn_out_of_range(geometry, obj.media)
+    model = transport(obj)
     live = [m for m in model.half_space.models if float(m.medium.sigma_s) > 0]
-    table = RadialTable(live, object.size)
-    share = area_share(object, table.mean / object.size, settings.area_share)
+    table = RadialTable(live, geometry.size)
+    share = area_share(geometry, table.mean / geometry.size, settings.area_share)
     # light may leave by another piece of the surface than it entered by
-    positions = PositionSampler(replace(object, pieces=None), table, AreaPoints(object.shape), share)
+    positions = PositionSampler(replace(geometry, pieces=None), table, obj.points, share)
     return ObjectModel(model, HalfSpaceProposals(positions, live[0]))

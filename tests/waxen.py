@@ -9,17 +9,18 @@ import numpy as np
 
 from full_geometry.models.storing import frame_of
 from full_geometry.object.features import n_side
+from full_geometry.object.learnable import object_of
 from full_geometry.object.patches import Patches, PatchSampler, cluster
-from full_geometry.object.subject import Subject
 from halfspace_sss import Medium
+from halfspace_sss.rendering.object.body import TranslucentObject
 
 BUNNY = Path(__file__).parents[1] / "figures" / "assets" / "bunny.ply"
 WAX = Medium(np.array([0.95, 0.8, 0.6]), np.array([0.05, 0.2, 0.4]), 0.0, 1.4)
 
 
-def wax_bunny() -> Subject:
+def wax_bunny() -> TranslucentObject:
     mi.set_variant("llvm_ad_rgb")
-    return Subject.of(mi.load_dict({"type": "ply", "filename": str(BUNNY)}), WAX)
+    return object_of(mi.load_dict({"type": "ply", "filename": str(BUNNY)}), WAX)
 
 
 def random_layers(rng: np.random.Generator, W: str, b: str, sizes: list[int], spread: float = 1.0) -> dict:
@@ -30,7 +31,7 @@ def random_layers(rng: np.random.Generator, W: str, b: str, sizes: list[int], sp
     return found
 
 
-def random_patches(subject: Subject, n: int, rng: np.random.Generator, spread: float = 1.0) -> PatchSampler:
-    frame = frame_of(subject)
-    patches = Patches(subject, frame, cluster(subject, frame, n))
+def random_patches(obj: TranslucentObject, n: int, rng: np.random.Generator, spread: float = 1.0) -> PatchSampler:
+    frame = frame_of(obj)
+    patches = Patches(obj, frame, cluster(obj, frame, n))
     return PatchSampler(frame, patches, random_layers(rng, "V", "c", [n_side(3), 16, n], spread))

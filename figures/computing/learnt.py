@@ -147,13 +147,13 @@ def _trained(task: Task, scene: dict[str, Any], name: str) -> dict[str, Any]:
     """Weights of an object, with what they took."""
     from full_geometry.learning.training import train_by_cpu
     from full_geometry.models.storing import KIND
-    from full_geometry.object.subject import Subject
+    from full_geometry.object.learnable import object_of
     from halfspace_sss.neural.store import load_weights
     from halfspace_sss.rendering.scenes.scene_files import open_scene
 
-    subject = Subject.given(open_scene(scene, KIND), None, None, name)
+    obj = object_of(open_scene(scene, KIND), None, None, name)
     started, of_cpu = time.perf_counter(), time.process_time()
-    _, path = train_by_cpu(subject, task.params["seconds"], task.folder / "weights", seed=task.params["seed"])
+    _, path = train_by_cpu(obj, task.params["seconds"], task.folder / "weights", seed=task.params["seed"])
     took = {"seconds": time.perf_counter() - started, "cpu seconds": time.process_time() - of_cpu}
     record = load_weights(path, KIND)[1]
     files = {file.name: file.read_bytes() for file in (path, path.with_suffix(".json"))}

@@ -26,9 +26,9 @@ from full_geometry.learning.fitting import DenseLayers, PatchLogits
 from full_geometry.models.storing import frame_of
 from full_geometry.object.features import Side, first_event, n_side, side_features
 from full_geometry.object.patches import Patches, PatchSampler, PatchWeights, cluster
-from full_geometry.object.subject import Subject
 from halfspace_sss.neural.perceptron import Perceptron
 from halfspace_sss.neural.training.fit import Objective, fit
+from halfspace_sss.rendering.object.body import TranslucentObject
 from halfspace_sss.rendering.object.points import SurfacePoint, number
 
 CLEAR = 1e-4  # of the size of the object: where the ray that finds a face begins
@@ -48,13 +48,13 @@ class AlphaP:
     """The model.
 
     Args:
-        subject: the object.
+        obj: the object.
         sampler: p, a flow of four dimensions.
         weights: layers A_k, a_k of log alpha and P_k, p_k of the shares of the channels.
         scale: mean throughput of each channel.
     """
 
-    subject: Subject
+    object: TranslucentObject
     sampler: FlowSampler
     weights: Mapping[str, np.ndarray]
     scale: tuple[float, ...]
@@ -62,10 +62,10 @@ class AlphaP:
 
     def _face(self, at: SurfacePoint, active: Any) -> tuple[Any, Any]:
         """The face that a point lies on, as a short ray from outside meets it, and where there is one."""
-        clear = number(CLEAR * self.subject.object.size)
+        clear = number(CLEAR * self.object.geometry.size)
         ray = mi.Ray3f(mi.Point3f(at.p + at.n * clear), mi.Vector3f(-at.n))
         ray.maxt = 2 * clear
-        hit = self.subject.object.scene.ray_intersect_preliminary(ray, False, active=mi.Bool(active))
+        hit = self.object.geometry.scene.ray_intersect_preliminary(ray, False, active=mi.Bool(active))
         return dr.select(hit.is_valid(), mi.UInt32(hit.prim_index), 0), active & hit.is_valid()
 
     @functools.cached_property
@@ -78,7 +78,7 @@ class AlphaP:
 
     def prepare(self, at: SurfacePoint, active: Any = True) -> PreparedAlphaP:
         """alpha and the weights of patches of an exit."""
-        side = Side(at, first_event(self.subject, at, active))
+        side = Side(at, first_event(self.object, at, active))
         features = side_features(self.sampler.frame, side)
         alpha = dr.exp(self._log_alpha(features)[0])
         return PreparedAlphaP(side, features, alpha, self.sampler.patches.prepare(side))
@@ -100,7 +100,7 @@ class AlphaP:
         u = sampler.chart.coordinates(face, at.p)
         towards = direction_square(at.n_out, exit.side.at.p - at.p, at.w)
         p = sampler.patches.density(exit.weights, face) * sampler.flow.density(told, [*u, *towards]) / dr.pi
-        entry = side_features(sampler.frame, Side(at, first_event(self.subject, at, active)))
+        entry = side_features(sampler.frame, Side(at, first_event(self.object, at, active)))
         logits = self._shares([*exit.features, *entry, *told])
         most = functools.reduce(dr.maximum, logits)
         shares = [dr.exp(v - most) for v in logits]
@@ -116,20 +116,20 @@ class AlphaP:
 HIDDEN = (32, 32)
 
 
-def fit_alpha_p(subject: Subject, recipe: FlowRecipe | None = None, seed: int = 0) -> AlphaP:
+def fit_alpha_p(obj: TranslucentObject, recipe: FlowRecipe | None = None, seed: int = 0) -> AlphaP:
     """S = alpha p of an object.
 
     Args:
-        subject: the object, a mesh.
+        obj: the object, a mesh.
         recipe: CPU seconds, sizes and rates.
         seed: of everything.
 
     Raises:
         ValueError: the shape is no mesh.
     """
-    recipe, frame = recipe or FlowRecipe(), frame_of(subject)
-    patches = Patches(subject, frame, cluster(subject, frame, seed=seed))
-    chart, n, channels = Chart(subject, frame, patches), n_side(len(subject.media)), len(subject.media)
+    recipe, frame = recipe or FlowRecipe(), frame_of(obj)
+    patches = Patches(obj, frame, cluster(obj, frame, seed=seed))
+    chart, n, channels = Chart(obj, frame, patches), n_side(len(obj.media)), len(obj.media)
     generator = torch.Generator().manual_seed(seed)
     nets = torch.nn.ModuleDict({
         "patches": PatchLogits(n, patches.areas, recipe.patch_hidden, seed),
@@ -137,7 +137,7 @@ def fit_alpha_p(subject: Subject, recipe: FlowRecipe | None = None, seed: int = 
         "alpha": DenseLayers([n, *HIDDEN, 1], generator),
         "shares": DenseLayers([2 * n + N_CONTEXT, *HIDDEN, channels], generator),
     })  # fmt: skip
-    pilot = flow_walks(subject, frame, patches, chart, recipe.chunk, (seed, 70))
+    pilot = flow_walks(obj, frame, patches, chart, recipe.chunk, (seed, 70))
     mean = pilot.total.mean(axis=0).astype(np.float64)
     scale = np.where(mean > 0, 1 / np.maximum(mean, 1e-30), 0.0).astype(np.float32)
     order = np.random.default_rng([seed, 71])
@@ -150,14 +150,14 @@ def fit_alpha_p(subject: Subject, recipe: FlowRecipe | None = None, seed: int = 
         )
 
     def data(k: int) -> Walks:
-        return flow_walks(subject, frame, patches, chart, recipe.chunk, (seed, 72, k))
+        return flow_walks(obj, frame, patches, chart, recipe.chunk, (seed, 72, k))
 
     fit(Objective(nets, loss), walk_batches(data, recipe, seed), recipe.schedule, seed)
     sampler = FlowSampler(
         PatchSampler(frame, patches, nets["patches"].arrays()), chart, ConditionalFlow(4, nets["flow"].arrays())
     )
     weights = {**nets["alpha"].arrays("A", "a"), **nets["shares"].arrays("P", "p")}
-    return AlphaP(subject, sampler, weights, tuple(float(v) for v in mean))
+    return AlphaP(obj, sampler, weights, tuple(float(v) for v in mean))
 
 
 def _density_loss(nets: torch.nn.ModuleDict, walks: Walks, rows: np.ndarray, scale: np.ndarray) -> torch.Tensor:

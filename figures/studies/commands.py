@@ -71,7 +71,7 @@ def _made(
     from figures.studies.flow_training import FlowRecipe
     from figures.studies.rivals import sampler_table
     from full_geometry.learning.training import train_by_cpu
-    from full_geometry.object.subject import Subject
+    from full_geometry.object.learnable import object_of
 
     def show(what: str, done: int, total: int) -> None:
         bar.show(done, total, what)
@@ -80,7 +80,7 @@ def _made(
         make = {"errors": rivals.error_table, "starts": rivals.start_table}[table]
         return make(scene, name, seconds=seconds, walks=samples, samples=samples, seed=seed, progress=show)
     with TemporaryDirectory() as folder:
-        learnt, _ = train_by_cpu(Subject.given(scene, None, None, name), seconds, folder, seed=seed)
+        learnt, _ = train_by_cpu(object_of(scene, None, None, name), seconds, folder, seed=seed)
     return sampler_table(learnt, FlowRecipe(seconds=0.5 * seconds), samples=samples, seed=seed, progress=show)
 
 
@@ -154,7 +154,7 @@ def shapes_command(
         tables[f"Spheres: {SPHERE_NOTE}"] = shape_errors.case_table(balls)
         if mesh is not None:
             bunny = list(shape_errors.of_mesh(mesh, MATERIALS, mm_per_unit))
-            tables["speed"] = shape_errors.speed_table(shape_errors.seconds_per_million(bunny[6].subject))
+            tables["speed"] = shape_errors.speed_table(shape_errors.seconds_per_million(bunny[6].object))
             rows = shape_errors.evaluate(iter(bunny), len(bunny), progress=show)
             tables[f"{mesh.stem}"] = shape_errors.summary(rows) + "\n" + shape_errors.case_table(rows)
         rows = shape_errors.evaluate(shape_errors.held_out(objects), objects, progress=show)

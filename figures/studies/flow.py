@@ -14,8 +14,8 @@ import numpy as np
 
 from full_geometry.object.features import ObjectFrame, PreparedExit, Side
 from full_geometry.object.patches import Patches, PatchSampler, PatchTable, PatchWeights, mesh_faces
-from full_geometry.object.subject import Subject
 from halfspace_sss.neural.perceptron import Perceptron, relu
+from halfspace_sss.rendering.object.body import TranslucentObject
 from halfspace_sss.rendering.object.points import CosineProposals, EntrySample, Point, SurfacePoint, number, turned
 
 # ---- The square [0, 1)² laid onto each patch of a surface, so that equal areas stay equal ----------
@@ -41,16 +41,16 @@ class Chart:
     """Points of patches by coordinates, and coordinates of points.
 
     Args:
-        subject: the object.
+        obj: the object.
         frame: of the object; the axes of patches turn with it.
         patches: of its surface.
     """
 
-    def __init__(self, subject: Subject, frame: ObjectFrame, patches: Patches) -> None:
-        self.subject = subject
-        centroids, normals, areas = mesh_faces(subject)
+    def __init__(self, obj: TranslucentObject, frame: ObjectFrame, patches: Patches) -> None:
+        self.object = obj
+        centroids, normals, areas = mesh_faces(obj)
         turn = np.eye(3) if frame.turn is None else np.array([np.array(row).ravel() for row in frame.turn])
-        centres, axes = _axes(centroids, normals * subject.object.sign, areas, patches, turn)
+        centres, axes = _axes(centroids, normals * obj.geometry.sign, areas, patches, turn)
         along, across = (np.einsum("fi,fi->f", centroids - centres[patches.of_face], axes[patches.of_face, k])
                          for k in (0, 1))  # fmt: skip
         strips = _strips(along, areas, patches)
@@ -87,12 +87,12 @@ class Chart:
         face = self._row("face", face)
         v = ((u[0] - self._row("low_1", strip)) / self._row("size_1", strip),
              (u[1] - self._row("low_2", face)) / self._row("size_2", face))  # fmt: skip
-        return self.subject.points.on_face(face, mi.Point2f(*(dr.clip(x, 0, INSIDE) for x in v)))
+        return self.object.points.on_face(face, mi.Point2f(*(dr.clip(x, 0, INSIDE) for x in v)))
 
     def coordinates(self, face: Any, p: Any) -> tuple[Any, Any]:
         """Coordinates in its patch of a point of a face."""
-        index = self.subject.object.shape.face_indices(face)
-        a, b, c = (self.subject.object.shape.vertex_position(i) for i in (index.x, index.y, index.z))
+        index = self.object.geometry.shape.face_indices(face)
+        a, b, c = (self.object.geometry.shape.vertex_position(i) for i in (index.x, index.y, index.z))
         ab, ac, ap = b - a, c - a, p - a
         n = dr.cross(ab, ac)
         square = dr.maximum(dr.squared_norm(n), 1e-38)
@@ -447,6 +447,6 @@ def draw_by(scene: mi.Scene, flow: Mapping[str, np.ndarray]) -> None:
     bodies = scene.integrator().prepare(scene)
     (body,) = bodies
     patches: PatchSampler = body.proposals.patches
-    chart = Chart(body.transport.subject, patches.frame, patches.patches)
+    chart = Chart(body.transport.object, patches.frame, patches.patches)
     sampler = FlowSampler(patches, chart, ConditionalFlow(2, flow))
     bodies[0] = replace(body, proposals=FlowProposals(sampler, body.geometry.sign, PatchTable(patches)))

@@ -30,9 +30,9 @@ from full_geometry.models.storing import Learnt
 from full_geometry.object.features import ObjectFrame, Side, first_event, n_side, side_features
 from full_geometry.object.pairs import trace_exits
 from full_geometry.object.patches import Patches, PatchSampler
-from full_geometry.object.subject import Subject
 from halfspace_sss.checks import check_count
 from halfspace_sss.neural.training.fit import CpuSchedule, Objective, Source, fit
+from halfspace_sss.rendering.object.body import TranslucentObject
 from halfspace_sss.rendering.object.points import EntrySample, cosine_above, number, place
 from halfspace_sss.tracing.walk import generator, pass_seed
 
@@ -95,12 +95,12 @@ class Lighting:
 
     Args:
         name: one of `LIGHTINGS`.
-        subject: the object, which casts shadows.
+        obj: the object, which casts shadows.
         aim: (entry, pair of uniforms) -> direction towards the light, its value over the density, and its distance.
     """
 
     name: str
-    subject: Subject
+    object: TranslucentObject
     aim: Callable[[Any, Any], tuple[Any, Any, Any]]
 
     def sample(self, entry: Any, u: Any, active: Any) -> tuple[Any, Any]:
@@ -109,10 +109,10 @@ class Lighting:
         ray = place(entry.p, entry.n).spawn_ray(w)
         ray.maxt = distance
         lit = active & (dr.dot(w, entry.n) > 0)
-        return w, dr.select(lit & ~self.subject.object.scene.ray_test(ray, False, lit), value, 0)
+        return w, dr.select(lit & ~self.object.geometry.scene.ray_test(ray, False, lit), value, 0)
 
 
-def lighting(name: str, subject: Subject) -> Lighting:
+def lighting(name: str, obj: TranslucentObject) -> Lighting:
     """A kind of light about an object: radiance 1 from everywhere, irradiance 1 from a direction, or intensity 1.
 
     Raises:
@@ -121,7 +121,7 @@ def lighting(name: str, subject: Subject) -> Lighting:
     if name not in LIGHTINGS:
         raise ValueError(f"lighting must be one of {', '.join(LIGHTINGS)}, got {name!r}")
     towards = mi.Vector3f(*TOWARDS.tolist())
-    place_of_light = mi.Point3f(*map(number, _above(subject)))
+    place_of_light = mi.Point3f(*map(number, _above(obj)))
 
     def sky(entry: Any, u: Any) -> tuple:
         w, density = cosine_above(entry.n_out, entry.n, u)
@@ -135,15 +135,15 @@ def lighting(name: str, subject: Subject) -> Lighting:
         r = dr.norm(d)
         return mi.Vector3f(d / r), 1 / (r * r), r
 
-    return Lighting(name, subject, {"sky": sky, "direction": direction, "near light": near}[name])
+    return Lighting(name, obj, {"sky": sky, "direction": direction, "near light": near}[name])
 
 
-def _above(subject: Subject) -> np.ndarray:
+def _above(obj: TranslucentObject) -> np.ndarray:
     """A point near the part of the surface that lies farthest towards the light."""
     from halfspace_sss.tracing.walk import generator, pass_seed
 
-    p = np.array(subject.random_points(generator(mi, 4096, pass_seed(23))).p)
-    return p[:, np.argmax(TOWARDS @ p)] + GAP * float(subject.object.size) * TOWARDS
+    p = np.array(obj.random_points(generator(mi, 4096, pass_seed(23))).p)
+    return p[:, np.argmax(TOWARDS @ p)] + GAP * float(obj.geometry.size) * TOWARDS
 
 
 # ---- Training data of flows: exits of walks as patches and coordinates in them, with their throughput
@@ -177,26 +177,26 @@ class Walks(NamedTuple):
 
 
 def flow_walks(
-    subject: Subject, frame: ObjectFrame, patches: Patches, chart: Chart, n: int, seed: tuple[int, ...],
+    obj: TranslucentObject, frame: ObjectFrame, patches: Patches, chart: Chart, n: int, seed: tuple[int, ...],
     light: Lighting | None = None,
 ) -> Walks:  # fmt: skip
     """n walks of random exits.
 
     Args:
-        subject, frame, patches, chart: of the object.
+        obj, frame, patches, chart: of the object.
         n: walks.
         seed: of the pass.
         light: that falls on the object: one sample of it at each end, times mu_i, is multiplied to T.
     """
     rng = generator(mi, n, pass_seed(*seed, 0))
-    starts = subject.random_points(rng)
-    exits = trace_exits(subject, starts, (*seed, 1))
+    starts = obj.random_points(rng)
+    exits = trace_exits(obj, starts, (*seed, 1))
     T = exits.T
     if light is not None:
         entry = EntrySample(exits.at.p, exits.at.n, exits.at.n_out, mi.Float(1), exits.face)
         w, value = light.sample(entry, mi.Point2f(rng.next_float32(), rng.next_float32()), dr.max(T) > 0)
         T = T * (value * entry.facing(w).mu)
-    from_all = side_features(frame, Side(starts, first_event(subject, starts)))
+    from_all = side_features(frame, Side(starts, first_event(obj, starts)))
     total = _rows(list(T), n)
     starts_rows = _rows(from_all, n)
     kept = dr.compress(dr.max(T) > 0)
@@ -205,11 +205,11 @@ def flow_walks(
     at, out = exits.at.gather(kept), starts.gather(kept)
     face = dr.gather(mi.UInt32, exits.face, kept)
     patch = patches.row("patch", face)
-    side = Side(out, first_event(subject, out))
+    side = Side(out, first_event(obj, out))
     told = _rows(context(frame, side, chart.frame(patch)), m)
     back = direction_square(at.n_out, out.p - at.p, at.w)
     u = _rows([*chart.coordinates(face, at.p), *back], m)
-    entry = _rows(side_features(frame, Side(at, first_event(subject, at))), m)
+    entry = _rows(side_features(frame, Side(at, first_event(obj, at))), m)
     return Walks(starts_rows[k], told, entry, u, np.array(patch).astype(np.int64), total[k], starts_rows, total)
 
 
@@ -309,8 +309,8 @@ def fit_patches(
         seed: of everything.
     """
     recipe, (model, sampler) = recipe or FlowRecipe(), learnt
-    chart = Chart(model.subject, sampler.frame, sampler.patches)
-    net = PatchLogits(n_side(len(model.subject.media)), sampler.patches.areas, recipe.patch_hidden, seed)
+    chart = Chart(model.object, sampler.frame, sampler.patches)
+    net = PatchLogits(n_side(len(model.object.media)), sampler.patches.areas, recipe.patch_hidden, seed)
 
     def loss(batch: FlowBatch) -> torch.Tensor:
         walks, rows = batch
@@ -331,7 +331,7 @@ def fit_flow(
         recipe, light, seed: as for `fit_patches`.
     """
     recipe, (model, sampler) = recipe or FlowRecipe(), learnt
-    chart = Chart(model.subject, sampler.frame, sampler.patches)
+    chart = Chart(model.object, sampler.frame, sampler.patches)
     net = FlowNetwork(2, N_CONTEXT, recipe.hidden, seed)
 
     def loss(batch: FlowBatch) -> torch.Tensor:
@@ -344,9 +344,9 @@ def fit_flow(
 
 
 def _source(learnt: Learnt, chart: Chart, recipe: FlowRecipe, light: Lighting | None, seed: int) -> Source:
-    subject, sampler = learnt.model.subject, learnt.sampler
+    obj, sampler = learnt.model.object, learnt.sampler
 
     def data(k: int) -> Walks:
-        return flow_walks(subject, sampler.frame, sampler.patches, chart, recipe.chunk, (seed, 61, k), light)
+        return flow_walks(obj, sampler.frame, sampler.patches, chart, recipe.chunk, (seed, 61, k), light)
 
     return walk_batches(data, recipe, seed)

@@ -21,9 +21,9 @@ import zuko
 from figures.studies.paper_network import placed
 from full_geometry.models.object_model import FullGeometry
 from full_geometry.object.features import ObjectFrame
-from full_geometry.object.subject import Subject, surface_point
 from halfspace_sss.neural.training.fit import ADAM, CpuSchedule, Descent, Objective, fit
-from halfspace_sss.rendering.object.points import SurfacePoint, channel_mean, cosine_above
+from halfspace_sss.rendering.object.body import TranslucentObject
+from halfspace_sss.rendering.object.points import SurfacePoint, channel_mean, cosine_above, surface_point
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 HIDDEN, LAYERS = (128, 128), 6
@@ -58,7 +58,7 @@ def incidence(model: FullGeometry, exits: SurfacePoint, points: SurfacePoint) ->
     Args:
         model: of the object.
         exits: one for each point.
-        points: of entry, with interpolated normals, see `Subject.random_places`.
+        points: of entry, with interpolated normals, see `TranslucentObject.random_places`.
     """
     n, (rows, columns) = dr.width(exits.p), GRID
     prepared = model.prepare(exits)
@@ -106,16 +106,16 @@ def fit_space_flow(model: FullGeometry, frame: ObjectFrame, seconds: float = 60.
 def _pairs(model: FullGeometry, frame: ObjectFrame, seed: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Exits (n, 5), uniform points (n, 3) and t over its mean."""
     n = PAIRS * POINTS
-    exits = model.subject.random_points(generator(mi, PAIRS, pass_seed(*seed, 0)))
+    exits = model.object.random_points(generator(mi, PAIRS, pass_seed(*seed, 0)))
     exits = exits.gather(dr.arange(mi.UInt32, n) // POINTS)
-    points = model.subject.random_places(generator(mi, n, pass_seed(*seed, 1)))
+    points = model.object.random_places(generator(mi, n, pass_seed(*seed, 1)))
     t = incidence(model, exits, points)
     return placed(frame, exits, n), placed(frame, points, n)[:, :3], (t / t.mean()).astype(np.float32)
 
 
-def mesh_arrays(subject: Subject, frame: ObjectFrame) -> tuple[np.ndarray, np.ndarray]:
+def mesh_arrays(obj: TranslucentObject, frame: ObjectFrame) -> tuple[np.ndarray, np.ndarray]:
     """Vertices, in the frame over the radius, and faces, as libigl takes them."""
-    parameters = mi.traverse(subject.object.shape)
+    parameters = mi.traverse(obj.geometry.shape)
     vertices = np.array(parameters["vertex_positions"], dtype=np.float64).reshape(-1, 3)
     turn = np.eye(3) if frame.turn is None else np.array([np.array(row).ravel() for row in frame.turn])
     centre, radius = np.array(frame.centre, dtype=float).ravel(), float(np.array(frame.radius).item())

@@ -19,13 +19,14 @@ from torch import nn
 from full_geometry.learning.model_errors import LOBES, POWER, ExitRadiance, ExitTruth, RadianceError, compare, reference
 from full_geometry.models.storing import Identity, frame_of, identify
 from full_geometry.object.features import ObjectFrame
+from full_geometry.object.learnable import object_of
 from full_geometry.object.pairs import trace_exits
-from full_geometry.object.subject import Subject
 from halfspace_sss.checks import check_choice, check_count, check_interval
 from halfspace_sss.neural.store import check_weights_folder, load_weights, save_weights, weights_folder
 from halfspace_sss.neural.training.fit import ADAM, CpuSchedule, Descent, Objective, Source, fit
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.provenance import provenance
+from halfspace_sss.rendering.object.body import TranslucentObject
 from halfspace_sss.rendering.object.points import SurfacePoint
 from halfspace_sss.rendering.scenes.learners import LearntObject, ObjectError
 from halfspace_sss.tracing.walk import generator, pass_seed
@@ -175,12 +176,12 @@ def placed(frame: ObjectFrame, at: SurfacePoint, n: int) -> np.ndarray:
 
 
 def walk_samples(
-    subject: Subject, frame: ObjectFrame, exits: SurfacePoint, n: int, seed: tuple[int, ...]
+    obj: TranslucentObject, frame: ObjectFrame, exits: SurfacePoint, n: int, seed: tuple[int, ...]
 ) -> PaperSamples:
     """N walks of each exit, as the paper's samples; walks that end inside keep T = 0 and a place of their own."""
     m = dr.width(exits.p)
     starts = exits.gather(dr.arange(mi.UInt32, m * n) // n)
-    ends = trace_exits(subject, starts, seed)
+    ends = trace_exits(obj, starts, seed)
     lost = dr.max(ends.T) <= 0
     here = SurfacePoint(*(dr.select(lost, a, b) for a, b in zip(starts, ends.at)))
     points = placed(frame, here, m * n).reshape(m, n, 5)
@@ -189,18 +190,18 @@ def walk_samples(
 
 
 def fit_paper(
-    subject: Subject, recipe: PaperRecipe | None = None, seed: int = 0, progress: NamedProgress | None = None
+    obj: TranslucentObject, recipe: PaperRecipe | None = None, seed: int = 0, progress: NamedProgress | None = None
 ) -> tuple[PaperNetwork, int]:
     """The network of an object after the recipe's CPU seconds, or when it stops; and its steps.
 
     Args:
-        subject: the object.
+        obj: the object.
         recipe: N, seconds and sizes.
         seed: of everything.
         progress: called with (what, done, total).
     """
     recipe = recipe or PaperRecipe()
-    net, last = PaperNetwork(recipe.n, len(subject.media), seed), deque([np.inf] * FOR_STEPS, FOR_STEPS)
+    net, last = PaperNetwork(recipe.n, len(obj.media), seed), deque([np.inf] * FOR_STEPS, FOR_STEPS)
 
     def loss(batch: tuple[torch.Tensor, ...]) -> torch.Tensor:
         *told, target = batch
@@ -210,20 +211,20 @@ def fit_paper(
 
     learner = Objective(net, loss)
     fitted = fit(
-        learner, _lit_batches(subject, recipe, seed), recipe.schedule, seed, validate=lambda: max(last),
+        learner, _lit_batches(obj, recipe, seed), recipe.schedule, seed, validate=lambda: max(last),
         target_error=ENOUGH, progress=progress, descent=Descent(learner, betas=ADAM, clip=np.inf),
     )  # fmt: skip
     return net, fitted.spent.steps
 
 
-def _lit_batches(subject: Subject, recipe: PaperRecipe, seed: int) -> Source:
+def _lit_batches(obj: TranslucentObject, recipe: PaperRecipe, seed: int) -> Source:
     """Exits, their points and their light, each time a random one, and the radiance that walks give."""
-    rng, frame = np.random.default_rng([seed, 80]), frame_of(subject)
+    rng, frame = np.random.default_rng([seed, 80]), frame_of(obj)
 
     def batches() -> Iterator[tuple[torch.Tensor, ...]]:
         for chunk in count():
-            exits = subject.random_points(generator(mi, recipe.exits, pass_seed(seed, 81, chunk)))
-            samples = walk_samples(subject, frame, exits, recipe.n, (seed, 82, chunk))
+            exits = obj.random_points(generator(mi, recipe.exits, pass_seed(seed, 81, chunk)))
+            samples = walk_samples(obj, frame, exits, recipe.n, (seed, 82, chunk))
             for _ in range(recipe.reuse):
                 for rows in np.array_split(rng.permutation(recipe.exits), max(recipe.exits // recipe.batch, 1)):
                     L = random_lights(len(rows), samples.T.shape[2], rng)(samples.w[rows])
@@ -243,12 +244,18 @@ POINTS = ("walks", "uniform")
 
 
 def paper_errors(
-    subject: Subject, net: PaperNetwork, truth: ExitTruth, *, points: str = "walks", repeats: int = 16, seed: int = 0
+    obj: TranslucentObject,
+    net: PaperNetwork,
+    truth: ExitTruth,
+    *,
+    points: str = "walks",
+    repeats: int = 16,
+    seed: int = 0,
 ) -> list[RadianceError]:
     """Errors per channel, under constant light and lobes.
 
     Args:
-        subject: the object.
+        obj: the object.
         net: its network.
         truth: exits and their radiance.
         points: "walks" or "uniform".
@@ -260,34 +267,34 @@ def paper_errors(
     """
     check_choice("points", points, POINTS)
     check_count("repeats", repeats, 2)
-    return compare(estimate(subject, net, truth.exits, points, repeats, seed), truth.truth)
+    return compare(estimate(obj, net, truth.exits, points, repeats, seed), truth.truth)
 
 
 def estimate(
-    subject: Subject, net: PaperNetwork, exits: SurfacePoint, points: str, repeats: int, seed: int = 0
+    obj: TranslucentObject, net: PaperNetwork, exits: SurfacePoint, points: str, repeats: int, seed: int = 0
 ) -> ExitRadiance:
     """Mean radiance of exits over repeats with new points, and its variance."""
-    frame, m, means = frame_of(subject), dr.width(exits.p), []
+    frame, m, means = frame_of(obj), dr.width(exits.p), []
     for k in range(repeats):
         if points == "walks":
-            samples = walk_samples(subject, frame, exits, net.n, (seed, 95, k))
+            samples = walk_samples(obj, frame, exits, net.n, (seed, 95, k))
         else:
-            samples = uniform_samples(subject, frame, exits, net.n, (seed, 96, k))
-        lights = measured_lights(m, len(subject.media))
+            samples = uniform_samples(obj, frame, exits, net.n, (seed, 96, k))
+        lights = measured_lights(m, len(obj.media))
         means.append(np.stack([net.radiance(samples, light) for light in lights], axis=-1))
     values = np.array(means, dtype=float).transpose(0, 2, 1, 3)
     return ExitRadiance(values.mean(axis=0), values.var(axis=0, ddof=1) / repeats)
 
 
 def uniform_samples(
-    subject: Subject, frame: ObjectFrame, exits: SurfacePoint, n: int, seed: tuple[int, ...]
+    obj: TranslucentObject, frame: ObjectFrame, exits: SurfacePoint, n: int, seed: tuple[int, ...]
 ) -> PaperSamples:
     """N points uniform over the area for each exit; the throughputs are left out."""
     m: Any = dr.width(exits.p)
-    at = subject.random_points(generator(mi, m * n, pass_seed(*seed)))
+    at = obj.random_points(generator(mi, m * n, pass_seed(*seed)))
     w = np.array(at.w, dtype=np.float32).T.reshape(m, n, 3)
     points = placed(frame, at, m * n).reshape(m, n, 5)
-    return PaperSamples(placed(frame, exits, m), points, w, np.zeros((m, n, len(subject.media)), np.float32))
+    return PaperSamples(placed(frame, exits, m), points, w, np.zeros((m, n, len(obj.media)), np.float32))
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -305,7 +312,7 @@ def save_network(folder: Path, identity: Identity, net: PaperNetwork, record: di
     return save_weights(path, KIND, {**arrays, "anchors": identity.anchors.astype(np.float32)}, whole)
 
 
-def load_network(subject: Subject, folder: Path | None = None) -> PaperNetwork:
+def load_network(obj: TranslucentObject, folder: Path | None = None) -> PaperNetwork:
     """The network of an object as it stands where it was trained.
 
     Raises:
@@ -313,11 +320,11 @@ def load_network(subject: Subject, folder: Path | None = None) -> PaperNetwork:
     """
     import torch
 
-    here = identify(subject)
+    here = identify(obj)
     path = (Path(folder) if folder else weights_folder()) / f"{KIND}-{here.digest()}.safetensors"
     if not path.exists():
         raise ValueError(
-            f"object {subject.object.shape.id()!r} must be trained for {KIND}, got one that is not in {path.parent}; "
+            f"object {obj.geometry.shape.id()!r} must be trained for {KIND}, got one that is not in {path.parent}; "
             f"`halfspace-sss train object --scene --model {KIND}` does it"
         )
     arrays, record = load_weights(path, KIND)
@@ -325,7 +332,7 @@ def load_network(subject: Subject, folder: Path | None = None) -> PaperNetwork:
     R, t = Identity(record["kind_of_shape"], record["topology"], anchors, dict(record["medium"])).pose(here)
     if not (np.allclose(R, np.eye(3), atol=1e-5) and np.allclose(t, 0, atol=1e-4 * np.ptp(anchors))):
         raise ValueError(f"{path}: object must stand where it was trained, got it moved or turned")
-    net = PaperNetwork(record["n"], len(subject.media))
+    net = PaperNetwork(record["n"], len(obj.media))
     net.load_state_dict({name: torch.from_numpy(value.astype(np.float32)) for name, value in arrays.items()})
     return net
 
@@ -346,12 +353,12 @@ def train(
         if value is not None:
             raise ValueError(f"{name} must be left out for {KIND}, got {value!r}")
     folder = check_weights_folder(folder)
-    subject, began = Subject.given(scene, None, None, object), time.monotonic()
-    net, steps = fit_paper(subject, PaperRecipe(seconds=seconds), seed, progress)
-    rows = paper_errors(subject, net, reference(subject, EXITS, WALKS, seed), seed=seed)
+    obj, began = object_of(scene, None, None, object), time.monotonic()
+    net, steps = fit_paper(obj, PaperRecipe(seconds=seconds), seed, progress)
+    rows = paper_errors(obj, net, reference(obj, EXITS, WALKS, seed), seed=seed)
     record = {"steps": steps, "seconds": seconds, "seed": seed, "errors": [row._asdict() for row in rows]}
-    path = save_network(folder, identify(subject), net, {**record, "provenance": provenance(seed=seed)})
-    name = subject.object.shape.id()
+    path = save_network(folder, identify(obj), net, {**record, "provenance": provenance(seed=seed)})
+    name = obj.geometry.shape.id()
     return LearntObject(name, path, _rows(name, rows), steps, time.monotonic() - began)
 
 
@@ -367,10 +374,10 @@ def errors(
     """The errors of the network of an object over so many exits, its points from walks as it was trained."""
     for name in models:
         check_choice("model", name, (KIND,))
-    subject = Subject.given(scene, None, None, object)
-    net = load_network(subject)
-    rows = paper_errors(subject, net, reference(subject, exits, WALKS, seed), seed=seed)
-    return _rows(subject.object.shape.id(), rows)
+    obj = object_of(scene, None, None, object)
+    net = load_network(obj)
+    rows = paper_errors(obj, net, reference(obj, exits, WALKS, seed), seed=seed)
+    return _rows(obj.geometry.shape.id(), rows)
 
 
 def _rows(name: str, rows: list[RadianceError]) -> list[ObjectError]:

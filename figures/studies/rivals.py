@@ -22,11 +22,12 @@ from full_geometry.learning.model_errors import measure, reference, transport_of
 from full_geometry.learning.training import train, train_by_cpu
 from full_geometry.models.object_model import HalfSpace
 from full_geometry.models.storing import KIND, Learnt
+from full_geometry.object.learnable import object_of
 from full_geometry.object.pairs import EntryProposals, Numbers
 from full_geometry.object.patches import AREA_SHARE, LearntProposals, PatchTable
-from full_geometry.object.subject import Subject
 from halfspace_sss.backend import kernel_seconds
 from halfspace_sss.neural.store import load_weights
+from halfspace_sss.rendering.object.body import TranslucentObject
 from halfspace_sss.rendering.object.half_space import HalfSpaceProposals
 from halfspace_sss.rendering.object.points import (
     ObjectModel,
@@ -68,8 +69,8 @@ def error_table(
     """
     import pandas
 
-    subject, rows = Subject.given(scene, None, None, name), []
-    truth = model_errors.reference(subject, exits, walks, seed)
+    obj, rows = object_of(scene, None, None, name), []
+    truth = model_errors.reference(obj, exits, walks, seed)
 
     def tell(what: str, done: int) -> None:
         if progress:
@@ -77,18 +78,18 @@ def error_table(
 
     tell("full_geometry", 0)
     with TemporaryDirectory() as folder:
-        learnt, _ = train_by_cpu(subject, seconds, folder, seed=seed)
-    proposals = EntryProposals(subject, HalfSpace(subject, BACKBONE)).with_patches(learnt.sampler)
+        learnt, _ = train_by_cpu(obj, seconds, folder, seed=seed)
+    proposals = EntryProposals(obj, HalfSpace(obj, BACKBONE)).with_patches(learnt.sampler)
     tell("S = alpha p", 1)
-    models = {BACKBONE: transport_of(subject, BACKBONE), "full_geometry": learnt.model}
-    models["S = alpha p"] = fit_alpha_p(subject, FlowRecipe(seconds=seconds), seed)
+    models = {BACKBONE: transport_of(obj, BACKBONE), "full_geometry": learnt.model}
+    models["S = alpha p"] = fit_alpha_p(obj, FlowRecipe(seconds=seconds), seed)
     for key, model in models.items():
-        errors = model_errors.measure(subject, model, proposals, truth=truth, samples=samples, seed=seed)
+        errors = model_errors.measure(obj, model, proposals, truth=truth, samples=samples, seed=seed)
         rows += [{"model": key, **row._asdict()} for row in errors]
     tell("full_geometry_paper", 2)
-    net, _ = fit_paper(subject, PaperRecipe(n=n, seconds=seconds), seed)
+    net, _ = fit_paper(obj, PaperRecipe(n=n, seconds=seconds), seed)
     for points in POINTS:
-        errors = paper_errors(subject, net, truth, points=points, seed=seed)
+        errors = paper_errors(obj, net, truth, points=points, seed=seed)
         rows += [{"model": f"full_geometry_paper, points {points}", **row._asdict()} for row in errors]
     tell("models", 4)
     return pandas.DataFrame(rows)
@@ -119,30 +120,32 @@ def start_table(
     """
     import pandas
 
-    subject, rows = Subject.given(scene, None, None, name), []
-    truth = reference(subject, exits, walks, seed)
+    obj, rows = object_of(scene, None, None, name), []
+    truth = reference(obj, exits, walks, seed)
     runs = [(start, *time) for start in STARTS for time in TIMES]
     for k, (start, share, part) in enumerate(runs):
         if progress:
             progress(f"{start}, {share * seconds:.3g} s", k, len(runs))
-        learnt, about = _learnt(subject, start, share * seconds, part, seed)
-        proposals = EntryProposals(subject, HalfSpace(subject, STANDARD.start))
+        learnt, about = _learnt(obj, start, share * seconds, part, seed)
+        proposals = EntryProposals(obj, HalfSpace(obj, STANDARD.start))
         proposals = proposals.with_patches(learnt.sampler if share else None)
-        errors = measure(subject, learnt.model, proposals, truth=truth, samples=samples, seed=seed)
+        errors = measure(obj, learnt.model, proposals, truth=truth, samples=samples, seed=seed)
         rows += [{"start": start, "planned": share * seconds, **about, **row._asdict()} for row in errors]
     return pandas.DataFrame(rows)
 
 
-def _learnt(subject: Subject, start: str, seconds: float, part: float, seed: int) -> tuple[Learnt, dict[str, Any]]:
+def _learnt(
+    obj: TranslucentObject, start: str, seconds: float, part: float, seed: int
+) -> tuple[Learnt, dict[str, Any]]:
     """A training with chunks of a part of those of the recipe; what it took."""
     recipe = replace(STANDARD.begun(start), chunk=int(STANDARD.chunk * part))
     with TemporaryDirectory() as folder:
         if seconds == 0:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                found = train(subject, seconds=0, recipe=recipe, seed=seed, folder=folder)
+                found = train(obj, seconds=0, recipe=recipe, seed=seed, folder=folder)
             return Learnt(found.model, found.sampler), {"seconds": 0.0, "steps": 0}
-        learnt, path = train_by_cpu(subject, seconds, folder, seed=seed, recipe=recipe)
+        learnt, path = train_by_cpu(obj, seconds, folder, seed=seed, recipe=recipe)
         record = load_weights(path, KIND)[1]
         return learnt, {"seconds": record["seconds"], "steps": record["steps"]}
 
@@ -188,11 +191,11 @@ class _Exits:
     face: Any
 
 
-def _exits(subject: Subject, n: int, repeated: int, seed: int) -> _Exits:
+def _exits(obj: TranslucentObject, n: int, repeated: int, seed: int) -> _Exits:
     """n random exits, `repeated` neighbouring lanes for each."""
     rng = Numbers(generator(mi, n, pass_seed(seed, 31)))
-    at = subject.points.sample(rng.next_1d(), rng.next_2d(), True)
-    sign = number(subject.object.sign)
+    at = obj.points.sample(rng.next_1d(), rng.next_2d(), True)
+    sign = number(obj.geometry.sign)
     n_out = mi.Normal3f(turned(at.n_shading, at.n) * sign)
     n_face = mi.Normal3f(at.n * sign)
     w, _ = cosine_above(n_out, n_face, rng.next_2d())
@@ -219,12 +222,18 @@ def _estimates(model: ObjectModel, light: Lighting, exits: _Exits, rng: Any, n: 
 
 
 def spread(
-    subject: Subject, model: ObjectModel, light: Lighting, *, exits: int = 256, samples: int = 2048, seed: int = 0
+    obj: TranslucentObject,
+    model: ObjectModel,
+    light: Lighting,
+    *,
+    exits: int = 256,
+    samples: int = 2048,
+    seed: int = 0,
 ) -> Spread:
     """The variance of one sample of a transport by its proposals.
 
     Args:
-        subject: the object.
+        obj: the object.
         model: transport and proposals.
         light: that falls on it.
         exits, samples: random exits, and samples of each.
@@ -232,7 +241,7 @@ def spread(
     """
     sums, per_pass = 0.0, max(min(LANES // exits, samples), 1)
     passes = max(samples // per_pass, 1)
-    lanes = _exits(subject, exits, per_pass, seed)
+    lanes = _exits(obj, exits, per_pass, seed)
     for k in range(passes):
         rng = Numbers(generator(mi, exits * per_pass, pass_seed(seed, 32, k)))
         estimates = _estimates(model, light, lanes, rng, 1)
@@ -246,9 +255,9 @@ def spread(
     return Spread(float(variance.mean()), total)
 
 
-def costs(subject: Subject, models: Mapping[str, ObjectModel], light: Lighting) -> dict[str, Cost]:
+def costs(obj: TranslucentObject, models: Mapping[str, ObjectModel], light: Lighting) -> dict[str, Cost]:
     """Time of each; they take turns, and of the repeats the fastest counts, which is the one that least delayed."""
-    lanes = _exits(subject, TIMED_LANES, 1, 5)
+    lanes = _exits(obj, TIMED_LANES, 1, 5)
     rng = generator(mi, TIMED_LANES, pass_seed(6))
     dr.eval(rng.state, rng.inc)
     best = {(name, n): np.inf for name in models for n in (1, MANY)}
@@ -283,10 +292,10 @@ def samplers(learnt: Learnt, recipe: FlowRecipe, light: Lighting, flow: Any, see
         seed: of the fits.
     """
     model, patches = learnt
-    object, sign = model.subject.object, model.subject.object.sign
+    object, sign = model.object.geometry, model.object.geometry.sign
     backbone = model.base.models
     table = RadialTable([m for m in backbone if float(m.medium.sigma_s) > 0], object.size)
-    probes = PositionSampler(replace(object, pieces=None), table, model.subject.points, AREA_SHARE)
+    probes = PositionSampler(replace(object, pieces=None), table, model.object.points, AREA_SHARE)
     lit = fit_patches(learnt, recipe, light=light, seed=seed)
     lit_flow = fit_flow(learnt._replace(sampler=lit), recipe, light=light, seed=seed)
     by_face, lit_by_face = PatchTable(patches), PatchTable(lit)
@@ -317,15 +326,15 @@ def sampler_table(
     """
     import pandas
 
-    subject, rows = learnt.model.subject, []
+    obj, rows = learnt.model.object, []
     transport = learnt.model
     flow, total = fit_flow(learnt, recipe, seed=seed), len(LIGHTINGS) * len(SAMPLERS)
     for name in LIGHTINGS:
-        light = lighting(name, subject)
+        light = lighting(name, obj)
         models = {key: ObjectModel(transport, p) for key, p in samplers(learnt, recipe, light, flow, seed).items()}
-        spent = costs(subject, models, light)
+        spent = costs(obj, models, light)
         for key, each in models.items():
-            V = spread(subject, each, light, exits=exits, samples=samples, seed=seed)
+            V = spread(obj, each, light, exits=exits, samples=samples, seed=seed)
             row = {"light": name, "sampler": key, "V": V.variance, "t exit": spent[key].exit, "t": spent[key].sample}
             row |= {f"V t, {n} of an exit": V.variance * spent[key].of(n) for n in SAMPLES_OF_AN_EXIT}
             rows.append({**row, "mean": float(V.mean.mean())})

@@ -51,8 +51,8 @@ def ablation_table(work: Path, seconds: float, progress: NamedProgress | None = 
     held = []
     for k in range(HELD_OUT_OBJECTS):
         family = families[k % len(families)]
-        subject = draw_subject((SEED, k), {family: HELD_OUT[family]}).subject
-        held.append(make_data(subject, mean_events(subject), (SEED, k)))
+        obj = draw_subject((SEED, k), {family: HELD_OUT[family]}).object
+        held.append(make_data(obj, mean_events(obj), (SEED, k)))
     held = [data for data in held if data is not None]
     lines = ["| descriptors | steps | likelihood left | mean radiance off: median | 90th percentile |",
              "| --- | --- | --- | --- | --- |"]  # fmt: skip

@@ -19,11 +19,12 @@ from full_geometry.learning.model_errors import LIGHTS, RadianceError, errors_of
 from full_geometry.learning.shape_data import draw_subject
 from full_geometry.models.descriptors import mean_chord
 from full_geometry.models.neural_shape import transport
-from full_geometry.object.subject import Subject
+from full_geometry.object.learnable import object_of
 from halfspace_sss.interface.model import bssrdf
 from halfspace_sss.materials import load as load_material
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.progress import NamedProgress
+from halfspace_sss.rendering.object.body import TranslucentObject
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 # ----------------------------------------------------------------------------------------------------
@@ -44,11 +45,11 @@ class Case:
 
     Args:
         name: of shape and medium.
-        subject: the object.
+        obj: the object.
     """
 
     name: str
-    subject: Subject
+    object: TranslucentObject
 
 
 @dataclass(frozen=True)
@@ -78,7 +79,7 @@ def held_out(n: int) -> Iterator[Case]:
     families = tuple(HELD_OUT)
     for k in range(n):
         family = families[k % len(families)]
-        yield Case(family, draw_subject((HELD_OUT_SEED, 10**6 + k), {family: HELD_OUT[family]}).subject)
+        yield Case(family, draw_subject((HELD_OUT_SEED, 10**6 + k), {family: HELD_OUT[family]}).object)
 
 
 def of_mesh(path: str | Path, materials: Sequence[str], mm_per_unit: float) -> Iterator[Case]:
@@ -87,14 +88,14 @@ def of_mesh(path: str | Path, materials: Sequence[str], mm_per_unit: float) -> I
         medium = load_material(material).medium
         for k, channel in enumerate("RGB"):
             shape = mi.load_dict({"type": "ply", "filename": str(path)})
-            yield Case(f"{material} {channel}", Subject.of(shape, medium.channel(k), mm_per_unit))
+            yield Case(f"{material} {channel}", object_of(shape, medium.channel(k), mm_per_unit))
 
 
 def spheres(albedo: float = 0.95, eta: float = 1.3) -> Iterator[Case]:
     """Spheres of 1, 3, 10 and 30 mean free paths."""
     for radius in RADII:
         shape = mi.load_dict({"type": "sphere", "radius": radius})
-        yield Case(f"sphere of {radius:g} mfp", Subject.of(shape, Medium(albedo, 1 - albedo, 0.0, eta)))
+        yield Case(f"sphere of {radius:g} mfp", object_of(shape, Medium(albedo, 1 - albedo, 0.0, eta)))
 
 
 def evaluate(
@@ -113,41 +114,41 @@ def evaluate(
     for k, case in enumerate(cases):
         if progress:
             progress(case.name, k, n)
-        subject = case.subject
-        models: dict[str, Any] = {"neural_shape": transport(subject, path)}
-        models |= {name: transport_of(subject, name) for name in HALF_SPACES if _takes(name, subject)}
-        walks = WALKS * (MORE if float(subject.media[0].albedo_prime) < DARK else 1)
-        errors = errors_of(subject, models, exits=EXITS, walks=walks, samples=SAMPLES, seed=seed)
+        obj = case.object
+        models: dict[str, Any] = {"neural_shape": transport(obj, path)}
+        models |= {name: transport_of(obj, name) for name in HALF_SPACES if _takes(name, obj)}
+        walks = WALKS * (MORE if float(obj.media[0].albedo_prime) < DARK else 1)
+        errors = errors_of(obj, models, exits=EXITS, walks=walks, samples=SAMPLES, seed=seed)
         rows.append(_row(case, errors))
     return rows
 
 
-def _takes(name: str, subject: Subject) -> bool:
+def _takes(name: str, obj: TranslucentObject) -> bool:
     """Whether a half-space model takes the medium and has its orders two and more."""
     try:
-        return bssrdf(name, subject.media[0]).orders == "multiple"
+        return bssrdf(name, obj.media[0]).orders == "multiple"
     except ValueError:
         return False
 
 
 def _row(case: Case, by_model: Mapping[str, list[RadianceError]]) -> Row:
-    m = case.subject.media[0]
+    m = case.object.media[0]
     errors = {
         model: {light: next((r.error, r.standard_error) for r in rows if r.light == light and r.channel == 0)
                 for light in LIGHTS}
         for model, rows in by_model.items()
     }  # fmt: skip
-    size = float(case.subject.mean_free_paths()[0])
-    thickness = mean_chord(case.subject) * float(m.sigma_t)
+    size = float(case.object.mean_free_paths()[0])
+    thickness = mean_chord(case.object) * float(m.sigma_t)
     return Row(case.name, size, float(m.albedo), float(m.g), m.eta, thickness, errors)
 
 
-def seconds_per_million(subject: Subject, path: Path | None = None) -> dict[str, float]:
+def seconds_per_million(obj: TranslucentObject, path: Path | None = None) -> dict[str, float]:
     """Seconds for a million evaluations, entry and exit prepared anew, of the network and of half-space models."""
-    models: dict[str, Any] = {"neural_shape": transport(subject, path)}
-    models |= {name: transport_of(subject, name) for name in HALF_SPACES}
+    models: dict[str, Any] = {"neural_shape": transport(obj, path)}
+    models |= {name: transport_of(obj, name) for name in HALF_SPACES}
     rng = generator(mi, LANES, pass_seed(29))
-    exits, entries = subject.random_points(rng), subject.random_points(rng)
+    exits, entries = obj.random_points(rng), obj.random_points(rng)
     dr.eval(exits, entries)
     seconds = {}
     for name, model in models.items():
@@ -277,7 +278,7 @@ def picture(case: Case, model: str, size: int = SIZE) -> np.ndarray:
 
 
 def _scene(case: Case, path: Path, size: int) -> dict[str, Any]:
-    shape, m = case.subject.object.shape, case.subject.media[0]
+    shape, m = case.object.geometry.shape, case.object.media[0]
     shape.write_ply(str(path))
     box = shape.bbox()
     centre, radius = np.array(box.center()).ravel(), 0.5 * float(np.linalg.norm(np.array(box.extents()).ravel()))

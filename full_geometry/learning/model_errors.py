@@ -24,18 +24,18 @@ import numpy as np
 
 from full_geometry.models.object_model import HalfSpace
 from full_geometry.models.storing import KIND, find_weights, load
+from full_geometry.object.learnable import object_of
 from full_geometry.object.pairs import EntryProposals, trace_exits
 from full_geometry.object.patches import ExitTable
-from full_geometry.object.subject import Subject
 from halfspace_sss.checks import check_choice, check_count
 from halfspace_sss.interface.model import bssrdf
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.progress import NamedProgress
+from halfspace_sss.rendering.object.body import TranslucentObject
 from halfspace_sss.rendering.object.half_space import HalfSpaceTransport
 from halfspace_sss.rendering.object.points import SurfacePoint, Transport
 from halfspace_sss.rendering.object.registry import lookup, model_names
 from halfspace_sss.rendering.object.settings import Settings
-from halfspace_sss.rendering.object.translucent import Inside
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 LOBES = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / np.sqrt(3.0)
@@ -88,7 +88,7 @@ def _passes(n_exits: int, per_exit: int) -> list[int]:
     return [min(most, per_exit - done) for done in range(0, per_exit, most)]
 
 
-def reference(subject: Subject, exits: int = 256, walks: int = 8192, seed: int = 0, fewest: int = 2) -> ExitTruth:
+def reference(obj: TranslucentObject, exits: int = 256, walks: int = 8192, seed: int = 0, fewest: int = 2) -> ExitTruth:
     """Exits and their radiance by walks.
 
     Args:
@@ -97,16 +97,18 @@ def reference(subject: Subject, exits: int = 256, walks: int = 8192, seed: int =
     """
     for name, value, least in (("exits", exits, 2), ("walks", walks, 2), ("seed", seed, 0)):
         check_count(name, value, least)
-    points = subject.random_points(generator(mi, exits, pass_seed(seed, 17)))
+    points = obj.random_points(generator(mi, exits, pass_seed(seed, 17)))
     dr.eval(points)
-    return ExitTruth(points, traced(subject, points, walks, (seed, 18), fewest=fewest))
+    return ExitTruth(points, traced(obj, points, walks, (seed, 18), fewest=fewest))
 
 
-def traced(subject: Subject, exits: SurfacePoint, walks: int, seed: tuple[int, ...], **orders: int) -> ExitRadiance:
+def traced(
+    obj: TranslucentObject, exits: SurfacePoint, walks: int, seed: tuple[int, ...], **orders: int
+) -> ExitRadiance:
     """Radiance of exits by so many walks of each; `orders` as for `trace_exits`."""
     sums = _Sums(dr.width(exits.p))
     for k, per_exit in enumerate(_passes(sums.n_exits, walks)):
-        ends = trace_exits(subject, _repeated(exits, per_exit), (*seed, k), **orders)
+        ends = trace_exits(obj, _repeated(exits, per_exit), (*seed, k), **orders)
         sums.add(ends.T, ends.at.w, per_exit)
     return sums.estimate()
 
@@ -187,7 +189,7 @@ def _jackknife(square: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
 
 
 def measure(
-    subject: Subject,
+    obj: TranslucentObject,
     transport: Transport,
     proposals: EntryProposals,
     *,
@@ -198,7 +200,7 @@ def measure(
     """The error of a transport of an object, per channel, under constant light and lobes.
 
     Args:
-        subject: the object.
+        obj: the object.
         transport: its S.
         proposals: where entries are drawn.
         truth: from `reference`, of the orders of the transport; made anew by default.
@@ -206,7 +208,7 @@ def measure(
         seed: of everything.
     """
     check_count("samples", samples, 2)
-    truth = truth or reference(subject, seed=seed, fewest=FEWEST[transport.orders])
+    truth = truth or reference(obj, seed=seed, fewest=FEWEST[transport.orders])
     return compare(modelled(transport, proposals, truth.exits, samples, seed), truth.truth)
 
 
@@ -221,7 +223,7 @@ def _even_sky(transport: Transport, by_S: ExitRadiance, truth: ExitTruth) -> lis
 
 
 def errors_of(
-    subject: Subject,
+    obj: TranslucentObject,
     transports: Mapping[str, Transport],
     *,
     exits: int = 256,
@@ -235,14 +237,14 @@ def errors_of(
     Of those that have learnt what even light leaves also the error of images under an even sky.
 
     Args:
-        subject: the object.
+        obj: the object.
         transports: by name.
         exits, seed: number of exits; of everything.
         walks, samples: of each exit, for the truth and for the models.
         progress: called with (what, done, total).
     """
     check_count("samples", samples, 2)
-    proposals = EntryProposals(subject, HalfSpace(subject, PROBES))
+    proposals = EntryProposals(obj, HalfSpace(obj, PROBES))
     truths: dict[str, ExitTruth] = {}
     rows, done = {}, 0
     total = len(transports) + len({t.orders for t in transports.values()})
@@ -254,7 +256,7 @@ def errors_of(
     for name, model in transports.items():
         if model.orders not in truths:
             tell("truth", done)
-            truths[model.orders] = reference(subject, exits, walks, seed, FEWEST[model.orders])
+            truths[model.orders] = reference(obj, exits, walks, seed, FEWEST[model.orders])
             done += 1
         tell(name, done)
         truth = truths[model.orders]
@@ -296,12 +298,12 @@ def errors(
     Raises:
         ValueError: an argument is out of range, the object has not been trained, or there is no such model.
     """
-    subject = Subject.given(shape, medium, mm_per_unit, object)
-    transports = {model: transport_of(subject, model, folder)}
-    return errors_of(subject, transports, exits=exits, walks=walks, samples=samples, seed=seed)[model]
+    obj = object_of(shape, medium, mm_per_unit, object)
+    transports = {model: transport_of(obj, model, folder)}
+    return errors_of(obj, transports, exits=exits, walks=walks, samples=samples, seed=seed)[model]
 
 
-def transport_of(subject: Subject, model: str, folder: str | os.PathLike | None = None) -> Transport:
+def transport_of(obj: TranslucentObject, model: str, folder: str | os.PathLike | None = None) -> Transport:
     """The transport called `model` of an object: "full_geometry", one that a package adds, or a half-space model.
 
     Raises:
@@ -310,13 +312,11 @@ def transport_of(subject: Subject, model: str, folder: str | os.PathLike | None 
     """
     check_choice("model", model, model_names())
     if model == KIND:
-        return load(find_weights(subject, folder), subject).model
+        return load(find_weights(obj, folder), obj).model
     entry = lookup(model)
     if not entry.knows_objects:
-        return HalfSpaceTransport([bssrdf(model, m) for m in subject.media])
-    make = entry.transport
-    inside = Inside("medium", subject.media[0], model, "total", True, subject.varying)
-    found = make(subject.object, inside, list(subject.media), Settings()).transport if make else None
-    if found is None or found.is_delta:
+        return HalfSpaceTransport([bssrdf(model, m) for m in obj.media])
+    transport = entry.transport(obj, Settings()).transport if entry.transport else None
+    if transport is None or transport.is_delta:
         raise ValueError(f"model must be one that has S for two points of a surface, got {model!r}")
-    return found
+    return transport

@@ -16,9 +16,10 @@ import numpy as np
 from full_geometry.learning.shapes import TRAINING, Family, make_shape
 from full_geometry.models.descriptors import ALONE, describe, end, medium, mixed
 from full_geometry.models.neural_shape import ALBEDO, ETA, SIZE, Backbone, G
+from full_geometry.object.learnable import object_of
 from full_geometry.object.pairs import EntryProposals, trace_exits
-from full_geometry.object.subject import Subject
 from halfspace_sss.physics.medium import Medium
+from halfspace_sss.rendering.object.body import TranslucentObject
 from halfspace_sss.rendering.object.points import SurfacePoint
 from halfspace_sss.tracing.walk import generator, pass_seed
 
@@ -36,16 +37,16 @@ class Drawn:
 
     Args:
         family: of the shape, or the name of the mesh.
-        subject: the object.
+        obj: the object.
     """
 
     family: str
-    subject: Subject
+    object: TranslucentObject
 
     def record(self) -> dict[str, Any]:
         """What it is, ready for JSON."""
-        m = self.subject.media[0]
-        size = float(self.subject.mean_free_paths()[0])
+        m = self.object.media[0]
+        size = float(self.object.mean_free_paths()[0])
         return {"family": self.family, "size_in_mfp": size, "albedo": float(m.albedo), "g": float(m.g), "eta": m.eta}
 
 
@@ -90,14 +91,14 @@ def draw_subject(
     sigma_t = size / math.sqrt(area)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # thin sheets look open to a survey of few rays
-        subject = Subject.of(shape, Medium(albedo * sigma_t, (1 - albedo) * sigma_t, g, eta))
-    return Drawn(family, subject)
+        obj = object_of(shape, Medium(albedo * sigma_t, (1 - albedo) * sigma_t, g, eta))
+    return Drawn(family, obj)
 
 
-def mean_events(subject: Subject) -> float:
+def mean_events(obj: TranslucentObject) -> float:
     """About how many events a walk has: at most the mean path 4 eta² V/A in mean free paths, at most 1/(1 - albedo)."""
-    m = subject.media[0]
-    size = float(subject.mean_free_paths()[0])
+    m = obj.media[0]
+    size = float(obj.mean_free_paths()[0])
     return 5 + min(1 / max(1 - float(m.albedo), 1e-9), 0.4 * size * m.eta**2)
 
 
@@ -144,17 +145,17 @@ class PairData:
         return cls(**{**stored, "share": float(stored["share"])})
 
 
-def make_data(subject: Subject, events: float, seed: tuple[int, ...]) -> PairData | None:
+def make_data(obj: TranslucentObject, events: float, seed: tuple[int, ...]) -> PairData | None:
     """Walks and proposals of an object; None if too few walks leave it.
 
     Args:
-        subject: the object, of one channel or of equal ones.
+        obj: the object, of one channel or of equal ones.
         events: of a walk, about, which limits the number of walks.
         seed: of all of it.
     """
     n = int(np.clip(EVENTS / events, FEWEST_WALKS, WALKS))
-    starts = subject.random_points(generator(mi, n, pass_seed(*seed, 0)))
-    exits = trace_exits(subject, starts, (*seed, 1), roulette_from=ROULETTE_FROM)
+    starts = obj.random_points(generator(mi, n, pass_seed(*seed, 0)))
+    exits = trace_exits(obj, starts, (*seed, 1), roulette_from=ROULETTE_FROM)
     kept = dr.compress(exits.T[0] > 0)
     if dr.width(kept) < FEWEST_EXITS:
         return None
@@ -162,28 +163,28 @@ def make_data(subject: Subject, events: float, seed: tuple[int, ...]) -> PairDat
     mean = float(dr.sum(exits.T[0])[0]) / n
     kept = dr.gather(mi.UInt32, kept, dr.arange(mi.UInt32, min(dr.width(kept), KEPT)))
     T = dr.gather(mi.Float, exits.T[0], kept).numpy()
-    mixtures = mixed(subject)
-    half_space = Backbone(subject, mixtures)
+    mixtures = mixed(obj)
+    half_space = Backbone(obj, mixtures)
     walks, _ = _columns(half_space, starts.gather(kept), exits.at.gather(kept))
     rng = generator(mi, KEPT, pass_seed(*seed, 2))
-    starts = subject.random_points(rng)
-    entries, weight = EntryProposals(subject, half_space).sample(starts, rng)
+    starts = obj.random_points(rng)
+    entries, weight = EntryProposals(obj, half_space).sample(starts, rng)
     proposals, S_0 = _columns(half_space, starts, entries)
     W = (S_0 * weight.numpy() / mean).astype(np.float32)
     T = (T / mean).astype(np.float32)
-    return PairData(walks, T, proposals, W, medium(subject, 0, mixtures[0]), share)
+    return PairData(walks, T, proposals, W, medium(obj, 0, mixtures[0]), share)
 
 
 def _columns(half_space: Backbone, exits: SurfacePoint, entries: SurfacePoint) -> tuple[np.ndarray, np.ndarray]:
     """Descriptors of pairs, (pairs, numbers), and S_0 P_o P_i of the first channel."""
-    subject = half_space.subject
-    o, i = (end(subject, at) for at in (exits, entries))
+    obj = half_space.object
+    o, i = (end(obj, at) for at in (exits, entries))
     query, F_t, above = half_space.query(exits, entries)
     added = F_t * half_space.added(o, i)[0]
     factor = dr.select(above, o.event.P[0] * i.event.P[0], 0)
     dr.eval(query, added, factor)
     S_0 = (half_space.models[0].eval(*(v.numpy() for v in query)) + added.numpy()) * factor.numpy()
-    pair = describe(subject, o, i, half_space.shares([mi.Float(S_0.astype(np.float32))], o, i))[0]
+    pair = describe(obj, o, i, half_space.shares([mi.Float(S_0.astype(np.float32))], o, i))[0]
     columns = [*pair.exit, *pair.entry, *pair.shared]
     dr.eval(columns)
     rows = np.stack([np.broadcast_to(c.numpy(), dr.width(exits.p)) for c in columns], axis=-1)

@@ -258,7 +258,7 @@ class _ShapeTraining:
                 return (PairData.from_arrays(stored) if record["kept"] else None), record
         started = time.process_time()
         drawn = draw_subject((self.seed, k), meshes=self.meshes)
-        data = make_data(drawn.subject, mean_events(drawn.subject), (self.seed, k))
+        data = make_data(drawn.object, mean_events(drawn.object), (self.seed, k))
         record = {**drawn.record(), "kept": data is not None, "cpu_seconds": time.process_time() - started}
         if place:
             stream = io.BytesIO()
@@ -313,7 +313,7 @@ class _ShapeTraining:
             at, pool = time.monotonic(), []
             for k in range(1, 1 + TRIAL_OBJECTS):
                 drawn = draw_subject((self.seed, 2**31 + k), meshes=self.meshes)
-                pool += [make_data(drawn.subject, mean_events(drawn.subject), (self.seed, k))]
+                pool += [make_data(drawn.object, mean_events(drawn.object), (self.seed, k))]
             pool = [grouped(data) for data in pool if data]
             each = (time.monotonic() - at) / TRIAL_OBJECTS
             trial, rng, at = ShapeFit(self.recipe, 0), np.random.default_rng(0), time.monotonic()

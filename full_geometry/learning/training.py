@@ -29,16 +29,17 @@ from full_geometry.learning.model_errors import (
 from full_geometry.models import storing
 from full_geometry.models.object_model import FullGeometry
 from full_geometry.models.storing import frame_of, identify
-from full_geometry.object.features import n_pair, n_side
+from full_geometry.object.features import n_local, n_pair, n_side
+from full_geometry.object.learnable import object_of
 from full_geometry.object.pairs import EntryProposals, Pairs, PairSource, WalkEnds, shuffled
 from full_geometry.object.patches import Patches, PatchSampler, cluster
-from full_geometry.object.subject import Subject
 from halfspace_sss.backend import busy_threads
 from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.neural.store import check_weights_folder, to_json
 from halfspace_sss.neural.training.work_folder import CHECKPOINT, claim
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.provenance import check_folder, provenance, write_atomically
+from halfspace_sss.rendering.object.body import TranslucentObject
 from halfspace_sss.rendering.object.points import SurfacePoint
 from halfspace_sss.rendering.scenes.camera_walks import TRIAL
 
@@ -65,7 +66,7 @@ def trusted(
         walks: of each exit, for order one.
         seed: of them.
     """
-    once = traced(model.subject, truth.exits, walks, seed, fewest=1, most=1)
+    once = traced(model.object, truth.exits, walks, seed, fewest=1, most=1)
     unscattered, *alphas = (np.array(part).reshape(len(once.mean), -1) for part in model.alpha.parts(truth.exits))
     known = (once, truth.truth)
     means = [part.mean[:, :, 0].mean(axis=1) for part in known]
@@ -124,7 +125,7 @@ class CameraExits:
 
     def __init__(self, source: PairSource, camera: Any, walks: int, seed: int) -> None:
         self.source, self.camera, self.walks, self.seed = source, camera, walks, seed
-        self.shape = source.subject.object.shape
+        self.shape = source.object.geometry.shape
         self.schedule = CameraSchedule.of(walks, camera.hits(self.shape), camera.pixels)
 
     def seconds_more(self) -> float:
@@ -237,7 +238,7 @@ def train(
     the same `work` ends with the same weights. The data of a chunk are made beside the steps on the one before it.
 
     Args:
-        shape: a closed Mitsuba shape, a scene, or a `Subject`, which has its medium.
+        shape: a closed Mitsuba shape, a scene, or a `TranslucentObject`, which has its medium.
         medium: 1/mm, scalar or one value per channel; of a scene it is that of the object's `translucent` surface.
         mm_per_unit: length of a scene unit, mm; by default what the integrator of a scene says, and 1 for a shape.
         object: id of the object in a scene; may be left out where there is one.
@@ -255,7 +256,7 @@ def train(
     Raises:
         ValueError: an argument is out of range, or `work` is of another run; nothing has been traced then.
     """
-    subject = shape if isinstance(shape, Subject) else Subject.given(shape, medium, mm_per_unit, object)
+    obj = shape if isinstance(shape, TranslucentObject) else object_of(shape, medium, mm_per_unit, object)
     check_interval("seconds", seconds, 0.0, 1e7)
     check_count("seed", seed, 0)
     if target_error is not None:
@@ -265,10 +266,10 @@ def train(
     folder = check_weights_folder(folder)
     if work is not None:
         check_folder(work)
-    if not any(float(m.sigma_s) > 0 for m in subject.media):
+    if not any(float(m.sigma_s) > 0 for m in obj.media):
         raise ValueError("medium must scatter in at least one channel to be learnt, got sigma_s 0 in all")
     recipe = recipe if start is None else recipe.begun(start)
-    run = _ObjectTraining(subject, recipe, int(seed), Path(work) if work else None, camera)
+    run = _ObjectTraining(obj, recipe, int(seed), Path(work) if work else None, camera)
     if seconds == 0:
         warnings.warn(f"an object that is trained for 0 seconds is rendered by {recipe.start}", stacklevel=2)
         return Trained(*run.learnt(), None, [], 0, 0.0)
@@ -276,51 +277,51 @@ def train(
 
 
 def train_by_cpu(
-    subject: Subject, seconds: float, folder: str | Path, *, seed: int = 0, recipe: Recipe = STANDARD
+    obj: TranslucentObject, seconds: float, folder: str | Path, *, seed: int = 0, recipe: Recipe = STANDARD
 ) -> tuple[storing.Learnt, Path]:
     """Learn an object in so many seconds of CPU time, whatever else the machine does; its errors take more.
 
     Args:
-        subject: the object.
+        obj: the object.
         seconds: of CPU time of this process, for data and fit.
         folder: for the weights.
         seed, recipe: of everything; sizes and rates.
     """
     check_interval("seconds", seconds, 1e-3, 1e7)
-    run, began = _ObjectTraining(subject, recipe, seed, None, None), time.process_time()
+    run, began = _ObjectTraining(obj, recipe, seed, None, None), time.process_time()
     run._prepare()
     while run.done < run.total:
         run._chunk(seconds, time.process_time)
     run.fitting.solve(run.source, run.done, seed)
     spent = (time.process_time() - began) / busy_threads()  # of all cores, as the trade counts
-    record = run._record(run._judged(reference(subject, EXITS, WALKS, seed), SAMPLES), spent)
+    record = run._record(run._judged(reference(obj, EXITS, WALKS, seed), SAMPLES), spent)
     return run.learnt(), storing.save(folder, run.identity, run.arrays(), record)
 
 
 class _ObjectTraining:
     """A training on its way."""
 
-    def __init__(self, subject: Subject, recipe: Recipe, seed: int, work: Path | None, camera: Any) -> None:
-        self.subject, self.recipe, self.seed, self.work, self.camera = subject, recipe, seed, work, camera
-        self.identity, self.frame = identify(subject), frame_of(subject)
-        self.base = storing.base_model(subject, recipe.start)
-        self.proposals = EntryProposals(subject, self.base)
-        self.source = PairSource(subject, self.frame, self.base, self.proposals)
+    def __init__(self, obj: TranslucentObject, recipe: Recipe, seed: int, work: Path | None, camera: Any) -> None:
+        self.object, self.recipe, self.seed, self.work, self.camera = obj, recipe, seed, work, camera
+        self.identity, self.frame = identify(obj), frame_of(obj)
+        self.base = storing.base_model(obj, recipe.start)
+        self.proposals = EntryProposals(obj, self.base)
+        self.source = PairSource(obj, self.frame, self.base, self.proposals)
         self.seen: CameraExits | None = None
         self.patches = self.centres = None
-        if "faces" in mi.traverse(subject.object.shape):
-            self.centres = cluster(subject, self.frame, seed=seed).astype(np.float16)
-            self.patches = Patches(subject, self.frame, self.centres.astype(np.float32))
+        if "faces" in mi.traverse(obj.geometry.shape):
+            self.centres = cluster(obj, self.frame, seed=seed).astype(np.float16)
+            self.patches = Patches(obj, self.frame, self.centres.astype(np.float32))
         self.fitting = self._new_fitting()
-        self.even = np.ones((2, len(subject.media)), np.float16)
+        self.even = np.ones((2, len(obj.media)), np.float16)
         self.done, self.total, self.walks, self.history = 0, math.inf, recipe.chunk, []
         self.ready: tuple[Pairs, Pairs] | None = None
         self.aside = ThreadPoolExecutor(1)
 
     def _new_fitting(self) -> ObjectFit:
-        channels = len(self.subject.media)
-        n_in = 2 * n_side(channels, self.subject.n_local) + n_pair(channels)
-        return ObjectFit(n_in, channels, self.subject.eta, self.recipe, self.seed, self.patches)
+        channels = len(self.object.media)
+        n_in = 2 * n_side(channels, n_local(self.object)) + n_pair(channels)
+        return ObjectFit(n_in, channels, self.object.media[0].eta, self.recipe, self.seed, self.patches)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """What is written: in half precision, but for what turns the inputs."""
@@ -330,14 +331,14 @@ class _ObjectTraining:
 
     def learnt(self) -> storing.Learnt:
         """Model and sampler as they stand."""
-        return storing.assemble(self.subject, self.frame, self.base, self.arrays(), self.patches)
+        return storing.assemble(self.object, self.frame, self.base, self.arrays(), self.patches)
 
     def go(
         self, seconds: float, chunks: int | None, target: float | None, folder: Path, progress: Progress | None
     ) -> Trained:
         started = time.monotonic()
         self._prepare(chunks)
-        truth = reference(self.subject, EXITS, WALKS, self.seed)
+        truth = reference(self.object, EXITS, WALKS, self.seed)
         saved, what = time.monotonic(), "training"
         while self.done < self.total and not self._reached(target):
             self._chunk(seconds)
@@ -417,7 +418,7 @@ class _ObjectTraining:
         """Of the model as it stands; entries follow the patches, which have less noise than probes."""
         model, sampler = self.learnt()
         by = self.proposals.with_patches(sampler)
-        return measure(self.subject, model, by, truth=truth, samples=samples, seed=self.seed)
+        return measure(self.object, model, by, truth=truth, samples=samples, seed=self.seed)
 
     def _judged(self, truth: ExitTruth, samples: int) -> list[RadianceError]:
         """Errors at the end, and what even light may be used for."""
@@ -428,7 +429,7 @@ class _ObjectTraining:
     def _validated(self, truth: ExitTruth) -> tuple[int, float, float]:
         """Chunk, largest error under constant light and its standard error."""
         rows = self._errors(truth, SAMPLES)
-        live = [r for r in rows if r.light == "constant" and float(self.subject.media[r.channel].sigma_s) > 0]
+        live = [r for r in rows if r.light == "constant" and float(self.object.media[r.channel].sigma_s) > 0]
         worst = max(live, key=lambda r: r.error, default=rows[0])
         return self.done, worst.error, worst.standard_error
 
@@ -442,7 +443,7 @@ class _ObjectTraining:
     def _record(self, errors: list[RadianceError], seconds: float) -> dict[str, Any]:
         return {
             "recipe": asdict(self.recipe), "seed": self.seed, "steps": self.fitting.step, "chunks": self.done,
-            storing.CHECKSUMS: storing.base_checksums(self.subject, self.recipe.start),
+            storing.CHECKSUMS: storing.base_checksums(self.object, self.recipe.start),
             "walks": self.walks * self.done, "seconds": seconds, "history": self.history,
             "errors": [row._asdict() for row in errors], "provenance": provenance(seed=self.seed),
         }  # fmt: skip

@@ -15,11 +15,11 @@ import mitsuba as mi
 import numpy as np
 
 from full_geometry.object.features import FirstEvent, first_event
-from full_geometry.object.subject import Subject, refract_in
 from halfspace_sss.neural.features import medium_features
 from halfspace_sss.physics.backbone import length_scale
 from halfspace_sss.physics.medium import Medium
-from halfspace_sss.rendering.object.points import SurfacePoint, number
+from halfspace_sss.rendering.object.body import TranslucentObject
+from halfspace_sss.rendering.object.points import SurfacePoint, number, refract_in
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 # ----------------------------------------------------------------------------------------------------
@@ -58,23 +58,23 @@ class Mixed(NamedTuple):
     k: float
 
 
-def mean_chord(subject: Subject) -> float:
+def mean_chord(obj: TranslucentObject) -> float:
     """4 V/A, V from the mean of x.n over random points of the surface; <= 0 where it is open or inside out."""
-    at = subject.random_points(generator(_mitsuba(), POINTS, pass_seed(SEED)))
+    at = obj.random_points(generator(_mitsuba(), POINTS, pass_seed(SEED)))
     x, n = (np.array(v, dtype=float) for v in (at.p, at.n))
     x -= x.mean(axis=1, keepdims=True)
     return float(4 / 3 * (x * n).sum(axis=0).mean())
 
 
-def mixed(subject: Subject) -> list[Mixed]:
+def mixed(obj: TranslucentObject) -> list[Mixed]:
     """What each channel mixes; M and m_2 are 0 where there is no scattering or no volume."""
-    at = subject.random_points(generator(_mitsuba(), POINTS, pass_seed(SEED)))
-    entering, chord = refract_in(at, number(subject.eta))[1], max(mean_chord(subject), 0.0)
-    kinds = [subject.media, *(tuple(map(kind, subject.media)) for kind in (_reduced, _unbounded))]
-    P = [first_event(replace(subject, media=media), at).P for media in kinds]
+    at = obj.random_points(generator(_mitsuba(), POINTS, pass_seed(SEED)))
+    entering, chord = refract_in(at, obj.eta)[1], max(mean_chord(obj), 0.0)
+    kinds = [obj.media, *(tuple(map(kind, obj.media)) for kind in (_reduced, _unbounded))]
+    P = [first_event(replace(obj, media=media), at).P for media in kinds]
     through = [entering, entering, 1.0]
     scattered = [[float(np.mean((F_t * p).numpy())) for p in each] for F_t, each in zip(through, P)]
-    return [_of(subject, media, parts, chord) for media, parts in zip(zip(*kinds), zip(*scattered))]
+    return [_of(obj, media, parts, chord) for media, parts in zip(zip(*kinds), zip(*scattered))]
 
 
 def _reduced(m: Medium) -> Medium:
@@ -85,7 +85,7 @@ def _unbounded(m: Medium) -> Medium:
     return Medium(m.sigma_s, m.sigma_a, m.g, 1.0)
 
 
-def _of(subject: Subject, media: Sequence[Medium], scattered: Sequence[float], chord: float) -> Mixed:
+def _of(obj: TranslucentObject, media: Sequence[Medium], scattered: Sequence[float], chord: float) -> Mixed:
     m, reduced, _ = media
     thickness, a = float(reduced.sigma_t) * chord, float(m.albedo)
     if not (thickness > 0 and a > 0 and scattered[0] > 0):
@@ -94,7 +94,7 @@ def _of(subject: Subject, media: Sequence[Medium], scattered: Sequence[float], c
     a_reduced, k, thin = float(reduced.albedo), scattered[1] / scattered[0], 1 / (1 + thickness**2)
     M = a**2 * max(q - q_direct, 0.0) / float(m.sigma_t)
     M += a * q * k**2 * a_reduced**2 * q_reduced / (1 - a_reduced * q_reduced) / float(reduced.sigma_t)
-    M /= math.pi * subject.object.area * chord * m.eta**2  # 4 V = c A
+    M /= math.pi * obj.geometry.area * chord * m.eta**2  # 4 V = c A
     return Mixed(M * thin, (a / (4 * math.pi * m.eta)) ** 2, thickness, q, q_reduced, q_direct, k)
 
 
@@ -195,24 +195,26 @@ def directions(n: int = RAYS) -> np.ndarray:
     return np.stack([s * np.cos(phi), s * np.sin(phi), z])
 
 
-def look(subject: Subject, at: SurfacePoint, event: FirstEvent, active: Any = True) -> list[RaySurroundings]:
+def look(obj: TranslucentObject, at: SurfacePoint, event: FirstEvent, active: Any = True) -> list[RaySurroundings]:
     """Surroundings of the first events of each channel; channels of the same extinction share them.
 
     Args:
-        subject: the object.
+        obj: the object.
         at: points of its surface, with the directions outside that light goes along.
         event: their first events.
         active: mask of lanes.
     """
     known: dict[tuple[float, float], RaySurroundings] = {}
-    for m, y in zip(subject.media, event.ys):
+    for m, y in zip(obj.media, event.ys):
         key = float(m.sigma_t), float(m.sigma_t_prime)
         if key not in known:
-            known[key] = _from(subject, at, y, key, active)
-    return [known[float(m.sigma_t), float(m.sigma_t_prime)] for m in subject.media]
+            known[key] = _from(obj, at, y, key, active)
+    return [known[float(m.sigma_t), float(m.sigma_t_prime)] for m in obj.media]
 
 
-def _from(subject: Subject, at: SurfacePoint, y: Any, extinctions: tuple[float, float], active: Any) -> RaySurroundings:
+def _from(
+    obj: TranslucentObject, at: SurfacePoint, y: Any, extinctions: tuple[float, float], active: Any
+) -> RaySurroundings:
     """Surroundings of the points y below the points of a surface, for sigma_t and sigma_t'."""
     tables = [mi.Float(row.astype(np.float32)) for row in directions()]
     sigma_t, sigma_t_prime = extinctions
@@ -223,7 +225,7 @@ def _from(subject: Subject, at: SurfacePoint, y: Any, extinctions: tuple[float, 
     def step(j: Any, *sums: list) -> tuple:
         u, v, w = (dr.gather(mi.Float, table, j) for table in tables)
         d = mi.Vector3f(t * u + b * v + n * w)
-        hit = subject.object.scene.ray_intersect_preliminary(mi.Ray3f(y, d), False, active)
+        hit = obj.geometry.scene.ray_intersect_preliminary(mi.Ray3f(y, d), False, active)
         ways = dr.select(hit.is_valid(), hit.t, FAR), dr.select(w > 0, depth / dr.maximum(w, 1e-6), FAR)
         c, c_plane = ([1 - dr.exp(-way * decay) for decay in decays] for way in ways)
         new = c, c_plane, [d * v for v in c], [d * v for v in c_plane]
@@ -293,42 +295,48 @@ class Pair(NamedTuple):
     shared: list[Any]
 
 
-def end(subject: Subject, at: SurfacePoint, active: Any = True) -> End:
+def end(obj: TranslucentObject, at: SurfacePoint, active: Any = True) -> End:
     """What belongs to one end alone, measured once for all partners."""
-    inner = refract_in(at, number(subject.eta))[0]
-    event = first_event(subject, at, active)
-    return End(at, event, look(subject, at, event, active), inner)
+    inner = refract_in(at, obj.eta)[0]
+    event = first_event(obj, at, active)
+    return End(at, event, look(obj, at, event, active), inner)
 
 
-def medium(subject: Subject, channel: int, mixed: Mixed) -> np.ndarray:
+def medium(obj: TranslucentObject, channel: int, mixed: Mixed) -> np.ndarray:
     """The numbers of the medium of a channel and of the object as a whole, (16,)."""
-    m = subject.media[channel]
+    m = obj.media[channel]
     albedo, g, eta = (np.float64(v) for v in (m.albedo, m.g, m.eta))
-    size = float(m.sigma_t_prime) * math.sqrt(subject.object.area)
+    size = float(m.sigma_t_prime) * math.sqrt(obj.geometry.area)
     of_medium = medium_features(np, albedo, g, eta, length_scale(albedo, g))
     sizes = [1 / (1 + 0.1 * size), 0.2 * math.log1p(size), 0.3 * math.log(mixed.chord + 1e-2)]
     return np.array([*of_medium, *sizes, mixed.q, mixed.q_reduced, mixed.q_direct, mixed.k], dtype=np.float32)
 
 
 def describe(
-    subject: Subject, exit: End, entry: End, shares: Sequence[Sequence[Any]], active: Any = True
+    obj: TranslucentObject, exit: End, entry: End, shares: Sequence[Sequence[Any]], active: Any = True
 ) -> list[Pair]:
     """The descriptors of pairs for each channel, with the shares of `Backbone`; those of one extinction share rays."""
     line = Segment.between(exit.at.p, entry.at.p)
     clear: dict[float, tuple[Any, Any]] = {}
     pairs = []
-    for c, m in enumerate(subject.media):
+    for c, m in enumerate(obj.media):
         key = float(m.sigma_t)
         if key not in clear:
-            clear[key] = _clearance(subject, exit.event.ys[c], entry.event.ys[c], active)
-        pairs.append(_channel(subject, c, exit, entry, line, clear[key], shares[c]))
+            clear[key] = _clearance(obj, exit.event.ys[c], entry.event.ys[c], active)
+        pairs.append(_channel(obj, c, exit, entry, line, clear[key], shares[c]))
     return pairs
 
 
 def _channel(
-    subject: Subject, c: int, exit: End, entry: End, line: Segment, clear: tuple[Any, Any], shares: Sequence[Any]
+    obj: TranslucentObject,
+    c: int,
+    exit: End,
+    entry: End,
+    line: Segment,
+    clear: tuple[Any, Any],
+    shares: Sequence[Any],
 ) -> Pair:
-    m = subject.media[c]
+    m = obj.media[c]
     s, t, g = number(float(m.sigma_t_prime)), number(float(m.sigma_t)), float(m.g)
     gap = Segment.between(exit.event.ys[c], entry.event.ys[c])
     own_o, own_i = _own(c, t, exit, entry, line, gap), _own(c, t, entry, exit, line.back, gap.back)
@@ -367,12 +375,12 @@ def _own(c: int, sigma_t: Any, here: End, there: End, line: Segment, gap: Segmen
     ]  # fmt: skip
 
 
-def _clearance(subject: Subject, a: Any, b: Any, active: Any) -> tuple[Any, Any]:
+def _clearance(obj: TranslucentObject, a: Any, b: Any, active: Any) -> tuple[Any, Any]:
     """Of the line between two points inside: 1 if it leaves the object, else 0; the length that it is outside for."""
     line = Segment.between(a, b)
 
     def reach(start: Any, d: Any, needed: Any) -> Any:
-        hit = subject.object.scene.ray_intersect_preliminary(mi.Ray3f(start, d), False, needed)
+        hit = obj.geometry.scene.ray_intersect_preliminary(mi.Ray3f(start, d), False, needed)
         return dr.select(hit.is_valid() & (hit.t < line.length), hit.t, line.length)
 
     one = reach(a, line.d, active)

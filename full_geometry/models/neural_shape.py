@@ -38,13 +38,13 @@ from full_geometry.models.descriptors import (
 from full_geometry.models.object_model import HalfSpace
 from full_geometry.object.features import Side
 from full_geometry.object.pairs import EntryProposals, trace_exits
-from full_geometry.object.subject import Subject, refract_in
 from halfspace_sss.interface.model import BSSRDF, bssrdf
 from halfspace_sss.lazy import once
 from halfspace_sss.neural.perceptron import Perceptron
 from halfspace_sss.neural.store import checksum_of, load_weights
 from halfspace_sss.physics.medium import Medium
-from halfspace_sss.rendering.object.points import SurfacePoint, number
+from halfspace_sss.rendering.object.body import TranslucentObject
+from halfspace_sss.rendering.object.points import SurfacePoint, number, refract_in
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 # ---- What the network of all shapes is trained on, and warns outside of ----------------------------
@@ -74,12 +74,12 @@ class Backbone(HalfSpace):
     """S_0 P_o P_i per channel.
 
     Args:
-        subject: the object.
+        obj: the object.
         mixtures: what each of its channels mixes.
     """
 
-    def __init__(self, subject: Subject, mixtures: Sequence[Mixed]) -> None:
-        super().__init__(subject, MODEL, FLOOR)
+    def __init__(self, obj: TranslucentObject, mixtures: Sequence[Mixed]) -> None:
+        super().__init__(obj, MODEL, FLOOR)
         self.mixtures = mixtures
 
     def added(self, exit: Side, entry: Side) -> list[Any]:
@@ -100,12 +100,12 @@ class Backbone(HalfSpace):
 
     def twice(self, exit: Side, entry: Side) -> Any:
         """S_twice/(F_t(w_o) P_o F_t(w_i) P_i) per channel, that of a plane taken off."""
-        eta = number(self.subject.eta)
+        eta = self.object.eta
         o, i = (refract_in(side.at, eta)[0] for side in (exit, entry))
         line = Segment.between(exit.at.p, entry.at.p)
         d_o, d_i = on_a_plane(exit.at.n_out, o, entry.at.n_out, i, line)
         channels = []
-        for c, (m, mixture) in enumerate(zip(self.subject.media, self.mixtures)):
+        for c, (m, mixture) in enumerate(zip(self.object.media, self.mixtures)):
             t = number(max(float(m.sigma_t), 1e-20))
             ys = exit.event.ys[c], entry.event.ys[c]
             spread = dr.square(exit.event.lengths[c]) + dr.square(entry.event.lengths[c])
@@ -140,7 +140,7 @@ class NeuralShape:
     positive; 0 below the horizons.
 
     Args:
-        subject: the object.
+        obj: the object.
         half_space: S_0 P_o P_i.
         weights: W_k (outputs, inputs) and b_k of the layers.
         media: numbers of each channel.
@@ -148,7 +148,7 @@ class NeuralShape:
         checksums: of the weights, and of those of the half-space models that they correct.
     """
 
-    subject: Subject
+    object: TranslucentObject
     half_space: Backbone
     weights: Mapping[str, np.ndarray]
     media: Sequence[np.ndarray]
@@ -159,11 +159,11 @@ class NeuralShape:
     is_delta = False
 
     @classmethod
-    def of(cls, subject: Subject, weights: Mapping[str, np.ndarray]) -> NeuralShape:
+    def of(cls, obj: TranslucentObject, weights: Mapping[str, np.ndarray]) -> NeuralShape:
         """The model of an object from the arrays of a file, not held to walks."""
-        mixtures = mixed(subject)
-        numbers = [medium(subject, c, mixture) for c, mixture in enumerate(mixtures)]
-        return cls(subject, Backbone(subject, mixtures), weights, numbers)
+        mixtures = mixed(obj)
+        numbers = [medium(obj, c, mixture) for c, mixture in enumerate(mixtures)]
+        return cls(obj, Backbone(obj, mixtures), weights, numbers)
 
     @functools.cached_property
     def _network(self) -> Perceptron:
@@ -185,7 +185,7 @@ class NeuralShape:
 
     def end(self, at: SurfacePoint, active: Any = True) -> End:
         """What belongs to one end alone."""
-        return end(self.subject, at, active)
+        return end(self.object, at, active)
 
     def prepare(self, at: SurfacePoint, active: Any = True) -> End:
         """The exit's side, for as many entries as are asked for."""
@@ -204,7 +204,7 @@ class NeuralShape:
     def __call__(self, exit: End, entry: End, active: Any = True) -> Any:
         """S of two ends, as `S`."""
         S_0 = self.half_space(exit, entry)
-        pairs = describe(self.subject, exit, entry, self.half_space.shares(S_0, exit, entry), active)
+        pairs = describe(self.object, exit, entry, self.half_space.shares(S_0, exit, entry), active)
         f = mi.Spectrum([self._f(pair, numbers) for pair, numbers in zip(pairs, self._media)])
         return dr.select(active, S_0 * dr.exp(f) * self._scale, 0)
 
@@ -253,8 +253,8 @@ def calibrated(model: NeuralShape) -> NeuralShape:
     weights = np.array([calibration_weight(mixture) for mixture in model.half_space.mixtures])
     if not weights.any():
         return model
-    proposals = EntryProposals(model.subject, model.half_space)
-    B = _mean(lambda n, k: _walks(model.subject, n, k), *WALKS)
+    proposals = EntryProposals(model.object, model.half_space)
+    B = _mean(lambda n, k: _walks(model.object, n, k), *WALKS)
     S = _mean(lambda n, k: _pairs(model, proposals, n, k), *PAIRS)
     known = (B > 0) & (S > 0)
     ratio = np.clip(np.where(known, B, 1) / np.where(known, S, 1), 1 / MOST_SCALE, MOST_SCALE)
@@ -279,15 +279,15 @@ def _relative_error(samples: np.ndarray) -> np.ndarray:
     return samples.std(axis=1) / np.maximum(samples.mean(axis=1), 1e-30) / np.sqrt(samples.shape[1])
 
 
-def _walks(subject: Subject, n: int, k: int) -> np.ndarray:
+def _walks(obj: TranslucentObject, n: int, k: int) -> np.ndarray:
     """Throughputs of n walks."""
-    starts = subject.random_points(generator(mi, n, pass_seed(SEED, 0, k)))
-    return _rows(trace_exits(subject, starts, (SEED, 1, k)).T)
+    starts = obj.random_points(generator(mi, n, pass_seed(SEED, 0, k)))
+    return _rows(trace_exits(obj, starts, (SEED, 1, k)).T)
 
 
 def _pairs(model: NeuralShape, proposals: EntryProposals, n: int, k: int) -> np.ndarray:
     """S mu_i over the density of the entries of n random exits."""
-    exits = model.subject.random_points(generator(mi, n, pass_seed(SEED, 2, k)))
+    exits = model.object.random_points(generator(mi, n, pass_seed(SEED, 2, k)))
     entries, over = proposals.sample(exits, generator(mi, n, pass_seed(SEED, 3, k)))
     dr.eval(exits, entries, over)
     return _rows(dr.select(over > 0, model.S(model.prepare(exits), entries) * over, 0))
@@ -329,21 +329,21 @@ def load(path: Path) -> dict[str, np.ndarray]:
     return {name: value.astype(np.float32) for name, value in arrays.items()}
 
 
-def checksums(subject: Subject, path: str | os.PathLike | None = None) -> tuple[str, ...]:
+def checksums(obj: TranslucentObject, path: str | os.PathLike | None = None) -> tuple[str, ...]:
     """Of the shipped weights or others, and of those of the half-space models that they correct."""
-    models = [bssrdf(MODEL, m) for m in subject.media]
+    models = [bssrdf(MODEL, m) for m in obj.media]
     own = checksum_of(Path(path) if path is not None else shipped_weights(), KIND)
     return (own, *(checksum for m in models for checksum in m.checksums))
 
 
-def transport(subject: Subject, path: str | os.PathLike | None = None) -> NeuralShape:
+def transport(obj: TranslucentObject, path: str | os.PathLike | None = None) -> NeuralShape:
     """The model of an object, by the shipped weights or others, held to the light that leaves by walks.
 
     Raises:
         ValueError: the file cannot be used, or the medium varies or is out of the range of `neural`.
     """
-    if subject.varying is not None:
-        name = subject.object.shape.id()
+    if obj.varying is not None:
+        name = obj.geometry.shape.id()
         raise ValueError(f"the medium of {name!r} must be the same everywhere for {KIND}, got one that varies")
-    model = NeuralShape.of(subject, load(Path(path) if path is not None else shipped_weights()))
-    return replace(calibrated(model), checksums=checksums(subject, path))
+    model = NeuralShape.of(obj, load(Path(path) if path is not None else shipped_weights()))
+    return replace(calibrated(model), checksums=checksums(obj, path))

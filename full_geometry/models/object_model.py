@@ -23,15 +23,16 @@ from full_geometry.object.features import (
     Side,
     entering,
     first_event,
+    n_local,
     n_pair,
     n_side,
     pair_features,
     side_features,
 )
-from full_geometry.object.subject import Subject
 from halfspace_sss.interface.model import BSSRDF, bssrdf
 from halfspace_sss.neural.perceptron import Perceptron
 from halfspace_sss.physics import fresnel
+from halfspace_sss.rendering.object.body import TranslucentObject
 from halfspace_sss.rendering.object.points import SurfacePoint, number, plane_query
 
 FLOOR = 1e-2  # reflectance of the floor, over that of the half-space
@@ -41,30 +42,30 @@ class HalfSpace:
     """S_0 P_o P_i per channel, S_0 the model of the plane plus a floor that does not depend on the positions.
 
     Args:
-        subject: the object.
+        obj: the object.
         model: name of a half-space model.
         floor: reflectance of the floor, over that of the half-space.
     """
 
-    def __init__(self, subject: Subject, model: str, floor: float = FLOOR) -> None:
-        self.subject, self.name, self.floor = subject, model, floor
-        self.models: list[BSSRDF] = [bssrdf(model, m) for m in subject.media]
+    def __init__(self, obj: TranslucentObject, model: str, floor: float = FLOOR) -> None:
+        self.object, self.name, self.floor = obj, model, floor
+        self.models: list[BSSRDF] = [bssrdf(model, m) for m in obj.media]
 
     @functools.cached_property
     def floors(self) -> list[float]:
         """Per channel floor of G: floor R_d / (A N), N = 4 pi C_phi(1/eta) normalises F_t over exit directions."""
         floors = []
-        for m in self.subject.media:
+        for m in self.object.media:
             N = 4 * math.pi * fresnel.C_phi(1 / m.eta)
             albedo = float(m.albedo_prime)
             R_d = albedo**2 * math.exp(-2 * math.sqrt(max(1 - albedo, 0.0)))
             share = self.floor * max(R_d, 1e-6) if float(m.sigma_s) > 0 else 0.0
-            floors.append(share / (self.subject.object.area * N))
+            floors.append(share / (self.object.geometry.area * N))
         return floors
 
     def end(self, at: SurfacePoint, active: Any = True) -> Side:
         """What belongs to one end alone."""
-        return Side(at, first_event(self.subject, at, active))
+        return Side(at, first_event(self.object, at, active))
 
     def __call__(self, exit: Side, entry: Side, active: Any = True) -> Any:
         """1/((scene unit)² sr), 0 below the horizons."""
@@ -79,7 +80,7 @@ class HalfSpace:
     def query(self, o: SurfacePoint, i: SurfacePoint) -> tuple[tuple, Any, Any]:
         """The query of the models, both Fresnel transmittances, and whether both directions are above the horizons."""
         query = plane_query(i, o, "distance")
-        mu_i, mu_o, eta = query[1], query[3], number(self.subject.eta)
+        mu_i, mu_o, eta = query[1], query[3], self.object.eta
         F_t = fresnel.F_t(mu_i, eta) * fresnel.F_t(mu_o, eta)
         return query, F_t, (mu_i > 0) & (mu_o > 0) & (dr.dot(o.w, o.n) > 0) & (dr.dot(i.w, i.n) > 0)
 
@@ -102,13 +103,13 @@ class DirectionalAlbedo:
     """Of one object.
 
     Args:
-        subject: the object.
+        obj: the object.
         frame: of the features.
         weights: A_k (outputs, inputs) and a_k of the layers.
         trusted: (2, channels) from `learning.training.trusted`.
     """
 
-    subject: Subject
+    object: TranslucentObject
     frame: ObjectFrame
     weights: Mapping[str, np.ndarray]
     trusted: np.ndarray
@@ -128,11 +129,11 @@ class DirectionalAlbedo:
 
     def parts(self, at: SurfacePoint, active: Any = True) -> tuple[Any, Any, Any]:
         """What passes unscattered, alpha_1 and alpha, per channel."""
-        columns = side_features(self.frame, Side(at, first_event(self.subject, at, active)))
-        media = self.subject.media
+        columns = side_features(self.frame, Side(at, first_event(self.object, at, active)))
+        media = self.object.media
         x, n = self._networks[1](self.units(columns)), len(media)
         live = mi.Spectrum([number(float(m.sigma_s) > 0) for m in media])
-        enters, most = (mi.Spectrum(v) for v in entering(columns, number(self.subject.eta), n))
+        enters, most = (mi.Spectrum(v) for v in entering(columns, self.object.eta, n))
         once, more = (live * most / (1 + dr.exp(-mi.Spectrum(part))) for part in (x[:n], x[n:]))
         return tuple(dr.select(active, part, 0) for part in (enters - most, once, more))
 
@@ -159,7 +160,7 @@ class FullGeometry:
     Orders two and more; positive; reciprocal as far as it has been learnt.
 
     Args:
-        subject: the object.
+        obj: the object.
         frame: of the features.
         base: S_0.
         weights: W_k (outputs, inputs) and b_k of the layers, Q of h.
@@ -167,7 +168,7 @@ class FullGeometry:
         checksums: of the file of weights, and of those of its base model.
     """
 
-    subject: Subject
+    object: TranslucentObject
     frame: ObjectFrame
     base: BaseModel
     weights: Mapping[str, np.ndarray]
@@ -179,12 +180,12 @@ class FullGeometry:
     @functools.cached_property
     def _network(self) -> Perceptron:
         """The first layer in two parts, exit and the rest."""
-        split = (self.weights["W_0"].shape[1] - n_pair(len(self.subject.media))) // 2
+        split = (self.weights["W_0"].shape[1] - n_pair(len(self.object.media))) // 2
         return Perceptron.named(self.weights, "W", "b", splits=[split], looped=True)
 
     @functools.cached_property
     def _h(self) -> Quadratic:
-        return Quadratic(self.weights["Q"], n_side(len(self.subject.media), self.subject.n_local))
+        return Quadratic(self.weights["Q"], n_side(len(self.object.media), n_local(self.object)))
 
     def prepare(self, at: SurfacePoint, active: Any = True) -> PreparedExit:
         """The exit's side, for as many entries as are asked for."""

@@ -6,6 +6,7 @@ It is the same shape of the same size in mean free paths, wherever it stands.
 from __future__ import annotations
 
 import hashlib
+import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -17,11 +18,12 @@ import numpy as np
 
 from full_geometry.models import neural_shape as shapes
 from full_geometry.models.object_model import DirectionalAlbedo, FullGeometry, HalfSpace
-from full_geometry.object.features import REFLECTIONS, BaseModel, ObjectFrame, n_pair, n_side, surroundings
+from full_geometry.object.features import REFLECTIONS, BaseModel, ObjectFrame, n_local, n_pair, n_side, surroundings
 from full_geometry.object.patches import Patches, PatchSampler
-from full_geometry.object.subject import Subject
 from halfspace_sss.interface.model import bssrdf
 from halfspace_sss.neural.store import load_weights, save_weights, weights_folder
+from halfspace_sss.physics.medium import Medium
+from halfspace_sss.rendering.object.body import TranslucentObject
 from halfspace_sss.rendering.object.points import number
 from halfspace_sss.rendering.object.varying import grid_values
 
@@ -111,9 +113,9 @@ def _kabsch(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray, float
     return R, t, float(np.linalg.norm(a @ R.T + t - b, axis=1).max())
 
 
-def identify(subject: Subject) -> Identity:
+def identify(obj: TranslucentObject) -> Identity:
     """The identity of an object as it stands."""
-    shape = subject.object.shape
+    shape = obj.geometry.shape
     parameters = mi.traverse(shape)
     topology = ""
     if "faces" in parameters:
@@ -128,16 +130,29 @@ def identify(subject: Subject) -> Identity:
         anchors = (matrix[:3, :3] @ corners + matrix[:3, 3:]).T
     else:
         raise ValueError(f"shape must be a mesh or have a transformation, got {shape.class_name()}")
-    media = subject.media
+    media = obj.media
     medium = {key: [float(getattr(m, key)) for m in media] for key in ("albedo", "g")}
-    medium |= {"size_in_mfp": subject.mean_free_paths().tolist(), "eta": float(subject.eta)}
-    grids, probes = _digest_of_grids(subject), _probed(subject, anchors)
+    medium |= {"size_in_mfp": obj.mean_free_paths().tolist(), "eta": float(obj.media[0].eta)}
+    grids, probes = _digest_of_grids(obj), _probed(obj, anchors)
     return Identity(shape.class_name(), topology, anchors.astype(np.float32), medium, grids, probes)
 
 
-def _digest_of_grids(subject: Subject) -> str:
+def _as_trained(obj: TranslucentObject, medium: dict[str, Any]) -> TranslucentObject:
+    """The same with the homogeneous equivalent of training, see `Identity`; itself where the medium is homogeneous.
+
+    Another equivalent, over the random points that the object has where it stands now, would be another S_0.
+    """
+    if obj.varying is None or len(medium["albedo"]) != len(obj.media):
+        return obj
+    known = zip(medium["albedo"], medium["size_in_mfp"], medium["g"])
+    length, eta = math.sqrt(obj.geometry.area), obj.media[0].eta
+    media = tuple(Medium.from_albedo(albedo, size / length, g, eta) for albedo, size, g in known)
+    return replace(obj, media=media)
+
+
+def _digest_of_grids(obj: TranslucentObject) -> str:
     """Of the voxels and of the ratios of what they are multiplied by; empty for a homogeneous medium."""
-    medium = subject.varying
+    medium = obj.varying
     if medium is None:
         return ""
     digest = hashlib.sha256()
@@ -149,17 +164,17 @@ def _digest_of_grids(subject: Subject) -> str:
     return digest.hexdigest()[:16]
 
 
-def _probed(subject: Subject, anchors: np.ndarray) -> np.ndarray:
+def _probed(obj: TranslucentObject, anchors: np.ndarray) -> np.ndarray:
     """sigma_t and sigma_s times sqrt(area) at points that move with the shape, (2 channels, points); none if constant.
 
     They tell grids that lie elsewhere in the object, or are interpolated in another way.
     """
-    if subject.varying is None:
+    if obj.varying is None:
         return np.zeros((0, 0), dtype=np.float32)
     centre, some = anchors.mean(axis=0), anchors[:: max(len(anchors) // PROBED, 1)]
     points = np.concatenate([centre + depth * (some - centre) for depth in DEPTHS])
-    values = np.concatenate(subject.varying.coefficients(mi.Point3f(points.T.astype(np.float32))))
-    return (values * np.sqrt(subject.object.area)).astype(np.float32)
+    values = np.concatenate(obj.varying.coefficients(mi.Point3f(points.T.astype(np.float32))))
+    return (values * np.sqrt(obj.geometry.area)).astype(np.float32)
 
 
 def _check_same(trained: np.ndarray, here: np.ndarray) -> None:
@@ -176,30 +191,30 @@ def _check_same(trained: np.ndarray, here: np.ndarray) -> None:
     raise ValueError(f"coefficients must be known at {trained.shape} points, as trained, got {here.shape}")
 
 
-def frame_of(subject: Subject, trained: Identity | None = None, turns: np.ndarray | None = None) -> ObjectFrame:
+def frame_of(obj: TranslucentObject, trained: Identity | None = None, turns: np.ndarray | None = None) -> ObjectFrame:
     """The frame of the features; that of training for an object that has been moved since.
 
     Args:
-        subject: the object.
+        obj: the object.
         trained: as it was trained.
         turns: of its surroundings then.
 
     Raises:
         ValueError: the object is not the one that was trained.
     """
-    here = identify(subject)
+    here = identify(obj)
     R, t = (np.eye(3), np.zeros(3)) if trained is None else trained.pose(here)
     anchors = here.anchors if trained is None else trained.anchors
     low, high = anchors.min(axis=0).astype(float), anchors.max(axis=0).astype(float)
     centre = R @ (0.5 * (low + high)) + t
     radius = 0.5 * float(np.linalg.norm(high - low))
-    each = [float(m.sigma_t) for m in subject.media]
+    each = [float(m.sigma_t) for m in obj.media]
     sigma_t = float(np.exp(np.mean(np.log(each))))
     turn = None if np.allclose(R, np.eye(3), atol=1e-6) else [mi.Vector3f(*map(number, row)) for row in R.T]
     frame = ObjectFrame(
         mi.Point3f(*map(number, centre)), number(radius), number(sigma_t), tuple(map(number, each)), turn
     )
-    return replace(frame, around=surroundings(subject, frame, turns))
+    return replace(frame, around=surroundings(obj, frame, turns))
 
 
 KIND = "full_geometry"
@@ -233,34 +248,34 @@ def save(folder: str | os.PathLike, identity: Identity, arrays: dict[str, np.nda
     return save_weights(Path(folder) / weights_name(identity), KIND, {**arrays, **bound}, whole)
 
 
-def find_weights(subject: Subject, folder: str | os.PathLike | None = None) -> Path:
+def find_weights(obj: TranslucentObject, folder: str | os.PathLike | None = None) -> Path:
     """The file of weights of an object.
 
     Raises:
         ValueError: there is none; says what tells the object from the nearest one that was trained.
     """
-    here = identify(subject)
+    here = identify(obj)
     place = Path(folder) if folder is not None else weights_folder()
     reasons = []
     for path in sorted(place.glob(f"{KIND}-{here.digest()}-*.safetensors")):
         try:
             identity, _, record = _trained(path)
             identity.pose(here)
-            _checked_base(path, record, subject.as_trained(identity.medium))
+            _checked_base(path, record, _as_trained(obj, identity.medium))
             return path
         except ValueError as error:
             reasons.append(f"{path.name}: {error}")
     why = f" ({'; '.join(reasons)})" if reasons else ""
     raise ValueError(
-        f"object {subject.object.name} must be trained for {KIND}, got one that is not in {place}{why}; "
+        f"object {obj.geometry.name} must be trained for {KIND}, got one that is not in {place}{why}; "
         "`halfspace-sss train object --scene` does it"
     )
 
 
-def trained(subject: Subject) -> bool:
+def trained(obj: TranslucentObject) -> bool:
     """Whether there are weights of an object."""
     try:
-        find_weights(subject)
+        find_weights(obj)
     except ValueError:
         return False
     return True
@@ -285,21 +300,21 @@ def _trained(path: Path) -> tuple[Identity, dict[str, np.ndarray], dict[str, Any
     return identity, arrays, record
 
 
-def _checked_base(path: Path, record: dict[str, Any], subject: Subject) -> str:
+def _checked_base(path: Path, record: dict[str, Any], obj: TranslucentObject) -> str:
     """Name of the model that weights multiply; ValueError if they were fitted to others of it than are here now."""
     place = path.with_suffix(".json")
     try:
         name, fitted = record["recipe"]["start"], tuple(record[CHECKSUMS])
     except (KeyError, TypeError) as error:
         raise ValueError(f"{place}: start must be recorded: of another version, to be trained again") from error
-    if fitted != base_checksums(subject, name):
+    if fitted != base_checksums(obj, name):
         raise ValueError(
             f"{place}: weights of the start {name} must be those of training, got others: to be trained again"
         )
     return name
 
 
-def load(path: str | os.PathLike, subject: Subject) -> Learnt:
+def load(path: str | os.PathLike, obj: TranslucentObject) -> Learnt:
     """The model of an object and its sampler from its weights.
 
     Raises:
@@ -308,49 +323,53 @@ def load(path: str | os.PathLike, subject: Subject) -> Learnt:
     path = Path(path)
     identity, arrays, record = _trained(path)
     try:
-        subject = subject.as_trained(identity.medium)
-        frame = frame_of(subject, identity, arrays[TURNS])
+        obj = _as_trained(obj, identity.medium)
+        frame = frame_of(obj, identity, arrays[TURNS])
         first, bias = ALPHA_LAYERS
         units = arrays[f"{first}{max(sum(name.startswith(bias) for name in arrays) - 1, 0)}"].shape[1]
-        channels, known = len(subject.media), arrays["W_0"].shape[1]
-        n = 2 * (n_side(channels, subject.n_local) + units) + n_pair(channels)
+        channels, known = len(obj.media), arrays["W_0"].shape[1]
+        n = 2 * (n_side(channels, n_local(obj)) + units) + n_pair(channels)
         if n != known:
             raise ValueError(f"W_0 must have {n} inputs, got {known}: of another version, to be trained again")
-        base = base_model(subject, _checked_base(path, record, subject))
+        base = base_model(obj, _checked_base(path, record, obj))
     except KeyError as error:
         raise ValueError(f"{path}: layers must be those of {KIND}, {error} is missing") from error
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
-    return assemble(subject, frame, base, arrays)
+    return assemble(obj, frame, base, arrays)
 
 
-def base_model(subject: Subject, name: str) -> BaseModel:
+def base_model(obj: TranslucentObject, name: str) -> BaseModel:
     """What the network of an object begins with: the network of all shapes, or a half-space model.
 
     Raises:
         ValueError: there is no such model, or it does not take the medium.
     """
-    return shapes.transport(subject) if name == shapes.KIND else HalfSpace(subject, name)
+    return shapes.transport(obj) if name == shapes.KIND else HalfSpace(obj, name)
 
 
-def base_checksums(subject: Subject, name: str) -> tuple[str, ...]:
+def base_checksums(obj: TranslucentObject, name: str) -> tuple[str, ...]:
     """Of the weights that a start has."""
     if name == shapes.KIND:
-        return shapes.checksums(subject)
-    return tuple(checksum for m in subject.media for checksum in bssrdf(name, m).checksums)
+        return shapes.checksums(obj)
+    return tuple(checksum for m in obj.media for checksum in bssrdf(name, m).checksums)
 
 
 def assemble(
-    subject: Subject, frame: ObjectFrame, base: BaseModel, arrays: Mapping[str, np.ndarray], patches: Any = None
+    obj: TranslucentObject,
+    frame: ObjectFrame,
+    base: BaseModel,
+    arrays: Mapping[str, np.ndarray],
+    patches: Any = None,
 ) -> Learnt:
     """Model and sampler from the arrays of a file; `patches` are made from their centres if they are not given."""
 
     def layers(names: tuple[str, ...]) -> dict[str, np.ndarray]:
         return {name: value for name, value in arrays.items() if name.startswith(names)}
 
-    alpha = DirectionalAlbedo(subject, frame, layers(ALPHA_LAYERS), arrays[EVEN])
-    model = FullGeometry(subject, frame, base, layers(S_LAYERS), alpha)
+    alpha = DirectionalAlbedo(obj, frame, layers(ALPHA_LAYERS), arrays[EVEN])
+    model = FullGeometry(obj, frame, base, layers(S_LAYERS), alpha)
     if CENTRES not in arrays:
         return Learnt(model, None)
-    patches = patches or Patches(subject, frame, arrays[CENTRES].astype(np.float32))
+    patches = patches or Patches(obj, frame, arrays[CENTRES].astype(np.float32))
     return Learnt(model, PatchSampler(frame, patches, layers(PATCH_LAYERS)))

@@ -25,12 +25,22 @@ import mitsuba as mi
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from full_geometry.object.subject import Subject, refract_in
 from halfspace_sss.arrays import library
 from halfspace_sss.interface.model import BSSRDF
 from halfspace_sss.neural.perceptron import Perceptron
 from halfspace_sss.physics import fresnel
-from halfspace_sss.rendering.object.points import SurfacePoint, channel_mean, lifted, mirrored, number, turned
+from halfspace_sss.rendering.object.body import TranslucentObject
+from halfspace_sss.rendering.object.points import (
+    SurfacePoint,
+    channel_mean,
+    lifted,
+    mirrored,
+    number,
+    refract_in,
+    turned,
+)
+from halfspace_sss.rendering.object.varying import grid_values
+from halfspace_sss.rendering.walk.media import walk_media
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 REFLECTIONS = 32
@@ -52,7 +62,7 @@ class FirstEvent(NamedTuple):
     local: tuple[Any, ...] = ()
 
 
-def flight(subject: Subject, o: Any, d: Any, l: Any) -> tuple[Any, Any]:  # noqa: E741
+def flight(obj: TranslucentObject, o: Any, d: Any, l: Any) -> tuple[Any, Any]:  # noqa: E741
     """exp(-∫ sigma_t) over a length l from o along d, and ∫ s sigma_t exp(-∫ sigma_t) ds, per channel.
 
     A medium that varies is marched in cells that grow from a part of a mean free path on, each homogeneous.
@@ -64,13 +74,13 @@ def flight(subject: Subject, o: Any, d: Any, l: Any) -> tuple[Any, Any]:  # noqa
         return T * through, inner + T * (mean + s * (1 - through))
 
     T, inner = mi.Spectrum(1), mi.Spectrum(0)
-    if subject.varying is None:
-        return add(subject.sigma_t, T, inner, mi.Float(0), l)
-    h = dr.minimum(l / CELLS, FIRST_CELL / dr.max(subject.sigma_t))
+    if obj.varying is None:
+        return add(obj.sigma_t, T, inner, mi.Float(0), l)
+    h = dr.minimum(l / CELLS, FIRST_CELL / dr.max(obj.sigma_t))
     growth = _growth(l / h)
 
     def cell(k: Any, s: Any, h: Any, T: Any, inner: Any) -> tuple:
-        sigma_t = subject.walk_media.heterogeneous.sigma_t(mi.UInt32(0), o + d * (s + 0.5 * h))
+        sigma_t = walk_media(obj).heterogeneous.sigma_t(mi.UInt32(0), o + d * (s + 0.5 * h))
         T, inner = add(sigma_t, T, inner, s, h)
         return k + 1, s + h, h * growth, T, inner
 
@@ -89,18 +99,46 @@ def _growth(ratio: Any) -> Any:
     return dr.exp(x)
 
 
-def first_event(subject: Subject, at: SurfacePoint, active: Any = True) -> FirstEvent:
+LEAST_RATIO = 1e-3  # in logarithms of what varies
+
+
+def _varying_channels(obj: TranslucentObject) -> tuple[int, int]:
+    """Channels in which extinction and albedo vary in space."""
+    volumes = (None, None) if obj.varying is None else (obj.varying.density, obj.varying.albedo_volume)
+    n_t, n_albedo = (0 if volume is None else grid_values(volume).shape[-1] for volume in volumes)
+    return n_t, n_albedo
+
+
+def n_local(obj: TranslucentObject) -> int:
+    """Number of what `local` gives."""
+    return sum(_varying_channels(obj))
+
+
+def local(obj: TranslucentObject, p: mi.Point3f) -> tuple[mi.Float, ...]:
+    """What varies, at the point p: log of sigma_t over its mean, and half the log of 1 - albedo."""
+    if obj.varying is None:
+        return ()
+    n_t, n_albedo = _varying_channels(obj)
+    sigma_t, sigma_s = walk_media(obj).heterogeneous.coefficients(mi.UInt32(0), p)
+    ratio, albedo = sigma_t / obj.sigma_t, sigma_s / dr.maximum(sigma_t, 1e-20)
+    return (
+        *(dr.log(ratio[c] + LEAST_RATIO) for c in range(n_t)),
+        *(0.5 * dr.log(1 - albedo[c] + LEAST_RATIO) for c in range(n_albedo)),
+    )
+
+
+def first_event(obj: TranslucentObject, at: SurfacePoint, active: Any = True) -> FirstEvent:
     """Of light that goes in or out along w at a point of the surface."""
-    sigma_t, eta, sign = subject.sigma_t, number(subject.eta), number(subject.object.sign)
-    media = subject.walk_media
+    sigma_t, eta, sign = obj.sigma_t, obj.eta, number(obj.geometry.sign)
+    media = walk_media(obj)
     d, _, valid = refract_in(at, eta)
     flags = mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame
 
     def step(k: Any, o: Any, d: Any, skip: Any, v: Any, way: Any, sums: tuple, active: Any) -> tuple:
         P, moments, length = sums
-        si = subject.object.scene.ray_intersect(mi.Ray3f(o + d * skip, d), flags, False, active)
+        si = obj.geometry.scene.ray_intersect(mi.Ray3f(o + d * skip, d), flags, False, active)
         l = dr.select(si.is_valid(), si.t + skip, 1e4 / dr.min(sigma_t))  # noqa: E741
-        through, inner = flight(subject, o, d, l)
+        through, inner = flight(obj, o, d, l)
         part, inner = v * (1 - through), v * inner
         moments = [moment + (o * a + d * b) for moment, a, b in zip(moments, part, inner)]
         length = length + part * way + inner
@@ -116,14 +154,14 @@ def first_event(subject: Subject, at: SurfacePoint, active: Any = True) -> First
 
     state = (
         mi.UInt32(0), mi.Point3f(at.p), d, media.clear(mi.UInt32(0), at.n, d), mi.Spectrum(1), mi.Float(0),
-        (mi.Spectrum(0), [mi.Vector3f(0) for _ in subject.media], mi.Spectrum(0)), valid & active,
+        (mi.Spectrum(0), [mi.Vector3f(0) for _ in obj.media], mi.Spectrum(0)), valid & active,
     )  # fmt: skip
     P, moments, length = dr.while_loop(state, lambda *s: s[-1], step, label="first event")[-2]
     total, each = dr.maximum(channel_mean(P), 1e-20), dr.maximum(P, 1e-20)
     y = dr.select(channel_mean(P) > 0, mi.Point3f(sum(moments) / (len(moments) * total)), at.p)
     ys = [dr.select(p > 0, mi.Point3f(moment / e), at.p) for moment, p, e in zip(moments, P, each)]
-    local = (*subject.local(at.p), *subject.local(y))
-    return FirstEvent(P, y, channel_mean(length) / total, ys, length / each, local)
+    coefficients = (*local(obj, at.p), *local(obj, y))
+    return FirstEvent(P, y, channel_mean(length) / total, ys, length / each, coefficients)
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -168,21 +206,21 @@ class Surroundings:
         return self.textures[kind].eval((mi.Point3f(q) - self.low) * self.scale)
 
 
-def surroundings(subject: Subject, frame: Any, turns: np.ndarray | None = None) -> Surroundings:
+def surroundings(obj: TranslucentObject, frame: Any, turns: np.ndarray | None = None) -> Surroundings:
     """The fields of an object.
 
     Args:
-        subject: the object.
+        obj: the object.
         frame: a `ObjectFrame` of its features.
         turns: those of training; by default made from random points.
     """
-    low, high = _bounds(subject, frame)
+    low, high = _bounds(obj, frame)
     longest = float((high - low).max())
     low, high = low - MARGIN * longest, high + MARGIN * longest
     path = 1 / float(np.array(frame.sigma_t * frame.radius).ravel()[0])
     cell = max(CELL * path, longest / MOST)
     cells = np.maximum(np.ceil((high - low) / cell).astype(int), 2)
-    values = _fields(insides(subject, frame, low, cell, cells), max(path / cell, 1.0))
+    values = _fields(insides(obj, frame, low, cell, cells), max(path / cell, 1.0))
     places = mi.Point3f(*map(number, low)), mi.Vector3f(*map(number, 1 / (cell * cells)))
 
     def turned(turns: np.ndarray) -> Surroundings:
@@ -191,14 +229,14 @@ def surroundings(subject: Subject, frame: Any, turns: np.ndarray | None = None) 
         return Surroundings(tuple(textures), *places, turns)
 
     straight = np.eye(FIELDS, FIELDS + 1, dtype=np.float32)
-    return turned(_turns(subject, frame, turned(np.stack([straight] * 2))) if turns is None else turns)
+    return turned(_turns(obj, frame, turned(np.stack([straight] * 2))) if turns is None else turns)
 
 
-def _turns(subject: Subject, frame: Any, fields: Surroundings) -> np.ndarray:
+def _turns(obj: TranslucentObject, frame: Any, fields: Surroundings) -> np.ndarray:
     """C^(-1/2) of the fields over random points and over their first events, with what takes their means off."""
-    at = subject.random_points(generator(mi, POINTS, pass_seed(SEED)))
+    at = obj.random_points(generator(mi, POINTS, pass_seed(SEED)))
     turns = []
-    for kind, place in ((POINT, at.p), (EVENT, first_event(subject, at).y)):
+    for kind, place in ((POINT, at.p), (EVENT, first_event(obj, at).y)):
         values = np.stack([v.numpy() for v in fields(frame.position(place), kind)]).astype(float)
         spread, axes = np.linalg.eigh(np.cov(values))
         turn = (axes / np.sqrt(np.maximum(spread, 0) + LEAST_SPREAD**2)) @ axes.T
@@ -206,7 +244,7 @@ def _turns(subject: Subject, frame: Any, fields: Surroundings) -> np.ndarray:
     return np.array(turns, dtype=np.float32)
 
 
-def insides(subject: Subject, frame: Any, low: np.ndarray, cell: float, cells: np.ndarray) -> np.ndarray:
+def insides(obj: TranslucentObject, frame: Any, low: np.ndarray, cell: float, cells: np.ndarray) -> np.ndarray:
     """1 where the middle of a cell lies inside, (z, y, x): where most of three rays meet the surface from within."""
     nx, ny, _ = (int(n) for n in cells)
     k = dr.arange(mi.UInt32, int(np.prod(cells)))
@@ -215,8 +253,8 @@ def insides(subject: Subject, frame: Any, low: np.ndarray, cell: float, cells: n
     votes = mi.UInt32(0)
     for ray in RAYS:
         p, d = frame.back(mi.Vector3f(*q), dr.normalize(mi.Vector3f(*ray)))
-        si = subject.object.scene.ray_intersect(mi.Ray3f(p, d))
-        votes += dr.select(si.is_valid() & (dr.dot(d, si.n) * number(subject.object.sign) > 0), mi.UInt32(1), 0)
+        si = obj.geometry.scene.ray_intersect(mi.Ray3f(p, d))
+        votes += dr.select(si.is_valid() & (dr.dot(d, si.n) * number(obj.geometry.sign) > 0), mi.UInt32(1), 0)
     return (votes >= 2).numpy().astype(np.float32).reshape(cells[::-1])
 
 
@@ -227,13 +265,13 @@ def _fields(inside: np.ndarray, path: float) -> np.ndarray:
     return np.stack([*balls, *(WIDTHS[SLOPED] * path * part for part in slope)], axis=-1)
 
 
-def _bounds(subject: Subject, frame: Any) -> tuple[np.ndarray, np.ndarray]:
+def _bounds(obj: TranslucentObject, frame: Any) -> tuple[np.ndarray, np.ndarray]:
     """Of the object in its frame."""
-    parameters = mi.traverse(subject.object.shape)
+    parameters = mi.traverse(obj.geometry.shape)
     if "vertex_positions" in parameters:
         corners = mi.Point3f(np.array(parameters["vertex_positions"]).reshape(-1, 3).T)
     else:
-        box = subject.object.shape.bbox()
+        box = obj.geometry.shape.bbox()
         low, high = (np.array(v, dtype=np.float32).ravel() for v in (box.min, box.max))
         corners = mi.Point3f(np.where(np.indices((2, 2, 2)).reshape(3, 8) > 0, high[:, None], low[:, None]))
     q = np.array(frame.position(corners)).reshape(3, -1).astype(float)

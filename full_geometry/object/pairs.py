@@ -25,10 +25,19 @@ from full_geometry.object.features import (
     side_features,
 )
 from full_geometry.object.patches import AREA_SHARE, ExitTable, LearntProposals, PatchSampler
-from full_geometry.object.subject import Subject, cosine_direction, surface_point
 from halfspace_sss.checks import check_count
-from halfspace_sss.rendering.object.points import PositionSampler, RadialTable, SurfacePoint, channel_mean, number
+from halfspace_sss.rendering.object.body import TranslucentObject
+from halfspace_sss.rendering.object.points import (
+    PositionSampler,
+    RadialTable,
+    SurfacePoint,
+    channel_mean,
+    cosine_direction,
+    number,
+    surface_point,
+)
 from halfspace_sss.rendering.walk import exits as walk_exits
+from halfspace_sss.rendering.walk.media import walk_media
 from halfspace_sss.rendering.walk.random_walk import Crossing, Event, Walk
 from halfspace_sss.tracing.walk import generator, pass_seed
 
@@ -80,7 +89,7 @@ class _Store:
 
 
 def trace_exits(
-    subject: Subject,
+    obj: TranslucentObject,
     starts: SurfacePoint,
     seed: tuple[int, ...],
     *,
@@ -101,7 +110,7 @@ def trace_exits(
     """
     check_count("fewest", fewest, 0)
     store = _Store.of(dr.width(starts.p), fewest, most)
-    walk_exits.walk_from(subject.walk_media, 0, starts, store, seed, LANES, roulette_from)
+    walk_exits.walk_from(walk_media(obj), 0, starts, store, seed, LANES, roulette_from)
     dr.eval(store.exits)
     return store.exits
 
@@ -172,7 +181,7 @@ class EntryProposals:
     weight v by a probe alone counts v D / ((1 - s) D + s q), one of a patch 1 / ((1 - s) D + s q).
 
     Args:
-        subject: the object.
+        obj: the object.
         base: whose radial densities the probes follow.
         area_share: of the candidates that are uniform over the area, without patches.
         patches: learnt weights, or None.
@@ -180,16 +189,16 @@ class EntryProposals:
 
     def __init__(
         self,
-        subject: Subject,
+        obj: TranslucentObject,
         base: BaseModel,
         area_share: float = AREA_SHARE,
         patches: PatchSampler | None = None,
     ) -> None:
         live = [m for m in base.models if float(m.medium.sigma_s) > 0]
-        table = RadialTable(live or base.models, subject.object.size)
-        self.subject, self.base, self.patches = subject, base, patches
+        table = RadialTable(live or base.models, obj.geometry.size)
+        self.object, self.base, self.patches = obj, base, patches
         # light may leave by another piece of the surface than it entered by
-        self.positions = PositionSampler(replace(subject.object, pieces=None), table, subject.points, area_share)
+        self.positions = PositionSampler(replace(obj.geometry, pieces=None), table, obj.points, area_share)
 
     def sample(
         self, exit: SurfacePoint, rng: Any, table: ExitTable | None = None, k: Any = 0
@@ -202,19 +211,19 @@ class EntryProposals:
             table: of weights of patches, which are asked of the network otherwise.
             k: of each exit, its number in the table.
         """
-        out = exit._replace(sign=number(self.subject.object.sign))
+        out = exit._replace(sign=number(self.object.geometry.sign))
         known = (out, mi.UInt32(k))
         if self.patches is None:
             entry = self.positions.sample(*known, Numbers(rng), mi.Bool(True))
         else:
-            drawn = LearntProposals(self.patches, self.positions, PATCH_SHARE, self.subject.object.sign, table)
-            where = drawn.prepare(out, PreparedExit(Side(exit, first_event(self.subject, exit)), []), mi.Bool(True))
+            drawn = LearntProposals(self.patches, self.positions, PATCH_SHARE, self.object.geometry.sign, table)
+            where = drawn.prepare(out, PreparedExit(Side(exit, first_event(self.object, exit)), []), mi.Bool(True))
             entry = drawn.sample(*known, where, Numbers(rng), mi.Bool(True))
         return entry.facing(cosine_direction(entry.n_out, entry.n, rng)), dr.pi * entry.weight
 
     def with_patches(self, patches: PatchSampler | None) -> EntryProposals:
         """The same with learnt weights of patches, which take the place of uniform points."""
-        return EntryProposals(self.subject, self.base, 0.0, patches) if patches is not None else self
+        return EntryProposals(self.object, self.base, 0.0, patches) if patches is not None else self
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,14 +231,14 @@ class PairSource:
     """Makes training data.
 
     Args:
-        subject: the object.
+        obj: the object.
         frame: of its features.
         base: base model S_0, which values of proposals have.
         proposals: where they come from.
         scale: of T of each channel, one over its mean; without it every walk that left is kept.
     """
 
-    subject: Subject
+    object: TranslucentObject
     frame: ObjectFrame
     base: BaseModel
     proposals: EntryProposals
@@ -246,8 +255,8 @@ class PairSource:
 
     def traced(self, n: int, seed: tuple[int, ...]) -> tuple[SurfacePoint, WalkEnds]:
         """Starts and ends of n walks of random exits."""
-        starts = self.subject.random_points(generator(mi, n, pass_seed(*seed, 0)))
-        return starts, trace_exits(self.subject, starts, (*seed, 1), fewest=1)
+        starts = self.object.random_points(generator(mi, n, pass_seed(*seed, 0)))
+        return starts, trace_exits(self.object, starts, (*seed, 1), fewest=1)
 
     def ended(self, starts: SurfacePoint, exits: WalkEnds, seed: tuple[int, ...]) -> Pairs:
         """The pairs of walks whose ends and orders from one on are known, those of two and more, T as values.
@@ -279,7 +288,7 @@ class PairSource:
         lanes = dr.arange(mi.UInt32, n) * EVEN_EVERY
         at, T = starts.gather(lanes), dr.gather(mi.Spectrum, exits.T, lanes)
         once = dr.gather(mi.UInt32, exits.order, lanes) == 1
-        columns = side_features(self.frame, Side(at, first_event(self.subject, at)))
+        columns = side_features(self.frame, Side(at, first_event(self.object, at)))
         return AlbedoSamples(_stacked(columns, n), _stacked([*dr.select(once, T, 0), *dr.select(once, 0, T)], n))
 
     def proposed(self, n: int, seed: tuple[int, ...], starts: SurfacePoint | None = None) -> Pairs:
@@ -291,7 +300,7 @@ class PairSource:
             starts: n exits that they are of; by default random ones.
         """
         rng = generator(mi, n, pass_seed(*seed, 2))
-        starts = starts or self.subject.random_points(rng)
+        starts = starts or self.object.random_points(rng)
         entries, weight = self.proposals.sample(starts, rng)
         return self._columns(starts, entries, weight)
 

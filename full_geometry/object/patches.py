@@ -21,15 +21,17 @@ import mitsuba as mi
 import numpy as np
 
 from full_geometry.object.features import ObjectFrame, PreparedExit, Side, first_event, side_features
-from full_geometry.object.subject import Subject, cosine_direction, surface_point
 from halfspace_sss.neural.perceptron import Perceptron
+from halfspace_sss.rendering.object.body import TranslucentObject
 from halfspace_sss.rendering.object.points import (
     CosineProposals,
     EntrySample,
     Point,
     PositionSampler,
     SurfacePoint,
+    cosine_direction,
     number,
+    surface_point,
     turned,
 )
 from halfspace_sss.tracing.walk import generator, pass_seed
@@ -41,15 +43,15 @@ ROUNDS = 12  # of k-means
 HIGHEST = 60.0  # of a logit, for the range of float32
 
 
-def mesh_faces(subject: Subject) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def mesh_faces(obj: TranslucentObject) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Centroids (n, 3), unit normals (n, 3) and areas (n,) of the faces.
 
     Raises:
         ValueError: the shape is no mesh.
     """
-    parameters = mi.traverse(subject.object.shape)
+    parameters = mi.traverse(obj.geometry.shape)
     if "faces" not in parameters:
-        raise ValueError(f"shape must be a mesh to be cut into patches, got {subject.object.shape.class_name()}")
+        raise ValueError(f"shape must be a mesh to be cut into patches, got {obj.geometry.shape.class_name()}")
     faces = np.array(parameters["faces"]).reshape(-1, 3)
     a, b, c = np.array(parameters["vertex_positions"], dtype=float).reshape(-1, 3)[faces].transpose(1, 0, 2)
     cross = np.cross(b - a, c - a)
@@ -57,20 +59,22 @@ def mesh_faces(subject: Subject) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return (a + b + c) / 3, cross / np.maximum(double, 1e-30)[:, None], 0.5 * double
 
 
-def _places(subject: Subject, frame: ObjectFrame) -> tuple[np.ndarray, np.ndarray]:
+def _places(obj: TranslucentObject, frame: ObjectFrame) -> tuple[np.ndarray, np.ndarray]:
     """What faces are clustered by, (n, 6) in the object's frame over its radius, and their areas."""
-    centroids, normals, areas = mesh_faces(subject)
+    centroids, normals, areas = mesh_faces(obj)
     turn = np.eye(3) if frame.turn is None else np.array([np.array(row).ravel() for row in frame.turn])
     radius, centre = float(np.array(frame.radius).item()), np.array(frame.centre, dtype=float).ravel()
     length = NORMAL_LENGTH / (float(np.array(frame.sigma_t).item()) * radius)
     return np.concatenate([(centroids - centre) @ turn.T / radius, length * normals @ turn.T], axis=1), areas
 
 
-def cluster(subject: Subject, frame: ObjectFrame, n: int = PATCHES, seed: int = 0, rounds: int = ROUNDS) -> np.ndarray:
+def cluster(
+    obj: TranslucentObject, frame: ObjectFrame, n: int = PATCHES, seed: int = 0, rounds: int = ROUNDS
+) -> np.ndarray:
     """Centres of at most n patches, (n, 6), in the frame of the object."""
     from scipy.spatial import cKDTree
 
-    x, areas = _places(subject, frame)
+    x, areas = _places(obj, frame)
     rng = np.random.default_rng(seed)
     n = min(n, int(np.count_nonzero(areas)))
     centres = x[rng.choice(len(x), n, replace=False, p=areas / areas.sum())]
@@ -86,16 +90,16 @@ class Patches:
     """Faces by patch, and uniform points of a patch.
 
     Args:
-        subject: the object, a mesh.
+        obj: the object, a mesh.
         frame: its frame.
         centres: from `cluster`, of this object or of the one that was trained.
     """
 
-    def __init__(self, subject: Subject, frame: ObjectFrame, centres: np.ndarray) -> None:
+    def __init__(self, obj: TranslucentObject, frame: ObjectFrame, centres: np.ndarray) -> None:
         from scipy.spatial import cKDTree
 
-        x, areas = _places(subject, frame)
-        self.subject, self.n = subject, len(centres)
+        x, areas = _places(obj, frame)
+        self.object, self.points, self.n = obj, obj.points, len(centres)
         self.of_face = cKDTree(centres).query(x)[1].astype(np.uint32)
         self.areas = np.bincount(self.of_face, areas, self.n)
         order = np.argsort(self.of_face, kind="stable")
@@ -126,7 +130,7 @@ class Patches:
             return (i < low) | ((i + 1 < high) & (self.row("within", i) <= goal))
 
         k = dr.binary_search(0, len(self.of_face), before)
-        return self.subject.points.on_face(self.row("face", mi.UInt32(k)), u)
+        return self.points.on_face(self.row("face", mi.UInt32(k)), u)
 
 
 class PatchWeights(NamedTuple):
@@ -229,7 +233,7 @@ class ExitTable:
     """
 
     def __init__(self, sampler: PatchSampler, exits: SurfacePoint) -> None:
-        side = Side(exits, first_event(sampler.patches.subject, exits))
+        side = Side(exits, first_event(sampler.patches.object, exits))
         rows = np.cumsum(_weights(sampler, side, dr.width(exits.p)), axis=1).astype(np.float32)
         self.n, self.table, self.last = rows.shape[1], mi.Float(rows.ravel()), mi.Float(rows[:, -1].copy())
 
@@ -247,11 +251,11 @@ class PatchTable:
     """
 
     def __init__(self, sampler: PatchSampler, cells: int = CELLS) -> None:
-        subject, n = sampler.patches.subject, len(sampler.patches.of_face)
+        obj, n = sampler.patches.object, len(sampler.patches.of_face)
         of_face = np.arange(n, dtype=np.uint32)
         if n > cells:
-            centres = cluster(subject, sampler.frame, cells, seed=1, rounds=1)
-            parts = Patches(subject, sampler.frame, centres)
+            centres = cluster(obj, sampler.frame, cells, seed=1, rounds=1)
+            parts = Patches(obj, sampler.frame, centres)
             of_face, n = parts.of_face, cells
         faces = mi.UInt32(of_face)
         total = 0.0
@@ -259,11 +263,11 @@ class PatchTable:
             rng = generator(mi, n, pass_seed(51, k))
             u_face, u = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
             cell = dr.arange(mi.UInt32, n)
-            at = subject.points.on_face(cell, u) if n == len(of_face) else parts.point(cell, u_face, u)
-            n_out = mi.Normal3f(turned(at.n_shading, at.n) * subject.object.sign)
-            normal = mi.Normal3f(at.n * subject.object.sign)
+            at = obj.points.on_face(cell, u) if n == len(of_face) else parts.point(cell, u_face, u)
+            n_out = mi.Normal3f(turned(at.n_shading, at.n) * obj.geometry.sign)
+            normal = mi.Normal3f(at.n * obj.geometry.sign)
             exit = surface_point(at.p, normal, n_out, cosine_direction(n_out, normal, rng))
-            total = total + _weights(sampler, Side(exit, first_event(subject, exit)), n)
+            total = total + _weights(sampler, Side(exit, first_event(obj, exit)), n)
         rows = np.cumsum(total / EXITS, axis=1).astype(np.float32)
         self.n, self.table, self.of_face = sampler.patches.n, mi.Float(rows.ravel()), faces
         self.last = mi.Float(rows[:, -1].copy())

@@ -60,10 +60,10 @@ N_PATCHES = 24
 @pytest.fixture(scope="module")
 def sampler() -> FlowSampler:
     """With random weights: densities hold for any."""
-    subject = wax_bunny()
-    points = random_patches(subject, N_PATCHES, np.random.default_rng(2))
+    obj = wax_bunny()
+    points = random_patches(obj, N_PATCHES, np.random.default_rng(2))
     flow = ConditionalFlow(2, shaken(2).arrays())
-    return FlowSampler(points, Chart(subject, points.frame, points.patches), flow)
+    return FlowSampler(points, Chart(obj, points.frame, points.patches), flow)
 
 
 def shaken(n: int, strength: float = 2.0) -> FlowNetwork:
@@ -141,7 +141,7 @@ def test_uniform_coordinates_are_uniform_over_a_patch(sampler: FlowSampler) -> N
     n, k = 2**17, 5
     at = sampler.chart.point(mi.UInt32(k), tuple(floats(uniform(n, 2, 11))))
     faces = np.flatnonzero(sampler.patches.patches.of_face == k)
-    areas = mesh_faces(sampler.chart.subject)[2][faces]
+    areas = mesh_faces(sampler.chart.object)[2][faces]
     counts = np.bincount(np.array(at.prim_index), minlength=len(sampler.patches.patches.of_face))
     assert counts.sum() == counts[faces].sum()
     expected = n * areas / areas.sum()
@@ -149,9 +149,9 @@ def test_uniform_coordinates_are_uniform_over_a_patch(sampler: FlowSampler) -> N
 
 
 def draws(sampler: FlowSampler, n: int) -> tuple:
-    subject = sampler.chart.subject
-    at = subject.random_points(generator(mi, 1, pass_seed(4))).gather(dr.zeros(mi.UInt32, n))
-    side = Side(at, first_event(subject, at))
+    obj = sampler.chart.object
+    at = obj.random_points(generator(mi, 1, pass_seed(4))).gather(dr.zeros(mi.UInt32, n))
+    side = Side(at, first_event(obj, at))
     weights = sampler.patches.prepare(side)
     u = floats(uniform(n, 3, 12))
     return side, weights, *sampler.sample(side, weights, u[0], (u[1], u[2]))
@@ -172,11 +172,11 @@ REGIONS = {
 
 @pytest.mark.parametrize("region", REGIONS)
 def test_entries_weighted_by_their_density_cover_the_area(sampler: FlowSampler, region: str) -> None:
-    subject, n = sampler.chart.subject, 2**18
+    obj, n = sampler.chart.object, 2**18
     _, _, at, density = draws(sampler, n)
-    flat = subject.points.sample(floats(uniform(n, 1, 15))[0], mi.Point2f(uniform(n, 2, 16)), True)
+    flat = obj.points.sample(floats(uniform(n, 1, 15))[0], mi.Point2f(uniform(n, 2, 16)), True)
     weight = REGIONS[region](np.array(at.p), np.array(at.n)) / np.array(density, dtype=float)
-    wanted = subject.object.area * REGIONS[region](np.array(flat.p), np.array(flat.n))
+    wanted = obj.geometry.area * REGIONS[region](np.array(flat.p), np.array(flat.n))
     assert abs(weight.mean() - wanted.mean()) < 4 * np.hypot(weight.std(), wanted.std()) / np.sqrt(n) + 1e-6
 
 
@@ -206,12 +206,12 @@ class Numbers:
 
 
 def test_proposals_of_the_flow_and_of_patches_give_the_same_estimate(sampler: FlowSampler) -> None:
-    subject, n = sampler.chart.subject, 2**18
-    at = subject.points.sample(floats(uniform(n, 1, 20))[0], mi.Point2f(uniform(n, 2, 21)), True)
-    sign = subject.object.sign
+    obj, n = sampler.chart.object, 2**18
+    at = obj.points.sample(floats(uniform(n, 1, 20))[0], mi.Point2f(uniform(n, 2, 21)), True)
+    sign = obj.geometry.sign
     n_out = mi.Normal3f(at.n_shading * sign)
     exit = Side(SurfacePoint(at.p, mi.Normal3f(at.n * sign), n_out, mi.Vector3f(n_out)), None)
-    exit = exit._replace(event=first_event(subject, exit.at))
+    exit = exit._replace(event=first_event(obj, exit.at))
     out, on, table = exit.at._replace(sign=mi.Float(sign)), mi.Bool(True), PatchTable(sampler.patches)
     means, errors = [], []
     for k, proposals in enumerate(
@@ -240,19 +240,19 @@ def test_a_scene_draws_by_a_flow(sampler: FlowSampler, tmp_path: Path, monkeypat
 
 def _wax_scene(sampler: FlowSampler, folder: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     """The bunny under a sky, with random weights of its own where renders find them."""
-    subject, frame = sampler.chart.subject, sampler.frame
+    obj, frame = sampler.chart.object, sampler.frame
     rng, n = np.random.default_rng(6), 2 * (n_side(3) + 5) + n_pair(3)
     arrays = {
         "W_0": 0.01 * rng.standard_normal((3, n)),
         "b_0": np.zeros(3),
-        CENTRES: cluster(subject, frame, N_PATCHES),
+        CENTRES: cluster(obj, frame, N_PATCHES),
     }
     arrays |= {EVEN: np.zeros((2, 3)), **random_layers(rng, "A", "a", [n_side(3), 5, 6])}
     arrays = {name: value.astype(np.float16) for name, value in {**arrays, **sampler.patches.weights}.items()}
     arrays |= {TURNS: frame.around.turns, ENDS: np.zeros((3, len(Terms.of(n_side(3)).rows)))}
-    save(folder, identify(subject), arrays, {"recipe": {"start": "better_dipole"}, CHECKSUMS: []})
+    save(folder, identify(obj), arrays, {"recipe": {"start": "better_dipole"}, CHECKSUMS: []})
     monkeypatch.setenv("HALFSPACE_SSS_WEIGHTS", str(folder))
-    box = subject.object.shape.bbox()
+    box = obj.geometry.shape.bbox()
     centre, radius = np.array(box.center()).ravel(), np.linalg.norm(np.array(box.extents()).ravel()) / 2
     view = mi.ScalarTransform4f().look_at(list(centre + [0, 0, 4 * radius]), list(centre), [0, 1, 0])
     film = {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}}

@@ -31,8 +31,9 @@ from figures.studies.paper_network import measured_lights, paper_errors, random_
 from full_geometry.learning.model_errors import reference  # noqa: E402
 from full_geometry.models.storing import frame_of  # noqa: E402
 from full_geometry.object.features import n_side  # noqa: E402
-from full_geometry.object.subject import Subject  # noqa: E402
+from full_geometry.object.learnable import object_of  # noqa: E402
 from halfspace_sss.cli import app as cli  # noqa: E402
+from halfspace_sss.rendering.object.body import TranslucentObject  # noqa: E402
 from halfspace_sss.rendering.object.points import EntrySample, SurfacePoint  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
@@ -42,39 +43,39 @@ N_PATCHES = 24
 
 
 @pytest.fixture(scope="module")
-def subject() -> Subject:
+def obj() -> TranslucentObject:
     return wax_bunny()
 
 
 @pytest.fixture(scope="module")
-def shaken(subject: Subject) -> AlphaP:
+def shaken(obj: TranslucentObject) -> AlphaP:
     """S = alpha p with random numbers: what it integrates to holds for any."""
     rng, n = np.random.default_rng(5), n_side(3)
     net = FlowNetwork(4, N_CONTEXT, (16,), 1)
     with torch.no_grad():
         net.transform.hyper[-1].bias.copy_(torch.randn(92, generator=torch.Generator().manual_seed(2)))
-    points = random_patches(subject, N_PATCHES, rng, 0.3)
-    sampler = FlowSampler(points, Chart(subject, points.frame, points.patches), ConditionalFlow(4, net.arrays()))
+    points = random_patches(obj, N_PATCHES, rng, 0.3)
+    sampler = FlowSampler(points, Chart(obj, points.frame, points.patches), ConditionalFlow(4, net.arrays()))
     own = (("A", "a", [n, 8, 1]), ("P", "p", [2 * n + N_CONTEXT, 8, 3]))
     weights = {name: array for layers in own for name, array in random_layers(rng, *layers, 0.3).items()}
-    return AlphaP(subject, sampler, weights, (0.5, 0.3, 0.1))
+    return AlphaP(obj, sampler, weights, (0.5, 0.3, 0.1))
 
 
-def test_alpha_is_the_light_that_comes_back_from_everywhere(subject: Subject, shaken: AlphaP) -> None:
+def test_alpha_is_the_light_that_comes_back_from_everywhere(obj: TranslucentObject, shaken: AlphaP) -> None:
     n = 2**17
-    exit = subject.random_points(generator(mi, 1, pass_seed(4))).gather(dr.zeros(mi.UInt32, n))
-    entries = subject.random_points(generator(mi, n, pass_seed(5)))
+    exit = obj.random_points(generator(mi, 1, pass_seed(4))).gather(dr.zeros(mi.UInt32, n))
+    entries = obj.random_points(generator(mi, n, pass_seed(5)))
     prepared = shaken.prepare(exit)
     S = np.array(shaken.S(prepared, entries), dtype=float) / np.array(shaken.scale)[:, None]
-    values = S.mean(axis=0) * np.pi * subject.object.area
+    values = S.mean(axis=0) * np.pi * obj.geometry.area
     alpha = np.array(prepared.alpha)[0]
     assert abs(values.mean() - alpha) < 4 * values.std() / np.sqrt(n)
     assert values.std() / np.sqrt(n) < 0.05 * alpha
 
 
-def test_a_little_training_brings_alpha_to_the_truth(subject: Subject) -> None:
-    model = fit_alpha_p(subject, FlowRecipe(steps=320, chunk=2**13, batch=512, rate=8e-3))
-    truth = reference(subject, 64, 512)
+def test_a_little_training_brings_alpha_to_the_truth(obj: TranslucentObject) -> None:
+    model = fit_alpha_p(obj, FlowRecipe(steps=320, chunk=2**13, batch=512, rate=8e-3))
+    truth = reference(obj, 64, 512)
     alpha = np.array(model.prepare(truth.exits).alpha)
     wanted = (truth.truth.mean[:, :, 0] / np.array(model.scale)[:, None]).mean(axis=0)
     assert np.corrcoef(alpha, wanted)[0, 1] > 0.4  # of 64 exits: by chance less than once in a thousand
@@ -87,20 +88,20 @@ def test_the_papers_network_takes_5_and_8_for_each_sample() -> None:
     assert linear[0].in_features == 5 + 8 * 7 and [m.out_features for m in linear] == [256, 256, 256, 3]
 
 
-def test_the_papers_network_learns_from_walks(subject: Subject) -> None:
-    truth = reference(subject, 64, 512)
+def test_the_papers_network_learns_from_walks(obj: TranslucentObject) -> None:
+    truth = reference(obj, 64, 512)
     recipe = paper.PaperRecipe(n=8, steps=100, batch=128, exits=512, reuse=8)
-    net, steps = paper.fit_paper(subject, recipe)
-    fresh = paper_errors(subject, paper.PaperNetwork(8), truth, repeats=4)
+    net, steps = paper.fit_paper(obj, recipe)
+    fresh = paper_errors(obj, paper.PaperNetwork(8), truth, repeats=4)
     assert steps > 10
-    assert np.mean([e.error for e in paper_errors(subject, net, truth, repeats=4)]) < np.mean([e.error for e in fresh])
+    assert np.mean([e.error for e in paper_errors(obj, net, truth, repeats=4)]) < np.mean([e.error for e in fresh])
 
 
 def test_the_papers_training_stops_where_the_error_has_stayed_small(
-    subject: Subject, monkeypatch: pytest.MonkeyPatch
+    obj: TranslucentObject, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(paper, "ENOUGH", 1e9)
-    assert paper.fit_paper(subject, paper.PaperRecipe(n=2, exits=256, batch=32, reuse=64))[1] == paper.FOR_STEPS
+    assert paper.fit_paper(obj, paper.PaperRecipe(n=2, exits=256, batch=32, reuse=64))[1] == paper.FOR_STEPS
 
 
 def test_lights_scale_with_their_factor_and_lobes_look_along_their_axes() -> None:
@@ -112,8 +113,8 @@ def test_lights_scale_with_their_factor_and_lobes_look_along_their_axes() -> Non
     assert np.all(random_lights(4, 3, np.random.default_rng(1))(w) >= 0)
 
 
-def test_points_are_laid_onto_the_nearest_triangle(subject: Subject) -> None:
-    vertices, faces = mesh_arrays(subject, frame_of(subject))
+def test_points_are_laid_onto_the_nearest_triangle(obj: TranslucentObject) -> None:
+    vertices, faces = mesh_arrays(obj, frame_of(obj))
     centres = vertices[faces].mean(axis=1)
     chosen = np.random.default_rng(3).choice(len(faces), 200, replace=False)
     normals = np.cross(vertices[faces[chosen, 1]] - centres[chosen], vertices[faces[chosen, 2]] - centres[chosen])
@@ -135,17 +136,17 @@ class EvenS:
 
 
 def test_an_even_S_takes_pi_from_all_directions_also_below_interpolated_horizons(tmp_path: Path) -> None:
-    ball = Subject.of(mi.load_dict(coarse_ball(tmp_path)), WAX)
+    ball = object_of(mi.load_dict(coarse_ball(tmp_path)), WAX)
     places = ball.random_places(generator(mi, 512, pass_seed(3)))
     assert np.array(dr.dot(places.n, places.n_out)).min() < 0.97
     assert np.allclose(incidence(EvenS(), places, places), np.pi, rtol=1e-5)
 
 
 @pytest.mark.parametrize("kind", LIGHTINGS)
-def test_no_light_comes_from_below_the_surface(subject: Subject, kind: str) -> None:
-    at = subject.random_points(generator(mi, 4096, pass_seed(6)))
+def test_no_light_comes_from_below_the_surface(obj: TranslucentObject, kind: str) -> None:
+    at = obj.random_points(generator(mi, 4096, pass_seed(6)))
     entry = EntrySample(at.p, at.n, at.n_out, mi.Float(1), dr.zeros(mi.UInt32, 4096))
-    w, value = lighting(kind, subject).sample(entry, mi.Point2f(0.3, 0.6), mi.Bool(True))
+    w, value = lighting(kind, obj).sample(entry, mi.Point2f(0.3, 0.6), mi.Bool(True))
     value, mu = np.array(value), np.array(dr.dot(w, at.n))
     assert np.all(value[mu <= 0] == 0) and np.all(value >= 0) and (value > 0).mean() > 0.1
 

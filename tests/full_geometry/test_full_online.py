@@ -24,8 +24,8 @@ import drjit as dr  # noqa: E402
 from full_geometry.learning import training  # noqa: E402
 from full_geometry.learning.fitting import Recipe  # noqa: E402
 from full_geometry.learning.training import CameraSchedule  # noqa: E402
+from full_geometry.object.learnable import object_of  # noqa: E402
 from full_geometry.object.pairs import trace_exits  # noqa: E402
-from full_geometry.object.subject import Subject  # noqa: E402
 from halfspace_sss import rendering  # noqa: E402
 from halfspace_sss.cli import app as cli  # noqa: E402
 from halfspace_sss.cli import render as cli_render  # noqa: E402
@@ -257,7 +257,7 @@ def test_first_exits_of_paths_from_the_camera_are_those_of_walks_from_where_they
     walks = camera_walks.CameraWalks(scene, settings, 0, 3, tmp_path / "walks.exr", {})
     (found,) = walks.exits(scene.shapes()[0], 0, 256)
     starts = SurfacePoint(found.x_o, found.n_o, found.n_o_shading, found.w_o)
-    other = trace_exits(Subject.given(scene, None), starts, (5,))
+    other = trace_exits(object_of(scene, None), starts, (5,))
     T, T_other = np.array(dr.select(found.order >= 2, found.throughput, 0)), np.array(other.T)
     assert T.shape[1] > 5000 and abs(walks.hits(scene.shapes()[0]) - T.shape[1] / 256) < 12
     for f in (lambda x, w: 1.0, lambda x, w: x[2] ** 2, lambda x, w: np.maximum(w[1], 0), lambda x, w: w[2] ** 4):

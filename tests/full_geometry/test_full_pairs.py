@@ -20,6 +20,7 @@ from full_geometry.learning.fitting import STANDARD, ObjectFit  # noqa: E402
 from full_geometry.models.object_model import HalfSpace  # noqa: E402
 from full_geometry.models.storing import frame_of  # noqa: E402
 from full_geometry.object.features import n_pair, n_side  # noqa: E402
+from full_geometry.object.learnable import object_of  # noqa: E402
 from full_geometry.object.pairs import (  # noqa: E402
     ENOUGH,
     AlbedoSamples,
@@ -28,7 +29,6 @@ from full_geometry.object.pairs import (  # noqa: E402
     PairSource,
     trace_exits,  # noqa: E402
 )
-from full_geometry.object.subject import Subject  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("rgb")
@@ -43,9 +43,9 @@ MEDIA = {
 
 
 def source_of(shape: str, medium: str) -> PairSource:
-    subject = Subject.of(mi.load_dict(SHAPES[shape]), MEDIA[medium])
-    start = HalfSpace(subject, "better_dipole")
-    return PairSource(subject, frame_of(subject), start, EntryProposals(subject, start))
+    obj = object_of(mi.load_dict(SHAPES[shape]), MEDIA[medium])
+    start = HalfSpace(obj, "better_dipole")
+    return PairSource(obj, frame_of(obj), start, EntryProposals(obj, start))
 
 
 def with_scale(source: PairSource, pairs: Pairs) -> PairSource:
@@ -78,8 +78,8 @@ def check_sums(every: Pairs, kept: Pairs, p: np.ndarray) -> None:
 @pytest.mark.parametrize("medium", MEDIA)
 def test_walks_that_are_kept_by_chance_carry_the_light_of_all(shape: str, medium: str) -> None:
     source = source_of(shape, medium)
-    starts = source.subject.random_points(generator(mi, N, pass_seed(1)))
-    exits = trace_exits(source.subject, starts, (2,))
+    starts = source.object.random_points(generator(mi, N, pass_seed(1)))
+    exits = trace_exits(source.object, starts, (2,))
     every = source.ended(starts, exits, (3,))
     mean = every.values.sum(axis=1, keepdims=True) / every.drawn
     p = np.minimum((every.values / mean).mean(axis=0) / ENOUGH, 1)
@@ -99,7 +99,7 @@ def test_proposals_that_are_used_have_the_sums_of_all_and_less_noise() -> None:
     source = source_of("bunny", "dark")
     walks, proposals = source.walks(N // 8, (5,)), source.proposed(N, (5,))
     n_in = len(proposals.features)
-    fitting = ObjectFit(n_in, 3, source.subject.eta, STANDARD, 0)
+    fitting = ObjectFit(n_in, 3, source.object.media[0].eta, STANDARD, 0)
     assert n_in == 2 * n_side(3) + n_pair(3)
     fitting.set_scale(walks)
     fitting.use(walks, source.proposed(N // 8, (6,)), None, np.random.default_rng(0))  # f is no more 0

@@ -25,10 +25,15 @@ from full_geometry.object.features import (  # noqa: E402
     Side,
     first_event,
 )
+from full_geometry.object.learnable import object_of  # noqa: E402
 from full_geometry.object.pairs import EntryProposals  # noqa: E402
 from full_geometry.object.patches import Patches, PatchSampler, PatchTable, cluster, mesh_faces  # noqa: E402
-from full_geometry.object.subject import Subject, cosine_direction, surface_point  # noqa: E402
-from halfspace_sss.rendering.object.points import SurfacePoint  # noqa: E402
+from halfspace_sss.rendering.object.body import TranslucentObject  # noqa: E402
+from halfspace_sss.rendering.object.points import (  # noqa: E402
+    SurfacePoint,  # noqa: E402
+    cosine_direction,
+    surface_point,
+)
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("rgb")
@@ -37,25 +42,25 @@ N_PATCHES = 64
 
 
 @pytest.fixture(scope="module")
-def subject() -> Subject:
+def obj() -> TranslucentObject:
     return wax_bunny()
 
 
 @pytest.fixture(scope="module")
-def sampler(subject: Subject) -> PatchSampler:
+def sampler(obj: TranslucentObject) -> PatchSampler:
     """With random weights: densities hold for any."""
-    return random_patches(subject, N_PATCHES, np.random.default_rng(2))
+    return random_patches(obj, N_PATCHES, np.random.default_rng(2))
 
 
-def one_exit(subject: Subject, lanes: int) -> Side:
-    point = subject.random_points(generator(mi, 1, pass_seed(4)))
+def one_exit(obj: TranslucentObject, lanes: int) -> Side:
+    point = obj.random_points(generator(mi, 1, pass_seed(4)))
     at = point.gather(dr.zeros(mi.UInt32, lanes))
-    return Side(at, first_event(subject, at))
+    return Side(at, first_event(obj, at))
 
 
-def draws(subject: Subject, sampler: PatchSampler, n: int = 2**17) -> tuple:
+def draws(obj: TranslucentObject, sampler: PatchSampler, n: int = 2**17) -> tuple:
     rng = generator(mi, n, pass_seed(9))
-    weights = sampler.prepare(one_exit(subject, n))
+    weights = sampler.prepare(one_exit(obj, n))
     u = (rng.next_float32(), rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32()))
     point, density = sampler.sample(weights, *u)
     return point, density, sampler.density(weights, point.prim_index)
@@ -69,62 +74,62 @@ def chi_square(counts: np.ndarray, expected: np.ndarray) -> float:
     return float(stats.chi2.sf(chi2, some.sum() - 1))
 
 
-def test_every_face_is_in_one_patch_and_areas_add_up(subject: Subject, sampler: PatchSampler) -> None:
-    areas = mesh_faces(subject)[2]
+def test_every_face_is_in_one_patch_and_areas_add_up(obj: TranslucentObject, sampler: PatchSampler) -> None:
+    areas = mesh_faces(obj)[2]
     assert len(sampler.patches.of_face) == len(areas) and sampler.patches.of_face.max() < N_PATCHES
     assert np.isclose(sampler.patches.areas.sum(), areas.sum(), rtol=1e-6)
 
 
-def test_faces_are_drawn_by_their_density(subject: Subject, sampler: PatchSampler) -> None:
-    point, _, _ = draws(subject, sampler)
-    faces, areas = np.array(point.prim_index), mesh_faces(subject)[2]
+def test_faces_are_drawn_by_their_density(obj: TranslucentObject, sampler: PatchSampler) -> None:
+    point, _, _ = draws(obj, sampler)
+    faces, areas = np.array(point.prim_index), mesh_faces(obj)[2]
     n = len(areas)
-    weights = sampler.prepare(one_exit(subject, n))
+    weights = sampler.prepare(one_exit(obj, n))
     density = np.array(sampler.density(weights, dr.arange(mi.UInt32, n)))
     assert np.isclose(np.sum(density * areas), 1, atol=1e-4)
     assert chi_square(np.bincount(faces, minlength=n), len(faces) * density * areas) > 1e-3
 
 
-def test_the_density_of_a_sample_is_that_of_its_face(subject: Subject, sampler: PatchSampler) -> None:
-    _, density, again = draws(subject, sampler, 4096)
+def test_the_density_of_a_sample_is_that_of_its_face(obj: TranslucentObject, sampler: PatchSampler) -> None:
+    _, density, again = draws(obj, sampler, 4096)
     assert np.allclose(np.array(density), np.array(again), rtol=1e-4) and np.all(np.array(density) > 0)
 
 
-def test_samples_lie_on_their_face(subject: Subject, sampler: PatchSampler) -> None:
-    point, _, _ = draws(subject, sampler, 4096)
-    centroids, normals, _ = mesh_faces(subject)
+def test_samples_lie_on_their_face(obj: TranslucentObject, sampler: PatchSampler) -> None:
+    point, _, _ = draws(obj, sampler, 4096)
+    centroids, normals, _ = mesh_faces(obj)
     face = np.array(point.prim_index)
     off = np.sum((np.array(point.p).T - centroids[face]) * normals[face], axis=1)
-    assert np.abs(off).max() < 1e-4 * subject.object.size
+    assert np.abs(off).max() < 1e-4 * obj.geometry.size
     assert np.allclose(np.array(point.n).T, normals[face], atol=1e-3)
 
 
 @pytest.mark.parametrize("cells", [256, 2**20])
-def test_faces_are_drawn_by_the_density_of_a_table(subject: Subject, sampler: PatchSampler, cells: int) -> None:
-    table, rng, n = PatchTable(sampler, cells), generator(mi, 2**17, pass_seed(14)), len(mesh_faces(subject)[2])
+def test_faces_are_drawn_by_the_density_of_a_table(obj: TranslucentObject, sampler: PatchSampler, cells: int) -> None:
+    table, rng, n = PatchTable(sampler, cells), generator(mi, 2**17, pass_seed(14)), len(mesh_faces(obj)[2])
     u = (rng.next_float32(), rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32()))
     point, drawn = sampler.sample(table.weights(mi.UInt32(77)), *u)
-    faces, areas = np.array(point.prim_index), mesh_faces(subject)[2]
+    faces, areas = np.array(point.prim_index), mesh_faces(obj)[2]
     density = np.array(sampler.density(table.weights(mi.UInt32(77)), dr.arange(mi.UInt32, n)))
     assert np.allclose(np.array(drawn), density[faces], rtol=1e-4)
     assert np.isclose(np.sum(density * areas), 1, atol=1e-4)
     assert chi_square(np.bincount(faces, minlength=n), len(faces) * density * areas) > 1e-3
 
 
-def test_a_table_is_near_the_network(subject: Subject, sampler: PatchSampler) -> None:
-    n = len(mesh_faces(subject)[2])
+def test_a_table_is_near_the_network(obj: TranslucentObject, sampler: PatchSampler) -> None:
+    n = len(mesh_faces(obj)[2])
     by_table = np.array(sampler.density(PatchTable(sampler).weights(mi.UInt32(0)), dr.arange(mi.UInt32, n)))
-    at = subject.points.on_face(mi.UInt32(0), mi.Point2f(0.5, 0.5))
-    n_out = mi.Normal3f(at.n_shading * subject.object.sign)
-    exit = SurfacePoint(at.p, mi.Normal3f(at.n * subject.object.sign), n_out, mi.Vector3f(n_out))
-    weights = sampler.prepare(Side(exit, first_event(subject, exit)))
+    at = obj.points.on_face(mi.UInt32(0), mi.Point2f(0.5, 0.5))
+    n_out = mi.Normal3f(at.n_shading * obj.geometry.sign)
+    exit = SurfacePoint(at.p, mi.Normal3f(at.n * obj.geometry.sign), n_out, mi.Vector3f(n_out))
+    weights = sampler.prepare(Side(exit, first_event(obj, exit)))
     by_network = np.array(sampler.density(weights, dr.arange(mi.UInt32, n)))
     assert np.corrcoef(np.log(by_table), np.log(by_network))[0, 1] > 0.8
 
 
 def test_the_two_sides_of_a_thin_plate_are_apart() -> None:
     plate = mi.load_dict({"type": "cube", "to_world": mi.ScalarTransform4f().scale([3, 3, 0.01])})
-    found = Subject.of(plate, WAX)
+    found = object_of(plate, WAX)
     frame = frame_of(found)
     patches = Patches(found, frame, cluster(found, frame, 6))
     normals = mesh_faces(found)[1]
@@ -133,16 +138,16 @@ def test_the_two_sides_of_a_thin_plate_are_apart() -> None:
 
 
 def test_a_shape_without_faces_has_no_patches() -> None:
-    ball = Subject.of(mi.load_dict({"type": "sphere"}), WAX)
+    ball = object_of(mi.load_dict({"type": "sphere"}), WAX)
     with pytest.raises(ValueError, match="must be a mesh"):
         cluster(ball, frame_of(ball))
 
 
-def test_learnt_weights_lower_the_variance_below_that_of_uniform_points(subject: Subject, tmp_path: Path) -> None:
+def test_learnt_weights_lower_the_variance_below_that_of_uniform_points(obj: TranslucentObject, tmp_path: Path) -> None:
     recipe = Recipe(width=24, depth=2, batch=1024, chunk=2**14, reuse=4)
-    found = train(subject.object.shape, WAX.scaled(1.5), chunks=6, recipe=recipe, folder=tmp_path)
+    found = train(obj.geometry.shape, WAX.scaled(1.5), chunks=6, recipe=recipe, folder=tmp_path)
     assert sum(path.stat().st_size for path in tmp_path.glob("*.safetensors")) < 100_000
-    inside, n = found.model.subject, 2**15
+    inside, n = found.model.object, 2**15
     rng = generator(mi, n, pass_seed(5))
     exits = inside.random_points(generator(mi, 64, pass_seed(6))).gather(dr.arange(mi.UInt32, n) // (n // 64))
     prepared = found.model.prepare(exits)
@@ -159,16 +164,18 @@ def test_learnt_weights_lower_the_variance_below_that_of_uniform_points(subject:
     assert abs(learnt.mean() / flat.mean() - 1) < 0.1
 
 
-def entry_at(subject: Subject, point, rng):
-    n_out = point.n_shading * subject.object.sign
-    n = mi.Normal3f(point.n * subject.object.sign)
+def entry_at(obj: TranslucentObject, point, rng):
+    n_out = point.n_shading * obj.geometry.sign
+    n = mi.Normal3f(point.n * obj.geometry.sign)
     return surface_point(point.p, n, n_out, cosine_direction(n_out, n, rng))
 
 
-def test_probes_and_patches_together_give_the_estimate_of_each_alone(subject: Subject, sampler: PatchSampler) -> None:
-    half_space = HalfSpace(subject, "better_dipole")
-    alone = EntryProposals(subject, half_space, 0.4)
-    exits = subject.random_points(generator(mi, 2**17, pass_seed(12)))
+def test_probes_and_patches_together_give_the_estimate_of_each_alone(
+    obj: TranslucentObject, sampler: PatchSampler
+) -> None:
+    half_space = HalfSpace(obj, "better_dipole")
+    alone = EntryProposals(obj, half_space, 0.4)
+    exits = obj.random_points(generator(mi, 2**17, pass_seed(12)))
     means, errors = [], []
     for k, proposals in enumerate((alone, alone.with_patches(sampler))):
         entries, weight = proposals.sample(exits, generator(mi, 2**17, pass_seed(13, k)))

@@ -36,8 +36,8 @@ from full_geometry.object.features import (  # noqa: E402
     first_event,  # noqa: E402
     n_side,
 )
+from full_geometry.object.learnable import object_of  # noqa: E402
 from full_geometry.object.pairs import trace_exits  # noqa: E402
-from full_geometry.object.subject import Subject  # noqa: E402
 from halfspace_sss import rendering  # noqa: E402
 from halfspace_sss.neural import store as known_weights  # noqa: E402
 from halfspace_sss.neural.store import load_weights, save_weights  # noqa: E402
@@ -231,7 +231,7 @@ def test_a_mesh_with_a_hole_is_warned_of_in_a_sentence() -> None:
     parameters["faces"] = np.array(parameters["faces"])[: 3 * (shape.face_count() - 2000)]
     parameters.update()
     with pytest.warns(UserWarning, match="is not closed: .* light that enters or leaves at the gap is lost"):
-        Subject.of(shape, WAX)
+        object_of(shape, WAX)
 
 
 def test_vertex_normals_against_their_faces_give_the_same_exits() -> None:
@@ -242,7 +242,7 @@ def test_vertex_normals_against_their_faces_give_the_same_exits() -> None:
     parameters["vertex_normals"] = -parameters["vertex_normals"]
     parameters.update()
     wax = Medium(np.array([0.95, 0.8, 0.6]), np.array([0.05, 0.2, 0.4]), 0.0, 1.4)
-    known = [reference(Subject.of(shape, wax, 2.0), exits=64, walks=512).truth.mean for shape in (upright, turned)]
+    known = [reference(object_of(shape, wax, 2.0), exits=64, walks=512).truth.mean for shape in (upright, turned)]
     np.testing.assert_allclose(*known, rtol=1e-4, atol=1e-5)
 
 
@@ -255,7 +255,7 @@ def test_pieces_that_are_wound_differently_are_refused() -> None:
     parameters["faces"] = np.concatenate([faces, faces[:, ::-1] + len(corners)]).ravel().astype(np.uint32)
     parameters.update()
     with pytest.raises(ValueError, match="must all point to the same side to be learnt, got pieces"):
-        Subject.of(both, WAX)
+        object_of(both, WAX)
 
 
 @pytest.mark.slow
@@ -265,7 +265,7 @@ def test_weights_of_another_version_are_left_aside_by_name(trained: Trained, tmp
     record = tmp_path / trained.path.with_suffix(".json").name
     record.write_text(record.read_text().replace('"format": ', '"format": 9'))
     with pytest.raises(ValueError, match=f"must be trained for full_geometry.*{trained.path.name}.*format must be"):
-        storing.find_weights(trained.model.subject, tmp_path)
+        storing.find_weights(trained.model.object, tmp_path)
 
 
 @pytest.mark.slow
@@ -279,31 +279,31 @@ def test_a_scene_of_another_unit_is_another_object(trained: Trained) -> None:
 
 @pytest.mark.slow
 def test_orders_below_two_and_the_others_agree_with_walks(trained: Trained) -> None:
-    subject, n = trained.model.subject, 2**19
-    at = subject.random_points(generator(mi, n, pass_seed(3)))
-    T = [trace_exits(subject, at, (4,), fewest=fewest).T for fewest in (0, 2)]
+    obj, n = trained.model.object, 2**19
+    at = obj.random_points(generator(mi, n, pass_seed(3)))
+    T = [trace_exits(obj, at, (4,), fewest=fewest).T for fewest in (0, 2)]
     few, more = (np.array(v) for v in trained.model.alpha(at))
     walked = np.array(T[0] - T[1]), np.array(T[1])
     for learnt, walk in zip((few, more), walked):
         error = (learnt - walk).std(axis=1) / np.sqrt(n)
         assert np.all(np.abs((learnt - walk).mean(axis=1)) <= 4 * error + 0.01 * walk.mean(axis=1))
-    P = np.array(first_event(subject, at).P)
+    P = np.array(first_event(obj, at).P)
     assert np.all(more >= 0) and np.all(more <= P + 1e-5)
 
 
 @pytest.mark.slow
 def test_S_of_training_and_of_images_know_the_same_of_even_light(trained: Trained) -> None:
-    subject, n = trained.model.subject, 4096
-    run = training._ObjectTraining(subject, QUICK, 0, None, None)
+    obj, n = trained.model.object, 4096
+    run = training._ObjectTraining(obj, QUICK, 0, None, None)
     networks, generator_ = run.fitting.average, torch.Generator().manual_seed(1)
     with torch.no_grad():
         for p in networks.parameters():
             p.normal_(std=0.2, generator=generator_)
     arrays = run.arrays()
     arrays[storing.ENDS] = 0.01 * np.random.default_rng(2).standard_normal(arrays[storing.ENDS].shape)
-    model = storing.assemble(subject, run.frame, run.base, arrays).model
+    model = storing.assemble(obj, run.frame, run.base, arrays).model
     rng = generator(mi, n, pass_seed(6))
-    exits, entries = subject.random_points(rng), subject.random_points(rng)
+    exits, entries = obj.random_points(rng), obj.random_points(rng)
     pairs = run.source._columns(exits, entries, mi.Float(1) + 0 * entries.p.x)
     with torch.no_grad():
         joined = networks["alpha"].joined(torch.from_numpy(pairs.features))
@@ -331,17 +331,17 @@ def test_weights_of_before_it_was_known_are_refused_by_name(
     arrays, record = load_weights(trained.path, storing.KIND)
     path = tmp_path / trained.path.name
     save_weights(path, storing.KIND, {k: v for k, v in arrays.items() if k != missing}, record)
-    subject = Subject.of(mi.load_dict(bunny()), WAX)
+    obj = object_of(mi.load_dict(bunny()), WAX)
     with pytest.raises(ValueError, match=f"{what}.*to be trained again"):
-        storing.find_weights(subject, tmp_path)
+        storing.find_weights(obj, tmp_path)
     with pytest.raises(ValueError, match="to be trained again"):
-        storing.load(path, subject)
+        storing.load(path, obj)
 
 
 @pytest.mark.slow
 def test_only_what_is_wrong_in_a_channel_is_left_to_other_estimates(trained: Trained) -> None:
     model, alpha = trained.model, trained.model.alpha
-    truth = reference(model.subject, 128, 512, 5)
+    truth = reference(model.object, 128, 512, 5)
 
     def judged(order: int, channel: int) -> np.ndarray:
         last = f"a_{len(alpha.weights) // 2 - 1}"
@@ -365,7 +365,7 @@ def test_errors_of_images_of_an_even_sky_are_those_of_alpha_where_it_is_trusted_
 
     def rows(known: list[float]) -> dict[str, list[tuple]]:
         alpha = replace(model.alpha, trusted=np.array([[1.0, 1.0, 1.0], known]))
-        found = errors_of(model.subject, {"it": replace(model, alpha=alpha)}, exits=64, walks=1024, samples=512)["it"]
+        found = errors_of(model.object, {"it": replace(model, alpha=alpha)}, exits=64, walks=1024, samples=512)["it"]
         return {kind: [row[2:] for row in found if row.light == kind] for kind in (EVEN_SKY, *LIGHTS)}
 
     by_alpha, by_S = rows([1.0, 0.0, 1.0]), rows([0.0, 0.0, 0.0])

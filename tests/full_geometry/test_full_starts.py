@@ -24,15 +24,15 @@ from full_geometry.learning.training import Trained, train  # noqa: E402
 from full_geometry.models import neural_shape as shapes  # noqa: E402
 from full_geometry.models import storing  # noqa: E402
 from full_geometry.models.object_model import HalfSpace  # noqa: E402
+from full_geometry.object.learnable import object_of  # noqa: E402
 from full_geometry.object.pairs import EntryProposals  # noqa: E402
-from full_geometry.object.subject import Subject  # noqa: E402
 from full_geometry.scene import learnt_model  # noqa: E402
 from halfspace_sss import Medium  # noqa: E402
 from halfspace_sss.neural import store as known_weights  # noqa: E402
 from halfspace_sss.neural.store import load_weights, save_weights  # noqa: E402
+from halfspace_sss.rendering.object.body import TranslucentObject  # noqa: E402
 from halfspace_sss.rendering.object.points import SurfacePoint  # noqa: E402
 from halfspace_sss.rendering.object.settings import Settings  # noqa: E402
-from halfspace_sss.rendering.object.translucent import Inside  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("mono")
@@ -41,12 +41,12 @@ QUICK, CHUNKS = Recipe(width=24, depth=2, batch=1024, chunk=2**13, reuse=2), 4
 SHAPE = shapes.KIND
 
 
-def subject(radius: float = 3.0) -> Subject:
-    return Subject.of(mi.load_dict({"type": "sphere", "radius": radius}), WAX.channel(1))
+def obj(radius: float = 3.0) -> TranslucentObject:
+    return object_of(mi.load_dict({"type": "sphere", "radius": radius}), WAX.channel(1))
 
 
 def learnt(folder: Path, start: str = SHAPE, **more) -> Trained:
-    return train(subject(), chunks=CHUNKS, recipe=QUICK, start=start, folder=folder, **more)
+    return train(obj(), chunks=CHUNKS, recipe=QUICK, start=start, folder=folder, **more)
 
 
 @pytest.fixture(scope="module")
@@ -55,30 +55,30 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Trained:
     return learnt(tmp_path_factory.mktemp("weights"))
 
 
-def points(of: Subject, n: int = 1024) -> list[SurfacePoint]:
+def points(of: TranslucentObject, n: int = 1024) -> list[SurfacePoint]:
     rng = generator(mi, n, pass_seed(7))
     return [of.random_points(rng) for _ in range(2)]
 
 
-def S_of(model, of: Subject) -> np.ndarray:
+def S_of(model, of: TranslucentObject) -> np.ndarray:
     exits, entries = points(of)
     return np.array(model.S(model.prepare(exits), entries))
 
 
 def test_before_any_step_it_is_the_network_of_all_shapes(tmp_path: Path) -> None:
     with pytest.warns(UserWarning, match="rendered by neural_shape"):
-        found = train(subject(), seconds=0, start=SHAPE, folder=tmp_path)
-    S = S_of(shapes.transport(subject()), subject())
-    assert np.mean(S > 0) > 0.9 and np.allclose(S_of(found.model, subject()), S, rtol=1e-5)
+        found = train(obj(), seconds=0, start=SHAPE, folder=tmp_path)
+    S = S_of(shapes.transport(obj()), obj())
+    assert np.mean(S > 0) > 0.9 and np.allclose(S_of(found.model, obj()), S, rtol=1e-5)
 
 
 def test_few_steps_from_it_are_worth_more_than_from_the_half_space(trained: Trained, tmp_path: Path) -> None:
-    truth = reference(subject(), 128, 8192, seed=5)
-    proposals = EntryProposals(subject(), HalfSpace(subject(), "better_dipole"))
+    truth = reference(obj(), 128, 8192, seed=5)
+    proposals = EntryProposals(obj(), HalfSpace(obj(), "better_dipole"))
     models = {SHAPE: trained.model, "better_dipole": learnt(tmp_path, "better_dipole").model}
     constant = {}
     for name, model in models.items():
-        rows = measure(subject(), model, proposals, truth=truth, samples=4096)
+        rows = measure(obj(), model, proposals, truth=truth, samples=4096)
         (constant[name],) = (row for row in rows if row.light == LIGHTS[0])
     a, b = constant[SHAPE], constant["better_dipole"]
     assert a.error + 4 * np.hypot(a.standard_error, b.standard_error) < b.error
@@ -87,19 +87,18 @@ def test_few_steps_from_it_are_worth_more_than_from_the_half_space(trained: Trai
 def test_the_file_says_where_it_began_and_gives_the_same_model_again(trained: Trained) -> None:
     record = json.loads(trained.path.with_suffix(".json").read_text())
     assert record["recipe"]["start"] == SHAPE and record["recipe"]["rate"] < QUICK.rate
-    assert tuple(record[storing.CHECKSUMS]) == shapes.checksums(subject())
-    again = storing.load(storing.find_weights(subject(), trained.path.parent), subject()).model
-    assert np.array_equal(S_of(again, subject()), S_of(trained.model, subject()))
-    assert not np.allclose(S_of(again, subject()), S_of(shapes.transport(subject()), subject()), rtol=1e-3)
+    assert tuple(record[storing.CHECKSUMS]) == shapes.checksums(obj())
+    again = storing.load(storing.find_weights(obj(), trained.path.parent), obj()).model
+    assert np.array_equal(S_of(again, obj()), S_of(trained.model, obj()))
+    assert not np.allclose(S_of(again, obj()), S_of(shapes.transport(obj()), obj()), rtol=1e-3)
 
 
 def test_renders_ask_the_model_that_was_trained(trained: Trained, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(known_weights.ENVIRONMENT_VARIABLE, str(trained.path.parent))
     surface = {"type": "translucent", "sigma_s": 0.8, "sigma_a": 0.2, "eta": 1.4, "model": "full_geometry"}
     shape = mi.load_dict({"type": "sphere", "radius": 3.0, "bsdf": surface})
-    here = Subject.of(shape, WAX.channel(1))
-    inside = Inside("medium", here.media[0], "full_geometry", "multiple", True)
-    transport = learnt_model(here.object, inside, list(here.media), Settings()).transport
+    here = object_of(shape, WAX.channel(1))
+    transport = learnt_model(here, Settings()).transport
     o, i = points(here)
     rendered = np.array(transport.S(transport.prepare(o), i))
     assert np.allclose(rendered, S_of(trained.model, here), rtol=1e-5)
@@ -128,16 +127,16 @@ def test_weights_that_began_with_another_network_of_all_shapes_are_refused(
     other = save_weights(tmp_path / shapes.WEIGHTS, SHAPE, {**arrays, "b_0": arrays["b_0"] + 1}, record)
     monkeypatch.setattr(shapes, "shipped_weights", lambda: other)
     monkeypatch.setenv(known_weights.ENVIRONMENT_VARIABLE, str(trained.path.parent))
-    assert not storing.trained(subject())
+    assert not storing.trained(obj())
     with pytest.raises(ValueError, match="weights of the start neural_shape must be those of training"):
-        storing.load(trained.path, subject())
+        storing.load(trained.path, obj())
 
 
 def test_weights_that_do_not_say_where_they_began_are_refused(trained: Trained, tmp_path: Path) -> None:
     arrays, record = load_weights(trained.path, storing.KIND)
     path = save_weights(tmp_path / trained.path.name, storing.KIND, arrays, {**record, "recipe": {}})
     with pytest.raises(ValueError, match="start must be recorded"):
-        storing.load(path, subject())
+        storing.load(path, obj())
 
 
 @pytest.mark.parametrize(
@@ -158,7 +157,7 @@ def test_a_start_that_is_none_is_refused_before_any_walk(
 def test_the_table_of_starts_has_all_of_both(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(starts, "STANDARD", QUICK)
     monkeypatch.setattr(starts, "TIMES", ((0.0, 1.0), (1.0, 0.5)))
-    monkeypatch.setattr(starts.Subject, "given", lambda *_: subject())
+    monkeypatch.setattr(starts, "object_of", lambda *_: obj())
     table = starts.start_table(None, seconds=0.5, exits=64, walks=1024, samples=1024)
     assert list(table.groupby(["start", "planned"], sort=False).size()) == [2, 2, 2, 2]
     assert np.all((table["steps"] > 0) == (table["planned"] > 0))

@@ -44,8 +44,8 @@ from full_geometry.object.features import (  # noqa: E402
     reverse,
     side_features,
 )
+from full_geometry.object.learnable import object_of  # noqa: E402
 from full_geometry.object.pairs import EntryProposals  # noqa: E402
-from full_geometry.object.subject import Subject  # noqa: E402
 from halfspace_sss import rendering  # noqa: E402
 from halfspace_sss.neural.store import load_weights, save_weights  # noqa: E402
 from halfspace_sss.rendering.object.points import SurfacePoint  # noqa: E402
@@ -81,16 +81,16 @@ def constant(found: list) -> np.ndarray:
 
 
 def test_training_halves_the_error_of_the_half_space(trained: Trained) -> None:
-    subject = trained.model.subject
-    proposals = EntryProposals(subject, HalfSpace(subject, "better_dipole"))
-    plane = measure(subject, transport_of(subject, "better_dipole"), proposals, samples=1024)
+    obj = trained.model.object
+    proposals = EntryProposals(obj, HalfSpace(obj, "better_dipole"))
+    plane = measure(obj, transport_of(obj, "better_dipole"), proposals, samples=1024)
     assert np.all(constant(trained.errors) < 0.5 * constant(plane))
     assert all(abs(row.ratio - 1) < 0.03 for row in trained.errors)
 
 
 def test_the_file_gives_the_same_model_again(trained: Trained) -> None:
-    subject = Subject.of(ball(), WAX)
-    again = storing.load(storing.find_weights(subject, trained.path.parent), subject).model
+    obj = object_of(ball(), WAX)
+    again = storing.load(storing.find_weights(obj, trained.path.parent), obj).model
     assert np.array_equal(S_of(again), S_of(trained.model))
     record = json.loads(trained.path.with_suffix(".json").read_text())
     assert record["orders"] == "multiple" and len(record["errors"]) == 6 and record["steps"] == trained.steps
@@ -98,7 +98,7 @@ def test_the_file_gives_the_same_model_again(trained: Trained) -> None:
 
 def points_of(model: FullGeometry, n: int = 4096) -> list[SurfacePoint]:
     rng = generator(mi, n, pass_seed(7))
-    return [model.subject.random_points(rng) for _ in range(2)]
+    return [model.object.random_points(rng) for _ in range(2)]
 
 
 def S_of(model: FullGeometry, points: list[SurfacePoint] | None = None) -> np.ndarray:
@@ -107,9 +107,9 @@ def S_of(model: FullGeometry, points: list[SurfacePoint] | None = None) -> np.nd
 
 
 def test_features_of_the_way_back_are_those_of_exit_and_entry_exchanged() -> None:
-    subject = Subject.of(mi.load_dict(bunny()), WAX)
-    frame, rng = frame_of(subject), generator(mi, 256, pass_seed(8))
-    a, b = (Side(at, first_event(subject, at)) for at in (subject.random_points(rng), subject.random_points(rng)))
+    obj = object_of(mi.load_dict(bunny()), WAX)
+    frame, rng = frame_of(obj), generator(mi, 256, pass_seed(8))
+    a, b = (Side(at, first_event(obj, at)) for at in (obj.random_points(rng), obj.random_points(rng)))
 
     def features(exit: Side, entry: Side) -> np.ndarray:
         columns = [*side_features(frame, exit), *side_features(frame, entry), *pair_features(frame, exit, entry)]
@@ -172,8 +172,8 @@ def test_no_training_gives_the_half_space_with_a_warning(tmp_path: Path) -> None
     with pytest.warns(UserWarning, match="rendered by better_dipole"):
         found = train(ball(200.0), WAX, seconds=0, folder=tmp_path)
     assert found.path is None and not list(tmp_path.iterdir())
-    plane = transport_of(found.model.subject, "better_dipole")
-    exits, entries = (found.model.subject.random_points(generator(mi, 64, pass_seed(k))) for k in (1, 2))
+    plane = transport_of(found.model.object, "better_dipole")
+    exits, entries = (found.model.object.random_points(generator(mi, 64, pass_seed(k))) for k in (1, 2))
     near = entries._replace(p=exits.p + 0.5 * mi.Vector3f(mi.coordinate_system(exits.n)[0]), n=exits.n, n_out=exits.n)
     near = near._replace(w=exits.n)
     S, S_0 = (np.array(t.S(t.prepare(exits), near)) for t in (found.model, plane))
@@ -191,7 +191,7 @@ def test_no_training_gives_the_half_space_with_a_warning(tmp_path: Path) -> None
 )
 def test_weights_of_another_object_are_refused(trained: Trained, shape: dict, medium: Medium, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        storing.find_weights(Subject.of(mi.load_dict(shape), medium), trained.path.parent)
+        storing.find_weights(object_of(mi.load_dict(shape), medium), trained.path.parent)
 
 
 def test_an_altered_file_is_refused(trained: Trained, tmp_path: Path) -> None:
@@ -200,7 +200,7 @@ def test_an_altered_file_is_refused(trained: Trained, tmp_path: Path) -> None:
     path = tmp_path / trained.path.name
     path.write_bytes(path.read_bytes()[:-4] + b"abcd")
     with pytest.raises(ValueError, match="sha256"):
-        storing.load(path, trained.model.subject)
+        storing.load(path, trained.model.object)
 
 
 def test_weights_of_other_inputs_are_refused(trained: Trained, tmp_path: Path) -> None:
@@ -208,12 +208,12 @@ def test_weights_of_other_inputs_are_refused(trained: Trained, tmp_path: Path) -
     path = tmp_path / trained.path.name
     save_weights(path, storing.KIND, {**arrays, "W_0": arrays["W_0"][:, :-6]}, record)
     with pytest.raises(ValueError, match="W_0 must have 166 inputs, got 160"):
-        storing.load(path, trained.model.subject)
+        storing.load(path, trained.model.object)
 
 
 def test_a_moved_and_turned_mesh_is_the_same_object(tmp_path: Path) -> None:
     model = train(mi.load_dict(bunny()), WAX, chunks=2, recipe=QUICK, folder=tmp_path).model
-    moved = Subject.of(mi.load_dict(bunny(turn=40.0, shift=3.0)), WAX)
+    moved = object_of(mi.load_dict(bunny(turn=40.0, shift=3.0)), WAX)
     again = storing.load(storing.find_weights(moved, tmp_path), moved).model
     turn = mi.Transform4f().translate([3, 0, -3]).rotate([0.6, 0.8, 0], 40)
     turned = [SurfacePoint(*(turn @ v for v in point[:4])) for point in points_of(model)]
@@ -221,7 +221,7 @@ def test_a_moved_and_turned_mesh_is_the_same_object(tmp_path: Path) -> None:
     seen = a > 1e-3 * a.max()
     assert np.median(np.abs(b[seen] / a[seen] - 1)) < 1e-3
     with pytest.raises(ValueError, match="times as large"):
-        storing.find_weights(Subject.of(mi.load_dict(bunny(scale=1.2)), WAX), tmp_path)
+        storing.find_weights(object_of(mi.load_dict(bunny(scale=1.2)), WAX), tmp_path)
 
 
 def test_the_error_leaves_noise_out() -> None:
@@ -237,7 +237,7 @@ def test_the_error_leaves_noise_out() -> None:
 
 
 def test_the_truth_has_no_error_against_itself() -> None:
-    a, b = (reference(Subject.of(ball(), WAX), 64, 2048, seed=1) for _ in range(2))
+    a, b = (reference(object_of(ball(), WAX), 64, 2048, seed=1) for _ in range(2))
     assert np.array_equal(a.truth.mean, b.truth.mean)
 
 
@@ -270,12 +270,12 @@ def test_an_object_of_a_scene_is_found_by_its_id() -> None:
     one, two = ({"type": "sphere", "radius": r, "center": [4 * r, 0, 0], "bsdf": surface} for r in (1.0, 2.0))
     scene = mi.load_dict({"type": "scene", "one": one, "two": two})
     with pytest.raises(ValueError, match="one of one, two, got None"):
-        Subject.given(scene, None)
-    found = Subject.given(scene, None, 2.0, "two")
+        object_of(scene, None)
+    found = object_of(scene, None, 2.0, "two")
     assert np.isclose(found.object.area, 16 * np.pi) and np.isclose(float(found.media[0].sigma_t), 2.0)
     rough = {**surface, "boundary": {"type": "roughdielectric", "alpha": 0.2, "int_ior": 1.4, "ext_ior": 1.0}}
     with pytest.raises(ValueError, match="must be smooth"):
-        Subject.given(mi.load_dict({"type": "scene", "one": {**one, "bsdf": rough}}), None)
+        object_of(mi.load_dict({"type": "scene", "one": {**one, "bsdf": rough}}), None)
 
 
 def test_one_exit_gathers_many_entries_in_one_loop(trained: Trained) -> None:

@@ -21,10 +21,11 @@ from full_geometry.learning.training import Trained, train  # noqa: E402
 from full_geometry.models import storing  # noqa: E402
 from full_geometry.models.object_model import HalfSpace  # noqa: E402
 from full_geometry.object.features import first_event, flight  # noqa: E402
+from full_geometry.object.learnable import object_of  # noqa: E402
 from full_geometry.object.pairs import EntryProposals  # noqa: E402
-from full_geometry.object.subject import Subject  # noqa: E402
 from halfspace_sss import rendering  # noqa: E402
 from halfspace_sss.neural import store as known_weights  # noqa: E402
+from halfspace_sss.rendering.object.body import TranslucentObject  # noqa: E402
 from halfspace_sss.rendering.object.points import SurfacePoint  # noqa: E402
 from halfspace_sss.rendering.scenes.scene_files import load_objects, load_scene  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
@@ -66,8 +67,8 @@ def objects(mm_per_unit: float = 1.0, **found) -> dict:
     return {"type": "scene", "integrator": {"type": "bssrdf", "mm_per_unit": mm_per_unit}, **found}
 
 
-def subject_of(**found) -> Subject:
-    return Subject.given(load_objects(objects(bunny=bunny(**found))), None)
+def subject_of(**found) -> TranslucentObject:
+    return object_of(load_objects(objects(bunny=bunny(**found))), None)
 
 
 @pytest.fixture(scope="module")
@@ -87,10 +88,10 @@ def test_a_march_gives_the_transmittance_and_the_way_of_light_in_layers() -> Non
     medium = {"sigma_t": grid(layers.reshape(4, 1, 1, 1), at), "albedo": 0.9, "eta": 1.4}
     cube = {"type": "cube", "to_world": at.translate([0.5, 0.5, 0.5]).scale(0.5)}
     scene = {"cube": {**cube, "bsdf": {"type": "translucent", **medium}}}
-    subject = Subject.given(load_objects(objects(**scene)), None)
+    obj = object_of(load_objects(objects(**scene)), None)
     starts, lengths = np.array([0.0, 0.3, 1.0, 2.2]), np.array([4.0, 2.0, 0.5, 1.7])
     o = mi.Point3f(np.stack([0 * starts + 2, 0 * starts + 2, starts]))
-    T, inner = flight(subject, o, mi.Vector3f(0, 0, 1), mi.Float(lengths))
+    T, inner = flight(obj, o, mi.Vector3f(0, 0, 1), mi.Float(lengths))
     for k, (start, length) in enumerate(zip(starts, lengths)):
         s = np.linspace(0, length, 20001)
         sigma_t = np.interp(start + s, np.arange(4) + 0.5, layers)
@@ -110,9 +111,9 @@ def test_a_grid_of_one_value_gives_the_first_event_of_the_homogeneous_medium() -
 
 
 def test_training_halves_the_error_of_the_half_space_in_a_medium_that_varies(trained: Trained) -> None:
-    subject = trained.model.subject
-    proposals = EntryProposals(subject, HalfSpace(subject, "better_dipole"))
-    plane = measure(subject, transport_of(subject, "better_dipole"), proposals, samples=1024)
+    obj = trained.model.object
+    proposals = EntryProposals(obj, HalfSpace(obj, "better_dipole"))
+    plane = measure(obj, transport_of(obj, "better_dipole"), proposals, samples=1024)
     assert np.all(constant(trained.errors) < 0.5 * constant(plane))
 
 
@@ -125,7 +126,7 @@ def test_an_object_moved_with_its_grids_is_the_same_one(trained: Trained, folder
     moved = subject_of(turn=40.0, shift=3.0)
     again = storing.load(storing.find_weights(moved, folder), moved).model
     rng = generator(mi, 4096, pass_seed(7))
-    points = [trained.model.subject.random_points(rng) for _ in range(2)]
+    points = [trained.model.object.random_points(rng) for _ in range(2)]
     turn = mi.Transform4f().translate([3, 0, 0]).rotate([0.6, 0.8, 0], 40)
     a, b = S_of(trained.model, points), S_of(again, [SurfacePoint(*(turn @ v for v in point[:4])) for point in points])
     seen = a > 1e-3 * a.max()

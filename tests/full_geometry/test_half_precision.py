@@ -13,7 +13,7 @@ dr = pytest.importorskip("drjit")
 mi = pytest.importorskip("mitsuba")
 
 from full_geometry.models.neural_shape import transport  # noqa: E402
-from full_geometry.object.subject import Subject  # noqa: E402
+from full_geometry.object.learnable import object_of  # noqa: E402
 from halfspace_sss.neural import perceptron  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
@@ -34,9 +34,9 @@ def test_the_network_of_all_shapes_is_off_by_less_than_its_noise(
 ) -> None:
     """Both S_0 and the correction are networks: 0.1 % in the median, 1 % nearly everywhere, none in the mean."""
     mi.set_variant("llvm_ad_rgb")
-    subject = Subject.of(mi.load_dict({"type": "sphere", "radius": radius}), MARBLE)
-    model, rng = transport(subject), generator(mi, N, pass_seed(4))
-    exit, entry = subject.random_points(rng), subject.random_points(rng)
+    obj = object_of(mi.load_dict({"type": "sphere", "radius": radius}), MARBLE)
+    model, rng = transport(obj), generator(mi, N, pass_seed(4))
+    exit, entry = obj.random_points(rng), obj.random_points(rng)
     dr.eval(exit, entry)
     single = np.array(model.S(model.prepare(exit), entry), dtype=float)
     monkeypatch.setattr(perceptron, "cooperative", in_half)

@@ -21,7 +21,8 @@ from full_geometry.models.neural_shape import (  # noqa: E402
     shipped_weights,
     transport,
 )
-from full_geometry.object.subject import Subject  # noqa: E402
+from full_geometry.object.learnable import object_of  # noqa: E402
+from halfspace_sss.rendering.object.body import TranslucentObject  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("mono")
@@ -29,19 +30,19 @@ pytestmark = pytest.mark.usefixtures("mono")
 WAX = Medium(0.95, 0.05, 0.0, 1.3)
 
 
-def ball(radius: float, medium: Medium = WAX) -> Subject:
-    return Subject.of(mi.load_dict({"type": "sphere", "radius": radius}), medium)
+def ball(radius: float, medium: Medium = WAX) -> TranslucentObject:
+    return object_of(mi.load_dict({"type": "sphere", "radius": radius}), medium)
 
 
-def free(subject: Subject) -> NeuralShape:
+def free(obj: TranslucentObject) -> NeuralShape:
     """By the shipped weights, not held."""
-    return NeuralShape.of(subject, load(shipped_weights()))
+    return NeuralShape.of(obj, load(shipped_weights()))
 
 
-def halved(subject: Subject) -> NeuralShape:
+def halved(obj: TranslucentObject) -> NeuralShape:
     """S of half its size, so that there is something to hold."""
-    model = free(subject)
-    return NeuralShape(model.subject, model.half_space, model.weights, model.media, [0.5] * len(model.media))
+    model = free(obj)
+    return NeuralShape(model.object, model.half_space, model.weights, model.media, [0.5] * len(model.media))
 
 
 @pytest.mark.parametrize("radius", [1.0, 3.0])
@@ -52,16 +53,16 @@ def test_as_much_light_leaves_a_sphere_as_by_walks(radius: float) -> None:
 
 
 def test_what_is_too_dark_is_made_as_bright_as_what_is_not() -> None:
-    subject = ball(3.0)
-    one, other = (calibrated(model(subject)).scales[0] for model in (free, halved))
+    obj = ball(3.0)
+    one, other = (calibrated(model(obj)).scales[0] for model in (free, halved))
     assert np.isclose(one, other, rtol=0.01) and not np.isclose(other, 0.5, rtol=0.5)
 
 
 def test_it_is_the_same_number_for_every_pair_so_that_light_may_take_the_way_back() -> None:
-    subject = ball(3.0)
-    model, bare = transport(subject), free(subject)
+    obj = ball(3.0)
+    model, bare = transport(obj), free(obj)
     rng = generator(mi, 512, pass_seed(7))
-    o, i = subject.random_points(rng), subject.random_points(rng)
+    o, i = obj.random_points(rng), obj.random_points(rng)
     there, back, unheld = (np.array(m.S(m.prepare(a), b)) for m, a, b in ((model, o, i), (model, i, o), (bare, o, i)))
     assert np.allclose(there, model.scales[0] * unheld, rtol=1e-5)
     assert np.allclose(there, back, rtol=5e-3, atol=1e-6 * there.max())
@@ -70,8 +71,8 @@ def test_it_is_the_same_number_for_every_pair_so_that_light_may_take_the_way_bac
 def test_each_channel_is_held_to_its_own_light() -> None:
     mi.set_variant("llvm_ad_rgb")
     medium = Medium(np.array([0.99, 0.5, 0.1]), np.array([0.01, 0.5, 0.9]), np.zeros(3), 1.3)
-    subject = ball(2.0, medium)
-    found = errors_of(subject, {"held": transport(subject)}, exits=64, walks=16384, samples=4096)
+    obj = ball(2.0, medium)
+    found = errors_of(obj, {"held": transport(obj)}, exits=64, walks=16384, samples=4096)
     ratios = [row.ratio for row in found["held"] if row.light == "constant"]
     assert len(ratios) == 3 and np.abs(np.array(ratios) - 1).max() < 0.04  # four times the noise of the darkest
 
@@ -89,14 +90,14 @@ def test_what_is_as_good_as_flat_is_left_as_it_is() -> None:
 
 @pytest.mark.parametrize("medium", [Medium(0.0, 1.0, 0.0, 1.3), Medium(1e-6, 1.0, 0.0, 1.3)])
 def test_where_nothing_or_next_to_nothing_leaves_it_stays_finite(medium: Medium) -> None:
-    subject = ball(3.0, medium)
-    model = transport(subject)
+    obj = ball(3.0, medium)
+    model = transport(obj)
     rng = generator(mi, 512, pass_seed(7))
-    value = np.array(model.S(model.prepare(subject.random_points(rng)), subject.random_points(rng)))
+    value = np.array(model.S(model.prepare(obj.random_points(rng)), obj.random_points(rng)))
     assert np.isfinite(value).all() and (value >= 0).all() and all(0.25 <= s <= 4 for s in model.scales)
 
 
 def test_what_is_open_is_left_as_it_is() -> None:
     with pytest.warns(UserWarning):
-        subject = Subject.of(mi.load_dict({"type": "rectangle"}), WAX)
-    assert transport(subject).scales == ()
+        obj = object_of(mi.load_dict({"type": "rectangle"}), WAX)
+    assert transport(obj).scales == ()

@@ -179,10 +179,10 @@ def test_models_of_whole_objects_refuse_it_too(model: str) -> None:
 
 
 def test_objects_with_something_inside_are_not_learnt() -> None:
-    subject = pytest.importorskip("full_geometry.object.subject").Subject
+    object_of = pytest.importorskip("full_geometry.object.learnable").object_of
     scene = mi.load_dict(view("bssrdf", wax=ball(), stone=_stone()))
     with pytest.raises(ValueError, match="must be empty for learning, got the shape 'stone' inside object 'wax'"):
-        subject.given(scene, None)
+        object_of(scene)
 
 
 def test_what_stands_at_the_surface_of_an_object_is_not_inside() -> None:

@@ -74,9 +74,9 @@ class Known(Even):
 def scene(kind: type, patch: pytest.MonkeyPatch, light: dict, **integrator) -> dict:
     """A ball with a transport, in light."""
 
-    def means(inside, found, media, settings, variation):
-        proposals = half_space_model("better_dipole", found, media, settings, variation).proposals
-        return ObjectModel(kind(found.area), proposals, 2)
+    def means(obj, inside, settings, variation):
+        proposals = half_space_model("better_dipole", obj.geometry, obj.media, settings, variation).proposals
+        return ObjectModel(kind(obj.geometry.area), proposals, 2)
 
     patch.setattr(bodies, "_model_of", means)
     patch.setattr(ModelEntry, "knows_objects", True)

@@ -1,10 +1,12 @@
-"""A translucent object ready to be rendered: its geometry, its models, and how events are chosen at its surface.
+"""A translucent object: its geometry and medium, and, once it is to be rendered, how its light is modelled.
 
 Checks come first: which shapes of a scene are translucent, what lies inside them, where cameras and media may not be.
 """
 
 from __future__ import annotations
 
+import functools
+import math
 import warnings
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
@@ -19,7 +21,18 @@ from halfspace_sss.interface.model import bssrdf
 from halfspace_sss.physics import single_scattering
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.object.half_space import Variation, half_space_model
-from halfspace_sss.rendering.object.points import ObjectAlbedo, ObjectModel, Proposals, Transport, number
+from halfspace_sss.rendering.object.points import (
+    AreaPoints,
+    ObjectAlbedo,
+    ObjectModel,
+    Proposals,
+    SurfacePoint,
+    Transport,
+    cosine_direction,
+    number,
+    surface_point,
+    turned,
+)
 from halfspace_sss.rendering.object.registry import AUTO, Choices, choices, lookup
 from halfspace_sss.rendering.object.settings import AUTOMATIC, Settings
 from halfspace_sss.rendering.object.shape import (
@@ -35,7 +48,7 @@ from halfspace_sss.rendering.object.shape import (
     survey,
 )
 from halfspace_sss.rendering.object.translucent import Inside, is_translucent
-from halfspace_sss.rendering.object.varying import equivalent, warn_of_means
+from halfspace_sss.rendering.object.varying import VaryingMedium, equivalent, warn_of_means
 
 __all__ = [
     "Content",
@@ -264,12 +277,12 @@ SMALL, LARGE = 1.0, 5e3  # mean free paths across an object, beyond which the un
 
 @dataclass(frozen=True, eq=False)
 class TranslucentObject:
-    """One translucent object.
+    """One translucent object; of one that is not rendered geometry and medium alone are known.
 
     Args:
         geometry: of its shape.
-        surface: its `translucent` BSDF.
-        media: medium of each channel, 1/(scene unit).
+        media: scalar medium of each channel of the variant, 1/(scene unit).
+        varying: how its medium varies in space, 1/(scene unit); `media` are then a homogeneous equivalent.
         transport: what light that enters elsewhere is worth here; None where no order from two on is asked for.
         proposals: where it may enter; None without a transport.
         entries: how many of them an exit draws.
@@ -281,21 +294,52 @@ class TranslucentObject:
     """
 
     geometry: Geometry
-    surface: Any
-    media: list[Medium]
-    transport: Transport | None
-    proposals: Proposals | None
-    entries: int
-    few: tuple[int, ...]
-    expected: Expected
-    variation: Variation
+    media: tuple[Medium, ...]
+    varying: VaryingMedium | None = None
+    transport: Transport | None = None
+    proposals: Proposals | None = None
+    entries: int = 1
+    few: tuple[int, ...] = ()
+    expected: Expected | None = None
+    variation: Variation | None = None
     gathered: Any = None
     control: Any = None
 
     @property
-    def eta(self) -> Any:
+    def surface(self) -> mi.BSDF:
+        """The BSDF of its shape: of one that is rendered `translucent`."""
+        return self.geometry.shape.bsdf()
+
+    @property
+    def eta(self) -> mi.Float:
         """Relative index of the media, as data of kernels."""
         return number(self.media[0].eta)
+
+    @functools.cached_property
+    def sigma_t(self) -> mi.Spectrum:
+        """Extinction of each channel, 1/(scene unit), as data of kernels: one kernel serves all media."""
+        return mi.Spectrum([number(m.sigma_t) for m in self.media])
+
+    @functools.cached_property
+    def points(self) -> AreaPoints:
+        """Uniform points of its surface."""
+        return AreaPoints(self.geometry.shape)
+
+    def random_places(self, rng: mi.PCG32) -> SurfacePoint:
+        """Points uniform over the area, seen along geometric normals: `n_out` is the interpolated one itself."""
+        u_face, u = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
+        at = self.points.sample(u_face, u, True)
+        n = at.n * self.geometry.sign
+        return surface_point(at.p, n, turned(at.n_shading, at.n) * self.geometry.sign, n)
+
+    def random_points(self, rng: mi.PCG32) -> SurfacePoint:
+        """Points uniform over the area, directions by the cosine to the shading normal, one for each lane of rng."""
+        at = self.random_places(rng)
+        return surface_point(at.p, at.n, at.n_out, cosine_direction(at.n_out, at.n, rng))
+
+    def mean_free_paths(self) -> np.ndarray:
+        """sigma_t sqrt(area) of each channel: the size of the object in mean free paths."""
+        return np.array([float(m.sigma_t) for m in self.media]) * math.sqrt(self.geometry.area)
 
     @property
     def alpha(self) -> ObjectAlbedo | None:
@@ -383,18 +427,22 @@ def _choices(scene: Any, settings: Settings) -> Choices:
 
 
 def _make_object(found: Geometry, inside: Inside, settings: Settings) -> TranslucentObject:
-    surface = found.shape.bsdf()
-    media = [m.scaled(settings.mm_per_unit) for m in inside.channels()]
+    media = tuple(m.scaled(settings.mm_per_unit) for m in inside.channels())
     check_size(found, [float(m.sigma_t) for m in media], settings.mm_per_unit)
+    varying = None if inside.varying is None else inside.varying.scaled(settings.mm_per_unit)
+    obj = TranslucentObject(found, media, varying)
     single_only = inside.orders == "single" or not any(float(m.sigma_s) > 0 for m in media)
-    variation = Variation(surface, settings.mm_per_unit, inside.model)
+    variation = Variation(obj.surface, settings.mm_per_unit, inside.model)
     none = ObjectModel(None, None)
-    transport, proposals, entries = none if single_only else _model_of(inside, found, media, settings, variation)
+    transport, proposals, entries = none if single_only else _model_of(obj, inside, settings, variation)
     if transport and transport.orders == "total" and inside.orders == "multiple":
         raise ValueError(f"orders must be total for the model {inside.model!r}, which contains them all, got multiple")
     few = _few(inside, transport)
     entries = entries if settings.entries == AUTOMATIC else settings.entries
-    return TranslucentObject(found, surface, media, transport, proposals, entries, few, expected_of(media), variation)
+    return replace(
+        obj, transport=transport, proposals=proposals, entries=entries, few=few, expected=expected_of(media),
+        variation=variation,
+    )  # fmt: skip
 
 
 def _few(inside: Inside, transport: Transport | None) -> tuple[int, ...]:
@@ -409,14 +457,12 @@ def _few(inside: Inside, transport: Transport | None) -> tuple[int, ...]:
     return (0, 1) if transport is None or lookup(inside.model).knows_objects else (1,)
 
 
-def _model_of(
-    inside: Inside, found: Geometry, media: list[Medium], settings: Settings, variation: Variation
-) -> ObjectModel:
+def _model_of(obj: TranslucentObject, inside: Inside, settings: Settings, variation: Variation) -> ObjectModel:
     of_object = lookup(inside.model).transport
     if of_object is not None:
-        return of_object(found, inside, media, settings)
-    warn_of_means(inside, found)
-    return half_space_model(inside.model, found, media, settings, variation)
+        return of_object(obj, settings)
+    warn_of_means(inside, obj.geometry)
+    return half_space_model(inside.model, obj.geometry, obj.media, settings, variation)
 
 
 def check_size(found: Geometry, sigma_t: Sequence[float], mm_per_unit: float) -> None:

@@ -8,11 +8,9 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from halfspace_sss.physics.medium import Medium
+from halfspace_sss.rendering.object.body import TranslucentObject
 from halfspace_sss.rendering.object.points import CosineProposals, EntrySample, ObjectModel, SurfacePoint, number
 from halfspace_sss.rendering.object.settings import Settings
-from halfspace_sss.rendering.object.shape import Geometry
-from halfspace_sss.rendering.object.translucent import Inside
 
 __all__ = ["LambertProposals", "LambertTransport", "lambert_model"]
 
@@ -57,6 +55,6 @@ class LambertProposals(CosineProposals):
         )
 
 
-def lambert_model(found: Geometry, inside: Inside, media: list[Medium], settings: Settings) -> ObjectModel:
+def lambert_model(obj: TranslucentObject, settings: Settings) -> ObjectModel:
     """The transport of a diffuse surface: what a half-space tends to as its mean free path goes to 0."""
-    return ObjectModel(LambertTransport([float(m.reflectance()) for m in media]), LambertProposals())
+    return ObjectModel(LambertTransport([float(m.reflectance()) for m in obj.media]), LambertProposals())

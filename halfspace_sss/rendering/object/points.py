@@ -41,6 +41,7 @@ __all__ = [
     "channel_mean",
     "cosine_above",
     "cosine_density",
+    "cosine_direction",
     "lift",
     "lifted",
     "local_frame",
@@ -49,8 +50,10 @@ __all__ = [
     "opposed",
     "place",
     "plane_query",
+    "refract_in",
     "separation",
     "sided",
+    "surface_point",
     "turned",
 ]
 
@@ -80,6 +83,30 @@ class SurfacePoint(NamedTuple):
     def gather(self, k: mi.UInt32) -> SurfacePoint:
         """The points of the lanes k."""
         return SurfacePoint(*(v if isinstance(v, float) else dr.gather(type(v), v, k) for v in self))
+
+
+def surface_point(p: mi.Point3f, n: mi.Normal3f, n_out: mi.Normal3f, w: mi.Vector3f) -> SurfacePoint:
+    """A point of the surface with the shading normal that w sees.
+
+    Args:
+        p: position.
+        n, n_out: outward geometric and shading normal.
+        w: direction outside.
+    """
+    return SurfacePoint(mi.Point3f(p), mi.Normal3f(n), lifted(n_out, n, w), mi.Vector3f(w))
+
+
+def refract_in(at: SurfacePoint, eta: mi.Float | float) -> tuple[mi.Vector3f, mi.Float, mi.Bool]:
+    """Direction inside of light that is seen along w, Fresnel transmittance, and whether it goes inwards at all.
+
+    mu' = sqrt(1 - (1 - mu²)/eta²), d = -w/eta + n (mu/eta - mu').
+    """
+    mu = dr.dot(at.w, at.n_out)
+    inner = 1 - (1 - mu * mu) / (eta * eta)
+    d = at.n_out * (mu / eta - dr.safe_sqrt(inner)) - at.w / eta
+    F = mi.fresnel(dr.maximum(mu, 0), eta)[0]
+    valid = (mu > 0) & (inner > 0) & (dr.dot(at.w, at.n) > 0) & (dr.dot(d, at.n) < 0)
+    return mi.Vector3f(dr.normalize(d)), dr.select(valid, 1 - F, 0), valid
 
 
 class Frame(NamedTuple):
@@ -226,6 +253,11 @@ def cosine_above(m: mi.Normal3f, n: mi.Normal3f, u: mi.Point2f) -> tuple[Any, An
     """A direction above the surface by the cosine to m, for a pair of uniforms, and its density |m.w| / pi."""
     w = opposed(mi.Frame3f(m).to_world(mi.warp.square_to_cosine_hemisphere(u)), n)
     return mi.Vector3f(w), cosine_density(m, n, w)
+
+
+def cosine_direction(n_out: mi.Normal3f, n: mi.Normal3f, rng: mi.PCG32) -> mi.Vector3f:
+    """A direction of `cosine_above` for numbers of a generator."""
+    return cosine_above(n_out, n, mi.Point2f(rng.next_float32(), rng.next_float32()))[0]
 
 
 def cosine_density(m: mi.Normal3f, n: mi.Normal3f, w: mi.Vector3f) -> Any:

@@ -2,8 +2,8 @@
 
 The half-space models are those of `interface.model`. Packages add others by entry points under the name of the model:
 
-- `halfspace_sss.transports`: a function of (geometry, inside, media, settings) that returns an `ObjectModel`: of the
-  `Geometry`, the `Inside`, the medium of each channel in 1/(scene unit) and the `Settings` of the integrator;
+- `halfspace_sss.transports`: a function of (object, settings) that returns an `ObjectModel`: of the
+  `TranslucentObject`, geometry and media, and the `Settings` of the integrator;
 - `halfspace_sss.learners`: a module or object that learns the model, see `rendering.scenes.learners`;
 - `halfspace_sss.choosers`: a function of (scene, settings) that returns `Choices`, what stands for the name in a scene;
   "auto" stands for the cheapest that is good enough.

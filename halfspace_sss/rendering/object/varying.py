@@ -43,6 +43,10 @@ class VaryingMedium:
     albedo_volume: Any
     albedo: np.ndarray
 
+    def scaled(self, factor: float) -> VaryingMedium:
+        """The same in other units of length: sigma_t times a factor."""
+        return replace(self, factor=self.factor * factor)
+
     @property
     def majorant(self) -> np.ndarray:
         """The largest sigma_t of each channel, 1/mm: interpolation exceeds no voxel."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary
 
 import drjit as dr
 import mitsuba as mi
@@ -11,10 +12,10 @@ import numpy as np
 
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.light.small_emitters import is_delta
-from halfspace_sss.rendering.object.body import Content, contents, translucent_shapes
+from halfspace_sss.rendering.object.body import Content, TranslucentObject, contents, translucent_shapes
 from halfspace_sss.rendering.object.points import lift
 from halfspace_sss.rendering.object.shape import Geometry, check_together, scene_of, survey
-from halfspace_sss.rendering.object.translucent import Inside, is_translucent
+from halfspace_sss.rendering.object.translucent import Inside, is_translucent, smooth_boundary
 from halfspace_sss.rendering.object.varying import VaryingMedium, eval_volume
 
 __all__ = [
@@ -25,6 +26,7 @@ __all__ = [
     "by_pointer",
     "per_channel",
     "pointer_numbers",
+    "walk_media",
 ]
 
 
@@ -455,6 +457,22 @@ class WalkMedia:
             float(mm_per_unit),
             found,
         )
+
+
+_OF_OBJECT: WeakKeyDictionary[TranslucentObject, WalkMedia] = WeakKeyDictionary()
+
+
+def walk_media(obj: TranslucentObject) -> WalkMedia:
+    """One object alone, with a smooth boundary; made once for each."""
+    found = _OF_OBJECT.get(obj)
+    if found is None:
+        medium, eta = obj.media[0], obj.media[0].eta
+        if len(obj.media) > 1:
+            values = {key: np.array([getattr(m, key) for m in obj.media]) for key in ("sigma_s", "sigma_a", "g")}
+            medium = Medium(**values, eta=eta)
+        inside, geometry = Inside("medium", medium, "", "total", True, obj.varying), obj.geometry
+        found = _OF_OBJECT[obj] = WalkMedia([geometry], [inside], geometry.scene, [smooth_boundary(eta)], 1.0)
+    return found
 
 
 def _bounds(scene: mi.Scene) -> mi.BoundingBox3f:
