@@ -31,7 +31,7 @@ from full_geometry.models.object_model import FullGeometry
 from full_geometry.models.storing import frame_of, identify
 from full_geometry.object.features import n_local, n_pair, n_side
 from full_geometry.object.learnable import object_of
-from full_geometry.object.pairs import EntryProposals, Pairs, PairSource, WalkEnds, shuffled
+from full_geometry.object.pairs import EntryProposals, Pairs, PairSource, WalkExits, shuffled
 from full_geometry.object.patches import Patches, PatchSampler, cluster
 from halfspace_sss.backend import busy_threads
 from halfspace_sss.checks import check_count, check_interval
@@ -161,7 +161,7 @@ class CameraExits:
         proposals.append(self.source.proposed(left[1], seed))
         return (shuffled(walks, order), shuffled(proposals, order)) if parts else (walks[0], proposals[0])
 
-    def _exits(self, numbers: list[int], order: np.random.Generator) -> list[tuple[SurfacePoint, WalkEnds]]:
+    def _exits(self, numbers: list[int], order: np.random.Generator) -> list[tuple[SurfacePoint, WalkExits]]:
         """Starts and ends of walks from the camera, launch by launch; of too many a random choice."""
         launches = [part for number in numbers for part in self.camera.exits(self.shape, number, self.schedule.spp)]
         with_exits = [part for part in launches if dr.width(part.object)]
@@ -176,11 +176,11 @@ class CameraExits:
         return parts
 
 
-def _points(part: Any) -> tuple[SurfacePoint, WalkEnds]:
+def _points(part: Any) -> tuple[SurfacePoint, WalkExits]:
     """First exits of the camera as walks of this package, of the orders from one on."""
     starts = SurfacePoint(part.x_o, part.n_o, part.n_o_shading, part.w_o)
     ends = SurfacePoint(part.x_i, part.n_i, part.n_i_shading, part.w_i)
-    return starts, WalkEnds(ends, dr.select(part.order >= 1, part.throughput, 0), part.order, part.face)
+    return starts, WalkExits(ends, dr.select(part.order >= 1, part.throughput, 0), part.order, part.face)
 
 
 def _lanes(numbers: np.ndarray) -> Any:

@@ -34,58 +34,13 @@ from halfspace_sss.rendering.object.points import (
     channel_mean,
     cosine_direction,
     number,
-    surface_point,
 )
-from halfspace_sss.rendering.walk import exits as walk_exits
 from halfspace_sss.rendering.walk.media import walk_media
-from halfspace_sss.rendering.walk.random_walk import Crossing, Event, Walk
+from halfspace_sss.rendering.walk.random_walk import WalkExits, exits
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 LANES = 2**15
 ROULETTE_FROM = 8  # scattering events: from 2 on weak channels of ketchup have 10 times the variance, for no time less
-
-
-class WalkEnds(NamedTuple):
-    """Ends of walks, one lane for each: T is 0 where it ended inside or left at an order that is not kept."""
-
-    at: SurfacePoint
-    T: Any
-    order: Any
-    face: Any
-
-
-@dataclass(frozen=True, eq=False)
-class _Store:
-    """A visitor that keeps the end of every walk at its number, and ends it there."""
-
-    exits: WalkEnds
-    fewest: Any
-    most: Any
-
-    @classmethod
-    def of(cls, n: int, fewest: int, most: int) -> _Store:
-        at = SurfacePoint(*(dr.zeros(kind, n) for kind in (mi.Point3f, mi.Normal3f, mi.Normal3f, mi.Vector3f)))
-        exits = WalkEnds(at, dr.zeros(mi.Spectrum, n), dr.zeros(mi.UInt32, n), dr.zeros(mi.UInt32, n))
-        dr.eval(exits)
-        return cls(exits, *(dr.opaque(mi.UInt32, order) for order in (fewest, most)))
-
-    def event(self, walk: Walk, record: Any, event: Event) -> tuple[Walk, Any]:
-        return walk, record
-
-    def boundary(self, walk: Walk, record: Any, si: Any, active: Any) -> tuple[Walk, Any]:
-        return walk, record
-
-    def surface(self, walk: Walk, record: Any, si: Any, bsdf: Any, k: Any) -> tuple[Walk, Any]:
-        return walk, record
-
-    def crossing(self, walk: Walk, record: Any, crossing: Crossing) -> tuple[Walk, Any]:
-        leaves, si = walk.alive & crossing.leaves, crossing.si
-        at = surface_point(si.p, si.n, si.sh_frame.n, walk.d)
-        kept = leaves & (walk.order >= self.fewest) & (walk.order <= self.most)
-        targets, values = (*self.exits.at[:4], *self.exits[1:]), (*at[:4], walk.weight, walk.order, si.prim_index)
-        for target, value in zip(targets, values):
-            dr.scatter(target, type(target)(value), record, kept)
-        return replace(walk, alive=walk.alive & ~leaves), record
 
 
 def trace_exits(
@@ -96,7 +51,7 @@ def trace_exits(
     fewest: int = 2,
     most: int = 2**31 - 1,
     roulette_from: int = ROULETTE_FROM,
-) -> WalkEnds:
+) -> WalkExits:
     """One walk from each start.
 
     Args:
@@ -109,10 +64,7 @@ def trace_exits(
         ValueError: fewest is not a whole number >= 0.
     """
     check_count("fewest", fewest, 0)
-    store = _Store.of(dr.width(starts.p), fewest, most)
-    walk_exits.walk_from(walk_media(obj), 0, starts, store, seed, LANES, roulette_from)
-    dr.eval(store.exits)
-    return store.exits
+    return exits(walk_media(obj), 0, starts, seed, LANES, roulette_from, fewest, most)
 
 
 PATCH_SHARE = 0.6  # of those by patches, where they are learnt
@@ -253,12 +205,12 @@ class PairSource:
         """n walks of random exits; of those that left at an order that counts some, see `ended`."""
         return self.ended(*self.traced(n, seed), seed)
 
-    def traced(self, n: int, seed: tuple[int, ...]) -> tuple[SurfacePoint, WalkEnds]:
+    def traced(self, n: int, seed: tuple[int, ...]) -> tuple[SurfacePoint, WalkExits]:
         """Starts and ends of n walks of random exits."""
         starts = self.object.random_points(generator(mi, n, pass_seed(*seed, 0)))
         return starts, trace_exits(self.object, starts, (*seed, 1), fewest=1)
 
-    def ended(self, starts: SurfacePoint, exits: WalkEnds, seed: tuple[int, ...]) -> Pairs:
+    def ended(self, starts: SurfacePoint, exits: WalkExits, seed: tuple[int, ...]) -> Pairs:
         """The pairs of walks whose ends and orders from one on are known, those of two and more, T as values.
 
         With t the mean over channels of T over its mean, a walk is kept with the chance p = min(1, t / 1.5), as T / p:
@@ -282,7 +234,7 @@ class PairSource:
         faces = np.array(dr.gather(mi.UInt32, exits.face, kept))
         return self._columns(starts.gather(kept), ends, T)._replace(drawn=n, faces=faces, even=even)
 
-    def _even(self, starts: SurfacePoint, exits: WalkEnds) -> AlbedoSamples:
+    def _even(self, starts: SurfacePoint, exits: WalkExits) -> AlbedoSamples:
         """What walks bring under the same light from everywhere, of every fourth walk."""
         n = max(dr.width(starts.p) // EVEN_EVERY, 1)
         lanes = dr.arange(mi.UInt32, n) * EVEN_EVERY

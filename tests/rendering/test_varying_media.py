@@ -110,8 +110,8 @@ def _layers(values: list, thickness: float, **more: Any) -> dict:
 
 def _exits(surface: dict, thickness: float, mu: float, seed: int) -> Any:
     from halfspace_sss.rendering.object.points import SurfacePoint
-    from halfspace_sss.rendering.walk.exits import exits
     from halfspace_sss.rendering.walk.media import WalkMedia
+    from halfspace_sss.rendering.walk.random_walk import exits
 
     scene = {"type": "scene", "object": {**_slab(thickness), "bsdf": {"type": "translucent", **surface}}}
     w = np.repeat([[np.sqrt(1 - mu * mu)], [0.0], [mu]], N, axis=1)
@@ -122,8 +122,8 @@ def _exits(surface: dict, thickness: float, mu: float, seed: int) -> Any:
 
 def _sides(out: Any) -> np.ndarray:
     """Throughput per walk that leaves above, and that leaves below; shape (2, channels, walks)."""
-    up = np.array(out.n_i)[2] > 0
-    T = np.array(out.throughput)
+    up = np.array(out.at.n_out)[2] > 0
+    T = np.array(out.T)
     return np.array([T * up, T * ~up])
 
 

@@ -55,7 +55,7 @@ def _on_sphere(radius: float, n: int, diffuse: bool = False):
 
 
 def _exits(*arguments: object, **options: object):
-    from halfspace_sss.rendering.walk.exits import exits
+    from halfspace_sss.rendering.walk.random_walk import exits
 
     return exits(*arguments, **options)
 
@@ -72,7 +72,7 @@ def test_without_absorption_all_that_enters_a_sphere_leaves_it() -> None:
     left = np.array(out.left)
     assert left.mean() > 0.9999
     entered = 1 - F_r(mu, 1.5)
-    for channel in np.array(out.throughput):
+    for channel in np.array(out.T):
         _check_mean(channel - entered, 0.0)
 
 
@@ -80,7 +80,7 @@ def test_exits_lie_on_the_surface_with_directions_that_point_away_from_it() -> N
     media = _media({"type": "sphere", "radius": 5.0}, sigma_s="0.5,1,2", sigma_a=0.01, eta=1.5)
     out = _exits(media, 0, _on_sphere(5.0, 4096)[0], 1)
     left = np.array(out.left)
-    x, n, w = (np.array(a)[:, left] for a in (out.x_i, out.n_i, out.w_i))
+    x, n, w = (np.array(a)[:, left] for a in (out.at.p, out.at.n_out, out.at.w))
     assert np.allclose(np.linalg.norm(x, axis=0), 5, atol=1e-3)
     assert np.allclose(n, x / 5, atol=1e-3)
     assert np.all((n * w).sum(axis=0) > 0)
@@ -88,7 +88,7 @@ def test_exits_lie_on_the_surface_with_directions_that_point_away_from_it() -> N
 
 def test_exits_of_a_large_slab_carry_the_reflectance_of_the_half_space() -> None:
     media = _media(_slab(), sigma_s="1,0.8,0.3", sigma_a="0.01,0.2,0.7", g=0.5, eta=1.4)
-    throughput = np.array(_exits(media, 0, _start(0.6), 2).throughput)
+    throughput = np.array(_exits(media, 0, _start(0.6), 2).T)
     for values, (s, a) in zip(throughput, ((1.0, 0.01), (0.8, 0.2), (0.3, 0.7))):
         expected = trace(Medium(s, a, 0.5, 1.4), 0.6, n_paths=2**19).reflectance()
         _check_mean(values, expected.value, expected.standard_error)
@@ -104,7 +104,7 @@ def test_a_ball_of_many_mean_free_paths_reflects_diffuse_light_as_the_half_space
     start = start._replace(p=mi.Point3f(start.p + mi.Vector3f(away, 0, 0)))
     out = _exits(media, 0, start, 9)
     order = np.array(out.order)
-    for values, s, a, g in zip(np.array(out.throughput), (0.99, 0.75, 0.3), (0.01, 0.25, 0.7), (0.0, 0.3, 0.0)):
+    for values, s, a, g in zip(np.array(out.T), (0.99, 0.75, 0.3), (0.01, 0.25, 0.7), (0.0, 0.3, 0.0)):
         plane = trace(Medium(s, a, g, 1.4), "diffuse", 200_000, 5)
         for name, kept in (("single", order == 1), ("multiple", order > 1)):
             expected = plane.reflectance(name)
@@ -117,14 +117,14 @@ def test_walks_count_their_scattering_events() -> None:
     media = _media(_slab(), sigma_s="1,0.8,0.3", sigma_a="0.01,0.2,0.7", g=0.5, eta=1.4)
     out = _exits(media, 0, _start(0.6), 3)
     once = np.array(out.order) == 1
-    for values, (s, a) in zip(np.array(out.throughput), ((1.0, 0.01), (0.8, 0.2), (0.3, 0.7))):
+    for values, (s, a) in zip(np.array(out.T), ((1.0, 0.01), (0.8, 0.2), (0.3, 0.7))):
         _check_mean(values * once, single_scattering.reflectance(Medium(s, a, 0.5, 1.4), 0.6))
 
 
 def test_a_visitor_sees_every_scattering_event() -> None:
     import drjit as dr
 
-    from halfspace_sss.rendering.walk.exits import ExitVisitor, walk_from
+    from halfspace_sss.rendering.walk.random_walk import ExitVisitor, walk_from
 
     n = 4096
     media = _media({"type": "sphere", "radius": 2.0}, sigma_s="1,0.8,0.3", sigma_a="0.01,0.2,0.7", g=0.5, eta=1.4)
@@ -136,7 +136,7 @@ def test_a_visitor_sees_every_scattering_event() -> None:
             return walk, record
 
     out = _exits(media, 0, start, 7)
-    walk_from(media, 0, start, Counter(_exits(media, 0, start, 8)), 7)
+    walk_from(media, 0, start, Counter.of(n), 7)
     left = np.array(out.left)
     assert np.array_equal(np.array(events)[left], np.array(out.order)[left])
 
@@ -152,7 +152,7 @@ def test_a_walk_whose_direction_is_below_the_surface_never_enters() -> None:
     start = start._replace(w=-start.w)
     out = _exits(_media(_slab(), sigma_s=1.0, sigma_a=0.1), 0, start, 5)
     assert not np.array(out.left).any()
-    assert not np.array(out.throughput).any()
+    assert not np.array(out.T).any()
 
 
 def test_each_object_of_a_scene_has_exits_of_its_own() -> None:
@@ -166,7 +166,7 @@ def test_each_object_of_a_scene_has_exits_of_its_own() -> None:
     media = WalkMedia.of(mi.load_dict(scene), 1.0)
     start, mu = _on_sphere(2.0, 2**14)
     middle = [k for k, obj in enumerate(media.objects) if abs(obj.scene.bbox().center().x) < 1]
-    throughput = np.array(_exits(media, middle[0], start, 8).throughput)
+    throughput = np.array(_exits(media, middle[0], start, 8).T)
     assert np.mean(np.abs(throughput - (1 - F_r(mu, 1.5)))) < 1e-4  # rounding lets a walk escape now and then
 
 
@@ -174,7 +174,7 @@ def test_a_rough_boundary_lets_walks_in_and_out() -> None:
     rough = {"type": "roughdielectric", "int_ior": 1.3, "ext_ior": 1.0, "alpha": 0.05}
     out = _exits(_media(_slab(), sigma_s=1.0, sigma_a=0.5, eta=1.3, b=rough), 0, _start(0.9), 6)
     expected = trace(Medium(1.0, 0.5, 0.0, 1.3), 0.9, n_paths=2**18).reflectance()
-    assert np.array(out.throughput)[0].mean() == pytest.approx(expected.value, rel=0.02)
+    assert np.array(out.T)[0].mean() == pytest.approx(expected.value, rel=0.02)
 
 
 def test_numbers_of_objects_and_lengths_that_do_not_fit_are_refused() -> None:

@@ -14,7 +14,7 @@ import numpy as np
 from halfspace_sss.rendering.scenes.reference_store import Reference, load, save
 
 if TYPE_CHECKING:
-    from halfspace_sss.rendering.walk.exits import FirstExits
+    from halfspace_sss.rendering.walk.path_loop import FirstExits
 
 __all__ = ["CameraWalks"]
 
@@ -62,8 +62,8 @@ class CameraWalks:
         """About how many paths of one sample per pixel meet an object first."""
         import drjit as dr
 
-        from halfspace_sss.rendering.walk.exits import FirstExits
         from halfspace_sss.rendering.walk.integrator import camera_rays
+        from halfspace_sss.rendering.walk.path_loop import FirstExits
 
         media = self.integrator.tracer(self.scene).visitor.media
         with dr.suspend_grad():

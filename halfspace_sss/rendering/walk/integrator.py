@@ -17,9 +17,8 @@ from halfspace_sss.rendering.object.body import check_sensors, check_size, place
 from halfspace_sss.rendering.object.settings import OF_MITSUBA, check_parameters
 from halfspace_sss.rendering.object.shape import number_of, same_objects
 from halfspace_sss.rendering.walk.emitter_connections import EmitterDirections, InnerLights, find_connections
-from halfspace_sss.rendering.walk.exits import FirstExits
 from halfspace_sss.rendering.walk.media import WalkMedia
-from halfspace_sss.rendering.walk.path_loop import LightVisitor, PathTracer
+from halfspace_sss.rendering.walk.path_loop import FirstExits, LightVisitor, PathTracer
 
 __all__ = ["camera_rays", "walk_integrator_class", "is_walk"]
 

@@ -15,19 +15,19 @@ import drjit as dr
 import mitsuba as mi
 
 from halfspace_sss.rendering.light.small_emitters import NARROW, WIDE, SmallEmitters
-from halfspace_sss.rendering.object.points import sided
+from halfspace_sss.rendering.object.points import lifted, sided
 from halfspace_sss.rendering.walk.emitter_connections import (
     Departure,
     EmitterDirections,
     InnerLights,
     SubpathConnections,
 )
-from halfspace_sss.rendering.walk.exits import FirstExitRecord, FirstExits, FirstExitVisitor
 from halfspace_sss.rendering.walk.media import WalkMedia
 from halfspace_sss.rendering.walk.random_walk import (
     OUTSIDE,
     Crossing,
     Event,
+    Visitor,
     Walk,
     Walker,
     draw,
@@ -37,7 +37,16 @@ from halfspace_sss.rendering.walk.random_walk import (
 )
 from halfspace_sss.tracing.walk import generator, pass_seed
 
-__all__ = ["LightRecord", "LightVisitor", "PathTracer", "power_heuristic", "start_record"]
+__all__ = [
+    "FirstExitRecord",
+    "FirstExitVisitor",
+    "FirstExits",
+    "LightRecord",
+    "LightVisitor",
+    "PathTracer",
+    "power_heuristic",
+    "start_record",
+]
 
 
 # ---- Loop state ------------------------------------------------------------------------------------------------------
@@ -400,3 +409,103 @@ def _begin(rays: mi.Ray3f, total: mi.UInt32, index: mi.UInt32, rng: mi.PCG32) ->
     o, d = dr.gather(mi.Point3f, rays.o, index, known), dr.gather(mi.Vector3f, rays.d, index, known)
     no, first = dr.full(mi.Bool, False, lanes), dr.full(mi.UInt32, 0, lanes)
     return CameraPath(index, start_walk(o, d, rng), start_record(lanes), no, first)
+
+
+# ---- First exits of paths from the camera ------------------------------------------------------------------------
+#
+# While walks gather light for an image, where they leave is kept for learning. A path that meets an object first goes
+# in at x_o against the direction w_o of the eye, or is reflected there, and leaves at x_i into w_i with the throughput
+# T. Over all such paths, those included that do not enter,
+#
+#     ∫∫ S(x_i, w_i; x_o, w_o) mu_i f(x_i, w_i) dw_i dA_i = E[T f(x_i, w_i)].
+
+
+@dataclass
+class FirstExits:
+    """One lane for each path; normals point outwards, directions away from the surface, which see shading normals."""
+
+    object: mi.Int32  # the number of the object that the path meets first, or -1
+    x_o: mi.Point3f
+    n_o: mi.Normal3f  # geometric
+    n_o_shading: mi.Normal3f
+    w_o: mi.Vector3f
+    throughput: mi.Spectrum  # T; 0 where no walk left
+    x_i: mi.Point3f
+    n_i: mi.Normal3f  # geometric
+    n_i_shading: mi.Normal3f
+    w_i: mi.Vector3f
+    order: mi.UInt32  # scattering events
+    face: mi.UInt32  # at x_i
+
+    @classmethod
+    def of(cls, scene: mi.Scene, media: WalkMedia, rays: mi.Ray3f) -> FirstExits:
+        """What rays of the camera meet first, and room for where their walks leave."""
+        si = scene.ray_intersect(rays, mi.RayFlags.All, coherent=True)
+        k = media.index_of(si.shape, si.is_valid())
+        si = media.seen(si, k, rays.d)
+        n = dr.width(rays)
+        kinds = mi.Spectrum, mi.Point3f, mi.Normal3f, mi.Normal3f, mi.Vector3f, mi.UInt32, mi.UInt32
+        found = cls(k, mi.Point3f(si.p), mi.Normal3f(si.n), mi.Normal3f(si.sh_frame.n), mi.Vector3f(-rays.d),
+                    *(dr.zeros(kind, n) for kind in kinds))  # fmt: skip
+        dr.eval(found)
+        return found
+
+    def of_object(self, k: int) -> FirstExits:
+        """The lanes of paths that meet object k first."""
+        kept = dr.compress(self.object == k)
+        lanes = {name: dr.gather(type(value), value, kept) for name, value in vars(self).items()}
+        found = FirstExits(**lanes)
+        dr.eval(found)
+        return found
+
+    def gather(self, lanes: mi.UInt32) -> FirstExits:
+        """The paths of the given lanes."""
+        return FirstExits(**{name: dr.gather(type(value), value, lanes) for name, value in vars(self).items()})
+
+
+@dataclass
+class FirstExitRecord:
+    """What a visitor keeps of a path, the number of the path, and whether it is inside the object it met first."""
+
+    record: Any
+    index: mi.UInt32
+    first: mi.Bool
+
+
+@dataclass(frozen=True, eq=False)
+class FirstExitVisitor:
+    """Another visitor, beside which the first exit of each path is stored at the number of the path.
+
+    Args:
+        visitor: the other one.
+        exits: where they are stored.
+    """
+
+    visitor: Visitor
+    exits: FirstExits
+
+    def event(self, walk: Walk, record: FirstExitRecord, event: Event) -> tuple[Walk, FirstExitRecord]:
+        walk, kept = self.visitor.event(walk, record.record, event)
+        return walk, replace(record, record=kept)
+
+    def boundary(
+        self, walk: Walk, record: FirstExitRecord, si: mi.SurfaceInteraction3f, active: mi.Bool
+    ) -> tuple[Walk, FirstExitRecord]:
+        walk, kept = self.visitor.boundary(walk, record.record, si, active)
+        return walk, replace(record, record=kept)
+
+    def surface(
+        self, walk: Walk, record: FirstExitRecord, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, k: mi.Int32
+    ) -> tuple[Walk, FirstExitRecord]:
+        walk, kept = self.visitor.surface(walk, record.record, si, bsdf, k)
+        return walk, replace(record, record=kept)
+
+    def crossing(self, walk: Walk, record: FirstExitRecord, crossing: Crossing) -> tuple[Walk, FirstExitRecord]:
+        walk, kept = self.visitor.crossing(walk, record.record, crossing)
+        to, si = self.exits, crossing.si
+        leaves, n_shading = walk.alive & crossing.leaves & record.first, lifted(si.sh_frame.n, si.n, walk.d)
+        pairs = ((to.throughput, walk.weight), (to.x_i, si.p), (to.n_i, si.n), (to.n_i_shading, n_shading),
+                 (to.w_i, walk.d), (to.order, walk.order), (to.face, si.prim_index))  # fmt: skip
+        for target, value in pairs:
+            dr.scatter(target, type(target)(value), record.index, leaves)
+        return walk, replace(record, record=kept)

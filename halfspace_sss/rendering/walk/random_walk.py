@@ -13,20 +13,23 @@ import drjit as dr
 import mitsuba as mi
 
 from halfspace_sss.physics.medium import eval_hg, sample_hg
-from halfspace_sss.rendering.object.points import channel_mean, sided
+from halfspace_sss.rendering.object.points import SurfacePoint, channel_mean, lift, sided, surface_point
 from halfspace_sss.rendering.walk.media import Coefficients, WalkMedia
-from halfspace_sss.tracing.walk import ROULETTE_BOOST, ROULETTE_WEIGHT
+from halfspace_sss.tracing.walk import ROULETTE_BOOST, ROULETTE_WEIGHT, generator, pass_seed
 
 __all__ = [
     "Crossing",
     "Event",
+    "ExitVisitor",
     "Flight",
     "OUTSIDE",
     "Visitor",
     "Walk",
+    "WalkExits",
     "Walker",
     "draw",
     "eval_phase",
+    "exits",
     "fly",
     "free_path",
     "pick",
@@ -34,6 +37,7 @@ __all__ = [
     "sample_bsdf",
     "start_walk",
     "turn",
+    "walk_from",
     "weigh",
 ]
 
@@ -354,3 +358,184 @@ def sample_bsdf(
 def draw(n: int, rng: mi.PCG32) -> mi.UInt32:
     """A whole number below n."""
     return dr.minimum(mi.UInt32(rng.next_float32() * n), n - 1)
+
+
+# ---- Walks from given points ----------------------------------------------------------------------------------------
+#
+# What a model of the light transport of an object is learnt from. A walk enters at x_o against the direction w_o and
+# leaves at x_i into w_i with the throughput T of each channel. Both refractions and absorption are in T; reflection at
+# x_o is not, so that walks which never enter have none:
+#
+#     ∫∫ S(x_i, w_i; x_o, w_o) mu_i f(x_i, w_i) dw_i dA_i = E[T f(x_i, w_i)].
+
+LANES = 2**13
+MOST = 2**31 - 1  # scattering events
+
+
+class WalkExits(NamedTuple):
+    """Where walks leave, in the order of their starts.
+
+    Args:
+        at: x_i and w_i.
+        T: throughput; 0 where the walk ended inside or left at an order that is not kept.
+        order: scattering events.
+        face: of the mesh, at x_i.
+    """
+
+    at: SurfacePoint
+    T: mi.Spectrum
+    order: mi.UInt32
+    face: mi.UInt32
+
+    @property
+    def left(self) -> mi.Bool:
+        """Whether the walk left at an order that is kept."""
+        return dr.max(self.T) > 0
+
+
+@dataclass(frozen=True, eq=False)
+class ExitVisitor:
+    """Stores each exit at the number of its walk, which is the record, and ends the walk there.
+
+    Args:
+        exits: where they are stored.
+        fewest, most: orders that are kept.
+    """
+
+    exits: WalkExits
+    fewest: mi.UInt32
+    most: mi.UInt32
+
+    @classmethod
+    def of(cls, n: int, fewest: int = 0, most: int = MOST) -> ExitVisitor:
+        """For n walks."""
+        at = SurfacePoint(*(dr.zeros(kind, n) for kind in (mi.Point3f, mi.Normal3f, mi.Normal3f, mi.Vector3f)))
+        exits = WalkExits(at, dr.zeros(mi.Spectrum, n), dr.zeros(mi.UInt32, n), dr.zeros(mi.UInt32, n))
+        dr.eval(exits)
+        return cls(exits, *(dr.opaque(mi.UInt32, order) for order in (fewest, most)))
+
+    def event(self, walk: Walk, record: mi.UInt32, event: Event) -> tuple[Walk, mi.UInt32]:
+        return walk, record
+
+    def boundary(
+        self, walk: Walk, record: mi.UInt32, si: mi.SurfaceInteraction3f, active: mi.Bool
+    ) -> tuple[Walk, mi.UInt32]:
+        return walk, record
+
+    def surface(
+        self, walk: Walk, record: mi.UInt32, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, k: mi.Int32
+    ) -> tuple[Walk, mi.UInt32]:
+        return walk, record
+
+    def crossing(self, walk: Walk, record: mi.UInt32, crossing: Crossing) -> tuple[Walk, mi.UInt32]:
+        leaves, si = walk.alive & crossing.leaves, crossing.si
+        at = surface_point(si.p, si.n, si.sh_frame.n, walk.d)
+        kept = leaves & (walk.order >= self.fewest) & (walk.order <= self.most)
+        targets, values = (*self.exits.at[:4], *self.exits[1:]), (*at[:4], walk.weight, walk.order, si.prim_index)
+        for target, value in zip(targets, values):
+            dr.scatter(target, type(target)(value), record, kept)
+        return replace(walk, alive=walk.alive & ~leaves), record
+
+
+def exits(
+    media: WalkMedia,
+    k: int,
+    start: SurfacePoint,
+    seed: int | tuple[int, ...],
+    lanes: int = LANES,
+    roulette_from: int = 1,
+    fewest: int = 0,
+    most: int = MOST,
+) -> WalkExits:
+    """Where walks from points on object k leave it.
+
+    Args:
+        media, k, start, seed, lanes, roulette_from: as of `walk_from`.
+        fewest, most: numbers of scattering events that are kept, among the orders of the object.
+
+    Returns:
+        Exits in the order of the starts.
+
+    Raises:
+        ValueError: there is no object k, or the arrays of `start` are of different lengths.
+    """
+    visitor = ExitVisitor.of(dr.width(start.p), fewest, most)
+    walk_from(media, k, start, visitor, seed, lanes, roulette_from)
+    dr.eval(visitor.exits)
+    return visitor.exits
+
+
+def walk_from(
+    media: WalkMedia,
+    k: int,
+    start: SurfacePoint,
+    visitor: Visitor,
+    seed: int | tuple[int, ...],
+    lanes: int = LANES,
+    roulette_from: int = 1,
+) -> None:
+    """Walk from points on object k until the walks leave it or end inside.
+
+    Args:
+        media: the translucent objects of a scene, see `WalkMedia.of`.
+        k: number of the object.
+        start: p, n, n_out and w, arrays of one length; where w is below the surface, no walk enters.
+        visitor: what is recorded; its record is the number of the walk. It has to end walks that leave.
+        seed: one whole number or more.
+        lanes: walks at a time; another number gives other walks.
+        roulette_from: scattering events from which on roulette may end a walk.
+
+    Raises:
+        ValueError: there is no object k, or the arrays of `start` are of different lengths.
+    """
+    n = _check(media, k, start)
+    if n == 0:
+        return
+    dr.eval(start)
+    lanes = min(lanes, n)
+    walker, total, k = Walker(media, visitor, roulette_from), dr.opaque(mi.UInt32, n), dr.opaque(mi.UInt32, k)
+
+    def renew(walk: Walk, index: mi.UInt32) -> tuple[Walk, mi.UInt32]:
+        return _enter(media, k, start, index + lanes, walk.rng), index + lanes
+
+    def body(walk: Walk, index: mi.UInt32) -> tuple[Walk, mi.UInt32]:
+        walk, index = dr.if_stmt((walk, index), walk.alive, walker.step, lambda *s: s, label="inside")
+        return dr.if_stmt((walk, index), ~walk.alive, renew, lambda *s: s, label="renew")
+
+    seeds = seed if isinstance(seed, tuple) else (seed,)
+    index = dr.arange(mi.UInt32, lanes)
+    walk = _enter(media, k, start, index, generator(mi, lanes, pass_seed(*seeds)))
+    dr.while_loop((walk, index), lambda walk, index: index < total, body, label="walks")
+    dr.eval()
+
+
+def _check(media: WalkMedia, k: int, start: SurfacePoint) -> int:
+    """The number of starts."""
+    if not 0 <= k < len(media.objects):
+        raise ValueError(f"k must be a whole number in [0, {len(media.objects) - 1}], got {k!r}")
+    widths = [dr.width(v) for v in start[:4]]
+    if len(set(widths)) > 1:
+        raise ValueError(f"p, n, n_out and w of the starts must be of one length, got {widths}")
+    return widths[0]
+
+
+def _enter(media: WalkMedia, k: mi.UInt32, start: SurfacePoint, index: mi.UInt32, rng: mi.PCG32) -> Walk:
+    """The walk of a start, refracted into the object."""
+    known = index < dr.width(start.p)
+    si = dr.zeros(mi.SurfaceInteraction3f, dr.width(index))
+    si.p = dr.gather(mi.Point3f, start.p, index, known)
+    si.n = dr.gather(mi.Normal3f, start.n, index, known)
+    si.sh_frame = mi.Frame3f(dr.gather(mi.Normal3f, start.n_out, index, known))
+    w = dr.gather(mi.Vector3f, start.w, index, known)
+    si.wi = si.to_local(w)
+    si = lift(si, w)
+    ctx = mi.BSDFContext()
+    ctx.type_mask = mi.BSDFFlags.Transmission
+    bs, value = sample_bsdf(media.boundary(k), si, rng, ctx)
+    d, _ = sided(si, bs.wo)
+    walk = start_walk(si.p, d, rng)
+    enters = known & (dr.dot(w, si.n) > 0) & (dr.dot(d, si.n) < 0) & (dr.max(value) > 0)
+    enters &= mi.Frame3f.cos_theta(si.wi) > 0
+    channel = draw(len(value), rng) if len(value) > 1 else walk.channel
+    return replace(walk, alive=enters, object=mi.Int32(k) + dr.zeros(mi.Int32, dr.width(index)), weight=value,
+                   skip=media.clear(k, si.n, d), scale=dr.square(bs.eta), channel=channel)  # fmt: skip
