@@ -117,11 +117,25 @@ def test_an_open_object_is_refused_by_name() -> None:
         _refused("'wax', which is not closed, got gathered", _scene("gathered", shape={"type": "rectangle"}))
 
 
-def test_light_that_is_not_finite_is_refused_by_name() -> None:
-    bitmap = mi.Bitmap(np.full((8, 16, 3), np.nan, dtype=np.float32))
-    _refused(
-        "light at object 'wax' must be finite", _scene("gathered", lights={"sky": {"type": "envmap", "bitmap": bitmap}})
-    )
+@pytest.mark.parametrize("integrator", ["sampled", "corrected", "gathered", "translucent_walk"])
+def test_light_that_is_not_finite_is_refused_by_emitter_and_texel(integrator: str) -> None:
+    texels = np.ones((8, 16, 3), dtype=np.float32)
+    texels[3, 5, 1] = np.inf if integrator == "sampled" else np.nan
+    scene = _scene("sampled", lights={"sky": {"type": "envmap", "bitmap": mi.Bitmap(texels)}})
+    if integrator == "translucent_walk":
+        found = mi.load_dict({"type": integrator})
+    else:
+        found = mi.load_dict({"type": "bssrdf", "light": integrator})
+    with pytest.raises(ValueError, match="light of emitter 'sky' must be finite, got .* row 3, column 5"):
+        mi.render(scene, integrator=found, spp=1)
+
+
+def test_black_light_leaves_a_mesh_of_few_faces_black() -> None:
+    images = [
+        _image(_scene(light, lights={"sky": {"type": "constant", "radiance": 0.0}}, shape={"type": "cube"}), 4)
+        for light in ("corrected", "gathered")
+    ]
+    assert not np.any(images)
 
 
 def test_derivatives_are_refused() -> None:

@@ -22,7 +22,7 @@ import numpy as np
 
 from halfspace_sss.rendering.object.translucent import is_translucent
 
-__all__ = ["NARROW", "SmallEmitters", "Sun", "WIDE", "is_delta", "spread", "suns_of"]
+__all__ = ["NARROW", "SmallEmitters", "Sun", "WIDE", "check_emitters", "is_delta", "spread", "suns_of"]
 
 
 # ---- Suns of an environment map -------------------------------------------------------------------------------------
@@ -122,9 +122,9 @@ class SmallEmitters:
         """Those of a scene; None if there are none.
 
         Raises:
-            ValueError: an emitter that Mitsuba's own path tracers cannot evaluate either.
+            ValueError: as in `check_emitters`.
         """
-        _check(scene)
+        check_emitters(scene)
         emitters = sorted((e for e in scene.emitters() if _has_place(e)), key=lambda e: not is_delta(e))
         sky = scene.environment()
         suns = [] if sky is None or "Constant" in sky.class_name() else suns_of(sky)
@@ -252,9 +252,14 @@ def is_delta(emitter: mi.Emitter) -> bool:
     return bool(emitter.flags() & int(mi.EmitterFlags.Delta)) and emitter.get_shape() is None
 
 
-def _check(scene: mi.Scene) -> None:
-    """Refuse emitters that do not work, and name those that no path from a camera finds."""
+def check_emitters(scene: mi.Scene) -> None:
+    """Refuse emitters that do not work, and warn of those that no path from a camera finds.
+
+    Raises:
+        ValueError: an emitter that Mitsuba's own path tracers cannot evaluate either, or light that is not finite.
+    """
     for emitter in scene.emitters():
+        _check_finite(emitter)
         kind = emitter.class_name()
         if kind.startswith("TimedSunsky"):
             raise ValueError(
@@ -263,6 +268,27 @@ def _check(scene: mi.Scene) -> None:
         if emitter.flags() & int(mi.EmitterFlags.Delta) and not is_delta(emitter):
             message = f"light of a {kind} is left out: it can neither be sampled nor met, as by path tracers of Mitsuba"
             warnings.warn(message, stacklevel=2)
+
+
+def _check_finite(emitter: mi.Emitter) -> None:
+    parameters = mi.traverse(emitter)
+    for key in parameters.keys():
+        value = parameters[key]
+        if not (dr.is_array_v(value) and dr.is_float_v(value)) or dr.is_matrix_v(value):
+            continue
+        flat = dr.detach(value.array if dr.is_tensor_v(value) else dr.ravel(value))
+        if dr.all(dr.isfinite(flat)):
+            continue
+        wrong = np.flatnonzero(~np.isfinite(np.array(flat)))
+        where = ""
+        if dr.is_tensor_v(value):
+            row, column = np.unravel_index(wrong[0], value.shape)[:2]
+            repeated = int(emitter.is_environment())  # columns before the first
+            where = f", the first in row {row}, column {column - repeated}"
+        raise ValueError(
+            f"light of emitter {emitter.id()!r} must be finite, got NaN or infinity in {len(wrong)} of "
+            f"{dr.width(flat)} values of its {key}{where}"
+        )
 
 
 def _has_place(emitter: mi.Emitter) -> bool:

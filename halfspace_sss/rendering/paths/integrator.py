@@ -14,6 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from halfspace_sss.interrupts import hear_again, interruptible
+from halfspace_sss.rendering.light.small_emitters import check_emitters
 from halfspace_sss.rendering.object.body import TranslucentObject, TranslucentObjects, make_objects
 from halfspace_sss.rendering.object.registry import Choices
 from halfspace_sss.rendering.object.settings import Settings, read_settings
@@ -67,6 +68,7 @@ def _class(variant: str) -> type:
         def prepare(self, scene: mi.Scene) -> list[TranslucentObject]:
             """The translucent objects of a scene, made ready once; ValueError if the scene cannot be rendered."""
             check_parameters(scene)
+            check_emitters(scene)
             with dr.suspend_grad():
                 return self._prepared(scene)
 
@@ -79,6 +81,7 @@ def _class(variant: str) -> type:
         def check(self, scene: mi.Scene, without: Collection[str] = ()) -> None:
             """ValueError if the scene cannot be rendered, as far as can be told without the objects `without`."""
             check_parameters(scene)
+            check_emitters(scene)
             with dr.suspend_grad():
                 make_objects(scene, self.settings, without)
 
