@@ -67,8 +67,8 @@ def ours(task: Task) -> dict[str, Any]:
     from full_geometry.learning.model_errors import modelled
     from full_geometry.learning.training import train_by_cpu
     from full_geometry.models.object_model import HalfSpace
-    from full_geometry.object.learnable import object_of
     from full_geometry.object.pairs import EntryProposals
+    from halfspace_sss.rendering.object.body import object_of
 
     prepare()
     p = task.params
@@ -84,7 +84,7 @@ def ours(task: Task) -> dict[str, Any]:
 def papers(task: Task) -> dict[str, Any]:
     """Errors of the paper's network for one N, its points from walks and uniform."""
     from figures.studies.paper_network import PaperRecipe, estimate, fit_paper
-    from full_geometry.object.learnable import object_of
+    from halfspace_sss.rendering.object.body import object_of
 
     prepare()
     p, repeats = task.params, 8

@@ -15,7 +15,7 @@ __getattr__, __dir__ = lazy_names(
         "Recipe": "learning.fitting",
         "errors": "learning.model_errors",
         "load": "models.storing",
-        "object_of": "object.learnable",
+        "object_of": "learning.model_errors",
         "train": "learning.training",
         "transport_of": "learning.model_errors",
     },

@@ -10,12 +10,11 @@ import numpy as np
 
 from full_geometry.learning.model_errors import RadianceError, errors_of, transport_of
 from full_geometry.models.storing import KIND, find_weights, trained
-from full_geometry.object.learnable import object_of
 from halfspace_sss.checks import check_count
 from halfspace_sss.interface.model import models as half_space_models
 from halfspace_sss.neural.store import check_weights_folder, load_weights
 from halfspace_sss.progress import NamedProgress
-from halfspace_sss.rendering.object.body import TranslucentObject
+from halfspace_sss.rendering.object.body import TranslucentObject, object_of
 from halfspace_sss.rendering.object.registry import model_names
 from halfspace_sss.rendering.object.translucent import is_translucent
 from halfspace_sss.rendering.scenes.learners import LearntObject, ObjectError

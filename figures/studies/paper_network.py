@@ -19,14 +19,13 @@ from torch import nn
 from full_geometry.learning.model_errors import LOBES, POWER, ExitRadiance, ExitTruth, RadianceError, compare, reference
 from full_geometry.models.storing import Identity, frame_of, identify
 from full_geometry.object.features import ObjectFrame
-from full_geometry.object.learnable import object_of
 from full_geometry.object.pairs import trace_exits
 from halfspace_sss.checks import check_choice, check_count, check_interval
 from halfspace_sss.neural.store import check_weights_folder, load_weights, save_weights, weights_folder
 from halfspace_sss.neural.training.fit import ADAM, CpuSchedule, Descent, Objective, Source, fit
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.provenance import provenance
-from halfspace_sss.rendering.object.body import TranslucentObject
+from halfspace_sss.rendering.object.body import TranslucentObject, object_of
 from halfspace_sss.rendering.object.points import SurfacePoint
 from halfspace_sss.rendering.scenes.learners import LearntObject, ObjectError
 from halfspace_sss.tracing.walk import generator, pass_seed

@@ -22,12 +22,11 @@ from full_geometry.learning.model_errors import measure, reference, transport_of
 from full_geometry.learning.training import train, train_by_cpu
 from full_geometry.models.object_model import HalfSpace
 from full_geometry.models.storing import KIND, Learnt
-from full_geometry.object.learnable import object_of
 from full_geometry.object.pairs import EntryProposals, Numbers
 from full_geometry.object.patches import AREA_SHARE, LearntProposals, PatchTable
 from halfspace_sss.backend import kernel_seconds
 from halfspace_sss.neural.store import load_weights
-from halfspace_sss.rendering.object.body import TranslucentObject
+from halfspace_sss.rendering.object.body import TranslucentObject, object_of
 from halfspace_sss.rendering.object.half_space import HalfSpaceProposals
 from halfspace_sss.rendering.object.points import (
     ObjectModel,

@@ -19,12 +19,11 @@ from full_geometry.learning.model_errors import LIGHTS, RadianceError, errors_of
 from full_geometry.learning.shape_data import draw_subject
 from full_geometry.models.descriptors import mean_chord
 from full_geometry.models.neural_shape import transport
-from full_geometry.object.learnable import object_of
 from halfspace_sss.interface.model import bssrdf
 from halfspace_sss.materials import load as load_material
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.progress import NamedProgress
-from halfspace_sss.rendering.object.body import TranslucentObject
+from halfspace_sss.rendering.object.body import TranslucentObject, object_of
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 # ----------------------------------------------------------------------------------------------------

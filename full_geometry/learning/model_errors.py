@@ -24,14 +24,13 @@ import numpy as np
 
 from full_geometry.models.object_model import HalfSpace
 from full_geometry.models.storing import KIND, find_weights, load
-from full_geometry.object.learnable import object_of
 from full_geometry.object.pairs import EntryProposals, trace_exits
 from full_geometry.object.patches import ExitTable
 from halfspace_sss.checks import check_choice, check_count
 from halfspace_sss.interface.model import bssrdf
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.progress import NamedProgress
-from halfspace_sss.rendering.object.body import TranslucentObject
+from halfspace_sss.rendering.object.body import TranslucentObject, object_of
 from halfspace_sss.rendering.object.half_space import HalfSpaceTransport
 from halfspace_sss.rendering.object.points import SurfacePoint, Transport
 from halfspace_sss.rendering.object.registry import lookup, model_names

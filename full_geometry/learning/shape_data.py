@@ -16,10 +16,9 @@ import numpy as np
 from full_geometry.learning.shapes import TRAINING, Family, make_shape
 from full_geometry.models.descriptors import ALONE, describe, end, medium, mixed
 from full_geometry.models.neural_shape import ALBEDO, ETA, SIZE, Backbone, G
-from full_geometry.object.learnable import object_of
 from full_geometry.object.pairs import EntryProposals, trace_exits
 from halfspace_sss.physics.medium import Medium
-from halfspace_sss.rendering.object.body import TranslucentObject
+from halfspace_sss.rendering.object.body import TranslucentObject, object_of
 from halfspace_sss.rendering.object.points import SurfacePoint
 from halfspace_sss.tracing.walk import generator, pass_seed
 

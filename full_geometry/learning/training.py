@@ -30,7 +30,6 @@ from full_geometry.models import storing
 from full_geometry.models.object_model import FullGeometry
 from full_geometry.models.storing import frame_of, identify
 from full_geometry.object.features import n_local, n_pair, n_side
-from full_geometry.object.learnable import object_of
 from full_geometry.object.pairs import EntryProposals, Pairs, PairSource, WalkExits, shuffled
 from full_geometry.object.patches import Patches, PatchSampler, cluster
 from halfspace_sss.backend import busy_threads
@@ -39,7 +38,7 @@ from halfspace_sss.neural.store import check_weights_folder, to_json
 from halfspace_sss.neural.training.work_folder import CHECKPOINT, claim
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.provenance import check_folder, provenance, write_atomically
-from halfspace_sss.rendering.object.body import TranslucentObject
+from halfspace_sss.rendering.object.body import TranslucentObject, object_of
 from halfspace_sss.rendering.object.points import SurfacePoint
 from halfspace_sss.rendering.scenes.camera_walks import TRIAL
 

@@ -8,10 +8,10 @@ from typing import Any
 
 from halfspace_sss.checks import check_choice
 from halfspace_sss.interface.model import model_class, models
-from halfspace_sss.rendering.object.body import translucent_shapes
+from halfspace_sss.rendering.object.body import millimetres, translucent_shapes
 from halfspace_sss.rendering.object.registry import AUTO, model_names
 from halfspace_sss.rendering.paths.gathering import Gathering
-from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED, load_objects, millimetres
+from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED, load_objects
 
 __all__ = ["GATHERED", "LAMBERT", "NO_SINGLE", "Stage", "Way", "stage", "ways"]
 

@@ -20,7 +20,6 @@ from full_geometry.learning.fitting import STANDARD, ObjectFit  # noqa: E402
 from full_geometry.models.object_model import HalfSpace  # noqa: E402
 from full_geometry.models.storing import frame_of  # noqa: E402
 from full_geometry.object.features import n_pair, n_side  # noqa: E402
-from full_geometry.object.learnable import object_of  # noqa: E402
 from full_geometry.object.pairs import (  # noqa: E402
     ENOUGH,
     AlbedoSamples,
@@ -29,6 +28,7 @@ from full_geometry.object.pairs import (  # noqa: E402
     PairSource,
     trace_exits,  # noqa: E402
 )
+from halfspace_sss.rendering.object.body import object_of  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("rgb")

@@ -27,9 +27,8 @@ from full_geometry.object.features import (  # noqa: E402
     pair_features,
     side_features,
 )
-from full_geometry.object.learnable import object_of  # noqa: E402
 from halfspace_sss import Medium  # noqa: E402
-from halfspace_sss.rendering.object.body import TranslucentObject  # noqa: E402
+from halfspace_sss.rendering.object.body import TranslucentObject, object_of  # noqa: E402
 from halfspace_sss.rendering.object.points import surface_point  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 

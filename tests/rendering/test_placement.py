@@ -179,7 +179,7 @@ def test_models_of_whole_objects_refuse_it_too(model: str) -> None:
 
 
 def test_objects_with_something_inside_are_not_learnt() -> None:
-    object_of = pytest.importorskip("full_geometry.object.learnable").object_of
+    object_of = pytest.importorskip("halfspace_sss.rendering.object.body").object_of
     scene = mi.load_dict(view("bssrdf", wax=ball(), stone=_stone()))
     with pytest.raises(ValueError, match="must be empty for learning, got the shape 'stone' inside object 'wax'"):
         object_of(scene)

@@ -5,6 +5,7 @@ Checks come first: which shapes of a scene are translucent, what lies inside the
 
 from __future__ import annotations
 
+import abc
 import functools
 import math
 import warnings
@@ -53,14 +54,19 @@ from halfspace_sss.rendering.object.varying import VaryingMedium, equivalent, wa
 __all__ = [
     "Content",
     "Expected",
+    "KnowsUnit",
     "TranslucentObject",
     "TranslucentObjects",
     "check_empty",
+    "check_geometry",
     "check_sensors",
     "check_size",
+    "check_surface",
     "contents",
     "expected_of",
     "make_objects",
+    "millimetres",
+    "object_of",
     "places_of",
     "translucent_shapes",
 ]
@@ -465,6 +471,26 @@ def _model_of(obj: TranslucentObject, inside: Inside, settings: Settings, variat
     return half_space_model(inside.model, obj.geometry, obj.media, settings, variation)
 
 
+class KnowsUnit(abc.ABC):
+    """An integrator that says how long a unit of its scene is: `bssrdf` and `translucent_walk`.
+
+    They register, as classes of Mitsuba take no second base.
+    """
+
+    mm_per_unit: float
+
+
+def millimetres(scene: mi.Scene) -> float:
+    """Millimetres in a unit of a scene, as its integrator says; 1, with a warning, if that is none of ours."""
+    integrator = scene.integrator()
+    if isinstance(integrator, KnowsUnit):
+        return float(integrator.mm_per_unit)
+    warnings.warn(
+        "a unit of the scene is taken for 1 mm: its integrator is not bssrdf or translucent_walk", stacklevel=3
+    )
+    return 1.0
+
+
 def check_size(found: Geometry, sigma_t: Sequence[float], mm_per_unit: float) -> None:
     """Warn of an object whose size in mean free paths speaks of another unit of length.
 
@@ -507,3 +533,85 @@ def expected_of(media: Sequence[Medium]) -> Expected:
         multiple = float(measure.reflectance(bssrdf("better_dipole", m), 1.0)) if float(m.sigma_s) > 0 else 0.0
         rows.append((float(single_scattering.reflectance(m, 1.0)), multiple, float(m.albedo)))
     return Expected(*np.mean(rows, axis=0).tolist())
+
+
+# --------------------------------------------------------------------------------------------------
+# One object alone, as it is learnt: of a shape with a medium, or of a scene.
+
+
+def object_of(
+    shape: Any, medium: Medium | None = None, mm_per_unit: float | None = None, name: str | None = None
+) -> TranslucentObject:
+    """The object of a shape filled with a medium, or the one called `name` in a scene.
+
+    Args:
+        shape: a Mitsuba shape, closed and no instance, whose own BSDF does not count; or a scene.
+        medium: 1/mm, scalar or with one value for each channel of the variant; of a scene it is that of the object's
+            `translucent` surface.
+        mm_per_unit: length of a scene unit, mm; by default what the integrator of a scene says, and 1 for a shape.
+        name: id of the object; may be left out where there is one.
+
+    Raises:
+        ValueError: a scene has no such object, or one that cannot be learnt: its boundary is rough, its normals point
+            to both sides, it is an instance or has something inside. The medium is missing or has other channels than
+            the variant, or mm_per_unit is not a finite number > 0.
+    """
+    if not isinstance(shape, mi.Scene):
+        geometry = survey(shape)
+        media = _in_scene_units(medium, 1.0 if mm_per_unit is None else mm_per_unit)
+        check_geometry(geometry)
+        return TranslucentObject(geometry, media)
+    geometry = survey(_object_of(shape, name))
+    check_empty(shape, [geometry], "learning")
+    unit = millimetres(shape) if mm_per_unit is None else mm_per_unit
+    inside = equivalent(geometry.shape.bsdf().inside, geometry)
+    media = _in_scene_units(inside.medium, unit)
+    check_geometry(geometry)
+    check_size(geometry, [float(m.sigma_t) for m in media], unit)
+    return TranslucentObject(geometry, media, None if inside.varying is None else inside.varying.scaled(unit))
+
+
+def _in_scene_units(medium: Medium | None, mm_per_unit: float) -> tuple[Medium, ...]:
+    """The scalar medium of each channel, 1/(scene unit)."""
+    if not (math.isfinite(mm_per_unit) and mm_per_unit > 0):
+        raise ValueError(f"mm_per_unit must be finite and > 0, got {mm_per_unit!r}")
+    if not isinstance(medium, Medium):
+        raise ValueError(f"medium must be a Medium, got {type(medium).__name__}")
+    n = len(mi.Spectrum(0))
+    if medium.n_channels not in (None, n):
+        raise ValueError(f"medium must have {n} channels under {mi.variant()}, got {medium.n_channels}")
+    scaled = medium.scaled(mm_per_unit)
+    return tuple(scaled if medium.n_channels is None else scaled.channel(k) for k in range(n))
+
+
+def check_geometry(geometry: Geometry) -> None:
+    """ValueError if the faces of an object do not all point to the same side: one sign stands for all of them."""
+    if geometry.signs is not None:
+        raise ValueError(
+            f"normals of {geometry.name} must all point to the same side to be learnt, got pieces that disagree"
+        )
+
+
+def check_surface(name: str, surface: Any) -> None:
+    """ValueError if the `translucent` surface of an object has what cannot be learnt."""
+    if surface.boundary.flags() & int(mi.BSDFFlags.Smooth):
+        raise ValueError(f"the boundary of {name!r} must be smooth to be learnt, got a rough one")
+
+
+def _object_of(scene: Any, name: str | None) -> Any:
+    """The translucent shape called `name` in a scene, or the only one.
+
+    Raises:
+        ValueError: there is none, there are several and none is named, or it cannot be learnt.
+    """
+    known = {s.id(): s for s in scene.shapes() if is_translucent(s.bsdf())}
+    instances = [s.id() for s in scene.shapes() if "nstance" in s.class_name()]
+    if name in instances or (name is None and instances and not known):
+        raise ValueError(f"object must not be an instance to be learnt, got {name or instances[0]!r}")
+    if name is None and len(known) == 1:
+        name = next(iter(known))
+    if name not in known:
+        names = ", ".join(id or name_of(shape) for id, shape in known.items())
+        raise ValueError(f"object must be one of {names or 'none'}, got {name!r}")
+    check_surface(name, known[name].bsdf())
+    return known[name]

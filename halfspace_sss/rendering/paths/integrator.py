@@ -15,7 +15,7 @@ import numpy as np
 
 from halfspace_sss.interrupts import hear_again, interruptible
 from halfspace_sss.rendering.light.small_emitters import check_emitters
-from halfspace_sss.rendering.object.body import TranslucentObject, TranslucentObjects, make_objects
+from halfspace_sss.rendering.object.body import KnowsUnit, TranslucentObject, TranslucentObjects, make_objects
 from halfspace_sss.rendering.object.registry import Choices
 from halfspace_sss.rendering.object.settings import Settings, read_settings
 from halfspace_sss.rendering.object.translucent import is_translucent
@@ -46,6 +46,7 @@ def is_bssrdf(integrator: mi.Integrator | None) -> bool:
 def _class(variant: str) -> type:
     """The class of a variant, which must be the current one."""
 
+    @KnowsUnit.register
     class BSSRDFIntegrator(mi.SamplingIntegrator):
         """Renders scenes with `translucent` objects; parameters as in `Settings`.
 
@@ -60,6 +61,7 @@ def _class(variant: str) -> type:
             mi.SamplingIntegrator.__init__(self, props)
             self.timed = float(props.get("timeout", -1.0)) > 0
             self.settings = read_settings(props)
+            self.mm_per_unit = self.settings.mm_per_unit
             self._bodies = TranslucentObjects(self.settings)
             self.gathering = Gathering()
             self._control_variates = ControlVariates()

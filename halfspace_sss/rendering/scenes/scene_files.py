@@ -18,7 +18,6 @@ from halfspace_sss.rendering.object.registry import lookup, model_names
 from halfspace_sss.rendering.object.settings import ORDERS, SHARED
 from halfspace_sss.rendering.object.translucent import is_translucent
 from halfspace_sss.rendering.paths.integrator import is_bssrdf
-from halfspace_sss.rendering.walk.integrator import is_walk
 
 __all__ = [
     "PATH_TRACED",
@@ -26,7 +25,6 @@ __all__ = [
     "first_cause",
     "load_objects",
     "load_scene",
-    "millimetres",
     "open_scene",
     "plainly",
 ]
@@ -195,18 +193,6 @@ def load_objects(scene: dict | str | Path, parameters: Mapping[str, str] | None 
     config.merge_meshes = False
     _transform(scene, state, config)
     return _made(scene, state, config)
-
-
-def millimetres(scene: Any) -> float:
-    """Millimetres in a unit of a scene, as its integrator says; 1, with a warning, if that is none of ours."""
-    integrator = scene.integrator()
-    if is_bssrdf(integrator):
-        return float(integrator.settings.mm_per_unit)
-    if is_walk(integrator):
-        return float(integrator.mm_per_unit)
-    ours = " or ".join(_INTEGRATORS.values())
-    warnings.warn(f"a unit of the scene is taken for 1 mm: its integrator is not {ours}", stacklevel=3)
-    return 1.0
 
 
 def _check(name: str, value: str | None, known: tuple[str, ...]) -> None:

@@ -13,14 +13,14 @@ import numpy as np
 
 from halfspace_sss.interrupts import interruptible
 from halfspace_sss.rendering.light.small_emitters import SmallEmitters
-from halfspace_sss.rendering.object.body import check_sensors, check_size, places_of
+from halfspace_sss.rendering.object.body import KnowsUnit, check_sensors, check_size, places_of
 from halfspace_sss.rendering.object.settings import OF_MITSUBA, check_parameters
 from halfspace_sss.rendering.object.shape import number_of, same_objects
 from halfspace_sss.rendering.walk.emitter_connections import EmitterDirections, InnerLights, find_connections
 from halfspace_sss.rendering.walk.media import WalkMedia
 from halfspace_sss.rendering.walk.path_loop import FirstExits, LightVisitor, PathTracer
 
-__all__ = ["camera_rays", "walk_integrator_class", "is_walk"]
+__all__ = ["camera_rays", "walk_integrator_class"]
 
 PARAMETERS = ("mm_per_unit", "max_depth", "rr_depth", "hide_emitters", "join_share")
 SAMPLES_PER_LAUNCH = 2**19
@@ -34,15 +34,11 @@ def walk_integrator_class() -> type:
     return _class(mi.variant())
 
 
-def is_walk(integrator: mi.Integrator | None) -> bool:
-    """Whether an integrator is `translucent_walk`."""
-    return isinstance(integrator, walk_integrator_class())
-
-
 @functools.cache
 def _class(variant: str) -> type:
     """The class of a variant, which must be the current one."""
 
+    @KnowsUnit.register
     class TranslucentWalk(mi.SamplingIntegrator):
         """Path tracer whose paths walk through objects with the surface `translucent`.
 
