@@ -18,18 +18,18 @@ if TYPE_CHECKING:
 
 # ---- Tables of samplers, of models and of base models of one object --------------------------------
 
-KEYS = {"errors": ["model"], "starts": ["start", "planned", "seconds", "steps"]}  # of tables of errors: a training
-TABLES = ("errors", "samplers", "starts")
+KEYS = {"errors": ["model"], "base_models": ["base_model", "planned", "seconds", "steps"]}  # of errors of a training
+TABLES = ("errors", "samplers", "base_models")
 
 
 def rivals_command(
     scene: Annotated[Path, typer.Option(help="Mitsuba XML file with the object.")],
     object: ObjectId = None,
     table: Annotated[
-        list[str] | None, typer.Option(help="errors, samplers or starts; repeat for several.", show_default="all")
+        list[str] | None, typer.Option(help="errors, samplers or base_models; repeat for several.", show_default="all")
     ] = None,
     seconds: Annotated[
-        float, typer.Option(help="CPU time of each training, data included; of starts of the longest.")
+        float, typer.Option(help="CPU time of each training, data included; of base models of the longest.")
     ] = 60.0,
     samples: Annotated[int, typer.Option(help="Of each exit, for errors and variances.", parser=whole)] = 2048,
     seed: Annotated[int, typer.Option(help="Seed of everything.", parser=whole)] = 0,
@@ -37,7 +37,7 @@ def rivals_command(
     variant: Variant = "llvm_ad_rgb",
     out: OutFolder = Path("rivals"),
 ) -> None:
-    """Compare ways of drawing entries by variance x time, models of an object and its starts by errors, by CPU time."""
+    """Compare ways of drawing entries by variance x time, models and base models by errors, by CPU time."""
     chosen = table or list(TABLES)
     for name in chosen:
         check_choice("table", name, TABLES)
@@ -77,7 +77,7 @@ def _made(
         bar.show(done, total, what)
 
     if table in KEYS:
-        make = {"errors": rivals.error_table, "starts": rivals.start_table}[table]
+        make = {"errors": rivals.error_table, "base_models": rivals.base_model_table}[table]
         return make(scene, name, seconds=seconds, walks=samples, samples=samples, seed=seed, progress=show)
     with TemporaryDirectory() as folder:
         learnt, _ = train_by_cpu(object_of(scene, None, None, name), seconds, folder, seed=seed)

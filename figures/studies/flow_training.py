@@ -96,16 +96,16 @@ class Lighting:
     Args:
         name: one of `LIGHTINGS`.
         obj: the object, which casts shadows.
-        aim: (entry, pair of uniforms) -> direction towards the light, its value over the density, and its distance.
+        sample_emitter: (entry, pair of uniforms) -> direction to the light, value over density, distance.
     """
 
     name: str
     object: TranslucentObject
-    aim: Callable[[Any, Any], tuple[Any, Any, Any]]
+    sample_emitter: Callable[[Any, Any], tuple[Any, Any, Any]]
 
     def sample(self, entry: Any, u: Any, active: Any) -> tuple[Any, Any]:
         """w_i at an entry, and the light from there over its density: 0 in the shadow."""
-        w, value, distance = self.aim(entry, u)
+        w, value, distance = self.sample_emitter(entry, u)
         ray = place(entry.p, entry.n).spawn_ray(w)
         ray.maxt = distance
         lit = active & (dr.dot(w, entry.n) > 0)

@@ -339,7 +339,7 @@ def load_network(obj: TranslucentObject, folder: Path | None = None) -> PaperNet
 def train(
     scene: Any, *, object: str | None = None, seconds: float = 60.0, target_error: float | None = None, seed: int = 0,
     folder: Path | None = None, work: Path | None = None, progress: NamedProgress | None = None,
-    start: str | None = None,
+    base_model: str | None = None,
 ) -> LearntObject:  # fmt: skip
     """The network of an object after so many seconds of CPU time, or where the paper's stop is met.
 
@@ -348,7 +348,7 @@ def train(
     """
     check_interval("seconds", seconds, 1e-3, 1e7)
     check_count("seed", seed, 0)
-    for name, value in (("target_error", target_error), ("work", work), ("start", start)):
+    for name, value in (("target_error", target_error), ("work", work), ("base_model", base_model)):
         if value is not None:
             raise ValueError(f"{name} must be left out for {KIND}, got {value!r}")
     folder = check_weights_folder(folder)

@@ -95,17 +95,17 @@ def error_table(
 
 
 # ----------------------------------------------------------------------------------------------------
-# The table of starts: errors of one object against CPU time, by the model that its network begins with.
+# The table of base models: errors of one object against CPU time, by the model that its network corrects.
 
-STARTS = (STANDARD.start, "neural_shape")
+BASE_MODELS = (STANDARD.base_model, "neural_shape")
 TIMES = ((0.0, 1.0), (1 / 12, 1 / 4), (1 / 3, 1 / 2), (1.0, 1.0))  # shares of the time, and of a chunk of the recipe
 
 
-def start_table(
+def base_model_table(
     scene: Any, name: str | None = None, *, seconds: float = 60.0, exits: int = 256, walks: int = 4096,
     samples: int = 4096, seed: int = 0, progress: Callable[[str, int, int], Any] | None = None,
 ) -> pandas.DataFrame:  # fmt: skip
-    """Rows of start, planned and spent CPU seconds, steps, channel, light, error, standard error, ratio of the means.
+    """Rows of base model, planned and spent CPU seconds, steps, channel, light, error with its error, ratio of means.
 
     Spent is all of a training but the truth: the pilot and the kernels that it compiles, data and fit.
 
@@ -121,23 +121,23 @@ def start_table(
 
     obj, rows = object_of(scene, None, None, name), []
     truth = reference(obj, exits, walks, seed)
-    runs = [(start, *time) for start in STARTS for time in TIMES]
-    for k, (start, share, part) in enumerate(runs):
+    runs = [(base_model, *time) for base_model in BASE_MODELS for time in TIMES]
+    for k, (base_model, share, part) in enumerate(runs):
         if progress:
-            progress(f"{start}, {share * seconds:.3g} s", k, len(runs))
-        learnt, about = _learnt(obj, start, share * seconds, part, seed)
-        proposals = EntryProposals(obj, HalfSpace(obj, STANDARD.start))
+            progress(f"{base_model}, {share * seconds:.3g} s", k, len(runs))
+        learnt, about = _learnt(obj, base_model, share * seconds, part, seed)
+        proposals = EntryProposals(obj, HalfSpace(obj, STANDARD.base_model))
         proposals = proposals.with_patches(learnt.sampler if share else None)
         errors = measure(obj, learnt.model, proposals, truth=truth, samples=samples, seed=seed)
-        rows += [{"start": start, "planned": share * seconds, **about, **row._asdict()} for row in errors]
+        rows += [{"base_model": base_model, "planned": share * seconds, **about, **row._asdict()} for row in errors]
     return pandas.DataFrame(rows)
 
 
 def _learnt(
-    obj: TranslucentObject, start: str, seconds: float, part: float, seed: int
+    obj: TranslucentObject, base_model: str, seconds: float, part: float, seed: int
 ) -> tuple[Learnt, dict[str, Any]]:
     """A training with chunks of a part of those of the recipe; what it took."""
-    recipe = replace(STANDARD.begun(start), chunk=int(STANDARD.chunk * part))
+    recipe = replace(STANDARD.with_base_model(base_model), chunk=int(STANDARD.chunk * part))
     with TemporaryDirectory() as folder:
         if seconds == 0:
             with warnings.catch_warnings():

@@ -202,7 +202,7 @@ BLOCK = 4096  # pairs whose layers stay in the cache
 LEAST = 0.05  # chance of a proposal: f moves while the chunk is used
 PATCH_HIDDEN, PATCH_BATCH = (64, 32), 1024
 ALPHA_HIDDEN = (32, 16)
-RATES = {SHAPES: 1.5e-3}  # by start: noise of walks leads large steps away from a near one
+RATES = {SHAPES: 1.5e-3}  # by base model: noise of walks leads large steps away from a near one
 
 
 @dataclass(frozen=True)
@@ -215,7 +215,7 @@ class Recipe:
         rate: largest learning rate.
         chunk: walks that are kept of those made at once, with twice as many proposals.
         reuse: times that each is used.
-        start: what is corrected: the name of a half-space model, or `neural_shape`.
+        base_model: S_0, which the network corrects: the name of a half-space model, or `neural_shape`.
     """
 
     width: int = 48
@@ -224,17 +224,17 @@ class Recipe:
     rate: float = 6e-3
     chunk: int = 2**17
     reuse: int = 2
-    start: str = "better_dipole"
+    base_model: str = "better_dipole"
 
     def __post_init__(self) -> None:
         for name in ("width", "depth", "batch", "chunk", "reuse"):
             check_count(name, getattr(self, name), 1)
         check_interval("rate", self.rate, 1e-8, 1.0)
-        check_choice("start", self.start, (SHAPES, *models()))
+        check_choice("base_model", self.base_model, (SHAPES, *models()))
 
-    def begun(self, start: str) -> Recipe:
-        """The same from another start, with the rate that suits it."""
-        return replace(self, start=start, rate=RATES.get(start, self.rate))
+    def with_base_model(self, name: str) -> Recipe:
+        """The same for another base model, with the rate that suits it."""
+        return replace(self, base_model=name, rate=RATES.get(name, self.rate))
 
 
 STANDARD = Recipe()

@@ -229,7 +229,7 @@ def train(
     work: str | Path | None = None,
     camera: Any = None,
     progress: Progress | None = None,
-    start: str | None = None,
+    base_model: str | None = None,
 ) -> Trained:
     """Learn S of an object and write its weights.
 
@@ -250,7 +250,7 @@ def train(
         work: folder for unfinished work.
         camera: a `CameraWalks`, whose walks join those of random exits.
         progress: called with (what, done, total).
-        start: base model,  `neural_shape` or a half-space model, with its rate; by default the recipe's.
+        base_model: `neural_shape` or a half-space model, with its rate; by default the recipe's.
 
     Raises:
         ValueError: an argument is out of range, or `work` is of another run; nothing has been traced then.
@@ -267,10 +267,10 @@ def train(
         check_folder(work)
     if not any(float(m.sigma_s) > 0 for m in obj.media):
         raise ValueError("medium must scatter in at least one channel to be learnt, got sigma_s 0 in all")
-    recipe = recipe if start is None else recipe.begun(start)
+    recipe = recipe if base_model is None else recipe.with_base_model(base_model)
     run = _ObjectTraining(obj, recipe, int(seed), Path(work) if work else None, camera)
     if seconds == 0:
-        warnings.warn(f"an object that is trained for 0 seconds is rendered by {recipe.start}", stacklevel=2)
+        warnings.warn(f"an object that is trained for 0 seconds is rendered by {recipe.base_model}", stacklevel=2)
         return Trained(*run.learnt(), None, [], 0, 0.0)
     return run.go(seconds, chunks, target_error, folder, progress)
 
@@ -303,7 +303,7 @@ class _ObjectTraining:
     def __init__(self, obj: TranslucentObject, recipe: Recipe, seed: int, work: Path | None, camera: Any) -> None:
         self.object, self.recipe, self.seed, self.work, self.camera = obj, recipe, seed, work, camera
         self.identity, self.frame = identify(obj), frame_of(obj)
-        self.base = storing.base_model(obj, recipe.start)
+        self.base = storing.base_model(obj, recipe.base_model)
         self.proposals = EntryProposals(obj, self.base)
         self.source = PairSource(obj, self.frame, self.base, self.proposals)
         self.seen: CameraExits | None = None
@@ -442,7 +442,7 @@ class _ObjectTraining:
     def _record(self, errors: list[RadianceError], seconds: float) -> dict[str, Any]:
         return {
             "recipe": asdict(self.recipe), "seed": self.seed, "steps": self.fitting.step, "chunks": self.done,
-            storing.CHECKSUMS: storing.base_checksums(self.object, self.recipe.start),
+            storing.CHECKSUMS: storing.base_checksums(self.object, self.recipe.base_model),
             "walks": self.walks * self.done, "seconds": seconds, "history": self.history,
             "errors": [row._asdict() for row in errors], "provenance": provenance(seed=self.seed),
         }  # fmt: skip

@@ -304,12 +304,13 @@ def _checked_base(path: Path, record: dict[str, Any], obj: TranslucentObject) ->
     """Name of the model that weights multiply; ValueError if they were fitted to others of it than are here now."""
     place = path.with_suffix(".json")
     try:
-        name, fitted = record["recipe"]["start"], tuple(record[CHECKSUMS])
+        recipe, fitted = record["recipe"], tuple(record[CHECKSUMS])
+        name = recipe["base_model"] if "base_model" in recipe else recipe["start"]  # its name before
     except (KeyError, TypeError) as error:
-        raise ValueError(f"{place}: start must be recorded: of another version, to be trained again") from error
+        raise ValueError(f"{place}: base_model must be recorded: of another version, to be trained again") from error
     if fitted != base_checksums(obj, name):
         raise ValueError(
-            f"{place}: weights of the start {name} must be those of training, got others: to be trained again"
+            f"{place}: weights of the base model {name} must be those of training, got others: to be trained again"
         )
     return name
 
@@ -349,7 +350,7 @@ def base_model(obj: TranslucentObject, name: str) -> BaseModel:
 
 
 def base_checksums(obj: TranslucentObject, name: str) -> tuple[str, ...]:
-    """Of the weights that a start has."""
+    """Of the weights that a base model has."""
     if name == shapes.KIND:
         return shapes.checksums(obj)
     return tuple(checksum for m in obj.media for checksum in bssrdf(name, m).checksums)

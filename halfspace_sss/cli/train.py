@@ -42,6 +42,7 @@ __all__ = ["trainings"]
 
 HELP = "Train networks on path tracing: models find them by the medium, and by the shape of an object."
 SWITCHES = {"--scene": "object", "--shapes": "shapes", "--universal": "universal"}  # of one command for all
+RENAMED = {"--start": "--base-model"}
 
 Seconds = Annotated[float, typer.Option(help="Time for data and fit, without compiling.")]
 TargetError = Annotated[
@@ -68,6 +69,9 @@ class _Trainings(TyperGroup):
             rest = [word for word in args if word not in ("--shapes", "--universal")]
             asked = shlex.join(["halfspace-sss", "train", kind, *rest])
             raise ValueError(f"train must be followed by {', '.join(sorted(self.commands))}: `{asked}`")
+        for word in args:
+            if (old := word.split("=")[0]) in RENAMED:
+                raise ValueError(f"{old} must be given by its new name, {RENAMED[old]}")
         return super().parse_args(ctx, args)
 
 
@@ -126,10 +130,10 @@ def object_command(
         str | None, typer.Option(help="Name of a model that learns objects.", show_default="full_geometry")
     ] = None,
     target_error: TargetError = None,
-    start: Annotated[
+    base_model: Annotated[
         str | None,
         typer.Option(
-            help="neural_shape or the half-space model that the network begins with.", show_default="better_dipole"
+            help="neural_shape or a half-space model, which the network corrects.", show_default="better_dipole"
         ),
     ] = None,
     seed: TrainingSeed = 0,
@@ -148,7 +152,7 @@ def object_command(
     learns = learner(model)
     loaded = load_objects(scene, parameters)
     how = {"object": object, "seconds": seconds, "target_error": target_error, "seed": seed, "folder": out}
-    how |= {"start": start} if start is not None else {}
+    how |= {"base_model": base_model} if base_model is not None else {}
     with Bar("training") as bar:
         found = learns.train(loaded, **how, work=work, progress=lambda what, done, total: bar.show(done, total, what))
     _report_object(found)

@@ -9,7 +9,7 @@ import numpy as np
 from halfspace_sss.arrays import broadcast_query, library
 from halfspace_sss.interface.model import Query
 from halfspace_sss.neural.features import medium_features, symmetric_features, travel
-from halfspace_sss.neural.hypernetwork import N_TERMS, Hypernetwork, Layers, log_balance
+from halfspace_sss.neural.hypernetwork import N_TERMS, Hypernetwork, Layers, log_calibration
 from halfspace_sss.neural.perceptron import Perceptron, cooperative, silu
 from halfspace_sss.neural.universal import load_hypernetwork, shipped_weights
 from halfspace_sss.physics.backbone import backbone_shape, length_scale
@@ -44,7 +44,7 @@ def neural_S(sigma_t: Any, albedo: Any, g: Any, eta: Any, r: Any, mu_i: Any, phi
     features = symmetric_features(lib, q.r, *travel(q), L)
     evaluate, layered = (_torch_network, _torch_terms) if hasattr(lib, "torch") else (_drjit_network, _drjit_terms)
     terms = layered(hyper, c, q.r)
-    factor = lib.exp(evaluate(hyper, c, features) + log_balance(terms, q.mu_i) + log_balance(terms, q.mu_o))
+    factor = lib.exp(evaluate(hyper, c, features) + log_calibration(terms, q.mu_i) + log_calibration(terms, q.mu_o))
     G = albedo * albedo * (backbone_shape(q.r, albedo, g, eta) * factor)
     return sigma_t * sigma_t * F_t(mu_i, eta) * F_t(mu_o, eta) * G
 
@@ -64,8 +64,8 @@ def _torch_network(hyper: Hypernetwork, c: list, features: list) -> Any:
 
 
 def _torch_terms(hyper: Hypernetwork, c: list, like: Any) -> Any:
-    """Coefficients of `log_balance`."""
-    return _torch_layers(hyper.balance_layers, c, like)
+    """Coefficients of `log_calibration`."""
+    return _torch_layers(hyper.calibration_layers, c, like)
 
 
 def _torch_layers(layers: Layers, c: list, like: Any) -> Any:
@@ -86,11 +86,11 @@ def _torch(array: np.ndarray, like: Any) -> Any:
 
 
 def _drjit_terms(hyper: Hypernetwork, c: list, like: Any) -> list:
-    """Coefficients of `log_balance`."""
+    """Coefficients of `log_calibration`."""
     import drjit as dr
 
     kind = type(like)
-    h = _drjit_layers(hyper.balance_layers, c, kind).array
+    h = _drjit_layers(hyper.calibration_layers, c, kind).array
     index = dr.uint32_array_t(kind)
     return [dr.gather(kind, h, index(k)) for k in range(N_TERMS)]
 

@@ -15,7 +15,10 @@ from halfspace_sss.neural.network import Network, layer_shapes
 from halfspace_sss.physics.backbone import length_scale
 from halfspace_sss.physics.medium import Medium
 
-__all__ = ["N_TERMS", "Hypernetwork", "Layers", "chebyshev", "check_range", "in_range", "log_balance", "named_layers"]
+__all__ = [
+    "CALIBRATION", "N_TERMS", "Hypernetwork", "Layers", "chebyshev", "check_range", "in_range", "log_calibration",
+    "named_layers",
+]  # fmt: skip
 
 Layers = tuple[tuple[np.ndarray, np.ndarray], ...]  # matrix (inputs, outputs) and bias of each
 
@@ -50,7 +53,7 @@ class Hypernetwork:
         base: theta_0, shape (P,).
         basis: Theta, shape (rank, P).
         width, depth: hidden layers of the small network.
-        balance_layers: matrices and biases that map medium features to the coefficients of `balance`; none while they
+        calibration_layers: matrices and biases that map medium features to `calibration`; none while they
             are not fitted yet.
     """
 
@@ -59,16 +62,16 @@ class Hypernetwork:
     basis: np.ndarray
     width: int
     depth: int
-    balance_layers: Layers = ()
+    calibration_layers: Layers = ()
 
     def network(self, albedo: float, g: float, eta: float) -> Network:
         """The small network of a medium; takes numbers."""
         h = _layered(self.medium_layers, albedo, g, eta)
         return Network.from_vector(self.base + h @ self.basis.astype(np.float64), self.shapes)
 
-    def balance(self, albedo: float, g: float, eta: float) -> tuple[float, ...]:
-        """The coefficients of log a of a medium, see `balance`; takes numbers."""
-        return tuple(_layered(self.balance_layers, albedo, g, eta).tolist()) if self.balance_layers else ()
+    def calibration(self, albedo: float, g: float, eta: float) -> tuple[float, ...]:
+        """The coefficients of log a of a medium, see `calibration`; takes numbers."""
+        return tuple(_layered(self.calibration_layers, albedo, g, eta).tolist()) if self.calibration_layers else ()
 
     @property
     def shapes(self) -> list[tuple[int, int]]:
@@ -76,7 +79,7 @@ class Hypernetwork:
 
     def parameters(self) -> dict[str, Any]:
         """Arrays by name, for the file of weights."""
-        layers = {**named_layers("medium", self.medium_layers), **named_layers("balance", self.balance_layers)}
+        layers = {**named_layers("medium", self.medium_layers), **named_layers(CALIBRATION, self.calibration_layers)}
         return {**layers, "base": self.base, "basis": self.basis}
 
 
@@ -95,9 +98,10 @@ def _layered(layers: Layers, albedo: float, g: float, eta: float) -> np.ndarray:
 
 
 N_TERMS = 4
+CALIBRATION = "balance"  # what files call the layers of the calibration
 
 
-def log_balance(c: Sequence[Any], mu: Any) -> Any:
+def log_calibration(c: Sequence[Any], mu: Any) -> Any:
     """log a(mu) = sum_k c_k T_k(2 mu - 1) of an outside cosine, by Clenshaw's recurrence; 0 for no terms.
 
     Args:

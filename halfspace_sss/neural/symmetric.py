@@ -9,7 +9,7 @@ from typing import Any
 
 from halfspace_sss.interface.model import BSSRDF, Query
 from halfspace_sss.neural.features import symmetric_features, travel
-from halfspace_sss.neural.hypernetwork import log_balance
+from halfspace_sss.neural.hypernetwork import log_calibration
 from halfspace_sss.neural.network import Network
 from halfspace_sss.physics.backbone import backbone_shape, length_scale
 from halfspace_sss.physics.medium import Medium
@@ -19,16 +19,16 @@ __all__ = ["LOG_RANGE", "SymmetricModel", "channel_queries", "channels", "factor
 LOG_RANGE = 30.0  # bound of the logarithm of the learnt factor
 
 
-def factored_G(network: Network, q: Query, albedo: Any, g: Any, eta: Any, balance: Sequence[float] = ()) -> Any:
+def factored_G(network: Network, q: Query, albedo: Any, g: Any, eta: Any, calibration: Sequence[float] = ()) -> Any:
     """G = B(r) exp(network(features)) a(mu_i) a(mu_o) of one channel: positive, reciprocal and mirror-invariant.
 
-    `balance` are the coefficients of log a, see `balance`; without them a is 1.
+    `calibration` are the coefficients of log a, see `calibration`; without them a is 1.
     """
     lib, L = q.lib, q.constant(length_scale(albedo, g))
     log_factor = network(symmetric_features(lib, q.r, *travel(q), L))
-    if len(balance):
-        c = [q.constant(v) for v in balance]
-        log_factor = log_factor + (log_balance(c, q.mu_i) + log_balance(c, q.mu_o))
+    if len(calibration):
+        c = [q.constant(v) for v in calibration]
+        log_factor = log_factor + (log_calibration(c, q.mu_i) + log_calibration(c, q.mu_o))
     factor = lib.exp(lib.minimum(lib.maximum(log_factor, -LOG_RANGE), LOG_RANGE))
     return q.constant(albedo * albedo) * (backbone_shape(q.r, albedo, g, eta) * factor)
 
@@ -36,27 +36,27 @@ def factored_G(network: Network, q: Query, albedo: Any, g: Any, eta: Any, balanc
 class SymmetricModel(BSSRDF):
     """A learnt BSSRDF of order >= 2 that is positive, reciprocal and mirror-invariant by construction.
 
-    A model gives `networks`, the small network of each channel of its medium, and may give their `balances`.
+    A model gives `networks`, the small network of each channel of its medium, and may give their `calibrations`.
     """
 
     orders = "multiple"
     reciprocal = True
     networks: list[Network]
-    balances: Sequence[Sequence[float]] = ()
+    calibrations: Sequence[Sequence[float]] = ()
 
     @property
     def checksums(self) -> tuple[str, ...]:
-        if not self.balances:
+        if not self.calibrations:
             return tuple(network.checksum for network in self.networks)
-        pairs = zip(self.networks, self.balances)
+        pairs = zip(self.networks, self.calibrations)
         return tuple(hashlib.sha256(f"{n.checksum} {tuple(c)}".encode()).hexdigest() for n, c in pairs)
 
     def G(self, q: Query) -> Any:
-        m, balances = self.medium, self.balances or [()] * len(self.networks)
+        m, calibrations = self.medium, self.calibrations or [()] * len(self.networks)
         if m.n_channels is None:
-            return factored_G(self.networks[0], q, m.albedo, m.g, m.eta, balances[0])
-        parts = zip(self.networks, balances, channels(m), channel_queries(q, m))
-        return q.lib.stack([factored_G(n, one, c.albedo, c.g, c.eta, balance) for n, balance, c, one in parts])
+            return factored_G(self.networks[0], q, m.albedo, m.g, m.eta, calibrations[0])
+        parts = zip(self.networks, calibrations, channels(m), channel_queries(q, m))
+        return q.lib.stack([factored_G(n, one, c.albedo, c.g, c.eta, calibration) for n, calibration, c, one in parts])
 
 
 def channel_queries(q: Query, medium: Medium) -> list[Query]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from halfspace_sss.lazy import once
 from halfspace_sss.neural.features import N_FEATURES, N_MEDIUM
-from halfspace_sss.neural.hypernetwork import N_TERMS, Hypernetwork, check_range
+from halfspace_sss.neural.hypernetwork import CALIBRATION, N_TERMS, Hypernetwork, check_range
 from halfspace_sss.neural.network import layer_shapes
 from halfspace_sss.neural.store import load_weights, record_count
 from halfspace_sss.neural.symmetric import SymmetricModel, channels
@@ -32,9 +32,9 @@ def load_hypernetwork(path: Path) -> Hypernetwork:
     arrays, record = load_weights(path, KIND)
     width, depth = record_count(path, record, "width"), record_count(path, record, "depth", 64)
     size = sum(i * o + o for i, o in layer_shapes(N_FEATURES, width, depth))
-    medium, balance = _sizes(arrays, "medium"), _sizes(arrays, "balance")
+    medium, calibration = _sizes(arrays, "medium"), _sizes(arrays, CALIBRATION)
     wanted = {"base": (size,), "basis": (medium[-1], size)}
-    wanted |= _layer_shapes("medium", medium) | _layer_shapes("balance", [*balance[:-1], N_TERMS])
+    wanted |= _layer_shapes("medium", medium) | _layer_shapes(CALIBRATION, [*calibration[:-1], N_TERMS])
     found = {name: array.shape for name, array in arrays.items()}
     if found != wanted:
         raise ValueError(f"{path}: shapes must be {wanted}, got {found}")
@@ -43,11 +43,11 @@ def load_hypernetwork(path: Path) -> Hypernetwork:
 
 def hypernetwork_of(arrays: Mapping[str, np.ndarray], width: int, depth: int) -> Hypernetwork:
     """The network of arrays by name, as they stand in a file of weights."""
-    medium, balance = (
+    medium, calibration = (
         tuple((arrays[f"{name}_{k}_W"], arrays[f"{name}_{k}_b"]) for k in range(_count(arrays, name)))
-        for name in ("medium", "balance")
+        for name in ("medium", CALIBRATION)
     )
-    return Hypernetwork(medium, arrays["base"], arrays["basis"], width, depth, balance)
+    return Hypernetwork(medium, arrays["base"], arrays["basis"], width, depth, calibration)
 
 
 def _count(arrays: Mapping[str, np.ndarray], name: str) -> int:
@@ -71,7 +71,7 @@ class Neural(SymmetricModel):
     """One network for all media: S = T_12 T_21 B(r) exp(MLP(features; theta)) a(mu_i) a(mu_o), order >= 2.
 
     A second network maps albedo, g and eta to the numbers theta of the small one, a third to those of a, which holds S
-    to the exact reflectance (`balance`): both once, so that evaluation costs that of the small one. Positive,
+    to the exact reflectance (`calibration`): both once, so that evaluation costs that of the small one. Positive,
     reciprocal and mirror-invariant by construction. Trained on path tracing over albedo [0, 1], g [-0.5, 0.98],
     eta [1, 2]; other media are refused. Single scattering is left out.
     """
@@ -85,4 +85,4 @@ class Neural(SymmetricModel):
         hyper = load_hypernetwork(weights or shipped_weights())
         ratios = [(float(m.albedo), float(np.float64(m.g)), m.eta) for m in channels(medium)]
         self.networks = [hyper.network(*one) for one in ratios]
-        self.balances = [hyper.balance(*one) for one in ratios]
+        self.calibrations = [hyper.calibration(*one) for one in ratios]

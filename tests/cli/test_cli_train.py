@@ -25,7 +25,9 @@ from halfspace_sss.neural.training.train_universal import UniversalRecipe
 FIG10 = materials.load("fig10").medium
 HOW = Fit(steps=20, n_groups=4, n_queries=32, validate_every=5)
 TINY = MaterialRecipe(n_groups=8, events=1e5, grid=CellGrid(8, 4), how=HOW)
-TINY_UNIVERSAL = UniversalRecipe(8, 1e5, CellGrid(8, 4), HOW, rank=2, balance_media=4, balance_how=Fit(5, n_groups=4))
+TINY_UNIVERSAL = UniversalRecipe(
+    8, 1e5, CellGrid(8, 4), HOW, rank=2, calibration_media=4, calibration_how=Fit(5, n_groups=4)
+)
 
 
 def _invoke(*arguments: str) -> Any:

@@ -250,7 +250,7 @@ def _wax_scene(sampler: FlowSampler, folder: Path, monkeypatch: pytest.MonkeyPat
     arrays |= {EVEN: np.zeros((2, 3)), **random_layers(rng, "A", "a", [n_side(3), 5, 6])}
     arrays = {name: value.astype(np.float16) for name, value in {**arrays, **sampler.patches.weights}.items()}
     arrays |= {TURNS: frame.around.turns, ENDS: np.zeros((3, len(Terms.of(n_side(3)).rows)))}
-    save(folder, identify(obj), arrays, {"recipe": {"start": "better_dipole"}, CHECKSUMS: []})
+    save(folder, identify(obj), arrays, {"recipe": {"base_model": "better_dipole"}, CHECKSUMS: []})
     monkeypatch.setenv("HALFSPACE_SSS_WEIGHTS", str(folder))
     box = obj.geometry.shape.bbox()
     centre, radius = np.array(box.center()).ravel(), np.linalg.norm(np.array(box.extents()).ravel()) / 2

@@ -82,10 +82,10 @@ def test_an_object_is_trained_measured_and_rendered(monkeypatch: Any) -> None:
 
 @pytest.mark.slow
 def test_an_object_begins_with_the_network_of_all_shapes_and_is_rendered() -> None:
-    result = _invoke("train", "object", "--scene", "ball.xml", "--start", "neural_shape")
+    result = _invoke("train", "object", "--scene", "ball.xml", "--base-model", "neural_shape")
     assert result.exit_code == 0, result.output
     (_, path) = _weights()
-    assert load_weights(path, "full_geometry")[1]["recipe"]["start"] == "neural_shape"
+    assert load_weights(path, "full_geometry")[1]["recipe"]["base_model"] == "neural_shape"
     result = _invoke("render", "ball.xml", "--model", "full_geometry", "--spp", "4", "--train-seconds", "0")
     assert result.exit_code == 0 and Path("render/ball_full_geometry.exr").exists(), result.output
 
@@ -191,11 +191,12 @@ REFUSED = [
     ),
     ([*TRAIN_BALL, "--out", "ball.xml"], "folder must be a folder or new, got 'ball.xml'"),
     ([*TRAIN_BALL, "--define", "x"], "define must be NAME=VALUE, got 'x'"),
-    ([*TRAIN_BALL, "--start", "neural_shap"], "start must be one of neural_shape,"),
+    ([*TRAIN_BALL, "--base-model", "neural_shap"], "base_model must be one of neural_shape,"),
     (
-        [*TRAIN_BALL, "--model", "full_geometry_paper", "--start", "neural_shape"],
-        "start must be left out for full_geometry_paper, got 'neural_shape'",
+        [*TRAIN_BALL, "--model", "full_geometry_paper", "--base-model", "neural_shape"],
+        "base_model must be left out for full_geometry_paper, got 'neural_shape'",
     ),
+    ([*TRAIN_BALL, "--start", "neural_shape"], "--start must be given by its new name, --base-model"),
     (["errors", "--object", "ball"], "object must be left out without --scene, got 'ball'"),
     (["errors", "--scene", "ball.xml", "--events", "1e5"], "events must be left out with --scene, got 100000.0"),
     (["errors", "--scene", "ball.xml", "--model", "no_model"], "model must be one of"),

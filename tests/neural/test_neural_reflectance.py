@@ -11,7 +11,7 @@ import pytest
 from halfspace_sss import Medium, bssrdf, trace
 from halfspace_sss.comparison.model_truths import exits, sampled_reflectance
 from halfspace_sss.comparison.truths import Truth, read_truths
-from halfspace_sss.neural.hypernetwork import N_TERMS, log_balance
+from halfspace_sss.neural.hypernetwork import N_TERMS, log_calibration
 from halfspace_sss.neural.universal import load_hypernetwork, shipped_weights
 from halfspace_sss.physics import single_scattering
 from halfspace_sss.physics.fresnel import F_r
@@ -108,14 +108,14 @@ def test_reflectances_at_the_ends_of_the_range_are_met_from_0_3_to_normal_incide
 @pytest.mark.parametrize("g", [-0.5, 0.98])
 @pytest.mark.parametrize("eta", [1.0, 2.0])
 def test_the_factor_of_every_medium_is_between_a_half_and_two(albedo: float, g: float, eta: float) -> None:
-    c = load_hypernetwork(shipped_weights()).balance(albedo, g, eta)
-    assert len(c) == N_TERMS and np.abs(log_balance(c, np.linspace(0, 1, 11))).max() < math.log(2)
+    c = load_hypernetwork(shipped_weights()).calibration(albedo, g, eta)
+    assert len(c) == N_TERMS and np.abs(log_calibration(c, np.linspace(0, 1, 11))).max() < math.log(2)
 
 
 def test_the_logarithm_of_the_factor_is_a_sum_of_chebyshev_polynomials() -> None:
     c, mu = np.array([0.3, -0.2, 0.1, 0.05]), np.linspace(0, 1, 7)
-    np.testing.assert_allclose(log_balance(c, mu), np.polynomial.chebyshev.chebval(2 * mu - 1, c), atol=1e-15)
-    assert np.all(log_balance((), mu) == 0)
+    np.testing.assert_allclose(log_calibration(c, mu), np.polynomial.chebyshev.chebval(2 * mu - 1, c), atol=1e-15)
+    assert np.all(log_calibration((), mu) == 0)
 
 
 def test_a_model_is_made_in_20_ms_and_names_its_factor() -> None:
@@ -125,5 +125,5 @@ def test_a_model_is_made_in_20_ms_and_names_its_factor() -> None:
     models = [bssrdf("neural", m) for m in media]
     assert (time.process_time() - started) / len(media) < 0.02
     before = models[0].checksums
-    models[0].balances = [(0.0,) * N_TERMS]
+    models[0].calibrations = [(0.0,) * N_TERMS]
     assert models[0].checksums != before

@@ -39,7 +39,7 @@ FIG10 = materials.load("fig10").medium
 HOW = Fit(steps=100, n_groups=8, n_queries=64, checkpoint_every=0.0, validate_every=50)
 GRID = CellGrid(8, 4)
 RECIPE = MaterialRecipe(n_groups=272, events=2e5, grid=GRID, how=HOW)  # more groups than one launch traces
-UNIVERSAL = UniversalRecipe(272, 2e5, GRID, HOW, rank=4, balance_media=8, balance_how=Fit(20, n_groups=8))
+UNIVERSAL = UniversalRecipe(272, 2e5, GRID, HOW, rank=4, calibration_media=8, calibration_how=Fit(20, n_groups=8))
 
 
 def run_channel(work: Path, progress: NamedProgress | None = None) -> Path:

@@ -1,8 +1,8 @@
 """Every emitter plugin of Mitsuba, by walks and models, against what rays find by chance.
 
 No ray finds a delta light or a sun: their references are spheres of the same flux, seen under 0.15 radians, and a sky
-without the sun. References look for no emitter (`join_share` 0); walks that do are held against Mitsuba's volume path
-tracer in `test_translucent_walk.py`. Every comparison states its orders, and the error that it could still miss.
+without the sun. References look for no emitter (`connection_share` 0); walks that do are held against Mitsuba's volume
+path tracer in `test_translucent_walk.py`. Every comparison states its orders, and the error that it could still miss.
 """
 
 from __future__ import annotations
@@ -123,7 +123,7 @@ def _means(scene: dict, spp: int, seed: int) -> np.ndarray:
 @cache
 def _reference(kind: str, orders: str) -> np.ndarray:
     """Means of images by walks that look for no emitter."""
-    scene = _scene({"type": "translucent_walk", "join_share": 0.0}, EMITTERS[kind]()[1], orders=orders)
+    scene = _scene({"type": "translucent_walk", "connection_share": 0.0}, EMITTERS[kind]()[1], orders=orders)
     return _means(scene, 2**14, 1001)
 
 

@@ -167,7 +167,7 @@ def _small_lamp() -> dict:
 def test_connections_bring_the_light_that_chance_brings_with_less_noise() -> None:
     surface = {"sigma_s": 0.5, "sigma_a": 0.02, "eta": 1.5, "reflection": False, "orders": "multiple"}
     joined, left_to_chance = (
-        _runs(mi.load_dict(_scene(surface, _small_lamp(), _cube(), join_share=share)), 12, spp, 1)
+        _runs(mi.load_dict(_scene(surface, _small_lamp(), _cube(), connection_share=share)), 12, spp, 1)
         for share, spp in ((0.5, 64), (0.0, 1024))
     )
     _agree(joined, left_to_chance, known_to=0.1)
@@ -208,7 +208,7 @@ def test_a_mono_variant_renders_one_channel_of_the_colours() -> None:
 
 
 @pytest.mark.parametrize(
-    ("key", "value"), [("mm_per_unit", 0.0), ("mm_per_unit", np.inf), ("max_depth", 0), ("join_share", 1.5)]
+    ("key", "value"), [("mm_per_unit", 0.0), ("mm_per_unit", np.inf), ("max_depth", 0), ("connection_share", 1.5)]
 )
 def test_parameters_out_of_range_are_refused(key: str, value: float) -> None:
     with pytest.raises(RuntimeError, match=f"{key} must be .* got {value}"):

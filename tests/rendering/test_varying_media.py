@@ -89,7 +89,7 @@ def test_null_collisions_change_nothing() -> None:
 def test_connections_and_directions_bring_the_light_that_chance_brings() -> None:
     surface = _varying(reflection=False, g=0.0)
     joined, left_to_chance = (
-        _runs(mi.load_dict(_scene(surface, _small_lamp(), _cube(), join_share=share)), 12, spp, 1)
+        _runs(mi.load_dict(_scene(surface, _small_lamp(), _cube(), connection_share=share)), 12, spp, 1)
         for share, spp in ((0.5, 64), (0.0, 1024))
     )
     assert np.abs(_z(joined, left_to_chance)).max() < WIDEST_Z

@@ -1,4 +1,4 @@
-"""Training of the network for all media: maps of many media, a fit, and a fit of `balance` to exact reflectances.
+"""Training of the network for all media: maps of many media, a fit, and a fit of `calibration` to exact reflectances.
 
 Of each medium, at some cosines of incidence, are known the exact R of order >= 2 (discrete ordinates less the exact
 single order) and the flux of the network towards 16 intervals of cosines of exit. The coefficients of a follow from the
@@ -25,7 +25,7 @@ from halfspace_sss.comparison.model_truths import exits
 from halfspace_sss.maps.grid import RANGES, draw_media
 from halfspace_sss.maps.noisy_maps import CellGrid, draw_directions, load_maps, looking_back, make_pool
 from halfspace_sss.neural.features import N_MEDIUM, medium_features
-from halfspace_sss.neural.hypernetwork import N_TERMS, Hypernetwork, Layers, chebyshev, named_layers
+from halfspace_sss.neural.hypernetwork import CALIBRATION, N_TERMS, Hypernetwork, Layers, chebyshev, named_layers
 from halfspace_sss.neural.store import save_weights
 from halfspace_sss.neural.training.fit import Fit, fit
 from halfspace_sss.neural.training.learners import Hyper
@@ -39,7 +39,7 @@ from halfspace_sss.physics.medium import Medium
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.provenance import check_folder, provenance, write_atomically
 
-__all__ = ["Fluxes", "UniversalRecipe", "balanced", "collect", "train_universal"]
+__all__ = ["Fluxes", "UniversalRecipe", "calibrated", "collect", "train_universal"]
 
 INTERVALS = 16  # of the cosine of exit
 COSINES = 2  # of incidence, of each medium
@@ -173,7 +173,7 @@ def _batches(data: Fluxes, size: int) -> Callable[[torch.Generator], tuple[torch
     return batch
 
 
-def balanced(data: Fluxes, how: Fit, seed: int, progress: NamedProgress | None = None) -> Layers:
+def calibrated(data: Fluxes, how: Fit, seed: int, progress: NamedProgress | None = None) -> Layers:
     """The layers that give the coefficients of log a of a medium, fitted to `data`; `n_groups` media a step."""
     learner = _Balance(seed)
     fit(learner, _batches(data, how.n_groups), how, seed, progress=progress)
@@ -190,8 +190,8 @@ class UniversalRecipe:
         grid: cells of a map.
         how: the fit.
         rank: numbers that describe a medium.
-        balance_media: whose reflectances the factor `balance` is fitted to.
-        balance_how: that fit, of `n_groups` media a step.
+        calibration_media: whose reflectances the factor `calibration` is fitted to.
+        calibration_how: that fit, of `n_groups` media a step.
     """
 
     n_media: int = 16384
@@ -199,12 +199,12 @@ class UniversalRecipe:
     grid: CellGrid = CellGrid(40, 16)
     how: Fit = field(default_factory=lambda: Fit(steps=150_000, n_groups=32, n_queries=128))
     rank: int = 48
-    balance_media: int = 4096
-    balance_how: Fit = field(default_factory=lambda: Fit(steps=25_000, n_groups=256))
+    calibration_media: int = 4096
+    calibration_how: Fit = field(default_factory=lambda: Fit(steps=25_000, n_groups=256))
 
     def __post_init__(self) -> None:
         check_count("n_media", self.n_media, 1)
-        check_count("balance_media", self.balance_media, 1)
+        check_count("calibration_media", self.calibration_media, 1)
         check_count("rank", self.rank, 1)
         check_interval("events", self.events, 1e4, 1e15)
 
@@ -247,8 +247,8 @@ def train_universal(
                      validate=check, progress=progress)  # fmt: skip
     arrays = learner.parameters_as_arrays()
     hyper = hypernetwork_of(arrays, learner.width, learner.depth)
-    known = collect(hyper, recipe.balance_media, seed, folder, progress)
-    arrays |= named_layers("balance", balanced(known, recipe.balance_how, seed))
+    known = collect(hyper, recipe.calibration_media, seed, folder, progress)
+    arrays |= named_layers(CALIBRATION, calibrated(known, recipe.calibration_how, seed))
     record: dict[str, Any] = {
         "width": learner.width, "depth": learner.depth, "ranges": {k: list(v) for k, v in RANGES.items()}, "seed": seed,
         "recipe": asdict(recipe), "data_seconds": data_seconds, "seconds": time.monotonic() - started,

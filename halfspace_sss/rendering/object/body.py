@@ -292,7 +292,7 @@ class TranslucentObject:
         transport: what light that enters elsewhere is worth here; None where no order from two on is asked for.
         proposals: where it may enter; None without a transport.
         entries: how many of them an exit draws.
-        few: the orders below two that are traced beside it: (0, 1), (1,) or none.
+        low_orders: the orders below two that are traced beside it: (0, 1), (1,) or none.
         expected: what each kind of light is expected to bring.
         variation: how its light varies with its medium.
         gathered: what leaves by orders from two on, in place of a transport, see `paths.gathering`.
@@ -305,7 +305,7 @@ class TranslucentObject:
     transport: Transport | None = None
     proposals: Proposals | None = None
     entries: int = 1
-    few: tuple[int, ...] = ()
+    low_orders: tuple[int, ...] = ()
     expected: Expected | None = None
     variation: Variation | None = None
     gathered: Any = None
@@ -355,7 +355,7 @@ class TranslucentObject:
     @property
     def splits(self) -> bool:
         """Whether light is of both kinds, orders below two and the transport's."""
-        return self.transport is not None and bool(self.few)
+        return self.transport is not None and bool(self.low_orders)
 
     def is_current(self) -> bool:
         """Whether the object still has the shape and the medium that it was made of."""
@@ -443,15 +443,15 @@ def _make_object(found: Geometry, inside: Inside, settings: Settings) -> Translu
     transport, proposals, entries = none if single_only else _model_of(obj, inside, settings, variation)
     if transport and transport.orders == "total" and inside.orders == "multiple":
         raise ValueError(f"orders must be total for the model {inside.model!r}, which contains them all, got multiple")
-    few = _few(inside, transport)
+    low_orders = _low_orders(inside, transport)
     entries = entries if settings.entries == AUTOMATIC else settings.entries
     return replace(
-        obj, transport=transport, proposals=proposals, entries=entries, few=few, expected=expected_of(media),
-        variation=variation,
+        obj, transport=transport, proposals=proposals, entries=entries, low_orders=low_orders,
+        expected=expected_of(media), variation=variation,
     )  # fmt: skip
 
 
-def _few(inside: Inside, transport: Transport | None) -> tuple[int, ...]:
+def _low_orders(inside: Inside, transport: Transport | None) -> tuple[int, ...]:
     """The orders below two that are traced beside a transport.
 
     No light passes a half-space: its models put into orders from two on what passes something thin.

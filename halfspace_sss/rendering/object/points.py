@@ -471,11 +471,11 @@ class PositionSampler:
     ) -> _Kept:
         """Take a candidate (point, normal, outward shading normal, face) instead with the probability h / sum of h."""
         p, n, n_out, face = at
-        c = self._candidates(p, n, out, axes)
-        hope = dr.select(active & (c > 0), self.table.pdf(dr.norm(p - out.p)) / dr.maximum(c, 1e-30), 0)
-        total = kept.total + hope
-        share = dr.select(total > 0, hope / total, 0)
-        take = (kept.u < share) & (hope > 0)
+        c = self._candidates(p, n, out, axes)  # weight: target p over density c
+        weight = dr.select(active & (c > 0), self.table.pdf(dr.norm(p - out.p)) / dr.maximum(c, 1e-30), 0)
+        total = kept.total + weight
+        share = dr.select(total > 0, weight / total, 0)
+        take = (kept.u < share) & (weight > 0)
         u = dr.select(take, kept.u / dr.maximum(share, 1e-20), (kept.u - share) / dr.maximum(1 - share, 1e-7))
         found = (dr.select(take, a, b) for a, b in zip((p, n, n_out, face), kept[2:]))
         return _Kept(dr.clip(u, 0, 1), total, *found)

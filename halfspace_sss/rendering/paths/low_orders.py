@@ -108,7 +108,7 @@ def sample_low_orders(
     with dr.suspend_grad():
         walk = _walk(obj, refracted, sampler, active & refracted.valid)
         once = walk.order == 1
-        counts = walk.left & (once if 0 not in obj.few else mi.Bool(True))
+        counts = walk.left & (once if 0 not in obj.low_orders else mi.Bool(True))
         straight = once & walk.straight
 
     # ---- throughput f / p

@@ -297,7 +297,7 @@ def sample_event(
             more = inside & ~low
             out, face = choice.refracted.out, at.si.prim_index
             events.append((more, partial(bssrdf_event, context, obj, out, face, sampler, at.others_only, more)))
-        if obj.few:
+        if obj.low_orders:
             events.append((low, partial(low_order_event, context, obj, choice.refracted, sampler, at.scattered, low)))
     for mask, event in events:
 
@@ -328,10 +328,10 @@ def choose_event(obj: TranslucentObject, si: mi.SurfaceInteraction3f, active: mi
 
     # ---- probabilities
     reflection = dr.clip(F, LEAST_REFLECTION, 0.95) if obj.surface.inside.reflection else mi.Float(0)
-    if not obj.few:
+    if not obj.low_orders:
         return EventChoice(reflection, mi.Float(0), RefractedRay(out, d, 1 - F, valid, mi.Float(0)))
     T = _transmittance(obj, out, d, valid)
-    passing = T if 0 in obj.few else LEAST_PASSING * T
+    passing = T if 0 in obj.low_orders else LEAST_PASSING * T
     albedo, single, multiple = (number(v) for v in (obj.expected.albedo, obj.expected.single, obj.expected.multiple))
     scattered = LOW_BOOST * (1 - T) * (single + (albedo - single) * T)
     both = passing + scattered
@@ -394,7 +394,7 @@ def _add_sky_means(
             out: SurfacePoint = choice.refracted.out,
         ) -> tuple[PathTally]:
             low, others = obj.alpha(out, here)
-            low = dr.select(at.others_only, 0, low) if obj.few else mi.Spectrum(0)
+            low = dr.select(at.others_only, 0, low) if obj.low_orders else mi.Spectrum(0)
             light = (low + dr.select(at.low_only, 0, others)) * context.sky.mean
             return (context.mode.add(tally, at.throughput * light),)
 

@@ -73,11 +73,11 @@ class Learner(Protocol):
         work: Path | None,
         progress: NamedProgress | None,
         camera: CameraWalks | None = None,
-        start: str | None = None,
+        base_model: str | None = None,
     ) -> LearntObject:
         """Learn an object and write its weights; walks of a camera that is given are data too.
 
-        `start` names the model that it begins with, where the learner knows several.
+        `base_model` names the model that its network corrects, where the learner knows several.
         """
 
     def untrained(self, scene: Any) -> list[str]:

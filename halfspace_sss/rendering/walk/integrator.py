@@ -22,7 +22,7 @@ from halfspace_sss.rendering.walk.path_loop import FirstExits, LightVisitor, Pat
 
 __all__ = ["camera_rays", "walk_integrator_class"]
 
-PARAMETERS = ("mm_per_unit", "max_depth", "rr_depth", "hide_emitters", "join_share")
+PARAMETERS = ("mm_per_unit", "max_depth", "rr_depth", "hide_emitters", "connection_share")
 SAMPLES_PER_LAUNCH = 2**19
 LANES = 2**14  # fastest of 2**12 to 2**18 on 2 cores
 FOREVER = 2**31 - 1
@@ -43,8 +43,8 @@ def _class(variant: str) -> type:
         """Path tracer whose paths walk through objects with the surface `translucent`.
 
         Parameters: `mm_per_unit` (1), `max_depth` (-1: no limit; counts surfaces seen from outside), `rr_depth` (5),
-        `hide_emitters` (false), `join_share` (0.5; probability of looking for light of small emitters from a scattering
-        event near the boundary, 0 leaves all light to chance).
+        `hide_emitters` (false), `connection_share` (0.5; probability of a connection with a small emitter from a
+        scattering event near the boundary, 0 leaves all light to chance).
         """
 
         def __init__(self, props: mi.Properties) -> None:
@@ -54,14 +54,14 @@ def _class(variant: str) -> type:
             self.max_depth = _depth("max_depth", int(props.get("max_depth", -1)))
             self.rr_depth = _depth("rr_depth", int(props.get("rr_depth", 5)))
             self.hidden = bool(props.get("hide_emitters", False))
-            self.join_share = _share("join_share", float(props.get("join_share", 0.5)))
+            self.connection_share = _share("connection_share", float(props.get("connection_share", 0.5)))
             self._prepared: tuple[int, list, tuple, Any] = (0, [], ([], []), None)
 
         def tracer(self, scene: mi.Scene) -> PathTracer:
             """What paths through a scene need; its objects are made ready once, its emitters may have been edited."""
             self._prepared = _prepared(scene, self._prepared, self.mm_per_unit)
             media, small = self._prepared[-1], SmallEmitters.of(scene)
-            connections = find_connections(scene, media, small, self.join_share)
+            connections = find_connections(scene, media, small, self.connection_share)
             directions = connections and EmitterDirections(scene, media, small)
             visitor = LightVisitor(scene, media, small, connections, directions, InnerLights.of(media))
             return PathTracer(visitor, self.max_depth, self.rr_depth, self.hidden)

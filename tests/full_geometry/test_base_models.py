@@ -12,7 +12,7 @@ from waxen import WAX
 mi = pytest.importorskip("mitsuba")
 pytest.importorskip("torch")
 
-from figures.studies import rivals as starts  # noqa: E402
+from figures.studies import rivals  # noqa: E402
 from full_geometry.learning import training  # noqa: E402
 from full_geometry.learning.fitting import Recipe  # noqa: E402
 from full_geometry.learning.model_errors import (  # noqa: E402
@@ -44,8 +44,8 @@ def obj(radius: float = 3.0) -> TranslucentObject:
     return object_of(mi.load_dict({"type": "sphere", "radius": radius}), WAX.channel(1))
 
 
-def learnt(folder: Path, start: str = SHAPE, **more) -> Trained:
-    return train(obj(), chunks=CHUNKS, recipe=QUICK, start=start, folder=folder, **more)
+def learnt(folder: Path, base_model: str = SHAPE, **more) -> Trained:
+    return train(obj(), chunks=CHUNKS, recipe=QUICK, base_model=base_model, folder=folder, **more)
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +66,7 @@ def S_of(model, of: TranslucentObject) -> np.ndarray:
 
 def test_before_any_step_it_is_the_network_of_all_shapes(tmp_path: Path) -> None:
     with pytest.warns(UserWarning, match="rendered by neural_shape"):
-        found = train(obj(), seconds=0, start=SHAPE, folder=tmp_path)
+        found = train(obj(), seconds=0, base_model=SHAPE, folder=tmp_path)
     S = S_of(shapes.transport(obj()), obj())
     assert np.mean(S > 0) > 0.9 and np.allclose(S_of(found.model, obj()), S, rtol=1e-5)
 
@@ -85,7 +85,7 @@ def test_few_steps_from_it_are_worth_more_than_from_the_half_space(trained: Trai
 
 def test_the_file_says_where_it_began_and_gives_the_same_model_again(trained: Trained) -> None:
     record = json.loads(trained.path.with_suffix(".json").read_text())
-    assert record["recipe"]["start"] == SHAPE and record["recipe"]["rate"] < QUICK.rate
+    assert record["recipe"]["base_model"] == SHAPE and record["recipe"]["rate"] < QUICK.rate
     assert tuple(record[storing.CHECKSUMS]) == shapes.checksums(obj())
     again = storing.load(storing.find_weights(obj(), trained.path.parent), obj()).model
     assert np.array_equal(S_of(again, obj()), S_of(trained.model, obj()))
@@ -127,39 +127,39 @@ def test_weights_that_began_with_another_network_of_all_shapes_are_refused(
     monkeypatch.setattr(shapes, "shipped_weights", lambda: other)
     monkeypatch.setenv(known_weights.ENVIRONMENT_VARIABLE, str(trained.path.parent))
     assert not storing.trained(obj())
-    with pytest.raises(ValueError, match="weights of the start neural_shape must be those of training"):
+    with pytest.raises(ValueError, match="weights of the base model neural_shape must be those of training"):
         storing.load(trained.path, obj())
 
 
 def test_weights_that_do_not_say_where_they_began_are_refused(trained: Trained, tmp_path: Path) -> None:
     arrays, record = load_weights(trained.path, storing.KIND)
     path = save_weights(tmp_path / trained.path.name, storing.KIND, arrays, {**record, "recipe": {}})
-    with pytest.raises(ValueError, match="start must be recorded"):
+    with pytest.raises(ValueError, match="base_model must be recorded"):
         storing.load(path, obj())
 
 
 @pytest.mark.parametrize(
-    ("medium", "start", "message"),
+    ("medium", "base_model", "message"),
     [
-        (WAX.channel(1), "neural_shap", "start must be one of neural_shape, .*got 'neural_shap'"),
+        (WAX.channel(1), "neural_shap", "base_model must be one of neural_shape, .*got 'neural_shap'"),
         (Medium(0.8, 0.2, 0.0, 5.0), SHAPE, "eta must"),
     ],
 )
-def test_a_start_that_is_none_is_refused_before_any_walk(
-    medium: Medium, start: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_base_model_that_is_none_is_refused_before_any_walk(
+    medium: Medium, base_model: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(training, "PairSource", None)
     with pytest.raises(ValueError, match=message):
-        train(mi.load_dict({"type": "sphere"}), medium, start=start, folder=tmp_path)
+        train(mi.load_dict({"type": "sphere"}), medium, base_model=base_model, folder=tmp_path)
 
 
-def test_the_table_of_starts_has_all_of_both(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(starts, "STANDARD", QUICK)
-    monkeypatch.setattr(starts, "TIMES", ((0.0, 1.0), (1.0, 0.5)))
-    monkeypatch.setattr(starts, "object_of", lambda *_: obj())
-    table = starts.start_table(None, seconds=0.5, exits=64, walks=1024, samples=1024)
-    assert list(table.groupby(["start", "planned"], sort=False).size()) == [2, 2, 2, 2]
+def test_the_table_of_base_models_has_all_of_both(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rivals, "STANDARD", QUICK)
+    monkeypatch.setattr(rivals, "TIMES", ((0.0, 1.0), (1.0, 0.5)))
+    monkeypatch.setattr(rivals, "object_of", lambda *_: obj())
+    table = rivals.base_model_table(None, seconds=0.5, exits=64, walks=1024, samples=1024)
+    assert list(table.groupby(["base_model", "planned"], sort=False).size()) == [2, 2, 2, 2]
     assert np.all((table["steps"] > 0) == (table["planned"] > 0))
     assert np.all(table["seconds"][table["planned"] > 0] > 0)
-    begun = table[(table["planned"] == 0) & (table["light"] == LIGHTS[0])].set_index("start")
-    assert begun["error"][SHAPE] < 0.5 * begun["error"]["better_dipole"]
+    untrained = table[(table["planned"] == 0) & (table["light"] == LIGHTS[0])].set_index("base_model")
+    assert untrained["error"][SHAPE] < 0.5 * untrained["error"]["better_dipole"]
