@@ -14,9 +14,8 @@ from halfspace_sss.checks import check_count
 from halfspace_sss.interface.model import models as half_space_models
 from halfspace_sss.neural.store import check_weights_folder, load_weights
 from halfspace_sss.progress import NamedProgress
-from halfspace_sss.rendering.object.body import TranslucentObject, object_of
+from halfspace_sss.rendering.object.body import TranslucentObject, object_of, outermost
 from halfspace_sss.rendering.object.registry import model_names
-from halfspace_sss.rendering.object.translucent import is_translucent
 from halfspace_sss.rendering.scenes.learners import LearntObject, ObjectError
 
 
@@ -27,9 +26,7 @@ def untrained(scene: Any) -> list[str]:
         ValueError: one cannot be learnt, or the folder of weights cannot be written to.
     """
     missing = []
-    for shape in scene.shapes() if find_spec("torch") else ():
-        if not is_translucent(shape.bsdf()):
-            continue
+    for shape in outermost(scene) if find_spec("torch") else ():
         inside = shape.bsdf().inside
         asked = inside.model == KIND and inside.orders != "single"
         if not asked or not np.any(inside.medium.sigma_s > 0):

@@ -69,6 +69,8 @@ def learnt_model(obj: TranslucentObject, settings: Settings) -> ObjectModel:
     return ObjectModel(transport, proposals, ENTRIES)
 
 
+learnt_model.takes_contents = True
+
 # ----------------------------------------------------------------------------------------------------
 # The network of all shapes in a scene: transport, entries by probes and over the area, and warnings out of range.
 

@@ -30,7 +30,7 @@ from halfspace_sss.checks import check_choice, check_count
 from halfspace_sss.interface.model import bssrdf
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.progress import NamedProgress
-from halfspace_sss.rendering.object.body import TranslucentObject, object_of
+from halfspace_sss.rendering.object.body import TranslucentObject, object_of, refuse
 from halfspace_sss.rendering.object.half_space import HalfSpaceTransport
 from halfspace_sss.rendering.object.points import SurfacePoint, Transport
 from halfspace_sss.rendering.object.registry import lookup, model_names
@@ -310,9 +310,11 @@ def transport_of(obj: TranslucentObject, model: str, folder: str | os.PathLike |
             it has no S for two points of a surface.
     """
     check_choice("model", model, model_names())
+    contents, entry = obj.geometry.contents, lookup(model)
+    if contents is not None and not entry.takes_contents:
+        refuse(contents.found[0], obj.geometry, f"the model {model!r}")
     if model == KIND:
         return load(find_weights(obj, folder), obj).model
-    entry = lookup(model)
     if not entry.knows_objects:
         return HalfSpaceTransport([bssrdf(model, m) for m in obj.media])
     transport = entry.transport(obj, Settings()).transport if entry.transport else None

@@ -25,7 +25,9 @@ from halfspace_sss.neural.store import load_weights, save_weights, weights_folde
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.object.body import TranslucentObject
 from halfspace_sss.rendering.object.points import number
+from halfspace_sss.rendering.object.translucent import Inside
 from halfspace_sss.rendering.object.varying import grid_values
+from halfspace_sss.rendering.scenes.identity import object_digest
 
 ANCHORS = 256
 CLOSE = 1e-4  # positions over the size of the object, coefficients relative
@@ -42,10 +44,11 @@ class Identity:
     Args:
         kind: class of the shape.
         topology: checksum of its faces, and whether it has normals of its own; empty for a shape without faces.
-        anchors: points that move with the shape, (n, 3), scene units.
+        anchors: points that move with the shape, then those of shapes inside it, (n, 3), scene units.
         medium: per channel albedo, g and sigma_t sqrt(area), and eta; of a medium that varies its equivalent.
         grids: digest of the voxels of a medium that varies.
         probes: coefficients of a medium that varies, see `_probed`.
+        contents: digest of shapes inside it, their surfaces and media, without their places.
     """
 
     kind: str
@@ -54,11 +57,12 @@ class Identity:
     medium: dict[str, Any]
     grids: str = ""
     probes: np.ndarray | None = None
+    contents: str = ""
 
     def digest(self) -> str:
-        """A name for shape, its handedness and ratios of the medium, without sizes."""
+        """A name for shape, its handedness, ratios of the medium and what lies inside, without sizes and places."""
         keys = ("g", "eta") if self.grids else ("albedo", "g", "eta")  # an equivalent is known up to its sampling
-        ratios = [self.grids] * bool(self.grids)
+        ratios = [digest for digest in (self.grids, self.contents) if digest]
         ratios += [f"{v:.6g}" for key in keys for v in np.atleast_1d(self.medium[key])]
         return hashlib.sha256("|".join([self.kind, self.topology, self._hand(), *ratios]).encode()).hexdigest()[:12]
 
@@ -71,7 +75,8 @@ class Identity:
 
     def record(self) -> dict[str, Any]:
         """Everything but the anchors and probes, ready for JSON."""
-        return {"kind_of_shape": self.kind, "topology": self.topology, "medium": self.medium, "grids": self.grids}
+        kept = {"kind_of_shape": self.kind, "topology": self.topology, "medium": self.medium, "grids": self.grids}
+        return {**kept, "contents": self.contents} if self.contents else kept
 
     def pose(self, other: Identity) -> tuple[np.ndarray, np.ndarray]:
         """R and t with R x + t = y for the points x of this object and y of the other, which is the same one moved.
@@ -79,7 +84,10 @@ class Identity:
         Raises:
             ValueError: it is another object; says in what.
         """
-        pairs = ("kind", "shape", "without faces"), ("topology", "mesh", "without faces"), ("grids", "grids", "none")
+        pairs = (
+            ("kind", "shape", "without faces"), ("topology", "mesh", "without faces"), ("grids", "grids", "none"),
+            ("contents", "what lies inside", "nothing"),
+        )  # fmt: skip
         for key, name, none in pairs:
             mine, theirs = getattr(self, key), getattr(other, key)
             if mine != theirs:
@@ -115,7 +123,18 @@ def _kabsch(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray, float
 
 def identify(obj: TranslucentObject) -> Identity:
     """The identity of an object as it stands."""
-    shape = obj.geometry.shape
+    topology, anchors = _anchored(obj.geometry.shape)
+    media = obj.media
+    medium = {key: [float(getattr(m, key)) for m in media] for key in ("albedo", "g")}
+    medium |= {"size_in_mfp": obj.mean_free_paths().tolist(), "eta": float(obj.media[0].eta)}
+    grids, probes = _digest_of_grids(obj), _probed(obj, anchors)
+    contents, more = _contents(obj, anchors)
+    anchors = np.concatenate([anchors, *more]).astype(np.float32)
+    return Identity(obj.geometry.shape.class_name(), topology, anchors, medium, grids, probes, contents)
+
+
+def _anchored(shape: mi.Shape) -> tuple[str, np.ndarray]:
+    """Topology and anchors of a shape, see `Identity`."""
     parameters = mi.traverse(shape)
     topology = ""
     if "faces" in parameters:
@@ -130,11 +149,39 @@ def identify(obj: TranslucentObject) -> Identity:
         anchors = (matrix[:3, :3] @ corners + matrix[:3, 3:]).T
     else:
         raise ValueError(f"shape must be a mesh or have a transformation, got {shape.class_name()}")
-    media = obj.media
-    medium = {key: [float(getattr(m, key)) for m in media] for key in ("albedo", "g")}
-    medium |= {"size_in_mfp": obj.mean_free_paths().tolist(), "eta": float(obj.media[0].eta)}
-    grids, probes = _digest_of_grids(obj), _probed(obj, anchors)
-    return Identity(shape.class_name(), topology, anchors.astype(np.float32), medium, grids, probes)
+    return topology, anchors
+
+
+def _contents(obj: TranslucentObject, anchors: np.ndarray) -> tuple[str, list[np.ndarray]]:
+    """Digest of what lies inside, in an order that the order in the scene has no part in, and anchors of each.
+
+    Args:
+        obj: the object.
+        anchors: its own; of those that are alike inside, the nearest to the first of them comes first.
+    """
+    contents, found = obj.geometry.contents, []
+    if contents is None:
+        return "", []
+    for shape, inside in zip(contents.shapes, contents.insides):
+        topology, x = _anchored(shape)
+        words = f"{shape.class_name()} {topology} {_surface(shape, inside, float(obj.media[0].sigma_t))}"
+        found.append((words, float(np.linalg.norm(x - anchors[0], axis=1).sum()), x))
+    found.sort(key=lambda each: each[:2])
+    digest = hashlib.sha256("|".join(words for words, _, _ in found).encode()).hexdigest()[:16]
+    return digest, [x for _, _, x in found]
+
+
+def _surface(shape: mi.Shape, inside: Inside | None, sigma_t: float) -> str:
+    """Of its BSDF and colours, or of its boundary and medium; names of materials and models do not count."""
+    bsdf, painted = shape.bsdf(), hashlib.sha256()
+    if inside is not None:
+        m = inside.medium
+        numbers = np.concatenate([np.ravel(v) for v in (m.albedo, m.g, m.sigma_t / max(sigma_t, 1e-30), m.eta)])
+        return f"{object_digest(bsdf.boundary)} {[f'{v:.6g}' for v in numbers]}"
+    for key, value in sorted(mi.traverse(shape).items()):
+        if key.startswith(("vertex_", "face_")) and key not in ("vertex_positions", "vertex_normals", "vertex_count"):
+            painted.update(key.encode() + np.array(value).tobytes())
+    return f"{object_digest(bsdf)} {painted.hexdigest()} {shape.has_flipped_normals()}"
 
 
 def _as_trained(obj: TranslucentObject, medium: dict[str, Any]) -> TranslucentObject:
@@ -235,8 +282,16 @@ class Learnt(NamedTuple):
 
 
 def weights_name(identity: Identity) -> str:
-    """File name of the weights of an object: its digest, and its size in mean free paths of the first channel."""
-    return f"{KIND}-{identity.digest()}-{identity.medium['size_in_mfp'][0]:.5g}.safetensors"
+    """File name of the weights of an object: its digest, and its size in mean free paths of the first channel.
+
+    Where something lies inside also what tells places apart: `find_weights` asks the poses of all with the same digest.
+    """
+    name = f"{KIND}-{identity.digest()}-{identity.medium['size_in_mfp'][0]:.5g}"
+    if identity.contents:
+        size = np.linalg.norm(np.std(identity.anchors, axis=0))
+        places = np.rint(identity.anchors / max(CLOSE * size, 1e-30)).astype(np.int64)
+        name += f"-{hashlib.sha256(places.tobytes()).hexdigest()[:8]}"
+    return f"{name}.safetensors"
 
 
 def save(folder: str | os.PathLike, identity: Identity, arrays: dict[str, np.ndarray], record: dict[str, Any]) -> Path:
@@ -292,7 +347,8 @@ def _trained(path: Path) -> tuple[Identity, dict[str, np.ndarray], dict[str, Any
     try:
         anchors, grids = arrays.pop("anchors"), record.get("grids", "")
         probes = arrays.pop("probes") if grids else None
-        identity = Identity(record["kind_of_shape"], record["topology"], anchors, dict(record["medium"]), grids, probes)
+        kind, topology, medium = record["kind_of_shape"], record["topology"], dict(record["medium"])
+        identity = Identity(kind, topology, anchors, medium, grids, probes, record.get("contents", ""))
         if {"albedo", "g", "eta", "size_in_mfp"} - set(identity.medium):
             raise KeyError("medium")
     except (KeyError, TypeError, ValueError) as error:

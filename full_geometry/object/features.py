@@ -10,7 +10,7 @@ length l_k from o_k along d_k are reached with the weight v_k: v_0 = 1, v_{k+1} 
     P = sum_k v_k (1 - exp(-sigma_t l_k)),    P y = sum_k v_k ∫_0^{l_k} sigma_t exp(-sigma_t s) (o_k + s d_k) ds.
 
 P is the probability to be scattered or absorbed before leaving; on a plane it is 1. What is still inside after the last
-reflection is left out.
+reflection is left out. Where a segment meets something inside the object, all of v_k ends there and counts in P.
 """
 
 from __future__ import annotations
@@ -130,7 +130,7 @@ def local(obj: TranslucentObject, p: mi.Point3f) -> tuple[mi.Float, ...]:
 def first_event(obj: TranslucentObject, at: SurfacePoint, active: Any = True) -> FirstEvent:
     """Of light that goes in or out along w at a point of the surface."""
     sigma_t, eta, sign = obj.sigma_t, obj.eta, number(obj.geometry.sign)
-    media = walk_media(obj)
+    media, contents = walk_media(obj), obj.geometry.contents
     d, _, valid = refract_in(at, eta)
     flags = mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame
 
@@ -138,7 +138,9 @@ def first_event(obj: TranslucentObject, at: SurfacePoint, active: Any = True) ->
         P, moments, length = sums
         si = obj.geometry.scene.ray_intersect(mi.Ray3f(o + d * skip, d), flags, False, active)
         l = dr.select(si.is_valid(), si.t + skip, 1e4 / dr.min(sigma_t))  # noqa: E741
+        l, met = (l, mi.Bool(False)) if contents is None else contents.reach(o, d, l, active)  # noqa: E741
         through, inner = flight(obj, o, d, l)
+        through, inner = dr.select(met, 0, through), dr.select(met, inner + through * l, inner)
         part, inner = v * (1 - through), v * inner
         moments = [moment + (o * a + d * b) for moment, a, b in zip(moments, part, inner)]
         length = length + part * way + inner
@@ -147,7 +149,7 @@ def first_event(obj: TranslucentObject, at: SurfacePoint, active: Any = True) ->
         c = dr.dot(d, n)
         v = v * through * mi.fresnel(dr.abs(c), dr.select(c > 0, 1 / eta, eta))[0]
         onward = -mirrored(n * (2 * c) - d, n_face)
-        goes_on = si.is_valid() & (c > 0) & (dr.max(v) > NEGLIGIBLE) & (k < REFLECTIONS)
+        goes_on = ~met & si.is_valid() & (c > 0) & (dr.max(v) > NEGLIGIBLE) & (k < REFLECTIONS)
         skip = media.clear(mi.UInt32(0), si.n, onward)
         onward = mi.Vector3f(onward)
         return k + 1, mi.Point3f(si.p), onward, skip, v, way + l, (P + part, moments, length), active & goes_on

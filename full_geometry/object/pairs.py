@@ -4,6 +4,8 @@ A walk begins at x_o, goes inwards along the refracted w_o with the weight F_t(m
 boundary from inside, and leaves at x_i along w_i with the throughput T of each channel. Then
 
     L_o(x_o, w_o) = E[T L_i(x_i, w_i)],    E[T delta(x - x_i, w - w_i)] = S(x, w; x_o, w_o) mu.
+
+A walk that meets something inside the object is one of two scattering events at least.
 """
 
 from __future__ import annotations
@@ -35,7 +37,7 @@ from halfspace_sss.rendering.object.points import (
     cosine_direction,
     number,
 )
-from halfspace_sss.rendering.walk.media import walk_media
+from halfspace_sss.rendering.walk.media import media_within
 from halfspace_sss.rendering.walk.random_walk import WalkExits, exits
 from halfspace_sss.tracing.walk import generator, pass_seed
 
@@ -64,7 +66,7 @@ def trace_exits(
         ValueError: fewest is not a whole number >= 0.
     """
     check_count("fewest", fewest, 0)
-    return exits(walk_media(obj), 0, starts, seed, LANES, roulette_from, fewest, most)
+    return exits(media_within(obj), 0, starts, seed, LANES, roulette_from, fewest, most)
 
 
 PATCH_SHARE = 0.6  # of those by patches, where they are learnt

@@ -46,6 +46,7 @@ from halfspace_sss.rendering.object.shape import (
     rays_into,
     same_objects,
     scene_of,
+    surface_of,
     survey,
 )
 from halfspace_sss.rendering.object.translucent import Inside, is_translucent
@@ -53,21 +54,24 @@ from halfspace_sss.rendering.object.varying import VaryingMedium, equivalent, wa
 
 __all__ = [
     "Content",
+    "Contents",
     "Expected",
     "KnowsUnit",
     "TranslucentObject",
     "TranslucentObjects",
-    "check_empty",
     "check_geometry",
     "check_sensors",
     "check_size",
     "check_surface",
     "contents",
     "expected_of",
+    "filled",
     "make_objects",
     "millimetres",
     "object_of",
+    "outermost",
     "places_of",
+    "refuse",
     "translucent_shapes",
 ]
 
@@ -113,17 +117,90 @@ def contents(scene: mi.Scene, objects: list[Geometry]) -> list[Content]:
     return found
 
 
-def check_empty(scene: mi.Scene, objects: list[Geometry], what: str) -> None:
-    """Refuse objects with something inside, for `what` does not see it.
+@dataclass(frozen=True, eq=False)
+class Contents:
+    """What lies inside one object, for a transport that takes it.
+
+    Args:
+        found: shapes that neither emit nor reach out of the object, those inside each other too.
+        scene: a scene that holds these only.
+        insides: of each what is below its surface, 1/(scene unit); None where that is not translucent.
+        surfaces: from `surface_of`.
+    """
+
+    found: list[Content]
+    scene: mi.Scene
+    insides: list[Inside | None]
+    surfaces: list[tuple[list, list]]
+
+    @classmethod
+    def of(cls, found: list[Content], world: mi.Scene, mm_per_unit: float) -> Contents:
+        """Of shapes in the scene `world`."""
+        shapes = [content.thing for content in found]
+        below = [shape.bsdf().inside if is_translucent(shape.bsdf()) else None for shape in shapes]
+        insides = [inside and replace(inside, medium=inside.medium.scaled(mm_per_unit)) for inside in below]
+        return cls(found, scene_of(shapes, world), insides, [surface_of(shape) for shape in shapes])
+
+    @property
+    def shapes(self) -> list[mi.Shape]:
+        """In the order of the scene."""
+        return [content.thing for content in self.found]
+
+    def is_current(self) -> bool:
+        """Whether the surfaces still are as they were."""
+        return all(surface_of(shape)[0] == keys for shape, (keys, _) in zip(self.shapes, self.surfaces))
+
+    def check_held(self) -> None:
+        """ValueError if gradients are enabled for a parameter of them: a transport knows no other."""
+        for content in self.found:
+            for key, value in mi.traverse(content.thing).items():
+                if dr.grad_enabled(value):
+                    raise ValueError(f"{key} of {content.name} inside an object must not have gradients enabled")
+
+    def reach(self, o: mi.Point3f, d: mi.Vector3f, length: mi.Float, active: mi.Bool) -> tuple[mi.Float, mi.Bool]:
+        """How far a way of some length leads before it meets one of them, and whether it does."""
+        hit = self.scene.ray_intersect_preliminary(mi.Ray3f(mi.Ray3f(o, d), length), False, active)
+        met = hit.is_valid()
+        return dr.select(met, hit.t, length), met
+
+
+def filled(scene: mi.Scene, objects: list[Geometry], mm_per_unit: float, what: str) -> list[Geometry]:
+    """The objects of a scene that lie in no other, each with its `contents`.
+
+    Args:
+        scene, objects: as of `contents`.
+        mm_per_unit: length of a scene unit, mm.
+        what: sees neither lamps inside objects, nor what lies partly inside.
 
     Raises:
-        ValueError: names what lies in which object, or partly in it.
+        ValueError: names such a thing and the object.
     """
-    for found in contents(scene, objects)[:1]:
-        raise ValueError(
-            f"objects must be empty for {what}, got {found.name} {'' if found.whole else 'partly '}inside "
-            f"object {objects[found.object].name}: the integrator translucent_walk traces it"
-        )
+    found = contents(scene, objects)
+    for content in found:
+        if isinstance(content.thing, mi.Emitter) or content.thing.is_emitter() or not content.whole:
+            refuse(content, objects[content.object], what)
+    held = [[content for content in found if content.object == k] for k in range(len(objects))]
+    return [
+        replace(obj, contents=Contents.of(inside, scene, mm_per_unit)) if inside else obj
+        for obj, inside in zip(objects, held)
+        if not any(obj.shape is content.thing for content in found)
+    ]
+
+
+def refuse(found: Content, holder: Geometry, what: str) -> None:
+    """ValueError that names what lies inside an object, or partly inside, which `what` does not see."""
+    raise ValueError(
+        f"objects must be empty for {what}, got {found.name} {'' if found.whole else 'partly '}inside "
+        f"object {holder.name}: the integrator translucent_walk traces it"
+    )
+
+
+def outermost(scene: mi.Scene) -> list[mi.Shape]:
+    """The translucent shapes of a scene that lie in no other."""
+    shapes = [shape for shape in scene.shapes() if is_translucent(shape.bsdf())]
+    holders = [a for a in shapes if any(a.bbox().contains(b.bbox()) for b in shapes if b is not a)]
+    found = contents(scene, [survey(shape) for shape in holders])
+    return [shape for shape in shapes if not any(shape is content.thing for content in found)]
 
 
 def places_of(scene: mi.Scene) -> tuple[list, list]:
@@ -378,21 +455,23 @@ class TranslucentObjects:
         shapes = scene.shapes()  # the scene itself, which holds its integrator, would never be freed
         world, before, bodies = self._made
         same = world == number_of(scene) and same_objects(before, shapes)
-        if not bodies or not same or not all(body.is_current() for body in bodies):
+        current = bool(bodies) and same and all(body.is_current() for body in bodies)
+        places = places_of(scene)
+        if current and places[0] != self._places[0]:
+            found = [body.geometry for body in bodies]
+            current = not any(geometry.contents for geometry in found) and not contents(scene, found)
+        if not current:
             if not (bodies and same):
                 self.choices = _choices(scene, self.settings)
             self._made = number_of(scene), shapes, make_objects(scene, self.settings, (), self.choices)
-            self._places = places_of(scene)
-        elif (places := places_of(scene))[0] != self._places[0]:
-            check_empty(scene, [body.geometry for body in bodies], _MODELS)
-            self._places = places
+        self._places = places
         return self._made[2]
 
 
 def make_objects(
     scene: Any, settings: Settings, without: Collection[str] = (), chosen: Choices | None = None
 ) -> list[TranslucentObject]:
-    """All objects of a scene that have a `translucent` surface, but for those with the ids in `without`.
+    """All objects of a scene that have a `translucent` surface, but for those in others or with the ids in `without`.
 
     Args:
         scene: of Mitsuba.
@@ -401,20 +480,21 @@ def make_objects(
         chosen: what stands for "auto", by default chosen now.
 
     Raises:
-        ValueError: there is none, a camera or anything else is inside one, a model refuses its medium, or the orders
-            that are asked for are not those of the model.
+        ValueError: there is none, a camera or a lamp is inside one, a model refuses its medium or what lies inside, or
+            the orders that are asked for are not those of the model.
     """
     shapes = translucent_shapes(scene)
     if not shapes:
         raise ValueError("the scene must have an object with a translucent BSDF, got none")
     objects = [survey(shape, scene) for shape in shapes]
-    check_together(scene, [found.scene for found in objects])
     check_sensors(scene, objects)
-    check_empty(scene, objects, _MODELS)
+    outer = filled(scene, objects, settings.mm_per_unit, _MODELS)
+    check_together(scene, [part.scene for found in outer for part in (found, found.contents) if part is not None])
     chosen = chosen or _choices(scene, settings)
-    insides = [_asked(shape, settings, chosen.models.get(k)) for k, shape in enumerate(shapes)]
-    named = [pair for pair in zip(objects, insides) if pair[0].shape.id() not in without]
-    return [_make_object(found, equivalent(inside, found), settings) for found, inside in named]
+    models = {id(shape): chosen.models.get(k) for k, shape in enumerate(shapes)}
+    named = [found for found in outer if found.shape.id() not in without]
+    insides = [_asked(found.shape, settings, models[id(found.shape)]) for found in named]
+    return [_make_object(found, equivalent(inside, found), settings) for found, inside in zip(named, insides)]
 
 
 def _asked(shape: Any, settings: Settings, model: str | None = None) -> Inside:
@@ -438,6 +518,8 @@ def _make_object(found: Geometry, inside: Inside, settings: Settings) -> Translu
     varying = None if inside.varying is None else inside.varying.scaled(settings.mm_per_unit)
     obj = TranslucentObject(found, media, varying)
     single_only = inside.orders == "single" or not any(float(m.sigma_s) > 0 for m in media)
+    if found.contents is not None:
+        _check_takes(found, inside, single_only)
     variation = Variation(obj.surface, settings.mm_per_unit, inside.model)
     none = ObjectModel(None, None)
     transport, proposals, entries = none if single_only else _model_of(obj, inside, settings, variation)
@@ -449,6 +531,16 @@ def _make_object(found: Geometry, inside: Inside, settings: Settings) -> Translu
         obj, transport=transport, proposals=proposals, entries=entries, low_orders=low_orders,
         expected=expected_of(media), variation=variation,
     )  # fmt: skip
+
+
+def _check_takes(found: Geometry, inside: Inside, single_only: bool) -> None:
+    """ValueError if a model does not take what lies inside its object, or some orders only are asked for."""
+    if single_only or not lookup(inside.model).takes_contents:
+        refuse(found.contents.found[0], found, f"the model {inside.model!r}")
+    if inside.orders != "total":
+        raise ValueError(
+            f"orders must be 'total' of objects with something inside, got {inside.orders!r} of object {found.name}"
+        )
 
 
 def _low_orders(inside: Inside, transport: Transport | None) -> tuple[int, ...]:
@@ -553,17 +645,16 @@ def object_of(
 
     Raises:
         ValueError: a scene has no such object, or one that cannot be learnt: its boundary is rough, its normals point
-            to both sides, it is an instance or has something inside. The medium is missing or has other channels than
-            the variant, or mm_per_unit is not a finite number > 0.
+            to both sides, it is an instance or has inside what cannot be learnt. The medium is missing or has other
+            channels than the variant, or mm_per_unit is not a finite number > 0.
     """
     if not isinstance(shape, mi.Scene):
         geometry = survey(shape)
         media = _in_scene_units(medium, 1.0 if mm_per_unit is None else mm_per_unit)
         check_geometry(geometry)
         return TranslucentObject(geometry, media)
-    geometry = survey(_object_of(shape, name))
-    check_empty(shape, [geometry], "learning")
     unit = millimetres(shape) if mm_per_unit is None else mm_per_unit
+    (geometry,) = filled(shape, [survey(_object_of(shape, name))], unit, "learning")
     inside = equivalent(geometry.shape.bsdf().inside, geometry)
     media = _in_scene_units(inside.medium, unit)
     check_geometry(geometry)
@@ -585,11 +676,28 @@ def _in_scene_units(medium: Medium | None, mm_per_unit: float) -> tuple[Medium, 
 
 
 def check_geometry(geometry: Geometry) -> None:
-    """ValueError if the faces of an object do not all point to the same side: one sign stands for all of them."""
+    """ValueError if the faces of an object point to both sides, as one sign stands for all, or as `_check_contents`."""
     if geometry.signs is not None:
         raise ValueError(
             f"normals of {geometry.name} must all point to the same side to be learnt, got pieces that disagree"
         )
+    if geometry.contents is not None:
+        _check_contents(geometry.name, geometry.contents)
+
+
+_DELTAS = int(mi.BSDFFlags.Delta) | int(mi.BSDFFlags.GlossyTransmission)  # of BSDFs inside an object
+
+
+def _check_contents(name: str, contents: Contents) -> None:
+    """ValueError if something inside an object cannot be learnt: light that it mirrors or refracts is a delta in S."""
+    for shape, inside in zip(contents.shapes, contents.insides):
+        if inside is None and shape.bsdf().flags() & _DELTAS:
+            raise ValueError(
+                f"what lies inside {name} must be opaque and no mirror, or translucent, to be learnt, as S holds no "
+                f"deltas, got the shape {name_of(shape)} with a {shape.bsdf().class_name()}"
+            )
+        if inside is not None and inside.varying is not None:
+            raise ValueError(f"media inside {name} must be homogeneous to be learnt, got that of {name_of(shape)}")
 
 
 def check_surface(name: str, surface: Any) -> None:
@@ -599,12 +707,12 @@ def check_surface(name: str, surface: Any) -> None:
 
 
 def _object_of(scene: Any, name: str | None) -> Any:
-    """The translucent shape called `name` in a scene, or the only one.
+    """The translucent shape called `name` in a scene, or the only one that lies in no other.
 
     Raises:
         ValueError: there is none, there are several and none is named, or it cannot be learnt.
     """
-    known = {s.id(): s for s in scene.shapes() if is_translucent(s.bsdf())}
+    known = {shape.id(): shape for shape in outermost(scene)}
     instances = [s.id() for s in scene.shapes() if "nstance" in s.class_name()]
     if name in instances or (name is None and instances and not known):
         raise ValueError(f"object must not be an instance to be learnt, got {name or instances[0]!r}")

@@ -3,7 +3,8 @@
 The half-space models are those of `interface.model`. Packages add others by entry points under the name of the model:
 
 - `halfspace_sss.transports`: a function of (object, settings) that returns an `ObjectModel`: of the
-  `TranslucentObject`, geometry and media, and the `Settings` of the integrator;
+  `TranslucentObject`, geometry and media, and the `Settings` of the integrator; where S has the paths that meet what
+  lies inside an object, of all orders, it has an attribute `takes_contents` that is true;
 - `halfspace_sss.learners`: a module or object that learns the model, see `rendering.scenes.learners`;
 - `halfspace_sss.choosers`: a function of (scene, settings) that returns `Choices`, what stands for the name in a scene;
   "auto" stands for the cheapest that is good enough.
@@ -66,6 +67,11 @@ class ModelEntry:
         if not callable(make):
             raise ValueError(f"model {self.name!r} must be made by a function, got {make!r}")
         return make
+
+    @property
+    def takes_contents(self) -> bool:
+        """Whether its transport takes objects with something inside."""
+        return bool(getattr(self.transport, "takes_contents", False))
 
     @property
     def learner(self) -> Any:

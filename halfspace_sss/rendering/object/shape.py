@@ -23,6 +23,7 @@ __all__ = [
     "rays_into",
     "same_objects",
     "scene_of",
+    "surface_of",
     "survey",
 ]
 
@@ -188,6 +189,7 @@ class Geometry:
         size: diagonal of the bounding box, scene units.
         area: scene units squared.
         fingerprint: what it was surveyed with, from `geometry_of`.
+        contents: the `Contents` that lie inside, for a transport that takes them; None where nothing does.
     """
 
     shape: Any
@@ -200,6 +202,7 @@ class Geometry:
     size: float
     area: float
     fingerprint: Any
+    contents: Any = None
 
     @property
     def name(self) -> str:
@@ -207,8 +210,9 @@ class Geometry:
         return name_of(self.shape)
 
     def is_current(self) -> bool:
-        """Whether the shape still is as it was surveyed."""
-        return geometry_of(self.shape)[0] == self.fingerprint[0]
+        """Whether the shape, and surfaces inside it, still are as they were surveyed."""
+        same = geometry_of(self.shape)[0] == self.fingerprint[0]
+        return same and (self.contents is None or self.contents.is_current())
 
     def piece(self, prim_index: mi.UInt32, active: mi.Bool) -> Any:
         """The number of the piece that a face belongs to."""
@@ -312,6 +316,15 @@ def geometry_of(shape: mi.Shape) -> tuple[list, list]:
             found.append((key, dr.detail.collect_indices(kept[-1])))
         elif key == "to_world":
             found.append((key, np.array(dr.detach(value).matrix).tobytes()))
+    return found, kept
+
+
+def surface_of(shape: mi.Shape) -> tuple[list, list]:
+    """What tells whether the surface of a shape has changed; what is kept so that no number is reused."""
+    found, kept = [], []
+    for key, value in mi.traverse(shape.bsdf()).items():
+        kept.append(dr.detach(value) if dr.is_array_v(value) else value)
+        found.append((key, dr.detail.collect_indices(kept[-1]) or repr(value)))
     return found, kept
 
 

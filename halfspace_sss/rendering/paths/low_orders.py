@@ -13,6 +13,8 @@ Light of emitters and suns that reaches the event without reflection is found by
 refracted towards a sampled point of them, where there is one that `refracted_connection` finds. Connections with an
 uneven sky have MIS weights against the phase function. All other light is left to chance, that of delta lights spread
 over a cone, see `light.small_emitters`. The boundary refracts as if it were smooth.
+
+A walk ends where it meets what lies inside the object: the transport has all such paths.
 """
 
 from __future__ import annotations
@@ -169,7 +171,15 @@ def _step(
     )  # fmt: skip
     met = _meet_boundary(of, met, (si, n_out, n), sampler)
     met.alive &= ~walk.left & (k + 1 < MOST_SEGMENTS)
-    return dr.select(scatters, scattered, met)
+    new = dr.select(scatters, scattered, met)
+    ended = _blocked(obj, walk.o, walk.d, new.length - walk.length, walk.alive)
+    return dr.select(ended, replace(walk, alive=mi.Bool(False)), new)
+
+
+def _blocked(obj: TranslucentObject, p: mi.Point3f, d: mi.Vector3f, length: mi.Float, active: mi.Bool) -> mi.Bool:
+    """Whether something inside the object lies on a way from p."""
+    contents = obj.geometry.contents
+    return mi.Bool(False) if contents is None else contents.reach(p, d, length, active)[1]
 
 
 def _scatter(
@@ -408,7 +418,8 @@ def refracted_connection(obj: TranslucentObject, p: mi.Point3f, target: mi.Point
     )  # fmt: skip
     state = (mi.UInt32(0), mi.Vector3f(start), none, mi.Bool(active))
     best = dr.while_loop(state, lambda k, d, best, active: active, step, label="refraction")[2]
-    return replace(best, valid=best.valid & active)
+    valid = best.valid & active
+    return replace(best, valid=valid & ~_blocked(obj, p, best.d, best.length, valid))
 
 
 def _first_guess(obj: TranslucentObject, p: mi.Point3f, w: mi.Vector3f, active: mi.Bool) -> mi.Vector3f:

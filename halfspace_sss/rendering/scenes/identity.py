@@ -5,13 +5,16 @@ from __future__ import annotations
 import hashlib
 import re
 import sys
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from halfspace_sss.rendering.paths.integrator import is_bssrdf
 
-__all__ = ["learnt", "scene_hash", "words"]
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+__all__ = ["learnt", "object_digest", "scene_hash", "words"]
 
 # a name says nothing of the image, an address nothing of the scene, and how many samples are taken is told elsewhere
 _MADE_UP = re.compile(r"0x[0-9a-fA-F]+|\bobject_\d+|\b_unnamed_\d+|__Root\w*")
@@ -25,7 +28,7 @@ def scene_hash(scene: Any, integrator: Any) -> str:
     What models have learnt is told by `learnt`.
     """
     own = scene.integrator()
-    found = sorted(_object_digest(child) for child in _children(scene) if child is not own)
+    found = sorted(object_digest(child) for child in _children(scene) if child is not own)
     return hashlib.sha256("\n".join([*found, words(integrator)]).encode()).hexdigest()
 
 
@@ -58,7 +61,8 @@ def _children(holder: Any) -> list[Any]:
     return callback.found
 
 
-def _object_digest(found: Any) -> str:
+def object_digest(found: mi.Object) -> str:
+    """SHA-256 of an object of Mitsuba, in words and by all its parameters."""
     import mitsuba as mi
 
     flipped = isinstance(found, mi.Shape) and found.has_flipped_normals()  # of which Mitsuba tells nothing in words

@@ -21,6 +21,7 @@ from halfspace_sss.checks import check_count
 from halfspace_sss.neural.store import weights_folder
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.provenance import check_folder
+from halfspace_sss.rendering.object.body import outermost
 from halfspace_sss.rendering.object.translucent import is_translucent
 from halfspace_sss.rendering.paths.integrator import is_bssrdf
 from halfspace_sss.rendering.scenes import reference
@@ -154,7 +155,7 @@ def _learnt(
 
 def _join(scene: Any) -> bool:
     """Whether walks show what the models show: all objects are learnt, and paths go farther than to an object."""
-    insides = [shape.bsdf().inside for shape in scene.shapes() if is_translucent(shape.bsdf())]
+    insides = [shape.bsdf().inside for shape in outermost(scene)]
     return scene.integrator().settings.max_depth != 1 and all(inside.model in learners() for inside in insides)
 
 

@@ -24,6 +24,7 @@ __all__ = [
     "InnerShapes",
     "WalkMedia",
     "by_pointer",
+    "media_within",
     "per_channel",
     "pointer_numbers",
     "walk_media",
@@ -463,7 +464,7 @@ _OF_OBJECT: WeakKeyDictionary[TranslucentObject, WalkMedia] = WeakKeyDictionary(
 
 
 def walk_media(obj: TranslucentObject) -> WalkMedia:
-    """One object alone, with a smooth boundary; made once for each."""
+    """One object alone, with a smooth boundary and as if it were empty; made once for each."""
     found = _OF_OBJECT.get(obj)
     if found is None:
         medium, eta = obj.media[0], obj.media[0].eta
@@ -473,6 +474,25 @@ def walk_media(obj: TranslucentObject) -> WalkMedia:
         inside, geometry = Inside("medium", medium, "", "total", True, obj.varying), obj.geometry
         found = _OF_OBJECT[obj] = WalkMedia([geometry], [inside], geometry.scene, [smooth_boundary(eta)], 1.0)
     return found
+
+
+_WITHIN: WeakKeyDictionary[TranslucentObject, WalkMedia] = WeakKeyDictionary()
+
+
+def media_within(obj: TranslucentObject) -> WalkMedia:
+    """The same with all that lies inside it, whose objects follow; made once for each."""
+    contents = obj.geometry.contents
+    if contents is None:
+        return walk_media(obj)
+    if obj not in _WITHIN:
+        alone, shapes = walk_media(obj), [s for s, inside in zip(contents.shapes, contents.insides) if inside]
+        objects = [obj.geometry, *(survey(shape) for shape in shapes)]
+        inner = InnerShapes.of(scene_of([obj.geometry.shape, *contents.shapes]), objects)
+        boundaries = [*alone.boundaries, *(shape.bsdf().boundary for shape in shapes)]
+        insides = [*alone.insides, *filter(None, contents.insides)]
+        own = scene_of([obj.geometry.shape, *shapes])
+        _WITHIN[obj] = WalkMedia(objects, insides, own, boundaries, 1.0, inner)
+    return _WITHIN[obj]
 
 
 def _bounds(scene: mi.Scene) -> mi.BoundingBox3f:

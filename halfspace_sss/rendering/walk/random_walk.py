@@ -159,6 +159,7 @@ def roulette(weight: mi.Spectrum, scale: mi.Float, u: mi.Float) -> tuple[mi.Bool
 
 
 OUTSIDE = -1
+MET = 2  # scattering events at least, of a walk that has met something inside: such paths are a transport's
 Record = TypeVar("Record")  # of a visitor, any PyTree of Dr.Jit
 
 
@@ -175,7 +176,7 @@ class Walk:
     weight: mi.Spectrum  # w_c = f_c / mean_k p_k
     density: mi.Spectrum  # q_c = p_c / mean_k p_k
     scale: mi.Float  # square of the relative index passed so far
-    order: mi.UInt32  # scattering events since it entered the object
+    order: mi.UInt32  # scattering events since it entered the object; MET at least once it has met what lies inside
     rng: mi.PCG32
 
     def ray(self, t: mi.Float) -> mi.Ray3f:
@@ -326,7 +327,7 @@ class Walker:
         o, skip = media.depart(k, si, d, to >= 0)
         walk = replace(walk, o=o, d=d, skip=skip, alive=alive, object=dr.select(alive, to, OUTSIDE),
                        weight=walk.weight * value, scale=walk.scale * dr.square(bs.eta),
-                       order=dr.select(through & nested, 0, walk.order))  # fmt: skip
+                       order=dr.select(own, walk.order, dr.maximum(walk.order, MET)))  # fmt: skip
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta) | (turned & ~plain)
         leaves = own & through & (around < 0)
         return self.visitor.crossing(walk, record, Crossing(si, mi.Vector3f(ray.d), leaves, bs.pdf, delta))
