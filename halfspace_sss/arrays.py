@@ -185,6 +185,11 @@ def _drjit_library() -> _DrJitLibrary:
     return _DrJitLibrary()
 
 
+def is_torch(lib: Any) -> bool:
+    """Whether functions of `library` are those for torch tensors."""
+    return isinstance(lib, _TorchLibrary)
+
+
 def library(*args: Any) -> Any:
     """The functions for the arguments: Dr.Jit if any is a Dr.Jit array, then torch, else NumPy.
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
 from figures.computing.contenders import OF_OBJECTS
@@ -116,8 +117,6 @@ def _scene(p: Mapping[str, Any], folder: Path, medium: Medium | None = None) -> 
         kept = {key: value for key, value in scene["bunny"]["bsdf"].items() if key != "material"}
         scene["bunny"]["bsdf"] = kept | coefficients
     if p["shape"] != "bunny":
-        import mitsuba as mi
-
         # 37 mm across as the bunny is tall, in the middle of the picture
         to_world = mi.ScalarTransform4f().translate([-0.55, 4.7, 0]).scale(0.42 / MM_PER_UNIT)
         bsdf = scene.pop("bunny")["bsdf"]

@@ -308,6 +308,9 @@ class Part:
         return f"{name}, {self.like}" if self.like else name
 
 
+_UNMODELLED: set[Function] = set()
+
+
 def unmodelled(function: Function) -> Function:
     """Declare that a function of parts finds no model by name, as path tracing does not; one that does is stopped.
 
@@ -322,7 +325,7 @@ def unmodelled(function: Function) -> Function:
         with no_models(f"{function.__module__}.{function.__qualname__}"):
             return function(task)
 
-    closed.unmodelled = True
+    _UNMODELLED.add(closed)
     return closed
 
 
@@ -359,7 +362,7 @@ def keys_of(parts: Sequence[Part]) -> dict[str, str]:
                 raise ValueError(f"part {part.name!r} must need parts that stand before it, got {name!r}")
         params = canonical(part.params, f"params of part {part.name!r}")
         about = {"function": part.function.__qualname__, "params": part.params}
-        unmodelled = getattr(part.function, "unmodelled", False)
+        unmodelled = part.function in _UNMODELLED
         about |= {"code": code_hash(part.function.__module__, part.function.__qualname__, params, unmodelled)}
         about |= {"inputs": [_file_hash(part, path) for path in part.inputs]}
         about |= {"needs": {name: keys[name] for name in part.needs}}

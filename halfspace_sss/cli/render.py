@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from halfspace_sss.extensions import Renderer
+    from halfspace_sss.rendering.paths.integrator import is_bssrdf
     from halfspace_sss.rendering.scenes.picture import Picture
     from halfspace_sss.rendering.scenes.reference import Limits
     from halfspace_sss.rendering.scenes.reference_store import Reference
@@ -104,7 +105,7 @@ def render_command(
     found = _rendered(loaded, file, limits, {"seed": seed, "sensor": sensor}, resume)
     picture = Picture(file.stem, _colours(found.mean), _numbers(found), _error(found), loaded, sensor, denoise)
     _report(found, _publish(picture, file, draw))
-    for sentence in getattr(loaded.integrator(), "gathered", []):
+    for sentence in loaded.integrator().gathered if is_bssrdf(loaded.integrator()) else ():
         console().print(sentence, highlight=False, markup=False, soft_wrap=True)
 
 

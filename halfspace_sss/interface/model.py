@@ -15,7 +15,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from halfspace_sss.arrays import broadcast_query
+from halfspace_sss.arrays import broadcast_query, is_torch
 from halfspace_sss.checks import check_choice, check_query
 from halfspace_sss.extensions import FAILURES, MODELS, TRANSPORTS, offered, offers, warn_left_out
 from halfspace_sss.lazy import once
@@ -125,7 +125,7 @@ def recorded_in_blocks(lib: Any, f: Callable[..., Any], args: tuple) -> Any:
 
 def _recorded(lib: Any, args: tuple) -> bool:
     """Whether torch records derivatives for going backwards, and of more queries than the probes take."""
-    if not hasattr(lib, "torch") or not lib.torch.is_grad_enabled() or args[0].numel() <= 2 * PROBE:
+    if not is_torch(lib) or not lib.torch.is_grad_enabled() or args[0].numel() <= 2 * PROBE:
         return False
     forward = lib.torch.autograd.forward_ad.unpack_dual
     if lib.torch._C._are_functorch_transforms_active() or any(forward(a).tangent is not None for a in args):

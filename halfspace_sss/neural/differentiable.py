@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from halfspace_sss.arrays import broadcast_query, library
+from halfspace_sss.arrays import broadcast_query, is_torch, library
 from halfspace_sss.interface.model import Query
 from halfspace_sss.neural.features import medium_features, symmetric_features, travel
 from halfspace_sss.neural.hypernetwork import N_TERMS, Hypernetwork, Layers, log_calibration
@@ -42,7 +42,7 @@ def neural_S(sigma_t: Any, albedo: Any, g: Any, eta: Any, r: Any, mu_i: Any, phi
     c = medium_features(lib, albedo, g, eta, L)
     q = Query(lib, sigma_t * r, mu_i, phi_i, mu_o, phi_o, eta)
     features = symmetric_features(lib, q.r, *travel(q), L)
-    evaluate, layered = (_torch_network, _torch_terms) if hasattr(lib, "torch") else (_drjit_network, _drjit_terms)
+    evaluate, layered = (_torch_network, _torch_terms) if is_torch(lib) else (_drjit_network, _drjit_terms)
     terms = layered(hyper, c, q.r)
     factor = lib.exp(evaluate(hyper, c, features) + log_calibration(terms, q.mu_i) + log_calibration(terms, q.mu_o))
     G = albedo * albedo * (backbone_shape(q.r, albedo, g, eta) * factor)

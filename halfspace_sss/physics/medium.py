@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import numbers
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -342,9 +342,16 @@ def check_scalar_medium(medium: Any) -> None:
         raise ValueError(f"medium must have one channel (take medium.channel(k)), got {medium.n_channels} channels")
 
 
-def medium_of(found: Any) -> Any:
+@runtime_checkable
+class HasMedium(Protocol):
+    """A material."""
+
+    medium: Medium
+
+
+def medium_of(given: Any) -> Any:
     """The medium of a material; anything else as it is."""
-    return getattr(found, "medium", found)
+    return given.medium if isinstance(given, HasMedium) else given
 
 
 def eval_hg(cos_theta: Any, g: Any) -> Any:

@@ -14,6 +14,7 @@ from halfspace_sss.progress import NamedProgress
 from halfspace_sss.rendering.object.registry import learnt_names, lookup
 from halfspace_sss.rendering.object.shape import survey
 from halfspace_sss.rendering.paths.gathering import PART
+from halfspace_sss.rendering.scenes.learners import CostedLearner
 from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED, first_cause
 from halfspace_sss.trade.exits import Exits, visible_exits
 from halfspace_sss.trade.images import with_flip
@@ -240,8 +241,7 @@ def training_seconds(scene: Any, object: str, model: str) -> float:
     A learner of the group `halfspace_sss.learners` tells them by a function `cost(scene, object)`.
     """
     learner = lookup(model).learner if model in learnt_names() else None
-    cost = getattr(learner, "cost", None)
-    return float(cost(scene, object)) if callable(cost) else 0.0
+    return float(learner.cost(scene, object)) if isinstance(learner, CostedLearner) else 0.0
 
 
 # --------------------------------------------------------------------------------------------------

@@ -9,6 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 __all__ = ["Exits", "visible_exits"]
@@ -39,8 +41,6 @@ class Exits:
 
     def rays(self, each: int) -> Any:
         """Every ray `each` times, next to each other."""
-        import drjit as dr
-        import mitsuba as mi
 
         index = dr.arange(mi.UInt32, self.n * each) // dr.opaque(mi.UInt32, each)
         o, d = (mi.TensorXf(v) for v in (self.o, self.d))
@@ -82,7 +82,6 @@ def visible_exits(scene: Any, shapes: list[Any], sensor: int, n: int, seed: int)
 
 def _look(scene: Any, camera: Any, shapes: list[Any], seed: tuple[int, int]) -> tuple[np.ndarray, list[np.ndarray]]:
     """Random rays of a camera, (6, LAUNCH), and which of them meet each shape first."""
-    import mitsuba as mi
 
     rng = np.random.default_rng([*seed, 23])
     u = [mi.Float(row) for row in rng.random((5, LAUNCH)).astype(np.float32)]
@@ -96,8 +95,6 @@ def _look(scene: Any, camera: Any, shapes: list[Any], seed: tuple[int, int]) -> 
 
 def _shows_lamp(scene: Any, shapes: list[Any], si: Any, through: bool) -> Any:
     """Whether smooth boundaries show an emitter other than the environment, as mirrors or `through` clear objects."""
-    import drjit as dr
-    import mitsuba as mi
 
     active, found = si.is_valid(), mi.Bool(False)
     for _ in range(CHAIN):

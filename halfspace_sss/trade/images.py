@@ -7,6 +7,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from halfspace_sss.extensions import renderer
@@ -34,7 +36,6 @@ def small_images(
         side: longest side, pixels.
         spp: samples for each pixel.
     """
-    import mitsuba as mi
 
     camera = on.scene.sensors()[sensor]
     film = camera.film()
@@ -58,7 +59,6 @@ def _rendered(
     mi: Any, scene: Any, camera: Any, integrator: Any, size: tuple[int, int], spp: int, seed: int
 ) -> np.ndarray:
     """Rays of the camera over its whole film, averaged in fewer pixels."""
-    import drjit as dr
 
     n = size[0] * size[1] * spp
     sampler = mi.load_dict({"type": "independent"})

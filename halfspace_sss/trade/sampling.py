@@ -8,6 +8,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from halfspace_sss.backend import clock
@@ -135,8 +137,6 @@ def _launch(
     stage: Stage, integrator: Any, exits: Exits, estimate: RadianceEstimate, each: int, seed: int
 ) -> tuple[int, float]:
     """`each` samples of every exit; bytes and seconds that it took."""
-    import drjit as dr
-    import mitsuba as mi
 
     rays = exits.rays(each)
     sampler = mi.load_dict({"type": "independent"})
@@ -169,8 +169,6 @@ def radiance(scene: Any, integrator: Any, sampler: Any, ray: Any) -> list[Any]:
         sampler: of a number for each ray at a time.
         ray: all of them.
     """
-    import drjit as dr
-    import mitsuba as mi
 
     sampler.schedule_state()
     dr.schedule(ray.o, ray.d)

@@ -6,11 +6,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import mitsuba as mi
+
 from halfspace_sss.checks import check_choice
 from halfspace_sss.interface.model import model_class, models
-from halfspace_sss.rendering.object.body import millimetres, translucent_shapes
+from halfspace_sss.rendering.object.body import KnowsUnit, millimetres, translucent_shapes
 from halfspace_sss.rendering.object.registry import AUTO, model_names
 from halfspace_sss.rendering.paths.gathering import Gathering
+from halfspace_sss.rendering.paths.integrator import is_bssrdf
 from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED, load_objects
 
 __all__ = ["GATHERED", "LAMBERT", "NO_SINGLE", "Stage", "Way", "stage", "ways"]
@@ -104,7 +107,6 @@ class Stage:
 
     def integrator(self, way: Way) -> Any:
         """The integrator of a way, which keeps what it has made ready; the scene is the same for all."""
-        import mitsuba as mi
 
         if way not in self._integrators:
             plugin = {"type": "translucent_walk"} | self.settings
@@ -132,7 +134,6 @@ def stage(scene: Any, parameters: dict[str, str] | None = None) -> Stage:
     Raises:
         ValueError: as `load_objects`; there is no translucent object or no sensor, or it is an instance.
     """
-    import mitsuba as mi
 
     loaded = scene if isinstance(scene, mi.Scene) else load_objects(scene, parameters)
     shapes = translucent_shapes(loaded)
@@ -153,10 +154,9 @@ def _check_instances(shapes: Sequence[Any]) -> None:
 def _settings(scene: Any) -> tuple[dict[str, Any], dict[str, Any]]:
     """What both integrators are told, and `bssrdf` alone; what the scene says, where its integrator is one of them."""
     integrator = scene.integrator()
-    stated = getattr(integrator, "settings", None)
-    if stated is not None:
-        return stated.shared(), stated.of_models()
+    if is_bssrdf(integrator):
+        return integrator.settings.shared(), integrator.settings.of_models()
     common: dict[str, Any] = {"mm_per_unit": millimetres(scene), "hide_emitters": False, "max_depth": 8, "rr_depth": 5}
-    if hasattr(integrator, "mm_per_unit"):
+    if isinstance(integrator, KnowsUnit):  # `translucent_walk`
         common |= {"hide_emitters": integrator.hidden}
     return common, {}

@@ -9,6 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from halfspace_sss.rendering.scenes.reference_store import Reference, load, save
@@ -42,7 +44,6 @@ class CameraWalks:
         self, scene: Any, settings: Any, sensor: int, seed: int, path: Path, about: dict[str, Any],
         progress: Callable[[Reference], None] | None = None,
     ) -> None:  # fmt: skip
-        import mitsuba as mi
 
         self.scene, self.sensor, self.seed, self.path = scene, scene.sensors()[sensor], seed, path
         self.integrator = mi.load_dict({"type": "translucent_walk", **settings.shared()})
@@ -60,7 +61,6 @@ class CameraWalks:
 
     def hits(self, shape: Any) -> int:
         """About how many paths of one sample per pixel meet an object first."""
-        import drjit as dr
 
         from halfspace_sss.rendering.walk.integrator import camera_rays
         from halfspace_sss.rendering.walk.path_loop import FirstExits
@@ -78,8 +78,6 @@ class CameraWalks:
             number: of the pass; `TRIAL` for one that is no part of the image.
             spp: samples per pixel.
         """
-        import drjit as dr
-        import mitsuba as mi
 
         name, kept = shape.id(), []
         media = self.integrator.tracer(self.scene).visitor.media

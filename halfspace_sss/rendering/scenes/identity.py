@@ -5,14 +5,12 @@ from __future__ import annotations
 import hashlib
 import re
 import sys
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
 from halfspace_sss.rendering.paths.integrator import is_bssrdf
-
-if TYPE_CHECKING:
-    import mitsuba as mi
 
 __all__ = ["learnt", "object_digest", "scene_hash", "words"]
 
@@ -45,7 +43,6 @@ def learnt(scene: Any, integrator: Any) -> list[str]:
 
 def _children(holder: Any) -> list[Any]:
     """The objects that stand in a scene or in another object, in any order."""
-    import mitsuba as mi
 
     class Children(mi.TraversalCallback):
         def __init__(self) -> None:
@@ -63,7 +60,6 @@ def _children(holder: Any) -> list[Any]:
 
 def object_digest(found: mi.Object) -> str:
     """SHA-256 of an object of Mitsuba, in words and by all its parameters."""
-    import mitsuba as mi
 
     flipped = isinstance(found, mi.Shape) and found.has_flipped_normals()  # of which Mitsuba tells nothing in words
     digest = hashlib.sha256(f"{words(found)}{flipped}".encode())

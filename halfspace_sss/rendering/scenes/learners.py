@@ -17,7 +17,7 @@ from halfspace_sss.rendering.object.registry import learnt_names, lookup
 from halfspace_sss.rendering.scenes.camera_walks import CameraWalks
 
 __all__ = [
-    "Learner", "LearntObject", "LearntShapes", "ObjectError", "ShapeLearner", "learner", "learners",
+    "CostedLearner", "Learner", "LearntObject", "LearntShapes", "ObjectError", "ShapeLearner", "learner", "learners",
     "object_errors", "shape_learner",
 ]  # fmt: skip
 
@@ -94,6 +94,14 @@ class Learner(Protocol):
         progress: NamedProgress | None,
     ) -> list[ObjectError]:
         """The errors of models of an object, over so many exits; of all that can be asked where none is named."""
+
+
+@runtime_checkable
+class CostedLearner(Protocol):
+    """Knows what the weights of an object took."""
+
+    def cost(self, scene: Any, object: str) -> float:
+        """Seconds; ValueError if the object has not been trained."""
 
 
 @runtime_checkable

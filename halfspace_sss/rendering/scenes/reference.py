@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
 from halfspace_sss.checks import check_count
@@ -161,7 +162,6 @@ def _pass_spp(found: Reference | None, fixed: int | None, most: int | None) -> i
 
 def _pass(found: Reference | None, scene: Any, integrator: Any, sensor: int, about: dict, spp: int) -> Reference:
     """One more pass."""
-    import mitsuba as mi
 
     number = found.passes if found else 0
     started = time.perf_counter()
@@ -186,7 +186,6 @@ def _check(spp_per_pass: int | None, seed: int, interval: float) -> None:
 
 def loaded(scene: Any, integrator: dict | None, sensor: int) -> tuple[Any, Any]:
     """The scene and its integrator as Mitsuba objects; errors as of `render`."""
-    import mitsuba as mi
 
     if isinstance(scene, (str, os.PathLike)) and not Path(scene).is_file():
         raise ValueError(f"scene must be a dict, a Mitsuba scene or a file, got {os.fspath(scene)!r}")
@@ -219,7 +218,6 @@ def _check_sensor(scene: Any, sensor: int) -> None:
 
 def about_render(scene: Any, integrator: Any, sensor: int, seed: int) -> dict[str, Any]:
     """What tells one render from another, with its provenance."""
-    import mitsuba as mi
 
     about = {
         "scene": scene_hash(scene, integrator),

@@ -13,6 +13,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import mitsuba as mi
+
 from halfspace_sss.interrupts import is_interrupt
 from halfspace_sss.rendering.object.registry import lookup, model_names
 from halfspace_sss.rendering.object.settings import ORDERS, SHARED
@@ -212,7 +214,6 @@ def _surfaces(state: Any) -> list[Any]:
 
 def _made(scene: dict | str | Path, state: Any, config: Any) -> Any:
     """The scene; files that an XML file names are looked for beside it first."""
-    import mitsuba as mi
 
     before, here = mi.file_resolver(), mi.FileResolver(mi.file_resolver())
     if not isinstance(scene, dict):
@@ -227,7 +228,6 @@ def _made(scene: dict | str | Path, state: Any, config: Any) -> Any:
 
 
 def _parsed(scene: dict | str | Path, parameters: Mapping[str, str]) -> tuple[Any, Any]:
-    import mitsuba as mi
 
     config = mi.parser.ParserConfig(mi.variant())
     config.parallel = False  # objects then have the same numbers each time, and kernels are found in Dr.Jit's cache
@@ -244,7 +244,6 @@ def _parsed(scene: dict | str | Path, parameters: Mapping[str, str]) -> tuple[An
 
 
 def _transform(scene: dict | str | Path, state: Any, config: Any) -> None:
-    import mitsuba as mi
 
     try:
         mi.parser.transform_all(config, state)
@@ -259,7 +258,6 @@ def _unreadable(scene: dict | str | Path, error: RuntimeError) -> ValueError:
 
 def _choose_integrator(state: Any, model: str | None, asked: bool, settings: Mapping[str, float]) -> None:
     """Make the integrator fit what is asked for; one that is made gets the settings."""
-    import mitsuba as mi
 
     wanted = _INTEGRATORS[model == PATH_TRACED]
     ours = [node.props for node in state.nodes if node.props.plugin_name() in _INTEGRATORS.values()]
