@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     import numpy as np
 
     from halfspace_sss.extensions import Renderer
-    from halfspace_sss.rendering.paths.integrator import is_bssrdf
     from halfspace_sss.rendering.scenes.picture import Picture
     from halfspace_sss.rendering.scenes.reference import Limits
     from halfspace_sss.rendering.scenes.reference_store import Reference
@@ -87,6 +86,7 @@ def render_command(
     """
     use_mitsuba(variant)
     from halfspace_sss.checks import check_count
+    from halfspace_sss.rendering.paths.integrator import is_bssrdf
     from halfspace_sss.rendering.scenes.picture import Picture
     from halfspace_sss.rendering.scenes.reference import Limits, chosen
     from halfspace_sss.rendering.scenes.scene_files import open_scene
