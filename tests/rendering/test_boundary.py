@@ -10,6 +10,7 @@ import pytest
 mi = pytest.importorskip("mitsuba")
 import drjit as dr  # noqa: E402
 
+from halfspace_sss.rendering.object.body import object_of  # noqa: E402
 from halfspace_sss.rendering.object.translucent import is_smooth_boundary, smooth_boundary  # noqa: E402
 from halfspace_sss.rendering.scenes.mitsuba_scene import with_media  # noqa: E402
 
@@ -70,6 +71,41 @@ def test_a_plain_dielectric_is_taken_as_its_index_and_a_tinted_or_rough_one_as_i
     assert is_smooth_boundary(surface().boundary) and is_smooth_boundary(surface(inner=dielectric(1.4)).boundary)
     assert surface(inner=dielectric(1.4, **tint)).boundary.class_name() == "SmoothDielectric"
     assert surface(inner=rough).boundary.class_name() == "RoughDielectric"
+
+
+OTHERS = {
+    "thindielectric": {"int_ior": 1.4, "ext_ior": 1.0},
+    "plastic": {"int_ior": 1.4, "ext_ior": 1.0},
+    "roughplastic": {"int_ior": 1.4, "ext_ior": 1.0},
+    "principled": {"eta": 1.4, "spec_trans": 1.0},
+    "principledthin": {"eta": 1.4},
+    "conductor": {},
+    "null": {},
+    "mask": {"opacity": 0.5, "inner": dielectric(1.4)},
+    "bumpmap": {"map": {"type": "checkerboard"}, "inner": dielectric(1.4)},
+}
+
+
+@pytest.mark.parametrize("kind", OTHERS)
+def test_boundaries_of_other_kinds_are_refused_by_name(kind: str) -> None:
+    with pytest.raises(Exception, match=r"the boundary must be a dielectric or roughdielectric, got a \w+"):
+        surface(inner={"type": kind, **OTHERS[kind]})
+
+
+@pytest.mark.parametrize("tint", ["specular_reflectance", "specular_transmittance"])
+def test_a_tinted_boundary_is_refused_by_models_and_traced_by_walks(tint: str) -> None:
+    bsdf = {"type": "translucent", "sigma_s": 1.0, "sigma_a": 0.5, "eta": 1.4, "inner": dielectric(1.4, **{tint: 0.5})}
+    described = {
+        "type": "scene",
+        "ball": {"type": "sphere", "radius": 3.0, "bsdf": bsdf},
+        "light": {"type": "constant"},
+    }
+    loaded = mi.load_dict(described)
+    message = f"the boundary of object 'ball' must be without {tint} under a model"
+    for ask in (mi.load_dict({"type": "bssrdf"}).prepare, lambda scene: object_of(scene, None, 1.0)):
+        with pytest.raises(ValueError, match=message):
+            ask(loaded)
+    mi.load_dict({"type": "translucent_walk"}).tracer(loaded)
 
 
 def test_volume_paths_meet_the_dielectric_of_mitsuba() -> None:

@@ -49,7 +49,7 @@ from halfspace_sss.rendering.object.shape import (
     surface_of,
     survey,
 )
-from halfspace_sss.rendering.object.translucent import Inside, is_translucent
+from halfspace_sss.rendering.object.translucent import Inside, check_tints, is_translucent
 from halfspace_sss.rendering.object.varying import VaryingMedium, equivalent, warn_of_means
 
 __all__ = [
@@ -518,6 +518,7 @@ def _make_object(found: Geometry, inside: Inside, settings: Settings) -> Translu
     varying = None if inside.varying is None else inside.varying.scaled(settings.mm_per_unit)
     obj = TranslucentObject(found, media, varying)
     single_only = inside.orders == "single" or not any(float(m.sigma_s) > 0 for m in media)
+    check_tints(found.name, obj.surface.boundary)
     if found.contents is not None:
         _check_takes(found, inside, single_only)
     variation = Variation(obj.surface, settings.mm_per_unit, inside.model)
@@ -702,6 +703,7 @@ def _check_contents(name: str, contents: Contents) -> None:
 
 def check_surface(name: str, surface: Any) -> None:
     """ValueError if the `translucent` surface of an object has what cannot be learnt."""
+    check_tints(repr(name), surface.boundary)
     if surface.boundary.flags() & int(mi.BSDFFlags.Smooth):
         raise ValueError(f"the boundary of {name!r} must be smooth to be learnt, got a rough one")
 

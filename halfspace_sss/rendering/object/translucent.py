@@ -59,6 +59,7 @@ __all__ = [
     "Inside",
     "PARAMETERS",
     "VARIABLE",
+    "check_tints",
     "is_smooth_boundary",
     "is_translucent",
     "read_inside",
@@ -147,17 +148,23 @@ def _boundary_class(variant: str) -> type:
     return SmoothBoundary
 
 
+DIELECTRICS = ("SmoothDielectric", "RoughDielectric")
+
+
 def boundary_of(surfaces: list[Any], eta: float) -> Any:
     """The boundary of a medium from the BSDFs inside a surface: at most one, a dielectric of the same index.
 
     Raises:
-        ValueError: there are several, or it is of another index.
+        ValueError: there are several, or it is of another index or kind.
     """
     if len(surfaces) > 1:
         raise ValueError(f"a translucent surface must have at most one BSDF inside, got {len(surfaces)}")
     for boundary in surfaces:
+        kind = boundary.class_name()
+        if kind not in DIELECTRICS:  # others have an index too: thindielectric, plastic, principled
+            raise ValueError(f"the boundary must be a dielectric or roughdielectric, got a {kind}")
         check_eta(boundary, eta)
-        if boundary.class_name() != "SmoothDielectric" or mi.traverse(boundary).keys() != {"eta"}:  # rough, or tinted
+        if kind != "SmoothDielectric" or mi.traverse(boundary).keys() != {"eta"}:  # rough, or tinted
             return boundary
     return smooth_boundary(eta)
 
@@ -169,6 +176,21 @@ def check_eta(boundary: mi.BSDF, eta: float) -> None:
     if found is None or abs(found - eta) > 2e-3 * eta:
         raise ValueError(
             f"the boundary must be a dielectric with eta {eta:g} of the medium (int_ior/ext_ior), got {found}"
+        )
+
+
+def check_tints(name: str, boundary: mi.BSDF) -> None:
+    """Refuse a boundary that colours what it reflects or lets through, by which models know no light.
+
+    Args:
+        name: of the object, as messages have it.
+        boundary: of its medium.
+    """
+    tints = sorted({key.partition(".")[0] for key in mi.traverse(boundary).keys() if key.startswith("specular_")})
+    if tints:
+        raise ValueError(
+            f"the boundary of object {name} must be without {tints[0]} under a model: the integrator translucent_walk "
+            "traces it"
         )
 
 
