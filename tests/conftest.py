@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import gc
 import os
+import signal
 import sys
 import warnings
 from importlib import resources
@@ -12,6 +13,9 @@ from pathlib import Path
 
 if "PYTEST_XDIST_WORKER" in os.environ:  # the tests run side by side: threads of each would only get in their way
     os.environ["OMP_NUM_THREADS"] = "1"
+
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as a shell starts what runs in its background
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 import numpy as np
 import pytest
@@ -54,10 +58,14 @@ def stand_ins(tmp_path_factory: pytest.TempPathFactory):
 
 
 @pytest.fixture(scope="module", autouse=True)
-def no_scenes_of_other_files() -> None:
-    """Kernels call what is left of scenes of other tests too, such as textures without colour: they are freed."""
+def no_traces_of_other_files() -> None:
+    """Kernels call what is left of scenes of other tests too, such as textures without colour: they are freed.
+
+    The variant of Mitsuba is that of most tests again, since fixtures of a module come before `rgb` of its tests.
+    """
     if "mitsuba" in sys.modules:
         gc.collect()
+        _set_variant("llvm_ad_rgb")
 
 
 @pytest.fixture(scope="session")
