@@ -12,8 +12,6 @@ from halfspace_sss.checks import check_choice
 from halfspace_sss.physics import fresnel
 from halfspace_sss.physics.medium import Medium
 
-__all__ = ["MOMENTS", "DiffuseBoundary", "Grosjean", "safe_differences", "unit_gauss"]
-
 MOMENTS = ("exact", "published")
 
 

@@ -9,8 +9,6 @@ from analytic_models._diffusion import DiffuseBoundary, Grosjean, safe_differenc
 from halfspace_sss.interface.model import Query, Separable
 from halfspace_sss.physics.medium import Medium
 
-__all__ = ["BetterDipole"]
-
 
 class BetterDipole(Separable):
     """Better dipole, S = T_12 R_d(r) T_21 / (4 pi C_phi(1/eta)): multiple scattering with a normalised exit lobe.

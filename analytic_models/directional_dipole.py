@@ -11,8 +11,6 @@ from analytic_models._diffusion import DiffuseBoundary, safe_differences
 from halfspace_sss.interface.model import BSSRDF, Query
 from halfspace_sss.physics.medium import Medium
 
-__all__ = ["DirectionalDipole"]
-
 R_MIN = 1e-6  # mean free paths
 
 

@@ -14,8 +14,6 @@ from halfspace_sss.interface.model import BSSRDF, Query
 from halfspace_sss.physics.fresnel import boundary_A
 from halfspace_sss.physics.medium import Medium
 
-__all__ = ["ForwardScatteringDipole", "Monopole"]
-
 R_MIN, MU_MIN = 1e-6, 1e-3  # mean free paths; refracted cosine
 VIRTUAL_SOURCES = ("classical", "grosjean", "directional")
 

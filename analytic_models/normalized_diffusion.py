@@ -13,8 +13,6 @@ from halfspace_sss.interface.model import Query, Separable, exit_normaliser
 from halfspace_sss.physics.fresnel import C_1
 from halfspace_sss.physics.medium import Medium
 
-__all__ = ["NormalizedDiffusion", "matched_albedos"]
-
 R_MIN = 1e-6  # mean free paths
 
 

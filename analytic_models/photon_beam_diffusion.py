@@ -10,8 +10,6 @@ from halfspace_sss.checks import check_choice
 from halfspace_sss.interface.model import BSSRDF, Query
 from halfspace_sss.physics.medium import Medium
 
-__all__ = ["PhotonBeamDiffusion"]
-
 R_MIN, MU_MIN = 1e-6, 1e-3  # mean free paths; refracted cosine
 KAPPAS = ("extinction", "reduced", "none")
 

@@ -11,8 +11,6 @@ from halfspace_sss.interface.model import Query, Separable, exit_normaliser
 from halfspace_sss.physics.fresnel import boundary_A_jensen
 from halfspace_sss.physics.medium import Medium
 
-__all__ = ["StandardDipole", "StandardDipoleNormalized"]
-
 
 class _Dipole:
     """Constants of the standard dipole in mean free paths, and its profile."""

@@ -27,8 +27,6 @@ from figures.drawing.style import paper, saved
 from figures.modelling.objects import TISSUES, tissue
 from figures.parts.part import Part, Result, Task
 
-__all__ = ["TITLE", "draw", "parts", "shown"]
-
 TITLE = "candle with its flame, mandarin and croissant, path traced and by models"
 OBJECTS = ("candle", "mandarin", "croissant")
 MODELS = ("neural", *(name for name in OF_OBJECTS if name == FULL_GEOMETRY))

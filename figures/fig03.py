@@ -12,8 +12,6 @@ from figures.computing.scenes import BUNNY, prepare
 from figures.drawing.style import TEXT, paper, saved
 from figures.parts.part import Part, Result, Task
 
-__all__ = ["TITLE", "draw", "parts", "sampled"]
-
 TITLE = "points of entry drawn by the paper's flow and by patches, beside uniform ones"
 SECONDS = {"draft": 12, "paper": 600}  # CPU time of the object, and of the flow
 POINTS = {"draft": 512, "paper": 2048}

@@ -22,9 +22,6 @@ from halfspace_sss.rendering.scenes import online, reference
 from halfspace_sss.rendering.scenes.combined import combined
 from halfspace_sss.rendering.scenes.reference_store import Reference
 
-__all__ = ["TITLE", "Snapshots", "draw", "modelled", "parts", "rivals", "trained_online", "walked"]
-
-
 TITLE = "error of the image over time: walks alone, walks that learn, the model trained before"
 SCENES = {  # material and lights
     "draft": (("potato", "small light"),),

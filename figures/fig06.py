@@ -15,8 +15,6 @@ from figures.drawing.page import page
 from figures.drawing.style import paper, saved
 from figures.parts.part import Part, Result, Task
 
-__all__ = ["TITLE", "draw", "parts", "seen"]
-
 TITLE = "one full-geometry model under four environments and from four views"
 MATERIAL = "potato"
 WINDOWS = "windows"  # the surroundings of Fig. 9 with its lamp

@@ -12,8 +12,6 @@ from figures.computing.scenes import BUNNY, prepare
 from figures.drawing.style import COLUMN, paper, saved
 from figures.parts.part import Part, Result, Task
 
-__all__ = ["TITLE", "draw", "ours", "papers", "parts", "truth_of"]
-
 TITLE = "error against the number of incident samples, the paper's network and ours"
 SECONDS = {"draft": 12, "paper": 600}  # CPU time of each training
 NUMBERS = {"draft": (1, 4, 16, 64), "paper": (1, 2, 4, 8, 16, 32, 64, 128)}

@@ -20,8 +20,6 @@ from figures.drawing.style import paper, saved
 from figures.parts.part import Part, Result, Task, unmodelled
 from halfspace_sss import materials
 
-__all__ = ["TITLE", "draw", "parts", "path_traced", "rendered"]
-
 TITLE = "five materials, path traced and by every kind of model, with FLIP"
 MODELS = (*contenders.MODELS, *contenders.OF_OBJECTS)
 SIZES = {"draft": 96, "paper": 384}

@@ -15,8 +15,6 @@ from halfspace_sss.comparison.reflectance_curves import FIG10_THETA_I, curves
 from halfspace_sss.materials import load
 from halfspace_sss.physics.medium import Medium
 
-__all__ = ["TITLE", "draw", "parts"]
-
 TITLE = "S over distance, path traced and by every model"
 WALKS = {"draft": 4_000_000, "paper": 64_000_000}  # for each angle of incidence
 

@@ -29,8 +29,6 @@ from figures.drawing.style import paper, saved
 from figures.parts.part import Part, Result, Task, unmodelled
 from halfspace_sss import materials
 
-__all__ = ["TITLE", "draw", "parts", "rivals", "truth"]
-
 TITLE = "path tracing and ours in equal time, raw and denoised, with FLIP"
 MATERIALS = ("marble", "ketchup")
 LIGHTS = "both"

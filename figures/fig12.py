@@ -16,8 +16,6 @@ from figures.drawing.page import page
 from figures.drawing.style import paper, saved
 from figures.parts.part import Part, Result, Task
 
-__all__ = ["SAMPLERS", "TITLE", "draw", "parts", "rendered"]
-
 TITLE = "one sample a pixel, with and without sampling that has learnt"
 SIZES = {"draft": 128, "paper": 512}
 SECONDS = {"draft": 15, "paper": 600}  # CPU time of the training, and of the flow

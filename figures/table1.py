@@ -14,8 +14,6 @@ from figures.fig09 import rendered
 from figures.parts.part import Part, Result
 from halfspace_sss import materials
 
-__all__ = ["PAPER", "TITLE", "Stated", "draw", "parts"]
-
 TITLE = "time of training and rendering, samples and size of weights, the paper's beside"
 SUBJECTS = {"draft": ("potato", "ketchup"), "paper": MATERIALS}
 MODELS = ("neural", *OF_OBJECTS)

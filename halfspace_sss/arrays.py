@@ -20,8 +20,6 @@ import numpy as np
 from halfspace_sss.backend import prepare_llvm
 from halfspace_sss.lazy import once
 
-__all__ = ["broadcast_query", "library"]
-
 
 def _fold(f: Any, tables: tuple, state: tuple, x: Any) -> tuple:
     """state = f(*state, *row) for each row of the equally long 1-D `tables`, in order; x tells the array type.

@@ -13,11 +13,6 @@ from typing import Any
 
 from halfspace_sss.lazy import once
 
-__all__ = [
-    "BACKENDS", "BackendError", "array_types", "busy_threads", "clock", "kernel_seconds", "prefer_bundled_llvm",
-    "prepare_llvm", "two_threads",
-]  # fmt: skip
-
 BACKENDS = ("llvm", "cuda")
 OLDEST_LLVM = 17  # 14 and 15 abort the process ("Cannot select: fminimum")
 

@@ -11,11 +11,6 @@ from typing import Any
 
 import numpy as np
 
-__all__ = [
-    "check_choice", "check_cosine", "check_count", "check_edges", "check_finite", "check_interval", "check_query",
-    "did_you_mean", "renamed", "rounding",
-]  # fmt: skip
-
 ROUNDING_ULPS = 4
 
 

@@ -18,23 +18,6 @@ from collections.abc import Callable, Iterator
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
-__all__ = [
-    "CHOOSERS",
-    "COMMANDS",
-    "FAILURES",
-    "FIGURES",
-    "LEARNERS",
-    "MODELS",
-    "STUDIES",
-    "TRANSPORTS",
-    "commands",
-    "loaded",
-    "offered",
-    "offers",
-    "renderer",
-    "warn_left_out",
-]
-
 COMMANDS, FIGURES, MODELS = "halfspace_sss.commands", "halfspace_sss.figures", "halfspace_sss.models"
 STUDIES = "halfspace_sss.studies"
 CHOOSERS, LEARNERS, TRANSPORTS = "halfspace_sss.choosers", "halfspace_sss.learners", "halfspace_sss.transports"

@@ -8,8 +8,6 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-__all__ = ["end_in_a_line", "hear_again", "interruptible", "is_interrupt"]
-
 
 def end_in_a_line() -> None:
     """From now on SIGINT ends the process with one line and 130, until `cli.interrupts` watches.

@@ -9,8 +9,6 @@ from typing import Any
 
 from halfspace_sss.provenance import naming, provenance, write_atomically
 
-__all__ = ["KeptRows"]
-
 
 class KeptRows(dict):
     """Rows by name, as JSON values.

@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-__all__ = ["Z_UPPER", "NoiseFree", "short"]
-
 Z_UPPER = 1.645  # a bound that holds in 95 % of cases
 CERTAIN = 2.0  # standard errors of the square below which an error is lost in noise
 

@@ -15,11 +15,6 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-__all__ = [
-    "check_folder", "naming", "provenance", "read_bytes", "read_text", "replace_together", "write_atomically",
-    "write_together",
-]  # fmt: skip
-
 LARGEST, LARGEST_TEXT = 10**9, 10**7  # bytes
 LIBRARIES = ("halfspace-sss", "numpy", "drjit", "mitsuba", "torch", "xarray", "zarr")
 

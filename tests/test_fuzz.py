@@ -5,6 +5,7 @@ The tests try few cases; HALFSPACE_SSS_FUZZ=100000 tries that many for each prop
 
 from __future__ import annotations
 
+import importlib
 import inspect
 import os
 import shutil
@@ -76,6 +77,7 @@ def test_nothing_at_the_command_line_ends_in_a_traceback(command: str, tmp_path:
         raise ValueError("computes")
 
     monkeypatch.chdir(tmp_path)
+    importlib.import_module("halfspace_sss.neural.training.train_universal")  # its package has a function of that name
     for place in COMPUTES:
         monkeypatch.setattr(place, reached)
     (tmp_path / "file").write_text("a file")

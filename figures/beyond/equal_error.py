@@ -34,12 +34,6 @@ from halfspace_sss.checks import check_choice
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.provenance import check_folder
 
-__all__ = [
-    "MODELLED", "TITLE", "draw", "errors", "furnace", "furnace_models", "furnace_scene", "long_modelled",
-    "measured", "modelled_contender", "modelled_scene", "parts", "split",
-]  # fmt: skip
-
-
 MODELLED = ("candle", "mandarin")
 LIGHTS = ("small light", "even sky")
 LAMP, LAMP_RADIUS = (-67.0, 46.0, -45.0), 8.0  # from what is looked at, mm: behind it, as with the bunny

@@ -25,8 +25,6 @@ from figures.modelling.objects import (
 from figures.parts.part import Part, Result, Task
 from halfspace_sss.provenance import check_folder
 
-__all__ = ["TITLE", "VIEWS", "View", "candle", "draw", "parts", "scene", "varying"]
-
 TITLE = "the objects modelled for the figures, path traced"
 SIZES = {"draft": 112, "paper": 448}
 SPP = {"draft": 32, "paper": 1024}

@@ -17,8 +17,6 @@ from figures.drawing.style import COLUMN, look, paper, saved
 from figures.parts.part import Part, Result, Task
 from halfspace_sss.physics.medium import Medium
 
-__all__ = ["TITLE", "draw", "parts"]
-
 TITLE = "bias of the half-space on spheres of decreasing radius, and what `neural_shape` leaves of it"
 MODELS = (*contenders.MODELS, "neural_shape")
 RADII = (1.0, 3.0, 10.0, 30.0, 100.0)  # mean free paths

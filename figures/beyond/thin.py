@@ -21,8 +21,6 @@ from full_geometry.learning.shapes import TRAINING, make_shape
 from halfspace_sss import materials
 from halfspace_sss.provenance import check_folder
 
-__all__ = ["TITLE", "draw", "parts", "path_traced", "rendered"]
-
 TITLE = "thin things lit from behind, by half-spaces and by the network of all shapes"
 MODELS = ("better_dipole", "neural", "neural_shape")
 SIZES = {"draft": 96, "paper": 384}

@@ -24,8 +24,6 @@ from halfspace_sss.physics.medium import Medium
 from halfspace_sss.trade.checking.random_scenes import RandomScene, mesh_file
 from halfspace_sss.trade.results import Assessment
 
-__all__ = ["TITLE", "draw", "measured", "parts"]
-
 TITLE = "bias against time to a given noise, for every way of rendering"
 SHAPES = ("bunny", "spikes")
 LIGHTS = {"sky": "even sky", "small light": "small light"}

@@ -13,12 +13,6 @@ from halfspace_sss.neural.symmetric import channels
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.object.registry import model_names
 
-__all__ = [
-    "MODELS", "OF_OBJECTS", "RR_DEPTHS", "VOLUMES", "WALK", "contender", "long_passes", "long_walk",
-    "ready", "volume",
-]  # fmt: skip
-
-
 MODELS = ("standard_dipole", "better_dipole", "directional_dipole", "photon_beam_diffusion", "neural")
 OF_OBJECTS = tuple(name for name in ("neural_shape", "full_geometry") if name in model_names())
 WALK = "translucent_walk"

@@ -16,13 +16,6 @@ import numpy as np
 from halfspace_sss.backend import BackendError
 from halfspace_sss.checks import check_choice, check_count, check_finite, check_interval
 
-__all__ = [
-    "FLIP", "LARGEST", "PIXELS_PER_DEGREE", "RELATIVE_MSE", "Difference", "Shot", "absent", "check_denoiser",
-    "check_image", "compared", "denoised", "exposure_range", "flip_hdr", "flip_ldr", "guides", "luminance",
-    "mean_flip", "noise_of", "relative_mse", "srgb", "stops_of",
-]  # fmt: skip
-
-
 LARGEST = 1e12  # radiance; squares of it, as tone mapping takes them, still fit float32
 
 

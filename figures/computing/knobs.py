@@ -26,8 +26,6 @@ from halfspace_sss.trade.assessing import assess_stage
 from halfspace_sss.trade.results import ObjectTrade
 from halfspace_sss.trade.ways import Stage, Way
 
-__all__ = ["Setting", "channel_settings", "entry_settings", "node_settings", "precision_settings"]
-
 ENTRIES, NODES = (1, 2, 4, 8), (4, 8, 16, 32, 64)
 BEAMS, USUAL_NODES, QUERIES = "photon_beam_diffusion", 16, 2**14
 PRECISIONS, LANES, REPEATS = ("float32", "float16"), 2**18, 3

@@ -20,12 +20,6 @@ from halfspace_sss.neural.symmetric import channels
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.provenance import check_folder
 
-__all__ = [
-    "FULL_GEOMETRY", "SHAPES", "TRAINING", "TRAIN_SECONDS", "accepting", "object_parts", "shape_of", "train_modelled",
-    "train_scan", "training_of", "weight_files", "weights_in", "with_weights",
-]  # fmt: skip
-
-
 SHAPES = ("bunny", "candle")
 
 

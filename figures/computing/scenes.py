@@ -13,12 +13,6 @@ from figures.parts.store import read_exr
 from halfspace_sss.checks import check_choice
 from halfspace_sss.provenance import check_folder
 
-__all__ = [
-    "BUNNY", "DRAGON", "ENVIRONMENTS", "MATERIALS", "MM_PER_UNIT", "SCANS", "Scan", "bunny_scene", "environment",
-    "environment_file", "long_render", "prepare", "scan_scene", "surroundings",
-]  # fmt: skip
-
-
 BUNNY = Path(__file__).parent.parent / "assets" / "bunny.ply"
 DRAGON = BUNNY.with_name("dragon.ply")
 MM_PER_UNIT = 3.8  # the bunny is 37 mm tall

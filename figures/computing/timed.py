@@ -12,8 +12,6 @@ import numpy as np
 from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.progress import Progress
 
-__all__ = ["TimedRender", "alternating", "pass_size", "rendered"]
-
 MOST_LANES = 2**22  # camera rays of a pass, for memory
 GROWTH, TOLERANCE, MOST_TRIALS = 16, 0.15, 8  # of the number of samples of a pass that is looked for
 

@@ -12,8 +12,6 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullForma
 from figures.drawing.style import TEXT, TRACED, look, paper, saved
 from halfspace_sss.comparison.curve_set import Curve, CurveSet
 
-__all__ = ["draw", "render"]
-
 RATIO_SPAN = 12.0  # the ratio panels show 1/12 to 12 at most; what is beyond lies at the edge of the panel
 MOST_COLUMNS = 4
 

@@ -13,8 +13,6 @@ from figures.drawing.style import look
 if TYPE_CHECKING:
     import pandas
 
-__all__ = ["equal_error", "furnace", "in_markdown", "label", "markdown", "sampling"]
-
 LATE_ROULETTE = volume(200)  # the usual setting of volpathmis for media that hardly absorb
 WANTED = 0.02  # noise of an image, root mean square over that of the image, at which a training is held against time
 CERTAIN = 2.0  # standard errors by which an error must stand out of the noise of the truth

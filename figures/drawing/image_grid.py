@@ -19,8 +19,6 @@ from matplotlib.textpath import TextPath
 from figures.computing.images import FLIP, Shot, absent, srgb
 from figures.drawing.style import TEXT
 
-__all__ = ["Crop", "image_grid"]
-
 GAP, ROW_GAP, TITLE, CAPTION, NAME = 0.035, 0.07, 0.17, 0.13, 0.16  # inches
 CROP_COLORS = ("#E69F00", "#56B4E9", "#009E73")
 PALE, GREY = "#f5f5f5", "#8a8a8a"

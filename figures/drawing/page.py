@@ -19,8 +19,6 @@ from figures.computing.images import FLIP, RELATIVE_MSE, Shot, denoised, guides,
 if TYPE_CHECKING:
     from halfspace_sss.rendering.scenes.picture import Picture
 
-__all__ = ["page", "render"]
-
 
 DIFFERENCE_SPAN = 1.0  # relative difference at the ends of the colours
 MAPS = {

@@ -11,8 +11,6 @@ import matplotlib as mpl
 from matplotlib.backends.backend_pdf import FigureCanvasPdf
 from matplotlib.figure import Figure
 
-__all__ = ["COLUMN", "TEXT", "TRACED", "Look", "look", "paper", "saved"]
-
 COLUMN, TEXT = 3.35, 7.0  # widths of a column and of the text block, inches
 TRACED = "path_traced"
 

@@ -22,8 +22,6 @@ from halfspace_sss.trade.ways import GATHERED, NO_SINGLE
 if TYPE_CHECKING:
     import pandas
 
-__all__ = ["JOBS", "draw", "image_shots", "markdown", "multiples", "render", "trade_panels", "trade_table"]
-
 
 NOISE = 0.01  # of the mean radiance, to which times are
 LEAST = 0.003  # smallest bias that is drawn; what is below lies there, an arrow down

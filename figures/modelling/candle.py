@@ -24,8 +24,6 @@ from full_geometry.learning.meshes import (
     surface,
 )
 
-__all__ = ["FLAME", "Candle", "make_candle"]
-
 BOX = Box((-33.0, -1.0, -33.0), (33.0, 71.0, 33.0))
 RADIUS, HEIGHT, POOL = 28.0, 64.0, 40.0
 BOWL = 22.5  # radius at the rim

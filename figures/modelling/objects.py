@@ -17,12 +17,6 @@ from halfspace_sss.materials.files import parse
 from halfspace_sss.materials.material import Material
 from halfspace_sss.provenance import write_atomically
 
-__all__ = [
-    "FLAME_RADIANCE", "OBJECTS", "TISSUES", "VARYING", "Grid", "Varying", "candle_parts", "learnable_parts",
-    "make_varying", "mixed", "tissue", "varying_parts",
-]  # fmt: skip
-
-
 TISSUES = Path(__file__).with_name("tissues.toml")
 
 Tissues = Callable[[np.ndarray], Mapping[str, np.ndarray]]

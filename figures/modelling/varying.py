@@ -25,9 +25,6 @@ from full_geometry.learning.meshes import (
     twisted,
 )
 
-__all__ = ["CROISSANT_BOX", "MANDARIN_BOX", "MEAT_BOX", "Croissant", "Mandarin", "Meat"]
-
-
 MANDARIN_BOX = Box((-33.0, -1.5, -31.0), (40.0, 44.0, 66.0))
 RADIUS, HALF = 28.0, 20.5  # of the whole fruit, across and up
 N = 10  # segments

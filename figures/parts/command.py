@@ -17,8 +17,6 @@ from halfspace_sss.cli.shared import Bar, console
 if TYPE_CHECKING:
     from figures.parts.runner import Plan
 
-__all__ = ["figures_command"]
-
 DRAWING = ("PIL", "flip_evaluator", "matplotlib")
 EXTRAS = ("PIL", "flip_evaluator", "matplotlib", "mitsuba")
 

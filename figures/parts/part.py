@@ -28,12 +28,6 @@ from halfspace_sss.interface.model import no_models
 from halfspace_sss.progress import Progress
 from halfspace_sss.rendering.object.registry import learnt_names, lookup, model_names
 
-__all__ = [
-    "PACKAGES", "QUALITIES", "Part", "Result", "Task", "canonical", "check_quality", "code_hash", "found_by_name",
-    "keys_of", "modules_of", "modules_reached", "unmodelled",
-]  # fmt: skip
-
-
 PACKAGES = ("figures", "full_geometry", "analytic_models", "halfspace_sss")
 MACHINERY = "figures.parts"  # keeps and orders what parts compute, and computes nothing of it
 RENDERS = "halfspace_sss.rendering.object.registry"  # is imported by all that finds models of objects

@@ -19,8 +19,6 @@ from halfspace_sss.checks import check_choice
 from halfspace_sss.progress import ProgressText
 from halfspace_sss.provenance import check_folder, provenance, write_together
 
-__all__ = ["Plan", "Projected", "compute", "draw", "duration", "figure", "plan", "projected"]
-
 
 class Projected(NamedTuple):
     """Seconds that a part will take and where that is known from; None and "" if nothing like it was measured."""

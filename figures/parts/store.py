@@ -17,8 +17,6 @@ from figures.parts.part import Part, Result, canonical
 from halfspace_sss.backend import BackendError, two_threads
 from halfspace_sss.provenance import provenance, write_together
 
-__all__ = ["DamagedPartError", "PartStore", "exr_bytes", "read_exr"]
-
 
 def _mitsuba() -> tuple[type, type]:
     """Bitmap and MemoryStream, which need no variant."""

@@ -34,8 +34,6 @@ if TYPE_CHECKING:
     from halfspace_sss.neural.training.fit import Budget
     from halfspace_sss.physics.medium import Medium
 
-__all__ = ["ablation_command"]
-
 
 def ablation_command(
     material: Annotated[

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 
     app: typer.Typer
 
-__all__ = ["app", "main"]
-
 _OWN = {
     "bench": "bench_command",
     "curves": "curves_command",

@@ -17,8 +17,6 @@ from halfspace_sss.provenance import check_folder, provenance, write_together
 if TYPE_CHECKING:
     from rich.table import Table
 
-__all__ = ["PARTS", "bench_command", "chosen_parts"]
-
 PARTS = ("walk", "volpath", "models", "maps")
 SECONDS = {"walk": 1, "volpath": 15, "models": 3, "maps": 100}  # about, for a row; only the time left depends on it
 TITLES = {

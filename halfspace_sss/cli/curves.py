@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     import pandas
     from rich.table import Table
 
-__all__ = ["curves_command", "error_table"]
-
 
 def curves_command(
     material: Annotated[str | None, typer.Argument(help="Name of a material; see `halfspace-sss materials`.")] = None,

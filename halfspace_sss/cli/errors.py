@@ -42,8 +42,6 @@ if TYPE_CHECKING:
     from halfspace_sss.physics.medium import Medium
     from halfspace_sss.rendering.scenes.learners import ObjectError
 
-__all__ = ["OBJECT_DEFINITION", "errors_command", "object_table"]
-
 EVENTS, BLOCK, BACKEND, VARIANT = 2e7, 4, "llvm", "llvm_ad_rgb"  # events for each medium
 EXITS = 256  # of an object
 SQUARE = ("error_square", "error_square_standard_error")  # what a printed error is made of

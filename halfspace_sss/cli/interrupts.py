@@ -10,8 +10,6 @@ import threading
 from types import FrameType
 from typing import Any
 
-__all__ = ["Interrupts", "interrupts"]
-
 WAIT = 0.02  # seconds; until an interrupt during an import is heard again
 _ENDS = (signal.SIGINT, signal.SIGTERM)
 PATIENCE = 3.0  # seconds; until it is said that a kernel, in which Python hears nothing, has to end first

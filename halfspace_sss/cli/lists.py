@@ -9,8 +9,6 @@ import typer
 
 from halfspace_sss.cli.shared import check_left_out, console
 
-__all__ = ["materials_command", "models_command"]
-
 
 def materials_command(
     name: Annotated[str | None, typer.Argument(help="A material, to show all of it; or the word `import`.")] = None,

@@ -32,8 +32,6 @@ if TYPE_CHECKING:
     from halfspace_sss.maps.grid import MapGrid
     from halfspace_sss.physics.medium import Medium
 
-__all__ = ["maps_command"]
-
 TARGET_ERROR = 0.05
 
 

@@ -34,8 +34,6 @@ if TYPE_CHECKING:
     from halfspace_sss.rendering.scenes.reference import Limits
     from halfspace_sss.rendering.scenes.reference_store import Reference
 
-__all__ = ["render_command"]
-
 SPP = 64
 ENDINGS = ("png", "html", "denoised.exr", "denoised.png")  # of what is drawn
 PHASES = ("walks.exr", "walks.json", "model.exr", "model.json")  # of an image with walks in it

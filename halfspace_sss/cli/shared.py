@@ -27,13 +27,6 @@ if TYPE_CHECKING:
 
     from halfspace_sss.physics.medium import Medium
 
-__all__ = [
-    "Albedo", "Backend", "Bar", "Channels", "Commands", "Define", "Eta", "Materials", "MeanCosine", "ObjectId",
-    "OutFolder", "SampleSeed", "SensorNumber", "SigmaT", "Variant", "by_channel", "check_channel", "check_left_out",
-    "console", "defined", "fig10_medium", "numbers", "set_quiet", "stated_medium", "tell", "tell_interrupt",
-    "use_mitsuba", "whole", "with_quiet",
-]  # fmt: skip
-
 
 def _end(message: str, code: int) -> typer.Exit:
     """The exit that ends the command, after one line on stderr."""

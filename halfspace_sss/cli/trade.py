@@ -31,8 +31,6 @@ if TYPE_CHECKING:
     from halfspace_sss.trade.advice import Advice, Job
     from halfspace_sss.trade.results import ObjectTrade, WayTrade
 
-__all__ = ["SHIPPED", "object_table", "trade_command"]
-
 SHIPPED = "trade.csv"  # in the package: five materials, two shapes, two lights
 TOLERANCE, IMAGES, ASSESS = 0.05, 1, 4.0
 

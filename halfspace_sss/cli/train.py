@@ -38,8 +38,6 @@ if TYPE_CHECKING:
     from halfspace_sss.physics.medium import Medium
     from halfspace_sss.rendering.scenes.learners import LearntObject
 
-__all__ = ["trainings"]
-
 HELP = "Train networks on path tracing: models find them by the medium, and by the shape of an object."
 SWITCHES = {"--scene": "object", "--shapes": "shapes", "--universal": "universal"}  # of one command for all
 RENAMED = {"--start": "--base-model"}

@@ -18,8 +18,6 @@ from halfspace_sss.cli.shared import Bar, console, whole
 from halfspace_sss.comparison.truths import MEASURES, Z_LIMIT, Comparison, Truth, Validation, validate
 from halfspace_sss.provenance import check_folder, provenance, write_together
 
-__all__ = ["row_filter", "summary", "validate_command", "write_results"]
-
 KINDS = ("published", "thirdparty", "exact")
 
 

@@ -28,11 +28,6 @@ from halfspace_sss.physics.reflectance import _inverse
 from halfspace_sss.tracing.tallies import AngularTally, FluxTally
 from halfspace_sss.tracing.walk import pass_seed, walk
 
-__all__ = [
-    "MAP_MEDIA", "MEDIA", "ROULETTE_DEPTHS", "bench_maps", "bench_models", "bench_volpath", "bench_walk", "machine",
-    "peak_memory",
-]  # fmt: skip
-
 MEDIA = ((0.75, 0.0, 1.3), (0.99, 0.0, 1.5), (0.999, 0.9, 1.3))
 MAP_MEDIA = ((0.75, 0.0, 1.3), (0.99, 0.8, 1.5))
 ROULETTE_DEPTHS = (5, 64, 256, 1024)

@@ -11,8 +11,6 @@ from halfspace_sss.interface.model import BSSRDF
 from halfspace_sss.maps.noisy_maps import CellGrid, Groups, radial_edges
 from halfspace_sss.physics.backbone import unwarp
 
-__all__ = ["cell_energies", "evaluated"]
-
 N_U, FIRST_N_PSI, LAST_N_PSI = 2, 6, 48  # Gauss points of a cell
 BRIGHT = 4  # directions of observation, of 16, on which convergence is tried
 CONVERGED = 3e-3  # of their energy

@@ -20,8 +20,6 @@ from halfspace_sss.provenance import check_folder, provenance, write_together
 if TYPE_CHECKING:
     import pandas
 
-__all__ = ["TRACED", "Curve", "CurveSet", "range_edges"]
-
 TRACED = "path_traced"
 UNITS = {
     "theta_i_deg": "degree, w_i from the normal",

@@ -28,11 +28,6 @@ from halfspace_sss.progress import NamedProgress
 if TYPE_CHECKING:
     import pandas
 
-__all__ = [
-    "GRID", "ModelError", "TracedMaps", "bands", "error_table", "held_out_media",
-    "losses", "model_error", "percentiles", "reference_maps", "references",
-]  # fmt: skip
-
 
 SET = 8  # directions of a set, each towards each at two azimuths
 

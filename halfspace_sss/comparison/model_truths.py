@@ -26,8 +26,6 @@ from halfspace_sss.progress import NamedProgress
 if TYPE_CHECKING:
     import pandas
 
-__all__ = ["SampledExits", "exits", "reflectance_truths", "sampled_reflectance", "truth_summary", "truths_cost"]
-
 
 LOBES = ((0.6, 0.3), (0.95, 0.03))  # mean cosine about the mirrored direction, width in azimuth of the position
 NEAR = (1e-3, 50.0)  # mean free paths; their distances are uniform in the logarithm

@@ -24,8 +24,6 @@ from halfspace_sss.progress import Progress
 from halfspace_sss.tracing.passes import launch_shape
 from halfspace_sss.tracing.tracer import Line, trace, trace_curve
 
-__all__ = ["FIG10_THETA_I", "curves", "default_paths", "default_range"]
-
 FIG10_THETA_I = (0.0, 30.0, 60.0, 75.0)
 REFLECTANCE_POINTS = 2**12
 MOST_MFP = 100.0  # transport mean free paths, end of the range where nothing is absorbed

@@ -21,12 +21,6 @@ from halfspace_sss.tracing.passes import Estimate, estimate, walk_passes
 from halfspace_sss.tracing.tracer import Trace, trace
 from halfspace_sss.tracing.walk import Boundary, Scatter
 
-__all__ = [
-    "MEASURES", "Z_LIMIT", "Comparison", "NotCovered", "Truth", "Validation", "read_truths", "trace_order",
-    "validate",
-]  # fmt: skip
-
-
 TABLE = Path(__file__).parent / "data" / "truths.csv"
 MEASURES = {
     "R_d": "R_d",

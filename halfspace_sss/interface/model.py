@@ -23,23 +23,6 @@ from halfspace_sss.physics.fresnel import C_phi, F_t, mu_internal
 from halfspace_sss.physics.layers import Layers
 from halfspace_sss.physics.medium import Medium, medium_of
 
-__all__ = [
-    "BSSRDF",
-    "DirectionSample",
-    "PositionSample",
-    "Query",
-    "RadialSampler",
-    "Separable",
-    "bssrdf",
-    "check_allowed",
-    "exit_normaliser",
-    "model_class",
-    "models",
-    "no_models",
-    "recorded_in_blocks",
-    "register_model",
-]
-
 
 @dataclass(frozen=True)
 class Query:

@@ -11,9 +11,6 @@ from halfspace_sss.arrays import library
 from halfspace_sss.physics.backbone import length_scale, unwarp, warp
 from halfspace_sss.physics.medium import Medium
 
-__all__ = ["RANGES", "MapGrid", "cell_edges", "draw_media", "map_directions", "radial_scale"]
-
-
 R_SMALLEST, R_LARGEST = 0.02, 12.0  # first edge in min(L, mfp), last edge in L
 MOST_THETA, MOST_CELLS = 4096, 2**22  # 3 GiB for the maps of one direction of incidence
 

@@ -21,8 +21,6 @@ from halfspace_sss.tracing.passes import PATHS_PER_LANE
 from halfspace_sss.tracing.tallies import CellSums
 from halfspace_sss.tracing.walk import Boundary, Scatter, pass_seed, walk
 
-__all__ = ["MapUnit", "UnitResult", "trace_unit"]
-
 GROUP = 16  # observations that share a walk
 HITS = 2  # scores per event, one in each half of the summed contributions
 MAP_BATCHES = 16

@@ -27,19 +27,6 @@ from halfspace_sss.provenance import write_atomically
 from halfspace_sss.tracing.tallies import CellSums
 from halfspace_sss.tracing.walk import Scatter, WalkConstants, pass_seed, walk
 
-__all__ = [
-    "CellGrid",
-    "Groups",
-    "MapLaunch",
-    "backbone_mass",
-    "draw_directions",
-    "load_maps",
-    "looking_back",
-    "make_pool",
-    "radial_edges",
-    "trace_groups",
-]
-
 LANES = 32768  # of one launch, at most
 FIRST_R = 0.02  # of min(L, mfp): smallest distance in the maps
 LEAST_ALBEDO = 1e-4  # G/albedo² of darker media is that of this one to 1e-4

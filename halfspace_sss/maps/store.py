@@ -30,11 +30,6 @@ from halfspace_sss.provenance import naming, provenance
 if TYPE_CHECKING:
     import xarray as xr
 
-__all__ = [
-    "ASKED", "check_chunks", "check_written", "drop_cut_off", "load_maps", "make_maps", "unit_checksum",
-    "written_checksums",
-]  # fmt: skip
-
 
 ASKED = "halfspace_sss_maps"  # the attribute with medium, grid and numbers of walks
 COORDINATES, ATTRIBUTE = "checksums_of_coordinates", "checksum_of_halfspace_sss_maps"

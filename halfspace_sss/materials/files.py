@@ -19,8 +19,6 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-__all__ = ["parse", "read"]
-
 PER_MM = {"1/mm": 1.0, "1/cm": 10.0}  # divisors: 2.41 / 10 is 0.241, 2.41 * 0.1 is not
 COEFFICIENTS = (("sigma_s", "sigma_a"), ("sigma_s_prime", "sigma_a"), ("sigma_t", "albedo"))
 Quantity = Literal["sigma_s", "sigma_s_prime", "sigma_t", "sigma_a", "albedo", "g", "eta", "sample_ml"]

@@ -15,8 +15,6 @@ from halfspace_sss.checks import check_choice
 from halfspace_sss.materials.material import Material
 from halfspace_sss.physics.medium import Medium
 
-__all__ = ["import_materials", "to_toml"]
-
 CHANNELS = ("R", "G", "B")
 OPENPBR = {  # defaults of OpenPBR 1.1
     "subsurface_weight": 0.0, "subsurface_color": (0.8, 0.8, 0.8), "subsurface_radius": 1.0,

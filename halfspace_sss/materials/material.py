@@ -13,8 +13,6 @@ import numpy as np
 from halfspace_sss.interface.model import BSSRDF, bssrdf, models
 from halfspace_sss.physics.medium import Medium
 
-__all__ = ["Material", "key_of"]
-
 LONGEST_NAME = 80  # bytes in UTF-8; file systems end at 255
 
 

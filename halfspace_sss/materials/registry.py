@@ -20,8 +20,6 @@ from halfspace_sss.physics.medium import Medium
 if TYPE_CHECKING:
     import pandas
 
-__all__ = ["ENTRY_POINT_GROUP", "ENVIRONMENT_VARIABLE", "Registry", "load", "names", "one_channel", "register", "table"]
-
 
 ENVIRONMENT_VARIABLE = "HALFSPACE_SSS_MATERIALS"
 ENTRY_POINT_GROUP = "halfspace_sss.materials"

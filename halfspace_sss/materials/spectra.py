@@ -19,8 +19,6 @@ from halfspace_sss.physics.medium import Medium
 from halfspace_sss.physics.reflectance import DIFFUSE, half_space_reflectance
 from halfspace_sss.provenance import read_text
 
-__all__ = ["RGBMedium", "SpectralMedium", "read_spectra"]
-
 PER_MM = {"1/mm": 1.0, "1/cm": 10.0}
 COLUMNS = ("wavelength", "mu_a", "mu_s", "g", "n")
 VISIBLE = (400.0, 700.0)  # nm; outside, colour-matching functions are below 2 % of their maximum, 4 % for z

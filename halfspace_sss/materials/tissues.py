@@ -27,8 +27,6 @@ from halfspace_sss.checks import check_choice, check_interval
 from halfspace_sss.materials.spectra import SpectralMedium
 from halfspace_sss.physics.layers import Layers
 
-__all__ = ["TISSUES", "Skin", "Tissue", "published_tissue", "skin", "tissue"]
-
 HAEMOGLOBIN = 150 / 64500  # mol/l in whole blood
 EPIDERMIS_MM = 0.06
 RANGE, FAT_RANGE = (250.0, 1000.0), (450.0, 1000.0)  # nm, of the tables

@@ -15,8 +15,6 @@ from halfspace_sss.neural.universal import load_hypernetwork, shipped_weights
 from halfspace_sss.physics.backbone import backbone_shape, length_scale
 from halfspace_sss.physics.fresnel import F_t
 
-__all__ = ["neural_S"]
-
 
 def neural_S(sigma_t: Any, albedo: Any, g: Any, eta: Any, r: Any, mu_i: Any, phi_i: Any, mu_o: Any, phi_o: Any) -> Any:
     """S of order >= 2 of the model `neural` in 1/(mm² sr), differentiable in all arguments, torch or Dr.Jit.

@@ -12,8 +12,6 @@ from halfspace_sss.arrays import library
 from halfspace_sss.interface.model import Query
 from halfspace_sss.physics.backbone import U_MAX, warp
 
-__all__ = ["N_FEATURES", "N_MEDIUM", "medium_features", "symmetric_features", "travel"]
-
 N_FEATURES, N_MEDIUM = 13, 9
 R_SMALLEST = 0.01  # of min(L, mfp): below it the learnt factor stays as it is there
 DEPTHS = (0.25, 1.0, 4.0)  # mean free paths along the refracted rays; L is the fourth

@@ -15,11 +15,6 @@ from halfspace_sss.neural.network import Network, layer_shapes
 from halfspace_sss.physics.backbone import length_scale
 from halfspace_sss.physics.medium import Medium
 
-__all__ = [
-    "CALIBRATION", "N_TERMS", "Hypernetwork", "Layers", "chebyshev", "check_range", "in_range", "log_calibration",
-    "named_layers",
-]  # fmt: skip
-
 Layers = tuple[tuple[np.ndarray, np.ndarray], ...]  # matrix (inputs, outputs) and bias of each
 
 

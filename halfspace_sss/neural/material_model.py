@@ -12,8 +12,6 @@ from halfspace_sss.neural.store import check_medium, find_weights, load_weights,
 from halfspace_sss.neural.symmetric import SymmetricModel, channels
 from halfspace_sss.physics.medium import Medium
 
-__all__ = ["KIND", "NeuralMaterial", "load_network", "network_arrays"]
-
 KIND = "neural_material"
 
 

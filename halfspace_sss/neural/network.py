@@ -12,8 +12,6 @@ import numpy as np
 
 from halfspace_sss.neural.perceptron import Perceptron, relu, silu
 
-__all__ = ["RELU", "SILU", "Activation", "Network", "layer_shapes"]
-
 NUMPY_BLOCK = 4096  # queries whose activations stay in the cache
 
 

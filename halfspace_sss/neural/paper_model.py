@@ -15,8 +15,6 @@ from halfspace_sss.physics.backbone import U_MAX, length_scale
 from halfspace_sss.physics.fresnel import F_t
 from halfspace_sss.physics.medium import Medium
 
-__all__ = ["KIND", "N_INPUTS", "NeuralPaper", "paper_inputs", "query_inputs"]
-
 KIND, N_INPUTS = "neural_paper", 6
 RADIUS = 4.0  # L; positions are divided by it
 T_SMALLEST = 1e-6  # product of transmittances; the network holds S, which is 0 where they are

@@ -14,8 +14,6 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["Perceptron", "cooperative", "hard_swish", "relu", "silu"]
-
 MOST_IN_HALF = 256.0  # of an input, which are of order one: a layer with weights of order one stays below 65504
 PACKET = 4  # numbers of a row that loops read at once
 

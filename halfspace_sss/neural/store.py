@@ -22,22 +22,6 @@ from halfspace_sss.checks import check_interval
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.provenance import check_folder, read_bytes, read_text, write_together
 
-__all__ = [
-    "ENVIRONMENT_VARIABLE",
-    "FORMAT",
-    "check_medium",
-    "check_weights_folder",
-    "checksum_of",
-    "find_weights",
-    "load_weights",
-    "record_count",
-    "record_number",
-    "save_weights",
-    "to_json",
-    "weights_folder",
-    "weights_name",
-]
-
 FORMAT = 1
 LARGEST = 1e4  # no weight of a network that works is as large
 

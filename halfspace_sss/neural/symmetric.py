@@ -14,8 +14,6 @@ from halfspace_sss.neural.network import Network
 from halfspace_sss.physics.backbone import backbone_shape, length_scale
 from halfspace_sss.physics.medium import Medium
 
-__all__ = ["LOG_RANGE", "SymmetricModel", "channel_queries", "channels", "factored_G"]
-
 LOG_RANGE = 30.0  # bound of the logarithm of the learnt factor
 
 

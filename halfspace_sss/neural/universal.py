@@ -16,8 +16,6 @@ from halfspace_sss.neural.store import load_weights, record_count
 from halfspace_sss.neural.symmetric import SymmetricModel, channels
 from halfspace_sss.physics.medium import Medium
 
-__all__ = ["Neural", "hypernetwork_of", "load_hypernetwork", "shipped_weights"]
-
 KIND = "neural"
 
 

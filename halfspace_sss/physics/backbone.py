@@ -13,8 +13,6 @@ import numpy as np
 
 from halfspace_sss.arrays import library
 
-__all__ = ["LONGEST", "U_MAX", "backbone", "backbone_shape", "length_scale", "unwarp", "warp"]
-
 LONGEST = 20.0  # transport mean free paths; caps the length scale where nothing absorbs
 U_MAX = 12.0  # beyond this u the learnt factor stays as it is there
 NEAR = 0.05  # mean free paths; bounds the near term at r = 0

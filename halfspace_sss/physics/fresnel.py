@@ -10,11 +10,6 @@ import numpy as np
 
 from halfspace_sss.arrays import library
 
-__all__ = [
-    "C_1", "C_2", "C_E", "C_phi", "F_r", "F_t", "boundary_A", "boundary_A_jensen", "mu_external",
-    "mu_internal", "published_polynomial_2C_1", "published_polynomial_3C_2",
-]  # fmt: skip
-
 
 def _matched(eta: Any) -> bool:
     """Whether the index is the number 1, for which formulas shorten to exact ones; arrays are masked instead."""

@@ -9,8 +9,6 @@ from dataclasses import dataclass
 
 from halfspace_sss.physics.medium import Medium, check_scalar_medium, medium_of
 
-__all__ = ["Layers"]
-
 
 @dataclass(frozen=True)
 class Layers:

@@ -15,15 +15,6 @@ import numpy as np
 from halfspace_sss.arrays import library
 from halfspace_sss.physics.reflectance import DIFFUSE, albedo_of_reflectance, half_space_reflectance
 
-__all__ = [
-    "Medium",
-    "check_ratios",
-    "check_scalar_medium",
-    "eval_hg",
-    "medium_of",
-    "sample_hg",
-]
-
 
 def _check(name: str, value: np.ndarray, ok: np.ndarray, bound: str) -> None:
     if not np.all(ok):

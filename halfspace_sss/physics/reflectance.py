@@ -30,8 +30,6 @@ from threadpoolctl import ThreadpoolController
 
 from halfspace_sss.physics.fresnel import F_r, F_t, mu_internal
 
-__all__ = ["DIFFUSE", "albedo_of_reflectance", "half_space_reflectance"]
-
 DIFFUSE = "diffuse"
 NODES = 96
 DEGREE = 64  # of ln(R / albedo) as a polynomial of x, s = x / (c + (1 - c) x), s² = 1 - albedo'

@@ -22,10 +22,6 @@ from halfspace_sss.checks import rounding
 from halfspace_sss.physics.fresnel import F_t, mu_external, mu_internal
 from halfspace_sss.physics.medium import Medium, eval_hg
 
-__all__ = [
-    "Contribution", "VertexSample", "brdf", "contribution", "exitance", "moments", "reflectance", "sample_vertex",
-]  # fmt: skip
-
 TINY = 1e-30
 _RANGES = dict.fromkeys(("phi", "delta_phi"), (-math.inf, math.inf)) | dict.fromkeys(("r", "s"), (0.0, math.inf))
 _NUMPY = library(0.0)

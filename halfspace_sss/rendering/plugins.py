@@ -8,8 +8,6 @@ from halfspace_sss.backend import BackendError, prepare_llvm, two_threads
 from halfspace_sss.rendering.object.settings import VARIANTS, variant_channels
 from halfspace_sss.rendering.scenes.scene_files import plainly
 
-__all__ = ["register"]
-
 _active = False
 _lock = threading.Lock()
 

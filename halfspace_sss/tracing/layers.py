@@ -26,8 +26,6 @@ from halfspace_sss.tracing.passes import Estimate, checked_radii, estimate, walk
 from halfspace_sss.tracing.tallies import BATCHES, CellSums, find_cell
 from halfspace_sss.tracing.walk import Boundary, generator, in_launches, roulette, turn
 
-__all__ = ["LAYER_ORDERS", "LayerTrace", "trace_layers"]
-
 LAYER_ORDERS = ("unscattered", "single", "multiple", "total")  # 0, 1, 2 or more events, and their sum
 
 

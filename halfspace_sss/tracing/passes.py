@@ -18,11 +18,6 @@ from halfspace_sss.progress import Progress
 from halfspace_sss.tracing.tallies import BATCHES, CellSums
 from halfspace_sss.tracing.walk import Tally, pass_seed, walk
 
-__all__ = [
-    "ORDERS", "PATHS_PER_LANE", "Estimate", "Pass", "checked_radii", "estimate", "launch_shape", "order_sum",
-    "walk_passes",
-]  # fmt: skip
-
 ORDERS = ("single", "multiple", "total")
 PATHS_PER_LANE, MAX_LANES = 64, 131072
 

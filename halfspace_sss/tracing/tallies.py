@@ -16,8 +16,6 @@ from halfspace_sss.physics.fresnel import mu_internal
 from halfspace_sss.physics.medium import eval_hg
 from halfspace_sss.tracing.walk import Boundary, Scatter
 
-__all__ = ["BATCHES", "AngularTally", "CellSums", "FluxTally", "LineTally", "MomentTally", "RingTally", "find_cell"]
-
 FIXED_POINT = 2.0**32  # quantum 2.3e-10 of a unit weight; a cell holds up to 4e9 unit weights
 BATCHES = 64  # independent groups of lanes, from whose spread the variance of a cell is taken
 

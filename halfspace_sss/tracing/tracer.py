@@ -17,11 +17,9 @@ from halfspace_sss.physics.layers import Layers
 from halfspace_sss.physics.medium import Medium, check_scalar_medium, medium_of
 from halfspace_sss.progress import Progress
 from halfspace_sss.tracing.layers import LayerTrace, trace_layers
-from halfspace_sss.tracing.passes import ORDERS, Estimate, checked_radii, estimate, order_sum, walk_passes
+from halfspace_sss.tracing.passes import Estimate, checked_radii, estimate, order_sum, walk_passes
 from halfspace_sss.tracing.tallies import AngularTally, FluxTally, LineTally, MomentTally, RingTally
 from halfspace_sss.tracing.walk import Tally
-
-__all__ = ["ORDERS", "CurveTrace", "Estimate", "Line", "Trace", "trace", "trace_curve"]
 
 
 @dataclass(frozen=True, repr=False)

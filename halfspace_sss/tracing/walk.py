@@ -19,11 +19,6 @@ import numpy as np
 from halfspace_sss.physics.fresnel import F_r
 from halfspace_sss.physics.medium import Medium, check_ratios, sample_hg
 
-__all__ = [
-    "Boundary", "Scatter", "Tally", "WalkConstants", "generator", "in_launches", "pass_seed", "roulette", "turn",
-    "walk",
-]  # fmt: skip
-
 # least variance x time over the media (albedo, g, eta) = (0.75, 0, 1.3), (0.99, 0, 1.5), (0.999, 0.9, 1.3)
 ROULETTE_WEIGHT, ROULETTE_BOOST = 0.3, 3.0
 # Albedo 1 never absorbs: roulette at each doubling of the number of events from LONG_PATH on. As P(order > N) ~ N^-1/2,

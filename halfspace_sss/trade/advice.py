@@ -23,8 +23,6 @@ from halfspace_sss.trade.assessing import assess
 from halfspace_sss.trade.results import Assessment, ObjectTrade, WayTrade, html_table, samples_for
 from halfspace_sss.trade.ways import GATHERED, LAMBERT, Way
 
-__all__ = ["Advice", "ObjectAdvice", "Option", "Job", "advise", "recommend"]
-
 INTEGRATOR = "bssrdf"
 DARK = "no light comes from it, every way shows it black"
 

@@ -30,8 +30,6 @@ from halfspace_sss.trade.statistics import (
 )
 from halfspace_sss.trade.ways import GATHERED, Stage, Way, stage, ways
 
-__all__ = ["EXITS", "assess", "assess_for", "assess_stage", "contenders", "training_seconds"]
-
 EXITS = 160  # few: their choice makes 6 % of a bias uncertain, and each gets the more samples
 TRACED_SHARE = 0.4  # of the time, for the walks that all ways are compared with
 FIRST_SHARE = 0.3  # of the time, for the look at all ways

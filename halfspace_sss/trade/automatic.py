@@ -28,8 +28,6 @@ from halfspace_sss.trade.assessing import assess_stage
 from halfspace_sss.trade.results import ObjectTrade, WayTrade
 from halfspace_sss.trade.ways import GATHERED, LAMBERT, Stage, Way
 
-__all__ = ["ENVIRONMENT_VARIABLE", "Pick", "choices_folder", "choose", "picked"]
-
 ENVIRONMENT_VARIABLE = "HALFSPACE_SSS_CHOICES"
 DEFAULT = "neural"
 EXITS = 96  # of each object

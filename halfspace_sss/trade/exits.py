@@ -13,8 +13,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-__all__ = ["Exits", "visible_exits"]
-
 LAUNCH, LAUNCHES = 2**16, 16  # rays of a look at the scene, and the most looks for an object that is hardly seen
 FEWEST = 32  # exits of an object that is assessed
 CHAIN = 4  # boundaries that light of a lamp may meet without scattering, mirrored by all or passing through

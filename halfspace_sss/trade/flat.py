@@ -23,8 +23,6 @@ from halfspace_sss.noise_free import NoiseFree
 from halfspace_sss.physics.medium import Medium, medium_of
 from halfspace_sss.trade.results import html_table
 
-__all__ = ["FlatAdvice", "FlatOption", "recommend_flat"]
-
 EVENTS = 4e6  # of the walks of each channel
 QUERIES = 2**12
 REACH = (0.02, 60.0)  # mean free paths that are compared where no range is given

@@ -18,8 +18,6 @@ from halfspace_sss.trade.sampling import radiance
 from halfspace_sss.trade.statistics import seeded
 from halfspace_sss.trade.ways import Stage, Way, stage
 
-__all__ = ["TradePicture", "picture_of", "small_images", "with_flip"]
-
 SIDE, SPP = 40, 32
 
 

@@ -14,8 +14,6 @@ from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED
 if TYPE_CHECKING:
     import pandas
 
-__all__ = ["Z_UPPER", "Assessment", "ObjectTrade", "WayTrade", "html_table", "samples_for"]
-
 
 @dataclass(frozen=True)
 class WayTrade:

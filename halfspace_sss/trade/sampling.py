@@ -20,8 +20,6 @@ from halfspace_sss.trade.exits import Exits
 from halfspace_sss.trade.statistics import RadianceEstimate, seeded
 from halfspace_sss.trade.ways import Stage, Way
 
-__all__ = ["Sampled", "first_sample", "radiance", "sample_more", "warm_up"]
-
 LANES = 2**18  # of a launch
 PILOT, FEWEST = 64, 8  # samples of each exit by which the time is foreseen, and of a launch that is worth it
 LEAST_SHARE = 0.2  # of the time of a launch that its samples take

@@ -21,11 +21,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-__all__ = [
-    "FIREFLIES", "Number", "RadianceEstimate", "joined", "mean_square", "mean_square_of_parts", "ratio_of_means",
-    "relative_variance", "seeded",
-]  # fmt: skip
-
 FIREFLIES = 1e-4  # share of samples, the brightest, that variances of a sample leave out
 
 

@@ -16,8 +16,6 @@ from halfspace_sss.rendering.paths.gathering import Gathering
 from halfspace_sss.rendering.paths.integrator import is_bssrdf
 from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED, load_objects
 
-__all__ = ["GATHERED", "LAMBERT", "NO_SINGLE", "Stage", "Way", "stage", "ways"]
-
 LAMBERT = "lambert"
 NO_SINGLE = "without single scattering"
 GATHERED = "gathered"

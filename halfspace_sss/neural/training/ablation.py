@@ -43,22 +43,6 @@ from halfspace_sss.progress import NamedProgress
 if TYPE_CHECKING:
     import pandas
 
-__all__ = [
-    "BUDGETS",
-    "VARIANTS",
-    "Factored",
-    "PlainTrial",
-    "SharedTurn",
-    "Variant",
-    "ablation",
-    "caption",
-    "cost",
-    "drawn_by_area",
-    "model_of",
-    "summary",
-    "trainings",
-]
-
 LOG_RANGE = 40.0  # of log(G/B); its exponential squared is still a float32
 DEPTH = 3
 

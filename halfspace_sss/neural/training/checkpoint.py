@@ -11,8 +11,6 @@ import torch
 
 from halfspace_sss.provenance import write_atomically
 
-__all__ = ["gone_on_with", "write"]
-
 Tensors = dict[str, torch.Tensor]
 
 

@@ -20,27 +20,6 @@ from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.neural.training import checkpoint
 from halfspace_sss.progress import NamedProgress
 
-__all__ = [
-    "ADAM",
-    "Budget",
-    "CpuSchedule",
-    "Descent",
-    "Fit",
-    "Fitted",
-    "Learnable",
-    "Objective",
-    "Samples",
-    "Schedule",
-    "Seconds",
-    "Source",
-    "Spent",
-    "Within",
-    "cosine",
-    "fit",
-    "torch_threads",
-    "warm_up",
-]
-
 LAST_RATE = 0.002  # of the largest
 WARM_UP_STEPS, WARM_UP_SHARE = 200, 0.02  # of a number of steps, of a budget
 

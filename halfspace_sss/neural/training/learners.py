@@ -19,8 +19,6 @@ from halfspace_sss.physics.backbone import backbone
 from halfspace_sss.physics.fresnel import F_t
 from halfspace_sss.physics.medium import Medium
 
-__all__ = ["Hyper", "PaperLearner", "Small", "apply_networks", "cell_loss", "initial_numbers", "relative_loss"]
-
 LOG_RANGE = 30.0
 
 

@@ -14,8 +14,6 @@ from halfspace_sss.maps.noisy_maps import CellGrid, Groups, backbone_mass, radia
 from halfspace_sss.neural.features import medium_features, symmetric_features
 from halfspace_sss.physics.backbone import length_scale, unwarp
 
-__all__ = ["Batch", "MapPool", "torch_library"]
-
 ENERGY_SHARE = 0.5  # of the queries of a batch follow the energy over u, the others are uniform in u
 TINY = 1e-30
 FLAT, STEEP = 1e-3, 8.0  # bounds of a slope

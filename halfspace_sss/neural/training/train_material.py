@@ -32,20 +32,6 @@ from halfspace_sss.physics.medium import Medium
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.provenance import check_folder, provenance
 
-__all__ = [
-    "FAST",
-    "STANDARD",
-    "SUBJECTS",
-    "MaterialRecipe",
-    "MaterialSubject",
-    "PaperSubject",
-    "TrainingSubject",
-    "TrainedChannel",
-    "Trial",
-    "train",
-    "train_channel",
-]
-
 VALIDATION_SEED = 104729
 VALIDATION_SETS = 4  # of 8 directions
 BLOCK = 2  # cells of a map put together for the validation error

@@ -39,8 +39,6 @@ from halfspace_sss.physics.medium import Medium
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.provenance import check_folder, provenance, write_atomically
 
-__all__ = ["Fluxes", "UniversalRecipe", "calibrated", "collect", "train_universal"]
-
 INTERVALS = 16  # of the cosine of exit
 COSINES = 2  # of incidence, of each medium
 MATCHED = 0.25  # of the media at least have eta = 1, where the network is weakest

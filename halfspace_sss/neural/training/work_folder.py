@@ -10,8 +10,6 @@ import halfspace_sss
 from halfspace_sss.neural.store import to_json
 from halfspace_sss.provenance import read_text, write_atomically
 
-__all__ = ["CHECKPOINT", "RUN", "claim"]
-
 RUN, CHECKPOINT = "run.json", "checkpoint.safetensors"
 WORK = ("maps-*.npy", "reflectances-*.npy", CHECKPOINT)
 

@@ -32,8 +32,6 @@ from halfspace_sss.rendering.object.points import AreaPoints, EntrySample, Surfa
 if TYPE_CHECKING:
     from halfspace_sss.rendering.object.body import TranslucentObject
 
-__all__ = ["PatchTransfer", "TransferRow", "patch_transfer"]
-
 PER_LENGTH = 1.0  # points over a transport mean free path
 FEWEST, MOST = 1024, 2048  # points: 13 MB to 50 MB for three channels
 SAMPLES = 2**21  # entries of all points

@@ -31,8 +31,6 @@ from halfspace_sss.rendering.object.shape import Geometry
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-__all__ = ["SurfacePoints", "uniform_entries"]
-
 REACH = 2.0  # h over the mean distance of points
 MOST_CELLS = 2**22
 R_3 = (

@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 
     from halfspace_sss.rendering.object.body import TranslucentObject
 
-__all__ = ["Albedo", "Incident", "Transfer", "cosine", "drawn", "transfer"]
-
 PER_LENGTH = 2.0  # points over a transport mean free path
 FEWEST, MOST = 1024, 8192  # points
 SAMPLES = 2**21  # entries of all points

@@ -22,9 +22,6 @@ import numpy as np
 
 from halfspace_sss.rendering.object.translucent import is_translucent
 
-__all__ = ["NARROW", "SmallEmitters", "Sun", "WIDE", "check_emitters", "is_delta", "spread", "suns_of"]
-
-
 # ---- Suns of an environment map -------------------------------------------------------------------------------------
 #
 # A path that meets the environment by chance finds a sun of solid angle Ω, which brings the share e of all light, with

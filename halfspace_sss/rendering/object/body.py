@@ -52,29 +52,6 @@ from halfspace_sss.rendering.object.shape import (
 from halfspace_sss.rendering.object.translucent import Inside, check_tints, is_translucent
 from halfspace_sss.rendering.object.varying import VaryingMedium, equivalent, warn_of_means
 
-__all__ = [
-    "Content",
-    "Contents",
-    "Expected",
-    "KnowsUnit",
-    "TranslucentObject",
-    "TranslucentObjects",
-    "check_geometry",
-    "check_sensors",
-    "check_size",
-    "check_surface",
-    "contents",
-    "expected_of",
-    "filled",
-    "make_objects",
-    "millimetres",
-    "object_of",
-    "outermost",
-    "places_of",
-    "refuse",
-    "translucent_shapes",
-]
-
 STARTS = 64  # rays of each sensor that are looked at
 LOOKS = 512  # rays that look for parts of a shape in an object
 DEEP = 1e-3  # of the size of an object: what reaches less deep stands at its surface

@@ -27,14 +27,6 @@ from halfspace_sss.rendering.object.settings import AUTOMATIC, Settings
 from halfspace_sss.rendering.object.shape import Geometry
 from halfspace_sss.rendering.object.translucent import VARIABLE
 
-__all__ = [
-    "HalfSpaceProposals",
-    "HalfSpaceTransport",
-    "Variation",
-    "area_share",
-    "half_space_model",
-]
-
 POINTS_PER_RATIO, MOST_POINTS = 60.0, 9  # candidates over the area
 
 

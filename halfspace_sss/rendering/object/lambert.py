@@ -12,8 +12,6 @@ from halfspace_sss.rendering.object.body import TranslucentObject
 from halfspace_sss.rendering.object.points import CosineProposals, EntrySample, ObjectModel, SurfacePoint, number
 from halfspace_sss.rendering.object.settings import Settings
 
-__all__ = ["LambertProposals", "LambertTransport", "lambert_model"]
-
 
 @dataclass(frozen=True, eq=False)
 class LambertTransport:

@@ -25,38 +25,6 @@ import numpy as np
 
 from halfspace_sss.rendering.object.shape import Geometry
 
-__all__ = [
-    "AreaPoints",
-    "CosineProposals",
-    "EntrySample",
-    "Frame",
-    "ObjectAlbedo",
-    "ObjectModel",
-    "Point",
-    "PositionSampler",
-    "Proposals",
-    "RadialTable",
-    "SurfacePoint",
-    "Transport",
-    "channel_mean",
-    "cosine_above",
-    "cosine_density",
-    "cosine_direction",
-    "lift",
-    "lifted",
-    "local_frame",
-    "mirrored",
-    "number",
-    "opposed",
-    "place",
-    "plane_query",
-    "refract_in",
-    "separation",
-    "sided",
-    "surface_point",
-    "turned",
-]
-
 
 class SurfacePoint(NamedTuple):
     """A point of a surface and a direction outside, which points away from it: an exit with w_o or an entry with w_i.

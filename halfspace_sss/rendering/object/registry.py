@@ -28,8 +28,6 @@ from halfspace_sss.rendering.object.settings import Settings
 if TYPE_CHECKING:
     import mitsuba as mi
 
-__all__ = ["AUTO", "Choices", "ModelEntry", "choices", "learnt_names", "lookup", "model_names"]
-
 AUTO = "auto"
 _BY_GROUP = once(offers)
 

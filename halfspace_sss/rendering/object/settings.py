@@ -8,19 +8,6 @@ from typing import Any
 
 from halfspace_sss.checks import check_choice, check_interval
 
-__all__ = [
-    "AUTOMATIC",
-    "GEOMETRIES",
-    "ORDERS",
-    "OF_MITSUBA",
-    "SHARED",
-    "Settings",
-    "VARIANTS",
-    "check_parameters",
-    "read_settings",
-    "variant_channels",
-]
-
 AUTOMATIC = -1.0
 ORDERS = ("total", "multiple", "single")
 GEOMETRIES = ("distance", "tangent")

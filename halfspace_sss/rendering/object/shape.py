@@ -12,21 +12,6 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-__all__ = [
-    "Geometry",
-    "RAYS",
-    "check_together",
-    "geometry_of",
-    "is_inside",
-    "name_of",
-    "number_of",
-    "rays_into",
-    "same_objects",
-    "scene_of",
-    "surface_of",
-    "survey",
-]
-
 MOST_COPIES = 1e-3  # share of the area in faces that exist twice, by which light may then be wrong
 CREASES = 0.01  # of the corners whose vertex normal may be on the other side of the face, as at sharp edges
 

@@ -55,18 +55,6 @@ from halfspace_sss.rendering.object.registry import model_names
 from halfspace_sss.rendering.object.settings import ORDERS, check_parameters, variant_channels
 from halfspace_sss.rendering.object.varying import constant_value, mean_of_grids, varying_medium
 
-__all__ = [
-    "Inside",
-    "PARAMETERS",
-    "VARIABLE",
-    "check_tints",
-    "is_smooth_boundary",
-    "is_translucent",
-    "read_inside",
-    "smooth_boundary",
-    "translucent_class",
-]
-
 REFLECTED, REFRACTED = 0, 1  # components
 
 

@@ -19,11 +19,6 @@ import numpy as np
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.object.shape import Geometry, crossings
 
-__all__ = [
-    "VaryingMedium", "constant_value", "equivalent", "eval_volume", "grid_values", "mean_of_grids", "varying_medium",
-    "warn_of_means",
-]  # fmt: skip
-
 POINTS = 2**15  # at which a medium is averaged over an object
 
 

@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from halfspace_sss.rendering.object.body import TranslucentObject
     from halfspace_sss.rendering.object.settings import Settings
 
-__all__ = ["ControlVariate", "ControlVariates"]
-
 FEWEST = 2**14  # points of an object at which light is gathered,
 PER_SAMPLE = 32  # of those that an exit sees, over the samples of a pixel: less noise than these leave,
 MOST_SHARE = 1 / 16  # of all samples,

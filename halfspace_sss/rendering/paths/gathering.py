@@ -30,8 +30,6 @@ if TYPE_CHECKING:
     from halfspace_sss.rendering.object.points import SurfacePoint
     from halfspace_sss.rendering.object.settings import Settings
 
-__all__ = ["PART", "TRACED", "Gathered", "Gathering", "GatheringPoint", "by_cosine", "by_emitters", "spreads"]
-
 DIRECTIONS = 2**20  # of all points of an object, by emitters, and as many by the cosine
 FEWEST, MOST = 64, 1024  # of a point
 PART = 1 / 8  # of the samples of a transfer

@@ -23,8 +23,6 @@ from halfspace_sss.rendering.paths.control_variate import ControlVariates
 from halfspace_sss.rendering.paths.gathering import Gathering
 from halfspace_sss.rendering.paths.path_loop import replay_paths, trace_paths
 
-__all__ = ["check_outermost", "check_parameters", "integrator_class", "launches", "replayer", "is_bssrdf"]
-
 SAMPLES_PER_LAUNCH = 2**20  # half a second on 2 cores
 GEOMETRY = ("to_world", "vertex_positions", "vertex_normals", "vertex_texcoords")
 

@@ -19,18 +19,6 @@ from halfspace_sss.rendering.light.small_emitters import WIDE, SmallEmitters, is
 from halfspace_sss.rendering.object.body import TranslucentObject
 from halfspace_sss.rendering.object.settings import AUTOMATIC, Settings
 
-__all__ = [
-    "Lights",
-    "PathTally",
-    "Primal",
-    "RenderContext",
-    "Replay",
-    "Sky",
-    "delta_light",
-    "mis_weight",
-    "sample_emitter",
-]
-
 
 @dataclass
 class PathTally:

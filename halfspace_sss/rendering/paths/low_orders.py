@@ -31,8 +31,6 @@ from halfspace_sss.rendering.object.body import TranslucentObject
 from halfspace_sss.rendering.object.points import SurfacePoint, lifted, mirrored, number, opposed, place, turned
 from halfspace_sss.rendering.paths.lighting import RenderContext, delta_light, mis_weight, sample_emitter
 
-__all__ = ["Connection", "LowOrderSample", "RefractedRay", "refracted_connection", "sample_low_orders"]
-
 MOST_SEGMENTS = 256
 FAINT = 0.1  # weight below which a scattered walk may end
 GRAZES = 0.05  # cosine at an emitter up to which its points are left to chance: their density over the area goes to 0

@@ -30,8 +30,6 @@ from halfspace_sss.rendering.paths.lighting import (
 )
 from halfspace_sss.rendering.paths.low_orders import RefractedRay, sample_low_orders
 
-__all__ = ["exit_at", "replay_paths", "trace_paths"]
-
 LEAST_REFLECTION = 0.05  # probability of reflection where there is light to come; Fresnel's is 0.04 face on
 LEAST_LOW, MOST_LOW = 0.03, 0.95  # probability of orders below two
 LOW_BOOST = 2.0  # as their light varies more from one sample to the next

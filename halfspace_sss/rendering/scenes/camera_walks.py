@@ -18,8 +18,6 @@ from halfspace_sss.rendering.scenes.reference_store import Reference, load, save
 if TYPE_CHECKING:
     from halfspace_sss.rendering.walk.path_loop import FirstExits
 
-__all__ = ["CameraWalks"]
-
 TRIAL = 2**31  # number of a pass that is no part of the image
 PASSES = "passes of objects"
 

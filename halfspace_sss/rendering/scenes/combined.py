@@ -8,8 +8,6 @@ import numpy as np
 
 from halfspace_sss.rendering.scenes.reference_store import Reference
 
-__all__ = ["combined"]
-
 TILE = 8  # pixels
 
 

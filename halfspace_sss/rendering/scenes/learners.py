@@ -16,11 +16,6 @@ from halfspace_sss.progress import NamedProgress
 from halfspace_sss.rendering.object.registry import learnt_names, lookup
 from halfspace_sss.rendering.scenes.camera_walks import CameraWalks
 
-__all__ = [
-    "CostedLearner", "Learner", "LearntObject", "LearntShapes", "ObjectError", "ShapeLearner", "learner", "learners",
-    "object_errors", "shape_learner",
-]  # fmt: skip
-
 
 class ObjectError(NamedTuple):
     """How wrong a model of an object is: relative RMSE of the radiance of its exits, and the ratio of the means."""

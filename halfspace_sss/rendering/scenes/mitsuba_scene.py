@@ -14,8 +14,6 @@ import numpy as np
 
 from halfspace_sss.rendering.object.translucent import is_smooth_boundary
 
-__all__ = ["with_media"]
-
 FAR = 1e5  # scene units within which objects lie
 VOLUME_PATH = {"type": "volpathmis", "max_depth": -1, "rr_depth": 64}
 

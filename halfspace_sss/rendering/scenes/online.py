@@ -30,8 +30,6 @@ from halfspace_sss.rendering.scenes.combined import combined
 from halfspace_sss.rendering.scenes.learners import LearntObject, learner, learners
 from halfspace_sss.rendering.scenes.reference_store import Reference, load, save
 
-__all__ = ["files", "render", "untrained"]
-
 TRAINING = "training"
 
 

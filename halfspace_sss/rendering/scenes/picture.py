@@ -9,8 +9,6 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-__all__ = ["Picture", "as_png"]
-
 
 @dataclass(frozen=True, eq=False)
 class Picture:

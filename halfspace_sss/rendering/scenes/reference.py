@@ -29,8 +29,6 @@ from halfspace_sss.rendering.scenes.identity import learnt, scene_hash, words
 from halfspace_sss.rendering.scenes.reference_store import Reference, load, save
 from halfspace_sss.rendering.scenes.scene_files import first_cause
 
-__all__ = ["Limits", "Progress", "Reference", "about_render", "check_same", "chosen", "load", "loaded", "render"]
-
 FEWEST_PASSES = 8  # before the spread of the passes is trusted to stop a run
 SHARE = 4  # a growing pass has at most a quarter of the samples so far: enough passes for their spread, few launches
 MOST_PIXELS = 2**26  # 8192 x 8192: the numbers of the pixels alone take some 10 GB

@@ -18,8 +18,6 @@ import numpy as np
 
 from halfspace_sss.provenance import write_together
 
-__all__ = ["Reference", "load"]
-
 FORMAT = "halfspace-sss reference 2"
 HEADER = "halfspace_sss"
 

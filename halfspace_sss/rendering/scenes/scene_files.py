@@ -21,16 +21,6 @@ from halfspace_sss.rendering.object.settings import ORDERS, SHARED
 from halfspace_sss.rendering.object.translucent import is_translucent
 from halfspace_sss.rendering.paths.integrator import is_bssrdf
 
-__all__ = [
-    "PATH_TRACED",
-    "SceneError",
-    "first_cause",
-    "load_objects",
-    "load_scene",
-    "open_scene",
-    "plainly",
-]
-
 _HERE = str(Path(__file__).parents[3])
 
 _PLACE = re.compile(r"(?:At|While loading) (?:dictionary node )?(.+? \(line \d+, col \d+\)|\S+): ")

@@ -38,9 +38,6 @@ from halfspace_sss.rendering.walk.random_walk import (
     turn,
 )
 
-__all__ = ["DEEPEST", "Departure", "EmitterDirections", "InnerLights", "SubpathConnections", "find_connections"]
-
-
 # ---- Connections with light subpaths --------------------------------------------------------------------------------
 #
 # The entering ray is sampled through a point a of the plane through p = v_k across the direction w_0 to the emitter,

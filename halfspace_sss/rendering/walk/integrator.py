@@ -20,8 +20,6 @@ from halfspace_sss.rendering.walk.emitter_connections import EmitterDirections, 
 from halfspace_sss.rendering.walk.media import WalkMedia
 from halfspace_sss.rendering.walk.path_loop import FirstExits, LightVisitor, PathTracer
 
-__all__ = ["camera_rays", "walk_integrator_class"]
-
 PARAMETERS = ("mm_per_unit", "max_depth", "rr_depth", "hide_emitters", "connection_share")
 SAMPLES_PER_LAUNCH = 2**19
 LANES = 2**14  # fastest of 2**12 to 2**18 on 2 cores

@@ -18,19 +18,6 @@ from halfspace_sss.rendering.object.shape import Geometry, check_together, scene
 from halfspace_sss.rendering.object.translucent import Inside, is_translucent, smooth_boundary
 from halfspace_sss.rendering.object.varying import VaryingMedium, eval_volume
 
-__all__ = [
-    "Coefficients",
-    "HeterogeneousMedia",
-    "InnerShapes",
-    "WalkMedia",
-    "by_pointer",
-    "media_within",
-    "per_channel",
-    "pointer_numbers",
-    "walk_media",
-]
-
-
 # ---- Shapes, media and lights inside objects ------------------------------------------------------------------------
 #
 # Indices are relative, as Mitsuba's path tracers take them: int_ior / ext_ior of a `dielectric` inside, and eta of an

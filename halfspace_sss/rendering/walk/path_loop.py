@@ -37,18 +37,6 @@ from halfspace_sss.rendering.walk.random_walk import (
 )
 from halfspace_sss.tracing.walk import generator, pass_seed
 
-__all__ = [
-    "FirstExitRecord",
-    "FirstExitVisitor",
-    "FirstExits",
-    "LightRecord",
-    "LightVisitor",
-    "PathTracer",
-    "power_heuristic",
-    "start_record",
-]
-
-
 # ---- Loop state ------------------------------------------------------------------------------------------------------
 
 

@@ -17,31 +17,6 @@ from halfspace_sss.rendering.object.points import SurfacePoint, channel_mean, li
 from halfspace_sss.rendering.walk.media import Coefficients, WalkMedia
 from halfspace_sss.tracing.walk import ROULETTE_BOOST, ROULETTE_WEIGHT, generator, pass_seed
 
-__all__ = [
-    "Crossing",
-    "Event",
-    "ExitVisitor",
-    "Flight",
-    "OUTSIDE",
-    "Visitor",
-    "Walk",
-    "WalkExits",
-    "Walker",
-    "draw",
-    "eval_phase",
-    "exits",
-    "fly",
-    "free_path",
-    "pick",
-    "roulette",
-    "sample_bsdf",
-    "start_walk",
-    "turn",
-    "walk_from",
-    "weigh",
-]
-
-
 # ---- Free flight, scattering and roulette with spectral MIS ---------------------------------------------------------
 #
 # A walk draws distances and angles with the coefficients of one channel, chosen at its start. Every channel c gets a

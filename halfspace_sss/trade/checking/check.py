@@ -18,8 +18,6 @@ from halfspace_sss.trade.results import Assessment, WayTrade
 from halfspace_sss.trade.statistics import seeded
 from halfspace_sss.trade.ways import Stage, Way, stage
 
-__all__ = ["WAYS", "check_scene", "outcome", "z_values"]
-
 WAYS = (
     PATH_TRACED, "lambert", "better_dipole", "directional_dipole", "neural", "better_dipole, gathered",
     "directional_dipole, gathered", "neural, gathered",

@@ -11,8 +11,6 @@ import numpy as np
 from halfspace_sss.checks import check_count
 from halfspace_sss.provenance import write_atomically
 
-__all__ = ["LIGHTS", "SHAPES", "RandomScene", "mesh_file", "random_scene", "write_scene"]
-
 SHAPES = ("ball", "blob", "slab", "ring", "spikes")
 LIGHTS = ("sky", "lamp", "lamp and sky", "windows")
 SIZE = 100.0  # mm across; sizes in mean free paths come by sigma_t

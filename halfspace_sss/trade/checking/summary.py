@@ -13,8 +13,6 @@ from halfspace_sss.trade.checking.check import WAYS, outcome, z_values
 if TYPE_CHECKING:
     import pandas
 
-__all__ = ["markdown", "outcomes", "summary"]
-
 DEAR = 1.5  # times the cheapest way, up to which a recommendation is called cheap
 ALWAYS = ("neural", "better_dipole", "path_traced", "auto")
 

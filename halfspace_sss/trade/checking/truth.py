@@ -19,8 +19,6 @@ from halfspace_sss.trade.results import Assessment, ObjectTrade, WayTrade
 from halfspace_sss.trade.statistics import seeded
 from halfspace_sss.trade.ways import Stage, Way
 
-__all__ = ["long_run", "mean_of"]
-
 FORMAT = "halfspace-sss trade truth 1"
 BATCH = 6.0  # seconds
 CLOSE = 0.2  # standard error of bias² over tolerance², which is a tenth of the tolerance for a bias as large

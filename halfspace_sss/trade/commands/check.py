@@ -12,8 +12,6 @@ from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.cli.shared import Bar, Variant, console, use_mitsuba, whole
 from halfspace_sss.provenance import check_folder
 
-__all__ = ["check_command"]
-
 
 def check_command(
     scenes: Annotated[int, typer.Option(help="How many.", parser=whole)] = 60,
