@@ -33,6 +33,7 @@ def _truths(out: Path) -> Any:
     return CliRunner().invoke(cli.app, ["errors", "--truths", "--model", "better_dipole", "--out", str(out)])
 
 
+@pytest.mark.slow
 def test_truths_say_what_they_take_and_go_on_after_what_is_kept(tmp_path: Path, monkeypatch: Any) -> None:
     found, asked = model_truths._reflectance, []
 

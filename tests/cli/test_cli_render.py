@@ -84,6 +84,7 @@ def test_a_wrong_argument_ends_with_2_and_leaves_the_files_of_before(
     assert _set(scene.parent / "out") == before
 
 
+@pytest.mark.slow
 def test_a_scene_without_ids_goes_on_to_more_samples_as_if_they_were_asked_for_at_once(tmp_path: Path) -> None:
     (tmp_path / "ball.xml").write_text(XML)
     for spp, out in (("4", "a"), ("64", "a"), ("64", "b")):

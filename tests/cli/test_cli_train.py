@@ -67,6 +67,7 @@ def test_without_arguments_the_material_is_fig10() -> None:
     assert _record(_weights()[0])["medium"] == {"albedo": 0.75, "g": 0.0, "eta": 1.3}
 
 
+@pytest.mark.slow
 def test_every_channel_of_every_material_has_its_row_and_weights() -> None:
     result = _invoke("train", "material", "ketchup", "fig10", "--fast", "--out", "mine")
     assert result.exit_code == 0 and len(_weights("mine")) == 4 and not _weights()

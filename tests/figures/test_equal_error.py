@@ -22,6 +22,8 @@ from full_geometry.learning.fitting import Recipe
 from halfspace_sss import materials
 
 mi = pytest.importorskip("mitsuba")
+
+pytestmark = pytest.mark.slow
 DIPOLE, BARE = MODELS[0], f"{MODELS[0]}, bare"
 LEARNT = "full_geometry"
 CHOSEN = (VOLUMES[0], VOLUMES[2], WALK, DIPOLE, BARE, LEARNT)

@@ -15,6 +15,8 @@ from figures import fig09
 from figures.beyond import spheres
 from figures.parts import runner  # noqa: E402
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture()
 def small(monkeypatch):

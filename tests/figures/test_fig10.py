@@ -38,6 +38,7 @@ def test_parts_together_are_one_set_of_curves(results: dict[str, Result]) -> Non
     assert together.n_paths == whole.n_paths
 
 
+@pytest.mark.slow
 def test_the_figure_and_its_tables_are_drawn(results: dict[str, Result], tmp_path: Path) -> None:
     files = fig10.draw(results)
     assert files["fig10.pdf"].startswith(b"%PDF") and files["fig10.png"].startswith(b"\x89PNG")

@@ -21,6 +21,8 @@ from figures.parts.part import Part, Result, Task
 from halfspace_sss.backend import BackendError
 
 mi = pytest.importorskip("mitsuba")
+
+pytestmark = pytest.mark.slow
 SIZE, METHODS = 24, [VOLUMES[0], VOLUMES[3], "neural"]
 
 

@@ -20,6 +20,8 @@ from figures.parts.part import Result, keys_of  # noqa: E402
 from full_geometry.learning import training  # noqa: E402
 from full_geometry.learning.fitting import Recipe  # noqa: E402
 
+pytestmark = pytest.mark.slow
+
 QUICK = Recipe(width=16, depth=2, batch=1024, chunk=2**12, reuse=2)
 MODEL = "full_geometry"
 SETTINGS = {

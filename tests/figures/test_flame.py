@@ -33,6 +33,8 @@ from halfspace_sss.rendering.object.points import (  # noqa: E402
 from halfspace_sss.rendering.paths.path_loop import exit_at  # noqa: E402
 from halfspace_sss.rendering.scenes.scene_files import load_scene  # noqa: E402
 
+pytestmark = pytest.mark.slow
+
 SIZE, BLOCKS, PASSES, SPP, LANES = 24, 3, 16, 64, 2**16
 SIGNIFICANCE = 1e-3
 WALK = "path_traced"

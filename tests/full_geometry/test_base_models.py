@@ -71,6 +71,7 @@ def test_before_any_step_it_is_the_network_of_all_shapes(tmp_path: Path) -> None
     assert np.mean(S > 0) > 0.9 and np.allclose(S_of(found.model, obj()), S, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_few_steps_from_it_are_worth_more_than_from_the_half_space(trained: Trained, tmp_path: Path) -> None:
     truth = reference(obj(), 128, 8192, seed=5)
     proposals = EntryProposals(obj(), HalfSpace(obj(), "better_dipole"))
@@ -104,6 +105,7 @@ def test_renders_ask_the_model_that_was_trained(trained: Trained, monkeypatch: p
     assert set(shapes.checksums(here)) < set(transport.checksums)
 
 
+@pytest.mark.slow
 def test_a_killed_run_ends_with_the_same_weights(trained: Trained, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(training, "CHECKPOINT_EVERY", 0.0)
 

@@ -148,6 +148,7 @@ def _same(a: str, b: str) -> bool:
     return left.keys() == right.keys() and all(np.array_equal(left[name], right[name]) for name in left)
 
 
+@pytest.mark.slow
 def test_an_interrupted_training_goes_on_to_the_same_weights(monkeypatch: Any) -> None:
     arguments = ("train", "object", "--scene", "ball.xml", "--seed", "3")
     assert _invoke(*arguments, "--out", "whole").exit_code == 0

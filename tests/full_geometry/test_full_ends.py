@@ -44,6 +44,7 @@ def solved(n: int, scale: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
     return known @ terms(x), found[0] @ terms(x)
 
 
+@pytest.mark.slow
 def test_what_proposals_lack_of_walks_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ends, "RIDGE", 10.0)
     asked, found = solved(2**16)

@@ -142,6 +142,7 @@ def test_a_shape_without_faces_has_no_patches() -> None:
         cluster(ball, frame_of(ball))
 
 
+@pytest.mark.slow
 def test_learnt_weights_lower_the_variance_below_that_of_uniform_points(obj: TranslucentObject, tmp_path: Path) -> None:
     recipe = Recipe(width=24, depth=2, batch=1024, chunk=2**14, reuse=4)
     found = train(obj.geometry.shape, WAX.scaled(1.5), chunks=6, recipe=recipe, folder=tmp_path)

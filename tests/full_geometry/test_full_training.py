@@ -136,6 +136,7 @@ def test_S_is_positive_and_finite(trained: Trained) -> None:
     assert np.all(np.isfinite(S)) and np.all(S >= 0) and np.mean(S > 0) > 0.9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mesh", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["sphere", "mesh"])
 def test_a_killed_run_ends_with_the_same_weights(mesh: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     arguments = {"chunks": 4, "recipe": QUICK, "seed": 3}
@@ -211,6 +212,7 @@ def test_weights_of_other_inputs_are_refused(trained: Trained, tmp_path: Path) -
         storing.load(path, trained.model.object)
 
 
+@pytest.mark.slow
 def test_a_moved_and_turned_mesh_is_the_same_object(tmp_path: Path) -> None:
     model = train(mi.load_dict(bunny()), WAX, chunks=2, recipe=QUICK, folder=tmp_path).model
     moved = object_of(mi.load_dict(bunny(turn=40.0, shift=3.0)), WAX)

@@ -109,6 +109,7 @@ def test_a_grid_of_one_value_gives_the_first_event_of_the_homogeneous_medium() -
     assert np.allclose(np.array(a.y), np.array(b.y), atol=2e-3)
 
 
+@pytest.mark.slow
 def test_training_halves_the_error_of_the_half_space_in_a_medium_that_varies(trained: Trained) -> None:
     obj = trained.model.object
     proposals = EntryProposals(obj, HalfSpace(obj, "better_dipole"))

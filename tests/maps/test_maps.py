@@ -114,6 +114,7 @@ make_maps({"m": Medium.from_albedo(0.75, 1.0)}, %r, grid=MapGrid(6, 16, 10, 8), 
 """
 
 
+@pytest.mark.slow
 def test_a_killed_run_resumes_to_the_same_bits(tmp_path):
     def start(folder):
         return subprocess.Popen([sys.executable, "-c", SCRIPT % str(folder)], stdout=subprocess.PIPE, text=True)

@@ -95,6 +95,7 @@ RELATIVE = [v for v in VARIANTS if v.learned != "S" and not v.warm]
 SQUARED = [v for v in VARIANTS if v.learned == "S"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", RELATIVE, ids=[v.name for v in RELATIVE])
 def test_a_variant_lowers_its_error_against_its_start(variant: Variant, pool: MapPool, reference: TracedMaps) -> None:
     def error(learner: Any) -> float:

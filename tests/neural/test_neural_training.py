@@ -157,6 +157,7 @@ def killed(tmp_path_factory: Any) -> Path:
     return work
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs a system with fork and SIGKILL")
 @pytest.mark.parametrize("what", RUNS)
 def test_a_run_that_was_killed_twice_ends_with_the_same_weights(

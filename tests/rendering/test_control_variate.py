@@ -53,6 +53,7 @@ def _images(scene: Any, spp: int = 128) -> np.ndarray:
     return np.array([np.array(mi.render(scene, spp=spp, seed=k), dtype=float) for k in range(SEEDS)])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("light", "model", "shape", "depth"),
     [("room", "better_dipole", "cube", 8), ("point", "better_dipole", "sphere", 2)],
@@ -66,6 +67,7 @@ def test_means_are_those_without_it_and_noise_is_less(light: str, model: str, sh
     assert np.median(b[inner].var(axis=0, ddof=1) / a[inner].var(axis=0, ddof=1)) < 1
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_image() -> None:
     images = [np.array(mi.render(_scene("corrected"), spp=4, seed=3)) for _ in range(2)]
     assert (images[0] == images[1]).all()

@@ -57,6 +57,7 @@ def _pictures(model: str, light: str) -> tuple[np.ndarray, ...]:
     return tuple(_image(scene, spp, seed) for scene, spp in ((sampled, 2**11), (gathered, 64)) for seed in (1, 2))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("light", ["sky", "lamp", "point", "floor"])
 @pytest.mark.parametrize("model", MODELS)
 def test_it_is_as_bright_as_the_model_sampled_within_3_percent(model: str, light: str) -> None:
@@ -96,6 +97,7 @@ def test_light_is_gathered_anew_when_an_emitter_was_edited() -> None:
     assert "gathered at" in edited.integrator().gathered[0]
 
 
+@pytest.mark.slow
 def test_transfer_is_made_anew_when_the_medium_was_edited() -> None:
     edited = _scene("gathered", lights=_lights("sky"))
     _image(edited, 4)

@@ -16,6 +16,7 @@ import recover_medium as example  # noqa: E402
 pytestmark = pytest.mark.usefixtures("rgb")
 
 
+@pytest.mark.slow
 def test_albedo_and_mean_free_path_are_found_from_four_images() -> None:
     """Of 8 x 8 pixels; the means of the last steps, whose spread by noise is 0.004 and 8 %."""
     given = example.images(

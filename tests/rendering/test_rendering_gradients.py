@@ -127,6 +127,7 @@ def test_render_and_backward_give_the_derivative_of_the_image():
     assert float(dr.grad(parameters[key])[0]) == pytest.approx(total, rel=0.02)
 
 
+@pytest.mark.slow
 def test_the_albedo_of_a_ball_is_found_from_its_image():
     target = make(floor=False, sigma_s=1.6, sigma_a=0.1, n=6)
     target = mi.TensorXf(mi.render(target, spp=512, seed=9))

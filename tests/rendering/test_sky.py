@@ -115,6 +115,7 @@ def lights(name: str) -> dict:
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("entries", [1, 3])
 @pytest.mark.parametrize("light", ["lamps and floor", "clouds"])
 def test_the_light_is_that_without_it(light: str, entries: int, monkeypatch: pytest.MonkeyPatch) -> None:
