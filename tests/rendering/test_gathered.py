@@ -98,6 +98,19 @@ def test_light_is_gathered_anew_when_an_emitter_was_edited() -> None:
 
 
 @pytest.mark.slow
+def test_light_is_gathered_anew_when_texels_of_the_sky_were_edited() -> None:
+    texels = np.ones((32, 64, 3), np.float32)
+    edited = _scene("gathered", lights={"sky": {"type": "envmap", "bitmap": mi.Bitmap(texels)}})
+    before, parameters = _image(edited, 4), mi.traverse(edited)
+    data = np.array(parameters["sky.data"])
+    data[15:17] = 20.0
+    parameters["sky.data"] = mi.TensorXf(data)
+    parameters.update()
+    after, fresh = _image(edited, 4), _image(_scene("gathered", lights={"sky": edited.emitters()[0]}), 4)
+    assert after.mean() > 1.5 * before.mean() and np.allclose(after, fresh, rtol=1e-3)
+
+
+@pytest.mark.slow
 def test_transfer_is_made_anew_when_the_medium_was_edited() -> None:
     edited = _scene("gathered", lights=_lights("sky"))
     _image(edited, 4)

@@ -46,7 +46,7 @@ from halfspace_sss.rendering.object.shape import (
     rays_into,
     same_objects,
     scene_of,
-    surface_of,
+    state_of,
     survey,
 )
 from halfspace_sss.rendering.object.translucent import Inside, check_tints, is_translucent
@@ -102,7 +102,7 @@ class Contents:
         found: shapes that neither emit nor reach out of the object, those inside each other too.
         scene: a scene that holds these only.
         insides: of each what is below its surface, 1/(scene unit); None where that is not translucent.
-        surfaces: from `surface_of`.
+        surfaces: state of each BSDF, from `state_of`.
     """
 
     found: list[Content]
@@ -116,7 +116,7 @@ class Contents:
         shapes = [content.thing for content in found]
         below = [shape.bsdf().inside if is_translucent(shape.bsdf()) else None for shape in shapes]
         insides = [inside and replace(inside, medium=inside.medium.scaled(mm_per_unit)) for inside in below]
-        return cls(found, scene_of(shapes, world), insides, [surface_of(shape) for shape in shapes])
+        return cls(found, scene_of(shapes, world), insides, [state_of(shape.bsdf()) for shape in shapes])
 
     @property
     def shapes(self) -> list[mi.Shape]:
@@ -125,7 +125,7 @@ class Contents:
 
     def is_current(self) -> bool:
         """Whether the surfaces still are as they were."""
-        return all(surface_of(shape)[0] == keys for shape, (keys, _) in zip(self.shapes, self.surfaces))
+        return all(state_of(shape.bsdf())[0] == keys for shape, (keys, _) in zip(self.shapes, self.surfaces))
 
     def check_held(self) -> None:
         """ValueError if gradients are enabled for a parameter of them: a transport knows no other."""

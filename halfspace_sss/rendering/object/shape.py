@@ -304,10 +304,10 @@ def geometry_of(shape: mi.Shape) -> tuple[list, list]:
     return found, kept
 
 
-def surface_of(shape: mi.Shape) -> tuple[list, list]:
-    """What tells whether the surface of a shape has changed; what is kept so that no number is reused."""
+def state_of(node: mi.Object) -> tuple[list, list]:
+    """What tells whether any parameter of an object of Mitsuba changed; what is kept so that no number is reused."""
     found, kept = [], []
-    for key, value in mi.traverse(shape.bsdf()).items():
+    for key, value in mi.traverse(node).items():
         kept.append(dr.detach(value) if dr.is_array_v(value) else value)
         found.append((key, dr.detail.collect_indices(kept[-1]) or repr(value)))
     return found, kept

@@ -21,7 +21,7 @@ import numpy as np
 from halfspace_sss.backend import clock
 from halfspace_sss.rendering.gathered.transfer import SAMPLES, SEED, Albedo, Incident, Transfer, cosine, transfer
 from halfspace_sss.rendering.object.points import cosine_above, place
-from halfspace_sss.rendering.object.shape import same_objects
+from halfspace_sss.rendering.object.shape import same_objects, state_of
 from halfspace_sss.rendering.paths.lighting import mis_weight
 from halfspace_sss.rendering.paths.path_loop import trace_paths
 
@@ -145,17 +145,9 @@ def _check(body: TranslucentObject) -> None:
 
 def _state(scene: mi.Scene) -> tuple[list, list]:
     """What tells whether anything that sends, blocks or scatters light has changed; what is kept for its numbers."""
-    keys, kept = [], []
-    for node in (*scene.emitters(), *scene.shapes()):
-        keys.append(id(node))
-        kept.append(node)
-        parameters = mi.traverse(node)
-        for key in parameters.keys():
-            value = parameters[key]
-            index = getattr(value, "index", None)
-            keys.append((key, index if isinstance(index, int) and index else repr(value)))
-            kept.append(value)
-    return keys, kept
+    nodes = [*scene.emitters(), *scene.shapes()]
+    states = [state_of(node) for node in nodes]
+    return [(id(node), keys) for node, (keys, _) in zip(nodes, states)], [nodes, [kept for _, kept in states]]
 
 
 def _leaving(
