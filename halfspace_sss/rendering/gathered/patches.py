@@ -17,7 +17,7 @@ between places in the cells where there are few.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -68,14 +68,14 @@ class PatchTransfer:
     seen: float
     moments: np.ndarray
 
-    def scaled_for(self, v: np.ndarray) -> PatchTransfer:
-        """With the factor that leaves the least variance in light of the relative variance v at an entry, per channel.
+    def factor(self, v: np.ndarray) -> np.ndarray:
+        """Of T, that leaves the least variance in light of the relative variance v at an entry, per channel.
 
         The variance is (1 + v) E[(S - beta h)²] - E[S - beta h]²: in even light entries by S itself are hard to better.
         """
         both, square, means, mean = self.moments
         beta = ((1 + v) * both - means) / np.maximum((1 + v) * square - mean, 1e-30)
-        return replace(self, T=self.T * np.clip(beta, 0, 1).astype(np.float32))
+        return np.clip(beta, 0, 1)
 
     @cached_property
     def _lanes(self) -> mi.Float:

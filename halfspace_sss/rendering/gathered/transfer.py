@@ -35,6 +35,7 @@ PER_LENGTH = 2.0  # points over a transport mean free path
 FEWEST, MOST = 1024, 8192  # points
 SAMPLES = 2**21  # entries of all points
 SEED = 7
+SMOOTHINGS = 8  # of what directions bring
 R_2 = 0.7548776662466927, 0.5698402909980532
 
 
@@ -109,17 +110,26 @@ class Transfer:
     error: float
 
     def __matmul__(self, L: Incident) -> np.ndarray:
-        """B for incident radiance, linear in w_o: constant and slope, (points, channels, 4)."""
+        """B for incident radiance, linear in w_o: constant and slope, (points, channels, 4).
+
+        What the directions w_i and w_o of single entries bring varies slowly over the surface, and was most of the
+        noise: it is averaged over a wider neighbourhood than B is blended from.
+        """
         away = self.w_i - L.middle[self.entry]
-        arriving = L.mean[self.entry]
+        mean, arriving = L.mean[self.entry], L.mean[self.entry]
         for axis in range(3):
             arriving += L.slope[self.entry, :, axis] * away[:, :, axis, None]
         B = np.einsum("jsc,jsc->jc", self.t, arriving)
         even = self.t.sum(axis=1)
         left = self.t * (arriving - (B / np.maximum(even, 1e-30))[:, None])  # 0 in even light, where a(w_o) is all
         slope = np.stack([np.einsum("jsc,js->jc", left, self.d_o[:, :, axis]) for axis in range(3)], axis=2)
-        slope = self.points.smoothed(np.einsum("jci,jik->jck", slope, self.inverse))
-        return np.concatenate([(B - np.einsum("jck,jk->jc", slope, self.middle))[:, :, None], slope], axis=2)
+        slope = np.einsum("jck,jki->jci", slope, self.inverse)
+        by_place = np.einsum("jsc,jsc->jc", self.t, mean)
+        by_direction = np.concatenate([(B - by_place)[:, :, None], slope], axis=2)
+        for _ in range(SMOOTHINGS):
+            by_direction = self.points.smoothed(by_direction)
+        first, slope = by_direction[:, :, 0], by_direction[:, :, 1:]
+        return np.concatenate([(by_place + first - np.einsum("jck,jk->jc", slope, self.middle))[:, :, None], slope], 2)
 
 
 def count_of(body: TranslucentObject) -> int:

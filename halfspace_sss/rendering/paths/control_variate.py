@@ -15,11 +15,18 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from halfspace_sss.rendering.gathered.patches import PatchTransfer, patch_transfer
+from halfspace_sss.rendering.gathered.patches import PatchTransfer, TransferRow, patch_transfer
 from halfspace_sss.rendering.gathered.points import uniform_entries
 from halfspace_sss.rendering.object.points import SurfacePoint, number
 from halfspace_sss.rendering.object.shape import same_objects
-from halfspace_sss.rendering.paths.gathering import TRACED, GatheringPoint, by_cosine, by_emitters, spreads
+from halfspace_sss.rendering.paths.gathering import (
+    TRACED,
+    GatheringPoint,
+    by_cosine,
+    by_emitters,
+    light_state,
+    spreads,
+)
 from halfspace_sss.rendering.paths.lighting import Primal, RenderContext
 
 if TYPE_CHECKING:
@@ -39,15 +46,22 @@ class ControlVariate:
 
     Args:
         transfer: T.
+        factor: of T, per channel.
         known: Σ_k T_jk Phi_k of all cells j, channel by channel.
     """
 
     transfer: PatchTransfer
+    factor: mi.Spectrum
     known: mi.Float
+
+    def row(self, out: SurfacePoint, face: mi.UInt32, active: mi.Bool) -> TransferRow:
+        """The cell of an exit on a face, and a(w_o) times the factor."""
+        j, a = self.transfer.row(out, face, active)
+        return TransferRow(j, a * self.factor)
 
     def radiance(self, out: SurfacePoint, face: mi.UInt32, active: mi.Bool) -> mi.Spectrum:
         """a(w_o) Σ_k T_jk Phi_k of an exit on a face."""
-        row = self.transfer.row(out, face, active)
+        row = self.row(out, face, active)
         return row.a * dr.gather(mi.Spectrum, self.known, row.j, active)
 
 
@@ -57,6 +71,8 @@ class ControlVariates:
     def __init__(self) -> None:
         self._bodies: list[TranslucentObject] = []
         self._transfers: list[PatchTransfer | None] = []
+        self._light: tuple[list, list] = ([], [])
+        self._factors: dict[int, np.ndarray] = {}  # of the light that they are for
 
     def of(
         self, scene: mi.Scene, bodies: list[TranslucentObject], settings: Settings, seed: int, spp: int, pixels: int
@@ -70,13 +86,20 @@ class ControlVariates:
         """
         if not same_objects(bodies, self._bodies):
             self._transfers = [patch_transfer(body) if _applies(body) else None for body in bodies]
-            self._bodies = bodies
+            self._bodies, self._light = bodies, ([], [])
+        state = light_state(scene)
+        if state[0] != self._light[0]:
+            self._light, self._factors = state, {}
         context, found = RenderContext.of(scene, bodies, settings, Primal()), []
-        for body, T in zip(bodies, self._transfers):
+        for k, (body, T) in enumerate(zip(bodies, self._transfers)):
             wanted = 0 if T is None else max(int(PER_SAMPLE * spp / T.seen), FEWEST)
             count = int(min(wanted, MOST_SHARE * spp * pixels))
-            pays = T is not None and count > LEAST_PAYING * wanted
-            found.append(replace(body, control=_control(context, body, T, seed, count)) if pays else body)
+            if T is None or count <= LEAST_PAYING * wanted:
+                found.append(body)
+                continue
+            if k not in self._factors:  # by light of its own: a factor must not follow Phi
+                self._factors[k] = T.factor(_arriving(context, body, T, FIXED, FEWEST)[1])
+            found.append(replace(body, control=_control(context, body, T, self._factors[k], seed, count)))
         return found
 
 
@@ -88,11 +111,11 @@ def _applies(body: TranslucentObject) -> bool:
 
 
 def _control(
-    context: RenderContext, body: TranslucentObject, T: PatchTransfer, seed: int, count: int
+    context: RenderContext, body: TranslucentObject, T: PatchTransfer, factor: np.ndarray, seed: int, count: int
 ) -> ControlVariate:
-    T = T.scaled_for(_arriving(context, body, T, FIXED, FEWEST)[1])  # of light of its own: a factor must not follow Phi
-    leaving = np.einsum("jkc,ck->jc", T.T, _arriving(context, body, T, seed, count)[0])
-    return ControlVariate(T, mi.Float(leaving.astype(np.float32).ravel()))
+    Phi = _arriving(context, body, T, seed, count)[0].astype(np.float32)
+    known = np.stack([T.T[:, :, c] @ row for c, row in enumerate(Phi)], axis=1)
+    return ControlVariate(T, dr.opaque(mi.Spectrum, factor.tolist()), mi.Float(known.ravel()))
 
 
 def _arriving(

@@ -104,7 +104,7 @@ class Gathering:
             ]
             self._transfers, self._bodies, self._light = made, bodies, ([], [])
             self.seconds = (clock() - started, 0.0)
-        state = _state(scene)
+        state = light_state(scene)
         if state[0] != self._light[0] or not self._found:
             started = clock()
             seeds = (1000 * self._part,) if self._part else (0, 1)
@@ -143,7 +143,7 @@ def _check(body: TranslucentObject) -> None:
         raise ValueError(f"light must be sampled for object {found.name}, whose medium varies, got gathered")
 
 
-def _state(scene: mi.Scene) -> tuple[list, list]:
+def light_state(scene: mi.Scene) -> tuple[list, list]:
     """What tells whether anything that sends, blocks or scatters light has changed; what is kept for its numbers."""
     nodes = [*scene.emitters(), *scene.shapes()]
     states = [state_of(node) for node in nodes]
@@ -166,22 +166,28 @@ def _leaving(
 def _incident(scene: mi.Scene, bodies: list[TranslucentObject], T: Transfer, settings: Settings, seed: int) -> Incident:
     """Incident radiance at all points."""
     count = len(T.points)
-    n = int(np.clip(DIRECTIONS // (2 * count), FEWEST, MOST))
-    lane = dr.arange(mi.UInt32, count * n)
-    j, s = lane // n, lane % n
+    n = int(np.clip(DIRECTIONS // (2 * count), FEWEST, MOST)) // TRACED * TRACED
+    lane, few = dr.arange(mi.UInt32, count * n), n // TRACED
+    # directions that are traced further come first: beside each other, as lanes that wait cost as much
+    traced, rest = lane < dr.opaque(mi.UInt32, count * few), lane - count * few
+    i = rest % (n - few)
+    s = dr.select(traced, lane % few * TRACED, i + i // (TRACED - 1) + 1)
+    j = dr.select(traced, lane // few, rest // (n - few))
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(100 + seed, dr.width(lane))
     at = GatheringPoint(*(dr.gather(type(v), v, j) for v in (T.points.p, T.points.n, T.points.n_out)))
     u, v = (_stratified(sampler, j, s, n) for _ in range(2))
     aimed, w_e = by_emitters(scene, T.albedo, at, u)
-    met, more, a, w_c = by_cosine(scene, bodies, T.albedo, settings, at, v, s % TRACED == 0, sampler)
-    arriving = met + TRACED * more
-    weight = dr.mean(a) + dr.zeros(mi.Float, count * n)
-    dr.eval(aimed, arriving, a, weight, w_e, w_c)
+    met, more, a, w_c = by_cosine(scene, bodies, T.albedo, settings, at, v, traced, sampler)
+    values = [v + dr.zeros(mi.Float, count * n) for v in (aimed, met + TRACED * more, a, dr.mean(a), w_e, w_c)]
+    dr.eval(values)
+    j, s = lane // n, lane % n
+    order = dr.select(s % TRACED == 0, j * few + s // TRACED, count * few + j * (n - few) + s - s // TRACED - 1)
+    aimed, arriving, a, weight, w_e, w_c = (dr.gather(type(v), v, order) for v in values)
 
     def total(value: Any) -> np.ndarray:
         """Sums over the directions of each point, (points, components)."""
-        return np.stack([np.array(dr.block_sum(part + dr.zeros(mi.Float, count * n), n)) for part in value], axis=1)
+        return np.stack([np.array(dr.block_sum(part, n)) for part in value], axis=1)
 
     norm, whole = total(a), total([weight])
     middle = total(weight * w_c) / np.maximum(whole, 1e-30)

@@ -626,7 +626,7 @@ def resample_entry(
     """
     with dr.suspend_grad():
         prepared = obj.transport.prepare(out, active)
-        control = obj.control.transfer.row(out, face, active & first) if obj.control else None
+        control = obj.control.row(out, face, active & first) if obj.control else None
         exit_point = _ExitPoint(out, face, prepared, obj.proposals.prepare(out, prepared, active), control)
 
     def draw(by_emitter: mi.Bool | None = None) -> Candidate:
