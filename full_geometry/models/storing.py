@@ -25,6 +25,7 @@ from halfspace_sss.neural.store import load_weights, save_weights, weights_folde
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.object.body import TranslucentObject
 from halfspace_sss.rendering.object.points import number
+from halfspace_sss.rendering.object.shape import name_of
 from halfspace_sss.rendering.object.translucent import Inside
 from halfspace_sss.rendering.object.varying import grid_values
 from halfspace_sss.rendering.scenes.identity import object_digest
@@ -145,10 +146,14 @@ def _anchored(shape: mi.Shape) -> tuple[str, np.ndarray]:
         anchors = positions[np.unique(np.linspace(0, len(positions) - 1, ANCHORS).astype(int))]
     elif "to_world" in parameters:
         matrix = np.array(parameters["to_world"].matrix, dtype=float).reshape(4, 4)
+        if "grid" in parameters:
+            topology = hashlib.sha256(np.array(parameters["grid"], dtype=np.float32).tobytes()).hexdigest()[:16]
         corners = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, 8)
         anchors = (matrix[:3, :3] @ corners + matrix[:3, 3:]).T
     else:
-        raise ValueError(f"shape must be a mesh or have a transformation, got {shape.class_name()}")
+        raise ValueError(
+            f"{name_of(shape)} must be a mesh or have a transformation to be learnt, got a {shape.class_name()}"
+        )
     return topology, anchors
 
 

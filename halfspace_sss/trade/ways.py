@@ -12,6 +12,7 @@ from halfspace_sss.checks import check_choice
 from halfspace_sss.interface.model import model_class, models
 from halfspace_sss.rendering.object.body import KnowsUnit, millimetres, translucent_shapes
 from halfspace_sss.rendering.object.registry import AUTO, model_names
+from halfspace_sss.rendering.object.shape import is_instance
 from halfspace_sss.rendering.paths.gathering import Gathering
 from halfspace_sss.rendering.paths.integrator import is_bssrdf
 from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED, load_objects
@@ -145,7 +146,7 @@ def stage(scene: Any, parameters: dict[str, str] | None = None) -> Stage:
 
 def _check_instances(shapes: Sequence[Any]) -> None:
     for shape in shapes:
-        if "nstance" in shape.class_name():
+        if is_instance(shape):
             raise ValueError(f"a translucent object must not be an instance, got {shape.id()!r}")
 
 

@@ -5,6 +5,7 @@ z-tests are at 4 standard errors (two-sided 6e-5), with fixed seeds.
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Callable
 from typing import Any
 
@@ -211,6 +212,13 @@ def varying() -> dict:
     return {"type": "translucent", "sigma_t": {"type": "gridvolume", "grid": grid}, "albedo": 0.9, "eta": 1.4}
 
 
+def hair() -> dict:
+    """Along the x axis."""
+    with tempfile.NamedTemporaryFile("w", suffix=".txt", delete=False) as file:
+        file.write("".join(f"{x} 0 0 0.05\n" for x in np.linspace(-0.5, 0.5, 5)))
+    return {"type": "bsplinecurve", "filename": file.name, "bsdf": BLACK}
+
+
 DELTA = "inside 'wax' must be opaque and no mirror, or translucent, to be learnt, .* the shape 'thing' with a "
 REFUSED: dict[str, tuple[Callable[[], dict], str]] = {
     "glass": (lambda: ball(0.3, bsdf={"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.4}), DELTA + "SmoothDiel"),
@@ -222,6 +230,7 @@ REFUSED: dict[str, tuple[Callable[[], dict], str]] = {
     "varying": (lambda: ball(0.3, bsdf=varying()), "media inside 'wax' must be homogeneous to be learnt, .* 'thing'"),
     "led": (lambda: ball(0.1, emitter={"type": "area"}), "must be empty for .*, got the shape 'thing' inside"),
     "lamp": (lambda: {"type": "point"}, "must be empty for .*, got the emitter 'thing' inside object 'wax'"),
+    "curve": (hair, "must be a mesh or have a transformation to be learnt, got the BSplineCurve 'thing'"),
     "wick": (lambda: ball(0.3, (0, 1, 0), bsdf=BLACK), "must be empty for .*, got the shape 'thing' partly inside"),
 }
 

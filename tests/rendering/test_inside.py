@@ -89,6 +89,17 @@ INSIDE: dict[str, Callable[[], tuple[dict, dict[str, str]]]] = {
         {"seed": _ball(0.7, bsdf=SEED), "stone": _ball(0.3, (0, 0, 0.2), bsdf=GREY)},
         {"seed": "wax"},
     ),
+    "instance": lambda: (
+        {
+            "group": {"type": "shapegroup", "part": _ball(0.5, bsdf=GREY)},
+            "one": {
+                "type": "instance",
+                "to_world": mi.ScalarTransform4f().translate([0.1, 0.2, 0.3]),
+                "of": {"type": "ref", "id": "group"},
+            },
+        },
+        {},
+    ),
     "stick": lambda: (
         {
             "stick": {

@@ -154,6 +154,13 @@ INSIDE: dict[str, Callable[[], tuple[dict, str]]] = {
         {"wick": {"type": "cylinder", "p1": [0, 6, 0], "radius": 0.3}},
         "'wick' partly inside object 'wax'",
     ),
+    "instance": lambda: (
+        {
+            "group": {"type": "shapegroup", "part": _stone()},
+            "one": {"type": "instance", "of": {"type": "ref", "id": "group"}},
+        },
+        "'one' inside object 'wax'",
+    ),
     "blade": lambda: (
         {"blade": {"type": "rectangle", "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], 80).scale([2, 0.004, 1])}},
         "'blade' inside object 'wax'",
@@ -177,6 +184,17 @@ def test_models_of_whole_objects_refuse_it_too(model: str) -> None:
     wax = ball(bsdf=surface(model, orders="total"))
     message = f"must be empty for the model '{model}', got the shape 'stone' inside object 'wax'"
     refused(message, view("bssrdf", wax=wax, stone=_stone()))
+
+
+def test_an_instance_beside_an_object_is_no_content_and_one_of_glass_inside_is_refused() -> None:
+    def placed(bsdf: dict, x: float) -> dict:
+        one = {"type": "instance", "to_world": mi.ScalarTransform4f().translate([x, x, 0]), "of": ref}
+        return view("translucent_walk", wax=ball(), group={"type": "shapegroup", "part": _stone(bsdf=bsdf)}, one=one)
+
+    ref, glass = {"type": "ref", "id": "group"}, {"type": "dielectric"}
+    beside = mi.load_dict(placed(glass, 4.5))  # in the box of the object, but not in it
+    beside.integrator().render(beside, spp=1)
+    refused("must be no instance, got 'part' in a shapegroup and the instance 'one' inside", placed(glass, 0.0))
 
 
 def test_what_stands_at_the_surface_of_an_object_is_not_inside() -> None:

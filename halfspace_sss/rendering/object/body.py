@@ -41,6 +41,7 @@ from halfspace_sss.rendering.object.shape import (
     check_together,
     geometry_of,
     is_inside,
+    is_instance,
     name_of,
     number_of,
     rays_into,
@@ -669,6 +670,13 @@ _DELTAS = int(mi.BSDFFlags.Delta) | int(mi.BSDFFlags.GlossyTransmission)  # of B
 def _check_contents(name: str, contents: Contents) -> None:
     """ValueError if something inside an object cannot be learnt: light that it mirrors or refracts is a delta in S."""
     for shape, inside in zip(contents.shapes, contents.insides):
+        if is_instance(shape):
+            raise ValueError(f"what lies inside {name} must be no instance to be learnt, got {name_of(shape)}")
+        if not {"faces", "to_world"} & set(mi.traverse(shape).keys()):
+            raise ValueError(
+                f"what lies inside {name} must be a mesh or have a transformation to be learnt, got the "
+                f"{shape.class_name()} {name_of(shape)}"
+            )
         if inside is None and shape.bsdf().flags() & _DELTAS:
             raise ValueError(
                 f"what lies inside {name} must be opaque and no mirror, or translucent, to be learnt, as S holds no "
@@ -692,7 +700,7 @@ def _object_of(scene: Any, name: str | None) -> Any:
         ValueError: there is none, there are several and none is named, or it cannot be learnt.
     """
     known = {shape.id(): shape for shape in outermost(scene)}
-    instances = [s.id() for s in scene.shapes() if "nstance" in s.class_name()]
+    instances = [s.id() for s in scene.shapes() if is_instance(s)]
     if name in instances or (name is None and instances and not known):
         raise ValueError(f"object must not be an instance to be learnt, got {name or instances[0]!r}")
     if name is None and len(known) == 1:

@@ -254,7 +254,7 @@ def survey(shape: mi.Shape, world: mi.Scene | None = None) -> Geometry:
             they point to both sides of a surface that has one side or is not closed.
     """
 
-    if "nstance" in shape.class_name():
+    if is_instance(shape):
         raise ValueError(f"a translucent object must not be an instance, got {shape.id() or shape}")
     if shape.is_mesh() and shape.face_count() == 0:
         raise ValueError(f"a mesh must have faces, got none in {name_of(shape)}")
@@ -430,16 +430,28 @@ def scene_of(shapes: list[Any], world: mi.Scene | None = None) -> Any:
 
     Args:
         shapes: of Mitsuba.
-        world: the scene that they stand in, if rays are traced in both by one kernel. It is not kept alive, and must
-            not be one that this function made.
+        world: the scene that they stand in, if rays are traced in both by one kernel or one is an instance. It is not
+            kept alive, and must not be one that this function made.
     """
 
     named = [*shapes, world] if world is not None and _by_optix() else shapes
+    if world is not None and any(map(is_instance, shapes)):  # Mitsuba looks for their groups in the scene
+        named = [*groups_of(world), *named]
     names = [known.id() for known in named]
     scene = mi.load_dict({"type": "scene", **{f"shape{k}": known for k, known in enumerate(named)}})
     for known, name in zip(named, names):
         known.set_id(name)
     return scene
+
+
+def is_instance(shape: mi.Shape) -> bool:
+    """Whether a shape shows a group of others."""
+    return "nstance" in shape.class_name()
+
+
+def groups_of(scene: mi.Scene) -> list[mi.Shape]:
+    """The groups that instances in a scene show."""
+    return [node for node in mi.traverse(scene).hierarchy if node.class_name() == "ShapeGroupPlugin"]
 
 
 def rays_into(box: mi.ScalarBoundingBox3f, n: int) -> Any:

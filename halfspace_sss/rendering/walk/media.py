@@ -14,7 +14,15 @@ from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.light.small_emitters import is_delta
 from halfspace_sss.rendering.object.body import Content, TranslucentObject, contents, translucent_shapes
 from halfspace_sss.rendering.object.points import lift
-from halfspace_sss.rendering.object.shape import Geometry, check_together, scene_of, survey
+from halfspace_sss.rendering.object.shape import (
+    Geometry,
+    check_together,
+    groups_of,
+    is_instance,
+    name_of,
+    scene_of,
+    survey,
+)
 from halfspace_sss.rendering.object.translucent import Inside, is_translucent, smooth_boundary
 from halfspace_sss.rendering.object.varying import VaryingMedium, eval_volume
 
@@ -49,12 +57,14 @@ class InnerShapes:
         """What lies inside; None if nothing does.
 
         Raises:
-            ValueError: something that refracts lies partly inside, is not closed, or objects count some orders only.
+            ValueError: something that refracts lies partly inside, is not closed or in an instance, or objects count
+                some orders only.
         """
         found = contents(scene, objects)
         if not found:
             return None
         _check(found, objects)
+        _check_instances(found, scene)
         glass = [survey(thing, scene) for thing in _shapes(found) if _displaces(thing)]
         for piece in glass:
             if not piece.closed:
@@ -127,6 +137,18 @@ def _check(found: list[Content], objects: list[Geometry]) -> None:
                     f"orders must be 'total' of objects with something inside, got {surface.inside.orders!r} where "
                     f"{content.name} lies inside object {holder.name}"
                 )
+
+
+def _check_instances(found: list[Content], scene: mi.Scene) -> None:
+    """ValueError if an instance inside may refract: rays meet shapes of its group, which stand in no table."""
+    instances = [shape for shape in _shapes(found) if is_instance(shape)]
+    nodes = [node for node in mi.traverse(scene).hierarchy if isinstance(node, mi.Shape) and node not in scene.shapes()]
+    grouped = [shape for shape in nodes if shape not in groups_of(scene) and _displaces(shape)]
+    if instances and grouped:
+        raise ValueError(
+            f"what refracts inside an object must be no instance, got {name_of(grouped[0])} in a shapegroup and the "
+            f"instance {name_of(instances[0])} inside"
+        )
 
 
 # ---- Heterogeneous media -------------------------------------------------------------------------------------------
