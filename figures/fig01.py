@@ -45,9 +45,9 @@ NOTES = (
 
 def parts(quality: str) -> list[Part]:
     """For each object its training, then its image by walks and by the models."""
-    size, found = SIZES[quality], []
+    size, results = SIZES[quality], []
     for name in OBJECTS:
-        found.append(train_modelled(name, RESOLUTION[quality], TRAIN_SECONDS[quality]))
+        results.append(train_modelled(name, RESOLUTION[quality], TRAIN_SECONDS[quality]))
         for model in (TRUTH, *MODELS):
             spp = SPP[quality].get(model, SPP[quality]["model"])
             params = {"object": name, "model": model, "size": size, "spp": spp, "resolution": RESOLUTION[quality]}
@@ -55,8 +55,8 @@ def parts(quality: str) -> list[Part]:
             needs = (training_of(name),) if model == FULL_GEOMETRY else ()
             weights = weight_files(model, tissue("candle wax").medium)
             inputs = (environment_file(LIGHT), TISSUES, *weights)
-            found.append(Part(f"{name}, {model}", shown, params, spp * size**2, needs, inputs, f"{name} {model}"))
-    return found
+            results.append(Part(f"{name}, {model}", shown, params, spp * size**2, needs, inputs, f"{name} {model}"))
+    return results
 
 
 def _view(name: str) -> View:

@@ -49,7 +49,7 @@ def sampled(task: Task) -> dict[str, Any]:
     exit = _exit(obj, p["towards"])
     in_space = flow.sample(exit, n, p["seed"])[0]
     rng = np.random.default_rng(p["seed"])
-    found = {
+    results = {
         "uniform": _positions(frame, obj.random_points(_lanes(n, 41)).p),
         "flow in space": in_space,
         "flow on the surface": on_surface(in_space, vertices, faces, p["seed"]),
@@ -57,8 +57,8 @@ def sampled(task: Task) -> dict[str, Any]:
     }
     shown = vertices[faces].mean(axis=1)[rng.permutation(len(faces))[:SHOWN]]
     return {
-        "points": {name: np.round(points, 5).tolist() for name, points in found.items()},
-        "rmsd": {name: rmsd(points, vertices, faces) for name, points in found.items()},
+        "points": {name: np.round(points, 5).tolist() for name, points in results.items()},
+        "rmsd": {name: rmsd(points, vertices, faces) for name, points in results.items()},
         "mesh": np.round(shown, 4).tolist(),
         "exit": _positions(frame, exit.p)[0].tolist(),
         "seconds": p["seconds"],

@@ -41,15 +41,15 @@ LOOKS = {
 
 def parts(quality: str) -> list[Part]:
     """For each scene a long path-traced image, then the three ways one after the other."""
-    size, seconds, found = SIZES[quality], SECONDS[quality], []
+    size, seconds, results = SIZES[quality], SECONDS[quality], []
     for material, lights in SCENES[quality]:
         common = {"material": material, "size": size, "lights": lights}
         name, truth = f"{material}, {lights}", {**common, "spp": TRUTH_SPP[quality], "seed": 0}
-        found.append(Part(f"{name}: truth", long_walk, truth, truth["spp"] * size**2, inputs=(BUNNY,)))
+        results.append(Part(f"{name}: truth", long_walk, truth, truth["spp"] * size**2, inputs=(BUNNY,)))
         times = {"seconds": seconds, "train_seconds": TRAIN_SECONDS[quality]}
         params = {**common, **times, "train_error": 1e-3, "model": KIND, "seed": 1}
-        found.append(Part(f"{name}: ways", rivals, params, 3 * seconds, inputs=(BUNNY,)))
-    return found
+        results.append(Part(f"{name}: ways", rivals, params, 3 * seconds, inputs=(BUNNY,)))
+    return results
 
 
 def rivals(task: Task) -> dict[str, Any]:
@@ -175,17 +175,17 @@ class Snapshots:
         """Since the start."""
         return time.monotonic() - self._started
 
-    def add(self, found: Reference, last: bool = False) -> None:
+    def add(self, result: Reference, last: bool = False) -> None:
         """Keep an image, if it is time or the last one."""
         now = self.seconds
         if self.times and now < STEP * self.times[-1] and not last:
             return
-        if last and self.spp and self.spp[-1] == found.spp:
+        if last and self.spp and self.spp[-1] == result.spp:
             return
         now = max(now, self.times[-1] + 1e-6) if self.times else now
         self.times.append(now)
-        self.images.append(found.mean[..., :3].astype(np.float32))
-        self.spp.append(found.spp)
+        self.images.append(result.mean[..., :3].astype(np.float32))
+        self.spp.append(result.spp)
         self._started += self.seconds - now
 
 
@@ -208,24 +208,24 @@ def trained_online(p: dict[str, Any], folder: Path, seconds: float, train_second
     Returns:
         The snapshots, the seconds at the switch, and what `about` tells of the training.
     """
-    found, walks, switch = Snapshots(), [None], [0.0]
+    result, walks, switch = Snapshots(), [None], [0.0]
 
     def traced(image: Reference) -> None:
         walks[0] = image
-        found.add(image)
+        result.add(image)
 
     def rendered(image: Reference) -> None:
         if not switch[0]:
-            switch[0] = found.seconds - image.seconds
-            found.add(walks[0], last=True)
-        found.add(combined(walks[0], image))
+            switch[0] = result.seconds - image.seconds
+            result.add(walks[0], last=True)
+        result.add(combined(walks[0], image))
 
     image = online.render(
         _scene(p, p["model"], train_seconds), folder / "online.exr", seed=p["seed"], walked=traced, progress=rendered,
         seconds=max(seconds - train_seconds, 0.1), interval=1e9,
     )  # fmt: skip
-    found.add(image, last=True)
-    return {"snapshots": found, "switch": switch[0], "training": image.about["training"]}
+    result.add(image, last=True)
+    return {"snapshots": result, "switch": switch[0], "training": image.about["training"]}
 
 
 def modelled(p: dict[str, Any], folder: Path, seconds: float) -> Snapshots:
@@ -244,7 +244,7 @@ def _rendered(scene: Any, path: Path, seed: int, seconds: float) -> Snapshots:
     integrator = scene.integrator()
     if is_bssrdf(integrator):
         integrator.prepare(scene)
-    found = Snapshots()
-    image = reference.render(scene, path, seed=seed, seconds=seconds, interval=1e9, resume=False, progress=found.add)
-    found.add(image, last=True)
-    return found
+    result = Snapshots()
+    image = reference.render(scene, path, seed=seed, seconds=seconds, interval=1e9, resume=False, progress=result.add)
+    result.add(image, last=True)
+    return result

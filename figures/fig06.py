@@ -34,7 +34,7 @@ NOTES = (
 
 def parts(quality: str) -> list[Part]:
     """The training, then each light and each view by walks and by the model."""
-    size, found = SIZES[quality], [train_scan(MATERIAL, MATERIAL, TRAIN_SECONDS[quality])]
+    size, results = SIZES[quality], [train_scan(MATERIAL, MATERIAL, TRAIN_SECONDS[quality])]
     for light, view in _cases():
         files = (environment_file(light),) if light in ENVIRONMENTS else ()
         for model, spp in SPP[quality].items():
@@ -49,8 +49,8 @@ def parts(quality: str) -> list[Part]:
             params["model"] = model
             needs = (training_of(MATERIAL),) if model == FULL_GEOMETRY else ()
             name = _name(light, view, model)
-            found.append(Part(name, seen, params, spp * size**2, needs, (BUNNY, *files), model))
-    return found
+            results.append(Part(name, seen, params, spp * size**2, needs, (BUNNY, *files), model))
+    return results
 
 
 def _cases() -> list[tuple[str, int]]:

@@ -28,10 +28,10 @@ def parts(quality: str) -> list[Part]:
     """Ours for all N, and a training of the paper's network for each N."""
     seconds, (exits, walks) = SECONDS[quality], TRUTH[quality]
     common = {"seconds": seconds, "exits": exits, "walks": walks, "seed": 0}
-    found = [Part(OURS, ours, {"numbers": list(NUMBERS[quality]), **common}, seconds, inputs=(BUNNY,))]
+    results = [Part(OURS, ours, {"numbers": list(NUMBERS[quality]), **common}, seconds, inputs=(BUNNY,))]
     for n in NUMBERS[quality]:
-        found.append(Part(f"paper, N = {n}", papers, {"n": n, **common}, seconds, inputs=(BUNNY,)))
-    return found
+        results.append(Part(f"paper, N = {n}", papers, {"n": n, **common}, seconds, inputs=(BUNNY,)))
+    return results
 
 
 def truth_of(obj: Any, p: Mapping[str, Any]) -> Any:
@@ -41,18 +41,18 @@ def truth_of(obj: Any, p: Mapping[str, Any]) -> Any:
     return reference(obj, p["exits"], p["walks"], p["seed"])
 
 
-def _rmse(found: Any, truth: Any, per_estimate: float) -> dict[str, float]:
+def _rmse(result: Any, truth: Any, per_estimate: float) -> dict[str, float]:
     """Relative RMSE of one estimate, its noise included and that of the truth taken out, mean over channels.
 
     Args:
-        found: estimates of the exits.
+        result: estimates of the exits.
         truth: from walks.
         per_estimate: variance of one estimate over that of their mean.
     """
     values = {}
     for light, columns in (("constant", slice(0, 1)), ("lobes", slice(1, None))):
-        a, b = found.mean[..., columns], truth.truth.mean[..., columns]
-        spread = found.variance[..., columns]
+        a, b = result.mean[..., columns], truth.truth.mean[..., columns]
+        spread = result.variance[..., columns]
         square = (a - b) ** 2 - spread - truth.truth.variance[..., columns] + per_estimate * spread
         ratio = square.mean(axis=1) / np.maximum(b.mean(axis=1), 1e-30) ** 2
         values[light] = float(np.sqrt(np.maximum(ratio.mean(axis=1), 0)).mean())
@@ -74,8 +74,8 @@ def ours(task: Task) -> dict[str, Any]:
     learnt, _ = train_by_cpu(obj, p["seconds"], task.folder, seed=p["seed"])
     truth = truth_of(obj, p)
     proposals = EntryProposals(obj, HalfSpace(obj, BACKBONE)).with_patches(learnt.sampler)
-    found = modelled(learnt.model, proposals, truth.exits, p["walks"], p["seed"])
-    rows = [{"method": OURS, "N": n, **_rmse(found, truth, p["walks"] / n)} for n in p["numbers"]]
+    result = modelled(learnt.model, proposals, truth.exits, p["walks"], p["seed"])
+    rows = [{"method": OURS, "N": n, **_rmse(result, truth, p["walks"] / n)} for n in p["numbers"]]
     return {"rows": rows}
 
 
@@ -91,8 +91,8 @@ def papers(task: Task) -> dict[str, Any]:
     net, steps = fit_paper(obj, PaperRecipe(n=p["n"], seconds=p["seconds"]), p["seed"])
     rows = []
     for points, name in (("walks", "paper, points of walks"), ("uniform", "paper, uniform points")):
-        found = estimate(obj, net, truth.exits, points, repeats, p["seed"])
-        rows.append({"method": name, "N": p["n"], **_rmse(found, truth, repeats)})
+        result = estimate(obj, net, truth.exits, points, repeats, p["seed"])
+        rows.append({"method": name, "N": p["n"], **_rmse(result, truth, repeats)})
     return {"rows": rows, "steps": steps}
 
 

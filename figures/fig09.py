@@ -38,22 +38,22 @@ NOTES = (
 
 def parts(quality: str) -> list[Part]:
     """For each material two path-traced images, then the image of each model."""
-    size, found = SIZES[quality], []
+    size, results = SIZES[quality], []
     for material in MATERIALS:
         common = {"material": material, "size": size, "seed": 0}
         spp = TRUTH_SPP[quality]
         for name, seed in (("path traced", 0), ("path traced again", AGAIN_SEED)):
             params = {**common, "seed": seed, "spp": spp}
-            found.append(Part(f"{material}, {name}", path_traced, params, spp * size**2, inputs=(BUNNY,)))
+            results.append(Part(f"{material}, {name}", path_traced, params, spp * size**2, inputs=(BUNNY,)))
         spp = MODEL_SPP[quality]
         for model in MODELS:
             learnt = model == FULL_GEOMETRY
-            found += [train_scan(material, material, TRAIN_SECONDS[quality])] if learnt else []
+            results += [train_scan(material, material, TRAIN_SECONDS[quality])] if learnt else []
             params = {**common, "spp": spp, "model": model}
             inputs = (BUNNY, *weight_files(model, materials.load(material).medium))
             needs = (training_of(material),) if learnt else ()
-            found.append(Part(f"{material}, {model}", rendered, params, 2 * spp * size**2, needs, inputs, model))
-    return found
+            results.append(Part(f"{material}, {model}", rendered, params, 2 * spp * size**2, needs, inputs, model))
+    return results
 
 
 @unmodelled
@@ -118,9 +118,11 @@ def _shots(results: Mapping[str, Result], material: str) -> tuple[str, list[Shot
     other = compared("Path traced again", gain * again.images["image"], gain * reference, mask=mask, numbers=numbers)
     shots.append(replace(other, numbers=other.numbers | {FLIP: f"{other.numbers[FLIP]:.3f}"}))  # text: no best model
     for model in MODELS:
-        found = results[f"{material}, {model}"]
-        numbers = {"seconds": found.numbers["seconds"], "spp": found.numbers["spp"]}
+        result = results[f"{material}, {model}"]
+        numbers = {"seconds": result.numbers["seconds"], "spp": result.numbers["spp"]}
         if model == FULL_GEOMETRY:
             numbers["CPU seconds of training"] = results[training_of(material)].numbers["cpu seconds"]
-        shots.append(compared(label(model), gain * found.images["image"], gain * reference, mask=mask, numbers=numbers))
+        shots.append(
+            compared(label(model), gain * result.images["image"], gain * reference, mask=mask, numbers=numbers)
+        )
     return f"{material} ({stops:+g} stops)", shots

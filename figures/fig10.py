@@ -65,8 +65,8 @@ def curve_set(results: Mapping[str, Result]) -> CurveSet:
     traced = [numbers[_traced_name(theta)] for theta in FIG10_THETA_I]
     common = dict(traced[0]["common"])
     medium, r_edges = Medium(**common.pop("medium")), np.array(common.pop("r_edges"))
-    found = [_as_curve(c) for part in numbers.values() for c in part["curves"]]
-    ordered = tuple(sorted(found, key=lambda c: FIG10_THETA_I.index(c.theta_i_deg)))  # stable: parts keep their order
+    outcome = [_as_curve(c) for part in numbers.values() for c in part["curves"]]
+    ordered = tuple(sorted(outcome, key=lambda c: FIG10_THETA_I.index(c.theta_i_deg)))  # stable: parts keep their order
     speeds = {name: speed for part in numbers.values() for name, speed in part["evaluations_per_s"].items()}
     seconds = sum(part["seconds"] for part in traced)
     return CurveSet(**common, medium=medium, r_edges=r_edges, curves=ordered, evaluations_per_s=speeds, seconds=seconds)
@@ -95,5 +95,5 @@ def _as_numbers(result: CurveSet) -> dict[str, Any]:
 
 def _as_curve(values: Mapping[str, Any]) -> Curve:
     arrays = {name: np.array(values[name]) for name in ("S", "S_at_r", "standard_error")}
-    reflectance = {order: tuple(found) for order, found in values["reflectance"].items()}
+    reflectance = {order: tuple(each) for order, each in values["reflectance"].items()}
     return Curve(**{**values, **arrays, "reflectance": reflectance})

@@ -50,20 +50,20 @@ NOTES = (
 
 def parts(quality: str) -> list[Part]:
     """For each material a long path-traced image, then what every method makes of the time."""
-    size, found = SIZES[quality], []
+    size, results = SIZES[quality], []
     for material in MATERIALS:
         common = {"material": material, "size": size, "lights": LIGHTS}
         spp = TRUTH_SPP[quality]
-        found.append(
+        results.append(
             Part(f"{material}, truth", truth, {**common, "spp": spp, "seed": 0}, spp * size**2, inputs=(BUNNY,))
         )
         params = {**common, "seconds": SECONDS[quality], "methods": list(METHODS), "seed": 1}
         learnt = FULL_GEOMETRY in METHODS
-        found += [train_scan(material, material, TRAIN_SECONDS[quality])] if learnt else []
+        results += [train_scan(material, material, TRAIN_SECONDS[quality])] if learnt else []
         files = [file for name in METHODS for file in weight_files(name, materials.load(material).medium)]
         work, needs = len(METHODS) * SECONDS[quality], (training_of(material),) if learnt else ()
-        found.append(Part(f"{material}, equal time", rivals, params, work, needs, (BUNNY, *files)))
-    return found
+        results.append(Part(f"{material}, equal time", rivals, params, work, needs, (BUNNY, *files)))
+    return results
 
 
 @unmodelled
@@ -82,10 +82,10 @@ def rivals(task: Task) -> dict[str, Any]:
     with with_weights(task.folder, task.needed):
         scenes = {name: contender(name, p["material"], p["size"], p["lights"]) for name in p["methods"]}
         spp = {name: pass_size(scene, each, p["seed"]) for name, scene in scenes.items()}
-        found = alternating(scenes, spp, p["seed"], seconds=p["seconds"], progress=task.progress)
+        result = alternating(scenes, spp, p["seed"], seconds=p["seconds"], progress=task.progress)
     about = guides(next(iter(scenes.values())))
     images, numbers = {"cover": about[0][..., 0]}, {}
-    for name, timed in found.items():
+    for name, timed in result.items():
         images[_key(name, "raw")] = timed.image.astype(np.float32)
         images[_key(name, "denoised")], seconds = denoised(timed.image, *about)
         numbers[name] = _numbers(timed, seconds)
@@ -112,9 +112,9 @@ def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
 
     scenes, rows = {}, []
     for material in dict.fromkeys(name.split(",")[0] for name in results):
-        name, shots, found = _shots(results[f"{material}, truth"], results[f"{material}, equal time"], material)
+        name, shots, result = _shots(results[f"{material}, truth"], results[f"{material}, equal time"], material)
         scenes[name] = shots
-        rows += found
+        rows += result
     with paper():
         grid = image_grid(scenes, printed=(FLIP, RELATIVE_MSE, "spp"))
         files: dict[str, bytes | str] = {f"fig11.{ending}": data for ending, data in saved(grid).items()}

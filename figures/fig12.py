@@ -41,20 +41,20 @@ def parts(quality: str) -> list[Part]:
 def rendered(task: Task) -> dict[str, Any]:
     """The images of all samplers and numbers of entries under all lights, and the converged ones."""
     prepare()
-    p, found, done = task.params, {}, 0
+    p, results, done = task.params, {}, 0
     folders, flow = _weights(task)
     total = len(p["lights"]) * (1 + len(SAMPLERS) * len(ENTRIES))
     for light in p["lights"]:
         passes = max(p["spp"] // SPP_PER_PASS, 1)
         images = [_image(folders["patches"], p, light, 1, SPP_PER_PASS, 100 + k) for k in range(passes)]
-        found[_key(light, "converged")] = np.mean(images, axis=0).astype(np.float32)
+        results[_key(light, "converged")] = np.mean(images, axis=0).astype(np.float32)
         for sampler in SAMPLERS:
             for n in ENTRIES:
                 drawn = flow if sampler == "flow" else None
-                found[_key(light, sampler, n)] = _image(folders[sampler], p, light, n, 1, 7, drawn)
+                results[_key(light, sampler, n)] = _image(folders[sampler], p, light, n, 1, 7, drawn)
                 done += 1
                 task.progress(done, total)
-    return found
+    return results
 
 
 def _key(*words: object) -> str:

@@ -44,17 +44,17 @@ PAPER = (
 
 def parts(quality: str) -> list[Part]:
     """For each material the training of the bunny, then an image by each model and number of entries."""
-    size, spp, found = SIZES[quality], SPP[quality], []
+    size, spp, results = SIZES[quality], SPP[quality], []
     for material in SUBJECTS[quality]:
         if FULL_GEOMETRY in MODELS:
-            found.append(train_scan(material, material, TRAIN_SECONDS[quality]))
+            results.append(train_scan(material, material, TRAIN_SECONDS[quality]))
         for model, entries in _cases():
             params = {"material": material, "size": size, "seed": 0, "spp": spp, "model": model, "entries": entries}
             needs = (training_of(material),) if model == FULL_GEOMETRY else ()
             inputs = (BUNNY, *weight_files(model, materials.load(material).medium))
             work = 2 * spp * size**2 * entries
-            found.append(Part(_name(material, model, entries), rendered, params, work, needs, inputs, model))
-    return found
+            results.append(Part(_name(material, model, entries), rendered, params, work, needs, inputs, model))
+    return results
 
 
 def _cases() -> list[tuple[str, int]]:
@@ -82,8 +82,8 @@ def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
 
 
 def _row(results: Mapping[str, Result], material: str, model: str, entries: int) -> dict[str, Any]:
-    found = results[_name(material, model, entries)]
-    pixels = found.images["image"].shape[0] * found.images["image"].shape[1]
+    result = results[_name(material, model, entries)]
+    pixels = result.images["image"].shape[0] * result.images["image"].shape[1]
     row = {"material": material, "model": label(model), "N": entries, "training, CPU s": 0.0, "steps": 0, "walks": 0}
     if model == FULL_GEOMETRY:
         learnt = results[training_of(material)].numbers
@@ -91,6 +91,6 @@ def _row(results: Mapping[str, Result], material: str, model: str, entries: int)
         size = learnt["kB"]
     else:
         size = sum(Path(file).stat().st_size for file in weight_files(model, materials.load(material).medium)) / 1000
-    samples = found.numbers["spp"] * pixels
-    seconds = found.numbers["seconds"]
+    samples = result.numbers["spp"] * pixels
+    seconds = result.numbers["seconds"]
     return {**row, "weights, kB": size, "samples": samples, "render, s": seconds, "s per 10⁶": 1e6 * seconds / samples}

@@ -61,12 +61,12 @@ def _refuse_old_loaded_llvm() -> None:
     version, given = dr.detail.llvm_version(), os.environ.get("DRJIT_LIBLLVM_PATH")
     if version is not None and version[0] >= OLDEST_LLVM:
         return
-    found = "no LLVM that it takes" if version is None or version[0] < 0 else "LLVM " + ".".join(map(str, version))
+    result = "no LLVM that it takes" if version is None or version[0] < 0 else "LLVM " + ".".join(map(str, version))
     remedy = "import halfspace_sss before drjit and mitsuba (`pip install karellen-llvm-core` brings an LLVM along)"
     if given and (_llvm_version(given) or 0) < OLDEST_LLVM:
         remedy = f"unset DRJIT_LIBLLVM_PATH = {given}"
     raise BackendError(
-        f"Dr.Jit found {found} when it was imported, but it needs LLVM {OLDEST_LLVM} or newer: {remedy}, "
+        f"Dr.Jit found {result} when it was imported, but it needs LLVM {OLDEST_LLVM} or newer: {remedy}, "
         "or set DRJIT_LIBLLVM_PATH before Python starts"
     )
 
@@ -86,9 +86,9 @@ def prepare_llvm() -> None:
     if given:
         version = _llvm_version(given)
         if version is None or version < OLDEST_LLVM:
-            found = "cannot be loaded" if version is None else f"is LLVM {version or 'before 16'}"
+            result = "cannot be loaded" if version is None else f"is LLVM {version or 'before 16'}"
             raise BackendError(
-                f"DRJIT_LIBLLVM_PATH = {given} {found}; Dr.Jit needs LLVM {OLDEST_LLVM} or newer: "
+                f"DRJIT_LIBLLVM_PATH = {given} {result}; Dr.Jit needs LLVM {OLDEST_LLVM} or newer: "
                 "unset it, or `pip install karellen-llvm-core`"
             )
         return

@@ -35,10 +35,10 @@ def warn_left_out(group: str, name: str, error: object) -> None:
 
 def offers(group: str) -> dict[str, EntryPoint]:
     """The entry points of a group by name, the first of each, those of this project before others; none is loaded."""
-    found: dict[str, EntryPoint] = {}
+    results: dict[str, EntryPoint] = {}
     for entry in _entries(group):
-        found.setdefault(entry.name, entry)
-    return found
+        results.setdefault(entry.name, entry)
+    return results
 
 
 def _entries(group: str) -> list[EntryPoint]:
@@ -57,30 +57,30 @@ def loaded(entry: EntryPoint) -> Any:
 def offered(group: str) -> Iterator[tuple[str, Any]]:
     """Name and object of every entry point of a group that loads, those of this project first."""
     for entry in _entries(group):
-        if (found := loaded(entry)) is not None:
-            yield entry.name, found
+        if (result := loaded(entry)) is not None:
+            yield entry.name, result
 
 
 def commands(group: str = COMMANDS) -> Iterator[tuple[str, Callable]]:
     """Name and function of every command, or study, that a package adds."""
-    for name, found in offered(group):
-        if callable(found):
-            yield name, found
+    for name, each in offered(group):
+        if callable(each):
+            yield name, each
         else:
-            warn_left_out(group, name, f"it must be a function, got {found!r}")
+            warn_left_out(group, name, f"it must be a function, got {each!r}")
 
 
 def renderer(kind: str) -> Renderer | None:
     """The function that draws results of a kind, e.g. "curves"; None if it or the drawing library is not installed."""
     for entry in entry_points(group=FIGURES, name=kind):
         try:
-            found = entry.load()
+            result = entry.load()
         except FAILURES as error:
             missing = (getattr(error, "name", None) or "").split(".")[0]
             if not isinstance(error, ModuleNotFoundError) or missing not in ("PIL", "matplotlib", "figures"):
                 warn_left_out(FIGURES, kind, error)
             continue
-        if callable(found):
-            return found
-        warn_left_out(FIGURES, kind, f"it must be a function, got {found!r}")
+        if callable(result):
+            return result
+        warn_left_out(FIGURES, kind, f"it must be a function, got {result!r}")
     return None

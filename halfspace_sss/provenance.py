@@ -41,7 +41,7 @@ def _version(name: str) -> str | None:
 
 def provenance(**parameters: Any) -> dict[str, Any]:
     """Command, parameters, versions, commit and platform, ready for JSON."""
-    versions = {name: found for name in LIBRARIES if (found := _version(name))}
+    versions = {name: result for name in LIBRARIES if (result := _version(name))}
     command = " ".join([Path(sys.argv[0]).name, *sys.argv[1:]])
     return {
         "command": command,

@@ -86,8 +86,8 @@ def modelled_contender(method: str, p: Mapping[str, Any], folder: Path, sampler:
         folder: for its files.
         sampler: Mitsuba's plugin of random numbers.
     """
-    found = modelled_scene(p["object"], p["resolution"], p["size"], p["lights"], folder, sampler)
-    return ready(method, found, p["object"], tissue("candle wax").medium)  # all tissues scatter isotropically
+    result = modelled_scene(p["object"], p["resolution"], p["size"], p["lights"], folder, sampler)
+    return ready(method, result, p["object"], tissue("candle wax").medium)  # all tissues scatter isotropically
 
 
 @unmodelled
@@ -120,25 +120,25 @@ FURNACE = {"draft": {"size": 16, "spp": 256}, "paper": {"size": 32, "spp": 16384
 
 def parts(quality: str) -> list[Part]:
     """For each object its training, for each light the truth and the errors with times; then samples and furnace."""
-    found = []
+    results = []
     for name, (scan, material) in SUBJECTS.items():
         if FULL_GEOMETRY in OF_OBJECTS:
-            found.append(train_scan(name, material, TRAIN_SECONDS[quality], scan=scan))
+            results.append(train_scan(name, material, TRAIN_SECONDS[quality], scan=scan))
         for lights in LIGHTS:
-            found += _parts_of(name, lights, quality)
+            results += _parts_of(name, lights, quality)
     for name in OBJECTS:
-        found.append(train_modelled(name, RESOLUTION[quality], TRAIN_SECONDS[quality]))
+        results.append(train_modelled(name, RESOLUTION[quality], TRAIN_SECONDS[quality]))
         for lights in LIGHTS:
-            found += _parts_of(name, lights, quality)
+            results += _parts_of(name, lights, quality)
     weights = weight_files("neural", materials.load(SPLIT_MATERIAL).medium)
     common = {"material": SPLIT_MATERIAL, "models": list(MODELS), "lanes": LANES[quality], "repeats": 5}
-    found.append(Part("time per sample", split, common, LANES[quality], inputs=(BUNNY, *weights)))
+    results.append(Part("time per sample", split, common, LANES[quality], inputs=(BUNNY, *weights)))
     for model in (WALK, *furnace_models()):
         params = {"model": model, **FURNACE[quality]}
         inputs = weight_files(model, materials.load(SPLIT_MATERIAL).medium) if model == "neural" else ()
         work = params["spp"] * params["size"] ** 2
-        found.append(Part(_furnace_name(model), furnace, params, work, inputs=inputs))
-    return found
+        results.append(Part(_furnace_name(model), furnace, params, work, inputs=inputs))
+    return results
 
 
 def _errors_name(name: str, lights: str) -> str:
@@ -185,8 +185,8 @@ def measured(task: Task) -> dict[str, Any]:
     """Errors and CPU seconds of all methods, whose passes take turns, and those of training."""
     prepare()
     p = task.params
-    (truth,) = (found for name, found in task.needed.items() if name.endswith(TRUTH))
-    seconds = [found.numbers["cpu seconds"] for name, found in task.needed.items() if name.endswith(TRAINING)]
+    (truth,) = (result for name, result in task.needed.items() if name.endswith(TRUTH))
+    seconds = [result.numbers["cpu seconds"] for name, result in task.needed.items() if name.endswith(TRAINING)]
 
     def progress(done: int, total: int) -> None:
         task.progress(total + done, 2 * total)
@@ -194,9 +194,9 @@ def measured(task: Task) -> dict[str, Any]:
     with with_weights(task.folder, task.needed):
         scenes = _compiled(task)
         cover = guides(scenes[WALK], 8)[0][..., 0] > 0
-        found = alternating(scenes, p["spp"], p["seed"], passes=p["passes"], progress=progress)
+        result = alternating(scenes, p["spp"], p["seed"], passes=p["passes"], progress=progress)
     traced = (WALK, *VOLUMES)
-    rows = [{"method": name, **errors(timed, truth, cover, name in traced)} for name, timed in found.items()]
+    rows = [{"method": name, **errors(timed, truth, cover, name in traced)} for name, timed in result.items()]
     level = float(np.mean(truth.images["image"][cover].astype(np.float64) ** 2))
     noise = float(np.mean(truth.images["variance"][cover], dtype=np.float64))
     about = {"mean square": level, "variance": noise, "seconds": truth.numbers["seconds"], "spp": truth.numbers["spp"]}
@@ -366,16 +366,16 @@ def _steps(scene: Any, n: int) -> dict[str, Callable[[], Any]]:
     dr.eval(tuple(out), face, tuple(entry), direction, sampler)  # named tuples are passed over
     ray = place(entry.p, entry.n).spawn_ray(direction)
     dr.eval(ray)
-    found = entry.weight > 0
-    dr.eval(found)
+    result = entry.weight > 0
+    dr.eval(result)
 
     def evaluated() -> Any:
         at = entry.facing(direction)
-        return body.transport.S(prepared, at, found) * at.mu
+        return body.transport.S(prepared, at, result) * at.mu
 
     return {
         "entries": lambda: tuple(body.proposals.sample(out, face, where, sampler.clone(), mi.Bool(True))),
-        "visibility": lambda: scene.ray_intersect_preliminary(ray, coherent=False, active=found),
+        "visibility": lambda: scene.ray_intersect_preliminary(ray, coherent=False, active=result),
         "evaluation": evaluated,
     }
 
@@ -385,12 +385,12 @@ def _seen(scene: Any, n: int) -> Any:
     import drjit as dr
     import mitsuba as mi
 
-    rng, sensor, found = np.random.default_rng(5), scene.sensors()[0], np.zeros((2, 0), dtype=np.float32)
-    while found.shape[1] < n:
+    rng, sensor, result = np.random.default_rng(5), scene.sensors()[0], np.zeros((2, 0), dtype=np.float32)
+    while result.shape[1] < n:
         place = rng.random((2, 2 * n)).astype(np.float32)
         ray, _ = sensor.sample_ray(0.0, 0.5, mi.Point2f(place), mi.Point2f(0.5))
-        found = np.hstack([found, place[:, np.array(scene.ray_intersect_preliminary(ray).is_valid())]])
-    ray, _ = sensor.sample_ray(0.0, 0.5, mi.Point2f(found[:, :n]), mi.Point2f(0.5))
+        result = np.hstack([result, place[:, np.array(scene.ray_intersect_preliminary(ray).is_valid())]])
+    ray, _ = sensor.sample_ray(0.0, 0.5, mi.Point2f(result[:, :n]), mi.Point2f(0.5))
     si = scene.ray_intersect(ray)
     dr.eval(si)
     return si

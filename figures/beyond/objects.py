@@ -60,14 +60,14 @@ VIEWS = {
 
 def parts(quality: str) -> list[Part]:
     """One image of each object."""
-    size, spp, found = SIZES[quality], SPP[quality], []
+    size, spp, results = SIZES[quality], SPP[quality], []
     for name in OBJECTS:
         params = {"object": name, "size": size, "spp": spp, "resolution": RESOLUTION[quality], "seed": 0}
         inputs = (environment_file(VIEWS[name].light), TISSUES)
         params |= {"view": list(VIEWS[name])}
         function = varying if name in VARYING else candle
-        found.append(Part(name, function, params, spp * size**2, inputs=inputs))
-    return found
+        results.append(Part(name, function, params, spp * size**2, inputs=inputs))
+    return results
 
 
 def scene(shown: Mapping[str, Any], view: View, size: int, low: float = 0.0) -> dict[str, Any]:
@@ -122,10 +122,10 @@ def varying(task: Task) -> dict[str, Any]:
 def _image(task: Task, loaded: Any, albedo: np.ndarray, normal: np.ndarray) -> dict[str, Any]:
     """The image in passes that survive an interruption, as rendered and denoised; then the files of the scene go."""
     spp = task.params["spp"]
-    found = long_render(task, loaded, min(SPP_PER_PASS, spp), max(spp // SPP_PER_PASS, 1))
-    image = np.maximum(found["image"], 0)
+    result = long_render(task, loaded, min(SPP_PER_PASS, spp), max(spp // SPP_PER_PASS, 1))
+    image = np.maximum(result["image"], 0)
     smooth, _ = denoised(image, albedo, normal)
-    return {"image": image, "denoised": smooth, "seconds": found["seconds"], "spp": found["spp"]}
+    return {"image": image, "denoised": smooth, "seconds": result["seconds"], "spp": result["spp"]}
 
 
 def _surface_albedo(loaded: Any, made: Varying) -> np.ndarray:

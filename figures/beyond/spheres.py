@@ -31,15 +31,15 @@ RUNS = 4  # of independent seeds, whose spread is the error
 def parts(quality: str) -> list[Part]:
     """The mean radiance of each sphere under each light, path traced and by each model."""
     medium = Medium.from_albedo(MEDIUM["albedo"], 1.0, MEDIUM["g"], MEDIUM["eta"])
-    found = []
+    results = []
     for model in (PATH_TRACED, *MODELS):
         for light in LIGHTS:
             params = {"model": model, "light": light, "radii": list(RADII), "medium": MEDIUM}
             params |= {"size": SIZE[quality], "spp": SPP[quality]}
             inputs = () if model == PATH_TRACED else weight_files(model, medium)
             like = "walk" if model == PATH_TRACED else "model"
-            found.append(Part(f"{light}, {model}", measured, params, SPP[quality], inputs=inputs, like=like))
-    return found
+            results.append(Part(f"{light}, {model}", measured, params, SPP[quality], inputs=inputs, like=like))
+    return results
 
 
 def measured(task: Task) -> dict[str, Any]:
@@ -103,8 +103,8 @@ def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
         for ax, light in zip(axes, LIGHTS):
             truth = results[f"{light}, {PATH_TRACED}"].numbers
             for model in MODELS:
-                found = results[f"{light}, {model}"].numbers
-                ratio, error = _ratio(found, truth)
+                result = results[f"{light}, {model}"].numbers
+                ratio, error = _ratio(result, truth)
                 style = look(model)
                 ax.errorbar(RADII, ratio, 2 * error, color=style.color, ls=style.dash, label=style.label, capsize=1.5)
                 rows += [
@@ -120,7 +120,7 @@ def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
     return files
 
 
-def _ratio(found: Mapping[str, Any], truth: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-    a, b = np.array(found["mean"]), np.array(truth["mean"])
-    relative = np.hypot(np.array(found["standard_error"]) / a, np.array(truth["standard_error"]) / b)
+def _ratio(values: Mapping[str, Any], truth: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+    a, b = np.array(values["mean"]), np.array(truth["mean"])
+    relative = np.hypot(np.array(values["standard_error"]) / a, np.array(truth["standard_error"]) / b)
     return a / b, a / b * relative

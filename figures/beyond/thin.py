@@ -58,17 +58,17 @@ THINGS = {
 
 def parts(quality: str) -> list[Part]:
     """For each thing the path-traced image, then the image of each model."""
-    size, found = SIZES[quality], []
+    size, results = SIZES[quality], []
     for name, thing in THINGS.items():
         common = {"thing": name, "made": list(thing), "size": size, "resolution": RESOLUTION[quality], "seed": 0}
         files, spp = ((DRAGON,) if not thing.family else ()), TRUTH_SPP[quality]
-        found.append(Part(f"{name}, path traced", path_traced, {**common, "spp": spp}, spp * size**2, inputs=files))
+        results.append(Part(f"{name}, path traced", path_traced, {**common, "spp": spp}, spp * size**2, inputs=files))
         for model in MODELS:
             params = {**common, "spp": MODEL_SPP[quality], "model": model}
             inputs = (*files, *weight_files(model, materials.load(thing.material).medium))
             work = params["spp"] * size**2
-            found.append(Part(f"{name}, {model}", rendered, params, work, inputs=inputs, like=model))
-    return found
+            results.append(Part(f"{name}, {model}", rendered, params, work, inputs=inputs, like=model))
+    return results
 
 
 @unmodelled

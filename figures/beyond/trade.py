@@ -39,24 +39,24 @@ KNOB_WAYS = ("better_dipole", "neural")
 
 def parts(quality: str) -> list[Part]:
     """The bunny's training for each material, then a scene each; the spikes are not learnt, as a new object."""
-    found = []
+    results = []
     for material in MATERIALS:
         medium = materials.load(material).medium
         inputs = (BUNNY, *(f for model in NETWORKS for f in weight_files(model, medium)))
         learns = FULL_GEOMETRY in OF_OBJECTS
         if learns:
-            found.append(train_scan(material, material, TRAIN_SECONDS[quality]))
+            results.append(train_scan(material, material, TRAIN_SECONDS[quality]))
         for shape in SHAPES:
             needs = (training_of(material),) if learns and shape == "bunny" else ()
             for light in LIGHTS:
                 params = {"material": material, "shape": shape, "light": light, "seconds": SECONDS[quality]}
                 params |= {"size": SIZE[quality], "spp": SPP[quality], "seed": 0}
-                found.append(Part(_name(material, shape, light), measured, params, SECONDS[quality], needs, inputs))
+                results.append(Part(_name(material, shape, light), measured, params, SECONDS[quality], needs, inputs))
     for material in KNOB_MATERIALS:
         params = {"material": material, "shape": "bunny", "light": "small light", "seconds": SECONDS[quality]}
         params |= {"seed": 0, "names": list(KNOB_WAYS)}
-        found.append(Part(f"{material}, knobs", turned, params, 6 * SECONDS[quality], inputs=(BUNNY,)))
-    return found
+        results.append(Part(f"{material}, knobs", turned, params, 6 * SECONDS[quality], inputs=(BUNNY,)))
+    return results
 
 
 def _name(material: str, shape: str, light: str) -> str:
@@ -79,13 +79,13 @@ def measured(task: Task) -> dict[str, Any]:
         def tell(what: str, done: int, total: int) -> None:
             task.progress(done, total + 1)
 
-        found = assess_stage(on, chosen, seconds=p["seconds"], seed=p["seed"], progress=tell)
-        named = {row.way for row in found.objects[0].ways if not row.refusal}
+        result = assess_stage(on, chosen, seconds=p["seconds"], seed=p["seed"], progress=tell)
+        named = {row.way for row in result.objects[0].ways if not row.refusal}
         shown = [way for way in chosen if way.name in named]
         images = small_images(on, shown, 0, p["seed"], p["size"], p["spp"])
-        found = with_flip(on, shown, found, 0, p["seed"], images, p["spp"])
+        result = with_flip(on, shown, result, 0, p["seed"], images, p["spp"])
     numbered = {f"image_{k}": image for k, image in enumerate(images.values())}
-    return {"assessment": found.record(), "seconds": p["seconds"], "shown": list(images), **numbered}
+    return {"assessment": result.record(), "seconds": p["seconds"], "shown": list(images), **numbered}
 
 
 def turned(task: Task) -> dict[str, Any]:
@@ -125,7 +125,7 @@ def _scene(p: Mapping[str, Any], folder: Path, medium: Medium | None = None) -> 
 
 def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
     """The figure, the table as CSV and Markdown, and the page to flip between images."""
-    found, shots = {}, {}
+    result, shots = {}, {}
     for material in MATERIALS:
         for shape in SHAPES:
             for light in LIGHTS:
@@ -133,17 +133,17 @@ def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
                 if name not in results:
                     continue
                 assessment = Assessment.of(results[name].numbers["assessment"])
-                found[material, shape, light] = assessment.objects[0]
+                result[material, shape, light] = assessment.objects[0]
                 shown = enumerate(results[name].numbers["shown"])
                 images = {way: np.asarray(results[name].images[f"image_{k}"]) for k, way in shown}
                 shots[name] = image_shots(images, assessment)
-    table = trade_plot.trade_table(found)
+    table = trade_plot.trade_table(result)
     with paper():
-        figure = multiples(found, TOLERANCE)
+        figure = multiples(result, TOLERANCE)
         files: dict[str, bytes | str] = {f"trade.{ending}": data for ending, data in saved(figure).items()}
     files["trade.csv"] = table.to_csv(index=False, lineterminator="\n", float_format="%.5g")
     knobs = [results[f"{m}, knobs"].numbers["settings"] for m in KNOB_MATERIALS if f"{m}, knobs" in results]
     seconds = max(results[name].numbers["seconds"] for name in shots)
-    files["trade.md"] = trade_plot.markdown(found, table, seconds, [s for settings in knobs for s in settings])
+    files["trade.md"] = trade_plot.markdown(result, table, seconds, [s for settings in knobs for s in settings])
     files["trade.html"] = page("Speed against accuracy", shots)
     return files

@@ -82,12 +82,12 @@ def _volume_scene(description: dict[str, Any], name: str, medium: Medium, rr_dep
     mm_per_unit = description["integrator"].get("mm_per_unit", 1.0)
     if np.ptp(medium.g) == 0:
         return with_media(description, mm_per_unit, integrator)
-    found = []
+    results = []
     for channel in channels(medium):
         values = {key: float(getattr(channel, key)) for key in ("sigma_s", "sigma_a", "g", "eta")}
         one = {**description[name], "bsdf": {"type": "translucent", **values}}
-        found.append(with_media({**description, name: one}, mm_per_unit, integrator))
-    return tuple(found)
+        results.append(with_media({**description, name: one}, mm_per_unit, integrator))
+    return tuple(results)
 
 
 @unmodelled

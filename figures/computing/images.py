@@ -278,8 +278,8 @@ def denoised(image: np.ndarray, albedo: np.ndarray, normal: np.ndarray) -> tuple
             raise ValueError(f"{name} must have the shape of the image {pixels.shape}, got {np.shape(guide)}")
     albedo, normal = (np.ascontiguousarray(guide, dtype=np.float32) for guide in (albedo, normal))
     started = time.perf_counter()
-    found = oidn.denoise(pixels, albedo=albedo, normal=normal, hdr=True)
-    return np.maximum(np.asarray(found), 0.0), time.perf_counter() - started
+    result = oidn.denoise(pixels, albedo=albedo, normal=normal, hdr=True)
+    return np.maximum(np.asarray(result), 0.0), time.perf_counter() - started
 
 
 WHITE = 0.9  # encoded luminance of the bright end
@@ -350,5 +350,5 @@ def compared(
     relative = relative_mse(reference, image, mask=mask, floor=FLOOR)
     flip = flip_ldr(srgb(reference, exposure), srgb(image, exposure), mask=mask)
     a, b = luminance(reference), luminance(image)
-    found = {FLIP: flip.mean, RELATIVE_MSE: relative.mean, **(numbers or {})}
-    return Shot(label, image, found, flip.map, (b - a) / np.sqrt(a * a + FLOOR))
+    results = {FLIP: flip.mean, RELATIVE_MSE: relative.mean, **(numbers or {})}
+    return Shot(label, image, results, flip.map, (b - a) / np.sqrt(a * a + FLOOR))

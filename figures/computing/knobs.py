@@ -46,18 +46,18 @@ def entry_settings(
     on: Stage, names: Sequence[str], seconds: float, seed: int = 0, entries: Sequence[int] = ENTRIES
 ) -> list[Setting]:
     """How many points of entry an exit draws, for models on the first object of a scene."""
-    found = []
+    results = []
     for n in entries:
         stage = replace(on, bssrdf={**on.bssrdf, "entries": n}, paces={}, _integrators={})
         chosen = [Way(PATH_TRACED), *map(Way, names)]
         seen = assess_stage(stage, chosen, seconds=seconds, seed=seed).objects[0]
-        found += [("entries", str(n), name, _cost(seen, name), seen.way(name).bias) for name in names]
-    usual = {way: cost for _, value, way, cost, _ in found if value == str(entries[0])}
-    return [Setting(knob, value, way, cost / usual[way], error) for knob, value, way, cost, error in found]
+        results += [("entries", str(n), name, _cost(seen, name), seen.way(name).bias) for name in names]
+    usual = {way: cost for _, value, way, cost, _ in results if value == str(entries[0])}
+    return [Setting(knob, value, way, cost / usual[way], error) for knob, value, way, cost, error in results]
 
 
-def _cost(found: ObjectTrade, way: str) -> float:
-    row = found.way(way)
+def _cost(assessed: ObjectTrade, way: str) -> float:
+    row = assessed.way(way)
     return row.time_to(1.0)
 
 
@@ -88,27 +88,27 @@ def node_settings(medium: Medium, events: float = 4e6, seed: int = 0) -> list[Se
     (traced,) = references([medium.in_mfp()], events, seed, 4)
     rng = np.random.default_rng(0)
     r, mu = 10 ** rng.uniform(-2, 1, QUERIES), rng.uniform(0.05, 1, (2, QUERIES))
-    found = []
+    results = []
     for n in NODES:
         model = model_class(BEAMS)(medium.in_mfp(), n_samples=n)
         started = time.perf_counter()
         model.eval(r, mu[0], 0.3, mu[1], 1.0)
-        found.append((n, time.perf_counter() - started, model_error(model, traced).error))
-    usual = next(took for n, took, _ in found if n == USUAL_NODES)
-    return [Setting("nodes", str(n), BEAMS, took / usual, error) for n, took, error in found]
+        results.append((n, time.perf_counter() - started, model_error(model, traced).error))
+    usual = next(took for n, took, _ in results if n == USUAL_NODES)
+    return [Setting("nodes", str(n), BEAMS, took / usual, error) for n, took, error in results]
 
 
 def precision_settings(medium: Medium, events: float = 4e6, seed: int = 0) -> list[Setting]:
     """Single against half precision of the network of `neural` on a scalar medium: error, time in Dr.Jit alone."""
     (traced,) = references([medium.in_mfp()], events, seed, 4)
-    found = []
+    results = []
     for precision in PRECISIONS:
         model = model_class("neural")(medium.in_mfp())
         (network,) = model.networks
         took = _network_seconds(network, precision)
         model.networks = [partial(_rounded, network, precision)]
-        found.append((precision, took, model_error(model, traced).error))
-    return [Setting("precision", name, "neural", took / found[0][1], error) for name, took, error in found]
+        results.append((precision, took, model_error(model, traced).error))
+    return [Setting("precision", name, "neural", took / results[0][1], error) for name, took, error in results]
 
 
 def _rounded(network: Network, precision: str, features: Sequence[Any]) -> Any:

@@ -119,8 +119,8 @@ def object_parts(name: str, resolution: int, folder: Path, seed: int = 0, model:
     """
     if name == "candle":
         return candle_parts(folder, resolution, seed, model)
-    found = make_varying(name, resolution, max(round(GRID * resolution), 8), seed)
-    return learnable_parts(found, folder, model)
+    result = make_varying(name, resolution, max(round(GRID * resolution), 8), seed)
+    return learnable_parts(result, folder, model)
 
 
 def _scanned(task: Task) -> dict[str, Any]:
@@ -157,14 +157,14 @@ def _trained(task: Task, scene: dict[str, Any], name: str) -> dict[str, Any]:
 
 def accepting(medium: Medium) -> list[str]:
     """Names of the models that can be made for the medium: a learnt one without weights for it is not among them."""
-    found = []
+    results = []
     for name in models():
         try:
             bssrdf(name, medium)
         except ValueError:
             continue
-        found.append(name)
-    return found
+        results.append(name)
+    return results
 
 
 def weight_files(model: str, medium: Medium) -> tuple[Path, ...]:

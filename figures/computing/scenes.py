@@ -76,22 +76,22 @@ def scan_scene(
 
     check_choice("scan", scan, SCANS)
     check_choice("lights", lights, LIGHTS)
-    found = SCANS[scan]
-    view = mi.ScalarTransform4f().look_at(_beside(found, _EYE), list(found.centre), [0, 1, 0])
+    result = SCANS[scan]
+    view = mi.ScalarTransform4f().look_at(_beside(result, _EYE), list(result.centre), [0, 1, 0])
     film = {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}}
     scene: dict[str, Any] = {
         "type": "scene",
-        "integrator": {"type": "bssrdf", "mm_per_unit": found.mm_per_unit, "hide_emitters": True},
+        "integrator": {"type": "bssrdf", "mm_per_unit": result.mm_per_unit, "hide_emitters": True},
         "sensor": {"type": "perspective", "fov": 26.0, "to_world": view, "film": film, "sampler": {"type": sampler}},
         scan: {
             "type": "ply",
-            "filename": str(found.file),
+            "filename": str(result.file),
             "bsdf": {"type": "translucent", "material": material, "model": model},
         },
     }
     if lights != "even sky":
         glow = {"type": "area", "radiance": {"type": "rgb", "value": [90.0, 84.0, 75.0]}}
-        lamp = {"center": _beside(found, _LAMP), "radius": 1.6 * found.scale}
+        lamp = {"center": _beside(result, _LAMP), "radius": 1.6 * result.scale}
         scene["lamp"] = {"type": "sphere", **lamp, "emitter": glow}
     if lights == "even sky":
         scene["sky"] = {"type": "constant", "radiance": 1.0}
@@ -164,9 +164,9 @@ def long_render(task: Task, scene: Any, spp_per_pass: int, passes: int) -> dict[
     """
     from halfspace_sss.rendering.scenes import reference
 
-    found = reference.render(
+    result = reference.render(
         scene, check_folder(task.folder) / "passes.exr", spp_per_pass=spp_per_pass, seed=task.params["seed"],
         passes=passes, progress=lambda so_far: task.progress(so_far.passes, passes),
     )  # fmt: skip
-    image, variance = (v[..., :3].astype(np.float32) for v in (found.mean, found.variance))
-    return {"image": image, "variance": variance, "seconds": found.seconds, "spp": found.spp}
+    image, variance = (v[..., :3].astype(np.float32) for v in (result.mean, result.variance))
+    return {"image": image, "variance": variance, "seconds": result.seconds, "spp": result.spp}

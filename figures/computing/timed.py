@@ -58,8 +58,8 @@ def rendered(scene: Any, spp: int, *seed: int) -> tuple[np.ndarray, float]:
     number = int(np.random.SeedSequence(seed).generate_state(1)[0])
     started = time.perf_counter()
     if isinstance(scene, tuple):
-        found = [np.array(mi.render(one, spp=spp, seed=number + k))[..., k] for k, one in enumerate(scene)]
-        image = np.stack(found, axis=2)
+        results = [np.array(mi.render(one, spp=spp, seed=number + k))[..., k] for k, one in enumerate(scene)]
+        image = np.stack(results, axis=2)
     else:
         image = np.array(mi.render(scene, spp=spp, seed=number), dtype=np.float32)[..., :3]
     seconds = time.perf_counter() - started
@@ -81,21 +81,21 @@ def pass_size(scene: Any, seconds: float, seed: int = 0) -> int:
     """
     check_interval("seconds", seconds, 1e-6, 1e6)
     pixels = int(np.prod(np.array(scene.sensors()[0].film().crop_size())))
-    most, spp, found = max(1, MOST_LANES // pixels), 1, []
+    most, spp, results = max(1, MOST_LANES // pixels), 1, []
     for k in range(MOST_TRIALS):
         rendered(scene, spp, seed, 2 * k)  # compiles, in some integrators for each number of samples
-        found.append((spp, rendered(scene, spp, seed, 2 * k + 1)[1]))
-        least = 1 if k or found[-1][1] > seconds else 2  # one sample may have taken what any render takes
-        wanted = min(most, GROWTH * spp, max(least, _samples_in(seconds, found)))
+        results.append((spp, rendered(scene, spp, seed, 2 * k + 1)[1]))
+        least = 1 if k or results[-1][1] > seconds else 2  # one sample may have taken what any render takes
+        wanted = min(most, GROWTH * spp, max(least, _samples_in(seconds, results)))
         if abs(wanted - spp) <= TOLERANCE * spp:
             break
         spp = wanted
-    return found[-1][0]
+    return results[-1][0]
 
 
-def _samples_in(seconds: float, found: list[tuple[int, float]]) -> int:
+def _samples_in(seconds: float, result: list[tuple[int, float]]) -> int:
     """Samples in so many seconds from what the smallest and the largest number took: a render has a cost of its own."""
-    (few, least), (many, longest) = min(found), max(found)
+    (few, least), (many, longest) = min(result), max(result)
     each = longest / many if many == few else max((longest - least) / (many - few), 0.2 * longest / many)
     return max(1, many + round((seconds - longest) / each))
 

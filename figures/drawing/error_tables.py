@@ -58,14 +58,14 @@ def equal_error(scenes: Mapping[tuple[str, str], Mapping[str, Any]]) -> pandas.D
     """
     import pandas
 
-    return pandas.DataFrame([row for scene, found in scenes.items() for row in _scene_rows(scene, found)])
+    return pandas.DataFrame([row for scene, each in scenes.items() for row in _scene_rows(scene, each)])
 
 
-def _scene_rows(scene: tuple[str, str], found: Mapping[str, Any]) -> list[dict[str, Any]]:
-    costs = _costs(found["rows"])
+def _scene_rows(scene: tuple[str, str], values: Mapping[str, Any]) -> list[dict[str, Any]]:
+    costs = _costs(values["rows"])
     best = min((name for name in VOLUMES if costs.get(name, 0.0) > 0), key=lambda name: costs[name], default=None)
-    best_cost, level, rows = costs.get(best, np.nan), found["truth"]["mean square"], []
-    for row in found["rows"]:
+    best_cost, level, rows = costs.get(best, np.nan), values["truth"]["mean square"], []
+    for row in values["rows"]:
         name, bias2, error = row["method"], _certain(row, "bias2"), _certain(row, "error")
         if "," in name:  # it leaves out on purpose what the truth has
             bias2 = error = np.nan
@@ -81,29 +81,29 @@ def _scene_rows(scene: tuple[str, str], found: Mapping[str, Any]) -> list[dict[s
                 "ratio to rr_depth 200": _ratio(costs.get(LATE_ROULETTE, np.nan), costs[name]),
                 "seconds until bias": _ratio(best_cost, bias2),
                 "is best volpathmis": name == best,
-                "seconds of training": found.get("training", {}).get(name, np.nan),
-                "images until paid": _until_paid(name, found, costs[name], best_cost),
+                "seconds of training": values.get("training", {}).get(name, np.nan),
+                "images until paid": _until_paid(name, values, costs[name], best_cost),
             }
         )
     return rows
 
 
-def _until_paid(name: str, found: Mapping[str, Any], cost: float, best: float) -> float:
+def _until_paid(name: str, values: Mapping[str, Any], cost: float, best: float) -> float:
     """Images of noise `WANTED` after which training and renders took less time than `volpathmis`; NaN if never."""
-    training = found.get("training", {}).get(name, np.nan)
-    saved = (best - cost) / (WANTED**2 * found["truth"]["mean square"])
+    training = values.get("training", {}).get(name, np.nan)
+    saved = (best - cost) / (WANTED**2 * values["truth"]["mean square"])
     return float(np.ceil(training / saved)) if saved > 0 and np.isfinite(training) else np.nan
 
 
 def _costs(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
     """Variance times seconds by method; of volpathmis no variance is below that of a later roulette."""
-    of_a_sample, found = {row["method"]: row["variance"] * row["spp"] for row in rows}, {}
+    of_a_sample, results = {row["method"]: row["variance"] * row["spp"] for row in rows}, {}
     for row in rows:
         name = row["method"]
         later = VOLUMES[VOLUMES.index(name) :] if name in VOLUMES else (name,)
         variance = max(of_a_sample[other] for other in later if other in of_a_sample) / row["spp"]
-        found[name] = variance * row["seconds"] if variance > 0 else np.nan
-    return found
+        results[name] = variance * row["seconds"] if variance > 0 else np.nan
+    return results
 
 
 def _certain(row: Mapping[str, Any], key: str) -> float:
@@ -128,7 +128,7 @@ def furnace(numbers: Mapping[str, Mapping[str, float]]) -> pandas.DataFrame:
     """Mean radiance by method, with its excess over 1."""
     import pandas
 
-    rows = [{"method": name, **found, "excess": found["mean"] - 1} for name, found in numbers.items()]
+    rows = [{"method": name, **each, "excess": each["mean"] - 1} for name, each in numbers.items()]
     return pandas.DataFrame(rows)
 
 

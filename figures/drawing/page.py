@@ -99,18 +99,18 @@ def _scene(name: str, shots: Sequence[Shot], exposure: float) -> dict[str, Any]:
 
 
 def _shot(shot: Shot, exposure: float) -> dict[str, Any]:
-    found: dict[str, Any] = {"label": shot.label, "why": shot.why, "numbers": {}}
+    results: dict[str, Any] = {"label": shot.label, "why": shot.why, "numbers": {}}
     for column, value in shot.numbers.items():
         plain = value if isinstance(value, str) else float(value)
-        found["numbers"][column] = plain if isinstance(plain, str) or math.isfinite(plain) else str(plain)
+        results["numbers"][column] = plain if isinstance(plain, str) or math.isfinite(plain) else str(plain)
     if shot.image is not None:
-        found["image"] = _png(np.round(255 * srgb(shot.image, exposure)).astype(np.uint8))
+        results["image"] = _png(np.round(255 * srgb(shot.image, exposure)).astype(np.uint8))
     for kind, low in (("flip", 0.0), ("difference", -DIFFERENCE_SPAN)):
         values = getattr(shot, kind)
         if values is not None:
             scaled = np.clip((np.asarray(values) - low) / (DIFFERENCE_SPAN - low), 0.0, 1.0)
-            found[kind] = _png(np.round(255 * scaled).astype(np.uint8), _colors(MAPS[kind][1]))
-    return found
+            results[kind] = _png(np.round(255 * scaled).astype(np.uint8), _colors(MAPS[kind][1]))
+    return results
 
 
 def _colors(name: str) -> np.ndarray:

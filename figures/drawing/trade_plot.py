@@ -46,23 +46,23 @@ def draw(objects: Sequence[ObjectTrade], tolerance: float) -> Figure:
     figure.get_layout_engine().set(w_pad=0.03, h_pad=0.03, wspace=0.03)
     grid = figure.subplots(len(objects), 2, squeeze=False)
     handles: dict[str, object] = {}
-    for found, (left, right) in zip(objects, grid):
-        handles |= trade_panels(found, left, right, tolerance)
-        left.set_title(f"{found.object}: {_mfp(found)} mean free paths across", pad=3)
+    for each, (left, right) in zip(objects, grid):
+        handles |= trade_panels(each, left, right, tolerance)
+        left.set_title(f"{each.object}: {_mfp(each)} mean free paths across", pad=3)
     figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=4, frameon=False)
     return figure
 
 
-def _mfp(found: ObjectTrade) -> str:
-    low, high = (f"{v:.3g}" for v in found.mfp)
+def _mfp(assessed: ObjectTrade) -> str:
+    low, high = (f"{v:.3g}" for v in assessed.mfp)
     return low if low == high else f"{low} to {high}"
 
 
-def trade_panels(found: ObjectTrade, left: Axes, right: Axes, tolerance: float) -> dict[str, object]:
+def trade_panels(assessed: ObjectTrade, left: Axes, right: Axes, tolerance: float) -> dict[str, object]:
     """Draw an object; the handles of the legend by label."""
-    rows = [w for w in found.ways if not w.refusal and w.variance > 0]
-    handles = _pareto(left, rows, found.pixels, tolerance)
-    _over_time(right, rows, found.pixels, tolerance)
+    rows = [w for w in assessed.ways if not w.refusal and w.variance > 0]
+    handles = _pareto(left, rows, assessed.pixels, tolerance)
+    _over_time(right, rows, assessed.pixels, tolerance)
     return handles
 
 
@@ -159,17 +159,17 @@ def _plain(ax: Axes) -> None:
     ax.yaxis.set_minor_formatter(NullFormatter())
 
 
-def multiples(found: Mapping[tuple[str, str, str], ObjectTrade], tolerance: float) -> Figure:
+def multiples(result: Mapping[tuple[str, str, str], ObjectTrade], tolerance: float) -> Figure:
     """Bias over time for each material, a row, and each shape and light, a column."""
-    materials = list(dict.fromkeys(key[0] for key in found))
-    columns = list(dict.fromkeys(key[1:] for key in found))
+    materials = list(dict.fromkeys(key[0] for key in result))
+    columns = list(dict.fromkeys(key[1:] for key in result))
     figure = Figure(figsize=(TEXT, 1.45 * len(materials) + 0.9), layout="constrained")
     figure.get_layout_engine().set(w_pad=0.015, h_pad=0.015, wspace=0.0, hspace=0.01)
     grid = figure.subplots(len(materials), len(columns), squeeze=False, sharex="col", sharey=True)
     handles: dict[str, object] = {}
     for i, material in enumerate(materials):
         for j, (shape, light) in enumerate(columns):
-            ax, o = grid[i, j], found.get((material, *columns[j]))
+            ax, o = grid[i, j], result.get((material, *columns[j]))
             if o is None:
                 ax.set_visible(False)
                 continue
@@ -182,10 +182,10 @@ def multiples(found: Mapping[tuple[str, str, str], ObjectTrade], tolerance: floa
             ax.label_outer()
     for ax in grid[:, 0]:
         ax.set_ylabel("bias of radiance")
-    tops = [w.bias_bound for o in found.values() for w in o.ways if not w.refusal and w.bias2 > 0]
+    tops = [w.bias_bound for o in result.values() for w in o.ways if not w.refusal and w.bias2 > 0]
     grid[0, 0].set_ylim(LEAST, 1.6 * max([*tops, tolerance]))
     for j in range(len(columns)):
-        _span(grid[0, j], [o for key, o in found.items() if key[1:] == columns[j]])
+        _span(grid[0, j], [o for key, o in result.items() if key[1:] == columns[j]])
     figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=4, frameon=False)
     return figure
 
@@ -195,11 +195,11 @@ def _span(ax: Axes, objects: Sequence[ObjectTrade]) -> None:
     ax.set_xlim(min(xs) / 2, max(xs) * 3)
 
 
-def image_shots(images: Mapping[str, np.ndarray], found: Assessment) -> list[Shot]:
+def image_shots(images: Mapping[str, np.ndarray], assessment: Assessment) -> list[Shot]:
     """The images of all ways, path traced first, with FLIP and what each costs."""
     reference = images[TRACED]
     exposure = _exposure(reference)
-    numbers = {w.way: w for o in found.objects for w in o.ways}
+    numbers = {w.way: w for o in assessment.objects for w in o.ways}
     shots = [Shot(_look(TRACED).label, reference, _numbers(numbers[TRACED]))]
     for name, image in images.items():
         if name != TRACED:
@@ -257,12 +257,12 @@ Bunny, small light; cost over that of the usual setting, error where the setting
 """
 
 
-def trade_table(found: Scenes) -> pandas.DataFrame:
+def trade_table(scenes: Scenes) -> pandas.DataFrame:
     """A row for each scene and way that renders it."""
     import pandas
 
     rows: list[dict[str, Any]] = []
-    for (material, shape, light), o in found.items():
+    for (material, shape, light), o in scenes.items():
         for w in o.ways:
             if w.refusal:
                 continue
@@ -274,20 +274,22 @@ def trade_table(found: Scenes) -> pandas.DataFrame:
     return pandas.DataFrame(rows)
 
 
-def markdown(found: Scenes, table: pandas.DataFrame, seconds: float, settings: Sequence[Mapping[str, Any]] = ()) -> str:
+def markdown(
+    scenes: Scenes, table: pandas.DataFrame, seconds: float, settings: Sequence[Mapping[str, Any]] = ()
+) -> str:
     """What is recommended, the bias of every way, and its cost; `seconds` is what each scene had."""
     lines = [INTRODUCTION.format(seconds=seconds), "## The cheapest way that keeps a tolerance", ""]
     lines += ["For images of 512 x 512 pixels; in brackets seconds of all cores for all of them, training counted.", ""]
     lines.append("| material | shape | light | " + " | ".join(_job(*job) for job in JOBS) + " |")
     lines.append("|---|---|---|" + "---|" * len(JOBS))
-    for scene, o in found.items():
+    for scene, o in scenes.items():
         told = []
         for tolerance, images in JOBS:
             option = advise(Assessment((o,), 0.0, 0.0, 0), Job(tolerance, images)).objects[0].options[0]
             told.append(f"{option.way} ({short(option.seconds)})")
         lines.append(f"| {' | '.join(scene)} | {' | '.join(told)} |")
     lines += ["", "## Bias", "", "Relative error of radiance over visible points, %.", ""]
-    lines += _grid(found, _bias)
+    lines += _grid(scenes, _bias)
     lines += [
         "",
         "## Cost",
@@ -295,7 +297,7 @@ def markdown(found: Scenes, table: pandas.DataFrame, seconds: float, settings: S
         "Variance of a sample times seconds of a million samples, over that of path tracing.",
         "",
     ]
-    lines += _grid(found, lambda w, o: f"{w.variance * w.seconds / (o.traced.variance * o.traced.seconds):.2g}")
+    lines += _grid(scenes, lambda w, o: f"{w.variance * w.seconds / (o.traced.variance * o.traced.seconds):.2g}")
     if settings:
         lines += ["", "## Knobs", "", KNOBS]
         lines += ["| material | knob | setting | way | cost | error, % |", "|---|---|---:|---|---:|---:|"]
@@ -314,11 +316,11 @@ def _bias(w: WayTrade, o: ObjectTrade) -> str:
     return w.told_bias
 
 
-def _grid(found: Scenes, cell: Any) -> list[str]:
+def _grid(scenes: Scenes, cell: Any) -> list[str]:
     """A row for each way, a column for each scene of a material, a table for each material."""
     lines: list[str] = []
-    for material in dict.fromkeys(key[0] for key in found):
-        mine = {key: o for key, o in found.items() if key[0] == material}
+    for material in dict.fromkeys(key[0] for key in scenes):
+        mine = {key: o for key, o in scenes.items() if key[0] == material}
         lines.append(f"| {material} | " + " | ".join(f"{shape}, {light}" for _, shape, light in mine) + " |")
         lines.append("|---|" + "---:|" * len(mine))
         names = dict.fromkeys(w.way for o in mine.values() for w in o.ways if not w.refusal)

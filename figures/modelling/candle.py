@@ -88,9 +88,9 @@ def wax_distance(p: np.ndarray, seed: int, drips: list[tuple]) -> np.ndarray:
     lift = y - rim * smoothstep(POOL - 8, HEIGHT, y)
     rho = length(x, z) - 0.5 * ring_noise(angle, seed + 1) * smoothstep(0, HEIGHT, y)
     side = rho - RADIUS - 0.25 * noise(p / 17, seed + 2)
-    found = overlap(side, np.abs(lift - HEIGHT / 2) - HEIGHT / 2, 4.0)
-    found = join(found, _rod_field(p, drips), 2.2)
-    return cut(found, _bowl(rho, angle, lift, y, seed), 3.5) + 0.06 * fbm(p / 6, seed + 3, 2) * (lift > POOL + 2)
+    result = overlap(side, np.abs(lift - HEIGHT / 2) - HEIGHT / 2, 4.0)
+    result = join(result, _rod_field(p, drips), 2.2)
+    return cut(result, _bowl(rho, angle, lift, y, seed), 3.5) + 0.06 * fbm(p / 6, seed + 3, 2) * (lift > POOL + 2)
 
 
 def _bowl(rho: np.ndarray, angle: np.ndarray, lift: np.ndarray, y: np.ndarray, seed: int) -> np.ndarray:
@@ -101,7 +101,7 @@ def _bowl(rho: np.ndarray, angle: np.ndarray, lift: np.ndarray, y: np.ndarray, s
 
 def _drips(seed: int) -> list[tuple]:
     """Runs of wax over the rim: bent rods that start flat and end in a bead, as (points, radii)."""
-    rng, found = np.random.default_rng([seed, 3]), []
+    rng, results = np.random.default_rng([seed, 3]), []
     angles = DIP_ANGLE + np.array([0.1, -0.42, 0.58, -0.7, 2.4, 3.5, -1.7]) + rng.uniform(-0.1, 0.1, 7)
     for angle in angles:
         off = np.angle(np.exp(1j * (angle - DIP_ANGLE)))
@@ -111,13 +111,13 @@ def _drips(seed: int) -> list[tuple]:
         ways = angle + np.concatenate([[0, 0], np.cumsum(rng.normal(0, 0.018, 6))])
         out = RADIUS + thick * np.array([-2.2, -0.75, -0.45, -0.35, -0.3, -0.3, -0.25, -0.25])
         points = np.stack([out * np.cos(ways), top - t * reach, out * np.sin(ways)], axis=1)
-        found.append((points, thick * np.array([1.6, 1.15, 0.95, 0.85, 0.8, 0.85, 1.2, 1.35])))
-    return found
+        results.append((points, thick * np.array([1.6, 1.15, 0.95, 0.85, 0.8, 0.85, 1.2, 1.35])))
+    return results
 
 
 def _rod_field(p: np.ndarray, rods: list[tuple]) -> np.ndarray:
-    found = np.full(p.shape[:-1], np.inf)
+    result = np.full(p.shape[:-1], np.inf)
     for points, radii in rods:
         for a, b, r, s in zip(points[:-1], points[1:], radii[:-1], radii[1:]):
-            found = np.minimum(found, capsule(p, a, b, r, s))
-    return found
+            result = np.minimum(result, capsule(p, a, b, r, s))
+    return result

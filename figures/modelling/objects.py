@@ -98,8 +98,8 @@ def mixed(tissues: Tissues, box: Box, resolution: int) -> Grid:
     high = tuple(float(low + cell * n) for low, n in zip(box.low, counts))
     x, y, z = (low + cell * (np.arange(n) + 0.5) for low, n in zip(box.low, counts))
     points = np.stack(np.broadcast_arrays(x[None, None], y[None, :, None], z[:, None, None]), axis=-1).reshape(-1, 3)
-    found = in_chunks(lambda p: _coefficients(tissues(p)), points).astype(np.float32)
-    sigma_t, sigma_s = found[:, 0], found[:, 1:]
+    result = in_chunks(lambda p: _coefficients(tissues(p)), points).astype(np.float32)
+    sigma_t, sigma_s = result[:, 0], result[:, 1:]
     shape = tuple(counts[::-1])
     albedo = np.minimum(sigma_s / sigma_t[:, None], 1)
     return Grid(sigma_t.reshape(shape), albedo.reshape(*shape, 3), Box(box.low, high))
@@ -153,8 +153,8 @@ def make_varying(name: str, resolution: int = 192, grid_resolution: int = 160, s
     if name not in VARYING:
         raise ValueError(f"object must be one of {', '.join(VARYING)}, got {name!r}")
     make, box = _MODELS[name]
-    found = make(seed)
-    mesh, grid = surface(found.distance, box, resolution), mixed(found.tissues, box, grid_resolution)
+    result = make(seed)
+    mesh, grid = surface(result.distance, box, resolution), mixed(result.tissues, box, grid_resolution)
     return Varying(name, mesh, grid, ETA[name], ROUGHNESS[name])
 
 
@@ -181,28 +181,28 @@ def candle_parts(folder: Path, resolution: int = 192, seed: int = 0, model: str 
     }
 
 
-def varying_parts(found: Varying, folder: Path) -> dict[str, Any]:
+def varying_parts(result: Varying, folder: Path) -> dict[str, Any]:
     """An object whose medium varies, as a rough dielectric about Mitsuba's `heterogeneous` medium; mm.
 
     Args:
-        found: the object.
+        result: the object.
         folder: where its PLY file and its grid volumes are written.
     """
-    path = found.mesh.write_ply(Path(folder) / f"{found.name}.ply")
-    boundary = {"type": "roughdielectric", "alpha": found.alpha, "int_ior": found.eta, "ext_ior": 1.0}
-    medium = found.grid.write(Path(folder), found.name)
-    return {found.name: {"type": "ply", "filename": str(path), "bsdf": boundary, "interior": medium}}
+    path = result.mesh.write_ply(Path(folder) / f"{result.name}.ply")
+    boundary = {"type": "roughdielectric", "alpha": result.alpha, "int_ior": result.eta, "ext_ior": 1.0}
+    medium = result.grid.write(Path(folder), result.name)
+    return {result.name: {"type": "ply", "filename": str(path), "bsdf": boundary, "interior": medium}}
 
 
-def learnable_parts(found: Varying, folder: Path, model: str = "full_geometry") -> dict[str, Any]:
+def learnable_parts(result: Varying, folder: Path, model: str = "full_geometry") -> dict[str, Any]:
     """An object whose medium varies with the surface `translucent` and a smooth boundary, so that it can be learnt; mm.
 
     Args:
-        found: the object.
+        result: the object.
         folder: where its PLY file and its grid volumes are written.
         model: of light in it.
     """
-    parts = varying_parts(found, folder)[found.name]
+    parts = varying_parts(result, folder)[result.name]
     grids = {key: parts["interior"][key] for key in ("sigma_t", "albedo")}
-    surface = {"type": "translucent", "model": model, "g": 0.0, "eta": found.eta, **grids}
-    return {found.name: {"type": "ply", "filename": parts["filename"], "bsdf": surface}}
+    surface = {"type": "translucent", "model": model, "g": 0.0, "eta": result.eta, **grids}
+    return {result.name: {"type": "ply", "filename": parts["filename"], "bsdf": surface}}

@@ -59,7 +59,7 @@ class Mandarin:
 
     def distance(self, p: np.ndarray) -> np.ndarray:
         """Of the surface, strands included."""
-        found = np.full(p.shape[:-1], np.inf)
+        result = np.full(p.shape[:-1], np.inf)
         for near, q, candidates in self._views(p):
             shape = self._shape_of(q)
             d = np.minimum.reduce(parts := [self._segment(q, k, shape) for k in candidates])
@@ -67,8 +67,8 @@ class Mandarin:
                 d = join(*parts, CREASE)
             close = np.abs(d) < 3.0
             d[close] -= self._relief(q[close], candidates[0][close])
-            found[near] = np.minimum(found[near], d)
-        return found
+            result[near] = np.minimum(result[near], d)
+        return result
 
     def _views(self, p: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, list[np.ndarray]]]:
         """For the whole and each segment taken out: which points are near, those in the fruit's own coordinates as they
@@ -101,14 +101,14 @@ class Mandarin:
     @cached_property
     def _heights(self) -> list[float]:
         """Heights at which the segments taken out rest on the floor."""
-        found = []
+        results = []
         for k, ((x, z), _, _) in zip(OUT, LAID):
             axis = np.arange(-24.0, 24.0, 0.8)
             p = np.stack(np.meshgrid(axis + x, axis, axis + z, indexing="ij"), axis=-1).reshape(-1, 3)
             q = self._put_back(p, k)
             inside = self._segment(q, np.full(len(q), k), self._shape_of(q)) < 0
-            found.append(0.4 - p[inside, 1].min())
-        return found
+            results.append(0.4 - p[inside, 1].min())
+        return results
 
     def _shape_of(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """What all segments share: distance of the flattened ball with dents at its poles, waviness of the sides."""
@@ -175,15 +175,15 @@ class Mandarin:
 
     def _pip(self, q: np.ndarray, k: np.ndarray) -> np.ndarray:
         """Share of pip: in about two segments of three one near the core."""
-        found = np.zeros(q.shape[:-1])
+        result = np.zeros(q.shape[:-1])
         for number in range(N):
             rng = np.random.default_rng([self.seed, 9, number])
             along, up, lean = CORE + rng.uniform(4.5, 7.0), rng.uniform(-5, 5), rng.uniform(-0.4, 0.4)
             mine = k == number
             if rng.random() < 0.65 and mine.any():
                 at = rotated(q[mine], 1, 0.5 * (self.edges[number] + self.edges[number + 1])) - np.array([along, up, 0])
-                found[mine] = smoothstep(0.3, -0.3, ellipsoid(rotated(at, 2, lean), PIP))
-        return found
+                result[mine] = smoothstep(0.3, -0.3, ellipsoid(rotated(at, 2, lean), PIP))
+        return result
 
 
 def _overlap_by(a: np.ndarray, b: np.ndarray, blend: np.ndarray) -> np.ndarray:
@@ -277,7 +277,7 @@ class Croissant:
         """Distance of the pores that open on the cut, longer along the layers than across."""
         deep = self._beyond(p)
         u, a, b, _ = self._axis(p)
-        found = np.full(p.shape[:-1], 1e3)
+        result = np.full(p.shape[:-1], 1e3)
         near = np.abs(deep) < 6
         a, b, deep = a[near], b[near], deep[near]
         best = np.full(a.shape, 1e3)
@@ -286,8 +286,8 @@ class Croissant:
             across = da * np.cos(turn) + db * np.sin(turn)
             along = -da * np.sin(turn) + db * np.cos(turn)
             best = np.minimum(best, (length(across, along / 1.7, deep / 1.4) - size) * 0.9)
-        found[near] = best
-        return found
+        result[near] = best
+        return result
 
     def browned(self, p: np.ndarray) -> np.ndarray:
         """How dark the crust is, 0 to 1: the lips of the layers and the top most, the valleys and the base least."""

@@ -115,7 +115,7 @@ def _announce(p: Plan) -> None:
     _say(f"{p.name} {p.quality}: {len(p.missing)} of {len(p.parts)} parts to compute, {_time(p)}")
     if p.unmeasured and p.quality == "paper":
         _say(f"  `halfspace-sss figures compute {p.name} --quality draft` measures them first")
-    sources = [found.source for found in p.seconds.values() if found.source]
+    sources = [each.source for each in p.seconds.values() if each.source]
     for source in dict.fromkeys(sources):
         _say(f"  {sources.count(source)} measured by {source}, scaled by work")
 

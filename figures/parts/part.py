@@ -65,15 +65,15 @@ def code_hash(module: str, function: str, params: str = "", unmodelled: bool = F
 def modules_reached(module: str, function: str, params: str = "", unmodelled: bool = False) -> list[str]:
     """What a function comes to, as `modules_of`; arguments as for `code_hash`."""
     own = _found(f"{module}:{function}")
-    found = modules_of(_resolved(own))
+    result = modules_of(_resolved(own))
     if unmodelled:
-        return found
-    sources = [own, *(_found(name) for name in found if name != NAMES and _path(name).stem != "__init__")]
+        return result
+    sources = [own, *(_found(name) for name in result if name != NAMES and _path(name).stem != "__init__")]
     texts = {text for source in sources for text in source.texts}
-    named = {name: homes for name, homes in found_by_name().items() if RENDERS in found or name in texts}
+    named = {name: homes for name, homes in found_by_name().items() if RENDERS in result or name in texts}
     named |= {name: homes for name, homes in found_by_name().items() if name in re.findall(r"\w+", params)}
     addressed = {text.partition(":")[0] for text in texts if ADDRESS.fullmatch(text)}
-    return modules_of([*found, *(home for homes in named.values() for home in homes), *addressed])
+    return modules_of([*result, *(home for homes in named.values() for home in homes), *addressed])
 
 
 @functools.cache
@@ -87,14 +87,14 @@ def modules_of(roots: Iterable[str]) -> list[str]:
 
     Of a figure only that counts which is imported from it, as "module:name", for it draws too.
     """
-    found: set[str] = set()
+    results: set[str] = set()
     ahead = list(roots)
     while ahead:
         name = ahead.pop()
-        if name not in found and _path(name):
-            found.add(name)
+        if name not in results and _path(name):
+            results.add(name)
             ahead += _resolved(_found(name))
-    return sorted(found)
+    return sorted(results)
 
 
 def _found(name: str) -> _Source:
@@ -148,8 +148,8 @@ def _source(path: Path, changed: int, definition: str) -> _Source:
         return _digested(_used_by(definition, tree))
     if path.name == "__init__.py":
         for node in [n for n in tree.body if isinstance(n, ast.If) and ast.unparse(n.test) == "TYPE_CHECKING"]:
-            for found in [n for n in node.body if isinstance(n, ast.ImportFrom)]:
-                doors |= {alias.name: f"{found.module}.{alias.name}" for alias in found.names}
+            for each in [n for n in node.body if isinstance(n, ast.ImportFrom)]:
+                doors |= {alias.name: f"{each.module}.{alias.name}" for alias in each.names}
             tree.body.remove(node)
     return _digested(tree)._replace(doors=doors)
 

@@ -41,16 +41,16 @@ def projected(parts: Sequence[Part], stores: Sequence[tuple[str, PartStore]]) ->
         for slug, kind, work, seconds in store.seconds():
             same.setdefault((slug, kind), (seconds / work, f"the same part in {label}"))
             kinds.setdefault(kind, []).append(seconds / work)
-    found = {}
+    results = {}
     for part in parts:
         if (part.slug, part.kind) in same:
             rate, source = same[part.slug, part.kind]
-            found[part.name] = Projected(rate * part.work, source)
+            results[part.name] = Projected(rate * part.work, source)
         elif part.kind in kinds:
-            found[part.name] = Projected(median(kinds[part.kind]) * part.work, "like parts")
+            results[part.name] = Projected(median(kinds[part.kind]) * part.work, "like parts")
         else:
-            found[part.name] = Projected(None, "")
-    return found
+            results[part.name] = Projected(None, "")
+    return results
 
 
 def duration(seconds: float) -> str:
@@ -229,16 +229,16 @@ def _computed(todo: Plan, part: Part, results: Mapping[str, Result], show: Calla
     key = todo.keys[part.name]
     other = _elsewhere(todo.folder, part, key)
     if other:
-        found = other.load(part, key)
-        return todo.store.save(part, key, {**found.images, **found.numbers}, found.seconds)
+        result = other.load(part, key)
+        return todo.store.save(part, key, {**result.images, **result.numbers}, result.seconds)
     folder = todo.store.unfinished(part, key)
     folder.mkdir(parents=True, exist_ok=True)
     needed = {name: results[name] for name in part.needs}
     task = Task(part.params, folder, needed, tuple(Path(path) for path in part.inputs), show)
     started = time.perf_counter()
     try:
-        found = part.function(task)
-        return todo.store.save(part, key, found, time.perf_counter() - started)
+        result = part.function(task)
+        return todo.store.save(part, key, result, time.perf_counter() - started)
     except ValueError as error:
         raise ValueError(f"{todo.name}, part {part.name!r}: {error}") from error
     finally:

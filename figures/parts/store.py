@@ -127,19 +127,19 @@ class PartStore:
         images = {name: read_exr(self._checked_image(part, about)) for name, about in record["images"].items()}
         return Result(images, record["numbers"], record["seconds"], record["work"])
 
-    def save(self, part: Part, key: str, found: Mapping[str, Any], seconds: float) -> Result:
+    def save(self, part: Part, key: str, values: Mapping[str, Any], seconds: float) -> Result:
         """Write what the function of a part returned; every file is whole or absent, the record comes last.
 
         Args:
             part, key: what was computed, from what.
-            found: arrays and values by name.
+            values: arrays and values by name.
             seconds: that it took.
 
         Raises:
             ValueError: an array has a wrong shape or a value that is not finite, or something is not ready for JSON.
         """
-        arrays = {name: value for name, value in found.items() if isinstance(value, np.ndarray)}
-        numbers = {name: value for name, value in found.items() if name not in arrays}
+        arrays = {name: value for name, value in values.items() if isinstance(value, np.ndarray)}
+        numbers = {name: value for name, value in values.items() if name not in arrays}
         canonical(numbers, f"numbers of part {part.name!r}")
         for name in arrays:
             if not re.fullmatch(r"[\w-]+", name):
@@ -168,14 +168,14 @@ class PartStore:
 
     def seconds(self) -> list[tuple[str, str, float, float]]:
         """(folder name, kind, work, seconds) of every part that has a sound record."""
-        found = []
+        results = []
         for path in sorted(self.folder.glob("*/record.json")):
             try:
                 record = json.loads(path.read_text(encoding="utf-8"))
-                found.append((path.parent.name, record["kind"], float(record["work"]), float(record["seconds"])))
+                results.append((path.parent.name, record["kind"], float(record["work"]), float(record["seconds"])))
             except (ValueError, KeyError, TypeError, OSError):
                 continue  # what a damaged record says of time is not worth an error
-        return found
+        return results
 
     def _part_folder(self, part: Part) -> Path:
         return self.folder / part.slug

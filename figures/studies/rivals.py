@@ -142,8 +142,8 @@ def _learnt(
         if seconds == 0:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                found = train(obj, seconds=0, recipe=recipe, seed=seed, folder=folder)
-            return Learnt(found.model, found.sampler), {"seconds": 0.0, "steps": 0}
+                result = train(obj, seconds=0, recipe=recipe, seed=seed, folder=folder)
+            return Learnt(result.model, result.sampler), {"seconds": 0.0, "steps": 0}
         learnt, path = train_by_cpu(obj, seconds, folder, seed=seed, recipe=recipe)
         record = load_weights(path, KIND)[1]
         return learnt, {"seconds": record["seconds"], "steps": record["steps"]}

@@ -214,7 +214,7 @@ def summary(rows: Sequence[Row]) -> str:
 
 def by_property(rows: Sequence[Row]) -> str:
     """Median errors under constant light by size, thickness, albedo and g, %."""
-    found = []
+    results = []
     for name, (value, edges) in BINS.items():
         for low, high in zip(edges, edges[1:]):
             inside = [r for r in rows if low <= value(r) < high]
@@ -222,8 +222,8 @@ def by_property(rows: Sequence[Row]) -> str:
                 own, best = ([f(r) for r in inside] for f in (lambda r: r.of(MODEL), lambda r: r.best()[1]))
                 to = "" if high > 1e8 else f" to {high:g}"
                 cells = (f"{100 * np.median(own):.1f}", f"{100 * max(own):.1f}", f"{100 * np.median(best):.1f}")
-                found.append([name, f"{low:g}{to}", str(len(inside)), *cells])
-    return _table(["by", "range", "objects", "median", "largest", "best half-space: median"], found)
+                results.append([name, f"{low:g}{to}", str(len(inside)), *cells])
+    return _table(["by", "range", "objects", "median", "largest", "best half-space: median"], results)
 
 
 def speed_table(seconds: dict[str, float]) -> str:

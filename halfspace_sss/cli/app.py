@@ -58,8 +58,8 @@ def _app() -> Any:
     app.callback()(_options(typer))
     for name, function in _OWN.items():
         module = importlib.import_module(f"halfspace_sss.cli.{_FILES.get(name, name)}")
-        found = getattr(module, function)
-        app.command(name)(found if name in _LISTS else with_quiet(found))
+        result = getattr(module, function)
+        app.command(name)(result if name in _LISTS else with_quiet(result))
     _add_commands(app, COMMANDS)
     app.add_typer(trainings(), name="train")
     studies = typer.Typer(no_args_is_help=True, help="Compare choices and rivals of the models: tables for the docs.")

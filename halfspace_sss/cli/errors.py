@@ -116,8 +116,8 @@ def errors_command(
         def show(what: str, done: int, total: int) -> None:
             bar.show(round(1000 * ((what == "models") + done / total)), 2000, what)
 
-        found = tables.references(list(media.values()), events * len(media), seed, block, show, backend)
-        table = tables.error_table(media, found, model or None, show)
+        result = tables.references(list(media.values()), events * len(media), seed, block, show, backend)
+        table = tables.error_table(media, result, model or None, show)
     how = {"events": events, "block": block, "seed": seed}
     files = _write(out, table, tables.percentiles(table), DEFINITION.format(block), how)
     _report(table, tables, len(media), block)
@@ -213,10 +213,10 @@ def _media(
         return {"medium": stated}
     if channel is not None:
         return dict(by_channel(names, channel))
-    found = [materials.load(name) for name in (materials.names() if registry else names or ["fig10"])]
+    results = [materials.load(name) for name in (materials.names() if registry else names or ["fig10"])]
     return {
         f"{m.name} {c}".strip(): one
-        for m in found
+        for m in results
         for c, one in zip(m.channels or ("",), channels(m.medium))
         if float(one.albedo) > 0
     }

@@ -94,9 +94,9 @@ class Interrupts:
         else:
             raise KeyboardInterrupt
 
-    def _unraisable(self, found: Any) -> None:
+    def _unraisable(self, result: Any) -> None:
         if self.received is None:
-            self._hook(found)
+            self._hook(result)
 
 
 def _is_importing(frame: FrameType | None) -> bool:

@@ -36,9 +36,9 @@ def _import(file: Path | None, out: Path | None, mm_per_unit: float | None) -> N
 
     if file is None:
         raise ValueError("file must be given to import, got None")
-    found, out = import_materials(file, mm_per_unit), out or Path(f"{file.stem}.toml")
-    write_atomically(out, to_toml(found))
-    for material in found:
+    result, out = import_materials(file, mm_per_unit), out or Path(f"{file.stem}.toml")
+    write_atomically(out, to_toml(result))
+    for material in result:
         typer.echo(f"{material.name}: {material.medium}")
     typer.echo(f"wrote {out}")
 

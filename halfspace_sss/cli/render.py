@@ -100,19 +100,19 @@ def render_command(
         console().print(sentence, highlight=False, markup=False, soft_wrap=True)
     name = [scene.stem, model or "scene", light or "", f"sensor{sensor}" if sensor else ""]
     file = out / f"{'_'.join(filter(None, name))}.exr"
-    found = _rendered(loaded, file, limits, {"seed": seed, "sensor": sensor}, resume)
-    picture = Picture(file.stem, _colours(found.mean), _numbers(found), _error(found), loaded, sensor, denoise)
-    _report(found, _publish(picture, file, draw))
+    result = _rendered(loaded, file, limits, {"seed": seed, "sensor": sensor}, resume)
+    picture = Picture(file.stem, _colours(result.mean), _numbers(result), _error(result), loaded, sensor, denoise)
+    _report(result, _publish(picture, file, draw))
     for sentence in loaded.integrator().gathered if is_bssrdf(loaded.integrator()) else ():
         console().print(sentence, highlight=False, markup=False, soft_wrap=True)
 
 
 def _renderer(denoise: bool) -> Renderer | None:
     """What draws the page and denoises, if it is there; BackendError before anything is rendered in vain."""
-    found = renderer("render")
-    if denoise and (found is None or find_spec("mitsuba_oidn") is None):
+    result = renderer("render")
+    if denoise and (result is None or find_spec("mitsuba_oidn") is None):
         raise BackendError('denoising needs mitsuba-oidn and a page: pip install "halfspace-sss[figures]"')
-    return found
+    return result
 
 
 def _unfinished(file: Path) -> Path:
@@ -169,12 +169,12 @@ class _Bars:
     def _learnt(self, what: str, done: int, total: int) -> None:
         self.bar.show(done, total, what)
 
-    def _rendered(self, found: Reference) -> None:
+    def _rendered(self, reference: Reference) -> None:
         if self.title != "rendering":
             self._begin("rendering")
-        self.so_far = found.spp
-        error = f", error {found.relative_error:.2%}" if math.isfinite(found.relative_error) else ""
-        self.bar.show(round(1000 * self.limits.share(found)), 1000, f"{found.spp} spp{error}")
+        self.so_far = reference.spp
+        error = f", error {reference.relative_error:.2%}" if math.isfinite(reference.relative_error) else ""
+        self.bar.show(round(1000 * self.limits.share(reference)), 1000, f"{reference.spp} spp{error}")
 
 
 def _publish(picture: Picture, file: Path, draw: Renderer | None) -> list[Path]:
@@ -195,25 +195,25 @@ def _colours(image: np.ndarray) -> np.ndarray:
     return image[..., :3] if image.shape[2] >= 3 else image[..., :1].repeat(3, axis=2)
 
 
-def _numbers(found: Reference) -> dict[str, str]:
-    error = found.relative_error
+def _numbers(reference: Reference) -> dict[str, str]:
+    error = reference.relative_error
     told = f"{error:.2%}" if 0 < error < math.inf else "–"
-    return {"samples": str(found.spp), "time, s": f"{found.seconds:.3g}", "relative error": told}
+    return {"samples": str(reference.spp), "time, s": f"{reference.seconds:.3g}", "relative error": told}
 
 
-def _report(found: Reference, files: list[Path]) -> None:
+def _report(reference: Reference, files: list[Path]) -> None:
     screen = console()
-    screen.print(f"{found.spp} samples a pixel in {found.seconds:.1f} s; {_error(found)}", highlight=False)
+    screen.print(f"{reference.spp} samples a pixel in {reference.seconds:.1f} s; {_error(reference)}", highlight=False)
     for path in files:
         screen.print(f"  {path}", highlight=False, markup=False, soft_wrap=True)
 
 
-def _error(found: Reference) -> str:
+def _error(reference: Reference) -> str:
     """What is known of the error of an image."""
-    if not found.mean[..., :3].any():
+    if not reference.mean[..., :3].any():
         return "every pixel is black: no light reaches the camera"
-    if found.passes < 2:
+    if reference.passes < 2:
         return "one pass has no estimate of its error"
-    if found.relative_error == 0:
+    if reference.relative_error == 0:
         return "all passes are the same: the camera sees nothing that varies, such as the sky alone"
-    return f"relative standard error of the image {found.relative_error:.2%}"
+    return f"relative standard error of the image {reference.relative_error:.2%}"

@@ -97,8 +97,8 @@ def console() -> Console:
     """A console that does not fold lines at 80 columns where the output is a file."""
     from rich.console import Console
 
-    found = Console(quiet=_quiet)
-    return found if found.is_terminal else Console(width=TABLE_WIDTH, quiet=_quiet)
+    result = Console(quiet=_quiet)
+    return result if result.is_terminal else Console(width=TABLE_WIDTH, quiet=_quiet)
 
 
 def tell(sentence: str) -> None:
@@ -338,10 +338,10 @@ def with_quiet(command: Callable) -> Callable:
         finally:
             set_quiet(False)
 
-    found = inspect.signature(command, eval_str=True)
+    result = inspect.signature(command, eval_str=True)
     kind = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but warnings and errors.")]
     option = inspect.Parameter("quiet", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=kind)
-    silenced.__signature__ = found.replace(parameters=[*found.parameters.values(), option])
-    silenced.__annotations__ = {**{p.name: p.annotation for p in found.parameters.values()}, "quiet": kind}
+    silenced.__signature__ = result.replace(parameters=[*result.parameters.values(), option])
+    silenced.__annotations__ = {**{p.name: p.annotation for p in result.parameters.values()}, "quiet": kind}
     del silenced.__wrapped__  # of which the signature would be read
     return silenced

@@ -107,8 +107,8 @@ def _material(name: str, r: str | None, tolerance: float, models: list[str] | No
     from halfspace_sss.trade.flat import recommend_flat
 
     limits = None if r is None else tuple(numbers("r", r))
-    found = recommend_flat(materials.load(name).medium, limits, tolerance=tolerance, models=models, seed=seed)
-    console().print(str(found), highlight=False, markup=False, soft_wrap=True)
+    result = recommend_flat(materials.load(name).medium, limits, tolerance=tolerance, models=models, seed=seed)
+    console().print(str(result), highlight=False, markup=False, soft_wrap=True)
 
 
 def _scene(file: Path, job: Job, how: dict[str, Any], out: Path) -> None:
@@ -117,31 +117,31 @@ def _scene(file: Path, job: Job, how: dict[str, Any], out: Path) -> None:
     from halfspace_sss.trade.assessing import assess
 
     with Bar("trade") as bar:
-        found = assess(
+        result = assess(
             file,
             **how,
             tolerance=job.tolerance,
             images=job.images,
             progress=lambda what, done, total: bar.show(done, total, what),
         )
-    advice = advise(found, job)
+    advice = advise(result, job)
     about = {"provenance": provenance(scene=str(file), tolerance=job.tolerance, images=job.images, **how)}
-    about |= {"integrator": advice.integrator, "sentences": str(advice).splitlines(), "assessment": found.record()}
+    about |= {"integrator": advice.integrator, "sentences": str(advice).splitlines(), "assessment": result.record()}
     files: dict[str, bytes | str] = {
-        "csv": found.table().to_csv(index=False, lineterminator="\n"),
+        "csv": result.table().to_csv(index=False, lineterminator="\n"),
         "json": json.dumps(about, indent=1) + "\n",
         **_drawn(file, advice, how),
     }
     paths = {out / f"{file.stem}_trade.{ending}": data for ending, data in files.items()}
     write_together(paths)
     screen = console()
-    for o in found.objects:
+    for o in result.objects:
         screen.print(object_table(o))
     screen.print(str(advice), highlight=False, markup=False, soft_wrap=True)
-    for o in found.objects:
+    for o in result.objects:
         for note in o.notes:
             typer.echo(f"warning: {note}", err=True)
-    screen.print(f"measured in {found.seconds:.1f} s, compilation {found.compilation:.1f} s beside", highlight=False)
+    screen.print(f"measured in {result.seconds:.1f} s, compilation {result.compilation:.1f} s beside", highlight=False)
     for path in paths:
         screen.print(f"  {path}", highlight=False, markup=False, soft_wrap=True)
 
@@ -157,10 +157,11 @@ def _drawn(file: Path, advice: Advice, how: dict[str, Any]) -> dict[str, bytes]:
     return draw(picture_of(file, advice.assessment, advice.tolerance, str(advice).splitlines(), how))
 
 
-def object_table(found: ObjectTrade) -> Any:
+def object_table(assessed: ObjectTrade) -> Any:
     """All ways of rendering an object."""
-    rows = [_row(row) for row in found.ways if not row.refusal]
-    title = f"{found.object}: {found.mfp[0]:.3g} to {found.mfp[1]:.3g} mean free paths, {100 * found.share:.3g} % seen"
+    rows = [_row(row) for row in assessed.ways if not row.refusal]
+    low, high = assessed.mfp
+    title = f"{assessed.object}: {low:.3g} to {high:.3g} mean free paths, {100 * assessed.share:.3g} % seen"
     headings = (*_HEADINGS[:-1], "mean / traced", "preparation, s", "memory, MB", "FLIP")
     return _rich(headings, rows, title)
 

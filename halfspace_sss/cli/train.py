@@ -152,8 +152,8 @@ def object_command(
     how = {"object": object, "seconds": seconds, "target_error": target_error, "seed": seed, "folder": out}
     how |= {"base_model": base_model} if base_model is not None else {}
     with Bar("training") as bar:
-        found = learns.train(loaded, **how, work=work, progress=lambda what, done, total: bar.show(done, total, what))
-    _report_object(found)
+        result = learns.train(loaded, **how, work=work, progress=lambda what, done, total: bar.show(done, total, what))
+    _report_object(result)
 
 
 def universal_command(
@@ -191,13 +191,13 @@ def shapes_command(
     from halfspace_sss.rendering.scenes.learners import shape_learner
 
     with Bar("shapes") as bar:
-        found = shape_learner().train_shapes(
+        result = shape_learner().train_shapes(
             out, seconds=seconds, seed=seed, meshes=mesh or [], work=work,
             progress=lambda what, done, total: bar.show(done, total, what),
         )  # fmt: skip
     screen = console()
-    told = f"{found.objects} objects, {found.steps} steps in {found.seconds:.0f} s; written:"
-    screen.print(told, f"  {found.path}", highlight=False, markup=False, soft_wrap=True, sep="\n")
+    told = f"{result.objects} objects, {result.steps} steps in {result.seconds:.0f} s; written:"
+    screen.print(told, f"  {result.path}", highlight=False, markup=False, soft_wrap=True, sep="\n")
 
 
 def _media(names: list[str], channel: str | None, given: dict[str, float | None]) -> dict[str, Medium]:
@@ -209,7 +209,7 @@ def _media(names: list[str], channel: str | None, given: dict[str, float | None]
     stated = stated_medium(names, given)
     if not names:
         return {"fig10": materials.load("fig10").medium} if stated is None else {"medium": stated}
-    return {found.name: found.medium for found in map(materials.load, names)}
+    return {each.name: each.medium for each in map(materials.load, names)}
 
 
 def _of_steps(recipe: Any, steps: int | None) -> Any:
@@ -235,16 +235,16 @@ def _train(
     )  # fmt: skip
 
 
-def _report_object(found: LearntObject) -> None:
+def _report_object(learnt: LearntObject) -> None:
     from halfspace_sss.cli.errors import OBJECT_DEFINITION, object_table
 
     screen = console()
-    if found.path is None:
-        screen.print(f"{found.object}: no weights are written", highlight=False, markup=False)
+    if learnt.path is None:
+        screen.print(f"{learnt.object}: no weights are written", highlight=False, markup=False)
         return
-    screen.print(object_table(found.errors), OBJECT_DEFINITION, highlight=False, sep="\n")
-    told = f"{found.steps} steps in {found.seconds:.0f} s; written:"
-    screen.print(told, f"  {found.path}", highlight=False, markup=False, soft_wrap=True, sep="\n")
+    screen.print(object_table(learnt.errors), OBJECT_DEFINITION, highlight=False, sep="\n")
+    told = f"{learnt.steps} steps in {learnt.seconds:.0f} s; written:"
+    screen.print(told, f"  {learnt.path}", highlight=False, markup=False, soft_wrap=True, sep="\n")
 
 
 def _report(rows: list[tuple[str, Any]]) -> None:

@@ -233,8 +233,8 @@ class CurveSet:
 
     def tables(self, name: str = "curves") -> dict[str, str]:
         """NAME.csv, of every series, and NAME_errors.csv."""
-        found = {f"{name}.csv": self.to_dataframe(), f"{name}_errors.csv": self.errors()}
-        return {file: table.to_csv(index=False, lineterminator="\n") for file, table in found.items()}
+        results = {f"{name}.csv": self.to_dataframe(), f"{name}_errors.csv": self.errors()}
+        return {file: table.to_csv(index=False, lineterminator="\n") for file, table in results.items()}
 
     def _figures(self) -> dict[str, bytes]:
         """The figure by file ending; none, with a warning, if it cannot be drawn."""

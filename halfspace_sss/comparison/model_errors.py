@@ -261,7 +261,7 @@ def references(
 
 def error_table(
     labels: Iterable[str],
-    found: list[TracedMaps],
+    maps: list[TracedMaps],
     names: Iterable[str] | None = None,
     progress: NamedProgress | None = None,
 ) -> pandas.DataFrame:
@@ -269,7 +269,7 @@ def error_table(
     import pandas
 
     rows: list[dict[str, Any]] = []
-    for k, (label, reference) in enumerate(zip(labels, found)):
+    for k, (label, reference) in enumerate(zip(labels, maps)):
         m = reference.medium
         for name in names or models():
             try:
@@ -282,7 +282,7 @@ def error_table(
             row |= {"error_square_standard_error": e.square_error, "raw": e.raw, "noise": e.noise, "bias": e.bias}
             rows.append(row | {"bias_noise": e.bias_noise} | {f"r {d}": v for d, v in e.by_decade.items()})
         if progress:
-            progress("models", k + 1, len(found))
+            progress("models", k + 1, len(maps))
     return pandas.DataFrame(rows)
 
 

@@ -105,15 +105,15 @@ def _by_lobe(model: BSSRDF, mu_i: np.ndarray, u: np.ndarray, g: float, width: fl
 
 def _density(model: BSSRDF, p: _Points) -> np.ndarray:
     """Sum of the densities of all proposals over the plane and outside directions, 1/(mm² sr)."""
-    found = model.pdf_position(p.r, 0.0, 1.0) * p.mu_o / math.pi
+    result = model.pdf_position(p.r, 0.0, 1.0) * p.mu_o / math.pi
     tau = model.medium.sigma_t * p.r
     near = ((tau > NEAR[0]) & (tau < NEAR[1])) / (p.r * p.r * math.log(NEAR[1] / NEAR[0]))
     sines = np.sqrt((1 - p.mu_i) * (1 + p.mu_i) * (1 - p.mu_o) * (1 + p.mu_o)) * np.cos(p.delta)
     for g, width in LOBES:
         lobe = _hg(sines + p.mu_i * p.mu_o, g) + _hg(sines - p.mu_i * p.mu_o, g)
         cauchy = math.sinh(width) / (2 * math.pi * (math.cosh(width) - np.cos(p.psi - 0.5 * p.delta)))
-        found = found + _weight(p.mu_i) * near * lobe * cauchy
-    return found
+        result = result + _weight(p.mu_i) * near * lobe * cauchy
+    return result
 
 
 def _hg(cosine: np.ndarray, g: float) -> np.ndarray:
@@ -140,7 +140,7 @@ def reflectance_truths(
     """
     import pandas
 
-    names, found = list(models() if names is None else names), {} if kept is None else kept
+    names, result = list(models() if names is None else names), {} if kept is None else kept
     truths, rows = _reflectances(), []
     for k, t in enumerate(truths):
         for name in names:
@@ -148,9 +148,9 @@ def reflectance_truths(
             if model is None:
                 continue
             key = _key(model, t)
-            if key not in found:
-                found[key] = _reflectance(model, t.mu_i)
-            R, error = (t.factor * v for v in found[key])
+            if key not in result:
+                result[key] = _reflectance(model, t.mu_i)
+            R, error = (t.factor * v for v in result[key])
             if t.measure == "R_total":
                 R += float(F_r(t.mu_i, t.medium.eta))
             m = t.medium

@@ -150,15 +150,15 @@ def curves(
     n_paths = default_paths(medium, backend) if n_paths is None else n_paths
     passes = launch_shape(n_paths)[2] if n_paths else 0
     steps = _Steps(progress, len(angles) * (passes + len(chosen)) + len(chosen))
-    found, walks, seconds = [], 0, 0.0
+    results, walks, seconds = [], 0, 0.0
     for k, theta in enumerate(angles):
         if n_paths:
             traced = trace_curve(medium, math.cos(math.radians(theta)), line, n_paths, seed + k, backend, steps.advance)
             walks, seconds = traced.n_paths, seconds + traced.seconds
             R = {order: tuple(traced.reflectance(order)) for order in ("multiple", "total")}
-            found.append(Curve(TRACED, "multiple", theta, traced.S, traced.S, traced.standard_error, R))
+            results.append(Curve(TRACED, "multiple", theta, traced.S, traced.S, traced.standard_error, R))
         for model in chosen:
-            found.append(_modelled(model, theta, line, orders))
+            results.append(_modelled(model, theta, line, orders))
             steps.advance()
     speeds = {}
     for model in chosen:
@@ -166,7 +166,7 @@ def curves(
         steps.advance()
     return CurveSet(
         title, medium, float(theta_o_deg), float(delta_phi_deg), float(line_deg), half_width, orders, line.r_edges,
-        tuple(found), speeds, walks, seed, backend, seconds, notes,
+        tuple(results), speeds, walks, seed, backend, seconds, notes,
     )  # fmt: skip
 
 

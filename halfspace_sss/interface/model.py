@@ -155,8 +155,8 @@ def _block_class() -> Any:
             inputs = [a for a, n in zip(args, needed) if n]
             with torch.enable_grad():
                 value = ctx.f(*args)
-                found = torch.autograd.grad(value, inputs, outer, create_graph=again, allow_unused=True)
-            grads = iter(found)
+                result = torch.autograd.grad(value, inputs, outer, create_graph=again, allow_unused=True)
+            grads = iter(result)
             return None, *(next(grads) if n else None for n in needed)
 
     return Block
@@ -535,13 +535,13 @@ def check_allowed(name: str) -> None:
 
 def listed_models(base: type) -> dict[str, type]:
     """The model classes of all lists by name, those of this project first."""
-    found: dict[str, type] = {}
+    results: dict[str, type] = {}
     for name, classes in offered(MODELS):
         try:
-            found |= _new_models(classes, base, found)
+            results |= _new_models(classes, base, results)
         except FAILURES as error:
             warn_left_out(MODELS, name, error)
-    return found
+    return results
 
 
 def _new_models(classes: Any, base: type, known: Collection[str]) -> dict[str, type]:

@@ -53,9 +53,9 @@ def check_written(dataset: xr.Dataset) -> None:
         raise ValueError(f"attribute {ASKED} does not match its checksum")
     if COORDINATES not in dataset.attrs:
         return
-    written, found = json.loads(dataset.attrs[COORDINATES]), _coordinates(dataset)
-    for name in sorted(written.keys() | found.keys()):
-        if written.get(name) != found.get(name):
+    written, result = json.loads(dataset.attrs[COORDINATES]), _coordinates(dataset)
+    for name in sorted(written.keys() | result.keys()):
+        if written.get(name) != result.get(name):
             raise ValueError(f"coordinate {name} does not match its checksum")
 
 
@@ -299,11 +299,11 @@ def _open(path: Path) -> xr.Dataset:
 def _open_same(path: Path, asked: dict[str, Any]) -> xr.Dataset:
     """The store at a path, which must have been made with the same parameters."""
     dataset = _open(path)
-    found = json.loads(dataset.attrs[ASKED])
+    result = json.loads(dataset.attrs[ASKED])
     wanted = json.loads(json.dumps(asked))
     for key, value in wanted.items():
-        if found.get(key) != value:
-            was = f"map store {path} was made with {key} = {found.get(key)!r}"
+        if result.get(key) != value:
+            was = f"map store {path} was made with {key} = {result.get(key)!r}"
             raise ValueError(f"{was}, got {value!r}: ask for the same, or take another folder")
     return dataset
 

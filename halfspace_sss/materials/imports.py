@@ -50,10 +50,10 @@ def import_materials(path: str | os.PathLike, mm_per_unit: float | None = None) 
     if not path.is_file():
         raise ValueError(f"path must be a file, got {str(path)!r}")
     reader, unit = readers[path.suffix.lower()]
-    found = list(reader(path, mm_per_unit or unit))
-    if not found:
+    results = list(reader(path, mm_per_unit or unit))
+    if not results:
         raise ValueError(f"{path}: must hold a material with subsurface scattering, got none")
-    return found
+    return results
 
 
 def _of_materialx(path: Path, unit: float) -> Iterator[Material]:
@@ -81,15 +81,15 @@ def _of_materialx(path: Path, unit: float) -> Iterator[Material]:
 
 def _value(node: Any, key: str, default: Any) -> Any:
     """The value of an input, colours in linear Rec. 709."""
-    found = node.getInput(key)
-    if found is None:
+    result = node.getInput(key)
+    if result is None:
         return default
-    if found.getNodeName() or found.getNodeGraphString():
+    if result.getNodeName() or result.getNodeGraphString():
         raise ValueError(f"{key} must be a value, got a connection")
-    value = found.getValue()
+    value = result.getValue()
     if not hasattr(value, "asTuple"):
         return value
-    space = found.getActiveColorSpace()
+    space = result.getActiveColorSpace()
     check_choice(f"colour space of {key}", space, TO_REC709)
     return TO_REC709[space] @ np.array(value.asTuple())
 

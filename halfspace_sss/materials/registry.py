@@ -54,17 +54,17 @@ class Registry:
     def register(self, material_or_path: Material | str | os.PathLike) -> tuple[str, ...]:
         """Add a material, or those of a TOML file or folder; returns their names."""
         if isinstance(material_or_path, Material):
-            found = [(IN_CODE, material_or_path)]
+            results = [(IN_CODE, material_or_path)]
         elif isinstance(material_or_path, (str, os.PathLike)):
-            found = list(_from_path(material_or_path))
+            results = list(_from_path(material_or_path))
         else:
             raise ValueError(f"material_or_path must be a Material or a path, got {material_or_path!r}")
-        if not found:
+        if not results:
             raise ValueError(f"material_or_path must hold at least one *.toml file, got {str(material_or_path)!r}")
         with self._lock:
             self._all()
-            self._materials, self._origins = self._with(found, (self._materials, self._origins))
-        return tuple(material.name for _, material in found)
+            self._materials, self._origins = self._with(results, (self._materials, self._origins))
+        return tuple(material.name for _, material in results)
 
     def _all(self) -> dict[str, Material]:
         with self._lock:
@@ -83,10 +83,10 @@ class Registry:
                 warn_left_out(ENTRY_POINT_GROUP, entry.name, error)
         return self._with(list(_of_user()), state)
 
-    def _with(self, found: Iterable[tuple[str, Material]], state: State) -> State:
+    def _with(self, result: Iterable[tuple[str, Material]], state: State) -> State:
         """The materials and origins of `state` and those found; ValueError if a name is taken."""
         (materials, origins), added = map(dict, state), set()
-        for origin, material in found:
+        for origin, material in result:
             key = key_of(material.name)
             if key in materials and (key in added or not self._comes_again(key, origin, material)):
                 taken = f"{materials[key].name!r} of {origins[key]}"

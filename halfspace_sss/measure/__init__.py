@@ -363,9 +363,9 @@ def _lattice(model: BSSRDF, mu_i: Any) -> Integral:
     parts = [model] if m.n_channels is None else [model.for_medium(m.channel(k)) for k in range(m.n_channels)]
     diffuse = isinstance(mu_i, str)
     mu, w = cosine_nodes(m.eta, DIFFUSE_COSINES) if diffuse else (_cosines(mu_i), None)
-    found = np.array([[lattice_reflectance(part, one) for part in parts] for one in mu.ravel().tolist()])
-    found = 2 * np.tensordot(w, found, 1) if diffuse else found.reshape(*mu.shape, len(parts), 2)
-    return Integral(*(v if m.n_channels is not None else v[..., 0][()] for v in (found[..., 0], found[..., 1])))
+    result = np.array([[lattice_reflectance(part, one) for part in parts] for one in mu.ravel().tolist()])
+    result = 2 * np.tensordot(w, result, 1) if diffuse else result.reshape(*mu.shape, len(parts), 2)
+    return Integral(*(v if m.n_channels is not None else v[..., 0][()] for v in (result[..., 0], result[..., 1])))
 
 
 def _check_diffuse(mu_i: Any) -> None:

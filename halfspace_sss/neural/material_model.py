@@ -27,9 +27,9 @@ def load_network(path: Path, kind: str, medium: Medium, n_in: int, activation: A
     check_medium(path, record, medium)
     shapes = layer_shapes(n_in, record_count(path, record, "width"), record_count(path, record, "depth", 64))
     wanted = {f"{name}_{k}": s for k, pair in enumerate(shapes) for name, s in zip("Wb", (pair, pair[1:]))}
-    found = {name: array.shape for name, array in arrays.items()}
-    if found != wanted:
-        raise ValueError(f"{path}: layers must be {wanted}, got {found}")
+    results = {name: array.shape for name, array in arrays.items()}
+    if results != wanted:
+        raise ValueError(f"{path}: layers must be {wanted}, got {results}")
     matrices = tuple(arrays[f"W_{k}"].astype(np.float32) for k in range(len(shapes)))
     return Network(matrices, tuple(arrays[f"b_{k}"].astype(np.float32) for k in range(len(shapes))), activation)
 

@@ -179,13 +179,13 @@ def _rows(vector: type, matrices: list[np.ndarray], biases: list[np.ndarray]) ->
     """As loops want them: rows filled up to packets."""
     import drjit as dr
 
-    kind, found = dr.value_t(vector), []
+    kind, results = dr.value_t(vector), []
     precision = np.float64 if _is_double(kind) else np.float32
     for W in matrices:
         W = np.pad(W, ((0, 0), (0, -W.shape[1] % PACKET)))
-        found.append((len(W), kind(W.ravel().astype(precision).tolist())))
+        results.append((len(W), kind(W.ravel().astype(precision).tolist())))
     # lists, not NumPy arrays: memory in any alignment would need kernels of its own
-    return found, [kind(np.asarray(b, dtype=precision).tolist()) for b in biases]
+    return results, [kind(np.asarray(b, dtype=precision).tolist()) for b in biases]
 
 
 def _product(W: Any, x: Any, bias: Any) -> Any:

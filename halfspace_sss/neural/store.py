@@ -185,13 +185,16 @@ def _digits(medium: Medium) -> dict[str, str]:
 
 def check_medium(path: Path, record: Mapping[str, Any], medium: Medium) -> None:
     """ValueError if the weights of `path` were trained for another medium, whatever the file is called."""
-    found = record.get("medium")
-    if not isinstance(found, dict) or any(type(found.get(name)) not in (int, float) for name in RATIOS):
-        raise ValueError(f"{path.with_suffix('.json')}: medium must have {', '.join(RATIOS)} as numbers, got {found!r}")
+    result = record.get("medium")
+    if not isinstance(result, dict) or any(type(result.get(name)) not in (int, float) for name in RATIOS):
+        raise ValueError(
+            f"{path.with_suffix('.json')}: medium must have {', '.join(RATIOS)} as numbers, got {result!r}"
+        )
     for name, wanted in _digits(medium).items():
-        if f"{found[name]:.8g}" != wanted:
+        if f"{result[name]:.8g}" != wanted:
             raise ValueError(
-                f"{path.with_suffix('.json')}: {name} of medium must be {wanted} for this medium, got {found[name]!r}: "
+                f"{path.with_suffix('.json')}: {name} of medium must be {wanted} for this medium, "
+                f"got {result[name]!r}: "
                 "the weights are those of another one, renamed"
             )
 

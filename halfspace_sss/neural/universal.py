@@ -33,9 +33,9 @@ def load_hypernetwork(path: Path) -> Hypernetwork:
     medium, calibration = _sizes(arrays, "medium"), _sizes(arrays, CALIBRATION)
     wanted = {"base": (size,), "basis": (medium[-1], size)}
     wanted |= _layer_shapes("medium", medium) | _layer_shapes(CALIBRATION, [*calibration[:-1], N_TERMS])
-    found = {name: array.shape for name, array in arrays.items()}
-    if found != wanted:
-        raise ValueError(f"{path}: shapes must be {wanted}, got {found}")
+    results = {name: array.shape for name, array in arrays.items()}
+    if results != wanted:
+        raise ValueError(f"{path}: shapes must be {wanted}, got {results}")
     return hypernetwork_of(arrays, width, depth)
 
 

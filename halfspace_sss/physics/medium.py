@@ -232,8 +232,8 @@ class Medium:
         ordinates; left out is what the boundary mirrors.
         """
         pairs = np.broadcast(self.albedo, self.g)
-        found = np.array([half_space_reflectance(float(a), float(g), self.eta, mu_i) for a, g in pairs])
-        return found if self.n_channels is not None else float(found[0])
+        result = np.array([half_space_reflectance(float(a), float(g), self.eta, mu_i) for a, g in pairs])
+        return result if self.n_channels is not None else float(result[0])
 
     @property
     def n_channels(self) -> int | None:
@@ -322,8 +322,8 @@ class Medium:
 
 def _short(value: Any) -> str:
     """To four digits; one number where all are the same."""
-    found = [f"{x:.4g}" for x in np.atleast_1d(value).tolist()]
-    return found[0] if len(set(found)) == 1 else " ".join(found)
+    results = [f"{x:.4g}" for x in np.atleast_1d(value).tolist()]
+    return results[0] if len(set(results)) == 1 else " ".join(results)
 
 
 def check_scalar_medium(medium: Any) -> None:

@@ -164,13 +164,13 @@ def albedo_of_reflectance(reflectance: np.ndarray, g: float, eta: float, mu_i: f
             f"reflectance must be in [0, {most:.4g}], what a medium without absorption reflects at eta {eta:g}, "
             f"got {float(wrong)!r}"
         )
-    found, slope = np.interp(R, values, x), polynomial.deriv()
+    result, slope = np.interp(R, values, x), polynomial.deriv()
     for _ in range(STEPS):
-        albedo, growth = _albedo(found, g)
-        value = albedo * np.exp(polynomial(found))
-        change = (growth + albedo * slope(found)) * np.exp(polynomial(found))
-        found = np.clip(found - (value - R) / np.minimum(change, -1e-12), 0, 1)
-    return np.minimum(_albedo(found, g)[0], 1.0)  # rounding gives 1 + 2e-16 too
+        albedo, growth = _albedo(result, g)
+        value = albedo * np.exp(polynomial(result))
+        change = (growth + albedo * slope(result)) * np.exp(polynomial(result))
+        result = np.clip(result - (value - R) / np.minimum(change, -1e-12), 0, 1)
+    return np.minimum(_albedo(result, g)[0], 1.0)  # rounding gives 1 + 2e-16 too
 
 
 @functools.lru_cache(maxsize=64)

@@ -147,11 +147,11 @@ def trace_layers(
         R = estimate(np.concatenate(samples)[:, : 3 * len(layers)].sum(axis=1))
         if relative_error and R.standard_error <= relative_error * R.value:
             break
-    n, found = len(layers), np.concatenate(samples)
+    n, result = len(layers), np.concatenate(samples)
     areas = None if edges is None else np.pi * np.diff(edges**2)
     return LayerTrace(
         layers, mu_i, seed, backend, paths, events, time.perf_counter() - started,
-        found[:, : 3 * n].reshape(-1, n, 3), found[:, 3 * n : 3 * n + 3], found[:, 3 * n + 3 :],
+        result[:, : 3 * n].reshape(-1, n, 3), result[:, 3 * n : 3 * n + 3], result[:, 3 * n + 3 :],
         None if edges is None else np.concatenate(rings) / areas,
     )  # fmt: skip
 

@@ -95,17 +95,17 @@ class Advice:
     tolerance: float
 
     def __repr__(self) -> str:
-        ways = ", ".join(f"{found.object}: {found.way}" for found in self.objects)
+        ways = ", ".join(f"{each.object}: {each.way}" for each in self.objects)
         return f"<{self.integrator} for a tolerance of {self.tolerance:.3g}; {ways}>"
 
     def _repr_html_(self) -> str:
         return html_table(("object", "way", "error", "seconds", ""), [
-            (found.object, o.way, f"{o.error:.3g}", f"{o.seconds:.3g}", o.why)
-            for found in self.objects for o in found.options
+            (each.object, o.way, f"{o.error:.3g}", f"{o.seconds:.3g}", o.why)
+            for each in self.objects for o in each.options
         ])  # fmt: skip
 
     def __str__(self) -> str:
-        text = [str(found) for found in self.objects]
+        text = [str(each) for each in self.objects]
         if len(self.objects) > 1:
             text.append(f"all objects together: {self.integrator}, {_time(self.seconds)}")
         return "\n".join(text)
@@ -157,14 +157,14 @@ def recommend(
     return advise(assess(scene, seed=seed, **how), job)
 
 
-def advise(found: Assessment, job: Job) -> Advice:
+def advise(assessment: Assessment, job: Job) -> Advice:
     """The ways for a job, from what has been measured."""
-    objects = tuple(_object(o, job) for o in found.objects)
+    objects = tuple(_object(o, job) for o in assessment.objects)
     told = [o for o in objects if o.way is not None]
     kinds = (INTEGRATOR, f"{INTEGRATOR}, {GATHERED}", PATH_TRACED)
     times = {kind: sum(_best(o, kind) for o in told) for kind in kinds}
     integrator = min(times, key=lambda kind: times[kind])
-    return Advice(objects, integrator, times[integrator], found, job.tolerance)
+    return Advice(objects, integrator, times[integrator], assessment, job.tolerance)
 
 
 def _best(advice: ObjectAdvice, kind: str) -> float:
@@ -177,25 +177,25 @@ def _best(advice: ObjectAdvice, kind: str) -> float:
     return min((o.seconds for o in advice.options if served[o.way]), default=math.inf)
 
 
-def _object(found: ObjectTrade, job: Job) -> ObjectAdvice:
-    if not found.ways:
-        return ObjectAdvice(found.object, None, (Option("", math.inf, 0, math.nan, "; ".join(found.notes)),))
-    rows = [row for row in found.ways if not row.refusal]
-    if found.is_dark:
+def _object(assessed: ObjectTrade, job: Job) -> ObjectAdvice:
+    if not assessed.ways:
+        return ObjectAdvice(assessed.object, None, (Option("", math.inf, 0, math.nan, "; ".join(assessed.notes)),))
+    rows = [row for row in assessed.ways if not row.refusal]
+    if assessed.is_dark:
         rows = sorted(rows, key=lambda row: row.seconds)
         dark = tuple(Option(w.way, w.preparation, 1, 0.0, f"{w.way}: {DARK}") for w in rows)
-        return ObjectAdvice(found.object, dark[0].way, dark)
-    options = [_option(found, row, job) for row in rows]
+        return ObjectAdvice(assessed.object, dark[0].way, dark)
+    options = [_option(assessed, row, job) for row in rows]
     allowed = [o for o in options if o[0] <= (job.seconds or math.inf)]
     if allowed and min(allowed)[0] < math.inf:
         best = min(allowed, key=lambda o: o[0])
-        told = [_told(found, o, best, job) for o in sorted(options, key=lambda o: (o is not best, o[0]))]
+        told = [_told(assessed, o, best, job) for o in sorted(options, key=lambda o: (o is not best, o[0]))]
     else:
-        options = [_in_time(found, o[3], job) for o in options]
+        options = [_in_time(assessed, o[3], job) for o in options]
         best = min(options, key=lambda o: o[2])
-        told = [_nearest(found, o, best, job) for o in sorted(options, key=lambda o: o[2])]
-    refused = [Option(w.way, math.inf, 0, math.nan, f"{w.way}: {w.refusal}") for w in found.ways if w.refusal]
-    return ObjectAdvice(found.object, best[3].way, (*told, *refused))
+        told = [_nearest(assessed, o, best, job) for o in sorted(options, key=lambda o: o[2])]
+    refused = [Option(w.way, math.inf, 0, math.nan, f"{w.way}: {w.refusal}") for w in assessed.ways if w.refusal]
+    return ObjectAdvice(assessed.object, best[3].way, (*told, *refused))
 
 
 _Raw = tuple[float, float, float, WayTrade]  # seconds, samples of a pixel, error, the way
@@ -205,28 +205,28 @@ def _once(row: WayTrade, job: Job) -> float:
     return row.preparation + (row.training if job.count_training else 0.0)
 
 
-def _option(found: ObjectTrade, row: WayTrade, job: Job) -> _Raw:
+def _option(assessed: ObjectTrade, row: WayTrade, job: Job) -> _Raw:
     needed = samples_for(row, job.tolerance)
     if not needed < math.inf:
         return math.inf, 0.0, row.bias, row
     spp = max(math.ceil(needed), 1)
-    took = _once(row, job) + job.images * found.pixels * spp * row.seconds
+    took = _once(row, job) + job.images * assessed.pixels * spp * row.seconds
     return took, spp, math.hypot(row.bias, math.sqrt(row.variance / spp)), row
 
 
-def _in_time(found: ObjectTrade, row: WayTrade, job: Job) -> _Raw:
+def _in_time(assessed: ObjectTrade, row: WayTrade, job: Job) -> _Raw:
     """What a way comes to in the time that is allowed."""
     left = (job.seconds or math.inf) - _once(row, job)
-    spp = math.floor(left / (job.images * found.pixels * row.seconds)) if left > 0 else 0
+    spp = math.floor(left / (job.images * assessed.pixels * row.seconds)) if left > 0 else 0
     error = math.hypot(row.bias, math.sqrt(row.variance / spp)) if spp > 0 else math.inf
     return float(job.seconds or math.inf), spp, error, row
 
 
-def _told(found: ObjectTrade, option: _Raw, best: _Raw, job: Job) -> Option:
+def _told(assessed: ObjectTrade, option: _Raw, best: _Raw, job: Job) -> Option:
     took, spp, error, row = option
     off = _off(row)
     if option is best:
-        size = f"{found.mfp[0]:.3g} to {found.mfp[1]:.3g} mean free paths across"
+        size = f"{assessed.mfp[0]:.3g} to {assessed.mfp[1]:.3g} mean free paths across"
         images = "an image" if job.images == 1 else f"{job.images} images"
         why = f"{row.way} is the cheapest that keeps {job.tolerance:.3g} ({size}): {off}, {images} in {_time(took)}"
         why += f" with {int(spp)} samples a pixel" + _training(row, job)
@@ -243,7 +243,7 @@ def _told(found: ObjectTrade, option: _Raw, best: _Raw, job: Job) -> Option:
     return Option(row.way, took, int(spp), error, why)
 
 
-def _nearest(found: ObjectTrade, option: _Raw, best: _Raw, job: Job) -> Option:
+def _nearest(assessed: ObjectTrade, option: _Raw, best: _Raw, job: Job) -> Option:
     took, spp, error, row = option
     if option is best:
         why = f"no way keeps {job.tolerance:.3g} in {_time(took)}; {row.way} comes nearest, {100 * error:.3g} %"

@@ -104,12 +104,12 @@ def assess(
         raise ValueError(f"sensor must be below {len(on.scene.sensors())}, the number of sensors, got {sensor}")
     how = {"seconds": seconds, "sensor": sensor, "seed": seed, "exits": exits, "progress": progress}
     if tolerance is None:
-        found = assess_stage(on, chosen, **how)
+        result = assess_stage(on, chosen, **how)
     else:
-        found = assess_for(on, chosen, tolerance, images=None if named else images, **how)
+        result = assess_for(on, chosen, tolerance, images=None if named else images, **how)
     if flip:
-        found = with_flip(on, chosen, found, sensor, seed)
-    return found
+        result = with_flip(on, chosen, result, sensor, seed)
+    return result
 
 
 def _chosen(models: Sequence[str] | None) -> list[Way]:
@@ -160,9 +160,9 @@ def assess_stage(
             sampled = _object(on, k, points, chosen, (seconds, samples, traced), seeded(seed, 42, k), tell)
             heard = [" ".join(str(w.message).split()) for w in caught]
         (walks,) = sampled[chosen[0]]
-        rows = tuple(_row(on, k, way, found, walks) for way, found in sampled.items())
+        rows = tuple(_row(on, k, way, item, walks) for way, item in sampled.items())
         compiled += sum(row.compilation for row in rows)
-        compiling += sum(each.compiling for found in sampled.values() if isinstance(found, list) for each in found)
+        compiling += sum(each.compiling for item in sampled.values() if isinstance(item, list) for each in item)
         radiance = tuple(float(v) for v in walks.estimate.mean.mean(axis=1))
         notes = tuple(dict.fromkeys(heard))
         objects.append(ObjectTrade(on.names[k], _mfp(on, k), points.share, points.pixels, radiance, rows, notes))
@@ -203,12 +203,12 @@ def _object(
             started = clock()
             try:
                 number = seeded(seed, chosen.index(way), *([half] if half else []))
-                found = first_sample(on, part, points, number, k)
-                beside = found.compiling + (0.0 if half or way.light != GATHERED else found.preparing)
+                result = first_sample(on, part, points, number, k)
+                beside = result.compiling + (0.0 if half or way.light != GATHERED else result.preparing)
                 end, started = end + beside, started + beside
                 left = share / len(way.halves) * (end - started) - (clock() - started)
-                sample_more(on, part, points, found, number, seconds=left, samples=samples)
-                sampled[way].append(found)
+                sample_more(on, part, points, result, number, seconds=left, samples=samples)
+                sampled[way].append(result)
             except (ValueError, RuntimeError) as error:
                 if way.model == PATH_TRACED:
                     raise ValueError(first_cause(error)) from error
@@ -217,18 +217,18 @@ def _object(
     return {way: sampled[way] for way in chosen}
 
 
-def _row(on: Stage, k: int, way: Way, found: list[Sampled] | str, traced: Sampled) -> WayTrade:
-    if isinstance(found, str):
-        return WayTrade(way.name, refusal=found)
-    parts, b = [each.estimate for each in found], traced.estimate
-    a, last = joined(parts), found[-1]  # whose kernels were ready
+def _row(on: Stage, k: int, way: Way, sampled: list[Sampled] | str, traced: Sampled) -> WayTrade:
+    if isinstance(sampled, str):
+        return WayTrade(way.name, refusal=sampled)
+    parts, b = [each.estimate for each in sampled], traced.estimate
+    a, last = joined(parts), sampled[-1]  # whose kernels were ready
     exact = way.model == PATH_TRACED
     bias2 = (0.0, 0.0) if exact else mean_square(a, b) if len(parts) == 1 else mean_square_of_parts(parts, b, KEPT)
     ratios = [(1.0, 0.0) if exact else ratio_of_means(a, b, c) for c in range(len(b.mean))]
     variance = relative_variance(a, b)
     row = WayTrade(
         way.name, *bias2, tuple(r[0] for r in ratios), tuple(r[1] for r in ratios), *variance, last.seconds,
-        a.samples * a.mean.shape[1], last.preparation, sum(each.compilation for each in found), 0.0, last.memory,
+        a.samples * a.mean.shape[1], last.preparation, sum(each.compilation for each in sampled), 0.0, last.memory,
     )  # fmt: skip
     return replace(row, training=training_seconds(on.scene, on.shapes[k].id(), way.model))
 
@@ -290,12 +290,12 @@ def assess_for(
     return Assessment(objects, *spent, first.seed)
 
 
-def _left_out(found: ObjectTrade, way: Way, tolerance: float, images: int, seconds: float) -> str:
+def _left_out(assessed: ObjectTrade, way: Way, tolerance: float, images: int, seconds: float) -> str:
     """Why a way is not worth a look for an object, after a look at others; empty where it is."""
-    rows = [row for row in found.ways if not row.refusal and row.variance >= 0]
-    jobs = [samples_for(row, tolerance) * row.seconds * images * found.pixels + row.preparation for row in rows]
+    rows = [row for row in assessed.ways if not row.refusal and row.variance >= 0]
+    jobs = [samples_for(row, tolerance) * row.seconds * images * assessed.pixels + row.preparation for row in rows]
     best = min(jobs, default=math.inf)
-    known = {row.way: row for row in found.ways}
+    known = {row.way: row for row in assessed.ways}
     if way.model not in known:
         return f"not measured in less than {DEAR_SECONDS:g} s: ask for it by its name"
     row = known[way.model]
@@ -322,9 +322,9 @@ def _most_promising(seen: Sequence[ObjectTrade], ways: Sequence[Way]) -> Way:
     return min(near, key=lambda way: sum(row.seconds for row in rows[way]))
 
 
-def contenders(found: ObjectTrade, tolerance: float) -> list[str]:
+def contenders(assessed: ObjectTrade, tolerance: float) -> list[str]:
     """Ways beside walks that may keep the tolerance, and may be the cheapest that does."""
-    rows = [row for row in found.ways if not row.refusal and row.variance >= 0]
+    rows = [row for row in assessed.ways if not row.refusal and row.variance >= 0]
     best = min((samples_for(row, tolerance) * row.seconds for row in rows), default=math.inf)
     return [row.way for row in rows if row.way != PATH_TRACED and _at_best(row, tolerance) < CLOSE * best]
 
@@ -335,10 +335,10 @@ def _at_best(row: WayTrade, tolerance: float) -> float:
     return max(row.variance / left, 1.0) * row.seconds if left > 0 else math.inf
 
 
-def _traced_share(found: ObjectTrade, names: set[str]) -> float:
+def _traced_share(assessed: ObjectTrade, names: set[str]) -> float:
     """Of the time, by which noise of differences is least: each way has sqrt(V t), walks serve all others at once."""
-    noise = [math.sqrt(r.variance * r.seconds) for r in found.ways if r.way in names and not r.refusal]
-    walks = math.sqrt(len(noise) * found.traced.variance * found.traced.seconds)
+    noise = [math.sqrt(r.variance * r.seconds) for r in assessed.ways if r.way in names and not r.refusal]
+    walks = math.sqrt(len(noise) * assessed.traced.variance * assessed.traced.seconds)
     return min(max(walks / (walks + sum(noise)), TRACED[0]), TRACED[1]) if noise and walks > 0 else TRACED[1]
 
 

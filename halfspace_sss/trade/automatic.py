@@ -90,14 +90,14 @@ def _measured(on: Stage, named: list[str], settings: Settings) -> dict[str, Any]
     ways = [Way(PATH_TRACED)]
     ways += [_way(name, light) for name in models if name != AUTO for light in lights if _has(name, light)]
     samples = _samples(on, settings.choice_share / len(ways))
-    found = assess_stage(on, ways, samples=samples, exits=EXITS)
-    picks = {light: [picked(o, settings.tolerance, light, name) for o, name in zip(found.objects, named)]
+    result = assess_stage(on, ways, samples=samples, exits=EXITS)
+    picks = {light: [picked(o, settings.tolerance, light, name) for o, name in zip(result.objects, named)]
              for light in lights}  # fmt: skip
     light = min(lights, key=lambda light: _total(picks[light]))
     about = provenance(tolerance=settings.tolerance, samples=samples, exits=EXITS)
     record = {"format": FORMAT, "light": light, "models": [pick.model for pick in picks[light]]}
     record |= {"sentences": [pick.sentence for pick in picks[light]]}
-    return {**record, "assessment": found.record(), "provenance": about}
+    return {**record, "assessment": result.record(), "provenance": about}
 
 
 def _has(model: str, light: str) -> bool:
@@ -130,34 +130,34 @@ def _total(picks: list[Pick]) -> float:
     return sum(pick.seconds for pick in picks)
 
 
-def picked(found: ObjectTrade, tolerance: float, light: str = "sampled", model: str = AUTO) -> Pick:
+def picked(assessed: ObjectTrade, tolerance: float, light: str = "sampled", model: str = AUTO) -> Pick:
     """The model for an object among those of one kind of light, or what can be said of the one that is named."""
     names = model_names() if model == AUTO else (model,)
     ways = {_way(name, light).name: name for name in names if name != AUTO}
-    rows = [row for row in found.ways if not row.refusal and row.way in ways]
-    if not rows or found.is_dark:
+    rows = [row for row in assessed.ways if not row.refusal and row.way in ways]
+    if not rows or assessed.is_dark:
         name = _default([ways[row.way] for row in rows] or list(ways.values()))
-        why = f"object {found.object!r}: {name}, as nothing is seen that could be compared"
+        why = f"object {assessed.object!r}: {name}, as nothing is seen that could be compared"
         return Pick(name, 0.0 if rows else math.inf, why)
     keeping = [row for row in rows if row.bias_bound <= tolerance]
     if keeping:
-        best = min(keeping, key=lambda row: _cost(found, row, tolerance))
+        best = min(keeping, key=lambda row: _cost(assessed, row, tolerance))
         why = f"{best.told_bias} % off, asked {100 * tolerance:.3g} %"
     else:
-        best = min(rows, key=lambda row: (row.bias_bound, _cost(found, row, tolerance)))
+        best = min(rows, key=lambda row: (row.bias_bound, _cost(assessed, row, tolerance)))
         why = f"the least wrong, {best.told_bias} % off"
         why += f"; no model is known to keep {100 * tolerance:.3g} %"
-    cost, walks = _cost(found, best, tolerance), _cost(found, found.traced, tolerance)
+    cost, walks = _cost(assessed, best, tolerance), _cost(assessed, assessed.traced, tolerance)
     if not keeping or walks < cost:
         why += "; translucent_walk would be better"
         why += " and faster" if walks < cost else ", which has no bias"
-    return Pick(ways[best.way], cost if keeping else math.inf, f"object {found.object!r}: {best.way}, {why}")
+    return Pick(ways[best.way], cost if keeping else math.inf, f"object {assessed.object!r}: {best.way}, {why}")
 
 
 def _default(names: list[str]) -> str:
     return DEFAULT if DEFAULT in names or not names else names[0]
 
 
-def _cost(found: ObjectTrade, row: WayTrade, tolerance: float) -> float:
+def _cost(assessed: ObjectTrade, row: WayTrade, tolerance: float) -> float:
     """Seconds of an image until its noise is at the tolerance."""
-    return row.preparation + found.pixels * row.time_to(tolerance) if row.variance >= 0 else math.inf
+    return row.preparation + assessed.pixels * row.time_to(tolerance) if row.variance >= 0 else math.inf

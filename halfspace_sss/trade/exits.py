@@ -60,17 +60,17 @@ def visible_exits(scene: Any, shapes: list[Any], sensor: int, n: int, seed: int)
     """
     camera = scene.sensors()[sensor]
     pixels = int(np.prod(np.array(camera.film().crop_size())))
-    found: list[list[np.ndarray]] = [[] for _ in shapes]
+    results: list[list[np.ndarray]] = [[] for _ in shapes]
     drawn = 0
     for k in range(LAUNCHES):
         rays, hit = _look(scene, camera, shapes, (seed, k))
         drawn += LAUNCH
-        for mine, mask in zip(found, hit):
+        for mine, mask in zip(results, hit):
             mine.append(rays[:, mask])
-        if all(sum(part.shape[1] for part in mine) >= n for mine in found):
+        if all(sum(part.shape[1] for part in mine) >= n for mine in results):
             break
     made: list[Exits | None] = []
-    for mine in found:
+    for mine in results:
         rays = np.concatenate(mine, axis=1)
         share = rays.shape[1] / drawn
         few = rays.shape[1] < FEWEST
@@ -94,7 +94,7 @@ def _look(scene: Any, camera: Any, shapes: list[Any], seed: tuple[int, int]) -> 
 def _shows_lamp(scene: Any, shapes: list[Any], si: Any, through: bool) -> Any:
     """Whether smooth boundaries show an emitter other than the environment, as mirrors or `through` clear objects."""
 
-    active, found = si.is_valid(), mi.Bool(False)
+    active, result = si.is_valid(), mi.Bool(False)
     for _ in range(CHAIN):
         eta, translucent = mi.Float(1), mi.Bool(False)
         for shape in shapes:
@@ -107,5 +107,5 @@ def _shows_lamp(scene: Any, shapes: list[Any], si: Any, through: bool) -> Any:
         onwards = dr.select(passes, mi.refract(si.wi, cosine_t, eta_ti), mi.reflect(si.wi))
         si = scene.ray_intersect(si.spawn_ray(si.to_world(onwards)), mi.RayFlags.All, False, active)
         active &= si.is_valid()
-        found |= active & (si.emitter(scene) != None)  # noqa: E711
-    return found
+        result |= active & (si.emitter(scene) != None)  # noqa: E711
+    return result

@@ -98,12 +98,12 @@ def recommend_flat(
         raise ValueError("medium must scatter, got albedo 0: S of order 2 and more is 0, no model is needed")
     _check_range(r)
     started = time.perf_counter()
-    found = references([m.in_mfp() for m in parts], events * len(parts), seed, 4)
+    result = references([m.in_mfp() for m in parts], events * len(parts), seed, 4)
     tracing = time.perf_counter() - started
     within = [(r[0] * float(m.sigma_t), r[1] * float(m.sigma_t)) if r else REACH for m in parts]
-    for m, one, bounds in zip(parts, found, within):
+    for m, one, bounds in zip(parts, result, within):
         _check_light(m, one, bounds)
-    rows = [_row(name, parts, found, within) for name in chosen or registered()]
+    rows = [_row(name, parts, result, within) for name in chosen or registered()]
     noise = max((row.noise for row in rows if row.noise < math.inf), default=math.inf)
     rows.append(_Row(PATH_TRACED, NoiseFree(0.0, 0.0), tolerance, tracing * (noise / tolerance) ** 2))
     return _advice(rows, tolerance, r or REACH, "mm" if r else "mean free paths")
@@ -120,10 +120,10 @@ def _check_range(r: tuple[float, float] | None) -> None:
         raise ValueError(f"r must ascend, got {r!r}")
 
 
-def _check_light(m: Medium, found: TracedMaps, within: tuple[float, float]) -> None:
-    radii = found.block_radii()
+def _check_light(m: Medium, maps: TracedMaps, within: tuple[float, float]) -> None:
+    radii = maps.block_radii()
     counts = ((radii >= within[0]) & (radii <= within[1]))[:, None, None, :, None]
-    if not (found.energies() * counts).sum() > 0:
+    if not (maps.energies() * counts).sum() > 0:
         low, high = within
         raise ValueError(
             f"r must hold distances at which light comes back, got {low:.3g} to {high:.3g} mean free paths for "
@@ -141,9 +141,9 @@ class _Row(NamedTuple):
     refusal: str = ""
 
 
-def _row(name: str, media: list[Medium], found: list[TracedMaps], within: list[tuple[float, float]]) -> _Row:
+def _row(name: str, media: list[Medium], maps: list[TracedMaps], within: list[tuple[float, float]]) -> _Row:
     errors, noises, seconds = [], [], 0.0
-    for m, one, bounds in zip(media, found, within):
+    for m, one, bounds in zip(media, maps, within):
         try:
             model = bssrdf(name, m.in_mfp())
         except ValueError as error:

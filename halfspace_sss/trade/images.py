@@ -38,14 +38,14 @@ def small_images(
     camera = on.scene.sensors()[sensor]
     film = camera.film()
     small = _film(np.array(film.crop_size(), dtype=int), side)
-    found = {}
+    results = {}
     for k, way in enumerate(chosen):
         try:
             image = _rendered(mi, on.scene, camera, on.integrator(way), small, spp, seeded(seed, 51, k))
         except (ValueError, RuntimeError):
             continue
-        found[way.name] = image
-    return found
+        results[way.name] = image
+    return results
 
 
 def _film(size: np.ndarray, side: int) -> tuple[int, int]:
@@ -76,7 +76,7 @@ def _rendered(
 def with_flip(
     on: Stage,
     chosen: Sequence[Way],
-    found: Assessment,
+    assessment: Assessment,
     sensor: int,
     seed: int,
     images: Mapping[str, np.ndarray] | None = None,
@@ -87,25 +87,25 @@ def with_flip(
     Args:
         on: the scene.
         chosen: ways, path traced first.
-        found: the assessment.
+        assessment: the assessment.
         sensor: number of the sensor.
         seed: of the samples.
         images: of `small_images`, if they have been rendered, with `spp` samples a pixel.
         spp: samples for each pixel.
     """
     flip = renderer("flip")
-    if flip is None or all(o.is_dark for o in found.objects):
-        return found
+    if flip is None or all(o.is_dark for o in assessment.objects):
+        return assessment
     images = small_images(on, chosen, sensor, seed, spp=spp) if images is None else images
     truth = images[PATH_TRACED]
     again = small_images(on, [chosen[0]], sensor, seeded(seed, 52), max(truth.shape), spp)[PATH_TRACED]
     noise = flip(truth, again)
     values = {name: noise if name == PATH_TRACED else flip(truth, image) for name, image in images.items()}
     objects = []
-    for o in found.objects:
+    for o in assessment.objects:
         rows = tuple(replace(w, flip=values.get(w.way), flip_noise=noise) if not w.refusal else w for w in o.ways)
         objects.append(replace(o, ways=rows))
-    return replace(found, objects=tuple(objects))
+    return replace(assessment, objects=tuple(objects))
 
 
 # --------------------------------------------------------------------------------------------------
@@ -135,20 +135,20 @@ class TradePicture:
 
 
 def picture_of(
-    file: Path, found: Assessment, tolerance: float, sentences: Sequence[str], how: Mapping[str, Any]
+    file: Path, assessment: Assessment, tolerance: float, sentences: Sequence[str], how: Mapping[str, Any]
 ) -> TradePicture:
     """The picture of a recommendation for a scene file, whose images are rendered for it.
 
     Args:
         file: the scene.
-        found: what was measured.
+        assessment: what was measured.
         tolerance: that was asked.
         sentences: of the recommendation.
         how: sensor, seed and parameters, as for `assess`.
     """
-    names = dict.fromkeys(w.way for o in found.objects for w in o.ways if not w.refusal)
+    names = dict.fromkeys(w.way for o in assessment.objects for w in o.ways if not w.refusal)
     images: Mapping[str, np.ndarray] = {}
     if names:
         on = stage(file, how["parameters"])
         images = small_images(on, [Way.of(name) for name in names], how["sensor"], how["seed"], PAGE_SIDE, SPP)
-    return TradePicture(file.stem, found, tolerance, tuple(sentences), images)
+    return TradePicture(file.stem, assessment, tolerance, tuple(sentences), images)

@@ -156,9 +156,9 @@ class Assessment:
         import pandas
 
         rows: list[dict[str, Any]] = []
-        for found in self.objects:
-            for w in found.ways:
-                row: dict[str, Any] = {"object": found.object, "mfp_min": found.mfp[0], "mfp_max": found.mfp[1]}
+        for each in self.objects:
+            for w in each.ways:
+                row: dict[str, Any] = {"object": each.object, "mfp_min": each.mfp[0], "mfp_max": each.mfp[1]}
                 row |= {"way": w.way, "bias": w.bias, "bias_standard_error": w.bias_error, "bias_bound": w.bias_bound}
                 row |= {"bias2": w.bias2, "bias2_standard_error": w.bias2_error}
                 for k, (value, error) in enumerate(zip(w.ratio, w.ratio_error)):

@@ -77,9 +77,9 @@ def first_sample(stage: Stage, way: Way, exits: Exits, seed: int, object: int = 
     _, overhead = _launch(stage, integrator, exits, estimate, 2, seeded(seed, 31, 1))
     again = time.perf_counter() - compiled
     waited = max(compiled - prepared - again, 0.0)
-    found = Sampled(estimate, preparation, preparing, waited, max(first - overhead, 0.0), overhead)
-    stage.paces[object, way] = found
-    return found
+    result = Sampled(estimate, preparation, preparing, waited, max(first - overhead, 0.0), overhead)
+    stage.paces[object, way] = result
+    return result
 
 
 def warm_up(stage: Stage, ways: Sequence[Way]) -> None:
@@ -96,7 +96,14 @@ def _prepare(stage: Stage, integrator: Any) -> None:
 
 
 def sample_more(
-    stage: Stage, way: Way, exits: Exits, found: Sampled, seed: int, *, seconds: float = 0.0, samples: int | None = None
+    stage: Stage,
+    way: Way,
+    exits: Exits,
+    sampled: Sampled,
+    seed: int,
+    *,
+    seconds: float = 0.0,
+    samples: int | None = None,
 ) -> None:
     """Sample further, for so many seconds or a number of samples of each exit.
 
@@ -104,7 +111,7 @@ def sample_more(
         stage: the scene.
         way: how it is rendered.
         exits: of the object.
-        found: what is there already.
+        sampled: what is there already.
         seed: of the samples.
         seconds: to spend.
         samples: of each exit, instead; the outcome then depends on the seed alone.
@@ -112,23 +119,23 @@ def sample_more(
     most, started, integrator = max(LANES // exits.n, 2), clock(), stage.integrator(way)
     while True:
         if samples:
-            each = samples - found.estimate.samples
+            each = samples - sampled.estimate.samples
         else:
-            each = _affordable(found, exits.n, seconds - (clock() - started)) if found.launches else PILOT
-        if not found.estimate.samples:
+            each = _affordable(sampled, exits.n, seconds - (clock() - started)) if sampled.launches else PILOT
+        if not sampled.estimate.samples:
             each = max(each, PILOT)
         if each < FEWEST:
             return
         each = min(each, most)
-        number = seeded(seed, 32, found.estimate.samples)
-        memory, took = _launch(stage, integrator, exits, found.estimate, each, number)
-        found.memory = max(found.memory, memory)
-        found.launches.append((exits.n * each, took))
+        number = seeded(seed, 32, sampled.estimate.samples)
+        memory, took = _launch(stage, integrator, exits, sampled.estimate, each, number)
+        sampled.memory = max(sampled.memory, memory)
+        sampled.launches.append((exits.n * each, took))
 
 
-def _affordable(found: Sampled, n: int, left: float) -> int:
+def _affordable(sampled: Sampled, n: int, left: float) -> int:
     """Samples of each exit that the rest of the time allows."""
-    return int(max(left - found.overhead, 0) / (found.seconds * n))
+    return int(max(left - sampled.overhead, 0) / (sampled.seconds * n))
 
 
 def _launch(

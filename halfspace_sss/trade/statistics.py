@@ -95,11 +95,11 @@ def mean_square_of_parts(parts: tuple[RadianceEstimate, RadianceEstimate], b: Ra
 
 def joined(parts: Sequence[RadianceEstimate]) -> RadianceEstimate:
     """All samples of several estimates at the same exits."""
-    found = RadianceEstimate(*parts[0].first.shape)
+    result = RadianceEstimate(*parts[0].first.shape)
     for part in parts:
-        found.add(part.first, part.second, part.samples)
-        found.bright = [tuple(map(np.concatenate, zip(*both))) for both in zip(found.bright, part.bright)]
-    return found
+        result.add(part.first, part.second, part.samples)
+        result.bright = [tuple(map(np.concatenate, zip(*both))) for both in zip(result.bright, part.bright)]
+    return result
 
 
 def relative_variance(a: RadianceEstimate, b: RadianceEstimate) -> Number:

@@ -70,10 +70,10 @@ def ways() -> list[Way]:
     """All of them: path traced first, a diffuse surface, every model with light sampled and gathered, and those without
     the single scattering."""
     names = [name for name in model_names() if name not in (AUTO, LAMBERT)]
-    found = [Way(PATH_TRACED), Way(LAMBERT), *map(Way, names)]
-    found += [Way(name, light=GATHERED) for name in names]
+    results = [Way(PATH_TRACED), Way(LAMBERT), *map(Way, names)]
+    results += [Way(name, light=GATHERED) for name in names]
     bare = [name for name in models() if model_class(name).orders == "multiple"]
-    return found + [Way(name, "multiple") for name in bare if name in ("better_dipole", "neural")]
+    return results + [Way(name, "multiple") for name in bare if name in ("better_dipole", "neural")]
 
 
 @dataclass(eq=False)

@@ -227,15 +227,15 @@ def ablation(
     runs = trainings(medium, budgets, seeds, seed)
     array_types(backend)
     medium, report = medium.in_mfp(), progress or (lambda what, done, total: None)
-    found = {} if kept is None else kept
-    report("maps", sum(name in found for name in runs), len(runs))
-    data = None if found.keys() >= runs.keys() else _data(medium, recipe, int(seed), backend)
+    result = {} if kept is None else kept
+    report("maps", sum(name in result for name in runs), len(runs))
+    data = None if result.keys() >= runs.keys() else _data(medium, recipe, int(seed), backend)
     rows = []
     for name, (k, budget, variant) in runs.items():
         report(f"{budget}: {variant.name}", len(rows), len(runs))
-        if name not in found:
-            found[name] = _row(variant, *data, recipe.how, budget, k)
-        rows.append({"budget": str(budget), "variant": variant.name, "seed": k} | found[name])
+        if name not in result:
+            result[name] = _row(variant, *data, recipe.how, budget, k)
+        rows.append({"budget": str(budget), "variant": variant.name, "seed": k} | result[name])
     report("done", len(rows), len(runs))
     return pandas.DataFrame(rows)
 
@@ -274,8 +274,8 @@ def _data(medium: Medium, recipe: MaterialRecipe, seed: int, backend: str) -> tu
     groups = draw_directions(*ratios, np.random.default_rng([seed, 0]))
     halves = make_pool(groups, recipe.grid, recipe.events, (seed, 1), None, None, backend)
     check = (VALIDATION_SEED, seed)
-    found = reference_maps([medium], SETS, recipe.grid, BLOCK, recipe.events / 4, check, None, backend)
-    return MapPool(groups, recipe.grid, halves), found[0]
+    result = reference_maps([medium], SETS, recipe.grid, BLOCK, recipe.events / 4, check, None, backend)
+    return MapPool(groups, recipe.grid, halves), result[0]
 
 
 def _row(

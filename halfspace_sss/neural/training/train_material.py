@@ -132,11 +132,11 @@ def train_channel(
     (reference,) = reference_maps([medium], VALIDATION_SETS, recipe.grid, BLOCK, events, check, None, backend)
     data_seconds = time.monotonic() - started
     learner = subject.learner(medium, pool, seed)
-    found: list[ModelError] = []  # the last of them is that of the end, unless the run was over when it was resumed
+    results: list[ModelError] = []  # the last of them is that of the end, unless the run was over when it was resumed
 
     def validate() -> float:
-        found.append(model_error(subject.model(medium, learner), reference))
-        return found[-1].known.bound
+        results.append(model_error(subject.model(medium, learner), reference))
+        return results[-1].known.bound
 
     how = recipe.how
     history, _ = fit(
@@ -144,7 +144,7 @@ def train_channel(
         checkpoint=place / CHECKPOINT if place else None, validate=validate,
         target_error=target_error, progress=progress,
     )  # fmt: skip
-    error = found[-1] if found else model_error(subject.model(medium, learner), reference)
+    error = results[-1] if results else model_error(subject.model(medium, learner), reference)
     fit_seconds = time.monotonic() - started - data_seconds
     record = {"width": learner.width, "depth": learner.depth, **subject.record(learner)}
     record |= _record(medium, recipe, seed, error, history, data_seconds, fit_seconds)

@@ -72,7 +72,7 @@ def collect(
     ratios = np.stack([np.maximum(albedo, LEAST_ALBEDO), g, eta], axis=1)
     mu_i = (np.arange(COSINES) + rng.random((n, COSINES))) / COSINES
     mu_i[:, -1] = np.where(rng.random(n) < 0.5, 1.0, mu_i[:, -1])  # normal incidence is asked for most
-    found = []
+    results = []
     for at in range(0, n, CHUNK):
         media = range(at, min(at + CHUNK, n))
         place = folder / f"reflectances-{at // CHUNK:05d}.npy" if folder else None
@@ -85,10 +85,10 @@ def collect(
                 file = io.BytesIO()
                 np.save(file, rows)
                 write_atomically(place, file.getvalue())
-        found.append(rows)
+        results.append(rows)
         if progress:
             progress("reflectances", min(at + CHUNK, n), n)
-    exact, error, flux = np.split(np.concatenate(found).astype(np.float64), [1, 2], axis=2)
+    exact, error, flux = np.split(np.concatenate(results).astype(np.float64), [1, 2], axis=2)
     return Fluxes(ratios, mu_i, exact[..., 0], flux, error[..., 0])
 
 
@@ -107,9 +107,9 @@ def _row(hyper: Hypernetwork, ratios: np.ndarray, mu_i: np.ndarray, seed: tuple[
 
 def _fluxes(model: Trial, mu_i: np.ndarray, points: int, seed: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Flux towards each interval and the standard error of their sum, for each cosine of incidence."""
-    found = exits(model, np.repeat(mu_i, REPEATS).tolist(), points, seed)
-    interval = np.minimum((found.mu_o * INTERVALS).astype(int), INTERVALS - 1)
-    flux = np.stack([np.bincount(b, f, INTERVALS) for b, f in zip(interval, found.flux)])
+    result = exits(model, np.repeat(mu_i, REPEATS).tolist(), points, seed)
+    interval = np.minimum((result.mu_o * INTERVALS).astype(int), INTERVALS - 1)
+    flux = np.stack([np.bincount(b, f, INTERVALS) for b, f in zip(interval, result.flux)])
     flux = flux.reshape(len(mu_i), REPEATS, INTERVALS)
     return flux.mean(axis=1), flux.sum(axis=2).std(axis=1, ddof=1) / np.sqrt(REPEATS)
 

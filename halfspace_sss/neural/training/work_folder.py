@@ -32,10 +32,10 @@ def claim(folder: Path, **run: Any) -> None:
             raise ValueError(f"{folder}: work must be that of a known run, got {left[0]} without {RUN}; remove it")
         write_atomically(place, to_json(run))
         return
-    wanted, found = _flat(json.loads(to_json(run))), _flat(_read(place))
-    for key in sorted(wanted.keys() | found.keys()):
-        if wanted.get(key) != found.get(key):
-            asked, stands = wanted.get(key), found.get(key)
+    wanted, result = _flat(json.loads(to_json(run))), _flat(_read(place))
+    for key in sorted(wanted.keys() | result.keys()):
+        if wanted.get(key) != result.get(key):
+            asked, stands = wanted.get(key), result.get(key)
             raise ValueError(
                 f"{place}: {key} must be {asked!r} to go on with this work, got {stands!r}; name another folder"
             )

@@ -85,7 +85,7 @@ class CameraWalks:
         with dr.suspend_grad():
             image = self.integrator.render(
                 self.scene, self.sensor, mi.UInt32(int(key.generate_state(1)[0])), spp,
-                keep=lambda found: kept.append(found.of_object(k)),
+                keep=lambda each: kept.append(each.of_object(k)),
             )  # fmt: skip
         if number != TRIAL:
             self._add(name, number, np.array(image, dtype=np.float32), spp, time.perf_counter() - started)
@@ -102,11 +102,11 @@ class CameraWalks:
         if not np.isfinite(image).all():
             bad = int((~np.isfinite(image)).any(axis=2).sum())
             raise ValueError(f"walks from the camera must be finite, got {bad} pixels that are not")
-        found = self.found or Reference(np.zeros(image.shape), np.zeros(image.shape), 0, 0, 0.0, self.about)
-        passes = found.about.get(PASSES, {})
+        result = self.found or Reference(np.zeros(image.shape), np.zeros(image.shape), 0, 0, 0.0, self.about)
+        passes = result.about.get(PASSES, {})
         if number >= passes.get(name, 0):
-            found = found.add(image, spp, seconds)
-            self.found = replace(found, about={**found.about, PASSES: {**passes, name: number + 1}})
+            result = result.add(image, spp, seconds)
+            self.found = replace(result, about={**result.about, PASSES: {**passes, name: number + 1}})
         if self.progress:
             self.progress(self.found)
 

@@ -24,8 +24,8 @@ def scene_hash(scene: Any, integrator: Any) -> str:
     What models have learnt is told by `learnt`.
     """
     own = scene.integrator()
-    found = sorted(object_digest(child) for child in _children(scene) if child is not own)
-    return hashlib.sha256("\n".join([*found, words(integrator)]).encode()).hexdigest()
+    result = sorted(object_digest(child) for child in _children(scene) if child is not own)
+    return hashlib.sha256("\n".join([*result, words(integrator)]).encode()).hexdigest()
 
 
 def learnt(scene: Any, integrator: Any) -> list[str]:
@@ -56,21 +56,21 @@ def _children(holder: Any) -> list[Any]:
     return callback.found
 
 
-def object_digest(found: mi.Object) -> str:
+def object_digest(node: mi.Object) -> str:
     """SHA-256 of an object of Mitsuba, in words and by all its parameters."""
 
-    flipped = isinstance(found, mi.Shape) and found.has_flipped_normals()  # of which Mitsuba tells nothing in words
-    digest = hashlib.sha256(f"{words(found)}{flipped}".encode())
-    for key, content in sorted((_MADE_UP.sub("", key), _content(value)) for key, value in mi.traverse(found).items()):
+    flipped = isinstance(node, mi.Shape) and node.has_flipped_normals()  # of which Mitsuba tells nothing in words
+    digest = hashlib.sha256(f"{words(node)}{flipped}".encode())
+    for key, content in sorted((_MADE_UP.sub("", key), _content(value)) for key, value in mi.traverse(node).items()):
         digest.update(b"\0%s\0%d\0" % (key.encode(), len(content)))
         digest.update(content)
     return digest.hexdigest()
 
 
-def words(found: Any) -> str:
+def words(result: Any) -> str:
     """What an object tells of itself, to the last digit where Python prints it."""
     with np.printoptions(precision=17, threshold=sys.maxsize):
-        return _LEFT_OUT.sub("", _MADE_UP.sub("", str(found)))
+        return _LEFT_OUT.sub("", _MADE_UP.sub("", str(result)))
 
 
 def _content(value: Any) -> bytes:

@@ -118,11 +118,11 @@ class ShapeLearner(Protocol):
 
 def learners() -> dict[str, Learner]:
     """All learners of objects by the name of their model."""
-    found = _found()
-    for name, other in found.items():
+    result = _found()
+    for name, other in result.items():
         if not isinstance(other, Learner | ShapeLearner):
             warn_left_out(LEARNERS, name, f"it must have the functions train, untrained and errors, got {other!r}")
-    return {name: each for name, each in found.items() if isinstance(each, Learner)}
+    return {name: each for name, each in result.items() if isinstance(each, Learner)}
 
 
 def learner(name: str | None = None) -> Learner:
@@ -148,8 +148,8 @@ def object_errors(scene: Any, models: Sequence[str], **how: Any) -> list[ObjectE
     first, known = learner(), learners()
     own = [name for name in models if known.get(name, first) is not first]
     others = [name for name in models if name not in own]
-    found = first.errors(scene, others, **how) if others or not own else []
-    return [*found, *(row for name in own for row in known[name].errors(scene, [name], **how))]
+    result = first.errors(scene, others, **how) if others or not own else []
+    return [*result, *(row for name in own for row in known[name].errors(scene, [name], **how))]
 
 
 def shape_learner() -> ShapeLearner:

@@ -47,11 +47,11 @@ def untrained(scene: Any) -> dict[str, list[str]]:
     if not is_bssrdf(scene.integrator()) or scene.integrator().settings.train_seconds == 0:
         return {}
     insides = [shape.bsdf().inside for shape in scene.shapes() if is_translucent(shape.bsdf())]
-    names, known, found = sorted({inside.model for inside in insides}), learners(), {}
+    names, known, results = sorted({inside.model for inside in insides}), learners(), {}
     for name in names:
         if name in known and (ids := known[name].untrained(scene)):
-            found[name] = ids
-    return found
+            results[name] = ids
+    return results
 
 
 def render(
@@ -118,15 +118,15 @@ def render(
     records = _learnt(scene, walks, seed, parts["training"], learning, told or (lambda sentence: None))
     integrator.prepare(scene)
     if walks.found is None:
-        found = reference.render(scene, path, resume=resume, **how)
-        found = replace(found, about={**found.about, TRAINING: records})
+        result = reference.render(scene, path, resume=resume, **how)
+        result = replace(result, about={**result.about, TRAINING: records})
     else:
         model = reference.render(scene, parts["model.exr"], **how)
-        found = combined(walks.found, model)
-        found = replace(found, about={**found.about, TRAINING: walks.found.about.get(TRAINING, [])})
-    save(path, found)
+        result = combined(walks.found, model)
+        result = replace(result, about={**result.about, TRAINING: walks.found.about.get(TRAINING, [])})
+    save(path, result)
     shutil.rmtree(parts["training"], ignore_errors=True)
-    return found
+    return result
 
 
 def _learnt(
@@ -139,11 +139,11 @@ def _learnt(
         if any(name == record["object"] for record in records):
             raise ValueError(f"weights of object {name!r} must be found once they are written, got none")
         told(_sentence(name, model, settings, camera is not None))
-        found = learner(model).train(
+        result = learner(model).train(
             scene, object=name, seconds=settings.train_seconds, target_error=settings.train_error, seed=seed,
             folder=None, work=work / f"{zlib.crc32(name.encode()):08x}", progress=learning, camera=camera,
         )  # fmt: skip
-        records.append(_record(found, model))
+        records.append(_record(result, model))
         if walks.found is not None:
             known = walks.found.about.get(TRAINING, [])
             walks.found = replace(walks.found, about={**walks.found.about, TRAINING: [*known, records[-1]]})
@@ -166,15 +166,15 @@ def _sentence(name: str, model: str, settings: Any, joined: bool) -> str:
     )
 
 
-def _record(found: LearntObject, model: str) -> dict[str, Any]:
+def _record(learnt: LearntObject, model: str) -> dict[str, Any]:
     """What the header of the image tells of a training."""
     return {
-        "object": found.object,
+        "object": learnt.object,
         "model": model,
-        "weights": found.path.name if found.path else None,
-        "steps": found.steps,
-        "seconds": found.seconds,
-        "errors": [row._asdict() for row in found.errors],
+        "weights": learnt.path.name if learnt.path else None,
+        "steps": learnt.steps,
+        "seconds": learnt.seconds,
+        "errors": [row._asdict() for row in learnt.errors],
     }
 
 

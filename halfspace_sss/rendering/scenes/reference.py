@@ -87,29 +87,29 @@ def render(
     scene, integrator = loaded(scene, integrator, sensor)
     about = about_render(scene, integrator, sensor, seed) | chosen(scene, integrator)
     about["learnt"] = learnt(scene, integrator)
-    found = _start(path, resume, about)
-    written = found if resume is True else None
+    result = _start(path, resume, about)
+    written = result if resume is True else None
     last = time.monotonic()
     try:
-        while not limits.reached(found):
-            found = _pass(found, scene, integrator, sensor, about, _pass_spp(found, spp_per_pass, spp))
+        while not limits.reached(result):
+            result = _pass(result, scene, integrator, sensor, about, _pass_spp(result, spp_per_pass, spp))
             if time.monotonic() - last >= interval:
-                _keep(path, found)
-                written, last = found, time.monotonic()
+                _keep(path, result)
+                written, last = result, time.monotonic()
             if progress is not None:
-                progress(found)
+                progress(result)
     finally:
-        if found is not None and found is not written:
-            _keep(path, found)
-    return found
+        if result is not None and result is not written:
+            _keep(path, result)
+    return result
 
 
-def _keep(path: Path, found: Reference) -> None:
+def _keep(path: Path, reference: Reference) -> None:
     """Save, also if an interrupt comes in the middle of it."""
     try:
-        save(path, found)
+        save(path, reference)
     except KeyboardInterrupt:
-        save(path, found)
+        save(path, reference)
         raise
 
 
@@ -133,35 +133,35 @@ class Limits:
             if value is not None and not (math.isfinite(value) and value > 0):
                 raise ValueError(f"{name} must be finite and > 0, got {value!r}")
 
-    def reached(self, found: Reference | None) -> bool:
-        if found is None:
+    def reached(self, reference: Reference | None) -> bool:
+        if reference is None:
             return False
-        trusted = found.passes >= FEWEST_PASSES
-        pairs = ((self.spp, found.spp), (self.passes, found.passes), (self.seconds, found.seconds))
-        certain = self.target_error is not None and trusted and found.relative_error <= self.target_error
+        trusted = reference.passes >= FEWEST_PASSES
+        pairs = ((self.spp, reference.spp), (self.passes, reference.passes), (self.seconds, reference.seconds))
+        certain = self.target_error is not None and trusted and reference.relative_error <= self.target_error
         return certain or any(limit is not None and value >= limit for limit, value in pairs)
 
-    def share(self, found: Reference) -> float:
+    def share(self, reference: Reference) -> float:
         """Of the work that is done, 0 to 1."""
-        pairs = ((found.spp, self.spp), (found.passes, self.passes), (found.seconds, self.seconds))
+        pairs = ((reference.spp, self.spp), (reference.passes, self.passes), (reference.seconds, self.seconds))
         shares = [value / limit for value, limit in pairs if limit is not None]
-        if self.target_error is not None and found.passes > 1:
-            error = found.relative_error
+        if self.target_error is not None and reference.passes > 1:
+            error = reference.relative_error
             shares.append((self.target_error / error) ** 2 if error > self.target_error else 1.0)
         return min(max(shares, default=0.0), 1.0)
 
 
-def _pass_spp(found: Reference | None, fixed: int | None, most: int | None) -> int:
+def _pass_spp(reference: Reference | None, fixed: int | None, most: int | None) -> int:
     """Samples per pixel of the next pass; a power of two where it grows, for Mitsuba compiles others anew."""
-    done = found.spp if found else 0
+    done = reference.spp if reference else 0
     size = fixed or min(2 ** (max(done // SHARE, 1).bit_length() - 1), LARGEST_PASS)
     return size if most is None else min(size, most - done)
 
 
-def _pass(found: Reference | None, scene: Any, integrator: Any, sensor: int, about: dict, spp: int) -> Reference:
+def _pass(reference: Reference | None, scene: Any, integrator: Any, sensor: int, about: dict, spp: int) -> Reference:
     """One more pass."""
 
-    number = found.passes if found else 0
+    number = reference.passes if reference else 0
     started = time.perf_counter()
     seed = int(np.random.SeedSequence([about["seed"], number]).generate_state(1)[0])
     image = mi.render(scene, sensor=sensor, integrator=integrator, seed=seed, spp=spp)
@@ -170,7 +170,7 @@ def _pass(found: Reference | None, scene: Any, integrator: Any, sensor: int, abo
     if not np.isfinite(image).all():
         bad = int((~np.isfinite(image)).any(axis=2).sum())
         raise ValueError(f"pass {number} must be finite, got {bad} pixels that are not")
-    start = found or Reference(np.zeros(image.shape), np.zeros(image.shape), 0, 0, 0.0, about)
+    start = reference or Reference(np.zeros(image.shape), np.zeros(image.shape), 0, 0, 0.0, about)
     return start.add(image, spp, time.perf_counter() - started)
 
 
@@ -235,8 +235,8 @@ def chosen(scene: Any, integrator: Any) -> dict[str, Any]:
     if AUTO not in (integrator.settings.model, integrator.settings.light, *models):
         return {}
     integrator.prepare(scene)
-    found = integrator.choices
-    return {"choices": found.sentences, "chosen": [found.light, *found.models.values()]}
+    result = integrator.choices
+    return {"choices": result.sentences, "chosen": [result.light, *result.models.values()]}
 
 
 def _start(path: Path, resume: bool | str | os.PathLike, about: dict[str, Any]) -> Reference | None:
@@ -248,20 +248,20 @@ def _start(path: Path, resume: bool | str | os.PathLike, about: dict[str, Any]) 
     if resume is False or (resume is True and not path.exists()):
         return None
     path = path if resume is True else Path(resume)
-    found = load(path)
-    check_same(found, path, about)
-    return found
+    result = load(path)
+    check_same(result, path, about)
+    return result
 
 
-def check_same(found: Reference, path: Path, about: dict[str, Any]) -> None:
+def check_same(reference: Reference, path: Path, about: dict[str, Any]) -> None:
     """ValueError if an image of a file is of another render, so that it cannot be gone on with."""
     for key in ("scene", "integrator", "sensor", "seed", "variant", "learnt", "chosen"):
-        there, here = found.about.get(key, []), about.get(key, [])
+        there, here = reference.about.get(key, []), about.get(key, [])
         if there != here:
             raise ValueError(
                 f"{path} must be of the same render to go on with it: {key} is {there!r} there and {here!r} here; "
                 "choose another file or delete it"
             )
-    versions = [p["provenance"]["versions"] for p in (found.about, about)]
+    versions = [p["provenance"]["versions"] for p in (reference.about, about)]
     if versions[0] != versions[1]:
         raise ValueError(f"{path} must be of the same versions to go on with it, got {versions[0]} and {versions[1]}")

@@ -92,22 +92,22 @@ def _all_names(channels: int) -> list[str]:
     return [part.format(name) for part in parts for name in names]
 
 
-def save(path: Path, found: Reference) -> None:
+def save(path: Path, reference: Reference) -> None:
     """Write the EXR, whole or not at all, and beside it the JSON of its header for people to read, never of another."""
     import mitsuba as mi
 
-    (mean, mean_rest), (variance, variance_rest) = _halves(found.mean), _halves(found.variance)
+    (mean, mean_rest), (variance, variance_rest) = _halves(reference.mean), _halves(reference.variance)
     pixels = np.ascontiguousarray(np.concatenate([mean, variance, mean_rest, variance_rest], axis=2), dtype=np.float32)
     header = {
         "format": FORMAT,
-        "passes": found.passes,
-        "spp": found.spp,
-        "seconds": found.seconds,
-        "relative_error": found.relative_error if math.isfinite(found.relative_error) else None,
+        "passes": reference.passes,
+        "spp": reference.spp,
+        "seconds": reference.seconds,
+        "relative_error": reference.relative_error if math.isfinite(reference.relative_error) else None,
         "pixels": hashlib.sha256(pixels.tobytes()).hexdigest(),
-        **found.about,
+        **reference.about,
     }
-    bitmap = mi.Bitmap(pixels, mi.Bitmap.PixelFormat.MultiChannel, channel_names=_all_names(found.mean.shape[2]))
+    bitmap = mi.Bitmap(pixels, mi.Bitmap.PixelFormat.MultiChannel, channel_names=_all_names(reference.mean.shape[2]))
     text = json.dumps(header, indent=1)
     bitmap.metadata()[HEADER] = text
     stream = mi.MemoryStream()

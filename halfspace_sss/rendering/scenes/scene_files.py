@@ -196,10 +196,10 @@ def _check(name: str, value: str | None, known: tuple[str, ...]) -> None:
 
 def _surfaces(state: Any) -> list[Any]:
     """The parameters of all translucent surfaces."""
-    found = [node.props for node in state.nodes if node.props.plugin_name() == "translucent"]
-    if not found:
+    results = [node.props for node in state.nodes if node.props.plugin_name() == "translucent"]
+    if not results:
         raise ValueError(_NO_OBJECT)
-    return found
+    return results
 
 
 def _made(scene: dict | str | Path, state: Any, config: Any) -> Any:

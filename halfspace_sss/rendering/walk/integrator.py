@@ -102,8 +102,8 @@ def _prepared(scene: mi.Scene, before: tuple, mm_per_unit: float) -> tuple[int, 
         return before
     media = WalkMedia.of(scene, mm_per_unit)
     check_sensors(scene, media.objects)
-    for found, inside in zip(media.objects, media.insides):
-        check_size(found, [mm_per_unit * float(m.sigma_t) for m in inside.channels()], mm_per_unit)
+    for each, inside in zip(media.objects, media.insides):
+        check_size(each, [mm_per_unit * float(m.sigma_t) for m in inside.channels()], mm_per_unit)
     return number_of(scene), shapes, places, media
 
 
@@ -183,9 +183,9 @@ def camera_rays(sensor: mi.Sensor, spp: int, seed: tuple[int, int]) -> tuple[mi.
 
 def _widened(ray: mi.Ray3f, n: int) -> mi.Ray3f:
     """n rays; those of a sensor that knows one ray only are one."""
-    found = mi.Ray3f(ray)
-    found.o, found.d = found.o + dr.zeros(mi.Point3f, n), found.d + dr.zeros(mi.Vector3f, n)
-    return found
+    result = mi.Ray3f(ray)
+    result.o, result.d = result.o + dr.zeros(mi.Point3f, n), result.d + dr.zeros(mi.Vector3f, n)
+    return result
 
 
 def _positive(name: str, value: float) -> float:

@@ -60,21 +60,21 @@ class InnerShapes:
             ValueError: something that refracts lies partly inside, is not closed or in an instance, or objects count
                 some orders only.
         """
-        found = contents(scene, objects)
-        if not found:
+        result = contents(scene, objects)
+        if not result:
             return None
-        _check(found, objects)
-        _check_instances(found, scene)
-        glass = [survey(thing, scene) for thing in _shapes(found) if _displaces(thing)]
+        _check(result, objects)
+        _check_instances(result, scene)
+        glass = [survey(thing, scene) for thing in _shapes(result) if _displaces(thing)]
         for piece in glass:
             if not piece.closed:
                 raise ValueError(f"what refracts inside an object must be closed, got the shape {piece.name}")
         if glass:
-            found = contents(scene, [*objects, *glass])
+            result = contents(scene, [*objects, *glass])
         holders = [*objects, *glass]
-        inside = [content for content in found if content.object < len(objects)]
+        inside = [content for content in result if content.object < len(objects)]
         things = {id(content.thing): content.thing for content in inside}
-        around = {key: _innermost(key, found, holders, len(objects)) for key in things}
+        around = {key: _innermost(key, result, holders, len(objects)) for key in things}
         own = [obj.shape for obj in objects]
         shapes = [*own, *(thing for thing in _shapes(inside) if not any(thing is shape for shape in own))]
         numbers = [int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0]) for shape in shapes]
@@ -104,23 +104,23 @@ class InnerShapes:
         return dr.select(known, dr.gather(type(table), table, pointer, known), otherwise)
 
 
-def _shapes(found: list[Content]) -> list[mi.Shape]:
-    return list({id(c.thing): c.thing for c in found if isinstance(c.thing, mi.Shape)}.values())
+def _shapes(result: list[Content]) -> list[mi.Shape]:
+    return list({id(c.thing): c.thing for c in result if isinstance(c.thing, mi.Shape)}.values())
 
 
 def _displaces(shape: mi.Shape) -> bool:
     return not is_translucent(shape.bsdf()) and bool(shape.bsdf().flags() & REFRACTS)
 
 
-def _innermost(key: int, found: list[Content], holders: list[Geometry], n: int) -> int:
+def _innermost(key: int, result: list[Content], holders: list[Geometry], n: int) -> int:
     """The smallest holder of a thing if that is an object, by its number; -1 if it is of glass."""
-    numbers = [content.object for content in found if id(content.thing) == key]
+    numbers = [content.object for content in result if id(content.thing) == key]
     smallest = min(numbers, key=lambda k: holders[k].size)
     return smallest if smallest < n else -1
 
 
-def _check(found: list[Content], objects: list[Geometry]) -> None:
-    for content in found:
+def _check(result: list[Content], objects: list[Geometry]) -> None:
+    for content in result:
         holder = objects[content.object]
         surfaces = [holder.shape.bsdf()]
         if isinstance(content.thing, mi.Shape):
@@ -139,9 +139,9 @@ def _check(found: list[Content], objects: list[Geometry]) -> None:
                 )
 
 
-def _check_instances(found: list[Content], scene: mi.Scene) -> None:
+def _check_instances(result: list[Content], scene: mi.Scene) -> None:
     """ValueError if an instance inside may refract: rays meet shapes of its group, which stand in no table."""
-    instances = [shape for shape in _shapes(found) if is_instance(shape)]
+    instances = [shape for shape in _shapes(result) if is_instance(shape)]
     nodes = [node for node in mi.traverse(scene).hierarchy if isinstance(node, mi.Shape) and node not in scene.shapes()]
     grouped = [shape for shape in nodes if shape not in groups_of(scene) and _displaces(shape)]
     if instances and grouped:
@@ -456,8 +456,8 @@ class WalkMedia:
             raise ValueError(f"mm_per_unit must be finite and > 0, got {mm_per_unit!r}")
         shapes = translucent_shapes(scene)
         inner, objects = scene_of(shapes, scene), [survey(shape, scene) for shape in shapes]
-        found = InnerShapes.of(scene, objects)
-        check_together(scene, [inner, *([found.scene] if found else []), *(obj.scene for obj in objects)])
+        result = InnerShapes.of(scene, objects)
+        check_together(scene, [inner, *([result.scene] if result else []), *(obj.scene for obj in objects)])
         surfaces = [shape.bsdf() for shape in shapes]
         return cls(
             objects,
@@ -465,7 +465,7 @@ class WalkMedia:
             inner,
             [surface.boundary for surface in surfaces],
             float(mm_per_unit),
-            found,
+            result,
         )
 
 
@@ -474,15 +474,15 @@ _OF_OBJECT: WeakKeyDictionary[TranslucentObject, WalkMedia] = WeakKeyDictionary(
 
 def walk_media(obj: TranslucentObject) -> WalkMedia:
     """One object alone, with a smooth boundary and as if it were empty; made once for each."""
-    found = _OF_OBJECT.get(obj)
-    if found is None:
+    result = _OF_OBJECT.get(obj)
+    if result is None:
         medium, eta = obj.media[0], obj.media[0].eta
         if len(obj.media) > 1:
             values = {key: np.array([getattr(m, key) for m in obj.media]) for key in ("sigma_s", "sigma_a", "g")}
             medium = Medium(**values, eta=eta)
         inside, geometry = Inside("medium", medium, "", "total", True, obj.varying), obj.geometry
-        found = _OF_OBJECT[obj] = WalkMedia([geometry], [inside], geometry.scene, [smooth_boundary(eta)], 1.0)
-    return found
+        result = _OF_OBJECT[obj] = WalkMedia([geometry], [inside], geometry.scene, [smooth_boundary(eta)], 1.0)
+    return result
 
 
 _WITHIN: WeakKeyDictionary[TranslucentObject, WalkMedia] = WeakKeyDictionary()

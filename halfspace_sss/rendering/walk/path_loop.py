@@ -433,18 +433,18 @@ class FirstExits:
         si = media.seen(si, k, rays.d)
         n = dr.width(rays)
         kinds = mi.Spectrum, mi.Point3f, mi.Normal3f, mi.Normal3f, mi.Vector3f, mi.UInt32, mi.UInt32
-        found = cls(k, mi.Point3f(si.p), mi.Normal3f(si.n), mi.Normal3f(si.sh_frame.n), mi.Vector3f(-rays.d),
+        result = cls(k, mi.Point3f(si.p), mi.Normal3f(si.n), mi.Normal3f(si.sh_frame.n), mi.Vector3f(-rays.d),
                     *(dr.zeros(kind, n) for kind in kinds))  # fmt: skip
-        dr.eval(found)
-        return found
+        dr.eval(result)
+        return result
 
     def of_object(self, k: int) -> FirstExits:
         """The lanes of paths that meet object k first."""
         kept = dr.compress(self.object == k)
         lanes = {name: dr.gather(type(value), value, kept) for name, value in vars(self).items()}
-        found = FirstExits(**lanes)
-        dr.eval(found)
-        return found
+        result = FirstExits(**lanes)
+        dr.eval(result)
+        return result
 
     def gather(self, lanes: mi.UInt32) -> FirstExits:
         """The paths of the given lanes."""

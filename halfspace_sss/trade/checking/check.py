@@ -43,20 +43,20 @@ def _quick(scene: RandomScene, on: Stage, ways: list[Way], path: Path, seconds: 
         if json.loads(json.dumps(how)).items() <= record.items():
             return record["quick"]
     number = seeded(scene.seed, scene.number, 0)
-    found = assess_for(on, ways, scene.tolerance, images=scene.images, seconds=seconds, seed=number).record()
-    record = {**how, "quick": found, "provenance": provenance(**how)}
+    result = assess_for(on, ways, scene.tolerance, images=scene.images, seconds=seconds, seed=number).record()
+    record = {**how, "quick": result, "provenance": provenance(**how)}
     write_atomically(path, json.dumps(record, indent=1) + "\n")
-    return found
+    return result
 
 
 def outcome(record: dict[str, Any]) -> dict[str, Any]:
     """What came of a scene: error and cost of the recommendation by the long runs, and those of the cheapest way."""
     scene = RandomScene(**{k: tuple(v) if isinstance(v, list) else v for k, v in record["scene"].items()})
     quick, long = (Assessment.of(record[key]) for key in ("quick", "long"))
-    found: dict[str, Any] = {"number": scene.number, "shape": scene.shape, "light": scene.light, "mfp": scene.mfp}
-    found |= {"tolerance": scene.tolerance, "images": scene.images, "seconds": quick.seconds}
+    results: dict[str, Any] = {"number": scene.number, "shape": scene.shape, "light": scene.light, "mfp": scene.mfp}
+    results |= {"tolerance": scene.tolerance, "images": scene.images, "seconds": quick.seconds}
     if not quick.objects[0].ways or quick.objects[0].is_dark:
-        return {**found, "way": None}
+        return {**results, "way": None}
     job = Job(scene.tolerance, scene.images)
     chosen = advise(quick, job).objects[0]
     option = chosen.options[0]
@@ -70,13 +70,13 @@ def outcome(record: dict[str, Any]) -> dict[str, Any]:
     sure = min((least[name] for name in known), default=math.inf)
     cost = row.preparation + scene.images * pixels * option.spp * row.seconds
     automatic = picked(quick.objects[0], scene.tolerance).model
-    found |= {"way": option.way, "spp": option.spp, "error": math.sqrt(error2)}
-    found |= {"error_standard_error": error2_error / (2 * math.sqrt(error2)), "cost_s": cost}
-    found |= {"cheapest": cheapest, "cheapest_s": least[cheapest], "ratio": cost / least[cheapest]}
-    found |= {"sure_ratio": cost / sure}
-    found |= {"keeps": error2 - 2 * error2_error <= scene.tolerance**2, "auto": automatic}
+    results |= {"way": option.way, "spp": option.spp, "error": math.sqrt(error2)}
+    results |= {"error_standard_error": error2_error / (2 * math.sqrt(error2)), "cost_s": cost}
+    results |= {"cheapest": cheapest, "cheapest_s": least[cheapest], "ratio": cost / least[cheapest]}
+    results |= {"sure_ratio": cost / sure}
+    results |= {"keeps": error2 - 2 * error2_error <= scene.tolerance**2, "auto": automatic}
     return (
-        found
+        results
         | {f"{name}_s": least.get(name, math.inf) for name in (PATH_TRACED, "neural", "better_dipole")}
         | {"auto_s": least.get(automatic, math.inf)}
     )
@@ -93,12 +93,12 @@ def _least(row: WayTrade, scene: RandomScene, pixels: float) -> float:
 def z_values(record: dict[str, Any]) -> list[tuple[str, float]]:
     """(bias² of the assessment - that of the long run) over their standard errors together, for each way."""
     quick, long = (Assessment.of(record[key]) for key in ("quick", "long"))
-    found = []
+    results = []
     for a in quick.objects[0].ways:
         if a.refusal or a.way == PATH_TRACED:
             continue
         b = long.objects[0].way(a.way)
         error = math.hypot(a.bias2_error, b.bias2_error)
         if error > 0:
-            found.append((a.way, (a.bias2 - b.bias2) / error))
-    return found
+            results.append((a.way, (a.bias2 - b.bias2) / error))
+    return results

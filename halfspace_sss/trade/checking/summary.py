@@ -34,18 +34,18 @@ def summary(records: Sequence[dict[str, Any]]) -> dict[str, Any]:
     table = outcomes(records)
     z = np.array([value for record in records for _, value in z_values(record)])
     cheap = table["ratio"] <= DEAR
-    found: dict[str, Any] = {"scenes": len(table), "kept": int(table["keeps"].sum()), "cheap": int(cheap.sum())}
-    found |= {"kept_and_cheap": int((table["keeps"] & cheap).sum())}
-    found |= {"surely_cheap": int((table["sure_ratio"] <= DEAR).sum())}
-    found["not_kept"] = [int(n) for n in table.loc[~table["keeps"], "number"]]
-    found["dear"] = [int(n) for n in table.loc[~cheap, "number"]]
-    found["assess_s"] = float(table["seconds"].max())
-    found["z"] = {"count": len(z), "mean": float(z.mean()), "sd": float(z.std(ddof=1)) if len(z) > 1 else math.nan}
-    found["z"] |= {"beyond_2": float(np.mean(np.abs(z) > 2)), "beyond_3": float(np.mean(np.abs(z) > 3))}
-    found["recommended"] = {str(k): int(v) for k, v in table["way"].value_counts().items()}
-    found["always"] = {name: _always(table, name) for name in ALWAYS}
-    found["recommended_s"], found["cheapest_s"] = float(table["cost_s"].sum()), float(table["cheapest_s"].sum())
-    return found
+    results: dict[str, Any] = {"scenes": len(table), "kept": int(table["keeps"].sum()), "cheap": int(cheap.sum())}
+    results |= {"kept_and_cheap": int((table["keeps"] & cheap).sum())}
+    results |= {"surely_cheap": int((table["sure_ratio"] <= DEAR).sum())}
+    results["not_kept"] = [int(n) for n in table.loc[~table["keeps"], "number"]]
+    results["dear"] = [int(n) for n in table.loc[~cheap, "number"]]
+    results["assess_s"] = float(table["seconds"].max())
+    results["z"] = {"count": len(z), "mean": float(z.mean()), "sd": float(z.std(ddof=1)) if len(z) > 1 else math.nan}
+    results["z"] |= {"beyond_2": float(np.mean(np.abs(z) > 2)), "beyond_3": float(np.mean(np.abs(z) > 3))}
+    results["recommended"] = {str(k): int(v) for k, v in table["way"].value_counts().items()}
+    results["always"] = {name: _always(table, name) for name in ALWAYS}
+    results["recommended_s"], results["cheapest_s"] = float(table["cost_s"].sum()), float(table["cheapest_s"].sum())
+    return results
 
 
 def _always(table: pandas.DataFrame, name: str) -> dict[str, Any]:
@@ -72,35 +72,35 @@ scene.
 """
 
 
-def markdown(found: dict[str, Any], table: pandas.DataFrame, how: dict[str, Any]) -> str:
+def markdown(values: dict[str, Any], table: pandas.DataFrame, how: dict[str, Any]) -> str:
     """The page: the summary and the misses.
 
     Args:
-        found: of `summary`.
+        values: of `summary`.
         table: of `outcomes`.
         how: scenes, first, seed, assess, truth: what was asked.
     """
-    n, z = found["scenes"], found["z"]
+    n, z = values["scenes"], values["z"]
     arguments = " ".join(
         f"--{key} {how[key]}" for key in ("scenes", "first", "seed", "tolerance") if how[key] is not None
     )
     lines = [
         INTRODUCTION.format(arguments=f"`{arguments}`", ways=len(WAYS), **{k: how[k] for k in ("assess", "truth")}),
-        f"{found['kept']} of {n} recommendations keep their tolerance (within two standard errors of the long run), "
-        f"{found['cheap']} cost at most {DEAR:g} times the cheapest way that does by the long run, "
-        f"{found['surely_cheap']} of the cheapest that does by two of its standard errors; an assessment took at most "
-        f"{found['assess_s']:.2g} s of two cores, compilation left out.",
+        f"{values['kept']} of {n} recommendations keep their tolerance (within two standard errors of the long run), "
+        f"{values['cheap']} cost at most {DEAR:g} times the cheapest way that does by the long run, "
+        f"{values['surely_cheap']} of the cheapest that does by two of its standard errors; an assessment took at most "
+        f"{values['assess_s']:.2g} s of two cores, compilation left out.",
         "",
         f"(bias² of the assessment - bias² of the long run) over their standard errors, {z['count']} pairs: mean "
         f"{z['mean']:+.2f}, standard deviation {z['sd']:.2f}, {100 * z['beyond_2']:.1f} % beyond 2, "
         f"{100 * z['beyond_3']:.1f} % beyond 3.",
         "",
-        f"Recommended: {', '.join(f'{name} {count}' for name, count in found['recommended'].items())}.",
+        f"Recommended: {', '.join(f'{name} {count}' for name, count in values['recommended'].items())}.",
         "",
         "| always | keeps the tolerance in | its time there, s | recommended there, s | median of ratios |",
         "|---|---:|---:|---:|---:|",
     ]
-    for name, row in found["always"].items():
+    for name, row in values["always"].items():
         numbers = [f"{row[key]:.3g}" if key in row else "–" for key in ("seconds", "recommended_s", "median_ratio")]
         lines.append(f"| {name} | {row['keeps']} of {n} | {' | '.join(numbers)} |")
     misses = table[~table["keeps"] | (table["ratio"] > DEAR)]

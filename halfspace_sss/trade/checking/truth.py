@@ -36,10 +36,10 @@ def long_run(on: Stage, ways: Sequence[Way], tolerance: float, path: Path, seed:
         if how.items() <= kept.items():
             batches = kept["batches"]
     while True:
-        found = mean_of([Assessment.of(b) for b in batches]) if batches else None
-        names = _open(found.objects[0], tolerance) if found else [way.name for way in ways]
-        if found and (not names or len(batches) * BATCH >= seconds):
-            return found
+        result = mean_of([Assessment.of(b) for b in batches]) if batches else None
+        names = _open(result.objects[0], tolerance) if result else [way.name for way in ways]
+        if result and (not names or len(batches) * BATCH >= seconds):
+            return result
         few = [way for way in ways if way.name in names or way.model == PATH_TRACED]
         traced = LATER if batches else FIRST
         batch = assess_stage(on, few, seconds=min(BATCH, seconds), seed=seeded(seed, len(batches)), traced=traced)
@@ -47,11 +47,11 @@ def long_run(on: Stage, ways: Sequence[Way], tolerance: float, path: Path, seed:
         write_atomically(path, json.dumps({**how, "batches": batches, "provenance": provenance(**how)}) + "\n")
 
 
-def _open(found: ObjectTrade, tolerance: float) -> list[str]:
+def _open(assessed: ObjectTrade, tolerance: float) -> list[str]:
     """Ways that may keep the tolerance and are not known well enough."""
-    if found.is_dark:
+    if assessed.is_dark:
         return []
-    rows = [row for row in found.ways if not row.refusal and row.bias2 - CERTAIN * row.bias2_error < tolerance**2]
+    rows = [row for row in assessed.ways if not row.refusal and row.bias2 - CERTAIN * row.bias2_error < tolerance**2]
     return [r.way for r in rows if r.bias2_error > CLOSE * tolerance**2 or r.variance_error > STEADY * r.variance]
 
 

@@ -52,10 +52,10 @@ def check_command(
         for k in numbers:
             records.append(check_scene(random_scene(k, seed, tolerance), out, assess, truth))
             bar.show(len(records), scenes, f"scene {k}")
-    table, found = outcomes(records), summary(records)
+    table, result = outcomes(records), summary(records)
     how = {"scenes": scenes, "first": first, "seed": seed, "tolerance": tolerance, "assess": assess, "truth": truth}
-    text = markdown(found, table, how)
-    about = {"provenance": provenance(**how), **found}
+    text = markdown(result, table, how)
+    about = {"provenance": provenance(**how), **result}
     write_together(
         {
             out / "check.csv": table.to_csv(index=False, lineterminator="\n"),
