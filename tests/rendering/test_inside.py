@@ -122,6 +122,20 @@ def test_walks_agree_with_the_volume_path_tracer_of_mitsuba(kind: str) -> None:
     _agree(_means(mi.load_dict(scene), 256, 1), _means(_theirs(scene, holders), 256, 1001))
 
 
+def test_an_even_sky_stays_even_over_objects_nested_four_deep_that_absorb_nothing() -> None:
+    def clear(sigma_s: str, eta: float) -> dict:
+        return {"type": "translucent", "sigma_s": sigma_s, "sigma_a": "0,0,0", "g": 0.2, "eta": eta}
+
+    inside = {
+        "a": _ball(0.7, bsdf=clear("2,1,3", 1.2)), "b": _ball(0.4, bsdf=clear("5,2,1", 0.8)),
+        "c": _ball(0.2, bsdf=clear("1,9,1", 1.3)),
+        "stone": _ball(0.1, bsdf={"type": "diffuse", "reflectance": 1.0}),
+    }  # fmt: skip
+    means = _means(mi.load_dict(_scene(inside, SKY, clear("1,2,3", 1.4))), 64, 1)
+    error = means.std(axis=0, ddof=1) / np.sqrt(RUNS)
+    assert (np.abs(means.mean(axis=0) - 1) < WIDEST_Z * error).all() and (error < LARGEST_ERROR).all()
+
+
 LED = {"type": "area", "radiance": {"type": "rgb", "value": [30.0, 20.0, 10.0]}}
 PLACE = (0.2, 0.1, 0.3)
 
