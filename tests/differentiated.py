@@ -127,9 +127,9 @@ class Shifted:
         return [model.eval(*query) for model in self.models]
 
     def coefficients(self, media: list) -> list:
-        from halfspace_sss.rendering.object.points import number
+        from halfspace_sss.rendering.object.points import opaque
 
-        return [tuple(number(v) for v in (m.sigma_s, m.sigma_t, m.g)) for m in self.media]
+        return [tuple(opaque(v) for v in (m.sigma_s, m.sigma_t, m.g)) for m in self.media]
 
 
 def _varied(body, variation):

@@ -29,7 +29,7 @@ from full_geometry.object.patches import Patches, PatchSampler, PatchWeights, cl
 from halfspace_sss.neural.perceptron import Perceptron
 from halfspace_sss.neural.training.fit import Objective, fit
 from halfspace_sss.rendering.object.body import TranslucentObject
-from halfspace_sss.rendering.object.points import SurfacePoint, number
+from halfspace_sss.rendering.object.points import SurfacePoint, opaque
 
 CLEAR = 1e-4  # of the size of the object: where the ray that finds a face begins
 
@@ -62,7 +62,7 @@ class AlphaP:
 
     def _face(self, at: SurfacePoint, active: Any) -> tuple[Any, Any]:
         """The face that a point lies on, as a short ray from outside meets it, and where there is one."""
-        clear = number(CLEAR * self.object.geometry.size)
+        clear = opaque(CLEAR * self.object.geometry.size)
         ray = mi.Ray3f(mi.Point3f(at.p + at.n * clear), mi.Vector3f(-at.n))
         ray.maxt = 2 * clear
         hit = self.object.geometry.scene.ray_intersect_preliminary(ray, False, active=mi.Bool(active))

@@ -16,7 +16,7 @@ from full_geometry.object.features import ObjectFrame, PreparedExit, Side
 from full_geometry.object.patches import Patches, PatchSampler, PatchTable, PatchWeights, mesh_faces
 from halfspace_sss.neural.perceptron import Perceptron, relu
 from halfspace_sss.rendering.object.body import TranslucentObject
-from halfspace_sss.rendering.object.points import CosineProposals, EntrySample, Point, SurfacePoint, number, turned
+from halfspace_sss.rendering.object.points import CosineProposals, EntrySample, Point, SurfacePoint, opaque, turned
 
 # ---- The square [0, 1)² laid onto each patch of a surface, so that equal areas stay equal ----------
 # A patch has two axes, the principal ones of its faces. Along the first its faces are put together to strips; u_1
@@ -431,9 +431,9 @@ class FlowProposals(CosineProposals):
         u = sampler.next_1d(), tuple(sampler.next_2d())
         weights = prepared.weights if self.table is None else self.table.weights(prim_index)
         at, density = self.sampler.sample(prepared.side, weights, *u)
-        n_out = turned(at.n_shading, at.n) * number(self.sign)
+        n_out = turned(at.n_shading, at.n) * opaque(self.sign)
         weight = dr.select(active & (density > 0), 1 / density, 0)
-        n = mi.Normal3f(at.n * number(self.sign))
+        n = mi.Normal3f(at.n * opaque(self.sign))
         return EntrySample(mi.Point3f(at.p), n, mi.Normal3f(n_out), weight, mi.UInt32(at.prim_index))
 
 

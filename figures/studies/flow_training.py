@@ -33,7 +33,7 @@ from full_geometry.object.patches import Patches, PatchSampler
 from halfspace_sss.checks import check_count
 from halfspace_sss.neural.training.fit import CpuSchedule, Objective, Source, fit
 from halfspace_sss.rendering.object.body import TranslucentObject
-from halfspace_sss.rendering.object.points import EntrySample, cosine_above, number, place
+from halfspace_sss.rendering.object.points import EntrySample, cosine_above, opaque, place
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 # ---- Training of conditional flows by zuko: -E[T log p(x | context)] over walks --------------------
@@ -121,7 +121,7 @@ def lighting(name: str, obj: TranslucentObject) -> Lighting:
     if name not in LIGHTINGS:
         raise ValueError(f"lighting must be one of {', '.join(LIGHTINGS)}, got {name!r}")
     towards = mi.Vector3f(*TOWARDS.tolist())
-    place_of_light = mi.Point3f(*map(number, _above(obj)))
+    place_of_light = mi.Point3f(*map(opaque, _above(obj)))
 
     def sky(entry: Any, u: Any) -> tuple:
         w, density = cosine_above(entry.n_out, entry.n, u)

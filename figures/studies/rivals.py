@@ -36,7 +36,7 @@ from halfspace_sss.rendering.object.points import (
     SurfacePoint,
     cosine_above,
     lifted,
-    number,
+    opaque,
     turned,
 )
 from halfspace_sss.tracing.walk import generator, pass_seed
@@ -194,7 +194,7 @@ def _exits(obj: TranslucentObject, n: int, repeated: int, seed: int) -> _Exits:
     """n random exits, `repeated` neighbouring lanes for each."""
     rng = Numbers(generator(mi, n, pass_seed(seed, 31)))
     at = obj.points.sample(rng.next_1d(), rng.next_2d(), True)
-    sign = number(obj.geometry.sign)
+    sign = opaque(obj.geometry.sign)
     n_out = mi.Normal3f(turned(at.n_shading, at.n) * sign)
     n_face = mi.Normal3f(at.n * sign)
     w, _ = cosine_above(n_out, n_face, rng.next_2d())

@@ -19,7 +19,7 @@ from halfspace_sss.neural.features import medium_features
 from halfspace_sss.physics.backbone import length_scale
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.object.body import TranslucentObject
-from halfspace_sss.rendering.object.points import SurfacePoint, number, refract_in
+from halfspace_sss.rendering.object.points import SurfacePoint, opaque, refract_in
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 # ----------------------------------------------------------------------------------------------------
@@ -152,10 +152,10 @@ def on_a_plane(n_o: Any, inner_o: Any, n_i: Any, inner_i: Any, line: Segment) ->
 
 def phases(g: float, d_o: Any, d_i: Any, d: Any) -> Any:
     """Both phase functions of light that goes along d from one end to the other, times (4 pi)²."""
-    a, b = number(1 + g * g), number(2 * g)
+    a, b = opaque(1 + g * g), opaque(2 * g)
     c_o, c_i = dr.dot(d_o, d), -dr.dot(d_i, d)
     base = dr.maximum(a - b * c_o, LEAST_PHASE) * dr.maximum(a - b * c_i, LEAST_PHASE)
-    return number((1 - g * g) ** 2) / (base * dr.sqrt(base))
+    return opaque((1 - g * g) ** 2) / (base * dr.sqrt(base))
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -218,7 +218,7 @@ def _from(
     """Surroundings of the points y below the points of a surface, for sigma_t and sigma_t'."""
     tables = [mi.Float(row.astype(np.float32)) for row in directions()]
     sigma_t, sigma_t_prime = extinctions
-    decays = [number(v) for v in (sigma_t, *(sigma_t_prime / length for length in LENGTHS))]
+    decays = [opaque(v) for v in (sigma_t, *(sigma_t_prime / length for length in LENGTHS))]
     n, (t, b) = at.n_out, _tangents(at)
     depth = dr.maximum(dr.dot(at.p - y, n), 0)
 
@@ -337,7 +337,7 @@ def _channel(
     shares: Sequence[Any],
 ) -> Pair:
     m = obj.media[c]
-    s, t, g = number(float(m.sigma_t_prime)), number(float(m.sigma_t)), float(m.g)
+    s, t, g = opaque(float(m.sigma_t_prime)), opaque(float(m.sigma_t)), float(m.g)
     gap = Segment.between(exit.event.ys[c], entry.event.ys[c])
     own_o, own_i = _own(c, t, exit, entry, line, gap), _own(c, t, entry, exit, line.back, gap.back)
     r = line.length * s
@@ -360,7 +360,7 @@ def _onward(g: float, exit: End, entry: End) -> Any:
     """0.3 log of a phase function of g², of light that two events turn from one end into the other."""
     g = min(g * abs(g), MOST_G)
     c = -dr.dot(exit.inner, entry.inner)
-    return 0.3 * dr.log(number(1 - g * g) / (number(1 + g * g) - number(2 * g) * c))
+    return 0.3 * dr.log(opaque(1 - g * g) / (opaque(1 + g * g) - opaque(2 * g) * c))
 
 
 def _own(c: int, sigma_t: Any, here: End, there: End, line: Segment, gap: Segment) -> list[Any]:

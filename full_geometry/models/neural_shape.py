@@ -44,7 +44,7 @@ from halfspace_sss.neural.perceptron import Perceptron
 from halfspace_sss.neural.store import checksum_of, load_weights
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.object.body import TranslucentObject
-from halfspace_sss.rendering.object.points import SurfacePoint, number, refract_in
+from halfspace_sss.rendering.object.points import SurfacePoint, opaque, refract_in
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 # ---- What the network of all shapes is trained on, and warns outside of ----------------------------
@@ -84,7 +84,7 @@ class Backbone(HalfSpace):
 
     def added(self, exit: Side, entry: Side) -> list[Any]:
         """Per channel the floor, what is mixed and what is scattered twice, over F_t(w_o) P_o F_t(w_i) P_i."""
-        everywhere = [number(floor + mixture.M) for floor, mixture in zip(self.floors, self.mixtures)]
+        everywhere = [opaque(floor + mixture.M) for floor, mixture in zip(self.floors, self.mixtures)]
         return [G + S for G, S in zip(everywhere, self.twice(exit, entry))]
 
     def shares(self, S_0: Any, exit: Side, entry: Side) -> list[tuple[Any, Any]]:
@@ -95,7 +95,7 @@ class Backbone(HalfSpace):
             over = dr.select(
                 S_0[c] > LEAST_S, F_t * exit.event.P[c] * entry.event.P[c] / dr.maximum(S_0[c], LEAST_S), 0
             )
-            parts.append((number(mixture.M) * over, twice * over))
+            parts.append((opaque(mixture.M) * over, twice * over))
         return parts
 
     def twice(self, exit: Side, entry: Side) -> Any:
@@ -106,19 +106,19 @@ class Backbone(HalfSpace):
         d_o, d_i = on_a_plane(exit.at.n_out, o, entry.at.n_out, i, line)
         channels = []
         for c, (m, mixture) in enumerate(zip(self.object.media, self.mixtures)):
-            t = number(max(float(m.sigma_t), 1e-20))
+            t = opaque(max(float(m.sigma_t), 1e-20))
             ys = exit.event.ys[c], entry.event.ys[c]
             spread = dr.square(exit.event.lengths[c]) + dr.square(entry.event.lengths[c])
             flat = Segment.between(d_o / t, mi.Vector3f(line.length, 0, 0) + d_i / t)
             here = _twice(m, o, i, Segment.between(*ys), spread)
             plane = _twice(m, d_o, d_i, flat, 2 / dr.square(t))
-            channels.append(number(mixture.m_2) * dr.maximum(here - plane, 0))
+            channels.append(opaque(mixture.m_2) * dr.maximum(here - plane, 0))
         return mi.Spectrum(channels)
 
 
 def _twice(m: Medium, d_o: Any, d_i: Any, line: Segment, spread: Any) -> Any:
     """Both phase functions and the attenuation along a line over its squared length, times (4 pi)²."""
-    t = number(float(m.sigma_t))
+    t = opaque(float(m.sigma_t))
     apart = dr.square(line.length) + spread / 12 + LEAST_LENGTH2 / dr.square(dr.maximum(t, 1e-20))
     return phases(min(max(float(m.g), -MOST_G), MOST_G), d_o, d_i, line.d) * dr.exp(-t * line.length) / apart
 
@@ -172,11 +172,11 @@ class NeuralShape:
 
     @functools.cached_property
     def _media(self) -> list[list[Any]]:
-        return [[number(v) for v in numbers] for numbers in self.media]
+        return [[opaque(v) for v in numbers] for numbers in self.media]
 
     @functools.cached_property
     def _scale(self) -> Any:
-        return mi.Spectrum([number(s) for s in self.scales or [1.0] * len(self.media)])
+        return mi.Spectrum([opaque(s) for s in self.scales or [1.0] * len(self.media)])
 
     @property
     def models(self) -> list[BSSRDF]:

@@ -33,7 +33,7 @@ from halfspace_sss.interface.model import BSSRDF, bssrdf
 from halfspace_sss.neural.perceptron import Perceptron
 from halfspace_sss.physics import fresnel
 from halfspace_sss.rendering.object.body import TranslucentObject
-from halfspace_sss.rendering.object.points import SurfacePoint, number, plane_query
+from halfspace_sss.rendering.object.points import SurfacePoint, opaque, plane_query
 
 FLOOR = 1e-2  # reflectance of the floor, over that of the half-space
 
@@ -75,7 +75,7 @@ class HalfSpace:
 
     def added(self, exit: Side, entry: Side) -> list[Any]:
         """Per channel what stands beside the plane, over F_t(w_o) P_o F_t(w_i) P_i."""
-        return [number(floor) for floor in self.floors]
+        return [opaque(floor) for floor in self.floors]
 
     def query(self, o: SurfacePoint, i: SurfacePoint) -> tuple[tuple, Any, Any]:
         """The query of the models, both Fresnel transmittances, and whether both directions are above the horizons."""
@@ -132,7 +132,7 @@ class DirectionalAlbedo:
         columns = side_features(self.frame, Side(at, first_event(self.object, at, active)))
         media = self.object.media
         x, n = self._networks[1](self.units(columns)), len(media)
-        live = mi.Spectrum([number(float(m.sigma_s) > 0) for m in media])
+        live = mi.Spectrum([opaque(float(m.sigma_s) > 0) for m in media])
         enters, most = (mi.Spectrum(v) for v in entering(columns, self.object.eta, n))
         once, more = (live * most / (1 + dr.exp(-mi.Spectrum(part))) for part in (x[:n], x[n:]))
         return tuple(dr.select(active, part, 0) for part in (enters - most, once, more))
@@ -140,7 +140,7 @@ class DirectionalAlbedo:
     @property
     def known(self) -> tuple[Any, Any]:
         """See `rendering.object.points.ObjectAlbedo`."""
-        return tuple(mi.Spectrum([number(float(v)) for v in row]) for row in self.trusted)
+        return tuple(mi.Spectrum([opaque(float(v)) for v in row]) for row in self.trusted)
 
     def __call__(self, at: SurfacePoint, active: Any = True) -> tuple[Any, Any]:
         """Orders zero and one, and alpha, per channel; 0 where they may not stand for even light."""

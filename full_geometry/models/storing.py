@@ -24,7 +24,7 @@ from halfspace_sss.interface.model import bssrdf
 from halfspace_sss.neural.store import load_weights, save_weights, weights_folder
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.object.body import TranslucentObject
-from halfspace_sss.rendering.object.points import number
+from halfspace_sss.rendering.object.points import opaque
 from halfspace_sss.rendering.object.shape import name_of
 from halfspace_sss.rendering.object.translucent import Inside
 from halfspace_sss.rendering.object.varying import grid_values
@@ -164,16 +164,16 @@ def _contents(obj: TranslucentObject, anchors: np.ndarray) -> tuple[str, list[np
         obj: the object.
         anchors: its own; of those that are alike inside, the nearest to the first of them comes first.
     """
-    contents, found = obj.geometry.contents, []
+    contents, results = obj.geometry.contents, []
     if contents is None:
         return "", []
     for shape, inside in zip(contents.shapes, contents.insides):
         topology, x = _anchored(shape)
         words = f"{shape.class_name()} {topology} {_surface(shape, inside, float(obj.media[0].sigma_t))}"
-        found.append((words, float(np.linalg.norm(x - anchors[0], axis=1).sum()), x))
-    found.sort(key=lambda each: each[:2])
-    digest = hashlib.sha256("|".join(words for words, _, _ in found).encode()).hexdigest()[:16]
-    return digest, [x for _, _, x in found]
+        results.append((words, float(np.linalg.norm(x - anchors[0], axis=1).sum()), x))
+    results.sort(key=lambda each: each[:2])
+    digest = hashlib.sha256("|".join(words for words, _, _ in results).encode()).hexdigest()[:16]
+    return digest, [x for _, _, x in results]
 
 
 def _surface(shape: mi.Shape, inside: Inside | None, sigma_t: float) -> str:
@@ -262,9 +262,9 @@ def frame_of(obj: TranslucentObject, trained: Identity | None = None, turns: np.
     radius = 0.5 * float(np.linalg.norm(high - low))
     each = [float(m.sigma_t) for m in obj.media]
     sigma_t = float(np.exp(np.mean(np.log(each))))
-    turn = None if np.allclose(R, np.eye(3), atol=1e-6) else [mi.Vector3f(*map(number, row)) for row in R.T]
+    turn = None if np.allclose(R, np.eye(3), atol=1e-6) else [mi.Vector3f(*map(opaque, row)) for row in R.T]
     frame = ObjectFrame(
-        mi.Point3f(*map(number, centre)), number(radius), number(sigma_t), tuple(map(number, each)), turn
+        mi.Point3f(*map(opaque, centre)), opaque(radius), opaque(sigma_t), tuple(map(opaque, each)), turn
     )
     return replace(frame, around=surroundings(obj, frame, turns))
 

@@ -35,7 +35,7 @@ from halfspace_sss.rendering.object.points import (
     channel_mean,
     lifted,
     mirrored,
-    number,
+    opaque,
     refract_in,
     turned,
 )
@@ -129,7 +129,7 @@ def local(obj: TranslucentObject, p: mi.Point3f) -> tuple[mi.Float, ...]:
 
 def first_event(obj: TranslucentObject, at: SurfacePoint, active: Any = True) -> FirstEvent:
     """Of light that goes in or out along w at a point of the surface."""
-    sigma_t, eta, sign = obj.sigma_t, obj.eta, number(obj.geometry.sign)
+    sigma_t, eta, sign = obj.sigma_t, obj.eta, opaque(obj.geometry.sign)
     media, contents = walk_media(obj), obj.geometry.contents
     d, _, valid = refract_in(at, eta)
     flags = mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame
@@ -223,7 +223,7 @@ def surroundings(obj: TranslucentObject, frame: Any, turns: np.ndarray | None = 
     cell = max(CELL * path, longest / MOST)
     cells = np.maximum(np.ceil((high - low) / cell).astype(int), 2)
     values = _fields(insides(obj, frame, low, cell, cells), max(path / cell, 1.0))
-    places = mi.Point3f(*map(number, low)), mi.Vector3f(*map(number, 1 / (cell * cells)))
+    places = mi.Point3f(*map(opaque, low)), mi.Vector3f(*map(opaque, 1 / (cell * cells)))
 
     def turned(turns: np.ndarray) -> Surroundings:
         every = (values @ turn[:, :-1].T + turn[:, -1] for turn in turns.astype(np.float32))
@@ -251,12 +251,12 @@ def insides(obj: TranslucentObject, frame: Any, low: np.ndarray, cell: float, ce
     nx, ny, _ = (int(n) for n in cells)
     k = dr.arange(mi.UInt32, int(np.prod(cells)))
     index = (k % nx, (k // nx) % ny, k // (nx * ny))
-    q = [number(a) + number(cell) * (mi.Float(i) + 0.5) for a, i in zip(low, index)]
+    q = [opaque(a) + opaque(cell) * (mi.Float(i) + 0.5) for a, i in zip(low, index)]
     votes = mi.UInt32(0)
     for ray in RAYS:
         p, d = frame.back(mi.Vector3f(*q), dr.normalize(mi.Vector3f(*ray)))
         si = obj.geometry.scene.ray_intersect(mi.Ray3f(p, d))
-        votes += dr.select(si.is_valid() & (dr.dot(d, si.n) * number(obj.geometry.sign) > 0), mi.UInt32(1), 0)
+        votes += dr.select(si.is_valid() & (dr.dot(d, si.n) * opaque(obj.geometry.sign) > 0), mi.UInt32(1), 0)
     return (votes >= 2).numpy().astype(np.float32).reshape(cells[::-1])
 
 

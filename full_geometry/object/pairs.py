@@ -35,7 +35,7 @@ from halfspace_sss.rendering.object.points import (
     SurfacePoint,
     channel_mean,
     cosine_direction,
-    number,
+    opaque,
 )
 from halfspace_sss.rendering.walk.media import media_within
 from halfspace_sss.rendering.walk.random_walk import WalkExits, exits
@@ -165,7 +165,7 @@ class EntryProposals:
             table: of weights of patches, which are asked of the network otherwise.
             k: of each exit, its number in the table.
         """
-        out = exit._replace(sign=number(self.object.geometry.sign))
+        out = exit._replace(sign=opaque(self.object.geometry.sign))
         known = (out, mi.UInt32(k))
         if self.patches is None:
             entry = self.positions.sample(*known, Numbers(rng), mi.Bool(True))
@@ -201,7 +201,7 @@ class PairSource:
     def scaled(self, scale: np.ndarray) -> PairSource:
         """The same with the scale of a fit, so that its mean over channels that have any light is 1."""
         live = max(np.count_nonzero(scale), 1)
-        return replace(self, scale=mi.Spectrum([number(v * len(scale) / live) for v in scale.tolist()]))
+        return replace(self, scale=mi.Spectrum([opaque(v * len(scale) / live) for v in scale.tolist()]))
 
     def walks(self, n: int, seed: tuple[int, ...]) -> Pairs:
         """n walks of random exits; of those that left at an order that counts some, see `ended`."""

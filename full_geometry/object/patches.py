@@ -30,7 +30,7 @@ from halfspace_sss.rendering.object.points import (
     PositionSampler,
     SurfacePoint,
     cosine_direction,
-    number,
+    opaque,
     surface_point,
     turned,
 )
@@ -334,11 +334,11 @@ class LearntProposals(CosineProposals):
     def sample(
         self, out: SurfacePoint, prim_index: Any, prepared: _PatchesOfExit, sampler: Any, active: Any
     ) -> EntrySample:
-        by_patch = active & (sampler.next_1d() < number(self.patch_share))
+        by_patch = active & (sampler.next_1d() < opaque(self.patch_share))
         weights = prepared.weights if self.table is None else self.table.weights(prim_index)
         at, _ = self.patches.sample(weights, sampler.next_1d(), sampler.next_1d(), sampler.next_2d())
-        n_out = turned(at.n_shading, at.n) * number(self.sign)
-        n = mi.Normal3f(at.n * number(self.sign))
+        n_out = turned(at.n_shading, at.n) * opaque(self.sign)
+        n = mi.Normal3f(at.n * opaque(self.sign))
         entry = EntrySample(mi.Point3f(at.p), n, mi.Normal3f(n_out), mi.Float(1), mi.UInt32(at.prim_index))
         if self.patch_share < 1:
             probed = self.positions.sample(out, prim_index, sampler, active & ~by_patch)
@@ -347,7 +347,7 @@ class LearntProposals(CosineProposals):
         if self.patch_share == 1:
             return entry._replace(weight=dr.select(by_patch, 1 / learnt, 0))
         near = self.positions.density(entry.p, entry.n, out, prepared.axes)
-        share = number(self.patch_share)
+        share = opaque(self.patch_share)
         # of a probe the weight is that of one hit among all, 1/density on average
         scale = dr.select(by_patch, 1, near) / (share * learnt + (1 - share) * near)
         return entry._replace(weight=dr.select(active, entry.weight * scale, 0))

@@ -1,6 +1,6 @@
 """The trade of speed for accuracy, measured: what each way of rendering a scene costs, and how wrong it is.
 
-found = trade.assess(scene)                                    # each way, on each translucent object
+assessment = trade.assess(scene)                               # each way, on each translucent object
 advice = trade.recommend(scene, tolerance=0.05, images=10)     # the cheapest way that is good enough
 """
 

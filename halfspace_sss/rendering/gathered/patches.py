@@ -85,14 +85,14 @@ class PatchTransfer:
         """Of an exit on a face."""
         mu = dr.dot(out.w, out.n_out)
         active = active & (mu > 0)
-        j, found = self.cells(out.p, out.n, face, active)
-        return TransferRow(j, dr.select(active & found, self.albedo(dr.maximum(mu, 0)), 0))
+        j, result = self.cells(out.p, out.n, face, active)
+        return TransferRow(j, dr.select(active & result, self.albedo(dr.maximum(mu, 0)), 0))
 
     def expected(self, row: TransferRow, entry: EntrySample, w_i: mi.Vector3f, active: mi.Bool) -> mi.Spectrum:
         """h, 1/((scene unit)² sr)."""
-        k, found = self.cells(entry.p, entry.n, entry.face, active)
+        k, result = self.cells(entry.p, entry.n, entry.face, active)
         at = row.j * dr.opaque(mi.UInt32, len(self.cells.points)) + k
-        T = dr.gather(mi.Spectrum, self._lanes, at, active & found)
+        T = dr.gather(mi.Spectrum, self._lanes, at, active & result)
         return row.a * T * self.albedo.cosine(w_i, entry.n, entry.n_out)
 
 
@@ -116,16 +116,16 @@ class SurfaceCells:
             return cls(points, None)
         face = dr.arange(mi.UInt32, n)
         at = AreaPoints(body.geometry.shape).on_face(face, mi.Point2f(*CENTROID))
-        k, found = points.nearest(mi.Point3f(at.p), mi.Normal3f(at.n) * body.geometry.side(face), mi.Bool(True))
-        dr.eval(k, found)
-        return cls(points, (found, k))
+        k, result = points.nearest(mi.Point3f(at.p), mi.Normal3f(at.n) * body.geometry.side(face), mi.Bool(True))
+        dr.eval(k, result)
+        return cls(points, (result, k))
 
     def __call__(self, p: mi.Point3f, n: mi.Normal3f, face: mi.UInt32, active: mi.Bool) -> tuple[mi.UInt32, mi.Bool]:
         """The cell of places with outward normals on faces, and whether there is one."""
         if self.of_face is None:
             return self.points.nearest(p, n, active)
-        found, k = self.of_face
-        return dr.gather(mi.UInt32, k, face, active), active & dr.gather(mi.Bool, found, face, active)
+        result, k = self.of_face
+        return dr.gather(mi.UInt32, k, face, active), active & dr.gather(mi.Bool, result, face, active)
 
 
 def patch_transfer(body: TranslucentObject, count: int | None = None, samples: int = SAMPLES) -> PatchTransfer:
@@ -134,25 +134,25 @@ def patch_transfer(body: TranslucentObject, count: int | None = None, samples: i
     count = count or int(np.clip(body.geometry.area * (PER_LENGTH * sigma) ** 2, FEWEST, MOST))
     points = SurfacePoints.of(body.geometry, count)
     cells = SurfaceCells.of(body, points)
-    found = drawn(body, points, cells, max(samples // count, 16))
+    result = drawn(body, points, cells, max(samples // count, 16))
     areas, places = _areas(body, cells)
-    pair = (np.arange(count)[:, None] * count + found.near)[found.known]
-    across = _evaluated(body, points, places, found.albedo)
+    pair = (np.arange(count)[:, None] * count + result.near)[result.known]
+    across = _evaluated(body, points, places, result.albedo)
     n = np.bincount(pair, minlength=count**2).reshape(count, count)
-    T, moments = np.empty((count, count, found.S.shape[2]), dtype=np.float32), []
+    T, moments = np.empty((count, count, result.S.shape[2]), dtype=np.float32), []
     for c in range(T.shape[2]):
-        S, h = found.S[found.known, c], (found.a * found.h)[found.known, c]
+        S, h = result.S[result.known, c], (result.a * result.h)[result.known, c]
         both, square = (np.bincount(pair, x, count**2).reshape(count, count) for x in (S * h, h * h))
-        typical = found.a[:, :, c].mean(axis=1)[:, None] * areas  # h of a cell is drawn with its share of S
+        typical = result.a[:, :, c].mean(axis=1)[:, None] * areas  # h of a cell is drawn with its share of S
         held = HELD * np.where(n > 0, square / np.maximum(n, 1), typical**2)
         T[:, :, c] = (both + held * across[:, :, c]) / np.maximum(square + held, 1e-30)
-        expected = found.known * T[np.arange(count)[:, None], found.near, c] * found.a[:, :, c] * found.h[:, :, c]
-        S, S_j, h_j = found.S[:, :, c], found.S[:, :, c].mean(axis=1), expected.mean(axis=1)
+        expected = result.known * T[np.arange(count)[:, None], result.near, c] * result.a[:, :, c] * result.h[:, :, c]
+        S, S_j, h_j = result.S[:, :, c], result.S[:, :, c].mean(axis=1), expected.mean(axis=1)
         moments.append([(S * expected).mean(), (expected**2).mean(), (S_j * h_j).mean(), (h_j**2).mean()])
     flux = np.maximum(T.mean(axis=2) * areas, 0)
     flux /= np.maximum(flux.sum(axis=1, keepdims=True), 1e-30)
     seen = 1 / np.maximum((flux**2 / (areas / areas.sum())).sum(axis=1), 1.0)
-    return PatchTransfer(cells, T, found.albedo, float(np.median(seen)), np.array(moments, dtype=float).T)
+    return PatchTransfer(cells, T, result.albedo, float(np.median(seen)), np.array(moments, dtype=float).T)
 
 
 def _evaluated(body: TranslucentObject, points: SurfacePoints, places: EntrySample, albedo: Albedo) -> np.ndarray:
@@ -179,8 +179,8 @@ def _evaluated(body: TranslucentObject, points: SurfacePoints, places: EntrySamp
         return k + 1, sampler
 
     dr.while_loop((mi.UInt32(0) + dr.zeros(mi.UInt32, count * n), sampler), lambda k, _: k < count, step, label="cells")
-    found = np.nan_to_num(np.array(values).reshape(count, count, n, size), nan=0.0, posinf=0.0)
-    return found.mean(axis=2)
+    result = np.nan_to_num(np.array(values).reshape(count, count, n, size), nan=0.0, posinf=0.0)
+    return result.mean(axis=2)
 
 
 def _areas(body: TranslucentObject, cells: SurfaceCells) -> tuple[np.ndarray, EntrySample]:

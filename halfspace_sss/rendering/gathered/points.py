@@ -23,7 +23,7 @@ from halfspace_sss.rendering.object.points import (
     SurfacePoint,
     cosine_above,
     lifted,
-    number,
+    opaque,
     turned,
 )
 from halfspace_sss.rendering.object.shape import Geometry
@@ -47,7 +47,7 @@ def uniform_entries(geometry: Geometry, u_face: mi.Float, u: mi.Point2f) -> Entr
     sign = geometry.side(face)
     n_out = mi.Normal3f(turned(mi.Normal3f(at.n_shading), mi.Normal3f(at.n))) * sign
     n = mi.Normal3f(at.n) * sign
-    return EntrySample(mi.Point3f(at.p), n, mi.Normal3f(n_out), number(geometry.area), face)
+    return EntrySample(mi.Point3f(at.p), n, mi.Normal3f(n_out), opaque(geometry.area), face)
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,12 +74,12 @@ class SurfacePoints:
     members: mi.UInt32
 
     @classmethod
-    def of(cls, found: Geometry, count: int) -> SurfacePoints:
+    def of(cls, geometry: Geometry, count: int) -> SurfacePoints:
         """`count` points of an object."""
         u = [mi.Float(((np.arange(1, count + 1) * r + 0.5) % 1.0).astype(np.float32)) for r in R_3]
-        p, n, n_out, _, face = uniform_entries(found, u[0], mi.Point2f(u[1], u[2]))
+        p, n, n_out, _, face = uniform_entries(geometry, u[0], mi.Point2f(u[1], u[2]))
         dr.eval(p, n, n_out, face)
-        h = REACH * float(np.sqrt(found.area / count))
+        h = REACH * float(np.sqrt(geometry.area / count))
         return cls(p, n, n_out, face, *_grid(np.array(p).T, h))
 
     def __len__(self) -> int:
@@ -105,23 +105,23 @@ class SurfacePoints:
     def smoothed(self, values: np.ndarray) -> np.ndarray:
         """Values (points, ...) blended at the points themselves."""
         rows = values.reshape(len(self), -1)
-        found = self.blend(mi.Float(rows.astype(np.float32).ravel()), rows.shape[1], self.p, self.n, mi.Bool(True))
-        return np.stack([np.array(v) for v in found], axis=1).reshape(values.shape)
+        result = self.blend(mi.Float(rows.astype(np.float32).ravel()), rows.shape[1], self.p, self.n, mi.Bool(True))
+        return np.stack([np.array(v) for v in result], axis=1).reshape(values.shape)
 
     def nearest(self, p: mi.Point3f, n: mi.Normal3f, active: mi.Bool) -> tuple[mi.UInt32, mi.Bool]:
         """The point of the largest weight at a place, and whether there is one."""
 
         def larger(j: mi.UInt32, w: mi.Float, best: tuple) -> tuple:
-            found = w > best[1]
-            return dr.select(found, j, best[0]), dr.select(found, w, best[1])
+            result = w > best[1]
+            return dr.select(result, j, best[0]), dr.select(result, w, best[1])
 
         _, (j, w) = self._near(p, n, active, (mi.UInt32(0), mi.Float(0)), larger)
         return j, w > 0
 
     def _near(self, p: mi.Point3f, n: mi.Normal3f, active: mi.Bool, state: object, visit: Callable) -> tuple:
         """The sum of weights, and the state after `visit(j, w_j, state)` for all points in reach."""
-        h = number(self.h)
-        cell = [mi.Int32(dr.floor((p[a] - number(self.low[a])) / h)) for a in range(3)]
+        h = opaque(self.h)
+        cell = [mi.Int32(dr.floor((p[a] - opaque(self.low[a])) / h)) for a in range(3)]
         counts = [dr.opaque(mi.Int32, int(c)) for c in self.cells]
         valid = active
         for index, count in zip(cell, counts):

@@ -24,7 +24,7 @@ import numpy as np
 
 from halfspace_sss.physics.fresnel import F_t
 from halfspace_sss.rendering.gathered.points import SurfacePoints
-from halfspace_sss.rendering.object.points import SurfacePoint, number
+from halfspace_sss.rendering.object.points import SurfacePoint, opaque
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -52,14 +52,14 @@ class Albedo:
     eta: float
 
     def __call__(self, mu: mi.Float) -> mi.Spectrum:
-        F = F_t(mu, number(self.eta))
-        rows = [[number(v) for v in row] for row in self.c]
+        F = F_t(mu, opaque(self.eta))
+        rows = [[opaque(v) for v in row] for row in self.c]
         return mi.Spectrum([F * dr.maximum(a + mu * (b + mu * c), 0) for a, b, c in rows])
 
     def cosine(self, w: mi.Vector3f, n: mi.Normal3f, n_out: mi.Normal3f) -> mi.Spectrum:
         """a(mu) mu / ∫ a(mu) mu dw of a direction above a surface of geometric normal n, mu the cosine to n_out."""
         mu = cosine(w, n, n_out)
-        return self(mu) * mu * mi.Spectrum([number(1 / v) for v in self.whole])
+        return self(mu) * mu * mi.Spectrum([opaque(1 / v) for v in self.whole])
 
     @cached_property
     def whole(self) -> np.ndarray:
@@ -142,11 +142,11 @@ def transfer(body: TranslucentObject, count: int | None = None, samples: int = S
     """The transfer of an object, by its model and the proposals of that."""
     points = SurfacePoints.of(body.geometry, count or count_of(body))
     each = max(samples // len(points), 16)
-    found = drawn(body, points, lambda p, n, _, active: points.nearest(p, n, active), each, seed)
-    t, error = _rows(points, found.S, _trusted(body), found.a)
-    near = np.where(found.known, found.near, np.arange(len(points))[:, None])
-    centred = _centred(found.w_o, found.a.mean(axis=2))
-    return Transfer(points, near, t, found.w_i, *centred, found.albedo, error)
+    result = drawn(body, points, lambda p, n, _, active: points.nearest(p, n, active), each, seed)
+    t, error = _rows(points, result.S, _trusted(body), result.a)
+    near = np.where(result.known, result.near, np.arange(len(points))[:, None])
+    centred = _centred(result.w_o, result.a.mean(axis=2))
+    return Transfer(points, near, t, result.w_i, *centred, result.albedo, error)
 
 
 class DrawnEntries(NamedTuple):

@@ -30,7 +30,7 @@ from halfspace_sss.rendering.object.points import (
     SurfacePoint,
     Transport,
     cosine_direction,
-    number,
+    opaque,
     surface_point,
     turned,
 )
@@ -77,7 +77,7 @@ class Content:
 
 def contents(scene: mi.Scene, objects: list[Geometry]) -> list[Content]:
     """What lies inside each closed object of a scene: of every shape a part that is deeper than `DEEP`, and lamps."""
-    found = []
+    results = []
     for shape in scene.shapes():
         alone = None
         for k, holder in enumerate(objects):
@@ -86,13 +86,13 @@ def contents(scene: mi.Scene, objects: list[Geometry]) -> list[Content]:
                 continue
             alone = alone or scene_of([shape], scene)
             if _deep(holder, _points_on(alone, shared)).any():
-                found.append(Content(shape, f"the shape {name_of(shape)}", k, _holds(holder, shape, alone)))
+                results.append(Content(shape, f"the shape {name_of(shape)}", k, _holds(holder, shape, alone)))
     for emitter in scene.emitters():
         place = _place(emitter)
         for k, holder in enumerate(objects):
             if place is not None and is_inside(holder, place[:, None]).all():
-                found.append(Content(emitter, f"the emitter {emitter.id()!r}", k, True))
-    return found
+                results.append(Content(emitter, f"the emitter {emitter.id()!r}", k, True))
+    return results
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,12 +112,12 @@ class Contents:
     surfaces: list[tuple[list, list]]
 
     @classmethod
-    def of(cls, found: list[Content], world: mi.Scene, mm_per_unit: float) -> Contents:
+    def of(cls, result: list[Content], world: mi.Scene, mm_per_unit: float) -> Contents:
         """Of shapes in the scene `world`."""
-        shapes = [content.thing for content in found]
+        shapes = [content.thing for content in result]
         below = [shape.bsdf().inside if is_translucent(shape.bsdf()) else None for shape in shapes]
         insides = [inside and replace(inside, medium=inside.medium.scaled(mm_per_unit)) for inside in below]
-        return cls(found, scene_of(shapes, world), insides, [state_of(shape.bsdf()) for shape in shapes])
+        return cls(result, scene_of(shapes, world), insides, [state_of(shape.bsdf()) for shape in shapes])
 
     @property
     def shapes(self) -> list[mi.Shape]:
@@ -153,22 +153,22 @@ def filled(scene: mi.Scene, objects: list[Geometry], mm_per_unit: float, what: s
     Raises:
         ValueError: names such a thing and the object.
     """
-    found = contents(scene, objects)
-    for content in found:
+    result = contents(scene, objects)
+    for content in result:
         if isinstance(content.thing, mi.Emitter) or content.thing.is_emitter() or not content.whole:
             refuse(content, objects[content.object], what)
-    held = [[content for content in found if content.object == k] for k in range(len(objects))]
+    held = [[content for content in result if content.object == k] for k in range(len(objects))]
     return [
         replace(obj, contents=Contents.of(inside, scene, mm_per_unit)) if inside else obj
         for obj, inside in zip(objects, held)
-        if not any(obj.shape is content.thing for content in found)
+        if not any(obj.shape is content.thing for content in result)
     ]
 
 
-def refuse(found: Content, holder: Geometry, what: str) -> None:
+def refuse(result: Content, holder: Geometry, what: str) -> None:
     """ValueError that names what lies inside an object, or partly inside, which `what` does not see."""
     raise ValueError(
-        f"objects must be empty for {what}, got {found.name} {'' if found.whole else 'partly '}inside "
+        f"objects must be empty for {what}, got {result.name} {'' if result.whole else 'partly '}inside "
         f"object {holder.name}: the integrator translucent_walk traces it"
     )
 
@@ -177,16 +177,16 @@ def outermost(scene: mi.Scene) -> list[mi.Shape]:
     """The translucent shapes of a scene that lie in no other."""
     shapes = [shape for shape in scene.shapes() if is_translucent(shape.bsdf())]
     holders = [a for a in shapes if any(a.bbox().contains(b.bbox()) for b in shapes if b is not a)]
-    found = contents(scene, [survey(shape) for shape in holders])
-    return [shape for shape in shapes if not any(shape is content.thing for content in found)]
+    result = contents(scene, [survey(shape) for shape in holders])
+    return [shape for shape in shapes if not any(shape is content.thing for content in result)]
 
 
 def places_of(scene: mi.Scene) -> tuple[list, list]:
     """What tells whether shapes or lamps of a scene have been moved; what is kept so that no number is reused."""
-    found = [geometry_of(shape) for shape in scene.shapes()]
+    results = [geometry_of(shape) for shape in scene.shapes()]
     lamps = [_place(emitter) for emitter in scene.emitters()]
     places = [None if place is None else place.tolist() for place in lamps]
-    return [*(key for key, _ in found), *places], [kept for _, kept in found]
+    return [*(key for key, _ in results), *places], [kept for _, kept in results]
 
 
 def _shared(shape: mi.Shape, holder: Geometry) -> Any:
@@ -284,20 +284,20 @@ def translucent_shapes(scene: mi.Scene) -> list[Any]:
 
 def _check_media(scene: mi.Scene) -> None:
     """ValueError if light would be scattered outside of the objects, or by a second medium in one."""
-    found = [
+    results = [
         (side, shape)
         for shape in scene.shapes()
         for side, medium in (("interior", shape.interior_medium()), ("exterior", shape.exterior_medium()))
         if medium is not None
     ]
-    for side, shape in found:
+    for side, shape in results:
         if is_translucent(shape.bsdf()):
             raise ValueError(
                 f"a translucent object must be without {side}, as its surface says what is inside, got the {side} "
                 f"of {shape.id()!r}"
             )
-    if found:
-        side, shape = found[0]
+    if results:
+        side, shape = results[0]
         raise ValueError(f"the scene must be without media of Mitsuba, such as fog, got the {side} of {shape.id()!r}")
     for place in (*scene.sensors(), *scene.emitters()):
         if place.get_medium() is not None:
@@ -311,9 +311,9 @@ def check_sensors(scene: mi.Scene, objects: list[Geometry]) -> None:
         ValueError: rays of a sensor begin inside an object, whose id is named.
     """
     for sensor in scene.sensors():
-        for found in objects:
-            if is_inside(found, _starts(sensor, found.size)).any():
-                raise ValueError(f"the camera must be outside of every object, got it inside {found.name}")
+        for each in objects:
+            if is_inside(each, _starts(sensor, each.size)).any():
+                raise ValueError(f"the camera must be outside of every object, got it inside {each.name}")
 
 
 def _starts(sensor: mi.Sensor, size: float) -> np.ndarray:
@@ -374,12 +374,12 @@ class TranslucentObject:
     @property
     def eta(self) -> mi.Float:
         """Relative index of the media, as data of kernels."""
-        return number(self.media[0].eta)
+        return opaque(self.media[0].eta)
 
     @functools.cached_property
     def sigma_t(self) -> mi.Spectrum:
         """Extinction of each channel, 1/(scene unit), as data of kernels: one kernel serves all media."""
-        return mi.Spectrum([number(m.sigma_t) for m in self.media])
+        return mi.Spectrum([opaque(m.sigma_t) for m in self.media])
 
     @functools.cached_property
     def points(self) -> AreaPoints:
@@ -436,8 +436,8 @@ class TranslucentObjects:
         current = bool(bodies) and same and all(body.is_current() for body in bodies)
         places = places_of(scene)
         if current and places[0] != self._places[0]:
-            found = [body.geometry for body in bodies]
-            current = not any(geometry.contents for geometry in found) and not contents(scene, found)
+            results = [body.geometry for body in bodies]
+            current = not any(geometry.contents for geometry in results) and not contents(scene, results)
         if not current:
             if not (bodies and same):
                 self.choices = _choices(scene, self.settings)
@@ -467,12 +467,12 @@ def make_objects(
     objects = [survey(shape, scene) for shape in shapes]
     check_sensors(scene, objects)
     outer = filled(scene, objects, settings.mm_per_unit, _MODELS)
-    check_together(scene, [part.scene for found in outer for part in (found, found.contents) if part is not None])
+    check_together(scene, [part.scene for each in outer for part in (each, each.contents) if part is not None])
     chosen = chosen or _choices(scene, settings)
     models = {id(shape): chosen.models.get(k) for k, shape in enumerate(shapes)}
-    named = [found for found in outer if found.shape.id() not in without]
-    insides = [_asked(found.shape, settings, models[id(found.shape)]) for found in named]
-    return [_make_object(found, equivalent(inside, found), settings) for found, inside in zip(named, insides)]
+    named = [each for each in outer if each.shape.id() not in without]
+    insides = [_asked(each.shape, settings, models[id(each.shape)]) for each in named]
+    return [_make_object(each, equivalent(inside, each), settings) for each, inside in zip(named, insides)]
 
 
 def _asked(shape: Any, settings: Settings, model: str | None = None) -> Inside:
@@ -490,15 +490,15 @@ def _choices(scene: Any, settings: Settings) -> Choices:
     return Choices({}, settings.light, {})
 
 
-def _make_object(found: Geometry, inside: Inside, settings: Settings) -> TranslucentObject:
+def _make_object(geometry: Geometry, inside: Inside, settings: Settings) -> TranslucentObject:
     media = tuple(m.scaled(settings.mm_per_unit) for m in inside.channels())
-    check_size(found, [float(m.sigma_t) for m in media], settings.mm_per_unit)
+    check_size(geometry, [float(m.sigma_t) for m in media], settings.mm_per_unit)
     varying = None if inside.varying is None else inside.varying.scaled(settings.mm_per_unit)
-    obj = TranslucentObject(found, media, varying)
+    obj = TranslucentObject(geometry, media, varying)
     single_only = inside.orders == "single" or not any(float(m.sigma_s) > 0 for m in media)
-    check_tints(found.name, obj.surface.boundary)
-    if found.contents is not None:
-        _check_takes(found, inside, single_only)
+    check_tints(geometry.name, obj.surface.boundary)
+    if geometry.contents is not None:
+        _check_takes(geometry, inside, single_only)
     variation = Variation(obj.surface, settings.mm_per_unit, inside.model)
     none = ObjectModel(None, None)
     transport, proposals, entries = none if single_only else _model_of(obj, inside, settings, variation)
@@ -512,13 +512,13 @@ def _make_object(found: Geometry, inside: Inside, settings: Settings) -> Translu
     )  # fmt: skip
 
 
-def _check_takes(found: Geometry, inside: Inside, single_only: bool) -> None:
+def _check_takes(geometry: Geometry, inside: Inside, single_only: bool) -> None:
     """ValueError if a model does not take what lies inside its object, or some orders only are asked for."""
     if single_only or not lookup(inside.model).takes_contents:
-        refuse(found.contents.found[0], found, f"the model {inside.model!r}")
+        refuse(geometry.contents.found[0], geometry, f"the model {inside.model!r}")
     if inside.orders != "total":
         raise ValueError(
-            f"orders must be 'total' of objects with something inside, got {inside.orders!r} of object {found.name}"
+            f"orders must be 'total' of objects with something inside, got {inside.orders!r} of object {geometry.name}"
         )
 
 
@@ -562,19 +562,19 @@ def millimetres(scene: mi.Scene) -> float:
     return 1.0
 
 
-def check_size(found: Geometry, sigma_t: Sequence[float], mm_per_unit: float) -> None:
+def check_size(geometry: Geometry, sigma_t: Sequence[float], mm_per_unit: float) -> None:
     """Warn of an object whose size in mean free paths speaks of another unit of length.
 
     Args:
-        found: the object.
+        geometry: the object.
         sigma_t: of each channel, 1/(scene unit).
         mm_per_unit: length of a scene unit, mm.
     """
-    thickness = [found.size * value for value in sigma_t]
+    thickness = [geometry.size * value for value in sigma_t]
     if min(thickness) < SMALL or max(thickness) > LARGE:
         warnings.warn(
-            f"object {found.name} is {min(thickness):.3g} to {max(thickness):.3g} mean free paths across, "
-            f"{found.size * mm_per_unit:.3g} mm: check mm_per_unit = {mm_per_unit:g}",
+            f"object {geometry.name} is {min(thickness):.3g} to {max(thickness):.3g} mean free paths across, "
+            f"{geometry.size * mm_per_unit:.3g} mm: check mm_per_unit = {mm_per_unit:g}",
             stacklevel=2,
         )
 

@@ -19,7 +19,7 @@ from halfspace_sss.rendering.object.points import (
     RadialTable,
     SurfacePoint,
     local_frame,
-    number,
+    opaque,
     opposed,
     plane_query,
 )
@@ -99,37 +99,39 @@ class HalfSpaceProposals:
 
 
 def half_space_model(
-    name: str, found: Geometry, media: list[Medium], settings: Settings, variation: Variation
+    name: str, geometry: Geometry, media: list[Medium], settings: Settings, variation: Variation
 ) -> ObjectModel:
     """The transport and the proposals of a half-space model on an object.
 
     Args:
         name: of the model.
-        found: the object.
+        geometry: the object.
         media: of each channel, 1/(scene unit).
         settings: geometry and share of uniform entries.
         variation: for derivatives by the medium.
     """
     models = [bssrdf(name, m) for m in media]
-    table = RadialTable([model for model, m in zip(models, media) if float(m.sigma_s) > 0], found.size)
-    share = area_share(found, table.mean / found.size, settings.area_share)
-    positions = PositionSampler(found, table, AreaPoints(found.shape), share)
+    table = RadialTable([model for model, m in zip(models, media) if float(m.sigma_s) > 0], geometry.size)
+    share = area_share(geometry, table.mean / geometry.size, settings.area_share)
+    positions = PositionSampler(geometry, table, AreaPoints(geometry.shape), share)
     transport = HalfSpaceTransport(models, settings.geometry, variation)
     return ObjectModel(transport, HalfSpaceProposals(positions, models[0]))
 
 
-def area_share(found: Geometry, ratio: float, wanted: float) -> float:
+def area_share(geometry: Geometry, ratio: float, wanted: float) -> float:
     """Share of candidates over the area, by default for a ratio of mean distance to object size.
 
     On a dragon of ratio 0.16 nine such points beside a probe bring variance x time to a third of that without, 15 do
     the same; at 0.05 (bunny) and 0.04 (candle) the first ones cut the tail at equal cost, kurtosis 18 to 7 and 15 to 5.
     """
-    if found.area > 0:
+    if geometry.area > 0:
         m = int(np.clip(round(POINTS_PER_RATIO * ratio), 1, MOST_POINTS))
         return wanted if wanted != AUTOMATIC else m / (1 + m)
     if wanted > 0:
-        kind = found.shape.class_name()
-        raise ValueError(f"area_share must be 0 for {found.shape.id()!r}, a {kind} without known area, got {wanted:g}")
+        kind = geometry.shape.class_name()
+        raise ValueError(
+            f"area_share must be 0 for {geometry.shape.id()!r}, a {kind} without known area, got {wanted:g}"
+        )
     return 0.0
 
 
@@ -205,18 +207,18 @@ class Variation:
 
     def coefficients(self, media: list[Medium]) -> list[tuple[Any, Any, Any]]:
         """sigma_s, sigma_t in 1/(scene unit) and g of each channel, with derivatives where they are followed."""
-        found = []
+        results = []
         for k, m in enumerate(media):
             albedo, sigma_t, g = (getattr(self.surface, name)[k] for name in VARIABLE)
-            sigma_t = sigma_t * number(self.mm_per_unit)
-            exact = tuple(number(v) for v in (m.sigma_s, m.sigma_t, m.g))
-            found.append(tuple(dr.replace_grad(a, b) for a, b in zip(exact, (albedo * sigma_t, sigma_t, g))))
-        return found
+            sigma_t = sigma_t * opaque(self.mm_per_unit)
+            exact = tuple(opaque(v) for v in (m.sigma_s, m.sigma_t, m.g))
+            results.append(tuple(dr.replace_grad(a, b) for a, b in zip(exact, (albedo * sigma_t, sigma_t, g))))
+        return results
 
 
 def _slope(stencil: Stencil, S: Any, query: tuple) -> Any:
     precise = _precise(query)
-    sides = [(S if model is None else type(S)(model.eval(*precise)), number(c)) for model, c in stencil]
+    sides = [(S if model is None else type(S)(model.eval(*precise)), opaque(c)) for model, c in stencil]
     least = sides[0][0]
     for value, _ in sides[1:]:
         least = dr.minimum(least, value)

@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from halfspace_sss.rendering.object.body import TranslucentObject
-from halfspace_sss.rendering.object.points import CosineProposals, EntrySample, ObjectModel, SurfacePoint, number
+from halfspace_sss.rendering.object.points import CosineProposals, EntrySample, ObjectModel, SurfacePoint, opaque
 from halfspace_sss.rendering.object.settings import Settings
 
 
@@ -33,7 +33,7 @@ class LambertTransport:
 
     def S(self, exit: SurfacePoint, at: SurfacePoint, active: mi.Bool = True) -> mi.Spectrum:
         """Over the density of `LambertProposals.sample`, whose point is the only one."""
-        R = [number(value) for value in self.reflectance]
+        R = [opaque(value) for value in self.reflectance]
         above = active & (dr.dot(exit.w, exit.n_out) > 0)
         return dr.select(above, (mi.Spectrum(*R) if len(R) > 1 else mi.Spectrum(R[0])) * dr.inv_pi, 0)
 

@@ -96,7 +96,7 @@ class Frame(NamedTuple):
         return self.t * (sine * c) + self.b * (sine * s) + self.n * mu
 
 
-def number(value: float) -> Any:
+def opaque(value: float) -> Any:
     """A number of a scene as data of a kernel, which then serves other materials and sizes too."""
 
     return dr.opaque(mi.Float, float(value))
@@ -113,9 +113,9 @@ def channel_mean(value: Any) -> Any:
 def place(p: mi.Point3f, n: mi.Normal3f) -> Any:
     """A point with its geometric normal, from which rays start clear of the surface."""
 
-    found = dr.zeros(mi.Interaction3f)
-    found.p, found.n = mi.Point3f(p), mi.Normal3f(n)
-    return found
+    result = dr.zeros(mi.Interaction3f)
+    result.p, result.n = mi.Point3f(p), mi.Normal3f(n)
+    return result
 
 
 def local_frame(n: mi.Normal3f, d: mi.Vector3f) -> Frame:
@@ -385,11 +385,11 @@ class PositionSampler:
 
     def density(self, p: mi.Point3f, n: mi.Normal3f, out: SurfacePoint, axes: tuple[mi.Vector3f, ...]) -> Any:
         """Density of candidates over the surface at p with normal n, for each that is drawn, 1/(scene unit)²."""
-        return self._candidates(p, n, out, axes) * number(1 / (self.probes + self.area_points))
+        return self._candidates(p, n, out, axes) * opaque(1 / (self.probes + self.area_points))
 
     def _candidates(self, p: mi.Point3f, n: mi.Normal3f, out: SurfacePoint, axes: tuple[mi.Vector3f, ...]) -> Any:
         """c = D + m/A, 1/(scene unit)²."""
-        uniform = number(self.area_points / self.geometry.area if self.area_points else 0.0)
+        uniform = opaque(self.area_points / self.geometry.area if self.area_points else 0.0)
         if not self.probes:
             return uniform
         d, total = p - out.p, 0.0
@@ -416,7 +416,7 @@ class PositionSampler:
         return EntrySample(kept.p, turned(kept.n, kept.n_out), kept.n_out, weight, kept.face)
 
     def _reach(self, across: mi.Float) -> Any:
-        return REACH * across + number(LEAST_REACH * self.geometry.size + NEAR * self.table.mean)
+        return REACH * across + opaque(LEAST_REACH * self.geometry.size + NEAR * self.table.mean)
 
     def _probe(
         self, out: SurfacePoint, axes: tuple[mi.Vector3f, ...], u_axis: mi.Float, u_length: mi.Float, u: mi.Point2f
@@ -428,7 +428,7 @@ class PositionSampler:
         second = dr.select(to_n, t, dr.select(to_s, n, s))
         sin_phi, cos_phi = dr.sincos(2 * dr.pi * u.y)
         r = self.table.sample(u.x)
-        reach = dr.select(u_length < LONG_SHARE, number(1.01 * self.geometry.size), self._reach(r))
+        reach = dr.select(u_length < LONG_SHARE, opaque(1.01 * self.geometry.size), self._reach(r))
         start = out.p + (first * cos_phi + second * sin_phi) * r - along * reach
         ray = mi.Ray3f(mi.Point3f(start), mi.Vector3f(along))
         ray.maxt = 2 * reach
@@ -445,8 +445,8 @@ class PositionSampler:
         share = dr.select(total > 0, weight / total, 0)
         take = (kept.u < share) & (weight > 0)
         u = dr.select(take, kept.u / dr.maximum(share, 1e-20), (kept.u - share) / dr.maximum(1 - share, 1e-7))
-        found = (dr.select(take, a, b) for a, b in zip((p, n, n_out, face), kept[2:]))
-        return _Kept(dr.clip(u, 0, 1), total, *found)
+        result = (dr.select(take, a, b) for a, b in zip((p, n, n_out, face), kept[2:]))
+        return _Kept(dr.clip(u, 0, 1), total, *result)
 
     def _hits(
         self,
@@ -484,7 +484,7 @@ class PositionSampler:
         active: mi.Bool,
     ) -> _Kept:
         """Points over the area as candidates."""
-        m, inverse = number(float(self.area_points)), number(1 / self.area_points)
+        m, inverse = opaque(float(self.area_points)), opaque(1 / self.area_points)
 
         def step(k: Any, kept: tuple) -> tuple:
             v = mi.Point2f(*(_wrapped(x + k * ratio) for x, ratio in zip((u.x, u.y), LATTICE)))
@@ -563,7 +563,7 @@ class AreaPoints:
         return self.on_face(self.faces.sample(u_face, active), u, active)
 
     def _radial(self, p: mi.Point3f) -> Any:
-        n = dr.normalize(p - mi.Point3f(*(number(c) for c in self.centre)))
+        n = dr.normalize(p - mi.Point3f(*(opaque(c) for c in self.centre)))
         return mi.Normal3f(-n if self.shape.has_flipped_normals() else n)
 
     def on_face(self, face: mi.UInt32, u: mi.Point2f, active: mi.Bool = True) -> Point:
@@ -617,7 +617,7 @@ class RadialTable:
 
     def _arrays(self) -> tuple[Any, ...]:
         if mi.variant() not in self._lanes:
-            numbers = (number(v) for v in (self.r_min, self.per_log, self.reach))
+            numbers = (opaque(v) for v in (self.r_min, self.per_log, self.reach))
             self._lanes[mi.variant()] = (*(mi.Float(v.astype(np.float32)) for v in self._numpy), *numbers)
             dr.eval(self._lanes[mi.variant()])
         return self._lanes[mi.variant()]

@@ -106,12 +106,12 @@ def _vertex_normals(positions: np.ndarray, vertex: np.ndarray, normals: np.ndarr
     def unit(v: np.ndarray) -> np.ndarray:
         return v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), np.finfo(float).tiny)
 
-    corners, found = positions[vertex], np.zeros_like(positions)
+    corners, result = positions[vertex], np.zeros_like(positions)
     for k in range(3):
         a, b = (unit(corners[:, (k + j) % 3] - corners[:, k]) for j in (1, 2))
         angle = 2 * np.arctan2(np.linalg.norm(a - b, axis=1), np.linalg.norm(a + b, axis=1))
-        np.add.at(found, vertex[:, k], angle[:, None] * unit(normals))
-    return unit(found)
+        np.add.at(result, vertex[:, k], angle[:, None] * unit(normals))
+    return unit(result)
 
 
 def _neighbours(corners: np.ndarray, solid: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -294,23 +294,23 @@ def survey(shape: mi.Shape, world: mi.Scene | None = None) -> Geometry:
 def geometry_of(shape: mi.Shape) -> tuple[list, list]:
     """What tells one geometry of a shape from the next; the arrays with it are kept so that no number is reused."""
 
-    found, kept = [], []
+    results, kept = [], []
     for key, value in mi.traverse(shape).items():
         if key in ("vertex_positions", "vertex_normals", "faces", "grid"):
             kept.append(dr.detach(value))
-            found.append((key, dr.detail.collect_indices(kept[-1])))
+            results.append((key, dr.detail.collect_indices(kept[-1])))
         elif key == "to_world":
-            found.append((key, np.array(dr.detach(value).matrix).tobytes()))
-    return found, kept
+            results.append((key, np.array(dr.detach(value).matrix).tobytes()))
+    return results, kept
 
 
 def state_of(node: mi.Object) -> tuple[list, list]:
     """What tells whether any parameter of an object of Mitsuba changed; what is kept so that no number is reused."""
-    found, kept = [], []
+    results, kept = [], []
     for key, value in mi.traverse(node).items():
         kept.append(dr.detach(value) if dr.is_array_v(value) else value)
-        found.append((key, dr.detail.collect_indices(kept[-1]) or repr(value)))
-    return found, kept
+        results.append((key, dr.detail.collect_indices(kept[-1]) or repr(value)))
+    return results, kept
 
 
 class _Votes:
@@ -386,17 +386,17 @@ def crossings(scene: mi.Scene, ray: mi.Ray3f, votes: _Votes | None = None) -> tu
     return dr.while_loop(state, lambda ray, side, count, active: active, step, label="crossings")[1:3]
 
 
-def is_inside(found: Geometry, points: Any) -> np.ndarray:
+def is_inside(geometry: Geometry, points: Any) -> np.ndarray:
     """Which points (array of shape (3, n)) lie inside a closed object, by the parity of the hits of rays from them."""
 
     points = np.asarray(points, dtype=float)
-    if not found.closed:
+    if not geometry.closed:
         return np.zeros(points.shape[1], dtype=bool)
     along = np.random.default_rng(11).standard_normal((3, 65))
     along /= np.linalg.norm(along, axis=0)
     start = np.repeat(points, along.shape[1], axis=1)
     ends = np.tile(along, points.shape[1])
-    _, count = crossings(found.scene, mi.Ray3f(mi.Point3f(start), mi.Vector3f(ends)))
+    _, count = crossings(geometry.scene, mi.Ray3f(mi.Point3f(start), mi.Vector3f(ends)))
     return (np.array(count) % 2).reshape(-1, along.shape[1]).mean(axis=1) > 0.5
 
 

@@ -159,11 +159,11 @@ def boundary_of(surfaces: list[Any], eta: float) -> Any:
 
 def check_eta(boundary: mi.BSDF, eta: float) -> None:
     """Refuse a boundary of another index than the medium's."""
-    found = mi.traverse(boundary).get("eta")
-    found = None if found is None else float(np.max(np.array(found)))
-    if found is None or abs(found - eta) > 2e-3 * eta:
+    result = mi.traverse(boundary).get("eta")
+    result = None if result is None else float(np.max(np.array(result)))
+    if result is None or abs(result - eta) > 2e-3 * eta:
         raise ValueError(
-            f"the boundary must be a dielectric with eta {eta:g} of the medium (int_ior/ext_ior), got {found}"
+            f"the boundary must be a dielectric with eta {eta:g} of the medium (int_ior/ext_ior), got {result}"
         )
 
 
@@ -323,7 +323,7 @@ def _class(variant: str) -> type:
 
 def _boundaries(props: mi.Properties) -> list[tuple[str, Any]]:
     """Names and surfaces of what stands inside."""
-    return [(key, found) for key, found in props.objects() if isinstance(found, mi.BSDF)]
+    return [(key, each) for key, each in props.objects() if isinstance(each, mi.BSDF)]
 
 
 # --------------------------------------------------------------------------------------------------
@@ -457,8 +457,8 @@ def _numbers(key: str, value: Any) -> Any:
 
     try:
         parts = value.split(",") if isinstance(value, str) else np.ravel(np.array(value, dtype=float)).tolist()
-        found = np.array([float(part) for part in parts])
+        result = np.array([float(part) for part in parts])
     except (TypeError, ValueError):
         got = f"a {value.class_name().partition('Impl')[0]}" if isinstance(value, mi.Object) else repr(value)
         raise ValueError(f"{key} must be a number, rgb, or numbers separated by commas, got {got}") from None
-    return float(found[0]) if len(found) == 1 else found
+    return float(result[0]) if len(result) == 1 else result

@@ -17,7 +17,7 @@ import numpy as np
 
 from halfspace_sss.rendering.gathered.patches import PatchTransfer, TransferRow, patch_transfer
 from halfspace_sss.rendering.gathered.points import uniform_entries
-from halfspace_sss.rendering.object.points import SurfacePoint, number
+from halfspace_sss.rendering.object.points import SurfacePoint, opaque
 from halfspace_sss.rendering.object.shape import same_objects
 from halfspace_sss.rendering.paths.gathering import (
     TRACED,
@@ -90,24 +90,24 @@ class ControlVariates:
         state = light_state(scene)
         if state[0] != self._light[0]:
             self._light, self._factors = state, {}
-        context, found = RenderContext.of(scene, bodies, settings, Primal()), []
+        context, results = RenderContext.of(scene, bodies, settings, Primal()), []
         for k, (body, T) in enumerate(zip(bodies, self._transfers)):
             wanted = 0 if T is None else max(int(PER_SAMPLE * spp / T.seen), FEWEST)
             count = int(min(wanted, MOST_SHARE * spp * pixels))
             if T is None or count <= LEAST_PAYING * wanted:
-                found.append(body)
+                results.append(body)
                 continue
             if k not in self._factors:  # by light of its own: a factor must not follow Phi
                 self._factors[k] = T.factor(_arriving(context, body, T, FIXED, FEWEST)[1])
-            found.append(replace(body, control=_control(context, body, T, self._factors[k], seed, count)))
-        return found
+            results.append(replace(body, control=_control(context, body, T, self._factors[k], seed, count)))
+        return results
 
 
 def _applies(body: TranslucentObject) -> bool:
     """Whether an object has one surface of known area whose entries are sampled everywhere."""
-    found = body.geometry
+    result = body.geometry
     even = body.surface.inside.varying is None
-    return spreads(body) and found.closed and found.area > 0 and found.pieces is None and even
+    return spreads(body) and result.closed and result.area > 0 and result.pieces is None and even
 
 
 def _control(
@@ -133,7 +133,7 @@ def _arriving(
     met, more, a, _ = by_cosine(
         context.scene, context.objects, T.albedo, context.settings, at, sampler.next_2d(), traced, sampler
     )
-    light = aimed + met + number(count / (count // TRACED)) * more
+    light = aimed + met + opaque(count / (count // TRACED)) * more
     if context.uses_sky(body):
         light -= a * context.sky_means(body)[1]
     light = mi.Spectrum(light)

@@ -121,11 +121,11 @@ class Gathering:
 
     def told(self) -> list[str]:
         """Of each object: points, and the noise of transfer and light."""
-        found = [body.gathered for body in self._found if body.gathered is not None]
+        results = [body.gathered for body in self._found if body.gathered is not None]
         return [
             f"light of {g.body.geometry.name} gathered at {len(g.transfer.points)} points: noise of the transfer "
             f"{g.transfer.error:.1%} a point, of the light {g.error:.1%}"
-            for g in found
+            for g in results
         ]
 
 
@@ -135,12 +135,12 @@ def spreads(body: TranslucentObject) -> bool:
 
 
 def _check(body: TranslucentObject) -> None:
-    found = body.geometry
-    if not found.closed or not found.area > 0:
-        lacks = "is not closed" if not found.closed else f"is a {found.shape.class_name()} without known area"
-        raise ValueError(f"light must be sampled for object {found.name}, which {lacks}, got gathered")
+    result = body.geometry
+    if not result.closed or not result.area > 0:
+        lacks = "is not closed" if not result.closed else f"is a {result.shape.class_name()} without known area"
+        raise ValueError(f"light must be sampled for object {result.name}, which {lacks}, got gathered")
     if body.surface.inside.varying is not None:
-        raise ValueError(f"light must be sampled for object {found.name}, whose medium varies, got gathered")
+        raise ValueError(f"light must be sampled for object {result.name}, whose medium varies, got gathered")
 
 
 def light_state(scene: mi.Scene) -> tuple[list, list]:

@@ -28,7 +28,7 @@ import mitsuba as mi
 from halfspace_sss.physics.medium import eval_hg, sample_hg
 from halfspace_sss.rendering.light.small_emitters import WIDE
 from halfspace_sss.rendering.object.body import TranslucentObject
-from halfspace_sss.rendering.object.points import SurfacePoint, lifted, mirrored, number, opposed, place, turned
+from halfspace_sss.rendering.object.points import SurfacePoint, lifted, mirrored, opaque, opposed, place, turned
 from halfspace_sss.rendering.paths.lighting import RenderContext, delta_light, mis_weight, sample_emitter
 
 MOST_SEGMENTS = 256
@@ -137,7 +137,7 @@ def sample_low_orders(
 def _walk(obj: TranslucentObject, refracted: RefractedRay, sampler: mi.Sampler, active: mi.Bool) -> _Walk:
     """The walk from an exit until it leaves."""
     zero, p = mi.Float(0), mi.Point3f(refracted.out.p)
-    media = [tuple(number(v) for v in (m.sigma_s, m.sigma_t, m.g)) for m in obj.media]
+    media = [tuple(opaque(v) for v in (m.sigma_s, m.sigma_t, m.g)) for m in obj.media]
     skip = _clear(obj, refracted.out.n, refracted.d)
     start = _Walk(
         p, mi.Vector3f(refracted.d), mi.Normal3f(refracted.out.n), mi.Float(skip), zero, mi.Float(1), mi.UInt32(0),
@@ -243,7 +243,7 @@ def meet(
 
 def _clear(obj: TranslucentObject, n: mi.Normal3f, d: mi.Vector3f) -> mi.Float:
     """Length along d after which a ray from the surface is clear of it; an origin moved instead lies deeper."""
-    return number(obj.geometry.rounding) / dr.maximum(dr.abs(dr.dot(n, d)), 0.1)
+    return opaque(obj.geometry.rounding) / dr.maximum(dr.abs(dr.dot(n, d)), 0.1)
 
 
 def _contribution(media: Media, length: mi.Float, order: mi.UInt32, cosine: mi.Float | None) -> mi.Spectrum:
@@ -287,7 +287,7 @@ def _connected(
         distant = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
         alone = context.sampled_by_nee(ds.emitter, ds.d)  # no other strategy counts this light
         active = active & (ds.pdf > 0) & (alone | mi.Bool(context.connects_sky(obj)))
-        reach = dr.select(distant, number(FAR * obj.geometry.size), ds.dist)
+        reach = dr.select(distant, opaque(FAR * obj.geometry.size), ds.dist)
         target = walk.event + ds.d * reach
         met = refracted_connection(obj, walk.event, target, active)
         # solid angle at the event per solid angle of the straight direction, over which the emitter was sampled
@@ -305,7 +305,7 @@ def _connected(
 
 def _phase_pdf(obj: TranslucentObject, walk: _Walk, met: Connection) -> mi.Float:
     """Density of the direction of a connection by the phase function, 1/sr inside, see `_scatter`."""
-    media = [tuple(number(v) for v in (m.sigma_s, m.sigma_t, m.g)) for m in obj.media]
+    media = [tuple(opaque(v) for v in (m.sigma_s, m.sigma_t, m.g)) for m in obj.media]
     W = _contribution(media, walk.event_length, mi.UInt32(1), None)
     cosine = dr.dot(walk.event_d, met.d)
     return dr.sum(W * _spectrum([eval_hg(cosine, m[2]) for m in media])) / dr.maximum(dr.sum(W), 1e-30)
@@ -314,7 +314,7 @@ def _phase_pdf(obj: TranslucentObject, walk: _Walk, met: Connection) -> mi.Float
 def _sky_pdf(obj: TranslucentObject, walk: _Walk, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
     """Density of a walk's direction outside, 1/sr, and 1, where a sky connection leads along it; elsewhere 1, 0."""
     with dr.suspend_grad():
-        reach = number(FAR * obj.geometry.size)
+        reach = opaque(FAR * obj.geometry.size)
         met = refracted_connection(obj, walk.event, walk.event + walk.d * reach, active)
         same = active & _is_same(walk, met, SAME_WAY)
         pdf = _phase_pdf(obj, walk, met) * met.T * reach * reach * met.density
@@ -328,7 +328,7 @@ def _met_by_chance(context: RenderContext, obj: TranslucentObject, walk: _Walk, 
         si = context.scene.ray_intersect(ray, mi.RayFlags.All, False, active)
         emitter = si.emitter(context.scene, active)
         active = active & (emitter != None) & context.sampled_by_nee(emitter, walk.d)  # noqa: E711
-        target = dr.select(si.is_valid(), si.p, walk.event + walk.d * number(FAR * obj.geometry.size))
+        target = dr.select(si.is_valid(), si.p, walk.event + walk.d * opaque(FAR * obj.geometry.size))
         met = refracted_connection(obj, walk.event, mi.Point3f(target), active)
         n = dr.select(si.is_valid(), si.n, 0)
         sampled = _is_same(walk, met, SAME_WAY) & _is_sampled(walk.event, target, n, met)

@@ -17,7 +17,7 @@ import drjit as dr
 import mitsuba as mi
 
 from halfspace_sss.rendering.object.body import TranslucentObject
-from halfspace_sss.rendering.object.points import SurfacePoint, lifted, number, place, turned
+from halfspace_sss.rendering.object.points import SurfacePoint, lifted, opaque, place, turned
 from halfspace_sss.rendering.object.settings import Settings
 from halfspace_sss.rendering.paths.lighting import (
     PathTally,
@@ -330,7 +330,7 @@ def choose_event(obj: TranslucentObject, si: mi.SurfaceInteraction3f, active: mi
         return EventChoice(reflection, mi.Float(0), RefractedRay(out, d, 1 - F, valid, mi.Float(0)))
     T = _transmittance(obj, out, d, valid)
     passing = T if 0 in obj.low_orders else LEAST_PASSING * T
-    albedo, single, multiple = (number(v) for v in (obj.expected.albedo, obj.expected.single, obj.expected.multiple))
+    albedo, single, multiple = (opaque(v) for v in (obj.expected.albedo, obj.expected.single, obj.expected.multiple))
     scattered = LOW_BOOST * (1 - T) * (single + (albedo - single) * T)
     both = passing + scattered
     low = mi.Float(1)
@@ -346,7 +346,7 @@ def _transmittance(obj: TranslucentObject, out: SurfacePoint, d: mi.Vector3f, ac
     wall = obj.geometry.scene.ray_intersect(ray, mi.RayFlags.Minimal, False, active)
     T = mi.Float(0)
     for medium in obj.media:
-        T = T + dr.exp(-number(medium.sigma_t) * wall.t) / len(obj.media)
+        T = T + dr.exp(-opaque(medium.sigma_t) * wall.t) / len(obj.media)
     return dr.select(active & wall.is_valid(), T, 0)
 
 
