@@ -157,7 +157,7 @@ def test_learnt_weights_lower_the_variance_below_that_of_uniform_points(obj: Tra
     at = entry_at(inside, point, rng)
     estimates = [np.array(found.model.S(prepared, at))[0] * np.pi / np.array(density)]
     uniform = inside.random_points(rng)
-    estimates.append(np.array(found.model.S(prepared, uniform))[0] * np.pi * inside.object.area)
+    estimates.append(np.array(found.model.S(prepared, uniform))[0] * np.pi * inside.geometry.area)
     learnt, flat = (v.reshape(64, -1) for v in estimates)
     spread = [np.mean(v.var(axis=1) / v.mean(axis=1).clip(1e-9) ** 2) for v in (learnt, flat)]
     assert spread[0] < 0.5 * spread[1]

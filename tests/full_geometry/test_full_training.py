@@ -274,7 +274,7 @@ def test_an_object_of_a_scene_is_found_by_its_id() -> None:
     with pytest.raises(ValueError, match="one of one, two, got None"):
         object_of(scene, None)
     found = object_of(scene, None, 2.0, "two")
-    assert np.isclose(found.object.area, 16 * np.pi) and np.isclose(float(found.media[0].sigma_t), 2.0)
+    assert np.isclose(found.geometry.area, 16 * np.pi) and np.isclose(float(found.media[0].sigma_t), 2.0)
     rough = {**surface, "boundary": {"type": "roughdielectric", "alpha": 0.2, "int_ior": 1.4, "ext_ior": 1.0}}
     with pytest.raises(ValueError, match="must be smooth"):
         object_of(mi.load_dict({"type": "scene", "one": {**one, "bsdf": rough}}), None)
