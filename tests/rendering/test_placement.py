@@ -204,6 +204,19 @@ def test_what_stands_at_the_surface_of_an_object_is_not_inside() -> None:
     assert contents(scene, [survey(shape) for shape in scene.shapes() if shape.id() == "wax"]) == []
 
 
+def test_a_curve_that_is_moved_into_an_object_by_its_points_is_refused_at_the_next_render(tmp_path: Path) -> None:
+    (tmp_path / "hair.txt").write_text("".join(f"{x} 8 0 0.1\n" for x in range(-2, 3)))
+    hair = {"type": "bsplinecurve", "filename": str(tmp_path / "hair.txt")}
+    scene = mi.load_dict(view("bssrdf", wax=ball(), hair=hair))
+    scene.integrator().render(scene, spp=1)
+    parameters = mi.traverse(scene)
+    points = np.array(parameters["hair.control_points"]).reshape(-1, 4)
+    parameters["hair.control_points"] = mi.Float((points - [0, 8, 0, 0]).ravel())
+    parameters.update()
+    with pytest.raises(ValueError, match="got the shape 'hair' inside object 'wax'"):
+        scene.integrator().render(scene, spp=1)
+
+
 def test_what_is_moved_into_an_object_is_refused_at_the_next_render() -> None:
     lamp = {"type": "point", "position": [0, 9, 0]}
     scene = mi.load_dict(view("bssrdf", wax=ball(), stone=_stone(center=[0, 8, 0]), lamp=lamp))

@@ -296,7 +296,7 @@ def geometry_of(shape: mi.Shape) -> tuple[list, list]:
 
     results, kept = [], []
     for key, value in mi.traverse(shape).items():
-        if key in ("vertex_positions", "vertex_normals", "faces", "grid"):
+        if key in ("vertex_positions", "vertex_normals", "faces", "grid", "control_points", "data"):
             kept.append(dr.detach(value))
             results.append((key, dr.detail.collect_indices(kept[-1])))
         elif key == "to_world":
