@@ -119,13 +119,11 @@ def _rounded(network: Network, precision: str, features: Sequence[Any]) -> Any:
 
 
 def _lanes(kind: type, precision: str) -> type:
-
     return dr.float16_array_t(kind) if precision == "float16" else dr.float32_array_t(kind)
 
 
 def _network_seconds(network: Network, precision: str) -> float:
     """Least of some runs over as many lanes as a launch has, compilation left out."""
-
     rng, n_in = np.random.default_rng(0), len(network.matrices[0])
     features = [_lanes(mi.Float, precision)(mi.Float(row)) for row in rng.random((n_in, LANES)).astype(np.float32)]
     dr.eval(features)

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from figures.studies.held_out import HELD_OUT
-from full_geometry.learning.shape_data import PairData, draw_subject, grouped, make_data, mean_events
+from full_geometry.learning.shape_data import PairData, draw_object, grouped, make_data, mean_events
 from full_geometry.learning.shape_training import STANDARD, ShapeFit
 from full_geometry.models.descriptors import N_LENGTHS, N_OWN
 from halfspace_sss.progress import NamedProgress
@@ -51,7 +51,7 @@ def ablation_table(work: Path, seconds: float, progress: NamedProgress | None = 
     held = []
     for k in range(HELD_OUT_OBJECTS):
         family = families[k % len(families)]
-        obj = draw_subject((SEED, k), {family: HELD_OUT[family]}).object
+        obj = draw_object((SEED, k), {family: HELD_OUT[family]}).object
         held.append(make_data(obj, mean_events(obj), (SEED, k)))
     held = [data for data in held if data is not None]
     lines = ["| descriptors | steps | likelihood left | mean radiance off: median | 90th percentile |",

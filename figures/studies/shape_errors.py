@@ -16,7 +16,7 @@ import numpy as np
 
 from figures.studies.held_out import HELD_OUT
 from full_geometry.learning.model_errors import LIGHTS, RadianceError, errors_of, transport_of
-from full_geometry.learning.shape_data import draw_subject
+from full_geometry.learning.shape_data import draw_object
 from full_geometry.models.descriptors import mean_chord
 from full_geometry.models.neural_shape import transport
 from halfspace_sss.interface.model import bssrdf
@@ -78,7 +78,7 @@ def held_out(n: int) -> Iterator[Case]:
     families = tuple(HELD_OUT)
     for k in range(n):
         family = families[k % len(families)]
-        yield Case(family, draw_subject((HELD_OUT_SEED, 10**6 + k), {family: HELD_OUT[family]}).object)
+        yield Case(family, draw_object((HELD_OUT_SEED, 10**6 + k), {family: HELD_OUT[family]}).object)
 
 
 def of_mesh(path: str | Path, materials: Sequence[str], mm_per_unit: float) -> Iterator[Case]:

@@ -63,7 +63,7 @@ def draw_medium(rng: np.random.Generator) -> tuple[float, float, float]:
     return min(float(reduced / (1 - g + g * reduced)), 1.0), float(g), float(eta)
 
 
-def draw_subject(
+def draw_object(
     seed: Sequence[int], families: Mapping[str, Family] | None = None, meshes: Sequence[Path] = ()
 ) -> Drawn:
     """A random shape with a random medium.

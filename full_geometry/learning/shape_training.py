@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from full_geometry.learning.shape_data import GroupedPairs, PairData, draw_subject, grouped, make_data, mean_events
+from full_geometry.learning.shape_data import GroupedPairs, PairData, draw_object, grouped, make_data, mean_events
 from full_geometry.models.descriptors import CURVED_OWN, CURVED_SHARED, N_MEDIUM, N_OWN, N_SHARED
 from full_geometry.models.neural_shape import ALBEDO, ETA, KIND, LEAST, PLACE_OF_G, SIZE, WEIGHTS, G, most
 from halfspace_sss.checks import check_count, check_interval
@@ -257,7 +257,7 @@ class _ShapeTraining:
                 record = json.loads(str(stored["record"]))
                 return (PairData.from_arrays(stored) if record["kept"] else None), record
         started = time.process_time()
-        drawn = draw_subject((self.seed, k), meshes=self.meshes)
+        drawn = draw_object((self.seed, k), meshes=self.meshes)
         data = make_data(drawn.object, mean_events(drawn.object), (self.seed, k))
         record = {**drawn.record(), "kept": data is not None, "cpu_seconds": time.process_time() - started}
         if place:
@@ -312,7 +312,7 @@ class _ShapeTraining:
             self.object(0)  # compiles the kernels
             at, pool = time.monotonic(), []
             for k in range(1, 1 + TRIAL_OBJECTS):
-                drawn = draw_subject((self.seed, 2**31 + k), meshes=self.meshes)
+                drawn = draw_object((self.seed, 2**31 + k), meshes=self.meshes)
                 pool += [make_data(drawn.object, mean_events(drawn.object), (self.seed, k))]
             pool = [grouped(data) for data in pool if data]
             each = (time.monotonic() - at) / TRIAL_OBJECTS

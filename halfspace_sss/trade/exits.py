@@ -39,7 +39,6 @@ class Exits:
 
     def rays(self, each: int) -> Any:
         """Every ray `each` times, next to each other."""
-
         index = dr.arange(mi.UInt32, self.n * each) // dr.opaque(mi.UInt32, each)
         o, d = (mi.TensorXf(v) for v in (self.o, self.d))
         columns = [dr.gather(mi.Float, table.array, index + k * self.n) for table in (o, d) for k in range(3)]
@@ -80,7 +79,6 @@ def visible_exits(scene: Any, shapes: list[Any], sensor: int, n: int, seed: int)
 
 def _look(scene: Any, camera: Any, shapes: list[Any], seed: tuple[int, int]) -> tuple[np.ndarray, list[np.ndarray]]:
     """Random rays of a camera, (6, LAUNCH), and which of them meet each shape first."""
-
     rng = np.random.default_rng([*seed, 23])
     u = [mi.Float(row) for row in rng.random((5, LAUNCH)).astype(np.float32)]
     ray, _ = camera.sample_ray_differential(camera.shutter_open(), u[0], mi.Point2f(*u[1:3]), mi.Point2f(*u[3:]))
@@ -93,7 +91,6 @@ def _look(scene: Any, camera: Any, shapes: list[Any], seed: tuple[int, int]) -> 
 
 def _shows_lamp(scene: Any, shapes: list[Any], si: Any, through: bool) -> Any:
     """Whether smooth boundaries show an emitter other than the environment, as mirrors or `through` clear objects."""
-
     active, result = si.is_valid(), mi.Bool(False)
     for _ in range(CHAIN):
         eta, translucent = mi.Float(1), mi.Bool(False)

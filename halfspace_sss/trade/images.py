@@ -34,7 +34,6 @@ def small_images(
         side: longest side, pixels.
         spp: samples for each pixel.
     """
-
     camera = on.scene.sensors()[sensor]
     film = camera.film()
     small = _film(np.array(film.crop_size(), dtype=int), side)
@@ -57,7 +56,6 @@ def _rendered(
     mi: Any, scene: Any, camera: Any, integrator: Any, size: tuple[int, int], spp: int, seed: int
 ) -> np.ndarray:
     """Rays of the camera over its whole film, averaged in fewer pixels."""
-
     n = size[0] * size[1] * spp
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(seed, n)

@@ -142,7 +142,6 @@ def _launch(
     stage: Stage, integrator: Any, exits: Exits, estimate: RadianceEstimate, each: int, seed: int
 ) -> tuple[int, float]:
     """`each` samples of every exit; bytes and seconds that it took."""
-
     rays = exits.rays(each)
     sampler = mi.load_dict({"type": "independent"})
     dr.flush_malloc_cache()
@@ -174,7 +173,6 @@ def radiance(scene: Any, integrator: Any, sampler: Any, ray: Any) -> list[Any]:
         sampler: of a number for each ray at a time.
         ray: all of them.
     """
-
     sampler.schedule_state()
     dr.schedule(ray.o, ray.d)
     dr.eval()

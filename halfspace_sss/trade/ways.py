@@ -106,7 +106,6 @@ class Stage:
 
     def integrator(self, way: Way) -> Any:
         """The integrator of a way, which keeps what it has made ready; the scene is the same for all."""
-
         if way not in self._integrators:
             plugin = {"type": "translucent_walk"} | self.settings
             if way.model != PATH_TRACED:
@@ -133,7 +132,6 @@ def stage(scene: Any, parameters: dict[str, str] | None = None) -> Stage:
     Raises:
         ValueError: as `load_objects`; there is no translucent object or no sensor, or it is an instance.
     """
-
     loaded = scene if isinstance(scene, mi.Scene) else load_objects(scene, parameters)
     shapes = translucent_shapes(loaded)
     if not shapes:

@@ -66,7 +66,7 @@ def objects(mm_per_unit: float = 1.0, **found) -> dict:
     return {"type": "scene", "integrator": {"type": "bssrdf", "mm_per_unit": mm_per_unit}, **found}
 
 
-def subject_of(**found) -> TranslucentObject:
+def varying_object(**found) -> TranslucentObject:
     return object_of(load_objects(objects(bunny=bunny(**found))), None)
 
 
@@ -101,8 +101,8 @@ def test_a_march_gives_the_transmittance_and_the_way_of_light_in_layers() -> Non
 
 def test_a_grid_of_one_value_gives_the_first_event_of_the_homogeneous_medium() -> None:
     plain = {"sigma_t": "2.0", "scale": 1.0, "albedo": "0.9, 0.8, 0.7"}
-    same = subject_of(density=np.full((2, 2, 2, 1), 0.4), albedo="0.9, 0.8, 0.7")
-    known = subject_of(**plain)
+    same = varying_object(density=np.full((2, 2, 2, 1), 0.4), albedo="0.9, 0.8, 0.7")
+    known = varying_object(**plain)
     at = known.random_points(generator(mi, 2048, pass_seed(4)))
     a, b = first_event(same, at), first_event(known, at)
     assert np.allclose(np.array(a.P), np.array(b.P), atol=2e-3)
@@ -123,7 +123,7 @@ def S_of(model, points: list[SurfacePoint]) -> np.ndarray:
 
 
 def test_an_object_moved_with_its_grids_is_the_same_one(trained: Trained, folder: Path) -> None:
-    moved = subject_of(turn=40.0, shift=3.0)
+    moved = varying_object(turn=40.0, shift=3.0)
     again = storing.load(storing.find_weights(moved, folder), moved).model
     rng = generator(mi, 4096, pass_seed(7))
     points = [trained.model.object.random_points(rng) for _ in range(2)]
@@ -145,12 +145,12 @@ def test_an_object_moved_with_its_grids_is_the_same_one(trained: Trained, folder
 )
 def test_weights_of_another_medium_are_refused(trained: Trained, folder: Path, changed: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        storing.find_weights(subject_of(**changed), folder)
+        storing.find_weights(varying_object(**changed), folder)
 
 
 def test_errors_refuse_a_model_of_a_medium_that_varies_as_renders_do() -> None:
     with pytest.raises(ValueError, match="must be the same everywhere for neural_shape, got one that varies"):
-        transport_of(subject_of(), "neural_shape")
+        transport_of(varying_object(), "neural_shape")
 
 
 def halves(shown: dict, model: str, mm_per_unit: float, spp: int = 128) -> np.ndarray:

@@ -20,7 +20,7 @@ from full_geometry.learning.shape_data import (  # noqa: E402  # noqa: E402
     GroupedPairs,
     PairData,
     draw_medium,
-    draw_subject,
+    draw_object,
     grouped,
     make_data,
     mean_events,
@@ -56,12 +56,12 @@ def test_objects_are_drawn_over_the_whole_range_and_not_beyond() -> None:
     for values, (low, high) in ((reduced, ALBEDO), (g, G), (eta, ETA)):
         assert low - 1e-9 <= values.min() < low + 0.1 * (high - low)
         assert high - 0.1 * (high - low) < values.max() <= high + 1e-9
-    sizes = [draw_subject((3, k)).object.mean_free_paths()[0] for k in range(12)]
+    sizes = [draw_object((3, k)).object.mean_free_paths()[0] for k in range(12)]
     assert SIZE[0] <= min(sizes) < 30 < max(sizes) <= SIZE[1]
 
 
 def test_data_repeat_and_have_a_mean_throughput_of_one() -> None:
-    obj = draw_subject((0, 4)).object
+    obj = draw_object((0, 4)).object
     one, two = (make_data(obj, mean_events(obj), (0, 4)) for _ in range(2))
     assert np.array_equal(one.walks, two.walks) and np.array_equal(one.W, two.W)
     assert np.isclose(one.T.mean() * one.share, 1.0, rtol=0.05)
@@ -89,7 +89,7 @@ def test_a_run_that_was_killed_ends_with_the_same_weights(tmp_path: Path, monkey
 
 def data_of(k: int) -> PairData:
     """Of object k of seed 1."""
-    obj = draw_subject((1, k)).object
+    obj = draw_object((1, k)).object
     return make_data(obj, mean_events(obj), (1, k))
 
 

@@ -25,8 +25,8 @@ from halfspace_sss.neural.training.learners import Hyper, PaperLearner, Small
 from halfspace_sss.neural.training.pool import MapPool
 from halfspace_sss.neural.training.train_material import (
     MaterialRecipe,
-    MaterialSubject,
-    PaperSubject,
+    MaterialTraining,
+    PaperTraining,
     TrainedChannel,
     Trial,
     train,
@@ -45,7 +45,7 @@ UNIVERSAL = UniversalRecipe(272, 2e5, GRID, HOW, rank=4, calibration_media=8, ca
 def run_channel(work: Path, progress: NamedProgress | None = None) -> Path:
     """Weights of a training of Fig. 10 that goes on with what is in `work`."""
     return train_channel(
-        FIG10, MaterialSubject(), RECIPE, 3, folder=work / "weights", work=work / "work", progress=progress
+        FIG10, MaterialTraining(), RECIPE, 3, folder=work / "weights", work=work / "work", progress=progress
     ).path
 
 
@@ -82,15 +82,15 @@ def _batches(pool: MapPool) -> Source:
 
 
 def test_a_trained_network_beats_its_untrained_start(pool: MapPool, reference: TracedMaps) -> None:
-    subject = MaterialSubject(warm=False)
-    learner = subject.learner(reference.medium, pool, 0)
-    before = model_error(subject.model(reference.medium, learner), reference).error
+    training = MaterialTraining(warm=False)
+    learner = training.learner(reference.medium, pool, 0)
+    before = model_error(training.model(reference.medium, learner), reference).error
     fit(learner, _batches(pool), replace(HOW, steps=150), 0)
-    assert model_error(subject.model(reference.medium, learner), reference).error < 0.5 * before
+    assert model_error(training.model(reference.medium, learner), reference).error < 0.5 * before
 
 
 def test_a_trained_network_of_the_paper_beats_its_untrained_start_by_its_own_loss(pool: MapPool) -> None:
-    learner = PaperLearner(FIG10.in_mfp(), PaperSubject().learner(FIG10.in_mfp(), pool, 0).scale, width=32)
+    learner = PaperLearner(FIG10.in_mfp(), PaperTraining().learner(FIG10.in_mfp(), pool, 0).scale, width=32)
     batch = pool.batch(64, 256, torch.Generator().manual_seed(1))
     before = float(learner.loss(batch).detach())
     fit(learner, _batches(pool), replace(HOW, steps=150), 0)
@@ -186,7 +186,7 @@ def interrupted(tmp_path_factory: Any) -> dict[str, Path]:
 
 
 def _other(what: str, work: Path, change: dict[str, Any]) -> None:
-    arguments = {"medium": FIG10, "subject": MaterialSubject(), "seed": 3, **change}
+    arguments = {"medium": FIG10, "training": MaterialTraining(), "seed": 3, **change}
     recipe = replace(UNIVERSAL if what == "universal" else RECIPE, **arguments.pop("recipe", {}))
     if what == "universal":
         train_universal(work, arguments["seed"], recipe)
@@ -199,8 +199,8 @@ SHARED = [({"seed": 4}, "seed"), ({"recipe": {"events": 6e5}}, "recipe.events"),
           ({"recipe": {"grid": CellGrid(8, 6)}}, "recipe.grid.n_psi")]  # fmt: skip
 OWN = {
     "channel": [({"medium": Medium.from_albedo(0.75, 1.0, 0.01, 1.3)}, "medium.g"),
-                ({"subject": PaperSubject()}, "subject.model"),
-                ({"subject": MaterialSubject(warm=False)}, "subject.warm")],
+                ({"training": PaperTraining()}, "training.model"),
+                ({"training": MaterialTraining(warm=False)}, "training.warm")],
     "universal": [({"recipe": {"rank": 5}}, "recipe.rank")],
 }  # fmt: skip
 

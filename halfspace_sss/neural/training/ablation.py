@@ -31,8 +31,8 @@ from halfspace_sss.neural.training.train_material import (
     STANDARD,
     VALIDATION_SEED,
     MaterialRecipe,
-    MaterialSubject,
-    PaperSubject,
+    MaterialTraining,
+    PaperTraining,
     Trial,
 )
 from halfspace_sss.physics.backbone import backbone, length_scale, unwarp
@@ -169,11 +169,11 @@ class Variant:
 
     def learner(self, medium: Medium, pool: MapPool, seed: int) -> Any:
         """A torch module with `loss` and `network`."""
-        paper = SharedTurn(medium, PaperSubject().learner(medium, pool, seed).scale, seed=seed)
+        paper = SharedTurn(medium, PaperTraining().learner(medium, pool, seed).scale, seed=seed)
         if self.learned == "S":
             return paper
         if self.symmetric and self.silu and self.width == 32:
-            return MaterialSubject(self.warm).learner(medium, pool, seed)
+            return MaterialTraining(self.warm).learner(medium, pool, seed)
         return Factored(paper, self.symmetric, self.learned == "log S/B", self.silu, self.width, seed)
 
 

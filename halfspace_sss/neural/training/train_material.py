@@ -78,7 +78,7 @@ class TrainedChannel:
     fit_seconds: float
 
 
-class TrainingSubject(Protocol):
+class ModelTraining(Protocol):
     """What is trained: a kind of model, with its learner and how the learner answers as a model."""
 
     kind: str
@@ -95,7 +95,7 @@ class TrainingSubject(Protocol):
 
 def train_channel(
     medium: Medium,
-    subject: TrainingSubject,
+    training: ModelTraining,
     recipe: MaterialRecipe = STANDARD,
     seed: int = 0,
     *,
@@ -109,7 +109,7 @@ def train_channel(
 
     Args:
         medium: scalar; only albedo, g and eta count.
-        subject: what is trained, see `subjects`.
+        training: what is trained, see `TRAININGS`.
         recipe: STANDARD, FAST or your own.
         seed: maps, batches and first numbers follow from it.
         folder: for the weights; by default where `bssrdf` finds them.
@@ -122,8 +122,8 @@ def train_channel(
     started, place = time.monotonic(), Path(work) if work else None
     medium = medium.in_mfp()
     if place:
-        what = {"model": subject.kind, **vars(subject)}
-        claim(place, medium=_ratios(medium), subject=what, recipe=asdict(recipe), seed=seed, backend=backend)
+        what = {"model": training.kind, **vars(training)}
+        claim(place, medium=_ratios(medium), training=what, recipe=asdict(recipe), seed=seed, backend=backend)
     groups = _groups(medium, recipe.n_groups, np.random.default_rng([seed, 0]))
     halves = make_pool(groups, recipe.grid, recipe.events, (seed, 1), place, progress, backend)
     pool = MapPool(groups, recipe.grid, halves)
@@ -131,11 +131,11 @@ def train_channel(
     events = recipe.validation_share * recipe.events
     (reference,) = reference_maps([medium], VALIDATION_SETS, recipe.grid, BLOCK, events, check, None, backend)
     data_seconds = time.monotonic() - started
-    learner = subject.learner(medium, pool, seed)
+    learner = training.learner(medium, pool, seed)
     results: list[ModelError] = []  # the last of them is that of the end, unless the run was over when it was resumed
 
     def validate() -> float:
-        results.append(model_error(subject.model(medium, learner), reference))
+        results.append(model_error(training.model(medium, learner), reference))
         return results[-1].known.bound
 
     how = recipe.how
@@ -144,12 +144,12 @@ def train_channel(
         checkpoint=place / CHECKPOINT if place else None, validate=validate,
         target_error=target_error, progress=progress,
     )  # fmt: skip
-    error = results[-1] if results else model_error(subject.model(medium, learner), reference)
+    error = results[-1] if results else model_error(training.model(medium, learner), reference)
     fit_seconds = time.monotonic() - started - data_seconds
-    record = {"width": learner.width, "depth": learner.depth, **subject.record(learner)}
+    record = {"width": learner.width, "depth": learner.depth, **training.record(learner)}
     record |= _record(medium, recipe, seed, error, history, data_seconds, fit_seconds)
-    path = Path(folder or weights_folder()) / weights_name(subject.kind, medium)
-    save_weights(path, subject.kind, network_arrays(learner.network()), record)
+    path = Path(folder or weights_folder()) / weights_name(training.kind, medium)
+    save_weights(path, training.kind, network_arrays(learner.network()), record)
     return TrainedChannel(medium, path, error, data_seconds, fit_seconds)
 
 
@@ -191,7 +191,7 @@ class Trial(SymmetricModel):
             self.fast_in = "numpy"
 
 
-class MaterialSubject:
+class MaterialTraining:
     """`neural_material`, started from what the universal network says of the medium, where it says anything.
 
     Args:
@@ -217,7 +217,7 @@ class MaterialSubject:
         return {"warm_start": self.warm}
 
 
-class PaperSubject:
+class PaperTraining:
     """`neural_paper`: 3 x 256, raw S, squared error."""
 
     kind = paper_model.KIND
@@ -241,7 +241,7 @@ def _generator() -> Any:
     return torch.Generator().manual_seed(0)
 
 
-SUBJECTS = {"neural_material": MaterialSubject(), "neural_paper": PaperSubject()}
+TRAININGS = {"neural_material": MaterialTraining(), "neural_paper": PaperTraining()}
 
 
 def train(
@@ -272,7 +272,7 @@ def train(
     Raises:
         ValueError: an argument is out of range, or the material is unknown; nothing has been traced then.
     """
-    check_choice("model", model, SUBJECTS)
+    check_choice("model", model, TRAININGS)
     if not isinstance(recipe, MaterialRecipe):
         raise ValueError(f"recipe must be a MaterialRecipe, got {recipe!r}")
     check_count("seed", seed, 0)
@@ -285,7 +285,7 @@ def train(
     array_types(backend)
     return [
         train_channel(
-            m, SUBJECTS[model], recipe, int(seed), folder=folder, work=Path(work) / f"channel-{k}" if work else None,
+            m, TRAININGS[model], recipe, int(seed), folder=folder, work=Path(work) / f"channel-{k}" if work else None,
             target_error=target_error, backend=backend, progress=progress,
         )
         for k, m in enumerate(media)

@@ -191,7 +191,6 @@ def places_of(scene: mi.Scene) -> tuple[list, list]:
 
 def _shared(shape: mi.Shape, holder: Geometry) -> Any:
     """The box that a shape shares with an object; None if it reaches less deep."""
-
     (a, b), (c, d), deep = _corners(shape.bbox()), _corners(holder.scene.bbox()), DEEP * holder.size
     low, high = np.maximum(a, c + deep), np.minimum(b, d - deep)
     return mi.ScalarBoundingBox3f(low.tolist(), high.tolist()) if (low <= high).all() else None
@@ -216,7 +215,6 @@ def _points_on(alone: mi.Scene, box: mi.ScalarBoundingBox3f) -> np.ndarray:
 
 def _points_by_area(alone: mi.Scene) -> np.ndarray:
     """Points drawn by area, shape (3, n); none of shapes that cannot be drawn from, such as curves and instances."""
-
     u = np.random.default_rng(19).random((2, LOOKS)).astype(np.float32)
     points = []
     for shape in alone.shapes():
@@ -230,7 +228,6 @@ def _points_by_area(alone: mi.Scene) -> np.ndarray:
 
 def _deep(holder: Geometry, points: np.ndarray) -> np.ndarray:
     """Which points lie inside an object, and deep."""
-
     inside = np.flatnonzero(is_inside(holder, points)) if points.shape[1] else np.zeros(0, dtype=int)
     if not len(inside):
         return np.zeros(0, dtype=bool)
@@ -249,7 +246,6 @@ def _holds(holder: Geometry, shape: mi.Shape, alone: mi.Scene) -> bool:
 
 def _place(emitter: mi.Emitter) -> np.ndarray | None:
     """Where an emitter without a shape is; None where it is nowhere or has a shape."""
-
     far = emitter.flags() & int(mi.EmitterFlags.Infinite)
     if far or emitter.is_environment() or emitter.get_shape() is not None:
         return None
@@ -264,7 +260,6 @@ def translucent_shapes(scene: mi.Scene) -> list[Any]:
         ValueError: such a surface is inside of another BSDF, which would show its reflection only, or its shape belongs
             to a shape group, whose instances are several objects; or the scene has media of Mitsuba.
     """
-
     shapes = scene.shapes()
     for node in mi.traverse(scene).hierarchy:
         if isinstance(node, mi.Shape) and node not in shapes and _inside(node.bsdf()):
@@ -318,7 +313,6 @@ def check_sensors(scene: mi.Scene, objects: list[Geometry]) -> None:
 
 def _starts(sensor: mi.Sensor, size: float) -> np.ndarray:
     """Shape (3, n); off a surface that the rays leave by a little of the size of an object."""
-
     u = np.random.default_rng(13).random((5, STARTS)).astype(np.float32)
     numbers = [mi.Float(row.tolist()) for row in u]
     # not sample_ray, which some sensors lack
@@ -328,7 +322,6 @@ def _starts(sensor: mi.Sensor, size: float) -> np.ndarray:
 
 def _inside(bsdf: mi.BSDF | None) -> bool:
     """Whether a BSDF is `translucent` or has such a one in it."""
-
     return bsdf is not None and any(is_translucent(node) for node in mi.traverse(bsdf).hierarchy)
 
 

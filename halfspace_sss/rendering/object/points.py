@@ -86,19 +86,16 @@ class Frame(NamedTuple):
 
     def azimuth(self, w: mi.Vector3f) -> Any:
         """Azimuth of w about the normal from t, radians."""
-
         return dr.atan2(dr.dot(w, self.b), dr.dot(w, self.t))
 
     def direction(self, mu: mi.Float, phi: mi.Float) -> Any:
         """The unit vector with cosine mu and azimuth phi."""
-
         sine, (s, c) = dr.safe_sqrt((1 - mu) * (1 + mu)), dr.sincos(phi)
         return self.t * (sine * c) + self.b * (sine * s) + self.n * mu
 
 
 def opaque(value: float) -> Any:
     """A number of a scene as data of a kernel, which then serves other materials and sizes too."""
-
     return dr.opaque(mi.Float, float(value))
 
 
@@ -112,7 +109,6 @@ def channel_mean(value: Any) -> Any:
 
 def place(p: mi.Point3f, n: mi.Normal3f) -> Any:
     """A point with its geometric normal, from which rays start clear of the surface."""
-
     result = dr.zeros(mi.Interaction3f)
     result.p, result.n = mi.Point3f(p), mi.Normal3f(n)
     return result
@@ -120,7 +116,6 @@ def place(p: mi.Point3f, n: mi.Normal3f) -> Any:
 
 def local_frame(n: mi.Normal3f, d: mi.Vector3f) -> Frame:
     """The frame of normal n whose first axis is d = x_o - x_i without its normal part; any axis where that is 0."""
-
     flat = d - n * dr.dot(n, d)
     length2 = dr.squared_norm(flat)
     spare, _ = mi.coordinate_system(n)
@@ -136,7 +131,6 @@ def separation(p_i: mi.Point3f, n_i: mi.Normal3f, p_o: mi.Point3f, n_o: mi.Norma
     the length of d in the common tangent plane where the normals are parallel, |d| where they are at right angles or
     turn away from each other, as on the two sides of something thin.
     """
-
     d = p_o - p_i
     if geometry == "distance":
         return dr.norm(d)
@@ -151,7 +145,6 @@ def plane_query(at: SurfacePoint, out: SurfacePoint, geometry: str) -> tuple[mi.
     r as in `separation`; each direction is taken against the normal of its own point, its azimuth from x_i -> x_o
     projected there. Cosines below the horizon come out as 0, at which every model is 0.
     """
-
     d = out.p - at.p
     frame_i, frame_o = local_frame(at.n_out, d), local_frame(out.n_out, d)
     mu_i, mu_o = (dr.clip(dr.dot(point.w, point.n_out), 0, 1) for point in (at, out))
@@ -177,7 +170,6 @@ def plane_query(at: SurfacePoint, out: SurfacePoint, geometry: str) -> tuple[mi.
 
 def turned(n_shading: mi.Normal3f, n: mi.Normal3f) -> Any:
     """The shading normal on the side of the geometric one: vertex normals need not agree with the winding of a face."""
-
     return dr.select(dr.dot(n_shading, n) < 0, -n_shading, n_shading)
 
 

@@ -41,7 +41,6 @@ def faces_of(shape: mi.Shape, name: str) -> Faces | None:
     Raises:
         ValueError: a surface of the mesh, called `name`, has one side only, as a Möbius strip has.
     """
-
     parameters = mi.traverse(shape)
     if "faces" not in parameters:
         return None
@@ -79,7 +78,6 @@ def check_copies(faces: Faces, name: str) -> None:
 
 def face_normals_agree(shape: mi.Shape, faces: Faces, name: str) -> None:
     """Warn that faces were turned, and make vertex normals anew that were averaged over faces of both sides."""
-
     parameters = mi.traverse(shape)
     turned = int(min((faces.sides < 0).sum(), (faces.sides > 0).sum()))
     more = ""
@@ -201,7 +199,6 @@ class Geometry:
 
     def piece(self, prim_index: mi.UInt32, active: mi.Bool) -> Any:
         """The number of the piece that a face belongs to."""
-
         if self.pieces is None:
             return mi.UInt32(0)
         return dr.gather(mi.UInt32, self.pieces, prim_index, active)
@@ -213,7 +210,6 @@ class Geometry:
         The largest coordinate counts, not that of the point: those of a large face or ball near the origin are no
         better.
         """
-
         box = self.scene.bbox()
         return float(np.max(np.abs([box.min, box.max]))) * mi.math.RayEpsilon if box.valid() else 0.0
 
@@ -229,7 +225,6 @@ class Geometry:
 
     def side(self, prim_index: mi.UInt32, active: mi.Bool = True) -> Any:
         """1 where the geometric normal of a face points outwards, -1 where it points inwards."""
-
         if self.signs is None:
             return mi.Float(self.sign)
         return dr.gather(mi.Float, self.signs, prim_index, active)
@@ -253,7 +248,6 @@ def survey(shape: mi.Shape, world: mi.Scene | None = None) -> Geometry:
         ValueError: the shape is an instance, whose geometry belongs to several objects; faces of a mesh exist twice; or
             they point to both sides of a surface that has one side or is not closed.
     """
-
     if is_instance(shape):
         raise ValueError(f"a translucent object must not be an instance, got {shape.id() or shape}")
     if shape.is_mesh() and shape.face_count() == 0:
@@ -293,7 +287,6 @@ def survey(shape: mi.Shape, world: mi.Scene | None = None) -> Geometry:
 
 def geometry_of(shape: mi.Shape) -> tuple[list, list]:
     """What tells one geometry of a shape from the next; the arrays with it are kept so that no number is reused."""
-
     results, kept = [], []
     for key, value in mi.traverse(shape).items():
         if key in ("vertex_positions", "vertex_normals", "faces", "grid", "control_points", "data"):
@@ -320,7 +313,6 @@ class _Votes:
     """
 
     def __init__(self, faces: Faces | None) -> None:
-
         n = 0 if faces is None else int(faces.pieces.max()) + 1
         mixed = faces is not None and faces.sides is not None
         n = n if n > 1 or mixed else 0
@@ -331,7 +323,6 @@ class _Votes:
 
     def add(self, si: mi.SurfaceInteraction3f, along: mi.Vector3f, entering: mi.Bool, active: mi.Bool) -> None:
         """Count a hit."""
-
         dr.scatter_add(self.opposed, mi.Float(1), 0, active & (dr.dot(si.sh_frame.n, si.n) < 0))
         if self.pieces is None:
             return
@@ -352,7 +343,6 @@ class _Votes:
 
     def signs(self) -> Any:
         """Of each face, or None if all pieces have the same."""
-
         if self.pieces is None:
             return None
         sign = np.where(self._shares() < 0.5, -1.0, 1.0)[np.array(self.pieces)]
@@ -388,7 +378,6 @@ def crossings(scene: mi.Scene, ray: mi.Ray3f, votes: _Votes | None = None) -> tu
 
 def is_inside(geometry: Geometry, points: Any) -> np.ndarray:
     """Which points (array of shape (3, n)) lie inside a closed object, by the parity of the hits of rays from them."""
-
     points = np.asarray(points, dtype=float)
     if not geometry.closed:
         return np.zeros(points.shape[1], dtype=bool)
@@ -416,7 +405,6 @@ def name_of(shape: mi.Shape) -> str:
 
 
 def _by_optix() -> bool:
-
     return mi.variant().startswith("cuda")
 
 
@@ -433,7 +421,6 @@ def scene_of(shapes: list[Any], world: mi.Scene | None = None) -> Any:
         world: the scene that they stand in, if rays are traced in both by one kernel or one is an instance. It is not
             kept alive, and must not be one that this function made.
     """
-
     named = [*shapes, world] if world is not None and _by_optix() else shapes
     if world is not None and any(map(is_instance, shapes)):  # Mitsuba looks for their groups in the scene
         named = [*groups_of(world), *named]
@@ -456,7 +443,6 @@ def groups_of(scene: mi.Scene) -> list[mi.Shape]:
 
 def rays_into(box: mi.ScalarBoundingBox3f, n: int) -> Any:
     """Rays from about a bounding box to places in it."""
-
     low, high = np.array(box.min, dtype=float), np.array(box.max, dtype=float)
     centre, radius = 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low))
     rng = np.random.default_rng(7)
@@ -498,6 +484,5 @@ def check_together(world: mi.Scene, scenes: list[Any]) -> None:
 
 def _met(scene: mi.Scene, ray: mi.Ray3f) -> Any:
     """The numbers of the shapes that rays meet in Dr.Jit's registry, 0 for none."""
-
     hit = scene.ray_intersect_preliminary(ray, False)
     return dr.select(hit.is_valid(), dr.reinterpret_array(mi.UInt32, hit.shape), 0)

@@ -393,7 +393,6 @@ def read_inside(props: mi.Properties) -> Inside:
 
 
 def _medium(props: mi.Properties) -> tuple[str, Medium, Any]:
-
     keys = ("sigma_s", "sigma_a", "sigma_t", "albedo", "scale", "g", "eta")
     inline = {key: constant_value(props[key]) for key in keys if key in props}
     if "material" in props:
@@ -416,7 +415,6 @@ def _medium(props: mi.Properties) -> tuple[str, Medium, Any]:
 
 def _inline_medium(inline: dict) -> tuple[Medium, Any]:
     """The medium of coefficients, and how it varies if it does."""
-
     values = {key: value if isinstance(value, mi.Volume) else _numbers(key, value) for key, value in inline.items()}
     volumes = [key for key, value in values.items() if isinstance(value, mi.Volume)]
     for key in volumes:
@@ -454,7 +452,6 @@ def _for_variant(label: str, medium: Medium, names: Any, props: mi.Properties) -
 
 def _numbers(key: str, value: Any) -> Any:
     """A number, or one per channel, from a parameter."""
-
     try:
         parts = value.split(",") if isinstance(value, str) else np.ravel(np.array(value, dtype=float)).tolist()
         result = np.array([float(part) for part in parts])

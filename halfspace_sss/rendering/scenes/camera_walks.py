@@ -76,7 +76,6 @@ class CameraWalks:
             number: of the pass; `TRIAL` for one that is no part of the image.
             spp: samples per pixel.
         """
-
         name, kept = shape.id(), []
         media = self.integrator.tracer(self.scene).visitor.media
         k = self._number(media, shape)

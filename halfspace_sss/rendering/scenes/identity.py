@@ -58,7 +58,6 @@ def _children(holder: Any) -> list[Any]:
 
 def object_digest(node: mi.Object) -> str:
     """SHA-256 of an object of Mitsuba, in words and by all its parameters."""
-
     flipped = isinstance(node, mi.Shape) and node.has_flipped_normals()  # of which Mitsuba tells nothing in words
     digest = hashlib.sha256(f"{words(node)}{flipped}".encode())
     for key, content in sorted((_MADE_UP.sub("", key), _content(value)) for key, value in mi.traverse(node).items()):

@@ -160,7 +160,6 @@ def _pass_spp(reference: Reference | None, fixed: int | None, most: int | None) 
 
 def _pass(reference: Reference | None, scene: Any, integrator: Any, sensor: int, about: dict, spp: int) -> Reference:
     """One more pass."""
-
     number = reference.passes if reference else 0
     started = time.perf_counter()
     seed = int(np.random.SeedSequence([about["seed"], number]).generate_state(1)[0])
@@ -184,7 +183,6 @@ def _check(spp_per_pass: int | None, seed: int, interval: float) -> None:
 
 def loaded(scene: Any, integrator: dict | None, sensor: int) -> tuple[Any, Any]:
     """The scene and its integrator as Mitsuba objects; errors as of `render`."""
-
     if isinstance(scene, (str, os.PathLike)) and not Path(scene).is_file():
         raise ValueError(f"scene must be a dict, a Mitsuba scene or a file, got {os.fspath(scene)!r}")
     try:
@@ -216,7 +214,6 @@ def _check_sensor(scene: Any, sensor: int) -> None:
 
 def about_render(scene: Any, integrator: Any, sensor: int, seed: int) -> dict[str, Any]:
     """What tells one render from another, with its provenance."""
-
     about = {
         "scene": scene_hash(scene, integrator),
         "integrator": words(integrator),

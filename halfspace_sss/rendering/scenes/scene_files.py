@@ -204,7 +204,6 @@ def _surfaces(state: Any) -> list[Any]:
 
 def _made(scene: dict | str | Path, state: Any, config: Any) -> Any:
     """The scene; files that an XML file names are looked for beside it first."""
-
     before, here = mi.file_resolver(), mi.FileResolver(mi.file_resolver())
     if not isinstance(scene, dict):
         here.prepend(str(Path(scene).resolve().parent))
@@ -218,7 +217,6 @@ def _made(scene: dict | str | Path, state: Any, config: Any) -> Any:
 
 
 def _parsed(scene: dict | str | Path, parameters: Mapping[str, str]) -> tuple[Any, Any]:
-
     config = mi.parser.ParserConfig(mi.variant())
     config.parallel = False  # objects then have the same numbers each time, and kernels are found in Dr.Jit's cache
     if not isinstance(scene, dict) and not Path(scene).is_file():
@@ -234,7 +232,6 @@ def _parsed(scene: dict | str | Path, parameters: Mapping[str, str]) -> tuple[An
 
 
 def _transform(scene: dict | str | Path, state: Any, config: Any) -> None:
-
     try:
         mi.parser.transform_all(config, state)
     except RuntimeError as error:
@@ -248,7 +245,6 @@ def _unreadable(scene: dict | str | Path, error: RuntimeError) -> ValueError:
 
 def _choose_integrator(state: Any, model: str | None, asked: bool, settings: Mapping[str, float]) -> None:
     """Make the integrator fit what is asked for; one that is made gets the settings."""
-
     wanted = _INTEGRATORS[model == PATH_TRACED]
     ours = [node.props for node in state.nodes if node.props.plugin_name() in _INTEGRATORS.values()]
     for props in ours if model else ():
