@@ -27,6 +27,7 @@ SMALL = {  # a small run of each command, and what it refuses
     "study ablation": (["--samples", "2000", "--seeds", "1", "--out", "o"], ["marbel"]),
     "study rivals": (["--scene", "ball.xml", "--out", "o"], ["--scene", "none.xml"]),
     "study shapes": (["--objects", "1", "--out", "o/shapes.md"], ["--objects", "-1"]),
+    "study speeds": (["--object", "candle", "--out", "o"], ["--object", "marbel"]),
     "study trade-check": (["--scenes", "1", "--out", "o"], ["--scenes", "-1"]),
     "trade": (["ball.xml", "--model", "better_dipole", "--assess", "0.2", "--out", "o"], ["marbel"]),
     "train material": (["--out", "o", "--work", "o/work"], ["marbel"]),
@@ -78,6 +79,7 @@ NO_FILES = ("materials", "models")
 LONG = (
     "study rivals",
     "study shapes",
+    "study speeds",
     "study trade-check",
     "train object",
     "train shapes",

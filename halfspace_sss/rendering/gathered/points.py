@@ -11,11 +11,14 @@ cells of the size h lists for each cell all points that some place in it can rea
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from scipy.sparse import csr_array
+from scipy.spatial import cKDTree
 
 from halfspace_sss.rendering.object.points import (
     AreaPoints,
@@ -104,9 +107,17 @@ class SurfacePoints:
 
     def smoothed(self, values: np.ndarray) -> np.ndarray:
         """Values (points, ...) blended at the points themselves."""
-        rows = values.reshape(len(self), -1)
-        result = self.blend(mi.Float(rows.astype(np.float32).ravel()), rows.shape[1], self.p, self.n, mi.Bool(True))
-        return np.stack([np.array(v) for v in result], axis=1).reshape(values.shape)
+        return (self._blending @ values.reshape(len(self), -1)).reshape(values.shape)
+
+    @cached_property
+    def _blending(self) -> csr_array:
+        """The weights of all points at all points, rows of sum 1."""
+        p, n = np.array(self.p, dtype=float).T, np.array(self.n, dtype=float).T
+        d = cKDTree(p).sparse_distance_matrix(cKDTree(p), self.h, output_type="coo_matrix")
+        j, k = d.coords
+        facing = np.maximum((n[j] * n[k]).sum(axis=1), 0)
+        w = csr_array((((1 - (d.data / self.h) ** 2) * facing) ** 2, (j, k)), shape=d.shape)
+        return w / w.sum(axis=1)[:, None]
 
     def nearest(self, p: mi.Point3f, n: mi.Normal3f, active: mi.Bool) -> tuple[mi.UInt32, mi.Bool]:
         """The point of the largest weight at a place, and whether there is one."""

@@ -1,0 +1,248 @@
+"""Speed of models over Mitsuba's volume path tracer in ordinary light: sampled, corrected and gathered.
+
+A cost is the median over the pixels of an object of variance of a sample over mean squared, times its CPU seconds.
+A speed is the cost of `volpathmis` at its best roulette depth over that of a way. Fireflies, which a median does not
+see, are mostly those of `volpathmis`.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pandas
+
+from figures.beyond.objects import VIEWS
+from figures.computing.contenders import WALK, ready, volume
+from figures.computing.images import guides
+from figures.computing.learnt import object_parts, weights_in
+from figures.computing.scenes import prepare, scan_scene, surroundings
+from figures.computing.timed import TimedRender, alternating, rendered
+from figures.modelling.objects import VARYING, tissue
+from halfspace_sss import materials
+from halfspace_sss.physics.medium import Medium
+
+LIGHTS = ("windows", "lamp and sky")
+MODELS = ("full_geometry", "neural", "better_dipole")
+KINDS = ("sampled", "corrected", "gathered")
+VOLUMES = tuple(volume(depth) for depth in (64, 200))
+SPP = {"volume": 4, WALK: 8, "model": 16}  # of a pass
+PASSES = 6
+RESOLUTION = 64  # of modelled objects
+LAMP, RADIUS = (0.5, 0.8, 0.6), 0.09  # from the middle, and radius, in sizes of the object
+GLOW, DIM = (60.0, 57.0, 52.0), (0.4, 0.45, 0.5)
+FRAME, NOISE, IMAGE = 256, 0.01, 512  # pixels of the next frame; noise of an image of so many pixels
+
+
+@dataclass(frozen=True)
+class LitObject:
+    """An object in a light.
+
+    Args:
+        name: "SCAN of MATERIAL", "candle" or an object whose medium varies.
+        light: of `LIGHTS`.
+    """
+
+    name: str
+    light: str
+
+    @property
+    def key(self) -> str:
+        """Id of its shape."""
+        return self.name.split()[0]
+
+    @property
+    def medium(self) -> Medium:
+        """Of a medium that varies any with its mean cosine."""
+        _, of, material = self.name.partition(" of ")
+        return materials.load(material).medium if of else tissue("candle wax").medium
+
+    def description(self, size: int, folder: Path) -> dict[str, Any]:
+        """The scene as a dict, `size` pixels wide."""
+        _, of, material = self.name.partition(" of ")
+        if of:
+            found = scan_scene(self.key, material, size, "even sky")
+        else:
+            view = VIEWS[self.name]
+            to_world = mi.ScalarTransform4f().look_at(list(view.origin), list(view.target), [0, 1, 0])
+            film = {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}}
+            shown = object_parts(self.name, RESOLUTION, folder)
+            found = {
+                "type": "scene",
+                "integrator": {"type": "bssrdf", "hide_emitters": True},
+                "sensor": {"type": "perspective", "fov": view.fov, "to_world": to_world, "film": film},
+                self.name: shown[self.name],
+            }
+        if self.light == "windows":
+            found["sky"] = {"type": "envmap", "bitmap": mi.Bitmap(surroundings())}
+            return found
+        box = mi.load_dict({k: v for k, v in found[self.key].items() if k != "bsdf"}).bbox()
+        across = float(np.linalg.norm(np.array(box.extents())))
+        centre = (np.ravel(np.array(box.center())) + across * np.array(LAMP)).tolist()
+        glow, dim = ({"type": "rgb", "value": list(v)} for v in (GLOW, DIM))
+        found["lamp"] = {
+            "type": "sphere",
+            "center": centre,
+            "radius": RADIUS * across,
+            "emitter": {"type": "area", "radiance": glow},
+        }
+        found["sky"] = {"type": "constant", "radiance": dim}
+        return found
+
+
+def ways_of(case: LitObject, models: tuple[str, ...]) -> list[str]:
+    """`volpathmis`, the walk, and models with the kinds of light that they take."""
+    kinds = KINDS[:1] if case.key in VARYING else KINDS
+    return [*VOLUMES, WALK, *(f"{model}, {kind}" for model in models for kind in kinds)]
+
+
+def scene_of(case: LitObject, way: str, size: int, folder: Path) -> Any:
+    """The Mitsuba scene of a way, or three."""
+    model, _, kind = way.partition(", ")
+    found = case.description(size, folder)
+    if kind:
+        found["integrator"]["light"] = kind
+    return ready(model, found, case.key, case.medium)
+
+
+def train(case: LitObject, seconds: float, folder: Path) -> float:
+    """Learn the object, unless it has been; the CPU seconds that took."""
+
+    from full_geometry.learning.training import train_by_cpu
+    from full_geometry.models.storing import KIND, find_weights
+    from halfspace_sss.rendering.object.body import object_of
+    from halfspace_sss.rendering.scenes.scene_files import open_scene
+
+    scene = open_scene(case.description(16, folder), KIND)
+    subject = object_of(scene, None, None, case.key)
+    with weights_in(folder):
+        try:
+            find_weights(subject)
+            return 0.0
+        except ValueError:
+            started = time.process_time()
+            train_by_cpu(subject, seconds, folder)
+            return time.process_time() - started
+
+
+def speeds(
+    names: list[str],
+    models: tuple[str, ...],
+    size: int,
+    seconds: float,
+    folder: Path,
+    seed: int,
+    progress: Callable[[str, int, int], None],
+) -> pandas.DataFrame:
+    """A row for each case and way.
+
+    Args:
+        names: of `LitObject`.
+        models: names.
+        size: pixels of the square images.
+        seconds: CPU time of a training of `full_geometry`.
+        folder: for weights and meshes.
+        seed: of all renders.
+        progress: called with what, done and all.
+    """
+    prepare()
+    rows, cases = [], [LitObject(name, light) for name in names for light in LIGHTS]
+    for k, case in enumerate(cases):
+        progress(f"{case.name}, {case.light}", k, len(cases))
+        training = train(case, seconds, folder) if "full_geometry" in models else 0.0
+        with weights_in(folder):
+            rows += _measured(case, models, size, folder, seed, training)
+    return pandas.DataFrame(rows)
+
+
+def _measured(
+    case: LitObject, models: tuple[str, ...], size: int, folder: Path, seed: int, training: float
+) -> list[dict[str, Any]]:
+    scenes, ready_after, spp = {}, {}, {}
+    for way in ways_of(case, models):
+        spp[way] = SPP["volume" if way in VOLUMES else WALK if way == WALK else "model"]
+        scenes[way] = scene_of(case, way, size, folder)
+        rendered(scenes[way], spp[way], seed)
+        ready_after[way] = sum(scenes[way].integrator().gathering.seconds) if "gathered" in way else 0.0
+    cover = guides(scenes[WALK], 8)[0][..., 0] > 0.999
+    found = alternating(scenes, spp, seed + 1, passes=PASSES)
+    noise = {way: _noise(timed, cover) for way, timed in found.items()}
+    seconds = {way: timed.typical_cpu_seconds / spp[way] for way, timed in found.items()}  # of a sample of all pixels
+    best = min(noise[way][0] * seconds[way] for way in VOLUMES)
+    rows = []
+    for way, (variance, error) in noise.items():
+        speed, gathered = best / (variance * seconds[way]), way.endswith("gathered")
+        light, camera = _next_frames(scenes[way], case, folder) if gathered else (np.nan, np.nan)
+        samples = max(variance / NOISE**2, 1.0)
+        rows.append(
+            {
+                "object": case.name, "light": case.light, "way": way, "speed": speed, "standard error": speed * error,
+                "ready after, s": ready_after[way],
+                "to 1 %, s": ready_after[way] + samples * seconds[way] * (IMAGE / size) ** 2,
+                "light changed, s": light, "camera moved, s": camera,
+                "training, s": training if way.startswith("full_geometry") else 0.0,
+            }
+        )  # fmt: skip
+    return rows
+
+
+def _noise(timed: TimedRender, cover: np.ndarray) -> tuple[float, float]:
+    """The variance of a sample over the mean squared, median over pixels and channels, and its relative error.
+
+    The error is that of passes: the spread of the medians without each of them in turn.
+    """
+    images = timed.images[:, cover].astype(np.float64)
+    mean = np.maximum(images.mean(axis=0), 1e-30)
+    spp = timed.spp // len(images)
+
+    def typical(chosen: np.ndarray) -> float:
+        return float(np.median(spp * chosen.var(axis=0, ddof=1) / mean**2))
+
+    value, n = typical(images), len(images)
+    without = [typical(np.delete(images, k, axis=0)) for k in range(n)]
+    return max(value, 1e-30), float(np.std(without) * np.sqrt(n - 1) / max(value, 1e-30))
+
+
+def _next_frames(scene: Any, case: LitObject, folder: Path) -> tuple[float, float]:
+    """CPU seconds of the next frame of one sample a pixel, once the light or the camera has changed."""
+    sensor = mi.load_dict(case.description(FRAME, folder)["sensor"])
+    lights, views = mi.traverse(scene), mi.traverse(sensor)
+    light = next(k for k in lights.keys() if k.startswith("sky") and k.endswith(("data", "radiance.value")))
+
+    def brighter() -> None:
+        lights[light] = lights[light] * 1.1
+        lights.update()
+
+    def nearer() -> None:
+        views["to_world"] = views["to_world"] @ mi.Transform4f().translate([0, 0, 0.01])
+        views.update()
+
+    found = []
+    for change in (brighter, nearer):
+        took = []
+        for seed in range(3):
+            started = time.process_time()
+            change()
+            np.array(mi.render(scene, sensor=sensor, spp=1, seed=seed))
+            took.append(time.process_time() - started)
+        found.append(min(took[1:]))  # the first compiles
+    return found[0], found[1]
+
+
+def tables(table: pandas.DataFrame) -> tuple[pandas.DataFrame, pandas.DataFrame]:
+    """Speeds with a column for each object and light, and what gathered light takes."""
+    table = table.assign(
+        case=table["object"] + ", " + table["light"],
+        text=[f"{a:.2g} ± {b:.1g}" for a, b in zip(table["speed"], table["standard error"])],
+    )
+    cases, ways = (list(dict.fromkeys(table[key])) for key in ("case", "way"))
+    wide = table.pivot(index="way", columns="case", values="text").loc[ways, cases].fillna("–")
+    wide["median"] = [f"{v:.2g}" for v in table.groupby("way")["speed"].median().loc[ways]]
+    gathered = table[table["way"].str.endswith("gathered")]
+    columns = ["case", "way", "ready after, s", "to 1 %, s", "light changed, s", "camera moved, s"]
+    return wide.reset_index(), gathered[columns]
