@@ -109,14 +109,14 @@ class SurfaceCells:
     of_face: tuple[mi.Bool, mi.UInt32] | None
 
     @classmethod
-    def of(cls, body: TranslucentObject, points: SurfacePoints) -> SurfaceCells:
+    def of(cls, obj: TranslucentObject, points: SurfacePoints) -> SurfaceCells:
         """Those of points."""
-        n = body.geometry.shape.face_count() if body.geometry.shape.is_mesh() else 0
+        n = obj.geometry.shape.face_count() if obj.geometry.shape.is_mesh() else 0
         if n < FACES * len(points):
             return cls(points, None)
         face = dr.arange(mi.UInt32, n)
-        at = AreaPoints(body.geometry.shape).on_face(face, mi.Point2f(*CENTROID))
-        k, result = points.nearest(mi.Point3f(at.p), mi.Normal3f(at.n) * body.geometry.side(face), mi.Bool(True))
+        at = AreaPoints(obj.geometry.shape).on_face(face, mi.Point2f(*CENTROID))
+        k, result = points.nearest(mi.Point3f(at.p), mi.Normal3f(at.n) * obj.geometry.side(face), mi.Bool(True))
         dr.eval(k, result)
         return cls(points, (result, k))
 
@@ -128,16 +128,16 @@ class SurfaceCells:
         return dr.gather(mi.UInt32, k, face, active), active & dr.gather(mi.Bool, result, face, active)
 
 
-def patch_transfer(body: TranslucentObject, count: int | None = None, samples: int = SAMPLES) -> PatchTransfer:
+def patch_transfer(obj: TranslucentObject, count: int | None = None, samples: int = SAMPLES) -> PatchTransfer:
     """T of an object, estimated by entries that the proposals of its model draw for exits at all points."""
-    sigma = np.mean([float(m.sigma_t_prime) for m in body.media])
-    count = count or int(np.clip(body.geometry.area * (PER_LENGTH * sigma) ** 2, FEWEST, MOST))
-    points = SurfacePoints.of(body.geometry, count)
-    cells = SurfaceCells.of(body, points)
-    result = drawn(body, points, cells, max(samples // count, 16))
-    areas, places = _areas(body, cells)
+    sigma = np.mean([float(m.sigma_t_prime) for m in obj.media])
+    count = count or int(np.clip(obj.geometry.area * (PER_LENGTH * sigma) ** 2, FEWEST, MOST))
+    points = SurfacePoints.of(obj.geometry, count)
+    cells = SurfaceCells.of(obj, points)
+    result = drawn(obj, points, cells, max(samples // count, 16))
+    areas, places = _areas(obj, cells)
     pair = (np.arange(count)[:, None] * count + result.near)[result.known]
-    across = _evaluated(body, points, places, result.albedo)
+    across = _evaluated(obj, points, places, result.albedo)
     n = np.bincount(pair, minlength=count**2).reshape(count, count)
     T, moments = np.empty((count, count, result.S.shape[2]), dtype=np.float32), []
     for c in range(T.shape[2]):
@@ -155,7 +155,7 @@ def patch_transfer(body: TranslucentObject, count: int | None = None, samples: i
     return PatchTransfer(cells, T, result.albedo, float(np.median(seen)), np.array(moments, dtype=float).T)
 
 
-def _evaluated(body: TranslucentObject, points: SurfacePoints, places: EntrySample, albedo: Albedo) -> np.ndarray:
+def _evaluated(obj: TranslucentObject, points: SurfacePoints, places: EntrySample, albedo: Albedo) -> np.ndarray:
     """T by S from places in all cells to the points, (points, points, channels)."""
     count, n = len(points), dr.width(places.p) // len(points)
     lane = dr.arange(mi.UInt32, count * n)
@@ -164,7 +164,7 @@ def _evaluated(body: TranslucentObject, points: SurfacePoints, places: EntrySamp
     sampler.seed(9, count * n)
     out, _ = points.exit(j, sampler.next_2d())
     active, size = mi.Bool(True), dr.size_v(mi.Spectrum)
-    prepared, a = body.transport.prepare(out, active), albedo(dr.dot(out.w, out.n_out))
+    prepared, a = obj.transport.prepare(out, active), albedo(dr.dot(out.w, out.n_out))
     values = dr.zeros(mi.Float, count * count * n * size)
     dr.eval(out, values, prepared, a)
 
@@ -172,7 +172,7 @@ def _evaluated(body: TranslucentObject, points: SurfacePoints, places: EntrySamp
         entry = EntrySample(*(dr.gather(type(v), v, k * n + s) for v in places))
         w, pdf = cosine_above(entry.n_out, entry.n, sampler.next_2d())
         at_entry = entry.facing(w)
-        S = body.transport.S(prepared, at_entry, pdf > 0) * at_entry.mu / (dr.maximum(pdf, 1e-8) * dr.maximum(a, 1e-6))
+        S = obj.transport.S(prepared, at_entry, pdf > 0) * at_entry.mu / (dr.maximum(pdf, 1e-8) * dr.maximum(a, 1e-6))
         at = ((j * count + k) * n + s) * size
         for c in range(size):
             dr.scatter(values, S[c], at + c)
@@ -183,11 +183,11 @@ def _evaluated(body: TranslucentObject, points: SurfacePoints, places: EntrySamp
     return result.mean(axis=2)
 
 
-def _areas(body: TranslucentObject, cells: SurfaceCells) -> tuple[np.ndarray, EntrySample]:
+def _areas(obj: TranslucentObject, cells: SurfaceCells) -> tuple[np.ndarray, EntrySample]:
     """Of all cells, and `PAIRS` places in each; the middle of those without."""
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(5, PLACES)
-    at = uniform_entries(body.geometry, sampler.next_1d(), sampler.next_2d())
+    at = uniform_entries(obj.geometry, sampler.next_1d(), sampler.next_2d())
     k, known = cells(at.p, at.n, at.face, mi.Bool(True))
     k = np.where(np.array(known), np.array(k), len(cells.points))
     counts = np.bincount(k, minlength=len(cells.points) + 1)[:-1]
@@ -198,4 +198,4 @@ def _areas(body: TranslucentObject, cells: SurfaceCells) -> tuple[np.ndarray, En
     at = at._replace(weight=at.weight + dr.zeros(mi.Float, PLACES))
     places = EntrySample(*(dr.gather(type(v), v, index) for v in at))
     dr.eval(places)
-    return np.maximum(counts, 0.5) * (body.geometry.area / PLACES), places
+    return np.maximum(counts, 0.5) * (obj.geometry.area / PLACES), places

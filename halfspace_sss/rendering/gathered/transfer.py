@@ -132,18 +132,18 @@ class Transfer:
         return np.concatenate([(by_place + first - np.einsum("jck,jk->jc", slope, self.middle))[:, :, None], slope], 2)
 
 
-def count_of(body: TranslucentObject) -> int:
+def count_of(obj: TranslucentObject) -> int:
     """How many points an object gets: so many that their distance is half a transport mean free path."""
-    sigma = np.mean([float(m.sigma_t_prime) for m in body.media])
-    return int(np.clip(body.geometry.area * (PER_LENGTH * sigma) ** 2, FEWEST, MOST))
+    sigma = np.mean([float(m.sigma_t_prime) for m in obj.media])
+    return int(np.clip(obj.geometry.area * (PER_LENGTH * sigma) ** 2, FEWEST, MOST))
 
 
-def transfer(body: TranslucentObject, count: int | None = None, samples: int = SAMPLES, seed: int = SEED) -> Transfer:
+def transfer(obj: TranslucentObject, count: int | None = None, samples: int = SAMPLES, seed: int = SEED) -> Transfer:
     """The transfer of an object, by its model and the proposals of that."""
-    points = SurfacePoints.of(body.geometry, count or count_of(body))
+    points = SurfacePoints.of(obj.geometry, count or count_of(obj))
     each = max(samples // len(points), 16)
-    result = drawn(body, points, lambda p, n, _, active: points.nearest(p, n, active), each, seed)
-    t, error = _rows(points, result.S, _trusted(body), result.a)
+    result = drawn(obj, points, lambda p, n, _, active: points.nearest(p, n, active), each, seed)
+    t, error = _rows(points, result.S, _trusted(obj), result.a)
     near = np.where(result.known, result.near, np.arange(len(points))[:, None])
     centred = _centred(result.w_o, result.a.mean(axis=2))
     return Transfer(points, near, t, result.w_i, *centred, result.albedo, error)
@@ -171,7 +171,7 @@ class DrawnEntries(NamedTuple):
     albedo: Albedo
 
 
-def drawn(body: TranslucentObject, points: SurfacePoints, cell: Callable, n: int, seed: int = SEED) -> DrawnEntries:
+def drawn(obj: TranslucentObject, points: SurfacePoints, cell: Callable, n: int, seed: int = SEED) -> DrawnEntries:
     """n entries for each point; `cell` of position, outward normal, face and mask says which they are near."""
     k = dr.arange(mi.UInt32, len(points) * n)
     j, s = k // n, k % n
@@ -181,14 +181,14 @@ def drawn(body: TranslucentObject, points: SurfacePoints, cell: Callable, n: int
     jitter = dr.gather(mi.Point2f, shift, j * n)
     u = [dr.fma(mi.Float(s), r, x) for r, x in zip(R_2, (jitter.x, jitter.y))]
     out, face = points.exit(j, mi.Point2f(*(x - dr.floor(x) for x in u)))
-    S, inverse, entry, w_i = _sample(body, out, face, sampler, active)
+    S, inverse, entry, w_i = _sample(obj, out, face, sampler, active)
     near, known = cell(entry.p, entry.n, entry.face, entry.weight > 0)
     mu, mu_i = dr.dot(out.w, out.n_out), cosine(w_i, entry.n, entry.n_out)
     dr.eval(S, inverse, near, known, mu, mu_i, w_i)
     shape = (len(points), n)
     S = np.array(S, dtype=np.float32).reshape(-1, *shape).transpose(1, 2, 0)
     S = np.nan_to_num(S, nan=0.0, posinf=0.0, neginf=0.0)
-    albedo = _fitted(body, np.array(mu), S.reshape(-1, S.shape[2]))
+    albedo = _fitted(obj, np.array(mu), S.reshape(-1, S.shape[2]))
     a = np.array(albedo(mu)).T.reshape(S.shape)
     h = np.array(albedo(mu_i) * (mu_i * inverse)).T.reshape(S.shape) / albedo.whole.astype(np.float32)
     w_i, w_o = (np.array(w, dtype=np.float32).T.reshape(*shape, 3) for w in (w_i, out.w))
@@ -203,29 +203,29 @@ def _centred(w: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.n
     return d, middle, np.linalg.inv(np.einsum("js,jsi,jsk->jik", a, d, d) + 1e-3 * np.eye(3))
 
 
-def _sample(body: TranslucentObject, out: SurfacePoint, face: mi.UInt32, sampler: mi.Sampler, active: mi.Bool) -> tuple:
+def _sample(obj: TranslucentObject, out: SurfacePoint, face: mi.UInt32, sampler: mi.Sampler, active: mi.Bool) -> tuple:
     """S mu_i over the density of an entry and its direction, the inverse of that, and both."""
-    prepared = body.transport.prepare(out, active)
-    where = body.proposals.prepare(out, prepared, active)
-    entry = body.proposals.sample(out, face, where, sampler, active)
+    prepared = obj.transport.prepare(out, active)
+    where = obj.proposals.prepare(out, prepared, active)
+    entry = obj.proposals.sample(out, face, where, sampler, active)
     active = active & (entry.weight > 0)
-    w_i, pdf = body.proposals.sample_direction(entry, out, sampler.next_2d())
+    w_i, pdf = obj.proposals.sample_direction(entry, out, sampler.next_2d())
     at = entry.facing(w_i)
     inverse = dr.select(active & (pdf > 0), entry.weight / dr.maximum(pdf, 1e-8), 0)
-    S = body.transport.S(prepared, at, active & (pdf > 0)) * (at.mu * inverse)
+    S = obj.transport.S(prepared, at, active & (pdf > 0)) * (at.mu * inverse)
     return mi.Spectrum(dr.select(active & (pdf > 0), S, 0)), inverse, entry, mi.Vector3f(w_i)
 
 
-def _trusted(body: TranslucentObject) -> np.ndarray:
+def _trusted(obj: TranslucentObject) -> np.ndarray:
     """The channels in which the model knows its directional albedo at every exit."""
-    if body.transport.alpha is None:
+    if obj.transport.alpha is None:
         return np.zeros(dr.size_v(mi.Spectrum), dtype=bool)
-    return np.ravel(np.array(body.transport.alpha.known[1])) > 0
+    return np.ravel(np.array(obj.transport.alpha.known[1])) > 0
 
 
-def _fitted(body: TranslucentObject, mu: np.ndarray, S: np.ndarray) -> Albedo:
+def _fitted(obj: TranslucentObject, mu: np.ndarray, S: np.ndarray) -> Albedo:
     """a(mu), by least squares over all samples."""
-    eta = float(body.media[0].eta)
+    eta = float(obj.media[0].eta)
     basis = F_t(mu.astype(float), eta)[:, None] * mu[:, None] ** np.arange(3)
     normal = basis.T @ basis + 1e-9 * len(mu) * np.eye(3)
     return Albedo(np.linalg.solve(normal, basis.T @ S.astype(float)).T, eta)

@@ -424,15 +424,15 @@ class TranslucentObjects:
     def of(self, scene: Any) -> list[TranslucentObject]:
         """The bodies of a scene; errors as in `make_objects`."""
         shapes = scene.shapes()  # the scene itself, which holds its integrator, would never be freed
-        world, before, bodies = self._made
+        world, before, objects = self._made
         same = world == number_of(scene) and same_objects(before, shapes)
-        current = bool(bodies) and same and all(body.is_current() for body in bodies)
+        current = bool(objects) and same and all(obj.is_current() for obj in objects)
         places = places_of(scene)
         if current and places[0] != self._places[0]:
-            results = [body.geometry for body in bodies]
+            results = [obj.geometry for obj in objects]
             current = not any(geometry.contents for geometry in results) and not contents(scene, results)
         if not current:
-            if not (bodies and same):
+            if not (objects and same):
                 self.choices = _choices(scene, self.settings)
             self._made = number_of(scene), shapes, make_objects(scene, self.settings, (), self.choices)
         self._places = places

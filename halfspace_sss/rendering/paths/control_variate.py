@@ -69,62 +69,62 @@ class ControlVariates:
     """Those of the objects of a scene; transfers are kept until the objects change."""
 
     def __init__(self) -> None:
-        self._bodies: list[TranslucentObject] = []
+        self._objects: list[TranslucentObject] = []
         self._transfers: list[PatchTransfer | None] = []
         self._light: tuple[list, list] = ([], [])
         self._factors: dict[int, np.ndarray] = {}  # of the light that they are for
 
     def of(
-        self, scene: mi.Scene, bodies: list[TranslucentObject], settings: Settings, seed: int, spp: int, pixels: int
+        self, scene: mi.Scene, objects: list[TranslucentObject], settings: Settings, seed: int, spp: int, pixels: int
     ) -> list[TranslucentObject]:
         """The objects, each with its control variate where it can have one that pays.
 
         Args:
-            scene, bodies, settings: what is rendered.
+            scene, objects, settings: what is rendered.
             seed: of the points at which light is gathered.
             spp, pixels: samples of a pixel, and pixels.
         """
-        if not same_objects(bodies, self._bodies):
-            self._transfers = [patch_transfer(body) if _applies(body) else None for body in bodies]
-            self._bodies, self._light = bodies, ([], [])
+        if not same_objects(objects, self._objects):
+            self._transfers = [patch_transfer(obj) if _applies(obj) else None for obj in objects]
+            self._objects, self._light = objects, ([], [])
         state = light_state(scene)
         if state[0] != self._light[0]:
             self._light, self._factors = state, {}
-        context, results = RenderContext.of(scene, bodies, settings, Primal()), []
-        for k, (body, T) in enumerate(zip(bodies, self._transfers)):
+        context, results = RenderContext.of(scene, objects, settings, Primal()), []
+        for k, (obj, T) in enumerate(zip(objects, self._transfers)):
             wanted = 0 if T is None else max(int(PER_SAMPLE * spp / T.seen), FEWEST)
             count = int(min(wanted, MOST_SHARE * spp * pixels))
             if T is None or count <= LEAST_PAYING * wanted:
-                results.append(body)
+                results.append(obj)
                 continue
             if k not in self._factors:  # by light of its own: a factor must not follow Phi
-                self._factors[k] = T.factor(_arriving(context, body, T, FIXED, FEWEST)[1])
-            results.append(replace(body, control=_control(context, body, T, self._factors[k], seed, count)))
+                self._factors[k] = T.factor(_arriving(context, obj, T, FIXED, FEWEST)[1])
+            results.append(replace(obj, control=_control(context, obj, T, self._factors[k], seed, count)))
         return results
 
 
-def _applies(body: TranslucentObject) -> bool:
+def _applies(obj: TranslucentObject) -> bool:
     """Whether an object has one surface of known area whose entries are sampled everywhere."""
-    result = body.geometry
-    even = body.surface.inside.varying is None
-    return spreads(body) and result.closed and result.area > 0 and result.pieces is None and even
+    result = obj.geometry
+    even = obj.surface.inside.varying is None
+    return spreads(obj) and result.closed and result.area > 0 and result.pieces is None and even
 
 
 def _control(
-    context: RenderContext, body: TranslucentObject, T: PatchTransfer, factor: np.ndarray, seed: int, count: int
+    context: RenderContext, obj: TranslucentObject, T: PatchTransfer, factor: np.ndarray, seed: int, count: int
 ) -> ControlVariate:
-    Phi = _arriving(context, body, T, seed, count)[0].astype(np.float32)
+    Phi = _arriving(context, obj, T, seed, count)[0].astype(np.float32)
     known = np.stack([T.T[:, :, c] @ row for c, row in enumerate(Phi)], axis=1)
     return ControlVariate(T, dr.opaque(mi.Spectrum, factor.tolist()), mi.Float(known.ravel()))
 
 
 def _arriving(
-    context: RenderContext, body: TranslucentObject, T: PatchTransfer, seed: int, count: int
+    context: RenderContext, obj: TranslucentObject, T: PatchTransfer, seed: int, count: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Phi, (channels, cells), and the relative variance of light in a cell, per channel."""
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(int(np.random.SeedSequence([seed, 28]).generate_state(1)[0]), count)
-    entry = uniform_entries(body.geometry, sampler.next_1d(), sampler.next_2d())
+    entry = uniform_entries(obj.geometry, sampler.next_1d(), sampler.next_2d())
     k, known = T.cells(entry.p, entry.n, entry.face, mi.Bool(True))
     at = GatheringPoint(entry.p, entry.n, entry.n_out)
     aimed, _ = by_emitters(context.scene, T.albedo, at, sampler.next_2d())
@@ -134,8 +134,8 @@ def _arriving(
         context.scene, context.objects, T.albedo, context.settings, at, sampler.next_2d(), traced, sampler
     )
     light = aimed + met + opaque(count / (count // TRACED)) * more
-    if context.uses_sky(body):
-        light -= a * context.sky_means(body)[1]
+    if context.uses_sky(obj):
+        light -= a * context.sky_means(obj)[1]
     light = mi.Spectrum(light)
     dr.eval(light, k, known)
     k, known, rows = np.array(k), np.array(known), np.array(light, dtype=float)
@@ -143,6 +143,6 @@ def _arriving(
     points = np.maximum(np.bincount(k, minlength=cells), 1)
     for row, whole in zip(rows, T.albedo.whole):
         total = np.bincount(k, row, cells)
-        Phi.append(total * (body.geometry.area / count / whole))
+        Phi.append(total * (obj.geometry.area / count / whole))
         v.append(max((row**2).sum() / max((total**2 / points).sum(), 1e-30) - 1, 0))
     return np.stack(Phi), np.array(v)

@@ -26,7 +26,7 @@ from halfspace_sss.rendering.paths.lighting import mis_weight
 from halfspace_sss.rendering.paths.path_loop import trace_paths
 
 if TYPE_CHECKING:
-    from halfspace_sss.rendering.object.body import TranslucentObject
+    from halfspace_sss.rendering.object.object import TranslucentObject
     from halfspace_sss.rendering.object.points import SurfacePoint
     from halfspace_sss.rendering.object.settings import Settings
 
@@ -41,13 +41,13 @@ class Gathered:
     """Radiance of orders from two on that leaves an object in the light of a scene.
 
     Args:
-        body: the object.
+        object: of it.
         transfer: of its model.
         values: B of all points, for each channel the constant and the slope over w_o.
         error: standard error of B by the gathering of light, over its mean.
     """
 
-    body: TranslucentObject
+    object: TranslucentObject
     transfer: Transfer
     values: mi.Float
     error: float
@@ -60,7 +60,7 @@ class Gathered:
         B = mi.Spectrum([b + x * out.w.x + y * out.w.y + z * out.w.z for b, x, y, z in rows])
         mu = dr.dot(out.w, out.n_out)
         a = self.transfer.albedo(dr.maximum(mu, 0))
-        alpha = self.body.transport.alpha
+        alpha = self.object.transport.alpha
         if alpha is not None:
             known = alpha.known[1]
             a = known * alpha(out, active)[1] + (1 - known) * a
@@ -80,66 +80,66 @@ class Gathering:
 
     def __init__(self, part: int = 0) -> None:
         self._part, self.seconds = part, (0.0, 0.0)
-        self._bodies: list[TranslucentObject] = []
+        self._objects: list[TranslucentObject] = []
         self._transfers: list[Transfer] = []
         self._light: tuple[list, list] = ([], [])
         self._found: list[TranslucentObject] = []
 
-    def of(self, scene: mi.Scene, bodies: list[TranslucentObject], settings: Settings) -> list[TranslucentObject]:
+    def of(self, scene: mi.Scene, objects: list[TranslucentObject], settings: Settings) -> list[TranslucentObject]:
         """The objects, each with what leaves it in place of its transport.
 
         Raises:
             ValueError: an object is open or has no known area, or light that arrives is not finite.
         """
-        if not same_objects(bodies, self._bodies):
-            spread = [spreads(body) for body in bodies]
-            for body, one in zip(bodies, spread):
+        if not same_objects(objects, self._objects):
+            spread = [spreads(obj) for obj in objects]
+            for obj, one in zip(objects, spread):
                 if one:
-                    _check(body)
+                    _check(obj)
             started = clock()
             samples = int(SAMPLES * PART) if self._part else SAMPLES
             made = [
-                transfer(body, samples=samples, seed=SEED + self._part) if one else None
-                for body, one in zip(bodies, spread)
+                transfer(obj, samples=samples, seed=SEED + self._part) if one else None
+                for obj, one in zip(objects, spread)
             ]
-            self._transfers, self._bodies, self._light = made, bodies, ([], [])
+            self._transfers, self._objects, self._light = made, objects, ([], [])
             self.seconds = (clock() - started, 0.0)
         state = light_state(scene)
         if state[0] != self._light[0] or not self._found:
             started = clock()
             seeds = (1000 * self._part,) if self._part else (0, 1)
             gathered = [
-                body if T is None else _leaving(scene, bodies, k, T, settings, seeds)
-                for k, (body, T) in enumerate(zip(bodies, self._transfers))
+                obj if T is None else _leaving(scene, objects, k, T, settings, seeds)
+                for k, (obj, T) in enumerate(zip(objects, self._transfers))
             ]
             self._found = [
-                g if isinstance(g, type(body)) else replace(body, transport=None, proposals=None, gathered=g)
-                for g, body in zip(gathered, bodies)
+                g if isinstance(g, type(obj)) else replace(obj, transport=None, proposals=None, gathered=g)
+                for g, obj in zip(gathered, objects)
             ]
             self._light, self.seconds = state, (self.seconds[0], clock() - started)
         return self._found
 
     def told(self) -> list[str]:
         """Of each object: points, and the noise of transfer and light."""
-        results = [body.gathered for body in self._found if body.gathered is not None]
+        results = [obj.gathered for obj in self._found if obj.gathered is not None]
         return [
-            f"light of {g.body.geometry.name} gathered at {len(g.transfer.points)} points: noise of the transfer "
+            f"light of {g.object.geometry.name} gathered at {len(g.transfer.points)} points: noise of the transfer "
             f"{g.transfer.error:.1%} a point, of the light {g.error:.1%}"
             for g in results
         ]
 
 
-def spreads(body: TranslucentObject) -> bool:
+def spreads(obj: TranslucentObject) -> bool:
     """Whether light leaves elsewhere than it entered, by orders that a transport has."""
-    return body.transport is not None and not body.transport.is_delta
+    return obj.transport is not None and not obj.transport.is_delta
 
 
-def _check(body: TranslucentObject) -> None:
-    result = body.geometry
+def _check(obj: TranslucentObject) -> None:
+    result = obj.geometry
     if not result.closed or not result.area > 0:
         lacks = "is not closed" if not result.closed else f"is a {result.shape.class_name()} without known area"
         raise ValueError(f"light must be sampled for object {result.name}, which {lacks}, got gathered")
-    if body.surface.inside.varying is not None:
+    if obj.surface.inside.varying is not None:
         raise ValueError(f"light must be sampled for object {result.name}, whose medium varies, got gathered")
 
 
@@ -151,19 +151,21 @@ def light_state(scene: mi.Scene) -> tuple[list, list]:
 
 
 def _leaving(
-    scene: mi.Scene, bodies: list[TranslucentObject], k: int, T: Transfer, settings: Settings, seeds: tuple[int, ...]
+    scene: mi.Scene, objects: list[TranslucentObject], k: int, T: Transfer, settings: Settings, seeds: tuple[int, ...]
 ) -> Gathered:
     """B of object k, in parts whose differences tell the noise."""
-    parts = np.stack([T @ _incident(scene, bodies, T, settings, 2 * k + seed) for seed in seeds])
+    parts = np.stack([T @ _incident(scene, objects, T, settings, 2 * k + seed) for seed in seeds])
     B = parts.mean(axis=0)
     if not np.isfinite(B).all():
-        raise ValueError(f"light at object {bodies[k].geometry.name} must be finite, got NaN or infinity")
+        raise ValueError(f"light at object {objects[k].geometry.name} must be finite, got NaN or infinity")
     spread = parts[..., 0].var(axis=0, ddof=1).mean() if len(parts) > 1 else np.nan
     error = np.sqrt(spread / len(parts)) / max(float(B[..., 0].mean()), 1e-30)
-    return Gathered(bodies[k], T, mi.Float(B.astype(np.float32).ravel()), float(error))
+    return Gathered(objects[k], T, mi.Float(B.astype(np.float32).ravel()), float(error))
 
 
-def _incident(scene: mi.Scene, bodies: list[TranslucentObject], T: Transfer, settings: Settings, seed: int) -> Incident:
+def _incident(
+    scene: mi.Scene, objects: list[TranslucentObject], T: Transfer, settings: Settings, seed: int
+) -> Incident:
     """Incident radiance at all points."""
     count = len(T.points)
     n = int(np.clip(DIRECTIONS // (2 * count), FEWEST, MOST)) // TRACED * TRACED
@@ -178,7 +180,7 @@ def _incident(scene: mi.Scene, bodies: list[TranslucentObject], T: Transfer, set
     at = GatheringPoint(*(dr.gather(type(v), v, j) for v in (T.points.p, T.points.n, T.points.n_out)))
     u, v = (_stratified(sampler, j, s, n) for _ in range(2))
     aimed, w_e = by_emitters(scene, T.albedo, at, u)
-    met, more, a, w_c = by_cosine(scene, bodies, T.albedo, settings, at, v, traced, sampler)
+    met, more, a, w_c = by_cosine(scene, objects, T.albedo, settings, at, v, traced, sampler)
     values = [v + dr.zeros(mi.Float, count * n) for v in (aimed, met + TRACED * more, a, dr.mean(a), w_e, w_c)]
     dr.eval(values)
     j, s = lane // n, lane % n
@@ -235,7 +237,7 @@ def by_emitters(scene: mi.Scene, albedo: Albedo, at: GatheringPoint, u: mi.Point
 
 
 def by_cosine(
-    scene: mi.Scene, bodies: list[TranslucentObject], albedo: Albedo, settings: Settings, at: GatheringPoint,
+    scene: mi.Scene, objects: list[TranslucentObject], albedo: Albedo, settings: Settings, at: GatheringPoint,
     u: mi.Point2f, traced: mi.Bool, sampler: mi.Sampler,
 ) -> tuple[mi.Spectrum, mi.Spectrum, mi.Spectrum, mi.Vector3f]:  # fmt: skip
     """By directions of the cosine: light of emitters that they meet, what other surfaces send along some, a, and w."""
@@ -250,5 +252,5 @@ def by_cosine(
     met = dr.select(shines, mis_weight(pdf, density) * emitter.eval(si, shines), 0)
     hidden = replace(settings, hide_emitters=True, light="sampled", max_depth=max(settings.max_depth - 1, -1) or 1)
     on = si.is_valid() & traced
-    parts, _ = trace_paths(scene, bodies, hidden, sampler, ray, on, scattered=True)
+    parts, _ = trace_paths(scene, objects, hidden, sampler, ray, on, scattered=True)
     return a * met, dr.select(on, a * (parts[0] + parts[1]), 0), a, w

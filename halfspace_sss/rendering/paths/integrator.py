@@ -60,7 +60,7 @@ def _class(variant: str) -> type:
             self.timed = float(props.get("timeout", -1.0)) > 0
             self.settings = read_settings(props)
             self.mm_per_unit = self.settings.mm_per_unit
-            self._bodies = TranslucentObjects(self.settings)
+            self._objects = TranslucentObjects(self.settings)
             self.gathering = Gathering()
             self._control_variates = ControlVariates()
             self._controlled: list[TranslucentObject] | None = None  # while an image is rendered
@@ -73,8 +73,8 @@ def _class(variant: str) -> type:
                 return self._prepared(scene)
 
         def _prepared(self, scene: mi.Scene) -> list[TranslucentObject]:
-            objects = self._bodies.of(scene)
-            if self._bodies.choices.light != "gathered":
+            objects = self._objects.of(scene)
+            if self._objects.choices.light != "gathered":
                 return objects
             return self.gathering.of(scene, objects, self.settings)
 
@@ -106,7 +106,7 @@ def _class(variant: str) -> type:
         ) -> list[TranslucentObject] | None:
             """The objects with light gathered as control variate, where that is asked for and pays."""
             spp, pixels = spp or sensor.sampler().sample_count(), int(dr.prod(sensor.film().crop_size()))
-            if self._bodies.choices.light != "corrected":
+            if self._objects.choices.light != "corrected":
                 return None
             return self._control_variates.of(scene, objects, self.settings, int(mi.UInt32(seed)[0]), spp, pixels)
 
@@ -138,7 +138,7 @@ def _class(variant: str) -> type:
         @property
         def choices(self) -> Choices:
             """What stands for "auto"; known when a scene has been prepared."""
-            return self._bodies.choices
+            return self._objects.choices
 
         @property
         def gathered(self) -> list[str]:
