@@ -262,7 +262,7 @@ def _training(row: WayTrade, job: Job) -> str:
 
 def _off(row: WayTrade) -> str:
     """What is known of a bias, in words."""
-    return "exact" if row.way == PATH_TRACED else f"{row.told_bias} % off"
+    return "exact" if row.is_exact else f"{row.told_bias} % off"
 
 
 def _time(seconds: float) -> str:

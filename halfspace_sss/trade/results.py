@@ -61,8 +61,13 @@ class WayTrade:
 
     @property
     def told_bias(self) -> str:
-        """The bias in percent, with its standard error or as a bound; walks have none."""
-        return "exact" if self.way == PATH_TRACED else self.off.told()
+        """The bias in percent, with its standard error or as a bound."""
+        return "exact" if self.is_exact else self.off.told()
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether it has no bias: walks where no delta light shines, see `sampling.sample_blur`."""
+        return self.way == PATH_TRACED and self.bias2 == self.bias2_error == 0
 
     @property
     def bias(self) -> float:

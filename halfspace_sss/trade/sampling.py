@@ -16,6 +16,7 @@ from halfspace_sss.backend import clock
 from halfspace_sss.rendering.object.settings import variant_channels
 from halfspace_sss.rendering.paths.gathering import PART
 from halfspace_sss.rendering.paths.integrator import is_bssrdf
+from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED
 from halfspace_sss.trade.exits import Exits
 from halfspace_sss.trade.statistics import RadianceEstimate, seeded
 from halfspace_sss.trade.ways import Stage, Way
@@ -23,6 +24,7 @@ from halfspace_sss.trade.ways import Stage, Way
 LANES = 2**18  # of a launch
 PILOT, FEWEST = 64, 8  # samples of each exit by which the time is foreseen, and of a launch that is worth it
 LEAST_SHARE = 0.2  # of the time of a launch that its samples take
+BLUR = 8.0  # 0.4 radians
 
 
 @dataclass(eq=False)
@@ -38,6 +40,7 @@ class Sampled:
         overhead: seconds of a launch of hardly any samples.
         launches: (samples of all exits, seconds) of each larger launch.
         memory: most bytes that Dr.Jit held while it ran.
+        blur: of walks in a scene with delta lights, what of their light is blurred, see `sample_blur`.
     """
 
     estimate: RadianceEstimate
@@ -48,6 +51,7 @@ class Sampled:
     overhead: float
     memory: int = 0
     launches: list[tuple[int, float]] = field(default_factory=list)
+    blur: RadianceEstimate | None = None
 
     @property
     def seconds(self) -> float:
@@ -133,6 +137,26 @@ def sample_more(
         sampled.launches.append((exits.n * each, took))
 
 
+def sample_blur(stage: Stage, exits: Exits, seed: int, samples: int) -> RadianceEstimate:
+    """Light of delta lights that walks find by no strategy, but spread over a cone, see `light.small_emitters`.
+
+    Those are the same paths with and without it, the cone so wide that few samples tell.
+
+    Args:
+        stage: the scene.
+        exits: of the object.
+        seed: of the samples.
+        samples: of each exit.
+    """
+    integrators = [stage.integrator(Way(PATH_TRACED, blur=blur)) for blur in (0.0, BLUR)]
+    estimate, most = RadianceEstimate(variant_channels(), exits.n), max(LANES // exits.n, 2)
+    while (each := min(samples - estimate.samples, most)) > 0:
+        number, rays = seeded(seed, 33, estimate.samples), exits.rays(each)
+        without, spread = (_sampled(stage, integrator, rays, number) for integrator in integrators)
+        estimate.add(*_sums([b - a for a, b in zip(without, spread)], each), each)
+    return estimate
+
+
 def _affordable(sampled: Sampled, n: int, left: float) -> int:
     """Samples of each exit that the rest of the time allows."""
     return int(max(left - sampled.overhead, 0) / (sampled.seconds * n))
@@ -143,23 +167,36 @@ def _launch(
 ) -> tuple[int, float]:
     """`each` samples of every exit; bytes and seconds that it took."""
     rays = exits.rays(each)
-    sampler = mi.load_dict({"type": "independent"})
     dr.flush_malloc_cache()
     dr.detail.malloc_clear_statistics()
     started = clock()
-    sampler.seed(seed, exits.n * each)
-    L = radiance(stage.scene, integrator, sampler, rays)
+    L = _sampled(stage, integrator, rays, seed)
+    first, second = _sums(L, each)
+    took = clock() - started
+    memory = int(dr.detail.malloc_watermark(dr.backend_v(mi.Float)))
+    estimate.add(first, second, each)
+    estimate.add_bright(np.array([c.numpy() for c in L]), each)
+    return memory, took
+
+
+def _sampled(stage: Stage, integrator: Any, rays: Any, seed: int) -> list[Any]:
+    """Radiance of rays, by channel."""
+
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(seed, dr.width(rays))
+    return radiance(stage.scene, integrator, sampler, rays)
+
+
+def _sums(L: list[Any], each: int) -> tuple[np.ndarray, np.ndarray]:
+    """Of values and of squares over the samples of each exit, (channels, n)."""
+
     sums = [dr.block_sum(v, each) for c in L for v in (c, c * c)]
     dr.eval(sums)
     dr.sync_thread()
-    took = clock() - started
-    memory = int(dr.detail.malloc_watermark(dr.backend_v(mi.Float)))
     rows = np.array([s.numpy() for s in sums], dtype=np.float64)
     if not np.isfinite(rows).all():
         raise ValueError(f"samples must be finite, got {int((~np.isfinite(rows)).sum())} exits that are not")
-    estimate.add(rows[0::2], rows[1::2], each)
-    estimate.add_bright(np.array([c.numpy() for c in L]), each)
-    return memory, took
+    return rows[0::2], rows[1::2]
 
 
 def radiance(scene: Any, integrator: Any, sampler: Any, ray: Any) -> list[Any]:

@@ -85,6 +85,12 @@ def mean_square(a: RadianceEstimate, b: RadianceEstimate) -> Number:
     return _ratio(square, b.mean.mean(axis=0), 2)
 
 
+def mean_square_of(difference: RadianceEstimate, b: RadianceEstimate) -> Number:
+    """Mean square of differences over the square of the mean radiance of b; may come out below 0 in noise."""
+    square = (difference.mean**2 - difference.variance).mean(axis=0)
+    return _ratio(square, b.mean.mean(axis=0), 2)
+
+
 def mean_square_of_parts(parts: tuple[RadianceEstimate, RadianceEstimate], b: RadianceEstimate, kept: float) -> Number:
     """Mean squared difference of two independent parts over the square of the mean radiance of b."""
     one, two = parts

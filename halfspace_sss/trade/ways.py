@@ -10,6 +10,7 @@ import mitsuba as mi
 
 from halfspace_sss.checks import check_choice
 from halfspace_sss.interface.model import model_class, models
+from halfspace_sss.rendering.light.small_emitters import is_delta
 from halfspace_sss.rendering.object.body import KnowsUnit, millimetres, translucent_shapes
 from halfspace_sss.rendering.object.registry import AUTO, model_names
 from halfspace_sss.rendering.object.shape import is_instance
@@ -31,12 +32,14 @@ class Way:
         orders: "multiple" leaves single scattering out; None takes the orders of the scene.
         light: "sampled" or "gathered", see `Settings`.
         part: of gathered light, see `Gathering`; 0 for all of it.
+        blur: of walks, see `translucent_walk`.
     """
 
     model: str
     orders: str | None = None
     light: str = "sampled"
     part: int = 0
+    blur: float = 1.0
 
     @property
     def halves(self) -> tuple[Way, ...]:
@@ -104,12 +107,17 @@ class Stage:
         """Ids of the objects."""
         return [shape.id() for shape in self.shapes]
 
+    @property
+    def blurs(self) -> bool:
+        """Whether walks spread light of a delta light over a blur, so that they are not exact."""
+        return any(map(is_delta, self.scene.emitters()))
+
     def integrator(self, way: Way) -> Any:
         """The integrator of a way, which keeps what it has made ready; the scene is the same for all."""
         if way not in self._integrators:
-            plugin = {"type": "translucent_walk"} | self.settings
+            plugin = {"type": "translucent_walk", "blur": way.blur} | self.settings
             if way.model != PATH_TRACED:
-                plugin |= {"type": "bssrdf", **self.bssrdf, "model": way.model, "light": way.light}
+                plugin = {**self.settings, "type": "bssrdf", **self.bssrdf, "model": way.model, "light": way.light}
                 plugin |= {"orders": way.orders} if way.orders else {}
                 plugin["train_seconds"] = 0.0  # who asks does not wait for the training of an object
             self._integrators[way] = mi.load_dict(plugin)

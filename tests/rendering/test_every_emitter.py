@@ -259,8 +259,8 @@ def _shape(name: str) -> dict:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("shape", ["sphere", "cube", "bunny"])
-def test_what_is_advised_as_exact_under_a_point_light_is_within_a_percent_of_a_ball_of_light(shape: str) -> None:
-    """All orders; the object is 20 to 46 mean free paths across."""
+def test_what_is_advised_under_a_point_light_is_within_a_percent_of_a_ball_of_light_and_says_so(shape: str) -> None:
+    """All orders; the object is 20 to 46 mean free paths across. Nothing is called exact, as some light is blurred."""
     found = []
     lamp, _ = EMITTERS["point"]()
     ball = {"ball": _ball(PLACE, _irradiance(lamp["lamp"], PLACE), 0.05)}
@@ -269,11 +269,9 @@ def test_what_is_advised_as_exact_under_a_point_light_is_within_a_percent_of_a_b
         scene["object"] |= _shape(shape)
         found.append(_means(scene, 2**13 if shape == "bunny" else 2**12, 1 + 100 * k).mean(axis=1))
         if k == 0:
-            advice = recommend(
-                mi.load_dict(scene), tolerance=0.05, assess_seconds=0.4, models=["lambert"], flip=False
-            ).objects[0]
-            exact = [option.way for option in advice.options if "exact" in option.why]
-            assert exact == ["path_traced"]
+            advice = recommend(mi.load_dict(scene), tolerance=0.05, assess_seconds=0.4, models=["lambert"], flip=False)
+            assert advice.objects[0].way == "path_traced" and "exact" not in str(advice)
+            assert 0 < advice.assessment.objects[0].traced.bias_bound < 0.01
     mean, error = found[1].mean(), np.hypot(*(x.std(ddof=1) / np.sqrt(len(x)) for x in found))
     assert error < 0.005 * mean
     assert abs(found[0].mean() / mean - 1) < 0.01

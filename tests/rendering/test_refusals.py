@@ -28,6 +28,7 @@ PLUGINS = [
     ({"type": "bssrdf", "mm_per_unit": -1.0}, "mm_per_unit must be .*got -1.0"),
     ({"type": "translucent_walk", "entries": 3}, "parameter of translucent_walk must be .*got 'entries'"),
     ({"type": "translucent_walk", "connection_share": 2.0}, "connection_share must be .*got 2.0"),
+    ({"type": "translucent_walk", "blur": -1.0}, "blur must be .*got -1.0"),
 ]
 
 

@@ -24,7 +24,7 @@ import mitsuba as mi
 import numpy as np
 
 from halfspace_sss.rendering.light.small_emitters import SmallEmitters, spread
-from halfspace_sss.rendering.object.points import channel_mean, opposed, sided
+from halfspace_sss.rendering.object.points import channel_mean, opaque, opposed, sided
 from halfspace_sss.rendering.walk.media import Coefficients, WalkMedia
 from halfspace_sss.rendering.walk.random_walk import (
     Event,
@@ -394,14 +394,16 @@ class InnerLights:
         media: the objects.
         emitters: the lights.
         tables: of each, what Dr.Jit's registry calls it, `pointer`, and the object `around` it.
+        blur: scale of the cone; 0 leaves its light out.
     """
 
     media: WalkMedia
     emitters: list[mi.Emitter]
     tables: dict[str, mi.UInt32 | mi.Int32]
+    blur: float
 
     @classmethod
-    def of(cls, media: WalkMedia) -> InnerLights | None:
+    def of(cls, media: WalkMedia, blur: float = 1.0) -> InnerLights | None:
         """Those of the objects of a scene; None if there are none."""
         if media.inner is None or not media.inner.lights:
             return None
@@ -409,7 +411,7 @@ class InnerLights:
         pointers = [int(dr.reinterpret_array(mi.UInt32, mi.EmitterPtr(emitter))[0]) for emitter in emitters]
         tables = {"pointer": mi.UInt32(pointers), "around": mi.Int32(around)}
         dr.make_opaque(tables)
-        return cls(media, list(emitters), tables)
+        return cls(media, list(emitters), tables, blur)
 
     def _drawn(self, k: mi.Int32, rng: mi.PCG32, active: mi.Bool) -> tuple[mi.Emitter | mi.EmitterPtr, mi.Bool]:
         """One of the lights, and whether it is in object k."""
@@ -433,7 +435,7 @@ class InnerLights:
     def spread(self, k: mi.Int32, ray: mi.Ray3f, rng: mi.PCG32, active: mi.Bool) -> mi.Spectrum:
         """Radiance of a light along a ray in object k, spread over a wide cone, over its probability."""
         emitter, here = self._drawn(k, rng, active)
-        L = spread(self.media.inner.scene, emitter, ray, mi.Float(CONE), here)
+        L = spread(self.media.inner.scene, emitter, ray, opaque(CONE * self.blur), here)
         at = dr.zeros(mi.Interaction3f)
         at.p = ray.o
         ds, _ = emitter.sample_direction(at, mi.Point2f(0.5), here)

@@ -20,10 +20,11 @@ from halfspace_sss.rendering.walk.emitter_connections import EmitterDirections, 
 from halfspace_sss.rendering.walk.media import WalkMedia
 from halfspace_sss.rendering.walk.path_loop import FirstExits, LightVisitor, PathTracer
 
-PARAMETERS = ("mm_per_unit", "max_depth", "rr_depth", "hide_emitters", "connection_share")
+PARAMETERS = ("mm_per_unit", "max_depth", "rr_depth", "hide_emitters", "connection_share", "blur")
 SAMPLES_PER_LAUNCH = 2**19
 LANES = 2**14  # fastest of 2**12 to 2**18 on 2 cores
 FOREVER = 2**31 - 1
+WIDEST = 20.0  # blur: 1 and 3 radians
 Keep = Callable[[FirstExits], None]
 
 
@@ -42,7 +43,9 @@ def _class(variant: str) -> type:
 
         Parameters: `mm_per_unit` (1), `max_depth` (-1: no limit; counts surfaces seen from outside), `rr_depth` (5),
         `hide_emitters` (false), `connection_share` (0.5; probability of a connection with a small emitter from a
-        scattering event near the boundary, 0 leaves all light to chance).
+        scattering event near the boundary, 0 leaves all light to chance), `blur` (1; scale of the cones over
+        which delta lights are spread where no strategy reaches them: less has less bias and more noise, 0 leaves that
+        light out).
         """
 
         def __init__(self, props: mi.Properties) -> None:
@@ -53,6 +56,7 @@ def _class(variant: str) -> type:
             self.rr_depth = _depth("rr_depth", int(props.get("rr_depth", 5)))
             self.hidden = bool(props.get("hide_emitters", False))
             self.connection_share = _share("connection_share", float(props.get("connection_share", 0.5)))
+            self.blur = _scale("blur", float(props.get("blur", 1.0)))
             self._prepared: tuple[int, list, tuple, Any] = (0, [], ([], []), None)
 
         def tracer(self, scene: mi.Scene) -> PathTracer:
@@ -61,7 +65,8 @@ def _class(variant: str) -> type:
             media, small = self._prepared[-1], SmallEmitters.of(scene)
             connections = find_connections(scene, media, small, self.connection_share)
             directions = connections and EmitterDirections(scene, media, small)
-            visitor = LightVisitor(scene, media, small, connections, directions, InnerLights.of(media))
+            inner = InnerLights.of(media, self.blur)
+            visitor = LightVisitor(scene, media, small, connections, directions, inner, self.blur)
             return PathTracer(visitor, self.max_depth, self.rr_depth, self.hidden)
 
         def render(
@@ -88,7 +93,8 @@ def _class(variant: str) -> type:
         render_forward = render_backward = _refuse_derivatives
 
         def to_string(self) -> str:
-            return f"TranslucentWalk[mm_per_unit = {self.mm_per_unit:g}, max_depth = {self.max_depth}]"
+            blur = f", blur = {self.blur:g}" if self.blur != 1 else ""
+            return f"TranslucentWalk[mm_per_unit = {self.mm_per_unit:g}, max_depth = {self.max_depth}{blur}]"
 
     return TranslucentWalk
 
@@ -191,6 +197,12 @@ def _widened(ray: mi.Ray3f, n: int) -> mi.Ray3f:
 def _positive(name: str, value: float) -> float:
     if not (math.isfinite(value) and value > 0):
         raise ValueError(f"{name} must be finite and > 0, got {value!r}")
+    return value
+
+
+def _scale(name: str, value: float) -> float:
+    if not 0 <= value <= WIDEST:
+        raise ValueError(f"{name} must be in [0, {WIDEST:g}], got {value!r}")
     return value
 
 

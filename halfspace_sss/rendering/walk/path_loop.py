@@ -15,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 
 from halfspace_sss.rendering.light.small_emitters import NARROW, WIDE, SmallEmitters
-from halfspace_sss.rendering.object.points import lifted, sided
+from halfspace_sss.rendering.object.points import lifted, opaque, sided
 from halfspace_sss.rendering.walk.emitter_connections import (
     Departure,
     EmitterDirections,
@@ -81,6 +81,7 @@ class LightVisitor:
         connections: of events with light subpaths of small emitters, if there are any.
         directions: from events to small emitters, where connections cannot find their light.
         inner_lights: delta lights inside objects, if there are any.
+        blur: scale of the cones over which delta lights outside are spread; 0 leaves their light out.
     """
 
     scene: mi.Scene
@@ -89,6 +90,7 @@ class LightVisitor:
     connections: SubpathConnections | None
     directions: EmitterDirections | None
     inner_lights: InnerLights | None = None
+    blur: float = 1.0
 
     def event(self, walk: Walk, record: LightRecord, event: Event) -> tuple[Walk, LightRecord]:
         # ---- inner lights
@@ -191,7 +193,7 @@ class LightVisitor:
             emitter = walk.o + w_0 * dr.norm(self.scene.bbox().extents())
             active &= ~(record.connected & self.connections.covers(which, emitter, w_0, record.pivot))
             directed = active & record.directed
-        radius = dr.select(directed, NARROW, WIDE)
+        radius = dr.select(directed, NARROW, opaque(WIDE * self.blur))
         ray = mi.Ray3f(walk.o, walk.d)
         L = self.small.spread(which, ray, radius, active)
         if self.connections is not None:
