@@ -35,7 +35,7 @@ def sampled(task: Task) -> dict[str, Any]:
     from figures.studies.paper_flow import fit_space_flow, mesh_arrays, on_surface, rmsd
     from full_geometry.learning.training import train_by_cpu
     from full_geometry.models.storing import frame_of
-    from halfspace_sss.rendering.object.body import object_of
+    from halfspace_sss.rendering.object.objects import object_of
 
     prepare()
     p, n = task.params, task.params["points"]

@@ -68,7 +68,7 @@ def _weights(task: Task) -> tuple[dict[str, Path], dict[str, np.ndarray]]:
     from full_geometry.learning.training import train_by_cpu
     from full_geometry.models.storing import CENTRES, KIND
     from halfspace_sss.neural.store import load_weights, save_weights
-    from halfspace_sss.rendering.object.body import object_of
+    from halfspace_sss.rendering.object.objects import object_of
 
     p, folders = task.params, {name: task.folder / name for name in ("probes", "patches")}
     obj = object_of(*shape_of("bunny", task.folder))

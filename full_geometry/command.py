@@ -14,7 +14,7 @@ from halfspace_sss.checks import check_count
 from halfspace_sss.interface.model import models as half_space_models
 from halfspace_sss.neural.store import check_weights_folder, load_weights
 from halfspace_sss.progress import NamedProgress
-from halfspace_sss.rendering.object.body import TranslucentObject, object_of, outermost
+from halfspace_sss.rendering.object.objects import TranslucentObject, object_of, outermost
 from halfspace_sss.rendering.object.registry import model_names
 from halfspace_sss.rendering.scenes.learners import LearntObject, ObjectError
 

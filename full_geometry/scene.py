@@ -15,8 +15,8 @@ from full_geometry.models.storing import CHECKSUMS, KIND, find_weights, load
 from full_geometry.object.patches import AREA_SHARE, LearntProposals, PatchTable
 from halfspace_sss.neural.store import checksum_of, load_weights
 from halfspace_sss.physics.medium import Medium
-from halfspace_sss.rendering.object.body import TranslucentObject, check_geometry, check_surface
 from halfspace_sss.rendering.object.half_space import HalfSpaceProposals, area_share
+from halfspace_sss.rendering.object.objects import TranslucentObject, check_geometry, check_surface
 from halfspace_sss.rendering.object.points import ObjectModel, PositionSampler, RadialTable
 from halfspace_sss.rendering.object.settings import AUTOMATIC, Settings
 from halfspace_sss.rendering.object.shape import Geometry

@@ -115,7 +115,7 @@ def train(case: LitObject, seconds: float, folder: Path) -> float:
 
     from full_geometry.learning.training import train_by_cpu
     from full_geometry.models.storing import KIND, find_weights
-    from halfspace_sss.rendering.object.body import object_of
+    from halfspace_sss.rendering.object.objects import object_of
     from halfspace_sss.rendering.scenes.scene_files import open_scene
 
     scene = open_scene(case.description(16, folder), KIND)

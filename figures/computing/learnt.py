@@ -142,7 +142,7 @@ def _trained(task: Task, scene: dict[str, Any], name: str) -> dict[str, Any]:
     from full_geometry.learning.training import train_by_cpu
     from full_geometry.models.storing import KIND
     from halfspace_sss.neural.store import load_weights
-    from halfspace_sss.rendering.object.body import object_of
+    from halfspace_sss.rendering.object.objects import object_of
     from halfspace_sss.rendering.scenes.scene_files import open_scene
 
     obj = object_of(open_scene(scene, KIND), None, None, name)

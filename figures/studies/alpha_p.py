@@ -28,7 +28,7 @@ from full_geometry.object.features import Side, first_event, n_side, side_featur
 from full_geometry.object.patches import Patches, PatchSampler, PatchWeights, cluster
 from halfspace_sss.neural.perceptron import Perceptron
 from halfspace_sss.neural.training.fit import Objective, fit
-from halfspace_sss.rendering.object.body import TranslucentObject
+from halfspace_sss.rendering.object.objects import TranslucentObject
 from halfspace_sss.rendering.object.points import SurfacePoint, opaque
 
 CLEAR = 1e-4  # of the size of the object: where the ray that finds a face begins

@@ -71,7 +71,7 @@ def _made(
     from figures.studies.flow_training import FlowRecipe
     from figures.studies.rivals import sampler_table
     from full_geometry.learning.training import train_by_cpu
-    from halfspace_sss.rendering.object.body import object_of
+    from halfspace_sss.rendering.object.objects import object_of
 
     def show(what: str, done: int, total: int) -> None:
         bar.show(done, total, what)

@@ -15,7 +15,7 @@ import numpy as np
 from full_geometry.object.features import ObjectFrame, PreparedExit, Side
 from full_geometry.object.patches import Patches, PatchSampler, PatchTable, PatchWeights, mesh_faces
 from halfspace_sss.neural.perceptron import Perceptron, relu
-from halfspace_sss.rendering.object.body import TranslucentObject
+from halfspace_sss.rendering.object.objects import TranslucentObject
 from halfspace_sss.rendering.object.points import CosineProposals, EntrySample, Point, SurfacePoint, opaque, turned
 
 # ---- The square [0, 1)² laid onto each patch of a surface, so that equal areas stay equal ----------

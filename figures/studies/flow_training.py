@@ -32,7 +32,7 @@ from full_geometry.object.pairs import trace_exits
 from full_geometry.object.patches import Patches, PatchSampler
 from halfspace_sss.checks import check_count
 from halfspace_sss.neural.training.fit import CpuSchedule, Objective, Source, fit
-from halfspace_sss.rendering.object.body import TranslucentObject
+from halfspace_sss.rendering.object.objects import TranslucentObject
 from halfspace_sss.rendering.object.points import EntrySample, cosine_above, opaque, place
 from halfspace_sss.tracing.walk import generator, pass_seed
 

@@ -22,7 +22,7 @@ from figures.studies.paper_network import placed
 from full_geometry.models.object_model import FullGeometry
 from full_geometry.object.features import ObjectFrame
 from halfspace_sss.neural.training.fit import ADAM, CpuSchedule, Descent, Objective, fit
-from halfspace_sss.rendering.object.body import TranslucentObject
+from halfspace_sss.rendering.object.objects import TranslucentObject
 from halfspace_sss.rendering.object.points import SurfacePoint, channel_mean, cosine_above, surface_point
 from halfspace_sss.tracing.walk import generator, pass_seed
 

@@ -25,7 +25,7 @@ from halfspace_sss.neural.store import check_weights_folder, load_weights, save_
 from halfspace_sss.neural.training.fit import ADAM, CpuSchedule, Descent, Objective, Source, fit
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.provenance import provenance
-from halfspace_sss.rendering.object.body import TranslucentObject, object_of
+from halfspace_sss.rendering.object.objects import TranslucentObject, object_of
 from halfspace_sss.rendering.object.points import SurfacePoint
 from halfspace_sss.rendering.scenes.learners import LearntObject, ObjectError
 from halfspace_sss.tracing.walk import generator, pass_seed

@@ -26,8 +26,8 @@ from full_geometry.object.pairs import EntryProposals, Numbers
 from full_geometry.object.patches import AREA_SHARE, LearntProposals, PatchTable
 from halfspace_sss.backend import kernel_seconds
 from halfspace_sss.neural.store import load_weights
-from halfspace_sss.rendering.object.body import TranslucentObject, object_of
 from halfspace_sss.rendering.object.half_space import HalfSpaceProposals
+from halfspace_sss.rendering.object.objects import TranslucentObject, object_of
 from halfspace_sss.rendering.object.points import (
     ObjectModel,
     PositionSampler,

@@ -30,8 +30,8 @@ from halfspace_sss.checks import check_choice, check_count
 from halfspace_sss.interface.model import bssrdf
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.progress import NamedProgress
-from halfspace_sss.rendering.object.body import TranslucentObject, object_of, refuse
 from halfspace_sss.rendering.object.half_space import HalfSpaceTransport
+from halfspace_sss.rendering.object.objects import TranslucentObject, object_of, refuse
 from halfspace_sss.rendering.object.points import SurfacePoint, Transport
 from halfspace_sss.rendering.object.registry import lookup, model_names
 from halfspace_sss.rendering.object.settings import Settings

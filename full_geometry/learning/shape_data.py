@@ -18,7 +18,7 @@ from full_geometry.models.descriptors import ALONE, describe, end, medium, mixed
 from full_geometry.models.neural_shape import ALBEDO, ETA, SIZE, Backbone, G
 from full_geometry.object.pairs import EntryProposals, trace_exits
 from halfspace_sss.physics.medium import Medium
-from halfspace_sss.rendering.object.body import TranslucentObject, object_of
+from halfspace_sss.rendering.object.objects import TranslucentObject, object_of
 from halfspace_sss.rendering.object.points import SurfacePoint
 from halfspace_sss.tracing.walk import generator, pass_seed
 

@@ -38,7 +38,7 @@ from halfspace_sss.neural.store import check_weights_folder, to_json
 from halfspace_sss.neural.training.work_folder import CHECKPOINT, claim
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.provenance import check_folder, provenance, write_atomically
-from halfspace_sss.rendering.object.body import TranslucentObject, object_of
+from halfspace_sss.rendering.object.objects import TranslucentObject, object_of
 from halfspace_sss.rendering.object.points import SurfacePoint
 from halfspace_sss.rendering.scenes.camera_walks import TRIAL
 

@@ -18,7 +18,7 @@ from full_geometry.object.features import FirstEvent, first_event
 from halfspace_sss.neural.features import medium_features
 from halfspace_sss.physics.backbone import length_scale
 from halfspace_sss.physics.medium import Medium
-from halfspace_sss.rendering.object.body import TranslucentObject
+from halfspace_sss.rendering.object.objects import TranslucentObject
 from halfspace_sss.rendering.object.points import SurfacePoint, opaque, refract_in
 from halfspace_sss.tracing.walk import generator, pass_seed
 

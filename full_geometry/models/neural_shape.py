@@ -43,7 +43,7 @@ from halfspace_sss.lazy import once
 from halfspace_sss.neural.perceptron import Perceptron
 from halfspace_sss.neural.store import checksum_of, load_weights
 from halfspace_sss.physics.medium import Medium
-from halfspace_sss.rendering.object.body import TranslucentObject
+from halfspace_sss.rendering.object.objects import TranslucentObject
 from halfspace_sss.rendering.object.points import SurfacePoint, opaque, refract_in
 from halfspace_sss.tracing.walk import generator, pass_seed
 

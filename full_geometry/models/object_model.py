@@ -32,7 +32,7 @@ from full_geometry.object.features import (
 from halfspace_sss.interface.model import BSSRDF, bssrdf
 from halfspace_sss.neural.perceptron import Perceptron
 from halfspace_sss.physics import fresnel
-from halfspace_sss.rendering.object.body import TranslucentObject
+from halfspace_sss.rendering.object.objects import TranslucentObject
 from halfspace_sss.rendering.object.points import SurfacePoint, opaque, plane_query
 
 FLOOR = 1e-2  # reflectance of the floor, over that of the half-space

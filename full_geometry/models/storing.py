@@ -23,7 +23,7 @@ from full_geometry.object.patches import Patches, PatchSampler
 from halfspace_sss.interface.model import bssrdf
 from halfspace_sss.neural.store import load_weights, save_weights, weights_folder
 from halfspace_sss.physics.medium import Medium
-from halfspace_sss.rendering.object.body import TranslucentObject
+from halfspace_sss.rendering.object.objects import TranslucentObject
 from halfspace_sss.rendering.object.points import opaque
 from halfspace_sss.rendering.object.shape import name_of
 from halfspace_sss.rendering.object.translucent import Inside

@@ -29,7 +29,7 @@ from halfspace_sss.arrays import library
 from halfspace_sss.interface.model import BSSRDF
 from halfspace_sss.neural.perceptron import Perceptron
 from halfspace_sss.physics import fresnel
-from halfspace_sss.rendering.object.body import TranslucentObject
+from halfspace_sss.rendering.object.objects import TranslucentObject
 from halfspace_sss.rendering.object.points import (
     SurfacePoint,
     channel_mean,

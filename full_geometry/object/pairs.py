@@ -28,7 +28,7 @@ from full_geometry.object.features import (
 )
 from full_geometry.object.patches import AREA_SHARE, ExitTable, LearntProposals, PatchSampler
 from halfspace_sss.checks import check_count
-from halfspace_sss.rendering.object.body import TranslucentObject
+from halfspace_sss.rendering.object.objects import TranslucentObject
 from halfspace_sss.rendering.object.points import (
     PositionSampler,
     RadialTable,

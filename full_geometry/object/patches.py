@@ -22,7 +22,7 @@ import numpy as np
 
 from full_geometry.object.features import ObjectFrame, PreparedExit, Side, first_event, side_features
 from halfspace_sss.neural.perceptron import Perceptron
-from halfspace_sss.rendering.object.body import TranslucentObject
+from halfspace_sss.rendering.object.objects import TranslucentObject
 from halfspace_sss.rendering.object.points import (
     CosineProposals,
     EntrySample,

@@ -19,7 +19,7 @@ import mitsuba as mi
 
 from halfspace_sss.neural.store import weights_folder
 from halfspace_sss.provenance import provenance, write_atomically
-from halfspace_sss.rendering.object.body import translucent_shapes
+from halfspace_sss.rendering.object.objects import translucent_shapes
 from halfspace_sss.rendering.object.registry import AUTO, Choices, model_names
 from halfspace_sss.rendering.object.settings import Settings
 from halfspace_sss.rendering.scenes.identity import scene_hash

@@ -11,7 +11,7 @@ import mitsuba as mi
 from halfspace_sss.checks import check_choice
 from halfspace_sss.interface.model import model_class, models
 from halfspace_sss.rendering.light.small_emitters import is_delta
-from halfspace_sss.rendering.object.body import KnowsUnit, millimetres, translucent_shapes
+from halfspace_sss.rendering.object.objects import KnowsUnit, millimetres, translucent_shapes
 from halfspace_sss.rendering.object.registry import AUTO, model_names
 from halfspace_sss.rendering.object.shape import is_instance
 from halfspace_sss.rendering.paths.gathering import Gathering

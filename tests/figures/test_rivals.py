@@ -32,7 +32,7 @@ from full_geometry.learning.model_errors import reference  # noqa: E402
 from full_geometry.models.storing import frame_of  # noqa: E402
 from full_geometry.object.features import n_side  # noqa: E402
 from halfspace_sss.cli import app as cli  # noqa: E402
-from halfspace_sss.rendering.object.body import TranslucentObject, object_of  # noqa: E402
+from halfspace_sss.rendering.object.objects import TranslucentObject, object_of  # noqa: E402
 from halfspace_sss.rendering.object.points import EntrySample, SurfacePoint  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 

@@ -29,7 +29,7 @@ from full_geometry.scene import learnt_model  # noqa: E402
 from halfspace_sss import Medium  # noqa: E402
 from halfspace_sss.neural import store as known_weights  # noqa: E402
 from halfspace_sss.neural.store import load_weights, save_weights  # noqa: E402
-from halfspace_sss.rendering.object.body import TranslucentObject, object_of  # noqa: E402
+from halfspace_sss.rendering.object.objects import TranslucentObject, object_of  # noqa: E402
 from halfspace_sss.rendering.object.points import SurfacePoint  # noqa: E402
 from halfspace_sss.rendering.object.settings import Settings  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402

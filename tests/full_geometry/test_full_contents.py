@@ -25,9 +25,9 @@ from full_geometry.object.features import first_event  # noqa: E402
 from full_geometry.object.pairs import trace_exits  # noqa: E402
 from halfspace_sss import rendering  # noqa: E402
 from halfspace_sss.neural import store as known_weights  # noqa: E402
-from halfspace_sss.rendering.object import body as bodies  # noqa: E402
-from halfspace_sss.rendering.object.body import object_of  # noqa: E402
+from halfspace_sss.rendering.object import objects  # noqa: E402
 from halfspace_sss.rendering.object.half_space import half_space_model  # noqa: E402
+from halfspace_sss.rendering.object.objects import object_of  # noqa: E402
 from halfspace_sss.rendering.object.points import ObjectModel, SurfacePoint, refract_in  # noqa: E402
 from halfspace_sss.rendering.scenes.mitsuba_scene import medium, with_media  # noqa: E402
 from halfspace_sss.rendering.walk.integrator import camera_rays  # noqa: E402
@@ -142,7 +142,7 @@ def test_orders_below_two_of_images_are_those_of_walks_that_meet_nothing_inside(
         found = half_space_model("better_dipole", obj.geometry, obj.media, settings, variation)
         return ObjectModel(Nothing(), found.proposals)
 
-    monkeypatch.setattr(bodies, "_model_of", nothing)
+    monkeypatch.setattr(objects, "_model_of", nothing)
     loaded = mi.load_dict(scene(INSIDE["second medium"](), light=LIGHTING[light], unit=1.0))
     ends = trace_exits(object_of(loaded, None), seen(loaded, 8192), (5,), fewest=0, most=1)
     lit = mi.Spectrum(1)

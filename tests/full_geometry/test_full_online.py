@@ -30,7 +30,7 @@ from halfspace_sss.cli import app as cli  # noqa: E402
 from halfspace_sss.cli import render as cli_render  # noqa: E402
 from halfspace_sss.neural import store as known_weights  # noqa: E402
 from halfspace_sss.neural.store import load_weights  # noqa: E402
-from halfspace_sss.rendering.object.body import object_of  # noqa: E402
+from halfspace_sss.rendering.object.objects import object_of  # noqa: E402
 from halfspace_sss.rendering.object.points import SurfacePoint  # noqa: E402
 from halfspace_sss.rendering.scenes import camera_walks, online, reference  # noqa: E402
 from halfspace_sss.rendering.scenes.combined import combined  # noqa: E402

@@ -28,7 +28,7 @@ from full_geometry.object.pairs import (  # noqa: E402
     PairSource,
     trace_exits,  # noqa: E402
 )
-from halfspace_sss.rendering.object.body import object_of  # noqa: E402
+from halfspace_sss.rendering.object.objects import object_of  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("rgb")

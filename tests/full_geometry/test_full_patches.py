@@ -27,7 +27,7 @@ from full_geometry.object.features import (  # noqa: E402
 )
 from full_geometry.object.pairs import EntryProposals  # noqa: E402
 from full_geometry.object.patches import Patches, PatchSampler, PatchTable, cluster, mesh_faces  # noqa: E402
-from halfspace_sss.rendering.object.body import TranslucentObject, object_of  # noqa: E402
+from halfspace_sss.rendering.object.objects import TranslucentObject, object_of  # noqa: E402
 from halfspace_sss.rendering.object.points import (  # noqa: E402
     SurfacePoint,  # noqa: E402
     cosine_direction,

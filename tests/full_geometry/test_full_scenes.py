@@ -40,7 +40,7 @@ from full_geometry.object.pairs import trace_exits  # noqa: E402
 from halfspace_sss import rendering  # noqa: E402
 from halfspace_sss.neural import store as known_weights  # noqa: E402
 from halfspace_sss.neural.store import load_weights, save_weights  # noqa: E402
-from halfspace_sss.rendering.object.body import object_of  # noqa: E402
+from halfspace_sss.rendering.object.objects import object_of  # noqa: E402
 from halfspace_sss.rendering.scenes.scene_files import load_objects, load_scene  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 

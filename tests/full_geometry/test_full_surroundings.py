@@ -28,7 +28,7 @@ from full_geometry.object.features import (  # noqa: E402
     side_features,
 )
 from halfspace_sss import Medium  # noqa: E402
-from halfspace_sss.rendering.object.body import TranslucentObject, object_of  # noqa: E402
+from halfspace_sss.rendering.object.objects import TranslucentObject, object_of  # noqa: E402
 from halfspace_sss.rendering.object.points import surface_point  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 

@@ -47,7 +47,7 @@ from full_geometry.object.features import (  # noqa: E402
 from full_geometry.object.pairs import EntryProposals  # noqa: E402
 from halfspace_sss import rendering  # noqa: E402
 from halfspace_sss.neural.store import load_weights, save_weights  # noqa: E402
-from halfspace_sss.rendering.object.body import object_of  # noqa: E402
+from halfspace_sss.rendering.object.objects import object_of  # noqa: E402
 from halfspace_sss.rendering.object.points import SurfacePoint  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 

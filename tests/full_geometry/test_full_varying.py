@@ -24,7 +24,7 @@ from full_geometry.object.features import first_event, flight  # noqa: E402
 from full_geometry.object.pairs import EntryProposals  # noqa: E402
 from halfspace_sss import rendering  # noqa: E402
 from halfspace_sss.neural import store as known_weights  # noqa: E402
-from halfspace_sss.rendering.object.body import TranslucentObject, object_of  # noqa: E402
+from halfspace_sss.rendering.object.objects import TranslucentObject, object_of  # noqa: E402
 from halfspace_sss.rendering.object.points import SurfacePoint  # noqa: E402
 from halfspace_sss.rendering.scenes.scene_files import load_objects, load_scene  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402

@@ -23,7 +23,7 @@ from full_geometry.object.features import (  # noqa: E402
     Side,
     first_event,
 )
-from halfspace_sss.rendering.object.body import TranslucentObject, object_of  # noqa: E402
+from halfspace_sss.rendering.object.objects import TranslucentObject, object_of  # noqa: E402
 from halfspace_sss.rendering.object.points import SurfacePoint, cosine_direction  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 

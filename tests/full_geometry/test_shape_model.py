@@ -26,7 +26,7 @@ from full_geometry.models.descriptors import (  # noqa: E402
     mixed,
 )
 from full_geometry.models.neural_shape import Backbone, NeuralShape, most, transport  # noqa: E402
-from halfspace_sss.rendering.object.body import TranslucentObject, object_of  # noqa: E402
+from halfspace_sss.rendering.object.objects import TranslucentObject, object_of  # noqa: E402
 from halfspace_sss.rendering.object.points import SurfacePoint, cosine_direction  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 

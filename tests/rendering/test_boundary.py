@@ -10,7 +10,7 @@ import pytest
 mi = pytest.importorskip("mitsuba")
 import drjit as dr  # noqa: E402
 
-from halfspace_sss.rendering.object.body import object_of  # noqa: E402
+from halfspace_sss.rendering.object.objects import object_of  # noqa: E402
 from halfspace_sss.rendering.object.translucent import is_smooth_boundary, smooth_boundary  # noqa: E402
 from halfspace_sss.rendering.scenes.mitsuba_scene import with_media  # noqa: E402
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from test_translucent_walk import COLOURED, _agree, _lamp, _runs, _scene, _small_lamp, _z
 
-from halfspace_sss.rendering.object import body as bodies
+from halfspace_sss.rendering.object import objects
 from halfspace_sss.rendering.object.points import ObjectModel
 from halfspace_sss.rendering.paths import low_orders
 from halfspace_sss.rendering.walk import media as walks
@@ -28,7 +28,7 @@ DARK = {"sigma_s": "0.02,0.05,0.1", "sigma_a": "0.2,0.1,0.02", "g": -0.2, "eta":
 @pytest.fixture
 def only_few(monkeypatch: pytest.MonkeyPatch) -> None:
     """No order from two on: neither in walks nor by a model."""
-    monkeypatch.setattr(bodies, "_model_of", lambda *_: ObjectModel(None, None))
+    monkeypatch.setattr(objects, "_model_of", lambda *_: ObjectModel(None, None))
     monkeypatch.setitem(walks._MOST, "total", 1)
 
 

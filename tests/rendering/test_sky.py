@@ -14,7 +14,7 @@ mi = pytest.importorskip("mitsuba")
 
 from rendered import surface  # noqa: E402
 
-from halfspace_sss.rendering.object import body as bodies  # noqa: E402
+from halfspace_sss.rendering.object import objects  # noqa: E402
 from halfspace_sss.rendering.object.half_space import half_space_model  # noqa: E402
 from halfspace_sss.rendering.object.points import ObjectModel  # noqa: E402
 from halfspace_sss.rendering.object.registry import ModelEntry  # noqa: E402
@@ -78,7 +78,7 @@ def scene(kind: type, patch: pytest.MonkeyPatch, light: dict, **integrator) -> d
         proposals = half_space_model("better_dipole", obj.geometry, obj.media, settings, variation).proposals
         return ObjectModel(kind(obj.geometry.area), proposals, 2)
 
-    patch.setattr(bodies, "_model_of", means)
+    patch.setattr(objects, "_model_of", means)
     patch.setattr(ModelEntry, "knows_objects", True)
     film = {"type": "hdrfilm", "width": 12, "height": 12, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
     view = mi.ScalarTransform4f().look_at([0, 1, 5], [0, 0, 0], [0, 1, 0]).scale(0.6)

@@ -197,7 +197,7 @@ def test_a_mono_variant_takes_grids_of_one_channel() -> None:
 
 
 def test_models_of_the_half_space_take_the_means_over_the_object() -> None:
-    from halfspace_sss.rendering.object.body import make_objects
+    from halfspace_sss.rendering.object.objects import make_objects
     from halfspace_sss.rendering.object.settings import Settings
 
     layers = np.array([[1.0, 2.0, 4.0], [3.0, 2.0, 8.0], [50.0, 50.0, 50.0], [50.0, 50.0, 50.0]])

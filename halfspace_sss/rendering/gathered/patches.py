@@ -30,7 +30,7 @@ from halfspace_sss.rendering.gathered.transfer import Albedo, drawn
 from halfspace_sss.rendering.object.points import AreaPoints, EntrySample, SurfacePoint, cosine_above
 
 if TYPE_CHECKING:
-    from halfspace_sss.rendering.object.body import TranslucentObject
+    from halfspace_sss.rendering.object.objects import TranslucentObject
 
 PER_LENGTH = 1.0  # points over a transport mean free path
 FEWEST, MOST = 1024, 2048  # points: 13 MB to 50 MB for three channels

@@ -29,7 +29,7 @@ from halfspace_sss.rendering.object.points import SurfacePoint, opaque
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from halfspace_sss.rendering.object.body import TranslucentObject
+    from halfspace_sss.rendering.object.objects import TranslucentObject
 
 PER_LENGTH = 2.0  # points over a transport mean free path
 FEWEST, MOST = 1024, 8192  # points

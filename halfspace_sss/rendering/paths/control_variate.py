@@ -30,7 +30,7 @@ from halfspace_sss.rendering.paths.gathering import (
 from halfspace_sss.rendering.paths.lighting import Primal, RenderContext
 
 if TYPE_CHECKING:
-    from halfspace_sss.rendering.object.body import TranslucentObject
+    from halfspace_sss.rendering.object.objects import TranslucentObject
     from halfspace_sss.rendering.object.settings import Settings
 
 FEWEST = 2**14  # points of an object at which light is gathered,

@@ -15,7 +15,7 @@ import numpy as np
 
 from halfspace_sss.interrupts import hear_again, interruptible
 from halfspace_sss.rendering.light.small_emitters import check_emitters
-from halfspace_sss.rendering.object.body import KnowsUnit, TranslucentObject, TranslucentObjects, make_objects
+from halfspace_sss.rendering.object.objects import KnowsUnit, TranslucentObject, TranslucentObjects, make_objects
 from halfspace_sss.rendering.object.registry import Choices
 from halfspace_sss.rendering.object.settings import Settings, read_settings
 from halfspace_sss.rendering.object.translucent import is_translucent

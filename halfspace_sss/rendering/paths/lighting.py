@@ -16,7 +16,7 @@ import mitsuba as mi
 import numpy as np
 
 from halfspace_sss.rendering.light.small_emitters import WIDE, SmallEmitters, is_delta
-from halfspace_sss.rendering.object.body import TranslucentObject
+from halfspace_sss.rendering.object.objects import TranslucentObject
 from halfspace_sss.rendering.object.settings import AUTOMATIC, Settings
 
 

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import drjit as dr
 import mitsuba as mi
 
-from halfspace_sss.rendering.object.body import TranslucentObject
+from halfspace_sss.rendering.object.objects import TranslucentObject
 from halfspace_sss.rendering.object.points import SurfacePoint, lifted, opaque, place, turned
 from halfspace_sss.rendering.object.settings import Settings
 from halfspace_sss.rendering.paths.lighting import (

@@ -21,7 +21,7 @@ from halfspace_sss.checks import check_count
 from halfspace_sss.neural.store import weights_folder
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.provenance import check_folder
-from halfspace_sss.rendering.object.body import outermost
+from halfspace_sss.rendering.object.objects import outermost
 from halfspace_sss.rendering.object.translucent import is_translucent
 from halfspace_sss.rendering.paths.integrator import is_bssrdf
 from halfspace_sss.rendering.scenes import reference

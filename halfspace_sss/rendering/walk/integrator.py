@@ -13,7 +13,7 @@ import numpy as np
 
 from halfspace_sss.interrupts import interruptible
 from halfspace_sss.rendering.light.small_emitters import SmallEmitters
-from halfspace_sss.rendering.object.body import KnowsUnit, check_sensors, check_size, places_of
+from halfspace_sss.rendering.object.objects import KnowsUnit, check_sensors, check_size, places_of
 from halfspace_sss.rendering.object.settings import OF_MITSUBA, check_parameters
 from halfspace_sss.rendering.object.shape import number_of, same_objects
 from halfspace_sss.rendering.walk.emitter_connections import EmitterDirections, InnerLights, find_connections

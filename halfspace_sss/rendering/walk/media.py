@@ -12,7 +12,7 @@ import numpy as np
 
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.light.small_emitters import is_delta
-from halfspace_sss.rendering.object.body import Content, TranslucentObject, contents, translucent_shapes
+from halfspace_sss.rendering.object.objects import Content, TranslucentObject, contents, translucent_shapes
 from halfspace_sss.rendering.object.points import lift
 from halfspace_sss.rendering.object.shape import (
     Geometry,
