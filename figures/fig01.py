@@ -9,7 +9,7 @@ import numpy as np
 
 from figures.beyond.objects import VIEWS, View, scene
 from figures.computing.contenders import OF_OBJECTS
-from figures.computing.images import Shot, compared, guides, stops_of
+from figures.computing.images import Shot, compared, cover, stops_of
 from figures.computing.learnt import (
     FULL_GEOMETRY,
     TRAIN_SECONDS,
@@ -74,7 +74,7 @@ def shown(task: Task) -> dict[str, Any]:
     made = object_parts(name, p["resolution"], task.folder, p["seed"])
     description = scene(made, View(*p["view"]), p["size"])
     alone = {key: description[key] for key in ("type", "sensor", name)}
-    cover = guides(mi.load_dict({**alone, "integrator": {"type": "path"}}))[0][..., 0]
+    covered = cover(mi.load_dict({**alone, "integrator": {"type": "path"}}))
     if p["model"] != TRUTH:
         description["integrator"] = {"type": "bssrdf"}
     each = min(SPP_PER_PASS, p["spp"])
@@ -85,7 +85,7 @@ def shown(task: Task) -> dict[str, Any]:
             seed = int(np.random.SeedSequence((p["seed"], k, p["model"] == TRUTH)).generate_state(1)[0])
             total = total + np.array(mi.render(loaded, spp=each, seed=seed))[..., :3]
             task.progress(k + 1, passes)
-    return {"image": (total / passes).astype(np.float32), "cover": cover, "spp": passes * each}
+    return {"image": (total / passes).astype(np.float32), "cover": covered, "spp": passes * each}
 
 
 def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:

@@ -14,6 +14,7 @@ from figures.computing.images import (
     Shot,
     check_denoiser,
     compared,
+    cover,
     denoised,
     guides,
     noise_of,
@@ -83,8 +84,9 @@ def rivals(task: Task) -> dict[str, Any]:
         scenes = {name: contender(name, p["material"], p["size"], p["lights"]) for name in p["methods"]}
         spp = {name: pass_size(scene, each, p["seed"]) for name, scene in scenes.items()}
         result = alternating(scenes, spp, p["seed"], seconds=p["seconds"], progress=task.progress)
-    about = guides(next(iter(scenes.values())))
-    images, numbers = {"cover": about[0][..., 0]}, {}
+    seen = next(iter(scenes.values()))
+    about = guides(seen)
+    images, numbers = {"cover": cover(seen)}, {}
     for name, timed in result.items():
         images[_key(name, "raw")] = timed.image.astype(np.float32)
         images[_key(name, "denoised")], seconds = denoised(timed.image, *about)

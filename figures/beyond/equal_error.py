@@ -10,7 +10,7 @@ import numpy as np
 
 from figures.beyond.objects import VIEWS
 from figures.computing.contenders import MODELS, OF_OBJECTS, VOLUMES, WALK, contender, long_passes, long_walk, ready
-from figures.computing.images import guides
+from figures.computing.images import cover
 from figures.computing.learnt import (
     FULL_GEOMETRY,
     TRAIN_SECONDS,
@@ -193,12 +193,12 @@ def measured(task: Task) -> dict[str, Any]:
 
     with with_weights(task.folder, task.needed):
         scenes = _compiled(task)
-        cover = guides(scenes[WALK], 8)[0][..., 0] > 0
+        covered = cover(scenes[WALK], 8) > 0
         result = alternating(scenes, p["spp"], p["seed"], passes=p["passes"], progress=progress)
     traced = (WALK, *VOLUMES)
-    rows = [{"method": name, **errors(timed, truth, cover, name in traced)} for name, timed in result.items()]
-    level = float(np.mean(truth.images["image"][cover].astype(np.float64) ** 2))
-    noise = float(np.mean(truth.images["variance"][cover], dtype=np.float64))
+    rows = [{"method": name, **errors(timed, truth, covered, name in traced)} for name, timed in result.items()]
+    level = float(np.mean(truth.images["image"][covered].astype(np.float64) ** 2))
+    noise = float(np.mean(truth.images["variance"][covered], dtype=np.float64))
     about = {"mean square": level, "variance": noise, "seconds": truth.numbers["seconds"], "spp": truth.numbers["spp"]}
     return {"rows": rows, "truth": about, "training": dict(zip([FULL_GEOMETRY], seconds))}
 

@@ -248,17 +248,31 @@ def check_denoiser() -> Any:
     return mitsuba_oidn
 
 
-def guides(scene: Any, spp: int = GUIDE_SPP, sensor: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Cover of each pixel by objects, as an albedo (H, W, 3), and mean shading normal (H, W, 3), both float32.
+def cover(scene: Any, spp: int = GUIDE_SPP) -> np.ndarray:
+    """Share of each pixel that objects cover, (H, W), float32."""
+    return _cover(_aovs(scene, "n:sh_normal", spp, 0))
 
-    What is below a translucent surface has no albedo of its own: covered pixels get 1.
+
+def guides(scene: Any, spp: int = GUIDE_SPP, sensor: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Mean albedo of each pixel (H, W, 3) and mean shading normal (H, W, 3), both float32.
+
+    The albedo of translucent objects is their directional albedo. Where there is none at all, as of mirrors and glass,
+    it is the cover of the pixel, as Open Image Denoise asks.
     """
+    both = _aovs(scene, "albedo:albedo,n:sh_normal", spp, sensor)
+    albedo, normal = np.clip(both[..., :3], 0, 1), both[..., 3:6]
+    return np.where(albedo.any(axis=2, keepdims=True), albedo, _cover(normal)[..., None]), np.clip(normal, -1, 1)
+
+
+def _aovs(scene: Any, aovs: str, spp: int, sensor: int) -> np.ndarray:
     import mitsuba as mi
 
-    aov = mi.load_dict({"type": "aov", "aovs": "n:sh_normal"})
-    normal = np.array(mi.render(scene, integrator=aov, sensor=sensor, spp=spp, seed=7), dtype=np.float32)[..., :3]
-    cover = np.clip(np.linalg.norm(normal, axis=2), 0, 1)
-    return np.repeat(cover[..., None], 3, axis=2), np.clip(normal, -1, 1)
+    integrator = mi.load_dict({"type": "aov", "aovs": aovs})
+    return np.array(mi.render(scene, integrator=integrator, sensor=sensor, spp=spp, seed=7), dtype=np.float32)
+
+
+def _cover(normal: np.ndarray) -> np.ndarray:
+    return np.clip(np.linalg.norm(normal[..., :3], axis=2), 0, 1)
 
 
 def denoised(image: np.ndarray, albedo: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, float]:

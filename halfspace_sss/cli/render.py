@@ -98,6 +98,9 @@ def render_command(
     loaded = open_scene(scene, model, orders, parameters, settings)
     for sentence in chosen(loaded, loaded.integrator()).get("choices", {}).values():
         console().print(sentence, highlight=False, markup=False, soft_wrap=True)
+    cameras = loaded.sensors()[sensor:][:1] if denoise else []
+    if any(not camera.film().rfilter().is_box_filter() for camera in cameras):
+        tell("the film has no box filter: the denoiser keeps most of the noise that other filters spread over pixels")
     name = [scene.stem, model or "scene", light or "", f"sensor{sensor}" if sensor else ""]
     file = out / f"{'_'.join(filter(None, name))}.exr"
     result = _rendered(loaded, file, limits, {"seed": seed, "sensor": sensor}, resume)

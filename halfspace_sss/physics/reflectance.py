@@ -35,6 +35,7 @@ NODES = 96
 DEGREE = 64  # of ln(R / albedo) as a polynomial of x, s = x / (c + (1 - c) x), s² = 1 - albedo'
 DENSE = 8192  # values of it between which its inverse is looked up
 STEPS = 2  # of Newton's method after that
+LEAST = 1e-6  # albedo that stands for 0 in ln(R / albedo)
 
 
 class _Basis(NamedTuple):
@@ -86,20 +87,45 @@ def _controller() -> ThreadpoolController:
 
 
 def _reflectance(albedo: float, g: float, eta: float, mu_i: float | str) -> float:
+    m, basis, T, share = _even_light(albedo, g, eta)
+    if mu_i == DIFFUSE:
+        up = (m.s - m.d) / 2
+        return float(2 * np.sum(basis.w * basis.mu * T * (up @ share)))
+    # reciprocity: what comes out towards mu_i then is R(mu_i)
+    return float(F_t(mu_i, eta) * _upwards(m, basis, share, mu_internal(mu_i, eta)) / eta**2)
+
+
+def _even_light(albedo: float, g: float, eta: float) -> tuple[_Modes, _Basis, np.ndarray, np.ndarray]:
+    """Modes, nodes, transmittance at the nodes, and the shares of the modes under radiance 1 from everywhere."""
     m, basis = _modes(albedo, g, eta), _basis(eta)
     down, up = (m.s + m.d) / 2, (m.s - m.d) / 2
     T = F_t(basis.mu, 1 / eta)
-    share = np.linalg.solve(down - F_r(basis.mu, 1 / eta)[:, None] * up, T * eta**2)  # radiance 1 from everywhere
-    if mu_i == DIFFUSE:
-        return float(2 * np.sum(basis.w * basis.mu * T * (up @ share)))
-    # reciprocity: what comes out towards mu_i then is R(mu_i)
-    inside = mu_internal(mu_i, eta)
+    return m, basis, T, np.linalg.solve(down - F_r(basis.mu, 1 / eta)[:, None] * up, T * eta**2)
+
+
+def _upwards(m: _Modes, basis: _Basis, share: np.ndarray, inside: float) -> float:
+    """Radiance that arrives at the boundary from within at the cosine `inside`."""
     P = np.polynomial.legendre.legvander(np.array([inside]), len(m.a_beta) - 1)[0] * m.a_beta
     root = np.sqrt(basis.w)
     even = P[0] * basis.w + ((P[2::2] - basis.mean * m.a_beta[2::2]) @ basis.even.T) * root
     odd = (P[1::2] @ basis.odd.T) * root
-    upwards = (even @ m.s - odd @ m.d) / (2 * (m.k * inside + 1))
-    return float(F_t(mu_i, eta) * (upwards @ share) / eta**2)
+    return (even @ m.s - odd @ m.d) / (2 * (m.k * inside + 1)) @ share
+
+
+def directional_table(g: float, eta: float, x: np.ndarray, mu_in: np.ndarray) -> np.ndarray:
+    """ln(R(mu) / (albedo F_t(mu))), shape (x, mu_in), which is smooth in both.
+
+    Args:
+        g, eta: as in `half_space_reflectance`.
+        x: in [0, 1], of the albedos 1 - albedo' = s², s = x / (c + (1 - c) x), c = (1 - max(g, 0))^(1/3).
+        mu_in: cosines inside, in [0, 1], of the directions mu outside.
+    """
+    result = []
+    with _one_thread():
+        for albedo in np.maximum(_albedo(np.asarray(x, dtype=float), g)[0], LEAST).tolist():
+            m, basis, _, share = _even_light(albedo, g, eta)
+            result.append([_upwards(m, basis, share, each) / (albedo * eta**2) for each in mu_in])
+    return np.log(result)
 
 
 def _check_direction(mu_i: float | str) -> None:

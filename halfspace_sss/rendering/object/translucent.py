@@ -32,13 +32,15 @@ Parameters, all optional but the medium:
     reflection: whether the boundary reflects light, by default true.
 
 `mitsuba.traverse` shows `albedo`, `sigma_t` (1/mm) and `g` of each channel, and the parameters of the boundary.
-To an integrator that knows nothing of the inside, the surface shows its reflection only. The index of a smooth boundary
-is data of kernels, which then serve media of any index.
+To an integrator that knows nothing of the inside, the surface shows its reflection only. The `albedo` of Mitsuba's
+integrator `aov` is the directional albedo of the medium. The index of a smooth boundary is data of kernels, which then
+serve media of any index.
 """
 
 from __future__ import annotations
 
 import functools
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -49,8 +51,10 @@ import numpy as np
 from halfspace_sss import materials
 from halfspace_sss.checks import check_choice
 from halfspace_sss.materials.registry import one_channel
+from halfspace_sss.physics.fresnel import F_t, mu_internal
 from halfspace_sss.physics.medium import Medium
-from halfspace_sss.rendering.object.points import mirrored
+from halfspace_sss.physics.reflectance import directional_table
+from halfspace_sss.rendering.object.points import mirrored, opaque
 from halfspace_sss.rendering.object.registry import model_names
 from halfspace_sss.rendering.object.settings import ORDERS, check_parameters, variant_channels
 from halfspace_sss.rendering.object.varying import constant_value, mean_of_grids, varying_medium
@@ -247,6 +251,7 @@ def _turned(w: mi.Vector3f, sign: mi.Float) -> Any:
 
 
 VARIABLE = ("albedo", "sigma_t", "g")  # by which light can be differentiated
+ALBEDOS, COSINES = 65, 9  # of tables of the directional albedo
 
 
 def translucent_class() -> type:
@@ -274,6 +279,7 @@ def _class(variant: str) -> type:
             self.reflection = Reflection.of(self.boundary)
             self.m_components = [self.boundary.flags(self.reflection.lobe)]
             self.m_flags = self.m_components[0]
+            self.directional: HalfSpaceAlbedo | None = None  # made when it is asked for
             for name in VARIABLE:
                 setattr(self, name, mi.Spectrum(np.atleast_1d(getattr(self.inside.medium, name)).tolist()))
 
@@ -315,10 +321,59 @@ def _class(variant: str) -> type:
         ) -> tuple[Any, Any]:
             return self.eval(ctx, si, wo, active), self.pdf(ctx, si, wo, active)
 
+        def eval_diffuse_reflectance(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> mi.Spectrum:
+            """What the half-space of the medium here sends towards the viewer under radiance 1 from everywhere.
+
+            All orders, without what the boundary mirrors: R(mu) of `Medium.reflectance`. The `albedo` of Mitsuba's
+            integrator `aov`, which leads denoisers.
+            """
+            m = self.inside.medium
+            if self.directional is None or not self.directional.serves(m):
+                self.directional = HalfSpaceAlbedo(m)
+            varying = self.inside.varying
+            albedo = self.albedo if varying is None else varying.albedo_at(si.p, active)
+            return self.directional(albedo, dr.abs(mi.Frame3f.cos_theta(si.wi))) & active
+
         def to_string(self) -> str:
             return f"Translucent[{self.inside}, boundary = {self.boundary}]"
 
     return Translucent
+
+
+class HalfSpaceAlbedo:
+    """R(mu) of half-spaces of any albedo, to 1 % (g up to 0.9), from tables over albedo and internal cosine.
+
+    Args:
+        medium: whose g, one for each channel, and eta hold.
+    """
+
+    def __init__(self, medium: Medium) -> None:
+        self.g, self.eta = np.atleast_1d(medium.g).astype(float).tolist(), float(medium.eta)
+        self.steepest = math.sqrt(max(1 - 1 / self.eta**2, 0.0))  # the least internal cosine
+        self._tables = {g: self._table(g) for g in set(self.g)}
+
+    def serves(self, medium: Medium) -> bool:
+        """Whether another medium differs by nothing but albedo and extinction."""
+        return self.g == np.atleast_1d(medium.g).tolist() and self.eta == medium.eta
+
+    def _table(self, g: float) -> mi.Texture2f:
+        x, mu_in = np.linspace(0, 1, ALBEDOS), np.linspace(self.steepest, 1, COSINES)
+        values = mi.TensorXf(directional_table(g, self.eta, x, mu_in).astype(np.float32)[..., None])
+        return mi.Texture2f(values, use_accel=False, wrap_mode=dr.WrapMode.Clamp)
+
+    def __call__(self, albedo: mi.Spectrum, mu: mi.Float) -> mi.Spectrum:
+        eta = opaque(self.eta)
+        F = F_t(mu, eta)
+        u = (mu_internal(mu, eta) - opaque(self.steepest)) * opaque(1 / (1 - self.steepest))
+        return mi.Spectrum([F * self._ratio(g, a, u) * a for g, a in zip(self.g, albedo)])
+
+    def _ratio(self, g: float, albedo: mi.Float, u: mi.Float) -> mi.Float:
+        """R / (albedo F_t)."""
+        c = opaque((1 - max(g, 0.0)) ** (1 / 3))
+        s = dr.safe_sqrt((1 - albedo) / (1 - opaque(g) * albedo))
+        x = s * c / (1 - (1 - c) * s)
+        at = [(v * (n - 1) + 0.5) / n for v, n in ((u, COSINES), (x, ALBEDOS))]
+        return dr.exp(self._tables[g].eval(mi.Point2f(*at))[0])
 
 
 def _boundaries(props: mi.Properties) -> list[tuple[str, Any]]:

@@ -55,6 +55,10 @@ class VaryingMedium:
         sigma_t = self.factor[:, None] * np.array(eval_volume(self.density, p))
         return sigma_t, self.albedo[:, None] * np.array(eval_volume(self.albedo_volume, p)) * sigma_t
 
+    def albedo_at(self, p: mi.Point3f, active: mi.Bool = True) -> mi.Spectrum:
+        """The albedo of single scattering at points."""
+        return mi.Spectrum(self.albedo.tolist()) * eval_volume(self.albedo_volume, p, active)
+
 
 def eval_volume(volume: mi.Volume | None, p: mi.Point3f, active: mi.Bool = True) -> Any:
     """The value of a volume at points, one per channel of the variant."""
