@@ -268,7 +268,7 @@ class ObjectFit:
         self.descent = Descent(self.modules, parts=list(self.modules.values()), average=AVERAGE, fused=True)
         self.average: torch.nn.ModuleDict = self.descent.average
         ones = torch.ones(2 * channels, 1, device=self.device)
-        self.scale, self.even_scale = ones[:channels].clone(), ones
+        self.scale, self.alpha_scale = ones[:channels].clone(), ones
 
     @property
     def step(self) -> int:
@@ -281,10 +281,10 @@ class ObjectFit:
         Order one counts as a part of all light: where it hardly leaves, its few large values would drown the rest.
         """
         self.scale = _inverse(self._tensor(walks.values.sum(axis=1) / walks.drawn))
-        exits, T = (self._tensor(v) for v in walks.even)
+        exits, T = (self._tensor(v) for v in walks.albedo)
         mean = T.mean(dim=1)
         once, more = mean.split(len(mean) // 2)
-        self.even_scale = _inverse(torch.cat([once + more, more]))
+        self.alpha_scale = _inverse(torch.cat([once + more, more]))
         for networks in (self.modules, self.average):
             networks["alpha"].begin(exits, mean)
 
@@ -301,12 +301,12 @@ class ObjectFit:
         batch = self.recipe.batch
         x, T = (self._tensor(v) for v in (walks.features, walks.values))
         y, W = self._worthy(proposals, order)
-        exits, even = (self._tensor(v) for v in walks.even)
+        exits, T_alpha = (self._tensor(v) for v in walks.albedo)
         patch = None
         if self.patches is not None:
             patch = self._tensor(self.patches.of_face[walks.faces].astype(np.int64))
         n_x, n_y = max(T.shape[1] // batch, 1), max(W.shape[1] // batch, 1)
-        kept, n_even = T.shape[1] / walks.drawn, max(even.shape[1] // n_x, 1)
+        kept, n_alpha = T.shape[1] / walks.drawn, max(T_alpha.shape[1] // n_x, 1)
         T, W = T * self.scale, W * self.scale
         with torch.no_grad(), torch_threads():
             self.ends.add_walks(*walks.of_random_exits(x, T))
@@ -314,9 +314,9 @@ class ObjectFit:
             for k in range(self.recipe.reuse):
                 back = k % 2 == 1
                 for i, j in zip(order.permutation(n_x), order.integers(0, n_y, n_x)):
-                    a, b, e = (slice(k * m, (k + 1) * m) for k, m in ((i, batch), (j, batch), (i, n_even)))
+                    a, b, e = (slice(k * m, (k + 1) * m) for k, m in ((i, batch), (j, batch), (i, n_alpha)))
                     loss = likelihood((self._f(x[:, a], back), T[:, a]), (self._f(y[:, b], back), W[:, b]), kept)
-                    loss = loss + mean_likelihood(self.modules["alpha"](exits[:, e]), even[:, e], self.even_scale)
+                    loss = loss + mean_likelihood(self.modules["alpha"](exits[:, e]), T_alpha[:, e], self.alpha_scale)
                     if patch is not None and not back:
                         loss = loss + self._patch_loss(x[:, a], T[:, a], patch[a])
                     self._advance(loss, steps)
@@ -339,7 +339,7 @@ class ObjectFit:
         return tensor(array, self.device)
 
     def _f(self, x: torch.Tensor, back: bool = False, of: torch.nn.ModuleDict | None = None) -> torch.Tensor:
-        """Of features of pairs: S knows what even light makes of both ends."""
+        """Of features of pairs: S knows the directional albedos of both ends."""
         of = of or self.modules
         return of["S"](of["alpha"].joined(x), back)
 
@@ -374,7 +374,7 @@ class ObjectFit:
 
     def _tensors(self) -> dict[str, torch.Tensor]:
         """Everything the next step depends on, by name; changing the tensors in place changes the fit."""
-        scales = {"scale": self.scale, "even_scale": self.even_scale, **self.ends.tensors()}
+        scales = {"scale": self.scale, "alpha_scale": self.alpha_scale, **self.ends.tensors()}
         return {**scales, **self.descent.tensors()}
 
     def save(self, path: Path, done: int, history: list) -> None:

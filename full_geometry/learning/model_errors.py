@@ -8,7 +8,7 @@ With the estimates a of the model and b of the walks and their variances,
     error² = mean_k[(a_k - b_k)² - var a_k - var b_k] / (mean_k b_k)²,
 
 for lobes the mean of the four; its standard error by the jackknife over exits. Under an even sky images take what a
-model knows of even light, where that is trusted, and no S: the error of that is the third kind.
+model knows of uniform light, where that is trusted, and no S: the error of that is the third kind.
 """
 
 from __future__ import annotations
@@ -162,7 +162,7 @@ def compare(model: ExitRadiance, truth: ExitRadiance) -> list[RadianceError]:
     return [_error(c, light, columns, model, truth) for c in range(len(truth.mean)) for light, columns in kinds]
 
 
-def of_even_light(model: ExitRadiance, truth: ExitRadiance) -> list[RadianceError]:
+def of_uniform_light(model: ExitRadiance, truth: ExitRadiance) -> list[RadianceError]:
     """The errors of all channels under an even sky, the first of the lights of both."""
     return [_error(c, EVEN_SKY, slice(0, 1), model, truth) for c in range(len(truth.mean))]
 
@@ -218,7 +218,7 @@ def _even_sky(transport: Transport, by_S: ExitRadiance, truth: ExitTruth) -> lis
         return []
     known = np.array(alpha.known[1]).reshape(n, 1, 1) > 0
     mean = np.where(known, np.array(alpha(truth.exits)[1]).reshape(n, -1, 1), by_S.mean[..., :1])
-    return of_even_light(ExitRadiance(mean, np.where(known, 0, by_S.variance[..., :1])), truth.truth)
+    return of_uniform_light(ExitRadiance(mean, np.where(known, 0, by_S.variance[..., :1])), truth.truth)
 
 
 def errors_of(
@@ -233,7 +233,7 @@ def errors_of(
 ) -> dict[str, list[RadianceError]]:
     """The errors of several transports of an object, by name; the truth is traced once for all of the same orders.
 
-    Of those that have learnt what even light leaves also the error of images under an even sky.
+    Of those that have learnt what uniform light leaves also the error of images under an even sky.
 
     Args:
         obj: the object.

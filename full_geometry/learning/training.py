@@ -22,7 +22,7 @@ from full_geometry.learning.model_errors import (
     ExitTruth,
     RadianceError,
     measure,
-    of_even_light,
+    of_uniform_light,
     reference,
     traced,
 )
@@ -42,13 +42,13 @@ from halfspace_sss.rendering.object.objects import TranslucentObject, object_of
 from halfspace_sss.rendering.object.points import SurfacePoint
 from halfspace_sss.rendering.scenes.camera_walks import TRIAL
 
-# ---- Where what was learnt of even light is good enough to stand for it ----------------------------
+# ---- Where the learnt directional albedo is good enough for images ----------------------------
 # S sees the surface around both its points, alpha is a network of the exit alone, which misses what changes over a mean
 # free path. So each channel is judged at the end of a training, as parts of all light that leaves,
 #
 #     |alpha_1 - E T_1|, |alpha - E T| <= 5 % of the mean of E T_0 + E T_1 + E T,   or alpha no worse than S,
 #
-# and where that fails images take even light by S or by the way of one event, as all other light.
+# and where that fails images take uniform light by S or by the way of one event, as all other light.
 
 MOST = 0.05
 
@@ -56,7 +56,7 @@ MOST = 0.05
 def trusted(
     model: FullGeometry, truth: ExitTruth, errors: list[RadianceError], walks: int, seed: tuple[int, ...]
 ) -> np.ndarray:
-    """1 where even light may be used and 0 where not, (2, channels): orders below two, then the others.
+    """1 where the directional albedo may be used and 0 where not, (2, channels): orders below two, then the others.
 
     Args:
         model: S and alpha.
@@ -78,7 +78,7 @@ def trusted(
 def _error(alpha: np.ndarray, truth: ExitRadiance) -> np.ndarray:
     """Relative RMSE of shares (channels, exits) under constant light, without the noise of walks."""
     shares = alpha[:, :, None].astype(float)
-    return np.array([row.error for row in of_even_light(ExitRadiance(shares, np.zeros_like(shares)), truth)])
+    return np.array([row.error for row in of_uniform_light(ExitRadiance(shares, np.zeros_like(shares)), truth)])
 
 
 # ---- Exits that the camera sees, beside random ones: its walks are data for the fit as they come ---
@@ -312,7 +312,7 @@ class _ObjectTraining:
             self.centres = cluster(obj, self.frame, seed=seed).astype(np.float16)
             self.patches = Patches(obj, self.frame, self.centres.astype(np.float32))
         self.fitting = self._new_fitting()
-        self.even = np.ones((2, len(obj.media)), np.float16)
+        self.trusted = np.ones((2, len(obj.media)), np.float16)
         self.done, self.total, self.walks, self.history = 0, math.inf, recipe.chunk, []
         self.ready: tuple[Pairs, Pairs] | None = None
         self.aside = ThreadPoolExecutor(1)
@@ -325,7 +325,7 @@ class _ObjectTraining:
     def arrays(self) -> dict[str, np.ndarray]:
         """What is written: in half precision, but for what turns the inputs."""
         arrays = {name: value.astype(np.float16) for name, value in self.fitting.arrays().items()}
-        arrays |= {storing.EVEN: self.even, storing.TURNS: self.frame.around.turns}
+        arrays |= {storing.TRUSTED: self.trusted, storing.TURNS: self.frame.around.turns}
         return arrays if self.centres is None else {**arrays, storing.CENTRES: self.centres}
 
     def learnt(self) -> storing.Learnt:
@@ -420,9 +420,9 @@ class _ObjectTraining:
         return measure(self.object, model, by, truth=truth, samples=samples, seed=self.seed)
 
     def _judged(self, truth: ExitTruth, samples: int) -> list[RadianceError]:
-        """Errors at the end, and what even light may be used for."""
+        """Errors at the end, and where the directional albedo may be used."""
         errors = self._errors(truth, samples)
-        self.even = trusted(self.learnt().model, truth, errors, WALKS, (self.seed, 20))
+        self.trusted = trusted(self.learnt().model, truth, errors, WALKS, (self.seed, 20))
         return errors
 
     def _validated(self, truth: ExitTruth) -> tuple[int, float, float]:

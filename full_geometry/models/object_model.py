@@ -143,7 +143,7 @@ class DirectionalAlbedo:
         return tuple(mi.Spectrum([opaque(float(v)) for v in row]) for row in self.trusted)
 
     def __call__(self, at: SurfacePoint, active: Any = True) -> tuple[Any, Any]:
-        """Orders zero and one, and alpha, per channel; 0 where they may not stand for even light."""
+        """Orders zero and one, and alpha, per channel; 0 where they may not stand for uniform light."""
         unscattered, once, more = self.parts(at, active)
         few, others = self.known
         return few * (unscattered + once), others * more
@@ -210,6 +210,6 @@ class FullGeometry:
         return dr.select(active, S_0 * dr.exp(BOUND * dr.tanh(f / BOUND)), 0)
 
     def _end(self, side: Side) -> tuple[list[Any], list[Any]]:
-        """Features of one end and what even light makes of them; h."""
+        """Features of one end and what uniform light makes of them; h."""
         columns = side_features(self.frame, side)
         return [*columns, *self.alpha.units(columns)], self._h(columns)

@@ -271,10 +271,10 @@ def frame_of(obj: TranslucentObject, trained: Identity | None = None, turns: np.
 
 KIND = "full_geometry"
 CHECKSUMS = "start_checksums"  # of a record
-CENTRES, EVEN, TURNS, ENDS = "centres", "even", "turns", "Q"
+CENTRES, TRUSTED, TURNS, ENDS = "centres", "even", "turns", "Q"
 S_LAYERS, ALPHA_LAYERS, PATCH_LAYERS = ("W_", "b_", ENDS), ("A_", "a_"), ("V_", "c_")
 NEEDED = (
-    (EVEN, "even light must be learnt"), (TURNS, "turns of what surrounds a point must be known"),
+    (TRUSTED, "directional albedo must be learnt"), (TURNS, "turns of what surrounds a point must be known"),
     (ENDS, "functions of ends must be solved for"),
 )  # fmt: skip
 
@@ -429,7 +429,7 @@ def assemble(
     def layers(names: tuple[str, ...]) -> dict[str, np.ndarray]:
         return {name: value for name, value in arrays.items() if name.startswith(names)}
 
-    alpha = DirectionalAlbedo(obj, frame, layers(ALPHA_LAYERS), arrays[EVEN])
+    alpha = DirectionalAlbedo(obj, frame, layers(ALPHA_LAYERS), arrays[TRUSTED])
     model = FullGeometry(obj, frame, base, layers(S_LAYERS), alpha)
     if CENTRES not in arrays:
         return Learnt(model, None)

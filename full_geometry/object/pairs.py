@@ -70,7 +70,7 @@ def trace_exits(
 
 
 PATCH_SHARE = 0.6  # of those by patches, where they are learnt
-EVEN_EVERY = 4  # walks, one tells what even light brings: that is simpler than S
+ALBEDO_EVERY = 4  # walks, one tells its light under uniform illumination: that is simpler than S
 ENOUGH = 1.5  # over the mean: pairs of less value are kept by chance, and then with more
 
 
@@ -101,7 +101,7 @@ class Pairs(NamedTuple):
     values: np.ndarray
     drawn: int
     faces: np.ndarray | None = None  # where walks left
-    even: AlbedoSamples | None = None  # of some of the walks
+    albedo: AlbedoSamples | None = None  # of some of the walks
     random: tuple[np.ndarray, int] | None = None  # where not all exits are random: which are, and how many were drawn
 
     def of_random_exits(self, x: Any, values: Any) -> tuple[Any, Any, int]:
@@ -121,11 +121,11 @@ def shuffled(parts: list[Pairs], order: np.random.Generator) -> Pairs:
     random = np.flatnonzero(places >= values.shape[1] - parts[-1].values.shape[1]), parts[-1].drawn
     drawn = sum(part.drawn for part in parts)
     pairs = Pairs(features[:, places], values[:, places], drawn, faces, random=random)
-    if parts[0].even is None:
+    if parts[0].albedo is None:
         return pairs
-    exits, T = (np.concatenate(columns, axis=1) for columns in zip(*(part.even for part in parts)))
+    exits, T = (np.concatenate(columns, axis=1) for columns in zip(*(part.albedo for part in parts)))
     places = order.permutation(T.shape[1])
-    return pairs._replace(even=AlbedoSamples(exits[:, places], T[:, places]))
+    return pairs._replace(albedo=AlbedoSamples(exits[:, places], T[:, places]))
 
 
 class EntryProposals:
@@ -222,7 +222,7 @@ class PairSource:
             starts, exits: of the walks.
             seed: of what is kept.
         """
-        n, even = dr.width(starts.p), self._even(starts, exits)
+        n, albedo = dr.width(starts.p), self._albedo_samples(starts, exits)
         T = dr.select(exits.order == 1, 0, exits.T)
         if self.scale is not None:
             p = dr.minimum(channel_mean(T * self.scale) / ENOUGH, 1)
@@ -231,15 +231,15 @@ class PairSource:
         kept = dr.compress(dr.max(T) > 0)
         if dr.width(kept) == 0:
             nothing = self._columns(starts, starts, dr.zeros(mi.Spectrum, n))
-            return nothing._replace(faces=np.zeros(n, np.uint32), even=even)
+            return nothing._replace(faces=np.zeros(n, np.uint32), albedo=albedo)
         ends, T = exits.at.gather(kept), dr.gather(mi.Spectrum, T, kept)
         faces = np.array(dr.gather(mi.UInt32, exits.face, kept))
-        return self._columns(starts.gather(kept), ends, T)._replace(drawn=n, faces=faces, even=even)
+        return self._columns(starts.gather(kept), ends, T)._replace(drawn=n, faces=faces, albedo=albedo)
 
-    def _even(self, starts: SurfacePoint, exits: WalkExits) -> AlbedoSamples:
+    def _albedo_samples(self, starts: SurfacePoint, exits: WalkExits) -> AlbedoSamples:
         """What walks bring under the same light from everywhere, of every fourth walk."""
-        n = max(dr.width(starts.p) // EVEN_EVERY, 1)
-        lanes = dr.arange(mi.UInt32, n) * EVEN_EVERY
+        n = max(dr.width(starts.p) // ALBEDO_EVERY, 1)
+        lanes = dr.arange(mi.UInt32, n) * ALBEDO_EVERY
         at, T = starts.gather(lanes), dr.gather(mi.Spectrum, exits.T, lanes)
         once = dr.gather(mi.UInt32, exits.order, lanes) == 1
         columns = side_features(self.frame, Side(at, first_event(self.object, at)))

@@ -34,7 +34,7 @@ from full_geometry.models.storing import (  # noqa: E402
     CENTRES,
     CHECKSUMS,
     ENDS,
-    EVEN,
+    TRUSTED,
     TURNS,
     identify,  # noqa: E402
     save,
@@ -247,7 +247,7 @@ def _wax_scene(sampler: FlowSampler, folder: Path, monkeypatch: pytest.MonkeyPat
         "b_0": np.zeros(3),
         CENTRES: cluster(obj, frame, N_PATCHES),
     }
-    arrays |= {EVEN: np.zeros((2, 3)), **random_layers(rng, "A", "a", [n_side(3), 5, 6])}
+    arrays |= {TRUSTED: np.zeros((2, 3)), **random_layers(rng, "A", "a", [n_side(3), 5, 6])}
     arrays = {name: value.astype(np.float16) for name, value in {**arrays, **sampler.patches.weights}.items()}
     arrays |= {TURNS: frame.around.turns, ENDS: np.zeros((3, len(Terms.of(n_side(3)).rows)))}
     save(folder, identify(obj), arrays, {"recipe": {"base_model": "better_dipole"}, CHECKSUMS: []})

@@ -121,4 +121,4 @@ def test_order_one_of_even_light_counts_as_a_part_of_all_light_and_more_orders_b
     T = np.repeat(np.array([[0.001], [0.3], [0.599], [0.1]], np.float32), 64, axis=1)
     fitting = ObjectFit(len(features), 2, 1.3, STANDARD, 0)
     fitting.set_scale(Pairs(features, np.ones((2, 64), np.float32), 64, None, AlbedoSamples(features[:n], T)))
-    assert np.allclose(fitting.even_scale.numpy()[:, 0], [1 / 0.6, 1 / 0.4, 1 / 0.599, 1 / 0.1], rtol=1e-5)
+    assert np.allclose(fitting.alpha_scale.numpy()[:, 0], [1 / 0.6, 1 / 0.4, 1 / 0.599, 1 / 0.1], rtol=1e-5)

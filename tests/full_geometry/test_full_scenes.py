@@ -318,7 +318,7 @@ def test_S_of_training_and_of_images_know_the_same_of_even_light(trained: Traine
 
 
 MISSING = [
-    (storing.EVEN, "even light must be learnt"),
+    (storing.TRUSTED, "directional albedo must be learnt"),
     (storing.TURNS, "turns of"),
     (storing.ENDS, "functions of ends"),
 ]

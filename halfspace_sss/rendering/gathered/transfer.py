@@ -121,7 +121,7 @@ class Transfer:
             arriving += L.slope[self.entry, :, axis] * away[:, :, axis, None]
         B = np.einsum("jsc,jsc->jc", self.t, arriving)
         even = self.t.sum(axis=1)
-        left = self.t * (arriving - (B / np.maximum(even, 1e-30))[:, None])  # 0 in even light, where a(w_o) is all
+        left = self.t * (arriving - (B / np.maximum(even, 1e-30))[:, None])  # 0 in uniform light, where a(w_o) is all
         slope = np.stack([np.einsum("jsc,js->jc", left, self.d_o[:, :, axis]) for axis in range(3)], axis=2)
         slope = np.einsum("jck,jki->jci", slope, self.inverse)
         by_place = np.einsum("jsc,jsc->jc", self.t, mean)

@@ -288,7 +288,7 @@ class ObjectAlbedo(Protocol):
     """The directional albedo of an object under uniform illumination, alpha = ∫ S mu_i dw_i dA_i.
 
     Attributes:
-        known: two spectra, 1 in the channels where it may stand for even light: of orders below two, and of S.
+        known: two spectra, 1 in the channels where it may stand for uniform light: of orders below two, and of S.
     """
 
     known: tuple[mi.Spectrum, mi.Spectrum]
