@@ -83,6 +83,13 @@ class Incident:
     slope: np.ndarray
     middle: np.ndarray
 
+    @classmethod
+    def mean_of(cls, parts: list[Incident]) -> Incident:
+        """The mean of several, about the mean of their middles."""
+        middle = np.mean([part.middle for part in parts], axis=0)
+        means = [part.mean + np.einsum("jck,jk->jc", part.slope, middle - part.middle) for part in parts]
+        return cls(np.mean(means, axis=0), np.mean([part.slope for part in parts], axis=0), middle)
+
 
 @dataclass(frozen=True, eq=False)
 class Transfer:
@@ -109,6 +116,15 @@ class Transfer:
     albedo: Albedo
     error: float
 
+    @property
+    def nbytes(self) -> int:
+        """Memory of all arrays of entries."""
+        return sum(v.nbytes for v in (self.entry, self.t, self.w_i, self.d_o, self.middle, self.inverse))
+
+    def by_place(self, L: Incident) -> np.ndarray:
+        """What leaves by the means of the light at the places of entries, (points, channels)."""
+        return np.einsum("jsc,jsc->jc", self.t, L.mean[self.entry])
+
     def __matmul__(self, L: Incident) -> np.ndarray:
         """B for incident radiance, linear in w_o: constant and slope, (points, channels, 4).
 
@@ -116,7 +132,7 @@ class Transfer:
         noise: it is averaged over a wider neighbourhood than B is blended from.
         """
         away = self.w_i - L.middle[self.entry]
-        mean, arriving = L.mean[self.entry], L.mean[self.entry]
+        arriving = L.mean[self.entry]
         for axis in range(3):
             arriving += L.slope[self.entry, :, axis] * away[:, :, axis, None]
         B = np.einsum("jsc,jsc->jc", self.t, arriving)
@@ -124,7 +140,7 @@ class Transfer:
         left = self.t * (arriving - (B / np.maximum(even, 1e-30))[:, None])  # 0 in uniform light, where a(w_o) is all
         slope = np.stack([np.einsum("jsc,js->jc", left, self.d_o[:, :, axis]) for axis in range(3)], axis=2)
         slope = np.einsum("jck,jki->jci", slope, self.inverse)
-        by_place = np.einsum("jsc,jsc->jc", self.t, mean)
+        by_place = self.by_place(L)
         by_direction = np.concatenate([(B - by_place)[:, :, None], slope], axis=2)
         for _ in range(SMOOTHINGS):
             by_direction = self.points.smoothed(by_direction)
@@ -144,7 +160,7 @@ def transfer(obj: TranslucentObject, count: int | None = None, samples: int = SA
     each = max(samples // len(points), 16)
     result = drawn(obj, points, lambda p, n, _, active: points.nearest(p, n, active), each, seed)
     t, error = _rows(points, result.S, _trusted(obj), result.a)
-    near = np.where(result.known, result.near, np.arange(len(points))[:, None])
+    near = np.where(result.known, result.near, np.arange(len(points), dtype=np.uint32)[:, None])
     centred = _centred(result.w_o, result.a.mean(axis=2))
     return Transfer(points, near, t, result.w_i, *centred, result.albedo, error)
 

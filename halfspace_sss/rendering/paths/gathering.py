@@ -120,11 +120,12 @@ class Gathering:
         return self._found
 
     def told(self) -> list[str]:
-        """Of each object: points, and the noise of transfer and light."""
+        """Of each object: points, memory, and the noise of transfer and light."""
         results = [obj.gathered for obj in self._found if obj.gathered is not None]
         return [
-            f"light of {g.object.geometry.name} gathered at {len(g.transfer.points)} points: noise of the transfer "
-            f"{g.transfer.error:.1%} a point, of the light {g.error:.1%}"
+            f"light of {g.object.geometry.name} gathered at {len(g.transfer.points)} points, "
+            f"{1e-6 * g.transfer.nbytes:.0f} MB: noise of the transfer {g.transfer.error:.1%} a point, "
+            f"of the light {g.error:.1%}"
             for g in results
         ]
 
@@ -154,11 +155,11 @@ def _leaving(
     scene: mi.Scene, objects: list[TranslucentObject], k: int, T: Transfer, settings: Settings, seeds: tuple[int, ...]
 ) -> Gathered:
     """B of object k, in parts whose differences tell the noise."""
-    parts = np.stack([T @ _incident(scene, objects, T, settings, 2 * k + seed) for seed in seeds])
-    B = parts.mean(axis=0)
+    lights = [_incident(scene, objects, T, settings, 2 * k + seed) for seed in seeds]
+    B, parts = T @ Incident.mean_of(lights), np.stack([T.by_place(light) for light in lights])
     if not np.isfinite(B).all():
         raise ValueError(f"light at object {objects[k].geometry.name} must be finite, got NaN or infinity")
-    spread = parts[..., 0].var(axis=0, ddof=1).mean() if len(parts) > 1 else np.nan
+    spread = parts.var(axis=0, ddof=1).mean() if len(parts) > 1 else np.nan
     error = np.sqrt(spread / len(parts)) / max(float(B[..., 0].mean()), 1e-30)
     return Gathered(objects[k], T, mi.Float(B.astype(np.float32).ravel()), float(error))
 
@@ -185,11 +186,15 @@ def _incident(
     dr.eval(values)
     j, s = lane // n, lane % n
     order = dr.select(s % TRACED == 0, j * few + s // TRACED, count * few + j * (n - few) + s - s // TRACED - 1)
-    aimed, arriving, a, weight, w_e, w_c = (dr.gather(type(v), v, order) for v in values)
+    values = [dr.gather(type(v), v, order) for v in values]
+    dr.eval(values)
+    aimed, arriving, a, weight, w_e, w_c = values
 
     def total(value: Any) -> np.ndarray:
         """Sums over the directions of each point, (points, components)."""
-        return np.stack([np.array(dr.block_sum(part, n)) for part in value], axis=1)
+        sums = [dr.block_sum(part, n) for part in value]
+        dr.eval(sums)
+        return np.stack([np.array(v) for v in sums], axis=1)
 
     norm, whole = total(a), total([weight])
     middle = total(weight * w_c) / np.maximum(whole, 1e-30)
