@@ -1,4 +1,4 @@
-"""One image from two of the same scene, by walks and by a model, with weights that know nothing of the pixel."""
+"""One image from two of the same scene, by walks and by a model: inverse-variance weights, cross-weighted."""
 
 from __future__ import annotations
 
@@ -17,9 +17,10 @@ def combined(walks: Reference, model: Reference) -> Reference:
     The image is cut into tiles like a chessboard. In each the variances of the mean are summed over pixels and colours,
     and V is the square of the mean of the roots of these sums, so that a single spike, as walks have them that find a
     small light by chance, does not decide alone. As a pixel that happens to be bright has a large variance too, weights
-    from the pixels themselves would darken the image: white tiles take s from the black ones and the other way round.
-    Filters wider than a box let neighbours at the edges of tiles share samples. With fewer than two passes of
-    one of them, or where neither varies, s is the share of the samples. The bias of the model does not count.
+    from the pixels themselves would darken the image. Tiles are cross-weighted: white ones take s from the black ones
+    and the other way round, as the two buffers of Rousselle, Knaus and Zwicker (2012) filter each other. Filters
+    wider than a box let neighbours at the edges of tiles share samples. With fewer than two passes of one of them, or
+    where neither varies, s is the share of the samples. The bias of the model does not count.
 
     Args:
         walks, model: of the same scene and sensor. What `model` is about is kept; `about["combined"]` tells the rest.
