@@ -15,6 +15,7 @@ mi = pytest.importorskip("mitsuba")
 import drjit as dr  # noqa: E402
 
 from halfspace_sss.physics.fresnel import F_t, mu_external  # noqa: E402
+from halfspace_sss.rendering.paths import low_orders  # noqa: E402
 from halfspace_sss.rendering.paths.low_orders import refracted_connection  # noqa: E402
 
 ETA, RADIUS, N = 1.4, 2.0, 400
@@ -110,6 +111,40 @@ def test_the_density_of_a_connection_is_how_its_target_spreads(ball) -> None:
     assert chosen.sum() > 50
     ratio = density[chosen] * area[chosen]
     assert np.median(np.abs(ratio - 1)) < 5e-3 and np.quantile(np.abs(ratio - 1), 0.9) < 0.05
+
+
+def test_a_connection_by_one_reflection_leaves_towards_its_target_and_knows_how_that_spreads(ball) -> None:
+    """Against rays in closed form, from random starts; the density as in the test above."""
+    p, target = points(5, 0.7), directions(6) * 8
+    start = mi.Vector3f(directions(7))
+    met = low_orders._connect(ball, mi.Point3f(p), mi.Point3f(target), start, True, low_orders.OTHERS, mi.Bool(True))
+    valid, d, h = np.array(met.valid), np.array(met.d, dtype=np.float64), 1e-4
+
+    def twice(d: np.ndarray) -> tuple[Passage, np.ndarray, np.ndarray]:
+        first = leave(p, d / np.linalg.norm(d, axis=0))
+        n, w = first.p / RADIUS, d / np.linalg.norm(d, axis=0)
+        second = leave(first.p, w - 2 * n * (w * n).sum(axis=0))
+        return second, first.length + second.length, 1 - first.valid * first.T
+
+    out, length, R = twice(d)
+    assert valid.sum() > N // 20 and out.valid[valid].all()
+    to = target - out.p
+    missed = np.linalg.norm(np.cross(to, out.w, axis=0), axis=0) / np.linalg.norm(to, axis=0)
+    assert missed[valid].max() < 2e-3
+    np.testing.assert_allclose(where(met.length, valid), length[valid], atol=1e-3)
+    np.testing.assert_allclose(where(met.T, valid), (R * out.T)[valid], atol=5e-3)
+    columns = []
+    for e in mi.coordinate_system(met.d):
+        ends = []
+        for sign in (1, -1):
+            moved = twice(d + sign * h * np.array(e, dtype=np.float64))[0]
+            t = ((target - moved.p) * out.w).sum(axis=0) / (moved.w * out.w).sum(axis=0)
+            ends.append(moved.p + moved.w * t)
+        columns.append((ends[0] - ends[1]) / (2 * h))
+    area = np.linalg.norm(np.cross(*columns, axis=0), axis=0)
+    chosen = valid & (area > 0.1) & (out.T > 0.5)
+    ratio = np.array(met.density)[chosen] * area[chosen]
+    assert chosen.sum() > 10 and np.median(np.abs(ratio - 1)) < 0.01
 
 
 def test_nothing_connects_where_nothing_is_asked_for(ball) -> None:

@@ -9,10 +9,10 @@ p the density of the walk; the factors eta² of radiance cancel, and Fresnel's i
 Whether a segment is passed, and where and how the walk is scattered, is drawn for the channels by their weights f_c so
 far.
 
-Light of emitters and suns that reaches the event without reflection is found by emitter connections: the ray that is
-refracted towards a sampled point of them, where there is one that `refracted_connection` finds. Connections with an
-uneven sky have MIS weights against the phase function. All other light is left to chance, that of delta lights spread
-over a cone, see `light.small_emitters`. The boundary refracts as if it were smooth.
+Light of emitters and suns that reaches the event after one reflection or none is found by emitter connections: rays
+that are refracted towards a sampled point of them, where Newton's method finds some. Connections with an uneven sky,
+without reflection, have MIS weights against the phase function. All other light is left to chance, that of delta lights
+spread over a cone, see `light.small_emitters`. The boundary refracts as if it were smooth.
 
 A walk ends where it meets what lies inside the object: the transport has all such paths.
 """
@@ -34,13 +34,15 @@ from halfspace_sss.rendering.paths.lighting import RenderContext, delta_light, m
 MOST_SEGMENTS = 256
 FAINT = 0.1  # weight below which a scattered walk may end
 GRAZES = 0.05  # cosine at an emitter up to which its points are left to chance: their density over the area goes to 0
-FOCUS = 10.0  # of the straight way into solid angle at the event; points of caustics beyond are left to chance
-SAME_WAY = 1e-2  # by which points of exit may differ, over their distance from the event
+FOCUS = 100.0  # of the straight way into solid angle at the event; points of caustics beyond are left to chance
+SAME_WAY = 3e-3  # by which points of exit may differ, over the length inside
 FAR = 1e4  # distance of what is infinitely far, over the size of the object
 
-NEWTON_STEPS = 6
-LONGEST_STEP = 0.5  # of the direction, radians
-TOLERANCE = 1e-3  # distance by which the target may be missed, over its distance
+FIRST, OTHERS = (
+    (6, 0.5),
+    (10, 0.15),
+)  # steps of Newton's method and the longest, radians, of the first connection and others
+TOLERANCE = 2e-4  # distance by which the target may be missed, over its distance
 
 Media = list["tuple[mi.Float, mi.Float, mi.Float]"]  # sigma_s, sigma_t and g of each channel
 
@@ -85,7 +87,7 @@ class _Walk:
     event_d: mi.Vector3f  # direction of arrival there
     event_length: mi.Float  # Λ there
     event_inverse_pdf: mi.Float  # 1 / p there, before the phase function
-    straight: mi.Bool  # nothing has reflected since the event
+    reflections: mi.UInt32  # at the boundary, since the event
     left: mi.Bool
     alive: mi.Bool
 
@@ -109,7 +111,7 @@ def sample_low_orders(
         walk = _walk(obj, refracted, sampler, active & refracted.valid)
         once = walk.order == 1
         counts = walk.left & (once if 0 not in obj.low_orders else mi.Bool(True))
-        straight = once & walk.straight
+        straight, connected = once & (walk.reflections == 0), once & (walk.reflections <= 1)
 
     # ---- throughput f / p
     media = obj.variation.coefficients(obj.media)
@@ -123,12 +125,12 @@ def sample_low_orders(
         at_event = _contribution(media, walk.event_length, mi.UInt32(1), None) * (walk.event_inverse_pdf * refracted.T)
         direct = _connected(context, (obj, media), walk, dr.select(once, at_event, 0), sampler, once)
     if lights.some_shaped or context.suns:
-        direct = direct + weight * _met_by_chance(context, obj, walk, counts & straight)
+        direct = direct + weight * _met_by_chance(context, obj, walk, sampler, counts & connected)
     if lights.some_delta:
         direct = direct + weight * _spread_lights(context, obj, walk, sampler, counts & (once | scattered))
     if sky:
         pdf, share = _sky_pdf(obj, walk, counts & straight)
-    return LowOrderSample(walk.o, walk.n, walk.d, weight, straight, pdf, share, direct, once)
+    return LowOrderSample(walk.o, walk.n, walk.d, weight, connected, pdf, share, direct, once)
 
 
 # ---- The walk --------------------------------------------------------------------------------------------------------
@@ -141,7 +143,7 @@ def _walk(obj: TranslucentObject, refracted: RefractedRay, sampler: mi.Sampler, 
     skip = _clear(obj, refracted.out.n, refracted.d)
     start = _Walk(
         p, mi.Vector3f(refracted.d), mi.Normal3f(refracted.out.n), mi.Float(skip), zero, mi.Float(1), mi.UInt32(0),
-        zero, mi.Point3f(p), mi.Vector3f(refracted.d), zero, zero, mi.Bool(True), mi.Bool(False), mi.Bool(active),
+        zero, mi.Point3f(p), mi.Vector3f(refracted.d), zero, zero, mi.UInt32(0), mi.Bool(False), mi.Bool(active),
     )  # fmt: skip
 
     def step(k: mi.UInt32, sampler: mi.Sampler, passing: mi.Float, walk: _Walk) -> tuple:
@@ -205,7 +207,7 @@ def _scatter(
     return replace(
         walk, o=p, d=mi.Vector3f(d), skip=mi.Float(0), length=length,
         inverse_pdf=inverse_pdf / dr.maximum(phase, 1e-30), order=mi.UInt32(1), cosine=mi.Float(cosine), event=p,
-        event_d=mi.Vector3f(walk.d), event_length=length, event_inverse_pdf=inverse_pdf, straight=mi.Bool(True),
+        event_d=mi.Vector3f(walk.d), event_length=length, event_inverse_pdf=inverse_pdf, reflections=mi.UInt32(0),
         alive=walk.alive & (dr.sum(W) > 0) & (dr.sum(chance) > 0),
     )  # fmt: skip
 
@@ -225,7 +227,7 @@ def _meet_boundary(of: tuple[TranslucentObject, Media], walk: _Walk, met: tuple,
     alive = walk.alive & si.is_valid() & (dr.dot(n, walk.d) > 0) & (sampler.next_1d() < survival)
     return replace(
         walk, o=mi.Point3f(si.p), d=d, n=mi.Normal3f(n), skip=mi.Float(_clear(obj, n, d)), left=alive & leaves,
-        straight=walk.straight & leaves, alive=alive & ~leaves,
+        reflections=walk.reflections + dr.select(leaves, 0, mi.UInt32(1)), alive=alive & ~leaves,
         inverse_pdf=walk.inverse_pdf / dr.maximum(survival, 1e-30),
     )  # fmt: skip
 
@@ -275,31 +277,66 @@ def _spectrum(values: list[mi.Float]) -> mi.Spectrum:
 # ---- Light: emitter connections, and what they do not find -----------------------------------------------------------
 
 
+class _Target(NamedTuple):
+    """A sampled point of an emitter."""
+
+    ds: mi.DirectionSample3f  # from the event
+    light: mi.Spectrum  # over the density
+    p: mi.Point3f
+    reach: mi.Float  # its distance
+    alone: mi.Bool  # whether no other strategy counts its light
+
+
 def _connected(
     context: RenderContext, of: tuple[TranslucentObject, Media], walk: _Walk, weight: mi.Spectrum, sampler: mi.Sampler,
     active: mi.Bool,
 ) -> mi.Spectrum:  # fmt: skip
-    """Light of a sampled emitter that is refracted at the boundary into the event, which has a weight."""
+    """Light of a sampled emitter that reaches the event, which has a weight, by refraction or one reflection more."""
     obj, media = of
     at = place(walk.event, mi.Normal3f(0, 0, 0))
     ds, light = sample_emitter(context, at, sampler.next_2d(), False, active)
     with dr.suspend_grad():
         distant = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
-        alone = context.sampled_by_nee(ds.emitter, ds.d)  # no other strategy counts this light
-        active = active & (ds.pdf > 0) & (alone | mi.Bool(context.connects_sky(obj)))
+        alone = context.sampled_by_nee(ds.emitter, ds.d)
+        active = active & (ds.pdf > 0)
         reach = dr.select(distant, opaque(FAR * obj.geometry.size), ds.dist)
-        target = walk.event + ds.d * reach
-        met = refracted_connection(obj, walk.event, target, active)
+        target = _Target(ds, light, walk.event + ds.d * reach, reach, alone)
+        met = refracted_connection(obj, walk.event, target.p, active & (alone | mi.Bool(context.connects_sky(obj))))
+    light = _light_along(context, of, walk, weight, target, met)
+    for reflects in (False, True) if context.lights.some_local or context.suns else ():
+        with dr.suspend_grad():
+            other = _trial(obj, walk, target.p, reflects, sampler, active & alone & _near(obj, walk, target.p, active))
+            other.valid &= ~_leaves(met, other.p, SAME_WAY)
+        more = _light_along(context, of, walk, weight, target, other)
+        with dr.suspend_grad():
+            # the fainter, the fewer are looked for again
+            counted = dr.minimum(other.T * dr.exp(-dr.min(_column(media, 1)) * other.length) / FAINT, 1)
+            again = (dr.max(more) > 0) & (sampler.next_1d() < counted)
+            trials, _ = _find(obj, walk, target.p, reflects, (other.p, SAME_WAY), sampler, again)
+            times = dr.select(again, mi.Float(trials) / counted, 0)
+        light = light + more * times
+    return light
+
+
+def _light_along(
+    context: RenderContext, of: tuple[TranslucentObject, Media], walk: _Walk, weight: mi.Spectrum, target: _Target,
+    met: Connection,
+) -> mi.Spectrum:  # fmt: skip
+    """Light of a target by its connection with the event, which has a weight."""
+    obj, media = of
+    with dr.suspend_grad():
         # solid angle at the event per solid angle of the straight direction, over which the emitter was sampled
+        ds, alone, reach = target.ds, target.alone, target.reach
         facing = dr.select(dr.squared_norm(ds.n) > 0, dr.abs(dr.dot(ds.n, met.w)) / dr.abs(dr.dot(ds.n, ds.d)), 1)
-        valid = met.valid & (ds.delta | ~alone | _is_sampled(walk.event, target, ds.n, met))
+        valid = met.valid & (ds.delta | ~alone | _is_sampled(walk.event, target.p, ds.n, met))
+        valid &= dr.dot(ds.n, met.w) <= 0
         spread = dr.select(ds.delta | ~alone, 1, facing) * reach * reach * met.density
         weight_sky = mis_weight(ds.pdf, _phase_pdf(obj, walk, met) * met.T * spread)
         cosine, passed = dr.dot(walk.event_d, met.d), met.T * spread * dr.select(alone, 1, weight_sky)
     phase = _spectrum([eval_hg(cosine, g) for _, _, g in media])
-    value = weight * phase * _contribution(media, met.length, mi.UInt32(0), None) * passed * light
+    value = weight * phase * _contribution(media, met.length, mi.UInt32(0), None) * passed * target.light
     edge = place(met.p, met.n)
-    blocked = context.scene.ray_test(edge.spawn_ray_to(target), False, valid)
+    blocked = context.scene.ray_test(edge.spawn_ray_to(target.p), False, valid)
     return dr.select(valid & ~blocked, value, 0)
 
 
@@ -316,22 +353,24 @@ def _sky_pdf(obj: TranslucentObject, walk: _Walk, active: mi.Bool) -> tuple[mi.F
     with dr.suspend_grad():
         reach = opaque(FAR * obj.geometry.size)
         met = refracted_connection(obj, walk.event, walk.event + walk.d * reach, active)
-        same = active & _is_same(walk, met, SAME_WAY)
+        same = active & _leaves(met, walk.o, SAME_WAY)
         pdf = _phase_pdf(obj, walk, met) * met.T * reach * reach * met.density
     return dr.select(same, pdf, 1), dr.select(same, mi.Float(1), 0)
 
 
-def _met_by_chance(context: RenderContext, obj: TranslucentObject, walk: _Walk, active: mi.Bool) -> mi.Spectrum:
+def _met_by_chance(
+    context: RenderContext, obj: TranslucentObject, walk: _Walk, sampler: mi.Sampler, active: mi.Bool
+) -> mi.Spectrum:
     """Emission that a walk meets from its event, which no connection with that point of an emitter would find."""
     with dr.suspend_grad():
         ray = place(walk.o, walk.n).spawn_ray(walk.d)
         si = context.scene.ray_intersect(ray, mi.RayFlags.All, False, active)
         emitter = si.emitter(context.scene, active)
         active = active & (emitter != None) & context.sampled_by_nee(emitter, walk.d)  # noqa: E711
-        target = dr.select(si.is_valid(), si.p, walk.event + walk.d * opaque(FAR * obj.geometry.size))
-        met = refracted_connection(obj, walk.event, mi.Point3f(target), active)
+        target = mi.Point3f(dr.select(si.is_valid(), si.p, walk.event + walk.d * opaque(FAR * obj.geometry.size)))
         n = dr.select(si.is_valid(), si.n, 0)
-        sampled = _is_same(walk, met, SAME_WAY) & _is_sampled(walk.event, target, n, met)
+        met = _taken(obj, walk, target, SAME_WAY, sampler, active)
+        sampled = met.valid & _is_sampled(walk.event, target, n, met)
     return dr.select(active & ~sampled, emitter.eval(si, active), 0)
 
 
@@ -341,15 +380,15 @@ def _spread_lights(
     """Light of a delta light whose cone holds a walk's way out, which no connection with it would find."""
     which, L = delta_light(context, sampler, place(walk.o, walk.n).spawn_ray(walk.d), active)
     with dr.suspend_grad():
-        connects = active & (dr.max(L) > 0) & walk.straight & (walk.order == 1)
+        connects = active & (dr.max(L) > 0) & (walk.order == 1)
         target = context.small.point(which, walk.event, FAR * obj.geometry.size)
-        met = refracted_connection(obj, walk.event, target, connects)
-    return dr.select(connects & _is_same(walk, met, 3 * WIDE), 0, L)
+        met = _taken(obj, walk, target, 3 * WIDE, sampler, connects)
+    return dr.select(met.valid, 0, L)
 
 
-def _is_same(walk: _Walk, met: Connection, tolerance: float) -> mi.Bool:
-    """Whether a walk has left its event by the connection, up to a share of the distance."""
-    return met.valid & (dr.norm(mi.Point3f(met.p) - walk.o) <= tolerance * dr.norm(walk.o - walk.event))
+def _leaves(met: Connection, x: mi.Point3f, tolerance: float) -> mi.Bool:
+    """Whether a connection leaves through a point of the boundary, up to a share of its length."""
+    return met.valid & (dr.norm(mi.Point3f(met.p) - x) <= tolerance * met.length)
 
 
 def _is_sampled(event: mi.Point3f, p: mi.Point3f, n: mi.Normal3f, met: Connection) -> mi.Bool:
@@ -363,40 +402,133 @@ def _faces(n: mi.Normal3f, d: mi.Vector3f) -> mi.Bool:
     return (dr.dot(n, d) < -GRAZES) | (dr.squared_norm(n) == 0)
 
 
-# ---- Refracted connection: Newton's method ---------------------------------------------------------------------------
+# ---- Other connections, from random directions ----------------------------------------------------------------------
+#
+# Many rays from an event may be refracted towards a point outside, with or without a reflection before. Newton's method
+# finds one of them, m, with a probability q_m over random directions d_1, d_2, ... that it starts from (specular
+# manifold sampling, Zeltner, Georgiev and Jakob 2020). With T the trials until m is found again, at most N of them,
+#
+#     E[min(T, N)] = (1 - (1 - q_m)^N) / q_m,
+#
+# so that light along what d_1 leads to, times min(T, N), is the share 1 - (1 - q_m)^N of all. The rest is light met by
+# chance, counted where N other directions do not lead to it. Chance and connections agree whatever the directions are
+# drawn from; q_m decides how much is left to chance.
+
+TRIALS = 32  # N
+SPREAD = (20.0, 2.0)  # concentrations of directions about the first guess
+NEAR = 4.0  # mean free paths of the straight way to the boundary, beyond which other connections are left to chance
+MIRRORED = 0.5  # probability to start as a flat boundary would reflect
+
+
+def _taken(
+    obj: TranslucentObject, walk: _Walk, target: mi.Point3f, tolerance: float, sampler: mi.Sampler, active: mi.Bool
+) -> Connection:
+    """The connection by which a walk has left its event, if one is found; without, it is met by chance alone."""
+    met = refracted_connection(obj, walk.event, target, active & (walk.reflections == 0))
+    met = replace(met, valid=_leaves(met, walk.o, tolerance))
+    near = _near(obj, walk, target, active)
+    for k, reflects in enumerate((False, True)):
+        lost = active & ~met.valid & (walk.reflections == k) & near
+        _, other = _find(obj, walk, target, reflects, (walk.o, tolerance), sampler, lost)
+        met = dr.select(other.valid, other, met)
+    return met
+
+
+def _find(
+    obj: TranslucentObject, walk: _Walk, target: mi.Point3f, reflects: bool, wanted: tuple[mi.Point3f, float],
+    sampler: mi.Sampler, active: mi.Bool,
+) -> tuple[mi.UInt32, Connection]:  # fmt: skip
+    """Trials until a connection leaves through the wanted point, up to a share of its length; valid if one did."""
+    x, tolerance = wanted
+
+    def trial(n: mi.UInt32, sampler: mi.Sampler, found: Connection, active: mi.Bool) -> tuple:
+        met = _trial(obj, walk, target, reflects, sampler, active)
+        same = _leaves(met, x, tolerance)
+        n = n + dr.select(active, mi.UInt32(1), 0)
+        return n, sampler, dr.select(active & same, met, found), active & ~same & (n < TRIALS)
+
+    state = (mi.UInt32(0), sampler, _no_connection(), mi.Bool(active))
+    n, _, found, _ = dr.while_loop(state, lambda n, sampler, found, active: active, trial, label="trials")
+    return n, found
+
+
+def _near(obj: TranslucentObject, walk: _Walk, target: mi.Point3f, active: mi.Bool) -> mi.Bool:
+    """Whether other connections are looked for: where light of the target is likely to be seen."""
+    if obj.geometry.contents is not None:
+        return mi.Bool(False)
+    ray = mi.Ray3f(walk.event, dr.normalize(target - walk.event))
+    ray.maxt = NEAR / opaque(min(m.sigma_t for m in obj.media))
+    return obj.geometry.scene.ray_test(ray, False, active)
+
+
+def _trial(
+    obj: TranslucentObject, walk: _Walk, target: mi.Point3f, reflects: bool, sampler: mi.Sampler, active: mi.Bool
+) -> Connection:
+    """A connection from a random direction: about the first guess, or where it reflects from any."""
+    v, u, toward = sampler.next_1d(), sampler.next_2d(), dr.normalize(target - walk.event)
+    if not reflects:
+        guess = _first_guess(obj, walk.event, toward, active)
+        d = mi.Frame3f(guess).to_world(mi.warp.square_to_von_mises_fisher(u, dr.select(v < 0.5, SPREAD[0], SPREAD[1])))
+        return _connect(obj, walk.event, target, d, False, OTHERS, active)
+    d = mi.warp.square_to_uniform_sphere(u)
+    si, n, _ = meet(obj, walk.event, d, mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame, active)
+    mirror = dr.normalize(target - (walk.event + n * (2 * dr.dot(si.p - walk.event, n))))
+    d = dr.select(v < MIRRORED, mirror - n * (2 * dr.dot(mirror, n)), d)
+    return _connect(obj, walk.event, target, d, True, OTHERS, active & si.is_valid())
+
+
+# ---- Specular connections: Newton's method ---------------------------------------------------------------------------
 #
 # In the spirit of Walter, Zhao, Holzschuch and Bala 2009: the direction at the event is moved by Newton's method until
-# the refracted ray meets the target. The derivative of the refracted ray (Igehy 1999) contains the curvature of the
-# shading normals. One solution is looked for, from where the straight ray meets the boundary: light that reaches the
-# event along several refracted rays is counted once, and where Newton's method fails the light is lost.
+# the refracted ray meets the target. The derivatives of reflected and refracted rays (Igehy 1999) contain the curvature
+# of the shading normals. Without reflection one solution is looked for, from where the straight ray meets the boundary:
+# light that reaches the event along several refracted rays is counted once, and where Newton's method fails the light
+# is lost.
 
 
 @dataclass
 class Connection:
-    """A refracted connection of a point inside with a point outside."""
+    """A specular connection of a point inside with a point outside."""
 
-    p: mi.Point3f  # on the boundary
+    p: mi.Point3f  # where it leaves
     n: mi.Normal3f  # geometric, outwards
-    d: mi.Vector3f  # direction inside
+    d: mi.Vector3f  # direction inside, at the point inside
     w: mi.Vector3f  # direction outside
-    T: mi.Float  # Fresnel transmittance
+    T: mi.Float  # Fresnel transmittance, times the reflectance where it is reflected
     length: mi.Float  # inside
     density: mi.Float  # solid angle inside per area across the ray at the target
     valid: mi.Bool
 
 
+def _no_connection() -> Connection:
+    p, n, d = mi.Point3f(0), mi.Normal3f(0, 0, 1), mi.Vector3f(0, 0, 1)
+    return Connection(p, n, d, mi.Vector3f(d), mi.Float(0), mi.Float(0), mi.Float(0), mi.Bool(False))
+
+
 def refracted_connection(obj: TranslucentObject, p: mi.Point3f, target: mi.Point3f, active: mi.Bool) -> Connection:
-    """The ray from p inside the object that is refracted towards `target` outside."""
+    """The ray from p inside the object that is refracted towards `target` outside, found from the first guess."""
+    start = _first_guess(obj, p, dr.normalize(target - p), active)
+    met = _connect(obj, p, target, start, False, FIRST, active)
+    return replace(met, valid=met.valid & ~_blocked(obj, p, met.d, met.length, met.valid))
+
+
+def _connect(
+    obj: TranslucentObject, p: mi.Point3f, target: mi.Point3f, start: mi.Vector3f, reflects: bool,
+    newton: tuple[int, float], active: mi.Bool,
+) -> Connection:  # fmt: skip
+    """A ray from p inside the object, reflected once or not, then refracted towards `target`; found from `start`."""
+
+    steps, longest = newton
 
     def step(k: mi.UInt32, d: mi.Vector3f, best: Connection, active: mi.Bool) -> tuple:
         # ---- J step = e in two axes
-        e, J, met, valid = _miss(obj, p, d, target, active)
+        e, J, met, valid = _miss(obj, p, d, target, reflects, active)
         (a, b), (c, f) = J
         det = a * f - b * c
         inverse = dr.rcp(dr.select(dr.abs(det) > 1e-12, det, 1e-12))
         step_1, step_2 = (f * e[0] - b * e[1]) * inverse, (a * e[1] - c * e[0]) * inverse
         size = dr.sqrt(step_1 * step_1 + step_2 * step_2)
-        shrink = dr.minimum(1, LONGEST_STEP / dr.maximum(size, 1e-9))
+        shrink = dr.minimum(1, longest / dr.maximum(size, 1e-9))
 
         # ---- keep it where it is close; go on where it is not exact
         miss = dr.sqrt(e[0] * e[0] + e[1] * e[1])
@@ -406,18 +538,12 @@ def refracted_connection(obj: TranslucentObject, p: mi.Point3f, target: mi.Point
         best = dr.select(active & close, new, best)
         e_1, e_2 = mi.coordinate_system(d)
         moved = dr.normalize(d + (e_1 * step_1 + e_2 * step_2) * shrink)
-        active = active & valid & (~close | (miss > 1e-5 * dr.norm(target - p))) & (k + 1 < NEWTON_STEPS)
+        active = active & valid & (~close | (miss > 1e-5 * dr.norm(target - p))) & (k + 1 < steps)
         return k + 1, dr.select(active, moved, d), best, active
 
-    start = _first_guess(obj, p, dr.normalize(target - p), active)
-    none = Connection(
-        mi.Point3f(0), mi.Normal3f(0, 0, 1), mi.Vector3f(0, 0, 1), mi.Vector3f(0, 0, 1), mi.Float(0), mi.Float(0),
-        mi.Float(0), mi.Bool(False),
-    )  # fmt: skip
-    state = (mi.UInt32(0), mi.Vector3f(start), none, mi.Bool(active))
-    best = dr.while_loop(state, lambda k, d, best, active: active, step, label="refraction")[2]
-    valid = best.valid & active
-    return replace(best, valid=valid & ~_blocked(obj, p, best.d, best.length, valid))
+    state = (mi.UInt32(0), mi.Vector3f(start), _no_connection(), mi.Bool(active))
+    best = dr.while_loop(state, lambda k, d, best, active: active, step, label="connection")[2]
+    return replace(best, valid=best.valid & active)
 
 
 def _first_guess(obj: TranslucentObject, p: mi.Point3f, w: mi.Vector3f, active: mi.Bool) -> mi.Vector3f:
@@ -427,37 +553,62 @@ def _first_guess(obj: TranslucentObject, p: mi.Point3f, w: mi.Vector3f, active: 
     return dr.normalize(across + n_out * dr.sqrt(dr.maximum(1 - dr.squared_norm(across), 1e-4)))
 
 
-def _miss(
-    obj: TranslucentObject, p: mi.Point3f, d: mi.Vector3f, target: mi.Point3f, active: mi.Bool
-) -> tuple[tuple, tuple, tuple, mi.Bool]:
-    """Miss of the target in two axes across the refracted ray, its derivative by d, the passage, and its validity.
+_Steps = list["tuple[mi.Vector3f, mi.Vector3f]"]  # differentials of a ray's origin and direction, by two axes
 
-    With dw across d: dx = s (dw - d (dw.n)/(d.n)); dn = n_u du + n_v dv; refracted w = eta d + (c_t - eta c) n.
+
+def _miss(
+    obj: TranslucentObject, p: mi.Point3f, d: mi.Vector3f, target: mi.Point3f, reflects: bool, active: mi.Bool
+) -> tuple[tuple, tuple, tuple, mi.Bool]:
+    """Miss of the target in two axes across the ray outside, its derivative by d, the passage, and its validity.
+
+    With dw across d, t the length and d' = -d reflected:
+
+        dx = (1 - d n / (d.n)) (dx + t dd),    dn = n_u du + n_v dv,
+        reflected  d - 2 (d.n) n,              refracted  eta d + (c_t - eta c) n.
     """
-    # ---- refracted ray
-    si, n_out, n = meet(obj, p, d, mi.RayFlags.All | mi.RayFlags.dNSdUV, active)
-    w, F, valid = _refract(obj, d, n_out)
+    # ---- to the boundary, if reflected twice
+    zero, T, length, skip, valid = mi.Vector3f(0), mi.Float(1), mi.Float(0), mi.Float(0), mi.Bool(active)
+    steps, o = [(zero, mi.Vector3f(e)) for e in mi.coordinate_system(d)], p
+    if reflects:
+        t, met, steps = _arrive(obj, o, d, skip, steps, valid)
+        si, n_out, n = met
+        c = dr.dot(d, n_out)
+        dc = [dr.dot(dd, n_out) + dr.dot(d, dn) for _, dd, dn in steps]
+        steps = [(dx, dd - 2 * (n_out * k + dn * c)) for (dx, dd, dn), k in zip(steps, dc)]
+        T, length, o, d = mi.fresnel(dr.maximum(c, 0), 1 / obj.eta)[0], t, mi.Point3f(si.p), d - n_out * (2 * c)
+        skip, valid = _clear(obj, n, d), valid & si.is_valid() & (c > 0) & (dr.dot(d, n) < 0)
+    t, (si, n_out, n), steps = _arrive(obj, o, d, skip, steps, valid)
+
+    # ---- refracted ray, and its differentials
+    w, F, passes = _refract(obj, d, n_out)
     eta, c = obj.eta, dr.dot(d, n_out)
     c_t = dr.sqrt(dr.maximum(1 - eta * eta * (1 - c * c), 1e-6))
-    flip = dr.select(dr.dot(si.sh_frame.n, n_out) > 0, 1.0, -1.0) * obj.geometry.curvature_sign
-    D = dr.dot(target - si.p, w)
-
-    # ---- its differentials by the two axes across d
-    f = mi.coordinate_system(w)
-    columns = []
-    for e in mi.coordinate_system(d):
-        dx = si.t * (e - d * (dr.dot(e, n) / dr.dot(d, n)))
-        du, dv = _surface_steps(si, dx)
-        dn = (si.dn_du * du + si.dn_dv * dv) * flip
-        dc = dr.dot(e, n_out) + dr.dot(d, dn)
-        dw = eta * e + dn * (c_t - eta * c) + n_out * (eta * eta * c * dc / c_t - eta * dc)
+    D, f, columns = dr.dot(target - si.p, w), mi.coordinate_system(w), []
+    for dx, dd, dn in steps:
+        dc = dr.dot(dd, n_out) + dr.dot(d, dn)
+        dw = eta * dd + dn * (c_t - eta * c) + n_out * (eta * eta * c * dc / c_t - eta * dc)
         moved = dx + dw * D
         columns.append((dr.dot(f[0], moved), dr.dot(f[1], moved)))
     miss = target - (si.p + w * D)
     e = (dr.dot(f[0], miss), dr.dot(f[1], miss))
     J = ((columns[0][0], columns[1][0]), (columns[0][1], columns[1][1]))
-    valid = valid & si.is_valid() & (D > 0) & (dr.dot(w, n) > 0)
-    return e, J, (mi.Point3f(si.p), mi.Normal3f(n), mi.Vector3f(w), 1 - F, si.t), valid
+    valid = valid & passes & si.is_valid() & (D > 0) & (dr.dot(w, n) > 0)
+    return e, J, (mi.Point3f(si.p), mi.Normal3f(n), mi.Vector3f(w), T * (1 - F), length + t), valid
+
+
+def _arrive(
+    obj: TranslucentObject, o: mi.Point3f, d: mi.Vector3f, skip: mi.Float, steps: _Steps, active: mi.Bool
+) -> tuple[mi.Float, tuple, list[tuple]]:
+    """Length of a ray inside, where it meets the boundary as of `meet`, and differentials dx, dd, dn there."""
+    si, n_out, n = met = meet(obj, o + d * skip, d, mi.RayFlags.All | mi.RayFlags.dNSdUV, active)
+    t, found = si.t + skip, []
+    flip = dr.select(dr.dot(si.sh_frame.n, n_out) > 0, 1.0, -1.0) * obj.geometry.curvature_sign
+    for dx, dd in steps:
+        dx = dx + dd * t
+        dx = dx - d * (dr.dot(dx, n) / dr.dot(d, n))
+        du, dv = _surface_steps(si, dx)
+        found.append((dx, dd, (si.dn_du * du + si.dn_dv * dv) * flip))
+    return t, met, found
 
 
 def _refract(obj: TranslucentObject, d: mi.Vector3f, n: mi.Normal3f) -> tuple[mi.Vector3f, mi.Float, mi.Bool]:
