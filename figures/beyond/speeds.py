@@ -169,7 +169,7 @@ def _measured(
         scenes[way] = scene_of(case, way, size, folder)
         rendered(scenes[way], spp[way], seed)
         ready_after[way] = sum(scenes[way].integrator().gathering.seconds) if "gathered" in way else 0.0
-    cover = guides(scenes[WALK], 8)[0][..., 0] > 0.999
+    cover = guides(scenes[WALK], 8)[0][..., 0] > 0
     found = alternating(scenes, spp, seed + 1, passes=PASSES)
     noise = {way: _noise(timed, cover) for way, timed in found.items()}
     seconds = {way: timed.typical_cpu_seconds / spp[way] for way, timed in found.items()}  # of a sample of all pixels
