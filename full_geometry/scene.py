@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 import warnings
-from dataclasses import replace
+from dataclasses import asdict, replace
 from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 
 from full_geometry.models.neural_shape import ALBEDO, ETA, SIZE, G, transport
-from full_geometry.models.storing import CHECKSUMS, KIND, find_weights, load
+from full_geometry.models.storing import CHECKSUMS, KIND, find_weights, load, nearest
 from full_geometry.object.patches import AREA_SHARE, LearntProposals, PatchTable
 from halfspace_sss.neural.store import checksum_of, load_weights
 from halfspace_sss.physics.medium import Medium
@@ -24,6 +24,7 @@ from halfspace_sss.rendering.object.translucent import is_translucent
 
 FINE = 2.5  # transport mean free paths of the radius of a patch, up to which patches do without probes
 PATCH_SHARE = 0.2  # of the entries where patches are larger: they reach what probes miss
+REFINED = 5.0  # seconds of a training that starts from weights of the same shape
 ENTRIES = 2  # of an exit: its own work is done once, and patches draw without a ray
 
 
@@ -34,13 +35,16 @@ def _weights(obj: TranslucentObject, settings: Settings) -> Path:
     except ValueError:
         if settings.train_seconds == 0 or find_spec("torch") is None:
             raise
-    from full_geometry.learning.training import train
+    from full_geometry.learning.training import STANDARD, train
 
+    start, seconds, more = nearest(obj, asdict(STANDARD)), settings.train_seconds, ""
+    if start is not None:
+        seconds = min(seconds, REFINED)
+        more = f", from weights of the same shape with another medium, {start.path.name}"
     warnings.warn(
-        f"object {obj.geometry.name} has no weights: it is learnt first, for {settings.train_seconds:g} s",
-        stacklevel=2,
+        f"object {obj.geometry.name} has no weights: it is learnt first, for {seconds:g} s{more}", stacklevel=2
     )
-    return train(obj, seconds=settings.train_seconds, target_error=settings.train_error).path
+    return train(obj, seconds=seconds, target_error=settings.train_error, start=start).path
 
 
 def learnt_model(obj: TranslucentObject, settings: Settings) -> ObjectModel:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -62,6 +63,12 @@ class DenseLayers(nn.Module):
             x = nn.functional.hardswish(torch.addmm(b, W, x))
         return x
 
+    def take(self, arrays: Mapping[str, np.ndarray], matrix: str, bias: str) -> None:
+        """The numbers that `arrays` gave."""
+        for k, (W, b) in enumerate(zip(self.matrices, self.biases)):
+            W.copy_(torch.from_numpy(arrays[f"{matrix}_{k}"].astype(np.float32)))
+            b.copy_(torch.from_numpy(arrays[f"{bias}_{k}"].astype(np.float32))[:, None])
+
     def arrays(self, matrix: str, bias: str) -> dict[str, np.ndarray]:
         arrays: dict[str, Any] = {}
         for k, (W, b) in enumerate(zip(self.matrices, self.biases)):
@@ -96,6 +103,10 @@ class Correction(nn.Module):
     def arrays(self) -> dict[str, np.ndarray]:
         """Matrices (outputs, inputs) and biases by name."""
         return self.layers.arrays("W", "b")
+
+    def take(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """The numbers that `arrays` gave."""
+        self.layers.take(arrays, "W", "b")
 
 
 def likelihood(walks: tuple, proposals: tuple, kept: float) -> torch.Tensor:
@@ -135,6 +146,17 @@ class AlbedoNetwork(nn.Module):
         with torch.no_grad():
             self.layers.biases[-1].copy_(torch.logit(share)[:, None])
 
+    def shift(self, x: torch.Tensor, T: torch.Tensor) -> None:
+        """Have the mean over exits x come to that of T, (2 channels, n), by the last bias."""
+        with torch.no_grad():
+            most, a = self._most(x), self.layers(x)
+            for _ in range(4):  # Newton
+                p = torch.sigmoid(a)
+                step = (T.mean(dim=1) - (most * p).mean(dim=1)) / (most * p * (1 - p)).mean(dim=1).clamp_min(1e-9)
+                step = step.clamp(-2, 2)[:, None]
+                a = a + step
+                self.layers.biases[-1].add_(step)
+
     def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Shares (2 channels, n) of features (inputs, n), and their logarithms up to that of F_t P."""
         a = self.layers(x)
@@ -150,6 +172,10 @@ class AlbedoNetwork(nn.Module):
     def arrays(self) -> dict[str, np.ndarray]:
         """Matrices (outputs, inputs) and biases by name."""
         return self.layers.arrays("A", "a")
+
+    def take(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """The numbers that `arrays` gave."""
+        self.layers.take(arrays, "A", "a")
 
 
 def mean_likelihood(both: tuple, T: torch.Tensor, scale: torch.Tensor) -> torch.Tensor:
@@ -187,6 +213,10 @@ class PatchLogits(nn.Module):
         """Matrices (outputs, inputs) and biases by name, without the shares of the area."""
         return self.layers.arrays("V", "c")
 
+    def take(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """The numbers that `arrays` gave."""
+        self.layers.take(arrays, "V", "c")
+
 
 def patch_likelihood(logits: torch.Tensor, T: torch.Tensor, patch: torch.Tensor) -> torch.Tensor:
     """-E[T log p(patch of x_i | exit)] over walks, for T (n,) of one channel or a mean of them."""
@@ -202,6 +232,7 @@ BLOCK = 4096  # pairs whose layers stay in the cache
 LEAST = 0.05  # chance of a proposal: f moves while the chunk is used
 PATCH_HIDDEN, PATCH_BATCH = (64, 32), 1024
 ALPHA_HIDDEN = (32, 16)
+REFINING = 4  # parts of rate and chunk where a training starts from other weights
 RATES = {SHAPES: 1.5e-3}  # by base model: noise of walks leads large steps away from a near one
 
 
@@ -235,6 +266,10 @@ class Recipe:
     def with_base_model(self, name: str) -> Recipe:
         """The same for another base model, with the rate that suits it."""
         return replace(self, base_model=name, rate=RATES.get(name, self.rate))
+
+    def refining(self) -> Recipe:
+        """The same for weights that begin near: smaller steps, and chunks of which seconds make several."""
+        return replace(self, rate=self.rate / REFINING, chunk=max(self.chunk // REFINING, self.batch))
 
 
 STANDARD = Recipe()
@@ -287,6 +322,19 @@ class ObjectFit:
         self.alpha_scale = _inverse(torch.cat([once + more, more]))
         for networks in (self.modules, self.average):
             networks["alpha"].begin(exits, mean)
+
+    def start(self, arrays: Mapping[str, np.ndarray], walks: Pairs) -> None:
+        """Begin with weights of the same recipe; alpha keeps the mean that `set_scale` gave it.
+
+        Args:
+            arrays: of the networks, as `arrays` names them.
+            walks: of the pilot.
+        """
+        for networks in (self.modules, self.average):
+            with torch.no_grad():
+                for module in networks.values():
+                    module.take(arrays)
+            networks["alpha"].shift(*(self._tensor(v) for v in walks.even))
 
     def use(self, walks: Pairs, proposals: Pairs, steps: int | None, order: np.random.Generator) -> None:
         """Steps on all batches of a chunk, `reuse` times over, every other time with exit and entry exchanged.

@@ -230,6 +230,7 @@ def train(
     camera: Any = None,
     progress: Progress | None = None,
     base_model: str | None = None,
+    start: storing.Neighbour | None = None,
 ) -> Trained:
     """Learn S of an object and write its weights.
 
@@ -251,6 +252,7 @@ def train(
         camera: a `CameraWalks`, whose walks join those of random exits.
         progress: called with (what, done, total).
         base_model: `neural_shape` or a half-space model, with its rate; by default the recipe's.
+        start: weights of the same shape with another medium, from which the networks begin, see `storing.nearest`.
 
     Raises:
         ValueError: an argument is out of range, or `work` is of another run; nothing has been traced then.
@@ -268,7 +270,8 @@ def train(
     if not any(float(m.sigma_s) > 0 for m in obj.media):
         raise ValueError("medium must scatter in at least one channel to be learnt, got sigma_s 0 in all")
     recipe = recipe if base_model is None else recipe.with_base_model(base_model)
-    run = _ObjectTraining(obj, recipe, int(seed), Path(work) if work else None, camera)
+    recipe = recipe if start is None else recipe.refining()
+    run = _ObjectTraining(obj, recipe, int(seed), Path(work) if work else None, camera, start)
     if seconds == 0:
         warnings.warn(f"an object that is trained for 0 seconds is rendered by {recipe.base_model}", stacklevel=2)
         return Trained(*run.learnt(), None, [], 0, 0.0)
@@ -300,7 +303,16 @@ def train_by_cpu(
 class _ObjectTraining:
     """A training on its way."""
 
-    def __init__(self, obj: TranslucentObject, recipe: Recipe, seed: int, work: Path | None, camera: Any) -> None:
+    def __init__(
+        self,
+        obj: TranslucentObject,
+        recipe: Recipe,
+        seed: int,
+        work: Path | None,
+        camera: Any,
+        start: storing.Neighbour | None = None,
+    ) -> None:
+        self.start = start
         self.object, self.recipe, self.seed, self.work, self.camera = obj, recipe, seed, work, camera
         self.identity, self.frame = identify(obj), frame_of(obj)
         self.base = storing.base_model(obj, recipe.base_model)
@@ -309,7 +321,8 @@ class _ObjectTraining:
         self.seen: CameraExits | None = None
         self.patches = self.centres = None
         if "faces" in mi.traverse(obj.geometry.shape):
-            self.centres = cluster(obj, self.frame, seed=seed).astype(np.float16)
+            known = start.arrays[storing.CENTRES] if start else cluster(obj, self.frame, seed=seed)
+            self.centres = known.astype(np.float16)
             self.patches = Patches(obj, self.frame, self.centres.astype(np.float32))
         self.fitting = self._new_fitting()
         self.trusted = np.ones((2, len(obj.media)), np.float16)
@@ -363,11 +376,14 @@ class _ObjectTraining:
         seed, n = (self.seed, 2**31), self.recipe.chunk // 4
         traced = self.source.traced(n, seed)
         self.fitting.set_scale(self.source.ended(*traced, seed))
+        if self.start:
+            self.fitting.start(self.start.arrays, self.source.ended(*traced, seed))
         self.source = self.source.scaled(self.fitting.scale.cpu().numpy()[:, 0])
         pilot, proposed = self.source.ended(*traced, seed), self.source.proposed(n, seed)
         self.walks = int(self.recipe.chunk / min(max(pilot.values.shape[1] / pilot.drawn, 0.05), 1.0))
         self._new_fitting().use(pilot, proposed, None, np.random.default_rng(0))
         run = {"object": self.identity.record(), "recipe": asdict(self.recipe), "seed": self.seed}
+        run |= {"start": self.start.path.name} if self.start else {}
         if self.camera:
             self.seen = CameraExits(self.source, self.camera, self.walks, self.seed)
             run["camera"] = {"scene": self.camera.about.get("scene"), "schedule": self.seen.schedule}

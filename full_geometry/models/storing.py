@@ -35,6 +35,7 @@ CLOSE = 1e-4  # positions over the size of the object, coefficients relative
 SAMPLED = 0.05  # of the homogeneous equivalent of a medium that varies, a mean over random points
 PROBED = 64  # anchors towards which a medium that varies is probed,
 DEPTHS = (1.0, 0.7, 0.4)  # at these parts of their distance from the middle
+LEAST_LOSS = 1e-3  # 1 - albedo below which media are alike
 NEAR, MOST_FAR = 1e-2, 0.03  # of the largest coefficient; share of points, for voxels that are not interpolated
 
 
@@ -93,13 +94,7 @@ class Identity:
             mine, theirs = getattr(self, key), getattr(other, key)
             if mine != theirs:
                 raise ValueError(f"{name} must be {mine or none}, as trained, got {theirs or 'none'}")
-        R, t, miss = _kabsch(self.anchors.astype(float), other.anchors.astype(float))
-        spread, others = (float(np.linalg.norm(np.std(v, axis=0))) for v in (self.anchors, other.anchors))
-        if miss > CLOSE * spread:
-            raise ValueError(
-                f"object must be the one that was trained, moved and turned only, got one that differs by "
-                f"{miss / spread:.2g} of its size (about {others / max(spread, 1e-30):.3g} times as large)"
-            )
+        R, t = self.moved(other)
         for key, mine in self.medium.items():
             theirs = other.medium[key]
             close = SAMPLED if self.grids else CLOSE
@@ -107,6 +102,17 @@ class Identity:
                 raise ValueError(f"{key} of the medium must be {mine}, as trained, got {theirs}")
         if self.grids:
             _check_same(self.probes, other.probes)
+        return R, t
+
+    def moved(self, other: Identity) -> tuple[np.ndarray, np.ndarray]:
+        """R and t of `pose` to an object that may have another medium."""
+        R, t, miss = _kabsch(self.anchors.astype(float), other.anchors.astype(float))
+        spread, others = (float(np.linalg.norm(np.std(v, axis=0))) for v in (self.anchors, other.anchors))
+        if miss > CLOSE * spread:
+            raise ValueError(
+                f"object must be the one that was trained, moved and turned only, got one that differs by "
+                f"{miss / spread:.2g} of its size (about {others / max(spread, 1e-30):.3g} times as large)"
+            )
         return R, t
 
 
@@ -330,6 +336,54 @@ def find_weights(obj: TranslucentObject, folder: str | os.PathLike | None = None
         f"object {obj.geometry.name} must be trained for {KIND}, got one that is not in {place}{why}; "
         "`halfspace-sss train object --scene` does it"
     )
+
+
+class Neighbour(NamedTuple):
+    """Weights of the same object with another medium: file, arrays, and how far the media are apart."""
+
+    path: Path
+    arrays: dict[str, np.ndarray]
+    distance: float
+
+
+MOST_APART = 1.0  # media of a neighbour, see `_apart`
+
+
+def nearest(
+    obj: TranslucentObject, recipe: Mapping[str, Any], folder: str | os.PathLike | None = None
+) -> Neighbour | None:
+    """Weights of the same shape with the medium that is most alike, from which a training may start; None without any.
+
+    Args:
+        obj: the object, of a homogeneous medium, with nothing inside.
+        recipe: of its training; sizes and base model must be those of the weights.
+        folder: of weights.
+    """
+    here, found = identify(obj), []
+    if here.grids or here.contents:
+        return None
+    for path in (Path(folder) if folder is not None else weights_folder()).glob(f"{KIND}-*.safetensors"):
+        try:
+            identity, arrays, record = _trained(path)
+            R, _ = identity.moved(here)
+            _checked_base(path, record, obj)
+        except ValueError:
+            continue
+        same = identity.kind == here.kind and identity.topology == here.topology and not identity.contents
+        alike = all(record["recipe"].get(key) == recipe[key] for key in ("width", "depth", "base_model"))
+        apart = _apart(identity.medium, here.medium)
+        if same and np.allclose(R, np.eye(3), atol=1e-3) and alike and apart <= MOST_APART:
+            found.append(Neighbour(path, arrays, apart))
+    return min(found, key=lambda each: (each.distance, each.path.name), default=None)
+
+
+def _apart(a: dict[str, Any], b: dict[str, Any]) -> float:
+    """The largest |ln| of the ratio of sizes in mean free paths and of 1 - albedo; infinite for other g and eta."""
+    if len(a["albedo"]) != len(b["albedo"]) or not np.allclose([*a["g"], a["eta"]], [*b["g"], b["eta"]], rtol=CLOSE):
+        return math.inf
+    lost = [np.log(np.maximum(1 - np.array(m["albedo"]), LEAST_LOSS)) for m in (a, b)]
+    sizes = [np.log(np.maximum(m["size_in_mfp"], 1e-30)) for m in (a, b)]
+    return float(max(np.abs(np.subtract(*values)).max() for values in (lost, sizes)))
 
 
 def trained(obj: TranslucentObject) -> bool:

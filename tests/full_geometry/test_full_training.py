@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import warnings
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -86,6 +87,24 @@ def test_training_halves_the_error_of_the_half_space(trained: Trained) -> None:
     plane = measure(obj, transport_of(obj, "better_dipole"), proposals, samples=1024)
     assert np.all(constant(trained.errors) < 0.5 * constant(plane))
     assert all(abs(row.ratio - 1) < 0.03 for row in trained.errors)
+
+
+@pytest.mark.slow
+def test_after_an_edit_of_the_medium_training_starts_from_what_is_known_of_the_shape(
+    trained: Trained, tmp_path: Path
+) -> None:
+    folder, recipe = trained.path.parent, asdict(QUICK)
+    edited = object_of(ball(), Medium([0.9, 0.85, 0.65], [0.1, 0.25, 0.45], 0.0, 1.4))
+    start = storing.nearest(edited, recipe, folder)
+    assert start.path == trained.path
+    for other in (object_of(ball(2.5), WAX), object_of(ball(), Medium(WAX.sigma_s, WAX.sigma_a, 0.3, 1.4))):
+        assert storing.nearest(other, recipe, folder) is None
+    assert storing.nearest(edited, {**recipe, "width": 32}, folder) is None
+    as_many = replace(QUICK, chunk=QUICK.refining().chunk)
+    anew = train(edited, chunks=2, recipe=as_many, folder=tmp_path / "anew")
+    refined = train(edited, chunks=2, recipe=QUICK, folder=tmp_path / "refined", start=start)
+    assert refined.steps == anew.steps
+    assert np.max(constant(refined.errors)) < 0.6 * np.max(constant(anew.errors))
 
 
 def test_the_file_gives_the_same_model_again(trained: Trained) -> None:
