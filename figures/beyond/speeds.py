@@ -19,7 +19,7 @@ import pandas
 
 from figures.beyond.objects import VIEWS
 from figures.computing.contenders import WALK, ready, volume
-from figures.computing.images import guides
+from figures.computing.images import cover
 from figures.computing.learnt import object_parts, weights_in
 from figures.computing.scenes import prepare, scan_scene, surroundings
 from figures.computing.timed import TimedRender, alternating, rendered
@@ -169,9 +169,9 @@ def _measured(
         scenes[way] = scene_of(case, way, size, folder)
         rendered(scenes[way], spp[way], seed)
         ready_after[way] = sum(scenes[way].integrator().gathering.seconds) if "gathered" in way else 0.0
-    cover = guides(scenes[WALK], 8)[0][..., 0] > 0
+    covered = cover(scenes[WALK]) > 0.999
     found = alternating(scenes, spp, seed + 1, passes=PASSES)
-    noise = {way: _noise(timed, cover) for way, timed in found.items()}
+    noise = {way: _noise(timed, covered) for way, timed in found.items()}
     seconds = {way: timed.typical_cpu_seconds / spp[way] for way, timed in found.items()}  # of a sample of all pixels
     best = min(noise[way][0] * seconds[way] for way in VOLUMES)
     rows = []
@@ -191,12 +191,12 @@ def _measured(
     return rows
 
 
-def _noise(timed: TimedRender, cover: np.ndarray) -> tuple[float, float]:
+def _noise(timed: TimedRender, covered: np.ndarray) -> tuple[float, float]:
     """The variance of a sample over the mean squared, median over pixels and channels, and its relative error.
 
     The error is that of passes: the spread of the medians without each of them in turn.
     """
-    images = timed.images[:, cover].astype(np.float64)
+    images = timed.images[:, covered].astype(np.float64)
     mean = np.maximum(images.mean(axis=0), 1e-30)
     spp = timed.spp // len(images)
 
