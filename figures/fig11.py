@@ -45,7 +45,7 @@ NOTES = (
     "Mitsuba's volpathmis with Russian roulette from vertex 5, 64, 200 and 1024 on, the one with the smallest relMSE "
     "is shown, a choice in its favour; the table of the files lists all. FLIP and relMSE of the pixels of the object "
     "at the stated exposure, against a long render by our walk, whose own noise is in all of them alike. The denoiser "
-    "is led by the normals of the object."
+    "is led by the albedo and the normals of the object."
 )
 
 

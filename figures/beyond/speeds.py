@@ -119,14 +119,14 @@ def train(case: LitObject, seconds: float, folder: Path) -> float:
     from halfspace_sss.rendering.scenes.scene_files import open_scene
 
     scene = open_scene(case.description(16, folder), KIND)
-    subject = object_of(scene, None, None, case.key)
+    learnt = object_of(scene, None, None, case.key)
     with weights_in(folder):
         try:
-            find_weights(subject)
+            find_weights(learnt)
             return 0.0
         except ValueError:
             started = time.process_time()
-            train_by_cpu(subject, seconds, folder)
+            train_by_cpu(learnt, seconds, folder)
             return time.process_time() - started
 
 

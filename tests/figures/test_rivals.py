@@ -184,7 +184,7 @@ def test_the_papers_network_is_trained_and_measured_by_the_commands(
 @pytest.mark.parametrize(
     "bad, message",
     [
-        (["--table", "images"], "table must be one of errors, samplers, starts"),
+        (["--table", "images"], "table must be one of errors, samplers, base_models"),
         (["--seconds", "0"], "seconds must"),
         (["--samples", "1"], "samples must"),
     ],

@@ -306,7 +306,7 @@ def _connected(
     for reflects in (False, True) if context.lights.some_local or context.suns else ():
         with dr.suspend_grad():
             other = _trial(obj, walk, target.p, reflects, sampler, active & alone & _near(obj, walk, target.p, active))
-            other.valid &= ~_leaves(met, other.p, SAME_WAY)
+            other.valid &= ~_leaves(obj, met, other.p, SAME_WAY)
         more = _light_along(context, of, walk, weight, target, other)
         with dr.suspend_grad():
             # the fainter, the fewer are looked for again
@@ -353,7 +353,7 @@ def _sky_pdf(obj: TranslucentObject, walk: _Walk, active: mi.Bool) -> tuple[mi.F
     with dr.suspend_grad():
         reach = opaque(FAR * obj.geometry.size)
         met = refracted_connection(obj, walk.event, walk.event + walk.d * reach, active)
-        same = active & _leaves(met, walk.o, SAME_WAY)
+        same = active & _leaves(obj, met, walk.o, SAME_WAY)
         pdf = _phase_pdf(obj, walk, met) * met.T * reach * reach * met.density
     return dr.select(same, pdf, 1), dr.select(same, mi.Float(1), 0)
 
@@ -386,9 +386,10 @@ def _spread_lights(
     return dr.select(met.valid, 0, L)
 
 
-def _leaves(met: Connection, x: mi.Point3f, tolerance: float) -> mi.Bool:
-    """Whether a connection leaves through a point of the boundary, up to a share of its length."""
-    return met.valid & (dr.norm(mi.Point3f(met.p) - x) <= tolerance * met.length)
+def _leaves(obj: TranslucentObject, met: Connection, x: mi.Point3f, tolerance: float) -> mi.Bool:
+    """Whether a connection leaves through a point of the boundary, up to a share of its length, and to rounding."""
+    apart = dr.norm(mi.Point3f(met.p) - x)
+    return met.valid & (apart <= tolerance * met.length + opaque(obj.geometry.rounding))
 
 
 def _is_sampled(event: mi.Point3f, p: mi.Point3f, n: mi.Normal3f, met: Connection) -> mi.Bool:
@@ -425,7 +426,7 @@ def _taken(
 ) -> Connection:
     """The connection by which a walk has left its event, if one is found; without, it is met by chance alone."""
     met = refracted_connection(obj, walk.event, target, active & (walk.reflections == 0))
-    met = replace(met, valid=_leaves(met, walk.o, tolerance))
+    met = replace(met, valid=_leaves(obj, met, walk.o, tolerance))
     near = _near(obj, walk, target, active)
     for k, reflects in enumerate((False, True)):
         lost = active & ~met.valid & (walk.reflections == k) & near
@@ -443,7 +444,7 @@ def _find(
 
     def trial(n: mi.UInt32, sampler: mi.Sampler, found: Connection, active: mi.Bool) -> tuple:
         met = _trial(obj, walk, target, reflects, sampler, active)
-        same = _leaves(met, x, tolerance)
+        same = _leaves(obj, met, x, tolerance)
         n = n + dr.select(active, mi.UInt32(1), 0)
         return n, sampler, dr.select(active & same, met, found), active & ~same & (n < TRIALS)
 
