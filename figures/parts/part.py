@@ -103,16 +103,12 @@ def _found(name: str) -> _Source:
     return _source(path, path.stat().st_mtime_ns, name.partition(":")[2])
 
 
+@functools.cache
 def _path(name: str) -> Path | None:
     """The file of a module of this project; None for any other name, and for the machinery of parts itself."""
     name = name.partition(":")[0]
     if name.partition(".")[0] not in PACKAGES or name.startswith(MACHINERY):
         return None
-    return _located(name)
-
-
-@functools.cache
-def _located(name: str) -> Path | None:
     try:
         spec = find_spec(name)
     except ModuleNotFoundError:

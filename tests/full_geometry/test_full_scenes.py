@@ -173,12 +173,6 @@ def test_the_mirrored_object_is_another_one(trained: Trained) -> None:
         load_scene(scene(mirrored, "full_geometry", train_seconds=0))
 
 
-@pytest.mark.slow
-def test_the_mirrored_object_can_be_learnt(folder: Path) -> None:
-    mirrored = {"bunny": bunny(mirror=True, bsdf=SURFACE)}
-    agree(mirrored, train(mi.load_dict(bunny(mirror=True)), WAX, chunks=CHUNKS // 2, recipe=QUICK, folder=folder))
-
-
 def test_objects_with_the_same_surface_are_not_merged(tmp_path: Path) -> None:
     text = "".join(
         f'<shape type="ply" id="{name}"><string name="filename" value="{BUNNY}"/><ref id="wax"/></shape>'

@@ -189,14 +189,3 @@ def test_nobody_is_told_of_means_where_the_medium_is_learnt(trained: Trained) ->
         warnings.simplefilter("always")
         load_scene(objects(bunny=bunny()))
     assert not any("varies in space" in str(warning.message) for warning in found)
-
-
-@pytest.mark.slow
-def test_an_object_of_the_figures_can_be_learnt_and_rendered(folder: Path, tmp_path: Path) -> None:
-    from figures.modelling.objects import learnable_parts, make_varying
-
-    parts = learnable_parts(make_varying("meat", 16, 16), tmp_path)
-    parts["meat"]["bsdf"] |= {"orders": "multiple", "reflection": False}
-    unit = 0.03  # the steak is 3 mm long, a few mean free paths
-    found = train(load_objects(objects(unit, **parts)), chunks=CHUNKS, recipe=QUICK, folder=folder)
-    agree(parts, found, unit)

@@ -267,7 +267,7 @@ def test_what_is_advised_under_a_point_light_is_within_a_percent_of_a_ball_of_li
     for k, lights in enumerate((lamp, ball)):
         scene = _scene({"type": "translucent_walk", "mm_per_unit": 10.0}, lights)
         scene["object"] |= _shape(shape)
-        found.append(_means(scene, 2**13 if shape == "bunny" else 2**12, 1 + 100 * k).mean(axis=1))
+        found.append(_means(scene, 2**12 if shape == "bunny" else 2**11, 1 + 100 * k).mean(axis=1))
         if k == 0:
             advice = recommend(mi.load_dict(scene), tolerance=0.05, assess_seconds=0.4, models=["lambert"], flip=False)
             assert advice.objects[0].way == "path_traced" and "exact" not in str(advice)

@@ -33,8 +33,8 @@ pytestmark = pytest.mark.usefixtures("quiet_rgb")
 @pytest.mark.slow
 @pytest.mark.parametrize("parameter", ["albedo", "sigma_t", "g"])
 def test_derivatives_by_the_medium_agree_with_finite_differences_for_every_model(name, parameter):
-    if name in UNTRAINED and parameter != "sigma_t":
-        pytest.skip("trained for one albedo and g")
+    if name == "neural_paper" or name in UNTRAINED and parameter != "sigma_t":
+        pytest.skip("trained for one medium; the same scaling law as neural_material, and a kernel of a minute")
     model = halfspace_sss.interface.model.bssrdf(name, Medium(**MEDIUM))
     scene = make("point", name, n=8, floor=False, orders="total" if model.orders == "total" else "multiple")
     expected, size = medium_difference(scene, parameter)
