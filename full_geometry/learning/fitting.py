@@ -334,7 +334,7 @@ class ObjectFit:
             with torch.no_grad():
                 for module in networks.values():
                     module.take(arrays)
-            networks["alpha"].shift(*(self._tensor(v) for v in walks.even))
+            networks["alpha"].shift(*(self._tensor(v) for v in walks.albedo))
 
     def use(self, walks: Pairs, proposals: Pairs, steps: int | None, order: np.random.Generator) -> None:
         """Steps on all batches of a chunk, `reuse` times over, every other time with exit and entry exchanged.
