@@ -147,7 +147,7 @@ def test_walks_find_the_light_of_every_emitter(kind: str) -> None:
 @pytest.mark.parametrize("kind", DAILY)
 def test_the_single_order_beside_models_is_that_of_walks_for_every_emitter(kind: str) -> None:
     scene = _scene({"type": "bssrdf"}, EMITTERS[kind]()[0], orders="single", model="better_dipole")
-    _agree(_means(scene, 2**13, 1), _reference(kind, "single"))
+    _agree(_means(scene, 2**11, 1), _reference(kind, "single"))
 
 
 def _same_light_otherwise(kind: str) -> dict:
