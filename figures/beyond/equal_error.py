@@ -355,13 +355,13 @@ def _steps(scene: Any, n: int) -> dict[str, Callable[[], Any]]:
     from halfspace_sss.rendering.object.points import cosine_above, place
     from halfspace_sss.rendering.paths.path_loop import exit_at
 
-    (body,) = scene.integrator().prepare(scene)
+    (obj,) = scene.integrator().prepare(scene)
     si, sampler = _seen(scene, n), mi.load_dict({"type": "independent"})
     sampler.seed(11, n)
-    out, face = exit_at(body, si), mi.UInt32(si.prim_index)
-    prepared = body.transport.prepare(out, mi.Bool(True))
-    where = body.proposals.prepare(out, prepared, mi.Bool(True))
-    entry = body.proposals.sample(out, face, where, sampler, mi.Bool(True))
+    out, face = exit_at(obj, si), mi.UInt32(si.prim_index)
+    prepared = obj.transport.prepare(out, mi.Bool(True))
+    where = obj.proposals.prepare(out, prepared, mi.Bool(True))
+    entry = obj.proposals.sample(out, face, where, sampler, mi.Bool(True))
     direction, _ = cosine_above(entry.n_out, entry.n, sampler.next_2d())  # the same for all models
     dr.eval(tuple(out), face, tuple(entry), direction, sampler)  # named tuples are passed over
     ray = place(entry.p, entry.n).spawn_ray(direction)
@@ -371,10 +371,10 @@ def _steps(scene: Any, n: int) -> dict[str, Callable[[], Any]]:
 
     def evaluated() -> Any:
         at = entry.facing(direction)
-        return body.transport.S(prepared, at, result) * at.mu
+        return obj.transport.S(prepared, at, result) * at.mu
 
     return {
-        "entries": lambda: tuple(body.proposals.sample(out, face, where, sampler.clone(), mi.Bool(True))),
+        "entries": lambda: tuple(obj.proposals.sample(out, face, where, sampler.clone(), mi.Bool(True))),
         "visibility": lambda: scene.ray_intersect_preliminary(ray, coherent=False, active=result),
         "evaluation": evaluated,
     }

@@ -444,9 +444,9 @@ def draw_by(scene: mi.Scene, flow: Mapping[str, np.ndarray]) -> None:
         scene: with one `translucent` object, of the model `full_geometry`.
         flow: weights of a `ConditionalFlow`, those of `fit_flow` for the object.
     """
-    bodies = scene.integrator().prepare(scene)
-    (body,) = bodies
-    patches: PatchSampler = body.proposals.patches
-    chart = Chart(body.transport.object, patches.frame, patches.patches)
+    objects = scene.integrator().prepare(scene)
+    (obj,) = objects
+    patches: PatchSampler = obj.proposals.patches
+    chart = Chart(obj.transport.object, patches.frame, patches.patches)
     sampler = FlowSampler(patches, chart, ConditionalFlow(2, flow))
-    bodies[0] = replace(body, proposals=FlowProposals(sampler, body.geometry.sign, PatchTable(patches)))
+    objects[0] = replace(obj, proposals=FlowProposals(sampler, obj.geometry.sign, PatchTable(patches)))

@@ -115,9 +115,10 @@ class Stage:
     def integrator(self, way: Way) -> Any:
         """The integrator of a way, which keeps what it has made ready; the scene is the same for all."""
         if way not in self._integrators:
-            plugin = {"type": "translucent_walk", "blur": way.blur} | self.settings
-            if way.model != PATH_TRACED:
-                plugin = {**self.settings, "type": "bssrdf", **self.bssrdf, "model": way.model, "light": way.light}
+            if way.model == PATH_TRACED:
+                plugin = {"type": "translucent_walk", **self.settings, "blur": way.blur}
+            else:
+                plugin = {"type": "bssrdf", **self.settings, **self.bssrdf, "model": way.model, "light": way.light}
                 plugin |= {"orders": way.orders} if way.orders else {}
                 plugin["train_seconds"] = 0.0  # who asks does not wait for the training of an object
             self._integrators[way] = mi.load_dict(plugin)

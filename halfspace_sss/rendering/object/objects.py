@@ -411,7 +411,7 @@ class TranslucentObject:
 
 
 class TranslucentObjects:
-    """The bodies of the scene that was asked for last, made anew when its objects, their shape or media changed."""
+    """The objects of the scene that was asked for last, made anew when its objects, their shape or media changed."""
 
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
@@ -422,7 +422,7 @@ class TranslucentObjects:
         self.choices = Choices({}, settings.light, {})  # for as long as the objects are the same
 
     def of(self, scene: Any) -> list[TranslucentObject]:
-        """The bodies of a scene; errors as in `make_objects`."""
+        """The objects of a scene; errors as in `make_objects`."""
         shapes = scene.shapes()  # the scene itself, which holds its integrator, would never be freed
         world, before, objects = self._made
         same = world == number_of(scene) and same_objects(before, shapes)

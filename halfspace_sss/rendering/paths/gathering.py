@@ -26,7 +26,7 @@ from halfspace_sss.rendering.paths.lighting import mis_weight
 from halfspace_sss.rendering.paths.path_loop import trace_paths
 
 if TYPE_CHECKING:
-    from halfspace_sss.rendering.object.object import TranslucentObject
+    from halfspace_sss.rendering.object.objects import TranslucentObject
     from halfspace_sss.rendering.object.points import SurfacePoint
     from halfspace_sss.rendering.object.settings import Settings
 

@@ -38,10 +38,8 @@ FOCUS = 100.0  # of the straight way into solid angle at the event; points of ca
 SAME_WAY = 3e-3  # by which points of exit may differ, over the length inside
 FAR = 1e4  # distance of what is infinitely far, over the size of the object
 
-FIRST, OTHERS = (
-    (6, 0.5),
-    (10, 0.15),
-)  # steps of Newton's method and the longest, radians, of the first connection and others
+# steps of Newton's method and the longest, radians, of the first connection and of others
+FIRST, OTHERS = (6, 0.5), (10, 0.15)
 TOLERANCE = 2e-4  # distance by which the target may be missed, over its distance
 
 Media = list["tuple[mi.Float, mi.Float, mi.Float]"]  # sigma_s, sigma_t and g of each channel
@@ -303,9 +301,13 @@ def _connected(
         target = _Target(ds, light, walk.event + ds.d * reach, reach, alone)
         met = refracted_connection(obj, walk.event, target.p, active & (alone | mi.Bool(context.connects_sky(obj))))
     light = _light_along(context, of, walk, weight, target, met)
-    for reflects in (False, True) if context.lights.some_local or context.suns else ():
+    if not (context.lights.some_local or context.suns):
+        return light
+    with dr.suspend_grad():
+        near = active & alone & _near(obj, walk, target.p, active)
+    for reflects in (False, True):
         with dr.suspend_grad():
-            other = _trial(obj, walk, target.p, reflects, sampler, active & alone & _near(obj, walk, target.p, active))
+            other = _trial(obj, walk, target.p, reflects, sampler, near)
             other.valid &= ~_leaves(obj, met, other.p, SAME_WAY)
         more = _light_along(context, of, walk, weight, target, other)
         with dr.suspend_grad():
