@@ -238,7 +238,8 @@ def test_vertex_normals_against_their_faces_give_the_same_exits() -> None:
     wax = Medium(np.array([0.95, 0.8, 0.6]), np.array([0.05, 0.2, 0.4]), 0.0, 1.4)
     known = [reference(object_of(shape, wax, 2.0), exits=64, walks=512).truth.mean for shape in (upright, turned)]
     alike = np.isclose(*known, rtol=1e-4, atol=1e-5)
-    assert alike.mean() > 0.99  # a walk at the edge of two faces may end in either, by rounding
+    # by rounding a walk at the edge of two faces may end in either: of one exit at most
+    assert np.count_nonzero(~alike.all(axis=(0, 2))) <= 1
 
 
 def test_pieces_that_are_wound_differently_are_refused() -> None:
