@@ -39,8 +39,8 @@ def test_the_reason_is_the_message_of_load_dict(plugin: dict, reason: str) -> No
 
 
 def test_a_bitmap_for_a_number_is_refused_in_a_sentence() -> None:
-    with pytest.raises(ValueError, match="^albedo must be .*, got a BitmapTexture$"):
-        mi.load_dict({"type": "translucent", "sigma_t": 1.0, "albedo": _bitmap()})
+    with pytest.raises(ValueError, match="^sigma_s must be constant, got a texture; albedo, sigma_t, .* may vary$"):
+        mi.load_dict({"type": "translucent", "sigma_s": _bitmap(), "sigma_a": 1.0})
 
 
 @pytest.mark.parametrize("integrator", ["bssrdf", "translucent_walk"])

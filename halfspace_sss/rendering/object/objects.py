@@ -173,6 +173,11 @@ def refuse(result: Content, holder: Geometry, what: str) -> None:
     )
 
 
+def refuse_textures(name: str, what: str) -> None:
+    """ValueError that names an object whose medium has textures, which `what` does not take."""
+    raise ValueError(f"object {name} must be without textures for {what}: the integrator translucent_walk takes them")
+
+
 def outermost(scene: mi.Scene) -> list[mi.Shape]:
     """The translucent shapes of a scene that lie in no other."""
     shapes = [shape for shape in scene.shapes() if is_translucent(shape.bsdf())]
@@ -490,6 +495,8 @@ def _make_object(geometry: Geometry, inside: Inside, settings: Settings) -> Tran
     obj = TranslucentObject(geometry, media, varying)
     single_only = inside.orders == "single" or not any(float(m.sigma_s) > 0 for m in media)
     check_tints(geometry.name, obj.surface.boundary)
+    if inside.textured is not None:
+        refuse_textures(geometry.name, f"the model {inside.model!r}")
     if geometry.contents is not None:
         _check_takes(geometry, inside, single_only)
     variation = Variation(obj.surface, settings.mm_per_unit, inside.model)
@@ -627,6 +634,8 @@ def object_of(
         return TranslucentObject(geometry, media)
     unit = millimetres(shape) if mm_per_unit is None else mm_per_unit
     (geometry,) = filled(shape, [survey(_object_of(shape, name))], unit, "learning")
+    if geometry.shape.bsdf().inside.textured is not None:
+        refuse_textures(geometry.name, "learning")
     inside = equivalent(geometry.shape.bsdf().inside, geometry)
     media = _in_scene_units(inside.medium, unit)
     check_geometry(geometry)
@@ -675,7 +684,7 @@ def _check_contents(name: str, contents: Contents) -> None:
                 f"what lies inside {name} must be opaque and no mirror, or translucent, to be learnt, as S holds no "
                 f"deltas, got the shape {name_of(shape)} with a {shape.bsdf().class_name()}"
             )
-        if inside is not None and inside.varying is not None:
+        if inside is not None and not inside.is_homogeneous:
             raise ValueError(f"media inside {name} must be homogeneous to be learnt, got that of {name_of(shape)}")
 
 

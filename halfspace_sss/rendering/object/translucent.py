@@ -19,6 +19,9 @@ Parameters, all optional but the medium:
     material: a name of the registry; or else `sigma_s`, `sigma_a` (1/mm; numbers, rgb, or strings of numbers separated
         by commas), `g` and `eta`; or `sigma_t` (1/mm), `albedo` and `scale` (a factor of sigma_t) instead of the
         first two. For a medium that varies in space `albedo` and one of `sigma_t` and `scale` may be a `gridvolume`.
+        For one that varies over the surface `albedo` and `sigma_t` may be textures of Mitsuba; see `object.textured`.
+    reflectance, mfp: instead of these, the reflectance of the half-space under even light and the mean free path (mm),
+        numbers or textures. Values of textures are taken as they are, above 1 too.
     model: name of a model of the library, by default "neural"; "neural_shape", which sees the shape and needs no
         training; "full_geometry", S of this very object, which is learnt before its first render, or by
         `halfspace-sss train object`; "lambert", a diffuse surface of the same reflectance; or "auto", the cheapest of
@@ -57,6 +60,7 @@ from halfspace_sss.physics.reflectance import directional_table
 from halfspace_sss.rendering.object.points import mirrored, opaque
 from halfspace_sss.rendering.object.registry import model_names
 from halfspace_sss.rendering.object.settings import ORDERS, check_parameters, variant_channels
+from halfspace_sss.rendering.object.textured import constant_texture, textured_medium
 from halfspace_sss.rendering.object.varying import constant_value, mean_of_grids, varying_medium
 
 REFLECTED, REFRACTED = 0, 1  # components
@@ -284,13 +288,18 @@ def _class(variant: str) -> type:
                 setattr(self, name, mi.Spectrum(np.atleast_1d(getattr(self.inside.medium, name)).tolist()))
 
         def traverse(self, callback: mi.TraversalCallback) -> None:
-            for name in VARIABLE if self.inside.varying is None else ():
+            textured = self.inside.textured
+            for name, texture in textured.textures.items() if textured else ():
+                callback.put(name, texture, mi.ParamFlags.Differentiable)
+            for name in VARIABLE if self.inside.is_homogeneous else ():
                 callback.put(name, getattr(self, name), mi.ParamFlags.Differentiable)
             callback.put("boundary", self.boundary, mi.ParamFlags.Differentiable)
 
         def parameters_changed(self, keys: Any = ()) -> None:
             # the integrators see another `inside`, and make anew what they made of it
-            if self.inside.varying is None:
+            if self.inside.textured is not None and not (keys and all(key.startswith("boundary") for key in keys)):
+                self.inside = self.inside.repainted()
+            elif self.inside.is_homogeneous:
                 self.inside = self.inside.changed(**{name: np.ravel(getattr(self, name)) for name in VARIABLE})
             check_eta(self.boundary, self.inside.medium.eta)
 
@@ -330,8 +339,9 @@ def _class(variant: str) -> type:
             m = self.inside.medium
             if self.directional is None or not self.directional.serves(m):
                 self.directional = HalfSpaceAlbedo(m)
-            varying = self.inside.varying
+            varying, textured = self.inside.varying, self.inside.textured
             albedo = self.albedo if varying is None else varying.albedo_at(si.p, active)
+            albedo = albedo if textured is None else textured.albedo_at(si, active)
             return self.directional(albedo, dr.abs(mi.Frame3f.cos_theta(si.wi))) & active
 
         def to_string(self) -> str:
@@ -386,8 +396,8 @@ def _boundaries(props: mi.Properties) -> list[tuple[str, Any]]:
 
 
 PARAMETERS = (
-    "material", "sigma_s", "sigma_a", "sigma_t", "albedo", "scale", "g", "eta", "model", "orders", "channel",
-    "dilution", "reflection",
+    "material", "sigma_s", "sigma_a", "sigma_t", "albedo", "scale", "reflectance", "mfp", "g", "eta", "model", "orders",
+    "channel", "dilution", "reflection",
 )  # fmt: skip
 
 
@@ -402,6 +412,7 @@ class Inside:
         orders: "total", "multiple" or "single".
         reflection: whether the boundary reflects.
         varying: how the medium varies in space, a `VaryingMedium`, or None. `medium` then has the means of the grids.
+        textured: how it varies over the surface, a `TexturedMedium`, or None; `medium` then has the means of texels.
     """
 
     label: str
@@ -410,6 +421,12 @@ class Inside:
     orders: str
     reflection: bool
     varying: Any = None
+    textured: Any = None
+
+    @property
+    def is_homogeneous(self) -> bool:
+        """Whether the medium is the same everywhere."""
+        return self.varying is None and self.textured is None
 
     def channels(self) -> list[Medium]:
         """The scalar media of the channels."""
@@ -433,6 +450,11 @@ class Inside:
             new = {name: float(value[0]) for name, value in new.items()}
         return replace(self, label="medium", medium=Medium.from_albedo(**new, eta=m.eta))
 
+    def repainted(self) -> Inside:
+        """The same with textures as they are now; ValueError if they are no medium's."""
+        self.textured.check()
+        return replace(self, medium=self.textured.mean(self.medium.g, self.medium.eta))
+
 
 def read_inside(props: mi.Properties) -> Inside:
     """The inside from the parameters of a surface.
@@ -440,16 +462,16 @@ def read_inside(props: mi.Properties) -> Inside:
     Raises:
         ValueError: a parameter is missing, unknown in value, or out of range.
     """
-    label, medium, varying = _medium(props)
+    label, medium, varying, textured = _medium(props)
     model, orders = props.get("model", "neural"), props.get("orders", "total")
     check_choice("orders", orders, ORDERS)
     check_choice("model", model, model_names())
-    return Inside(label, medium, model, orders, bool(props.get("reflection", True)), varying)
+    return Inside(label, medium, model, orders, bool(props.get("reflection", True)), varying, textured)
 
 
-def _medium(props: mi.Properties) -> tuple[str, Medium, Any]:
-    keys = ("sigma_s", "sigma_a", "sigma_t", "albedo", "scale", "g", "eta")
-    inline = {key: constant_value(props[key]) for key in keys if key in props}
+def _medium(props: mi.Properties) -> tuple[str, Medium, Any, Any]:
+    keys = ("sigma_s", "sigma_a", "sigma_t", "albedo", "scale", "reflectance", "mfp", "g", "eta")
+    inline = {key: constant_texture(constant_value(props[key])) for key in keys if key in props}
     if "material" in props:
         if inline:
             raise ValueError(f"material must stand without {', '.join(inline)}, got both")
@@ -458,33 +480,50 @@ def _medium(props: mi.Properties) -> tuple[str, Medium, Any]:
         label, medium, names = material.name, material.medium, material.channels
     elif "dilution" in props:
         raise ValueError(f"dilution must be left out without material, got {props['dilution']!r}")
-    elif {"sigma_s", "sigma_a"} <= inline.keys() or {"sigma_t", "albedo"} <= inline.keys():
+    elif any(inline.keys() >= set(pair) for pair in PAIRS):
         label, names = "medium", None
-        medium, varying = _inline_medium(inline)
-        if varying is not None:
-            return label, medium, varying
+        medium, varying, textured = _inline_medium(inline)
+        if not (varying is None and textured is None):
+            return label, medium, varying, textured
     else:
-        raise ValueError("a translucent surface must have material, or sigma_s and sigma_a, or sigma_t and albedo")
-    return *_for_variant(label, medium, names, props), None
+        raise ValueError(
+            "a translucent surface must have material, or sigma_s and sigma_a, or sigma_t and albedo, or reflectance "
+            "and mfp"
+        )
+    return *_for_variant(label, medium, names, props), None, None
 
 
-def _inline_medium(inline: dict) -> tuple[Medium, Any]:
-    """The medium of coefficients, and how it varies if it does."""
-    values = {key: value if isinstance(value, mi.Volume) else _numbers(key, value) for key, value in inline.items()}
+IN_SPACE, OVER_SURFACE = ("sigma_t", "scale", "albedo"), ("albedo", "sigma_t", "reflectance", "mfp")
+PAIRS = (("sigma_s", "sigma_a"), ("sigma_t", "albedo"), ("reflectance", "mfp"))
+
+
+def _inline_medium(inline: dict) -> tuple[Medium, Any, Any]:
+    """The medium of coefficients, and how it varies in space or over the surface if it does."""
+    values = {k: v if isinstance(v, (mi.Volume, mi.Texture)) else _numbers(k, v) for k, v in inline.items()}
     volumes = [key for key, value in values.items() if isinstance(value, mi.Volume)]
-    for key in volumes:
-        if key not in ("sigma_t", "scale", "albedo"):
-            raise ValueError(f"{key} must be constant, got a volume; sigma_t, scale and albedo may vary")
-    eta = float(np.max(values.pop("eta", 1.3)))
-    if "sigma_s" in values:
-        if extra := values.keys() - {"sigma_s", "sigma_a", "g"}:
-            raise ValueError(f"sigma_s and sigma_a must stand without {', '.join(sorted(extra))}, got both")
-        return Medium(**values, eta=eta), None
-    g, scale = values.get("g", 0.0), values.get("scale", 1.0)
+    textures = [key for key, value in values.items() if isinstance(value, mi.Texture)]
+    for keys, kind, able in ((volumes, "volume", IN_SPACE), (textures, "texture", OVER_SURFACE)):
+        for key in keys:
+            if key not in able:
+                raise ValueError(f"{key} must be constant, got a {kind}; {', '.join(able)} may vary")
+    if volumes and textures:
+        raise ValueError(f"{textures[0]} must be a number where {volumes[0]} is a volume, got a texture")
+    eta, g = float(np.max(values.pop("eta", 1.3))), values.pop("g", 0.0)
+    pair = next(pair for pair in PAIRS if values.keys() >= set(pair))
+    if extra := values.keys() - set(pair) - ({"scale"} if "albedo" in pair else set()):
+        raise ValueError(f"{' and '.join(pair)} must stand without {', '.join(sorted(extra))}, got both")
+    if textures:
+        textured = textured_medium(values, g, eta, variant_channels())
+        return textured.mean(g, eta), None, textured
+    if "sigma_s" in pair:
+        return Medium(**values, g=g, eta=eta), None, None
+    if "mfp" in pair:
+        return Medium.from_reflectance(**values, g=g, eta=eta), None, None
+    scale = values.get("scale", 1.0)
     if not volumes:
-        return Medium.from_albedo(values["albedo"], np.asarray(values["sigma_t"]) * scale, g, eta), None
+        return Medium.from_albedo(values["albedo"], np.asarray(values["sigma_t"]) * scale, g, eta), None, None
     varying = varying_medium(values["sigma_t"], values["albedo"], scale, variant_channels())
-    return mean_of_grids(varying, g, eta), varying
+    return mean_of_grids(varying, g, eta), varying, None
 
 
 def _for_variant(label: str, medium: Medium, names: Any, props: mi.Properties) -> tuple[str, Medium]:

@@ -161,8 +161,10 @@ def mean_of_grids(medium: VaryingMedium, g: Any, eta: float) -> Medium:
 def equivalent(inside: Any, obj: Geometry) -> Any:
     """The inside of an object with a homogeneous medium, which models of the half-space take.
 
-    Its sigma_s and sigma_a are the means over the volume of the object.
+    Its sigma_s and sigma_a are the means over the volume of the object, its albedo and sigma_t those over textures.
     """
+    if inside.textured is not None:
+        return replace(inside, medium=inside.textured.mean(inside.medium.g, inside.medium.eta, obj.shape))
     if inside.varying is None:
         return inside
     p = _points(obj.scene.bbox())

@@ -103,6 +103,8 @@ def medium(inside: Any, mm_per_unit: float) -> Any:
         raise ValueError(f"g must be the same in all channels for Mitsuba's media, got {m.g} for {inside.label}")
     g = float(np.max(m.g))
     phase = {"type": "hg", "g": g} if g else {"type": "isotropic"}
+    if inside.textured is not None:
+        raise ValueError(f"media must be without textures for Mitsuba's media, got those of {inside.label}")
     if inside.varying is not None:
         return mi.load_dict({"type": "heterogeneous", **_volumes(inside.varying, mm_per_unit), "phase": phase})
     scale = float(np.max(m.sigma_t))  # Mitsuba takes colours up to one

@@ -25,7 +25,7 @@ import numpy as np
 
 from halfspace_sss.rendering.light.small_emitters import SmallEmitters, spread
 from halfspace_sss.rendering.object.points import channel_mean, opaque, opposed, sided
-from halfspace_sss.rendering.walk.media import Coefficients, WalkMedia
+from halfspace_sss.rendering.walk.media import Coefficients, WalkMedia, WalkMedium
 from halfspace_sss.rendering.walk.random_walk import (
     Event,
     Walk,
@@ -155,7 +155,7 @@ class SubpathConnections:
         enters &= dr.max(weight) > 0
 
         # ---- the walk from there
-        walk = start_walk(mi.Point3f(si.p), d, rng)
+        walk = start_walk(mi.Point3f(si.p), d, rng, event.medium)
         walk = replace(walk, skip=self.media.clear(k, si.n, d), alive=enters, object=k, weight=weight,
                        channel=draw(len(m.sigma_t), rng))  # fmt: skip
         state = (LightSubpath(walk, mi.Bool(enters), mi.Bool(enters), L), event)
@@ -166,7 +166,7 @@ class SubpathConnections:
         """One flight of the light subpath, and a connection on its ray if that may have one."""
         media, walk, rng = self.media, s.walk, s.walk.rng
         # ---- connection of an event q on the ray
-        m = media.coefficients(event.object, walk.o)
+        m = media.coefficients(event.object, walk.o, event.medium)
         connectable = s.lit & s.fresh
         t, over = _on_ray(walk, event, rng.next_float32())
         t = dr.select(connectable, t, 0)
@@ -179,7 +179,7 @@ class SubpathConnections:
         # ---- free flight, to a scattering event after which the subpath must reflect, or to the boundary
         u, p = None, mi.Point3f(walk.o + walk.d * flight)
         if media.varies:
-            m, u = media.coefficients(event.object, p), rng.next_float32()
+            m, u = media.coefficients(event.object, p, event.medium), rng.next_float32()
         ended = fly(m, walk.weight, walk.density, walk.channel, flight, reach, u)
         u = mi.Point2f(rng.next_float32(), rng.next_float32())
         turned, weight, density = turn(m, ended.weight, ended.density, walk.channel, walk.d, u, media.same_g)
@@ -201,13 +201,14 @@ class SubpathConnections:
         media, q = self.media, mi.Point3f(walk.o + walk.d * t)
         to_p = mi.Ray3f(q, dr.normalize(event.p - q))
         to_p.maxt = dr.norm(event.p - q)
-        at_q = media.coefficients(event.object, q)
+        at_q = media.coefficients(event.object, q, event.medium)
         phases = eval_phase(event.m, dr.dot(event.along, -to_p.d)) * eval_phase(event.m, dr.dot(to_p.d, walk.d))
         value = dr.select(over > 0, walk.weight * at_q.sigma_s * phases * over, 0)
         bright = dr.max(value) > 0
         bright &= ~media.scene.ray_test(to_p, False, bright)
-        T = media.transmittance(event.object, mi.Ray3f(walk.o, walk.d), dr.select(bright, t, 0), walk.rng)
-        T *= media.transmittance(event.object, to_p, dr.select(bright, to_p.maxt, 0), walk.rng)
+        to_q, medium = mi.Ray3f(walk.o, walk.d), event.medium
+        T = media.transmittance(event.object, to_q, dr.select(bright, t, 0), walk.rng, medium)
+        T *= media.transmittance(event.object, to_p, dr.select(bright, to_p.maxt, 0), walk.rng, medium)
         return dr.select(bright, value * T, 0)
 
     def _reflect(self, walk: Walk, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f) -> tuple:
@@ -339,13 +340,13 @@ class EmitterDirections:
         phase = eval_phase(m, dr.dot(event.along, d))
         # radiance shrinks by eta² on its way out, as the weight of the walk has when it came in
         factor = (1 - F) * dr.square(eta_ti) / (pdf / n + channel_mean(phase))
-        T = self.media.transmittance(k, ray, dr.select(valid, si.t, 0), rng)
+        T = self.media.transmittance(k, ray, dr.select(valid, si.t, 0), rng, event.medium)
         value = phase * T * factor
         return dr.select(valid, value * self.small.along(which, way, outside, valid), 0)
 
-    def share(self, which: mi.Int32, way: Departure, active: mi.Bool) -> mi.Float:
+    def share(self, which: mi.Int32, way: Departure, active: mi.Bool, medium: WalkMedium | tuple[()] = ()) -> mi.Float:
         """Weight of having hit emitter `which`, if >= 0, by the phase function (balance heuristic against `light`)."""
-        k, m = way.object, self.media.coefficients(way.object, way.p)
+        k, m = way.object, self.media.coefficients(way.object, way.p, medium)
         guess, concentration, valid = self._guess(way.p, k, type(k)(dr.maximum(which, 0)), m, active & (which >= 0))
         lobes = _lobes(dr.dot(guess, way.ahead), concentration) / len(self.small)
         phase = channel_mean(eval_phase(m, dr.dot(way.along, way.ahead)))
@@ -421,18 +422,29 @@ class InnerLights:
             return self.emitters[0], here
         return dr.reinterpret_array(mi.EmitterPtr, dr.gather(mi.UInt32, self.tables["pointer"], which)), here
 
-    def light(self, k: mi.Int32, at: mi.Interaction3f, rng: mi.PCG32, active: mi.Bool) -> tuple:
+    def light(
+        self,
+        k: mi.Int32,
+        at: mi.Interaction3f,
+        rng: mi.PCG32,
+        active: mi.Bool,
+        medium: WalkMedium | tuple[()] = (),
+    ) -> tuple:
         """The direction to a light from an interaction in object k, and its irradiance across, over its probability."""
         emitter, here = self._drawn(k, rng, active)
         ds, E = emitter.sample_direction(at, mi.Point2f(0.5), here)
         lit = here & (ds.pdf > 0) & (dr.max(E) > 0)
         ray = at.spawn_ray(ds.d)
-        sigma_t = self.media.spectrum("sigma_t", k)
+        sigma_t = medium.sigma_t if medium else self.media.spectrum("sigma_t", k)
         r = NEAREST / dr.max(sigma_t)
         near = dr.select(ds.dist < r, 3 * dr.square(ds.dist / r) * (1 + 0.25 * r * sigma_t), 1)
-        return ds.d, dr.select(lit, self._passed(k, ray, ds.dist, rng, lit) * E * (near * len(self.emitters)), 0)
+        return ds.d, dr.select(
+            lit, self._passed(k, ray, ds.dist, rng, lit, medium) * E * (near * len(self.emitters)), 0
+        )
 
-    def spread(self, k: mi.Int32, ray: mi.Ray3f, rng: mi.PCG32, active: mi.Bool) -> mi.Spectrum:
+    def spread(
+        self, k: mi.Int32, ray: mi.Ray3f, rng: mi.PCG32, active: mi.Bool, medium: WalkMedium | tuple[()] = ()
+    ) -> mi.Spectrum:
         """Radiance of a light along a ray in object k, spread over a wide cone, over its probability."""
         emitter, here = self._drawn(k, rng, active)
         L = spread(self.media.inner.scene, emitter, ray, opaque(CONE * self.blur), here)
@@ -440,12 +452,20 @@ class InnerLights:
         at.p = ray.o
         ds, _ = emitter.sample_direction(at, mi.Point2f(0.5), here)
         lit = here & (dr.max(L) > 0)
-        T = self.media.transmittance(k, ray, dr.select(lit, ds.dist, 0), rng)
+        T = self.media.transmittance(k, ray, dr.select(lit, ds.dist, 0), rng, medium)
         return dr.select(lit, T * L * len(self.emitters), 0)
 
-    def _passed(self, k: mi.Int32, ray: mi.Ray3f, distance: mi.Float, rng: mi.PCG32, active: mi.Bool) -> mi.Spectrum:
+    def _passed(
+        self,
+        k: mi.Int32,
+        ray: mi.Ray3f,
+        distance: mi.Float,
+        rng: mi.PCG32,
+        active: mi.Bool,
+        medium: WalkMedium | tuple[()],
+    ) -> mi.Spectrum:
         """The transmittance of what is between: 0 behind any surface."""
         shadow = mi.Ray3f(ray)
         shadow.maxt = distance * (1 - 1e-4)
         clear = active & ~self.media.inner.scene.ray_test(shadow, False, active)
-        return dr.select(clear, self.media.transmittance(k, ray, dr.select(clear, distance, 0), rng), 0)
+        return dr.select(clear, self.media.transmittance(k, ray, dr.select(clear, distance, 0), rng, medium), 0)

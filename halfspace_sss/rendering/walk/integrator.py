@@ -16,6 +16,7 @@ from halfspace_sss.rendering.light.small_emitters import SmallEmitters
 from halfspace_sss.rendering.object.objects import KnowsUnit, check_sensors, check_size, places_of
 from halfspace_sss.rendering.object.settings import OF_MITSUBA, check_parameters
 from halfspace_sss.rendering.object.shape import number_of, same_objects
+from halfspace_sss.rendering.object.varying import equivalent
 from halfspace_sss.rendering.walk.emitter_connections import EmitterDirections, InnerLights, find_connections
 from halfspace_sss.rendering.walk.media import WalkMedia
 from halfspace_sss.rendering.walk.path_loop import FirstExits, LightVisitor, PathTracer
@@ -109,7 +110,8 @@ def _prepared(scene: mi.Scene, before: tuple, mm_per_unit: float) -> tuple[int, 
     media = WalkMedia.of(scene, mm_per_unit)
     check_sensors(scene, media.objects)
     for each, inside in zip(media.objects, media.insides):
-        check_size(each, [mm_per_unit * float(m.sigma_t) for m in inside.channels()], mm_per_unit)
+        known = equivalent(inside, each) if inside.textured else inside
+        check_size(each, [mm_per_unit * float(m.sigma_t) for m in known.channels()], mm_per_unit)
     return number_of(scene), shapes, places, media
 
 

@@ -125,6 +125,10 @@ def _check(result: list[Content], objects: list[Geometry]) -> None:
         surfaces = [holder.shape.bsdf()]
         if isinstance(content.thing, mi.Shape):
             translucent = is_translucent(content.thing.bsdf())
+            if surfaces[0].inside.textured is not None and (translucent or _displaces(content.thing)):
+                raise ValueError(
+                    f"an object with textures must hold nothing that refracts, got {content.name} in {holder.name}"
+                )
             if not content.whole and (translucent or _displaces(content.thing)):
                 raise ValueError(
                     f"what refracts must lie inside an object or outside, got {content.name} partly inside "
@@ -267,6 +271,14 @@ class Coefficients(NamedTuple):
     mean_t: mi.Spectrum  # sigma_t, or its mean where that varies
 
 
+@dataclass
+class WalkMedium:
+    """What a walk takes of textures, at the point where it enters, for its whole way; 1/(scene unit)."""
+
+    sigma_t: mi.Spectrum
+    sigma_s: mi.Spectrum
+
+
 @dataclass(frozen=True, eq=False)
 class WalkMedia:
     """The translucent objects of a scene, each addressed by its number.
@@ -301,6 +313,7 @@ class WalkMedia:
         tables["fewest"] = mi.UInt32([_FEWEST[inside.orders] for inside in self.insides])
         tables["most"] = mi.UInt32([_MOST[inside.orders] for inside in self.insides])
         tables["rounding"] = mi.Float([obj.rounding for obj in self.objects])
+        tables["textured"] = mi.Bool([inside.textured is not None for inside in self.insides])
         tables["reflects"] = mi.Bool([inside.reflection for inside in self.insides])
         tables["rough"] = mi.Bool([is_rough(b) for b in self.boundaries])
         tables["boundary"] = pointer_numbers([mi.BSDFPtr(b) for b in self.boundaries])
@@ -368,19 +381,57 @@ class WalkMedia:
         """An entry of a table with one column per channel."""
         return mi.Spectrum([dr.gather(mi.Float, column, self._place(k)) for column in self.tables[key]])
 
-    def coefficients(self, k: mi.Int32, p: mi.Point3f) -> Coefficients:
-        """Of object k at the point p."""
+    @property
+    def textured(self) -> bool:
+        """Whether a medium has textures, so that walks carry what they took of them."""
+        return any(inside.textured is not None for inside in self.insides)
+
+    def fetch(self, k: mi.Int32, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> WalkMedium | tuple[()]:
+        """What a walk takes that enters object k at a point of its surface: the medium there; () without textures."""
+        if not self.textured:
+            return ()
+        sigma_t, sigma_s = self.spectrum("sigma_t", k), self.spectrum("sigma_s", k)
+        for number, inside in enumerate(self.insides):
+            if inside.textured is not None:
+                here = active & (k == number)
+                albedo, extinction = inside.textured.scaled(self.mm_per_unit).at(si, here)
+                sigma_t = dr.select(here, extinction, sigma_t)
+                sigma_s = dr.select(here, albedo * extinction, sigma_s)
+        return WalkMedium(sigma_t, sigma_s)
+
+    def unknown(self, lanes: int) -> WalkMedium | tuple[()]:
+        """What a walk carries before it has entered anything."""
+        return WalkMedium(*(dr.full(mi.Spectrum, 1, lanes) for _ in range(2))) if self.textured else ()
+
+    def coefficients(self, k: mi.Int32, p: mi.Point3f, medium: WalkMedium | tuple[()] = ()) -> Coefficients:
+        """Of object k at the point p, for a walk that took `medium` from `fetch`."""
         mean, g = self.spectrum("sigma_t", k), self.spectrum("g", k)
         if self.heterogeneous is None:
+            if medium:
+                return Coefficients(medium.sigma_t, medium.sigma_s, g, medium.sigma_t, medium.sigma_t)
             return Coefficients(mean, self.spectrum("sigma_s", k), g, mean, mean)
         sigma_t, sigma_s = self.heterogeneous.coefficients(k, p)
-        return Coefficients(sigma_t, sigma_s, g, self.heterogeneous.majorant(k), mean)
+        result = Coefficients(sigma_t, sigma_s, g, self.heterogeneous.majorant(k), mean)
+        if not medium:
+            return result
+        own = Coefficients(medium.sigma_t, medium.sigma_s, g, medium.sigma_t, medium.sigma_t)
+        textured = self.row("textured", k)
+        return Coefficients(*(dr.select(textured, a, b) for a, b in zip(own, result)))
 
-    def transmittance(self, k: mi.Int32, ray: mi.Ray3f, distance: mi.Float, rng: mi.PCG32) -> mi.Spectrum:
+    def transmittance(
+        self,
+        k: mi.Int32,
+        ray: mi.Ray3f,
+        distance: mi.Float,
+        rng: mi.PCG32,
+        medium: WalkMedium | tuple[()] = (),
+    ) -> mi.Spectrum:
         """exp(-∫ sigma_t) over a distance along a ray inside object k; by ratio tracking where a medium varies."""
+        own = dr.exp(-(medium.sigma_t if medium else self.spectrum("sigma_t", k)) * distance)
         if self.heterogeneous is None:
-            return dr.exp(-self.spectrum("sigma_t", k) * distance)
-        return self.heterogeneous.transmittance(k, ray, distance, rng)
+            return own
+        result = self.heterogeneous.transmittance(k, ray, distance, rng)
+        return dr.select(self.row("textured", k), own, result) if medium else result
 
     def index_of(self, shape: mi.ShapePtr, active: mi.Bool | bool = True) -> mi.Int32:
         """The number of the object that a shape is, or -1."""
@@ -456,6 +507,9 @@ class WalkMedia:
             raise ValueError(f"mm_per_unit must be finite and > 0, got {mm_per_unit!r}")
         shapes = translucent_shapes(scene)
         inner, objects = scene_of(shapes, scene), [survey(shape, scene) for shape in shapes]
+        for obj in objects:
+            if obj.shape.bsdf().inside.textured is not None:
+                obj.shape.bsdf().inside.textured.check(obj)
         result = InnerShapes.of(scene, objects)
         check_together(scene, [inner, *([result.scene] if result else []), *(obj.scene for obj in objects)])
         surfaces = [shape.bsdf() for shape in shapes]

@@ -22,7 +22,7 @@ from halfspace_sss.rendering.walk.emitter_connections import (
     InnerLights,
     SubpathConnections,
 )
-from halfspace_sss.rendering.walk.media import WalkMedia
+from halfspace_sss.rendering.walk.media import WalkMedia, WalkMedium
 from halfspace_sss.rendering.walk.random_walk import (
     OUTSIDE,
     Crossing,
@@ -98,7 +98,7 @@ class LightVisitor:
         if self.inner_lights is not None:
             at = dr.zeros(mi.Interaction3f)
             at.p = event.p
-            d, E = self.inner_lights.light(walk.object, at, walk.rng, True)
+            d, E = self.inner_lights.light(walk.object, at, walk.rng, True, walk.medium)
             record = replace(record, L=record.L + walk.weight * eval_phase(event.m, dr.dot(event.along, d)) * E)
         if self.connections is None:
             return walk, record
@@ -143,7 +143,7 @@ class LightVisitor:
         L = record.L + dr.select(shines, walk.weight * emitter.eval(si, shines), 0)
         if self.inner_lights is not None:
             lit = (k < 0) & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-            d, E = self.inner_lights.light(walk.object, si, walk.rng, lit)
+            d, E = self.inner_lights.light(walk.object, si, walk.rng, lit, walk.medium)
             L = L + dr.select(lit, walk.weight * bsdf.eval(mi.BSDFContext(), si, si.to_local(d), lit) * E, 0)
         return walk, replace(record, L=L)
 
@@ -173,12 +173,14 @@ class LightVisitor:
             which = self.small.index_of(emitter, walk.d)
             active &= ~(record.connected & self.connections.covers(which, si.p, walk.d, record.pivot))
             directed = active & record.directed
-            state = (which, record.departure, share, directed)
-            _, _, share, _ = dr.if_stmt(state, directed, self._against_directions, lambda *state: state)
+            state = (which, record.departure, walk.medium, share, directed)
+            _, _, _, share, _ = dr.if_stmt(state, directed, self._against_directions, lambda *state: state)
         return dr.select(active, walk.weight * emitter.eval(si, active) * share, 0)
 
-    def _against_directions(self, which: mi.Int32, departure: Departure, share: mi.Float, directed: mi.Bool) -> tuple:
-        return which, departure, self.directions.share(which, departure, directed), directed
+    def _against_directions(
+        self, which: mi.Int32, departure: Departure, medium: WalkMedium, share: mi.Float, directed: mi.Bool
+    ) -> tuple:
+        return which, departure, medium, self.directions.share(which, departure, directed, medium), directed
 
     def spread_lights(self, walk: Walk, record: LightRecord, active: mi.Bool) -> mi.Spectrum:
         """Light of a delta light whose cone holds the ray, where no other strategy finds it."""
@@ -198,8 +200,8 @@ class LightVisitor:
         L = self.small.spread(which, ray, radius, active)
         if self.connections is not None:
             directed &= dr.max(L) > 0
-            state = (which, record.departure, mi.Float(1), directed)
-            _, _, share, _ = dr.if_stmt(state, directed, self._against_directions, lambda *state: state)
+            state = (which, record.departure, walk.medium, mi.Float(1), directed)
+            _, _, _, share, _ = dr.if_stmt(state, directed, self._against_directions, lambda *state: state)
             L = L * share
         return dr.select(active, walk.weight * L * n, 0)
 
@@ -209,7 +211,8 @@ class LightVisitor:
             return mi.Spectrum(0)
         ray = mi.Ray3f(walk.o + walk.d * walk.skip, walk.d)
         active = active & walk.alive & (walk.object >= 0)
-        return dr.select(active, walk.weight * self.inner_lights.spread(walk.object, ray, walk.rng, active), 0)
+        L = self.inner_lights.spread(walk.object, ray, walk.rng, active, walk.medium)
+        return dr.select(active, walk.weight * L, 0)
 
     def sampled_emitter(
         self,
@@ -298,7 +301,7 @@ class PathTracer:
         def renew(p: CameraPath) -> CameraPath:
             dr.scatter(L, p.light.L, p.index)
             dr.scatter(hit, p.hit, p.index)
-            return _begin(rays, total, p.index + step, p.walk.rng)
+            return _begin(rays, total, p.index + step, p.walk.rng, self.visitor.media)
 
         def body(p: CameraPath) -> tuple[CameraPath]:
             p = dr.if_stmt((p,), p.walk.object >= 0, inside, _same, label="inside")
@@ -306,7 +309,8 @@ class PathTracer:
             p = dr.if_stmt((p,), outside, self._outside, _same, label="outside")
             return (dr.if_stmt((p,), ~p.walk.alive, renew, _same),)
 
-        start = _begin(rays, total, dr.arange(mi.UInt32, lanes), generator(mi, lanes, pass_seed(*seed)))
+        rng = generator(mi, lanes, pass_seed(*seed))
+        start = _begin(rays, total, dr.arange(mi.UInt32, lanes), rng, self.visitor.media)
         dr.while_loop((start,), lambda p: p.index < total, body, label="paths")
         dr.eval(L, hit)
         return L, hit
@@ -373,6 +377,9 @@ class PathTracer:
             returns = encloses & (dr.dot(d, si.n) > 0)
             k, enters = dr.select(returns, around, k), enters | returns
         o, skip = media.depart(near, si, d, enters) if media.objects else (si.spawn_ray(d).o, walk.skip)
+        if media.textured:  # the medium of the exit, for the whole walk
+            enters_object = alive & enters
+            walk = replace(walk, medium=dr.select(enters_object, media.fetch(near, si, enters_object), walk.medium))
         walk = replace(walk, o=o, d=d, skip=skip, alive=alive, order=dr.select(enters, 0, walk.order),
                        object=dr.select(alive & enters, k, OUTSIDE), weight=weight, scale=scale,
                        channel=channel)  # fmt: skip
@@ -394,11 +401,11 @@ def _same(p: CameraPath) -> CameraPath:
     return p
 
 
-def _begin(rays: mi.Ray3f, total: mi.UInt32, index: mi.UInt32, rng: mi.PCG32) -> CameraPath:
+def _begin(rays: mi.Ray3f, total: mi.UInt32, index: mi.UInt32, rng: mi.PCG32, media: WalkMedia) -> CameraPath:
     lanes, known = dr.width(index), index < total
     o, d = dr.gather(mi.Point3f, rays.o, index, known), dr.gather(mi.Vector3f, rays.d, index, known)
     no, first = dr.full(mi.Bool, False, lanes), dr.full(mi.UInt32, 0, lanes)
-    return CameraPath(index, start_walk(o, d, rng), start_record(lanes), no, first)
+    return CameraPath(index, start_walk(o, d, rng, media.unknown(lanes)), start_record(lanes), no, first)
 
 
 # ---- First exits of paths from the camera ------------------------------------------------------------------------

@@ -14,7 +14,7 @@ import mitsuba as mi
 
 from halfspace_sss.physics.medium import eval_hg, sample_hg
 from halfspace_sss.rendering.object.points import SurfacePoint, channel_mean, lift, sided, surface_point
-from halfspace_sss.rendering.walk.media import Coefficients, WalkMedia
+from halfspace_sss.rendering.walk.media import Coefficients, WalkMedia, WalkMedium
 from halfspace_sss.tracing.walk import ROULETTE_BOOST, ROULETTE_WEIGHT, generator, pass_seed
 
 # ---- Free flight, scattering and roulette with spectral MIS ---------------------------------------------------------
@@ -153,6 +153,7 @@ class Walk:
     scale: mi.Float  # square of the relative index passed so far
     order: mi.UInt32  # scattering events since it entered the object; MET at least once it has met what lies inside
     rng: mi.PCG32
+    medium: WalkMedium | tuple[()] = ()  # that it took of textures where it entered, see `WalkMedia.fetch`
 
     def ray(self, t: mi.Float) -> mi.Ray3f:
         """Looks for the boundary on a flight of length t; its distances begin after `skip`."""
@@ -169,6 +170,7 @@ class Event:
     along: mi.Vector3f  # direction of arrival
     object: mi.Int32
     m: Coefficients
+    medium: WalkMedium | tuple[()] = ()  # of the walk
 
 
 @dataclass
@@ -217,15 +219,15 @@ class Walker:
     def step(self, walk: Walk, record: Record) -> tuple[Walk, Record]:
         """A free flight, and the scattering event, the null collision or the boundary at its end."""
         media, rng = self.media, walk.rng
-        m, u = media.coefficients(walk.object, walk.o), None
+        m, u = media.coefficients(walk.object, walk.o, walk.medium), None
         t = free_path(m, walk.channel, rng.next_float32())
         ray, p = walk.ray(t), mi.Point3f(walk.o + walk.d * t)
         hit = (media.inner or media).scene.ray_intersect_preliminary(ray, coherent=False)
         if media.varies:
-            m, u = media.coefficients(walk.object, p), rng.next_float32()
+            m, u = media.coefficients(walk.object, p, walk.medium), rng.next_float32()
         flight = fly(m, walk.weight, walk.density, walk.channel, t, hit.t + walk.skip, u)
         walk = replace(walk, weight=flight.weight, density=flight.density)
-        event = Event(p, ray.d, walk.object, m)
+        event = Event(p, ray.d, walk.object, m, walk.medium)
         meets = ~(flight.scatters | flight.null)
         if media.varies:
             o, skip = dr.select(flight.null, p, walk.o), dr.select(flight.null, 0, walk.skip)
@@ -300,6 +302,9 @@ class Walker:
         to = dr.select(through, to, k)
         alive = si.is_valid() & ~leaked & (bs.pdf > 0) & (dr.max(value) > 0)
         o, skip = media.depart(k, si, d, to >= 0)
+        if media.textured:
+            new = (to != k) & (to >= 0)
+            walk = replace(walk, medium=dr.select(new, media.fetch(dr.maximum(to, 0), si, new), walk.medium))
         walk = replace(walk, o=o, d=d, skip=skip, alive=alive, object=dr.select(alive, to, OUTSIDE),
                        weight=walk.weight * value, scale=walk.scale * dr.square(bs.eta),
                        order=dr.select(own, walk.order, dr.maximum(walk.order, MET)))  # fmt: skip
@@ -312,14 +317,14 @@ def _pass(walk: Walk, record: Record, *rest: Any) -> tuple[Walk, Record]:
     return walk, record
 
 
-def start_walk(o: mi.Point3f, d: mi.Vector3f, rng: mi.PCG32) -> Walk:
-    """A walk that begins outside."""
+def start_walk(o: mi.Point3f, d: mi.Vector3f, rng: mi.PCG32, medium: WalkMedium | tuple[()] = ()) -> Walk:
+    """A walk that begins outside; `medium` is what it carries of textures."""
     lanes = dr.width(o)
     return Walk(
         alive=dr.full(mi.Bool, True, lanes), object=dr.full(mi.Int32, OUTSIDE, lanes), o=o, d=d,
         skip=dr.full(mi.Float, 0, lanes), channel=dr.full(mi.UInt32, 0, lanes), weight=dr.full(mi.Spectrum, 1, lanes),
         density=dr.full(mi.Spectrum, 1, lanes), scale=dr.full(mi.Float, 1, lanes),
-        order=dr.full(mi.UInt32, 0, lanes), rng=rng,
+        order=dr.full(mi.UInt32, 0, lanes), rng=rng, medium=medium,
     )  # fmt: skip
 
 
@@ -462,7 +467,7 @@ def walk_from(
         roulette_from: scattering events from which on roulette may end a walk.
 
     Raises:
-        ValueError: there is no object k, or the arrays of `start` are of different lengths.
+        ValueError: there is no object k, media have textures, or the arrays of `start` are of different lengths.
     """
     n = _check(media, k, start)
     if n == 0:
@@ -489,6 +494,8 @@ def _check(media: WalkMedia, k: int, start: SurfacePoint) -> int:
     """The number of starts."""
     if not 0 <= k < len(media.objects):
         raise ValueError(f"k must be a whole number in [0, {len(media.objects) - 1}], got {k!r}")
+    if media.textured:
+        raise ValueError(f"media must be without textures for walks from points, got those of {media.objects[k].name}")
     widths = [dr.width(v) for v in start[:4]]
     if len(set(widths)) > 1:
         raise ValueError(f"p, n, n_out and w of the starts must be of one length, got {widths}")

@@ -1,0 +1,276 @@
+"""Media by textures of the surface: albedo and extinction, or reflectance and mean free path, at a point of it.
+
+A medium below a surface has no texture: a value per point of the surface is a convention. The walk takes the medium of
+the exit, the point that the camera sees, for its whole way, as Cycles, Arnold and RenderMan do.
+
+    albedo, sigma_t = A(x), scale T(x)    or    a(R(x)), scale / l(x)
+
+A, T, R and l are Mitsuba's textures or numbers; a(R) is the albedo whose half-space has the reflectance R, tabulated.
+The mean cosine and the relative index are constant.
+"""
+
+from __future__ import annotations
+
+import re
+import warnings
+from dataclasses import dataclass, replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from halfspace_sss.physics.medium import Medium
+from halfspace_sss.physics.reflectance import albedo_of_reflectance, half_space_reflectance
+from halfspace_sss.rendering.object.points import opaque
+from halfspace_sss.rendering.object.shape import Geometry, name_of
+
+NODES = 1025  # of the table of x by reflectance
+BY_UV = ("BitmapTexture", "Checkerboard")
+UNKNOWN = {"albedo": 0.5, "reflectance": 0.2, "sigma_t": 1.0, "mfp": 1.0}  # means of attributes before a mesh is known
+
+
+@dataclass(frozen=True, eq=False)
+class AlbedoTable:
+    """The albedo a(R) of half-spaces of one index, from x of `physics.reflectance` over sqrt(R / most).
+
+    Args:
+        g: of each channel.
+        most: reflectance of albedo 1 of each channel; a(R) = 1 above it.
+        tables: by g.
+    """
+
+    g: list[float]
+    most: np.ndarray
+    tables: dict[float, mi.Texture1f]
+
+    @classmethod
+    def of(cls, g: list[float], eta: float) -> AlbedoTable:
+        """For a mean cosine of each channel and a relative index."""
+        most = {each: half_space_reflectance(1.0, each, eta) for each in set(g)}
+        tables = {}
+        for each, top in most.items():
+            albedo = albedo_of_reflectance(top * np.linspace(0, 1, NODES) ** 2, each, eta)
+            s, c = np.sqrt((1 - albedo) / (1 - each * albedo)), _bend(each)
+            x = mi.TensorXf((s * c / (1 - (1 - c) * s)).astype(np.float32)[:, None])
+            tables[each] = mi.Texture1f(x, use_accel=False, wrap_mode=dr.WrapMode.Clamp)
+        return cls(g, np.array([most[each] for each in g]), tables)
+
+    def warn_of_clipped(self, values: np.ndarray) -> None:
+        """Warn of the rows of reflectance that no medium has, which are clipped."""
+        above = (values > self.most * (1 + 1e-6)).any(axis=1)
+        if above.any():
+            warnings.warn(
+                f"{int(above.sum())} of {len(above)} texels of reflectance are above {_short(self.most)}, that of a "
+                "medium without absorption, and are clipped",
+                stacklevel=2,
+            )
+
+    def __call__(self, reflectance: mi.Spectrum) -> mi.Spectrum:
+        albedos = []
+        for g, most, R in zip(self.g, self.most, reflectance):
+            u = (dr.sqrt(dr.clip(R * opaque(1 / most), 0, 1)) * (NODES - 1) + 0.5) / NODES
+            x, c = self.tables[g].eval(mi.Point1f(u))[0], opaque(_bend(g))
+            s2 = dr.square(x / (c + (1 - c) * x))
+            albedos.append((1 - s2) / (1 - opaque(g) * s2))
+        return mi.Spectrum(albedos)
+
+
+def _short(values: np.ndarray) -> str:
+    return " ".join(dict.fromkeys(f"{v:.4g}" for v in values))
+
+
+def _bend(g: float) -> float:
+    return (1 - max(g, 0.0)) ** (1 / 3)
+
+
+@dataclass(frozen=True, eq=False)
+class TexturedMedium:
+    """Albedo and extinction at points of the surface.
+
+    Args:
+        albedo: a texture, of reflectance if there is a `table`, or one number per channel.
+        sigma_t: a texture, of the mean free path if `inverse`, or one number per channel; 1/mm and mm.
+        scale: factor of sigma_t.
+        table: albedo by reflectance.
+        inverse: whether `sigma_t` is a mean free path.
+    """
+
+    albedo: Any
+    sigma_t: Any
+    scale: float = 1.0
+    table: AlbedoTable | None = None
+    inverse: bool = False
+
+    def scaled(self, factor: float) -> TexturedMedium:
+        """The same in other units of length: sigma_t times a factor."""
+        return replace(self, scale=self.scale * factor)
+
+    def at(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> tuple[mi.Spectrum, mi.Spectrum]:
+        """Albedo and sigma_t at a point of the surface."""
+        return self.albedo_at(si, active), self._extinction(_value(self.sigma_t, si, active))
+
+    def albedo_at(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> mi.Spectrum:
+        """The albedo of single scattering at a point of the surface."""
+        value = _value(self.albedo, si, active)
+        return value if self.table is None else self.table(value)
+
+    def _extinction(self, value: Any) -> Any:
+        scale = opaque(self.scale)
+        return scale / value if self.inverse else value * scale
+
+    @property
+    def textures(self) -> dict[str, mi.Texture]:
+        """By the name of their parameter."""
+        names = ("reflectance" if self.table else "albedo", "mfp" if self.inverse else "sigma_t")
+        return {name: value for name, value in zip(names, (self.albedo, self.sigma_t)) if isinstance(value, mi.Texture)}
+
+    def mean(self, g: Any, eta: float, shape: mi.Shape | None = None) -> Medium:
+        """The homogeneous medium with the means of albedo and extinction over texels, and over vertices of a mesh.
+
+        Args:
+            g, eta: mean cosine and relative index.
+            shape: whose attributes textures may show; without it `UNKNOWN` stands for them.
+        """
+        means = {name: _mean(name, texture, shape) for name, texture in self.textures.items()}
+        albedo = means.get("albedo", self.albedo)
+        if self.table is not None:
+            albedo = np.ravel(np.array(self.table(mi.Spectrum(means["reflectance"].tolist()))))
+        sigma_t = self.scale * (1 / means["mfp"] if self.inverse else means.get("sigma_t", self.sigma_t))
+        pair = (np.minimum(albedo, 1.0).astype(float), sigma_t)
+        return Medium.from_albedo(*(v if len(v) > 1 else float(v[0]) for v in pair), g, eta)
+
+    def check(self, obj: Geometry | None = None) -> None:
+        """Refuse textures that are no medium's, and warn of colours that no medium has, which are clipped.
+
+        Args:
+            obj: the object they are on, whose uv and attributes they need; without it their texels are looked at.
+
+        Raises:
+            ValueError: texels are not finite, of the albedo outside [0, 1], of reflectance negative, of sigma_t or mfp
+                not > 0; or the mesh of the object has no uv, or not the attribute.
+        """
+        for name, texture in self.textures.items():
+            values = texels(texture)
+            if obj is not None:
+                if _by_uv(texture) and obj.shape.is_mesh() and not obj.shape.has_vertex_texcoords():
+                    raise ValueError(f"object {obj.name} must have uv for the texture {name}, got a mesh without")
+                values = attributes(name, texture, obj.shape)
+            if len(values):
+                check_values(name, values)
+            if self.table is not None and name == "reflectance":
+                self.table.warn_of_clipped(values)
+
+
+def _value(source: Any, si: mi.SurfaceInteraction3f, active: mi.Bool) -> Any:
+    if isinstance(source, mi.Texture):
+        return mi.Spectrum(source.eval(si, active))
+    return mi.Spectrum([opaque(v) for v in source])
+
+
+def texels(texture: mi.Texture) -> np.ndarray:
+    """The values of a texture that are its own, shape (n, channels of the variant); none of attributes of a mesh."""
+    values = []
+    for node in mi.traverse(texture).hierarchy:
+        parameters = mi.traverse(node)
+        if _kind(node) == "BitmapTexture":
+            data = np.array(parameters["data"], dtype=float)
+            values.append(data.reshape(-1, data.shape[-1]))
+        elif "value" in parameters:  # of a constant
+            values.append(np.array(parameters["value"], dtype=float).reshape(1, -1))
+    n = len(mi.Spectrum(0))
+    return np.concatenate([np.zeros((0, n)), *(np.broadcast_to(v, (len(v), n)) for v in values)])
+
+
+def attributes(name: str, texture: mi.Texture, shape: mi.Shape) -> np.ndarray:
+    """The values of attributes of a mesh that a texture shows, shape (n, channels of the variant).
+
+    Raises:
+        ValueError: the shape has no such attribute, or one of another number of channels; `name` is the parameter's.
+    """
+    n, values = len(mi.Spectrum(0)), []
+    for node in mi.traverse(texture).hierarchy:
+        if _kind(node) != "MeshAttribute":
+            continue
+        key = re.search(r'name = "([^"]*)"', str(node)).group(1)
+        if not (shape.is_mesh() and shape.has_attribute(key)):
+            raise ValueError(f"object {name_of(shape)} must have the attribute {key!r} of the texture {name}")
+        count = shape.face_count() if key.startswith("face_") else shape.vertex_count()
+        each = np.array(mi.traverse(shape)[key], dtype=float).reshape(count, -1)
+        if each.shape[1] not in (1, 3):
+            raise ValueError(
+                f"the attribute {key!r} of the texture {name} must have 1 or 3 values, got {each.shape[1]}"
+            )
+        each = each if each.shape[1] == n else each.mean(axis=1, keepdims=True)
+        values.append(np.broadcast_to(each * float(mi.traverse(node)["scale"]), (count, n)))
+    return np.concatenate([np.zeros((0, n)), *values])
+
+
+def _kind(node: mi.Object) -> str:
+    return node.class_name().partition("Impl")[0]
+
+
+def _by_uv(texture: mi.Texture) -> bool:
+    return any(_kind(node) in BY_UV for node in mi.traverse(texture).hierarchy)
+
+
+def _mean(name: str, texture: mi.Texture, shape: mi.Shape | None) -> np.ndarray:
+    values = texels(texture)
+    if shape is not None:
+        values = np.concatenate([values, attributes(name, texture, shape)])
+    return values.mean(axis=0) if len(values) else np.full(len(mi.Spectrum(0)), UNKNOWN[name])
+
+
+def check_values(name: str, values: np.ndarray) -> None:
+    """ValueError if values of a parameter are no medium's."""
+    bounds = {
+        "albedo": ("in [0, 1]", (values >= 0) & (values <= 1)),
+        "reflectance": ("finite and >= 0", np.isfinite(values) & (values >= 0)),
+        "scale": ("finite and > 0", np.isfinite(values) & (values > 0)),
+        "sigma_t": ("finite and > 0 (1/mm)", np.isfinite(values) & (values > 0)),
+        "mfp": ("finite and > 0 (mm)", np.isfinite(values) & (values > 0)),
+    }
+    bound, ok = bounds[name]
+    if not ok.all():
+        raise ValueError(f"{name} must be {bound}, got {float(values[~ok].flat[0])!r}")
+
+
+def textured_medium(values: dict[str, Any], g: Any, eta: float, channels: int) -> TexturedMedium:
+    """The medium of parameters of which at least one is a texture.
+
+    Args:
+        values: `albedo` and `sigma_t`, with or without `scale`, or `reflectance` and `mfp`; textures, or numbers.
+        g: a number or one per channel.
+        eta: relative index.
+        channels: of the variant.
+
+    Raises:
+        ValueError: a number is out of range, or as `TexturedMedium.check`.
+    """
+    for name, value in values.items():
+        if not isinstance(value, mi.Texture):
+            check_values(name, np.atleast_1d(np.asarray(value, dtype=float)))
+            if np.size(value) not in (1, channels):
+                raise ValueError(f"{name} must be a number or one per channel ({channels}), got {np.size(value)}")
+    painted = "reflectance" in values
+    color, extent = (values[key] for key in (("reflectance", "mfp") if painted else ("albedo", "sigma_t")))
+    table, inverse = None, painted and isinstance(extent, mi.Texture)
+    if painted and isinstance(color, mi.Texture):
+        table = AlbedoTable.of(np.broadcast_to(np.asarray(g, dtype=float), channels).tolist(), eta)
+    elif painted:
+        color = Medium.from_reflectance(np.broadcast_to(color, channels), 1.0, g, eta).albedo
+    if painted and not inverse:
+        extent = 1 / np.asarray(extent, dtype=float)
+    pair = (v if isinstance(v, mi.Texture) else np.broadcast_to(np.asarray(v, dtype=float), channels).copy()
+            for v in (color, extent))  # fmt: skip
+    result = TexturedMedium(*pair, float(values.get("scale", 1.0)), table, inverse)
+    result.check()
+    return result
+
+
+def constant_texture(value: Any) -> Any:
+    """A parameter as it is, but a texture without places by its value."""
+    if not isinstance(value, mi.Texture) or value.is_spatially_varying() or _kind(value) == "MeshAttribute":
+        return value
+    result = np.ravel(np.array(value.eval(dr.zeros(mi.SurfaceInteraction3f, 1)), dtype=float))
+    return result[0] if np.ptp(result) == 0 else result

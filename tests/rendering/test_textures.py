@@ -1,0 +1,150 @@
+"""Media by textures of the surface: what they are, what the walk takes of them, and what is refused."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from test_translucent_walk import WIDEST_Z_OF_RUNS, _lamp, _runs, _scene, _small_lamp, _z
+
+from halfspace_sss import Medium
+
+pytestmark = pytest.mark.usefixtures("rgb")
+
+mi = pytest.importorskip("mitsuba")
+
+PLAIN = {"sigma_t": "0.5,1.25,2.5", "albedo": "0.9375,0.875,0.75", "g": 0.5, "eta": 1.4}
+OTHER = {**PLAIN, "sigma_t": "1.5,0.75,0.5", "albedo": "0.25,0.5,0.875"}
+
+
+def _bitmap(values: Any, **more: Any) -> dict:
+    """Rows of texels, shape (rows, columns, channels)."""
+    data = np.ascontiguousarray(values, dtype=np.float32)
+    return {"type": "bitmap", "bitmap": mi.Bitmap(data), "raw": True, "filter_type": "nearest", **more}
+
+
+def _texels(*colours: str) -> dict:
+    """One row, each texel as wide as the others."""
+    return _bitmap([[[float(x) for x in colour.split(",")] for colour in colours]])
+
+
+def _painted(*surfaces: dict) -> dict:
+    """Surfaces side by side about the axis of a sphere: of two, the first has y > 0."""
+    textures = {key: _texels(*(surface[key] for surface in surfaces)) for key in ("sigma_t", "albedo")}
+    return {**surfaces[0], **textures}
+
+
+@pytest.mark.parametrize("light", [_lamp, _small_lamp], ids=["lamp", "small"])
+def test_a_constant_texture_is_a_constant(light: Any) -> None:
+    """To rounding: kernels differ, as walks carry their medium."""
+    images = [mi.render(mi.load_dict(_scene(s, light())), spp=64, seed=1).numpy() for s in (PLAIN, _painted(PLAIN))]
+    np.testing.assert_allclose(images[1], images[0], atol=2e-6 * images[0].max())
+
+
+def test_a_walk_keeps_the_medium_of_its_exit() -> None:
+    """Each half of a sphere looks as a sphere all of its medium does."""
+    painted, first, second = (
+        _runs(mi.load_dict(_scene(s, _small_lamp())), 12, 64, seed)
+        for s, seed in ((_painted(PLAIN, OTHER), 1), (PLAIN, 100), (OTHER, 200))
+    )
+    assert np.abs(_z(painted, np.concatenate([first[:, :4], second[:, 4:]], axis=1))).max() < WIDEST_Z_OF_RUNS
+    assert np.abs(_z(painted, second)).max() > WIDEST_Z_OF_RUNS  # which is seen
+
+
+def test_texels_that_change_are_as_in_a_fresh_scene() -> None:
+    scene, fresh = (mi.load_dict(_scene(_painted(s, PLAIN), _lamp())) for s in (OTHER, PLAIN))
+    mi.render(scene, spp=1)
+    parameters, wanted = mi.traverse(scene), mi.traverse(fresh)
+    for key in ("object.bsdf.albedo.data", "object.bsdf.sigma_t.data"):
+        parameters[key] = wanted[key]
+    parameters.update()
+    assert np.array_equal(*(mi.render(s, spp=16, seed=2).numpy() for s in (scene, fresh)))
+    parameters["object.bsdf.albedo.data"] = mi.TensorXf(np.full((1, 2, 3), np.nan, dtype=np.float32))
+    with pytest.raises(ValueError, match="albedo must be in .0, 1., got nan"):
+        parameters.update()
+
+
+def _mesh(color: np.ndarray | None = None, **more: Any) -> Any:
+    """A tetrahedron without uv, with an attribute of its vertices."""
+    mesh = mi.Mesh("tetrahedron", 4, 4, **more)
+    parameters = mi.traverse(mesh)
+    parameters["vertex_positions"] = mi.Float([0, 0, 0, 9, 0, 0, 0, 9, 0, 0, 0, 9])
+    parameters["faces"] = mi.UInt32([0, 2, 1, 0, 1, 3, 0, 3, 2, 1, 2, 3])
+    parameters.update()
+    if color is not None:
+        mesh.add_attribute("vertex_color", color.size // 4, color.ravel().tolist())
+    return mesh
+
+
+def _on_mesh(surface: dict, color: np.ndarray | None = None) -> None:
+    """Asks for an image of it."""
+    props = mi.Properties()
+    props["bsdf"] = mi.load_dict({"type": "translucent", **surface})
+    scene = _scene(PLAIN)
+    scene["object"] = _mesh(color, props=props)
+    mi.render(mi.load_dict(scene), spp=1)
+
+
+def test_reflectance_becomes_the_medium_of_that_reflectance() -> None:
+    """Of each channel, to 2e-5, over the whole range."""
+    colours = np.random.default_rng(3).uniform(0, 0.9, (1, 32, 3))
+    colours[0, :2] = [[0, 1e-3, 1], [0.02, 0.5, 0.98]]
+    colours *= Medium.from_albedo(1.0, 1.0, 0.6, 1.4).reflectance()
+    surface = {"reflectance": _bitmap(colours), "mfp": _bitmap(np.full((1, 1, 3), [0.2, 4.0, 50.0])), "g": 0.6}
+    textured = mi.load_dict({"type": "translucent", **surface, "eta": 1.4}).inside.textured
+    si = mi.SurfaceInteraction3f()
+    si.uv = mi.Point2f((np.arange(32) + 0.5) / 32, 0.5)
+    albedo, sigma_t = (np.array(v).T for v in textured.at(si))
+    wanted = Medium.from_reflectance(colours[0].ravel(), 1.0, 0.6, 1.4).albedo
+    np.testing.assert_allclose(albedo.ravel(), wanted, atol=2e-5)
+    np.testing.assert_allclose(sigma_t, np.broadcast_to([5, 0.25, 0.02], (32, 3)), rtol=1e-6)
+
+
+def test_colours_that_no_medium_has_are_clipped_with_one_warning() -> None:
+    colours = np.full((4, 5, 3), 0.3)
+    colours[1, :3, 0] = 0.99
+    with pytest.warns(UserWarning, match="3 of 20 texels of reflectance are above 0.93") as caught:
+        surface = mi.load_dict({"type": "translucent", "reflectance": _bitmap(colours), "mfp": 1.0})
+    assert len(caught) == 1
+    si = mi.SurfaceInteraction3f()
+    si.uv = mi.Point2f(0.1, 0.3)
+    assert np.ravel(np.array(surface.inside.textured.at(si)[0]))[0] == 1
+
+
+def test_a_number_of_reflectance_is_the_medium_that_has_it() -> None:
+    inside = mi.load_dict({"type": "translucent", "reflectance": "0.8,0.5,0.2", "mfp": 2.0, "g": 0.5}).inside
+    assert inside.medium == Medium.from_reflectance(np.array([0.8, 0.5, 0.2]), 2.0, 0.5, 1.3)
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"albedo": np.full((1, 1, 3), np.nan)}, r"albedo must be in \[0, 1\], got nan"),
+        ({"albedo": np.full((1, 2, 3), 1.5)}, r"albedo must be in \[0, 1\], got 1.5"),
+        ({"albedo": np.full((1, 2, 1), -0.5)}, r"albedo must be in \[0, 1\], got -0.5"),
+        ({"sigma_t": np.zeros((1, 2, 3))}, r"sigma_t must be finite and > 0 \(1/mm\), got 0.0"),
+        ({"sigma_t": np.ones((1, 1, 3)), "scale": -1.0}, "scale must be finite and > 0, got -1.0"),
+        ({"albedo": np.full((1, 1, 3), 0.5), "sigma_t": "1,2"}, r"sigma_t must be a number or one per channel \(3\)"),
+        ({"g": np.full((1, 1, 3), 0.5)}, "g must be constant, got a texture; albedo, sigma_t, reflectance, mfp may"),
+    ],
+)
+def test_textures_that_are_no_media_are_refused(changed: dict, message: str) -> None:
+    textures = {key: _bitmap(value) if isinstance(value, np.ndarray) else value for key, value in changed.items()}
+    with pytest.raises(RuntimeError, match=message):
+        mi.load_dict({"type": "translucent", **PLAIN, **textures})
+
+
+@pytest.mark.parametrize(
+    ("texture", "color", "message"),
+    [
+        (None, None, "object 'object' must have uv for the texture albedo, got a mesh without"),
+        ("vertex_color", None, "must have the attribute 'vertex_color' of the texture albedo"),
+        ("vertex_color", np.full((4, 2), 0.5), "'vertex_color' of the texture albedo must have 1 or 3 values, got 2"),
+        ("vertex_color", np.full((4, 3), 1.5), r"albedo must be in \[0, 1\], got 1.5"),
+    ],
+)
+def test_textures_without_a_place_on_a_mesh_are_refused(texture: str | None, color: Any, message: str) -> None:
+    albedo = _texels(PLAIN["albedo"]) if texture is None else {"type": "mesh_attribute", "name": texture}
+    with pytest.raises(ValueError, match=message):
+        _on_mesh({**PLAIN, "albedo": albedo}, color)
