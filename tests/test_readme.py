@@ -22,14 +22,20 @@ PAGES = [
         f"docs/{name}.md"
         for name in (
             "index",
+            "start",
+            "gallery",
             "curves",
             "materials",
-            "tracing",
             "rendering",
-            "learnt_models",
             "choosing",
+            "train",
+            "add_model",
+            "tracing",
+            "biomedical",
             "figures",
             "conventions",
+            "learnt_models",
+            "errors",
             "formats",
             "limits",
         )

@@ -14,16 +14,16 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 ELSEWHERE = re.compile(r"^(https?:|data:|#|mailto:|javascript:)")
 TAGS = set(
-    "a abbr b blockquote body br button code dd del details div dl dt em footer form h1 h2 h3 h4 h5 h6 head header hr"
-    " html i iframe img input kbd label li link main meta nav noscript ol p path pre script section small span strong"
-    " style sub summary sup svg table tbody td th thead title tr ul".split()
+    "a abbr b blockquote body br button code dd del details div dl dt em figcaption figure footer form h1 h2 h3 h4"
+    " h5 h6 head header hr html i iframe img input kbd label li link main meta nav noscript ol p path pre script"
+    " section small span strong style sub summary sup svg table tbody td th thead title tr ul".split()
 )
 
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("site")
-    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(folder)]
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(folder)]
     subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
     return folder
 

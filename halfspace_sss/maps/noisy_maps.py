@@ -255,8 +255,10 @@ def make_pool(
 ) -> np.ndarray:
     """Cell integrals of all groups, (n, 2, 16, n_u, n_psi), kept launch by launch in `folder` so that a run can go on.
 
-    Args: as `trace_groups`; progress is called with ("data", launches done, launches in all). The folder must be that
-        of this run, see `work_folder`.
+    Args:
+        groups, grid, events, seed, backend: as in `trace_groups`.
+        folder: that of this run, see `work_folder`.
+        progress: called with ("data", launches done, launches in all).
 
     Raises:
         ValueError: a file of maps in the folder is damaged.
