@@ -111,12 +111,34 @@ def two_threads() -> None:
         dr.set_thread_count(2)
 
 
+def cores() -> int:
+    """Cores that this process may use, by its affinity and the quota of its control group, at least one."""
+    here = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    try:
+        quota, period = Path("/sys/fs/cgroup/cpu.max").read_text(encoding="ascii").split()
+        return max(min(here, int(quota) // int(period)), 1)
+    except (OSError, ValueError):  # none, or "max"
+        return here
+
+
+def limit_threads(threads: int) -> None:
+    """Give this process that many threads: those of Dr.Jit, BLAS and torch."""
+    from threadpoolctl import threadpool_limits
+
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):  # of libraries not loaded yet
+        os.environ[name] = str(threads)
+    threadpool_limits(threads)
+    prepare_llvm()
+    import drjit as dr
+
+    dr.set_thread_count(threads)
+
+
 def busy_threads() -> int:
     """Threads of Dr.Jit that can run at once."""
     import drjit as dr
 
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return min(dr.thread_count(), cores)
+    return min(dr.thread_count(), cores())
 
 
 def clock() -> float:

@@ -33,6 +33,7 @@ PAGES = [
             "tracing",
             "biomedical",
             "figures",
+            "cluster",
             "conventions",
             "learnt_models",
             "errors",

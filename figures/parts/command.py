@@ -12,9 +12,11 @@ import typer
 
 import figures
 from halfspace_sss.backend import BackendError
-from halfspace_sss.cli.shared import Bar, console
+from halfspace_sss.cli.shared import Bar, Scheduler, Workers, console, executor_of
 
 if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
     from figures.parts.runner import Plan
 
 DRAWING = ("PIL", "flip_evaluator", "matplotlib")
@@ -45,6 +47,8 @@ def figures_command(
         list[str] | None, typer.Argument(help="Names of figures.", metavar="[NAMES]...", show_default="all")
     ] = None,
     quality: Annotated[Quality, typer.Option(help="draft: minutes on two cores. paper: as published.")] = Quality.draft,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
     out: Annotated[Path, typer.Option(help="Folder for parts and pictures of all figures.")] = Path("out"),
 ) -> None:
     """Make the figures of the paper; a part that is there is computed again only if what it depends on changed."""
@@ -57,7 +61,9 @@ def figures_command(
             figure(name)
         if action in (Action.draw, Action.all):
             _check_drawing()
-        do([plan(name, quality.value, out) for name in chosen], out)
+        plans = [plan(name, quality.value, out) for name in chosen]
+        with executor_of(workers, scheduler) as executor:
+            do(plans, out, executor)
     except ModuleNotFoundError as error:
         if (error.name or "").split(".")[0] not in EXTRAS:
             raise
@@ -75,7 +81,7 @@ def _say(text: str) -> None:
     console().print(text, highlight=False, markup=False, soft_wrap=True)
 
 
-def _list(plans: list[Plan], out: Path) -> None:
+def _list(plans: list[Plan], out: Path, executor: Executor | None) -> None:
     from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
@@ -120,10 +126,10 @@ def _announce(p: Plan) -> None:
         _say(f"  {sources.count(source)} measured by {source}, scaled by work")
 
 
-def _compute(plans: list[Plan], out: Path) -> None:
+def _compute(plans: list[Plan], out: Path, executor: Executor | None) -> None:
     _announce_all(plans)
     for p in plans:
-        _compute_one(p, out)
+        _compute_one(p, out, executor)
 
 
 def _announce_all(plans: list[Plan]) -> None:
@@ -137,17 +143,17 @@ def _announce_all(plans: list[Plan]) -> None:
         _say(f"together about {duration(sum(p.projected_seconds for p in plans))}{more}")
 
 
-def _compute_one(p: Plan, out: Path) -> None:
+def _compute_one(p: Plan, out: Path, executor: Executor | None) -> None:
     from figures.parts.runner import compute, duration
 
     started = time.perf_counter()
     with Bar(p.name) as bar:
-        compute(p.name, p.quality, out, bar.show, _say)
+        compute(p.name, p.quality, out, bar.show, _say, executor)
     if p.missing:
         _say(f"{p.name}: computed in {duration(time.perf_counter() - started)}")
 
 
-def _draw(plans: list[Plan], out: Path) -> None:
+def _draw(plans: list[Plan], out: Path, executor: Executor | None) -> None:
     from figures.parts.runner import draw
 
     for p in plans:
@@ -155,8 +161,8 @@ def _draw(plans: list[Plan], out: Path) -> None:
             _say(f"  {path}")
 
 
-def _all(plans: list[Plan], out: Path) -> None:
+def _all(plans: list[Plan], out: Path, executor: Executor | None) -> None:
     _announce_all(plans)
     for p in plans:
-        _compute_one(p, out)
-        _draw([p], out)
+        _compute_one(p, out, executor)
+        _draw([p], out, executor)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import functools
 import importlib
 import json
 import time
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
@@ -16,7 +18,8 @@ import figures
 from figures.parts.part import QUALITIES, Part, Result, Task, check_quality, keys_of
 from figures.parts.store import DamagedPartError, PartStore
 from halfspace_sss.checks import check_choice
-from halfspace_sss.progress import ProgressText
+from halfspace_sss.executors import completed, waves
+from halfspace_sss.progress import Progress, ProgressText
 from halfspace_sss.provenance import check_folder, provenance, write_together
 
 
@@ -142,7 +145,12 @@ def plan(name: str, quality: str, out: str | Path) -> Plan:
 
 
 def compute(
-    name: str, quality: str, out: str | Path, progress: ProgressText | None = None, say: Say | None = None
+    name: str,
+    quality: str,
+    out: str | Path,
+    progress: ProgressText | None = None,
+    say: Say | None = None,
+    executor: Executor | None = None,
 ) -> dict[str, Result]:
     """Compute what is missing, damaged or changed of a figure; finished parts survive an interruption.
 
@@ -150,6 +158,7 @@ def compute(
         name, quality, out: as in `plan`.
         progress: called with (steps done, steps in all, name of the part).
         say: called with a line for each part that was damaged.
+        executor: where parts are computed and written (see `halfspace_sss.executors`); by default in this process.
 
     Returns:
         The results of all parts by name.
@@ -157,27 +166,25 @@ def compute(
     Raises:
         ValueError: as in `plan`, or from a part, whose name it gives.
     """
-    todo = plan(name, quality, out)
+    todo = plan(name, quality, Path(out).absolute() if executor else out)
     for part_name, reason in todo.damaged.items():
         if say:
             say(f"{name}: part {part_name!r} is damaged and computed again: {reason}")
-    weights = _weights(todo)
-    total, done, results = sum(weights.values()), 0.0, {}
-    for part in todo.parts:
-        if part.name not in todo.missing:
-            results[part.name] = todo.store.load(part, todo.keys[part.name])
-            continue
-        weight = weights[part.name]
+    weights, done = _weights(todo), 0.0
+    total = sum(weights.values())
 
-        def show(k: int, n: int, start: float = done, weight: float = weight, text: str = part.name) -> None:
-            if progress:
-                progress(int(STEPS * (start + weight * k / max(n, 1)) / total), STEPS, text)
+    def show(part: str, k: int, n: int) -> None:
+        if progress:
+            progress(int(STEPS * (done + weights[part] * k / max(n, 1)) / total), STEPS, part)
 
-        show(0, 1)
-        results[part.name] = _computed(todo, part, results, show)
-        done += weight
-        show(1, 1)
-    return results
+    for wave in waves({part.name: part.needs for part in todo.parts if part.name in todo.missing}):
+        parts = {
+            f"{name}, part {part!r}": (todo, part, None if executor else functools.partial(show, part)) for part in wave
+        }
+        for _, part in completed(executor, _computed, parts):
+            done += weights[part]
+            show(part, 0, 1)
+    return {part.name: todo.store.load(part, todo.keys[part.name]) for part in todo.parts}
 
 
 def draw(name: str, quality: str, out: str | Path) -> list[Path]:
@@ -225,22 +232,27 @@ def _elsewhere(folder: Path, part: Part, key: str) -> PartStore | None:
     return None
 
 
-def _computed(todo: Plan, part: Part, results: Mapping[str, Result], show: Callable[[int, int], None]) -> Result:
-    key = todo.keys[part.name]
+def _computed(todo: Plan, name: str, show: Progress | None) -> str:
+    """Compute a part, with what it needs from its store, and write it there; its name."""
+    parts = {part.name: part for part in todo.parts}
+    part, key = parts[name], todo.keys[name]
     other = _elsewhere(todo.folder, part, key)
     if other:
         result = other.load(part, key)
-        return todo.store.save(part, key, {**result.images, **result.numbers}, result.seconds)
+        todo.store.save(part, key, {**result.images, **result.numbers}, result.seconds)
+        return name
     folder = todo.store.unfinished(part, key)
     folder.mkdir(parents=True, exist_ok=True)
-    needed = {name: results[name] for name in part.needs}
-    task = Task(part.params, folder, needed, tuple(Path(path) for path in part.inputs), show)
+    needed = {needs: todo.store.load(parts[needs], todo.keys[needs]) for needs in part.needs}
+    inputs = tuple(Path(path) for path in part.inputs)
+    task = Task(part.params, folder, needed, inputs, **({"progress": show} if show else {}))
+    if show:
+        show(0, 1)
     started = time.perf_counter()
     try:
         result = part.function(task)
-        return todo.store.save(part, key, result, time.perf_counter() - started)
-    except ValueError as error:
-        raise ValueError(f"{todo.name}, part {part.name!r}: {error}") from error
+        todo.store.save(part, key, result, time.perf_counter() - started)
     finally:
         if folder.is_dir() and not any(folder.iterdir()):
             folder.rmdir()
+    return name

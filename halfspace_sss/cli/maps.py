@@ -15,10 +15,13 @@ from halfspace_sss.cli.shared import (
     Eta,
     Materials,
     MeanCosine,
+    Scheduler,
     SigmaT,
+    Workers,
     by_channel,
     check_channel,
     console,
+    executor_of,
     fig10_medium,
     numbers,
     stated_medium,
@@ -57,6 +60,8 @@ def maps_command(
     seed: Annotated[int, typer.Option(help="Seed of directions and walks.", parser=whole)] = 0,
     backend: Backend = "llvm",
     share: Annotated[str, typer.Option(help="k/n: of n processes that fill one folder, this is number k < n.")] = "0/1",
+    workers: Workers = None,
+    scheduler: Scheduler = None,
     out: Annotated[Path, typer.Option(help="Folder of the stores; a run with the same options is continued.")] = Path(
         "maps"
     ),
@@ -69,10 +74,10 @@ def maps_command(
         target_error = TARGET_ERROR
     part = _share(share)
     check_folder(out)
-    with Bar("tracing") as bar:
+    with executor_of(workers, scheduler) as executor, Bar("tracing") as bar:
         stores = make_maps(
             media, out, grid=_grid(grid), target_error=target_error, n_paths=paths, seed=seed, backend=backend,
-            share=part, progress=bar.show,
+            share=part, progress=bar.show, executor=executor,
         )  # fmt: skip
     _report(stores, part)
 

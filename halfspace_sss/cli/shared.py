@@ -12,7 +12,8 @@ import shlex
 import signal
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -23,6 +24,8 @@ from halfspace_sss.backend import BackendError, prepare_llvm
 from halfspace_sss.cli.interrupts import interrupts
 
 if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
     from rich.console import Console
 
     from halfspace_sss.physics.medium import Medium
@@ -217,10 +220,35 @@ OutFolder = Annotated[Path, typer.Option(help="Folder for the files; those of th
 Backend = Annotated[str, typer.Option(help="llvm or cuda.")]
 VARIANTS = ("llvm_ad_rgb", "llvm_ad_mono", "cuda_ad_rgb", "cuda_ad_mono")
 Variant = Annotated[str, typer.Option(help="Variant of Mitsuba.")]
+Workers = Annotated[
+    int | None,
+    typer.Option(help="Processes that share the cores and the parts of the work.", parser=whole, show_default="none"),
+]
+Scheduler = Annotated[
+    str | None,
+    typer.Option(help="Address or file of a Dask scheduler, whose workers do the work.", show_default="none"),
+]
 Define = Annotated[
     list[str] | None,
     typer.Option("--define", "-D", help="Value of $NAME in the scene; repeat for more.", metavar="NAME=VALUE"),
 ]
+
+
+@contextmanager
+def executor_of(workers: int | None, scheduler: str | None) -> Iterator[Executor | None]:
+    """Where parts run: None stands for this process."""
+    from halfspace_sss import executors
+
+    if workers is not None and scheduler is not None:
+        raise ValueError(f"workers must be left out beside a scheduler, got {workers}")
+    if scheduler is not None:
+        with executors.scheduler(scheduler) as result:
+            yield result
+    elif workers is not None:
+        with executors.workers(workers) as result:
+            yield result
+    else:
+        yield None
 
 
 def numbers(name: str, text: str) -> list[float]:

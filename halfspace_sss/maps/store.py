@@ -13,6 +13,7 @@ import shutil
 import struct
 import zlib
 from collections.abc import Mapping
+from concurrent.futures import Executor
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,6 +22,7 @@ import numpy as np
 
 from halfspace_sss.backend import array_types
 from halfspace_sss.checks import check_count, check_interval
+from halfspace_sss.executors import completed
 from halfspace_sss.maps.grid import MapGrid, cell_edges, map_directions
 from halfspace_sss.maps.map_tracing import MapUnit, UnitResult, trace_unit
 from halfspace_sss.physics.medium import Medium
@@ -128,6 +130,7 @@ def make_maps(
     backend: str = "llvm",
     share: tuple[int, int] = (0, 1),
     progress: ProgressText | None = None,
+    executor: Executor | None = None,
 ) -> dict[str, Path]:
     """Trace training maps of media into `folder/NAME.zarr`, one Zarr store each, continuing what is there.
 
@@ -145,6 +148,7 @@ def make_maps(
         seed, backend: as in `trace`.
         share: (k, n) does every n-th unit from the k-th on, so that n processes can fill one folder together.
         progress: called with (units done, units in all, what was just done), first with those that were done before.
+        executor: where units are traced and written (see `halfspace_sss.executors`); by default in this process.
 
     Returns:
         name -> path of the store.
@@ -171,10 +175,14 @@ def make_maps(
     before = len(units) - len(left)
     if progress:
         progress(before, len(units), "")
-    for done, (name, channel, unit) in enumerate(left, before + 1):
-        _write(paths[name], channel, unit.theta_index, trace_unit(unit))
+    parts = {
+        f"{name} channel {channel} direction {unit.theta_index + 1}/{grid.n_theta}": (path.absolute(), channel, unit)
+        for name, channel, unit in left
+        for path in (paths[name],)
+    }
+    for done, (text, _) in enumerate(completed(executor, _trace_and_write, parts), before + 1):
         if progress:
-            progress(done, len(units), f"{name} channel {channel} direction {unit.theta_index + 1}/{grid.n_theta}")
+            progress(done, len(units), text)
     return paths
 
 
@@ -316,6 +324,11 @@ def _done(path: Path, dataset: xr.Dataset, channel: int, theta: int) -> bool:
         return stored != 0 and stored == unit_checksum(*(dataset[name].isel(at).values for name in DATA))
     except Exception as error:
         raise ValueError(f"map store {path} is damaged in channel {channel}, theta {theta}: {error}") from error
+
+
+def _trace_and_write(path: Path, channel: int, unit: MapUnit) -> None:
+    """A part of the work: chunks of its own, which no other unit writes."""
+    _write(path, channel, unit.theta_index, trace_unit(unit))
 
 
 def _write(path: Path, channel: int, theta: int, result: UnitResult) -> None:

@@ -1,0 +1,156 @@
+"""Where the independent parts of a long work run: one after another here, in processes, or on the workers of Dask.
+
+Long work takes a `concurrent.futures.Executor`; without one its parts run in this process. A part is named by what it
+depends on and writes its result whole or not at all, so that it may be lost, or run twice, anywhere.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from concurrent.futures import BrokenExecutor, CancelledError, Executor, ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import halfspace_sss
+from halfspace_sss.backend import BackendError, cores, limit_threads
+from halfspace_sss.checks import check_count
+
+_PROCESS = os.getpid()  # that imported this module: a forked child has another one
+
+
+def completed(
+    executor: Executor | None, function: Callable[..., Any], parts: Mapping[str, Sequence[Any]]
+) -> Iterator[tuple[str, Any]]:
+    """Name and result of each part, in the order in which they end.
+
+    Args:
+        executor: where they run; None: here, one after another, each when it is asked for.
+        function: at the top of a module; called with the arguments of a part.
+        parts: arguments by the name that errors tell.
+
+    Raises:
+        ValueError: from a part, with its name; or parts would run in a forked process, where Dr.Jit hangs.
+        BackendError: a worker ended.
+    """
+    if executor is None:
+        for name, arguments in parts.items():
+            with _naming(name):
+                result = function(*arguments)
+            yield name, result
+        return
+    futures = {executor.submit(_part, function, arguments): name for name, arguments in parts.items()}
+    try:
+        for future in as_completed(list(futures)):
+            with _naming(name := futures.pop(future)):
+                result = future.result()
+            yield name, result
+    finally:
+        for future in futures:
+            future.cancel()
+
+
+def waves(needs: Mapping[str, Collection[str]]) -> Iterator[list[str]]:
+    """Names in groups, each of which needs only names of the groups before; names that are not keys are there."""
+    left = dict(needs)
+    while left:
+        wave = [name for name, needed in left.items() if not left.keys() & set(needed)]
+        if not wave:
+            raise ValueError(f"parts must not need each other in a circle, got {', '.join(left)}")
+        yield wave
+        left = {name: needed for name, needed in left.items() if name not in wave}
+
+
+@contextmanager
+def workers(number: int) -> Iterator[Executor]:
+    """Processes of this machine that share its cores evenly; started by spawn, and ended with this process.
+
+    Args:
+        number: of processes.
+
+    Raises:
+        ValueError: the number is not above 0.
+    """
+    check_count("workers", number, 1)
+    threads = max(cores() // number, 1)
+    context = multiprocessing.get_context("spawn")
+    before = set(multiprocessing.active_children())
+    executor = ProcessPoolExecutor(number, context, _begin, (threads,))
+    try:
+        yield executor
+    except BaseException:
+        for process in set(multiprocessing.active_children()) - before:
+            process.terminate()
+        raise
+    finally:
+        executor.shutdown(cancel_futures=True)
+
+
+@contextmanager
+def scheduler(address: str) -> Iterator[Executor]:
+    """The workers of a Dask scheduler.
+
+    Args:
+        address: as tcp://HOST:8786, or the file that `dask scheduler --scheduler-file` writes.
+
+    Raises:
+        BackendError: Dask is not installed, or no scheduler answers.
+        ValueError: a worker has another version of this package, or several threads.
+    """
+    try:
+        from distributed import Client, KilledWorker
+
+        from halfspace_sss.dask_worker import WorkerSetUp
+    except ModuleNotFoundError as error:
+        raise BackendError(f'a scheduler needs {error.name}: pip install "halfspace-sss[cluster]"') from error
+    where = {"scheduler_file": address} if Path(address).is_file() else {"address": address}
+    try:
+        client = Client(**where, timeout=10, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise BackendError(f"no scheduler answers at {address}: {error}") from error
+    with client:
+        client.register_plugin(WorkerSetUp(halfspace_sss.__version__))
+        try:
+            yield client.get_executor(pure=False)
+        except KilledWorker as error:
+            raise BackendError(f"workers ended again and again under one part: {error}") from error
+
+
+def _begin(threads: int) -> None:
+    """First of all in a worker: its parent hears of interrupts, and its parent's end is its own."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    limit_threads(threads)
+
+
+def _end_with_parent() -> None:
+    multiprocessing.parent_process().join()
+    os._exit(1)
+
+
+def _part(function: Callable[..., Any], arguments: Sequence[Any]) -> Any:
+    if os.getpid() != _PROCESS:
+        raise ValueError(
+            "executor must start its processes by spawn, got a forked one, in which Dr.Jit hangs: "
+            "ProcessPoolExecutor(mp_context=multiprocessing.get_context('spawn'))"
+        )
+    return function(*arguments)
+
+
+@contextmanager
+def _naming(name: str) -> Iterator[None]:
+    """What a part says is told with its name."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from error
+    except (BrokenExecutor, CancelledError) as error:
+        raise BackendError(f"{name}: a worker or the scheduler ended; parts that were done are kept") from error
+    except Exception as error:
+        if hasattr(error, "add_note"):  # from Python 3.11 on
+            error.add_note(f"in part {name}")
+        raise

@@ -1,0 +1,126 @@
+"""Parts on workers: the same bits as in one process, errors with the name of the part, and no process left behind."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from concurrent.futures import Executor, ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+
+import psutil
+import pytest
+
+from halfspace_sss import Medium, executors, make_maps
+from halfspace_sss.backend import BackendError, cores
+from halfspace_sss.executors import completed, waves
+from halfspace_sss.maps.grid import MapGrid
+from halfspace_sss.maps.store import load_maps
+
+MEDIA = {"even": Medium.from_albedo(0.75, 1.0, 0.0, 1.3), "forward": Medium.from_albedo(0.99, 1.0, 0.8, 1.5)}
+HOW = {"grid": MapGrid(2, 16, 6, 4), "target_error": None, "n_paths": 2048}
+
+
+def odd(k: int) -> int:
+    if k % 2 == 0:
+        raise ValueError(f"k must be odd, got {k}")
+    return k * k
+
+
+def place(_: int) -> tuple[int, int]:
+    """Process and threads of Dr.Jit."""
+    import drjit as dr
+
+    return os.getpid(), dr.thread_count()
+
+
+@pytest.mark.parametrize("executor", [None, ThreadPoolExecutor(2)], ids=["here", "threads"])
+def test_a_part_gives_its_result_or_its_error_under_its_name(executor: Executor | None) -> None:
+    assert dict(completed(executor, odd, {"three": (3,), "five": (5,)})) == {"three": 9, "five": 25}
+    with pytest.raises(ValueError, match="part four: k must be odd, got 4"):
+        list(completed(executor, odd, {"part four": (4,)}))
+
+
+def test_without_an_executor_a_part_runs_when_it_is_asked_for() -> None:
+    threads = []
+    parts = completed(None, lambda k: threads.append((k, threading.get_ident())), {"a": (1,), "b": (2,)})
+    assert not threads
+    next(parts)
+    assert threads == [(1, threading.get_ident())]
+
+
+def test_parts_wait_for_those_that_they_need() -> None:
+    needs = {"image": ["weights", "mesh"], "mesh": [], "weights": ["mesh", "kept"], "other": []}
+    assert list(waves(needs)) == [["mesh", "other"], ["weights"], ["image"]]
+    with pytest.raises(ValueError, match="circle, got a, b"):
+        list(waves({"a": ["b"], "b": ["a"]}))
+
+
+def test_a_forked_process_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(executors, "_PROCESS", -1)
+    with ThreadPoolExecutor(1) as executor, pytest.raises(ValueError, match="part: executor must start .* by spawn"):
+        list(completed(executor, odd, {"part": (1,)}))
+
+
+def test_what_is_no_number_of_workers_and_no_scheduler_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ValueError, match="workers must be a whole number >= 1, got 0"), executors.workers(0):
+        pass
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(BackendError, match=r"pip install \"halfspace-sss\[cluster\]\""), executors.scheduler("x"):
+        pass
+
+
+@contextmanager
+def dask(threads: int = 1) -> Iterator[str]:
+    """Address of a scheduler with one worker."""
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(n_workers=1, threads_per_worker=threads, dashboard_address=None) as cluster:
+        yield cluster.scheduler_address
+
+
+@pytest.mark.slow
+def test_two_processes_share_the_cores_and_give_the_bits_of_one(tmp_path: Path) -> None:
+    here = make_maps(MEDIA, tmp_path / "here", **HOW)
+    with executors.workers(2) as executor:
+        there = make_maps(MEDIA, tmp_path / "there", executor=executor, **HOW)
+        ((process, threads),) = dict(completed(executor, place, {"place": (0,)})).values()
+        assert process != os.getpid() and threads == max(cores() // 2, 1)
+    for name in MEDIA:
+        assert load_maps(there[name]).S.equals(load_maps(here[name]).S)
+
+
+@pytest.mark.slow
+def test_workers_of_dask_give_the_bits_of_one_process(tmp_path: Path) -> None:
+    here = make_maps(MEDIA, tmp_path / "here", **HOW)
+    with dask() as address, executors.scheduler(address) as executor:
+        there = make_maps(MEDIA, tmp_path / "there", executor=executor, **HOW)
+    for name in MEDIA:
+        assert load_maps(there[name]).S.equals(load_maps(here[name]).S)
+    with dask(threads=2) as address:
+        with pytest.raises(ValueError, match="must run one part at a time .* got 2 threads"):
+            with executors.scheduler(address):
+                pass
+
+
+@pytest.mark.slow
+def test_a_killed_worker_ends_the_command_and_the_next_one_goes_on(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "halfspace_sss", "maps", "--albedo", "0.9", "--grid", "4,16,6,4", "--paths", "3e5"]
+    run = [*command, "--workers", "2", "--out", str(tmp_path)]
+    process = subprocess.Popen(run, stderr=subprocess.PIPE, text=True)
+    workers: list[psutil.Process] = []
+    for _ in range(600):
+        children = psutil.Process(process.pid).children()
+        workers = [child for child in children if any("spawn_main" in word for word in child.cmdline())]
+        if len(workers) == 2:
+            break
+        time.sleep(0.1)
+    workers[0].kill()
+    _, messages = process.communicate(timeout=60)
+    assert process.returncode == 1 and "a worker or the scheduler ended" in messages
+    assert not psutil.wait_procs(workers, timeout=10)[1]
+    assert subprocess.run([*command, "--out", str(tmp_path)], capture_output=True).returncode == 0
+    assert (load_maps(tmp_path / "medium.zarr")["n_paths"] >= 300_000).all()
