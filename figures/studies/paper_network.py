@@ -182,7 +182,7 @@ def walk_samples(
     starts = exits.gather(dr.arange(mi.UInt32, m * n) // n)
     ends = trace_exits(obj, starts, seed)
     lost = dr.max(ends.T) <= 0
-    here = SurfacePoint(*(dr.select(lost, a, b) for a, b in zip(starts, ends.at)))
+    here = SurfacePoint(*(dr.select(lost, a, b) for a, b in zip(starts[:5], ends.at)))
     points = placed(frame, here, m * n).reshape(m, n, 5)
     w, T = (np.array(v, dtype=np.float32).T.reshape(m, n, -1) for v in (here.w, ends.T))
     return PaperSamples(placed(frame, exits, m), points, w, np.ascontiguousarray(T))

@@ -342,7 +342,7 @@ class LearntProposals(CosineProposals):
         entry = EntrySample(mi.Point3f(at.p), n, mi.Normal3f(n_out), mi.Float(1), mi.UInt32(at.prim_index))
         if self.patch_share < 1:
             probed = self.positions.sample(out, prim_index, sampler, active & ~by_patch)
-            entry = EntrySample(*(dr.select(by_patch, a, b) for a, b in zip(entry, probed)))
+            entry = EntrySample(*(dr.select(by_patch, a, b) for a, b in zip(entry[:5], probed)))
         learnt = self.patches.density(weights, entry.face)
         if self.patch_share == 1:
             return entry._replace(weight=dr.select(by_patch, 1 / learnt, 0))

@@ -1,4 +1,4 @@
-"""Media by textures of the surface: what they are, what the walk takes of them, and what is refused."""
+"""Media by textures of the surface: what they are, what the walk and models take of them, and what is refused."""
 
 from __future__ import annotations
 
@@ -9,10 +9,14 @@ import pytest
 from test_translucent_walk import WIDEST_Z_OF_RUNS, _lamp, _runs, _scene, _small_lamp, _z
 
 from halfspace_sss import Medium
+from halfspace_sss.rendering.object.objects import make_objects
+from halfspace_sss.rendering.object.points import SurfacePoint
+from halfspace_sss.rendering.object.settings import Settings
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
 mi = pytest.importorskip("mitsuba")
+import drjit as dr  # noqa: E402
 
 PLAIN = {"sigma_t": "0.5,1.25,2.5", "albedo": "0.9375,0.875,0.75", "g": 0.5, "eta": 1.4}
 OTHER = {**PLAIN, "sigma_t": "1.5,0.75,0.5", "albedo": "0.25,0.5,0.875"}
@@ -50,6 +54,110 @@ def test_a_walk_keeps_the_medium_of_its_exit() -> None:
     )
     assert np.abs(_z(painted, np.concatenate([first[:, :4], second[:, 4:]], axis=1))).max() < WIDEST_Z_OF_RUNS
     assert np.abs(_z(painted, second)).max() > WIDEST_Z_OF_RUNS  # which is seen
+
+
+def test_a_white_texture_without_absorption_is_invisible_in_uniform_light() -> None:
+    surface = {"reflectance": _bitmap(np.ones((2, 2, 3))), "mfp": 0.4, "eta": 1.5}
+    with pytest.warns(UserWarning, match="4 of 4 texels of reflectance are above"):
+        image = mi.render(mi.load_dict(_scene(surface)), spp=16, seed=1).numpy()
+    np.testing.assert_allclose(image, 1, rtol=1e-5)
+
+
+ANALYTIC = [
+    *("standard_dipole", "better_dipole", "directional_dipole", "normalized_diffusion", "lambert"),
+    pytest.param("photon_beam_diffusion", marks=pytest.mark.slow),
+]
+
+
+def _transports(name: str, *surfaces: dict) -> list[Any]:
+    objects = [
+        make_objects(mi.load_dict(_scene({**surface, "model": name}, mm_per_unit=0.5)), Settings())[0]
+        for surface in surfaces
+    ]
+    return objects
+
+
+def _S(obj: Any, seed: int = 1, n: int = 512) -> np.ndarray:
+    """S between random points at most a few mean free paths apart, channels last."""
+    rng = np.random.default_rng(seed)
+    p = rng.normal(size=(3, n))
+    p, far = p / np.linalg.norm(p, axis=0), 10.0
+    q = p + rng.normal(size=(3, n)) * rng.uniform(0.01, 0.2, n)
+    q /= np.linalg.norm(q, axis=0)
+    ends = []
+    for x in (p, q):
+        w = mi.Vector3f(dr.normalize(mi.Vector3f(x + 0.3 * rng.normal(size=(3, n)))))
+        medium = () if obj.textured is None else obj.textured.at_point(
+            obj.geometry, mi.Point3f(far * x), mi.Normal3f(x), mi.UInt32(0))  # fmt: skip
+        ends.append(SurfacePoint(mi.Point3f(far * x), mi.Normal3f(x), mi.Normal3f(x), w, medium=medium))
+    return np.array(obj.transport.S(obj.transport.prepare(ends[0]), ends[1])).T
+
+
+@pytest.mark.parametrize("analytic", ANALYTIC)
+def test_models_of_one_texel_are_those_of_its_medium(analytic: str) -> None:
+    """Albedo 1 among them, so that a white texture has the energy of the model."""
+    white = {**PLAIN, "albedo": "1,0.875,0.5"}
+    plain, painted = (_S(obj) for obj in _transports(analytic, white, _painted(white)))
+    np.testing.assert_allclose(painted, plain, rtol=2e-5, atol=1e-6 * plain.max())
+
+
+@pytest.mark.parametrize("analytic", ANALYTIC)
+def test_models_between_nodes_are_those_of_the_medium(analytic: str) -> None:
+    """With other texels beside, to 1 %: ln S is close to linear between nodes."""
+    medium = {**PLAIN, "albedo": "0.96,0.83,0.65"}
+    beside = {**PLAIN, "albedo": "0.3,0.99,0.999", "sigma_t": "3,2,1"}
+    (plain, painted) = _transports(analytic, medium, _painted(medium, beside))
+    a, b = _S(plain), _S(painted)
+    upper = np.random.default_rng(1).normal(size=(3, 512))[1] > 0.5  # both ends are in the first texel
+    assert np.abs(a - b)[upper].sum() < 0.01 * a[upper].sum() or analytic == "lambert"
+    assert np.abs(a - b).sum() > 0.05 * a.sum()
+
+
+def test_S_is_the_geometric_mean_of_both_ends() -> None:
+    """And so reciprocal."""
+    first, second, painted = _transports("better_dipole", PLAIN, OTHER, _painted(PLAIN, OTHER))
+    a, b, c = (_S(obj) for obj in (first, second, painted))
+    rng = np.random.default_rng(1)
+    p = rng.normal(size=(3, 512))
+    q = p / np.linalg.norm(p, axis=0) + rng.normal(size=(3, 512)) * rng.uniform(0.01, 0.2, 512)
+    across = p[1] * q[1] < 0
+    assert 10 < across.sum() < 200
+    wanted = np.where(across[:, None], np.sqrt(a * b), np.where((p[1] > 0)[:, None], a, b))
+    np.testing.assert_allclose(c, wanted, rtol=5e-3, atol=1e-5 * wanted.max())
+
+
+@pytest.mark.slow
+def test_a_model_of_a_constant_texture_renders_as_of_a_constant() -> None:
+    images = []
+    for surface in (PLAIN, _painted(PLAIN)):
+        scene = _scene({**surface, "model": "better_dipole"}, _small_lamp())
+        scene["integrator"] = {"type": "bssrdf", "mm_per_unit": 0.8}
+        images.append(mi.render(mi.load_dict(scene), spp=64, seed=1).numpy())
+    np.testing.assert_allclose(images[1], images[0], atol=1e-5 * images[0].max())
+
+
+@pytest.mark.parametrize(
+    ("model", "integrator", "message"),
+    [
+        ("neural", {}, "model must be analytic for media by textures, got 'neural', which is a network"),
+        ("neural_shape", {}, "must be without textures for the model 'neural_shape'"),
+        ("full_geometry", {}, "must be without textures for the model 'full_geometry'"),
+        ("better_dipole", {"light": "gathered"}, "light must be sampled for object .*, whose medium has textures"),
+    ],
+)
+def test_what_takes_no_textures_refuses_them_by_name(model: str, integrator: dict, message: str) -> None:
+    scene = _scene({**_painted(PLAIN, OTHER), "model": model})
+    scene["integrator"] = {"type": "bssrdf", **integrator}
+    with pytest.raises(ValueError, match=message):
+        mi.render(mi.load_dict(scene), spp=1)
+
+
+def test_the_albedo_of_aovs_is_that_of_the_texels() -> None:
+    painted, *plain = (mi.load_dict({"type": "translucent", **s}) for s in (_painted(PLAIN, OTHER), PLAIN, OTHER))
+    si = dr.zeros(mi.SurfaceInteraction3f, 2)
+    si.uv, si.wi = mi.Point2f([0.2, 0.7], 0.5), mi.Vector3f(0.6, 0, 0.8)
+    wanted = [np.ravel(np.array(surface.eval_diffuse_reflectance(si))) for surface in plain]
+    np.testing.assert_allclose(np.array(painted.eval_diffuse_reflectance(si)).T, wanted, rtol=1e-6)
 
 
 def test_texels_that_change_are_as_in_a_fresh_scene() -> None:
@@ -95,7 +203,8 @@ def test_reflectance_becomes_the_medium_of_that_reflectance() -> None:
     textured = mi.load_dict({"type": "translucent", **surface, "eta": 1.4}).inside.textured
     si = mi.SurfaceInteraction3f()
     si.uv = mi.Point2f((np.arange(32) + 0.5) / 32, 0.5)
-    albedo, sigma_t = (np.array(v).T for v in textured.at(si))
+    at = textured.at(si)
+    albedo, sigma_t = np.array(at.albedo).T, np.array(at.sigma_t).T
     wanted = Medium.from_reflectance(colours[0].ravel(), 1.0, 0.6, 1.4).albedo
     np.testing.assert_allclose(albedo.ravel(), wanted, atol=2e-5)
     np.testing.assert_allclose(sigma_t, np.broadcast_to([5, 0.25, 0.02], (32, 3)), rtol=1e-6)
@@ -109,7 +218,7 @@ def test_colours_that_no_medium_has_are_clipped_with_one_warning() -> None:
     assert len(caught) == 1
     si = mi.SurfaceInteraction3f()
     si.uv = mi.Point2f(0.1, 0.3)
-    assert np.ravel(np.array(surface.inside.textured.at(si)[0]))[0] == 1
+    assert np.ravel(np.array(surface.inside.textured.at(si).albedo))[0] == 1
 
 
 def test_a_number_of_reflectance_is_the_medium_that_has_it() -> None:

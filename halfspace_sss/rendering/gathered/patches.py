@@ -169,7 +169,7 @@ def _evaluated(obj: TranslucentObject, points: SurfacePoints, places: EntrySampl
     dr.eval(out, values, prepared, a)
 
     def step(k: mi.UInt32, sampler: mi.Sampler) -> tuple[mi.UInt32, mi.Sampler]:
-        entry = EntrySample(*(dr.gather(type(v), v, k * n + s) for v in places))
+        entry = places.gather(k * n + s)
         w, pdf = cosine_above(entry.n_out, entry.n, sampler.next_2d())
         at_entry = entry.facing(w)
         S = obj.transport.S(prepared, at_entry, pdf > 0) * at_entry.mu / (dr.maximum(pdf, 1e-8) * dr.maximum(a, 1e-6))
@@ -196,6 +196,6 @@ def _areas(obj: TranslucentObject, cells: SurfaceCells) -> tuple[np.ndarray, Ent
     chosen = first[:, None] + np.arange(PAIRS) % np.maximum(counts, 1)[:, None]
     index = mi.UInt32(order[np.minimum(chosen, PLACES - 1)].ravel().astype(np.uint32))
     at = at._replace(weight=at.weight + dr.zeros(mi.Float, PLACES))
-    places = EntrySample(*(dr.gather(type(v), v, index) for v in at))
+    places = at.gather(index)
     dr.eval(places)
     return np.maximum(counts, 0.5) * (obj.geometry.area / PLACES), places

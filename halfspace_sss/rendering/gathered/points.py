@@ -80,7 +80,7 @@ class SurfacePoints:
     def of(cls, geometry: Geometry, count: int) -> SurfacePoints:
         """`count` points of an object."""
         u = [mi.Float(((np.arange(1, count + 1) * r + 0.5) % 1.0).astype(np.float32)) for r in R_3]
-        p, n, n_out, _, face = uniform_entries(geometry, u[0], mi.Point2f(u[1], u[2]))
+        p, n, n_out, _, face, _ = uniform_entries(geometry, u[0], mi.Point2f(u[1], u[2]))
         dr.eval(p, n, n_out, face)
         h = REACH * float(np.sqrt(geometry.area / count))
         return cls(p, n, n_out, face, *_grid(np.array(p).T, h))

@@ -7,10 +7,13 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
+from halfspace_sss.physics.reflectance import albedo_of_reflectance, half_space_reflectance
 from halfspace_sss.rendering.object.objects import TranslucentObject
 from halfspace_sss.rendering.object.points import CosineProposals, EntrySample, ObjectModel, SurfacePoint, opaque
 from halfspace_sss.rendering.object.settings import Settings
+from halfspace_sss.rendering.object.textured import bend, x_of_albedo
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +41,52 @@ class LambertTransport:
         return dr.select(above, (mi.Spectrum(*R) if len(R) > 1 else mi.Spectrum(R[0])) * dr.inv_pi, 0)
 
 
+NODES = 1025  # of the table of R by x
+
+
+@dataclass(frozen=True, eq=False)
+class TexturedLambertTransport:
+    """The same with the reflectance of the medium at the point, by a table of ln(R / albedo) over x.
+
+    Args:
+        g: mean cosine of each channel.
+        tables: by mean cosine.
+    """
+
+    g: list[float]
+    tables: dict[float, mi.Texture1f]
+    orders = "total"
+    checksums = ()
+    alpha = None
+    is_delta = True
+
+    @classmethod
+    def of(cls, g: list[float], eta: float) -> TexturedLambertTransport:
+        """For a mean cosine of each channel and a relative index."""
+        tables = {}
+        for each in set(g):
+            R = half_space_reflectance(1.0, each, eta) * np.linspace(0, 1, NODES)[1:] ** 2
+            albedo = albedo_of_reflectance(R, each, eta)
+            x = x_of_albedo(np, albedo, each, bend(each))[::-1]
+            ratio = np.interp(np.linspace(0, 1, NODES), x, np.log(R / albedo)[::-1])
+            tensor = mi.TensorXf(ratio.astype(np.float32)[:, None])
+            tables[each] = mi.Texture1f(tensor, use_accel=False, wrap_mode=dr.WrapMode.Clamp)
+        return cls(g, tables)
+
+    def prepare(self, at: SurfacePoint, active: mi.Bool = True) -> SurfacePoint:
+        """Nothing is done for the exit alone."""
+        return at
+
+    def S(self, exit: SurfacePoint, at: SurfacePoint, active: mi.Bool = True) -> mi.Spectrum:
+        """As of `LambertTransport`."""
+        R = []
+        for g, albedo in zip(self.g, exit.medium.albedo):
+            x = x_of_albedo(dr, dr.clip(albedo, 0, 1), opaque(g), opaque(bend(g)))
+            R.append(albedo * dr.exp(self.tables[g].eval(mi.Point1f((x * (NODES - 1) + 0.5) / NODES))[0]))
+        above = active & (dr.dot(exit.w, exit.n_out) > 0)
+        return dr.select(above, (mi.Spectrum(*R) if len(R) > 1 else mi.Spectrum(R[0])) * dr.inv_pi, 0)
+
+
 @dataclass(frozen=True, eq=False)
 class LambertProposals(CosineProposals):
     """The exit itself, directions by the cosine."""
@@ -55,4 +104,10 @@ class LambertProposals(CosineProposals):
 
 def lambert_model(obj: TranslucentObject, settings: Settings) -> ObjectModel:
     """The transport of a diffuse surface: what a half-space tends to as its mean free path goes to 0."""
+    if obj.textured is not None:
+        transport = TexturedLambertTransport.of([m.g for m in obj.media], obj.media[0].eta)
+        return ObjectModel(transport, LambertProposals())
     return ObjectModel(LambertTransport([float(m.reflectance()) for m in obj.media]), LambertProposals())
+
+
+lambert_model.takes_textures = True

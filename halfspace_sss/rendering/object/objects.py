@@ -22,6 +22,7 @@ from halfspace_sss.interface.model import bssrdf
 from halfspace_sss.physics import single_scattering
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.object.half_space import Variation, half_space_model
+from halfspace_sss.rendering.object.palette import textured_model
 from halfspace_sss.rendering.object.points import (
     AreaPoints,
     ObjectAlbedo,
@@ -50,6 +51,7 @@ from halfspace_sss.rendering.object.shape import (
     state_of,
     survey,
 )
+from halfspace_sss.rendering.object.textured import TexturedMedium
 from halfspace_sss.rendering.object.translucent import Inside, check_tints, is_translucent
 from halfspace_sss.rendering.object.varying import VaryingMedium, equivalent, warn_of_means
 
@@ -175,7 +177,9 @@ def refuse(result: Content, holder: Geometry, what: str) -> None:
 
 def refuse_textures(name: str, what: str) -> None:
     """ValueError that names an object whose medium has textures, which `what` does not take."""
-    raise ValueError(f"object {name} must be without textures for {what}: the integrator translucent_walk takes them")
+    raise ValueError(
+        f"object {name} must be without textures for {what}: translucent_walk and models of the half-space take them"
+    )
 
 
 def outermost(scene: mi.Scene) -> list[mi.Shape]:
@@ -342,6 +346,7 @@ class TranslucentObject:
         geometry: of its shape.
         media: scalar medium of each channel of the variant, 1/(scene unit).
         varying: how its medium varies in space, 1/(scene unit); `media` are then a homogeneous equivalent.
+        textured: likewise over its surface.
         transport: what light that enters elsewhere is worth here; None where no order from two on is asked for.
         proposals: where it may enter; None without a transport.
         entries: how many of them an exit draws.
@@ -350,11 +355,13 @@ class TranslucentObject:
         variation: how its light varies with its medium.
         gathered: what leaves by orders from two on, in place of a transport, see `paths.gathering`.
         control: control variate of entries at the first vertex of a path, see `paths.control_variate`.
+        painted: state of its shape, whose attributes textures show.
     """
 
     geometry: Geometry
     media: tuple[Medium, ...]
     varying: VaryingMedium | None = None
+    textured: TexturedMedium | None = None
     transport: Transport | None = None
     proposals: Proposals | None = None
     entries: int = 1
@@ -363,6 +370,7 @@ class TranslucentObject:
     variation: Variation | None = None
     gathered: Any = None
     control: Any = None
+    painted: tuple[list, list] = ([], [])
 
     @property
     def surface(self) -> mi.BSDF:
@@ -412,7 +420,8 @@ class TranslucentObject:
 
     def is_current(self) -> bool:
         """Whether the object still has the shape and the medium that it was made of."""
-        return self.surface.inside is self.variation.inside and self.geometry.is_current()
+        same = self.textured is None or self.painted[0] == state_of(self.geometry.shape)[0]
+        return same and self.surface.inside is self.variation.inside and self.geometry.is_current()
 
 
 class TranslucentObjects:
@@ -493,10 +502,12 @@ def _make_object(geometry: Geometry, inside: Inside, settings: Settings) -> Tran
     check_size(geometry, [float(m.sigma_t) for m in media], settings.mm_per_unit)
     varying = None if inside.varying is None else inside.varying.scaled(settings.mm_per_unit)
     obj = TranslucentObject(geometry, media, varying)
+    if inside.textured is not None:
+        inside.textured.check(geometry)
+        textured = inside.textured.scaled(settings.mm_per_unit)
+        obj = replace(obj, textured=textured, painted=state_of(geometry.shape))
     single_only = inside.orders == "single" or not any(float(m.sigma_s) > 0 for m in media)
     check_tints(geometry.name, obj.surface.boundary)
-    if inside.textured is not None:
-        refuse_textures(geometry.name, f"the model {inside.model!r}")
     if geometry.contents is not None:
         _check_takes(geometry, inside, single_only)
     variation = Variation(obj.surface, settings.mm_per_unit, inside.model)
@@ -537,7 +548,11 @@ def _low_orders(inside: Inside, transport: Transport | None) -> tuple[int, ...]:
 def _model_of(obj: TranslucentObject, inside: Inside, settings: Settings, variation: Variation) -> ObjectModel:
     of_object = lookup(inside.model).transport
     if of_object is not None:
+        if obj.textured is not None and not getattr(of_object, "takes_textures", False):
+            refuse_textures(obj.geometry.name, f"the model {inside.model!r}")
         return of_object(obj, settings)
+    if obj.textured is not None:
+        return textured_model(inside.model, obj.geometry, obj.media, obj.textured, settings)
     warn_of_means(inside, obj.geometry)
     return half_space_model(inside.model, obj.geometry, obj.media, settings, variation)
 

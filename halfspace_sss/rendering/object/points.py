@@ -35,6 +35,7 @@ class SurfacePoint(NamedTuple):
         n_out: outward shading normal, as w sees it: see `lifted`.
         w: direction.
         sign: that turns geometric normals of the shape outwards.
+        medium: at the point, a `SurfaceMedium` in 1/(scene unit), of objects with textures.
     """
 
     p: mi.Point3f
@@ -42,6 +43,7 @@ class SurfacePoint(NamedTuple):
     n_out: mi.Normal3f
     w: mi.Vector3f
     sign: mi.Float | float = 1.0
+    medium: Any = ()
 
     @property
     def mu(self) -> mi.Float:
@@ -50,7 +52,7 @@ class SurfacePoint(NamedTuple):
 
     def gather(self, k: mi.UInt32) -> SurfacePoint:
         """The points of the lanes k."""
-        return SurfacePoint(*(v if isinstance(v, float) else dr.gather(type(v), v, k) for v in self))
+        return SurfacePoint(*(v if isinstance(v, (float, tuple)) else dr.gather(type(v), v, k) for v in self))
 
 
 def surface_point(p: mi.Point3f, n: mi.Normal3f, n_out: mi.Normal3f, w: mi.Vector3f) -> SurfacePoint:
@@ -240,6 +242,7 @@ class EntrySample(NamedTuple):
         n, n_out: outward geometric and shading normal.
         weight: 1/density over the area, (scene unit)²; 0 where none was found.
         face: its number.
+        medium: as of a `SurfacePoint`.
     """
 
     p: mi.Point3f
@@ -247,10 +250,15 @@ class EntrySample(NamedTuple):
     n_out: mi.Normal3f
     weight: mi.Float
     face: mi.UInt32
+    medium: Any = ()
+
+    def gather(self, k: mi.UInt32) -> EntrySample:
+        """The entries of the lanes k."""
+        return EntrySample(*(v if isinstance(v, tuple) else dr.gather(type(v), v, k) for v in self))
 
     def facing(self, w: mi.Vector3f) -> SurfacePoint:
         """The entry with light from w, with the shading normal that w sees."""
-        return SurfacePoint(self.p, self.n, lifted(self.n_out, self.n, w), w)
+        return SurfacePoint(self.p, self.n, lifted(self.n_out, self.n, w), w, medium=self.medium)
 
 
 class Proposals(Protocol):

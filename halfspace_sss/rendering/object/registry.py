@@ -4,7 +4,8 @@ The half-space models are those of `interface.model`. Packages add others by ent
 
 - `halfspace_sss.transports`: a function of (object, settings) that returns an `ObjectModel`: of the
   `TranslucentObject`, geometry and media, and the `Settings` of the integrator; where S has the paths that meet what
-  lies inside an object, of all orders, it has an attribute `takes_contents` that is true;
+  lies inside an object, of all orders, it has an attribute `takes_contents` that is true; where it takes media by
+  textures, `takes_textures`;
 - `halfspace_sss.learners`: a module or object that learns the model, see `rendering.scenes.learners`;
 - `halfspace_sss.choosers`: a function of (scene, settings) that returns `Choices`, what stands for the name in a scene;
   "auto" stands for the cheapest that is good enough.

@@ -51,8 +51,7 @@ class AlbedoTable:
         tables = {}
         for each, top in most.items():
             albedo = albedo_of_reflectance(top * np.linspace(0, 1, NODES) ** 2, each, eta)
-            s, c = np.sqrt((1 - albedo) / (1 - each * albedo)), _bend(each)
-            x = mi.TensorXf((s * c / (1 - (1 - c) * s)).astype(np.float32)[:, None])
+            x = mi.TensorXf(x_of_albedo(np, albedo, each, bend(each)).astype(np.float32)[:, None])
             tables[each] = mi.Texture1f(x, use_accel=False, wrap_mode=dr.WrapMode.Clamp)
         return cls(g, np.array([most[each] for each in g]), tables)
 
@@ -70,7 +69,7 @@ class AlbedoTable:
         albedos = []
         for g, most, R in zip(self.g, self.most, reflectance):
             u = (dr.sqrt(dr.clip(R * opaque(1 / most), 0, 1)) * (NODES - 1) + 0.5) / NODES
-            x, c = self.tables[g].eval(mi.Point1f(u))[0], opaque(_bend(g))
+            x, c = self.tables[g].eval(mi.Point1f(u))[0], opaque(bend(g))
             s2 = dr.square(x / (c + (1 - c) * x))
             albedos.append((1 - s2) / (1 - opaque(g) * s2))
         return mi.Spectrum(albedos)
@@ -80,8 +79,30 @@ def _short(values: np.ndarray) -> str:
     return " ".join(dict.fromkeys(f"{v:.4g}" for v in values))
 
 
-def _bend(g: float) -> float:
+def bend(g: float) -> float:
+    """c of `physics.reflectance` for a mean cosine."""
     return (1 - max(g, 0.0)) ** (1 / 3)
+
+
+def x_of_albedo(lib: Any, albedo: Any, g: Any, c: Any) -> Any:
+    """x of `physics.reflectance`: 0 for albedo 1, 1 for albedo 0.
+
+    Args:
+        lib: NumPy or Dr.Jit.
+        albedo: of single scattering.
+        g: mean cosine.
+        c: from `bend`.
+    """
+    s = lib.sqrt((1 - albedo) / (1 - g * albedo))
+    return s * c / (1 - (1 - c) * s)
+
+
+@dataclass
+class SurfaceMedium:
+    """The medium at a point of the surface, per channel."""
+
+    albedo: mi.Spectrum
+    sigma_t: mi.Spectrum
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,9 +127,15 @@ class TexturedMedium:
         """The same in other units of length: sigma_t times a factor."""
         return replace(self, scale=self.scale * factor)
 
-    def at(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> tuple[mi.Spectrum, mi.Spectrum]:
+    def at(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> SurfaceMedium:
         """Albedo and sigma_t at a point of the surface."""
-        return self.albedo_at(si, active), self._extinction(_value(self.sigma_t, si, active))
+        return SurfaceMedium(self.albedo_at(si, active), self._extinction(_value(self.sigma_t, si, active)))
+
+    def at_point(
+        self, obj: Geometry, p: mi.Point3f, n: mi.Normal3f, face: mi.UInt32, active: mi.Bool = True
+    ) -> SurfaceMedium:
+        """The same at a point of an object with its outward normal and its face."""
+        return self.at(_interaction(obj, p, n, face, active), active)
 
     def albedo_at(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> mi.Spectrum:
         """The albedo of single scattering at a point of the surface."""
@@ -124,6 +151,18 @@ class TexturedMedium:
         """By the name of their parameter."""
         names = ("reflectance" if self.table else "albedo", "mfp" if self.inverse else "sigma_t")
         return {name: value for name, value in zip(names, (self.albedo, self.sigma_t)) if isinstance(value, mi.Texture)}
+
+    def values_on(self, shape: mi.Shape) -> tuple[np.ndarray, np.ndarray]:
+        """Albedo and sigma_t of texels and attributes, shapes (n, channels); of a texture of another kind none."""
+        values = {
+            name: np.concatenate([texels(texture), attributes(name, texture, shape)])
+            for name, texture in self.textures.items()
+        }
+        albedo = values.get("albedo", np.atleast_2d(self.albedo)) if self.table is None else values["reflectance"].T
+        if self.table is not None:
+            albedo = np.array(self.table(mi.Spectrum(albedo.astype(np.float32)))).reshape(albedo.shape).T
+        sigma_t = 1 / values["mfp"] if self.inverse else values.get("sigma_t", np.atleast_2d(self.sigma_t))
+        return albedo.astype(float), self.scale * sigma_t.astype(float)
 
     def mean(self, g: Any, eta: float, shape: mi.Shape | None = None) -> Medium:
         """The homogeneous medium with the means of albedo and extinction over texels, and over vertices of a mesh.
@@ -160,6 +199,29 @@ class TexturedMedium:
                 check_values(name, values)
             if self.table is not None and name == "reflectance":
                 self.table.warn_of_clipped(values)
+
+
+def _interaction(
+    obj: Geometry, p: mi.Point3f, n: mi.Normal3f, face: mi.UInt32, active: mi.Bool
+) -> mi.SurfaceInteraction3f:
+    """What textures ask for, at a point of an object: of a mesh from its face, else where a short ray meets it."""
+    if not obj.shape.is_mesh():
+        off = opaque(max(10 * obj.rounding, 1e-5 * obj.size))
+        ray = mi.Ray3f(mi.Point3f(p + n * off), mi.Vector3f(-n))
+        return obj.scene.ray_intersect(ray, mi.RayFlags.Minimal | mi.RayFlags.UV, False, active)
+    si = dr.zeros(mi.SurfaceInteraction3f, dr.width(p))
+    si.p, si.n, si.prim_index, si.shape = mi.Point3f(p), mi.Normal3f(n), mi.UInt32(face), mi.ShapePtr(obj.shape)
+    if obj.shape.has_vertex_texcoords():
+        index = obj.shape.face_indices(si.prim_index, active)
+        a, b, c = (obj.shape.vertex_position(i, active) for i in (index.x, index.y, index.z))
+        u, v, w = (obj.shape.vertex_texcoord(i, active) for i in (index.x, index.y, index.z))
+        e, f, d = b - a, c - a, si.p - a
+        ee, ef, ff = dr.dot(e, e), dr.dot(e, f), dr.dot(f, f)
+        det = dr.maximum(ee * ff - ef * ef, 1e-30)
+        s = (ff * dr.dot(d, e) - ef * dr.dot(d, f)) / det
+        t = (ee * dr.dot(d, f) - ef * dr.dot(d, e)) / det
+        si.uv = u + (v - u) * s + (w - u) * t
+    return si
 
 
 def _value(source: Any, si: mi.SurfaceInteraction3f, active: mi.Bool) -> Any:

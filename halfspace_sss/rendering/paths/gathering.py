@@ -142,6 +142,8 @@ def _check(obj: TranslucentObject) -> None:
         raise ValueError(f"light must be sampled for object {result.name}, which {lacks}, got gathered")
     if obj.surface.inside.varying is not None:
         raise ValueError(f"light must be sampled for object {result.name}, whose medium varies, got gathered")
+    if obj.textured is not None:
+        raise ValueError(f"light must be sampled for object {result.name}, whose medium has textures, got gathered")
 
 
 def light_state(scene: mi.Scene) -> tuple[list, list]:

@@ -29,6 +29,7 @@ from halfspace_sss.physics.medium import eval_hg, sample_hg
 from halfspace_sss.rendering.light.small_emitters import WIDE
 from halfspace_sss.rendering.object.objects import TranslucentObject
 from halfspace_sss.rendering.object.points import SurfacePoint, lifted, mirrored, opaque, opposed, place, turned
+from halfspace_sss.rendering.object.textured import SurfaceMedium
 from halfspace_sss.rendering.paths.lighting import RenderContext, delta_light, mis_weight, sample_emitter
 
 MOST_SEGMENTS = 256
@@ -88,6 +89,7 @@ class _Walk:
     reflections: mi.UInt32  # at the boundary, since the event
     left: mi.Bool
     alive: mi.Bool
+    medium: SurfaceMedium | tuple[()] = ()  # of the exit, of objects with textures
 
 
 # ---- The estimator ---------------------------------------------------------------------------------------------------
@@ -112,7 +114,7 @@ def sample_low_orders(
         straight, connected = once & (walk.reflections == 0), once & (walk.reflections <= 1)
 
     # ---- throughput f / p
-    media = obj.variation.coefficients(obj.media)
+    media = _media(obj, walk.medium) if walk.medium else obj.variation.coefficients(obj.media)
     f = _contribution(media, walk.length, walk.order, walk.cosine)
     weight = dr.select(counts, f * (walk.inverse_pdf * refracted.T), 0)
 
@@ -137,18 +139,27 @@ def sample_low_orders(
 def _walk(obj: TranslucentObject, refracted: RefractedRay, sampler: mi.Sampler, active: mi.Bool) -> _Walk:
     """The walk from an exit until it leaves."""
     zero, p = mi.Float(0), mi.Point3f(refracted.out.p)
-    media = [tuple(opaque(v) for v in (m.sigma_s, m.sigma_t, m.g)) for m in obj.media]
+    media = _media(obj, refracted.out.medium)
     skip = _clear(obj, refracted.out.n, refracted.d)
     start = _Walk(
         p, mi.Vector3f(refracted.d), mi.Normal3f(refracted.out.n), mi.Float(skip), zero, mi.Float(1), mi.UInt32(0),
         zero, mi.Point3f(p), mi.Vector3f(refracted.d), zero, zero, mi.UInt32(0), mi.Bool(False), mi.Bool(active),
+        refracted.out.medium,
     )  # fmt: skip
 
     def step(k: mi.UInt32, sampler: mi.Sampler, passing: mi.Float, walk: _Walk) -> tuple:
-        return k + 1, sampler, passing, _step((obj, media), k, sampler, passing, walk)
+        own = _media(obj, walk.medium) if walk.medium else media
+        return k + 1, sampler, passing, _step((obj, own), k, sampler, passing, walk)
 
     state = (mi.UInt32(0), sampler, mi.Float(refracted.passing), start)
     return dr.while_loop(state, lambda k, sampler, passing, walk: walk.alive, step, label="low orders")[3]
+
+
+def _media(obj: TranslucentObject, medium: SurfaceMedium | tuple[()]) -> Media:
+    """The medium of each channel: that of the exit, or of the object where it has no textures."""
+    if not medium:
+        return [tuple(opaque(v) for v in (m.sigma_s, m.sigma_t, m.g)) for m in obj.media]
+    return [(a * t, t, opaque(m.g)) for a, t, m in zip(medium.albedo, medium.sigma_t, obj.media)]
 
 
 def _step(
@@ -344,7 +355,7 @@ def _light_along(
 
 def _phase_pdf(obj: TranslucentObject, walk: _Walk, met: Connection) -> mi.Float:
     """Density of the direction of a connection by the phase function, 1/sr inside, see `_scatter`."""
-    media = [tuple(opaque(v) for v in (m.sigma_s, m.sigma_t, m.g)) for m in obj.media]
+    media = _media(obj, walk.medium)
     W = _contribution(media, walk.event_length, mi.UInt32(1), None)
     cosine = dr.dot(walk.event_d, met.d)
     return dr.sum(W * _spectrum([eval_hg(cosine, m[2]) for m in media])) / dr.maximum(dr.sum(W), 1e-30)
@@ -460,7 +471,7 @@ def _near(obj: TranslucentObject, walk: _Walk, target: mi.Point3f, active: mi.Bo
     if obj.geometry.contents is not None:
         return mi.Bool(False)
     ray = mi.Ray3f(walk.event, dr.normalize(target - walk.event))
-    ray.maxt = NEAR / opaque(min(m.sigma_t for m in obj.media))
+    ray.maxt = NEAR / (dr.min(walk.medium.sigma_t) if walk.medium else opaque(min(m.sigma_t for m in obj.media)))
     return obj.geometry.scene.ray_test(ray, False, active)
 
 

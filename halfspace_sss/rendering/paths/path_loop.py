@@ -344,9 +344,9 @@ def _transmittance(obj: TranslucentObject, out: SurfacePoint, d: mi.Vector3f, ac
     """To the other side, mean over channels; light of the path does not count, as choices hold in derivatives."""
     ray = place(out.p, out.n).spawn_ray(d)
     wall = obj.geometry.scene.ray_intersect(ray, mi.RayFlags.Minimal, False, active)
-    T = mi.Float(0)
-    for medium in obj.media:
-        T = T + dr.exp(-opaque(medium.sigma_t) * wall.t) / len(obj.media)
+    T, each = mi.Float(0), out.medium.sigma_t if out.medium else [opaque(m.sigma_t) for m in obj.media]
+    for sigma_t in each:
+        T = T + dr.exp(-sigma_t * wall.t) / len(obj.media)
     return dr.select(active & wall.is_valid(), T, 0)
 
 
@@ -357,7 +357,8 @@ def exit_at(obj: TranslucentObject, si: mi.SurfaceInteraction3f) -> SurfacePoint
     if not obj.geometry.closed:  # a sheet is a half-space from both sides
         sign = dr.select(dr.dot(n_face, w) > 0, 1.0, -1.0)
     n = lifted(turned(si.sh_frame.n, n_face), n_face, w)
-    return SurfacePoint(mi.Point3f(si.p), n_face * sign, n * sign, w, sign)
+    medium = () if obj.textured is None else obj.textured.at(si)
+    return SurfacePoint(mi.Point3f(si.p), n_face * sign, n * sign, w, sign, medium)
 
 
 def _where(context: RenderContext, sampler: mi.Sampler, mask: mi.Bool, otherwise: tuple, event: Callable) -> tuple:

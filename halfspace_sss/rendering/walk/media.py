@@ -394,9 +394,9 @@ class WalkMedia:
         for number, inside in enumerate(self.insides):
             if inside.textured is not None:
                 here = active & (k == number)
-                albedo, extinction = inside.textured.scaled(self.mm_per_unit).at(si, here)
-                sigma_t = dr.select(here, extinction, sigma_t)
-                sigma_s = dr.select(here, albedo * extinction, sigma_s)
+                at = inside.textured.scaled(self.mm_per_unit).at(si, here)
+                sigma_t = dr.select(here, at.sigma_t, sigma_t)
+                sigma_s = dr.select(here, at.albedo * at.sigma_t, sigma_s)
         return WalkMedium(sigma_t, sigma_s)
 
     def unknown(self, lanes: int) -> WalkMedium | tuple[()]:
