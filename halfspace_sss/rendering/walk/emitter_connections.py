@@ -37,6 +37,7 @@ from halfspace_sss.rendering.walk.random_walk import (
     start_walk,
     turn,
 )
+from halfspace_sss.rendering.walk.scores import Score, phase_score
 
 # ---- Connections with light subpaths --------------------------------------------------------------------------------
 #
@@ -72,6 +73,8 @@ class LightSubpath:
     lit: mi.Bool  # whether its ray comes from an emitter or a reflection, so that it may be connected with the event
     fresh: mi.Bool  # whether the ray begins there, rather than at a null collision
     L: mi.Spectrum  # light of the connections so far
+    score: Score | tuple[()]  # of the walk, where derivatives are asked for
+    slopes: Score | tuple[()]  # light of each connection times its score
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,12 +86,14 @@ class SubpathConnections:
         media: its translucent objects.
         small: its small emitters.
         share: probability of a light subpath at an event near the boundary.
+        scored: whether light comes with its slopes.
     """
 
     scene: mi.Scene
     media: WalkMedia
     small: SmallEmitters
     share: float
+    scored: bool = False
 
     def covers(self, k: mi.Int32, y: mi.Point3f, w: mi.Vector3f, pivot: mi.Point3f) -> mi.Bool:
         """Whether connections at `pivot` find light from the point y of emitter k along -w; no emitter has k < 0.
@@ -101,16 +106,19 @@ class SubpathConnections:
         ahead = self.small.distant(near) | (dr.dot(y - pivot, w_0) * cosine > 0)
         return (k >= 0) & small & (dr.abs(cosine) > STEEPEST) & ahead
 
-    def light(self, event: Event, rng: mi.PCG32) -> tuple[mi.Spectrum, mi.PCG32]:
-        """Light of connections at an event per weight of the walk from the camera, and the generator."""
+    def light(self, event: Event, rng: mi.PCG32) -> tuple[mi.Spectrum, Score | tuple[()], mi.PCG32]:
+        """Light of connections at an event per weight of the walk from the camera, its slopes, and the generator."""
         n = len(self.small)
         which = draw(n, rng)
         w_0, small = self.small.direction(which, event.p)
         sample, survive = self._sample_emitter(which, w_0, event)
         chosen = small & (rng.next_float32() < self.share * survive)
-        L = mi.Spectrum(0) + dr.zeros(mi.Spectrum, dr.width(event.p))
-        rng, L, *_ = dr.if_stmt((rng, L, event, sample), chosen, self._enter, lambda *state: state, label="connection")
-        return L * (n / (self.share * survive)), rng
+        lanes = dr.width(event.p)
+        L, slopes = mi.Spectrum(0) + dr.zeros(mi.Spectrum, lanes), Score.sums(lanes) if self.scored else ()
+        state = (rng, L, slopes, event, sample)
+        rng, L, slopes, *_ = dr.if_stmt(state, chosen, self._enter, lambda *state: state, label="connection")
+        factor = n / (self.share * survive)
+        return L * factor, slopes and slopes * factor, rng
 
     def _sample_emitter(self, which: mi.UInt32, w_0: mi.Vector3f, event: Event) -> tuple[EmitterSample, mi.Float]:
         """Where light of an emitter enters towards an event, and the probability to look for it, (0, 1]."""
@@ -129,7 +137,9 @@ class SubpathConnections:
         promise = dr.maximum(dr.exp(-0.5 * dr.min(m.mean_t) * depth), LEAST_PROMISE)
         return EmitterSample(which, w_0, mi.Vector3f(shift), depth), promise
 
-    def _enter(self, rng: mi.PCG32, L: mi.Spectrum, event: Event, sample: EmitterSample) -> tuple:
+    def _enter(
+        self, rng: mi.PCG32, L: mi.Spectrum, slopes: Score | tuple[()], event: Event, sample: EmitterSample
+    ) -> tuple:
         """Sample a ray of light, refract it into the object and follow it."""
         # ---- a ray from the emitter to a point near the event
         k, m = event.object, event.m
@@ -158,9 +168,10 @@ class SubpathConnections:
         walk = start_walk(mi.Point3f(si.p), d, rng, event.medium)
         walk = replace(walk, skip=self.media.clear(k, si.n, d), alive=enters, object=k, weight=weight,
                        channel=draw(len(m.sigma_t), rng))  # fmt: skip
-        state = (LightSubpath(walk, mi.Bool(enters), mi.Bool(enters), L), event)
+        score = Score.zeros(dr.width(event.p)) if self.scored else ()
+        state = (LightSubpath(walk, mi.Bool(enters), mi.Bool(enters), L, score, slopes), event)
         s, event = dr.while_loop(state, lambda s, event: s.walk.alive, self._follow, label="light")
-        return s.walk.rng, s.L, event, sample
+        return s.walk.rng, s.L, s.slopes, event, sample
 
     def _follow(self, s: LightSubpath, event: Event) -> tuple[LightSubpath, Event]:
         """One flight of the light subpath, and a connection on its ray if that may have one."""
@@ -174,7 +185,8 @@ class SubpathConnections:
         ray = walk.ray(dr.maximum(t, flight))
         hit = media.scene.ray_intersect_preliminary(ray, coherent=False)
         reach = hit.t + walk.skip
-        L = s.L + self._connect(walk, event, t, dr.select(connectable & (t < reach), over, 0))
+        light, extra = self._connect(walk, event, t, dr.select(connectable & (t < reach), over, 0))
+        L, slopes = s.L + light, s.slopes and s.slopes + (s.score + extra) * light
 
         # ---- free flight, to a scattering event after which the subpath must reflect, or to the boundary
         u, p = None, mi.Point3f(walk.o + walk.d * flight)
@@ -194,22 +206,33 @@ class SubpathConnections:
         walk, *_ = dr.if_stmt((walk, ray, hit), ~collided, self._reflect, lambda *state: state)
         scattered.rng = walk.rng
         lit = ~ended.scatters & (s.lit | ~collided)
-        return LightSubpath(dr.select(ended.scatters, scattered, walk), lit, ~ended.null, L), event
+        score = s.score and s.score + Score(
+            dr.select(ended.scatters, mi.Float(1), 0), dr.minimum(flight, reach),
+            dr.select(ended.scatters, phase_score(m.g, dr.dot(s.walk.d, turned)), 0))  # fmt: skip
+        return LightSubpath(dr.select(ended.scatters, scattered, walk), lit, ~ended.null, L, score, slopes), event
 
-    def _connect(self, walk: Walk, event: Event, t: mi.Float, over: mi.Float) -> mi.Spectrum:
-        """Light of a connection at the distance t on a ray of light; `over` is one over its density."""
+    def _connect(self, walk: Walk, event: Event, t: mi.Float, over: mi.Float) -> tuple[mi.Spectrum, Score | tuple[()]]:
+        """Light of a connection at the distance t on a ray of light, and its score after that of the subpath.
+
+        `over` is one over the density of t.
+        """
         media, q = self.media, mi.Point3f(walk.o + walk.d * t)
         to_p = mi.Ray3f(q, dr.normalize(event.p - q))
         to_p.maxt = dr.norm(event.p - q)
         at_q = media.coefficients(event.object, q, event.medium)
-        phases = eval_phase(event.m, dr.dot(event.along, -to_p.d)) * eval_phase(event.m, dr.dot(to_p.d, walk.d))
+        cosines = dr.dot(event.along, -to_p.d), dr.dot(to_p.d, walk.d)
+        phases = eval_phase(event.m, cosines[0]) * eval_phase(event.m, cosines[1])
         value = dr.select(over > 0, walk.weight * at_q.sigma_s * phases * over, 0)
         bright = dr.max(value) > 0
         bright &= ~media.scene.ray_test(to_p, False, bright)
         to_q, medium = mi.Ray3f(walk.o, walk.d), event.medium
         T = media.transmittance(event.object, to_q, dr.select(bright, t, 0), walk.rng, medium)
         T *= media.transmittance(event.object, to_p, dr.select(bright, to_p.maxt, 0), walk.rng, medium)
-        return dr.select(bright, value * T, 0)
+        light = dr.select(bright, value * T, 0)
+        if not self.scored:
+            return light, ()
+        turns = phase_score(event.m.g, cosines[0]) + phase_score(event.m.g, cosines[1])
+        return light, Score(mi.Float(1), dr.select(bright, t + to_p.maxt, 0), dr.select(bright, turns, 0))
 
     def _reflect(self, walk: Walk, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f) -> tuple:
         """Reflection at the boundary from inside with the probability of its reflectance."""
@@ -253,14 +276,14 @@ def _on_ray(walk: Walk, event: Event, u: mi.Float) -> tuple[mi.Float, mi.Float]:
 
 
 def find_connections(
-    scene: mi.Scene, media: WalkMedia, small: SmallEmitters | None, share: float
+    scene: mi.Scene, media: WalkMedia, small: SmallEmitters | None, share: float, scored: bool = False
 ) -> SubpathConnections | None:
     """Connections with the small emitters of a scene; None without any, or without an object of smooth boundary."""
     if small is None or not media.objects or media.all_rough or share == 0:
         return None
     if media.inner is not None and not np.array(media.inner.tables["alone"]).any():
         return None
-    return SubpathConnections(scene, media, small, share)
+    return SubpathConnections(scene, media, small, share, scored)
 
 
 # ---- Directions from events to emitters -----------------------------------------------------------------------------
@@ -294,11 +317,13 @@ class EmitterDirections:
         scene: the Mitsuba scene.
         media: its translucent objects.
         small: its small emitters.
+        scored: whether light comes with its slopes.
     """
 
     scene: mi.Scene
     media: WalkMedia
     small: SmallEmitters
+    scored: bool = False
 
     def _guess(
         self, v: mi.Point3f, k: mi.Int32, which: mi.Int32, m: Coefficients, active: mi.Bool
@@ -320,8 +345,8 @@ class EmitterDirections:
             d = dr.normalize(dr.select(cosine > 0, refracted, d))
         return d, dr.minimum(dr.square(eta) / dr.maximum(self.small.angle2(which, v), 1e-6), 1e6), valid
 
-    def light(self, event: Event, rng: mi.PCG32) -> mi.Spectrum:
-        """An estimate of the light of small emitters that leaves from an event, per weight of the walk."""
+    def light(self, event: Event, rng: mi.PCG32) -> tuple[mi.Spectrum, Score | tuple[()]]:
+        """An estimate of the light of small emitters that leaves from an event, per weight of the walk; its slopes."""
         v, k, m = event.p, event.object, event.m
         n = len(self.small)
         which = mi.Int32(draw(n, rng))
@@ -342,7 +367,11 @@ class EmitterDirections:
         factor = (1 - F) * dr.square(eta_ti) / (pdf / n + channel_mean(phase))
         T = self.media.transmittance(k, ray, dr.select(valid, si.t, 0), rng, event.medium)
         value = phase * T * factor
-        return dr.select(valid, value * self.small.along(which, way, outside, valid), 0)
+        light = dr.select(valid, value * self.small.along(which, way, outside, valid), 0)
+        if not self.scored:
+            return light, ()
+        cosine = dr.dot(event.along, d)
+        return light, Score(mi.Float(0), dr.select(valid, si.t, 0), phase_score(m.g, cosine)) * light
 
     def share(self, which: mi.Int32, way: Departure, active: mi.Bool, medium: WalkMedium | tuple[()] = ()) -> mi.Float:
         """Weight of having hit emitter `which`, if >= 0, by the phase function (balance heuristic against `light`)."""

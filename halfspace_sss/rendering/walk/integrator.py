@@ -16,10 +16,12 @@ from halfspace_sss.rendering.light.small_emitters import SmallEmitters
 from halfspace_sss.rendering.object.objects import KnowsUnit, check_sensors, check_size, places_of
 from halfspace_sss.rendering.object.settings import OF_MITSUBA, check_parameters
 from halfspace_sss.rendering.object.shape import number_of, same_objects
+from halfspace_sss.rendering.object.translucent import VARIABLE, is_translucent
 from halfspace_sss.rendering.object.varying import equivalent
 from halfspace_sss.rendering.walk.emitter_connections import EmitterDirections, InnerLights, find_connections
 from halfspace_sss.rendering.walk.media import WalkMedia
 from halfspace_sss.rendering.walk.path_loop import FirstExits, LightVisitor, PathTracer
+from halfspace_sss.rendering.walk.scores import PathScores, with_derivatives
 
 PARAMETERS = ("mm_per_unit", "max_depth", "rr_depth", "hide_emitters", "connection_share", "blur")
 SAMPLES_PER_LAUNCH = 2**19
@@ -60,13 +62,19 @@ def _class(variant: str) -> type:
             self.blur = _scale("blur", float(props.get("blur", 1.0)))
             self._prepared: tuple[int, list, tuple, Any] = (0, [], ([], []), None)
 
-        def tracer(self, scene: mi.Scene) -> PathTracer:
-            """What paths through a scene need; its objects are made ready once, its emitters may have been edited."""
+        def tracer(self, scene: mi.Scene, scored: bool = False) -> PathTracer:
+            """What paths through a scene need; its objects are made ready once, its emitters may have been edited.
+
+            Args:
+                scored: whether derivatives are asked for.
+            """
             self._prepared = _prepared(scene, self._prepared, self.mm_per_unit)
             media, small = self._prepared[-1], SmallEmitters.of(scene)
-            connections = find_connections(scene, media, small, self.connection_share)
-            directions = connections and EmitterDirections(scene, media, small)
+            connections = find_connections(scene, media, small, self.connection_share, scored)
+            directions = connections and EmitterDirections(scene, media, small, scored)
             inner = InnerLights.of(media, self.blur)
+            if scored and inner is not None:
+                raise ValueError("objects must hold no delta lights for derivatives of translucent_walk")
             visitor = LightVisitor(scene, media, small, connections, directions, inner, self.blur)
             return PathTracer(visitor, self.max_depth, self.rr_depth, self.hidden)
 
@@ -91,7 +99,39 @@ def _class(variant: str) -> type:
         ) -> tuple:
             return _samples(self.tracer(scene), sampler, ray, active)
 
-        render_forward = render_backward = _refuse_derivatives
+        def render_forward(
+            self, scene: mi.Scene, params: Any, sensor: mi.Sensor | int = 0, seed: mi.UInt32 | int = 0, spp: int = 0
+        ) -> mi.TensorXf:
+            """The derivative of the image along that of the parameters."""
+            with dr.suspend_grad():
+                image = self._differentiable(scene, sensor, seed, spp)
+                with dr.resume_grad():
+                    dr.forward_to(image)
+                    return dr.grad(image)
+
+        def render_backward(
+            self, scene: mi.Scene, params: Any, grad_in: mi.TensorXf, sensor: mi.Sensor | int = 0,
+            seed: mi.UInt32 | int = 0, spp: int = 0,
+        ) -> None:  # fmt: skip
+            """Add to the gradients of parameters what that of the image, `grad_in`, makes of them."""
+            with dr.suspend_grad():
+                image = self._differentiable(scene, sensor, seed, spp)
+                with dr.resume_grad():
+                    dr.set_grad(image, grad_in)
+                    dr.enqueue(dr.ADMode.Backward, image)
+                    dr.traverse(dr.ADMode.Backward)
+                dr.eval()
+
+        def _differentiable(
+            self, scene: mi.Scene, sensor: mi.Sensor | int, seed: mi.UInt32 | int, spp: int
+        ) -> mi.TensorXf:
+            _check_followed(scene)
+            sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+            spp = spp or sensor.sampler().sample_count()
+            with interruptible():
+                _render(self.tracer(scene, True), sensor, int(mi.UInt32(seed)[0]), spp, None, True)
+                with dr.resume_grad():
+                    return sensor.film().develop()
 
         def to_string(self) -> str:
             blur = f", blur = {self.blur:g}" if self.blur != 1 else ""
@@ -115,16 +155,32 @@ def _prepared(scene: mi.Scene, before: tuple, mm_per_unit: float) -> tuple[int, 
     return number_of(scene), shapes, places, media
 
 
-def _refuse_derivatives(*_: Any, **__: Any) -> None:
-    raise ValueError("the integrator of a derivative of light must be bssrdf, got translucent_walk")
+def _check_followed(scene: mi.Scene) -> None:
+    """Refuse derivatives that scores of walks do not have.
+
+    Raises:
+        ValueError: gradients are enabled for another parameter than albedo, sigma_t and g of translucent surfaces, or
+            a delta light stands inside an object.
+    """
+    parameters = mi.traverse(scene)
+    for key, (_, _, owner, _) in parameters.properties.items():
+        with dr.resume_grad():
+            enabled = dr.grad_enabled(parameters[key])
+        if enabled and not (is_translucent(owner) and key.rsplit(".", 1)[-1] in VARIABLE):
+            raise ValueError(
+                f"{key} must not have gradients enabled: translucent_walk differentiates light by albedo, sigma_t and "
+                "g of translucent surfaces; bssrdf by emitters and textures too"
+            )
 
 
-def _render(tracer: PathTracer, sensor: mi.Sensor, seed: int, spp: int, keep: Keep | None) -> None:
+def _render(
+    tracer: PathTracer, sensor: mi.Sensor, seed: int, spp: int, keep: Keep | None, scored: bool = False
+) -> None:
     """Fill the film of a sensor, in launches between which an interrupt is heard."""
     sensor.film().prepare([])
     most = max(1, SAMPLES_PER_LAUNCH // int(dr.prod(_sampled_size(sensor.film()))))
     for launch, start in enumerate(range(0, spp, most)):
-        _launch(tracer, sensor, min(most, spp - start), (seed, launch), keep)
+        _launch(tracer, sensor, min(most, spp - start), (seed, launch), keep, scored)
 
 
 def _samples(
@@ -137,17 +193,30 @@ def _samples(
     return dr.select(active, L, 0), active & seen, []
 
 
-def _launch(tracer: PathTracer, sensor: mi.Sensor, spp: int, seed: tuple[int, int], keep: Keep | None) -> None:
-    """Trace spp rays through each pixel and add them to the film."""
-    film = sensor.film()
+def _launch(
+    tracer: PathTracer, sensor: mi.Sensor, spp: int, seed: tuple[int, int], keep: Keep | None, scored: bool
+) -> None:
+    """Trace spp rays through each pixel and add them to the film, with derivatives if `scored`."""
     rays, weight, position = camera_rays(sensor, spp, seed)
+    if scored:
+        media = tracer.visitor.media
+        with dr.resume_grad():
+            scores = PathScores.of(media, dr.width(rays))
+        L, seen = tracer.trace(rays, LANES, seed, scores=scores)
+        with dr.resume_grad():
+            _splat(sensor.film(), rays, with_derivatives(L, scores, media) * weight, seen, position, spp)
+        return
     exits = FirstExits.of(tracer.visitor.scene, tracer.visitor.media, rays) if keep else None
     L, seen = tracer.trace(rays, LANES, seed, exits)
     if keep:
         keep(exits)
+    _splat(sensor.film(), rays, weight * L, seen, position, spp)
+
+
+def _splat(film: mi.Film, rays: mi.Ray3f, L: mi.Spectrum, seen: mi.Bool, position: mi.Vector2f, spp: int) -> None:
+    """Add the light of rays to a film."""
     block = film.create_block()
     block.set_coalesce(block.coalesce() and spp >= 4)
-    L = weight * L
     alpha = dr.select(seen, mi.Float(1), mi.Float(0))
     has_alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
     if mi.has_flag(film.flags(), mi.FilmFlags.Special):

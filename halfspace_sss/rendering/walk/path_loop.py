@@ -35,6 +35,7 @@ from halfspace_sss.rendering.walk.random_walk import (
     sample_bsdf,
     start_walk,
 )
+from halfspace_sss.rendering.walk.scores import PathScores, Score, ScoreVisitor, Stay, StayRecord
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 # ---- Loop state ------------------------------------------------------------------------------------------------------
@@ -54,6 +55,7 @@ class LightRecord:
     directed: mi.Bool  # directions to emitters were sampled at the last event, and nothing has reflected since
     departure: Departure  # from the last event
     scattered: mi.Bool  # whether a vertex has scattered into a solid angle: delta lights then are no longer hidden
+    slopes: Score | tuple[()] = ()  # where derivatives are asked for, see `walk.scores`
 
 
 @dataclass
@@ -65,6 +67,7 @@ class CameraPath:
     light: LightRecord  # what it has gathered
     hit: mi.Bool  # whether its first ray hit anything
     depth: mi.UInt32  # vertices on surfaces met from outside
+    stay: Stay | tuple[()] = ()  # inside an object, where derivatives are asked for
 
 
 # ---- Light gathered along a path -------------------------------------------------------------------------------------
@@ -119,12 +122,11 @@ class LightVisitor:
         return walk, replace(record, departure=departure)
 
     def _connect(self, walk: Walk, record: LightRecord, event: Event) -> tuple[Walk, LightRecord, Event]:
-        light, rng = self.connections.light(event, walk.rng)
-        return replace(walk, rng=rng), replace(record, L=record.L + walk.weight * light), event
+        light, slopes, rng = self.connections.light(event, walk.rng)
+        return replace(walk, rng=rng), _plus(record, walk, light, slopes), event
 
     def _direct(self, walk: Walk, record: LightRecord, event: Event) -> tuple[Walk, LightRecord, Event]:
-        light = self.directions.light(event, walk.rng)
-        return walk, replace(record, L=record.L + walk.weight * light), event
+        return walk, _plus(record, walk, *self.directions.light(event, walk.rng)), event
 
     def boundary(
         self, walk: Walk, record: LightRecord, si: mi.SurfaceInteraction3f, active: mi.Bool
@@ -240,7 +242,13 @@ def _same_state(*state: Any) -> tuple:
     return state
 
 
-def start_record(lanes: int) -> LightRecord:
+def _plus(record: LightRecord, walk: Walk, light: mi.Spectrum, slopes: Score | tuple[()]) -> LightRecord:
+    """With light per weight of the walk, and its slopes beyond those of the walk."""
+    slopes = slopes and record.slopes + slopes * walk.weight
+    return replace(record, L=record.L + walk.weight * light, slopes=slopes)
+
+
+def start_record(lanes: int, scored: bool = False) -> LightRecord:
     """Of a path that begins at the camera."""
 
     def full(kind: type, value: float | bool | int) -> Any:
@@ -252,7 +260,7 @@ def start_record(lanes: int) -> LightRecord:
         straight=full(mi.Bool, False), connected=full(mi.Bool, False), pivot=mi.Point3f(point),
         directed=full(mi.Bool, False),
         departure=Departure(mi.Point3f(point), along, mi.Vector3f(along), full(mi.Int32, 0)),
-        scattered=full(mi.Bool, False),
+        scattered=full(mi.Bool, False), slopes=Score.sums(lanes) if scored else (),
     )  # fmt: skip
 
 
@@ -282,35 +290,51 @@ class PathTracer:
     hide_emitters: bool
 
     def trace(
-        self, rays: mi.Ray3f, lanes: int, seed: tuple[int, ...], exits: FirstExits | None = None
+        self,
+        rays: mi.Ray3f,
+        lanes: int,
+        seed: tuple[int, ...],
+        exits: FirstExits | None = None,
+        scores: PathScores | None = None,
     ) -> tuple[mi.Spectrum, mi.Bool]:
-        """Radiance along each ray, and whether it hits anything; `exits`, if given, stores the first exits."""
+        """Radiance along each ray, and whether it hits anything; `exits` or `scores`, if given, are filled."""
         n = dr.width(rays)
         dr.eval(rays)
         lanes = min(lanes, n)
         L, hit = dr.zeros(mi.Spectrum, n), dr.zeros(mi.Bool, n)
         dr.eval(L, hit)
-        walker = Walker(self.visitor.media, FirstExitVisitor(self.visitor, exits) if exits else self.visitor)
+        media, visitor = self.visitor.media, FirstExitVisitor(self.visitor, exits) if exits else self.visitor
+        scorer = ScoreVisitor(self.visitor, media, scores) if scores else None
+        walker = Walker(media, scorer or visitor)
         total, step = (dr.opaque(mi.UInt32, v) for v in (n, lanes))  # kernels then serve images of any size
 
         def inside(p: CameraPath) -> CameraPath:
             record = FirstExitRecord(p.light, p.index, p.depth == 1) if exits else p.light
+            record = StayRecord(p.light, p.index, p.stay) if scores else record
             walk, record = walker.step(p.walk, record)
-            return replace(p, walk=walk, light=record.record if exits else record)
+            stay = record.stay if scores else ()
+            return replace(p, walk=walk, light=record.record if exits or scores else record, stay=stay)
+
+        def end_stay(p: CameraPath) -> CameraPath:
+            record = scorer.end(StayRecord(p.light, p.index, p.stay))
+            return replace(p, light=record.record, stay=record.stay)
 
         def renew(p: CameraPath) -> CameraPath:
             dr.scatter(L, p.light.L, p.index)
             dr.scatter(hit, p.hit, p.index)
-            return _begin(rays, total, p.index + step, p.walk.rng, self.visitor.media)
+            return _begin(rays, total, p.index + step, p.walk.rng, media, bool(scores))
 
         def body(p: CameraPath) -> tuple[CameraPath]:
             p = dr.if_stmt((p,), p.walk.object >= 0, inside, _same, label="inside")
+            if scores:
+                ended = (p.stay.object >= 0) & (p.walk.object != p.stay.object)
+                p = dr.if_stmt((p,), ended, end_stay, _same, label="end of a stay")
             outside = p.walk.alive & (p.walk.object < 0)
             p = dr.if_stmt((p,), outside, self._outside, _same, label="outside")
             return (dr.if_stmt((p,), ~p.walk.alive, renew, _same),)
 
         rng = generator(mi, lanes, pass_seed(*seed))
-        start = _begin(rays, total, dr.arange(mi.UInt32, lanes), rng, self.visitor.media)
+        start = _begin(rays, total, dr.arange(mi.UInt32, lanes), rng, media, bool(scores))
         dr.while_loop((start,), lambda p: p.index < total, body, label="paths")
         dr.eval(L, hit)
         return L, hit
@@ -401,11 +425,14 @@ def _same(p: CameraPath) -> CameraPath:
     return p
 
 
-def _begin(rays: mi.Ray3f, total: mi.UInt32, index: mi.UInt32, rng: mi.PCG32, media: WalkMedia) -> CameraPath:
+def _begin(
+    rays: mi.Ray3f, total: mi.UInt32, index: mi.UInt32, rng: mi.PCG32, media: WalkMedia, scored: bool = False
+) -> CameraPath:
     lanes, known = dr.width(index), index < total
     o, d = dr.gather(mi.Point3f, rays.o, index, known), dr.gather(mi.Vector3f, rays.d, index, known)
     no, first = dr.full(mi.Bool, False, lanes), dr.full(mi.UInt32, 0, lanes)
-    return CameraPath(index, start_walk(o, d, rng, media.unknown(lanes)), start_record(lanes), no, first)
+    walk, stay = start_walk(o, d, rng, media.unknown(lanes)), Stay.none(lanes) if scored else ()
+    return CameraPath(index, walk, start_record(lanes, scored), no, first, stay)
 
 
 # ---- First exits of paths from the camera ------------------------------------------------------------------------

@@ -1,0 +1,212 @@
+"""Scores of walks: derivatives of images by media, from sums that each path takes along.
+
+The light of a path is a sum of contributions. Inside an object each is a product of coefficients over a density that
+is held (detached sampling; Zeltner, Speierer, Georgiev and Jakob 2021): with n scattering events and the length d,
+
+    f = sigma_s^n e^(-sigma_t d) prod p(cos theta),    d log f = n dsigma_s / sigma_s - d dsigma_t + sum d log p.
+
+This holds for each channel, whichever channel the walk was drawn by, and for all orders. MIS weights add up to one for
+any medium, so they are held too. The loop sums contribution times n, d and sum d log p / dg; no path is replayed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import drjit as dr
+import mitsuba as mi
+
+from halfspace_sss.rendering.object.translucent import VARIABLE
+from halfspace_sss.rendering.walk.media import WalkMedia
+
+if TYPE_CHECKING:
+    from halfspace_sss.rendering.walk.random_walk import Crossing, Event, Visitor, Walk
+
+
+@dataclass
+class Score:
+    """What d log f is made of, or the sum of contributions times that; numbers, or one per channel."""
+
+    n: mi.Float | mi.Spectrum  # scattering events
+    d: mi.Float | mi.Spectrum  # length, scene units
+    g: mi.Spectrum  # sum of d log p / dg
+
+    def __add__(self, other: Score) -> Score:
+        return Score(self.n + other.n, self.d + other.d, self.g + other.g)
+
+    def __mul__(self, factor: mi.Float | mi.Spectrum) -> Score:
+        return Score(self.n * factor, self.d * factor, self.g * factor)
+
+    @classmethod
+    def zeros(cls, lanes: int) -> Score:
+        return cls(dr.zeros(mi.Float, lanes), dr.zeros(mi.Float, lanes), dr.zeros(mi.Spectrum, lanes))
+
+    @classmethod
+    def sums(cls, lanes: int) -> Score:
+        """No contributions yet."""
+        return cls(*(dr.zeros(mi.Spectrum, lanes) for _ in range(3)))
+
+
+def phase_score(g: mi.Spectrum, cosine: mi.Float) -> mi.Spectrum:
+    """d log p / dg of the Henyey-Greenstein phase function, for each channel."""
+    parts = [3 * (cosine - c) / (1 + dr.square(c) - 2 * c * cosine) - 2 * c / (1 - dr.square(c)) for c in g]
+    return mi.Spectrum(parts)
+
+
+@dataclass
+class Stay:
+    """Of a path inside one object, from its entry on."""
+
+    object: mi.Int32  # by number; -1 outside
+    score: Score
+    along: mi.Vector3f  # direction before the last scattering event
+    turned: mi.Bool  # whether the flight begins at that
+
+    @classmethod
+    def none(cls, lanes: int) -> Stay:
+        """Of a path that begins."""
+        along, turned = dr.zeros(mi.Vector3f, lanes), dr.full(mi.Bool, False, lanes)
+        return cls(dr.full(mi.Int32, -1, lanes), Score.zeros(lanes), along, turned)
+
+
+@dataclass
+class StayRecord:
+    """What a visitor keeps of a path, the path's number, and its stay."""
+
+    record: Any  # with the light L and the sums `slopes`
+    index: mi.UInt32
+    stay: Stay
+
+
+@dataclass(frozen=True, eq=False)
+class PathScores:
+    """Sums over the stays of each path in each object that is followed, one row of paths for each such object.
+
+    Light L of a path after a stay has the score q at its end. So the whole path has the slopes p + q L, with p the
+    slopes of light gathered inside less q times the light until the end.
+
+    Args:
+        paths: their number.
+        rows: table from the number of an object to its row, -1 without one.
+        p, q: sums over stays.
+    """
+
+    paths: int
+    rows: mi.Int32
+    p: Score
+    q: Score
+
+    @classmethod
+    def of(cls, media: WalkMedia, paths: int) -> PathScores:
+        """For so many paths."""
+        numbers = [k for k, _ in followed(media)]
+        rows = mi.Int32([numbers.index(k) if k in numbers else -1 for k in range(len(media.objects))])
+        room = paths * len(numbers)
+        result = cls(paths, rows, Score.sums(room), Score.zeros(room))
+        dr.eval(result.p, result.q, rows)
+        return result
+
+    def add(self, r: StayRecord) -> None:
+        """The stays of paths, which have ended."""
+        row, end = dr.gather(mi.Int32, self.rows, r.stay.object), r.stay.score
+        at, known = r.index + mi.UInt32(dr.maximum(row, 0)) * dr.opaque(mi.UInt32, self.paths), row >= 0
+        for target, value in ((self.p, r.record.slopes + end * (-r.record.L)), (self.q, end)):
+            for to, each in zip(vars(target).values(), vars(value).values()):
+                dr.scatter_reduce(dr.ReduceOp.Add, to, type(to)(each), at, known, dr.ReduceMode.NoConflicts)
+
+    def slopes(self, row: int, L: mi.Spectrum) -> Score:
+        """Of the light L of all paths."""
+        at = dr.arange(mi.UInt32, self.paths) + row * self.paths
+        p, q = (Score(*(dr.gather(type(v), v, at) for v in vars(sums).values())) for sums in (self.p, self.q))
+        return p + q * L
+
+
+@dataclass(frozen=True, eq=False)
+class ScoreVisitor:
+    """Another visitor, beside which the scores of paths are summed.
+
+    Args:
+        visitor: the other one, whose record has L and `slopes`.
+        media: the objects.
+        scores: where stays are summed.
+    """
+
+    visitor: Visitor
+    media: WalkMedia
+    scores: PathScores
+
+    def _flown(self, walk: Walk, stay: Stay, p: mi.Point3f) -> Stay:
+        """After a flight to p: its length, and the angle by which it began."""
+        g = self.media.spectrum("g", walk.object)
+        turn = dr.select(stay.turned, phase_score(g, dr.dot(stay.along, walk.d)), 0)
+        score = stay.score + Score(mi.Float(0), dr.norm(p - walk.o), turn)
+        return replace(stay, object=walk.object, score=score, turned=mi.Bool(False))
+
+    def _gathered(self, r: StayRecord, stay: Stay, before: mi.Spectrum, after: Any) -> StayRecord:
+        """The record after a visit that has added to the light."""
+        slopes = after.slopes + stay.score * (after.L - before)
+        return replace(r, record=replace(after, slopes=slopes), stay=stay)
+
+    def event(self, walk: Walk, record: StayRecord, event: Event) -> tuple[Walk, StayRecord]:
+        stay = self._flown(walk, record.stay, event.p)
+        stay = replace(stay, score=replace(stay.score, n=stay.score.n + 1), along=event.along, turned=mi.Bool(True))
+        before = mi.Spectrum(record.record.L)
+        walk, after = self.visitor.event(walk, record.record, event)
+        return walk, self._gathered(record, stay, before, after)
+
+    def boundary(
+        self, walk: Walk, record: StayRecord, si: mi.SurfaceInteraction3f, active: mi.Bool
+    ) -> tuple[Walk, StayRecord]:
+        # where something lies inside, `surface` has come here first
+        stay = self._flown(walk, record.stay, si.p) if self.media.inner is None else record.stay
+        before = mi.Spectrum(record.record.L)
+        walk, after = self.visitor.boundary(walk, record.record, si, active)
+        return walk, self._gathered(record, stay, before, after)
+
+    def surface(
+        self, walk: Walk, record: StayRecord, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, k: mi.Int32
+    ) -> tuple[Walk, StayRecord]:
+        stay, before = self._flown(walk, record.stay, si.p), mi.Spectrum(record.record.L)
+        walk, after = self.visitor.surface(walk, record.record, si, bsdf, k)
+        return walk, self._gathered(record, stay, before, after)
+
+    def crossing(self, walk: Walk, record: StayRecord, crossing: Crossing) -> tuple[Walk, StayRecord]:
+        walk, kept = self.visitor.crossing(walk, record.record, crossing)
+        return walk, replace(record, record=kept)
+
+    def end(self, record: StayRecord) -> StayRecord:
+        """Store the stay and begin another."""
+        self.scores.add(record)
+        lanes = dr.width(record.index)
+        return replace(record, record=replace(record.record, slopes=Score.sums(lanes)), stay=Stay.none(lanes))
+
+
+def followed(media: WalkMedia) -> list[tuple[int, dict[str, mi.Spectrum]]]:
+    """The number and the coefficients (scene units) of each object with gradients enabled.
+
+    Raises:
+        ValueError: the albedo of one of them, which must have gradients, is 0 in a channel.
+    """
+    result = []
+    for k, obj in enumerate(media.objects):
+        surface, unit = obj.shape.bsdf(), {"sigma_t": media.mm_per_unit}
+        values = {name: getattr(surface, name) for name in VARIABLE}
+        values = {name: value * unit.get(name, 1.0) for name, value in values.items() if dr.grad_enabled(value)}
+        if "albedo" in values and float(dr.min(dr.detach(values["albedo"]))[0]) <= 0:
+            raise ValueError(f"albedo must be > 0 to be differentiated by, got 0 in a channel of {obj.name}")
+        result += [(k, values)] if values else []
+    return result
+
+
+def with_derivatives(L: mi.Spectrum, scores: PathScores, media: WalkMedia) -> mi.Spectrum:
+    """The light L of paths, with derivatives by the media of objects whose gradients are enabled."""
+    result = mi.Spectrum(L)
+    for row, (_, values) in enumerate(followed(media)):
+        with dr.suspend_grad():
+            slopes = scores.slopes(row, L)
+        for name, value in values.items():
+            known = dr.detach(value)
+            by = {"albedo": slopes.n / known, "sigma_t": slopes.n / known - slopes.d, "g": slopes.g}[name]
+            result += by * (value - known)
+    return result
