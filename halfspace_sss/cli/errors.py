@@ -22,13 +22,16 @@ from halfspace_sss.cli.shared import (
     MeanCosine,
     ObjectId,
     OutFolder,
+    Scheduler,
     SigmaT,
     Variant,
+    Workers,
     by_channel,
     check_channel,
     check_left_out,
     console,
     defined,
+    executor_of,
     stated_medium,
     use_mitsuba,
     whole,
@@ -88,22 +91,26 @@ def errors_command(
     backend: Backend = BACKEND,
     define: Define = None,
     variant: Variant = VARIANT,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
     out: OutFolder = Path("errors"),
 ) -> None:
     """Compare models with path tracing over all directions: error, bias, decades of r; written as CSV and JSON."""
     from halfspace_sss.comparison import model_errors as tables
 
+    places = {"workers": workers, "scheduler": scheduler}
     given = {"sigma_t": sigma_t, "albedo": albedo, "g": g, "eta": eta}
     if scene is not None:
         changed = {"events": (events, EVENTS), "block": (block, BLOCK), "backend": (backend, BACKEND)}
         others = {"material": material, "channel": channel, "registry": registry, "held_out": held_out,
-                  "as_trained": as_trained, "truths": truths, **given}  # fmt: skip
+                  "as_trained": as_trained, "truths": truths, **places, **given}  # fmt: skip
         check_left_out({**others, **{k: None if a == b else a for k, (a, b) in changed.items()}}, "with --scene")
         _object(scene, model or [], {"object": object, "seed": seed, "exits": exits}, variant, define, out)
         return
     changed = {"variant": None if variant == VARIANT else variant, "exits": None if exits == EXITS else exits}
     check_left_out({"object": object, "define": define, **changed}, "without --scene")
     if truths:
+        check_left_out(places, "with --truths")
         _truths(material or registry or held_out is not None, model, out)
         return
     media = _media((material or [], channel), registry, (held_out, as_trained), seed, given)
@@ -111,13 +118,13 @@ def errors_command(
     _check_accepted(model or (), list(media.values()))
     array_types(backend)
     check_folder(out)
-    with Bar("errors") as bar:
+    with executor_of(**places) as executor, Bar("errors") as bar:
 
         def show(what: str, done: int, total: int) -> None:
             bar.show(round(1000 * ((what == "models") + done / total)), 2000, what)
 
-        result = tables.references(list(media.values()), events * len(media), seed, block, show, backend)
-        table = tables.error_table(media, result, model or None, show)
+        result = tables.references(list(media.values()), events * len(media), seed, block, show, backend, executor)
+        table = tables.error_table(media, result, model or None, show, executor)
     how = {"events": events, "block": block, "seed": seed}
     files = _write(out, table, tables.percentiles(table), DEFINITION.format(block), how)
     _report(table, tables, len(media), block)

@@ -22,12 +22,15 @@ from halfspace_sss.cli.shared import (
     MeanCosine,
     ObjectId,
     OutFolder,
+    Scheduler,
     SigmaT,
     Variant,
+    Workers,
     by_channel,
     check_channel,
     console,
     defined,
+    executor_of,
     stated_medium,
     use_mitsuba,
     whole,
@@ -102,22 +105,31 @@ def material_command(
     target_error: TargetError = None,
     seed: TrainingSeed = 0,
     backend: MapsBackend = "llvm",
+    workers: Workers = None,
+    scheduler: Scheduler = None,
     out: WeightsFolder = None,
     work: Work = None,
 ) -> None:
     """Train the network of a medium, for each channel of materials or of the coefficients that are given."""
     _need_torch()
+    from halfspace_sss.executors import completed
+
     media = _media(material or [], channel, {"sigma_t": sigma_t, "albedo": albedo, "g": g, "eta": eta})
     from halfspace_sss.neural.training.train_material import FAST, STANDARD
 
     recipe = _of_steps(FAST if fast else STANDARD, steps)
-    rows = []
-    with Bar("training") as bar:
-        for name, medium in media.items():
-            rows += [
-                (name, r) for r in _train(name, medium, bar, model, recipe, seed, out, work, target_error, backend)
-            ]
-    _report(rows)
+    how = {"model": model, "recipe": recipe, "seed": seed, "target_error": target_error, "backend": backend}
+    rows: dict[str, list[Any]] = {}
+    with executor_of(workers, scheduler) as executor, Bar("training") as bar:
+        if executor:  # whose processes may run elsewhere
+            out, work = (folder and folder.absolute() for folder in (out, work))
+        how["folder"] = out
+        parts = {name: (name, medium, how, work, None if executor else bar) for name, medium in media.items()}
+        for name, result in completed(executor, _train, parts):
+            rows[name] = result
+            if executor:
+                bar.show(len(rows), len(parts), name)
+    _report([(name, each) for name in parts for each in rows[name]])
 
 
 def object_command(
@@ -220,19 +232,14 @@ def _of_steps(recipe: Any, steps: int | None) -> Any:
     return replace(recipe, how=replace(recipe.how, steps=steps))
 
 
-def _train(
-    name: str, medium: Medium, bar: Bar, model: str, recipe: Any, seed: int, out: Path | None, work: Path | None,
-    target_error: float | None, backend: str,
-) -> list[Any]:  # fmt: skip
+def _train(name: str, medium: Medium, how: dict[str, Any], work: Path | None, bar: Bar | None) -> list[Any]:
+    """Networks of the channels of a medium; on a worker without a bar."""
     from halfspace_sss.neural import train
 
     def show(what: str, done: int, total: int) -> None:
         bar.show(done, total, f"{name}: {what}")
 
-    return train(
-        medium, model=model, recipe=recipe, seed=seed, folder=out, work=work / name if work else None,
-        target_error=target_error, backend=backend, progress=show,
-    )  # fmt: skip
+    return train(medium, **how, work=work / name if work else None, progress=show if bar else None)
 
 
 def _report_object(learnt: LearntObject) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -16,6 +17,7 @@ import numpy as np
 
 from halfspace_sss.arrays import library
 from halfspace_sss.comparison.cell_energies import cell_energies
+from halfspace_sss.executors import completed
 from halfspace_sss.interface.model import BSSRDF, bssrdf, models
 from halfspace_sss.maps.grid import draw_media
 from halfspace_sss.maps.noisy_maps import LEAST_ALBEDO, CellGrid, Groups, make_pool, radial_edges
@@ -211,6 +213,7 @@ def reference_maps(
     seed: tuple[int, ...],
     progress: NamedProgress | None = None,
     backend: str = "llvm",
+    executor: Executor | None = None,
 ) -> list[TracedMaps]:
     """Traced maps of scalar media, each with `n_sets` times 8 directions of incidence times 16 of observation.
 
@@ -218,11 +221,12 @@ def reference_maps(
         media: scalar media; lengths are mean free paths of each.
         events: scattering events over all media.
         seed: must differ from that of any training.
+        executor: where launches run (see `halfspace_sss.executors`); by default in this process.
     """
     rng = np.random.default_rng(list(seed))
     parts = [_reciprocal_directions(m, n_sets, grid.n_psi, rng) for m in media]
     columns = (np.concatenate([getattr(p, n) for p in parts]) for n in Groups.__dataclass_fields__)
-    halves = make_pool(Groups(*columns), grid, events, (*seed, 1), None, progress, backend)
+    halves = make_pool(Groups(*columns), grid, events, (*seed, 1), None, progress, backend, executor)
     n = n_sets * SET
     maps = [_mean_of_both_ways(p, halves[k * n : (k + 1) * n]) for k, p in enumerate(parts)]
     return [TracedMaps(m.in_mfp(), p, grid, h, block) for m, p, h in zip(media, parts, maps)]
@@ -253,10 +257,10 @@ def held_out_media(n: int, seed: int = 0, as_trained: bool = False) -> list[Medi
 
 def references(
     media: list[Medium], events: float, seed: int = 0, block: int = BLOCK,
-    progress: NamedProgress | None = None, backend: str = "llvm",
+    progress: NamedProgress | None = None, backend: str = "llvm", executor: Executor | None = None,
 ) -> list[TracedMaps]:  # fmt: skip
     """Traced maps of the media: 128 unseen pairs of directions each, `events` over all."""
-    return reference_maps(media, 1, GRID, block, events, (HELD_OUT_SEED, seed), progress, backend)
+    return reference_maps(media, 1, GRID, block, events, (HELD_OUT_SEED, seed), progress, backend, executor)
 
 
 def error_table(
@@ -264,26 +268,43 @@ def error_table(
     maps: list[TracedMaps],
     names: Iterable[str] | None = None,
     progress: NamedProgress | None = None,
+    executor: Executor | None = None,
 ) -> pandas.DataFrame:
-    """One row per medium and model that accepts it: error, noise, bias (fractions), error by decade of r in mfp."""
+    """One row per medium and model that accepts it: error, noise, bias (fractions), error by decade of r in mfp.
+
+    Args:
+        labels: of the media, each another one.
+        maps: of the media, in that order.
+        names: of models; by default all.
+        progress: called with ("models", media done, media in all).
+        executor: where media are compared (see `halfspace_sss.executors`); by default in this process.
+    """
     import pandas
 
-    rows: list[dict[str, Any]] = []
-    for k, (label, reference) in enumerate(zip(labels, maps)):
-        m = reference.medium
-        for name in names or models():
-            try:
-                model = bssrdf(name, m)
-            except ValueError:
-                continue  # the model refuses this medium
-            e = model_error(model, reference)
-            row = {"medium": label, "albedo": float(m.albedo), "g": float(m.g), "eta": m.eta, "model": name}
-            row |= {"orders": model.orders, "error": e.error, "error_square": e.square}
-            row |= {"error_square_standard_error": e.square_error, "raw": e.raw, "noise": e.noise, "bias": e.bias}
-            rows.append(row | {"bias_noise": e.bias_noise} | {f"r {d}": v for d, v in e.by_decade.items()})
+    chosen = list(names or models())
+    parts = {label: (label, reference, chosen) for label, reference in zip(labels, maps)}
+    rows: dict[str, list[dict[str, Any]]] = {}
+    for label, result in completed(executor, _rows, parts):
+        rows[label] = result
         if progress:
-            progress("models", k + 1, len(maps))
-    return pandas.DataFrame(rows)
+            progress("models", len(rows), len(parts))
+    return pandas.DataFrame([row for label in parts for row in rows[label]])
+
+
+def _rows(label: str, reference: TracedMaps, names: list[str]) -> list[dict[str, Any]]:
+    """Of one medium, a row for each model that accepts it."""
+    rows, m = [], reference.medium
+    for name in names:
+        try:
+            model = bssrdf(name, m)
+        except ValueError:
+            continue  # the model refuses this medium
+        e = model_error(model, reference)
+        row = {"medium": label, "albedo": float(m.albedo), "g": float(m.g), "eta": m.eta, "model": name}
+        row |= {"orders": model.orders, "error": e.error, "error_square": e.square}
+        row |= {"error_square_standard_error": e.square_error, "raw": e.raw, "noise": e.noise, "bias": e.bias}
+        rows.append(row | {"bias_noise": e.bias_noise} | {f"r {d}": v for d, v in e.by_decade.items()})
+    return rows
 
 
 def percentiles(table: pandas.DataFrame) -> pandas.DataFrame:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import io
 import math
+from concurrent.futures import Executor
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from types import ModuleType
@@ -19,6 +20,7 @@ import numpy as np
 from halfspace_sss.arrays import library
 from halfspace_sss.backend import array_types
 from halfspace_sss.checks import check_count
+from halfspace_sss.executors import completed
 from halfspace_sss.maps.map_tracing import GROUP, MapTally
 from halfspace_sss.physics.backbone import U_MAX, backbone, length_scale, unwarp, warp
 from halfspace_sss.physics.medium import eval_hg
@@ -252,6 +254,7 @@ def make_pool(
     folder: Path | None = None,
     progress: NamedProgress | None = None,
     backend: str = "llvm",
+    executor: Executor | None = None,
 ) -> np.ndarray:
     """Cell integrals of all groups, (n, 2, 16, n_u, n_psi), kept launch by launch in `folder` so that a run can go on.
 
@@ -259,23 +262,29 @@ def make_pool(
         groups, grid, events, seed, backend: as in `trace_groups`.
         folder: that of this run, see `work_folder`.
         progress: called with ("data", launches done, launches in all).
+        executor: where launches run (see `halfspace_sss.executors`); by default in this process.
 
     Raises:
         ValueError: a file of maps in the folder is damaged.
     """
     halves = np.zeros((len(groups), 2, 16, grid.n_u, grid.n_psi), np.float32)
     launches = trace_groups(groups, grid, events, seed, backend=backend)
-    for k, launch in enumerate(launches):
-        place = folder / f"maps-{'-'.join(map(str, seed))}-{k:05d}.npy" if folder else None
-        if place and place.exists():
-            maps = load_maps(place, (len(launch.index), *halves.shape[1:]))
-        else:
-            maps = launch.trace()
-            if place:
-                file = io.BytesIO()
-                np.save(file, maps)
-                write_atomically(place, file.getvalue())
-        halves[launch.index] = maps
+    places = [folder / f"maps-{'-'.join(map(str, seed))}-{k:05d}.npy" if folder else None for k in range(len(launches))]
+    parts = {f"launch {k}": (launch, place) for k, (launch, place) in enumerate(zip(launches, places))}
+    for done, (name, maps) in enumerate(completed(executor, _traced, parts), 1):
+        halves[parts[name][0].index] = maps
         if progress:
-            progress("data", k + 1, len(launches))
+            progress("data", done, len(launches))
     return halves
+
+
+def _traced(launch: MapLaunch, place: Path | None) -> np.ndarray:
+    """Maps of a launch, from its file if there is one."""
+    if place and place.exists():
+        return load_maps(place, (len(launch.index), 2, GROUP, launch.grid.n_u, launch.grid.n_psi))
+    maps = launch.trace()
+    if place:
+        file = io.BytesIO()
+        np.save(file, maps)
+        write_atomically(place, file.getvalue())
+    return maps

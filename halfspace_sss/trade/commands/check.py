@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from halfspace_sss.checks import check_count, check_interval
-from halfspace_sss.cli.shared import Bar, Variant, console, use_mitsuba, whole
+from halfspace_sss.cli.shared import Bar, Scheduler, Variant, Workers, console, executor_of, use_mitsuba, whole
 from halfspace_sss.provenance import check_folder
+
+if TYPE_CHECKING:
+    from halfspace_sss.trade.checking.random_scenes import RandomScene
 
 
 def check_command(
@@ -22,6 +25,8 @@ def check_command(
     truth: Annotated[float, typer.Option(help="Most seconds of the long runs, with seeds of their own.")] = 24.0,
     write_only: Annotated[bool, typer.Option("--write-only", help="Write the scenes, measure nothing.")] = False,
     variant: Variant = "llvm_ad_rgb",
+    workers: Workers = None,
+    scheduler: Scheduler = None,
     out: Annotated[Path, typer.Option(help="Folder; scenes that were measured there are not measured again.")] = Path(
         "trade-check"
     ),
@@ -43,15 +48,17 @@ def check_command(
             console().print(f"  {write_scene(random_scene(k, seed, tolerance), out)}", highlight=False, soft_wrap=True)
         return
     use_mitsuba(variant)
+    from halfspace_sss.executors import completed
     from halfspace_sss.provenance import provenance, write_together
-    from halfspace_sss.trade.checking.check import check_scene
     from halfspace_sss.trade.checking.summary import markdown, outcomes, summary
 
-    records = []
-    with Bar("scenes") as bar:
-        for k in numbers:
-            records.append(check_scene(random_scene(k, seed, tolerance), out, assess, truth))
-            bar.show(len(records), scenes, f"scene {k}")
+    parts = {f"scene {k}": (random_scene(k, seed, tolerance), out.absolute(), assess, truth, variant) for k in numbers}
+    done: dict[str, dict[str, Any]] = {}
+    with executor_of(workers, scheduler) as executor, Bar("scenes") as bar:
+        for name, record in completed(executor, _record, parts):
+            done[name] = record
+            bar.show(len(done), scenes, name)
+    records = [done[name] for name in parts]
     table, result = outcomes(records), summary(records)
     how = {"scenes": scenes, "first": first, "seed": seed, "tolerance": tolerance, "assess": assess, "truth": truth}
     text = markdown(result, table, how)
@@ -64,3 +71,14 @@ def check_command(
         }
     )
     console().print(text, highlight=False, markup=False, soft_wrap=True)
+
+
+def _record(scene: RandomScene, out: Path, assess: float, truth: float, variant: str) -> dict[str, Any]:
+    """The record of a scene; a worker takes the variant with its first one."""
+    import mitsuba as mi
+
+    from halfspace_sss.trade.checking.check import check_scene
+
+    if mi.variant() != variant:
+        use_mitsuba(variant)
+    return check_scene(scene, out, assess, truth)
