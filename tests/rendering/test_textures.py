@@ -63,9 +63,10 @@ def test_a_white_texture_without_absorption_is_invisible_in_uniform_light() -> N
     np.testing.assert_allclose(image, 1, rtol=1e-5)
 
 
-ANALYTIC = [
+TAKING = [
     *("standard_dipole", "better_dipole", "directional_dipole", "normalized_diffusion", "lambert"),
     pytest.param("photon_beam_diffusion", marks=pytest.mark.slow),
+    pytest.param("neural", marks=pytest.mark.slow),
 ]
 
 
@@ -93,23 +94,23 @@ def _S(obj: Any, seed: int = 1, n: int = 512) -> np.ndarray:
     return np.array(obj.transport.S(obj.transport.prepare(ends[0]), ends[1])).T
 
 
-@pytest.mark.parametrize("analytic", ANALYTIC)
-def test_models_of_one_texel_are_those_of_its_medium(analytic: str) -> None:
-    """Albedo 1 among them, so that a white texture has the energy of the model."""
-    white = {**PLAIN, "albedo": "1,0.875,0.5"}
-    plain, painted = (_S(obj) for obj in _transports(analytic, white, _painted(white)))
+@pytest.mark.parametrize("model", TAKING)
+def test_models_of_one_texel_are_those_of_its_medium(model: str) -> None:
+    """Of albedo 1: a white texture has the energy of the model."""
+    white = {**PLAIN, "albedo": "1,1,1"}
+    plain, painted = (_S(obj) for obj in _transports(model, white, _painted(white)))
     np.testing.assert_allclose(painted, plain, rtol=2e-5, atol=1e-6 * plain.max())
 
 
-@pytest.mark.parametrize("analytic", ANALYTIC)
-def test_models_between_nodes_are_those_of_the_medium(analytic: str) -> None:
-    """With other texels beside, to 1 %: ln S is close to linear between nodes."""
+@pytest.mark.parametrize("model", TAKING)
+def test_models_between_nodes_are_those_of_the_medium(model: str) -> None:
+    """With other texels beside, to 0.5 %, networks with their fewer nodes to 1.5 %: ln S is nearly linear in v."""
     medium = {**PLAIN, "albedo": "0.96,0.83,0.65"}
     beside = {**PLAIN, "albedo": "0.3,0.99,0.999", "sigma_t": "3,2,1"}
-    (plain, painted) = _transports(analytic, medium, _painted(medium, beside))
+    (plain, painted) = _transports(model, medium, _painted(medium, beside))
     a, b = _S(plain), _S(painted)
     upper = np.random.default_rng(1).normal(size=(3, 512))[1] > 0.5  # both ends are in the first texel
-    assert np.abs(a - b)[upper].sum() < 0.01 * a[upper].sum() or analytic == "lambert"
+    assert np.abs(a - b)[upper].sum() < (0.015 if model == "neural" else 0.005) * a[upper].sum() or model == "lambert"
     assert np.abs(a - b).sum() > 0.05 * a.sum()
 
 
@@ -139,7 +140,6 @@ def test_a_model_of_a_constant_texture_renders_as_of_a_constant() -> None:
 @pytest.mark.parametrize(
     ("model", "integrator", "message"),
     [
-        ("neural", {}, "model must be analytic for media by textures, got 'neural', which is a network"),
         ("neural_shape", {}, "must be without textures for the model 'neural_shape'"),
         ("full_geometry", {}, "must be without textures for the model 'full_geometry'"),
         ("better_dipole", {"light": "gathered"}, "light must be sampled for object .*, whose medium has textures"),
@@ -153,11 +153,15 @@ def test_what_takes_no_textures_refuses_them_by_name(model: str, integrator: dic
 
 
 def test_the_albedo_of_aovs_is_that_of_the_texels() -> None:
-    painted, *plain = (mi.load_dict({"type": "translucent", **s}) for s in (_painted(PLAIN, OTHER), PLAIN, OTHER))
+    surface = mi.load_dict({"type": "translucent", **_painted(PLAIN, OTHER)})
     si = dr.zeros(mi.SurfaceInteraction3f, 2)
     si.uv, si.wi = mi.Point2f([0.2, 0.7], 0.5), mi.Vector3f(0.6, 0, 0.8)
-    wanted = [np.ravel(np.array(surface.eval_diffuse_reflectance(si))) for surface in plain]
-    np.testing.assert_allclose(np.array(painted.eval_diffuse_reflectance(si)).T, wanted, rtol=1e-6)
+    found = np.array(surface.eval_diffuse_reflectance(si)).T
+    albedos = [[float(x) for x in s["albedo"].split(",")] for s in (PLAIN, OTHER)]
+    wanted = [
+        Medium.from_albedo(np.array(albedo), 1.0, PLAIN["g"], PLAIN["eta"]).reflectance(0.8) for albedo in albedos
+    ]
+    np.testing.assert_allclose(found, wanted, rtol=2e-3)
 
 
 def test_texels_that_change_are_as_in_a_fresh_scene() -> None:
