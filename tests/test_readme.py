@@ -24,6 +24,7 @@ PAGES = [
             "index",
             "start",
             "gallery",
+            "notebooks",
             "curves",
             "materials",
             "rendering",
@@ -48,6 +49,10 @@ SNIPPETS = {
     page: [text for language, text in blocks if language == "python"]
     for page, blocks in BLOCKS.items()
     if any(language == "python" for language, _ in blocks)
+}
+SNIPPETS |= {  # scripts with cells, whole
+    str(path.relative_to(ROOT)): [path.read_text(encoding="utf-8")]
+    for path in sorted((ROOT / "docs" / "notebooks").glob("*.py"))
 }
 COMMANDS = list(
     dict.fromkeys(
