@@ -117,7 +117,9 @@ def test_a_connection_by_one_reflection_leaves_towards_its_target_and_knows_how_
     """Against rays in closed form, from random starts; the density as in the test above."""
     p, target = points(5, 0.7), directions(6) * 8
     start = mi.Vector3f(directions(7))
-    met = low_orders._connect(ball, mi.Point3f(p), mi.Point3f(target), start, True, low_orders.OTHERS, mi.Bool(True))
+    met = low_orders._connect(
+        ball, mi.Point3f(p), mi.Point3f(target), start, mi.Bool(True), low_orders.OTHERS, mi.Bool(True)
+    )
     valid, d, h = np.array(met.valid), np.array(met.d, dtype=np.float64), 1e-4
 
     def twice(d: np.ndarray) -> tuple[Passage, np.ndarray, np.ndarray]:

@@ -296,6 +296,15 @@ class _Target(NamedTuple):
     alone: mi.Bool  # whether no other strategy counts its light
 
 
+@dataclass
+class _Way:
+    """Where light of a target passes from the event: the scattering angle, the length inside, and what passes."""
+
+    cosine: mi.Float
+    length: mi.Float
+    passed: mi.Float  # over the density of the target; times the trials of `_ways`
+
+
 def _connected(
     context: RenderContext, of: tuple[TranslucentObject, Media], walk: _Walk, weight: mi.Spectrum, sampler: mi.Sampler,
     active: mi.Bool,
@@ -310,47 +319,34 @@ def _connected(
         active = active & (ds.pdf > 0)
         reach = dr.select(distant, opaque(FAR * obj.geometry.size), ds.dist)
         target = _Target(ds, light, walk.event + ds.d * reach, reach, alone)
-        met = refracted_connection(obj, walk.event, target.p, active & (alone | mi.Bool(context.connects_sky(obj))))
-    light = _light_along(context, of, walk, weight, target, met)
-    if not (context.lights.some_local or context.suns):
-        return light
-    with dr.suspend_grad():
-        near = active & alone & _near(obj, walk, target.p, active)
-    for reflects in (False, True):
-        with dr.suspend_grad():
-            other = _trial(obj, walk, target.p, reflects, sampler, near)
-            other.valid &= ~_leaves(obj, met, other.p, SAME_WAY)
-        more = _light_along(context, of, walk, weight, target, other)
-        with dr.suspend_grad():
-            # the fainter, the fewer are looked for again
-            counted = dr.minimum(other.T * dr.exp(-dr.min(_column(media, 1)) * other.length) / FAINT, 1)
-            again = (dr.max(more) > 0) & (sampler.next_1d() < counted)
-            trials, _ = _find(obj, walk, target.p, reflects, (other.p, SAME_WAY), sampler, again)
-            times = dr.select(again, mi.Float(trials) / counted, 0)
-        light = light + more * times
-    return light
+        first = active & (alone | mi.Bool(context.connects_sky(obj)))
+        if context.lights.some_local or context.suns:
+            near = active & alone & _near(obj, walk, target.p, active)
+            ways = _ways(context, of, walk, weight, target, (first, near), sampler)
+        else:
+            ways = [_way(context, obj, walk, target, refracted_connection(obj, walk.event, target.p, first))]
+    return sum((_light_along(media, weight, target, way) for way in ways), mi.Spectrum(0))
 
 
-def _light_along(
-    context: RenderContext, of: tuple[TranslucentObject, Media], walk: _Walk, weight: mi.Spectrum, target: _Target,
-    met: Connection,
-) -> mi.Spectrum:  # fmt: skip
-    """Light of a target by its connection with the event, which has a weight."""
-    obj, media = of
-    with dr.suspend_grad():
-        # solid angle at the event per solid angle of the straight direction, over which the emitter was sampled
-        ds, alone, reach = target.ds, target.alone, target.reach
-        facing = dr.select(dr.squared_norm(ds.n) > 0, dr.abs(dr.dot(ds.n, met.w)) / dr.abs(dr.dot(ds.n, ds.d)), 1)
-        valid = met.valid & (ds.delta | ~alone | _is_sampled(walk.event, target.p, ds.n, met))
-        valid &= dr.dot(ds.n, met.w) <= 0
-        spread = dr.select(ds.delta | ~alone, 1, facing) * reach * reach * met.density
-        weight_sky = mis_weight(ds.pdf, _phase_pdf(obj, walk, met) * met.T * spread)
-        cosine, passed = dr.dot(walk.event_d, met.d), met.T * spread * dr.select(alone, 1, weight_sky)
-    phase = _spectrum([eval_hg(cosine, g) for _, _, g in media])
-    value = weight * phase * _contribution(media, met.length, mi.UInt32(0), None) * passed * target.light
-    edge = place(met.p, met.n)
-    blocked = context.scene.ray_test(edge.spawn_ray_to(target.p), False, valid)
-    return dr.select(valid & ~blocked, value, 0)
+def _light_along(media: Media, weight: mi.Spectrum, target: _Target, way: _Way) -> mi.Spectrum:
+    """Light of a target that reaches the event, which has a weight."""
+    phase = _spectrum([eval_hg(way.cosine, g) for _, _, g in media])
+    value = weight * phase * _contribution(media, way.length, mi.UInt32(0), None) * way.passed * target.light
+    return dr.select(way.passed > 0, value, 0)
+
+
+def _way(context: RenderContext, obj: TranslucentObject, walk: _Walk, target: _Target, met: Connection) -> _Way:
+    """The way of light of a target by its connection with the event."""
+    # ---- solid angle at the event per solid angle of the straight direction, over which the emitter was sampled
+    ds, alone, reach = target.ds, target.alone, target.reach
+    facing = dr.select(dr.squared_norm(ds.n) > 0, dr.abs(dr.dot(ds.n, met.w)) / dr.abs(dr.dot(ds.n, ds.d)), 1)
+    valid = met.valid & (ds.delta | ~alone | _is_sampled(walk.event, target.p, ds.n, met))
+    valid &= dr.dot(ds.n, met.w) <= 0
+    spread = dr.select(ds.delta | ~alone, 1, facing) * reach * reach * met.density
+    weight_sky = mis_weight(ds.pdf, _phase_pdf(obj, walk, met) * met.T * spread)
+    valid &= ~context.scene.ray_test(place(met.p, met.n).spawn_ray_to(target.p), False, valid)
+    passed = dr.select(valid, met.T * spread * dr.select(alone, 1, weight_sky), 0)
+    return _Way(dr.dot(walk.event_d, met.d), mi.Float(met.length), passed)
 
 
 def _phase_pdf(obj: TranslucentObject, walk: _Walk, met: Connection) -> mi.Float:
@@ -434,36 +430,64 @@ NEAR = 4.0  # mean free paths of the straight way to the boundary, beyond which 
 MIRRORED = 0.5  # probability to start as a flat boundary would reflect
 
 
+def _ways(
+    context: RenderContext, of: tuple[TranslucentObject, Media], walk: _Walk, weight: mi.Spectrum, target: _Target,
+    looks: tuple[mi.Bool, mi.Bool], sampler: mi.Sampler,
+) -> list[_Way]:  # fmt: skip
+    """The ways of light of a target: from the first guess, and from random directions, without and with a reflection.
+
+    One loop over all, so that a kernel holds Newton's method once. `looks` says where it looks for the first, and for
+    the others.
+    """
+    obj, media = of
+
+    def step(
+        kind: mi.UInt32, n: mi.UInt32, sampler: mi.Sampler, counted: mi.Float, seen: tuple, way: _Way, ways: list[_Way]
+    ) -> tuple:
+        """Trial n of a kind of way: the first finds one, others look for it again."""
+        first, other, (straight, p) = n == 0, kind > 0, seen
+        met = _trial(obj, walk.event, target.p, kind == 2, other, sampler, dr.select(other, looks[1], looks[0]))
+
+        # ---- one that is found; the fainter, the fewer are looked for again
+        new = met.valid & first & ~(other & _leaves(obj, straight, met.p, SAME_WAY))
+        way = dr.select(first, _way(context, obj, walk, target, replace(met, valid=new)), way)
+        lit = dr.max(_light_along(media, weight, target, way)) > 0
+        share = dr.minimum(met.T * dr.exp(-dr.min(_column(media, 1)) * met.length) / FAINT, 1)
+        again = first & other & lit & (sampler.next_1d(first & other) < share)
+        counted, p = dr.select(first, share, counted), dr.select(first, met.p, p)
+        straight = dr.select(other, straight, met)
+
+        # ---- it counts as often as it took to be found again
+        ends = dr.select(first, ~again, _leaves(obj, met, p, SAME_WAY) | (n == TRIALS))
+        times = dr.select(other, dr.select(first, 0, mi.Float(n) / counted), 1)
+        done = replace(way, passed=dr.select(times > 0, way.passed * times, 0))
+        ways = [dr.select(ends & (kind == k), done, known) for k, known in enumerate(ways)]
+        kind, n = dr.select(ends, kind + 1, kind), dr.select(ends, 0, n + 1)
+        return kind, n, sampler, counted, (straight, p), way, ways
+
+    def none() -> _Way:
+        return _Way(mi.Float(0), mi.Float(0), mi.Float(0))
+
+    seen = _no_connection(), mi.Point3f(0)
+    state = (mi.UInt32(0), mi.UInt32(0), sampler, mi.Float(1), seen, none(), [none(), none(), none()])
+    return dr.while_loop(state, lambda kind, *_: kind < 3, step, label="ways")[-1]
+
+
 def _taken(
     obj: TranslucentObject, walk: _Walk, target: mi.Point3f, tolerance: float, sampler: mi.Sampler, active: mi.Bool
 ) -> Connection:
     """The connection by which a walk has left its event, if one is found; without, it is met by chance alone."""
-    met = refracted_connection(obj, walk.event, target, active & (walk.reflections == 0))
-    met = replace(met, valid=_leaves(obj, met, walk.o, tolerance))
-    near = _near(obj, walk, target, active)
-    for k, reflects in enumerate((False, True)):
-        lost = active & ~met.valid & (walk.reflections == k) & near
-        _, other = _find(obj, walk, target, reflects, (walk.o, tolerance), sampler, lost)
-        met = dr.select(other.valid, other, met)
-    return met
+    near, reflected = _near(obj, walk, target, active), walk.reflections == 1
 
+    def step(n: mi.UInt32, sampler: mi.Sampler, found: Connection, active: mi.Bool) -> tuple:
+        met = _trial(obj, walk.event, target, reflected, n > 0, sampler, active)
+        met = replace(met, valid=_leaves(obj, met, walk.o, tolerance))
+        return n + 1, sampler, dr.select(active, met, found), active & ~met.valid & near & (n < TRIALS)
 
-def _find(
-    obj: TranslucentObject, walk: _Walk, target: mi.Point3f, reflects: bool, wanted: tuple[mi.Point3f, float],
-    sampler: mi.Sampler, active: mi.Bool,
-) -> tuple[mi.UInt32, Connection]:  # fmt: skip
-    """Trials until a connection leaves through the wanted point, up to a share of its length; valid if one did."""
-    x, tolerance = wanted
-
-    def trial(n: mi.UInt32, sampler: mi.Sampler, found: Connection, active: mi.Bool) -> tuple:
-        met = _trial(obj, walk, target, reflects, sampler, active)
-        same = _leaves(obj, met, x, tolerance)
-        n = n + dr.select(active, mi.UInt32(1), 0)
-        return n, sampler, dr.select(active & same, met, found), active & ~same & (n < TRIALS)
-
-    state = (mi.UInt32(0), sampler, _no_connection(), mi.Bool(active))
-    n, _, found, _ = dr.while_loop(state, lambda n, sampler, found, active: active, trial, label="trials")
-    return n, found
+    # the first guess is without a reflection
+    active = active & ((walk.reflections == 0) | (reflected & near))
+    state = (dr.select(reflected, mi.UInt32(1), 0), sampler, _no_connection(), mi.Bool(active))
+    return dr.while_loop(state, lambda n, sampler, found, active: active, step, label="trials")[2]
 
 
 def _near(obj: TranslucentObject, walk: _Walk, target: mi.Point3f, active: mi.Bool) -> mi.Bool:
@@ -476,19 +500,21 @@ def _near(obj: TranslucentObject, walk: _Walk, target: mi.Point3f, active: mi.Bo
 
 
 def _trial(
-    obj: TranslucentObject, walk: _Walk, target: mi.Point3f, reflects: bool, sampler: mi.Sampler, active: mi.Bool
-) -> Connection:
-    """A connection from a random direction: about the first guess, or where it reflects from any."""
-    v, u, toward = sampler.next_1d(), sampler.next_2d(), dr.normalize(target - walk.event)
-    if not reflects:
-        guess = _first_guess(obj, walk.event, toward, active)
-        d = mi.Frame3f(guess).to_world(mi.warp.square_to_von_mises_fisher(u, dr.select(v < 0.5, SPREAD[0], SPREAD[1])))
-        return _connect(obj, walk.event, target, d, False, OTHERS, active)
+    obj: TranslucentObject, p: mi.Point3f, target: mi.Point3f, reflects: mi.Bool, random: mi.Bool, sampler: mi.Sampler,
+    active: mi.Bool,
+) -> Connection:  # fmt: skip
+    """A connection from the first guess, or a `random` direction: about the guess, or where it reflects from any."""
+    v, u, toward = sampler.next_1d(random), sampler.next_2d(random), dr.normalize(target - p)
     d = mi.warp.square_to_uniform_sphere(u)
-    si, n, _ = meet(obj, walk.event, d, mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame, active)
-    mirror = dr.normalize(target - (walk.event + n * (2 * dr.dot(si.p - walk.event, n))))
+    si, n, _ = meet(obj, p, dr.select(reflects, d, toward), mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame, active)
+    guess = _refracted_inwards(obj, n, toward)
+    about = mi.warp.square_to_von_mises_fisher(u, dr.select(v < 0.5, mi.Float(SPREAD[0]), SPREAD[1]))
+    mirror = dr.normalize(target - (p + n * (2 * dr.dot(si.p - p, n))))
     d = dr.select(v < MIRRORED, mirror - n * (2 * dr.dot(mirror, n)), d)
-    return _connect(obj, walk.event, target, d, True, OTHERS, active & si.is_valid())
+    start = dr.select(reflects, d, dr.select(random, mi.Frame3f(guess).to_world(about), guess))
+    newton = dr.select(random, mi.UInt32(OTHERS[0]), FIRST[0]), dr.select(random, mi.Float(OTHERS[1]), FIRST[1])
+    met = _connect(obj, p, target, start, reflects, newton, active & (~reflects | si.is_valid()))
+    return replace(met, valid=met.valid & ~_blocked(obj, p, met.d, met.length, met.valid))
 
 
 # ---- Specular connections: Newton's method ---------------------------------------------------------------------------
@@ -521,16 +547,21 @@ def _no_connection() -> Connection:
 
 def refracted_connection(obj: TranslucentObject, p: mi.Point3f, target: mi.Point3f, active: mi.Bool) -> Connection:
     """The ray from p inside the object that is refracted towards `target` outside, found from the first guess."""
-    start = _first_guess(obj, p, dr.normalize(target - p), active)
+    toward = dr.normalize(target - p)
+    _, n, _ = meet(obj, p, toward, mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame, active)
+    start = _refracted_inwards(obj, n, toward)
     met = _connect(obj, p, target, start, False, FIRST, active)
     return replace(met, valid=met.valid & ~_blocked(obj, p, met.d, met.length, met.valid))
 
 
 def _connect(
-    obj: TranslucentObject, p: mi.Point3f, target: mi.Point3f, start: mi.Vector3f, reflects: bool,
-    newton: tuple[int, float], active: mi.Bool,
+    obj: TranslucentObject, p: mi.Point3f, target: mi.Point3f, start: mi.Vector3f, reflects: mi.Bool | bool,
+    newton: tuple, active: mi.Bool,
 ) -> Connection:  # fmt: skip
-    """A ray from p inside the object, reflected once or not, then refracted towards `target`; found from `start`."""
+    """A ray from p inside the object, reflected once or not, then refracted towards `target`; found from `start`.
+
+    `newton` are the number of its steps and the longest. Where `reflects` is False itself, code for it is left out.
+    """
 
     steps, longest = newton
 
@@ -560,18 +591,17 @@ def _connect(
     return replace(best, valid=best.valid & active)
 
 
-def _first_guess(obj: TranslucentObject, p: mi.Point3f, w: mi.Vector3f, active: mi.Bool) -> mi.Vector3f:
-    """The direction inside of light that arrives along -w where the straight ray along w meets the boundary."""
-    _, n_out, _ = meet(obj, p, w, mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame, active)
-    across = (w - n_out * dr.dot(w, n_out)) / obj.eta
-    return dr.normalize(across + n_out * dr.sqrt(dr.maximum(1 - dr.squared_norm(across), 1e-4)))
+def _refracted_inwards(obj: TranslucentObject, n: mi.Normal3f, w: mi.Vector3f) -> mi.Vector3f:
+    """The direction inside, from the event, of light that arrives along -w where the normal outwards is n."""
+    across = (w - n * dr.dot(w, n)) / obj.eta
+    return dr.normalize(across + n * dr.sqrt(dr.maximum(1 - dr.squared_norm(across), 1e-4)))
 
 
 _Steps = list["tuple[mi.Vector3f, mi.Vector3f]"]  # differentials of a ray's origin and direction, by two axes
 
 
 def _miss(
-    obj: TranslucentObject, p: mi.Point3f, d: mi.Vector3f, target: mi.Point3f, reflects: bool, active: mi.Bool
+    obj: TranslucentObject, p: mi.Point3f, d: mi.Vector3f, target: mi.Point3f, reflects: mi.Bool | bool, active: mi.Bool
 ) -> tuple[tuple, tuple, tuple, mi.Bool]:
     """Miss of the target in two axes across the ray outside, its derivative by d, the passage, and its validity.
 
@@ -583,14 +613,17 @@ def _miss(
     # ---- to the boundary, if reflected twice
     zero, T, length, skip, valid = mi.Vector3f(0), mi.Float(1), mi.Float(0), mi.Float(0), mi.Bool(active)
     steps, o = [(zero, mi.Vector3f(e)) for e in mi.coordinate_system(d)], p
-    if reflects:
-        t, met, steps = _arrive(obj, o, d, skip, steps, valid)
-        si, n_out, n = met
+    if reflects is not False:
+        t, (si, n_out, n), arrived = _arrive(obj, o, d, skip, steps, valid & reflects)
         c = dr.dot(d, n_out)
-        dc = [dr.dot(dd, n_out) + dr.dot(d, dn) for _, dd, dn in steps]
-        steps = [(dx, dd - 2 * (n_out * k + dn * c)) for (dx, dd, dn), k in zip(steps, dc)]
-        T, length, o, d = mi.fresnel(dr.maximum(c, 0), 1 / obj.eta)[0], t, mi.Point3f(si.p), d - n_out * (2 * c)
-        skip, valid = _clear(obj, n, d), valid & si.is_valid() & (c > 0) & (dr.dot(d, n) < 0)
+        dc = [dr.dot(dd, n_out) + dr.dot(d, dn) for _, dd, dn in arrived]
+        onward = [(dx, dd - 2 * (n_out * k + dn * c)) for (dx, dd, dn), k in zip(arrived, dc)]
+        F, back = mi.fresnel(dr.maximum(c, 0), 1 / obj.eta)[0], d - n_out * (2 * c)
+        valid &= ~reflects | (si.is_valid() & (c > 0) & (dr.dot(back, n) < 0))
+        T, length = dr.select(reflects, F, 1), dr.select(reflects, t, 0)
+        skip = dr.select(reflects, _clear(obj, n, back), 0)
+        o, d = dr.select(reflects, si.p, o), dr.select(reflects, back, d)
+        steps = [tuple(dr.select(reflects, x, y) for x, y in zip(*pair)) for pair in zip(onward, steps)]
     t, (si, n_out, n), steps = _arrive(obj, o, d, skip, steps, valid)
 
     # ---- refracted ray, and its differentials
