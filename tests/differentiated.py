@@ -77,16 +77,22 @@ def followed(parameters, key: str):
     return value
 
 
-def backward(scene, key: str) -> np.ndarray:
-    """Derivative of the weighted sum of the image."""
+def derivatives(scene, keys: list[str]) -> dict[str, np.ndarray]:
+    """Derivatives of the weighted sum of the image by several parameters, of one replay."""
     parameters = mi.traverse(scene)
-    value = followed(parameters, key)
-    parameters[key] = value
+    values = {key: followed(parameters, key) for key in keys}
+    for key, value in values.items():
+        parameters[key] = value
     parameters.update()
     scene.integrator().render_backward(scene, parameters, mi.TensorXf(weights(scene)), 0, SEED, SPP)
-    parameters[key] = dr.detach(value)
+    for key, value in values.items():
+        parameters[key] = dr.detach(value)
     parameters.update()
-    return np.array(dr.grad(value), dtype=float).ravel()
+    return {key: np.array(dr.grad(value), dtype=float).ravel() for key, value in values.items()}
+
+
+def backward(scene, key: str) -> np.ndarray:
+    return derivatives(scene, [key])[key]
 
 
 def forward(scene, key: str) -> float:

@@ -18,6 +18,7 @@ from differentiated import (  # noqa: E402
     SPP,
     UNTRAINED,
     backward,
+    derivatives,
     difference,
     envmap,
     forward,
@@ -30,68 +31,69 @@ from differentiated import (  # noqa: E402
 pytestmark = pytest.mark.usefixtures("quiet_rgb")
 
 
+COEFFICIENTS = ("albedo", "sigma_t", "g")
+
+
+def _by_the_medium(scene, names: tuple[str, ...]) -> dict[str, np.ndarray]:
+    found = derivatives(scene, [f"ball.bsdf.{name}" for name in names])
+    return dict(zip(names, found.values()))
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("parameter", ["albedo", "sigma_t", "g"])
-def test_derivatives_by_the_medium_agree_with_finite_differences_for_every_model(name, parameter):
-    if name == "neural_paper" or name in UNTRAINED and parameter != "sigma_t":
+def test_derivatives_by_the_medium_agree_with_finite_differences_for_every_model(name):
+    if name == "neural_paper":
         pytest.skip("trained for one medium; the same scaling law as neural_material, and a kernel of a minute")
     model = halfspace_sss.interface.model.bssrdf(name, Medium(**MEDIUM))
     scene = make("point", name, n=8, floor=False, orders="total" if model.orders == "total" else "multiple")
-    expected, size = medium_difference(scene, parameter)
-    assert backward(scene, f"ball.bsdf.{parameter}").sum() == pytest.approx(expected, abs=2e-3 * size)
+    for parameter, found in _by_the_medium(scene, ("sigma_t",) if name in UNTRAINED else COEFFICIENTS).items():
+        expected, size = medium_difference(scene, parameter)
+        assert found.sum() == pytest.approx(expected, abs=2e-3 * size)
+
+
+OF_LIGHT = {
+    "sky": "light.radiance.value", "lamp": "light.emitter.radiance.value", "point": "light.intensity.value",
+    "sun": "light.irradiance.value", "envmap": "light.data",
+}  # fmt: skip
+FLOOR = "floor.bsdf.reflectance.color1.value"
 
 
 @pytest.mark.parametrize("light", [*LIGHTS, pytest.param("envmap", marks=pytest.mark.slow)])
-def test_derivatives_by_each_channel_agree_with_finite_differences_under_every_light(light):
-    scene = make(envmap() if light == "envmap" else light)
-    for parameter in ("albedo", "sigma_t", "g"):
-        found = backward(scene, f"ball.bsdf.{parameter}")
+def test_derivatives_under_every_light_agree_with_finite_differences_and_with_the_image_by_the_light(light):
+    """By each channel of the medium and the texture of another surface; what light shows is linear in it."""
+    scene = make(envmap() if light == "envmap" else light, **({} if light == "sky" else {"boundary": ROUGH}))
+    found = derivatives(scene, [*(f"ball.bsdf.{name}" for name in COEFFICIENTS), FLOOR, OF_LIGHT[light]])
+    for parameter in COEFFICIENTS:
         for k in range(3):
             expected, size = medium_difference(scene, parameter, k)
-            assert found[k] == pytest.approx(expected, abs=2e-3 * size)
-    assert forward(scene, "ball.bsdf.g") == pytest.approx(found.sum(), abs=1e-4 * np.abs(found).sum())
+            assert found[f"ball.bsdf.{parameter}"][k] == pytest.approx(expected, abs=2e-3 * size)
+    by_g = found["ball.bsdf.g"]
+    assert forward(scene, "ball.bsdf.g") == pytest.approx(by_g.sum(), abs=1e-4 * np.abs(by_g).sum())
+    assert found[FLOOR].sum() == pytest.approx(difference(scene, FLOOR, 5e-3, mi.Float), rel=5e-3)
+    value = np.array(mi.traverse(scene)[OF_LIGHT[light]], dtype=float).ravel()
+    assert value.size in (found[OF_LIGHT[light]].size, 1)
+    shown = (image(scene) * weights(scene)).sum()
+    assert (value * found[OF_LIGHT[light]]).sum() == pytest.approx(shown, rel=2e-3)
 
 
 def test_single_scattering_alone_is_differentiated_by_the_medium():
     scene = make("lamp", orders="single", floor=False)
-    for parameter in ("albedo", "sigma_t", "g"):
+    for parameter, found in _by_the_medium(scene, COEFFICIENTS).items():
         expected, size = medium_difference(scene, parameter)
-        assert backward(scene, f"ball.bsdf.{parameter}").sum() == pytest.approx(expected, abs=2e-3 * size)
+        assert found.sum() == pytest.approx(expected, abs=2e-3 * size)
 
 
-def test_the_radiance_of_a_constant_sky_times_its_derivative_is_the_image(name):
-    model = halfspace_sss.interface.model.bssrdf(name, Medium(**MEDIUM))
-    orders = "total" if model.orders == "total" else "multiple"
-    scene = make(model=name, orders=orders, floor=False, n=4)
+@pytest.mark.parametrize("model", ["standard_dipole", "neural"])
+def test_the_radiance_of_a_constant_sky_times_its_derivative_is_the_image(model):
+    scene = make(model=model, orders="multiple", floor=False, n=4)
     expected = (image(scene) * weights(scene)).sum()
     assert backward(scene, "light.radiance.value").sum() == pytest.approx(expected, rel=1e-3)
 
 
-@pytest.mark.parametrize("key", ["light.radiance.value", "floor.bsdf.reflectance.color1.value", "ball.bsdf.albedo"])
 @pytest.mark.parametrize("reflection", [True, False])
-def test_forward_and_backward_derivatives_agree(key, reflection):
+def test_forward_and_backward_derivatives_agree(reflection):
     scene = make(orders="total", reflection=reflection, boundary=ROUGH)
-    assert forward(scene, key) == pytest.approx(backward(scene, key).sum(), rel=1e-4)
-
-
-@pytest.mark.parametrize(
-    "light, key",
-    [("lamp", "light.emitter.radiance.value"), ("point", "light.intensity.value"), ("sun", "light.irradiance.value"),
-     ("envmap", "light.data")],
-)  # fmt: skip
-def test_the_light_of_emitters_times_its_derivative_is_the_image(light, key):
-    scene = make(envmap() if light == "envmap" else light, boundary=ROUGH)
-    value = np.array(mi.traverse(scene)[key], dtype=float).ravel()
-    found = backward(scene, key)
-    assert value.size in (found.size, 1)
-    assert (value * found).sum() == pytest.approx((image(scene) * weights(scene)).sum(), rel=2e-3)
-
-
-@pytest.mark.parametrize("light", ["sky", "lamp", "point"])
-def test_derivatives_by_the_texture_of_another_surface_agree_with_finite_differences(light):
-    scene = make(light)
-    key = "floor.bsdf.reflectance.color1.value"
-    assert backward(scene, key).sum() == pytest.approx(difference(scene, key, 5e-3, mi.Float), rel=5e-3)
+    for key, found in derivatives(scene, ["light.radiance.value", FLOOR, "ball.bsdf.albedo"]).items():
+        assert forward(scene, key) == pytest.approx(found.sum(), rel=1e-4)
 
 
 def test_derivatives_by_a_bitmap_agree_with_finite_differences():
