@@ -6,6 +6,7 @@ import json
 import os
 import re
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from types import SimpleNamespace
@@ -84,6 +85,16 @@ def test_a_second_run_computes_nothing_and_gives_the_same(toy: Toy, tmp_path: Pa
         for image in result.images:
             assert second[name].images[image].dtype == np.float32
             np.testing.assert_array_equal(second[name].images[image], result.images[image])
+
+
+def test_parts_on_an_executor_come_after_what_they_need_and_give_the_same(toy: Toy, tmp_path: Path) -> None:
+    first = compute("toy", "draft", tmp_path / "here")
+    with ThreadPoolExecutor(2) as executor:
+        second = compute("toy", "draft", tmp_path / "there", executor=executor)
+    assert sorted(CALLS[3:5]) == ["a", "b"] and CALLS[5:] == ["gap"]
+    for name, result in first.items():
+        assert second[name].numbers == result.numbers
+        assert all((second[name].images[key] == image).all() for key, image in result.images.items())
 
 
 def test_a_part_that_another_figure_has_is_taken_from_there(toy: Toy, tmp_path: Path, monkeypatch: Any) -> None:
