@@ -17,7 +17,7 @@ FLOORS = {  # of each package, a room may import those to its left; "" is what l
     "halfspace_sss": [
         "", "physics", "interface", "tracing", "maps", "measure", "materials", "comparison", "neural",
         "neural.training", "rendering.object", "rendering.light", "rendering.gathered",
-        "rendering.walk", "rendering.paths", "rendering.scenes", "rendering", "trade",
+        "rendering.walk", "rendering.paths", "rendering.scenes", "rendering", "inverse", "trade",
         "trade.checking", "cli", "trade.commands",
     ],
     "full_geometry": ["object", "models", "learning", "neural_shape", ""],

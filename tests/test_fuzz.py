@@ -40,7 +40,8 @@ COMPUTES = [  # what is replaced: the properties are of what comes before the co
     "halfspace_sss.trade.assessing.assess_for", "halfspace_sss.trade.checking.check.check_scene",
     "halfspace_sss.trade.checking.random_scenes.write_scene", "figures.studies.shape_errors.evaluate",
     "full_geometry.learning.shape_training._ShapeTraining", "full_geometry.learning.training._ObjectTraining",
-    "full_geometry.command.errors_of", "figures.studies.paper_network.fit_paper",
+    "full_geometry.command.errors_of", "halfspace_sss.inverse.fitting.MediumDescent",
+    "figures.studies.paper_network.fit_paper",
     "figures.studies.rivals.error_table", "figures.studies.rivals.base_model_table",
 ]  # fmt: skip
 ODD = ["", " ", "nan", "inf", "-inf", "-1", "0", "1", "2", "0.5", "1e6", "1e400", "1,2", "0,", "1/2", "2/1", "marble",

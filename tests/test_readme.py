@@ -35,6 +35,7 @@ PAGES = [
             "biomedical",
             "figures",
             "cluster",
+            "inverse",
             "conventions",
             "learnt_models",
             "errors",

@@ -24,6 +24,7 @@ _OWN = {
     "bench": "bench_command",
     "curves": "curves_command",
     "errors": "errors_command",
+    "fit": "fit_command",
     "maps": "maps_command",
     "materials": "materials_command",
     "models": "models_command",

@@ -21,7 +21,7 @@ MEDIA = {
     "point": {"albedo": "0.95,0.9,0.8", "sigma_t": "1.0,0.5,0.8", "eta": 1.4},
 }
 WIDEST_Z = 4.0
-RUNS = 8
+RUNS = 6
 
 
 def _scene(light: str, n: int = 8, **surface: Any) -> mi.Scene:

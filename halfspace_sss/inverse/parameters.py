@@ -1,0 +1,144 @@
+"""What is fitted of a medium, in variables without bounds: logit albedo, log sigma_t or mfp, artanh g."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from halfspace_sss.checks import check_choice
+from halfspace_sss.rendering.object.objects import translucent_shapes
+from halfspace_sss.rendering.object.shape import name_of
+from halfspace_sss.rendering.object.translucent import VARIABLE
+
+NAMES = ("albedo", "sigma_t", "mfp", "g")
+ALBEDO = (1e-4, 1 - 1e-5)  # bounds
+G = 0.98  # |g| is less
+SIZES = (0.02, 5e3)  # of the object, mean free paths
+NEAR = 0.02  # of the way between bounds, in the variable, that counts as at a bound
+
+
+def translucent_object(scene: mi.Scene, name: str | None) -> mi.Shape:
+    """The translucent object of a scene by name, or the only one.
+
+    Raises:
+        ValueError: there is none of that name, or there are several and no name was given.
+    """
+    shapes = {shape.id(): shape for shape in translucent_shapes(scene)}
+    if name is None and len(shapes) == 1:
+        return next(iter(shapes.values()))
+    if name is None:
+        raise ValueError(f"object must be one of {', '.join(shapes)}, got none")
+    check_choice("object", name, shapes)
+    return shapes[name]
+
+
+@dataclass(frozen=True, eq=False)
+class FitParameters:
+    """What is fitted of one object.
+
+    Args:
+        names: of `NAMES`.
+        shape: the object.
+        extent: its size, mm.
+    """
+
+    names: tuple[str, ...]
+    shape: mi.Shape
+    extent: float
+
+    @classmethod
+    def of(cls, names: Sequence[str], shape: mi.Shape, mm_per_unit: float) -> FitParameters:
+        """Of an object.
+
+        Raises:
+            ValueError: a name is unknown or there twice, sigma_t and mfp are both asked for, or the medium varies.
+        """
+        if not names or len(set(names)) < len(names):
+            raise ValueError(f"parameters must be one or more of {', '.join(NAMES)}, each once, got {list(names)}")
+        for name in names:
+            check_choice("parameter", name, NAMES)
+        if {"sigma_t", "mfp"} <= set(names):
+            raise ValueError("parameters must be sigma_t or mfp, got both")
+        if not shape.bsdf().inside.is_homogeneous:
+            raise ValueError(f"the medium of {name_of(shape)} must be homogeneous to be fitted, got one that varies")
+        box = shape.bbox()
+        return cls(tuple(names), shape, float(dr.norm(box.max - box.min)) * mm_per_unit)
+
+    def start(self) -> dict[str, mi.Float | mi.Spectrum]:
+        """The variables of the medium as it is, within the bounds."""
+        surface, result = self.shape.bsdf(), {}
+        for name in self.names:
+            if name == "g":  # one for all channels
+                x = mi.Float(np.arctanh(np.clip(np.mean(np.ravel(surface.g)), -0.95 * G, 0.95 * G) / G))
+            elif name == "albedo":
+                a = np.clip(np.ravel(surface.albedo), 0.01, 0.999)
+                x = mi.Spectrum(np.log(a / (1 - a)).tolist())
+            else:
+                x = mi.Spectrum((np.log(np.ravel(surface.sigma_t)) * (1 if name == "sigma_t" else -1)).tolist())
+            result[name] = self.clipped(name, x)
+        return result
+
+    def bounds(self, name: str) -> tuple[float, float]:
+        """Of a variable."""
+        if name == "albedo":
+            return tuple(float(np.log(a / (1 - a))) for a in ALBEDO)
+        if name == "g":
+            return -3.0, 3.0
+        low, high = (float(np.log(size / self.extent)) for size in SIZES)
+        return (low, high) if name == "sigma_t" else (-high, -low)
+
+    def clipped(self, name: str, x: mi.Float | mi.Spectrum) -> mi.Float | mi.Spectrum:
+        """A variable within its bounds."""
+        return type(x)(dr.clip(x, *self.bounds(name)))
+
+    def values(self, x: dict[str, mi.Float | mi.Spectrum]) -> dict[str, mi.Spectrum]:
+        """Coefficients of the surface, with the gradients of the variables."""
+        result = {}
+        for name, value in x.items():
+            if name == "albedo":
+                result[name] = 1 / (1 + dr.exp(-value))
+            elif name == "g":
+                result[name] = mi.Spectrum(G * dr.tanh(value))
+            else:
+                result["sigma_t"] = dr.exp(value if name == "sigma_t" else -value)
+        return result
+
+    def put(self, x: dict[str, mi.Float | mi.Spectrum]) -> None:
+        """Set the medium of the object."""
+        surface, values = self.shape.bsdf(), self.values(x)
+        for name, value in values.items():
+            setattr(surface, name, value)
+        surface.parameters_changed([name for name in VARIABLE if name in values])
+
+    def shown(self, x: dict[str, mi.Float | mi.Spectrum]) -> dict[str, np.ndarray]:
+        """The parameters as numbers; mfp in mm, sigma_t in 1/mm."""
+        values = {name: np.ravel(np.array(dr.detach(value), dtype=float)) for name, value in self.values(x).items()}
+        if "mfp" in self.names:
+            values["mfp"] = 1 / values.pop("sigma_t")
+        if "g" in values:
+            values["g"] = values["g"][:1]
+        return {name: values[name] for name in self.names}
+
+    def slopes(self, x: dict[str, mi.Float | mi.Spectrum]) -> dict[str, np.ndarray]:
+        """Derivatives of the shown parameters by their variables."""
+        shown, result = self.shown(x), {}
+        for name, value in shown.items():
+            by = {"albedo": value * (1 - value), "g": G - value**2 / G}
+            result[name] = by.get(name, value)
+        return result
+
+    def at_bounds(self, x: dict[str, mi.Float | mi.Spectrum]) -> list[str]:
+        """A sentence for each parameter that lies at a bound."""
+        said = []
+        for name, value in self.shown(x).items():
+            low, high = self.bounds(name)
+            place = (np.ravel(np.array(x[name], dtype=float)) - low) / (high - low)
+            for c, share in enumerate(place):
+                if not NEAR < share < 1 - NEAR:
+                    which = f" of channel {c}" if len(place) > 1 else ""
+                    said.append(f"{name}{which} is at its bound: {value[c]:.4g}")
+        return said

@@ -1,0 +1,130 @@
+"""The fit of media to images: what is refused, what is found, and that it goes on where it was left."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+mi = pytest.importorskip("mitsuba")
+from halfspace_sss import inverse  # noqa: E402
+from halfspace_sss.cli import app as cli  # noqa: E402
+from halfspace_sss.inverse.views import GivenView, read_views  # noqa: E402
+from halfspace_sss.rendering.scenes.scene_files import open_scene  # noqa: E402
+
+pytestmark = pytest.mark.usefixtures("quiet_rgb")
+
+XML = """<scene version="3.0.0">
+  <integrator type="translucent_walk"><boolean name="hide_emitters" value="true"/></integrator>
+  <emitter type="directional"><vector name="direction" x="-0.2" y="0.3" z="-1"/></emitter>
+  <emitter type="constant"><float name="radiance" value="0.3"/></emitter>
+  <sensor type="perspective">
+    <float name="fov" value="14"/>
+    <transform name="to_world"><lookat origin="0,0,40" target="0,0,0" up="0,1,0"/></transform>
+    <film type="hdrfilm"><integer name="width" value="8"/><integer name="height" value="8"/>
+      <string name="pixel_format" value="rgb"/><rfilter type="box"/></film>
+  </sensor>
+  <shape type="sphere" id="ball">
+    <float name="radius" value="4"/>
+    <bsdf type="translucent">
+      <string name="albedo" value="0.9, 0.85, 0.68"/><string name="sigma_t" value="0.5"/><float name="eta" value="1"/>
+    </bsdf>
+  </shape>
+</scene>
+"""
+TRUE = {"albedo": (0.95, 0.9, 0.6), "sigma_t": (0.5, 0.5, 0.5)}
+
+
+def _scene(tmp_path: Path) -> mi.Scene:
+    (tmp_path / "a.xml").write_text(XML)
+    return open_scene(tmp_path / "a.xml")
+
+
+def _target(scene: mi.Scene, spp: int = 4096) -> np.ndarray:
+    surface = scene.shapes()[0].bsdf()
+    before = {name: getattr(surface, name) for name in TRUE}
+    for values in (TRUE, {name: np.ravel(value) for name, value in before.items()}):
+        for name, value in values.items():
+            setattr(surface, name, mi.Spectrum(np.array(value).tolist()))
+        surface.parameters_changed(list(TRUE))
+        if values is TRUE:
+            image = np.array(mi.render(scene, spp=spp, seed=99))
+    return image
+
+
+def test_views_and_parameters_that_do_not_fit_are_refused_by_name(tmp_path: Path) -> None:
+    scene, image = _scene(tmp_path), np.full((8, 8, 3), 0.5, np.float32)
+    good = GivenView.of("a", 0, image)
+
+    def refused(match: str, images: Any = (good,), names: tuple[str, ...] = ("albedo",), **more: Any) -> None:
+        with pytest.raises(ValueError, match=match):
+            inverse.fit(scene, list(images), names, model=None, **more)
+
+    refused("image a must be 8 x 8 of 3 channels as sensor 0, got 4 x 8", [GivenView.of("a", 0, image[:, :4])])
+    refused("sensor of a must be below 1", [GivenView.of("a", 1, image)])
+    refused("parameter must be one of albedo.*got 'albdo'; did you mean 'albedo'", names=("albdo",))
+    refused("sigma_t or mfp, got both", names=("mfp", "sigma_t"))
+    refused("object must be one of ball", object="bell")
+    refused("not held out, got none", [GivenView.of("a", 0, image, held_out=True)])
+    with pytest.raises(ValueError, match="image a must be finite, got 1 pixels"):
+        GivenView.of("a", 0, np.where(np.arange(192).reshape(8, 8, 3) == 7, np.nan, image))
+    aside = XML.replace('target="0,0,0"', 'target="0,40,0"')
+    (tmp_path / "b.xml").write_text(aside)
+    scene = open_scene(tmp_path / "b.xml")
+    refused("object ball must be seen by a view, got none of 1")
+
+
+def test_views_of_a_file_are_linear_and_leave_out_what_is_saturated(tmp_path: Path) -> None:
+    shown = np.full((2, 2, 3), 128, np.uint8)
+    shown[0, 0] = 255
+    mi.Bitmap(shown).write(str(tmp_path / "a.png"))
+    row = {"image": "a.png", "transfer": "srgb", "held_out": True}
+    (tmp_path / "views.json").write_text(json.dumps({"views": [row]}))
+    with pytest.warns(UserWarning, match="a.png: 1 saturated pixels do not count"):
+        (view,) = read_views(tmp_path / "views.json")
+    assert view.held_out and view.counts.tolist() == [[False, True], [True, True]]
+    assert view.image[1, 1] == pytest.approx(0.2158605, abs=1e-5)
+    for wrong, match in (({"image": "a.png"}, "must have a transfer"), ({**row, "senor": 0}, "did you mean 'sensor'")):
+        (tmp_path / "views.json").write_text(json.dumps({"views": [wrong]}))
+        with pytest.raises(ValueError, match=match):
+            read_views(tmp_path / "views.json")
+
+
+@pytest.mark.slow
+def test_the_albedo_of_an_object_is_found_from_its_image(tmp_path: Path) -> None:
+    scene = _scene(tmp_path)
+    views = [GivenView.of("a", 0, _target(scene))]
+    found = inverse.fit(scene, views, ("albedo",), settings=inverse.FitSettings(steps=32, spp=64))
+    assert found.values["albedo"] == pytest.approx(TRUE["albedo"], abs=0.015)
+    assert found.steps[-1].loss < found.steps[0].loss
+    assert not found.told
+
+
+@pytest.mark.slow
+def test_a_killed_fit_goes_on_with_the_same_bits_and_the_command_writes_a_scene(tmp_path: Path) -> None:
+    scene = _scene(tmp_path)
+    image = _target(scene, 64)
+    mi.Bitmap(image).write(str(tmp_path / "a.exr"))
+    (tmp_path / "views.json").write_text(json.dumps({"views": [{"image": "a.exr"}]}))
+    arguments = ["fit", str(tmp_path / "a.xml"), "--images", str(tmp_path / "views.json"), "--steps", "3", "--spp", "4"]
+    whole = CliRunner().invoke(cli.app, [*arguments, "--out", str(tmp_path / "whole")])
+    assert whole.exit_code == 0, whole.output
+
+    def kill(done: int, *_: Any) -> None:
+        if done == 2:
+            raise KeyboardInterrupt
+
+    how = {"settings": inverse.FitSettings(steps=3, spp=4), "work": tmp_path / "work"}
+    with pytest.raises(KeyboardInterrupt):
+        inverse.fit(tmp_path / "a.xml", read_views(tmp_path / "views.json"), progress=kill, **how)
+    rest = CliRunner().invoke(cli.app, [*arguments, "--out", str(tmp_path / "rest"), "--work", str(tmp_path / "work")])
+    assert rest.exit_code == 0, rest.output
+    numbers = [json.loads((tmp_path / each / "a_fit.json").read_text()) for each in ("whole", "rest")]
+    assert all(numbers[0][key] == numbers[1][key] for key in numbers[0] if key != "provenance")
+    medium = open_scene(tmp_path / "rest" / "a_fit.xml").shapes()[0].bsdf().inside.medium
+    assert medium.albedo == pytest.approx(numbers[0]["values"]["albedo"])
+    assert "[[material]]" in (tmp_path / "rest" / "a_fit.toml").read_text()
