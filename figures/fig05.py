@@ -11,11 +11,11 @@ import numpy as np
 
 from figures.computing.contenders import long_walk
 from figures.computing.images import FLIP, RELATIVE_MSE, compared, srgb
-from figures.computing.learnt import weights_in
 from figures.computing.scenes import BUNNY, bunny_scene, prepare
 from figures.drawing.style import TEXT, Look, paper, saved
 from figures.parts.part import Part, Result, Task
 from full_geometry.models.storing import KIND
+from halfspace_sss.neural.store import weights_in
 from halfspace_sss.provenance import check_folder
 from halfspace_sss.rendering.paths.integrator import is_bssrdf
 from halfspace_sss.rendering.scenes import online, reference

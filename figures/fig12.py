@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 
 from figures.computing.images import Shot, compared, stops_of
-from figures.computing.learnt import shape_of, weights_in
+from figures.computing.learnt import shape_of
 from figures.computing.scenes import BUNNY, bunny_scene, prepare
 from figures.drawing.image_grid import image_grid
 from figures.drawing.page import page
 from figures.drawing.style import paper, saved
 from figures.parts.part import Part, Result, Task
+from halfspace_sss.neural.store import weights_in
 
 TITLE = "one sample a pixel, with and without sampling that has learnt"
 SIZES = {"draft": 128, "paper": 512}

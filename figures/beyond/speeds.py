@@ -20,11 +20,12 @@ import pandas
 from figures.beyond.objects import VIEWS
 from figures.computing.contenders import WALK, ready, volume
 from figures.computing.images import cover
-from figures.computing.learnt import object_parts, weights_in
+from figures.computing.learnt import object_parts
 from figures.computing.scenes import prepare, scan_scene, surroundings
 from figures.computing.timed import TimedRender, alternating, rendered
 from figures.modelling.objects import VARYING, tissue
 from halfspace_sss import materials
+from halfspace_sss.neural.store import weights_in
 from halfspace_sss.physics.medium import Medium
 
 LIGHTS = ("windows", "lamp and sky")

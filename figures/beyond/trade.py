@@ -1,4 +1,4 @@
-"""The trade of speed for accuracy: five materials, two shapes and two lights by every way of rendering."""
+"""The trade of speed for accuracy: three materials, two shapes and two lights by walks, models and gathered light."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 
 from figures.computing.contenders import OF_OBJECTS
 from figures.computing.learnt import FULL_GEOMETRY, TRAIN_SECONDS, train_scan, training_of, weight_files, with_weights
-from figures.computing.scenes import BUNNY, MATERIALS, MM_PER_UNIT, bunny_scene, prepare
+from figures.computing.scenes import BUNNY, MM_PER_UNIT, bunny_scene, prepare
 from figures.drawing import trade_plot
 from figures.drawing.page import page
 from figures.drawing.style import paper, saved
@@ -21,18 +21,26 @@ from figures.drawing.trade_plot import image_shots, multiples
 from figures.parts.part import Part, Result, Task
 from halfspace_sss import materials
 from halfspace_sss.physics.medium import Medium
+from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED
 from halfspace_sss.trade.checking.random_scenes import RandomScene, mesh_file
 from halfspace_sss.trade.results import Assessment
+from halfspace_sss.trade.ways import GATHERED, LAMBERT, Way
 
 TITLE = "bias against time to a given noise, for every way of rendering"
+MATERIALS = ("marble", "potato", "ketchup")
 SHAPES = ("bunny", "spikes")
 LIGHTS = {"sky": "even sky", "small light": "small light"}
-SECONDS = {"draft": 2.0, "paper": 40.0}
+SECONDS = {"draft": 2.0, "paper": 24.0}
 SIZE = {"draft": 64, "paper": 128}
 SPP = {"draft": 16, "paper": 32}
 SPIKES = RandomScene(0, 0, "spikes", "sky", (), (), 0.0, 1.3, 0.0, (), 0.05, 1)
 TOLERANCE = 0.05
-NETWORKS = ("neural", "neural_material", "neural_shape")
+NETWORKS = ("neural", "neural_shape")
+LEARNT = (*NETWORKS, FULL_GEOMETRY)
+WAYS = (
+    PATH_TRACED, LAMBERT, "standard_dipole_normalized", "better_dipole", "directional_dipole", "photon_beam_diffusion",
+    *LEARNT, *(f"{model}, {GATHERED}" for model in ("better_dipole", *LEARNT)),
+)  # fmt: skip
 KNOB_MATERIALS = ("marble", "ketchup")
 KNOB_WAYS = ("better_dipole", "neural")
 
@@ -67,14 +75,14 @@ def measured(task: Task) -> dict[str, Any]:
     """The assessment of a scene, and an image by each way."""
     from halfspace_sss.trade.assessing import assess_stage
     from halfspace_sss.trade.images import small_images, with_flip
-    from halfspace_sss.trade.ways import stage, ways
+    from halfspace_sss.trade.ways import stage
 
     prepare()
     p, learnt = task.params, with_weights(task.folder, task.needed)
     with TemporaryDirectory() as folder, learnt, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # they are in the notes of the assessment
         on = stage(_scene(p, Path(folder)))
-        chosen = ways()
+        chosen = [Way.of(name) for name in WAYS]
 
         def tell(what: str, done: int, total: int) -> None:
             task.progress(done, total + 1)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import os
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -15,7 +14,7 @@ from figures.modelling.candle import make_candle
 from figures.modelling.objects import candle_parts, learnable_parts, make_varying, tissue
 from figures.parts.part import Part, Result, Task
 from halfspace_sss import bssrdf, materials, models
-from halfspace_sss.neural.store import ENVIRONMENT_VARIABLE
+from halfspace_sss.neural.store import weights_in
 from halfspace_sss.neural.symmetric import channels
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.provenance import check_folder
@@ -37,19 +36,6 @@ def shape_of(name: str, folder: Path, resolution: int = 96, seed: int = 0) -> tu
         return mi.load_dict({"type": "ply", "filename": str(BUNNY)}), materials.load("potato").medium, MM_PER_UNIT
     path = make_candle(resolution, seed).wax.write_ply(folder / "wax.ply")
     return mi.load_dict({"type": "ply", "filename": str(path)}), tissue("candle wax").medium, 1.0
-
-
-@contextmanager
-def weights_in(folder: Path) -> Iterator[None]:
-    """Weights are kept and looked for in a folder, and nowhere else."""
-    before = os.environ.get(ENVIRONMENT_VARIABLE)
-    os.environ[ENVIRONMENT_VARIABLE] = str(folder)
-    try:
-        yield
-    finally:
-        os.environ.pop(ENVIRONMENT_VARIABLE)
-        if before is not None:
-            os.environ[ENVIRONMENT_VARIABLE] = before
 
 
 FULL_GEOMETRY = "full_geometry"

@@ -32,7 +32,7 @@ from full_geometry.models.storing import frame_of, identify
 from full_geometry.object.features import n_local, n_pair, n_side
 from full_geometry.object.pairs import EntryProposals, Pairs, PairSource, WalkExits, shuffled
 from full_geometry.object.patches import Patches, PatchSampler, cluster
-from halfspace_sss.backend import busy_threads
+from halfspace_sss.backend import clock
 from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.neural.store import check_weights_folder, to_json
 from halfspace_sss.neural.training.work_folder import CHECKPOINT, claim
@@ -290,12 +290,12 @@ def train_by_cpu(
         seed, recipe: of everything; sizes and rates.
     """
     check_interval("seconds", seconds, 1e-3, 1e7)
-    run, began = _ObjectTraining(obj, recipe, seed, None, None), time.process_time()
+    run, began = _ObjectTraining(obj, recipe, seed, None, None), clock()
     run._prepare()
     while run.done < run.total:
         run._chunk(seconds, time.process_time)
     run.fitting.solve(run.source, run.done, seed)
-    spent = (time.process_time() - began) / busy_threads()  # of all cores, as the trade counts
+    spent = clock() - began
     record = run._record(run._judged(reference(obj, EXITS, WALKS, seed), SAMPLES), spent)
     return run.learnt(), storing.save(folder, run.identity, run.arrays(), record)
 
@@ -348,7 +348,7 @@ class _ObjectTraining:
     def go(
         self, seconds: float, chunks: int | None, target: float | None, folder: Path, progress: Progress | None
     ) -> Trained:
-        started = time.monotonic()
+        started, began = time.monotonic(), clock()
         self._prepare(chunks)
         truth = reference(self.object, EXITS, WALKS, self.seed)
         saved, what = time.monotonic(), "training"
@@ -366,10 +366,10 @@ class _ObjectTraining:
                 progress(what, self.done, self.total)
         self.fitting.solve(self.source, self.done, self.seed)
         errors = self._judged(truth, 2 * WALKS)
-        spent = time.monotonic() - started
         self._save_camera()
-        path = storing.save(folder, self.identity, self.arrays(), self._record(errors, spent))
-        return Trained(*self.learnt(), path, errors, self.fitting.step, spent)
+        record = self._record(errors, clock() - began)  # of all cores, as the trade counts
+        path = storing.save(folder, self.identity, self.arrays(), record)
+        return Trained(*self.learnt(), path, errors, self.fitting.step, time.monotonic() - started)
 
     def _prepare(self, chunks: int | None = None) -> None:
         """Scales and shares from a pilot, which compiles all kernels; the work of a run that was killed."""

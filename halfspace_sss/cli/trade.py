@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from halfspace_sss.trade.advice import Advice, Job
     from halfspace_sss.trade.results import ObjectTrade, WayTrade
 
-SHIPPED = "trade.csv"  # in the package: five materials, two shapes, two lights
+SHIPPED = "trade.csv"  # in the package: three materials, two shapes, two lights
 TOLERANCE, IMAGES, ASSESS = 0.05, 1, 4.0
 
 
@@ -49,6 +49,9 @@ def trade_command(
     way: Annotated[list[str] | None, typer.Option(hidden=True)] = None,  # what --model was called before
     every: Annotated[bool, typer.Option("--all", help="Every way, also those that cannot win.")] = False,
     assess: Annotated[float, typer.Option(help="Seconds of measuring for each object.")] = ASSESS,
+    train_seconds: Annotated[
+        float, typer.Option(help="Learn objects without weights first, for so many seconds each; the time counts.")
+    ] = 0.0,
     r: Annotated[str | None, typer.Option(help="Of a material: smallest and largest distance, mm, as 0.1,20.")] = None,
     sensor: SensorNumber = 0,
     seed: SampleSeed = 0,
@@ -75,6 +78,7 @@ def trade_command(
 
         models = [way.name for way in ways()] if every and models is None else models
         how = {"seconds": assess, "models": models, "sensor": sensor, "seed": seed, "parameters": parameters}
+        how |= {"train_seconds": train_seconds}
         _scene(Path(what), Job(tolerance, images, seconds), how, out)
     else:
         check_left_out({"seconds": seconds, "define": define}, "with a material")

@@ -11,7 +11,8 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -160,6 +161,19 @@ def weights_folder() -> Path:
         return Path(os.environ[ENVIRONMENT_VARIABLE])
     variable, default = ("LOCALAPPDATA", "AppData/Local") if os.name == "nt" else ("XDG_DATA_HOME", ".local/share")
     return Path(os.environ.get(variable) or Path.home() / default) / "halfspace-sss" / "weights"
+
+
+@contextmanager
+def weights_in(folder: Path) -> Iterator[None]:
+    """Weights are kept and looked for in a folder, and nowhere else."""
+    before = os.environ.get(ENVIRONMENT_VARIABLE)
+    os.environ[ENVIRONMENT_VARIABLE] = str(folder)
+    try:
+        yield
+    finally:
+        os.environ.pop(ENVIRONMENT_VARIABLE)
+        if before is not None:
+            os.environ[ENVIRONMENT_VARIABLE] = before
 
 
 def check_weights_folder(folder: str | Path | None = None) -> Path:

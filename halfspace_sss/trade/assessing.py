@@ -14,7 +14,7 @@ from halfspace_sss.progress import NamedProgress
 from halfspace_sss.rendering.object.registry import learnt_names, lookup
 from halfspace_sss.rendering.object.shape import survey
 from halfspace_sss.rendering.paths.gathering import PART
-from halfspace_sss.rendering.scenes.learners import CostedLearner
+from halfspace_sss.rendering.scenes.learners import CostedLearner, Learner, learner
 from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED, first_cause
 from halfspace_sss.trade.exits import Exits, visible_exits
 from halfspace_sss.trade.images import with_flip
@@ -67,6 +67,7 @@ def assess(
     images: int = 1,
     exits: int = EXITS,
     parameters: dict[str, str] | None = None,
+    train_seconds: float = 0.0,
     progress: NamedProgress | None = None,
     only: Sequence[str] | None = None,
 ) -> Assessment:
@@ -89,6 +90,8 @@ def assess(
         images: of that job.
         exits: points of each object.
         parameters: values of the parameters $name of an XML file.
+        train_seconds: that each object without weights is learnt for before, as `train object` does; 0 for what has
+            been learnt. The time of a training is a cost of its model.
         progress: called with (what, done, total).
         only: what `models` was called before.
 
@@ -104,12 +107,15 @@ def assess(
     if tolerance is not None:
         check_interval("tolerance", tolerance, 1e-4, 10.0)
     check_count("images", images, 1)
+    check_interval("train_seconds", train_seconds, 0.0, 1e7)
     named = renamed(models, only, "models", "only")
     chosen = _chosen(named if named is not None or tolerance is None else CANDIDATES)
     on = stage(scene, parameters)
     check_count("sensor", sensor, 0)
     if sensor >= len(on.scene.sensors()):
         raise ValueError(f"sensor must be below {len(on.scene.sensors())}, the number of sensors, got {sensor}")
+    if train_seconds > 0:
+        learn(on, train_seconds, seed, progress)
     how = {"seconds": seconds, "sensor": sensor, "seed": seed, "exits": exits, "progress": progress}
     if tolerance is None:
         result = assess_stage(on, chosen, **how)
@@ -259,8 +265,30 @@ def training_seconds(scene: Any, object: str, model: str) -> float:
 
     A learner of the group `halfspace_sss.learners` tells them by a function `cost(scene, object)`.
     """
-    learner = lookup(model).learner if model in learnt_names() else None
-    return float(learner.cost(scene, object)) if isinstance(learner, CostedLearner) else 0.0
+    learns = lookup(model).learner if model in learnt_names() else None
+    return float(learns.cost(scene, object)) if isinstance(learns, CostedLearner) else 0.0
+
+
+def learn(on: Stage, seconds: float, seed: int = 0, progress: NamedProgress | None = None) -> None:
+    """Learn each object of a stage that has no weights yet; one that cannot be learnt is left out with a warning."""
+    learns = learner()
+    how = {"seconds": seconds, "target_error": None, "seed": seed, "folder": None, "work": None, "progress": progress}
+    for name in on.names:
+        if not _is_learnt(learns, on.scene, name):
+            try:
+                learns.train(on.scene, object=name, **how)
+            except ValueError as error:
+                warnings.warn(f"object {name!r} is not learnt: {first_cause(error)}", stacklevel=3)
+
+
+def _is_learnt(learns: Learner, scene: Any, object: str) -> bool:
+    if not isinstance(learns, CostedLearner):
+        return False
+    try:
+        learns.cost(scene, object)
+    except ValueError:
+        return False
+    return True
 
 
 # --------------------------------------------------------------------------------------------------

@@ -7,10 +7,11 @@ import math
 from pathlib import Path
 from typing import Any
 
+from halfspace_sss.neural.store import weights_in
 from halfspace_sss.provenance import provenance, write_atomically
 from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED
 from halfspace_sss.trade.advice import Job, advise
-from halfspace_sss.trade.assessing import assess_for
+from halfspace_sss.trade.assessing import assess_for, learn
 from halfspace_sss.trade.automatic import picked
 from halfspace_sss.trade.checking.random_scenes import RandomScene, write_scene
 from halfspace_sss.trade.checking.truth import long_run
@@ -19,19 +20,27 @@ from halfspace_sss.trade.statistics import seeded
 from halfspace_sss.trade.ways import Stage, Way, stage
 
 WAYS = (
-    PATH_TRACED, "lambert", "better_dipole", "directional_dipole", "neural", "better_dipole, gathered",
-    "directional_dipole, gathered", "neural, gathered",
+    PATH_TRACED, "lambert", "better_dipole", "neural", "full_geometry",
+    "better_dipole, gathered", "neural, gathered", "full_geometry, gathered",
 )  # fmt: skip
-FORMAT = "halfspace-sss trade check 4"
+LEARNT = "full_geometry"
+TRAIN_SECONDS = 20.0
+FORMAT = "halfspace-sss trade check 5"
 
 
 def check_scene(scene: RandomScene, folder: Path, seconds: float, truth_seconds: float) -> dict[str, Any]:
-    """The record of a scene: the assessment, and the mean of long runs; what the folder holds is not run again."""
+    """The record of a scene: the assessment, and the mean of long runs; what the folder holds is not run again.
+
+    Its object is learnt before, which is a cost of the model that needs it.
+    """
     file = write_scene(scene, folder)
     on, ways = stage(file), [Way.of(name) for name in WAYS]
-    quick = _quick(scene, on, ways, file.with_suffix(".json"), seconds)
-    truth = file.with_suffix(".truth.json")
-    long = long_run(on, ways, scene.tolerance, truth, seeded(scene.seed, scene.number, 1), truth_seconds)
+    with weights_in(folder / "weights"):
+        if any(way.model == LEARNT for way in ways):
+            learn(on, TRAIN_SECONDS)
+        quick = _quick(scene, on, ways, file.with_suffix(".json"), seconds)
+        truth = file.with_suffix(".truth.json")
+        long = long_run(on, ways, scene.tolerance, truth, seeded(scene.seed, scene.number, 1), truth_seconds)
     return {"scene": scene.record(), "quick": quick, "long": long.record()}
 
 
@@ -68,7 +77,7 @@ def outcome(record: dict[str, Any]) -> dict[str, Any]:
     cheapest = min(least, key=lambda name: least[name])
     known = [name for name, w in truth.items() if w.bias2 + 2 * w.bias2_error < scene.tolerance**2]
     sure = min((least[name] for name in known), default=math.inf)
-    cost = row.preparation + scene.images * pixels * option.spp * row.seconds
+    cost = row.training + row.preparation + scene.images * pixels * option.spp * row.seconds
     automatic = picked(quick.objects[0], scene.tolerance).model
     results |= {"way": option.way, "spp": option.spp, "error": math.sqrt(error2)}
     results |= {"error_standard_error": error2_error / (2 * math.sqrt(error2)), "cost_s": cost}
@@ -83,11 +92,11 @@ def outcome(record: dict[str, Any]) -> dict[str, Any]:
 
 
 def _least(row: WayTrade, scene: RandomScene, pixels: float) -> float:
-    """Seconds of a job by a way if bias and variance were known."""
+    """Seconds of a job by a way if bias and variance were known, training and preparation included."""
     left = scene.tolerance**2 - max(row.bias2, 0.0)
     if not left > 0:
         return math.inf
-    return row.preparation + scene.images * pixels * max(math.ceil(row.variance / left), 1) * row.seconds
+    return row.training + row.preparation + scene.images * pixels * max(math.ceil(row.variance / left), 1) * row.seconds
 
 
 def z_values(record: dict[str, Any]) -> list[tuple[str, float]]:

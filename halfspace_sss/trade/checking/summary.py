@@ -8,11 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from halfspace_sss.trade.checking.check import WAYS, outcome, z_values
+from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED
+from halfspace_sss.trade.checking.check import TRAIN_SECONDS, WAYS, outcome, z_values
 
 if TYPE_CHECKING:
     import pandas
 
+ASKED = 5.0  # seconds of an assessment
 DEAR = 1.5  # times the cheapest way, up to which a recommendation is called cheap
 ALWAYS = ("neural", "better_dipole", "path_traced", "auto")
 
@@ -42,6 +44,13 @@ def summary(records: Sequence[dict[str, Any]]) -> dict[str, Any]:
     results["assess_s"] = float(table["seconds"].max())
     results["z"] = {"count": len(z), "mean": float(z.mean()), "sd": float(z.std(ddof=1)) if len(z) > 1 else math.nan}
     results["z"] |= {"beyond_2": float(np.mean(np.abs(z) > 2)), "beyond_3": float(np.mean(np.abs(z) > 3))}
+    results["assess_median_s"], results["quick"] = (
+        float(table["seconds"].median()),
+        int((table["seconds"] <= ASKED).sum()),
+    )
+    results["models_cheapest"] = int((table["cheapest"] != PATH_TRACED).sum())
+    results["models_recommended"] = int((table["way"] != PATH_TRACED).sum())
+    results["cheapest"] = {str(k): int(v) for k, v in table["cheapest"].value_counts().items()}
     results["recommended"] = {str(k): int(v) for k, v in table["way"].value_counts().items()}
     results["always"] = {name: _always(table, name) for name in ALWAYS}
     results["recommended_s"], results["cheapest_s"] = float(table["cost_s"].sum()), float(table["cheapest_s"].sum())
@@ -64,11 +73,11 @@ INTRODUCTION = """\
 # What the advice of the trade is worth
 
 Written by `halfspace-sss study trade-check` ({arguments}): random scenes of shape x medium x light x size x tolerance.
-Each has {assess:g} s for a recommendation among {ways} ways, and up to {truth:g} s of long runs with exits and samples
-of their own. A long run ends when bias² is known to a fifth of the squared tolerance and variances to 15 %. Times are
-those of the processor, all cores together. *Always* is the cost of one fixed choice where it can keep the tolerance,
-with as many samples as the long runs say. `auto` is the choice of the model of that name for the tolerance of the
-scene.
+Each object is learnt for {train:g} s before. Each scene has {assess:g} s for a recommendation among {ways} ways, and up
+to {truth:g} s of long runs with exits and samples of their own. A long run ends when bias² is known to a fifth of the
+squared tolerance and variances to 15 %. Times are those of the processor, all cores together, training and
+preparation included. *Always* is the cost of one fixed choice where it can keep the tolerance, with as many samples as
+the long runs say. `auto` is the choice of the model of that name for the tolerance of the scene.
 """
 
 
@@ -85,7 +94,9 @@ def markdown(values: dict[str, Any], table: pandas.DataFrame, how: dict[str, Any
         f"--{key} {how[key]}" for key in ("scenes", "first", "seed", "tolerance") if how[key] is not None
     )
     lines = [
-        INTRODUCTION.format(arguments=f"`{arguments}`", ways=len(WAYS), **{k: how[k] for k in ("assess", "truth")}),
+        INTRODUCTION.format(
+            arguments=f"`{arguments}`", ways=len(WAYS), train=TRAIN_SECONDS, **{k: how[k] for k in ("assess", "truth")}
+        ),
         f"{values['kept']} of {n} recommendations keep their tolerance (within two standard errors of the long run), "
         f"{values['cheap']} cost at most {DEAR:g} times the cheapest way that does by the long run, "
         f"{values['surely_cheap']} of the cheapest that does by two of its standard errors; an assessment took at most "
@@ -94,6 +105,12 @@ def markdown(values: dict[str, Any], table: pandas.DataFrame, how: dict[str, Any
         f"(bias² of the assessment - bias² of the long run) over their standard errors, {z['count']} pairs: mean "
         f"{z['mean']:+.2f}, standard deviation {z['sd']:.2f}, {100 * z['beyond_2']:.1f} % beyond 2, "
         f"{100 * z['beyond_3']:.1f} % beyond 3.",
+        "",
+        f"A model is the cheapest way by the long run in {values['models_cheapest']} of {n} scenes, and recommended in "
+        f"{values['models_recommended']}. Assessments of at most {ASKED:g} s: {values['quick']}; median "
+        f"{values['assess_median_s']:.2g} s.",
+        "",
+        f"Cheapest by the long run: {', '.join(f'{name} {count}' for name, count in values['cheapest'].items())}.",
         "",
         f"Recommended: {', '.join(f'{name} {count}' for name, count in values['recommended'].items())}.",
         "",
