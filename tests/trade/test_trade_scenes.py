@@ -246,6 +246,28 @@ def test_the_command_measures_a_scene_and_writes_files(tmp_path: Path, monkeypat
     assert "is the cheapest that keeps 0.4" in result.stdout
 
 
+def test_objects_without_weights_are_learnt_before_and_refusals_are_heard(monkeypatch: pytest.MonkeyPatch) -> None:
+    from halfspace_sss.trade import assessing
+
+    class Learnt:
+        asked: list[tuple[str, float]] = []
+
+        def cost(self, scene: Any, object: str) -> float:
+            if object != "ball0":
+                raise ValueError("no weights")
+            return 3.0
+
+        def train(self, scene: Any, *, object: str, seconds: float, **how: Any) -> None:
+            self.asked.append((object, seconds))
+            if object == "ball2":
+                raise ValueError("ball2 must be closed")
+
+    monkeypatch.setattr(assessing, "learner", Learnt)
+    with pytest.warns(UserWarning, match="'ball2' is not learnt: ball2 must be closed"):
+        assessing.learn(stage(scene(n=3)), 7.0)
+    assert Learnt.asked == [("ball1", 7.0), ("ball2", 7.0)]
+
+
 def test_the_check_goes_on_where_it_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from halfspace_sss.trade.checking import check, truth
 
