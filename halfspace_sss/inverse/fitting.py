@@ -86,7 +86,7 @@ class MaterialFit:
         errors: standard errors by the Gauss-Newton matrix and the misfit.
         correlation: of all numbers in the order of `values`.
         medium: of the object.
-        misfit: root of the loss of all fitted views at the end.
+        misfit: root of the loss of all fitted views at the end; 0 if noise takes the loss below 0.
         held_out: likewise of views held out; None without any.
         exposures: factor by which each view's image of the medium is multiplied to match the given one.
         told: sentences about bounds and about what the images do not tell.
@@ -260,7 +260,9 @@ class MediumDescent:
         losses = {which: self._compare(which, end)[0] for which in range(len(self.views))}
         fitted = float(np.mean([losses[which] for which in self.fitted]))
         held = [loss for which, loss in losses.items() if self.views[which].held_out]
-        covariance = self._covariance(max(fitted, 0.0))
+        last = np.array([step.loss for step in self.steps[int((1 - AVERAGED) * end) :]])
+        noise = float(last.std() / np.sqrt(len(last)))  # of its mean, which may be below 0
+        covariance = self._covariance(max(float(last.mean()), noise))
         slopes = np.concatenate(list(self.parameters.slopes(x).values()))
         error = np.sqrt(np.maximum(np.diag(covariance), 0))
         correlation = covariance / np.maximum(np.outer(error, error), 1e-30)
@@ -275,7 +277,7 @@ class MediumDescent:
         return MaterialFit(values, errors, correlation, medium, _root(fitted), test, exposures, told, self.steps)
 
     def _covariance(self, loss: float) -> np.ndarray:
-        """Of the variables: loss (J^T w J)^-1, with the Jacobians of two independent renders in the product."""
+        """Of the variables: loss (J^T w J)^-1; the Jacobians of two independent renders stand in the product."""
         size = sum(len(_numbers(x)) for x in self.adam.values())
         normal, count = np.zeros((size, size)), 0
         for which in self.fitted:
