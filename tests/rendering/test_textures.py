@@ -261,3 +261,15 @@ def test_textures_without_a_place_on_a_mesh_are_refused(texture: str | None, col
     albedo = _texels(PLAIN["albedo"]) if texture is None else {"type": "mesh_attribute", "name": texture}
     with pytest.raises(ValueError, match=message):
         _on_mesh({**PLAIN, "albedo": albedo}, color)
+
+
+def test_uv_at_a_point_of_a_face_is_that_of_a_ray_there() -> None:
+    texels = np.random.default_rng(2).uniform(0.1, 0.9, (8, 8, 3))
+    surface = {**PLAIN, "albedo": _bitmap(texels, filter_type="bilinear")}
+    cube = {"type": "cube", "to_world": mi.ScalarTransform4f().scale(5).rotate([1, 1, 0], 30)}
+    obj = make_objects(mi.load_dict(_scene({**surface, "model": "lambert"}, shape=cube)), Settings())[0]
+    o = np.random.default_rng(3).normal(size=(3, 64))
+    o /= np.linalg.norm(o, axis=0)
+    si = obj.geometry.scene.ray_intersect(mi.Ray3f(mi.Point3f(20 * o), mi.Vector3f(-o)))
+    found = obj.textured.at_point(obj.geometry, si.p, si.n, si.prim_index).albedo
+    np.testing.assert_allclose(np.array(found), np.array(obj.textured.at(si).albedo), atol=1e-4)
