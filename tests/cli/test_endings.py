@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
@@ -30,7 +31,7 @@ SMALL = {  # a small run of each command, and what it refuses
     "study speeds": (["--object", "candle", "--out", "o"], ["--object", "marbel"]),
     "study trade-check": (["--scenes", "1", "--out", "o"], ["--scenes", "-1"]),
     "trade": (["ball.xml", "--model", "better_dipole", "--assess", "0.2", "--out", "o"], ["marbel"]),
-    "train material": (["--out", "o", "--work", "o/work"], ["marbel"]),
+    "train material": (["--fast", "--out", "o", "--work", "o/work"], ["marbel"]),
     "train object": (["--scene", "ball.xml", "--out", "o"], ["--scene", "none.xml"]),
     "train shapes": (["--out", "o"], ["--mesh", "none.ply"]),
     "train universal": (["--out", "o"], ["--steps", "0"]),
@@ -46,11 +47,33 @@ def stub(*_, progress, **__):
 module.ablation, module.summary = stub, lambda table: table
 """
 HARNESS = """
-import os, signal, sys
+import atexit, gc, json, os, signal, subprocess, sys
+from pathlib import Path
+import matplotlib.pyplot, pandas, scipy.interpolate, torch, zarr  # once for all runs: each is a fork
 from halfspace_sss.cli import shared
 from halfspace_sss.cli import app as cli
-moment, stub = sys.argv[1:3]
-del sys.argv[1:3]
+cli._app()
+gc.freeze()
+
+for folder, mount, moment, stub, arguments in json.loads(sys.argv[1]):
+    os.chdir(folder)
+    if mount:
+        os.mkdir("o")
+        subprocess.run(["mount", "-t", "tmpfs", "-o", mount, "none", "o"], check=True)
+    child = os.fork()
+    if child == 0:
+        break
+    status = os.waitpid(child, 0)[1]
+    files = [str(path.relative_to("o")) for path in Path("o").rglob("*") if path.is_file()]
+    Path("ended.json").write_text(json.dumps([os.waitstatus_to_exitcode(status), Path("err").read_text(), files]))
+    if mount:
+        subprocess.run(["umount", "-l", "o"], check=True)
+else:
+    sys.exit()
+
+for k, name in ((1, "out"), (2, "err")):
+    os.dup2(os.open(name, os.O_WRONLY | os.O_CREAT), k)
+sys.argv[1:] = arguments
 exec(stub)
 def before(function):
     def changed(*arguments, **options):
@@ -64,7 +87,13 @@ elif moment == "progress":
     shared.Bar.show = before(shared.Bar.show)
 elif moment == "file":
     os.fsync, os.replace = before(os.fsync), before(os.replace)
-cli.main()
+try:
+    cli.main()
+except SystemExit as end:  # as the interpreter ends, but for its modules, which take half a second
+    atexit._run_exitfuncs()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(end.code or 0)
 """
 COLUMNS = {
     "bad input": ("none", "work", "2"),
@@ -87,26 +116,18 @@ LONG = (
 )  # minutes
 
 
-def _ended(command: str, column: str, folder: Path) -> tuple[str, str, set[str]]:
-    """Exit code, stderr and files left of a run."""
+def _run(command: str, column: str, folder: Path) -> tuple[str, str | None, str, str, list[str]]:
+    """Folder, mount, moment of the interrupt, stub and arguments of a run."""
     moment, place, _ = COLUMNS[column]
     small, wrong = SMALL[command]
     (folder / "ball.xml").write_text(XML)
     arguments = [*command.split(), *(wrong if column == "bad input" else small)]
-    run = [sys.executable, "-c", HARNESS, moment, STUB if command == "study ablation" else "", *arguments]
-    if place in MOUNTS:
-        (folder / "o").mkdir()
-        script = f'mount -t tmpfs -o {MOUNTS[place]} none o && "$@"; code=$?; find o -type f >left; exit $code'
-        run = ["unshare", "-rm", "sh", "-c", script, "sh", *run]
-    done = subprocess.run(run, capture_output=True, text=True, cwd=folder, timeout=600)
-    mounted = (folder / "left").read_text().split("\n") if place in MOUNTS else []
-    found = {*mounted, *(str(p.relative_to(folder)) for p in (folder / "o").rglob("*") if p.is_file())} - {""}
-    return str(done.returncode), done.stderr, found
+    return str(folder), MOUNTS.get(place), moment, STUB if command == "study ablation" else "", arguments
 
 
 def _kinds(files: set[str]) -> str:
     """The files in the folder of the results, a store as one."""
-    names = {re.sub(r"\.zarr/.*", ".zarr/", name.removeprefix("o/")) for name in files}
+    names = {re.sub(r"\.zarr/.*", ".zarr/", name) for name in files}
     return ", ".join(sorted(names)) or "none"
 
 
@@ -114,13 +135,16 @@ def _kinds(files: set[str]) -> str:
 def table(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, str], tuple[str, str, set[str]]]:
     if shutil.which("unshare") is None or subprocess.run(["unshare", "-rm", "true"]).returncode:
         pytest.skip("a full disk and a read-only folder need a mount namespace")
-    found = {}
-    for command in SMALL:
-        for column in COLUMNS:
-            if command in (*NO_FILES, *LONG) and column not in ("bad input", "interrupt at the start"):
-                continue
-            found[command, column] = _ended(command, column, tmp_path_factory.mktemp("run"))
-    return found
+    runs = {
+        (command, column): _run(command, column, tmp_path_factory.mktemp("run"))
+        for command in SMALL
+        for column in COLUMNS
+        if command not in (*NO_FILES, *LONG) or column in ("bad input", "interrupt at the start")
+    }
+    command = ["unshare", "-rm", sys.executable, "-c", HARNESS, json.dumps(list(runs.values()))]
+    subprocess.run(command, check=True, timeout=1800)
+    ended = {key: json.loads((Path(run[0]) / "ended.json").read_text()) for key, run in runs.items()}
+    return {key: (str(code), messages, set(files)) for key, (code, messages, files) in ended.items()}
 
 
 def test_every_command_is_in_the_table() -> None:

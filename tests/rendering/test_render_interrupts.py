@@ -22,20 +22,21 @@ import mitsuba as mi
 scene = scene_of(sys.argv[1], 128)
 mi.render(scene, spp=1)
 sent = []
-def send():
-    time.sleep(float(sys.argv[2]))
+def send(wait):
+    time.sleep(wait)
     sent.append(time.monotonic())
     os.kill(os.getpid(), signal.SIGINT)
-threading.Thread(target=send, daemon=True).start()
-try:
-    mi.render(scene, spp=2**13).numpy()
-except KeyboardInterrupt:
-    print("heard after", time.monotonic() - sent[0])
-try:
-    os.kill(os.getpid(), signal.SIGINT)
-    time.sleep(5)
-except KeyboardInterrupt:
-    print("heard again")
+for wait in (0.1, 1.5):
+    threading.Thread(target=send, args=(wait,), daemon=True).start()
+    try:
+        mi.render(scene, spp=2**13).numpy()
+    except KeyboardInterrupt:
+        print("heard after", time.monotonic() - sent[-1])
+    try:
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(5)
+    except KeyboardInterrupt:
+        print("heard again")
 print(sys.getprofile(), mi.render(scene, spp=1).numpy().mean() > 0)
 """
 
@@ -60,14 +61,14 @@ def scene_of(kind: str, size: int, sampler: str = "independent"):
 
 
 @pytest.mark.parametrize("integrator", ["bssrdf", "translucent_walk"])
-@pytest.mark.parametrize("wait", [0.1, 1.5])
-def test_an_interrupt_is_heard_in_a_launch_and_so_is_the_next_one(integrator: str, wait: float) -> None:
-    run = [sys.executable, "-c", CODE, integrator, str(wait)]
-    done = subprocess.run(run, capture_output=True, text=True, timeout=120, cwd=os.getcwd())
+def test_an_interrupt_is_heard_early_and_late_in_a_launch_and_so_is_the_next_one(integrator: str) -> None:
+    run = [sys.executable, "-c", CODE, integrator]
+    done = subprocess.run(run, capture_output=True, text=True, timeout=240, cwd=os.getcwd())
     assert done.returncode == 0, done.stderr
     lines = [line for line in done.stdout.splitlines() if "WARN" not in line]
-    assert float(next(line for line in lines if "heard after" in line).split()[-1]) < 3  # 0.4 s alone on two cores
-    assert any("heard again" in line for line in lines) and any("None True" in line for line in lines)
+    heard = [float(line.split()[-1]) for line in lines if "heard after" in line]
+    assert len(heard) == 2 and max(heard) < 3  # 0.4 s alone on two cores
+    assert sum("heard again" in line for line in lines) == 2 and any("None True" in line for line in lines)
 
 
 def test_images_in_many_launches_have_the_mean_of_images_in_one(monkeypatch: pytest.MonkeyPatch) -> None:
