@@ -13,7 +13,7 @@ import halfspace_sss
 from halfspace_sss.neural import universal
 from halfspace_sss.neural.store import load_weights, save_weights
 from halfspace_sss.neural.universal import shipped_weights
-from halfspace_sss.rendering.scenes.identity import learnt, scene_hash
+from halfspace_sss.rendering.scenes.identity import learnt, object_digest, scene_hash
 from halfspace_sss.rendering.scenes.scene_files import load_scene
 
 pytestmark = pytest.mark.usefixtures("rgb")
@@ -120,6 +120,13 @@ def test_media_that_differ_in_the_last_digits_are_different_scenes() -> None:
         return scene_hash(found, found.integrator())
 
     assert scene(2.0) == scene(2.0) != scene(float(np.nextafter(2.0, 3.0)))
+
+
+def test_another_attribute_of_a_mesh_is_another_scene() -> None:
+    def digest(name: str) -> str:
+        return object_digest(mi.load_dict({"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": name}}))
+
+    assert digest("vertex_color") != digest("vertex_albedo")
 
 
 def test_objects_that_swap_their_surfaces_are_another_scene() -> None:

@@ -12,9 +12,12 @@ import numpy as np
 
 from halfspace_sss.rendering.paths.integrator import is_bssrdf
 
-# a name says nothing of the image, an address nothing of the scene, and how many samples are taken is told elsewhere
+# a name says nothing of the image but that of an attribute, an address nothing of the scene, and how many samples are
+# taken is told elsewhere
 _MADE_UP = re.compile(r"0x[0-9a-fA-F]+|\bobject_\d+|\b_unnamed_\d+|__Root\w*")
-_LEFT_OUT = re.compile(r'^\s*(name = ".*"|(sample_count|samples_per_wavefront|wavefront_size) = \d+),?$', re.MULTILINE)
+_LEFT_OUT = re.compile(
+    r'^\s*(name = "(?!vertex_|face_).*"|(sample_count|samples_per_wavefront|wavefront_size) = \d+),?$', re.MULTILINE
+)
 
 
 def scene_hash(scene: Any, integrator: Any) -> str:
