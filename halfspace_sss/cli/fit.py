@@ -35,10 +35,9 @@ def fit_command(
     parameter: Annotated[str, typer.Option(help="Of albedo, sigma_t, mfp, g.")] = "albedo,sigma_t",
     model: Annotated[str, typer.Option(help="translucent_walk, or the name of a model.")] = "translucent_walk",
     object: ObjectId = None,  # noqa: A002
-    steps: Annotated[int, typer.Option(help="Steps of Adam.", parser=whole)] = 150,
+    steps: Annotated[int, typer.Option(help="Gauss-Newton steps.", parser=whole)] = 30,
     spp: Annotated[int, typer.Option(help="Samples a pixel of each render of a step.", parser=whole)] = 64,
     batch: Annotated[int, typer.Option(help="Views a step.", parser=whole, show_default="4, or all")] = 0,
-    rate: Annotated[float, typer.Option(help="Of Adam.")] = 0.05,
     loss: Annotated[str, typer.Option(help="relative or l2.")] = "relative",
     exposure: Annotated[bool, typer.Option("--exposure", help="Each image has an unknown factor.")] = False,
     seed: SampleSeed = 0,
@@ -50,7 +49,7 @@ def fit_command(
     use_mitsuba(variant)
     from halfspace_sss.inverse import FitSettings, fit, read_views
 
-    settings = FitSettings(steps, spp, batch, rate, loss, exposure, seed)
+    settings = FitSettings(steps, spp, batch, loss, exposure, seed)
     check_folder(out)
     names = [name.strip() for name in parameter.split(",")]
     with Bar("fit") as bar:

@@ -1,10 +1,12 @@
-"""The fit: Adam on images of a scene, by unbiased gradients and an unbiased loss.
+"""The fit: damped Gauss-Newton steps on images of a scene, by unbiased slopes and an unbiased loss.
 
 With two renders I, I' of independent samples, an image T and weights w, the loss of a view is
 
-    mean w (I - T) (I' - T),    gradient 2 mean w ((I + I') / 2 - T) dI'',
+    mean w (I - T) (I' - T),    half its gradient g = mean w J^T ((I + I') / 2 - T),    H = mean w J^T J',
 
-where dI'' has samples of its own, so that noise has no bias in either (Deng et al. 2022 take the product too).
+where the Jacobians J, J' of pixels by variables have samples of their own, so that noise has no bias in any of them
+(Deng et al. 2022 take the product of two renders too). H is a running mean over steps. The variables move by -H^-1 g,
+in the second half of the steps by 1, 1/2, 1/3, ... of that, which averages the noise of g (Robbins and Monro 1951).
 Weights are 1, or 1 / (T + a tenth of the mean of T)².
 """
 
@@ -22,7 +24,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from halfspace_sss.checks import check_choice, check_count, check_interval
+from halfspace_sss.checks import check_choice, check_count
 from halfspace_sss.inverse.parameters import FitParameters, translucent_object
 from halfspace_sss.inverse.views import GivenView, check_views
 from halfspace_sss.physics.medium import Medium
@@ -32,12 +34,13 @@ from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED, open_scene
 
 LOSSES = ("relative", "l2")
 FLOOR = 0.1  # of the mean of an image, added to it in relative weights
-SETTLING = 0.5  # part of the steps after which the rate falls, to LAST of itself
-LAST = 0.1
+SETTLING = 0.5  # part of the steps after which they are averaged
+MEMORY = 0.15  # of H, what a step is at least
+LONGEST = 0.7  # change of a variable in a step
+DAMPED = 1e-3  # of the largest eigenvalue of H, below which it is not trusted
 EXPOSURE = 10.0  # most, of a factor
-AVERAGED = 0.25  # last part of the steps, over which variables are averaged
 WALK = "translucent_walk"
-PURPOSES = ("order", "first", "second", "gradient", "slope", "other slope", "test", "other test")
+PURPOSES = ("order", "first", "second", "slope", "other slope", "test", "other test")
 
 
 @dataclass(frozen=True)
@@ -45,19 +48,17 @@ class FitSettings:
     """How to fit.
 
     Args:
-        steps: of Adam.
-        spp: samples a pixel of each of the three renders of a view.
+        steps: how many.
+        spp: samples a pixel of each render of a view: two images, and its slopes by each parameter.
         batch: views a step; 0 takes 4 or all, whichever is less.
-        rate: of Adam; it falls to a tenth over the second half of the steps.
         loss: "relative" or "l2".
         exposure: whether each image may have a factor of its own, of geometric mean 1.
         seed: of all samples.
     """
 
-    steps: int = 150
+    steps: int = 30
     spp: int = 64
     batch: int = 0
-    rate: float = 0.05
     loss: str = "relative"
     exposure: bool = False
     seed: int = 0
@@ -65,7 +66,6 @@ class FitSettings:
     def __post_init__(self) -> None:
         for name, least in (("steps", 1), ("spp", 1), ("batch", 0), ("seed", 0)):
             check_count(name, getattr(self, name), least)
-        check_interval("rate", self.rate, 1e-6, 10.0)
         check_choice("loss", self.loss, LOSSES)
 
 
@@ -83,7 +83,7 @@ class MaterialFit:
 
     Args:
         values: of each parameter; sigma_t in 1/mm, mfp in mm.
-        errors: standard errors by the Gauss-Newton matrix and the misfit.
+        errors: standard errors by H, the misfit, and the noise of the steps.
         correlation: of all numbers in the order of `values`.
         medium: of the object.
         misfit: root of the loss of all fitted views at the end; 0 if noise takes the loss below 0.
@@ -144,7 +144,7 @@ def fit(
 
 
 class MediumDescent:
-    """Adam on the variables of a medium.
+    """Gauss-Newton steps on the variables of a medium.
 
     Args:
         scene, views, parameters, settings: as of `fit`, checked.
@@ -163,14 +163,14 @@ class MediumDescent:
         self.fitted = [k for k, view in enumerate(views) if not view.held_out]
         self.weights = [_weights(view, settings.loss) for view in views]
         self.exposures, self.steps = np.ones(len(views)), []
-        self.adam = mi.ad.Adam(lr=settings.rate)
-        for name, x in parameters.start().items():
-            self.adam[name] = x
-        self.mean = {name: 0.0 for name in parameters.names}  # of the last steps
+        self.x = parameters.start()
+        size = sum(len(_numbers(x)) for x in self.x.values())
+        self.H, self.slopes = np.zeros((size, size)), {}  # slopes: the last Jacobian of each view
+        self.moves = np.zeros((0, size))  # -H^-1 g of the steps that are averaged
         self.kept = _KeptSteps(work / "state.npz", self._fingerprint()) if work else None
 
     def _fingerprint(self) -> str:
-        start = {name: np.ravel(np.array(x)).tolist() for name, x in self.parameters.start().items()}
+        start = {name: _numbers(x).tolist() for name, x in self.parameters.start().items()}
         of = json.dumps([asdict(self.settings), start, [(v.sensor, v.held_out) for v in self.views]])
         digest = hashlib.sha256(of.encode())
         for view in self.views:
@@ -183,56 +183,62 @@ class MediumDescent:
         """All steps that are left."""
         if self.kept is not None:
             self.kept.load(self)
-        total = self.settings.steps
-        while (k := len(self.steps)) < total:
-            part = max(k / total - SETTLING, 0) / (1 - SETTLING)
-            self.adam.set_learning_rate(self.settings.rate * LAST**part)
+        while (k := len(self.steps)) < self.settings.steps:
             self._step(k)
-            if (last := k - int((1 - AVERAGED) * total)) >= 0:
-                for name, mean in self.mean.items():
-                    self.mean[name] = mean + (_numbers(self.adam[name]) - mean) / (last + 1)
             if self.kept is not None:
                 self.kept.save(self)
             if progress:
-                progress(k + 1, total, _line(self.steps[-1]))
+                progress(k + 1, self.settings.steps, _line(self.steps[-1]))
 
     def _step(self, k: int) -> None:
         batch = min(self.settings.batch or 4, len(self.fitted))
-        order = np.random.default_rng([self.settings.seed, k]).permutation(self.fitted)
-        shown = self.parameters.shown(dict(self.adam))
-        losses, variance = [], 0.0
-        for which in order[:batch]:
-            loss, noise, adjoint = self._compare(int(which), k)
-            self.parameters.put(dict(self.adam))
-            seed, spp = self._seed(k, int(which), "gradient"), self.settings.spp
-            sensor = self.views[which].sensor
-            self.scene.integrator().render_backward(self.scene, None, mi.TensorXf(adjoint / batch), sensor, seed, spp)
+        order = np.random.default_rng([self.settings.seed, k]).permutation(self.fitted)[:batch]
+        values = {name: value.tolist() for name, value in self.parameters.shown(self.x).items()}
+        losses, variance, g, H = [], 0.0, 0.0, 0.0
+        for which in map(int, order):
+            loss, noise, residual = self._compare(which, k)
+            J = self._jacobian(which, k, "slope")
+            before = self.slopes.get(which)
+            w = self.weights[which].ravel() / self._count(which)
+            product = (J * w[:, None]).T @ (self._jacobian(which, k, "other slope") if before is None else before)
+            g, H = g + J.T @ (w * residual.ravel()) / batch, H + (product + product.T) / (2 * batch)
+            self.slopes[which] = J
             losses.append(loss)
             variance += noise / batch**2
-        self.adam.step()
-        for name in self.parameters.names:
-            self.adam[name] = self.parameters.clipped(name, dr.detach(self.adam[name]))
-        values = {name: value.tolist() for name, value in shown.items()}
+        self.H += max(MEMORY, 1 / (k + 1)) * (H - self.H)
+        move = -_solved(self.H, g)
+        move *= min(1.0, LONGEST / max(np.abs(move).max(), 1e-30))
+        later = k - int(SETTLING * self.settings.steps)
+        if later >= 0:
+            self.moves = np.vstack([self.moves, move])
+        self._move(move / max(later + 1, 1))
         self.steps.append(FitStep(float(np.mean(losses)), float(np.sqrt(variance)), values))
 
+    def _move(self, move: np.ndarray) -> None:
+        at = 0
+        for name, x in self.x.items():
+            now = _numbers(x) + move[at : at + len(_numbers(x))]
+            at += len(now)
+            self.x[name] = self.parameters.clipped(name, type(x)(now.tolist() if len(now) > 1 else float(now[0])))
+
+    def _count(self, which: int) -> float:
+        """Numbers of a view that count."""
+        return max(float((self.weights[which] > 0).sum()), 1.0)
+
     def _compare(self, which: int, k: int) -> tuple[float, float, np.ndarray]:
-        """Loss of a view, its variance by noise, and the gradient of the loss by the image."""
+        """Loss of a view, its variance by noise, and the mean residual of both renders."""
         view, w = self.views[which], self.weights[which]
-        self._put()
+        self.parameters.put(self.x)
         purposes = ("test", "other test") if view.held_out else ("first", "second")
         pair = [self._image(view, self._seed(k, which, each)) for each in purposes]
         if self.settings.exposure:
             self._expose(which, pair)
         e = self.exposures[which]
         a, b = (e * image - view.image for image in pair)
-        n = max(float((w > 0).sum()), 1.0)
+        n = self._count(which)
         noise = np.square(a - b) / 2  # variance of each
         variance = float((np.square(w) * (noise * (np.square(a) + np.square(b)) / 2)).sum()) / n**2
-        return float((w * a * b).sum() / n), variance, (w * e * (a + b) / n).astype(np.float32)
-
-    def _put(self) -> None:
-        with dr.suspend_grad():
-            self.parameters.put({name: dr.detach(x) for name, x in self.adam.items()})
+        return float((w * a * b).sum() / n), variance, (a + b) / 2
 
     def _image(self, view: GivenView, seed: int) -> np.ndarray:
         image = mi.render(self.scene, sensor=view.sensor, seed=seed, spp=self.settings.spp)
@@ -245,22 +251,19 @@ class MediumDescent:
         self.exposures[which] = np.clip(found, 1 / EXPOSURE, EXPOSURE)
         self.exposures[self.fitted] /= np.exp(np.log(self.exposures[self.fitted]).mean())
 
-    def _seed(self, k: int, which: int, purpose: str) -> int:
-        words = [self.settings.seed, k, which, PURPOSES.index(purpose)]
+    def _seed(self, k: int, which: int, purpose: str, parameter: int = 0) -> int:
+        words = [self.settings.seed, k, which, PURPOSES.index(purpose), parameter]
         return int(np.random.SeedSequence(words).generate_state(1)[0])
 
     # ---- the end
 
     def result(self) -> MaterialFit:
-        """At the mean of the last steps."""
-        for name in self.parameters.names:
-            x = self.mean[name]
-            self.adam[name] = type(self.adam[name])(x.tolist() if len(x) > 1 else float(x[0]))
-        x, end = dict(self.adam), self.settings.steps
+        """Where the steps have ended."""
+        x, end = self.x, self.settings.steps
         losses = {which: self._compare(which, end)[0] for which in range(len(self.views))}
         fitted = float(np.mean([losses[which] for which in self.fitted]))
         held = [loss for which, loss in losses.items() if self.views[which].held_out]
-        last = np.array([step.loss for step in self.steps[int((1 - AVERAGED) * end) :]])
+        last = np.array([step.loss for step in self.steps[int(SETTLING * end) :]])
         noise = float(last.std() / np.sqrt(len(last)))  # of its mean, which may be below 0
         covariance = self._covariance(max(float(last.mean()), noise))
         slopes = np.concatenate(list(self.parameters.slopes(x).values()))
@@ -270,33 +273,28 @@ class MediumDescent:
         for name, value in values.items():
             errors[name] = (error * slopes)[at : at + len(value)]
             at += len(value)
-        self._put()
+        self.parameters.put(x)
         told = self.parameters.at_bounds(x) + _ambiguity(values, correlation)
         medium, test = self.parameters.shape.bsdf().inside.medium, _root(float(np.mean(held))) if held else None
         exposures = self.exposures.tolist()
         return MaterialFit(values, errors, correlation, medium, _root(fitted), test, exposures, told, self.steps)
 
     def _covariance(self, loss: float) -> np.ndarray:
-        """Of the variables: loss (J^T w J)^-1; the Jacobians of two independent renders stand in the product."""
-        size = sum(len(_numbers(x)) for x in self.adam.values())
-        normal, count = np.zeros((size, size)), 0
-        for which in self.fitted:
-            w = self.weights[which].ravel()
-            pair = [self._jacobian(which, each) for each in ("slope", "other slope")]
-            product = (pair[0] * w[:, None]).T @ pair[1]
-            normal, count = normal + (product + product.T) / 2, count + int((w > 0).sum())
-        e, v = np.linalg.eigh(normal)
-        return loss * (v / np.maximum(e, 1e-9 * max(e.max(), 1e-30))) @ v.T
+        """Of the variables: loss H^-1 / n by the images, and the noise of the mean of the last steps."""
+        n = sum(self._count(which) for which in self.fitted)
+        by_images = loss * _solved(self.H, np.eye(len(self.H))) / n
+        m = len(self.moves)
+        return by_images + (np.atleast_2d(np.cov(self.moves.T)) / m if m > 1 else 0.0)
 
-    def _jacobian(self, which: int, purpose: str) -> np.ndarray:
+    def _jacobian(self, which: int, k: int, purpose: str) -> np.ndarray:
         """Derivatives of all pixels by all variables; a channel knows of no other but by g."""
         view, columns = self.views[which], []
         for j, name in enumerate(self.parameters.names):
-            x = {key: type(value)(dr.detach(value)) for key, value in self.adam.items()}
+            x = {key: type(value)(value) for key, value in self.x.items()}
             dr.enable_grad(x[name])
             dr.set_grad(x[name], 1.0)
             self.parameters.put(x)
-            seed = self._seed(self.settings.steps + j, which, purpose)
+            seed = self._seed(k, which, purpose, j)
             spp = self.settings.spp
             found = self.scene.integrator().render_forward(self.scene, None, view.sensor, seed, spp)
             d = self.exposures[which] * np.array(found, dtype=np.float64)[..., : view.image.shape[2]]
@@ -307,6 +305,13 @@ class MediumDescent:
         return np.stack(columns, axis=1)
 
 
+def _solved(H: np.ndarray, g: np.ndarray) -> np.ndarray:
+    """H^-1 g; noise makes small eigenvalues of H wrong, negative ones too."""
+    e, v = np.linalg.eigh(H)
+    e = np.maximum(np.abs(e), DAMPED * max(np.abs(e).max(), 1e-30))
+    return (v / e) @ (v.T @ g)
+
+
 class _KeptSteps:
     """The state of a descent after each step, in a file."""
 
@@ -315,11 +320,9 @@ class _KeptSteps:
 
     def save(self, descent: MediumDescent) -> None:
         arrays = {"exposures": descent.exposures, "of": np.array(self.of), "steps": np.array(json.dumps(descent.steps))}
-        for name in descent.parameters.names:
-            x, _, _, (t, m, v, *_) = descent.adam.state[name]
-            for key, value in (("x", x), ("t", t), ("m", m), ("v", v)):
-                arrays[f"{name} {key}"] = np.array(dr.detach(value))
-            arrays[f"{name} mean"] = np.asarray(descent.mean[name])
+        arrays |= {"H": descent.H, "moves": descent.moves}
+        arrays |= {f"slopes {which}": J for which, J in descent.slopes.items()}
+        arrays |= {f"x {name}": _numbers(x) for name, x in descent.x.items()}
         file = io.BytesIO()
         np.savez(file, **arrays)
         write_atomically(self.path, file.getvalue())
@@ -336,22 +339,12 @@ class _KeptSteps:
             raise ValueError(
                 f"work must be a new folder or that of the same fit, got another one in {self.path.parent}"
             )
-        descent.exposures = arrays["exposures"]
+        descent.exposures, descent.H, descent.moves = (arrays[key] for key in ("exposures", "H", "moves"))
         descent.steps = [FitStep(*row) for row in json.loads(str(arrays["steps"]))]
-        for name in descent.parameters.names:
-            x, *rest, (t, m, v, *more) = descent.adam.state[name]
-            now = [_like(old, arrays[f"{name} {key}"]) for key, old in (("x", x), ("t", t), ("m", m), ("v", v))]
-            dr.enable_grad(now[0])
-            descent.adam.state[name] = (now[0], *rest, (*now[1:], *more))
-            descent.mean[name] = arrays[f"{name} mean"]
-
-
-def _like(old: mi.Float | mi.Spectrum, values: np.ndarray) -> mi.Float | mi.Spectrum:
-    """Numbers as an array of another's kind, which may be None in a new optimizer."""
-    numbers = np.ravel(values).tolist()
-    if old is None:
-        return mi.Spectrum(numbers) if len(numbers) > 1 else mi.Float(numbers)
-    return type(old)(numbers if len(numbers) > 1 else numbers[0])
+        descent.slopes = {int(key.split()[1]): J for key, J in arrays.items() if key.startswith("slopes ")}
+        for name, x in descent.x.items():
+            numbers = arrays[f"x {name}"].tolist()
+            descent.x[name] = type(x)(numbers if len(numbers) > 1 else numbers[0])
 
 
 def _numbers(x: mi.Float | mi.Spectrum) -> np.ndarray:
