@@ -146,7 +146,7 @@ def test_only_the_chosen_channels_are_taken(command: str, monkeypatch: Any, tmp_
     result = CliRunner().invoke(
         cli.app, [*command.split(), "marble", "ketchup", "--channel", "B,R", "--out", str(tmp_path)]
     )
-    assert result.stderr.endswith("error: enough\n")
+    assert result.stderr.endswith("enough\n")
     from halfspace_sss import materials
 
     marble, ketchup = (materials.load(name).medium for name in ("marble", "ketchup"))

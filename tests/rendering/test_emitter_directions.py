@@ -83,7 +83,7 @@ def test_sampled_directions_and_chance_share_the_light_of_lamps_between_them() -
         chance = np.array(found.share(dr.full(mi.Int32, k, d.shape[1]), way, mi.Bool(True)))
         assert ((chance > 0) & (chance < 1)).all()
         whole, left = whole + solid * value.sum(axis=1), left + solid * (value * (1 - chance)).sum(axis=1)
-    L = np.array(found.light(event(found.media, LANES), generator(mi, LANES, pass_seed(1))))
+    L = np.array(found.light(event(found.media, LANES), generator(mi, LANES, pass_seed(1)))[0])
     mean, error = L.mean(axis=1), L.std(axis=1, ddof=1) / np.sqrt(LANES)
     assert np.abs((mean - left) / np.hypot(error, 1e-3 * left)).max() < WIDEST_Z  # of the quadrature: the lamps' rims
     assert (error < 0.005 * left).all() and (left < 0.8 * whole).all()
