@@ -58,8 +58,8 @@ def fit_command(
     for name, value in found.values.items():
         numbers = "  ".join(f"{v:.4g} ± {e:.1g}" for v, e in zip(value, found.errors[name]))
         screen.print(f"{name}: {numbers}", highlight=False)
-    held = "" if found.held_out is None else f", of views held out {found.held_out:.3g}"
-    screen.print(f"root of the loss {found.misfit:.3g}{held}", highlight=False)
+    held = "" if found.held_out is None else f", of views held out {found.held_out.told()} %"
+    screen.print(f"root of the loss {found.misfit.told()} %{held}", highlight=False)
     for sentence in found.told:
         tell(sentence)
     for path in _write(found, scene, object, out):
@@ -89,8 +89,9 @@ def _write(found: MaterialFit, scene: Path, name: str | None, out: Path) -> list
 def _plain(found: MaterialFit) -> dict[str, Any]:
     values = {"values": found.values, "errors": found.errors}
     plain = {key: {name: v.tolist() for name, v in each.items()} for key, each in values.items()}
+    held = None if found.held_out is None else found.held_out._asdict()
     return {
-        **plain, "correlation": found.correlation.tolist(), "misfit": found.misfit, "held_out": found.held_out,
+        **plain, "correlation": found.correlation.tolist(), "misfit": found.misfit._asdict(), "held_out": held,
         "exposures": found.exposures, "told": found.told, "steps": [step._asdict() for step in found.steps],
     }  # fmt: skip
 

@@ -27,6 +27,7 @@ import numpy as np
 from halfspace_sss.checks import check_choice, check_count
 from halfspace_sss.inverse.parameters import FitParameters, translucent_object
 from halfspace_sss.inverse.views import GivenView, check_views
+from halfspace_sss.noise_free import NoiseFree
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.progress import ProgressText
 from halfspace_sss.provenance import check_folder, write_atomically
@@ -86,7 +87,7 @@ class MaterialFit:
         errors: standard errors by H, the misfit, and the noise of the steps.
         correlation: of all numbers in the order of `values`.
         medium: of the object.
-        misfit: root of the loss of all fitted views at the end; 0 if noise takes the loss below 0.
+        misfit: root of the loss of all fitted views at the end.
         held_out: likewise of views held out; None without any.
         exposures: factor by which each view's image of the medium is multiplied to match the given one.
         told: sentences about bounds and about what the images do not tell.
@@ -97,8 +98,8 @@ class MaterialFit:
     errors: dict[str, np.ndarray]
     correlation: np.ndarray
     medium: Medium
-    misfit: float
-    held_out: float | None
+    misfit: NoiseFree
+    held_out: NoiseFree | None
     exposures: list[float]
     told: list[str]
     steps: list[FitStep] = field(repr=False)
@@ -260,9 +261,9 @@ class MediumDescent:
     def result(self) -> MaterialFit:
         """Where the steps have ended."""
         x, end = self.x, self.settings.steps
-        losses = {which: self._compare(which, end)[0] for which in range(len(self.views))}
-        fitted = float(np.mean([losses[which] for which in self.fitted]))
-        held = [loss for which, loss in losses.items() if self.views[which].held_out]
+        losses = [self._compare(which, end)[:2] for which in range(len(self.views))]
+        fitted = _root([losses[which] for which in self.fitted])
+        held = [loss for loss, view in zip(losses, self.views) if view.held_out]
         last = np.array([step.loss for step in self.steps[int(SETTLING * end) :]])
         noise = float(last.std() / np.sqrt(len(last)))  # of its mean, which may be below 0
         covariance = self._covariance(max(float(last.mean()), noise))
@@ -275,9 +276,9 @@ class MediumDescent:
             at += len(value)
         self.parameters.put(x)
         told = self.parameters.at_bounds(x) + _ambiguity(values, correlation)
-        medium, test = self.parameters.shape.bsdf().inside.medium, _root(float(np.mean(held))) if held else None
+        medium, test = self.parameters.shape.bsdf().inside.medium, _root(held) if held else None
         exposures = self.exposures.tolist()
-        return MaterialFit(values, errors, correlation, medium, _root(fitted), test, exposures, told, self.steps)
+        return MaterialFit(values, errors, correlation, medium, fitted, test, exposures, told, self.steps)
 
     def _covariance(self, loss: float) -> np.ndarray:
         """Of the variables: loss H^-1 / n by the images, and the noise of the mean of the last steps."""
@@ -360,8 +361,10 @@ def _weights(view: GivenView, loss: str) -> np.ndarray:
     return np.where(view.counts[..., None], w, 0.0)
 
 
-def _root(loss: float) -> float:
-    return float(np.sqrt(max(loss, 0.0)))
+def _root(losses: Sequence[tuple[float, float]]) -> NoiseFree:
+    """The root of a mean loss, of losses and their variances."""
+    loss, variance = np.mean(losses, axis=0)
+    return NoiseFree(float(loss), float(np.sqrt(variance / len(losses))))
 
 
 def _line(step: FitStep) -> str:
