@@ -21,6 +21,7 @@ SMALL = {  # a small run of each command, and what it refuses
     "curves": (["--paths", "4096", "--theta-i", "0", "--model", "better_dipole", "--out", "o"], ["marbel"]),
     "errors": (["--model", "better_dipole", "--events", "1e4", "--out", "o"], ["marbel"]),
     "figures": (["compute", "fig10", "--out", "o"], ["compute", "nope"]),
+    "fit": (["ball.xml", "--images", "views.json", "--out", "o"], ["none.xml", "--images", "views.json"]),
     "maps": (["--grid", "2,16,6,4", "--paths", "2048", "--out", "o"], ["marbel"]),
     "materials": ([], ["marbel"]),
     "models": ([], ["extra"]),
@@ -106,6 +107,7 @@ COLUMNS = {
 MOUNTS = {"full": "size=4k", "locked": "ro"}
 NO_FILES = ("materials", "models")
 LONG = (
+    "fit",
     "study rivals",
     "study shapes",
     "study speeds",

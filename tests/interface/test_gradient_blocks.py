@@ -38,7 +38,7 @@ def gradients(queries, monkeypatch):
 @pytest.mark.slow
 def test_values_and_derivatives_of_blocks_are_those_of_the_whole(name, gradients):
     model = halfspace_sss.bssrdf(name, MEDIUM)
-    n = 5 * interface.PROBE + 1
+    n = 5 * interface.PROBE + 28
     S, derivatives, _ = gradients(model, 1 << 40, n)
     in_blocks, by_blocks, joined = gradients(model, 1, n)
     assert len(joined.next_functions) == 6
