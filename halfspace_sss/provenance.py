@@ -51,9 +51,35 @@ def provenance(**parameters: Any) -> dict[str, Any]:
     }
 
 
+def path_of(path: str | os.PathLike) -> Path:
+    """A path of this machine, or that of an object store for a URL that fsspec knows, such as s3://BUCKET/maps.
+
+    Raises:
+        ValueError: a package that such a URL needs is not installed, or no file system has its protocol.
+    """
+    if is_remote(path) or "://" not in str(path):
+        return path if is_remote(path) else Path(path)
+    try:
+        from upath import UPath
+
+        found = UPath(str(path))
+        found.fs  # noqa: B018 - its package is imported here
+    except ImportError as error:
+        raise ValueError(f'{path} needs more packages: pip install "halfspace-sss[cluster]"; {error}') from error
+    return found
+
+
+def is_remote(path: Any) -> bool:
+    """Whether `path_of` found it to be in an object store, where files are whole or absent and nothing is renamed."""
+    return hasattr(path, "storage_options")
+
+
 def check_folder(folder: str | Path) -> Path:
     """The folder as a path; ValueError if it, or what it would lie in, is a file or cannot be written to."""
-    path = Path(folder)
+    path = path_of(folder)
+    if is_remote(path):
+        _check_store(path)
+        return path
     part = next(part for part in (path, *path.absolute().parents) if part.exists())
     if not part.is_dir():
         raise ValueError(f"folder must be a folder or new, got {str(folder)!r}, where {str(part)!r} is a file")
@@ -65,9 +91,19 @@ def check_folder(folder: str | Path) -> Path:
     return path
 
 
+def _check_store(path: Any) -> None:
+    """That an object store can be written to; its packages raise errors of their own kinds."""
+    probe = path / f".{platform.node()}.{os.getpid()}"
+    try:
+        probe.write_bytes(b"1")
+        probe.unlink()
+    except Exception as error:
+        raise ValueError(f"folder must be one that can be written to, got {str(path)!r}: {error}") from error
+
+
 def read_bytes(path: str | Path, most: int = LARGEST) -> bytes:
     """The content of a file; OSError if it is no regular file (a device has no end) or larger than `most` bytes."""
-    path = Path(path)
+    path = path_of(path)
     path.stat()  # says why, if there is none
     if not path.is_file():
         raise OSError(errno.EINVAL, "it must be a regular file", str(path))
@@ -91,11 +127,16 @@ def write_atomically(path: Path, content: bytes | str) -> None:
 def write_together(files: Mapping[Path, bytes | str]) -> None:
     """Write files that belong together: those that are there at any moment are all whole and of the same writing.
 
-    All are written under temporary names first, so that a full disk leaves the files of before.
+    All are written under temporary names first, so that a full disk leaves the files of before. In an object store they
+    are written in their order, each whole; readers there compare the checksum that the last one names.
 
     Raises:
         OSError: a file cannot be written; the message names it.
     """
+    if any(map(is_remote, files)):
+        for path, content in files.items():
+            path.write_bytes(content.encode() if isinstance(content, str) else content)
+        return
     written: dict[Path, Path] = {}
     try:
         for path, content in files.items():

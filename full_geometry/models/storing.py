@@ -23,6 +23,7 @@ from full_geometry.object.patches import Patches, PatchSampler
 from halfspace_sss.interface.model import bssrdf
 from halfspace_sss.neural.store import load_weights, save_weights, weights_folder
 from halfspace_sss.physics.medium import Medium
+from halfspace_sss.provenance import path_of
 from halfspace_sss.rendering.object.objects import TranslucentObject
 from halfspace_sss.rendering.object.points import opaque
 from halfspace_sss.rendering.object.shape import name_of
@@ -311,7 +312,7 @@ def save(folder: str | os.PathLike, identity: Identity, arrays: dict[str, np.nda
     bound = {"anchors": identity.anchors.astype(np.float32)}
     if identity.grids:
         bound["probes"] = identity.probes
-    return save_weights(Path(folder) / weights_name(identity), KIND, {**arrays, **bound}, whole)
+    return save_weights(path_of(folder) / weights_name(identity), KIND, {**arrays, **bound}, whole)
 
 
 def find_weights(obj: TranslucentObject, folder: str | os.PathLike | None = None) -> Path:
@@ -321,7 +322,7 @@ def find_weights(obj: TranslucentObject, folder: str | os.PathLike | None = None
         ValueError: there is none; says what tells the object from the nearest one that was trained.
     """
     here = identify(obj)
-    place = Path(folder) if folder is not None else weights_folder()
+    place = path_of(folder or weights_folder())
     reasons = []
     for path in sorted(place.glob(f"{KIND}-{here.digest()}-*.safetensors")):
         try:
@@ -362,7 +363,7 @@ def nearest(
     here, found = identify(obj), []
     if here.grids or here.contents:
         return None
-    for path in (Path(folder) if folder is not None else weights_folder()).glob(f"{KIND}-*.safetensors"):
+    for path in path_of(folder or weights_folder()).glob(f"{KIND}-*.safetensors"):
         try:
             identity, arrays, record = _trained(path)
             R, _ = identity.moved(here)

@@ -27,7 +27,7 @@ from halfspace_sss.cli.shared import (
     stated_medium,
     whole,
 )
-from halfspace_sss.provenance import check_folder
+from halfspace_sss.provenance import check_folder, path_of
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -62,9 +62,14 @@ def maps_command(
     share: Annotated[str, typer.Option(help="k/n: of n processes that fill one folder, this is number k < n.")] = "0/1",
     workers: Workers = None,
     scheduler: Scheduler = None,
-    out: Annotated[Path, typer.Option(help="Folder of the stores; a run with the same options is continued.")] = Path(
-        "maps"
-    ),
+    out: Annotated[
+        Path,
+        typer.Option(
+            help="Folder of the stores, or a URL as s3://BUCKET/maps; a run with the same options is continued.",
+            parser=path_of,
+            metavar="FOLDER",
+        ),
+    ] = Path("maps"),
 ) -> None:
     """Trace training maps into Zarr stores; an interrupted run goes on when it is started again."""
     from halfspace_sss.maps.store import make_maps

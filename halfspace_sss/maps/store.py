@@ -27,13 +27,14 @@ from halfspace_sss.maps.grid import MapGrid, cell_edges, map_directions
 from halfspace_sss.maps.map_tracing import MapUnit, UnitResult, trace_unit
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.progress import ProgressText
-from halfspace_sss.provenance import naming, provenance
+from halfspace_sss.provenance import is_remote, naming, path_of, provenance
 
 if TYPE_CHECKING:
     import xarray as xr
 
 
 ASKED = "halfspace_sss_maps"  # the attribute with medium, grid and numbers of walks
+METADATA = ".zmetadata"  # of all arrays of a store
 COORDINATES, ATTRIBUTE = "checksums_of_coordinates", "checksum_of_halfspace_sss_maps"
 
 
@@ -141,7 +142,7 @@ def make_maps(
 
     Args:
         media: name -> medium; channels of a medium become a dimension of its store.
-        folder: where the stores are, made if absent.
+        folder: where the stores are, made if absent; or a URL of an object store (see `provenance.path_of`).
         grid: numbers of directions and cells.
         target_error: stop a unit at this mean cell error (see `trace_unit`); None to trace `n_paths` exactly.
         n_paths: walks per unit and group of 16 observations; with a target error, the most that are traced.
@@ -160,15 +161,15 @@ def make_maps(
     grid = grid or MapGrid()
     _check(media, target_error, n_paths, seed, share)
     array_types(backend)
-    paths = {name: Path(folder) / f"{name}.zarr" for name in media}
+    paths = {name: path_of(folder) / f"{name}.zarr" for name in media}
     asked = {name: _parameters(m, grid, target_error, n_paths, seed, backend) for name, m in media.items()}
     units = _units(media, grid, target_error, n_paths or MOST_PATHS, seed, backend)[share[0] :: share[1]]
     for name in media:
-        if paths[name].exists():
+        if _exists(paths[name]):
             drop_cut_off(paths[name], {(channel, u.theta_index) for of, channel, u in units if of == name})
             _open_same(paths[name], asked[name])
     for name, medium in media.items():
-        if not paths[name].exists():
+        if not _exists(paths[name]):
             _create(paths[name], medium, grid, seed, asked[name])
     stores = {name: _open_same(path, asked[name]) for name, path in paths.items()}
     left = [u for u in units if not _done(paths[u[0]], stores[u[0]], u[1], u[2].theta_index)]
@@ -260,7 +261,7 @@ def _template(medium: Medium, grid: MapGrid, seed: int) -> xr.Dataset:
 
 
 def _create(path: Path, medium: Medium, grid: MapGrid, seed: int, asked: dict[str, Any]) -> None:
-    """A store of the right shape, made under another name and renamed.
+    """A store of the right shape, made under another name and renamed; in an object store, with its metadata last.
 
     Encoded in memory: zarr's threads, which an interrupt does not end, would write on into a folder just removed.
     """
@@ -271,6 +272,10 @@ def _create(path: Path, medium: Medium, grid: MapGrid, seed: int, asked: dict[st
     dataset.attrs |= written_checksums(dataset)
     chunks = {name: {"chunks": (1, 1, *dataset[name].shape[2:])} for name in dataset.data_vars}
     dataset.to_zarr(MemoryStore(memory), mode="w", zarr_format=2, encoding=chunks)
+    if is_remote(path):
+        for key in sorted(memory, key=METADATA.__eq__):
+            (path / key).write_bytes(memory[key].to_bytes())
+        return
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     shutil.rmtree(temporary, ignore_errors=True)
     try:
@@ -286,12 +291,21 @@ def _create(path: Path, medium: Medium, grid: MapGrid, seed: int, asked: dict[st
         shutil.rmtree(temporary, ignore_errors=True)
 
 
+def _exists(path: Path) -> bool:
+    return (path / METADATA).exists() if is_remote(path) else path.exists()
+
+
+def _at(path: Path) -> dict[str, Any]:
+    """A store in the words of xarray."""
+    return {"store": str(path), "storage_options": dict(path.storage_options)} if is_remote(path) else {"store": path}
+
+
 def _open(path: Path) -> xr.Dataset:
     import xarray as xr
 
     try:
         check_chunks(path)
-        dataset = xr.open_zarr(path, chunks=None)
+        dataset = xr.open_zarr(**_at(path), chunks=None)
         asked = json.loads(dataset.attrs[ASKED])
         missing = {*DATA, "checksum", "n_paths", "n_events"} - set(dataset.data_vars)
         if missing:
@@ -341,10 +355,10 @@ def _write(path: Path, channel: int, theta: int, result: UnitResult) -> None:
         data[name] = (dims[:2], np.full((1, 1), getattr(result, name), kind))
     region = {"channel": slice(channel, channel + 1), "theta": slice(theta, theta + 1)}
     with naming(path):
-        xr.Dataset(data).to_zarr(path, region=region, mode="r+")
+        xr.Dataset(data).to_zarr(**_at(path), region=region, mode="r+")
     checksum = np.full((1, 1), unit_checksum(result.S, result.variance), np.uint64)
     with naming(path):
-        xr.Dataset({"checksum": (dims[:2], checksum)}).to_zarr(path, region=region, mode="r+")
+        xr.Dataset({"checksum": (dims[:2], checksum)}).to_zarr(**_at(path), region=region, mode="r+")
 
 
 def load_maps(path: str | os.PathLike) -> xr.Dataset:
@@ -357,8 +371,8 @@ def load_maps(path: str | os.PathLike) -> xr.Dataset:
     Raises:
         ValueError: the store is absent, damaged or unfinished; the message names store, channel and direction.
     """
-    path = Path(path)
-    if not path.exists():
+    path = path_of(path)
+    if not _exists(path):
         raise ValueError(f"map store must exist, got {path}")
     dataset = _open(path)
     try:

@@ -21,7 +21,7 @@ import numpy as np
 
 from halfspace_sss.checks import check_interval
 from halfspace_sss.physics.medium import Medium
-from halfspace_sss.provenance import check_folder, read_bytes, read_text, write_together
+from halfspace_sss.provenance import check_folder, path_of, read_bytes, read_text, write_together
 
 FORMAT = 1
 LARGEST = 1e4  # no weight of a network that works is as large
@@ -74,7 +74,7 @@ def save_weights(path: str | os.PathLike, kind: str, arrays: Mapping[str, np.nda
     """
     from safetensors.numpy import save
 
-    path = Path(path)
+    path = path_of(path)
     if path.suffix != ".safetensors":
         raise ValueError(f"path must end in .safetensors, got {str(path)!r}")
     _check_numbers(path, arrays)
@@ -93,7 +93,7 @@ def load_weights(path: str | os.PathLike, kind: str) -> tuple[dict[str, np.ndarr
         ValueError: it is no such file, is truncated or altered, of another kind, version or shape, or holds numbers
             that are not finite; the message names the file.
     """
-    path = Path(path)
+    path = path_of(path)
     record = _read_record(path, kind)
     try:
         data = read_bytes(path)
@@ -106,27 +106,27 @@ def load_weights(path: str | os.PathLike, kind: str) -> tuple[dict[str, np.ndarr
 
 def checksum_of(path: str | os.PathLike, kind: str) -> str:
     """SHA-256 of the arrays of a file of weights, as its record names it; errors as in `load_weights`."""
-    return _read_record(Path(path), kind)["sha256"]
+    return _read_record(path_of(path), kind)["sha256"]
 
 
 def _read_record(path: Path, kind: str) -> dict[str, Any]:
     if path.suffix != ".safetensors":
         raise ValueError(f"{path}: weights must be a .safetensors file (a pickle could run code), got {path.suffix!r}")
-    place = _record_path(path)
+    where = _record_path(path)
     try:
-        record = json.loads(read_text(place))
+        record = json.loads(read_text(where))
     except OSError as error:
-        raise ValueError(f"{place}: record of the weights cannot be read: {error.strerror}") from error
+        raise ValueError(f"{where}: record of the weights cannot be read: {error.strerror}") from error
     except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
-        raise ValueError(f"{place}: record of the weights must be JSON: {error}") from error
+        raise ValueError(f"{where}: record of the weights must be JSON: {error}") from error
     if not isinstance(record, dict):
-        raise ValueError(f"{place}: record of the weights must be a JSON object, got {type(record).__name__}")
+        raise ValueError(f"{where}: record of the weights must be a JSON object, got {type(record).__name__}")
     for key, wanted in (("format", FORMAT), ("kind", kind)):
         if record.get(key) != wanted:
-            raise ValueError(f"{place}: {key} must be {wanted!r}, got {record.get(key)!r}")
+            raise ValueError(f"{where}: {key} must be {wanted!r}, got {record.get(key)!r}")
     for key, sort in (("sha256", str), ("shapes", dict)):
         if not isinstance(record.get(key), sort):
-            raise ValueError(f"{place}: {key} must be a {sort.__name__}, got {record.get(key)!r}")
+            raise ValueError(f"{where}: {key} must be a {sort.__name__}, got {record.get(key)!r}")
     return record
 
 
@@ -156,9 +156,9 @@ RATIOS = ("albedo", "g", "eta")
 
 
 def weights_folder() -> Path:
-    """Folder for trained weights: HALFSPACE_SSS_WEIGHTS, or the user's data folder."""
+    """Folder for trained weights: HALFSPACE_SSS_WEIGHTS, also a URL, or the user's data folder."""
     if os.environ.get(ENVIRONMENT_VARIABLE):
-        return Path(os.environ[ENVIRONMENT_VARIABLE])
+        return path_of(os.environ[ENVIRONMENT_VARIABLE])
     variable, default = ("LOCALAPPDATA", "AppData/Local") if os.name == "nt" else ("XDG_DATA_HOME", ".local/share")
     return Path(os.environ.get(variable) or Path.home() / default) / "halfspace-sss" / "weights"
 
