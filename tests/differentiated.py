@@ -155,13 +155,14 @@ def medium_difference(scene, name: str, only: int | None = None) -> tuple[float,
     return float(difference.sum()), float(np.abs(difference).sum())
 
 
-def difference(scene, key: str, h: float, kind) -> float:
+def difference(scene, key: str, h: float, kind, bodies: list | None = None) -> float:
+    """Central difference; with `bodies`, made before, entries are drawn from the same densities on both sides."""
     parameters = mi.traverse(scene)
     value, sides = kind(parameters[key]), []
     for sign in (1, -1):
         parameters[key] = value + sign * h
         parameters.update()
-        sides.append((image(scene) * weights(scene)).sum())
+        sides.append((image(scene, bodies) * weights(scene)).sum())
     parameters[key] = value
     parameters.update()
     return float(sides[0] - sides[1]) / (2 * h)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from rendered import MEDIUM, surface
+from rendered import MEDIUM, direction, surface
 
 import halfspace_sss
-from halfspace_sss import Medium
+from halfspace_sss import Medium, models
 
 mi = pytest.importorskip("mitsuba")
 import drjit as dr  # noqa: E402
@@ -108,6 +108,57 @@ def test_derivatives_by_a_bitmap_agree_with_finite_differences():
     found = backward(scene, key)
     assert (found != 0).mean() > 0.5
     assert found.sum() == pytest.approx(difference(scene, key, 2e-3, mi.TensorXf), rel=1e-2)
+
+
+def _painted(model: str) -> mi.Scene:
+    """A ball of texels beside a tetrahedron with attributes of vertices and faces."""
+    rng, at = np.random.default_rng(4), mi.ScalarTransform4f()
+
+    def bitmap(low: float, high: float) -> dict:
+        return {
+            "type": "bitmap",
+            "bitmap": mi.Bitmap(rng.uniform(low, high, (4, 8, 3)).astype(np.float32)),
+            "raw": True,
+        }
+
+    def surface(albedo: dict, sigma_t: dict) -> dict:
+        return {"type": "translucent", "model": model, "orders": "multiple" if model in models() else "total",
+                "albedo": albedo, "sigma_t": sigma_t, "eta": 1.4, "reflection": False}  # fmt: skip
+
+    props = mi.Properties()
+    attributes = [{"type": "mesh_attribute", "name": name} for name in ("vertex_albedo", "face_sigma_t")]
+    props["bsdf"] = mi.load_dict(surface(*attributes))
+    mesh = mi.Mesh("tetrahedron", 4, 4, props=props)
+    parameters = mi.traverse(mesh)
+    parameters["vertex_positions"] = mi.Float(np.ravel(5 * np.vstack([np.zeros(3), np.eye(3)]) + [2, -2, -2]))
+    parameters["faces"] = mi.UInt32([0, 2, 1, 0, 1, 3, 0, 3, 2, 1, 2, 3])
+    parameters.update()
+    mesh.add_attribute("vertex_albedo", 3, rng.uniform(0.5, 0.95, 12).astype(np.float32))
+    mesh.add_attribute("face_sigma_t", 1, rng.uniform(1, 3, 4).astype(np.float32))
+    ball = surface(bitmap(0.5, 0.95), bitmap(1, 3))
+    return mi.load_dict({"type": "scene", "light": LIGHTS["lamp"], "solid": mesh,
+        "integrator": {"type": "bssrdf", "max_depth": 3, "rr_depth": 100, "hide_emitters": True},
+        "ball": {"type": "sphere", "center": [-2, 1, 0], "radius": 2.5, "bsdf": ball},
+        "sensor": {"type": "perspective", "fov": 20.0, "film": {"type": "hdrfilm", "width": 8, "height": 8},
+                   "to_world": at.look_at((30 * direction(50)).tolist(), [0, 0, 0], [0, 0, 1])}})  # fmt: skip
+
+
+def test_derivatives_by_textures_of_a_medium_agree_with_finite_differences():
+    scene = _painted("standard_dipole")
+    bodies = scene.integrator().prepare(scene)
+    keys = {"ball.bsdf.albedo.data": mi.TensorXf, "ball.bsdf.sigma_t.data": mi.TensorXf,
+            "solid.vertex_albedo": mi.Float, "solid.face_sigma_t": mi.Float}  # fmt: skip
+    found = derivatives(scene, list(keys))
+    for key, kind in keys.items():
+        expected = difference(scene, key, 4e-3 if "albedo" in key else 1e-2, kind, bodies)
+        assert found[key].sum() == pytest.approx(expected, abs=1e-3 * np.abs(found[key]).sum())
+        assert (found[key] != 0).mean() > 0.2
+
+
+@pytest.mark.parametrize("model", ["lambert", "neural"])
+def test_derivatives_by_textures_of_a_medium_are_refused_without_an_analytic_model(model):
+    with pytest.raises(ValueError, match=f"textures must not have gradients enabled under '{model}'"):
+        derivatives(_painted(model), ["solid.vertex_albedo"])
 
 
 def test_derivatives_by_the_roughness_of_the_boundary_agree_with_finite_differences():

@@ -168,23 +168,11 @@ class Variation:
         Raises:
             ValueError: the model knows no medium beside its own.
         """
-        if self.inside.textured is not None:
-            self._check_textures()
         for name in VARIABLE:
             with dr.resume_grad():
                 wanted = dr.grad_enabled(getattr(self.surface, name))
             if wanted and name not in self._stencils:
                 self._stencils[name] = [self._stencil(name, m) for m in self.inside.channels()]
-
-    def _check_textures(self) -> None:
-        """ValueError if derivatives by a texture of the medium are asked for."""
-        for name, texture in self.inside.textured.textures.items():
-            for key, value in mi.traverse(texture).items():
-                with dr.resume_grad():
-                    if dr.is_diff_v(value) and dr.grad_enabled(value):
-                        raise ValueError(
-                            f"{name}.{key} must not have gradients enabled: models have none by textures of the medium"
-                        )
 
     def _stencil(self, name: str, m: Medium) -> Stencil:
         value = float(getattr(m, name))

@@ -22,7 +22,7 @@ from halfspace_sss.interface.model import bssrdf
 from halfspace_sss.physics import single_scattering
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.object.half_space import Variation, half_space_model
-from halfspace_sss.rendering.object.palette import textured_model
+from halfspace_sss.rendering.object.palette import TexturedTransport, textured_model
 from halfspace_sss.rendering.object.points import (
     AreaPoints,
     ObjectAlbedo,
@@ -417,6 +417,25 @@ class TranslucentObject:
     def splits(self) -> bool:
         """Whether light is of both kinds, orders below two and the transport's."""
         return self.transport is not None and bool(self.low_orders)
+
+    def prepare_derivatives(self) -> None:
+        """Make what derivatives by the medium need, before any loop is recorded.
+
+        Raises:
+            ValueError: they are asked for, and the model has none.
+        """
+        self.variation.prepare()
+        if self.geometry.contents is not None:
+            self.geometry.contents.check_held()
+        analytic = isinstance(self.transport, TexturedTransport) and not self.transport.checksums
+        if self.textured is None or self.transport is None or analytic:
+            return
+        with dr.resume_grad():
+            if self.textured.is_followed(self.geometry.shape):
+                raise ValueError(
+                    f"textures must not have gradients enabled under {self.surface.inside.model!r}, got some of object "
+                    f"{self.geometry.name}: analytic models have derivatives by them"
+                )
 
     def is_current(self) -> bool:
         """Whether the object still has the shape and the medium that it was made of."""

@@ -7,7 +7,12 @@ ends of a way of light,
 
 S_o of the half-space of the medium at the exit, S_i of that at the entry: reciprocal where the model is, and S of the
 medium where both are the same. Between nodes ln(S / albedo^p) is linear, p = 1 for models of all orders, else 2. Nodes
-are even in v, the square root of x of `physics.reflectance`, for albedos near 1.
+are even in v, the square root of x of `physics.reflectance`, for albedos near 1. Those of analytic models cover all
+albedos, so that kernels serve textures that change.
+
+Derivatives by the medium of each end, with ln S_o and ln S_i as they are interpolated:
+
+    dS = S/2 Σ_ends (d ln S / dv dv + p d ln albedo + d ln S / d ln sigma_t d ln sigma_t).
 
 Measured between nodes against models of the medium itself, sums of S over random pairs of points: 0.3 % at most for
 analytic models, 1.2 % for `neural` with texels of albedo 0.3 to 0.999.
@@ -44,6 +49,9 @@ from halfspace_sss.rendering.object.textured import SurfaceMedium, TexturedMediu
 NODES = 32  # over all albedos
 OF_NETWORKS = 9  # nodes, whatever the albedos: each is a part of the kernel
 LEAST = 1e-4  # albedo that stands for less at nodes
+MOST = 1 - 1e-6  # above which S has no derivative by it, as dv is infinite
+SLOPED = ("albedo", "sigma_t")
+STEP = 0.01  # of ln sigma_t, for its slope
 FAINT = 1e-35  # of S, below which it is interpolated itself
 LEVELS = (0.0, 0.5, 1.0)  # quantiles of albedo and extinction in the radial density of entries
 
@@ -55,6 +63,14 @@ class NodeRange(NamedTuple):
     cells: int
     low: float
     step: float
+
+
+@dataclass
+class Slope:
+    """Half of d ln S of the half-space at one end, in one channel."""
+
+    by_v: mi.Float  # between nodes
+    by_log_sigma_t: mi.Float
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,13 +106,13 @@ class Palette:
         models: list[BSSRDF] = []
         rows: list[NodeRange] = []
         for c, m in enumerate(media):
-            alike = [k for k, other in enumerate(media) if other.g == m.g] if network else [c]
-            if alike[0] < c:  # networks share nodes
+            alike = [k for k, other in enumerate(media) if other.g == m.g]
+            if alike[0] < c:  # they share nodes
                 rows.append(rows[alike[0]])
                 continue
-            ends = np.clip([albedos[:, alike].max(), albedos[:, alike].min()], LEAST, 1.0)
+            ends = np.clip([albedos[:, alike].max(), albedos[:, alike].min()], LEAST, 1.0) if network else (1.0, LEAST)
             low, high = (math.sqrt(x_of_albedo(np, a, m.g, bend(m.g))) for a in ends)
-            cells = OF_NETWORKS - 1 if network else max(math.ceil((high - low) * NODES), 1)
+            cells = OF_NETWORKS - 1 if network else NODES
             nodes = _albedo_of_v(np.linspace(low, high, cells + 1), m.g) if high > low else np.full(cells + 1, ends[0])
             rows.append(NodeRange(len(models), cells, low, (high - low) / cells))
             models += [bssrdf(name, Medium.from_albedo(float(a), 1.0, m.g, m.eta)) for a in nodes]
@@ -110,41 +126,82 @@ class Palette:
     def S(self, ends: Sequence[SurfaceMedium], query: tuple[mi.Float, ...], active: mi.Bool) -> mi.Spectrum:
         """sqrt(S_o S_i) of the media at both ends, at a query in scene units, 1/((scene unit)² sr).
 
+        With derivatives by the media where they are followed; not by networks.
+        """
+        by_albedo, by_sigma_t = (any(dr.grad_enabled(getattr(end, key)) for end in ends) for key in SLOPED)
+        with dr.suspend_grad():
+            result, slopes = self._at_ends(ends, query, by_albedo, by_sigma_t, active)
+        if not (by_albedo or by_sigma_t):
+            return result
+        change = [mi.Float(0) for _ in self.rows]
+        for k, slope in enumerate(slopes):
+            end, c = ends[k // len(self.rows)], k % len(self.rows)
+            albedo = dr.clip(end.albedo[c], LEAST, MOST)
+            variables = (_v(albedo, opaque(self.g[c]), opaque(bend(self.g[c]))), dr.log(end.sigma_t[c]))
+            factors = (slope.by_v, slope.by_log_sigma_t)
+            for x, factor in ((dr.log(albedo), self.power / 2), *zip(variables, factors)):
+                change[c] += (x - dr.detach(x)) * factor
+        return mi.Spectrum([value * (1 + each) for value, each in zip(result, change)])
+
+    def _at_ends(
+        self, ends: Sequence[SurfaceMedium], query: tuple[mi.Float, ...], by_albedo: bool, by_sigma_t: bool,
+        active: mi.Bool,
+    ) -> tuple[mi.Spectrum, list[Slope]]:  # fmt: skip
+        """S, and the slopes of each end and channel, 0 where they are not asked for.
+
         A loop over ends and channels, so that models are recorded once.
         """
-        n = len(self.rows)
+        n, lanes = len(self.rows), dr.width(query[0])
         tables = [mi.Float([float(v) for v in column]) for column in zip(*(self._numbers(c) for c in range(n)))]
         dr.make_opaque(tables)
 
-        def step(k: mi.UInt32, result: mi.Spectrum) -> tuple[mi.UInt32, mi.Spectrum]:
+        def step(k: mi.UInt32, result: mi.Spectrum, slopes: list[Slope]) -> tuple[mi.UInt32, mi.Spectrum, list[Slope]]:
             c, first = k % n, k < n
             albedo, sigma_t = (
-                dr.select(first, _pick(getattr(ends[0], key), c), _pick(getattr(ends[1], key), c))
-                for key in ("albedo", "sigma_t")
+                dr.select(first, _pick(getattr(ends[0], key), c), _pick(getattr(ends[1], key), c)) for key in SLOPED
             )
             node, cells, low, per_step, g, bent = (dr.gather(mi.Float, table, c) for table in tables)
-            v = dr.sqrt(x_of_albedo(dr, dr.clip(albedo, LEAST, 1), g, bent))
-            t = dr.clip((v - low) * per_step, 0, cells)
+            albedo = dr.clip(albedo, 0, 1)
+            t = dr.clip((_v(dr.maximum(albedo, LEAST), g, bent) - low) * per_step, 0, cells)
             cell = dr.minimum(dr.floor(t), cells - 1)
-            S = self._between(mi.UInt32(node + cell), t - cell, (query[0] * sigma_t, *query[1:]), active)
-            root = sigma_t * dr.sqrt(albedo**self.power * S)
-            return k + 1, mi.Spectrum([dr.select(c == j, value * root, value) for j, value in enumerate(result)])
 
-        start = mi.UInt32(0) + dr.zeros(mi.UInt32, dr.width(query[0])), dr.full(mi.Spectrum, 1, dr.width(query[0]))
-        return dr.while_loop(start, lambda k, result: active & (k < 2 * n), step, label="ends and channels")[1]
+            def pair(factor: float) -> tuple[mi.Float, mi.Float]:
+                at = query[0] * sigma_t * factor
+                return self._nodes(mi.UInt32(node + cell), t - cell, (at, *query[1:]), active)
+
+            a, b = pair(1.0)
+            S, f = _between(a, b, t - cell), t - cell
+            root = sigma_t * dr.sqrt(albedo**self.power * S)
+            if slopes:
+                new, known = Slope(mi.Float(0), mi.Float(0)), dr.minimum(a, b) > FAINT
+                if by_albedo:
+                    new.by_v = dr.select(known, 0.5 * per_step * (_log(b) - _log(a)), 0)
+                if by_sigma_t:
+                    by_r = (_log(_between(*pair(1 + STEP), f)) - _log(_between(*pair(1 - STEP), f))) / (2 * STEP)
+                    new.by_log_sigma_t = dr.select(known, 1 + 0.5 * by_r, 0)
+                slopes = [dr.select(k == j, new, old) for j, old in enumerate(slopes)]
+            return (
+                k + 1,
+                mi.Spectrum([dr.select(c == j, value * root, value) for j, value in enumerate(result)]),
+                slopes,
+            )
+
+        slopes = [dr.zeros(Slope, lanes) for _ in range(2 * n)] if by_albedo or by_sigma_t else []
+        start = mi.UInt32(0) + dr.zeros(mi.UInt32, lanes), dr.full(mi.Spectrum, 1, lanes), slopes
+        return dr.while_loop(start, lambda k, *_: active & (k < 2 * n), step, label="ends and channels")[1:]
 
     def _numbers(self, c: int) -> tuple[float, ...]:
         row, g = self.rows[c], self.g[c]
         return row.first, row.cells, row.low, 1 / row.step if row.step > 0 else 0.0, g, bend(g)
 
-    def _between(self, k: mi.UInt32, f: mi.Float, query: tuple[mi.Float, ...], active: mi.Bool) -> mi.Float:
-        """S / albedo^p at the share f of the way from node k to the next, for sigma_t = 1."""
+    def _nodes(
+        self, k: mi.UInt32, f: mi.Float, query: tuple[mi.Float, ...], active: mi.Bool
+    ) -> tuple[mi.Float, mi.Float]:
+        """S / albedo^p of node k and the next, for sigma_t = 1; of networks twice that at the share f between."""
         if self.models[0].checksums:
-            return self._between_networks(k, f, query, active)
+            return (self._between_networks(k, f, query, active),) * 2
         pairs = [self._pair(*pair) for pair in zip(self.models, self.models[1:])]  # one function with other data
-        a, b = dr.switch(k, pairs, *query, active)
-        between = dr.exp((1 - f) * dr.log(dr.maximum(a, FAINT)) + f * dr.log(dr.maximum(b, FAINT)))
-        return dr.select(dr.minimum(a, b) > FAINT, between, dr.lerp(a, b, f))
+        return dr.switch(k, pairs, *query, active)
 
     def _pair(self, first: BSSRDF, second: BSSRDF) -> Callable:
         def pair(*args: Any) -> tuple[mi.Float, mi.Float]:
@@ -170,6 +227,19 @@ class Palette:
         return dr.exp(total)
 
 
+def _between(a: mi.Float, b: mi.Float, f: mi.Float) -> mi.Float:
+    """At the share f of the way, in the logarithm."""
+    return dr.select(dr.minimum(a, b) > FAINT, dr.exp((1 - f) * _log(a) + f * _log(b)), dr.lerp(a, b, f))
+
+
+def _log(S: mi.Float) -> mi.Float:
+    return dr.log(dr.maximum(S, FAINT))
+
+
+def _v(albedo: mi.Float, g: mi.Float, bent: mi.Float) -> mi.Float:
+    return dr.sqrt(x_of_albedo(dr, albedo, g, bent))
+
+
 def _pick(values: mi.Spectrum, c: mi.UInt32) -> mi.Float:
     value = values[0]
     for k in range(1, len(values)):
@@ -189,10 +259,14 @@ class TexturedTransport:
 
     Args:
         palette: the models.
+        obj: the object.
+        textured: its medium, 1/(scene unit).
         geometry: "distance" or "tangent", see `points.separation`.
     """
 
     palette: Palette
+    obj: Geometry
+    textured: TexturedMedium
     geometry: str = "distance"
     alpha = None
     is_delta = False
@@ -211,9 +285,11 @@ class TexturedTransport:
 
     def S(self, exit: SurfacePoint, at: SurfacePoint, active: mi.Bool = True) -> mi.Spectrum:
         """See `Transport`."""
-        query = plane_query(at, exit, self.geometry)
-        above = active & (at.mu > 0) & (query[3] > 0)
-        return dr.select(above, self.palette.S((exit.medium, at.medium), query, above), 0)
+        with dr.suspend_grad():
+            query = plane_query(at, exit, self.geometry)
+            above = active & (at.mu > 0) & (query[3] > 0)
+        ends = [self.textured.followed(self.obj, end, above) for end in (exit, at)]
+        return dr.select(above, self.palette.S(ends, query, above), 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -267,7 +343,7 @@ def textured_model(
     table = RadialTable(models, geometry.size)
     share = area_share(geometry, table.mean / geometry.size, settings.area_share)
     positions = PositionSampler(geometry, table, AreaPoints(geometry.shape), share)
-    transport = TexturedTransport(Palette.of(name, albedos, media), settings.geometry)
+    transport = TexturedTransport(Palette.of(name, albedos, media), geometry, textured, settings.geometry)
     return ObjectModel(transport, TexturedProposals(HalfSpaceProposals(positions, models[0]), textured))
 
 

@@ -22,7 +22,7 @@ import numpy as np
 
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.physics.reflectance import albedo_of_reflectance, half_space_reflectance
-from halfspace_sss.rendering.object.points import opaque
+from halfspace_sss.rendering.object.points import SurfacePoint, opaque
 from halfspace_sss.rendering.object.shape import Geometry, name_of
 
 NODES = 1025  # of the table of x by reflectance
@@ -99,10 +99,11 @@ def x_of_albedo(lib: Any, albedo: Any, g: Any, c: Any) -> Any:
 
 @dataclass
 class SurfaceMedium:
-    """The medium at a point of the surface, per channel."""
+    """The medium at a point of the surface, per channel, and the number of the face there."""
 
     albedo: mi.Spectrum
     sigma_t: mi.Spectrum
+    face: mi.UInt32
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,13 +130,30 @@ class TexturedMedium:
 
     def at(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> SurfaceMedium:
         """Albedo and sigma_t at a point of the surface."""
-        return SurfaceMedium(self.albedo_at(si, active), self._extinction(_value(self.sigma_t, si, active)))
+        sigma_t = self._extinction(_value(self.sigma_t, si, active))
+        return SurfaceMedium(self.albedo_at(si, active), sigma_t, mi.UInt32(si.prim_index))
 
     def at_point(
         self, obj: Geometry, p: mi.Point3f, n: mi.Normal3f, face: mi.UInt32, active: mi.Bool = True
     ) -> SurfaceMedium:
         """The same at a point of an object with its outward normal and its face."""
         return self.at(_interaction(obj, p, n, face, active), active)
+
+    def followed(self, obj: Geometry, at: SurfacePoint, active: mi.Bool = True) -> SurfaceMedium:
+        """The medium at a point that knows it, with derivatives by texels and attributes where they are followed."""
+        if not self.is_followed(obj.shape):
+            return at.medium
+        found = self.at_point(obj, at.p, at.n, at.medium.face, active)
+        albedo, sigma_t = (
+            dr.replace_grad(getattr(at.medium, key), getattr(found, key)) for key in ("albedo", "sigma_t")
+        )
+        return SurfaceMedium(albedo, sigma_t, at.medium.face)
+
+    def is_followed(self, shape: mi.Shape) -> bool:
+        """Whether derivatives by texels, or by attributes of a shape, are followed."""
+        values = [value for texture in self.textures.values() for _, value in mi.traverse(texture)]
+        values += [mi.traverse(shape)[key] for texture in self.textures.values() for _, key in shown(texture)]
+        return any(dr.is_diff_v(value) and dr.grad_enabled(value) for value in values)
 
     def albedo_at(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> mi.Spectrum:
         """The albedo of single scattering at a point of the surface."""
@@ -251,10 +269,7 @@ def attributes(name: str, texture: mi.Texture, shape: mi.Shape) -> np.ndarray:
         ValueError: the shape has no such attribute, or one of another number of channels; `name` is the parameter's.
     """
     n, values = len(mi.Spectrum(0)), []
-    for node in mi.traverse(texture).hierarchy:
-        if _kind(node) != "MeshAttribute":
-            continue
-        key = re.search(r'name = "([^"]*)"', str(node)).group(1)
+    for node, key in shown(texture):
         if not (shape.is_mesh() and shape.has_attribute(key)):
             raise ValueError(f"object {name_of(shape)} must have the attribute {key!r} of the texture {name}")
         count = shape.face_count() if key.startswith("face_") else shape.vertex_count()
@@ -266,6 +281,12 @@ def attributes(name: str, texture: mi.Texture, shape: mi.Shape) -> np.ndarray:
         each = each if each.shape[1] == n else each.mean(axis=1, keepdims=True)
         values.append(np.broadcast_to(each * float(mi.traverse(node)["scale"]), (count, n)))
     return np.concatenate([np.zeros((0, n)), *values])
+
+
+def shown(texture: mi.Texture) -> list[tuple[mi.Object, str]]:
+    """The attributes of a mesh that a texture shows: the node that does, and the name of each."""
+    nodes = [node for node in mi.traverse(texture).hierarchy if _kind(node) == "MeshAttribute"]
+    return [(node, re.search(r'name = "([^"]*)"', str(node)).group(1)) for node in nodes]
 
 
 def _kind(node: mi.Object) -> str:

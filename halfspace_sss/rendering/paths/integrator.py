@@ -272,14 +272,12 @@ def replayer(objects: list[TranslucentObject], settings: Settings) -> mi.Integra
     """An integrator of Mitsuba's radiative backpropagation around the paths through a scene with these objects.
 
     Raises:
-        ValueError: gradients are enabled for a medium, and the model knows no other, or for what lies inside an object.
+        ValueError: as of `TranslucentObject.prepare_derivatives`.
     """
     from mitsuba.python.ad.integrators.common import RBIntegrator
 
     for obj in objects:
-        obj.variation.prepare()
-        if obj.geometry.contents is not None:
-            obj.geometry.contents.check_held()
+        obj.prepare_derivatives()
 
     class Replayer(RBIntegrator):
         """Mitsuba's camera rays and films, this project's paths."""

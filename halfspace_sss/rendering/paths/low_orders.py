@@ -114,7 +114,10 @@ def sample_low_orders(
         straight, connected = once & (walk.reflections == 0), once & (walk.reflections <= 1)
 
     # ---- throughput f / p
-    media = _media(obj, walk.medium) if walk.medium else obj.variation.coefficients(obj.media)
+    if walk.medium:
+        media = _media(obj, obj.textured.followed(obj.geometry, refracted.out, active))
+    else:
+        media = obj.variation.coefficients(obj.media)
     f = _contribution(media, walk.length, walk.order, walk.cosine)
     weight = dr.select(counts, f * (walk.inverse_pdf * refracted.T), 0)
 
