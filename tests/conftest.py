@@ -110,6 +110,12 @@ def mono() -> None:
 
 
 @pytest.fixture
+def spectral() -> None:
+    """Our plugins under the variant llvm_ad_spectral of Mitsuba."""
+    _set_variant("llvm_ad_spectral")
+
+
+@pytest.fixture
 def quiet_rgb(rgb: None):
     """As `rgb`, without warnings."""
     with warnings.catch_warnings():

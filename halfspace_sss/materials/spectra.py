@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -101,6 +101,27 @@ class SpectralMedium:
         self._check_covered(float(asked.min()), float(asked.max()))
         s, a, g, n = (np.interp(asked, self.wavelengths, v) for v in (self.sigma_s, self.sigma_a, self.g, self.n))
         return Medium(s, a, g, float(np.mean(n)))
+
+    def visible(self, n: int) -> Medium:
+        """The medium at n wavelengths evenly over what the spectra have of 400 to 700 nm, else over all of them."""
+        low, high = np.clip(VISIBLE, self.wavelengths[0], self.wavelengths[-1])
+        if low == high:
+            low, high = self.wavelengths[[0, -1]]
+        return self.medium(low + (high - low) * (np.arange(n) + 0.5) / n)
+
+    def surface(self) -> dict[str, Any]:
+        """The medium as parameters of the surface `translucent` of a Mitsuba dictionary, under a spectral variant.
+
+        The index is the mean over the visible range: renders have no dispersion.
+        """
+
+        def spectrum(values: np.ndarray) -> dict[str, Any] | float:
+            texts = (", ".join(f"{v:.9g}" for v in row) for row in (self.wavelengths, values))
+            named = dict(zip(("wavelengths", "values"), texts))
+            return {"type": "irregular", **named} if np.ptp(values) else float(values[0])
+
+        values = {name: spectrum(getattr(self, name)) for name in ("sigma_s", "sigma_a", "g")}
+        return {**values, "eta": self.visible(4).eta}
 
     def reflectance(self, wavelengths: Sequence[float], mu_i: float | str = DIFFUSE) -> np.ndarray:
         """Reflectance of the half-space at these wavelengths (nm), each with its own index; as `Medium.reflectance`."""

@@ -19,7 +19,7 @@ def register() -> None:
     and `render`, which without it begins with "unknown plugin" and a traceback.
 
     Raises:
-        ValueError: no variant is set, or the plugins do not run under it (scalar, spectral or polarised ones).
+        ValueError: no variant is set, or the plugins do not run under it (scalar or polarised ones).
         BackendError: Mitsuba is not installed, or the LLVM that Dr.Jit found would abort the process.
     """
     global _active

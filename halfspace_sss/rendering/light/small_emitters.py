@@ -32,6 +32,7 @@ MOST = 8  # suns
 RADII = np.radians(0.15 * 1.3 ** np.arange(16))  # of cones, up to 7.7 degrees
 HALO = 0.05  # radiance of the ring about a sun, to twice its radius, over that of the sun: a cone that has it all
 MARGIN = 1.3  # of the radius, for what few samples do not show of the rim
+LOOKED_AT = (450.0, 520.0, 580.0, 640.0)  # nm, under spectral variants
 LEAST_VARIANCE = 1.0  # that chance would have, of the square of the mean: below, a region is left to chance
 
 
@@ -59,7 +60,10 @@ def _light(environment: mi.Emitter) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     """Directions (n, 3) that the environment draws, its radiance there, and their part of its light."""
     k = dr.arange(mi.UInt32, SAMPLES**2)
     u = mi.Point2f(k % SAMPLES + 0.5, k // SAMPLES + 0.5) / SAMPLES
-    ds, weight = environment.sample_direction(dr.zeros(mi.Interaction3f, SAMPLES**2), u)
+    at = dr.zeros(mi.Interaction3f, SAMPLES**2)
+    if mi.is_spectral:
+        at.wavelengths = mi.Spectrum(*LOOKED_AT)
+    ds, weight = environment.sample_direction(at, u)
     energy = np.array(mi.Spectrum(weight) + dr.zeros(mi.Float, SAMPLES**2), dtype=float).max(axis=0)
     energy = np.where(np.isfinite(energy), energy, 0)
     return np.array(ds.d, dtype=float).T, energy * np.array(ds.pdf), energy
@@ -204,7 +208,7 @@ class SmallEmitters:
             sine, (sin_phi, cos_phi) = dr.safe_sqrt(x * (2 - x)), dr.sincos(2 * dr.pi * u.y)
             way = mi.Frame3f(axis).to_world(mi.Vector3f(sine * cos_phi, sine * sin_phi, 1 - x))
             si = dr.zeros(mi.SurfaceInteraction3f)
-            si.wi = -way
+            si.wi, si.wavelengths = -way, at.wavelengths
             L = self.scene.environment().eval(si, sun) * _solid_angle(radius)
             d, light = dr.select(sun, way, d), dr.select(sun, L, light)
         return d, distance, light
@@ -235,7 +239,7 @@ class SmallEmitters:
 def spread(scene: mi.Scene, emitter: mi.EmitterPtr, ray: mi.Ray3f, radius: mi.Float, active: mi.Bool) -> mi.Spectrum:
     """E / Ω of a delta light, for a ray whose angle with the direction to it is below the radius of Ω."""
     at = dr.zeros(mi.Interaction3f)
-    at.p = ray.o
+    at.p, at.wavelengths = ray.o, ray.wavelengths
     ds, E = emitter.sample_direction(at, mi.Point2f(0.5), active)
     seen = active & (ds.pdf > 0) & _within(ray.d, ds.d, radius) & (dr.max(E) > 0)
     shadow = mi.Ray3f(ray.o, ds.d)

@@ -487,6 +487,10 @@ def make_objects(
         ValueError: there is none, a camera or a lamp is inside one, a model refuses its medium or what lies inside, or
             the orders that are asked for are not those of the model.
     """
+    if mi.is_spectral:
+        raise ValueError(
+            f"variant must be RGB or mono for {_MODELS}, got {mi.variant()}: translucent_walk traces spectra"
+        )
     shapes = translucent_shapes(scene)
     if not shapes:
         raise ValueError("the scene must have an object with a translucent BSDF, got none")
@@ -661,6 +665,8 @@ def object_of(
             to both sides, it is an instance or has inside what cannot be learnt. The medium is missing or has other
             channels than the variant, or mm_per_unit is not a finite number > 0.
     """
+    if mi.is_spectral:
+        raise ValueError(f"variant must be RGB or mono for an object to be learnt, got {mi.variant()}")
     if not isinstance(shape, mi.Scene):
         geometry = survey(shape)
         media = _in_scene_units(medium, 1.0 if mm_per_unit is None else mm_per_unit)

@@ -98,11 +98,12 @@ def read_settings(props: Any) -> Settings:
 # The variants of Mitsuba under which the plugins run.
 
 
-VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb", "llvm_ad_mono", "cuda_ad_mono")
+CHANNELS = {"rgb": 3, "mono": 1, "spectral": 4}
+VARIANTS = tuple(f"{backend}_ad_{kind}" for kind in CHANNELS for backend in ("llvm", "cuda"))
 
 
 def variant_channels() -> int:
-    """3 under an RGB variant of Mitsuba, 1 under a mono one.
+    """3 under an RGB variant of Mitsuba, 1 under a mono one, 4 wavelengths under a spectral one.
 
     Raises:
         ValueError: no variant is set, or another kind is.
@@ -111,8 +112,8 @@ def variant_channels() -> int:
 
     variant = mi.variant()
     if variant not in VARIANTS:
-        raise ValueError(f"variant must be llvm_ad_ or cuda_ad_ with rgb or mono, got {variant!r}")
-    return 3 if variant.endswith("rgb") else 1
+        raise ValueError(f"variant must be llvm_ad_ or cuda_ad_ with rgb, mono or spectral, got {variant!r}")
+    return CHANNELS[variant.rpartition("_")[2]]
 
 
 # --------------------------------------------------------------------------------------------------

@@ -44,6 +44,7 @@ from __future__ import annotations
 
 import functools
 import math
+import warnings
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -54,12 +55,14 @@ import numpy as np
 from halfspace_sss import materials
 from halfspace_sss.checks import check_choice
 from halfspace_sss.materials.registry import one_channel
+from halfspace_sss.materials.spectra import SpectralMedium
 from halfspace_sss.physics.fresnel import F_t, mu_internal
 from halfspace_sss.physics.medium import Medium
-from halfspace_sss.physics.reflectance import directional_table
+from halfspace_sss.physics.reflectance import directional_table, half_space_reflectance
 from halfspace_sss.rendering.object.points import mirrored, opaque
 from halfspace_sss.rendering.object.registry import model_names
 from halfspace_sss.rendering.object.settings import ORDERS, check_parameters, variant_channels
+from halfspace_sss.rendering.object.spectral import CHANNELS, MediumByWavelength, read_file, spectral_medium
 from halfspace_sss.rendering.object.textured import constant_texture, textured_medium
 from halfspace_sss.rendering.object.varying import constant_value, mean_of_grids, varying_medium
 
@@ -291,7 +294,7 @@ def _class(variant: str) -> type:
             textured = self.inside.textured
             for name, texture in textured.textures.items() if textured else ():
                 callback.put(name, texture, mi.ParamFlags.Differentiable)
-            for name in VARIABLE if self.inside.is_homogeneous else ():
+            for name in VARIABLE if self.inside.is_constant else ():
                 callback.put(name, getattr(self, name), mi.ParamFlags.Differentiable)
             callback.put("boundary", self.boundary, mi.ParamFlags.Differentiable)
 
@@ -299,7 +302,7 @@ def _class(variant: str) -> type:
             # the integrators see another `inside`, and make anew what they made of it
             if self.inside.textured is not None and not (keys and all(key.startswith("boundary") for key in keys)):
                 self.inside = self.inside.repainted()
-            elif self.inside.is_homogeneous:
+            elif self.inside.is_constant:
                 self.inside = self.inside.changed(**{name: np.ravel(getattr(self, name)) for name in VARIABLE})
             check_eta(self.boundary, self.inside.medium.eta)
 
@@ -339,9 +342,12 @@ def _class(variant: str) -> type:
             m = self.inside.medium
             if self.directional is None or not self.directional.serves(m):
                 self.directional = HalfSpaceAlbedo(m)
-            varying, textured = self.inside.varying, self.inside.textured
+            varying, textured, spectral = self.inside.varying, self.inside.textured, self.inside.spectral
             albedo = self.albedo if varying is None else varying.albedo_at(si.p, active)
             albedo = albedo if textured is None else textured.albedo_at(si, active)
+            if spectral is not None:
+                sigma_t, sigma_s, _ = spectral.at(si.wavelengths)
+                albedo = sigma_s / dr.maximum(sigma_t, 1e-30)
             return self.directional(albedo, dr.abs(mi.Frame3f.cos_theta(si.wi))) & active
 
         def to_string(self) -> str:
@@ -397,7 +403,7 @@ def _boundaries(props: mi.Properties) -> list[tuple[str, Any]]:
 
 PARAMETERS = (
     "material", "sigma_s", "sigma_a", "sigma_t", "albedo", "scale", "reflectance", "mfp", "g", "eta", "model", "orders",
-    "channel", "dilution", "reflection",
+    "channel", "dilution", "reflection", "spectra", "unit",
 )  # fmt: skip
 
 
@@ -413,6 +419,7 @@ class Inside:
         reflection: whether the boundary reflects.
         varying: how the medium varies in space, a `VaryingMedium`, or None. `medium` then has the means of the grids.
         textured: how it varies over the surface, a `TexturedMedium`, or None; `medium` then has the means of texels.
+        spectral: how it varies with wavelength, a `MediumByWavelength`, or None; `medium` then is at four wavelengths.
     """
 
     label: str
@@ -422,11 +429,17 @@ class Inside:
     reflection: bool
     varying: Any = None
     textured: Any = None
+    spectral: Any = None
 
     @property
     def is_homogeneous(self) -> bool:
         """Whether the medium is the same everywhere."""
         return self.varying is None and self.textured is None
+
+    @property
+    def is_constant(self) -> bool:
+        """Whether it is the same at all wavelengths too, so that a few numbers are the whole medium."""
+        return self.is_homogeneous and self.spectral is None
 
     def channels(self) -> list[Medium]:
         """The scalar media of the channels."""
@@ -462,16 +475,72 @@ def read_inside(props: mi.Properties) -> Inside:
     Raises:
         ValueError: a parameter is missing, unknown in value, or out of range.
     """
-    label, medium, varying, textured = _medium(props)
+    if mi.is_spectral:
+        label, medium, spectral = _by_wavelength(props)
+        varying, textured = None, None
+    else:
+        (label, medium, varying, textured), spectral = _medium(props), None
     model, orders = props.get("model", "neural"), props.get("orders", "total")
     check_choice("orders", orders, ORDERS)
     check_choice("model", model, model_names())
-    return Inside(label, medium, model, orders, bool(props.get("reflection", True)), varying, textured)
+    return Inside(label, medium, model, orders, bool(props.get("reflection", True)), varying, textured, spectral)
+
+
+COEFFICIENTS = ("sigma_s", "sigma_a", "sigma_t", "albedo", "scale", "reflectance", "mfp", "g", "eta")
+
+
+def _by_wavelength(props: mi.Properties) -> tuple[str, Medium, MediumByWavelength | None]:
+    """Of a spectral variant: the medium at four wavelengths, and at all where it is not the same at all."""
+    for key in ("material", "dilution", "channel"):
+        if key in props:
+            raise ValueError(
+                f"{key} must be left out under a spectral variant, as the channels of materials are no spectra, got "
+                f"{props[key]!r}: give spectra"
+            )
+    values, wavelengths = spectral_medium(props, COEFFICIENTS)
+    if "spectra" in props:
+        if values:
+            raise ValueError(f"spectra must stand without {', '.join(values)}, got both")
+        spectral = MediumByWavelength.of(read_file(props))
+        return str(props["spectra"]), spectral.mean(), spectral
+    if not any(values.keys() >= set(pair) for pair in PAIRS):
+        raise ValueError(
+            "a translucent surface must have spectra, or sigma_s and sigma_a, or sigma_t and albedo, or reflectance "
+            "and mfp under a spectral variant"
+        )
+    if np.ndim(values.get("eta", 1.0)):
+        raise ValueError("eta must be a number under a spectral variant, got a spectrum: dispersion is left out")
+    if wavelengths is not None and "reflectance" in values:
+        values["reflectance"] = _clipped(values)
+    medium, _, _ = _inline_medium(values)
+    if wavelengths is None:
+        return "medium", _of_channels(medium, CHANNELS), None
+    by_wavelength = _of_channels(medium, len(wavelengths))
+    coefficients = (by_wavelength.sigma_s, by_wavelength.sigma_a, by_wavelength.g, medium.eta)
+    spectral = MediumByWavelength.of(SpectralMedium(wavelengths, *coefficients))
+    return "medium", spectral.mean(), spectral
+
+
+def _clipped(values: dict[str, Any]) -> np.ndarray:
+    """Reflectance by wavelength, which a colour may make more than any medium has, at what that has; warns of it."""
+    g, R = np.broadcast_arrays(values.get("g", 0.0), values["reflectance"])
+    most = {each: half_space_reflectance(1.0, each, float(values.get("eta", ETA))) for each in set(g.tolist())}
+    most = np.array([most[each] for each in g.tolist()])
+    above = int((most * (1 + 1e-6) < R).sum())
+    if above:
+        warnings.warn(
+            f"{above} of {len(R)} wavelengths of reflectance are above {most.min():.4g}, that of a medium without "
+            "absorption, and are clipped",
+            stacklevel=2,
+        )
+    return np.minimum(R, most)
 
 
 def _medium(props: mi.Properties) -> tuple[str, Medium, Any, Any]:
-    keys = ("sigma_s", "sigma_a", "sigma_t", "albedo", "scale", "reflectance", "mfp", "g", "eta")
-    inline = {key: constant_texture(constant_value(props[key])) for key in keys if key in props}
+    for key in ("spectra", "unit"):
+        if key in props:
+            raise ValueError(f"{key} must be left out but under a spectral variant, got {props[key]!r}")
+    inline = {key: constant_texture(constant_value(props[key])) for key in COEFFICIENTS if key in props}
     if "material" in props:
         if inline:
             raise ValueError(f"material must stand without {', '.join(inline)}, got both")
@@ -494,6 +563,7 @@ def _medium(props: mi.Properties) -> tuple[str, Medium, Any, Any]:
 
 
 IN_SPACE, OVER_SURFACE = ("sigma_t", "scale", "albedo"), ("albedo", "sigma_t", "reflectance", "mfp")
+ETA = 1.3  # where none is given
 PAIRS = (("sigma_s", "sigma_a"), ("sigma_t", "albedo"), ("reflectance", "mfp"))
 
 
@@ -508,7 +578,7 @@ def _inline_medium(inline: dict) -> tuple[Medium, Any, Any]:
                 raise ValueError(f"{key} must be constant, got a {kind}; {', '.join(able)} may vary")
     if volumes and textures:
         raise ValueError(f"{textures[0]} must be a number where {volumes[0]} is a volume, got a texture")
-    eta, g = float(np.max(values.pop("eta", 1.3))), values.pop("g", 0.0)
+    eta, g = float(np.max(values.pop("eta", ETA))), values.pop("g", 0.0)
     pair = next(pair for pair in PAIRS if values.keys() >= set(pair))
     if extra := values.keys() - set(pair) - ({"scale"} if "albedo" in pair else set()):
         raise ValueError(f"{' and '.join(pair)} must stand without {', '.join(sorted(extra))}, got both")
@@ -537,11 +607,16 @@ def _for_variant(label: str, medium: Medium, names: Any, props: mi.Properties) -
     if channel is not None:
         raise ValueError(f"channel must be left out under this variant or for this medium, got {channel!r}")
     if wanted == 3 and n is None:
-        same = {key: np.full(3, float(getattr(medium, key))) for key in ("sigma_s", "sigma_a", "g")}
-        return label, Medium(**same, eta=medium.eta)
+        return label, _of_channels(medium, 3)
     if wanted == 3 and n != 3:
         raise ValueError(f"medium must have 1 or 3 channels, got {n}")
     return label, medium
+
+
+def _of_channels(medium: Medium, n: int) -> Medium:
+    """A medium of n channels, the same in all if it has none."""
+    same = {key: np.broadcast_to(getattr(medium, key), n).astype(float) for key in ("sigma_s", "sigma_a", "g")}
+    return Medium(**same, eta=medium.eta)
 
 
 def _numbers(key: str, value: Any) -> Any:

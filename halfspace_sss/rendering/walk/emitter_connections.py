@@ -25,7 +25,7 @@ import numpy as np
 
 from halfspace_sss.rendering.light.small_emitters import SmallEmitters, spread
 from halfspace_sss.rendering.object.points import channel_mean, opaque, opposed, sided
-from halfspace_sss.rendering.walk.media import Coefficients, WalkMedia, WalkMedium
+from halfspace_sss.rendering.walk.media import Coefficients, WalkMedia, WalkMedium, interaction_of, ray_of
 from halfspace_sss.rendering.walk.random_walk import (
     Event,
     Walk,
@@ -259,9 +259,7 @@ def _draw_across(event: Event, sample: EmitterSample, rng: mi.PCG32) -> tuple[mi
     density = sum(channel_mean(c * wide * dr.exp(-c * wide * r)) for c in RATES) / (len(RATES) * 2 * dr.pi * r)
     sin_phi, cos_phi = dr.sincos(2 * dr.pi * rng.next_float32())
     s, t = mi.coordinate_system(sample.w_0)
-    at = dr.zeros(mi.Interaction3f)
-    at.p = mi.Point3f(event.p + sample.shift + (s * cos_phi + t * sin_phi) * r)
-    return at, density
+    return interaction_of(event.p + sample.shift + (s * cos_phi + t * sin_phi) * r, event.medium), density
 
 
 def _on_ray(walk: Walk, event: Event, u: mi.Float) -> tuple[mi.Float, mi.Float]:
@@ -352,7 +350,7 @@ class EmitterDirections:
         which = mi.Int32(draw(n, rng))
         guess, concentration, valid = self._guess(v, k, which, m, True)
         d, pdf = _draw_lobe(guess, concentration, rng)
-        ray = mi.Ray3f(v, d)
+        ray = ray_of(v, d, event.medium)
         ray.maxt = 2 * DEEPEST / dr.min(m.mean_t)
         si = self.media.scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=valid)
         valid &= si.is_valid() & (self.media.index_of(si.shape) == k)

@@ -125,6 +125,8 @@ def _class(variant: str) -> type:
         def _differentiable(
             self, scene: mi.Scene, sensor: mi.Sensor | int, seed: mi.UInt32 | int, spp: int
         ) -> mi.TensorXf:
+            if mi.is_spectral:
+                raise ValueError(f"derivatives must be of an RGB or mono variant, got {mi.variant()}")
             _check_followed(scene)
             sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
             spp = spp or sensor.sampler().sample_count()
@@ -177,6 +179,9 @@ def _render(
     tracer: PathTracer, sensor: mi.Sensor, seed: int, spp: int, keep: Keep | None, scored: bool = False
 ) -> None:
     """Fill the film of a sensor, in launches between which an interrupt is heard."""
+    for obj, inside in zip(tracer.visitor.media.objects, tracer.visitor.media.insides):
+        if inside.spectral is not None:
+            inside.spectral.check_covers(obj.name, sensor)
     sensor.film().prepare([])
     most = max(1, SAMPLES_PER_LAUNCH // int(dr.prod(_sampled_size(sensor.film()))))
     for launch, start in enumerate(range(0, spp, most)):
@@ -222,6 +227,7 @@ def _splat(film: mi.Film, rays: mi.Ray3f, L: mi.Spectrum, seen: mi.Bool, positio
     if mi.has_flag(film.flags(), mi.FilmFlags.Special):
         values = film.prepare_sample(L, rays.wavelengths, block.channel_count(), weight=1.0, alpha=alpha)
     else:
+        L = mi.spectrum_to_srgb(L, rays.wavelengths) if mi.is_spectral else L
         rgb = [L[0]] * 3 if len(L) == 1 and block.channel_count() >= 4 else list(L)
         values = [*rgb, *([alpha] if has_alpha else []), mi.Float(1)]
     block.put(position, values)
@@ -262,6 +268,8 @@ def _widened(ray: mi.Ray3f, n: int) -> mi.Ray3f:
     """n rays; those of a sensor that knows one ray only are one."""
     result = mi.Ray3f(ray)
     result.o, result.d = result.o + dr.zeros(mi.Point3f, n), result.d + dr.zeros(mi.Vector3f, n)
+    if mi.is_spectral:
+        result.wavelengths = result.wavelengths + dr.zeros(mi.Spectrum, n)
     return result
 
 

@@ -273,10 +273,26 @@ class Coefficients(NamedTuple):
 
 @dataclass
 class WalkMedium:
-    """What a walk takes of textures, at the point where it enters, for its whole way; 1/(scene unit)."""
+    """What a walk carries: of textures and spectra the medium where it enters, for its whole way; 1/(scene unit)."""
 
     sigma_t: mi.Spectrum
     sigma_s: mi.Spectrum
+    g: mi.Spectrum | tuple[()] = ()  # where it differs by wavelength
+    wavelengths: mi.Spectrum | tuple[()] = ()  # of its light, nm, under spectral variants
+
+
+def ray_of(o: mi.Point3f, d: mi.Vector3f, medium: WalkMedium | tuple[()]) -> mi.Ray3f:
+    """A ray with the wavelengths of a walk that carries `medium`."""
+    return mi.Ray3f(o, d, 0, medium.wavelengths) if mi.is_spectral else mi.Ray3f(o, d)
+
+
+def interaction_of(p: mi.Point3f, medium: WalkMedium | tuple[()]) -> mi.Interaction3f:
+    """A point that emitters are seen from, with the wavelengths of a walk that carries `medium`."""
+    at = dr.zeros(mi.Interaction3f)
+    at.p = mi.Point3f(p)
+    if mi.is_spectral:
+        at.wavelengths = medium.wavelengths
+    return at
 
 
 @dataclass(frozen=True, eq=False)
@@ -334,7 +350,7 @@ class WalkMedia:
     @property
     def same_g(self) -> bool:
         """Whether g of every medium is the same in all channels."""
-        return all(np.ptp(inside.medium.g) == 0 for inside in self.insides)
+        return all(np.ptp((inside.spectral or inside.medium).g) == 0 for inside in self.insides)
 
     @property
     def any_rough(self) -> bool:
@@ -382,33 +398,42 @@ class WalkMedia:
         return mi.Spectrum([dr.gather(mi.Float, column, self._place(k)) for column in self.tables[key]])
 
     @property
-    def textured(self) -> bool:
-        """Whether a medium has textures, so that walks carry what they took of them."""
-        return any(inside.textured is not None for inside in self.insides)
+    def carried(self) -> bool:
+        """Whether walks carry their medium: what they took of textures, or of spectra at their wavelengths."""
+        return mi.is_spectral or any(inside.textured is not None for inside in self.insides)
 
     def fetch(self, k: mi.Int32, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> WalkMedium | tuple[()]:
-        """What a walk takes that enters object k at a point of its surface: the medium there; () without textures."""
-        if not self.textured:
+        """What a walk takes that enters object k at a point of its surface: the medium there; () if none is carried."""
+        if not self.carried:
             return ()
-        sigma_t, sigma_s = self.spectrum("sigma_t", k), self.spectrum("sigma_s", k)
+        sigma_t, sigma_s, g = (self.spectrum(key, k) for key in ("sigma_t", "sigma_s", "g"))
         for number, inside in enumerate(self.insides):
+            here = active & (k == number)
             if inside.textured is not None:
-                here = active & (k == number)
                 at = inside.textured.scaled(self.mm_per_unit).at(si, here)
                 sigma_t = dr.select(here, at.sigma_t, sigma_t)
                 sigma_s = dr.select(here, at.albedo * at.sigma_t, sigma_s)
-        return WalkMedium(sigma_t, sigma_s)
+            elif inside.spectral is not None:
+                at = inside.spectral.at(si.wavelengths, self.mm_per_unit)
+                sigma_t, sigma_s, g = (dr.select(here, a, b) for a, b in zip(at, (sigma_t, sigma_s, g)))
+        g = () if self.same_g else g
+        return WalkMedium(sigma_t, sigma_s, g, si.wavelengths) if mi.is_spectral else WalkMedium(sigma_t, sigma_s)
 
-    def unknown(self, lanes: int) -> WalkMedium | tuple[()]:
+    def unknown(self, lanes: int, wavelengths: mi.Spectrum | tuple[()] = ()) -> WalkMedium | tuple[()]:
         """What a walk carries before it has entered anything."""
-        return WalkMedium(*(dr.full(mi.Spectrum, 1, lanes) for _ in range(2))) if self.textured else ()
+        if not self.carried:
+            return ()
+        g = dr.full(mi.Spectrum, 0, lanes) if mi.is_spectral and not self.same_g else ()
+        return WalkMedium(*(dr.full(mi.Spectrum, 1, lanes) for _ in range(2)), g, wavelengths)
 
     def coefficients(self, k: mi.Int32, p: mi.Point3f, medium: WalkMedium | tuple[()] = ()) -> Coefficients:
         """Of object k at the point p, for a walk that took `medium` from `fetch`."""
         mean, g = self.spectrum("sigma_t", k), self.spectrum("g", k)
         if self.heterogeneous is None:
             if medium:
-                return Coefficients(medium.sigma_t, medium.sigma_s, g, medium.sigma_t, medium.sigma_t)
+                return Coefficients(
+                    medium.sigma_t, medium.sigma_s, medium.g if len(medium.g) else g, medium.sigma_t, medium.sigma_t
+                )
             return Coefficients(mean, self.spectrum("sigma_s", k), g, mean, mean)
         sigma_t, sigma_s = self.heterogeneous.coefficients(k, p)
         result = Coefficients(sigma_t, sigma_s, g, self.heterogeneous.majorant(k), mean)

@@ -22,7 +22,7 @@ from halfspace_sss.rendering.walk.emitter_connections import (
     InnerLights,
     SubpathConnections,
 )
-from halfspace_sss.rendering.walk.media import WalkMedia, WalkMedium
+from halfspace_sss.rendering.walk.media import WalkMedia, WalkMedium, interaction_of, ray_of
 from halfspace_sss.rendering.walk.random_walk import (
     OUTSIDE,
     Crossing,
@@ -99,8 +99,7 @@ class LightVisitor:
         # ---- inner lights
         record = replace(record, scattered=mi.Bool(True))
         if self.inner_lights is not None:
-            at = dr.zeros(mi.Interaction3f)
-            at.p = event.p
+            at = interaction_of(event.p, walk.medium)
             d, E = self.inner_lights.light(walk.object, at, walk.rng, True, walk.medium)
             record = replace(record, L=record.L + walk.weight * eval_phase(event.m, dr.dot(event.along, d)) * E)
         if self.connections is None:
@@ -198,7 +197,7 @@ class LightVisitor:
             active &= ~(record.connected & self.connections.covers(which, emitter, w_0, record.pivot))
             directed = active & record.directed
         radius = dr.select(directed, NARROW, opaque(WIDE * self.blur))
-        ray = mi.Ray3f(walk.o, walk.d)
+        ray = ray_of(walk.o, walk.d, walk.medium)
         L = self.small.spread(which, ray, radius, active)
         if self.connections is not None:
             directed &= dr.max(L) > 0
@@ -211,7 +210,7 @@ class LightVisitor:
         """Light of an inner light whose cone holds the ray, from a vertex that it was not sampled at."""
         if self.inner_lights is None:
             return mi.Spectrum(0)
-        ray = mi.Ray3f(walk.o + walk.d * walk.skip, walk.d)
+        ray = ray_of(walk.o + walk.d * walk.skip, walk.d, walk.medium)
         active = active & walk.alive & (walk.object >= 0)
         L = self.inner_lights.spread(walk.object, ray, walk.rng, active, walk.medium)
         return dr.select(active, walk.weight * L, 0)
@@ -341,7 +340,7 @@ class PathTracer:
 
     def _outside(self, p: CameraPath) -> CameraPath:
         """A ray outside all objects, and the surface that it meets."""
-        ray = mi.Ray3f(p.walk.o, p.walk.d)
+        ray = ray_of(p.walk.o, p.walk.d, p.walk.medium)
         si = self.visitor.scene.ray_intersect(ray, mi.RayFlags.All, coherent=False)
 
         # ---- emission, with its MIS weight
@@ -401,7 +400,7 @@ class PathTracer:
             returns = encloses & (dr.dot(d, si.n) > 0)
             k, enters = dr.select(returns, around, k), enters | returns
         o, skip = media.depart(near, si, d, enters) if media.objects else (si.spawn_ray(d).o, walk.skip)
-        if media.textured:  # the medium of the exit, for the whole walk
+        if media.carried:  # the medium of the exit, for the whole walk
             enters_object = alive & enters
             walk = replace(walk, medium=dr.select(enters_object, media.fetch(near, si, enters_object), walk.medium))
         walk = replace(walk, o=o, d=d, skip=skip, alive=alive, order=dr.select(enters, 0, walk.order),
@@ -431,7 +430,8 @@ def _begin(
     lanes, known = dr.width(index), index < total
     o, d = dr.gather(mi.Point3f, rays.o, index, known), dr.gather(mi.Vector3f, rays.d, index, known)
     no, first = dr.full(mi.Bool, False, lanes), dr.full(mi.UInt32, 0, lanes)
-    walk, stay = start_walk(o, d, rng, media.unknown(lanes)), Stay.none(lanes) if scored else ()
+    wavelengths = dr.gather(mi.Spectrum, rays.wavelengths, index, known) if mi.is_spectral else ()
+    walk, stay = start_walk(o, d, rng, media.unknown(lanes, wavelengths)), Stay.none(lanes) if scored else ()
     return CameraPath(index, walk, start_record(lanes, scored), no, first, stay)
 
 

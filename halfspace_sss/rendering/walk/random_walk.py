@@ -14,7 +14,7 @@ import mitsuba as mi
 
 from halfspace_sss.physics.medium import eval_hg, sample_hg
 from halfspace_sss.rendering.object.points import SurfacePoint, channel_mean, lift, sided, surface_point
-from halfspace_sss.rendering.walk.media import Coefficients, WalkMedia, WalkMedium
+from halfspace_sss.rendering.walk.media import Coefficients, WalkMedia, WalkMedium, ray_of
 from halfspace_sss.tracing.walk import ROULETTE_BOOST, ROULETTE_WEIGHT, generator, pass_seed
 
 # ---- Free flight, scattering and roulette with spectral MIS ---------------------------------------------------------
@@ -153,11 +153,11 @@ class Walk:
     scale: mi.Float  # square of the relative index passed so far
     order: mi.UInt32  # scattering events since it entered the object; MET at least once it has met what lies inside
     rng: mi.PCG32
-    medium: WalkMedium | tuple[()] = ()  # that it took of textures where it entered, see `WalkMedia.fetch`
+    medium: WalkMedium | tuple[()] = ()  # that it took where it entered, see `WalkMedia.fetch`
 
     def ray(self, t: mi.Float) -> mi.Ray3f:
         """Looks for the boundary on a flight of length t; its distances begin after `skip`."""
-        ray = mi.Ray3f(self.o + self.d * self.skip, self.d)
+        ray = ray_of(self.o + self.d * self.skip, self.d, self.medium)
         ray.maxt = dr.maximum(t - self.skip, 0)
         return ray
 
@@ -302,7 +302,7 @@ class Walker:
         to = dr.select(through, to, k)
         alive = si.is_valid() & ~leaked & (bs.pdf > 0) & (dr.max(value) > 0)
         o, skip = media.depart(k, si, d, to >= 0)
-        if media.textured:
+        if media.carried:
             new = (to != k) & (to >= 0)
             walk = replace(walk, medium=dr.select(new, media.fetch(dr.maximum(to, 0), si, new), walk.medium))
         walk = replace(walk, o=o, d=d, skip=skip, alive=alive, object=dr.select(alive, to, OUTSIDE),
@@ -318,7 +318,7 @@ def _pass(walk: Walk, record: Record, *rest: Any) -> tuple[Walk, Record]:
 
 
 def start_walk(o: mi.Point3f, d: mi.Vector3f, rng: mi.PCG32, medium: WalkMedium | tuple[()] = ()) -> Walk:
-    """A walk that begins outside; `medium` is what it carries of textures."""
+    """A walk that begins outside; `medium` is what it carries."""
     lanes = dr.width(o)
     return Walk(
         alive=dr.full(mi.Bool, True, lanes), object=dr.full(mi.Int32, OUTSIDE, lanes), o=o, d=d,
@@ -494,7 +494,7 @@ def _check(media: WalkMedia, k: int, start: SurfacePoint) -> int:
     """The number of starts."""
     if not 0 <= k < len(media.objects):
         raise ValueError(f"k must be a whole number in [0, {len(media.objects) - 1}], got {k!r}")
-    if media.textured:
+    if media.carried:
         raise ValueError(f"media must be without textures for walks from points, got those of {media.objects[k].name}")
     widths = [dr.width(v) for v in start[:4]]
     if len(set(widths)) > 1:
