@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from halfspace_sss.rendering.paths.gathering import _steadied
+
 pytestmark = pytest.mark.usefixtures("rgb")
 
 mi = pytest.importorskip("mitsuba")
@@ -151,6 +153,15 @@ def test_black_light_leaves_a_mesh_of_few_faces_black() -> None:
         for light in ("corrected", "gathered")
     ]
     assert not np.any(images)
+
+
+def test_a_mirrored_lamp_that_few_directions_found_is_shared_by_all_points() -> None:
+    sent = np.random.default_rng(5).uniform(0.5, 1.5, (512, 2))
+    sent[7, 0] = 1000.0
+    steady = _steadied(sent)
+    found = steady * sent
+    assert np.allclose(found.sum(axis=0), sent.sum(axis=0))
+    assert found[7, 0] < 10 and np.allclose(steady[:, 1], 1, atol=0.01)
 
 
 def test_derivatives_are_refused() -> None:

@@ -19,6 +19,7 @@ import mitsuba as mi
 import numpy as np
 
 from halfspace_sss.backend import clock
+from halfspace_sss.rendering.gathered.points import SurfacePoints
 from halfspace_sss.rendering.gathered.transfer import SAMPLES, SEED, Albedo, Incident, Transfer, cosine, transfer
 from halfspace_sss.rendering.object.points import cosine_above, place
 from halfspace_sss.rendering.object.shape import same_objects, state_of
@@ -33,6 +34,8 @@ if TYPE_CHECKING:
 DIRECTIONS = 2**20  # of all points of an object, by emitters, and as many by the cosine
 FEWEST, MOST = 64, 1024  # of a point
 PART = 1 / 8  # of the samples of a transfer
+SPREADINGS = 4  # of what other surfaces send,
+BRIGHTEST = 1 / 128  # of the points, which share it no matter how bright
 TRACED = 8  # one of so many directions by the cosine is traced further, where it meets a surface
 
 
@@ -184,13 +187,13 @@ def _incident(
     u, v = (_stratified(sampler, j, s, n) for _ in range(2))
     aimed, w_e = by_emitters(scene, T.albedo, at, u)
     met, more, a, w_c = by_cosine(scene, objects, T.albedo, settings, at, v, traced, sampler)
-    values = [v + dr.zeros(mi.Float, count * n) for v in (aimed, met + TRACED * more, a, dr.mean(a), w_e, w_c)]
+    values = [v + dr.zeros(mi.Float, count * n) for v in (aimed, met, TRACED * more, a, dr.mean(a), w_e, w_c)]
     dr.eval(values)
     j, s = lane // n, lane % n
     order = dr.select(s % TRACED == 0, j * few + s // TRACED, count * few + j * (n - few) + s - s // TRACED - 1)
     values = [dr.gather(type(v), v, order) for v in values]
     dr.eval(values)
-    aimed, arriving, a, weight, w_e, w_c = values
+    aimed, met, more, a, weight, w_e, w_c = values
 
     def total(value: Any) -> np.ndarray:
         """Sums over the directions of each point, (points, components)."""
@@ -200,7 +203,9 @@ def _incident(
 
     norm, whole = total(a), total([weight])
     middle = total(weight * w_c) / np.maximum(whole, 1e-30)
-    mean = total(aimed + arriving) / np.maximum(norm, 1e-30)
+    sent = total(more)
+    steady = _steadied(sent)
+    mean = total(aimed + met) + _spread(T.points, steady * sent)
     centre = dr.gather(mi.Vector3f, mi.Vector3f(*(mi.Float(c) for c in middle.T.astype(np.float32))), j)
     d_e, d_c = w_e - centre, w_c - centre
     pairs = [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]
@@ -208,10 +213,29 @@ def _incident(
     C = np.empty((count, 3, 3))
     for column, (i, k) in zip(second.T, pairs):
         C[:, i, k] = C[:, k, i] = column
-    first = np.stack([total(aimed * d_e[i] + arriving * d_c[i]) for i in range(3)], axis=2)
+    axes = [total(aimed * d_e[i] + met * d_c[i]) + _spread(T.points, steady * total(more * d_c[i])) for i in range(3)]
+    first = np.stack(axes, axis=2)
     slope = np.einsum("jci,jik->jck", first, np.linalg.inv(C + 1e-3 * np.eye(3)))
-    slope = slope / np.maximum(norm, 1e-30)[:, :, None]
-    return Incident(*(part.astype(np.float32) for part in (mean, slope, middle)))
+    norm = np.maximum(norm, 1e-30)
+    return Incident(*(part.astype(np.float32) for part in (mean / norm, slope / norm[:, :, None], middle)))
+
+
+def _steadied(sent: np.ndarray) -> np.ndarray:
+    """Factors of what other surfaces send to points, (points, channels), by which the brightest share that of the next.
+
+    Of mirrored lamps a few points may hold half of all light; what is cut goes to all points by what they have.
+    """
+    most = np.quantile(sent, 1 - BRIGHTEST, axis=0)
+    kept = np.where(most > 0, np.minimum(sent, most), sent)
+    whole = sent.sum(axis=0) / np.maximum(kept.sum(axis=0), 1e-30)
+    return np.where(sent > 0, kept / np.maximum(sent, 1e-30), 1) * whole
+
+
+def _spread(points: SurfacePoints, values: np.ndarray) -> np.ndarray:
+    """What a few traced directions bring, over the neighbourhood: it varies slowly, and was most of the noise."""
+    for _ in range(SPREADINGS):
+        values = points.smoothed(values)
+    return values
 
 
 class GatheringPoint(NamedTuple):
