@@ -1,20 +1,30 @@
 """Long use of one process: memory stays flat, threads agree, many queries are answered block by block.
 
+And many processes, of which some are killed all the time.
+
 Minutes, so only where HALFSPACE_SSS_SOAK is set: 1 for all of it, a smaller number for that share.
 """
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import numpy as np
 import psutil
 import pytest
 
 import halfspace_sss
-from halfspace_sss import Medium
+from halfspace_sss import Medium, executors
+from halfspace_sss.executors import completed
+from halfspace_sss.maps.store import load_maps
 
 SHARE = float(os.environ.get("HALFSPACE_SSS_SOAK", "0"))
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(SHARE <= 0, reason="HALFSPACE_SSS_SOAK is not set")]
@@ -96,3 +106,79 @@ def test_many_queries_are_answered_block_by_block_in_flat_memory() -> None:
     assert np.all(np.abs(values - values.mean()) < 5 * errors)
     print(f"{len(used) * BLOCK:.0e} queries: {used[1]:.0f} MiB after the second block, {max(used):.0f} at most")
     assert max(used) < 1.1 * used[1]
+
+
+MAPS = [sys.executable, "-m", "halfspace_sss", "maps", "--albedo", "0.95", "--grid", "64,16,6,4", "--paths", "1e6"]
+KILLS, EVERY = 12, 5.0  # seconds
+
+
+@contextlib.contextmanager
+def _dask(folder: Path) -> Iterator[tuple[subprocess.Popen, subprocess.Popen, Path]]:
+    """A scheduler and two workers that are started again when they end."""
+    file = folder / f"scheduler{time.monotonic_ns()}.json"
+    options = ["--scheduler-file", str(file)]
+    # a part meets several kills before it is done
+    environment = os.environ | {"DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "100"}
+    common = {"env": environment, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    dask = [sys.executable, "-m", "dask"]
+    quiet = ["--no-dashboard", "--port", "0"]
+    scheduler = subprocess.Popen([*dask, "scheduler", *options, *quiet], **common)
+    workers = subprocess.Popen([*dask, "worker", *options, "--nthreads", "1", "--nworkers", "2"], **common)
+    try:
+        yield scheduler, workers, file
+    finally:
+        for process in (scheduler, workers):
+            if process.poll() is None:
+                for child in psutil.Process(process.pid).children(recursive=True):
+                    with contextlib.suppress(psutil.NoSuchProcess):
+                        child.kill()
+                process.kill()
+            process.wait()
+
+
+def _kill_a_worker(nannies: subprocess.Popen, k: int) -> None:
+    """One of the processes that compute."""
+    children = psutil.Process(nannies.pid).children(recursive=True)
+    found = [c for c in children if any("spawn_main" in word for word in c.cmdline())]
+    if found:
+        found[k % len(found)].kill()
+
+
+@pytest.mark.skipif(SHARE < 1, reason="HALFSPACE_SSS_SOAK is below 1")
+def test_a_minute_of_killed_workers_and_a_killed_scheduler_leave_the_bits_of_a_quiet_run(tmp_path: Path) -> None:
+    pytest.importorskip("distributed")
+    out = ["--out", str(tmp_path / "there")]
+    subprocess.run([*MAPS, "--out", str(tmp_path / "here")], check=True, capture_output=True)
+    with _dask(tmp_path) as (scheduler, workers, file):
+        run = subprocess.Popen([*MAPS, "--scheduler", str(file), *out], stderr=subprocess.PIPE, text=True)
+        for k in range(KILLS):
+            time.sleep(EVERY)
+            _kill_a_worker(workers, k)
+        assert run.poll() is None, run.communicate()  # else nothing was left to be killed
+        scheduler.kill()
+        _, said = run.communicate(timeout=120)
+        assert run.returncode == 1 and "ended" in said
+    with pytest.raises(ValueError, match="unfinished"):
+        load_maps(tmp_path / "there" / "medium.zarr")
+    with _dask(tmp_path) as (_, _, file):
+        subprocess.run([*MAPS, "--scheduler", str(file), *out], check=True, capture_output=True, timeout=600)
+    here, there = (load_maps(tmp_path / name / "medium.zarr").drop_vars("seconds") for name in ("here", "there"))
+    assert here.equals(there)
+
+
+def nothing(k: int) -> int:
+    return k
+
+
+def test_ten_thousand_parts_cost_little_time_and_no_memory() -> None:
+    n, used = max(1000, int(SHARE * 10_000)), []
+    with executors.workers(2) as executor:
+        next(completed(executor, nothing, {"first": (0,)}))
+        begin = time.perf_counter()
+        for k, _ in enumerate(completed(executor, nothing, {str(k): (k,) for k in range(n)})):
+            if k % (n // 10) == 0:
+                used.append(_resident())
+        seconds = time.perf_counter() - begin
+    print(f"{n} parts: {seconds:.1f} s, {used[0]:.0f} MiB after the first, {max(used):.0f} at most")
+    assert seconds < 6e-3 * n
+    assert max(used) < used[0] + 10
