@@ -1,4 +1,4 @@
-"""Fig. 3: points of entry of one exit by the paper's flow and by learnt patches, beside uniform ones."""
+"""Fig. 3: points of entry of one exit by the paper's flow, without and with light, and by learnt patches."""
 
 from __future__ import annotations
 
@@ -7,16 +7,18 @@ from typing import Any
 
 import numpy as np
 
-from figures.computing.learnt import SHAPES, shape_of
-from figures.computing.scenes import BUNNY, prepare
+from figures.computing.learnt import SHAPES, object_parts
+from figures.computing.scenes import BUNNY, bunny_scene, prepare
 from figures.drawing.style import TEXT, paper, saved
 from figures.parts.part import Part, Result, Task
+from halfspace_sss.provenance import check_folder
 
-TITLE = "points of entry drawn by the paper's flow and by patches, beside uniform ones"
+TITLE = "points of entry drawn by the paper's flow, without and with light, and by patches"
 SECONDS = {"draft": 12, "paper": 600}  # CPU time of the object, and of the flow
 POINTS = {"draft": 512, "paper": 2048}
 RESOLUTION = {"draft": 64, "paper": 192}  # of the candle
-SHOWN = 6000  # barycentres behind the points
+SHOWN = ("uniform", "flow", "flow with light", "patches")
+PLACES, DOTS = 40_000, 6000  # of the surface, and those behind the points
 TOWARDS = {"bunny": (0.1, 0.25, 1.0), "candle": (0.1, 0.8, 1.0)}  # where the eye stands, and near what the exit lies
 
 
@@ -31,7 +33,7 @@ def parts(quality: str) -> list[Part]:
 
 
 def sampled(task: Task) -> dict[str, Any]:
-    """Points in the object's frame over its radius, and their RMSD to the nearest barycentre."""
+    """Points in the object's frame over its radius, their RMSD to the nearest barycentre, and light where they are."""
     from figures.studies.paper_flow import fit_space_flow, mesh_arrays, on_surface, rmsd
     from full_geometry.learning.training import train_by_cpu
     from full_geometry.models.storing import frame_of
@@ -39,30 +41,55 @@ def sampled(task: Task) -> dict[str, Any]:
 
     prepare()
     p, n = task.params, task.params["points"]
-    obj = object_of(*shape_of(p["object"], task.folder, p["resolution"], p["seed"]))
+    scene = _lit(p["object"], task, p["resolution"], p["seed"])
+    obj = object_of(scene)
     learnt, _ = train_by_cpu(obj, p["seconds"], task.folder, seed=p["seed"])
-    task.progress(1, 3)
+    task.progress(1, 4)
     frame = frame_of(obj)
-    flow = fit_space_flow(learnt.model, frame, p["seconds"], p["seed"])
-    task.progress(2, 3)
     vertices, faces = mesh_arrays(obj, frame)
     exit = _exit(obj, p["towards"])
-    in_space = flow.sample(exit, n, p["seed"])[0]
-    rng = np.random.default_rng(p["seed"])
-    results = {
-        "uniform": _positions(frame, obj.random_points(_lanes(n, 41)).p),
-        "flow in space": in_space,
-        "flow on the surface": on_surface(in_space, vertices, faces, p["seed"]),
-        "patches": _positions(frame, _by_patches(learnt, exit, n)),
-    }
-    shown = vertices[faces].mean(axis=1)[rng.permutation(len(faces))[:SHOWN]]
+    results = {"uniform": _positions(frame, obj.random_points(_lanes(n, 41)).p)}
+    for k, (name, light) in enumerate((("flow", None), ("flow with light", scene)), 2):
+        flow = fit_space_flow(learnt.model, frame, p["seconds"], p["seed"], light)
+        in_space = flow.sample(exit, n, p["seed"])[0]
+        results |= {f"{name}, in space": in_space, name: on_surface(in_space, vertices, faces, p["seed"])}
+        task.progress(k, 4)
+    results["patches"] = _positions(frame, _by_patches(learnt, exit, n))
+    places, E = _light(obj, scene, frame)
     return {
-        "points": {name: np.round(points, 5).tolist() for name, points in results.items()},
+        "points": {name: np.round(results[name], 5).tolist() for name in SHOWN},
         "rmsd": {name: rmsd(points, vertices, faces) for name, points in results.items()},
-        "mesh": np.round(shown, 4).tolist(),
+        "light": {name: _light_at(points, places, E) for name, points in results.items()},
+        "mesh": np.round(places[:DOTS], 4).tolist(),
+        "E": np.round(E[:DOTS] / E.max(), 4).tolist(),
         "exit": _positions(frame, exit.p)[0].tolist(),
         "seconds": p["seconds"],
     }
+
+
+def _lit(name: str, task: Task, resolution: int, seed: int) -> Any:
+    """The candle with its flame, or the bunny with a small light behind."""
+    from halfspace_sss.rendering.scenes.scene_files import open_scene
+
+    if name == "candle":
+        shown = object_parts("candle", resolution, check_folder(task.folder), seed)
+        return open_scene({"type": "scene", "integrator": {"type": "bssrdf"}, **shown}, "neural")
+    return open_scene(bunny_scene("potato", 16, "small light"), "neural")
+
+
+def _light(obj: Any, scene: Any, frame: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Random places of the surface, and the light that arrives there."""
+    from figures.studies.paper_flow import irradiance
+
+    at = obj.random_places(_lanes(PLACES, 43))
+    return _positions(frame, at.p), irradiance(at, scene, (44,))
+
+
+def _light_at(points: np.ndarray, places: np.ndarray, E: np.ndarray) -> float:
+    """Mean light at points, by the nearest place of each, over that of the surface."""
+    from scipy.spatial import cKDTree
+
+    return float(E[cKDTree(places).query(points)[1]].mean() / E.mean())
 
 
 def _lanes(n: int, seed: int) -> Any:
@@ -104,23 +131,28 @@ def _positions(frame: Any, p: Any) -> np.ndarray:
 
 
 def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
-    """The figure as PDF and PNG, and the distances as a table."""
+    """The figure as PDF and PNG, and distances and light as a table."""
     import pandas
     from matplotlib.figure import Figure
 
     with paper():
-        names = list(next(iter(results.values())).numbers["points"])
         figure = Figure(figsize=(TEXT, 0.31 * TEXT * len(results)))
-        axes = figure.subplots(len(results), len(names), squeeze=False)
+        axes = figure.subplots(len(results), len(SHOWN), squeeze=False)
         for row, (name, result) in zip(axes, results.items()):
-            for ax, kind in zip(row, names):
+            for ax, kind in zip(row, SHOWN):
                 _draw_points(ax, result.numbers, kind, TOWARDS[name])
-                ax.set_title(f"{kind}\nRMSD {result.numbers['rmsd'][kind]:.4f}")
+                ax.set_title(f"{kind}\nlight at points {result.numbers['light'][kind]:.2f}")
             row[0].set_ylabel(name)
         figure.tight_layout(pad=0.3)
         files: dict[str, bytes | str] = {f"fig03.{end}": data for end, data in saved(figure).items()}
     rows = [
-        {"object": name, "points": kind, "rmsd over the radius": value, "CPU seconds": result.numbers["seconds"]}
+        {
+            "object": name,
+            "points": kind,
+            "rmsd over the radius": value,
+            "light over the mean": result.numbers["light"][kind],
+            "CPU seconds": result.numbers["seconds"],
+        }
         for name, result in results.items()
         for kind, value in result.numbers["rmsd"].items()
     ]
@@ -129,13 +161,15 @@ def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
 
 
 def _draw_points(ax: Any, numbers: Mapping[str, Any], kind: str, towards: tuple[float, float, float]) -> None:
-    """The mesh in grey, points as the eye sees them, those on the far side paler, and the exit."""
+    """The surface, brighter where light arrives, points as the eye sees them, those on the far side paler, the exit."""
     eye = np.array(towards) / np.linalg.norm(towards)
     right = np.cross([0, 1, 0], eye)
     right /= np.linalg.norm(right)
     axes = np.stack([right, np.cross(eye, right), eye])
     mesh, points, exit = (np.array(v) @ axes.T for v in (numbers["mesh"], numbers["points"][kind], [numbers["exit"]]))
-    ax.scatter(*mesh.T[:2], s=0.6, c="#d5d5d5", linewidths=0, rasterized=True)
+    order = np.argsort(mesh[:, 2])  # the near side covers the far one
+    E = np.sqrt(np.array(numbers["E"]))[order]
+    ax.scatter(*mesh[order].T[:2], s=1.5, c=E, cmap="YlOrBr", vmin=-0.15, vmax=1.3, linewidths=0, rasterized=True)
     ax.scatter(*points.T[:2], s=3, c="#0072B2", alpha=0.6, linewidths=0, rasterized=True)
     ax.scatter(*exit.T[:2], s=30, c="#D55E00", marker="*", linewidths=0, zorder=5)
     low, high = mesh.min(axis=0), mesh.max(axis=0)

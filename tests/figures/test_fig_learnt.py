@@ -32,10 +32,11 @@ def test_parts_have_keys_and_more_work_in_paper_quality(module) -> None:
 
 def test_points_of_both_objects_are_drawn_with_their_distances() -> None:
     rng = np.random.default_rng(0)
-    kinds = ("uniform", "flow in space", "flow on the surface", "patches")
+    kinds = (*fig03.SHOWN, "flow, in space")
     numbers = {
-        "points": {kind: rng.random((8, 3)).tolist() for kind in kinds}, "rmsd": dict.fromkeys(kinds, 0.01),
-        "mesh": rng.random((20, 3)).tolist(), "exit": [0.5, 0.5, 0.5], "seconds": 1,
+        "points": {kind: rng.random((8, 3)).tolist() for kind in fig03.SHOWN},
+        "rmsd": dict.fromkeys(kinds, 0.01), "light": dict.fromkeys(kinds, 2.0),
+        "mesh": rng.random((20, 3)).tolist(), "E": [0.5] * 20, "exit": [0.5, 0.5, 0.5], "seconds": 1,
     }  # fmt: skip
     files = fig03.draw({name: result(**numbers) for name in SHAPES})
     assert files["fig03.png"].startswith(b"\x89PNG")

@@ -26,7 +26,7 @@ from figures.studies.alpha_p import AlphaP, fit_alpha_p  # noqa: E402
 from figures.studies.commands import _errors_wide, markdown  # noqa: E402
 from figures.studies.flow import N_CONTEXT, Chart, ConditionalFlow, FlowSampler  # noqa: E402  # noqa: E402
 from figures.studies.flow_training import LIGHTINGS, FlowNetwork, FlowRecipe, lighting  # noqa: E402
-from figures.studies.paper_flow import incidence, mesh_arrays, on_surface, rmsd  # noqa: E402
+from figures.studies.paper_flow import incidence, irradiance, lit_incidence, mesh_arrays, on_surface, rmsd  # noqa: E402
 from figures.studies.paper_network import measured_lights, paper_errors, random_lights  # noqa: E402
 from full_geometry.learning.model_errors import reference  # noqa: E402
 from full_geometry.models.storing import frame_of  # noqa: E402
@@ -139,6 +139,21 @@ def test_an_even_S_takes_pi_from_all_directions_also_below_interpolated_horizons
     places = ball.random_places(generator(mi, 512, pass_seed(3)))
     assert np.array(dr.dot(places.n, places.n_out)).min() < 0.97
     assert np.allclose(incidence(EvenS(), places, places), np.pi, rtol=1e-5)
+
+
+def test_the_light_of_a_scene_arrives_where_a_lamp_is_seen(tmp_path: Path) -> None:
+    lamp = {"type": "sphere", "center": [0, 0, 6], "radius": 0.5, "emitter": {"type": "area", "radiance": 3.0}}
+    lit = mi.load_dict({"type": "scene", "ball": {"type": "sphere", "bsdf": {"type": "diffuse"}}, "lamp": lamp})
+    ball = object_of(mi.load_dict({"type": "sphere"}), WAX)
+    places = ball.random_places(generator(mi, 4096, pass_seed(3)))
+    E, z = irradiance(places, lit, (1,)), np.array(places.n)[2]
+    assert np.all(E[z < 0] == 0) and np.all(E[z > 0.3] > 0)
+    d = np.array([[0], [0], [6]]) - np.array(places.p)
+    far = np.linalg.norm(d, axis=0)
+    wanted = 3.0 * np.pi * 0.25 * (np.array(places.n) * d).sum(axis=0) / far**3  # of a ball that is seen whole
+    ratio = E[z > 0.3] / wanted[z > 0.3]
+    assert abs(ratio.mean() - 1) < 4 * ratio.std() / np.sqrt(len(ratio)) + 1e-3 and ratio.std() < 0.05
+    assert np.allclose(lit_incidence(EvenS(), places, places, lit, (1,)), E, rtol=1e-5)
 
 
 @pytest.mark.parametrize("kind", LIGHTINGS)
