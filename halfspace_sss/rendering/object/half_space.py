@@ -166,11 +166,14 @@ class Variation:
         """Make the models that the derivatives need, before any loop is recorded.
 
         Raises:
-            ValueError: the model knows no medium beside its own.
+            ValueError: the model knows no medium beside its own, or g of an object with textures is followed.
         """
-        for name in VARIABLE:
+        textured = self.inside.textured is not None  # which knows its derivatives but for g
+        for name in VARIABLE if not textured else ("g",):
             with dr.resume_grad():
                 wanted = dr.grad_enabled(getattr(self.surface, name))
+            if wanted and textured:
+                raise ValueError("g must not have gradients enabled under models of objects with textures, got them")
             if wanted and name not in self._stencils:
                 self._stencils[name] = [self._stencil(name, m) for m in self.inside.channels()]
 

@@ -13,7 +13,8 @@ from __future__ import annotations
 
 import re
 import warnings
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import drjit as dr
@@ -116,6 +117,7 @@ class TexturedMedium:
         scale: factor of sigma_t.
         table: albedo by reflectance.
         inverse: whether `sigma_t` is a mean free path.
+        variables: the numbers among them, as light may be differentiated by them.
     """
 
     albedo: Any
@@ -123,6 +125,7 @@ class TexturedMedium:
     scale: float = 1.0
     table: AlbedoTable | None = None
     inverse: bool = False
+    variables: Mapping[str, mi.Spectrum] = field(default_factory=dict)
 
     def scaled(self, factor: float) -> TexturedMedium:
         """The same in other units of length: sigma_t times a factor."""
@@ -130,7 +133,7 @@ class TexturedMedium:
 
     def at(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> SurfaceMedium:
         """Albedo and sigma_t at a point of the surface."""
-        sigma_t = self._extinction(_value(self.sigma_t, si, active))
+        sigma_t = self._extinction(self._value("sigma_t", si, active))
         return SurfaceMedium(self.albedo_at(si, active), sigma_t, mi.UInt32(si.prim_index))
 
     def at_point(
@@ -150,15 +153,23 @@ class TexturedMedium:
         return SurfaceMedium(albedo, sigma_t, at.medium.face)
 
     def is_followed(self, shape: mi.Shape) -> bool:
-        """Whether derivatives by texels, or by attributes of a shape, are followed."""
+        """Whether derivatives by texels, by attributes of a shape, or by constants beside them, are followed."""
         values = [value for texture in self.textures.values() for _, value in mi.traverse(texture)]
+        values += self.variables.values()
         values += [mi.traverse(shape)[key] for texture in self.textures.values() for _, key in shown(texture)]
         return any(dr.is_diff_v(value) and dr.grad_enabled(value) for value in values)
 
     def albedo_at(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> mi.Spectrum:
         """The albedo of single scattering at a point of the surface."""
-        value = _value(self.albedo, si, active)
+        value = self._value("albedo", si, active)
         return value if self.table is None else self.table(value)
+
+    def _value(self, name: str, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Spectrum:
+        source = getattr(self, name)
+        if isinstance(source, mi.Texture):
+            return mi.Spectrum(source.eval(si, active))
+        value = mi.Spectrum([opaque(v) for v in source])
+        return dr.replace_grad(value, self.variables[name]) if name in self.variables else value
 
     def _extinction(self, value: Any) -> Any:
         scale = opaque(self.scale)
@@ -169,6 +180,12 @@ class TexturedMedium:
         """By the name of their parameter."""
         names = ("reflectance" if self.table else "albedo", "mfp" if self.inverse else "sigma_t")
         return {name: value for name, value in zip(names, (self.albedo, self.sigma_t)) if isinstance(value, mi.Texture)}
+
+    @property
+    def constants(self) -> tuple[str, ...]:
+        """The coefficients that no texture varies; g only where no table of albedos is made for it."""
+        found = [name for name in ("albedo", "sigma_t") if not isinstance(getattr(self, name), mi.Texture)]
+        return (*found, *(("g",) if self.table is None else ()))
 
     def values_on(self, shape: mi.Shape) -> tuple[np.ndarray, np.ndarray]:
         """Albedo and sigma_t of texels and attributes, shapes (n, channels); of a texture of another kind none."""
@@ -240,12 +257,6 @@ def _interaction(
         t = (ee * dr.dot(d, f) - ef * dr.dot(d, e)) / det
         si.uv = u + (v - u) * s + (w - u) * t
     return si
-
-
-def _value(source: Any, si: mi.SurfaceInteraction3f, active: mi.Bool) -> Any:
-    if isinstance(source, mi.Texture):
-        return mi.Spectrum(source.eval(si, active))
-    return mi.Spectrum([opaque(v) for v in source])
 
 
 def texels(texture: mi.Texture) -> np.ndarray:
@@ -344,9 +355,12 @@ def textured_medium(values: dict[str, Any], g: Any, eta: float, channels: int) -
         color = Medium.from_reflectance(np.broadcast_to(color, channels), 1.0, g, eta).albedo
     if painted and not inverse:
         extent = 1 / np.asarray(extent, dtype=float)
+    scale = float(values.get("scale", 1.0))
+    if not isinstance(extent, mi.Texture):
+        extent, scale = np.asarray(extent, dtype=float) * scale, 1.0
     pair = (v if isinstance(v, mi.Texture) else np.broadcast_to(np.asarray(v, dtype=float), channels).copy()
             for v in (color, extent))  # fmt: skip
-    result = TexturedMedium(*pair, float(values.get("scale", 1.0)), table, inverse)
+    result = TexturedMedium(*pair, scale, table, inverse)
     result.check()
     return result
 

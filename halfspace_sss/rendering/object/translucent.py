@@ -34,7 +34,8 @@ Parameters, all optional but the medium:
         medium; by default smooth.
     reflection: whether the boundary reflects light, by default true.
 
-`mitsuba.traverse` shows `albedo`, `sigma_t` (1/mm) and `g` of each channel, and the parameters of the boundary.
+`mitsuba.traverse` shows `albedo`, `sigma_t` (1/mm) and `g` of each channel, textures where they stand for these, and
+the parameters of the boundary.
 To an integrator that knows nothing of the inside, the surface shows its reflection only. The `albedo` of Mitsuba's
 integrator `aov` is the directional albedo of the medium. The index of a smooth boundary is data of kernels, which then
 serve media of any index.
@@ -289,21 +290,22 @@ def _class(variant: str) -> type:
             self.directional: HalfSpaceAlbedo | None = None  # made when it is asked for
             for name in VARIABLE:
                 setattr(self, name, mi.Spectrum(np.atleast_1d(getattr(self.inside.medium, name)).tolist()))
+            self.inside = self.inside.with_variables(self)
 
         def traverse(self, callback: mi.TraversalCallback) -> None:
             textured = self.inside.textured
             for name, texture in textured.textures.items() if textured else ():
                 callback.put(name, texture, mi.ParamFlags.Differentiable)
-            for name in VARIABLE if self.inside.is_constant else ():
+            for name in self.inside.constants:
                 callback.put(name, getattr(self, name), mi.ParamFlags.Differentiable)
             callback.put("boundary", self.boundary, mi.ParamFlags.Differentiable)
 
         def parameters_changed(self, keys: Any = ()) -> None:
             # the integrators see another `inside`, and make anew what they made of it
-            if self.inside.textured is not None and not (keys and all(key.startswith("boundary") for key in keys)):
-                self.inside = self.inside.repainted()
-            elif self.inside.is_constant:
-                self.inside = self.inside.changed(**{name: np.ravel(getattr(self, name)) for name in VARIABLE})
+            repainted = self.inside.textured is not None and not (keys and all(k.startswith("boundary") for k in keys))
+            if repainted or (self.inside.constants and self.inside.textured is None):
+                values = {name: np.ravel(getattr(self, name)) for name in self.inside.constants}
+                self.inside = self.inside.changed(**values).with_variables(self)
             check_eta(self.boundary, self.inside.medium.eta)
 
         def _shown(self, ctx: mi.BSDFContext, value: Any) -> Any:
@@ -437,9 +439,11 @@ class Inside:
         return self.varying is None and self.textured is None
 
     @property
-    def is_constant(self) -> bool:
-        """Whether it is the same at all wavelengths too, so that a few numbers are the whole medium."""
-        return self.is_homogeneous and self.spectral is None
+    def constants(self) -> tuple[str, ...]:
+        """The coefficients of `VARIABLE` that are the same everywhere, which are parameters of the surface."""
+        if self.varying is not None or self.spectral is not None:
+            return ()
+        return VARIABLE if self.textured is None else tuple(n for n in VARIABLE if n in self.textured.constants)
 
     def channels(self) -> list[Medium]:
         """The scalar media of the channels."""
@@ -447,26 +451,38 @@ class Inside:
         return [self.medium] if n is None else [self.medium.channel(k) for k in range(n)]
 
     def changed(self, **values: np.ndarray) -> Inside:
-        """The same with another medium; numbers that are the same in single precision are kept as they are.
+        """The same with other constants, and with textures as they are now.
+
+        Numbers that are the same in single precision are kept as they are.
 
         Args:
-            values: `albedo`, `sigma_t` (1/mm) and `g`, one for each channel.
+            values: the `constants`: of `albedo`, `sigma_t` (1/mm) and `g`, one for each channel.
+
+        Raises:
+            ValueError: textures are no medium's.
         """
         m, n = self.medium, self.medium.n_channels
         values = {name: np.asarray(value, dtype=float) for name, value in values.items()}
         old = {name: np.atleast_1d(getattr(m, name)) for name in values}
         kept = {name: np.float32(old[name]) == np.float32(value) for name, value in values.items()}
-        if all(same.all() for same in kept.values()):
+        if self.textured is None and all(same.all() for same in kept.values()):
             return self
         new = {name: np.where(kept[name], old[name], value) for name, value in values.items()}
+        if self.textured is not None:
+            g = m.g if "g" not in new else new["g"] if n else float(new["g"][0])
+            textured = replace(self.textured, **{name: v for name, v in new.items() if name != "g"})
+            textured.check()
+            return replace(self, medium=textured.mean(g, m.eta), textured=textured)
         if n is None:
             new = {name: float(value[0]) for name, value in new.items()}
         return replace(self, label="medium", medium=Medium.from_albedo(**new, eta=m.eta))
 
-    def repainted(self) -> Inside:
-        """The same with textures as they are now; ValueError if they are no medium's."""
-        self.textured.check()
-        return replace(self, medium=self.textured.mean(self.medium.g, self.medium.eta))
+    def with_variables(self, surface: Any) -> Inside:
+        """The same, with numbers beside textures as the surface has them, by which light may be differentiated."""
+        if self.textured is None:
+            return self
+        variables = {name: getattr(surface, name) for name in self.constants if name != "g"}
+        return replace(self, textured=replace(self.textured, variables=variables))
 
 
 def read_inside(props: mi.Properties) -> Inside:

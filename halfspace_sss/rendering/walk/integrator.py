@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import drjit as dr
@@ -13,10 +14,10 @@ import numpy as np
 
 from halfspace_sss.interrupts import interruptible
 from halfspace_sss.rendering.light.small_emitters import SmallEmitters
-from halfspace_sss.rendering.object.objects import KnowsUnit, check_sensors, check_size, places_of
+from halfspace_sss.rendering.object.objects import KnowsUnit, check_sensors, check_size, places_of, translucent_shapes
 from halfspace_sss.rendering.object.settings import OF_MITSUBA, check_parameters
 from halfspace_sss.rendering.object.shape import number_of, same_objects
-from halfspace_sss.rendering.object.translucent import VARIABLE, is_translucent
+from halfspace_sss.rendering.object.textured import shown
 from halfspace_sss.rendering.object.varying import equivalent
 from halfspace_sss.rendering.walk.emitter_connections import EmitterDirections, InnerLights, find_connections
 from halfspace_sss.rendering.walk.media import WalkMedia
@@ -116,11 +117,11 @@ def _class(variant: str) -> type:
             """Add to the gradients of parameters what that of the image, `grad_in`, makes of them."""
             with dr.suspend_grad():
                 image = self._differentiable(scene, sensor, seed, spp)
-                with dr.resume_grad():
+                with dr.resume_grad(), _one_thread():
                     dr.set_grad(image, grad_in)
                     dr.enqueue(dr.ADMode.Backward, image)
                     dr.traverse(dr.ADMode.Backward)
-                dr.eval()
+                    dr.eval()
 
         def _differentiable(
             self, scene: mi.Scene, sensor: mi.Sensor | int, seed: mi.UInt32 | int, spp: int
@@ -157,21 +158,41 @@ def _prepared(scene: mi.Scene, before: tuple, mm_per_unit: float) -> tuple[int, 
     return number_of(scene), shapes, places, media
 
 
+@contextlib.contextmanager
+def _one_thread() -> Iterator[None]:
+    """Let one thread work, so that sums over many paths, such as those of texels, have the same bits in each run."""
+    threads = dr.thread_count()
+    dr.sync_thread()
+    dr.set_thread_count(1)
+    try:
+        yield
+        dr.sync_thread()
+    finally:
+        dr.set_thread_count(threads)
+
+
 def _check_followed(scene: mi.Scene) -> None:
     """Refuse derivatives that scores of walks do not have.
 
     Raises:
-        ValueError: gradients are enabled for another parameter than albedo, sigma_t and g of translucent surfaces, or
-            a delta light stands inside an object.
+        ValueError: gradients are enabled for another parameter than albedo, sigma_t and g of translucent surfaces and
+            what their textures show, or a delta light stands inside an object.
     """
-    parameters = mi.traverse(scene)
+    parameters, owners, attributes = mi.traverse(scene), [], set()
+    for shape in translucent_shapes(scene):
+        textured = shape.bsdf().inside.textured
+        owners.append(shape.bsdf())
+        for texture in textured.textures.values() if textured else ():
+            owners += mi.traverse(texture).hierarchy
+            attributes |= {(id(shape), name) for _, name in shown(texture)}
     for key, (_, _, owner, _) in parameters.properties.items():
         with dr.resume_grad():
             enabled = dr.grad_enabled(parameters[key])
-        if enabled and not (is_translucent(owner) and key.rsplit(".", 1)[-1] in VARIABLE):
+        name = key.rsplit(".", 1)[-1]
+        if enabled and not (any(owner is each for each in owners) or (id(owner), name) in attributes):
             raise ValueError(
                 f"{key} must not have gradients enabled: translucent_walk differentiates light by albedo, sigma_t and "
-                "g of translucent surfaces; bssrdf by emitters and textures too"
+                "g of translucent surfaces and by their textures; bssrdf by emitters and other textures too"
             )
 
 

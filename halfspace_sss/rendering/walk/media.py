@@ -272,6 +272,26 @@ class Coefficients(NamedTuple):
 
 
 @dataclass
+class Place:
+    """A point of a surface, as textures ask for it."""
+
+    p: mi.Point3f
+    uv: mi.Point2f
+    face: mi.UInt32
+
+    @classmethod
+    def unknown(cls, lanes: int) -> Place:
+        """No point."""
+        return cls(dr.zeros(mi.Point3f, lanes), dr.zeros(mi.Point2f, lanes), dr.zeros(mi.UInt32, lanes))
+
+    def on(self, shape: mi.Shape) -> mi.SurfaceInteraction3f:
+        """What textures of a shape are looked up by."""
+        si = dr.zeros(mi.SurfaceInteraction3f, dr.width(self.face))
+        si.p, si.uv, si.prim_index, si.shape = self.p, self.uv, self.face, mi.ShapePtr(shape)
+        return si
+
+
+@dataclass
 class WalkMedium:
     """What a walk carries: of textures and spectra the medium where it enters, for its whole way; 1/(scene unit)."""
 
@@ -279,6 +299,7 @@ class WalkMedium:
     sigma_s: mi.Spectrum
     g: mi.Spectrum | tuple[()] = ()  # where it differs by wavelength
     wavelengths: mi.Spectrum | tuple[()] = ()  # of its light, nm, under spectral variants
+    place: Place | tuple[()] = ()  # where it entered, if media have textures
 
 
 def ray_of(o: mi.Point3f, d: mi.Vector3f, medium: WalkMedium | tuple[()]) -> mi.Ray3f:
@@ -400,7 +421,12 @@ class WalkMedia:
     @property
     def carried(self) -> bool:
         """Whether walks carry their medium: what they took of textures, or of spectra at their wavelengths."""
-        return mi.is_spectral or any(inside.textured is not None for inside in self.insides)
+        return mi.is_spectral or self.textured
+
+    @property
+    def textured(self) -> bool:
+        """Whether a medium has textures, so that walks carry the place where they took it."""
+        return any(inside.textured is not None for inside in self.insides)
 
     def fetch(self, k: mi.Int32, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> WalkMedium | tuple[()]:
         """What a walk takes that enters object k at a point of its surface: the medium there; () if none is carried."""
@@ -416,15 +442,17 @@ class WalkMedia:
             elif inside.spectral is not None:
                 at = inside.spectral.at(si.wavelengths, self.mm_per_unit)
                 sigma_t, sigma_s, g = (dr.select(here, a, b) for a, b in zip(at, (sigma_t, sigma_s, g)))
-        g = () if self.same_g else g
-        return WalkMedium(sigma_t, sigma_s, g, si.wavelengths) if mi.is_spectral else WalkMedium(sigma_t, sigma_s)
+        g, wavelengths = () if self.same_g else g, si.wavelengths if mi.is_spectral else ()
+        place = Place(mi.Point3f(si.p), mi.Point2f(si.uv), mi.UInt32(si.prim_index)) if self.textured else ()
+        return WalkMedium(sigma_t, sigma_s, g if mi.is_spectral else (), wavelengths, place)
 
     def unknown(self, lanes: int, wavelengths: mi.Spectrum | tuple[()] = ()) -> WalkMedium | tuple[()]:
         """What a walk carries before it has entered anything."""
         if not self.carried:
             return ()
         g = dr.full(mi.Spectrum, 0, lanes) if mi.is_spectral and not self.same_g else ()
-        return WalkMedium(*(dr.full(mi.Spectrum, 1, lanes) for _ in range(2)), g, wavelengths)
+        place = Place.unknown(lanes) if self.textured else ()
+        return WalkMedium(*(dr.full(mi.Spectrum, 1, lanes) for _ in range(2)), g, wavelengths, place)
 
     def coefficients(self, k: mi.Int32, p: mi.Point3f, medium: WalkMedium | tuple[()] = ()) -> Coefficients:
         """Of object k at the point p, for a walk that took `medium` from `fetch`."""

@@ -431,7 +431,8 @@ def _begin(
     o, d = dr.gather(mi.Point3f, rays.o, index, known), dr.gather(mi.Vector3f, rays.d, index, known)
     no, first = dr.full(mi.Bool, False, lanes), dr.full(mi.UInt32, 0, lanes)
     wavelengths = dr.gather(mi.Spectrum, rays.wavelengths, index, known) if mi.is_spectral else ()
-    walk, stay = start_walk(o, d, rng, media.unknown(lanes, wavelengths)), Stay.none(lanes) if scored else ()
+    walk = start_walk(o, d, rng, media.unknown(lanes, wavelengths))
+    stay = Stay.none(lanes, media.textured) if scored else ()
     return CameraPath(index, walk, start_record(lanes, scored), no, first, stay)
 
 

@@ -7,21 +7,27 @@ is held (detached sampling; Zeltner, Speierer, Georgiev and Jakob 2021): with n 
 
 This holds for each channel, whichever channel the walk was drawn by, and for all orders. MIS weights add up to one for
 any medium, so they are held too. The loop sums contribution times n, d and sum d log p / dg; no path is replayed.
+
+A walk takes of textures the medium of the point where it entered. So each stay has a place of its own, and Dr.Jit goes
+on from the coefficients there to texels, vertices or faces.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
 
-from halfspace_sss.rendering.object.translucent import VARIABLE
-from halfspace_sss.rendering.walk.media import WalkMedia
+from halfspace_sss.rendering.walk.media import Place, WalkMedia
 
 if TYPE_CHECKING:
+    from halfspace_sss.rendering.object.textured import TexturedMedium
     from halfspace_sss.rendering.walk.random_walk import Crossing, Event, Visitor, Walk
+
+SLOTS = 4  # stays of a path in textured objects that are kept apart
 
 
 @dataclass
@@ -62,12 +68,16 @@ class Stay:
     score: Score
     along: mi.Vector3f  # direction before the last scattering event
     turned: mi.Bool  # whether the flight begins at that
+    before: mi.UInt32  # stays of the path that have ended
+    place: Place | tuple[()] = ()  # where it entered, if media have textures
 
     @classmethod
-    def none(cls, lanes: int) -> Stay:
-        """Of a path that begins."""
+    def none(cls, lanes: int, textured: bool, before: mi.UInt32 | None = None) -> Stay:
+        """Of a path outside; of one that begins without the number of stays `before`."""
         along, turned = dr.zeros(mi.Vector3f, lanes), dr.full(mi.Bool, False, lanes)
-        return cls(dr.full(mi.Int32, -1, lanes), Score.zeros(lanes), along, turned)
+        before = dr.zeros(mi.UInt32, lanes) if before is None else before
+        place = Place.unknown(lanes) if textured else ()
+        return cls(dr.full(mi.Int32, -1, lanes), Score.zeros(lanes), along, turned, before, place)
 
 
 @dataclass
@@ -77,6 +87,63 @@ class StayRecord:
     record: Any  # with the light L and the sums `slopes`
     index: mi.UInt32
     stay: Stay
+
+
+@dataclass(frozen=True, eq=False)
+class KeptStays:
+    """The stays of each path in textured objects, in slots: one after another those of all paths.
+
+    Of a path with more of them the last slot keeps one, drawn evenly from those that are left, times their number.
+
+    Args:
+        paths: their number.
+        number: by slot, of the object; -1 in empty slots.
+        place: by slot, where the stay began.
+        left: by path, for how many stays its last slot stands.
+        p, q: by slot, as of `PathScores`.
+    """
+
+    paths: int
+    number: mi.Int32
+    place: Place
+    left: mi.UInt32
+    p: Score
+    q: Score
+
+    @classmethod
+    def of(cls, paths: int) -> KeptStays:
+        """For so many paths."""
+        room = SLOTS * paths
+        number, left = dr.full(mi.Int32, -1, room), dr.full(mi.UInt32, 1, paths)
+        result = cls(paths, number, Place.unknown(room), left, Score.sums(room), Score.zeros(room))
+        dr.eval(result)
+        return result
+
+    def add(self, index: mi.UInt32, stay: Stay, p: Score, active: mi.Bool) -> None:
+        """A stay of each path that has ended."""
+        left = mi.UInt32(dr.maximum(mi.Int32(stay.before) - (SLOTS - 2), 1))
+        drawn = mi.sample_tea_32(index, stay.before)[0] % left == 0
+        at = index + dr.minimum(stay.before, SLOTS - 1) * dr.opaque(mi.UInt32, self.paths)
+        pairs = [(self.number, stay.object)]
+        for to, value in ((self.place, stay.place), (self.p, p), (self.q, stay.score)):
+            pairs += [(getattr(to, each.name), getattr(value, each.name)) for each in fields(to)]
+        for to, value in pairs:
+            dr.scatter(to, type(to)(value), at, active & drawn)
+        dr.scatter(self.left, left, index, active)
+
+    def slots(self, L: mi.Spectrum) -> Iterator[tuple[mi.Int32, Place, Score]]:
+        """For each slot, of the light L of all paths: the number of the object, the place and the slopes."""
+        for slot in range(SLOTS):
+            at = dr.arange(mi.UInt32, self.paths) + slot * self.paths
+            number, place, p, q = (_gathered(v, at) for v in (self.number, self.place, self.p, self.q))
+            slopes = p + q * L
+            yield number, place, slopes * mi.Float(self.left) if slot == SLOTS - 1 else slopes
+
+
+def _gathered(values: Any, at: mi.UInt32) -> Any:
+    if dr.is_array_v(values):
+        return dr.gather(type(values), values, at)
+    return type(values)(*(dr.gather(type(v), v, at) for v in vars(values).values()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,36 +157,44 @@ class PathScores:
         paths: their number.
         rows: table from the number of an object to its row, -1 without one.
         p, q: sums over stays.
+        kept: stays in textured objects that are followed, if there are any.
+        painted: by the number of an object, whether it is one of these.
     """
 
     paths: int
     rows: mi.Int32
     p: Score
     q: Score
+    kept: KeptStays | None
+    painted: mi.Bool
 
     @classmethod
     def of(cls, media: WalkMedia, paths: int) -> PathScores:
         """For so many paths."""
         numbers = [k for k, _ in followed(media)]
         rows = mi.Int32([numbers.index(k) if k in numbers else -1 for k in range(len(media.objects))])
-        room = paths * len(numbers)
-        result = cls(paths, rows, Score.sums(room), Score.zeros(room))
-        dr.eval(result.p, result.q, rows)
+        room, textured = paths * len(numbers), followed_textures(media)
+        painted = mi.Bool([k in textured for k in range(len(media.objects))])
+        kept = KeptStays.of(paths) if textured else None
+        result = cls(paths, rows, Score.sums(room), Score.zeros(room), kept, painted)
+        dr.eval(result.p, result.q, rows, painted)
         return result
 
     def add(self, r: StayRecord) -> None:
         """The stays of paths, which have ended."""
         row, end = dr.gather(mi.Int32, self.rows, r.stay.object), r.stay.score
         at, known = r.index + mi.UInt32(dr.maximum(row, 0)) * dr.opaque(mi.UInt32, self.paths), row >= 0
-        for target, value in ((self.p, r.record.slopes + end * (-r.record.L)), (self.q, end)):
+        p = r.record.slopes + end * (-r.record.L)
+        for target, value in ((self.p, p), (self.q, end)) if dr.width(self.q.n) else ():
             for to, each in zip(vars(target).values(), vars(value).values()):
                 dr.scatter_reduce(dr.ReduceOp.Add, to, type(to)(each), at, known, dr.ReduceMode.NoConflicts)
+        if self.kept:
+            self.kept.add(r.index, r.stay, p, dr.gather(mi.Bool, self.painted, r.stay.object))
 
     def slopes(self, row: int, L: mi.Spectrum) -> Score:
         """Of the light L of all paths."""
         at = dr.arange(mi.UInt32, self.paths) + row * self.paths
-        p, q = (Score(*(dr.gather(type(v), v, at) for v in vars(sums).values())) for sums in (self.p, self.q))
-        return p + q * L
+        return _gathered(self.p, at) + _gathered(self.q, at) * L
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +216,8 @@ class ScoreVisitor:
         g = self.media.spectrum("g", walk.object)
         turn = dr.select(stay.turned, phase_score(g, dr.dot(stay.along, walk.d)), 0)
         score = stay.score + Score(mi.Float(0), dr.norm(p - walk.o), turn)
-        return replace(stay, object=walk.object, score=score, turned=mi.Bool(False))
+        place = walk.medium and walk.medium.place
+        return replace(stay, object=walk.object, score=score, turned=mi.Bool(False), place=place)
 
     def _gathered(self, r: StayRecord, stay: Stay, before: mi.Spectrum, after: Any) -> StayRecord:
         """The record after a visit that has added to the light."""
@@ -179,7 +255,9 @@ class ScoreVisitor:
         """Store the stay and begin another."""
         self.scores.add(record)
         lanes = dr.width(record.index)
-        return replace(record, record=replace(record.record, slopes=Score.sums(lanes)), stay=Stay.none(lanes))
+        painted = dr.gather(mi.Bool, self.scores.painted, record.stay.object)
+        stay = Stay.none(lanes, self.media.textured, record.stay.before + dr.select(painted, mi.UInt32(1), 0))
+        return replace(record, record=replace(record.record, slopes=Score.sums(lanes)), stay=stay)
 
 
 def followed(media: WalkMedia) -> list[tuple[int, dict[str, mi.Spectrum]]]:
@@ -191,11 +269,31 @@ def followed(media: WalkMedia) -> list[tuple[int, dict[str, mi.Spectrum]]]:
     result = []
     for k, obj in enumerate(media.objects):
         surface, unit = obj.shape.bsdf(), {"sigma_t": media.mm_per_unit}
-        values = {name: getattr(surface, name) for name in VARIABLE}
+        own = [n for n in surface.inside.constants if n == "g" or surface.inside.textured is None]  # the rest by place
+        values = {name: getattr(surface, name) for name in own}
         values = {name: value * unit.get(name, 1.0) for name, value in values.items() if dr.grad_enabled(value)}
         if "albedo" in values and float(dr.min(dr.detach(values["albedo"]))[0]) <= 0:
             raise ValueError(f"albedo must be > 0 to be differentiated by, got 0 in a channel of {obj.name}")
         result += [(k, values)] if values else []
+    return result
+
+
+def followed_textures(media: WalkMedia) -> dict[int, TexturedMedium]:
+    """The number and the textures (scene units) of each object with gradients enabled in texels or attributes.
+
+    Raises:
+        ValueError: the albedo of one of them is 0 somewhere.
+    """
+    result = {}
+    for k, (obj, inside) in enumerate(zip(media.objects, media.insides)):
+        if inside.textured is None:
+            continue
+        textured = inside.textured.scaled(media.mm_per_unit)
+        if textured.is_followed(obj.shape):
+            with dr.suspend_grad():
+                if textured.values_on(obj.shape)[0].min() <= 0:
+                    raise ValueError(f"albedo must be > 0 to be differentiated by, got 0 in a texture of {obj.name}")
+            result[k] = textured
     return result
 
 
@@ -205,8 +303,24 @@ def with_derivatives(L: mi.Spectrum, scores: PathScores, media: WalkMedia) -> mi
     for row, (_, values) in enumerate(followed(media)):
         with dr.suspend_grad():
             slopes = scores.slopes(row, L)
-        for name, value in values.items():
-            known = dr.detach(value)
-            by = {"albedo": slopes.n / known, "sigma_t": slopes.n / known - slopes.d, "g": slopes.g}[name]
-            result += by * (value - known)
+        result += _change(slopes, values)
+    textured = followed_textures(media) if scores.kept else {}
+    with dr.suspend_grad():
+        slots = list(scores.kept.slots(L)) if textured else []
+    for number, place, slopes in slots:
+        for k, medium in textured.items():
+            here = number == k
+            at = medium.at(place.on(media.objects[k].shape), here)
+            values = {name: dr.select(here, getattr(at, name), 1) for name in ("albedo", "sigma_t")}
+            result += _change(slopes, values)
+    return result
+
+
+def _change(slopes: Score, values: dict[str, mi.Spectrum]) -> mi.Spectrum:
+    """Zero, with the derivatives that the slopes are by coefficients."""
+    result = mi.Spectrum(0)
+    for name, value in values.items():
+        known = dr.detach(value)
+        by = {"albedo": slopes.n / known, "sigma_t": slopes.n / known - slopes.d, "g": slopes.g}[name]
+        result += by * (value - known)
     return result
