@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from test_translucent_walk import WIDEST_Z_OF_RUNS, _runs, _scene, _z
 
-from halfspace_sss import materials
+from halfspace_sss import Medium, bssrdf, materials
+from halfspace_sss.rendering.object.points import SurfacePoint, plane_query
 
 mi = pytest.importorskip("mitsuba")
 import drjit as dr  # noqa: E402
@@ -44,12 +45,20 @@ def _lights() -> dict[str, dict]:
     }  # fmt: skip
 
 
-@pytest.mark.parametrize(("light", "n"), [("lamp", 4), ("point", 4), pytest.param("sky", 31, marks=pytest.mark.slow)])
-def test_each_wavelength_is_that_of_a_mono_render(light: str, n: int) -> None:
+@pytest.mark.parametrize(
+    ("integrator", "light", "n"),
+    [
+        ({"type": "translucent_walk", "mm_per_unit": 0.02}, "lamp", 4),
+        pytest.param({"type": "translucent_walk", "mm_per_unit": 0.02}, "point", 4, marks=pytest.mark.slow),
+        ({"type": "bssrdf", "mm_per_unit": 0.1, "model": "better_dipole"}, "lamp", 4),
+        pytest.param({"type": "translucent_walk", "mm_per_unit": 0.02}, "sky", 31, marks=pytest.mark.slow),
+    ],
+    ids=["walk, lamp", "walk, point", "better_dipole, lamp", "walk, sky"],
+)
+def test_each_wavelength_is_that_of_a_mono_render(integrator: dict, light: str, n: int) -> None:
     """Skin, with g by wavelength; the whole image, by runs of independent seeds."""
     skin, wavelengths = _skin(), np.linspace(400, 700, n)
-    scale = {"mm_per_unit": 0.02}
-    scene = _scene(skin.surface(), _lights()[light], **scale)
+    scene = _scene(skin.surface(), _lights()[light], **integrator)
     scene["sensor"]["film"] = _bands(wavelengths)
     spectral = _runs(mi.load_dict(scene), RUNS, 16 * n, 1).mean(axis=(1, 2))
     mi.set_variant("llvm_ad_mono")
@@ -57,11 +66,36 @@ def test_each_wavelength_is_that_of_a_mono_render(light: str, n: int) -> None:
     for k, nm in enumerate(wavelengths):
         m = skin.medium(float(nm))
         surface = {"sigma_s": m.sigma_s, "sigma_a": m.sigma_a, "g": m.g, "eta": skin.surface()["eta"]}
-        mono = _runs(mi.load_dict(_scene(surface, _lights()[light], **scale)), RUNS, 32, 100 * (k + 1))[..., 0]
+        mono = _runs(mi.load_dict(_scene(surface, _lights()[light], **integrator)), RUNS, 32, 100 * (k + 1))[..., 0]
         a, b = spectral[:, k], mono.mean(axis=(1, 2))
         z.append((a.mean() - b.mean()) / np.hypot(a.std(ddof=1), b.std(ddof=1)) * np.sqrt(RUNS))
     assert np.abs(z).max() < 4, z
     assert np.ptp(spectral.mean(axis=0)) > 0.2 * spectral.mean()  # wavelengths differ
+
+
+@pytest.mark.parametrize(
+    "model", ["better_dipole", "forward_scattering_dipole", pytest.param("neural", marks=pytest.mark.slow)]
+)
+def test_models_take_the_medium_at_each_wavelength(model: str) -> None:
+    """To the error of nodes, and for networks that of similar media near the exit; sums of S over pairs of points."""
+    skin, nm, unit = _skin(), [410.0, 530.0, 590.0, 690.0], 0.1
+    scene = mi.load_dict(_scene({**skin.surface(), "model": model}, type="bssrdf", mm_per_unit=unit))
+    obj = scene.integrator().prepare(scene)[0]
+    rng, n = np.random.default_rng(3), 256
+    si = dr.zeros(mi.SurfaceInteraction3f, n)
+    si.wavelengths = mi.Spectrum(*nm)
+    p, ends = rng.normal(size=(3, n)), []
+    for x in (p, p + rng.normal(size=(3, n)) * rng.uniform(0.01, 0.3, n)):
+        x = x / np.linalg.norm(x, axis=0)
+        w = dr.normalize(mi.Vector3f(x + 0.3 * rng.normal(size=(3, n))))
+        ends.append(SurfacePoint(mi.Point3f(10 * x), mi.Normal3f(x), mi.Normal3f(x), w))
+    S = np.array(obj.transport.S(ends[0]._replace(medium=obj.medium_at(si)), ends[1]))
+    query = plane_query(ends[1], ends[0], "distance")
+    for found, wavelength in zip(S, nm):
+        m = skin.medium(wavelength)
+        alone = bssrdf(model, Medium(m.sigma_s, m.sigma_a, m.g, obj.media[0].eta).scaled(unit))
+        wanted = np.array(alone.eval(*query)) * (np.array(query[3]) > 0)
+        assert np.abs(found - wanted).sum() < (0.08 if model == "neural" else 0.003) * wanted.sum()
 
 
 def test_a_grey_medium_under_d65_is_grey() -> None:
@@ -80,7 +114,7 @@ def _inside(**parameters: Any) -> Any:
 def test_the_medium_of_a_ray_is_that_of_its_wavelengths() -> None:
     skin = _skin()
     inside, nm = _inside(**skin.surface()), [400.5, 523.3, 612.0, 830.0]
-    found = np.array(inside.spectral.at(mi.Spectrum(*nm), 2.0)).reshape(3, 4)
+    found = np.array(inside.spectral.scaled(2.0).at(mi.Spectrum(*nm))).reshape(3, 4)
     m = skin.medium(nm)
     np.testing.assert_allclose(found, [2 * m.sigma_t, 2 * m.sigma_s, m.g], rtol=2e-4)
 
@@ -148,11 +182,17 @@ def test_spectra_are_refused_under_other_variants(rgb: None) -> None:
         mi.load_dict({"type": "translucent", "spectra": "a.csv"})
 
 
-def test_models_and_derivatives_refuse_spectra() -> None:
+def test_other_models_light_and_derivatives_refuse_spectra() -> None:
     scene = mi.load_dict(_scene({"sigma_s": SPECTRUM, "sigma_a": 1.0, "model": "better_dipole"}))
-    with pytest.raises(
-        ValueError, match="^variant must be RGB or mono for models of their light, got llvm_ad_spectral"
+    for settings, reason in (
+        (
+            {"model": "neural_shape"},
+            "variant must be RGB or mono for the model 'neural_shape' of object 'object', got",
+        ),
+        ({"model": "auto"}, "model must be named under a spectral variant, got 'auto'"),
+        ({"light": "gathered"}, "light must be 'sampled' under a spectral variant, got 'gathered'"),
     ):
-        mi.render(scene, integrator=mi.load_dict({"type": "bssrdf"}), spp=1)
+        with pytest.raises(ValueError, match=f"^{reason}"):
+            mi.render(scene, integrator=mi.load_dict({"type": "bssrdf", **settings}), spp=1)
     with pytest.raises(ValueError, match="^derivatives must be of an RGB or mono variant, got llvm_ad_spectral"):
         scene.integrator().render_backward(scene, None, mi.TensorXf(0))

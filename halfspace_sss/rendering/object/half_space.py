@@ -25,6 +25,7 @@ from halfspace_sss.rendering.object.points import (
 )
 from halfspace_sss.rendering.object.settings import AUTOMATIC, Settings
 from halfspace_sss.rendering.object.shape import Geometry
+from halfspace_sss.rendering.object.textured import TexturedMedium
 from halfspace_sss.rendering.object.translucent import VARIABLE
 
 POINTS_PER_RATIO, MOST_POINTS = 60.0, 9  # candidates over the area
@@ -75,10 +76,12 @@ class HalfSpaceProposals:
     Args:
         positions: of entries.
         model: whose directions of incidence are drawn.
+        textured: a medium that entries are to know, 1/(scene unit), or None.
     """
 
     positions: PositionSampler
     model: Any
+    textured: TexturedMedium | None = None
 
     def prepare(self, out: SurfacePoint, prepared: Any, active: mi.Bool) -> None:
         """Nothing is done for the exit alone."""
@@ -86,7 +89,11 @@ class HalfSpaceProposals:
     def sample(
         self, out: SurfacePoint, prim_index: mi.UInt32, prepared: None, sampler: mi.Sampler, active: mi.Bool
     ) -> EntrySample:
-        return self.positions.sample(out, prim_index, sampler, active)
+        entry = self.positions.sample(out, prim_index, sampler, active)
+        if self.textured is None:
+            return entry
+        place = self.positions.geometry, entry.p, entry.n, entry.face
+        return entry._replace(medium=self.textured.at_point(*place, active & (entry.weight > 0)))
 
     def sample_direction(self, entry: EntrySample, out: SurfacePoint, u: mi.Point2f) -> tuple[Any, Any]:
         frame = local_frame(entry.n_out, out.p - entry.p)

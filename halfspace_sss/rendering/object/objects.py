@@ -22,7 +22,7 @@ from halfspace_sss.interface.model import bssrdf
 from halfspace_sss.physics import single_scattering
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.object.half_space import Variation, half_space_model
-from halfspace_sss.rendering.object.palette import TexturedTransport, textured_model
+from halfspace_sss.rendering.object.palette import PaletteTransport, palette_model
 from halfspace_sss.rendering.object.points import (
     AreaPoints,
     ObjectAlbedo,
@@ -51,7 +51,8 @@ from halfspace_sss.rendering.object.shape import (
     state_of,
     survey,
 )
-from halfspace_sss.rendering.object.textured import TexturedMedium
+from halfspace_sss.rendering.object.spectral import MediumByWavelength
+from halfspace_sss.rendering.object.textured import SurfaceMedium, TexturedMedium
 from halfspace_sss.rendering.object.translucent import Inside, check_tints, is_translucent
 from halfspace_sss.rendering.object.varying import VaryingMedium, equivalent, warn_of_means
 
@@ -347,6 +348,7 @@ class TranslucentObject:
         media: scalar medium of each channel of the variant, 1/(scene unit).
         varying: how its medium varies in space, 1/(scene unit); `media` are then a homogeneous equivalent.
         textured: likewise over its surface.
+        spectral: likewise by wavelength.
         transport: what light that enters elsewhere is worth here; None where no order from two on is asked for.
         proposals: where it may enter; None without a transport.
         entries: how many of them an exit draws.
@@ -362,6 +364,7 @@ class TranslucentObject:
     media: tuple[Medium, ...]
     varying: VaryingMedium | None = None
     textured: TexturedMedium | None = None
+    spectral: MediumByWavelength | None = None
     transport: Transport | None = None
     proposals: Proposals | None = None
     entries: int = 1
@@ -386,6 +389,12 @@ class TranslucentObject:
     def sigma_t(self) -> mi.Spectrum:
         """Extinction of each channel, 1/(scene unit), as data of kernels: one kernel serves all media."""
         return mi.Spectrum([opaque(m.sigma_t) for m in self.media])
+
+    def medium_at(self, si: mi.SurfaceInteraction3f) -> SurfaceMedium | tuple[()]:
+        """The medium at a point of its surface, where that has textures or spectra; else ()."""
+        if self.spectral is not None:
+            return self.spectral.at_exit(si)
+        return () if self.textured is None else self.textured.at(si)
 
     @functools.cached_property
     def points(self) -> AreaPoints:
@@ -427,7 +436,7 @@ class TranslucentObject:
         self.variation.prepare()
         if self.geometry.contents is not None:
             self.geometry.contents.check_held()
-        analytic = isinstance(self.transport, TexturedTransport) and not self.transport.checksums
+        analytic = isinstance(self.transport, PaletteTransport) and not self.transport.checksums
         if self.textured is None or self.transport is None or analytic:
             return
         with dr.resume_grad():
@@ -487,10 +496,8 @@ def make_objects(
         ValueError: there is none, a camera or a lamp is inside one, a model refuses its medium or what lies inside, or
             the orders that are asked for are not those of the model.
     """
-    if mi.is_spectral:
-        raise ValueError(
-            f"variant must be RGB or mono for {_MODELS}, got {mi.variant()}: translucent_walk traces spectra"
-        )
+    if mi.is_spectral and settings.light != "sampled":
+        raise ValueError(f"light must be 'sampled' under a spectral variant, got {settings.light!r}")
     shapes = translucent_shapes(scene)
     if not shapes:
         raise ValueError("the scene must have an object with a translucent BSDF, got none")
@@ -516,6 +523,8 @@ def _choices(scene: Any, settings: Settings) -> Choices:
     """What stands for "auto", measured if anything is."""
     insides = [_asked(shape, settings) for shape in translucent_shapes(scene)]
     if insides and (settings.light == AUTO or any(inside.model == AUTO for inside in insides)):
+        if mi.is_spectral:
+            raise ValueError("model must be named under a spectral variant, got 'auto'")
         return choices(scene, settings)
     return Choices({}, settings.light, {})
 
@@ -529,6 +538,8 @@ def _make_object(geometry: Geometry, inside: Inside, settings: Settings) -> Tran
         inside.textured.check(geometry)
         textured = inside.textured.scaled(settings.mm_per_unit)
         obj = replace(obj, textured=textured, painted=state_of(geometry.shape))
+    if inside.spectral is not None:
+        obj = replace(obj, spectral=inside.spectral.scaled(settings.mm_per_unit))
     single_only = inside.orders == "single" or not any(float(m.sigma_s) > 0 for m in media)
     check_tints(geometry.name, obj.surface.boundary)
     if geometry.contents is not None:
@@ -571,11 +582,19 @@ def _low_orders(inside: Inside, transport: Transport | None) -> tuple[int, ...]:
 def _model_of(obj: TranslucentObject, inside: Inside, settings: Settings, variation: Variation) -> ObjectModel:
     of_object = lookup(inside.model).transport
     if of_object is not None:
+        if obj.spectral is not None:
+            raise ValueError(
+                f"variant must be RGB or mono for the model {inside.model!r} of object {obj.geometry.name}, got "
+                f"{mi.variant()}: translucent_walk and models of the half-space take spectra"
+            )
         if obj.textured is not None and not getattr(of_object, "takes_textures", False):
             refuse_textures(obj.geometry.name, f"the model {inside.model!r}")
         return of_object(obj, settings)
     if obj.textured is not None:
-        return textured_model(inside.model, obj.geometry, obj.media, obj.textured, settings)
+        return palette_model(inside.model, obj.geometry, obj.media, obj.textured, settings)
+    if obj.spectral is not None:
+        of_mean = replace(obj.media[0], g=float(np.mean([m.g for m in obj.media])))
+        return palette_model(inside.model, obj.geometry, (of_mean,) * len(obj.media), obj.spectral, settings)
     warn_of_means(inside, obj.geometry)
     return half_space_model(inside.model, obj.geometry, obj.media, settings, variation)
 

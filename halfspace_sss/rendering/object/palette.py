@@ -34,7 +34,6 @@ from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.object.half_space import HalfSpaceProposals, area_share
 from halfspace_sss.rendering.object.points import (
     AreaPoints,
-    EntrySample,
     ObjectModel,
     PositionSampler,
     RadialTable,
@@ -44,6 +43,7 @@ from halfspace_sss.rendering.object.points import (
 )
 from halfspace_sss.rendering.object.settings import Settings
 from halfspace_sss.rendering.object.shape import Geometry
+from halfspace_sss.rendering.object.spectral import MediumByWavelength
 from halfspace_sss.rendering.object.textured import SurfaceMedium, TexturedMedium, bend, x_of_albedo
 
 NODES = 32  # over all albedos
@@ -53,6 +53,7 @@ MOST = 1 - 1e-6  # above which S has no derivative by it, as dv is infinite
 SLOPED = ("albedo", "sigma_t")
 STEP = 0.01  # of ln sigma_t, for its slope
 FAINT = 1e-35  # of S, below which it is interpolated itself
+Varied = TexturedMedium | MediumByWavelength
 LEVELS = (0.0, 0.5, 1.0)  # quantiles of albedo and extinction in the radial density of entries
 
 
@@ -124,7 +125,7 @@ class Palette:
         return 1 if self.models[0].orders == "total" else 2
 
     def S(self, ends: Sequence[SurfaceMedium], query: tuple[mi.Float, ...], active: mi.Bool) -> mi.Spectrum:
-        """sqrt(S_o S_i) of the media at both ends, at a query in scene units, 1/((scene unit)² sr).
+        """sqrt(S_o S_i) of the media at both ends, or S of one, at a query in scene units, 1/((scene unit)² sr).
 
         With derivatives by the media where they are followed; not by networks.
         """
@@ -158,7 +159,7 @@ class Palette:
         def step(k: mi.UInt32, result: mi.Spectrum, slopes: list[Slope]) -> tuple[mi.UInt32, mi.Spectrum, list[Slope]]:
             c, first = k % n, k < n
             albedo, sigma_t = (
-                dr.select(first, _pick(getattr(ends[0], key), c), _pick(getattr(ends[1], key), c)) for key in SLOPED
+                dr.select(first, _pick(getattr(ends[0], key), c), _pick(getattr(ends[-1], key), c)) for key in SLOPED
             )
             node, cells, low, per_step, g, bent = (dr.gather(mi.Float, table, c) for table in tables)
             albedo = dr.clip(albedo, 0, 1)
@@ -171,7 +172,8 @@ class Palette:
 
             a, b = pair(1.0)
             S, f = _between(a, b, t - cell), t - cell
-            root = sigma_t * dr.sqrt(albedo**self.power * S)
+            S = dr.square(sigma_t) * albedo**self.power * S
+            root = S if len(ends) == 1 else dr.sqrt(S)
             if slopes:
                 new, known = Slope(mi.Float(0), mi.Float(0)), dr.minimum(a, b) > FAINT
                 if by_albedo:
@@ -188,7 +190,7 @@ class Palette:
 
         slopes = [dr.zeros(Slope, lanes) for _ in range(2 * n)] if by_albedo or by_sigma_t else []
         start = mi.UInt32(0) + dr.zeros(mi.UInt32, lanes), dr.full(mi.Spectrum, 1, lanes), slopes
-        return dr.while_loop(start, lambda k, *_: active & (k < 2 * n), step, label="ends and channels")[1:]
+        return dr.while_loop(start, lambda k, *_: active & (k < len(ends) * n), step, label="ends and channels")[1:]
 
     def _numbers(self, c: int) -> tuple[float, ...]:
         row, g = self.rows[c], self.g[c]
@@ -254,19 +256,19 @@ def _albedo_of_v(v: np.ndarray, g: float) -> np.ndarray:
 
 
 @dataclass(frozen=True, eq=False)
-class TexturedTransport:
-    """S = sqrt(S_o S_i) of the media at both ends.
+class PaletteTransport:
+    """S = sqrt(S_o S_i) of the media at both ends, or S of that at the wavelengths of a ray.
 
     Args:
         palette: the models.
         obj: the object.
-        textured: its medium, 1/(scene unit).
+        medium: what varies, 1/(scene unit).
         geometry: "distance" or "tangent", see `points.separation`.
     """
 
     palette: Palette
     obj: Geometry
-    textured: TexturedMedium
+    medium: Varied
     geometry: str = "distance"
     alpha = None
     is_delta = False
@@ -288,63 +290,34 @@ class TexturedTransport:
         with dr.suspend_grad():
             query = plane_query(at, exit, self.geometry)
             above = active & (at.mu > 0) & (query[3] > 0)
-        ends = [self.textured.followed(self.obj, end, above) for end in (exit, at)]
+        ends = self.medium.ends(self.obj, exit, at, above)
         return dr.select(above, self.palette.S(ends, query, above), 0)
 
 
-@dataclass(frozen=True, eq=False)
-class TexturedProposals:
-    """Proposals of a half-space model, whose entries know the medium there.
-
-    Args:
-        plain: those proposals.
-        textured: the medium, 1/(scene unit).
-    """
-
-    plain: HalfSpaceProposals
-    textured: TexturedMedium
-
-    def prepare(self, out: SurfacePoint, prepared: Any, active: mi.Bool) -> None:
-        """Nothing is done for the exit alone."""
-
-    def sample(
-        self, out: SurfacePoint, prim_index: mi.UInt32, prepared: None, sampler: mi.Sampler, active: mi.Bool
-    ) -> EntrySample:
-        entry = self.plain.sample(out, prim_index, prepared, sampler, active)
-        obj = self.plain.positions.geometry
-        medium = self.textured.at_point(obj, entry.p, entry.n, entry.face, active & (entry.weight > 0))
-        return entry._replace(medium=medium)
-
-    def sample_direction(self, entry: EntrySample, out: SurfacePoint, u: mi.Point2f) -> tuple[Any, Any]:
-        return self.plain.sample_direction(entry, out, u)
-
-    def pdf_direction(self, entry: EntrySample, out: SurfacePoint, w_i: mi.Vector3f) -> Any:
-        return self.plain.pdf_direction(entry, out, w_i)
-
-
-def textured_model(
-    name: str, geometry: Geometry, media: tuple[Medium, ...], textured: TexturedMedium, settings: Settings
+def palette_model(
+    name: str, geometry: Geometry, media: tuple[Medium, ...], medium: Varied, settings: Settings
 ) -> ObjectModel:
-    """The transport and the proposals of a half-space model on an object whose medium has textures.
+    """The transport and the proposals of a half-space model on an object whose medium has textures or spectra.
 
     Args:
         name: of the model.
         geometry: the object.
         media: of each channel, of which g and eta hold, 1/(scene unit).
-        textured: the medium, 1/(scene unit).
+        medium: what varies, 1/(scene unit).
         settings: geometry and share of uniform entries.
 
     Raises:
         ValueError: the model knows some media only.
     """
-    values = [v if len(v) else np.array([[0.0], [1.0]]) for v in textured.values_on(geometry.shape)]
+    values = [v if len(v) else np.array([[0.0], [1.0]]) for v in medium.values_on(geometry.shape)]
     albedos, extinctions = (np.broadcast_to(v, (len(v), len(media))) for v in values)
     models = _spread(name, albedos, extinctions, media)
     table = RadialTable(models, geometry.size)
     share = area_share(geometry, table.mean / geometry.size, settings.area_share)
     positions = PositionSampler(geometry, table, AreaPoints(geometry.shape), share)
-    transport = TexturedTransport(Palette.of(name, albedos, media), geometry, textured, settings.geometry)
-    return ObjectModel(transport, TexturedProposals(HalfSpaceProposals(positions, models[0]), textured))
+    transport = PaletteTransport(Palette.of(name, albedos, media), geometry, medium, settings.geometry)
+    known = medium if isinstance(medium, TexturedMedium) else None  # else that of the exit
+    return ObjectModel(transport, HalfSpaceProposals(positions, models[0], known))
 
 
 def _spread(name: str, albedos: np.ndarray, extinctions: np.ndarray, media: tuple[Medium, ...]) -> list[BSSRDF]:

@@ -109,10 +109,15 @@ def channel_mean(value: Any) -> Any:
     return dr.sum(value) / len(value)
 
 
-def place(p: mi.Point3f, n: mi.Normal3f) -> Any:
-    """A point with its geometric normal, from which rays start clear of the surface."""
+def place(p: mi.Point3f, n: mi.Normal3f, medium: Any = ()) -> Any:
+    """A point with its geometric normal, from which rays start clear of the surface.
+
+    Under spectral variants with the wavelengths of a `medium`: emitters are asked for those.
+    """
     result = dr.zeros(mi.Interaction3f)
     result.p, result.n = mi.Point3f(p), mi.Normal3f(n)
+    if mi.is_spectral and medium:
+        result.wavelengths = medium.wavelengths
     return result
 
 

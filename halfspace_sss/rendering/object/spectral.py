@@ -1,13 +1,16 @@
 """Media by wavelength, under spectral variants of Mitsuba, where a ray has four wavelengths and each is a channel.
 
 The coefficients are those at the wavelengths of the ray, sigma_t(l), sigma_s(l) and g(l). The relative index is one
-number, the mean over the visible range: dispersion is left out.
+number, the mean over the visible range: dispersion is left out. Models of the half-space know one g, the visible mean
+g_0, and take the similar medium
+
+    sigma_s* = sigma_s (1 - g) / (1 - g_0),    sigma_t* = sigma_s* + sigma_a.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -16,10 +19,13 @@ import numpy as np
 
 from halfspace_sss.materials.spectra import SpectralMedium, read_spectra
 from halfspace_sss.physics.medium import Medium
-from halfspace_sss.rendering.object.points import opaque
+from halfspace_sss.rendering.object.points import SurfacePoint, opaque
+from halfspace_sss.rendering.object.shape import Geometry
+from halfspace_sss.rendering.object.textured import SurfaceMedium
 
 STEP = 1.0  # nm, of tables
 CHANNELS = 4  # wavelengths of a ray
+EVERYWHERE = np.array([1.0, 1e6])  # nm, of media given by numbers
 IN_UNITS = ("sigma_s", "sigma_a", "sigma_t", "mfp")  # no colours: rgb is a reflectance in [0, 1]
 LOOKS = 256  # wavelengths that a sensor is asked for
 
@@ -30,16 +36,20 @@ class MediumByWavelength:
 
     Args:
         spectra: the medium.
-        tables: sigma_t, sigma_s (1/mm) and g at every `STEP` from the first wavelength to the last.
+        tables: sigma_t, sigma_s (1/mm) and g at every `STEP` from the first wavelength to the last, or at these two.
+        scale: factor of sigma_t and sigma_s.
     """
 
     spectra: SpectralMedium
     tables: list[mi.Float]
+    scale: float = 1.0
 
     @classmethod
     def of(cls, spectra: SpectralMedium) -> MediumByWavelength:
         """Of spectra."""
-        m = spectra.medium(_grid(spectra.wavelengths[0], spectra.wavelengths[-1]))
+        even = all(np.ptp(getattr(spectra, key)) == 0 for key in ("sigma_s", "sigma_a", "g"))
+        ends = spectra.wavelengths[[0, -1]]
+        m = spectra.medium(ends if even else _grid(*ends))
         tables = [mi.Float(np.broadcast_to(v, m.sigma_t.shape).tolist()) for v in (m.sigma_t, m.sigma_s, m.g)]
         dr.make_opaque(tables)
         return cls(spectra, tables)
@@ -49,8 +59,12 @@ class MediumByWavelength:
         """Mean cosine by wavelength."""
         return self.spectra.g
 
-    def at(self, wavelengths: mi.Spectrum, scale: float = 1.0) -> tuple[mi.Spectrum, mi.Spectrum, mi.Spectrum]:
-        """sigma_t and sigma_s times a scale, and g, at wavelengths in nm; beyond the spectra as at their ends."""
+    def scaled(self, factor: float) -> MediumByWavelength:
+        """The same in other units of length: sigma_t and sigma_s times a factor."""
+        return replace(self, scale=self.scale * factor)
+
+    def at(self, wavelengths: mi.Spectrum) -> tuple[mi.Spectrum, mi.Spectrum, mi.Spectrum]:
+        """sigma_t, sigma_s and g at wavelengths in nm; beyond the spectra as at their ends."""
         (first, last), n = self.spectra.wavelengths[[0, -1]], dr.width(self.tables[0])
         results = [[], [], []]
         for wavelength in wavelengths:
@@ -59,7 +73,29 @@ class MediumByWavelength:
             for table, values in zip(self.tables, results):
                 values.append(dr.lerp(dr.gather(mi.Float, table, k), dr.gather(mi.Float, table, k + 1), t - k))
         sigma_t, sigma_s, g = (mi.Spectrum(values) for values in results)
-        return sigma_t * opaque(scale), sigma_s * opaque(scale), g
+        return sigma_t * opaque(self.scale), sigma_s * opaque(self.scale), g
+
+    def at_exit(self, si: mi.SurfaceInteraction3f) -> SurfaceMedium:
+        """The medium where light leaves, for its whole way."""
+        sigma_t, sigma_s, g = self.at(si.wavelengths)
+        return SurfaceMedium(sigma_s / dr.maximum(sigma_t, 1e-30), sigma_t, si.prim_index, g, si.wavelengths)
+
+    def ends(self, obj: Geometry, exit: SurfacePoint, at: SurfacePoint, active: mi.Bool) -> list[SurfaceMedium]:
+        """The medium by whose half-space light goes to an exit: the similar one of the mean g."""
+        m = exit.medium
+        albedo, sigma_t = self._similar(m.albedo, m.sigma_t, m.g)
+        return [SurfaceMedium(albedo, sigma_t, m.face)]
+
+    def values_on(self, shape: mi.Shape) -> tuple[np.ndarray, np.ndarray]:
+        """Albedo and sigma_t of that medium at the wavelengths of the tables, shapes (n, 1)."""
+        sigma_t, sigma_s, g = (np.array(table, dtype=float)[:, None] for table in self.tables)
+        albedo, sigma_t = self._similar(sigma_s / np.maximum(sigma_t, 1e-30), sigma_t, g)
+        return albedo, self.scale * sigma_t
+
+    def _similar(self, albedo: Any, sigma_t: Any, g: Any) -> tuple[Any, Any]:
+        factor = (1 - g) / (1 - self.mean().g.mean())
+        extinction = sigma_t * (albedo * factor + 1 - albedo)
+        return albedo * factor * sigma_t / (extinction + 1e-30), extinction
 
     def mean(self) -> Medium:
         """The medium at four visible wavelengths, with their mean index, see `SpectralMedium.visible`."""

@@ -105,6 +105,8 @@ class SurfaceMedium:
     albedo: mi.Spectrum
     sigma_t: mi.Spectrum
     face: mi.UInt32
+    g: mi.Spectrum | tuple[()] = ()  # and the wavelengths, nm, under spectral variants
+    wavelengths: mi.Spectrum | tuple[()] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,6 +153,10 @@ class TexturedMedium:
             dr.replace_grad(getattr(at.medium, key), getattr(found, key)) for key in ("albedo", "sigma_t")
         )
         return SurfaceMedium(albedo, sigma_t, at.medium.face)
+
+    def ends(self, obj: Geometry, exit: SurfacePoint, at: SurfacePoint, active: mi.Bool) -> list[SurfaceMedium]:
+        """The media by whose half-spaces light goes from an entry to an exit: those of both ends, as `followed`."""
+        return [self.followed(obj, end, active) for end in (exit, at)]
 
     def is_followed(self, shape: mi.Shape) -> bool:
         """Whether derivatives by texels, by attributes of a shape, or by constants beside them, are followed."""

@@ -63,7 +63,7 @@ from halfspace_sss.physics.reflectance import directional_table, half_space_refl
 from halfspace_sss.rendering.object.points import mirrored, opaque
 from halfspace_sss.rendering.object.registry import model_names
 from halfspace_sss.rendering.object.settings import ORDERS, check_parameters, variant_channels
-from halfspace_sss.rendering.object.spectral import CHANNELS, MediumByWavelength, read_file, spectral_medium
+from halfspace_sss.rendering.object.spectral import EVERYWHERE, MediumByWavelength, read_file, spectral_medium
 from halfspace_sss.rendering.object.textured import constant_texture, textured_medium
 from halfspace_sss.rendering.object.varying import constant_value, mean_of_grids, varying_medium
 
@@ -421,7 +421,7 @@ class Inside:
         reflection: whether the boundary reflects.
         varying: how the medium varies in space, a `VaryingMedium`, or None. `medium` then has the means of the grids.
         textured: how it varies over the surface, a `TexturedMedium`, or None; `medium` then has the means of texels.
-        spectral: how it varies with wavelength, a `MediumByWavelength`, or None; `medium` then is at four wavelengths.
+        spectral: by wavelength, a `MediumByWavelength`, under spectral variants; `medium` then is at four wavelengths.
     """
 
     label: str
@@ -505,8 +505,8 @@ def read_inside(props: mi.Properties) -> Inside:
 COEFFICIENTS = ("sigma_s", "sigma_a", "sigma_t", "albedo", "scale", "reflectance", "mfp", "g", "eta")
 
 
-def _by_wavelength(props: mi.Properties) -> tuple[str, Medium, MediumByWavelength | None]:
-    """Of a spectral variant: the medium at four wavelengths, and at all where it is not the same at all."""
+def _by_wavelength(props: mi.Properties) -> tuple[str, Medium, MediumByWavelength]:
+    """Of a spectral variant: the medium at four wavelengths, and at all."""
     for key in ("material", "dilution", "channel"):
         if key in props:
             raise ValueError(
@@ -529,8 +529,7 @@ def _by_wavelength(props: mi.Properties) -> tuple[str, Medium, MediumByWavelengt
     if wavelengths is not None and "reflectance" in values:
         values["reflectance"] = _clipped(values)
     medium, _, _ = _inline_medium(values)
-    if wavelengths is None:
-        return "medium", _of_channels(medium, CHANNELS), None
+    wavelengths = EVERYWHERE if wavelengths is None else wavelengths
     by_wavelength = _of_channels(medium, len(wavelengths))
     coefficients = (by_wavelength.sigma_s, by_wavelength.sigma_a, by_wavelength.g, medium.eta)
     spectral = MediumByWavelength.of(SpectralMedium(wavelengths, *coefficients))

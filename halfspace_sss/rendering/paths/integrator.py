@@ -93,6 +93,9 @@ def _class(variant: str) -> type:
             sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
             with interruptible(), undisturbed(), dr.suspend_grad():
                 objects = self.prepare(scene)
+                for obj in objects:
+                    if obj.spectral is not None:
+                        obj.spectral.check_covers(obj.geometry.name, sensor)
                 self._controlled = self._with_control_variates(scene, objects, sensor, seed, spp)
                 try:
                     for launch in launches(sensor, seed, spp, lambda: not self.timed and self.should_stop()):
@@ -121,6 +124,8 @@ def _class(variant: str) -> type:
                 replayer(objects, self.settings).render_backward(scene, *args, **more)
 
         def _differentiable(self, scene: mi.Scene) -> list[TranslucentObject]:
+            if mi.is_spectral:
+                raise ValueError(f"derivatives must be of an RGB or mono variant, got {mi.variant()}")
             if self.settings.light != "sampled":
                 raise ValueError(f"light must be sampled for derivatives, got {self.settings.light}")
             return self.prepare(scene)

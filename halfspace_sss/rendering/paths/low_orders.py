@@ -115,7 +115,10 @@ def sample_low_orders(
 
     # ---- throughput f / p
     if walk.medium:
-        media = _media(obj, obj.textured.followed(obj.geometry, refracted.out, active))
+        of_exit = refracted.out.medium
+        if obj.textured is not None:
+            of_exit = obj.textured.followed(obj.geometry, refracted.out, active)
+        media = _media(obj, of_exit)
     else:
         media = obj.variation.coefficients(obj.media)
     f = _contribution(media, walk.length, walk.order, walk.cosine)
@@ -162,7 +165,8 @@ def _media(obj: TranslucentObject, medium: SurfaceMedium | tuple[()]) -> Media:
     """The medium of each channel: that of the exit, or of the object where it has no textures."""
     if not medium:
         return [tuple(opaque(v) for v in (m.sigma_s, m.sigma_t, m.g)) for m in obj.media]
-    return [(a * t, t, opaque(m.g)) for a, t, m in zip(medium.albedo, medium.sigma_t, obj.media)]
+    g = medium.g if len(medium.g) else [opaque(m.g) for m in obj.media]
+    return [(a * t, t, each) for a, t, each in zip(medium.albedo, medium.sigma_t, g)]
 
 
 def _step(
@@ -314,7 +318,7 @@ def _connected(
 ) -> mi.Spectrum:  # fmt: skip
     """Light of a sampled emitter that reaches the event, which has a weight, by refraction or one reflection more."""
     obj, media = of
-    at = place(walk.event, mi.Normal3f(0, 0, 0))
+    at = place(walk.event, mi.Normal3f(0, 0, 0), walk.medium)
     ds, light = sample_emitter(context, at, sampler.next_2d(), False, active)
     with dr.suspend_grad():
         distant = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
@@ -375,7 +379,7 @@ def _met_by_chance(
 ) -> mi.Spectrum:
     """Emission that a walk meets from its event, which no connection with that point of an emitter would find."""
     with dr.suspend_grad():
-        ray = place(walk.o, walk.n).spawn_ray(walk.d)
+        ray = place(walk.o, walk.n, walk.medium).spawn_ray(walk.d)
         si = context.scene.ray_intersect(ray, mi.RayFlags.All, False, active)
         emitter = si.emitter(context.scene, active)
         active = active & (emitter != None) & context.sampled_by_nee(emitter, walk.d)  # noqa: E711
@@ -390,7 +394,8 @@ def _spread_lights(
     context: RenderContext, obj: TranslucentObject, walk: _Walk, sampler: mi.Sampler, active: mi.Bool
 ) -> mi.Spectrum:
     """Light of a delta light whose cone holds a walk's way out, which no connection with it would find."""
-    which, L = delta_light(context, sampler, place(walk.o, walk.n).spawn_ray(walk.d), active)
+    ray = place(walk.o, walk.n, walk.medium).spawn_ray(walk.d)
+    which, L = delta_light(context, sampler, ray, active)
     with dr.suspend_grad():
         connects = active & (dr.max(L) > 0) & (walk.order == 1)
         target = context.small.point(which, walk.event, FAR * obj.geometry.size)

@@ -155,7 +155,9 @@ def _loop(
         active = active & (sampler.next_1d() < survival)
         throughput = throughput / survival
         origin = place(following.previous.p, following.previous.n)
-        ray = dr.select(active, origin.spawn_ray(following.d), path.ray)
+        onward = origin.spawn_ray(following.d)
+        onward.wavelengths = path.ray.wavelengths
+        ray = dr.select(active, onward, path.ray)
 
         # ---- second pass: from the camera again, where the first pass has ended
         again = ~active & needs_second & ~path.second_pass
@@ -357,8 +359,7 @@ def exit_at(obj: TranslucentObject, si: mi.SurfaceInteraction3f) -> SurfacePoint
     if not obj.geometry.closed:  # a sheet is a half-space from both sides
         sign = dr.select(dr.dot(n_face, w) > 0, 1.0, -1.0)
     n = lifted(turned(si.sh_frame.n, n_face), n_face, w)
-    medium = () if obj.textured is None else obj.textured.at(si)
-    return SurfacePoint(mi.Point3f(si.p), n_face * sign, n * sign, w, sign, medium)
+    return SurfacePoint(mi.Point3f(si.p), n_face * sign, n * sign, w, sign, obj.medium_at(si))
 
 
 def _where(context: RenderContext, sampler: mi.Sampler, mask: mi.Bool, otherwise: tuple, event: Callable) -> tuple:
@@ -477,6 +478,7 @@ def _add_mirrored(
     def look(_: mi.Spectrum, __: mi.Bool, tally: PathTally) -> tuple[mi.Spectrum, mi.Bool, PathTally]:
         origin = reflected.previous
         ray = place(origin.p, origin.n).spawn_ray(reflected.d)
+        ray.wavelengths = at.ray.wavelengths
         si = context.scene.ray_intersect(ray, mi.RayFlags.All, False, active)
         L_e = emission(context, sampler, ray, si, origin, mi.Bool(True), at.scattered, active)
         light = at.throughput * L_e
@@ -661,7 +663,7 @@ def _draw_candidate(
         entry = proposals.sample(out, exit_point.face, exit_point.proposals, sampler, active)
         active = active & (entry.weight > 0)
         d, pdf = proposals.sample_direction(entry, out, sampler.next_2d())
-        at, pdf, distance = place(entry.p, entry.n), (1 - share) * pdf, mi.Float(-1)
+        at, pdf, distance = place(entry.p, entry.n, out.medium), (1 - share) * pdf, mi.Float(-1)
     delta, emitter_point, light, brightness = mi.Bool(False), mi.Point3f(0), mi.Spectrum(0), mi.Float(1)
     sky_weight = mi.Float(1) if context.uses_sky(obj) else mi.Float(0)
     if share == 0:

@@ -440,7 +440,7 @@ class WalkMedia:
                 sigma_t = dr.select(here, at.sigma_t, sigma_t)
                 sigma_s = dr.select(here, at.albedo * at.sigma_t, sigma_s)
             elif inside.spectral is not None:
-                at = inside.spectral.at(si.wavelengths, self.mm_per_unit)
+                at = inside.spectral.scaled(self.mm_per_unit).at(si.wavelengths)
                 sigma_t, sigma_s, g = (dr.select(here, a, b) for a, b in zip(at, (sigma_t, sigma_s, g)))
         g, wavelengths = () if self.same_g else g, si.wavelengths if mi.is_spectral else ()
         place = Place(mi.Point3f(si.p), mi.Point2f(si.uv), mi.UInt32(si.prim_index)) if self.textured else ()
