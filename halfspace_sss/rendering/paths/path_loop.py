@@ -154,10 +154,7 @@ def _loop(
         survival = dr.select(depth >= settings.rr_depth, dr.minimum(largest, 0.95), 1.0)
         active = active & (sampler.next_1d() < survival)
         throughput = throughput / survival
-        origin = place(following.previous.p, following.previous.n)
-        onward = origin.spawn_ray(following.d)
-        onward.wavelengths = path.ray.wavelengths
-        ray = dr.select(active, onward, path.ray)
+        ray = dr.select(active, _ray_from(following.previous, following.d, path.ray), path.ray)
 
         # ---- second pass: from the camera again, where the first pass has ended
         again = ~active & needs_second & ~path.second_pass
@@ -184,6 +181,13 @@ def _loop(
     two = path.second_pass
     parts = dr.select(two, path.L_first, path.tally.L), dr.select(two, path.tally.L, 0)
     return parts, path.tally.derivative, path.hit
+
+
+def _ray_from(origin: PreviousVertex, d: mi.Vector3f, before: mi.Ray3f) -> mi.Ray3f:
+    """A ray along d from a vertex, clear of its surface, with the wavelengths of the one before."""
+    ray = place(origin.p, origin.n).spawn_ray(d)
+    ray.wavelengths = before.wavelengths
+    return ray
 
 
 def _camera_vertex() -> PreviousVertex:
@@ -477,8 +481,7 @@ def _add_mirrored(
 
     def look(_: mi.Spectrum, __: mi.Bool, tally: PathTally) -> tuple[mi.Spectrum, mi.Bool, PathTally]:
         origin = reflected.previous
-        ray = place(origin.p, origin.n).spawn_ray(reflected.d)
-        ray.wavelengths = at.ray.wavelengths
+        ray = _ray_from(origin, reflected.d, at.ray)
         si = context.scene.ray_intersect(ray, mi.RayFlags.All, False, active)
         L_e = emission(context, sampler, ray, si, origin, mi.Bool(True), at.scattered, active)
         light = at.throughput * L_e
