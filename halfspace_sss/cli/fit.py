@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -23,8 +24,7 @@ from halfspace_sss.cli.shared import (
 from halfspace_sss.provenance import check_folder, provenance, write_together
 
 if TYPE_CHECKING:
-    from halfspace_sss.inverse.fitting import MaterialFit
-    from halfspace_sss.physics.medium import Medium
+    from halfspace_sss.inverse.comparing import MaterialFit
 
 COEFFICIENTS = ("material", "dilution", "sigma_s", "sigma_a", "sigma_t", "albedo", "scale", "reflectance", "mfp", "g")
 
@@ -32,32 +32,43 @@ COEFFICIENTS = ("material", "dilution", "sigma_s", "sigma_a", "sigma_t", "albedo
 def fit_command(
     scene: Annotated[Path, typer.Argument(help="Mitsuba XML file with the cameras, the lights and a first medium.")],
     images: Annotated[Path, typer.Option(help="JSON file of the views, see `halfspace_sss.inverse.read_views`.")],
-    parameter: Annotated[str, typer.Option(help="Of albedo, sigma_t, mfp, g.")] = "albedo,sigma_t",
+    parameter: Annotated[
+        str, typer.Option(help="Of albedo, reflectance, sigma_t, mfp, g; the texture, where there is one.")
+    ] = "albedo,sigma_t",
     model: Annotated[str, typer.Option(help="translucent_walk, or the name of a model.")] = "translucent_walk",
     object: ObjectId = None,  # noqa: A002
-    steps: Annotated[int, typer.Option(help="Gauss-Newton steps.", parser=whole)] = 30,
+    steps: Annotated[int, typer.Option(help="How many.", parser=whole, show_default="30, or 200 with textures")] = 0,
     spp: Annotated[int, typer.Option(help="Samples a pixel of each render of a step.", parser=whole)] = 64,
     batch: Annotated[int, typer.Option(help="Views a step.", parser=whole, show_default="4, or all")] = 0,
     loss: Annotated[str, typer.Option(help="relative or l2.")] = "relative",
     exposure: Annotated[bool, typer.Option("--exposure", help="Each image has an unknown factor.")] = False,
+    rate: Annotated[float, typer.Option(help="Of textures: of Adam.")] = 0.2,
+    tv: Annotated[float, typer.Option(help="Of textures: weight of their total variation.")] = 1e-3,
+    levels: Annotated[int, typer.Option(help="Of bitmaps: resolutions, from coarse to fine.", parser=whole)] = 3,
     seed: SampleSeed = 0,
     work: Annotated[Path | None, typer.Option(help="Folder where an interrupted fit goes on.")] = None,
     variant: Variant = "llvm_ad_rgb",
     out: OutFolder = Path("fit"),
 ) -> None:
-    """Fit the medium of an object to images: NAME_fit.toml (material), .xml (scene with it), .json (all numbers)."""
+    """Fit the medium of an object to images: NAME_fit.toml (material), .xml (scene with it), .json (all numbers).
+
+    A texture is written as NAME_fit_PARAMETER.exr, an attribute of a mesh with it as NAME_fit.ply.
+    """
     use_mitsuba(variant)
     from halfspace_sss.inverse import FitSettings, fit, read_views
 
-    settings = FitSettings(steps, spp, batch, loss, exposure, seed)
+    settings = FitSettings(steps, spp, batch, loss, exposure, seed, rate, tv, levels)
     check_folder(out)
     names = [name.strip() for name in parameter.split(",")]
     with Bar("fit") as bar:
         found = fit(scene, read_views(images), names, model, object, settings, work, bar.show)
     screen = console()
     for name, value in found.values.items():
-        numbers = "  ".join(f"{v:.4g} ± {e:.1g}" for v, e in zip(value, found.errors[name]))
-        screen.print(f"{name}: {numbers}", highlight=False)
+        errors = [f" ± {e:.1g}" for e in found.errors[name]] if found.errors else [""] * len(value)
+        screen.print(f"{name}: {'  '.join(f'{v:.4g}{e}' for v, e in zip(value, errors))}", highlight=False)
+    for name, values in found.textures.items():
+        mean = " ".join(f"{v:.4g}" for v in values.reshape(-1, values.shape[-1]).mean(axis=0))
+        screen.print(f"{name}: {' x '.join(map(str, values.shape[:-1]))} numbers of mean {mean}", highlight=False)
     held = "" if found.held_out is None else f", of views held out {found.held_out.told()} %"
     screen.print(f"root of the loss {found.misfit.told()} %{held}", highlight=False)
     for sentence in found.told:
@@ -75,9 +86,17 @@ def _write(found: MaterialFit, scene: Path, name: str | None, out: Path) -> list
     told = provenance(**{key: value.tolist() for key, value in found.values.items()})
     files = {out / f"{stem}.json": json.dumps({**_plain(found), "provenance": told}, indent=1)}
     if found.medium.n_channels == 3:
-        material = Material(stem, found.medium, ("R", "G", "B"), set="fit", source=f"fitted to images of {scene.name}")
+        material = Material(
+            stem,
+            found.medium,
+            ("R", "G", "B"),
+            set="fit",
+            source=f"{'means of textures ' * bool(found.textures)}fitted to images of {scene.name}",
+        )
         files[out / f"{stem}.toml"] = to_toml([material])
-    text = _with_medium(scene, name, found.medium)
+    painted, textures = _with_textures(scene, name, found, out / stem)
+    files |= textures
+    text = _with_medium(scene, name, found, painted)
     if text is None:
         tell(f"{scene.name} has no single surface `translucent` to put the medium in: no scene was written")
     else:
@@ -96,26 +115,86 @@ def _plain(found: MaterialFit) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _with_medium(scene: Path, name: str | None, medium: Medium) -> str | None:
+def _with_textures(
+    scene: Path, name: str | None, found: MaterialFit, stem: Path
+) -> tuple[dict[str, Path], dict[Path, bytes]]:
+    """By parameter, or `mesh`, the files of textures; and these."""
+    from halfspace_sss.inverse.textures import painted_mesh
+    from halfspace_sss.rendering.scenes.picture import as_exr
+
+    ways, files = {}, {}
+    for key, values in found.textures.items():
+        if values.ndim == 3:
+            ways[key] = stem.with_name(f"{stem.name}_{key}.exr")
+            files[ways[key]] = as_exr(values)
+    attributes = {key: values for key, values in found.textures.items() if values.ndim == 2}
+    if attributes:
+        ways["mesh"] = stem.with_name(f"{stem.name}.ply")
+        files[ways["mesh"]] = painted_mesh(scene, name, attributes)
+    return ways, files
+
+
+def _with_medium(scene: Path, name: str | None, found: MaterialFit, painted: dict[str, Path]) -> str | None:
     """The scene with another medium in the object; None if it is not clear which surface that is."""
     root = ElementTree.parse(scene).getroot()
     shapes = [shape for shape in root.iter("shape") if name is None or shape.get("id") == name]
+    own = {id(bsdf): shape for shape in shapes for bsdf in shape.iter("bsdf") if bsdf.get("type") == "translucent"}
     surfaces = [bsdf for shape in shapes for bsdf in shape.iter("bsdf") if bsdf.get("type") == "translucent"]
-    ids = {ref.get("id") for shape in shapes for ref in shape.iter("ref")}
+    ids = {ref.get("id"): shape for shape in shapes for ref in shape.iter("ref")}
     surfaces += [b for b in root.findall("bsdf") if b.get("type") == "translucent" and b.get("id") in ids]
     if len(surfaces) != 1:
         return None
-    surface = surfaces[0]
-    for child in [child for child in surface if child.get("name") in COEFFICIENTS]:
-        surface.remove(child)
-    for key in ("albedo", "sigma_t", "g"):
-        value = getattr(medium, key)
-        text = ", ".join(repr(float(v)) for v in (value if medium.n_channels else [value]))
-        ElementTree.SubElement(surface, "string", name=key, value=text)
-    if not any(child.get("name") == "eta" for child in surface):
-        ElementTree.SubElement(surface, "float", name="eta", value=repr(float(medium.eta)))
+    surface, medium = surfaces[0], found.medium
     for node in root.iter("string"):
         if node.get("name") == "filename" and "$" not in node.get("value", "$"):
             node.set("value", str((scene.parent / node.get("value")).resolve()))
+    if found.textures:
+        shape = own.get(id(surface), ids.get(surface.get("id")))
+        _paint(root, surface, shape, found, painted)
+    else:
+        _remove(surface, *COEFFICIENTS)
+        for key in ("albedo", "sigma_t", "g"):
+            _add_numbers(surface, key, getattr(medium, key) if medium.n_channels else [getattr(medium, key)])
+    if not any(child.get("name") == "eta" for child in surface):
+        ElementTree.SubElement(surface, "float", name="eta", value=repr(float(medium.eta)))
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="unicode") + "\n"
+
+
+def _add_numbers(surface: ElementTree.Element, key: str, values: Any) -> None:
+    ElementTree.SubElement(surface, "string", name=key, value=", ".join(repr(float(v)) for v in values))
+
+
+def _paint(
+    root: ElementTree.Element, surface: ElementTree.Element, shape: ElementTree.Element, found: MaterialFit,
+    files: dict[str, Path],
+) -> None:  # fmt: skip
+    """Put textures and the constants beside them into a scene: bitmaps by their files, attributes with their mesh."""
+    if {"sigma_t", "mfp"} & (found.values.keys() | found.textures.keys()):
+        _remove(surface, "scale")
+    for key, value in found.values.items():
+        other = {"mfp": "sigma_t", "sigma_t": "mfp"}.get(key, key)
+        named = key if any(child.get("name") == key for child in surface) else other
+        _remove(surface, named)
+        _add_numbers(surface, named, value if named == key else 1 / value)
+    for key in found.textures:
+        (texture,) = [child for child in surface if child.get("name") == key]
+        if texture.tag == "ref":
+            source = next(each for each in root.iter("texture") if each.get("id") == texture.get("id"))
+            surface.remove(texture)
+            texture = ElementTree.SubElement(surface, "texture", name=key, type=source.get("type"))
+            texture.extend(copy.deepcopy(child) for child in source)
+        _remove(texture, "scale")
+        if key in files:
+            _remove(texture, "filename", "raw")
+            ElementTree.SubElement(texture, "string", name="filename", value=str(files[key].resolve()))
+            ElementTree.SubElement(texture, "boolean", name="raw", value="true")
+    if "mesh" in files:  # in the space of the scene
+        _remove(shape, "filename", "to_world", "flip_normals")
+        shape.set("type", "ply")
+        ElementTree.SubElement(shape, "string", name="filename", value=str(files["mesh"].resolve()))
+
+
+def _remove(node: ElementTree.Element, *names: str) -> None:
+    for child in [child for child in node if child.get("name") in names]:
+        node.remove(child)

@@ -11,12 +11,19 @@ from typing import TYPE_CHECKING
 from halfspace_sss.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from halfspace_sss.inverse.fitting import FitSettings, MaterialFit, fit
+    from halfspace_sss.inverse.comparing import FitSettings, MaterialFit
+    from halfspace_sss.inverse.fitting import fit
     from halfspace_sss.inverse.views import GivenView, read_views
 
 __all__ = ["MaterialFit", "FitSettings", "GivenView", "fit", "read_views"]
 
 __getattr__, __dir__ = lazy_names(
     __name__,
-    {"MaterialFit": "fitting", "FitSettings": "fitting", "fit": "fitting", "GivenView": "views", "read_views": "views"},
+    {
+        "MaterialFit": "comparing",
+        "FitSettings": "comparing",
+        "fit": "fitting",
+        "GivenView": "views",
+        "read_views": "views",
+    },
 )

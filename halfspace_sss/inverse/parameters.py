@@ -36,6 +36,23 @@ def translucent_object(scene: mi.Scene, name: str | None) -> mi.Shape:
     return shapes[name]
 
 
+def check_names(names: Sequence[str], known: Sequence[str]) -> None:
+    """ValueError if names of parameters are none of those known, are there twice, or ask for sigma_t and mfp both."""
+    if not names or len(set(names)) < len(names):
+        raise ValueError(f"parameters must be one or more of {', '.join(known)}, each once, got {list(names)}")
+    for name in names:
+        check_choice("parameter", name, known)
+    if {"sigma_t", "mfp"} <= set(names):
+        raise ValueError("parameters must be sigma_t or mfp, got both")
+
+
+def size_bounds(shape: mi.Shape, mm_per_unit: float) -> tuple[float, float]:
+    """Bounds of sigma_t (1/mm): those at which the object is `SIZES` mean free paths large."""
+    box = shape.bbox()
+    extent = float(dr.norm(box.max - box.min)) * mm_per_unit
+    return SIZES[0] / extent, SIZES[1] / extent
+
+
 @dataclass(frozen=True, eq=False)
 class FitParameters:
     """What is fitted of one object.
@@ -43,12 +60,12 @@ class FitParameters:
     Args:
         names: of `NAMES`.
         shape: the object.
-        extent: its size, mm.
+        sizes: bounds of sigma_t, 1/mm.
     """
 
     names: tuple[str, ...]
     shape: mi.Shape
-    extent: float
+    sizes: tuple[float, float]
 
     @classmethod
     def of(cls, names: Sequence[str], shape: mi.Shape, mm_per_unit: float) -> FitParameters:
@@ -57,16 +74,10 @@ class FitParameters:
         Raises:
             ValueError: a name is unknown or there twice, sigma_t and mfp are both asked for, or the medium varies.
         """
-        if not names or len(set(names)) < len(names):
-            raise ValueError(f"parameters must be one or more of {', '.join(NAMES)}, each once, got {list(names)}")
-        for name in names:
-            check_choice("parameter", name, NAMES)
-        if {"sigma_t", "mfp"} <= set(names):
-            raise ValueError("parameters must be sigma_t or mfp, got both")
+        check_names(names, NAMES)
         if not shape.bsdf().inside.is_homogeneous:
             raise ValueError(f"the medium of {name_of(shape)} must be homogeneous to be fitted, got one that varies")
-        box = shape.bbox()
-        return cls(tuple(names), shape, float(dr.norm(box.max - box.min)) * mm_per_unit)
+        return cls(tuple(names), shape, size_bounds(shape, mm_per_unit))
 
     def start(self) -> dict[str, mi.Float | mi.Spectrum]:
         """The variables of the medium as it is, within the bounds."""
@@ -88,7 +99,7 @@ class FitParameters:
             return tuple(float(np.log(a / (1 - a))) for a in ALBEDO)
         if name == "g":
             return -3.0, 3.0
-        low, high = (float(np.log(size / self.extent)) for size in SIZES)
+        low, high = (float(np.log(size)) for size in self.sizes)
         return (low, high) if name == "sigma_t" else (-high, -low)
 
     def clipped(self, name: str, x: mi.Float | mi.Spectrum) -> mi.Float | mi.Spectrum:

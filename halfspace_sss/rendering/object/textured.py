@@ -270,7 +270,7 @@ def texels(texture: mi.Texture) -> np.ndarray:
     values = []
     for node in mi.traverse(texture).hierarchy:
         parameters = mi.traverse(node)
-        if _kind(node) == "BitmapTexture":
+        if kind_of(node) == "BitmapTexture":
             data = np.array(parameters["data"], dtype=float)
             values.append(data.reshape(-1, data.shape[-1]))
         elif "value" in parameters:  # of a constant
@@ -302,16 +302,17 @@ def attributes(name: str, texture: mi.Texture, shape: mi.Shape) -> np.ndarray:
 
 def shown(texture: mi.Texture) -> list[tuple[mi.Object, str]]:
     """The attributes of a mesh that a texture shows: the node that does, and the name of each."""
-    nodes = [node for node in mi.traverse(texture).hierarchy if _kind(node) == "MeshAttribute"]
+    nodes = [node for node in mi.traverse(texture).hierarchy if kind_of(node) == "MeshAttribute"]
     return [(node, re.search(r'name = "([^"]*)"', str(node)).group(1)) for node in nodes]
 
 
-def _kind(node: mi.Object) -> str:
+def kind_of(node: mi.Object) -> str:
+    """The class of a texture, without what Mitsuba appends to it."""
     return node.class_name().partition("Impl")[0]
 
 
 def _by_uv(texture: mi.Texture) -> bool:
-    return any(_kind(node) in BY_UV for node in mi.traverse(texture).hierarchy)
+    return any(kind_of(node) in BY_UV for node in mi.traverse(texture).hierarchy)
 
 
 def _mean(name: str, texture: mi.Texture, shape: mi.Shape | None) -> np.ndarray:
@@ -373,7 +374,7 @@ def textured_medium(values: dict[str, Any], g: Any, eta: float, channels: int) -
 
 def constant_texture(value: Any) -> Any:
     """A parameter as it is, but a texture without places by its value."""
-    if not isinstance(value, mi.Texture) or value.is_spatially_varying() or _kind(value) == "MeshAttribute":
+    if not isinstance(value, mi.Texture) or value.is_spatially_varying() or kind_of(value) == "MeshAttribute":
         return value
     result = np.ravel(np.array(value.eval(dr.zeros(mi.SurfaceInteraction3f, 1)), dtype=float))
     return result[0] if np.ptp(result) == 0 else result

@@ -37,7 +37,12 @@ class Picture:
 
     def exr(self, image: np.ndarray) -> bytes:
         """An image as it is."""
-        return _written(mi.Bitmap(np.ascontiguousarray(image, dtype=np.float32)), mi.Bitmap.FileFormat.OpenEXR)
+        return as_exr(image)
+
+
+def as_exr(image: np.ndarray) -> bytes:
+    """Numbers (H, W, channels) as they are."""
+    return _written(mi.Bitmap(np.ascontiguousarray(image, dtype=np.float32)), mi.Bitmap.FileFormat.OpenEXR)
 
 
 def as_png(image: np.ndarray) -> bytes:

@@ -1,0 +1,262 @@
+"""Renders of views against their images, and the state of a fit between its steps.
+
+With two renders I, I' of independent samples, an image T and weights w, the loss of a view is
+
+    mean w (I - T) (I' - T),
+
+in which noise has no bias (Deng et al. 2022 take the product of two renders too). Weights are 1, or
+1 / (T + a tenth of the mean of T)².
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import NamedTuple, Protocol
+
+import mitsuba as mi
+import numpy as np
+
+from halfspace_sss.checks import check_choice, check_count, check_interval
+from halfspace_sss.inverse.views import GivenView
+from halfspace_sss.noise_free import NoiseFree
+from halfspace_sss.physics.medium import Medium
+from halfspace_sss.progress import ProgressText
+from halfspace_sss.provenance import write_atomically
+
+LOSSES = ("relative", "l2")
+FLOOR = 0.1  # of the mean of an image, added to it in relative weights
+EXPOSURE = 10.0  # most, of a factor
+BATCH = 4
+PURPOSES = ("order", "first", "second", "slope", "other slope", "test", "other test")
+
+
+@dataclass(frozen=True)
+class FitSettings:
+    """How to fit.
+
+    Args:
+        steps: how many; 0 takes 30, or 200 where textures are fitted.
+        spp: samples a pixel of each render of a view: two images, and its slopes.
+        batch: views a step; 0 takes 4 or all, whichever is less.
+        loss: "relative" or "l2".
+        exposure: whether each image may have a factor of its own, of geometric mean 1.
+        seed: of all samples.
+        rate: of Adam, in the variables of textures and of constants beside them.
+        tv: weight of the total variation of textures in their variables.
+        levels: resolutions of a bitmap, each twice the one before, that are fitted in turn.
+    """
+
+    steps: int = 0
+    spp: int = 64
+    batch: int = 0
+    loss: str = "relative"
+    exposure: bool = False
+    seed: int = 0
+    rate: float = 0.2
+    tv: float = 1e-3
+    levels: int = 3
+
+    def __post_init__(self) -> None:
+        for name, least in (("steps", 0), ("spp", 1), ("batch", 0), ("seed", 0), ("levels", 1)):
+            check_count(name, getattr(self, name), least)
+        check_choice("loss", self.loss, LOSSES)
+        check_interval("rate", self.rate, 1e-6, 10.0)
+        check_interval("tv", self.tv, 0.0, 1e6)
+
+
+class FitStep(NamedTuple):
+    """Loss of the views of a step, its standard error by noise, and the parameters before it; of textures the means."""
+
+    loss: float
+    error: float
+    values: dict[str, list[float]]
+
+    def line(self) -> str:
+        """For the progress."""
+        numbers = "; ".join(f"{name} {' '.join(f'{v:.4g}' for v in value)}" for name, value in self.values.items())
+        return f"loss {self.loss:.3g} ± {self.error:.1g}  {numbers}"
+
+
+@dataclass(frozen=True)
+class MaterialFit:
+    """What was found.
+
+    Args:
+        values: of each parameter that is the same everywhere; sigma_t in 1/mm, mfp in mm.
+        errors: standard errors by H, the misfit, and the noise of the steps; none beside textures.
+        correlation: of all numbers in the order of `values`; empty beside textures.
+        medium: of the object; with textures their means.
+        misfit: root of the loss of all fitted views at the end.
+        held_out: likewise of views held out; None without any.
+        exposures: factor by which each view's image of the medium is multiplied to match the given one.
+        told: sentences about bounds and about what the images do not tell.
+        steps: the way there.
+        textures: of each parameter that has one, the texels (rows, columns, channels), or the attribute of each vertex
+            or face, shape (n, channels).
+    """
+
+    values: dict[str, np.ndarray]
+    errors: dict[str, np.ndarray]
+    correlation: np.ndarray
+    medium: Medium
+    misfit: NoiseFree
+    held_out: NoiseFree | None
+    exposures: list[float]
+    told: list[str]
+    steps: list[FitStep] = field(repr=False)
+    textures: dict[str, np.ndarray] = field(default_factory=dict, repr=False)
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """The views of a scene as it is now, against their images.
+
+    Args:
+        scene, views, settings: as of `fit`, checked.
+        weights: of each view, by pixel and channel.
+        exposures: factor of each view, changed in place.
+    """
+
+    scene: mi.Scene
+    views: list[GivenView]
+    settings: FitSettings
+    weights: list[np.ndarray] = field(init=False)
+    exposures: np.ndarray = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "weights", [_weights(view, self.settings.loss) for view in self.views])
+        object.__setattr__(self, "exposures", np.ones(len(self.views)))
+
+    @property
+    def fitted(self) -> list[int]:
+        """The views that are not held out."""
+        return [k for k, view in enumerate(self.views) if not view.held_out]
+
+    def batch(self, k: int) -> list[int]:
+        """The views of a step."""
+        n = min(self.settings.batch or BATCH, len(self.fitted))
+        return np.random.default_rng([self.settings.seed, k]).permutation(self.fitted)[:n].tolist()
+
+    def count(self, which: int) -> float:
+        """Numbers of a view that count."""
+        return max(float((self.weights[which] > 0).sum()), 1.0)
+
+    def seed(self, k: int, which: int, purpose: str, parameter: int = 0) -> int:
+        """Of the samples of a render in a step."""
+        words = [self.settings.seed, k, which, PURPOSES.index(purpose), parameter]
+        return int(np.random.SeedSequence(words).generate_state(1)[0])
+
+    def view(self, which: int, k: int) -> tuple[float, float, np.ndarray]:
+        """Loss of a view in a step, its variance by noise, and the mean residual of both renders."""
+        view, w = self.views[which], self.weights[which]
+        purposes = ("test", "other test") if view.held_out else ("first", "second")
+        pair = [self._image(view, self.seed(k, which, each)) for each in purposes]
+        if self.settings.exposure:
+            self._expose(which, pair)
+        e = self.exposures[which]
+        a, b = (e * image - view.image for image in pair)
+        n = self.count(which)
+        noise = np.square(a - b) / 2  # variance of each
+        variance = float((np.square(w) * (noise * (np.square(a) + np.square(b)) / 2)).sum()) / n**2
+        return float((w * a * b).sum() / n), variance, (a + b) / 2
+
+    def roots(self, k: int) -> tuple[NoiseFree, NoiseFree | None]:
+        """The root of the loss of all fitted views, and likewise of views held out; None without any."""
+        losses = [self.view(which, k)[:2] for which in range(len(self.views))]
+        held = [loss for loss, view in zip(losses, self.views) if view.held_out]
+        return _root([losses[which] for which in self.fitted]), _root(held) if held else None
+
+    def _image(self, view: GivenView, seed: int) -> np.ndarray:
+        image = mi.render(self.scene, sensor=view.sensor, seed=seed, spp=self.settings.spp)
+        return np.array(image, dtype=np.float64)[..., : view.image.shape[2]]
+
+    def _expose(self, which: int, pair: list[np.ndarray]) -> None:
+        """The factor of least squares; those of all fitted views have the geometric mean 1."""
+        counts, T = self.views[which].counts[..., None], self.views[which].image
+        found = (counts * T * (pair[0] + pair[1]) / 2).sum() / max((counts * pair[0] * pair[1]).sum(), 1e-30)
+        self.exposures[which] = np.clip(found, 1 / EXPOSURE, EXPOSURE)
+        self.exposures[self.fitted] /= np.exp(np.log(self.exposures[self.fitted]).mean())
+
+    def fingerprint(self, *start: object) -> str:
+        """Of the images, the settings and where a fit starts."""
+        views = [(v.sensor, v.held_out) for v in self.views]
+        digest = hashlib.sha256(json.dumps([asdict(self.settings), start, views]).encode())
+        for view in self.views:
+            digest.update(view.image.tobytes() + view.counts.tobytes())
+        return digest.hexdigest()
+
+
+def _weights(view: GivenView, loss: str) -> np.ndarray:
+    """Of each pixel and channel; 0 where it does not count."""
+    w = np.ones(view.image.shape) if loss == "l2" else None
+    if w is None:
+        T = np.maximum(view.image, 0)
+        w = 1 / np.square(T + FLOOR * max(float(T[view.counts].mean()) if view.counts.any() else 0.0, 1e-6))
+    return np.where(view.counts[..., None], w, 0.0)
+
+
+def _root(losses: Sequence[tuple[float, float]]) -> NoiseFree:
+    """The root of a mean loss, of losses and their variances."""
+    loss, variance = np.mean(losses, axis=0)
+    return NoiseFree(float(loss), float(np.sqrt(variance / len(losses))))
+
+
+class Descent(Protocol):
+    """Steps that bring a scene closer to images."""
+
+    comparison: Comparison
+    total: int
+    steps: list[FitStep]
+
+    def step(self, k: int) -> FitStep:
+        """Take step k."""
+
+    def state(self) -> dict[str, np.ndarray]:
+        """All that the next step depends on, but exposures and steps."""
+
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Go back to such a state."""
+
+    def fingerprint(self) -> str:
+        """Of what is fitted to what, how, and from where."""
+
+
+def descend(descent: Descent, work: Path | None, progress: ProgressText | None) -> None:
+    """Take all steps that are left, kept in the folder `work`, from which the same fit goes on.
+
+    Raises:
+        ValueError: `work` is that of another fit.
+    """
+    path, of = work and work / "state.npz", descent.fingerprint()
+    if path is not None and path.exists():
+        _load(path, of, descent)
+    while (k := len(descent.steps)) < descent.total:
+        descent.steps.append(descent.step(k))
+        if path is not None:
+            _save(path, of, descent)
+        if progress:
+            progress(k + 1, descent.total, descent.steps[-1].line())
+
+
+def _save(path: Path, of: str, descent: Descent) -> None:
+    arrays = {"of": np.array(of), "steps": np.array(json.dumps(descent.steps))}
+    file = io.BytesIO()
+    np.savez(file, **arrays, exposures=descent.comparison.exposures, **descent.state())
+    write_atomically(path, file.getvalue())
+
+
+def _load(path: Path, of: str, descent: Descent) -> None:
+    try:
+        arrays = dict(np.load(path, allow_pickle=False))
+    except (OSError, ValueError, EOFError) as error:
+        raise ValueError(f"{path} must be the state of a fit, got {error}") from error
+    if str(arrays["of"]) != of:
+        raise ValueError(f"work must be a new folder or that of the same fit, got another one in {path.parent}")
+    descent.comparison.exposures[:] = arrays.pop("exposures")
+    descent.steps = [FitStep(*row) for row in json.loads(str(arrays["steps"]))]
+    descent.restore(arrays)

@@ -1,0 +1,126 @@
+"""The fit of textures to images: a checkerboard found, what is refused and told, files, and going on after a kill."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+mi = pytest.importorskip("mitsuba")
+from halfspace_sss import inverse  # noqa: E402
+from halfspace_sss.cli import app as cli  # noqa: E402
+from halfspace_sss.inverse.views import GivenView, read_views  # noqa: E402
+from halfspace_sss.rendering.scenes.scene_files import open_scene  # noqa: E402
+
+pytestmark = pytest.mark.usefixtures("quiet_rgb")
+
+XML = """<scene version="3.0.0">
+  <integrator type="translucent_walk"><boolean name="hide_emitters" value="true"/></integrator>
+  <emitter type="directional"><vector name="direction" x="-0.2" y="0.3" z="-1"/></emitter>
+  <emitter type="constant"><float name="radiance" value="0.3"/></emitter>
+  <sensor type="perspective">
+    <float name="fov" value="9"/>
+    <transform name="to_world"><lookat origin="0,0,40" target="0,0,0" up="0,1,0"/></transform>
+    <film type="hdrfilm"><integer name="width" value="12"/><integer name="height" value="12"/>
+      <string name="pixel_format" value="rgb"/><rfilter type="box"/></film>
+  </sensor>
+  <shape type="SHAPE" id="plate">
+    <bsdf type="translucent">TEXTURE
+      <string name="sigma_t" value="3"/><float name="eta" value="1.3"/>
+    </bsdf>
+    MORE
+  </shape>
+</scene>
+"""
+BITMAP = """<texture type="bitmap" name="KEY"><string name="filename" value="FILE"/><boolean name="raw" value="true"/>
+</texture>"""
+ATTRIBUTE = '<texture type="mesh_attribute" name="KEY"><string name="name" value="vertex_color"/></texture>'
+PLATE = '<transform name="to_world"><scale x="3" y="3" z="1"/></transform>'
+
+
+def _bitmap(folder: Path, values: np.ndarray, key: str = "albedo") -> Path:
+    mi.Bitmap(np.ascontiguousarray(values, np.float32)).write(str(folder / "texels.exr"))
+    texture = BITMAP.replace("KEY", key).replace("FILE", "texels.exr")
+    path = folder / "a.xml"
+    path.write_text(XML.replace("SHAPE", "cube").replace("TEXTURE", texture).replace("MORE", PLATE))
+    return path
+
+
+def _mesh(folder: Path) -> Path:
+    cube = mi.load_dict({"type": "cube", "to_world": mi.ScalarTransform4f().scale([3, 3, 1])})
+    cube.add_attribute("vertex_color", 3, [0.8] * 3 * cube.vertex_count())
+    cube.write_ply(str(folder / "plate.ply"))
+    path, file = folder / "a.xml", '<string name="filename" value="plate.ply"/>'
+    texture = ATTRIBUTE.replace("KEY", "albedo")
+    path.write_text(XML.replace("SHAPE", "ply").replace("TEXTURE", texture).replace("MORE", file))
+    return path
+
+
+def _views(scene: Path, spp: int) -> list[GivenView]:
+    return [GivenView.of("a", 0, np.array(mi.render(open_scene(scene), spp=spp, seed=99)))]
+
+
+@pytest.mark.slow
+def test_a_checkerboard_is_found_from_its_image(tmp_path: Path) -> None:
+    i, j = np.indices((4, 4))
+    true = np.where(((i + j) % 2 == 0)[..., None], [0.95, 0.9, 0.6], [0.7, 0.8, 0.9])
+    views = _views(_bitmap(tmp_path, true), 2048)
+    settings = inverse.FitSettings(steps=50, spp=64, rate=0.3, tv=0, levels=2)
+    found = inverse.fit(_bitmap(tmp_path, np.full((4, 4, 3), 0.8)), views, ("albedo",), settings=settings)
+    error = found.textures["albedo"] - true
+    assert np.sqrt(np.square(error).mean()) < 0.03
+    assert np.abs(error).max() < 0.1
+    assert not found.told
+
+
+def test_textures_that_cannot_be_fitted_are_refused_by_name(tmp_path: Path) -> None:
+    view = [GivenView.of("a", 0, np.full((12, 12, 3), 0.5, np.float32))]
+
+    def refused(match: str, scene: Path, *names: str) -> None:
+        with pytest.raises(ValueError, match=match):
+            inverse.fit(scene, view, names)
+
+    path = _bitmap(tmp_path, np.full((4, 4, 3), 0.3), "reflectance")
+    path.write_text(path.read_text().replace("sigma_t", "mfp"))
+    refused("parameter must be one of reflectance, sigma_t, mfp, got 'albedo'", path, "albedo")
+    path = _bitmap(tmp_path, np.full((4, 4, 3), 0.3))
+    refused("sigma_t or mfp, got both", path, "albedo", "sigma_t", "mfp")
+    board = '<texture type="checkerboard" name="albedo"/>'
+    path.write_text(XML.replace("SHAPE", "cube").replace("TEXTURE", board).replace("MORE", PLATE))
+    refused("albedo of 'plate' must be a bitmap or mesh_attribute to be fitted, got a Checkerb", path, "albedo")
+
+
+@pytest.mark.parametrize("kind", ["bitmap", "mesh"])
+def test_a_killed_fit_of_textures_goes_on_with_the_same_bits_and_writes_a_scene(tmp_path: Path, kind: str) -> None:
+    path = _bitmap(tmp_path, np.full((4, 6, 3), 0.8)) if kind == "bitmap" else _mesh(tmp_path)
+    mi.Bitmap(np.array(mi.render(open_scene(path), spp=64, seed=9)) * 1.1).write(str(tmp_path / "b.exr"))
+    (tmp_path / "views.json").write_text(json.dumps({"views": [{"image": "b.exr"}]}))
+    arguments = ["fit", str(path), "--images", str(tmp_path / "views.json"), "--parameter", "albedo,sigma_t"]
+    arguments += ["--steps", "4", "--spp", "64", "--levels", "2"]
+    whole = CliRunner().invoke(cli.app, [*arguments, "--out", str(tmp_path / "whole")])
+    assert whole.exit_code == 0, whole.output
+
+    def kill(done: int, *_: Any) -> None:
+        if done == 3:
+            raise KeyboardInterrupt
+
+    how = {"settings": inverse.FitSettings(steps=4, spp=64, levels=2), "work": tmp_path / "work"}
+    with pytest.raises(KeyboardInterrupt):
+        inverse.fit(path, read_views(tmp_path / "views.json"), ("albedo", "sigma_t"), progress=kill, **how)
+    rest = CliRunner().invoke(cli.app, [*arguments, "--out", str(tmp_path / "rest"), "--work", str(tmp_path / "work")])
+    assert rest.exit_code == 0, rest.output
+    file = {"bitmap": "a_fit_albedo.exr", "mesh": "a_fit.ply"}[kind]
+    assert (tmp_path / "whole" / file).read_bytes() == (tmp_path / "rest" / file).read_bytes()
+    numbers = json.loads((tmp_path / "rest" / "a_fit.json").read_text())
+    surface = open_scene(tmp_path / "rest" / "a_fit.xml").shapes()[0].bsdf()
+    assert np.ravel(surface.sigma_t) == pytest.approx(numbers["values"]["sigma_t"], rel=1e-6)
+    albedo, _ = surface.inside.textured.values_on(open_scene(tmp_path / "rest" / "a_fit.xml").shapes()[0])
+    means = [row["values"]["albedo"] for row in numbers["steps"]]
+    assert means[0] == pytest.approx([0.8] * 3, rel=1e-5) and means[0] != means[-1]
+    assert np.abs(albedo - 0.8).max() > 0.01
+    if kind == "mesh":
+        assert "texels or vertices of albedo are seen by no view" in " ".join(whole.output.split())
