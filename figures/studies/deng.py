@@ -26,7 +26,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from figures.computing.photographs import Studio
+from figures.studies.photographs import Studio
 from halfspace_sss.progress import Progress
 
 MODEL, ORDERS = "standard_dipole_normalized", "multiple"

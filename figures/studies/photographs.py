@@ -1,22 +1,18 @@
 """Photographs of a modelled object for a fit: from all around, each under one distant light of its own.
 
-Walks, without what the boundary mirrors; no floor, no flame. Cameras lie above the horizon, lights anywhere: lobes
-cos^32 about their directions, as chance finds them.
+Cameras lie above the horizon, lights anywhere: lobes cos^32 about their directions, which chance finds.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from figures.computing.learnt import object_parts
 from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED, load_scene
 
-LAMPS = ("flame",)
 FAR, FOV = 5.0, 24.0  # distance of cameras over the radius of the object; degrees
 LEAST_HEIGHT = 0.05  # sine of the elevation of cameras
 POWER, LIGHT_ROWS = 32, 64  # of the lobe of a light, and of the map that has it
@@ -48,13 +44,6 @@ class Poses:
 def _unit(up: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
     side = np.sqrt(1 - up * up)
     return np.stack([side * np.cos(azimuth), up, side * np.sin(azimuth)], axis=1)
-
-
-def parts_without_lamps(name: str, resolution: int, folder: Path, seed: int) -> dict[str, Any]:
-    """The shapes of an object that give no light themselves; its boundary mirrors nothing."""
-    parts = {key: part for key, part in object_parts(name, resolution, folder, seed).items() if key not in LAMPS}
-    parts[name]["bsdf"] = {**parts[name]["bsdf"], "reflection": False}
-    return parts
 
 
 class Studio:
