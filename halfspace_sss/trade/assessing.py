@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 from halfspace_sss.backend import clock
@@ -33,7 +33,7 @@ from halfspace_sss.trade.statistics import (
 )
 from halfspace_sss.trade.ways import GATHERED, Stage, Way, stage, ways
 
-EXITS = 160  # few: their choice makes 6 % of a bias uncertain, and each gets the more samples
+EXITS = 480  # few: their choice makes 3 % of a bias uncertain, and each gets the more samples
 TRACED_SHARE = 0.4  # of the time, for the walks that all ways are compared with
 WALKED = 0.5  # of it, where delta lights are blurred: the rest tells what that is worth
 # Of the light that walks spread over 0.05 radians, what the blur is off by: from 0.2 to 0.4 radians that light changes
@@ -48,9 +48,9 @@ CANDIDATES = (
     *(f"{name}, {GATHERED}" for name in ("better_dipole", "neural", "full_geometry", "neural_shape")),
 )  # fmt: skip
 DEAR, DEAR_SECONDS = ("neural_shape",), 30.0  # to look at, which takes that long
-KEPT = 0.15  # of the variance of a part by all samples: measured, 0.12 and 0.16 on a bunny under an HDRI
 GATHERING = 2**20  # samples of a model whose time the gathering of its light takes at least
 LONGEST = 1.5  # times the seconds of an assessment that a gathering may take
+GATHERED_SHARE = 0.1  # most of the time for samples of gathered light, which has little noise
 CLOSE = 1.3  # times the cost of the cheapest way, up to which another may turn out cheaper
 TRACED = (0.3, 0.95)  # least and most of the time of the second look for walks
 
@@ -153,34 +153,75 @@ def assess_stage(
 
     With `samples` of each exit instead of seconds; `traced` is the share of the time for walks.
     """
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # they are heard when the ways are made ready again
-        for walks in (True, False):
-            warm_up(on, [way for way in chosen if (way.model == PATH_TRACED) == walks and way.light != GATHERED])
-    started = clock()
-    seen = visible_exits(on.scene, on.shapes, sensor, exits, seeded(seed, 41))
-    objects, compiled, compiling = [], 0.0, 0.0
-    for k, points in enumerate(seen):
-        if points is None:
-            objects.append(_unseen(on, k))
-            continue
+    look = _Look.of(on, chosen, sensor, exits, seed)
+    look.more(chosen, (seconds, samples, traced), seeded(seed, 42), progress)
+    return look.assessment(seed)
 
-        def tell(way: str, done: int, k: int = k) -> None:
-            if progress:
-                progress(f"{on.names[k]}, {way}", k * len(chosen) + done, len(seen) * len(chosen))
 
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            sampled = _object(on, k, points, chosen, (seconds, samples, traced), seeded(seed, 42, k), tell)
-            heard = [" ".join(str(w.message).split()) for w in caught]
-        (walks,) = sampled[chosen[0]]
-        rows = tuple(_row(on, k, way, item, walks) for way, item in sampled.items())
-        compiled += sum(row.compilation for row in rows)
-        compiling += sum(each.compiling for item in sampled.values() if isinstance(item, list) for each in item)
-        radiance = tuple(float(v) for v in walks.estimate.mean.mean(axis=1))
-        notes = tuple(dict.fromkeys(heard))
-        objects.append(ObjectTrade(on.names[k], _mfp(on, k), points.share, points.pixels, radiance, rows, notes))
-    return Assessment(tuple(objects), clock() - started - compiling, compiled, seed)
+@dataclass(eq=False)
+class _Look:
+    """What has been sampled of a scene.
+
+    Args:
+        on: the scene.
+        started: when, by `clock`.
+        points: of each object; None where it is hardly seen.
+        sampled: by each way, or why it refuses the object.
+        heard: warnings.
+    """
+
+    on: Stage
+    started: float
+    points: list[Exits | None]
+    sampled: list[dict[Way, list[Sampled] | str]]
+    heard: list[list[str]]
+
+    @classmethod
+    def of(cls, on: Stage, chosen: Sequence[Way], sensor: int, exits: int, seed: int) -> _Look:
+        """Nothing yet, at exits of all objects, with kernels ready for what ways have in common."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # they are heard when the ways are made ready again
+            for walks in (True, False):
+                warm_up(on, [way for way in chosen if (way.model == PATH_TRACED) == walks and way.light != GATHERED])
+        started = clock()
+        seen = visible_exits(on.scene, on.shapes, sensor, exits, seeded(seed, 41))
+        return cls(on, started, seen, [{} for _ in seen], [[] for _ in seen])
+
+    def more(
+        self,
+        chosen: Sequence[Way],
+        budget: tuple[float, int | None, float],
+        seed: int,
+        progress: NamedProgress | None,
+    ) -> None:
+        """Sample some ways, or go on with them, for so many seconds each object or so many samples each exit."""
+        for k, points in enumerate(self.points):
+
+            def tell(way: str, done: int, k: int = k) -> None:
+                if progress:
+                    progress(f"{self.on.names[k]}, {way}", k * len(chosen) + done, len(self.points) * len(chosen))
+
+            if points is not None:
+                with warnings.catch_warnings(record=True) as caught:
+                    warnings.simplefilter("always")
+                    _object(self.on, k, points, chosen, budget, seeded(seed, k), tell, self.sampled[k])
+                    self.heard[k] += [" ".join(str(w.message).split()) for w in caught]
+
+    def assessment(self, seed: int) -> Assessment:
+        """What all samples say."""
+        objects, compiled, compiling = [], 0.0, 0.0
+        for k, (points, sampled) in enumerate(zip(self.points, self.sampled)):
+            if points is None:
+                objects.append(_unseen(self.on, k))
+                continue
+            (walks,) = next(item for way, item in sampled.items() if way.model == PATH_TRACED)
+            rows = tuple(_row(self.on, k, way, item, walks) for way, item in sampled.items())
+            compiled += sum(row.compilation for row in rows)
+            compiling += sum(each.compiling for item in sampled.values() if isinstance(item, list) for each in item)
+            radiance = tuple(float(v) for v in walks.estimate.mean.mean(axis=1))
+            seen, notes = (points.share, points.pixels, radiance, rows), tuple(dict.fromkeys(self.heard[k]))
+            objects.append(ObjectTrade(self.on.names[k], _mfp(self.on, k), *seen, notes))
+        return Assessment(tuple(objects), clock() - self.started - compiling, compiled, seed)
 
 
 def _unseen(on: Stage, k: int) -> ObjectTrade:
@@ -203,36 +244,48 @@ def _object(
     budget: tuple[float, int | None, float],
     seed: int,
     tell: Any,
-) -> dict[Way, list[Sampled] | str]:
-    """What all ways say of an object, or why they refuse it."""
+    sampled: dict[Way, list[Sampled] | str],
+) -> None:
+    """What all ways say of an object, or why they refuse it; what is known of one is added to."""
     seconds, samples, traced = budget
-    sampled: dict[Way, list[Sampled] | str] = {}
     end = clock() + seconds
     gathered_first = sorted(chosen, key=lambda way: way.light != GATHERED)  # what is left of the time serves the others
+    sampled |= {way: [] for way in chosen if way not in sampled}
     for done, way in enumerate(gathered_first):
         tell(way.name, done)
         share = traced if way.model == PATH_TRACED and len(chosen) > 1 else 1 / (len(chosen) - done)
-        sampled[way] = []
+        share = min(share, GATHERED_SHARE) if way.light == GATHERED and not samples else share
         for half, part in enumerate(way.halves):
             started = clock()
             try:
                 number = seeded(seed, chosen.index(way), *([half] if half else []))
-                result = first_sample(on, part, points, number, k)
-                beside = result.compiling + (0.0 if half or way.light != GATHERED else result.preparing)
+                result, beside = _begun(on, part, points, number, k, sampled[way], half)
                 end, started = end + beside, started + beside
                 left = share / len(way.halves) * (end - started) - (clock() - started)
                 blurs = way.model == PATH_TRACED and on.blurs
                 left *= WALKED if blurs else 1.0
                 sample_more(on, part, points, result, number, seconds=left, samples=samples)
                 if blurs:
-                    result.blur = sample_blur(on, points, number, result.estimate.samples // 2)
-                sampled[way].append(result)
+                    more = sample_blur(on, points, number, result.estimate.samples // 2)
+                    result.blur = joined([result.blur, more]) if result.blur else more
             except (ValueError, RuntimeError) as error:
                 if way.model == PATH_TRACED:
                     raise ValueError(first_cause(error)) from error
                 sampled[way] = first_cause(error)
                 break
-    return {way: sampled[way] for way in chosen}
+
+
+def _begun(
+    on: Stage, way: Way, points: Exits, seed: int, k: int, sampled: list[Sampled], half: int
+) -> tuple[Sampled, float]:
+    """A way or half of one made ready and among those sampled, and seconds of that which no time is foreseen for."""
+    if half < len(sampled):
+        return sampled[half], 0.0
+    result = first_sample(on, way, points, seed, k)
+    if half:  # what the first part took longer to prepare was compilation
+        sampled[0].compiling += max(sampled[0].preparing - result.preparing, 0.0)
+    sampled.append(result)
+    return result, result.compiling + (0.0 if half or way.light != GATHERED else result.preparing)
 
 
 def _row(on: Stage, k: int, way: Way, sampled: list[Sampled] | str, traced: Sampled) -> WayTrade:
@@ -243,7 +296,7 @@ def _row(on: Stage, k: int, way: Way, sampled: list[Sampled] | str, traced: Samp
     exact = way.model == PATH_TRACED
     doubt, bias2 = _of_blur(traced.blur, b) if traced.blur else Number(0.0, 0.0), Number(0.0, 0.0)
     if not exact:
-        bias2 = mean_square(a, b) if len(parts) == 1 else mean_square_of_parts(parts, b, KEPT)
+        bias2 = mean_square(a, b) if len(parts) == 1 else mean_square_of_parts(parts, b, _kept(on, k, way))
     bias2 = Number(bias2.value + max(doubt.value, 0.0), math.hypot(bias2.error, doubt.error))
     ratios = [(1.0, 0.0) if exact else ratio_of_means(a, b, c) for c in range(len(b.mean))]
     variance = relative_variance(a, b)
@@ -252,6 +305,12 @@ def _row(on: Stage, k: int, way: Way, sampled: list[Sampled] | str, traced: Samp
         a.samples * a.mean.shape[1], last.preparation, sum(each.compilation for each in sampled), 0.0, last.memory,
     )  # fmt: skip
     return replace(row, training=training_seconds(on.scene, on.shapes[k].id(), way.model))
+
+
+def _kept(on: Stage, k: int, way: Way) -> float:
+    """Of the variance of parts of gathered light, the share that a render has."""
+    one, two = (on.integrator(half).gathering for half in way.halves)
+    return one.kept(two, k)
 
 
 def _of_blur(blurred: RadianceEstimate, b: RadianceEstimate) -> Number:
@@ -312,11 +371,12 @@ def assess_for(
     Ways that cannot be the cheapest for a job of `images` are left out by what the first look at others says; with
     None all are measured.
     """
-    how = {"sensor": sensor, "exits": exits, "progress": progress}
     dear = DEAR if seconds < DEAR_SECONDS else ()
     later = [way for way in chosen if images and (way.light == GATHERED or way.model in dear)]
     ahead = [way for way in chosen if way not in later]
-    first = assess_stage(on, ahead, seconds=FIRST_SHARE * seconds, seed=seed, **how)
+    look = _Look.of(on, ahead, sensor, exits, seed)
+    look.more(ahead, (FIRST_SHARE * seconds, None, TRACED_SHARE), seeded(seed, 42), progress)
+    first = look.assessment(seed)
     seen = [o for o in first.objects if o.ways and not o.is_dark]
     if not seen:
         return first
@@ -332,17 +392,17 @@ def assess_for(
     few = [way for way in ahead if way.name in names or way.model == PATH_TRACED] + wanted
     traced = sum(_traced_share(o, names) for o in seen) / len(seen)
     left = max(seconds - first.seconds / len(seen), LEAST_SHARE * seconds)
-    again = assess_stage(on, few, seconds=left, seed=seeded(seed, 71), traced=traced, **how)
+    look.more(few, (left, None, traced), seeded(seed, 71), progress)
+    again = look.assessment(seed)
     out = tuple(WayTrade(way.name, refusal=reasons[way][0]) for way in later if way not in wanted)
-    objects = tuple(_merged(a, b, out) for a, b in zip(first.objects, again.objects))
-    spent = (first.seconds + again.seconds, first.compilation + again.compilation)
-    return Assessment(objects, *spent, first.seed)
+    objects = tuple(replace(o, ways=(*o.ways, *out)) if o.ways else o for o in again.objects)
+    return replace(again, objects=objects)
 
 
 def _left_out(assessed: ObjectTrade, way: Way, tolerance: float, images: int, seconds: float) -> str:
     """Why a way is not worth a look for an object, after a look at others; empty where it is."""
     rows = [row for row in assessed.ways if not row.refusal and row.variance >= 0]
-    jobs = [samples_for(row, tolerance) * row.seconds * images * assessed.pixels + row.preparation for row in rows]
+    jobs = [samples_for(row, tolerance) * row.seconds * images * assessed.pixels + _once(row) for row in rows]
     best = min(jobs, default=math.inf)
     known = {row.way: row for row in assessed.ways}
     if way.model not in known:
@@ -352,7 +412,7 @@ def _left_out(assessed: ObjectTrade, way: Way, tolerance: float, images: int, se
         return row.refusal
     if row.bias2 - DOUBT * row.bias2_error > tolerance**2:
         return f"not measured, as {way.model} is {row.told_bias} % off, asked {100 * tolerance:.3g} %"
-    least = row.preparation + GATHERING * row.seconds
+    least = _once(row) + GATHERING * row.seconds
     if least > best:
         return f"not measured, as another way keeps {tolerance:.3g} in {best:.2g} s, before its light is gathered"
     parts = row.preparation + 2 * PART * GATHERING * row.seconds
@@ -362,13 +422,18 @@ def _left_out(assessed: ObjectTrade, way: Way, tolerance: float, images: int, se
 
 
 def _most_promising(seen: Sequence[ObjectTrade], ways: Sequence[Way]) -> Way:
-    """The way whose light is gathered fastest, of those whose model no other beats by more than the doubt in biases."""
+    """The way whose light is gathered first, of those whose model no other beats by more than the doubt in biases."""
     rows = {way: [row for o in seen for row in o.ways if row.way == way.model] for way in ways}
     bias2 = {way: sum(max(row.bias2, 0.0) for row in rows[way]) for way in ways}
     doubt = {way: DOUBT * math.hypot(*(row.bias2_error for row in rows[way])) for way in ways}
     least = min(bias2[way] + doubt[way] for way in ways)
     near = [way for way in ways if bias2[way] - doubt[way] <= least]
-    return min(near, key=lambda way: sum(row.seconds for row in rows[way]))
+    return min(near, key=lambda way: sum(_once(row) + GATHERING * row.seconds for row in rows[way]))
+
+
+def _once(row: WayTrade) -> float:
+    """Seconds before the first image."""
+    return row.preparation + row.training
 
 
 def contenders(assessed: ObjectTrade, tolerance: float) -> list[str]:
@@ -389,29 +454,3 @@ def _traced_share(assessed: ObjectTrade, names: set[str]) -> float:
     noise = [math.sqrt(r.variance * r.seconds) for r in assessed.ways if r.way in names and not r.refusal]
     walks = math.sqrt(len(noise) * assessed.traced.variance * assessed.traced.seconds)
     return min(max(walks / (walks + sum(noise)), TRACED[0]), TRACED[1]) if noise and walks > 0 else TRACED[1]
-
-
-def _merged(a: ObjectTrade, b: ObjectTrade, left_out: tuple[WayTrade, ...]) -> ObjectTrade:
-    """Both looks as one, which have exits and samples of their own, and the ways of the second alone."""
-    if not a.ways or not b.ways:
-        return a
-    known = {row.way for row in a.ways}
-    later = tuple(row for row in b.ways if row.way not in known)
-    second = {row.way: row for row in b.ways if not row.refusal}
-    walks = (a.traced, b.traced)
-    rows = [_mean(row, second[row.way], walks) if row.way in second and not row.refusal else row for row in a.ways]
-    return replace(a, ways=(*rows, *later, *left_out))
-
-
-def _mean(a: WayTrade, b: WayTrade, walks: tuple[WayTrade, WayTrade]) -> WayTrade:
-    """The mean of two rows, weighed by what noise their samples leave: errors grow with values, which they'd favour."""
-    V, V_walks = a.variance + b.variance, walks[0].variance + walks[1].variance
-    noise = [V / row.samples + V_walks / walk.samples for row, walk in zip((a, b), walks)]
-    u = noise[1] / (noise[0] + noise[1]) if sum(noise) > 0 else 0.5
-    ratio = tuple(u * x + (1 - u) * y for x, y in zip(a.ratio, b.ratio))
-    return replace(
-        a, bias2=u * a.bias2 + (1 - u) * b.bias2, bias2_error=math.hypot(u * a.bias2_error, (1 - u) * b.bias2_error),
-        ratio=ratio, ratio_error=tuple(math.hypot(u * x, (1 - u) * y) for x, y in zip(a.ratio_error, b.ratio_error)),
-        variance=0.5 * V, variance_error=0.5 * math.hypot(a.variance_error, b.variance_error),
-        seconds=min(a.seconds, b.seconds), samples=a.samples + b.samples, memory=max(a.memory, b.memory),
-    )  # fmt: skip

@@ -13,6 +13,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from halfspace_sss.rendering.gathered.transfer import R_2
+
 LAUNCH, LAUNCHES = 2**16, 16  # rays of a look at the scene, and the most looks for an object that is hardly seen
 FEWEST = 32  # exits of an object that is assessed
 CHAIN = 4  # boundaries that light of a lamp may meet without scattering, mirrored by all or passing through
@@ -78,9 +80,11 @@ def visible_exits(scene: Any, shapes: list[Any], sensor: int, n: int, seed: int)
 
 
 def _look(scene: Any, camera: Any, shapes: list[Any], seed: tuple[int, int]) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Random rays of a camera, (6, LAUNCH), and which of them meet each shape first."""
+    """Random rays of a camera, (6, LAUNCH), evenly over its film, and which of them meet each shape first."""
     rng = np.random.default_rng([*seed, 23])
-    u = [mi.Float(row) for row in rng.random((5, LAUNCH)).astype(np.float32)]
+    rows = rng.random((5, LAUNCH))
+    rows[1:3] = (rows[1:3, :1] + np.arange(LAUNCH) * np.array(R_2)[:, None]) % 1
+    u = [mi.Float(row) for row in np.minimum(rows, 1 - 2**-24).astype(np.float32)]
     ray, _ = camera.sample_ray_differential(camera.shutter_open(), u[0], mi.Point2f(*u[1:3]), mi.Point2f(*u[3:]))
     si = scene.ray_intersect(mi.Ray3f(ray), mi.RayFlags.All, coherent=False)
     plain = si.is_valid() & ~(_shows_lamp(scene, shapes, si, False) | _shows_lamp(scene, shapes, si, True))

@@ -10,8 +10,13 @@ from two independent parts a_1 and a_2
     bias² = Σ_k,c [(a_1 - b)(a_2 - b) - var b + kept (a_1 - a_2)² / 2] / (n C),  over (mean b)²,
 
 where `kept` is the share of the variance of a part that gathering with all samples has. Standard errors are those of
-the jackknife over exits. Variances of a sample are without the brightest of 10⁴ samples: fireflies, whose share of a
-variance no assessment can tell, and which images are rid of by filters rather than by samples.
+the jackknife over exits.
+
+The brightest of 10⁴ samples are fireflies, such as lamps that are mirrored after a walk: one of them may carry a
+hundredth of all light. Variances of a sample are without them, as no assessment can tell their share, and images are
+rid of them by filters rather than by samples. In biases they count as much as the next brightest sample, and what they
+carry beyond goes to all exits by their radiance: its mean is kept, where it belongs is not. The noise e of that mean,
+which all exits share, is taken from bias² like other noise and adds sqrt(2) e² and 2 e bias to its standard error.
 """
 
 from __future__ import annotations
@@ -78,11 +83,48 @@ class RadianceEstimate:
         """Of the mean."""
         return self.sample_variance / self.samples
 
+    @property
+    def steady(self) -> SteadyMean:
+        """The mean whose fireflies are shared by all exits."""
+        channels, n = self.first.shape
+        rest, mean, shared = RadianceEstimate(channels, n), np.empty((channels, n)), np.zeros(channels)
+        rest.add(self.first, self.second, self.samples)
+        for c, (values, exits) in enumerate(self.bright):
+            order = np.argsort(values)[::-1][: int(FIREFLIES * self.samples * n) + 1]
+            if len(order) > 1:
+                (values, exits), limit = (values[order[:-1]], exits[order[:-1]]), values[order[-1]]
+                np.subtract.at(rest.first[c], exits, values - limit)
+                np.subtract.at(rest.second[c], exits, values**2 - limit**2)
+                whole = max(self.first[c].sum(), 1e-300)
+                shared[c] = ((values - limit) ** 2).sum() / whole**2
+            mean[c] = rest.mean[c] * self.first[c].sum() / max(rest.first[c].sum(), 1e-300)
+        return SteadyMean(mean, rest.variance, shared)
+
+
+class SteadyMean(NamedTuple):
+    """Of exits, (channels, n), with the noise of each alone, and what all share, relative, (channels,)."""
+
+    mean: np.ndarray
+    variance: np.ndarray
+    shared: np.ndarray
+
+    @property
+    def noise(self) -> np.ndarray:
+        """Variance of the mean at each exit."""
+        return self.variance + self.shared[:, None] * self.mean**2
+
 
 def mean_square(a: RadianceEstimate, b: RadianceEstimate) -> Number:
     """Mean squared difference over the square of the mean radiance of b; may come out below 0 in noise."""
-    square = ((a.mean - b.mean) ** 2 - a.variance - b.variance).mean(axis=0)
-    return _ratio(square, b.mean.mean(axis=0), 2)
+    one, walks = a.steady, b.steady
+    square = ((one.mean - walks.mean) ** 2 - one.noise - walks.noise).mean(axis=0)
+    return _with_shared(_ratio(square, walks.mean.mean(axis=0), 2), one, walks)
+
+
+def _with_shared(found: Number, *noisy: SteadyMean) -> Number:
+    """With the error of noise that all exits share."""
+    e2 = sum(float(each.shared.mean()) for each in noisy)
+    return Number(found.value, float(np.sqrt(found.error**2 + 2 * e2**2 + 4 * max(found.value, 0.0) * e2)))
 
 
 def mean_square_of(difference: RadianceEstimate, b: RadianceEstimate) -> Number:
@@ -93,10 +135,10 @@ def mean_square_of(difference: RadianceEstimate, b: RadianceEstimate) -> Number:
 
 def mean_square_of_parts(parts: tuple[RadianceEstimate, RadianceEstimate], b: RadianceEstimate, kept: float) -> Number:
     """Mean squared difference of two independent parts over the square of the mean radiance of b."""
-    one, two = parts
-    left = (one.mean - b.mean) * (two.mean - b.mean) - b.variance
-    noise = 0.5 * ((one.mean - two.mean) ** 2 - one.variance - two.variance)
-    return _ratio((left + kept * noise).mean(axis=0), b.mean.mean(axis=0), 2)
+    one, two, walks = *(part.steady for part in parts), b.steady
+    left = (one.mean - walks.mean) * (two.mean - walks.mean) - walks.noise
+    noise = 0.5 * ((one.mean - two.mean) ** 2 - one.noise - two.noise)
+    return _with_shared(_ratio((left + kept * noise).mean(axis=0), walks.mean.mean(axis=0), 2), walks)
 
 
 def joined(parts: Sequence[RadianceEstimate]) -> RadianceEstimate:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from halfspace_sss.cli import trade
+from halfspace_sss.rendering.paths.gathering import PART, Gathering
 from halfspace_sss.trade import recommend
 from halfspace_sss.trade.advice import Job, advise
 from halfspace_sss.trade.assessing import _left_out, _most_promising, contenders
@@ -71,6 +73,40 @@ def test_fireflies_are_not_in_the_variance_of_a_sample() -> None:
     steady = relative_variance(found, found).value * found.mean.mean() ** 2
     assert steady == pytest.approx(0.36, rel=0.01)  # the standard error of 2e5 samples is 0.3 %
     assert found.sample_variance.mean() > 1000
+
+
+def test_fireflies_of_walks_put_neither_bias_nor_noise_into_a_square() -> None:
+    rng, found, naive, n = np.random.default_rng(8), [], [], 1250
+    for _ in range(SEEDS // 2):
+        values = rng.normal(0.98, 0.5, (1, EXITS, n))
+        values[rng.random(values.shape) < 5e-5] = 400.0  # half of the share that counts as fireflies, 2 % of the light
+        walks = RadianceEstimate(1, EXITS)
+        walks.add(values.sum(-1), (values**2).sum(-1), n)
+        walks.add_bright(values.reshape(1, -1), n)
+        model = _estimate(rng, np.ones((1, EXITS)), 0.02)
+        found.append(mean_square(model, walks))
+        naive.append(((model.mean - walks.mean) ** 2 - model.variance - walks.variance).mean())
+    values, errors = np.array(found).T
+    assert abs(values.mean()) < 4 * values.std() / math.sqrt(len(values))  # 4 standard errors
+    assert values.std() < 0.4 * np.std(naive)
+    assert 0.6 < errors.mean() / values.std() < 1.4
+
+
+def test_the_kept_noise_of_gathered_parts_is_half_that_of_light_and_an_eighth_of_that_of_the_transfer() -> None:
+    rng, T, L = np.random.default_rng(9), np.full((30, 400), 1 / 400), np.ones((400, 1))
+
+    def kept(of_transfer: float, of_light: float) -> float:
+        parts = [Gathering(1), Gathering(2)]
+        for part in parts:
+            transfer = T * rng.normal(1, of_transfer, T.shape) if of_transfer else T
+            light = L * rng.normal(1, of_light, L.shape) if of_light else L
+            part._found = [SimpleNamespace(gathered=SimpleNamespace(transfer=transfer, light=light))]
+        return parts[0].kept(parts[1], 0)
+
+    assert kept(0.0, 0.3) == pytest.approx(0.5)
+    assert kept(0.3, 0.0) == pytest.approx(PART)
+    assert PART < kept(0.3, 0.3) < 0.5
+    assert kept(0.0, 0.0) == 1.0
 
 
 @pytest.mark.parametrize(("bias2", "bias2_error", "error"), [(0.0, 0.0, 0.1), (4e-4, 3e-4, 0.3), (-1e-3, 5e-4, 2.0)])

@@ -48,12 +48,14 @@ class Gathered:
         transfer: of its model.
         values: B of all points, for each channel the constant and the slope over w_o.
         error: standard error of B by the gathering of light, over its mean.
+        light: that arrives.
     """
 
     object: TranslucentObject
     transfer: Transfer
     values: mi.Float
     error: float
+    light: Incident
 
     def radiance(self, out: SurfacePoint, active: mi.Bool) -> mi.Spectrum:
         """L_o of an exit; 0 below the horizon."""
@@ -122,6 +124,20 @@ class Gathering:
             self._light, self.seconds = state, (self.seconds[0], clock() - started)
         return self._found
 
+    def kept(self, other: Gathering, k: int) -> float:
+        """Of the variance of parts of an object's light, the share that gathering with all samples has.
+
+        Args:
+            other: another part of the same scene.
+            k: number of the object.
+        """
+        one, two = self._found[k].gathered, other._found[k].gathered
+        B = one.transfer @ one.light
+        by_light = ((B - one.transfer @ two.light) ** 2).mean()
+        by_transfer = ((B - two.transfer @ one.light) ** 2).mean()
+        whole = by_light + by_transfer
+        return float((0.5 * by_light + PART * by_transfer) / whole) if whole > 0 else 1.0
+
     def told(self) -> list[str]:
         """Of each object: points, memory, and the noise of transfer and light."""
         results = [obj.gathered for obj in self._found if obj.gathered is not None]
@@ -161,12 +177,13 @@ def _leaving(
 ) -> Gathered:
     """B of object k, in parts whose differences tell the noise."""
     lights = [_incident(scene, objects, T, settings, 2 * k + seed) for seed in seeds]
-    B, parts = T @ Incident.mean_of(lights), np.stack([T.by_place(light) for light in lights])
+    light = Incident.mean_of(lights)
+    B, parts = T @ light, np.stack([T.by_place(part) for part in lights])
     if not np.isfinite(B).all():
         raise ValueError(f"light at object {objects[k].geometry.name} must be finite, got NaN or infinity")
     spread = parts.var(axis=0, ddof=1).mean() if len(parts) > 1 else np.nan
     error = np.sqrt(spread / len(parts)) / max(float(B[..., 0].mean()), 1e-30)
-    return Gathered(objects[k], T, mi.Float(B.astype(np.float32).ravel()), float(error))
+    return Gathered(objects[k], T, mi.Float(B.astype(np.float32).ravel()), float(error), light)
 
 
 def _incident(

@@ -19,7 +19,7 @@ from halfspace_sss.trade.results import Assessment, ObjectTrade, WayTrade
 from halfspace_sss.trade.statistics import seeded
 from halfspace_sss.trade.ways import Stage, Way
 
-FORMAT = "halfspace-sss trade truth 1"
+FORMAT = "halfspace-sss trade truth 2"
 BATCH = 6.0  # seconds
 CLOSE = 0.2  # standard error of bias² over tolerance², which is a tenth of the tolerance for a bias as large
 CERTAIN = 3.0  # standard errors beyond the tolerance, after which a way is left
