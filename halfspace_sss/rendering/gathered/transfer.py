@@ -9,7 +9,7 @@ the proposals of the model, with directions at both ends, so that under the same
 unbiased estimate of what the model gives. Where the model knows its directional albedo there (`alpha`), the row is
 normalised by that.
 
-a(mu) = F_t(mu) (c_0 + c_1 mu + c_2 mu²) per channel is fitted to all samples.
+a(mu) = F_t(mu) (c_0 + c_1 mu + c_2 mu²) per channel is fitted to samples of all points.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 PER_LENGTH = 2.0  # points over a transport mean free path
 FEWEST, MOST = 1024, 8192  # points
 SAMPLES = 2**21  # entries of all points
+FITTED = 2**18
 SEED = 7
 SMOOTHINGS = 8  # of what directions bring
 R_2 = 0.7548776662466927, 0.5698402909980532
@@ -121,6 +122,11 @@ class Transfer:
         """Memory of all arrays of entries."""
         return sum(v.nbytes for v in (self.entry, self.t, self.w_i, self.d_o, self.middle, self.inverse))
 
+    @cached_property
+    def _even(self) -> tuple[np.ndarray, np.ndarray]:
+        """Of uniform light, what leaves (points, channels), and its sum over d_o, (points, channels, 3)."""
+        return np.maximum(self.t.sum(axis=1), 1e-30), self.t.transpose(0, 2, 1) @ self.d_o
+
     def by_place(self, L: Incident) -> np.ndarray:
         """What leaves by the means of the light at the places of entries, (points, channels)."""
         return np.einsum("jsc,jsc->jc", self.t, L.mean[self.entry])
@@ -131,14 +137,13 @@ class Transfer:
         What the directions w_i and w_o of single entries bring varies slowly over the surface, and was most of the
         noise: it is averaged over a wider neighbourhood than B is blended from.
         """
-        away = self.w_i - L.middle[self.entry]
-        arriving = L.mean[self.entry]
+        arriving = (L.mean - np.einsum("kci,ki->kc", L.slope, L.middle))[self.entry]
         for axis in range(3):
-            arriving += L.slope[self.entry, :, axis] * away[:, :, axis, None]
-        B = np.einsum("jsc,jsc->jc", self.t, arriving)
-        even = self.t.sum(axis=1)
-        left = self.t * (arriving - (B / np.maximum(even, 1e-30))[:, None])  # 0 in uniform light, where a(w_o) is all
-        slope = np.stack([np.einsum("jsc,js->jc", left, self.d_o[:, :, axis]) for axis in range(3)], axis=2)
+            arriving += L.slope[:, :, axis][self.entry] * self.w_i[:, :, axis, None]
+        arriving *= self.t
+        B = arriving.sum(axis=1)
+        slope = arriving.transpose(0, 2, 1) @ self.d_o
+        slope -= self._even[1] * (B / self._even[0])[:, :, None]  # 0 in uniform light, where a(w_o) is all
         slope = np.einsum("jck,jki->jci", slope, self.inverse)
         by_place = self.by_place(L)
         by_direction = np.concatenate([(B - by_place)[:, :, None], slope], axis=2)
@@ -174,7 +179,7 @@ class DrawnEntries(NamedTuple):
         near, known: the point that the entry is nearest to, and whether there is one.
         w_i, w_o: directions.
         a: directional albedo at the exit, per channel.
-        albedo: fitted to all.
+        albedo: fitted to them.
     """
 
     S: np.ndarray
@@ -240,8 +245,9 @@ def _trusted(obj: TranslucentObject) -> np.ndarray:
 
 
 def _fitted(obj: TranslucentObject, mu: np.ndarray, S: np.ndarray) -> Albedo:
-    """a(mu), by least squares over all samples."""
-    eta = float(obj.media[0].eta)
+    """a(mu), by least squares over samples, of which `FITTED` are enough."""
+    step = max(len(mu) // FITTED, 1)
+    mu, S, eta = mu[::step], S[::step], float(obj.media[0].eta)
     basis = F_t(mu.astype(float), eta)[:, None] * mu[:, None] ** np.arange(3)
     normal = basis.T @ basis + 1e-9 * len(mu) * np.eye(3)
     return Albedo(np.linalg.solve(normal, basis.T @ S.astype(float)).T, eta)

@@ -31,8 +31,8 @@ if TYPE_CHECKING:
     from halfspace_sss.rendering.object.points import SurfacePoint
     from halfspace_sss.rendering.object.settings import Settings
 
-DIRECTIONS = 2**20  # of all points of an object, by emitters, and as many by the cosine
-FEWEST, MOST = 64, 1024  # of a point
+DIRECTIONS = 2**19  # of all points of an object, by emitters, and as many by the cosine
+FEWEST, MOST = 32, 1024  # of a point
 PART = 1 / 8  # of the samples of a transfer
 SPREADINGS = 4  # of what other surfaces send,
 BRIGHTEST = 1 / 128  # of the points, which share it no matter how bright
