@@ -153,13 +153,13 @@ def assess_stage(
 
     With `samples` of each exit instead of seconds; `traced` is the share of the time for walks.
     """
-    look = _Look.of(on, chosen, sensor, exits, seed)
+    look = _Samples.of(on, chosen, sensor, exits, seed)
     look.more(chosen, (seconds, samples, traced), seeded(seed, 42), progress)
     return look.assessment(seed)
 
 
 @dataclass(eq=False)
-class _Look:
+class _Samples:
     """What has been sampled of a scene.
 
     Args:
@@ -177,7 +177,7 @@ class _Look:
     heard: list[list[str]]
 
     @classmethod
-    def of(cls, on: Stage, chosen: Sequence[Way], sensor: int, exits: int, seed: int) -> _Look:
+    def of(cls, on: Stage, chosen: Sequence[Way], sensor: int, exits: int, seed: int) -> _Samples:
         """Nothing yet, at exits of all objects, with kernels ready for what ways have in common."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # they are heard when the ways are made ready again
@@ -374,7 +374,7 @@ def assess_for(
     dear = DEAR if seconds < DEAR_SECONDS else ()
     later = [way for way in chosen if images and (way.light == GATHERED or way.model in dear)]
     ahead = [way for way in chosen if way not in later]
-    look = _Look.of(on, ahead, sensor, exits, seed)
+    look = _Samples.of(on, ahead, sensor, exits, seed)
     look.more(ahead, (FIRST_SHARE * seconds, None, TRACED_SHARE), seeded(seed, 42), progress)
     first = look.assessment(seed)
     seen = [o for o in first.objects if o.ways and not o.is_dark]
