@@ -1,6 +1,7 @@
 """Photographs of a modelled object for a fit: from all around, each under one distant light of its own.
 
-Cameras lie above the horizon, lights anywhere: lobes cos^32 about their directions, which chance finds.
+Cameras lie above the horizon, lights anywhere: wide lobes cos^4, which
+chance finds.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED, load_scene
 
 FAR, FOV = 5.0, 24.0  # distance of cameras over the radius of the object; degrees
 LEAST_HEIGHT = 0.05  # sine of the elevation of cameras
-POWER, LIGHT_ROWS = 32, 64  # of the lobe of a light, and of the map that has it
+POWER, LIGHT_ROWS = 4, 64  # of the lobe of a light, and of the map that has it
 
 
 @dataclass(frozen=True)

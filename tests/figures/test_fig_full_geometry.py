@@ -1,4 +1,4 @@
-"""Figures 1, 6, 9, 11 and Table 1 with `full_geometry`, in miniature: trained, rendered and drawn."""
+"""Figures 1, 6, 7, 9, 11 and Table 1 with `full_geometry`, in miniature: trained, rendered and drawn."""
 
 from __future__ import annotations
 
@@ -12,11 +12,12 @@ pytest.importorskip("mitsuba")
 pytest.importorskip("torch")
 pytest.importorskip("flip_evaluator")
 
-from figures import fig01, fig06, fig09, fig11, table1  # noqa: E402
+from figures import fig01, fig06, fig07, fig09, fig11, table1  # noqa: E402
 from figures.computing import learnt, scenes  # noqa: E402
 from figures.computing.contenders import OF_OBJECTS, VOLUMES  # noqa: E402
 from figures.parts import runner  # noqa: E402
 from figures.parts.part import Result, keys_of  # noqa: E402
+from figures.studies import distant_light  # noqa: E402
 from full_geometry.learning import training  # noqa: E402
 from full_geometry.learning.fitting import Recipe  # noqa: E402
 
@@ -29,6 +30,10 @@ SETTINGS = {
         "OBJECTS": ("candle", "croissant"), "MODELS": (MODEL,), "SIZES": {"draft": 12}, "RESOLUTION": {"draft": 24},
     },
     fig06: {"LIGHTS": ("sunset", "even sky"), "VIEWS": (0, 180), "SIZES": {"draft": 12}},
+    fig07: {
+        "OBJECTS": ("candle",), "SIZES": {"draft": 12}, "RESOLUTION": {"draft": 24}, "STEPS": {"draft": 2},
+        "PHOTOGRAPHS": {"draft": {"n": 2, "size": 8, "spp": 4}}, "STEP_SPP": {"draft": 1}, "BACKGROUND_SPP": 4,
+    },
     fig09: {
         "MATERIALS": ("ketchup",), "MODELS": (MODEL,), "SIZES": {"draft": 12}, "MODEL_SPP": {"draft": 4},
         "TRUTH_SPP": {"draft": 32},
@@ -49,6 +54,9 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(fig01.SPP, "draft", {"path_traced": 16, "model": 4})
     monkeypatch.setitem(fig06.SPP, "draft", {"path_traced": 16, MODEL: 4})
     monkeypatch.setattr(fig06, "MATERIAL", "ketchup")
+    monkeypatch.setitem(fig07.SPP, "draft", dict.fromkeys(fig07.SPP["draft"], 16))
+    monkeypatch.setattr(distant_light, "DIRECTIONS", 12)
+    monkeypatch.setattr(distant_light, "CHUNK", 2**10)
     monkeypatch.setitem(fig11.SECONDS, "draft", 0.1)
     monkeypatch.setitem(fig11.TRUTH_SPP, "draft", 32)
 
@@ -83,6 +91,17 @@ def test_fig_1_compares_objects_with_walks_where_they_cover_pixels(small: None, 
         found = results[f"{name}, full_geometry"].images
         assert 0.02 < (found["cover"] > 0.5).mean() < 0.9 and found["image"][found["cover"] > 0.5].mean() > 1e-3
     assert files["fig01.png"].startswith(b"\x89PNG")
+
+
+def test_fig_7_compares_both_rivals_and_ours_with_walks(small: None, tmp_path: Path) -> None:
+    results, files = drawn("fig07", tmp_path)
+    table = rows(files["fig07.csv"])
+    assert list(table["method"]) == [fig07.DENG, fig07.TG, "Ours, full geometry"]
+    assert table["FLIP"].between(0, 1).all() and (table["training, CPU s"] > 0).all()
+    mask = results["candle, path_traced"].images["cover"] > 0.5
+    for name in (fig07.DENG, fig07.TG):
+        assert results[f"candle, {name}"].images["image"][mask].mean() > 1e-3
+    assert files["fig07.png"].startswith(b"\x89PNG") and "Deng et al." in files["fig07.html"]
 
 
 def test_fig_6_renders_all_lights_and_views_by_one_training(small: None, tmp_path: Path) -> None:
@@ -124,7 +143,7 @@ def test_weights_of_another_training_are_not_found(small: None, tmp_path: Path) 
         load_scene(scene, MODEL)
 
 
-@pytest.mark.parametrize("module", [fig01, fig06, table1])
+@pytest.mark.parametrize("module", [fig01, fig06, fig07, table1])
 def test_parts_have_keys_and_more_work_in_paper_quality(module) -> None:
     draft, paper = (module.parts(quality) for quality in ("draft", "paper"))
     assert len(keys_of(draft)) == len(draft)
@@ -133,5 +152,5 @@ def test_parts_have_keys_and_more_work_in_paper_quality(module) -> None:
 
 def test_models_of_objects_are_among_the_columns() -> None:
     assert MODEL in OF_OBJECTS
-    for module in (fig01, fig06, fig09, fig11, table1):
+    for module in (fig01, fig06, fig07, fig09, fig11, table1):
         assert any(MODEL in part.name or MODEL in part.params.get("methods", ()) for part in module.parts("draft"))

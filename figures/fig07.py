@@ -1,0 +1,163 @@
+"""Fig. 7: mandarin, meat, candle and croissant, path traced, by Deng et al. 2022, TG et al. 2023 and ours; FLIP."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from figures.beyond.objects import VIEWS, View, scene
+from figures.computing.images import Shot, compared, stops_of
+from figures.computing.learnt import (
+    FULL_GEOMETRY,
+    TRAIN_SECONDS,
+    object_parts,
+    train_modelled,
+    training_of,
+)
+from figures.computing.scenes import environment_file, prepare
+from figures.drawing.image_grid import image_grid
+from figures.drawing.page import page
+from figures.drawing.style import paper, saved
+from figures.fig01 import LIGHT, RESOLUTION, TRUTH, shown
+from figures.modelling.objects import TISSUES
+from figures.parts.part import Part, Result, Task
+from halfspace_sss.provenance import check_folder
+
+TITLE = "mandarin, meat, candle and croissant, path traced, by two rivals and ours, with FLIP"
+OBJECTS = ("mandarin", "meat", "candle", "croissant")
+DENG, TG = "Deng et al. 2022", "TG et al. 2023"
+LABELS = {DENG: DENG, TG: TG, FULL_GEOMETRY: "Ours, full geometry"}
+SIZES = {"draft": 72, "paper": 448}
+SPP = {
+    "draft": {TRUTH: 256, FULL_GEOMETRY: 256, DENG: 256, TG: 4},
+    "paper": {TRUTH: 8192, FULL_GEOMETRY: 1024, DENG: 1024, TG: 16},
+}
+PHOTOGRAPHS = {"draft": {"n": 24, "size": 40, "spp": 160}, "paper": {"n": 100, "size": 256, "spp": 64}}
+STEPS, STEP_SPP = {"draft": 70, "paper": 10000}, {"draft": 16, "paper": 32}
+LAMPS = ("flame",)
+BACKGROUND_SPP = 64  # of what the network of distant light does not show
+NOTES = (
+    "Each method was given the object before, none these lights. Deng et al.: a dipole with an albedo of each vertex, "
+    "fitted to photographs under distant lights. TG et al.: a network for one distant light, environments as sums over "
+    "directions, the flame as its direction from the centre of the candle. FLIP and relative squared error of the "
+    "pixels of the object against our walk, the noise of all images included."
+)
+
+
+def parts(quality: str) -> list[Part]:
+    """For each object its training, then its image by walks, by both rivals and by ours."""
+    size, resolution, seconds, results = SIZES[quality], RESOLUTION[quality], TRAIN_SECONDS[quality], []
+    for name in OBJECTS:
+        results.append(train_modelled(name, resolution, seconds))
+        common = {"object": name, "size": size, "resolution": resolution, "seed": 0}
+        common["view"] = list(VIEWS[name]._replace(light=LIGHT))
+        inputs = (environment_file(LIGHT), TISSUES)
+        for method, spp in SPP[quality].items():
+            params, work, needs = {**common, "spp": spp, "model": method}, spp * size**2, ()
+            function = {DENG: deng, TG: distant}.get(method, shown)
+            if method == DENG:
+                params |= {"photographs": PHOTOGRAPHS[quality], "steps": STEPS[quality], "step spp": STEP_SPP[quality]}
+                work = STEPS[quality] * STEP_SPP[quality] * PHOTOGRAPHS[quality]["size"] ** 2
+            if method == TG:
+                params |= {"seconds": seconds}
+                work = seconds
+            if method == FULL_GEOMETRY:
+                needs = (training_of(name),)
+            results.append(Part(f"{name}, {method}", function, params, work, needs, inputs, f"{name} {method}"))
+    return results
+
+
+def _unlit(name: str, resolution: int, folder: Path, seed: int) -> dict[str, Any]:
+    """The shapes of an object that give no light themselves; its boundary mirrors nothing."""
+    parts = {key: part for key, part in object_parts(name, resolution, folder, seed).items() if key not in LAMPS}
+    parts[name]["bsdf"] = {**parts[name]["bsdf"], "reflection": False}
+    return parts
+
+
+def deng(task: Task) -> dict[str, Any]:
+    """An object as the fit of Deng et al. has found it from photographs."""
+    import mitsuba as mi
+
+    from figures.studies import deng as study
+    from figures.studies.photographs import Studio
+    from halfspace_sss.rendering.scenes.scene_files import load_scene
+
+    prepare()
+    p, name, folder = task.params, task.params["object"], check_folder(task.folder)
+    taken, began = p["photographs"], time.process_time()
+    parts = _unlit(name, p["resolution"], folder, p["seed"])
+    studio = Studio(parts, name, taken["size"], taken["n"], p["seed"])
+    images = studio.photographs(taken["spp"], p["seed"])
+    eta = float(parts[name]["bsdf"]["eta"])
+    start = study.painted(parts[name], folder / "start.ply", eta, reflection=False)
+    studio = Studio({**parts, name: start}, name, taken["size"], taken["n"], p["seed"], study.MODEL)
+    textures = study.fit(studio, images, steps=p["steps"], spp=p["step spp"], seed=p["seed"], progress=task.progress)
+    seconds = time.process_time() - began
+    made = object_parts(name, p["resolution"], folder, p["seed"])
+    made[name] = study.painted(made[name], folder / "found.ply", eta, textures)
+    description = {**scene(made, View(*p["view"]), p["size"]), "integrator": {"type": "bssrdf"}}
+    loaded = load_scene(description, study.MODEL)
+    image = np.array(mi.render(loaded, spp=p["spp"], seed=p["seed"] + 1))[..., :3]
+    about = {"cpu seconds": seconds, "kB": 2 * textures.albedo.size / 1000, "sigma_t": textures.sigma_t.tolist()}
+    return {"image": image.astype(np.float32), "spp": p["spp"], **about}
+
+
+def distant(task: Task) -> dict[str, Any]:
+    """An object as the network of TG et al. shows it, before what it mirrors and the rest of the scene."""
+    import mitsuba as mi
+
+    from figures.studies import distant_light as study
+    from halfspace_sss.rendering.object.objects import object_of
+    from halfspace_sss.rendering.scenes.scene_files import open_scene
+
+    prepare()
+    p, name, folder = task.params, task.params["object"], check_folder(task.folder)
+    parts, began = object_parts(name, p["resolution"], folder, p["seed"]), time.process_time()
+    alone = {"type": "scene", "integrator": {"type": "bssrdf"}, name: parts[name]}
+    obj = object_of(open_scene(alone, FULL_GEOMETRY), None, None, name)
+    net = study.fit_distant(obj, p["seconds"], p["seed"], progress=lambda _, done, total: task.progress(done, total))
+    seconds = time.process_time() - began
+    description = {**scene(parts, View(*p["view"]), p["size"]), "integrator": {"type": "path", "max_depth": 8}}
+    lamps = {key: description.pop(key) for key in LAMPS if key in description}
+    surroundings = {key: value for key, value in description.items() if key not in parts}
+    light = [study.incident(mi.load_dict(surroundings), net.centre, p["seed"])]
+    if lamps:
+        alone = {"type": "scene", "integrator": description["integrator"], **lamps}
+        light.append(study.lamp(mi.load_dict(alone), net.centre, p["seed"]))
+    directions, E = (np.concatenate(columns) for columns in zip(*light))
+    loaded = mi.load_dict({**description, **lamps})
+    image = study.image(loaded, name, net, directions, E, p["spp"], p["seed"])
+    image = image + np.array(mi.render(loaded, spp=BACKGROUND_SPP, seed=p["seed"]))[..., :3]
+    return {"image": image.astype(np.float32), "spp": p["spp"], "cpu seconds": seconds, "kB": net.kilobytes}
+
+
+def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
+    """The figure as PDF and PNG, the page to flip between the images, and the numbers as a table."""
+    import pandas
+
+    scenes = {name: _shots(results, name) for name in dict.fromkeys(key.split(", ")[0] for key in results)}
+    rows = [{"object": name, "method": s.label, **s.numbers} for name, shots in scenes.items() for s in shots[1:]]
+    with paper():
+        files: dict[str, bytes | str] = {f"fig07.{end}": data for end, data in saved(image_grid(scenes)).items()}
+    files["fig07.csv"] = pandas.DataFrame(rows).to_csv(index=False, lineterminator="\n")
+    files["fig07.html"] = page("Fig. 7: four objects by two rivals and ours", scenes, notes=NOTES)
+    return files
+
+
+def _shots(results: Mapping[str, Result], name: str) -> list[Shot]:
+    """The images of an object, exposed alike, with the CPU seconds of each training."""
+    truth = results[f"{name}, {TRUTH}"]
+    reference, mask = np.maximum(truth.images["image"], 0), truth.images["cover"] > 0.5
+    gain = np.float32(2.0 ** stops_of(reference, mask))
+    shots = [Shot("Path traced", gain * reference, {})]
+    for method, label in LABELS.items():
+        result = results[f"{name}, {method}"]
+        learnt = results[training_of(name)] if method == FULL_GEOMETRY else result
+        numbers = {"training, CPU s": learnt.numbers["cpu seconds"]}
+        image = gain * result.images["image"]
+        shots.append(compared(label, image, gain * reference, mask=mask, numbers=numbers))
+    return shots
