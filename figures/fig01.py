@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from figures.beyond.objects import VIEWS, View, scene
+from figures.beyond.objects import VIEWS, View, foot, scene
 from figures.computing.contenders import OF_OBJECTS
 from figures.computing.images import Shot, compared, cover, stops_of
 from figures.computing.learnt import (
@@ -72,7 +72,7 @@ def shown(task: Task) -> dict[str, Any]:
     prepare()
     p, name = task.params, task.params["object"]
     made = object_parts(name, p["resolution"], task.folder, p["seed"])
-    description = scene(made, View(*p["view"]), p["size"])
+    description = scene(made, View(*p["view"]), p["size"], foot(made[name]))
     alone = {key: description[key] for key in ("type", "sensor", name)}
     covered = cover(mi.load_dict({**alone, "integrator": {"type": "path"}}))
     if p["model"] != TRUTH:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from figures.beyond.objects import VIEWS, View, scene
+from figures.beyond.objects import VIEWS, View, foot, scene
 from figures.computing.images import Shot, compared, stops_of
 from figures.computing.learnt import (
     FULL_GEOMETRY,
@@ -36,12 +36,13 @@ SPP = {
     "draft": {TRUTH: 256, FULL_GEOMETRY: 256, DENG: 256, TG: 4},
     "paper": {TRUTH: 8192, FULL_GEOMETRY: 1024, DENG: 1024, TG: 16},
 }
-PHOTOGRAPHS = {"draft": {"n": 24, "size": 40, "spp": 160}, "paper": {"n": 100, "size": 256, "spp": 64}}
-STEPS, STEP_SPP = {"draft": 70, "paper": 10000}, {"draft": 16, "paper": 32}
+PHOTOGRAPHS = {"draft": {"n": 24, "size": 40, "spp": 96}, "paper": {"n": 100, "size": 256, "spp": 64}}
+STEPS, STEP_SPP = {"draft": 70, "paper": 10000}, {"draft": 32, "paper": 32}
+TEXELS = {"draft": 600, "paper": 262144}
 LAMPS = ("flame",)
 BACKGROUND_SPP = 64  # of what the network of distant light does not show
 NOTES = (
-    "Each method was given the object before, none these lights. Deng et al.: a dipole with an albedo of each vertex, "
+    "Each method was given the object before, none these lights. Deng et al.: a dipole with a texture of the albedo, "
     "fitted to photographs under distant lights. TG et al.: a network for one distant light, environments as sums over "
     "directions, the flame as its direction from the centre of the candle. FLIP and relative squared error of the "
     "pixels of the object against our walk, the noise of all images included."
@@ -61,6 +62,7 @@ def parts(quality: str) -> list[Part]:
             function = {DENG: deng, TG: distant}.get(method, shown)
             if method == DENG:
                 params |= {"photographs": PHOTOGRAPHS[quality], "steps": STEPS[quality], "step spp": STEP_SPP[quality]}
+                params |= {"texels": TEXELS[quality]}
                 work = STEPS[quality] * STEP_SPP[quality] * PHOTOGRAPHS[quality]["size"] ** 2
             if method == TG:
                 params |= {"seconds": seconds}
@@ -95,12 +97,14 @@ def deng(task: Task) -> dict[str, Any]:
     eta = float(parts[name]["bsdf"]["eta"])
     start = study.painted(parts[name], folder / "start.ply", eta, reflection=False)
     studio = Studio({**parts, name: start}, name, taken["size"], taken["n"], p["seed"], study.MODEL)
-    textures = study.fit(studio, images, steps=p["steps"], spp=p["step spp"], seed=p["seed"], progress=task.progress)
+    textures = study.fit(
+        studio, images, texels=p["texels"], steps=p["steps"], spp=p["step spp"], seed=p["seed"], progress=task.progress
+    )
     seconds = time.process_time() - began
     made = object_parts(name, p["resolution"], folder, p["seed"])
     made[name] = study.painted(made[name], folder / "found.ply", eta, textures)
-    description = {**scene(made, View(*p["view"]), p["size"]), "integrator": {"type": "bssrdf"}}
-    loaded = load_scene(description, study.MODEL)
+    description = scene(made, View(*p["view"]), p["size"], foot(made[name]))
+    loaded = load_scene({**description, "integrator": {"type": "bssrdf"}}, study.MODEL)
     image = np.array(mi.render(loaded, spp=p["spp"], seed=p["seed"] + 1))[..., :3]
     about = {"cpu seconds": seconds, "kB": 2 * textures.albedo.size / 1000, "sigma_t": textures.sigma_t.tolist()}
     return {"image": image.astype(np.float32), "spp": p["spp"], **about}
@@ -121,7 +125,8 @@ def distant(task: Task) -> dict[str, Any]:
     obj = object_of(open_scene(alone, FULL_GEOMETRY), None, None, name)
     net = study.fit_distant(obj, p["seconds"], p["seed"], progress=lambda _, done, total: task.progress(done, total))
     seconds = time.process_time() - began
-    description = {**scene(parts, View(*p["view"]), p["size"]), "integrator": {"type": "path", "max_depth": 8}}
+    description = scene(parts, View(*p["view"]), p["size"], foot(parts[name]))
+    description["integrator"] = {"type": "path", "max_depth": 8}
     lamps = {key: description.pop(key) for key in LAMPS if key in description}
     surroundings = {key: value for key, value in description.items() if key not in parts}
     light = [study.incident(mi.load_dict(surroundings), net.centre, p["seed"])]

@@ -91,6 +91,13 @@ def scene(shown: Mapping[str, Any], view: View, size: int, low: float = 0.0) -> 
     }
 
 
+def foot(part: Mapping[str, Any]) -> float:
+    """Height of the lowest point of a mesh in a file, mm; 0 if it is above."""
+    import mitsuba as mi
+
+    return min(0.0, float(mi.load_dict({"type": "ply", "filename": part["filename"]}).bbox().min[1]))
+
+
 def candle(task: Task) -> dict[str, Any]:
     """The candle by exact walks."""
     from halfspace_sss.rendering.scenes.scene_files import load_scene

@@ -8,10 +8,10 @@ coefficients reduced (g = 0), no single scattering. This is `standard_dipole_nor
 A = (1 + F_dr)/(1 - F_dr) is that of the published fit of F_dr = 2 C_1(eta): 0.2 % at most from eta 1.3 to 1.5.
 
 Loss: the product of the residuals of two renders, and 0.01 of the total variation of the albedo. Adam (0.9, 0.999),
-rates 0.05 of the albedo and of ln sigma_t, times 0.95 each 1000 steps, one photograph a step. The albedo is an
-attribute of vertices, sigma_t one value a channel. Left out: their fit of the roughness and of eta; the penalty of the
-range of sigma_t, which their code applies to its logarithm; and their sampling, for that of `bssrdf`. As they take
-10 000 steps, and drafts few, the rates fall to 0 by a cosine besides, without which noise stays in the albedo.
+rates 0.05 of the albedo and of ln sigma_t, times 0.95 each 1000 steps, one photograph a step. The albedo has
+texels of neighbouring vertices, sigma_t one value a channel. Left out: their fit of the roughness and of eta; the
+penalty of the range of sigma_t, which their code applies to its logarithm; and their sampling, for that of `bssrdf`. As
+they take 10 000 steps, and drafts few, the rates fall to 0 by a cosine besides.
 
 Source: Deng, Luan, Walter, Bala and Marschner: Reconstructing Translucent Objects Using Differentiable Rendering,
 SIGGRAPH 2022, and their code.
@@ -26,6 +26,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from scipy.spatial import cKDTree
 
 from figures.studies.photographs import Studio
 from halfspace_sss.progress import Progress
@@ -71,13 +72,15 @@ def painted(
 
 
 def fit(
-    studio: Studio, images: np.ndarray, *, steps: int, spp: int, seed: int = 0, progress: Progress | None = None
-) -> DengTextures:
+    studio: Studio, images: np.ndarray, *, texels: int, steps: int, spp: int, seed: int = 0,
+    progress: Progress | None = None,
+) -> DengTextures:  # fmt: skip
     """Textures of the object of a studio from its photographs.
 
     Args:
         studio: where they were taken, with the object as `painted` makes it.
         images: of all its poses (n, size, size, 3).
+        texels: of the albedo: so many vertices, each with those that are nearest to it; all of them if there are fewer.
         steps: of Adam.
         spp: samples a pixel of each of both renders.
         seed: of the order of photographs and of all samples.
@@ -85,16 +88,17 @@ def fit(
     parameters, of = studio.parameters, studio.shape.id()
     keys = {"albedo": f"{of}.{ALBEDO}", "log_sigma_t": f"{of}.bsdf.sigma_t"}
     first, second = (mi.UInt32(end) for end in _edges(studio.shape))
+    rng = np.random.default_rng([seed, 11])
+    texel = mi.UInt32((3 * _texels(studio.shape, texels, rng)[:, None] + np.arange(3)).ravel().astype(np.uint32))
     scale = 1 / float(images[images > 0].mean())
     optimiser = mi.ad.Adam(lr=RATE, beta_1=0.9, beta_2=0.999)
-    optimiser["albedo"] = mi.Float(parameters[keys["albedo"]])
+    optimiser["albedo"] = dr.full(mi.Float, START[0], 3 * min(texels, studio.shape.vertex_count()))
     optimiser["log_sigma_t"] = dr.log(mi.Spectrum(parameters[keys["log_sigma_t"]]))
-    rng = np.random.default_rng([seed, 11])
     for k in range(steps):
         optimiser.set_learning_rate(RATE * FALL ** (k / EACH) * (1 + np.cos(np.pi * k / steps)) / 2)
         which = int(rng.integers(len(images)))
         studio.set_up(which)
-        albedo = optimiser["albedo"]
+        albedo = dr.gather(mi.Float, optimiser["albedo"], texel)
         parameters[keys["albedo"]], parameters[keys["log_sigma_t"]] = albedo, dr.exp(optimiser["log_sigma_t"])
         parameters.update()
         seeds = np.random.SeedSequence([seed, k]).generate_state(2)
@@ -108,8 +112,14 @@ def fit(
         optimiser["log_sigma_t"] = dr.clip(optimiser["log_sigma_t"], *(float(np.log(v)) for v in (SMALLEST, LARGEST)))
         if progress is not None:
             progress(k + 1, steps)
-    albedo, log_sigma_t = (np.array(dr.detach(optimiser[key])) for key in keys)
-    return DengTextures(albedo.reshape(-1, 3), np.exp(np.ravel(log_sigma_t)))
+    albedo = np.array(dr.gather(mi.Float, dr.detach(optimiser["albedo"]), texel)).reshape(-1, 3)
+    return DengTextures(albedo, np.exp(np.ravel(np.array(dr.detach(optimiser["log_sigma_t"])))))
+
+
+def _texels(mesh: mi.Mesh, n: int, rng: np.random.Generator) -> np.ndarray:
+    """The number of the texel of each vertex."""
+    points = np.array(mi.traverse(mesh)["vertex_positions"]).reshape(-1, 3)
+    return cKDTree(points[rng.permutation(len(points))[:n]]).query(points)[1]
 
 
 def _edges(mesh: mi.Mesh) -> np.ndarray:

@@ -31,7 +31,7 @@ SETTINGS = {
     },
     fig06: {"LIGHTS": ("sunset", "even sky"), "VIEWS": (0, 180), "SIZES": {"draft": 12}},
     fig07: {
-        "OBJECTS": ("candle",), "SIZES": {"draft": 12}, "RESOLUTION": {"draft": 24}, "STEPS": {"draft": 2},
+        "OBJECTS": ("meat",), "SIZES": {"draft": 12}, "RESOLUTION": {"draft": 24}, "STEPS": {"draft": 2},
         "PHOTOGRAPHS": {"draft": {"n": 2, "size": 8, "spp": 4}}, "STEP_SPP": {"draft": 1}, "BACKGROUND_SPP": 4,
     },
     fig09: {
@@ -98,9 +98,9 @@ def test_fig_7_compares_both_rivals_and_ours_with_walks(small: None, tmp_path: P
     table = rows(files["fig07.csv"])
     assert list(table["method"]) == [fig07.DENG, fig07.TG, "Ours, full geometry"]
     assert table["FLIP"].between(0, 1).all() and (table["training, CPU s"] > 0).all()
-    mask = results["candle, path_traced"].images["cover"] > 0.5
+    mask = results["meat, path_traced"].images["cover"] > 0.5
     for name in (fig07.DENG, fig07.TG):
-        assert results[f"candle, {name}"].images["image"][mask].mean() > 1e-3
+        assert results[f"meat, {name}"].images["image"][mask].mean() > 1e-3
     assert files["fig07.png"].startswith(b"\x89PNG") and "Deng et al." in files["fig07.html"]
 
 
