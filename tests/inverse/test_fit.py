@@ -44,15 +44,18 @@ def _scene(tmp_path: Path) -> mi.Scene:
     return open_scene(tmp_path / "a.xml")
 
 
-def _target(scene: mi.Scene, spp: int = 4096) -> np.ndarray:
+def _put(scene: mi.Scene, values: dict) -> None:
     surface = scene.shapes()[0].bsdf()
-    before = {name: getattr(surface, name) for name in TRUE}
-    for values in (TRUE, {name: np.ravel(value) for name, value in before.items()}):
-        for name, value in values.items():
-            setattr(surface, name, mi.Spectrum(np.array(value).tolist()))
-        surface.parameters_changed(list(TRUE))
-        if values is TRUE:
-            image = np.array(mi.render(scene, spp=spp, seed=99))
+    for name, value in values.items():
+        setattr(surface, name, mi.Spectrum(np.ravel(value).tolist()))
+    surface.parameters_changed(list(values))
+
+
+def _target(scene: mi.Scene, spp: int = 4096) -> np.ndarray:
+    before = {name: np.array(getattr(scene.shapes()[0].bsdf(), name)) for name in TRUE}
+    _put(scene, TRUE)
+    image = np.array(mi.render(scene, spp=spp, seed=99))
+    _put(scene, before)
     return image
 
 
@@ -128,3 +131,24 @@ def test_a_killed_fit_goes_on_with_the_same_bits_and_the_command_writes_a_scene(
     medium = open_scene(tmp_path / "rest" / "a_fit.xml").shapes()[0].bsdf().inside.medium
     assert medium.albedo == pytest.approx(numbers[0]["values"]["albedo"])
     assert "[[material]]" in (tmp_path / "rest" / "a_fit.toml").read_text()
+
+
+@pytest.mark.slow
+def test_exposures_of_images_are_found_and_noise_at_most_doubles_the_error(tmp_path: Path) -> None:
+    start = XML.index("  <sensor")
+    end = XML.index("  <shape")
+    sensors = "".join(XML[start:end].replace("0,0,40", eye) for eye in ("0,0,40", "40,1,0"))
+    (tmp_path / "a.xml").write_text(XML[:start] + sensors + XML[end:])
+    scene = open_scene(tmp_path / "a.xml")
+    _put(scene, TRUE)
+    images = [np.array(mi.render(scene, sensor=k, spp=4096, seed=90 + k)) for k in range(2)]
+    rng, factors = np.random.default_rng(0), np.array([1.05, 1 / 1.05])
+    noisy = [e * image * (1 + 0.01 * rng.standard_normal(image.shape)) for e, image in zip(factors, images)]
+    errors = {}
+    for exposure, given in ((False, images), (True, noisy)):
+        settings = inverse.FitSettings(steps=16, spp=128, exposure=exposure)
+        views = [GivenView.of(f"view {k}", k, image) for k, image in enumerate(given)]
+        found = inverse.fit(open_scene(tmp_path / "a.xml"), views, ("albedo",), model=None, settings=settings)
+        errors[exposure] = np.sqrt(np.square(found.values["albedo"] - TRUE["albedo"]).mean())
+    assert errors[True] < 2 * errors[False]
+    assert found.exposures == pytest.approx(factors, abs=0.005)

@@ -121,6 +121,6 @@ def test_a_killed_fit_of_textures_goes_on_with_the_same_bits_and_writes_a_scene(
     albedo, _ = surface.inside.textured.values_on(open_scene(tmp_path / "rest" / "a_fit.xml").shapes()[0])
     means = [row["values"]["albedo"] for row in numbers["steps"]]
     assert means[0] == pytest.approx([0.8] * 3, rel=1e-5) and means[0] != means[-1]
-    assert np.abs(albedo - 0.8).max() > 0.01
+    assert (np.abs(albedo - 0.8) > 1e-3).any()
     if kind == "mesh":
         assert "texels or vertices of albedo are seen by no view" in " ".join(whole.output.split())
