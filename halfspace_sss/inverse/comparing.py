@@ -113,7 +113,7 @@ class MaterialFit:
 
 
 @dataclass(frozen=True, eq=False)
-class Comparison:
+class ViewComparison:
     """The views of a scene as it is now, against their images.
 
     Args:
@@ -206,10 +206,10 @@ def _root(losses: Sequence[tuple[float, float]]) -> NoiseFree:
     return NoiseFree(float(loss), float(np.sqrt(variance / len(losses))))
 
 
-class Descent(Protocol):
+class FitDescent(Protocol):
     """Steps that bring a scene closer to images."""
 
-    comparison: Comparison
+    comparison: ViewComparison
     total: int
     steps: list[FitStep]
 
@@ -226,7 +226,7 @@ class Descent(Protocol):
         """Of what is fitted to what, how, and from where."""
 
 
-def descend(descent: Descent, work: Path | None, progress: ProgressText | None) -> None:
+def descend(descent: FitDescent, work: Path | None, progress: ProgressText | None) -> None:
     """Take all steps that are left, kept in the folder `work`, from which the same fit goes on.
 
     Raises:
@@ -243,14 +243,14 @@ def descend(descent: Descent, work: Path | None, progress: ProgressText | None) 
             progress(k + 1, descent.total, descent.steps[-1].line())
 
 
-def _save(path: Path, of: str, descent: Descent) -> None:
+def _save(path: Path, of: str, descent: FitDescent) -> None:
     arrays = {"of": np.array(of), "steps": np.array(json.dumps(descent.steps))}
     file = io.BytesIO()
     np.savez(file, **arrays, exposures=descent.comparison.exposures, **descent.state())
     write_atomically(path, file.getvalue())
 
 
-def _load(path: Path, of: str, descent: Descent) -> None:
+def _load(path: Path, of: str, descent: FitDescent) -> None:
     try:
         arrays = dict(np.load(path, allow_pickle=False))
     except (OSError, ValueError, EOFError) as error:

@@ -18,7 +18,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from halfspace_sss.inverse.comparing import Comparison, FitSettings, FitStep, MaterialFit, descend
+from halfspace_sss.inverse.comparing import FitSettings, FitStep, MaterialFit, ViewComparison, descend
 from halfspace_sss.inverse.parameters import FitParameters, translucent_object
 from halfspace_sss.inverse.views import GivenView, check_views
 from halfspace_sss.progress import ProgressText
@@ -68,7 +68,7 @@ def fit(
     mm_per_unit = getattr(integrator, "mm_per_unit", None) or integrator.settings.mm_per_unit
     check_views(scene, images, shape)
     work = None if work is None else check_folder(work)
-    comparison, textured = Comparison(scene, list(images), settings), shape.bsdf().inside.textured is not None
+    comparison, textured = ViewComparison(scene, list(images), settings), shape.bsdf().inside.textured is not None
     if textured:
         from halfspace_sss.inverse.textures import TextureDescent, TextureParameters  # torch
 
@@ -87,7 +87,7 @@ class MediumDescent:
         parameters: what is fitted.
     """
 
-    def __init__(self, comparison: Comparison, parameters: FitParameters) -> None:
+    def __init__(self, comparison: ViewComparison, parameters: FitParameters) -> None:
         self.comparison, self.parameters = comparison, parameters
         self.total = comparison.settings.steps or STEPS
         self.steps: list[FitStep] = []

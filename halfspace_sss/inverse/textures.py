@@ -20,7 +20,7 @@ import mitsuba as mi
 import numpy as np
 import torch
 
-from halfspace_sss.inverse.comparing import Comparison, FitStep, MaterialFit
+from halfspace_sss.inverse.comparing import FitStep, MaterialFit, ViewComparison
 from halfspace_sss.inverse.parameters import ALBEDO, NEAR, G, check_names, size_bounds, translucent_object
 from halfspace_sss.rendering.object.shape import name_of
 from halfspace_sss.rendering.object.textured import TexturedMedium, kind_of, shown
@@ -208,7 +208,7 @@ class TextureDescent:
         parameters: what is fitted.
     """
 
-    def __init__(self, comparison: Comparison, parameters: TextureParameters) -> None:
+    def __init__(self, comparison: ViewComparison, parameters: TextureParameters) -> None:
         self.comparison, self.parameters = comparison, parameters
         self.total = comparison.settings.steps or STEPS
         self.steps: list[FitStep] = []

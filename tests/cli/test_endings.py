@@ -27,6 +27,7 @@ SMALL = {  # a small run of each command, and what it refuses
     "models": ([], ["extra"]),
     "render": (["ball.xml", "--spp", "4", "--out", "o"], ["none.xml"]),
     "study ablation": (["--samples", "2000", "--seeds", "1", "--out", "o"], ["marbel"]),
+    "study inversion": (["--size", "8", "--out", "o"], ["--size", "0"]),
     "study rivals": (["--scene", "ball.xml", "--out", "o"], ["--scene", "none.xml"]),
     "study shapes": (["--objects", "1", "--out", "o/shapes.md"], ["--objects", "-1"]),
     "study speeds": (["--object", "candle", "--out", "o"], ["--object", "marbel"]),
@@ -108,6 +109,7 @@ MOUNTS = {"full": "size=4k", "locked": "ro"}
 NO_FILES = ("materials", "models")
 LONG = (
     "fit",
+    "study inversion",
     "study rivals",
     "study shapes",
     "study speeds",
