@@ -38,7 +38,7 @@ SPP = {
 }
 PHOTOGRAPHS = {"draft": {"n": 24, "size": 40, "spp": 96}, "paper": {"n": 100, "size": 256, "spp": 64}}
 STEPS, STEP_SPP = {"draft": 70, "paper": 10000}, {"draft": 32, "paper": 32}
-TEXELS = {"draft": 600, "paper": 262144}
+TEXELS = {"draft": 1500, "paper": 262144}
 LAMPS = ("flame",)
 BACKGROUND_SPP = 64  # of what the network of distant light does not show
 NOTES = (

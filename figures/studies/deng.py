@@ -11,7 +11,8 @@ Loss: the product of the residuals of two renders, and 0.01 of the total variati
 rates 0.05 of the albedo and of ln sigma_t, times 0.95 each 1000 steps, one photograph a step. The albedo has
 texels of neighbouring vertices, sigma_t one value a channel. Left out: their fit of the roughness and of eta; the
 penalty of the range of sigma_t, which their code applies to its logarithm; and their sampling, for that of `bssrdf`. As
-they take 10 000 steps, and drafts few, the rates fall to 0 by a cosine besides.
+they take 10 000 steps, and drafts few, the rates fall to 0 by a cosine besides. The albedo moves by sqrt(1 - albedo):
+its own derivatives have no bound near 1, and one of them stops Adam there for a thousand steps.
 
 Source: Deng, Luan, Walter, Bala and Marschner: Reconstructing Translucent Objects Using Differentiable Rendering,
 SIGGRAPH 2022, and their code.
@@ -35,7 +36,7 @@ MODEL, ORDERS = "standard_dipole_normalized", "multiple"
 START = (0.95, 1.0)  # albedo and sigma_t, 1/mm
 RATE, FALL, EACH = 0.05, 0.95, 1000
 VARIATION = 0.01  # weight of the total variation
-BOUNDS = (0.01, 0.9999)  # of the albedo
+BOUNDS = (0.01, 0.995)  # of sqrt(1 - albedo)
 SMALLEST, LARGEST = 0.02, 50.0  # of sigma_t, 1/mm
 ALBEDO = "vertex_albedo"
 
@@ -92,13 +93,13 @@ def fit(
     texel = mi.UInt32((3 * _texels(studio.shape, texels, rng)[:, None] + np.arange(3)).ravel().astype(np.uint32))
     scale = 1 / float(images[images > 0].mean())
     optimiser = mi.ad.Adam(lr=RATE, beta_1=0.9, beta_2=0.999)
-    optimiser["albedo"] = dr.full(mi.Float, START[0], 3 * min(texels, studio.shape.vertex_count()))
+    optimiser["s"] = dr.full(mi.Float, np.sqrt(1 - START[0]), 3 * min(texels, studio.shape.vertex_count()))
     optimiser["log_sigma_t"] = dr.log(mi.Spectrum(parameters[keys["log_sigma_t"]]))
     for k in range(steps):
         optimiser.set_learning_rate(RATE * FALL ** (k / EACH) * (1 + np.cos(np.pi * k / steps)) / 2)
         which = int(rng.integers(len(images)))
         studio.set_up(which)
-        albedo = dr.gather(mi.Float, optimiser["albedo"], texel)
+        albedo = 1 - dr.square(dr.gather(mi.Float, optimiser["s"], texel))
         parameters[keys["albedo"]], parameters[keys["log_sigma_t"]] = albedo, dr.exp(optimiser["log_sigma_t"])
         parameters.update()
         seeds = np.random.SeedSequence([seed, k]).generate_state(2)
@@ -108,12 +109,12 @@ def fit(
         variation = dr.mean(dr.abs(dr.gather(mi.Float, albedo, first) - dr.gather(mi.Float, albedo, second)))
         dr.backward(dr.mean(dr.square(residual), axis=None) + VARIATION * variation)
         optimiser.step()
-        optimiser["albedo"] = dr.clip(optimiser["albedo"], *BOUNDS)
+        optimiser["s"] = dr.clip(optimiser["s"], *BOUNDS)
         optimiser["log_sigma_t"] = dr.clip(optimiser["log_sigma_t"], *(float(np.log(v)) for v in (SMALLEST, LARGEST)))
         if progress is not None:
             progress(k + 1, steps)
-    albedo = np.array(dr.gather(mi.Float, dr.detach(optimiser["albedo"]), texel)).reshape(-1, 3)
-    return DengTextures(albedo, np.exp(np.ravel(np.array(dr.detach(optimiser["log_sigma_t"])))))
+    s = np.array(dr.gather(mi.Float, dr.detach(optimiser["s"]), texel)).reshape(-1, 3)
+    return DengTextures(1 - s * s, np.exp(np.ravel(np.array(dr.detach(optimiser["log_sigma_t"])))))
 
 
 def _texels(mesh: mi.Mesh, n: int, rng: np.random.Generator) -> np.ndarray:
