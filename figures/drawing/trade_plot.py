@@ -236,6 +236,7 @@ across. The small light stands behind the object: what the camera sees of it was
 |---|---|
 | bias | relative error of radiance at any number of samples, noise of both sides subtracted, ± standard error |
 | points | root mean square over visible points and channels |
+| fireflies | the brightest of 10⁴ samples; in biases what they carry is spread over the object |
 | < x | bias lost in noise, below x in 95 % of cases |
 | cost | variance of a sample times its seconds: the time to a given noise |
 | seconds | of the processor, all cores together, without compilation |

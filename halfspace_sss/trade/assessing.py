@@ -6,6 +6,7 @@ import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from statistics import NormalDist
 from typing import Any
 
 from halfspace_sss.backend import clock
@@ -40,7 +41,7 @@ WALKED = 0.5  # of it, where delta lights are blurred: the rest tells what that 
 # by 0.06 +- 0.06 of itself, on a bunny of 2 to 5 mean free paths, where it is 12 % of all.
 BLUR_EFFECT = 0.1
 BLUR_SEEN = 0.04  # probability that a direction is in the cone of `sample_blur`
-FIRST_SHARE = 0.3  # of the time, for the look at all ways
+FIRST_SHARE = 0.45  # of the time, for the look at all ways
 LEAST_SHARE = 0.25  # of the time, for the second look, however long the first one took
 DOUBT = 2.0  # standard errors
 CANDIDATES = (
@@ -50,7 +51,7 @@ CANDIDATES = (
 DEAR, DEAR_SECONDS = ("neural_shape",), 30.0  # to look at, which takes that long
 GATHERING = 2**20  # samples of a model whose time the gathering of its light takes at least
 LONGEST = 1.5  # times the seconds of an assessment that a gathering may take
-GATHERED_SHARE = 0.1  # most of the time for samples of gathered light, which has little noise
+GATHERED_SHARE = 0.2  # most of the time for samples of gathered light: sqrt(V t) is a quarter of that of walks
 CLOSE = 1.3  # times the cost of the cheapest way, up to which another may turn out cheaper
 TRACED = (0.3, 0.95)  # least and most of the time of the second look for walks
 
@@ -384,7 +385,7 @@ def assess_for(
     reasons = {way: [_left_out(o, way, tolerance, images, seconds) for o in seen] for way in later}
     wanted = [way for way in later if "" in reasons[way]]
     if len(wanted) > 1:
-        best = _most_promising(seen, wanted)
+        best = _most_promising(seen, wanted, tolerance, images or 1)
         for way in wanted:
             reasons[way] = [f"not measured, as {best.name} promises more: ask for it by its name"]
         wanted = [best]
@@ -401,10 +402,7 @@ def assess_for(
 
 def _left_out(assessed: ObjectTrade, way: Way, tolerance: float, images: int, seconds: float) -> str:
     """Why a way is not worth a look for an object, after a look at others; empty where it is."""
-    rows = [row for row in assessed.ways if not row.refusal and row.variance >= 0]
-    jobs = [samples_for(row, tolerance) * row.seconds * images * assessed.pixels + _once(row) for row in rows]
-    best = min(jobs, default=math.inf)
-    known = {row.way: row for row in assessed.ways}
+    best, known = _cheapest(assessed, tolerance, images), {row.way: row for row in assessed.ways}
     if way.model not in known:
         return f"not measured in less than {DEAR_SECONDS:g} s: ask for it by its name"
     row = known[way.model]
@@ -421,14 +419,29 @@ def _left_out(assessed: ObjectTrade, way: Way, tolerance: float, images: int, se
     return ""
 
 
-def _most_promising(seen: Sequence[ObjectTrade], ways: Sequence[Way]) -> Way:
-    """The way whose light is gathered first, of those whose model no other beats by more than the doubt in biases."""
-    rows = {way: [row for o in seen for row in o.ways if row.way == way.model] for way in ways}
-    bias2 = {way: sum(max(row.bias2, 0.0) for row in rows[way]) for way in ways}
-    doubt = {way: DOUBT * math.hypot(*(row.bias2_error for row in rows[way])) for way in ways}
-    least = min(bias2[way] + doubt[way] for way in ways)
-    near = [way for way in ways if bias2[way] - doubt[way] <= least]
-    return min(near, key=lambda way: sum(_once(row) + GATHERING * row.seconds for row in rows[way]))
+def _most_promising(seen: Sequence[ObjectTrade], ways: Sequence[Way], tolerance: float, images: int) -> Way:
+    """The way by which the job is expected to end first.
+
+    It keeps the tolerance by the chance that its model does, and takes what gathering takes then, else what the
+    cheapest of the other ways does.
+    """
+
+    def expected(way: Way) -> float:
+        total = 0.0
+        for o in seen:
+            row = o.way(way.model)
+            chance = NormalDist().cdf((tolerance**2 - max(row.bias2, 0.0)) / max(row.bias2_error, 1e-30))
+            total += chance * (_once(row) + GATHERING * row.seconds) + (1 - chance) * _cheapest(o, tolerance, images)
+        return total
+
+    return min(ways, key=expected)
+
+
+def _cheapest(assessed: ObjectTrade, tolerance: float, images: int) -> float:
+    """Seconds of a job by the ways that have been measured."""
+    rows = [row for row in assessed.ways if not row.refusal and row.variance >= 0]
+    jobs = [samples_for(row, tolerance) * row.seconds * images * assessed.pixels + _once(row) for row in rows]
+    return min(jobs, default=math.inf)
 
 
 def _once(row: WayTrade) -> float:

@@ -22,7 +22,7 @@ from halfspace_sss.trade.statistics import RadianceEstimate, seeded
 from halfspace_sss.trade.ways import Stage, Way
 
 LANES = 2**18  # of a launch
-PILOT, FEWEST = 24, 8  # samples of each exit by which the time is foreseen, and of a launch that is worth it
+PILOT, FEWEST = 48, 8  # samples of each exit by which the time is foreseen, and of a launch that is worth it
 LEAST_SHARE = 0.2  # of the time of a launch that its samples take
 BLUR = 8.0  # 0.4 radians
 

@@ -71,10 +71,10 @@ class RadianceEstimate:
         """Of one sample, without fireflies."""
         channels, n = self.first.shape
         first, second, samples = self.first.copy(), self.second.copy(), np.full((channels, n), float(self.samples))
-        for c, (values, exits) in enumerate(self.bright):
-            out = np.argsort(values)[len(values) - int(FIREFLIES * self.samples * n) :]
-            for table, lost in ((first, values[out]), (second, values[out] ** 2), (samples, 1.0)):
-                np.subtract.at(table[c], exits[out], lost)
+        for c in range(channels):
+            values, exits, _ = self._fireflies(c)
+            for table, lost in ((first, values), (second, values**2), (samples, 1.0)):
+                np.subtract.at(table[c], exits, lost)
         samples = np.maximum(samples, 2)
         return np.maximum(second / samples - (first / samples) ** 2, 0) * (samples / (samples - 1))
 
@@ -83,20 +83,33 @@ class RadianceEstimate:
         """Of the mean."""
         return self.sample_variance / self.samples
 
+    def _fireflies(self, channel: int) -> tuple[np.ndarray, np.ndarray, float]:
+        """The brightest samples of a channel, the exits that they are of, and the next brightest sample."""
+        values, exits = self.bright[channel]
+        order = np.argsort(values)[::-1][: int(FIREFLIES * self.samples * self.first.shape[1]) + 1]
+        if len(order) < 2:
+            return values[:0], exits[:0], 0.0
+        return values[order[:-1]], exits[order[:-1]], float(values[order[-1]])
+
+    @property
+    def doubt(self) -> float:
+        """Standard error of the mean of `steady_variance`, as which samples are left out is chance: each counts as
+        the square of the next brightest."""
+        channels, n = self.first.shape
+        squares = [limit**2 for _, _, limit in map(self._fireflies, range(channels))]
+        return float(np.mean(squares) * np.sqrt(FIREFLIES / max(self.samples * n, 1)))
+
     @property
     def steady(self) -> SteadyMean:
         """The mean whose fireflies are shared by all exits."""
         channels, n = self.first.shape
         rest, mean, shared = RadianceEstimate(channels, n), np.empty((channels, n)), np.zeros(channels)
         rest.add(self.first, self.second, self.samples)
-        for c, (values, exits) in enumerate(self.bright):
-            order = np.argsort(values)[::-1][: int(FIREFLIES * self.samples * n) + 1]
-            if len(order) > 1:
-                (values, exits), limit = (values[order[:-1]], exits[order[:-1]]), values[order[-1]]
-                np.subtract.at(rest.first[c], exits, values - limit)
-                np.subtract.at(rest.second[c], exits, values**2 - limit**2)
-                whole = max(self.first[c].sum(), 1e-300)
-                shared[c] = ((values - limit) ** 2).sum() / whole**2
+        for c in range(channels):
+            values, exits, limit = self._fireflies(c)
+            np.subtract.at(rest.first[c], exits, values - limit)
+            np.subtract.at(rest.second[c], exits, values**2 - limit**2)
+            shared[c] = (((values - limit) / max(self.first[c].sum(), 1e-300)) ** 2).sum()
             mean[c] = rest.mean[c] * self.first[c].sum() / max(rest.first[c].sum(), 1e-300)
         return SteadyMean(mean, rest.variance, shared)
 
@@ -152,7 +165,8 @@ def joined(parts: Sequence[RadianceEstimate]) -> RadianceEstimate:
 
 def relative_variance(a: RadianceEstimate, b: RadianceEstimate) -> Number:
     """Variance of one sample of a, mean over exits and channels, over the square of the mean radiance of b."""
-    return _ratio(a.steady_variance.mean(axis=0), b.mean.mean(axis=0), 2)
+    value, error = _ratio(a.steady_variance.mean(axis=0), b.mean.mean(axis=0), 2)
+    return Number(value, float(np.hypot(error, a.doubt / b.mean.mean() ** 2)) if np.isfinite(error) else error)
 
 
 def ratio_of_means(a: RadianceEstimate, b: RadianceEstimate, channel: int) -> Number:

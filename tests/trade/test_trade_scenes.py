@@ -14,7 +14,7 @@ from halfspace_sss import Medium
 from halfspace_sss.cli import app as cli
 from halfspace_sss.physics.fresnel import F_r
 from halfspace_sss.rendering.object.registry import model_names
-from halfspace_sss.trade import assess, recommend
+from halfspace_sss.trade import assess, assessing, recommend
 from halfspace_sss.trade.checking.random_scenes import random_scene, write_scene
 from halfspace_sss.trade.exits import visible_exits
 from halfspace_sss.trade.images import small_images
@@ -141,6 +141,25 @@ def test_an_instance_is_refused_in_a_sentence() -> None:
     instanced = {**scene(), "group": group, "one": {"type": "instance", "g": {"type": "ref", "id": "group"}}}
     with pytest.raises(ValueError, match="a translucent object must stand in the scene itself"):
         assess(instanced, models=FEW, **QUICK)
+
+
+def test_the_second_look_goes_on_with_the_samples_of_the_first_and_gathers_light(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    known: list[tuple[Way, int]] = []
+
+    def noted(on: Any, way: Way, points: Any, sampled: Any, *args: Any, **more: Any) -> None:
+        known.append((way, sampled.estimate.samples))
+        sample_more(on, way, points, sampled, *args, **more)
+
+    monkeypatch.setattr(assessing, "sample_more", noted)
+    asked = ["better_dipole", "better_dipole, gathered"]
+    found = assess(scene(orders="multiple"), models=asked, tolerance=0.05, **QUICK).objects[0]
+    walks = [samples for way, samples in known if way == Way("path_traced")]
+    assert len(walks) == 2 and walks[0] < walks[1] and found.traced.samples > 64 * walks[1]
+    sampled, gathered = (found.way(name) for name in asked)
+    error = np.hypot(sampled.ratio_error, gathered.ratio_error)
+    assert np.all(np.abs(np.subtract(sampled.ratio, gathered.ratio)) < 4 * error + 0.03)
 
 
 def test_a_point_through_which_a_lamp_would_be_seen_is_left_out() -> None:

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 DIRECTIONS = 2**19  # of all points of an object, by emitters, and as many by the cosine
 FEWEST, MOST = 32, 1024  # of a point
-PART = 1 / 8  # of the samples of a transfer
+PART = 1 / 16  # of the samples of a transfer
 SPREADINGS = 4  # of what other surfaces send,
 BRIGHTEST = 1 / 128  # of the points, which share it no matter how bright
 TRACED = 8  # one of so many directions by the cosine is traced further, where it meets a surface
