@@ -180,6 +180,7 @@ class MediumDescent:
             dr.enable_grad(x[name])
             dr.set_grad(x[name], 1.0)
             self.parameters.put(x)
+            dr.forward_from(x[name], dr.ADFlag.ClearEdges)  # models begin at the coefficients
             seed, scene = compared.seed(k, which, purpose, j), compared.scene
             found = scene.integrator().render_forward(scene, None, view.sensor, seed, spp)
             d = compared.exposures[which] * np.array(found, dtype=np.float64)[..., : view.image.shape[2]]

@@ -152,3 +152,14 @@ def test_exposures_of_images_are_found_and_noise_at_most_doubles_the_error(tmp_p
         errors[exposure] = np.sqrt(np.square(found.values["albedo"] - TRUE["albedo"]).mean())
     assert errors[True] < 2 * errors[False]
     assert found.exposures == pytest.approx(factors, abs=0.005)
+
+
+@pytest.mark.slow
+def test_a_model_of_the_half_space_is_fitted_to_its_own_image(tmp_path: Path) -> None:
+    (tmp_path / "a.xml").write_text(XML.replace('name="eta" value="1"', 'name="eta" value="1.3"'))
+    scene = open_scene(tmp_path / "a.xml", "better_dipole")
+    views = [GivenView.of("a", 0, _target(scene, 1024))]
+    settings = inverse.FitSettings(steps=5, spp=64)
+    _put(scene, {"sigma_t": TRUE["sigma_t"]})
+    found = inverse.fit(scene, views, ("albedo",), model=None, settings=settings)
+    assert found.values["albedo"] == pytest.approx(TRUE["albedo"], abs=0.02)

@@ -69,7 +69,7 @@ def test_a_checkerboard_is_found_from_its_image(tmp_path: Path) -> None:
     i, j = np.indices((4, 4))
     true = np.where(((i + j) % 2 == 0)[..., None], [0.95, 0.9, 0.6], [0.7, 0.8, 0.9])
     views = _views(_bitmap(tmp_path, true), 2048)
-    settings = inverse.FitSettings(steps=50, spp=64, rate=0.3, tv=0, levels=2)
+    settings = inverse.FitSettings(steps=30, spp=128, rate=0.4, tv=0, levels=2)
     found = inverse.fit(_bitmap(tmp_path, np.full((4, 4, 3), 0.8)), views, ("albedo",), settings=settings)
     error = found.textures["albedo"] - true
     assert np.sqrt(np.square(error).mean()) < 0.03
