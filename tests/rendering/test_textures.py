@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from test_translucent_walk import WIDEST_Z_OF_RUNS, _lamp, _runs, _scene, _small_lamp, _z
 
 from halfspace_sss import Medium
+from halfspace_sss.neural import material_model, paper_model, store
 from halfspace_sss.rendering.object.objects import make_objects
 from halfspace_sss.rendering.object.points import SurfacePoint
 from halfspace_sss.rendering.object.settings import Settings
@@ -65,6 +67,7 @@ def test_a_white_texture_without_absorption_is_invisible_in_uniform_light() -> N
 
 TAKING = [
     *("standard_dipole", "better_dipole", "directional_dipole", "normalized_diffusion", "lambert"),
+    pytest.param("forward_scattering_dipole", marks=pytest.mark.slow),
     pytest.param("photon_beam_diffusion", marks=pytest.mark.slow),
     pytest.param("neural", marks=pytest.mark.slow),
 ]
@@ -149,6 +152,18 @@ def test_what_takes_no_textures_refuses_them_by_name(model: str, integrator: dic
     scene = _scene({**_painted(PLAIN, OTHER), "model": model})
     scene["integrator"] = {"type": "bssrdf", **integrator}
     with pytest.raises(ValueError, match=message):
+        mi.render(mi.load_dict(scene), spp=1)
+
+
+@pytest.mark.parametrize("module", [material_model, paper_model], ids=["neural_material", "neural_paper"])
+def test_models_of_one_medium_refuse_textures_by_name(
+    module: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(module, "find_weights", store.find_weights)
+    monkeypatch.setenv("HALFSPACE_SSS_WEIGHTS", str(tmp_path))
+    scene = _scene({**_painted(PLAIN, OTHER), "model": module.KIND})
+    scene["integrator"] = {"type": "bssrdf"}
+    with pytest.raises(ValueError, match=f"^model '{module.KIND}' must be one of any medium for media by textures: "):
         mi.render(mi.load_dict(scene), spp=1)
 
 

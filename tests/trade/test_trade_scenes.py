@@ -181,6 +181,36 @@ def test_a_way_that_refuses_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert "must be trained" in found.way("full_geometry").refusal
 
 
+def _painted(*albedos: float) -> dict[str, Any]:
+    """A medium of ten mean free paths whose albedo is a row of texels."""
+    texels = np.array([[[albedo] * 3 for albedo in albedos]], dtype=np.float32)
+    bitmap = {"type": "bitmap", "bitmap": mi.Bitmap(texels), "raw": True, "filter_type": "nearest"}
+    return {"albedo": bitmap, "sigma_t": 10.0}
+
+
+def test_a_textured_object_is_assessed_by_the_ways_that_take_it() -> None:
+    """A texture of one colour is as far from walks as its medium; others of two colours say what they refuse."""
+    quick = {**QUICK, "seconds": 1.0}
+    ways = ["better_dipole", "neural_shape", "better_dipole, gathered"]
+    medium = {"sigma_s": 9.5, "sigma_a": 0.5}
+    plain, one = (assess(scene(m), models=ways[:1], **quick).objects[0].way(ways[0]) for m in (medium, _painted(0.95)))
+    assert abs(plain.ratio[0] - one.ratio[0]) < 4 * np.hypot(plain.ratio_error[0], one.ratio_error[0])
+    found = assess(scene(_painted(0.95, 0.5)), models=ways, **quick)
+    two = [found.objects[0].way(way) for way in ways]
+    assert not two[0].refusal and two[0].samples > 0
+    assert "must be without textures for the model 'neural_shape'" in two[1].refusal
+    assert "light must be sampled for object 'ball0'" in two[2].refusal
+    assert recommend(found, tolerance=0.9).objects[0].way in ("path_traced", "better_dipole")
+
+
+@pytest.mark.slow
+def test_auto_of_a_textured_object_is_a_model_that_takes_textures() -> None:
+    loaded = mi.load_dict(scene(_painted(0.95, 0.5), model="auto"))
+    (obj,) = loaded.integrator().prepare(loaded)
+    assert obj.textured is not None and obj.transport is not None
+    assert np.isfinite(mi.render(loaded, spp=1).numpy()).all()
+
+
 def test_an_unknown_way_is_refused_with_the_nearest() -> None:
     with pytest.raises(ValueError, match="did you mean 'neural'"):
         assess(scene(), models=["nural"], **QUICK)

@@ -100,10 +100,13 @@ class Palette:
         Raises:
             ValueError: the model knows some media only.
         """
+        refusal = ""  # raised outside of the handler: messages of Mitsuba's functions are those of first causes
         try:
             network = bool(bssrdf(name, Medium.from_albedo(0.5, 1.0, media[0].g, media[0].eta)).checksums)
         except ValueError as error:
-            raise ValueError(f"model {name!r} must be one of any medium for media by textures: {error}") from None
+            refusal = str(error)
+        if refusal:
+            raise ValueError(f"model {name!r} must be one of any medium for media by textures: {refusal}")
         models: list[BSSRDF] = []
         rows: list[NodeRange] = []
         for c, m in enumerate(media):
@@ -311,11 +314,11 @@ def palette_model(
     """
     values = [v if len(v) else np.array([[0.0], [1.0]]) for v in medium.values_on(geometry.shape)]
     albedos, extinctions = (np.broadcast_to(v, (len(v), len(media))) for v in values)
-    models = _spread(name, albedos, extinctions, media)
+    palette, models = Palette.of(name, albedos, media), _spread(name, albedos, extinctions, media)
     table = RadialTable(models, geometry.size)
     share = area_share(geometry, table.mean / geometry.size, settings.area_share)
     positions = PositionSampler(geometry, table, AreaPoints(geometry.shape), share)
-    transport = PaletteTransport(Palette.of(name, albedos, media), geometry, medium, settings.geometry)
+    transport = PaletteTransport(palette, geometry, medium, settings.geometry)
     known = medium if isinstance(medium, TexturedMedium) else None  # else that of the exit
     return ObjectModel(transport, HalfSpaceProposals(positions, models[0], known))
 
