@@ -21,9 +21,7 @@ from figures.computing.learnt import (
 )
 from figures.computing.scenes import environment_file, prepare
 from figures.drawing.error_tables import label
-from figures.drawing.image_grid import image_grid
-from figures.drawing.page import page
-from figures.drawing.style import paper, saved
+from figures.drawing.image_files import image_files, rows_of
 from figures.modelling.objects import TISSUES, tissue
 from figures.parts.part import Part, Result, Task
 
@@ -90,15 +88,8 @@ def shown(task: Task) -> dict[str, Any]:
 
 def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
     """The figure as PDF and PNG, the page to flip between the images, and the numbers as a table."""
-    import pandas
-
     scenes = {name: _shots(results, name) for name in dict.fromkeys(key.split(", ")[0] for key in results)}
-    rows = [{"object": name, "model": s.label, **s.numbers} for name, shots in scenes.items() for s in shots[1:]]
-    with paper():
-        files: dict[str, bytes | str] = {f"fig01.{end}": data for end, data in saved(image_grid(scenes)).items()}
-    files["fig01.csv"] = pandas.DataFrame(rows).to_csv(index=False, lineterminator="\n")
-    files["fig01.html"] = page("Fig. 1: candle, mandarin and croissant", scenes, notes=NOTES)
-    return files
+    return image_files("fig01", "Fig. 1: candle, mandarin and croissant", scenes, rows_of(scenes, "object"), NOTES)
 
 
 def _shots(results: Mapping[str, Result], name: str) -> list[Shot]:

@@ -14,9 +14,7 @@ from figures.computing.images import FLIP, Shot, compared, noise_of, stops_of
 from figures.computing.learnt import FULL_GEOMETRY, TRAIN_SECONDS, train_scan, training_of, weight_files, with_weights
 from figures.computing.scenes import BUNNY, MATERIALS, bunny_scene, long_render, prepare
 from figures.drawing.error_tables import label
-from figures.drawing.image_grid import image_grid
-from figures.drawing.page import page
-from figures.drawing.style import paper, saved
+from figures.drawing.image_files import image_files
 from figures.parts.part import Part, Result, Task, unmodelled
 from halfspace_sss import materials
 
@@ -89,18 +87,12 @@ def rendered(task: Task) -> dict[str, Any]:
 
 def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
     """The figure as PDF and PNG, the page to flip between the images, and the numbers as a table."""
-    import pandas
-
     scenes, rows = {}, []
     for material in MATERIALS:
         name, shots = _shots(results, material)
         scenes[name] = shots
         rows += [{"material": material, "model": s.label, **s.numbers} for s in shots if s.image is not None]
-    with paper():
-        files: dict[str, bytes | str] = {f"fig09.{end}": data for end, data in saved(image_grid(scenes)).items()}
-    files["fig09.csv"] = pandas.DataFrame(rows).to_csv(index=False, lineterminator="\n")
-    files["fig09.html"] = page("Fig. 9: five materials by every kind of model", scenes, notes=NOTES)
-    return files
+    return image_files("fig09", "Fig. 9: five materials by every kind of model", scenes, rows, NOTES)
 
 
 def _shots(results: Mapping[str, Result], material: str) -> tuple[str, list[Shot]]:

@@ -24,9 +24,7 @@ from figures.computing.learnt import FULL_GEOMETRY, TRAIN_SECONDS, train_scan, t
 from figures.computing.scenes import BUNNY, prepare
 from figures.computing.timed import TimedRender, alternating, pass_size
 from figures.drawing.error_tables import label
-from figures.drawing.image_grid import image_grid
-from figures.drawing.page import page
-from figures.drawing.style import paper, saved
+from figures.drawing.image_files import image_files
 from figures.parts.part import Part, Result, Task, unmodelled
 from halfspace_sss import materials
 
@@ -110,19 +108,14 @@ def _numbers(timed: TimedRender, seconds: float) -> dict[str, Any]:
 
 def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
     """The figure as PDF and PNG, the page to flip between the images, and the numbers as a table."""
-    import pandas
-
     scenes, rows = {}, []
     for material in dict.fromkeys(name.split(",")[0] for name in results):
         name, shots, result = _shots(results[f"{material}, truth"], results[f"{material}, equal time"], material)
         scenes[name] = shots
         rows += result
-    with paper():
-        grid = image_grid(scenes, printed=(FLIP, RELATIVE_MSE, "spp"))
-        files: dict[str, bytes | str] = {f"fig11.{ending}": data for ending, data in saved(grid).items()}
-    files["fig11.csv"] = pandas.DataFrame(rows).to_csv(index=False, lineterminator="\n")
-    files["fig11.html"] = page("Fig. 11: path tracing and ours in equal time", scenes, notes=NOTES)
-    return files
+    return image_files(
+        "fig11", "Fig. 11: path tracing and ours in equal time", scenes, rows, NOTES, (FLIP, RELATIVE_MSE, "spp")
+    )
 
 
 def _shots(truth: Result, rivals: Result, material: str) -> tuple[str, list[Shot], list[dict[str, Any]]]:

@@ -8,12 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from figures.computing.images import Shot, compared, noise_of, stops_of
-from figures.computing.scenes import BUNNY, MM_PER_UNIT, long_render, prepare
-from figures.drawing.error_tables import label
-from figures.drawing.image_grid import image_grid
-from figures.drawing.page import page
-from figures.drawing.style import paper, saved
+from figures.computing.scenes import BUNNY, MM_PER_UNIT
+from figures.computing.things import Staging, lit_scene, shown, thing_parts, walked
+from figures.drawing.image_files import against_walks, image_files, rows_of
 from figures.parts.part import Part, Result, Task, unmodelled
 from halfspace_sss.neural.universal import shipped_weights
 from halfspace_sss.provenance import check_folder
@@ -34,73 +31,39 @@ GROUT_WIDTH = 0.02  # of the largest extent
 TEXELS = (128, 256)
 BANDS = ((0.80, 0.72, 0.60), (0.62, 0.36, 0.20), (0.84, 0.80, 0.70), (0.70, 0.50, 0.34), (0.45, 0.25, 0.16))
 SPOT = (0.68, 0.20, 0.10)
+STAGE = Staging((0.25, 0.15, 1), (-0.9, 0.8, 0.7), fov=23.0, lamp_radius=0.4, sky=0.25)
 NOTES = (
     "All images contain all scattering orders. The walk takes the medium of its exit for the whole way, models that of "
-    "both ends. The bunny's reflectance is an attribute of its vertices, the ball's reflectance and mean free path are "
-    "bitmaps. FLIP and relative squared error of the pixels of the object; the noise of both images is in them."
+    "both ends. The bunny's reflectance is an attribute of its vertices, the ball's reflectance and mean free "
+    "path are bitmaps. FLIP and relative squared error of the pixels of the object; the noise of both is in them."
 )
 
 
 def parts(quality: str) -> list[Part]:
     """For each thing the path-traced image, then the image of each model."""
-    size, results = SIZES[quality], []
+    models = [(model, (shipped_weights(),) if model == "neural" else ()) for model in MODELS]
+    spp, results = (TRUTH_SPP[quality], MODEL_SPP[quality]), []
     for thing in THINGS:
-        common = {"thing": thing, "size": size, "seed": 0}
-        files, spp = ((BUNNY,) if thing == "bunny" else ()), TRUTH_SPP[quality]
-        params = {**common, "spp": spp}
-        results.append(Part(f"{thing}, path traced", path_traced, params, spp * size**2, inputs=files))
-        for model in MODELS:
-            params = {**common, "spp": MODEL_SPP[quality], "model": model}
-            work = params["spp"] * size**2
-            inputs = (*files, *((shipped_weights(),) if model == "neural" else ()))
-            results.append(Part(f"{thing}, {model}", rendered, params, work, inputs=inputs, like=model))
+        common = {"thing": thing, "size": SIZES[quality], "seed": 0}
+        files = (BUNNY,) if thing == "bunny" else ()
+        results += thing_parts(thing, common, spp, (path_traced, rendered), models, files)
     return results
 
 
 @unmodelled
 def path_traced(task: Task) -> dict[str, Any]:
-    """The image by random walks, in passes that survive an interruption."""
-    prepare()
-    return long_render(task, _scene(task, "path_traced"), SPP_PER_PASS, task.params["spp"] // SPP_PER_PASS)
+    """The image by random walks."""
+    return walked(task, _scene, SPP_PER_PASS)
 
 
 def rendered(task: Task) -> dict[str, Any]:
     """The image of a model."""
-    import mitsuba as mi
-
-    prepare()
-    p = task.params
-    image = mi.render(_scene(task, p["model"]), spp=p["spp"], seed=p["seed"] + 1)
-    return {"image": np.array(image)[..., :3].astype(np.float32), "spp": p["spp"]}
+    return shown(task, _scene)
 
 
-def _scene(task: Task, model: str) -> Any:
-    """A painted thing under a small lamp and a dim even sky."""
-    import mitsuba as mi
-
-    from halfspace_sss.rendering.scenes.scene_files import load_scene
-
-    p = task.params
-    thing = _bunny(check_folder(task.folder)) if p["thing"] == "bunny" else _ball()
-    box = mi.load_dict({key: value for key, value in thing.items() if key != "bsdf"}).bbox()
-    centre, radius = np.array(box.center()).ravel(), 0.5 * float(np.linalg.norm(np.array(box.extents()).ravel()))
-    view = mi.ScalarTransform4f().look_at(list(centre + 4 * radius * _unit(0.25, 0.15, 1)), list(centre), [0, 1, 0])
-    film = {"type": "hdrfilm", "width": p["size"], "height": p["size"], "rfilter": {"type": "box"}}
-    sampler = {"type": "independent" if model == "path_traced" else "multijitter"}
-    glow, where = {"type": "area", "radiance": 60.0}, list(centre + 3 * radius * _unit(-0.9, 0.8, 0.7))
-    description = {
-        "type": "scene",
-        "integrator": {"type": "bssrdf", "mm_per_unit": MM_PER_UNIT, "hide_emitters": True},
-        "sensor": {"type": "perspective", "fov": 23.0, "to_world": view, "film": film, "sampler": sampler},
-        "thing": thing,
-        "sky": {"type": "constant", "radiance": 0.25},
-        "lamp": {"type": "sphere", "center": where, "radius": 0.4 * radius, "emitter": glow},
-    }
-    return load_scene(description, model)
-
-
-def _unit(*d: float) -> np.ndarray:
-    return np.array(d) / np.linalg.norm(d)
+def _scene(task: Task, model: str) -> dict[str, Any]:
+    thing = _bunny(check_folder(task.folder)) if task.params["thing"] == "bunny" else _ball()
+    return lit_scene({"thing": thing}, STAGE, task.params["size"], MM_PER_UNIT, model)
 
 
 def _bunny(folder: Path) -> dict[str, Any]:
@@ -157,28 +120,6 @@ def bands() -> tuple[np.ndarray, np.ndarray]:
 
 
 def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
-    """The figure as PDF and PNG, the page to flip between the images, and the numbers as a table."""
-    import pandas
-
-    scenes = {thing: _shots(results, thing) for thing in THINGS}
-    rows = [{"thing": n, "model": s.label, **s.numbers} for n, shots in scenes.items() for s in shots[1:]]
-    with paper():
-        files: dict[str, bytes | str] = {f"textures.{end}": data for end, data in saved(image_grid(scenes)).items()}
-    files["textures.csv"] = pandas.DataFrame(rows).to_csv(index=False, lineterminator="\n")
-    files["textures.html"] = page("Media by textures", scenes, notes=NOTES)
-    return files
-
-
-def _shots(results: Mapping[str, Result], thing: str) -> list[Shot]:
-    """The images of a thing, exposed alike; with the mean of each over that of the walks."""
-    truth = results[f"{thing}, path traced"]
-    reference = truth.images["image"]
-    mask = reference.max(axis=2) > 0
-    gain = np.float32(2.0 ** stops_of(reference, mask))
-    error = noise_of(reference, truth.images["variance"], mask)
-    shots = [Shot("Path traced", gain * reference, {"standard error": error})]
-    for model in MODELS:
-        image = results[f"{thing}, {model}"].images["image"]
-        numbers = {"mean over path traced": float(image[mask].mean() / reference[mask].mean())}
-        shots.append(compared(label(model), gain * image, gain * reference, mask=mask, numbers=numbers))
-    return shots
+    """The figure, the page and the table."""
+    scenes = {thing: against_walks(results, thing, MODELS) for thing in THINGS}
+    return image_files("textures", "Media by textures", scenes, rows_of(scenes, "thing"), NOTES)

@@ -112,7 +112,7 @@ def object_parts(name: str, resolution: int, folder: Path, seed: int = 0, model:
 def _scanned(task: Task) -> dict[str, Any]:
     prepare()
     p = task.params
-    return _trained(task, scan_scene(p["scan"], p["material"], 16, "even sky"), p["scan"])
+    return trained(task, scan_scene(p["scan"], p["material"], 16, "even sky"), p["scan"])
 
 
 def _modelled(task: Task) -> dict[str, Any]:
@@ -120,11 +120,14 @@ def _modelled(task: Task) -> dict[str, Any]:
     p, name = task.params, task.params["object"]
     shown = object_parts(name, p["resolution"], check_folder(task.folder), p["seed"])
     scene = {"type": "scene", "integrator": {"type": "bssrdf"}, **shown}
-    return _trained(task, scene, name)
+    return trained(task, scene, name)
 
 
-def _trained(task: Task, scene: dict[str, Any], name: str) -> dict[str, Any]:
-    """Weights of an object, with what they took."""
+def trained(task: Task, scene: dict[str, Any], name: str) -> dict[str, Any]:
+    """Weights of the object called `name` in the description of a scene, with what they took.
+
+    The parameters "seconds" (of CPU time) and "seed" of the task are those of the training.
+    """
     from full_geometry.learning.training import train_by_cpu
     from full_geometry.models.storing import KIND
     from halfspace_sss.neural.store import load_weights

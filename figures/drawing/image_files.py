@@ -1,0 +1,63 @@
+"""The files of a figure of images, and the images of a thing against those of walks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from figures.computing.images import FLIP, Shot, compared, noise_of, stops_of
+from figures.drawing.error_tables import label
+from figures.drawing.image_grid import image_grid
+from figures.drawing.page import page
+from figures.drawing.style import paper, saved
+from figures.parts.part import Result
+
+
+def image_files(
+    figure: str,
+    title: str,
+    scenes: Mapping[str, Sequence[Shot]],
+    rows: Sequence[Mapping[str, Any]],
+    notes: str,
+    printed: Sequence[str] = (FLIP,),
+) -> dict[str, bytes | str]:
+    """The figure as PDF and PNG, the page to flip between the images, and the numbers as a table.
+
+    Args:
+        figure: its name.
+        title: of the page.
+        scenes: images of each scene, the reference first.
+        rows: of the table.
+        notes: below the images of the page.
+        printed: numbers below each image of the picture.
+    """
+    import pandas
+
+    with paper():
+        drawn = saved(image_grid(scenes, printed=printed))
+    files: dict[str, bytes | str] = {f"{figure}.{end}": data for end, data in drawn.items()}
+    files[f"{figure}.csv"] = pandas.DataFrame(rows).to_csv(index=False, lineterminator="\n")
+    files[f"{figure}.html"] = page(title, scenes, notes=notes)
+    return files
+
+
+def rows_of(scenes: Mapping[str, Sequence[Shot]], key: str) -> list[dict[str, Any]]:
+    """Rows of the table of a figure: the numbers of each image but the references; `key` is what a scene is called."""
+    return [{key: name, "model": shot.label, **shot.numbers} for name, shots in scenes.items() for shot in shots[1:]]
+
+
+def against_walks(results: Mapping[str, Result], name: str, models: Iterable[str]) -> list[Shot]:
+    """The images of a thing, exposed alike; with the mean of each over that of the walks."""
+    truth = results[f"{name}, path traced"]
+    reference = truth.images["image"]
+    mask = reference.max(axis=2) > 0
+    gain = np.float32(2.0 ** stops_of(reference, mask))
+    error = noise_of(reference, truth.images["variance"], mask)
+    shots = [Shot("Path traced", gain * reference, {"standard error": error})]
+    for model in models:
+        image = results[f"{name}, {model}"].images["image"]
+        numbers = {"mean over path traced": float(image[mask].mean() / reference[mask].mean())}
+        shots.append(compared(label(model), gain * image, gain * reference, mask=mask, numbers=numbers))
+    return shots
