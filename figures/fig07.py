@@ -19,9 +19,7 @@ from figures.computing.learnt import (
     training_of,
 )
 from figures.computing.scenes import environment_file, prepare
-from figures.drawing.image_grid import image_grid
-from figures.drawing.page import page
-from figures.drawing.style import paper, saved
+from figures.drawing.image_files import image_files
 from figures.fig01 import LIGHT, RESOLUTION, TRUTH, shown
 from figures.modelling.objects import TISSUES
 from figures.parts.part import Part, Result, Task
@@ -142,15 +140,9 @@ def distant(task: Task) -> dict[str, Any]:
 
 def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
     """The figure as PDF and PNG, the page to flip between the images, and the numbers as a table."""
-    import pandas
-
     scenes = {name: _shots(results, name) for name in dict.fromkeys(key.split(", ")[0] for key in results)}
     rows = [{"object": name, "method": s.label, **s.numbers} for name, shots in scenes.items() for s in shots[1:]]
-    with paper():
-        files: dict[str, bytes | str] = {f"fig07.{end}": data for end, data in saved(image_grid(scenes)).items()}
-    files["fig07.csv"] = pandas.DataFrame(rows).to_csv(index=False, lineterminator="\n")
-    files["fig07.html"] = page("Fig. 7: four objects by two rivals and ours", scenes, notes=NOTES)
-    return files
+    return image_files("fig07", "Fig. 7: four objects by two rivals and ours", scenes, rows, NOTES)
 
 
 def _shots(results: Mapping[str, Result], name: str) -> list[Shot]:
