@@ -11,6 +11,8 @@ import typer
 
 from halfspace_sss.backend import BackendError
 from halfspace_sss.cli.shared import (
+    SPECTRAL,
+    VARIANTS,
     Bar,
     Define,
     OutFolder,
@@ -82,7 +84,7 @@ def render_command(
     Until it is done, NAME_MODEL.unfinished.exr holds it, and the files of before stay. Objects whose model has to learn
     them are learnt first, where they have no weights, from walks that join the image.
     """
-    use_mitsuba(variant)
+    use_mitsuba(variant, VARIANTS + SPECTRAL)
     from halfspace_sss.checks import check_count
     from halfspace_sss.rendering.paths.integrator import is_bssrdf
     from halfspace_sss.rendering.scenes.picture import Picture

@@ -219,6 +219,7 @@ SampleSeed = Annotated[int, typer.Option(help="Seed of the samples.", parser=who
 OutFolder = Annotated[Path, typer.Option(help="Folder for the files; those of the same names are replaced.")]
 Backend = Annotated[str, typer.Option(help="llvm or cuda.")]
 VARIANTS = ("llvm_ad_rgb", "llvm_ad_mono", "cuda_ad_rgb", "cuda_ad_mono")
+SPECTRAL = ("llvm_ad_spectral", "cuda_ad_spectral")
 Variant = Annotated[str, typer.Option(help="Variant of Mitsuba.")]
 Workers = Annotated[
     int | None,
@@ -295,10 +296,10 @@ def check_channel(channel: str | None, names: list[str]) -> None:
         raise ValueError(f"channel must be left out unless materials are named, got {channel!r}")
 
 
-def use_mitsuba(variant: str) -> None:
-    """Mitsuba with our plugins, under a variant."""
-    if variant not in VARIANTS:
-        raise ValueError(f"variant must be one of {', '.join(VARIANTS)}, got {variant!r}")
+def use_mitsuba(variant: str, known: tuple[str, ...] = VARIANTS) -> None:
+    """Mitsuba with our plugins, under a variant, one of those that a command knows."""
+    if variant not in known:
+        raise ValueError(f"variant must be one of {', '.join(known)}, got {variant!r}")
     if variant.startswith("llvm"):
         prepare_llvm()
     try:

@@ -131,6 +131,16 @@ def test_a_mono_render_has_a_page_too(scene: Path) -> None:
     assert _names(scene.parent / "out") == SET
 
 
+def test_a_spectral_render_has_a_page_too(scene: Path) -> None:
+    spectrum = '<spectrum name="albedo" value="360:0.8, 830:0.95"/> <float name="sigma_t" value="3"/>'
+    material = '<string name="material" value="marble"/>'
+    assert material in XML
+    scene.write_text(XML.replace(material, spectrum))
+    result = _render(scene, "--spp", "1", "--variant", "llvm_ad_spectral")
+    assert result.exit_code == 0, result.stderr
+    assert _names(scene.parent / "out") == SET
+
+
 @pytest.mark.parametrize("command", ["errors", "train material"])
 def test_only_the_chosen_channels_are_taken(command: str, monkeypatch: Any, tmp_path: Path) -> None:
     seen = []
