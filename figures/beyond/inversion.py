@@ -1,8 +1,9 @@
 """Materials from images, measured: `fit` beside Mitsuba's `prbvolpath` on homogeneous media, and textures of a bunny.
 
 Media after the synthetic benchmark of Son et al. 2024: sigma_t 20, 50, 50 and albedo 0.9, from sigma_t 50 and albedo
-0.5, of a cube of edge 0.2; images of `volpath` at depth 256. `prbvolpath` at depth 6 and 64 moves log sigma_t and logit
-albedo by Adam at rate 0.05, one view a step, with two independent renders in its loss. All CPU seconds, compiling too.
+0.5, of a cube of 0.2 mm; images of `volpathmis` at depth 256, as `volpath` has outliers. `prbvolpath` at depth 6 and 64
+moves log sigma_t and logit albedo by Adam at rate 0.05, one view a step, with two independent renders in its loss. All
+CPU seconds, compiling too.
 
 Textures: the albedo of the bunny's vertices from views around it, lit by one lamp, so that some see its lit side and
 some its other side; images by `translucent_walk`. FLIP of views held out, and under a light from elsewhere.
@@ -58,7 +59,8 @@ def medium_rows(
         progress: called with (what, done, total).
     """
     for case, kind in CASES.items():
-        truth = with_media(_cube(TRUE, kind, size), 1.0, {"type": "volpath", "max_depth": TARGET_DEPTH})
+        volpath = {"type": "volpathmis", "max_depth": TARGET_DEPTH, "hide_emitters": True}
+        truth = with_media(_cube(TRUE, kind, size), 1.0, volpath)
         images = [np.array(mi.render(truth, sensor=k, spp=16 * spp, seed=seed + k)) for k in range(len(SIDES))]
         views = [GivenView.of(f"view {k}", k, image) for k, image in enumerate(images)]
         settings = inverse.FitSettings(steps=steps, spp=spp, seed=seed)

@@ -20,9 +20,11 @@ def inversion_command(
         list[str] | None, typer.Option(help="media or textures; repeat for both.", show_default="both")
     ] = None,
     size: Annotated[int, typer.Option(help="Pixels of the square images.", parser=whole)] = 24,
-    spp: Annotated[int, typer.Option(help="Samples a pixel of each render of a step.", parser=whole)] = 32,
-    steps: Annotated[int, typer.Option(help="Of `fit`, of media; textures take 4 times as many.", parser=whole)] = 30,
-    prb_steps: Annotated[int, typer.Option(help="Of `prbvolpath`.", parser=whole)] = 80,
+    spp: Annotated[
+        int, typer.Option(help="Samples a pixel of each render of a step; textures take a quarter.", parser=whole)
+    ] = 64,
+    steps: Annotated[int, typer.Option(help="Of `fit`, of media; textures take twice as many.", parser=whole)] = 30,
+    prb_steps: Annotated[int, typer.Option(help="Of `prbvolpath`.", parser=whole)] = 200,
     seed: Annotated[int, typer.Option(help="Seed of everything.", parser=whole)] = 0,
     out: OutFolder = Path("inversion"),
 ) -> None:
@@ -49,7 +51,7 @@ def inversion_command(
             if name == "media":
                 rows = list(inversion.medium_rows(size, spp, steps, prb_steps, seed, show))
             else:
-                rows = [inversion.texture_row(2 * size, spp, 4 * steps, seed, out, show)]
+                rows = [inversion.texture_row(2 * size, max(spp // 4, 1), 2 * steps, seed, out, show)]
         frame = pandas.DataFrame(rows)
         files[out / f"{name}.csv"] = frame.to_csv(index=False, lineterminator="\n")
         files[out / f"{name}.md"] = markdown(frame)
