@@ -41,7 +41,7 @@ from importlib.metadata import entry_points
 __all__ = ["FIGURES", "figure_modules"]
 
 OF_PAPER = ("fig01", "fig03", "fig05", "fig06", "fig07", "fig08", "fig09", "fig10", "fig11", "fig12", "table1")
-BEYOND = ("spheres", "thin", "textures", "scenes", "equal_error", "objects", "trade")
+BEYOND = ("spheres", "thin", "textures", "gathered", "scenes", "equal_error", "objects", "trade")
 FIGURES = (*OF_PAPER, *BEYOND)
 GROUP = "halfspace_sss.figure_modules"
 

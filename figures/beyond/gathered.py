@@ -1,0 +1,109 @@
+"""The figure `gathered`: a bunny walked, by a model sampled, and by the same in gathered light, in equal time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from figures.computing.contenders import WALK, long_walk, ready
+from figures.computing.images import FLIP, Shot, compared, cover, noise_of, stops_of
+from figures.computing.learnt import FULL_GEOMETRY, TRAIN_SECONDS, train_scan, training_of, with_weights
+from figures.computing.scenes import BUNNY, prepare, scan_scene
+from figures.computing.timed import rendered
+from figures.drawing.image_grid import image_grid
+from figures.drawing.page import page
+from figures.drawing.style import paper, saved
+from figures.parts.part import Part, Result, Task
+from halfspace_sss import materials
+from halfspace_sss.backend import clock
+
+TITLE = "walked, sampled and gathered in equal time"
+MATERIALS = ("marble",)
+LIGHTS = "both"
+WAYS = {"walked": (WALK, "sampled"), "sampled": (FULL_GEOMETRY, "sampled"), "gathered": (FULL_GEOMETRY, "gathered")}
+SIZES = {"draft": 192, "paper": 512}
+SECONDS = {"draft": 8.0, "paper": 20.0}  # of the processor, all cores together
+TRUTH_SPP = {"draft": 384, "paper": 4096}
+PASSES, PILOT = 8, 2  # of an image, about; samples of a pixel by which the time of others is foreseen
+NOTES = (
+    "All had the same seconds of the processor, compilation and the training of `full_geometry` left out, the "
+    "gathering of light counted. FLIP of the pixels of the object against a long walk; the noise of both is in it."
+)
+
+
+def parts(quality: str) -> list[Part]:
+    """For each material the object learnt, a long walk, then what every way makes of the time."""
+    size, spp, results = SIZES[quality], TRUTH_SPP[quality], []
+    for material in MATERIALS:
+        common = {"material": material, "size": size, "lights": LIGHTS}
+        params = {**common, "spp": spp, "seed": 0}
+        results.append(Part(f"{material}, truth", long_walk, params, spp * size**2, inputs=(BUNNY,)))
+        results.append(train_scan(material, material, TRAIN_SECONDS[quality]))
+        params = {**common, "seconds": SECONDS[quality], "seed": 1}
+        needs = (training_of(material),)
+        results.append(Part(f"{material}, equal time", in_time, params, len(WAYS) * SECONDS[quality], needs, (BUNNY,)))
+    return results
+
+
+def in_time(task: Task) -> dict[str, Any]:
+    """What each way makes of the same time."""
+    prepare()
+    p = task.params
+    medium, found, numbers = materials.load(p["material"]).medium, {}, {}
+    with with_weights(task.folder, task.needed):
+        for way, (method, light) in WAYS.items():
+            description = scan_scene("bunny", p["material"], p["size"], p["lights"])
+            description["integrator"]["light"] = light
+            scene = ready(method, description, "bunny", medium)
+            found[way], numbers[way] = _passes(scene, p["seconds"], p["seed"], light == "gathered")
+            found["cover"] = cover(scene)
+    return {**found, "ways": numbers}
+
+
+def _passes(scene: Any, seconds: float, seed: int, gathers: bool) -> tuple[np.ndarray, dict[str, Any]]:
+    """The mean of passes that take so long, light gathered anew among it, and their numbers."""
+    rendered(scene, PILOT, seed, 0)  # compiles
+    started = clock()
+    if gathers:
+        scene.integrator().gathering = type(scene.integrator().gathering)()
+        scene.integrator().prepare(scene)
+    gathering, started = clock() - started, clock()
+    rendered(scene, PILOT, seed, 1)
+    spp = max(round(PILOT * (seconds - gathering) / PASSES / (clock() - started)), 1)
+    rendered(scene, spp, seed, 2)  # compiles for that number
+    images, started = [], clock()
+    while not images or (clock() - started) * (1 + 0.5 / len(images)) < seconds - gathering:
+        images.append(rendered(scene, spp, seed, 3 + len(images))[0])
+    took = gathering + clock() - started
+    image = np.mean(images, axis=0, dtype=np.float64).astype(np.float32)
+    return image, {"spp": spp * len(images), "seconds": took, "seconds of gathering": gathering}
+
+
+def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
+    """The figure as PDF and PNG, the page to flip between the images, and the numbers as a table."""
+    import pandas
+
+    scenes = {material: _shots(results, material) for material in MATERIALS}
+    rows = [{"material": name, "way": s.label, **s.numbers} for name, shots in scenes.items() for s in shots[1:]]
+    with paper():
+        grid = image_grid(scenes, printed=(FLIP, "spp"))
+        files: dict[str, bytes | str] = {f"gathered.{end}": data for end, data in saved(grid).items()}
+    files["gathered.csv"] = pandas.DataFrame(rows).to_csv(index=False, lineterminator="\n")
+    files["gathered.html"] = page("Walked, sampled and gathered in equal time", scenes, notes=NOTES)
+    return files
+
+
+def _shots(results: Mapping[str, Result], material: str) -> list[Shot]:
+    """The images of a material, exposed alike."""
+    truth, equal = results[f"{material}, truth"], results[f"{material}, equal time"]
+    reference, mask = truth.images["image"], equal.images["cover"] > 0
+    gain = np.float32(2.0 ** stops_of(reference, mask))
+    error = noise_of(reference, truth.images["variance"], mask)
+    shots = [Shot("Path traced, long", gain * reference, {"standard error": error})]
+    for way, about in equal.numbers["ways"].items():
+        numbers = {**about, "spp": str(about["spp"])}
+        title = f"{way.capitalize()}, {about['seconds']:.2g} s"
+        shots.append(compared(title, gain * equal.images[way], gain * reference, mask=mask, numbers=numbers))
+    return shots
