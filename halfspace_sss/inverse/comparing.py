@@ -31,6 +31,7 @@ from halfspace_sss.provenance import write_atomically
 LOSSES = ("relative", "l2")
 FLOOR = 0.1  # of the mean of an image, added to it in relative weights
 EXPOSURE = 10.0  # most, of a factor
+EXPOSURE_MEMORY = 0.2  # what one step counts in a factor
 BATCH = 4
 PURPOSES = ("order", "first", "second", "slope", "other slope", "test", "other test")
 
@@ -119,23 +120,28 @@ class ViewComparison:
     Args:
         scene, views, settings: as of `fit`, checked.
         weights: of each view, by pixel and channel.
-        exposures: factor of each view, changed in place.
+        factors: of each view, changed in place: by which its render becomes its image, up to one common factor.
     """
 
     scene: mi.Scene
     views: list[GivenView]
     settings: FitSettings
     weights: list[np.ndarray] = field(init=False)
-    exposures: np.ndarray = field(init=False)
+    factors: np.ndarray = field(init=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "weights", [_weights(view, self.settings.loss) for view in self.views])
-        object.__setattr__(self, "exposures", np.ones(len(self.views)))
+        object.__setattr__(self, "factors", np.ones(len(self.views)))
 
     @property
     def fitted(self) -> list[int]:
         """The views that are not held out."""
         return [k for k, view in enumerate(self.views) if not view.held_out]
+
+    @property
+    def exposures(self) -> np.ndarray:
+        """The factors of views over the geometric mean of those that are fitted."""
+        return self.factors / np.exp(np.log(self.factors[self.fitted]).mean())
 
     def batch(self, k: int) -> list[int]:
         """The views of a step."""
@@ -176,11 +182,11 @@ class ViewComparison:
         return np.array(image, dtype=np.float64)[..., : view.image.shape[2]]
 
     def _expose(self, which: int, pair: list[np.ndarray]) -> None:
-        """The factor of least squares; those of all fitted views have the geometric mean 1."""
+        """The factor of least squares, as a running mean of logarithms for views that are fitted."""
         counts, T = self.views[which].counts[..., None], self.views[which].image
         found = (counts * T * (pair[0] + pair[1]) / 2).sum() / max((counts * pair[0] * pair[1]).sum(), 1e-30)
-        self.exposures[which] = np.clip(found, 1 / EXPOSURE, EXPOSURE)
-        self.exposures[self.fitted] /= np.exp(np.log(self.exposures[self.fitted]).mean())
+        part = 1.0 if self.views[which].held_out else EXPOSURE_MEMORY
+        self.factors[which] *= (np.clip(found, 1 / EXPOSURE, EXPOSURE) / self.factors[which]) ** part
 
     def fingerprint(self, *start: object) -> str:
         """Of the images, the settings and where a fit starts."""
@@ -246,7 +252,7 @@ def descend(descent: FitDescent, work: Path | None, progress: ProgressText | Non
 def _save(path: Path, of: str, descent: FitDescent) -> None:
     arrays = {"of": np.array(of), "steps": np.array(json.dumps(descent.steps))}
     file = io.BytesIO()
-    np.savez(file, **arrays, exposures=descent.comparison.exposures, **descent.state())
+    np.savez(file, **arrays, factors=descent.comparison.factors, **descent.state())
     write_atomically(path, file.getvalue())
 
 
@@ -257,6 +263,6 @@ def _load(path: Path, of: str, descent: FitDescent) -> None:
         raise ValueError(f"{path} must be the state of a fit, got {error}") from error
     if str(arrays["of"]) != of:
         raise ValueError(f"work must be a new folder or that of the same fit, got another one in {path.parent}")
-    descent.comparison.exposures[:] = arrays.pop("exposures")
+    descent.comparison.factors[:] = arrays.pop("factors")
     descent.steps = [FitStep(*row) for row in json.loads(str(arrays["steps"]))]
     descent.restore(arrays)
