@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated
 
 import typer
@@ -51,7 +52,9 @@ def inversion_command(
             if name == "media":
                 rows = list(inversion.medium_rows(size, spp, steps, prb_steps, seed, show))
             else:
-                rows = [inversion.texture_row(2 * size, max(spp // 4, 1), 2 * steps, seed, out, show)]
+                with TemporaryDirectory() as folder:
+                    few = max(spp // 4, 1)
+                    rows = [inversion.texture_row(2 * size, few, 2 * steps, seed, Path(folder), show)]
         frame = pandas.DataFrame(rows)
         files[out / f"{name}.csv"] = frame.to_csv(index=False, lineterminator="\n")
         files[out / f"{name}.md"] = markdown(frame)
