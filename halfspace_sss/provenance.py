@@ -55,18 +55,16 @@ def path_of(path: str | os.PathLike) -> Path:
     """A path of this machine, or that of an object store for a URL that fsspec knows, such as s3://BUCKET/maps.
 
     Raises:
-        ValueError: a package that such a URL needs is not installed, or no file system has its protocol.
+        ValueError: universal_pathlib is not installed, or no file system has the protocol. The package of the file
+            system, such as s3fs, is missed when the path is used.
     """
     if is_remote(path) or "://" not in str(path):
         return path if is_remote(path) else Path(path)
     try:
         from upath import UPath
-
-        found = UPath(str(path))
-        found.fs  # noqa: B018 - its package is imported here
     except ImportError as error:
         raise ValueError(f'{path} needs more packages: pip install "halfspace-sss[cluster]"; {error}') from error
-    return found
+    return UPath(str(path))
 
 
 def is_remote(path: Any) -> bool:
