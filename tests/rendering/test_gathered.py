@@ -8,6 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from full_geometry.learning.meshes import Box, surface
+from full_geometry.learning.shapes import box
+from halfspace_sss.rendering.gathered.points import SurfacePoints, uniform_entries
+from halfspace_sss.rendering.object.shape import survey
 from halfspace_sss.rendering.paths.gathering import _steadied
 
 pytestmark = pytest.mark.usefixtures("rgb")
@@ -162,6 +166,20 @@ def test_a_mirrored_lamp_that_few_directions_found_is_shared_by_all_points() -> 
     found = steady * sent
     assert np.allclose(found.sum(axis=0), sent.sum(axis=0))
     assert found[7, 0] < 10 and np.allclose(steady[:, 1], 1, atol=0.01)
+
+
+def test_every_place_of_a_surface_in_rows_of_faces_has_a_point_in_reach() -> None:
+    # of the set of points alone 6 and 13 % had none, and were black
+    def even_box(p: np.ndarray) -> np.ndarray:
+        return box(p, np.array([1.0, 0.7, 1.0]), 0.25)
+
+    geometry = survey(surface(even_box, Box((-1.1, -0.8, -1.1), (1.1, 0.8, 1.1)), 96).mitsuba("box"))
+    u = np.random.default_rng(5).random((3, 200_000)).astype(np.float32)
+    at = uniform_entries(geometry, mi.Float(u[0]), mi.Point2f(u[1:]))
+    for count in (512, 2048):
+        points = SurfacePoints.of(geometry, count)
+        assert count < len(points) < 1.15 * count
+        assert np.mean(~np.array(points.nearest(at.p, at.n, mi.Bool(True))[1])) < 1e-4
 
 
 def test_derivatives_are_refused() -> None:

@@ -133,6 +133,7 @@ def patch_transfer(obj: TranslucentObject, count: int | None = None, samples: in
     sigma = np.mean([float(m.sigma_t_prime) for m in obj.media])
     count = count or int(np.clip(obj.geometry.area * (PER_LENGTH * sigma) ** 2, FEWEST, MOST))
     points = SurfacePoints.of(obj.geometry, count)
+    count = len(points)
     cells = SurfaceCells.of(obj, points)
     result = drawn(obj, points, cells, max(samples // count, 16))
     areas, places = _areas(obj, cells)

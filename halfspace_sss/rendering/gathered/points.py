@@ -1,6 +1,7 @@
 """Points of a surface that hold what varies slowly over it, and a lookup that blends those near any place.
 
-Points are a low-discrepancy set over the area. Between them a value is blended with the weights
+Points are a low-discrepancy set over the area, and more where that leaves gaps. Between them a value is blended with
+the weights
 
     w_j = (1 - d_j² / h²)² max(n_j.n, 0)²,    d_j < h,
 
@@ -34,6 +35,8 @@ from halfspace_sss.rendering.object.shape import Geometry
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+PLACES = 2**17  # that must have a point in reach
+LOOKS = (23, 24)  # seeds of such places
 REACH = 2.0  # h over the mean distance of points
 MOST_CELLS = 2**22
 R_3 = (
@@ -83,7 +86,32 @@ class SurfacePoints:
         p, n, n_out, _, face, _ = uniform_entries(geometry, u[0], mi.Point2f(u[1], u[2]))
         dr.eval(p, n, n_out, face)
         h = REACH * float(np.sqrt(geometry.area / count))
-        return cls(p, n, n_out, face, *_grid(np.array(p).T, h))
+        result = cls(p, n, n_out, face, *_grid(np.array(p).T, h))
+        for seed in LOOKS:
+            result = result._without_gaps(geometry, seed)
+        return result
+
+    def _without_gaps(self, geometry: Geometry, seed: int) -> SurfacePoints:
+        """With points where random places have none in reach: faces in rows can be in step with the set."""
+        u = np.random.default_rng(seed).random((3, PLACES)).astype(np.float32)
+        at = uniform_entries(geometry, mi.Float(u[0]), mi.Point2f(u[1:]))
+        missed = np.flatnonzero(~np.array(self.nearest(at.p, at.n, mi.Bool(True))[1]))
+        if not len(missed):
+            return self
+        p, n = (np.array(v, dtype=float)[:, missed].T for v in (at.p, at.n))
+        near = cKDTree(p).query_ball_point(p, 0.5 * self.h)
+        left, kept = np.ones(len(missed), dtype=bool), []
+        for k, others in enumerate(near):
+            if left[k]:
+                kept.append(k)
+                others = np.array(others)
+                left[others[n[others] @ n[k] > 0.5]] = False
+        chosen, old = missed[kept], (self.p, self.n, self.n_out, self.face)
+        p, n, n_out, face = (
+            type(a)(np.concatenate([np.array(a), np.array(b)[..., chosen]], axis=-1))
+            for a, b in zip(old, (at.p, at.n, at.n_out, at.face))
+        )
+        return SurfacePoints(p, n, n_out, face, *_grid(np.array(p).T, self.h))
 
     def __len__(self) -> int:
         return dr.width(self.p)
