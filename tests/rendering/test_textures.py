@@ -137,7 +137,8 @@ def test_a_model_of_a_constant_texture_renders_as_of_a_constant() -> None:
         scene = _scene({**surface, "model": "better_dipole"}, _small_lamp())
         scene["integrator"] = {"type": "bssrdf", "mm_per_unit": 0.8}
         images.append(mi.render(mi.load_dict(scene), spp=64, seed=1).numpy())
-    np.testing.assert_allclose(images[1], images[0], atol=1e-5 * images[0].max())
+    # .3 % is what interpolation between nodes of the albedo may be off; random numbers are the same
+    np.testing.assert_allclose(images[1], images[0], rtol=3e-3, atol=1e-5 * images[0].max())
 
 
 @pytest.mark.parametrize(
