@@ -11,9 +11,7 @@ import numpy as np
 from figures.computing.images import Shot, compared, stops_of
 from figures.computing.learnt import shape_of
 from figures.computing.scenes import BUNNY, bunny_scene, prepare
-from figures.drawing.image_grid import image_grid
-from figures.drawing.page import page
-from figures.drawing.style import paper, saved
+from figures.drawing.image_files import image_files
 from figures.parts.part import Part, Result, Task
 from halfspace_sss.neural.store import weights_in
 
@@ -104,8 +102,6 @@ def _image(
 
 def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
     """The figure as PDF and PNG, the page to flip between the images, and the numbers as a table."""
-    import pandas
-
     images, scenes, rows = results["bunny"].images, {}, []
     for light in LIGHTS:
         reference = np.maximum(images[_key(light, "converged")], 0)
@@ -119,8 +115,4 @@ def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
                 shots.append(compared(label, gain * image, gain * reference, mask=mask, numbers={}))
                 rows.append({"light": light, "sampler": sampler, "N": n, **shots[-1].numbers})
         scenes[LIGHTS[light]] = shots
-    with paper():
-        files: dict[str, bytes | str] = {f"fig12.{end}": data for end, data in saved(image_grid(scenes)).items()}
-    files["fig12.csv"] = pandas.DataFrame(rows).to_csv(index=False, lineterminator="\n")
-    files["fig12.html"] = page("Fig. 12: one sample a pixel", scenes, notes=NOTES)
-    return files
+    return image_files("fig12", "Fig. 12: one sample a pixel", scenes, rows, NOTES)

@@ -58,8 +58,10 @@ def path_of(path: str | os.PathLike) -> Path:
         ValueError: universal_pathlib is not installed, or no file system has the protocol. The package of the file
             system, such as s3fs, is missed when the path is used.
     """
-    if is_remote(path) or "://" not in str(path):
-        return path if is_remote(path) else Path(path)
+    if is_remote(path):
+        return path
+    if "://" not in str(path):
+        return Path(path)
     try:
         from upath import UPath
     except ImportError as error:

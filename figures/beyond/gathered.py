@@ -12,9 +12,7 @@ from figures.computing.images import FLIP, Shot, compared, cover, noise_of, stop
 from figures.computing.learnt import FULL_GEOMETRY, TRAIN_SECONDS, train_scan, training_of, with_weights
 from figures.computing.scenes import BUNNY, prepare, scan_scene
 from figures.computing.timed import rendered
-from figures.drawing.image_grid import image_grid
-from figures.drawing.page import page
-from figures.drawing.style import paper, saved
+from figures.drawing.image_files import image_files
 from figures.parts.part import Part, Result, Task
 from halfspace_sss import materials
 from halfspace_sss.backend import clock
@@ -83,16 +81,10 @@ def _passes(scene: Any, seconds: float, seed: int, gathers: bool) -> tuple[np.nd
 
 def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
     """The figure as PDF and PNG, the page to flip between the images, and the numbers as a table."""
-    import pandas
-
     scenes = {material: _shots(results, material) for material in MATERIALS}
     rows = [{"material": name, "way": s.label, **s.numbers} for name, shots in scenes.items() for s in shots[1:]]
-    with paper():
-        grid = image_grid(scenes, printed=(FLIP, "spp"))
-        files: dict[str, bytes | str] = {f"gathered.{end}": data for end, data in saved(grid).items()}
-    files["gathered.csv"] = pandas.DataFrame(rows).to_csv(index=False, lineterminator="\n")
-    files["gathered.html"] = page("Walked, sampled and gathered in equal time", scenes, notes=NOTES)
-    return files
+    title = "Walked, sampled and gathered in equal time"
+    return image_files("gathered", title, scenes, rows, NOTES, printed=(FLIP, "spp"))
 
 
 def _shots(results: Mapping[str, Result], material: str) -> list[Shot]:

@@ -199,8 +199,9 @@ class ViewComparison:
 
 def _weights(view: GivenView, loss: str) -> np.ndarray:
     """Of each pixel and channel; 0 where it does not count."""
-    w = np.ones(view.image.shape) if loss == "l2" else None
-    if w is None:
+    if loss == "l2":
+        w = np.ones(view.image.shape)
+    else:
         T = np.maximum(view.image, 0)
         w = 1 / np.square(T + FLOOR * max(float(T[view.counts].mean()) if view.counts.any() else 0.0, 1e-6))
     return np.where(view.counts[..., None], w, 0.0)
