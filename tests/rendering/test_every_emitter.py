@@ -204,6 +204,28 @@ def test_models_of_the_half_space_find_the_light_of_every_emitter(kind: str) -> 
     _model_finds_all_light(kind, "neural")
 
 
+TOGETHER = [("point", "constant"), *(pytest.param(pair, marks=pytest.mark.slow) for pair in (
+    ("directional", "constant"), ("point", "directional"), ("spot", "envmap"), ("directional", "envmap"),
+))]  # fmt: skip
+WAYS = [("bssrdf", "multiple"), *(pytest.param(way, marks=pytest.mark.slow) for way in (
+    ("bssrdf", "single"), ("translucent_walk", "total"),
+))]  # fmt: skip
+
+
+@pytest.mark.parametrize("way", WAYS, ids="-".join)
+@pytest.mark.parametrize("pair", TOGETHER, ids="-".join)
+def test_light_of_two_emitters_is_the_sum_of_that_of_each(pair: tuple[str, str], way: tuple[str, str]) -> None:
+    # light of delta lights beside another emitter was that of two of them in orders from two on
+    integrator, orders = way
+    lights = [EMITTERS[kind]() for kind in pair]
+    scenes = [{"first": lights[0]}, {"second": lights[1]}, {"first": lights[0], "second": lights[1]}]
+    found = [
+        _means(_scene({"type": integrator}, each, orders=orders, model="better_dipole"), 2**9, 500 * k)
+        for k, each in enumerate(scenes)
+    ]
+    _agree(found[2], found[0] + found[1])
+
+
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> Iterator[np.ndarray]:
     """What a short training of the sphere may be off by under even light, of each channel, by its own error."""

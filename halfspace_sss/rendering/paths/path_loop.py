@@ -599,7 +599,7 @@ class Candidate:
     emitter_distance: mi.Float  # of the emitter that d was drawn for; < 0: drawn by the proposals
     delta: mi.Bool  # whether no ray can hit that emitter
     emitter_point: mi.Point3f
-    light: mi.Spectrum  # light of the emitter over the density, where delta
+    light: mi.Spectrum  # light of the emitter, where delta
     target: mi.Float  # resampling target
     by_emitter: mi.Bool  # whether d is drawn by next-event estimation, where there is an entry
     sky_weight: mi.Float  # MIS weight of d among the ways to draw directions of the sky
@@ -678,6 +678,7 @@ def _draw_candidate(
     if share > 0:
         nee = active & by_emitter
         ds, light = sample_emitter(context, at, sampler.next_2d(), False, nee)
+        light = light * dr.detach(ds.pdf)  # the weight has the density, of delta lights the probability of the choice
         with dr.suspend_grad():
             delta, emitter_point = nee & ds.delta, mi.Point3f(ds.p)
             if context.uses_sky(obj):
@@ -689,7 +690,7 @@ def _draw_candidate(
             pdf = dr.select(nee, share * ds.pdf + dr.select(ds.delta, 0, (1 - share) * pdf_proposal), pdf)
             distance = dr.select(nee, dr.select(ds.emitter.is_environment(), dr.inf, ds.dist), distance)
             active = active & (pdf > 0)
-            brightness = dr.select(nee, dr.max(light) * dr.select(ds.delta, 1, ds.pdf), 1)
+            brightness = dr.select(nee, dr.max(light), 1)
 
     # ---- transport and resampling target
     with dr.suspend_grad():
