@@ -146,7 +146,7 @@ def _varied(body, variation):
 def medium_difference(scene, name: str, only: int | None = None) -> tuple[float, float]:
     """Central difference by a coefficient of the medium, with densities held; and the sum of its size over pixels."""
     bodies = scene.integrator().prepare(scene)
-    h = {"albedo": 1e-3, "sigma_t": 5e-3, "g": 4e-3}[name]
+    h = {"albedo": 1e-3, "sigma_t": 1e-2, "g": 4e-3}[name]
     sides = []
     for sign in (1, -1):
         shifted = [_varied(body, Shifted(body, name, sign * h, only)) for body in bodies]

@@ -329,7 +329,7 @@ def _connected(
         first = active & (alone | mi.Bool(context.connects_sky(obj)))
         if context.lights.some_local or context.suns:
             near = active & alone & _near(obj, walk, target.p, active)
-            ways = _ways(context, of, walk, weight, target, (first, near), sampler)
+            ways = _ways(context, obj, walk, weight, target, (first, near), sampler)
         else:
             ways = [_way(context, obj, walk, target, refracted_connection(obj, walk.event, target.p, first))]
     return sum((_light_along(media, weight, target, way) for way in ways), mi.Spectrum(0))
@@ -439,15 +439,15 @@ MIRRORED = 0.5  # probability to start as a flat boundary would reflect
 
 
 def _ways(
-    context: RenderContext, of: tuple[TranslucentObject, Media], walk: _Walk, weight: mi.Spectrum, target: _Target,
+    context: RenderContext, obj: TranslucentObject, walk: _Walk, weight: mi.Spectrum, target: _Target,
     looks: tuple[mi.Bool, mi.Bool], sampler: mi.Sampler,
 ) -> list[_Way]:  # fmt: skip
     """The ways of light of a target: from the first guess, and from random directions, without and with a reflection.
 
     One loop over all, so that a kernel holds Newton's method once. `looks` says where it looks for the first, and for
-    the others.
+    the others. Which are looked for again is decided by the medium itself, also where another is differentiated by.
     """
-    obj, media = of
+    media = _media(obj, walk.medium)
 
     def step(
         kind: mi.UInt32, n: mi.UInt32, sampler: mi.Sampler, counted: mi.Float, seen: tuple, way: _Way, ways: list[_Way]
