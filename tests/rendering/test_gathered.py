@@ -36,11 +36,12 @@ def _lights(name: str) -> dict:
 
 
 def _scene(
-    light: str, model: str = "better_dipole", lights: dict | None = None, shape: dict | None = None, **more: Any
-):
+    light: str, model: str = "better_dipole", lights: dict | None = None, shape: dict | None = None,
+    surface: dict = MEDIUM, **more: Any,
+):  # fmt: skip
     film = {"type": "hdrfilm", "width": 12, "height": 12, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
     view = mi.ScalarTransform4f().look_at([0, 0, 8], [0, 0, 0], [0, 1, 0])
-    surface = {"type": "translucent", **MEDIUM, "model": model, "orders": "multiple", "reflection": False, **more}
+    surface = {"type": "translucent", **surface, "model": model, "orders": "multiple", "reflection": False, **more}
     return mi.load_dict(
         {
             "type": "scene",
@@ -78,6 +79,22 @@ def test_its_pixels_differ_from_the_model_sampled_by_6_percent_at_most(model: st
     a, b, one, two = _pictures(model, light)
     square = ((one - a) * (two - b)).mean(axis=(0, 1))  # noise of the two is independent
     assert (np.sqrt(np.maximum(square, 0)) / a.mean(axis=(0, 1)) < 0.06).all()
+
+
+def test_textures_are_as_bright_as_the_model_sampled_on_both_sides_of_an_edge() -> None:
+    """Each half of a sphere, and its rows beside the edge, which are 40 % off if the medium of the exit is left out."""
+    colours = np.array([[[0.8, 0.5, 0.3], [0.2, 0.6, 0.5]]], np.float32)
+    texels = {"type": "bitmap", "bitmap": mi.Bitmap(colours), "raw": True, "filter_type": "nearest"}
+    painted = {"reflectance": texels, "mfp": "0.8,0.6,0.4", "g": 0.3, "eta": 1.4}
+    pictures = []
+    for light, spp in (("sampled", 2**11), ("gathered", 64)):
+        scene = _scene(light, lights=_lights("lamp"), surface=painted)
+        pictures += [_image(scene, spp, seed) for seed in (1, 2)]
+    rows = np.s_[2:5, 5:6, 6:7, 7:10]
+    a, b, one, two = (np.stack([x[row, 3:9].mean(axis=(0, 1)) for row in rows]) for x in pictures)
+    noise = np.abs(a - b) / 2
+    assert (np.abs((one + two) / (a + b) - 1) < 0.03 + 4 * noise / (a + b)).all()
+    assert np.abs(np.log(a[1] / a[2])).max() > 0.5
 
 
 def test_a_sample_has_a_fiftieth_of_the_variance_at_most() -> None:

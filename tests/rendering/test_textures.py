@@ -146,7 +146,6 @@ def test_a_model_of_a_constant_texture_renders_as_of_a_constant() -> None:
     [
         ("neural_shape", {}, "must be without textures for the model 'neural_shape'"),
         ("full_geometry", {}, "must be without textures for the model 'full_geometry'"),
-        ("better_dipole", {"light": "gathered"}, "light must be sampled for object .*, whose medium has textures"),
     ],
 )
 def test_what_takes_no_textures_refuses_them_by_name(model: str, integrator: dict, message: str) -> None:

@@ -9,6 +9,14 @@ the proposals of the model, with directions at both ends, so that under the same
 unbiased estimate of what the model gives. Where the model knows its directional albedo there (`alpha`), the row is
 normalised by that.
 
+Textures vary over less than the distance of points. The medium at entries is that of their own places, and with the
+reflectance R of the half-space at the exit
+
+    L_o(x_o, w_o) = a(w_o) R(x_o)^e B(x_o),
+
+e per channel with which what leaves under the same light from everywhere is smoothest: 1/2 where light comes from
+further than from the next point, as models take the medium at both ends, up to 1.
+
 a(mu) = F_t(mu) (c_0 + c_1 mu + c_2 mu²) per channel is fitted to samples of all points.
 """
 
@@ -105,6 +113,7 @@ class Transfer:
         inverse: (points, 3, 3) of the covariance of d_o.
         albedo: a.
         error: standard error of the sums of rows over their mean, worst channel, root mean square.
+        e: exponent of the reflectance at the exit, per channel.
     """
 
     points: SurfacePoints
@@ -116,6 +125,7 @@ class Transfer:
     inverse: np.ndarray
     albedo: Albedo
     error: float
+    e: np.ndarray
 
     @property
     def nbytes(self) -> int:
@@ -164,10 +174,18 @@ def transfer(obj: TranslucentObject, count: int | None = None, samples: int = SA
     points = SurfacePoints.of(obj.geometry, count or count_of(obj))
     each = max(samples // len(points), 16)
     result = drawn(obj, points, lambda p, n, _, active: points.nearest(p, n, active), each, seed)
-    t, error = _rows(points, result.S, _trusted(obj), result.a)
+    e = _exponents(points, result)
+    t, error = _rows(points, result.S / (result.paint**e)[:, None], _trusted(obj), result.a)
     near = np.where(result.known, result.near, np.arange(len(points), dtype=np.uint32)[:, None])
     centred = _centred(result.w_o, result.a.mean(axis=2))
-    return Transfer(points, near, t, result.w_i, *centred, result.albedo, error)
+    return Transfer(points, near, t, result.w_i, *centred, result.albedo, error, e)
+
+
+def _exponents(points: SurfacePoints, found: DrawnEntries) -> np.ndarray:
+    """e of each channel, by what reflectance and light of points are over those of their neighbours."""
+    light = found.S.sum(axis=1) / np.maximum(found.a.sum(axis=1), 1e-30)
+    x, y = (v - points.smoothed(v) for v in (np.log(found.paint), np.log(np.maximum(light, 1e-30))))
+    return np.clip((x * y).sum(axis=0) / np.maximum((x * x).sum(axis=0), 1e-12), 0, 1).astype(np.float32)
 
 
 class DrawnEntries(NamedTuple):
@@ -180,6 +198,7 @@ class DrawnEntries(NamedTuple):
         w_i, w_o: directions.
         a: directional albedo at the exit, per channel.
         albedo: fitted to them.
+        paint: reflectance of the medium at the point, per channel, where media have textures; else 1.
     """
 
     S: np.ndarray
@@ -190,6 +209,7 @@ class DrawnEntries(NamedTuple):
     w_o: np.ndarray
     a: np.ndarray
     albedo: Albedo
+    paint: np.ndarray
 
 
 def drawn(obj: TranslucentObject, points: SurfacePoints, cell: Callable, n: int, seed: int = SEED) -> DrawnEntries:
@@ -202,10 +222,12 @@ def drawn(obj: TranslucentObject, points: SurfacePoints, cell: Callable, n: int,
     jitter = dr.gather(mi.Point2f, shift, j * n)
     u = [dr.fma(mi.Float(s), r, x) for r, x in zip(R_2, (jitter.x, jitter.y))]
     out, face = points.exit(j, mi.Point2f(*(x - dr.floor(x) for x in u)))
+    out = obj.knowing(out, face)
     S, inverse, entry, w_i = _sample(obj, out, face, sampler, active)
     near, known = cell(entry.p, entry.n, entry.face, entry.weight > 0)
     mu, mu_i = dr.dot(out.w, out.n_out), cosine(w_i, entry.n, entry.n_out)
-    dr.eval(S, inverse, near, known, mu, mu_i, w_i)
+    paint = mi.Spectrum(1) if obj.textured is None else obj.transport.paint(out)
+    dr.eval(S, inverse, near, known, mu, mu_i, w_i, paint)
     shape = (len(points), n)
     S = np.array(S, dtype=np.float32).reshape(-1, *shape).transpose(1, 2, 0)
     S = np.nan_to_num(S, nan=0.0, posinf=0.0, neginf=0.0)
@@ -213,7 +235,9 @@ def drawn(obj: TranslucentObject, points: SurfacePoints, cell: Callable, n: int,
     a = np.array(albedo(mu)).T.reshape(S.shape)
     h = np.array(albedo(mu_i) * (mu_i * inverse)).T.reshape(S.shape) / albedo.whole.astype(np.float32)
     w_i, w_o = (np.array(w, dtype=np.float32).T.reshape(*shape, 3) for w in (w_i, out.w))
-    return DrawnEntries(S, h, np.array(near).reshape(shape), np.array(known).reshape(shape), w_i, w_o, a, albedo)
+    paint = np.broadcast_to(np.array(paint), (S.shape[2], len(mu)))[:, ::n].T
+    near, known = (np.array(v).reshape(shape) for v in (near, known))
+    return DrawnEntries(S, h, near, known, w_i, w_o, a, albedo, np.maximum(paint, 1e-20))
 
 
 def _centred(w: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -396,6 +396,12 @@ class TranslucentObject:
             return self.spectral.at_exit(si)
         return () if self.textured is None else self.textured.at(si)
 
+    def knowing(self, at: SurfacePoint, face: mi.UInt32, active: mi.Bool = True) -> SurfacePoint:
+        """A point of its surface on a face with the medium there, where that has textures."""
+        if self.textured is None:
+            return at
+        return at._replace(medium=self.textured.at_point(self.geometry, at.p, at.n, face, active))
+
     @functools.cached_property
     def points(self) -> AreaPoints:
         """Uniform points of its surface."""

@@ -23,12 +23,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from halfspace_sss import measure
 from halfspace_sss.interface.model import BSSRDF, bssrdf
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.object.half_space import HalfSpaceProposals, area_share
@@ -52,6 +54,7 @@ LEAST = 1e-4  # albedo that stands for less at nodes
 MOST = 1 - 1e-6  # above which S has no derivative by it, as dv is infinite
 SLOPED = ("albedo", "sigma_t")
 STEP = 0.01  # of ln sigma_t, for its slope
+SEEN = 0.7  # cosine at which reflectances of nodes are known
 FAINT = 1e-35  # of S, below which it is interpolated itself
 Varied = TexturedMedium | MediumByWavelength
 LEVELS = (0.0, 0.5, 1.0)  # quantiles of albedo and extinction in the radial density of entries
@@ -164,17 +167,15 @@ class Palette:
             albedo, sigma_t = (
                 dr.select(first, _pick(getattr(ends[0], key), c), _pick(getattr(ends[-1], key), c)) for key in SLOPED
             )
-            node, cells, low, per_step, g, bent = (dr.gather(mi.Float, table, c) for table in tables)
+            per_step, numbers = dr.gather(mi.Float, tables[3], c), [dr.gather(mi.Float, table, c) for table in tables]
             albedo = dr.clip(albedo, 0, 1)
-            t = dr.clip((_v(dr.maximum(albedo, LEAST), g, bent) - low) * per_step, 0, cells)
-            cell = dr.minimum(dr.floor(t), cells - 1)
+            node, f = _node(albedo, numbers)
 
             def pair(factor: float) -> tuple[mi.Float, mi.Float]:
-                at = query[0] * sigma_t * factor
-                return self._nodes(mi.UInt32(node + cell), t - cell, (at, *query[1:]), active)
+                return self._nodes(node, f, (query[0] * sigma_t * factor, *query[1:]), active)
 
             a, b = pair(1.0)
-            S, f = _between(a, b, t - cell), t - cell
+            S = _between(a, b, f)
             S = dr.square(sigma_t) * albedo**self.power * S
             root = S if len(ends) == 1 else dr.sqrt(S)
             if slopes:
@@ -194,6 +195,22 @@ class Palette:
         slopes = [dr.zeros(Slope, lanes) for _ in range(2 * n)] if by_albedo or by_sigma_t else []
         start = mi.UInt32(0) + dr.zeros(mi.UInt32, lanes), dr.full(mi.Spectrum, 1, lanes), slopes
         return dr.while_loop(start, lambda k, *_: active & (k < len(ends) * n), step, label="ends and channels")[1:]
+
+    def reflectance(self, albedo: mi.Spectrum) -> mi.Spectrum:
+        """Of half-spaces of the orders of the models, at one cosine, interpolated as S is."""
+        results = []
+        for c, value in enumerate(albedo):
+            value = dr.clip(value, 0, 1)
+            k, f = _node(value, [opaque(v) for v in self._numbers(c)])
+            a, b = (dr.gather(mi.Float, self._reflectances, dr.minimum(k + j, len(self.models) - 1)) for j in (0, 1))
+            results.append(dr.exp(dr.lerp(a, b, f)) * value**self.power)
+        return mi.Spectrum(results)
+
+    @cached_property
+    def _reflectances(self) -> mi.Float:
+        """ln(R / albedo^p) of all nodes."""
+        R = [measure.reflectance(m, SEEN) / float(m.medium.albedo) ** self.power for m in self.models]
+        return mi.Float(np.log(R).astype(np.float32))
 
     def _numbers(self, c: int) -> tuple[float, ...]:
         row, g = self.rows[c], self.g[c]
@@ -230,6 +247,14 @@ class Palette:
             needed = active & (weight > 0)
             total, *_ = dr.if_stmt((total, weight, query), needed, add, lambda *state: state, label="node")
         return dr.exp(total)
+
+
+def _node(albedo: mi.Float, numbers: Sequence[mi.Float]) -> tuple[mi.UInt32, mi.Float]:
+    """The node below an albedo in [0, 1], and the share of the way to the next, for `Palette._numbers`."""
+    first, cells, low, per_step, g, bent = numbers
+    t = dr.clip((_v(dr.maximum(albedo, LEAST), g, bent) - low) * per_step, 0, cells)
+    cell = dr.minimum(dr.floor(t), cells - 1)
+    return mi.UInt32(first + cell), t - cell
 
 
 def _between(a: mi.Float, b: mi.Float, f: mi.Float) -> mi.Float:
@@ -295,6 +320,10 @@ class PaletteTransport:
             above = active & (at.mu > 0) & (query[3] > 0)
         ends = self.medium.ends(self.obj, exit, at, above)
         return dr.select(above, self.palette.S(ends, query, above), 0)
+
+    def paint(self, at: SurfacePoint) -> mi.Spectrum:
+        """See `Transport`."""
+        return self.palette.reflectance(at.medium.albedo)
 
 
 def palette_model(

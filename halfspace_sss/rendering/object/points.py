@@ -337,6 +337,9 @@ class Transport(Protocol):
             active: mask of lanes.
         """
 
+    def paint(self, at: SurfacePoint) -> mi.Spectrum:
+        """The reflectance of the half-space of the medium at an exit; only of objects with textures."""
+
 
 class ObjectModel(NamedTuple):
     """What renders an object inside: a transport, the proposals that suit it, and how many entries an exit draws."""

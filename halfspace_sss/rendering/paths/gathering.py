@@ -21,7 +21,7 @@ import numpy as np
 from halfspace_sss.backend import clock
 from halfspace_sss.rendering.gathered.points import SurfacePoints
 from halfspace_sss.rendering.gathered.transfer import SAMPLES, SEED, Albedo, Incident, Transfer, cosine, transfer
-from halfspace_sss.rendering.object.points import cosine_above, place
+from halfspace_sss.rendering.object.points import cosine_above, opaque, place
 from halfspace_sss.rendering.object.shape import same_objects, state_of
 from halfspace_sss.rendering.paths.lighting import mis_weight
 from halfspace_sss.rendering.paths.path_loop import trace_paths
@@ -65,6 +65,8 @@ class Gathered:
         B = mi.Spectrum([b + x * out.w.x + y * out.w.y + z * out.w.z for b, x, y, z in rows])
         mu = dr.dot(out.w, out.n_out)
         a = self.transfer.albedo(dr.maximum(mu, 0))
+        if self.object.textured is not None:
+            a *= self.object.transport.paint(out) ** mi.Spectrum([opaque(v) for v in self.transfer.e])
         alpha = self.object.transport.alpha
         if alpha is not None:
             known = alpha.known[1]
@@ -161,8 +163,6 @@ def _check(obj: TranslucentObject) -> None:
         raise ValueError(f"light must be sampled for object {result.name}, which {lacks}, got gathered")
     if obj.surface.inside.varying is not None:
         raise ValueError(f"light must be sampled for object {result.name}, whose medium varies, got gathered")
-    if obj.textured is not None:
-        raise ValueError(f"light must be sampled for object {result.name}, whose medium has textures, got gathered")
 
 
 def light_state(scene: mi.Scene) -> tuple[list, list]:
