@@ -7,7 +7,7 @@ reflected at the boundary by Fresnel as often as it takes, and leaves. After k =
 
 p the density of the walk; the factors eta² of radiance cancel, and Fresnel's inside with the chance to be reflected.
 Whether a segment is passed, and where and how the walk is scattered, is drawn for the channels by their weights f_c so
-far.
+far. Of events some are drawn nearer the boundary, and of directions some towards it: that light is little attenuated.
 
 Light of emitters and suns that reaches the event after one reflection or none is found by emitter connections: rays
 that are refracted towards a sampled point of them, where Newton's method finds some. Connections with an uneven sky,
@@ -33,6 +33,8 @@ from halfspace_sss.rendering.object.textured import SurfaceMedium
 from halfspace_sss.rendering.paths.lighting import RenderContext, delta_light, mis_weight, sample_emitter
 
 MOST_SEGMENTS = 256
+EARLY = 0.5  # probability of an event drawn by twice sigma_t: light has the way out to go as well
+OUTWARDS = 0.3  # probability of a direction drawn from those that leave by the boundary behind
 FAINT = 0.1  # weight below which a scattered walk may end
 GRAZES = 0.05  # cosine at an emitter up to which its points are left to chance: their density over the area goes to 0
 FOCUS = 100.0  # of the straight way into solid angle at the event; points of caustics beyond are left to chance
@@ -84,6 +86,7 @@ class _Walk:
     cosine: mi.Float  # of the scattering angle
     event: mi.Point3f  # the scattering event
     event_d: mi.Vector3f  # direction of arrival there
+    event_n: mi.Normal3f  # of the boundary that was left last, outwards
     event_length: mi.Float  # Λ there
     event_inverse_pdf: mi.Float  # 1 / p there, before the phase function
     reflections: mi.UInt32  # at the boundary, since the event
@@ -149,8 +152,8 @@ def _walk(obj: TranslucentObject, refracted: RefractedRay, sampler: mi.Sampler, 
     skip = _clear(obj, refracted.out.n, refracted.d)
     start = _Walk(
         p, mi.Vector3f(refracted.d), mi.Normal3f(refracted.out.n), mi.Float(skip), zero, mi.Float(1), mi.UInt32(0),
-        zero, mi.Point3f(p), mi.Vector3f(refracted.d), zero, zero, mi.UInt32(0), mi.Bool(False), mi.Bool(active),
-        refracted.out.medium,
+        zero, mi.Point3f(p), mi.Vector3f(refracted.d), mi.Normal3f(refracted.out.n), zero, zero, mi.UInt32(0),
+        mi.Bool(False), mi.Bool(active), refracted.out.medium,
     )  # fmt: skip
 
     def step(k: mi.UInt32, sampler: mi.Sampler, passing: mi.Float, walk: _Walk) -> tuple:
@@ -181,7 +184,7 @@ def _step(
     passing = dr.select(k == 0, passing, dr.sum(W * T) / dr.maximum(dr.sum(W), 1e-30))
     first = walk.order == 0
     scatters = first & (sampler.next_1d() >= passing)
-    scattered = _scatter(media, walk, (W, 1 - T), dr.maximum(1 - passing, 1e-7), sampler)
+    scattered = _scatter(of, walk, (W, 1 - T), dr.maximum(1 - passing, 1e-7), sampler)
     met = replace(
         walk, length=walk.length + length, inverse_pdf=walk.inverse_pdf / dr.select(first, passing, 1)
     )  # fmt: skip
@@ -199,33 +202,62 @@ def _blocked(obj: TranslucentObject, p: mi.Point3f, d: mi.Vector3f, length: mi.F
 
 
 def _scatter(
-    media: Media, walk: _Walk, weights: tuple[mi.Spectrum, mi.Spectrum], scattering: mi.Float, sampler: mi.Sampler
-) -> _Walk:
+    of: tuple[TranslucentObject, Media], walk: _Walk, weights: tuple[mi.Spectrum, mi.Spectrum], scattering: mi.Float,
+    sampler: mi.Sampler,
+) -> _Walk:  # fmt: skip
     """The event on this segment, which happens with the probability `scattering`.
 
     `weights` are f_c / p and the chance of channel c to be scattered on the segment.
     """
-    # ---- distance s by the coefficient of a channel; density by the mean over channels
-    sigma_t, g, (W, ends) = _column(media, 1), _column(media, 2), weights
+    # ---- distance s by once or twice the coefficient of a channel; density by the mean over both and channels
+    (obj, media), (W, ends) = of, weights
+    sigma_t, g = _column(media, 1), _column(media, 2)
     u, v, channel, chance = sampler.next_1d(), sampler.next_2d(), sampler.next_2d(), W * ends
-    rate = dr.maximum(_pick(sigma_t, chance, channel.x), 1e-12)
-    s = -dr.log(1 - u * dr.minimum(_pick(ends, chance, channel.x), 1 - 1e-7)) / rate
-    density = dr.sum(W * sigma_t * dr.exp(-sigma_t * s)) / dr.maximum(dr.sum(chance), 1e-30)
-    inverse_pdf = walk.inverse_pdf / dr.maximum(density * scattering, 1e-30)
+    rate, end = dr.maximum(_pick(sigma_t, chance, channel.x), 1e-12), _pick(ends, chance, channel.x)
+    early = sampler.next_1d() < EARLY
+    rate, end = rate * dr.select(early, 2, 1.0), end * dr.select(early, 2 - end, 1.0)
+    s = -dr.log(1 - u * dr.minimum(end, 1 - 1e-7)) / rate
+    passed = dr.exp(-sigma_t * s)
+    density = W * sigma_t * passed * (1 - EARLY + 2 * EARLY * passed / (2 - ends))
+    density = dr.sum(density) / dr.maximum(dr.sum(chance), 1e-30) * scattering
+    inverse_pdf = walk.inverse_pdf / dr.maximum(density, 1e-30)
 
-    # ---- direction by the phase function of a channel; density likewise
+    # ---- direction by the phase function of a channel, or outwards; density likewise
     W = _contribution(media, walk.length + s, mi.UInt32(1), None) * inverse_pdf
-    cosine = sample_hg(v.x, _pick(g, W, channel.y))
-    phase = dr.sum(W * _spectrum([eval_hg(cosine, m[2]) for m in media])) / dr.maximum(dr.sum(W), 1e-30)
+    outwards, least = sampler.next_1d() < OUTWARDS, _least_outwards(obj)
+    cosine = dr.select(outwards, 1 - v.x * (1 - least), sample_hg(v.x, _pick(g, W, channel.y)))
     sine, (sin_phi, cos_phi) = dr.safe_sqrt((1 - cosine) * (1 + cosine)), dr.sincos(2 * dr.pi * v.y)
-    d = mi.Frame3f(walk.d).to_world(mi.Vector3f(sine * cos_phi, sine * sin_phi, cosine))
+    axis = dr.select(outwards, mi.Vector3f(walk.n), walk.d)
+    d = mi.Frame3f(axis).to_world(mi.Vector3f(sine * cos_phi, sine * sin_phi, cosine))
     p, length = mi.Point3f(walk.o + walk.d * s), walk.length + s
+    pdf = _direction_pdf(of, W, dr.dot(walk.d, d), dr.dot(walk.n, d))
     return replace(
         walk, o=p, d=mi.Vector3f(d), skip=mi.Float(0), length=length,
-        inverse_pdf=inverse_pdf / dr.maximum(phase, 1e-30), order=mi.UInt32(1), cosine=mi.Float(cosine), event=p,
-        event_d=mi.Vector3f(walk.d), event_length=length, event_inverse_pdf=inverse_pdf, reflections=mi.UInt32(0),
+        inverse_pdf=inverse_pdf / dr.maximum(pdf, 1e-30), order=mi.UInt32(1), cosine=mi.Float(dr.dot(walk.d, d)),
+        event=p, event_d=mi.Vector3f(walk.d), event_n=mi.Normal3f(walk.n), event_length=length,
+        event_inverse_pdf=inverse_pdf, reflections=mi.UInt32(0),
         alive=walk.alive & (dr.sum(W) > 0) & (dr.sum(chance) > 0),
     )  # fmt: skip
+
+
+def _least_outwards(obj: TranslucentObject) -> mi.Float:
+    """The cosine to the normal from which on a flat boundary lets light out."""
+    return dr.safe_sqrt(1 - 1 / dr.square(obj.eta))
+
+
+def _direction_pdf(
+    of: tuple[TranslucentObject, Media], W: mi.Spectrum, cosine: mi.Float, outwards: mi.Float
+) -> mi.Float:
+    """Density of the direction of an event, 1/sr.
+
+    Args:
+        W: weights of the channels.
+        cosine, outwards: of the direction to that of arrival and to the normal outwards.
+    """
+    (obj, media) = of
+    least = _least_outwards(obj)
+    phase = dr.sum(W * _spectrum([eval_hg(cosine, m[2]) for m in media])) / dr.maximum(dr.sum(W), 1e-30)
+    return (1 - OUTWARDS) * phase + dr.select(outwards > least, OUTWARDS / (2 * dr.pi * (1 - least)), 0)
 
 
 def _meet_boundary(of: tuple[TranslucentObject, Media], walk: _Walk, met: tuple, sampler: mi.Sampler) -> _Walk:
@@ -357,11 +389,10 @@ def _way(context: RenderContext, obj: TranslucentObject, walk: _Walk, target: _T
 
 
 def _phase_pdf(obj: TranslucentObject, walk: _Walk, met: Connection) -> mi.Float:
-    """Density of the direction of a connection by the phase function, 1/sr inside, see `_scatter`."""
+    """Density of the direction of a connection by chance, 1/sr inside, see `_scatter`."""
     media = _media(obj, walk.medium)
     W = _contribution(media, walk.event_length, mi.UInt32(1), None)
-    cosine = dr.dot(walk.event_d, met.d)
-    return dr.sum(W * _spectrum([eval_hg(cosine, m[2]) for m in media])) / dr.maximum(dr.sum(W), 1e-30)
+    return _direction_pdf((obj, media), W, dr.dot(walk.event_d, met.d), dr.dot(walk.event_n, met.d))
 
 
 def _sky_pdf(obj: TranslucentObject, walk: _Walk, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
