@@ -74,6 +74,7 @@ def learnt_model(obj: TranslucentObject, settings: Settings) -> ObjectModel:
 
 
 learnt_model.takes_contents = True
+learnt_model.takes_textures = True
 
 # ----------------------------------------------------------------------------------------------------
 # The network of all shapes in a scene: transport, entries by probes and over the area, and warnings out of range.

@@ -39,8 +39,8 @@ STAGES = {
 }
 NOTES = (
     "All images contain all scattering orders. The head's reflectance is a bitmap by uv, the leaf's an attribute of "
-    "vertices: the walk takes the medium of its exit for the whole way, half-space models that of both ends; "
-    "full_geometry refuses textures. The stone in the jelly is opaque: half-space models refuse it, "
+    "vertices: the walk takes the medium of its exit for the whole way, half-space models that of both ends. "
+    "The stone in the jelly is opaque: half-space models refuse it, "
     "full_geometry learnt jelly and stone. FLIP and relative squared error of the pixels of the object; the noise of "
     "both images is in them."
 )

@@ -31,7 +31,7 @@ from halfspace_sss.interface.model import bssrdf
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.rendering.object.half_space import HalfSpaceTransport
-from halfspace_sss.rendering.object.objects import TranslucentObject, object_of, refuse
+from halfspace_sss.rendering.object.objects import TranslucentObject, object_of, refuse, refuse_textures
 from halfspace_sss.rendering.object.points import SurfacePoint, Transport
 from halfspace_sss.rendering.object.registry import lookup, model_names
 from halfspace_sss.rendering.object.settings import Settings
@@ -315,6 +315,8 @@ def transport_of(obj: TranslucentObject, model: str, folder: str | os.PathLike |
         refuse(contents.found[0], obj.geometry, f"the model {model!r}")
     if model == KIND:
         return load(find_weights(obj, folder), obj).model
+    if obj.textured is not None:
+        refuse_textures(obj.geometry.name, f"errors of {model!r}")
     if not entry.knows_objects:
         return HalfSpaceTransport([bssrdf(model, m) for m in obj.media])
     transport = entry.transport(obj, Settings()).transport if entry.transport else None

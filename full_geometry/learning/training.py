@@ -170,7 +170,8 @@ class CameraExits:
         for part, a, b in zip(with_exits, ends, ends[1:]):
             own = chosen[(chosen >= a) & (chosen < b)] - a
             if len(own):
-                parts.append(_points(part.gather(_lanes(own))))
+                starts, ends = _points(part.gather(_lanes(own)))
+                parts.append((self.source.object.knowing(starts), ends))
         dr.eval(parts)
         return parts
 

@@ -21,6 +21,7 @@ from full_geometry.object.features import (
     PreparedExit,
     Quadratic,
     Side,
+    entered,
     entering,
     first_event,
     n_local,
@@ -33,6 +34,7 @@ from halfspace_sss.interface.model import BSSRDF, bssrdf
 from halfspace_sss.neural.perceptron import Perceptron
 from halfspace_sss.physics import fresnel
 from halfspace_sss.rendering.object.objects import TranslucentObject
+from halfspace_sss.rendering.object.palette import palette_of
 from halfspace_sss.rendering.object.points import SurfacePoint, opaque, plane_query
 
 FLOOR = 1e-2  # reflectance of the floor, over that of the half-space
@@ -40,6 +42,8 @@ FLOOR = 1e-2  # reflectance of the floor, over that of the half-space
 
 class HalfSpace:
     """S_0 P_o P_i per channel, S_0 the model of the plane plus a floor that does not depend on the positions.
+
+    Where media have textures S_0 is that of the medium of the exit, and the floor a share of its reflectance.
 
     Args:
         obj: the object.
@@ -50,6 +54,7 @@ class HalfSpace:
     def __init__(self, obj: TranslucentObject, model: str, floor: float = FLOOR) -> None:
         self.object, self.name, self.floor = obj, model, floor
         self.models: list[BSSRDF] = [bssrdf(model, m) for m in obj.media]
+        self.palette = None if obj.textured is None else palette_of(model, obj.geometry, obj.media, obj.textured)
 
     @functools.cached_property
     def floors(self) -> list[float]:
@@ -70,12 +75,21 @@ class HalfSpace:
     def __call__(self, exit: Side, entry: Side, active: Any = True) -> Any:
         """1/((scene unit)² sr), 0 below the horizons."""
         query, F_t, above = self.query(exit.at, entry.at)
-        S_0 = mi.Spectrum([m.eval(*query) + F_t * G for m, G in zip(self.models, self.added(exit, entry))])
+        if self.palette is None:
+            values = [m.eval(*query) for m in self.models]
+        else:
+            values = self.palette.S([exit.at.medium], query, above & active)
+        S_0 = mi.Spectrum([value + F_t * G for value, G in zip(values, self.added(exit, entry))])
         return dr.select(above, S_0 * exit.event.P * entry.event.P, 0)
 
     def added(self, exit: Side, entry: Side) -> list[Any]:
         """Per channel what stands beside the plane, over F_t(w_o) P_o F_t(w_i) P_i."""
-        return [opaque(floor) for floor in self.floors]
+        floors = [opaque(floor) for floor in self.floors]
+        if self.palette is None:
+            return floors
+        R = self.palette.reflectance(exit.at.medium.albedo)
+        means = self.palette.reflectance(mi.Spectrum([opaque(m.albedo) for m in self.object.media]))
+        return [floor * value / dr.maximum(mean, 1e-20) for floor, value, mean in zip(floors, R, means)]
 
     def query(self, o: SurfacePoint, i: SurfacePoint) -> tuple[tuple, Any, Any]:
         """The query of the models, both Fresnel transmittances, and whether both directions are above the horizons."""
@@ -201,13 +215,17 @@ class FullGeometry:
             at: entry, with w_i.
             active: mask of lanes.
         """
-        entry, net = self.base.end(at, active), self._network
+        entry, net = self.base.end(entered(at, exit.side.at), active), self._network
         features, h = self._end(entry)
         features += pair_features(self.frame, exit.side, entry)
         f = mi.Spectrum(net.rest(net.activation(net.first(1, features) + net.vector(exit.hidden))))
         f += mi.Spectrum(exit.h) + mi.Spectrum(h)
         S_0 = self.base(exit.side, entry, active)
         return dr.select(active, S_0 * dr.exp(BOUND * dr.tanh(f / BOUND)), 0)
+
+    def paint(self, at: SurfacePoint) -> Any:
+        """See `rendering.object.points.Transport`."""
+        return self.base.palette.reflectance(at.medium.albedo)
 
     def _end(self, side: Side) -> tuple[list[Any], list[Any]]:
         """Features of one end and what uniform light makes of them; h."""

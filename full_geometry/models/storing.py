@@ -24,7 +24,7 @@ from halfspace_sss.interface.model import bssrdf
 from halfspace_sss.neural.store import load_weights, save_weights, weights_folder
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.provenance import path_of
-from halfspace_sss.rendering.object.objects import TranslucentObject
+from halfspace_sss.rendering.object.objects import TranslucentObject, refuse_textures
 from halfspace_sss.rendering.object.points import opaque
 from halfspace_sss.rendering.object.shape import name_of
 from halfspace_sss.rendering.object.translucent import Inside
@@ -52,6 +52,7 @@ class Identity:
         grids: digest of the voxels of a medium that varies.
         probes: coefficients of a medium that varies, see `_probed`.
         contents: digest of shapes inside it, their surfaces and media, without their places.
+        textures: digest of the textures of its medium, and of uv and attributes.
     """
 
     kind: str
@@ -61,11 +62,12 @@ class Identity:
     grids: str = ""
     probes: np.ndarray | None = None
     contents: str = ""
+    textures: str = ""
 
     def digest(self) -> str:
         """A name for shape, its handedness, ratios of the medium and what lies inside, without sizes and places."""
         keys = ("g", "eta") if self.grids else ("albedo", "g", "eta")  # an equivalent is known up to its sampling
-        ratios = [digest for digest in (self.grids, self.contents) if digest]
+        ratios = [digest for digest in (self.grids, self.contents, self.textures) if digest]
         ratios += [f"{v:.6g}" for key in keys for v in np.atleast_1d(self.medium[key])]
         return hashlib.sha256("|".join([self.kind, self.topology, self._hand(), *ratios]).encode()).hexdigest()[:12]
 
@@ -79,7 +81,7 @@ class Identity:
     def record(self) -> dict[str, Any]:
         """Everything but the anchors and probes, ready for JSON."""
         kept = {"kind_of_shape": self.kind, "topology": self.topology, "medium": self.medium, "grids": self.grids}
-        return {**kept, "contents": self.contents} if self.contents else kept
+        return kept | {key: getattr(self, key) for key in ("contents", "textures") if getattr(self, key)}
 
     def pose(self, other: Identity) -> tuple[np.ndarray, np.ndarray]:
         """R and t with R x + t = y for the points x of this object and y of the other, which is the same one moved.
@@ -89,7 +91,7 @@ class Identity:
         """
         pairs = (
             ("kind", "shape", "without faces"), ("topology", "mesh", "without faces"), ("grids", "grids", "none"),
-            ("contents", "what lies inside", "nothing"),
+            ("contents", "what lies inside", "nothing"), ("textures", "textures", "none"),
         )  # fmt: skip
         for key, name, none in pairs:
             mine, theirs = getattr(self, key), getattr(other, key)
@@ -138,7 +140,8 @@ def identify(obj: TranslucentObject) -> Identity:
     grids, probes = _digest_of_grids(obj), _probed(obj, anchors)
     contents, more = _contents(obj, anchors)
     anchors = np.concatenate([anchors, *more]).astype(np.float32)
-    return Identity(obj.geometry.shape.class_name(), topology, anchors, medium, grids, probes, contents)
+    kind = obj.geometry.shape.class_name()
+    return Identity(kind, topology, anchors, medium, grids, probes, contents, _digest_of_textures(obj))
 
 
 def _anchored(shape: mi.Shape) -> tuple[str, np.ndarray]:
@@ -185,15 +188,29 @@ def _contents(obj: TranslucentObject, anchors: np.ndarray) -> tuple[str, list[np
 
 def _surface(shape: mi.Shape, inside: Inside | None, sigma_t: float) -> str:
     """Of its BSDF and colours, or of its boundary and medium; names of materials and models do not count."""
-    bsdf, painted = shape.bsdf(), hashlib.sha256()
+    bsdf = shape.bsdf()
     if inside is not None:
         m = inside.medium
         numbers = np.concatenate([np.ravel(v) for v in (m.albedo, m.g, m.sigma_t / max(sigma_t, 1e-30), m.eta)])
         return f"{object_digest(bsdf.boundary)} {[f'{v:.6g}' for v in numbers]}"
+    return f"{object_digest(bsdf)} {_painted(shape)} {shape.has_flipped_normals()}"
+
+
+def _painted(shape: mi.Shape) -> str:
+    """Digest of uv and attributes."""
+    painted = hashlib.sha256()
     for key, value in sorted(mi.traverse(shape).items()):
         if key.startswith(("vertex_", "face_")) and key not in ("vertex_positions", "vertex_normals", "vertex_count"):
             painted.update(key.encode() + np.array(value).tobytes())
-    return f"{object_digest(bsdf)} {painted.hexdigest()} {shape.has_flipped_normals()}"
+    return painted.hexdigest()
+
+
+def _digest_of_textures(obj: TranslucentObject) -> str:
+    """Empty for a medium without; what is constant, and the scale, are in the means."""
+    if obj.textured is None:
+        return ""
+    words = [f"{name} {object_digest(texture)}" for name, texture in obj.textured.textures.items()]
+    return hashlib.sha256("|".join([*words, _painted(obj.geometry.shape)]).encode()).hexdigest()[:16]
 
 
 def _as_trained(obj: TranslucentObject, medium: dict[str, Any]) -> TranslucentObject:
@@ -356,12 +373,12 @@ def nearest(
     """Weights of the same shape with the medium that is most alike, from which a training may start; None without any.
 
     Args:
-        obj: the object, of a homogeneous medium, with nothing inside.
+        obj: the object; weights are of homogeneous media with nothing inside.
         recipe: of its training; sizes and base model must be those of the weights.
         folder: of weights.
     """
     here, found = identify(obj), []
-    if here.grids or here.contents:
+    if here.grids or here.contents or here.textures:
         return None
     for path in path_of(folder or weights_folder()).glob(f"{KIND}-*.safetensors"):
         try:
@@ -370,7 +387,8 @@ def nearest(
             _checked_base(path, record, obj)
         except ValueError:
             continue
-        same = identity.kind == here.kind and identity.topology == here.topology and not identity.contents
+        same = identity.kind == here.kind and identity.topology == here.topology
+        same = same and not (identity.contents or identity.textures)
         alike = all(record["recipe"].get(key) == recipe[key] for key in ("width", "depth", "base_model"))
         apart = _apart(identity.medium, here.medium)
         if same and np.allclose(R, np.eye(3), atol=1e-3) and alike and apart <= MOST_APART:
@@ -408,7 +426,8 @@ def _trained(path: Path) -> tuple[Identity, dict[str, np.ndarray], dict[str, Any
         anchors, grids = arrays.pop("anchors"), record.get("grids", "")
         probes = arrays.pop("probes") if grids else None
         kind, topology, medium = record["kind_of_shape"], record["topology"], dict(record["medium"])
-        identity = Identity(kind, topology, anchors, medium, grids, probes, record.get("contents", ""))
+        more = (record.get(key, "") for key in ("contents", "textures"))
+        identity = Identity(kind, topology, anchors, medium, grids, probes, *more)
         if {"albedo", "g", "eta", "size_in_mfp"} - set(identity.medium):
             raise KeyError("medium")
     except (KeyError, TypeError, ValueError) as error:
@@ -462,6 +481,8 @@ def base_model(obj: TranslucentObject, name: str) -> BaseModel:
     Raises:
         ValueError: there is no such model, or it does not take the medium.
     """
+    if name == shapes.KIND and obj.textured is not None:
+        refuse_textures(obj.geometry.name, f"the base model {name!r}")
     return shapes.transport(obj) if name == shapes.KIND else HalfSpace(obj, name)
 
 

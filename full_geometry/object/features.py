@@ -51,7 +51,8 @@ CELLS, FIRST_CELL = 12, 0.25  # of a march; the first one in mean free paths
 class FirstEvent(NamedTuple):
     """P per channel; y and the mean length of the way there, means over channels weighted by P; both per channel.
 
-    Of a medium that varies also `local`: logarithms of its coefficients where light enters and at y.
+    Also `local`: of a medium that varies logarithms of its coefficients where light enters and at y, of one with
+    textures those of the exit.
     """
 
     P: Any
@@ -62,7 +63,7 @@ class FirstEvent(NamedTuple):
     local: tuple[Any, ...] = ()
 
 
-def flight(obj: TranslucentObject, o: Any, d: Any, l: Any) -> tuple[Any, Any]:  # noqa: E741
+def flight(obj: TranslucentObject, o: Any, d: Any, l: Any, sigma_t: Any) -> tuple[Any, Any]:  # noqa: E741
     """exp(-∫ sigma_t) over a length l from o along d, and ∫ s sigma_t exp(-∫ sigma_t) ds, per channel.
 
     A medium that varies is marched in cells that grow from a part of a mean free path on, each homogeneous.
@@ -75,8 +76,8 @@ def flight(obj: TranslucentObject, o: Any, d: Any, l: Any) -> tuple[Any, Any]:  
 
     T, inner = mi.Spectrum(1), mi.Spectrum(0)
     if obj.varying is None:
-        return add(obj.sigma_t, T, inner, mi.Float(0), l)
-    h = dr.minimum(l / CELLS, FIRST_CELL / dr.max(obj.sigma_t))
+        return add(sigma_t, T, inner, mi.Float(0), l)
+    h = dr.minimum(l / CELLS, FIRST_CELL / dr.max(sigma_t))
     growth = _growth(l / h)
 
     def cell(k: Any, s: Any, h: Any, T: Any, inner: Any) -> tuple:
@@ -111,13 +112,21 @@ def _varying_channels(obj: TranslucentObject) -> tuple[int, int]:
 
 def n_local(obj: TranslucentObject) -> int:
     """Number of what `local` gives."""
-    return sum(_varying_channels(obj))
+    if obj.textured is not None:
+        return len(obj.media) * (2 - len({"albedo", "sigma_t"}.intersection(obj.textured.constants)))
+    return 2 * sum(_varying_channels(obj))
 
 
-def local(obj: TranslucentObject, p: mi.Point3f) -> tuple[mi.Float, ...]:
-    """What varies, at the point p: log of sigma_t over its mean, and half the log of 1 - albedo."""
-    if obj.varying is None:
-        return ()
+def local(obj: TranslucentObject, at: SurfacePoint, y: mi.Point3f) -> tuple[mi.Float, ...]:
+    """What varies, of the point `at` and of its y: log of sigma_t over its mean, and half the log of 1 - albedo."""
+    if obj.textured is not None:
+        ratio, lost = at.medium.sigma_t / obj.sigma_t, 1 - at.medium.albedo
+        kinds = {"sigma_t": dr.log(ratio + LEAST_RATIO), "albedo": 0.5 * dr.log(lost + LEAST_RATIO)}
+        return tuple(v for name, values in kinds.items() if name not in obj.textured.constants for v in values)
+    return () if obj.varying is None else (*_varied(obj, at.p), *_varied(obj, y))
+
+
+def _varied(obj: TranslucentObject, p: mi.Point3f) -> tuple[mi.Float, ...]:
     n_t, n_albedo = _varying_channels(obj)
     sigma_t, sigma_s = walk_media(obj).heterogeneous.coefficients(mi.UInt32(0), p)
     ratio, albedo = sigma_t / obj.sigma_t, sigma_s / dr.maximum(sigma_t, 1e-20)
@@ -129,7 +138,8 @@ def local(obj: TranslucentObject, p: mi.Point3f) -> tuple[mi.Float, ...]:
 
 def first_event(obj: TranslucentObject, at: SurfacePoint, active: Any = True) -> FirstEvent:
     """Of light that goes in or out along w at a point of the surface."""
-    sigma_t, eta, sign = obj.sigma_t, obj.eta, opaque(obj.geometry.sign)
+    sigma_t = obj.sigma_t if obj.textured is None else at.medium.sigma_t
+    eta, sign = obj.eta, opaque(obj.geometry.sign)
     media, contents = walk_media(obj), obj.geometry.contents
     d, _, valid = refract_in(at, eta)
     flags = mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame
@@ -139,7 +149,7 @@ def first_event(obj: TranslucentObject, at: SurfacePoint, active: Any = True) ->
         si = obj.geometry.scene.ray_intersect(mi.Ray3f(o + d * skip, d), flags, False, active)
         l = dr.select(si.is_valid(), si.t + skip, 1e4 / dr.min(sigma_t))  # noqa: E741
         l, met = (l, mi.Bool(False)) if contents is None else contents.reach(o, d, l, active)  # noqa: E741
-        through, inner = flight(obj, o, d, l)
+        through, inner = flight(obj, o, d, l, sigma_t)
         through, inner = dr.select(met, 0, through), dr.select(met, inner + through * l, inner)
         part, inner = v * (1 - through), v * inner
         moments = [moment + (o * a + d * b) for moment, a, b in zip(moments, part, inner)]
@@ -162,8 +172,7 @@ def first_event(obj: TranslucentObject, at: SurfacePoint, active: Any = True) ->
     total, each = dr.maximum(channel_mean(P), 1e-20), dr.maximum(P, 1e-20)
     y = dr.select(channel_mean(P) > 0, mi.Point3f(sum(moments) / (len(moments) * total)), at.p)
     ys = [dr.select(p > 0, mi.Point3f(moment / e), at.p) for moment, p, e in zip(moments, P, each)]
-    coefficients = (*local(obj, at.p), *local(obj, y))
-    return FirstEvent(P, y, channel_mean(length) / total, ys, length / each, coefficients)
+    return FirstEvent(P, y, channel_mean(length) / total, ys, length / each, local(obj, at, y))
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -295,6 +304,11 @@ class Side(NamedTuple):
     event: FirstEvent
 
 
+def entered(at: SurfacePoint, exit: SurfacePoint) -> SurfacePoint:
+    """An entry of light that leaves at an exit, whose medium walks have all the way where media have textures."""
+    return at._replace(medium=exit.medium)
+
+
 @dataclass(frozen=True, eq=False)
 class ObjectFrame:
     """The object's own frame and scales.
@@ -330,8 +344,8 @@ class ObjectFrame:
 
 
 def n_side(channels: int, local: int = 0) -> int:
-    """Number of features of a side, of which twice `local` are what varies where light enters and at y."""
-    return P_0 + channels + 2 * local + 2 * FIELDS
+    """Number of features of a side, of which `local` are what varies."""
+    return P_0 + channels + local + 2 * FIELDS
 
 
 def n_pair(channels: int) -> int:

@@ -22,6 +22,7 @@ from full_geometry.object.features import (
     ObjectFrame,
     PreparedExit,
     Side,
+    entered,
     first_event,
     pair_features,
     side_features,
@@ -260,7 +261,7 @@ class PairSource:
 
     def _columns(self, exits: SurfacePoint, entries: SurfacePoint, value: Any) -> Pairs:
         """Features of pairs; `value` is a spectrum, or a weight that S_0 is to be multiplied by."""
-        exit, entry = (self.base.end(at) for at in (exits, entries))
+        exit, entry = (self.base.end(at) for at in (exits, entered(entries, exits)))
         if isinstance(value, mi.Float):
             value = self.base(exit, entry) * value
         columns = [*side_features(self.frame, exit), *side_features(self.frame, entry)]

@@ -267,6 +267,7 @@ class PatchTable:
             n_out = mi.Normal3f(turned(at.n_shading, at.n) * obj.geometry.sign)
             normal = mi.Normal3f(at.n * obj.geometry.sign)
             exit = surface_point(at.p, normal, n_out, cosine_direction(n_out, normal, rng))
+            exit = obj.knowing(exit, mi.UInt32(at.prim_index))
             total = total + _weights(sampler, Side(exit, first_event(obj, exit)), n)
         rows = np.cumsum(total / EXITS, axis=1).astype(np.float32)
         self.n, self.table, self.of_face = sampler.patches.n, mi.Float(rows.ravel()), faces

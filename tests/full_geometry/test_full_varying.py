@@ -90,7 +90,7 @@ def test_a_march_gives_the_transmittance_and_the_way_of_light_in_layers() -> Non
     obj = object_of(load_objects(objects(**scene)), None)
     starts, lengths = np.array([0.0, 0.3, 1.0, 2.2]), np.array([4.0, 2.0, 0.5, 1.7])
     o = mi.Point3f(np.stack([0 * starts + 2, 0 * starts + 2, starts]))
-    T, inner = flight(obj, o, mi.Vector3f(0, 0, 1), mi.Float(lengths))
+    T, inner = flight(obj, o, mi.Vector3f(0, 0, 1), mi.Float(lengths), obj.sigma_t)
     for k, (start, length) in enumerate(zip(starts, lengths)):
         s = np.linspace(0, length, 20001)
         sigma_t = np.interp(start + s, np.arange(4) + 0.5, layers)

@@ -145,7 +145,6 @@ def test_a_model_of_a_constant_texture_renders_as_of_a_constant() -> None:
     ("model", "integrator", "message"),
     [
         ("neural_shape", {}, "must be without textures for the model 'neural_shape'"),
-        ("full_geometry", {}, "must be without textures for the model 'full_geometry'"),
     ],
 )
 def test_what_takes_no_textures_refuses_them_by_name(model: str, integrator: dict, message: str) -> None:

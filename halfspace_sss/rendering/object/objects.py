@@ -179,7 +179,8 @@ def refuse(result: Content, holder: Geometry, what: str) -> None:
 def refuse_textures(name: str, what: str) -> None:
     """ValueError that names an object whose medium has textures, which `what` does not take."""
     raise ValueError(
-        f"object {name} must be without textures for {what}: translucent_walk and models of the half-space take them"
+        f"object {name} must be without textures for {what}: translucent_walk, full_geometry and models of the "
+        "half-space take them"
     )
 
 
@@ -396,8 +397,8 @@ class TranslucentObject:
             return self.spectral.at_exit(si)
         return () if self.textured is None else self.textured.at(si)
 
-    def knowing(self, at: SurfacePoint, face: mi.UInt32, active: mi.Bool = True) -> SurfacePoint:
-        """A point of its surface on a face with the medium there, where that has textures."""
+    def knowing(self, at: SurfacePoint, face: mi.UInt32 | None = None, active: mi.Bool = True) -> SurfacePoint:
+        """A point of its surface with the medium there, where that has textures; a ray finds an unknown face."""
         if self.textured is None:
             return at
         return at._replace(medium=self.textured.at_point(self.geometry, at.p, at.n, face, active))
@@ -412,12 +413,14 @@ class TranslucentObject:
         u_face, u = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
         at = self.points.sample(u_face, u, True)
         n = at.n * self.geometry.sign
-        return surface_point(at.p, n, turned(at.n_shading, at.n) * self.geometry.sign, n)
+        result = surface_point(at.p, n, turned(at.n_shading, at.n) * self.geometry.sign, n)
+        return self.knowing(result, mi.UInt32(at.prim_index))
 
     def random_points(self, rng: mi.PCG32) -> SurfacePoint:
         """Points uniform over the area, directions by the cosine to the shading normal, one for each lane of rng."""
         at = self.random_places(rng)
-        return surface_point(at.p, at.n, at.n_out, cosine_direction(at.n_out, at.n, rng))
+        w = cosine_direction(at.n_out, at.n, rng)
+        return surface_point(at.p, at.n, at.n_out, w)._replace(medium=at.medium)
 
     def mean_free_paths(self) -> np.ndarray:
         """sigma_t sqrt(area) of each channel: the size of the object in mean free paths."""
@@ -699,13 +702,14 @@ def object_of(
         return TranslucentObject(geometry, media)
     unit = millimetres(shape) if mm_per_unit is None else mm_per_unit
     (geometry,) = filled(shape, [survey(_object_of(shape, name))], unit, "learning")
-    if geometry.shape.bsdf().inside.textured is not None:
-        refuse_textures(geometry.name, "learning")
     inside = equivalent(geometry.shape.bsdf().inside, geometry)
     media = _in_scene_units(inside.medium, unit)
     check_geometry(geometry)
     check_size(geometry, [float(m.sigma_t) for m in media], unit)
-    return TranslucentObject(geometry, media, None if inside.varying is None else inside.varying.scaled(unit))
+    varying, textured = (part if part is None else part.scaled(unit) for part in (inside.varying, inside.textured))
+    if textured is not None:
+        textured.check(geometry)
+    return TranslucentObject(geometry, media, varying, textured)
 
 
 def _in_scene_units(medium: Medium | None, mm_per_unit: float) -> tuple[Medium, ...]:

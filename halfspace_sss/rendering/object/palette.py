@@ -341,15 +341,25 @@ def palette_model(
     Raises:
         ValueError: the model knows some media only.
     """
-    values = [v if len(v) else np.array([[0.0], [1.0]]) for v in medium.values_on(geometry.shape)]
-    albedos, extinctions = (np.broadcast_to(v, (len(v), len(media))) for v in values)
-    palette, models = Palette.of(name, albedos, media), _spread(name, albedos, extinctions, media)
+    palette = palette_of(name, geometry, media, medium)
+    models = _spread(name, *_values_of(geometry, media, medium), media)
     table = RadialTable(models, geometry.size)
     share = area_share(geometry, table.mean / geometry.size, settings.area_share)
     positions = PositionSampler(geometry, table, AreaPoints(geometry.shape), share)
     transport = PaletteTransport(palette, geometry, medium, settings.geometry)
     known = medium if isinstance(medium, TexturedMedium) else None  # else that of the exit
     return ObjectModel(transport, HalfSpaceProposals(positions, models[0], known))
+
+
+def palette_of(name: str, geometry: Geometry, media: tuple[Medium, ...], medium: Varied) -> Palette:
+    """The models of all media of an object; arguments and errors as of `palette_model`."""
+    return Palette.of(name, _values_of(geometry, media, medium)[0], media)
+
+
+def _values_of(geometry: Geometry, media: tuple[Medium, ...], medium: Varied) -> tuple[np.ndarray, np.ndarray]:
+    """Albedos and extinctions of an object, (n, channels)."""
+    values = [v if len(v) else np.array([[0.0], [1.0]]) for v in medium.values_on(geometry.shape)]
+    return tuple(np.broadcast_to(v, (len(v), len(media))) for v in values)
 
 
 def _spread(name: str, albedos: np.ndarray, extinctions: np.ndarray, media: tuple[Medium, ...]) -> list[BSSRDF]:

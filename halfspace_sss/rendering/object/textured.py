@@ -139,9 +139,9 @@ class TexturedMedium:
         return SurfaceMedium(self.albedo_at(si, active), sigma_t, mi.UInt32(si.prim_index))
 
     def at_point(
-        self, obj: Geometry, p: mi.Point3f, n: mi.Normal3f, face: mi.UInt32, active: mi.Bool = True
+        self, obj: Geometry, p: mi.Point3f, n: mi.Normal3f, face: mi.UInt32 | None, active: mi.Bool = True
     ) -> SurfaceMedium:
-        """The same at a point of an object with its outward normal and its face."""
+        """The same at a point of an object with its outward normal and its face, if that is known."""
         return self.at(_interaction(obj, p, n, face, active), active)
 
     def followed(self, obj: Geometry, at: SurfacePoint, active: mi.Bool = True) -> SurfaceMedium:
@@ -243,10 +243,10 @@ class TexturedMedium:
 
 
 def _interaction(
-    obj: Geometry, p: mi.Point3f, n: mi.Normal3f, face: mi.UInt32, active: mi.Bool
+    obj: Geometry, p: mi.Point3f, n: mi.Normal3f, face: mi.UInt32 | None, active: mi.Bool
 ) -> mi.SurfaceInteraction3f:
     """What textures ask for, at a point of an object: of a mesh from its face, else where a short ray meets it."""
-    if not obj.shape.is_mesh():
+    if face is None or not obj.shape.is_mesh():
         off = opaque(max(10 * obj.rounding, 1e-5 * obj.size))
         ray = mi.Ray3f(mi.Point3f(p + n * off), mi.Vector3f(-n))
         return obj.scene.ray_intersect(ray, mi.RayFlags.Minimal | mi.RayFlags.UV, False, active)

@@ -587,7 +587,7 @@ def walk_media(obj: TranslucentObject) -> WalkMedia:
         if len(obj.media) > 1:
             values = {key: np.array([getattr(m, key) for m in obj.media]) for key in ("sigma_s", "sigma_a", "g")}
             medium = Medium(**values, eta=eta)
-        inside, geometry = Inside("medium", medium, "", "total", True, obj.varying), obj.geometry
+        inside, geometry = Inside("medium", medium, "", "total", True, obj.varying, obj.textured), obj.geometry
         result = _OF_OBJECT[obj] = WalkMedia([geometry], [inside], geometry.scene, [smooth_boundary(eta)], 1.0)
     return result
 

@@ -14,6 +14,7 @@ import mitsuba as mi
 
 from halfspace_sss.physics.medium import eval_hg, sample_hg
 from halfspace_sss.rendering.object.points import SurfacePoint, channel_mean, lift, sided, surface_point
+from halfspace_sss.rendering.object.textured import SurfaceMedium
 from halfspace_sss.rendering.walk.media import Coefficients, WalkMedia, WalkMedium, ray_of
 from halfspace_sss.tracing.walk import ROULETTE_BOOST, ROULETTE_WEIGHT, generator, pass_seed
 
@@ -467,7 +468,8 @@ def walk_from(
         roulette_from: scattering events from which on roulette may end a walk.
 
     Raises:
-        ValueError: there is no object k, media have textures, or the arrays of `start` are of different lengths.
+        ValueError: there is no object k, its medium has textures and is not known at the start, or the arrays of
+            `start` are of different lengths.
     """
     n = _check(media, k, start)
     if n == 0:
@@ -494,8 +496,8 @@ def _check(media: WalkMedia, k: int, start: SurfacePoint) -> int:
     """The number of starts."""
     if not 0 <= k < len(media.objects):
         raise ValueError(f"k must be a whole number in [0, {len(media.objects) - 1}], got {k!r}")
-    if media.carried:
-        raise ValueError(f"media must be without textures for walks from points, got those of {media.objects[k].name}")
+    if media.carried and not start.medium:
+        raise ValueError(f"walks from points of {media.objects[k].name}, which has textures, must know their medium")
     widths = [dr.width(v) for v in start[:4]]
     if len(set(widths)) > 1:
         raise ValueError(f"p, n, n_out and w of the starts must be of one length, got {widths}")
@@ -516,7 +518,12 @@ def _enter(media: WalkMedia, k: mi.UInt32, start: SurfacePoint, index: mi.UInt32
     ctx.type_mask = mi.BSDFFlags.Transmission
     bs, value = sample_bsdf(media.boundary(k), si, rng, ctx)
     d, _ = sided(si, bs.wo)
-    walk = start_walk(si.p, d, rng)
+    medium: WalkMedium | tuple[()] = ()
+    if media.carried:
+        of_exit = dr.gather(SurfaceMedium, start.medium, index, known)
+        lanes = dr.width(index)
+        medium = replace(media.unknown(lanes), sigma_t=of_exit.sigma_t, sigma_s=of_exit.albedo * of_exit.sigma_t)
+    walk = start_walk(si.p, d, rng, medium)
     enters = known & (dr.dot(w, si.n) > 0) & (dr.dot(d, si.n) < 0) & (dr.max(value) > 0)
     enters &= mi.Frame3f.cos_theta(si.wi) > 0
     channel = draw(len(value), rng) if len(value) > 1 else walk.channel
