@@ -221,4 +221,5 @@ def _error(reference: Reference) -> str:
         return "one pass has no estimate of its error"
     if reference.relative_error == 0:
         return "all passes are the same: the camera sees nothing that varies, such as the sky alone"
-    return f"relative standard error of the image {reference.relative_error:.2%}"
+    told, share = f"relative standard error of the image {reference.relative_error:.2%}", reference.share_by_chance
+    return f"{told}, of the variance at most {share:.0%} light that orders 0 and 1 meet by chance" if share else told

@@ -70,6 +70,30 @@ def test_a_file_reads_back_as_it_was_and_tells_its_origin(tmp_path: Path) -> Non
     np.testing.assert_allclose(rgb, made.mean, rtol=1e-6)
 
 
+def _by_chance(folder: Path, orders: str, light: dict) -> tuple[reference.Reference, np.ndarray]:
+    """A render of one sample in each pass by a model, and its passes."""
+    scene = {**_scene(), "light": light}
+    scene["integrator"] = {"type": "bssrdf", "hide_emitters": True}
+    scene["object"]["bsdf"] |= {"model": "better_dipole", "orders": orders, "reflection": False}
+    scene = mi.load_dict(scene)
+    reference.render(scene, folder / "a.exr", spp_per_pass=1, passes=4, resume=False)
+    seeds = [int(np.random.SeedSequence([0, k]).generate_state(1)[0]) for k in range(4)]
+    images = [np.array(mi.render(scene, spp=1, seed=seed), dtype=float) for seed in seeds]
+    return reference.load(folder / "a.exr"), np.stack(images)
+
+
+def test_light_that_orders_below_two_meet_by_chance_is_told_as_a_share_of_the_variance(tmp_path: Path) -> None:
+    sky = {"type": "constant"}
+    lamp = {"type": "sphere", "center": [1, 3, 3], "radius": 0.2, "emitter": {"type": "area", "radiance": 100.0}}
+    by_sky, images = _by_chance(tmp_path, "single", sky)
+    whole = (images**2).sum()
+    assert by_sky.about["squares_by_chance"] == pytest.approx(whole, rel=1e-4)
+    assert by_sky.share_by_chance == min(whole / 4**2 / by_sky.variance.sum(), 1.0)
+    by_lamp, images = _by_chance(tmp_path, "single", lamp)
+    assert by_lamp.about["squares_by_chance"] < 0.1 * (images**2).sum()
+    assert _by_chance(tmp_path, "multiple", sky)[0].share_by_chance == 0.0
+
+
 def test_a_run_in_two_parts_gives_the_bits_of_a_run_in_one(tmp_path: Path) -> None:
     whole = reference.render(_scene(), tmp_path / "whole.exr", spp_per_pass=4, passes=9)
     reference.render(_scene(), tmp_path / "parts.exr", spp_per_pass=4, passes=4)

@@ -300,5 +300,5 @@ def by_cosine(
     met = dr.select(shines, mis_weight(pdf, density) * emitter.eval(si, shines), 0)
     hidden = replace(settings, hide_emitters=True, light="sampled", max_depth=max(settings.max_depth - 1, -1) or 1)
     on = si.is_valid() & traced
-    parts, _ = trace_paths(scene, objects, hidden, sampler, ray, on, scattered=True)
+    parts, *_ = trace_paths(scene, objects, hidden, sampler, ray, on, scattered=True)
     return a * met, dr.select(on, a * (parts[0] + parts[1]), 0), a, w

@@ -64,6 +64,7 @@ def _class(variant: str) -> type:
             self.gathering = Gathering()
             self._control_variates = ControlVariates()
             self._controlled: list[TranslucentObject] | None = None  # while an image is rendered
+            self._by_chance = dr.zeros(mi.Float64, 1)
 
         def prepare(self, scene: mi.Scene) -> list[TranslucentObject]:
             """The translucent objects of a scene, made ready once; ValueError if the scene cannot be rendered."""
@@ -97,6 +98,7 @@ def _class(variant: str) -> type:
                     if obj.spectral is not None:
                         obj.spectral.check_covers(obj.geometry.name, sensor)
                 self._controlled = self._with_control_variates(scene, objects, sensor, seed, spp)
+                self._by_chance = dr.zeros(mi.Float64, 1)
                 try:
                     for launch in launches(sensor, seed, spp, lambda: not self.timed and self.should_stop()):
                         super().render(scene, sensor=sensor, seed=launch.seed, spp=launch.spp, develop=True)
@@ -137,13 +139,20 @@ def _class(variant: str) -> type:
             check_outermost(scene)
             with undisturbed(), dr.suspend_grad():
                 objects = self._prepared(scene) if self._controlled is None else self._controlled
-                parts, hit = trace_paths(scene, objects, self.settings, sampler, ray, active)
+                parts, hit, chance = trace_paths(scene, objects, self.settings, sampler, ray, active)
+                squares = dr.select(hit & active, mi.Float64(dr.squared_norm(chance)), 0)
+                dr.scatter_add(self._by_chance, squares, mi.UInt32(0))
             return parts[0] + parts[1], hit, []
 
         @property
         def choices(self) -> Choices:
             """What stands for "auto"; known when a scene has been prepared."""
             return self._objects.choices
+
+        @property
+        def by_chance(self) -> float:
+            """Of light that orders below two met by chance, squares summed over channels and samples of an image."""
+            return float(self._by_chance[0])
 
         @property
         def gathered(self) -> list[str]:
@@ -289,7 +298,7 @@ def replayer(objects: list[TranslucentObject], settings: Settings) -> mi.Integra
 
         def sample(self, mode: dr.ADMode, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f, **given: Any) -> tuple:
             if mode == dr.ADMode.Primal:
-                parts, hit = trace_paths(scene, objects, settings, sampler, ray, given["active"])
+                parts, hit, _ = trace_paths(scene, objects, settings, sampler, ray, given["active"])
                 return parts[0] + parts[1], hit, [], parts
             parts, backward = given["state_in"], mode == dr.ADMode.Backward
             d = replay_paths(scene, objects, settings, sampler, ray, parts, given["δL"], backward)

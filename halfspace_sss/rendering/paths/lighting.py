@@ -8,7 +8,7 @@ others held, and no loop is recorded. Directions and densities are held too.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import drjit as dr
@@ -26,6 +26,7 @@ class PathTally:
 
     L: mi.Spectrum  # primal: radiance so far; replay: radiance still to come
     derivative: mi.Spectrum | tuple[()]  # replay forward: derivative of L; backward: adjoint of L; primal: nothing
+    chance: mi.Spectrum  # primal: of L, light that orders below two have met by chance
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,11 @@ class Primal:
 
     def add(self, tally: PathTally, light: mi.Spectrum) -> PathTally:
         """Add the light of one estimator of the path."""
-        return PathTally(tally.L + light, tally.derivative)
+        return replace(tally, L=tally.L + light)
+
+    def note_chance(self, tally: PathTally, light: mi.Spectrum) -> PathTally:
+        """Note light, which is in the tally already, as met by chance."""
+        return replace(tally, chance=tally.chance + light)
 
     def settle(
         self, tally: PathTally, light: mi.Spectrum, weight: mi.Spectrum, continues: mi.Bool, shown: mi.Spectrum | float
@@ -66,7 +71,11 @@ class Replay:
     def add(self, tally: PathTally, light: mi.Spectrum) -> PathTally:
         """Take the light of one estimator away, and differentiate it."""
         tally = self._differentiate(tally, light)
-        return PathTally(tally.L - dr.detach(light), tally.derivative)
+        return replace(tally, L=tally.L - dr.detach(light))
+
+    def note_chance(self, tally: PathTally, light: mi.Spectrum) -> PathTally:
+        """Nothing: what is met by chance is known from the first pass."""
+        return tally
 
     def settle(
         self, tally: PathTally, light: mi.Spectrum, weight: mi.Spectrum, continues: mi.Bool, shown: mi.Spectrum | float
@@ -75,7 +84,7 @@ class Replay:
         L = tally.L - dr.detach(light)
         fixed = dr.detach(weight)
         L_next = dr.select(continues & (fixed != 0), L / dr.select(fixed != 0, fixed, 1), 0)
-        return self._differentiate(PathTally(L, tally.derivative), light + weight * (L_next + shown))
+        return self._differentiate(replace(tally, L=L), light + weight * (L_next + shown))
 
     def _differentiate(self, tally: PathTally, value: mi.Spectrum) -> PathTally:
         if not dr.grad_enabled(value):
@@ -83,7 +92,7 @@ class Replay:
         if self.backward:
             dr.backward_from(tally.derivative * value)
             return tally
-        return PathTally(tally.L, tally.derivative + dr.forward_to(value))
+        return replace(tally, derivative=tally.derivative + dr.forward_to(value))
 
 
 NEE_SHARE = 0.5

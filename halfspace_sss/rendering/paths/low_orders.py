@@ -69,6 +69,7 @@ class LowOrderSample(NamedTuple):
     pdf: mi.Float  # of d by the phase function, for the MIS weight of the sky; 1 where no connection leads along d
     emitter_share: mi.Float  # 1 where one does, else 0
     direct: mi.Spectrum
+    chance: mi.Spectrum  # of that, what no connection has found
     once: mi.Bool  # whether it was scattered
 
 
@@ -128,18 +129,18 @@ def sample_low_orders(
     weight = dr.select(counts, f * (walk.inverse_pdf * refracted.T), 0)
 
     # ---- emitter connections, emission met by chance, delta lights
-    direct, lights = mi.Spectrum(0), context.lights
+    direct, chance, lights = mi.Spectrum(0), mi.Spectrum(0), context.lights
     pdf, share, sky = mi.Float(1), mi.Float(0), context.connects_sky(obj)
     if lights.some_local or context.suns or sky:
         at_event = _contribution(media, walk.event_length, mi.UInt32(1), None) * (walk.event_inverse_pdf * refracted.T)
         direct = _connected(context, (obj, media), walk, dr.select(once, at_event, 0), sampler, once)
     if lights.some_shaped or context.suns:
-        direct = direct + weight * _met_by_chance(context, obj, walk, sampler, counts & connected)
+        chance = chance + weight * _met_by_chance(context, obj, walk, sampler, counts & connected)
     if lights.some_delta:
-        direct = direct + weight * _spread_lights(context, obj, walk, sampler, counts & (once | scattered))
+        chance = chance + weight * _spread_lights(context, obj, walk, sampler, counts & (once | scattered))
     if sky:
         pdf, share = _sky_pdf(obj, walk, counts & straight)
-    return LowOrderSample(walk.o, walk.n, walk.d, weight, connected, pdf, share, direct, once)
+    return LowOrderSample(walk.o, walk.n, walk.d, weight, connected, pdf, share, direct + chance, chance, once)
 
 
 # ---- The walk --------------------------------------------------------------------------------------------------------

@@ -50,6 +50,12 @@ class PreviousVertex:
     sky_only: mi.Bool  # emitter connections have counted all emission but that of the sky beside its suns
     emitter_distance: mi.Float  # of the emitter that the direction was drawn for, alone counted; < 0: any direction
     mirrored: mi.Bool  # the direction was the only one, so that next-event estimation had none
+    low_orders: mi.Bool  # it is that of a walk of orders below two
+
+    @property
+    def by_chance(self) -> mi.Bool:
+        """Whether a walk of orders below two meets emission there that no connection would find."""
+        return self.low_orders & (self.emitter_share == 0)
 
 
 @dataclass
@@ -82,15 +88,15 @@ class PathState:
 def trace_paths(
     scene: mi.Scene, objects: list[TranslucentObject], settings: Settings, sampler: mi.Sampler, ray: mi.Ray3f,
     active: mi.Bool, scattered: bool = False,
-) -> tuple[tuple[mi.Spectrum, mi.Spectrum], mi.Bool]:  # fmt: skip
-    """Radiance along a camera ray in two parts for a replay, and whether the ray hits anything.
+) -> tuple[tuple[mi.Spectrum, mi.Spectrum], mi.Bool, mi.Spectrum]:  # fmt: skip
+    """Radiance along a camera ray in two parts for a replay, whether the ray hits anything, and light by chance.
 
-    The second part is light of orders below two of the object that the ray meets first. `scattered` says whether the
-    ray is one of many that a vertex may have sent, as for a path that goes on.
+    The second part is light of orders below two of the object that the ray meets first. What was met by chance is in
+    both. `scattered` says whether the ray is one of many that a vertex may have sent, as for a path that goes on.
     """
     context = RenderContext.of(scene, objects, settings, Primal())
-    L, _, hit = _loop(context, sampler, ray, (mi.Spectrum(0), mi.Spectrum(0)), (), active, scattered)
-    return L, hit
+    L, tally, hit = _loop(context, sampler, ray, (mi.Spectrum(0), mi.Spectrum(0)), (), active, scattered)
+    return L, hit, tally.chance
 
 
 def replay_paths(
@@ -107,7 +113,7 @@ def replay_paths(
         backward: otherwise the derivative of the radiance is returned, for the derivatives that the parameters carry.
     """
     context = RenderContext.of(scene, objects, settings, Replay(backward))
-    return _loop(context, sampler, ray, L, mi.Spectrum(0 if d is None else d), mi.Bool(True))[1]
+    return _loop(context, sampler, ray, L, mi.Spectrum(0 if d is None else d), mi.Bool(True))[1].derivative
 
 
 # ---- The loop --------------------------------------------------------------------------------------------------------
@@ -116,8 +122,8 @@ def replay_paths(
 def _loop(
     context: RenderContext, sampler: mi.Sampler, camera_ray: mi.Ray3f, L: tuple[mi.Spectrum, mi.Spectrum],
     derivative: mi.Spectrum | tuple[()], active: mi.Bool, scattered: bool = False,
-) -> tuple[tuple[mi.Spectrum, mi.Spectrum], mi.Spectrum | tuple[()], mi.Bool]:  # fmt: skip
-    """All vertices of a path, in one or two passes: L, its derivative, and whether the camera ray hits anything.
+) -> tuple[tuple[mi.Spectrum, mi.Spectrum], PathTally, mi.Bool]:  # fmt: skip
+    """All vertices of a path, in one or two passes: L, the tally, and whether the camera ray hits anything.
 
     Where the first vertex is on an object with orders below two beside others, the path begins there a second time for
     the orders below two: the choice between both was most of the variance under a sky.
@@ -137,6 +143,7 @@ def _loop(
             counts = active & ~(first & path.second_pass)
             L_e = emission(context, sampler, path.ray, si, path.previous, shown, path.scattered, counts)
             tally = mode.add(path.tally, path.throughput * L_e)
+            tally = mode.note_chance(tally, dr.select(path.previous.by_chance, path.throughput * L_e, 0))
         hit = path.hit | (first & si.is_valid())
         active = active & si.is_valid() & (path.previous.emitter_distance < 0) & (path.depth + 1 < max_depth)
         needs_second = path.needs_second | (active & first & _on_splitting(context, si))
@@ -160,7 +167,7 @@ def _loop(
         again = ~active & needs_second & ~path.second_pass
         return sampler, PathState(
             ray=dr.select(again, camera_ray, ray),
-            tally=PathTally(dr.select(again, L[1], tally.L), tally.derivative),
+            tally=replace(tally, L=dr.select(again, L[1], tally.L)),
             throughput=dr.select(again, mi.Spectrum(1), throughput),
             previous=dr.select(again, _camera_vertex(), following.previous),
             depth=dr.select(again, mi.UInt32(0), depth),
@@ -173,14 +180,14 @@ def _loop(
         )
 
     start = PathState(
-        camera_ray, PathTally(L[0], derivative), mi.Spectrum(1), _camera_vertex(), mi.UInt32(0), mi.Bool(scattered),
-        mi.Bool(False), mi.Bool(False), mi.Spectrum(0), mi.Bool(False), mi.Bool(active),
+        camera_ray, PathTally(L[0], derivative, mi.Spectrum(0)), mi.Spectrum(1), _camera_vertex(), mi.UInt32(0),
+        mi.Bool(scattered), mi.Bool(False), mi.Bool(False), mi.Spectrum(0), mi.Bool(False), mi.Bool(active),
     )  # fmt: skip
     with dr.suspend_grad():
         _, path = dr.while_loop((sampler, start), lambda sampler, path: path.active, step, label="bssrdf")
     two = path.second_pass
     parts = dr.select(two, path.L_first, path.tally.L), dr.select(two, path.tally.L, 0)
-    return parts, path.tally.derivative, path.hit
+    return parts, path.tally, path.hit
 
 
 def _ray_from(origin: PreviousVertex, d: mi.Vector3f, before: mi.Ray3f) -> mi.Ray3f:
@@ -198,7 +205,7 @@ def _camera_vertex() -> PreviousVertex:
 def _path_end() -> NextVertex:
     """No next vertex."""
     zero, no = mi.Float(0), mi.Bool(False)
-    previous = PreviousVertex(mi.Point3f(0), mi.Normal3f(0), zero, mi.Float(0), no, mi.Float(-1), mi.Bool(False))
+    previous = PreviousVertex(mi.Point3f(0), mi.Normal3f(0), zero, mi.Float(0), no, mi.Float(-1), no, mi.Bool(no))
     return NextVertex(previous, mi.Vector3f(0), mi.Spectrum(0), mi.Bool(False))
 
 
@@ -308,8 +315,9 @@ def sample_event(
         def below(
             _: NextVertex, tally: PathTally, mask: mi.Bool = mask, event: Callable = event
         ) -> tuple[NextVertex, PathTally]:
-            new, direct = event()
+            new, direct, chance = event()
             light = at.throughput / probability * direct
+            tally = context.mode.note_chance(tally, at.throughput / probability * chance)
             return new, context.mode.settle(tally, light, new.weight, mask, mi.Spectrum(0))
 
         following, tally = _where(context, sampler, mask, (following, tally), below)
@@ -512,7 +520,7 @@ def bsdf_event(
     delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
     previous = PreviousVertex(
         mi.Point3f(si.p), mi.Normal3f(si.n), dr.select(delta, 1, bs.pdf), dr.select(delta, mi.Float(0), 1),
-        mi.Bool(False), mi.Float(-1), delta,
+        mi.Bool(False), mi.Float(-1), delta, mi.Bool(False),
     )  # fmt: skip
     return NextVertex(previous, si.to_world(bs.wo), weight, ~delta), direct
 
@@ -543,15 +551,19 @@ def low_order_event(
     sampler: mi.Sampler,
     scattered: mi.Bool,
     active: mi.Bool,
-) -> tuple[NextVertex, mi.Spectrum]:
-    """Light that was scattered at most once inside, and emitter connections of that event; c taken off as below."""
+) -> tuple[NextVertex, mi.Spectrum, mi.Spectrum]:
+    """Light that was scattered at most once inside, and emitter connections of that event; c taken off as below.
+
+    Last comes what of the light was met by chance.
+    """
     sample = sample_low_orders(context, obj, refracted, sampler, scattered, active)
     no = mi.Bool(False)
-    previous = PreviousVertex(sample.p, sample.n, sample.pdf, sample.emitter_share, sample.connected, mi.Float(-1), no)
+    previous = PreviousVertex(sample.p, sample.n, sample.pdf, sample.emitter_share, sample.connected, mi.Float(-1), no,
+                              mi.Bool(True))  # fmt: skip
     direct = sample.direct
     if context.uses_sky(obj):
         direct = direct - sample.weight * context.sky_means(obj)[0]
-    return NextVertex(previous, sample.d, sample.weight, mi.Bool(sample.once)), direct
+    return NextVertex(previous, sample.d, sample.weight, mi.Bool(sample.once)), direct, sample.chance
 
 
 # ---- BSSRDF: light that entered the object elsewhere -----------------------------------------------------------------
@@ -565,7 +577,7 @@ def bssrdf_event(
     sampler: mi.Sampler,
     first: mi.Bool,
     active: mi.Bool,
-) -> tuple[NextVertex, mi.Spectrum]:
+) -> tuple[NextVertex, mi.Spectrum, mi.Spectrum]:
     """Light that entered elsewhere and leaves at `out` by the transport of the object.
 
     Delta lights are its next-event estimation. c of `lighting.Sky` is taken off where `_add_sky_means` has added it,
@@ -583,8 +595,9 @@ def bssrdf_event(
     previous = PreviousVertex(
         entry.p, entry.n, dr.select(anywhere, entry.pdf, 1),
         dr.select(anywhere, mi.Float(context.lights.nee_share), 0), no, entry.emitter_distance, mi.Bool(False),
+        mi.Bool(False),
     )  # fmt: skip
-    return NextVertex(previous, entry.d, dr.select(entry.delta, 0, entry.weight), mi.Bool(True)), direct
+    return NextVertex(previous, entry.d, dr.select(entry.delta, 0, entry.weight), mi.Bool(True)), direct, mi.Spectrum(0)
 
 
 @dataclass

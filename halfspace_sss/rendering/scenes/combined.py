@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from halfspace_sss.rendering.scenes.reference_store import Reference
+from halfspace_sss.rendering.scenes.reference_store import BY_CHANCE, Reference
 
 TILE = 8  # pixels
 
@@ -41,7 +41,7 @@ def combined(walks: Reference, model: Reference) -> Reference:
     return replace(
         model, mean=mean, variance=variance,
         passes=walks.passes + model.passes, spp=walks.spp + model.spp, seconds=walks.seconds + model.seconds,
-        about={**model.about, "combined": about},
+        about={**{k: v for k, v in model.about.items() if k != BY_CHANCE}, "combined": about},
     )  # fmt: skip
 
 

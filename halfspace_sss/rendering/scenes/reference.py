@@ -13,7 +13,7 @@ import math
 import os
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,7 @@ from halfspace_sss.rendering.object.registry import AUTO
 from halfspace_sss.rendering.object.translucent import is_translucent
 from halfspace_sss.rendering.paths.integrator import is_bssrdf
 from halfspace_sss.rendering.scenes.identity import learnt, scene_hash, words
-from halfspace_sss.rendering.scenes.reference_store import Reference, load, save
+from halfspace_sss.rendering.scenes.reference_store import BY_CHANCE, Reference, load, save
 from halfspace_sss.rendering.scenes.scene_files import first_cause
 
 FEWEST_PASSES = 8  # before the spread of the passes is trusted to stop a run
@@ -170,7 +170,11 @@ def _pass(reference: Reference | None, scene: Any, integrator: Any, sensor: int,
         bad = int((~np.isfinite(image)).any(axis=2).sum())
         raise ValueError(f"pass {number} must be finite, got {bad} pixels that are not")
     start = reference or Reference(np.zeros(image.shape), np.zeros(image.shape), 0, 0, 0.0, about)
-    return start.add(image, spp, time.perf_counter() - started)
+    result = start.add(image, spp, time.perf_counter() - started)
+    if not is_bssrdf(integrator) or mi.is_spectral:
+        return result
+    squares = float(f"{start.about.get(BY_CHANCE, 0.0) + integrator.by_chance:.6g}")
+    return replace(result, about={**result.about, BY_CHANCE: squares})
 
 
 def _check(spp_per_pass: int | None, seed: int, interval: float) -> None:

@@ -20,6 +20,7 @@ from halfspace_sss.provenance import write_together
 
 FORMAT = "halfspace-sss reference 2"
 HEADER = "halfspace_sss"
+BY_CHANCE = "squares_by_chance"  # of light that orders below two met by chance, summed over samples
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +60,18 @@ class Reference:
         if not lit.any():
             return math.inf if self.mean[..., :3].any() else 0.0
         return float(np.sqrt(self.variance[..., :3][lit].sum() / np.sum(self.mean[..., :3][lit] ** 2)))
+
+    @property
+    def share_by_chance(self) -> float | None:
+        """Most of the variance that is light which orders below two meet by chance; None where it is not known.
+
+        At most: the square of its mean is not taken off, which is small where it makes much noise. Other filters than
+        a box, which share samples among pixels, make it larger.
+        """
+        whole = self.variance[..., :3].sum()
+        if BY_CHANCE not in self.about or self.passes < 2:
+            return None
+        return min(self.about[BY_CHANCE] / self.spp**2 / whole, 1.0) if whole > 0 else 0.0
 
     def add(self, image: np.ndarray, spp: int, seconds: float) -> Reference:
         """The average with one more pass of spp samples per pixel, rounded to what a file keeps.
@@ -104,6 +117,7 @@ def save(path: Path, reference: Reference) -> None:
         "spp": reference.spp,
         "seconds": reference.seconds,
         "relative_error": reference.relative_error if math.isfinite(reference.relative_error) else None,
+        "share_by_chance": reference.share_by_chance,
         "pixels": hashlib.sha256(pixels.tobytes()).hexdigest(),
         **reference.about,
     }
@@ -144,7 +158,7 @@ def load(path: str | os.PathLike) -> Reference:
         passes, spp, seconds = int(header.pop("passes")), int(header.pop("spp")), float(header.pop("seconds"))
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{name} must tell passes, spp and seconds: {error!r}") from error
-    for key in ("format", "relative_error"):
+    for key in ("format", "relative_error", "share_by_chance"):
         header.pop(key, None)
     mean, variance, mean_rest, variance_rest = np.split(pixels.astype(np.float64), 4, axis=2)
     return Reference(mean + mean_rest, variance + variance_rest, passes, spp, seconds, header)
