@@ -358,7 +358,7 @@ class TranslucentObject:
         variation: how its light varies with its medium.
         gathered: what leaves by orders from two on, in place of a transport, see `paths.gathering`.
         control: control variate of entries at the first vertex of a path, see `paths.control_variate`.
-        painted: state of its shape, whose attributes textures show.
+        painted: state of its shape, whose attributes textures show, if the surface has textures.
     """
 
     geometry: Geometry
@@ -457,7 +457,11 @@ class TranslucentObject:
 
     def is_current(self) -> bool:
         """Whether the object still has the shape and the medium that it was made of."""
-        same = self.textured is None or self.painted[0] == state_of(self.geometry.shape)[0]
+        textured, shape = self.surface.inside.textured, self.geometry.shape
+        same = textured is None or self.painted[0] == state_of(shape)[0]
+        if textured is not None and self.textured is None:  # its textures are the same everywhere
+            with dr.resume_grad():
+                same = same and not textured.is_followed(shape)
         return same and self.surface.inside is self.variation.inside and self.geometry.is_current()
 
 
@@ -545,7 +549,8 @@ def _make_object(geometry: Geometry, inside: Inside, settings: Settings) -> Tran
     obj = TranslucentObject(geometry, media, varying)
     if inside.textured is not None:
         inside.textured.check(geometry)
-        textured = inside.textured.scaled(settings.mm_per_unit)
+        even = inside.textured.is_even(geometry.shape)
+        textured = None if even else inside.textured.scaled(settings.mm_per_unit)
         obj = replace(obj, textured=textured, painted=state_of(geometry.shape))
     if inside.spectral is not None:
         obj = replace(obj, spectral=inside.spectral.scaled(settings.mm_per_unit))
@@ -706,9 +711,10 @@ def object_of(
     media = _in_scene_units(inside.medium, unit)
     check_geometry(geometry)
     check_size(geometry, [float(m.sigma_t) for m in media], unit)
+    if inside.textured is not None:
+        inside.textured.check(geometry)
+        inside = replace(inside, textured=None) if inside.textured.is_even(geometry.shape) else inside
     varying, textured = (part if part is None else part.scaled(unit) for part in (inside.varying, inside.textured))
-    if textured is not None:
-        textured.check(geometry)
     return TranslucentObject(geometry, media, varying, textured)
 
 

@@ -28,6 +28,7 @@ from halfspace_sss.rendering.object.shape import Geometry, name_of
 
 NODES = 1025  # of the table of x by reflectance
 BY_UV = ("BitmapTexture", "Checkerboard")
+KNOWN = (*BY_UV, "MeshAttribute", "UniformSpectrum", "SRGBReflectanceSpectrum")  # of which all values are known
 UNKNOWN = {"albedo": 0.5, "reflectance": 0.2, "sigma_t": 1.0, "mfp": 1.0}  # means of attributes before a mesh is known
 
 
@@ -215,10 +216,26 @@ class TexturedMedium:
         means = {name: _mean(name, texture, shape) for name, texture in self.textures.items()}
         albedo = means.get("albedo", self.albedo)
         if self.table is not None:
-            albedo = np.ravel(np.array(self.table(mi.Spectrum(means["reflectance"].tolist()))))
+            R = np.minimum(means["reflectance"], self.table.most)
+            albedo = Medium.from_reflectance(R, 1.0, g, eta).albedo
         sigma_t = self.scale * (1 / means["mfp"] if self.inverse else means.get("sigma_t", self.sigma_t))
         pair = (np.minimum(albedo, 1.0).astype(float), sigma_t)
         return Medium.from_albedo(*(v if len(v) > 1 else float(v[0]) for v in pair), g, eta)
+
+    def is_even(self, shape: mi.Shape) -> bool:
+        """Whether its textures are the same everywhere on a shape, and no derivatives by them are followed.
+
+        Models are then those of the medium itself, of which they are 0.3 % off between nodes of the albedo.
+        """
+        values = [
+            np.concatenate([texels(texture), attributes(name, texture, shape)])
+            for name, texture in self.textures.items()
+        ]
+        even = all(len(v) > 0 and (v == v[0]).all() for v in values)
+        nodes = [node for texture in self.textures.values() for node in mi.traverse(texture).hierarchy]
+        known = all(kind_of(node) in KNOWN for node in nodes)
+        with dr.resume_grad():
+            return even and known and not self.is_followed(shape)
 
     def check(self, obj: Geometry | None = None) -> None:
         """Refuse textures that are no medium's, and warn of colours that no medium has, which are clipped.
@@ -319,6 +336,8 @@ def _mean(name: str, texture: mi.Texture, shape: mi.Shape | None) -> np.ndarray:
     values = texels(texture)
     if shape is not None:
         values = np.concatenate([values, attributes(name, texture, shape)])
+    if len(values) and (values == values[0]).all():
+        return values[0]  # to the last bit
     return values.mean(axis=0) if len(values) else np.full(len(mi.Spectrum(0)), UNKNOWN[name])
 
 
