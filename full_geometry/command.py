@@ -16,6 +16,7 @@ from halfspace_sss.neural.store import check_weights_folder, load_weights
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.rendering.object.objects import TranslucentObject, object_of, outermost
 from halfspace_sss.rendering.object.registry import model_names
+from halfspace_sss.rendering.object.wrapped import surface_of
 from halfspace_sss.rendering.scenes.learners import LearntObject, ObjectError
 
 
@@ -27,7 +28,7 @@ def untrained(scene: Any) -> list[str]:
     """
     missing = []
     for shape in outermost(scene) if find_spec("torch") else ():
-        inside = shape.bsdf().inside
+        inside = surface_of(shape).inside
         asked = inside.model == KIND and inside.orders != "single"
         if not asked or not np.any(inside.medium.sigma_s > 0):
             continue

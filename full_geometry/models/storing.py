@@ -29,6 +29,7 @@ from halfspace_sss.rendering.object.points import opaque
 from halfspace_sss.rendering.object.shape import name_of
 from halfspace_sss.rendering.object.translucent import Inside
 from halfspace_sss.rendering.object.varying import grid_values
+from halfspace_sss.rendering.object.wrapped import surface_of
 from halfspace_sss.rendering.scenes.identity import object_digest
 
 ANCHORS = 256
@@ -192,7 +193,7 @@ def _surface(shape: mi.Shape, inside: Inside | None, sigma_t: float) -> str:
     if inside is not None:
         m = inside.medium
         numbers = np.concatenate([np.ravel(v) for v in (m.albedo, m.g, m.sigma_t / max(sigma_t, 1e-30), m.eta)])
-        return f"{object_digest(bsdf.boundary)} {[f'{v:.6g}' for v in numbers]}"
+        return f"{object_digest(surface_of(shape).boundary)} {[f'{v:.6g}' for v in numbers]}"
     return f"{object_digest(bsdf)} {_painted(shape)} {shape.has_flipped_normals()}"
 
 

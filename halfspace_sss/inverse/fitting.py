@@ -23,6 +23,7 @@ from halfspace_sss.inverse.parameters import FitParameters, translucent_object
 from halfspace_sss.inverse.views import GivenView, check_views
 from halfspace_sss.progress import ProgressText
 from halfspace_sss.provenance import check_folder
+from halfspace_sss.rendering.object.wrapped import surface_of
 from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED, open_scene
 
 STEPS = 30
@@ -68,7 +69,7 @@ def fit(
     mm_per_unit = getattr(integrator, "mm_per_unit", None) or integrator.settings.mm_per_unit
     check_views(scene, images, shape)
     work = None if work is None else check_folder(work)
-    comparison, textured = ViewComparison(scene, list(images), settings), shape.bsdf().inside.textured is not None
+    comparison, textured = ViewComparison(scene, list(images), settings), surface_of(shape).inside.textured is not None
     if textured:
         from halfspace_sss.inverse.textures import TextureDescent, TextureParameters  # torch
 
@@ -161,7 +162,7 @@ class MediumDescent:
             errors[name] = (error * slopes)[at : at + len(value)]
             at += len(value)
         told = self.parameters.at_bounds(x) + _ambiguity(values, correlation)
-        medium, exposures = self.parameters.shape.bsdf().inside.medium, self.comparison.exposures.tolist()
+        medium, exposures = surface_of(self.parameters.shape).inside.medium, self.comparison.exposures.tolist()
         return MaterialFit(values, errors, correlation, medium, fitted, test, exposures, told, self.steps)
 
     def _covariance(self, loss: float) -> np.ndarray:

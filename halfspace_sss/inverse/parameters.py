@@ -13,6 +13,7 @@ from halfspace_sss.checks import check_choice
 from halfspace_sss.rendering.object.objects import translucent_shapes
 from halfspace_sss.rendering.object.shape import name_of
 from halfspace_sss.rendering.object.translucent import VARIABLE
+from halfspace_sss.rendering.object.wrapped import surface_of
 
 NAMES = ("albedo", "sigma_t", "mfp", "g")
 ALBEDO = (1e-4, 1 - 1e-5)  # bounds
@@ -75,13 +76,13 @@ class FitParameters:
             ValueError: a name is unknown or there twice, sigma_t and mfp are both asked for, or the medium varies.
         """
         check_names(names, NAMES)
-        if not shape.bsdf().inside.is_homogeneous:
+        if not surface_of(shape).inside.is_homogeneous:
             raise ValueError(f"the medium of {name_of(shape)} must be homogeneous to be fitted, got one that varies")
         return cls(tuple(names), shape, size_bounds(shape, mm_per_unit))
 
     def start(self) -> dict[str, mi.Float | mi.Spectrum]:
         """The variables of the medium as it is, within the bounds."""
-        surface, result = self.shape.bsdf(), {}
+        surface, result = surface_of(self.shape), {}
         for name in self.names:
             if name == "g":  # one for all channels
                 x = mi.Float(np.arctanh(np.clip(np.mean(np.ravel(surface.g)), -0.95 * G, 0.95 * G) / G))
@@ -120,7 +121,7 @@ class FitParameters:
 
     def put(self, x: dict[str, mi.Float | mi.Spectrum]) -> None:
         """Set the medium of the object."""
-        surface, values = self.shape.bsdf(), self.values(x)
+        surface, values = surface_of(self.shape), self.values(x)
         for name, value in values.items():
             setattr(surface, name, value)
         surface.parameters_changed([name for name in VARIABLE if name in values])

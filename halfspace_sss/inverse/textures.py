@@ -24,6 +24,7 @@ from halfspace_sss.inverse.comparing import FitStep, MaterialFit, ViewComparison
 from halfspace_sss.inverse.parameters import ALBEDO, NEAR, G, check_names, size_bounds, translucent_object
 from halfspace_sss.rendering.object.shape import name_of
 from halfspace_sss.rendering.object.textured import TexturedMedium, kind_of, shown
+from halfspace_sss.rendering.object.wrapped import surface_of
 from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED, open_scene
 
 STEPS = 200
@@ -138,7 +139,7 @@ class TextureParameters:
             ValueError: a name is unknown, there twice, or of another medium than the object's; a texture is neither a
                 bitmap nor an attribute of the mesh.
         """
-        textured = shape.bsdf().inside.textured
+        textured = surface_of(shape).inside.textured
         constants = [name for name in textured.constants if name != "sigma_t"]
         lengths = ["sigma_t", "mfp"] if "sigma_t" in textured.constants else []
         check_names(names, (*textured.textures, *constants, *lengths))
@@ -151,7 +152,7 @@ def _variable(
 ) -> Variable:
     texture, factor, pairs, n = textured.textures.get(name), 1.0, None, len(mi.Spectrum(0))
     if texture is None:
-        owner, ending = shape.bsdf(), "sigma_t" if name == "mfp" else name
+        owner, ending = surface_of(shape), "sigma_t" if name == "mfp" else name
     elif kind_of(texture) == "BitmapTexture":
         owner, ending = texture, "data"
     elif kind_of(texture) == "MeshAttribute":
@@ -319,7 +320,7 @@ class TextureDescent:
         for v in self.parameters.variables:
             told += self._told(v)
         textures = {v.name: found.pop(v.name) for v in self.parameters.variables if v.is_texture}
-        medium = self.parameters.shape.bsdf().inside
+        medium = surface_of(self.parameters.shape).inside
         medium = medium.textured.mean(medium.medium.g, medium.medium.eta, self.parameters.shape)
         exposures = self.comparison.exposures.tolist()
         return MaterialFit(found, {}, np.zeros((0, 0)), medium, fitted, held, exposures, told, self.steps, textures)
@@ -350,7 +351,7 @@ def painted_mesh(scene: str | Path, name: str | None, values: Mapping[str, np.nd
     shape = translucent_object(open_scene(scene, PATH_TRACED), name)
     parameters, stream = mi.traverse(shape), mi.MemoryStream()
     for key, each in values.items():
-        attribute = shown(shape.bsdf().inside.textured.textures[key])[0][1]
+        attribute = shown(surface_of(shape).inside.textured.textures[key])[0][1]
         parameters[attribute] = mi.Float(each.ravel().tolist())
     parameters.update()
     shape.write_ply(stream)

@@ -14,6 +14,7 @@ from halfspace_sss.checks import check_count, check_interval, renamed
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.rendering.object.registry import learnt_names, lookup
 from halfspace_sss.rendering.object.shape import survey
+from halfspace_sss.rendering.object.wrapped import surface_of
 from halfspace_sss.rendering.paths.gathering import PART
 from halfspace_sss.rendering.scenes.learners import CostedLearner, Learner, learner
 from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED, first_cause
@@ -233,7 +234,7 @@ def _unseen(on: Stage, k: int) -> ObjectTrade:
 def _mfp(on: Stage, k: int) -> tuple[float, float]:
     """Mean free paths across an object."""
     size = survey(on.shapes[k]).size * on.mm_per_unit
-    thickness = [size * float(m.sigma_t) for m in on.shapes[k].bsdf().inside.channels()]
+    thickness = [size * float(m.sigma_t) for m in surface_of(on.shapes[k]).inside.channels()]
     return min(thickness), max(thickness)
 
 

@@ -22,6 +22,7 @@ from halfspace_sss.provenance import provenance, write_atomically
 from halfspace_sss.rendering.object.objects import translucent_shapes
 from halfspace_sss.rendering.object.registry import AUTO, Choices, model_names
 from halfspace_sss.rendering.object.settings import Settings
+from halfspace_sss.rendering.object.wrapped import surface_of
 from halfspace_sss.rendering.scenes.identity import scene_hash
 from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED
 from halfspace_sss.trade.assessing import assess_stage
@@ -53,7 +54,7 @@ def choose(scene: mi.Scene, settings: Settings) -> Choices:
         ValueError: the scene cannot be rendered, or the file of an earlier choice is damaged.
     """
     on = Stage(scene, translucent_shapes(scene), settings.shared(), settings.of_models())
-    named = [settings.model or shape.bsdf().inside.model for shape in on.shapes]
+    named = [settings.model or surface_of(shape).inside.model for shape in on.shapes]
     path = choices_folder() / f"{_identity(on, settings)}.json"
     record = _read(path) if path.is_file() else None
     if record is None or len(record["models"]) != len(named):

@@ -14,6 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from halfspace_sss.rendering.gathered.transfer import R_2
+from halfspace_sss.rendering.object.wrapped import surface_of
 
 LAUNCH, LAUNCHES = 2**16, 16  # rays of a look at the scene, and the most looks for an object that is hardly seen
 FEWEST = 32  # exits of an object that is assessed
@@ -100,7 +101,10 @@ def _shows_lamp(scene: Any, shapes: list[Any], si: Any, through: bool) -> Any:
         eta, translucent = mi.Float(1), mi.Bool(False)
         for shape in shapes:
             here = si.shape == mi.ShapePtr(shape)
-            eta, translucent = dr.select(here, float(shape.bsdf().inside.channels()[0].eta), eta), translucent | here
+            eta, translucent = (
+                dr.select(here, float(surface_of(shape).inside.channels()[0].eta), eta),
+                translucent | here,
+            )
         active &= translucent
         cosine = mi.Frame3f.cos_theta(si.wi)
         reflectance, cosine_t, _, eta_ti = mi.fresnel(cosine, eta)

@@ -120,19 +120,6 @@ def test_integrators_around_ours_show_the_same_image(outer, integrator):
     assert abs(around.mean() / image(make(integrator), 512).mean() - 1) < 0.01
 
 
-@pytest.mark.parametrize(
-    "wrapper, label",
-    [({"type": "twosided"}, "TwoSidedBRDF"), ({"type": "mask", "opacity": 0.5}, "MaskBSDF"),
-     ({"type": "blendbsdf", "weight": 0.5, "other": {"type": "diffuse"}}, "BlendBSDF"),
-     ({"type": "bumpmap", "map": {"type": "checkerboard"}}, "BumpMap"),
-     ({"type": "normalmap", "normalmap": {"type": "checkerboard"}}, "NormalMap")],
-)  # fmt: skip
-@pytest.mark.parametrize("integrator", INTEGRATORS)
-def test_a_translucent_surface_inside_of_another_is_refused(integrator, wrapper, label):
-    scene = make(integrator, second={"type": "cube", "bsdf": {**wrapper, "inner": surface()}})
-    assert refusal(scene) == f"a translucent surface must stand alone, got one inside the {label} of 'second'"
-
-
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_instances_of_a_translucent_object_are_refused(integrator):
     group = {"type": "shapegroup", "part": {"type": "cube", "bsdf": surface()}}

@@ -20,7 +20,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from halfspace_sss.rendering.object.translucent import is_translucent
+from halfspace_sss.rendering.object.wrapped import surface_of
 
 # ---- Suns of an environment map -------------------------------------------------------------------------------------
 #
@@ -296,7 +296,7 @@ def _has_place(emitter: mi.Emitter) -> bool:
     """Whether an emitter is neither the environment nor out of reach nor the surface of a translucent object."""
     shape = emitter.get_shape()
     met = not emitter.flags() & int(mi.EmitterFlags.Delta)
-    return not emitter.is_environment() and (shape is None or (met and not is_translucent(shape.bsdf())))
+    return not emitter.is_environment() and (shape is None or (met and not surface_of(shape)))
 
 
 def _place(emitter: mi.Emitter) -> tuple[float, float, float, bool, float]:

@@ -53,8 +53,9 @@ from halfspace_sss.rendering.object.shape import (
 )
 from halfspace_sss.rendering.object.spectral import MediumByWavelength
 from halfspace_sss.rendering.object.textured import SurfaceMedium, TexturedMedium
-from halfspace_sss.rendering.object.translucent import Inside, check_tints, is_translucent
+from halfspace_sss.rendering.object.translucent import Inside, check_tints
 from halfspace_sss.rendering.object.varying import VaryingMedium, equivalent, warn_of_means
+from halfspace_sss.rendering.object.wrapped import Wrapping, surface_of, wrapping_of
 
 STARTS = 64  # rays of each sensor that are looked at
 LOOKS = 512  # rays that look for parts of a shape in an object
@@ -118,7 +119,8 @@ class Contents:
     def of(cls, result: list[Content], world: mi.Scene, mm_per_unit: float) -> Contents:
         """Of shapes in the scene `world`."""
         shapes = [content.thing for content in result]
-        below = [shape.bsdf().inside if is_translucent(shape.bsdf()) else None for shape in shapes]
+        surfaces = [surface_of(shape) for shape in shapes]
+        below = [surface and surface.inside for surface in surfaces]
         insides = [inside and replace(inside, medium=inside.medium.scaled(mm_per_unit)) for inside in below]
         return cls(result, scene_of(shapes, world), insides, [state_of(shape.bsdf()) for shape in shapes])
 
@@ -186,7 +188,7 @@ def refuse_textures(name: str, what: str) -> None:
 
 def outermost(scene: mi.Scene) -> list[mi.Shape]:
     """The translucent shapes of a scene that lie in no other."""
-    shapes = [shape for shape in scene.shapes() if is_translucent(shape.bsdf())]
+    shapes = [shape for shape in scene.shapes() if surface_of(shape)]
     holders = [a for a in shapes if any(a.bbox().contains(b.bbox()) for b in shapes if b is not a)]
     result = contents(scene, [survey(shape) for shape in holders])
     return [shape for shape in shapes if not any(shape is content.thing for content in result)]
@@ -268,24 +270,18 @@ def translucent_shapes(scene: mi.Scene) -> list[Any]:
     """The shapes whose surface is `translucent`.
 
     Raises:
-        ValueError: such a surface is inside of another BSDF, which would show its reflection only, or its shape belongs
-            to a shape group, whose instances are several objects; or the scene has media of Mitsuba.
+        ValueError: a shape belongs to a shape group, whose instances are several objects; the scene has media of
+            Mitsuba; or as of `wrapping_of`.
     """
     shapes = scene.shapes()
     for node in mi.traverse(scene).hierarchy:
-        if isinstance(node, mi.Shape) and node not in shapes and _inside(node.bsdf()):
+        if isinstance(node, mi.Shape) and node not in shapes and surface_of(node):
             raise ValueError(
                 f"a translucent object must stand in the scene itself, got {node.id()!r} in a shapegroup: "
                 "give each instance a shape of its own"
             )
-    for shape in shapes:
-        bsdf = shape.bsdf()
-        if _inside(bsdf) and not is_translucent(bsdf):
-            raise ValueError(
-                f"a translucent surface must stand alone, got one inside the {bsdf.class_name()} of {shape.id()!r}"
-            )
     _check_media(scene)
-    return [shape for shape in shapes if is_translucent(shape.bsdf())]
+    return [shape for shape in shapes if surface_of(shape)]
 
 
 def _check_media(scene: mi.Scene) -> None:
@@ -297,7 +293,7 @@ def _check_media(scene: mi.Scene) -> None:
         if medium is not None
     ]
     for side, shape in results:
-        if is_translucent(shape.bsdf()):
+        if surface_of(shape):
             raise ValueError(
                 f"a translucent object must be without {side}, as its surface says what is inside, got the {side} "
                 f"of {shape.id()!r}"
@@ -329,11 +325,6 @@ def _starts(sensor: mi.Sensor, size: float) -> np.ndarray:
     # not sample_ray, which some sensors lack
     ray, _ = sensor.sample_ray_differential(0.0, numbers[0], mi.Point2f(*numbers[1:3]), mi.Point2f(*numbers[3:]))
     return np.array(mi.Point3f(ray.o + ray.d * (1e-4 * size))).reshape(3, -1)
-
-
-def _inside(bsdf: mi.BSDF | None) -> bool:
-    """Whether a BSDF is `translucent` or has such a one in it."""
-    return bsdf is not None and any(is_translucent(node) for node in mi.traverse(bsdf).hierarchy)
 
 
 _MODELS = "models of their light"
@@ -376,10 +367,15 @@ class TranslucentObject:
     control: Any = None
     painted: tuple[list, list] = ([], [])
 
+    @functools.cached_property
+    def wrapping(self) -> Wrapping:
+        """Its `translucent` surface, and what is around it."""
+        return wrapping_of(self.geometry.shape) or Wrapping(self.geometry.shape.bsdf())
+
     @property
     def surface(self) -> mi.BSDF:
-        """The BSDF of its shape: of one that is rendered `translucent`."""
-        return self.geometry.shape.bsdf()
+        """Of one that is rendered its `translucent` surface, else the BSDF of its shape."""
+        return self.wrapping.surface
 
     @property
     def eta(self) -> mi.Float:
@@ -428,8 +424,8 @@ class TranslucentObject:
 
     @property
     def alpha(self) -> ObjectAlbedo | None:
-        """Its directional albedo, where its transport knows one."""
-        return None if self.transport is None else self.transport.alpha
+        """Its directional albedo, where its transport knows one: with the normals that it has without a normal map."""
+        return None if self.transport is None or self.wrapping.bend is not None else self.transport.alpha
 
     @property
     def splits(self) -> bool:
@@ -527,7 +523,7 @@ def make_objects(
 
 def _asked(shape: Any, settings: Settings, model: str | None = None) -> Inside:
     """What is inside an object, with the model and orders that the integrator asks for."""
-    inside = shape.bsdf().inside
+    inside = surface_of(shape).inside
     asked = {"model": model or settings.model or inside.model, "orders": settings.orders or inside.orders}
     return inside if asked == {key: getattr(inside, key) for key in asked} else replace(inside, **asked)
 
@@ -556,6 +552,7 @@ def _make_object(geometry: Geometry, inside: Inside, settings: Settings) -> Tran
         obj = replace(obj, spectral=inside.spectral.scaled(settings.mm_per_unit))
     single_only = inside.orders == "single" or not any(float(m.sigma_s) > 0 for m in media)
     check_tints(geometry.name, obj.surface.boundary)
+    obj.wrapping.check(geometry)
     if geometry.contents is not None:
         _check_takes(geometry, inside, single_only)
     variation = Variation(obj.surface, settings.mm_per_unit, inside.model)
@@ -603,6 +600,11 @@ def _model_of(obj: TranslucentObject, inside: Inside, settings: Settings, variat
             )
         if obj.textured is not None and not getattr(of_object, "takes_textures", False):
             refuse_textures(obj.geometry.name, f"the model {inside.model!r}")
+        if obj.wrapping.bend is not None and lookup(inside.model).learner is not None:
+            raise ValueError(
+                f"object {obj.geometry.name} must be without normal and bump maps for the model {inside.model!r}: "
+                "translucent_walk and models of the half-space take them"
+            )
         return of_object(obj, settings)
     if obj.textured is not None:
         return palette_model(inside.model, obj.geometry, obj.media, obj.textured, settings)
@@ -707,7 +709,7 @@ def object_of(
         return TranslucentObject(geometry, media)
     unit = millimetres(shape) if mm_per_unit is None else mm_per_unit
     (geometry,) = filled(shape, [survey(_object_of(shape, name))], unit, "learning")
-    inside = equivalent(geometry.shape.bsdf().inside, geometry)
+    inside = equivalent(surface_of(geometry.shape).inside, geometry)
     media = _in_scene_units(inside.medium, unit)
     check_geometry(geometry)
     check_size(geometry, [float(m.sigma_t) for m in media], unit)
@@ -785,5 +787,5 @@ def _object_of(scene: Any, name: str | None) -> Any:
     if name not in known:
         names = ", ".join(id or name_of(shape) for id, shape in known.items())
         raise ValueError(f"object must be one of {names or 'none'}, got {name!r}")
-    check_surface(name, known[name].bsdf())
+    check_surface(name, surface_of(known[name]))
     return known[name]

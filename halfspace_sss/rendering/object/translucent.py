@@ -288,6 +288,7 @@ def _class(variant: str) -> type:
             self.m_components = [self.boundary.flags(self.reflection.lobe)]
             self.m_flags = self.m_components[0]
             self.directional: HalfSpaceAlbedo | None = None  # made when it is asked for
+            self.asked: list[Any] | None = None  # shading frames that it is asked with, while `object.wrapped` listens
             for name in VARIABLE:
                 setattr(self, name, mi.Spectrum(np.atleast_1d(getattr(self.inside.medium, name)).tolist()))
             self.inside = self.inside.with_variables(self)
@@ -325,6 +326,9 @@ def _class(variant: str) -> type:
         def eval(
             self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
         ) -> Any:
+            if self.asked is not None:
+                self.asked.append(mi.Frame3f(si.sh_frame))
+                return mi.Spectrum(0)
             return self._shown(ctx, self.reflection.eval(ctx, si, wo, active))
 
         def pdf(self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True) -> Any:

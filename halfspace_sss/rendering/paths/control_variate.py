@@ -106,7 +106,7 @@ class ControlVariates:
 def _applies(obj: TranslucentObject) -> bool:
     """Whether an object has one surface of known area whose entries are sampled everywhere."""
     result = obj.geometry
-    even = obj.surface.inside.is_homogeneous
+    even = obj.surface.inside.is_homogeneous and obj.wrapping.bend is None
     return spreads(obj) and result.closed and result.area > 0 and result.pieces is None and even
 
 

@@ -163,6 +163,10 @@ def _check(obj: TranslucentObject) -> None:
         raise ValueError(f"light must be sampled for object {result.name}, which {lacks}, got gathered")
     if obj.surface.inside.varying is not None:
         raise ValueError(f"light must be sampled for object {result.name}, whose medium varies, got gathered")
+    if obj.wrapping.bend is not None:
+        raise ValueError(
+            f"light must be sampled for object {result.name}, which has a normal or bump map, got gathered"
+        )
 
 
 def light_state(scene: mi.Scene) -> tuple[list, list]:

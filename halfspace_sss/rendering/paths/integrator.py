@@ -19,6 +19,7 @@ from halfspace_sss.rendering.object.objects import KnowsUnit, TranslucentObject,
 from halfspace_sss.rendering.object.registry import Choices
 from halfspace_sss.rendering.object.settings import Settings, read_settings
 from halfspace_sss.rendering.object.translucent import is_translucent
+from halfspace_sss.rendering.object.wrapped import wraps
 from halfspace_sss.rendering.paths.control_variate import ControlVariates
 from halfspace_sss.rendering.paths.gathering import Gathering
 from halfspace_sss.rendering.paths.path_loop import replay_paths, trace_paths
@@ -273,9 +274,14 @@ def _moves(owner: mi.Object, name: str) -> bool:
 
 def _selects(parameters: mi.SceneParameters, owner: mi.Object | None, name: str) -> bool:
     """Whether a parameter does more than scale light: the share of a mirror in a blend, the index that a medium has."""
+    own = True
     while owner is not None:
-        if isinstance(owner, mi.BSDF) and owner.class_name() == "BlendBSDF":
-            return bool(owner.flags() & int(mi.BSDFFlags.Delta))
+        if isinstance(owner, mi.BSDF):
+            if wraps(owner):
+                return own  # its mask or map: what it is around is asked by itself
+            if owner.class_name() == "BlendBSDF":
+                return bool(owner.flags() & int(mi.BSDFFlags.Delta))
+            own = False
         owner = parameters.hierarchy[owner][0]
         if is_translucent(owner) and name == "eta":
             return True

@@ -285,7 +285,9 @@ def meet(
     obj: TranslucentObject, p: mi.Point3f, d: mi.Vector3f, flags: int, active: mi.Bool
 ) -> tuple[mi.SurfaceInteraction3f, mi.Normal3f, mi.Normal3f]:
     """Interaction with the boundary, shading normal and geometric normal, both outwards (along d for a sheet)."""
+    flags = flags | mi.RayFlags.All if obj.wrapping.bend is not None else flags
     si = obj.geometry.scene.ray_intersect(mi.Ray3f(p, d), flags, False, active)
+    si = obj.wrapping.bent(si, active & si.is_valid())
     sign = obj.geometry.side(si.prim_index, active & si.is_valid())
     if not obj.geometry.closed:
         sign = dr.select(dr.dot(si.n, d) > 0, 1.0, -1.0)
@@ -563,7 +565,7 @@ def _trial(
 # the refracted ray meets the target. The derivatives of reflected and refracted rays (Igehy 1999) contain the curvature
 # of the shading normals. Without reflection one solution is looked for, from where the straight ray meets the boundary:
 # light that reaches the event along several refracted rays is counted once, and where Newton's method fails the light
-# is lost.
+# is lost. The curvature of normal and bump maps is left out of derivatives, so that they focus no light.
 
 
 @dataclass

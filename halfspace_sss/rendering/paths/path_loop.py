@@ -149,8 +149,8 @@ def _loop(
         needs_second = path.needs_second | (active & first & _on_splitting(context, si))
 
         # ---- event: its next-event estimation goes to the tally, its ray to the next vertex
-        vertex = Vertex(si, path.ray, path.throughput, first & path.second_pass, first & ~path.second_pass,
-                        path.scattered, active)  # fmt: skip
+        vertex = Vertex(*met_surface(context, sampler, path.ray, si, active), path.ray, path.throughput,
+                        first & path.second_pass, first & ~path.second_pass, path.scattered, active)  # fmt: skip
         following, tally = sample_event(context, sampler, vertex, tally)
         throughput = dr.select(active, path.throughput * following.weight, path.throughput)
 
@@ -252,7 +252,8 @@ def emission(
 class Vertex(NamedTuple):
     """A surface point of a path, and what it has brought there."""
 
-    si: mi.SurfaceInteraction3f
+    si: mi.SurfaceInteraction3f  # as normal maps around translucent surfaces bend it
+    bsdf: mi.BSDFPtr  # that is met there, inside of masks and blends
     ray: mi.Ray3f
     throughput: mi.Spectrum
     low_only: mi.Bool  # first vertex of the second pass: orders below two only
@@ -277,6 +278,32 @@ class Taken(NamedTuple):
     u: mi.Float
 
 
+def met_surface(
+    context: RenderContext, sampler: mi.Sampler, ray: mi.Ray3f, si: mi.SurfaceInteraction3f, active: mi.Bool
+) -> tuple[mi.SurfaceInteraction3f, mi.BSDFPtr]:
+    """What a ray meets: the interaction as normal maps bend it, and the BSDF that masks and blends leave."""
+    bsdf = si.bsdf(ray)
+    for obj in context.objects:
+        around = obj.wrapping
+        if around.surface is obj.geometry.shape.bsdf():
+            continue
+        with dr.suspend_grad():
+            here = active & (si.shape == mi.ShapePtr(obj.geometry.shape))
+            own = mi.BSDFPtr(around.surface)
+            if around.mixes:
+                behind = (dr.dot(si.n, ray.d) * obj.geometry.side(si.prim_index, here) > 0) & obj.geometry.closed
+                own = around.draw(si, behind, sampler.next_1d(), here)
+            bsdf = dr.select(here, own, bsdf)
+            si = around.bent(si, here & (bsdf == mi.BSDFPtr(around.surface)))
+    return si, bsdf
+
+
+def _met(obj: TranslucentObject, at: Vertex) -> mi.Bool:
+    """Whether the translucent surface of an object is met."""
+    here = at.active & (at.si.shape == mi.ShapePtr(obj.geometry.shape))
+    return here & (at.bsdf == mi.BSDFPtr(obj.surface)) if obj.wrapping.mixes else here
+
+
 def sample_event(
     context: RenderContext, sampler: mi.Sampler, at: Vertex, tally: PathTally
 ) -> tuple[NextVertex, PathTally]:
@@ -285,7 +312,7 @@ def sample_event(
     choices = []
     with dr.suspend_grad():
         for obj in context.objects:
-            here = at.active & (at.si.shape == mi.ShapePtr(obj.geometry.shape))
+            here = _met(obj, at)
             choice = choose_event(obj, at.si, here)
             if obj.splits:
                 low = dr.select(at.low_only, mi.Float(1), dr.select(at.others_only, 0, choice.low_orders))
@@ -453,15 +480,17 @@ def _scatter_outside(
         if obj.surface.inside.reflection:
             glossy |= here & ~at.low_only
     plain = at.active & ~inside
+    if any(obj.wrapping.mixes for obj in context.objects):
+        plain &= ~at.low_only  # what stands beside a surface is of the first pass
 
     def scatter(_: NextVertex, __: mi.Bool, tally: PathTally) -> tuple:
         u = sampler.next_2d(), sampler.next_1d(), sampler.next_2d()
         with dr.suspend_grad():
-            following, direct = bsdf_event(context, u, at.ray, at.si, plain | glossy)
+            following, direct = bsdf_event(context, u, at.bsdf, at.si, plain | glossy)
         shown, meets, tally = _add_mirrored(context, sampler, following, at, tally, glossy)
         reflects = glossy & meets & (u_event < reflection)
         if context.mode.tracks:  # again: no derivatives may be pending while others are passed on
-            following, direct = bsdf_event(context, u, at.ray, at.si, plain | glossy)
+            following, direct = bsdf_event(context, u, at.bsdf, at.si, plain | glossy)
         tally = context.mode.settle(tally, at.throughput * direct, following.weight, plain | reflects, shown)
         return following, meets, tally
 
@@ -499,12 +528,12 @@ def _add_mirrored(
 
 
 def bsdf_event(
-    context: RenderContext, u: tuple[mi.Point2f, mi.Float, mi.Point2f], ray: mi.Ray3f, si: mi.SurfaceInteraction3f,
-    active: mi.Bool,
+    context: RenderContext, u: tuple[mi.Point2f, mi.Float, mi.Point2f], bsdf: mi.BSDFPtr,
+    si: mi.SurfaceInteraction3f, active: mi.Bool,
 ) -> tuple[NextVertex, mi.Spectrum]:  # fmt: skip
     """BSDF sampling and next-event estimation, weighted against each other by the balance heuristic."""
     # ---- next-event estimation
-    bsdf, ctx = si.bsdf(ray), mi.BSDFContext()
+    ctx = mi.BSDFContext()
     smooth = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
     ds, light = sample_emitter(context, si, u[0], True, smooth)
     smooth &= ds.pdf != 0
@@ -678,6 +707,7 @@ def _draw_candidate(
     with dr.suspend_grad():
         entry = proposals.sample(out, exit_point.face, exit_point.proposals, sampler, active)
         active = active & (entry.weight > 0)
+        entry = obj.wrapping.bent_entry(obj.geometry, entry, active)
         d, pdf = proposals.sample_direction(entry, out, sampler.next_2d())
         at, pdf, distance = place(entry.p, entry.n, out.medium), (1 - share) * pdf, mi.Float(-1)
     delta, emitter_point, light, brightness = mi.Bool(False), mi.Point3f(0), mi.Spectrum(0), mi.Float(1)

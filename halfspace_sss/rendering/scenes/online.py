@@ -22,7 +22,7 @@ from halfspace_sss.neural.store import weights_folder
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.provenance import check_folder
 from halfspace_sss.rendering.object.objects import outermost
-from halfspace_sss.rendering.object.translucent import is_translucent
+from halfspace_sss.rendering.object.wrapped import surface_of, wrapping_of
 from halfspace_sss.rendering.paths.integrator import is_bssrdf
 from halfspace_sss.rendering.scenes import reference
 from halfspace_sss.rendering.scenes.camera_walks import CameraWalks
@@ -46,7 +46,7 @@ def untrained(scene: Any) -> dict[str, list[str]]:
     """
     if not is_bssrdf(scene.integrator()) or scene.integrator().settings.train_seconds == 0:
         return {}
-    insides = [shape.bsdf().inside for shape in scene.shapes() if is_translucent(shape.bsdf())]
+    insides = [surface.inside for surface in map(surface_of, scene.shapes()) if surface]
     names, known, results = sorted({inside.model for inside in insides}), learners(), {}
     for name in names:
         if name in known and (ids := known[name].untrained(scene)):
@@ -152,9 +152,10 @@ def _learnt(
 
 
 def _join(scene: Any) -> bool:
-    """Whether walks show what the models show: all objects are learnt, and paths go farther than to an object."""
-    insides = [shape.bsdf().inside for shape in outermost(scene)]
-    return scene.integrator().settings.max_depth != 1 and all(inside.model in learners() for inside in insides)
+    """Whether walks show what the models show: all objects are learnt and unmasked, and paths go past an object."""
+    around = [wrapping_of(shape) for shape in outermost(scene)]
+    learnt = all(each.surface.inside.model in learners() and not each.mixes for each in around)
+    return scene.integrator().settings.max_depth != 1 and learnt
 
 
 def _sentence(name: str, model: str, settings: Any, joined: bool) -> str:

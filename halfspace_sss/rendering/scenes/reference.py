@@ -23,7 +23,7 @@ import numpy as np
 from halfspace_sss.checks import check_count
 from halfspace_sss.provenance import check_folder, provenance
 from halfspace_sss.rendering.object.registry import AUTO
-from halfspace_sss.rendering.object.translucent import is_translucent
+from halfspace_sss.rendering.object.wrapped import surface_of
 from halfspace_sss.rendering.paths.integrator import is_bssrdf
 from halfspace_sss.rendering.scenes.identity import learnt, scene_hash, words
 from halfspace_sss.rendering.scenes.reference_store import BY_CHANCE, Reference, load, save
@@ -232,7 +232,7 @@ def chosen(scene: Any, integrator: Any) -> dict[str, Any]:
     """What was chosen for "auto" and why; it is chosen now if it has not been."""
     if not is_bssrdf(integrator):
         return {}
-    models = [shape.bsdf().inside.model for shape in scene.shapes() if is_translucent(shape.bsdf())]
+    models = [surface.inside.model for surface in map(surface_of, scene.shapes()) if surface]
     if AUTO not in (integrator.settings.model, integrator.settings.light, *models):
         return {}
     integrator.prepare(scene)

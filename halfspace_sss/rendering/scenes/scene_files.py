@@ -18,7 +18,7 @@ import mitsuba as mi
 from halfspace_sss.interrupts import is_interrupt
 from halfspace_sss.rendering.object.registry import lookup, model_names
 from halfspace_sss.rendering.object.settings import ORDERS, SHARED
-from halfspace_sss.rendering.object.translucent import is_translucent
+from halfspace_sss.rendering.object.wrapped import surface_of
 from halfspace_sss.rendering.paths.integrator import is_bssrdf
 
 _HERE = str(Path(__file__).parents[3])
@@ -157,7 +157,7 @@ def open_scene(
     _choose_integrator(state, model, bool(model or orders), settings or {})
     _set_parameters(state, settings or {})
     loaded = _made(scene, state, config)
-    if not any(is_translucent(shape.bsdf()) for shape in loaded.shapes()):
+    if not any(map(surface_of, loaded.shapes())):
         raise ValueError(_NO_OBJECT)
     return loaded
 

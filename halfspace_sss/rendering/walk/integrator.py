@@ -19,6 +19,7 @@ from halfspace_sss.rendering.object.settings import OF_MITSUBA, check_parameters
 from halfspace_sss.rendering.object.shape import number_of, same_objects
 from halfspace_sss.rendering.object.textured import shown
 from halfspace_sss.rendering.object.varying import equivalent
+from halfspace_sss.rendering.object.wrapped import surface_of
 from halfspace_sss.rendering.walk.emitter_connections import EmitterDirections, InnerLights, find_connections
 from halfspace_sss.rendering.walk.media import WalkMedia
 from halfspace_sss.rendering.walk.path_loop import FirstExits, LightVisitor, PathTracer
@@ -180,8 +181,8 @@ def _check_followed(scene: mi.Scene) -> None:
     """
     parameters, owners, attributes = mi.traverse(scene), [], set()
     for shape in translucent_shapes(scene):
-        textured = shape.bsdf().inside.textured
-        owners.append(shape.bsdf())
+        textured = surface_of(shape).inside.textured
+        owners.append(surface_of(shape))
         for texture in textured.textures.values() if textured else ():
             owners += mi.traverse(texture).hierarchy
             attributes |= {(id(shape), name) for _, name in shown(texture)}

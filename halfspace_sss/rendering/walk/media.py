@@ -23,8 +23,9 @@ from halfspace_sss.rendering.object.shape import (
     scene_of,
     survey,
 )
-from halfspace_sss.rendering.object.translucent import Inside, is_translucent, smooth_boundary
+from halfspace_sss.rendering.object.translucent import Inside, smooth_boundary
 from halfspace_sss.rendering.object.varying import VaryingMedium, eval_volume
+from halfspace_sss.rendering.object.wrapped import Wrapping, surface_of, wrapping_of
 
 # ---- Shapes, media and lights inside objects ------------------------------------------------------------------------
 #
@@ -109,7 +110,7 @@ def _shapes(result: list[Content]) -> list[mi.Shape]:
 
 
 def _displaces(shape: mi.Shape) -> bool:
-    return not is_translucent(shape.bsdf()) and bool(shape.bsdf().flags() & REFRACTS)
+    return not surface_of(shape) and bool(shape.bsdf().flags() & REFRACTS)
 
 
 def _innermost(key: int, result: list[Content], holders: list[Geometry], n: int) -> int:
@@ -122,9 +123,9 @@ def _innermost(key: int, result: list[Content], holders: list[Geometry], n: int)
 def _check(result: list[Content], objects: list[Geometry]) -> None:
     for content in result:
         holder = objects[content.object]
-        surfaces = [holder.shape.bsdf()]
+        surfaces = [surface_of(holder.shape)]
         if isinstance(content.thing, mi.Shape):
-            translucent = is_translucent(content.thing.bsdf())
+            translucent = bool(surface_of(content.thing))
             if surfaces[0].inside.textured is not None and (translucent or _displaces(content.thing)):
                 raise ValueError(
                     f"an object with textures must hold nothing that refracts, got {content.name} in {holder.name}"
@@ -134,7 +135,7 @@ def _check(result: list[Content], objects: list[Geometry]) -> None:
                     f"what refracts must lie inside an object or outside, got {content.name} partly inside "
                     f"object {holder.name}"
                 )
-            surfaces += [content.thing.bsdf()] if translucent else []
+            surfaces += [surface_of(content.thing)] if translucent else []
         for surface in surfaces:
             if surface.inside.orders != "total":
                 raise ValueError(
@@ -153,6 +154,16 @@ def _check_instances(result: list[Content], scene: mi.Scene) -> None:
             f"what refracts inside an object must be no instance, got {name_of(grouped[0])} in a shapegroup and the "
             f"instance {name_of(instances[0])} inside"
         )
+
+
+def _check_mixes(wrappings: list[Wrapping], objects: list[Geometry], inner: InnerShapes | None) -> None:
+    """ValueError if a mask or blend is on an object inside another, or with something inside."""
+    alone = [True] * len(objects) if inner is None else np.array(inner.tables["alone"]).tolist()
+    for around, obj, free in zip(wrappings, objects, alone):
+        if around.mixes and not free:
+            raise ValueError(
+                f"an object with a mask or blendbsdf must be in no other and hold nothing, got object {obj.name}"
+            )
 
 
 # ---- Heterogeneous media -------------------------------------------------------------------------------------------
@@ -327,6 +338,7 @@ class WalkMedia:
         boundaries: dielectric BSDF of each.
         mm_per_unit: length of a scene unit, mm.
         inner: what lies inside the objects, if anything does.
+        wrappings: what is around their surfaces; () where nothing is.
     """
 
     objects: list[Geometry]
@@ -335,6 +347,7 @@ class WalkMedia:
     boundaries: list[mi.BSDF]
     mm_per_unit: float
     inner: InnerShapes | None = None
+    wrappings: tuple[Wrapping, ...] = ()
 
     def __post_init__(self) -> None:
         media = [inside.medium for inside in self.insides]
@@ -366,7 +379,7 @@ class WalkMedia:
     def is_current(self) -> bool:
         """Whether the objects still have the shapes and the media that this was made of."""
         pairs = zip(self.objects, self.insides)
-        return all(inside is obj.shape.bsdf().inside and obj.is_current() for obj, inside in pairs)
+        return all(inside is surface_of(obj.shape).inside and obj.is_current() for obj, inside in pairs)
 
     @property
     def same_g(self) -> bool:
@@ -382,7 +395,12 @@ class WalkMedia:
     def needed(self) -> int:
         """What boundaries have to know of a point that a walk meets: derivatives of positions where one is rough."""
         few = mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame | mi.RayFlags.UV
-        return mi.RayFlags.All if self.any_rough else few
+        return mi.RayFlags.All if self.any_rough or self.any_bent else few
+
+    @property
+    def any_bent(self) -> bool:
+        """Whether a normal or bump map bends the normals of an object."""
+        return any(around.bend is not None for around in self.wrappings)
 
     @property
     def all_rough(self) -> bool:
@@ -529,7 +547,7 @@ class WalkMedia:
     @property
     def interpolates(self) -> bool:
         """Whether normals of an object are not those of its surface."""
-        return any(obj.shape.is_mesh() and obj.shape.has_vertex_normals() for obj in self.objects)
+        return self.any_bent or any(obj.shape.is_mesh() and obj.shape.has_vertex_normals() for obj in self.objects)
 
     def seen(self, si: mi.SurfaceInteraction3f, k: mi.Int32, direction: mi.Vector3f) -> mi.SurfaceInteraction3f:
         """The interaction as a ray along `direction` sees it: normals outwards, none on the other side of the ray."""
@@ -540,7 +558,9 @@ class WalkMedia:
         self, si: mi.SurfaceInteraction3f, k: mi.Int32, direction: mi.Vector3f
     ) -> mi.SurfaceInteraction3f:
         """The interaction with its normals turned to the outside of object k; `direction` is that of the ray."""
-        if all(obj.upright for obj in self.objects):
+        for number, around in enumerate(self.wrappings):
+            si = around.bent(si, k == number)
+        if all(obj.upright for obj in self.objects) and not self.any_bent:
             return si
         n = dr.select(k >= 0, si.n * self.side(dr.maximum(k, 0), si.prim_index), si.n)
         flip = (k >= 0) & (dr.dot(si.sh_frame.n, n) < 0)
@@ -548,6 +568,21 @@ class WalkMedia:
         si.sh_frame = dr.select(flip, mi.Frame3f(-n), si.sh_frame)
         si.wi = si.to_local(-direction)
         return si
+
+    def draw(self, si: mi.SurfaceInteraction3f, d: mi.Vector3f, rng: mi.PCG32) -> tuple[mi.Int32, mi.BSDFPtr]:
+        """The number of the object that a ray along d meets from outside, -1 for another surface, and the BSDF of that.
+
+        Masks and blends may show another surface where an object is.
+        """
+        k, bsdf = self.index_of(si.shape), si.bsdf()
+        for number, around in enumerate(self.wrappings):
+            if around.mixes:
+                here, obj = k == number, self.objects[number]
+                behind = (dr.dot(si.n, d) * obj.side(si.prim_index, here) > 0) & obj.closed
+                drawn = around.draw(si, behind, rng.next_float32(), here)
+                bsdf = dr.select(here, drawn, bsdf)
+                k = dr.select(here & (drawn != mi.BSDFPtr(around.surface)), -1, k)
+        return k, bsdf
 
     @classmethod
     def of(cls, scene: mi.Scene, mm_per_unit: float) -> WalkMedia:
@@ -561,11 +596,15 @@ class WalkMedia:
         shapes = translucent_shapes(scene)
         inner, objects = scene_of(shapes, scene), [survey(shape, scene) for shape in shapes]
         for obj in objects:
-            if obj.shape.bsdf().inside.textured is not None:
-                obj.shape.bsdf().inside.textured.check(obj)
+            if surface_of(obj.shape).inside.textured is not None:
+                surface_of(obj.shape).inside.textured.check(obj)
         result = InnerShapes.of(scene, objects)
         check_together(scene, [inner, *([result.scene] if result else []), *(obj.scene for obj in objects)])
-        surfaces = [shape.bsdf() for shape in shapes]
+        wrappings = [wrapping_of(shape) for shape in shapes]
+        for around, obj in zip(wrappings, objects):
+            around.check(obj)
+        _check_mixes(wrappings, objects, result)
+        surfaces, some = [around.surface for around in wrappings], any(a.bend or a.mixes for a in wrappings)
         return cls(
             objects,
             [surface.inside for surface in surfaces],
@@ -573,6 +612,7 @@ class WalkMedia:
             [surface.boundary for surface in surfaces],
             float(mm_per_unit),
             result,
+            tuple(wrappings) if some else (),
         )
 
 
@@ -604,7 +644,7 @@ def media_within(obj: TranslucentObject) -> WalkMedia:
         alone, shapes = walk_media(obj), [s for s, inside in zip(contents.shapes, contents.insides) if inside]
         objects = [obj.geometry, *(survey(shape) for shape in shapes)]
         inner = InnerShapes.of(scene_of([obj.geometry.shape, *contents.shapes]), objects)
-        boundaries = [*alone.boundaries, *(shape.bsdf().boundary for shape in shapes)]
+        boundaries = [*alone.boundaries, *(surface_of(shape).boundary for shape in shapes)]
         insides = [*alone.insides, *filter(None, contents.insides)]
         own = scene_of([obj.geometry.shape, *shapes])
         _WITHIN[obj] = WalkMedia(objects, insides, own, boundaries, 1.0, inner)

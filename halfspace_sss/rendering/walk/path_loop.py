@@ -361,10 +361,10 @@ class PathTracer:
         """A surface met from outside: next-event estimation, BSDF sampling, Russian roulette, the way on or in."""
         # ---- BSDF or boundary
         walk, light, media = p.walk, p.light, self.visitor.media
-        rng, k = walk.rng, media.index_of(si.shape)
+        rng = walk.rng
+        k, bsdf = media.draw(si, walk.d, rng)
         translucent, near = k >= 0, dr.maximum(k, 0)
         si = media.seen(si, k, walk.d)
-        bsdf = si.bsdf()
         if media.objects:
             boundary = media.boundary(near)
             bsdf = dr.select(translucent, boundary if isinstance(boundary, mi.BSDFPtr) else mi.BSDFPtr(boundary), bsdf)

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 import drjit as dr
 import mitsuba as mi
 
+from halfspace_sss.rendering.object.wrapped import surface_of
 from halfspace_sss.rendering.walk.media import Place, WalkMedia
 
 if TYPE_CHECKING:
@@ -268,7 +269,7 @@ def followed(media: WalkMedia) -> list[tuple[int, dict[str, mi.Spectrum]]]:
     """
     result = []
     for k, obj in enumerate(media.objects):
-        surface, unit = obj.shape.bsdf(), {"sigma_t": media.mm_per_unit}
+        surface, unit = surface_of(obj.shape), {"sigma_t": media.mm_per_unit}
         own = [n for n in surface.inside.constants if n == "g" or surface.inside.textured is None]  # the rest by place
         values = {name: getattr(surface, name) for name in own}
         values = {name: value * unit.get(name, 1.0) for name, value in values.items() if dr.grad_enabled(value)}
