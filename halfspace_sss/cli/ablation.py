@@ -17,8 +17,11 @@ from halfspace_sss.cli.shared import (
     Eta,
     MeanCosine,
     OutFolder,
+    Scheduler,
     SigmaT,
+    Workers,
     console,
+    executor_of,
     stated_medium,
     whole,
 )
@@ -56,6 +59,8 @@ def ablation_command(
     seeds: Annotated[int, typer.Option(help="Trainings of each variant.", parser=whole)] = 3,
     seed: Annotated[int, typer.Option(help="Seed of the maps, and the first of the trainings.", parser=whole)] = 0,
     backend: Backend = "llvm",
+    workers: Workers = None,
+    scheduler: Scheduler = None,
     out: OutFolder = Path("ablation"),
 ) -> None:
     """Train the paper's network, `neural_material` and what lies between them, at equal time and at equal data.
@@ -76,12 +81,12 @@ def ablation_command(
     how = {"medium": repr(medium.in_mfp()), "recipe": repr(STANDARD), "seed": seed, "backend": backend}
     kept = KeptRows(out / "ablation.part", how)
     typer.echo(variants.cost(run for name, run in runs.items() if name not in kept), err=True)
-    with Bar("ablation") as bar:
+    with executor_of(workers, scheduler) as executor, Bar("ablation") as bar:
         table = variants.ablation(
-            medium, STANDARD, budgets, seeds, seed, backend=backend, kept=kept,
+            medium, STANDARD, budgets, seeds, seed, backend=backend, kept=kept, executor=executor,
             progress=lambda what, done, total: bar.show(done, total, what),
         )  # fmt: skip
-    summary, caption = variants.summary(table), variants.caption(budgets)
+    summary, caption = variants.summary(table), variants.caption(budgets, int(table["threads"].max()))
     how = {"medium": title, "budgets": [str(b) for b in budgets], "seeds": seeds, "seed": seed, "backend": backend}
     files = _write(out, table, summary, caption, how)
     kept.finish()

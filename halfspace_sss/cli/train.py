@@ -20,7 +20,6 @@ from halfspace_sss.cli.shared import (
     Eta,
     Materials,
     MeanCosine,
-    ObjectId,
     OutFolder,
     Scheduler,
     SigmaT,
@@ -54,6 +53,10 @@ Steps = Annotated[
 ]
 TrainingSeed = Annotated[int, typer.Option(help="Seed of data, batches and first numbers.", parser=whole)]
 MapsBackend = Annotated[str, typer.Option(help="llvm or cuda, for the maps.")]
+Objects = Annotated[
+    list[str] | None,
+    typer.Option(help="Its id in the scene; repeat for more.", show_default="the only translucent one"),
+]
 WeightsFolder = Annotated[
     Path | None, typer.Option(help="Folder for the weights.", show_default="where models find them")
 ]
@@ -134,7 +137,7 @@ def material_command(
 
 def object_command(
     scene: Annotated[Path, typer.Option(help="Mitsuba XML file with the object.")],
-    object: ObjectId = None,
+    object: Objects = None,
     seconds: Seconds = 60.0,
     model: Annotated[
         str | None, typer.Option(help="Name of a model that learns objects.", show_default="full_geometry")
@@ -149,23 +152,55 @@ def object_command(
     seed: TrainingSeed = 0,
     define: Define = None,
     variant: Variant = "llvm_ad_rgb",
+    workers: Workers = None,
+    scheduler: Scheduler = None,
     out: WeightsFolder = None,
     work: Work = None,
 ) -> None:
-    """Train the network of an object of a scene, which `render` then knows, and say how wrong it is."""
+    """Train the networks of objects of a scene, which `render` then knows, and say how wrong they are."""
     _need_torch()
     parameters = defined(define)
+    use_mitsuba(variant)
+    from halfspace_sss.executors import completed
+    from halfspace_sss.rendering.object.objects import object_of
+    from halfspace_sss.rendering.scenes.learners import learner
+    from halfspace_sss.rendering.scenes.scene_files import load_objects
+
+    learner(model)
+    for name in object if object and len(object) > 1 else ():  # before one is trained
+        object_of(load_objects(scene, parameters), None, None, name)
+    how = {"seconds": seconds, "target_error": target_error, "seed": seed}
+    how |= {"base_model": base_model} if base_model is not None else {}
+    with executor_of(workers, scheduler) as executor, Bar("training") as bar:
+        if executor:  # whose processes may run elsewhere
+            scene, out, work = (path and path.absolute() for path in (scene, out, work))
+        how["folder"] = out
+        of, parts = (scene, parameters, variant, model), {}
+        for name in dict.fromkeys(object or (None,)):
+            own = work / name if work and len(object or ()) > 1 else work
+            parts[name or "object"] = (of, {**how, "object": name, "work": own}, None if executor else bar)
+        learnt = {}
+        for name, result in completed(executor, _train_object, parts):
+            learnt[name] = result
+            if executor:
+                bar.show(len(learnt), len(parts), name)
+    for name in parts:
+        _report_object(learnt[name])
+
+
+def _train_object(
+    of: tuple[Path, dict[str, str], str, str | None], how: dict[str, Any], bar: Bar | None
+) -> LearntObject:  # fmt: skip
+    """The network of an object of a scene file, by its parameters, variant and learner; on a worker without a bar."""
+    scene, parameters, variant, model = of
     use_mitsuba(variant)
     from halfspace_sss.rendering.scenes.learners import learner
     from halfspace_sss.rendering.scenes.scene_files import load_objects
 
-    learns = learner(model)
-    loaded = load_objects(scene, parameters)
-    how = {"object": object, "seconds": seconds, "target_error": target_error, "seed": seed, "folder": out}
-    how |= {"base_model": base_model} if base_model is not None else {}
-    with Bar("training") as bar:
-        result = learns.train(loaded, **how, work=work, progress=lambda what, done, total: bar.show(done, total, what))
-    _report_object(result)
+    def show(what: str, done: int, total: int) -> None:
+        bar.show(done, total, what)
+
+    return learner(model).train(load_objects(scene, parameters), **how, progress=show if bar else None)
 
 
 def universal_command(

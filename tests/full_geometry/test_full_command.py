@@ -6,6 +6,7 @@ import errno
 import functools
 import os
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,7 @@ from full_geometry.learning.fitting import Recipe  # noqa: E402
 from halfspace_sss.cli import app as cli  # noqa: E402
 from halfspace_sss.neural import store as known_weights  # noqa: E402
 from halfspace_sss.neural.store import load_weights  # noqa: E402
+from halfspace_sss.rendering.object.objects import object_of  # noqa: E402
 
 QUICK = Recipe(width=24, depth=2, batch=1024, chunk=2**13, reuse=4)
 TRAIN, REFERENCE = training.train, model_errors.reference
@@ -88,6 +90,34 @@ def test_an_object_begins_with_the_network_of_all_shapes_and_is_rendered() -> No
     assert load_weights(path, "full_geometry")[1]["recipe"]["base_model"] == "neural_shape"
     result = _invoke("render", "ball.xml", "--model", "full_geometry", "--spp", "4", "--train-seconds", "0")
     assert result.exit_code == 0 and Path("render/ball_full_geometry.exr").exists(), result.output
+
+
+ASIDE = BALL.replace("NAME", "other").replace('value="1"/>', 'value="2"/><point name="center" x="5" y="0" z="0"/>')
+TWO = XML.replace("  <sensor", f"{ASIDE}  <sensor")
+
+
+def test_several_objects_are_each_trained_with_work_of_their_own(monkeypatch: Any) -> None:
+    asked = []
+
+    def learns(scene: Any, **how: Any) -> SimpleNamespace:
+        asked.append((how["object"], how["work"]))
+        model = SimpleNamespace(object=object_of(scene, None, None, how["object"]))
+        return SimpleNamespace(model=model, path=None, errors=[], steps=0, seconds=0.0)
+
+    monkeypatch.setattr(training, "train", learns)
+    Path("two.xml").write_text(TWO)
+    named = ("--object", "ball", "--object", "other", "--object", "ball")
+    result = _invoke("train", "object", "--scene", "two.xml", *named, "--work", "work")
+    assert result.exit_code == 0, result.output
+    assert asked == [("ball", Path("work/ball")), ("other", Path("work/other"))]
+    assert "ball: no weights" in result.stdout and "other: no weights" in result.stdout
+
+
+def test_a_name_among_several_that_no_object_has_is_refused_before_any_is_trained(monkeypatch: Any) -> None:
+    monkeypatch.setattr(training, "train", lambda *a, **how: pytest.fail("it began"))
+    Path("two.xml").write_text(TWO)
+    result = _invoke("train", "object", "--scene", "two.xml", "--object", "ball", "--object", "bell")
+    assert result.exit_code == 2 and "bell" in result.stderr
 
 
 def test_a_model_with_single_scattering_is_held_against_walks_with_it(monkeypatch: Any) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -70,10 +71,10 @@ def table() -> pandas.DataFrame:
     return ablation(FIG10, TINY, (Seconds(0.05), Samples(ALMOST)), seeds=1)
 
 
-def _first_and_small(seeds: int) -> pandas.DataFrame:
+def _first_and_small(seeds: int, executor: Executor | None = None) -> pandas.DataFrame:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module, "VARIANTS", (VARIANTS[0], VARIANTS[-2]))
-        return ablation(FIG10, TINY, [Samples(ALMOST)], seeds=seeds, seed=5)
+        return ablation(FIG10, TINY, [Samples(ALMOST)], seeds=seeds, seed=5, executor=executor)
 
 
 @pytest.fixture(scope="module")
@@ -152,8 +153,9 @@ def test_at_equal_time_every_variant_trains_until_the_time_is_spent(table: panda
     assert (found["seconds"] >= 0.05).all() and (found["samples"] == found["steps"] * BATCH).all()
 
 
-def test_at_equal_data_a_seed_repeats_and_another_one_differs(repeated: pandas.DataFrame) -> None:
-    again = _first_and_small(1).drop(columns="seconds")
+def test_at_equal_data_a_seed_repeats_in_an_executor_and_another_one_differs(repeated: pandas.DataFrame) -> None:
+    with ThreadPoolExecutor(1) as executor:
+        again = _first_and_small(1, executor).drop(columns="seconds")
     first, other = (t.drop(columns="seconds").reset_index(drop=True) for _, t in repeated.groupby("seed"))
     pandas.testing.assert_frame_equal(first, again, check_exact=True)
     assert (first["error"] != other["error"]).all()
@@ -216,7 +218,9 @@ def test_the_command_writes_and_prints_both_tables_and_the_caption(small: Path) 
     assert result.exit_code == 0, result.output
     for words in ("fig10: 0.05 s each, 1 seed(s)", "fig10: 300 samples each", *(v.name for v in VARIANTS[-2:])):
         assert words in result.stdout
-    assert " ".join(caption([Seconds(0.05), Samples(300)]).split()) in " ".join(result.stdout.split())
+    assert " ".join(caption([Seconds(0.05), Samples(300)], torch.get_num_threads()).split()) in " ".join(
+        result.stdout.split()
+    )
     assert "ablation" in result.stderr  # the bar
     rows, content = pandas.read_csv("deep/found/ablation.csv"), json.loads(Path("deep/found/ablation.json").read_text())
     assert len(rows) == len(content["summary"]) == 4 and rows["error"].notna().all()
@@ -236,7 +240,7 @@ def test_a_budget_that_is_given_stands_alone_and_both_are_the_default(small: Pat
 
 
 def test_the_caption_says_what_the_table_does_and_does_not_say() -> None:
-    text = caption(BUDGETS)
+    text = caption(BUDGETS, 2)
     for words in ("for 20 s, or 1,000,000 samples each", "not their converged error", "says nothing against", "brings"):
         assert words in text
 

@@ -5,9 +5,11 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Iterable, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import product
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -17,13 +19,14 @@ from halfspace_sss.arrays import library
 from halfspace_sss.backend import array_types
 from halfspace_sss.checks import check_count
 from halfspace_sss.comparison.model_errors import TracedMaps, model_error, reference_maps
+from halfspace_sss.executors import completed
 from halfspace_sss.interface.model import BSSRDF, Query
 from halfspace_sss.maps.noisy_maps import draw_directions, make_pool, radial_edges
 from halfspace_sss.neural.features import N_FEATURES
 from halfspace_sss.neural.hypernetwork import in_range
 from halfspace_sss.neural.network import RELU, SILU, Network, layer_shapes
 from halfspace_sss.neural.paper_model import N_INPUTS, T_SMALLEST, NeuralPaper, query_inputs
-from halfspace_sss.neural.training.fit import Budget, Fit, Samples, Seconds, Within, fit
+from halfspace_sss.neural.training.fit import Budget, Samples, Seconds, Within, fit
 from halfspace_sss.neural.training.learners import PaperLearner, apply_networks, initial_numbers, relative_loss
 from halfspace_sss.neural.training.pool import Batch, MapPool
 from halfspace_sss.neural.training.train_material import (
@@ -201,12 +204,13 @@ def ablation(
     backend: str = "llvm",
     progress: NamedProgress | None = None,
     kept: dict[str, dict[str, float]] | None = None,
+    executor: Executor | None = None,
 ) -> pandas.DataFrame:
     """Train every variant within the same budgets on the same maps; one row per seed, budget and variant.
 
-    Columns: budget, variant, seed, kB (of the numbers in single precision), steps, samples, seconds, error, raw, noise,
-    bias (fractions), and the error in each decade of r, mean free paths. Rows of a budget of samples repeat for the
-    same seeds, backend, version and number of threads, but for their seconds.
+    Columns: budget, variant, seed, threads, kB (of the numbers in single precision), steps, samples, seconds, error,
+    raw, noise, bias (fractions), and the error in each decade of r, mean free paths. Rows of a budget of samples repeat
+    for the same seeds, backend, version and number of threads, but for their seconds.
 
     Args:
         medium: scalar; only albedo, g and eta count. Outside the range of the universal network the last variant is
@@ -216,8 +220,10 @@ def ablation(
         seeds: trainings of each variant, which differ in batches and first numbers.
         seed: of the maps; the trainings have the seeds from this one on.
         backend: of the maps, "llvm" or "cuda".
-        progress: called with (what comes next, trainings done, trainings in all).
+        progress: called with (what has come last, trainings done, trainings in all).
         kept: rows found before, of the same medium, recipe, seed of maps and backend; new ones are added.
+        executor: where trainings run, each with the maps of its process; None: here. Equal time is the same for all
+            variants only where all workers have as many threads, and cores of their own.
 
     Raises:
         ValueError: an argument is out of range; nothing has been traced then.
@@ -228,16 +234,16 @@ def ablation(
     array_types(backend)
     medium, report = medium.in_mfp(), progress or (lambda what, done, total: None)
     result = {} if kept is None else kept
-    report("maps", sum(name in result for name in runs), len(runs))
-    data = None if result.keys() >= runs.keys() else _data(medium, recipe, int(seed), backend)
-    rows = []
-    for name, (k, budget, variant) in runs.items():
-        report(f"{budget}: {variant.name}", len(rows), len(runs))
-        if name not in result:
-            result[name] = _row(variant, *data, recipe.how, budget, k)
-        rows.append({"budget": str(budget), "variant": variant.name, "seed": k} | result[name])
-    report("done", len(rows), len(runs))
-    return pandas.DataFrame(rows)
+    of = _Maps(float(medium.sigma_s), float(medium.sigma_a), float(medium.g), float(medium.eta), recipe, seed, backend)
+    left = {name: (of, variant, budget, k) for name, (k, budget, variant) in runs.items() if name not in result}
+    report("maps", len(runs) - len(left), len(runs))
+    for name, row in completed(executor, _row, left):
+        result[name] = row
+        report(name, sum(known in result for known in runs), len(runs))
+    if left:
+        _data.cache_clear()
+    told = {name: {"budget": str(budget), "variant": v.name, "seed": k} for name, (k, budget, v) in runs.items()}
+    return pandas.DataFrame([told[name] | result[name] for name in runs])
 
 
 def trainings(
@@ -267,27 +273,41 @@ def cost(runs: Iterable[tuple[int, Budget, Variant]]) -> str:
     return f"{len(budgets)} trainings: {', '.join(parts) or 'none left'}; maps and comparisons besides"
 
 
-def _data(medium: Medium, recipe: MaterialRecipe, seed: int, backend: str) -> tuple[MapPool, TracedMaps]:
-    """Maps to learn from, as for `neural.train`, and others to compare with."""
+class _Maps(NamedTuple):
+    """What maps of an ablation depend on."""
+
+    sigma_s: float
+    sigma_a: float
+    g: float
+    eta: float
+    recipe: MaterialRecipe
+    seed: int
+    backend: str
+
+
+@lru_cache(maxsize=1)
+def _data(of: _Maps) -> tuple[MapPool, TracedMaps]:
+    """Maps to learn from, as for `neural.train`, and others to compare with; once in a process."""
+    medium, recipe, seed = Medium(*of[:4]), of.recipe, int(of.seed)
     n = recipe.n_groups
     ratios = (np.full(n, float(v)) for v in (medium.albedo, medium.g, medium.eta))
     groups = draw_directions(*ratios, np.random.default_rng([seed, 0]))
-    halves = make_pool(groups, recipe.grid, recipe.events, (seed, 1), None, None, backend)
+    halves = make_pool(groups, recipe.grid, recipe.events, (seed, 1), None, None, of.backend)
     check = (VALIDATION_SEED, seed)
-    result = reference_maps([medium], SETS, recipe.grid, BLOCK, recipe.events / 4, check, None, backend)
+    result = reference_maps([medium], SETS, recipe.grid, BLOCK, recipe.events / 4, check, None, of.backend)
     return MapPool(groups, recipe.grid, halves), result[0]
 
 
-def _row(
-    variant: Variant, pool: MapPool, reference: TracedMaps, how: Fit, budget: Budget, seed: int
-) -> dict[str, float]:
+def _row(of: _Maps, variant: Variant, budget: Budget, seed: int) -> dict[str, float]:
+    """One training, and how wrong it is."""
+    (pool, reference), how = _data(of), of.recipe.how
     if variant.by_area:
         pool = drawn_by_area(pool)
     learner = variant.learner(reference.medium, pool, seed)
     source = pool.batches(how.n_groups, how.n_queries)
     spent = fit(learner, source, Within(budget, how), seed, threads=None).spent
     e = model_error(model_of(learner, reference.medium), reference)
-    row = {"kB": 4e-3 * sum(p.numel() for p in learner.parameters())}
+    row = {"threads": torch.get_num_threads(), "kB": 4e-3 * sum(p.numel() for p in learner.parameters())}
     row |= {key: getattr(spent, key) for key in ("steps", "samples", "seconds")}
     row |= {"error": e.error, "raw": e.raw, "noise": e.noise, "bias": e.bias}
     return row | {f"r {d}": v for d, v in e.by_decade.items()}
@@ -307,9 +327,9 @@ def summary(table: pandas.DataFrame) -> pandas.DataFrame:
     return pandas.DataFrame(rows)
 
 
-def caption(budgets: Sequence[Budget] = BUDGETS) -> str:
-    """What the table says, and what it does not."""
-    within, threads = ", or ".join(map(str, budgets)), torch.get_num_threads()
+def caption(budgets: Sequence[Budget], threads: int) -> str:
+    """What the table of trainings on so many threads says, and what it does not."""
+    within = ", or ".join(map(str, budgets))
     return (
         f"Each row changes one thing against the row above it. All are trained on the same maps, for {within} each, on "
         f"{threads} thread(s), and asked for unseen pairs of directions. samples: cells seen, two points of each; "
