@@ -85,20 +85,23 @@ class Palette:
         models: at the nodes of all channels.
         rows: of each channel.
         g: mean cosine of each channel.
+        alike: whether extinction is the same everywhere.
     """
 
     models: list[BSSRDF]
     rows: list[NodeRange]
     g: list[float]
+    alike: bool
 
     @classmethod
-    def of(cls, name: str, albedos: np.ndarray, media: Sequence[Medium]) -> Palette:
+    def of(cls, name: str, albedos: np.ndarray, media: Sequence[Medium], alike: bool = False) -> Palette:
         """Of a model.
 
         Args:
             name: of it.
             albedos: that nodes have to cover, shape (n, channels).
             media: of each channel, of which g and eta hold.
+            alike: whether extinction is the same everywhere.
 
         Raises:
             ValueError: the model knows some media only.
@@ -123,7 +126,7 @@ class Palette:
             nodes = _albedo_of_v(np.linspace(low, high, cells + 1), m.g) if high > low else np.full(cells + 1, ends[0])
             rows.append(NodeRange(len(models), cells, low, (high - low) / cells))
             models += [bssrdf(name, Medium.from_albedo(float(a), 1.0, m.g, m.eta)) for a in nodes]
-        return cls(models, rows, [m.g for m in media])
+        return cls(models, rows, [m.g for m in media], alike)
 
     @property
     def power(self) -> int:
@@ -135,6 +138,9 @@ class Palette:
 
         With derivatives by the media where they are followed; not by networks.
         """
+        if self.models[0].checksums:
+            with dr.suspend_grad():
+                return self._of_networks(ends, query, active)
         by_albedo, by_sigma_t = (any(dr.grad_enabled(getattr(end, key)) for end in ends) for key in SLOPED)
         with dr.suspend_grad():
             result, slopes = self._at_ends(ends, query, by_albedo, by_sigma_t, active)
@@ -158,9 +164,7 @@ class Palette:
 
         A loop over ends and channels, so that models are recorded once.
         """
-        n, lanes = len(self.rows), dr.width(query[0])
-        tables = [mi.Float([float(v) for v in column]) for column in zip(*(self._numbers(c) for c in range(n)))]
-        dr.make_opaque(tables)
+        n, lanes, tables = len(self.rows), dr.width(query[0]), self._tables()
 
         def step(k: mi.UInt32, result: mi.Spectrum, slopes: list[Slope]) -> tuple[mi.UInt32, mi.Spectrum, list[Slope]]:
             c, first = k % n, k < n
@@ -172,7 +176,8 @@ class Palette:
             node, f = _node(albedo, numbers)
 
             def pair(factor: float) -> tuple[mi.Float, mi.Float]:
-                return self._nodes(node, f, (query[0] * sigma_t * factor, *query[1:]), active)
+                pairs = [self._pair(*pair) for pair in zip(self.models, self.models[1:])]  # one function, other data
+                return dr.switch(node, pairs, query[0] * sigma_t * factor, *query[1:], active)
 
             a, b = pair(1.0)
             S = _between(a, b, f)
@@ -216,16 +221,15 @@ class Palette:
         row, g = self.rows[c], self.g[c]
         return row.first, row.cells, row.low, 1 / row.step if row.step > 0 else 0.0, g, bend(g)
 
-    def _nodes(
-        self, k: mi.UInt32, f: mi.Float, query: tuple[mi.Float, ...], active: mi.Bool
-    ) -> tuple[mi.Float, mi.Float]:
-        """S / albedo^p of node k and the next, for sigma_t = 1; of networks twice that at the share f between."""
-        if self.models[0].checksums:
-            return (self._between_networks(k, f, query, active),) * 2
-        pairs = [self._pair(*pair) for pair in zip(self.models, self.models[1:])]  # one function with other data
-        return dr.switch(k, pairs, *query, active)
+    def _tables(self) -> list[mi.Float]:
+        """`_numbers` by channel."""
+        tables = [mi.Float([float(v) for v in column]) for column in zip(*map(self._numbers, range(len(self.rows))))]
+        dr.make_opaque(tables)
+        return tables
 
     def _pair(self, first: BSSRDF, second: BSSRDF) -> Callable:
+        """A function for S / albedo^p of two nodes, for sigma_t = 1."""
+
         def pair(*args: Any) -> tuple[mi.Float, mi.Float]:
             *query, active = args
             return tuple(dr.select(active, self._over_power(m, query), 0) for m in (first, second))
@@ -235,18 +239,47 @@ class Palette:
     def _over_power(self, model: BSSRDF, query: Sequence[mi.Float]) -> mi.Float:
         return model.eval(*query) * opaque(float(model.medium.albedo) ** -self.power)
 
-    def _between_networks(self, k: mi.UInt32, f: mi.Float, query: tuple[mi.Float, ...], active: mi.Bool) -> mi.Float:
-        """The same node after node, where a neighbouring lane needs it: weights that differ by lane are slow."""
+    def _of_networks(self, ends: Sequence[SurfaceMedium], query: tuple[mi.Float, ...], active: mi.Bool) -> mi.Spectrum:
+        """S by networks, in a loop over channels and, where extinctions differ, over ends.
+
+        Of ends of the same extinction the query is the same, so that nodes of both are asked once.
+        """
+        n, tables = len(self.rows), self._tables()
+        groups = [ends] if self.alike else [[end] for end in ends]
+
+        def step(k: mi.UInt32, result: mi.Spectrum) -> tuple[mi.UInt32, mi.Spectrum]:
+            c, first = k % n, k < n
+            numbers, places, total = [dr.gather(mi.Float, table, c) for table in tables], [], mi.Float(0)
+            for pair in zip(groups[0], groups[-1]):
+                albedo, sigma_t = (dr.select(first, *(_pick(getattr(end, key), c) for end in pair)) for key in SLOPED)
+                albedo = dr.clip(albedo, 0, 1)
+                places.append(_node(albedo, numbers))
+                total += 2 * dr.log(sigma_t) + self.power * dr.log(dr.maximum(albedo, FAINT))
+            total += self._between_networks(places, (query[0] * sigma_t, *query[1:]), active)
+            root = dr.exp(total / len(ends))
+            return k + 1, mi.Spectrum([dr.select(c == j, value * root, value) for j, value in enumerate(result)])
+
+        lanes = dr.width(query[0])
+        start = mi.UInt32(0) + dr.zeros(mi.UInt32, lanes), dr.full(mi.Spectrum, 1, lanes)
+        return dr.while_loop(start, lambda k, _: active & (k < len(groups) * n), step, label="ends and channels")[1]
+
+    def _between_networks(
+        self, places: list[tuple[mi.UInt32, mi.Float]], query: tuple[mi.Float, ...], active: mi.Bool
+    ) -> mi.Float:
+        """Sum over places, a node and the share of the way to the next, of ln(S / albedo^p) for sigma_t = 1.
+
+        Node after node, where a neighbouring lane needs it: weights that differ by lane are slow.
+        """
         total = mi.Float(0)
         for j, model in enumerate(self.models):
-            weight = dr.select(k == j, 1 - f, dr.select(k + 1 == j, f, 0))
+            weight = sum(dr.select(k == j, 1 - f, dr.select(k + 1 == j, f, 0)) for k, f in places)
 
             def add(total: mi.Float, weight: mi.Float, query: tuple, model: BSSRDF = model) -> tuple:
                 return total + weight * dr.log(dr.maximum(self._over_power(model, query), FAINT)), weight, query
 
             needed = active & (weight > 0)
             total, *_ = dr.if_stmt((total, weight, query), needed, add, lambda *state: state, label="node")
-        return dr.exp(total)
+        return total
 
 
 def _node(albedo: mi.Float, numbers: Sequence[mi.Float]) -> tuple[mi.UInt32, mi.Float]:
@@ -353,7 +386,8 @@ def palette_model(
 
 def palette_of(name: str, geometry: Geometry, media: tuple[Medium, ...], medium: Varied) -> Palette:
     """The models of all media of an object; arguments and errors as of `palette_model`."""
-    return Palette.of(name, _values_of(geometry, media, medium)[0], media)
+    albedos, extinctions = _values_of(geometry, media, medium)
+    return Palette.of(name, albedos, media, bool((extinctions == extinctions[0]).all()))
 
 
 def _values_of(geometry: Geometry, media: tuple[Medium, ...], medium: Varied) -> tuple[np.ndarray, np.ndarray]:
