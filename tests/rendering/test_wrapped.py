@@ -143,6 +143,11 @@ REFUSED = {
     "glass": (lambda: _blend(PLAIN, {"type": "dielectric"}), {}, "got one with the SmoothDielectric, which lets light"),
     "blend in a map": (lambda: _flat(_blend(PLAIN, RED)), {}, "with maps inside, got one inside normalmap"),
     "learnt": (lambda: _flat({**PLAIN, "model": "neural_shape"}), {}, "'object' must be without normal and bump maps"),
+    "no slopes": (
+        lambda: {"type": "bumpmap", "map": {"type": "checkerboard"}, "of": PLAIN},
+        {},
+        "bumpmap of object 'object' must be a texture with slopes, such as a bitmap, got .*not implemented",
+    ),
     "gathered": (lambda: _flat(PLAIN), {"light": "gathered"}, "'object', which has a normal or bump map, got gathered"),
 }
 

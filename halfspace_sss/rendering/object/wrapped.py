@@ -65,11 +65,19 @@ class Wrapping:
     mixes: tuple[Mix, ...] = ()
 
     def check(self, obj: Geometry) -> None:
-        """ValueError if a mesh has no uv for its normal or bump map."""
+        """ValueError if a mesh has no uv for its normal or bump map, or a bump map has no slopes."""
         if self.bend is not None and obj.shape.is_mesh() and not obj.shape.has_vertex_texcoords():
             raise ValueError(
                 f"object {obj.name} must have uv for its {BENDS[self.bend.class_name()]}, got a mesh without"
             )
+        if self.bend is not None:
+            try:
+                self._frame(dr.zeros(mi.SurfaceInteraction3f, 1), mi.Bool(True))
+            except RuntimeError as error:  # of textures that Mitsuba cannot take slopes of
+                raise ValueError(
+                    f"{BENDS[self.bend.class_name()]} of object {obj.name} must be a texture with slopes, such as a "
+                    f"bitmap, got {error}"
+                ) from error
 
     def draw(self, si: mi.SurfaceInteraction3f, behind: mi.Bool, u: mi.Float, active: mi.Bool) -> mi.BSDFPtr:
         """The BSDF that a ray from outside meets at a point of the surface.
