@@ -26,6 +26,7 @@ SPP_PER_PASS = 64
 NOTES = (
     "The same network in all images, one path a pixel; what differs is where points of entry are drawn: probes that "
     "follow the half-space, learnt weights of patches, a flow inside patches. Of N entries of an exit one is followed. "
+    "Gathered light takes the sum over entries. "
     "FLIP and relative squared error against many samples by patches."
 )
 
@@ -38,7 +39,7 @@ def parts(quality: str) -> list[Part]:
 
 
 def rendered(task: Task) -> dict[str, Any]:
-    """The images of all samplers and numbers of entries under all lights, and the converged ones."""
+    """The images of all samplers and numbers of entries under all lights, by gathered light, and the converged ones."""
     prepare()
     p, results, done = task.params, {}, 0
     folders, flow = _weights(task)
@@ -47,6 +48,7 @@ def rendered(task: Task) -> dict[str, Any]:
         passes = max(p["spp"] // SPP_PER_PASS, 1)
         images = [_image(folders["patches"], p, light, 1, SPP_PER_PASS, 100 + k) for k in range(passes)]
         results[_key(light, "converged")] = np.mean(images, axis=0).astype(np.float32)
+        results[_key(light, "gathered")] = _image(folders["patches"], p, light, 1, 1, 7, gathered=True)
         for sampler in SAMPLERS:
             for n in ENTRIES:
                 drawn = flow if sampler == "flow" else None
@@ -82,9 +84,10 @@ def _weights(task: Task) -> tuple[dict[str, Path], dict[str, np.ndarray]]:
 
 
 def _image(
-    folder: Path, p: Mapping[str, Any], light: str, entries: int, spp: int, seed: int, flow: Any = None
-) -> np.ndarray:
-    """The image with the weights of a folder; entries by a flow if its weights are given."""
+    folder: Path, p: Mapping[str, Any], light: str, entries: int, spp: int, seed: int, flow: Any = None,
+    gathered: bool = False,
+) -> np.ndarray:  # fmt: skip
+    """The image with the weights of a folder; entries by a flow if its weights are given, or light gathered."""
     import mitsuba as mi
 
     from figures.studies.flow import draw_by
@@ -92,6 +95,7 @@ def _image(
 
     description = bunny_scene("potato", p["size"], light)
     description["integrator"]["entries"] = entries
+    description["integrator"]["light"] = "gathered" if gathered else "sampled"
     description["bunny"]["bsdf"]["orders"] = "multiple"
     with weights_in(folder):
         scene = load_scene(description, "full_geometry")
@@ -108,11 +112,10 @@ def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
         mask = reference.max(axis=2) > 0
         gain = np.float32(2.0 ** stops_of(reference, mask))
         shots = [Shot("Converged", gain * reference, {})]
-        for n in ENTRIES:
-            for sampler in SAMPLERS:
-                image = images[_key(light, sampler, n)]
-                label = f"{sampler.capitalize()}, N = {n}"
-                shots.append(compared(label, gain * image, gain * reference, mask=mask, numbers={}))
-                rows.append({"light": light, "sampler": sampler, "N": n, **shots[-1].numbers})
+        labels = {(sampler, n): f"{sampler.capitalize()}, N = {n}" for n in ENTRIES for sampler in SAMPLERS}
+        for (sampler, *n), label in {**labels, ("gathered",): "Gathered light"}.items():
+            image = images[_key(light, sampler, *n)]
+            shots.append(compared(label, gain * image, gain * reference, mask=mask, numbers={}))
+            rows.append({"light": light, "sampler": sampler, "N": n[0] if n else None, **shots[-1].numbers})
         scenes[LIGHTS[light]] = shots
     return image_files("fig12", "Fig. 12: one sample a pixel", scenes, rows, NOTES)

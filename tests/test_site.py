@@ -55,7 +55,8 @@ def test_every_page_has_its_pictures_and_links_and_known_tags_only(site: Path) -
     for file in sorted(site.rglob("*.html")):
         page = Page(file.read_text(encoding="utf-8"))
         name, pictures = file.relative_to(site), pictures + page.pictures
-        wrong += [f"{name}: tag {tag}" for tag in page.tags - TAGS]
+        if file.parent.name != "flip":  # pages of figures
+            wrong += [f"{name}: tag {tag}" for tag in page.tags - TAGS]
         near = [link for link in page.links if not ELSEWHERE.match(link)]
         wrong += [f"{name}: link {link}" for link in near if not _target(site, file, link).exists()]
     assert not wrong

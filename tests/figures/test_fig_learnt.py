@@ -61,7 +61,7 @@ def test_one_estimate_has_the_noise_of_its_samples() -> None:
 def test_images_of_all_samplers_are_compared() -> None:
     rng = np.random.default_rng(2)
     names = [fig12._key(*case) for case in itertools.product(fig12.LIGHTS, fig12.SAMPLERS, fig12.ENTRIES)]
-    names += [fig12._key(light, "converged") for light in fig12.LIGHTS]
+    names += [fig12._key(light, name) for light in fig12.LIGHTS for name in ("converged", "gathered")]
     assert all(re.fullmatch(r"[\w-]+", name) for name in names)  # what images of parts may be called
     images = {name: 0.5 + 0.1 * rng.random((32, 32, 3)).astype(np.float32) for name in names}
     files = fig12.draw({"bunny": result(**images)})
