@@ -13,7 +13,8 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import drjit as dr
@@ -274,6 +275,14 @@ class PatchTable:
         self.last = mi.Float(rows[:, -1].copy())
         dr.eval(self.table, self.of_face, self.last)
 
+    def lit(self, brightness: np.ndarray) -> PatchTable:
+        """With weights times the brightness of patches."""
+        result = copy(self)
+        rows = np.array(self.table).reshape(-1, self.n)
+        rows = np.cumsum(np.diff(rows, axis=1, prepend=0) * brightness, axis=1).astype(np.float32)
+        result.table, result.last = mi.Float(rows.ravel()), mi.Float(rows[:, -1].copy())
+        return result
+
     def weights(self, face: Any) -> PatchWeights:
         """Of an exit on a face."""
         cell = dr.gather(type(self.of_face), self.of_face, face)
@@ -328,6 +337,16 @@ class LearntProposals(CosineProposals):
     sign: float
     table: PatchTable | None = None
 
+    def lit(self, brightness: np.ndarray) -> LearntProposals:
+        """With weights times the brightness of faces."""
+        table, parts = self.table, self.patches.patches
+        if table is not None:
+            areas = self.positions.points.areas
+            mass = np.bincount(parts.of_face, areas * brightness, parts.n) / np.maximum(parts.areas, 1e-30)
+            table = table.lit(mass)
+        positions = replace(self.positions, points=self.positions.points.lit(brightness))
+        return replace(self, positions=positions, table=table)
+
     def prepare(self, out: SurfacePoint, prepared: PreparedExit, active: Any) -> _PatchesOfExit:
         weights = self.patches.prepare(prepared.side) if self.table is None else None
         return _PatchesOfExit(weights, (out.n_out, *mi.coordinate_system(out.n_out)))
@@ -347,7 +366,7 @@ class LearntProposals(CosineProposals):
         learnt = self.patches.density(weights, entry.face)
         if self.patch_share == 1:
             return entry._replace(weight=dr.select(by_patch, 1 / learnt, 0))
-        near = self.positions.density(entry.p, entry.n, out, prepared.axes)
+        near = self.positions.density(entry.p, entry.n, entry.face, out, prepared.axes)
         share = opaque(self.patch_share)
         # of a probe the weight is that of one hit among all, 1/density on average
         scale = dr.select(by_patch, 1, near) / (share * learnt + (1 - share) * near)

@@ -9,7 +9,7 @@ import pytest
 
 from halfspace_sss import rendering
 from halfspace_sss.rendering.gathered import patches
-from halfspace_sss.rendering.paths import control_variate
+from halfspace_sss.rendering.paths import control_variate, lit_entries
 
 mi = pytest.importorskip("mitsuba")
 
@@ -71,3 +71,17 @@ def test_means_are_those_without_it_and_noise_is_less(light: str, model: str, sh
 def test_the_same_seed_gives_the_same_image() -> None:
     images = [np.array(mi.render(_scene("corrected"), spp=4, seed=3)) for _ in range(2)]
     assert (images[0] == images[1]).all()
+
+
+@pytest.mark.slow
+def test_entries_drawn_by_light_have_the_same_mean_and_less_noise(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(lit_entries, "LEAST", 0)
+    images = []
+    for gain in (np.inf, 0.0):
+        monkeypatch.setattr(lit_entries, "LEAST_GAIN", gain)
+        images.append(_images(_scene("sampled", "point", "better_dipole", "cube"), spp=256))
+    means = [part.mean(axis=(1, 2)) for part in images]
+    error = np.sqrt(sum(m.var(axis=0, ddof=1) / SEEDS for m in means))
+    assert (np.abs(means[0].mean(axis=0) - means[1].mean(axis=0)) < Z * error).all()
+    by_S, by_light = (part[:, 2:6, 2:6].var(axis=0, ddof=1).mean() for part in images)
+    assert by_light < by_S

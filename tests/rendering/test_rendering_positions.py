@@ -92,8 +92,8 @@ def test_a_probe_alone_on_a_plane_follows_its_density():
     X, Y = np.meshgrid(middle, middle, indexing="ij")
     p = mi.Point3f(np.stack([X.ravel(), Y.ravel(), np.zeros(X.size)]))
     axes = (out.n, *mi.coordinate_system(out.n))
-    density = np.array(positions.density(p, mi.Normal3f(0, 0, 1), out, axes)).reshape(cells, fine, cells, fine)
-    mass = density.mean(axis=(1, 3)) * (2 * half / cells) ** 2
+    density = np.array(positions.density(p, mi.Normal3f(0, 0, 1), mi.UInt32(0), out, axes))
+    mass = density.reshape(cells, fine, cells, fine).mean(axis=(1, 3)) * (2 * half / cells) ** 2
     keep = mass < 0.3 * mass.max()  # about the exit the density is too steep for this grid
     counts = np.append(counts[keep], N - counts[keep].sum())
     assert chi_square(counts, N * np.append(mass[keep], 1 - mass[keep].sum())) > 1e-3

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -82,6 +82,10 @@ class HalfSpaceProposals:
     positions: PositionSampler
     model: Any
     textured: TexturedMedium | None = None
+
+    def lit(self, brightness: np.ndarray) -> HalfSpaceProposals:
+        """With more points where faces are bright."""
+        return replace(self, positions=replace(self.positions, points=self.positions.points.lit(brightness)))
 
     def prepare(self, out: SurfacePoint, prepared: Any, active: mi.Bool) -> None:
         """Nothing is done for the exit alone."""

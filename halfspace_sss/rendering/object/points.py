@@ -11,11 +11,13 @@ which another axis finds x more often, and the others through the whole object. 
 beside it c(x) = D(x) + m/A candidates are expected per area (balance heuristic); one is taken with a probability
 proportional to h = p(|x - x_o|)/c and has the weight (sum of all h)/p(|x - x_o|) (resampled importance sampling,
 Talbot, Cline and Egbert 2005). The m points are a lattice shifted at random: each is uniform, all are spread out.
+Where faces are known to differ in brightness b, of mean 1 over the area, the points have the density b/A and h = b p/c.
 """
 
 from __future__ import annotations
 
 import math
+from copy import copy
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
@@ -269,6 +271,10 @@ class EntrySample(NamedTuple):
 class Proposals(Protocol):
     """Where light that leaves at an exit may have entered."""
 
+    def lit(self, brightness: np.ndarray) -> Proposals:
+        """Proposals that draw more entries where light is bright, positive numbers of the faces of a mesh."""
+        return self
+
     def prepare(self, out: SurfacePoint, prepared: Any, active: mi.Bool) -> Any:
         """What is done once for all entries of an exit; `prepared` is what the transport has made of it."""
 
@@ -391,13 +397,19 @@ class PositionSampler:
         """What turns the normal of a face outwards: of a sheet, to the side of the exit."""
         return self.geometry.side(prim_index, active) if self.geometry.closed else out.sign
 
-    def density(self, p: mi.Point3f, n: mi.Normal3f, out: SurfacePoint, axes: tuple[mi.Vector3f, ...]) -> Any:
+    def density(
+        self, p: mi.Point3f, n: mi.Normal3f, face: mi.UInt32, out: SurfacePoint, axes: tuple[mi.Vector3f, ...]
+    ) -> Any:
         """Density of candidates over the surface at p with normal n, for each that is drawn, 1/(scene unit)²."""
-        return self._candidates(p, n, out, axes) * opaque(1 / (self.probes + self.area_points))
+        return self._candidates(p, n, self.points.brightness(face), out, axes) * opaque(
+            1 / (self.probes + self.area_points)
+        )
 
-    def _candidates(self, p: mi.Point3f, n: mi.Normal3f, out: SurfacePoint, axes: tuple[mi.Vector3f, ...]) -> Any:
-        """c = D + m/A, 1/(scene unit)²."""
-        uniform = opaque(self.area_points / self.geometry.area if self.area_points else 0.0)
+    def _candidates(
+        self, p: mi.Point3f, n: mi.Normal3f, b: mi.Float, out: SurfacePoint, axes: tuple[mi.Vector3f, ...]
+    ) -> Any:
+        """c = D + m b/A, 1/(scene unit)²."""
+        uniform = b * opaque(self.area_points / self.geometry.area if self.area_points else 0.0)
         if not self.probes:
             return uniform
         d, total = p - out.p, 0.0
@@ -419,7 +431,7 @@ class PositionSampler:
             kept = self._hits(self._probe(out, axes, u_axis, u_length, u), out, axes, piece, kept, active)
         if self.area_points:
             kept = self._uniform(out, axes, piece, u_face, u, kept, active)
-        total, p = kept.total, self.table.pdf(dr.norm(kept.p - out.p))
+        total, p = kept.total, self.table.pdf(dr.norm(kept.p - out.p)) * self.points.brightness(kept.face)
         weight = dr.select(total > 0, total / dr.maximum(p, 1e-30), 0)
         return EntrySample(kept.p, turned(kept.n, kept.n_out), kept.n_out, weight, kept.face)
 
@@ -447,8 +459,9 @@ class PositionSampler:
     ) -> _Kept:
         """Take a candidate (point, normal, outward shading normal, face) instead with the probability h / sum of h."""
         p, n, n_out, face = at
-        c = self._candidates(p, n, out, axes)  # weight: target p over density c
-        weight = dr.select(active & (c > 0), self.table.pdf(dr.norm(p - out.p)) / dr.maximum(c, 1e-30), 0)
+        b = self.points.brightness(face)
+        c = self._candidates(p, n, b, out, axes)  # weight: target b p over density c
+        weight = dr.select(active & (c > 0), b * self.table.pdf(dr.norm(p - out.p)) / dr.maximum(c, 1e-30), 0)
         total = kept.total + weight
         share = dr.select(total > 0, weight / total, 0)
         take = (kept.u < share) & (weight > 0)
@@ -552,15 +565,27 @@ class AreaPoints:
 
     def __init__(self, shape: mi.Shape) -> None:
         self.shape = shape
-        self.faces = self.centre = None
+        self.faces = self.centre = self.light = None
         parameters = mi.traverse(shape)
         if shape.class_name() == "Sphere":  # Mitsuba's normals of sampled points are wrong where it is mirrored
             self.centre = np.array(parameters["to_world"].matrix, dtype=np.float64).reshape(4, 4)[:3, 3]
         if "faces" in parameters:
             faces = np.array(parameters["faces"]).reshape(-1, 3)
             a, b, c = np.array(parameters["vertex_positions"]).reshape(-1, 3)[faces].transpose(1, 0, 2)
-            areas = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
-            self.faces = mi.DiscreteDistribution(mi.Float(areas.astype(np.float32)))
+            self.areas = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+            self.faces = mi.DiscreteDistribution(mi.Float(self.areas.astype(np.float32)))
+
+    def lit(self, brightness: np.ndarray) -> AreaPoints:
+        """Points of a mesh by the brightness of its faces, positive numbers."""
+        result = copy(self)
+        brightness = brightness * (self.areas.sum() / (self.areas * brightness).sum())
+        result.light = mi.Float(brightness.astype(np.float32))
+        result.faces = mi.DiscreteDistribution(mi.Float((self.areas * brightness).astype(np.float32)))
+        return result
+
+    def brightness(self, face: mi.UInt32) -> Any:
+        """Density of points over that of uniform ones, on a face."""
+        return 1.0 if self.light is None else dr.gather(mi.Float, self.light, face)
 
     def sample(self, u_face: mi.Float, u: mi.Point2f, active: mi.Bool) -> Point:
         """A point for uniform numbers u_face and the pair u."""

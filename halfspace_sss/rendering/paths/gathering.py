@@ -280,9 +280,12 @@ def _weight(albedo: Albedo, at: GatheringPoint, w: mi.Vector3f) -> tuple[mi.Spec
     return albedo(mu) * dr.pi, mu * dr.inv_pi
 
 
-def by_emitters(scene: mi.Scene, albedo: Albedo, at: GatheringPoint, u: mi.Point2f) -> tuple[mi.Spectrum, mi.Vector3f]:
-    """Light of sampled emitters, and its direction."""
+def by_emitters(
+    scene: mi.Scene, albedo: Albedo, at: GatheringPoint, u: mi.Point2f, c: mi.Spectrum | float = 0.0
+) -> tuple[mi.Spectrum, mi.Vector3f]:
+    """Light of sampled emitters less c of the sky, and its direction."""
     ds, light = scene.sample_emitter_direction(place(at.p, at.n), u, True)
+    light -= dr.select(ds.emitter.is_environment(), c / dr.maximum(ds.pdf, 1e-30), 0)
     a, pdf = _weight(albedo, at, ds.d)
     share = dr.select(ds.delta, 1, mis_weight(ds.pdf, pdf))
     return dr.select((ds.pdf > 0) & (pdf > 0), a * pdf * light * share, 0), ds.d
@@ -293,6 +296,17 @@ def by_cosine(
     u: mi.Point2f, traced: mi.Bool, sampler: mi.Sampler,
 ) -> tuple[mi.Spectrum, mi.Spectrum, mi.Spectrum, mi.Vector3f]:  # fmt: skip
     """By directions of the cosine: light of emitters that they meet, what other surfaces send along some, a, and w."""
+    met, a, w, ray, si = met_by_cosine(scene, albedo, at, u)
+    hidden = replace(settings, hide_emitters=True, light="sampled", max_depth=max(settings.max_depth - 1, -1) or 1)
+    on = si.is_valid() & traced
+    parts, *_ = trace_paths(scene, objects, hidden, sampler, ray, on, scattered=True)
+    return met, dr.select(on, a * (parts[0] + parts[1]), 0), a, w
+
+
+def met_by_cosine(
+    scene: mi.Scene, albedo: Albedo, at: GatheringPoint, u: mi.Point2f, c: mi.Spectrum | float = 0.0
+) -> tuple[mi.Spectrum, mi.Spectrum, mi.Vector3f, mi.Ray3f, mi.SurfaceInteraction3f]:
+    """Light of emitters that a direction of the cosine meets, less c of the sky; a, that direction, its ray and hit."""
     w, _ = cosine_above(at.n_out, at.n, u)
     a, pdf = _weight(albedo, at, w)
     here = place(at.p, at.n)
@@ -301,8 +315,6 @@ def by_cosine(
     emitter = si.emitter(scene)
     shines = emitter != None  # noqa: E711
     density = scene.pdf_emitter_direction(here, mi.DirectionSample3f(scene, si, here), shines)
-    met = dr.select(shines, mis_weight(pdf, density) * emitter.eval(si, shines), 0)
-    hidden = replace(settings, hide_emitters=True, light="sampled", max_depth=max(settings.max_depth - 1, -1) or 1)
-    on = si.is_valid() & traced
-    parts, *_ = trace_paths(scene, objects, hidden, sampler, ray, on, scattered=True)
-    return a * met, dr.select(on, a * (parts[0] + parts[1]), 0), a, w
+    L = emitter.eval(si, shines) - dr.select(emitter.is_environment(), c, 0)
+    met = dr.select(shines, mis_weight(pdf, density) * L, 0)
+    return a * met, a, w, ray, si

@@ -7,6 +7,7 @@ import gc
 import math
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import drjit as dr
@@ -22,6 +23,7 @@ from halfspace_sss.rendering.object.translucent import is_translucent
 from halfspace_sss.rendering.object.wrapped import wraps
 from halfspace_sss.rendering.paths.control_variate import ControlVariates
 from halfspace_sss.rendering.paths.gathering import Gathering
+from halfspace_sss.rendering.paths.lit_entries import LitEntries
 from halfspace_sss.rendering.paths.path_loop import replay_paths, trace_paths
 
 SAMPLES_PER_LAUNCH = 2**20  # half a second on 2 cores
@@ -63,8 +65,9 @@ def _class(variant: str) -> type:
             self.mm_per_unit = self.settings.mm_per_unit
             self._objects = TranslucentObjects(self.settings)
             self.gathering = Gathering()
+            self._lit_entries = LitEntries()
             self._control_variates = ControlVariates()
-            self._controlled: list[TranslucentObject] | None = None  # while an image is rendered
+            self._lit: list[TranslucentObject] | None = None  # while an image is rendered
             self._by_chance = dr.zeros(mi.Float64, 1)
 
         def prepare(self, scene: mi.Scene) -> list[TranslucentObject]:
@@ -98,23 +101,27 @@ def _class(variant: str) -> type:
                 for obj in objects:
                     if obj.spectral is not None:
                         obj.spectral.check_covers(obj.geometry.name, sensor)
-                self._controlled = self._with_control_variates(scene, objects, sensor, seed, spp)
+                self._lit = self._by_light(scene, objects, sensor, seed, spp)
                 self._by_chance = dr.zeros(mi.Float64, 1)
                 try:
                     for launch in launches(sensor, seed, spp, lambda: not self.timed and self.should_stop()):
                         super().render(scene, sensor=sensor, seed=launch.seed, spp=launch.spp, develop=True)
                 finally:
-                    self._controlled = None
+                    self._lit = None
                 return sensor.film().develop() if develop else None
 
-        def _with_control_variates(
+        def _by_light(
             self, scene: mi.Scene, objects: list[TranslucentObject], sensor: mi.Sensor, seed: mi.UInt32 | int, spp: int
-        ) -> list[TranslucentObject] | None:
-            """The objects with light gathered as control variate, where that is asked for and pays."""
+        ) -> list[TranslucentObject]:
+            """The objects with entries drawn by light, and light gathered as control variate, where that pays."""
             spp, pixels = spp or sensor.sampler().sample_count(), int(dr.prod(sensor.film().crop_size()))
-            if self._objects.choices.light != "corrected":
-                return None
-            return self._control_variates.of(scene, objects, self.settings, int(mi.UInt32(seed)[0]), spp, pixels)
+            light, number = self._objects.choices.light, int(mi.UInt32(seed)[0])
+            if light == "gathered":
+                return objects
+            proposals = self._lit_entries.of(scene, objects, self.settings, spp * pixels)
+            if light == "corrected":
+                objects = self._control_variates.of(scene, objects, self.settings, number, spp, pixels)
+            return [replace(obj, proposals=given) for obj, given in zip(objects, proposals)]
 
         def render_forward(self, scene: mi.Scene, *args: Any, **more: Any) -> mi.TensorXf:
             objects = self._differentiable(scene)
@@ -139,7 +146,7 @@ def _class(variant: str) -> type:
         ) -> tuple[mi.Spectrum, mi.Bool, list]:  # fmt: skip
             check_outermost(scene)
             with undisturbed(), dr.suspend_grad():
-                objects = self._prepared(scene) if self._controlled is None else self._controlled
+                objects = self._prepared(scene) if self._lit is None else self._lit
                 parts, hit, chance = trace_paths(scene, objects, self.settings, sampler, ray, active)
                 squares = dr.select(hit & active, mi.Float64(dr.squared_norm(chance)), 0)
                 dr.scatter_add(self._by_chance, squares, mi.UInt32(0))

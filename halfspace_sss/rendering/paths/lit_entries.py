@@ -1,0 +1,104 @@
+"""Entries drawn where light arrives: proposals that know how bright the faces of an object are.
+
+For a model S the density of entries of least variance is proportional to S times
+
+    e² = E[(a(w_i) mu_i L_i / pdf)²],
+
+the mean square over directions as paths draw them. Proposals that know S of an exit alone draw by S; here e of each
+part of a mesh is estimated, and they draw by S (e + `FLOOR` of its mean), as the paper's Eq. 12 has light in it.
+Any e leaves the means as they are. Light by way of other surfaces is not in e: the floor is for that.
+
+e is used where it pays: where the mean of e² over the area is `LEAST_GAIN` times the square of the mean of e.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from halfspace_sss.rendering.gathered.patches import SurfaceCells
+from halfspace_sss.rendering.gathered.points import SurfacePoints, uniform_entries
+from halfspace_sss.rendering.gathered.transfer import Albedo
+from halfspace_sss.rendering.object.shape import same_objects
+from halfspace_sss.rendering.paths.gathering import GatheringPoint, by_emitters, light_state, met_by_cosine, spreads
+from halfspace_sss.rendering.paths.lighting import Primal, RenderContext
+
+if TYPE_CHECKING:
+    from halfspace_sss.rendering.object.objects import TranslucentObject
+    from halfspace_sss.rendering.object.points import Proposals
+    from halfspace_sss.rendering.object.settings import Settings
+
+CELLS = 1024  # of a mesh of many faces
+LEAST, MOST = 2**14, 2**16  # points of an object at which light is looked at,
+SHARE = 1 / 4  # of all samples of an image: with fewer than the least, entries are by S alone
+FLOOR = 0.1  # of 0.03 the mean of the variance over pixels is larger, of 0.3 the median
+LEAST_GAIN = 1.5
+SEED = 33
+
+
+class LitEntries:
+    """Proposals of the objects of a scene by the light of it, kept until something changes."""
+
+    def __init__(self) -> None:
+        self._objects: list[TranslucentObject] = []
+        self._state: tuple[list, int] = ([], 0)
+        self._kept: list = []
+        self._proposals: list[Proposals | None] = []
+
+    def of(
+        self, scene: mi.Scene, objects: list[TranslucentObject], settings: Settings, samples: int
+    ) -> list[Proposals | None]:
+        """Of each object.
+
+        Args:
+            scene, objects, settings: what is rendered.
+            samples: of all pixels.
+        """
+        count = int(min(SHARE * samples, MOST))
+        if count < LEAST or mi.is_spectral:
+            return [obj.proposals for obj in objects]
+        state, kept = light_state(scene)
+        if not same_objects(objects, self._objects) or (state, count) != self._state:
+            context = RenderContext.of(scene, objects, settings, Primal())
+            self._proposals = [_lit(context, obj, count) for obj in objects]
+            self._objects, self._state, self._kept = objects, (state, count), kept
+        return self._proposals
+
+
+def _lit(context: RenderContext, obj: TranslucentObject, count: int) -> Proposals | None:
+    geometry = obj.geometry
+    faces = geometry.shape.face_count() if geometry.shape.is_mesh() else 1
+    if faces == 1 or context.lights.nee_share == 0 or not (spreads(obj) and geometry.closed and geometry.area > 0):
+        return obj.proposals
+    cells = SurfaceCells.of(obj, SurfacePoints.of(geometry, CELLS)).of_face
+    cell = np.arange(faces) if cells is None else np.array(cells[1])
+    face, square = _brought(context, obj, count)
+    k, n = cell[face], cell.max() + 1
+    number = np.bincount(k, minlength=n)
+    e = np.sqrt(np.bincount(k, square, n) / np.maximum(number, 1))
+    e = np.where(number > 0, e, e[k].mean())
+    mean = e[k].mean()
+    if not (np.isfinite(mean) and mean > 0 and (e[k] ** 2).mean() > LEAST_GAIN * mean**2):
+        return obj.proposals
+    return obj.proposals.lit((e / mean + FLOOR)[cell])
+
+
+def _brought(context: RenderContext, obj: TranslucentObject, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Faces of uniform points, and the square of what a direction at them brings for a unit of S, mean of channels.
+
+    Half of the mean square over emitter samples and directions by the cosine: a factor of all is of no account.
+    """
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(SEED, count)
+    entry = uniform_entries(obj.geometry, sampler.next_1d(), sampler.next_2d())
+    at = GatheringPoint(entry.p, entry.n, entry.n_out)
+    albedo = Albedo(np.tile([1.0, 0.0, 0.0], (len(obj.media), 1)), float(obj.media[0].eta))
+    c = context.sky_means(obj)[1] if context.uses_sky(obj) else mi.Spectrum(0)
+    aimed, _ = by_emitters(context.scene, albedo, at, sampler.next_2d(), c)
+    met = met_by_cosine(context.scene, albedo, at, sampler.next_2d(), c)[0]
+    square, face = dr.mean(aimed * aimed + met * met) + dr.zeros(mi.Float, count), entry.face
+    dr.eval(square, face)
+    return np.array(face), np.array(square, dtype=float)
