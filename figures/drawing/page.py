@@ -14,9 +14,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib import colormaps  # without it there is no page, which must be known before one is drawn
 
-from figures.computing.images import FLIP, RELATIVE_MSE, Shot, denoised, guides, srgb
+from figures.computing.images import FLIP, RELATIVE_MSE, Shot, compared, denoised, guides, srgb
 
 if TYPE_CHECKING:
+    from halfspace_sss.inverse.comparing import MaterialFit
     from halfspace_sss.rendering.scenes.picture import Picture
 
 
@@ -151,3 +152,14 @@ def render(picture: Picture) -> dict[str, bytes]:
         files = {"denoised.exr": picture.exr(clean), "denoised.png": picture.png(clean)}
     text = page(picture.title, {picture.title: shots}, caption=picture.caption, lower_is_better=())
     return {"html": text.encode(), **files}
+
+
+def fit(found: MaterialFit) -> bytes:
+    """The page that flips between the given image of each view and what a fit has found."""
+    scenes = {}
+    for view in found.views:
+        shape = (*view.counts.shape, 3)  # one channel is grey
+        given, image = (np.broadcast_to(np.nan_to_num(each), shape) for each in (view.given, view.found))
+        shots = [Shot("given", np.maximum(given, 0.0)), compared("found", image, given, mask=view.counts)]
+        scenes[f"{view.name}, held out" if view.held_out else view.name] = shots
+    return page("Images and fit", scenes, notes="FLIP and relative squared error of the pixels that count.").encode()

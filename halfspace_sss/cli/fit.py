@@ -21,6 +21,7 @@ from halfspace_sss.cli.shared import (
     use_mitsuba,
     whole,
 )
+from halfspace_sss.extensions import renderer
 from halfspace_sss.provenance import check_folder, provenance, write_together
 
 if TYPE_CHECKING:
@@ -52,6 +53,7 @@ def fit_command(
 ) -> None:
     """Fit the medium of an object to images: NAME_fit.toml (material), .xml (scene with it), .json (all numbers).
 
+    NAME_fit.html flips between each image and what was found.
     A texture is written as NAME_fit_PARAMETER.exr, an attribute of a mesh with it as NAME_fit.ply.
     """
     use_mitsuba(variant)
@@ -94,6 +96,8 @@ def _write(found: MaterialFit, scene: Path, name: str | None, out: Path) -> list
             source=f"{'means of textures ' * bool(found.textures)}fitted to images of {scene.name}",
         )
         files[out / f"{stem}.toml"] = to_toml([material])
+    if draw := renderer("fit"):
+        files[out / f"{stem}.html"] = draw(found)
     painted, textures = _with_textures(scene, name, found, out / stem)
     files |= textures
     text = _with_medium(scene, name, found, painted)

@@ -26,12 +26,11 @@ from halfspace_sss.inverse.views import GivenView
 from halfspace_sss.noise_free import NoiseFree
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.progress import ProgressText
-from halfspace_sss.provenance import write_atomically
+from halfspace_sss.provenance import provenance, write_atomically
 
 LOSSES = ("relative", "l2")
 FLOOR = 0.1  # of the mean of an image, added to it in relative weights
 EXPOSURE = 10.0  # most, of a factor
-EXPOSURE_MEMORY = 0.2  # what one step counts in a factor
 BATCH = 4
 PURPOSES = ("order", "first", "second", "slope", "other slope", "test", "other test")
 
@@ -83,6 +82,16 @@ class FitStep(NamedTuple):
         return f"loss {self.loss:.3g} ± {self.error:.1g}  {numbers}"
 
 
+class FittedView(NamedTuple):
+    """A given image and what was found, (height, width, channels); which pixels count, and whether it only tests."""
+
+    name: str
+    given: np.ndarray
+    found: np.ndarray
+    counts: np.ndarray
+    held_out: bool
+
+
 @dataclass(frozen=True)
 class MaterialFit:
     """What was found.
@@ -97,6 +106,7 @@ class MaterialFit:
         exposures: factor by which each view's image of the medium is multiplied to match the given one.
         told: sentences about bounds and about what the images do not tell.
         steps: the way there.
+        views: what each view shows beside its given image.
         textures: of each parameter that has one, the texels (rows, columns, channels), or the attribute of each vertex
             or face, shape (n, channels).
     """
@@ -110,7 +120,24 @@ class MaterialFit:
     exposures: list[float]
     told: list[str]
     steps: list[FitStep] = field(repr=False)
+    views: list[FittedView] = field(default_factory=list, repr=False)
     textures: dict[str, np.ndarray] = field(default_factory=dict, repr=False)
+
+
+class ViewMisfit(NamedTuple):
+    """What two renders of a view say.
+
+    Args:
+        loss, variance: of the view, and its variance by noise.
+        residual: mean of both renders times the exposure e, less the image.
+        exposure_slope, exposure_curvature: half the derivatives of the loss by ln e, of Gauss and Newton.
+    """
+
+    loss: float
+    variance: float
+    residual: np.ndarray
+    exposure_slope: float
+    exposure_curvature: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,44 +184,56 @@ class ViewComparison:
         words = [self.settings.seed, k, which, PURPOSES.index(purpose), parameter]
         return int(np.random.SeedSequence(words).generate_state(1)[0])
 
-    def view(self, which: int, k: int) -> tuple[float, float, np.ndarray]:
-        """Loss of a view in a step, its variance by noise, and the mean residual of both renders."""
+    def view(self, which: int, k: int) -> ViewMisfit:
+        """A view in a step; one that is held out at the exposure that suits it."""
         view, w = self.views[which], self.weights[which]
         purposes = ("test", "other test") if view.held_out else ("first", "second")
         pair = [self._image(view, self.seed(k, which, each)) for each in purposes]
-        if self.settings.exposure:
-            self._expose(which, pair)
-        e = self.exposures[which]
-        a, b = (e * image - view.image for image in pair)
-        n = self.count(which)
-        noise = np.square(a - b) / 2  # variance of each
-        variance = float((np.square(w) * (noise * (np.square(a) + np.square(b)) / 2)).sum()) / n**2
-        return float((w * a * b).sum() / n), variance, (a + b) / 2
+        misfit = _misfit(pair, self.exposures[which], view.image, w)
+        if self.settings.exposure and view.held_out:
+            self.expose(which, -misfit.exposure_slope / misfit.exposure_curvature)
+            misfit = _misfit(pair, self.exposures[which], view.image, w)
+        return misfit
 
-    def roots(self, k: int) -> tuple[NoiseFree, NoiseFree | None]:
-        """The root of the loss of all fitted views, and likewise of views held out; None without any."""
-        losses = [self.view(which, k)[:2] for which in range(len(self.views))]
+    def ends(self, k: int) -> tuple[NoiseFree, NoiseFree | None, list[FittedView]]:
+        """The root of the loss of all fitted views, and likewise of views held out (None without any); all views."""
+        misfits = [self.view(which, k) for which in range(len(self.views))]
+        losses = [(m.loss, m.variance) for m in misfits]
         held = [loss for loss, view in zip(losses, self.views) if view.held_out]
-        return _root([losses[which] for which in self.fitted]), _root(held) if held else None
+        shown = [
+            FittedView(view.name, view.image, m.residual + view.image, view.counts, view.held_out)
+            for view, m in zip(self.views, misfits)
+        ]
+        return _root([losses[which] for which in self.fitted]), _root(held) if held else None, shown
 
     def _image(self, view: GivenView, seed: int) -> np.ndarray:
         image = mi.render(self.scene, sensor=view.sensor, seed=seed, spp=self.settings.spp)
         return np.array(image, dtype=np.float64)[..., : view.image.shape[2]]
 
-    def _expose(self, which: int, pair: list[np.ndarray]) -> None:
-        """The factor of least squares, as a running mean of logarithms for views that are fitted."""
-        counts, T = self.views[which].counts[..., None], self.views[which].image
-        found = (counts * T * (pair[0] + pair[1]) / 2).sum() / max((counts * pair[0] * pair[1]).sum(), 1e-30)
-        part = 1.0 if self.views[which].held_out else EXPOSURE_MEMORY
-        self.factors[which] *= (np.clip(found, 1 / EXPOSURE, EXPOSURE) / self.factors[which]) ** part
+    def expose(self, which: int, share: float) -> None:
+        """Add a share to the factor of a view."""
+        factor = self.factors[which] * (1 + np.clip(share, -0.5, 1.0))
+        self.factors[which] = np.clip(factor, 1 / EXPOSURE, EXPOSURE)
 
     def fingerprint(self, *start: object) -> str:
-        """Of the images, the settings and where a fit starts."""
+        """Of the images, the settings, where a fit starts, and versions."""
         views = [(v.sensor, v.held_out) for v in self.views]
-        digest = hashlib.sha256(json.dumps([asdict(self.settings), start, views]).encode())
+        told = provenance()
+        of = [asdict(self.settings), start, views, told["versions"], told["commit"]]
+        digest = hashlib.sha256(json.dumps(of).encode())
         for view in self.views:
             digest.update(view.image.tobytes() + view.counts.tobytes())
         return digest.hexdigest()
+
+
+def _misfit(pair: Sequence[np.ndarray], e: float, T: np.ndarray, w: np.ndarray) -> ViewMisfit:
+    a, b = (e * image - T for image in pair)
+    n = max(float((w > 0).sum()), 1.0)
+    noise = np.square(a - b) / 2  # variance of each
+    variance = float((np.square(w) * (noise * (np.square(a) + np.square(b)) / 2)).sum()) / n**2
+    loss, residual = float((w * a * b).sum() / n), (a + b) / 2
+    slope = loss + float((w * T * residual).sum() / n)  # mean w (a + T) b, of independent samples
+    return ViewMisfit(loss, variance, residual, slope, float((w * (a + T) * (b + T)).sum() / n))
 
 
 def _weights(view: GivenView, loss: str) -> np.ndarray:

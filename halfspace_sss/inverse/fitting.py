@@ -5,8 +5,10 @@ Half the gradient of the loss of a view, see `comparing`, and H of the steps are
     g = mean w J^T ((I + I') / 2 - T),    H = mean w J^T J',
 
 where the Jacobians J, J' of pixels by variables have samples of their own, so that noise has no bias in any of them.
-H is a running mean over steps. The variables move by -H^-1 g, in the second half of the steps by 1, 1/2, 1/3, ... of
-that, which averages the noise of g (Robbins and Monro 1951). Textures are fitted by `textures`.
+J is a running mean over the steps of a view, and H over all steps. Exposures of views are variables too, by their
+logarithms, whose sum is 0: the derivatives of pixels by them are the image. The variables move by -H^-1 g, in the
+second half of the steps by 1, 1/2, 1/3, ... of that, which averages the noise of g (Robbins and Monro 1951). Textures
+are fitted by `textures`.
 """
 
 from __future__ import annotations
@@ -18,7 +20,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from halfspace_sss.inverse.comparing import FitSettings, FitStep, MaterialFit, ViewComparison, descend
+from halfspace_sss.inverse.comparing import FitSettings, FitStep, MaterialFit, ViewComparison, ViewMisfit, descend
 from halfspace_sss.inverse.parameters import FitParameters, translucent_object
 from halfspace_sss.inverse.views import GivenView, check_views
 from halfspace_sss.progress import ProgressText
@@ -28,7 +30,7 @@ from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED, open_scene
 
 STEPS = 30
 SETTLING = 0.5  # part of the steps after which they are averaged
-MEMORY = 0.15  # of H, what a step is at least
+MEMORY = 0.15  # of J and H, what a step is at least
 LONGEST = 0.7  # change of a variable in a step
 DAMPED = 1e-3  # of the largest eigenvalue of H, below which it is not trusted
 WALK = "translucent_walk"
@@ -93,8 +95,10 @@ class MediumDescent:
         self.total = comparison.settings.steps or STEPS
         self.steps: list[FitStep] = []
         self.x = parameters.start()
-        size = sum(len(_numbers(x)) for x in self.x.values())
-        self.H, self.slopes = np.zeros((size, size)), {}  # slopes: the last Jacobian of each view
+        n = len(comparison.fitted) if comparison.settings.exposure else 1
+        self.free = _of_sum_0(n)  # directions of log exposures, shape (views, views - 1)
+        size = sum(len(_numbers(x)) for x in self.x.values()) + n - 1
+        self.H, self.slopes, self.visits = np.zeros((size, size)), {}, {}  # slopes: the mean Jacobian of each view
         self.moves = np.zeros((0, size))  # -H^-1 g of the steps that are averaged
 
     def fingerprint(self) -> str:
@@ -102,10 +106,13 @@ class MediumDescent:
 
     def state(self) -> dict[str, np.ndarray]:
         slopes = {f"slopes {which}": J for which, J in self.slopes.items()}
-        return {"H": self.H, "moves": self.moves, **slopes, **{f"x {name}": _numbers(x) for name, x in self.x.items()}}
+        x = {f"x {name}": _numbers(x) for name, x in self.x.items()}
+        visits = np.array(list(self.visits.items()))
+        return {"H": self.H, "moves": self.moves, "visits": visits, **slopes, **x}
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         self.H, self.moves = arrays["H"], arrays["moves"]
+        self.visits = dict(arrays["visits"].tolist())
         self.slopes = {int(key.split()[1]): J for key, J in arrays.items() if key.startswith("slopes ")}
         for name, x in self.x.items():
             numbers = arrays[f"x {name}"].tolist()
@@ -119,15 +126,18 @@ class MediumDescent:
         losses, variance, g, H = [], 0.0, 0.0, 0.0
         for which in (views := compared.batch(k)):
             self.parameters.put(self.x)
-            loss, noise, residual = compared.view(which, k)
-            J = self._jacobian(which, k, "slope")
+            misfit = compared.view(which, k)
+            new = self._jacobian(which, k, "slope")
             before = self.slopes.get(which)
-            w = compared.weights[which].ravel() / compared.count(which)
-            product = (J * w[:, None]).T @ (self._jacobian(which, k, "other slope") if before is None else before)
-            g, H = g + J.T @ (w * residual.ravel()) / len(views), H + (product + product.T) / (2 * len(views))
+            if before is None:
+                before = self._jacobian(which, k, "other slope")
+            self.visits[which] = self.visits.get(which, 0) + 1
+            J = before + max(MEMORY, 1 / (self.visits[which] + 1)) * (new - before)
+            gv, Hv = self._normal(which, misfit, J, before, new)
+            g, H = g + gv / len(views), H + Hv / len(views)
             self.slopes[which] = J
-            losses.append(loss)
-            variance += noise / len(views) ** 2
+            losses.append(misfit.loss)
+            variance += misfit.variance / len(views) ** 2
         self.H += max(MEMORY, 1 / (k + 1)) * (H - self.H)
         move = -_solved(self.H, g)
         move *= min(1.0, LONGEST / max(np.abs(move).max(), 1e-30))
@@ -137,12 +147,29 @@ class MediumDescent:
         self._move(move / max(later + 1, 1))
         return FitStep(float(np.mean(losses)), float(np.sqrt(variance)), values)
 
+    def _normal(
+        self, which: int, misfit: ViewMisfit, J: np.ndarray, before: np.ndarray, new: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """g and H of a view, by J and by two Jacobians of independent samples; without the exposure e in any."""
+        compared, e = self.comparison, self.comparison.exposures[which]
+        w = compared.weights[which].ravel() / compared.count(which)
+        g, H = e * J.T @ (w * misfit.residual.ravel()), e**2 * (before * w[:, None]).T @ new
+        if self.free.size:
+            direction = self.free[compared.fitted.index(which)]
+            image = (misfit.residual + compared.views[which].image).ravel()
+            cross = e * np.outer(J.T @ (w * image), direction)
+            H = np.block([[H, cross], [cross.T, misfit.exposure_curvature * np.outer(direction, direction)]])
+            g = np.append(g, misfit.exposure_slope * direction)
+        return g, (H + H.T) / 2
+
     def _move(self, move: np.ndarray) -> None:
         at = 0
         for name, x in self.x.items():
             now = _numbers(x) + move[at : at + len(_numbers(x))]
             at += len(now)
             self.x[name] = self.parameters.clipped(name, type(x)(now.tolist() if len(now) > 1 else float(now[0])))
+        for which, share in zip(self.comparison.fitted, self.free @ move[at:]):
+            self.comparison.expose(which, np.expm1(share))
 
     # ---- the end
 
@@ -150,11 +177,12 @@ class MediumDescent:
         """Where the steps have ended."""
         x, end = self.x, self.total
         self.parameters.put(x)
-        fitted, test = self.comparison.roots(end)
+        fitted, test, views = self.comparison.ends(end)
         last = np.array([step.loss for step in self.steps[int(SETTLING * end) :]])
         noise = float(last.std() / np.sqrt(len(last)))  # of its mean, which may be below 0
         covariance = self._covariance(max(float(last.mean()), noise))
         slopes = np.concatenate(list(self.parameters.slopes(x).values()))
+        covariance = covariance[: len(slopes), : len(slopes)]  # without exposures
         error = np.sqrt(np.maximum(np.diag(covariance), 0))
         correlation = covariance / np.maximum(np.outer(error, error), 1e-30)
         values, errors, at = self.parameters.shown(x), {}, 0
@@ -163,7 +191,7 @@ class MediumDescent:
             at += len(value)
         told = self.parameters.at_bounds(x) + _ambiguity(values, correlation)
         medium, exposures = surface_of(self.parameters.shape).inside.medium, self.comparison.exposures.tolist()
-        return MaterialFit(values, errors, correlation, medium, fitted, test, exposures, told, self.steps)
+        return MaterialFit(values, errors, correlation, medium, fitted, test, exposures, told, self.steps, views)
 
     def _covariance(self, loss: float) -> np.ndarray:
         """Of the variables: loss H^-1 / n by the images, and the noise of the mean of the last steps."""
@@ -184,7 +212,7 @@ class MediumDescent:
             dr.forward_from(x[name], dr.ADFlag.ClearEdges)  # models begin at the coefficients
             seed, scene = compared.seed(k, which, purpose, j), compared.scene
             found = scene.integrator().render_forward(scene, None, view.sensor, seed, spp)
-            d = compared.exposures[which] * np.array(found, dtype=np.float64)[..., : view.image.shape[2]]
+            d = np.array(found, dtype=np.float64)[..., : view.image.shape[2]]
             numbers = len(_numbers(x[name]))
             for c in range(numbers):
                 keep = np.ones(d.shape[2]) if numbers == 1 else np.arange(d.shape[2]) == c
@@ -194,9 +222,15 @@ class MediumDescent:
 
 def _solved(H: np.ndarray, g: np.ndarray) -> np.ndarray:
     """H^-1 g; noise makes small eigenvalues of H wrong, negative ones too."""
-    e, v = np.linalg.eigh(H)
+    scale = 1 / np.sqrt(np.maximum(np.abs(np.diag(H)), 1e-30))
+    e, v = np.linalg.eigh(H * np.outer(scale, scale))
     e = np.maximum(np.abs(e), DAMPED * max(np.abs(e).max(), 1e-30))
-    return (v / e) @ (v.T @ g)
+    return np.diag(scale) @ (v / e) @ (v.T @ (np.diag(scale) @ g))
+
+
+def _of_sum_0(n: int) -> np.ndarray:
+    """An orthonormal basis of vectors of n numbers whose sum is 0, shape (n, n - 1)."""
+    return np.linalg.svd(np.ones((1, n)))[2][1:].T
 
 
 def _numbers(x: mi.Float | mi.Spectrum) -> np.ndarray:

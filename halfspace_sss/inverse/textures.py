@@ -31,6 +31,7 @@ STEPS = 200
 COARSE = 0.5  # part of the steps for all resolutions but the last
 FALLING = 0.5  # part of the steps in which the rate falls
 LAST = {"albedo": 9.0, "reflectance": 9.0, "g": 2.9}  # size of variables beyond which they are at a bound
+EXPOSURE_MEMORY = 0.2  # of the step to the best exposure, what is taken
 SMOOTH = 0.01  # added to differences of neighbours, in quadrature
 
 
@@ -257,10 +258,12 @@ class TextureDescent:
         values = self._put()
         means = {name: numbers.reshape(-1, numbers.shape[-1]).mean(axis=0) for name, numbers in self._shown().items()}
         for which in (views := compared.batch(k)):
-            loss, noise, residual = compared.view(which, k)
-            self._backward(which, k, residual / len(views))
-            losses.append(loss)
-            variance += noise / len(views) ** 2
+            misfit = compared.view(which, k)
+            self._backward(which, k, misfit.residual / len(views))
+            if settings.exposure:
+                compared.expose(which, -EXPOSURE_MEMORY * misfit.exposure_slope / misfit.exposure_curvature)
+            losses.append(misfit.loss)
+            variance += misfit.variance / len(views) ** 2
         self.adam.zero_grad()
         for v in self.parameters.variables:
             slope = np.array(dr.grad(self.scene_parameters[v.key]), dtype=float).reshape(v.start.shape)
@@ -315,7 +318,7 @@ class TextureDescent:
         self._put()
         for v in self.parameters.variables:
             dr.disable_grad(self.scene_parameters[v.key])
-        fitted, held = self.comparison.roots(self.total)
+        fitted, held, views = self.comparison.ends(self.total)
         found, told = self._shown(), []
         for v in self.parameters.variables:
             told += self._told(v)
@@ -323,7 +326,9 @@ class TextureDescent:
         medium = surface_of(self.parameters.shape).inside
         medium = medium.textured.mean(medium.medium.g, medium.medium.eta, self.parameters.shape)
         exposures = self.comparison.exposures.tolist()
-        return MaterialFit(found, {}, np.zeros((0, 0)), medium, fitted, held, exposures, told, self.steps, textures)
+        return MaterialFit(
+            found, {}, np.zeros((0, 0)), medium, fitted, held, exposures, told, self.steps, views, textures
+        )
 
     def _told(self, v: Variable) -> list[str]:
         """What is at a bound, and what no view sees."""

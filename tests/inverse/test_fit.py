@@ -131,6 +131,8 @@ def test_a_killed_fit_goes_on_with_the_same_bits_and_the_command_writes_a_scene(
     medium = open_scene(tmp_path / "rest" / "a_fit.xml").shapes()[0].bsdf().inside.medium
     assert medium.albedo == pytest.approx(numbers[0]["values"]["albedo"])
     assert "[[material]]" in (tmp_path / "rest" / "a_fit.toml").read_text()
+    pages = [(tmp_path / each / "a_fit.html").read_text() for each in ("whole", "rest")]
+    assert pages[0] == pages[1] and '"found"' in pages[0] and '"given"' in pages[0]
 
 
 @pytest.mark.slow
