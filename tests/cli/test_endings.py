@@ -44,8 +44,8 @@ import pandas
 from halfspace_sss.neural.training import ablation as module
 def stub(*_, progress, **__):
     progress("maps", 0, 1)
-    row = {"budget": "2,000 samples", "variant": "x", "kB": 1.0, "samples": 1.0, "seconds": 1.0, "noise": 0.1}
-    return pandas.DataFrame([row | {k: 0.1 for k in ("error", "bias", "error_sd", "bias_sd", "r 1-10")}])
+    row = {"budget": "2,000 samples", "variant": "x", "threads": 1, "kB": 1.0, "samples": 1.0, "seconds": 1.0}
+    return pandas.DataFrame([row | {k: 0.1 for k in ("noise", "error", "bias", "error_sd", "bias_sd", "r 1-10")}])
 module.ablation, module.summary = stub, lambda table: table
 """
 HARNESS = """

@@ -189,6 +189,7 @@ def test_the_albedo_of_a_ball_is_found_from_its_image():
     optimiser = mi.ad.Adam(lr=0.05)
     optimiser[key] = parameters[key]
     for step in range(40):
+        optimiser.set_learning_rate(0.05 * 0.93**step)  # at a constant one it swings to the end
         optimiser[key] = dr.clip(optimiser[key], 0.1, 0.99)
         parameters.update(optimiser)
         found = mi.render(scene, parameters, spp=32, seed=step)
