@@ -12,7 +12,7 @@ import signal
 import threading
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, ProcessPoolExecutor, as_completed
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ import halfspace_sss
 from halfspace_sss.backend import BackendError, cores, limit_threads
 from halfspace_sss.checks import check_count
 
+LOCAL = "local"  # in place of an address: a cluster of Dask on this machine
 _PROCESS = os.getpid()  # that imported this module: a forked child has another one
 
 
@@ -95,24 +96,28 @@ def scheduler(address: str) -> Iterator[Executor]:
     """The workers of a Dask scheduler.
 
     Args:
-        address: as tcp://HOST:8786, or the file that `dask scheduler --scheduler-file` writes.
+        address: as tcp://HOST:8786, or the file that `dask scheduler --scheduler-file` writes; "local": of a cluster on
+            this machine, one worker for each core, that ends with the block.
 
     Raises:
         BackendError: Dask is not installed, or no scheduler answers.
         ValueError: a worker has another version of this package, or several threads.
     """
     try:
-        from distributed import Client, KilledWorker
+        from distributed import Client, KilledWorker, LocalCluster
 
         from halfspace_sss.dask_worker import WorkerSetUp
     except ModuleNotFoundError as error:
         raise BackendError(f'a scheduler needs {error.name}: pip install "halfspace-sss[cluster]"') from error
-    where = {"scheduler_file": address} if Path(address).is_file() else {"address": address}
-    try:
-        client = Client(**where, timeout=10, set_as_default=False)
-    except (OSError, ValueError) as error:
-        raise BackendError(f"no scheduler answers at {address}: {error}") from error
-    with client:
+    with ExitStack() as stack:
+        if address == LOCAL:
+            cluster = LocalCluster(n_workers=cores(), threads_per_worker=1, dashboard_address="127.0.0.1:0")
+            address = stack.enter_context(cluster).scheduler_address
+        where = {"scheduler_file": address} if Path(address).is_file() else {"address": address}
+        try:
+            client = stack.enter_context(Client(**where, timeout=10, set_as_default=False))
+        except (OSError, ValueError) as error:
+            raise BackendError(f"no scheduler answers at {address}: {error}") from error
         client.register_plugin(WorkerSetUp(halfspace_sss.__version__))
         try:
             yield client.get_executor(pure=False)

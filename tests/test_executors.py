@@ -75,7 +75,7 @@ def test_what_is_no_number_of_workers_and_no_scheduler_is_refused(monkeypatch: p
 
 
 @contextmanager
-def dask(threads: int = 1) -> Iterator[str]:
+def dask(threads: int) -> Iterator[str]:
     """Address of a scheduler with one worker."""
     distributed = pytest.importorskip("distributed")
     with distributed.LocalCluster(n_workers=1, threads_per_worker=threads, dashboard_address=None) as cluster:
@@ -96,7 +96,7 @@ def test_two_processes_share_the_cores_and_give_the_bits_of_one(tmp_path: Path) 
 @pytest.mark.slow
 def test_workers_of_dask_give_the_bits_of_one_process(tmp_path: Path) -> None:
     here = make_maps(MEDIA, tmp_path / "here", **HOW)
-    with dask() as address, executors.scheduler(address) as executor:
+    with executors.scheduler("local") as executor:
         there = make_maps(MEDIA, tmp_path / "there", executor=executor, **HOW)
     for name in MEDIA:
         assert load_maps(there[name]).S.equals(load_maps(here[name]).S)

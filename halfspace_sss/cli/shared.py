@@ -227,7 +227,9 @@ Workers = Annotated[
 ]
 Scheduler = Annotated[
     str | None,
-    typer.Option(help="Address or file of a Dask scheduler, whose workers do the work.", show_default="none"),
+    typer.Option(
+        help="Address or file of a Dask scheduler, whose workers do the work; local starts one.", show_default="none"
+    ),
 ]
 Define = Annotated[
     list[str] | None,
