@@ -167,8 +167,10 @@ def object_command(
     from halfspace_sss.rendering.scenes.scene_files import load_objects
 
     learner(model)
-    for name in object if object and len(object) > 1 else ():  # before one is trained
-        object_of(load_objects(scene, parameters), None, None, name)
+    if object and len(object) > 1:  # all are looked for before one is trained
+        loaded = load_objects(scene, parameters)
+        for name in object:
+            object_of(loaded, None, None, name)
     how = {"seconds": seconds, "target_error": target_error, "seed": seed}
     how |= {"base_model": base_model} if base_model is not None else {}
     with executor_of(workers, scheduler) as executor, Bar("training") as bar:
@@ -190,7 +192,7 @@ def object_command(
 
 def _train_object(
     of: tuple[Path, dict[str, str], str, str | None], how: dict[str, Any], bar: Bar | None
-) -> LearntObject:  # fmt: skip
+) -> LearntObject:
     """The network of an object of a scene file, by its parameters, variant and learner; on a worker without a bar."""
     scene, parameters, variant, model = of
     use_mitsuba(variant)

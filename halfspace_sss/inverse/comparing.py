@@ -186,14 +186,23 @@ class ViewComparison:
 
     def view(self, which: int, k: int) -> ViewMisfit:
         """A view in a step; one that is held out at the exposure that suits it."""
-        view, w = self.views[which], self.weights[which]
+        view = self.views[which]
         purposes = ("test", "other test") if view.held_out else ("first", "second")
         pair = [self._image(view, self.seed(k, which, each)) for each in purposes]
-        misfit = _misfit(pair, self.exposures[which], view.image, w)
+        misfit = self._misfit(which, pair)
         if self.settings.exposure and view.held_out:
             self.expose(which, -misfit.exposure_slope / misfit.exposure_curvature)
-            misfit = _misfit(pair, self.exposures[which], view.image, w)
+            misfit = self._misfit(which, pair)
         return misfit
+
+    def _misfit(self, which: int, pair: Sequence[np.ndarray]) -> ViewMisfit:
+        e, T, w, n = self.exposures[which], self.views[which].image, self.weights[which], self.count(which)
+        a, b = (e * image - T for image in pair)
+        noise = np.square(a - b) / 2  # variance of each
+        variance = float((np.square(w) * (noise * (np.square(a) + np.square(b)) / 2)).sum()) / n**2
+        loss, residual = float((w * a * b).sum() / n), (a + b) / 2
+        slope = loss + float((w * T * residual).sum() / n)  # mean w (a + T) b, of independent samples
+        return ViewMisfit(loss, variance, residual, slope, float((w * (a + T) * (b + T)).sum() / n))
 
     def ends(self, k: int) -> tuple[NoiseFree, NoiseFree | None, list[FittedView]]:
         """The root of the loss of all fitted views, and likewise of views held out (None without any); all views."""
@@ -224,16 +233,6 @@ class ViewComparison:
         for view in self.views:
             digest.update(view.image.tobytes() + view.counts.tobytes())
         return digest.hexdigest()
-
-
-def _misfit(pair: Sequence[np.ndarray], e: float, T: np.ndarray, w: np.ndarray) -> ViewMisfit:
-    a, b = (e * image - T for image in pair)
-    n = max(float((w > 0).sum()), 1.0)
-    noise = np.square(a - b) / 2  # variance of each
-    variance = float((np.square(w) * (noise * (np.square(a) + np.square(b)) / 2)).sum()) / n**2
-    loss, residual = float((w * a * b).sum() / n), (a + b) / 2
-    slope = loss + float((w * T * residual).sum() / n)  # mean w (a + T) b, of independent samples
-    return ViewMisfit(loss, variance, residual, slope, float((w * (a + T) * (b + T)).sum() / n))
 
 
 def _weights(view: GivenView, loss: str) -> np.ndarray:

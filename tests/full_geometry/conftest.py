@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
+
+from halfspace_sss.neural import store
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -17,3 +20,12 @@ def fewer_walks() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(training, "WALKS", 512)
         yield
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Where weights are kept and looked for."""
+    found = tmp_path_factory.mktemp("weights")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(store.ENVIRONMENT_VARIABLE, str(found))
+        yield found

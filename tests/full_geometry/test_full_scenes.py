@@ -38,7 +38,6 @@ from full_geometry.object.features import (  # noqa: E402
 )
 from full_geometry.object.pairs import trace_exits  # noqa: E402
 from halfspace_sss import rendering  # noqa: E402
-from halfspace_sss.neural import store as known_weights  # noqa: E402
 from halfspace_sss.neural.store import load_weights, save_weights  # noqa: E402
 from halfspace_sss.rendering.object.objects import object_of  # noqa: E402
 from halfspace_sss.rendering.scenes.scene_files import load_objects, load_scene  # noqa: E402
@@ -52,15 +51,6 @@ CHUNKS, PASSES = 16, 6
 COLOURS = {"sigma_s": "0.95,0.8,0.6", "sigma_a": "0.05,0.2,0.4", "eta": 1.4}
 WAX = Medium(np.array([0.95, 0.8, 0.6]), np.array([0.05, 0.2, 0.4]), 0.0, 1.4)
 SURFACE = {"type": "translucent", **COLOURS, "model": "full_geometry", "orders": "multiple", "reflection": False}
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory):
-    """Where weights are kept and looked for."""
-    found = tmp_path_factory.mktemp("weights")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv(known_weights.ENVIRONMENT_VARIABLE, str(found))
-        yield found
 
 
 @pytest.fixture(scope="module")

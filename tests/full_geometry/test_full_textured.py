@@ -20,7 +20,6 @@ from full_geometry.models import storing  # noqa: E402
 from full_geometry.models.object_model import HalfSpace  # noqa: E402
 from full_geometry.object.pairs import trace_exits  # noqa: E402
 from halfspace_sss import rendering  # noqa: E402
-from halfspace_sss.neural import store as known_weights  # noqa: E402
 from halfspace_sss.rendering.object.objects import TranslucentObject, object_of  # noqa: E402
 from halfspace_sss.rendering.scenes.scene_files import load_objects  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
@@ -30,15 +29,6 @@ pytestmark = pytest.mark.usefixtures("rgb")
 QUICK = Recipe(width=32, depth=2, batch=1024, chunk=2**15, reuse=4)
 CHUNKS, PASSES = 6, 6
 PALE, DARK = ([0.98, 0.9, 0.7], [2.0, 3.0, 4.0]), ([0.5, 0.7, 0.95], [4.0, 3.0, 2.0])  # albedo, sigma_t
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory):
-    """Where weights are kept and looked for."""
-    found = tmp_path_factory.mktemp("weights")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv(known_weights.ENVIRONMENT_VARIABLE, str(found))
-        yield found
 
 
 def cube(*media: tuple, **more) -> dict:

@@ -23,7 +23,6 @@ from full_geometry.models.object_model import HalfSpace  # noqa: E402
 from full_geometry.object.features import first_event, flight  # noqa: E402
 from full_geometry.object.pairs import EntryProposals  # noqa: E402
 from halfspace_sss import rendering  # noqa: E402
-from halfspace_sss.neural import store as known_weights  # noqa: E402
 from halfspace_sss.rendering.object.objects import TranslucentObject, object_of  # noqa: E402
 from halfspace_sss.rendering.object.points import SurfacePoint  # noqa: E402
 from halfspace_sss.rendering.scenes.scene_files import load_objects, load_scene  # noqa: E402
@@ -37,15 +36,6 @@ CHUNKS, PASSES = 8, 6
 RNG = np.random.default_rng(3)
 DENSITY = 8.0 ** -RNG.random((4, 4, 4, 1))
 ALBEDO = 0.9 + 0.095 * RNG.random((4, 4, 4, 3))
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory):
-    """Where weights are kept and looked for."""
-    found = tmp_path_factory.mktemp("weights")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv(known_weights.ENVIRONMENT_VARIABLE, str(found))
-        yield found
 
 
 def grid(values: np.ndarray, to_world, **more) -> dict:
