@@ -1,4 +1,4 @@
-"""Fig. 1: candle, mandarin and croissant in surroundings, path traced and by models, with FLIP."""
+"""Fig. 1: candle, mandarin and croissant in surroundings, path traced and by gathered light of models, with FLIP."""
 
 from __future__ import annotations
 
@@ -25,19 +25,20 @@ from figures.drawing.image_files import image_files, rows_of
 from figures.modelling.objects import TISSUES, tissue
 from figures.parts.part import Part, Result, Task
 
-TITLE = "candle with its flame, mandarin and croissant, path traced and by models"
+TITLE = "candle with its flame, mandarin and croissant, path traced and by gathered light of models"
 OBJECTS = ("candle", "mandarin", "croissant")
 MODELS = ("neural", *(name for name in OF_OBJECTS if name == FULL_GEOMETRY))
 TRUTH = "path_traced"
-SIZES = {"draft": 72, "paper": 448}
-SPP = {"draft": {TRUTH: 256, "model": 64}, "paper": {TRUTH: 8192, "model": 1024}}
+SIZES = {"draft": 128, "paper": 448}
+SPP = {"draft": {TRUTH: 256, "model": 128}, "paper": {TRUTH: 8192, "model": 1024}}
 SPP_PER_PASS = 16
 RESOLUTION = {"draft": 64, "paper": 240}  # of surfaces; grids have half of it
 LIGHT = "sunset"  # the small lamps of the studio are hardly found by walks
 NOTES = (
     "The candle is homogeneous wax with its flame as a small emitter in the bowl; mandarin and croissant are grid "
-    "volumes, of which the half-space takes the means. Smooth boundaries, all scattering orders. FLIP and relative "
-    "squared error of the pixels of the object, against our walk, whose own noise is in all of them alike."
+    "volumes, of which the half-space takes the means. Smooth boundaries, all scattering orders; models by their "
+    "gathered light. FLIP and relative squared error of the pixels of the object, against our walk, whose own noise is "
+    "in all of them alike."
 )
 
 
@@ -74,7 +75,7 @@ def shown(task: Task) -> dict[str, Any]:
     alone = {key: description[key] for key in ("type", "sensor", name)}
     covered = cover(mi.load_dict({**alone, "integrator": {"type": "path"}}))
     if p["model"] != TRUTH:
-        description["integrator"] = {"type": "bssrdf"}
+        description["integrator"] = {"type": "bssrdf", "light": "gathered"}
     each = min(SPP_PER_PASS, p["spp"])
     passes = p["spp"] // each
     with with_weights(task.folder, task.needed):

@@ -27,8 +27,9 @@ SIZES = {"draft": 72, "paper": 384}
 SPP = {"draft": {"path_traced": 256, FULL_GEOMETRY: 64}, "paper": {"path_traced": 8192, FULL_GEOMETRY: 1024}}
 AXIS = (-0.17, 0.15)  # x and z of the axis that the camera goes about
 NOTES = (
-    "Trained once, without any of these lights: the same weights in all images. All scattering orders. FLIP and "
-    "relative squared error of the pixels of the object, against walks, whose own noise is in them as well."
+    "Trained once, without any of these lights: the same weights in all images, by gathered light. All scattering "
+    "orders. FLIP and relative squared error of the pixels of the object, against walks, whose own noise is in them as "
+    "well."
 )
 
 
@@ -76,6 +77,7 @@ def seen(task: Task) -> dict[str, Any]:
         description["sky"] = environment(p["light"], p["scale"])
     about = mi.ScalarTransform4f().translate([AXIS[0], 0, AXIS[1]])
     turn = about @ mi.ScalarTransform4f().rotate([0, 1, 0], p["view"]) @ about.inverse()
+    description["integrator"]["light"] = "gathered"
     description["sensor"]["to_world"] = turn @ description["sensor"]["to_world"]
     with with_weights(task.folder, task.needed):
         scene = load_scene(description, p["model"])

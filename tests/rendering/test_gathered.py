@@ -97,6 +97,20 @@ def test_textures_are_as_bright_as_the_model_sampled_on_both_sides_of_an_edge() 
     assert np.abs(np.log(a[1] / a[2])).max() > 0.5
 
 
+@pytest.mark.filterwarnings("ignore:object")
+def test_a_medium_that_varies_is_as_bright_as_the_model_sampled() -> None:
+    values = np.random.default_rng(1).uniform(0.5, 2, (3, 3, 3, 3)).astype(np.float32)
+    grid = {"type": "gridvolume", "grid": mi.VolumeGrid(values), "raw": True}
+    grid["to_world"] = mi.ScalarTransform4f().scale(2).translate([-0.5, -0.5, -0.5])
+    cloud = {"sigma_t": grid, "albedo": "0.98,0.9,0.8", "g": 0.3, "eta": 1.4}
+    pictures = []
+    for light, spp in (("sampled", 2**11), ("gathered", 64)):
+        scene = _scene(light, lights=_lights("lamp"), surface=cloud)
+        pictures += [_image(scene, spp, seed).mean(axis=(0, 1)) for seed in (1, 2)]
+    a, b, one, two = pictures
+    assert (np.abs((one + two) / (a + b) - 1) < 0.03 + 2 * np.abs(a - b) / (a + b)).all()
+
+
 def test_a_sample_has_a_fiftieth_of_the_variance_at_most() -> None:
     a, b, one, two = _pictures("better_dipole", "lamp")
     inner = np.s_[3:9, 3:9]

@@ -161,8 +161,6 @@ def _check(obj: TranslucentObject) -> None:
     if not result.closed or not result.area > 0:
         lacks = "is not closed" if not result.closed else f"is a {result.shape.class_name()} without known area"
         raise ValueError(f"light must be sampled for object {result.name}, which {lacks}, got gathered")
-    if obj.surface.inside.varying is not None:
-        raise ValueError(f"light must be sampled for object {result.name}, whose medium varies, got gathered")
     if obj.wrapping.bend is not None:
         raise ValueError(
             f"light must be sampled for object {result.name}, which has a normal or bump map, got gathered"
