@@ -155,11 +155,14 @@ def render(picture: Picture) -> dict[str, bytes]:
 
 
 def fit(found: MaterialFit) -> bytes:
-    """The page that flips between the given image of each view and what a fit has found."""
-    scenes = {}
+    """The page that flips between the given image of each view and what a fit has found, exposed for the brightest."""
+    scenes, given = {}, [view.given[view.counts] for view in found.views]
+    bright = max((float(np.percentile(pixels, 97)) for pixels in given if pixels.size), default=1.0)
+    exposure = round(-math.log2(bright), 1) if bright > 0 else 0.0
     for view in found.views:
         shape = (*view.counts.shape, 3)  # one channel is grey
         given, image = (np.broadcast_to(np.nan_to_num(each), shape) for each in (view.given, view.found))
         shots = [Shot("given", np.maximum(given, 0.0)), compared("found", image, given, mask=view.counts)]
         scenes[f"{view.name}, held out" if view.held_out else view.name] = shots
-    return page("Images and fit", scenes, notes="FLIP and relative squared error of the pixels that count.").encode()
+    notes = "FLIP and relative squared error of the pixels that count."
+    return page("Images and fit", scenes, exposure=exposure, caption="; ".join(found.lines()), notes=notes).encode()

@@ -36,12 +36,12 @@ def fit_command(
     parameter: Annotated[
         str, typer.Option(help="Of albedo, reflectance, sigma_t, mfp, g; the texture, where there is one.")
     ] = "albedo,sigma_t",
-    model: Annotated[str, typer.Option(help="translucent_walk, or the name of a model.")] = "translucent_walk",
+    model: Annotated[str, typer.Option(help="translucent_walk, or a model of the half-space.")] = "translucent_walk",
     object: ObjectId = None,  # noqa: A002
     steps: Annotated[int, typer.Option(help="How many.", parser=whole, show_default="30, or 200 with textures")] = 0,
     spp: Annotated[int, typer.Option(help="Samples a pixel of each render of a step.", parser=whole)] = 64,
     batch: Annotated[int, typer.Option(help="Views a step.", parser=whole, show_default="4, or all")] = 0,
-    loss: Annotated[str, typer.Option(help="relative or l2.")] = "relative",
+    loss: Annotated[str, typer.Option(help="relative, l2, or robust.")] = "relative",
     exposure: Annotated[bool, typer.Option("--exposure", help="Each image has an unknown factor.")] = False,
     rate: Annotated[float, typer.Option(help="Of textures: of Adam.")] = 0.2,
     tv: Annotated[float, typer.Option(help="Of textures: weight of their total variation.")] = 1e-3,
@@ -65,14 +65,8 @@ def fit_command(
     with Bar("fit") as bar:
         found = fit(scene, read_views(images), names, model, object, settings, work, bar.show)
     screen = console()
-    for name, value in found.values.items():
-        errors = [f" ± {e:.1g}" for e in found.errors[name]] if found.errors else [""] * len(value)
-        screen.print(f"{name}: {'  '.join(f'{v:.4g}{e}' for v, e in zip(value, errors))}", highlight=False)
-    for name, values in found.textures.items():
-        mean = " ".join(f"{v:.4g}" for v in values.reshape(-1, values.shape[-1]).mean(axis=0))
-        screen.print(f"{name}: {' x '.join(map(str, values.shape[:-1]))} numbers of mean {mean}", highlight=False)
-    held = "" if found.held_out is None else f", of views held out {found.held_out.told()} %"
-    screen.print(f"root of the loss {found.misfit.told()} %{held}", highlight=False)
+    for line in found.lines():
+        screen.print(line, highlight=False)
     for sentence in found.told:
         tell(sentence)
     for path in _write(found, scene, object, out):

@@ -4,8 +4,14 @@ With two renders I, I' of independent samples, an image T and weights w, the los
 
     mean w (I - T) (I' - T),
 
-in which noise has no bias (Deng et al. 2022 take the product of two renders too). Weights are 1, or
-1 / (T + a tenth of the mean of T)².
+in which noise has no bias (Deng et al. 2022 take the product of two renders too). Weights are 1 ("l2"), or
+1 / (T + a tenth of the mean of T)² ("relative"). "robust" makes that the loss of Huber (1964), by weights that are
+found anew in each step: with r = |I'' - T| / (T + a tenth of the mean of T) of a third render I'', they are
+
+    1 / (T + a tenth of the mean of T)² / max(1, r / 5 %)
+
+over the mean of their last factor. The third render knows nothing of the noise of the others, so weights have no bias
+either; that noise blurs the bend at 5 %.
 """
 
 from __future__ import annotations
@@ -28,11 +34,12 @@ from halfspace_sss.physics.medium import Medium
 from halfspace_sss.progress import ProgressText
 from halfspace_sss.provenance import provenance, write_atomically
 
-LOSSES = ("relative", "l2")
+LOSSES = ("relative", "l2", "robust")
 FLOOR = 0.1  # of the mean of an image, added to it in relative weights
+BEND = 0.05  # relative residual, beyond which the robust loss grows by its size
 EXPOSURE = 10.0  # most, of a factor
 BATCH = 4
-PURPOSES = ("order", "first", "second", "slope", "other slope", "test", "other test")
+PURPOSES = ("order", "first", "second", "slope", "other slope", "test", "other test", "weights")
 
 
 @dataclass(frozen=True)
@@ -43,7 +50,7 @@ class FitSettings:
         steps: how many; 0 takes 30, or 200 where textures are fitted.
         spp: samples a pixel of each render of a view: two images, and its slopes.
         batch: views a step; 0 takes 4 or all, whichever is less.
-        loss: "relative" or "l2".
+        loss: "relative", "l2" or "robust".
         exposure: whether each image may have a factor of its own, of geometric mean 1.
         seed: of all samples.
         rate: of Adam, in the variables of textures and of constants beside them.
@@ -123,6 +130,18 @@ class MaterialFit:
     views: list[FittedView] = field(default_factory=list, repr=False)
     textures: dict[str, np.ndarray] = field(default_factory=dict, repr=False)
 
+    def lines(self) -> list[str]:
+        """Each parameter with its errors, and the misfit."""
+        told = []
+        for name, value in self.values.items():
+            errors = [f" ± {e:.1g}" for e in self.errors[name]] if self.errors else [""] * len(value)
+            told.append(f"{name}: {'  '.join(f'{v:.4g}{e}' for v, e in zip(value, errors))}")
+        for name, values in self.textures.items():
+            mean = " ".join(f"{v:.4g}" for v in values.reshape(-1, values.shape[-1]).mean(axis=0))
+            told.append(f"{name}: {' x '.join(map(str, values.shape[:-1]))} numbers of mean {mean}")
+        held = "" if self.held_out is None else f", of views held out {self.held_out.told()} %"
+        return [*told, f"root of the loss {self.misfit.told()} %{held}"]
+
 
 class ViewMisfit(NamedTuple):
     """What two renders of a view say.
@@ -130,12 +149,14 @@ class ViewMisfit(NamedTuple):
     Args:
         loss, variance: of the view, and its variance by noise.
         residual: mean of both renders times the exposure e, less the image.
+        weights: of pixels and channels.
         exposure_slope, exposure_curvature: half the derivatives of the loss by ln e, of Gauss and Newton.
     """
 
     loss: float
     variance: float
     residual: np.ndarray
+    weights: np.ndarray
     exposure_slope: float
     exposure_curvature: float
 
@@ -146,7 +167,7 @@ class ViewComparison:
 
     Args:
         scene, views, settings: as of `fit`, checked.
-        weights: of each view, by pixel and channel.
+        weights: of each view, by pixel and channel, before a robust loss changes them.
         factors: of each view, changed in place: by which its render becomes its image, up to one common factor.
     """
 
@@ -189,20 +210,30 @@ class ViewComparison:
         view = self.views[which]
         purposes = ("test", "other test") if view.held_out else ("first", "second")
         pair = [self._image(view, self.seed(k, which, each)) for each in purposes]
-        misfit = self._misfit(which, pair)
+        weights = self._weights(which, k)
+        misfit = self._misfit(which, pair, weights)
         if self.settings.exposure and view.held_out:
             self.expose(which, -misfit.exposure_slope / misfit.exposure_curvature)
-            misfit = self._misfit(which, pair)
+            misfit = self._misfit(which, pair, weights)
         return misfit
 
-    def _misfit(self, which: int, pair: Sequence[np.ndarray]) -> ViewMisfit:
-        e, T, w, n = self.exposures[which], self.views[which].image, self.weights[which], self.count(which)
+    def _weights(self, which: int, k: int) -> np.ndarray:
+        """Of a view in a step."""
+        weights, view = self.weights[which], self.views[which]
+        if self.settings.loss != "robust":
+            return weights
+        image = self.exposures[which] * self._image(view, self.seed(k, which, "weights"))
+        factor = 1 / np.maximum(np.sqrt(weights) * np.abs(image - view.image) / BEND, 1)
+        return weights * factor / factor[weights > 0].mean() if (weights > 0).any() else weights
+
+    def _misfit(self, which: int, pair: Sequence[np.ndarray], w: np.ndarray) -> ViewMisfit:
+        e, T, n = self.exposures[which], self.views[which].image, self.count(which)
         a, b = (e * image - T for image in pair)
         noise = np.square(a - b) / 2  # variance of each
         variance = float((np.square(w) * (noise * (np.square(a) + np.square(b)) / 2)).sum()) / n**2
         loss, residual = float((w * a * b).sum() / n), (a + b) / 2
         slope = loss + float((w * T * residual).sum() / n)  # mean w (a + T) b, of independent samples
-        return ViewMisfit(loss, variance, residual, slope, float((w * (a + T) * (b + T)).sum() / n))
+        return ViewMisfit(loss, variance, residual, w, slope, float((w * (a + T) * (b + T)).sum() / n))
 
     def ends(self, k: int) -> tuple[NoiseFree, NoiseFree | None, list[FittedView]]:
         """The root of the loss of all fitted views, and likewise of views held out (None without any); all views."""

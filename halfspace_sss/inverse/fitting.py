@@ -21,7 +21,7 @@ import mitsuba as mi
 import numpy as np
 
 from halfspace_sss.inverse.comparing import FitSettings, FitStep, MaterialFit, ViewComparison, ViewMisfit, descend
-from halfspace_sss.inverse.parameters import FitParameters, translucent_object
+from halfspace_sss.inverse.parameters import FitParameters, check_derivatives, translucent_object
 from halfspace_sss.inverse.views import GivenView, check_views
 from halfspace_sss.progress import ProgressText
 from halfspace_sss.provenance import check_folder
@@ -53,22 +53,23 @@ def fit(
         images: views of it.
         parameters: names of `parameters.NAMES`; where the medium has a texture for one, the texture is fitted, a
             bitmap or an attribute of the mesh.
-        model: `translucent_walk` or the name of a model; None, and a Mitsuba scene, keep the integrator.
+        model: `translucent_walk` or the name of a model of the half-space; None, and a Mitsuba scene, keep the
+            integrator.
         object: name of the object; without it there must be one only.
         settings: how.
         work: a folder where each step is kept; the same fit started again goes on there, with the same bits.
         progress: called after each step.
 
     Raises:
-        ValueError: an argument is out of range, views do not belong to the scene, none shows the object, or `work` is
-            that of another fit.
+        ValueError: an argument is out of range, views do not belong to the scene, none shows the object, images by
+            the model have no derivatives, or `work` is that of another fit.
     """
     settings = settings or FitSettings()
     if not isinstance(scene, mi.Scene):
         scene = open_scene(scene, PATH_TRACED if model == WALK else model)
     shape = translucent_object(scene, object)
-    integrator = scene.integrator()
-    mm_per_unit = getattr(integrator, "mm_per_unit", None) or integrator.settings.mm_per_unit
+    check_derivatives(scene.integrator(), shape, parameters)
+    mm_per_unit = scene.integrator().mm_per_unit
     check_views(scene, images, shape)
     work = None if work is None else check_folder(work)
     comparison, textured = ViewComparison(scene, list(images), settings), surface_of(shape).inside.textured is not None
@@ -152,7 +153,7 @@ class MediumDescent:
     ) -> tuple[np.ndarray, np.ndarray]:
         """g and H of a view, by J and by two Jacobians of independent samples; without the exposure e in any."""
         compared, e = self.comparison, self.comparison.exposures[which]
-        w = compared.weights[which].ravel() / compared.count(which)
+        w = misfit.weights.ravel() / compared.count(which)
         g, H = e * J.T @ (w * misfit.residual.ravel()), e**2 * (before * w[:, None]).T @ new
         if self.free.size:
             direction = self.free[compared.fitted.index(which)]

@@ -10,10 +10,14 @@ import mitsuba as mi
 import numpy as np
 
 from halfspace_sss.checks import check_choice
-from halfspace_sss.rendering.object.objects import translucent_shapes
+from halfspace_sss.interface.model import bssrdf
+from halfspace_sss.rendering.object.half_space import Variation
+from halfspace_sss.rendering.object.objects import KnowsUnit, translucent_shapes
+from halfspace_sss.rendering.object.registry import lookup
 from halfspace_sss.rendering.object.shape import name_of
 from halfspace_sss.rendering.object.translucent import VARIABLE
 from halfspace_sss.rendering.object.wrapped import surface_of
+from halfspace_sss.rendering.paths.integrator import is_bssrdf
 
 NAMES = ("albedo", "sigma_t", "mfp", "g")
 ALBEDO = (1e-4, 1 - 1e-5)  # bounds
@@ -35,6 +39,33 @@ def translucent_object(scene: mi.Scene, name: str | None) -> mi.Shape:
         raise ValueError(f"object must be one of {', '.join(shapes)}, got none")
     check_choice("object", name, shapes)
     return shapes[name]
+
+
+def check_derivatives(integrator: mi.Integrator, shape: mi.Shape, names: Sequence[str]) -> None:
+    """Refuse images without derivatives by parameters of an object, before anything is rendered or learnt.
+
+    Raises:
+        ValueError: the integrator is neither `translucent_walk` nor `bssrdf`, or of the latter the light is not
+            sampled, or the model of the object is none of the half-space, or has no derivative by a parameter.
+    """
+    if not isinstance(integrator, KnowsUnit):
+        raise ValueError(f"integrator must be translucent_walk or bssrdf, got {integrator.class_name()}")
+    if not is_bssrdf(integrator):
+        return
+    settings, inside = integrator.settings, surface_of(shape).inside
+    if settings.light != "sampled":
+        raise ValueError(f"light must be sampled to fit a medium, got {settings.light}")
+    model, known = settings.model or inside.model, "translucent_walk and models of the half-space have derivatives"
+    if not lookup(model).of_half_space:
+        raise ValueError(f"model must have derivatives by the medium, got {model!r}: {known}")
+    if inside.textured is not None:
+        if bssrdf(model, inside.channels()[0]).checksums:
+            raise ValueError(f"model must have derivatives by textures, got {model!r}: analytic models have them")
+        if "g" in names:
+            raise ValueError(f"g must not be fitted beside textures by {model!r}: translucent_walk has its derivative")
+        return
+    coefficients = ["sigma_t" if name == "mfp" else name for name in names]
+    Variation(surface_of(shape), integrator.mm_per_unit, model).check(n for n in coefficients if n in VARIABLE)
 
 
 def check_names(names: Sequence[str], known: Sequence[str]) -> None:

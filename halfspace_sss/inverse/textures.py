@@ -259,7 +259,7 @@ class TextureDescent:
         means = {name: numbers.reshape(-1, numbers.shape[-1]).mean(axis=0) for name, numbers in self._shown().items()}
         for which in (views := compared.batch(k)):
             misfit = compared.view(which, k)
-            self._backward(which, k, misfit.residual / len(views))
+            self._backward(which, k, misfit.weights * misfit.residual / len(views))
             if settings.exposure:
                 compared.expose(which, -EXPOSURE_MEMORY * misfit.exposure_slope / misfit.exposure_curvature)
             losses.append(misfit.loss)
@@ -299,13 +299,13 @@ class TextureDescent:
         numbers = {v.name: v.numbers(self.x[v.name].detach()).numpy() for v in self.parameters.variables}
         return {v.name: v.shown(numbers[v.name]) for v in self.parameters.variables}
 
-    def _backward(self, which: int, k: int, residual: np.ndarray) -> None:
-        """Add to the gradients of what was set those of the loss of a view."""
+    def _backward(self, which: int, k: int, weighted: np.ndarray) -> None:
+        """Add to the gradients of what was set those of the loss of a view, by its residual times weights."""
         compared, scene = self.comparison, self.comparison.scene
-        view, weight = compared.views[which], compared.weights[which] / compared.count(which)
+        view = compared.views[which]
         shape = scene.sensors()[view.sensor].film().develop().shape
         slope = np.zeros(shape, np.float32)  # of the loss by pixels
-        slope[..., : view.image.shape[2]] = 2 * weight * residual * compared.exposures[which]
+        slope[..., : view.image.shape[2]] = 2 * weighted * compared.exposures[which] / compared.count(which)
         seed = compared.seed(k, which, "slope")
         scene.integrator().render_backward(
             scene, self.scene_parameters, mi.TensorXf(slope), view.sensor, seed, compared.settings.spp

@@ -81,6 +81,26 @@ def test_views_and_parameters_that_do_not_fit_are_refused_by_name(tmp_path: Path
     refused("object ball must be seen by a view, got none of 1")
 
 
+@pytest.mark.parametrize("model", ["neural_shape", "full_geometry", "lambert", "auto"])
+def test_models_without_derivatives_are_refused_before_anything_is_rendered(tmp_path: Path, model: str) -> None:
+    _scene(tmp_path)
+    view = GivenView.of("a", 0, np.full((8, 8, 3), 0.5, np.float32))
+    with pytest.raises(ValueError, match=f"model must have derivatives by the medium, got '{model}'"):
+        inverse.fit(tmp_path / "a.xml", [view], ("albedo",), model)
+
+
+def test_integrators_and_light_without_derivatives_are_refused(tmp_path: Path) -> None:
+    view = GivenView.of("a", 0, np.full((8, 8, 3), 0.5, np.float32))
+    gathered = '<string name="light" value="gathered"/><string name="model" value="better_dipole"/>'
+    for integrator, match in (
+        ('<integrator type="path">', "integrator must be translucent_walk or bssrdf, got PathIntegrator"),
+        (f'<integrator type="bssrdf">{gathered}', "light must be sampled to fit a medium, got gathered"),
+    ):
+        (tmp_path / "a.xml").write_text(XML.replace('<integrator type="translucent_walk">', integrator))
+        with pytest.raises(ValueError, match=match):
+            inverse.fit(mi.load_file(str(tmp_path / "a.xml")), [view], ("albedo",))
+
+
 def test_views_of_a_file_are_linear_and_leave_out_what_is_saturated(tmp_path: Path) -> None:
     shown = np.full((2, 2, 3), 128, np.uint8)
     shown[0, 0] = 255
@@ -108,6 +128,37 @@ def test_the_albedo_of_an_object_is_found_from_its_image(tmp_path: Path) -> None
 
 
 @pytest.mark.slow
+def test_a_robust_loss_leaves_out_spoiled_pixels_and_has_no_bias_by_noise(tmp_path: Path) -> None:
+    clean = _target(_scene(tmp_path))
+    spoiled = clean.copy()
+    spoiled[np.random.default_rng(0).random((8, 8)) < 0.1] *= 3
+    errors = {}
+    for image, loss in ((clean, "robust"), (spoiled, "robust"), (spoiled, "relative")):
+        settings = inverse.FitSettings(steps=24, spp=32, loss=loss)
+        views = [GivenView.of("a", 0, image)]
+        found = inverse.fit(tmp_path / "a.xml", views, ("albedo",), settings=settings).values["albedo"]
+        errors[image is clean, loss] = np.abs(found - TRUE["albedo"]).max()
+    assert errors[True, "robust"] < 0.015
+    assert errors[False, "robust"] < 0.03
+    assert errors[False, "relative"] > 2 * errors[False, "robust"]
+
+
+@pytest.mark.slow
+def test_the_albedo_below_a_rough_boundary_is_found_and_the_boundary_kept(tmp_path: Path) -> None:
+    boundary = """<bsdf type="roughdielectric" name="boundary"><float name="alpha" value="0.3"/>
+      <float name="int_ior" value="1.3"/><float name="ext_ior" value="1"/></bsdf>"""
+    (tmp_path / "a.xml").write_text(XML.replace('<float name="eta" value="1"/>', boundary))
+    mi.Bitmap(_target(open_scene(tmp_path / "a.xml"))).write(str(tmp_path / "a.exr"))
+    (tmp_path / "views.json").write_text(json.dumps({"views": [{"image": "a.exr"}]}))
+    how = ["--images", str(tmp_path / "views.json"), "--parameter", "albedo", "--steps", "24", "--out", str(tmp_path)]
+    found = CliRunner().invoke(cli.app, ["fit", str(tmp_path / "a.xml"), *how])
+    assert found.exit_code == 0, found.output
+    surface = open_scene(tmp_path / "a_fit.xml").shapes()[0].bsdf()
+    assert np.ravel(surface.albedo) == pytest.approx(TRUE["albedo"], abs=0.015)
+    assert float(mi.traverse(surface)["boundary.alpha.value"][0]) == pytest.approx(0.3)
+
+
+@pytest.mark.slow
 def test_a_killed_fit_goes_on_with_the_same_bits_and_the_command_writes_a_scene(tmp_path: Path) -> None:
     scene = _scene(tmp_path)
     image = _target(scene, 64)
@@ -132,7 +183,7 @@ def test_a_killed_fit_goes_on_with_the_same_bits_and_the_command_writes_a_scene(
     assert medium.albedo == pytest.approx(numbers[0]["values"]["albedo"])
     assert "[[material]]" in (tmp_path / "rest" / "a_fit.toml").read_text()
     pages = [(tmp_path / each / "a_fit.html").read_text() for each in ("whole", "rest")]
-    assert pages[0] == pages[1] and '"found"' in pages[0] and '"given"' in pages[0]
+    assert pages[0] == pages[1] and "albedo: " in pages[0] and '"found"' in pages[0] and '"given"' in pages[0]
 
 
 @pytest.mark.slow

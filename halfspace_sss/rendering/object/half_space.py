@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -187,6 +188,12 @@ class Variation:
                 raise ValueError("g must not have gradients enabled under models of objects with textures, got them")
             if wanted and name not in self._stencils:
                 self._stencils[name] = [self._stencil(name, m) for m in self.inside.channels()]
+
+    def check(self, names: Iterable[str]) -> None:
+        """ValueError if the model knows no medium beside its own in one of the parameters."""
+        for name in names:
+            for m in self.inside.channels():
+                self._stencil(name, m)
 
     def _stencil(self, name: str, m: Medium) -> Stencil:
         value = float(getattr(m, name))
