@@ -1,4 +1,4 @@
-"""The command `study speeds`: models over Mitsuba's volume path tracer in ordinary light."""
+"""The commands `study speeds`, of models in ordinary light, and `study means`, of control variates."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from halfspace_sss.checks import check_choice, check_count, check_interval
 from halfspace_sss.cli.shared import Bar, OutFolder, console, use_mitsuba, whole
 from halfspace_sss.provenance import check_folder, write_together
 
-__all__ = ["speeds_command"]
+__all__ = ["means_command", "speeds_command"]
 
 SPEED_OBJECTS = ("bunny of potato", "bunny of marble", "dragon of potato", "candle", "mandarin")
 
@@ -20,35 +20,100 @@ SPEED_OBJECTS = ("bunny of potato", "bunny of marble", "dragon of potato", "cand
 def speeds_command(
     objects: Annotated[
         list[str] | None,
-        typer.Option("--object", help="SCAN of MATERIAL, candle or mandarin; repeat for more.", show_default="five"),
+        typer.Option(
+            "--object",
+            help="bunny, dragon, hand or ribbon of MATERIAL, candle, mandarin, meat or croissant.",
+            show_default="five",
+        ),
     ] = None,
     model: Annotated[
         list[str] | None,
-        typer.Option(help="full_geometry, neural or better_dipole; repeat for more.", show_default="all three"),
+        typer.Option(
+            help="full_geometry, neural_shape, neural or better_dipole; repeat for more.", show_default="all four"
+        ),
     ] = None,
+    light: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="windows, lamp and sky, even sky, or small light (of scans); repeat for more.",
+            show_default="the first two",
+        ),
+    ] = None,
+    kind: Annotated[
+        list[str] | None,
+        typer.Option(help="sampled, corrected or gathered; repeat for more.", show_default="all three"),
+    ] = None,
+    over: Annotated[str, typer.Option(help="What counts as one: volpathmis or translucent_walk.")] = "volpathmis",
+    passes: Annotated[int, typer.Option(help="Passes of 16 samples a pixel.", parser=whole)] = 6,
+    frames: Annotated[bool, typer.Option(help="Time the next frames of gathered light too.")] = True,
     size: Annotated[int, typer.Option(help="Pixels of the square images.", parser=whole)] = 96,
     seconds: Annotated[float, typer.Option(help="CPU time of each training of full_geometry.")] = 24.0,
     seed: Annotated[int, typer.Option(help="Seed of all renders.", parser=whole)] = 0,
     out: OutFolder = Path("speeds"),
 ) -> None:
-    """Measure the speed of models over volpathmis: windows, lamp and sky; sampled, corrected and gathered."""
-    chosen, models = tuple(objects or SPEED_OBJECTS), tuple(model or ("full_geometry", "neural", "better_dipole"))
-    scans = [f"{scan} of" for scan in ("bunny", "dragon")]
-    for name in chosen:
-        if name not in ("candle", "mandarin") and not name.startswith(tuple(scans)):
-            raise ValueError(f"object must be candle, mandarin or one of {', '.join(scans)} MATERIAL, got {name!r}")
+    """Measure the speed of models over volpathmis or walks: sampled, corrected and gathered."""
+    use_mitsuba("llvm_ad_rgb")
+    from figures.beyond.speeds import KINDS, LIGHTS, MODELS, OTHER_LIGHTS, OVER, LitObject, Measuring, speeds, tables
+
+    names, models, lights = tuple(objects or SPEED_OBJECTS), tuple(model or MODELS), tuple(light or LIGHTS)
+    kinds = tuple(kind or KINDS)
     for name in models:
-        check_choice("model", name, ("full_geometry", "neural", "better_dipole"))
+        check_choice("model", name, MODELS)
+    for name in lights:
+        check_choice("light", name, (*LIGHTS, *OTHER_LIGHTS))
+    for name in kinds:
+        check_choice("kind", name, KINDS)
+    check_choice("over", over, OVER)
     check_count("size", size, 16)
+    check_count("passes", passes, 3)
     check_count("seed", seed, 0)
     check_interval("seconds", seconds, 0.1, 1e6)
+    cases = [LitObject(name, each) for name in names for each in lights]
     check_folder(out)
-    use_mitsuba("llvm_ad_rgb")
-    from figures.beyond.speeds import speeds, tables
-
+    how = Measuring(models, kinds, size, passes, over, frames, seconds, seed)
     with Bar("speeds") as bar:
-        table = speeds(list(chosen), models, size, seconds, out / "work", seed, lambda what, k, n: bar.show(k, n, what))
+        table = speeds(cases, how, out / "work", lambda what, k, n: bar.show(k, n, what))
     text = "\n".join(markdown(part) for part in tables(table))
     csv = table.to_csv(index=False, lineterminator="\n")
     write_together({out / "speeds.csv": csv, out / "speeds.md": text})
+    console().print(text, highlight=False, markup=False, soft_wrap=True)
+
+
+def means_command(
+    object: Annotated[str, typer.Option(help="As of `study speeds`.")] = "bunny of potato",
+    light: Annotated[str, typer.Option(help="windows, lamp and sky, even sky, or small light (of scans).")] = "windows",
+    model: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="full_geometry, neural_shape, neural or better_dipole; repeat for more.", show_default="all four"
+        ),
+    ] = None,
+    samples: Annotated[
+        int, typer.Option(help="Of all pixels, with and without together, of each model.", parser=whole)
+    ] = 10**7,
+    size: Annotated[int, typer.Option(help="Pixels of the square images.", parser=whole)] = 32,
+    seconds: Annotated[float, typer.Option(help="CPU time of the training of full_geometry.")] = 12.0,
+    seed: Annotated[int, typer.Option(help="Seed of all renders.", parser=whole)] = 0,
+    out: OutFolder = Path("means"),
+) -> None:
+    """Test by z-values that gathered light as control variate leaves the means of models as they are."""
+    use_mitsuba("llvm_ad_rgb")
+    from figures.beyond.means import Testing, means
+    from figures.beyond.speeds import LIGHTS, MODELS, OTHER_LIGHTS, LitObject
+
+    models = tuple(model or MODELS)
+    for name in models:
+        check_choice("model", name, MODELS)
+    check_choice("light", light, (*LIGHTS, *OTHER_LIGHTS))
+    case = LitObject(object, light)
+    check_count("size", size, 4)
+    check_count("samples", samples, 1)
+    check_count("seed", seed, 0)
+    check_interval("seconds", seconds, 0.1, 1e6)
+    check_folder(out)
+    how = Testing(models, samples, size, seconds=seconds, seed=seed)
+    with Bar("means") as bar:
+        table = means(case, how, out / "work", lambda what, k, n: bar.show(k, n, what))
+    text = markdown(table)
+    write_together({out / "means.csv": table.to_csv(index=False, lineterminator="\n"), out / "means.md": text})
     console().print(text, highlight=False, markup=False, soft_wrap=True)

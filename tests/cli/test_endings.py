@@ -28,6 +28,7 @@ SMALL = {  # a small run of each command, and what it refuses
     "render": (["ball.xml", "--spp", "4", "--out", "o"], ["none.xml"]),
     "study ablation": (["--samples", "2000", "--seeds", "1", "--out", "o"], ["marbel"]),
     "study inversion": (["--size", "8", "--out", "o"], ["--size", "0"]),
+    "study means": (["--out", "o"], ["--object", "marbel"]),
     "study rivals": (["--scene", "ball.xml", "--out", "o"], ["--scene", "none.xml"]),
     "study shapes": (["--objects", "1", "--out", "o/shapes.md"], ["--objects", "-1"]),
     "study speeds": (["--object", "candle", "--out", "o"], ["--object", "marbel"]),
@@ -110,6 +111,7 @@ NO_FILES = ("materials", "models")
 LONG = (
     "fit",
     "study inversion",
+    "study means",
     "study rivals",
     "study shapes",
     "study speeds",

@@ -1,4 +1,4 @@
-"""The noise that `study speeds` compares: light that few samples meet counts by its variance."""
+"""What `study speeds` compares, and the z-values of `study means`."""
 
 from __future__ import annotations
 
@@ -7,8 +7,11 @@ import pytest
 
 pytest.importorskip("mitsuba")
 
-from figures.beyond.speeds import PASSES, _noise  # noqa: E402
+from figures.beyond.means import _compared  # noqa: E402
+from figures.beyond.speeds import PASSES, LitObject, Measuring, _noise, ways_of  # noqa: E402
 from figures.computing.timed import TimedRender  # noqa: E402
+from figures.modelling.shapes import SHAPES  # noqa: E402
+from full_geometry.learning.meshes import surface  # noqa: E402
 
 
 def test_noise_holds_light_that_most_pixels_have_not_met() -> None:
@@ -19,3 +22,57 @@ def test_noise_holds_light_that_most_pixels_have_not_met() -> None:
     variance, error = _noise(timed, np.ones((size, size), dtype=bool))
     assert variance == pytest.approx(1 / chance - 1, rel=0.1)
     assert 0 < error < 0.1
+
+
+def test_an_object_smaller_than_a_block_is_refused() -> None:
+    timed = TimedRender(np.ones((PASSES, 16, 16, 3), np.float32), PASSES * 16, (1.0,) * PASSES, (1.0,) * PASSES)
+    covered = np.zeros((16, 16), dtype=bool)
+    covered[4, 4] = True
+    with pytest.raises(ValueError, match="size must be larger"):
+        _noise(timed, covered)
+
+
+@pytest.mark.parametrize(
+    ("thing", "light", "said"),
+    [
+        ("teapot of potato", "windows", "object must be one of"),
+        ("candle of potato", "windows", "object must be one of"),
+        ("hand of marbel", "windows", "material"),
+        ("hand of potato", "small light", "object must be a scan"),
+    ],
+)
+def test_an_object_that_there_is_not_is_refused(thing: str, light: str, said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        LitObject(thing, light)
+
+
+def test_an_object_whose_medium_varies_has_no_ways_that_refuse_it() -> None:
+    ways = ways_of(LitObject("mandarin", "windows"), Measuring())
+    assert not [way for way in ways if "neural_shape" in way or "gathered" in way or "corrected" in way]
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_a_shape_is_closed_and_in_one_piece(shape: str) -> None:
+    mesh = surface(*SHAPES[shape](), 48)
+    edges = np.sort(mesh.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    assert (np.unique(edges, axis=0, return_counts=True)[1] == 2).all()
+    label = np.arange(len(mesh.vertices))
+    for _ in range(len(label)):
+        least = np.minimum(label[edges[:, 0]], label[edges[:, 1]])
+        after = label.copy()
+        np.minimum.at(after, edges.ravel(), np.repeat(least, 2))
+        if (after == label).all():
+            break
+        label = after
+    assert (label[np.unique(edges)] == label[edges[0, 0]]).all()
+
+
+@pytest.mark.parametrize(("bias", "least", "most"), [(0.0, 0.0, 4.0), (0.01, 8.0, 30.0)])
+def test_z_is_of_the_noise_of_images_and_shows_a_bias(bias: float, least: float, most: float) -> None:
+    rng = np.random.default_rng(3)
+    shared = rng.normal(0, 0.002, (40, 2, 1, 3))  # of light gathered for an image
+    images = 1 + shared + rng.normal(0, 0.02, (40, 2, 100, 3))
+    images[:, 1] += bias
+    found = _compared(images)
+    assert all(least <= abs(found[f"z {c}"]) < most for c in range(3))
+    assert all(found[f"ratio {c}"] == pytest.approx(1 + bias, abs=5 * found[f"± {c}"]) for c in range(3))
