@@ -107,19 +107,22 @@ def test_models_of_one_texel_are_those_of_its_medium(model: str) -> None:
 
 @pytest.mark.parametrize("model", TAKING)
 def test_models_between_nodes_are_those_of_the_medium(model: str) -> None:
-    """With other texels beside, to 0.5 %, networks with their fewer nodes to 1.5 %: ln S is nearly linear in v."""
+    """With other texels beside, to 0.5 %, by reduced networks to 2.5 %: ln S is nearly linear in v."""
     medium = {**PLAIN, "albedo": "0.96,0.83,0.65"}
     beside = {**PLAIN, "albedo": "0.3,0.99,0.999", "sigma_t": "3,2,1"}
     (plain, painted) = _transports(model, medium, _painted(medium, beside))
     a, b = _S(plain), _S(painted)
     upper = np.random.default_rng(1).normal(size=(3, 512))[1] > 0.5  # both ends are in the first texel
-    assert np.abs(a - b)[upper].sum() < (0.015 if model == "neural" else 0.005) * a[upper].sum() or model == "lambert"
+    assert np.abs(a - b)[upper].sum() < (0.025 if model == "neural" else 0.005) * a[upper].sum() or model == "lambert"
     assert np.abs(a - b).sum() > 0.05 * a.sum()
 
 
-def test_S_is_the_geometric_mean_of_both_ends() -> None:
-    """And so reciprocal."""
-    first, second, painted = _transports("better_dipole", PLAIN, OTHER, _painted(PLAIN, OTHER))
+@pytest.mark.parametrize(
+    ("model", "error"), [("better_dipole", 5e-3), pytest.param("neural", 0.1, marks=pytest.mark.slow)]
+)
+def test_S_is_the_geometric_mean_of_both_ends(model: str, error: float) -> None:
+    """And so reciprocal; by reduced networks single values to 10 %, their sum to 2 %."""
+    first, second, painted = _transports(model, PLAIN, OTHER, _painted(PLAIN, OTHER))
     a, b, c = (_S(obj) for obj in (first, second, painted))
     rng = np.random.default_rng(1)
     p = rng.normal(size=(3, 512))
@@ -127,7 +130,8 @@ def test_S_is_the_geometric_mean_of_both_ends() -> None:
     across = p[1] * q[1] < 0
     assert 10 < across.sum() < 200
     wanted = np.where(across[:, None], np.sqrt(a * b), np.where((p[1] > 0)[:, None], a, b))
-    np.testing.assert_allclose(c, wanted, rtol=5e-3, atol=1e-5 * wanted.max())
+    np.testing.assert_allclose(c, wanted, rtol=error, atol=1e-5 * wanted.max())
+    np.testing.assert_allclose(c[across].sum(axis=0), wanted[across].sum(axis=0), rtol=min(error, 0.02))
 
 
 def test_a_model_of_a_constant_texture_renders_as_of_a_constant() -> None:
@@ -284,11 +288,12 @@ def test_textures_without_a_place_on_a_mesh_are_refused(texture: str | None, col
         _on_mesh({**PLAIN, "albedo": albedo}, color)
 
 
-def test_uv_at_a_point_of_a_face_is_that_of_a_ray_there() -> None:
+@pytest.mark.parametrize("shape", ["cube", "sphere"])
+def test_uv_at_a_point_of_a_face_is_that_of_a_ray_there(shape: str) -> None:
     texels = np.random.default_rng(2).uniform(0.1, 0.9, (8, 8, 3))
     surface = {**PLAIN, "albedo": _bitmap(texels, filter_type="bilinear")}
-    cube = {"type": "cube", "to_world": mi.ScalarTransform4f().scale(5).rotate([1, 1, 0], 30)}
-    obj = make_objects(mi.load_dict(_scene({**surface, "model": "lambert"}, shape=cube)), Settings())[0]
+    form = {"type": shape, "to_world": mi.ScalarTransform4f().scale(5).rotate([1, 1, 0], 30)}
+    obj = make_objects(mi.load_dict(_scene({**surface, "model": "lambert"}, shape=form)), Settings())[0]
     o = np.random.default_rng(3).normal(size=(3, 64))
     o /= np.linalg.norm(o, axis=0)
     si = obj.geometry.scene.ray_intersect(mi.Ray3f(mi.Point3f(20 * o), mi.Vector3f(-o)))

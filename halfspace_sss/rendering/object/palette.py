@@ -10,19 +10,22 @@ medium where both are the same. Between nodes ln(S / albedo^p) is linear, p = 1 
 are even in v, the square root of x of `physics.reflectance`, for albedos near 1. Those of analytic models cover all
 albedos, so that kernels serve textures that change.
 
+Networks cost more than all else, and each node would be one. So `neural` has the backbone of the albedo itself, and two
+networks for all nodes (`neural.reduced`), asked once for both ends where extinction or the whole medium is the same.
+
 Derivatives by the medium of each end, with ln S_o and ln S_i as they are interpolated:
 
     dS = S/2 Σ_ends (d ln S / dv dv + p d ln albedo + d ln S / d ln sigma_t d ln sigma_t).
 
 Measured between nodes against models of the medium itself, sums of S over random pairs of points: 0.3 % at most for
-analytic models, 1.2 % for `neural` with texels of albedo 0.3 to 0.999.
+analytic models, 0.7 % for `neural` with texels of albedo 0.3 to 0.999.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -31,7 +34,11 @@ import mitsuba as mi
 import numpy as np
 
 from halfspace_sss import measure
-from halfspace_sss.interface.model import BSSRDF, bssrdf
+from halfspace_sss.arrays import broadcast_query
+from halfspace_sss.interface.model import BSSRDF, Query, bssrdf
+from halfspace_sss.neural.reduced import MODES, ReducedNetworks, shape_over_power
+from halfspace_sss.neural.universal import Neural
+from halfspace_sss.physics.fresnel import F_t
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.object.half_space import HalfSpaceProposals, area_share
 from halfspace_sss.rendering.object.points import (
@@ -49,12 +56,12 @@ from halfspace_sss.rendering.object.spectral import MediumByWavelength
 from halfspace_sss.rendering.object.textured import SurfaceMedium, TexturedMedium, bend, x_of_albedo
 
 NODES = 32  # over all albedos
-OF_NETWORKS = 9  # nodes, whatever the albedos: each is a part of the kernel
 LEAST = 1e-4  # albedo that stands for less at nodes
 MOST = 1 - 1e-6  # above which S has no derivative by it, as dv is infinite
 SLOPED = ("albedo", "sigma_t")
 STEP = 0.01  # of ln sigma_t, for its slope
 SEEN = 0.7  # cosine at which reflectances of nodes are known
+SAME = 1e-4  # of ln sigma_t, and of the way from node to node: media that differ less are asked once
 FAINT = 1e-35  # of S, below which it is interpolated itself
 Varied = TexturedMedium | MediumByWavelength
 LEVELS = (0.0, 0.5, 1.0)  # quantiles of albedo and extinction in the radial density of entries
@@ -86,12 +93,14 @@ class Palette:
         rows: of each channel.
         g: mean cosine of each channel.
         alike: whether extinction is the same everywhere.
+        networks: of the nodes of rows, by the number of their first, where the model is `neural`.
     """
 
     models: list[BSSRDF]
     rows: list[NodeRange]
     g: list[float]
     alike: bool
+    networks: dict[int, ReducedNetworks]
 
     @classmethod
     def of(cls, name: str, albedos: np.ndarray, media: Sequence[Medium], alike: bool = False) -> Palette:
@@ -108,25 +117,28 @@ class Palette:
         """
         refusal = ""  # raised outside of the handler: messages of Mitsuba's functions are those of first causes
         try:
-            network = bool(bssrdf(name, Medium.from_albedo(0.5, 1.0, media[0].g, media[0].eta)).checksums)
+            learnt = isinstance(bssrdf(name, Medium.from_albedo(0.5, 1.0, media[0].g, media[0].eta)), Neural)
         except ValueError as error:
             refusal = str(error)
         if refusal:
             raise ValueError(f"model {name!r} must be one of any medium for media by textures: {refusal}")
         models: list[BSSRDF] = []
         rows: list[NodeRange] = []
+        networks: dict[int, ReducedNetworks] = {}
         for c, m in enumerate(media):
-            alike = [k for k, other in enumerate(media) if other.g == m.g]
-            if alike[0] < c:  # they share nodes
-                rows.append(rows[alike[0]])
+            sharing = [k for k, other in enumerate(media) if other.g == m.g]  # nodes
+            if sharing[0] < c:
+                rows.append(rows[sharing[0]])
                 continue
-            ends = np.clip([albedos[:, alike].max(), albedos[:, alike].min()], LEAST, 1.0) if network else (1.0, LEAST)
+            covered = albedos[:, sharing]
+            ends = np.clip([covered.max(), covered.min()], LEAST, 1.0) if learnt else (1.0, LEAST)
             low, high = (math.sqrt(x_of_albedo(np, a, m.g, bend(m.g))) for a in ends)
-            cells = OF_NETWORKS - 1 if network else NODES
-            nodes = _albedo_of_v(np.linspace(low, high, cells + 1), m.g) if high > low else np.full(cells + 1, ends[0])
-            rows.append(NodeRange(len(models), cells, low, (high - low) / cells))
+            nodes = _albedo_of_v(np.linspace(low, high, NODES + 1), m.g) if high > low else np.full(NODES + 1, ends[0])
+            rows.append(NodeRange(len(models), NODES, low, (high - low) / NODES))
             models += [bssrdf(name, Medium.from_albedo(float(a), 1.0, m.g, m.eta)) for a in nodes]
-        return cls(models, rows, [m.g for m in media], alike)
+            if learnt:
+                networks[rows[-1].first] = ReducedNetworks.of(models[rows[-1].first :])
+        return cls(models, rows, [m.g for m in media], alike, networks)
 
     @property
     def power(self) -> int:
@@ -138,7 +150,7 @@ class Palette:
 
         With derivatives by the media where they are followed; not by networks.
         """
-        if self.models[0].checksums:
+        if self.networks:
             with dr.suspend_grad():
                 return self._of_networks(ends, query, active)
         by_albedo, by_sigma_t = (any(dr.grad_enabled(getattr(end, key)) for end in ends) for key in SLOPED)
@@ -240,46 +252,68 @@ class Palette:
         return model.eval(*query) * opaque(float(model.medium.albedo) ** -self.power)
 
     def _of_networks(self, ends: Sequence[SurfaceMedium], query: tuple[mi.Float, ...], active: mi.Bool) -> mi.Spectrum:
-        """S by networks, in a loop over channels and, where extinctions differ, over ends.
+        """S by networks, in a loop over channels and, where extinction varies, over ends.
 
-        Of ends of the same extinction the query is the same, so that nodes of both are asked once.
+        Of ends of the same extinction the query is the same, so that networks are asked once.
         """
-        n, tables = len(self.rows), self._tables()
-        groups = [ends] if self.alike else [[end] for end in ends]
+        n, tables, passes = len(self.rows), self._tables(), 1 if self.alike else len(ends)
+        lib, args = broadcast_query(*query)
+        across = Query(lib, *args, opaque(float(self.models[0].medium.eta)))
+        transmitted = F_t(across.mu_i, across.index) * F_t(across.mu_o, across.index)
 
         def step(k: mi.UInt32, result: mi.Spectrum) -> tuple[mi.UInt32, mi.Spectrum]:
-            c, first = k % n, k < n
-            numbers, places, total = [dr.gather(mi.Float, table, c) for table in tables], [], mi.Float(0)
-            for pair in zip(groups[0], groups[-1]):
-                albedo, sigma_t = (dr.select(first, *(_pick(getattr(end, key), c) for end in pair)) for key in SLOPED)
-                albedo = dr.clip(albedo, 0, 1)
-                places.append(_node(albedo, numbers))
-                total += 2 * dr.log(sigma_t) + self.power * dr.log(dr.maximum(albedo, FAINT))
-            total += self._between_networks(places, (query[0] * sigma_t, *query[1:]), active)
-            root = dr.exp(total / len(ends))
+            c, first, needed, root = k % n, k < n, active, mi.Float(1)
+            numbers = [dr.gather(mi.Float, table, c) for table in tables]
+            media = [[_pick(getattr(end, key), c) for key in SLOPED] for end in ends]
+            if passes > 1:
+                needed = active & (first | _differ(*media, numbers))
+                media, root = [[dr.select(first, a, b) for a, b in zip(*media)]], _pick(result, c)
+
+            def ask(root: mi.Float) -> tuple[mi.Float]:
+                q, root = replace(across, r=across.r * media[0][1]), mi.Float(1)
+                phi = self._functions(q, mi.UInt32(numbers[0]))
+                for albedo, sigma_t in media:
+                    log_factor = self._log_factor(phi, albedo, numbers)
+                    S = dr.square(albedo * sigma_t) * transmitted * shape_over_power(q, albedo, numbers[4], log_factor)
+                    root *= S if len(ends) == 1 else dr.sqrt(S)
+                return (root,)
+
+            (root,) = dr.if_stmt((root,), needed, ask, lambda root: (root,), label="networks")
             return k + 1, mi.Spectrum([dr.select(c == j, value * root, value) for j, value in enumerate(result)])
 
-        lanes = dr.width(query[0])
-        start = mi.UInt32(0) + dr.zeros(mi.UInt32, lanes), dr.full(mi.Spectrum, 1, lanes)
-        return dr.while_loop(start, lambda k, _: active & (k < len(groups) * n), step, label="ends and channels")[1]
+        start = mi.UInt32(0) + dr.zeros(mi.UInt32, dr.width(query[0])), dr.full(mi.Spectrum, 1, dr.width(query[0]))
+        return dr.while_loop(start, lambda k, _: active & (k < passes * n), step, label="ends and channels")[1]
 
-    def _between_networks(
-        self, places: list[tuple[mi.UInt32, mi.Float]], query: tuple[mi.Float, ...], active: mi.Bool
-    ) -> mi.Float:
-        """Sum over places, a node and the share of the way to the next, of ln(S / albedo^p) for sigma_t = 1.
+    def _functions(self, q: Query, first: mi.UInt32) -> list[mi.Float]:
+        """phi of the networks of the row that begins with a node."""
+        if len(self.networks) == 1:
+            return next(iter(self.networks.values())).functions(q)
+        values = tuple(dr.zeros(mi.Float, dr.width(q.r)) for _ in range(MODES + 1))
+        for number, networks in self.networks.items():
 
-        Node after node, where a neighbouring lane needs it: weights that differ by lane are slow.
-        """
-        total = mi.Float(0)
-        for j, model in enumerate(self.models):
-            weight = sum(dr.select(k == j, 1 - f, dr.select(k + 1 == j, f, 0)) for k, f in places)
+            def ask(*values: mi.Float, of: ReducedNetworks = networks) -> tuple:
+                return tuple(of.functions(q))
 
-            def add(total: mi.Float, weight: mi.Float, query: tuple, model: BSSRDF = model) -> tuple:
-                return total + weight * dr.log(dr.maximum(self._over_power(model, query), FAINT)), weight, query
+            values = dr.if_stmt(values, first == number, ask, lambda *values: values, label="networks of a row")
+        return list(values)
 
-            needed = active & (weight > 0)
-            total, *_ = dr.if_stmt((total, weight, query), needed, add, lambda *state: state, label="node")
-        return total
+    def _log_factor(self, phi: list[mi.Float], albedo: mi.Float, numbers: list[mi.Float]) -> mi.Float:
+        node, f = _node(dr.clip(albedo, 0, 1), numbers)
+        low, high = (dr.gather(mi.Vector4f, self._coefficients, node + j) for j in (0, 1))
+        return phi[0] + sum(c * value for c, value in zip(dr.lerp(low, high, f), phi[1:]))
+
+    @cached_property
+    def _coefficients(self) -> mi.Float:
+        """Of `MODES` functions of all nodes."""
+        rows = np.concatenate([networks.coefficients for networks in self.networks.values()])
+        return mi.Float(rows.astype(np.float32).ravel())
+
+
+def _differ(exit: list[mi.Float], entry: list[mi.Float], numbers: list[mi.Float]) -> mi.Bool:
+    """Whether albedo or sigma_t, of the ends of a way, differ by so much that S does."""
+    (node, f), (other, h) = (_node(dr.clip(albedo, 0, 1), numbers) for albedo, _ in (exit, entry))
+    apart = abs(mi.Float(node) - mi.Float(other) + f - h)
+    return (apart > SAME) | (abs(dr.log(exit[1] / entry[1])) > SAME)
 
 
 def _node(albedo: mi.Float, numbers: Sequence[mi.Float]) -> tuple[mi.UInt32, mi.Float]:

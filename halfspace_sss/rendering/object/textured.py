@@ -266,6 +266,12 @@ def _interaction(
     if face is None or not obj.shape.is_mesh():
         off = opaque(max(10 * obj.rounding, 1e-5 * obj.size))
         ray = mi.Ray3f(mi.Point3f(p + n * off), mi.Vector3f(-n))
+        if obj.shape.class_name() == "Sphere":  # which knows its uv without a search
+            met = dr.zeros(mi.PreliminaryIntersection3f, dr.width(p))
+            met.t, met.shape = off, mi.ShapePtr(obj.shape)
+            si = obj.shape.compute_surface_interaction(ray, met, mi.RayFlags.Minimal | mi.RayFlags.UV, active)
+            si.shape = mi.ShapePtr(obj.shape)
+            return si
         return obj.scene.ray_intersect(ray, mi.RayFlags.Minimal | mi.RayFlags.UV, False, active)
     si = dr.zeros(mi.SurfaceInteraction3f, dr.width(p))
     si.p, si.n, si.prim_index, si.shape = mi.Point3f(p), mi.Normal3f(n), mi.UInt32(face), mi.ShapePtr(obj.shape)
