@@ -117,7 +117,7 @@ class MediumDescent:
         self.slopes = {int(key.split()[1]): J for key, J in arrays.items() if key.startswith("slopes ")}
         for name, x in self.x.items():
             numbers = arrays[f"x {name}"].tolist()
-            self.x[name] = type(x)(numbers if len(numbers) > 1 else numbers[0])
+            self.x[name] = self.parameters.clipped(name, type(x)(numbers if len(numbers) > 1 else numbers[0]))
 
     # ---- steps
 

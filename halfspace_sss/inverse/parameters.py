@@ -135,8 +135,10 @@ class FitParameters:
         return (low, high) if name == "sigma_t" else (-high, -low)
 
     def clipped(self, name: str, x: mi.Float | mi.Spectrum) -> mi.Float | mi.Spectrum:
-        """A variable within its bounds."""
-        return type(x)(dr.clip(x, *self.bounds(name)))
+        """A variable within its bounds, as data of kernels: literals would be code, compiled anew in each step."""
+        clipped = type(x)(dr.clip(x, *self.bounds(name)))
+        dr.make_opaque(clipped)
+        return clipped
 
     def values(self, x: dict[str, mi.Float | mi.Spectrum]) -> dict[str, mi.Spectrum]:
         """Coefficients of the surface, with the gradients of the variables."""

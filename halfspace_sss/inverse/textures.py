@@ -290,6 +290,7 @@ class TextureDescent:
         for v in self.parameters.variables:
             numbers = values[v.name].detach().numpy().astype(np.float32)
             value = v.kind(numbers) if numbers.ndim == 3 else v.kind(numbers.ravel().tolist())
+            dr.make_opaque(value)  # as literals they would be code, and each step would compile anew
             dr.enable_grad(value)
             self.scene_parameters[v.key] = value
         self.scene_parameters.update()

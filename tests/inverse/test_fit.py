@@ -11,6 +11,8 @@ import pytest
 from typer.testing import CliRunner
 
 mi = pytest.importorskip("mitsuba")
+import drjit as dr  # noqa: E402
+
 from halfspace_sss import inverse  # noqa: E402
 from halfspace_sss.cli import app as cli  # noqa: E402
 from halfspace_sss.inverse.views import GivenView, read_views  # noqa: E402
@@ -156,6 +158,21 @@ def test_the_albedo_below_a_rough_boundary_is_found_and_the_boundary_kept(tmp_pa
     surface = open_scene(tmp_path / "a_fit.xml").shapes()[0].bsdf()
     assert np.ravel(surface.albedo) == pytest.approx(TRUE["albedo"], abs=0.015)
     assert float(mi.traverse(surface)["boundary.alpha.value"][0]) == pytest.approx(0.3)
+
+
+@pytest.mark.parametrize("model", ["translucent_walk", pytest.param("better_dipole", marks=pytest.mark.slow)])
+def test_all_steps_of_a_fit_run_the_same_kernels(tmp_path: Path, model: str) -> None:
+    """What is code in one step and another code in the next is compiled each time."""
+    (tmp_path / "a.xml").write_text(XML.replace('name="eta" value="1"', 'name="eta" value="1.3"'))
+    kernels, view = [], GivenView.of("a", 0, np.full((8, 8, 3), 0.4, np.float32))
+
+    def keep(*_: Any) -> None:
+        kernels.append({kernel["hash"] for kernel in dr.kernel_history() if "hash" in kernel})
+
+    settings = inverse.FitSettings(steps=3, spp=4)
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        inverse.fit(tmp_path / "a.xml", [view], ("albedo", "sigma_t"), model, settings=settings, progress=keep)
+    assert kernels[2] and kernels[2] <= kernels[1]
 
 
 @pytest.mark.slow

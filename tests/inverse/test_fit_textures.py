@@ -11,6 +11,8 @@ import pytest
 from typer.testing import CliRunner
 
 mi = pytest.importorskip("mitsuba")
+import drjit as dr  # noqa: E402
+
 from halfspace_sss import inverse  # noqa: E402
 from halfspace_sss.cli import app as cli  # noqa: E402
 from halfspace_sss.inverse.views import GivenView, read_views  # noqa: E402
@@ -75,6 +77,19 @@ def test_a_checkerboard_is_found_from_its_image(tmp_path: Path) -> None:
     assert np.sqrt(np.square(error).mean()) < 0.03
     assert np.abs(error).max() < 0.1
     assert not found.told
+
+
+def test_all_steps_of_a_fit_of_textures_run_the_same_kernels(tmp_path: Path) -> None:
+    path, kernels = _bitmap(tmp_path, np.full((4, 4, 3), 0.8)), []
+    view = GivenView.of("a", 0, np.full((12, 12, 3), 0.5, np.float32))
+
+    def keep(*_: Any) -> None:
+        kernels.append({kernel["hash"] for kernel in dr.kernel_history() if "hash" in kernel})
+
+    settings = inverse.FitSettings(steps=3, spp=4, levels=1)
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        inverse.fit(path, [view], ("albedo", "sigma_t"), settings=settings, progress=keep)
+    assert kernels[2] and kernels[2] <= kernels[1]
 
 
 def test_textures_that_cannot_be_fitted_are_refused_by_name(tmp_path: Path) -> None:
