@@ -11,8 +11,8 @@ from figures.beyond.objects import VIEWS, View, foot, scene
 from figures.computing.contenders import OF_OBJECTS
 from figures.computing.images import Shot, compared, cover, stops_of
 from figures.computing.learnt import (
+    CHUNKS,
     FULL_GEOMETRY,
-    TRAIN_SECONDS,
     object_parts,
     train_modelled,
     training_of,
@@ -46,7 +46,7 @@ def parts(quality: str) -> list[Part]:
     """For each object its training, then its image by walks and by the models."""
     size, results = SIZES[quality], []
     for name in OBJECTS:
-        results.append(train_modelled(name, RESOLUTION[quality], TRAIN_SECONDS[quality]))
+        results.append(train_modelled(name, RESOLUTION[quality], CHUNKS[quality]))
         for model in (TRUTH, *MODELS):
             spp = SPP[quality].get(model, SPP[quality]["model"])
             params = {"object": name, "model": model, "size": size, "spp": spp, "resolution": RESOLUTION[quality]}

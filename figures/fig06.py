@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from figures.computing.images import Shot, compared, stops_of
-from figures.computing.learnt import FULL_GEOMETRY, TRAIN_SECONDS, train_scan, training_of, with_weights
+from figures.computing.learnt import CHUNKS, FULL_GEOMETRY, train_scan, training_of, with_weights
 from figures.computing.scenes import BUNNY, ENVIRONMENTS, bunny_scene, environment, environment_file, prepare
 from figures.drawing.image_grid import image_grid
 from figures.drawing.page import page
@@ -35,7 +35,7 @@ NOTES = (
 
 def parts(quality: str) -> list[Part]:
     """The training, then each light and each view by walks and by the model."""
-    size, results = SIZES[quality], [train_scan(MATERIAL, MATERIAL, TRAIN_SECONDS[quality])]
+    size, results = SIZES[quality], [train_scan(MATERIAL, MATERIAL, CHUNKS[quality])]
     for light, view in _cases():
         files = (environment_file(light),) if light in ENVIRONMENTS else ()
         for model, spp in SPP[quality].items():

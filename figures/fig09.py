@@ -11,7 +11,7 @@ import numpy as np
 
 from figures.computing import contenders
 from figures.computing.images import FLIP, Shot, compared, noise_of, stops_of
-from figures.computing.learnt import FULL_GEOMETRY, TRAIN_SECONDS, train_scan, training_of, weight_files, with_weights
+from figures.computing.learnt import CHUNKS, FULL_GEOMETRY, train_scan, training_of, weight_files, with_weights
 from figures.computing.scenes import BUNNY, MATERIALS, bunny_scene, long_render, prepare
 from figures.drawing.error_tables import label
 from figures.drawing.image_files import image_files
@@ -46,7 +46,7 @@ def parts(quality: str) -> list[Part]:
         spp = MODEL_SPP[quality]
         for model in MODELS:
             learnt = model == FULL_GEOMETRY
-            results += [train_scan(material, material, TRAIN_SECONDS[quality])] if learnt else []
+            results += [train_scan(material, material, CHUNKS[quality])] if learnt else []
             params = {**common, "spp": spp, "model": model}
             inputs = (BUNNY, *weight_files(model, materials.load(material).medium))
             needs = (training_of(material),) if learnt else ()

@@ -20,7 +20,7 @@ from figures.computing.images import (
     noise_of,
     stops_of,
 )
-from figures.computing.learnt import FULL_GEOMETRY, TRAIN_SECONDS, train_scan, training_of, weight_files, with_weights
+from figures.computing.learnt import CHUNKS, FULL_GEOMETRY, train_scan, training_of, weight_files, with_weights
 from figures.computing.scenes import BUNNY, prepare
 from figures.computing.timed import TimedRender, alternating, pass_size
 from figures.drawing.error_tables import label
@@ -58,7 +58,7 @@ def parts(quality: str) -> list[Part]:
         )
         params = {**common, "seconds": SECONDS[quality], "methods": list(METHODS), "seed": 1}
         learnt = FULL_GEOMETRY in METHODS
-        results += [train_scan(material, material, TRAIN_SECONDS[quality])] if learnt else []
+        results += [train_scan(material, material, CHUNKS[quality])] if learnt else []
         files = [file for name in METHODS for file in weight_files(name, materials.load(material).medium)]
         work, needs = len(METHODS) * SECONDS[quality], (training_of(material),) if learnt else ()
         results.append(Part(f"{material}, equal time", rivals, params, work, needs, (BUNNY, *files)))

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from figures.computing.contenders import OF_OBJECTS
-from figures.computing.learnt import FULL_GEOMETRY, TRAIN_SECONDS, train_scan, training_of, weight_files
+from figures.computing.learnt import CHUNKS, FULL_GEOMETRY, train_scan, training_of, weight_files
 from figures.computing.scenes import BUNNY, MATERIALS
 from figures.drawing.error_tables import in_markdown, label
 from figures.fig09 import rendered
@@ -47,7 +47,7 @@ def parts(quality: str) -> list[Part]:
     size, spp, results = SIZES[quality], SPP[quality], []
     for material in SUBJECTS[quality]:
         if FULL_GEOMETRY in MODELS:
-            results.append(train_scan(material, material, TRAIN_SECONDS[quality]))
+            results.append(train_scan(material, material, CHUNKS[quality]))
         for model, entries in _cases():
             params = {"material": material, "size": size, "seed": 0, "spp": spp, "model": model, "entries": entries}
             needs = (training_of(material),) if model == FULL_GEOMETRY else ()

@@ -12,8 +12,8 @@ from figures.beyond.objects import VIEWS
 from figures.computing.contenders import MODELS, OF_OBJECTS, VOLUMES, WALK, contender, long_passes, long_walk, ready
 from figures.computing.images import cover
 from figures.computing.learnt import (
+    CHUNKS,
     FULL_GEOMETRY,
-    TRAIN_SECONDS,
     TRAINING,
     accepting,
     object_parts,
@@ -123,11 +123,11 @@ def parts(quality: str) -> list[Part]:
     results = []
     for name, (scan, material) in SUBJECTS.items():
         if FULL_GEOMETRY in OF_OBJECTS:
-            results.append(train_scan(name, material, TRAIN_SECONDS[quality], scan=scan))
+            results.append(train_scan(name, material, CHUNKS[quality], scan=scan))
         for lights in LIGHTS:
             results += _parts_of(name, lights, quality)
     for name in OBJECTS:
-        results.append(train_modelled(name, RESOLUTION[quality], TRAIN_SECONDS[quality]))
+        results.append(train_modelled(name, RESOLUTION[quality], CHUNKS[quality]))
         for lights in LIGHTS:
             results += _parts_of(name, lights, quality)
     weights = weight_files("neural", materials.load(SPLIT_MATERIAL).medium)

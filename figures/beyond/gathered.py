@@ -9,7 +9,7 @@ import numpy as np
 
 from figures.computing.contenders import WALK, long_walk, ready
 from figures.computing.images import FLIP, Shot, compared, cover, noise_of, stops_of
-from figures.computing.learnt import FULL_GEOMETRY, TRAIN_SECONDS, train_scan, training_of, with_weights
+from figures.computing.learnt import CHUNKS, FULL_GEOMETRY, train_scan, training_of, with_weights
 from figures.computing.scenes import BUNNY, prepare, scan_scene
 from figures.computing.timed import rendered
 from figures.drawing.image_files import image_files
@@ -38,7 +38,7 @@ def parts(quality: str) -> list[Part]:
         common = {"material": material, "size": size, "lights": LIGHTS}
         params = {**common, "spp": spp, "seed": 0}
         results.append(Part(f"{material}, truth", long_walk, params, spp * size**2, inputs=(BUNNY,)))
-        results.append(train_scan(material, material, TRAIN_SECONDS[quality]))
+        results.append(train_scan(material, material, CHUNKS[quality]))
         params = {**common, "seconds": SECONDS[quality], "seed": 1}
         needs = (training_of(material),)
         results.append(Part(f"{material}, equal time", in_time, params, len(WAYS) * SECONDS[quality], needs, (BUNNY,)))

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from figures.computing.learnt import FULL_GEOMETRY, TRAIN_SECONDS, trained, training_of, weight_files, with_weights
+from figures.computing.learnt import CHUNKS, FULL_GEOMETRY, trained, training_of, weight_files, with_weights
 from figures.computing.scenes import prepare
 from figures.computing.things import Staging, lit_scene, shown, thing_parts, walked
 from figures.drawing.image_files import against_walks, image_files, rows_of
@@ -55,8 +55,8 @@ def parts(quality: str) -> list[Part]:
         files = [(model, weight_files(model, JELLY)) for model in models]
         needs: tuple[str, ...] = ()
         if FULL_GEOMETRY in models:
-            training = {**common, "seconds": TRAIN_SECONDS[quality], "model": FULL_GEOMETRY}
-            results.append(Part(training_of(thing), learnt, training, TRAIN_SECONDS[quality]))
+            training = {**common, "chunks": CHUNKS[quality], "model": FULL_GEOMETRY}
+            results.append(Part(training_of(thing), learnt, training, CHUNKS[quality]))
             needs = (training_of(thing),)
         results += thing_parts(thing, common, spp, (path_traced, rendered), files, needs=needs)
     return results

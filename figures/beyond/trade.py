@@ -12,7 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from figures.computing.contenders import OF_OBJECTS
-from figures.computing.learnt import FULL_GEOMETRY, TRAIN_SECONDS, train_scan, training_of, weight_files, with_weights
+from figures.computing.learnt import CHUNKS, FULL_GEOMETRY, train_scan, training_of, weight_files, with_weights
 from figures.computing.scenes import BUNNY, MM_PER_UNIT, bunny_scene, prepare
 from figures.drawing import trade_plot
 from figures.drawing.page import page
@@ -53,7 +53,7 @@ def parts(quality: str) -> list[Part]:
         inputs = (BUNNY, *(f for model in NETWORKS for f in weight_files(model, medium)))
         learns = FULL_GEOMETRY in OF_OBJECTS
         if learns:
-            results.append(train_scan(material, material, TRAIN_SECONDS[quality]))
+            results.append(train_scan(material, material, CHUNKS[quality]))
         for shape in SHAPES:
             needs = (training_of(material),) if learns and shape == "bunny" else ()
             for light in LIGHTS:

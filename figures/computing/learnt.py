@@ -64,35 +64,35 @@ def with_weights(folder: Path, needed: Mapping[str, Result]) -> Iterator[None]:
         yield
 
 
-TRAIN_SECONDS = {"draft": 24, "paper": 240}  # CPU time: half of it on two cores; one for all figures, which share parts
+CHUNKS = {"draft": 4, "paper": 40}  # of all figures, which share parts; seconds would give each machine other weights
 GRID = 0.5  # cells of a medium along an object over cubes of its surface
 
 
-def train_scan(name: str, material: str, seconds: float, seed: int = 0, scan: str = "bunny") -> Part:
-    """The part in which a scanned object of a material is learnt, for so many seconds of CPU time.
+def train_scan(name: str, material: str, chunks: int, seed: int = 0, scan: str = "bunny") -> Part:
+    """The part in which a scanned object of a material is learnt by so many chunks of data.
 
     Args:
         name: of what is learnt, by which `training_of` finds it.
         material: in the registry.
-        seconds: of CPU time.
+        chunks: see `full_geometry.learning.training.train_by_chunks`.
         seed: of the training.
         scan: name in `scenes.SCANS`.
     """
-    params = {"scan": scan, "material": material, "seconds": seconds, "seed": seed, "model": FULL_GEOMETRY}
-    return Part(training_of(name), _scanned, params, seconds, inputs=(SCANS[scan].file,))
+    params = {"scan": scan, "material": material, "chunks": chunks, "seed": seed, "model": FULL_GEOMETRY}
+    return Part(training_of(name), _scanned, params, chunks, inputs=(SCANS[scan].file,))
 
 
-def train_modelled(name: str, resolution: int, seconds: float, seed: int = 0) -> Part:
+def train_modelled(name: str, resolution: int, chunks: int, seed: int = 0) -> Part:
     """The part in which a modelled object is learnt.
 
     Args:
         name: a name in `modelling.objects.OBJECTS`.
         resolution: of its surface.
-        seconds: of CPU time.
+        chunks: as in `train_scan`.
         seed: of the object and its training.
     """
-    params = {"object": name, "resolution": resolution, "seconds": seconds, "seed": seed, "model": FULL_GEOMETRY}
-    return Part(training_of(name), _modelled, params, seconds)
+    params = {"object": name, "resolution": resolution, "chunks": chunks, "seed": seed, "model": FULL_GEOMETRY}
+    return Part(training_of(name), _modelled, params, chunks)
 
 
 def object_parts(name: str, resolution: int, folder: Path, seed: int = 0, model: str = "neural") -> dict[str, Any]:
@@ -126,9 +126,9 @@ def _modelled(task: Task) -> dict[str, Any]:
 def trained(task: Task, scene: dict[str, Any], name: str) -> dict[str, Any]:
     """Weights of the object called `name` in the description of a scene, with what they took.
 
-    The parameters "seconds" (of CPU time) and "seed" of the task are those of the training.
+    The parameters "chunks" and "seed" of the task are those of the training.
     """
-    from full_geometry.learning.training import train_by_cpu
+    from full_geometry.learning.training import train_by_chunks
     from full_geometry.models.storing import KIND
     from halfspace_sss.neural.store import load_weights
     from halfspace_sss.rendering.object.objects import object_of
@@ -136,7 +136,7 @@ def trained(task: Task, scene: dict[str, Any], name: str) -> dict[str, Any]:
 
     obj = object_of(open_scene(scene, KIND), None, None, name)
     started, of_cpu = time.perf_counter(), time.process_time()
-    _, path = train_by_cpu(obj, task.params["seconds"], task.folder / "weights", seed=task.params["seed"])
+    _, path = train_by_chunks(obj, task.params["chunks"], task.folder / "weights", seed=task.params["seed"])
     took = {"seconds": time.perf_counter() - started, "cpu seconds": time.process_time() - of_cpu}
     record = load_weights(path, KIND)[1]
     files = {file.name: file.read_bytes() for file in (path, path.with_suffix(".json"))}

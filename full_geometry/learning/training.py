@@ -291,14 +291,20 @@ def train_by_cpu(
         seed, recipe: of everything; sizes and rates.
     """
     check_interval("seconds", seconds, 1e-3, 1e7)
-    run, began = _ObjectTraining(obj, recipe, seed, None, None), clock()
-    run._prepare()
-    while run.done < run.total:
-        run._chunk(seconds, time.process_time)
-    run.fitting.solve(run.source, run.done, seed)
-    spent = clock() - began
-    record = run._record(run._judged(reference(obj, EXITS, WALKS, seed), SAMPLES), spent)
-    return run.learnt(), storing.save(folder, run.identity, run.arrays(), record)
+    return _ObjectTraining(obj, recipe, seed, None, None).unattended(folder, seconds, None)
+
+
+def train_by_chunks(
+    obj: TranslucentObject, chunks: int, folder: str | Path, *, seed: int = 0, recipe: Recipe = STANDARD
+) -> tuple[storing.Learnt, Path]:
+    """Learn an object by so many chunks of data, with the same weights whatever the number of threads.
+
+    Args:
+        obj, folder, seed, recipe: as in `train_by_cpu`.
+        chunks: each of `recipe.chunk` walks that are kept.
+    """
+    check_count("chunks", chunks, 1)
+    return _ObjectTraining(obj, recipe, seed, None, None).unattended(folder, 0.0, chunks)
 
 
 class _ObjectTraining:
@@ -371,6 +377,17 @@ class _ObjectTraining:
         record = self._record(errors, clock() - began)  # of all cores, as the trade counts
         path = storing.save(folder, self.identity, self.arrays(), record)
         return Trained(*self.learnt(), path, errors, self.fitting.step, time.monotonic() - started)
+
+    def unattended(self, folder: str | Path, seconds: float, chunks: int | None) -> tuple[storing.Learnt, Path]:
+        """Without errors on the way: for CPU seconds, or a number of chunks in place of a plan by them."""
+        began = clock()
+        self._prepare(chunks)
+        while self.done < self.total:
+            self._chunk(seconds, time.process_time)
+        self.fitting.solve(self.source, self.done, self.seed)
+        spent = clock() - began
+        record = self._record(self._judged(reference(self.object, EXITS, WALKS, self.seed), SAMPLES), spent)
+        return self.learnt(), storing.save(folder, self.identity, self.arrays(), record)
 
     def _prepare(self, chunks: int | None = None) -> None:
         """Scales and shares from a pilot, which compiles all kernels; the work of a run that was killed."""

@@ -45,16 +45,17 @@ SETTINGS = {
 
 @pytest.fixture()
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    train = training.train_by_cpu
-    monkeypatch.setattr(training, "train_by_cpu", lambda *a, **how: train(*a, **{**how, "recipe": QUICK}))
+    train = training.train_by_chunks
+    monkeypatch.setattr(training, "train_by_chunks", lambda *a, **how: train(*a, **{**how, "recipe": QUICK}))
     for module, settings in SETTINGS.items():
-        monkeypatch.setitem(module.TRAIN_SECONDS, "draft", 0.01)
+        monkeypatch.setitem(module.CHUNKS, "draft", 1)
         for name, value in settings.items():
             monkeypatch.setattr(module, name, value)
     monkeypatch.setitem(fig01.SPP, "draft", {"path_traced": 16, "model": 4})
     monkeypatch.setitem(fig06.SPP, "draft", {"path_traced": 16, MODEL: 4})
     monkeypatch.setattr(fig06, "MATERIAL", "ketchup")
     monkeypatch.setitem(fig07.SPP, "draft", dict.fromkeys(fig07.SPP["draft"], 16))
+    monkeypatch.setitem(fig07.SECONDS, "draft", 0.01)
     monkeypatch.setattr(distant_light, "DIRECTIONS", 12)
     monkeypatch.setattr(distant_light, "CHUNK", 2**10)
     monkeypatch.setitem(fig11.SECONDS, "draft", 0.1)

@@ -29,7 +29,7 @@ from full_geometry.learning.model_errors import (  # noqa: E402  # noqa: E402
     reference,
     transport_of,
 )
-from full_geometry.learning.training import Trained, train  # noqa: E402
+from full_geometry.learning.training import Trained, train, train_by_chunks  # noqa: E402
 from full_geometry.models import storing  # noqa: E402
 from full_geometry.models.object_model import (  # noqa: E402
     FullGeometry,
@@ -55,6 +55,7 @@ from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 pytestmark = pytest.mark.usefixtures("rgb")
 
 QUICK, CHUNKS = Recipe(width=24, depth=2, batch=1024, chunk=2**14, reuse=4), 12
+FEW = replace(QUICK, chunk=2**12)
 WAX = Medium([0.95, 0.8, 0.6], [0.05, 0.2, 0.4], 0.0, 1.4)
 
 
@@ -105,6 +106,19 @@ def test_after_an_edit_of_the_medium_training_starts_from_what_is_known_of_the_s
     refined = train(edited, chunks=2, recipe=QUICK, folder=tmp_path / "refined", start=start)
     assert refined.steps == anew.steps
     assert np.max(constant(refined.errors)) < 0.6 * np.max(constant(anew.errors))
+
+
+@pytest.mark.slow
+def test_weights_of_a_number_of_chunks_are_the_same_bits_by_one_thread_and_by_three(tmp_path: Path) -> None:
+    before, found = dr.thread_count(), []
+    for threads in (1, 3):
+        dr.set_thread_count(threads)
+        try:
+            _, path = train_by_chunks(object_of(ball(), WAX), 2, tmp_path / str(threads), recipe=FEW)
+        finally:
+            dr.set_thread_count(before)
+        found.append(path.read_bytes())
+    assert found[0] == found[1]
 
 
 def test_the_file_gives_the_same_model_again(trained: Trained) -> None:
