@@ -105,12 +105,12 @@ def _shot(shot: Shot, exposure: float) -> dict[str, Any]:
         plain = value if isinstance(value, str) else float(value)
         results["numbers"][column] = plain if isinstance(plain, str) or math.isfinite(plain) else str(plain)
     if shot.image is not None:
-        results["image"] = _png(np.round(255 * srgb(shot.image, exposure)).astype(np.uint8))
+        results["image"] = _address(np.round(255 * srgb(shot.image, exposure)).astype(np.uint8))
     for kind, low in (("flip", 0.0), ("difference", -DIFFERENCE_SPAN)):
         values = getattr(shot, kind)
         if values is not None:
             scaled = np.clip((np.asarray(values) - low) / (DIFFERENCE_SPAN - low), 0.0, 1.0)
-            results[kind] = _png(np.round(255 * scaled).astype(np.uint8), _colors(MAPS[kind][1]))
+            results[kind] = _address(_colors(MAPS[kind][1])[np.round(255 * scaled).astype(np.uint8)])
     return results
 
 
@@ -126,15 +126,13 @@ def _map(kind: str) -> dict[str, Any]:
     return {"title": title, "colors": colors, "ends": ends}
 
 
-def _png(pixels: np.ndarray, palette: np.ndarray | None = None) -> str:
-    """A data address of the pixels: (H, W, 3) colours, or (H, W) numbers of colours in a palette."""
+def _address(pixels: np.ndarray) -> str:
+    """A data address of the pixels, (H, W, 3) bytes, without loss; WebP takes a quarter less than PNG."""
     from PIL import Image
 
-    image, buffer = Image.fromarray(pixels), io.BytesIO()
-    if palette is not None:
-        image.putpalette(palette.tobytes())
-    image.save(buffer, "PNG", optimize=True)
-    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode()
+    buffer = io.BytesIO()
+    Image.fromarray(pixels).save(buffer, "WEBP", lossless=True)
+    return "data:image/webp;base64," + base64.b64encode(buffer.getvalue()).decode()
 
 
 def render(picture: Picture) -> dict[str, bytes]:
