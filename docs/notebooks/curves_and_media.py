@@ -16,6 +16,9 @@ skin = sss.Medium.from_reflectance([0.72, 0.48, 0.38], mfp=[1.2, 0.4, 0.2], g=0.
 for medium in (marble.medium, soap, skin):
     print(medium, medium.reflectance())
 
+# %%
+marble
+
 # %% [markdown]
 # The reflectance of the half-space by a random walk, with its standard error, beside the exact one.
 
@@ -24,12 +27,9 @@ walk = sss.trace(soap, mu_i=0.5, n_paths=50_000, seed=1)
 print(*walk.reflectance(), soap.reflectance(mu_i=0.5))
 
 # %% [markdown]
-# S along a line of exit points, path traced and by models. `L1` is the error of a model over a range of distances,
-# `noise` that of the walks.
+# S along a line of exit points, path traced and by models. A notebook shows the plot above the errors: `L1` is that of
+# a model over a range of distances, `noise` that of the walks. `curves.plot()` is a figure of matplotlib.
 
 # %%
 curves = sss.curves(soap, theta_i_deg=[0, 60], models=["better_dipole", "neural"], n_paths=50_000)
-print(curves.errors()[["theta_i_deg", "series", "r_from_mm", "r_to_mm", "L1", "noise"]])
-
-# %%
-figure = curves.plot()
+curves

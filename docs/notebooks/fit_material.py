@@ -56,6 +56,13 @@ for name, value in found.values.items():
 print(f"misfit of the images: {found.misfit.value:.3f} ± {found.misfit.standard_error:.3f}")
 
 # %% [markdown]
+# Above the given images, below those of what was found.
+
+# %%
+rows = [np.concatenate([getattr(view, which) for view in found.views], axis=1) for which in ("given", "found")]
+mi.util.convert_to_bitmap(mi.TensorXf(np.concatenate(rows).repeat(10, axis=0).repeat(10, axis=1)))
+
+# %% [markdown]
 # The scene with what was found, rendered like any other; or `found.medium` for curves and models.
 
 # %%

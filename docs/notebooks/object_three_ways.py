@@ -52,6 +52,8 @@ for name, pixels in ways.items():
 
 # %% [markdown]
 # What the light crosses shows the difference: a diffuse surface sends none of it through the ball.
+# From left to right: diffuse, half-space, walks. `mi.util.write_bitmap` writes a file.
 
 # %%
-mi.util.write_bitmap("three_ways.png", np.concatenate(list(ways.values()), axis=1))
+row = np.concatenate(list(ways.values()), axis=1)
+mi.util.convert_to_bitmap(mi.TensorXf(row.repeat(3, axis=0).repeat(3, axis=1)))

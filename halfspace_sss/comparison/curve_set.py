@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import io
 import json
 import math
 from collections.abc import Mapping
@@ -105,7 +107,16 @@ class CurveSet:
     def _repr_html_(self) -> str:
         columns = ["theta_i_deg", "series", "r_from_mm", "r_to_mm", "L1", "noise", "bias", "bias_standard_error"]
         table = self.errors()[columns].to_html(index=False, float_format="{:.3g}".format)
-        return f"<p>{escape(repr(self).strip('<>'))}</p>{table}"
+        return f"<p>{escape(repr(self).strip('<>'))}</p>{self._drawn()}{table}"
+
+    def _drawn(self) -> str:
+        """The plot as a page shows it; nothing without matplotlib."""
+        draw = renderer("curves_figure")
+        if draw is None:
+            return ""
+        file = io.BytesIO()
+        draw(self).savefig(file, format="png")
+        return f'<img src="data:image/png;base64,{base64.b64encode(file.getvalue()).decode()}">'
 
     def plot(self) -> Any:
         """A `matplotlib.figure.Figure`: S over r for each direction of incidence, and its ratio to the traced curve.

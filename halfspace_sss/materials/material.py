@@ -6,6 +6,7 @@ import math
 import numbers
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from html import escape
 from types import MappingProxyType
 
 import numpy as np
@@ -90,6 +91,10 @@ class Material:
                 object.__setattr__(self, name, tuple(getattr(self, name)))
         # the registry hands out one object to all callers, so none of them may change it
         object.__setattr__(self, "sources", MappingProxyType(dict(self.sources)))
+
+    def _repr_html_(self) -> str:
+        """The table of the medium under name, set and source."""
+        return f"<p>{escape(f'{self.name}, {self.set}: {self.source}')}</p>{self.medium._repr_html_()}"
 
     def __getstate__(self) -> dict:
         return {**self.__dict__, "sources": dict(self.sources)}

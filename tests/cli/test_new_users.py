@@ -102,13 +102,16 @@ def test_objects_show_medium_and_unit_in_a_line(curve_set) -> None:
         assert "\n" not in repr(found) and len(repr(found)) < 200
     for found in (sss.bssrdf("neural", MEDIUM), trace, curve_set):
         assert "sigma_t 0.241/mm, albedo 0.75, g 0, eta 1.3" in repr(found)
-    for found in (MEDIUM, sss.materials.load("marble").medium, curve_set, advice):
+    marble = sss.materials.load("marble")
+    for found in (MEDIUM, marble.medium, marble, curve_set, advice):
         assert "<table" in found._repr_html_()
+    assert "marble, Jensen2001" in marble._repr_html_()
 
 
 def test_curves_are_drawn_by_themselves(curve_set) -> None:
     figure = pytest.importorskip("matplotlib.figure")
     assert isinstance(curve_set.plot(), figure.Figure)
+    assert '<img src="data:image/png;base64,iVBOR' in curve_set._repr_html_()
 
 
 def test_both_integrators_warn_of_a_size_that_speaks_of_another_unit() -> None:
