@@ -45,6 +45,7 @@ SAMPLES = 2**21  # entries of all points
 FITTED = 2**18
 SEED = 7
 SMOOTHINGS = 8  # of what directions bring
+BLOCK = 64  # rows
 R_2 = 0.7548776662466927, 0.5698402909980532
 
 
@@ -139,7 +140,15 @@ class Transfer:
 
     def by_place(self, L: Incident) -> np.ndarray:
         """What leaves by the means of the light at the places of entries, (points, channels)."""
-        return np.einsum("jsc,jsc->jc", self.t, L.mean[self.entry])
+        found = np.empty_like(L.mean)
+        for rows in self._blocks:
+            found[rows] = np.einsum("jsc,jsc->jc", self.t[rows], np.take(L.mean, self.entry[rows], axis=0))
+        return found
+
+    @property
+    def _blocks(self) -> list[slice]:
+        """Rows that fit into the cache of a core together."""
+        return [slice(k, k + BLOCK) for k in range(0, len(self.entry), BLOCK)]
 
     def __matmul__(self, L: Incident) -> np.ndarray:
         """B for incident radiance, linear in w_o: constant and slope, (points, channels, 4).
@@ -147,12 +156,17 @@ class Transfer:
         What the directions w_i and w_o of single entries bring varies slowly over the surface, and was most of the
         noise: it is averaged over a wider neighbourhood than B is blended from.
         """
-        arriving = (L.mean - np.einsum("kci,ki->kc", L.slope, L.middle))[self.entry]
-        for axis in range(3):
-            arriving += L.slope[:, :, axis][self.entry] * self.w_i[:, :, axis, None]
-        arriving *= self.t
-        B = arriving.sum(axis=1)
-        slope = arriving.transpose(0, 2, 1) @ self.d_o
+        constant = L.mean - np.einsum("kci,ki->kc", L.slope, L.middle)
+        axes = [np.ascontiguousarray(L.slope[:, :, axis]) for axis in range(3)]
+        B, slope = np.empty_like(L.mean), np.empty_like(L.slope)
+        for rows in self._blocks:
+            entry, w_i = self.entry[rows], self.w_i[rows]
+            arriving = np.take(constant, entry, axis=0)
+            for axis, along in enumerate(axes):
+                arriving += np.take(along, entry, axis=0) * w_i[:, :, axis, None]
+            arriving *= self.t[rows]
+            B[rows] = arriving.sum(axis=1)
+            slope[rows] = arriving.transpose(0, 2, 1) @ self.d_o[rows]
         slope -= self._even[1] * (B / self._even[0])[:, :, None]  # 0 in uniform light, where a(w_o) is all
         slope = np.einsum("jck,jki->jci", slope, self.inverse)
         by_place = self.by_place(L)

@@ -429,8 +429,8 @@ class TranslucentObject:
 
     @property
     def splits(self) -> bool:
-        """Whether light is of both kinds, orders below two and the transport's."""
-        return self.transport is not None and bool(self.low_orders)
+        """Whether light is of both kinds, orders below two and others, of the transport or gathered."""
+        return (self.transport is not None or self.gathered is not None) and bool(self.low_orders)
 
     def prepare_derivatives(self) -> None:
         """Make what derivatives by the medium need, before any loop is recorded.

@@ -31,8 +31,8 @@ class Settings:
         entries: points of entry that an exit draws, of which one is followed, chosen by what it may bring; AUTOMATIC
             leaves it to the model.
         light: "sampled", without bias; "corrected", the same with gathered light as control variate, see
-            `paths.control_variate`; or "gathered" once for all samples, see `paths.gathering`: orders from two on
-            have a little bias and no noise; or "auto", the cheaper of both that keeps the tolerance, by measurement.
+            `paths.control_variate`; or "gathered" once for all samples, see `paths.gathering`: scattered light
+            has a little bias and no noise; or "auto", the cheaper of both that keeps the tolerance, by measurement.
         hide_emitters: whether directly visible emitters are left out.
         train_seconds: time for each object whose model has to learn it first; 0 refuses objects without weights.
         train_error: relative error under constant light, measured on the way, from which on it has learnt enough.

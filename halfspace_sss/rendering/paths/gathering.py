@@ -19,10 +19,12 @@ import mitsuba as mi
 import numpy as np
 
 from halfspace_sss.backend import clock
+from halfspace_sss.rendering.gathered.inner import Events, InnerLight, has_inner_light
 from halfspace_sss.rendering.gathered.points import SurfacePoints
 from halfspace_sss.rendering.gathered.transfer import SAMPLES, SEED, Albedo, Incident, Transfer, cosine, transfer
 from halfspace_sss.rendering.object.points import cosine_above, opaque, place
 from halfspace_sss.rendering.object.shape import same_objects, state_of
+from halfspace_sss.rendering.paths.inner_light import COUNT, inner_light
 from halfspace_sss.rendering.paths.lighting import mis_weight
 from halfspace_sss.rendering.paths.path_loop import trace_paths
 
@@ -36,6 +38,7 @@ FEWEST, MOST = 32, 1024  # of a point
 PART = 1 / 16  # of the samples of a transfer
 SPREADINGS = 4  # of what other surfaces send,
 BRIGHTEST = 1 / 128  # of the points, which share it no matter how bright
+PAIRS = [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]  # of axes
 TRACED = 8  # one of so many directions by the cosine is traced further, where it meets a surface
 
 
@@ -49,6 +52,7 @@ class Gathered:
         values: B of all points, for each channel the constant and the slope over w_o.
         error: standard error of B by the gathering of light, over its mean.
         light: that arrives.
+        inner: at events of order 1 inside; None where that order is traced.
     """
 
     object: TranslucentObject
@@ -56,6 +60,7 @@ class Gathered:
     values: mi.Float
     error: float
     light: Incident
+    inner: InnerLight | None = None
 
     def radiance(self, out: SurfacePoint, active: mi.Bool) -> mi.Spectrum:
         """L_o of an exit; 0 below the horizon."""
@@ -89,6 +94,7 @@ class Gathering:
         self._part, self.seconds = part, (0.0, 0.0)
         self._objects: list[TranslucentObject] = []
         self._transfers: list[Transfer] = []
+        self._events: list[Events | None] = []
         self._light: tuple[list, list] = ([], [])
         self._found: list[TranslucentObject] = []
 
@@ -110,14 +116,16 @@ class Gathering:
                 for obj, one in zip(objects, spread)
             ]
             self._transfers, self._objects, self._light = made, objects, ([], [])
+            inner = [bool(one and not self._part and has_inner_light(obj)) for obj, one in zip(objects, spread)]
+            self._events = [Events.of(obj, COUNT) if one else None for obj, one in zip(objects, inner)]
             self.seconds = (clock() - started, 0.0)
         state = light_state(scene)
         if state[0] != self._light[0] or not self._found:
             started = clock()
-            seeds = (1000 * self._part,) if self._part else (0, 1)
+            seed, parts = (1000 * self._part, 1) if self._part else (0, 2)
             gathered = [
-                obj if T is None else _leaving(scene, objects, k, T, settings, seeds)
-                for k, (obj, T) in enumerate(zip(objects, self._transfers))
+                obj if T is None else _leaving(scene, objects, k, (T, events), settings, seed, parts)
+                for k, (obj, T, events) in enumerate(zip(objects, self._transfers, self._events))
             ]
             self._found = [
                 g if isinstance(g, type(obj)) else replace(obj, transport=None, proposals=None, gathered=g)
@@ -175,68 +183,99 @@ def light_state(scene: mi.Scene) -> tuple[list, list]:
 
 
 def _leaving(
-    scene: mi.Scene, objects: list[TranslucentObject], k: int, T: Transfer, settings: Settings, seeds: tuple[int, ...]
-) -> Gathered:
-    """B of object k, in parts whose differences tell the noise."""
-    lights = [_incident(scene, objects, T, settings, 2 * k + seed) for seed in seeds]
+    scene: mi.Scene, objects: list[TranslucentObject], k: int, of: tuple[Transfer, Events | None], settings: Settings,
+    seed: int, parts: int,
+) -> Gathered:  # fmt: skip
+    """B of object k, in parts whose differences tell the noise, and light inside."""
+    T, events = of
+    lights, others = zip(*_incident(scene, objects, T, settings, 2 * k + seed, parts))
     light = Incident.mean_of(lights)
-    B, parts = T @ light, np.stack([T.by_place(part) for part in lights])
+    B, found = T @ light, np.stack([T.by_place(part) for part in lights])
     if not np.isfinite(B).all():
         raise ValueError(f"light at object {objects[k].geometry.name} must be finite, got NaN or infinity")
-    spread = parts.var(axis=0, ddof=1).mean() if len(parts) > 1 else np.nan
-    error = np.sqrt(spread / len(parts)) / max(float(B[..., 0].mean()), 1e-30)
-    return Gathered(objects[k], T, mi.Float(B.astype(np.float32).ravel()), float(error), light)
+    spread = found.var(axis=0, ddof=1).mean() if parts > 1 else np.nan
+    error = np.sqrt(spread / parts) / max(float(B[..., 0].mean()), 1e-30)
+    inner = None
+    if events is not None:
+        seen = mi.Float(np.mean(others, axis=0).astype(np.float32).ravel())
+        inner = inner_light(scene, objects, k, settings, events, (T.points, seen))
+    return Gathered(objects[k], T, mi.Float(B.astype(np.float32).ravel()), float(error), light, inner)
 
 
 def _incident(
-    scene: mi.Scene, objects: list[TranslucentObject], T: Transfer, settings: Settings, seed: int
-) -> Incident:
-    """Incident radiance at all points."""
-    count = len(T.points)
+    scene: mi.Scene, objects: list[TranslucentObject], T: Transfer, settings: Settings, seed: int, parts: int
+) -> list[tuple[Incident, np.ndarray]]:
+    """Incident radiance at all points, and the mean of other surfaces that each sees, (points, channels), in parts.
+
+    Parts are independent estimates by as many directions each, of one launch.
+    """
+    count, rows = len(T.points), len(T.points) * parts
     n = int(np.clip(DIRECTIONS // (2 * count), FEWEST, MOST)) // TRACED * TRACED
-    lane, few = dr.arange(mi.UInt32, count * n), n // TRACED
+    lane, few = dr.arange(mi.UInt32, rows * n), n // TRACED
     # directions that are traced further come first: beside each other, as lanes that wait cost as much
-    traced, rest = lane < dr.opaque(mi.UInt32, count * few), lane - count * few
+    traced, rest = lane < dr.opaque(mi.UInt32, rows * few), lane - rows * few
     i = rest % (n - few)
     s = dr.select(traced, lane % few * TRACED, i + i // (TRACED - 1) + 1)
     j = dr.select(traced, lane // few, rest // (n - few))
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(100 + seed, dr.width(lane))
-    at = GatheringPoint(*(dr.gather(type(v), v, j) for v in (T.points.p, T.points.n, T.points.n_out)))
+    at = GatheringPoint(*(dr.gather(type(v), v, j % count) for v in (T.points.p, T.points.n, T.points.n_out)))
     u, v = (_stratified(sampler, j, s, n) for _ in range(2))
     aimed, w_e = by_emitters(scene, T.albedo, at, u)
-    met, more, a, w_c = by_cosine(scene, objects, T.albedo, settings, at, v, traced, sampler)
-    values = [v + dr.zeros(mi.Float, count * n) for v in (aimed, met, TRACED * more, a, dr.mean(a), w_e, w_c)]
+    met, more, a, w_c, on = by_cosine(scene, objects, T.albedo, settings, at, v, traced, sampler)
+    seen = dr.select(on, a, 0)
+    values = [v + dr.zeros(mi.Float, rows * n) for v in (aimed, met, TRACED * more, a, dr.mean(a), w_e, w_c, seen)]
     dr.eval(values)
     j, s = lane // n, lane % n
-    order = dr.select(s % TRACED == 0, j * few + s // TRACED, count * few + j * (n - few) + s - s // TRACED - 1)
+    order = dr.select(s % TRACED == 0, j * few + s // TRACED, rows * few + j * (n - few) + s - s // TRACED - 1)
     values = [dr.gather(type(v), v, order) for v in values]
     dr.eval(values)
-    aimed, met, more, a, weight, w_e, w_c = values
+    sums = _moments(values, j, n)
+    return [_of_part(T.points, *(v[k * count : (k + 1) * count] for v in sums)) for k in range(parts)]
+
+
+def _moments(values: list, j: mi.UInt32, n: int) -> list[np.ndarray]:
+    """Sums over the n directions of each row, about the middle of directions.
+
+    Args:
+        values: by directions: light of emitters, light that they meet, what other surfaces send, a, its mean over
+            channels, directions of emitters and by the cosine, and a of those that meet a surface.
+        j: row of each direction.
+        n: directions of a row.
+    """
+    aimed, met, more, a, weight, w_e, w_c, seen = values
 
     def total(value: Any) -> np.ndarray:
-        """Sums over the directions of each point, (points, components)."""
+        """Of each row, (rows, components)."""
         sums = [dr.block_sum(part, n) for part in value]
         dr.eval(sums)
         return np.stack([np.array(v) for v in sums], axis=1)
 
-    norm, whole = total(a), total([weight])
-    middle = total(weight * w_c) / np.maximum(whole, 1e-30)
-    sent = total(more)
-    steady = _steadied(sent)
-    mean = total(aimed + met) + _spread(T.points, steady * sent)
+    whole = np.maximum(total([weight]), 1e-30)
+    middle = total(weight * w_c) / whole
     centre = dr.gather(mi.Vector3f, mi.Vector3f(*(mi.Float(c) for c in middle.T.astype(np.float32))), j)
     d_e, d_c = w_e - centre, w_c - centre
-    pairs = [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]
-    second = total([weight * d_c[i] * d_c[k] for i, k in pairs]) / np.maximum(whole, 1e-30)
-    C = np.empty((count, 3, 3))
-    for column, (i, k) in zip(second.T, pairs):
+    second = total([weight * d_c[i] * d_c[k] for i, k in PAIRS]) / whole
+    axes = np.stack([total(aimed * d_e[i] + met * d_c[i]) for i in range(3)], axis=2)
+    sent = np.stack([total(more * d_c[i]) for i in range(3)], axis=2)
+    return [total(a), middle, total(aimed + met), total(more), total(seen), second, axes, sent]
+
+
+def _of_part(
+    points: SurfacePoints, norm: np.ndarray, middle: np.ndarray, direct: np.ndarray, sent: np.ndarray, seen: np.ndarray,
+    second: np.ndarray, axes: np.ndarray, sent_axes: np.ndarray,
+) -> tuple[Incident, np.ndarray]:  # fmt: skip
+    """Incident radiance by the sums of `_moments`, and the mean of other surfaces."""
+    steady, C = _steadied(sent), np.empty((len(norm), 3, 3))
+    spread = _spread(points, steady * sent)
+    for column, (i, k) in zip(second.T, PAIRS):
         C[:, i, k] = C[:, k, i] = column
-    axes = [total(aimed * d_e[i] + met * d_c[i]) + _spread(T.points, steady * total(more * d_c[i])) for i in range(3)]
-    first = np.stack(axes, axis=2)
+    first = axes + _spread(points, steady[:, :, None] * sent_axes)
     slope = np.einsum("jci,jik->jck", first, np.linalg.inv(C + 1e-3 * np.eye(3)))
     norm = np.maximum(norm, 1e-30)
-    return Incident(*(part.astype(np.float32) for part in (mean / norm, slope / norm[:, :, None], middle)))
+    parts = ((direct + spread) / norm, slope / norm[:, :, None], middle)
+    others = spread / np.maximum(_spread(points, TRACED * seen), 1e-30)
+    return Incident(*(part.astype(np.float32) for part in parts)), others
 
 
 def _steadied(sent: np.ndarray) -> np.ndarray:
@@ -292,13 +331,16 @@ def by_emitters(
 def by_cosine(
     scene: mi.Scene, objects: list[TranslucentObject], albedo: Albedo, settings: Settings, at: GatheringPoint,
     u: mi.Point2f, traced: mi.Bool, sampler: mi.Sampler,
-) -> tuple[mi.Spectrum, mi.Spectrum, mi.Spectrum, mi.Vector3f]:  # fmt: skip
-    """By directions of the cosine: light of emitters that they meet, what other surfaces send along some, a, and w."""
+) -> tuple[mi.Spectrum, mi.Spectrum, mi.Spectrum, mi.Vector3f, mi.Bool]:  # fmt: skip
+    """By directions of the cosine: light of emitters that they meet, what other surfaces send along some, a, and w.
+
+    Last comes along which.
+    """
     met, a, w, ray, si = met_by_cosine(scene, albedo, at, u)
     hidden = replace(settings, hide_emitters=True, light="sampled", max_depth=max(settings.max_depth - 1, -1) or 1)
     on = si.is_valid() & traced
     parts, *_ = trace_paths(scene, objects, hidden, sampler, ray, on, scattered=True)
-    return met, dr.select(on, a * (parts[0] + parts[1]), 0), a, w
+    return met, dr.select(on, a * (parts[0] + parts[1]), 0), a, w, on
 
 
 def met_by_cosine(

@@ -15,6 +15,8 @@ without reflection, have MIS weights against the phase function. All other light
 spread over a cone, see `light.small_emitters`. The boundary refracts as if it were smooth.
 
 A walk ends where it meets what lies inside the object: the transport has all such paths.
+
+Where light at events was gathered (`gathered.inner`), the walk passes, and what events along it send is looked up.
 """
 
 from __future__ import annotations
@@ -111,6 +113,8 @@ def sample_low_orders(
 
     What passes unscattered shows delta lights only if the path has `scattered` before.
     """
+    if obj.gathered is not None and obj.gathered.inner is not None:
+        return _by_inner_light(context, obj, refracted, sampler, scattered, active)
     with dr.suspend_grad():
         walk = _walk(obj, refracted, sampler, active & refracted.valid)
         once = walk.order == 1
@@ -133,7 +137,9 @@ def sample_low_orders(
     pdf, share, sky = mi.Float(1), mi.Float(0), context.connects_sky(obj)
     if lights.some_local or context.suns or sky:
         at_event = _contribution(media, walk.event_length, mi.UInt32(1), None) * (walk.event_inverse_pdf * refracted.T)
-        direct = _connected(context, (obj, media), walk, dr.select(once, at_event, 0), sampler, once)
+        for light, d in _connected(context, (obj, media), walk, dr.select(once, at_event, 0), sampler, sky, once):
+            cosine = dr.dot(walk.event_d, d)
+            direct += light * _spectrum([eval_hg(cosine, g) for _, _, g in media])
     if lights.some_shaped or context.suns:
         chance = chance + weight * _met_by_chance(context, obj, walk, sampler, counts & connected)
     if lights.some_delta:
@@ -143,19 +149,127 @@ def sample_low_orders(
     return LowOrderSample(walk.o, walk.n, walk.d, weight, connected, pdf, share, direct + chance, chance, once)
 
 
+# ---- By gathered light: what events along a ray send is known --------------------------------------------------------
+
+ALONG = 3  # events that are looked up on a segment, a multiple of the channels
+
+
+def _by_inner_light(
+    context: RenderContext, obj: TranslucentObject, refracted: RefractedRay, sampler: mi.Sampler, scattered: mi.Bool,
+    active: mi.Bool,
+) -> LowOrderSample:  # fmt: skip
+    """`sample_low_orders` where light at events was gathered: the walk passes, and order 1 is what it looks up."""
+    media = _media(obj, ())
+    start = _begun(obj, refracted, active & refracted.valid)
+
+    def step(k: mi.UInt32, sampler: mi.Sampler, walk: _Walk, light: mi.Spectrum) -> tuple:
+        met, length = _to_boundary(obj, walk)
+        light = dr.select(walk.alive, light + _scattered_along((obj, media), walk, length, sampler), light)
+        walk = _meet_boundary((obj, media), replace(walk, length=walk.length + length), met, sampler)
+        survival = dr.minimum(dr.max(dr.exp(-_column(media, 1) * walk.length)) * walk.inverse_pdf / FAINT, 1)
+        survives = sampler.next_1d() < survival
+        walk = replace(
+            walk, left=walk.left & survives, alive=walk.alive & survives & (k + 1 < MOST_SEGMENTS),
+            inverse_pdf=walk.inverse_pdf / dr.maximum(survival, 1e-30),
+        )  # fmt: skip
+        return k + 1, sampler, walk, light
+
+    state = (mi.UInt32(0), sampler, start, mi.Spectrum(0))
+    walk, light = dr.while_loop(state, lambda k, sampler, walk, light: walk.alive, step, label="passing")[2:]
+    counts = walk.left & mi.Bool(0 in obj.low_orders)
+    weight = dr.select(counts, dr.exp(-_column(media, 1) * walk.length) * (walk.inverse_pdf * refracted.T), 0)
+    direct = dr.select(refracted.valid, light * refracted.T, 0)
+    if context.lights.some_delta:
+        direct += weight * _spread_lights(context, obj, walk, sampler, counts & scattered)
+    no = mi.Bool(False)
+    return LowOrderSample(walk.o, walk.n, walk.d, weight, no, mi.Float(1), mi.Float(0), direct, mi.Spectrum(0), no)
+
+
+def _scattered_along(
+    of: tuple[TranslucentObject, Media], walk: _Walk, length: mi.Float, sampler: mi.Sampler
+) -> mi.Spectrum:
+    """∫ sigma_s exp(-sigma_t (Λ + s)) J ds over a segment, over the density of the walk."""
+    (obj, media), n, light = of, len(of[1]), mi.Spectrum(0)
+    sigma_s, sigma_t = _column(media, 0), _column(media, 1)
+    ends, passed, shift = 1 - dr.exp(-sigma_t * length), dr.exp(-sigma_t * walk.length), sampler.next_1d()
+
+    def look(m: mi.UInt32, light: mi.Spectrum) -> tuple[mi.UInt32, mi.Spectrum]:
+        rate, end = media[0][1], ends[0]
+        for c in range(1, n):
+            rate, end = dr.select(m % n == c, media[c][1], rate), dr.select(m % n == c, ends[c], end)
+        u = shift + mi.Float(m) / ALONG
+        s = dr.minimum(-dr.log(1 - dr.minimum((u - dr.floor(u)) * end, 1 - 1e-7)) / rate, length)
+        density = dr.sum(sigma_t * dr.exp(-sigma_t * s) / dr.maximum(ends, 1e-30)) / n
+        J = obj.gathered.inner(walk.o + walk.d * s, walk.d, walk.alive)
+        return m + 1, light + sigma_s * dr.exp(-sigma_t * s) * J / dr.maximum(density, 1e-30)
+
+    light = dr.while_loop((mi.UInt32(0), light), lambda m, _: m < ALONG, look, label="events")[1]
+    return light * passed * (walk.inverse_pdf / ALONG)
+
+
+class LightAtEvents(NamedTuple):
+    """Light that reaches events without scattering.
+
+    Args:
+        connected: by emitter connections, over the density of the emitter, with its direction; of several ways.
+        left: walks that have left the object, of directions over the sphere, and how many reflections they have met.
+        weight: of them, per unit of the radiance that they meet.
+        chance: of that light of emitters, which no connection has found, with the weight.
+    """
+
+    connected: list[tuple[mi.Spectrum, mi.Vector3f]]
+    left: _Walk
+    weight: mi.Spectrum
+    chance: mi.Spectrum
+
+
+def light_at_events(
+    context: RenderContext, obj: TranslucentObject, p: mi.Point3f, n: mi.Normal3f, d: mi.Vector3f, sampler: mi.Sampler
+) -> LightAtEvents:
+    """Light at places inside an object, from directions d that are uniform over the sphere and by connections.
+
+    Args:
+        context: of the scene.
+        obj: the object, of one medium.
+        p: places.
+        n: outward geometric normals near them.
+        d: directions.
+        sampler: of what else is random.
+    """
+    # ---- the walk has the weight 1 at its event
+    media, zero = _media(obj, ()), mi.Float(0)
+    scale = 1 / dr.maximum(dr.max(_column(media, 0)), 1e-30)
+    start = _Walk(
+        mi.Point3f(p), mi.Vector3f(d), mi.Normal3f(n), zero, zero, 4 * dr.pi * scale, mi.UInt32(1), zero, mi.Point3f(p),
+        mi.Vector3f(d), mi.Normal3f(n), zero, mi.Float(1), mi.UInt32(0), mi.Bool(False), mi.Bool(True),
+    )  # fmt: skip
+
+    def step(k: mi.UInt32, sampler: mi.Sampler, walk: _Walk) -> tuple:
+        met, length = _to_boundary(obj, walk)
+        walk = _meet_boundary((obj, media), replace(walk, length=walk.length + length), met, sampler)
+        return k + 1, sampler, replace(walk, alive=walk.alive & (k + 1 < MOST_SEGMENTS))
+
+    state = (mi.UInt32(0), sampler, start)
+    walk = dr.while_loop(state, lambda k, sampler, walk: walk.alive, step, label="light at events")[2]
+    weight = dr.select(walk.left, dr.exp(-_column(media, 1) * walk.length) * (walk.inverse_pdf / scale), 0)
+
+    # ---- emitters beside the sky
+    connected, chance, lights = [], mi.Spectrum(0), context.lights
+    if lights.some_local or context.suns:
+        connected = _connected(context, (obj, media), walk, mi.Spectrum(1), sampler, False, mi.Bool(True))
+    if lights.some_shaped or context.suns:
+        chance += weight * _met_by_chance(context, obj, walk, sampler, walk.left & (walk.reflections <= 1))
+    if lights.some_delta:
+        chance += weight * _spread_lights(context, obj, walk, sampler, walk.left)
+    return LightAtEvents(connected, walk, weight, chance)
+
+
 # ---- The walk --------------------------------------------------------------------------------------------------------
 
 
 def _walk(obj: TranslucentObject, refracted: RefractedRay, sampler: mi.Sampler, active: mi.Bool) -> _Walk:
     """The walk from an exit until it leaves."""
-    zero, p = mi.Float(0), mi.Point3f(refracted.out.p)
-    media = _media(obj, refracted.out.medium)
-    skip = _clear(obj, refracted.out.n, refracted.d)
-    start = _Walk(
-        p, mi.Vector3f(refracted.d), mi.Normal3f(refracted.out.n), mi.Float(skip), zero, mi.Float(1), mi.UInt32(0),
-        zero, mi.Point3f(p), mi.Vector3f(refracted.d), mi.Normal3f(refracted.out.n), zero, zero, mi.UInt32(0),
-        mi.Bool(False), mi.Bool(active), refracted.out.medium,
-    )  # fmt: skip
+    media, start = _media(obj, refracted.out.medium), _begun(obj, refracted, active)
 
     def step(k: mi.UInt32, sampler: mi.Sampler, passing: mi.Float, walk: _Walk) -> tuple:
         own = _media(obj, walk.medium) if walk.medium else media
@@ -163,6 +277,24 @@ def _walk(obj: TranslucentObject, refracted: RefractedRay, sampler: mi.Sampler, 
 
     state = (mi.UInt32(0), sampler, mi.Float(refracted.passing), start)
     return dr.while_loop(state, lambda k, sampler, passing, walk: walk.alive, step, label="low orders")[3]
+
+
+def _begun(obj: TranslucentObject, refracted: RefractedRay, active: mi.Bool) -> _Walk:
+    """A walk at the exit."""
+    zero, p = mi.Float(0), mi.Point3f(refracted.out.p)
+    skip = _clear(obj, refracted.out.n, refracted.d)
+    return _Walk(
+        p, mi.Vector3f(refracted.d), mi.Normal3f(refracted.out.n), mi.Float(skip), zero, mi.Float(1), mi.UInt32(0),
+        zero, mi.Point3f(p), mi.Vector3f(refracted.d), mi.Normal3f(refracted.out.n), zero, zero, mi.UInt32(0),
+        mi.Bool(False), mi.Bool(active), refracted.out.medium,
+    )  # fmt: skip
+
+
+def _to_boundary(obj: TranslucentObject, walk: _Walk) -> tuple[tuple, mi.Float]:
+    """What a walk meets at the boundary, as of `meet`, and how far away."""
+    flags = mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame
+    si, n_out, n = meet(obj, walk.o + walk.d * walk.skip, walk.d, flags, walk.alive)
+    return (si, n_out, n), si.t + walk.skip
 
 
 def _media(obj: TranslucentObject, medium: SurfaceMedium | tuple[()]) -> Media:
@@ -177,9 +309,8 @@ def _step(
     of: tuple[TranslucentObject, Media], k: mi.UInt32, sampler: mi.Sampler, passing: mi.Float, walk: _Walk
 ) -> _Walk:
     """One segment: to the event, or to the boundary and what happens there."""
-    (obj, media), flags = of, mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame
-    si, n_out, n = meet(obj, walk.o + walk.d * walk.skip, walk.d, flags, walk.alive)
-    length = si.t + walk.skip
+    obj, media = of
+    (si, n_out, n), length = _to_boundary(obj, walk)
     W = _contribution(media, walk.length, walk.order, walk.cosine) * walk.inverse_pdf
     T = dr.select(si.is_valid(), dr.exp(-_column(media, 1) * length), 0)
     passing = dr.select(k == 0, passing, dr.sum(W * T) / dr.maximum(dr.sum(W), 1e-30))
@@ -340,18 +471,21 @@ class _Target(NamedTuple):
 
 @dataclass
 class _Way:
-    """Where light of a target passes from the event: the scattering angle, the length inside, and what passes."""
+    """Where light of a target passes from the event: the direction and length inside, and what passes."""
 
-    cosine: mi.Float
+    d: mi.Vector3f
     length: mi.Float
     passed: mi.Float  # over the density of the target; times the trials of `_ways`
 
 
 def _connected(
     context: RenderContext, of: tuple[TranslucentObject, Media], walk: _Walk, weight: mi.Spectrum, sampler: mi.Sampler,
-    active: mi.Bool,
-) -> mi.Spectrum:  # fmt: skip
-    """Light of a sampled emitter that reaches the event, which has a weight, by refraction or one reflection more."""
+    sky: bool, active: mi.Bool,
+) -> list[tuple[mi.Spectrum, mi.Vector3f]]:  # fmt: skip
+    """Light of a sampled emitter that reaches the event, which has a weight, by refraction or one reflection more.
+
+    Of each way the light, without the phase function, and its direction at the event; of the `sky` too if asked for.
+    """
     obj, media = of
     at = place(walk.event, mi.Normal3f(0, 0, 0), walk.medium)
     ds, light = sample_emitter(context, at, sampler.next_2d(), False, active)
@@ -361,19 +495,18 @@ def _connected(
         active = active & (ds.pdf > 0)
         reach = dr.select(distant, opaque(FAR * obj.geometry.size), ds.dist)
         target = _Target(ds, light, walk.event + ds.d * reach, reach, alone)
-        first = active & (alone | mi.Bool(context.connects_sky(obj)))
+        first = active & (alone | mi.Bool(sky))
         if context.lights.some_local or context.suns:
             near = active & alone & _near(obj, walk, target.p, active)
             ways = _ways(context, obj, walk, weight, target, (first, near), sampler)
         else:
             ways = [_way(context, obj, walk, target, refracted_connection(obj, walk.event, target.p, first))]
-    return sum((_light_along(media, weight, target, way) for way in ways), mi.Spectrum(0))
+    return [(_light_along(media, weight, target, way), way.d) for way in ways]
 
 
 def _light_along(media: Media, weight: mi.Spectrum, target: _Target, way: _Way) -> mi.Spectrum:
-    """Light of a target that reaches the event, which has a weight."""
-    phase = _spectrum([eval_hg(way.cosine, g) for _, _, g in media])
-    value = weight * phase * _contribution(media, way.length, mi.UInt32(0), None) * way.passed * target.light
+    """Light of a target that reaches the event, which has a weight, without the phase function."""
+    value = weight * _contribution(media, way.length, mi.UInt32(0), None) * way.passed * target.light
     return dr.select(way.passed > 0, value, 0)
 
 
@@ -388,7 +521,7 @@ def _way(context: RenderContext, obj: TranslucentObject, walk: _Walk, target: _T
     weight_sky = mis_weight(ds.pdf, _phase_pdf(obj, walk, met) * met.T * spread)
     valid &= ~context.scene.ray_test(place(met.p, met.n).spawn_ray_to(target.p), False, valid)
     passed = dr.select(valid, met.T * spread * dr.select(alone, 1, weight_sky), 0)
-    return _Way(dr.dot(walk.event_d, met.d), mi.Float(met.length), passed)
+    return _Way(mi.Vector3f(met.d), mi.Float(met.length), passed)
 
 
 def _phase_pdf(obj: TranslucentObject, walk: _Walk, met: Connection) -> mi.Float:
@@ -508,7 +641,7 @@ def _ways(
         return kind, n, sampler, counted, (straight, p), way, ways
 
     def none() -> _Way:
-        return _Way(mi.Float(0), mi.Float(0), mi.Float(0))
+        return _Way(mi.Vector3f(0, 0, 1), mi.Float(0), mi.Float(0))
 
     seen = _no_connection(), mi.Point3f(0)
     state = (mi.UInt32(0), mi.UInt32(0), sampler, mi.Float(1), seen, none(), [none(), none(), none()])

@@ -316,7 +316,9 @@ def sample_event(
             choice = choose_event(obj, at.si, here)
             if obj.splits:
                 low = dr.select(at.low_only, mi.Float(1), dr.select(at.others_only, 0, choice.low_orders))
-                choice = choice._replace(low_orders=low, reflection=dr.select(at.low_only, 0, choice.reflection))
+                # where the others are gathered, there is nothing to choose against reflection
+                others = choice.reflection if obj.gathered is None else dr.select(at.others_only, 1, choice.reflection)
+                choice = choice._replace(low_orders=low, reflection=dr.select(at.low_only, 0, others))
             choices.append((obj, here, choice))
 
     # ---- light that is known without sampling, then BSDF or reflection
@@ -458,7 +460,7 @@ def _add_gathered(
         ) -> tuple[PathTally]:
             return (context.mode.add(tally, at.throughput * obj.gathered.radiance(out, here)),)
 
-        (tally,) = _where(context, sampler, here, (tally,), known)
+        (tally,) = _where(context, sampler, here & ~at.low_only, (tally,), known)
     return tally
 
 
