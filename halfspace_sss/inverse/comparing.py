@@ -149,6 +149,7 @@ class ViewMisfit(NamedTuple):
     Args:
         loss, variance: of the view, and its variance by noise.
         residual: mean of both renders times the exposure e, less the image.
+        noise: its variance, of all pixels.
         weights: of pixels and channels.
         exposure_slope, exposure_curvature: half the derivatives of the loss by ln e, of Gauss and Newton.
     """
@@ -156,6 +157,7 @@ class ViewMisfit(NamedTuple):
     loss: float
     variance: float
     residual: np.ndarray
+    noise: np.ndarray
     weights: np.ndarray
     exposure_slope: float
     exposure_curvature: float
@@ -233,7 +235,8 @@ class ViewComparison:
         variance = float((np.square(w) * (noise * (np.square(a) + np.square(b)) / 2)).sum()) / n**2
         loss, residual = float((w * a * b).sum() / n), (a + b) / 2
         slope = loss + float((w * T * residual).sum() / n)  # mean w (a + T) b, of independent samples
-        return ViewMisfit(loss, variance, residual, w, slope, float((w * (a + T) * (b + T)).sum() / n))
+        curvature = float((w * (a + T) * (b + T)).sum() / n)
+        return ViewMisfit(loss, variance, residual, noise / 2, w, slope, curvature)
 
     def ends(self, k: int) -> tuple[NoiseFree, NoiseFree | None, list[FittedView]]:
         """The root of the loss of all fitted views, and likewise of views held out (None without any); all views."""

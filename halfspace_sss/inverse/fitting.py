@@ -1,20 +1,22 @@
 """The fit of a homogeneous medium: damped Gauss-Newton steps on images of a scene, by unbiased slopes and loss.
 
-Half the gradient of the loss of a view, see `comparing`, and H of the steps are
+A view keeps the means of what was measured of it: of its render I, of the variables x there, and of the Jacobian J of
+pixels by variables. With weights w and a target T, half the gradient of its loss at x, and H, are
 
-    g = mean w J^T ((I + I') / 2 - T),    H = mean w J^T J',
+    g = mean w J^T (I - T) + H (x - mean of x),    H = mean w J^T J' over different steps,
 
-where the Jacobians J, J' of pixels by variables have samples of their own, so that noise has no bias in any of them.
-J is a running mean over the steps of a view, and H over all steps. Exposures of views are variables too, by their
-logarithms, whose sum is 0: the derivatives of pixels by them are the image. The variables move by -H^-1 g, in the
-second half of the steps by 1, 1/2, 1/3, ... of that, which averages the noise of g (Robbins and Monro 1951). Textures
-are fitted by `textures`.
+so that noise, whose samples are independent, has no bias in any of them. The variables move by -H^-1 g of all views. In
+the first part of the steps a view forgets what was measured far from where the variables are now; later it forgets
+nothing, and the noise of all its samples is averaged. Exposures of views are variables too, by their logarithms, whose
+sum is 0: the derivatives of pixels by them are the image. Textures are fitted by `textures`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -29,8 +31,8 @@ from halfspace_sss.rendering.object.wrapped import surface_of
 from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED, open_scene
 
 STEPS = 30
-SETTLING = 0.5  # part of the steps after which they are averaged
-MEMORY = 0.15  # of J and H, what a step is at least
+SETTLING = 0.5  # part of the steps after which nothing is forgotten
+FAR = 0.15  # change of a variable at which what was measured counts half
 LONGEST = 0.7  # change of a variable in a step
 DAMPED = 1e-3  # of the largest eigenvalue of H, below which it is not trusted
 WALK = "translucent_walk"
@@ -83,6 +85,66 @@ def fit(
     return descent.result()
 
 
+@dataclass(eq=False)
+class ViewMeans:
+    """Weighted means of what was measured of a view in the steps, and sums of squares of their weights.
+
+    Args:
+        weights, image, variance: of all pixels; renders without exposure times weights, and variance of that mean by
+            noise.
+        x: the variables there.
+        product: mean of the product of both renders, by pixel weights.
+        steps: how many the means count for.
+        J: mean Jacobian, (pixels, variables), of as many as `jacobians` counts for.
+        squares: sum of squares of weights times w J^T J, of single Jacobians.
+        share: sum of squares of the weights in J.
+    """
+
+    weights: np.ndarray
+    image: np.ndarray
+    variance: np.ndarray
+    x: np.ndarray
+    product: float
+    steps: float
+    J: np.ndarray
+    squares: np.ndarray
+    jacobians: float = 0.0
+    share: float = 0.0
+
+    @classmethod
+    def none(cls, pixels: int, variables: int) -> ViewMeans:
+        """Before the first step."""
+        image, x, J = np.zeros(pixels), np.zeros(variables), np.zeros((pixels, variables))
+        return cls(image, image, image, x, 0.0, 0.0, J, np.zeros((variables, variables)))
+
+    def forget(self, x: np.ndarray) -> None:
+        """Count less for what is far from x."""
+        kept = 1 / (1 + (np.abs(x - self.x).max() / FAR) ** 4)
+        self.steps, self.jacobians = kept * self.steps, kept * self.jacobians
+
+    def add_jacobian(self, J: np.ndarray, w: np.ndarray) -> None:
+        """Of one step more, with the weights of its pixels."""
+        self.jacobians += 1
+        a = 1 / self.jacobians
+        self.J = self.J + a * (J - self.J)
+        self.squares = (1 - a) ** 2 * self.squares + a**2 * (J * w[:, None]).T @ J
+        self.share = (1 - a) ** 2 * self.share + a**2
+
+    def add_image(self, w: np.ndarray, image: np.ndarray, noise: np.ndarray, product: float, x: np.ndarray) -> None:
+        """Of one step more, at x."""
+        self.steps += 1
+        a = 1 / self.steps
+        self.weights = self.weights + a * (w - self.weights)
+        self.image = self.image + a * (w * image - self.image)
+        self.variance = (1 - a) ** 2 * self.variance + a**2 * w**2 * noise
+        self.product += a * (product - self.product)
+        self.x = self.x + a * (x - self.x)
+
+    def curvature(self) -> np.ndarray:
+        """w J^T J' of different steps."""
+        return ((self.J * self.weights[:, None]).T @ self.J - self.squares) / (1 - self.share)
+
+
 class MediumDescent:
     """Gauss-Newton steps on the variables of a medium.
 
@@ -98,23 +160,26 @@ class MediumDescent:
         self.x = parameters.start()
         n = len(comparison.fitted) if comparison.settings.exposure else 1
         self.free = _of_sum_0(n)  # directions of log exposures, shape (views, views - 1)
-        size = sum(len(_numbers(x)) for x in self.x.values()) + n - 1
-        self.H, self.slopes, self.visits = np.zeros((size, size)), {}, {}  # slopes: the mean Jacobian of each view
-        self.moves = np.zeros((0, size))  # -H^-1 g of the steps that are averaged
+        self.means: dict[int, ViewMeans] = {}
 
     def fingerprint(self) -> str:
         return self.comparison.fingerprint({name: _numbers(x).tolist() for name, x in self.parameters.start().items()})
 
     def state(self) -> dict[str, np.ndarray]:
-        slopes = {f"slopes {which}": J for which, J in self.slopes.items()}
-        x = {f"x {name}": _numbers(x) for name, x in self.x.items()}
-        visits = np.array(list(self.visits.items()))
-        return {"H": self.H, "moves": self.moves, "visits": visits, **slopes, **x}
+        means = {
+            f"view {which} {key}": np.asarray(value)
+            for which, each in self.means.items()
+            for key, value in vars(each).items()
+        }
+        return {**means, **{f"x {name}": _numbers(x) for name, x in self.x.items()}}
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
-        self.H, self.moves = arrays["H"], arrays["moves"]
-        self.visits = dict(arrays["visits"].tolist())
-        self.slopes = {int(key.split()[1]): J for key, J in arrays.items() if key.startswith("slopes ")}
+        kept: dict[int, dict[str, Any]] = {}
+        for key, value in arrays.items():
+            if key.startswith("view "):
+                _, which, name = key.split()
+                kept.setdefault(int(which), {})[name] = value if value.ndim else float(value)
+        self.means = {which: ViewMeans(**each) for which, each in kept.items()}
         for name, x in self.x.items():
             numbers = arrays[f"x {name}"].tolist()
             self.x[name] = self.parameters.clipped(name, type(x)(numbers if len(numbers) > 1 else numbers[0]))
@@ -122,46 +187,51 @@ class MediumDescent:
     # ---- steps
 
     def step(self, k: int) -> FitStep:
-        compared = self.comparison
+        compared, x = self.comparison, np.concatenate([_numbers(each) for each in self.x.values()])
         values = {name: value.tolist() for name, value in self.parameters.shown(self.x).items()}
-        losses, variance, g, H = [], 0.0, 0.0, 0.0
+        losses, variance = [], 0.0
         for which in (views := compared.batch(k)):
             self.parameters.put(self.x)
             misfit = compared.view(which, k)
-            new = self._jacobian(which, k, "slope")
-            before = self.slopes.get(which)
-            if before is None:
-                before = self._jacobian(which, k, "other slope")
-            self.visits[which] = self.visits.get(which, 0) + 1
-            J = before + max(MEMORY, 1 / (self.visits[which] + 1)) * (new - before)
-            gv, Hv = self._normal(which, misfit, J, before, new)
-            g, H = g + gv / len(views), H + Hv / len(views)
-            self.slopes[which] = J
+            self._measure(which, k, misfit, x)
             losses.append(misfit.loss)
             variance += misfit.variance / len(views) ** 2
-        self.H += max(MEMORY, 1 / (k + 1)) * (H - self.H)
-        move = -_solved(self.H, g)
-        move *= min(1.0, LONGEST / max(np.abs(move).max(), 1e-30))
-        later = k - int(SETTLING * self.total)
-        if later >= 0:
-            self.moves = np.vstack([self.moves, move])
-        self._move(move / max(later + 1, 1))
+        g, H = self._normal(x)
+        move = -_solved(H, g)
+        self._move(move * min(1.0, LONGEST / max(np.abs(move).max(), 1e-30)))
         return FitStep(float(np.mean(losses)), float(np.sqrt(variance)), values)
 
-    def _normal(
-        self, which: int, misfit: ViewMisfit, J: np.ndarray, before: np.ndarray, new: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """g and H of a view, by J and by two Jacobians of independent samples; without the exposure e in any."""
+    def _measure(self, which: int, k: int, misfit: ViewMisfit, x: np.ndarray) -> None:
+        """Add a step to the means of a view."""
         compared, e = self.comparison, self.comparison.exposures[which]
         w = misfit.weights.ravel() / compared.count(which)
-        g, H = e * J.T @ (w * misfit.residual.ravel()), e**2 * (before * w[:, None]).T @ new
-        if self.free.size:
-            direction = self.free[compared.fitted.index(which)]
-            image = (misfit.residual + compared.views[which].image).ravel()
-            cross = e * np.outer(J.T @ (w * image), direction)
-            H = np.block([[H, cross], [cross.T, misfit.exposure_curvature * np.outer(direction, direction)]])
-            g = np.append(g, misfit.exposure_slope * direction)
-        return g, (H + H.T) / 2
+        image = (misfit.residual + compared.views[which].image).ravel() / e
+        means = self.means.setdefault(which, ViewMeans.none(len(image), len(x)))
+        if k < SETTLING * self.total:
+            means.forget(x)
+        if means.jacobians < 1:  # little is left for products of different steps
+            means.add_jacobian(self._jacobian(which, k, "other slope"), w)
+        means.add_jacobian(self._jacobian(which, k, "slope"), w)
+        means.add_image(w, image, misfit.noise.ravel() / e**2, misfit.exposure_curvature / e**2, x)
+
+    def _normal(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """g and H of all variables, those of exposures last, at x: means of the views that were met."""
+        n, size = len(x), len(x) + self.free.shape[1]
+        g, H = np.zeros(size), np.zeros((size, size))
+        for which, means in self.means.items():
+            compared, e, moved = self.comparison, self.comparison.exposures[which], x - means.x
+            T, curved = compared.views[which].image.ravel(), means.curvature()
+            by = means.J.T @ means.image
+            g[:n] += e**2 * (by + curved @ moved) - e * means.J.T @ (means.weights * T)
+            H[:n, :n] += e**2 * curved
+            if self.free.size:
+                direction = self.free[compared.fitted.index(which)]
+                bright = e**2 * (means.product + 2 * by @ moved + moved @ curved @ moved)
+                g[n:] += (bright - e * T @ (means.image + means.weights * (means.J @ moved))) * direction
+                H[n:, n:] += bright * np.outer(direction, direction)
+                H[:n, n:] += e**2 * np.outer(by + curved @ moved, direction)
+        H[n:, :n] = H[:n, n:].T
+        return g / len(self.means), H / len(self.means)
 
     def _move(self, move: np.ndarray) -> None:
         at = 0
@@ -195,11 +265,18 @@ class MediumDescent:
         return MaterialFit(values, errors, correlation, medium, fitted, test, exposures, told, self.steps, views)
 
     def _covariance(self, loss: float) -> np.ndarray:
-        """Of the variables: loss H^-1 / n by the images, and the noise of the mean of the last steps."""
+        """Of the variables: loss H^-1 / n by the images, and the noise of the renders."""
+        x = np.concatenate([_numbers(each) for each in self.x.values()])
+        inverse = _solved(self._normal(x)[1], np.eye(len(x) + self.free.shape[1]))
         n = sum(self.comparison.count(which) for which in self.comparison.fitted)
-        by_images = loss * _solved(self.H, np.eye(len(self.H))) / n
-        m = len(self.moves)
-        return by_images + (np.atleast_2d(np.cov(self.moves.T)) / m if m > 1 else 0.0)
+        noise = np.zeros_like(inverse)  # of g
+        for which, means in self.means.items():
+            e = self.comparison.exposures[which]
+            direction = self.free[self.comparison.fitted.index(which)] if self.free.size else np.zeros(0)
+            image = means.image / np.maximum(means.weights, 1e-30)
+            slopes = e**2 * np.hstack([means.J, np.outer(image, direction)])
+            noise += (slopes * means.variance[:, None]).T @ slopes / len(self.means) ** 2
+        return inverse @ (loss * np.eye(len(noise)) / n + noise @ inverse)
 
     def _jacobian(self, which: int, k: int, purpose: str) -> np.ndarray:
         """Derivatives of all pixels by all variables; a channel knows of no other but by g."""
