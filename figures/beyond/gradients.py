@@ -1,0 +1,123 @@
+"""Gradients of an image by the medium of an object, measured: `translucent_walk` beside Mitsuba's `prbvolpath`.
+
+A step is a render, and a pass backwards of the mean of its pixels to the albedo of each channel, under a lamp and a
+dim sky. A boundary of index 1 is `null` for `prbvolpath`, which then connects to lights through it. With v the variance
+of a gradient over its square, mean over channels, and t the CPU seconds of a step, v t is what counts. `prbvolpath`
+leaves out all that is scattered more often than its depth. First steps include compilation, where Dr.Jit's cache has no
+kernels (`DRJIT_CACHE_DIR` may name an empty folder).
+"""
+
+from __future__ import annotations
+
+import time
+from typing import Any, NamedTuple
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from figures.computing.scenes import SCANS, scan_scene
+from halfspace_sss.progress import NamedProgress
+from halfspace_sss.rendering.scenes.mitsuba_scene import medium, with_media
+from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED, load_scene
+
+CASES = {f"{scan}, eta {eta}": (scan, eta) for scan in ("bunny", "dragon") for eta in (1.0, 1.4)}
+DEPTHS = (64, 256)
+MEDIUM = {"albedo": "0.95, 0.89, 0.82", "sigma_t": "2.4"}  # 1/mm
+REPEATS, WALK_REPEATS = 6, 12
+
+
+class Steps(NamedTuple):
+    """Gradients (n, 3) of steps with samples of their own, CPU seconds of one, and of the first."""
+
+    gradients: np.ndarray
+    seconds: float
+    first: float
+
+    @property
+    def mean(self) -> np.ndarray:
+        """Of each channel."""
+        return self.gradients.mean(axis=0)
+
+    @property
+    def variance(self) -> float:
+        """Of a step over the squared gradient, mean over channels."""
+        return float((self.gradients.var(axis=0, ddof=1) / self.mean**2).mean())
+
+    @property
+    def red(self) -> tuple[float, float]:
+        """The gradient by the albedo of the first channel, the largest, and its standard error."""
+        values = self.gradients[:, 0]
+        return float(values.mean()), float(values.std(ddof=1) / np.sqrt(len(values)))
+
+
+def gradient_rows(case: str, size: int, spp: int, seed: int, progress: NamedProgress | None = None) -> list[dict]:
+    """Of each way: the gradient, how far it is below that of the walk, its noise and time.
+
+    Args:
+        case: of `CASES`.
+        size: pixels of the square image.
+        spp: samples a pixel.
+        seed: of all samples.
+        progress: called with (what, done, total).
+    """
+    scan, eta = CASES[case]
+    description = scan_scene(scan, "potato", size)
+    description[scan]["bsdf"] = {"type": "translucent", **MEDIUM, "eta": eta}
+    description["sky"] = {"type": "constant", "radiance": 0.15}
+    unit = SCANS[scan].mm_per_unit
+    description["integrator"] = {"type": "translucent_walk", "mm_per_unit": unit}
+    ways: dict[str, Any] = {"walk": lambda: load_scene(description, PATH_TRACED)}
+    for depth in DEPTHS:
+        prb = {"type": "prbvolpath", "max_depth": depth}
+        ways[f"prbvolpath, depth {depth}"] = lambda prb=prb: as_media(description, scan, unit, prb)
+    rows, walk = [], None
+    for k, (way, made) in enumerate(ways.items()):
+        if progress:
+            progress(f"{case}, {way}", k, len(ways))
+        found = _steps(made(), spp, REPEATS if walk else WALK_REPEATS, seed)
+        walk = walk or found
+        (g, error), (of_walk, its_error) = found.red, walk.red
+        below = 1 - g / of_walk
+        rows.append({
+            "case": case, "way": way, "gradient R": g, "below the walk, %": 100 * below,
+            "±": 100 * (1 - below) * float(np.hypot(error / g, its_error / of_walk)) if found is not walk else 0.0,
+            "noise of a step, %": 100 * found.variance**0.5, "CPU s a step": found.seconds,
+            "first step, CPU s": found.first,
+            "time for equal noise": found.variance * found.seconds / (walk.variance * walk.seconds),
+        })  # fmt: skip
+    return rows
+
+
+def as_media(scene: dict[str, Any], name: str, mm_per_unit: float, integrator: dict[str, Any]) -> mi.Scene:
+    """`with_media`, but that the boundary of an object of index 1 is `null`.
+
+    Args:
+        scene: for `mitsuba.load_dict`, that shows its emitters: depths are others than of a refracting boundary.
+        name: of the object.
+        mm_per_unit: length of a scene unit, mm.
+        integrator: of Mitsuba.
+    """
+    if scene[name]["bsdf"]["eta"] != 1:
+        return with_media(scene, mm_per_unit, integrator)
+    inside = medium(mi.load_dict(scene[name]["bsdf"]).inside, mm_per_unit)
+    shape = {**scene[name], "bsdf": {"type": "null"}, "interior": inside}
+    return mi.load_dict({**scene, name: shape, "integrator": integrator})
+
+
+def _steps(scene: mi.Scene, spp: int, repeats: int, seed: int) -> Steps:
+    parameters = mi.traverse(scene)
+    key = next(k for k in parameters.keys() if k.endswith(("bsdf.albedo", "albedo.value.value")))
+    gradients, seconds = [], []
+    for k in range(repeats + 1):  # the first compiles
+        seeds = np.random.SeedSequence([seed, k]).generate_state(2)
+        value = type(parameters[key])(dr.detach(parameters[key]))
+        at = time.process_time()
+        dr.enable_grad(value)
+        parameters[key] = value
+        parameters.update()
+        image = mi.render(scene, parameters, spp=spp, seed=int(seeds[0]), seed_grad=int(seeds[1]))
+        dr.backward(dr.mean(image, axis=None))
+        gradients.append(np.ravel(np.array(dr.grad(parameters[key]), dtype=float)))
+        seconds.append(time.process_time() - at)
+    return Steps(np.array(gradients), float(np.median(seconds[1:])), seconds[0])
