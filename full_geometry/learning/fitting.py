@@ -459,6 +459,7 @@ def _inverse(mean: torch.Tensor) -> torch.Tensor:
 # know the fit, so that E[T phi] is over all walks that it has seen. r keeps small what these do not tell.
 
 RIDGE = 1e6  # times 1/n of walks and of proposals, effective numbers, is r over the diagonal of H
+SMALLEST = 1e-8  # of the diagonal of H; terms below tell nothing, and would get coefficients beyond all bounds
 SAMPLE = 2**14  # pairs that H is taken over
 COLUMNS = 8192  # columns at once
 
@@ -507,7 +508,7 @@ class Ends:
         c = torch.zeros_like(lit)
         for k in torch.nonzero((self.of_V[0] > 0) & (self.of_T[0] > 0))[:, 0].tolist():
             H = self.curve[k].double()
-            scale = H.diagonal().clamp_min(1e-12).rsqrt()
+            scale = H.diagonal().clamp_min(SMALLEST).rsqrt()
             H = H * scale[:, None] * scale
             H += torch.diag(H.new_full((len(H),), RIDGE * float(noise[k])))
             light = self.of_V[0, k] / self.proposed

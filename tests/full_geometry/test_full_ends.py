@@ -57,6 +57,17 @@ def test_what_few_walks_do_not_tell_is_left_as_it_is() -> None:
     assert found.std() < 0.5 * asked.std()
 
 
+def test_a_feature_that_hardly_varies_has_bounded_coefficients(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ends, "RIDGE", 10.0)
+    x, rng = features(2**12, 0), np.random.default_rng(2)
+    x[[3, N + 3]] = 5e-7 * rng.standard_normal((2, x.shape[1]))
+    sums = Ends(1, N, torch.device("cpu"))
+    T = torch.from_numpy(rng.exponential(size=(1, x.shape[1])).astype(np.float32))
+    sums.add_walks(torch.from_numpy(x), T, x.shape[1])
+    sums.add_proposals(torch.from_numpy(x), torch.ones(1, x.shape[1]))
+    assert np.abs(sums.solved()).max() < 20
+
+
 def test_units_of_light_do_not_count() -> None:
     assert np.allclose(solved(2**13)[1], solved(2**13, scale=1e-6)[1], rtol=1e-3, atol=1e-4)
 
