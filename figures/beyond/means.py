@@ -34,7 +34,7 @@ class Testing:
 
     models: tuple[str, ...]
     samples: int = 10**7
-    size: int = 32
+    size: int = 64
     passes: int = 40
     seconds: float = 12.0
     seed: int = 0
@@ -45,15 +45,17 @@ def means(
 ) -> pandas.DataFrame:
     """For each model the mean over the object with the control variate over that without, and z-values.
 
-    Orders from two on, as the others have no control variate. With the means m_k of the images of either kind,
-    z = (m_1 - m_0) / sqrt(s_1² + s_0²), s² their variance over their number. Light that is gathered for an image is in
-    all its pixels, and so in s.
+    Orders from two on, as the others have no control variate. With the difference d_k of two images of the same seed,
+    z = mean(d) / sqrt(variance(d) / passes). Light that is gathered for an image is in all its pixels, and so in d_k.
 
     Args:
         case: an object in its light.
         how: it is tested.
         folder: for weights and meshes.
         progress: called with what, done and all.
+
+    Raises:
+        ValueError: the images are too small for a control variate to pay, so that there is none.
     """
     prepare()
     spp, total, rows = max(how.samples // (2 * how.passes * how.size**2), 1), len(how.models) * how.passes, []
@@ -67,28 +69,28 @@ def means(
             inside, images = cover(scenes[0]) > 0.999, []
             for n in range(how.passes):
                 progress(model, k * how.passes + n, total)
-                images.append([rendered(scene, spp, how.seed, k, n, i)[0][inside] for i, scene in enumerate(scenes)])
+                images.append([rendered(scene, spp, how.seed, k, n)[0][inside] for scene in scenes])
+            if all((one == other).all() for one, other in images):
+                raise ValueError(f"size must be larger for a control variate of {model} to pay, got {how.size}")
         rows.append({"model": model, **_compared(np.array(images, dtype=np.float64))})
     return pandas.DataFrame(rows)
 
 
 def _compared(images: np.ndarray) -> dict[str, Any]:
     """Of (passes, kinds, pixels, channels): ratios of means, z of each channel, and those of pixels."""
-    whole, (z, error) = images.mean(axis=2), _z(images.mean(axis=2))
-    pixels = _z(images)[0]
-    m = whole.mean(axis=0)
-    variance = images.var(axis=0, ddof=1).mean(axis=(1, 2))
+    mean, variance = images.mean(axis=(0, 2)), images.var(axis=0, ddof=1).mean(axis=(1, 2))
+    difference = images[:, 1] - images[:, 0]
+    (z, error), pixels = _z(difference.mean(axis=1)), _z(difference)[0]
     found: dict[str, Any] = {}
-    for c in range(len(z)):
-        found |= {f"ratio {c}": m[1, c] / m[0, c], f"± {c}": error[c] / m[0, c], f"z {c}": z[c]}
-    beyond = np.abs(pixels) > 2
+    for c, of_one in enumerate(mean[0]):
+        found |= {f"ratio {c}": mean[1, c] / of_one, f"± {c}": error[c] / of_one, f"z {c}": z[c]}
     return {
         **found, "variance, with over without": variance[1] / variance[0], "pixels x channels": pixels.size,
-        "of |z| > 2": float(beyond.mean()), "largest |z|": float(np.abs(pixels).max()),
+        "of |z| > 2": float(np.mean(np.abs(pixels) > 2)), "largest |z|": float(np.abs(pixels).max()),
     }  # fmt: skip
 
 
-def _z(images: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """z of the second kind against the first, and the standard error of the difference, over passes."""
-    mean, error = images.mean(axis=0), np.sqrt(images.var(axis=0, ddof=1).sum(axis=0) / len(images))
-    return (mean[1] - mean[0]) / np.maximum(error, 1e-30), error
+def _z(difference: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """z of the mean over passes, and its standard error."""
+    error = difference.std(axis=0, ddof=1) / np.sqrt(len(difference))
+    return difference.mean(axis=0) / np.maximum(error, 1e-30), error

@@ -91,7 +91,7 @@ def means_command(
     samples: Annotated[
         int, typer.Option(help="Of all pixels, with and without together, of each model.", parser=whole)
     ] = 10**7,
-    size: Annotated[int, typer.Option(help="Pixels of the square images.", parser=whole)] = 32,
+    size: Annotated[int, typer.Option(help="Pixels of the square images.", parser=whole)] = 64,
     seconds: Annotated[float, typer.Option(help="CPU time of the training of full_geometry.")] = 12.0,
     seed: Annotated[int, typer.Option(help="Seed of all renders.", parser=whole)] = 0,
     out: OutFolder = Path("means"),
