@@ -15,6 +15,7 @@ from pathlib import Path
 import psutil
 import pytest
 
+import halfspace_sss
 from halfspace_sss import Medium, executors, make_maps
 from halfspace_sss.backend import BackendError, cores
 from halfspace_sss.executors import completed, waves
@@ -94,7 +95,7 @@ def test_two_processes_share_the_cores_and_give_the_bits_of_one(tmp_path: Path) 
 
 
 @pytest.mark.slow
-def test_workers_of_dask_give_the_bits_of_one_process(tmp_path: Path) -> None:
+def test_workers_of_dask_give_the_bits_of_one_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     here = make_maps(MEDIA, tmp_path / "here", **HOW)
     with executors.scheduler("local") as executor:
         there = make_maps(MEDIA, tmp_path / "there", executor=executor, **HOW)
@@ -102,6 +103,10 @@ def test_workers_of_dask_give_the_bits_of_one_process(tmp_path: Path) -> None:
         assert load_maps(there[name]).S.equals(load_maps(here[name]).S)
     with dask(threads=2) as address:
         with pytest.raises(ValueError, match="must run one part at a time .* got 2 threads"):
+            with executors.scheduler(address):
+                pass
+        monkeypatch.setattr(halfspace_sss, "__version__", "0.0.1")  # of this process, not of its workers
+        with pytest.raises(ValueError, match="worker .* must have halfspace-sss 0.0.1, got"):
             with executors.scheduler(address):
                 pass
 

@@ -297,7 +297,7 @@ def train_by_cpu(
 def train_by_chunks(
     obj: TranslucentObject, chunks: int, folder: str | Path, *, seed: int = 0, recipe: Recipe = STANDARD
 ) -> tuple[storing.Learnt, Path]:
-    """Learn an object by so many chunks of data, with the same weights whatever the number of threads.
+    """Learn an object by so many chunks of data, so that the clock has no part in the weights.
 
     Args:
         obj, folder, seed, recipe: as in `train_by_cpu`.
