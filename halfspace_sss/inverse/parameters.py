@@ -11,6 +11,7 @@ import numpy as np
 
 from halfspace_sss.checks import check_choice
 from halfspace_sss.interface.model import bssrdf
+from halfspace_sss.neural.universal import Neural
 from halfspace_sss.rendering.object.half_space import Variation
 from halfspace_sss.rendering.object.objects import KnowsUnit, translucent_shapes
 from halfspace_sss.rendering.object.registry import lookup
@@ -59,8 +60,11 @@ def check_derivatives(integrator: mi.Integrator, shape: mi.Shape, names: Sequenc
     if not lookup(model).of_half_space:
         raise ValueError(f"model must have derivatives by the medium, got {model!r}: {known}")
     if inside.textured is not None:
-        if bssrdf(model, inside.channels()[0]).checksums:
-            raise ValueError(f"model must have derivatives by textures, got {model!r}: analytic models have them")
+        made = bssrdf(model, inside.channels()[0])
+        if made.checksums and not isinstance(made, Neural):
+            raise ValueError(
+                f"model must have derivatives by textures, got {model!r}: analytic models and neural have them"
+            )
         if "g" in names:
             raise ValueError(f"g must not be fitted beside textures by {model!r}: translucent_walk has its derivative")
         return

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from test_translucent_walk import WIDEST_Z_OF_RUNS, _lamp, _runs, _scene, _small_lamp, _z
 
-from halfspace_sss import Medium
+from halfspace_sss import Medium, bssrdf, measure
 from halfspace_sss.neural import material_model, paper_model, store
 from halfspace_sss.rendering.object.objects import make_objects
 from halfspace_sss.rendering.object.points import SurfacePoint
@@ -63,6 +63,24 @@ def test_a_white_texture_without_absorption_is_invisible_in_uniform_light() -> N
     with pytest.warns(UserWarning, match="4 of 4 texels of reflectance are above"):
         image = mi.render(mi.load_dict(_scene(surface)), spp=16, seed=1).numpy()
     np.testing.assert_allclose(image, 1, rtol=1e-5)
+
+
+@pytest.mark.parametrize("model", ["better_dipole", "standard_dipole", pytest.param("neural", marks=pytest.mark.slow)])
+def test_a_white_texture_sends_the_energy_of_the_model(model: str) -> None:
+    """To 0.5 %: along the normal under even light F_r(1) + R(1) of the half-space, as these models are reciprocal."""
+    half, at = 400.0, mi.ScalarTransform4f()
+    view = at.look_at([0, 0, 2 * half], [0, 0, 0], [0, 1, 0]) @ at.scale([0.25 * half, 0.25 * half, 1])
+    white = {"albedo": _texels("1,1,1", "0.999999,0.999999,0.999999"), "sigma_t": 1.0, "eta": 1.4, "model": model}
+    scene = {
+        "type": "scene",
+        "integrator": {"type": "bssrdf"},
+        "sensor": {"type": "orthographic", "to_world": view, "film": {"type": "hdrfilm", "width": 32, "height": 32}},
+        "sky": {"type": "constant", "radiance": 1.0},
+        "block": {"type": "cube", "to_world": at.scale(half), "bsdf": {"type": "translucent", **white}},
+    }
+    image = mi.render(mi.load_dict(scene), spp=256, seed=1).numpy()
+    own = measure.reflectance(bssrdf(model, Medium.from_albedo(1.0, 1.0, 0.0, 1.4)), 1.0, "total")
+    assert image.mean() == pytest.approx(float(own) + (0.4 / 2.4) ** 2, rel=5e-3)
 
 
 TAKING = [

@@ -441,14 +441,13 @@ class TranslucentObject:
         self.variation.prepare()
         if self.geometry.contents is not None:
             self.geometry.contents.check_held()
-        analytic = isinstance(self.transport, PaletteTransport) and not self.transport.checksums
-        if self.textured is None or self.transport is None or analytic:
+        if self.textured is None or self.transport is None or isinstance(self.transport, PaletteTransport):
             return
         with dr.resume_grad():
             if self.textured.is_followed(self.geometry.shape):
                 raise ValueError(
                     f"textures must not have gradients enabled under {self.surface.inside.model!r}, got some of object "
-                    f"{self.geometry.name}: analytic models have derivatives by them"
+                    f"{self.geometry.name}: models of the half-space have derivatives by them"
                 )
 
     def is_current(self) -> bool:

@@ -59,7 +59,7 @@ NODES = 32  # over all albedos
 LEAST = 1e-4  # albedo that stands for less at nodes
 MOST = 1 - 1e-6  # above which S has no derivative by it, as dv is infinite
 SLOPED = ("albedo", "sigma_t")
-STEP = 0.01  # of ln sigma_t, for its slope
+STEP, V_STEP = 0.01, 2e-3  # of ln sigma_t and v, for slopes
 SEEN = 0.7  # cosine at which reflectances of nodes are known
 SAME = 1e-4  # of ln sigma_t, and of the way from node to node: media that differ less are asked once
 FAINT = 1e-35  # of S, below which it is interpolated itself
@@ -133,7 +133,9 @@ class Palette:
             covered = albedos[:, sharing]
             ends = np.clip([covered.max(), covered.min()], LEAST, 1.0) if learnt else (1.0, LEAST)
             low, high = (math.sqrt(x_of_albedo(np, a, m.g, bend(m.g))) for a in ends)
-            nodes = _albedo_of_v(np.linspace(low, high, NODES + 1), m.g) if high > low else np.full(NODES + 1, ends[0])
+            if learnt:  # so that slopes are known at the ends
+                low, high = max(low - 2 * V_STEP, 0.0), high + 2 * V_STEP
+            nodes = np.clip(_albedo_of_v(np.linspace(low, high, NODES + 1), m.g, bend(m.g)), LEAST / 10, 1)
             rows.append(NodeRange(len(models), NODES, low, (high - low) / NODES))
             models += [bssrdf(name, Medium.from_albedo(float(a), 1.0, m.g, m.eta)) for a in nodes]
             if learnt:
@@ -148,14 +150,12 @@ class Palette:
     def S(self, ends: Sequence[SurfaceMedium], query: tuple[mi.Float, ...], active: mi.Bool) -> mi.Spectrum:
         """sqrt(S_o S_i) of the media at both ends, or S of one, at a query in scene units, 1/((scene unit)² sr).
 
-        With derivatives by the media where they are followed; not by networks.
+        With derivatives by the media where they are followed.
         """
-        if self.networks:
-            with dr.suspend_grad():
-                return self._of_networks(ends, query, active)
         by_albedo, by_sigma_t = (any(dr.grad_enabled(getattr(end, key)) for end in ends) for key in SLOPED)
         with dr.suspend_grad():
-            result, slopes = self._at_ends(ends, query, by_albedo, by_sigma_t, active)
+            ask = self._of_networks if self.networks else self._at_ends
+            result, slopes = ask(ends, query, by_albedo, by_sigma_t, active)
         if not (by_albedo or by_sigma_t):
             return result
         change = [mi.Float(0) for _ in self.rows]
@@ -251,38 +251,51 @@ class Palette:
     def _over_power(self, model: BSSRDF, query: Sequence[mi.Float]) -> mi.Float:
         return model.eval(*query) * opaque(float(model.medium.albedo) ** -self.power)
 
-    def _of_networks(self, ends: Sequence[SurfaceMedium], query: tuple[mi.Float, ...], active: mi.Bool) -> mi.Spectrum:
-        """S by networks, in a loop over channels and, where extinction varies, over ends.
+    def _of_networks(
+        self, ends: Sequence[SurfaceMedium], query: tuple[mi.Float, ...], by_albedo: bool, by_sigma_t: bool,
+        active: mi.Bool,
+    ) -> tuple[mi.Spectrum, list[Slope]]:  # fmt: skip
+        """As `_at_ends` by networks, in a loop over channels and, where extinction varies, over ends.
 
         Of ends of the same extinction the query is the same, so that networks are asked once.
         """
         n, tables, passes = len(self.rows), self._tables(), 1 if self.alike else len(ends)
+        lanes = dr.width(query[0])
         lib, args = broadcast_query(*query)
         across = Query(lib, *args, opaque(float(self.models[0].medium.eta)))
         transmitted = F_t(across.mu_i, across.index) * F_t(across.mu_o, across.index)
 
-        def step(k: mi.UInt32, result: mi.Spectrum) -> tuple[mi.UInt32, mi.Spectrum]:
+        def step(k: mi.UInt32, result: mi.Spectrum, slopes: list[Slope]) -> tuple[mi.UInt32, mi.Spectrum, list[Slope]]:
             c, first, needed, root = k % n, k < n, active, mi.Float(1)
             numbers = [dr.gather(mi.Float, table, c) for table in tables]
             media = [[_pick(getattr(end, key), c) for key in SLOPED] for end in ends]
             if passes > 1:
-                needed = active & (first | _differ(*media, numbers))
+                needed = active & (first | _differ(*media, numbers) | (len(slopes) > 0))
                 media, root = [[dr.select(first, a, b) for a, b in zip(*media)]], _pick(result, c)
 
-            def ask(root: mi.Float) -> tuple[mi.Float]:
+            def ask(root: mi.Float, new: list[Slope]) -> tuple[mi.Float, list[Slope]]:
                 q, root = replace(across, r=across.r * media[0][1]), mi.Float(1)
                 phi = self._functions(q, mi.UInt32(numbers[0]))
                 for albedo, sigma_t in media:
-                    log_factor = self._log_factor(phi, albedo, numbers)
-                    S = dr.square(albedo * sigma_t) * transmitted * shape_over_power(q, albedo, numbers[4], log_factor)
+                    S = dr.square(albedo * sigma_t) * transmitted * self._shape(q, phi, albedo, numbers)
                     root *= S if len(ends) == 1 else dr.sqrt(S)
-                return (root,)
+                if new:
+                    new = self._slopes(q, phi, [albedo for albedo, _ in media], numbers, by_sigma_t)
+                return root, new
 
-            (root,) = dr.if_stmt((root,), needed, ask, lambda root: (root,), label="networks")
-            return k + 1, mi.Spectrum([dr.select(c == j, value * root, value) for j, value in enumerate(result)])
+            new = [dr.zeros(Slope, lanes) for _ in (media if slopes else ())]
+            root, new = dr.if_stmt((root, new), needed, ask, lambda *state: state, label="networks")
+            both = len(new) > 1  # ends at once
+            slopes = [
+                dr.select(k == j - n * (both and j >= n), new[both and j >= n], old) for j, old in enumerate(slopes)
+            ]
+            product = mi.Spectrum([dr.select(c == j, value * root, value) for j, value in enumerate(result)])
+            return k + 1, product, slopes
 
-        start = mi.UInt32(0) + dr.zeros(mi.UInt32, dr.width(query[0])), dr.full(mi.Spectrum, 1, dr.width(query[0]))
-        return dr.while_loop(start, lambda k, _: active & (k < passes * n), step, label="ends and channels")[1]
+        slopes = [dr.zeros(Slope, lanes) for _ in range(2 * n)] if by_albedo or by_sigma_t else []
+        start = mi.UInt32(0) + dr.zeros(mi.UInt32, lanes), dr.full(mi.Spectrum, 1, lanes), slopes
+        count = passes * n
+        return dr.while_loop(start, lambda k, *_: active & (k < count), step, label="ends and channels")[1:]
 
     def _functions(self, q: Query, first: mi.UInt32) -> list[mi.Float]:
         """phi of the networks of the row that begins with a node."""
@@ -297,10 +310,30 @@ class Palette:
             values = dr.if_stmt(values, first == number, ask, lambda *values: values, label="networks of a row")
         return list(values)
 
-    def _log_factor(self, phi: list[mi.Float], albedo: mi.Float, numbers: list[mi.Float]) -> mi.Float:
+    def _shape(self, q: Query, phi: list[mi.Float], albedo: mi.Float, numbers: list[mi.Float]) -> mi.Float:
+        """S / albedo² without transmittances, for sigma_t = 1."""
         node, f = _node(dr.clip(albedo, 0, 1), numbers)
         low, high = (dr.gather(mi.Vector4f, self._coefficients, node + j) for j in (0, 1))
-        return phi[0] + sum(c * value for c, value in zip(dr.lerp(low, high, f), phi[1:]))
+        log_factor = phi[0] + sum(c * value for c, value in zip(dr.lerp(low, high, f), phi[1:]))
+        return shape_over_power(q, albedo, numbers[4], log_factor)
+
+    def _slopes(
+        self, q: Query, phi: list[mi.Float], albedos: list[mi.Float], numbers: list[mi.Float], by_sigma_t: bool
+    ) -> list[Slope]:
+        """Of media at one query, by differences."""
+        results, sides = [], []
+        if by_sigma_t:
+            queries = [replace(q, r=q.r * factor) for factor in (1 + STEP, 1 - STEP)]
+            sides = [(side, self._functions(side, mi.UInt32(numbers[0]))) for side in queries]
+        for albedo in albedos:
+            v = _v(dr.clip(albedo, LEAST, 1), *numbers[4:])
+            at = [self._shape(q, phi, _albedo_of_v(v + h, *numbers[4:]), numbers) for h in (V_STEP, -V_STEP)]
+            slope = Slope(0.25 / V_STEP * (_log(at[0]) - _log(at[1])), mi.Float(0))
+            if by_sigma_t:
+                ahead, behind = (_log(self._shape(side, of, albedo, numbers)) for side, of in sides)
+                slope.by_log_sigma_t = 1 + 0.25 / STEP * (ahead - behind)
+            results.append(slope)
+        return results
 
     @cached_property
     def _coefficients(self) -> mi.Float:
@@ -344,8 +377,8 @@ def _pick(values: mi.Spectrum, c: mi.UInt32) -> mi.Float:
     return value
 
 
-def _albedo_of_v(v: np.ndarray, g: float) -> np.ndarray:
-    x, c = v * v, bend(g)
+def _albedo_of_v(v: Any, g: Any, c: Any) -> Any:
+    x = v * v
     s2 = (x / (c + (1 - c) * x)) ** 2
     return (1 - s2) / (1 - g * s2)
 
