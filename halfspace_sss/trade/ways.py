@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -11,9 +10,8 @@ import mitsuba as mi
 from halfspace_sss.checks import check_choice
 from halfspace_sss.interface.model import model_class, models
 from halfspace_sss.rendering.light.small_emitters import is_delta
-from halfspace_sss.rendering.object.objects import KnowsUnit, millimetres, translucent_shapes
+from halfspace_sss.rendering.object.objects import KnowsUnit, millimetres, refuse_instances, translucent_shapes
 from halfspace_sss.rendering.object.registry import AUTO, model_names
-from halfspace_sss.rendering.object.shape import is_instance
 from halfspace_sss.rendering.paths.gathering import Gathering
 from halfspace_sss.rendering.paths.integrator import is_bssrdf
 from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED, load_objects
@@ -147,14 +145,8 @@ def stage(scene: Any, parameters: dict[str, str] | None = None) -> Stage:
         raise ValueError("the scene must have an object with a translucent BSDF, got none")
     if not loaded.sensors():
         raise ValueError("the scene must have a sensor, got none")
-    _check_instances(shapes)
+    refuse_instances(loaded, shapes, "the trade")
     return Stage(loaded, shapes, *_settings(loaded))
-
-
-def _check_instances(shapes: Sequence[Any]) -> None:
-    for shape in shapes:
-        if is_instance(shape):
-            raise ValueError(f"a translucent object must not be an instance, got {shape.id()!r}")
 
 
 def _settings(scene: Any) -> tuple[dict[str, Any], dict[str, Any]]:

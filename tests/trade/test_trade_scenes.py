@@ -139,7 +139,7 @@ def test_an_object_behind_another_is_refused_in_a_sentence() -> None:
 def test_an_instance_is_refused_in_a_sentence() -> None:
     group = {"type": "shapegroup", "ball": scene()["ball0"]}
     instanced = {**scene(), "group": group, "one": {"type": "instance", "g": {"type": "ref", "id": "group"}}}
-    with pytest.raises(ValueError, match="a translucent object must stand in the scene itself"):
+    with pytest.raises(ValueError, match="must be no instances for the trade, got the shape 'ball' in a shapegroup"):
         assess(instanced, models=FEW, **QUICK)
 
 

@@ -293,8 +293,14 @@ def geometry_of(shape: mi.Shape) -> tuple[list, list]:
             kept.append(dr.detach(value))
             results.append((key, dr.detail.collect_indices(kept[-1])))
         elif key == "to_world":
-            results.append((key, np.array(dr.detach(value).matrix).tobytes()))
+            results.append((key, matrix_of(value).tobytes()))
     return results, kept
+
+
+def matrix_of(to_world: mi.Transform4f) -> np.ndarray:
+    """The matrix (4, 4) of a transformation, read number by number: as one array it would take a kernel."""
+    matrix = dr.detach(to_world).matrix
+    return np.array([[matrix[row, column][0] for column in range(4)] for row in range(4)], dtype=float)
 
 
 def state_of(node: mi.Object) -> tuple[list, list]:
@@ -362,7 +368,7 @@ def crossings(scene: mi.Scene, ray: mi.Ray3f, votes: _Votes | None = None) -> tu
     """Side of the first hit of each ray (1: the normal points to the ray, 0: no hit) and the number of hits."""
 
     def step(ray: mi.Ray3f, side: Any, count: Any, active: mi.Bool) -> tuple:
-        si = scene.ray_intersect(ray, mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame, False, active)
+        si = meet_alone(scene, ray, mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame, active)
         active &= si.is_valid()
         first = dr.select(dr.dot(si.n, ray.d) < 0, 1.0, -1.0)
         if votes is not None:
@@ -376,17 +382,61 @@ def crossings(scene: mi.Scene, ray: mi.Ray3f, votes: _Votes | None = None) -> tu
     return dr.while_loop(state, lambda ray, side, count, active: active, step, label="crossings")[1:3]
 
 
+def meet_alone(scene: mi.Scene, ray: mi.Ray3f, flags: int, active: mi.Bool | bool = True) -> mi.SurfaceInteraction3f:
+    """What a ray meets in a scene of one shape, by the function of this shape.
+
+    Mitsuba would have functions of all shapes that exist in the kernel, those of other scenes too; of a thousand
+    instances that takes minutes.
+    """
+    (shape,) = (each for each in scene.shapes()) if len(scene.shapes()) == 1 else (None,)
+    if shape is None or is_instance(shape):
+        return scene.ray_intersect(ray, flags, False, active)
+    hit = scene.ray_intersect_preliminary(ray, False, active=active)
+    active = active & hit.is_valid()
+    si = shape.compute_surface_interaction(ray, hit, flags, active)
+    si.shape = dr.select(active, mi.ShapePtr(shape), None)
+    return completed(si, hit, ray, flags, active)
+
+
+def completed(
+    si: mi.SurfaceInteraction3f, hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, flags: int, active: mi.Bool
+) -> mi.SurfaceInteraction3f:
+    """An interaction with what no shape knows: the distance, the direction to the ray's origin and the tangents."""
+    si.t, si.prim_index = dr.select(active, hit.t, dr.inf), hit.prim_index
+    si.time, si.wavelengths = ray.time, ray.wavelengths
+    if flags & mi.RayFlags.ShadingFrame:
+        si.initialize_sh_frame()
+    si.wi = dr.select(active, si.to_local(-ray.d), -ray.d)
+    return si
+
+
+FEW, MANY = 3, 65  # rays from a point, which decide where they agree, and where they do not
+
+
 def is_inside(geometry: Geometry, points: Any) -> np.ndarray:
     """Which points (array of shape (3, n)) lie inside a closed object, by the parity of the hits of rays from them."""
-    points = np.asarray(points, dtype=float)
+    points, box = np.asarray(points, dtype=float), geometry.scene.bbox()
+    result = np.zeros(points.shape[1], dtype=bool)
     if not geometry.closed:
-        return np.zeros(points.shape[1], dtype=bool)
-    along = np.random.default_rng(11).standard_normal((3, 65))
+        return result
+    low, high = (np.reshape(np.array(end, dtype=float), (3, 1)) for end in (box.min, box.max))
+    near = np.flatnonzero(((points >= low) & (points <= high)).all(axis=0))
+    share = _odd_share(geometry, points[:, near], FEW)
+    result[near] = share > 0.5
+    doubtful = near[(share > 0) & (share < 1)]
+    result[doubtful] = _odd_share(geometry, points[:, doubtful], MANY) > 0.5
+    return result
+
+
+def _odd_share(geometry: Geometry, points: np.ndarray, n: int) -> np.ndarray:
+    """The share of n rays from each point that meet the object an odd number of times."""
+    if not points.shape[1]:
+        return np.zeros(0)
+    along = np.random.default_rng(11).standard_normal((3, n))
     along /= np.linalg.norm(along, axis=0)
-    start = np.repeat(points, along.shape[1], axis=1)
-    ends = np.tile(along, points.shape[1])
+    start, ends = np.repeat(points, n, axis=1), np.tile(along, points.shape[1])
     _, count = crossings(geometry.scene, mi.Ray3f(mi.Point3f(start), mi.Vector3f(ends)))
-    return (np.array(count) % 2).reshape(-1, along.shape[1]).mean(axis=1) > 0.5
+    return (np.array(count) % 2).reshape(-1, n).mean(axis=1)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -443,16 +493,21 @@ def groups_of(scene: mi.Scene) -> list[mi.Shape]:
 
 def rays_into(box: mi.ScalarBoundingBox3f, n: int) -> Any:
     """Rays from about a bounding box to places in it."""
-    low, high = np.array(box.min, dtype=float), np.array(box.max, dtype=float)
-    centre, radius = 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low))
+    ends = (np.array(end, dtype=float).reshape(1, 3) for end in (box.min, box.max))
+    (start,), (along,) = ways_into(*ends, n)
+    return mi.Ray3f(mi.Point3f(start), mi.Vector3f(along))
+
+
+def ways_into(low: np.ndarray, high: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Origins and directions of such rays for boxes with the corners (m, 3): shapes (m, 3, n)."""
+    centre, radius = 0.5 * (low + high), 0.5 * np.linalg.norm(high - low, axis=1)[:, None, None]
     rng = np.random.default_rng(7)
     ends = rng.standard_normal((2, 3, n))
     ends /= np.linalg.norm(ends, axis=1, keepdims=True)
-    start = centre[:, None] + 1.1 * radius * ends[0]
-    target = centre[:, None] + 0.9 * radius * ends[1] * rng.random(n) ** (1 / 3)
+    start = centre[:, :, None] + 1.1 * radius * ends[0]
+    target = centre[:, :, None] + 0.9 * radius * ends[1] * rng.random(n) ** (1 / 3)
     along = target - start
-    along /= np.linalg.norm(along, axis=0)
-    return mi.Ray3f(mi.Point3f(start), mi.Vector3f(along))
+    return start, along / np.linalg.norm(along, axis=1, keepdims=True)
 
 
 def check_together(world: mi.Scene, scenes: list[Any]) -> None:
@@ -475,7 +530,11 @@ def check_together(world: mi.Scene, scenes: list[Any]) -> None:
     together = [_met(scene, ray) for scene, ray in zip(tried, rays)]
     dr.eval(together)
     for scene, by_itself, beside in zip(tried, alone, map(np.array, together)):
-        own = [0, *(int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0]) for shape in scene.shapes())]
+        shapes = scene.shapes()
+        if any(map(is_instance, shapes)):
+            nodes = [node for group in groups_of(scene) for node in mi.traverse(group).hierarchy]
+            shapes = [*shapes, *(node for node in nodes if isinstance(node, mi.Shape))]
+        own = [0, *(int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0]) for shape in shapes)]
         if (by_itself != beside).any() or (scene is not world and not np.isin(beside, own).all()):
             raise RuntimeError(
                 "rays of objects and of the scene around them must be traced by one kernel, got some lost"

@@ -125,7 +125,7 @@ class SubpathConnections:
         p, k, m = event.p, event.object, event.m
         ray = mi.Ray3f(p, w_0)
         ray.maxt = DEEPEST / dr.min(m.mean_t)
-        si = self.media.scene.ray_intersect(ray, mi.RayFlags.Minimal, coherent=False)
+        si = self.media.sight.intersect(self.media.scene, ray, mi.RayFlags.Minimal)
         n = si.n * self.media.side(k, si.prim_index)
         facing = si.is_valid() & (dr.dot(n, w_0) > 0)
         far = dr.select(si.is_valid(), si.t, ray.maxt)
@@ -149,9 +149,10 @@ class SubpathConnections:
         flux = light * (dr.abs(dr.dot(w, sample.w_0)) / density)
         distant = self.small.distant(which)
         away = dr.select(distant, 4 * dr.norm(self.scene.bbox().extents()), distance * (1 - 1e-4))
-        si = self.scene.ray_intersect(mi.Ray3f(mi.Point3f(at.p + w * away), -w), mi.RayFlags.All, coherent=False)
+        way = mi.Ray3f(mi.Point3f(at.p + w * away), -w)
+        si = self.media.sight.intersect(self.scene, way, mi.RayFlags.All)
         steep = dr.abs(dr.dot(w, sample.w_0)) > STEEPEST
-        enters = si.is_valid() & (dr.max(light) > 0) & steep & (self.media.index_of(si.shape) == mi.Int32(k))
+        enters = si.is_valid() & (dr.max(light) > 0) & steep & (self.media.index_of(si) == mi.Int32(k))
 
         # ---- refraction at the boundary
         si = self.media.face_outwards(si, dr.select(enters, mi.Int32(k), -1), -w)
@@ -237,11 +238,11 @@ class SubpathConnections:
     def _reflect(self, walk: Walk, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f) -> tuple:
         """Reflection at the boundary from inside with the probability of its reflectance."""
         k, d = mi.Int32(walk.object), walk.d
-        si = hit.compute_surface_interaction(ray)
+        si = self.media.sight.interaction(hit, ray, mi.RayFlags.All)
         si = self.media.seen(si, k, d)
         F, _, _, _ = mi.fresnel(mi.Frame3f.cos_theta(si.wi), self.media.row("eta", k))
         new, _ = sided(si, mi.reflect(si.wi))
-        met = self.media.met(si.shape, k)
+        met = self.media.met(si, k)
         foreign = met != k  # an object that overlaps: the ray goes on behind it
         new = dr.select(foreign, d, new)
         inside = (dr.dot(si.n, d) > 0) & (dr.dot(si.n, new) < 0) & (walk.rng.next_float32() < F)
@@ -333,7 +334,7 @@ class EmitterDirections:
         for _ in range(GUESSES):
             ray = mi.Ray3f(v, d)
             ray.maxt = DEEPEST / dr.min(m.mean_t)
-            si = self.media.scene.ray_intersect(ray, mi.RayFlags.Minimal, coherent=False, active=valid)
+            si = self.media.sight.intersect(self.media.scene, ray, mi.RayFlags.Minimal, active=valid)
             valid &= si.is_valid()
             n = si.n * self.media.side(k, si.prim_index)
             w, _ = self.small.direction(which, si.p)
@@ -352,14 +353,14 @@ class EmitterDirections:
         d, pdf = _draw_lobe(guess, concentration, rng)
         ray = ray_of(v, d, event.medium)
         ray.maxt = 2 * DEEPEST / dr.min(m.mean_t)
-        si = self.media.scene.ray_intersect(ray, mi.RayFlags.All, coherent=False, active=valid)
-        valid &= si.is_valid() & (self.media.index_of(si.shape) == k)
+        si = self.media.sight.intersect(self.media.scene, ray, mi.RayFlags.All, active=valid)
+        valid &= si.is_valid() & (self.media.index_of(si) == k)
         si = self.media.seen(si, k, d)
         F, cos_t, eta_it, eta_ti = mi.fresnel(mi.Frame3f.cos_theta(si.wi), self.media.row("eta", k))
         w = opposed(si.to_world(mi.refract(si.wi, cos_t, eta_ti)), si.n)
         valid &= (dr.dot(d, si.n) > 0) & (dr.dot(w, si.n) > 0) & (F < 1)
         way = si.spawn_ray(w)
-        outside = self.scene.ray_intersect(way, mi.RayFlags.All, coherent=False, active=valid)
+        outside = self.media.sight.intersect(self.scene, way, mi.RayFlags.All, active=valid)
         phase = eval_phase(m, dr.dot(event.along, d))
         # radiance shrinks by eta² on its way out, as the weight of the walk has when it came in
         factor = (1 - F) * dr.square(eta_ti) / (pdf / n + channel_mean(phase))

@@ -14,7 +14,8 @@ import numpy as np
 
 from halfspace_sss.interrupts import interruptible
 from halfspace_sss.rendering.light.small_emitters import SmallEmitters
-from halfspace_sss.rendering.object.objects import KnowsUnit, check_sensors, check_size, places_of, translucent_shapes
+from halfspace_sss.rendering.object.contents import check_sensors
+from halfspace_sss.rendering.object.objects import KnowsUnit, check_size, places_of, translucent_shapes
 from halfspace_sss.rendering.object.settings import OF_MITSUBA, check_parameters
 from halfspace_sss.rendering.object.shape import number_of, same_objects
 from halfspace_sss.rendering.object.textured import shown

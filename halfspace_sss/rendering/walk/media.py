@@ -12,17 +12,19 @@ import numpy as np
 
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.light.small_emitters import is_delta
-from halfspace_sss.rendering.object.objects import Content, TranslucentObject, contents, translucent_shapes
-from halfspace_sss.rendering.object.points import lift
-from halfspace_sss.rendering.object.shape import (
-    Geometry,
-    check_together,
-    groups_of,
-    is_instance,
-    name_of,
-    scene_of,
-    survey,
+from halfspace_sss.rendering.object.contents import Content, contents
+from halfspace_sss.rendering.object.instances import (
+    Group,
+    Placed,
+    Sight,
+    corners,
+    ends_of,
+    pointer_numbers,
+    shown_groups,
 )
+from halfspace_sss.rendering.object.objects import TranslucentObject, translucent_shapes
+from halfspace_sss.rendering.object.points import lift
+from halfspace_sss.rendering.object.shape import Geometry, check_together, scene_of, survey
 from halfspace_sss.rendering.object.translucent import Inside, smooth_boundary
 from halfspace_sss.rendering.object.varying import VaryingMedium, eval_volume
 from halfspace_sss.rendering.object.wrapped import Wrapping, surface_of, wrapping_of
@@ -43,13 +45,14 @@ class InnerShapes:
 
     Args:
         scene: a Mitsuba scene that holds the objects, and the shapes inside or partly inside them.
-        tables: by what Dr.Jit's registry calls a shape, the number of the object `around` it or -1, and whether it
-            `displaces` that; by the number of an object, whether it stands `alone`, neither in another nor around
-            anything.
+        placed: these shapes at their places, which are numbered.
+        tables: by these numbers, the number of the object `around` a shape or -1, and whether it `displaces` that; by
+            the number of an object, whether it stands `alone`, neither in another nor around anything.
         lights: the delta lights in the medium of an object, and its number.
     """
 
     scene: mi.Scene
+    placed: Placed
     tables: dict[str, Any]
     lights: list[tuple[mi.Emitter, int]]
 
@@ -58,51 +61,54 @@ class InnerShapes:
         """What lies inside; None if nothing does.
 
         Raises:
-            ValueError: something that refracts lies partly inside, is not closed or in an instance, or objects count
-                some orders only.
+            ValueError: something that refracts lies partly inside or is not closed, or objects count some orders only.
         """
         result = contents(scene, objects)
         if not result:
             return None
-        _check(result, objects)
-        _check_instances(result, scene)
+        groups = shown_groups(scene)
+        own = Placed.of([obj.shape for obj in objects], groups)
+        _check(result, objects, own)
         glass = [survey(thing, scene) for thing in _shapes(result) if _displaces(thing)]
         for piece in glass:
             if not piece.closed:
                 raise ValueError(f"what refracts inside an object must be closed, got the shape {piece.name}")
         if glass:
             result = contents(scene, [*objects, *glass])
-        holders = [*objects, *glass]
-        inside = [content for content in result if content.object < len(objects)]
-        things = {id(content.thing): content.thing for content in inside}
-        around = {key: _innermost(key, result, holders, len(objects)) for key in things}
-        own = [obj.shape for obj in objects]
-        shapes = [*own, *(thing for thing in _shapes(inside) if not any(thing is shape for shape in own))]
-        numbers = [int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0]) for shape in shapes]
-        at = np.full(max(numbers) + 1, -1, dtype=np.int32)
-        displaces = np.zeros(len(at), dtype=bool)
-        for number, shape in zip(numbers, shapes):
-            at[number], displaces[number] = around.get(id(shape), -1), _displaces(shape)
-        holding = {content.object for content in inside}
-        alone = [k not in holding and id(shape) not in things for k, shape in enumerate(own)]
-        tables = {"around": mi.Int32(at.tolist()), "displaces": mi.Bool(displaces.tolist()), "alone": mi.Bool(alone)}
+        holders = Placed.of([obj.shape for obj in (*objects, *glass)], groups)
+        inside = [content for content in result if content.object < len(own)]
+        things = [thing for thing in _shapes(inside) if not any(thing is shape for shape in own.shapes)]
+        placed = Placed.of([*own.shapes, *things], groups)
+        first = {id(shape): int(number) for shape, number in zip(placed.shapes, placed.first)}
+        around, lights = np.full(len(placed), -1), {}
+        holding, held = np.zeros(len(own), dtype=bool), np.zeros(len(placed), dtype=bool)
+        for content in _largest_first(result, holders):
+            number = content.object if content.object < len(own) else -1
+            if isinstance(content.thing, mi.Emitter):
+                lights[id(content.thing)] = content.thing, number
+            elif id(content.thing) in first:
+                place = first[id(content.thing)] + content.rank
+                around[place], held[place] = number, held[place] or number >= 0
+            holding[[number] if number >= 0 else []] = True
+        displaces = [_displaces(shape) for shape in placed.shapes]
+        alone = ~holding & ~held[: len(own)]
+        tables = {"around": mi.Int32(around.tolist()), "alone": mi.Bool(alone.tolist())}
+        tables["displaces"] = mi.Bool([displaces[kind] for kind in placed.kind])
         dr.make_opaque(tables)
-        lights = [(thing, around[key]) for key, thing in things.items() if isinstance(thing, mi.Emitter)]
-        lights = [(light, k) for light, k in lights if is_delta(light) and k >= 0]
-        return cls(scene_of(shapes, scene), tables, lights)
+        lights = [(light, k) for light, k in lights.values() if is_delta(light) and k >= 0]
+        return cls(placed.scene(scene), placed, tables, lights)
 
-    def around(self, shape: mi.ShapePtr) -> mi.Int32:
-        """The number of the object around a shape, or -1."""
-        return self._of_shape("around", shape, -1)
+    def around(self, si: mi.SurfaceInteraction3f) -> mi.Int32:
+        """The number of the object around what a ray has met, or -1."""
+        return self._met("around", si, -1)
 
-    def displaces(self, shape: mi.ShapePtr) -> mi.Bool:
-        """Whether a shape, which is no translucent object, displaces the medium around it."""
-        return self._of_shape("displaces", shape, False)
+    def displaces(self, si: mi.SurfaceInteraction3f) -> mi.Bool:
+        """Whether that, which is no translucent object, displaces the medium around it."""
+        return self._met("displaces", si, False)
 
-    def _of_shape(self, key: str, shape: mi.ShapePtr, otherwise: int | bool) -> mi.Int32 | mi.Bool:
-        pointer, table = dr.reinterpret_array(mi.UInt32, shape), self.tables[key]
-        known = pointer < dr.width(table)
-        return dr.select(known, dr.gather(type(table), table, pointer, known), otherwise)
+    def _met(self, key: str, si: mi.SurfaceInteraction3f, otherwise: int | bool) -> mi.Int32 | mi.Bool:
+        number, table = self.placed.number(si), self.tables[key]
+        return dr.select(number >= 0, dr.gather(type(table), table, dr.maximum(number, 0)), otherwise)
 
 
 def _shapes(result: list[Content]) -> list[mi.Shape]:
@@ -113,16 +119,16 @@ def _displaces(shape: mi.Shape) -> bool:
     return not surface_of(shape) and bool(shape.bsdf().flags() & REFRACTS)
 
 
-def _innermost(key: int, result: list[Content], holders: list[Geometry], n: int) -> int:
-    """The smallest holder of a thing if that is an object, by its number; -1 if it is of glass."""
-    numbers = [content.object for content in result if id(content.thing) == key]
-    smallest = min(numbers, key=lambda k: holders[k].size)
-    return smallest if smallest < n else -1
+def _largest_first(result: list[Content], holders: Placed) -> list[Content]:
+    """Sorted by the size of what is around, the smallest last."""
+    boxes = [ends_of(corners(shape.bbox(), holders.to_world(k))) for k, shape in enumerate(holders.shapes)]
+    sizes = np.concatenate([np.linalg.norm(high - low, axis=1) for low, high in boxes])
+    return sorted(result, key=lambda content: -sizes[content.object])
 
 
-def _check(result: list[Content], objects: list[Geometry]) -> None:
+def _check(result: list[Content], objects: list[Geometry], placed: Placed) -> None:
     for content in result:
-        holder = objects[content.object]
+        holder = objects[placed.kind[content.object]]
         surfaces = [surface_of(holder.shape)]
         if isinstance(content.thing, mi.Shape):
             translucent = bool(surface_of(content.thing))
@@ -144,23 +150,11 @@ def _check(result: list[Content], objects: list[Geometry]) -> None:
                 )
 
 
-def _check_instances(result: list[Content], scene: mi.Scene) -> None:
-    """ValueError if an instance inside may refract: rays meet shapes of its group, which stand in no table."""
-    instances = [shape for shape in _shapes(result) if is_instance(shape)]
-    nodes = [node for node in mi.traverse(scene).hierarchy if isinstance(node, mi.Shape) and node not in scene.shapes()]
-    grouped = [shape for shape in nodes if shape not in groups_of(scene) and _displaces(shape)]
-    if instances and grouped:
-        raise ValueError(
-            f"what refracts inside an object must be no instance, got {name_of(grouped[0])} in a shapegroup and the "
-            f"instance {name_of(instances[0])} inside"
-        )
-
-
-def _check_mixes(wrappings: list[Wrapping], objects: list[Geometry], inner: InnerShapes | None) -> None:
+def _check_mixes(wrappings: list[Wrapping], objects: list[Geometry], placed: Placed, inner: InnerShapes | None) -> None:
     """ValueError if a mask or blend is on an object inside another, or with something inside."""
-    alone = [True] * len(objects) if inner is None else np.array(inner.tables["alone"]).tolist()
-    for around, obj, free in zip(wrappings, objects, alone):
-        if around.mixes and not free:
+    alone = np.ones(len(placed), dtype=bool) if inner is None else np.array(inner.tables["alone"])
+    for kind, (around, obj) in enumerate(zip(wrappings, objects)):
+        if around.mixes and not alone[placed.numbers(kind)].all():
             raise ValueError(
                 f"an object with a mask or blendbsdf must be in no other and hold nothing, got object {obj.name}"
             )
@@ -331,14 +325,18 @@ def interaction_of(p: mi.Point3f, medium: WalkMedium | tuple[()]) -> mi.Interact
 class WalkMedia:
     """The translucent objects of a scene, each addressed by its number.
 
+    An object is a shape at one of its places. What is known of all places is listed by shape.
+
     Args:
-        objects: geometry of each.
-        insides: the `Inside` of each.
-        scene: a Mitsuba scene that holds these objects only.
-        boundaries: dielectric BSDF of each.
+        objects: geometry of each shape.
+        insides: the `Inside` of each shape.
+        scene: a Mitsuba scene that holds these objects, and what is in groups with them.
+        boundaries: dielectric BSDF of each shape.
         mm_per_unit: length of a scene unit, mm.
         inner: what lies inside the objects, if anything does.
-        wrappings: what is around their surfaces; () where nothing is.
+        wrappings: what is around surfaces, by shape; () where nothing is.
+        shown: the groups that the scene shows.
+        sight: what rays meet in it, and in scenes of some of its shapes.
     """
 
     objects: list[Geometry]
@@ -348,33 +346,36 @@ class WalkMedia:
     mm_per_unit: float
     inner: InnerShapes | None = None
     wrappings: tuple[Wrapping, ...] = ()
+    shown: tuple[Group, ...] = ()
+    sight: Sight = Sight([], {})
 
     def __post_init__(self) -> None:
-        media = [inside.medium for inside in self.insides]
-        tables = {}
+        placed = Placed.of([obj.shape for obj in self.objects], self.shown)
+        object.__setattr__(self, "placed", placed)
+        insides, boundaries = ([rows[kind] for kind in placed.kind] for rows in (self.insides, self.boundaries))
+        media, tables = [inside.medium for inside in insides], {}
         for key in ("sigma_t", "sigma_s", "g"):
             scale = 1.0 if key == "g" else self.mm_per_unit
             tables[key] = per_channel([getattr(m, key) for m in media], scale)
         tables["eta"] = mi.Float([m.eta for m in media])
         sides = [[obj.sign] if obj.signs is None else np.array(obj.signs).tolist() for obj in self.objects]
         tables["side"] = mi.Float(sum(sides, []))
-        tables["first"] = mi.UInt32(np.cumsum([0, *map(len, sides)])[:-1].tolist())
-        tables["step"] = mi.UInt32([int(len(side) > 1) for side in sides])
-        tables["fewest"] = mi.UInt32([_FEWEST[inside.orders] for inside in self.insides])
-        tables["most"] = mi.UInt32([_MOST[inside.orders] for inside in self.insides])
-        tables["rounding"] = mi.Float([obj.rounding for obj in self.objects])
-        tables["textured"] = mi.Bool([inside.textured is not None for inside in self.insides])
-        tables["reflects"] = mi.Bool([inside.reflection for inside in self.insides])
-        tables["rough"] = mi.Bool([is_rough(b) for b in self.boundaries])
-        tables["boundary"] = pointer_numbers([mi.BSDFPtr(b) for b in self.boundaries])
-        tables["shape"] = by_pointer([mi.ShapePtr(obj.shape) for obj in self.objects])
+        tables["first"] = mi.UInt32(np.cumsum([0, *map(len, sides)])[placed.kind].tolist())
+        tables["step"] = mi.UInt32([int(len(sides[kind]) > 1) for kind in placed.kind])
+        tables["fewest"] = mi.UInt32([_FEWEST[inside.orders] for inside in insides])
+        tables["most"] = mi.UInt32([_MOST[inside.orders] for inside in insides])
+        tables["rounding"] = mi.Float(placed.rounding(self.objects))
+        tables["textured"] = mi.Bool([inside.textured is not None for inside in insides])
+        tables["reflects"] = mi.Bool([inside.reflection for inside in insides])
+        tables["rough"] = mi.Bool([is_rough(b) for b in boundaries])
+        numbers = pointer_numbers([mi.BSDFPtr(b) for b in self.boundaries])
+        tables["boundary"] = mi.UInt32([numbers[kind] for kind in placed.kind])
+        tables["kind"] = mi.UInt32(placed.kind.tolist())
         dr.make_opaque(tables)  # one kernel for all media
         object.__setattr__(self, "tables", tables)
         object.__setattr__(self, "box", _bounds(self.scene))
-        varies = any(inside.varying is not None for inside in self.insides)
-        object.__setattr__(
-            self, "heterogeneous", HeterogeneousMedia.of(self.insides, self.mm_per_unit) if varies else None
-        )
+        varies = any(inside.varying is not None for inside in insides)
+        object.__setattr__(self, "heterogeneous", HeterogeneousMedia.of(insides, self.mm_per_unit) if varies else None)
 
     def is_current(self) -> bool:
         """Whether the objects still have the shapes and the media that this was made of."""
@@ -421,7 +422,13 @@ class WalkMedia:
 
     def _place(self, k: mi.Int32) -> mi.UInt32 | mi.Int32:
         """Of object k in tables: the same in all lanes, which is faster, where there is one object."""
-        return mi.UInt32(0) if len(self.objects) == 1 else k
+        return mi.UInt32(0) if len(self.placed) == 1 else k
+
+    def has_shape(self, k: mi.Int32, kind: int) -> mi.Bool:
+        """Whether object k, which may be -1, has a shape of the list."""
+        if not self.placed.repeated:
+            return k == kind
+        return (k >= 0) & (dr.gather(mi.UInt32, self.tables["kind"], dr.maximum(k, 0)) == kind)
 
     def counts(self, k: mi.Int32, order: mi.UInt32) -> mi.Bool:
         """Whether a walk that leaves object k after so many events counts."""
@@ -452,7 +459,7 @@ class WalkMedia:
             return ()
         sigma_t, sigma_s, g = (self.spectrum(key, k) for key in ("sigma_t", "sigma_s", "g"))
         for number, inside in enumerate(self.insides):
-            here = active & (k == number)
+            here = active & self.has_shape(k, number)
             if inside.textured is not None:
                 at = inside.textured.scaled(self.mm_per_unit).at(si, here)
                 sigma_t = dr.select(here, at.sigma_t, sigma_t)
@@ -504,16 +511,13 @@ class WalkMedia:
         result = self.heterogeneous.transmittance(k, ray, distance, rng)
         return dr.select(self.row("textured", k), own, result) if medium else result
 
-    def index_of(self, shape: mi.ShapePtr, active: mi.Bool | bool = True) -> mi.Int32:
-        """The number of the object that a shape is, or -1."""
-        pointer = dr.reinterpret_array(mi.UInt32, shape)
-        table = self.tables["shape"]
-        known = active & (pointer < dr.width(table))
-        return dr.select(known, dr.gather(mi.Int32, table, pointer, known), -1)
+    def index_of(self, si: mi.SurfaceInteraction3f, active: mi.Bool | bool = True) -> mi.Int32:
+        """The number of the object that a ray has met, or -1."""
+        return self.placed.number(si, active)
 
-    def met(self, shape: mi.ShapePtr, k: mi.Int32) -> mi.Int32:
-        """The number of the object whose boundary, the given shape, a ray inside object k has met."""
-        return k if len(self.objects) == 1 else self.index_of(shape)
+    def met(self, si: mi.SurfaceInteraction3f, k: mi.Int32) -> mi.Int32:
+        """The number of the object whose boundary a ray inside object k has met."""
+        return k if len(self.objects) == 1 and not self.placed.repeated else self.index_of(si)
 
     def boundary(self, k: mi.Int32) -> mi.BSDF | mi.BSDFPtr:
         """The dielectric of object k: one BSDF, or a pointer in each lane."""
@@ -559,7 +563,7 @@ class WalkMedia:
     ) -> mi.SurfaceInteraction3f:
         """The interaction with its normals turned to the outside of object k; `direction` is that of the ray."""
         for number, around in enumerate(self.wrappings):
-            si = around.bent(si, k == number)
+            si = around.bent(si, self.has_shape(k, number))
         if all(obj.upright for obj in self.objects) and not self.any_bent:
             return si
         n = dr.select(k >= 0, si.n * self.side(dr.maximum(k, 0), si.prim_index), si.n)
@@ -574,10 +578,10 @@ class WalkMedia:
 
         Masks and blends may show another surface where an object is.
         """
-        k, bsdf = self.index_of(si.shape), si.bsdf()
+        k, bsdf = self.index_of(si), si.bsdf()
         for number, around in enumerate(self.wrappings):
             if around.mixes:
-                here, obj = k == number, self.objects[number]
+                here, obj = self.has_shape(k, number), self.objects[number]
                 behind = (dr.dot(si.n, d) * obj.side(si.prim_index, here) > 0) & obj.closed
                 drawn = around.draw(si, behind, rng.next_float32(), here)
                 bsdf = dr.select(here, drawn, bsdf)
@@ -589,21 +593,26 @@ class WalkMedia:
         """The objects of a scene whose surface is `translucent`.
 
         Raises:
-            ValueError: mm_per_unit is not a finite number > 0, an object is an instance, or as `InnerShapes.of`.
+            ValueError: mm_per_unit is not a finite number > 0, the medium of an instance varies in space, or as
+                `InnerShapes.of`.
         """
         if not (np.isfinite(mm_per_unit) and mm_per_unit > 0):
             raise ValueError(f"mm_per_unit must be finite and > 0, got {mm_per_unit!r}")
-        shapes = translucent_shapes(scene)
-        inner, objects = scene_of(shapes, scene), [survey(shape, scene) for shape in shapes]
-        for obj in objects:
-            if surface_of(obj.shape).inside.textured is not None:
-                surface_of(obj.shape).inside.textured.check(obj)
+        shapes, shown = translucent_shapes(scene), shown_groups(scene)
+        placed, objects = Placed.of(shapes, shown), [survey(shape, scene) for shape in shapes]
+        inner = placed.scene(scene)
+        for obj, group in zip(objects, placed.groups):
+            inside = surface_of(obj.shape).inside
+            if inside.varying is not None and group is not None:
+                raise ValueError(f"the medium of an instance must not vary in space, got that of object {obj.name}")
+            if inside.textured is not None:
+                inside.textured.check(obj)
         result = InnerShapes.of(scene, objects)
         check_together(scene, [inner, *([result.scene] if result else []), *(obj.scene for obj in objects)])
         wrappings = [wrapping_of(shape) for shape in shapes]
         for around, obj in zip(wrappings, objects):
             around.check(obj)
-        _check_mixes(wrappings, objects, result)
+        _check_mixes(wrappings, objects, placed, result)
         surfaces, some = [around.surface for around in wrappings], any(a.bend or a.mixes for a in wrappings)
         return cls(
             objects,
@@ -613,6 +622,8 @@ class WalkMedia:
             float(mm_per_unit),
             result,
             tuple(wrappings) if some else (),
+            tuple(shown),
+            Sight.of(scene, shown),
         )
 
 
@@ -663,17 +674,3 @@ def _bounds(scene: mi.Scene) -> mi.BoundingBox3f:
 def is_rough(boundary: mi.BSDF) -> bool:
     """Whether a boundary scatters into a solid angle."""
     return bool(boundary.flags() & int(mi.BSDFFlags.Smooth))
-
-
-def pointer_numbers(pointers: list[mi.ShapePtr | mi.BSDFPtr]) -> mi.UInt32:
-    """What Dr.Jit's registry calls each."""
-    return mi.UInt32([int(dr.reinterpret_array(mi.UInt32, pointer)[0]) for pointer in pointers])
-
-
-def by_pointer(pointers: list[mi.ShapePtr]) -> mi.Int32:
-    """Table from the number of a pointer in Dr.Jit's registry to its place in the list, -1 for others."""
-    ids = np.array(pointer_numbers(pointers), dtype=int).tolist()
-    table = np.full(max(ids, default=0) + 1, -1, dtype=np.int32)
-    for k, number in enumerate(ids):
-        table[number] = k
-    return mi.Int32(table.tolist())  # lists, not NumPy arrays: memory in any alignment would need kernels of its own

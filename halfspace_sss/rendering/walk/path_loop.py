@@ -151,7 +151,7 @@ class LightVisitor:
     def crossing(self, walk: Walk, record: LightRecord, crossing: Crossing) -> tuple[Walk, LightRecord]:
         record = replace(record, previous=crossing.si.p, pdf=crossing.pdf, delta=crossing.delta)
         if self.media.inner is not None:
-            sampled = (self.media.index_of(crossing.si.shape) < 0) & ~crossing.delta
+            sampled = (self.media.index_of(crossing.si) < 0) & ~crossing.delta
             record = replace(record, delta=crossing.delta | ~crossing.leaves, scattered=record.scattered | sampled,
                              L=record.L + self.spread_inner_lights(walk, record.scattered & ~sampled))  # fmt: skip
         if self.connections is None:
@@ -341,7 +341,7 @@ class PathTracer:
     def _outside(self, p: CameraPath) -> CameraPath:
         """A ray outside all objects, and the surface that it meets."""
         ray = ray_of(p.walk.o, p.walk.d, p.walk.medium)
-        si = self.visitor.scene.ray_intersect(ray, mi.RayFlags.All, coherent=False)
+        si = self.visitor.media.sight.intersect(self.visitor.scene, ray, mi.RayFlags.All)
 
         # ---- emission, with its MIS weight
         first = p.depth == 0
@@ -371,8 +371,8 @@ class PathTracer:
         mute = translucent & ~media.row("reflects", near) if media.objects else mi.Bool(False)
         lit = ~mute
         if media.inner is not None:
-            around = media.inner.around(si.shape)
-            encloses = ~translucent & (around >= 0) & media.inner.displaces(si.shape) & (dr.dot(walk.d, si.n) > 0)
+            around = media.inner.around(si)
+            encloses = ~translucent & (around >= 0) & media.inner.displaces(si) & (dr.dot(walk.d, si.n) > 0)
             lit &= ~encloses  # emitters on its other side are behind a medium
 
         # ---- next-event estimation
@@ -465,8 +465,8 @@ class FirstExits:
     @classmethod
     def of(cls, scene: mi.Scene, media: WalkMedia, rays: mi.Ray3f) -> FirstExits:
         """What rays of the camera meet first, and room for where their walks leave."""
-        si = scene.ray_intersect(rays, mi.RayFlags.All, coherent=True)
-        k = media.index_of(si.shape, si.is_valid())
+        si = media.sight.intersect(scene, rays, mi.RayFlags.All, coherent=True)
+        k = media.index_of(si, si.is_valid())
         si = media.seen(si, k, rays.d)
         n = dr.width(rays)
         kinds = mi.Spectrum, mi.Point3f, mi.Normal3f, mi.Normal3f, mi.Vector3f, mi.UInt32, mi.UInt32

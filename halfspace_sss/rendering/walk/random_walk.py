@@ -256,8 +256,8 @@ class Walker:
     ) -> tuple[Walk, Record]:
         """Reflection at the boundary seen from inside, or the way out."""
         media, k = self.media, walk.object
-        si = hit.compute_surface_interaction(ray, media.needed)
-        met = media.met(si.shape, k)
+        si = media.sight.interaction(hit, ray, media.needed)
+        met = media.met(si, k)
         foreign = met != k  # of an object that overlaps: the flight goes on behind it
         si = media.seen(si, k, ray.d)
         leaked = ~foreign & (dr.dot(si.n, ray.d) < 0)  # rounding has put the walk outside
@@ -281,11 +281,11 @@ class Walker:
     ) -> tuple[Walk, Record]:
         """The same where something lies inside: reflection or refraction at any surface, into what is on that side."""
         media, inner, k = self.media, self.media.inner, walk.object
-        si = hit.compute_surface_interaction(ray, mi.RayFlags.All)
-        met, around = media.index_of(si.shape, si.is_valid()), inner.around(si.shape)
+        si = media.sight.interaction(hit, ray, mi.RayFlags.All)
+        met, around = media.index_of(si, si.is_valid()), inner.around(si)
         own, nested, plain = met == k, (met >= 0) & (met != k), met < 0
         si = media.seen(si, met, ray.d)
-        refracts = plain & inner.displaces(si.shape)
+        refracts = plain & inner.displaces(si)
         inwards = dr.dot(si.n, ray.d) < 0
         leaked = (own & inwards) | ((nested | refracts) & (~inwards | (around != k)))  # rounding has put the walk there
         boundary = media.boundary(dr.maximum(met, 0))

@@ -173,9 +173,9 @@ class PathScores:
     def of(cls, media: WalkMedia, paths: int) -> PathScores:
         """For so many paths."""
         numbers = [k for k, _ in followed(media)]
-        rows = mi.Int32([numbers.index(k) if k in numbers else -1 for k in range(len(media.objects))])
+        rows = mi.Int32([numbers.index(k) if k in numbers else -1 for k in media.placed.kind])
         room, textured = paths * len(numbers), followed_textures(media)
-        painted = mi.Bool([k in textured for k in range(len(media.objects))])
+        painted = mi.Bool([k in textured for k in media.placed.kind])
         kept = KeptStays.of(paths) if textured else None
         result = cls(paths, rows, Score.sums(room), Score.zeros(room), kept, painted)
         dr.eval(result.p, result.q, rows, painted)
@@ -310,7 +310,7 @@ def with_derivatives(L: mi.Spectrum, scores: PathScores, media: WalkMedia) -> mi
         slots = list(scores.kept.slots(L)) if textured else []
     for number, place, slopes in slots:
         for k, medium in textured.items():
-            here = number == k
+            here = media.has_shape(number, k)
             at = medium.at(place.on(media.objects[k].shape), here)
             values = {name: dr.select(here, getattr(at, name), 1) for name in ("albedo", "sigma_t")}
             result += _change(slopes, values)

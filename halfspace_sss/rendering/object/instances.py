@@ -1,0 +1,270 @@
+"""Shapes that stand in a scene at many places: the instances of a `shapegroup`.
+
+A ray that meets an instance knows the shape of the group, `si.shape`, and the instance, `si.instance`. So each shape at
+each of its places is a thing of its own, with the number
+
+    first(si.shape) + rank(si.instance),
+
+rank the place of an instance among those of its group, 0 of what stands in the scene itself. Tables are by these
+numbers; what is known of a shape alone is known once, in the frame of its group.
+"""
+
+from __future__ import annotations
+
+import functools
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from halfspace_sss.rendering.object.shape import Geometry, completed, groups_of, is_instance, matrix_of, scene_of
+
+
+@dataclass(frozen=True, eq=False)
+class Group:
+    """A group that instances show.
+
+    Args:
+        shapes: in it.
+        instances: of it, at least one.
+        to_world: array (n, 4, 4), of each instance.
+    """
+
+    shapes: list[mi.Shape]
+    instances: list[mi.Shape]
+    to_world: np.ndarray
+
+
+def shown_groups(scene: mi.Scene) -> list[Group]:
+    """The groups that instances in a scene show."""
+    of_name: dict[str, list[mi.Shape]] = {}
+    for shape in scene.shapes():
+        if is_instance(shape):  # which tells its group in words alone
+            name = re.search(r'ShapeGroup\[\s*name = "(.*)",\n', str(shape))[1]
+            of_name.setdefault(name, []).append(shape)
+    results = []
+    for group in groups_of(scene) if of_name else ():
+        instances = of_name.get(group.id(), [])
+        shapes = [n for n in mi.traverse(group).hierarchy if isinstance(n, mi.Shape) and n is not group]
+        matrices = [matrix_of(mi.traverse(each)["to_world"]) for each in instances]
+        results += [Group(shapes, instances, np.stack(matrices))] if instances else []
+    return results
+
+
+def shapes_of(scene: mi.Scene, groups: Sequence[Group]) -> list[mi.Shape]:
+    """All shapes of a scene but instances, each once: those of the scene itself, then those of the groups it shows."""
+    own = [shape for shape in scene.shapes() if not is_instance(shape)]
+    return [*own, *(shape for group in groups for shape in group.shapes)]
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """Shapes at their places in a scene.
+
+    Args:
+        shapes: each once.
+        groups: of each, or None for what stands in the scene itself.
+        first: array (shapes + 1,), the number of the first thing of each shape, then that of all things.
+    """
+
+    shapes: list[mi.Shape]
+    groups: list[Group | None]
+    first: np.ndarray
+
+    @classmethod
+    def of(cls, shapes: list[mi.Shape], shown: Sequence[Group]) -> Placed:
+        """Shapes of a scene that shows these groups."""
+        groups = [next((g for g in shown if any(s is shape for s in g.shapes)), None) for shape in shapes]
+        first = np.cumsum([0, *(1 if g is None else len(g.instances) for g in groups)])
+        return cls(shapes, groups, first)
+
+    def __len__(self) -> int:
+        return int(self.first[-1])
+
+    @property
+    def repeated(self) -> bool:
+        """Whether a shape stands in a group."""
+        return any(group is not None for group in self.groups)
+
+    @functools.cached_property
+    def kind(self) -> np.ndarray:
+        """Array (things,), the place of the shape of each in the list."""
+        return np.repeat(np.arange(len(self.shapes)), np.diff(self.first))
+
+    def numbers(self, kind: int) -> range:
+        """Of the things of a shape."""
+        return range(int(self.first[kind]), int(self.first[kind + 1]))
+
+    def to_world(self, kind: int) -> np.ndarray:
+        """Array (n, 4, 4), of the things of a shape."""
+        group = self.groups[kind]
+        return np.eye(4)[None] if group is None else group.to_world
+
+    def scene(self, world: mi.Scene | None = None) -> mi.Scene:
+        """A scene that holds them, with all else that is in their groups."""
+        own = [shape for shape, group in zip(self.shapes, self.groups) if group is None]
+        shown = list({id(group): group for group in self.groups if group is not None}.values())
+        return scene_of([*own, *(instance for group in shown for instance in group.instances)], world)
+
+    def rounding(self, geometries: list[Geometry]) -> list[float]:
+        """Of each thing a bound of how far from its surface rounding puts points, scene units."""
+        results = []
+        for kind, geometry in enumerate(geometries):
+            if self.groups[kind] is None:
+                results.append(geometry.rounding)
+                continue
+            to_world = self.to_world(kind)
+            there = np.abs(corners(geometry.scene.bbox(), to_world)).max(axis=(1, 2)) * mi.math.RayEpsilon
+            here = geometry.rounding * np.linalg.norm(to_world[:, :3, :3], ord=2, axis=(1, 2))
+            results += np.maximum(there, here).tolist()
+        return results
+
+    @functools.cached_property
+    def tables(self) -> dict[str, mi.Int32 | mi.UInt32]:
+        """By what Dr.Jit's registry calls a shape the number of its `first` thing or -1; of an instance its `rank`."""
+        ranks = {id(g): np.arange(len(g.instances)) for g in self.groups if g is not None}
+        shown = {id(g): g.instances for g in self.groups if g is not None}
+        instances = [mi.ShapePtr(each) for group in shown.values() for each in group]
+        rank = np.concatenate([*ranks.values(), np.zeros(0, dtype=int)])
+        tables = {"first": by_pointer([mi.ShapePtr(s) for s in self.shapes], self.first[:-1], -1)}
+        tables |= {"rank": by_pointer(instances, rank, 0)} if instances else {}
+        dr.make_opaque(tables)
+        return tables
+
+    def number(self, si: mi.SurfaceInteraction3f, active: mi.Bool | bool = True) -> mi.Int32:
+        """The number of the thing that a ray has met, -1 for anything else."""
+        first = _looked_up(self.tables["first"], si.shape, -1, active)
+        if "rank" not in self.tables:
+            return first
+        rank = _looked_up(self.tables["rank"], si.instance, 0, active & (first >= 0))
+        return first + rank
+
+
+def corners(box: mi.ScalarBoundingBox3f, to_world: np.ndarray) -> np.ndarray:
+    """Of a box under each of the transformations (n, 4, 4) its corners, shape (n, 3, 8)."""
+    ends = np.stack([np.ravel(np.array(end, dtype=float)) for end in (box.min, box.max)])
+    points = np.stack(np.meshgrid(*ends.T, indexing="ij")).reshape(3, 8)
+    return to_world[:, :3, :3] @ points + to_world[:, :3, 3:]
+
+
+def ends_of(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of sets of points (n, 3, m) the least and the largest coordinates, shapes (n, 3)."""
+    return points.min(axis=2), points.max(axis=2)
+
+
+def by_pointer(pointers: list[mi.ShapePtr], values: np.ndarray, otherwise: int) -> mi.Int32:
+    """Table from the number of a pointer in Dr.Jit's registry to a value."""
+    ids = pointer_numbers(pointers)
+    table = np.full(max(ids, default=0) + 1, otherwise, dtype=np.int32)
+    table[ids] = values
+    return mi.Int32(table.tolist())  # lists, not NumPy arrays: memory in any alignment would need kernels of its own
+
+
+def pointer_numbers(pointers: list[mi.ShapePtr | mi.BSDFPtr]) -> list[int]:
+    """What Dr.Jit's registry calls each."""
+    return [int(dr.reinterpret_array(mi.UInt32, pointer)[0]) for pointer in pointers]
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """What rays meet in a scene, and in scenes of some of its shapes.
+
+    Mitsuba has a function for every instance in each kernel, which takes 30 ms to compile and, at 1000 of them, 10 s to
+    record again. Here there is one for every shape, and instances are data:
+
+        p = M p',    n = M^-T n' / |M^-T n'|,    dp = M dp',    dn = (1 - n n^T) M^-T dn' / |M^-T n'|.
+
+    Args:
+        shapes: that rays may meet, where there are instances.
+        tables: by what Dr.Jit's registry calls a shape its place in the list, `kind`, and an instance its `row`, 0 of
+            what is none; by row the columns of M and of its inverse, and the `first` kind of the group; by kind the
+            `pointer`.
+    """
+
+    shapes: list[mi.Shape]
+    tables: dict[str, Any]
+
+    @classmethod
+    def of(cls, scene: mi.Scene, shown: Sequence[Group]) -> Sight:
+        """Of a scene that shows these groups."""
+        if not shown:
+            return cls([], {})
+        shapes = shapes_of(scene, shown)
+        instances = [mi.ShapePtr(each) for group in shown for each in group.instances]
+        M = np.concatenate([np.eye(4)[None], *(group.to_world for group in shown)])
+        pointers = [mi.ShapePtr(each) for each in shapes]
+        sizes = [len(shapes) - sum(len(group.shapes) for group in shown), *(len(group.shapes) for group in shown)]
+        first = np.repeat(np.cumsum([0, *sizes])[:-1], [1, *(len(group.instances) for group in shown)])
+        tables = {"kind": by_pointer(pointers, np.arange(len(shapes)), 0), "first": mi.Int32(first.tolist())}
+        tables["pointer"] = mi.UInt32(pointer_numbers(pointers))
+        tables["row"] = by_pointer(instances, 1 + np.arange(len(instances)), 0)
+        for key, matrices in (("to_world", M), ("to_object", np.linalg.inv(M))):
+            tables[key] = [mi.Float(matrices[:, :3, k].ravel().tolist()) for k in range(4)]
+        dr.make_opaque(tables)
+        return cls(shapes, tables)
+
+    def intersect(
+        self, scene: mi.Scene, ray: mi.Ray3f, flags: int, coherent: bool = False, active: mi.Bool | bool = True
+    ) -> mi.SurfaceInteraction3f:
+        """What a ray meets in a scene of the shapes."""
+        if not self.shapes:
+            return scene.ray_intersect(ray, flags, coherent, active)
+        hit = scene.ray_intersect_preliminary(ray, coherent, active=active)
+        return self.interaction(hit, ray, flags, active)
+
+    def interaction(
+        self, hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, flags: int, active: mi.Bool | bool = True
+    ) -> mi.SurfaceInteraction3f:
+        """What a ray has met."""
+        if not self.shapes:
+            return hit.compute_surface_interaction(ray, flags, active)
+        active = active & hit.is_valid()
+        row = _looked_up(self.tables["row"], hit.instance, 0, active)
+        M, inverse = (self._columns(key, row, active) for key in ("to_world", "to_object"))
+        local = mi.Ray3f(ray)
+        local.o, local.d = mi.Point3f(_map(inverse, ray.o) + inverse[3]), mi.Vector3f(_map(inverse, ray.d))
+        # on a CPU a hit knows the number of a shape in its group instead of the shape
+        in_group = dr.gather(mi.Int32, self.tables["first"], row, active) + mi.Int32(hit.shape_index)
+        own = _looked_up(self.tables["kind"], hit.shape, 0, active)
+        kind = dr.select(active & (hit.shape == None), in_group, own)  # noqa: E711
+        calls = [functools.partial(_interaction, shape, flags) for shape in self.shapes]
+        si = dr.switch(mi.UInt32(kind), calls, hit, local, active) if len(calls) > 1 else calls[0](hit, local, active)
+        si.shape = dr.reinterpret_array(mi.ShapePtr, dr.gather(mi.UInt32, self.tables["pointer"], kind, active))
+        si.instance, si.p = hit.instance, mi.Point3f(_map(M, si.p) + M[3])
+        si.n, si.dp_du, si.dp_dv = dr.normalize(_transposed(inverse, si.n)), _map(M, si.dp_du), _map(M, si.dp_dv)
+        if flags & mi.RayFlags.ShadingFrame:
+            n = _transposed(inverse, si.sh_frame.n)
+            scale = dr.rcp(dr.norm(n))
+            n *= scale
+            si.dn_du, si.dn_dv = (
+                (v := _transposed(inverse, each) * scale) - n * dr.dot(n, v) for each in (si.dn_du, si.dn_dv)
+            )
+            si.sh_frame.n = n
+        return completed(si, hit, ray, flags, active)
+
+    def _columns(self, key: str, row: mi.Int32, active: mi.Bool) -> list[mi.Vector3f]:
+        return [dr.gather(mi.Vector3f, column, row, active) for column in self.tables[key]]
+
+
+def _map(columns: list[mi.Vector3f], v: mi.Vector3f) -> mi.Vector3f:
+    return columns[0] * v.x + columns[1] * v.y + columns[2] * v.z
+
+
+def _transposed(columns: list[mi.Vector3f], v: mi.Vector3f) -> mi.Normal3f:
+    return mi.Normal3f(*(dr.dot(column, v) for column in columns[:3]))
+
+
+def _interaction(
+    shape: mi.Shape, flags: int, hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool
+) -> mi.SurfaceInteraction3f:
+    return shape.compute_surface_interaction(ray, hit, flags, active)
+
+
+def _looked_up(table: mi.Int32, pointer: mi.ShapePtr, otherwise: int, active: Any) -> mi.Int32:
+    number = dr.reinterpret_array(mi.UInt32, pointer)
+    known = active & (number < dr.width(table))
+    return dr.select(known, dr.gather(mi.Int32, table, number, known), otherwise)
