@@ -95,7 +95,7 @@ def test_models_take_the_medium_at_each_wavelength(model: str) -> None:
         m = skin.medium(wavelength)
         alone = bssrdf(model, Medium(m.sigma_s, m.sigma_a, m.g, obj.media[0].eta).scaled(unit))
         wanted = np.array(alone.eval(*query)) * (np.array(query[3]) > 0)
-        assert np.abs(found - wanted).sum() < (0.08 if model == "neural" else 0.003) * wanted.sum()
+        assert np.abs(found - wanted).sum() < (0.1 if model == "neural" else 0.003) * wanted.sum()
 
 
 def test_a_grey_medium_under_d65_is_grey() -> None:
