@@ -27,7 +27,7 @@ from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED, load_scene
 THINGS = ("bunny", "ball")
 WAYS: Mapping[str, str] = {"walk": PATH_TRACED, "deng_dipole": deng.MODEL}
 VIEWS, HELD = 8, 2
-GIVEN, SHOWN = 16, 64  # samples of images that are given and that are compared, over those of a render of a step
+GIVEN, SHOWN = 16, 32  # samples of images that are given and that are compared, over those of a render of a step
 PAINT = "vertex_paint"
 SIGMA_T = "0.8, 1.2, 2"  # 1/mm
 GUESS = 0.8  # of the albedo
