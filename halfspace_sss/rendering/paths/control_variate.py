@@ -130,7 +130,7 @@ def _arriving(
     aimed, _ = by_emitters(context.scene, T.albedo, at, sampler.next_2d())
     # beside each other, as lanes that wait cost as much
     traced = dr.arange(mi.UInt32, count) < dr.opaque(mi.UInt32, count // TRACED)
-    met, more, a, _ = by_cosine(
+    met, more, a, *_ = by_cosine(
         context.scene, context.objects, T.albedo, context.settings, at, sampler.next_2d(), traced, sampler
     )
     light = aimed + met + opaque(count / (count // TRACED)) * more
