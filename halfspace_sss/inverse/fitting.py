@@ -119,7 +119,7 @@ class ViewMeans:
 
     def forget(self, x: np.ndarray) -> None:
         """Count less for what is far from x."""
-        kept = 1 / (1 + (np.abs(x - self.x).max() / FAR) ** 4)
+        kept = float(1 / (1 + (np.abs(x - self.x).max() / FAR) ** 4))
         self.steps, self.jacobians = kept * self.steps, kept * self.jacobians
 
     def add_jacobian(self, J: np.ndarray, w: np.ndarray) -> None:
@@ -204,7 +204,7 @@ class MediumDescent:
     def _measure(self, which: int, k: int, misfit: ViewMisfit, x: np.ndarray) -> None:
         """Add a step to the means of a view."""
         compared, e = self.comparison, self.comparison.exposures[which]
-        w = misfit.weights.ravel() / compared.count(which)
+        w = misfit.weights.ravel().astype(float) / compared.count(which)
         image = (misfit.residual + compared.views[which].image).ravel() / e
         means = self.means.setdefault(which, ViewMeans.none(len(image), len(x)))
         if k < SETTLING * self.total:

@@ -32,8 +32,7 @@ from halfspace_sss.neural.features import symmetric_features, travel
 from halfspace_sss.neural.hypernetwork import log_calibration
 from halfspace_sss.neural.network import Network
 from halfspace_sss.neural.perceptron import Perceptron
-from halfspace_sss.neural.symmetric import LOG_RANGE
-from halfspace_sss.neural.universal import Neural
+from halfspace_sss.neural.symmetric import LOG_RANGE, SymmetricModel
 from halfspace_sss.physics.backbone import backbone_shape, length_scale
 
 PLACES = 0.1, 0.9  # of the two networks among the models
@@ -58,7 +57,7 @@ class ReducedNetworks:
     coefficients: np.ndarray
 
     @classmethod
-    def of(cls, models: Sequence[Neural]) -> ReducedNetworks:
+    def of(cls, models: Sequence[SymmetricModel]) -> ReducedNetworks:
         """Of models of one g and eta, by albedo in an order in which they are smooth."""
         q = _queries(max(_length(m) for m in models), models[0].medium.eta)
         wanted = np.stack([_log_factor(m, q) for m in models])
@@ -94,7 +93,7 @@ def shape_over_power(q: Query, albedo: Any, g: Any, log_factor: Any) -> Any:
     return backbone_shape(q.r, albedo, g, q.index) * factor
 
 
-def _length(model: Neural) -> float:
+def _length(model: SymmetricModel) -> float:
     return float(length_scale(float(model.medium.albedo), float(model.medium.g)))
 
 
@@ -111,12 +110,12 @@ def _queries(longest: float, eta: float) -> Query:
     return Query(library(r), r, mu_i, phi_i, mu_o, phi_o, eta)
 
 
-def _log_factor(model: Neural, q: Query) -> np.ndarray:
+def _log_factor(model: SymmetricModel, q: Query) -> np.ndarray:
     c = model.calibrations[0]
     return model.networks[0](_features(q, _length(model))) + log_calibration(c, q.mu_i) + log_calibration(c, q.mu_o)
 
 
-def _weights(models: Sequence[Neural], q: Query, log_factors: np.ndarray) -> np.ndarray:
+def _weights(models: Sequence[SymmetricModel], q: Query, log_factors: np.ndarray) -> np.ndarray:
     """r² sqrt(S_o S_i) of each model at one end, with every model at the other, shape (models, queries)."""
     S = [shape_over_power(q, float(m.medium.albedo), float(m.medium.g), y) for m, y in zip(models, log_factors)]
     roots = q.r * np.sqrt(np.maximum(S, 1e-30))
