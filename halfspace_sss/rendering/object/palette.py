@@ -37,7 +37,7 @@ from halfspace_sss import measure
 from halfspace_sss.arrays import broadcast_query
 from halfspace_sss.interface.model import BSSRDF, Query, bssrdf
 from halfspace_sss.neural.reduced import MODES, ReducedNetworks, shape_over_power
-from halfspace_sss.neural.universal import Neural
+from halfspace_sss.neural.symmetric import SymmetricModel
 from halfspace_sss.physics.fresnel import F_t
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.object.half_space import HalfSpaceProposals, area_share
@@ -117,7 +117,7 @@ class Palette:
         """
         refusal = ""  # raised outside of the handler: messages of Mitsuba's functions are those of first causes
         try:
-            learnt = isinstance(bssrdf(name, Medium.from_albedo(0.5, 1.0, media[0].g, media[0].eta)), Neural)
+            learnt = isinstance(bssrdf(name, Medium.from_albedo(0.5, 1.0, media[0].g, media[0].eta)), SymmetricModel)
         except ValueError as error:
             refusal = str(error)
         if refusal:
