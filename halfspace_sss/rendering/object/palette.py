@@ -117,7 +117,8 @@ class Palette:
         """
         refusal = ""  # raised outside of the handler: messages of Mitsuba's functions are those of first causes
         try:
-            learnt = isinstance(bssrdf(name, Medium.from_albedo(0.5, 1.0, media[0].g, media[0].eta)), SymmetricModel)
+            model = bssrdf(name, Medium.from_albedo(0.5, 1.0, media[0].g, media[0].eta))
+            learnt = isinstance(model, SymmetricModel) and bool(model.calibrations)  # as `neural` has for every medium
         except ValueError as error:
             refusal = str(error)
         if refusal:
