@@ -119,6 +119,7 @@ class Palette:
         try:
             model = bssrdf(name, Medium.from_albedo(0.5, 1.0, media[0].g, media[0].eta))
             learnt = isinstance(model, SymmetricModel) and bool(model.calibrations)  # as `neural` has for every medium
+            refusal = "its weights are those of one medium" if model.checksums and not learnt else ""
         except ValueError as error:
             refusal = str(error)
         if refusal:
