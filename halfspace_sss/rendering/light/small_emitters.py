@@ -20,6 +20,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from halfspace_sss.rendering.object.shape import by_pointer, looked_up, pointer_numbers
 from halfspace_sss.rendering.object.wrapped import surface_of
 
 # ---- Suns of an environment map -------------------------------------------------------------------------------------
@@ -133,13 +134,11 @@ class SmallEmitters:
             return None
         rows = [_place(emitter) for emitter in emitters] + [(*sun.direction, True, sun.radius) for sun in suns]
         x, y, z, distant, radius = zip(*rows)
-        pointers = [int(dr.reinterpret_array(mi.UInt32, mi.EmitterPtr(emitter))[0]) for emitter in emitters]
-        index = [-1] * (max(pointers, default=0) + 1)
-        for k, pointer in enumerate(pointers):
-            index[pointer] = k
+        pointers = [mi.EmitterPtr(emitter) for emitter in emitters]
         tables = {
             "x": mi.Float(x), "y": mi.Float(y), "z": mi.Float(z), "distant": mi.Bool(distant),
-            "radius": mi.Float(radius), "pointer": mi.UInt32(pointers or [0]), "index": mi.Int32(index),
+            "radius": mi.Float(radius), "pointer": mi.UInt32(pointer_numbers(pointers) or [0]),
+            "index": by_pointer(pointers, np.arange(len(pointers)), -1),
         }  # fmt: skip
         dr.make_opaque(tables)
         return cls(scene, emitters, sum(map(is_delta, emitters)), suns, tables)
@@ -184,9 +183,7 @@ class SmallEmitters:
 
     def index_of(self, emitter: mi.EmitterPtr, w: mi.Vector3f) -> mi.Int32:
         """The number of an emitter that a ray along w meets, or -1."""
-        pointer = dr.reinterpret_array(mi.UInt32, emitter)
-        known = pointer < dr.width(self.tables["index"])
-        k = dr.select(known, dr.gather(mi.Int32, self.tables["index"], pointer, known), -1)
+        k = looked_up(self.tables["index"], emitter, -1)
         sky = emitter.is_environment() if self.suns else None
         for number in range(len(self.emitters), len(self)):
             sun = dr.opaque(mi.UInt32, number)

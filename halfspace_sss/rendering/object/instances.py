@@ -21,7 +21,17 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from halfspace_sss.rendering.object.shape import Geometry, completed, groups_of, is_instance, matrix_of, scene_of
+from halfspace_sss.rendering.object.shape import (
+    Geometry,
+    by_pointer,
+    completed,
+    groups_of,
+    is_instance,
+    looked_up,
+    matrix_of,
+    pointer_numbers,
+    scene_of,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,10 +147,10 @@ class Placed:
 
     def number(self, si: mi.SurfaceInteraction3f, active: mi.Bool | bool = True) -> mi.Int32:
         """The number of the thing that a ray has met, -1 for anything else."""
-        first = _looked_up(self.tables["first"], si.shape, -1, active)
+        first = looked_up(self.tables["first"], si.shape, -1, active)
         if "rank" not in self.tables:
             return first
-        rank = _looked_up(self.tables["rank"], si.instance, 0, active & (first >= 0))
+        rank = looked_up(self.tables["rank"], si.instance, 0, active & (first >= 0))
         return first + rank
 
 
@@ -154,19 +164,6 @@ def corners(box: mi.ScalarBoundingBox3f, to_world: np.ndarray) -> np.ndarray:
 def ends_of(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Of sets of points (n, 3, m) the least and the largest coordinates, shapes (n, 3)."""
     return points.min(axis=2), points.max(axis=2)
-
-
-def by_pointer(pointers: list[mi.ShapePtr], values: np.ndarray, otherwise: int) -> mi.Int32:
-    """Table from the number of a pointer in Dr.Jit's registry to a value."""
-    ids = pointer_numbers(pointers)
-    table = np.full(max(ids, default=0) + 1, otherwise, dtype=np.int32)
-    table[ids] = values
-    return mi.Int32(table.tolist())  # lists, not NumPy arrays: memory in any alignment would need kernels of its own
-
-
-def pointer_numbers(pointers: list[mi.ShapePtr | mi.BSDFPtr]) -> list[int]:
-    """What Dr.Jit's registry calls each."""
-    return [int(dr.reinterpret_array(mi.UInt32, pointer)[0]) for pointer in pointers]
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,13 +220,13 @@ class Sight:
         if not self.shapes:
             return hit.compute_surface_interaction(ray, flags, active)
         active = active & hit.is_valid()
-        row = _looked_up(self.tables["row"], hit.instance, 0, active)
+        row = looked_up(self.tables["row"], hit.instance, 0, active)
         M, inverse = (self._columns(key, row, active) for key in ("to_world", "to_object"))
         local = mi.Ray3f(ray)
         local.o, local.d = mi.Point3f(_map(inverse, ray.o) + inverse[3]), mi.Vector3f(_map(inverse, ray.d))
         # on a CPU a hit knows the number of a shape in its group instead of the shape
         in_group = dr.gather(mi.Int32, self.tables["first"], row, active) + mi.Int32(hit.shape_index)
-        own = _looked_up(self.tables["kind"], hit.shape, 0, active)
+        own = looked_up(self.tables["kind"], hit.shape, 0, active)
         kind = dr.select(active & (hit.shape == None), in_group, own)  # noqa: E711
         calls = [functools.partial(_interaction, shape, flags) for shape in self.shapes]
         si = dr.switch(mi.UInt32(kind), calls, hit, local, active) if len(calls) > 1 else calls[0](hit, local, active)
@@ -262,9 +259,3 @@ def _interaction(
     shape: mi.Shape, flags: int, hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool
 ) -> mi.SurfaceInteraction3f:
     return shape.compute_surface_interaction(ray, hit, flags, active)
-
-
-def _looked_up(table: mi.Int32, pointer: mi.ShapePtr, otherwise: int, active: Any) -> mi.Int32:
-    number = dr.reinterpret_array(mi.UInt32, pointer)
-    known = active & (number < dr.width(table))
-    return dr.select(known, dr.gather(mi.Int32, table, number, known), otherwise)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -458,6 +459,26 @@ def _by_optix() -> bool:
     return mi.variant().startswith("cuda")
 
 
+def by_pointer(pointers: list[Any], values: np.ndarray, otherwise: int) -> mi.Int32:
+    """Table from the number of a pointer in Dr.Jit's registry to a value."""
+    ids = pointer_numbers(pointers)
+    table = np.full(max(ids, default=0) + 1, otherwise, dtype=np.int32)
+    table[ids] = values
+    return mi.Int32(table.tolist())  # lists, not NumPy arrays: memory in any alignment would need kernels of its own
+
+
+def pointer_numbers(pointers: Iterable[Any]) -> list[int]:
+    """What Dr.Jit's registry calls each."""
+    return [int(dr.reinterpret_array(mi.UInt32, pointer)[0]) for pointer in pointers]
+
+
+def looked_up(table: mi.Int32, pointer: Any, otherwise: int, active: Any = True) -> mi.Int32:
+    """The value of a pointer in a table of `by_pointer`."""
+    number = dr.reinterpret_array(mi.UInt32, pointer)
+    known = active & (number < dr.width(table))
+    return dr.select(known, dr.gather(mi.Int32, table, number, known), otherwise)
+
+
 def number_of(scene: mi.Scene) -> int:
     """What tells the scenes apart that objects may stand in; only OptiX has to know."""
     return scene.ptr if _by_optix() else 0
@@ -534,7 +555,7 @@ def check_together(world: mi.Scene, scenes: list[Any]) -> None:
         if any(map(is_instance, shapes)):
             nodes = [node for group in groups_of(scene) for node in mi.traverse(group).hierarchy]
             shapes = [*shapes, *(node for node in nodes if isinstance(node, mi.Shape))]
-        own = [0, *(int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0]) for shape in shapes)]
+        own = [0, *pointer_numbers(map(mi.ShapePtr, shapes))]
         if (by_itself != beside).any() or (scene is not world and not np.isin(beside, own).all()):
             raise RuntimeError(
                 "rays of objects and of the scene around them must be traced by one kernel, got some lost"

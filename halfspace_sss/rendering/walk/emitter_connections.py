@@ -25,6 +25,7 @@ import numpy as np
 
 from halfspace_sss.rendering.light.small_emitters import SmallEmitters, spread
 from halfspace_sss.rendering.object.points import channel_mean, opaque, opposed, sided
+from halfspace_sss.rendering.object.shape import pointer_numbers
 from halfspace_sss.rendering.walk.media import Coefficients, WalkMedia, WalkMedium, interaction_of, ray_of
 from halfspace_sss.rendering.walk.random_walk import (
     Event,
@@ -437,8 +438,7 @@ class InnerLights:
         if media.inner is None or not media.inner.lights:
             return None
         emitters, around = zip(*media.inner.lights)
-        pointers = [int(dr.reinterpret_array(mi.UInt32, mi.EmitterPtr(emitter))[0]) for emitter in emitters]
-        tables = {"pointer": mi.UInt32(pointers), "around": mi.Int32(around)}
+        tables = {"pointer": mi.UInt32(pointer_numbers(map(mi.EmitterPtr, emitters))), "around": mi.Int32(around)}
         dr.make_opaque(tables)
         return cls(media, list(emitters), tables, blur)
 

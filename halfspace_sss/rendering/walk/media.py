@@ -13,18 +13,10 @@ import numpy as np
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.light.small_emitters import is_delta
 from halfspace_sss.rendering.object.contents import Content, contents
-from halfspace_sss.rendering.object.instances import (
-    Group,
-    Placed,
-    Sight,
-    corners,
-    ends_of,
-    pointer_numbers,
-    shown_groups,
-)
+from halfspace_sss.rendering.object.instances import Group, Placed, Sight, corners, ends_of, shown_groups
 from halfspace_sss.rendering.object.objects import TranslucentObject, translucent_shapes
 from halfspace_sss.rendering.object.points import lift
-from halfspace_sss.rendering.object.shape import Geometry, check_together, scene_of, survey
+from halfspace_sss.rendering.object.shape import Geometry, check_together, pointer_numbers, scene_of, survey
 from halfspace_sss.rendering.object.translucent import Inside, smooth_boundary
 from halfspace_sss.rendering.object.varying import VaryingMedium, eval_volume
 from halfspace_sss.rendering.object.wrapped import Wrapping, surface_of, wrapping_of
