@@ -18,7 +18,7 @@ import numpy as np
 
 from figures.computing.scenes import SCANS, scan_scene
 from halfspace_sss.progress import NamedProgress
-from halfspace_sss.rendering.scenes.mitsuba_scene import medium, with_media
+from halfspace_sss.rendering.scenes.mitsuba_scene import with_media
 from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED, load_scene
 
 CASES = {f"{scan}, eta {eta}": (scan, eta) for scan in ("bunny", "dragon") for eta in (1.0, 1.4)}
@@ -70,7 +70,7 @@ def gradient_rows(case: str, size: int, spp: int, seed: int, progress: NamedProg
     ways: dict[str, Any] = {"walk": lambda: load_scene(description, PATH_TRACED)}
     for depth in DEPTHS:
         prb = {"type": "prbvolpath", "max_depth": depth}
-        ways[f"prbvolpath, depth {depth}"] = lambda prb=prb: as_media(description, scan, unit, prb)
+        ways[f"prbvolpath, depth {depth}"] = lambda prb=prb: with_media(description, unit, prb)
     rows, walk = [], None
     for k, (way, made) in enumerate(ways.items()):
         if progress:
@@ -87,22 +87,6 @@ def gradient_rows(case: str, size: int, spp: int, seed: int, progress: NamedProg
             "time for equal noise": found.variance * found.seconds / (walk.variance * walk.seconds),
         })  # fmt: skip
     return rows
-
-
-def as_media(scene: dict[str, Any], name: str, mm_per_unit: float, integrator: dict[str, Any]) -> mi.Scene:
-    """`with_media`, but that the boundary of an object of index 1 is `null`.
-
-    Args:
-        scene: for `mitsuba.load_dict`, that shows its emitters: depths are others than of a refracting boundary.
-        name: of the object.
-        mm_per_unit: length of a scene unit, mm.
-        integrator: of Mitsuba.
-    """
-    if scene[name]["bsdf"]["eta"] != 1:
-        return with_media(scene, mm_per_unit, integrator)
-    inside = medium(mi.load_dict(scene[name]["bsdf"]).inside, mm_per_unit)
-    shape = {**scene[name], "bsdf": {"type": "null"}, "interior": inside}
-    return mi.load_dict({**scene, name: shape, "integrator": integrator})
 
 
 def _steps(scene: mi.Scene, spp: int, repeats: int, seed: int) -> Steps:

@@ -16,11 +16,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from figures.beyond.gradients import as_media
 from figures.beyond.inversion_textures import rms
 from halfspace_sss import inverse
 from halfspace_sss.inverse.views import GivenView
 from halfspace_sss.progress import NamedProgress
+from halfspace_sss.rendering.scenes.mitsuba_scene import with_media
 
 CASES: Mapping[str, Mapping[str, float]] = {
     "eta 1": {"eta": 1.0, "g": 0.0},
@@ -87,7 +87,7 @@ def medium_rows(
 def targets(case: str, number: int, size: int, spp: int, seed: int) -> list[np.ndarray]:
     """The images of a medium from all sides by `volpathmis`."""
     volpath = {"type": "volpathmis", "max_depth": TARGET_DEPTH}
-    truth = as_media(_cube(target(number), CASES[case], size), "object", 1.0, volpath)
+    truth = with_media(_cube(target(number), CASES[case], size), 1.0, volpath)
     return [np.array(mi.render(truth, sensor=k, spp=spp, seed=seed + k)) for k in range(len(SIDES))]
 
 
@@ -134,7 +134,7 @@ def _prb(
     start: dict[str, Any], images: list[np.ndarray], spp: int, steps: int, depth: int, seed: int
 ) -> dict[str, np.ndarray]:
     """Adam on log sigma_t and logit albedo by Mitsuba's gradients of volume paths."""
-    scene = as_media(start, "object", 1.0, {"type": "prbvolpath", "max_depth": depth})
+    scene = with_media(start, 1.0, {"type": "prbvolpath", "max_depth": depth})
     parameters = mi.traverse(scene)
     keys = {name: next(k for k in parameters.keys() if k.endswith(f"{name}.value.value")) for name in START}
     scale = float(START["sigma_t"].max())  # `with_media` has the colour over this

@@ -39,7 +39,7 @@ FLOOR = 0.1  # of the mean of an image, added to it in relative weights
 BEND = 0.05  # relative residual, beyond which the robust loss grows by its size
 EXPOSURE = 10.0  # most, of a factor
 BATCH = 4
-PURPOSES = ("order", "first", "second", "slope", "other slope", "test", "other test", "weights")
+PURPOSES = ("order", "first", "second", "slope", "test", "other test", "weights")
 
 
 @dataclass(frozen=True)
@@ -207,11 +207,15 @@ class ViewComparison:
         words = [self.settings.seed, k, which, PURPOSES.index(purpose), parameter]
         return int(np.random.SeedSequence(words).generate_state(1)[0])
 
-    def view(self, which: int, k: int) -> ViewMisfit:
-        """A view in a step; one that is held out at the exposure that suits it."""
+    def view(self, which: int, k: int, pair: Sequence[np.ndarray] = ()) -> ViewMisfit:
+        """A view in a step; one that is held out at the exposure that suits it.
+
+        Args:
+            pair: its two renders, if they are there.
+        """
         view = self.views[which]
         purposes = ("test", "other test") if view.held_out else ("first", "second")
-        pair = [self._image(view, self.seed(k, which, each)) for each in purposes]
+        pair = pair or [self.image(view, self.seed(k, which, each)) for each in purposes]
         weights = self._weights(which, k)
         misfit = self._misfit(which, pair, weights)
         if self.settings.exposure and view.held_out:
@@ -224,7 +228,7 @@ class ViewComparison:
         weights, view = self.weights[which], self.views[which]
         if self.settings.loss != "robust":
             return weights
-        image = self.exposures[which] * self._image(view, self.seed(k, which, "weights"))
+        image = self.exposures[which] * self.image(view, self.seed(k, which, "weights"))
         factor = 1 / np.maximum(np.sqrt(weights) * np.abs(image - view.image) / BEND, 1)
         return weights * factor / factor[weights > 0].mean() if (weights > 0).any() else weights
 
@@ -249,9 +253,9 @@ class ViewComparison:
         ]
         return _root([losses[which] for which in self.fitted]), _root(held) if held else None, shown
 
-    def _image(self, view: GivenView, seed: int) -> np.ndarray:
-        image = mi.render(self.scene, sensor=view.sensor, seed=seed, spp=self.settings.spp)
-        return np.array(image, dtype=np.float64)[..., : view.image.shape[2]]
+    def image(self, view: GivenView, seed: int) -> np.ndarray:
+        """A render of a view, without exposure."""
+        return pixels_of(view, mi.render(self.scene, sensor=view.sensor, seed=seed, spp=self.settings.spp))
 
     def expose(self, which: int, share: float) -> None:
         """Add a share to the factor of a view."""
@@ -267,6 +271,11 @@ class ViewComparison:
         for view in self.views:
             digest.update(view.image.tobytes() + view.counts.tobytes())
         return digest.hexdigest()
+
+
+def pixels_of(view: GivenView, image: mi.TensorXf) -> np.ndarray:
+    """A render in the shape of the image of a view."""
+    return np.array(image, dtype=np.float64)[..., : view.image.shape[2]]
 
 
 def _weights(view: GivenView, loss: str) -> np.ndarray:

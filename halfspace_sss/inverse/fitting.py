@@ -3,12 +3,13 @@
 A view keeps the means of what was measured of it: of its render I, of the variables x there, and of the Jacobian J of
 pixels by variables. With weights w and a target T, half the gradient of its loss at x, and H, are
 
-    g = mean w J^T (I - T) + H (x - mean of x),    H = mean w J^T J' over different steps,
+    g = mean w J^T (I - T) + H (x - mean of x),    H = mean w J^T J',
 
-so that noise, whose samples are independent, has no bias in any of them. The variables move by -H^-1 g of all views. In
-the first part of the steps a view forgets what was measured far from where the variables are now; later it forgets
-nothing, and the noise of all its samples is averaged. Exposures of views are variables too, by their logarithms, whose
-sum is 0: the derivatives of pixels by them are the image. Textures are fitted by `textures`.
+both over different renders, so that noise, whose samples are independent, has no bias in any of them. The variables
+move by -H^-1 g of all views. In the first part of the steps a view forgets what was measured far from where the
+variables are now; later it forgets nothing, and the noise of all its samples is averaged. Exposures of views are
+variables too, by their logarithms, whose sum is 0: the derivatives of pixels by them are the image. Textures are
+fitted by `textures`.
 """
 
 from __future__ import annotations
@@ -22,7 +23,15 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from halfspace_sss.inverse.comparing import FitSettings, FitStep, MaterialFit, ViewComparison, ViewMisfit, descend
+from halfspace_sss.inverse.comparing import (
+    FitSettings,
+    FitStep,
+    MaterialFit,
+    ViewComparison,
+    ViewMisfit,
+    descend,
+    pixels_of,
+)
 from halfspace_sss.inverse.parameters import FitParameters, check_derivatives, translucent_object
 from halfspace_sss.inverse.views import GivenView, check_views
 from halfspace_sss.progress import ProgressText
@@ -87,17 +96,19 @@ def fit(
 
 @dataclass(eq=False)
 class ViewMeans:
-    """Weighted means of what was measured of a view in the steps, and sums of squares of their weights.
+    """Means of what was measured of a view in the steps, and sums of squares of their weights.
 
     Args:
         weights, image, variance: of all pixels; renders without exposure times weights, and variance of that mean by
             noise.
         x: the variables there.
-        product: mean of the product of both renders, by pixel weights.
-        steps: how many the means count for.
+        product: mean of the product of both renders of a step, by pixel weights.
+        renders: how many the means count for.
         J: mean Jacobian, (pixels, variables), of as many as `jacobians` counts for.
         squares: sum of squares of weights times w J^T J, of single Jacobians.
         share: sum of squares of the weights in J.
+        own: sum of products of weights times w J^T I and w J^T T, of Jacobian J and image I of the same render.
+        own_share: sum of products of the weights of both.
     """
 
     weights: np.ndarray
@@ -105,44 +116,57 @@ class ViewMeans:
     variance: np.ndarray
     x: np.ndarray
     product: float
-    steps: float
+    renders: float
     J: np.ndarray
     squares: np.ndarray
+    own: np.ndarray
     jacobians: float = 0.0
     share: float = 0.0
+    own_share: float = 0.0
 
     @classmethod
     def none(cls, pixels: int, variables: int) -> ViewMeans:
         """Before the first step."""
         image, x, J = np.zeros(pixels), np.zeros(variables), np.zeros((pixels, variables))
-        return cls(image, image, image, x, 0.0, 0.0, J, np.zeros((variables, variables)))
+        own = np.zeros((2, variables))
+        return cls(image, image, image, x, 0.0, 0.0, J, np.zeros((variables, variables)), own)
 
     def forget(self, x: np.ndarray) -> None:
         """Count less for what is far from x."""
         kept = float(1 / (1 + (np.abs(x - self.x).max() / FAR) ** 4))
-        self.steps, self.jacobians = kept * self.steps, kept * self.jacobians
+        self.renders, self.jacobians = kept * self.renders, kept * self.jacobians
 
-    def add_jacobian(self, J: np.ndarray, w: np.ndarray) -> None:
-        """Of one step more, with the weights of its pixels."""
+    def add(
+        self, w: np.ndarray, image: np.ndarray, J: np.ndarray | None, T: np.ndarray, noise: np.ndarray,
+        product: float, x: np.ndarray,
+    ) -> None:  # fmt: skip
+        """A render more, at x: its image and Jacobian (None: without one), and the variance of the image by noise."""
+        self.renders += 1
+        b = 1 / self.renders
+        self.weights = self.weights + b * (w - self.weights)
+        self.image = self.image + b * (w * image - self.image)
+        self.variance = (1 - b) ** 2 * self.variance + b**2 * w**2 * noise
+        self.product += b * (product - self.product)
+        self.x = self.x + b * (x - self.x)
+        self.own, self.own_share = (1 - b) * self.own, (1 - b) * self.own_share
+        if J is None:
+            return
         self.jacobians += 1
         a = 1 / self.jacobians
         self.J = self.J + a * (J - self.J)
         self.squares = (1 - a) ** 2 * self.squares + a**2 * (J * w[:, None]).T @ J
         self.share = (1 - a) ** 2 * self.share + a**2
-
-    def add_image(self, w: np.ndarray, image: np.ndarray, noise: np.ndarray, product: float, x: np.ndarray) -> None:
-        """Of one step more, at x."""
-        self.steps += 1
-        a = 1 / self.steps
-        self.weights = self.weights + a * (w - self.weights)
-        self.image = self.image + a * (w * image - self.image)
-        self.variance = (1 - a) ** 2 * self.variance + a**2 * w**2 * noise
-        self.product += a * (product - self.product)
-        self.x = self.x + a * (x - self.x)
+        self.own = (1 - a) * self.own + a * b * np.stack([w * image, w * T]) @ J
+        self.own_share = (1 - a) * self.own_share + a * b
 
     def curvature(self) -> np.ndarray:
-        """w J^T J' of different steps."""
+        """w J^T J' of different renders."""
         return ((self.J * self.weights[:, None]).T @ self.J - self.squares) / (1 - self.share)
+
+    def by(self, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """w J^T I' and w J^T T' of different renders; of the same ones, noise of J meets I - T only."""
+        both = np.stack([self.image, self.weights * T]) @ self.J
+        return tuple((both - self.own) / (1 - self.own_share))
 
 
 class MediumDescent:
@@ -161,6 +185,8 @@ class MediumDescent:
         n = len(comparison.fitted) if comparison.settings.exposure else 1
         self.free = _of_sum_0(n)  # directions of log exposures, shape (views, views - 1)
         self.means: dict[int, ViewMeans] = {}
+        # walks have image and derivatives of the same paths; models take a pass for each variable
+        self.at_once = hasattr(comparison.scene.integrator(), "render_derivatives")
 
     def fingerprint(self) -> str:
         return self.comparison.fingerprint({name: _numbers(x).tolist() for name, x in self.parameters.start().items()})
@@ -191,9 +217,7 @@ class MediumDescent:
         values = {name: value.tolist() for name, value in self.parameters.shown(self.x).items()}
         losses, variance = [], 0.0
         for which in (views := compared.batch(k)):
-            self.parameters.put(self.x)
-            misfit = compared.view(which, k)
-            self._measure(which, k, misfit, x)
+            misfit = self._measure(which, k, x)
             losses.append(misfit.loss)
             variance += misfit.variance / len(views) ** 2
         g, H = self._normal(x)
@@ -201,18 +225,21 @@ class MediumDescent:
         self._move(move * min(1.0, LONGEST / max(np.abs(move).max(), 1e-30)))
         return FitStep(float(np.mean(losses)), float(np.sqrt(variance)), values)
 
-    def _measure(self, which: int, k: int, misfit: ViewMisfit, x: np.ndarray) -> None:
-        """Add a step to the means of a view."""
-        compared, e = self.comparison, self.comparison.exposures[which]
-        w = misfit.weights.ravel().astype(float) / compared.count(which)
-        image = (misfit.residual + compared.views[which].image).ravel() / e
-        means = self.means.setdefault(which, ViewMeans.none(len(image), len(x)))
+    def _measure(self, which: int, k: int, x: np.ndarray) -> ViewMisfit:
+        """Render a view twice, and add that to its means."""
+        compared, view = self.comparison, self.comparison.views[which]
+        means = self.means.setdefault(which, ViewMeans.none(view.image.size, len(x)))
         if k < SETTLING * self.total:
             means.forget(x)
-        if means.jacobians < 1:  # little is left for products of different steps
-            means.add_jacobian(self._jacobian(which, k, "other slope"), w)
-        means.add_jacobian(self._jacobian(which, k, "slope"), w)
-        means.add_image(w, image, misfit.noise.ravel() / e**2, misfit.exposure_curvature / e**2, x)
+        both = self.at_once or means.jacobians < 1  # little is left for products of different renders
+        (a, J), (b, other_J) = self._render(which, k, "first", True), self._render(which, k, "second", both)
+        misfit = compared.view(which, k, [a, b])
+        w = misfit.weights.ravel().astype(float) / compared.count(which)
+        e = compared.exposures[which]
+        noise, product = 2 * misfit.noise.ravel() / e**2, misfit.exposure_curvature / e**2
+        for image, slopes in ((a, J), (b, other_J)):
+            means.add(w, image.ravel(), slopes, view.image.ravel(), noise, product, x)
+        return misfit
 
     def _normal(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """g and H of all variables, those of exposures last, at x: means of the views that were met."""
@@ -221,8 +248,8 @@ class MediumDescent:
         for which, means in self.means.items():
             compared, e, moved = self.comparison, self.comparison.exposures[which], x - means.x
             T, curved = compared.views[which].image.ravel(), means.curvature()
-            by = means.J.T @ means.image
-            g[:n] += e**2 * (by + curved @ moved) - e * means.J.T @ (means.weights * T)
+            by, by_T = means.by(T)
+            g[:n] += e**2 * (by + curved @ moved) - e * by_T
             H[:n, :n] += e**2 * curved
             if self.free.size:
                 direction = self.free[compared.fitted.index(which)]
@@ -278,20 +305,41 @@ class MediumDescent:
             noise += (slopes * means.variance[:, None]).T @ slopes / len(self.means) ** 2
         return inverse @ (loss * np.eye(len(noise)) / n + noise @ inverse)
 
-    def _jacobian(self, which: int, k: int, purpose: str) -> np.ndarray:
-        """Derivatives of all pixels by all variables; a channel knows of no other but by g."""
-        compared, columns = self.comparison, []
-        view, spp = compared.views[which], compared.settings.spp
-        for j, name in enumerate(self.parameters.names):
-            x = {key: type(value)(value) for key, value in self.x.items()}
-            dr.enable_grad(x[name])
+    def _render(self, which: int, k: int, purpose: str, sloped: bool) -> tuple[np.ndarray, np.ndarray | None]:
+        """A render of a view, and derivatives of its pixels by all variables; a channel knows of no other but by g."""
+        compared, scene = self.comparison, self.comparison.scene
+        view, spp, integrator = compared.views[which], compared.settings.spp, scene.integrator()
+        seed = compared.seed(k, which, purpose)
+        if sloped and self.at_once:
+            x = self._followed(self.parameters.names)
+            self.parameters.put(x)
+            image, found = integrator.render_derivatives(scene, list(x.values()), view.sensor, seed, spp)
+            self.parameters.put(self.x)
+            return pixels_of(view, image), self._columns(view, found)
+        self.parameters.put(self.x)
+        image, found = compared.image(view, seed), []
+        for j, name in enumerate(self.parameters.names if sloped else ()):
+            x = self._followed([name])
             dr.set_grad(x[name], 1.0)
             self.parameters.put(x)
             dr.forward_from(x[name], dr.ADFlag.ClearEdges)  # models begin at the coefficients
-            seed, scene = compared.seed(k, which, purpose, j), compared.scene
-            found = scene.integrator().render_forward(scene, None, view.sensor, seed, spp)
-            d = np.array(found, dtype=np.float64)[..., : view.image.shape[2]]
-            numbers = len(_numbers(x[name]))
+            seed = compared.seed(k, which, "slope", 2 * j + (purpose == "second"))
+            found.append(integrator.render_forward(scene, None, view.sensor, seed, spp))
+        self.parameters.put(self.x)
+        return image, self._columns(view, found) if sloped else None
+
+    def _followed(self, names: Sequence[str]) -> dict[str, mi.Float | mi.Spectrum]:
+        """The variables, some with gradients."""
+        x = {name: type(value)(value) for name, value in self.x.items()}
+        for name in names:
+            dr.enable_grad(x[name])
+        return x
+
+    def _columns(self, view: GivenView, found: Sequence[mi.TensorXf]) -> np.ndarray:
+        """The Jacobian of derivatives along each parameter."""
+        columns = []
+        for name, d in zip(self.parameters.names, found):
+            d, numbers = pixels_of(view, d), len(_numbers(self.x[name]))
             for c in range(numbers):
                 keep = np.ones(d.shape[2]) if numbers == 1 else np.arange(d.shape[2]) == c
                 columns.append((d * keep).ravel())

@@ -7,7 +7,7 @@ import pytest
 
 mi = pytest.importorskip("mitsuba")
 from figures.beyond import inversion, inversion_textures  # noqa: E402
-from figures.beyond.gradients import as_media  # noqa: E402
+from halfspace_sss.rendering.scenes.mitsuba_scene import with_media  # noqa: E402
 from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED, open_scene  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("quiet_rgb")
@@ -26,7 +26,7 @@ def test_drawn_media_are_in_their_ranges_and_differ() -> None:
 def test_the_cube_of_mitsuba_is_that_of_the_walk(case: str) -> None:
     cube = inversion._cube(inversion.FIRST, inversion.CASES[case], 8)
     volpath = {"type": "volpathmis", "max_depth": inversion.TARGET_DEPTH}
-    scenes = open_scene(cube, PATH_TRACED), as_media(cube, "object", 1.0, volpath)
+    scenes = open_scene(cube, PATH_TRACED), with_media(cube, 1.0, volpath)
     means = [[np.array(mi.render(s, spp=512, seed=k)).mean(axis=(0, 1)) for k in range(4)] for s in scenes]
     (a, b), noise = np.mean(means, axis=1), np.std(means, axis=1, ddof=1) / 2
     assert (np.abs(a - b) < 6 * np.hypot(*noise) + 0.005 * a).all()

@@ -29,6 +29,7 @@ WIDEST_Z = 4.4  # two-sided 1e-5
 LANES = 2**18
 HEIGHT = 50.0  # of the slab, whose top is z = 0
 SIGMA_T, ALBEDO = np.array([0.7, 1.0, 1.5]), np.array([0.9, 0.5, 0.2])
+MATCHED = 1 + 1e-6  # index of a boundary that hardly refracts; through 1 light goes straight to events
 ALONG = direction(130.0, 0.4)  # of arrival at the event
 
 
@@ -39,7 +40,7 @@ class Beam(NamedTuple):
     E: np.ndarray
 
 
-def connections_of(lights: dict, g: float = 0.0, eta: float = 1.0, albedo: Any = ALBEDO, height: float = HEIGHT,
+def connections_of(lights: dict, g: float = 0.0, eta: float = MATCHED, albedo: Any = ALBEDO, height: float = HEIGHT,
              share: float = 1.0, shape: dict | None = None) -> SubpathConnections:  # fmt: skip
     """Of lights over a wide slab."""
     sigma_s, sigma_a = (",".join(f"{x:.9g}" for x in part) for part in (albedo * SIGMA_T, (1 - albedo) * SIGMA_T))

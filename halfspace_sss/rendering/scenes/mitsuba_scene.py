@@ -1,4 +1,4 @@
-"""A scene with translucent objects as Mitsuba's own scene: a dielectric boundary around a homogeneous medium.
+"""A scene with translucent objects as Mitsuba's own scene: a boundary around a homogeneous medium.
 
 Mitsuba's volume path tracers, which nobody here wrote, then render the same light transport.
 """
@@ -23,8 +23,10 @@ def with_media(scene: dict | str | Path, mm_per_unit: float, integrator: dict | 
     or with a `heterogeneous` one where the medium varies in space.
 
     The medium has the albedo sigma_s / sigma_t, the extinction sigma_t mm_per_unit in 1/(scene unit) and the phase
-    function `hg`; the boundary is the dielectric of the surface. Where an object is larger than the grid of its
-    sigma_t, Mitsuba's medium is empty beyond it, while ours goes on as the grid's `wrap_mode` says.
+    function `hg`; the boundary is the dielectric of the surface, and `null` where that has the index 1: Mitsuba then
+    connects events to emitters, counts no vertex there, and hides by `hide_emitters` what is behind it. Where an object
+    is larger than the grid of its sigma_t, Mitsuba's medium is empty beyond it, while ours goes on as the
+    grid's `wrap_mode` says.
 
     Args:
         scene: a dict as for `mitsuba.load_dict`, or a path of an XML file.
@@ -62,7 +64,8 @@ def _fill(config: Any, state: Any, shape: Any, mm_per_unit: float) -> None:
         if state.nodes[index].props.plugin_name() != "translucent":
             continue
         surface = _instance(config, state, index)
-        plain = {"type": "dielectric", "int_ior": float(surface.inside.medium.eta), "ext_ior": 1.0}
+        eta = float(surface.inside.medium.eta)
+        plain = {"type": "null"} if eta == 1 else {"type": "dielectric", "int_ior": eta, "ext_ior": 1.0}
         shape[key] = mi.load_dict(plain) if is_smooth_boundary(surface.boundary) else surface.boundary
         shape["interior"] = medium(surface.inside, mm_per_unit)
         return

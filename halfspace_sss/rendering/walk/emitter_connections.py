@@ -278,8 +278,11 @@ def _on_ray(walk: Walk, event: Event, u: mi.Float) -> tuple[mi.Float, mi.Float]:
 def find_connections(
     scene: mi.Scene, media: WalkMedia, small: SmallEmitters | None, share: float, scored: bool = False
 ) -> SubpathConnections | None:
-    """Connections with the small emitters of a scene; None without any, or without an object of smooth boundary."""
-    if small is None or not media.objects or media.all_rough or share == 0:
+    """Connections with the small emitters of a scene; None without any, or without an object of smooth boundary.
+
+    Where nothing refracts, `straight_light` needs none.
+    """
+    if small is None or share == 0 or not media.any_refracts:
         return None
     if media.inner is not None and not np.array(media.inner.tables["alone"]).any():
         return None

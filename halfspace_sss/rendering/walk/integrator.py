@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import drjit as dr
@@ -25,6 +25,7 @@ from halfspace_sss.rendering.walk.emitter_connections import EmitterDirections, 
 from halfspace_sss.rendering.walk.media import WalkMedia
 from halfspace_sss.rendering.walk.path_loop import FirstExits, LightVisitor, PathTracer
 from halfspace_sss.rendering.walk.scores import PathScores, with_derivatives
+from halfspace_sss.rendering.walk.straight_light import find_straight_light
 
 PARAMETERS = ("mm_per_unit", "max_depth", "rr_depth", "hide_emitters", "connection_share", "blur")
 SAMPLES_PER_LAUNCH = 2**19
@@ -78,7 +79,8 @@ def _class(variant: str) -> type:
             inner = InnerLights.of(media, self.blur)
             if scored and inner is not None:
                 raise ValueError("objects must hold no delta lights for derivatives of translucent_walk")
-            visitor = LightVisitor(scene, media, small, connections, directions, inner, self.blur)
+            straight = find_straight_light(scene, media, self.max_depth == FOREVER, scored)
+            visitor = LightVisitor(scene, media, small, connections, directions, straight, inner, self.blur)
             return PathTracer(visitor, self.max_depth, self.rr_depth, self.hidden)
 
         def render(
@@ -111,6 +113,26 @@ def _class(variant: str) -> type:
                 with dr.resume_grad():
                     dr.forward_to(image)
                     return dr.grad(image)
+
+        def render_derivatives(
+            self, scene: mi.Scene, variables: Sequence[Any], sensor: mi.Sensor | int = 0, seed: mi.UInt32 | int = 0,
+            spp: int = 0,
+        ) -> tuple[mi.TensorXf, list[mi.TensorXf]]:  # fmt: skip
+            """The image, and its derivative along each of the variables that media come from: all of the same paths.
+
+            Args:
+                variables: arrays with gradients enabled; all their numbers change alike.
+            """
+            with dr.suspend_grad():
+                image, found = self._differentiable(scene, sensor, seed, spp), []
+                with dr.resume_grad():
+                    for x in variables:
+                        dr.clear_grad(image)
+                        dr.set_grad(x, 1.0)
+                        dr.forward_from(x, dr.ADFlag.ClearInput | dr.ADFlag.ClearInterior)
+                        found.append(dr.grad(image))
+                        dr.eval(found[-1])
+                return dr.detach(image), found
 
         def render_backward(
             self, scene: mi.Scene, params: Any, grad_in: mi.TensorXf, sensor: mi.Sensor | int = 0,

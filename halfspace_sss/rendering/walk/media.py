@@ -17,7 +17,7 @@ from halfspace_sss.rendering.object.instances import Group, Placed, Sight, corne
 from halfspace_sss.rendering.object.objects import TranslucentObject, translucent_shapes
 from halfspace_sss.rendering.object.points import lift
 from halfspace_sss.rendering.object.shape import Geometry, check_together, pointer_numbers, scene_of, survey
-from halfspace_sss.rendering.object.translucent import Inside, smooth_boundary
+from halfspace_sss.rendering.object.translucent import Inside, is_smooth_boundary, smooth_boundary
 from halfspace_sss.rendering.object.varying import VaryingMedium, eval_volume
 from halfspace_sss.rendering.object.wrapped import Wrapping, surface_of, wrapping_of
 
@@ -360,11 +360,14 @@ class WalkMedia:
         tables["textured"] = mi.Bool([inside.textured is not None for inside in insides])
         tables["reflects"] = mi.Bool([inside.reflection for inside in insides])
         tables["rough"] = mi.Bool([is_rough(b) for b in boundaries])
+        straight = self._straight()
+        tables["straight"] = mi.Bool([straight[kind] for kind in placed.kind])
         numbers = pointer_numbers([mi.BSDFPtr(b) for b in self.boundaries])
         tables["boundary"] = mi.UInt32([numbers[kind] for kind in placed.kind])
         tables["kind"] = mi.UInt32(placed.kind.tolist())
         dr.make_opaque(tables)  # one kernel for all media
         object.__setattr__(self, "tables", tables)
+        object.__setattr__(self, "any_straight", any(straight))
         object.__setattr__(self, "box", _bounds(self.scene))
         varies = any(inside.varying is not None for inside in insides)
         object.__setattr__(self, "heterogeneous", HeterogeneousMedia.of(insides, self.mm_per_unit) if varies else None)
@@ -396,16 +399,26 @@ class WalkMedia:
         return any(around.bend is not None for around in self.wrappings)
 
     @property
-    def all_rough(self) -> bool:
-        """Whether no boundary is smooth."""
-        return all(is_rough(b) for b in self.boundaries)
+    def any_refracts(self) -> bool:
+        """Whether a boundary is smooth and not straight."""
+        return any(not is_rough(b) and not straight for b, straight in zip(self.boundaries, self._straight()))
 
     def connects(self, k: mi.Int32) -> mi.Bool:
-        """Whether emitters can be connected to events in object k through its boundary: smooth, and nothing inside."""
-        smooth = ~self.row("rough", k)
-        if self.inner is None:
-            return smooth
-        return smooth & dr.gather(mi.Bool, self.inner.tables["alone"], self._place(k))
+        """Whether connections go through the boundary of object k: smooth, refracting, and nothing inside."""
+        return self._alone(~self.row("rough", k) & ~self.row("straight", k), k)
+
+    def straight(self, k: mi.Int32) -> mi.Bool:
+        """Whether light goes straight through the boundary of object k: of index 1, and nothing inside."""
+        return self._alone(self.row("straight", k), k)
+
+    def _alone(self, able: mi.Bool, k: mi.Int32) -> mi.Bool:
+        return able if self.inner is None else able & dr.gather(mi.Bool, self.inner.tables["alone"], self._place(k))
+
+    def _straight(self) -> list[bool]:
+        """By shape, whether its boundary is smooth, of index 1, and everywhere."""
+        mixes = [around.mixes for around in self.wrappings] or [False] * len(self.insides)
+        rows = zip(self.insides, self.boundaries, mixes)
+        return [inside.medium.eta == 1 and is_smooth_boundary(b) and not mixed for inside, b, mixed in rows]
 
     def row(self, key: str, k: mi.Int32) -> mi.Float | mi.UInt32 | mi.Bool:
         """An entry of a table for object k."""

@@ -3,7 +3,8 @@
 One symbolic loop whose lanes begin a new path when one ends. A step is a segment inside an object (`random_walk`) or a
 ray outside with the surface that it meets. Emission is weighted against next-event estimation at the previous vertex
 (power heuristic) and against the strategies of `emitter_connections`. Delta lights, which no ray meets, are spread over
-a cone where a path leaves a vertex that next-event estimation could not light (`light.small_emitters`).
+a cone where a path leaves a vertex that next-event estimation could not light (`light.small_emitters`). Boundaries of
+index 1 are no vertices (`straight_light`).
 """
 
 from __future__ import annotations
@@ -36,6 +37,7 @@ from halfspace_sss.rendering.walk.random_walk import (
     start_walk,
 )
 from halfspace_sss.rendering.walk.scores import PathScores, Score, ScoreVisitor, Stay, StayRecord
+from halfspace_sss.rendering.walk.straight_light import StraightLight
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 # ---- Loop state ------------------------------------------------------------------------------------------------------
@@ -54,6 +56,7 @@ class LightRecord:
     pivot: mi.Point3f  # the event at the end of that edge
     directed: mi.Bool  # directions to emitters were sampled at the last event, and nothing has reflected since
     departure: Departure  # from the last event
+    sighted: mi.Bool  # an emitter was sampled at the last event, and only boundaries of index 1 were passed since
     scattered: mi.Bool  # whether a vertex has scattered into a solid angle: delta lights then are no longer hidden
     slopes: Score | tuple[()] = ()  # where derivatives are asked for, see `walk.scores`
 
@@ -83,6 +86,7 @@ class LightVisitor:
         small: its small emitters, if there are any.
         connections: of events with light subpaths of small emitters, if there are any.
         directions: from events to small emitters, where connections cannot find their light.
+        straight_light: of emitters through boundaries of index 1, if there are any.
         inner_lights: delta lights inside objects, if there are any.
         blur: scale of the cones over which delta lights outside are spread; 0 leaves their light out.
     """
@@ -92,6 +96,7 @@ class LightVisitor:
     small: SmallEmitters | None
     connections: SubpathConnections | None
     directions: EmitterDirections | None
+    straight_light: StraightLight | None = None
     inner_lights: InnerLights | None = None
     blur: float = 1.0
 
@@ -102,6 +107,13 @@ class LightVisitor:
             at = interaction_of(event.p, walk.medium)
             d, E = self.inner_lights.light(walk.object, at, walk.rng, True, walk.medium)
             record = replace(record, L=record.L + walk.weight * eval_phase(event.m, dr.dot(event.along, d)) * E)
+
+        # ---- emitters behind boundaries of index 1
+        if self.straight_light is not None:
+            sees = self.media.straight(walk.object) & self.media.counts(walk.object, walk.order + 1)
+            departure = Departure(event.p, event.along, record.departure.ahead, walk.object)
+            record = replace(record, sighted=sees, departure=departure, delta=record.delta | sees)
+            walk, record, _ = dr.if_stmt((walk, record, event), sees, self._see, _same_state, label="emitters")
         if self.connections is None:
             return walk, record
 
@@ -123,6 +135,9 @@ class LightVisitor:
     def _connect(self, walk: Walk, record: LightRecord, event: Event) -> tuple[Walk, LightRecord, Event]:
         light, slopes, rng = self.connections.light(event, walk.rng)
         return replace(walk, rng=rng), _plus(record, walk, light, slopes), event
+
+    def _see(self, walk: Walk, record: LightRecord, event: Event) -> tuple[Walk, LightRecord, Event]:
+        return walk, _plus(record, walk, *self.straight_light.light(event, walk.rng)), event
 
     def _direct(self, walk: Walk, record: LightRecord, event: Event) -> tuple[Walk, LightRecord, Event]:
         return walk, _plus(record, walk, *self.directions.light(event, walk.rng)), event
@@ -149,16 +164,29 @@ class LightVisitor:
         return walk, replace(record, L=L)
 
     def crossing(self, walk: Walk, record: LightRecord, crossing: Crossing) -> tuple[Walk, LightRecord]:
+        before = record
         record = replace(record, previous=crossing.si.p, pdf=crossing.pdf, delta=crossing.delta)
         if self.media.inner is not None:
             sampled = (self.media.index_of(crossing.si) < 0) & ~crossing.delta
             record = replace(record, delta=crossing.delta | ~crossing.leaves, scattered=record.scattered | sampled,
                              L=record.L + self.spread_inner_lights(walk, record.scattered & ~sampled))  # fmt: skip
+        if self.straight_light is not None:
+            record = self._from_event(walk, record, before, crossing)
         if self.connections is None:
             return walk, record
         straight = record.straight & crossing.leaves
         departure = replace(record.departure, ahead=crossing.along)
         return walk, replace(record, straight=straight, directed=record.directed & straight, departure=departure)
+
+    def _from_event(self, walk: Walk, record: LightRecord, before: LightRecord, crossing: Crossing) -> LightRecord:
+        """The record of a path that has left an object of index 1: its last vertex is still the event."""
+        way, medium = before.departure, walk.medium
+        first = before.delta  # way out since the event
+        near = dr.norm(crossing.si.p - way.p) < self.straight_light.reach(way.object, way.p, medium)
+        sighted = before.sighted & crossing.leaves & (~first | near)
+        pdf = self.straight_light.pdf(way.object, way.p, dr.dot(way.along, crossing.along), medium)
+        return replace(record, sighted=sighted, previous=dr.select(sighted, way.p, record.previous),
+                       pdf=dr.select(sighted, pdf, record.pdf), delta=record.delta & ~sighted)  # fmt: skip
 
     def met_emitter(self, walk: Walk, record: LightRecord, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Spectrum:
         """Light of an emitter that the ray meets, weighted against sampling it from the last vertex."""
@@ -259,7 +287,7 @@ def start_record(lanes: int, scored: bool = False) -> LightRecord:
         straight=full(mi.Bool, False), connected=full(mi.Bool, False), pivot=mi.Point3f(point),
         directed=full(mi.Bool, False),
         departure=Departure(mi.Point3f(point), along, mi.Vector3f(along), full(mi.Int32, 0)),
-        scattered=full(mi.Bool, False), slopes=Score.sums(lanes) if scored else (),
+        sighted=full(mi.Bool, False), scattered=full(mi.Bool, False), slopes=Score.sums(lanes) if scored else (),
     )  # fmt: skip
 
 
@@ -334,8 +362,9 @@ class PathTracer:
 
         rng = generator(mi, lanes, pass_seed(*seed))
         start = _begin(rays, total, dr.arange(mi.UInt32, lanes), rng, media, bool(scores))
-        dr.while_loop((start,), lambda p: p.index < total, body, label="paths")
-        dr.eval(L, hit)
+        with dr.scoped_set_flag(dr.JitFlag.OptimizeLoops, False):  # records the loop twice, for kernels no faster
+            dr.while_loop((start,), lambda p: p.index < total, body, label="paths")
+            dr.eval(L, hit)
         return L, hit
 
     def _outside(self, p: CameraPath) -> CameraPath:
@@ -408,11 +437,16 @@ class PathTracer:
                        channel=channel)  # fmt: skip
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta) | turned
         scattered = light.scattered | ~delta
-        light = replace(light, L=L, previous=si.p, pdf=bs.pdf, delta=delta, scattered=scattered)
+        again = mi.Bool(False)  # still straight from the event
+        if self.visitor.straight_light is not None:
+            again = light.sighted & enters & (k == light.departure.object)
+            again &= self.visitor.straight_light.passes_again(near)
+        light = replace(light, L=L, previous=dr.select(again, light.previous, si.p), sighted=again,
+                        pdf=dr.select(again, light.pdf, bs.pdf), delta=delta & ~again, scattered=scattered)  # fmt: skip
         if media.inner is not None:
-            light = replace(
-                light, delta=delta | enters | encloses, L=L + self.visitor.spread_inner_lights(walk, scattered & enters)
-            )
+            delta = ~again & (delta | enters | encloses)
+            L = L + self.visitor.spread_inner_lights(walk, scattered & enters)
+            light = replace(light, delta=delta, L=L)
         return replace(p, walk=walk, light=light)
 
 

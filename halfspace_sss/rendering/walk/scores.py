@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from halfspace_sss.rendering.object.wrapped import surface_of
 from halfspace_sss.rendering.walk.media import Place, WalkMedia
@@ -273,7 +274,7 @@ def followed(media: WalkMedia) -> list[tuple[int, dict[str, mi.Spectrum]]]:
         own = [n for n in surface.inside.constants if n == "g" or surface.inside.textured is None]  # the rest by place
         values = {name: getattr(surface, name) for name in own}
         values = {name: value * unit.get(name, 1.0) for name, value in values.items() if dr.grad_enabled(value)}
-        if "albedo" in values and float(dr.min(dr.detach(values["albedo"]))[0]) <= 0:
+        if "albedo" in values and np.min(surface.inside.medium.albedo) <= 0:
             raise ValueError(f"albedo must be > 0 to be differentiated by, got 0 in a channel of {obj.name}")
         result += [(k, values)] if values else []
     return result
