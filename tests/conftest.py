@@ -21,6 +21,7 @@ import numpy as np
 import pytest
 
 import halfspace_sss
+from halfspace_sss import backend
 from halfspace_sss.materials import registry
 from halfspace_sss.neural import material_model, paper_model, store
 from halfspace_sss.neural.features import N_FEATURES
@@ -33,7 +34,14 @@ LONGEST = (
     "test_flame", "test_translucent_walk", "test_fig_full_geometry", "test_full_training", "test_control_variate",
     "test_inside", "test_rendering_kernels", "test_varying_media", "test_gathered", "test_figure_sources",
     "test_neural_reflectance", "test_full_command", "test_gradient_blocks", "test_neural_training", "test_cli_train",
+    "test_rendering_normals", "test_wrapped", "test_readme", "test_shape_model", "test_full_varying",
+    "test_inner_light", "test_extremes", "test_low_orders", "test_model_contract", "test_fuzz",
 )  # fmt: skip
+
+
+def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
+    """Four at most: each takes up to 2 GB of memory."""
+    return max(2, min(backend.cores(), 4))
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

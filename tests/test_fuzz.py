@@ -84,7 +84,7 @@ def test_nothing_at_the_command_line_ends_in_a_traceback(command: str, tmp_path:
     (tmp_path / "file").write_text("a file")
     (tmp_path / "ball.xml").write_text(XML)
 
-    @settings(max_examples=CASES or 30, **HOW)
+    @settings(max_examples=CASES or 12, **HOW)
     @given(_lines(command))
     def check(arguments: list[str]) -> None:
         result = CliRunner().invoke(cli.app, arguments)

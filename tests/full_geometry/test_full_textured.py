@@ -84,6 +84,7 @@ def test_walks_from_points_have_the_medium_of_their_start_and_S_0_too() -> None:
         np.testing.assert_allclose(S[0], S[1], rtol=0.01, atol=1e-5 * S[1].max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changed", "message"),
     [((DARK, PALE), "must be trained for full_geometry"), ((PALE, PALE), "must be trained for full_geometry")],
@@ -94,6 +95,7 @@ def test_weights_of_other_textures_are_refused(trained: Trained, folder: Path, c
         storing.find_weights(painted(*changed), folder)
 
 
+@pytest.mark.slow
 def test_an_object_moved_with_its_textures_is_the_same_one(trained: Trained, folder: Path) -> None:
     turn = mi.ScalarTransform4f().translate([3, 0, 0]).rotate([0.6, 0.8, 0], 40)
     assert storing.find_weights(painted(PALE, DARK, to_world=turn), folder) == trained.path
@@ -104,7 +106,8 @@ def test_half_space_models_have_no_errors_of_textures() -> None:
         transport_of(painted(PALE, DARK), "better_dipole")
 
 
-@pytest.mark.parametrize("light", ["sampled", pytest.param("gathered", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("light", ["sampled", "gathered"])
 def test_an_image_has_the_light_of_walks_within_the_stated_error(trained: Trained, light: str) -> None:
     """In quarters of the picture; gathered light has 3 % of its own."""
     shown = mi.load_dict(scene(light, cube=cube(PALE, DARK)))

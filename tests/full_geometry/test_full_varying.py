@@ -112,6 +112,7 @@ def S_of(model, points: list[SurfacePoint]) -> np.ndarray:
     return np.array(model.S(model.prepare(exits), entries))
 
 
+@pytest.mark.slow
 def test_an_object_moved_with_its_grids_is_the_same_one(trained: Trained, folder: Path) -> None:
     moved = varying_object(turn=40.0, shift=3.0)
     again = storing.load(storing.find_weights(moved, folder), moved).model
@@ -123,6 +124,7 @@ def test_an_object_moved_with_its_grids_is_the_same_one(trained: Trained, folder
     assert np.median(np.abs(b[seen] / a[seen] - 1)) < 2e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
@@ -170,10 +172,12 @@ def agree(shown: dict, trained: Trained, mm_per_unit: float = 1.0) -> None:
     assert np.all(stated < 0.12) and np.all(errors < 0.02)
 
 
+@pytest.mark.slow
 def test_an_image_has_the_light_of_walks_within_the_stated_error(trained: Trained) -> None:
     agree({"bunny": bunny()}, trained)
 
 
+@pytest.mark.slow
 def test_nobody_is_told_of_means_where_the_medium_is_learnt(trained: Trained) -> None:
     with warnings.catch_warnings(record=True) as found:
         warnings.simplefilter("always")

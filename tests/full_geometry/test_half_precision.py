@@ -28,13 +28,10 @@ def in_half(x: Any) -> Any:
     return SINGLE([dr.float16_array_t(kind)(dr.clip(v, -256, 256)) for v in x])
 
 
-@pytest.mark.parametrize("radius", [1.0, 10.0])
-def test_the_network_of_all_shapes_is_off_by_less_than_its_noise(
-    radius: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_network_of_all_shapes_is_off_by_less_than_its_noise(monkeypatch: pytest.MonkeyPatch) -> None:
     """Both S_0 and the correction are networks: 0.1 % in the median, 1 % nearly everywhere, none in the mean."""
     mi.set_variant("llvm_ad_rgb")
-    obj = object_of(mi.load_dict({"type": "sphere", "radius": radius}), MARBLE)
+    obj = object_of(mi.load_dict({"type": "sphere", "radius": 3.0}), MARBLE)
     model, rng = transport(obj), generator(mi, N, pass_seed(4))
     exit, entry = obj.random_points(rng), obj.random_points(rng)
     dr.eval(exit, entry)

@@ -73,8 +73,10 @@ def test_it_is_as_bright_as_the_model_sampled_within_3_percent(model: str, light
     assert (np.abs((one + two) / (a + b) - 1) < 0.03 + 4 * noise / (a + b)).all()
 
 
-@pytest.mark.parametrize("light", ["sky", "lamp", "point"])
-@pytest.mark.parametrize("model", MODELS)
+OTHERS = [pytest.param(*case, marks=pytest.mark.slow) for case in (("neural", "sky"), ("better_dipole", "point"))]
+
+
+@pytest.mark.parametrize(("model", "light"), [("better_dipole", "lamp"), ("neural", "point"), *OTHERS])
 def test_its_pixels_differ_from_the_model_sampled_by_6_percent_at_most(model: str, light: str) -> None:
     a, b, one, two = _pictures(model, light)
     square = ((one - a) * (two - b)).mean(axis=(0, 1))  # noise of the two is independent

@@ -19,7 +19,6 @@ mi = pytest.importorskip("mitsuba")
 
 CLEAR = {"sigma_s": ".3,.25,.2", "sigma_a": ".02,.1,.3", "eta": 1.4}  # a ball of 4 to 6 mean free paths
 LAMP = {"type": "sphere", "center": [1.5, 3, 2.5], "radius": 0.5, "emitter": {"type": "area", "radiance": 40.0}}
-POINT = {"type": "point", "position": [1.5, 3, 2.5], "intensity": 40.0}
 SKY = {"type": "constant", "radiance": 0.5}
 
 
@@ -37,7 +36,6 @@ def _floor() -> dict:
 def _lights(name: str) -> dict:
     return {
         "lamp and sky": {"lamp": LAMP, "sky": SKY},
-        "point": {"lamp": POINT},
         "windows": {"sky": _uneven()},
         "floor": {"floor": _floor(), "sky": SKY},
     }[name]
@@ -76,8 +74,8 @@ def _pictures(light: str, g: float) -> tuple[np.ndarray, np.ndarray]:
     return np.array(found[0]), np.array(found[1])
 
 
-CASES = [("lamp and sky", 0.0), ("windows", 0.3)]
-SLOW = [pytest.param(*case, marks=pytest.mark.slow) for case in (("point", 0.0), ("floor", 0.3))]
+CASES = [("lamp and sky", 0.0), pytest.param("windows", 0.3, marks=pytest.mark.slow)]
+SLOW = [pytest.param("floor", 0.3, marks=pytest.mark.slow)]
 
 
 @pytest.mark.parametrize(("light", "g"), CASES + SLOW)

@@ -80,20 +80,18 @@ def same(a: np.ndarray, b: np.ndarray) -> None:
     assert p.min() * p.size > 1e-4
 
 
-@pytest.mark.parametrize("light", LIGHTS)
-@pytest.mark.parametrize("normals", [False, True], ids=["faces", "vertex normals"])
+@pytest.mark.parametrize(("light", "normals"), [("sky", False), ("lamp", True)], ids=["faces", "vertex normals"])
 def test_a_mesh_looks_the_same_however_it_is_wound_flipped_and_mirrored(light, normals, tmp_path):
     upright = image(mesh(tmp_path, False, normals), light)
-    for reverse, flip, mirror in itertools.product((False, True), repeat=3):
+    for reverse, flip, mirror in ((True, False, False), (False, True, False), (False, False, True), (True, True, True)):
         same(image(mesh(tmp_path, reverse, normals, flip, mirror), light, seed=2), upright)
 
 
-@pytest.mark.parametrize("light", LIGHTS)
-def test_a_sphere_looks_the_same_flipped_and_mirrored(light):
-    upright = image({"type": "sphere", "radius": 4.0}, light)
-    for flip, sign in itertools.product((False, True), (1, -1)):
+def test_a_sphere_looks_the_same_flipped_and_mirrored():
+    upright = image({"type": "sphere", "radius": 4.0}, "lamp")
+    for flip, sign in ((True, 1), (False, -1), (True, -1)):
         to_world = mi.ScalarTransform4f().scale([sign * 4.0, 4.0, 4.0])
-        same(image({"type": "sphere", "flip_normals": flip, "to_world": to_world}, light, seed=2), upright)
+        same(image({"type": "sphere", "flip_normals": flip, "to_world": to_world}, "lamp", seed=2), upright)
 
 
 def test_a_rough_boundary_looks_the_same_inside_out():

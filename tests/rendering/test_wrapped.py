@@ -96,9 +96,7 @@ def slab(folder, slope: float) -> dict:
     return {"type": "obj", "filename": str(path)}
 
 
-@pytest.mark.parametrize(
-    ("kind", "integrator"), [("normalmap", "bssrdf"), ("normalmap", "translucent_walk"), ("bumpmap", "bssrdf")]
-)
+@pytest.mark.parametrize(("kind", "integrator"), [("normalmap", "translucent_walk"), ("bumpmap", "bssrdf")])
 def test_a_map_of_one_slope_is_a_mesh_with_such_normals(integrator, kind, tmp_path):
     slope = float(np.tan(TILT))
     if kind == "normalmap":
