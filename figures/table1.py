@@ -31,7 +31,9 @@ were not in Dr.Jit's cache; *render* in seconds for the image, without compilati
 its authors, for its own networks on their machine: they stand beside for their order of magnitude."""
 RIVALS_NOTES = """\
 The objects of Fig. 7, in its quality. Deng et al.: the photographs it takes, and the fit of its textures, the albedo of
-each vertex in half precision. TG et al.: walks and network, in half precision."""
+each vertex in half precision. TG et al.: walks and network, in half precision. *Render*: CPU seconds of a million
+samples of the image, compilation and gathered light left out. A sample of TG et al. is a sum over all directions of the
+environment."""
 
 
 class Stated(NamedTuple):
@@ -61,13 +63,14 @@ def parts(quality: str) -> list[Part]:
             inputs = (BUNNY, *weight_files(model, materials.load(material).medium))
             work = 2 * spp * size**2 * entries
             results.append(Part(_name(material, model, entries), rendered, params, work, needs, inputs, model))
-    return results + [part for part in fig07.parts(quality) if part.name in _rivals()]
+    told = {part for pair in _rivals() for part in pair}
+    return results + [part for part in fig07.parts(quality) if part.name in told]
 
 
-def _rivals() -> dict[str, tuple[str, str]]:
-    """Object and label of the parts of Fig. 7 that tell a training, by name."""
+def _rivals() -> dict[tuple[str, str], tuple[str, str]]:
+    """Object and label by the parts of Fig. 7 that tell the training and the image: one part for both of the rivals."""
     return {
-        training_of(name) if method == FULL_GEOMETRY else f"{name}, {method}": (name, shown)
+        (training_of(name) if method == FULL_GEOMETRY else f"{name}, {method}", f"{name}, {method}"): (name, shown)
         for name in fig07.OBJECTS
         for method, shown in fig07.LABELS.items()
     }
@@ -86,13 +89,14 @@ def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
     """The rows as CSV, and both tables as Markdown."""
     import pandas
 
-    subjects = dict.fromkeys(name.split(", ")[0] for name in results if name not in _rivals())
+    of_rivals = {part for pair in _rivals() for part in pair}
+    subjects = dict.fromkeys(name.split(", ")[0] for name in results if name not in of_rivals)
     rows = pandas.DataFrame([_row(results, *case) for case in ((m, *c) for m in subjects for c in _cases())])
     beside = pandas.DataFrame(PAPER).rename(columns={"training": "training, s", "kilobytes": "weights, kB"})
-    told = {name: results[name].numbers for name in _rivals() if name in results}
     rivals = pandas.DataFrame([
-        {"object": name, "method": shown, "training, CPU s": told[part]["cpu seconds"], "weights, kB": told[part]["kB"]}
-        for part, (name, shown) in _rivals().items() if part in told
+        {"object": name, "method": shown, "training, CPU s": results[training].numbers["cpu seconds"],
+         "weights, kB": results[training].numbers["kB"], "render, CPU s per 10⁶": _per_million(results[image])}
+        for (training, image), (name, shown) in _rivals().items() if image in results
     ])  # fmt: skip
     text = ["# Time, samples and size", NOTES, in_markdown(rows), "## Beside the rivals", RIVALS_NOTES,
             in_markdown(rivals), "## As published", in_markdown(beside)]  # fmt: skip
@@ -102,6 +106,12 @@ def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
         "table1_paper.csv": beside.to_csv(index=False, lineterminator="\n"),
         "table1.md": "\n\n".join(text) + "\n",
     }
+
+
+def _per_million(result: Result) -> float:
+    """CPU seconds of a million samples of an image."""
+    rows, columns = result.images["image"].shape[:2]
+    return 1e6 * result.numbers["cpu seconds of a sample"] / (rows * columns)
 
 
 def _row(results: Mapping[str, Result], material: str, model: str, entries: int) -> dict[str, Any]:

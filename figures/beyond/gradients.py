@@ -1,9 +1,9 @@
 """Gradients of an image by the medium of an object, measured: `translucent_walk` beside Mitsuba's `prbvolpath`.
 
-A step is a render, and a pass backwards of the mean of its pixels to the albedo of each channel, under a lamp and a
-dim sky. A boundary of index 1 is `null` for `prbvolpath`, which then connects to lights through it. With v the variance
-of a gradient over its square, mean over channels, and t the CPU seconds of a step, v t is what counts. `prbvolpath`
-leaves out all that is scattered more often than its depth. First steps include compilation, where Dr.Jit's cache has no
+A step is the image and the derivative of its mean by the albedo of each channel, under a lamp and a dim sky: of walks
+by the same paths, as `fit` takes them; of `prbvolpath` by a render and a pass backwards. With v the variance of a
+gradient over its square, mean over channels, and t the CPU seconds of a step, v t is what counts. `prbvolpath` leaves
+out all that is scattered more often than its depth. First steps include compilation, where Dr.Jit's cache has no
 kernels (`DRJIT_CACHE_DIR` may name an empty folder).
 """
 
@@ -92,7 +92,7 @@ def gradient_rows(case: str, size: int, spp: int, seed: int, progress: NamedProg
 def _steps(scene: mi.Scene, spp: int, repeats: int, seed: int) -> Steps:
     parameters = mi.traverse(scene)
     key = next(k for k in parameters.keys() if k.endswith(("bsdf.albedo", "albedo.value.value")))
-    gradients, seconds = [], []
+    gradients, seconds, walks = [], [], hasattr(scene.integrator(), "render_derivatives")
     for k in range(repeats + 1):  # the first compiles
         seeds = np.random.SeedSequence([seed, k]).generate_state(2)
         value = type(parameters[key])(dr.detach(parameters[key]))
@@ -100,8 +100,12 @@ def _steps(scene: mi.Scene, spp: int, repeats: int, seed: int) -> Steps:
         dr.enable_grad(value)
         parameters[key] = value
         parameters.update()
-        image = mi.render(scene, parameters, spp=spp, seed=int(seeds[0]), seed_grad=int(seeds[1]))
-        dr.backward(dr.mean(image, axis=None))
-        gradients.append(np.ravel(np.array(dr.grad(parameters[key]), dtype=float)))
+        if walks:
+            _, (slopes,) = scene.integrator().render_derivatives(scene, [value], seed=int(seeds[0]), spp=spp)
+            gradients.append(np.array(slopes, dtype=float).mean(axis=(0, 1)) / 3)
+        else:
+            image = mi.render(scene, parameters, spp=spp, seed=int(seeds[0]), seed_grad=int(seeds[1]))
+            dr.backward(dr.mean(image, axis=None))
+            gradients.append(np.ravel(np.array(dr.grad(parameters[key]), dtype=float)))
         seconds.append(time.process_time() - at)
     return Steps(np.array(gradients), float(np.median(seconds[1:])), seconds[0])

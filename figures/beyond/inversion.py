@@ -9,7 +9,7 @@ one view a step, with two independent renders in its loss. All CPU seconds, comp
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import drjit as dr
@@ -19,7 +19,7 @@ import numpy as np
 from figures.beyond.inversion_textures import rms
 from halfspace_sss import inverse
 from halfspace_sss.inverse.views import GivenView
-from halfspace_sss.progress import NamedProgress
+from halfspace_sss.progress import NamedProgress, ProgressText
 from halfspace_sss.rendering.scenes.mitsuba_scene import with_media
 
 CASES: Mapping[str, Mapping[str, float]] = {
@@ -35,6 +35,7 @@ EDGE = 0.2  # mm
 TARGET_DEPTH = 256
 DEPTHS = (6, 64)
 RATE = 0.05
+WITHIN = (30, 10, 3)  # % of sigma_t, and when it was reached
 SIDES = ([0, 0, 1], [1, 0.2, 0], [0, 1, 0.2], [-1, 0, 0.3], [0.2, -1, 0], [0.3, 0.2, -1])
 
 
@@ -48,7 +49,7 @@ def medium_rows(
     case: str, number: int, size: int, spp: int, target_spp: int, steps: int, prb_steps: int, seed: int,
     progress: NamedProgress | None = None,
 ) -> list[dict[str, Any]]:  # fmt: skip
-    """Of each way: errors of what was found, and CPU seconds.
+    """Of each way: errors of what was found, CPU seconds, and those after which errors of sigma_t stayed small.
 
     Args:
         case: of `CASES`.
@@ -67,21 +68,32 @@ def medium_rows(
     settings = inverse.FitSettings(steps=steps, spp=spp, seed=seed)
     for depth in (None, *(DEPTHS if prb_steps else ())):
         way = "fit" if depth is None else f"prbvolpath, depth {depth}"
+        at, times = time.process_time(), []
 
-        def show(done: int, total: int, _: str, way: str = way) -> None:
+        def show(done: int, total: int, _: str, way: str = way, times: list[float] = times, at: float = at) -> None:
+            times.append(time.process_time() - at)
             if progress:
                 progress(f"{case}, target {number}, {way}", done, total)
 
-        at = time.process_time()
+        start = _cube(START, kind, size)
         if depth is None:
-            start = _cube(START, kind, size)
-            found = inverse.fit(start, views, ("albedo", "sigma_t"), settings=settings, progress=show).values
+            fitted = inverse.fit(start, views, ("albedo", "sigma_t"), settings=settings, progress=show)
+            way_there = [{name: np.array(v) for name, v in step.values.items()} for step in fitted.steps[1:]]
+            way_there.append(fitted.values)
         else:
-            found = _prb(_cube(START, kind, size), images, spp, prb_steps, depth, seed)
-        seconds = time.process_time() - at
+            way_there = _prb(start, images, spp, prb_steps, depth, seed, show)
         about = {"case": case, "target": number, "way": way, "samples of targets": target_spp, "seed": seed}
-        rows.append({**about, **_errors(found, true, kind["g"]), "CPU s": seconds})
+        seconds, off = time.process_time() - at, [_errors(found, true, kind["g"]) for found in way_there]
+        until = {f"CPU s to {most} %": _until([e["sigma_t, %"] for e in off], times, most) for most in WITHIN}
+        rows.append({**about, **off[-1], "CPU s": seconds, **until})
     return rows
+
+
+def _until(off: Sequence[float], times: Sequence[float], most: float) -> float:
+    """When an error fell below `most` for good; NaN if it did not."""
+    above = [k for k, error in enumerate(off) if error >= most]
+    first = above[-1] + 1 if above else 0
+    return times[first] if first < len(times) else np.nan
 
 
 def targets(case: str, number: int, size: int, spp: int, seed: int) -> list[np.ndarray]:
@@ -131,9 +143,9 @@ def _film(size: int) -> dict[str, Any]:
 
 
 def _prb(
-    start: dict[str, Any], images: list[np.ndarray], spp: int, steps: int, depth: int, seed: int
-) -> dict[str, np.ndarray]:
-    """Adam on log sigma_t and logit albedo by Mitsuba's gradients of volume paths."""
+    start: dict[str, Any], images: list[np.ndarray], spp: int, steps: int, depth: int, seed: int, show: ProgressText
+) -> list[dict[str, np.ndarray]]:
+    """The medium after each step of Adam on log sigma_t and logit albedo, by Mitsuba's gradients of volume paths."""
     scene = with_media(start, 1.0, {"type": "prbvolpath", "max_depth": depth})
     parameters = mi.traverse(scene)
     keys = {name: next(k for k in parameters.keys() if k.endswith(f"{name}.value.value")) for name in START}
@@ -142,6 +154,7 @@ def _prb(
     weights = [1 / dr.square(target + 0.1 * dr.mean(target, axis=None)) for target in targets]
     adam = mi.ad.Adam(lr=RATE)
     x = {"albedo": np.log(START["albedo"] / (1 - START["albedo"])), "sigma_t": np.log(START["sigma_t"] / scale)}
+    found = []
     for name, key in keys.items():
         adam[name] = type(parameters[key])(x[name].tolist())
     for k in range(steps):
@@ -152,5 +165,7 @@ def _prb(
         image = mi.render(scene, parameters, sensor=which, spp=spp, seed=int(seeds[0]), seed_grad=int(seeds[1]))
         dr.backward(dr.mean(weights[which] * dr.square(image - targets[which]), axis=None))
         adam.step()
-    x = {name: np.ravel(np.array(dr.detach(adam[name]), dtype=float)) for name in keys}
-    return {"albedo": 1 / (1 + np.exp(-x["albedo"])), "sigma_t": scale * np.exp(x["sigma_t"])}
+        x = {name: np.ravel(np.array(dr.detach(adam[name]), dtype=float)) for name in keys}
+        found.append({"albedo": 1 / (1 + np.exp(-x["albedo"])), "sigma_t": scale * np.exp(x["sigma_t"])})
+        show(k + 1, steps, "")
+    return found

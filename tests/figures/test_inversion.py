@@ -21,6 +21,12 @@ def test_drawn_media_are_in_their_ranges_and_differ() -> None:
     assert (inversion.target(0)["sigma_t"] == [20, 50, 50]).all()
 
 
+def test_an_error_is_small_from_when_it_stays_so() -> None:
+    times = [1.0, 2.0, 3.0, 4.0]
+    assert inversion._until([40, 20, 35, 5], times, 30) == 4 and inversion._until([20, 9, 4, 2], times, 30) == 1
+    assert np.isnan(inversion._until([40, 20, 35, 31], times, 30))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("case", ["eta 1", "eta 1.4, rough"])
 def test_the_cube_of_mitsuba_is_that_of_the_walk(case: str) -> None:

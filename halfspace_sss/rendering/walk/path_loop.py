@@ -197,6 +197,9 @@ class LightVisitor:
         ds = mi.DirectionSample3f(self.scene, si, previous)
         sampled = active & ~record.delta
         pdf = dr.select(sampled, self.scene.pdf_emitter_direction(previous, ds, sampled), 0)
+        if self.straight_light is not None:
+            sighted = sampled & record.sighted
+            pdf = dr.select(sighted, self.straight_light.pdf_emitter(previous, ds, sighted), pdf)
         share = dr.select(record.delta, 1, power_heuristic(record.pdf, pdf))
         if self.connections is not None and self.small.some_met:
             which = self.small.index_of(emitter, walk.d)

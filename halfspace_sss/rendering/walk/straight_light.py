@@ -1,10 +1,11 @@
 """Light of emitters that reaches events straight, through boundaries of relative index 1.
 
-A boundary without refraction hides no emitter. Each event samples one, of all emitters of the scene, and weights it
-against the direction that the phase function draws (power heuristic), as volume path tracers do through boundaries
-that are `null`. On its way out light may leave the object and pass it again. Both strategies know the same ways: the
-object of the event, and nothing else, lies between the event and the emitter, and the first way out is no longer than
-`FARTHEST` mean free paths. All other light is left to chance.
+A boundary without refraction hides no emitter. Each event samples one of the emitters and weights it against the
+direction that the phase function draws (power heuristic), as volume path tracers do through boundaries that are `null`.
+On its way out light may leave the object and pass it again. Both strategies know the same ways: the object of the
+event, and nothing else, lies between the event and the emitter, and the first way out is no longer than `FARTHEST`
+mean free paths. All other light is left to chance, and so is that of an even sky: its samples add more noise than they
+take away.
 """
 
 from __future__ import annotations
@@ -13,10 +14,12 @@ from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from halfspace_sss.rendering.object.points import channel_mean
+from halfspace_sss.rendering.object.shape import by_pointer, looked_up, pointer_numbers
 from halfspace_sss.rendering.walk.media import WalkMedia, WalkMedium, interaction_of, ray_of
-from halfspace_sss.rendering.walk.random_walk import Event, eval_phase
+from halfspace_sss.rendering.walk.random_walk import Event, draw, eval_phase
 from halfspace_sss.rendering.walk.scores import Score, phase_score
 
 FARTHEST = 16.0  # mean free paths: e^-16 is below what float32 adds to 1
@@ -43,6 +46,8 @@ class StraightLight:
     Args:
         scene: the Mitsuba scene.
         media: its translucent objects.
+        emitters: those that are sampled.
+        tables: `pointer`, what Dr.Jit's registry calls each of them, and from that number to its place, `index`.
         again: whether light may pass an object again on its way: not where walks carry their medium, nor where paths
             have a limit of depth.
         scored: whether light comes with its slopes.
@@ -50,6 +55,8 @@ class StraightLight:
 
     scene: mi.Scene
     media: WalkMedia
+    emitters: list[mi.Emitter]
+    tables: dict[str, mi.UInt32 | mi.Int32]
     again: bool
     scored: bool = False
 
@@ -65,14 +72,22 @@ class StraightLight:
         """Density by which the phase function draws a direction at the point p of object k, 1/sr."""
         return channel_mean(eval_phase(self.media.coefficients(k, p, medium), cosine))
 
+    def pdf_emitter(self, at: mi.Interaction3f, ds: mi.DirectionSample3f, active: mi.Bool) -> mi.Float:
+        """Density by which `light` draws a direction to an emitter, 1/sr; 0 of emitters that are not sampled."""
+        active = active & (looked_up(self.tables["index"], ds.emitter, -1) >= 0)
+        return dr.select(active, ds.emitter.pdf_direction(at, ds, active) / len(self.emitters), 0)
+
     def light(self, event: Event, rng: mi.PCG32) -> tuple[mi.Spectrum, Score | tuple[()]]:
         """An estimate of the light that an event sends on, per weight of the walk, and its slopes."""
-        at = interaction_of(event.p, event.medium)
-        ds, light = self.scene.sample_emitter_direction(at, mi.Point2f(rng.next_float32(), rng.next_float32()), False)
+        at, n, emitter = interaction_of(event.p, event.medium), len(self.emitters), self.emitters[0]
+        if n > 1:
+            pointer = dr.gather(mi.UInt32, self.tables["pointer"], draw(n, rng))
+            emitter = dr.reinterpret_array(mi.EmitterPtr, pointer)
+        ds, light = emitter.sample_direction(at, mi.Point2f(rng.next_float32(), rng.next_float32()))
         cosine = dr.dot(event.along, ds.d)
         phase = eval_phase(event.m, cosine)
-        a, b = dr.square(ds.pdf), dr.square(channel_mean(phase))
-        value = dr.select(ds.pdf > 0, phase * light * dr.select(ds.delta, 1, a / (a + b)), 0)
+        a, b = dr.square(ds.pdf / n), dr.square(channel_mean(phase))
+        value = dr.select(ds.pdf > 0, phase * light * (n * dr.select(ds.delta, 1, a / (a + b))), 0)
         lit = (dr.max(value) > 0) & dr.isfinite(channel_mean(value))
         way = self._way(event, ds, lit, rng)
         result = dr.select(lit & way.arrives, value * way.T, 0)
@@ -108,7 +123,12 @@ class StraightLight:
 
 
 def find_straight_light(scene: mi.Scene, media: WalkMedia, again: bool, scored: bool = False) -> StraightLight | None:
-    """Straight light of a scene; None without an object of index 1 that can have it, or without an emitter."""
-    if not media.any_straight or not scene.emitters():
+    """Straight light of a scene; None without an object of index 1 that can have it, or an emitter to sample."""
+    emitters = [emitter for emitter in scene.emitters() if "Constant" not in emitter.class_name()]
+    if not media.any_straight or not emitters:
         return None
-    return StraightLight(scene, media, again and not media.carried, scored)
+    pointers = [mi.EmitterPtr(emitter) for emitter in emitters]
+    numbers = mi.UInt32(pointer_numbers(pointers))
+    tables = {"pointer": numbers, "index": by_pointer(pointers, np.arange(len(pointers)), -1)}
+    dr.make_opaque(tables)
+    return StraightLight(scene, media, emitters, tables, again and not media.carried, scored)
