@@ -146,7 +146,7 @@ def first_event(obj: TranslucentObject, at: SurfacePoint, active: Any = True) ->
 
     def step(k: Any, o: Any, d: Any, skip: Any, v: Any, way: Any, sums: tuple, active: Any) -> tuple:
         P, moments, length = sums
-        si = obj.geometry.scene.ray_intersect(mi.Ray3f(o + d * skip, d), flags, False, active)
+        si = obj.geometry.ray_intersect(mi.Ray3f(o + d * skip, d), flags, False, active)
         l = dr.select(si.is_valid(), si.t + skip, 1e4 / dr.min(sigma_t))  # noqa: E741
         l, met = (l, mi.Bool(False)) if contents is None else contents.reach(o, d, l, active)  # noqa: E741
         through, inner = flight(obj, o, d, l, sigma_t)
@@ -264,7 +264,7 @@ def insides(obj: TranslucentObject, frame: Any, low: np.ndarray, cell: float, ce
     votes = mi.UInt32(0)
     for ray in RAYS:
         p, d = frame.back(mi.Vector3f(*q), dr.normalize(mi.Vector3f(*ray)))
-        si = obj.geometry.scene.ray_intersect(mi.Ray3f(p, d))
+        si = obj.geometry.ray_intersect(mi.Ray3f(p, d), mi.RayFlags.All)
         votes += dr.select(si.is_valid() & (dr.dot(d, si.n) * opaque(obj.geometry.sign) > 0), mi.UInt32(1), 0)
     return (votes >= 2).numpy().astype(np.float32).reshape(cells[::-1])
 

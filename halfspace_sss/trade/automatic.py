@@ -19,7 +19,7 @@ import mitsuba as mi
 
 from halfspace_sss.neural.store import weights_folder
 from halfspace_sss.provenance import provenance, write_atomically
-from halfspace_sss.rendering.object.objects import translucent_shapes
+from halfspace_sss.rendering.object.objects import refuse_instances, translucent_shapes
 from halfspace_sss.rendering.object.registry import AUTO, Choices, model_names
 from halfspace_sss.rendering.object.settings import Settings
 from halfspace_sss.rendering.object.wrapped import surface_of
@@ -53,7 +53,9 @@ def choose(scene: mi.Scene, settings: Settings) -> Choices:
     Raises:
         ValueError: the scene cannot be rendered, or the file of an earlier choice is damaged.
     """
-    on = Stage(scene, translucent_shapes(scene), settings.shared(), settings.of_models())
+    shapes = translucent_shapes(scene)
+    refuse_instances(scene, shapes, "the model 'auto'")
+    on = Stage(scene, shapes, settings.shared(), settings.of_models())
     named = [settings.model or surface_of(shape).inside.model for shape in on.shapes]
     path = choices_folder() / f"{_identity(on, settings)}.json"
     record = _read(path) if path.is_file() else None

@@ -201,7 +201,7 @@ def test_an_instance_is_refused(folder: Path) -> None:
     group = {"type": "shapegroup", "inner": {"type": "sphere", "bsdf": SURFACE}}
     objects = {"group": group, "copy": {"type": "instance", "inner": {"type": "ref", "id": "group"}}}
     with pytest.raises(ValueError, match="object must not be an instance to be learnt, got 'copy'"):
-        train(load_objects({"type": "scene", **objects}), folder=folder)
+        train(load_objects({"type": "scene", **objects}), object="copy", folder=folder)
 
 
 def test_a_medium_that_nowhere_scatters_is_refused(folder: Path) -> None:

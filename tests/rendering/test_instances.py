@@ -1,7 +1,8 @@
-"""Instances of translucent objects: walks see each as they see an object of its own at that place."""
+"""Instances of translucent objects: walks and models see each as they see an object of its own at that place."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -35,12 +36,13 @@ def box(**more: Any) -> dict:
     return {"type": "cube", "to_world": at, "bsdf": surface(orders="total"), **more}
 
 
-def view(integrator: str = "translucent_walk", **things: dict) -> dict:
+def view(integrator: str | dict = "translucent_walk", **things: dict) -> dict:
     film = {"type": "hdrfilm", "width": 8, "height": 6, "rfilter": {"type": "box"}, "pixel_format": "rgb",
             "component_format": "float32"}  # fmt: skip
     at = mi.ScalarTransform4f().look_at([0, -2, 12], [0, 0, 0], [0, 1, 0])
     sensor = {"type": "perspective", "fov": 26.0, "to_world": at, "film": film}
-    return {"type": "scene", "integrator": {"type": integrator}, "sensor": sensor, **things}
+    integrator = integrator if isinstance(integrator, dict) else {"type": integrator}
+    return {"type": "scene", "integrator": integrator, "sensor": sensor, **things}
 
 
 def shown(parts: dict[str, dict], to_world: list[Any]) -> dict[str, dict]:
@@ -67,7 +69,7 @@ def light() -> dict[str, dict]:
 
 
 def images(scene: dict, spp: int, seed: int, runs: int = 12) -> np.ndarray:
-    loaded = mi.load_dict(scene)
+    loaded = mi.load_dict(scene, optimize=False)  # which would merge meshes
     return np.array([np.array(mi.render(loaded, spp=spp, seed=seed + k), dtype=float) for k in range(runs)])
 
 
@@ -175,14 +177,15 @@ def test_each_shape_of_each_instance_has_a_number_of_its_own() -> None:
     assert abs(int(number[1]) - int(number[0])) == 1  # two instances of one shape
 
 
-@pytest.mark.slow
-def test_derivatives_by_the_medium_are_those_of_objects_that_stand_there() -> None:
+def agree_in_slopes(integrator: str, wax: dict, by: str) -> None:
+    """Derivatives of images by the medium of instances, and of boxes that stand there."""
+
     def slopes(made: Any, seed: int) -> np.ndarray:
         bsdf, results = {"type": "ref", "id": "wax"}, []
-        wax = {**surface(orders="total"), "id": "wax"}
-        scene = mi.load_dict(view(**light(), wax=wax, **made({"box": box(bsdf=bsdf)}, places())))
+        things = {**light(), "wax": {**wax, "id": "wax"}, **made({"box": box(bsdf=bsdf)}, places())}
+        scene = mi.load_dict(view(integrator, **things))
         parameters = mi.traverse(scene)
-        (key,) = (name for name in parameters.keys() if name.endswith("sigma_t"))
+        (key,) = (name for name in parameters.keys() if name.endswith(by))
         dr.enable_grad(parameters[key])
         for k in range(8):
             dr.set_grad(parameters[key], 1.0)
@@ -196,6 +199,11 @@ def test_derivatives_by_the_medium_are_those_of_objects_that_stand_there() -> No
     assert (error < 0.1 * np.abs(wanted.mean(axis=0))).all()
 
 
+@pytest.mark.slow
+def test_derivatives_by_the_medium_are_those_of_objects_that_stand_there() -> None:
+    agree_in_slopes("translucent_walk", surface(orders="total"), "sigma_t")
+
+
 def refusal(scene: dict) -> str:
     loaded = mi.load_dict(scene)
     with pytest.raises(ValueError) as caught:
@@ -203,9 +211,104 @@ def refusal(scene: dict) -> str:
     return str(caught.value)
 
 
-def test_instances_are_refused_by_models() -> None:
-    found = refusal(view("bssrdf", **light(), **shown({"box": box()}, places())))
-    assert "must be no instances for models of their light, got the shape 'box' in a shapegroup" in found
+def seen(model: str, to_world: list[Any], **more: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Images of a box by a model, as instances and as boxes that stand there."""
+    parts = {"box": box(bsdf=surface(model, "total", **more))}
+    return tuple(images(view("bssrdf", **light(), **made(parts, to_world)), 128, seed, 8)
+                 for seed, made in ((1, shown), (1001, direct)))  # fmt: skip
+
+
+def stretched() -> list[Any]:
+    a, b = places()
+    return [a @ mi.ScalarTransform4f().scale([0.9, 1.4, 0.7]), b @ mi.ScalarTransform4f().scale([1.0, 1.0, -1.2])]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", ["neural", "lambert", "neural_shape"])
+def test_models_see_turned_instances_as_objects_that_stand_there(model: str) -> None:
+    agree(*seen(model, places()), 0.005)
+
+
+@pytest.mark.slow
+def test_a_model_of_the_half_space_sees_stretched_and_mirrored_instances_as_such_meshes() -> None:
+    agree(*seen("better_dipole", stretched()), 0.005)
+
+
+@pytest.mark.slow
+def test_textures_are_painted_on_stretched_instances_as_on_such_meshes() -> None:
+    checks = {"type": "checkerboard", "color0": {"type": "rgb", "value": [0.95, 0.7, 0.4]}, "color1": 0.2}
+    agree(*seen("better_dipole", stretched(), medium={"albedo": checks, "sigma_t": 3.0}), 0.005)
+
+
+@pytest.mark.slow
+def test_an_object_is_learnt_once_for_all_its_instances(monkeypatch: Any, tmp_path: Any) -> None:
+    training = pytest.importorskip("full_geometry.learning.training")
+    from halfspace_sss.neural import store
+
+    learnt, train = [], training.train
+    quick = replace(training.STANDARD, width=16, depth=2, batch=1024, chunk=2**12)
+
+    def counted(obj: Any, **how: Any) -> Any:
+        learnt.append(obj.geometry.name)
+        return train(obj, chunks=4, recipe=quick)
+
+    monkeypatch.setattr(training, "train", counted)
+    monkeypatch.setattr(training, "WALKS", 512)
+    monkeypatch.setenv(store.ENVIRONMENT_VARIABLE, str(tmp_path))
+    agree(*seen("full_geometry", places()), 0.01)
+    assert learnt == ["'box'"]  # what stands there is the same object too
+
+
+@pytest.mark.slow
+def test_derivatives_of_a_model_by_the_medium_of_instances_are_those_of_objects_that_stand_there() -> None:
+    agree_in_slopes("bssrdf", surface("better_dipole", "total"), "albedo")
+
+
+def test_a_thousand_instances_are_rendered_by_the_kernels_of_a_few() -> None:
+    def kernels(n: int) -> int:
+        grid = [mi.ScalarTransform4f().translate([2.3 * (k % 40), 2.3 * (k // 40), -3]) for k in range(n)]
+        parts = {"box": box(bsdf=surface("better_dipole", "total"))}
+        scene = mi.load_dict(view("bssrdf", sky={"type": "constant"}, **shown(parts, grid)))
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.kernel_history_clear()
+            mi.render(scene, spp=1)
+            return sum(each["type"] == dr.KernelType.JIT for each in dr.kernel_history())
+
+    assert kernels(1000) <= kernels(50) + 4  # pairs of neighbours are looked at in parts
+
+
+def test_an_instance_that_has_moved_is_seen_where_it_stands() -> None:
+    parts = {"box": box(bsdf=surface("better_dipole", "total"))}
+    scene = mi.load_dict(view("bssrdf", sky={"type": "constant"}, **shown(parts, places())))
+    before = np.array(mi.render(scene, spp=4))
+    parameters = mi.traverse(scene)
+    key = next(name for name in parameters.keys() if "copy0" in name and name.endswith("to_world"))
+    parameters[key] = mi.Transform4f().translate([0, 0, -500])
+    parameters.update()
+    after = np.array(mi.render(scene, spp=4))
+    fresh = mi.load_dict(view("bssrdf", sky={"type": "constant"}, **shown(parts, [
+        mi.ScalarTransform4f().translate([0, 0, -500]), places()[1]])))  # fmt: skip
+    assert (after == np.array(mi.render(fresh, spp=4))).all() and (after != before).any()
+
+
+@pytest.mark.parametrize(
+    ("bsdf", "integrator", "wanted"),
+    [
+        ({"model": "neural_shape"}, {}, "must be moved, turned or mirrored for the model 'neural_shape', got lengths"),
+        ({"model": "better_dipole"}, {"light": "gathered"}, "light must be sampled of objects that instances show"),
+        ({"model": "auto"}, {}, "objects must be no instances for the model 'auto', got the shape 'box'"),
+    ],
+)
+def test_what_models_do_not_have_for_instances_is_refused_by_name(bsdf: dict, integrator: dict, wanted: str) -> None:
+    parts = {"box": box(bsdf=surface(orders="total") | bsdf)}
+    scene = view({"type": "bssrdf", **integrator}, **light(), **shown(parts, stretched()))
+    assert wanted in refusal(scene)
+
+
+def test_things_inside_instances_are_refused_by_models() -> None:
+    stone = {"type": "sphere", "radius": 0.2, "bsdf": GREY}
+    found = refusal(view("bssrdf", **light(), **shown({"box": box(), "stone": stone}, places())))
+    assert "objects must be empty for models of their light" in found and "inside object 'box'" in found
 
 
 def test_instances_that_overlap_are_refused_by_name() -> None:

@@ -123,11 +123,18 @@ def half_space_model(
         variation: for derivatives by the medium.
     """
     models = [bssrdf(name, m) for m in media]
-    table = RadialTable([model for model, m in zip(models, media) if float(m.sigma_s) > 0], geometry.size)
+    table = radial_table([model for model, m in zip(models, media) if float(m.sigma_s) > 0], name, geometry)
     share = area_share(geometry, table.mean / geometry.size, settings.area_share)
     positions = PositionSampler(geometry, table, AreaPoints(geometry.shape), share)
     transport = HalfSpaceTransport(models, settings.geometry, variation)
     return ObjectModel(transport, HalfSpaceProposals(positions, models[0]))
+
+
+def radial_table(models: list[BSSRDF], name: str, geometry: Geometry) -> RadialTable:
+    """Distances between entries and exits, in the frame of the shape: of instances of a mean size."""
+    if geometry.group is not None:
+        models = [bssrdf(name, model.medium.scaled(geometry.group.scale)) for model in models]
+    return RadialTable(models, geometry.size)
 
 
 def area_share(geometry: Geometry, ratio: float, wanted: float) -> float:

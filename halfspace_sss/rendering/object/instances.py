@@ -15,7 +15,7 @@ import functools
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -47,6 +47,29 @@ class Group:
     shapes: list[mi.Shape]
     instances: list[mi.Shape]
     to_world: np.ndarray
+
+    @functools.cached_property
+    def longest(self) -> float:
+        """By how much an instance makes a length larger, at most."""
+        return float(np.linalg.norm(self.to_world[:, :3, :3], ord=2, axis=(1, 2)).max())
+
+    @functools.cached_property
+    def scale(self) -> float:
+        """Length in an instance over that in the group, mean of the logarithm."""
+        return float(np.exp(np.log(np.abs(np.linalg.det(self.to_world[:, :3, :3]))).mean() / 3))
+
+    @functools.cached_property
+    def stretch(self) -> float:
+        """The largest difference of a length in an instance from that in the group, relative."""
+        return float(np.abs(np.linalg.svd(self.to_world[:, :3, :3], compute_uv=False) - 1).max())
+
+    @functools.cached_property
+    def rounding(self) -> np.ndarray:
+        """Of each instance a bound of how far from surfaces rounding puts points, scene units."""
+        here = np.max([corners(shape.bbox(), np.eye(4)[None]) for shape in self.shapes], axis=0)
+        there = np.max([np.abs(corners(s.bbox(), self.to_world)).max(axis=(1, 2)) for s in self.shapes], axis=0)
+        own = np.abs(here).max() * np.linalg.norm(self.to_world[:, :3, :3], ord=2, axis=(1, 2))
+        return np.maximum(there, own) * mi.math.RayEpsilon
 
 
 def shown_groups(scene: mi.Scene) -> list[Group]:
@@ -166,20 +189,77 @@ def ends_of(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return points.min(axis=2), points.max(axis=2)
 
 
+class Pose(NamedTuple):
+    """Where the instance stands that each lane has met; the world itself where it has met none.
+
+        p = M p',    n = M^-T n' / |M^-T n'|,    dp = M dp',    dn = (1 - n n^T) M^-T dn' / |M^-T n'|.
+
+    Args:
+        to_world, to_object: columns of M and of its inverse.
+        rounding: see `Group.rounding`.
+    """
+
+    to_world: list[mi.Vector3f]
+    to_object: list[mi.Vector3f]
+    rounding: mi.Float
+
+    def point_into(self, p: mi.Point3f) -> mi.Point3f:
+        """A point in the frame of the group."""
+        return mi.Point3f(_map(self.to_object, p) + self.to_object[3])
+
+    def normal_into(self, n: mi.Normal3f) -> mi.Normal3f:
+        """A normal in the frame of the group."""
+        return dr.normalize(_transposed(self.to_world, n))
+
+    def ray_into(self, ray: mi.Ray3f) -> mi.Ray3f:
+        """A ray in the frame of the group, at the same distances."""
+        local = mi.Ray3f(ray)
+        local.o, local.d = self.point_into(ray.o), mi.Vector3f(_map(self.to_object, ray.d))
+        return local
+
+    def into(self, at: Any) -> Any:
+        """A `points.SurfacePoint` in the frame of the group."""
+        w = mi.Vector3f(dr.normalize(_map(self.to_object, at.w)))
+        return at._replace(p=self.point_into(at.p), n=self.normal_into(at.n), n_out=self.normal_into(at.n_out), w=w)
+
+    def entry(self, entry: Any) -> Any:
+        """A `points.EntrySample` of the frame of the group in the scene: dA = |det M| |M^-T n'| dA'."""
+        n, n_out = (_transposed(self.to_object, each) for each in (entry.n, entry.n_out))
+        x, y, z, shift = self.to_world
+        area = dr.abs(dr.dot(x, dr.cross(y, z))) * dr.norm(n)
+        return entry._replace(
+            p=mi.Point3f(_map(self.to_world, entry.p) + shift), n=dr.normalize(n), n_out=dr.normalize(n_out),
+            weight=entry.weight * area,
+        )  # fmt: skip
+
+    def shown(self, si: mi.SurfaceInteraction3f, flags: int) -> mi.SurfaceInteraction3f:
+        """What a ray has met in the frame of the group, in the scene; without what `shape.completed` adds."""
+        M, inverse = self.to_world, self.to_object
+        si.p = mi.Point3f(_map(M, si.p) + M[3])
+        si.n, si.dp_du, si.dp_dv = dr.normalize(_transposed(inverse, si.n)), _map(M, si.dp_du), _map(M, si.dp_dv)
+        if flags & mi.RayFlags.ShadingFrame:
+            n = _transposed(inverse, si.sh_frame.n)
+            scale = dr.rcp(dr.norm(n))
+            n *= scale
+            si.dn_du, si.dn_dv = (
+                (v := _transposed(inverse, each) * scale) - n * dr.dot(n, v) for each in (si.dn_du, si.dn_dv)
+            )
+            si.sh_frame.n = n
+        return si
+
+
 @dataclass(frozen=True, eq=False)
 class Sight:
     """What rays meet in a scene, and in scenes of some of its shapes.
 
     Mitsuba has a function for every instance in each kernel, which takes 30 ms to compile and, at 1000 of them, 10 s to
-    record again. Here there is one for every shape, and instances are data:
-
-        p = M p',    n = M^-T n' / |M^-T n'|,    dp = M dp',    dn = (1 - n n^T) M^-T dn' / |M^-T n'|.
+    record again. Here there is one for every shape, and instances are data, see `Pose`.
 
     Args:
         shapes: that rays may meet, where there are instances.
         tables: by what Dr.Jit's registry calls a shape its place in the list, `kind`, and an instance its `row`, 0 of
-            what is none; by row the columns of M and of its inverse, and the `first` kind of the group; by kind the
-            `pointer`.
+            what is none; by row the columns of M and of its inverse, `rounding`, and the `first` kind of the group; by
+            kind the `pointer`.
     """
 
     shapes: list[mi.Shape]
@@ -190,7 +270,11 @@ class Sight:
         """Of a scene that shows these groups."""
         if not shown:
             return cls([], {})
-        shapes = shapes_of(scene, shown)
+        return cls.of_shapes(shapes_of(scene, shown), shown)
+
+    @classmethod
+    def of_shapes(cls, shapes: list[mi.Shape], shown: Sequence[Group] = ()) -> Sight:
+        """Of shapes, those of groups last."""
         instances = [mi.ShapePtr(each) for group in shown for each in group.instances]
         M = np.concatenate([np.eye(4)[None], *(group.to_world for group in shown)])
         pointers = [mi.ShapePtr(each) for each in shapes]
@@ -201,6 +285,7 @@ class Sight:
         tables["row"] = by_pointer(instances, 1 + np.arange(len(instances)), 0)
         for key, matrices in (("to_world", M), ("to_object", np.linalg.inv(M))):
             tables[key] = [mi.Float(matrices[:, :3, k].ravel().tolist()) for k in range(4)]
+        tables["rounding"] = mi.Float([0.0, *(v for group in shown for v in group.rounding.tolist())])
         dr.make_opaque(tables)
         return cls(shapes, tables)
 
@@ -221,9 +306,8 @@ class Sight:
             return hit.compute_surface_interaction(ray, flags, active)
         active = active & hit.is_valid()
         row = looked_up(self.tables["row"], hit.instance, 0, active)
-        M, inverse = (self._columns(key, row, active) for key in ("to_world", "to_object"))
-        local = mi.Ray3f(ray)
-        local.o, local.d = mi.Point3f(_map(inverse, ray.o) + inverse[3]), mi.Vector3f(_map(inverse, ray.d))
+        pose = self._pose(row, active)
+        local = pose.ray_into(ray)
         # on a CPU a hit knows the number of a shape in its group instead of the shape
         in_group = dr.gather(mi.Int32, self.tables["first"], row, active) + mi.Int32(hit.shape_index)
         own = looked_up(self.tables["kind"], hit.shape, 0, active)
@@ -231,17 +315,16 @@ class Sight:
         calls = [functools.partial(_interaction, shape, flags) for shape in self.shapes]
         si = dr.switch(mi.UInt32(kind), calls, hit, local, active) if len(calls) > 1 else calls[0](hit, local, active)
         si.shape = dr.reinterpret_array(mi.ShapePtr, dr.gather(mi.UInt32, self.tables["pointer"], kind, active))
-        si.instance, si.p = hit.instance, mi.Point3f(_map(M, si.p) + M[3])
-        si.n, si.dp_du, si.dp_dv = dr.normalize(_transposed(inverse, si.n)), _map(M, si.dp_du), _map(M, si.dp_dv)
-        if flags & mi.RayFlags.ShadingFrame:
-            n = _transposed(inverse, si.sh_frame.n)
-            scale = dr.rcp(dr.norm(n))
-            n *= scale
-            si.dn_du, si.dn_dv = (
-                (v := _transposed(inverse, each) * scale) - n * dr.dot(n, v) for each in (si.dn_du, si.dn_dv)
-            )
-            si.sh_frame.n = n
-        return completed(si, hit, ray, flags, active)
+        si.instance = hit.instance
+        return completed(pose.shown(si, flags), hit, ray, flags, active)
+
+    def pose(self, si: mi.SurfaceInteraction3f, active: mi.Bool | bool = True) -> Pose:
+        """Where the instance stands that a ray has met."""
+        return self._pose(looked_up(self.tables["row"], si.instance, 0, active), active)
+
+    def _pose(self, row: mi.Int32, active: mi.Bool | bool) -> Pose:
+        M, inverse = (self._columns(key, row, active) for key in ("to_world", "to_object"))
+        return Pose(M, inverse, dr.gather(mi.Float, self.tables["rounding"], row, active))
 
     def _columns(self, key: str, row: mi.Int32, active: mi.Bool) -> list[mi.Vector3f]:
         return [dr.gather(mi.Vector3f, column, row, active) for column in self.tables[key]]
@@ -259,3 +342,86 @@ def _interaction(
     shape: mi.Shape, flags: int, hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f, active: mi.Bool
 ) -> mi.SurfaceInteraction3f:
     return shape.compute_surface_interaction(ray, hit, flags, active)
+
+
+# --------------------------------------------------------------------------------------------------
+# Transports and proposals of a shape in a group, for the instance that is met: the same for all.
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedProposals:
+    """Entries drawn in the frame of the group, directions in the scene.
+
+    Args:
+        proposals: `points.Proposals` of the shape.
+        pose: of the instance.
+    """
+
+    proposals: Any
+    pose: Pose
+
+    def prepare(self, out: Any, prepared: Any, active: mi.Bool) -> Any:
+        """As of the proposals."""
+        return self.proposals.prepare(self.pose.into(out), prepared, active)
+
+    def sample(self, out: Any, prim_index: mi.UInt32, prepared: Any, sampler: mi.Sampler, active: mi.Bool) -> Any:
+        """As of the proposals."""
+        return self.pose.entry(self.proposals.sample(self.pose.into(out), prim_index, prepared, sampler, active))
+
+    def sample_direction(self, entry: Any, out: Any, u: mi.Point2f) -> tuple[Any, Any]:
+        """As of the proposals, which ask for both ends alone."""
+        return self.proposals.sample_direction(entry, out, u)
+
+    def pdf_direction(self, entry: Any, out: Any, w_i: mi.Vector3f) -> Any:
+        """As of the proposals."""
+        return self.proposals.pdf_direction(entry, out, w_i)
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedTransport:
+    """S of a learnt object in the frame of the group, which an instance moves, turns or mirrors.
+
+    Args:
+        transport: `points.Transport` of the shape.
+        pose: of the instance.
+    """
+
+    transport: Any
+    pose: Pose
+    is_delta = False
+
+    @property
+    def orders(self) -> str:
+        return self.transport.orders
+
+    @property
+    def checksums(self) -> tuple[str, ...]:
+        return self.transport.checksums
+
+    @property
+    def alpha(self) -> PlacedAlbedo | None:
+        return None if self.transport.alpha is None else PlacedAlbedo(self.transport.alpha, self.pose)
+
+    def prepare(self, at: Any, active: mi.Bool = True) -> Any:
+        """As of the transport."""
+        return self.transport.prepare(self.pose.into(at), active)
+
+    def S(self, exit: Any, at: Any, active: mi.Bool = True) -> mi.Spectrum:
+        """As of the transport."""
+        return self.transport.S(exit, self.pose.into(at), active)
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedAlbedo:
+    """`points.ObjectAlbedo` of a learnt object in the frame of the group."""
+
+    alpha: Any
+    pose: Pose
+
+    @property
+    def known(self) -> tuple[mi.Spectrum, mi.Spectrum]:
+        return self.alpha.known
+
+    def __call__(self, at: Any, active: mi.Bool) -> tuple[mi.Spectrum, mi.Spectrum]:
+        """As of the shape."""
+        return self.alpha(self.pose.into(at), active)

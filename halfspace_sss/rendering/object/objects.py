@@ -23,7 +23,16 @@ from halfspace_sss.physics import single_scattering
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.object.contents import Content, check_sensors, contents, place_of
 from halfspace_sss.rendering.object.half_space import Variation, half_space_model
-from halfspace_sss.rendering.object.instances import shapes_of, shown_groups
+from halfspace_sss.rendering.object.instances import (
+    Group,
+    Placed,
+    PlacedProposals,
+    PlacedTransport,
+    Pose,
+    Sight,
+    shapes_of,
+    shown_groups,
+)
 from halfspace_sss.rendering.object.palette import PaletteTransport, palette_model
 from halfspace_sss.rendering.object.points import (
     AreaPoints,
@@ -118,10 +127,14 @@ def filled(scene: mi.Scene, objects: list[Geometry], mm_per_unit: float, what: s
         ValueError: names such a thing and the object.
     """
     result = contents(scene, objects)
+    kinds = Placed.of([obj.shape for obj in objects], shown_groups(scene)).kind
     for content in result:
-        if isinstance(content.thing, mi.Emitter) or content.thing.is_emitter() or not content.whole:
-            refuse(content, objects[content.object], what)
-    held = [[content for content in result if content.object == k] for k in range(len(objects))]
+        holder = objects[kinds[content.object]]
+        lamp = isinstance(content.thing, mi.Emitter) or content.thing.is_emitter()
+        moves = holder.group or (content.shown and any(obj.shape is content.thing for obj in objects))
+        if lamp or moves or not content.whole:
+            refuse(content, holder, what)
+    held = [[content for content in result if kinds[content.object] == k] for k in range(len(objects))]
     return [
         replace(obj, contents=Contents.of(inside, scene, mm_per_unit)) if inside else obj
         for obj, inside in zip(objects, held)
@@ -156,10 +169,11 @@ def refuse_textures(name: str, what: str) -> None:
 
 
 def outermost(scene: mi.Scene) -> list[mi.Shape]:
-    """The translucent shapes of a scene that lie in no other."""
-    shapes = [shape for shape in scene.shapes() if surface_of(shape)]
-    holders = [a for a in shapes if any(a.bbox().contains(b.bbox()) for b in shapes if b is not a)]
-    result = contents(scene, [survey(shape) for shape in holders])
+    """The translucent shapes of a scene, and of the groups that instances in it show, that lie in no other."""
+    groups, shapes = shown_groups(scene), translucent_shapes(scene)
+    own = [shape for shape in scene.shapes() if surface_of(shape) or is_instance(shape)]
+    holders = [a for a in shapes if groups or any(a.bbox().contains(b.bbox()) for b in own if b is not a)]
+    result = contents(scene, [surveyed(shape, scene, groups) for shape in holders])
     return [shape for shape in shapes if not any(shape is content.thing for content in result)]
 
 
@@ -227,6 +241,7 @@ class TranslucentObject:
         gathered: what leaves by orders from two on, in place of a transport, see `paths.gathering`.
         control: control variate of entries at the first vertex of a path, see `paths.control_variate`.
         painted: state of its shape, whose attributes textures show, if the surface has textures.
+        sight: of the scene that it is rendered in.
     """
 
     geometry: Geometry
@@ -243,6 +258,28 @@ class TranslucentObject:
     gathered: Any = None
     control: Any = None
     painted: tuple[list, list] = ([], [])
+    sight: Sight = Sight([], {})
+
+    @property
+    def repeated(self) -> bool:
+        """Whether instances show it."""
+        return self.geometry.group is not None
+
+    def at(self, pose: Pose | None) -> TranslucentObject:
+        """It as the instance that is met shows it; itself where it stands in the scene.
+
+        S of the half-space is asked for in the scene, that of a whole object in the frame of the group.
+        """
+        if not self.repeated:
+            return self
+        geometry, transport, proposals = self.geometry.placed(pose), self.transport, self.proposals
+        if transport is not None and not transport.is_delta:
+            proposals = PlacedProposals(proposals, pose)
+            if isinstance(transport, PaletteTransport):
+                transport = replace(transport, obj=geometry)
+            elif lookup(self.variation.model).transport is not None:
+                transport = PlacedTransport(transport, pose)
+        return replace(self, geometry=geometry, transport=transport, proposals=proposals)
 
     @functools.cached_property
     def wrapping(self) -> Wrapping:
@@ -358,6 +395,7 @@ class TranslucentObjects:
         if current and places[0] != self._places[0]:
             results = [obj.geometry for obj in objects]
             current = not any(geometry.contents for geometry in results) and not contents(scene, results)
+            current = current and not objects[0].sight.shapes
         if not current:
             if not (objects and same):
                 self.choices = _choices(scene, self.settings)
@@ -386,8 +424,8 @@ def make_objects(
     shapes = translucent_shapes(scene)
     if not shapes:
         raise ValueError("the scene must have an object with a translucent BSDF, got none")
-    refuse_instances(scene, shapes, _MODELS)
-    objects = [survey(shape, scene) for shape in shapes]
+    groups = shown_groups(scene)
+    objects = [surveyed(shape, scene, groups) for shape in shapes]
     check_sensors(scene, objects)
     outer = filled(scene, objects, settings.mm_per_unit, _MODELS)
     check_together(scene, [part.scene for each in outer for part in (each, each.contents) if part is not None])
@@ -395,7 +433,36 @@ def make_objects(
     models = {id(shape): chosen.models.get(k) for k, shape in enumerate(shapes)}
     named = [each for each in outer if each.shape.id() not in without]
     insides = [_asked(each.shape, settings, models[id(each.shape)]) for each in named]
-    return [_make_object(each, equivalent(inside, each), settings) for each, inside in zip(named, insides)]
+    for each, inside in zip(named, insides):
+        if each.group is not None:
+            _check_repeated(each, inside, settings)
+    results = [_make_object(each, equivalent(inside, each), settings) for each, inside in zip(named, insides)]
+    sight = Sight.of(scene, groups)
+    return [replace(obj, sight=sight) for obj in results]
+
+
+def surveyed(shape: mi.Shape, scene: mi.Scene, groups: Sequence[Group]) -> Geometry:
+    """`survey` of a shape of a scene that shows these groups."""
+    group = next((each for each in groups if any(shape is part for part in each.shapes)), None)
+    return replace(survey(shape, scene), group=group)
+
+
+RIGID = 1e-3  # of lengths, by which instances of what is learnt may differ
+
+
+def _check_repeated(geometry: Geometry, inside: Inside, settings: Settings) -> None:
+    """ValueError if instances of an object are not what its model or light takes."""
+    if inside.varying is not None:
+        raise ValueError(f"the medium of an instance must not vary in space, got that of object {geometry.name}")
+    if settings.light == "gathered":
+        raise ValueError(f"light must be sampled of objects that instances show, got gathered of {geometry.name}")
+    of_object = inside.orders != "single" and lookup(inside.model).transport
+    if of_object and inside.model != "lambert" and geometry.group.stretch > RIGID:
+        raise ValueError(
+            f"instances of object {geometry.name} must be moved, turned or mirrored for the model {inside.model!r}, "
+            f"got lengths that differ by {100 * geometry.group.stretch:.3g} %: give each size a group of its own, or "
+            "take translucent_walk or a model of the half-space"
+        )
 
 
 def _asked(shape: Any, settings: Settings, model: str | None = None) -> Inside:
@@ -520,11 +587,12 @@ def check_size(geometry: Geometry, sigma_t: Sequence[float], mm_per_unit: float)
         sigma_t: of each channel, 1/(scene unit).
         mm_per_unit: length of a scene unit, mm.
     """
-    thickness = [geometry.size * value for value in sigma_t]
+    size = geometry.size * (1 if geometry.group is None else geometry.group.scale)
+    thickness = [size * value for value in sigma_t]
     if min(thickness) < SMALL or max(thickness) > LARGE:
         warnings.warn(
             f"object {geometry.name} is {min(thickness):.3g} to {max(thickness):.3g} mean free paths across, "
-            f"{geometry.size * mm_per_unit:.3g} mm: check mm_per_unit = {mm_per_unit:g}",
+            f"{size * mm_per_unit:.3g} mm: check mm_per_unit = {mm_per_unit:g}",
             stacklevel=2,
         )
 
@@ -585,7 +653,8 @@ def object_of(
         check_geometry(geometry)
         return TranslucentObject(geometry, media)
     unit = millimetres(shape) if mm_per_unit is None else mm_per_unit
-    (geometry,) = filled(shape, [survey(_object_of(shape, name))], unit, "learning")
+    geometry = surveyed(_object_of(shape, name), shape, shown_groups(shape))
+    (geometry,) = filled(shape, [geometry], unit, "learning")
     inside = equivalent(surface_of(geometry.shape).inside, geometry)
     media = _in_scene_units(inside.medium, unit)
     check_geometry(geometry)

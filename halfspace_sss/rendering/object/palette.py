@@ -40,12 +40,11 @@ from halfspace_sss.neural.reduced import MODES, ReducedNetworks, shape_over_powe
 from halfspace_sss.neural.symmetric import SymmetricModel
 from halfspace_sss.physics.fresnel import F_t
 from halfspace_sss.physics.medium import Medium
-from halfspace_sss.rendering.object.half_space import HalfSpaceProposals, area_share
+from halfspace_sss.rendering.object.half_space import HalfSpaceProposals, area_share, radial_table
 from halfspace_sss.rendering.object.points import (
     AreaPoints,
     ObjectModel,
     PositionSampler,
-    RadialTable,
     SurfacePoint,
     opaque,
     plane_query,
@@ -445,7 +444,7 @@ def palette_model(
     """
     palette = palette_of(name, geometry, media, medium)
     models = _spread(name, *_values_of(geometry, media, medium), media)
-    table = RadialTable(models, geometry.size)
+    table = radial_table(models, name, geometry)
     share = area_share(geometry, table.mean / geometry.size, settings.area_share)
     positions = PositionSampler(geometry, table, AreaPoints(geometry.shape), share)
     transport = PaletteTransport(palette, geometry, medium, settings.geometry)

@@ -481,7 +481,7 @@ class PositionSampler:
         """All hits of a probe as candidates."""
 
         def step(ray: mi.Ray3f, left: Any, kept: tuple, active: mi.Bool) -> tuple:
-            si = self.geometry.scene.ray_intersect(ray, _FLAGS(), False, active)
+            si = self.geometry.ray_intersect(ray, _FLAGS(), False, active)
             active &= si.is_valid() & (left > 0)
             same = self.geometry.piece(si.prim_index, active) == piece
             side = self._side(out, si.prim_index, active & same)

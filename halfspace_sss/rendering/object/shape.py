@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -174,6 +174,9 @@ class Geometry:
         area: scene units squared.
         fingerprint: what it was surveyed with, from `geometry_of`.
         contents: the `Contents` that lie inside, for a transport that takes them; None where nothing does.
+        group: the `instances.Group` whose instances show the shape; None of a shape that stands in the scene itself.
+        pose: the `instances.Pose` of the instance that is met, for rays of the scene; without it those of a shape in a
+            group are in the frame of the group.
     """
 
     shape: Any
@@ -187,6 +190,8 @@ class Geometry:
     area: float
     fingerprint: Any
     contents: Any = None
+    group: Any = None
+    pose: Any = None
 
     @property
     def name(self) -> str:
@@ -213,6 +218,30 @@ class Geometry:
         """
         box = self.scene.bbox()
         return float(np.max(np.abs([box.min, box.max]))) * mi.math.RayEpsilon if box.valid() else 0.0
+
+    @property
+    def clearance(self) -> mi.Float:
+        """`rounding` as data of kernels; of an instance where that stands."""
+        return dr.opaque(mi.Float, self.rounding) if self.pose is None else self.pose.rounding
+
+    def placed(self, pose: Any) -> Geometry:
+        """As the instance of a pose shows it, its size that of the largest."""
+        return replace(self, pose=pose, size=self.size * self.group.longest)
+
+    def ray_intersect(
+        self, ray: mi.Ray3f, flags: int, coherent: bool = False, active: mi.Bool | bool = True
+    ) -> mi.SurfaceInteraction3f:
+        """What a ray meets of the shape alone."""
+        if self.group is None:
+            return self.scene.ray_intersect(ray, flags, coherent, active)
+        if self.pose is None:
+            return meet_alone(self.scene, ray, flags, active)
+        si = self.pose.shown(meet_alone(self.scene, self.pose.ray_into(ray), flags, active), flags)
+        return completed(si, si, ray, flags, active & si.is_valid())
+
+    def ray_test(self, ray: mi.Ray3f, coherent: bool = False, active: mi.Bool | bool = True) -> mi.Bool:
+        """Whether a ray meets the shape."""
+        return self.scene.ray_test(ray if self.pose is None else self.pose.ray_into(ray), coherent, active)
 
     @property
     def upright(self) -> bool:

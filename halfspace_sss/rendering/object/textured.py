@@ -263,8 +263,10 @@ def _interaction(
     obj: Geometry, p: mi.Point3f, n: mi.Normal3f, face: mi.UInt32 | None, active: mi.Bool
 ) -> mi.SurfaceInteraction3f:
     """What textures ask for, at a point of an object: of a mesh from its face, else where a short ray meets it."""
+    if obj.pose is not None:
+        p, n, obj = obj.pose.point_into(p), obj.pose.normal_into(n), replace(obj, pose=None)
     if face is None or not obj.shape.is_mesh():
-        off = opaque(max(10 * obj.rounding, 1e-5 * obj.size))
+        off = dr.maximum(10 * obj.clearance, opaque(1e-5 * obj.size))
         ray = mi.Ray3f(mi.Point3f(p + n * off), mi.Vector3f(-n))
         if obj.shape.class_name() == "Sphere":  # which knows its uv without a search
             met = dr.zeros(mi.PreliminaryIntersection3f, dr.width(p))
@@ -272,7 +274,7 @@ def _interaction(
             si = obj.shape.compute_surface_interaction(ray, met, mi.RayFlags.Minimal | mi.RayFlags.UV, active)
             si.shape = mi.ShapePtr(obj.shape)
             return si
-        return obj.scene.ray_intersect(ray, mi.RayFlags.Minimal | mi.RayFlags.UV, False, active)
+        return obj.ray_intersect(ray, mi.RayFlags.Minimal | mi.RayFlags.UV, False, active)
     si = dr.zeros(mi.SurfaceInteraction3f, dr.width(p))
     si.p, si.n, si.prim_index, si.shape = mi.Point3f(p), mi.Normal3f(n), mi.UInt32(face), mi.ShapePtr(obj.shape)
     if obj.shape.has_vertex_texcoords():

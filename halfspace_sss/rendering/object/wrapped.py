@@ -112,9 +112,9 @@ class Wrapping:
         """The entry with the bent normal, looked up where a short ray meets the object."""
         if self.bend is None:
             return entry
-        off = opaque(max(10 * obj.rounding, 1e-5 * obj.size))
+        off = dr.maximum(10 * obj.clearance, opaque(1e-5 * obj.size))
         ray = mi.Ray3f(mi.Point3f(entry.p + entry.n * off), mi.Vector3f(-entry.n))
-        si = obj.scene.ray_intersect(ray, mi.RayFlags.All, False, active)
+        si = obj.ray_intersect(ray, mi.RayFlags.All, False, active)
         n = turned(self.bent(si, active & si.is_valid()).sh_frame.n, entry.n)
         return entry._replace(n_out=mi.Normal3f(dr.select(si.is_valid(), n, entry.n_out)))
 

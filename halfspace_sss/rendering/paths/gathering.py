@@ -29,6 +29,7 @@ from halfspace_sss.rendering.paths.lighting import mis_weight
 from halfspace_sss.rendering.paths.path_loop import trace_paths
 
 if TYPE_CHECKING:
+    from halfspace_sss.rendering.object.instances import Sight
     from halfspace_sss.rendering.object.objects import TranslucentObject
     from halfspace_sss.rendering.object.points import SurfacePoint
     from halfspace_sss.rendering.object.settings import Settings
@@ -160,8 +161,8 @@ class Gathering:
 
 
 def spreads(obj: TranslucentObject) -> bool:
-    """Whether light leaves elsewhere than it entered, by orders that a transport has."""
-    return obj.transport is not None and not obj.transport.is_delta
+    """Whether light leaves elsewhere than it entered, by orders that a transport has, of an object at one place."""
+    return obj.transport is not None and not obj.transport.is_delta and not obj.repeated
 
 
 def _check(obj: TranslucentObject) -> None:
@@ -336,7 +337,7 @@ def by_cosine(
 
     Last comes along which.
     """
-    met, a, w, ray, si = met_by_cosine(scene, albedo, at, u)
+    met, a, w, ray, si = met_by_cosine(scene, objects[0].sight, albedo, at, u)
     hidden = replace(settings, hide_emitters=True, light="sampled", max_depth=max(settings.max_depth - 1, -1) or 1)
     on = si.is_valid() & traced
     parts, *_ = trace_paths(scene, objects, hidden, sampler, ray, on, scattered=True)
@@ -344,14 +345,14 @@ def by_cosine(
 
 
 def met_by_cosine(
-    scene: mi.Scene, albedo: Albedo, at: GatheringPoint, u: mi.Point2f, c: mi.Spectrum | float = 0.0
+    scene: mi.Scene, sight: Sight, albedo: Albedo, at: GatheringPoint, u: mi.Point2f, c: mi.Spectrum | float = 0.0
 ) -> tuple[mi.Spectrum, mi.Spectrum, mi.Vector3f, mi.Ray3f, mi.SurfaceInteraction3f]:
     """Light of emitters that a direction of the cosine meets, less c of the sky; a, that direction, its ray and hit."""
     w, _ = cosine_above(at.n_out, at.n, u)
     a, pdf = _weight(albedo, at, w)
     here = place(at.p, at.n)
     ray = here.spawn_ray(w)
-    si = scene.ray_intersect(ray, mi.RayFlags.All, True)
+    si = sight.intersect(scene, ray, mi.RayFlags.All, True)
     emitter = si.emitter(scene)
     shines = emitter != None  # noqa: E711
     density = scene.pdf_emitter_direction(here, mi.DirectionSample3f(scene, si, here), shines)

@@ -65,7 +65,7 @@ def inner_light(
 def _beyond(context: RenderContext, left: Any, others: tuple[SurfacePoints, mi.Float]) -> mi.Spectrum:
     """Radiance that walks meet outside, but for that of emitters which connections may have found."""
     ray = place(left.o, left.n).spawn_ray(left.d)
-    si = context.scene.ray_intersect(ray, mi.RayFlags.All, True, left.left)
+    si = context.ray_intersect(ray, True, left.left)
     emitter = si.emitter(context.scene, left.left)
     shines = left.left & (emitter != None)  # noqa: E711
     counts = shines

@@ -16,6 +16,7 @@ import mitsuba as mi
 import numpy as np
 
 from halfspace_sss.rendering.light.small_emitters import WIDE, SmallEmitters, is_delta
+from halfspace_sss.rendering.object.instances import Pose, Sight
 from halfspace_sss.rendering.object.objects import TranslucentObject
 from halfspace_sss.rendering.object.settings import AUTOMATIC, Settings
 
@@ -216,6 +217,19 @@ class RenderContext:
         with dr.suspend_grad():
             small = SmallEmitters.of(scene)
         return cls(scene, lights, objects, settings, mode, Sky.of(scene, lights, objects), small)
+
+    @property
+    def sight(self) -> Sight:
+        """What rays meet in the scene."""
+        return self.objects[0].sight if self.objects else Sight([], {})
+
+    def ray_intersect(self, ray: mi.Ray3f, coherent: mi.Bool | bool, active: mi.Bool) -> mi.SurfaceInteraction3f:
+        """What a ray meets, with all that is known of the surface there."""
+        return self.sight.intersect(self.scene, ray, mi.RayFlags.All, coherent, active)
+
+    def pose(self, si: mi.SurfaceInteraction3f) -> Pose | None:
+        """Where the instance stands that a ray has met; None where no object is shown by one."""
+        return self.sight.pose(si) if any(obj.repeated for obj in self.objects) else None
 
     @property
     def suns(self) -> bool:

@@ -417,7 +417,7 @@ def meet(
 ) -> tuple[mi.SurfaceInteraction3f, mi.Normal3f, mi.Normal3f]:
     """Interaction with the boundary, shading normal and geometric normal, both outwards (along d for a sheet)."""
     flags = flags | mi.RayFlags.All if obj.wrapping.bend is not None else flags
-    si = obj.geometry.scene.ray_intersect(mi.Ray3f(p, d), flags, False, active)
+    si = obj.geometry.ray_intersect(mi.Ray3f(p, d), flags, False, active)
     si = obj.wrapping.bent(si, active & si.is_valid())
     sign = obj.geometry.side(si.prim_index, active & si.is_valid())
     if not obj.geometry.closed:
@@ -427,7 +427,7 @@ def meet(
 
 def _clear(obj: TranslucentObject, n: mi.Normal3f, d: mi.Vector3f) -> mi.Float:
     """Length along d after which a ray from the surface is clear of it; an origin moved instead lies deeper."""
-    return opaque(obj.geometry.rounding) / dr.maximum(dr.abs(dr.dot(n, d)), 0.1)
+    return obj.geometry.clearance / dr.maximum(dr.abs(dr.dot(n, d)), 0.1)
 
 
 def _contribution(media: Media, length: mi.Float, order: mi.UInt32, cosine: mi.Float | None) -> mi.Spectrum:
@@ -547,7 +547,7 @@ def _met_by_chance(
     """Emission that a walk meets from its event, which no connection with that point of an emitter would find."""
     with dr.suspend_grad():
         ray = place(walk.o, walk.n, walk.medium).spawn_ray(walk.d)
-        si = context.scene.ray_intersect(ray, mi.RayFlags.All, False, active)
+        si = context.ray_intersect(ray, False, active)
         emitter = si.emitter(context.scene, active)
         active = active & (emitter != None) & context.sampled_by_nee(emitter, walk.d)  # noqa: E711
         target = mi.Point3f(dr.select(si.is_valid(), si.p, walk.event + walk.d * opaque(FAR * obj.geometry.size)))
@@ -573,7 +573,7 @@ def _spread_lights(
 def _leaves(obj: TranslucentObject, met: Connection, x: mi.Point3f, tolerance: float) -> mi.Bool:
     """Whether a connection leaves through a point of the boundary, up to a share of its length, and to rounding."""
     apart = dr.norm(mi.Point3f(met.p) - x)
-    return met.valid & (apart <= tolerance * met.length + opaque(obj.geometry.rounding))
+    return met.valid & (apart <= tolerance * met.length + obj.geometry.clearance)
 
 
 def _is_sampled(event: mi.Point3f, p: mi.Point3f, n: mi.Normal3f, met: Connection) -> mi.Bool:
@@ -671,7 +671,7 @@ def _near(obj: TranslucentObject, walk: _Walk, target: mi.Point3f, active: mi.Bo
         return mi.Bool(False)
     ray = mi.Ray3f(walk.event, dr.normalize(target - walk.event))
     ray.maxt = NEAR / (dr.min(walk.medium.sigma_t) if walk.medium else opaque(min(m.sigma_t for m in obj.media)))
-    return obj.geometry.scene.ray_test(ray, False, active)
+    return obj.geometry.ray_test(ray, False, active)
 
 
 def _trial(

@@ -128,14 +128,14 @@ def _loop(
     Where the first vertex is on an object with orders below two beside others, the path begins there a second time for
     the orders below two: the choice between both was most of the variance under a sky.
     """
-    scene, settings, mode = context.scene, context.settings, context.mode
+    settings, mode = context.settings, context.mode
     camera_ray = mi.Ray3f(camera_ray)
     max_depth = 0xFFFFFFFF if settings.max_depth < 0 else settings.max_depth
 
     def step(sampler: mi.Sampler, path: PathState) -> tuple[mi.Sampler, PathState]:
         # ---- intersection
         first, active = path.depth == 0, path.active
-        si = scene.ray_intersect(path.ray, mi.RayFlags.All, first, active)
+        si = context.ray_intersect(path.ray, first, active)
 
         # ---- emission, with its MIS weight against next-event estimation at the previous vertex
         with dr.resume_grad(when=mode.tracks):
@@ -311,8 +311,8 @@ def sample_event(
     # ---- probabilities of the events
     choices = []
     with dr.suspend_grad():
-        for obj in context.objects:
-            here = _met(obj, at)
+        for known in context.objects:
+            here, obj = _met(known, at), known.at(context.pose(at.si))
             choice = choose_event(obj, at.si, here)
             if obj.splits:
                 low = dr.select(at.low_only, mi.Float(1), dr.select(at.others_only, 0, choice.low_orders))
@@ -386,7 +386,7 @@ def choose_event(obj: TranslucentObject, si: mi.SurfaceInteraction3f, active: mi
 def _transmittance(obj: TranslucentObject, out: SurfacePoint, d: mi.Vector3f, active: mi.Bool) -> mi.Float:
     """To the other side, mean over channels; light of the path does not count, as choices hold in derivatives."""
     ray = place(out.p, out.n).spawn_ray(d)
-    wall = obj.geometry.scene.ray_intersect(ray, mi.RayFlags.Minimal, False, active)
+    wall = obj.geometry.ray_intersect(ray, mi.RayFlags.Minimal, False, active)
     T, each = mi.Float(0), out.medium.sigma_t if out.medium else [opaque(m.sigma_t) for m in obj.media]
     for sigma_t in each:
         T = T + dr.exp(-sigma_t * wall.t) / len(obj.media)
@@ -521,7 +521,7 @@ def _add_mirrored(
     def look(_: mi.Spectrum, __: mi.Bool, tally: PathTally) -> tuple[mi.Spectrum, mi.Bool, PathTally]:
         origin = reflected.previous
         ray = _ray_from(origin, reflected.d, at.ray)
-        si = context.scene.ray_intersect(ray, mi.RayFlags.All, False, active)
+        si = context.ray_intersect(ray, False, active)
         L_e = emission(context, sampler, ray, si, origin, mi.Bool(True), at.scattered, active)
         light = at.throughput * L_e
         return light, active & si.is_valid(), context.mode.add(tally, reflected.weight * light)

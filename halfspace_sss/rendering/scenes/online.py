@@ -21,7 +21,7 @@ from halfspace_sss.checks import check_count
 from halfspace_sss.neural.store import weights_folder
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.provenance import check_folder
-from halfspace_sss.rendering.object.objects import outermost
+from halfspace_sss.rendering.object.objects import outermost, translucent_shapes
 from halfspace_sss.rendering.object.wrapped import surface_of, wrapping_of
 from halfspace_sss.rendering.paths.integrator import is_bssrdf
 from halfspace_sss.rendering.scenes import reference
@@ -46,7 +46,7 @@ def untrained(scene: Any) -> dict[str, list[str]]:
     """
     if not is_bssrdf(scene.integrator()) or scene.integrator().settings.train_seconds == 0:
         return {}
-    insides = [surface.inside for surface in map(surface_of, scene.shapes()) if surface]
+    insides = [surface_of(shape).inside for shape in translucent_shapes(scene)]
     names, known, results = sorted({inside.model for inside in insides}), learners(), {}
     for name in names:
         if name in known and (ids := known[name].untrained(scene)):
@@ -152,9 +152,14 @@ def _learnt(
 
 
 def _join(scene: Any) -> bool:
-    """Whether walks show what the models show: all objects are learnt and unmasked, and paths go past an object."""
-    around = [wrapping_of(shape) for shape in outermost(scene)]
-    learnt = all(each.surface.inside.model in learners() and not each.mixes for each in around)
+    """Whether walks show what the models show: all objects are learnt and unmasked, and paths go past an object.
+
+    Exits on instances are of several places, and no data for learning.
+    """
+    shapes, own = outermost(scene), scene.shapes()
+    alone = all(any(shape is each for each in own) for shape in shapes)
+    around = map(wrapping_of, shapes)
+    learnt = alone and all(each.surface.inside.model in learners() and not each.mixes for each in around)
     return scene.integrator().settings.max_depth != 1 and learnt
 
 

@@ -22,6 +22,7 @@ import numpy as np
 
 from halfspace_sss.checks import check_count
 from halfspace_sss.provenance import check_folder, provenance
+from halfspace_sss.rendering.object.objects import translucent_shapes
 from halfspace_sss.rendering.object.registry import AUTO
 from halfspace_sss.rendering.object.wrapped import surface_of
 from halfspace_sss.rendering.paths.integrator import is_bssrdf
@@ -232,7 +233,7 @@ def chosen(scene: Any, integrator: Any) -> dict[str, Any]:
     """What was chosen for "auto" and why; it is chosen now if it has not been."""
     if not is_bssrdf(integrator):
         return {}
-    models = [surface.inside.model for surface in map(surface_of, scene.shapes()) if surface]
+    models = [surface.inside.model for surface in map(surface_of, translucent_shapes(scene))]
     if AUTO not in (integrator.settings.model, integrator.settings.light, *models):
         return {}
     integrator.prepare(scene)

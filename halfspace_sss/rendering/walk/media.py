@@ -644,7 +644,9 @@ def walk_media(obj: TranslucentObject) -> WalkMedia:
             values = {key: np.array([getattr(m, key) for m in obj.media]) for key in ("sigma_s", "sigma_a", "g")}
             medium = Medium(**values, eta=eta)
         inside, geometry = Inside("medium", medium, "", "total", True, obj.varying, obj.textured), obj.geometry
-        result = _OF_OBJECT[obj] = WalkMedia([geometry], [inside], geometry.scene, [smooth_boundary(eta)], 1.0)
+        sight = Sight([], {}) if geometry.group is None else Sight.of_shapes([geometry.shape])
+        result = WalkMedia([geometry], [inside], geometry.scene, [smooth_boundary(eta)], 1.0, sight=sight)
+        _OF_OBJECT[obj] = result
     return result
 
 
