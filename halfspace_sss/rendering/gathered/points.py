@@ -39,6 +39,7 @@ PLACES = 2**17  # that must have a point in reach
 LOOKS = (23, 24)  # seeds of such places
 REACH = 2.0  # h over the mean distance of points
 MOST_CELLS = 2**22
+LIKE = 0.2  # difference of logarithms of colours that are blended
 R_3 = (
     0.8191725133961645,
     0.6710436067037893,
@@ -133,9 +134,18 @@ class SurfacePoints:
         scale = dr.select(weight > 0, dr.rcp(dr.maximum(weight, 1e-30)), 0)
         return [v * scale for v in total]
 
-    def smoothed(self, values: np.ndarray) -> np.ndarray:
-        """Values (points, ...) blended at the points themselves."""
-        return (self._blending @ values.reshape(len(self), -1)).reshape(values.shape)
+    def smoothed(self, values: np.ndarray, paint: np.ndarray | None = None) -> np.ndarray:
+        """Values (points, ...) blended at the points themselves; with `paint` (points, channels) among like colours."""
+        weights = self._blending if paint is None else self._of_like(np.log(paint))
+        return (weights @ values.reshape(len(self), -1)).reshape(values.shape)
+
+    def _of_like(self, x: np.ndarray) -> csr_array:
+        """The weights of all points at all points, less where x is unlike, rows of sum 1."""
+        near = self._blending.tocoo()
+        j, k = near.coords
+        apart = np.abs(x[j] - x[k]).max(axis=1)
+        w = csr_array((near.data * np.exp(-((apart / LIKE) ** 2)), (j, k)), shape=near.shape)
+        return w / w.sum(axis=1)[:, None]
 
     @cached_property
     def _blending(self) -> csr_array:

@@ -189,7 +189,8 @@ def transfer(obj: TranslucentObject, count: int | None = None, samples: int = SA
     each = max(samples // len(points), 16)
     result = drawn(obj, points, lambda p, n, _, active: points.nearest(p, n, active), each, seed)
     e = _exponents(points, result)
-    t, error = _rows(points, result.S / (result.paint**e)[:, None], _trusted(obj), result.a)
+    paint = None if obj.textured is None else result.paint
+    t, error = _rows(points, result.S / (result.paint**e)[:, None], (_trusted(obj), paint), result.a)
     near = np.where(result.known, result.near, np.arange(len(points), dtype=np.uint32)[:, None])
     centred = _centred(result.w_o, result.a.mean(axis=2))
     return Transfer(points, near, t, result.w_i, *centred, result.albedo, error, e)
@@ -291,14 +292,17 @@ def _fitted(obj: TranslucentObject, mu: np.ndarray, S: np.ndarray) -> Albedo:
     return Albedo(np.linalg.solve(normal, basis.T @ S.astype(float)).T, eta)
 
 
-def _rows(points: SurfacePoints, S: np.ndarray, trusted: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, float]:
+def _rows(
+    points: SurfacePoints, S: np.ndarray, known: tuple[np.ndarray, np.ndarray | None], a: np.ndarray
+) -> tuple[np.ndarray, float]:
     """t of all rows: S over a at the exit, both summed over the directions of a row; and the error of the sums.
 
-    A row has the sum 1 where alpha is the directional albedo, and that of its neighbours elsewhere.
+    A row has the sum 1 where alpha is the directional albedo, and that of its neighbours of like colour elsewhere.
     """
-    n = S.shape[1]
+    n, (trusted, paint) = S.shape[1], known
     sums = S.sum(axis=1, keepdims=True)
-    even = points.smoothed(points.smoothed(sums / np.maximum(a.sum(axis=1, keepdims=True), 1e-30)))
+    even = sums / np.maximum(a.sum(axis=1, keepdims=True), 1e-30)
+    even = points.smoothed(points.smoothed(even, paint), paint)
     t = S * (np.where(trusted, 1, even) / np.maximum(sums, 1e-30))
     deviation = (S - sums / n).std(axis=1) / np.sqrt(n) / np.maximum(sums[:, 0].mean(axis=0) / n, 1e-30)
     return t.astype(np.float32), float(np.sqrt((deviation**2).mean(axis=0)).max())
