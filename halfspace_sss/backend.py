@@ -7,11 +7,15 @@ import os
 import sys
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from halfspace_sss.lazy import once
+
+if TYPE_CHECKING:
+    from threadpoolctl import ThreadpoolController
 
 BACKENDS = ("llvm", "cuda")
 OLDEST_LLVM = 17  # 14 and 15 abort the process ("Cannot select: fminimum")
@@ -132,6 +136,21 @@ def limit_threads(threads: int) -> None:
     import drjit as dr
 
     dr.set_thread_count(threads)
+
+
+def one_blas_thread() -> AbstractContextManager:
+    """One thread of the BLAS: its sums then have one order, and small matrices are slower with more.
+
+    On a machine that has other work they are so many times over.
+    """
+    return _controller().limit(limits=1, user_api="blas")
+
+
+@once
+def _controller() -> ThreadpoolController:
+    from threadpoolctl import ThreadpoolController
+
+    return ThreadpoolController()
 
 
 def busy_threads() -> int:

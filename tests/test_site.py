@@ -11,6 +11,8 @@ from urllib.parse import unquote
 
 import pytest
 
+import halfspace_sss
+
 ROOT = Path(__file__).resolve().parent.parent
 ELSEWHERE = re.compile(r"^(https?:|data:|#|mailto:|javascript:)")
 TAGS = set(
@@ -61,6 +63,12 @@ def test_every_page_has_its_pictures_and_links_and_known_tags_only(site: Path) -
         wrong += [f"{name}: link {link}" for link in near if not _target(site, file, link).exists()]
     assert not wrong
     assert pictures >= 5
+
+
+def test_every_page_says_the_version_and_so_does_the_citation(site: Path) -> None:
+    said = f"halfspace-sss {halfspace_sss.__version__}, "
+    assert [file for file in site.rglob("index.html") if said not in file.read_text(encoding="utf-8")] == []
+    assert f"version: {halfspace_sss.__version__}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
 
 
 def test_the_site_begins_with_a_page(site: Path) -> None:

@@ -26,6 +26,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from halfspace_sss.arrays import library
+from halfspace_sss.backend import one_blas_thread
 from halfspace_sss.interface.model import BSSRDF
 from halfspace_sss.neural.perceptron import Perceptron
 from halfspace_sss.physics import fresnel
@@ -249,9 +250,10 @@ def _turns(obj: TranslucentObject, frame: Any, fields: Surroundings) -> np.ndarr
     turns = []
     for kind, place in ((POINT, at.p), (EVENT, first_event(obj, at).y)):
         values = np.stack([v.numpy() for v in fields(frame.position(place), kind)]).astype(float)
-        spread, axes = np.linalg.eigh(np.cov(values))
-        turn = (axes / np.sqrt(np.maximum(spread, 0) + LEAST_SPREAD**2)) @ axes.T
-        turns.append(np.column_stack([turn, -turn @ values.mean(axis=1)]))
+        with one_blas_thread():
+            spread, axes = np.linalg.eigh(np.cov(values))
+            turn = (axes / np.sqrt(np.maximum(spread, 0) + LEAST_SPREAD**2)) @ axes.T
+            turns.append(np.column_stack([turn, -turn @ values.mean(axis=1)]))
     return np.array(turns, dtype=np.float32)
 
 

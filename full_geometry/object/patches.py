@@ -22,6 +22,7 @@ import mitsuba as mi
 import numpy as np
 
 from full_geometry.object.features import ObjectFrame, PreparedExit, Side, first_event, side_features
+from halfspace_sss.backend import one_blas_thread
 from halfspace_sss.neural.perceptron import Perceptron
 from halfspace_sss.rendering.object.objects import TranslucentObject
 from halfspace_sss.rendering.object.points import (
@@ -295,11 +296,12 @@ def _weights(sampler: PatchSampler, exit: Side, n: int) -> np.ndarray:
     dr.eval(columns)
     x = np.stack([np.broadcast_to(c.numpy(), n) for c in columns])
     depth = len(sampler.weights) // 2
-    for k in range(depth):
-        W, b = (sampler.weights[f"{name}_{k}"].astype(np.float32) for name in ("V", "c"))
-        x = W @ x + b[:, None]
-        if k < depth - 1:
-            x = x * np.clip(x / 6 + 0.5, 0, 1)
+    with one_blas_thread():  # or entries would depend on how many there are
+        for k in range(depth):
+            W, b = (sampler.weights[f"{name}_{k}"].astype(np.float32) for name in ("V", "c"))
+            x = W @ x + b[:, None]
+            if k < depth - 1:
+                x = x * np.clip(x / 6 + 0.5, 0, 1)
     areas = sampler.patches.areas
     log_share = np.log(np.maximum(areas / areas.sum(), 1e-30))
     weights = np.exp(np.minimum(x + log_share[:, None].astype(np.float32), HIGHEST))

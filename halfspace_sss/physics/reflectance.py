@@ -22,12 +22,11 @@ from __future__ import annotations
 import functools
 import math
 import numbers
-from contextlib import AbstractContextManager
 from typing import NamedTuple
 
 import numpy as np
-from threadpoolctl import ThreadpoolController
 
+from halfspace_sss.backend import one_blas_thread
 from halfspace_sss.physics.fresnel import F_r, F_t, mu_internal
 
 DIFFUSE = "diffuse"
@@ -72,18 +71,8 @@ def half_space_reflectance(albedo: float, g: float, eta: float, mu_i: float | st
     Left out: what the boundary reflects from outside. Relative error 1e-5 at most for |g| <= 0.99.
     """
     _check_direction(mu_i)
-    with _one_thread():
+    with one_blas_thread():
         return _reflectance(albedo, g, eta, mu_i)
-
-
-def _one_thread() -> AbstractContextManager:
-    """One thread of the BLAS: matrices of 96 are slower with more, many times so on a machine that has other work."""
-    return _controller().limit(limits=1, user_api="blas")
-
-
-@functools.lru_cache(maxsize=1)
-def _controller() -> ThreadpoolController:
-    return ThreadpoolController()
 
 
 def _reflectance(albedo: float, g: float, eta: float, mu_i: float | str) -> float:
@@ -121,7 +110,7 @@ def directional_table(g: float, eta: float, x: np.ndarray, mu_in: np.ndarray) ->
         mu_in: cosines inside, in [0, 1], of the directions mu outside.
     """
     result = []
-    with _one_thread():
+    with one_blas_thread():
         for albedo in np.maximum(_albedo(np.asarray(x, dtype=float), g)[0], LEAST).tolist():
             m, basis, _, share = _even_light(albedo, g, eta)
             result.append([_upwards(m, basis, share, each) / (albedo * eta**2) for each in mu_in])
@@ -207,7 +196,7 @@ def _inverse(g: float, eta: float, mu_i: float | str) -> tuple[np.ndarray, np.nd
         albedo = _albedo(x, g)[0]
         return np.log([_reflectance(a, g, eta, mu_i) / a for a in albedo])
 
-    with _one_thread():
+    with one_blas_thread():
         polynomial = np.polynomial.Chebyshev.interpolate(log_ratio, DEGREE, domain=[0, 1])
     x = np.linspace(1, 0, DENSE)
     return x, np.maximum.accumulate(_albedo(x, g)[0] * np.exp(polynomial(x))), polynomial

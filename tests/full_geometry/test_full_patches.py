@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy import stats
+from threadpoolctl import threadpool_limits
 
 mi = pytest.importorskip("mitsuba")
 dr = pytest.importorskip("drjit")
@@ -71,6 +72,16 @@ def chi_square(counts: np.ndarray, expected: np.ndarray) -> float:
     some = wanted > 0
     chi2 = np.sum((observed[some] - wanted[some]) ** 2 / wanted[some])
     return float(stats.chi2.sf(chi2, some.sum() - 1))
+
+
+def test_weights_of_patches_have_the_same_bits_however_many_threads_the_blas_has(
+    obj: TranslucentObject, sampler: PatchSampler
+) -> None:
+    tables = []
+    for threads in (1, 2, 3):
+        with threadpool_limits(threads, "blas"):
+            tables.append(np.array(PatchTable(sampler).table))
+    assert all(np.array_equal(table, tables[0]) for table in tables)
 
 
 def test_every_face_is_in_one_patch_and_areas_add_up(obj: TranslucentObject, sampler: PatchSampler) -> None:
