@@ -50,7 +50,7 @@ CANDIDATES = (
     *(f"{name}, {GATHERED}" for name in ("better_dipole", "neural", "full_geometry", "neural_shape")),
 )  # fmt: skip
 DEAR, DEAR_SECONDS = ("neural_shape",), 30.0  # to look at, which takes that long
-GATHERING = 2**20  # samples of a model whose time the gathering of its light takes at least
+GATHERING = 2**19  # samples of a model whose time the gathering of its light takes at least
 LONGEST = 1.5  # times the seconds of an assessment that a gathering may take
 GATHERED_SHARE = 0.2  # most of the time for samples of gathered light: sqrt(V t) is a quarter of that of walks
 CLOSE = 1.3  # times the cost of the cheapest way, up to which another may turn out cheaper

@@ -11,8 +11,9 @@ import pytest
 from full_geometry.learning.meshes import Box, surface
 from full_geometry.learning.shapes import box
 from halfspace_sss.rendering.gathered.points import SurfacePoints, uniform_entries
+from halfspace_sss.rendering.gathered.transfer import Incident, RowUniforms, _agreement
 from halfspace_sss.rendering.object.shape import survey
-from halfspace_sss.rendering.paths.gathering import _steadied
+from halfspace_sss.rendering.paths.gathering import _steadied, _stratified
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -199,6 +200,40 @@ def test_a_mirrored_lamp_that_few_directions_found_is_shared_by_all_points() -> 
     found = steady * sent
     assert np.allclose(found.sum(axis=0), sent.sum(axis=0))
     assert found[7, 0] < 10 and np.allclose(steady[:, 1], 1, atol=0.01)
+
+
+def test_rings_keep_uniform_light_as_it_is() -> None:
+    scene = _scene("gathered", lights=_lights("sky"))
+    T = scene.integrator().prepare(scene)[0].gathered.transfer
+    shape = (len(T.points), T.t.shape[2])
+    B = T @ Incident(np.full(shape, 2.0, np.float32), np.zeros((*shape, 3), np.float32), np.zeros((shape[0], 3)))
+    assert np.allclose(B[:, :, 0], 2 * T.t.sum(axis=1), rtol=1e-4)
+    assert np.abs(B[:, :, 1:]).max() < 1e-4 * B[:, :, 0].mean()
+
+
+def test_numbers_of_a_row_are_one_in_each_stratum() -> None:
+    import drjit as dr
+
+    k = dr.arange(mi.UInt32, 3 * 64)
+    sampler = RowUniforms(k // 64, k % 64, 3, 64, seed=5)
+    one, pair = np.array(sampler.next_1d()).reshape(3, 64), np.array(sampler.next_2d()).reshape(2, 3, 64)
+    assert np.allclose(np.diff(np.sort(one), axis=1), 1 / 64, atol=1e-6)
+    assert (np.diff(np.sort(pair), axis=2) < 4 / 64).all()
+
+
+def test_directions_that_are_traced_further_cover_the_hemisphere() -> None:
+    import drjit as dr
+
+    sampler, j = mi.load_dict({"type": "independent"}), dr.arange(mi.UInt32, 4096)
+    sampler.seed(3, 4096 * 24)
+    u = np.array(_stratified(sampler, j, mi.UInt32(8), mi.UInt32(24)))
+    assert (np.abs(np.histogram(u[0], 8, (0, 1))[0] / 512 - 1) < 0.25).all()
+
+
+def test_what_halves_of_entries_do_not_agree_on_is_left_out() -> None:
+    noise, signal = np.random.default_rng(5).standard_normal((3, 4000, 2, 1))[:2], np.full((4000, 2, 1), 3.0)
+    assert (_agreement(*noise) < 0.1).all()
+    assert (_agreement(*(signal + noise)) > 0.9).all()
 
 
 def test_every_place_of_a_surface_in_rows_of_faces_has_a_point_in_reach() -> None:

@@ -18,6 +18,9 @@ e per channel with which what leaves under the same light from everywhere is smo
 further than from the next point, as models take the medium at both ends, up to 1.
 
 a(mu) = F_t(mu) (c_0 + c_1 mu + c_2 mu²) per channel is fitted to samples of all points.
+
+What comes from afar varies slowly over exits. So entries of a point are parted into rings by their distance, and the
+mean light of a ring, and the share that it has of all, are averaged over the neighbourhood, the wider the farther.
 """
 
 from __future__ import annotations
@@ -31,8 +34,8 @@ import mitsuba as mi
 import numpy as np
 
 from halfspace_sss.physics.fresnel import F_t
-from halfspace_sss.rendering.gathered.points import SurfacePoints
-from halfspace_sss.rendering.object.points import SurfacePoint, opaque
+from halfspace_sss.rendering.gathered.points import REACH, SurfacePoints
+from halfspace_sss.rendering.object.points import SurfacePoint, cosine_above, opaque, wrapped
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -41,12 +44,19 @@ if TYPE_CHECKING:
 
 PER_LENGTH = 2.0  # points over a transport mean free path
 FEWEST, MOST = 1024, 8192  # points
-SAMPLES = 2**21  # entries of all points
+SAMPLES = 2**20  # entries of all points
+FEWEST_ENTRIES = 16  # of a point
 FITTED = 2**18
 SEED = 7
-SMOOTHINGS = 8  # of what directions bring
+SMOOTHINGS = 16  # of what directions bring
+RINGS = 2.0, 5.0  # distances of entries that part the rings, over that of points,
+ROUNDS = 0, 2, 8  # and how often what each brings is smoothed,
+SHARE_ROUNDS = 2, 4, 8  # and its share of the row
+HALVES = 2  # of the entries of a row, which are independent
 BLOCK = 64  # rows
 R_2 = 0.7548776662466927, 0.5698402909980532
+GOLDEN = 0.6180339887498949
+LATTICE = 128  # directions of a hemisphere
 
 
 def cosine(w: mi.Vector3f, n: mi.Normal3f, n_out: mi.Normal3f) -> mi.Float:
@@ -101,6 +111,38 @@ class Incident:
         return cls(np.mean(means, axis=0), np.mean([part.slope for part in parts], axis=0), middle)
 
 
+class Hemispheres(NamedTuple):
+    """Directions above the surface at points, by the weight a(mu) mu.
+
+    Args:
+        whole: its integral, (points, channels).
+        middle: mean direction, (points, 3), for the mean of a over channels.
+        inverse: of the covariance, (points, 3, 3).
+    """
+
+    whole: np.ndarray
+    middle: np.ndarray
+    inverse: np.ndarray
+
+    @classmethod
+    def of(cls, points: SurfacePoints, albedo: Albedo) -> Hemispheres:
+        """By a lattice of directions: of the few that light is gathered along they would be too noisy."""
+        k, each = dr.arange(mi.UInt32, len(points) * LATTICE), dr.opaque(mi.UInt32, LATTICE)
+        j, s = k // each, mi.Float(k % each)
+        n, n_out = (dr.gather(mi.Normal3f, v, j) for v in (points.n, points.n_out))
+        w, _ = cosine_above(n_out, n, mi.Point2f((s + 0.5) / LATTICE, wrapped(s * GOLDEN)))
+        a = albedo(cosine(w, n, n_out)) * dr.pi
+        weight = dr.mean(a)
+        sums = [*a, *(weight * w), *(weight * w[i] * w[k] for i in range(3) for k in range(3)), weight]
+        sums = [dr.block_sum(v, LATTICE) for v in sums]
+        dr.eval(sums)
+        *rows, total = (np.array(v, dtype=float) for v in sums)
+        whole, middle, second = np.split(np.stack(rows, axis=1), [len(rows) - 12, len(rows) - 9], axis=1)
+        middle, second = (v / np.maximum(total, 1e-30)[:, None] for v in (middle, second))
+        C = second.reshape(-1, 3, 3) - middle[:, :, None] * middle[:, None, :]
+        return cls(np.maximum(whole / LATTICE, 1e-30), middle, np.linalg.inv(C + 1e-3 * np.eye(3)))
+
+
 @dataclass(frozen=True, eq=False)
 class Transfer:
     """Of one object.
@@ -109,6 +151,7 @@ class Transfer:
         points: where light is gathered and where it leaves.
         entry: (points, samples) numbers of the points that entries are at.
         t: (points, samples, channels).
+        ring: (points, samples) of entries, by their distance.
         w_i: (points, samples, 3) directions of entries.
         d_o: (points, samples, 3) directions of exits less their `middle`, (points, 3), both weighted by a.
         inverse: (points, 3, 3) of the covariance of d_o.
@@ -120,6 +163,7 @@ class Transfer:
     points: SurfacePoints
     entry: np.ndarray
     t: np.ndarray
+    ring: np.ndarray
     w_i: np.ndarray
     d_o: np.ndarray
     middle: np.ndarray
@@ -128,22 +172,49 @@ class Transfer:
     error: float
     e: np.ndarray
 
+    @cached_property
+    def hemispheres(self) -> Hemispheres:
+        """Of its points."""
+        return Hemispheres.of(self.points, self.albedo)
+
     @property
     def nbytes(self) -> int:
         """Memory of all arrays of entries."""
-        return sum(v.nbytes for v in (self.entry, self.t, self.w_i, self.d_o, self.middle, self.inverse))
-
-    @cached_property
-    def _even(self) -> tuple[np.ndarray, np.ndarray]:
-        """Of uniform light, what leaves (points, channels), and its sum over d_o, (points, channels, 3)."""
-        return np.maximum(self.t.sum(axis=1), 1e-30), self.t.transpose(0, 2, 1) @ self.d_o
+        return sum(v.nbytes for v in (self.entry, self.t, self.ring, self.w_i, self.d_o, self.middle, self.inverse))
 
     def by_place(self, L: Incident) -> np.ndarray:
-        """What leaves by the means of the light at the places of entries, (points, channels)."""
-        found = np.empty_like(L.mean)
-        for rows in self._blocks:
-            found[rows] = np.einsum("jsc,jsc->jc", self.t[rows], np.take(L.mean, self.entry[rows], axis=0))
-        return found
+        """What leaves by the means of the light at the places of entries, (points, channels).
+
+        The light of a ring is the mean over its entries in the neighbourhood, the wider the farther they are; so is the
+        share of the ring.
+        """
+        share, whole = self._shares
+        return (share * self._smoothed(self._by_ring(L.mean), ROUNDS) / np.maximum(whole, 1e-30)).sum(axis=1)
+
+    def _by_ring(self, mean: np.ndarray) -> np.ndarray:
+        """Σ t L of each ring, (points, rings, channels)."""
+        count, rings = len(self.entry), len(ROUNDS)
+        at, entry = (np.arange(count)[:, None] * rings + self.ring).ravel(), self.entry.ravel()
+        columns = [
+            np.bincount(at, self.t[:, :, c].ravel() * mean[entry, c], count * rings) for c in range(mean.shape[1])
+        ]
+        return np.stack(columns, axis=1).reshape(count, rings, -1)
+
+    @cached_property
+    def _shares(self) -> tuple[np.ndarray, np.ndarray]:
+        """Of uniform light, (points, rings, channels): shares of the row, and what rings bring, both smoothed."""
+        found = self._by_ring(np.ones((len(self.entry), self.t.shape[2])))
+        share = self._smoothed(found, SHARE_ROUNDS)
+        share *= (found.sum(axis=1) / np.maximum(share.sum(axis=1), 1e-30))[:, None]
+        return share, self._smoothed(found, ROUNDS)
+
+    def _smoothed(self, values: np.ndarray, times: tuple[int, ...]) -> np.ndarray:
+        """Values of rings, (points, rings, channels), each so many times."""
+        smooth = np.copy(values)
+        for k, rounds in enumerate(times):
+            for _ in range(rounds):
+                smooth[:, k] = self.points.smoothed(smooth[:, k])
+        return smooth
 
     @property
     def _blocks(self) -> list[slice]:
@@ -154,27 +225,44 @@ class Transfer:
         """B for incident radiance, linear in w_o: constant and slope, (points, channels, 4).
 
         What the directions w_i and w_o of single entries bring varies slowly over the surface, and was most of the
-        noise: it is averaged over a wider neighbourhood than B is blended from.
+        noise: it is averaged over a wider neighbourhood than B is blended from, and kept as far as two halves of the
+        entries agree on it.
         """
-        constant = L.mean - np.einsum("kci,ki->kc", L.slope, L.middle)
-        axes = [np.ascontiguousarray(L.slope[:, :, axis]) for axis in range(3)]
-        B, slope = np.empty_like(L.mean), np.empty_like(L.slope)
-        for rows in self._blocks:
-            entry, w_i = self.entry[rows], self.w_i[rows]
-            arriving = np.take(constant, entry, axis=0)
-            for axis, along in enumerate(axes):
-                arriving += np.take(along, entry, axis=0) * w_i[:, :, axis, None]
-            arriving *= self.t[rows]
-            B[rows] = arriving.sum(axis=1)
-            slope[rows] = arriving.transpose(0, 2, 1) @ self.d_o[rows]
-        slope -= self._even[1] * (B / self._even[0])[:, :, None]  # 0 in uniform light, where a(w_o) is all
-        slope = np.einsum("jck,jki->jci", slope, self.inverse)
-        by_place = self.by_place(L)
-        by_direction = np.concatenate([(B - by_place)[:, :, None], slope], axis=2)
+        n = self.entry.shape[1] // HALVES
+        halves = np.stack([self._by_direction(L, half) for half in (slice(0, n), slice(n, None))], axis=1)
         for _ in range(SMOOTHINGS):
-            by_direction = self.points.smoothed(by_direction)
-        first, slope = by_direction[:, :, 0], by_direction[:, :, 1:]
-        return np.concatenate([(by_place + first - np.einsum("jck,jk->jc", slope, self.middle))[:, :, None], slope], 2)
+            halves = self.points.smoothed(halves)
+        one, two = halves[:, 0], halves[:, 1]
+        first, slope = ((one + two)[:, :, part] * _agreement(one[:, :, part], two[:, :, part]) for part in PARTS)
+        constant = self.by_place(L) + first[:, :, 0] - np.einsum("jck,jk->jc", slope, self.middle)
+        return np.concatenate([constant[:, :, None], slope], axis=2)
+
+    def _by_direction(self, L: Incident, half: slice) -> np.ndarray:
+        """By a half of the entries, what the slope of light brings, and the slope over w_o, (points, channels, 4)."""
+        axes = [np.ascontiguousarray(L.slope[:, :, axis]) for axis in range(3)]
+        found = np.empty((*L.mean.shape, 4), dtype=L.mean.dtype)
+        for rows in self._blocks:
+            entry, t, d_o = self.entry[rows, half], self.t[rows, half], self.d_o[rows, half]
+            d_i, more = self.w_i[rows, half] - np.take(L.middle, entry, axis=0), 0.0
+            for axis, along in enumerate(axes):
+                more = more + np.take(along, entry, axis=0) * d_i[:, :, axis, None]
+            more *= t
+            arriving = more + t * np.take(L.mean, entry, axis=0)
+            found[rows, :, 0] = more.sum(axis=1)
+            slope, even = (v.transpose(0, 2, 1) @ d_o for v in (arriving, t))
+            brings = arriving.sum(axis=1) / np.maximum(t.sum(axis=1), 1e-30)
+            found[rows, :, 1:] = slope - even * brings[:, :, None]  # 0 in uniform light, where a(w_o) is all
+        found[:, :, 1:] = np.einsum("jck,jki->jci", found[:, :, 1:], self.inverse)
+        return found
+
+
+PARTS = slice(0, 1), slice(1, 4)
+
+
+def _agreement(one: np.ndarray, two: np.ndarray) -> np.ndarray:
+    """Of the sum of two independent estimates the share that is no noise, per channel, for all points and axes."""
+    both, whole = (one * two).sum(axis=(0, 2)), ((one + two) ** 2).sum(axis=(0, 2))
+    return np.clip(4 * both / np.maximum(whole, 1e-30), 0, 1)[:, None]
 
 
 def count_of(obj: TranslucentObject) -> int:
@@ -186,14 +274,20 @@ def count_of(obj: TranslucentObject) -> int:
 def transfer(obj: TranslucentObject, count: int | None = None, samples: int = SAMPLES, seed: int = SEED) -> Transfer:
     """The transfer of an object, by its model and the proposals of that."""
     points = SurfacePoints.of(obj.geometry, count or count_of(obj))
-    each = max(samples // len(points), 16)
-    result = drawn(obj, points, lambda p, n, _, active: points.nearest(p, n, active), each, seed)
+    result = drawn(obj, points, lambda p, n, _, active: points.nearest(p, n, active), samples, seed)
     e = _exponents(points, result)
     paint = None if obj.textured is None else result.paint
     t, error = _rows(points, result.S / (result.paint**e)[:, None], (_trusted(obj), paint), result.a)
     near = np.where(result.known, result.near, np.arange(len(points), dtype=np.uint32)[:, None])
     centred = _centred(result.w_o, result.a.mean(axis=2))
-    return Transfer(points, near, t, result.w_i, *centred, result.albedo, error, e)
+    return Transfer(points, near, t, _rings(points, near), result.w_i, *centred, result.albedo, error, e)
+
+
+def _rings(points: SurfacePoints, entry: np.ndarray) -> np.ndarray:
+    """The ring of each entry, by the distance of its point."""
+    p = np.array(points.p, dtype=np.float32).T
+    d = np.linalg.norm(np.take(p, entry, axis=0) - p[:, None], axis=2)
+    return np.digitize(d, np.array(RINGS) * points.h / REACH).astype(np.uint8)
 
 
 def _exponents(points: SurfacePoints, found: DrawnEntries) -> np.ndarray:
@@ -201,6 +295,32 @@ def _exponents(points: SurfacePoints, found: DrawnEntries) -> np.ndarray:
     light = found.S.sum(axis=1) / np.maximum(found.a.sum(axis=1), 1e-30)
     x, y = (v - points.smoothed(v) for v in (np.log(found.paint), np.log(np.maximum(light, 1e-30))))
     return np.clip((x * y).sum(axis=0) / np.maximum((x * x).sum(axis=0), 1e-12), 0, 1).astype(np.float32)
+
+
+class RowUniforms:
+    """Uniform numbers of n lanes for each row: lattices in an order of their own, shifted for each row.
+
+    Args:
+        row, k: of each lane, and its number in the row.
+        rows, n: how many rows, and lanes of each.
+        seed: of orders and shifts.
+    """
+
+    def __init__(self, row: mi.UInt32, k: mi.UInt32, rows: int, n: int, seed: int) -> None:
+        self._row, self._k, self._rows, self._n, self._rng = row, k, rows, n, np.random.default_rng(seed)
+
+    def _shifted(self, u: np.ndarray) -> mi.Float:
+        u, shift = (mi.Float(v.astype(np.float32)) for v in (u, self._rng.random(self._rows)))
+        return wrapped(dr.gather(mi.Float, u, self._k) + dr.gather(mi.Float, shift, self._row))
+
+    def next_1d(self, active: mi.Bool = True) -> mi.Float:
+        """The next number of each lane."""
+        return self._shifted(self._rng.permutation(self._n) / self._n)
+
+    def next_2d(self, active: mi.Bool = True) -> mi.Point2f:
+        """The next pair."""
+        order = self._rng.permutation(self._n)
+        return mi.Point2f(*(self._shifted(order * r % 1.0) for r in R_2))
 
 
 class DrawnEntries(NamedTuple):
@@ -227,16 +347,16 @@ class DrawnEntries(NamedTuple):
     paint: np.ndarray
 
 
-def drawn(obj: TranslucentObject, points: SurfacePoints, cell: Callable, n: int, seed: int = SEED) -> DrawnEntries:
-    """n entries for each point; `cell` of position, outward normal, face and mask says which they are near."""
+def drawn(
+    obj: TranslucentObject, points: SurfacePoints, cell: Callable, samples: int, seed: int = SEED
+) -> DrawnEntries:
+    """As many entries for each point; `cell` of position, outward normal, face and mask says which they are near."""
+    n = max(samples // len(points), FEWEST_ENTRIES) // HALVES * HALVES
     k = dr.arange(mi.UInt32, len(points) * n)
-    j, s = k // n, k % n
-    sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(seed, dr.width(k))
-    shift, active = sampler.next_2d(), mi.Bool(True)
-    jitter = dr.gather(mi.Point2f, shift, j * n)
-    u = [dr.fma(mi.Float(s), r, x) for r, x in zip(R_2, (jitter.x, jitter.y))]
-    out, face = points.exit(j, mi.Point2f(*(x - dr.floor(x) for x in u)))
+    each = dr.opaque(mi.UInt32, n // HALVES)  # kernels are those of other numbers of points too
+    half, active = k // each, mi.Bool(True)
+    j, sampler = half // HALVES, RowUniforms(half, k % each, HALVES * len(points), n // HALVES, seed)
+    out, face = points.exit(j, sampler.next_2d())
     out = obj.knowing(out, face)
     S, inverse, entry, w_i = _sample(obj, out, face, sampler, active)
     near, known = cell(entry.p, entry.n, entry.face, entry.weight > 0)
@@ -263,7 +383,7 @@ def _centred(w: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.n
     return d, middle, np.linalg.inv(np.einsum("js,jsi,jsk->jik", a, d, d) + 1e-3 * np.eye(3))
 
 
-def _sample(obj: TranslucentObject, out: SurfacePoint, face: mi.UInt32, sampler: mi.Sampler, active: mi.Bool) -> tuple:
+def _sample(obj: TranslucentObject, out: SurfacePoint, face: mi.UInt32, sampler: RowUniforms, active: mi.Bool) -> tuple:
     """S mu_i over the density of an entry and its direction, the inverse of that, and both."""
     prepared = obj.transport.prepare(out, active)
     where = obj.proposals.prepare(out, prepared, active)

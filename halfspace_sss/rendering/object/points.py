@@ -508,8 +508,8 @@ class PositionSampler:
         m, inverse = opaque(float(self.area_points)), opaque(1 / self.area_points)
 
         def step(k: Any, kept: tuple) -> tuple:
-            v = mi.Point2f(*(_wrapped(x + k * ratio) for x, ratio in zip((u.x, u.y), LATTICE)))
-            at = self.points.sample(_wrapped(u_face + k * inverse), v, active)
+            v = mi.Point2f(*(wrapped(x + k * ratio) for x, ratio in zip((u.x, u.y), LATTICE)))
+            at = self.points.sample(wrapped(u_face + k * inverse), v, active)
             same = self.geometry.piece(at.prim_index, active) == piece
             side = self._side(out, at.prim_index, active & same)
             point = (at.p, at.n, turned(at.n_shading, at.n) * side, at.prim_index)
@@ -530,7 +530,7 @@ class _Kept(NamedTuple):
     face: Any
 
 
-def _wrapped(u: mi.Float) -> mi.Float:
+def wrapped(u: mi.Float) -> mi.Float:
     """u modulo one, below one."""
     return dr.minimum(u - dr.floor(u), 1 - 2**-24)
 

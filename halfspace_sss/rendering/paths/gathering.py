@@ -12,7 +12,7 @@ between light and view is lost; detail of light below the distance of the points
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -21,7 +21,17 @@ import numpy as np
 from halfspace_sss.backend import clock
 from halfspace_sss.rendering.gathered.inner import Events, InnerLight, has_inner_light
 from halfspace_sss.rendering.gathered.points import SurfacePoints
-from halfspace_sss.rendering.gathered.transfer import SAMPLES, SEED, Albedo, Incident, Transfer, cosine, transfer
+from halfspace_sss.rendering.gathered.transfer import (
+    GOLDEN,
+    SAMPLES,
+    SEED,
+    Albedo,
+    Hemispheres,
+    Incident,
+    Transfer,
+    cosine,
+    transfer,
+)
 from halfspace_sss.rendering.object.points import cosine_above, opaque, place
 from halfspace_sss.rendering.object.shape import same_objects, state_of
 from halfspace_sss.rendering.paths.inner_light import COUNT, inner_light
@@ -34,12 +44,11 @@ if TYPE_CHECKING:
     from halfspace_sss.rendering.object.points import SurfacePoint
     from halfspace_sss.rendering.object.settings import Settings
 
-DIRECTIONS = 2**19  # of all points of an object, by emitters, and as many by the cosine
-FEWEST, MOST = 32, 1024  # of a point
-PART = 1 / 16  # of the samples of a transfer
+DIRECTIONS = 2**18  # of all points of an object, by emitters, and as many by the cosine
+FEWEST, MOST = 24, 1024  # of a point
+PART = 1 / 8  # of the samples of a transfer
 SPREADINGS = 4  # of what other surfaces send,
 BRIGHTEST = 1 / 128  # of the points, which share it no matter how bright
-PAIRS = [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]  # of axes
 TRACED = 8  # one of so many directions by the cosine is traced further, where it meets a surface
 
 
@@ -212,70 +221,51 @@ def _incident(
     """
     count, rows = len(T.points), len(T.points) * parts
     n = int(np.clip(DIRECTIONS // (2 * count), FEWEST, MOST)) // TRACED * TRACED
-    lane, few = dr.arange(mi.UInt32, rows * n), n // TRACED
+    # kernels are those of other numbers of points too
+    lane, each, few, all_few = dr.arange(mi.UInt32, rows * n), *_numbers(n, n // TRACED, rows * (n // TRACED))
     # directions that are traced further come first: beside each other, as lanes that wait cost as much
-    traced, rest = lane < dr.opaque(mi.UInt32, rows * few), lane - rows * few
-    i = rest % (n - few)
+    traced, rest = lane < all_few, lane - all_few
+    i = rest % (each - few)
     s = dr.select(traced, lane % few * TRACED, i + i // (TRACED - 1) + 1)
-    j = dr.select(traced, lane // few, rest // (n - few))
+    j = dr.select(traced, lane // few, rest // (each - few))
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(100 + seed, dr.width(lane))
-    at = GatheringPoint(*(dr.gather(type(v), v, j % count) for v in (T.points.p, T.points.n, T.points.n_out)))
-    u, v = (_stratified(sampler, j, s, n) for _ in range(2))
+    point = j % _numbers(count)[0]
+    at = GatheringPoint(*(dr.gather(type(v), v, point) for v in (T.points.p, T.points.n, T.points.n_out)))
+    u, v = (_stratified(sampler, j, s, each) for _ in range(2))
     aimed, w_e = by_emitters(scene, T.albedo, at, u)
     met, more, a, w_c, on = by_cosine(scene, objects, T.albedo, settings, at, v, traced, sampler)
-    seen = dr.select(on, a, 0)
-    values = [v + dr.zeros(mi.Float, rows * n) for v in (aimed, met, TRACED * more, a, dr.mean(a), w_e, w_c, seen)]
+    around = T.hemispheres
+    centre = dr.gather(mi.Vector3f, mi.Vector3f(around.middle.T.astype(np.float32)), point)
+    d_e, d_c = w_e - centre, w_c - centre
+    values = [aimed + met, *(aimed * d_e[i] + met * d_c[i] for i in range(3))]
+    values += [TRACED * more, *(TRACED * more * d_c[i] for i in range(3)), TRACED * dr.select(on, a, 0)]
+    values = [mi.Spectrum(v) + dr.zeros(mi.Float, rows * n) for v in values]
     dr.eval(values)
-    j, s = lane // n, lane % n
-    order = dr.select(s % TRACED == 0, j * few + s // TRACED, rows * few + j * (n - few) + s - s // TRACED - 1)
-    values = [dr.gather(type(v), v, order) for v in values]
-    dr.eval(values)
-    sums = _moments(values, j, n)
-    return [_of_part(T.points, *(v[k * count : (k + 1) * count] for v in sums)) for k in range(parts)]
+    j, s = lane // each, lane % each
+    order = dr.select(s % TRACED == 0, j * few + s // TRACED, all_few + j * (each - few) + s - s // TRACED - 1)
+    sums = [dr.block_sum(dr.gather(mi.Float, v, order), n) for value in values for v in value]
+    dr.eval(sums)
+    found = np.stack([np.array(v, dtype=float) for v in sums], axis=1).reshape(rows, len(values), -1) / n
+    return [_of_part(T.points, around, found[k * count : (k + 1) * count]) for k in range(parts)]
 
 
-def _moments(values: list, j: mi.UInt32, n: int) -> list[np.ndarray]:
-    """Sums over the n directions of each row, about the middle of directions.
+def _of_part(points: SurfacePoints, around: Hemispheres, found: np.ndarray) -> tuple[Incident, np.ndarray]:
+    """Incident radiance, and the mean of other surfaces.
 
     Args:
-        values: by directions: light of emitters, light that they meet, what other surfaces send, a, its mean over
-            channels, directions of emitters and by the cosine, and a of those that meet a surface.
-        j: row of each direction.
-        n: directions of a row.
+        points: where.
+        around: their hemispheres.
+        found: (points, 9, channels), with the weight a(mu) mu: light of emitters, and times directions about their
+            middle; what other surfaces send, and times these; 1 where they are.
     """
-    aimed, met, more, a, weight, w_e, w_c, seen = values
-
-    def total(value: Any) -> np.ndarray:
-        """Of each row, (rows, components)."""
-        sums = [dr.block_sum(part, n) for part in value]
-        dr.eval(sums)
-        return np.stack([np.array(v) for v in sums], axis=1)
-
-    whole = np.maximum(total([weight]), 1e-30)
-    middle = total(weight * w_c) / whole
-    centre = dr.gather(mi.Vector3f, mi.Vector3f(*(mi.Float(c) for c in middle.T.astype(np.float32))), j)
-    d_e, d_c = w_e - centre, w_c - centre
-    second = total([weight * d_c[i] * d_c[k] for i, k in PAIRS]) / whole
-    axes = np.stack([total(aimed * d_e[i] + met * d_c[i]) for i in range(3)], axis=2)
-    sent = np.stack([total(more * d_c[i]) for i in range(3)], axis=2)
-    return [total(a), middle, total(aimed + met), total(more), total(seen), second, axes, sent]
-
-
-def _of_part(
-    points: SurfacePoints, norm: np.ndarray, middle: np.ndarray, direct: np.ndarray, sent: np.ndarray, seen: np.ndarray,
-    second: np.ndarray, axes: np.ndarray, sent_axes: np.ndarray,
-) -> tuple[Incident, np.ndarray]:  # fmt: skip
-    """Incident radiance by the sums of `_moments`, and the mean of other surfaces."""
-    steady, C = _steadied(sent), np.empty((len(norm), 3, 3))
+    direct, sent, seen = found[:, 0], found[:, 4], found[:, 8]
+    steady = _steadied(sent)
     spread = _spread(points, steady * sent)
-    for column, (i, k) in zip(second.T, PAIRS):
-        C[:, i, k] = C[:, k, i] = column
-    first = axes + _spread(points, steady[:, :, None] * sent_axes)
-    slope = np.einsum("jci,jik->jck", first, np.linalg.inv(C + 1e-3 * np.eye(3)))
-    norm = np.maximum(norm, 1e-30)
-    parts = ((direct + spread) / norm, slope / norm[:, :, None], middle)
-    others = spread / np.maximum(_spread(points, TRACED * seen), 1e-30)
+    first = found[:, 1:4] + _spread(points, steady[:, None] * found[:, 5:8])
+    slope = np.einsum("jic,jik->jck", first, around.inverse) / around.whole[:, :, None]
+    parts = ((direct + spread) / around.whole, slope, around.middle)
+    others = spread / np.maximum(_spread(points, seen), 1e-30)
     return Incident(*(part.astype(np.float32) for part in parts)), others
 
 
@@ -305,10 +295,14 @@ class GatheringPoint(NamedTuple):
     n_out: mi.Normal3f
 
 
-def _stratified(sampler: mi.Sampler, j: mi.UInt32, s: mi.UInt32, n: int) -> mi.Point2f:
+def _numbers(*values: int) -> list[mi.UInt32]:
+    return [dr.opaque(mi.UInt32, value) for value in values]
+
+
+def _stratified(sampler: mi.Sampler, j: mi.UInt32, s: mi.UInt32, n: mi.UInt32) -> mi.Point2f:
     """Pairs of uniforms for n directions of each point, a lattice shifted for each point."""
     shift = dr.gather(mi.Point2f, sampler.next_2d(), j * n)
-    x = mi.Point2f((mi.Float(s) + shift.x) / n, dr.fma(mi.Float(s), 0.6180339887498949, shift.y))
+    x = mi.Point2f(mi.Float(s) / mi.Float(n) + shift.x, dr.fma(mi.Float(s), GOLDEN, shift.y))
     return x - dr.floor(x)
 
 

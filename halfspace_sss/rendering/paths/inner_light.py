@@ -42,11 +42,11 @@ def inner_light(
     context, obj, count = RenderContext.of(scene, objects, settings, Primal()), objects[k], dr.width(events.p)
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(SEED + k, count)
-    # neighbours take directions of one lattice
-    lane, turn = np.arange(count)[:, None], np.random.default_rng(SEED + k).random(2)
-    u = mi.Point2f(((lane * R_2 + turn) % 1.0).astype(np.float32).T)
+    # neighbours take directions, and points of emitters, of one lattice each
+    lane, turn = np.arange(count)[:, None], np.random.default_rng(SEED + k).random(4)
+    u, u_emitter = (mi.Point2f(((lane * R_2 + t) % 1.0).astype(np.float32).T) for t in np.split(turn, 2))
     d = mi.warp.square_to_uniform_sphere(u)
-    found = light_at_events(context, obj, events.p, events.n, d, sampler)
+    found = light_at_events(context, obj, events.p, events.n, d, u_emitter, sampler)
     met = found.chance + found.weight * _beyond(context, found.left, others)
     largest = bands(obj)
 

@@ -137,7 +137,9 @@ def sample_low_orders(
     pdf, share, sky = mi.Float(1), mi.Float(0), context.connects_sky(obj)
     if lights.some_local or context.suns or sky:
         at_event = _contribution(media, walk.event_length, mi.UInt32(1), None) * (walk.event_inverse_pdf * refracted.T)
-        for light, d in _connected(context, (obj, media), walk, dr.select(once, at_event, 0), sampler, sky, once):
+        for light, d in _connected(
+            context, (obj, media), walk, dr.select(once, at_event, 0), sampler.next_2d(), sampler, sky, once
+        ):
             cosine = dr.dot(walk.event_d, d)
             direct += light * _spectrum([eval_hg(cosine, g) for _, _, g in media])
     if lights.some_shaped or context.suns:
@@ -224,8 +226,9 @@ class LightAtEvents(NamedTuple):
 
 
 def light_at_events(
-    context: RenderContext, obj: TranslucentObject, p: mi.Point3f, n: mi.Normal3f, d: mi.Vector3f, sampler: mi.Sampler
-) -> LightAtEvents:
+    context: RenderContext, obj: TranslucentObject, p: mi.Point3f, n: mi.Normal3f, d: mi.Vector3f, u: mi.Point2f,
+    sampler: mi.Sampler,
+) -> LightAtEvents:  # fmt: skip
     """Light at places inside an object, from directions d that are uniform over the sphere and by connections.
 
     Args:
@@ -234,6 +237,7 @@ def light_at_events(
         p: places.
         n: outward geometric normals near them.
         d: directions.
+        u: uniform numbers of emitters.
         sampler: of what else is random.
     """
     # ---- the walk has the weight 1 at its event
@@ -256,7 +260,7 @@ def light_at_events(
     # ---- emitters beside the sky
     connected, chance, lights = [], mi.Spectrum(0), context.lights
     if lights.some_local or context.suns:
-        connected = _connected(context, (obj, media), walk, mi.Spectrum(1), sampler, False, mi.Bool(True))
+        connected = _connected(context, (obj, media), walk, mi.Spectrum(1), u, sampler, False, mi.Bool(True))
     if lights.some_shaped or context.suns:
         chance += weight * _met_by_chance(context, obj, walk, sampler, walk.left & (walk.reflections <= 1))
     if lights.some_delta:
@@ -479,8 +483,8 @@ class _Way:
 
 
 def _connected(
-    context: RenderContext, of: tuple[TranslucentObject, Media], walk: _Walk, weight: mi.Spectrum, sampler: mi.Sampler,
-    sky: bool, active: mi.Bool,
+    context: RenderContext, of: tuple[TranslucentObject, Media], walk: _Walk, weight: mi.Spectrum, u: mi.Point2f,
+    sampler: mi.Sampler, sky: bool, active: mi.Bool,
 ) -> list[tuple[mi.Spectrum, mi.Vector3f]]:  # fmt: skip
     """Light of a sampled emitter that reaches the event, which has a weight, by refraction or one reflection more.
 
@@ -488,7 +492,7 @@ def _connected(
     """
     obj, media = of
     at = place(walk.event, mi.Normal3f(0, 0, 0), walk.medium)
-    ds, light = sample_emitter(context, at, sampler.next_2d(), False, active)
+    ds, light = sample_emitter(context, at, u, False, active)
     with dr.suspend_grad():
         distant = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
         alone = context.sampled_by_nee(ds.emitter, ds.d)
