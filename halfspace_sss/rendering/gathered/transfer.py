@@ -280,7 +280,9 @@ def transfer(obj: TranslucentObject, count: int | None = None, samples: int = SA
     t, error = _rows(points, result.S / (result.paint**e)[:, None], (_trusted(obj), paint), result.a)
     near = np.where(result.known, result.near, np.arange(len(points), dtype=np.uint32)[:, None])
     centred = _centred(result.w_o, result.a.mean(axis=2))
-    return Transfer(points, near, t, _rings(points, near), result.w_i, *centred, result.albedo, error, e)
+    # rows beside an edge of a texture are not to be averaged with those beyond
+    ring = _rings(points, near) if paint is None else np.zeros(near.shape, np.uint8)
+    return Transfer(points, near, t, ring, result.w_i, *centred, result.albedo, error, e)
 
 
 def _rings(points: SurfacePoints, entry: np.ndarray) -> np.ndarray:
