@@ -9,6 +9,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -122,3 +123,24 @@ def test_a_machine_with_one_core_writes_and_reads_images(use: str, tmp_path: Pat
         [sys.executable, "-c", code], capture_output=True, text=True, env=env, cwd=tmp_path, timeout=60
     )
     assert found.returncode == 0, found.stderr
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="cores cannot be told here")
+@pytest.mark.parametrize(
+    "quota, most", [("150000 100000", 1), ("50000 100000", 1), ("900000000 100000", None), ("max 100000", None)]
+)
+def test_cores_are_those_that_the_control_group_allows(
+    quota: str, most: int | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(backend, "Path", lambda path: SimpleNamespace(read_text=lambda encoding: quota))
+    assert backend.cores() == (most or len(os.sched_getaffinity(0)))
+
+
+def test_kernels_are_kept_where_the_environment_says(tmp_path: Path) -> None:
+    code = (
+        "import halfspace_sss\nfrom halfspace_sss.backend import array_types\nF = array_types().Float\n"
+        "print((F([1, 2]) * 3 + 0.12345)[1])"
+    )
+    env = {**os.environ, "DRJIT_CACHE_DIR": str(tmp_path)}
+    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, env=env, timeout=60)
+    assert list(tmp_path.glob("*.bin"))

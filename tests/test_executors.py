@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import subprocess
 import sys
@@ -37,6 +38,10 @@ def place(_: int) -> tuple[int, int]:
     import drjit as dr
 
     return os.getpid(), dr.thread_count()
+
+
+def full(path: str) -> None:
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), path)
 
 
 @pytest.mark.parametrize("executor", [None, ThreadPoolExecutor(2)], ids=["here", "threads"])
@@ -90,6 +95,8 @@ def test_two_processes_share_the_cores_and_give_the_bits_of_one(tmp_path: Path) 
         there = make_maps(MEDIA, tmp_path / "there", executor=executor, **HOW)
         ((process, threads),) = dict(completed(executor, place, {"place": (0,)})).values()
         assert process != os.getpid() and threads == max(cores() // 2, 1)
+        with pytest.raises(OSError, match="No space left on device: 'where/part'"):  # as on one worker's disk
+            list(completed(executor, full, {"part": ("where/part",)}))
     for name in MEDIA:
         assert load_maps(there[name]).S.equals(load_maps(here[name]).S)
 
@@ -109,6 +116,40 @@ def test_workers_of_dask_give_the_bits_of_one_process(tmp_path: Path, monkeypatc
         with pytest.raises(ValueError, match="worker .* must have halfspace-sss 0.0.1, got"):
             with executors.scheduler(address):
                 pass
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("said", [None, "3"])
+def test_a_worker_of_dask_has_the_threads_that_the_environment_says_and_one_otherwise(
+    said: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    if said:
+        monkeypatch.setenv("OMP_NUM_THREADS", said)
+    with dask(threads=1) as address, executors.scheduler(address) as executor:
+        ((_, threads),) = dict(completed(executor, place, {"place": (0,)})).values()
+    assert threads == int(said or 1)
+
+
+@pytest.mark.slow
+def test_a_cluster_that_takes_a_worker_away_and_brings_others_gives_the_bits_of_one_process(tmp_path: Path) -> None:
+    distributed, taken = pytest.importorskip("distributed"), []
+    here = make_maps(MEDIA, tmp_path / "here", **HOW)
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
+
+        def take(done: int, *_: object) -> None:
+            if done and not taken:
+                taken.append(True)
+                cluster.scale(1)
+                while len(cluster.scheduler_info["workers"]) > 1:
+                    time.sleep(0.1)
+                cluster.scale(3)
+
+        with executors.scheduler(cluster.scheduler_address) as executor:
+            there = make_maps(MEDIA, tmp_path / "there", executor=executor, progress=take, **HOW)
+    assert taken
+    for name in MEDIA:
+        assert load_maps(there[name]).S.equals(load_maps(here[name]).S)
 
 
 @pytest.mark.slow
