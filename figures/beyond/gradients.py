@@ -24,31 +24,26 @@ from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED, load_scene
 CASES = {f"{scan}, eta {eta}": (scan, eta) for scan in ("bunny", "dragon") for eta in (1.0, 1.4)}
 DEPTHS = (64, 256)
 MEDIUM = {"albedo": "0.95, 0.89, 0.82", "sigma_t": "2.4"}  # 1/mm
-REPEATS, WALK_REPEATS = 6, 12
+REPEATS, WALK_REPEATS = 20, 12
 
 
 class Steps(NamedTuple):
-    """Gradients (n, 3) of steps with samples of their own, CPU seconds of one, and of the first."""
+    """Gradients (n, 3) of steps of independent samples, their variance (3,), CPU seconds of one, and of the first."""
 
     gradients: np.ndarray
+    variances: np.ndarray
     seconds: float
     first: float
 
     @property
-    def mean(self) -> np.ndarray:
-        """Of each channel."""
-        return self.gradients.mean(axis=0)
-
-    @property
     def variance(self) -> float:
         """Of a step over the squared gradient, mean over channels."""
-        return float((self.gradients.var(axis=0, ddof=1) / self.mean**2).mean())
+        return float((self.variances / self.gradients.mean(axis=0) ** 2).mean())
 
     @property
     def red(self) -> tuple[float, float]:
         """The gradient by the albedo of the first channel, the largest, and its standard error."""
-        values = self.gradients[:, 0]
-        return float(values.mean()), float(values.std(ddof=1) / np.sqrt(len(values)))
+        return float(self.gradients[:, 0].mean()), float(np.sqrt(self.variances[0] / len(self.gradients)))
 
 
 def gradient_rows(case: str, size: int, spp: int, seed: int, progress: NamedProgress | None = None) -> list[dict]:
@@ -92,7 +87,7 @@ def gradient_rows(case: str, size: int, spp: int, seed: int, progress: NamedProg
 def _steps(scene: mi.Scene, spp: int, repeats: int, seed: int) -> Steps:
     parameters = mi.traverse(scene)
     key = next(k for k in parameters.keys() if k.endswith(("bsdf.albedo", "albedo.value.value")))
-    gradients, seconds, walks = [], [], hasattr(scene.integrator(), "render_derivatives")
+    gradients, pixels, seconds, walks = [], [], [], hasattr(scene.integrator(), "render_derivatives")
     for k in range(repeats + 1):  # the first compiles
         seeds = np.random.SeedSequence([seed, k]).generate_state(2)
         value = type(parameters[key])(dr.detach(parameters[key]))
@@ -102,10 +97,15 @@ def _steps(scene: mi.Scene, spp: int, repeats: int, seed: int) -> Steps:
         parameters.update()
         if walks:
             _, (slopes,) = scene.integrator().render_derivatives(scene, [value], seed=int(seeds[0]), spp=spp)
-            gradients.append(np.array(slopes, dtype=float).mean(axis=(0, 1)) / 3)
+            slopes = np.array(slopes, dtype=float) / 3
+            gradients.append(slopes.mean(axis=(0, 1)))
+            pixels.append(slopes)
         else:
             image = mi.render(scene, parameters, spp=spp, seed=int(seeds[0]), seed_grad=int(seeds[1]))
             dr.backward(dr.mean(image, axis=None))
             gradients.append(np.ravel(np.array(dr.grad(parameters[key]), dtype=float)))
         seconds.append(time.process_time() - at)
-    return Steps(np.array(gradients), float(np.median(seconds[1:])), seconds[0])
+    variances = np.var(gradients, axis=0, ddof=1)
+    if walks:  # of the sum of independent pixels, of which there are many
+        variances = np.var(pixels, axis=0, ddof=1).mean(axis=(0, 1)) / pixels[0][..., 0].size
+    return Steps(np.array(gradients), variances, float(np.median(seconds[1:])), seconds[0])

@@ -76,6 +76,8 @@ def check_names(names: Sequence[str], known: Sequence[str]) -> None:
     """ValueError if names of parameters are none of those known, are there twice, or ask for sigma_t and mfp both."""
     if not names or len(set(names)) < len(names):
         raise ValueError(f"parameters must be one or more of {', '.join(known)}, each once, got {list(names)}")
+    if "alpha" in names:
+        raise ValueError("parameter must not be alpha: a rough boundary stays as it is, there is no derivative by it")
     for name in names:
         check_choice("parameter", name, known)
     if {"sigma_t", "mfp"} <= set(names):

@@ -73,6 +73,7 @@ def test_views_and_parameters_that_do_not_fit_are_refused_by_name(tmp_path: Path
     refused("image a must be 8 x 8 of 3 channels as sensor 0, got 4 x 8", [GivenView.of("a", 0, image[:, :4])])
     refused("sensor of a must be below 1", [GivenView.of("a", 1, image)])
     refused("parameter must be one of albedo.*got 'albdo'; did you mean 'albedo'", names=("albdo",))
+    refused("parameter must not be alpha: a rough boundary stays as it is", names=("alpha",))
     refused("sigma_t or mfp, got both", names=("mfp", "sigma_t"))
     refused("object must be one of ball", object="bell")
     refused("not held out, got none", [GivenView.of("a", 0, image, held_out=True)])

@@ -88,3 +88,16 @@ def test_a_white_medium_whose_channels_scatter_unlike_is_as_bright_as_its_sky() 
     error = images.std(axis=0, ddof=1) / np.sqrt(RUNS)
     assert (np.abs(images.mean(axis=0) - 0.5) < WIDEST_Z * error + 1e-6).all()
     assert (error < 0.005).all()
+
+
+@pytest.mark.slow
+def test_a_texture_of_one_colour_is_as_bright_as_the_colour() -> None:
+    """Light that passes the object again took another medium there, so that it is left to chance."""
+    colour = np.full((2, 2, 3), [0.9, 0.8, 0.5], np.float32)
+    texture = {"type": "bitmap", "bitmap": mi.Bitmap(colour), "raw": True}
+    ball = {"type": "sphere", "radius": 4.0}
+    found, wanted = (
+        _means(mi.load_dict(_scene(ball, ("lamp",), {**MEDIUM, "albedo": albedo})), 256, seed)
+        for seed, albedo in enumerate((texture, MEDIUM["albedo"]))
+    )
+    _agree(found, wanted, 0.03)
