@@ -15,7 +15,8 @@ reflectance R of the half-space at the exit
     L_o(x_o, w_o) = a(w_o) R(x_o)^e B(x_o),
 
 e per channel with which what leaves under the same light from everywhere is smoothest: 1/2 where light comes from
-further than from the next point, as models take the medium at both ends, up to 1.
+further than from the next point, as models take the medium at both ends, up to 1. The shape of a varies with ln R,
+linearly: light of darker media is of fewer orders, and leaves more sideways.
 
 a(mu) = F_t(mu) (c_0 + c_1 mu + c_2 mu²) per channel is fitted to samples of all points.
 
@@ -66,14 +67,22 @@ def cosine(w: mi.Vector3f, n: mi.Normal3f, n_out: mi.Normal3f) -> mi.Float:
 
 @dataclass(frozen=True)
 class Albedo:
-    """a(mu) = F_t(mu) (c_0 + c_1 mu + c_2 mu²), c per channel, shape (channels, 3)."""
+    """a(mu) = F_t(mu) (c_0 + c_1 mu + c_2 mu²), c per channel, shape (channels, 3).
+
+    Where media have textures, at an exit of the reflectance R with c + tilt (ln R - middle) for c.
+    """
 
     c: np.ndarray
     eta: float
+    tilt: np.ndarray | None = None
+    middle: np.ndarray | None = None
 
-    def __call__(self, mu: mi.Float) -> mi.Spectrum:
+    def __call__(self, mu: mi.Float, paint: mi.Spectrum | None = None) -> mi.Spectrum:
         F = F_t(mu, opaque(self.eta))
         rows = [[opaque(v) for v in row] for row in self.c]
+        if self.tilt is not None and paint is not None:
+            x = [dr.log(dr.maximum(R, 1e-20)) - opaque(v) for R, v in zip(paint, self.middle)]
+            rows = [[v + opaque(d) * each for v, d in zip(row, tilt)] for row, tilt, each in zip(rows, self.tilt, x)]
         return mi.Spectrum([F * dr.maximum(a + mu * (b + mu * c), 0) for a, b, c in rows])
 
     def cosine(self, w: mi.Vector3f, n: mi.Normal3f, n_out: mi.Normal3f) -> mi.Spectrum:
@@ -369,7 +378,9 @@ def drawn(
     S = np.array(S, dtype=np.float32).reshape(-1, *shape).transpose(1, 2, 0)
     S = np.nan_to_num(S, nan=0.0, posinf=0.0, neginf=0.0)
     albedo = _fitted(obj, np.array(mu), S.reshape(-1, S.shape[2]))
-    a = np.array(albedo(mu)).T.reshape(S.shape)
+    if obj.textured is not None:
+        albedo = _tilted(albedo, np.array(mu).reshape(shape), S, np.array(paint)[:, ::n].T)
+    a = np.array(albedo(mu, paint)).T.reshape(S.shape)
     h = np.array(albedo(mu_i) * (mu_i * inverse)).T.reshape(S.shape) / albedo.whole.astype(np.float32)
     w_i, w_o = (np.array(w, dtype=np.float32).T.reshape(*shape, 3) for w in (w_i, out.w))
     paint = np.broadcast_to(np.array(paint), (S.shape[2], len(mu)))[:, ::n].T
@@ -412,6 +423,21 @@ def _fitted(obj: TranslucentObject, mu: np.ndarray, S: np.ndarray) -> Albedo:
     basis = F_t(mu.astype(float), eta)[:, None] * mu[:, None] ** np.arange(3)
     normal = basis.T @ basis + 1e-9 * len(mu) * np.eye(3)
     return Albedo(np.linalg.solve(normal, basis.T @ S.astype(float)).T, eta)
+
+
+def _tilted(albedo: Albedo, mu: np.ndarray, S: np.ndarray, paint: np.ndarray) -> Albedo:
+    """With c that varies with the reflectance: by least squares over S of points, (points, samples, channels)."""
+    step, x = max(mu.size // FITTED, 1), np.log(np.maximum(paint, 1e-20))
+    even = np.array(albedo(mi.Float(mu.ravel()))).T.reshape(S.shape).sum(axis=1) / np.maximum(S.sum(axis=1), 1e-30)
+    mu, y = mu[:, ::step].astype(float), S[:, ::step] * even[:, None]
+    powers, middle = F_t(mu, albedo.eta)[:, :, None] * mu[:, :, None] ** np.arange(3), x.mean(axis=0)
+    found = []
+    for k in range(len(albedo.c)):
+        basis = np.concatenate([powers, powers * (x[:, k] - middle[k])[:, None, None]], axis=2).reshape(-1, 6)
+        normal = basis.T @ basis + 1e-9 * len(basis) * np.eye(6)
+        found.append(np.linalg.solve(normal, basis.T @ y[:, :, k].ravel()))
+    c = np.stack(found)
+    return Albedo(c[:, :3], albedo.eta, c[:, 3:], middle)
 
 
 def _rows(

@@ -79,9 +79,10 @@ class Gathered:
         rows = [B[4 * c : 4 * c + 4] for c in range(size)]
         B = mi.Spectrum([b + x * out.w.x + y * out.w.y + z * out.w.z for b, x, y, z in rows])
         mu = dr.dot(out.w, out.n_out)
-        a = self.transfer.albedo(dr.maximum(mu, 0))
-        if self.object.textured is not None:
-            a *= self.object.transport.paint(out) ** mi.Spectrum([opaque(v) for v in self.transfer.e])
+        paint = None if self.object.textured is None else self.object.transport.paint(out)
+        a = self.transfer.albedo(dr.maximum(mu, 0), paint)
+        if paint is not None:
+            a *= paint ** mi.Spectrum([opaque(v) for v in self.transfer.e])
         alpha = self.object.transport.alpha
         if alpha is not None:
             known = alpha.known[1]
