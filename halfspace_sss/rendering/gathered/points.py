@@ -145,7 +145,7 @@ class SurfacePoints:
         j, k = near.coords
         apart = np.abs(x[j] - x[k]).max(axis=1)
         w = csr_array((near.data * np.exp(-((apart / LIKE) ** 2)), (j, k)), shape=near.shape)
-        return w / w.sum(axis=1)[:, None]
+        return (w / w.sum(axis=1)[:, None]).tocsr()
 
     @cached_property
     def _blending(self) -> csr_array:
@@ -155,7 +155,7 @@ class SurfacePoints:
         j, k = d.coords
         facing = np.maximum((n[j] * n[k]).sum(axis=1), 0)
         w = csr_array((((1 - (d.data / self.h) ** 2) * facing) ** 2, (j, k)), shape=d.shape)
-        return w / w.sum(axis=1)[:, None]
+        return (w / w.sum(axis=1)[:, None]).tocsr()
 
     def nearest(self, p: mi.Point3f, n: mi.Normal3f, active: mi.Bool) -> tuple[mi.UInt32, mi.Bool]:
         """The point of the largest weight at a place, and whether there is one."""

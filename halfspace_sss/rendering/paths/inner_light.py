@@ -14,7 +14,7 @@ import numpy as np
 
 from halfspace_sss.rendering.gathered.inner import Events, InnerLight, bands
 from halfspace_sss.rendering.gathered.transfer import R_2
-from halfspace_sss.rendering.object.points import place
+from halfspace_sss.rendering.object.points import opaque, place, wrapped
 from halfspace_sss.rendering.paths.lighting import Primal, RenderContext
 from halfspace_sss.rendering.paths.low_orders import light_at_events
 
@@ -43,8 +43,9 @@ def inner_light(
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(SEED + k, count)
     # neighbours take directions, and points of emitters, of one lattice each
-    lane, turn = np.arange(count)[:, None], np.random.default_rng(SEED + k).random(4)
-    u, u_emitter = (mi.Point2f(((lane * R_2 + t) % 1.0).astype(np.float32).T) for t in np.split(turn, 2))
+    lane, turn = dr.arange(mi.UInt32, count), np.random.default_rng(SEED + k).random(4)
+    steps = [mi.Float(lane * int(2**32 * r)) * 2**-32 for r in R_2]
+    u, u_emitter = (mi.Point2f(*(wrapped(x + opaque(t)) for x, t in zip(steps, part))) for part in np.split(turn, 2))
     d = mi.warp.square_to_uniform_sphere(u)
     found = light_at_events(context, obj, events.p, events.n, d, u_emitter, sampler)
     met = found.chance + found.weight * _beyond(context, found.left, others)

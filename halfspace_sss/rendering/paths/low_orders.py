@@ -260,7 +260,11 @@ def light_at_events(
     # ---- emitters beside the sky
     connected, chance, lights = [], mi.Spectrum(0), context.lights
     if lights.some_local or context.suns:
-        connected = _connected(context, (obj, media), walk, mi.Spectrum(1), u, sampler, False, mi.Bool(True))
+        k = dr.arange(mi.UInt32, dr.width(p)) // BESIDE
+        looked = k % RARELY == 0  # lanes beside each other, as those that wait cost as much
+        connected = _connected(
+            context, (obj, media), walk, mi.Spectrum(1), u, sampler, False, mi.Bool(True), (looked, RARELY)
+        )
     if lights.some_shaped or context.suns:
         chance += weight * _met_by_chance(context, obj, walk, sampler, walk.left & (walk.reflections <= 1))
     if lights.some_delta:
@@ -484,11 +488,12 @@ class _Way:
 
 def _connected(
     context: RenderContext, of: tuple[TranslucentObject, Media], walk: _Walk, weight: mi.Spectrum, u: mi.Point2f,
-    sampler: mi.Sampler, sky: bool, active: mi.Bool,
+    sampler: mi.Sampler, sky: bool, active: mi.Bool, others: tuple[mi.Bool | bool, float] = (True, 1.0),
 ) -> list[tuple[mi.Spectrum, mi.Vector3f]]:  # fmt: skip
     """Light of a sampled emitter that reaches the event, which has a weight, by refraction or one reflection more.
 
     Of each way the light, without the phase function, and its direction at the event; of the `sky` too if asked for.
+    `others` says where ways that no straight line leads to are looked for, and how much they count there.
     """
     obj, media = of
     at = place(walk.event, mi.Normal3f(0, 0, 0), walk.medium)
@@ -501,8 +506,9 @@ def _connected(
         target = _Target(ds, light, walk.event + ds.d * reach, reach, alone)
         first = active & (alone | mi.Bool(sky))
         if context.lights.some_local or context.suns:
-            near = active & alone & _near(obj, walk, target.p, active)
-            ways = _ways(context, obj, walk, weight, target, (first, near), sampler)
+            near = active & alone & others[0] & _near(obj, walk, target.p, active)
+            straight, *bent = _ways(context, obj, walk, weight, target, (first, near), sampler)
+            ways = [straight, *(replace(way, passed=way.passed * others[1]) for way in bent)]
         else:
             ways = [_way(context, obj, walk, target, refracted_connection(obj, walk.event, target.p, first))]
     return [(_light_along(media, weight, target, way), way.d) for way in ways]
@@ -606,6 +612,7 @@ def _faces(n: mi.Normal3f, d: mi.Vector3f) -> mi.Bool:
 TRIALS = 32  # N
 SPREAD = (20.0, 2.0)  # concentrations of directions about the first guess
 NEAR = 4.0  # mean free paths of the straight way to the boundary, beyond which other connections are left to chance
+RARELY, BESIDE = 8, 64  # of gathered events one in so many, and lanes beside it, as other ways bring 1 % of the light
 MIRRORED = 0.5  # probability to start as a flat boundary would reflect
 
 
