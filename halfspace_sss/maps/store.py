@@ -265,24 +265,24 @@ def _create(path: Path, medium: Medium, grid: MapGrid, seed: int, asked: dict[st
 
     Encoded in memory: zarr's threads, which an interrupt does not end, would write on into a folder just removed.
     """
-    from zarr.storage import MemoryStore
-
     dataset, memory = _template(medium, grid, seed), {}
     dataset.attrs |= {ASKED: json.dumps(asked, sort_keys=True), "provenance": json.dumps(provenance())}
     dataset.attrs |= written_checksums(dataset)
     chunks = {name: {"chunks": (1, 1, *dataset[name].shape[2:])} for name in dataset.data_vars}
-    dataset.to_zarr(MemoryStore(memory), mode="w", zarr_format=2, encoding=chunks)
+    dataset.to_zarr(memory, mode="w", zarr_format=2, encoding=chunks)
+    # bytes in version 2 of zarr, the last one for Python 3.10
+    content = {key: data if isinstance(data, bytes) else data.to_bytes() for key, data in memory.items()}
     if is_remote(path):
-        for key in sorted(memory, key=METADATA.__eq__):
-            (path / key).write_bytes(memory[key].to_bytes())
+        for key in sorted(content, key=METADATA.__eq__):
+            (path / key).write_bytes(content[key])
         return
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     shutil.rmtree(temporary, ignore_errors=True)
     try:
         with naming(path):
-            for key, data in memory.items():
+            for key, data in content.items():
                 (temporary / key).parent.mkdir(parents=True, exist_ok=True)
-                (temporary / key).write_bytes(data.to_bytes())
+                (temporary / key).write_bytes(data)
             os.replace(temporary, path)
     except OSError:
         if not path.exists():  # else another process, with another share, was first
