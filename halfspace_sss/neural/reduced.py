@@ -15,6 +15,8 @@ Measured over other random queries, weighted by r² sqrt(S_o S_i) of pairs of al
     0, 0.0001 to 1               0.9                 1.9              0.4
     0.5, 0.3 to 0.999            0.8                 1.5              0.2
     0.8, 0.6 to 0.9999           1.4                 4.0              0.9
+
+By one network, of the middle, the mean is 1.3, 1.8 and, for g = 0.8, 5.9 %.
 """
 
 from __future__ import annotations
