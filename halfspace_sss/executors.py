@@ -92,12 +92,13 @@ def workers(number: int) -> Iterator[Executor]:
 
 
 @contextmanager
-def scheduler(address: str) -> Iterator[Executor]:
+def scheduler(address: str, say: Callable[[str], object] | None = None) -> Iterator[Executor]:
     """The workers of a Dask scheduler.
 
     Args:
         address: as tcp://HOST:8786, or the file that `dask scheduler --scheduler-file` writes; "local": of a cluster on
             this machine, one worker for each core, that ends with the block.
+        say: called with a line that tells where Dask's dashboard is, if there is one.
 
     Raises:
         BackendError: Dask is not installed, or no scheduler answers.
@@ -118,6 +119,8 @@ def scheduler(address: str) -> Iterator[Executor]:
             client = stack.enter_context(Client(**where, timeout=10, set_as_default=False))
         except (OSError, ValueError) as error:
             raise BackendError(f"no scheduler answers at {address}: {error}") from error
+        if say and client.dashboard_link:
+            say(f"dashboard of Dask: {client.dashboard_link}")
         client.register_plugin(WorkerSetUp(halfspace_sss.__version__))
         try:
             yield client.get_executor(pure=False)

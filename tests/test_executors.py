@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import subprocess
 import sys
 import threading
@@ -104,10 +105,12 @@ def test_two_processes_share_the_cores_and_give_the_bits_of_one(tmp_path: Path) 
 @pytest.mark.slow
 def test_workers_of_dask_give_the_bits_of_one_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     here = make_maps(MEDIA, tmp_path / "here", **HOW)
-    with executors.scheduler("local") as executor:
+    said: list[str] = []
+    with executors.scheduler("local", said.append) as executor:
         there = make_maps(MEDIA, tmp_path / "there", executor=executor, **HOW)
     for name in MEDIA:
         assert load_maps(there[name]).S.equals(load_maps(here[name]).S)
+    assert re.fullmatch(r"dashboard of Dask: http://127\.0\.0\.1:\d+/status", *said)
     with dask(threads=2) as address:
         with pytest.raises(ValueError, match="must run one part at a time .* got 2 threads"):
             with executors.scheduler(address):

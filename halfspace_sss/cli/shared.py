@@ -245,7 +245,7 @@ def executor_of(workers: int | None, scheduler: str | None) -> Iterator[Executor
     if workers is not None and scheduler is not None:
         raise ValueError(f"workers must be left out beside a scheduler, got {workers}")
     if scheduler is not None:
-        with executors.scheduler(scheduler) as result:
+        with executors.scheduler(scheduler, console().print) as result:
             yield result
     elif workers is not None:
         with executors.workers(workers) as result:
