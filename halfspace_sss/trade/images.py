@@ -94,7 +94,9 @@ def with_flip(
     flip = renderer("flip")
     if flip is None or all(o.is_dark for o in assessment.objects):
         return assessment
-    images = small_images(on, chosen, sensor, seed, spp=spp) if images is None else images
+    measured = {PATH_TRACED, *(w.way for o in assessment.objects for w in o.ways if not w.refusal)}
+    shown = [way for way in chosen if way.name in measured]  # others would gather light for a number that is not told
+    images = small_images(on, shown, sensor, seed, spp=spp) if images is None else images
     truth = images[PATH_TRACED]
     again = small_images(on, [chosen[0]], sensor, seeded(seed, 52), max(truth.shape), spp)[PATH_TRACED]
     noise = flip(truth, again)
