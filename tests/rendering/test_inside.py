@@ -76,6 +76,7 @@ SEED = {"type": "translucent", "sigma_s": "4,2,1", "sigma_a": ".5,.1,.02", "g": 
 
 INSIDE: dict[str, Callable[[], tuple[dict, dict[str, str]]]] = {
     "nearly filled by black": lambda: ({"stone": _ball(0.9, bsdf=BLACK)}, {}),
+    "coloured stone": lambda: ({"stone": _ball(0.5, (0.1, 0.2, 0.3), bsdf=GREY)}, {}),
     "bubble": lambda: ({"air": _ball(0.6, (0.1, 0.2, 0.2), bsdf=AIR)}, {"air": "wax"}),
     "frosted glass": lambda: ({"glass": _ball(0.6, (0, 0, 0.3), bsdf=FROSTED)}, {"glass": "wax"}),
     "stone in a bubble": lambda: (
