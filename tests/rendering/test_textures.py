@@ -12,6 +12,7 @@ from test_translucent_walk import WIDEST_Z_OF_RUNS, _lamp, _runs, _scene, _small
 from halfspace_sss import Medium, bssrdf, measure
 from halfspace_sss.neural import material_model, paper_model, store
 from halfspace_sss.rendering.object.objects import make_objects
+from halfspace_sss.rendering.object.palette import Distances
 from halfspace_sss.rendering.object.points import SurfacePoint
 from halfspace_sss.rendering.object.settings import Settings
 
@@ -150,6 +151,18 @@ def test_S_is_the_geometric_mean_of_both_ends(model: str, error: float) -> None:
     wanted = np.where(across[:, None], np.sqrt(a * b), np.where((p[1] > 0)[:, None], a, b))
     np.testing.assert_allclose(c, wanted, rtol=error, atol=1e-5 * wanted.max())
     np.testing.assert_allclose(c[across].sum(axis=0), wanted[across].sum(axis=0), rtol=min(error, 0.02))
+
+
+@pytest.mark.parametrize("count", [0, 3])
+def test_networks_are_asked_at_all_distances_or_between_few(count: int) -> None:
+    """Between three, functions quadratic in the logarithm are exact, of distances that are the same too."""
+    every = [mi.Float(0.1, 2), mi.Float(0.3, 2), mi.Float(0.7, 2)]
+    distances = Distances.of(every, count)
+    values = [[dr.square(dr.log(r)), dr.log(r)] for r in distances.r]
+    for k, r in enumerate(every):
+        square, linear = distances.interpolated(values, k, r)
+        np.testing.assert_allclose(square, np.log(r) ** 2, atol=1e-5)
+        np.testing.assert_allclose(linear, np.log(r), atol=1e-5)
 
 
 def test_a_model_of_a_constant_texture_renders_as_of_a_constant() -> None:
