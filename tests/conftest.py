@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import functools
 import gc
 import os
 import signal
@@ -103,6 +104,10 @@ def _set_variant(name: str) -> None:
 
     mi.set_variant(name)
     rendering.register()
+    for load in ("load_dict", "load_file", "load_string"):
+        if not isinstance(getattr(mi, load), functools.partial):
+            # several threads number the shapes by chance: other kernels would be compiled for the same scene
+            setattr(mi, load, functools.partial(getattr(mi, load), parallel=False))
 
 
 @pytest.fixture

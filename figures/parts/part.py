@@ -87,20 +87,38 @@ def modules_of(roots: Iterable[str]) -> list[str]:
 
     Of a figure only that counts which is imported from it, as "module:name", for it draws too.
     """
+    return list(_modules_of(frozenset(roots)))
+
+
+@functools.lru_cache(maxsize=1024)
+def _modules_of(roots: frozenset[str]) -> tuple[str, ...]:
     results: set[str] = set()
     ahead = list(roots)
     while ahead:
         name = ahead.pop()
         if name not in results and _path(name):
             results.add(name)
-            ahead += _resolved(_found(name))
-    return sorted(results)
+            ahead += _next(name)
+    return tuple(sorted(results))
 
 
+@functools.cache
+def _next(name: str) -> tuple[str, ...]:
+    """Modules that a module imports."""
+    return tuple(dict.fromkeys(_resolved(_found(name))))
+
+
+@functools.cache
 def _found(name: str) -> _Source:
-    """The code of a module, or of "module:name" what that definition uses of it."""
+    """The code of a module, or of "module:name" what that definition uses of it, as it was looked at last."""
     path = _path(name)
     return _source(path, path.stat().st_mtime_ns, name.partition(":")[2])
+
+
+def _look_again() -> None:
+    """Files may have been edited since: what follows from them is forgotten; those that were not stay read."""
+    for known in (_modules_of, _next, _found):
+        known.cache_clear()
 
 
 @functools.cache
@@ -151,10 +169,10 @@ def _source(path: Path, changed: int, definition: str) -> _Source:
 
 
 def _digested(tree: ast.Module) -> _Source:
-    imports = tuple(dict.fromkeys(_imported(tree)))
     digest = hashlib.sha256(_bare(tree).encode()).hexdigest()
-    texts = [node.value for node in ast.walk(tree) if isinstance(node, ast.Constant) and isinstance(node.value, str)]
-    return _Source(digest, imports, frozenset(texts), {})
+    nodes = list(ast.walk(tree))
+    texts = [node.value for node in nodes if isinstance(node, ast.Constant) and isinstance(node.value, str)]
+    return _Source(digest, tuple(dict.fromkeys(_imported(nodes))), frozenset(texts), {})
 
 
 def _used_by(function: str, tree: ast.Module) -> ast.Module:
@@ -184,10 +202,10 @@ def _bound_by(statement: ast.stmt) -> Iterator[str]:
             yield node.id
 
 
-def _imported(tree: ast.Module) -> Iterator[str]:
+def _imported(nodes: list[ast.AST]) -> Iterator[str]:
     """Dotted names that are imported anywhere in a file, and those taken from imported packages as `package.name`."""
     bound: dict[str, str] = {}
-    for node in ast.walk(tree):
+    for node in nodes:
         if isinstance(node, ast.Import):
             for alias in node.names:
                 yield alias.name
@@ -196,9 +214,18 @@ def _imported(tree: ast.Module) -> Iterator[str]:
             for alias in node.names:
                 yield f"{node.module}.{alias.name}"
                 bound[alias.asname or alias.name] = f"{node.module}.{alias.name}"
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Attribute) and (owner := ast.unparse(node.value)) in bound:
+    for node in nodes:
+        if isinstance(node, ast.Attribute) and (owner := _dotted(node.value)) in bound:
             yield f"{bound[owner]}.{node.attr}"
+
+
+def _dotted(node: ast.expr) -> str:
+    """The text of a name such as `package.module`; empty for any other expression."""
+    last = []
+    while isinstance(node, ast.Attribute):
+        last.append(node.attr)
+        node = node.value
+    return ".".join([node.id, *reversed(last)]) if isinstance(node, ast.Name) else ""
 
 
 def _bare(tree: ast.Module) -> str:
@@ -339,6 +366,7 @@ def keys_of(parts: Sequence[Part]) -> dict[str, str]:
         ValueError: two names give the same folder, a part needs one that does not stand before it, or an input cannot
             be read.
     """
+    _look_again()
     keys: dict[str, str] = {}
     slugs: dict[str, str] = {}
     for part in parts:
