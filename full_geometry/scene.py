@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from full_geometry.models.neural_shape import ALBEDO, ETA, SIZE, G, transport
+from full_geometry.models.neural_shape import ALBEDO, ETA, MODEL, SIZE, G, transport
 from full_geometry.models.storing import CHECKSUMS, KIND, find_weights, load, nearest
 from full_geometry.object.patches import AREA_SHARE, LearntProposals, PatchTable
 from halfspace_sss.neural.store import checksum_of, load_weights
@@ -123,3 +123,6 @@ def shape_model(obj: TranslucentObject, settings: Settings) -> ObjectModel:
     # light may leave by another piece of the surface than it entered by
     positions = PositionSampler(replace(geometry, pieces=None), table, obj.points, share)
     return ObjectModel(model, HalfSpaceProposals(positions, live[0]))
+
+
+shape_model.varies_as = MODEL

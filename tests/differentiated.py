@@ -77,14 +77,15 @@ def followed(parameters, key: str):
     return value
 
 
-def derivatives(scene, keys: list[str]) -> dict[str, np.ndarray]:
-    """Derivatives of the weighted sum of the image by several parameters, of one replay."""
+def derivatives(scene, keys: list[str], by: np.ndarray | None = None) -> dict[str, np.ndarray]:
+    """Derivatives of the weighted sum of the image by several parameters, of one replay; `by` has other weights."""
+    by = weights(scene) if by is None else by
     parameters = mi.traverse(scene)
     values = {key: followed(parameters, key) for key in keys}
     for key, value in values.items():
         parameters[key] = value
     parameters.update()
-    scene.integrator().render_backward(scene, parameters, mi.TensorXf(weights(scene)), 0, SEED, SPP)
+    scene.integrator().render_backward(scene, parameters, mi.TensorXf(by), 0, SEED, SPP)
     for key, value in values.items():
         parameters[key] = dr.detach(value)
     parameters.update()
@@ -110,27 +111,29 @@ def forward(scene, key: str) -> float:
 
 
 class Shifted:
-    """Stands in for the `Variation` of a body: the light of another medium along paths of this one."""
+    """Stands in for the `Variation` of a body: coefficients of another medium along paths of this one."""
 
     def __init__(self, body, name: str, h: float, only: int | None) -> None:
-        self.inside, media = body.variation.inside, []
+        self.inside, self.model, self.media = body.variation.inside, body.variation.model, []
         for k, m in enumerate(self.inside.channels()):
             ratios = {key: float(getattr(m, key)) for key in ("albedo", "sigma_t", "g")}
             ratios[name] += h if only in (None, k) else 0.0
-            media.append(Medium.from_albedo(**ratios, eta=m.eta))
-        if self.inside.model in UNTRAINED:  # by the scaling law, so that the stand-ins keep their weights
-            self.models = [type(own)(Medium(own.medium.sigma_s * m.sigma_t, own.medium.sigma_a * m.sigma_t, m.g, m.eta))
-                           for own, m in ((bssrdf(self.inside.model, c.in_mfp()), s)
-                                          for c, s in zip(self.inside.channels(), media))]  # fmt: skip
-        else:
-            self.models = [bssrdf(self.inside.model, m) for m in media] if body.transport else []
-        self.media = media
+            self.media.append(Medium.from_albedo(**ratios, eta=m.eta))
 
-    def prepare(self) -> None:
+    def prepare(self, transport) -> None:
         """Nothing is differentiated by."""
 
-    def S(self, values: list, query: tuple) -> list:
-        return [model.eval(*query) for model in self.models]
+    def transport(self, own):
+        """That of the other medium."""
+        if own is None:
+            return None
+        if self.inside.model not in UNTRAINED:
+            return own.transport.beside(self.media)
+        models = []  # by the scaling law, so that the stand-ins keep their weights
+        for c, m in zip(self.inside.channels(), self.media):
+            one, s = bssrdf(self.inside.model, c.in_mfp()), float(m.sigma_t)
+            models.append(type(one)(Medium(one.medium.sigma_s * s, one.medium.sigma_a * s, m.g, m.eta)))
+        return dataclasses.replace(own.transport, models=models)
 
     def coefficients(self, media: list) -> list:
         from halfspace_sss.rendering.object.points import opaque
@@ -138,9 +141,8 @@ class Shifted:
         return [tuple(opaque(v) for v in (m.sigma_s, m.sigma_t, m.g)) for m in self.media]
 
 
-def _varied(body, variation):
-    transport = body.transport and dataclasses.replace(body.transport, variation=variation)
-    return dataclasses.replace(body, variation=variation, transport=transport)
+def varied(body, variation):
+    return dataclasses.replace(body, variation=variation, transport=variation.transport(body.transport))
 
 
 def medium_difference(scene, name: str, only: int | None = None) -> tuple[float, float]:
@@ -149,7 +151,7 @@ def medium_difference(scene, name: str, only: int | None = None) -> tuple[float,
     h = {"albedo": 1e-3, "sigma_t": 1e-2, "g": 4e-3}[name]
     sides = []
     for sign in (1, -1):
-        shifted = [_varied(body, Shifted(body, name, sign * h, only)) for body in bodies]
+        shifted = [varied(body, Shifted(body, name, sign * h, only)) for body in bodies]
         sides.append(image(scene, shifted) * weights(scene))
     difference = (sides[0] - sides[1]) / (2 * h)
     return float(difference.sum()), float(np.abs(difference).sum())

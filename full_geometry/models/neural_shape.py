@@ -37,7 +37,7 @@ from full_geometry.models.descriptors import (
 )
 from full_geometry.models.object_model import HalfSpace
 from full_geometry.object.features import Side
-from full_geometry.object.pairs import EntryProposals, trace_exits
+from full_geometry.object.pairs import EntryProposals, trace_exits, trace_scores
 from halfspace_sss.interface.model import BSSRDF, bssrdf
 from halfspace_sss.lazy import once
 from halfspace_sss.neural.perceptron import Perceptron
@@ -76,10 +76,11 @@ class Backbone(HalfSpace):
     Args:
         obj: the object.
         mixtures: what each of its channels mixes.
+        precise: as of `HalfSpace`.
     """
 
-    def __init__(self, obj: TranslucentObject, mixtures: Sequence[Mixed]) -> None:
-        super().__init__(obj, MODEL, FLOOR)
+    def __init__(self, obj: TranslucentObject, mixtures: Sequence[Mixed], precise: bool = False) -> None:
+        super().__init__(obj, MODEL, FLOOR, precise)
         self.mixtures = mixtures
 
     def added(self, exit: Side, entry: Side) -> list[Any]:
@@ -146,6 +147,7 @@ class NeuralShape:
         media: numbers of each channel.
         scales: s of each channel, see `calibrated`; 1 if there are none.
         checksums: of the weights, and of those of the half-space models that they correct.
+        precise: on CUDA without half precision, for differences.
     """
 
     object: TranslucentObject
@@ -154,21 +156,32 @@ class NeuralShape:
     media: Sequence[np.ndarray]
     scales: Sequence[float] = ()
     checksums: tuple[str, ...] = ()
+    precise: bool = False
     orders = "multiple"
     alpha = None
     is_delta = False
 
     @classmethod
-    def of(cls, obj: TranslucentObject, weights: Mapping[str, np.ndarray]) -> NeuralShape:
+    def of(cls, obj: TranslucentObject, weights: Mapping[str, np.ndarray], precise: bool = False) -> NeuralShape:
         """The model of an object from the arrays of a file, not held to walks."""
         mixtures = mixed(obj)
         numbers = [medium(obj, c, mixture) for c, mixture in enumerate(mixtures)]
-        return cls(obj, Backbone(obj, mixtures), weights, numbers)
+        return cls(obj, Backbone(obj, mixtures, precise), weights, numbers, precise=precise)
+
+    def beside(self, media: Sequence[Medium]) -> NeuralShape:
+        """See `rendering.object.variation.Neighboured`; s by the walks and pairs that this one was held to."""
+        near = NeuralShape.of(replace(self.object, media=tuple(media)), self.weights, True)
+        return replace(near, scales=self.held.scales(near) if self.scales else ())
+
+    @functools.cached_property
+    def held(self) -> HeldLight:
+        """How much light leaves it, as its medium changes."""
+        return HeldLight.of(self)
 
     @functools.cached_property
     def _network(self) -> Perceptron:
         """The first layer in two parts, own and the rest."""
-        return Perceptron.named(self.weights, "W", "b", splits=[N_OWN])
+        return Perceptron.named(self.weights, "W", "b", splits=[N_OWN], looped=self.precise)
 
     @functools.cached_property
     def _media(self) -> list[list[Any]]:
@@ -241,6 +254,8 @@ SEED = 37
 FLAT = 1000.0  # mean chord in transport mean free paths
 WALKS, PAIRS = (2**15, 2**18), (2**17, 2**18)  # fewest, most: few pairs miss what is rare and bright
 ENOUGH = 5e-3  # relative standard error
+SCORED, COMPARED = 2**16, 2**15  # walks and pairs by which s of neighbouring media is known
+COEFFICIENTS = ("sigma_s", "sigma_t", "g")  # of the scores of walks
 MOST_SCALE = 4.0
 
 
@@ -259,6 +274,57 @@ def calibrated(model: NeuralShape) -> NeuralShape:
     known = (B > 0) & (S > 0)
     ratio = np.clip(np.where(known, B, 1) / np.where(known, S, 1), 1 / MOST_SCALE, MOST_SCALE)
     return replace(model, scales=tuple((np.array(model.scales or 1.0) * ratio**weights).tolist()))
+
+
+@dataclass(frozen=True, eq=False)
+class HeldLight:
+    """How B and <S> of a model change with its medium: B by the scores of walks, <S> by the same pairs.
+
+    Args:
+        model: calibrated.
+        scores: d ln B by sigma_s, sigma_t (scene units) and g, (3, channels).
+        exits, entries, over: pairs, as of `_drawn`.
+    """
+
+    model: NeuralShape
+    scores: np.ndarray
+    exits: SurfacePoint
+    entries: SurfacePoint
+    over: Any
+
+    @classmethod
+    def of(cls, model: NeuralShape) -> HeldLight:
+        """Of a calibrated model."""
+        obj = model.object
+        starts = obj.random_points(generator(mi, SCORED, pass_seed(SEED, 4)))
+        throughput, score = trace_scores(obj, starts, (SEED, 5))
+        T, n, d, g = _rows(throughput), score.n.numpy(), score.d.numpy(), _rows(score.g)
+        sigma_s = np.maximum([float(m.sigma_s) for m in obj.media], 1e-30)
+        parts = (T * n).mean(axis=1) / sigma_s, -(T * d).mean(axis=1), (T * g).mean(axis=1)
+        pairs = _drawn(model, EntryProposals(obj, model.half_space), COMPARED, 0)
+        B = np.maximum(T.mean(axis=1), 1e-30)
+        return cls(model, np.array(parts) / B, *pairs)
+
+    def spread(self, model: NeuralShape) -> np.ndarray:
+        """<S> of each channel of a model of this object, by these pairs."""
+        return _values(model, self.exits, self.entries, self.over).mean(axis=1)
+
+    @functools.cached_property
+    def _bare(self) -> np.ndarray:
+        """<S> of the model without s."""
+        return self.spread(replace(self.model, scales=()))
+
+    def scales(self, near: NeuralShape) -> tuple[float, ...]:
+        """s of the same object with a medium a little beside."""
+        media = zip(self.model.object.media, near.object.media)
+        moved = [[float(getattr(b, key)) - float(getattr(a, key)) for key in COEFFICIENTS] for a, b in media]
+        brighter = (self.scores * np.transpose(moved)).sum(axis=0)
+        ratio = self.spread(near) / np.maximum(self._bare, 1e-30)
+        weights, others = (np.array([calibration_weight(mixture) for mixture in m.half_space.mixtures])
+                           for m in (self.model, near))  # fmt: skip
+        whole = np.log(self.model.scales) / np.where(weights > 0, weights, 1)
+        whole += np.where((weights > 0) & (ratio > 0), brighter - np.log(np.maximum(ratio, 1e-30)), 0)
+        return tuple(np.exp(others * whole).tolist())
 
 
 def calibration_weight(mixture: Mixed) -> float:
@@ -287,9 +353,18 @@ def _walks(obj: TranslucentObject, n: int, k: int) -> np.ndarray:
 
 def _pairs(model: NeuralShape, proposals: EntryProposals, n: int, k: int) -> np.ndarray:
     """S mu_i over the density of the entries of n random exits."""
+    return _values(model, *_drawn(model, proposals, n, k))
+
+
+def _drawn(model: NeuralShape, proposals: EntryProposals, n: int, k: int) -> tuple[SurfacePoint, SurfacePoint, Any]:
+    """n random exits, their entries, and mu_i over the density of these."""
     exits = model.object.random_points(generator(mi, n, pass_seed(SEED, 2, k)))
     entries, over = proposals.sample(exits, generator(mi, n, pass_seed(SEED, 3, k)))
     dr.eval(exits, entries, over)
+    return exits, entries, over
+
+
+def _values(model: NeuralShape, exits: SurfacePoint, entries: SurfacePoint, over: Any) -> np.ndarray:
     return _rows(dr.select(over > 0, model.S(model.prepare(exits), entries) * over, 0))
 
 

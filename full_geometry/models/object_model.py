@@ -33,6 +33,7 @@ from full_geometry.object.features import (
 from halfspace_sss.interface.model import BSSRDF, bssrdf
 from halfspace_sss.neural.perceptron import Perceptron
 from halfspace_sss.physics import fresnel
+from halfspace_sss.rendering.object.half_space import in_double
 from halfspace_sss.rendering.object.objects import TranslucentObject
 from halfspace_sss.rendering.object.palette import palette_of
 from halfspace_sss.rendering.object.points import SurfacePoint, opaque, plane_query
@@ -49,10 +50,11 @@ class HalfSpace:
         obj: the object.
         model: name of a half-space model.
         floor: reflectance of the floor, over that of the half-space.
+        precise: the model is asked `in_double`, for differences.
     """
 
-    def __init__(self, obj: TranslucentObject, model: str, floor: float = FLOOR) -> None:
-        self.object, self.name, self.floor = obj, model, floor
+    def __init__(self, obj: TranslucentObject, model: str, floor: float = FLOOR, precise: bool = False) -> None:
+        self.object, self.name, self.floor, self.precise = obj, model, floor, precise
         self.models: list[BSSRDF] = [bssrdf(model, m) for m in obj.media]
         self.palette = None if obj.textured is None else palette_of(model, obj.geometry, obj.media, obj.textured)
 
@@ -76,7 +78,8 @@ class HalfSpace:
         """1/((scene unit)² sr), 0 below the horizons."""
         query, F_t, above = self.query(exit.at, entry.at)
         if self.palette is None:
-            values = [m.eval(*query) for m in self.models]
+            asked = in_double(query) if self.precise else query
+            values = [mi.Float(m.eval(*asked)) for m in self.models]
         else:
             values = self.palette.S([exit.at.medium], query, above & active)
         S_0 = mi.Spectrum([value + F_t * G for value, G in zip(values, self.added(exit, entry))])

@@ -40,6 +40,7 @@ from halfspace_sss.rendering.object.points import (
 )
 from halfspace_sss.rendering.walk.media import media_within
 from halfspace_sss.rendering.walk.random_walk import WalkExits, exits
+from halfspace_sss.rendering.walk.scores import Score, scored_exits
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 LANES = 2**15
@@ -68,6 +69,12 @@ def trace_exits(
     """
     check_count("fewest", fewest, 0)
     return exits(media_within(obj), 0, starts, seed, LANES, roulette_from, fewest, most)
+
+
+def trace_scores(obj: TranslucentObject, starts: SurfacePoint, seed: tuple[int, ...]) -> tuple[Any, Score]:
+    """T of one walk from each start, of two events and more, and the scores of walks that left."""
+    exits, scores = scored_exits(media_within(obj), 0, starts, seed, LANES, ROULETTE_FROM, 2)
+    return exits.T, scores
 
 
 PATCH_SHARE = 0.6  # of those by patches, where they are learnt

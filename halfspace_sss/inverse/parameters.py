@@ -12,11 +12,11 @@ import numpy as np
 from halfspace_sss.checks import check_choice
 from halfspace_sss.interface.model import bssrdf
 from halfspace_sss.neural.universal import Neural
-from halfspace_sss.rendering.object.half_space import Variation
 from halfspace_sss.rendering.object.objects import KnowsUnit, translucent_shapes
 from halfspace_sss.rendering.object.registry import lookup
 from halfspace_sss.rendering.object.shape import name_of
 from halfspace_sss.rendering.object.translucent import VARIABLE
+from halfspace_sss.rendering.object.variation import Variation
 from halfspace_sss.rendering.object.wrapped import surface_of
 from halfspace_sss.rendering.paths.integrator import is_bssrdf
 
@@ -47,7 +47,7 @@ def check_derivatives(integrator: mi.Integrator, shape: mi.Shape, names: Sequenc
 
     Raises:
         ValueError: the integrator is neither `translucent_walk` nor `bssrdf`, or of the latter the light is not
-            sampled, or the model of the object is none of the half-space, or has no derivative by a parameter.
+            sampled, or the model of the object has no derivative by a parameter.
     """
     if not isinstance(integrator, KnowsUnit):
         raise ValueError(f"integrator must be translucent_walk or bssrdf, got {integrator.class_name()}")
@@ -56,12 +56,10 @@ def check_derivatives(integrator: mi.Integrator, shape: mi.Shape, names: Sequenc
     settings, inside = integrator.settings, surface_of(shape).inside
     if settings.light != "sampled":
         raise ValueError(f"light must be sampled to fit a medium, got {settings.light}")
-    model, known = settings.model or inside.model, "translucent_walk and models of the half-space have derivatives"
-    if not lookup(model).of_half_space:
-        raise ValueError(f"model must have derivatives by the medium, got {model!r}: {known}")
+    model = settings.model or inside.model
     if inside.textured is not None:
-        made = bssrdf(model, inside.channels()[0])
-        if made.checksums and not isinstance(made, Neural):
+        made = bssrdf(model, inside.channels()[0]) if lookup(model).of_half_space else None
+        if made is None or (made.checksums and not isinstance(made, Neural)):
             raise ValueError(
                 f"model must have derivatives by textures, got {model!r}: analytic models and neural have them"
             )

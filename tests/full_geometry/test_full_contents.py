@@ -138,8 +138,8 @@ LIGHTING = {"sky": SKY, "lamp": {"light": ball(2.0, (3, 1.5, 1.5), emitter={"typ
 def test_orders_below_two_of_images_are_those_of_walks_that_meet_nothing_inside(
     light: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def nothing(obj: Any, inside: Any, settings: Any, variation: Any) -> ObjectModel:
-        found = half_space_model("better_dipole", obj.geometry, obj.media, settings, variation)
+    def nothing(obj: Any, inside: Any, settings: Any) -> ObjectModel:
+        found = half_space_model("better_dipole", obj.geometry, obj.media, settings)
         return ObjectModel(Nothing(), found.proposals)
 
     monkeypatch.setattr(objects, "_model_of", nothing)

@@ -85,7 +85,7 @@ def test_views_and_parameters_that_do_not_fit_are_refused_by_name(tmp_path: Path
     refused("object ball must be seen by a view, got none of 1")
 
 
-@pytest.mark.parametrize("model", ["neural_shape", "full_geometry", "lambert", "auto"])
+@pytest.mark.parametrize("model", ["full_geometry", "lambert", "auto"])
 def test_models_without_derivatives_are_refused_before_anything_is_rendered(tmp_path: Path, model: str) -> None:
     _scene(tmp_path)
     view = GivenView.of("a", 0, np.full((8, 8, 3), 0.5, np.float32))

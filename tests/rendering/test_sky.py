@@ -74,8 +74,8 @@ class Known(Even):
 def scene(kind: type, patch: pytest.MonkeyPatch, light: dict, **integrator) -> dict:
     """A ball with a transport, in light."""
 
-    def means(obj, inside, settings, variation):
-        proposals = half_space_model("better_dipole", obj.geometry, obj.media, settings, variation).proposals
+    def means(obj, inside, settings):
+        proposals = half_space_model("better_dipole", obj.geometry, obj.media, settings).proposals
         return ObjectModel(kind(obj.geometry.area), proposals, 2)
 
     patch.setattr(objects, "_model_of", means)

@@ -22,7 +22,7 @@ from halfspace_sss.interface.model import bssrdf
 from halfspace_sss.physics import single_scattering
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.object.contents import Content, check_sensors, contents, place_of
-from halfspace_sss.rendering.object.half_space import Variation, half_space_model
+from halfspace_sss.rendering.object.half_space import half_space_model
 from halfspace_sss.rendering.object.instances import (
     Group,
     Placed,
@@ -63,6 +63,7 @@ from halfspace_sss.rendering.object.shape import (
 from halfspace_sss.rendering.object.spectral import MediumByWavelength
 from halfspace_sss.rendering.object.textured import SurfaceMedium, TexturedMedium
 from halfspace_sss.rendering.object.translucent import Inside, check_tints
+from halfspace_sss.rendering.object.variation import Variation, VariedTransport
 from halfspace_sss.rendering.object.varying import VaryingMedium, equivalent, warn_of_means
 from halfspace_sss.rendering.object.wrapped import Wrapping, surface_of, wrapping_of
 
@@ -352,7 +353,7 @@ class TranslucentObject:
         Raises:
             ValueError: they are asked for, and the model has none.
         """
-        self.variation.prepare()
+        self.variation.prepare(self.transport)
         if self.geometry.contents is not None:
             self.geometry.contents.check_held()
         if self.textured is None or self.transport is None or isinstance(self.transport, PaletteTransport):
@@ -501,10 +502,11 @@ def _make_object(geometry: Geometry, inside: Inside, settings: Settings) -> Tran
         _check_takes(geometry, inside, single_only)
     variation = Variation(obj.surface, settings.mm_per_unit, inside.model)
     none = ObjectModel(None, None)
-    transport, proposals, entries = none if single_only else _model_of(obj, inside, settings, variation)
+    transport, proposals, entries = none if single_only else _model_of(obj, inside, settings)
     if transport and transport.orders == "total" and inside.orders == "multiple":
         raise ValueError(f"orders must be total for the model {inside.model!r}, which contains them all, got multiple")
     low_orders = _low_orders(inside, transport)
+    transport = VariedTransport(transport, variation) if hasattr(transport, "beside") else transport
     entries = entries if settings.entries == AUTOMATIC else settings.entries
     return replace(
         obj, transport=transport, proposals=proposals, entries=entries, low_orders=low_orders,
@@ -534,7 +536,7 @@ def _low_orders(inside: Inside, transport: Transport | None) -> tuple[int, ...]:
     return (0, 1) if transport is None or lookup(inside.model).knows_objects else (1,)
 
 
-def _model_of(obj: TranslucentObject, inside: Inside, settings: Settings, variation: Variation) -> ObjectModel:
+def _model_of(obj: TranslucentObject, inside: Inside, settings: Settings) -> ObjectModel:
     of_object = lookup(inside.model).transport
     if of_object is not None:
         if obj.spectral is not None:
@@ -556,7 +558,7 @@ def _model_of(obj: TranslucentObject, inside: Inside, settings: Settings, variat
         of_mean = replace(obj.media[0], g=float(np.mean([m.g for m in obj.media])))
         return palette_model(inside.model, obj.geometry, (of_mean,) * len(obj.media), obj.spectral, settings)
     warn_of_means(inside, obj.geometry)
-    return half_space_model(inside.model, obj.geometry, obj.media, settings, variation)
+    return half_space_model(inside.model, obj.geometry, obj.media, settings)
 
 
 class KnowsUnit(abc.ABC):

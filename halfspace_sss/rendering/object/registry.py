@@ -5,7 +5,8 @@ The half-space models are those of `interface.model`. Packages add others by ent
 - `halfspace_sss.transports`: a function of (object, settings) that returns an `ObjectModel`: of the
   `TranslucentObject`, geometry and media, and the `Settings` of the integrator; where S has the paths that meet what
   lies inside an object, of all orders, it has an attribute `takes_contents` that is true; where it takes media by
-  textures, `takes_textures`;
+  textures, `takes_textures`; where it has derivatives by the medium, as of `variation.Neighboured`, `varies_as`, the
+  name of a half-space model that knows the same media;
 - `halfspace_sss.learners`: a module or object that learns the model, see `rendering.scenes.learners`;
 - `halfspace_sss.choosers`: a function of (scene, settings) that returns `Choices`, what stands for the name in a scene;
   "auto" stands for the cheapest that is good enough.
@@ -71,6 +72,11 @@ class ModelEntry:
     def takes_contents(self) -> bool:
         """Whether its transport takes objects with something inside."""
         return bool(getattr(self.transport, "takes_contents", False))
+
+    @property
+    def varies_as(self) -> str | None:
+        """The half-space model of whose media it has derivatives; None where it has none."""
+        return self.name if self.of_half_space else getattr(self.transport, "varies_as", None)
 
     @property
     def learner(self) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
@@ -635,6 +636,12 @@ class WalkMedia:
 _OF_OBJECT: WeakKeyDictionary[TranslucentObject, WalkMedia] = WeakKeyDictionary()
 
 
+@functools.cache
+def _boundary(variant: str, eta: float) -> mi.BSDF:
+    """One for all media of an index: kernels call every BSDF that there is, and a new one would compile them anew."""
+    return smooth_boundary(eta)
+
+
 def walk_media(obj: TranslucentObject) -> WalkMedia:
     """One object alone, with a smooth boundary and as if it were empty; made once for each."""
     result = _OF_OBJECT.get(obj)
@@ -645,7 +652,7 @@ def walk_media(obj: TranslucentObject) -> WalkMedia:
             medium = Medium(**values, eta=eta)
         inside, geometry = Inside("medium", medium, "", "total", True, obj.varying, obj.textured), obj.geometry
         sight = Sight([], {}) if geometry.group is None else Sight.of_shapes([geometry.shape])
-        result = WalkMedia([geometry], [inside], geometry.scene, [smooth_boundary(eta)], 1.0, sight=sight)
+        result = WalkMedia([geometry], [inside], geometry.scene, [_boundary(mi.variant(), eta)], 1.0, sight=sight)
         _OF_OBJECT[obj] = result
     return result
 

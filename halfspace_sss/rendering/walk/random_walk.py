@@ -203,6 +203,13 @@ class Visitor(Protocol):
         """After reflection at the boundary or refraction through it; `walk` is on its way again."""
 
 
+class StartVisitor(Visitor, Protocol):
+    """One of walks from given points."""
+
+    def begun(self, index: mi.UInt32) -> Record:
+        """The record of the walks with these numbers, at their starts."""
+
+
 @dataclass(frozen=True, eq=False)
 class Walker:
     """A walk inside translucent objects.
@@ -377,7 +384,7 @@ class WalkExits(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ExitVisitor:
-    """Stores each exit at the number of its walk, which is the record, and ends the walk there.
+    """Stores each exit at the number of its walk, which is its record, and ends the walk there.
 
     Args:
         exits: where they are stored.
@@ -395,6 +402,9 @@ class ExitVisitor:
         exits = WalkExits(at, dr.zeros(mi.Spectrum, n), dr.zeros(mi.UInt32, n), dr.zeros(mi.UInt32, n))
         dr.eval(exits)
         return cls(exits, *(dr.opaque(mi.UInt32, order) for order in (fewest, most)))
+
+    def begun(self, index: mi.UInt32) -> mi.UInt32:
+        return index
 
     def event(self, walk: Walk, record: mi.UInt32, event: Event) -> tuple[Walk, mi.UInt32]:
         return walk, record
@@ -451,7 +461,7 @@ def walk_from(
     media: WalkMedia,
     k: int,
     start: SurfacePoint,
-    visitor: Visitor,
+    visitor: StartVisitor,
     seed: int | tuple[int, ...],
     lanes: int = LANES,
     roulette_from: int = 1,
@@ -462,7 +472,7 @@ def walk_from(
         media: the translucent objects of a scene, see `WalkMedia.of`.
         k: number of the object.
         start: p, n, n_out and w, arrays of one length; where w is below the surface, no walk enters.
-        visitor: what is recorded; its record is the number of the walk. It has to end walks that leave.
+        visitor: what is recorded. It has to end walks that leave.
         seed: one whole number or more.
         lanes: walks at a time; another number gives other walks.
         roulette_from: scattering events from which on roulette may end a walk.
@@ -478,17 +488,19 @@ def walk_from(
     lanes = min(lanes, n)
     walker, total, k = Walker(media, visitor, roulette_from), dr.opaque(mi.UInt32, n), dr.opaque(mi.UInt32, k)
 
-    def renew(walk: Walk, index: mi.UInt32) -> tuple[Walk, mi.UInt32]:
-        return _enter(media, k, start, index + lanes, walk.rng), index + lanes
+    def renew(walk: Walk, index: mi.UInt32, record: Record) -> tuple[Walk, mi.UInt32, Record]:
+        index = index + lanes
+        return _enter(media, k, start, index, walk.rng), index, visitor.begun(index)
 
-    def body(walk: Walk, index: mi.UInt32) -> tuple[Walk, mi.UInt32]:
-        walk, index = dr.if_stmt((walk, index), walk.alive, walker.step, lambda *s: s, label="inside")
-        return dr.if_stmt((walk, index), ~walk.alive, renew, lambda *s: s, label="renew")
+    def body(walk: Walk, index: mi.UInt32, record: Record) -> tuple[Walk, mi.UInt32, Record]:
+        walk, record = dr.if_stmt((walk, record), walk.alive, walker.step, lambda *s: s, label="inside")
+        return dr.if_stmt((walk, index, record), ~walk.alive, renew, lambda *s: s, label="renew")
 
     seeds = seed if isinstance(seed, tuple) else (seed,)
     index = dr.arange(mi.UInt32, lanes)
     walk = _enter(media, k, start, index, generator(mi, lanes, pass_seed(*seeds)))
-    dr.while_loop((walk, index), lambda walk, index: index < total, body, label="walks")
+    state = (walk, index, visitor.begun(index))
+    dr.while_loop(state, lambda walk, index, record: index < total, body, label="walks")
     dr.eval()
 
 

@@ -24,8 +24,10 @@ import numpy as np
 
 from halfspace_sss.rendering.object.wrapped import surface_of
 from halfspace_sss.rendering.walk.media import Place, WalkMedia
+from halfspace_sss.rendering.walk.random_walk import ExitVisitor, WalkExits, walk_from
 
 if TYPE_CHECKING:
+    from halfspace_sss.rendering.object.points import SurfacePoint
     from halfspace_sss.rendering.object.textured import TexturedMedium
     from halfspace_sss.rendering.walk.random_walk import Crossing, Event, Visitor, Walk
 
@@ -80,6 +82,19 @@ class Stay:
         before = dr.zeros(mi.UInt32, lanes) if before is None else before
         place = Place.unknown(lanes) if textured else ()
         return cls(dr.full(mi.Int32, -1, lanes), Score.zeros(lanes), along, turned, before, place)
+
+    def flown(self, walk: Walk, p: mi.Point3f, media: WalkMedia) -> Stay:
+        """After a flight to p: its length, and the angle by which it began."""
+        g = media.spectrum("g", walk.object)
+        turn = dr.select(self.turned, phase_score(g, dr.dot(self.along, walk.d)), 0)
+        score = self.score + Score(mi.Float(0), dr.norm(p - walk.o), turn)
+        place = walk.medium and walk.medium.place
+        return replace(self, object=walk.object, score=score, turned=mi.Bool(False), place=place)
+
+    def scattered(self, event: Event) -> Stay:
+        """After a scattering event."""
+        score = replace(self.score, n=self.score.n + 1)
+        return replace(self, score=score, along=event.along, turned=mi.Bool(True))
 
 
 @dataclass
@@ -213,22 +228,13 @@ class ScoreVisitor:
     media: WalkMedia
     scores: PathScores
 
-    def _flown(self, walk: Walk, stay: Stay, p: mi.Point3f) -> Stay:
-        """After a flight to p: its length, and the angle by which it began."""
-        g = self.media.spectrum("g", walk.object)
-        turn = dr.select(stay.turned, phase_score(g, dr.dot(stay.along, walk.d)), 0)
-        score = stay.score + Score(mi.Float(0), dr.norm(p - walk.o), turn)
-        place = walk.medium and walk.medium.place
-        return replace(stay, object=walk.object, score=score, turned=mi.Bool(False), place=place)
-
     def _gathered(self, r: StayRecord, stay: Stay, before: mi.Spectrum, after: Any) -> StayRecord:
         """The record after a visit that has added to the light."""
         slopes = after.slopes + stay.score * (after.L - before)
         return replace(r, record=replace(after, slopes=slopes), stay=stay)
 
     def event(self, walk: Walk, record: StayRecord, event: Event) -> tuple[Walk, StayRecord]:
-        stay = self._flown(walk, record.stay, event.p)
-        stay = replace(stay, score=replace(stay.score, n=stay.score.n + 1), along=event.along, turned=mi.Bool(True))
+        stay = record.stay.flown(walk, event.p, self.media).scattered(event)
         before = mi.Spectrum(record.record.L)
         walk, after = self.visitor.event(walk, record.record, event)
         return walk, self._gathered(record, stay, before, after)
@@ -237,7 +243,7 @@ class ScoreVisitor:
         self, walk: Walk, record: StayRecord, si: mi.SurfaceInteraction3f, active: mi.Bool
     ) -> tuple[Walk, StayRecord]:
         # where something lies inside, `surface` has come here first
-        stay = self._flown(walk, record.stay, si.p) if self.media.inner is None else record.stay
+        stay = record.stay.flown(walk, si.p, self.media) if self.media.inner is None else record.stay
         before = mi.Spectrum(record.record.L)
         walk, after = self.visitor.boundary(walk, record.record, si, active)
         return walk, self._gathered(record, stay, before, after)
@@ -245,7 +251,7 @@ class ScoreVisitor:
     def surface(
         self, walk: Walk, record: StayRecord, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, k: mi.Int32
     ) -> tuple[Walk, StayRecord]:
-        stay, before = self._flown(walk, record.stay, si.p), mi.Spectrum(record.record.L)
+        stay, before = record.stay.flown(walk, si.p, self.media), mi.Spectrum(record.record.L)
         walk, after = self.visitor.surface(walk, record.record, si, bsdf, k)
         return walk, self._gathered(record, stay, before, after)
 
@@ -260,6 +266,75 @@ class ScoreVisitor:
         painted = dr.gather(mi.Bool, self.scores.painted, record.stay.object)
         stay = Stay.none(lanes, self.media.textured, record.stay.before + dr.select(painted, mi.UInt32(1), 0))
         return replace(record, record=replace(record.record, slopes=Score.sums(lanes)), stay=stay)
+
+
+# ---- Walks from given points ----------------------------------------------------------------------------------------
+
+
+@dataclass
+class ScoredWalk:
+    """The number of a walk, and its stay."""
+
+    index: mi.UInt32
+    stay: Stay
+
+
+@dataclass(frozen=True, eq=False)
+class ScoredExitVisitor:
+    """Stores exits, and the score of each walk at its exit; of objects with nothing inside and without textures.
+
+    Args:
+        exits: stores them without scores.
+        media: the objects.
+        scores: where those of the exits are stored.
+    """
+
+    exits: ExitVisitor
+    media: WalkMedia
+    scores: Score
+
+    def begun(self, index: mi.UInt32) -> ScoredWalk:
+        return ScoredWalk(index, Stay.none(dr.width(index), False))
+
+    def event(self, walk: Walk, record: ScoredWalk, event: Event) -> tuple[Walk, ScoredWalk]:
+        return walk, replace(record, stay=record.stay.flown(walk, event.p, self.media).scattered(event))
+
+    def boundary(
+        self, walk: Walk, record: ScoredWalk, si: mi.SurfaceInteraction3f, active: mi.Bool
+    ) -> tuple[Walk, ScoredWalk]:
+        return walk, replace(record, stay=record.stay.flown(walk, si.p, self.media))
+
+    def surface(
+        self, walk: Walk, record: ScoredWalk, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, k: mi.Int32
+    ) -> tuple[Walk, ScoredWalk]:
+        return walk, record
+
+    def crossing(self, walk: Walk, record: ScoredWalk, crossing: Crossing) -> tuple[Walk, ScoredWalk]:
+        leaves = walk.alive & crossing.leaves
+        for target, value in zip(vars(self.scores).values(), vars(record.stay.score).values()):
+            dr.scatter(target, value, record.index, leaves)
+        walk, _ = self.exits.crossing(walk, record.index, crossing)
+        return walk, record
+
+
+def scored_exits(
+    media: WalkMedia, k: int, start: SurfacePoint, seed: int | tuple[int, ...], lanes: int, roulette_from: int,
+    fewest: int = 0,
+) -> tuple[WalkExits, Score]:  # fmt: skip
+    """`random_walk.exits`, with the score of each walk up to its exit.
+
+    Raises:
+        ValueError: as there.
+    """
+    n = dr.width(start.p)
+    visitor = ScoredExitVisitor(ExitVisitor.of(n, fewest), media, Score.zeros(n))
+    dr.eval(visitor.scores)
+    walk_from(media, k, start, visitor, seed, lanes, roulette_from)
+    dr.eval(visitor.exits.exits, visitor.scores)
+    return visitor.exits.exits, visitor.scores
+
+
+# ---- Derivatives of images ------------------------------------------------------------------------------------------
 
 
 def followed(media: WalkMedia) -> list[tuple[int, dict[str, mi.Spectrum]]]:
