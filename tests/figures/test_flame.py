@@ -119,11 +119,9 @@ def rendered(scene, spp: int = SPP) -> np.ndarray:
     return np.array([blocks(np.array(mi.render(scene, spp=spp, seed=k))) for k in range(PASSES)])
 
 
-@pytest.mark.parametrize("model", ["better_dipole", "full_geometry"])
-def test_light_of_the_flame_enters_the_wax_as_a_sum_over_both_surfaces_says(
-    folder: Path, trained: Trained, model: str
-) -> None:
-    scene = candle(folder, model, 2)
+def test_light_of_the_flame_enters_the_wax_as_a_sum_over_both_surfaces_says(folder: Path) -> None:
+    """Whatever the model; the one of the object is held to walks below."""
+    scene = candle(folder, "better_dipole", 2)
     found, wanted = rendered(scene), np.array([summed(scene, k) for k in range(2 * PASSES)])
     p = stats.ttest_ind(found, wanted, axis=0, equal_var=False).pvalue
     assert p.min() * p.size > SIGNIFICANCE, (found.mean(axis=0) / wanted.mean(axis=0), p)

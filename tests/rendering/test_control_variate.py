@@ -56,7 +56,7 @@ def _images(scene: Any, spp: int = 128) -> np.ndarray:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("light", "model", "shape", "depth"),
-    [("room", "better_dipole", "cube", 8), ("point", "better_dipole", "sphere", 2), ("room", "neural", "cube", 8)],
+    [("room", "better_dipole", "cube", 8), ("point", "better_dipole", "sphere", 2)],
 )
 def test_means_are_those_without_it_and_noise_is_less(light: str, model: str, shape: str, depth: int) -> None:
     a, b = (_images(_scene(kind, light, model, shape, max_depth=depth)) for kind in ("sampled", "corrected"))

@@ -50,14 +50,12 @@ def test_derivatives_by_the_medium_agree_with_finite_differences_for_every_model
         assert found.sum() == pytest.approx(expected, abs=2e-3 * size)
 
 
-OF_LIGHT = {
-    "lamp": "light.emitter.radiance.value", "sun": "light.irradiance.value", "envmap": "light.data",
-}  # fmt: skip
+OF_LIGHT = {"lamp": "light.emitter.radiance.value", "envmap": "light.data"}
 FLOOR = "floor.bsdf.reflectance.color1.value"
 
 
-@pytest.mark.parametrize("light", ["lamp", "sun", pytest.param("envmap", marks=pytest.mark.slow)])
-def test_derivatives_under_every_light_agree_with_finite_differences_and_with_the_image_by_the_light(light):
+@pytest.mark.parametrize("light", ["lamp", pytest.param("envmap", marks=pytest.mark.slow)])
+def test_derivatives_under_a_lamp_and_a_sky_agree_with_finite_differences_and_with_the_image_by_the_light(light):
     """By each channel of the medium and the texture of another surface; what light shows is linear in it."""
     scene = make(envmap() if light == "envmap" else light, boundary=ROUGH)
     found = derivatives(scene, [*(f"ball.bsdf.{name}" for name in COEFFICIENTS), FLOOR, OF_LIGHT[light]])
@@ -141,9 +139,8 @@ def _painted(model: str) -> mi.Scene:
                    "to_world": at.look_at((30 * direction(50)).tolist(), [0, 0, 0], [0, 0, 1])}})  # fmt: skip
 
 
-@pytest.mark.parametrize("model", ["standard_dipole", pytest.param("neural", marks=pytest.mark.slow)])
-def test_derivatives_by_textures_of_a_medium_agree_with_finite_differences(model):
-    scene = _painted(model)
+def test_derivatives_by_textures_of_a_medium_agree_with_finite_differences():
+    scene = _painted("standard_dipole")
     bodies = scene.integrator().prepare(scene)
     keys = {"ball.bsdf.albedo.data": mi.TensorXf, "ball.bsdf.sigma_t.data": mi.TensorXf,
             "solid.vertex_albedo": mi.Float, "solid.face_sigma_t": mi.Float}  # fmt: skip
