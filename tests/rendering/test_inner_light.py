@@ -12,6 +12,7 @@ from halfspace_sss.rendering.gathered import inner
 from halfspace_sss.rendering.object import objects
 from halfspace_sss.rendering.object.objects import object_of
 from halfspace_sss.rendering.paths import gathering
+from halfspace_sss.rendering.paths.inner_light import _directions
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -113,6 +114,19 @@ def test_a_plane_of_values_is_known_everywhere_inside() -> None:
 def test_bands_are_as_many_as_the_mean_cosine_needs() -> None:
     found = [inner.bands(_ball(g=g)) for g in (0.0, 0.1, 0.3, -0.3)]
     assert found == [0, 1, 2, 2]
+
+
+@pytest.mark.parametrize("eta", [1.0, 1.4])
+def test_directions_by_an_environment_have_the_density_that_is_stated(eta: float) -> None:
+    sky, n = _scene({"sky": _uneven()}).environment(), 2**16
+    events = mi.Point3f(np.zeros((3, n))), mi.Normal3f(np.tile([[0.0], [0.6], [0.8]], n))
+    u = mi.Point2f(np.random.default_rng(1).random((2, n)).astype(np.float32))
+    d, inverse_pdf = (np.array(v, dtype=float) for v in _directions(sky, events, eta, u))
+    moments = np.stack([np.ones(n), *d, d[0] ** 2, d[1] ** 2, d[1] * d[2]])
+    values = moments * inverse_pdf
+    expected = 4 * np.pi * np.array([1, 0, 0, 0, 1 / 3, 1 / 3, 0])
+    assert np.allclose(np.linalg.norm(d, axis=0), 1, atol=1e-4)
+    assert (np.abs(values.mean(axis=1) - expected) < 5 * values.std(axis=1) / np.sqrt(n)).all()
 
 
 @pytest.mark.parametrize(

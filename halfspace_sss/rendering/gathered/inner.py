@@ -27,7 +27,7 @@ from halfspace_sss.rendering.object.points import cosine_above, opaque, place, r
 if TYPE_CHECKING:
     from halfspace_sss.rendering.object.objects import TranslucentObject
 
-WIDTH = 0.6  # h in mean free paths
+WIDTH = 0.9  # h in mean free paths
 MOST = 2**15  # nodes; h grows until there are no more
 WIDEST = 1.5  # h in mean free paths, beyond which the depth of events is not resolved
 LEAST = 1.0  # weight of the events of a node, below which it has no plane

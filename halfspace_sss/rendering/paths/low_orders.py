@@ -214,7 +214,7 @@ class LightAtEvents(NamedTuple):
 
     Args:
         connected: by emitter connections, over the density of the emitter, with its direction; of several ways.
-        left: walks that have left the object, of directions over the sphere, and how many reflections they have met.
+        left: walks that have left the object, and how many reflections they have met.
         weight: of them, per unit of the radiance that they meet.
         chance: of that light of emitters, which no connection has found, with the weight.
     """
@@ -226,21 +226,21 @@ class LightAtEvents(NamedTuple):
 
 
 def light_at_events(
-    context: RenderContext, obj: TranslucentObject, p: mi.Point3f, n: mi.Normal3f, d: mi.Vector3f, u: mi.Point2f,
-    sampler: mi.Sampler,
+    context: RenderContext, obj: TranslucentObject, at: tuple[mi.Point3f, mi.Normal3f],
+    ways: tuple[mi.Vector3f, mi.Float], u: mi.Point2f, sampler: mi.Sampler,
 ) -> LightAtEvents:  # fmt: skip
-    """Light at places inside an object, from directions d that are uniform over the sphere and by connections.
+    """Light at places inside an object, along directions and by connections.
 
     Args:
         context: of the scene.
         obj: the object, of one medium.
-        p: places.
-        n: outward geometric normals near them.
-        d: directions.
+        at: places, and outward geometric normals near them.
+        ways: directions, and the inverse of their density, sr.
         u: uniform numbers of emitters.
         sampler: of what else is random.
     """
     # ---- the walk has the weight 1 at its event
+    (p, n), (d, inverse_pdf) = at, ways
     media, zero = _media(obj, ()), mi.Float(0)
     scale = 1 / dr.maximum(dr.max(_column(media, 0)), 1e-30)
     start = _Walk(
@@ -256,6 +256,7 @@ def light_at_events(
     state = (mi.UInt32(0), sampler, start)
     walk = dr.while_loop(state, lambda k, sampler, walk: walk.alive, step, label="light at events")[2]
     weight = dr.select(walk.left, dr.exp(-_column(media, 1) * walk.length) * (walk.inverse_pdf / scale), 0)
+    weight *= inverse_pdf * dr.inv_four_pi
 
     # ---- emitters beside the sky
     connected, chance, lights = [], mi.Spectrum(0), context.lights
