@@ -9,6 +9,7 @@ import os
 import signal
 import sys
 import warnings
+from collections.abc import Iterator
 from importlib import resources
 from pathlib import Path
 
@@ -20,6 +21,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as a shell starts what 
 
 import numpy as np
 import pytest
+import typer.testing
 
 import halfspace_sss
 from halfspace_sss import backend
@@ -88,6 +90,14 @@ def no_traces_of_other_files() -> None:
     if "mitsuba" in sys.modules:
         gc.collect()
         _set_variant("llvm_ad_rgb")
+
+
+@pytest.fixture(scope="session", autouse=True)
+def commands_made_once() -> Iterator[None]:
+    """The command line is made from its functions once, and not for each line that a test enters."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(typer.testing, "_get_command", functools.cache(typer.testing._get_command))
+        yield
 
 
 @pytest.fixture(scope="session")

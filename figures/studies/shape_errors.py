@@ -148,7 +148,7 @@ def seconds_per_million(obj: TranslucentObject, path: Path | None = None) -> dic
     models |= {name: transport_of(obj, name) for name in HALF_SPACES}
     rng = generator(mi, LANES, pass_seed(29))
     exits, entries = obj.random_points(rng), obj.random_points(rng)
-    dr.eval(exits, entries)
+    dr.eval(tuple(exits), tuple(entries))  # named tuples are passed over
     seconds = {}
     for name, model in models.items():
         times = []

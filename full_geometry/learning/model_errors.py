@@ -32,7 +32,7 @@ from halfspace_sss.physics.medium import Medium
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.rendering.object.half_space import HalfSpaceTransport
 from halfspace_sss.rendering.object.objects import TranslucentObject, object_of, refuse, refuse_textures
-from halfspace_sss.rendering.object.points import SurfacePoint, Transport
+from halfspace_sss.rendering.object.points import SurfacePoint, Transport, evaluate
 from halfspace_sss.rendering.object.registry import lookup, model_names
 from halfspace_sss.rendering.object.settings import Settings
 from halfspace_sss.tracing.walk import generator, pass_seed
@@ -67,13 +67,11 @@ class _Sums:
     def add(self, value: Any, w: Any, per_exit: int) -> None:
         """Samples of all exits, `per_exit` neighbouring lanes for each: value per channel of unit light from w."""
         lights = [mi.Float(1)] + [dr.maximum(dr.dot(w, mi.Vector3f(*axis.tolist())), 0) ** POWER for axis in LOBES]
-        rows = []
-        for v in value:
-            products = [v * light for light in lights]
-            parts = [dr.block_sum(p + 0 * v, per_exit) for p in (*products, *(p * p for p in products))]
-            dr.eval(parts)
-            rows.append(np.stack([p.numpy() for p in parts], axis=-1).astype(float))
-        self.sums = self.sums + np.stack(rows)
+        products = [[v * light + 0 * v for light in lights] for v in value]
+        products = [[*row, *(p * p for p in row)] for row in products]
+        dr.eval(products)  # at once: a sum evaluates what it is of, each with a kernel of its own
+        rows = [np.stack([dr.block_sum(p, per_exit).numpy() for p in row], axis=-1) for row in products]
+        self.sums = self.sums + np.stack(rows).astype(float)
         self.n += per_exit
 
     def estimate(self) -> ExitRadiance:
@@ -97,7 +95,7 @@ def reference(obj: TranslucentObject, exits: int = 256, walks: int = 8192, seed:
     for name, value, least in (("exits", exits, 2), ("walks", walks, 2), ("seed", seed, 0)):
         check_count(name, value, least)
     points = obj.random_points(generator(mi, exits, pass_seed(seed, 17)))
-    dr.eval(points)
+    evaluate(points)
     return ExitTruth(points, traced(obj, points, walks, (seed, 18), fewest=fewest))
 
 
@@ -113,7 +111,7 @@ def traced(
 
 
 def _repeated(points: SurfacePoint, times: int) -> SurfacePoint:
-    return points.gather(dr.arange(mi.UInt32, dr.width(points.p) * times) // times)
+    return points.gather(dr.arange(mi.UInt32, dr.width(points.p) * times) // dr.opaque(mi.UInt32, times))
 
 
 def modelled(
@@ -133,9 +131,9 @@ def modelled(
     for k, per_exit in enumerate(_passes(n, samples)):
         points, lanes = _repeated(exits, per_exit), dr.arange(mi.UInt32, n * per_exit)
         rng = generator(mi, n * per_exit, pass_seed(seed, 19, k))
-        entries, weight = proposals.sample(points, rng, table, lanes // per_exit)
+        entries, weight = proposals.sample(points, rng, table, lanes // dr.opaque(mi.UInt32, per_exit))
         value = transport.S(transport.prepare(points), entries, weight > 0) * weight
-        dr.eval(value, entries)
+        evaluate(value, entries)
         sums.add(value, entries.w, per_exit)
     return sums.estimate()
 

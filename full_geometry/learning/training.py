@@ -39,7 +39,7 @@ from halfspace_sss.neural.training.work_folder import CHECKPOINT, claim
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.provenance import check_folder, provenance, write_atomically
 from halfspace_sss.rendering.object.objects import TranslucentObject, object_of
-from halfspace_sss.rendering.object.points import SurfacePoint
+from halfspace_sss.rendering.object.points import SurfacePoint, evaluate
 from halfspace_sss.rendering.scenes.camera_walks import TRIAL
 
 # ---- Where the learnt directional albedo is good enough for images ----------------------------
@@ -66,7 +66,9 @@ def trusted(
         seed: of them.
     """
     once = traced(model.object, truth.exits, walks, seed, fewest=1, most=1)
-    unscattered, *alphas = (np.array(part).reshape(len(once.mean), -1) for part in model.alpha.parts(truth.exits))
+    parts = model.alpha.parts(truth.exits)
+    dr.eval(parts)
+    unscattered, *alphas = (np.array(part).reshape(len(once.mean), -1) for part in parts)
     known = (once, truth.truth)
     means = [part.mean[:, :, 0].mean(axis=1) for part in known]
     light = np.maximum(unscattered.mean(axis=1) + sum(means), 1e-30)
@@ -172,7 +174,7 @@ class CameraExits:
             if len(own):
                 starts, ends = _points(part.gather(_lanes(own)))
                 parts.append((self.source.object.knowing(starts), ends))
-        dr.eval(parts)
+        evaluate(parts)
         return parts
 
 

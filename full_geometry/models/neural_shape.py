@@ -44,7 +44,7 @@ from halfspace_sss.neural.perceptron import Perceptron
 from halfspace_sss.neural.store import checksum_of, load_weights
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.object.objects import TranslucentObject
-from halfspace_sss.rendering.object.points import SurfacePoint, opaque, refract_in
+from halfspace_sss.rendering.object.points import SurfacePoint, evaluate, opaque, refract_in
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 # ---- What the network of all shapes is trained on, and warns outside of ----------------------------
@@ -360,7 +360,7 @@ def _drawn(model: NeuralShape, proposals: EntryProposals, n: int, k: int) -> tup
     """n random exits, their entries, and mu_i over the density of these."""
     exits = model.object.random_points(generator(mi, n, pass_seed(SEED, 2, k)))
     entries, over = proposals.sample(exits, generator(mi, n, pass_seed(SEED, 3, k)))
-    dr.eval(exits, entries, over)
+    evaluate(exits, entries, over)
     return exits, entries, over
 
 

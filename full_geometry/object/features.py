@@ -249,7 +249,9 @@ def _turns(obj: TranslucentObject, frame: Any, fields: Surroundings) -> np.ndarr
     at = obj.random_points(generator(mi, POINTS, pass_seed(SEED)))
     turns = []
     for kind, place in ((POINT, at.p), (EVENT, first_event(obj, at).y)):
-        values = np.stack([v.numpy() for v in fields(frame.position(place), kind)]).astype(float)
+        values = fields(frame.position(place), kind)
+        dr.eval(values)
+        values = np.stack([v.numpy() for v in values]).astype(float)
         with one_blas_thread():
             spread, axes = np.linalg.eigh(np.cov(values))
             turn = (axes / np.sqrt(np.maximum(spread, 0) + LEAST_SPREAD**2)) @ axes.T

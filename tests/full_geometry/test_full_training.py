@@ -146,6 +146,7 @@ def test_features_of_the_way_back_are_those_of_exit_and_entry_exchanged() -> Non
 
     def features(exit: Side, entry: Side) -> np.ndarray:
         columns = [*side_features(frame, exit), *side_features(frame, entry), *pair_features(frame, exit, entry)]
+        dr.eval(columns)  # or each has a kernel of its own
         return np.stack([np.array(column) for column in columns])
 
     order, signs = reverse(n_side(3), 3)
@@ -170,10 +171,9 @@ def test_S_is_positive_and_finite(trained: Trained) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("mesh", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["sphere", "mesh"])
-def test_a_killed_run_ends_with_the_same_weights(mesh: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    arguments = {"chunks": 4, "recipe": QUICK, "seed": 3}
-    shape = mi.load_dict(bunny()) if mesh else ball()
+def test_a_killed_run_ends_with_the_same_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    arguments = {"chunks": 3, "recipe": QUICK, "seed": 3}
+    shape = mi.load_dict(bunny())
     whole = train(shape, WAX, folder=tmp_path / "a", work=tmp_path / "whole", **arguments)
     monkeypatch.setattr(training, "CHECKPOINT_EVERY", 0.0)
 
@@ -187,8 +187,7 @@ def test_a_killed_run_ends_with_the_same_weights(mesh: bool, tmp_path: Path, mon
     assert again.steps == whole.steps
     for one, other in ((whole.model, again.model), (whole.model.alpha, again.model.alpha)):
         assert all(np.array_equal(v, other.weights[name]) for name, v in one.weights.items())
-    if mesh:
-        assert all(np.array_equal(v, again.sampler.weights[name]) for name, v in whole.sampler.weights.items())
+    assert all(np.array_equal(v, again.sampler.weights[name]) for name, v in whole.sampler.weights.items())
 
 
 def test_work_of_another_object_is_refused(tmp_path: Path) -> None:

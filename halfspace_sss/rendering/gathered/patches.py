@@ -27,7 +27,7 @@ import numpy as np
 
 from halfspace_sss.rendering.gathered.points import SurfacePoints, uniform_entries
 from halfspace_sss.rendering.gathered.transfer import Albedo, drawn
-from halfspace_sss.rendering.object.points import AreaPoints, EntrySample, SurfacePoint, cosine_above
+from halfspace_sss.rendering.object.points import AreaPoints, EntrySample, SurfacePoint, cosine_above, evaluate
 
 if TYPE_CHECKING:
     from halfspace_sss.rendering.object.objects import TranslucentObject
@@ -198,5 +198,5 @@ def _areas(obj: TranslucentObject, cells: SurfaceCells) -> tuple[np.ndarray, Ent
     index = mi.UInt32(order[np.minimum(chosen, PLACES - 1)].ravel().astype(np.uint32))
     at = at._replace(weight=at.weight + dr.zeros(mi.Float, PLACES))
     places = at.gather(index)
-    dr.eval(places)
+    evaluate(places)
     return np.maximum(counts, 0.5) * (obj.geometry.area / PLACES), places

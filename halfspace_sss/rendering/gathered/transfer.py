@@ -373,7 +373,7 @@ def drawn(
     near, known = cell(entry.p, entry.n, entry.face, entry.weight > 0)
     mu, mu_i = dr.dot(out.w, out.n_out), cosine(w_i, entry.n, entry.n_out)
     paint = mi.Spectrum(1) if obj.textured is None else obj.transport.paint(out)
-    dr.eval(S, inverse, near, known, mu, mu_i, w_i, paint)
+    dr.eval(S, inverse, near, known, mu, mu_i, w_i, out.w, paint)
     shape = (len(points), n)
     S = np.array(S, dtype=np.float32).reshape(-1, *shape).transpose(1, 2, 0)
     S = np.nan_to_num(S, nan=0.0, posinf=0.0, neginf=0.0)

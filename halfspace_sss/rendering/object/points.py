@@ -57,6 +57,18 @@ class SurfacePoint(NamedTuple):
         return SurfacePoint(*(v if isinstance(v, (float, tuple)) else dr.gather(type(v), v, k) for v in self))
 
 
+def evaluate(*values: Any) -> None:
+    """Evaluate arrays together, and those of named tuples, which `dr.eval` passes over."""
+    ahead, found = list(values), []
+    while ahead:
+        value = ahead.pop()
+        if isinstance(value, (tuple, list)):
+            ahead += value
+        else:
+            found.append(value)
+    dr.eval(found)
+
+
 def surface_point(p: mi.Point3f, n: mi.Normal3f, n_out: mi.Normal3f, w: mi.Vector3f) -> SurfacePoint:
     """A point of the surface with the shading normal that w sees.
 

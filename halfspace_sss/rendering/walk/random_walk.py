@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 
 from halfspace_sss.physics.medium import eval_hg, sample_hg
-from halfspace_sss.rendering.object.points import SurfacePoint, channel_mean, lift, sided, surface_point
+from halfspace_sss.rendering.object.points import SurfacePoint, channel_mean, evaluate, lift, sided, surface_point
 from halfspace_sss.rendering.object.textured import SurfaceMedium
 from halfspace_sss.rendering.walk.media import Coefficients, WalkMedia, WalkMedium, ray_of
 from halfspace_sss.tracing.walk import ROULETTE_BOOST, ROULETTE_WEIGHT, generator, pass_seed
@@ -400,7 +400,7 @@ class ExitVisitor:
         """For n walks."""
         at = SurfacePoint(*(dr.zeros(kind, n) for kind in (mi.Point3f, mi.Normal3f, mi.Normal3f, mi.Vector3f)))
         exits = WalkExits(at, dr.zeros(mi.Spectrum, n), dr.zeros(mi.UInt32, n), dr.zeros(mi.UInt32, n))
-        dr.eval(exits)
+        evaluate(exits)
         return cls(exits, *(dr.opaque(mi.UInt32, order) for order in (fewest, most)))
 
     def begun(self, index: mi.UInt32) -> mi.UInt32:
@@ -453,7 +453,7 @@ def exits(
     """
     visitor = ExitVisitor.of(dr.width(start.p), fewest, most)
     walk_from(media, k, start, visitor, seed, lanes, roulette_from)
-    dr.eval(visitor.exits)
+    evaluate(visitor.exits)
     return visitor.exits
 
 
@@ -484,13 +484,14 @@ def walk_from(
     n = _check(media, k, start)
     if n == 0:
         return
-    dr.eval(start)
+    evaluate(start)
     lanes = min(lanes, n)
-    walker, total, k = Walker(media, visitor, roulette_from), dr.opaque(mi.UInt32, n), dr.opaque(mi.UInt32, k)
+    walker = Walker(media, visitor, roulette_from)
+    total, step, k = (dr.opaque(mi.UInt32, v) for v in (n, lanes, k))  # kernels then serve any number of walks
 
     def renew(walk: Walk, index: mi.UInt32, record: Record) -> tuple[Walk, mi.UInt32, Record]:
-        index = index + lanes
-        return _enter(media, k, start, index, walk.rng), index, visitor.begun(index)
+        index = index + step
+        return _enter(media, k, start, total, index, walk.rng), index, visitor.begun(index)
 
     def body(walk: Walk, index: mi.UInt32, record: Record) -> tuple[Walk, mi.UInt32, Record]:
         walk, record = dr.if_stmt((walk, record), walk.alive, walker.step, lambda *s: s, label="inside")
@@ -498,7 +499,7 @@ def walk_from(
 
     seeds = seed if isinstance(seed, tuple) else (seed,)
     index = dr.arange(mi.UInt32, lanes)
-    walk = _enter(media, k, start, index, generator(mi, lanes, pass_seed(*seeds)))
+    walk = _enter(media, k, start, total, index, generator(mi, lanes, pass_seed(*seeds)))
     state = (walk, index, visitor.begun(index))
     dr.while_loop(state, lambda walk, index, record: index < total, body, label="walks")
     dr.eval()
@@ -516,9 +517,11 @@ def _check(media: WalkMedia, k: int, start: SurfacePoint) -> int:
     return widths[0]
 
 
-def _enter(media: WalkMedia, k: mi.UInt32, start: SurfacePoint, index: mi.UInt32, rng: mi.PCG32) -> Walk:
-    """The walk of a start, refracted into the object."""
-    known = index < dr.width(start.p)
+def _enter(
+    media: WalkMedia, k: mi.UInt32, start: SurfacePoint, total: mi.UInt32, index: mi.UInt32, rng: mi.PCG32
+) -> Walk:
+    """The walk of one of so many starts, refracted into the object."""
+    known = index < total
     si = dr.zeros(mi.SurfaceInteraction3f, dr.width(index))
     si.p = dr.gather(mi.Point3f, start.p, index, known)
     si.n = dr.gather(mi.Normal3f, start.n, index, known)
