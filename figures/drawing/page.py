@@ -163,4 +163,5 @@ def fit(found: MaterialFit) -> bytes:
         shots = [Shot("given", np.maximum(given, 0.0)), compared("found", image, given, mask=view.counts)]
         scenes[f"{view.name}, held out" if view.held_out else view.name] = shots
     notes = "FLIP and relative squared error of the pixels that count."
-    return page("Images and fit", scenes, exposure=exposure, caption="; ".join(found.lines()), notes=notes).encode()
+    caption = "; ".join([*found.lines(), *found.told])
+    return page("Images and fit", scenes, exposure=exposure, caption=caption, notes=notes).encode()

@@ -38,14 +38,12 @@ def fit_command(
     ] = "albedo,sigma_t",
     model: Annotated[str, typer.Option(help="translucent_walk, or a model of the half-space.")] = "translucent_walk",
     object: ObjectId = None,  # noqa: A002
-    steps: Annotated[int, typer.Option(help="How many.", parser=whole, show_default="30, or 200 with textures")] = 0,
+    steps: Annotated[int, typer.Option(help="How many.", parser=whole, show_default="30, or 60 with textures")] = 0,
     spp: Annotated[int, typer.Option(help="Samples a pixel of each render of a step.", parser=whole)] = 64,
     batch: Annotated[int, typer.Option(help="Views a step.", parser=whole, show_default="4, or all")] = 0,
     loss: Annotated[str, typer.Option(help="relative, l2, or robust.")] = "relative",
     exposure: Annotated[bool, typer.Option("--exposure", help="Each image has an unknown factor.")] = False,
-    rate: Annotated[float, typer.Option(help="Of textures: of Adam.")] = 0.2,
-    tv: Annotated[float, typer.Option(help="Of textures: weight of their total variation.")] = 1e-3,
-    levels: Annotated[int, typer.Option(help="Of bitmaps: resolutions, from coarse to fine.", parser=whole)] = 3,
+    tv: Annotated[float, typer.Option(help="Of textures: weight of their total variation.")] = 0.02,
     seed: SampleSeed = 0,
     work: Annotated[Path | None, typer.Option(help="Folder where an interrupted fit goes on.")] = None,
     variant: Variant = "llvm_ad_rgb",
@@ -54,12 +52,13 @@ def fit_command(
     """Fit the medium of an object to images: NAME_fit.toml (material), .xml (scene with it), .json (all numbers).
 
     NAME_fit.html flips between each image and what was found.
-    A texture is written as NAME_fit_PARAMETER.exr, an attribute of a mesh with it as NAME_fit.ply.
+    A texture is written as NAME_fit_PARAMETER.exr, its standard errors as NAME_fit_PARAMETER_error.exr; an attribute of
+    a mesh with it as NAME_fit.ply, its errors as the attribute NAME_error. Errors are NaN where no view shows a texel.
     """
     use_mitsuba(variant)
     from halfspace_sss.inverse import FitSettings, fit, read_views
 
-    settings = FitSettings(steps, spp, batch, loss, exposure, seed, rate, tv, levels)
+    settings = FitSettings(steps, spp, batch, loss, exposure, seed, tv)
     check_folder(out)
     names = [name.strip() for name in parameter.split(",")]
     with Bar("fit") as bar:
@@ -125,7 +124,8 @@ def _with_textures(
         if values.ndim == 3:
             ways[key] = stem.with_name(f"{stem.name}_{key}.exr")
             files[ways[key]] = as_exr(values)
-    attributes = {key: values for key, values in found.textures.items() if values.ndim == 2}
+            files[stem.with_name(f"{stem.name}_{key}_error.exr")] = as_exr(found.texture_errors[key])
+    attributes = {k: (v, found.texture_errors[k]) for k, v in found.textures.items() if v.ndim == 2}
     if attributes:
         ways["mesh"] = stem.with_name(f"{stem.name}.ply")
         files[ways["mesh"]] = painted_mesh(scene, name, attributes)

@@ -19,11 +19,12 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -39,6 +40,9 @@ FLOOR = 0.1  # of the mean of an image, added to it in relative weights
 BEND = 0.05  # relative residual, beyond which the robust loss grows by its size
 EXPOSURE = 10.0  # most, of a factor
 BATCH = 4
+SETTLING = 0.5  # part of the steps after which nothing is forgotten
+FAR = 0.15  # change of a variable at which what was measured counts half
+LONGEST = 0.7  # change of a variable in a step
 PURPOSES = ("order", "first", "second", "slope", "test", "other test", "weights")
 
 
@@ -47,15 +51,13 @@ class FitSettings:
     """How to fit.
 
     Args:
-        steps: how many; 0 takes 30, or 200 where textures are fitted.
+        steps: how many; 0 takes 30, or 60 where textures are fitted.
         spp: samples a pixel of each render of a view: two images, and its slopes.
         batch: views a step; 0 takes 4 or all, whichever is less.
         loss: "relative", "l2" or "robust".
         exposure: whether each image may have a factor of its own, of geometric mean 1.
         seed: of all samples.
-        rate: of Adam, in the variables of textures and of constants beside them.
         tv: weight of the total variation of textures in their variables.
-        levels: resolutions of a bitmap, each twice the one before, that are fitted in turn.
     """
 
     steps: int = 0
@@ -64,15 +66,12 @@ class FitSettings:
     loss: str = "relative"
     exposure: bool = False
     seed: int = 0
-    rate: float = 0.2
-    tv: float = 1e-3
-    levels: int = 3
+    tv: float = 0.02
 
     def __post_init__(self) -> None:
-        for name, least in (("steps", 0), ("spp", 1), ("batch", 0), ("seed", 0), ("levels", 1)):
+        for name, least in (("steps", 0), ("spp", 1), ("batch", 0), ("seed", 0)):
             check_count(name, getattr(self, name), least)
         check_choice("loss", self.loss, LOSSES)
-        check_interval("rate", self.rate, 1e-6, 10.0)
         check_interval("tv", self.tv, 0.0, 1e6)
 
 
@@ -105,7 +104,7 @@ class MaterialFit:
 
     Args:
         values: of each parameter that is the same everywhere; sigma_t in 1/mm, mfp in mm.
-        errors: standard errors by H, the misfit, and the noise of the steps; none beside textures.
+        errors: standard errors by H, the misfit, and the noise of the steps.
         correlation: of all numbers in the order of `values`; empty beside textures.
         medium: of the object; with textures their means.
         misfit: root of the loss of all fitted views at the end.
@@ -116,6 +115,7 @@ class MaterialFit:
         views: what each view shows beside its given image.
         textures: of each parameter that has one, the texels (rows, columns, channels), or the attribute of each vertex
             or face, shape (n, channels).
+        texture_errors: their standard errors by noise, NaN where no view shows a texel.
     """
 
     values: dict[str, np.ndarray]
@@ -129,16 +129,19 @@ class MaterialFit:
     steps: list[FitStep] = field(repr=False)
     views: list[FittedView] = field(default_factory=list, repr=False)
     textures: dict[str, np.ndarray] = field(default_factory=dict, repr=False)
+    texture_errors: dict[str, np.ndarray] = field(default_factory=dict, repr=False)
 
     def lines(self) -> list[str]:
         """Each parameter with its errors, and the misfit."""
         told = []
         for name, value in self.values.items():
-            errors = [f" ± {e:.1g}" for e in self.errors[name]] if self.errors else [""] * len(value)
+            errors = [f" ± {e:.1g}" for e in self.errors[name]]
             told.append(f"{name}: {'  '.join(f'{v:.4g}{e}' for v, e in zip(value, errors))}")
         for name, values in self.textures.items():
             mean = " ".join(f"{v:.4g}" for v in values.reshape(-1, values.shape[-1]).mean(axis=0))
-            told.append(f"{name}: {' x '.join(map(str, values.shape[:-1]))} numbers of mean {mean}")
+            size, error = " x ".join(map(str, values.shape[:-1])), self.texture_errors[name]
+            known = f"{np.nanmedian(error):.1g}" if np.isfinite(error).any() else "nan"
+            told.append(f"{name}: {size} numbers of mean {mean}, median of their errors {known}")
         held = "" if self.held_out is None else f", of views held out {self.held_out.told()} %"
         return [*told, f"root of the loss {self.misfit.told()} %{held}"]
 
@@ -256,6 +259,50 @@ class ViewComparison:
     def image(self, view: GivenView, seed: int) -> np.ndarray:
         """A render of a view, without exposure."""
         return pixels_of(view, mi.render(self.scene, sensor=view.sensor, seed=seed, spp=self.settings.spp))
+
+    @property
+    def at_once(self) -> bool:
+        """Whether image and derivatives come from the same paths; models take a pass for each variable."""
+        return hasattr(self.scene.integrator(), "render_derivatives")
+
+    def sloped(
+        self, which: int, k: int, purpose: str, x: Mapping[str, Any], put: Callable[[Mapping[str, Any]], None],
+        slopes: bool,
+    ) -> tuple[np.ndarray, list[np.ndarray]]:  # fmt: skip
+        """A render of a view in a step, and its derivatives by each variable, all of whose numbers change alike.
+
+        Args:
+            purpose: "first" or "second".
+            x: the variables by name.
+            put: sets the medium by them, with their gradients.
+            slopes: whether derivatives are asked for.
+        """
+        view, spp, integrator = self.views[which], self.settings.spp, self.scene.integrator()
+        seed, found = self.seed(k, which, purpose), []
+
+        def followed(names: Iterable[str]) -> dict[str, Any]:
+            result = {name: type(value)(value) for name, value in x.items()}
+            for name in names:
+                dr.enable_grad(result[name])
+            return result
+
+        if slopes and self.at_once:
+            followed_x = followed(x)
+            put(followed_x)
+            image, found = integrator.render_derivatives(self.scene, list(followed_x.values()), view.sensor, seed, spp)
+            put(x)
+            return pixels_of(view, image), [pixels_of(view, d) for d in found]
+        put(x)
+        image = self.image(view, seed)
+        for j, name in enumerate(x if slopes else ()):
+            followed_x = followed([name])
+            dr.set_grad(followed_x[name], 1.0)
+            put(followed_x)
+            dr.forward_from(followed_x[name], dr.ADFlag.ClearEdges)  # models begin at the coefficients
+            seed = self.seed(k, which, "slope", 2 * j + (purpose == "second"))
+            found.append(pixels_of(view, integrator.render_forward(self.scene, None, view.sensor, seed, spp)))
+        put(x)
+        return image, found
 
     def expose(self, which: int, share: float) -> None:
         """Add a share to the factor of a view."""

@@ -24,13 +24,15 @@ import mitsuba as mi
 import numpy as np
 
 from halfspace_sss.inverse.comparing import (
+    FAR,
+    LONGEST,
+    SETTLING,
     FitSettings,
     FitStep,
     MaterialFit,
     ViewComparison,
     ViewMisfit,
     descend,
-    pixels_of,
 )
 from halfspace_sss.inverse.parameters import FitParameters, check_derivatives, translucent_object
 from halfspace_sss.inverse.views import GivenView, check_views
@@ -40,9 +42,6 @@ from halfspace_sss.rendering.object.wrapped import surface_of
 from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED, open_scene
 
 STEPS = 30
-SETTLING = 0.5  # part of the steps after which nothing is forgotten
-FAR = 0.15  # change of a variable at which what was measured counts half
-LONGEST = 0.7  # change of a variable in a step
 DAMPED = 1e-3  # of the largest eigenvalue of H, below which it is not trusted
 WALK = "translucent_walk"
 
@@ -85,7 +84,7 @@ def fit(
     work = None if work is None else check_folder(work)
     comparison, textured = ViewComparison(scene, list(images), settings), surface_of(shape).inside.textured is not None
     if textured:
-        from halfspace_sss.inverse.textures import TextureDescent, TextureParameters  # torch
+        from halfspace_sss.inverse.textures import TextureDescent, TextureParameters  # scipy
 
         descent = TextureDescent(comparison, TextureParameters.of(parameters, shape, mm_per_unit, scene))
     else:
@@ -185,8 +184,6 @@ class MediumDescent:
         n = len(comparison.fitted) if comparison.settings.exposure else 1
         self.free = _of_sum_0(n)  # directions of log exposures, shape (views, views - 1)
         self.means: dict[int, ViewMeans] = {}
-        # walks have image and derivatives of the same paths; models take a pass for each variable
-        self.at_once = hasattr(comparison.scene.integrator(), "render_derivatives")
 
     def fingerprint(self) -> str:
         return self.comparison.fingerprint({name: _numbers(x).tolist() for name, x in self.parameters.start().items()})
@@ -231,7 +228,7 @@ class MediumDescent:
         means = self.means.setdefault(which, ViewMeans.none(view.image.size, len(x)))
         if k < SETTLING * self.total:
             means.forget(x)
-        both = self.at_once or means.jacobians < 1  # little is left for products of different renders
+        both = compared.at_once or means.jacobians < 1  # little is left for products of different renders
         (a, J), (b, other_J) = self._render(which, k, "first", True), self._render(which, k, "second", both)
         misfit = compared.view(which, k, [a, b])
         w = misfit.weights.ravel().astype(float) / compared.count(which)
@@ -307,39 +304,14 @@ class MediumDescent:
 
     def _render(self, which: int, k: int, purpose: str, sloped: bool) -> tuple[np.ndarray, np.ndarray | None]:
         """A render of a view, and derivatives of its pixels by all variables; a channel knows of no other but by g."""
-        compared, scene = self.comparison, self.comparison.scene
-        view, spp, integrator = compared.views[which], compared.settings.spp, scene.integrator()
-        seed = compared.seed(k, which, purpose)
-        if sloped and self.at_once:
-            x = self._followed(self.parameters.names)
-            self.parameters.put(x)
-            image, found = integrator.render_derivatives(scene, list(x.values()), view.sensor, seed, spp)
-            self.parameters.put(self.x)
-            return pixels_of(view, image), self._columns(view, found)
-        self.parameters.put(self.x)
-        image, found = compared.image(view, seed), []
-        for j, name in enumerate(self.parameters.names if sloped else ()):
-            x = self._followed([name])
-            dr.set_grad(x[name], 1.0)
-            self.parameters.put(x)
-            dr.forward_from(x[name], dr.ADFlag.ClearEdges)  # models begin at the coefficients
-            seed = compared.seed(k, which, "slope", 2 * j + (purpose == "second"))
-            found.append(integrator.render_forward(scene, None, view.sensor, seed, spp))
-        self.parameters.put(self.x)
-        return image, self._columns(view, found) if sloped else None
+        image, found = self.comparison.sloped(which, k, purpose, self.x, self.parameters.put, sloped)
+        return image, self._columns(found) if sloped else None
 
-    def _followed(self, names: Sequence[str]) -> dict[str, mi.Float | mi.Spectrum]:
-        """The variables, some with gradients."""
-        x = {name: type(value)(value) for name, value in self.x.items()}
-        for name in names:
-            dr.enable_grad(x[name])
-        return x
-
-    def _columns(self, view: GivenView, found: Sequence[mi.TensorXf]) -> np.ndarray:
+    def _columns(self, found: Sequence[np.ndarray]) -> np.ndarray:
         """The Jacobian of derivatives along each parameter."""
         columns = []
         for name, d in zip(self.parameters.names, found):
-            d, numbers = pixels_of(view, d), len(_numbers(self.x[name]))
+            numbers = len(_numbers(self.x[name]))
             for c in range(numbers):
                 keep = np.ones(d.shape[2]) if numbers == 1 else np.arange(d.shape[2]) == c
                 columns.append((d * keep).ravel())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,10 @@ import drjit as dr  # noqa: E402
 
 from halfspace_sss import inverse  # noqa: E402
 from halfspace_sss.cli import app as cli  # noqa: E402
+from halfspace_sss.inverse.comparing import ViewComparison  # noqa: E402
+from halfspace_sss.inverse.textures import TextureDescent, TextureParameters  # noqa: E402
 from halfspace_sss.inverse.views import GivenView, read_views  # noqa: E402
+from halfspace_sss.rendering.object.wrapped import surface_of  # noqa: E402
 from halfspace_sss.rendering.scenes.scene_files import open_scene  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("quiet_rgb")
@@ -72,12 +76,50 @@ def test_a_checkerboard_is_found_from_its_image(tmp_path: Path) -> None:
     i, j = np.indices((4, 4))
     true = np.where(((i + j) % 2 == 0)[..., None], [0.95, 0.9, 0.6], [0.7, 0.8, 0.9])
     views = _views(_bitmap(tmp_path, true), 2048)
-    settings = inverse.FitSettings(steps=30, spp=128, rate=0.4, tv=0, levels=2)
+    settings = inverse.FitSettings(steps=30, spp=128, tv=0)
     found = inverse.fit(_bitmap(tmp_path, np.full((4, 4, 3), 0.8)), views, ("albedo",), settings=settings)
     error = found.textures["albedo"] - true
     assert np.sqrt(np.square(error).mean()) < 0.03
     assert np.abs(error).max() < 0.1
     assert not found.told
+    z = error / found.texture_errors["albedo"]
+    assert 0.5 < np.sqrt(np.square(z).mean()) < 2
+
+
+@pytest.mark.parametrize("kind", ["bitmap", "mesh"])
+def test_pixels_know_the_texels_that_they_show(tmp_path: Path, kind: str) -> None:
+    """Of odd numbers of rows and columns too, whose first and last ones are neighbours."""
+    values = np.random.default_rng(0).uniform(0.2, 0.9, (5, 3, 3) if kind == "bitmap" else (24, 3))
+    scene = open_scene(_bitmap(tmp_path, values) if kind == "bitmap" else _mesh(tmp_path))
+    shape = scene.shapes()[0]
+    if kind == "mesh":
+        mesh = mi.traverse(shape)
+        values = np.resize(values, (shape.vertex_count(), 3))
+        mesh["vertex_color"] = values.ravel().tolist()
+        mesh.update()
+    view = GivenView.of("a", 0, np.ones((12, 12, 3), np.float32))
+    comparison = ViewComparison(scene, [view], inverse.FitSettings())
+    descent = TextureDescent(comparison, TextureParameters.of(["albedo"], shape, 1.0, scene))
+    at, si, _ = descent._points(0)
+    seen = np.array(surface_of(shape).inside.textured.textures["albedo"].eval(si))
+    wanted = np.stack([np.bincount(at, c, 144) / np.maximum(np.bincount(at, minlength=144), 1) for c in seen], axis=1)
+    found = (descent._footprints[0, 0] @ values.ravel()).reshape(-1, 3)
+    np.testing.assert_allclose(found, wanted, atol=2e-4)
+    assert (wanted > 0.1).mean() > 0.3
+
+
+def test_what_is_dark_is_known_less_and_what_is_not_seen_is_not_known(tmp_path: Path) -> None:
+    """A lamp at the left of the plate."""
+    path = _mesh(tmp_path)
+    lamp = '<emitter type="point"><point name="position" x="-4" y="0" z="2.5"/></emitter>'
+    path.write_text(re.sub("<emitter type=.(directional|constant).*</emitter>", lamp, path.read_text()))
+    scene = open_scene(path)
+    views = [GivenView.of("a", 0, np.array(mi.render(scene, spp=64, seed=9)))]
+    settings = inverse.FitSettings(steps=2, spp=64, loss="l2", tv=0)
+    error = inverse.fit(scene, views, ("albedo",), model=None, settings=settings).texture_errors["albedo"]
+    x, _, z = np.array(mi.traverse(scene.shapes()[0])["vertex_positions"]).reshape(-1, 3).T
+    seen = np.isfinite(error).all(axis=1)
+    assert not seen[z < 0].any() and 2 * error[seen & (x < 0)].mean() < error[seen & (x > 0)].mean()
 
 
 def test_all_steps_of_a_fit_of_textures_run_the_same_kernels(tmp_path: Path) -> None:
@@ -87,7 +129,7 @@ def test_all_steps_of_a_fit_of_textures_run_the_same_kernels(tmp_path: Path) -> 
     def keep(*_: Any) -> None:
         kernels.append({kernel["hash"] for kernel in dr.kernel_history() if "hash" in kernel})
 
-    settings = inverse.FitSettings(steps=3, spp=4, levels=1)
+    settings = inverse.FitSettings(steps=3, spp=4)
     gc.collect()  # scenes of other tests would leave the registry between two steps, and change their kernels
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
         inverse.fit(path, [view], ("albedo", "sigma_t"), settings=settings, progress=keep)
@@ -117,7 +159,7 @@ def test_a_killed_fit_of_textures_goes_on_with_the_same_bits_and_writes_a_scene(
     mi.Bitmap(np.array(mi.render(open_scene(path), spp=64, seed=9)) * 1.1).write(str(tmp_path / "b.exr"))
     (tmp_path / "views.json").write_text(json.dumps({"views": [{"image": "b.exr"}]}))
     arguments = ["fit", str(path), "--images", str(tmp_path / "views.json"), "--parameter", "albedo,sigma_t"]
-    arguments += ["--steps", "4", "--spp", "64", "--levels", "2"]
+    arguments += ["--steps", "4", "--spp", "64"]
     whole = CliRunner().invoke(cli.app, [*arguments, "--out", str(tmp_path / "whole")])
     assert whole.exit_code == 0, whole.output
 
@@ -125,7 +167,7 @@ def test_a_killed_fit_of_textures_goes_on_with_the_same_bits_and_writes_a_scene(
         if done == 3:
             raise KeyboardInterrupt
 
-    how = {"settings": inverse.FitSettings(steps=4, spp=64, levels=2), "work": tmp_path / "work"}
+    how = {"settings": inverse.FitSettings(steps=4, spp=64), "work": tmp_path / "work"}
     with pytest.raises(KeyboardInterrupt):
         inverse.fit(path, read_views(tmp_path / "views.json"), ("albedo", "sigma_t"), progress=kill, **how)
     rest = CliRunner().invoke(cli.app, [*arguments, "--out", str(tmp_path / "rest"), "--work", str(tmp_path / "work")])
@@ -139,5 +181,8 @@ def test_a_killed_fit_of_textures_goes_on_with_the_same_bits_and_writes_a_scene(
     means = [row["values"]["albedo"] for row in numbers["steps"]]
     assert means[0] == pytest.approx([0.8] * 3, rel=1e-5) and means[0] != means[-1]
     assert (np.abs(albedo - 0.8) > 1e-3).any()
-    if kind == "mesh":
+    if kind == "bitmap":
+        error = np.array(mi.Bitmap(str(tmp_path / "rest" / "a_fit_albedo_error.exr")))
+        assert error.shape == (4, 6, 3) and (error > 0).any()
+    else:
         assert "texels or vertices of albedo are seen by no view" in " ".join(whole.output.split())

@@ -120,7 +120,8 @@ class TexturedMedium:
         scale: factor of sigma_t.
         table: albedo by reflectance.
         inverse: whether `sigma_t` is a mean free path.
-        variables: the numbers among them, as light may be differentiated by them.
+        variables: of these names, by whose numbers light may be differentiated: those that no texture varies, and
+            others in place of texels, all of which then change alike.
     """
 
     albedo: Any
@@ -173,10 +174,12 @@ class TexturedMedium:
 
     def _value(self, name: str, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Spectrum:
         source = getattr(self, name)
-        if isinstance(source, mi.Texture):
-            return mi.Spectrum(source.eval(si, active))
-        value = mi.Spectrum([opaque(v) for v in source])
-        return dr.replace_grad(value, self.variables[name]) if name in self.variables else value
+        followed = self.variables.get(name)
+        if not isinstance(source, mi.Texture):
+            value = mi.Spectrum([opaque(v) for v in source])
+            return value if followed is None else dr.replace_grad(value, followed)
+        value = mi.Spectrum(source.eval(si, active))
+        return value if followed is None else dr.detach(value) + followed - dr.detach(followed)
 
     def _extinction(self, value: Any) -> Any:
         scale = opaque(self.scale)

@@ -481,12 +481,12 @@ class Inside:
             new = {name: float(value[0]) for name, value in new.items()}
         return replace(self, label="medium", medium=Medium.from_albedo(**new, eta=m.eta))
 
-    def with_variables(self, surface: Any) -> Inside:
+    def with_variables(self, surface: Any, **more: Any) -> Inside:
         """The same, with numbers beside textures as the surface has them, by which light may be differentiated."""
         if self.textured is None:
             return self
         variables = {name: getattr(surface, name) for name in self.constants if name != "g"}
-        return replace(self, textured=replace(self.textured, variables=variables))
+        return replace(self, textured=replace(self.textured, variables=variables | more))
 
 
 def read_inside(props: mi.Properties) -> Inside:
