@@ -63,7 +63,7 @@ def fit(
         images: views of it.
         parameters: names of `parameters.NAMES`; where the medium has a texture for one, the texture is fitted, a
             bitmap or an attribute of the mesh.
-        model: `translucent_walk` or the name of a model of the half-space; None, and a Mitsuba scene, keep the
+        model: `translucent_walk`, `neural_shape` or a model of the half-space; None, and a Mitsuba scene, keep the
             integrator.
         object: name of the object; without it there must be one only.
         settings: how.
