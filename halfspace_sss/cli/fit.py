@@ -36,7 +36,9 @@ def fit_command(
     parameter: Annotated[
         str, typer.Option(help="Of albedo, reflectance, sigma_t, mfp, g; the texture, where there is one.")
     ] = "albedo,sigma_t",
-    model: Annotated[str, typer.Option(help="translucent_walk, neural_shape, or a model of the half-space.")] = "translucent_walk",
+    model: Annotated[
+        str, typer.Option(help="translucent_walk, neural_shape, or a model of the half-space.")
+    ] = "translucent_walk",
     object: ObjectId = None,  # noqa: A002
     steps: Annotated[int, typer.Option(help="How many.", parser=whole, show_default="30, or 60 with textures")] = 0,
     spp: Annotated[int, typer.Option(help="Samples a pixel of each render of a step.", parser=whole)] = 64,

@@ -1,9 +1,9 @@
 """Light at events of order 1 inside an object, gathered once: see `gathered.inner`.
 
-At each event one sampled emitter is connected with it, and a direction is walked to the boundary and out, three under an
-environment that varies. What it meets there is emission, or of other surfaces the mean of what they send to the points
-of the object near where it left. Most directions are those that an environment draws outside, bent by a flat boundary:
-so its bright parts are found without a search.
+At each event one sampled emitter is connected with it, and a direction is walked to the boundary and out, three under
+an environment that varies. What it meets there is emission, or of other surfaces the mean of what they send to the
+points of the object near where it left. Most directions are those that an environment draws outside, bent by a flat
+boundary: so its bright parts are found without a search.
 """
 
 from __future__ import annotations
