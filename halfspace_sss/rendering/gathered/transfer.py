@@ -238,7 +238,7 @@ class Transfer:
         entries agree on it.
         """
         n = self.entry.shape[1] // HALVES
-        halves = np.stack([self._by_direction(L, half) for half in (slice(0, n), slice(n, None))], axis=1)
+        halves = np.stack([self._by_direction(L, half) for half in (slice(0, n), slice(n, 2 * n))], axis=1)
         for _ in range(SMOOTHINGS):
             halves = self.points.smoothed(halves)
         one, two = halves[:, 0], halves[:, 1]
@@ -249,17 +249,19 @@ class Transfer:
     def _by_direction(self, L: Incident, half: slice) -> np.ndarray:
         """By a half of the entries, what the slope of light brings, and the slope over w_o, (points, channels, 4)."""
         axes = [np.ascontiguousarray(L.slope[:, :, axis]) for axis in range(3)]
-        found = np.empty((*L.mean.shape, 4), dtype=L.mean.dtype)
+        found, ones = np.empty((*L.mean.shape, 4), dtype=L.mean.dtype), np.ones(half.stop - half.start, self.t.dtype)
         for rows in self._blocks:
             entry, t, d_o = self.entry[rows, half], self.t[rows, half], self.d_o[rows, half]
-            d_i, more = self.w_i[rows, half] - np.take(L.middle, entry, axis=0), 0.0
-            for axis, along in enumerate(axes):
-                more = more + np.take(along, entry, axis=0) * d_i[:, :, axis, None]
+            d_i = self.w_i[rows, half] - np.take(L.middle, entry, axis=0)
+            more = np.take(axes[0], entry, axis=0) * d_i[:, :, 0, None]
+            for axis in (1, 2):
+                more += np.take(axes[axis], entry, axis=0) * d_i[:, :, axis, None]
             more *= t
-            arriving = more + t * np.take(L.mean, entry, axis=0)
-            found[rows, :, 0] = more.sum(axis=1)
+            arriving = t * np.take(L.mean, entry, axis=0)
+            arriving += more
+            found[rows, :, 0] = ones @ more  # twice as fast as a sum over the axis
             slope, even = (v.transpose(0, 2, 1) @ d_o for v in (arriving, t))
-            brings = arriving.sum(axis=1) / np.maximum(t.sum(axis=1), 1e-30)
+            brings = (ones @ arriving) / np.maximum(ones @ t, 1e-30)
             found[rows, :, 1:] = slope - even * brings[:, :, None]  # 0 in uniform light, where a(w_o) is all
         found[:, :, 1:] = np.einsum("jck,jki->jci", found[:, :, 1:], self.inverse)
         return found

@@ -12,6 +12,7 @@ between light and view is lost; detail of light below the distance of the points
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
 import drjit as dr
@@ -60,17 +61,24 @@ class Gathered:
         object: of it.
         transfer: of its model.
         values: B of all points, for each channel the constant and the slope over w_o.
-        error: standard error of B by the gathering of light, over its mean.
         light: that arrives.
+        parts: independent estimates of it.
         inner: at events of order 1 inside; None where that order is traced.
     """
 
     object: TranslucentObject
     transfer: Transfer
     values: mi.Float
-    error: float
     light: Incident
+    parts: tuple[Incident, ...]
     inner: InnerLight | None = None
+
+    @cached_property
+    def error(self) -> float:
+        """Standard error of B by the gathering of light, over its mean; NaN where that is not in parts."""
+        found = np.stack([self.transfer.by_place(part) for part in self.parts])
+        spread = found.var(axis=0, ddof=1).mean() if len(found) > 1 else np.nan
+        return float(np.sqrt(spread / len(found)) / max(float(found.mean()), 1e-30))
 
     def radiance(self, out: SurfacePoint, active: mi.Bool) -> mi.Spectrum:
         """L_o of an exit; 0 below the horizon."""
@@ -197,20 +205,18 @@ def _leaving(
     scene: mi.Scene, objects: list[TranslucentObject], k: int, of: tuple[Transfer, Events | None], settings: Settings,
     seed: int, parts: int,
 ) -> Gathered:  # fmt: skip
-    """B of object k, in parts whose differences tell the noise, and light inside."""
+    """B of object k, by light in parts whose differences tell the noise, and light inside."""
     T, events = of
     lights, others = zip(*_incident(scene, objects, T, settings, 2 * k + seed, parts))
     light = Incident.mean_of(lights)
-    B, found = T @ light, np.stack([T.by_place(part) for part in lights])
+    B = T @ light
     if not np.isfinite(B).all():
         raise ValueError(f"light at object {objects[k].geometry.name} must be finite, got NaN or infinity")
-    spread = found.var(axis=0, ddof=1).mean() if parts > 1 else np.nan
-    error = np.sqrt(spread / parts) / max(float(B[..., 0].mean()), 1e-30)
     inner = None
     if events is not None:
         seen = mi.Float(np.mean(others, axis=0).astype(np.float32).ravel())
         inner = inner_light(scene, objects, k, settings, events, (T.points, seen))
-    return Gathered(objects[k], T, mi.Float(B.astype(np.float32).ravel()), float(error), light, inner)
+    return Gathered(objects[k], T, mi.Float(B.astype(np.float32).ravel()), light, lights, inner)
 
 
 def _incident(
