@@ -64,9 +64,8 @@ def inversion_command(
     }  # fmt: skip
     few = max(spp // 4, 1)
     painted = {
-        f"{thing}, {way}": partial(_painted, inversion_textures.texture_row, thing, way, 2 * size, few, 2 * steps, seed)
+        thing: partial(_painted, inversion_textures.texture_rows, thing, 2 * size, few, 2 * steps, seed)
         for thing in inversion_textures.THINGS
-        for way in inversion_textures.WAYS
     }
     slopes = {case: partial(gradients.gradient_rows, case, size, spp, seed) for case in gradients.CASES}
     every = {"media": media, "textures": painted, "gradients": slopes}
@@ -88,11 +87,6 @@ def inversion_command(
     write_together(files)
 
 
-def _painted(row: Callable[..., dict[str, Any]], thing: str, way: str, *how: int, progress: Callable) -> list[dict]:
+def _painted(rows: Callable[..., list[dict[str, Any]]], *how: Any, progress: Callable) -> list[dict[str, Any]]:
     with TemporaryDirectory() as folder:
-        show = partial(_told, progress, f"{thing}, {way}")
-        return [row(thing, way, *how, Path(folder), show)]
-
-
-def _told(progress: Callable, what: str, done: int, total: int, line: str) -> None:
-    progress(f"{what}: {line}", done, total)
+        return rows(*how, Path(folder), progress)

@@ -21,13 +21,13 @@ from figures.computing.scenes import BUNNY, MM_PER_UNIT
 from figures.studies import deng
 from halfspace_sss import inverse
 from halfspace_sss.inverse.views import GivenView
-from halfspace_sss.progress import ProgressText
+from halfspace_sss.progress import NamedProgress
 from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED, load_scene
 
 THINGS = ("bunny", "ball")
 WAYS: Mapping[str, str] = {"walk": PATH_TRACED, "deng_dipole": deng.MODEL}
 VIEWS, HELD = 8, 2
-GIVEN, SHOWN = 16, 32  # samples of images that are given and that are compared, over those of a render of a step
+GIVEN, SHOWN = 64, 128  # samples of images that are given and that are compared, over those of a render of a step
 PAINT = "vertex_paint"
 SIGMA_T = "0.8, 1.2, 2"  # 1/mm
 GUESS = 0.8  # of the albedo
@@ -36,20 +36,19 @@ BALL = 4.0  # radius, units of 3.8 mm
 TEXELS = 128
 
 
-def texture_row(
-    thing: str, way: str, size: int, spp: int, steps: int, seed: int, folder: Path, progress: ProgressText | None = None
-) -> dict[str, Any]:
-    """Errors of the albedo, and FLIP of images.
+def texture_rows(
+    thing: str, size: int, spp: int, steps: int, seed: int, folder: Path, progress: NamedProgress | None = None
+) -> list[dict[str, Any]]:
+    """Of each way, from the same images: errors of the albedo, and FLIP of images.
 
     Args:
         thing: of `THINGS`.
-        way: of `WAYS`, by which it is fitted.
         size: pixels of the square images.
         spp: samples a pixel of each render of a step.
         steps: of the fit.
         seed: of all samples.
         folder: where meshes are written.
-        progress: called after each step.
+        progress: called with (what, done, total).
     """
     true = _albedo(thing)
 
@@ -61,30 +60,32 @@ def texture_row(
     ) -> list[np.ndarray]:
         return [np.array(mi.render(of, sensor=k, spp=more * spp, seed=seed + k))[..., :3] for k in views]
 
-    truth, first = scene("true", true, PATH_TRACED), scene("first", np.full_like(true, GUESS), WAYS[way])
-    images = shown(truth, seed, range(VIEWS), GIVEN)
-    given = [GivenView.of(f"view {k}", k, image) for k, image in enumerate(images)]
-    held, before = shown(truth, seed + 30), shown(first, seed + 50)
-    settings = inverse.FitSettings(steps=steps, spp=spp, seed=seed)
-    at = time.process_time()
-    found = inverse.fit(first, given, ("albedo",), model=None, settings=settings, progress=progress)
-    seconds = time.process_time() - at
-    albedo = found.textures["albedo"]
-    relit = [
-        shown(scene(f"relit {k}", values, model, OTHER_LAMP), seed + 70 + 20 * k)
-        for k, (values, model) in enumerate(((true, PATH_TRACED), (albedo, WAYS[way])))
-    ]
-
     def flip(wanted: list[np.ndarray], got: list[np.ndarray]) -> float:
         return float(np.mean([mean_flip(*pair) for pair in zip(wanted, got)]))
 
-    return {
-        "object": thing, "way": way, "size": size, "steps": steps, "seed": seed, "numbers": true.size // 3,
-        "RMSE, first guess": rms(true - GUESS), "RMSE": rms(albedo - true),
-        "held out: FLIP, first guess": flip(held, before), "held out: FLIP": flip(held, shown(first, seed + 50)),
-        "held out: FLIP of noise": flip(held, shown(truth, seed + 50)), "other lamp: FLIP": flip(*relit),
-        "CPU s": seconds,
-    }  # fmt: skip
+    truth, relit = scene("true", true, PATH_TRACED), scene("true relit", true, PATH_TRACED, OTHER_LAMP)
+    images = shown(truth, seed, range(VIEWS), GIVEN)
+    given = [GivenView.of(f"view {k}", k, image) for k, image in enumerate(images)]
+    held, other, noise = shown(truth, seed + 30), shown(relit, seed + 70), shown(truth, seed + 50)
+    settings, rows = inverse.FitSettings(steps=steps, spp=spp, seed=seed), []
+    for way, model in WAYS.items():
+        first = scene("first", np.full_like(true, GUESS), model)
+        before, at = shown(first, seed + 50), time.process_time()
+
+        def show(done: int, total: int, line: str, way: str = way) -> None:
+            if progress:
+                progress(f"{thing}, {way}: {line}", done, total)
+
+        found = inverse.fit(first, given, ("albedo",), model=None, settings=settings, progress=show)
+        seconds, albedo = time.process_time() - at, found.textures["albedo"]
+        got = shown(scene("relit", albedo, model, OTHER_LAMP), seed + 90)
+        rows.append({
+            "object": thing, "way": way, "size": size, "steps": steps, "seed": seed, "numbers": true.size // 3,
+            "RMSE, first guess": rms(true - GUESS), "RMSE": rms(albedo - true),
+            "held out: FLIP, first guess": flip(held, before), "held out: FLIP": flip(held, shown(first, seed + 50)),
+            "held out: FLIP of noise": flip(held, noise), "other lamp: FLIP": flip(other, got), "CPU s": seconds,
+        })  # fmt: skip
+    return rows
 
 
 def rms(values: np.ndarray) -> float:
