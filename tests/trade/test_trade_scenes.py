@@ -15,6 +15,7 @@ from halfspace_sss.cli import app as cli
 from halfspace_sss.physics.fresnel import F_r
 from halfspace_sss.rendering.object.registry import model_names
 from halfspace_sss.trade import assess, assessing, recommend
+from halfspace_sss.trade.assessing import assess_stage
 from halfspace_sss.trade.checking.random_scenes import random_scene, write_scene
 from halfspace_sss.trade.exits import visible_exits
 from halfspace_sss.trade.images import small_images
@@ -58,10 +59,11 @@ def scene(medium: dict | None = None, light: dict | None = None, n: int = 1, **m
 
 
 def test_a_ball_of_ten_mean_free_paths_is_as_dark_by_a_half_space_as_images_say() -> None:
-    found = assess(scene({"sigma_s": 9.5, "sigma_a": 0.5, "eta": 1.3}), models=["neural"], **{**QUICK, "seconds": 1.0})
+    on, ways = stage(scene({"sigma_s": 9.5, "sigma_a": 0.5, "eta": 1.3})), [Way.of("path_traced"), Way.of("neural")]
+    found = assess_stage(on, ways, samples=1024, exits=64)
     row = found.objects[0].way("neural")
-    # of light from inside 0.85 is left (README, spheres); about a quarter of the radiance is reflected or single
-    assert row.ratio[0] == pytest.approx(0.9, abs=0.05) and row.bias > 0.05
+    # 0.85 of light from inside is left (spheres), and all that is reflected or single; four seeds: 0.845 to 0.86
+    assert row.ratio[0] == pytest.approx(0.87, abs=0.05) and row.bias > 0.05
     assert row.ratio_error[0] < 0.03
     assert found.objects[0].mfp == pytest.approx((34.6, 34.6), rel=0.01)
     assert row.seconds > 0 and row.memory > 0 and row.samples > 0
