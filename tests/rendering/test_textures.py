@@ -137,10 +137,10 @@ def test_models_between_nodes_are_those_of_the_medium(model: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("model", "error"), [("better_dipole", 5e-3), pytest.param("neural", 0.1, marks=pytest.mark.slow)]
+    ("model", "error"), [("better_dipole", 5e-3), pytest.param("neural", 0.15, marks=pytest.mark.slow)]
 )
 def test_S_is_the_geometric_mean_of_both_ends(model: str, error: float) -> None:
-    """And so reciprocal; by reduced networks single values to 10 %, their sum to 2 %."""
+    """And so reciprocal; by reduced networks single values to 15 %, their sum to 2 %."""
     first, second, painted = _transports(model, PLAIN, OTHER, _painted(PLAIN, OTHER))
     a, b, c = (_S(obj) for obj in (first, second, painted))
     rng = np.random.default_rng(1)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
@@ -636,10 +635,11 @@ class WalkMedia:
 _OF_OBJECT: WeakKeyDictionary[TranslucentObject, WalkMedia] = WeakKeyDictionary()
 
 
-@functools.cache
-def _boundary(variant: str, eta: float) -> mi.BSDF:
-    """One for all media of an index: kernels call every BSDF that there is, and a new one would compile them anew."""
-    return smooth_boundary(eta)
+def _boundary(eta: float) -> mi.BSDF:
+    """That of another object of the index: kernels call every BSDF that there is, and a new one compiles them anew."""
+    others = (media.boundaries[0] for media in _OF_OBJECT.values() if media.insides[0].medium.eta == eta)
+    known = next(filter(is_smooth_boundary, others), None)
+    return smooth_boundary(eta) if known is None else known
 
 
 def walk_media(obj: TranslucentObject) -> WalkMedia:
@@ -652,7 +652,7 @@ def walk_media(obj: TranslucentObject) -> WalkMedia:
             medium = Medium(**values, eta=eta)
         inside, geometry = Inside("medium", medium, "", "total", True, obj.varying, obj.textured), obj.geometry
         sight = Sight([], {}) if geometry.group is None else Sight.of_shapes([geometry.shape])
-        result = WalkMedia([geometry], [inside], geometry.scene, [_boundary(mi.variant(), eta)], 1.0, sight=sight)
+        result = WalkMedia([geometry], [inside], geometry.scene, [_boundary(eta)], 1.0, sight=sight)
         _OF_OBJECT[obj] = result
     return result
 
