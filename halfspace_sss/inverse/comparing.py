@@ -361,6 +361,28 @@ class FitDescent(Protocol):
         """Of what is fitted to what, how, and from where."""
 
 
+def kept_at(change: Any) -> Any:
+    """Share that is kept of what was measured before a variable changed by so much."""
+    return 1 / (1 + (change / FAR) ** 4)
+
+
+def arrays_of_means(means: Mapping[int, Any]) -> dict[str, np.ndarray]:
+    """Means of views, dataclasses of arrays and numbers, as a state keeps them."""
+    return {
+        f"view {which} {key}": np.asarray(value) for which, each in means.items() for key, value in vars(each).items()
+    }
+
+
+def means_of_arrays(arrays: Mapping[str, np.ndarray], kind: Callable[..., Any]) -> dict[int, Any]:
+    """The means of a class that a state keeps."""
+    kept: dict[int, dict[str, Any]] = {}
+    for key, value in arrays.items():
+        if key.startswith("view "):
+            _, which, name = key.split()
+            kept.setdefault(int(which), {})[name] = value if value.ndim else float(value)
+    return {which: kind(**each) for which, each in kept.items()}
+
+
 def descend(descent: FitDescent, work: Path | None, progress: ProgressText | None) -> None:
     """Take all steps that are left, kept in the folder `work`, from which the same fit goes on.
 

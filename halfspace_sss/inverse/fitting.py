@@ -17,14 +17,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from halfspace_sss.inverse.comparing import (
-    FAR,
     LONGEST,
     SETTLING,
     FitSettings,
@@ -32,7 +30,10 @@ from halfspace_sss.inverse.comparing import (
     MaterialFit,
     ViewComparison,
     ViewMisfit,
+    arrays_of_means,
     descend,
+    kept_at,
+    means_of_arrays,
 )
 from halfspace_sss.inverse.parameters import FitParameters, check_derivatives, translucent_object
 from halfspace_sss.inverse.views import GivenView, check_views
@@ -132,7 +133,7 @@ class ViewMeans:
 
     def forget(self, x: np.ndarray) -> None:
         """Count less for what is far from x."""
-        kept = float(1 / (1 + (np.abs(x - self.x).max() / FAR) ** 4))
+        kept = float(kept_at(np.abs(x - self.x).max()))
         self.renders, self.jacobians = kept * self.renders, kept * self.jacobians
 
     def add(
@@ -189,20 +190,10 @@ class MediumDescent:
         return self.comparison.fingerprint({name: _numbers(x).tolist() for name, x in self.parameters.start().items()})
 
     def state(self) -> dict[str, np.ndarray]:
-        means = {
-            f"view {which} {key}": np.asarray(value)
-            for which, each in self.means.items()
-            for key, value in vars(each).items()
-        }
-        return {**means, **{f"x {name}": _numbers(x) for name, x in self.x.items()}}
+        return {**arrays_of_means(self.means), **{f"x {name}": _numbers(x) for name, x in self.x.items()}}
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
-        kept: dict[int, dict[str, Any]] = {}
-        for key, value in arrays.items():
-            if key.startswith("view "):
-                _, which, name = key.split()
-                kept.setdefault(int(which), {})[name] = value if value.ndim else float(value)
-        self.means = {which: ViewMeans(**each) for which, each in kept.items()}
+        self.means = means_of_arrays(arrays, ViewMeans)
         for name, x in self.x.items():
             numbers = arrays[f"x {name}"].tolist()
             self.x[name] = self.parameters.clipped(name, type(x)(numbers if len(numbers) > 1 else numbers[0]))

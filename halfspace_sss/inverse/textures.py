@@ -35,13 +35,15 @@ from scipy.sparse import block_diag, csr_array, diags_array, hstack, kron, vstac
 from scipy.sparse.linalg import LinearOperator, cg
 
 from halfspace_sss.inverse.comparing import (
-    FAR,
     LONGEST,
     SETTLING,
     FitStep,
     MaterialFit,
     ViewComparison,
     ViewMisfit,
+    arrays_of_means,
+    kept_at,
+    means_of_arrays,
 )
 from halfspace_sss.inverse.parameters import ALBEDO, NEAR, G, check_names, size_bounds, translucent_object
 from halfspace_sss.rendering.object.shape import name_of
@@ -325,7 +327,7 @@ class PixelMeans:
     def forget(self, shown: np.ndarray, by_x: np.ndarray) -> None:
         """Count less for what is far from what is shown now, in variables by derivatives of the numbers."""
         far = np.abs(shown - self.shown) / np.maximum(by_x, 1e-30)
-        kept = 1 / (1 + (far.max(axis=0) / FAR) ** 4)
+        kept = kept_at(far.max(axis=0))
         self.renders, self.sloped = kept * self.renders, kept * self.sloped
 
     def add(
@@ -392,15 +394,10 @@ class TextureDescent:
         return self.comparison.fingerprint([(v.name, v.start.tolist()) for v in self.variables])
 
     def state(self) -> dict[str, np.ndarray]:
-        means = {f"{which} {key}": value for which, each in self.means.items() for key, value in vars(each).items()}
-        return {**means, "x": self.x}
+        return {**arrays_of_means(self.means), "x": self.x}
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
-        self.x, kept = arrays["x"], {}
-        for key, value in arrays.items():
-            if " " in key:
-                kept.setdefault(int(key.split()[0]), {})[key.split()[1]] = value
-        self.means = {which: PixelMeans(**each) for which, each in kept.items()}
+        self.x, self.means = arrays["x"], means_of_arrays(arrays, PixelMeans)
 
     # ---- steps
 

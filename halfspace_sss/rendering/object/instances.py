@@ -21,6 +21,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from halfspace_sss.rendering.object.points import TransportAround
 from halfspace_sss.rendering.object.shape import (
     Geometry,
     by_pointer,
@@ -378,25 +379,14 @@ class PlacedProposals:
 
 
 @dataclass(frozen=True, eq=False)
-class PlacedTransport:
+class PlacedTransport(TransportAround):
     """S of a learnt object in the frame of the group, which an instance moves, turns or mirrors.
 
     Args:
-        transport: `points.Transport` of the shape.
         pose: of the instance.
     """
 
-    transport: Any
     pose: Pose
-    is_delta = False
-
-    @property
-    def orders(self) -> str:
-        return self.transport.orders
-
-    @property
-    def checksums(self) -> tuple[str, ...]:
-        return self.transport.checksums
 
     @property
     def alpha(self) -> PlacedAlbedo | None:

@@ -359,6 +359,30 @@ class Transport(Protocol):
         """The reflectance of the half-space of the medium at an exit; only of objects with textures."""
 
 
+@dataclass(frozen=True, eq=False)
+class TransportAround:
+    """What a transport around another one has of it.
+
+    Args:
+        transport: the other one.
+    """
+
+    transport: Transport
+    is_delta = False
+
+    @property
+    def orders(self) -> str:
+        return self.transport.orders
+
+    @property
+    def checksums(self) -> tuple[str, ...]:
+        return self.transport.checksums
+
+    @property
+    def alpha(self) -> ObjectAlbedo | None:
+        return self.transport.alpha
+
+
 class ObjectModel(NamedTuple):
     """What renders an object inside: a transport, the proposals that suit it, and how many entries an exit draws."""
 

@@ -19,7 +19,7 @@ import mitsuba as mi
 
 from halfspace_sss.interface.model import bssrdf
 from halfspace_sss.physics.medium import Medium
-from halfspace_sss.rendering.object.points import ObjectAlbedo, SurfacePoint, Transport, opaque
+from halfspace_sss.rendering.object.points import SurfacePoint, Transport, TransportAround, opaque
 from halfspace_sss.rendering.object.registry import lookup
 from halfspace_sss.rendering.object.translucent import VARIABLE
 
@@ -157,29 +157,14 @@ class Variation:
 
 
 @dataclass(frozen=True, eq=False)
-class VariedTransport:
-    """Another transport, with its derivatives by the medium.
+class VariedTransport(TransportAround):
+    """Another transport, a `Neighboured` one, with its derivatives by the medium.
 
     Args:
-        transport: a `Neighboured` one.
         variation: of its object.
     """
 
-    transport: Any
     variation: Variation
-    is_delta = False
-
-    @property
-    def orders(self) -> str:
-        return self.transport.orders
-
-    @property
-    def checksums(self) -> tuple[str, ...]:
-        return self.transport.checksums
-
-    @property
-    def alpha(self) -> ObjectAlbedo | None:
-        return self.transport.alpha
 
     def prepare(self, at: SurfacePoint, active: mi.Bool = True) -> tuple[Any, SurfacePoint]:
         """As of the transport, and the exit, for its neighbours."""
