@@ -6,7 +6,8 @@ object each takes, until bias and noise together are at the tolerance e,
     T = training + preparation + images n t V / (e² - b²),
 
 and a way with b >= e never gets there. With standard errors s of b² and v of V, and x = 1 / samples, b² + V x is taken
-at its bound that holds in 95 % of cases, b² + V x + 1.645 sqrt(s² + v² x²).
+a standard error above what was measured, b² + V x + sqrt(s² + v² x²). Biases of models are spread over decades, so that
+few lie where that errs: see docs/trade_check.md.
 """
 
 from __future__ import annotations
@@ -153,7 +154,7 @@ def recommend(
         return advise(scene, job)
     if "assess_seconds" in assessing:
         assessing["seconds"] = assessing.pop("assess_seconds")
-    how = {"flip": False, "tolerance": tolerance, "images": images, **assessing}
+    how = {"flip": False, "tolerance": tolerance, "images": images, "count_training": count_training, **assessing}
     return advise(assess(scene, seed=seed, **how), job)
 
 

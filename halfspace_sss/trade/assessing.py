@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from statistics import NormalDist
 from typing import Any
 
@@ -21,7 +21,7 @@ from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED, first_cause
 from halfspace_sss.trade.exits import Exits, visible_exits
 from halfspace_sss.trade.images import with_flip
 from halfspace_sss.trade.results import Assessment, ObjectTrade, WayTrade, samples_for
-from halfspace_sss.trade.sampling import Sampled, first_sample, sample_blur, sample_more, warm_up
+from halfspace_sss.trade.sampling import PILOT, Sampled, first_sample, sample_blur, sample_more, warm_up
 from halfspace_sss.trade.statistics import (
     Number,
     RadianceEstimate,
@@ -42,8 +42,15 @@ WALKED = 0.5  # of it, where delta lights are blurred: the rest tells what that 
 # by 0.06 +- 0.06 of itself, on a bunny of 2 to 5 mean free paths, where it is 12 % of all.
 BLUR_EFFECT = 0.1
 BLUR_SEEN = 0.04  # probability that a direction is in the cone of `sample_blur`
+FIRST = (0.0, None, 1.0)  # budget of a look by the first samples alone
+MOST, FEWEST, POINTS = 384, 64, 5e-3  # of points for a tolerance, and how many times V t
+LOOK = 16_000  # samples of all points by which a way is looked at first
 FIRST_SHARE = 0.45  # of the time, for the look at all ways
-LEAST_SHARE = 0.25  # of the time, for the second look, however long the first one took
+LEAST_SHARE = 0.25  # of the time, for walks and what may win against them, however long all else takes
+LAST_SHARE = 0.05  # likewise, after light has been gathered
+TOLD = 0.1  # standard error of a bias² over the squared tolerance that is enough
+UNEVEN = 1.5  # times the noise of a bias² if all points were as noisy
+STEADY = 0.05  # relative error of their variance where nothing may win against walks
 DOUBT = 2.0  # standard errors
 CANDIDATES = (
     PATH_TRACED, "lambert", "better_dipole", "neural", "full_geometry", "neural_shape",
@@ -52,9 +59,9 @@ CANDIDATES = (
 DEAR, DEAR_SECONDS = ("neural_shape",), 30.0  # to look at, which takes that long
 GATHERING = 2**19  # samples of a model whose time the gathering of its light takes at least
 LONGEST = 1.5  # times the seconds of an assessment that a gathering may take
+LIGHT_SECONDS = 0.4  # of a part of the light, beside its transfer: by emitters, and of the first samples
 GATHERED_SHARE = 0.2  # most of the time for samples of gathered light: sqrt(V t) is a quarter of that of walks
 CLOSE = 1.3  # times the cost of the cheapest way, up to which another may turn out cheaper
-TRACED = (0.3, 0.95)  # least and most of the time of the second look for walks
 
 
 def assess(
@@ -67,6 +74,7 @@ def assess(
     flip: bool = True,
     tolerance: float | None = None,
     images: int = 1,
+    count_training: bool = True,
     exits: int = EXITS,
     parameters: dict[str, str] | None = None,
     train_seconds: float = 0.0,
@@ -81,16 +89,18 @@ def assess(
 
     Args:
         scene: a Mitsuba scene, a dict as for `mitsuba.load_dict`, or the path of an XML file.
-        seconds: for each object, shared by all ways; compilation and gathering of light come on top.
+        seconds: for each object, shared by all ways; compilation comes on top, and so does gathering of light without a
+            tolerance. With one, walks have a quarter of the time however long all else takes.
         models: names of ways, such as "neural" or "neural, gathered", all of which are measured; by default all, or
             with a tolerance those of `CANDIDATES` that might be the cheapest to keep it. "path_traced" is always
             among them.
         sensor: number of the sensor.
         seed: of everything; what depends on the clock is how many samples are taken.
         flip: whether to render small images for FLIP, if the evaluator is installed.
-        tolerance: of a job; more than half of the time is then for ways that might be the cheapest to keep it.
+        tolerance: of a job; most of the time is then for walks and for ways that might be the cheapest to keep it.
         images: of that job.
-        exits: points of each object.
+        count_training: whether the time of a training that has been done counts in it.
+        exits: points of each object, with a tolerance fewer where walks are noisy.
         parameters: values of the parameters $name of an XML file.
         train_seconds: that each object without weights is learnt for before, as `train object` does; 0 for what has
             been learnt. The time of a training is a cost of its model.
@@ -122,7 +132,8 @@ def assess(
     if tolerance is None:
         result = assess_stage(on, chosen, **how)
     else:
-        result = assess_for(on, chosen, tolerance, images=None if named else images, **how)
+        job = {"images": None if named else images, "count_training": count_training}
+        result = assess_for(on, chosen, tolerance, **job, **how)
     if flip:
         result = with_flip(on, chosen, result, sensor, seed)
     return result
@@ -170,6 +181,7 @@ class _Samples:
         points: of each object; None where it is hardly seen.
         sampled: by each way, or why it refuses the object.
         heard: warnings.
+        mfp: mean free paths across, smallest and largest of the channels.
     """
 
     on: Stage
@@ -177,6 +189,8 @@ class _Samples:
     points: list[Exits | None]
     sampled: list[dict[Way, list[Sampled] | str]]
     heard: list[list[str]]
+    mfp: list[tuple[float, float]]
+    _training: dict[tuple[int, str], float] = field(default_factory=dict)
 
     @classmethod
     def of(cls, on: Stage, chosen: Sequence[Way], sensor: int, exits: int, seed: int) -> _Samples:
@@ -187,7 +201,8 @@ class _Samples:
                 warm_up(on, [way for way in chosen if (way.model == PATH_TRACED) == walks and way.light != GATHERED])
         started = clock()
         seen = visible_exits(on.scene, on.shapes, sensor, exits, seeded(seed, 41))
-        return cls(on, started, seen, [{} for _ in seen], [[] for _ in seen])
+        mfp = [_mfp(on, k) for k in range(len(seen))]
+        return cls(on, started, seen, [{} for _ in seen], [[] for _ in seen], mfp)
 
     def more(
         self,
@@ -209,26 +224,63 @@ class _Samples:
                     _object(self.on, k, points, chosen, budget, seeded(seed, k), tell, self.sampled[k])
                     self.heard[k] += [" ".join(str(w.message).split()) for w in caught]
 
+    def keep(self, walked: Assessment) -> None:
+        """Fewer points where walks are noisy or slow: of a bias² b² n of them leave errors of about
+
+        b² sqrt(2 / n) by their choice and V t sqrt(2 n) / time by noise, which are equal for n = time b² / (V t).
+        """
+        for k, o in enumerate(walked.objects):
+            noise = o.traced.variance * o.traced.seconds if o.ways else 0.0
+            if noise > 0:
+                n = min(max(int(POINTS / noise), FEWEST), self.points[k].n)
+                self.points[k] = self.points[k].first(n)
+                for each in (each for item in self.sampled[k].values() for each in item):
+                    each.estimate = each.estimate.of_first(n)
+
+    def enough(self, k: int, row: WayTrade, told: float | None) -> float:
+        """Further seconds of a way until a small bias² is known to `told`; with None until its variance is."""
+        spent = row.samples * row.seconds
+        if told is None:
+            return spent * ((row.variance_error / (STEADY * row.variance)) ** 2 - 1)
+        noise = UNEVEN * row.variance * math.sqrt(2 * self.points[k].n) * row.seconds
+        return noise / told - spent if told else math.inf
+
     def assessment(self, seed: int) -> Assessment:
         """What all samples say."""
-        objects, compiled, compiling = [], 0.0, 0.0
+        objects, compiled = [], 0.0
         for k, (points, sampled) in enumerate(zip(self.points, self.sampled)):
             if points is None:
-                objects.append(_unseen(self.on, k))
+                objects.append(_unseen(self.on.names[k], self.mfp[k]))
                 continue
             (walks,) = next(item for way, item in sampled.items() if way.model == PATH_TRACED)
-            rows = tuple(_row(self.on, k, way, item, walks) for way, item in sampled.items())
+            rows = tuple(
+                replace(
+                    _row(self.on, k, way, item, walks), training=0.0 if isinstance(item, str) else self.training(k, way)
+                )
+                for way, item in sampled.items()
+            )
             compiled += sum(row.compilation for row in rows)
-            compiling += sum(each.compiling for item in sampled.values() if isinstance(item, list) for each in item)
             radiance = tuple(float(v) for v in walks.estimate.mean.mean(axis=1))
             seen, notes = (points.share, points.pixels, radiance, rows), tuple(dict.fromkeys(self.heard[k]))
-            objects.append(ObjectTrade(self.on.names[k], _mfp(self.on, k), *seen, notes))
-        return Assessment(tuple(objects), clock() - self.started - compiling, compiled, seed)
+            objects.append(ObjectTrade(self.on.names[k], self.mfp[k], *seen, notes))
+        return Assessment(tuple(objects), self.seconds, compiled, seed)
+
+    def training(self, k: int, way: Way) -> float:
+        """`training_seconds` of an object."""
+        if (k, way.model) not in self._training:
+            self._training[k, way.model] = training_seconds(self.on.scene, self.on.names[k], way.model)
+        return self._training[k, way.model]
+
+    @property
+    def seconds(self) -> float:
+        """Spent, compilation left out."""
+        compiling = sum(each.compiling for of in self.sampled for i in of.values() if isinstance(i, list) for each in i)
+        return clock() - self.started - compiling
 
 
-def _unseen(on: Stage, k: int) -> ObjectTrade:
-    note = f"object {on.names[k]!r} is hardly seen by the camera, if at all: nothing can be told of it"
-    return ObjectTrade(on.names[k], _mfp(on, k), 0.0, 0.0, (), (), (note,))
+def _unseen(name: str, mfp: tuple[float, float]) -> ObjectTrade:
+    note = f"object {name!r} is hardly seen by the camera, if at all: nothing can be told of it"
+    return ObjectTrade(name, mfp, 0.0, 0.0, (), (), (note,))
 
 
 def _mfp(on: Stage, k: int) -> tuple[float, float]:
@@ -255,21 +307,25 @@ def _object(
     sampled |= {way: [] for way in chosen if way not in sampled}
     for done, way in enumerate(gathered_first):
         tell(way.name, done)
+        if isinstance(sampled[way], str):
+            continue
         share = traced if way.model == PATH_TRACED and len(chosen) > 1 else 1 / (len(chosen) - done)
-        share = min(share, GATHERED_SHARE) if way.light == GATHERED and not samples else share
+        share = min(share, GATHERED_SHARE) if way.light == GATHERED and len(chosen) > 1 and not samples else share
         for half, part in enumerate(way.halves):
             started = clock()
             try:
                 number = seeded(seed, chosen.index(way), *([half] if half else []))
-                result, beside = _begun(on, part, points, number, k, sampled[way], half)
+                each = PILOT if samples else max(PILOT, LOOK // points.n)
+                result, beside = _begun(on, part, points, (number, each), k, sampled[way], half)
                 end, started = end + beside, started + beside
                 left = share / len(way.halves) * (end - started) - (clock() - started)
                 blurs = way.model == PATH_TRACED and on.blurs
                 left *= WALKED if blurs else 1.0
                 sample_more(on, part, points, result, number, seconds=left, samples=samples)
                 if blurs:
-                    more = sample_blur(on, points, number, result.estimate.samples // 2)
-                    result.blur = joined([result.blur, more]) if result.blur else more
+                    known = [result.blur] if result.blur else []
+                    wanted = result.estimate.samples // 2 - sum(each.samples for each in known)
+                    result.blur = joined([*known, sample_blur(on, points, number, wanted)])
             except (ValueError, RuntimeError) as error:
                 if way.model == PATH_TRACED:
                     raise ValueError(first_cause(error)) from error
@@ -278,12 +334,12 @@ def _object(
 
 
 def _begun(
-    on: Stage, way: Way, points: Exits, seed: int, k: int, sampled: list[Sampled], half: int
+    on: Stage, way: Way, points: Exits, how: tuple[int, int], k: int, sampled: list[Sampled], half: int
 ) -> tuple[Sampled, float]:
     """A way or half of one made ready and among those sampled, and seconds of that which no time is foreseen for."""
     if half < len(sampled):
         return sampled[half], 0.0
-    result = first_sample(on, way, points, seed, k)
+    result = first_sample(on, way, points, *how, k)
     if half:  # what the first part took longer to prepare was compilation
         sampled[0].compiling += max(sampled[0].preparing - result.preparing, 0.0)
     sampled.append(result)
@@ -302,11 +358,10 @@ def _row(on: Stage, k: int, way: Way, sampled: list[Sampled] | str, traced: Samp
     bias2 = Number(bias2.value + max(doubt.value, 0.0), math.hypot(bias2.error, doubt.error))
     ratios = [(1.0, 0.0) if exact else ratio_of_means(a, b, c) for c in range(len(b.mean))]
     variance = relative_variance(a, b)
-    row = WayTrade(
+    return WayTrade(
         way.name, *bias2, tuple(r[0] for r in ratios), tuple(r[1] for r in ratios), *variance, last.seconds,
         a.samples * a.mean.shape[1], last.preparation, sum(each.compilation for each in sampled), 0.0, last.memory,
     )  # fmt: skip
-    return replace(row, training=training_seconds(on.scene, on.shapes[k].id(), way.model))
 
 
 def _kept(on: Stage, k: int, way: Way) -> float:
@@ -366,44 +421,126 @@ def assess_for(
     sensor: int = 0,
     seed: int = 0,
     exits: int = EXITS,
+    count_training: bool = True,
     progress: NamedProgress | None = None,
 ) -> Assessment:
     """As `assess_stage`, with most of the time for ways that could be the cheapest to keep a tolerance.
 
-    Ways that cannot be the cheapest for a job of `images` are left out by what the first look at others says; with
-    None all are measured.
+    Ways that cannot be the cheapest for a job of `images` are left out by what few samples of others say; with None
+    all are measured. The time is that of all that is done, and points are fewer where walks are noisy.
     """
     dear = DEAR if seconds < DEAR_SECONDS else ()
     later = [way for way in chosen if images and (way.light == GATHERED or way.model in dear)]
     ahead = [way for way in chosen if way not in later]
-    look = _Samples.of(on, ahead, sensor, exits, seed)
-    look.more(ahead, (FIRST_SHARE * seconds, None, TRACED_SHARE), seeded(seed, 42), progress)
+    look = _Samples.of(on, ahead, sensor, min(exits, MOST) if images else exits, seed)
+    if images:
+        look.more([way for way in ahead if way.model == PATH_TRACED], FIRST, seeded(seed, 42), progress)
+        first = look.assessment(seed)
+        out = _too_dear(look, first, chosen, tolerance, images) if count_training else {}
+        ahead, later = ([way for way in ways if way not in out] for ways in (ahead, later))
+        look.keep(first)
+        look.more([way for way in ahead if way.model != PATH_TRACED], FIRST, seeded(seed, 43), progress)
+    else:
+        out: dict[Way, str] = {}
+        look.more(ahead, (FIRST_SHARE * seconds, None, TRACED_SHARE), seeded(seed, 42), progress)
     first = look.assessment(seed)
-    seen = [o for o in first.objects if o.ways and not o.is_dark]
+    seen = [k for k, o in enumerate(first.objects) if o.ways and not o.is_dark]
     if not seen:
         return first
-    names = {name for o in seen for name in contenders(o, tolerance)}
-    reasons = {way: [_left_out(o, way, tolerance, images, seconds) for o in seen] for way in later}
-    wanted = [way for way in later if "" in reasons[way]]
-    if len(wanted) > 1:
-        best = _most_promising(seen, wanted, tolerance, images or 1)
-        for way in wanted:
-            reasons[way] = [f"not measured, as {best.name} promises more: ask for it by its name"]
-        wanted = [best]
-    names -= {way.model for way in wanted}  # what gathers no light cannot win where that is worth its preparation
-    few = [way for way in ahead if way.name in names or way.model == PATH_TRACED] + wanted
-    traced = sum(_traced_share(o, names) for o in seen) / len(seen)
-    left = max(seconds - first.seconds / len(seen), LEAST_SHARE * seconds)
-    look.more(few, (left, None, traced), seeded(seed, 71), progress)
+
+    def left_of(assessed: Assessment) -> float:
+        return max(seconds - assessed.seconds / len(seen), 0.0)
+
+    job = (tolerance, images, seconds, count_training)
+    few, gathering, _ = _promising([first.objects[k] for k in seen], ahead, later, job)
+    reserve = sum(_gathering(first.objects[k].way(gathering.model)) for k in seen) / len(seen) if gathering else 0.0
+    told = TOLD * tolerance**2 if images else 0.0
+    alone = images and not gathering and len(few) == 1
+    left = max(left_of(first) - reserve, LEAST_SHARE * seconds)
+    _go_on(look, first, few, (left, None if alone else told), seeded(seed, 71), progress)
     again = look.assessment(seed)
-    out = tuple(WayTrade(way.name, refusal=reasons[way][0]) for way in later if way not in wanted)
-    objects = tuple(replace(o, ways=(*o.ways, *out)) if o.ways else o for o in again.objects)
+    few, gathering, reasons = _promising([again.objects[k] for k in seen], ahead, later, job)
+    while gathering:
+        look.more([gathering], FIRST, seeded(seed, 72), progress)
+        again = look.assessment(seed)
+        if not all(again.objects[k].way(gathering.name).refusal for k in seen):
+            few.append(gathering)
+            _go_on(look, again, few, (max(left_of(again), LAST_SHARE * seconds), told), seeded(seed, 73), progress)
+            again = look.assessment(seed)
+            break
+        later = [way for way in later if way != gathering]
+        few, gathering, reasons = _promising([again.objects[k] for k in seen], ahead, later, job)
+    out |= {way: reasons[way] for way in later if way != gathering}
+    rows = tuple(WayTrade(way.name, refusal=reason) for way, reason in out.items() if reason)
+    objects = tuple(replace(o, ways=(*o.ways, *rows)) if o.ways else o for o in again.objects)
     return replace(again, objects=objects)
 
 
-def _left_out(assessed: ObjectTrade, way: Way, tolerance: float, images: int, seconds: float) -> str:
+def _too_dear(
+    look: _Samples, walked: Assessment, chosen: Sequence[Way], tolerance: float, images: int
+) -> dict[Way, str]:
+    """Ways that are not worth a look beside walks, as their training alone takes longer than the job by these."""
+    found = {}
+    walks = [(k, _cheapest(o, tolerance, images)) for k, o in enumerate(walked.objects) if o.ways]
+    for way in chosen:
+        pairs = [(look.training(k, way), best) for k, best in walks]
+        if pairs and all(training > best for training, best in pairs):
+            training, best = pairs[0]
+            job = f"path_traced keeps {tolerance:.3g} in {best:.2g} s"
+            found[way] = f"not measured, as {job}, and the training of {way.model} took {training:.2g} s"
+    return found
+
+
+def _promising(
+    seen: Sequence[ObjectTrade], ahead: Sequence[Way], later: Sequence[Way], job: tuple[float, int | None, float, bool]
+) -> tuple[list[Way], Way | None, dict[Way, str]]:
+    """Walks and the ways that may win against them, the way whose light is worth gathering, and why others are not."""
+    tolerance, images, _, counted = job
+    names = {name for o in seen for name in contenders(o, tolerance)}
+    reasons = {way: [_left_out(o, way, *job) for o in seen] for way in later}
+    wanted = [way for way in later if "" in reasons[way]]
+    told, best = {way: given[0] for way, given in reasons.items()}, None
+    if wanted:
+        best = _most_promising(seen, wanted, tolerance, images or 1, counted)
+        told |= {way: f"not measured, as {best.name} promises more: ask for it by its name" for way in wanted}
+        names -= {way.model for way in wanted}  # they cannot win where gathering their light is worth its time
+    return [way for way in ahead if way.name in names or way.model == PATH_TRACED], best, told
+
+
+def _go_on(
+    look: _Samples, assessed: Assessment, few: Sequence[Way], budget: tuple[float, float | None], seed: int,
+    progress: NamedProgress | None,
+) -> None:  # fmt: skip
+    """Sample some ways further, for the seconds of the budget or until a bias² is known to its second number.
+
+    Noise is least where each has sqrt(V t) of the time; walks serve all others at once.
+    """
+    left, told = budget
+    parts, enough = dict.fromkeys(few, 0.0), dict.fromkeys(few, 0.0)
+    for k, o in enumerate(assessed.objects):
+        rows = {way: o.way(way.name) for way in few} if o.ways else {}
+        for way, row in rows.items():
+            if not row.refusal and row.variance > 0:
+                others = max(len(few) - 1, 1) if way.model == PATH_TRACED else 1
+                parts[way] = max(parts[way], math.sqrt(others * row.variance * row.seconds))
+                enough[way] = max(enough[way], look.enough(k, row, told))
+    whole = max(sum(parts.values()), 1e-30)
+    for way in few:
+        seconds = min(left * parts[way] / whole, enough[way])
+        if seconds > 0:
+            look.more([way], (seconds, None, 1.0), seeded(seed, few.index(way)), progress)
+
+
+def _gathering(row: WayTrade) -> float:
+    """Seconds of gathering two parts of the light of a model."""
+    return 2 * (PART * GATHERING * row.seconds + LIGHT_SECONDS)
+
+
+def _left_out(
+    assessed: ObjectTrade, way: Way, tolerance: float, images: int, seconds: float, counted: bool = True
+) -> str:
     """Why a way is not worth a look for an object, after a look at others; empty where it is."""
-    best, known = _cheapest(assessed, tolerance, images), {row.way: row for row in assessed.ways}
+    best, known = _cheapest(assessed, tolerance, images, counted), {row.way: row for row in assessed.ways}
     if way.model not in known:
         return f"not measured in less than {DEAR_SECONDS:g} s: ask for it by its name"
     row = known[way.model]
@@ -411,7 +548,7 @@ def _left_out(assessed: ObjectTrade, way: Way, tolerance: float, images: int, se
         return row.refusal
     if row.bias2 - DOUBT * row.bias2_error > tolerance**2:
         return f"not measured, as {way.model} is {row.told_bias} % off, asked {100 * tolerance:.3g} %"
-    least = _once(row) + GATHERING * row.seconds
+    least = _once(row, counted) + GATHERING * row.seconds
     if least > best:
         return f"not measured, as another way keeps {tolerance:.3g} in {best:.2g} s, before its light is gathered"
     parts = row.preparation + 2 * PART * GATHERING * row.seconds
@@ -420,7 +557,9 @@ def _left_out(assessed: ObjectTrade, way: Way, tolerance: float, images: int, se
     return ""
 
 
-def _most_promising(seen: Sequence[ObjectTrade], ways: Sequence[Way], tolerance: float, images: int) -> Way:
+def _most_promising(
+    seen: Sequence[ObjectTrade], ways: Sequence[Way], tolerance: float, images: int, counted: bool = True
+) -> Way:
     """The way by which the job is expected to end first.
 
     It keeps the tolerance by the chance that its model does, and takes what gathering takes then, else what the
@@ -432,22 +571,23 @@ def _most_promising(seen: Sequence[ObjectTrade], ways: Sequence[Way], tolerance:
         for o in seen:
             row = o.way(way.model)
             chance = NormalDist().cdf((tolerance**2 - max(row.bias2, 0.0)) / max(row.bias2_error, 1e-30))
-            total += chance * (_once(row) + GATHERING * row.seconds) + (1 - chance) * _cheapest(o, tolerance, images)
+            best = _cheapest(o, tolerance, images, counted)
+            total += chance * (_once(row, counted) + GATHERING * row.seconds) + (1 - chance) * best
         return total
 
     return min(ways, key=expected)
 
 
-def _cheapest(assessed: ObjectTrade, tolerance: float, images: int) -> float:
+def _cheapest(assessed: ObjectTrade, tolerance: float, images: int, counted: bool = True) -> float:
     """Seconds of a job by the ways that have been measured."""
     rows = [row for row in assessed.ways if not row.refusal and row.variance >= 0]
-    jobs = [samples_for(row, tolerance) * row.seconds * images * assessed.pixels + _once(row) for row in rows]
+    jobs = [samples_for(row, tolerance) * row.seconds * images * assessed.pixels + _once(row, counted) for row in rows]
     return min(jobs, default=math.inf)
 
 
-def _once(row: WayTrade) -> float:
+def _once(row: WayTrade, counted: bool = True) -> float:
     """Seconds before the first image."""
-    return row.preparation + row.training
+    return row.preparation + (row.training if counted else 0.0)
 
 
 def contenders(assessed: ObjectTrade, tolerance: float) -> list[str]:
@@ -461,10 +601,3 @@ def _at_best(row: WayTrade, tolerance: float) -> float:
     """Seconds for a pixel if the bias is as small as it may be."""
     left = tolerance**2 - max(row.bias2 - DOUBT * row.bias2_error, 0.0)
     return max(row.variance / left, 1.0) * row.seconds if left > 0 else math.inf
-
-
-def _traced_share(assessed: ObjectTrade, names: set[str]) -> float:
-    """Of the time, by which noise of differences is least: each way has sqrt(V t), walks serve all others at once."""
-    noise = [math.sqrt(r.variance * r.seconds) for r in assessed.ways if r.way in names and not r.refusal]
-    walks = math.sqrt(len(noise) * assessed.traced.variance * assessed.traced.seconds)
-    return min(max(walks / (walks + sum(noise)), TRACED[0]), TRACED[1]) if noise and walks > 0 else TRACED[1]

@@ -6,7 +6,7 @@ by chance the few of them that are drawn would decide all means.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -39,6 +39,10 @@ class Exits:
     @property
     def n(self) -> int:
         return self.o.shape[1]
+
+    def first(self, n: int) -> Exits:
+        """The first n of them, which are as random as all."""
+        return replace(self, o=self.o[:, :n], d=self.d[:, :n])
 
     def rays(self, each: int) -> Any:
         """Every ray `each` times, next to each other."""

@@ -8,11 +8,13 @@ from dataclasses import asdict, dataclass
 from html import escape
 from typing import TYPE_CHECKING, Any
 
-from halfspace_sss.noise_free import Z_UPPER, NoiseFree
+from halfspace_sss.noise_free import NoiseFree
 from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED
 
 if TYPE_CHECKING:
     import pandas
+
+DOUBT = 1.0  # standard errors that count as error: biases spread over decades, and few lie where less is told
 
 
 @dataclass(frozen=True)
@@ -89,7 +91,7 @@ class WayTrade:
         return self.variance / noise**2 * self.seconds
 
 
-def samples_for(row: WayTrade, tolerance: float, z: float = Z_UPPER) -> float:
+def samples_for(row: WayTrade, tolerance: float, z: float = DOUBT) -> float:
     """Samples n of a pixel by which bias² + variance / n and z of its standard errors are at tolerance²; inf for none.
 
     With a = tolerance² - bias² the smaller root of (a - V / n)² = z² (s² + (v / n)²).

@@ -6,7 +6,7 @@ import contextlib
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -22,7 +22,7 @@ from halfspace_sss.trade.statistics import RadianceEstimate, seeded
 from halfspace_sss.trade.ways import Stage, Way
 
 LANES = 2**18  # of a launch
-PILOT, FEWEST = 48, 8  # samples of each exit by which the time is foreseen, and of a launch that is worth it
+PILOT, FEWEST = 48, 8  # samples of each exit of the first launch, and of a launch that is worth it
 LEAST_SHARE = 0.2  # of the time of a launch that its samples take
 BLUR = 8.0  # 0.4 radians
 
@@ -35,10 +35,11 @@ class Sampled:
         estimate: radiance of the exits.
         preparation: seconds, of tables, surveys and gathering of all light, once for a scene.
         preparing: seconds that it took here, where a part of the light is gathered; 0 if it was known.
-        compilation: seconds of the first launch beyond those of the next, by the clock on the wall.
+        compilation: seconds of the first launch beyond those of the same one again, if it compiled a kernel, by the
+            clock on the wall.
         compiling: the same by `clock`.
-        overhead: seconds of a launch of hardly any samples.
-        launches: (samples of all exits, seconds) of each larger launch.
+        overhead: seconds of a launch whatever its samples: its paths are recorded, and their kernel is found again.
+        launches: (samples of all exits, seconds) of each launch that compiled nothing.
         memory: most bytes that Dr.Jit held while it ran.
         blur: of walks in a scene with delta lights, what of their light is blurred, see `sample_blur`.
     """
@@ -46,9 +47,9 @@ class Sampled:
     estimate: RadianceEstimate
     preparation: float
     preparing: float
-    compilation: float
-    compiling: float
-    overhead: float
+    compilation: float = 0.0
+    compiling: float = 0.0
+    overhead: float = 0.0
     memory: int = 0
     launches: list[tuple[int, float]] = field(default_factory=list)
     blur: RadianceEstimate | None = None
@@ -59,7 +60,7 @@ class Sampled:
         return min(max(took - self.overhead, LEAST_SHARE * took) / n for n, took in self.launches)
 
 
-def first_sample(stage: Stage, way: Way, exits: Exits, seed: int, object: int = 0) -> Sampled:
+def first_sample(stage: Stage, way: Way, exits: Exits, seed: int, each: int = PILOT, object: int = 0) -> Sampled:
     """Make a way ready and take few samples, which compiles its kernels; nothing if an earlier look knows its pace.
 
     Raises:
@@ -71,19 +72,33 @@ def first_sample(stage: Stage, way: Way, exits: Exits, seed: int, object: int = 
     integrator, started = stage.integrator(way), clock()
     _prepare(stage, integrator)
     preparation = preparing = clock() - started
-    prepared = time.perf_counter()
     if way.part:  # of all samples, after what is made ready for parts and whole alike
         made, light = integrator.gathering.seconds
         preparation += made * (1 / PART - 1) + light
-    estimate = RadianceEstimate(variant_channels(), exits.n)
-    _, first = _launch(stage, integrator, exits, estimate, 2, seeded(seed, 31, 0))
-    compiled = time.perf_counter()
-    _, overhead = _launch(stage, integrator, exits, estimate, 2, seeded(seed, 31, 1))
-    again = time.perf_counter() - compiled
-    waited = max(compiled - prepared - again, 0.0)
-    result = Sampled(estimate, preparation, preparing, waited, max(first - overhead, 0.0), overhead)
+        same = stage.paces.get((object, replace(way, light="sampled", part=0)))  # which made the objects for both
+        preparation += same.preparation if same else 0.0
+    result = Sampled(RadianceEstimate(variant_channels(), exits.n), preparation, preparing)
+    _first_launch(stage, integrator, exits, result, each, seeded(seed, 31))
     stage.paces[object, way] = result
     return result
+
+
+def _first_launch(stage: Stage, integrator: Any, exits: Exits, sampled: Sampled, each: int, seed: int) -> None:
+    """`each` samples of every exit; where a kernel was compiled the same again, for the time alone."""
+    began = time.perf_counter()
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        launch = _launch(stage, integrator, exits, sampled.estimate, each, seed)
+        kernels = dr.kernel_history([dr.KernelType.JIT])
+    ended = time.perf_counter()
+    if not all(kernel["cache_hit"] for kernel in kernels):
+        again = _launch(stage, integrator, exits, RadianceEstimate(variant_channels(), exits.n), each, seed)
+        sampled.compiling = max(launch.seconds - again.seconds, 0.0)
+        sampled.compilation = max(2 * ended - began - time.perf_counter(), 0.0)
+        launch = again
+    sampled.overhead = launch.recording + 1e-3 * sum(kernel["codegen_time"] for kernel in kernels)
+    sampled.memory = launch.memory
+    sampled.launches.append((exits.n * each, launch.seconds))
 
 
 def warm_up(stage: Stage, ways: Sequence[Way]) -> None:
@@ -125,16 +140,16 @@ def sample_more(
         if samples:
             each = samples - sampled.estimate.samples
         else:
-            each = _affordable(sampled, exits.n, seconds - (clock() - started)) if sampled.launches else PILOT
+            each = _affordable(sampled, exits.n, seconds - (clock() - started))
         if not sampled.estimate.samples:
             each = max(each, PILOT)
         if each < FEWEST:
             return
         each = min(each, most)
         number = seeded(seed, 32, sampled.estimate.samples)
-        memory, took = _launch(stage, integrator, exits, sampled.estimate, each, number)
-        sampled.memory = max(sampled.memory, memory)
-        sampled.launches.append((exits.n * each, took))
+        launch = _launch(stage, integrator, exits, sampled.estimate, each, number)
+        sampled.memory = max(sampled.memory, launch.memory)
+        sampled.launches.append((exits.n * each, launch.seconds))
 
 
 def sample_blur(stage: Stage, exits: Exits, seed: int, samples: int) -> RadianceEstimate:
@@ -152,7 +167,7 @@ def sample_blur(stage: Stage, exits: Exits, seed: int, samples: int) -> Radiance
     estimate, most = RadianceEstimate(variant_channels(), exits.n), max(LANES // exits.n, 2)
     while (each := min(samples - estimate.samples, most)) > 0:
         number, rays = seeded(seed, 33, estimate.samples), exits.rays(each)
-        without, spread = (_sampled(stage, integrator, rays, number) for integrator in integrators)
+        without, spread = (radiance(stage.scene, one, _sampler(number, rays), rays) for one in integrators)
         estimate.add(*_sums([b - a for a, b in zip(without, spread)], each), each)
     return estimate
 
@@ -162,29 +177,38 @@ def _affordable(sampled: Sampled, n: int, left: float) -> int:
     return int(max(left - sampled.overhead, 0) / (sampled.seconds * n))
 
 
+class TimedLaunch(NamedTuple):
+    """Bytes and seconds that it took, and seconds of these until its kernel ran."""
+
+    memory: int
+    seconds: float
+    recording: float
+
+
 def _launch(
     stage: Stage, integrator: Any, exits: Exits, estimate: RadianceEstimate, each: int, seed: int
-) -> tuple[int, float]:
-    """`each` samples of every exit; bytes and seconds that it took."""
+) -> TimedLaunch:
+    """`each` samples of every exit."""
     rays = exits.rays(each)
     dr.flush_malloc_cache()
     dr.detail.malloc_clear_statistics()
     started = clock()
-    L = _sampled(stage, integrator, rays, seed)
+    L = _recorded(stage.scene, integrator, _sampler(seed, rays), rays)
+    recorded = clock()
+    dr.eval(L)
     first, second = _sums(L, each)
-    took = clock() - started
+    ended = clock()
     memory = int(dr.detail.malloc_watermark(dr.backend_v(mi.Float)))
     estimate.add(first, second, each)
     estimate.add_bright(np.array([c.numpy() for c in L]), each)
-    return memory, took
+    return TimedLaunch(memory, ended - started, recorded - started)
 
 
-def _sampled(stage: Stage, integrator: Any, rays: Any, seed: int) -> list[Any]:
-    """Radiance of rays, by channel."""
-
-    sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(seed, dr.width(rays))
-    return radiance(stage.scene, integrator, sampler, rays)
+def _sampler(seed: int, rays: Any) -> Any:
+    """Independent numbers for each ray."""
+    result = mi.load_dict({"type": "independent"})
+    result.seed(seed, dr.width(rays))
+    return result
 
 
 def _sums(L: list[Any], each: int) -> tuple[np.ndarray, np.ndarray]:
@@ -210,10 +234,15 @@ def radiance(scene: Any, integrator: Any, sampler: Any, ray: Any) -> list[Any]:
         sampler: of a number for each ray at a time.
         ray: all of them.
     """
+    L = _recorded(scene, integrator, sampler, ray)
+    dr.eval(L)
+    return L
+
+
+def _recorded(scene: Any, integrator: Any, sampler: Any, ray: Any) -> list[Any]:
+    """Radiance of rays that is to be evaluated."""
     sampler.schedule_state()
     dr.schedule(ray.o, ray.d)
     dr.eval()
     ray, nothing = mi.Ray3f(ray.o, ray.d), dr.zeros(mi.Float, sampler.wavefront_size())
-    L = [c + nothing for c in integrator.sample(scene, sampler, ray, None, mi.Bool(True))[0]]
-    dr.eval(L)
-    return L
+    return [c + nothing for c in integrator.sample(scene, sampler, ray, None, mi.Bool(True))[0]]

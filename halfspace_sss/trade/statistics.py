@@ -56,6 +56,13 @@ class RadianceEstimate:
             index = np.argpartition(row, -keep)[-keep:]
             self.bright[c] = tuple(np.concatenate(p) for p in zip(self.bright[c], (row[index], index // each)))
 
+    def of_first(self, n: int) -> RadianceEstimate:
+        """Of the first n exits."""
+        result = RadianceEstimate(len(self.first), n)
+        result.add(self.first[:, :n], self.second[:, :n], self.samples)
+        result.bright = [(values[exits < n], exits[exits < n]) for values, exits in self.bright]
+        return result
+
     @property
     def mean(self) -> np.ndarray:
         return self.first / max(self.samples, 1)

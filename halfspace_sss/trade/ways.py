@@ -122,6 +122,9 @@ class Stage:
             self._integrators[way] = mi.load_dict(plugin)
             if way.part:
                 self._integrators[way].gathering = Gathering(way.part)
+            sampled = self._integrators.get(replace(way, light="sampled", part=0))
+            if way.light == GATHERED and sampled is not None and not mi.is_spectral:  # which refuses gathered light
+                self._integrators[way].take_over(sampled)
         return self._integrators[way]
 
     def forget(self, way: Way) -> None:

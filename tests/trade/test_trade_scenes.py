@@ -116,13 +116,14 @@ def test_all_channels_of_exits_and_images_are_traced_once_and_by_one_kernel() ->
     on, way = stage(scene()), Way.of("better_dipole")
     (exits,) = visible_exits(on.scene, on.shapes, 0, 32, 0)
     found = first_sample(on, way, exits, 0)
+    known = len(found.launches)
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
         sample_more(on, way, exits, found, 0, samples=66)
         small_images(on, [way], 0, 0, side=8, spp=4)
         kernels = dr.kernel_history([dr.KernelType.JIT])
     paths = [kernel["hash"] for kernel in kernels if "Symbolic loop: bssrdf" in kernel["ir"].getvalue()]
-    assert len(paths) == len(found.launches) + 1 == 2 and len(set(paths)) == 1
+    assert len(paths) == len(found.launches) - known + 1 == 2 and len(set(paths)) == 1
 
 
 def test_ten_objects_are_assessed_one_by_one() -> None:
@@ -158,7 +159,7 @@ def test_the_second_look_goes_on_with_the_samples_of_the_first_and_gathers_light
     asked = ["better_dipole", "better_dipole, gathered"]
     found = assess(scene(orders="multiple"), models=asked, tolerance=0.05, **QUICK).objects[0]
     walks = [samples for way, samples in known if way == Way("path_traced")]
-    assert len(walks) == 2 and walks[0] < walks[1] and found.traced.samples > 64 * walks[1]
+    assert len(walks) == 2 and 0 < walks[0] <= walks[1] and found.traced.samples > 64 * walks[1]
     sampled, gathered = (found.way(name) for name in asked)
     error = np.hypot(sampled.ratio_error, gathered.ratio_error)
     assert np.all(np.abs(np.subtract(sampled.ratio, gathered.ratio)) < 4 * error + 0.03)

@@ -386,6 +386,10 @@ class TranslucentObjects:
             lookup(settings.model)
         self.choices = Choices({}, settings.light, {})  # for as long as the objects are the same
 
+    def take_over(self, other: TranslucentObjects) -> None:
+        """What another has made by the same settings but for the light, which no model needs to know."""
+        self._made, self._places = other._made, other._places
+
     def of(self, scene: Any) -> list[TranslucentObject]:
         """The objects of a scene; errors as in `make_objects`."""
         shapes = scene.shapes()  # the scene itself, which holds its integrator, would never be freed

@@ -83,6 +83,10 @@ def _class(variant: str) -> type:
                 return objects
             return self.gathering.of(scene, objects, self.settings)
 
+        def take_over(self, other: mi.Integrator) -> None:
+            """The objects of another integrator of this class that differs in light alone."""
+            self._objects.take_over(other._objects)
+
         def check(self, scene: mi.Scene, without: Collection[str] = ()) -> None:
             """ValueError if the scene cannot be rendered, as far as can be told without the objects `without`."""
             check_parameters(scene)
