@@ -9,11 +9,12 @@ from dataclasses import dataclass, field, replace
 from statistics import NormalDist
 from typing import Any
 
+import numpy as np
+
 from halfspace_sss.backend import clock
 from halfspace_sss.checks import check_count, check_interval, renamed
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.rendering.object.registry import learnt_names, lookup
-from halfspace_sss.rendering.object.shape import survey
 from halfspace_sss.rendering.object.wrapped import surface_of
 from halfspace_sss.rendering.paths.gathering import PART
 from halfspace_sss.rendering.scenes.learners import CostedLearner, Learner, learner
@@ -44,7 +45,11 @@ BLUR_EFFECT = 0.1
 BLUR_SEEN = 0.04  # probability that a direction is in the cone of `sample_blur`
 FIRST = (0.0, None, 1.0)  # budget of a look by the first samples alone
 MOST, FEWEST, POINTS = 384, 64, 5e-3  # of points for a tolerance, and how many times V t
-LOOK = 16_000  # samples of all points by which a way is looked at first
+LOOK, SLOW = (
+    16_000,
+    4,
+)  # samples of all points by which a way is looked at first; for walks, which may be slow, a quarter
+WALKED_FIRST = 0.15  # seconds of walks that tell how many points and which ways are worth a look
 FIRST_SHARE = 0.45  # of the time, for the look at all ways
 LEAST_SHARE = 0.25  # of the time, for walks and what may win against them, however long all else takes
 LAST_SHARE = 0.05  # likewise, after light has been gathered
@@ -285,7 +290,8 @@ def _unseen(name: str, mfp: tuple[float, float]) -> ObjectTrade:
 
 def _mfp(on: Stage, k: int) -> tuple[float, float]:
     """Mean free paths across an object."""
-    size = survey(on.shapes[k]).size * on.mm_per_unit
+    box = on.shapes[k].bbox()
+    size = float(np.linalg.norm(np.array(box.max, dtype=float) - np.array(box.min, dtype=float))) * on.mm_per_unit
     thickness = [size * float(m.sigma_t) for m in surface_of(on.shapes[k]).inside.channels()]
     return min(thickness), max(thickness)
 
@@ -315,7 +321,8 @@ def _object(
             started = clock()
             try:
                 number = seeded(seed, chosen.index(way), *([half] if half else []))
-                each = PILOT if samples else max(PILOT, LOOK // points.n)
+                few, least = (LOOK, PILOT) if way.model != PATH_TRACED else (LOOK // SLOW, PILOT // SLOW)
+                each = PILOT if samples else max(least, few // points.n)
                 result, beside = _begun(on, part, points, (number, each), k, sampled[way], half)
                 end, started = end + beside, started + beside
                 left = share / len(way.halves) * (end - started) - (clock() - started)
@@ -434,7 +441,8 @@ def assess_for(
     ahead = [way for way in chosen if way not in later]
     look = _Samples.of(on, ahead, sensor, min(exits, MOST) if images else exits, seed)
     if images:
-        look.more([way for way in ahead if way.model == PATH_TRACED], FIRST, seeded(seed, 42), progress)
+        for number, budget in ((42, FIRST), (44, (WALKED_FIRST, None, 1.0))):  # the first launch tells little of time
+            look.more([way for way in ahead if way.model == PATH_TRACED], budget, seeded(seed, number), progress)
         first = look.assessment(seed)
         out = _too_dear(look, first, chosen, tolerance, images) if count_training else {}
         ahead, later = ([way for way in ways if way not in out] for ways in (ahead, later))
