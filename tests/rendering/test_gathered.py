@@ -10,6 +10,7 @@ import pytest
 
 from full_geometry.learning.meshes import Box, surface
 from full_geometry.learning.shapes import box
+from halfspace_sss.rendering.gathered.entries import StratifiedEntries
 from halfspace_sss.rendering.gathered.points import SurfacePoints, uniform_entries
 from halfspace_sss.rendering.gathered.transfer import Incident, RowUniforms, _agreement
 from halfspace_sss.rendering.object.shape import survey
@@ -222,6 +223,20 @@ def test_numbers_of_a_row_are_one_in_each_stratum() -> None:
     one, pair = np.array(sampler.next_1d()).reshape(3, 64), np.array(sampler.next_2d()).reshape(2, 3, 64)
     assert np.allclose(np.diff(np.sort(one), axis=1), 1 / 64, atol=1e-6)
     assert (np.diff(np.sort(pair), axis=2) < 4 / 64).all()
+
+
+def test_entries_by_even_steps_weigh_the_area_and_are_as_many_in_a_half_by_every_seed() -> None:
+    scene = _scene("sampled", lights=_lights("sky"))
+    obj = scene.integrator().prepare(scene)[0]
+    points, n = SurfacePoints.of(obj.geometry, 256), 64
+    right, weights, counts = np.array(points.p)[0] > 0, [], []
+    for seed in range(6):
+        entries = StratifiedEntries.of(obj.proposals.positions, points, n, seed)
+        weights.append(np.mean(entries.weight) / obj.geometry.area)
+        counts.append(right[entries.near.reshape(-1, n)].sum(axis=1))
+    share = np.mean(counts, axis=0) / n
+    assert np.mean(weights) == pytest.approx(1, abs=0.05)
+    assert np.var(counts, axis=0, ddof=1).mean() < 0.25 * (n * share * (1 - share)).mean()  # 1 by chance
 
 
 def test_directions_that_are_traced_further_cover_the_hemisphere() -> None:

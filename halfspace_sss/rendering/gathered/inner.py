@@ -126,7 +126,9 @@ def _occupied(x: np.ndarray, h: float) -> int:
 def _places(obj: TranslucentObject, count: int) -> tuple[mi.Point3f, mi.Normal3f]:
     """Events along rays that are refracted inwards, and normals where they enter."""
     k = dr.arange(mi.UInt32, count)
-    u = [mi.Float(((np.arange(1, count + 1) * r + 0.5) % 1.0).astype(np.float32)) for r in R_3]
+    u = [(np.arange(1, count + 1) * r + 0.5) % 1.0 for r in R_3]
+    order = np.argsort(u[0])  # by faces: rays of neighbours meet the same part of the surface
+    u = [mi.Float(v[order].astype(np.float32)) for v in u]
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(11, count)
     entry = uniform_entries(obj.geometry, u[0], mi.Point2f(u[1], u[2]))

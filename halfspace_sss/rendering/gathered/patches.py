@@ -139,15 +139,16 @@ def patch_transfer(obj: TranslucentObject, count: int | None = None, samples: in
     areas, places = _areas(obj, cells)
     pair = (np.arange(count)[:, None] * count + result.near)[result.known]
     across = _evaluated(obj, points, places, result.albedo)
+    expects = result.a * result.cosine * result.area[:, :, None]
     n = np.bincount(pair, minlength=count**2).reshape(count, count)
     T, moments = np.empty((count, count, result.S.shape[2]), dtype=np.float32), []
     for c in range(T.shape[2]):
-        S, h = result.S[result.known, c], (result.a * result.h)[result.known, c]
+        S, h = result.S[result.known, c], expects[result.known, c]
         both, square = (np.bincount(pair, x, count**2).reshape(count, count) for x in (S * h, h * h))
         typical = result.a[:, :, c].mean(axis=1)[:, None] * areas  # h of a cell is drawn with its share of S
         held = HELD * np.where(n > 0, square / np.maximum(n, 1), typical**2)
         T[:, :, c] = (both + held * across[:, :, c]) / np.maximum(square + held, 1e-30)
-        expected = result.known * T[np.arange(count)[:, None], result.near, c] * result.a[:, :, c] * result.h[:, :, c]
+        expected = result.known * T[np.arange(count)[:, None], result.near, c] * expects[:, :, c]
         S, S_j, h_j = result.S[:, :, c], result.S[:, :, c].mean(axis=1), expected.mean(axis=1)
         moments.append([(S * expected).mean(), (expected**2).mean(), (S_j * h_j).mean(), (h_j**2).mean()])
     flux = np.maximum(T.mean(axis=2) * areas, 0)

@@ -40,6 +40,7 @@ LOOKS = (23, 24)  # seeds of such places
 REACH = 2.0  # h over the mean distance of points
 MOST_CELLS = 2**22
 LIKE = 0.2  # difference of logarithms of colours that are blended
+GOLDEN = 0.6180339887498949
 R_3 = (
     0.8191725133961645,
     0.6710436067037893,

@@ -5,9 +5,16 @@ Directions are taken apart: with the directional albedo a(mu) of the model,
     S(x_i, w_i; x_o, w_o) ~ a(w_o) q(x_i, x_o) a(w_i),    L_o(x_o, w_o) = a(w_o) B(x_o),    B_j = Σ_s t_js L_k(j,s),
 
 L_k the mean of the incident radiance at point k, weighted by a(mu_i) mu_i. Of each point j the entries s are drawn by
-the proposals of the model, with directions at both ends, so that under the same light from everywhere the sum is an
-unbiased estimate of what the model gives. Where the model knows its directional albedo there (`alpha`), the row is
-normalised by that.
+the distance from it, see `entries`, with directions at both ends, so that under the same light from everywhere the sum
+is an unbiased estimate of what the model gives. Where the model knows its directional albedo there (`alpha`), the row
+is normalised by that.
+
+What S has beyond that, as it depends on directions at both ends, brings the slope of light over w_i, and B a slope over
+w_o. For these the entries weigh
+
+    t_js - T_j/n a(mu_i) mu_i a(mu_o) / (p(w_i) <a mu a>),    T_j = Σ_s t_js,
+
+<a mu a> the mean of the numerator over p in the row: the second term brings nothing on average, and most of the noise.
 
 Textures vary over less than the distance of points. The medium at entries is that of their own places, and with the
 reflectance R of the half-space at the exit
@@ -28,15 +35,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from halfspace_sss.physics.fresnel import F_t
-from halfspace_sss.rendering.gathered.points import REACH, SurfacePoints
-from halfspace_sss.rendering.object.points import SurfacePoint, cosine_above, opaque, wrapped
+from halfspace_sss.rendering.gathered.entries import StratifiedEntries
+from halfspace_sss.rendering.gathered.points import GOLDEN, REACH, SurfacePoints
+from halfspace_sss.rendering.object.points import EntrySample, SurfacePoint, cosine_above, evaluate, opaque, wrapped
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -45,18 +53,18 @@ if TYPE_CHECKING:
 
 PER_LENGTH = 2.0  # points over a transport mean free path
 FEWEST, MOST = 1024, 8192  # points
-SAMPLES = 2**20  # entries of all points
-FEWEST_ENTRIES = 16  # of a point
+SAMPLES = 3 * 2**17  # entries of all points,
+FEWEST_ENTRIES, FEWEST_OF_PART = 48, 16  # and of a point
 FITTED = 2**18
 SEED = 7
 SMOOTHINGS = 16  # of what directions bring
 RINGS = 2.0, 5.0  # distances of entries that part the rings, over that of points,
 ROUNDS = 0, 2, 8  # and how often what each brings is smoothed,
 SHARE_ROUNDS = 2, 4, 8  # and its share of the row
-HALVES = 2  # of the entries of a row, which are independent
+HALVES = 2  # of the entries of a row,
+EXITS = 4  # and directions of exits of each
 BLOCK = 64  # rows
 R_2 = 0.7548776662466927, 0.5698402909980532
-GOLDEN = 0.6180339887498949
 LATTICE = 128  # directions of a hemisphere
 
 
@@ -142,9 +150,9 @@ class Hemispheres(NamedTuple):
         w, _ = cosine_above(n_out, n, mi.Point2f((s + 0.5) / LATTICE, wrapped(s * GOLDEN)))
         a = albedo(cosine(w, n, n_out)) * dr.pi
         weight = dr.mean(a)
-        sums = [*a, *(weight * w), *(weight * w[i] * w[k] for i in range(3) for k in range(3)), weight]
-        sums = [dr.block_sum(v, LATTICE) for v in sums]
-        dr.eval(sums)
+        values = [*a, *(weight * w), *(weight * w[i] * w[k] for i in range(3) for k in range(3)), weight]
+        dr.eval(values)  # once for all sums
+        sums = [dr.block_sum(v, LATTICE) for v in values]
         *rows, total = (np.array(v, dtype=float) for v in sums)
         whole, middle, second = np.split(np.stack(rows, axis=1), [len(rows) - 12, len(rows) - 9], axis=1)
         middle, second = (v / np.maximum(total, 1e-30)[:, None] for v in (middle, second))
@@ -159,7 +167,8 @@ class Transfer:
     Args:
         points: where light is gathered and where it leaves.
         entry: (points, samples) numbers of the points that entries are at.
-        t: (points, samples, channels).
+        t: (points, samples, channels),
+        beyond: and what of it is for the dependence on directions.
         ring: (points, samples) of entries, by their distance.
         w_i: (points, samples, 3) directions of entries.
         d_o: (points, samples, 3) directions of exits less their `middle`, (points, 3), both weighted by a.
@@ -172,6 +181,7 @@ class Transfer:
     points: SurfacePoints
     entry: np.ndarray
     t: np.ndarray
+    beyond: np.ndarray
     ring: np.ndarray
     w_i: np.ndarray
     d_o: np.ndarray
@@ -189,7 +199,8 @@ class Transfer:
     @property
     def nbytes(self) -> int:
         """Memory of all arrays of entries."""
-        return sum(v.nbytes for v in (self.entry, self.t, self.ring, self.w_i, self.d_o, self.middle, self.inverse))
+        of_entries = self.entry, self.t, self.beyond, self.ring, self.w_i, self.d_o
+        return sum(v.nbytes for v in (*of_entries, self.middle, self.inverse))
 
     def by_place(self, L: Incident) -> np.ndarray:
         """What leaves by the means of the light at the places of entries, (points, channels).
@@ -251,17 +262,17 @@ class Transfer:
         axes = [np.ascontiguousarray(L.slope[:, :, axis]) for axis in range(3)]
         found, ones = np.empty((*L.mean.shape, 4), dtype=L.mean.dtype), np.ones(half.stop - half.start, self.t.dtype)
         for rows in self._blocks:
-            entry, t, d_o = self.entry[rows, half], self.t[rows, half], self.d_o[rows, half]
+            entry, t, beyond, d_o = (v[rows, half] for v in (self.entry, self.t, self.beyond, self.d_o))
             d_i = self.w_i[rows, half] - np.take(L.middle, entry, axis=0)
-            more = np.take(axes[0], entry, axis=0) * d_i[:, :, 0, None]
+            aside = np.take(axes[0], entry, axis=0) * d_i[:, :, 0, None]
             for axis in (1, 2):
-                more += np.take(axes[axis], entry, axis=0) * d_i[:, :, axis, None]
-            more *= t
-            arriving = t * np.take(L.mean, entry, axis=0)
-            arriving += more
-            found[rows, :, 0] = ones @ more  # twice as fast as a sum over the axis
-            slope, even = (v.transpose(0, 2, 1) @ d_o for v in (arriving, t))
-            brings = (ones @ arriving) / np.maximum(ones @ t, 1e-30)
+                aside += np.take(axes[axis], entry, axis=0) * d_i[:, :, axis, None]
+            arriving = np.take(L.mean, entry, axis=0)
+            found[rows, :, 0] = ones @ (beyond * aside)  # twice as fast as a sum over the axis
+            arriving += aside
+            brings = (ones @ (t * arriving)) / np.maximum(ones @ t, 1e-30)
+            arriving *= beyond
+            slope, even = (v.transpose(0, 2, 1) @ d_o for v in (arriving, beyond))
             found[rows, :, 1:] = slope - even * brings[:, :, None]  # 0 in uniform light, where a(w_o) is all
         found[:, :, 1:] = np.einsum("jck,jki->jci", found[:, :, 1:], self.inverse)
         return found
@@ -282,18 +293,20 @@ def count_of(obj: TranslucentObject) -> int:
     return int(np.clip(obj.geometry.area * (PER_LENGTH * sigma) ** 2, FEWEST, MOST))
 
 
-def transfer(obj: TranslucentObject, count: int | None = None, samples: int = SAMPLES, seed: int = SEED) -> Transfer:
-    """The transfer of an object, by its model and the proposals of that."""
-    points = SurfacePoints.of(obj.geometry, count or count_of(obj))
-    result = drawn(obj, points, lambda p, n, _, active: points.nearest(p, n, active), samples, seed)
-    e = _exponents(points, result)
+def transfer(obj: TranslucentObject, share: float = 1.0, seed: int = SEED) -> Transfer:
+    """The transfer of an object, by its model and the radial density of its proposals, with a share of all entries."""
+    points = SurfacePoints.of(obj.geometry, count_of(obj))
+    n = max(int(share * max(SAMPLES / len(points), FEWEST_ENTRIES)), FEWEST_OF_PART)
+    result = stratified(obj, points, n, seed)
     paint = None if obj.textured is None else result.paint
+    e = np.zeros(result.S.shape[2], np.float32) if paint is None else _exponents(points, result)
     t, error = _rows(points, result.S / (result.paint**e)[:, None], (_trusted(obj), paint), result.a)
-    near = np.where(result.known, result.near, np.arange(len(points), dtype=np.uint32)[:, None])
     centred = _centred(result.w_o, result.a.mean(axis=2))
     # rows beside an edge of a texture are not to be averaged with those beyond
-    ring = _rings(points, near) if paint is None else np.zeros(near.shape, np.uint8)
-    return Transfer(points, near, t, ring, result.w_i, *centred, result.albedo, error, e)
+    ring = _rings(points, result.near) if paint is None else np.zeros(result.near.shape, np.uint8)
+    expected = result.cosine * result.a
+    expected *= t.sum(axis=1, keepdims=True) / np.maximum(expected.sum(axis=1, keepdims=True), 1e-30)
+    return Transfer(points, result.near, t, t - expected, ring, result.w_i, *centred, result.albedo, error, e)
 
 
 def _rings(points: SurfacePoints, entry: np.ndarray) -> np.ndarray:
@@ -322,26 +335,41 @@ class RowUniforms:
     def __init__(self, row: mi.UInt32, k: mi.UInt32, rows: int, n: int, seed: int) -> None:
         self._row, self._k, self._rows, self._n, self._rng = row, k, rows, n, np.random.default_rng(seed)
 
-    def _shifted(self, u: np.ndarray) -> mi.Float:
-        u, shift = (mi.Float(v.astype(np.float32)) for v in (u, self._rng.random(self._rows)))
-        return wrapped(dr.gather(mi.Float, u, self._k) + dr.gather(mi.Float, shift, self._row))
-
     def next_1d(self, active: mi.Bool = True) -> mi.Float:
         """The next number of each lane."""
-        return self._shifted(self._rng.permutation(self._n) / self._n)
+        return self._lattice(self._rng.permutation(self._n) / self._n)(self._row, self._k)
 
     def next_2d(self, active: mi.Bool = True) -> mi.Point2f:
         """The next pair."""
+        return mi.Point2f(*(one(self._row, self._k) for one in self.pair()))
+
+    def pair(self) -> list[Lattice]:
+        """The next pair, for any row and place in it."""
         order = self._rng.permutation(self._n)
-        return mi.Point2f(*(self._shifted(order * r % 1.0) for r in R_2))
+        return [self._lattice(order * r % 1.0) for r in R_2]
+
+    def _lattice(self, u: np.ndarray) -> Lattice:
+        return Lattice(*(mi.Float(v.astype(np.float32)) for v in (u, self._rng.random(self._rows))))
+
+
+class Lattice(NamedTuple):
+    """Numbers of each place in a row, and the shift of each row."""
+
+    u: mi.Float
+    shift: mi.Float
+
+    def __call__(self, row: mi.UInt32, k: mi.UInt32) -> mi.Float:
+        """Number k of a row."""
+        return wrapped(dr.gather(mi.Float, self.u, k) + dr.gather(mi.Float, self.shift, row))
 
 
 class DrawnEntries(NamedTuple):
-    """Entries that the proposals draw for exits at points: n for each, in arrays (points, n) and more.
+    """Entries that are drawn for exits at points: n for each, in arrays (points, n) and more.
 
     Args:
         S: S mu_i over the density, per channel.
-        h: a(mu_i) mu_i / ∫ a(mu) mu dw over the density, per channel.
+        cosine: a(mu_i) mu_i / ∫ a(mu) mu dw over the density of directions, per channel.
+        area: inverse of the density of entries.
         near, known: the point that the entry is nearest to, and whether there is one.
         w_i, w_o: directions.
         a: directional albedo at the exit, per channel.
@@ -350,7 +378,8 @@ class DrawnEntries(NamedTuple):
     """
 
     S: np.ndarray
-    h: np.ndarray
+    cosine: np.ndarray
+    area: np.ndarray
     near: np.ndarray
     known: np.ndarray
     w_i: np.ndarray
@@ -360,34 +389,109 @@ class DrawnEntries(NamedTuple):
     paint: np.ndarray
 
 
-def drawn(
-    obj: TranslucentObject, points: SurfacePoints, cell: Callable, samples: int, seed: int = SEED
-) -> DrawnEntries:
-    """As many entries for each point; `cell` of position, outward normal, face and mask says which they are near."""
-    n = max(samples // len(points), FEWEST_ENTRIES) // HALVES * HALVES
+class _Brought(NamedTuple):
+    """By entries: S mu_i over their density, the direction of incidence, its cosine, and that over its density."""
+
+    S: mi.Spectrum
+    w_i: mi.Vector3f
+    mu_i: mi.Float
+    over: mi.Float
+
+
+def drawn(obj: TranslucentObject, points: SurfacePoints, cell: Callable, samples: int) -> DrawnEntries:
+    """As many entries for each point, by the proposals; `cell` of position, normal, face and mask is what is near."""
+    n = samples // len(points) // HALVES * HALVES
     k = dr.arange(mi.UInt32, len(points) * n)
     each = dr.opaque(mi.UInt32, n // HALVES)  # kernels are those of other numbers of points too
     half, active = k // each, mi.Bool(True)
-    j, sampler = half // HALVES, RowUniforms(half, k % each, HALVES * len(points), n // HALVES, seed)
+    j, sampler = half // HALVES, RowUniforms(half, k % each, HALVES * len(points), n // HALVES, SEED)
     out, face = points.exit(j, sampler.next_2d())
     out = obj.knowing(out, face)
-    S, inverse, entry, w_i = _sample(obj, out, face, sampler, active)
+    prepared = obj.transport.prepare(out, active)
+    entry = obj.proposals.sample(out, face, obj.proposals.prepare(out, prepared, active), sampler, active)
+    brought = _brought(obj, prepared, out, entry, sampler.next_2d())
     near, known = cell(entry.p, entry.n, entry.face, entry.weight > 0)
-    mu, mu_i = dr.dot(out.w, out.n_out), cosine(w_i, entry.n, entry.n_out)
-    paint = mi.Spectrum(1) if obj.textured is None else obj.transport.paint(out)
-    dr.eval(S, inverse, near, known, mu, mu_i, w_i, out.w, paint)
-    shape = (len(points), n)
-    S = np.array(S, dtype=np.float32).reshape(-1, *shape).transpose(1, 2, 0)
-    S = np.nan_to_num(S, nan=0.0, posinf=0.0, neginf=0.0)
-    albedo = _fitted(obj, np.array(mu), S.reshape(-1, S.shape[2]))
+    paint = _paint(obj, out)
+    evaluate(brought, near, known, out, paint, entry.weight)
+    places = [np.array(v).reshape(len(points), n) for v in (near, known, entry.weight)]
+    return _collected(obj, brought, places, out, paint)
+
+
+def stratified(obj: TranslucentObject, points: SurfacePoints, n: int, seed: int) -> DrawnEntries:
+    """About n entries for each point, by their distance from it; those of one exit share what S asks of that."""
+    n //= HALVES * EXITS
+    each, exits, size = dr.opaque(mi.UInt32, n), dr.opaque(mi.UInt32, EXITS), dr.size_v(mi.Spectrum)
+    rows, n = HALVES * len(points), EXITS * n
+    lane = dr.arange(mi.UInt32, rows * EXITS)
+    half, k = lane // exits, lane % exits
+    out, face = points.exit(half // HALVES, RowUniforms(half, k, rows, EXITS, seed).next_2d())
+    out = obj.knowing(out, face)
+    prepared, paint = obj.transport.prepare(out, mi.Bool(True)), _paint(obj, out)
+    entries = StratifiedEntries.of(obj.proposals.positions, points, HALVES * n, seed)
+    u = RowUniforms(half, k, rows, n, seed + 1).pair()
+    S, w_i, mu_i, over = (dr.zeros(mi.Float, c * rows * n) for c in (size, 3, 1, 1))
+    evaluate(out, paint, u, S, w_i, mu_i, over)
+
+    def step(i: mi.UInt32) -> tuple[mi.UInt32]:
+        s = i * exits + k  # of the half, which has every second entry along the surface
+        entry = entries((half // HALVES * each * exits + s) * HALVES + half % HALVES)
+        if obj.textured is not None:
+            entry = entry._replace(medium=obj.textured.at_point(obj.geometry, entry.p, entry.n, entry.face))
+        brought = _brought(obj, prepared, out, entry, mi.Point2f(*(one(half, s) for one in u)))
+        for target, value in zip((S, w_i, mu_i, over), brought):
+            dr.scatter(target, value, half * each * exits + s)
+        return (i + 1,)
+
+    dr.while_loop((mi.UInt32(0) + dr.zeros(mi.UInt32, rows * EXITS),), lambda i: i < each, step, label="entries")
+    dr.eval(S, w_i, mu_i, over)
+    along, whole = (len(points), n, HALVES), (len(points), HALVES * n)
+    near, area = (v.reshape(along).swapaxes(1, 2).reshape(whole) for v in (entries.near, np.array(entries.weight)))
+    brought = _Brought(dr.unravel(mi.Spectrum, S), dr.unravel(mi.Vector3f, w_i), mu_i, over)
+    return _collected(obj, brought, [near, area > 0, area], out, paint)
+
+
+def _paint(obj: TranslucentObject, out: SurfacePoint) -> mi.Spectrum:
+    """The reflectance at exits, where media have textures; else 1."""
+    one = dr.zeros(mi.Spectrum, dr.width(out.p)) + 1
+    return one if obj.textured is None else mi.Spectrum(obj.transport.paint(out))
+
+
+def _brought(obj: TranslucentObject, prepared: Any, out: SurfacePoint, entry: EntrySample, u: mi.Point2f) -> _Brought:
+    """By entries of exits, along directions for pairs of uniform numbers."""
+    w_i, pdf = obj.proposals.sample_direction(entry, out, u)
+    active = (entry.weight > 0) & (pdf > 0)
+    over = dr.select(active, 1 / dr.maximum(pdf, 1e-8), 0)
+    at = entry.facing(mi.Vector3f(w_i))
+    S = obj.transport.S(prepared, at, active) * (at.mu * over * entry.weight)
+    mu_i = cosine(at.w, entry.n, entry.n_out)
+    return _Brought(mi.Spectrum(dr.select(active, S, 0)), at.w, mi.Float(mu_i), mi.Float(mu_i * over))
+
+
+def _collected(
+    obj: TranslucentObject, brought: _Brought, places: list[np.ndarray], out: SurfacePoint, paint: mi.Spectrum
+) -> DrawnEntries:
+    """Arrays of entries, of which some share an exit: near, known and area of each, and what it brought."""
+    near, known, area = places
+    count, n = near.shape
+
+    def of_entries(v: Any) -> np.ndarray:
+        """(points, entries, channels) of values of exits, of which each half has its own for entries in turn."""
+        v = np.atleast_2d(np.array(v, dtype=np.float32)).T
+        v = v.reshape(count, HALVES, 1, -1, v.shape[1])
+        return np.broadcast_to(v, (count, HALVES, n // (HALVES * v.shape[3]), *v.shape[3:])).reshape(count, n, -1)
+
+    S = np.array(brought.S, dtype=np.float32).T.reshape(count, n, -1)
+    S = np.nan_to_num(S, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
+    mu = dr.dot(out.w, out.n_out)
+    mu_o, w_o = of_entries(mu), of_entries(out.w)
+    R = np.array(paint, dtype=np.float32).T.reshape(count, -1, S.shape[2])[:, 0]
+    albedo = _fitted(obj, mu_o.ravel(), S.reshape(-1, S.shape[2]))
     if obj.textured is not None:
-        albedo = _tilted(albedo, np.array(mu).reshape(shape), S, np.array(paint)[:, ::n].T)
-    a = np.array(albedo(mu, paint)).T.reshape(S.shape)
-    h = np.array(albedo(mu_i) * (mu_i * inverse)).T.reshape(S.shape) / albedo.whole.astype(np.float32)
-    w_i, w_o = (np.array(w, dtype=np.float32).T.reshape(*shape, 3) for w in (w_i, out.w))
-    paint = np.broadcast_to(np.array(paint), (S.shape[2], len(mu)))[:, ::n].T
-    near, known = (np.array(v).reshape(shape) for v in (near, known))
-    return DrawnEntries(S, h, near, known, w_i, w_o, a, albedo, np.maximum(paint, 1e-20))
+        albedo = _tilted(albedo, mu_o[:, :, 0], S, R)
+    a = of_entries(mi.Spectrum(albedo(mu, paint)))
+    cosine = np.array(albedo(brought.mu_i) * brought.over).T.reshape(S.shape) / albedo.whole.astype(np.float32)
+    w_i = np.array(brought.w_i, dtype=np.float32).T.reshape(count, n, 3)
+    return DrawnEntries(S, cosine, area, near, known, w_i, w_o, a, albedo, np.maximum(R, 1e-20))
 
 
 def _centred(w: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -396,19 +500,6 @@ def _centred(w: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.n
     middle = np.einsum("js,jsi->ji", a, w)
     d = w - middle[:, None]
     return d, middle, np.linalg.inv(np.einsum("js,jsi,jsk->jik", a, d, d) + 1e-3 * np.eye(3))
-
-
-def _sample(obj: TranslucentObject, out: SurfacePoint, face: mi.UInt32, sampler: RowUniforms, active: mi.Bool) -> tuple:
-    """S mu_i over the density of an entry and its direction, the inverse of that, and both."""
-    prepared = obj.transport.prepare(out, active)
-    where = obj.proposals.prepare(out, prepared, active)
-    entry = obj.proposals.sample(out, face, where, sampler, active)
-    active = active & (entry.weight > 0)
-    w_i, pdf = obj.proposals.sample_direction(entry, out, sampler.next_2d())
-    at = entry.facing(w_i)
-    inverse = dr.select(active & (pdf > 0), entry.weight / dr.maximum(pdf, 1e-8), 0)
-    S = obj.transport.S(prepared, at, active & (pdf > 0)) * (at.mu * inverse)
-    return mi.Spectrum(dr.select(active & (pdf > 0), S, 0)), inverse, entry, mi.Vector3f(w_i)
 
 
 def _trusted(obj: TranslucentObject) -> np.ndarray:

@@ -21,10 +21,8 @@ import numpy as np
 
 from halfspace_sss.backend import clock
 from halfspace_sss.rendering.gathered.inner import Events, InnerLight, has_inner_light
-from halfspace_sss.rendering.gathered.points import SurfacePoints
+from halfspace_sss.rendering.gathered.points import GOLDEN, SurfacePoints
 from halfspace_sss.rendering.gathered.transfer import (
-    GOLDEN,
-    SAMPLES,
     SEED,
     Albedo,
     Hemispheres,
@@ -129,11 +127,8 @@ class Gathering:
                 if one:
                     _check(obj)
             started = clock()
-            samples = int(SAMPLES * PART) if self._part else SAMPLES
-            made = [
-                transfer(obj, samples=samples, seed=SEED + self._part) if one else None
-                for obj, one in zip(objects, spread)
-            ]
+            share = PART if self._part else 1.0
+            made = [transfer(obj, share, SEED + self._part) if one else None for obj, one in zip(objects, spread)]
             self._transfers, self._objects, self._light = made, objects, ([], [])
             inner = [bool(one and not self._part and has_inner_light(obj)) for obj, one in zip(objects, spread)]
             self._events = [Events.of(obj, COUNT) if one else None for obj, one in zip(objects, inner)]
