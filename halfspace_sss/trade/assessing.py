@@ -45,10 +45,7 @@ BLUR_EFFECT = 0.1
 BLUR_SEEN = 0.04  # probability that a direction is in the cone of `sample_blur`
 FIRST = (0.0, None, 1.0)  # budget of a look by the first samples alone
 MOST, FEWEST, POINTS = 384, 64, 5e-3  # of points for a tolerance, and how many times V t
-LOOK, SLOW = (
-    16_000,
-    4,
-)  # samples of all points by which a way is looked at first; for walks, which may be slow, a quarter
+LOOK, SLOW = 16_000, 4  # samples of all points by which a way is first looked at, for slow walks a quarter
 WALKED_FIRST = 0.15  # seconds of walks that tell how many points and which ways are worth a look
 FIRST_SHARE = 0.45  # of the time, for the look at all ways
 LEAST_SHARE = 0.25  # of the time, for walks and what may win against them, however long all else takes
@@ -57,6 +54,7 @@ TOLD = 0.1  # standard error of a bias² over the squared tolerance that is enou
 UNEVEN = 1.5  # times the noise of a bias² if all points were as noisy
 STEADY = 0.05  # relative error of their variance where nothing may win against walks
 DOUBT = 2.0  # standard errors
+FAR = 6.0  # times the tolerance: beyond 30 % models of the half-space were within a factor of 1.6 of each other
 CANDIDATES = (
     PATH_TRACED, "lambert", "better_dipole", "neural", "full_geometry", "neural_shape",
     *(f"{name}, {GATHERED}" for name in ("better_dipole", "neural", "full_geometry", "neural_shape")),
@@ -447,7 +445,12 @@ def assess_for(
         out = _too_dear(look, first, chosen, tolerance, images) if count_training else {}
         ahead, later = ([way for way in ways if way not in out] for ways in (ahead, later))
         look.keep(first)
-        look.more([way for way in ahead if way.model != PATH_TRACED], FIRST, seeded(seed, 43), progress)
+        flat = [way for way in ahead if way.model != PATH_TRACED and lookup(way.model).of_half_space]
+        look.more(flat[:1], FIRST, seeded(seed, 45), progress)
+        out |= _as_far_off(look.assessment(seed), flat, later, tolerance)
+        ahead, later = ([way for way in ways if way not in out] for ways in (ahead, later))
+        rest = [way for way in ahead if way.model != PATH_TRACED and way not in flat[:1]]
+        look.more(rest, FIRST, seeded(seed, 43), progress)
     else:
         out: dict[Way, str] = {}
         look.more(ahead, (FIRST_SHARE * seconds, None, TRACED_SHARE), seeded(seed, 42), progress)
@@ -497,6 +500,16 @@ def _too_dear(
             job = f"path_traced keeps {tolerance:.3g} in {best:.2g} s"
             found[way] = f"not measured, as {job}, and the training of {way.model} took {training:.2g} s"
     return found
+
+
+def _as_far_off(found: Assessment, flat: Sequence[Way], later: Sequence[Way], tolerance: float) -> dict[Way, str]:
+    """Models of the half-space that are not worth a look, as the first of them is far off and they err alike."""
+    rows = [o.way(flat[0].name) for o in found.objects if o.ways] if flat else []
+    if not rows or any(r.refusal or r.bias2 - DOUBT * r.bias2_error < (FAR * tolerance) ** 2 for r in rows):
+        return {}
+    others = {way.model for way in flat[1:]} - {flat[0].model}
+    why = f"not measured, as {flat[0].model} is {rows[0].told_bias} % off, and models of the half-space err alike"
+    return {way: why for way in (*flat, *later) if way.model in others}
 
 
 def _promising(
