@@ -135,7 +135,7 @@ def _places(obj: TranslucentObject, count: int) -> tuple[mi.Point3f, mi.Normal3f
     w, _ = cosine_above(entry.n_out, entry.n, sampler.next_2d())
     d, _, valid = refract_in(surface_point(entry.p, entry.n, entry.n_out, w), obj.eta)
     d = dr.select(valid, d, -entry.n)
-    wall = obj.geometry.scene.ray_intersect(place(entry.p, entry.n).spawn_ray(d), mi.RayFlags.Minimal, True)
+    wall = obj.geometry.scene.ray_intersect_preliminary(place(entry.p, entry.n).spawn_ray(d), False, True)
     length = dr.select(wall.is_valid(), wall.t, opaque(obj.geometry.rounding))
     sigma = mi.Float(0)
     for c, medium in enumerate(obj.media):

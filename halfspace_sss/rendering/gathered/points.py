@@ -90,7 +90,9 @@ class SurfacePoints:
         h = REACH * float(np.sqrt(geometry.area / count))
         result = cls(p, n, n_out, face, *_grid(np.array(p).T, h))
         for seed in LOOKS:
-            result = result._without_gaps(geometry, seed)
+            sparse, result = result, result._without_gaps(geometry, seed)
+            if result is sparse:
+                break
         return result
 
     def _without_gaps(self, geometry: Geometry, seed: int) -> SurfacePoints:

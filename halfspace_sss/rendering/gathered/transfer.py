@@ -12,9 +12,10 @@ is normalised by that.
 What S has beyond that, as it depends on directions at both ends, brings the slope of light over w_i, and B a slope over
 w_o. For these the entries weigh
 
-    t_js - T_j/n a(mu_i) mu_i a(mu_o) / (p(w_i) <a mu a>),    T_j = Σ_s t_js,
+    t_js - T_j e_s / Σ e,    e = q a(mu_i) mu_i a(mu_o) / p(w_i),    T_j = Σ_s t_js,
 
-<a mu a> the mean of the numerator over p in the row: the second term brings nothing on average, and most of the noise.
+q the mean of t over e of all pairs in a like position. The second term brings nothing on average, and most of the
+noise.
 
 Textures vary over less than the distance of points. The medium at entries is that of their own places, and with the
 reflectance R of the half-space at the exit
@@ -57,8 +58,9 @@ SAMPLES = 3 * 2**17  # entries of all points,
 FEWEST_ENTRIES, FEWEST_OF_PART = 48, 16  # and of a point
 FITTED = 2**18
 SEED = 7
-SMOOTHINGS = 16  # of what directions bring
+SMOOTHINGS = 8  # of what directions bring
 RINGS = 2.0, 5.0  # distances of entries that part the rings, over that of points,
+LIKE_DISTANCES, LIKE_COSINES = 14, 8  # classes of pairs of points
 ROUNDS = 0, 2, 8  # and how often what each brings is smoothed,
 SHARE_ROUNDS = 2, 4, 8  # and its share of the row
 HALVES = 2  # of the entries of a row,
@@ -303,17 +305,38 @@ def transfer(obj: TranslucentObject, share: float = 1.0, seed: int = SEED) -> Tr
     t, error = _rows(points, result.S / (result.paint**e)[:, None], (_trusted(obj), paint), result.a)
     centred = _centred(result.w_o, result.a.mean(axis=2))
     # rows beside an edge of a texture are not to be averaged with those beyond
-    ring = _rings(points, result.near) if paint is None else np.zeros(result.near.shape, np.uint8)
-    expected = result.cosine * result.a
+    d, kind = _geometry(points, result.near)
+    ring = np.digitize(d, RINGS).astype(np.uint8) if paint is None else np.zeros(d.shape, np.uint8)
+    beyond = t - _expected(result, t, kind)
+    return Transfer(points, result.near, t, beyond, ring, result.w_i, *centred, result.albedo, error, e)
+
+
+def _geometry(points: SurfacePoints, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of entries the distance of their point, over that of points, and a number for all pairs in a like position.
+
+    That is by the distance, and the cosines of both normals to the line between the points.
+    """
+    p, n = (np.array(v, dtype=np.float32).T for v in (points.p, points.n))
+    line = np.take(p, near, axis=0) - p[:, None]
+    d = np.sqrt(np.einsum("jsk,jsk->js", line, line)) * (REACH / points.h)
+    scale = (REACH / points.h) / np.maximum(d, 1e-6)
+    cosines = np.einsum("jsk,jsk->js", np.take(n, near, axis=0), line), np.einsum("jk,jsk->js", n, line)
+    kind = np.minimum(2 * np.log2(1 + d), LIKE_DISTANCES - 1).astype(np.int32)
+    for mu in cosines:
+        step = np.clip((1 + mu * scale) * (0.5 * LIKE_COSINES), 0, LIKE_COSINES - 1)
+        kind = kind * LIKE_COSINES + step.astype(np.int32)
+    return d, kind
+
+
+def _expected(found: DrawnEntries, t: np.ndarray, kind: np.ndarray) -> np.ndarray:
+    """t if S were separable, and its dependence on positions the same for all pairs that are alike."""
+    expected = found.cosine * found.a
+    count = LIKE_DISTANCES * LIKE_COSINES**2
+    for c in range(t.shape[2]):
+        whole, even = (np.bincount(kind.ravel(), v[:, :, c].ravel(), count) for v in (t, expected))
+        expected[:, :, c] *= np.take((whole / np.maximum(even, 1e-30)).astype(np.float32), kind)
     expected *= t.sum(axis=1, keepdims=True) / np.maximum(expected.sum(axis=1, keepdims=True), 1e-30)
-    return Transfer(points, result.near, t, t - expected, ring, result.w_i, *centred, result.albedo, error, e)
-
-
-def _rings(points: SurfacePoints, entry: np.ndarray) -> np.ndarray:
-    """The ring of each entry, by the distance of its point."""
-    p = np.array(points.p, dtype=np.float32).T
-    d = np.linalg.norm(np.take(p, entry, axis=0) - p[:, None], axis=2)
-    return np.digitize(d, np.array(RINGS) * points.h / REACH).astype(np.uint8)
+    return expected
 
 
 def _exponents(points: SurfacePoints, found: DrawnEntries) -> np.ndarray:

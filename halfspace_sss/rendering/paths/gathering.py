@@ -318,11 +318,14 @@ def by_emitters(
     scene: mi.Scene, albedo: Albedo, at: GatheringPoint, u: mi.Point2f, c: mi.Spectrum | float = 0.0
 ) -> tuple[mi.Spectrum, mi.Vector3f]:
     """Light of sampled emitters less c of the sky, and its direction."""
-    ds, light = scene.sample_emitter_direction(place(at.p, at.n), u, True)
-    light -= dr.select(ds.emitter.is_environment(), c / dr.maximum(ds.pdf, 1e-30), 0)
+    here = place(at.p, at.n)
+    ds, light = scene.sample_emitter_direction(here, u, False)
     a, pdf = _weight(albedo, at, ds.d)
+    above = (ds.pdf > 0) & (pdf > 0)
+    light = dr.select(scene.ray_test(here.spawn_ray_to(ds.p), above), 0, light)
+    light -= dr.select(ds.emitter.is_environment(), c / dr.maximum(ds.pdf, 1e-30), 0)
     share = dr.select(ds.delta, 1, mis_weight(ds.pdf, pdf))
-    return dr.select((ds.pdf > 0) & (pdf > 0), a * pdf * light * share, 0), ds.d
+    return dr.select(above, a * pdf * light * share, 0), ds.d
 
 
 def by_cosine(
