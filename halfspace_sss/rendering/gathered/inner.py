@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from scipy.sparse import csr_array
+from scipy.sparse import csc_array, csr_array
 
 from halfspace_sss.rendering.gathered.points import R_3, uniform_entries
 from halfspace_sss.rendering.object.points import cosine_above, opaque, place, refract_in, surface_point
@@ -148,14 +148,12 @@ def _places(obj: TranslucentObject, count: int) -> tuple[mi.Point3f, mi.Normal3f
 
 def _weights(f: np.ndarray, cell: np.ndarray, counts: np.ndarray) -> csr_array:
     """Weights (all nodes, events) for places f in their cells."""
-    rows, values = [], []
-    for corner in np.ndindex(2, 2, 2):
-        at = cell + corner
-        rows.append((at[:, 2] * counts[1] + at[:, 1]) * counts[0] + at[:, 0])
-        values.append(np.where(corner, f, 1 - f).prod(axis=1))
-    columns = np.tile(np.arange(len(f)), 8)
-    shape = (int(counts.prod()), len(f))
-    return csr_array((np.concatenate(values), (np.concatenate(rows), columns)), shape=shape)
+    rows, values, along = [], [], ((1 - f).T, f.T)
+    for i, j, k in np.ndindex(2, 2, 2):
+        rows.append(((cell[:, 2] + k) * counts[1] + cell[:, 1] + j) * counts[0] + cell[:, 0] + i)
+        values.append(along[i][0] * along[j][1] * along[k][2])
+    of_events = (np.stack(v, axis=1).ravel() for v in (values, rows))
+    return csc_array((*of_events, 8 * np.arange(len(f) + 1)), shape=(int(counts.prod()), len(f))).tocsr()
 
 
 @dataclass(frozen=True, eq=False)
