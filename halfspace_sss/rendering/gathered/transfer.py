@@ -9,13 +9,13 @@ the distance from it, see `entries`, with directions at both ends, so that under
 is an unbiased estimate of what the model gives. Where the model knows its directional albedo there (`alpha`), the row
 is normalised by that.
 
-What S has beyond that, as it depends on directions at both ends, brings the slope of light over w_i, and B a slope over
-w_o. For these the entries weigh
+What S has beyond that depends on directions mostly as the first event does, which lies towards or away from the other
+end. With w bent by the boundary, less its mean by a(mu) mu, S gets for entry and exit the factors
 
-    t_js - T_j e_s / Σ e,    e = q a(mu_i) mu_i a(mu_o) / p(w_i),    T_j = Σ_s t_js,
+    1 + g.w,    g = g_n n + g_d d,    d from one end to the other,
 
-q the mean of t over e of all pairs in a like position. The second term brings nothing on average, and most of the
-noise.
+g_n and g_d of a distance those of all pairs at that distance, by least squares over directions of entries and exits. So
+light brings Σ_s t_js (L_k + g.M_k), M_k its first moment, and B a slope over w_o.
 
 Textures vary over less than the distance of points. The medium at entries is that of their own places, and with the
 reflectance R of the half-space at the exit
@@ -48,7 +48,7 @@ from halfspace_sss.rendering.gathered.points import GOLDEN, REACH, SurfacePoints
 from halfspace_sss.rendering.object.points import EntrySample, SurfacePoint, cosine_above, evaluate, opaque, wrapped
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from halfspace_sss.rendering.object.objects import TranslucentObject
 
@@ -58,14 +58,14 @@ SAMPLES = 3 * 2**17  # entries of all points,
 FEWEST_ENTRIES, FEWEST_OF_PART = 48, 16  # and of a point
 FITTED = 2**18
 SEED = 7
-SMOOTHINGS = 8  # of what directions bring
 RINGS = 2.0, 5.0  # distances of entries that part the rings, over that of points,
+STEPS = tuple(2 ** (k / 2) for k in range(12))  # and those that part the steps of g
+SLOPE_ROUNDS = 2  # smoothings of the slope over w_o
 LIKE_DISTANCES, LIKE_COSINES = 14, 8  # classes of pairs of points
 ROUNDS = 0, 2, 8  # and how often what each brings is smoothed,
 SHARE_ROUNDS = 2, 4, 8  # and its share of the row
 HALVES = 2  # of the entries of a row,
 EXITS = 4  # and directions of exits of each
-BLOCK = 64  # rows
 R_2 = 0.7548776662466927, 0.5698402909980532
 LATTICE = 128  # directions of a hemisphere
 
@@ -110,24 +110,27 @@ class Albedo:
 
 @dataclass(frozen=True, eq=False)
 class Incident:
-    """Radiance at points, linear in its direction: L_i(w) = mean + slope.(w - middle), as weighted by a(mu) mu.
+    """Radiance at points, weighted by a(mu_i) mu_i.
 
     Args:
         mean: (points, channels).
-        slope: (points, channels, 3).
-        middle: (points, 3).
+        moment: mean of L_i(w) (bent w - middle), `middle` that of `Hemispheres`, (points, channels, 3).
     """
 
     mean: np.ndarray
-    slope: np.ndarray
-    middle: np.ndarray
+    moment: np.ndarray
 
     @classmethod
-    def mean_of(cls, parts: list[Incident]) -> Incident:
-        """The mean of several, about the mean of their middles."""
-        middle = np.mean([part.middle for part in parts], axis=0)
-        means = [part.mean + np.einsum("jck,jk->jc", part.slope, middle - part.middle) for part in parts]
-        return cls(np.mean(means, axis=0), np.mean([part.slope for part in parts], axis=0), middle)
+    def mean_of(cls, parts: Sequence[Incident]) -> Incident:
+        """The mean of several."""
+        return cls(*(np.mean([getattr(part, name) for part in parts], axis=0) for name in ("mean", "moment")))
+
+
+def bent(w: mi.Vector3f, n_out: mi.Normal3f, eta: float) -> mi.Vector3f:
+    """A direction outside as the boundary bends it, turned back to the outer side."""
+    mu = dr.dot(w, n_out)
+    mu_t = dr.sqrt(1 - (1 - dr.minimum(dr.square(mu), 1)) * opaque(eta**-2))
+    return mi.Vector3f((w - mu * n_out) * opaque(1 / eta) + mu_t * n_out)
 
 
 class Hemispheres(NamedTuple):
@@ -135,13 +138,13 @@ class Hemispheres(NamedTuple):
 
     Args:
         whole: its integral, (points, channels).
-        middle: mean direction, (points, 3), for the mean of a over channels.
-        inverse: of the covariance, (points, 3, 3).
+        middle: mean of directions bent by the boundary, (points, 3), for the mean of a over channels.
+        covariance: of these, (points, 3, 3).
     """
 
     whole: np.ndarray
     middle: np.ndarray
-    inverse: np.ndarray
+    covariance: np.ndarray
 
     @classmethod
     def of(cls, points: SurfacePoints, albedo: Albedo) -> Hemispheres:
@@ -151,7 +154,7 @@ class Hemispheres(NamedTuple):
         n, n_out = (dr.gather(mi.Normal3f, v, j) for v in (points.n, points.n_out))
         w, _ = cosine_above(n_out, n, mi.Point2f((s + 0.5) / LATTICE, wrapped(s * GOLDEN)))
         a = albedo(cosine(w, n, n_out)) * dr.pi
-        weight = dr.mean(a)
+        weight, w = dr.mean(a), bent(w, n_out, albedo.eta)
         values = [*a, *(weight * w), *(weight * w[i] * w[k] for i in range(3) for k in range(3)), weight]
         dr.eval(values)  # once for all sums
         sums = [dr.block_sum(v, LATTICE) for v in values]
@@ -159,7 +162,7 @@ class Hemispheres(NamedTuple):
         whole, middle, second = np.split(np.stack(rows, axis=1), [len(rows) - 12, len(rows) - 9], axis=1)
         middle, second = (v / np.maximum(total, 1e-30)[:, None] for v in (middle, second))
         C = second.reshape(-1, 3, 3) - middle[:, :, None] * middle[:, None, :]
-        return cls(np.maximum(whole / LATTICE, 1e-30), middle, np.linalg.inv(C + 1e-3 * np.eye(3)))
+        return cls(np.maximum(whole / LATTICE, 1e-30), middle, C)
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,64 +171,87 @@ class Transfer:
 
     Args:
         points: where light is gathered and where it leaves.
+        around: their hemispheres.
         entry: (points, samples) numbers of the points that entries are at.
-        t: (points, samples, channels),
-        beyond: and what of it is for the dependence on directions.
+        t: (points, samples, channels).
         ring: (points, samples) of entries, by their distance.
-        w_i: (points, samples, 3) directions of entries.
-        d_o: (points, samples, 3) directions of exits less their `middle`, (points, 3), both weighted by a.
-        inverse: (points, 3, 3) of the covariance of d_o.
+        toward: (points, samples, 3) direction from the entry's point to the exit; 0 where both are one.
+        step: (points, samples) of g, by their distance.
+        g: (steps, channels, 2) along the normal and towards the other end.
         albedo: a.
         error: standard error of the sums of rows over their mean, worst channel, root mean square.
         e: exponent of the reflectance at the exit, per channel.
     """
 
     points: SurfacePoints
+    around: Hemispheres
     entry: np.ndarray
     t: np.ndarray
-    beyond: np.ndarray
     ring: np.ndarray
-    w_i: np.ndarray
-    d_o: np.ndarray
-    middle: np.ndarray
-    inverse: np.ndarray
+    toward: np.ndarray
+    step: np.ndarray
+    g: np.ndarray
     albedo: Albedo
     error: float
     e: np.ndarray
 
-    @cached_property
-    def hemispheres(self) -> Hemispheres:
-        """Of its points."""
-        return Hemispheres.of(self.points, self.albedo)
-
     @property
     def nbytes(self) -> int:
         """Memory of all arrays of entries."""
-        of_entries = self.entry, self.t, self.beyond, self.ring, self.w_i, self.d_o
-        return sum(v.nbytes for v in (*of_entries, self.middle, self.inverse))
+        return sum(v.nbytes for v in (self.entry, self.t, self.ring, self.toward, self.step))
 
-    def by_place(self, L: Incident) -> np.ndarray:
-        """What leaves by the means of the light at the places of entries, (points, channels).
+    @cached_property
+    def _n_out(self) -> np.ndarray:
+        return np.array(self.points.n_out, dtype=np.float32).T
+
+    def __matmul__(self, L: Incident) -> np.ndarray:
+        """B for incident radiance, linear in the bent w_o: constant and slope, (points, channels, 4)."""
+        light = self._arriving(L)
+        sums = np.maximum(self.t.sum(axis=1), 1e-30)
+        brings = np.einsum("jsc,jsc->jc", self.t, light) / sums
+        more = self.t * (light - brings[:, None])  # 0 in uniform light, where a(w_o) is all
+        upright, aside = (more * np.take(self.g[:, :, k], self.step, axis=0) for k in range(2))
+        slope = upright.sum(axis=1)[:, :, None] * self._n_out[:, None] - aside.transpose(0, 2, 1) @ self.toward
+        for _ in range(SLOPE_ROUNDS):
+            slope = self.points.smoothed(slope)
+        constant = self._by_place(light) - np.einsum("jck,jk->jc", slope, self.around.middle)
+        return np.concatenate([constant[:, :, None], slope], axis=2)
+
+    def mean(self, L: Incident) -> np.ndarray:
+        """B in the mean over w_o, (points, channels)."""
+        return self._by_place(self._arriving(L))
+
+    def _arriving(self, L: Incident) -> np.ndarray:
+        """The mean of L_i (1 + g.(bent w_i - middle)) of entries, (points, samples, channels)."""
+        upright = np.einsum("jck,jk->jc", L.moment, self._n_out)
+        light = np.take(self.g[:, :, 0], self.step, axis=0) * np.take(upright, self.entry, axis=0)
+        aside = np.zeros_like(light)
+        for axis in range(3):
+            aside += np.take(L.moment[:, :, axis], self.entry, axis=0) * self.toward[:, :, axis, None]
+        light += np.take(self.g[:, :, 1], self.step, axis=0) * aside
+        light += np.take(L.mean, self.entry, axis=0)
+        return np.maximum(light, 0)
+
+    def _by_place(self, light: np.ndarray) -> np.ndarray:
+        """What leaves by the light of entries, (points, channels).
 
         The light of a ring is the mean over its entries in the neighbourhood, the wider the farther they are; so is the
         share of the ring.
         """
         share, whole = self._shares
-        return (share * self._smoothed(self._by_ring(L.mean), ROUNDS) / np.maximum(whole, 1e-30)).sum(axis=1)
+        return (share * self._smoothed(self._by_ring(light), ROUNDS) / np.maximum(whole, 1e-30)).sum(axis=1)
 
-    def _by_ring(self, mean: np.ndarray) -> np.ndarray:
+    def _by_ring(self, light: np.ndarray) -> np.ndarray:
         """Σ t L of each ring, (points, rings, channels)."""
-        count, rings = len(self.entry), len(ROUNDS)
-        at, entry = (np.arange(count)[:, None] * rings + self.ring).ravel(), self.entry.ravel()
-        columns = [
-            np.bincount(at, self.t[:, :, c].ravel() * mean[entry, c], count * rings) for c in range(mean.shape[1])
-        ]
-        return np.stack(columns, axis=1).reshape(count, rings, -1)
+        (count, _, size), rings = light.shape, len(ROUNDS)
+        at, brought = (np.arange(count)[:, None] * rings + self.ring).ravel(), self.t * light
+        columns = [np.bincount(at, brought[:, :, c].ravel(), count * rings) for c in range(size)]
+        return np.stack(columns, axis=1).reshape(count, rings, size)
 
     @cached_property
     def _shares(self) -> tuple[np.ndarray, np.ndarray]:
         """Of uniform light, (points, rings, channels): shares of the row, and what rings bring, both smoothed."""
-        found = self._by_ring(np.ones((len(self.entry), self.t.shape[2])))
+        found = self._by_ring(np.ones_like(self.t))
         share = self._smoothed(found, SHARE_ROUNDS)
         share *= (found.sum(axis=1) / np.maximum(share.sum(axis=1), 1e-30))[:, None]
         return share, self._smoothed(found, ROUNDS)
@@ -237,56 +263,6 @@ class Transfer:
             for _ in range(rounds):
                 smooth[:, k] = self.points.smoothed(smooth[:, k])
         return smooth
-
-    @property
-    def _blocks(self) -> list[slice]:
-        """Rows that fit into the cache of a core together."""
-        return [slice(k, k + BLOCK) for k in range(0, len(self.entry), BLOCK)]
-
-    def __matmul__(self, L: Incident) -> np.ndarray:
-        """B for incident radiance, linear in w_o: constant and slope, (points, channels, 4).
-
-        What the directions w_i and w_o of single entries bring varies slowly over the surface, and was most of the
-        noise: it is averaged over a wider neighbourhood than B is blended from, and kept as far as two halves of the
-        entries agree on it.
-        """
-        n = self.entry.shape[1] // HALVES
-        halves = np.stack([self._by_direction(L, half) for half in (slice(0, n), slice(n, 2 * n))], axis=1)
-        for _ in range(SMOOTHINGS):
-            halves = self.points.smoothed(halves)
-        one, two = halves[:, 0], halves[:, 1]
-        first, slope = ((one + two)[:, :, part] * _agreement(one[:, :, part], two[:, :, part]) for part in PARTS)
-        constant = self.by_place(L) + first[:, :, 0] - np.einsum("jck,jk->jc", slope, self.middle)
-        return np.concatenate([constant[:, :, None], slope], axis=2)
-
-    def _by_direction(self, L: Incident, half: slice) -> np.ndarray:
-        """By a half of the entries, what the slope of light brings, and the slope over w_o, (points, channels, 4)."""
-        axes = [np.ascontiguousarray(L.slope[:, :, axis]) for axis in range(3)]
-        found, ones = np.empty((*L.mean.shape, 4), dtype=L.mean.dtype), np.ones(half.stop - half.start, self.t.dtype)
-        for rows in self._blocks:
-            entry, t, beyond, d_o = (v[rows, half] for v in (self.entry, self.t, self.beyond, self.d_o))
-            d_i = self.w_i[rows, half] - np.take(L.middle, entry, axis=0)
-            aside = np.take(axes[0], entry, axis=0) * d_i[:, :, 0, None]
-            for axis in (1, 2):
-                aside += np.take(axes[axis], entry, axis=0) * d_i[:, :, axis, None]
-            arriving = np.take(L.mean, entry, axis=0)
-            found[rows, :, 0] = ones @ (beyond * aside)  # twice as fast as a sum over the axis
-            arriving += aside
-            brings = (ones @ (t * arriving)) / np.maximum(ones @ t, 1e-30)
-            arriving *= beyond
-            slope, even = (v.transpose(0, 2, 1) @ d_o for v in (arriving, beyond))
-            found[rows, :, 1:] = slope - even * brings[:, :, None]  # 0 in uniform light, where a(w_o) is all
-        found[:, :, 1:] = np.einsum("jck,jki->jci", found[:, :, 1:], self.inverse)
-        return found
-
-
-PARTS = slice(0, 1), slice(1, 4)
-
-
-def _agreement(one: np.ndarray, two: np.ndarray) -> np.ndarray:
-    """Of the sum of two independent estimates the share that is no noise, per channel, for all points and axes."""
-    both, whole = (one * two).sum(axis=(0, 2)), ((one + two) ** 2).sum(axis=(0, 2))
-    return np.clip(4 * both / np.maximum(whole, 1e-30), 0, 1)[:, None]
 
 
 def count_of(obj: TranslucentObject) -> int:
@@ -303,16 +279,57 @@ def transfer(obj: TranslucentObject, share: float = 1.0, seed: int = SEED) -> Tr
     paint = None if obj.textured is None else result.paint
     e = np.zeros(result.S.shape[2], np.float32) if paint is None else _exponents(points, result)
     t, error = _rows(points, result.S / (result.paint**e)[:, None], (_trusted(obj), paint), result.a)
-    centred = _centred(result.w_o, result.a.mean(axis=2))
+    toward, d, kind = _geometry(points, result.near)
     # rows beside an edge of a texture are not to be averaged with those beyond
-    d, kind = _geometry(points, result.near)
     ring = np.digitize(d, RINGS).astype(np.uint8) if paint is None else np.zeros(d.shape, np.uint8)
-    beyond = t - _expected(result, t, kind)
-    return Transfer(points, result.near, t, beyond, ring, result.w_i, *centred, result.albedo, error, e)
+    step = np.digitize(d, STEPS).astype(np.uint8)
+    around = Hemispheres.of(points, result.albedo)
+    g = _leanings(points, around, result, (t, t - _expected(result, t, kind)), (toward, step))
+    return Transfer(points, around, result.near, t, ring, toward, step, g, result.albedo, error, e)
 
 
-def _geometry(points: SurfacePoints, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of entries the distance of their point, over that of points, and a number for all pairs in a like position.
+def _leanings(
+    points: SurfacePoints, around: Hemispheres, found: DrawnEntries, weights: tuple[np.ndarray, np.ndarray],
+    apart: tuple[np.ndarray, np.ndarray],
+) -> np.ndarray:  # fmt: skip
+    """g of all steps, (steps, channels, 2), by least squares over entries, and exits, of all pairs at a distance.
+
+    With f the cosines of the bent w - middle to the normal and to the other end, E over directions by a(mu) mu,
+
+        Σ_s t_s E[f f^T] g = Σ_s t_s f_s,
+
+    where t less what is expected of separable S stands on the right.
+    """
+    (t, beyond), (toward, step), size = weights, apart, len(STEPS) + 1
+    n_out, eta = np.array(points.n_out, dtype=np.float32).T, found.albedo.eta
+    own = np.broadcast_to(np.arange(len(n_out))[:, None], step.shape)
+    A, b = np.zeros((size, t.shape[2], 2, 2)), np.zeros((size, t.shape[2], 2))
+    for at, w, way in ((found.near, found.w_i, toward), (own, found.w_o, -toward)):
+        n = np.take(n_out, at, axis=0)
+        mu = np.einsum("jsk,jsk->js", w, n)
+        mu_t = np.sqrt(1 - np.maximum(1 - mu**2, 0) / eta**2)
+        d = w / eta + (mu_t - mu / eta)[:, :, None] * n - np.take(around.middle, at, axis=0)
+        axes = n, way
+        spread = [np.einsum("jsik,jsk->jsi", np.take(around.covariance, at, axis=0), axis) for axis in axes]
+        for i in range(2):
+            f = np.einsum("jsk,jsk->js", d, axes[i])
+            b[:, :, i] += _summed(step, beyond * f[:, :, None], size)
+            for k in range(2):
+                A[:, :, i, k] += _summed(step, t * np.einsum("jsk,jsk->js", axes[i], spread[k])[:, :, None], size)
+    A += (1e-3 * np.trace(A, axis1=2, axis2=3) + 1e-30)[:, :, None, None] * np.eye(2)
+    return np.linalg.solve(A, b[..., None])[..., 0].astype(np.float32)
+
+
+def _summed(step: np.ndarray, values: np.ndarray, size: int) -> np.ndarray:
+    """Sums of values of pairs, (points, samples, channels), of each step."""
+    columns = [np.bincount(step.ravel(), values[:, :, c].ravel(), size) for c in range(values.shape[2])]
+    return np.stack(columns, axis=1)
+
+
+def _geometry(points: SurfacePoints, near: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of entries the direction from their point to the exit, the distance over that of points, and a number of pairs.
+
+    The number is the same for all pairs in a like position.
 
     That is by the distance, and the cosines of both normals to the line between the points.
     """
@@ -325,7 +342,7 @@ def _geometry(points: SurfacePoints, near: np.ndarray) -> tuple[np.ndarray, np.n
     for mu in cosines:
         step = np.clip((1 + mu * scale) * (0.5 * LIKE_COSINES), 0, LIKE_COSINES - 1)
         kind = kind * LIKE_COSINES + step.astype(np.int32)
-    return d, kind
+    return line * (-scale)[:, :, None], d, kind
 
 
 def _expected(found: DrawnEntries, t: np.ndarray, kind: np.ndarray) -> np.ndarray:
@@ -515,14 +532,6 @@ def _collected(
     cosine = np.array(albedo(brought.mu_i) * brought.over).T.reshape(S.shape) / albedo.whole.astype(np.float32)
     w_i = np.array(brought.w_i, dtype=np.float32).T.reshape(count, n, 3)
     return DrawnEntries(S, cosine, area, near, known, w_i, w_o, a, albedo, np.maximum(R, 1e-20))
-
-
-def _centred(w: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Directions less their mean by the weights a, the mean, and the inverse of their covariance."""
-    a = a / a.sum(axis=1, keepdims=True)
-    middle = np.einsum("js,jsi->ji", a, w)
-    d = w - middle[:, None]
-    return d, middle, np.linalg.inv(np.einsum("js,jsi,jsk->jik", a, d, d) + 1e-3 * np.eye(3))
 
 
 def _trusted(obj: TranslucentObject) -> np.ndarray:

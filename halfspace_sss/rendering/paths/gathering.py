@@ -5,8 +5,9 @@ by directions of the cosine (balance heuristic); what other surfaces send is tra
 B = T L follows, see `gathered.transfer`, and at an exit L_o(x_o, w_o) = a(w_o) B(x_o), blended between points. Jensen
 and Buhler (2002) take two passes so with a dipole; here the second is a sparse matrix that outlives the light.
 
-What is not known: light of directions apart from its a(mu)-weighted mean, so that a model's dependence on the azimuth
-between light and view is lost; detail of light below the distance of the points. Its noise is that of the gathering.
+What is not known: light of directions apart from its a(mu)-weighted mean and first moment, so that a dependence of the
+model on the azimuth between light and view is lost; detail of light below the distance of the points. Its noise is that
+of the gathering.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from halfspace_sss.rendering.gathered.transfer import (
     Hemispheres,
     Incident,
     Transfer,
+    bent,
     cosine,
     transfer,
 )
@@ -58,7 +60,7 @@ class Gathered:
     Args:
         object: of it.
         transfer: of its model.
-        values: B of all points, for each channel the constant and the slope over w_o.
+        values: B of all points, for each channel the constant and the slope over w_o bent by the boundary.
         light: that arrives.
         parts: independent estimates of it.
         inner: at events of order 1 inside; None where that order is traced.
@@ -74,7 +76,7 @@ class Gathered:
     @cached_property
     def error(self) -> float:
         """Standard error of B by the gathering of light, over its mean; NaN where that is not in parts."""
-        found = np.stack([self.transfer.by_place(part) for part in self.parts])
+        found = np.stack([self.transfer.mean(part) for part in self.parts])
         spread = found.var(axis=0, ddof=1).mean() if len(found) > 1 else np.nan
         return float(np.sqrt(spread / len(found)) / max(float(found.mean()), 1e-30))
 
@@ -82,8 +84,8 @@ class Gathered:
         """L_o of an exit; 0 below the horizon."""
         size = dr.size_v(mi.Spectrum)
         B = self.transfer.points.blend(self.values, 4 * size, out.p, out.n, active)
-        rows = [B[4 * c : 4 * c + 4] for c in range(size)]
-        B = mi.Spectrum([b + x * out.w.x + y * out.w.y + z * out.w.z for b, x, y, z in rows])
+        rows, w = [B[4 * c : 4 * c + 4] for c in range(size)], bent(out.w, out.n_out, self.transfer.albedo.eta)
+        B = mi.Spectrum([b + x * w.x + y * w.y + z * w.z for b, x, y, z in rows])
         mu = dr.dot(out.w, out.n_out)
         paint = None if self.object.textured is None else self.object.transport.paint(out)
         a = self.transfer.albedo(dr.maximum(mu, 0), paint)
@@ -237,9 +239,9 @@ def _incident(
     u, v = (_stratified(sampler, j, s, each) for _ in range(2))
     aimed, w_e = by_emitters(scene, T.albedo, at, u)
     met, more, a, w_c, on = by_cosine(scene, objects, T.albedo, settings, at, v, traced, sampler)
-    around = T.hemispheres
+    around = T.around
     centre = dr.gather(mi.Vector3f, mi.Vector3f(around.middle.T.astype(np.float32)), point)
-    d_e, d_c = w_e - centre, w_c - centre
+    d_e, d_c = (bent(w, at.n_out, T.albedo.eta) - centre for w in (w_e, w_c))
     values = [aimed + met, *(aimed * d_e[i] + met * d_c[i] for i in range(3))]
     values += [TRACED * more, *(TRACED * more * d_c[i] for i in range(3)), TRACED * dr.select(on, a, 0)]
     values = [mi.Spectrum(v) + dr.zeros(mi.Float, rows * n) for v in values]
@@ -265,8 +267,7 @@ def _of_part(points: SurfacePoints, around: Hemispheres, found: np.ndarray) -> t
     steady = _steadied(sent)
     spread = _spread(points, steady * sent)
     first = found[:, 1:4] + _spread(points, steady[:, None] * found[:, 5:8])
-    slope = np.einsum("jic,jik->jck", first, around.inverse) / around.whole[:, :, None]
-    parts = ((direct + spread) / around.whole, slope, around.middle)
+    parts = ((direct + spread) / around.whole, np.moveaxis(first, 1, 2) / around.whole[:, :, None])
     others = spread / np.maximum(_spread(points, seen), 1e-30)
     return Incident(*(part.astype(np.float32) for part in parts)), others
 
