@@ -43,7 +43,7 @@ import mitsuba as mi
 import numpy as np
 
 from halfspace_sss.physics.fresnel import F_t
-from halfspace_sss.rendering.gathered.entries import StratifiedEntries
+from halfspace_sss.rendering.gathered.entries import PLACES, StratifiedEntries
 from halfspace_sss.rendering.gathered.points import GOLDEN, REACH, SurfacePoints
 from halfspace_sss.rendering.object.points import EntrySample, SurfacePoint, cosine_above, evaluate, opaque, wrapped
 
@@ -58,6 +58,10 @@ SAMPLES = 3 * 2**17  # entries of all points,
 FEWEST_ENTRIES, FEWEST_OF_PART = 48, 16  # and of a point
 FITTED = 2**18
 SEED = 7
+COARSEST = (
+    0.5  # distance of places of entries in transport mean free paths; the proposals draw those of denser objects,
+)
+DENSE = 8 / 3  # times as many
 RINGS = 2.0, 5.0  # distances of entries that part the rings, over that of points,
 STEPS = tuple(2 ** (k / 2) for k in range(12))  # and those that part the steps of g
 SLOPE_ROUNDS = 2  # smoothings of the slope over w_o
@@ -275,21 +279,31 @@ def transfer(obj: TranslucentObject, share: float = 1.0, seed: int = SEED) -> Tr
     """The transfer of an object, by its model and the radial density of its proposals, with a share of all entries."""
     points = SurfacePoints.of(obj.geometry, count_of(obj))
     n = max(int(share * max(SAMPLES / len(points), FEWEST_ENTRIES)), FEWEST_OF_PART)
-    result = stratified(obj, points, n, seed)
+    if places_resolve(obj):
+        result = stratified(obj, points, n, seed)
+    else:
+        result = drawn(
+            obj,
+            points,
+            lambda p, n_out, _, active: points.nearest(p, n_out, active),
+            int(DENSE * n) * len(points),
+            seed,
+        )
     paint = None if obj.textured is None else result.paint
     e = np.zeros(result.S.shape[2], np.float32) if paint is None else _exponents(points, result)
     t, error = _rows(points, result.S / (result.paint**e)[:, None], (_trusted(obj), paint), result.a)
-    toward, d, kind = _geometry(points, result.near)
+    near = np.where(result.known, result.near, np.arange(len(points), dtype=np.uint32)[:, None])
+    toward, d, kind = _geometry(points, near)
     # rows beside an edge of a texture are not to be averaged with those beyond
     ring = np.digitize(d, RINGS).astype(np.uint8) if paint is None else np.zeros(d.shape, np.uint8)
     step = np.digitize(d, STEPS).astype(np.uint8)
     around = Hemispheres.of(points, result.albedo)
-    g = _leanings(points, around, result, (t, t - _expected(result, t, kind)), (toward, step))
-    return Transfer(points, around, result.near, t, ring, toward, step, g, result.albedo, error, e)
+    g = _leanings(points, around, result, (near, t, t - _expected(result, t, kind)), (toward, step))
+    return Transfer(points, around, near, t, ring, toward, step, g, result.albedo, error, e)
 
 
 def _leanings(
-    points: SurfacePoints, around: Hemispheres, found: DrawnEntries, weights: tuple[np.ndarray, np.ndarray],
+    points: SurfacePoints, around: Hemispheres, found: DrawnEntries, weights: tuple[np.ndarray, ...],
     apart: tuple[np.ndarray, np.ndarray],
 ) -> np.ndarray:  # fmt: skip
     """g of all steps, (steps, channels, 2), by least squares over entries, and exits, of all pairs at a distance.
@@ -300,11 +314,11 @@ def _leanings(
 
     where t less what is expected of separable S stands on the right.
     """
-    (t, beyond), (toward, step), size = weights, apart, len(STEPS) + 1
+    (near, t, beyond), (toward, step), size = weights, apart, len(STEPS) + 1
     n_out, eta = np.array(points.n_out, dtype=np.float32).T, found.albedo.eta
     own = np.broadcast_to(np.arange(len(n_out))[:, None], step.shape)
     A, b = np.zeros((size, t.shape[2], 2, 2)), np.zeros((size, t.shape[2], 2))
-    for at, w, way in ((found.near, found.w_i, toward), (own, found.w_o, -toward)):
+    for at, w, way in ((near, found.w_i, toward), (own, found.w_o, -toward)):
         n = np.take(n_out, at, axis=0)
         mu = np.einsum("jsk,jsk->js", w, n)
         mu_t = np.sqrt(1 - np.maximum(1 - mu**2, 0) / eta**2)
@@ -438,13 +452,21 @@ class _Brought(NamedTuple):
     over: mi.Float
 
 
-def drawn(obj: TranslucentObject, points: SurfacePoints, cell: Callable, samples: int) -> DrawnEntries:
+def places_resolve(obj: TranslucentObject) -> bool:
+    """Whether S of an object varies little from one of the places of `entries` to the next."""
+    sigma = max(float(np.max(m.sigma_t_prime)) for m in obj.media)
+    return sigma * float(np.sqrt(obj.geometry.area / PLACES)) < COARSEST
+
+
+def drawn(
+    obj: TranslucentObject, points: SurfacePoints, cell: Callable, samples: int, seed: int = SEED
+) -> DrawnEntries:
     """As many entries for each point, by the proposals; `cell` of position, normal, face and mask is what is near."""
     n = samples // len(points) // HALVES * HALVES
     k = dr.arange(mi.UInt32, len(points) * n)
     each = dr.opaque(mi.UInt32, n // HALVES)  # kernels are those of other numbers of points too
     half, active = k // each, mi.Bool(True)
-    j, sampler = half // HALVES, RowUniforms(half, k % each, HALVES * len(points), n // HALVES, SEED)
+    j, sampler = half // HALVES, RowUniforms(half, k % each, HALVES * len(points), n // HALVES, seed)
     out, face = points.exit(j, sampler.next_2d())
     out = obj.knowing(out, face)
     prepared = obj.transport.prepare(out, active)
