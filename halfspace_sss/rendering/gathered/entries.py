@@ -17,10 +17,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from halfspace_sss.rendering.gathered.points import GOLDEN, R_3, REACH, SurfacePoints, uniform_entries
+from halfspace_sss.rendering.gathered.points import GOLDEN, REACH, SurfacePoints, uniform_entries
 from halfspace_sss.rendering.object.points import EntrySample, PositionSampler, evaluate, opaque
 
 PLACES = 2**17
+ROOTS = 2**0.5, 3**0.5, 5**0.5  # of their lattice: by that of the points they would be in step with all of these
 GROUP = 16  # points, whose places are one where their middle is farther
 FAR = 3.0  # than times their radius
 NEAR = 1.2  # distances of points: places of a point that is nearer are drawn one by one
@@ -110,7 +111,7 @@ def _places(
     positions: PositionSampler, points: SurfacePoints, rank: np.ndarray, rng: np.random.Generator
 ) -> tuple[EntrySample, mi.UInt32]:
     """Uniform places in the order of their points, of that rank, and those."""
-    u = [(np.arange(1, PLACES + 1) * r + shift) % 1.0 for r, shift in zip(R_3, rng.random(3))]
+    u = [(np.arange(1, PLACES + 1) * r + shift) % 1.0 for r, shift in zip(ROOTS, rng.random(3))]
     u = [mi.Float(np.minimum(v, 1 - 2**-24).astype(np.float32)) for v in u]
     at = uniform_entries(positions.geometry, u[0], mi.Point2f(u[1], u[2]))
     at = at._replace(weight=at.weight + dr.zeros(mi.Float, PLACES))
