@@ -17,7 +17,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from halfspace_sss.rendering.gathered.points import GOLDEN, REACH, SurfacePoints, uniform_entries
+from halfspace_sss.rendering.gathered.points import GOLDEN, REACH, SurfacePoints, lattice, uniform_entries
 from halfspace_sss.rendering.object.points import EntrySample, PositionSampler, evaluate, opaque
 
 PLACES = 2**17
@@ -111,8 +111,7 @@ def _places(
     positions: PositionSampler, points: SurfacePoints, rank: np.ndarray, rng: np.random.Generator
 ) -> tuple[EntrySample, mi.UInt32]:
     """Uniform places in the order of their points, of that rank, and those."""
-    u = [(np.arange(1, PLACES + 1) * r + shift) % 1.0 for r, shift in zip(ROOTS, rng.random(3))]
-    u = [mi.Float(np.minimum(v, 1 - 2**-24).astype(np.float32)) for v in u]
+    u = [mi.Float(np.minimum(v, 1 - 2**-24).astype(np.float32)) for v in lattice(PLACES, ROOTS, rng.random(3))]
     at = uniform_entries(positions.geometry, u[0], mi.Point2f(u[1], u[2]))
     at = at._replace(weight=at.weight + dr.zeros(mi.Float, PLACES))
     point, known = (np.array(v) for v in points.nearest(at.p, at.n, mi.Bool(True)))

@@ -21,7 +21,7 @@ import mitsuba as mi
 import numpy as np
 from scipy.sparse import csc_array, csr_array
 
-from halfspace_sss.rendering.gathered.points import R_3, uniform_entries
+from halfspace_sss.rendering.gathered.points import lattice, uniform_entries
 from halfspace_sss.rendering.object.points import cosine_above, opaque, place, refract_in, surface_point
 
 if TYPE_CHECKING:
@@ -126,7 +126,7 @@ def _occupied(x: np.ndarray, h: float) -> int:
 def _places(obj: TranslucentObject, count: int) -> tuple[mi.Point3f, mi.Normal3f]:
     """Events along rays that are refracted inwards, and normals where they enter."""
     k = dr.arange(mi.UInt32, count)
-    u = [(np.arange(1, count + 1) * r + 0.5) % 1.0 for r in R_3]
+    u = lattice(count)
     order = np.argsort(u[0])  # by faces: rays of neighbours meet the same part of the surface
     u = [mi.Float(v[order].astype(np.float32)) for v in u]
     sampler = mi.load_dict({"type": "independent"})

@@ -33,7 +33,7 @@ from halfspace_sss.rendering.object.points import (
 from halfspace_sss.rendering.object.shape import Geometry
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
 PLACES = 2**17  # that must have a point in reach
 LOOKS = (23, 24)  # seeds of such places
@@ -46,6 +46,11 @@ R_3 = (
     0.6710436067037893,
     0.5497004779019703,
 )  # of three dimensions (Roberts 2018)
+
+
+def lattice(count: int, roots: Sequence[float] = R_3, shift: Sequence[float] = (0.5, 0.5, 0.5)) -> list[np.ndarray]:
+    """Low-discrepancy numbers in [0, 1), `count` of each root: multiples of these, shifted."""
+    return [(np.arange(1, count + 1) * r + s) % 1.0 for r, s in zip(roots, shift)]
 
 
 def uniform_entries(geometry: Geometry, u_face: mi.Float, u: mi.Point2f) -> EntrySample:
@@ -84,7 +89,7 @@ class SurfacePoints:
     @classmethod
     def of(cls, geometry: Geometry, count: int) -> SurfacePoints:
         """`count` points of an object."""
-        u = [mi.Float(((np.arange(1, count + 1) * r + 0.5) % 1.0).astype(np.float32)) for r in R_3]
+        u = [mi.Float(v.astype(np.float32)) for v in lattice(count)]
         p, n, n_out, _, face, _ = uniform_entries(geometry, u[0], mi.Point2f(u[1], u[2]))
         dr.eval(p, n, n_out, face)
         h = REACH * float(np.sqrt(geometry.area / count))
