@@ -13,8 +13,8 @@ from figures.drawing.style import COLUMN, paper, saved
 from figures.parts.part import Part, Result, Task
 
 TITLE = "error against the number of incident samples, the paper's network and ours"
-SECONDS = {"draft": 12, "paper": 600}  # CPU time of each training
-NUMBERS = {"draft": (1, 4, 16, 64), "paper": (1, 2, 4, 8, 16, 32, 64, 128)}
+SECONDS = {"draft": 6, "paper": 600}  # CPU time of each training
+NUMBERS = {"draft": (1, 8, 64), "paper": (1, 2, 4, 8, 16, 32, 64, 128)}
 TRUTH = {"draft": (96, 512), "paper": (256, 8192)}  # exits, and walks of each
 OURS = "full_geometry"
 LIGHTS = ("constant", "lobes")

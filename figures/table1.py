@@ -19,11 +19,12 @@ from figures.parts.part import Part, Result
 from halfspace_sss import materials
 
 TITLE = "time of training and rendering, samples and size of weights, the paper's beside"
-SUBJECTS = {"draft": ("potato", "ketchup"), "paper": MATERIALS}
+SUBJECTS = {"draft": ("potato",), "paper": MATERIALS}
 MODELS = ("neural", *OF_OBJECTS)
 SIZES = {"draft": 64, "paper": 384}
-SPP = {"draft": 64, "paper": 1024}  # of each of two passes
-SEVERAL = 4  # entries of an exit, beside 1, of models of objects
+SPP = {"draft": 36, "paper": 1024}  # of each of two passes
+SEVERAL = 4  # entries of an exit, beside 1
+WITH_SEVERAL = {"draft": (FULL_GEOMETRY,), "paper": OF_OBJECTS}
 NOTES = """\
 The bunny of Fig. 9 on this machine, LLVM backend. *Training* in CPU seconds, compilation of kernels included where they
 were not in Dr.Jit's cache; *render* in seconds for the image, without compilation; *samples* of all pixels together.
@@ -57,7 +58,7 @@ def parts(quality: str) -> list[Part]:
     for material in SUBJECTS[quality]:
         if FULL_GEOMETRY in MODELS:
             results.append(train_scan(material, material, CHUNKS[quality]))
-        for model, entries in _cases():
+        for model, entries in _cases(quality):
             params = {"material": material, "size": size, "seed": 0, "spp": spp, "model": model, "entries": entries}
             needs = (training_of(material),) if model == FULL_GEOMETRY else ()
             inputs = (BUNNY, *weight_files(model, materials.load(material).medium))
@@ -76,9 +77,9 @@ def _rivals() -> dict[tuple[str, str], tuple[str, str]]:
     }
 
 
-def _cases() -> list[tuple[str, int]]:
+def _cases(quality: str) -> list[tuple[str, int]]:
     """Models with numbers of entries."""
-    return [(model, n) for model in MODELS for n in ((1, SEVERAL) if model in OF_OBJECTS else (1,))]
+    return [(model, n) for model in MODELS for n in ((1, SEVERAL) if model in WITH_SEVERAL[quality] else (1,))]
 
 
 def _name(material: str, model: str, entries: int) -> str:
@@ -91,7 +92,8 @@ def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
 
     of_rivals = {part for pair in _rivals() for part in pair}
     subjects = dict.fromkeys(name.split(", ")[0] for name in results if name not in of_rivals)
-    rows = pandas.DataFrame([_row(results, *case) for case in ((m, *c) for m in subjects for c in _cases())])
+    cases = [(material, *case) for material in subjects for case in _cases("paper")]
+    rows = pandas.DataFrame([_row(results, *case) for case in cases if _name(*case) in results])
     beside = pandas.DataFrame(PAPER).rename(columns={"training": "training, s", "kilobytes": "weights, kB"})
     rivals = pandas.DataFrame([
         {"object": name, "method": shown, "training, CPU s": results[training].numbers["cpu seconds"],

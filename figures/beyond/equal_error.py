@@ -9,7 +9,17 @@ from typing import Any
 import numpy as np
 
 from figures.beyond.objects import VIEWS
-from figures.computing.contenders import MODELS, OF_OBJECTS, VOLUMES, WALK, contender, long_passes, long_walk, ready
+from figures.computing.contenders import (
+    MODELS,
+    OF_OBJECTS,
+    VOLUMES,
+    WALK,
+    contender,
+    long_passes,
+    long_walk,
+    ready,
+    volume,
+)
 from figures.computing.images import cover
 from figures.computing.learnt import (
     CHUNKS,
@@ -112,7 +122,11 @@ SPP = {  # of a pass; one that is much shorter would show what a render costs be
     "draft": {"volume": 4, WALK: 16, "model": 64},
     "paper": {"volume": 64, WALK: 64, "model": 1024},
 }
-BARE_MODELS = {"draft": (MODELS[0], MODELS[-1]), "paper": MODELS}  # most of the time of a draft goes into compiling
+# most of the time of a draft goes into compiling, which each method takes for each kind of light
+COMPARED = {"draft": ("marble", "ketchup", "candle"), "paper": (*SUBJECTS, *OBJECTS)}
+ROULETTES = {"draft": (volume(5), volume(200)), "paper": VOLUMES}
+HALF_SPACES = {"draft": ("better_dipole", "neural"), "paper": MODELS}
+BARE_MODELS = {"draft": ("neural",), "paper": MODELS}
 RESOLUTION = {"draft": 64, "paper": 192}  # of modelled objects
 LANES = {"draft": 2**18, "paper": 2**22}
 FURNACE = {"draft": {"size": 16, "spp": 256}, "paper": {"size": 32, "spp": 16384}}
@@ -121,17 +135,18 @@ FURNACE = {"draft": {"size": 16, "spp": 256}, "paper": {"size": 32, "spp": 16384
 def parts(quality: str) -> list[Part]:
     """For each object its training, for each light the truth and the errors with times; then samples and furnace."""
     results = []
-    for name, (scan, material) in SUBJECTS.items():
+    chosen = COMPARED[quality]
+    for name, (scan, material) in ((key, each) for key, each in SUBJECTS.items() if key in chosen):
         if FULL_GEOMETRY in OF_OBJECTS:
             results.append(train_scan(name, material, CHUNKS[quality], scan=scan))
         for lights in LIGHTS:
             results += _parts_of(name, lights, quality)
-    for name in OBJECTS:
+    for name in (key for key in OBJECTS if key in chosen):
         results.append(train_modelled(name, RESOLUTION[quality], CHUNKS[quality]))
         for lights in LIGHTS:
             results += _parts_of(name, lights, quality)
     weights = weight_files("neural", materials.load(SPLIT_MATERIAL).medium)
-    common = {"material": SPLIT_MATERIAL, "models": list(MODELS), "lanes": LANES[quality], "repeats": 5}
+    common = {"material": SPLIT_MATERIAL, "models": list(HALF_SPACES[quality]), "lanes": LANES[quality], "repeats": 5}
     results.append(Part("time per sample", split, common, LANES[quality], inputs=(BUNNY, *weights)))
     for model in (WALK, *furnace_models()):
         params = {"model": model, **FURNACE[quality]}
@@ -153,7 +168,7 @@ def _parts_of(name: str, lights: str, quality: str) -> list[Part]:
     of_subject, file, medium = _subject(name, quality)
     common, spp = {**of_subject, "size": SIZES[quality], "lights": lights}, SPP[quality]
     known = (model for model in OF_OBJECTS if name not in VARYING or model == FULL_GEOMETRY)  # of media that vary
-    methods = [*VOLUMES, WALK, *MODELS, *known]
+    methods = [*ROULETTES[quality], WALK, *HALF_SPACES[quality], *known]
     if name in BARE_MATERIALS:
         methods += [f"{model}, {BARE}" for model in BARE_MODELS[quality]]
     kinds = {method: "volume" if method in VOLUMES else WALK if method == WALK else "model" for method in methods}

@@ -30,6 +30,12 @@ TITLE = "bias against time to a given noise, for every way of rendering"
 MATERIALS = ("marble", "potato", "ketchup")
 SHAPES = ("bunny", "spikes")
 LIGHTS = {"sky": "even sky", "small light": "small light"}
+ALL = tuple((material, shape, light) for material in MATERIALS for shape in SHAPES for light in LIGHTS)
+SCENES = {  # of a draft: a model of an object and both lights, a dense material, a shape that nothing learnt
+    "draft": (("potato", "bunny", "sky"), ("potato", "bunny", "small light"), ("marble", "bunny", "small light"),
+              ("potato", "spikes", "small light")),
+    "paper": ALL,
+}  # fmt: skip
 SECONDS = {"draft": 2.0, "paper": 60.0}  # second halves of gathered light, of 5 to 20 s each, count in it
 KNOB_SECONDS = {"draft": 2.0, "paper": 24.0}
 SIZE = {"draft": 64, "paper": 128}
@@ -42,7 +48,9 @@ WAYS = (
     PATH_TRACED, LAMBERT, "standard_dipole_normalized", "better_dipole", "directional_dipole", "photon_beam_diffusion",
     *LEARNT, *(f"{model}, {GATHERED}" for model in ("better_dipole", *LEARNT)),
 )  # fmt: skip
-KNOB_MATERIALS = ("marble", "ketchup")
+FEW = (PATH_TRACED, LAMBERT, "better_dipole", *LEARNT, *(f"{model}, {GATHERED}" for model in ("neural", FULL_GEOMETRY)))
+CHOSEN = {"draft": FEW, "paper": WAYS}
+KNOB_MATERIALS = {"draft": ("marble",), "paper": ("marble", "ketchup")}
 KNOB_WAYS = ("better_dipole", "neural")
 
 
@@ -50,18 +58,20 @@ def parts(quality: str) -> list[Part]:
     """The bunny's training for each material, then a scene each; the spikes are not learnt, as a new object."""
     results = []
     for material in MATERIALS:
+        scenes = [scene for scene in SCENES[quality] if scene[0] == material]
+        if not scenes:
+            continue
         medium = materials.load(material).medium
         inputs = (BUNNY, *(f for model in NETWORKS for f in weight_files(model, medium)))
         learns = FULL_GEOMETRY in OF_OBJECTS
         if learns:
             results.append(train_scan(material, material, CHUNKS[quality]))
-        for shape in SHAPES:
+        for _, shape, light in scenes:
             needs = (training_of(material),) if learns and shape == "bunny" else ()
-            for light in LIGHTS:
-                params = {"material": material, "shape": shape, "light": light, "seconds": SECONDS[quality]}
-                params |= {"size": SIZE[quality], "spp": SPP[quality], "seed": 0}
-                results.append(Part(_name(material, shape, light), measured, params, SECONDS[quality], needs, inputs))
-    for material in KNOB_MATERIALS:
+            params = {"material": material, "shape": shape, "light": light, "seconds": SECONDS[quality]}
+            params |= {"size": SIZE[quality], "spp": SPP[quality], "seed": 0, "ways": list(CHOSEN[quality])}
+            results.append(Part(_name(material, shape, light), measured, params, SECONDS[quality], needs, inputs))
+    for material in KNOB_MATERIALS[quality]:
         params = {"material": material, "shape": "bunny", "light": "small light", "seconds": KNOB_SECONDS[quality]}
         params |= {"seed": 0, "names": list(KNOB_WAYS)}
         results.append(Part(f"{material}, knobs", turned, params, 6 * KNOB_SECONDS[quality], inputs=(BUNNY,)))
@@ -83,7 +93,7 @@ def measured(task: Task) -> dict[str, Any]:
     with TemporaryDirectory() as folder, learnt, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # they are in the notes of the assessment
         on = stage(_scene(p, Path(folder)))
-        chosen = [Way.of(name) for name in WAYS]
+        chosen = [Way.of(name) for name in p["ways"]]
 
         def tell(what: str, done: int, total: int) -> None:
             task.progress(done, total + 1)
@@ -135,23 +145,21 @@ def _scene(p: Mapping[str, Any], folder: Path, medium: Medium | None = None) -> 
 def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
     """The figure, the table as CSV and Markdown, and the page to flip between images."""
     result, shots = {}, {}
-    for material in MATERIALS:
-        for shape in SHAPES:
-            for light in LIGHTS:
-                name = _name(material, shape, light)
-                if name not in results:
-                    continue
-                assessment = Assessment.of(results[name].numbers["assessment"])
-                result[material, shape, light] = assessment.objects[0]
-                shown = enumerate(results[name].numbers["shown"])
-                images = {way: np.asarray(results[name].images[f"image_{k}"]) for k, way in shown}
-                shots[name] = image_shots(images, assessment)
+    for scene in ALL:
+        name = _name(*scene)
+        if name not in results:
+            continue
+        assessment = Assessment.of(results[name].numbers["assessment"])
+        result[scene] = assessment.objects[0]
+        shown = enumerate(results[name].numbers["shown"])
+        images = {way: np.asarray(results[name].images[f"image_{k}"]) for k, way in shown}
+        shots[name] = image_shots(images, assessment)
     table = trade_plot.trade_table(result)
     with paper():
         figure = multiples(result, TOLERANCE)
         files: dict[str, bytes | str] = {f"trade.{ending}": data for ending, data in saved(figure).items()}
     files["trade.csv"] = table.to_csv(index=False, lineterminator="\n", float_format="%.5g")
-    knobs = [results[f"{m}, knobs"].numbers["settings"] for m in KNOB_MATERIALS if f"{m}, knobs" in results]
+    knobs = [result.numbers["settings"] for name, result in results.items() if name.endswith(", knobs")]
     seconds = max(results[name].numbers["seconds"] for name in shots)
     files["trade.md"] = trade_plot.markdown(result, table, seconds, [s for settings in knobs for s in settings])
     files["trade.html"] = page("Speed against accuracy", shots)

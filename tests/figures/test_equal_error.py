@@ -251,10 +251,9 @@ def test_the_small_light_of_the_candle_is_its_flame_and_that_of_others_a_lamp(tm
 
 
 def test_the_figure_covers_scans_and_modelled_objects_two_lights_and_every_model() -> None:
-    draft, paper = equal_error.parts("draft"), equal_error.parts("paper")
-    assert [part.name for part in draft] == [part.name for part in paper]
-    assert f"{MODELS[1]}, bare" in paper[2].params["spp"]
-    scenes = [part for part in draft if part.name.endswith(", errors")]
+    paper = {part.name: part for part in equal_error.parts("paper")}
+    assert f"{MODELS[1]}, bare" in paper["marble, small light, errors"].params["spp"]
+    scenes = [part for part in paper.values() if part.name.endswith(", errors")]
     assert len(scenes) == 16
     for part in scenes:
         assert {*VOLUMES, WALK, *MODELS, LEARNT} <= set(part.params["spp"])
@@ -263,4 +262,11 @@ def test_the_figure_covers_scans_and_modelled_objects_two_lights_and_every_model
     assert [part.params["object"] for part in scenes if "object" in part.params] == [n for n in MODELLED for _ in "ab"]
     assert all(("neural_shape" in part.params["spp"]) == (part.params.get("object") != "mandarin") for part in scenes)
     assert sum(BARE in part.params["spp"] for part in scenes) == 6
-    assert all(b.work > 4 * a.work for a, b in zip(draft, paper))
+
+
+def test_a_draft_is_a_part_of_the_figure() -> None:
+    draft, paper = ({part.name: part for part in equal_error.parts(quality)} for quality in ("draft", "paper"))
+    assert all(paper[name].work > 4 * part.work for name, part in draft.items())
+    scenes = [name for name in draft if name.endswith(", errors")]
+    assert any("candle" in name for name in scenes) and any("even sky" in name for name in scenes)
+    assert all(set(draft[name].params["spp"]) < set(paper[name].params["spp"]) for name in scenes)

@@ -20,7 +20,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture()
 def small(monkeypatch):
-    monkeypatch.setattr(fig09, "MATERIALS", ("marble",))
+    monkeypatch.setattr(fig09, "SHOWN", {"draft": ("marble",)})
     monkeypatch.setattr(fig09, "MODELS", ("better_dipole", "neural"))
     monkeypatch.setattr(fig09, "SIZES", {"draft": 20})
     monkeypatch.setattr(fig09, "MODEL_SPP", {"draft": 8})

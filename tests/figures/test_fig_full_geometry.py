@@ -35,7 +35,7 @@ SETTINGS = {
         "PHOTOGRAPHS": {"draft": {"n": 2, "size": 8, "spp": 4}}, "STEP_SPP": {"draft": 1}, "BACKGROUND_SPP": 4,
     },
     fig09: {
-        "MATERIALS": ("ketchup",), "MODELS": (MODEL,), "SIZES": {"draft": 12}, "MODEL_SPP": {"draft": 4},
+        "SHOWN": {"draft": ("ketchup",)}, "MODELS": (MODEL,), "SIZES": {"draft": 12}, "MODEL_SPP": {"draft": 4},
         "TRUTH_SPP": {"draft": 32},
     },
     fig11: {"MATERIALS": ("ketchup",), "METHODS": (VOLUMES[0], MODEL), "SIZES": {"draft": 12}},
