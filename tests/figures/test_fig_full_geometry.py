@@ -31,7 +31,7 @@ SETTINGS = {
     },
     fig06: {"LIGHTS": ("sunset", "even sky"), "VIEWS": (0, 180), "SIZES": {"draft": 12}},
     fig07: {
-        "OBJECTS": ("meat",), "SIZES": {"draft": 12}, "RESOLUTION": {"draft": 24}, "STEPS": {"draft": 2},
+        "SHOWN": {"draft": ("meat",)}, "SIZES": {"draft": 12}, "RESOLUTION": {"draft": 24}, "STEPS": {"draft": 2},
         "PHOTOGRAPHS": {"draft": {"n": 2, "size": 8, "spp": 4}}, "STEP_SPP": {"draft": 1}, "BACKGROUND_SPP": 4,
     },
     fig09: {
