@@ -123,10 +123,11 @@ SPP = {  # of a pass; one that is much shorter would show what a render costs be
     "paper": {"volume": 64, WALK: 64, "model": 1024},
 }
 # most of the time of a draft goes into compiling, which each method takes for each kind of light
-COMPARED = {"draft": ("marble", "ketchup", "candle"), "paper": (*SUBJECTS, *OBJECTS)}
+COMPARED = {"draft": ("marble", "candle"), "paper": (*SUBJECTS, *OBJECTS)}
 ROULETTES = {"draft": (volume(5), volume(200)), "paper": VOLUMES}
 HALF_SPACES = {"draft": ("better_dipole", "neural"), "paper": MODELS}
-BARE_MODELS = {"draft": ("neural",), "paper": MODELS}
+BARE_MODELS = {"draft": (), "paper": MODELS}
+LEARNT = {"draft": (FULL_GEOMETRY,), "paper": OF_OBJECTS}
 RESOLUTION = {"draft": 64, "paper": 192}  # of modelled objects
 LANES = {"draft": 2**18, "paper": 2**22}
 FURNACE = {"draft": {"size": 16, "spp": 256}, "paper": {"size": 32, "spp": 16384}}
@@ -167,7 +168,7 @@ def _furnace_name(method: str) -> str:
 def _parts_of(name: str, lights: str, quality: str) -> list[Part]:
     of_subject, file, medium = _subject(name, quality)
     common, spp = {**of_subject, "size": SIZES[quality], "lights": lights}, SPP[quality]
-    known = (model for model in OF_OBJECTS if name not in VARYING or model == FULL_GEOMETRY)  # of media that vary
+    known = (model for model in LEARNT[quality] if name not in VARYING or model == FULL_GEOMETRY)  # of media that vary
     methods = [*ROULETTES[quality], WALK, *HALF_SPACES[quality], *known]
     if name in BARE_MATERIALS:
         methods += [f"{model}, {BARE}" for model in BARE_MODELS[quality]]

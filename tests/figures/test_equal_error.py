@@ -49,6 +49,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Result]:
         patch.setattr(training, "train_by_chunks", lambda *a, **how: train(*a, **{**how, "recipe": QUICK}))
         patch.setitem(equal_error.CHUNKS, "draft", 1)
         patch.setattr(equal_error, "SUBJECTS", {"ketchup": ("bunny", "ketchup")})
+        patch.setitem(equal_error.COMPARED, "draft", ("ketchup",))
         patch.setattr(equal_error, "OBJECTS", ())
         patch.setattr(equal_error, "LIGHTS", ("even sky",))
         patch.setattr(equal_error, "furnace_models", lambda: [DIPOLE])
