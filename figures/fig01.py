@@ -10,7 +10,7 @@ import numpy as np
 
 from figures.beyond.objects import VIEWS, View, foot, scene
 from figures.computing.contenders import OF_OBJECTS
-from figures.computing.images import Shot, compared, cover, stops_of
+from figures.computing.images import Shot
 from figures.computing.learnt import (
     CHUNKS,
     FULL_GEOMETRY,
@@ -20,7 +20,9 @@ from figures.computing.learnt import (
     weight_files,
     with_weights,
 )
+from figures.computing.references import NOTE, against, reference_image, reference_shot
 from figures.computing.scenes import environment_file, prepare
+from figures.computing.timed import COMPILING, gathered_anew
 from figures.drawing.error_tables import label
 from figures.drawing.image_files import image_files, rows_of
 from figures.modelling.objects import TISSUES, tissue
@@ -31,15 +33,13 @@ OBJECTS = ("candle", "mandarin", "croissant")
 MODELS = ("neural", *(name for name in OF_OBJECTS if name == FULL_GEOMETRY))
 TRUTH = "path_traced"
 SIZES = {"draft": 128, "paper": 448}
-SPP = {"draft": {TRUTH: 256, "model": 128}, "paper": {TRUTH: 8192, "model": 1024}}
-SPP_PER_PASS = 16
+SPP = {"draft": {TRUTH: 128, "model": 64}, "paper": {TRUTH: 512, "model": 128}}
 RESOLUTION = {"draft": 64, "paper": 240}  # of surfaces; grids have half of it
 LIGHT = "sunset"  # the small lamps of the studio are hardly found by walks
 NOTES = (
     "The candle is homogeneous wax with its flame as a small emitter in the bowl; mandarin and croissant are grid "
     "volumes, of which the half-space takes the means. Smooth boundaries, all scattering orders; models by their "
-    "gathered light. FLIP and relative squared error of the pixels of the object, against our walk, whose own noise is "
-    "in all of them alike."
+    f"gathered light. FLIP and relative squared error of the pixels of the object. {NOTE}"
 )
 
 
@@ -64,7 +64,7 @@ def _view(name: str) -> View:
 
 
 def shown(task: Task) -> dict[str, Any]:
-    """An object in its surroundings, and its cover of each pixel."""
+    """An object in its surroundings: the reference, or the image of a model by its gathered light."""
     import mitsuba as mi
 
     from halfspace_sss.rendering.scenes.scene_files import load_scene
@@ -73,22 +73,18 @@ def shown(task: Task) -> dict[str, Any]:
     p, name = task.params, task.params["object"]
     made = object_parts(name, p["resolution"], task.folder, p["seed"])
     description = scene(made, View(*p["view"]), p["size"], foot(made[name]))
-    alone = {key: description[key] for key in ("type", "sensor", name)}
-    covered = cover(mi.load_dict({**alone, "integrator": {"type": "path"}}))
-    if p["model"] != TRUTH:
-        description["integrator"] = {"type": "bssrdf", "light": "gathered"}
-    each = min(SPP_PER_PASS, p["spp"])
-    passes = p["spp"] // each
+    if p["model"] == TRUTH:
+        alone = {key: description[key] for key in ("type", "sensor", name)}
+        covering = mi.load_dict({**alone, "integrator": {"type": "path"}})
+        return reference_image(task, load_scene(description, p["model"]), covering)
+    description["integrator"] = {"type": "bssrdf", "light": "gathered"}
     with with_weights(task.folder, task.needed):
-        loaded, total, took = load_scene(description, p["model"]), 0.0, []
-        for k in range(passes):
-            seed = int(np.random.SeedSequence((p["seed"], k, p["model"] == TRUTH)).generate_state(1)[0])
-            began = time.process_time()
-            total = total + np.array(mi.render(loaded, spp=each, seed=seed))[..., :3]
-            took.append(time.process_time() - began)
-            task.progress(k + 1, passes)
-    image = {"image": (total / passes).astype(np.float32), "cover": covered, "spp": passes * each}
-    return {**image, "cpu seconds of a sample": min(took) / each}  # a first pass compiles and gathers light
+        loaded = load_scene(description, p["model"])
+        mi.render(loaded, spp=COMPILING, seed=p["seed"] + 1)  # compiles
+        gathering, began = gathered_anew(loaded), time.process_time()
+        image = np.array(mi.render(loaded, spp=p["spp"], seed=p["seed"] + 2))[..., :3]
+    each = (time.process_time() - began) / p["spp"]
+    return {"image": image, "spp": p["spp"], "seconds of gathering": gathering, "cpu seconds of a sample": each}
 
 
 def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
@@ -99,11 +95,6 @@ def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
 
 def _shots(results: Mapping[str, Result], name: str) -> list[Shot]:
     """The images of an object, exposed alike."""
-    truth = results[f"{name}, {TRUTH}"]
-    reference, mask = np.maximum(truth.images["image"], 0), truth.images["cover"] > 0.5
-    gain = np.float32(2.0 ** stops_of(reference, mask))
-    shots = [Shot("Path traced", gain * reference, {})]
-    for model in MODELS:
-        image = results[f"{name}, {model}"].images["image"]
-        shots.append(compared(label(model), gain * image, gain * reference, mask=mask, numbers={}))
-    return shots
+    reference = reference_shot(results[f"{name}, {TRUTH}"])
+    images = {model: results[f"{name}, {model}"].images["image"] for model in MODELS}
+    return [reference[0], *(against(reference, label(model), image) for model, image in images.items())]

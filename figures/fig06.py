@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from figures.computing.images import Shot, compared, stops_of
+from figures.computing.images import Shot
 from figures.computing.learnt import CHUNKS, FULL_GEOMETRY, train_scan, training_of, with_weights
+from figures.computing.references import NOTE, against, reference_image, reference_shot
 from figures.computing.scenes import BUNNY, ENVIRONMENTS, bunny_scene, environment, environment_file, prepare
 from figures.drawing.image_grid import image_grid
 from figures.drawing.page import page
@@ -24,12 +25,11 @@ SCALES = {"sunset": 1.5, "forest": 0.8}
 VIEWS = (0, 90, 180, 270)  # degrees about the bunny
 VIEWS_LIGHT = LIGHTS[0]
 SIZES = {"draft": 72, "paper": 384}
-SPP = {"draft": {"path_traced": 256, FULL_GEOMETRY: 64}, "paper": {"path_traced": 8192, FULL_GEOMETRY: 1024}}
+SPP = {"draft": {"path_traced": 128, FULL_GEOMETRY: 64}, "paper": {"path_traced": 1024, FULL_GEOMETRY: 128}}
 AXIS = (-0.17, 0.15)  # x and z of the axis that the camera goes about
 NOTES = (
     "Trained once, without any of these lights: the same weights in all images, by gathered light. All scattering "
-    "orders. FLIP and relative squared error of the pixels of the object, against walks, whose own noise is in them as "
-    "well."
+    f"orders. FLIP and relative squared error of the pixels of the object. {NOTE}"
 )
 
 
@@ -81,7 +81,9 @@ def seen(task: Task) -> dict[str, Any]:
     description["sensor"]["to_world"] = turn @ description["sensor"]["to_world"]
     with with_weights(task.folder, task.needed):
         scene = load_scene(description, p["model"])
-        image = np.array(mi.render(scene, spp=p["spp"], seed=p["seed"] + (p["model"] == PATH_TRACED)))
+        if p["model"] == PATH_TRACED:
+            return reference_image(task, scene)
+        image = np.array(mi.render(scene, spp=p["spp"], seed=p["seed"]))
     return {"image": image[..., :3].astype(np.float32), "spp": p["spp"]}
 
 
@@ -105,12 +107,9 @@ def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
 
 def _pair(results: Mapping[str, Result], light: str, view: int) -> tuple[Shot, Shot]:
     """The images by walks and by the model, exposed alike."""
-    reference = results[_name(light, view, "path_traced")].images["image"]
-    mask = reference.max(axis=2) > 0
-    gain = np.float32(2.0 ** stops_of(reference, mask))
-    image = results[_name(light, view, FULL_GEOMETRY)].images["image"]
-    model = compared("Full geometry", gain * image, gain * reference, mask=mask, numbers={})
-    return Shot("Path traced", gain * reference, {}), model
+    reference = reference_shot(results[_name(light, view, "path_traced")])
+    model = against(reference, "Full geometry", results[_name(light, view, FULL_GEOMETRY)].images["image"])
+    return reference[0], model
 
 
 def _by_method(pairs: Mapping[str, tuple[Shot, Shot]]) -> dict[str, list[Shot]]:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from figures.beyond.objects import VIEWS, View, foot, scene
-from figures.computing.images import Shot, compared, stops_of
+from figures.computing.images import Shot
 from figures.computing.learnt import (
     CHUNKS,
     FULL_GEOMETRY,
@@ -18,9 +18,11 @@ from figures.computing.learnt import (
     train_modelled,
     training_of,
 )
+from figures.computing.references import NOTE, against, reference_shot
 from figures.computing.scenes import environment_file, prepare
 from figures.drawing.image_files import image_files
-from figures.fig01 import LIGHT, RESOLUTION, TRUTH, shown
+from figures.fig01 import LIGHT, RESOLUTION, SIZES, TRUTH, shown
+from figures.fig01 import SPP as OURS_SPP
 from figures.modelling.objects import TISSUES
 from figures.parts.part import Part, Result, Task
 from halfspace_sss.provenance import check_folder
@@ -30,22 +32,18 @@ OBJECTS = ("mandarin", "meat", "candle", "croissant")
 SHOWN = {"draft": ("mandarin", "candle"), "paper": OBJECTS}
 DENG, TG = "Deng et al. 2022", "TG et al. 2023"
 LABELS = {DENG: DENG, TG: TG, FULL_GEOMETRY: "Ours, full geometry"}
-SIZES = {"draft": 72, "paper": 448}
-SPP = {
-    "draft": {TRUTH: 256, FULL_GEOMETRY: 64, DENG: 64, TG: 2},
-    "paper": {TRUTH: 8192, FULL_GEOMETRY: 1024, DENG: 1024, TG: 16},
-}
-PHOTOGRAPHS = {"draft": {"n": 16, "size": 32, "spp": 64}, "paper": {"n": 100, "size": 256, "spp": 64}}
-STEPS, STEP_SPP = {"draft": 50, "paper": 10000}, {"draft": 16, "paper": 32}
-TEXELS = {"draft": 1500, "paper": 262144}
+RIVALS_SPP = {"draft": {DENG: 64, TG: 2}, "paper": {DENG: 128, TG: 16}}
+PHOTOGRAPHS = {"draft": {"n": 16, "size": 32, "spp": 64}, "paper": {"n": 24, "size": 64, "spp": 96}}
+STEPS, STEP_SPP = {"draft": 50, "paper": 120}, {"draft": 16, "paper": 32}
+TEXELS = {"draft": 1500, "paper": 6000}
 LAMPS = ("flame",)
-SECONDS = {"draft": 8.0, "paper": 240.0}  # CPU time of the network of TG et al., as ours takes
+SECONDS = {"draft": 8.0, "paper": 48.0}  # CPU time of the network of TG et al., as ours takes
 BACKGROUND_SPP = 64  # of what the network of distant light does not show
 NOTES = (
     "Each method was given the object before, none these lights. Deng et al.: a dipole with a texture of the albedo, "
     "fitted to photographs under distant lights. TG et al.: a network for one distant light, environments as sums over "
     "directions, the flame as its direction from the centre of the candle. FLIP and relative squared error of the "
-    "pixels of the object against our walk, the noise of all images included."
+    f"pixels of the object. {NOTE}"
 )
 
 
@@ -57,7 +55,8 @@ def parts(quality: str) -> list[Part]:
         common = {"object": name, "size": size, "resolution": resolution, "seed": 0}
         common["view"] = list(VIEWS[name]._replace(light=LIGHT))
         inputs = (environment_file(LIGHT), TISSUES)
-        for method, spp in SPP[quality].items():
+        ours = {TRUTH: OURS_SPP[quality][TRUTH], FULL_GEOMETRY: OURS_SPP[quality]["model"]}
+        for method, spp in {**ours, **RIVALS_SPP[quality]}.items():
             params, work, needs = {**common, "spp": spp, "model": method}, spp * size**2, ()
             function = {DENG: deng, TG: distant}.get(method, shown)
             if method == DENG:
@@ -155,14 +154,11 @@ def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
 
 def _shots(results: Mapping[str, Result], name: str) -> list[Shot]:
     """The images of an object, exposed alike, with the CPU seconds of each training."""
-    truth = results[f"{name}, {TRUTH}"]
-    reference, mask = np.maximum(truth.images["image"], 0), truth.images["cover"] > 0.5
-    gain = np.float32(2.0 ** stops_of(reference, mask))
-    shots = [Shot("Path traced", gain * reference, {})]
+    reference = reference_shot(results[f"{name}, {TRUTH}"])
+    shots = [reference[0]]
     for method, label in LABELS.items():
         result = results[f"{name}, {method}"]
         learnt = results[training_of(name)] if method == FULL_GEOMETRY else result
         numbers = {"training, CPU s": learnt.numbers["cpu seconds"]}
-        image = gain * result.images["image"]
-        shots.append(compared(label, image, gain * reference, mask=mask, numbers=numbers))
+        shots.append(against(reference, label, result.images["image"], **numbers))
     return shots

@@ -7,25 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from figures.computing.contenders import MODELS, OF_OBJECTS, VOLUMES, WALK, contender, long_walk
-from figures.computing.images import (
-    FLIP,
-    RELATIVE_MSE,
-    Shot,
-    check_denoiser,
-    compared,
-    cover,
-    denoised,
-    guides,
-    noise_of,
-    stops_of,
-)
+from figures.computing.contenders import MODELS, OF_OBJECTS, VOLUMES, WALK, contender
+from figures.computing.images import FLIP, RELATIVE_MSE, Shot, check_denoiser, denoised, guides
 from figures.computing.learnt import CHUNKS, FULL_GEOMETRY, train_scan, training_of, weight_files, with_weights
+from figures.computing.references import NOTE, against, long_reference, reference_shot
 from figures.computing.scenes import BUNNY, prepare
 from figures.computing.timed import TimedRender, alternating, pass_size
 from figures.drawing.error_tables import label
 from figures.drawing.image_files import image_files
-from figures.parts.part import Part, Result, Task, unmodelled
+from figures.parts.part import Part, Result, Task
 from halfspace_sss import materials
 
 TITLE = "path tracing and ours in equal time, raw and denoised, with FLIP"
@@ -36,15 +26,14 @@ METHODS = (*VOLUMES, WALK, OURS, *OF_OBJECTS)
 ROULETTES = {"draft": (VOLUMES[0], VOLUMES[-1]), "paper": VOLUMES}
 SIZES = {"draft": 96, "paper": 384}
 SECONDS = {"draft": 1.0, "paper": 60.0}  # for an image
-TRUTH_SPP = {"draft": 256, "paper": 16384}
+TRUTH_SPP = {"draft": 128, "paper": 1024}
 PASSES, SHORTEST = 8, 1.0  # of an image, about; seconds, of a pass: a render has a cost of its own
 NOTES = (
     "Every method had the same time, compilation and the training of `full_geometry` left out; passes of all methods "
     "took turns on the same machine. Of "
     "Mitsuba's volpathmis with Russian roulette from vertex 5, 64, 200 and 1024 on, the one with the smallest relMSE "
     "is shown, a choice in its favour; the table of the files lists all. FLIP and relMSE of the pixels of the object "
-    "at the stated exposure, against a long render by our walk, whose own noise is in all of them alike. The denoiser "
-    "is led by the albedo and the normals of the object."
+    f"at the stated exposure. {NOTE}"
 )
 
 
@@ -54,9 +43,8 @@ def parts(quality: str) -> list[Part]:
     for material in MATERIALS:
         common = {"material": material, "size": size, "lights": LIGHTS}
         spp = TRUTH_SPP[quality]
-        results.append(
-            Part(f"{material}, truth", truth, {**common, "spp": spp, "seed": 0}, spp * size**2, inputs=(BUNNY,))
-        )
+        params = {**common, "spp": spp, "seed": 0}
+        results.append(Part(f"{material}, truth", long_reference, params, spp * size**2, inputs=(BUNNY,)))
         methods = [name for name in METHODS if name not in VOLUMES or name in ROULETTES[quality]]
         params = {**common, "seconds": SECONDS[quality], "methods": methods, "seed": 1}
         learnt = FULL_GEOMETRY in METHODS
@@ -65,13 +53,6 @@ def parts(quality: str) -> list[Part]:
         work, needs = len(methods) * SECONDS[quality], (training_of(material),) if learnt else ()
         results.append(Part(f"{material}, equal time", rivals, params, work, needs, (BUNNY, *files)))
     return results
-
-
-@unmodelled
-def truth(task: Task) -> dict[str, Any]:
-    """The long image, if its rivals can be denoised."""
-    check_denoiser()  # before time is spent
-    return long_walk(task)
 
 
 def rivals(task: Task) -> dict[str, Any]:
@@ -86,7 +67,7 @@ def rivals(task: Task) -> dict[str, Any]:
         result = alternating(scenes, spp, p["seed"], seconds=p["seconds"], progress=task.progress)
     seen = next(iter(scenes.values()))
     about = guides(seen)
-    images, numbers = {"cover": cover(seen)}, {}
+    images, numbers = {}, {}
     for name, timed in result.items():
         images[_key(name, "raw")] = timed.image.astype(np.float32)
         images[_key(name, "denoised")], seconds = denoised(timed.image, *about)
@@ -122,30 +103,22 @@ def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
 
 def _shots(truth: Result, rivals: Result, material: str) -> tuple[str, list[Shot], list[dict[str, Any]]]:
     """The material with its exposure, the images that are shown, multiplied by it, and the rows of all methods."""
-    reference, mask = truth.images["image"], rivals.images["cover"] > 0
-    stops = stops_of(reference, mask)
-    gain = np.float32(2.0**stops)
-    error = noise_of(reference, truth.images["variance"], mask)
-    numbers = {name: truth.numbers[name] for name in ("spp", "seconds")}
-    shots, rows = {}, [{"material": material, "method": WALK, "state": "truth", **numbers, "standard error": error}]
+    reference = reference_shot(truth, "Path traced, long")
+    shots, rows = {}, [{"material": material, "method": WALK, "state": "truth", **reference[0].numbers}]
     for name, about in rivals.numbers["methods"].items():
         for state in ("raw", "denoised"):
-            image = gain * rivals.images[_key(name, state)]
             extra = {"spp": str(about["spp"]), "seconds": about["seconds"]}
             if state == "denoised":
                 extra["seconds"] += about["seconds of denoising"]
-            shot = compared(_title(name, state), image, gain * reference, mask=mask, numbers=extra)
+            shot = against(reference, _title(name, state), rivals.images[_key(name, state)], **extra)
             shots[name, state] = shot
             rows.append({"material": material, "method": name, "state": state, **shot.numbers})
     volumes = [name for name in rivals.numbers["methods"] if name in VOLUMES]
     best = min(volumes, key=lambda name: shots[name, "raw"].numbers[RELATIVE_MSE])
     for row in rows:
         row["shown"] = row["state"] == "truth" or row["method"] not in volumes or row["method"] == best
-    reference_shot = Shot(
-        "Path traced, long", gain * reference, {**numbers, "spp": str(numbers["spp"]), "standard error": error}
-    )
     chosen = [shot for (name, _), shot in shots.items() if name not in volumes or name == best]
-    return f"{material} ({stops:+g} stops)", [reference_shot, *chosen], rows
+    return f"{material} ({reference[2]:+g} stops)", [reference[0], *chosen], rows
 
 
 def _title(name: str, state: str) -> str:

@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from figures.computing.contenders import WALK, long_walk, ready
-from figures.computing.images import FLIP, Shot, compared, cover, noise_of, stops_of
+from figures.computing.contenders import WALK, ready
+from figures.computing.images import FLIP, Shot, cover
 from figures.computing.learnt import CHUNKS, FULL_GEOMETRY, train_scan, training_of, with_weights
+from figures.computing.references import NOTE, against, long_reference, reference_shot
 from figures.computing.scenes import BUNNY, prepare, scan_scene
-from figures.computing.timed import rendered
+from figures.computing.timed import gathered_anew, rendered
 from figures.drawing.image_files import image_files
 from figures.parts.part import Part, Result, Task
 from halfspace_sss import materials
@@ -21,13 +22,13 @@ TITLE = "walked, sampled and gathered in equal time"
 MATERIALS = ("marble",)
 LIGHTS = "both"
 WAYS = {"walked": (WALK, "sampled"), "sampled": (FULL_GEOMETRY, "sampled"), "gathered": (FULL_GEOMETRY, "gathered")}
-SIZES = {"draft": 192, "paper": 512}
+SIZES = {"draft": 192, "paper": 384}
 SECONDS = {"draft": 4.0, "paper": 20.0}  # of the processor, all cores together
-TRUTH_SPP = {"draft": 384, "paper": 4096}
+TRUTH_SPP = {"draft": 128, "paper": 1024}
 PASSES, PILOT = 8, 2  # of an image, about; samples of a pixel by which the time of others is foreseen
 NOTES = (
     "All had the same seconds of the processor, compilation and the training of `full_geometry` left out, the "
-    "gathering of light counted. FLIP of the pixels of the object against a long walk; the noise of both is in it."
+    f"gathering of light counted. FLIP of the pixels of the object. {NOTE}"
 )
 
 
@@ -37,7 +38,7 @@ def parts(quality: str) -> list[Part]:
     for material in MATERIALS:
         common = {"material": material, "size": size, "lights": LIGHTS}
         params = {**common, "spp": spp, "seed": 0}
-        results.append(Part(f"{material}, truth", long_walk, params, spp * size**2, inputs=(BUNNY,)))
+        results.append(Part(f"{material}, truth", long_reference, params, spp * size**2, inputs=(BUNNY,)))
         results.append(train_scan(material, material, CHUNKS[quality]))
         params = {**common, "seconds": SECONDS[quality], "seed": 1}
         needs = (training_of(material),)
@@ -63,11 +64,7 @@ def in_time(task: Task) -> dict[str, Any]:
 def _passes(scene: Any, seconds: float, seed: int, gathers: bool) -> tuple[np.ndarray, dict[str, Any]]:
     """The mean of passes that take so long, light gathered anew among it, and their numbers."""
     rendered(scene, PILOT, seed, 0)  # compiles
-    started = clock()
-    if gathers:
-        scene.integrator().gathering = type(scene.integrator().gathering)()
-        scene.integrator().prepare(scene)
-    gathering, started = clock() - started, clock()
+    gathering, started = gathered_anew(scene) if gathers else 0.0, clock()
     rendered(scene, PILOT, seed, 1)
     spp = max(round(PILOT * (seconds - gathering) / PASSES / (clock() - started)), 1)
     rendered(scene, spp, seed, 2)  # compiles for that number
@@ -89,13 +86,10 @@ def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
 
 def _shots(results: Mapping[str, Result], material: str) -> list[Shot]:
     """The images of a material, exposed alike."""
-    truth, equal = results[f"{material}, truth"], results[f"{material}, equal time"]
-    reference, mask = truth.images["image"], equal.images["cover"] > 0
-    gain = np.float32(2.0 ** stops_of(reference, mask))
-    error = noise_of(reference, truth.images["variance"], mask)
-    shots = [Shot("Path traced, long", gain * reference, {"standard error": error})]
+    equal = results[f"{material}, equal time"]
+    reference = reference_shot(results[f"{material}, truth"])
+    shots = [reference[0]]
     for way, about in equal.numbers["ways"].items():
-        numbers = {**about, "spp": str(about["spp"])}
         title = f"{way.capitalize()}, {about['seconds']:.2g} s"
-        shots.append(compared(title, gain * equal.images[way], gain * reference, mask=mask, numbers=numbers))
+        shots.append(against(reference, title, equal.images[way], **{**about, "spp": str(about["spp"])}))
     return shots

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from figures.computing.learnt import CHUNKS, FULL_GEOMETRY, trained, training_of, weight_files, with_weights
+from figures.computing.references import NOTE
 from figures.computing.scenes import prepare
 from figures.computing.things import Staging, lit_scene, shown, thing_parts, walked
 from figures.drawing.image_files import against_walks, image_files, rows_of
@@ -21,15 +22,13 @@ from halfspace_sss.physics.medium import Medium
 from halfspace_sss.provenance import check_folder
 
 TITLE = "a painted head, a leaf of coloured vertices and a stone in jelly, walked and by models"
-GATHERED = f"{FULL_GEOMETRY}, gathered"
-OF_OBJECTS = (FULL_GEOMETRY, GATHERED)
+OF_OBJECTS = (FULL_GEOMETRY,)
 OF_SURFACES = ("better_dipole", "neural", *OF_OBJECTS)
 THINGS = {"head": OF_SURFACES, "leaf": OF_SURFACES, "jelly": OF_OBJECTS}
 SIZES = {"draft": 112, "paper": 384}
 RESOLUTION = {"draft": 96, "paper": 192}
-MODEL_SPP = {"draft": 64, "paper": 2304}  # square numbers, for the sampler
-TRUTH_SPP = {"draft": 256, "paper": 8192}
-SPP_PER_PASS = 32
+MODEL_SPP = {"draft": 64, "paper": 128}
+TRUTH_SPP = {"draft": 128, "paper": 1024}
 MM_PER_UNIT = {"head": 10.0, "leaf": 15.0, "jelly": 10.0}
 WAX_MFP, LEAF_MFP, LEAF_SEED = "1.0,0.6,0.4", "0.2,0.25,0.12", 3  # mm
 JELLY = Medium.from_albedo(np.array([0.99, 0.72, 0.6]), np.array([0.16, 0.18, 0.20]), 0.5, 1.35)
@@ -42,8 +41,8 @@ NOTES = (
     "All images contain all scattering orders. The head's reflectance is a bitmap by uv, the leaf's an attribute of "
     "vertices: the walk takes the medium of its exit for the whole way, half-space models that of both ends, and "
     "full_geometry learnt it from walks. The stone in the jelly is opaque: half-space models refuse it, "
-    "full_geometry learnt jelly and stone. FLIP and relative squared error of the pixels of the object; the noise of "
-    "both images is in them."
+    "full_geometry learnt jelly and stone. Models by their gathered light. FLIP and relative squared error of the "
+    f"pixels of the object. {NOTE}"
 )
 
 
@@ -71,7 +70,7 @@ def learnt(task: Task) -> dict[str, Any]:
 @unmodelled
 def path_traced(task: Task) -> dict[str, Any]:
     """The image by random walks."""
-    return walked(task, _scene, SPP_PER_PASS)
+    return walked(task, _scene)
 
 
 def rendered(task: Task) -> dict[str, Any]:
@@ -84,10 +83,7 @@ def _scene(task: Task, model: str) -> dict[str, Any]:
     p, folder = task.params, check_folder(task.folder)
     name = p["thing"]
     things = {"head": _head, "leaf": _leaf, "jelly": _jelly}[name](folder, p["resolution"])
-    scene = lit_scene(things, STAGES[name], p["size"], MM_PER_UNIT[name], model)
-    if model == GATHERED:
-        scene["integrator"]["light"] = "gathered"
-    return scene
+    return lit_scene(things, STAGES[name], p["size"], MM_PER_UNIT[name], model)
 
 
 def _head(folder: Path, resolution: int) -> dict[str, Any]:

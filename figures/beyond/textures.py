@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from figures.computing.references import NOTE
 from figures.computing.scenes import BUNNY, MM_PER_UNIT
 from figures.computing.things import Staging, lit_scene, shown, thing_parts, walked
 from figures.drawing.image_files import against_walks, image_files, rows_of
@@ -19,9 +20,8 @@ TITLE = "media by textures of the surface: painted reflectance, walked and by ha
 MODELS = ("lambert", "better_dipole", "neural")
 THINGS = ("bunny", "ball")
 SIZES = {"draft": 128, "paper": 384}
-MODEL_SPP = {"draft": 64, "paper": 2304}  # square numbers, for the sampler
-TRUTH_SPP = {"draft": 512, "paper": 8192}
-SPP_PER_PASS = 32
+MODEL_SPP = {"draft": 64, "paper": 128}
+TRUTH_SPP = {"draft": 128, "paper": 1024}
 ETA = 1.4
 BUNNY_MFP = "1.2,0.8,0.5"  # mm
 CELLS = 60  # of the mosaic on the bunny
@@ -35,7 +35,8 @@ STAGE = Staging((0.25, 0.15, 1), (-0.9, 0.8, 0.7), fov=23.0, lamp_radius=0.4, sk
 NOTES = (
     "All images contain all scattering orders. The walk takes the medium of its exit for the whole way, models that of "
     "both ends. The bunny's reflectance is an attribute of its vertices, the ball's reflectance and mean free "
-    "path are bitmaps. FLIP and relative squared error of the pixels of the object; the noise of both is in them."
+    "path are bitmaps. Models by their gathered light. FLIP and relative squared error of the pixels of the object. "
+    f"{NOTE}"
 )
 
 
@@ -53,7 +54,7 @@ def parts(quality: str) -> list[Part]:
 @unmodelled
 def path_traced(task: Task) -> dict[str, Any]:
     """The image by random walks."""
-    return walked(task, _scene, SPP_PER_PASS)
+    return walked(task, _scene)
 
 
 def rendered(task: Task) -> dict[str, Any]:

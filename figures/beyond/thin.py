@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from figures.computing.learnt import weight_files
+from figures.computing.references import NOTE
 from figures.computing.scenes import DRAGON, SCANS
 from figures.computing.things import Staging, lit_scene, shown, thing_parts, walked
 from figures.drawing.image_files import against_walks, image_files, rows_of
@@ -20,14 +21,13 @@ TITLE = "thin things lit from behind, by half-spaces and by the network of all s
 MODELS = ("better_dipole", "neural", "neural_shape")
 SIZES = {"draft": 96, "paper": 384}
 RESOLUTION = {"draft": 64, "paper": 192}  # of the meshes that are made
-MODEL_SPP = {"draft": 64, "paper": 2304}  # square numbers, for the sampler
-TRUTH_SPP = {"draft": 256, "paper": 8192}
-SPP_PER_PASS = 16
+MODEL_SPP = {"draft": 64, "paper": 128}
+TRUTH_SPP = {"draft": 128, "paper": 1024}
 NOTES = (
     "All images contain all scattering orders: the models lack the orders below two, which are path traced beside "
     "them, but for what passes a half-space unscattered. The leaf is of a family of shapes that `neural_shape` was not "
-    "trained on; the dragon was among its meshes, and shells, but not this one, among its families. FLIP and relative "
-    "squared error of the pixels of the object; the noise of both images is in them."
+    "trained on; the dragon was among its meshes, and shells, but not this one, among its families. Models by their "
+    f"gathered light. FLIP and relative squared error of the pixels of the object. {NOTE}"
 )
 
 
@@ -64,7 +64,7 @@ def parts(quality: str) -> list[Part]:
 @unmodelled
 def path_traced(task: Task) -> dict[str, Any]:
     """The image by random walks."""
-    return walked(task, _scene, SPP_PER_PASS)
+    return walked(task, _scene)
 
 
 def rendered(task: Task) -> dict[str, Any]:

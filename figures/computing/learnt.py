@@ -64,7 +64,7 @@ def with_weights(folder: Path, needed: Mapping[str, Result]) -> Iterator[None]:
         yield
 
 
-CHUNKS = {"draft": 2, "paper": 40}  # of all figures, which share parts; seconds would depend on what else runs
+CHUNKS = {"draft": 2, "paper": 8}  # of all figures, which share parts; seconds would depend on what else runs
 GRID = 0.5  # cells of a medium along an object over cubes of its surface
 
 

@@ -17,6 +17,7 @@ BUNNY = Path(__file__).parent.parent / "assets" / "bunny.ply"
 DRAGON = BUNNY.with_name("dragon.ply")
 MM_PER_UNIT = 3.8  # the bunny is 37 mm tall
 MATERIALS = ("marble", "apple", "potato", "ketchup", "regular chocolate milk")
+VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb")
 LIGHTS = ("both", "small light", "even sky")
 
 
@@ -34,7 +35,7 @@ _EYE, _LAMP = (6.55, 4.3, 24), (-13.45, 9.3, -9)  # from what is looked at, unit
 
 
 def prepare() -> None:
-    """Set the variant of Mitsuba that the figures use, and register the plugins.
+    """Set the variant of Mitsuba that the figures use unless it is one of `VARIANTS`, and register the plugins.
 
     Scenes of earlier parts are freed, so that the objects of the next get their numbers, and it their kernels.
     """
@@ -42,8 +43,8 @@ def prepare() -> None:
 
     from halfspace_sss import rendering
 
-    if mi.variant() != "llvm_ad_rgb":
-        mi.set_variant("llvm_ad_rgb")
+    if mi.variant() not in VARIANTS:
+        mi.set_variant(VARIANTS[0])
     rendering.register()
     gc.collect()
 
@@ -154,19 +155,27 @@ def environment(name: str, scale: float = 1.0, turn: float = 0.0) -> dict[str, A
     return {"type": "envmap", "bitmap": mi.Bitmap(image), "scale": scale, "to_world": to_world}
 
 
-def long_render(task: Task, scene: Any, spp_per_pass: int, passes: int) -> dict[str, Any]:
+SEEDS_APART = 10_000  # of the halves of an image; passes count up from the first seed
+
+
+def long_render(task: Task, scene: Any, spp_per_pass: int, passes: int, half: int = 0) -> dict[str, Any]:
     """The image of a scene with its variance, seconds and samples; what is done of it is kept in the task's folder.
 
     Args:
         task: whose parameter "seed" is that of the first pass.
         scene: Mitsuba scene.
         spp_per_pass, passes: samples per pixel of each pass, and their number.
+        half: 1 for another image of other random numbers.
     """
     from halfspace_sss.rendering.scenes import reference
 
     result = reference.render(
-        scene, check_folder(task.folder) / "passes.exr", spp_per_pass=spp_per_pass, seed=task.params["seed"],
-        passes=passes, progress=lambda so_far: task.progress(so_far.passes, passes),
-    )  # fmt: skip
+        scene,
+        check_folder(task.folder) / f"passes{half}.exr",
+        spp_per_pass=spp_per_pass,
+        seed=task.params["seed"] + half * SEEDS_APART,
+        passes=passes,
+        progress=lambda so_far: task.progress(so_far.passes, passes),
+    )
     image, variance = (v[..., :3].astype(np.float32) for v in (result.mean, result.variance))
     return {"image": image, "variance": variance, "seconds": result.seconds, "spp": result.spp}

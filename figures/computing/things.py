@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from figures.computing.scenes import long_render, prepare
+from figures.computing.references import reference_image
+from figures.computing.scenes import prepare
 from figures.parts.part import Part, Task
 
 WALKED = "path_traced"
@@ -44,12 +45,11 @@ def lit_scene(things: dict[str, Any], stage: Staging, size: int, mm_per_unit: fl
     eye, lamp = (np.array(d) / np.linalg.norm(d) for d in (stage.eye, stage.lamp))
     view = mi.ScalarTransform4f().look_at(list(centre + stage.far * radius * eye), list(centre), [0, 1, 0])
     film = {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}}
-    sampler = {"type": "independent" if model == WALKED else "multijitter"}
     where = {"center": list(centre + 3 * radius * lamp), "radius": stage.lamp_radius * radius}
     return {
         "type": "scene",
         "integrator": {"type": "bssrdf", "mm_per_unit": mm_per_unit, "hide_emitters": True},
-        "sensor": {"type": "perspective", "fov": stage.fov, "to_world": view, "film": film, "sampler": sampler},
+        "sensor": {"type": "perspective", "fov": stage.fov, "to_world": view, "film": film},
         **things,
         "sky": {"type": "constant", "radiance": stage.sky},
         "lamp": {"type": "sphere", **where, "emitter": {"type": "area", "radiance": stage.glow}},
@@ -86,17 +86,16 @@ def thing_parts(
     return results
 
 
-def walked(task: Task, scene_of: Callable[[Task, str], dict[str, Any]], spp_per_pass: int) -> dict[str, Any]:
-    """The image by random walks, in passes that survive an interruption."""
+def walked(task: Task, scene_of: Callable[[Task, str], dict[str, Any]]) -> dict[str, Any]:
+    """`reference_image` of a thing."""
     from halfspace_sss.rendering.scenes.scene_files import load_scene
 
     prepare()
-    scene = load_scene(scene_of(task, WALKED), WALKED)
-    return long_render(task, scene, spp_per_pass, task.params["spp"] // spp_per_pass)
+    return reference_image(task, load_scene(scene_of(task, WALKED), WALKED))
 
 
 def shown(task: Task, scene_of: Callable[[Task, str], dict[str, Any]]) -> dict[str, Any]:
-    """The image of a model; what comes behind a comma in its name is for `scene_of` to read."""
+    """The image of a model by its gathered light."""
     import mitsuba as mi
 
     from halfspace_sss.rendering.scenes.scene_files import load_scene
@@ -104,5 +103,6 @@ def shown(task: Task, scene_of: Callable[[Task, str], dict[str, Any]]) -> dict[s
     prepare()
     p = task.params
     description = scene_of(task, p["model"])
-    image = mi.render(load_scene(description, p["model"].partition(",")[0]), spp=p["spp"], seed=p["seed"] + 1)
+    description["integrator"]["light"] = "gathered"
+    image = mi.render(load_scene(description, p["model"]), spp=p["spp"], seed=p["seed"] + 1)
     return {"image": np.array(image)[..., :3].astype(np.float32), "spp": p["spp"]}

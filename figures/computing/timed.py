@@ -9,10 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from halfspace_sss.backend import clock
 from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.progress import Progress
 
 MOST_LANES = 2**22  # camera rays of a pass, for memory
+COMPILING = 2  # samples per pixel of a render that is not timed: a power of two has the kernels of all others
 GROWTH, TOLERANCE, MOST_TRIALS = 16, 0.15, 8  # of the number of samples of a pass that is looked for
 
 
@@ -46,6 +48,14 @@ class TimedRender:
     def typical_cpu_seconds(self) -> float:
         """Of a pass: the median."""
         return float(np.median(self.pass_cpu_seconds))
+
+
+def gathered_anew(scene: Any) -> float:
+    """Gather the light of a scene by `bssrdf` as if it never had been; the CPU seconds that takes."""
+    started = clock()
+    scene.integrator().gathering = type(scene.integrator().gathering)()
+    scene.integrator().prepare(scene)
+    return clock() - started
 
 
 def rendered(scene: Any, spp: int, *seed: int) -> tuple[np.ndarray, float]:

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from figures.computing.images import FLIP, Shot, compared, noise_of, stops_of
+from figures.computing.images import FLIP, Shot
+from figures.computing.references import against, reference_shot
 from figures.drawing.error_tables import label
 from figures.drawing.image_grid import image_grid
 from figures.drawing.page import page
@@ -50,14 +51,11 @@ def rows_of(scenes: Mapping[str, Sequence[Shot]], key: str) -> list[dict[str, An
 
 def against_walks(results: Mapping[str, Result], name: str, models: Iterable[str]) -> list[Shot]:
     """The images of a thing, exposed alike; with the mean of each over that of the walks."""
-    truth = results[f"{name}, path traced"]
-    reference = truth.images["image"]
-    mask = reference.max(axis=2) > 0
-    gain = np.float32(2.0 ** stops_of(reference, mask))
-    error = noise_of(reference, truth.images["variance"], mask)
-    shots = [Shot("Path traced", gain * reference, {"standard error": error})]
+    reference = reference_shot(results[f"{name}, path traced"])
+    shot, mask, stops = reference
+    shots = [shot]
     for model in models:
         image = results[f"{name}, {model}"].images["image"]
-        numbers = {"mean over path traced": float(image[mask].mean() / reference[mask].mean())}
-        shots.append(compared(label(model), gain * image, gain * reference, mask=mask, numbers=numbers))
+        mean = float(np.float32(2.0**stops) * image[mask].mean() / shot.image[mask].mean())
+        shots.append(against(reference, label(model), image, **{"mean over path traced": mean}))
     return shots

@@ -12,7 +12,7 @@ import typer
 
 import figures
 from halfspace_sss.backend import BackendError
-from halfspace_sss.cli.shared import Bar, Scheduler, Workers, console, executor_of
+from halfspace_sss.cli.shared import Bar, Scheduler, Variant, Workers, console, executor_of, use_mitsuba
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -49,11 +49,16 @@ def figures_command(
     quality: Annotated[Quality, typer.Option(help="draft: minutes on two cores. paper: as published.")] = Quality.draft,
     workers: Workers = None,
     scheduler: Scheduler = None,
+    variant: Variant = "llvm_ad_rgb",
     out: Annotated[Path, typer.Option(help="Folder for parts and pictures of all figures.")] = Path("out"),
 ) -> None:
     """Make the figures of the paper; a part that is there is computed again only if what it depends on changed."""
     from figures.parts.runner import figure, plan
 
+    if variant != "llvm_ad_rgb":
+        if workers or scheduler:
+            raise ValueError(f"variant must be llvm_ad_rgb with --workers or --scheduler, got {variant!r}")
+        use_mitsuba(variant, ("llvm_ad_rgb", "cuda_ad_rgb"))
     chosen = list(dict.fromkeys(names or figures.figure_modules()))
     do = {Action.list: _list, Action.compute: _compute, Action.draw: _draw, Action.all: _all}[action]
     try:

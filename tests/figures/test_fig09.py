@@ -37,16 +37,14 @@ def table(text: str) -> list[dict[str, str]]:
 
 def test_fig_9_compares_each_model_with_the_path_traced_image(small, tmp_path):
     results = runner.compute("fig09", "draft", tmp_path)
-    walks = ["marble, path traced", "marble, path traced again"]
+    walks = ["marble, path traced"]
     assert [name for name in results] == [*walks, "marble, better_dipole", "marble, neural"]
     image = results["marble, neural"].images["image"]
     assert image.shape == (20, 20, 3) and np.isfinite(image).all() and image.max() > 0.05
     files = fig09.draw(results)
     rows = table(files["fig09.csv"])
-    assert [row["model"] for row in rows] == ["Path traced", "Path traced again", "Better dipole", "Neural half-space"]
-    assert all(0 < float(row["FLIP"]) < 1 for row in rows[1:])
-    a, b = (results[name].images["image"] for name in walks)
-    assert not np.array_equal(a, b) and abs(a.mean() / b.mean() - 1) < 0.2
+    assert [row["model"] for row in rows] == ["Path traced", "Better dipole", "Neural half-space"]
+    assert all(0 < float(row["FLIP"]) < 1 for row in rows)
     assert files["fig09.png"][:4] == b"\x89PNG" and "<html" in files["fig09.html"]
 
 

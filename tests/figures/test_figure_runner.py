@@ -74,6 +74,14 @@ def _invoke(*arguments: str) -> Any:
     return CliRunner().invoke(cli.app, ["figures", *arguments])
 
 
+def test_another_variant_is_refused_for_several_processes(toy: Toy) -> None:
+    result = _invoke("list", "--variant", "cuda_ad_rgb", "--workers", "2")
+    assert result.exit_code == 2
+    assert "variant must be llvm_ad_rgb with --workers or --scheduler, got 'cuda_ad_rgb'" in " ".join(
+        result.output.split()
+    )
+
+
 def test_a_second_run_computes_nothing_and_gives_the_same(toy: Toy, tmp_path: Path) -> None:
     first = compute("toy", "draft", tmp_path)
     assert CALLS == ["a", "b", "gap"]

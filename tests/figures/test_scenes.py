@@ -32,5 +32,5 @@ def test_colours_of_a_leaf_vary_and_are_those_of_media() -> None:
 
 def test_parts_of_paper_quality_are_more_work_and_all_differ() -> None:
     draft, paper = scenes.parts("draft"), scenes.parts("paper")
-    assert len({part.name for part in draft}) == len(draft) == 16
+    assert len({part.name for part in draft}) == len(draft) == 13
     assert sum(p.work for p in paper) > 10 * sum(p.work for p in draft)

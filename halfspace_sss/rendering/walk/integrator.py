@@ -30,6 +30,7 @@ from halfspace_sss.rendering.walk.straight_light import find_straight_light
 PARAMETERS = ("mm_per_unit", "max_depth", "rr_depth", "hide_emitters", "connection_share", "blur")
 SAMPLES_PER_LAUNCH = 2**19
 LANES = 2**14  # fastest of 2**12 to 2**18 on 2 cores
+GPU_FACTOR = 4  # as many times lanes and samples on CUDA: 1.2 to 1.4 times as fast on an H200
 FOREVER = 2**31 - 1
 WIDEST = 20.0  # blur: 1 and 3 radians
 Keep = Callable[[FirstExits], None]
@@ -228,9 +229,14 @@ def _render(
         if inside.spectral is not None:
             inside.spectral.check_covers(obj.name, sensor)
     sensor.film().prepare([])
-    most = max(1, SAMPLES_PER_LAUNCH // int(dr.prod(_sampled_size(sensor.film()))))
+    most = max(1, _on_device(SAMPLES_PER_LAUNCH) // int(dr.prod(_sampled_size(sensor.film()))))
     for launch, start in enumerate(range(0, spp, most)):
         _launch(tracer, sensor, min(most, spp - start), (seed, launch), keep, scored)
+
+
+def _on_device(number: int) -> int:
+    """A number of lanes or samples for the device of the current variant."""
+    return number * GPU_FACTOR if mi.variant().startswith("cuda") else number
 
 
 def _samples(
@@ -239,7 +245,7 @@ def _samples(
     """Radiance along rays of another integrator around this one."""
     with dr.suspend_grad():
         seed = tuple(int(2**24 * sampler.next_1d()[0]) for _ in range(2))
-        L, seen = tracer.trace(_widened(ray, sampler.wavefront_size()), LANES, seed)
+        L, seen = tracer.trace(_widened(ray, sampler.wavefront_size()), _on_device(LANES), seed)
     return dr.select(active, L, 0), active & seen, []
 
 
@@ -252,12 +258,12 @@ def _launch(
         media = tracer.visitor.media
         with dr.resume_grad():
             scores = PathScores.of(media, dr.width(rays))
-        L, seen = tracer.trace(rays, LANES, seed, scores=scores)
+        L, seen = tracer.trace(rays, _on_device(LANES), seed, scores=scores)
         with dr.resume_grad():
             _splat(sensor.film(), rays, with_derivatives(L, scores, media) * weight, seen, position, spp)
         return
     exits = FirstExits.of(tracer.visitor.scene, tracer.visitor.media, rays) if keep else None
-    L, seen = tracer.trace(rays, LANES, seed, exits)
+    L, seen = tracer.trace(rays, _on_device(LANES), seed, exits)
     if keep:
         keep(exits)
     _splat(sensor.film(), rays, weight * L, seen, position, spp)

@@ -1,0 +1,99 @@
+"""The path traced images that others are compared with: two halves, denoised, and what FLIP tells of their noise."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from figures.computing.contenders import WALK, contender
+from figures.computing.images import (
+    FLIP,
+    Shot,
+    check_denoiser,
+    compared,
+    cover,
+    denoised,
+    guides,
+    noise_of,
+    stops_of,
+)
+from figures.computing.scenes import long_render, prepare
+from figures.parts.part import Result, Task, unmodelled
+
+SPP_PER_PASS = 32
+NOTE = (
+    "The reference is path traced and denoised by Open Image Denoise, led by albedo and normals of the object. FLIP "
+    "below it is between its two halves, each denoised from half of the samples: more than the noise that is left."
+)
+
+
+def reference_image(task: Task, scene: Any, alone: Any = None) -> dict[str, Any]:
+    """The path traced image of a scene without its noise, and how far two halves of its samples are apart.
+
+    Args:
+        task: whose parameters "spp" and "seed" are those of the image; what is done of it is kept in its folder.
+        scene: Mitsuba scene with an integrator that traces paths.
+        alone: the scene with nothing but the object, whose pixels count; by default all that is there counts.
+    """
+    check_denoiser()  # before time is spent
+    spp = task.params["spp"] // 2
+    each = min(SPP_PER_PASS, max(spp // 2, 1))
+    halves = [long_render(task, scene, each, max(spp // each, 2), half) for half in (0, 1)]
+    covered, about = cover(alone or scene), guides(scene)
+    seen = covered if alone is None else cover(scene)
+    raw = np.mean([half["image"] for half in halves], axis=0)
+
+    def clean(image: np.ndarray) -> np.ndarray:
+        return denoised(np.maximum(image, 0), *about)[0] * (seen > 0)[..., None]
+
+    image, first, second = clean(raw), *(clean(half["image"]) for half in halves)
+    mask = covered > 0.5
+    variance = 0.25 * (halves[0]["variance"] + halves[1]["variance"])
+    numbers = {"standard error": noise_of(raw, variance, mask), "halves": _apart(image, first, second, mask)}
+    for key in ("seconds", "spp"):
+        numbers[key] = sum(half[key] for half in halves)
+    return {"image": image.astype(np.float32), "cover": covered, **numbers}
+
+
+@unmodelled
+def long_reference(task: Task) -> dict[str, Any]:
+    """`reference_image` of a scanned object; the parameters are material, size, lights, spp, seed and any scan."""
+    prepare()
+    p = task.params
+    return reference_image(task, contender(WALK, p["material"], p["size"], p["lights"], scan=p.get("scan", "bunny")))
+
+
+def _apart(image: np.ndarray, first: np.ndarray, second: np.ndarray, mask: np.ndarray) -> float:
+    """FLIP between the halves of an image, at its exposure."""
+    gain = np.float32(2.0 ** stops_of(image, mask))
+    return compared("second", gain * second, gain * first, mask=mask).numbers[FLIP]
+
+
+def reference_shot(result: Result, label: str = "Path traced") -> tuple[Shot, np.ndarray, float]:
+    """The reference exposed as it is shown, the mask of the pixels that count, and the stops.
+
+    Args:
+        result: of a part that gave `reference_image`.
+        label: of the image.
+    """
+    image, mask = result.images["image"], result.images["cover"] > 0.5
+    stops = stops_of(image, mask)
+    apart = f"{result.numbers['halves']:.3f}"  # text: it is no model that could be the best
+    numbers = {FLIP: apart, **{key: result.numbers[key] for key in ("standard error", "spp")}}
+    return Shot(label, np.float32(2.0**stops) * image, numbers), mask, stops
+
+
+def against(reference: tuple[Shot, np.ndarray, float], label: str, image: np.ndarray, **numbers: Any) -> Shot:
+    """An image beside a reference, exposed alike.
+
+    Args:
+        reference: as `reference_shot` gives it.
+        label: of the model or method.
+        image: linear radiance, not exposed.
+        numbers: further columns.
+    """
+    shot, mask, stops = reference
+    result = compared(label, np.float32(2.0**stops) * image, shot.image, mask=mask)
+    return replace(result, numbers={**result.numbers, **numbers})
