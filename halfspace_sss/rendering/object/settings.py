@@ -120,7 +120,7 @@ def variant_channels() -> int:
 # The names of parameters that plugins take: one that none takes is refused.
 
 
-OF_MITSUBA = ("block_size", "samples_per_pass", "timeout")  # read by its `SamplingIntegrator`
+OF_MITSUBA = ("block_size", "samples_per_pass", "timeout")  # of its `SamplingIntegrator`; launches are ours
 
 
 def check_parameters(plugin: str, props: Any, known: Collection[str]) -> None:

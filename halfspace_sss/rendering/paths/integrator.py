@@ -5,16 +5,15 @@ from __future__ import annotations
 import functools
 import gc
 import math
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
-from halfspace_sss.interrupts import hear_again, interruptible
+from halfspace_sss.interrupts import interruptible
 from halfspace_sss.rendering.light.small_emitters import check_emitters
 from halfspace_sss.rendering.object.objects import KnowsUnit, TranslucentObject, TranslucentObjects, make_objects
 from halfspace_sss.rendering.object.registry import Choices
@@ -24,6 +23,7 @@ from halfspace_sss.rendering.object.wrapped import wraps
 from halfspace_sss.rendering.paths.control_variate import ControlVariates
 from halfspace_sss.rendering.paths.gathering import Gathering
 from halfspace_sss.rendering.paths.lit_entries import LitEntries
+from halfspace_sss.rendering.paths.low_discrepancy import path_numbers
 from halfspace_sss.rendering.paths.path_loop import replay_paths, trace_paths
 
 SAMPLES_PER_LAUNCH = 2**20  # half a second on 2 cores
@@ -60,7 +60,6 @@ def _class(variant: str) -> type:
 
         def __init__(self, props: mi.Properties) -> None:
             mi.SamplingIntegrator.__init__(self, props)
-            self.timed = float(props.get("timeout", -1.0)) > 0
             self.settings = read_settings(props)
             self.mm_per_unit = self.settings.mm_per_unit
             self._objects = TranslucentObjects(self.settings)
@@ -98,7 +97,7 @@ def _class(variant: str) -> type:
             self, scene: mi.Scene, sensor: mi.Sensor | int = 0, seed: mi.UInt32 | int = 0, spp: int = 0,
             develop: bool = True, evaluate: bool = True,
         ) -> mi.TensorXf | None:  # fmt: skip
-            """The image, in launches; KeyboardInterrupt between two if one was interrupted."""
+            """The image, in launches, between which an interrupt is heard."""
             sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
             with interruptible(), undisturbed(), dr.suspend_grad():
                 objects = self.prepare(scene)
@@ -108,11 +107,27 @@ def _class(variant: str) -> type:
                 self._lit = self._by_light(scene, objects, sensor, seed, spp)
                 self._by_chance = dr.zeros(mi.Float64, 1)
                 try:
-                    for launch in launches(sensor, seed, spp, lambda: not self.timed and self.should_stop()):
-                        super().render(scene, sensor=sensor, seed=launch.seed, spp=launch.spp, develop=True)
+                    sensor.film().prepare([])
+                    for launch in launches(sensor, spp):
+                        sensor.film().put_block(self._block(scene, sensor, int(mi.UInt32(seed)[0]), launch))
+                        dr.eval(sensor.film().develop(raw=True))
+                        dr.sync_thread()
                 finally:
                     self._lit = None
                 return sensor.film().develop() if develop else None
+
+        def _block(self, scene: mi.Scene, sensor: mi.Sensor, seed: int, launch: Launch) -> mi.ImageBlock:
+            """What a launch adds to the film."""
+            from mitsuba.python.ad.integrators.common import ADIntegrator
+
+            sampler, film = launch.sampler(sensor, seed), sensor.film()
+            ray, weight, position = ADIntegrator.sample_rays(self, scene, sensor, sampler)
+            L, hit, _ = self.sample(scene, sampler, ray)
+            block = film.create_block()
+            block.set_coalesce(block.coalesce() and launch.spp >= 4)
+            alpha = dr.select(hit, mi.Float(1), 0)
+            ADIntegrator._splat_to_block(block, film, position, L * weight, 1.0, alpha, [], ray.wavelengths)
+            return block
 
         def _by_light(
             self, scene: mi.Scene, objects: list[TranslucentObject], sensor: mi.Sensor, seed: mi.UInt32 | int, spp: int
@@ -197,46 +212,40 @@ def undisturbed() -> Iterator[None]:
 
 
 class Launch(NamedTuple):
-    """Seed and samples per pixel."""
+    """Samples of each pixel: how many have been taken before, and how many are taken."""
 
-    seed: int
+    first: int
     spp: int
 
+    def sampler(self, sensor: mi.Sensor, seed: int) -> mi.Sampler:
+        """Its random numbers: of `low_discrepancy` in place of independent ones, else of the sampler of a sensor."""
+        film, sampler = sensor.film(), sensor.sampler().clone()
+        size = film.crop_size() + 2 * film.rfilter().border_size() * film.sample_border()
+        pixels = int(dr.prod(size))
+        if is_independent(sampler):
+            return path_numbers(seed, pixels, *self)
+        sampler.set_sample_count(self.spp)
+        sampler.set_samples_per_wavefront(sampler.sample_count())
+        sampler.seed(seed, pixels * sampler.sample_count())
+        return sampler
 
-def launches(sensor: mi.Sensor, seed: mi.UInt32 | int, spp: int, stopped: Callable[[], bool]) -> Iterator[Launch]:
-    """Launches of equally many samples, each to be rendered to the film of a sensor, which holds their mean in the end.
 
-    Only samples of the sampler `independent` are split. Other samplers round the samples of each launch up to a square
-    or another number of strata, and would stratify each launch alone: they have one launch, at whose end an interrupt
-    is heard.
+def is_independent(sampler: mi.Sampler) -> bool:
+    """Whether a sampler is Mitsuba's `independent`."""
+    return sampler.class_name() == "IndependentSampler"
 
-    Args:
-        sensor, seed, spp: what is rendered; the first launch has the seed itself.
-        stopped: whether Mitsuba, whose handler takes signals while it renders, was told to stop.
 
-    Raises:
-        KeyboardInterrupt: a launch was interrupted.
+def launches(sensor: mi.Sensor, spp: int) -> Iterator[Launch]:
+    """Launches of about equally many samples, each to be rendered to the film of a sensor.
+
+    Only samples of the sampler `independent` are split, as those of `low_discrepancy` go on in the next launch. Other
+    samplers round the samples of each launch up to a square or another number of strata: they have one launch.
     """
-    film, total = sensor.film(), None
-    spp, seed = spp or sensor.sampler().sample_count(), int(mi.UInt32(seed)[0])
-    n = min(math.ceil(spp * int(dr.prod(film.crop_size())) / SAMPLES_PER_LAUNCH), spp)
-    n = n if sensor.sampler().class_name() == "IndependentSampler" else 1
-    for k in range(n):
-        yield Launch(_seed(seed, k), (spp * (k + 1)) // n - (spp * k) // n)
-        raw = film.develop(raw=True)
-        total = raw if total is None else total + raw
-        dr.eval(total)
-        dr.sync_thread()
-        hear_again()
-        if stopped():
-            raise KeyboardInterrupt
-    if n > 1:
-        film.prepare([])
-        film.put_block(mi.ImageBlock(total, film.crop_offset(), film.rfilter(), False))
-
-
-def _seed(seed: int, k: int) -> int:
-    return seed if k == 0 else int(np.random.SeedSequence([seed, k]).generate_state(1)[0])
+    spp = spp or sensor.sampler().sample_count()
+    n = min(math.ceil(spp * int(dr.prod(sensor.film().crop_size())) / SAMPLES_PER_LAUNCH), spp)
+    ends = [(spp * k) // n for k in range(n + 1)] if is_independent(sensor.sampler()) else [0, spp]
+    for first, last in zip(ends, ends[1:]):
+        yield Launch(first, last - first)
 
 
 # ---- Derivatives: Mitsuba's radiative backpropagation around a replay of the paths ---------------------------------

@@ -66,7 +66,7 @@ class Reference:
         """Most of the variance that is light which orders below two meet by chance; None where it is not known.
 
         At most: the square of its mean is not taken off, which is small where it makes much noise. Other filters than
-        a box, which share samples among pixels, make it larger.
+        a box, which share samples among pixels, make it larger, and so do samples of low discrepancy.
         """
         whole = self.variance[..., :3].sum()
         if BY_CHANCE not in self.about or self.passes < 2:
