@@ -25,7 +25,7 @@ SCALES = {"sunset": 1.5, "forest": 0.8}
 VIEWS = (0, 90, 180, 270)  # degrees about the bunny
 VIEWS_LIGHT = LIGHTS[0]
 SIZES = {"draft": 72, "paper": 384}
-SPP = {"draft": {"path_traced": 128, FULL_GEOMETRY: 64}, "paper": {"path_traced": 1024, FULL_GEOMETRY: 128}}
+SPP = {"draft": {"path_traced": 128, FULL_GEOMETRY: 16}, "paper": {"path_traced": 1024, FULL_GEOMETRY: 64}}
 AXIS = (-0.17, 0.15)  # x and z of the axis that the camera goes about
 NOTES = (
     "Trained once, without any of these lights: the same weights in all images, by gathered light. All scattering "

@@ -24,7 +24,7 @@ TITLE = "five materials, path traced and by every kind of model, with FLIP"
 MODELS = (*contenders.MODELS, *contenders.OF_OBJECTS)
 SHOWN = {"draft": ("marble", "ketchup"), "paper": MATERIALS}
 SIZES = {"draft": 96, "paper": 384}
-MODEL_SPP = {"draft": 64, "paper": 128}
+MODEL_SPP = {"draft": 16, "paper": 64}
 TRUTH_SPP = {"draft": 128, "paper": 1024}
 NOTES = (
     "All images contain all scattering orders: to the models without single scattering it is added, path traced. "

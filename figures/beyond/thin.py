@@ -21,7 +21,7 @@ TITLE = "thin things lit from behind, by half-spaces and by the network of all s
 MODELS = ("better_dipole", "neural", "neural_shape")
 SIZES = {"draft": 96, "paper": 384}
 RESOLUTION = {"draft": 64, "paper": 192}  # of the meshes that are made
-MODEL_SPP = {"draft": 64, "paper": 128}
+MODEL_SPP = {"draft": 16, "paper": 64}
 TRUTH_SPP = {"draft": 128, "paper": 1024}
 NOTES = (
     "All images contain all scattering orders: the models lack the orders below two, which are path traced beside "
