@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from figures.computing.contenders import WALK, ready
-from figures.computing.images import FLIP, Shot, cover
+from figures.computing.images import FLIP, Shot
 from figures.computing.learnt import CHUNKS, FULL_GEOMETRY, train_scan, training_of, with_weights
 from figures.computing.references import NOTE, against, long_reference, reference_shot
 from figures.computing.scenes import BUNNY, prepare, scan_scene
@@ -57,7 +57,6 @@ def in_time(task: Task) -> dict[str, Any]:
             description["integrator"]["light"] = light
             scene = ready(method, description, "bunny", medium)
             found[way], numbers[way] = _passes(scene, p["seconds"], p["seed"], light == "gathered")
-            found["cover"] = cover(scene)
     return {**found, "ways": numbers}
 
 

@@ -64,7 +64,7 @@ def parts(quality: str) -> list[Part]:
 def learnt(task: Task) -> dict[str, Any]:
     """Weights of a thing, of the jelly with its stone."""
     prepare()
-    return trained(task, _scene(task, FULL_GEOMETRY), "thing")
+    return trained(task, _scene(task), "thing")
 
 
 @unmodelled
@@ -79,11 +79,11 @@ def rendered(task: Task) -> dict[str, Any]:
         return shown(task, _scene)
 
 
-def _scene(task: Task, model: str) -> dict[str, Any]:
+def _scene(task: Task) -> dict[str, Any]:
     p, folder = task.params, check_folder(task.folder)
     name = p["thing"]
     things = {"head": _head, "leaf": _leaf, "jelly": _jelly}[name](folder, p["resolution"])
-    return lit_scene(things, STAGES[name], p["size"], MM_PER_UNIT[name], model)
+    return lit_scene(things, STAGES[name], p["size"], MM_PER_UNIT[name])
 
 
 def _head(folder: Path, resolution: int) -> dict[str, Any]:

@@ -62,9 +62,9 @@ def rendered(task: Task) -> dict[str, Any]:
     return shown(task, _scene)
 
 
-def _scene(task: Task, model: str) -> dict[str, Any]:
+def _scene(task: Task) -> dict[str, Any]:
     thing = _bunny(check_folder(task.folder)) if task.params["thing"] == "bunny" else _ball()
-    return lit_scene({"thing": thing}, STAGE, task.params["size"], MM_PER_UNIT, model)
+    return lit_scene({"thing": thing}, STAGE, task.params["size"], MM_PER_UNIT)
 
 
 def _bunny(folder: Path) -> dict[str, Any]:

@@ -72,13 +72,13 @@ def rendered(task: Task) -> dict[str, Any]:
     return shown(task, _scene)
 
 
-def _scene(task: Task, model: str) -> dict[str, Any]:
+def _scene(task: Task) -> dict[str, Any]:
     p, thing = task.params, THINGS[task.params["thing"]]
     path = _mesh(thing, p["resolution"], check_folder(task.folder))
     surface = {"type": "translucent", "material": thing.material, "model": "neural"}
     stage = Staging(thing.eye, thing.lamp, fov=27.0, lamp_radius=0.45, sky=0.15)
     shape = {"type": "ply", "filename": str(path), "bsdf": surface}
-    return lit_scene({"thing": shape}, stage, p["size"], thing.mm_per_unit, model)
+    return lit_scene({"thing": shape}, stage, p["size"], thing.mm_per_unit)
 
 
 def _mesh(thing: Thing, resolution: int, folder: Path) -> Path:

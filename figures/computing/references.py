@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -95,5 +94,4 @@ def against(reference: tuple[Shot, np.ndarray, float], label: str, image: np.nda
         numbers: further columns.
     """
     shot, mask, stops = reference
-    result = compared(label, np.float32(2.0**stops) * image, shot.image, mask=mask)
-    return replace(result, numbers={**result.numbers, **numbers})
+    return compared(label, np.float32(2.0**stops) * image, shot.image, mask=mask, numbers=numbers)

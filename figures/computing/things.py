@@ -12,8 +12,6 @@ from figures.computing.references import reference_image
 from figures.computing.scenes import prepare
 from figures.parts.part import Part, Task
 
-WALKED = "path_traced"
-
 
 class Staging(NamedTuple):
     """Where a thing is seen and lit from: directions, in its radii; the vertical angle of view is in degrees."""
@@ -27,7 +25,7 @@ class Staging(NamedTuple):
     far: float = 4.0  # of the eye; the lamp is at 3
 
 
-def lit_scene(things: dict[str, Any], stage: Staging, size: int, mm_per_unit: float, model: str) -> dict[str, Any]:
+def lit_scene(things: dict[str, Any], stage: Staging, size: int, mm_per_unit: float) -> dict[str, Any]:
     """The scene of a thing, as a dict for `rendering.scenes.scene_files.load_scene`.
 
     Args:
@@ -35,7 +33,6 @@ def lit_scene(things: dict[str, Any], stage: Staging, size: int, mm_per_unit: fl
         stage: how.
         size: pixels of the square image.
         mm_per_unit: of the shapes.
-        model: of their light, or "path_traced", which takes other random numbers.
     """
     import mitsuba as mi
 
@@ -86,15 +83,15 @@ def thing_parts(
     return results
 
 
-def walked(task: Task, scene_of: Callable[[Task, str], dict[str, Any]]) -> dict[str, Any]:
+def walked(task: Task, scene_of: Callable[[Task], dict[str, Any]]) -> dict[str, Any]:
     """`reference_image` of a thing."""
-    from halfspace_sss.rendering.scenes.scene_files import load_scene
+    from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED, load_scene
 
     prepare()
-    return reference_image(task, load_scene(scene_of(task, WALKED), WALKED))
+    return reference_image(task, load_scene(scene_of(task), PATH_TRACED))
 
 
-def shown(task: Task, scene_of: Callable[[Task, str], dict[str, Any]]) -> dict[str, Any]:
+def shown(task: Task, scene_of: Callable[[Task], dict[str, Any]]) -> dict[str, Any]:
     """The image of a model by its gathered light."""
     import mitsuba as mi
 
@@ -102,7 +99,7 @@ def shown(task: Task, scene_of: Callable[[Task, str], dict[str, Any]]) -> dict[s
 
     prepare()
     p = task.params
-    description = scene_of(task, p["model"])
+    description = scene_of(task)
     description["integrator"]["light"] = "gathered"
     image = mi.render(load_scene(description, p["model"]), spp=p["spp"], seed=p["seed"] + 1)
     return {"image": np.array(image)[..., :3].astype(np.float32), "spp": p["spp"]}
