@@ -46,11 +46,11 @@ from halfspace_sss.inverse.comparing import (
     means_of_arrays,
 )
 from halfspace_sss.inverse.parameters import ALBEDO, NEAR, G, check_names, size_bounds, translucent_object
+from halfspace_sss.rendering.object.sensors import camera_rays
 from halfspace_sss.rendering.object.shape import name_of
 from halfspace_sss.rendering.object.textured import TexturedMedium, kind_of, shown
 from halfspace_sss.rendering.object.wrapped import surface_of
 from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED, open_scene
-from halfspace_sss.rendering.walk.integrator import camera_rays
 
 STEPS = 60
 RAYS = 16  # of a pixel, for D

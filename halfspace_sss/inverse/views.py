@@ -15,7 +15,7 @@ import numpy as np
 
 from halfspace_sss.checks import check_choice, check_count, did_you_mean
 from halfspace_sss.provenance import read_text
-from halfspace_sss.rendering.walk.integrator import camera_rays
+from halfspace_sss.rendering.object.sensors import camera_rays
 
 TRANSFERS = ("linear", "srgb")
 KEYS = ("image", "sensor", "transfer", "mask", "held_out")

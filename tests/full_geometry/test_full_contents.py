@@ -29,8 +29,8 @@ from halfspace_sss.rendering.object import objects  # noqa: E402
 from halfspace_sss.rendering.object.half_space import half_space_model  # noqa: E402
 from halfspace_sss.rendering.object.objects import object_of  # noqa: E402
 from halfspace_sss.rendering.object.points import ObjectModel, SurfacePoint, refract_in  # noqa: E402
+from halfspace_sss.rendering.object.sensors import camera_rays  # noqa: E402
 from halfspace_sss.rendering.scenes.mitsuba_scene import medium, with_media  # noqa: E402
-from halfspace_sss.rendering.walk.integrator import camera_rays  # noqa: E402
 from halfspace_sss.rendering.walk.media import WalkMedia  # noqa: E402
 from halfspace_sss.rendering.walk.path_loop import FirstExits  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402

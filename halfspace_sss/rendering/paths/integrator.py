@@ -17,6 +17,7 @@ from halfspace_sss.interrupts import interruptible
 from halfspace_sss.rendering.light.small_emitters import check_emitters
 from halfspace_sss.rendering.object.objects import KnowsUnit, TranslucentObject, TranslucentObjects, make_objects
 from halfspace_sss.rendering.object.registry import Choices
+from halfspace_sss.rendering.object.sensors import rays_by, sampled_size, splat
 from halfspace_sss.rendering.object.settings import Settings, read_settings
 from halfspace_sss.rendering.object.translucent import is_translucent
 from halfspace_sss.rendering.object.wrapped import wraps
@@ -109,25 +110,18 @@ def _class(variant: str) -> type:
                 try:
                     sensor.film().prepare([])
                     for launch in launches(sensor, spp):
-                        sensor.film().put_block(self._block(scene, sensor, int(mi.UInt32(seed)[0]), launch))
-                        dr.eval(sensor.film().develop(raw=True))
+                        self._launch(scene, sensor, int(mi.UInt32(seed)[0]), launch)
                         dr.sync_thread()
                 finally:
                     self._lit = None
                 return sensor.film().develop() if develop else None
 
-        def _block(self, scene: mi.Scene, sensor: mi.Sensor, seed: int, launch: Launch) -> mi.ImageBlock:
-            """What a launch adds to the film."""
-            from mitsuba.python.ad.integrators.common import ADIntegrator
-
-            sampler, film = launch.sampler(sensor, seed), sensor.film()
-            ray, weight, position = ADIntegrator.sample_rays(self, scene, sensor, sampler)
+        def _launch(self, scene: mi.Scene, sensor: mi.Sensor, seed: int, launch: Launch) -> None:
+            """Add the samples of a launch to the film."""
+            sampler = launch.sampler(sensor, seed)
+            ray, weight, position = rays_by(sensor, sampler, sampler.sample_count())
             L, hit, _ = self.sample(scene, sampler, ray)
-            block = film.create_block()
-            block.set_coalesce(block.coalesce() and launch.spp >= 4)
-            alpha = dr.select(hit, mi.Float(1), 0)
-            ADIntegrator._splat_to_block(block, film, position, L * weight, 1.0, alpha, [], ray.wavelengths)
-            return block
+            splat(sensor.film(), ray, L * weight, hit, position, launch.spp)
 
         def _by_light(
             self, scene: mi.Scene, objects: list[TranslucentObject], sensor: mi.Sensor, seed: mi.UInt32 | int, spp: int
@@ -219,9 +213,7 @@ class Launch(NamedTuple):
 
     def sampler(self, sensor: mi.Sensor, seed: int) -> mi.Sampler:
         """Its random numbers: of `low_discrepancy` in place of independent ones, else of the sampler of a sensor."""
-        film, sampler = sensor.film(), sensor.sampler().clone()
-        size = film.crop_size() + 2 * film.rfilter().border_size() * film.sample_border()
-        pixels = int(dr.prod(size))
+        sampler, pixels = sensor.sampler().clone(), int(dr.prod(sampled_size(sensor.film())))
         if is_independent(sampler):
             return path_numbers(seed, pixels, *self)
         sampler.set_sample_count(self.spp)

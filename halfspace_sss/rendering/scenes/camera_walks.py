@@ -60,7 +60,7 @@ class CameraWalks:
     def hits(self, shape: Any) -> int:
         """About how many paths of one sample per pixel meet an object first."""
 
-        from halfspace_sss.rendering.walk.integrator import camera_rays
+        from halfspace_sss.rendering.object.sensors import camera_rays
         from halfspace_sss.rendering.walk.path_loop import FirstExits
 
         media = self.integrator.tracer(self.scene).visitor.media

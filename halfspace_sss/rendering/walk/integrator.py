@@ -10,12 +10,12 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from halfspace_sss.interrupts import interruptible
 from halfspace_sss.rendering.light.small_emitters import SmallEmitters
 from halfspace_sss.rendering.object.contents import check_sensors
 from halfspace_sss.rendering.object.objects import KnowsUnit, check_size, places_of, translucent_shapes
+from halfspace_sss.rendering.object.sensors import camera_rays, sampled_size, splat, widened
 from halfspace_sss.rendering.object.settings import OF_MITSUBA, check_parameters
 from halfspace_sss.rendering.object.shape import number_of, same_objects
 from halfspace_sss.rendering.object.textured import shown
@@ -229,7 +229,7 @@ def _render(
         if inside.spectral is not None:
             inside.spectral.check_covers(obj.name, sensor)
     sensor.film().prepare([])
-    most = max(1, _on_device(SAMPLES_PER_LAUNCH) // int(dr.prod(_sampled_size(sensor.film()))))
+    most = max(1, _on_device(SAMPLES_PER_LAUNCH) // int(dr.prod(sampled_size(sensor.film()))))
     for launch, start in enumerate(range(0, spp, most)):
         _launch(tracer, sensor, min(most, spp - start), (seed, launch), keep, scored)
 
@@ -245,7 +245,7 @@ def _samples(
     """Radiance along rays of another integrator around this one."""
     with dr.suspend_grad():
         seed = tuple(int(2**24 * sampler.next_1d()[0]) for _ in range(2))
-        L, seen = tracer.trace(_widened(ray, sampler.wavefront_size()), _on_device(LANES), seed)
+        L, seen = tracer.trace(widened(ray, sampler.wavefront_size()), _on_device(LANES), seed)
     return dr.select(active, L, 0), active & seen, []
 
 
@@ -260,68 +260,13 @@ def _launch(
             scores = PathScores.of(media, dr.width(rays))
         L, seen = tracer.trace(rays, _on_device(LANES), seed, scores=scores)
         with dr.resume_grad():
-            _splat(sensor.film(), rays, with_derivatives(L, scores, media) * weight, seen, position, spp)
+            splat(sensor.film(), rays, with_derivatives(L, scores, media) * weight, seen, position, spp)
         return
     exits = FirstExits.of(tracer.visitor.scene, tracer.visitor.media, rays) if keep else None
     L, seen = tracer.trace(rays, _on_device(LANES), seed, exits)
     if keep:
         keep(exits)
-    _splat(sensor.film(), rays, weight * L, seen, position, spp)
-
-
-def _splat(film: mi.Film, rays: mi.Ray3f, L: mi.Spectrum, seen: mi.Bool, position: mi.Vector2f, spp: int) -> None:
-    """Add the light of rays to a film."""
-    block = film.create_block()
-    block.set_coalesce(block.coalesce() and spp >= 4)
-    alpha = dr.select(seen, mi.Float(1), mi.Float(0))
-    has_alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
-    if mi.has_flag(film.flags(), mi.FilmFlags.Special):
-        values = film.prepare_sample(L, rays.wavelengths, block.channel_count(), weight=1.0, alpha=alpha)
-    else:
-        L = mi.spectrum_to_srgb(L, rays.wavelengths) if mi.is_spectral else L
-        rgb = [L[0]] * 3 if len(L) == 1 and block.channel_count() >= 4 else list(L)
-        values = [*rgb, *([alpha] if has_alpha else []), mi.Float(1)]
-    block.put(position, values)
-    film.put_block(block)
-    dr.eval(block.tensor())
-
-
-def _sampled_size(film: mi.Film) -> mi.ScalarVector2u:
-    size = film.crop_size()
-    return size + 2 * film.rfilter().border_size() if film.sample_border() else size
-
-
-def camera_rays(sensor: mi.Sensor, spp: int, seed: tuple[int, int]) -> tuple[mi.Ray3f, mi.Spectrum, mi.Vector2f]:
-    """Rays of spp samples of each pixel, their weights, and their positions on the film."""
-    film, size = sensor.film(), _sampled_size(sensor.film())
-    border = film.rfilter().border_size() if film.sample_border() else 0
-    sampler = sensor.sampler().clone()
-    sampler.set_sample_count(spp)
-    spp = sampler.sample_count()  # some samplers take squares only
-    n = int(dr.prod(size)) * spp
-    sampler.set_samples_per_wavefront(spp)
-    sampler.seed(int(np.random.SeedSequence(list(seed)).generate_state(1)[0]), n)
-    index, width = dr.arange(mi.UInt32, n) // dr.opaque(mi.UInt32, spp), dr.opaque(mi.UInt32, int(size[0]))
-    pixel = mi.Vector2i(index % width, index // width) - border + mi.Vector2i(film.crop_offset())
-    position = mi.Vector2f(pixel) + sampler.next_2d()
-    scale = 1 / mi.ScalarVector2f(film.crop_size())
-    offset = -mi.ScalarVector2f(film.crop_offset()) * scale
-    aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
-    time = sensor.shutter_open()
-    if sensor.shutter_open_time() > 0:
-        time += sampler.next_1d() * sensor.shutter_open_time()
-    ray, weight = sensor.sample_ray_differential(time, sampler.next_1d(), dr.fma(position, scale, offset), aperture)
-    # in a box filter a position that rounding puts on the edge of a pixel belongs to the neighbour too
-    return _widened(ray, n), weight, mi.Vector2f(pixel) if film.rfilter().is_box_filter() else position
-
-
-def _widened(ray: mi.Ray3f, n: int) -> mi.Ray3f:
-    """n rays; those of a sensor that knows one ray only are one."""
-    result = mi.Ray3f(ray)
-    result.o, result.d = result.o + dr.zeros(mi.Point3f, n), result.d + dr.zeros(mi.Vector3f, n)
-    if mi.is_spectral:
-        result.wavelengths = result.wavelengths + dr.zeros(mi.Spectrum, n)
-    return result
+    splat(sensor.film(), rays, weight * L, seen, position, spp)
 
 
 def _positive(name: str, value: float) -> float:
