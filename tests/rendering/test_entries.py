@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from rendered import mean_of_pixels, surface
+from rendered import mean_of_pixels, render, surface
 
 mi = pytest.importorskip("mitsuba")
 
@@ -22,8 +22,11 @@ def _variant():
     rendering.register()
 
 
-def seen(light: str, entries: int) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels that show the ball only."""
+DARK = {"type": "point", "position": [0, 0, 9], "intensity": 1e-6}  # beside it directions are not chosen by the sky
+
+
+def scene_of(light: str, entries: int, **beside: dict) -> dict:
+    """All pixels show the ball."""
     emitter = dict(LIGHTS[light])
     if light == "window":
         sky = np.full((8, 16, 3), 0.1, np.float32)
@@ -32,18 +35,29 @@ def seen(light: str, entries: int) -> tuple[np.ndarray, np.ndarray]:
     view = mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0]).scale(0.7)
     film = {"type": "hdrfilm", "width": 24, "height": 24, "rfilter": {"type": "box"}}
     ball = {"type": "sphere", "bsdf": surface(medium={"sigma_s": 6.0, "sigma_a": 0.1})}
-    scene = {
+    return {
         "type": "scene", "integrator": {"type": "bssrdf", "max_depth": 3, "entries": entries}, "light": emitter,
         "ball": ball, "sensor": {"type": "orthographic", "to_world": view, "film": film},
+        **beside,
     }  # fmt: skip
-    return mean_of_pixels(scene, spp=256)
 
 
 @pytest.mark.parametrize("light", LIGHTS)
 def test_several_entries_give_the_light_of_one(light):
-    (one, one_error), (four, four_error) = seen(light, 1), seen(light, 4)
+    (one, one_error), (four, four_error) = (mean_of_pixels(scene_of(light, entries), spp=256) for entries in (1, 4))
     assert np.all(np.abs(one - four) < 4 * np.hypot(one_error, four_error)) and np.all(one > 0)
     assert np.all(np.abs(four / one - 1) < 0.03)
+
+
+def test_directions_that_a_sky_chooses_give_the_same_light_with_less_noise():
+    grey, down = {"type": "diffuse"}, mi.ScalarTransform4f().translate([0, -1.02, 0]).rotate([1, 0, 0], -90).scale(3)
+    for beside in ({}, {"floor": {"type": "rectangle", "to_world": down, "bsdf": grey}}):
+        means, errors = [], []
+        for dark in ({}, {"dark": DARK}):
+            one, two = (render(scene_of("window", 2, **beside, **dark), 512, seed) for seed in (3, 4))
+            means.append(0.5 * (one + two).mean(axis=(0, 1)))
+            errors.append(0.5 * (one - two).std(axis=(0, 1)) / np.sqrt(one[..., 0].size))
+        assert np.all(np.abs(means[0] - means[1]) < 5 * np.hypot(*errors)) and np.all(errors[0] < 0.85 * errors[1])
 
 
 def test_several_entries_are_less_noisy_under_a_sky():

@@ -98,6 +98,7 @@ class Replay:
 
 NEE_SHARE = 0.5
 SKY_DIRECTIONS = 128  # squared
+DIM_ALONE, DIM = 0.1, 1.0  # of the mean radiance of the sky, expected of surfaces before it
 MOST_LEFT = 0.5  # of the mean square of the radiance of the sky, once its mean is taken away
 
 
@@ -117,12 +118,19 @@ class Lights:
         some_local: whether there is an emitter beside the environment.
         some_shaped: whether there is one with a shape, which rays can hit.
         some_delta: whether there is one that no ray can hit (point, spot, directional).
+        sky_alone: whether the environment is the only one, and varies.
     """
 
     nee_share: float
     some_local: bool
     some_shaped: bool
     some_delta: bool
+    sky_alone: bool
+
+    @property
+    def entry_share(self) -> float:
+        """`nee_share` of entries, where such directions are apart from those that may meet anything."""
+        return 0.0 if self.sky_alone else self.nee_share
 
     @classmethod
     def of(cls, scene: mi.Scene) -> Lights:
@@ -132,7 +140,7 @@ class Lights:
         delta = any(map(is_delta, emitters))
         local = any(not emitter.is_environment() for emitter in emitters)
         shaped = any(emitter.get_shape() is not None for emitter in emitters)
-        return cls(0.0 if even else NEE_SHARE, local, shaped, delta)
+        return cls(0.0 if even else NEE_SHARE, local, shaped, delta, not even and not local)
 
 
 class Sky(NamedTuple):
@@ -249,6 +257,25 @@ class RenderContext:
         """Candidates of resampling for an exit: one where c is nearly all light and the settings leave it open."""
         alone = self.uses_sky(obj) and not self.lights.some_local
         return 1 if alone and self.settings.entries == AUTOMATIC else obj.entries
+
+    @property
+    def dim(self) -> float:
+        """Radiance that is expected of surfaces before the sky, over its own: less where an object has itself alone."""
+        return DIM_ALONE if len(self.scene.shapes()) == 1 else DIM
+
+    def sample_sky(
+        self, at: mi.Interaction3f, u: mi.Point2f, active: mi.Bool
+    ) -> tuple[mi.Vector3f, mi.Float, mi.Spectrum]:
+        """A direction of the sky, the only emitter, its density, 1/sr, and the radiance from there."""
+        ds, light = self.scene.sample_emitter_direction(at, u, False, active)
+        return ds.d, ds.pdf, light * ds.pdf
+
+    def eval_sky(self, at: mi.Interaction3f, d: mi.Vector3f, active: mi.Bool) -> tuple[mi.Float, mi.Spectrum]:
+        """The density of a direction by `sample_sky`, and the radiance from there."""
+        sky = self.scene.environment()
+        si = dr.zeros(mi.SurfaceInteraction3f)
+        si.wi, si.wavelengths = -d, at.wavelengths
+        return self.scene.pdf_emitter_direction(at, _towards(sky, d), active), sky.eval(si, active)
 
     def connects_sky(self, obj: TranslucentObject) -> bool:
         """Whether scattering events are connected with the sky: where it varies and c does not take its noise away."""

@@ -17,7 +17,7 @@ import drjit as dr
 import mitsuba as mi
 
 from halfspace_sss.rendering.object.objects import TranslucentObject
-from halfspace_sss.rendering.object.points import SurfacePoint, lifted, opaque, place, turned
+from halfspace_sss.rendering.object.points import EntrySample, SurfacePoint, lifted, opaque, place, turned
 from halfspace_sss.rendering.object.settings import Settings
 from halfspace_sss.rendering.paths.lighting import (
     PathTally,
@@ -33,6 +33,7 @@ from halfspace_sss.rendering.paths.low_orders import RefractedRay, sample_low_or
 LEAST_REFLECTION = 0.05  # probability of reflection where there is light to come; Fresnel's is 0.04 face on
 LEAST_LOW, MOST_LOW = 0.03, 0.95  # probability of orders below two
 LOW_BOOST = 2.0  # as their light varies more from one sample to the next
+DIRECTIONS = 8  # of the sky at an entry, of which one is kept
 LEAST_PASSING = 0.3  # of T, where order 0 does not count: reflected back, a walk may be scattered yet
 
 
@@ -625,7 +626,7 @@ def bssrdf_event(
     anywhere, no = entry.emitter_distance < 0, mi.Bool(False)
     previous = PreviousVertex(
         entry.p, entry.n, dr.select(anywhere, entry.pdf, 1),
-        dr.select(anywhere, mi.Float(context.lights.nee_share), 0), no, entry.emitter_distance, mi.Bool(False),
+        dr.select(anywhere, mi.Float(context.lights.entry_share), 0), no, entry.emitter_distance, mi.Bool(False),
         mi.Bool(False),
     )  # fmt: skip
     return NextVertex(previous, entry.d, dr.select(entry.delta, 0, entry.weight), mi.Bool(True)), direct, mi.Spectrum(0)
@@ -647,6 +648,14 @@ class Candidate:
     target: mi.Float  # resampling target
     by_emitter: mi.Bool  # whether d is drawn by next-event estimation, where there is an entry
     sky_weight: mi.Float  # MIS weight of d among the ways to draw directions of the sky
+
+
+class _Entry(NamedTuple):
+    """An entry for an exit, and as a point from which rays start."""
+
+    entry: EntrySample
+    out: SurfacePoint
+    at: mi.Interaction3f
 
 
 class _ExitPoint(NamedTuple):
@@ -701,18 +710,24 @@ def _draw_candidate(
 ) -> Candidate:  # fmt: skip
     """A point of entry by the proposals, and a direction by emitters or by the proposals (one-sample MIS).
 
-    The choice between both is the same for all candidates of an exit: `by_emitter`, drawn where it is None.
+    The choice between both is the same for all candidates of an exit: `by_emitter`, drawn where it is None. Under a sky
+    alone the direction is one of several, see `_towards_sky`.
     """
-    share, proposals, out = context.lights.nee_share, obj.proposals, exit_point.out
+    share, proposals, out = context.lights.entry_share, obj.proposals, exit_point.out
 
-    # ---- point of entry, and a direction by the proposals
+    # ---- point of entry, and a direction that may meet anything
     with dr.suspend_grad():
         entry = proposals.sample(out, exit_point.face, exit_point.proposals, sampler, active)
         active = active & (entry.weight > 0)
         entry = obj.wrapping.bent_entry(obj.geometry, entry, active)
-        d, pdf = proposals.sample_direction(entry, out, sampler.next_2d())
-        at, pdf, distance = place(entry.p, entry.n, out.medium), (1 - share) * pdf, mi.Float(-1)
-    delta, emitter_point, light, brightness = mi.Bool(False), mi.Point3f(0), mi.Spectrum(0), mi.Float(1)
+        at, distance, brightness = place(entry.p, entry.n, out.medium), mi.Float(-1), mi.Float(1)
+        if context.lights.sky_alone:
+            d, pdf, brightness = _towards_sky(context, obj, _Entry(entry, out, at), sampler, active)
+            active = active & (pdf > 0)
+        else:
+            d, pdf = proposals.sample_direction(entry, out, sampler.next_2d())
+            pdf = (1 - share) * pdf
+    delta, emitter_point, light = mi.Bool(False), mi.Point3f(0), mi.Spectrum(0)
     sky_weight = mi.Float(1) if context.uses_sky(obj) else mi.Float(0)
     if share == 0:
         by_emitter = mi.Bool(False)
@@ -748,3 +763,38 @@ def _draw_candidate(
     target = dr.detach(dr.max(dr.abs(weight))) * brightness
     return Candidate(mi.Point3f(entry.p), mi.Normal3f(entry.n), d, weight, pdf, distance, delta, emitter_point, light,
                      target, by_emitter, sky_weight)  # fmt: skip
+
+
+def _towards_sky(
+    context: RenderContext, obj: TranslucentObject, where: _Entry, sampler: mi.Sampler, active: mi.Bool
+) -> tuple[mi.Vector3f, mi.Float, mi.Float]:
+    """A direction at an entry where the sky is the only emitter, by resampled importance sampling.
+
+    Half of `DIRECTIONS` are drawn by the sky, half by the proposals. With p_e and p_i the densities of both, one is
+    kept with the probability t_k / p_k over the sum of all, p = (p_e + p_i) / 2, t = p_i (abs(L - c) + dim): the light
+    that it brings if nothing is in the way. What is in the way may shine too, so that no direction is left out; dim is
+    a share of the mean of abs(L - c), see `RenderContext.dim`. An evaluation of S is worth many of the sky.
+
+    Returns:
+        Direction; its density, the number of directions times t over the sum of t_k / p_k; and abs(L - c) + dim.
+    """
+    c = context.sky_means(obj)[1] if context.uses_sky(obj) else mi.Spectrum(0)
+    directions = []
+    for k in range(DIRECTIONS):
+        if k % 2:
+            w, p_e, L = context.sample_sky(where.at, sampler.next_2d(), active)
+            p_i = obj.proposals.pdf_direction(where.entry, where.out, w)
+        else:
+            w, p_i = obj.proposals.sample_direction(where.entry, where.out, sampler.next_2d())
+            p_e, L = context.eval_sky(where.at, w, active)
+        over = dr.select(active & (p_i > 0), 2 * p_i / dr.maximum(p_i + p_e, 1e-30), 0)
+        directions.append((w, p_i, dr.max(dr.abs(L - c)), over))
+    number, light = sum(over for *_, over in directions), sum(L * over for *_, L, over in directions)
+    dim = dr.select(light > 0, context.dim * light / dr.maximum(number, 1e-30), 1)
+    total = light + dim * number
+    left, kept = sampler.next_1d() * total, (mi.Vector3f(0, 0, 1), mi.Float(0), mi.Float(0))
+    for w, p_i, L, over in directions:
+        kept = dr.select((over > 0) & (left >= 0), (w, p_i, L + dim), kept)
+        left = left - (L + dim) * over
+    d, p_i, brightness = kept
+    return d, dr.select(total > 0, DIRECTIONS * p_i * brightness / dr.maximum(total, 1e-30), 0), brightness
