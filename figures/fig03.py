@@ -14,7 +14,7 @@ from figures.parts.part import Part, Result, Task
 from halfspace_sss.provenance import check_folder
 
 TITLE = "points of entry drawn by the paper's flow, without and with light, and by patches"
-SECONDS = {"draft": 6, "paper": 600}  # CPU time of the object, and of the flow
+SECONDS = {"draft": 6, "paper": 60}  # CPU time of the object, and of each flow
 POINTS = {"draft": 512, "paper": 2048}
 RESOLUTION = {"draft": 64, "paper": 192}  # of the candle
 SHOWN = ("uniform", "flow", "flow with light", "patches")
