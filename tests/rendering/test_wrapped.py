@@ -44,8 +44,10 @@ def same(a: np.ndarray, b: np.ndarray) -> None:
     assert p.min() * p.size > 1e-4, (a.mean(axis=(0, 1, 2)), b.mean(axis=(0, 1, 2)))
     noisy = np.concatenate([a, b]).std(axis=0) > 1e-6
     assert np.allclose(a.mean(axis=0)[~noisy], b.mean(axis=0)[~noisy], atol=1e-5)
-    p = stats.ttest_ind(a[:, noisy], b[:, noisy]).pvalue
-    assert p.min() * p.size > 1e-4
+    # pixels that few samples find the object in have no normal distribution
+    often = np.min([np.median(np.abs(x - np.median(x, axis=0)), axis=0) for x in (a, b)], axis=0) > 1e-4 * a.mean()
+    p = stats.ttest_ind(a[:, often], b[:, often]).pvalue
+    assert often.mean() > 0.5 and p.min() * p.size > 1e-4
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
