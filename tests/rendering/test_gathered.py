@@ -11,6 +11,7 @@ import pytest
 from full_geometry.learning.meshes import Box, surface
 from full_geometry.learning.shapes import box
 from halfspace_sss.rendering.gathered.entries import StratifiedEntries
+from halfspace_sss.rendering.gathered.pairs import Rays, lit_pairs
 from halfspace_sss.rendering.gathered.points import SurfacePoints, uniform_entries
 from halfspace_sss.rendering.gathered.transfer import Incident, RowUniforms
 from halfspace_sss.rendering.object.shape import survey
@@ -213,6 +214,19 @@ def test_rings_keep_uniform_light_as_it_is() -> None:
     B = T @ Incident(np.full(shape, 2.0, np.float32), np.zeros((*shape, 3), np.float32))
     assert np.allclose(B[:, :, 0], 2 * T.t.sum(axis=1), rtol=1e-4)
     assert np.abs(B[:, :, 1:]).max() < 1e-4 * B[:, :, 0].mean()
+
+
+def test_pairs_are_chosen_by_their_light_and_along_rays_that_bring_some() -> None:
+    rng = np.random.default_rng(3)
+    brought, point = rng.exponential(size=(64, 32)), rng.integers(0, 64, (64, 32))
+    rays = Rays(rng.normal(size=(64, 10, 3)), rng.exponential(size=(64, 10, 3)) * (np.arange(10) > 4)[:, None])
+    lit = lit_pairs(brought, point, rays)
+    n = len(lit.row) // 64
+    share = 0.9 * brought / brought.sum(axis=1, keepdims=True) + 0.1 / 32
+    assert np.abs(np.bincount(lit.number, minlength=brought.size) - n * share.ravel()).max() <= 1
+    assert np.allclose(lit.share * n * share.ravel()[lit.number], 1)
+    whole = rays.light.sum(axis=1)[point.ravel()[lit.number]]
+    assert np.allclose((lit.colour * whole).mean(axis=1), whole.mean(axis=1))  # 0 along rays without light
 
 
 def test_numbers_of_a_row_are_one_in_each_stratum() -> None:

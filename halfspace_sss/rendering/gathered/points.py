@@ -128,7 +128,11 @@ class SurfacePoints:
     def exit(self, k: mi.UInt32, u: mi.Point2f) -> tuple[SurfacePoint, mi.UInt32]:
         """Point k as an exit in a direction by the cosine, for a pair of uniforms, and its face."""
         n, n_out = dr.gather(mi.Normal3f, self.n, k), dr.gather(mi.Normal3f, self.n_out, k)
-        w, _ = cosine_above(n_out, n, u)
+        return self.exit_along(k, cosine_above(n_out, n, u)[0])
+
+    def exit_along(self, k: mi.UInt32, w: mi.Vector3f) -> tuple[SurfacePoint, mi.UInt32]:
+        """Point k as an exit, and its face."""
+        n, n_out = dr.gather(mi.Normal3f, self.n, k), dr.gather(mi.Normal3f, self.n_out, k)
         out = SurfacePoint(dr.gather(mi.Point3f, self.p, k), n, lifted(n_out, n, w), w, mi.Float(1))
         return out, dr.gather(mi.UInt32, self.face, k)
 

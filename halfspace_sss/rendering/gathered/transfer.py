@@ -6,8 +6,8 @@ Directions are taken apart: with the directional albedo a(mu) of the model,
 
 L_k the mean of the incident radiance at point k, weighted by a(mu_i) mu_i. Of each point j the entries s are drawn by
 the distance from it, see `entries`, with directions at both ends, so that under the same light from everywhere the sum
-is an unbiased estimate of what the model gives. Where the model knows its directional albedo there (`alpha`), the row
-is normalised by that.
+is an unbiased estimate of what the model gives. Where the model knows its directional albedo (`alpha`), the mean
+radiance c of a sky leaves by that, as in `paths.lighting.Sky`, and rows have but the rest of the light to carry.
 
 What S has beyond that depends on directions mostly as the first event does, which lies towards or away from the other
 end. With w bent by the boundary, less its mean by a(mu) mu, S gets for entry and exit the factors
@@ -15,7 +15,11 @@ end. With w bent by the boundary, less its mean by a(mu) mu, S gets for entry an
     1 + g.w,    g = g_n n + g_d d,    d from one end to the other,
 
 g_n and g_d of a distance those of all pairs at that distance, by least squares over directions of entries and exits. So
-light brings Σ_s t_js (L_k + g.M_k), M_k its first moment, and B a slope over w_o.
+light brings Σ_s t_js (L_k + g.M_k), M_k its first moment, and B a slope over w_o. These factors are divided out of t.
+What is left of S, by the place on the object, is known once light is: for a few entries S is asked along directions w
+of light at them, see `pairs`, and with t' for that B gets
+
+    Σ_s (t'_js(w) - t_js (1 + g.w)) L_k,    averaged over the neighbourhood.
 
 Textures vary over less than the distance of points. The medium at entries is that of their own places, and with the
 reflectance R of the half-space at the exit
@@ -44,6 +48,7 @@ import numpy as np
 
 from halfspace_sss.physics.fresnel import F_t
 from halfspace_sss.rendering.gathered.entries import PLACES, StratifiedEntries
+from halfspace_sss.rendering.gathered.pairs import EntryPairs, Rays, lit_pairs
 from halfspace_sss.rendering.gathered.points import GOLDEN, REACH, SurfacePoints
 from halfspace_sss.rendering.object.points import EntrySample, SurfacePoint, cosine_above, evaluate, opaque, wrapped
 
@@ -64,12 +69,14 @@ COARSEST = (
 DENSE = 8 / 3  # times as many
 RINGS = 2.0, 5.0  # distances of entries that part the rings, over that of points,
 STEPS = tuple(2 ** (k / 2) for k in range(12))  # and those that part the steps of g
-SLOPE_ROUNDS = 2  # smoothings of the slope over w_o
+KNOWN_ROUNDS = 16  # smoothings of what S brings over alpha,
+SLOPE_ROUNDS = 2  # of the slope over w_o,
+BEYOND_ROUNDS = 16  # and of what S along directions of light has beyond the transfer
 LIKE_DISTANCES, LIKE_COSINES = 14, 8  # classes of pairs of points
 ROUNDS = 0, 2, 8  # and how often what each brings is smoothed,
 SHARE_ROUNDS = 2, 4, 8  # and its share of the row
-HALVES = 2  # of the entries of a row,
-EXITS = 4  # and directions of exits of each
+EXITS = 8  # directions of exits of a row
+LEAST, LEAST_LEANING = 0.05, 0.2  # of what weights are divided by, over its mean
 R_2 = 0.7548776662466927, 0.5698402909980532
 LATTICE = 128  # directions of a hemisphere
 
@@ -111,13 +118,18 @@ class Albedo:
         a = np.maximum(self.c @ mu ** np.arange(3)[:, None], 0) * F_t(mu, self.eta)
         return np.maximum(2 * np.pi * (a * mu).mean(axis=1), 1e-30)
 
+    @property
+    def least(self) -> np.ndarray:
+        """Of what weights are divided by, per channel."""
+        return (LEAST / np.pi * self.whole).astype(np.float32)
+
 
 @dataclass(frozen=True, eq=False)
 class Incident:
     """Radiance at points, weighted by a(mu_i) mu_i.
 
     Args:
-        mean: (points, channels).
+        mean: (points, channels), less what is known without a transfer.
         moment: mean of L_i(w) (bent w - middle), `middle` that of `Hemispheres`, (points, channels, 3).
     """
 
@@ -185,6 +197,9 @@ class Transfer:
         albedo: a.
         error: standard error of the sums of rows over their mean, worst channel, root mean square.
         e: exponent of the reflectance at the exit, per channel.
+        trusted: channels in which alpha is what uniform light brings.
+        pairs: by which S is asked again.
+        unit: t over S / a(mu_i), (points, samples, channels).
     """
 
     points: SurfacePoints
@@ -198,11 +213,14 @@ class Transfer:
     albedo: Albedo
     error: float
     e: np.ndarray
+    trusted: np.ndarray
+    pairs: EntryPairs
+    unit: np.ndarray
 
     @property
     def nbytes(self) -> int:
-        """Memory of all arrays of entries."""
-        return sum(v.nbytes for v in (self.entry, self.t, self.ring, self.toward, self.step))
+        """Memory of all arrays of entries, but the places themselves."""
+        return sum(v.nbytes for v in (self.entry, self.t, self.ring, self.toward, self.step, self.unit, self.pairs.w_o))
 
     @cached_property
     def _n_out(self) -> np.ndarray:
@@ -211,14 +229,56 @@ class Transfer:
     def __matmul__(self, L: Incident) -> np.ndarray:
         """B for incident radiance, linear in the bent w_o: constant and slope, (points, channels, 4)."""
         light = self._arriving(L)
-        sums = np.maximum(self.t.sum(axis=1), 1e-30)
-        brings = np.einsum("jsc,jsc->jc", self.t, light) / sums
-        more = self.t * (light - brings[:, None])  # 0 in uniform light, where a(w_o) is all
-        upright, aside = (more * np.take(self.g[:, :, k], self.step, axis=0) for k in range(2))
-        slope = upright.sum(axis=1)[:, :, None] * self._n_out[:, None] - aside.transpose(0, 2, 1) @ self.toward
-        for _ in range(SLOPE_ROUNDS):
+        brought = self.t * light
+        slope = self._slope(brought.sum(axis=1), self._leaning(brought), SLOPE_ROUNDS)
+        return self._about_middle(self._by_place(light), slope)
+
+    def beyond(self, L: np.ndarray, rays: Rays) -> np.ndarray:
+        """What S along the directions of light brings beyond 1 + g.w, as `@` returns it.
+
+        Args:
+            L: mean of the radiance that comes along rays, (points, channels).
+            rays: to points.
+        """
+        lit = lit_pairs((self.t * np.take(L, self.entry, axis=0)).mean(axis=2), self.entry, rays)
+        (S, mu), rows, point = self.pairs.S(lit), len(self.points), self.entry.ravel()[lit.number]
+        toward, step, t, unit = (
+            v.reshape(-1, *v.shape[2:])[lit.number] for v in (self.toward, self.step, self.t, self.unit)
+        )
+        found = unit * S / np.maximum(np.array(self.albedo(mi.Float(mu))).T, self.albedo.least)
+        n, g, row = self._n_out[point], self.g[step], lit.row
+        d = _bent(lit.w, n, self.albedo.eta) - self.around.middle[point]
+        expected = 1 + g[:, :, 0] * (d * n).sum(axis=1)[:, None] + g[:, :, 1] * (d * toward).sum(axis=1)[:, None]
+        more = (found - t * np.maximum(expected, 0)) * lit.colour * L[point] * lit.share[:, None]
+        brought, upright = (_of_rows(row, v, rows) for v in (more, more * g[:, :, 0]))
+        aside = [_of_rows(row, more * g[:, :, 1] * toward[:, k, None], rows) for k in range(3)]
+        slope = self._slope(
+            brought, upright[:, :, None] * self._n_out[:, None] - np.stack(aside, axis=2), BEYOND_ROUNDS
+        )
+        for _ in range(BEYOND_ROUNDS):
+            brought = self.points.smoothed(brought)
+        return self._about_middle(brought, slope)
+
+    def _leaning(self, brought: np.ndarray) -> np.ndarray:
+        """The slope over w_o of what entries bring, (points, channels, 3)."""
+        upright, aside = (brought * np.take(self.g[:, :, k], self.step, axis=0) for k in range(2))
+        return upright.sum(axis=1)[:, :, None] * self._n_out[:, None] - aside.transpose(0, 2, 1) @ self.toward
+
+    @cached_property
+    def _even(self) -> np.ndarray:
+        """That of uniform light, over what it brings."""
+        return self._leaning(self.t) / np.maximum(self.t.sum(axis=1), 1e-30)[:, :, None]
+
+    def _slope(self, brought: np.ndarray, leaning: np.ndarray, rounds: int) -> np.ndarray:
+        """Less that of uniform light, where a(w_o) is all; smoothed."""
+        slope = leaning - brought[:, :, None] * self._even
+        for _ in range(rounds):
             slope = self.points.smoothed(slope)
-        constant = self._by_place(light) - np.einsum("jck,jk->jc", slope, self.around.middle)
+        return slope
+
+    def _about_middle(self, mean: np.ndarray, slope: np.ndarray) -> np.ndarray:
+        """Constant and slope of what has that mean over w_o."""
+        constant = mean - np.einsum("jck,jk->jc", slope, self.around.middle)
         return np.concatenate([constant[:, :, None], slope], axis=2)
 
     def mean(self, L: Incident) -> np.ndarray:
@@ -234,7 +294,7 @@ class Transfer:
             aside += np.take(L.moment[:, :, axis], self.entry, axis=0) * self.toward[:, :, axis, None]
         light += np.take(self.g[:, :, 1], self.step, axis=0) * aside
         light += np.take(L.mean, self.entry, axis=0)
-        return np.maximum(light, 0)
+        return light
 
     def _by_place(self, light: np.ndarray) -> np.ndarray:
         """What leaves by the light of entries, (points, channels).
@@ -291,22 +351,45 @@ def transfer(obj: TranslucentObject, share: float = 1.0, seed: int = SEED) -> Tr
         )
     paint = None if obj.textured is None else result.paint
     e = np.zeros(result.S.shape[2], np.float32) if paint is None else _exponents(points, result)
-    t, error = _rows(points, result.S / (result.paint**e)[:, None], (_trusted(obj), paint), result.a)
+    S = result.S / (result.paint**e)[:, None]
+    trusted, whole = _rows(obj, points, result, S, paint)
     near = np.where(result.known, result.near, np.arange(len(points), dtype=np.uint32)[:, None])
     toward, d, kind = _geometry(points, near)
     # rows beside an edge of a texture are not to be averaged with those beyond
     ring = np.digitize(d, RINGS).astype(np.uint8) if paint is None else np.zeros(d.shape, np.uint8)
     step = np.digitize(d, STEPS).astype(np.uint8)
     around = Hemispheres.of(points, result.albedo)
-    g = _leanings(points, around, result, (near, t, t - _expected(result, t, kind)), (toward, step))
-    return Transfer(points, around, near, t, ring, toward, step, g, result.albedo, error, e)
+    t = _scaled(S, whole)
+    g, factors = _leanings(points, around, result, (near, t, t - _expected(result, t, kind)), (toward, step))
+    weight = np.take(around.whole.astype(np.float32), near, axis=0)
+    weight /= np.maximum(result.a, result.albedo.least) * factors[1]
+    over = weight / (np.maximum(result.cosine, LEAST) * factors[0])
+    before, after = (_summed(kind, v, LIKE_DISTANCES * LIKE_COSINES**2) for v in (t, t * over))
+    kept = (before / np.maximum(after, 1e-30)).astype(np.float32)[kind]  # what pairs that are alike bring
+    over *= kept
+    S *= over
+    t = _scaled(S, whole)
+    sums, n = S.sum(axis=1, keepdims=True), S.shape[1]
+    deviation = (S - sums / n).std(axis=1) / np.sqrt(n) / np.maximum(sums[:, 0].mean(axis=0) / n, 1e-30)
+    error = float(np.sqrt((deviation**2).mean(axis=0)).max())
+    scale = whole / np.maximum(sums[:, 0], 1e-30) / result.paint**e
+    unit = weight * kept * (result.albedo.whole * scale).astype(np.float32)[:, None]
+    pairs = EntryPairs(obj, points.exit_along, result.w_o, result.entries)
+    return Transfer(points, around, near, t, ring, toward, step, g, result.albedo, error, e, trusted, pairs, unit)
+
+
+def _scaled(S: np.ndarray, whole: np.ndarray) -> np.ndarray:
+    """Rows of these sums."""
+    return (S * (whole / np.maximum(S.sum(axis=1), 1e-30))[:, None]).astype(np.float32)
 
 
 def _leanings(
     points: SurfacePoints, around: Hemispheres, found: DrawnEntries, weights: tuple[np.ndarray, ...],
     apart: tuple[np.ndarray, np.ndarray],
-) -> np.ndarray:  # fmt: skip
+) -> tuple[np.ndarray, list[np.ndarray]]:  # fmt: skip
     """g of all steps, (steps, channels, 2), by least squares over entries, and exits, of all pairs at a distance.
+
+    Then 1 + g.w of entries, and of exits, (points, samples, channels).
 
     With f the cosines of the bent w - middle to the normal and to the other end, E over directions by a(mu) mu,
 
@@ -315,29 +398,40 @@ def _leanings(
     where t less what is expected of separable S stands on the right.
     """
     (near, t, beyond), (toward, step), size = weights, apart, len(STEPS) + 1
-    n_out, eta = np.array(points.n_out, dtype=np.float32).T, found.albedo.eta
+    n_out = np.array(points.n_out, dtype=np.float32).T
     own = np.broadcast_to(np.arange(len(n_out))[:, None], step.shape)
-    A, b = np.zeros((size, t.shape[2], 2, 2)), np.zeros((size, t.shape[2], 2))
+    A, b, cosines = np.zeros((size, t.shape[2], 2, 2)), np.zeros((size, t.shape[2], 2)), []
     for at, w, way in ((near, found.w_i, toward), (own, found.w_o, -toward)):
         n = np.take(n_out, at, axis=0)
-        mu = np.einsum("jsk,jsk->js", w, n)
-        mu_t = np.sqrt(1 - np.maximum(1 - mu**2, 0) / eta**2)
-        d = w / eta + (mu_t - mu / eta)[:, :, None] * n - np.take(around.middle, at, axis=0)
+        d = _bent(w, n, found.albedo.eta) - np.take(around.middle.astype(np.float32), at, axis=0)
         axes = n, way
+        cosines.append([np.einsum("jsk,jsk->js", d, axis) for axis in axes])
         spread = [np.einsum("jsik,jsk->jsi", np.take(around.covariance, at, axis=0), axis) for axis in axes]
         for i in range(2):
-            f = np.einsum("jsk,jsk->js", d, axes[i])
-            b[:, :, i] += _summed(step, beyond * f[:, :, None], size)
+            b[:, :, i] += _summed(step, beyond * cosines[-1][i][:, :, None], size)
             for k in range(2):
                 A[:, :, i, k] += _summed(step, t * np.einsum("jsk,jsk->js", axes[i], spread[k])[:, :, None], size)
     A += (1e-3 * np.trace(A, axis1=2, axis2=3) + 1e-30)[:, :, None, None] * np.eye(2)
-    return np.linalg.solve(A, b[..., None])[..., 0].astype(np.float32)
+    g = np.linalg.solve(A, b[..., None])[..., 0].astype(np.float32)
+    each = [np.take(g[:, :, k], step, axis=0) for k in range(2)]
+    factors = [1 + sum(v * f[:, :, None] for v, f in zip(each, end)) for end in cosines]
+    return g, [np.maximum(f, LEAST_LEANING) for f in factors]
+
+
+def _bent(w: np.ndarray, n: np.ndarray, eta: float) -> np.ndarray:
+    """`bent` of arrays (..., 3)."""
+    mu = np.einsum("...k,...k->...", w, n)[..., None]
+    return w / eta + (np.sqrt(1 - np.maximum(1 - mu**2, 0) / eta**2) - mu / eta) * n
 
 
 def _summed(step: np.ndarray, values: np.ndarray, size: int) -> np.ndarray:
     """Sums of values of pairs, (points, samples, channels), of each step."""
-    columns = [np.bincount(step.ravel(), values[:, :, c].ravel(), size) for c in range(values.shape[2])]
-    return np.stack(columns, axis=1)
+    return _of_rows(step.ravel(), values.reshape(-1, values.shape[2]), size)
+
+
+def _of_rows(row: np.ndarray, values: np.ndarray, rows: int) -> np.ndarray:
+    """Sums of values (entries, channels) of each row."""
+    return np.stack([np.bincount(row, v, rows) for v in values.T], axis=1)
 
 
 def _geometry(points: SurfacePoints, near: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -429,6 +523,8 @@ class DrawnEntries(NamedTuple):
         a: directional albedo at the exit, per channel.
         albedo: fitted to them.
         paint: reflectance of the medium at the point, per channel, where media have textures; else 1.
+        entries: given their numbers.
+        exits: of a point, which entries have in turn.
     """
 
     S: np.ndarray
@@ -441,6 +537,8 @@ class DrawnEntries(NamedTuple):
     a: np.ndarray
     albedo: Albedo
     paint: np.ndarray
+    entries: Callable[[mi.UInt32], EntrySample]
+    exits: int
 
 
 class _Brought(NamedTuple):
@@ -462,11 +560,11 @@ def drawn(
     obj: TranslucentObject, points: SurfacePoints, cell: Callable, samples: int, seed: int = SEED
 ) -> DrawnEntries:
     """As many entries for each point, by the proposals; `cell` of position, normal, face and mask is what is near."""
-    n = samples // len(points) // HALVES * HALVES
+    n = samples // len(points)
     k = dr.arange(mi.UInt32, len(points) * n)
-    each = dr.opaque(mi.UInt32, n // HALVES)  # kernels are those of other numbers of points too
-    half, active = k // each, mi.Bool(True)
-    j, sampler = half // HALVES, RowUniforms(half, k % each, HALVES * len(points), n // HALVES, seed)
+    each = dr.opaque(mi.UInt32, n)  # kernels are those of other numbers of points too
+    j, active = k // each, mi.Bool(True)
+    sampler = RowUniforms(j, k % each, len(points), n, seed)
     out, face = points.exit(j, sampler.next_2d())
     out = obj.knowing(out, face)
     prepared = obj.transport.prepare(out, active)
@@ -476,40 +574,39 @@ def drawn(
     paint = _paint(obj, out)
     evaluate(brought, near, known, out, paint, entry.weight)
     places = [np.array(v).reshape(len(points), n) for v in (near, known, entry.weight)]
-    return _collected(obj, brought, places, out, paint)
+    return _collected(obj, brought, places, out, paint, entry.gather)
 
 
 def stratified(obj: TranslucentObject, points: SurfacePoints, n: int, seed: int) -> DrawnEntries:
     """About n entries for each point, by their distance from it; those of one exit share what S asks of that."""
-    n //= HALVES * EXITS
+    n //= EXITS
     each, exits, size = dr.opaque(mi.UInt32, n), dr.opaque(mi.UInt32, EXITS), dr.size_v(mi.Spectrum)
-    rows, n = HALVES * len(points), EXITS * n
+    rows, n = len(points), EXITS * n
     lane = dr.arange(mi.UInt32, rows * EXITS)
-    half, k = lane // exits, lane % exits
-    out, face = points.exit(half // HALVES, RowUniforms(half, k, rows, EXITS, seed).next_2d())
+    j, k = lane // exits, lane % exits
+    out, face = points.exit(j, RowUniforms(j, k, rows, EXITS, seed).next_2d())
     out = obj.knowing(out, face)
     prepared, paint = obj.transport.prepare(out, mi.Bool(True)), _paint(obj, out)
-    entries = StratifiedEntries.of(obj.proposals.positions, points, HALVES * n, seed)
-    u = RowUniforms(half, k, rows, n, seed + 1).pair()
+    entries = StratifiedEntries.of(obj.proposals.positions, points, n, seed)
+    u = RowUniforms(j, k, rows, n, seed + 1).pair()
     S, w_i, mu_i, over = (dr.zeros(mi.Float, c * rows * n) for c in (size, 3, 1, 1))
     evaluate(out, paint, u, S, w_i, mu_i, over)
 
     def step(i: mi.UInt32) -> tuple[mi.UInt32]:
-        s = i * exits + k  # of the half, which has every second entry along the surface
-        entry = entries((half // HALVES * each * exits + s) * HALVES + half % HALVES)
+        s = i * exits + k
+        entry = entries(j * each * exits + s)
         if obj.textured is not None:
             entry = entry._replace(medium=obj.textured.at_point(obj.geometry, entry.p, entry.n, entry.face))
-        brought = _brought(obj, prepared, out, entry, mi.Point2f(*(one(half, s) for one in u)))
+        brought = _brought(obj, prepared, out, entry, mi.Point2f(*(one(j, s) for one in u)))
         for target, value in zip((S, w_i, mu_i, over), brought):
-            dr.scatter(target, value, half * each * exits + s)
+            dr.scatter(target, value, j * each * exits + s)
         return (i + 1,)
 
     dr.while_loop((mi.UInt32(0) + dr.zeros(mi.UInt32, rows * EXITS),), lambda i: i < each, step, label="entries")
     dr.eval(S, w_i, mu_i, over)
-    along, whole = (len(points), n, HALVES), (len(points), HALVES * n)
-    near, area = (v.reshape(along).swapaxes(1, 2).reshape(whole) for v in (entries.near, np.array(entries.weight)))
+    near, area = (np.array(v).reshape(rows, n) for v in (entries.near, entries.weight))
     brought = _Brought(dr.unravel(mi.Spectrum, S), dr.unravel(mi.Vector3f, w_i), mu_i, over)
-    return _collected(obj, brought, [near, area > 0, area], out, paint)
+    return _collected(obj, brought, [near, area > 0, area], out, paint, entries)
 
 
 def _paint(obj: TranslucentObject, out: SurfacePoint) -> mi.Spectrum:
@@ -530,17 +627,18 @@ def _brought(obj: TranslucentObject, prepared: Any, out: SurfacePoint, entry: En
 
 
 def _collected(
-    obj: TranslucentObject, brought: _Brought, places: list[np.ndarray], out: SurfacePoint, paint: mi.Spectrum
-) -> DrawnEntries:
+    obj: TranslucentObject, brought: _Brought, places: list[np.ndarray], out: SurfacePoint, paint: mi.Spectrum,
+    entries: Callable[[mi.UInt32], EntrySample],
+) -> DrawnEntries:  # fmt: skip
     """Arrays of entries, of which some share an exit: near, known and area of each, and what it brought."""
     near, known, area = places
     count, n = near.shape
 
     def of_entries(v: Any) -> np.ndarray:
-        """(points, entries, channels) of values of exits, of which each half has its own for entries in turn."""
+        """(points, entries, channels) of values of exits, which entries have in turn."""
         v = np.atleast_2d(np.array(v, dtype=np.float32)).T
-        v = v.reshape(count, HALVES, 1, -1, v.shape[1])
-        return np.broadcast_to(v, (count, HALVES, n // (HALVES * v.shape[3]), *v.shape[3:])).reshape(count, n, -1)
+        v = v.reshape(count, 1, -1, v.shape[1])
+        return np.broadcast_to(v, (count, n // v.shape[2], *v.shape[2:])).reshape(count, n, -1)
 
     S = np.array(brought.S, dtype=np.float32).T.reshape(count, n, -1)
     S = np.nan_to_num(S, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
@@ -552,15 +650,8 @@ def _collected(
         albedo = _tilted(albedo, mu_o[:, :, 0], S, R)
     a = of_entries(mi.Spectrum(albedo(mu, paint)))
     cosine = np.array(albedo(brought.mu_i) * brought.over).T.reshape(S.shape) / albedo.whole.astype(np.float32)
-    w_i = np.array(brought.w_i, dtype=np.float32).T.reshape(count, n, 3)
-    return DrawnEntries(S, cosine, area, near, known, w_i, w_o, a, albedo, np.maximum(R, 1e-20))
-
-
-def _trusted(obj: TranslucentObject) -> np.ndarray:
-    """The channels in which the model knows its directional albedo at every exit."""
-    if obj.transport.alpha is None:
-        return np.zeros(dr.size_v(mi.Spectrum), dtype=bool)
-    return np.ravel(np.array(obj.transport.alpha.known[1])) > 0
+    w_i, exits = np.array(brought.w_i, dtype=np.float32).T.reshape(count, n, 3), dr.width(out.w) // count
+    return DrawnEntries(S, cosine, area, near, known, w_i, w_o, a, albedo, np.maximum(R, 1e-20), entries, exits)
 
 
 def _fitted(obj: TranslucentObject, mu: np.ndarray, S: np.ndarray) -> Albedo:
@@ -588,16 +679,22 @@ def _tilted(albedo: Albedo, mu: np.ndarray, S: np.ndarray, paint: np.ndarray) ->
 
 
 def _rows(
-    points: SurfacePoints, S: np.ndarray, known: tuple[np.ndarray, np.ndarray | None], a: np.ndarray
-) -> tuple[np.ndarray, float]:
-    """t of all rows: S over a at the exit, both summed over the directions of a row; and the error of the sums.
+    obj: TranslucentObject, points: SurfacePoints, found: DrawnEntries, S: np.ndarray, paint: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Channels in which the model knows its directional albedo at every exit, and sums of rows, (points, channels).
 
-    A row has the sum 1 where alpha is the directional albedo, and that of its neighbours of like colour elsewhere.
+    The sum is that of S over those of alpha, or of a where that is not known, for the directions of a row. They are
+    means over neighbours, of like colour where a is fitted.
     """
-    n, (trusted, paint) = S.shape[1], known
-    sums = S.sum(axis=1, keepdims=True)
-    even = sums / np.maximum(a.sum(axis=1, keepdims=True), 1e-30)
+    even = S.mean(axis=1) / np.maximum(found.a.mean(axis=1), 1e-30)
     even = points.smoothed(points.smoothed(even, paint), paint)
-    t = S * (np.where(trusted, 1, even) / np.maximum(sums, 1e-30))
-    deviation = (S - sums / n).std(axis=1) / np.sqrt(n) / np.maximum(sums[:, 0].mean(axis=0) / n, 1e-30)
-    return t.astype(np.float32), float(np.sqrt((deviation**2).mean(axis=0)).max())
+    if obj.transport.alpha is None:
+        return np.zeros(even.shape[1], dtype=bool), even
+    j = mi.UInt32(np.repeat(np.arange(len(points), dtype=np.uint32), found.exits))
+    out, face = points.exit_along(j, mi.Vector3f(found.w_o[:, : found.exits].reshape(-1, 3).T))
+    alpha = np.array(obj.transport.alpha(obj.knowing(out, face), mi.Bool(True))[1], dtype=np.float32)
+    known = found.S.mean(axis=1) / np.maximum(alpha.T.reshape(len(points), found.exits, -1).mean(axis=1), 1e-30)
+    for _ in range(KNOWN_ROUNDS):
+        known = points.smoothed(known)
+    trusted = np.ravel(np.array(obj.transport.alpha.known[1])) > 0
+    return trusted, np.where(trusted, known, even)

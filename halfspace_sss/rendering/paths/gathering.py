@@ -5,16 +5,16 @@ by directions of the cosine (balance heuristic); what other surfaces send is tra
 B = T L follows, see `gathered.transfer`, and at an exit L_o(x_o, w_o) = a(w_o) B(x_o), blended between points. Jensen
 and Buhler (2002) take two passes so with a dipole; here the second is a sparse matrix that outlives the light.
 
-What is not known: light of directions apart from its a(mu)-weighted mean and first moment, so that a dependence of the
-model on the azimuth between light and view is lost; detail of light below the distance of the points. Its noise is that
-of the gathering.
+What is not known: a dependence of the model on the azimuth between light and view; how light varies over directions,
+apart from its a(mu)-weighted mean, first moment, and what S along a few directions of it brings in the neighbourhood;
+detail of light below the distance of the points. Its noise is that of the gathering.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -22,6 +22,7 @@ import numpy as np
 
 from halfspace_sss.backend import clock
 from halfspace_sss.rendering.gathered.inner import Events, InnerLight, has_inner_light
+from halfspace_sss.rendering.gathered.pairs import Rays
 from halfspace_sss.rendering.gathered.points import GOLDEN, SurfacePoints
 from halfspace_sss.rendering.gathered.transfer import (
     SEED,
@@ -36,7 +37,7 @@ from halfspace_sss.rendering.gathered.transfer import (
 from halfspace_sss.rendering.object.points import cosine_above, opaque, place
 from halfspace_sss.rendering.object.shape import same_objects, state_of
 from halfspace_sss.rendering.paths.inner_light import COUNT, inner_light
-from halfspace_sss.rendering.paths.lighting import mis_weight
+from halfspace_sss.rendering.paths.lighting import Lights, Sky, mis_weight
 from halfspace_sss.rendering.paths.path_loop import trace_paths
 
 if TYPE_CHECKING:
@@ -61,8 +62,9 @@ class Gathered:
         object: of it.
         transfer: of its model.
         values: B of all points, for each channel the constant and the slope over w_o bent by the boundary.
-        light: that arrives.
+        light: that arrives, less c.
         parts: independent estimates of it.
+        c: mean radiance of the sky in the channels where alpha is known, else 0, see `lighting.Sky`.
         inner: at events of order 1 inside; None where that order is traced.
     """
 
@@ -71,12 +73,13 @@ class Gathered:
     values: mi.Float
     light: Incident
     parts: tuple[Incident, ...]
+    c: np.ndarray
     inner: InnerLight | None = None
 
     @cached_property
     def error(self) -> float:
         """Standard error of B by the gathering of light, over its mean; NaN where that is not in parts."""
-        found = np.stack([self.transfer.mean(part) for part in self.parts])
+        found = np.stack([self.transfer.mean(part) + self.c for part in self.parts])
         spread = found.var(axis=0, ddof=1).mean() if len(found) > 1 else np.nan
         return float(np.sqrt(spread / len(found)) / max(float(found.mean()), 1e-30))
 
@@ -204,22 +207,30 @@ def _leaving(
 ) -> Gathered:  # fmt: skip
     """B of object k, by light in parts whose differences tell the noise, and light inside."""
     T, events = of
-    lights, others = zip(*_incident(scene, objects, T, settings, 2 * k + seed, parts))
+    found, rays = _incident(scene, objects, T, settings, 2 * k + seed, parts)
+    lights, others = zip(*found)
+    sky = Sky.of(scene, Lights.of(scene), objects[k : k + 1])
+    c = np.zeros(len(T.trusted)) if sky is None else T.trusted * np.ravel(np.array(sky.mean))
+    lights = tuple(replace(light, mean=light.mean - c.astype(np.float32)) for light in lights)
     light = Incident.mean_of(lights)
     B = T @ light
+    B[:, :, 0] += c
+    if objects[k].textured is None:  # averages over the neighbourhood would cross edges of textures
+        direct = np.maximum(rays.light.sum(axis=1) / T.around.whole - c, 0)
+        B += T.beyond(direct.astype(np.float32), rays)
     if not np.isfinite(B).all():
         raise ValueError(f"light at object {objects[k].geometry.name} must be finite, got NaN or infinity")
     inner = None
     if events is not None:
         seen = mi.Float(np.mean(others, axis=0).astype(np.float32).ravel())
         inner = inner_light(scene, objects, k, settings, events, (T.points, seen))
-    return Gathered(objects[k], T, mi.Float(B.astype(np.float32).ravel()), light, lights, inner)
+    return Gathered(objects[k], T, mi.Float(B.astype(np.float32).ravel()), light, lights, c, inner)
 
 
 def _incident(
     scene: mi.Scene, objects: list[TranslucentObject], T: Transfer, settings: Settings, seed: int, parts: int
-) -> list[tuple[Incident, np.ndarray]]:
-    """Incident radiance at all points, and the mean of other surfaces that each sees, (points, channels), in parts.
+) -> tuple[list[tuple[Incident, np.ndarray]], Rays]:
+    """Incident radiance at all points, and the mean of other surfaces that each sees, in parts; emitters' light by ray.
 
     Parts are independent estimates by as many directions each, of one launch.
     """
@@ -245,13 +256,22 @@ def _incident(
     values = [aimed + met, *(aimed * d_e[i] + met * d_c[i] for i in range(3))]
     values += [TRACED * more, *(TRACED * more * d_c[i] for i in range(3)), TRACED * dr.select(on, a, 0)]
     values = [mi.Spectrum(v) + dr.zeros(mi.Float, rows * n) for v in values]
-    dr.eval(values)
+    each_light = [mi.Spectrum(v) + dr.zeros(mi.Float, rows * n) for v in (aimed, met)]
+    dr.eval(values, each_light, w_e, w_c)
     j, s = lane // each, lane % each
     order = dr.select(s % TRACED == 0, j * few + s // TRACED, all_few + j * (each - few) + s - s // TRACED - 1)
     sums = [dr.block_sum(dr.gather(mi.Float, v, order), n) for value in values for v in value]
     dr.eval(sums)
     found = np.stack([np.array(v, dtype=float) for v in sums], axis=1).reshape(rows, len(values), -1) / n
-    return [_of_part(T.points, around, found[k * count : (k + 1) * count]) for k in range(parts)]
+    at = np.array(order)
+
+    def by_point(v: Any) -> np.ndarray:
+        v = np.array(v).T[at].reshape(parts, count, n, -1)
+        return np.moveaxis(v, 0, 1).reshape(count, parts * n, -1)
+
+    w, light = (np.concatenate([by_point(v) for v in both], axis=1) for both in ((w_e, w_c), each_light))
+    rays = Rays(w, light / (parts * n))
+    return [_of_part(T.points, around, found[k * count : (k + 1) * count]) for k in range(parts)], rays
 
 
 def _of_part(points: SurfacePoints, around: Hemispheres, found: np.ndarray) -> tuple[Incident, np.ndarray]:
