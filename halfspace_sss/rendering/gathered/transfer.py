@@ -63,9 +63,7 @@ SAMPLES = 3 * 2**17  # entries of all points,
 FEWEST_ENTRIES, FEWEST_OF_PART = 48, 16  # and of a point
 FITTED = 2**18
 SEED = 7
-COARSEST = (
-    0.5  # distance of places of entries in transport mean free paths; the proposals draw those of denser objects,
-)
+COARSEST = 0.5  # transport mean free paths between places of entries; proposals draw those of denser objects,
 DENSE = 8 / 3  # times as many
 RINGS = 2.0, 5.0  # distances of entries that part the rings, over that of points,
 STEPS = tuple(2 ** (k / 2) for k in range(12))  # and those that part the steps of g
