@@ -80,10 +80,10 @@ SLOW = [pytest.param("floor", 0.3, marks=pytest.mark.slow)]
 
 
 @pytest.mark.parametrize(("light", "g"), CASES + SLOW)
-def test_light_is_that_of_traced_events_within_1_percent(light: str, g: float) -> None:
+def test_light_is_that_of_traced_events_within_1_percent_and_beside_a_floor_within_2(light: str, g: float) -> None:
     traced, gathered = (x.mean(axis=(1, 2)) for x in _pictures(light, g))
-    noise = traced.std(axis=0, ddof=1) / np.sqrt(3)
-    assert (np.abs(gathered.mean(axis=0) - traced.mean(axis=0)) < 0.01 * traced.mean(axis=0) + 5 * noise).all()
+    noise, most = traced.std(axis=0, ddof=1) / np.sqrt(3), 0.02 if light == "floor" else 0.01
+    assert (np.abs(gathered.mean(axis=0) - traced.mean(axis=0)) < most * traced.mean(axis=0) + 5 * noise).all()
 
 
 @pytest.mark.parametrize(("light", "g"), CASES)
