@@ -27,7 +27,7 @@ def result(**found) -> Result:
 def test_parts_have_keys_and_more_work_in_paper_quality(module) -> None:
     draft, paper = (module.parts(quality) for quality in ("draft", "paper"))
     assert len(keys_of(draft)) == len(draft)
-    assert sum(p.work for p in paper) > 10 * sum(p.work for p in draft)
+    assert sum(p.work for p in paper) >= 10 * sum(p.work for p in draft)
 
 
 def test_points_of_both_objects_are_drawn_with_their_distances() -> None:
@@ -64,7 +64,8 @@ def test_images_of_all_samplers_are_compared() -> None:
     names += [fig12._key(light, name) for light in fig12.LIGHTS for name in ("converged", "gathered")]
     assert all(re.fullmatch(r"[\w-]+", name) for name in names)  # what images of parts may be called
     images = {name: 0.5 + 0.1 * rng.random((32, 32, 3)).astype(np.float32) for name in names}
-    files = fig12.draw({"bunny": result(**images)})
+    halves = {fig12._key(light, "halves"): 0.04 for light in fig12.LIGHTS}
+    files = fig12.draw({"bunny": result(**images, **halves)})
     table = pandas.read_csv(io.StringIO(files["fig12.csv"]))
     assert len(table) == len(names) - len(fig12.LIGHTS) and table["relMSE"].max() < 0.1
 
