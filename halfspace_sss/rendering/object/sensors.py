@@ -14,24 +14,27 @@ def sampled_size(film: mi.Film) -> mi.ScalarVector2u:
 
 
 def camera_rays(sensor: mi.Sensor, spp: int, seed: tuple[int, int]) -> tuple[mi.Ray3f, mi.Spectrum, mi.Vector2f]:
-    """`rays_by` a copy of the sampler of the sensor, spp samples of each pixel; some samplers take squares only."""
+    """`rays_by` the sampler of the sensor."""
+    return rays_by(sensor, seeded_sampler(sensor, spp, int(np.random.SeedSequence(list(seed)).generate_state(1)[0])))
+
+
+def seeded_sampler(sensor: mi.Sensor, spp: int, seed: int) -> mi.Sampler:
+    """A copy of the sampler of a sensor for spp samples of each pixel, or more: some samplers take squares only."""
     sampler = sensor.sampler().clone()
     sampler.set_sample_count(spp)
-    spp = sampler.sample_count()
-    sampler.set_samples_per_wavefront(spp)
-    n = int(dr.prod(sampled_size(sensor.film()))) * spp
-    sampler.seed(int(np.random.SeedSequence(list(seed)).generate_state(1)[0]), n)
-    return rays_by(sensor, sampler, spp)
+    sampler.set_samples_per_wavefront(sampler.sample_count())
+    sampler.seed(seed, int(dr.prod(sampled_size(sensor.film()))) * sampler.sample_count())
+    return sampler
 
 
-def rays_by(sensor: mi.Sensor, sampler: mi.Sampler, spp: int) -> tuple[mi.Ray3f, mi.Spectrum, mi.Vector2f]:
-    """Rays of spp samples of each pixel, their weights, and their positions on the film.
+def rays_by(sensor: mi.Sensor, sampler: mi.Sampler) -> tuple[mi.Ray3f, mi.Spectrum, mi.Vector2f]:
+    """Rays of all samples of each pixel, their weights, and their positions on the film.
 
     Args:
         sensor: its film has been prepared.
         sampler: with a lane for each ray, pixel by pixel.
-        spp: samples of a pixel.
     """
+    spp = sampler.sample_count()
     film, size = sensor.film(), sampled_size(sensor.film())
     border = film.rfilter().border_size() if film.sample_border() else 0
     n = int(dr.prod(size)) * spp

@@ -17,7 +17,7 @@ from halfspace_sss.interrupts import interruptible
 from halfspace_sss.rendering.light.small_emitters import check_emitters
 from halfspace_sss.rendering.object.objects import KnowsUnit, TranslucentObject, TranslucentObjects, make_objects
 from halfspace_sss.rendering.object.registry import Choices
-from halfspace_sss.rendering.object.sensors import rays_by, sampled_size, splat
+from halfspace_sss.rendering.object.sensors import rays_by, sampled_size, seeded_sampler, splat
 from halfspace_sss.rendering.object.settings import Settings, read_settings
 from halfspace_sss.rendering.object.translucent import is_translucent
 from halfspace_sss.rendering.object.wrapped import wraps
@@ -119,7 +119,7 @@ def _class(variant: str) -> type:
         def _launch(self, scene: mi.Scene, sensor: mi.Sensor, seed: int, launch: Launch) -> None:
             """Add the samples of a launch to the film."""
             sampler = launch.sampler(sensor, seed)
-            ray, weight, position = rays_by(sensor, sampler, sampler.sample_count())
+            ray, weight, position = rays_by(sensor, sampler)
             L, hit, _ = self.sample(scene, sampler, ray)
             splat(sensor.film(), ray, L * weight, hit, position, launch.spp)
 
@@ -213,13 +213,9 @@ class Launch(NamedTuple):
 
     def sampler(self, sensor: mi.Sensor, seed: int) -> mi.Sampler:
         """Its random numbers: of `low_discrepancy` in place of independent ones, else of the sampler of a sensor."""
-        sampler, pixels = sensor.sampler().clone(), int(dr.prod(sampled_size(sensor.film())))
-        if is_independent(sampler):
-            return path_numbers(seed, pixels, *self)
-        sampler.set_sample_count(self.spp)
-        sampler.set_samples_per_wavefront(sampler.sample_count())
-        sampler.seed(seed, pixels * sampler.sample_count())
-        return sampler
+        if is_independent(sensor.sampler()):
+            return path_numbers(seed, int(dr.prod(sampled_size(sensor.film()))), *self)
+        return seeded_sampler(sensor, self.spp, seed)
 
 
 def is_independent(sampler: mi.Sampler) -> bool:

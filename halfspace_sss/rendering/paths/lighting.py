@@ -154,7 +154,6 @@ class Sky(NamedTuple):
     density as weight: bright directions, which are sampled often, have little noise of their own.
     """
 
-    emitter: mi.Emitter
     mean: mi.Spectrum  # c
 
     @classmethod
@@ -180,11 +179,7 @@ class Sky(NamedTuple):
             left = np.average((L - c[:, None]) ** 2, axis=1, weights=weight).sum()
             if left > MOST_LEFT * np.average(L**2, axis=1, weights=weight).sum():
                 return None
-            return cls(emitter, dr.opaque(mi.Spectrum, c.tolist()))
-
-    def pdf(self, scene: mi.Scene, at: mi.Interaction3f, d: mi.Vector3f, active: mi.Bool) -> mi.Float:
-        """Density of next-event estimation for a direction of the sky, 1/sr."""
-        return scene.pdf_emitter_direction(at, _towards(self.emitter, d), active)
+            return cls(dr.opaque(mi.Spectrum, c.tolist()))
 
 
 def _towards(emitter: mi.Emitter, d: mi.Vector3f) -> mi.DirectionSample3f:
@@ -270,12 +265,15 @@ class RenderContext:
         ds, light = self.scene.sample_emitter_direction(at, u, False, active)
         return ds.d, ds.pdf, light * ds.pdf
 
+    def pdf_sky(self, at: mi.Interaction3f, d: mi.Vector3f, active: mi.Bool) -> mi.Float:
+        """Density of emitter sampling for a direction of the sky, 1/sr."""
+        return self.scene.pdf_emitter_direction(at, _towards(self.scene.environment(), d), active)
+
     def eval_sky(self, at: mi.Interaction3f, d: mi.Vector3f, active: mi.Bool) -> tuple[mi.Float, mi.Spectrum]:
         """The density of a direction by `sample_sky`, and the radiance from there."""
-        sky = self.scene.environment()
         si = dr.zeros(mi.SurfaceInteraction3f)
         si.wi, si.wavelengths = -d, at.wavelengths
-        return self.scene.pdf_emitter_direction(at, _towards(sky, d), active), sky.eval(si, active)
+        return self.pdf_sky(at, d, active), self.scene.environment().eval(si, active)
 
     def connects_sky(self, obj: TranslucentObject) -> bool:
         """Whether scattering events are connected with the sky: where it varies and c does not take its noise away."""

@@ -742,7 +742,7 @@ def _draw_candidate(
         with dr.suspend_grad():
             delta, emitter_point = nee & ds.delta, mi.Point3f(ds.p)
             if context.uses_sky(obj):
-                pdf_sky = share * context.sky.pdf(context.scene, at, d, active & ~by_emitter)
+                pdf_sky = share * context.pdf_sky(at, d, active & ~by_emitter)
                 of_sky = dr.select(ds.emitter.is_environment(), 1, 0)
                 sky_weight = dr.select(nee, of_sky, mis_weight(pdf, pdf_sky))
             pdf_proposal = proposals.pdf_direction(entry, out, ds.d)
