@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from statistics import NormalDist
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -43,13 +43,14 @@ WALKED = 0.5  # of it, where delta lights are blurred: the rest tells what that 
 # by 0.06 +- 0.06 of itself, on a bunny of 2 to 5 mean free paths, where it is 12 % of all.
 BLUR_EFFECT = 0.1
 BLUR_SEEN = 0.04  # probability that a direction is in the cone of `sample_blur`
-FIRST = (0.0, None, 1.0)  # budget of a look by the first samples alone
+OWN_SHARE = 0.15  # of the time of a way, for what it costs in the light of the scene; soft light has the rest
+SOFT_EFFECT = 0.2  # of a bias², what soft light may change of it: see docs/trade_check.md
 MOST, FEWEST, POINTS = 384, 64, 5e-3  # of points for a tolerance, and how many times V t
 LOOK, SLOW = 16_000, 4  # samples of all points by which a way is first looked at, for slow walks a quarter
 WALKED_FIRST = 0.15  # seconds of walks that tell how many points and which ways are worth a look
 FIRST_SHARE = 0.45  # of the time, for the look at all ways
 LEAST_SHARE = 0.25  # of the time, for walks and what may win against them, however long all else takes
-LAST_SHARE = 0.05  # likewise, after light has been gathered
+LAST_SHARE = 0.1  # likewise, after light has been gathered
 TOLD = 0.1  # standard error of a bias² over the squared tolerance that is enough
 UNEVEN = 1.5  # times the noise of a bias² if all points were as noisy
 STEADY = 0.05  # relative error of their variance where nothing may win against walks
@@ -65,6 +66,22 @@ LONGEST = 1.5  # times the seconds of an assessment that a gathering may take
 LIGHT_SECONDS = 0.4  # of a part of the light, beside its transfer: by emitters, and of the first samples
 GATHERED_SHARE = 0.2  # most of the time for samples of gathered light: sqrt(V t) is a quarter of that of walks
 CLOSE = 1.3  # times the cost of the cheapest way, up to which another may turn out cheaper
+
+
+class LookBudget(NamedTuple):
+    """Of a look at several ways.
+
+    Args:
+        seconds: for each object; with 0 the first samples are all.
+        samples: of each exit, instead.
+        traced: share of the walks.
+        own: share of the light of the scene, where biases are told by soft light.
+    """
+
+    seconds: float = 0.0
+    samples: int | None = None
+    traced: float = 1.0
+    own: float = OWN_SHARE
 
 
 def assess(
@@ -170,7 +187,7 @@ def assess_stage(
     With `samples` of each exit instead of seconds; `traced` is the share of the time for walks.
     """
     look = _Samples.of(on, chosen, sensor, exits, seed)
-    look.more(chosen, (seconds, samples, traced), seeded(seed, 42), progress)
+    look.more(chosen, LookBudget(seconds, samples, traced), seeded(seed, 42), progress)
     return look.assessment(seed)
 
 
@@ -210,11 +227,11 @@ class _Samples:
     def more(
         self,
         chosen: Sequence[Way],
-        budget: tuple[float, int | None, float],
+        budget: LookBudget,
         seed: int,
         progress: NamedProgress | None,
     ) -> None:
-        """Sample some ways, or go on with them, for so many seconds each object or so many samples each exit."""
+        """Sample some ways, or go on with them."""
         for k, points in enumerate(self.points):
 
             def tell(way: str, done: int, k: int = k) -> None:
@@ -233,20 +250,26 @@ class _Samples:
         b² sqrt(2 / n) by their choice and V t sqrt(2 n) / time by noise, which are equal for n = time b² / (V t).
         """
         for k, o in enumerate(walked.objects):
-            noise = o.traced.variance * o.traced.seconds if o.ways else 0.0
+            noise = self.noise(k, Way(PATH_TRACED)).value if o.ways else 0.0
             if noise > 0:
                 n = min(max(int(POINTS / noise), FEWEST), self.points[k].n)
                 self.points[k] = self.points[k].first(n)
                 for each in (each for item in self.sampled[k].values() for each in item):
                     each.estimate = each.estimate.of_first(n)
 
-    def enough(self, k: int, row: WayTrade, told: float | None) -> float:
+    def noise(self, k: int, way: Way) -> Number:
+        """V t of the samples that tell the bias of a way, and the seconds that they took."""
+        walks, told = (_told(self.on, each, self.sampled[k][each]) for each in (Way(PATH_TRACED), way))
+        a, b = (joined([each.estimate for each in of]) for of in (told, walks))
+        seconds = told[-1].seconds
+        return Number(relative_variance(a, b).value * seconds, a.samples * a.mean.shape[1] * seconds)
+
+    def enough(self, k: int, way: Way, row: WayTrade, told: float | None) -> float:
         """Further seconds of a way until a small bias² is known to `told`; with None until its variance is."""
-        spent = row.samples * row.seconds
         if told is None:
-            return spent * ((row.variance_error / (STEADY * row.variance)) ** 2 - 1)
-        noise = UNEVEN * row.variance * math.sqrt(2 * self.points[k].n) * row.seconds
-        return noise / told - spent if told else math.inf
+            return row.samples * row.seconds * ((row.variance_error / (STEADY * row.variance)) ** 2 - 1)
+        noise, spent = self.noise(k, way)
+        return UNEVEN * math.sqrt(2 * self.points[k].n) * noise / told - spent if told else math.inf
 
     def assessment(self, seed: int) -> Assessment:
         """What all samples say."""
@@ -255,7 +278,7 @@ class _Samples:
             if points is None:
                 objects.append(_unseen(self.on.names[k], self.mfp[k]))
                 continue
-            (walks,) = next(item for way, item in sampled.items() if way.model == PATH_TRACED)
+            walks = sampled[Way(PATH_TRACED)]
             rows = tuple(
                 replace(
                     _row(self.on, k, way, item, walks), training=0.0 if isinstance(item, str) else self.training(k, way)
@@ -263,7 +286,7 @@ class _Samples:
                 for way, item in sampled.items()
             )
             compiled += sum(row.compilation for row in rows)
-            radiance = tuple(float(v) for v in walks.estimate.mean.mean(axis=1))
+            radiance = tuple(float(v) for v in walks[0].estimate.mean.mean(axis=1))
             seen, notes = (points.share, points.pixels, radiance, rows), tuple(dict.fromkeys(self.heard[k]))
             objects.append(ObjectTrade(self.on.names[k], self.mfp[k], *seen, notes))
         return Assessment(tuple(objects), self.seconds, compiled, seed)
@@ -299,32 +322,31 @@ def _object(
     k: int,
     points: Exits,
     chosen: Sequence[Way],
-    budget: tuple[float, int | None, float],
+    budget: LookBudget,
     seed: int,
     tell: Any,
     sampled: dict[Way, list[Sampled] | str],
 ) -> None:
     """What all ways say of an object, or why they refuse it; what is known of one is added to."""
-    seconds, samples, traced = budget
-    end = clock() + seconds
+    samples, end = budget.samples, clock() + budget.seconds
     gathered_first = sorted(chosen, key=lambda way: way.light != GATHERED)  # what is left of the time serves the others
     sampled |= {way: [] for way in chosen if way not in sampled}
     for done, way in enumerate(gathered_first):
         tell(way.name, done)
         if isinstance(sampled[way], str):
             continue
-        share = traced if way.model == PATH_TRACED and len(chosen) > 1 else 1 / (len(chosen) - done)
+        share = budget.traced if way.model == PATH_TRACED and len(chosen) > 1 else 1 / (len(chosen) - done)
         share = min(share, GATHERED_SHARE) if way.light == GATHERED and len(chosen) > 1 and not samples else share
-        for half, part in enumerate(way.halves):
+        for half, part in enumerate(on.looks(way)):
             started = clock()
             try:
                 number = seeded(seed, chosen.index(way), *([half] if half else []))
-                few, least = (LOOK, PILOT) if way.model != PATH_TRACED else (LOOK // SLOW, PILOT // SLOW)
-                each = PILOT if samples else max(least, few // points.n)
+                fewer = SLOW if way.model == PATH_TRACED else 1
+                each = PILOT if samples else max(PILOT, LOOK // points.n) // fewer
                 result, beside = _begun(on, part, points, (number, each), k, sampled[way], half)
                 end, started = end + beside, started + beside
-                left = share / len(way.halves) * (end - started) - (clock() - started)
-                blurs = way.model == PATH_TRACED and on.blurs
+                left = share * _part_of(on, way, part, budget) * (end - started) - (clock() - started)
+                blurs = way.model == PATH_TRACED and on.blurs and not part.soft
                 left *= WALKED if blurs else 1.0
                 sample_more(on, part, points, result, number, seconds=left, samples=samples)
                 if blurs:
@@ -338,6 +360,14 @@ def _object(
                 break
 
 
+def _part_of(on: Stage, way: Way, look: Way, budget: LookBudget) -> float:
+    """The share of a look in the time of its way; few samples tell what gathered light costs."""
+    own = 0.0 if way.light == GATHERED else budget.own
+    if on.soft is None:
+        return 1 / len(way.halves)
+    return (1 - own) / len(way.halves) if look.soft else own
+
+
 def _begun(
     on: Stage, way: Way, points: Exits, how: tuple[int, int], k: int, sampled: list[Sampled], half: int
 ) -> tuple[Sampled, float]:
@@ -345,27 +375,41 @@ def _begun(
     if half < len(sampled):
         return sampled[half], 0.0
     result = first_sample(on, way, points, *how, k)
-    if half:  # what the first part took longer to prepare was compilation
+    if half == 1 and way.part:  # what the first part took longer to prepare was compilation
         sampled[0].compiling += max(sampled[0].preparing - result.preparing, 0.0)
     sampled.append(result)
     return result, result.compiling + (0.0 if half or way.light != GATHERED else result.preparing)
 
 
-def _row(on: Stage, k: int, way: Way, sampled: list[Sampled] | str, traced: Sampled) -> WayTrade:
+def _own(on: Stage, way: Way, sampled: list[Sampled]) -> list[Sampled]:
+    """Of what has been sampled of a way, that in the light of the scene."""
+    return [each for look, each in zip(on.looks(way), sampled) if not look.soft]
+
+
+def _told(on: Stage, way: Way, sampled: list[Sampled]) -> list[Sampled]:
+    """Of what has been sampled of a way, that which tells its bias."""
+    return [each for look, each in zip(on.looks(way), sampled) if look.soft == (on.soft is not None)]
+
+
+def _row(on: Stage, k: int, way: Way, sampled: list[Sampled] | str, walks: list[Sampled]) -> WayTrade:
     if isinstance(sampled, str):
         return WayTrade(way.name, refusal=sampled)
-    parts, b = [each.estimate for each in sampled], traced.estimate
-    a, last = joined(parts), sampled[-1]  # whose kernels were ready
+    own, told = (joined([each.estimate for each in of(on, way, sampled)]) for of in (_own, _told))
+    (walked,), (b,) = _own(on, Way(PATH_TRACED), walks), [each.estimate for each in _told(on, Way(PATH_TRACED), walks)]
+    parts, last = [each.estimate for each in _told(on, way, sampled)], _own(on, way, sampled)[-1]  # with kernels ready
     exact = way.model == PATH_TRACED
-    doubt, bias2 = _of_blur(traced.blur, b) if traced.blur else Number(0.0, 0.0), Number(0.0, 0.0)
+    bias2, doubt = Number(0.0, 0.0), Number(0.0, 0.0)
     if not exact:
-        bias2 = mean_square(a, b) if len(parts) == 1 else mean_square_of_parts(parts, b, _kept(on, k, way))
-    bias2 = Number(bias2.value + max(doubt.value, 0.0), math.hypot(bias2.error, doubt.error))
-    ratios = [(1.0, 0.0) if exact else ratio_of_means(a, b, c) for c in range(len(b.mean))]
-    variance = relative_variance(a, b)
+        bias2 = mean_square(told, b) if len(parts) == 1 else mean_square_of_parts(parts, b, _kept(on, k, way))
+    if walked.blur:
+        doubt = _of_blur(walked.blur, walked.estimate)
+    effect = SOFT_EFFECT * max(bias2.value, 0.0) if on.soft else 0.0
+    bias2 = Number(bias2.value + max(doubt.value, 0.0), math.hypot(bias2.error, doubt.error, effect))
+    ratios = [(1.0, 0.0) if exact else ratio_of_means(told, b, c) for c in range(len(b.mean))]
     return WayTrade(
-        way.name, *bias2, tuple(r[0] for r in ratios), tuple(r[1] for r in ratios), *variance, last.seconds,
-        a.samples * a.mean.shape[1], last.preparation, sum(each.compilation for each in sampled), 0.0, last.memory,
+        way.name, *bias2, tuple(r[0] for r in ratios), tuple(r[1] for r in ratios),
+        *relative_variance(own, walked.estimate), last.seconds, own.samples * own.mean.shape[1], last.preparation,
+        sum(each.compilation for each in sampled), 0.0, last.memory,
     )  # fmt: skip
 
 
@@ -432,28 +476,37 @@ def assess_for(
     """As `assess_stage`, with most of the time for ways that could be the cheapest to keep a tolerance.
 
     Ways that cannot be the cheapest for a job of `images` are left out by what few samples of others say; with None
-    all are measured. The time is that of all that is done, and points are fewer where walks are noisy.
+    all are measured. The time is that of all that is done, and points are fewer where walks are noisy. Biases are
+    told by soft light, see `soft_light`.
     """
+    with on.softened() as lit:
+        return _assessed_for(lit, chosen, tolerance, images, seconds, sensor, seed, exits, count_training, progress)
+
+
+def _assessed_for(
+    on: Stage, chosen: Sequence[Way], tolerance: float, images: int | None, seconds: float, sensor: int, seed: int,
+    exits: int, count_training: bool, progress: NamedProgress | None,
+) -> Assessment:  # fmt: skip
     dear = DEAR if seconds < DEAR_SECONDS else ()
     later = [way for way in chosen if images and (way.light == GATHERED or way.model in dear)]
     ahead = [way for way in chosen if way not in later]
     look = _Samples.of(on, ahead, sensor, min(exits, MOST) if images else exits, seed)
     if images:
-        for number, budget in ((42, FIRST), (44, (WALKED_FIRST, None, 1.0))):  # the first launch tells little of time
-            look.more([way for way in ahead if way.model == PATH_TRACED], budget, seeded(seed, number), progress)
+        for number, took in ((42, 0.0), (44, WALKED_FIRST)):  # the first launch tells little of time
+            look.more([Way(PATH_TRACED)], LookBudget(took), seeded(seed, number), progress)
         first = look.assessment(seed)
         out = _too_dear(look, first, chosen, tolerance, images) if count_training else {}
         ahead, later = ([way for way in ways if way not in out] for ways in (ahead, later))
         look.keep(first)
         flat = [way for way in ahead if way.model != PATH_TRACED and lookup(way.model).of_half_space]
-        look.more(flat[:1], FIRST, seeded(seed, 45), progress)
+        look.more(flat[:1], LookBudget(), seeded(seed, 45), progress)
         out |= _as_far_off(look.assessment(seed), flat, later, tolerance)
         ahead, later = ([way for way in ways if way not in out] for ways in (ahead, later))
         rest = [way for way in ahead if way.model != PATH_TRACED and way not in flat[:1]]
-        look.more(rest, FIRST, seeded(seed, 43), progress)
+        look.more(rest, LookBudget(), seeded(seed, 43), progress)
     else:
         out: dict[Way, str] = {}
-        look.more(ahead, (FIRST_SHARE * seconds, None, TRACED_SHARE), seeded(seed, 42), progress)
+        look.more(ahead, LookBudget(FIRST_SHARE * seconds, traced=TRACED_SHARE), seeded(seed, 42), progress)
     first = look.assessment(seed)
     seen = [k for k, o in enumerate(first.objects) if o.ways and not o.is_dark]
     if not seen:
@@ -472,7 +525,7 @@ def assess_for(
     again = look.assessment(seed)
     few, gathering, reasons = _promising([again.objects[k] for k in seen], ahead, later, job)
     while gathering:
-        look.more([gathering], FIRST, seeded(seed, 72), progress)
+        look.more([gathering], LookBudget(), seeded(seed, 72), progress)
         again = look.assessment(seed)
         if not all(again.objects[k].way(gathering.name).refusal for k in seen):
             few.append(gathering)
@@ -529,27 +582,28 @@ def _promising(
 
 
 def _go_on(
-    look: _Samples, assessed: Assessment, few: Sequence[Way], budget: tuple[float, float | None], seed: int,
+    look: _Samples, assessed: Assessment, few: Sequence[Way], limit: tuple[float, float | None], seed: int,
     progress: NamedProgress | None,
 ) -> None:  # fmt: skip
-    """Sample some ways further, for the seconds of the budget or until a bias² is known to its second number.
+    """Sample some ways further, for the seconds of the limit or until a bias² is known to its second number.
 
     Noise is least where each has sqrt(V t) of the time; walks serve all others at once.
     """
-    left, told = budget
+    left, told = limit
     parts, enough = dict.fromkeys(few, 0.0), dict.fromkeys(few, 0.0)
     for k, o in enumerate(assessed.objects):
         rows = {way: o.way(way.name) for way in few} if o.ways else {}
         for way, row in rows.items():
             if not row.refusal and row.variance > 0:
                 others = max(len(few) - 1, 1) if way.model == PATH_TRACED else 1
-                parts[way] = max(parts[way], math.sqrt(others * row.variance * row.seconds))
-                enough[way] = max(enough[way], look.enough(k, row, told))
+                parts[way] = max(parts[way], math.sqrt(others * look.noise(k, way).value))
+                enough[way] = max(enough[way], look.enough(k, way, row, told))
     whole = max(sum(parts.values()), 1e-30)
     for way in few:
         seconds = min(left * parts[way] / whole, enough[way])
         if seconds > 0:
-            look.more([way], (seconds, None, 1.0), seeded(seed, few.index(way)), progress)
+            budget = LookBudget(seconds, own=1.0 if told is None else OWN_SHARE)
+            look.more([way], budget, seeded(seed, few.index(way)), progress)
 
 
 def _gathering(row: WayTrade) -> float:

@@ -69,30 +69,30 @@ def first_sample(stage: Stage, way: Way, exits: Exits, seed: int, each: int = PI
     if (object, way) in stage.paces:
         estimate = RadianceEstimate(variant_channels(), exits.n)
         return replace(stage.paces[object, way], estimate=estimate, preparing=0.0, compilation=0.0, compiling=0.0)
-    integrator, started = stage.integrator(way), clock()
-    _prepare(stage, integrator)
+    started = clock()
+    _prepare(stage, way)
     preparation = preparing = clock() - started
     if way.part:  # of all samples, after what is made ready for parts and whole alike
-        made, light = integrator.gathering.seconds
-        preparation += made * (1 / PART - 1) + light
+        made, light = stage.integrator(way).gathering.seconds
+        preparation = max(preparing - made - light, 0.0) + made / PART + 2 * light
         same = stage.paces.get((object, replace(way, light="sampled", part=0)))  # which made the objects for both
         preparation += same.preparation if same else 0.0
     result = Sampled(RadianceEstimate(variant_channels(), exits.n), preparation, preparing)
-    _first_launch(stage, integrator, exits, result, each, seeded(seed, 31))
+    _first_launch(stage, way, exits, result, each, seeded(seed, 31))
     stage.paces[object, way] = result
     return result
 
 
-def _first_launch(stage: Stage, integrator: Any, exits: Exits, sampled: Sampled, each: int, seed: int) -> None:
+def _first_launch(stage: Stage, way: Way, exits: Exits, sampled: Sampled, each: int, seed: int) -> None:
     """`each` samples of every exit; where a kernel was compiled the same again, for the time alone."""
     began = time.perf_counter()
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
-        launch = _launch(stage, integrator, exits, sampled.estimate, each, seed)
+        launch = _launch(stage, way, exits, sampled.estimate, each, seed)
         kernels = dr.kernel_history([dr.KernelType.JIT])
     ended = time.perf_counter()
     if not all(kernel["cache_hit"] for kernel in kernels):
-        again = _launch(stage, integrator, exits, RadianceEstimate(variant_channels(), exits.n), each, seed)
+        again = _launch(stage, way, exits, RadianceEstimate(variant_channels(), exits.n), each, seed)
         sampled.compiling = max(launch.seconds - again.seconds, 0.0)
         sampled.compilation = max(2 * ended - began - time.perf_counter(), 0.0)
         launch = again
@@ -105,13 +105,14 @@ def warm_up(stage: Stage, ways: Sequence[Way]) -> None:
     """Compile what preparation needs, by the first way that does not refuse the scene, and forget that way again."""
     for way in () if any(way in [known for _, known in stage.paces] for way in ways) else ways:
         with contextlib.suppress(ValueError, RuntimeError):
-            _prepare(stage, stage.integrator(way))
+            _prepare(stage, way)
             stage.forget(way)
             return
 
 
-def _prepare(stage: Stage, integrator: Any) -> None:
-    (integrator.prepare if is_bssrdf(integrator) else integrator.tracer)(stage.scene)
+def _prepare(stage: Stage, way: Way) -> None:
+    integrator = stage.integrator(way)
+    (integrator.prepare if is_bssrdf(integrator) else integrator.tracer)(stage.lit(way))
 
 
 def sample_more(
@@ -135,7 +136,7 @@ def sample_more(
         seconds: to spend.
         samples: of each exit, instead; the outcome then depends on the seed alone.
     """
-    most, started, integrator = max(LANES // exits.n, 2), clock(), stage.integrator(way)
+    most, started = max(LANES // exits.n, 2), clock()
     while True:
         if samples:
             each = samples - sampled.estimate.samples
@@ -147,7 +148,7 @@ def sample_more(
             return
         each = min(each, most)
         number = seeded(seed, 32, sampled.estimate.samples)
-        launch = _launch(stage, integrator, exits, sampled.estimate, each, number)
+        launch = _launch(stage, way, exits, sampled.estimate, each, number)
         sampled.memory = max(sampled.memory, launch.memory)
         sampled.launches.append((exits.n * each, launch.seconds))
 
@@ -163,11 +164,11 @@ def sample_blur(stage: Stage, exits: Exits, seed: int, samples: int) -> Radiance
         seed: of the samples.
         samples: of each exit.
     """
-    integrators = [stage.integrator(Way(PATH_TRACED, blur=blur)) for blur in (0.0, BLUR)]
+    ways = [Way(PATH_TRACED, blur=blur) for blur in (0.0, BLUR)]
     estimate, most = RadianceEstimate(variant_channels(), exits.n), max(LANES // exits.n, 2)
     while (each := min(samples - estimate.samples, most)) > 0:
         number, rays = seeded(seed, 33, estimate.samples), exits.rays(each)
-        without, spread = (radiance(stage.scene, one, _sampler(number, rays), rays) for one in integrators)
+        without, spread = (radiance(stage.lit(w), stage.integrator(w), _sampler(number, rays), rays) for w in ways)
         estimate.add(*_sums([b - a for a, b in zip(without, spread)], each), each)
     return estimate
 
@@ -185,15 +186,13 @@ class TimedLaunch(NamedTuple):
     recording: float
 
 
-def _launch(
-    stage: Stage, integrator: Any, exits: Exits, estimate: RadianceEstimate, each: int, seed: int
-) -> TimedLaunch:
+def _launch(stage: Stage, way: Way, exits: Exits, estimate: RadianceEstimate, each: int, seed: int) -> TimedLaunch:
     """`each` samples of every exit."""
     rays = exits.rays(each)
     dr.flush_malloc_cache()
     dr.detail.malloc_clear_statistics()
     started = clock()
-    L = _recorded(stage.scene, integrator, _sampler(seed, rays), rays)
+    L = _recorded(stage.lit(way), stage.integrator(way), _sampler(seed, rays), rays)
     recorded = clock()
     dr.eval(L)
     first, second = _sums(L, each)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -15,6 +17,7 @@ from halfspace_sss.rendering.object.registry import AUTO, model_names
 from halfspace_sss.rendering.paths.gathering import Gathering
 from halfspace_sss.rendering.paths.integrator import is_bssrdf
 from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED, load_objects
+from halfspace_sss.trade.soft_light import SoftLight
 
 LAMBERT = "lambert"
 NO_SINGLE = "without single scattering"
@@ -31,6 +34,7 @@ class Way:
         light: "sampled" or "gathered", see `Settings`.
         part: of gathered light, see `Gathering`; 0 for all of it.
         blur: of walks, see `translucent_walk`.
+        soft: whether it is looked at in soft light, see `soft_light`.
     """
 
     model: str
@@ -38,6 +42,7 @@ class Way:
     light: str = "sampled"
     part: int = 0
     blur: float = 1.0
+    soft: bool = False
 
     @property
     def halves(self) -> tuple[Way, ...]:
@@ -87,6 +92,7 @@ class Stage:
         settings: of its integrator, by parameter name.
         bssrdf: parameters that `bssrdf` alone understands.
         paces: what an earlier look found by (object, way), by which the next one need not feel its way.
+        soft: light by which biases are told; None where the light of the scene tells them.
     """
 
     scene: Any
@@ -94,6 +100,7 @@ class Stage:
     settings: dict[str, Any]
     bssrdf: dict[str, Any]
     paces: dict[tuple[int, Way], Any] = field(default_factory=dict)
+    soft: SoftLight | None = None
     _integrators: dict[Way, Any] = field(default_factory=dict)
 
     @property
@@ -110,8 +117,32 @@ class Stage:
         """Whether walks spread light of a delta light over a blur, so that they are not exact."""
         return any(map(is_delta, self.scene.emitters()))
 
+    @contextmanager
+    def softened(self) -> Iterator[Stage]:
+        """The same with soft light beside its own, if it has an environment map; its own is put back at the end."""
+        soft = SoftLight.of(self.scene)
+        try:
+            yield replace(self, soft=soft)
+        finally:
+            if soft is not None:
+                soft.show(False)
+
+    def looks(self, way: Way) -> tuple[Way, ...]:
+        """What a way is measured by: its halves, or in soft light for the bias and one half for what it costs."""
+        if self.soft is None:
+            return way.halves
+        *rest, last = (replace(half, soft=True) for half in way.halves)
+        return (*rest, way.halves[-1], last)
+
+    def lit(self, way: Way) -> Any:
+        """The scene in the light that a way is looked at in."""
+        if self.soft is not None:
+            self.soft.show(way.soft)
+        return self.scene
+
     def integrator(self, way: Way) -> Any:
-        """The integrator of a way, which keeps what it has made ready; the scene is the same for all."""
+        """The integrator of a way, which keeps what it has made ready; shapes are the same in all light."""
+        way = replace(way, soft=False)
         if way not in self._integrators:
             if way.model == PATH_TRACED:
                 plugin = {"type": "translucent_walk", **self.settings, "blur": way.blur}

@@ -14,7 +14,7 @@ from halfspace_sss import Medium
 from halfspace_sss.cli import app as cli
 from halfspace_sss.physics.fresnel import F_r
 from halfspace_sss.rendering.object.registry import model_names
-from halfspace_sss.trade import assess, assessing, recommend
+from halfspace_sss.trade import assess, assessing, recommend, sampling
 from halfspace_sss.trade.assessing import assess_stage
 from halfspace_sss.trade.checking.random_scenes import random_scene, write_scene
 from halfspace_sss.trade.exits import visible_exits
@@ -146,23 +146,53 @@ def test_an_instance_is_refused_in_a_sentence() -> None:
         assess(instanced, models=FEW, **QUICK)
 
 
-def test_the_second_look_goes_on_with_the_samples_of_the_first_and_gathers_light(
+def windows() -> np.ndarray:
+    """An environment map, dark but for a window."""
+    pixels = np.full((32, 64, 3), 0.1, dtype=np.float32)
+    pixels[8:14, 20:28] = (9.0, 8.0, 6.0)
+    return pixels
+
+
+def test_the_second_look_goes_on_with_the_samples_of_the_first_and_tells_biases_by_soft_light(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    known: list[tuple[Way, int]] = []
+    lit = stage(scene(light={"type": "envmap", "bitmap": mi.Bitmap(windows())}, orders="multiple")).scene
+    pixels = np.array(mi.traverse(lit.environment())["data"])
+    known: list[tuple[Way, int, Any]] = []
+    shown: list[tuple[bool, float]] = []
 
     def noted(on: Any, way: Way, points: Any, sampled: Any, *args: Any, **more: Any) -> None:
-        known.append((way, sampled.estimate.samples))
+        known.append((way, sampled.estimate.samples, sampled))
         sample_more(on, way, points, sampled, *args, **more)
 
+    def launched(on: Any, way: Way, *args: Any) -> Any:
+        result = launch(on, way, *args)
+        shown.append((way.soft, float(np.array(mi.traverse(lit.environment())["data"]).max())))
+        return result
+
+    launch = sampling._launch
     monkeypatch.setattr(assessing, "sample_more", noted)
+    monkeypatch.setattr(sampling, "_launch", launched)
     asked = ["better_dipole", "better_dipole, gathered"]
-    found = assess(scene(orders="multiple"), models=asked, tolerance=0.05, **QUICK).objects[0]
-    walks = [samples for way, samples in known if way == Way("path_traced")]
-    assert len(walks) == 2 and 0 < walks[0] <= walks[1] and found.traced.samples > 64 * walks[1]
+    found = assess(lit, models=asked, tolerance=0.05, **QUICK).objects[0]
+    (_, first, _), (_, second, walks) = (row for row in known if row[0] == Way("path_traced", soft=True))
+    assert 0 < first <= second < walks.estimate.samples
+    assert all((brightest < 9) == soft for soft, brightest in shown)
+    assert np.array_equal(np.array(mi.traverse(lit.environment())["data"]), pixels)
     sampled, gathered = (found.way(name) for name in asked)
     error = np.hypot(sampled.ratio_error, gathered.ratio_error)
     assert np.all(np.abs(np.subtract(sampled.ratio, gathered.ratio)) < 4 * error + 0.03)
+
+
+def test_soft_light_keeps_the_mean_and_the_first_moment_of_an_environment() -> None:
+    from halfspace_sss.trade.soft_light import smoothed
+
+    own = np.concatenate([windows()[:, -1:], windows(), windows()[:, :1]], axis=1)
+    theta, phi = np.linspace(0, np.pi, 32)[:, None], (np.arange(64) + 0.5) * np.pi / 32
+    moments = np.stack([np.ones((32, 64)), np.cos(theta) + 0 * phi, np.sin(theta) * np.cos(phi)]) * np.sin(theta)
+    before, after = (np.tensordot(moments, of[:, 1:-1], 2) / moments[0].sum() for of in (own, smoothed(own)))
+    assert np.allclose(after, before, atol=0.02 * before[0].max()) and 0 <= smoothed(own).min()
+    assert smoothed(own).max() < 0.6 * own.max()
 
 
 def test_a_point_through_which_a_lamp_would_be_seen_is_left_out() -> None:

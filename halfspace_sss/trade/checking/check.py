@@ -25,7 +25,7 @@ WAYS = (
 )  # fmt: skip
 LEARNT = "full_geometry"
 TRAIN_SECONDS = 20.0
-FORMAT = "halfspace-sss trade check 6"
+FORMAT = "halfspace-sss trade check 7"
 
 
 def check_scene(scene: RandomScene, folder: Path, seconds: float, truth_seconds: float) -> dict[str, Any]:
