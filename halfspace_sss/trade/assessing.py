@@ -44,6 +44,7 @@ WALKED = 0.5  # of it, where delta lights are blurred: the rest tells what that 
 BLUR_EFFECT = 0.1
 BLUR_SEEN = 0.04  # probability that a direction is in the cone of `sample_blur`
 OWN_SHARE = 0.15  # of the time of a way, for what it costs in the light of the scene; soft light has the rest
+SOFT_PAYS = 2.0  # times the variance in soft light that walks have in the light of the scene, from which it pays
 SOFT_EFFECT = 0.2  # of a bias², what soft light may change of it: see docs/trade_check.md
 MOST, FEWEST, POINTS = 384, 64, 5e-3  # of points for a tolerance, and how many times V t
 LOOK, SLOW = 16_000, 4  # samples of all points by which a way is first looked at, for slow walks a quarter
@@ -263,6 +264,19 @@ class _Samples:
         a, b = (joined([each.estimate for each in of]) for of in (told, walks))
         seconds = told[-1].seconds
         return Number(relative_variance(a, b).value * seconds, a.samples * a.mean.shape[1] * seconds)
+
+    def soft_light_pays(self) -> bool:
+        """Whether walks have much less noise in soft light than in that of the scene."""
+        walks = (of.get(Way(PATH_TRACED)) for of in self.sampled)
+        V = ([relative_variance(each.estimate, each.estimate).value for each in found] for found in walks if found)
+        return any(own > SOFT_PAYS * soft for own, soft in V)
+
+    def keep_own_light(self) -> None:
+        """Tell biases by the light of the scene, and forget what has been sampled in soft light."""
+        for of in self.sampled:
+            of |= {way: _own(self.on, way, found) for way, found in of.items() if not isinstance(found, str)}
+        self.on.lit(Way(PATH_TRACED))
+        self.on = replace(self.on, soft=None)
 
     def enough(self, k: int, way: Way, row: WayTrade, told: float | None) -> float:
         """Further seconds of a way until a small bias² is known to `told`; with None until its variance is."""
@@ -491,9 +505,12 @@ def _assessed_for(
     later = [way for way in chosen if images and (way.light == GATHERED or way.model in dear)]
     ahead = [way for way in chosen if way not in later]
     look = _Samples.of(on, ahead, sensor, min(exits, MOST) if images else exits, seed)
+    for number, took in ((46, 0.0), (44, WALKED_FIRST)):  # the first launch tells little of time
+        look.more([Way(PATH_TRACED)], LookBudget(took), seeded(seed, number), progress)
+    if on.soft and not look.soft_light_pays():
+        look.keep_own_light()
+        look.more([Way(PATH_TRACED)], LookBudget(WALKED_FIRST), seeded(seed, 47), progress)
     if images:
-        for number, took in ((42, 0.0), (44, WALKED_FIRST)):  # the first launch tells little of time
-            look.more([Way(PATH_TRACED)], LookBudget(took), seeded(seed, number), progress)
         first = look.assessment(seed)
         out = _too_dear(look, first, chosen, tolerance, images) if count_training else {}
         ahead, later = ([way for way in ways if way not in out] for ways in (ahead, later))
