@@ -24,10 +24,9 @@ from halfspace_sss.rendering.object.registry import AUTO, Choices, model_names
 from halfspace_sss.rendering.object.settings import Settings
 from halfspace_sss.rendering.object.wrapped import surface_of
 from halfspace_sss.rendering.scenes.identity import scene_hash
-from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED
 from halfspace_sss.trade.assessing import assess_stage
 from halfspace_sss.trade.results import ObjectTrade, WayTrade
-from halfspace_sss.trade.ways import GATHERED, LAMBERT, Stage, Way
+from halfspace_sss.trade.ways import GATHERED, LAMBERT, WALKS, Stage, Way
 
 ENVIRONMENT_VARIABLE = "HALFSPACE_SSS_CHOICES"
 DEFAULT = "neural"
@@ -90,7 +89,7 @@ def _read(path: Path) -> dict[str, Any]:
 def _measured(on: Stage, named: list[str], settings: Settings) -> dict[str, Any]:
     lights = ("sampled", GATHERED) if settings.light == AUTO else (settings.light,)
     models = model_names() if AUTO in named else dict.fromkeys(named)
-    ways = [Way(PATH_TRACED)]
+    ways = [WALKS]
     ways += [_way(name, light) for name in models if name != AUTO for light in lights if _has(name, light)]
     samples = _samples(on, settings.choice_share / len(ways))
     result = assess_stage(on, ways, samples=samples, exits=EXITS)

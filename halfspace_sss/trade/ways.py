@@ -72,11 +72,14 @@ class Way:
         return cls(model, "multiple" if NO_SINGLE in more else None, GATHERED if GATHERED in more else "sampled")
 
 
+WALKS = Way(PATH_TRACED)
+
+
 def ways() -> list[Way]:
     """All of them: path traced first, a diffuse surface, every model with light sampled and gathered, and those without
     the single scattering."""
     names = [name for name in model_names() if name not in (AUTO, LAMBERT)]
-    results = [Way(PATH_TRACED), Way(LAMBERT), *map(Way, names)]
+    results = [WALKS, Way(LAMBERT), *map(Way, names)]
     results += [Way(name, light=GATHERED) for name in names]
     bare = [name for name in models() if model_class(name).orders == "multiple"]
     return results + [Way(name, "multiple") for name in bare if name in ("better_dipole", "neural")]

@@ -12,8 +12,8 @@ from halfspace_sss.cli import trade
 from halfspace_sss.rendering.paths.gathering import PART, Gathering
 from halfspace_sss.trade import recommend
 from halfspace_sss.trade.advice import Job, advise
-from halfspace_sss.trade.assessing import _left_out, _most_promising, contenders
 from halfspace_sss.trade.automatic import picked
+from halfspace_sss.trade.contending import contenders, left_out, most_promising
 from halfspace_sss.trade.results import Assessment, ObjectTrade, WayTrade, samples_for
 from halfspace_sss.trade.statistics import (
     FIREFLIES,
@@ -268,7 +268,7 @@ def test_light_is_gathered_for_an_assessment_only_where_it_may_win(
     found = _assessment(_way("neural", 0.01, 0.001, 2e-6)).objects[
         0
     ]  # at least 2.1 s of gathering, of two parts 0.26 s
-    why = _left_out(found, Way.of("neural, gathered"), tolerance, images, seconds)
+    why = left_out(found, Way.of("neural, gathered"), tolerance, images, seconds)
     assert why.endswith(reason) and bool(why) == bool(reason)
 
 
@@ -277,9 +277,9 @@ def test_the_light_of_the_model_is_gathered_by_which_the_job_is_expected_to_end_
     close = _assessment(_way("neural", 0.02, 0.03, 4e-6), _way("better_dipole", 0.03, 0.03, 2e-6)).objects
     apart = _assessment(_way("neural", 0.02, 0.01, 4e-6), _way("better_dipole", 0.1, 0.01, 2e-6)).objects
     dear = _assessment(_way("neural", 0.02, 0.01, 4e-6), _way("better_dipole", 0.01, 0.01, 2e-6, training=1e4)).objects
-    assert _most_promising(close, ways, 0.05, 10) == ways[1]
-    assert _most_promising(apart, ways, 0.05, 10_000) == ways[0]
-    assert _most_promising(dear, ways, 0.05, 10_000) == ways[0]
+    assert most_promising(close, ways, 0.05, 10) == ways[1]
+    assert most_promising(apart, ways, 0.05, 10_000) == ways[0]
+    assert most_promising(dear, ways, 0.05, 10_000) == ways[0]
 
 
 def test_of_the_noise_of_gathered_light_what_a_render_keeps_counts_as_bias() -> None:
