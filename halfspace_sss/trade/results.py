@@ -24,7 +24,8 @@ class WayTrade:
     Attributes:
         way: its name.
         bias2: squared relative error of radiance that no number of samples removes, noise taken out; it may come out
-            below 0. Mean over visible exits and channels, over the square of the mean radiance.
+            below 0. Mean over visible exits and channels, over the square of the mean radiance. By soft light under an
+            environment map, where a tolerance is asked, as `ratio` is: see `soft_light`.
         bias2_error: its standard error.
         ratio, ratio_error: mean radiance over that of walks, for each channel, with standard errors.
         variance, variance_error: of one sample without fireflies (`statistics.FIREFLIES`), over the square of the mean
