@@ -11,9 +11,11 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from concurrent.futures import BrokenExecutor, CancelledError, Executor, ProcessPoolExecutor, as_completed
+from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager
+from heapq import heappop, heappush
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any
 
 import halfspace_sss
@@ -25,45 +27,65 @@ _PROCESS = os.getpid()  # that imported this module: a forked child has another 
 
 
 def completed(
-    executor: Executor | None, function: Callable[..., Any], parts: Mapping[str, Sequence[Any]]
+    executor: Executor | None,
+    function: Callable[..., Any],
+    parts: Mapping[str, Sequence[Any]],
+    needs: Mapping[str, Collection[str]] | None = None,
+    most: int | None = None,
 ) -> Iterator[tuple[str, Any]]:
     """Name and result of each part, in the order in which they end.
 
     Args:
         executor: where they run; None: here, one after another, each when it is asked for.
         function: at the top of a module; called with the arguments of a part.
-        parts: arguments by the name that errors tell.
+        parts: arguments by the name that errors tell; of those that can run the first are started first.
+        needs: names of the parts that must have ended before a part starts; names that are not parts are there.
+        most: parts that the executor is given at a time; all that can run by default.
 
     Raises:
-        ValueError: from a part, with its name; or parts would run in a forked process, where Dr.Jit hangs.
+        ValueError: from a part, with its name; parts need each other in a circle, or would run in a forked process,
+            where Dr.Jit hangs.
         BackendError: a worker ended.
     """
-    if executor is None:
-        for name, arguments in parts.items():
-            with _naming(name):
-                result = function(*arguments)
-            yield name, result
-        return
-    futures = {executor.submit(_part, function, arguments): name for name, arguments in parts.items()}
+    names, left = list(parts), {name: parts.keys() & set((needs or {}).get(name, ())) for name in parts}
+    after: dict[str, list[int]] = {}
+    for k, name in enumerate(names):
+        for needed in left[name]:
+            after.setdefault(needed, []).append(k)
+    ready = [k for k, name in enumerate(names) if not left[name]]  # sorted, and so a heap
+    most = 1 if executor is None else most or len(names)
+    futures: dict[Future, str] = {}
+    ended: SimpleQueue[Future] = SimpleQueue()
+    count = 0
+
+    def started(name: str) -> Future:
+        if executor is not None:
+            return executor.submit(_part, function, parts[name])
+        here: Future = Future()
+        with _naming(name):
+            here.set_result(function(*parts[name]))
+        return here
+
     try:
-        for future in as_completed(list(futures)):
-            with _naming(name := futures.pop(future)):
+        while ready or futures:
+            while ready and len(futures) < most:
+                name = names[heappop(ready)]
+                futures[future := started(name)] = name
+                future.add_done_callback(ended.put)
+            with _naming(name := futures.pop(future := ended.get())):
                 result = future.result()
+            for k in after.get(name, ()):
+                left[names[k]].remove(name)
+                if not left[names[k]]:
+                    heappush(ready, k)
+            count += 1
             yield name, result
+        if count < len(names):
+            circle = ", ".join(name for name in names if left[name])
+            raise ValueError(f"parts must not need each other in a circle, got {circle}")
     finally:
         for future in futures:
             future.cancel()
-
-
-def waves(needs: Mapping[str, Collection[str]]) -> Iterator[list[str]]:
-    """Names in groups, each of which needs only names of the groups before; names that are not keys are there."""
-    left = dict(needs)
-    while left:
-        wave = [name for name, needed in left.items() if not left.keys() & set(needed)]
-        if not wave:
-            raise ValueError(f"parts must not need each other in a circle, got {', '.join(left)}")
-        yield wave
-        left = {name: needed for name, needed in left.items() if name not in wave}
 
 
 @contextmanager

@@ -20,7 +20,7 @@ import pytest
 import halfspace_sss
 from halfspace_sss import Medium, executors, make_maps
 from halfspace_sss.backend import BackendError, cores
-from halfspace_sss.executors import completed, waves
+from halfspace_sss.executors import completed
 from halfspace_sss.maps.grid import MapGrid
 from halfspace_sss.maps.store import load_maps
 
@@ -61,10 +61,14 @@ def test_without_an_executor_a_part_runs_when_it_is_asked_for() -> None:
 
 
 def test_parts_wait_for_those_that_they_need() -> None:
-    needs = {"image": ["weights", "mesh"], "mesh": [], "weights": ["mesh", "kept"], "other": []}
-    assert list(waves(needs)) == [["mesh", "other"], ["weights"], ["image"]]
+    needs = {"image": ["weights", "mesh"], "weights": ["mesh", "kept"]}
+    parts = {name: (k,) for name, k in {"image": 5, "mesh": 1, "weights": 3, "other": 7}.items()}
+    for executor in (None, ThreadPoolExecutor(2)):
+        order = [name for name, _ in completed(executor, odd, parts, needs, most=2)]
+        assert sorted(order) == sorted(parts) and order.index("mesh") < order.index("weights") < order.index("image")
+    assert [name for name, _ in completed(None, odd, parts, needs)] == ["mesh", "weights", "image", "other"]
     with pytest.raises(ValueError, match="circle, got a, b"):
-        list(waves({"a": ["b"], "b": ["a"]}))
+        list(completed(None, odd, {"a": (1,), "b": (3,)}, {"a": ["b"], "b": ["a"]}))
 
 
 def test_a_forked_process_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -123,7 +123,10 @@ SPP = {  # of a pass; one that is much shorter would show what a render costs be
     "paper": {"volume": 64, WALK: 64, "model": 1024},
 }
 # most of the time of a draft goes into compiling, which each method takes for each kind of light
-COMPARED = {"draft": ("marble", "candle"), "paper": (*SUBJECTS, *OBJECTS)}
+COMPARED = {  # and in which light
+    "draft": {"marble": LIGHTS, "candle": LIGHTS[:1]},
+    "paper": dict.fromkeys((*SUBJECTS, *OBJECTS), LIGHTS),
+}
 ROULETTES = {"draft": (volume(5), volume(200)), "paper": VOLUMES}
 HALF_SPACES = {"draft": ("better_dipole", "neural"), "paper": MODELS}
 BARE_MODELS = {"draft": (), "paper": MODELS}
@@ -140,11 +143,11 @@ def parts(quality: str) -> list[Part]:
     for name, (scan, material) in ((key, each) for key, each in SUBJECTS.items() if key in chosen):
         if FULL_GEOMETRY in OF_OBJECTS:
             results.append(train_scan(name, material, CHUNKS[quality], scan=scan))
-        for lights in LIGHTS:
+        for lights in chosen[name]:
             results += _parts_of(name, lights, quality)
     for name in (key for key in OBJECTS if key in chosen):
         results.append(train_modelled(name, RESOLUTION[quality], CHUNKS[quality]))
-        for lights in LIGHTS:
+        for lights in chosen[name]:
             results += _parts_of(name, lights, quality)
     weights = weight_files("neural", materials.load(SPLIT_MATERIAL).medium)
     common = {"material": SPLIT_MATERIAL, "models": list(HALF_SPACES[quality]), "lanes": LANES[quality], "repeats": 5}

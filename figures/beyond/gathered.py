@@ -12,7 +12,7 @@ from figures.computing.images import FLIP, Shot
 from figures.computing.learnt import CHUNKS, FULL_GEOMETRY, train_scan, training_of, with_weights
 from figures.computing.references import NOTE, against, long_reference, reference_shot
 from figures.computing.scenes import BUNNY, prepare, scan_scene
-from figures.computing.timed import gathered_anew, rendered
+from figures.computing.timed import gathered_anew, power_of_two, rendered
 from figures.drawing.image_files import image_files
 from figures.parts.part import Part, Result, Task
 from halfspace_sss import materials
@@ -22,10 +22,10 @@ TITLE = "walked, sampled and gathered in equal time"
 MATERIALS = ("marble",)
 LIGHTS = "both"
 WAYS = {"walked": (WALK, "sampled"), "sampled": (FULL_GEOMETRY, "sampled"), "gathered": (FULL_GEOMETRY, "gathered")}
-SIZES = {"draft": 192, "paper": 384}
+SIZES = {"draft": 128, "paper": 384}
 SECONDS = {"draft": 4.0, "paper": 20.0}  # of the processor, all cores together
 TRUTH_SPP = {"draft": 128, "paper": 1024}
-PASSES, PILOT = 8, 2  # of an image, about; samples of a pixel by which the time of others is foreseen
+PASSES, PILOT = 8, 2  # of an image, at least; samples of a pixel by which the time of others is foreseen
 NOTES = (
     "All had the same seconds of the processor, compilation and the training of `full_geometry` left out, the "
     f"gathering of light counted. FLIP of the pixels of the object. {NOTE}"
@@ -65,7 +65,7 @@ def _passes(scene: Any, seconds: float, seed: int, gathers: bool) -> tuple[np.nd
     rendered(scene, PILOT, seed, 0)  # compiles
     gathering, started = gathered_anew(scene) if gathers else 0.0, clock()
     rendered(scene, PILOT, seed, 1)
-    spp = max(round(PILOT * (seconds - gathering) / PASSES / (clock() - started)), 1)
+    spp = power_of_two(PILOT * (seconds - gathering) / PASSES / (clock() - started))
     rendered(scene, spp, seed, 2)  # compiles for that number
     images, started = [], clock()
     while not images or (clock() - started) * (1 + 0.5 / len(images)) < seconds - gathering:

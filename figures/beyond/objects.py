@@ -27,7 +27,7 @@ from halfspace_sss.provenance import check_folder
 
 TITLE = "the objects modelled for the figures, path traced"
 SIZES = {"draft": 112, "paper": 448}
-SPP = {"draft": 32, "paper": 1024}
+SPP = {"draft": 16, "paper": 1024}
 RESOLUTION = {"draft": 96, "paper": 240}  # of surfaces and of grids
 SPP_PER_PASS = 8
 GUIDE_PASSES = 8

@@ -32,10 +32,9 @@ SHAPES = ("bunny", "spikes")
 LIGHTS = {"sky": "even sky", "small light": "small light"}
 ALL = tuple((material, shape, light) for material in MATERIALS for shape in SHAPES for light in LIGHTS)
 SCENES = {  # a draft has both lights, a dense material and a shape that nothing learnt; it tells little of small lights
-    "draft": (("marble", "bunny", "sky"), ("potato", "bunny", "sky"), ("potato", "bunny", "small light"),
-              ("potato", "spikes", "sky")),
+    "draft": (("marble", "bunny", "sky"), ("potato", "bunny", "small light"), ("potato", "spikes", "sky")),
     "paper": ALL,
-}  # fmt: skip
+}
 SECONDS = {"draft": 4.0, "paper": 60.0}  # second halves of gathered light, of 5 to 20 s each, count in it
 KNOB_SECONDS = {"draft": 1.0, "paper": 24.0}
 SIZE = {"draft": 64, "paper": 128}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -15,7 +16,7 @@ from halfspace_sss.progress import Progress
 
 MOST_LANES = 2**22  # camera rays of a pass, for memory
 COMPILING = 2  # samples per pixel of a render that is not timed: a power of two has the kernels of all others
-GROWTH, TOLERANCE, MOST_TRIALS = 16, 0.15, 8  # of the number of samples of a pass that is looked for
+GROWTH, MOST_TRIALS = 16, 8  # of the number of samples of a pass that is looked for
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +80,7 @@ def rendered(scene: Any, spp: int, *seed: int) -> tuple[np.ndarray, float]:
 
 
 def pass_size(scene: Any, seconds: float, seed: int = 0) -> int:
-    """Samples per pixel of a pass that takes about so many seconds; its kernels are compiled then.
+    """Samples per pixel of a pass that takes so many seconds or half as many; its kernels are compiled then.
 
     Args:
         scene: Mitsuba scene.
@@ -96,11 +97,16 @@ def pass_size(scene: Any, seconds: float, seed: int = 0) -> int:
         rendered(scene, spp, seed, 2 * k)  # compiles, in some integrators for each number of samples
         results.append((spp, rendered(scene, spp, seed, 2 * k + 1)[1]))
         least = 1 if k or results[-1][1] > seconds else 2  # one sample may have taken what any render takes
-        wanted = min(most, GROWTH * spp, max(least, _samples_in(seconds, results)))
-        if abs(wanted - spp) <= TOLERANCE * spp:
+        wanted = power_of_two(min(most, GROWTH * spp, max(least, _samples_in(seconds, results))))
+        if wanted == spp:
             break
         spp = wanted
     return results[-1][0]
+
+
+def power_of_two(samples: float) -> int:
+    """The largest power of two that is no more, at least 1: any number would have kernels of its own in every run."""
+    return 2 ** max(math.floor(math.log2(samples)), 0) if samples > 0 else 1
 
 
 def _samples_in(seconds: float, result: list[tuple[int, float]]) -> int:

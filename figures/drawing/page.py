@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 
 DIFFERENCE_SPAN = 1.0  # relative difference at the ends of the colours
+QUALITY, MAP_QUALITY, LEVELS = 90, 70, 16  # of JPEG; of a map without loss, whichever is smaller
 MAPS = {
     "flip": ("FLIP", "magma", ("no difference, 0", "1")),
     "difference": ("relative difference", "RdBu_r", ("darker, ≤ −1", "brighter, ≥ 1")),
@@ -105,12 +106,12 @@ def _shot(shot: Shot, exposure: float) -> dict[str, Any]:
         plain = value if isinstance(value, str) else float(value)
         results["numbers"][column] = plain if isinstance(plain, str) or math.isfinite(plain) else str(plain)
     if shot.image is not None:
-        results["image"] = _address(np.round(255 * srgb(shot.image, exposure)).astype(np.uint8))
+        results["image"] = _image_address(np.round(255 * srgb(shot.image, exposure)).astype(np.uint8))
     for kind, low in (("flip", 0.0), ("difference", -DIFFERENCE_SPAN)):
         values = getattr(shot, kind)
         if values is not None:
             scaled = np.clip((np.asarray(values) - low) / (DIFFERENCE_SPAN - low), 0.0, 1.0)
-            results[kind] = _address(_colors(MAPS[kind][1])[np.round(255 * scaled).astype(np.uint8)])
+            results[kind] = _map_address(scaled, _colors(MAPS[kind][1]))
     return results
 
 
@@ -126,13 +127,34 @@ def _map(kind: str) -> dict[str, Any]:
     return {"title": title, "colors": colors, "ends": ends}
 
 
-def _address(pixels: np.ndarray) -> str:
-    """A data address of the pixels, (H, W, 3) bytes, without loss; WebP takes a quarter less than PNG."""
+def _map_address(scaled: np.ndarray, colors: np.ndarray) -> str:
+    """A data address of a map (H, W) in [0, 1] in the 256 colours, or in few of them."""
+    few = np.round((LEVELS - 1) * scaled) / (LEVELS - 1)
+    full, few = (colors[np.round(255 * values).astype(np.uint8)] for values in (scaled, few))
+    return min(_exact(few), _lossy(full, MAP_QUALITY), key=len)
+
+
+def _image_address(pixels: np.ndarray) -> str:
+    """A data address of the pixels, (H, W, 3) bytes; FLIP between images as they were and as they are shown differs by
+    less than 0.006."""
+    return min(_exact(pixels), _lossy(pixels, QUALITY), key=len)
+
+
+def _exact(pixels: np.ndarray) -> str:
+    return _address(pixels, "webp", lossless=True)
+
+
+def _lossy(pixels: np.ndarray, quality: int) -> str:
+    """Without WebP, which has half of the resolution in colour, where noise is."""
+    return _address(pixels, "jpeg", quality=quality, subsampling=0, optimize=True)
+
+
+def _address(pixels: np.ndarray, kind: str, **settings: Any) -> str:
     from PIL import Image
 
     buffer = io.BytesIO()
-    Image.fromarray(pixels).save(buffer, "WEBP", lossless=True)
-    return "data:image/webp;base64," + base64.b64encode(buffer.getvalue()).decode()
+    Image.fromarray(pixels).save(buffer, kind, **settings)
+    return f"data:image/{kind};base64," + base64.b64encode(buffer.getvalue()).decode()
 
 
 def render(picture: Picture) -> dict[str, bytes]:

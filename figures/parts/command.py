@@ -11,16 +11,20 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 import figures
-from halfspace_sss.backend import BackendError
-from halfspace_sss.cli.shared import Bar, Scheduler, Variant, Workers, console, executor_of, use_mitsuba
+from halfspace_sss.backend import BackendError, cores
+from halfspace_sss.cli.shared import Bar, Scheduler, Variant, console, executor_of, use_mitsuba, whole
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from concurrent.futures import Executor
 
     from figures.parts.runner import Plan
 
 DRAWING = ("PIL", "flip_evaluator", "matplotlib")
 EXTRAS = ("PIL", "flip_evaluator", "matplotlib", "mitsuba")
+WORKERS = "Processes that share the cores and the parts of the work."
+MOST_WORKERS = 2  # that are not asked for: each has its kernels in memory
+AHEAD = 2  # parts that each process has been given, so that none waits while a figure is drawn
 
 
 class Action(str, Enum):
@@ -47,7 +51,7 @@ def figures_command(
         list[str] | None, typer.Argument(help="Names of figures.", metavar="[NAMES]...", show_default="all")
     ] = None,
     quality: Annotated[Quality, typer.Option(help="draft: minutes on two cores. paper: as published.")] = Quality.draft,
-    workers: Workers = None,
+    workers: Annotated[int | None, typer.Option(help=WORKERS, parser=whole, show_default="2 for drafts")] = None,
     scheduler: Scheduler = None,
     variant: Variant = "llvm_ad_rgb",
     out: Annotated[Path, typer.Option(help="Folder for parts and pictures of all figures.")] = Path("out"),
@@ -67,12 +71,20 @@ def figures_command(
         if action in (Action.draw, Action.all):
             _check_drawing()
         plans = [plan(name, quality.value, out) for name in chosen]
+        if workers is None and scheduler is None and variant == "llvm_ad_rgb" and quality is Quality.draft:
+            workers = _workers(plans) if action in (Action.compute, Action.all) else None
         with executor_of(workers, scheduler) as executor:
             do(plans, out, executor)
     except ModuleNotFoundError as error:
         if (error.name or "").split(".")[0] not in EXTRAS:
             raise
         raise BackendError(f'figures need {error.name}: pip install "halfspace-sss[figures,render]"') from error
+
+
+def _workers(plans: list[Plan]) -> int | None:
+    """Processes for drafts, whose parts are too small for several threads; None for this one."""
+    number = min(cores(), MOST_WORKERS, len({p.keys[name] for p in plans for name in p.missing}))
+    return number if number > 1 else None
 
 
 def _check_drawing() -> None:
@@ -132,9 +144,20 @@ def _announce(p: Plan) -> None:
 
 
 def _compute(plans: list[Plan], out: Path, executor: Executor | None) -> None:
+    for _ in _completed(plans, executor):
+        pass
+
+
+def _completed(plans: list[Plan], executor: Executor | None) -> Iterator[Plan]:
+    """The figures as all of their parts are computed."""
+    from figures.parts.runner import completed_plans, duration
+
     _announce_all(plans)
-    for p in plans:
-        _compute_one(p, out, executor)
+    started, most = time.perf_counter(), getattr(executor, "_max_workers", None)
+    with Bar(plans[0].name if len(plans) == 1 else "figures") as bar:
+        yield from completed_plans(plans, bar.show, _say, executor, most and AHEAD * most)
+    if any(p.missing for p in plans):
+        _say(f"computed in {duration(time.perf_counter() - started)}")
 
 
 def _announce_all(plans: list[Plan]) -> None:
@@ -145,17 +168,8 @@ def _announce_all(plans: list[Plan]) -> None:
     if sum(bool(p.missing) for p in plans) > 1:
         unknown = sum(len(p.unmeasured) for p in plans)
         more = f" and {unknown} parts not measured yet" if unknown else ""
-        _say(f"together about {duration(sum(p.projected_seconds for p in plans))}{more}")
-
-
-def _compute_one(p: Plan, out: Path, executor: Executor | None) -> None:
-    from figures.parts.runner import compute, duration
-
-    started = time.perf_counter()
-    with Bar(p.name) as bar:
-        compute(p.name, p.quality, out, bar.show, _say, executor)
-    if p.missing:
-        _say(f"{p.name}: computed in {duration(time.perf_counter() - started)}")
+        each = {p.keys[name]: s.seconds or 0.0 for p in plans for name, s in p.seconds.items()}  # shared ones once
+        _say(f"together about {duration(sum(each.values()))}{more}")
 
 
 def _draw(plans: list[Plan], out: Path, executor: Executor | None) -> None:
@@ -167,7 +181,5 @@ def _draw(plans: list[Plan], out: Path, executor: Executor | None) -> None:
 
 
 def _all(plans: list[Plan], out: Path, executor: Executor | None) -> None:
-    _announce_all(plans)
-    for p in plans:
-        _compute_one(p, out, executor)
+    for p in _completed(plans, executor):
         _draw([p], out, executor)

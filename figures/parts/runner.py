@@ -6,9 +6,9 @@ import functools
 import importlib
 import json
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
 from types import ModuleType
@@ -18,7 +18,7 @@ import figures
 from figures.parts.part import QUALITIES, Part, Result, Task, check_quality, keys_of
 from figures.parts.store import DamagedPartError, PartStore
 from halfspace_sss.checks import check_choice
-from halfspace_sss.executors import completed, waves
+from halfspace_sss.executors import completed
 from halfspace_sss.progress import Progress, ProgressText
 from halfspace_sss.provenance import check_folder, provenance, write_together
 
@@ -166,25 +166,65 @@ def compute(
     Raises:
         ValueError: as in `plan`, or from a part, whose name it gives.
     """
-    todo = plan(name, quality, Path(out).absolute() if executor else out)
-    for part_name, reason in todo.damaged.items():
-        if say:
-            say(f"{name}: part {part_name!r} is damaged and computed again: {reason}")
-    weights, done = _weights(todo), 0.0
-    total = sum(weights.values())
-
-    def show(part: str, k: int, n: int) -> None:
-        if progress:
-            progress(int(STEPS * (done + weights[part] * k / max(n, 1)) / total), STEPS, part)
-
-    for wave in waves({part.name: part.needs for part in todo.parts if part.name in todo.missing}):
-        parts = {
-            f"{name}, part {part!r}": (todo, part, None if executor else functools.partial(show, part)) for part in wave
-        }
-        for _, part in completed(executor, _computed, parts):
-            done += weights[part]
-            show(part, 0, 1)
+    todo = plan(name, quality, out)
+    for _ in completed_plans([todo], progress, say, executor):
+        pass
     return {part.name: todo.store.load(part, todo.keys[part.name]) for part in todo.parts}
+
+
+def completed_plans(
+    plans: Sequence[Plan],
+    progress: ProgressText | None = None,
+    say: Say | None = None,
+    executor: Executor | None = None,
+    most: int | None = None,
+) -> Iterator[Plan]:
+    """Compute what several figures lack, what they share once; gives each plan as soon as all of its parts are there.
+
+    Args:
+        plans: as `plan` makes them.
+        progress, say, executor: as in `compute`.
+        most: parts that the executor is given at a time; all that can run by default.
+
+    Raises:
+        ValueError: from a part, whose name it gives.
+    """
+    if executor:
+        plans = [replace(todo, folder=todo.folder.absolute()) for todo in plans]
+    for todo in plans:
+        for part, reason in todo.damaged.items():
+            if say:
+                say(f"{todo.name}: part {part!r} is damaged and computed again: {reason}")
+    owners: dict[str, str] = {}  # names of the first parts of these keys
+    weights, parts, needs, left = {}, {}, {}, {}
+    done, measured = 0.0, not any(todo.unmeasured for todo in plans)
+
+    def show(name: str, told: str, k: int, n: int) -> None:
+        if progress:
+            progress(int(STEPS * (done + weights[name] * k / max(n, 1)) / sum(weights.values())), STEPS, told)
+
+    for todo in plans:
+        known = {part: _named(todo, part) for part in todo.missing}
+        left[todo.name] = set(known.values())
+        for part in (part for part in todo.parts if part.name in known):
+            name, key = known[part.name], todo.keys[part.name]
+            told = part.name if len(plans) == 1 else f"{todo.name}: {part.name}"
+            parts[name] = (todo, part.name, None if executor else functools.partial(show, name, told))
+            owner = owners.setdefault(key, name)
+            needs[name] = [*(known[each] for each in part.needs if each in known), *([owner] if owner != name else [])]
+            weights[name] = _weight(todo, part, measured) if owner == name else LEAST
+    yield from (todo for todo in plans if not todo.missing)
+    for name, (todo, part) in completed(executor, _computed, parts, needs, most):
+        done += weights[name]
+        show(name, part if len(plans) == 1 else f"{todo}: {part}", 0, 1)
+        left[todo].remove(name)
+        if not left[todo]:
+            yield next(p for p in plans if p.name == todo)
+
+
+def _named(todo: Plan, part: str) -> str:
+    """What errors call a part."""
+    return f"{todo.name}, part {part!r}"
 
 
 def draw(name: str, quality: str, out: str | Path) -> list[Path]:
@@ -213,12 +253,15 @@ def draw(name: str, quality: str, out: str | Path) -> list[Path]:
     return [done.folder / file for file in content]
 
 
-def _weights(todo: Plan) -> dict[str, float]:
-    """What each missing part counts in the bar: its seconds, or its work while the seconds of some are unknown."""
-    parts = [part for part in todo.parts if part.name in todo.missing]
-    if todo.unmeasured:
-        return {part.name: part.work for part in parts}
-    return {part.name: max(todo.seconds[part.name].seconds if part.name in todo.seconds else 0, 1e-3) for part in parts}
+LEAST = 1e-3  # that a part counts in the bar
+
+
+def _weight(todo: Plan, part: Part, measured: bool) -> float:
+    """What a missing part counts in the bar: its seconds, or its share of the work while some are unknown."""
+    if not measured:
+        missing = [each for each in todo.parts if each.name in todo.missing]
+        return len(missing) * part.work / sum(each.work for each in missing)
+    return max(todo.seconds[part.name].seconds if part.name in todo.seconds else 0, LEAST)
 
 
 def _elsewhere(folder: Path, part: Part, key: str) -> PartStore | None:
@@ -232,15 +275,15 @@ def _elsewhere(folder: Path, part: Part, key: str) -> PartStore | None:
     return None
 
 
-def _computed(todo: Plan, name: str, show: Progress | None) -> str:
-    """Compute a part, with what it needs from its store, and write it there; its name."""
+def _computed(todo: Plan, name: str, show: Progress | None) -> tuple[str, str]:
+    """Compute a part, with what it needs from its store, and write it there; names of its figure and itself."""
     parts = {part.name: part for part in todo.parts}
     part, key = parts[name], todo.keys[name]
     other = _elsewhere(todo.folder, part, key)
     if other:
         result = other.load(part, key)
         todo.store.save(part, key, {**result.images, **result.numbers}, result.seconds)
-        return name
+        return todo.name, name
     folder = todo.store.unfinished(part, key)
     folder.mkdir(parents=True, exist_ok=True)
     needed = {needs: todo.store.load(parts[needs], todo.keys[needs]) for needs in part.needs}
@@ -255,4 +298,4 @@ def _computed(todo: Plan, name: str, show: Progress | None) -> str:
     finally:
         if folder.is_dir() and not any(folder.iterdir()):
             folder.rmdir()
-    return name
+    return todo.name, name

@@ -49,9 +49,8 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Result]:
         patch.setattr(training, "train_by_chunks", lambda *a, **how: train(*a, **{**how, "recipe": QUICK}))
         patch.setitem(equal_error.CHUNKS, "draft", 1)
         patch.setattr(equal_error, "SUBJECTS", {"ketchup": ("bunny", "ketchup")})
-        patch.setitem(equal_error.COMPARED, "draft", ("ketchup",))
+        patch.setitem(equal_error.COMPARED, "draft", {"ketchup": ("even sky",)})
         patch.setattr(equal_error, "OBJECTS", ())
-        patch.setattr(equal_error, "LIGHTS", ("even sky",))
         patch.setattr(equal_error, "furnace_models", lambda: [DIPOLE])
         for name, value in (("SIZES", 24), ("TRUTH_SPP", 64), ("LANES", 4096), ("FURNACE", {"size": 8, "spp": 64})):
             patch.setitem(getattr(equal_error, name), "draft", value)

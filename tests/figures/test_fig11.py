@@ -122,7 +122,7 @@ class Sixteen:
 
 
 @pytest.mark.parametrize(
-    ("own", "each", "expected"), [(0.1, 0.01, 40), (0.3, 0.01, 20), (0.0, 2.0, 1), (0.0, 1e-9, 2**14)]
+    ("own", "each", "expected"), [(0.1, 0.01, 32), (0.3, 0.01, 16), (0.0, 2.0, 1), (0.0, 1e-9, 2**14)]
 )
 def test_a_pass_takes_the_time_that_it_is_given(own: float, each: float, expected: int, monkeypatch: Any) -> None:
     Clock(monkeypatch, own, each)

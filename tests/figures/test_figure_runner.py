@@ -17,6 +17,7 @@ import pytest
 from typer.testing import CliRunner
 
 import figures
+from figures.parts import command
 from figures.parts.part import Part, Result, Task
 from figures.parts.runner import compute, draw, figure, plan
 from halfspace_sss.cli import app as cli
@@ -58,6 +59,7 @@ def toy(monkeypatch: pytest.MonkeyPatch) -> Toy:
     module = Toy(TITLE="two images", function=shade, level=0.25, inputs=())
     monkeypatch.setattr(figures, "FIGURES", ("toy", "fig10"))
     monkeypatch.setitem(sys.modules, "figures.toy", module)
+    monkeypatch.setattr(command, "cores", lambda: 1)  # other processes do not know the toy
     CALLS.clear()
     return module
 
