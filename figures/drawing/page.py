@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 DIFFERENCE_SPAN = 1.0  # relative difference at the ends of the colours
-QUALITY, MAP_QUALITY, LEVELS = 90, 70, 16  # of JPEG; of a map without loss, whichever is smaller
+QUALITY, MAP_QUALITY, LEVELS = 88, 70, 25  # of JPEG; of a map without loss, whichever is smaller
 MAPS = {
     "flip": ("FLIP", "magma", ("no difference, 0", "1")),
     "difference": ("relative difference", "RdBu_r", ("darker, ≤ −1", "brighter, ≥ 1")),

@@ -155,7 +155,9 @@ def _completed(plans: list[Plan], executor: Executor | None) -> Iterator[Plan]:
     _announce_all(plans)
     started, most = time.perf_counter(), getattr(executor, "_max_workers", None)
     with Bar(plans[0].name if len(plans) == 1 else "figures") as bar:
-        yield from completed_plans(plans, bar.show, _say, executor, most and AHEAD * most)
+        for p in completed_plans(plans, bar.show, _say, executor, most and AHEAD * most):
+            with bar.standing():
+                yield p
     if any(p.missing for p in plans):
         _say(f"computed in {duration(time.perf_counter() - started)}")
 

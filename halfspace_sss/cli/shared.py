@@ -141,6 +141,16 @@ class Bar:
         self._total = total
         self._shown.show(done, total, text)
 
+    @contextmanager
+    def standing(self) -> Iterator[None]:
+        """Meanwhile lines may be printed, which come below the bar as it is; it goes on below them."""
+        progress = getattr(self._shown, "progress", None)
+        if progress:
+            progress.stop()
+        yield
+        if progress:
+            progress.start()
+
     def __exit__(self, kind: type | None, *_: object) -> None:
         if self._shown is not None:
             self._shown.stop(self._total if kind is None else None)
@@ -156,17 +166,17 @@ class _Moving:
         steps = (TextColumn(title), BarColumn(30), TextColumn("{task.percentage:.0f} %"))
         times = (TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn())
         text = TextColumn("{task.fields[text]}", markup=False, table_column=Column(ratio=1, no_wrap=True))
-        self._progress = Progress(*steps, *times, text, console=screen, expand=True, speed_estimate_period=MEMORY)
-        self._progress.start()
-        self._task = self._progress.add_task("", completed=done, text="")
+        self.progress = Progress(*steps, *times, text, console=screen, expand=True, speed_estimate_period=MEMORY)
+        self.progress.start()
+        self._task = self.progress.add_task("", completed=done, text="")
 
     def show(self, done: int, total: int, text: str) -> None:
-        self._progress.update(self._task, completed=done, total=total, text=text)
+        self.progress.update(self._task, completed=done, total=total, text=text)
 
     def stop(self, total: int | None) -> None:
         if total is not None:
-            self._progress.update(self._task, completed=total)
-        self._progress.stop()
+            self.progress.update(self._task, completed=total)
+        self.progress.stop()
 
 
 class _Lines:

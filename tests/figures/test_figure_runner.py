@@ -19,7 +19,7 @@ from typer.testing import CliRunner
 import figures
 from figures.parts import command
 from figures.parts.part import Part, Result, Task
-from figures.parts.runner import compute, draw, figure, plan
+from figures.parts.runner import completed_plans, compute, draw, figure, plan
 from halfspace_sss.cli import app as cli
 
 CALLS: list[str] = []  # which parts were computed, in turn
@@ -120,6 +120,11 @@ def test_a_part_that_another_figure_has_is_taken_from_there(toy: Toy, tmp_path: 
     toy.level = 0.75
     assert compute("twin", "draft", tmp_path)["gap"].numbers["gap"] == 0.25
     assert CALLS[3:] == ["a", "gap"]
+    for executor in (None, ThreadPoolExecutor(2)):
+        CALLS.clear()
+        both = [plan(name, "draft", tmp_path / str(executor is None)) for name in ("toy", "twin")]
+        assert [done.name for done in completed_plans(both, executor=executor)] == ["toy", "twin"]
+        assert sorted(CALLS) == ["a", "b", "gap"] and draw("twin", "draft", tmp_path / str(executor is None))
 
 
 def test_what_depends_on_a_changed_parameter_is_computed_again_and_nothing_else(toy: Toy, tmp_path: Path) -> None:
