@@ -62,7 +62,8 @@ def assess(
 
     At points of an object that the camera sees, radiance by each way is compared with that by random walks, with the
     noise of both taken out; time is that of the same samples. Lights, reflections and other objects are those of the
-    scene, at its own largest depth.
+    scene, at its own largest depth. With a tolerance, biases under an environment map are told by soft
+    light, see `soft_light`; the map of a loaded scene is edited meanwhile, and put back.
 
     Args:
         scene: a Mitsuba scene, a dict as for `mitsuba.load_dict`, or the path of an XML file.

@@ -1,7 +1,7 @@
 """Soft light: an environment map smoothed over directions, in which few walks tell how wrong a model is.
 
 A walk through a refracting boundary meets a window by chance alone. What S makes of light after two orders and more
-varies little over direction, so that smooth light leaves its relative error nearly what it is (docs/trade_check.md):
+varies little over direction, so that smooth light leaves its relative error nearly what it is (docs/choosing.md):
 
     L'(w) = c + g [∫ K(w.w') L(w') dw' - c],  K(x) = κ exp(κ (x - 1)) / (2 pi (1 - exp(-2 κ))),  κ = 1 / SOFT²,
 
