@@ -33,7 +33,7 @@ OBJECTS = ("candle", "mandarin", "croissant")
 MODELS = ("neural", *(name for name in OF_OBJECTS if name == FULL_GEOMETRY))
 TRUTH = "path_traced"
 SIZES = {"draft": 128, "paper": 448}
-SPP = {"draft": {TRUTH: 64, "model": 16}, "paper": {TRUTH: 512, "model": 32}}
+SPP = {"draft": {TRUTH: 64, "model": 64}, "paper": {TRUTH: 512, "model": 32}}  # of few pixels more cost little
 RESOLUTION = {"draft": 64, "paper": 240}  # of surfaces; grids have half of it
 LIGHT = "sunset"  # the small lamps of the studio are hardly found by walks
 NOTES = (
