@@ -29,7 +29,8 @@ def speeds_command(
     model: Annotated[
         list[str] | None,
         typer.Option(
-            help="full_geometry, neural_shape, neural or better_dipole; repeat for more.", show_default="all four"
+            help="full_geometry, neural_shape, neural, better_dipole, or path_traced gathered; repeat for more.",
+            show_default="the first four",
         ),
     ] = None,
     light: Annotated[
@@ -53,12 +54,23 @@ def speeds_command(
 ) -> None:
     """Measure the speed of models over volpathmis or walks: sampled, corrected and gathered."""
     use_mitsuba("llvm_ad_rgb")
-    from figures.beyond.speeds import KINDS, LIGHTS, MODELS, OTHER_LIGHTS, OVER, LitObject, Measuring, speeds, tables
+    from figures.beyond.speeds import (
+        KINDS,
+        LIGHTS,
+        MODELS,
+        MORE_MODELS,
+        OTHER_LIGHTS,
+        OVER,
+        LitObject,
+        Measuring,
+        speeds,
+        tables,
+    )
 
     names, models, lights = tuple(objects or SPEED_OBJECTS), tuple(model or MODELS), tuple(light or LIGHTS)
     kinds = tuple(kind or KINDS)
     for name in models:
-        check_choice("model", name, MODELS)
+        check_choice("model", name, (*MODELS, *MORE_MODELS))
     for name in lights:
         check_choice("light", name, (*LIGHTS, *OTHER_LIGHTS))
     for name in kinds:

@@ -45,9 +45,15 @@ NETWORKS = ("neural", "neural_shape")
 LEARNT = (*NETWORKS, FULL_GEOMETRY)
 WAYS = (
     PATH_TRACED, LAMBERT, "standard_dipole_normalized", "better_dipole", "directional_dipole", "photon_beam_diffusion",
-    *LEARNT, *(f"{model}, {GATHERED}" for model in ("better_dipole", *LEARNT)),
+    *LEARNT, *(f"{model}, {GATHERED}" for model in ("better_dipole", *LEARNT, PATH_TRACED)),
 )  # fmt: skip
-FEW = (PATH_TRACED, LAMBERT, "better_dipole", *LEARNT, *(f"{model}, {GATHERED}" for model in ("neural", FULL_GEOMETRY)))
+FEW = (
+    PATH_TRACED,
+    LAMBERT,
+    "better_dipole",
+    *LEARNT,
+    *(f"{model}, {GATHERED}" for model in (PATH_TRACED, FULL_GEOMETRY)),
+)
 CHOSEN = {"draft": FEW, "paper": WAYS}
 KNOB_MATERIALS = {"draft": ("marble",), "paper": ("marble", "ketchup")}
 KNOB_WAYS = ("better_dipole", "neural")

@@ -36,7 +36,7 @@ LAST_SHARE = 0.1  # likewise, after light has been gathered
 TOLD = 0.1  # standard error of a bias² over the squared tolerance that is enough
 CANDIDATES = (
     PATH_TRACED, "lambert", "better_dipole", "neural", "full_geometry", "neural_shape",
-    *(f"{name}, {GATHERED}" for name in ("better_dipole", "neural", "full_geometry", "neural_shape")),
+    *(f"{name}, {GATHERED}" for name in ("better_dipole", "neural", "full_geometry", "neural_shape", PATH_TRACED)),
 )  # fmt: skip
 DEAR = ("neural_shape",)  # to look at, which takes DEAR_SECONDS
 
@@ -121,7 +121,7 @@ def _chosen(models: Sequence[str] | None) -> list[Way]:
     if models is None:
         return ways()
     chosen = [Way.of(name) for name in models]
-    return [WALKS, *(way for way in dict.fromkeys(chosen) if way.model != PATH_TRACED)]
+    return [WALKS, *(way for way in dict.fromkeys(chosen) if not way.walks)]
 
 
 def assess_stage(
@@ -186,11 +186,11 @@ def _assessed_for(
         out = too_dear(look, first, chosen, tolerance, images) if count_training else {}
         ahead, later = ([way for way in ways if way not in out] for ways in (ahead, later))
         look.keep(first)
-        flat = [way for way in ahead if way.model != PATH_TRACED and lookup(way.model).of_half_space]
+        flat = [way for way in ahead if not way.walks and lookup(way.model).of_half_space]
         look.more(flat[:1], LookBudget(), seeded(seed, 45), progress)
         out |= as_far_off(look.assessment(seed), flat, later, tolerance)
         ahead, later = ([way for way in ways if way not in out] for ways in (ahead, later))
-        rest = [way for way in ahead if way.model != PATH_TRACED and way not in flat[:1]]
+        rest = [way for way in ahead if not way.walks and way not in flat[:1]]
         look.more(rest, LookBudget(), seeded(seed, 43), progress)
     else:
         out: dict[Way, str] = {}
@@ -243,7 +243,7 @@ def _go_on(
         rows = {way: o.way(way.name) for way in few} if o.ways else {}
         for way, row in rows.items():
             if not row.refusal and row.variance > 0:
-                others = max(len(few) - 1, 1) if way.model == PATH_TRACED else 1
+                others = max(len(few) - 1, 1) if way.walks else 1
                 parts[way] = max(parts[way], math.sqrt(others * look.noise(k, way).value))
                 enough[way] = max(enough[way], look.enough(k, way, row, told))
     whole = max(sum(parts.values()), 1e-30)

@@ -24,6 +24,7 @@ from halfspace_sss.rendering.object.registry import AUTO, Choices, model_names
 from halfspace_sss.rendering.object.settings import Settings
 from halfspace_sss.rendering.object.wrapped import surface_of
 from halfspace_sss.rendering.scenes.identity import scene_hash
+from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED
 from halfspace_sss.trade.assessing import assess_stage
 from halfspace_sss.trade.results import ObjectTrade, WayTrade
 from halfspace_sss.trade.ways import GATHERED, LAMBERT, WALKS, Stage, Way
@@ -88,9 +89,9 @@ def _read(path: Path) -> dict[str, Any]:
 
 def _measured(on: Stage, named: list[str], settings: Settings) -> dict[str, Any]:
     lights = ("sampled", GATHERED) if settings.light == AUTO else (settings.light,)
-    models = model_names() if AUTO in named else dict.fromkeys(named)
+    models = _known() if AUTO in named else dict.fromkeys(named)
     ways = [WALKS]
-    ways += [_way(name, light) for name in models if name != AUTO for light in lights if _has(name, light)]
+    ways += [_way(name, light) for name in models for light in lights if _has(name, light)]
     samples = _samples(on, settings.choice_share / len(ways))
     result = assess_stage(on, ways, samples=samples, exits=EXITS)
     picks = {light: [picked(o, settings.tolerance, light, name) for o, name in zip(result.objects, named)]
@@ -100,6 +101,11 @@ def _measured(on: Stage, named: list[str], settings: Settings) -> dict[str, Any]
     record = {"format": FORMAT, "light": light, "models": [pick.model for pick in picks[light]]}
     record |= {"sentences": [pick.sentence for pick in picks[light]]}
     return {**record, "assessment": result.record(), "provenance": about}
+
+
+def _known() -> list[str]:
+    """Models that "auto" chooses among; walks have no share in it."""
+    return [name for name in model_names() if name not in (AUTO, PATH_TRACED)]
 
 
 def _has(model: str, light: str) -> bool:
@@ -134,8 +140,8 @@ def _total(picks: list[Pick]) -> float:
 
 def picked(assessed: ObjectTrade, tolerance: float, light: str = "sampled", model: str = AUTO) -> Pick:
     """The model for an object among those of one kind of light, or what can be said of the one that is named."""
-    names = model_names() if model == AUTO else (model,)
-    ways = {_way(name, light).name: name for name in names if name != AUTO}
+    names = _known() if model == AUTO else (model,)
+    ways = {_way(name, light).name: name for name in names}
     rows = [row for row in assessed.ways if not row.refusal and row.way in ways]
     if not rows or assessed.is_dark:
         name = _default([ways[row.way] for row in rows] or list(ways.values()))

@@ -59,7 +59,7 @@ def promising(
         best = most_promising(seen, wanted, tolerance, images or 1, counted)
         told |= {way: f"not measured, as {best.name} promises more: ask for it by its name" for way in wanted}
         names -= {way.model for way in wanted}  # they cannot win where gathering their light is worth its time
-    return [way for way in ahead if way.name in names or way.model == PATH_TRACED], best, told
+    return [way for way in ahead if way.name in names or way.walks], best, told
 
 
 def gathering_seconds(row: WayTrade) -> float:

@@ -15,7 +15,7 @@ from halfspace_sss.progress import NamedProgress
 from halfspace_sss.rendering.object.registry import learnt_names, lookup
 from halfspace_sss.rendering.object.wrapped import surface_of
 from halfspace_sss.rendering.scenes.learners import CostedLearner
-from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED, first_cause
+from halfspace_sss.rendering.scenes.scene_files import first_cause
 from halfspace_sss.trade.exits import Exits, visible_exits
 from halfspace_sss.trade.results import Assessment, ObjectTrade, WayTrade
 from halfspace_sss.trade.sampling import PILOT, Sampled, first_sample, sample_blur, sample_more, warm_up
@@ -90,7 +90,7 @@ class SceneSamples:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # they are heard when the ways are made ready again
             for walks in (True, False):
-                warm_up(on, [way for way in chosen if (way.model == PATH_TRACED) == walks and way.light != GATHERED])
+                warm_up(on, [way for way in chosen if way.walks == walks and way.light != GATHERED])
         started = clock()
         seen = visible_exits(on.scene, on.shapes, sensor, exits, seeded(seed, 41))
         mfp = [_mfp(on, k) for k in range(len(seen))]
@@ -220,18 +220,18 @@ def _object(
         tell(way.name, done)
         if isinstance(sampled[way], str):
             continue
-        share = budget.traced if way.model == PATH_TRACED and len(chosen) > 1 else 1 / (len(chosen) - done)
+        share = budget.traced if way.walks and len(chosen) > 1 else 1 / (len(chosen) - done)
         share = min(share, GATHERED_SHARE) if way.light == GATHERED and len(chosen) > 1 and not samples else share
         for half, part in enumerate(on.looks(way)):
             started = clock()
             try:
                 number = seeded(seed, chosen.index(way), *([half] if half else []))
-                fewer = SLOW if way.model == PATH_TRACED else 1
+                fewer = SLOW if way.walks else 1
                 each = PILOT if samples else max(PILOT, LOOK // points.n) // fewer
                 result, beside = _begun(on, part, points, (number, each), k, sampled[way], half)
                 end, started = end + beside, started + beside
                 left = share * _part_of(on, way, part, budget) * (end - started) - (clock() - started)
-                blurs = way.model == PATH_TRACED and on.blurs and not part.soft
+                blurs = way.walks and on.blurs and not part.soft
                 left *= WALKED if blurs else 1.0
                 sample_more(on, part, points, result, number, seconds=left, samples=samples)
                 if blurs:
@@ -239,7 +239,7 @@ def _object(
                     wanted = result.estimate.samples // 2 - sum(each.samples for each in known)
                     result.blur = joined([*known, sample_blur(on, points, number, wanted)])
             except (ValueError, RuntimeError) as error:
-                if way.model == PATH_TRACED:
+                if way.walks:
                     raise ValueError(first_cause(error)) from error
                 sampled[way] = first_cause(error)
                 break
@@ -282,7 +282,7 @@ def _row(on: Stage, k: int, way: Way, sampled: list[Sampled] | str, walks: list[
     own, told = (joined([each.estimate for each in of(on, way, sampled)]) for of in (_own, _told))
     (walked,), (b,) = _own(on, WALKS, walks), [each.estimate for each in _told(on, WALKS, walks)]
     parts, last = [each.estimate for each in _told(on, way, sampled)], _own(on, way, sampled)[-1]  # with kernels ready
-    exact = way.model == PATH_TRACED
+    exact = way.walks
     bias2, doubt = Number(0.0, 0.0), Number(0.0, 0.0)
     if not exact:
         bias2 = mean_square(told, b) if len(parts) == 1 else mean_square_of_parts(parts, b, _kept(on, k, way))

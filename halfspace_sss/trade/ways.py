@@ -29,7 +29,7 @@ class Way:
     """A model for all objects, or "path_traced"; with orders instead of those of the scene, if any.
 
     Args:
-        model: name of a model, or "path_traced".
+        model: name of a model, or "path_traced": walks, or photons where light is gathered.
         orders: "multiple" leaves single scattering out; None takes the orders of the scene.
         light: "sampled" or "gathered", see `Settings`.
         part: of gathered light, see `Gathering`; 0 for all of it.
@@ -43,6 +43,11 @@ class Way:
     part: int = 0
     blur: float = 1.0
     soft: bool = False
+
+    @property
+    def walks(self) -> bool:
+        """Whether the integrator is `translucent_walk`."""
+        return self.model == PATH_TRACED and self.light != GATHERED
 
     @property
     def halves(self) -> tuple[Way, ...]:
@@ -65,9 +70,9 @@ class Way:
     def of(cls, name: str) -> Way:
         """The way of that name; ValueError if there is none."""
         model, *more = name.split(", ")
-        check_choice("way", model, (PATH_TRACED, *(m for m in model_names() if m != AUTO)))
+        check_choice("way", model, tuple(m for m in model_names() if m != AUTO))
         for part in more:
-            known = (NO_SINGLE,) if model in (PATH_TRACED, LAMBERT) else (NO_SINGLE, GATHERED)
+            known = (NO_SINGLE,) if model == LAMBERT else (NO_SINGLE, GATHERED)
             check_choice(f"what follows {model}", part, known)
         return cls(model, "multiple" if NO_SINGLE in more else None, GATHERED if GATHERED in more else "sampled")
 
@@ -78,9 +83,9 @@ WALKS = Way(PATH_TRACED)
 def ways() -> list[Way]:
     """All of them: path traced first, a diffuse surface, every model with light sampled and gathered, and those without
     the single scattering."""
-    names = [name for name in model_names() if name not in (AUTO, LAMBERT)]
+    names = [name for name in model_names() if name not in (AUTO, LAMBERT, PATH_TRACED)]
     results = [WALKS, Way(LAMBERT), *map(Way, names)]
-    results += [Way(name, light=GATHERED) for name in names]
+    results += [Way(name, light=GATHERED) for name in (*names, PATH_TRACED)]
     bare = [name for name in models() if model_class(name).orders == "multiple"]
     return results + [Way(name, "multiple") for name in bare if name in ("better_dipole", "neural")]
 
@@ -147,7 +152,7 @@ class Stage:
         """The integrator of a way, which keeps what it has made ready; shapes are the same in all light."""
         way = replace(way, soft=False)
         if way not in self._integrators:
-            if way.model == PATH_TRACED:
+            if way.walks:
                 plugin = {"type": "translucent_walk", **self.settings, "blur": way.blur}
             else:
                 plugin = {"type": "bssrdf", **self.settings, **self.bssrdf, "model": way.model, "light": way.light}
@@ -157,7 +162,7 @@ class Stage:
             if way.part:
                 self._integrators[way].gathering = Gathering(way.part)
             sampled = self._integrators.get(replace(way, light="sampled", part=0))
-            if way.light == GATHERED and sampled is not None and not mi.is_spectral:  # which refuses gathered light
+            if way.light == GATHERED and is_bssrdf(sampled) and not mi.is_spectral:  # which refuses gathered light
                 self._integrators[way].take_over(sampled)
         return self._integrators[way]
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from halfspace_sss.cli import trade
-from halfspace_sss.rendering.paths.gathering import PART, Gathering
+from halfspace_sss.rendering.paths.gathering import PART, Gathering, Transferred
 from halfspace_sss.trade import recommend
 from halfspace_sss.trade.advice import Job, advise
 from halfspace_sss.trade.automatic import picked
@@ -100,7 +100,8 @@ def test_the_kept_noise_of_gathered_parts_is_half_that_of_light_and_a_part_of_th
         for part in parts:
             transfer = T * rng.normal(1, of_transfer, T.shape) if of_transfer else T
             light = L * rng.normal(1, of_light, L.shape) if of_light else L
-            part._found = [SimpleNamespace(gathered=SimpleNamespace(transfer=transfer, light=light))]
+            gathered = Transferred(*[None] * 6, transfer=transfer, light=light)
+            part._found = [SimpleNamespace(gathered=gathered)]
         return parts[0].kept(parts[1], 0)
 
     assert kept(0.0, 0.3) == pytest.approx(0.5)
@@ -223,7 +224,7 @@ def test_a_way_comes_back_by_its_name(way: str) -> None:
     assert Way.of(way).name == way
 
 
-@pytest.mark.parametrize("unknown", ["path_traced, gathered", "lambert, gathered", "neural, collected"])
+@pytest.mark.parametrize("unknown", ["path_traced, sampled", "lambert, gathered", "neural, collected"])
 def test_a_way_that_does_not_exist_is_refused(unknown: str) -> None:
     with pytest.raises(ValueError, match="what follows"):
         Way.of(unknown)

@@ -6,14 +6,14 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any
 
-from halfspace_sss.checks import check_choice, check_interval
+from halfspace_sss.checks import check_choice, check_count, check_interval
 
 AUTOMATIC = -1.0
 ORDERS = ("total", "multiple", "single")
 GEOMETRIES = ("distance", "tangent")
 LIGHTS = ("sampled", "corrected", "gathered", "auto")
 SHARED = ("mm_per_unit", "max_depth", "rr_depth", "hide_emitters")  # what `translucent_walk` understands too
-OF_MODELS = ("geometry", "area_share", "entries")
+OF_MODELS = ("geometry", "area_share", "entries", "photons")
 
 
 @dataclass(frozen=True)
@@ -33,6 +33,7 @@ class Settings:
         light: "sampled", without bias; "corrected", the same with gathered light as control variate, see
             `paths.control_variate`; or "gathered" once for all samples, see `paths.gathering`: scattered light
             has a little bias and no noise; or "auto", the cheaper of both that keeps the tolerance, by measurement.
+        photons: of each object, where light is gathered for the model "path_traced".
         hide_emitters: whether directly visible emitters are left out.
         train_seconds: time for each object whose model has to learn it first; 0 refuses objects without weights.
         train_error: relative error under constant light, measured on the way, from which on it has learnt enough.
@@ -48,6 +49,7 @@ class Settings:
     geometry: str = "distance"
     area_share: float = AUTOMATIC
     entries: int = int(AUTOMATIC)
+    photons: int = 2**20
     hide_emitters: bool = False
     light: str = "sampled"
     train_seconds: float = 60.0
@@ -67,6 +69,7 @@ class Settings:
             raise ValueError(f"rr_depth must be at least 1, got {self.rr_depth}")
         if self.entries < 1 and self.entries != AUTOMATIC:
             raise ValueError(f"entries must be at least 1, got {self.entries}")
+        check_count("photons", self.photons, 1000)
         check_choice("light", self.light, LIGHTS)
         check_choice("orders", self.orders, ("", *ORDERS))
         if self.geometry not in GEOMETRIES:

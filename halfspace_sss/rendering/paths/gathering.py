@@ -3,7 +3,8 @@
 At each point the mean of the incident radiance, weighted by a(mu) mu, is estimated per channel by emitter sampling and
 by directions of the cosine (balance heuristic); what other surfaces send is traced along the latter, by the path loop.
 B = T L follows, see `gathered.transfer`, and at an exit L_o(x_o, w_o) = a(w_o) B(x_o), blended between points. Jensen
-and Buhler (2002) take two passes so with a dipole; here the second is a sparse matrix that outlives the light.
+and Buhler (2002) take two passes so with a dipole; here the second is a sparse matrix that outlives the light. Where no
+model is asked for but walks, these carry the light: see `photons`.
 
 What is not known: a dependence of the model on the azimuth between light and view; how light varies over directions,
 apart from its a(mu)-weighted mean, first moment, and what S along a few directions of it brings in the neighbourhood;
@@ -39,6 +40,7 @@ from halfspace_sss.rendering.object.shape import same_objects, state_of
 from halfspace_sss.rendering.paths.inner_light import COUNT, inner_light
 from halfspace_sss.rendering.paths.lighting import Lights, Sky, mis_weight
 from halfspace_sss.rendering.paths.path_loop import trace_paths
+from halfspace_sss.rendering.paths.photons import WalkedPoints, WalkedTransport, leaving
 
 if TYPE_CHECKING:
     from halfspace_sss.rendering.object.instances import Sight
@@ -60,21 +62,58 @@ class Gathered:
 
     Args:
         object: of it.
-        transfer: of its model.
+        points: where B is known.
+        albedo: a(mu).
         values: B of all points, for each channel the constant and the slope over w_o bent by the boundary.
-        light: that arrives, less c.
-        parts: independent estimates of it.
-        c: mean radiance of the sky in the channels where alpha is known, else 0, see `lighting.Sky`.
         inner: at events of order 1 inside; None where that order is traced.
+        e: exponent of the reflectance at exits, per channel, where media have textures.
     """
 
     object: TranslucentObject
-    transfer: Transfer
+    points: SurfacePoints
+    albedo: Albedo
     values: mi.Float
-    light: Incident
-    parts: tuple[Incident, ...]
-    c: np.ndarray
     inner: InnerLight | None = None
+    e: np.ndarray | None = None
+
+    @property
+    def told(self) -> str:
+        """How many points, and the noise of B."""
+        raise NotImplementedError
+
+    def radiance(self, out: SurfacePoint, active: mi.Bool) -> mi.Spectrum:
+        """L_o of an exit; 0 below the horizon."""
+        size = dr.size_v(mi.Spectrum)
+        B = self.points.blend(self.values, 4 * size, out.p, out.n, active)
+        rows, w = [B[4 * c : 4 * c + 4] for c in range(size)], bent(out.w, out.n_out, self.albedo.eta)
+        B = mi.Spectrum([b + x * w.x + y * w.y + z * w.z for b, x, y, z in rows])
+        mu = dr.dot(out.w, out.n_out)
+        paint = None if self.object.textured is None else self.object.transport.paint(out)
+        a = self.albedo(dr.maximum(mu, 0), paint)
+        if paint is not None:
+            a *= paint ** mi.Spectrum([opaque(v) for v in self.e])
+        alpha = self.object.transport.alpha
+        if alpha is not None:
+            known = alpha.known[1]
+            a = known * alpha(out, active)[1] + (1 - known) * a
+        return dr.select(active & (mu > 0), a * dr.maximum(B, 0), 0)
+
+
+@dataclass(frozen=True, eq=False)
+class Transferred(Gathered):
+    """By the transfer of a model.
+
+    Args:
+        transfer: of it.
+        light: that arrives, less c.
+        parts: independent estimates of it.
+        c: mean radiance of the sky in the channels where alpha is known, else 0, see `lighting.Sky`.
+    """
+
+    transfer: Transfer = None
+    light: Incident = None
+    parts: tuple[Incident, ...] = ()
+    c: np.ndarray | float = 0.0
 
     @cached_property
     def error(self) -> float:
@@ -83,30 +122,49 @@ class Gathered:
         spread = found.var(axis=0, ddof=1).mean() if len(found) > 1 else np.nan
         return float(np.sqrt(spread / len(found)) / max(float(found.mean()), 1e-30))
 
-    def radiance(self, out: SurfacePoint, active: mi.Bool) -> mi.Spectrum:
-        """L_o of an exit; 0 below the horizon."""
-        size = dr.size_v(mi.Spectrum)
-        B = self.transfer.points.blend(self.values, 4 * size, out.p, out.n, active)
-        rows, w = [B[4 * c : 4 * c + 4] for c in range(size)], bent(out.w, out.n_out, self.transfer.albedo.eta)
-        B = mi.Spectrum([b + x * w.x + y * w.y + z * w.z for b, x, y, z in rows])
-        mu = dr.dot(out.w, out.n_out)
-        paint = None if self.object.textured is None else self.object.transport.paint(out)
-        a = self.transfer.albedo(dr.maximum(mu, 0), paint)
-        if paint is not None:
-            a *= paint ** mi.Spectrum([opaque(v) for v in self.transfer.e])
-        alpha = self.object.transport.alpha
-        if alpha is not None:
-            known = alpha.known[1]
-            a = known * alpha(out, active)[1] + (1 - known) * a
-        return dr.select(active & (mu > 0), a * dr.maximum(B, 0), 0)
+    @property
+    def told(self) -> str:
+        return (
+            f"gathered at {len(self.points)} points, {1e-6 * self.transfer.nbytes:.0f} MB: noise of the transfer "
+            f"{self.transfer.error:.1%} a point, of the light {self.error:.1%}"
+        )
+
+    def kept(self, other: Transferred) -> float:
+        """Of the variance of two parts the share that gathering with all samples has."""
+        B = self.transfer @ self.light
+        by_light = ((B - self.transfer @ other.light) ** 2).mean()
+        by_transfer = ((B - other.transfer @ self.light) ** 2).mean()
+        whole = by_light + by_transfer
+        return float((0.5 * by_light + PART * by_transfer) / whole) if whole > 0 else 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Walked(Gathered):
+    """By photons.
+
+    Args:
+        count: of them.
+        error: standard error of B over its mean.
+    """
+
+    count: int = 0
+    error: float = 0.0
+
+    @property
+    def told(self) -> str:
+        return f"carried by {self.count} photons to {len(self.points)} points: noise {self.error:.1%} a point"
+
+    def kept(self, other: Walked) -> float:
+        """Of the variance of two parts the share that all photons have."""
+        return PART
 
 
 class Gathering:
     """Gathered light of the objects of a scene, kept until something in the scene changes.
 
     Args:
-        part: 0 for all samples; others are independent of each other, with a share `PART` of the samples of a transfer
-            and half the light.
+        part: 0 for all samples; others are independent of each other, with a share `PART` of the photons, or of the
+            samples of a transfer and half the light.
 
     Attributes:
         seconds: by `clock`, of the transfers and of the light, as they were last found.
@@ -115,7 +173,7 @@ class Gathering:
     def __init__(self, part: int = 0) -> None:
         self._part, self.seconds = part, (0.0, 0.0)
         self._objects: list[TranslucentObject] = []
-        self._transfers: list[Transfer] = []
+        self._transfers: list[Transfer | WalkedPoints | None] = []
         self._events: list[Events | None] = []
         self._light: tuple[list, list] = ([], [])
         self._found: list[TranslucentObject] = []
@@ -133,7 +191,7 @@ class Gathering:
                     _check(obj)
             started = clock()
             share = PART if self._part else 1.0
-            made = [transfer(obj, share, SEED + self._part) if one else None for obj, one in zip(objects, spread)]
+            made = [_ways(obj, share, SEED + self._part) if one else None for obj, one in zip(objects, spread)]
             self._transfers, self._objects, self._light = made, objects, ([], [])
             inner = [bool(one and not self._part and has_inner_light(obj)) for obj, one in zip(objects, spread)]
             self._events = [Events.of(obj, COUNT) if one else None for obj, one in zip(objects, inner)]
@@ -160,27 +218,23 @@ class Gathering:
             other: another part of the same scene.
             k: number of the object.
         """
-        one, two = self._found[k].gathered, other._found[k].gathered
-        B = one.transfer @ one.light
-        by_light = ((B - one.transfer @ two.light) ** 2).mean()
-        by_transfer = ((B - two.transfer @ one.light) ** 2).mean()
-        whole = by_light + by_transfer
-        return float((0.5 * by_light + PART * by_transfer) / whole) if whole > 0 else 1.0
+        one = self._found[k].gathered
+        return 1.0 if one is None else one.kept(other._found[k].gathered)
 
     def told(self) -> list[str]:
-        """Of each object: points, memory, and the noise of transfer and light."""
+        """Of each object: points, memory, and noise."""
         results = [obj.gathered for obj in self._found if obj.gathered is not None]
-        return [
-            f"light of {g.object.geometry.name} gathered at {len(g.transfer.points)} points, "
-            f"{1e-6 * g.transfer.nbytes:.0f} MB: noise of the transfer {g.transfer.error:.1%} a point, "
-            f"of the light {g.error:.1%}"
-            for g in results
-        ]
+        return [f"light of {g.object.geometry.name} {g.told}" for g in results]
 
 
 def spreads(obj: TranslucentObject) -> bool:
     """Whether light leaves elsewhere than it entered, by orders that a transport has, of an object at one place."""
     return obj.transport is not None and not obj.transport.is_delta and not obj.repeated
+
+
+def _ways(obj: TranslucentObject, share: float, seed: int) -> Transfer | WalkedPoints:
+    """What carries light through an object."""
+    return WalkedPoints.of(obj) if isinstance(obj.transport, WalkedTransport) else transfer(obj, share, seed)
 
 
 def _check(obj: TranslucentObject) -> None:
@@ -202,13 +256,23 @@ def light_state(scene: mi.Scene) -> tuple[list, list]:
 
 
 def _leaving(
-    scene: mi.Scene, objects: list[TranslucentObject], k: int, of: tuple[Transfer, Events | None], settings: Settings,
-    seed: int, parts: int,
+    scene: mi.Scene, objects: list[TranslucentObject], k: int, of: tuple[Transfer | WalkedPoints, Events | None],
+    settings: Settings, seed: int, parts: int,
 ) -> Gathered:  # fmt: skip
     """B of object k, by light in parts whose differences tell the noise, and light inside."""
     T, events = of
     found, rays = _incident(scene, objects, T, settings, 2 * k + seed, parts)
     lights, others = zip(*found)
+    if not all(np.isfinite(light.mean).all() for light in lights):
+        raise ValueError(f"light at object {objects[k].geometry.name} must be finite, got NaN or infinity")
+    inner = None
+    if events is not None:
+        seen = mi.Float(np.mean(others, axis=0).astype(np.float32).ravel())
+        inner = inner_light(scene, objects, k, settings, events, (T.points, seen))
+    if isinstance(T, WalkedPoints):
+        count = int(settings.photons * (PART if parts == 1 else 1))
+        albedo, B, error = leaving(T, rays, count, 2 * k + seed)
+        return Walked(objects[k], T.points, albedo, mi.Float(B.astype(np.float32).ravel()), inner, None, count, error)
     sky = Sky.of(scene, Lights.of(scene), objects[k : k + 1])
     c = np.zeros(len(T.trusted)) if sky is None else T.trusted * np.ravel(np.array(sky.mean))
     lights = tuple(replace(light, mean=light.mean - c.astype(np.float32)) for light in lights)
@@ -218,21 +282,22 @@ def _leaving(
     if objects[k].textured is None:  # averages over the neighbourhood would cross edges of textures
         direct = np.maximum(rays.light.sum(axis=1) / T.around.whole - c, 0)
         B += T.beyond(direct.astype(np.float32), rays)
-    if not np.isfinite(B).all():
-        raise ValueError(f"light at object {objects[k].geometry.name} must be finite, got NaN or infinity")
-    inner = None
-    if events is not None:
-        seen = mi.Float(np.mean(others, axis=0).astype(np.float32).ravel())
-        inner = inner_light(scene, objects, k, settings, events, (T.points, seen))
-    return Gathered(objects[k], T, mi.Float(B.astype(np.float32).ravel()), light, lights, c, inner)
+    values = mi.Float(B.astype(np.float32).ravel())
+    return Transferred(objects[k], T.points, T.albedo, values, inner, T.e, T, light, lights, c)
 
 
 def _incident(
-    scene: mi.Scene, objects: list[TranslucentObject], T: Transfer, settings: Settings, seed: int, parts: int
+    scene: mi.Scene,
+    objects: list[TranslucentObject],
+    T: Transfer | WalkedPoints,
+    settings: Settings,
+    seed: int,
+    parts: int,
 ) -> tuple[list[tuple[Incident, np.ndarray]], Rays]:
-    """Incident radiance at all points, and the mean of other surfaces that each sees, in parts; emitters' light by ray.
+    """Incident radiance at all points, and the mean of other surfaces that each sees, in parts; light by ray.
 
-    Parts are independent estimates by as many directions each, of one launch.
+    Parts are independent estimates by as many directions each, of one launch. For a transfer rays have the light of
+    emitters alone.
     """
     count, rows = len(T.points), len(T.points) * parts
     n = int(np.clip(DIRECTIONS // (2 * count), FEWEST, MOST)) // TRACED * TRACED
@@ -256,7 +321,8 @@ def _incident(
     values = [aimed + met, *(aimed * d_e[i] + met * d_c[i] for i in range(3))]
     values += [TRACED * more, *(TRACED * more * d_c[i] for i in range(3)), TRACED * dr.select(on, a, 0)]
     values = [mi.Spectrum(v) + dr.zeros(mi.Float, rows * n) for v in values]
-    each_light = [mi.Spectrum(v) + dr.zeros(mi.Float, rows * n) for v in (aimed, met)]
+    along = met + TRACED * more if isinstance(T, WalkedPoints) else met
+    each_light = [mi.Spectrum(v) + dr.zeros(mi.Float, rows * n) for v in (aimed, along)]
     dr.eval(values, each_light, w_e, w_c)
     j, s = lane // each, lane % each
     order = dr.select(s % TRACED == 0, j * few + s // TRACED, all_few + j * (each - few) + s - s // TRACED - 1)

@@ -118,7 +118,7 @@ def load_scene(
     Args:
         scene: a dict as for `mitsuba.load_dict`, or the path of an XML file.
         model: for all translucent objects, instead of what the scene says: the name of a model, or "path_traced",
-            which walks through the objects instead.
+            which walks through the objects instead, from the light if that is gathered.
         orders: of all translucent objects, instead of what the scene says.
         parameters: values of the parameters $name of an XML file.
         settings: parameters of the integrator `bssrdf`, instead of what the scene says.
@@ -142,19 +142,22 @@ def open_scene(
     settings: Mapping[str, float] | None = None,
 ) -> Any:
     """As `load_scene`, but nothing is prepared yet: no model is made, and no object is learnt."""
-    _check("model", model, (*model_names(), PATH_TRACED))
+    _check("model", model, model_names())
     _check("orders", orders, ORDERS)
+    walks = model == PATH_TRACED and (settings or {}).get("light") != "gathered"
     state, config = _parsed(scene, parameters or {})
     # a model that knows whole objects does not know what Mitsuba makes of several with the same BSDF
     names = [str(props.get("model", "")) for props in _surfaces(state)]
-    config.merge_meshes = not any(name in model_names() and lookup(name).knows_objects for name in (*names, model))
+    config.merge_meshes = not any(
+        name in model_names() and lookup(name).knows_objects for name in (*names, "" if walks else model)
+    )
     _transform(scene, state, config)
     for props in _surfaces(state):  # anew: the nodes have moved
-        if model and model != PATH_TRACED:
+        if model and not walks:
             props["model"] = model
         if orders:
             props["orders"] = orders
-    _choose_integrator(state, model, bool(model or orders), settings or {})
+    _choose_integrator(state, walks, (bool(model), bool(model or orders)), settings or {})
     _set_parameters(state, settings or {})
     loaded = _made(scene, state, config)
     if not any(map(surface_of, loaded.shapes())):
@@ -243,9 +246,9 @@ def _unreadable(scene: dict | str | Path, error: RuntimeError) -> ValueError:
     return ValueError(f"{name} cannot be read: {first_cause(error)}")
 
 
-def _choose_integrator(state: Any, model: str | None, asked: bool, settings: Mapping[str, float]) -> None:
-    """Make the integrator fit what is asked for; one that is made gets the settings."""
-    wanted = _INTEGRATORS[model == PATH_TRACED]
+def _choose_integrator(state: Any, walks: bool, asked: tuple[bool, bool], settings: Mapping[str, float]) -> None:
+    """Make the integrator fit: whether a model, or anything, is asked for; one that is made gets the settings."""
+    wanted, (model, anything) = _INTEGRATORS[walks], asked
     ours = [node.props for node in state.nodes if node.props.plugin_name() in _INTEGRATORS.values()]
     for props in ours if model else ():
         _set_integrator(props, wanted)
@@ -253,9 +256,9 @@ def _choose_integrator(state: Any, model: str | None, asked: bool, settings: Map
         return
     others = [node.props for node in state.nodes if node.type == mi.ObjectType.Integrator]
     if not others:
-        given = {} if model == PATH_TRACED else settings
+        given = {} if walks else settings
         state.nodes[0].props["integrator"] = mi.load_dict({"type": wanted, **given})
-    elif asked:
+    elif anything:
         name = others[0].plugin_name()
         warnings.warn(f"the integrator {name!r} of the scene is replaced by {wanted!r}", stacklevel=3)
         _set_integrator(others[0], wanted)

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 from halfspace_sss.provenance import provenance, write_atomically
-from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED
 from halfspace_sss.trade.assessing import assess_stage
 from halfspace_sss.trade.results import Assessment, ObjectTrade, WayTrade
 from halfspace_sss.trade.statistics import seeded
@@ -40,7 +39,7 @@ def long_run(on: Stage, ways: Sequence[Way], tolerance: float, path: Path, seed:
         names = _open(result.objects[0], tolerance) if result else [way.name for way in ways]
         if result and (not names or len(batches) * BATCH >= seconds):
             return result
-        few = [way for way in ways if way.name in names or way.model == PATH_TRACED]
+        few = [way for way in ways if way.name in names or way.walks]
         traced = LATER if batches else FIRST
         batch = assess_stage(on, few, seconds=min(BATCH, seconds), seed=seeded(seed, len(batches)), traced=traced)
         batches.append(batch.record())
