@@ -119,6 +119,12 @@ def test_path_traced_is_the_walk_unless_its_light_is_gathered(settings: dict, bs
     assert is_bssrdf(scene.integrator()) == bssrdf
 
 
+@pytest.mark.parametrize("light", ["gatherd", "corrected"])
+def test_path_traced_takes_no_light_but_sampled_and_gathered(light: str) -> None:
+    with pytest.raises(ValueError, match=f"light must be one of sampled, gathered, got '{light}'"):
+        open_scene(_dict(SKY, {"type": "bssrdf"}), "path_traced", None, None, {"light": light})
+
+
 def test_the_way_is_rendered_by_the_flags_that_it_names() -> None:
     assert Way.of("path_traced, gathered").flags == "--model path_traced --light gathered"
     assert not Way.of("path_traced, gathered").walks

@@ -108,6 +108,9 @@ def test_the_kept_noise_of_gathered_parts_is_half_that_of_light_and_a_part_of_th
     assert kept(0.3, 0.0) == pytest.approx(PART)
     assert PART < kept(0.3, 0.3) < 0.5
     assert kept(0.0, 0.0) == 1.0
+    part = Gathering(1)
+    part._found = [SimpleNamespace(gathered=None)]  # of an object without orders from two on
+    assert part.kept(part, 0) == 1.0
 
 
 @pytest.mark.parametrize(("bias2", "bias2_error", "error"), [(0.0, 0.0, 0.1), (4e-4, 3e-4, 0.3), (-1e-3, 5e-4, 2.0)])

@@ -17,7 +17,7 @@ import mitsuba as mi
 
 from halfspace_sss.interrupts import is_interrupt
 from halfspace_sss.rendering.object.registry import lookup, model_names
-from halfspace_sss.rendering.object.settings import ORDERS, SHARED
+from halfspace_sss.rendering.object.settings import LIGHTS, ORDERS, SHARED
 from halfspace_sss.rendering.object.wrapped import surface_of
 from halfspace_sss.rendering.paths.integrator import is_bssrdf
 
@@ -144,7 +144,9 @@ def open_scene(
     """As `load_scene`, but nothing is prepared yet: no model is made, and no object is learnt."""
     _check("model", model, model_names())
     _check("orders", orders, ORDERS)
-    walks = model == PATH_TRACED and (settings or {}).get("light") != "gathered"
+    light = (settings or {}).get("light")
+    _check("light", light, LIGHTS if model != PATH_TRACED else ("sampled", "gathered"))
+    walks = model == PATH_TRACED and light != "gathered"
     state, config = _parsed(scene, parameters or {})
     # a model that knows whole objects does not know what Mitsuba makes of several with the same BSDF
     names = [str(props.get("model", "")) for props in _surfaces(state)]
