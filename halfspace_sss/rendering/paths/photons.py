@@ -117,7 +117,14 @@ class Leaving(NamedTuple):
 
 
 def leaving(here: WalkedPoints, rays: Rays, count: int, seed: int) -> Leaving:
-    """By so many photons of light that was gathered along rays to the points."""
+    """What photons of gathered light tell.
+
+    Args:
+        here: points of the object.
+        rays: to these, with all light that arrives.
+        count: photons, `PASS` at a time, so that memory is that of a pass.
+        seed: of the photons.
+    """
     points, eta = here.points, float(here.object.media[0].eta)
     passes = max(round(count / PASS), 1)
     left = _left(here, rays, count // passes, (seed, 0))

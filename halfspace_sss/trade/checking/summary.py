@@ -100,7 +100,7 @@ def markdown(values: dict[str, Any], table: pandas.DataFrame, how: dict[str, Any
         f"{values['kept']} of {n} recommendations keep their tolerance (within two standard errors of the long run), "
         f"{values['cheap']} cost at most {DEAR:g} times the cheapest way that does by the long run, "
         f"{values['surely_cheap']} of the cheapest that does by two of its standard errors; an assessment took at most "
-        f"{values['assess_s']:.2g} s of two cores, compilation left out.",
+        f"{values['assess_s']:.2g} s of the processor, compilation left out.",
         "",
         f"(bias² of the assessment - bias² of the long run) over their standard errors, {z['count']} pairs: mean "
         f"{z['mean']:+.2f}, standard deviation {z['sd']:.2f}, {100 * z['beyond_2']:.1f} % beyond 2, "
