@@ -286,6 +286,13 @@ def test_the_light_of_the_model_is_gathered_by_which_the_job_is_expected_to_end_
     assert most_promising(dear, ways, 0.05, 10_000) == ways[0]
 
 
+def test_photons_are_tried_where_no_model_promises_to_keep_the_tolerance() -> None:
+    ways = [Way.of("neural, gathered"), Way.of("path_traced, gathered")]
+    near, far = (_assessment(_way("neural", bias, 0.01, 4e-6)).objects for bias in (0.01, 0.08))
+    assert most_promising(near, ways, 0.05, 10_000) == ways[0]
+    assert most_promising(far, ways, 0.05, 10_000) == ways[1]
+
+
 def test_of_the_noise_of_gathered_light_what_a_render_keeps_counts_as_bias() -> None:
     rng, found = np.random.default_rng(6), []
     off, own, kept = 0.1, 0.2, 0.15
