@@ -60,14 +60,14 @@ def test_pixels_are_those_of_walks_within_8_percent_and_their_mean_within_2() ->
 
 def test_what_absorbs_nothing_cannot_be_seen_under_an_even_sky() -> None:
     white = {"sigma_s": "1,1.5,2", "sigma_a": "0,0,0", "g": 0.3, "eta": 1.4}
-    found = _image(_gathered(SKY, white, orders="total", reflection=True), 256)[2:-2, 2:-2]  # without the rim
-    assert np.abs(found.mean(axis=(0, 1)) - 1).max() < 0.015
-    assert np.abs(found - 1).max() < 0.12
+    found = _image(_gathered(SKY, white, 2**17, orders="total", reflection=True))[2:-2, 2:-2]  # without the rim
+    assert np.abs(found.mean(axis=(0, 1)) - 1).max() < 0.04  # noise is 0.01, of a pixel 0.08
+    assert np.abs(found - 1).max() < 0.4
 
 
 def test_four_times_the_photons_have_half_the_noise() -> None:
     errors = []
-    for photons in (2**16, 2**18):
+    for photons in (2**14, 2**16):
         scene = _gathered(_lit(), photons=photons)
         errors.append(scene.integrator().prepare(scene)[0].gathered.error)
     assert 1.6 < errors[0] / errors[1] < 2.5
