@@ -248,8 +248,8 @@ class Transfer:
         d = _bent(lit.w, n, self.albedo.eta) - self.around.middle[point]
         expected = 1 + g[:, :, 0] * (d * n).sum(axis=1)[:, None] + g[:, :, 1] * (d * toward).sum(axis=1)[:, None]
         more = (found - t * np.maximum(expected, 0)) * lit.colour * L[point] * lit.share[:, None]
-        brought, upright = (_of_rows(row, v, rows) for v in (more, more * g[:, :, 0]))
-        aside = [_of_rows(row, more * g[:, :, 1] * toward[:, k, None], rows) for k in range(3)]
+        brought, upright = (row_sums(row, v, rows) for v in (more, more * g[:, :, 0]))
+        aside = [row_sums(row, more * g[:, :, 1] * toward[:, k, None], rows) for k in range(3)]
         slope = self._slope(
             brought, upright[:, :, None] * self._n_out[:, None] - np.stack(aside, axis=2), BEYOND_ROUNDS
         )
@@ -424,10 +424,10 @@ def _bent(w: np.ndarray, n: np.ndarray, eta: float) -> np.ndarray:
 
 def _summed(step: np.ndarray, values: np.ndarray, size: int) -> np.ndarray:
     """Sums of values of pairs, (points, samples, channels), of each step."""
-    return _of_rows(step.ravel(), values.reshape(-1, values.shape[2]), size)
+    return row_sums(step.ravel(), values.reshape(-1, values.shape[2]), size)
 
 
-def _of_rows(row: np.ndarray, values: np.ndarray, rows: int) -> np.ndarray:
+def row_sums(row: np.ndarray, values: np.ndarray, rows: int) -> np.ndarray:
     """Sums of values (entries, channels) of each row."""
     return np.stack([np.bincount(row, v, rows) for v in values.T], axis=1)
 

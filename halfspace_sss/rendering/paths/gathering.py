@@ -13,6 +13,7 @@ detail of light below the distance of the points. Its noise is that of the gathe
 
 from __future__ import annotations
 
+import abc
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -57,7 +58,7 @@ TRACED = 8  # one of so many directions by the cosine is traced further, where i
 
 
 @dataclass(frozen=True, eq=False)
-class Gathered:
+class Gathered(abc.ABC):
     """Radiance of orders from two on that leaves an object in the light of a scene.
 
     Args:
@@ -77,9 +78,13 @@ class Gathered:
     e: np.ndarray | None = None
 
     @property
+    @abc.abstractmethod
     def told(self) -> str:
         """How many points, and the noise of B."""
-        raise NotImplementedError
+
+    @abc.abstractmethod
+    def kept(self, other: Any) -> float:
+        """Of the variance of two parts the share that all samples have."""
 
     def radiance(self, out: SurfacePoint, active: mi.Bool) -> mi.Spectrum:
         """L_o of an exit; 0 below the horizon."""
@@ -130,7 +135,6 @@ class Transferred(Gathered):
         )
 
     def kept(self, other: Transferred) -> float:
-        """Of the variance of two parts the share that gathering with all samples has."""
         B = self.transfer @ self.light
         by_light = ((B - self.transfer @ other.light) ** 2).mean()
         by_transfer = ((B - other.transfer @ self.light) ** 2).mean()
@@ -155,7 +159,6 @@ class Walked(Gathered):
         return f"carried by {self.count} photons to {len(self.points)} points: noise {self.error:.1%} a point"
 
     def kept(self, other: Walked) -> float:
-        """Of the variance of two parts the share that all photons have."""
         return PART
 
 

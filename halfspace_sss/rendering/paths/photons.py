@@ -25,7 +25,7 @@ import numpy as np
 
 from halfspace_sss.physics.fresnel import F_t
 from halfspace_sss.rendering.gathered.points import REACH, SurfacePoints, lattice, uniform_entries
-from halfspace_sss.rendering.gathered.transfer import RINGS, ROUNDS, Albedo, Hemispheres, bent, count_of
+from halfspace_sss.rendering.gathered.transfer import RINGS, ROUNDS, Albedo, Hemispheres, bent, count_of, row_sums
 from halfspace_sss.rendering.object.half_space import half_space_model
 from halfspace_sss.rendering.object.points import ObjectModel, SurfacePoint, TransportAround
 from halfspace_sss.rendering.walk.media import media_within
@@ -178,9 +178,9 @@ def _left(here: WalkedPoints, rays: Rays, count: int, seed: tuple[int, ...]) -> 
 def _deposited(left: _LeftAt, around: Hemispheres, rows: int) -> tuple[np.ndarray, np.ndarray]:
     """Sums of flux by half, ring and point, (2, rings, points, channels), and first moments (points, channels, 3)."""
     kinds, half = len(ROUNDS), np.arange(len(left.near)) % 2
-    sums = _sums((half * kinds + left.ring) * rows + left.near, left.flux, 2 * kinds * rows)
+    sums = row_sums((half * kinds + left.ring) * rows + left.near, left.flux, 2 * kinds * rows)
     about = left.w - around.middle[left.near]
-    first = [_sums(left.near, left.flux * about[:, k, None], rows) for k in range(3)]
+    first = [row_sums(left.near, left.flux * about[:, k, None], rows) for k in range(3)]
     return sums.reshape(2, kinds, rows, -1), np.stack(first, axis=2)
 
 
@@ -206,7 +206,7 @@ def _fitted(left: _LeftAt, eta: float) -> Albedo:
     """a(mu) by least squares over a histogram of what leaves, which is as a(mu) mu."""
     at = (np.arange(BINS) + 0.5) / BINS
     basis = (F_t(at, eta) * at)[:, None] * at[:, None] ** np.arange(3)
-    seen = _sums(np.minimum((left.mu * BINS).astype(int), BINS - 1), left.flux, BINS)
+    seen = row_sums(np.minimum((left.mu * BINS).astype(int), BINS - 1), left.flux, BINS)
     dark = ~(seen.sum(axis=0) > 0)
     seen = np.where(dark, seen.sum(axis=1, keepdims=True) + basis[:, :1] * dark.all(), seen)
     return Albedo(np.linalg.lstsq(basis, seen / seen.mean(axis=0), rcond=None)[0].T, eta)
@@ -234,7 +234,3 @@ def _slope(points: SurfacePoints, around: Hemispheres, first: np.ndarray, over: 
     C, upright = around.covariance, np.einsum("jik,jai,jak->j", around.covariance, n, n)
     spread = 0.5 * (np.trace(C, axis1=1, axis2=2) - upright)
     return (first - (first * n).sum(axis=2, keepdims=True) * n) / (spread[:, None] * np.maximum(over, 1e-30))[..., None]
-
-
-def _sums(row: np.ndarray, values: np.ndarray, rows: int) -> np.ndarray:
-    return np.stack([np.bincount(row, v, rows) for v in values.T], axis=1)
