@@ -74,7 +74,7 @@ def figures_command(
         if workers is None and scheduler is None and variant == "llvm_ad_rgb" and quality is Quality.draft:
             workers = _workers(plans) if action in (Action.compute, Action.all) else None
         with executor_of(workers, scheduler) as executor:
-            do(plans, out, executor)
+            do(plans, out, executor, workers and AHEAD * workers)
     except ModuleNotFoundError as error:
         if (error.name or "").split(".")[0] not in EXTRAS:
             raise
@@ -98,7 +98,7 @@ def _say(text: str) -> None:
     console().print(text, highlight=False, markup=False, soft_wrap=True)
 
 
-def _list(plans: list[Plan], out: Path, executor: Executor | None) -> None:
+def _list(plans: list[Plan], out: Path, executor: Executor | None, most: int | None) -> None:
     from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
@@ -143,19 +143,19 @@ def _announce(p: Plan) -> None:
         _say(f"  {sources.count(source)} measured by {source}, scaled by work")
 
 
-def _compute(plans: list[Plan], out: Path, executor: Executor | None) -> None:
-    for _ in _completed(plans, executor):
+def _compute(plans: list[Plan], out: Path, executor: Executor | None, most: int | None) -> None:
+    for _ in _completed(plans, executor, most):
         pass
 
 
-def _completed(plans: list[Plan], executor: Executor | None) -> Iterator[Plan]:
+def _completed(plans: list[Plan], executor: Executor | None, most: int | None) -> Iterator[Plan]:
     """The figures as all of their parts are computed."""
     from figures.parts.runner import completed_plans, duration
 
     _announce_all(plans)
-    started, most = time.perf_counter(), getattr(executor, "_max_workers", None)
+    started = time.perf_counter()
     with Bar(plans[0].name if len(plans) == 1 else "figures") as bar:
-        for p in completed_plans(plans, bar.show, _say, executor, most and AHEAD * most):
+        for p in completed_plans(plans, bar.show, _say, executor, most):
             with bar.standing():
                 yield p
     if any(p.missing for p in plans):
@@ -174,7 +174,7 @@ def _announce_all(plans: list[Plan]) -> None:
         _say(f"together about {duration(sum(each.values()))}{more}")
 
 
-def _draw(plans: list[Plan], out: Path, executor: Executor | None) -> None:
+def _draw(plans: list[Plan], out: Path, executor: Executor | None, most: int | None) -> None:
     from figures.parts.runner import draw
 
     for p in plans:
@@ -182,6 +182,6 @@ def _draw(plans: list[Plan], out: Path, executor: Executor | None) -> None:
             _say(f"  {path}")
 
 
-def _all(plans: list[Plan], out: Path, executor: Executor | None) -> None:
-    for p in _completed(plans, executor):
-        _draw([p], out, executor)
+def _all(plans: list[Plan], out: Path, executor: Executor | None, most: int | None) -> None:
+    for p in _completed(plans, executor, most):
+        _draw([p], out, executor, most)

@@ -54,8 +54,10 @@ import atexit, gc, json, os, signal, subprocess, sys
 from pathlib import Path
 import matplotlib.pyplot, pandas, scipy.interpolate, torch, zarr  # once for all runs: each is a fork
 from halfspace_sss.cli import shared
+from figures.parts import command
 from halfspace_sss.cli import app as cli
 cli._app()
+command.MOST_WORKERS = 1  # the process that is interrupted writes the files, and no other has written some by then
 gc.freeze()
 
 for folder, mount, moment, stub, arguments in json.loads(sys.argv[1]):
