@@ -109,7 +109,6 @@ EVENTS = 1e6  # of the walks of one object
 FEWEST_WALKS, WALKS = 2**13, 2**15
 KEPT = 2**13  # walks that left, and proposals, of one object
 FEWEST_EXITS = 128
-ROULETTE_FROM = 8
 NAMES = ("walks", "T", "proposals", "W", "medium", "share")
 
 
@@ -154,7 +153,7 @@ def make_data(obj: TranslucentObject, events: float, seed: tuple[int, ...]) -> P
     """
     n = int(np.clip(EVENTS / events, FEWEST_WALKS, WALKS))
     starts = obj.random_points(generator(mi, n, pass_seed(*seed, 0)))
-    exits = trace_exits(obj, starts, (*seed, 1), roulette_from=ROULETTE_FROM)
+    exits = trace_exits(obj, starts, (*seed, 1))
     kept = dr.compress(exits.T[0] > 0)
     if dr.width(kept) < FEWEST_EXITS:
         return None

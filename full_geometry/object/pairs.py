@@ -43,9 +43,6 @@ from halfspace_sss.rendering.walk.random_walk import WalkExits, exits
 from halfspace_sss.rendering.walk.scores import Score, scored_exits
 from halfspace_sss.tracing.walk import generator, pass_seed
 
-LANES = 2**15
-ROULETTE_FROM = 8  # scattering events: from 2 on weak channels of ketchup have 10 times the variance, for no time less
-
 
 def trace_exits(
     obj: TranslucentObject,
@@ -54,7 +51,6 @@ def trace_exits(
     *,
     fewest: int = 2,
     most: int = 2**31 - 1,
-    roulette_from: int = ROULETTE_FROM,
 ) -> WalkExits:
     """One walk from each start.
 
@@ -62,18 +58,17 @@ def trace_exits(
         starts: where light is seen to leave, and the direction towards the eye.
         seed: of the pass, as for `walk.pass_seed`.
         fewest, most: numbers of scattering events that are kept.
-        roulette_from: scattering events, from which on walks of little weight are ended by chance.
 
     Raises:
         ValueError: fewest is not a whole number >= 0.
     """
     check_count("fewest", fewest, 0)
-    return exits(media_within(obj), 0, starts, seed, LANES, roulette_from, fewest, most)
+    return exits(media_within(obj), 0, starts, seed, fewest, most)
 
 
 def trace_scores(obj: TranslucentObject, starts: SurfacePoint, seed: tuple[int, ...]) -> tuple[Any, Score]:
     """T of one walk from each start, of two events and more, and the scores of walks that left."""
-    exits, scores = scored_exits(media_within(obj), 0, starts, seed, LANES, ROULETTE_FROM, 2)
+    exits, scores = scored_exits(media_within(obj), 0, starts, seed, 2)
     return exits.T, scores
 
 

@@ -39,7 +39,6 @@ if TYPE_CHECKING:
 MODEL, BETWEEN = "path_traced", "better_dipole"  # the latter for light from one object to the next, or itself
 PASS = 2**20  # photons at a time
 PLACES = 2**20  # by which areas of points are measured
-LANES, ROULETTE_FROM = 2**15, 8  # of walks; see `full_geometry.object.pairs`
 BINS = 64  # of cosines of exits
 SLOPE_ROUNDS = 12  # smoothings of the slope over w_o
 
@@ -163,7 +162,7 @@ class _LeftAt(NamedTuple):
 def _left(here: WalkedPoints, rays: Rays, count: int, seed: tuple[int, ...]) -> _LeftAt:
     points, eta = here.points, float(here.object.media[0].eta)
     start, entered, power = _photons(here, rays, count, seed)
-    found = exits(media_within(here.object), 0, start, (*seed, 19), LANES, ROULETTE_FROM, 2)
+    found = exits(media_within(here.object), 0, start, (*seed, 19), 2)
     near, known = points.nearest(found.at.p, found.at.n, found.left)
     mu, w = dr.dot(found.at.w, found.at.n_out), bent(found.at.w, found.at.n_out, eta)
     kept = known & found.left & (mu > 0)

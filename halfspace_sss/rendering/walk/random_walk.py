@@ -251,7 +251,9 @@ class Walker:
         u = mi.Point2f(rng.next_float32(), rng.next_float32())
         d, weight, density = turn(event.m, walk.weight, walk.density, walk.channel, event.along, u, media.same_g)
         order = walk.order + 1
-        scale = walk.scale if self.roulette_from <= 1 else dr.select(order < self.roulette_from, dr.inf, walk.scale)
+        scale = walk.scale
+        if self.roulette_from > 1:  # before, walks without weight alone end
+            scale = dr.select(order < self.roulette_from, dr.largest(mi.Float), scale)
         survives, weight = roulette(weight, scale, rng.next_float32())
         alive = survives & (order <= media.row("most", walk.object)) & media.box.contains(event.p)
         walk = replace(walk, o=event.p, d=d, skip=mi.Float(0), weight=weight, density=density, order=order,
@@ -357,7 +359,8 @@ def draw(n: int, rng: mi.PCG32) -> mi.UInt32:
 #
 #     ∫∫ S(x_i, w_i; x_o, w_o) mu_i f(x_i, w_i) dw_i dA_i = E[T f(x_i, w_i)].
 
-LANES = 2**13
+LANES = 2**15
+ROULETTE_FROM = 8  # scattering events: from 2 on weak channels of ketchup have 10 times the variance, for no time less
 MOST = 2**31 - 1  # scattering events
 
 
@@ -434,15 +437,13 @@ def exits(
     k: int,
     start: SurfacePoint,
     seed: int | tuple[int, ...],
-    lanes: int = LANES,
-    roulette_from: int = 1,
     fewest: int = 0,
     most: int = MOST,
 ) -> WalkExits:
     """Where walks from points on object k leave it.
 
     Args:
-        media, k, start, seed, lanes, roulette_from: as of `walk_from`.
+        media, k, start, seed: as of `walk_from`.
         fewest, most: numbers of scattering events that are kept, among the orders of the object.
 
     Returns:
@@ -452,7 +453,7 @@ def exits(
         ValueError: there is no object k, or the arrays of `start` are of different lengths.
     """
     visitor = ExitVisitor.of(dr.width(start.p), fewest, most)
-    walk_from(media, k, start, visitor, seed, lanes, roulette_from)
+    walk_from(media, k, start, visitor, seed)
     evaluate(visitor.exits)
     return visitor.exits
 
@@ -464,7 +465,7 @@ def walk_from(
     visitor: StartVisitor,
     seed: int | tuple[int, ...],
     lanes: int = LANES,
-    roulette_from: int = 1,
+    roulette_from: int = ROULETTE_FROM,
 ) -> None:
     """Walk from points on object k until the walks leave it or end inside.
 

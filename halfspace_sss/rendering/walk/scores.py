@@ -318,9 +318,8 @@ class ScoredExitVisitor:
 
 
 def scored_exits(
-    media: WalkMedia, k: int, start: SurfacePoint, seed: int | tuple[int, ...], lanes: int, roulette_from: int,
-    fewest: int = 0,
-) -> tuple[WalkExits, Score]:  # fmt: skip
+    media: WalkMedia, k: int, start: SurfacePoint, seed: int | tuple[int, ...], fewest: int = 0
+) -> tuple[WalkExits, Score]:
     """`random_walk.exits`, with the score of each walk up to its exit.
 
     Raises:
@@ -329,7 +328,7 @@ def scored_exits(
     n = dr.width(start.p)
     visitor = ScoredExitVisitor(ExitVisitor.of(n, fewest), media, Score.zeros(n))
     dr.eval(visitor.scores)
-    walk_from(media, k, start, visitor, seed, lanes, roulette_from)
+    walk_from(media, k, start, visitor, seed)
     dr.eval(visitor.exits.exits, visitor.scores)
     return visitor.exits.exits, visitor.scores
 
