@@ -1,4 +1,4 @@
-"""The figure `gathered`: a bunny walked, by a model sampled, and by the same in gathered light, in equal time."""
+"""The figure `gathered`: a bunny walked, then in equal time by a model sampled, gathered, and by photons."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from figures.computing.contenders import WALK, ready
 from figures.computing.images import FLIP, Shot
 from figures.computing.learnt import CHUNKS, FULL_GEOMETRY, train_scan, training_of, with_weights
 from figures.computing.references import NOTE, against, long_reference, reference_shot
@@ -15,20 +14,26 @@ from figures.computing.scenes import BUNNY, prepare, scan_scene
 from figures.computing.timed import gathered_anew, power_of_two, rendered
 from figures.drawing.image_files import image_files
 from figures.parts.part import Part, Result, Task
-from halfspace_sss import materials
 from halfspace_sss.backend import clock
+from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED, load_scene
 
-TITLE = "walked, sampled and gathered in equal time"
+TITLE = "walked, sampled, gathered, and by photons in equal time"
 MATERIALS = ("marble",)
 LIGHTS = "both"
-WAYS = {"walked": (WALK, "sampled"), "sampled": (FULL_GEOMETRY, "sampled"), "gathered": (FULL_GEOMETRY, "gathered")}
+WAYS = {
+    "walked": (PATH_TRACED, "sampled"),
+    "sampled": (FULL_GEOMETRY, "sampled"),
+    "gathered": (FULL_GEOMETRY, "gathered"),
+    "photons": (PATH_TRACED, "gathered"),
+}
 SIZES = {"draft": 128, "paper": 384}
 SECONDS = {"draft": 4.0, "paper": 20.0}  # of the processor, all cores together
+PHOTONS = {"draft": 2**18, "paper": 2**20}
 TRUTH_SPP = {"draft": 128, "paper": 1024}
 PASSES, PILOT = 8, 2  # of an image, at least; samples of a pixel by which the time of others is foreseen
 NOTES = (
     "All had the same seconds of the processor, compilation and the training of `full_geometry` left out, the "
-    f"gathering of light counted. FLIP of the pixels of the object. {NOTE}"
+    f"gathering of light and the walks of photons counted. FLIP of the pixels of the object. {NOTE}"
 )
 
 
@@ -40,7 +45,7 @@ def parts(quality: str) -> list[Part]:
         params = {**common, "spp": spp, "seed": 0}
         results.append(Part(f"{material}, truth", long_reference, params, spp * size**2, inputs=(BUNNY,)))
         results.append(train_scan(material, material, CHUNKS[quality]))
-        params = {**common, "seconds": SECONDS[quality], "seed": 1}
+        params = {**common, "seconds": SECONDS[quality], "photons": PHOTONS[quality], "seed": 1}
         needs = (training_of(material),)
         results.append(Part(f"{material}, equal time", in_time, params, len(WAYS) * SECONDS[quality], needs, (BUNNY,)))
     return results
@@ -49,13 +54,11 @@ def parts(quality: str) -> list[Part]:
 def in_time(task: Task) -> dict[str, Any]:
     """What each way makes of the same time."""
     prepare()
-    p = task.params
-    medium, found, numbers = materials.load(p["material"]).medium, {}, {}
+    p, found, numbers = task.params, {}, {}
     with with_weights(task.folder, task.needed):
-        for way, (method, light) in WAYS.items():
+        for way, (model, light) in WAYS.items():
             description = scan_scene("bunny", p["material"], p["size"], p["lights"])
-            description["integrator"]["light"] = light
-            scene = ready(method, description, "bunny", medium)
+            scene = load_scene(description, model, settings={"light": light, "photons": p["photons"]})
             found[way], numbers[way] = _passes(scene, p["seconds"], p["seed"], light == "gathered")
     return {**found, "ways": numbers}
 
@@ -79,7 +82,7 @@ def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
     """The figure as PDF and PNG, the page to flip between the images, and the numbers as a table."""
     scenes = {material: _shots(results, material) for material in MATERIALS}
     rows = [{"material": name, "way": s.label, **s.numbers} for name, shots in scenes.items() for s in shots[1:]]
-    title = "Walked, sampled and gathered in equal time"
+    title = "Walked, sampled, gathered, and by photons in equal time"
     return image_files("gathered", title, scenes, rows, NOTES, printed=(FLIP, "spp"))
 
 

@@ -9,7 +9,7 @@ import pandas
 import pytest
 
 from figures.beyond import gathered
-from figures.computing.contenders import WALK
+from figures.computing.learnt import FULL_GEOMETRY
 from figures.parts.part import Result, Task
 
 pytest.importorskip("mitsuba")
@@ -21,8 +21,9 @@ def test_all_ways_have_the_same_time_in_which_light_is_gathered(
     tmp_path: object, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     dipole = "better_dipole"
-    ways = {"walked": (WALK, "sampled"), "sampled": (dipole, "sampled"), "gathered": (dipole, "gathered")}
+    ways = {way: (dipole if model == FULL_GEOMETRY else model, light) for way, (model, light) in gathered.WAYS.items()}
     monkeypatch.setattr(gathered, "WAYS", ways)
+    monkeypatch.setitem(gathered.PHOTONS, "draft", 2**17)
     monkeypatch.setitem(gathered.SIZES, "draft", 24)
     monkeypatch.setitem(gathered.SECONDS, "draft", 2.0)
     monkeypatch.setitem(gathered.TRUTH_SPP, "draft", 64)
