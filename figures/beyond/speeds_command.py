@@ -1,4 +1,4 @@
-"""The commands `study speeds`, of models in ordinary light, and `study means`, of control variates."""
+"""The commands `study speeds`, of models in ordinary light, `study gathered`, of errors, and `study means`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from halfspace_sss.checks import check_choice, check_count, check_interval
 from halfspace_sss.cli.shared import Bar, OutFolder, console, use_mitsuba, whole
 from halfspace_sss.provenance import check_folder, write_together
 
-__all__ = ["means_command", "speeds_command"]
+__all__ = ["gathered_command", "means_command", "speeds_command"]
 
 SPEED_OBJECTS = ("bunny of potato", "bunny of marble", "dragon of potato", "candle", "mandarin")
 
@@ -88,6 +88,54 @@ def speeds_command(
     text = "\n".join(markdown(part) for part in tables(table))
     csv = table.to_csv(index=False, lineterminator="\n")
     write_together({out / "speeds.csv": csv, out / "speeds.md": text})
+    console().print(text, highlight=False, markup=False, soft_wrap=True)
+
+
+def gathered_command(
+    objects: Annotated[
+        list[str] | None, typer.Option("--object", help="As of `study speeds`.", show_default="bunny of potato")
+    ] = None,
+    model: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="full_geometry, neural_shape, neural, better_dipole or path_traced; repeat for more.",
+            show_default="full_geometry, better_dipole and path_traced",
+        ),
+    ] = None,
+    light: Annotated[
+        list[str] | None,
+        typer.Option(help="As of `study speeds`; repeat for more.", show_default="the first two there"),
+    ] = None,
+    samples: Annotated[
+        int,
+        typer.Option(help="Of a pixel, sampled and walked; an eighth of them gathered.", parser=whole),
+    ] = 2048,
+    size: Annotated[int, typer.Option(help="Pixels of the square images.", parser=whole)] = 64,
+    seconds: Annotated[float, typer.Option(help="CPU time of each training of full_geometry.")] = 24.0,
+    seed: Annotated[int, typer.Option(help="Seed of all renders.", parser=whole)] = 0,
+    out: OutFolder = Path("gathered"),
+) -> None:
+    """Measure what gathered light adds to the error of models, and how far both are off walks: all orders."""
+    use_mitsuba("llvm_ad_rgb")
+    from figures.beyond.gathered_error import Comparing, gathered_errors
+    from figures.beyond.speeds import LIGHTS, MODELS, MORE_MODELS, OTHER_LIGHTS, LitObject
+
+    models, lights = tuple(model or ("full_geometry", "better_dipole", *MORE_MODELS)), tuple(light or LIGHTS)
+    for name in models:
+        check_choice("model", name, (*MODELS, *MORE_MODELS))
+    for name in lights:
+        check_choice("light", name, (*LIGHTS, *OTHER_LIGHTS))
+    cases = [LitObject(name, each) for name in objects or ("bunny of potato",) for each in lights]
+    check_count("samples", samples, 16)
+    check_count("size", size, 16)
+    check_count("seed", seed, 0)
+    check_interval("seconds", seconds, 0.1, 1e6)
+    check_folder(out)
+    how = Comparing(models, samples, size=size, seconds=seconds, seed=seed)
+    with Bar("gathered") as bar:
+        table = gathered_errors(cases, how, out / "work", lambda what, k, n: bar.show(k, n, what))
+    text = markdown(table)
+    write_together({out / "gathered.csv": table.to_csv(index=False, lineterminator="\n"), out / "gathered.md": text})
     console().print(text, highlight=False, markup=False, soft_wrap=True)
 
 

@@ -27,6 +27,7 @@ SMALL = {  # a small run of each command, and what it refuses
     "models": ([], ["extra"]),
     "render": (["ball.xml", "--spp", "4", "--out", "o"], ["none.xml"]),
     "study ablation": (["--samples", "2000", "--seeds", "1", "--out", "o"], ["marbel"]),
+    "study gathered": (["--out", "o"], ["--object", "marbel"]),
     "study inversion": (["--size", "8", "--out", "o"], ["--size", "0"]),
     "study means": (["--out", "o"], ["--object", "marbel"]),
     "study rivals": (["--scene", "ball.xml", "--out", "o"], ["--scene", "none.xml"]),
@@ -112,6 +113,7 @@ MOUNTS = {"full": "size=4k", "locked": "ro"}
 NO_FILES = ("materials", "models")
 LONG = (
     "fit",
+    "study gathered",
     "study inversion",
     "study means",
     "study rivals",

@@ -7,6 +7,7 @@ import pytest
 
 pytest.importorskip("mitsuba")
 
+from figures.beyond.gathered_error import off  # noqa: E402
 from figures.beyond.means import _compared  # noqa: E402
 from figures.beyond.speeds import PASSES, LitObject, Measuring, _noise, ways_of  # noqa: E402
 from figures.computing.timed import TimedRender  # noqa: E402
@@ -22,6 +23,17 @@ def test_noise_holds_light_that_most_pixels_have_not_met() -> None:
     variance, error = _noise(timed, np.ones((size, size), dtype=bool))
     assert variance == pytest.approx(1 / chance - 1, rel=0.1)
     assert 0 < error < 0.1
+
+
+def test_an_error_is_told_without_the_noise_of_samples() -> None:
+    rng, pixels = np.random.default_rng(2), 4000
+    truth, bias = rng.uniform(0.5, 1.5, (pixels, 3)), 0.04 * rng.standard_normal((3, 1, pixels, 3))
+    reference = truth + 0.2 * rng.standard_normal((2, pixels, 3))
+    found = off(truth + bias + 0.2 * rng.standard_normal((3, 2, pixels, 3)), reference)
+    assert abs(found.rms - 0.04 / np.sqrt((truth**2).mean())) < 4 * found.error < 0.02
+    assert found.mean == pytest.approx(1, abs=0.01)
+    again = off(truth + 0.2 * rng.standard_normal((3, 2, pixels, 3)), reference)
+    assert again.rms < 4 * again.error < 0.06
 
 
 def test_an_object_smaller_than_a_block_is_refused() -> None:

@@ -168,13 +168,14 @@ class Gathering:
     Args:
         part: 0 for all samples; others are independent of each other, with a share `PART` of the photons, or of the
             samples of a transfer and half the light.
+        seed: of what is drawn.
 
     Attributes:
         seconds: by `clock`, of the transfers and of the light, as they were last found.
     """
 
-    def __init__(self, part: int = 0) -> None:
-        self._part, self.seconds = part, (0.0, 0.0)
+    def __init__(self, part: int = 0, seed: int = 0) -> None:
+        self._part, self._seed, self.seconds = part, seed, (0.0, 0.0)
         self._objects: list[TranslucentObject] = []
         self._transfers: list[Transfer | WalkedPoints | None] = []
         self._events: list[Events | None] = []
@@ -194,7 +195,8 @@ class Gathering:
                     _check(obj)
             started = clock()
             share = PART if self._part else 1.0
-            made = [_ways(obj, share, SEED + self._part) if one else None for obj, one in zip(objects, spread)]
+            seed = SEED + self._part + 10 * self._seed
+            made = [_ways(obj, share, seed) if one else None for obj, one in zip(objects, spread)]
             self._transfers, self._objects, self._light = made, objects, ([], [])
             inner = [bool(one and not self._part and has_inner_light(obj)) for obj, one in zip(objects, spread)]
             self._events = [Events.of(obj, COUNT) if one else None for obj, one in zip(objects, inner)]
@@ -202,7 +204,7 @@ class Gathering:
         state = light_state(scene)
         if state[0] != self._light[0] or not self._found:
             started = clock()
-            seed, parts = (1000 * self._part, 1) if self._part else (0, 2)
+            seed, parts = 1000 * self._part + 10_000 * self._seed, 1 if self._part else 2
             gathered = [
                 obj if T is None else _leaving(scene, objects, k, (T, events), settings, seed, parts)
                 for k, (obj, T, events) in enumerate(zip(objects, self._transfers, self._events))
