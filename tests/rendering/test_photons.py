@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from halfspace_sss.rendering.paths import gathering
 from halfspace_sss.rendering.paths.integrator import is_bssrdf
 from halfspace_sss.rendering.scenes.scene_files import open_scene
 from halfspace_sss.trade.ways import Way
@@ -63,6 +64,19 @@ def test_what_absorbs_nothing_cannot_be_seen_under_an_even_sky() -> None:
     found = _image(_gathered(SKY, white, 2**17, orders="total", reflection=True))[2:-2, 2:-2]  # without the rim
     assert np.abs(found.mean(axis=(0, 1)) - 1).max() < 0.04  # noise is 0.01, of a pixel 0.08
     assert np.abs(found - 1).max() < 0.4
+
+
+def test_objects_send_each_other_what_photons_brought(monkeypatch: pytest.MonkeyPatch) -> None:
+    leaving, sent = gathering._leaving, []
+
+    def watched(scene: Any, obj: Any, k: int, between: list, *rest: Any) -> Any:
+        sent.append(between[k].gathered is not None)
+        return leaving(scene, obj, k, between, *rest)
+
+    monkeypatch.setattr(gathering, "_leaving", watched)
+    scene = _gathered(SKY, photons=2**16)
+    scene.integrator().prepare(scene)
+    assert sent == [False, True]
 
 
 def test_four_times_the_photons_have_half_the_noise() -> None:

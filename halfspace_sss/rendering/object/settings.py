@@ -13,6 +13,7 @@ ORDERS = ("total", "multiple", "single")
 GEOMETRIES = ("distance", "tangent")
 LIGHTS = ("sampled", "corrected", "gathered", "auto")
 SHARED = ("mm_per_unit", "max_depth", "rr_depth", "hide_emitters")  # what `translucent_walk` understands too
+FEWEST_PHOTONS = 1000
 OF_MODELS = ("geometry", "area_share", "entries", "photons")
 
 
@@ -69,7 +70,7 @@ class Settings:
             raise ValueError(f"rr_depth must be at least 1, got {self.rr_depth}")
         if self.entries < 1 and self.entries != AUTOMATIC:
             raise ValueError(f"entries must be at least 1, got {self.entries}")
-        check_count("photons", self.photons, 1000)
+        check_count("photons", self.photons, FEWEST_PHOTONS)
         check_choice("light", self.light, LIGHTS)
         check_choice("orders", self.orders, ("", *ORDERS))
         if self.geometry not in GEOMETRIES:

@@ -37,6 +37,7 @@ from halfspace_sss.rendering.gathered.transfer import (
     transfer,
 )
 from halfspace_sss.rendering.object.points import cosine_above, opaque, place
+from halfspace_sss.rendering.object.settings import FEWEST_PHOTONS
 from halfspace_sss.rendering.object.shape import same_objects, state_of
 from halfspace_sss.rendering.paths.inner_light import COUNT, inner_light
 from halfspace_sss.rendering.paths.lighting import Lights, Sky, mis_weight
@@ -205,14 +206,11 @@ class Gathering:
         if state[0] != self._light[0] or not self._found:
             started = clock()
             seed, parts = 1000 * self._part + 10_000 * self._seed, 1 if self._part else 2
-            gathered = [
-                obj if T is None else _leaving(scene, objects, k, (T, events), settings, seed, parts)
-                for k, (obj, T, events) in enumerate(zip(objects, self._transfers, self._events))
-            ]
-            self._found = [
-                g if isinstance(g, type(obj)) else replace(obj, transport=None, proposals=None, gathered=g)
-                for g, obj in zip(gathered, objects)
-            ]
+            ways = list(zip(self._transfers, self._events))
+            walked = [(T if isinstance(T, WalkedPoints) else None, None) for T, _ in ways]
+            fewer = replace(settings, photons=max(int(PART * settings.photons), FEWEST_PHOTONS))
+            between = _lit(scene, objects, objects, walked, fewer, seed + 500, parts)
+            self._found = _lit(scene, objects, between, ways, settings, seed, parts)
             self._light, self.seconds = state, (self.seconds[0], clock() - started)
         return self._found
 
@@ -260,35 +258,48 @@ def light_state(scene: mi.Scene) -> tuple[list, list]:
     return [(id(node), keys) for node, (keys, _) in zip(nodes, states)], [nodes, [kept for _, kept in states]]
 
 
+def _lit(
+    scene: mi.Scene, objects: list[TranslucentObject], between: list[TranslucentObject],
+    ways: list[tuple[Transfer | WalkedPoints | None, Events | None]], settings: Settings, seed: int, parts: int,
+) -> list[TranslucentObject]:  # fmt: skip
+    """The objects, those with a way by what leaves them; by `between` they send light to each other and themselves."""
+    found = list(between)
+    for k, (obj, (T, events)) in enumerate(zip(objects, ways)):
+        if T is not None:
+            g = _leaving(scene, obj, k, between, (T, events), settings, seed, parts)
+            found[k] = replace(obj, transport=None, proposals=None, gathered=g)
+    return found
+
+
 def _leaving(
-    scene: mi.Scene, objects: list[TranslucentObject], k: int, of: tuple[Transfer | WalkedPoints, Events | None],
-    settings: Settings, seed: int, parts: int,
+    scene: mi.Scene, obj: TranslucentObject, k: int, between: list[TranslucentObject],
+    of: tuple[Transfer | WalkedPoints, Events | None], settings: Settings, seed: int, parts: int,
 ) -> Gathered:  # fmt: skip
     """B of object k, by light in parts whose differences tell the noise, and light inside."""
     T, events = of
-    found, rays = _incident(scene, objects, T, settings, 2 * k + seed, parts)
+    found, rays = _incident(scene, between, T, settings, 2 * k + seed, parts)
     lights, others = zip(*found)
     if not all(np.isfinite(light.mean).all() for light in lights):
-        raise ValueError(f"light at object {objects[k].geometry.name} must be finite, got NaN or infinity")
+        raise ValueError(f"light at object {obj.geometry.name} must be finite, got NaN or infinity")
     inner = None
     if events is not None:
         seen = mi.Float(np.mean(others, axis=0).astype(np.float32).ravel())
-        inner = inner_light(scene, objects, k, settings, events, (T.points, seen))
+        inner = inner_light(scene, between, k, settings, events, (T.points, seen))
     if isinstance(T, WalkedPoints):
         count = int(settings.photons * (PART if parts == 1 else 1))
         albedo, B, error = leaving(T, rays, count, 2 * k + seed)
-        return Walked(objects[k], T.points, albedo, mi.Float(B.astype(np.float32).ravel()), inner, None, count, error)
-    sky = Sky.of(scene, Lights.of(scene), objects[k : k + 1])
+        return Walked(obj, T.points, albedo, mi.Float(B.astype(np.float32).ravel()), inner, None, count, error)
+    sky = Sky.of(scene, Lights.of(scene), [obj])
     c = np.zeros(len(T.trusted)) if sky is None else T.trusted * np.ravel(np.array(sky.mean))
     lights = tuple(replace(light, mean=light.mean - c.astype(np.float32)) for light in lights)
     light = Incident.mean_of(lights)
     B = T @ light
     B[:, :, 0] += c
-    if objects[k].textured is None:  # averages over the neighbourhood would cross edges of textures
+    if obj.textured is None:  # averages over the neighbourhood would cross edges of textures
         direct = np.maximum(rays.light.sum(axis=1) / T.around.whole - c, 0)
         B += T.beyond(direct.astype(np.float32), rays)
     values = mi.Float(B.astype(np.float32).ravel())
-    return Transferred(objects[k], T.points, T.albedo, values, inner, T.e, T, light, lights, c)
+    return Transferred(obj, T.points, T.albedo, values, inner, T.e, T, light, lights, c)
 
 
 def _incident(

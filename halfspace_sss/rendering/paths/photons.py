@@ -11,6 +11,7 @@ summed over exits nearest to j. a(mu) = F_t(mu) (c_0 + c_1 mu + c_2 mu²) is fit
 the bent w_o, along the surface, by their first moment. Sums over exits are averaged over the neighbourhood, the wider
 the farther photons have come from: the density estimate of Jensen's photon map (1996), over points that stay.
 
+What objects send to each other, and to themselves, comes by a dipole for a few photons, then by these.
 Unlike a transfer, walks are those of one light: other lights ask for new ones. Emission inside objects is left out.
 """
 
@@ -36,7 +37,7 @@ if TYPE_CHECKING:
     from halfspace_sss.rendering.object.objects import TranslucentObject
     from halfspace_sss.rendering.object.settings import Settings
 
-MODEL, BETWEEN = "path_traced", "better_dipole"  # the latter for light from one object to the next, or itself
+MODEL, BETWEEN = "path_traced", "better_dipole"  # the latter for light between objects, before photons bring it
 PASS = 2**20  # photons at a time
 PLACES = 2**20  # by which areas of points are measured
 BINS = 64  # of cosines of exits
@@ -45,7 +46,7 @@ SLOPE_ROUNDS = 12  # smoothings of the slope over w_o
 
 @dataclass(frozen=True, eq=False)
 class WalkedTransport(TransportAround):
-    """Stands for S where walks from the light take its place; a dipole in what objects send to each other before."""
+    """Stands for S where walks from the light take its place; a dipole in what objects first send to each other."""
 
     alpha = None
 
