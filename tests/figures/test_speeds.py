@@ -28,11 +28,11 @@ def test_noise_holds_light_that_most_pixels_have_not_met() -> None:
 def test_an_error_is_told_without_the_noise_of_samples() -> None:
     rng, pixels = np.random.default_rng(2), 4000
     truth, bias = rng.uniform(0.5, 1.5, (pixels, 3)), 0.04 * rng.standard_normal((3, 1, pixels, 3))
-    reference = truth + 0.2 * rng.standard_normal((2, pixels, 3))
-    found = off(truth + bias + 0.2 * rng.standard_normal((3, 2, pixels, 3)), reference)
+    reference = truth + 0.1 * rng.standard_normal((2, pixels, 3))
+    found = off(truth + bias + 0.1 * rng.standard_normal((3, 2, pixels, 3)), reference)
     assert abs(found.rms - 0.04 / np.sqrt((truth**2).mean())) < 4 * found.error < 0.02
     assert found.mean == pytest.approx(1, abs=0.01)
-    again = off(truth + 0.2 * rng.standard_normal((3, 2, pixels, 3)), reference)
+    again = off(truth + 0.1 * rng.standard_normal((3, 2, pixels, 3)), reference)
     assert again.rms < 4 * again.error < 0.06
 
 
