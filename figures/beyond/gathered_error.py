@@ -20,6 +20,7 @@ from halfspace_sss.rendering.paths.gathering import Gathering
 from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED
 
 PASS = 64  # samples of a pixel at a time
+SAMPLED, ADDED, GATHERED = KINDS = "sampled over walks", "gathered over sampled", "gathered over walks"
 
 
 @dataclass(frozen=True)
@@ -90,12 +91,22 @@ def _of_model(
     if model != PATH_TRACED:
         samples = scene_of(case, f"{model}, sampled", how.size, folder)
         sampled = _halves(samples, how.spp, inside, how.seed, 1 + how.gatherings)
-        row |= _told("sampled over walks", off(sampled[None], walked)) | _told("added", off(images, sampled))
-    return row | _told("gathered over walks", off(images, walked))
+        row |= _row(SAMPLED, off(sampled[None], walked)) | _row(ADDED, off(images, sampled))
+    return row | _row(GATHERED, off(images, walked))
 
 
-def _told(name: str, found: Off) -> dict[str, float]:
-    return {f"{name}, %": 100 * found.rms, f"± {name}": 100 * found.error, f"mean, {name}": found.mean}
+def _row(kind: str, found: Off) -> dict[str, float]:
+    return {f"{kind}, %": 100 * found.rms, f"± {kind}": 100 * found.error, f"mean, {kind}": found.mean}
+
+
+def shown(table: pandas.DataFrame) -> pandas.DataFrame:
+    """Errors with what is uncertain of them, and means of the image, as text."""
+    found = table[["object", "light", "model"]].copy()
+    for kind in [kind for kind in KINDS if f"{kind}, %" in table]:
+        rows = table[[f"{kind}, %", f"± {kind}", f"mean, {kind}"]].to_numpy()
+        found[f"{kind}, %"] = ["–" if np.isnan(rms) else f"{rms:.1f} ± {error:.1f}" for rms, error, _ in rows]
+        found[f"mean, {kind}"] = ["–" if np.isnan(mean) else f"{mean:.3f}" for *_, mean in rows]
+    return found
 
 
 def _halves(scene: Any, spp: int, inside: np.ndarray, *seed: int) -> np.ndarray:

@@ -117,7 +117,7 @@ def gathered_command(
 ) -> None:
     """Measure what gathered light adds to the error of models, and how far both are off walks: all orders."""
     use_mitsuba("llvm_ad_rgb")
-    from figures.beyond.gathered_error import Comparing, gathered_errors
+    from figures.beyond.gathered_error import Comparing, gathered_errors, shown
     from figures.beyond.speeds import LIGHTS, MODELS, MORE_MODELS, OTHER_LIGHTS, LitObject
 
     models, lights = tuple(model or ("full_geometry", "better_dipole", *MORE_MODELS)), tuple(light or LIGHTS)
@@ -134,7 +134,7 @@ def gathered_command(
     how = Comparing(models, samples, size=size, seconds=seconds, seed=seed)
     with Bar("gathered") as bar:
         table = gathered_errors(cases, how, out / "work", lambda what, k, n: bar.show(k, n, what))
-    text = markdown(table)
+    text = markdown(shown(table))
     write_together({out / "gathered.csv": table.to_csv(index=False, lineterminator="\n"), out / "gathered.md": text})
     console().print(text, highlight=False, markup=False, soft_wrap=True)
 
