@@ -28,7 +28,7 @@ SCENES = {  # material and lights
     "paper": (("potato", "small light"), ("marble", "small light"), ("potato", "both"), ("marble", "both")),
 }
 SIZES = {"draft": 48, "paper": 256}
-SECONDS = {"draft": 10.0, "paper": 600.0}  # of each way
+SECONDS = {"draft": 8.0, "paper": 600.0}  # of each way
 TRAIN_SECONDS = {"draft": 4.0, "paper": 60.0}
 TRUTH_SPP = {"draft": 512, "paper": 16384}
 WARM_UP = 0.5  # seconds of learning; the first run compiles

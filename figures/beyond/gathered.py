@@ -27,7 +27,7 @@ WAYS = {
     "photons": (PATH_TRACED, "gathered"),
 }
 SIZES = {"draft": 128, "paper": 384}
-SECONDS = {"draft": 4.0, "paper": 20.0}  # of the processor, all cores together
+SECONDS = {"draft": 3.0, "paper": 20.0}  # of the processor, all cores together
 PHOTONS = {"draft": 2**18, "paper": 2**20}
 TRUTH_SPP = {"draft": 128, "paper": 1024}
 PASSES, PILOT = 8, 2  # of an image, at least; samples of a pixel by which the time of others is foreseen
