@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from halfspace_sss.checks import check_choice, check_count, check_interval, renamed
+from halfspace_sss.comparison.curve_set import TRACED
 from halfspace_sss.comparison.model_errors import TracedMaps, model_error, references
 from halfspace_sss.interface.model import BSSRDF, bssrdf
 from halfspace_sss.interface.model import models as registered
@@ -26,7 +27,6 @@ from halfspace_sss.trade.results import html_table
 EVENTS = 4e6  # of the walks of each channel
 QUERIES = 2**12
 REACH = (0.02, 60.0)  # mean free paths that are compared where no range is given
-PATH_TRACED = "path_traced"
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ def recommend_flat(
         _check_light(m, one, bounds)
     rows = [_row(name, parts, result, within) for name in chosen or registered()]
     noise = max((row.noise for row in rows if row.noise < math.inf), default=math.inf)
-    rows.append(_Row(PATH_TRACED, NoiseFree(0.0, 0.0), tolerance, tracing * (noise / tolerance) ** 2))
+    rows.append(_Row(TRACED, NoiseFree(0.0, 0.0), tolerance, tracing * (noise / tolerance) ** 2))
     return _advice(rows, tolerance, r or REACH, "mm" if r else "mean free paths")
 
 
@@ -168,14 +168,14 @@ def _seconds(model: BSSRDF) -> float:
 
 
 def _advice(rows: list[_Row], tolerance: float, r: tuple[float, float], unit: str) -> FlatAdvice:
-    keeping = [row for row in rows if row.error.bound <= tolerance and row.name != PATH_TRACED]
+    keeping = [row for row in rows if row.error.bound <= tolerance and row.name != TRACED]
     best = min(keeping, key=lambda row: row.seconds) if keeping else rows[-1]
     options = []
     for row in sorted(rows, key=lambda row: (row is not best, row.error.value)):
         name, error, _, seconds, refusal = row
         off = f"{error.told()} % off"
         cost = f"{1e6 * seconds:.3g} s for a million values"
-        if name == PATH_TRACED:
+        if name == TRACED:
             why = f"{name} takes {seconds:.3g} s until its noise is {100 * tolerance:.3g} %"
         elif refusal:
             why = f"{name}: {refusal}"

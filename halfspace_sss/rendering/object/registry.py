@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     import mitsuba as mi
 
 AUTO = "auto"
+PATH_TRACED = "path_traced"  # walks, or photons where light is gathered
 _BY_GROUP = once(offers)
 
 

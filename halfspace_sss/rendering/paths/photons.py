@@ -29,6 +29,7 @@ from halfspace_sss.rendering.gathered.points import REACH, SurfacePoints, lattic
 from halfspace_sss.rendering.gathered.transfer import RINGS, ROUNDS, Albedo, Hemispheres, bent, count_of, row_sums
 from halfspace_sss.rendering.object.half_space import half_space_model
 from halfspace_sss.rendering.object.points import ObjectModel, SurfacePoint, TransportAround
+from halfspace_sss.rendering.object.registry import PATH_TRACED
 from halfspace_sss.rendering.walk.media import media_within
 from halfspace_sss.rendering.walk.random_walk import exits
 
@@ -37,7 +38,7 @@ if TYPE_CHECKING:
     from halfspace_sss.rendering.object.objects import TranslucentObject
     from halfspace_sss.rendering.object.settings import Settings
 
-MODEL, BETWEEN = "path_traced", "better_dipole"  # the latter for light between objects, before photons bring it
+BETWEEN = "better_dipole"  # for light between objects, before photons bring it
 PASS = 2**20  # photons at a time
 PLACES = 2**20  # by which areas of points are measured
 BINS = 64  # of cosines of exits
@@ -65,8 +66,8 @@ def walked_model(obj: TranslucentObject, settings: Settings) -> ObjectModel:
     """
     if settings.light != "gathered":
         raise ValueError(
-            f"light must be gathered for the model {MODEL!r} of object {obj.geometry.name}, got {settings.light}: "
-            "the integrator translucent_walk samples walks"
+            f"light must be gathered for the model {PATH_TRACED!r} of object {obj.geometry.name}, got "
+            f"{settings.light}: the integrator translucent_walk samples walks"
         )
     transport, proposals, entries = half_space_model(BETWEEN, obj.geometry, obj.media, settings)
     return ObjectModel(WalkedTransport(transport), proposals, entries)

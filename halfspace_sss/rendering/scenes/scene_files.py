@@ -16,7 +16,7 @@ from typing import Any
 import mitsuba as mi
 
 from halfspace_sss.interrupts import is_interrupt
-from halfspace_sss.rendering.object.registry import lookup, model_names
+from halfspace_sss.rendering.object.registry import PATH_TRACED, lookup, model_names
 from halfspace_sss.rendering.object.settings import LIGHTS, ORDERS, SHARED
 from halfspace_sss.rendering.object.wrapped import surface_of
 from halfspace_sss.rendering.paths.integrator import is_bssrdf
@@ -97,7 +97,6 @@ def _is_ours(error: BaseException) -> bool:
     return _TRACEBACK in text and "ValueError: " in text and _HERE in text[text.rindex(_TRACEBACK) :]
 
 
-PATH_TRACED = "path_traced"
 _INTEGRATORS = {False: "bssrdf", True: "translucent_walk"}
 _NO_OBJECT = "the scene must have an object with a translucent BSDF, got none"
 

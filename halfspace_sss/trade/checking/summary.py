@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 ASKED = 5.0  # seconds of an assessment
 DEAR = 1.5  # times the cheapest way, up to which a recommendation is called cheap
-ALWAYS = ("neural", "better_dipole", "path_traced", "auto")
+ALWAYS = ("neural", "better_dipole", PATH_TRACED, "auto")
 
 
 def outcomes(records: Sequence[dict[str, Any]]) -> pandas.DataFrame:
