@@ -62,34 +62,40 @@ def gathered_errors(
         how: they are compared.
         folder: for weights and meshes.
         progress: called with what, done and all.
+
+    Raises:
+        ValueError: a model refuses an object.
     """
     prepare()
     rows, total = [], len(cases) * len(how.models)
     for k, case in enumerate(cases):
         if "full_geometry" in how.models:
             train(case, how.seconds, folder)
+        with weights_in(folder):  # first, as they may refuse the object
+            scenes = {model: scene_of(case, f"{model}, gathered", how.size, folder) for model in how.models}
         walk = scene_of(case, WALK, how.size, folder)
         inside = cover(walk) > 0.999
         progress(f"{case.name}, {case.light}", k * len(how.models), total)
         walked = _halves(walk, how.spp, inside, how.seed, 0)
-        for j, model in enumerate(how.models, 1):
-            with weights_in(folder):
-                rows.append({"object": case.name, "light": case.light, "model": model})
-                rows[-1] |= _of_model(case, model, how, folder, inside, walked)
+        for j, (model, gathers) in enumerate(scenes.items(), 1):
+            samples = None
+            if model != PATH_TRACED:
+                with weights_in(folder):
+                    samples = scene_of(case, f"{model}, sampled", how.size, folder)
+            rows.append({"object": case.name, "light": case.light, "model": model})
+            rows[-1] |= _of_model(gathers, samples, how, inside, walked)
             progress(f"{case.name}, {case.light}", k * len(how.models) + j, total)
     return pandas.DataFrame(rows)
 
 
-def _of_model(
-    case: LitObject, model: str, how: Comparing, folder: Path, inside: np.ndarray, walked: np.ndarray
-) -> dict[str, Any]:
-    gathers, found = scene_of(case, f"{model}, gathered", how.size, folder), []
+def _of_model(gathers: Any, samples: Any, how: Comparing, inside: np.ndarray, walked: np.ndarray) -> dict[str, Any]:
+    """Errors by the scenes of a model; by photons there is none whose light is sampled."""
+    found = []
     for k in range(how.gatherings):
         gathers.integrator().gathering = Gathering(seed=k)
         found.append(_halves(gathers, how.spp // 8, inside, how.seed, 1 + k))
     images, row = np.array(found), {}
-    if model != PATH_TRACED:
-        samples = scene_of(case, f"{model}, sampled", how.size, folder)
+    if samples is not None:
         sampled = _halves(samples, how.spp, inside, how.seed, 1 + how.gatherings)
         row |= _row(SAMPLED, off(sampled[None], walked)) | _row(ADDED, off(images, sampled))
     return row | _row(GATHERED, off(images, walked))
