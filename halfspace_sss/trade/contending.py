@@ -18,9 +18,7 @@ DEAR_SECONDS = 30.0  # of an assessment that looks at the dearest ways too
 GATHERING = 2**19  # samples of a model whose time the gathering of its light takes at least
 LONGEST = 1.5  # times the seconds of an assessment that a gathering may take
 LIGHT_SECONDS = 0.4  # of a part of the light, beside its transfer: by emitters, and of the first samples
-PHOTONS = (
-    0.05**2
-)  # bias² that photons are expected to have, give or take as much: 0.02 to 0.03 under windows, more by lamps
+PHOTONS = 0.05**2  # bias² that is expected of photons, give or take as much: 0.02 to 0.03 under windows, more by lamps
 CLOSE = 1.3  # times the cost of the cheapest way, up to which another may turn out cheaper
 
 
