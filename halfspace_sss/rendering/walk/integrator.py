@@ -26,11 +26,13 @@ from halfspace_sss.rendering.walk.media import WalkMedia
 from halfspace_sss.rendering.walk.path_loop import FirstExits, LightVisitor, PathTracer
 from halfspace_sss.rendering.walk.scores import PathScores, with_derivatives
 from halfspace_sss.rendering.walk.straight_light import find_straight_light
+from halfspace_sss.rendering.walk.unscattered_light import inside_cells_of, unscattered_light
 
-PARAMETERS = ("mm_per_unit", "max_depth", "rr_depth", "hide_emitters", "connection_share", "blur")
+PARAMETERS = ("mm_per_unit", "max_depth", "rr_depth", "hide_emitters", "connection_share", "blur", "light")
 SAMPLES_PER_LAUNCH = 2**19
 LANES = 2**14  # fastest of 2**12 to 2**18 on 2 cores
 GPU_FACTOR = 4  # as many times lanes and samples on CUDA: 1.2 to 1.4 times as fast on an H200
+LIGHTS = ("precomputed", "sampled")
 FOREVER = 2**31 - 1
 WIDEST = 20.0  # blur: 1 and 3 radians
 Keep = Callable[[FirstExits], None]
@@ -65,19 +67,28 @@ def _class(variant: str) -> type:
             self.hidden = bool(props.get("hide_emitters", False))
             self.connection_share = _share("connection_share", float(props.get("connection_share", 0.5)))
             self.blur = _scale("blur", float(props.get("blur", 1.0)))
+            self.light = _one_of("light", str(props.get("light", "precomputed")), LIGHTS)
             self._prepared: tuple[int, list, tuple, Any] = (0, [], ([], []), None)
+            self._cells: tuple[Any, list] = (None, [])
 
-        def tracer(self, scene: mi.Scene, scored: bool = False) -> PathTracer:
+        def tracer(self, scene: mi.Scene, seed: int = 0, scored: bool = False) -> PathTracer:
             """What paths through a scene need; its objects are made ready once, its emitters may have been edited.
 
             Args:
-                scored: whether derivatives are asked for.
+                seed: of the light that is precomputed.
+                scored: whether derivatives are asked for, which leave light to be sampled.
             """
             self._prepared = _prepared(scene, self._prepared, self.mm_per_unit)
             media, small = self._prepared[-1], SmallEmitters.of(scene)
+            inner = InnerLights.of(media, self.blur)
+            if self.light == "precomputed" and not scored and media.objects:
+                if self._cells[0] is not media:
+                    self._cells = media, inside_cells_of(media)
+                light = unscattered_light(scene, media, seed, self._cells[1])
+                visitor = LightVisitor(scene, media, small, None, None, None, inner, self.blur, light)
+                return PathTracer(visitor, self.max_depth, self.rr_depth, self.hidden)
             connections = find_connections(scene, media, small, self.connection_share, scored)
             directions = connections and EmitterDirections(scene, media, small, scored)
-            inner = InnerLights.of(media, self.blur)
             if scored and inner is not None:
                 raise ValueError("objects must hold no delta lights for derivatives of translucent_walk")
             straight = find_straight_light(scene, media, self.max_depth == FOREVER, scored)
@@ -92,7 +103,8 @@ def _class(variant: str) -> type:
             sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
             spp = spp or sensor.sampler().sample_count()
             with interruptible(), dr.suspend_grad():
-                _render(self.tracer(scene), sensor, int(mi.UInt32(seed)[0]), spp, keep)
+                seed = int(mi.UInt32(seed)[0])
+                _render(self.tracer(scene, seed), sensor, seed, spp, keep)
                 return sensor.film().develop() if develop else None
 
         def sample(
@@ -157,7 +169,7 @@ def _class(variant: str) -> type:
             sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
             spp = spp or sensor.sampler().sample_count()
             with interruptible():
-                _render(self.tracer(scene, True), sensor, int(mi.UInt32(seed)[0]), spp, None, True)
+                _render(self.tracer(scene, scored=True), sensor, int(mi.UInt32(seed)[0]), spp, None, True)
                 with dr.resume_grad():
                     return sensor.film().develop()
 
@@ -284,6 +296,12 @@ def _scale(name: str, value: float) -> float:
 def _share(name: str, value: float) -> float:
     if not 0 <= value <= 1:
         raise ValueError(f"{name} must be in [0, 1], got {value!r}")
+    return value
+
+
+def _one_of(name: str, value: str, known: Sequence[str]) -> str:
+    if value not in known:
+        raise ValueError(f"{name} must be one of {', '.join(known)}, got {value!r}")
     return value
 
 

@@ -411,8 +411,14 @@ class WalkMedia:
         """Whether light goes straight through the boundary of object k: of index 1, and nothing inside."""
         return self._alone(self.row("straight", k), k)
 
+    def is_outermost(self, k: mi.Int32) -> mi.Bool:
+        """Whether object k stands in no other, so that light of emitters arrives at its boundary."""
+        if self.inner is None:
+            return mi.Bool(True)
+        return dr.gather(mi.Int32, self.inner.tables["around"], self.place_of(k)) < 0
+
     def _alone(self, able: mi.Bool, k: mi.Int32) -> mi.Bool:
-        return able if self.inner is None else able & dr.gather(mi.Bool, self.inner.tables["alone"], self._place(k))
+        return able if self.inner is None else able & dr.gather(mi.Bool, self.inner.tables["alone"], self.place_of(k))
 
     def _straight(self) -> list[bool]:
         """By shape, whether its boundary is smooth, of index 1, and everywhere."""
@@ -423,9 +429,9 @@ class WalkMedia:
     def row(self, key: str, k: mi.Int32) -> mi.Float | mi.UInt32 | mi.Bool:
         """An entry of a table for object k."""
         table = self.tables[key]
-        return dr.gather(type(table), table, self._place(k))
+        return dr.gather(type(table), table, self.place_of(k))
 
-    def _place(self, k: mi.Int32) -> mi.UInt32 | mi.Int32:
+    def place_of(self, k: mi.Int32) -> mi.UInt32 | mi.Int32:
         """Of object k in tables: the same in all lanes, which is faster, where there is one object."""
         return mi.UInt32(0) if len(self.placed) == 1 else k
 
@@ -446,7 +452,7 @@ class WalkMedia:
 
     def spectrum(self, key: str, k: mi.Int32) -> mi.Spectrum:
         """An entry of a table with one column per channel."""
-        return mi.Spectrum([dr.gather(mi.Float, column, self._place(k)) for column in self.tables[key]])
+        return mi.Spectrum([dr.gather(mi.Float, column, self.place_of(k)) for column in self.tables[key]])
 
     @property
     def carried(self) -> bool:

@@ -38,6 +38,7 @@ from halfspace_sss.rendering.walk.random_walk import (
 )
 from halfspace_sss.rendering.walk.scores import PathScores, Score, ScoreVisitor, Stay, StayRecord
 from halfspace_sss.rendering.walk.straight_light import StraightLight
+from halfspace_sss.rendering.walk.unscattered_light import UnscatteredLight
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 # ---- Loop state ------------------------------------------------------------------------------------------------------
@@ -58,6 +59,7 @@ class LightRecord:
     departure: Departure  # from the last event
     sighted: mi.Bool  # an emitter was sampled at the last event, and only boundaries of index 1 were passed since
     scattered: mi.Bool  # whether a vertex has scattered into a solid angle: delta lights then are no longer hidden
+    precomputed: mi.Bool  # the ray's emission is in the unscattered light of the last event, or in the mirror image
     slopes: Score | tuple[()] = ()  # where derivatives are asked for, see `walk.scores`
 
 
@@ -89,6 +91,7 @@ class LightVisitor:
         straight_light: of emitters through boundaries of index 1, if there are any.
         inner_lights: delta lights inside objects, if there are any.
         blur: scale of the cones over which delta lights outside are spread; 0 leaves their light out.
+        unscattered: light that events find precomputed, in place of connections, directions and straight light.
     """
 
     scene: mi.Scene
@@ -99,6 +102,7 @@ class LightVisitor:
     straight_light: StraightLight | None = None
     inner_lights: InnerLights | None = None
     blur: float = 1.0
+    unscattered: UnscatteredLight | None = None
 
     def event(self, walk: Walk, record: LightRecord, event: Event) -> tuple[Walk, LightRecord]:
         # ---- inner lights
@@ -107,6 +111,13 @@ class LightVisitor:
             at = interaction_of(event.p, walk.medium)
             d, E = self.inner_lights.light(walk.object, at, walk.rng, True, walk.medium)
             record = replace(record, L=record.L + walk.weight * eval_phase(event.m, dr.dot(event.along, d)) * E)
+
+        # ---- emitters whose light arrives unscattered: weight ∫ p(w.w') L_0(x, w') dw'
+        if self.unscattered is not None:
+            counts = self.media.counts(walk.object, walk.order + 1)
+            L = walk.weight * self.unscattered.light(self.media, event)
+            held = self.media.is_outermost(walk.object)
+            return walk, replace(record, L=record.L + dr.select(counts & held, L, 0), precomputed=mi.Bool(held))
 
         # ---- emitters behind boundaries of index 1
         if self.straight_light is not None:
@@ -147,6 +158,7 @@ class LightVisitor:
     ) -> tuple[Walk, LightRecord]:
         if not self.media.any_rough:
             return walk, record
+        active = active & ~record.precomputed
         light = self.sampled_emitter(walk, si, self.media.boundary(walk.object), active)
         return walk, replace(record, L=record.L + light)
 
@@ -161,7 +173,7 @@ class LightVisitor:
             lit = (k < 0) & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
             d, E = self.inner_lights.light(walk.object, si, walk.rng, lit, walk.medium)
             L = L + dr.select(lit, walk.weight * bsdf.eval(mi.BSDFContext(), si, si.to_local(d), lit) * E, 0)
-        return walk, replace(record, L=L)
+        return walk, replace(record, L=L, precomputed=record.precomputed & (k == walk.object))
 
     def crossing(self, walk: Walk, record: LightRecord, crossing: Crossing) -> tuple[Walk, LightRecord]:
         before = record
@@ -191,7 +203,7 @@ class LightVisitor:
     def met_emitter(self, walk: Walk, record: LightRecord, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Spectrum:
         """Light of an emitter that the ray meets, weighted against sampling it from the last vertex."""
         emitter = si.emitter(self.scene)
-        active = active & (emitter != None)  # noqa: E711
+        active = active & (emitter != None) & ~record.precomputed  # noqa: E711
         previous = dr.zeros(mi.Interaction3f)
         previous.p = record.previous
         ds = mi.DirectionSample3f(self.scene, si, previous)
@@ -209,6 +221,19 @@ class LightVisitor:
             _, _, _, share, _ = dr.if_stmt(state, directed, self._against_directions, lambda *state: state)
         return dr.select(active, walk.weight * emitter.eval(si, active) * share, 0)
 
+    def mirrored_emitter(
+        self, walk: Walk, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active: mi.Bool
+    ) -> mi.Spectrum:
+        """Light of the emitter that a smooth boundary mirrors, F L, which no random choice of reflection then meets."""
+        ctx = mi.BSDFContext()
+        ctx.type_mask = mi.BSDFFlags.DeltaReflection
+        bs, value = bsdf.sample(ctx, si, 0.0, mi.Point2f(0), active)
+        d, _ = sided(si, bs.wo)
+        met = self.media.sight.intersect(self.scene, si.spawn_ray(d), mi.RayFlags.All, active=active)
+        emitter = met.emitter(self.scene, active)
+        active = active & (emitter != None) & (bs.pdf > 0)  # noqa: E711
+        return dr.select(active, walk.weight * value * emitter.eval(met, active), 0)
+
     def _against_directions(
         self, which: mi.Int32, departure: Departure, medium: WalkMedium, share: mi.Float, directed: mi.Bool
     ) -> tuple:
@@ -220,7 +245,7 @@ class LightVisitor:
             return mi.Spectrum(0)
         n = self.small.n_delta
         which = mi.Int32(draw(n, walk.rng)) if n > 1 else dr.zeros(mi.Int32, dr.width(walk.o))
-        active = active & record.scattered & record.delta
+        active = active & record.scattered & record.delta & ~record.precomputed
         directed = mi.Bool(False)
         if self.connections is not None:
             w_0, _ = self.small.direction(which, walk.o)
@@ -290,7 +315,8 @@ def start_record(lanes: int, scored: bool = False) -> LightRecord:
         straight=full(mi.Bool, False), connected=full(mi.Bool, False), pivot=mi.Point3f(point),
         directed=full(mi.Bool, False),
         departure=Departure(mi.Point3f(point), along, mi.Vector3f(along), full(mi.Int32, 0)),
-        sighted=full(mi.Bool, False), scattered=full(mi.Bool, False), slopes=Score.sums(lanes) if scored else (),
+        sighted=full(mi.Bool, False), scattered=full(mi.Bool, False),
+        precomputed=full(mi.Bool, False), slopes=Score.sums(lanes) if scored else (),
     )  # fmt: skip
 
 
@@ -380,7 +406,7 @@ class PathTracer:
         shown = ~first if self.hide_emitters else mi.Bool(True)
         L = p.light.L + self.visitor.met_emitter(p.walk, p.light, si, shown)
         L = L + self.visitor.spread_lights(p.walk, p.light, p.walk.alive)
-        light = replace(p.light, L=L, connected=mi.Bool(False), directed=mi.Bool(False))
+        light = replace(p.light, L=L, connected=mi.Bool(False), directed=mi.Bool(False), precomputed=mi.Bool(False))
 
         # ---- the surface
         depth = p.depth + 1
@@ -409,6 +435,12 @@ class PathTracer:
 
         # ---- next-event estimation
         L = light.L + self.visitor.sampled_emitter(walk, si, bsdf, lit, translucent)
+
+        # ---- emitters in the mirror of a smooth boundary: F L(mirrored direction)
+        mirrors = translucent & lit & ~media.row("rough", near) if media.objects else mi.Bool(False)
+        mirrors &= self.visitor.unscattered is not None
+        if self.visitor.unscattered is not None:
+            L = L + self.visitor.mirrored_emitter(walk, si, bsdf, mirrors)
 
         # ---- BSDF sampling
         bs, value = sample_bsdf(bsdf, si, rng)
@@ -446,6 +478,8 @@ class PathTracer:
             again &= self.visitor.straight_light.passes_again(near)
         light = replace(light, L=L, previous=dr.select(again, light.previous, si.p), sighted=again,
                         pdf=dr.select(again, light.pdf, bs.pdf), delta=delta & ~again, scattered=scattered)  # fmt: skip
+        if self.visitor.unscattered is not None:
+            light = replace(light, precomputed=mirrors & ~enters)
         if media.inner is not None:
             delta = ~again & (delta | enters | encloses)
             L = L + self.visitor.spread_inner_lights(walk, scattered & enters)

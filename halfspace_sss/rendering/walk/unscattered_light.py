@@ -1,0 +1,196 @@
+"""Light that reaches the inside of objects unscattered, precomputed on a grid.
+
+Under a refracting boundary a walk from the camera meets light where it leaves, by chance. The radiance L_0 that arrives
+at a point inside before it has scattered needs no chance: rays from the emitters, refracted at the surface and
+reflected inside, bring it to the cells of a grid, once for an image. A walk then adds at each of its events
+
+    weight ∫ p(w.w') L_0(x, w') dw',
+
+and drops the emitters that it meets after its last event as long as it has met nothing but the boundary of the object
+since, as the grid holds their light. Light that comes by way of other surfaces, or through another part of the object,
+stays to be met by chance.
+
+Rays begin at points uniform over the surface, each with one sample of the emitters. Along a ray six points are drawn by
+the transmittance, each channel in turn (balance heuristic), and added to the moments of L_0 in their cells. The fit in
+each cell is linear, by least squares over the part inside (`inside_cells`): it keeps the light of a cell and its first
+moments, so that its error in an image is of second order in the size of cells.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from halfspace_sss.rendering.gathered.points import lattice, uniform_entries
+from halfspace_sss.rendering.object.points import lift, opaque, sided
+from halfspace_sss.rendering.walk.inside_cells import POINTS, InsideCells, grid_edge
+from halfspace_sss.rendering.walk.media import WalkMedia
+from halfspace_sss.rendering.walk.random_walk import Event, pick, sample_bsdf
+from halfspace_sss.tracing.walk import generator, pass_seed
+
+RAYS = 2**19  # of light for each object
+EDGE = 0.9  # of cells, mean free paths
+ALONG = 6  # points on a segment of a ray
+FEWEST_POINTS, MOST_POINTS = 2**14, 2**22  # of the surface, that find the cells it cuts
+ROULETTE = 0.1  # part of its light below which a reflected ray may end
+R_4 = (0.8566748838545029, 0.7338918566271260, 0.6287067210378087, 0.5385972572236101)  # Roberts 2018, four dimensions
+
+
+@dataclass(frozen=True, eq=False)
+class UnscatteredLight:
+    """Unscattered light inside the objects of a scene.
+
+    Args:
+        slot, values: cells of all objects, one after the other; of each slot and channel the value at the centre and
+            the slopes, 1/4pi of the fluence.
+        tables: by the number of an object, where its cells begin, their corner, 1/h and counts.
+    """
+
+    slot: mi.Int32
+    values: mi.Float
+    tables: dict[str, Any]
+    info: dict = field(default_factory=dict)
+
+    def light(self, media: WalkMedia, event: Event) -> mi.Spectrum:
+        """Unscattered light that an event of a walk scatters on along it, per weight of the walk."""
+        at = {key: dr.gather(type(t), t, media.place_of(event.object)) for key, t in self.tables.items()}
+        x = (event.p - at["low"]) * at["scale"]
+        cell = mi.Vector3i(dr.floor(x))
+        inside = dr.all((cell >= 0) & (cell < at["counts"]))
+        index = at["first"] + (cell.z * at["counts"].y + cell.y) * at["counts"].x + cell.x
+        slot = dr.gather(mi.Int32, self.slot, index, inside)
+        held, y = inside & (slot >= 0), x - (mi.Vector3f(cell) + 0.5)
+        n = len(mi.Spectrum(0))
+        rows = [dr.gather(mi.Vector4f, self.values, mi.UInt32(slot * n + c), held) for c in range(n)]
+        return mi.Spectrum([v.x + v.y * y.x + v.z * y.y + v.w * y.z for v in rows])
+
+
+def unscattered_light(
+    scene: mi.Scene, media: WalkMedia, seed: int, cells: list[InsideCells], rays: int = RAYS
+) -> UnscatteredLight:
+    """Unscattered light of the emitters of a scene in cells of its objects, from `inside_cells_of`."""
+    slots, values, first = [], [], 0
+    rows = {"first": [], "low": [], "scale": [], "counts": []}
+    start = 0
+    for k, grid in enumerate(cells):
+        D = _moments(scene, media, k, grid, seed, rays)
+        slot = np.array(grid.slot)
+        slots.append(np.where(slot >= 0, slot + start, -1))
+        values.append(grid.fit(D / grid.h**3) / (4 * np.pi))
+        for key, value in (("first", first), ("low", grid.low), ("scale", 1 / grid.h), ("counts", grid.counts)):
+            rows[key].append(value)
+        first, start = first + slot.size, start + len(grid)
+    kinds = {"first": mi.Int32, "low": mi.Point3f, "scale": mi.Float, "counts": mi.Vector3i}
+    tables = {key: kind(np.array(rows[key]).T) for key, kind in kinds.items()}
+    slot, value = mi.Int32(np.concatenate(slots)), mi.Float(np.concatenate(values).astype(np.float32).ravel())
+    dr.make_opaque(tables, slot, value)
+    return UnscatteredLight(slot, value, tables)
+
+
+def inside_cells_of(media: WalkMedia, edge: float = EDGE) -> list[InsideCells]:
+    """The cells of all objects, `edge` mean free paths wide."""
+    results = []
+    for k in range(len(media.placed)):
+        kind = int(media.placed.kind[k])
+        geometry = media.objects[kind]
+        sigma_t = media.mm_per_unit * float(np.mean(media.insides[kind].medium.sigma_t))
+        box = media.scene.bbox()
+        ends = tuple(np.array(end, dtype=float).ravel() for end in (geometry.scene.bbox().min, geometry.scene.bbox().max))
+        h = grid_edge(ends, edge / sigma_t)
+        n = int(np.clip(POINTS * geometry.area / h**2, FEWEST_POINTS, MOST_POINTS))
+        u = [mi.Float(v.astype(np.float32)) for v in lattice(n)]
+        points = uniform_entries(geometry, u[0], mi.Point2f(u[1], u[2])).p
+        results.append(InsideCells.of(media, k, points, ends, h))
+    return results
+
+
+def _moments(scene: mi.Scene, media: WalkMedia, k: int, grid: InsideCells, seed: int, rays: int) -> np.ndarray:
+    """∫ L_0 x_j dx dw over the inside of each cell, shape (slots, 3, 4), x about its centre in units of h."""
+    geometry = media.objects[int(media.placed.kind[k])]
+    n, number = len(mi.Spectrum(0)), dr.full(mi.Int32, k, rays)
+    D = dr.zeros(mi.Float, len(grid) * n * 4)
+    rng = generator(mi, rays, pass_seed(seed, k))
+
+    # ---- points of the surface, in order along its faces, with a sample of the emitters each
+    shift = np.random.default_rng([seed, k]).random(5)
+    u = [(dr.arange(mi.Float, rays) + opaque(shift[4])) / opaque(rays)]
+    for root, s in zip(R_4, shift):
+        # multiples of a root in whole numbers, which float32 would round
+        step, offset = (dr.opaque(mi.UInt32, int(v * 2**32) % 2**32) for v in (root, s))
+        u.append(mi.Float((dr.arange(mi.UInt32, rays) * step + offset) >> 8) * 2**-24)
+    at = uniform_entries(geometry, dr.minimum(u[0], 1 - 2**-24), mi.Point2f(u[1], u[2]))
+    si = dr.zeros(mi.SurfaceInteraction3f, rays)
+    si.p, si.n, si.sh_frame = mi.Point3f(at.p), mi.Normal3f(at.n), mi.Frame3f(at.n_out)
+    ds, light = scene.sample_emitter_direction(si, mi.Point2f(u[3], u[4]), True)
+    si.wi = si.to_local(ds.d)
+    si = lift(si, ds.d)
+
+    # ---- refraction: flux = L cos(w, n_s) f cos / pdf |d.n| / |d.n_s|, as the walk sees the boundary
+    ctx = mi.BSDFContext(mi.TransportMode.Importance)
+    ctx.type_mask = mi.BSDFFlags.Transmission
+    bs, value = sample_bsdf(media.boundary(number), si, rng, ctx)
+    d, _ = sided(si, bs.wo)
+    cosine = mi.Frame3f.cos_theta(si.wi)
+    bend = dr.abs(dr.dot(d, si.n)) / dr.maximum(dr.abs(mi.Frame3f.cos_theta(bs.wo)), 1e-6)
+    enters = (ds.pdf > 0) & (bs.pdf > 0) & (dr.dot(si.n, ds.d) > 0) & (cosine > 0) & (dr.dot(d, si.n) < 0)
+    flux = dr.select(enters, light * value * (cosine * bend * opaque(geometry.area / rays)), 0)
+    enters &= dr.max(flux) > 0
+
+    sigma_t = media.spectrum("sigma_t", number)
+    low, scale = mi.Point3f(*(opaque(v) for v in grid.low)), opaque(1 / grid.h)
+    counts = mi.Vector3i(*(dr.opaque(mi.Int32, int(v)) for v in grid.counts))
+    slots = grid.slot
+
+    def segment(o, d, skip, flux, length, alive, rng) -> tuple:
+        ray = mi.Ray3f(o + d * skip, d)
+        si = media.sight.intersect(media.scene, ray, mi.RayFlags.All, active=alive)
+        own = alive & si.is_valid()
+        own &= media.met(si, number) == number
+        far = dr.select(own, si.t + skip, 0)
+
+        # ---- points along it: density mean_c sigma_c T_c / (1 - T_c(far))
+        passed, ends = dr.exp(-sigma_t * length), 1 - dr.exp(-sigma_t * far)
+        u0, turn = rng.next_float32(), mi.UInt32(rng.next_float32() * n)
+
+        def add(j: mi.UInt32) -> tuple:
+            rate, end = (pick(v, (j + turn) % n) for v in (sigma_t, ends))
+            u = u0 + mi.Float(j) / ALONG
+            s = dr.minimum(-dr.log(1 - dr.minimum((u - dr.floor(u)) * end, 1 - 2**-24)) / rate, far)
+            T = dr.exp(-sigma_t * s)
+            pdf = dr.sum(sigma_t * T / dr.maximum(ends, 1e-20)) / n
+            light = flux * passed * T / dr.maximum(pdf * ALONG, 1e-20)
+            x = (o + d * s - low) * scale
+            cell = mi.Vector3i(dr.floor(x))
+            y = x - (mi.Vector3f(cell) + 0.5)
+            held = own & (far > 0) & dr.all((cell >= 0) & (cell < counts))
+            slot = dr.gather(mi.Int32, slots, (cell.z * counts.y + cell.y) * counts.x + cell.x, held)
+            held &= slot >= 0
+            for c in range(n):
+                moments = mi.Vector4f(1, y.x, y.y, y.z) * light[c]
+                dr.scatter_add(D, moments, mi.UInt32(slot * n + c), held)
+            return (j + 1,)
+
+        dr.while_loop((mi.UInt32(0),), lambda j: j < ALONG, add, label="points of a ray")
+
+        # ---- reflection inside, with the weight of the boundary and roulette
+        si = media.seen(si, number, d)
+        ctx = mi.BSDFContext(mi.TransportMode.Importance)
+        ctx.type_mask = mi.BSDFFlags.Reflection
+        bs, value = sample_bsdf(media.boundary(number), si, rng, ctx)
+        new, _ = sided(si, bs.wo)
+        length = length + far
+        left = dr.max(value) * dr.max(flux * dr.exp(-sigma_t * length)) / dr.maximum(dr.max(flux), 1e-30)
+        survive = dr.minimum(left / ROULETTE, 1)
+        alive = own & (dr.dot(si.n, d) > 0) & (dr.dot(si.n, new) < 0) & (rng.next_float32() < survive)
+        flux = flux * value / dr.maximum(survive, 1e-20)
+        return mi.Point3f(si.p), mi.Vector3f(new), media.clear(number, si.n, new), flux, length, alive, rng
+
+    start = (mi.Point3f(at.p), mi.Vector3f(d), media.clear(number, si.n, d), mi.Spectrum(flux), dr.zeros(mi.Float, rays),
+             mi.Bool(enters), rng)  # fmt: skip
+    dr.while_loop(start, lambda o, d, skip, flux, length, alive, rng: alive, segment, label="rays of light")
+    dr.eval(D)
+    return np.array(D, dtype=float).reshape(len(grid), n, 4)
