@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from scipy.ndimage import label
+from scipy.ndimage import distance_transform_cdt, label
 
 from halfspace_sss.rendering.object.points import opaque
 from halfspace_sss.rendering.walk.media import WalkMedia
@@ -40,29 +40,27 @@ class InsideCells:
         h: edge of a cell, scene units.
         counts: cells along each axis.
         slot: of each cell its place among those that hold a part of the inside, -1 of the others.
-        parent: (slots,) the slot whose fit it shares, its own for most.
-        offset: (slots, 3) centre of the cell, from that of the parent, in units of h.
-        moments: (slots, 4, 4) of the inside of the cell, about its centre.
+        slots: number of the cells that hold one.
+        cut: (cut,) slots of the cells that the surface cuts; all others are whole.
+        place: (cut,) of each of them the place in `cut` of the cell whose fit it shares, its own for most.
+        offset: (cut, 3) its centre from that of this cell, in units of h.
+        moments: (cut, 4, 4) m_jk of its inside, about its centre.
     """
 
     low: np.ndarray
     h: float
     counts: np.ndarray
     slot: mi.Int32
-    parent: np.ndarray
+    slots: int
+    cut: np.ndarray
+    place: np.ndarray
     offset: np.ndarray
     moments: np.ndarray
 
-    def __len__(self) -> int:
-        return len(self.parent)
-
-    @property
-    def volume(self) -> float:
-        """Of the inside, scene units cubed."""
-        return float(self.moments[:, 0, 0].sum()) * self.h**3
-
     @classmethod
-    def of(cls, media: WalkMedia, k: int, points: mi.Point3f, box: tuple[np.ndarray, np.ndarray], h: float) -> InsideCells:
+    def of(
+        cls, media: WalkMedia, k: int, points: mi.Point3f, box: tuple[np.ndarray, np.ndarray], h: float, depth: float
+    ) -> InsideCells:
         """The cells of object k.
 
         Args:
@@ -71,84 +69,87 @@ class InsideCells:
             points: uniform over its surface, at least POINTS for each h².
             box: its least and largest coordinates.
             h: edge of a cell; larger where the grid would have more than MOST_CELLS.
+            depth: below the surface, beyond which cells hold nothing, scene units.
         """
         h = grid_edge(box, h)
-        counts = np.ceil((box[1] - box[0]) / h + 2 * MARGIN).astype(int) + 1
+        counts = np.ceil((box[1] - box[0]) / h + 2 * MARGIN).astype(int) + 2
         low = 0.5 * (box[0] + box[1]) - 0.5 * counts * h
         cut = _cut(points, low, h, counts)
 
         # cells between cut ones are inside or outside all together: a ray from one of them tells
         parts, n = label(~cut.reshape(counts[::-1]))
-        parts = parts.ravel()
-        ids, first = np.unique(parts, return_index=True)
-        whole = np.zeros(n + 1, dtype=bool)
-        whole[ids] = _starts_inside(media, k, _centres(first, low, h, counts), h)
+        parts, one = parts.ravel(), np.zeros(n + 1, dtype=int)
+        one[parts] = np.arange(len(parts))
+        whole = _starts_inside(media, k, _centres(one, low, h, counts))
         whole[0] = False  # the cut ones
         inside = whole[parts]
 
         cells = np.flatnonzero(cut)
-        measured = _measure(media, k, cells, low, h, counts)
-        kept = measured[:, 0] > 1e-6
-        cells, measured = cells[kept], measured[kept]
-        full = np.flatnonzero(inside)
-        order = np.argsort(np.concatenate([cells, full]), kind="stable")
-        held = np.concatenate([cells, full])[order]
-        of_full = [1.0, 0, 0, 0, 1 / 12, 1 / 12, 1 / 12, 0, 0, 0]
-        moments = np.concatenate([measured, np.tile(of_full, (len(full), 1))])[order]
+        moments = _measure(media, k, cells, low, h, counts)
+        kept = moments[:, 0, 0] > 1e-6
+        cells, moments = cells[kept], moments[kept]
+
+        # whole cells within the depth that light reaches
+        if inside.any():
+            apart = distance_transform_cdt(~cut.reshape(counts[::-1]), "chessboard").ravel()
+            inside &= (apart - 1) * h < depth
+        inside[cells] = True
+        held = np.flatnonzero(inside)
         slot = np.full(counts.prod(), -1, dtype=np.int32)
         slot[held] = np.arange(len(held))
-        parent, offset = _parents(slot, held, moments[:, 0], counts)
-        square = np.empty((len(held), 4, 4))
-        for column, (i, j) in enumerate(PAIRS):
-            square[:, i, j] = square[:, j, i] = moments[:, column]
-        return cls(low, h, counts, mi.Int32(slot), parent, offset, square)
+        place, offset = _parents(cells, moments[:, 0, 0], counts)
+        return cls(low, h, counts, mi.Int32(slot), len(held), slot[cells], place, offset, moments)
 
     def fit(self, D: np.ndarray) -> np.ndarray:
         """Of least squares over the inside, the value at the centre of each cell and its slopes by units of h.
 
         Args:
-            D: (slots, ..., 4) ∫ f x_j dx / h³ over the inside of each cell, x about its centre.
+            D: (slots, channels, 4) ∫ f x_j dx / h³ over the inside of each cell, x about its centre.
 
         Returns:
             Coefficients of 1, x, y, z, of the same shape.
         """
-        # ---- sums of D and of the moments over the cells that share a fit, about the centre of the parent
-        shift = np.tile(np.eye(4), (len(self), 1, 1))
-        shift[:, 1:, 0] = self.offset
-        M, b = shift @ self.moments @ shift.transpose(0, 2, 1), np.einsum("sij,s...j->s...i", shift, D)
-        own = self.parent == np.arange(len(self))
-        M, b = (_added(values, self.parent, own) for values in (M, b))
+        # ---- whole cells: the mean, and slopes by the variance 1/12
+        result = D * np.array([1, *[12 / (1 + RIDGE)] * 3], dtype=D.dtype)
+
+        # ---- sums over the cells that share a fit, about the centre of their parent
+        rows, parent, offset = self.cut, self.place, self.offset
+        shift = np.tile(np.eye(4), (len(rows), 1, 1))
+        shift[:, 1:, 0] = offset
+        M, b = shift @ self.moments @ shift.transpose(0, 2, 1), np.einsum("sij,scj->sci", shift, D[rows])
+        M, b = (_added(values, parent) for values in (M, b))
 
         # ---- the mean, and slopes about the centroid
-        V, x = M[:, 0, 0], M[:, 0, 1:] / M[:, 0, 0, None]
-        C = M[:, 1:, 1:] / V[:, None, None] - x[:, :, None] * x[:, None, :] + RIDGE / 12 * np.eye(3)
-        mean = b[..., 0] / V.reshape(-1, *[1] * (b.ndim - 2))
-        about = b[..., 1:] / V.reshape(-1, *[1] * (b.ndim - 1)) - mean[..., None] * _spread(x, b.ndim)
-        slopes = np.einsum("sij,s...j->s...i", np.linalg.inv(C), about)
-        value = mean - (slopes * _spread(x, b.ndim)).sum(axis=-1)
+        V, x = M[:, :1, 0], M[:, 1:, 0] / M[:, :1, 0]
+        C = M[:, 1:, 1:] / V[:, :, None] - x[:, :, None] * x[:, None, :] + RIDGE / 12 * np.eye(3)
+        mean = b[:, :, 0] / V
+        slopes = (b[:, :, 1:] / V[:, :, None] - mean[:, :, None] * x[:, None]) @ _inverse(C)
+        value = mean - np.einsum("scj,sj->sc", slopes, x)
 
         # ---- of each cell that of its parent, about its own centre
-        value, slopes = value[self.parent], slopes[self.parent]
-        value = value + (slopes * _spread(self.offset, b.ndim)).sum(axis=-1)
-        return np.concatenate([value[..., None], slopes], axis=-1)
+        value, slopes = value[parent], slopes[parent]
+        value = value + np.einsum("scj,sj->sc", slopes, offset)
+        result[rows] = np.concatenate([value[:, :, None], slopes], axis=2)
+        return result
 
 
-def _spread(x: np.ndarray, ndim: int) -> np.ndarray:
-    """(slots, 3) with axes of length 1 between."""
-    return x.reshape(len(x), *[1] * (ndim - 2), 3)
+def _inverse(C: np.ndarray) -> np.ndarray:
+    """Of symmetric matrices (n, 3, 3), by cofactors: the same bits on every processor."""
+    rows = np.stack([np.cross(C[:, 1], C[:, 2]), np.cross(C[:, 2], C[:, 0]), np.cross(C[:, 0], C[:, 1])], axis=1)
+    return rows / (C[:, 0] * rows[:, 0]).sum(axis=1)[:, None, None]
 
 
-def _added(values: np.ndarray, parent: np.ndarray, own: np.ndarray) -> np.ndarray:
+def _added(values: np.ndarray, parent: np.ndarray) -> np.ndarray:
     """With the values of cells that share the fit of another added to its own."""
-    total = values.copy()
-    np.add.at(total, parent[~own], values[~own])
+    total, shares = values.copy(), parent != np.arange(len(parent))
+    np.add.at(total, parent[shares], values[shares])
     return total
 
 
 def grid_edge(box: tuple[np.ndarray, np.ndarray], h: float) -> float:
     """h, or the least edge of cells by which a grid has no more than MOST_CELLS."""
     size = box[1] - box[0]
-    while np.prod(np.ceil(size / h + 2 * MARGIN) + 1) > MOST_CELLS:
+    while np.prod(np.ceil(size / h + 2 * MARGIN) + 2) > MOST_CELLS:
         h *= 1.05
     return h
 
@@ -191,7 +192,7 @@ def _own_hit(media: WalkMedia, k: mi.Int32, ray: mi.Ray3f) -> tuple[mi.Float, mi
     return t, found, leaves
 
 
-def _starts_inside(media: WalkMedia, k: int, p: mi.Point3f, h: float) -> np.ndarray:
+def _starts_inside(media: WalkMedia, k: int, p: mi.Point3f) -> np.ndarray:
     """Whether points away from the surface of object k are inside it: most of three rays leave it first."""
     votes = 0
     for axis in range(3):
@@ -203,10 +204,8 @@ def _starts_inside(media: WalkMedia, k: int, p: mi.Point3f, h: float) -> np.ndar
 
 
 def _measure(media: WalkMedia, k: int, cells: np.ndarray, low: np.ndarray, h: float, counts: np.ndarray) -> np.ndarray:
-    """Moments of the inside of cells, in the order of PAIRS, from columns at jittered places along the three axes."""
+    """Moments (cells, 4, 4) of the inside of cells, from columns at jittered places along the three axes."""
     n = len(cells)
-    if n == 0:
-        return np.zeros((0, len(PAIRS)))
     centre = _centres(cells, low, h, counts)
     number, edge = dr.full(mi.Int32, k, n), opaque(h)
     rng = generator(mi, n, pass_seed(k))
@@ -244,24 +243,23 @@ def _measure(media: WalkMedia, k: int, cells: np.ndarray, low: np.ndarray, h: fl
     state = (dr.zeros(mi.UInt32, n), rng, [dr.zeros(mi.Float, n) for _ in PAIRS])
     _, _, sums = dr.while_loop(state, lambda i, rng, sums: i < total, column, label="columns")
     dr.eval(sums)
-    return np.array(sums, dtype=float).T / (3 * COLUMNS**2)
+    square = np.empty((n, 4, 4))
+    for (i, j), values in zip(PAIRS, sums):
+        square[:, i, j] = square[:, j, i] = np.array(values, dtype=float) / (3 * COLUMNS**2)
+    return square
 
 
-def _parents(slot: np.ndarray, held: np.ndarray, volume: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of each slot the one whose fit it shares, the largest neighbour of a small one, and the way from there."""
-    parent, offset = np.arange(len(held)), np.zeros((len(held), 3))
+def _parents(cells: np.ndarray, volume: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of each cut cell the one whose fit it shares, the largest cut neighbour of a small one, and the way from there."""
+    parent, offset = np.arange(len(cells)), np.zeros((len(cells), 3))
     small = np.flatnonzero(volume < SMALLEST)
-    z, rest = np.divmod(held[small], counts[1] * counts[0])
-    y, x = np.divmod(rest, counts[0])
-    place, best = np.stack([x, y, z], axis=1), np.full(len(small), SMALLEST)
+    strides, best = np.array([1, counts[0], counts[0] * counts[1]]), np.full(len(small), SMALLEST)
     for axis in range(3):
         for step in (-1, 1):
-            to = place + step * (np.arange(3) == axis)
-            ok = ((to >= 0) & (to < counts)).all(axis=1)
-            other = np.where(ok, slot[np.where(ok, (to[:, 2] * counts[1] + to[:, 1]) * counts[0] + to[:, 0], 0)], -1)
-            size = np.where(other >= 0, volume[other], 0)
+            # the grid has an empty rim, so that no neighbour of an inner cell lies across its end
+            other = np.searchsorted(cells, cells[small] + step * strides[axis]).clip(max=len(cells) - 1)
+            size = np.where(cells[other] == cells[small] + step * strides[axis], volume[other], 0)
             better = size > best
             best[better], parent[small[better]] = size[better], other[better]
-            offset[small[better]] = 0
-            offset[small[better], axis] = -step
+            offset[small[better]] = -step * (np.arange(3) == axis)
     return parent, offset

@@ -14,17 +14,26 @@ Rays begin at points uniform over the surface, each with one sample of the emitt
 the transmittance, each channel in turn (balance heuristic), and added to the moments of L_0 in their cells. The fit in
 each cell is linear, by least squares over the part inside (`inside_cells`): it keeps the light of a cell and its first
 moments, so that its error in an image is of second order in the size of cells.
+
+Where a medium does not scatter evenly, the directions w' of the light of a cell count. They are parted by octants; the
+light of each is a lobe of Henyey-Greenstein about its mean direction w_m with the mean cosine a_m that it has, so that
+
+    ∫ p_g(w.w') L_0(x, w') dw' = phi(x) sum_m s_m p_(g a_m)(w.w_m),
+
+phi the fluence of unscattered light and s_m the share of the octant: two such functions of g and a convolve to one of
+g a. A single direction is exact.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from halfspace_sss.physics.medium import eval_hg
 from halfspace_sss.rendering.gathered.points import lattice, uniform_entries
 from halfspace_sss.rendering.object.points import lift, opaque, sided
 from halfspace_sss.rendering.walk.inside_cells import POINTS, InsideCells, grid_edge
@@ -34,8 +43,10 @@ from halfspace_sss.tracing.walk import generator, pass_seed
 
 RAYS = 2**19  # of light for each object
 EDGE = 0.9  # of cells, mean free paths
+DEPTH = 12.0  # mean free paths below the surface: e^-12 is left of light there
 ALONG = 6  # points on a segment of a ray
 FEWEST_POINTS, MOST_POINTS = 2**14, 2**22  # of the surface, that find the cells it cuts
+OCTANTS = 8
 ROULETTE = 0.1  # part of its light below which a reflected ray may end
 R_4 = (0.8566748838545029, 0.7338918566271260, 0.6287067210378087, 0.5385972572236101)  # Roberts 2018, four dimensions
 
@@ -45,15 +56,16 @@ class UnscatteredLight:
     """Unscattered light inside the objects of a scene.
 
     Args:
-        slot, values: cells of all objects, one after the other; of each slot and channel the value at the centre and
-            the slopes, 1/4pi of the fluence.
+        slot: of the cells of all objects, one after the other.
+        fluence: of each slot and channel the value at the centre and the slopes by units of h.
+        lobes: of each slot and octant s_m by channel, 0, a_m w_m, 0; None where all media scatter evenly.
         tables: by the number of an object, where its cells begin, their corner, 1/h and counts.
     """
 
     slot: mi.Int32
-    values: mi.Float
+    fluence: mi.Float
+    lobes: mi.Float | None
     tables: dict[str, Any]
-    info: dict = field(default_factory=dict)
 
     def light(self, media: WalkMedia, event: Event) -> mi.Spectrum:
         """Unscattered light that an event of a walk scatters on along it, per weight of the walk."""
@@ -65,30 +77,65 @@ class UnscatteredLight:
         slot = dr.gather(mi.Int32, self.slot, index, inside)
         held, y = inside & (slot >= 0), x - (mi.Vector3f(cell) + 0.5)
         n = len(mi.Spectrum(0))
-        rows = [dr.gather(mi.Vector4f, self.values, mi.UInt32(slot * n + c), held) for c in range(n)]
-        return mi.Spectrum([v.x + v.y * y.x + v.z * y.y + v.w * y.z for v in rows])
+        rows = [dr.gather(mi.Vector4f, self.fluence, mi.UInt32(slot * n + c), held) for c in range(n)]
+        phi = mi.Spectrum([v.x + v.y * y.x + v.z * y.y + v.w * y.z for v in rows])
+        if self.lobes is None:
+            return phi / (4 * dr.pi)
+
+        # ---- sum_m s_m p_(g a_m)(w.w_m)
+        g, total = event.m.g, mi.Spectrum(0)
+        for m in range(OCTANTS):
+            index = mi.UInt32(slot * OCTANTS + m) * 2
+            share, v = (dr.gather(mi.Vector4f, self.lobes, index + i, held) for i in range(2))
+            v = mi.Vector3f(v.x, v.y, v.z)
+            a = dr.norm(v)
+            cosine = dr.dot(event.along, v) / dr.maximum(a, 1e-6)
+            if media.same_g:
+                phase = [eval_hg(cosine, g[0] * a)] * n
+            else:
+                phase = [eval_hg(cosine, g[c] * a) for c in range(n)]
+            total += mi.Spectrum([share[c] * phase[c] for c in range(n)])
+        return phi * total
 
 
 def unscattered_light(
     scene: mi.Scene, media: WalkMedia, seed: int, cells: list[InsideCells], rays: int = RAYS
 ) -> UnscatteredLight:
     """Unscattered light of the emitters of a scene in cells of its objects, from `inside_cells_of`."""
-    slots, values, first = [], [], 0
+    directional = any(np.any(inside.medium.g) for inside in media.insides)
+    slots, values, lobes, first = [], [], [], 0
     rows = {"first": [], "low": [], "scale": [], "counts": []}
     start = 0
     for k, grid in enumerate(cells):
-        D = _moments(scene, media, k, grid, seed, rays)
+        D, octants = _moments(scene, media, k, grid, seed, rays, directional)
         slot = np.array(grid.slot)
         slots.append(np.where(slot >= 0, slot + start, -1))
-        values.append(grid.fit(D / grid.h**3) / (4 * np.pi))
+        values.append(grid.fit(D / grid.h**3))
+        lobes.append(_lobes(octants, grid) if directional else [])
         for key, value in (("first", first), ("low", grid.low), ("scale", 1 / grid.h), ("counts", grid.counts)):
             rows[key].append(value)
-        first, start = first + slot.size, start + len(grid)
+        first, start = first + slot.size, start + grid.slots
     kinds = {"first": mi.Int32, "low": mi.Point3f, "scale": mi.Float, "counts": mi.Vector3i}
     tables = {key: kind(np.array(rows[key]).T) for key, kind in kinds.items()}
-    slot, value = mi.Int32(np.concatenate(slots)), mi.Float(np.concatenate(values).astype(np.float32).ravel())
-    dr.make_opaque(tables, slot, value)
-    return UnscatteredLight(slot, value, tables)
+    slot, *arrays = mi.Int32(np.concatenate(slots)), *(
+        mi.Float(np.concatenate(v).astype(np.float32).ravel()) for v in (values, lobes)
+    )
+    dr.make_opaque(tables, slot, arrays)
+    return UnscatteredLight(slot, arrays[0], arrays[1] if directional else None, tables)
+
+
+def _lobes(octants: np.ndarray, grid: InsideCells) -> np.ndarray:
+    """Shares of the light of octants, and their mean directions, shape (slots, octants, 8).
+
+    Args:
+        octants: (slots, octants, 8) light by channel, 0, light of all channels times direction, 0.
+        grid: tells the cells that share the light of another.
+    """
+    octants[grid.cut] = octants[grid.cut[grid.place]]
+    light, v = octants[..., :4], octants[..., 4:]
+    v /= np.maximum(light.sum(axis=-1, keepdims=True), 1e-30)
+    light /= np.maximum(light.sum(axis=1, keepdims=True), 1e-30)
+    return octants
 
 
 def inside_cells_of(media: WalkMedia, edge: float = EDGE) -> list[InsideCells]:
@@ -97,22 +144,28 @@ def inside_cells_of(media: WalkMedia, edge: float = EDGE) -> list[InsideCells]:
     for k in range(len(media.placed)):
         kind = int(media.placed.kind[k])
         geometry = media.objects[kind]
-        sigma_t = media.mm_per_unit * float(np.mean(media.insides[kind].medium.sigma_t))
-        box = media.scene.bbox()
+        sigma_t = media.mm_per_unit * np.atleast_1d(media.insides[kind].medium.sigma_t)
         ends = tuple(np.array(end, dtype=float).ravel() for end in (geometry.scene.bbox().min, geometry.scene.bbox().max))
-        h = grid_edge(ends, edge / sigma_t)
+        h = grid_edge(ends, edge / float(np.mean(sigma_t)))
         n = int(np.clip(POINTS * geometry.area / h**2, FEWEST_POINTS, MOST_POINTS))
         u = [mi.Float(v.astype(np.float32)) for v in lattice(n)]
         points = uniform_entries(geometry, u[0], mi.Point2f(u[1], u[2])).p
-        results.append(InsideCells.of(media, k, points, ends, h))
+        results.append(InsideCells.of(media, k, points, ends, h, DEPTH / float(np.min(sigma_t))))
     return results
 
 
-def _moments(scene: mi.Scene, media: WalkMedia, k: int, grid: InsideCells, seed: int, rays: int) -> np.ndarray:
-    """∫ L_0 x_j dx dw over the inside of each cell, shape (slots, 3, 4), x about its centre in units of h."""
+def _moments(
+    scene: mi.Scene, media: WalkMedia, k: int, grid: InsideCells, seed: int, rays: int, directional: bool
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """∫ L_0 x_j dx dw over the inside of each cell, shape (slots, channels, 4), x about its centre in units of h.
+
+    With it, if `directional`, ∫ L_0 dx dw by channel and ∫ L_0 w dx dw of all channels, each of the directions w to
+    the light in an octant, shape (slots, octants, 8).
+    """
     geometry = media.objects[int(media.placed.kind[k])]
     n, number = len(mi.Spectrum(0)), dr.full(mi.Int32, k, rays)
-    D = dr.zeros(mi.Float, len(grid) * n * 4)
+    D = dr.zeros(mi.Float, grid.slots * n * 4)
+    octants = dr.zeros(mi.Float, grid.slots * OCTANTS * 8 if directional else 1)
     rng = generator(mi, rays, pass_seed(seed, k))
 
     # ---- points of the surface, in order along its faces, with a sample of the emitters each
@@ -154,6 +207,7 @@ def _moments(scene: mi.Scene, media: WalkMedia, k: int, grid: InsideCells, seed:
 
         # ---- points along it: density mean_c sigma_c T_c / (1 - T_c(far))
         passed, ends = dr.exp(-sigma_t * length), 1 - dr.exp(-sigma_t * far)
+        octant = dr.select(d.x < 0, 1, 0) + dr.select(d.y < 0, 2, 0) + dr.select(d.z < 0, 4, 0)
         u0, turn = rng.next_float32(), mi.UInt32(rng.next_float32() * n)
 
         def add(j: mi.UInt32) -> tuple:
@@ -172,6 +226,12 @@ def _moments(scene: mi.Scene, media: WalkMedia, k: int, grid: InsideCells, seed:
             for c in range(n):
                 moments = mi.Vector4f(1, y.x, y.y, y.z) * light[c]
                 dr.scatter_add(D, moments, mi.UInt32(slot * n + c), held)
+            if directional:
+                index = mi.UInt32(slot * OCTANTS + octant) * 2
+                by_channel = mi.Vector4f(*(light[c] if c < n else mi.Float(0) for c in range(4)))
+                v = d * -dr.sum(light)
+                dr.scatter_add(octants, by_channel, index, held)
+                dr.scatter_add(octants, mi.Vector4f(v.x, v.y, v.z, 0), index + 1, held)
             return (j + 1,)
 
         dr.while_loop((mi.UInt32(0),), lambda j: j < ALONG, add, label="points of a ray")
@@ -192,5 +252,6 @@ def _moments(scene: mi.Scene, media: WalkMedia, k: int, grid: InsideCells, seed:
     start = (mi.Point3f(at.p), mi.Vector3f(d), media.clear(number, si.n, d), mi.Spectrum(flux), dr.zeros(mi.Float, rays),
              mi.Bool(enters), rng)  # fmt: skip
     dr.while_loop(start, lambda o, d, skip, flux, length, alive, rng: alive, segment, label="rays of light")
-    dr.eval(D)
-    return np.array(D, dtype=float).reshape(len(grid), n, 4)
+    dr.eval(D, octants)
+    D = np.array(D).reshape(grid.slots, n, 4)
+    return D, np.array(octants).reshape(grid.slots, OCTANTS, 8) if directional else None
