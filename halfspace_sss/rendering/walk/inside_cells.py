@@ -175,7 +175,7 @@ def _centres(cells: np.ndarray, low: np.ndarray, h: float, counts: np.ndarray) -
 
 
 def _own_hit(media: WalkMedia, k: mi.Int32, ray: mi.Ray3f) -> tuple[mi.Float, mi.Bool, mi.Bool]:
-    """Distance to the surface of object k along a ray, whether it is met, and whether the ray leaves the object there."""
+    """Distance to the surface of object k along a ray, whether it is met, and whether the ray leaves the object."""
 
     def nearer(t: mi.Float, found: mi.Bool, leaves: mi.Bool, going: mi.Bool) -> tuple:
         si = media.sight.intersect(media.scene, mi.Ray3f(ray.o + ray.d * t, ray.d), mi.RayFlags.Minimal, active=going)
@@ -187,7 +187,12 @@ def _own_hit(media: WalkMedia, k: mi.Int32, ray: mi.Ray3f) -> tuple[mi.Float, mi
         return t, found | own, dr.select(own, out, leaves), hit & ~own
 
     lanes = dr.width(ray.o)
-    start = (dr.zeros(mi.Float, lanes), dr.full(mi.Bool, False, lanes), dr.full(mi.Bool, False, lanes), dr.full(mi.Bool, True, lanes))
+    start = (
+        dr.zeros(mi.Float, lanes),
+        dr.full(mi.Bool, False, lanes),
+        dr.full(mi.Bool, False, lanes),
+        dr.full(mi.Bool, True, lanes),
+    )
     t, found, leaves, _ = dr.while_loop(start, lambda t, f, o, going: going, nearer, label="own surface")
     return t, found, leaves
 
@@ -217,7 +222,9 @@ def _measure(media: WalkMedia, k: int, cells: np.ndarray, low: np.ndarray, h: fl
         u = (mi.Float(place % COLUMNS) + rng.next_float32()) / COLUMNS - 0.5
         v = (mi.Float(place // COLUMNS) + rng.next_float32()) / COLUMNS - 0.5
         start = mi.Vector3f(
-            dr.select(axis == 0, -0.5, u), dr.select(axis == 1, -0.5, dr.select(axis == 0, u, v)), dr.select(axis == 2, -0.5, v)
+            dr.select(axis == 0, -0.5, u),
+            dr.select(axis == 1, -0.5, dr.select(axis == 0, u, v)),
+            dr.select(axis == 2, -0.5, v),
         )
         d = mi.Vector3f(*(dr.select(axis == a, mi.Float(1), 0) for a in range(3)))
 
@@ -250,7 +257,7 @@ def _measure(media: WalkMedia, k: int, cells: np.ndarray, low: np.ndarray, h: fl
 
 
 def _parents(cells: np.ndarray, volume: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of each cut cell the one whose fit it shares, the largest cut neighbour of a small one, and the way from there."""
+    """Of each cut cell the one whose fit it shares, for small ones the largest cut neighbour, and the way from there."""
     parent, offset = np.arange(len(cells)), np.zeros((len(cells), 3))
     small = np.flatnonzero(volume < SMALLEST)
     strides, best = np.array([1, counts[0], counts[0] * counts[1]]), np.full(len(small), SMALLEST)

@@ -27,6 +27,7 @@ g a. A single direction is exact.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import zip_longest
 from typing import Any
 
 import drjit as dr
@@ -35,18 +36,19 @@ import numpy as np
 
 from halfspace_sss.physics.medium import eval_hg
 from halfspace_sss.rendering.gathered.points import lattice, uniform_entries
-from halfspace_sss.rendering.object.points import lift, opaque, sided
+from halfspace_sss.rendering.object.instances import Pose, corners, ends_of
+from halfspace_sss.rendering.object.points import EntrySample, lift, opaque, sided
 from halfspace_sss.rendering.walk.inside_cells import POINTS, InsideCells, grid_edge
 from halfspace_sss.rendering.walk.media import WalkMedia
 from halfspace_sss.rendering.walk.random_walk import Event, pick, sample_bsdf
 from halfspace_sss.tracing.walk import generator, pass_seed
 
-RAYS = 2**19  # of light for each object
 EDGE = 0.9  # of cells, mean free paths
 DEPTH = 12.0  # mean free paths below the surface: e^-12 is left of light there
 ALONG = 6  # points on a segment of a ray
 FEWEST_POINTS, MOST_POINTS = 2**14, 2**22  # of the surface, that find the cells it cuts
 OCTANTS = 8
+MOST_G = 0.85  # above, light reaches a fraction of the depth that walks do, and cells are too many
 ROULETTE = 0.1  # part of its light below which a reflected ray may end
 R_4 = (0.8566748838545029, 0.7338918566271260, 0.6287067210378087, 0.5385972572236101)  # Roberts 2018, four dimensions
 
@@ -99,9 +101,17 @@ class UnscatteredLight:
 
 
 def unscattered_light(
-    scene: mi.Scene, media: WalkMedia, seed: int, cells: list[InsideCells], rays: int = RAYS
+    scene: mi.Scene, media: WalkMedia, seed: int, cells: list[InsideCells], rays: int
 ) -> UnscatteredLight:
-    """Unscattered light of the emitters of a scene in cells of its objects, from `inside_cells_of`."""
+    """Unscattered light of the emitters of a scene.
+
+    Args:
+        scene: of Mitsuba.
+        media: its objects.
+        seed: whole number.
+        cells: of the objects, from `inside_cells_of`.
+        rays: of light, for each object.
+    """
     directional = any(np.any(inside.medium.g) for inside in media.insides)
     slots, values, lobes, first = [], [], [], 0
     rows = {"first": [], "low": [], "scale": [], "counts": []}
@@ -117,8 +127,9 @@ def unscattered_light(
         first, start = first + slot.size, start + grid.slots
     kinds = {"first": mi.Int32, "low": mi.Point3f, "scale": mi.Float, "counts": mi.Vector3i}
     tables = {key: kind(np.array(rows[key]).T) for key, kind in kinds.items()}
-    slot, *arrays = mi.Int32(np.concatenate(slots)), *(
-        mi.Float(np.concatenate(v).astype(np.float32).ravel()) for v in (values, lobes)
+    slot, *arrays = (
+        mi.Int32(np.concatenate(slots)),
+        *(mi.Float(np.concatenate(v).astype(np.float32).ravel()) for v in (values, lobes)),
     )
     dr.make_opaque(tables, slot, arrays)
     return UnscatteredLight(slot, arrays[0], arrays[1] if directional else None, tables)
@@ -138,20 +149,55 @@ def _lobes(octants: np.ndarray, grid: InsideCells) -> np.ndarray:
     return octants
 
 
+def obstacle(media: WalkMedia) -> str:
+    """Why light of a scene must be sampled; "" where it can be precomputed."""
+    if mi.is_spectral:
+        return f"the variant {mi.variant()} has no light by channel"
+    for obj, inside, around in zip_longest(media.objects, media.insides, media.wrappings):
+        if not obj.closed:
+            return f"object {obj.name} is not closed"
+        if inside.textured is not None and "sigma_t" not in inside.textured.constants:
+            return f"sigma_t of object {obj.name} has a texture, of which each walk takes its own value"
+        if around is not None and (around.mixes or around.bend is not None):
+            return f"the surface of object {obj.name} is masked, blended, or has a normal or bump map"
+        if np.max(np.abs(inside.medium.g)) > MOST_G:
+            return f"abs(g) of object {obj.name} is above {MOST_G}"
+    return ""
+
+
 def inside_cells_of(media: WalkMedia, edge: float = EDGE) -> list[InsideCells]:
     """The cells of all objects, `edge` mean free paths wide."""
     results = []
-    for k in range(len(media.placed)):
-        kind = int(media.placed.kind[k])
-        geometry = media.objects[kind]
+    for k, kind in enumerate(media.placed.kind):
         sigma_t = media.mm_per_unit * np.atleast_1d(media.insides[kind].medium.sigma_t)
-        ends = tuple(np.array(end, dtype=float).ravel() for end in (geometry.scene.bbox().min, geometry.scene.bbox().max))
-        h = grid_edge(ends, edge / float(np.mean(sigma_t)))
-        n = int(np.clip(POINTS * geometry.area / h**2, FEWEST_POINTS, MOST_POINTS))
-        u = [mi.Float(v.astype(np.float32)) for v in lattice(n)]
-        points = uniform_entries(geometry, u[0], mi.Point2f(u[1], u[2])).p
-        results.append(InsideCells.of(media, k, points, ends, h, DEPTH / float(np.min(sigma_t))))
+        box = media.objects[kind].scene.bbox()
+        low, high = ends_of(corners(box, _to_world(media, k)[None]))
+        h = grid_edge((low[0], high[0]), edge / float(np.mean(sigma_t)))
+        depth = np.inf if media.varies else DEPTH / float(np.min(sigma_t))
+        area = float(
+            np.mean(np.array(_entries(media, k, [mi.Float(v.astype(np.float32)) for v in lattice(2**10)]).weight))
+        )
+        n = int(np.clip(POINTS * area / h**2, FEWEST_POINTS, MOST_POINTS))
+        points = _entries(media, k, [mi.Float(v.astype(np.float32)) for v in lattice(n)]).p
+        results.append(InsideCells.of(media, k, points, (low[0], high[0]), h, depth))
     return results
+
+
+def _to_world(media: WalkMedia, k: int) -> np.ndarray:
+    """Where object k stands: the matrix of an instance."""
+    kind = int(media.placed.kind[k])
+    return media.placed.to_world(kind)[k - int(media.placed.first[kind])]
+
+
+def _entries(media: WalkMedia, k: int, u: list[mi.Float]) -> EntrySample:
+    """Points uniform over the surface of object k, in an instance over that in its group; the weight is 1 / density."""
+    kind = int(media.placed.kind[k])
+    entries = uniform_entries(media.objects[kind], u[0], mi.Point2f(u[1], u[2]))
+    if media.placed.groups[kind] is None:
+        return entries
+    M = _to_world(media, k)
+    columns = [[mi.Vector3f(*(opaque(v) for v in column)) for column in m[:3].T] for m in (M, np.linalg.inv(M))]
+    return Pose(*columns, mi.Float(0)).entry(entries)
 
 
 def _moments(
@@ -162,7 +208,6 @@ def _moments(
     With it, if `directional`, ∫ L_0 dx dw by channel and ∫ L_0 w dx dw of all channels, each of the directions w to
     the light in an octant, shape (slots, octants, 8).
     """
-    geometry = media.objects[int(media.placed.kind[k])]
     n, number = len(mi.Spectrum(0)), dr.full(mi.Int32, k, rays)
     D = dr.zeros(mi.Float, grid.slots * n * 4)
     octants = dr.zeros(mi.Float, grid.slots * OCTANTS * 8 if directional else 1)
@@ -175,7 +220,7 @@ def _moments(
         # multiples of a root in whole numbers, which float32 would round
         step, offset = (dr.opaque(mi.UInt32, int(v * 2**32) % 2**32) for v in (root, s))
         u.append(mi.Float((dr.arange(mi.UInt32, rays) * step + offset) >> 8) * 2**-24)
-    at = uniform_entries(geometry, dr.minimum(u[0], 1 - 2**-24), mi.Point2f(u[1], u[2]))
+    at = _entries(media, k, [dr.minimum(u[0], 1 - 2**-24), u[1], u[2]])
     si = dr.zeros(mi.SurfaceInteraction3f, rays)
     si.p, si.n, si.sh_frame = mi.Point3f(at.p), mi.Normal3f(at.n), mi.Frame3f(at.n_out)
     ds, light = scene.sample_emitter_direction(si, mi.Point2f(u[3], u[4]), True)
@@ -190,7 +235,7 @@ def _moments(
     cosine = mi.Frame3f.cos_theta(si.wi)
     bend = dr.abs(dr.dot(d, si.n)) / dr.maximum(dr.abs(mi.Frame3f.cos_theta(bs.wo)), 1e-6)
     enters = (ds.pdf > 0) & (bs.pdf > 0) & (dr.dot(si.n, ds.d) > 0) & (cosine > 0) & (dr.dot(d, si.n) < 0)
-    flux = dr.select(enters, light * value * (cosine * bend * opaque(geometry.area / rays)), 0)
+    flux = dr.select(enters, light * value * (cosine * bend * at.weight / opaque(rays)), 0)
     enters &= dr.max(flux) > 0
 
     sigma_t = media.spectrum("sigma_t", number)
@@ -198,7 +243,10 @@ def _moments(
     counts = mi.Vector3i(*(dr.opaque(mi.Int32, int(v)) for v in grid.counts))
     slots = grid.slot
 
-    def segment(o, d, skip, flux, length, alive, rng) -> tuple:
+    def transmitted(o: mi.Point3f, d: mi.Vector3f, s: mi.Float, rng: mi.PCG32) -> mi.Spectrum:
+        return media.transmittance(number, mi.Ray3f(o, d), s, rng) if media.varies else dr.exp(-sigma_t * s)
+
+    def segment(o, d, skip, flux, passed, alive, rng) -> tuple:
         ray = mi.Ray3f(o + d * skip, d)
         si = media.sight.intersect(media.scene, ray, mi.RayFlags.All, active=alive)
         own = alive & si.is_valid()
@@ -206,16 +254,17 @@ def _moments(
         far = dr.select(own, si.t + skip, 0)
 
         # ---- points along it: density mean_c sigma_c T_c / (1 - T_c(far))
-        passed, ends = dr.exp(-sigma_t * length), 1 - dr.exp(-sigma_t * far)
+        ends = 1 - dr.exp(-sigma_t * far)
         octant = dr.select(d.x < 0, 1, 0) + dr.select(d.y < 0, 2, 0) + dr.select(d.z < 0, 4, 0)
         u0, turn = rng.next_float32(), mi.UInt32(rng.next_float32() * n)
 
-        def add(j: mi.UInt32) -> tuple:
+        def add(j: mi.UInt32, rng: mi.PCG32) -> tuple:
             rate, end = (pick(v, (j + turn) % n) for v in (sigma_t, ends))
             u = u0 + mi.Float(j) / ALONG
             s = dr.minimum(-dr.log(1 - dr.minimum((u - dr.floor(u)) * end, 1 - 2**-24)) / rate, far)
             T = dr.exp(-sigma_t * s)
             pdf = dr.sum(sigma_t * T / dr.maximum(ends, 1e-20)) / n
+            T = transmitted(o, d, s, rng) if media.varies else T
             light = flux * passed * T / dr.maximum(pdf * ALONG, 1e-20)
             x = (o + d * s - low) * scale
             cell = mi.Vector3i(dr.floor(x))
@@ -232,9 +281,9 @@ def _moments(
                 v = d * -dr.sum(light)
                 dr.scatter_add(octants, by_channel, index, held)
                 dr.scatter_add(octants, mi.Vector4f(v.x, v.y, v.z, 0), index + 1, held)
-            return (j + 1,)
+            return j + 1, rng
 
-        dr.while_loop((mi.UInt32(0),), lambda j: j < ALONG, add, label="points of a ray")
+        _, rng = dr.while_loop((mi.UInt32(0), rng), lambda j, rng: j < ALONG, add, label="points of a ray")
 
         # ---- reflection inside, with the weight of the boundary and roulette
         si = media.seen(si, number, d)
@@ -242,16 +291,16 @@ def _moments(
         ctx.type_mask = mi.BSDFFlags.Reflection
         bs, value = sample_bsdf(media.boundary(number), si, rng, ctx)
         new, _ = sided(si, bs.wo)
-        length = length + far
-        left = dr.max(value) * dr.max(flux * dr.exp(-sigma_t * length)) / dr.maximum(dr.max(flux), 1e-30)
+        passed = passed * transmitted(o, d, far, rng)
+        left = dr.max(value) * dr.max(flux * passed) / dr.maximum(dr.max(flux), 1e-30)
         survive = dr.minimum(left / ROULETTE, 1)
         alive = own & (dr.dot(si.n, d) > 0) & (dr.dot(si.n, new) < 0) & (rng.next_float32() < survive)
         flux = flux * value / dr.maximum(survive, 1e-20)
-        return mi.Point3f(si.p), mi.Vector3f(new), media.clear(number, si.n, new), flux, length, alive, rng
+        return mi.Point3f(si.p), mi.Vector3f(new), media.clear(number, si.n, new), flux, passed, alive, rng
 
-    start = (mi.Point3f(at.p), mi.Vector3f(d), media.clear(number, si.n, d), mi.Spectrum(flux), dr.zeros(mi.Float, rays),
-             mi.Bool(enters), rng)  # fmt: skip
-    dr.while_loop(start, lambda o, d, skip, flux, length, alive, rng: alive, segment, label="rays of light")
+    start = (mi.Point3f(at.p), mi.Vector3f(d), media.clear(number, si.n, d), mi.Spectrum(flux),
+             dr.full(mi.Spectrum, 1, rays), mi.Bool(enters), rng)  # fmt: skip
+    dr.while_loop(start, lambda o, d, skip, flux, passed, alive, rng: alive, segment, label="rays of light")
     dr.eval(D, octants)
     D = np.array(D).reshape(grid.slots, n, 4)
     return D, np.array(octants).reshape(grid.slots, OCTANTS, 8) if directional else None
