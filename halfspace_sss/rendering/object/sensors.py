@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -52,8 +54,11 @@ def rays_by(sensor: mi.Sensor, sampler: mi.Sampler) -> tuple[mi.Ray3f, mi.Spectr
     return widened(ray, n), weight, mi.Vector2f(pixel) if film.rfilter().is_box_filter() else position
 
 
-def splat(film: mi.Film, rays: mi.Ray3f, L: mi.Spectrum, seen: mi.Bool, position: mi.Vector2f, spp: int) -> None:
-    """Add the light of rays to a film."""
+def splat(
+    film: mi.Film, rays: mi.Ray3f, L: mi.Spectrum, seen: mi.Bool, position: mi.Vector2f, spp: int,
+    layers: Sequence[mi.Float] = (),
+) -> None:  # fmt: skip
+    """Add the light of rays to a film, and values of further channels."""
     block = film.create_block()
     block.set_coalesce(block.coalesce() and spp >= 4)
     alpha = dr.select(seen, mi.Float(1), mi.Float(0))
@@ -63,7 +68,7 @@ def splat(film: mi.Film, rays: mi.Ray3f, L: mi.Spectrum, seen: mi.Bool, position
     else:
         L = mi.spectrum_to_srgb(L, rays.wavelengths) if mi.is_spectral else L
         rgb = [L[0]] * 3 if len(L) == 1 and block.channel_count() >= 4 else list(L)
-        values = [*rgb, *([alpha] if has_alpha else []), mi.Float(1)]
+        values = [*rgb, *([alpha] if has_alpha else []), mi.Float(1), *layers]
     block.put(position, values)
     film.put_block(block)
     dr.eval(block.tensor())

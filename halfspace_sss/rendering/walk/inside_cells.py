@@ -257,7 +257,7 @@ def _measure(media: WalkMedia, k: int, cells: np.ndarray, low: np.ndarray, h: fl
 
 
 def _parents(cells: np.ndarray, volume: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of each cut cell the one whose fit it shares, for small ones the largest cut neighbour, and the way from there."""
+    """Of each cut cell the one whose fit it shares, for a small one its largest neighbour, and the way from there."""
     parent, offset = np.arange(len(cells)), np.zeros((len(cells), 3))
     small = np.flatnonzero(volume < SMALLEST)
     strides, best = np.array([1, counts[0], counts[0] * counts[1]]), np.full(len(small), SMALLEST)

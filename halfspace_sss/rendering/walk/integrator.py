@@ -28,10 +28,11 @@ from halfspace_sss.rendering.walk.scores import PathScores, with_derivatives
 from halfspace_sss.rendering.walk.straight_light import find_straight_light
 from halfspace_sss.rendering.walk.unscattered_light import inside_cells_of, obstacle, unscattered_light
 
-PARAMETERS = ("mm_per_unit", "max_depth", "rr_depth", "hide_emitters", "connection_share", "blur", "light")
+PARAMETERS = ("mm_per_unit", "max_depth", "rr_depth", "hide_emitters", "connection_share", "blur", "light", "layers")
 SAMPLES_PER_LAUNCH = 2**19
 LANES = 2**14  # fastest of 2**12 to 2**18 on 2 cores
 GPU_FACTOR = 4  # as many times lanes and samples on CUDA: 1.2 to 1.4 times as fast on an H200
+LAYER = ["emission.R", "emission.G", "emission.B"]
 LIGHTS = ("auto", "precomputed", "sampled")
 SAMPLES_PER_RAY = 4  # of the image, for each ray of light: these take a tenth of the time or less
 FEWEST_RAYS, MOST_RAYS = 2**16, 2**21
@@ -60,7 +61,9 @@ def _class(variant: str) -> type:
         light out), `light` ("auto"; "precomputed" finds light that arrives unscattered on a grid, see
         `unscattered_light`, which has 10 to 50 times less noise in the same time and a bias of less than .3 %;
         "sampled" meets it by chance and by connections, without that bias; "auto" precomputes it where that is
-        possible, and samples it for derivatives).
+        possible, and samples it for derivatives), `layers` (false; true adds the channels emission.R, .G and .B to the
+        image: emitters that the camera sees, at once or in the mirror of an object, which leaves what is behind it for
+        a denoiser).
         """
 
         def __init__(self, props: mi.Properties) -> None:
@@ -73,6 +76,7 @@ def _class(variant: str) -> type:
             self.connection_share = _share("connection_share", float(props.get("connection_share", 0.5)))
             self.blur = _scale("blur", float(props.get("blur", 1.0)))
             self.light = _one_of("light", str(props.get("light", "auto")), LIGHTS)
+            self.layers = bool(props.get("layers", False))
             self._prepared: tuple[int, list, tuple, Any] = (0, [], ([], []), None)
             self._cells: tuple[Any, list] = (None, [])
 
@@ -93,14 +97,14 @@ def _class(variant: str) -> type:
                 rays = min(max(samples // SAMPLES_PER_RAY, FEWEST_RAYS), MOST_RAYS)
                 light = unscattered_light(scene, media, seed, self._cells[1], rays)
                 visitor = LightVisitor(scene, media, small, None, None, None, inner, self.blur, light)
-                return PathTracer(visitor, self.max_depth, self.rr_depth, self.hidden)
+                return PathTracer(visitor, self.max_depth, self.rr_depth, self.hidden, self.layers)
             connections = find_connections(scene, media, small, self.connection_share, scored)
             directions = connections and EmitterDirections(scene, media, small, scored)
             if scored and inner is not None:
                 raise ValueError("objects must hold no delta lights for derivatives of translucent_walk")
             straight = find_straight_light(scene, media, self.max_depth == FOREVER, scored)
             visitor = LightVisitor(scene, media, small, connections, directions, straight, inner, self.blur)
-            return PathTracer(visitor, self.max_depth, self.rr_depth, self.hidden)
+            return PathTracer(visitor, self.max_depth, self.rr_depth, self.hidden, self.layers)
 
         def precomputes(self, media: WalkMedia) -> bool:
             """Whether images find unscattered light precomputed.
@@ -139,8 +143,9 @@ def _class(variant: str) -> type:
             with dr.suspend_grad():
                 seed = tuple(int(2**24 * sampler.next_1d()[0]) for _ in range(2))
                 tracer = self.tracer(scene, seed[0], sampler.wavefront_size())
-                L, seen = tracer.trace(widened(ray, sampler.wavefront_size()), _on_device(LANES), seed)
-            return dr.select(active, L, 0), active & seen, []
+                L, seen, emission = tracer.trace(widened(ray, sampler.wavefront_size()), _on_device(LANES), seed)
+            layer = list(mi.Color3f(emission)) if self.layers else []
+            return dr.select(active, L, 0), active & seen, layer
 
         def render_forward(
             self, scene: mi.Scene, params: Any, sensor: mi.Sensor | int = 0, seed: mi.UInt32 | int = 0, spp: int = 0
@@ -197,6 +202,9 @@ def _class(variant: str) -> type:
                 _render(self.tracer(scene, scored=True), sensor, int(mi.UInt32(seed)[0]), spp, None, True)
                 with dr.resume_grad():
                     return sensor.film().develop()
+
+        def aov_names(self) -> list[str]:
+            return LAYER if self.layers else []
 
         def to_string(self) -> str:
             blur = f", blur = {self.blur:g}" if self.blur != 1 else ""
@@ -265,7 +273,7 @@ def _render(
     for obj, inside in zip(tracer.visitor.media.objects, tracer.visitor.media.insides):
         if inside.spectral is not None:
             inside.spectral.check_covers(obj.name, sensor)
-    sensor.film().prepare([])
+    sensor.film().prepare(LAYER if tracer.layers else [])
     most = max(1, _on_device(SAMPLES_PER_LAUNCH) // int(dr.prod(sampled_size(sensor.film()))))
     for launch, start in enumerate(range(0, spp, most)):
         _launch(tracer, sensor, min(most, spp - start), (seed, launch), keep, scored)
@@ -285,15 +293,16 @@ def _launch(
         media = tracer.visitor.media
         with dr.resume_grad():
             scores = PathScores.of(media, dr.width(rays))
-        L, seen = tracer.trace(rays, _on_device(LANES), seed, scores=scores)
+        L, seen, _ = tracer.trace(rays, _on_device(LANES), seed, scores=scores)
         with dr.resume_grad():
             splat(sensor.film(), rays, with_derivatives(L, scores, media) * weight, seen, position, spp)
         return
     exits = FirstExits.of(tracer.visitor.scene, tracer.visitor.media, rays) if keep else None
-    L, seen = tracer.trace(rays, _on_device(LANES), seed, exits)
+    L, seen, emission = tracer.trace(rays, _on_device(LANES), seed, exits)
     if keep:
         keep(exits)
-    splat(sensor.film(), rays, weight * L, seen, position, spp)
+    layer = list(mi.Color3f(weight * emission)) if tracer.layers else []
+    splat(sensor.film(), rays, weight * L, seen, position, spp, layer)
 
 
 def _positive(name: str, value: float) -> float:

@@ -73,6 +73,7 @@ class CameraPath:
     hit: mi.Bool  # whether its first ray hit anything
     depth: mi.UInt32  # vertices on surfaces met from outside
     stay: Stay | tuple[()] = ()  # inside an object, where derivatives are asked for
+    emission: mi.Spectrum | tuple[()] = ()  # seen at once or in the mirror of what is met first, if asked for
 
 
 # ---- Light gathered along a path -------------------------------------------------------------------------------------
@@ -338,12 +339,14 @@ class PathTracer:
         max_depth: most vertices on surfaces met from outside; what happens inside an object does not count.
         rr_depth: vertices outside after which roulette may end a path.
         hide_emitters: whether the camera sees no emitters.
+        layers: whether emission that the camera sees, at once or in the mirror of an object, is also told apart.
     """
 
     visitor: LightVisitor
     max_depth: int
     rr_depth: int
     hide_emitters: bool
+    layers: bool = False
 
     def trace(
         self,
@@ -352,17 +355,22 @@ class PathTracer:
         seed: tuple[int, ...],
         exits: FirstExits | None = None,
         scores: PathScores | None = None,
-    ) -> tuple[mi.Spectrum, mi.Bool]:
-        """Radiance along each ray, and whether it hits anything; `exits` or `scores`, if given, are filled."""
+    ) -> tuple[mi.Spectrum, mi.Bool, mi.Spectrum]:
+        """Radiance along each ray, whether it hits anything, and the layer of emission; fills `exits` or `scores`."""
         n = dr.width(rays)
         dr.eval(rays)
         lanes = min(lanes, n)
         L, hit = dr.zeros(mi.Spectrum, n), dr.zeros(mi.Bool, n)
-        dr.eval(L, hit)
+        emission = dr.zeros(mi.Spectrum, n if self.layers else 1)
+        dr.eval(L, hit, emission)
         media, visitor = self.visitor.media, FirstExitVisitor(self.visitor, exits) if exits else self.visitor
         scorer = ScoreVisitor(self.visitor, media, scores) if scores else None
         walker = Walker(media, scorer or visitor)
         total, step = (dr.opaque(mi.UInt32, v) for v in (n, lanes))  # kernels then serve images of any size
+
+        def begin(index: mi.UInt32, rng: mi.PCG32) -> CameraPath:
+            path = _begin(rays, total, index, rng, media, bool(scores))
+            return replace(path, emission=dr.zeros(mi.Spectrum, dr.width(index))) if self.layers else path
 
         def inside(p: CameraPath) -> CameraPath:
             record = FirstExitRecord(p.light, p.index, p.depth == 1) if exits else p.light
@@ -378,7 +386,9 @@ class PathTracer:
         def renew(p: CameraPath) -> CameraPath:
             dr.scatter(L, p.light.L, p.index)
             dr.scatter(hit, p.hit, p.index)
-            return _begin(rays, total, p.index + step, p.walk.rng, media, bool(scores))
+            if self.layers:
+                dr.scatter(emission, p.emission, p.index)
+            return begin(p.index + step, p.walk.rng)
 
         def body(p: CameraPath) -> tuple[CameraPath]:
             p = dr.if_stmt((p,), p.walk.object >= 0, inside, _same, label="inside")
@@ -390,11 +400,11 @@ class PathTracer:
             return (dr.if_stmt((p,), ~p.walk.alive, renew, _same),)
 
         rng = generator(mi, lanes, pass_seed(*seed))
-        start = _begin(rays, total, dr.arange(mi.UInt32, lanes), rng, media, bool(scores))
+        start = begin(dr.arange(mi.UInt32, lanes), rng)
         with dr.scoped_set_flag(dr.JitFlag.OptimizeLoops, False):  # records the loop twice, for kernels no faster
             dr.while_loop((start,), lambda p: p.index < total, body, label="paths")
-            dr.eval(L, hit)
-        return L, hit
+            dr.eval(L, hit, emission)
+        return L, hit, emission
 
     def _outside(self, p: CameraPath) -> CameraPath:
         """A ray outside all objects, and the surface that it meets."""
@@ -404,7 +414,10 @@ class PathTracer:
         # ---- emission, with its MIS weight
         first = p.depth == 0
         shown = ~first if self.hide_emitters else mi.Bool(True)
-        L = p.light.L + self.visitor.met_emitter(p.walk, p.light, si, shown)
+        emission = self.visitor.met_emitter(p.walk, p.light, si, shown)
+        if self.layers:
+            p = replace(p, emission=p.emission + dr.select(first, emission, 0))
+        L = p.light.L + emission
         L = L + self.visitor.spread_lights(p.walk, p.light, p.walk.alive)
         light = replace(p.light, L=L, connected=mi.Bool(False), directed=mi.Bool(False), precomputed=mi.Bool(False))
 
@@ -438,9 +451,10 @@ class PathTracer:
 
         # ---- emitters in the mirror of a smooth boundary: F L(mirrored direction)
         mirrors = translucent & lit & ~media.row("rough", near) if media.objects else mi.Bool(False)
-        mirrors &= self.visitor.unscattered is not None
-        if self.visitor.unscattered is not None:
-            L = L + self.visitor.mirrored_emitter(walk, si, bsdf, mirrors)
+        emission = self.visitor.mirrored_emitter(walk, si, bsdf, mirrors) if media.objects else mi.Spectrum(0)
+        L = L + emission
+        if self.layers:
+            p = replace(p, emission=p.emission + dr.select(p.depth == 1, emission, 0))
 
         # ---- BSDF sampling
         bs, value = sample_bsdf(bsdf, si, rng)
@@ -478,8 +492,7 @@ class PathTracer:
             again &= self.visitor.straight_light.passes_again(near)
         light = replace(light, L=L, previous=dr.select(again, light.previous, si.p), sighted=again,
                         pdf=dr.select(again, light.pdf, bs.pdf), delta=delta & ~again, scattered=scattered)  # fmt: skip
-        if self.visitor.unscattered is not None:
-            light = replace(light, precomputed=mirrors & ~enters)
+        light = replace(light, precomputed=mirrors & ~enters)
         if media.inner is not None:
             delta = ~again & (delta | enters | encloses)
             L = L + self.visitor.spread_inner_lights(walk, scattered & enters)
