@@ -411,12 +411,6 @@ class WalkMedia:
         """Whether light goes straight through the boundary of object k: of index 1, and nothing inside."""
         return self._alone(self.row("straight", k), k)
 
-    def is_outermost(self, k: mi.Int32) -> mi.Bool:
-        """Whether object k stands in no other, so that light of emitters arrives at its boundary."""
-        if self.inner is None:
-            return mi.Bool(True)
-        return dr.gather(mi.Int32, self.inner.tables["around"], self.place_of(k)) < 0
-
     def _alone(self, able: mi.Bool, k: mi.Int32) -> mi.Bool:
         return able if self.inner is None else able & dr.gather(mi.Bool, self.inner.tables["alone"], self.place_of(k))
 

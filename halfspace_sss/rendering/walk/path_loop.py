@@ -117,8 +117,7 @@ class LightVisitor:
         if self.unscattered is not None:
             counts = self.media.counts(walk.object, walk.order + 1)
             L = walk.weight * self.unscattered.light(self.media, event)
-            held = self.media.is_outermost(walk.object)
-            return walk, replace(record, L=record.L + dr.select(counts & held, L, 0), precomputed=mi.Bool(held))
+            return walk, replace(record, L=record.L + dr.select(counts, L, 0), precomputed=mi.Bool(True))
 
         # ---- emitters behind boundaries of index 1
         if self.straight_light is not None:
@@ -174,7 +173,7 @@ class LightVisitor:
             lit = (k < 0) & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
             d, E = self.inner_lights.light(walk.object, si, walk.rng, lit, walk.medium)
             L = L + dr.select(lit, walk.weight * bsdf.eval(mi.BSDFContext(), si, si.to_local(d), lit) * E, 0)
-        return walk, replace(record, L=L, precomputed=record.precomputed & (k == walk.object))
+        return walk, replace(record, L=L)
 
     def crossing(self, walk: Walk, record: LightRecord, crossing: Crossing) -> tuple[Walk, LightRecord]:
         before = record

@@ -44,6 +44,7 @@ from halfspace_sss.rendering.walk.random_walk import Event, pick, sample_bsdf
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 EDGE = 0.9  # of cells, mean free paths
+MOST_EDGE = 1.5  # beyond, the mean of an image is more than .5 % off
 DEPTH = 12.0  # mean free paths below the surface: e^-12 is left of light there
 ALONG = 6  # points on a segment of a ray
 FEWEST_POINTS, MOST_POINTS = 2**14, 2**22  # of the surface, that find the cells it cuts
@@ -153,6 +154,12 @@ def obstacle(media: WalkMedia) -> str:
     """Why light of a scene must be sampled; "" where it can be precomputed."""
     if mi.is_spectral:
         return f"the variant {mi.variant()} has no light by channel"
+    if media.inner is not None:
+        return "something lies inside an object"
+    for k, kind in enumerate(media.placed.kind):
+        h = _edges(media, k, EDGE)[1] * media.mm_per_unit * float(np.mean(media.insides[kind].medium.sigma_t))
+        if h > MOST_EDGE:
+            return f"object {media.objects[kind].name} is so many mean free paths wide that cells have {h:.2g}"
     for obj, inside, around in zip_longest(media.objects, media.insides, media.wrappings):
         if not obj.closed:
             return f"object {obj.name} is not closed"
@@ -160,6 +167,8 @@ def obstacle(media: WalkMedia) -> str:
             return f"sigma_t of object {obj.name} has a texture, of which each walk takes its own value"
         if around is not None and (around.mixes or around.bend is not None):
             return f"the surface of object {obj.name} is masked, blended, or has a normal or bump map"
+        if inside.orders != "total":
+            return f"orders of object {obj.name} are {inside.orders!r}"
         if np.max(np.abs(inside.medium.g)) > MOST_G:
             return f"abs(g) of object {obj.name} is above {MOST_G}"
     return ""
@@ -170,17 +179,23 @@ def inside_cells_of(media: WalkMedia, edge: float = EDGE) -> list[InsideCells]:
     results = []
     for k, kind in enumerate(media.placed.kind):
         sigma_t = media.mm_per_unit * np.atleast_1d(media.insides[kind].medium.sigma_t)
-        box = media.objects[kind].scene.bbox()
-        low, high = ends_of(corners(box, _to_world(media, k)[None]))
-        h = grid_edge((low[0], high[0]), edge / float(np.mean(sigma_t)))
+        box, h = _edges(media, k, edge)
         depth = np.inf if media.varies else DEPTH / float(np.min(sigma_t))
         area = float(
             np.mean(np.array(_entries(media, k, [mi.Float(v.astype(np.float32)) for v in lattice(2**10)]).weight))
         )
         n = int(np.clip(POINTS * area / h**2, FEWEST_POINTS, MOST_POINTS))
         points = _entries(media, k, [mi.Float(v.astype(np.float32)) for v in lattice(n)]).p
-        results.append(InsideCells.of(media, k, points, (low[0], high[0]), h, depth))
+        results.append(InsideCells.of(media, k, points, box, h, depth))
     return results
+
+
+def _edges(media: WalkMedia, k: int, edge: float) -> tuple[tuple[np.ndarray, np.ndarray], float]:
+    """The box of object k, and the edge of its cells, scene units."""
+    kind = media.placed.kind[k]
+    low, high = ends_of(corners(media.objects[kind].scene.bbox(), _to_world(media, k)[None]))
+    sigma_t = media.mm_per_unit * float(np.mean(media.insides[kind].medium.sigma_t))
+    return (low[0], high[0]), grid_edge((low[0], high[0]), edge / sigma_t)
 
 
 def _to_world(media: WalkMedia, k: int) -> np.ndarray:
