@@ -1,0 +1,225 @@
+"""Light that walks find precomputed inside objects: cells, means against sampled light, and refusals."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytestmark = pytest.mark.usefixtures("rgb")
+
+dr, mi = pytest.importorskip("drjit"), pytest.importorskip("mitsuba")
+
+WIDEST_Z = 4.4  # two-sided 1e-5
+MEDIUM = {"sigma_s": "1.0,1.5,2.0", "sigma_a": "0.01,0.05,0.3", "eta": 1.4}
+
+
+def _ball(radius: float = 5.0, **to_world: Any) -> dict:
+    return {"type": "sphere", "radius": radius, **to_world}
+
+
+def _cube() -> dict:
+    return {"type": "cube", "to_world": mi.ScalarTransform4f().scale(4).rotate([0.6, 0.8, 0], 30)}
+
+
+def _lamp(size: float = 6.0) -> dict:
+    to_world = mi.ScalarTransform4f().look_at([20, 25, 10], [0, 0, 0], [0, 1, 0]).scale(size)
+    return {"type": "rectangle", "to_world": to_world, "emitter": {"type": "area", "radiance": 20.0}}
+
+
+def _scene(how: str, surface: dict, shape: dict | None = None, pixels: int = 8, **more: Any) -> Any:
+    """An object of about 10 units from the front, and what else is given."""
+    film = {"type": "hdrfilm", "width": pixels, "height": pixels, "rfilter": {"type": "box"}, "pixel_format": "rgb",
+            "component_format": "float32"}  # fmt: skip
+    view = mi.ScalarTransform4f().look_at([0, 10, 40], [0, 0, 0], [0, 1, 0])
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "translucent_walk", "light": how},
+            "sensor": {"type": "perspective", "fov": 16.0, "to_world": view, "film": film},
+            "object": {**(shape or _ball()), "bsdf": {"type": "translucent", **surface}},
+            **more,
+        }
+    )
+
+
+def _means(scene: Any, runs: int, spp: int, seed: int) -> np.ndarray:
+    return np.array([np.array(mi.render(scene, spp=spp, seed=seed + k)).mean(axis=(0, 1)) for k in range(runs)])
+
+
+def _compare(surface: dict, known_to: float, shape: dict | None = None, spp: int = 256, **more: Any) -> None:
+    """Mean colours with precomputed and with sampled light agree, and are known to a share of themselves."""
+    found, wanted = (
+        _means(_scene(light, surface, shape, **more), runs, spp, seed)
+        for light, runs, seed in (("precomputed", 8, 1), ("sampled", 24, 101))
+    )
+    error = np.hypot(*(x.std(axis=0, ddof=1) / np.sqrt(len(x)) for x in (found, wanted)))
+    assert (error < known_to * wanted.mean(axis=0)).all(), error / wanted.mean(axis=0)
+    bias = 0.003 * wanted.mean(axis=0)  # of cells
+    assert (np.abs(found.mean(axis=0) - wanted.mean(axis=0)) < WIDEST_Z * error + bias).all()
+
+
+# ---- cells
+
+
+def _cells(shape: dict, edge: float = 0.9) -> Any:
+    from halfspace_sss.rendering.walk.media import WalkMedia
+    from halfspace_sss.rendering.walk.unscattered_light import inside_cells_of
+
+    scene = _scene("precomputed", MEDIUM, shape, light={"type": "constant"})
+    return inside_cells_of(WalkMedia.of(scene, 1.0), edge)[0]
+
+
+def _volume(cells: Any) -> float:
+    return (cells.slots - len(cells.cut) + cells.moments[:, 0, 0].sum()) * cells.h**3
+
+
+@pytest.mark.parametrize(("shape", "volume"), [(_ball, 4 / 3 * np.pi * 125), (_cube, 512.0)])
+def test_cells_have_the_volume_of_an_object(shape: Any, volume: float) -> None:
+    assert _volume(_cells(shape())) == pytest.approx(volume, rel=2e-3)
+
+
+def test_cells_know_the_second_moments_of_a_ball() -> None:
+    """∫ x² of a ball is 4/15 pi R^5."""
+    cells = _cells(_ball())
+    slot = np.array(cells.slot)
+    place = np.stack(np.unravel_index(np.flatnonzero(slot >= 0), cells.counts[::-1])[::-1], axis=1)
+    centre = cells.low + (place + 0.5) * cells.h
+    whole = np.zeros((cells.slots, 4, 4)) + np.diag([1, 1 / 12, 1 / 12, 1 / 12])
+    whole[cells.cut] = cells.moments
+    V, x, xx = whole[:, 0, 0], whole[:, 0, 1:], np.einsum("sjj->sj", whole[:, 1:, 1:])
+    total = (V[:, None] * centre**2 + 2 * cells.h * x * centre + cells.h**2 * xx).sum(axis=0) * cells.h**3
+    assert total == pytest.approx(4 / 15 * np.pi * 5**5, rel=5e-3)
+
+
+def test_the_fit_keeps_the_integral_over_cells_that_share_it() -> None:
+    cells = _cells(_cube())
+    D = np.random.default_rng(1).random((cells.slots, 3, 4))
+    fit = cells.fit(D)
+    whole = np.zeros((cells.slots, 4)) + [1, 0, 0, 0]
+    whole[cells.cut] = cells.moments[:, 0]
+    kept = np.einsum("scj,sj->sc", fit, whole)
+    groups, inner = cells.cut[cells.place], np.setdiff1d(np.arange(cells.slots), cells.cut)
+    assert kept[inner] == pytest.approx(D[inner, :, 0])
+    for group in np.unique(groups):
+        members = cells.cut[groups == group]
+        assert kept[members].sum(axis=0) == pytest.approx(D[members, :, 0].sum(axis=0))
+
+
+# ---- images
+
+
+def test_a_medium_without_absorption_is_invisible_in_uniform_light() -> None:
+    surface = {"sigma_s": "1.0,2.0,3.0", "sigma_a": 0.0, "eta": 1.5}
+    means = _means(_scene("precomputed", surface, light={"type": "constant"}), 8, 512, 1)
+    error = means.std(axis=0, ddof=1) / np.sqrt(len(means))
+    assert (error < 0.006).all()
+    assert (np.abs(means.mean(axis=0) - 1) < WIDEST_Z * error + 0.002).all()
+
+
+def test_precomputed_light_of_a_lamp_has_the_mean_of_sampled_light() -> None:
+    _compare(MEDIUM, 0.01, lamp=_lamp())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", ["cube", "sky", "point", "sun", "floor", "two", "instances", "g", "rough", "albedo"])
+def test_precomputed_light_has_the_mean_of_sampled_light(case: str) -> None:
+    lamp, floor = {"lamp": _lamp()}, {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": 0.6}}
+    floor["to_world"] = mi.ScalarTransform4f().translate([0, -5.2, 0]).rotate([1, 0, 0], -90).scale(30)
+    if case == "cube":
+        _compare(MEDIUM, 0.01, _cube(), **lamp)
+    elif case == "sky":
+        _compare(MEDIUM, 0.004, light={"type": "constant"})
+    elif case == "point":
+        _compare(MEDIUM, 0.01, light={"type": "point", "position": [20, 25, 10], "intensity": 900.0})
+    elif case == "sun":
+        _compare(MEDIUM, 0.01, light={"type": "directional", "direction": [-1, -2, -0.5], "irradiance": 3.0})
+    elif case == "floor":
+        _compare(MEDIUM, 0.01, floor=floor, **lamp)
+    elif case == "two":
+        other = {**_ball(3.0, center=[6, -1, 4]), "bsdf": {"type": "translucent", **MEDIUM, "sigma_s": "2.0,1.0,0.7"}}
+        _compare(MEDIUM, 0.01, other=other, **lamp)
+    elif case == "instances":
+        group = {"type": "shapegroup", "part": {**_ball(2.0), "bsdf": {"type": "translucent", **MEDIUM}}}
+        mirror = mi.ScalarTransform4f().translate([5, 4, 2]).scale([-1, 1.5, 1])
+        shown = {"type": "instance", "to_world": mirror, "group": {"type": "ref", "id": "group"}}
+        _compare(MEDIUM, 0.01, group=group, shown=shown, **lamp)
+    elif case == "g":
+        _compare({**MEDIUM, "g": 0.7}, 0.01, **lamp)
+    elif case == "rough":
+        _compare({**MEDIUM, "boundary": {"type": "roughdielectric", "alpha": 0.3, "int_ior": 1.4, "ext_ior": 1.0}},
+                 0.01, **lamp)  # fmt: skip
+    else:
+        painted = {"type": "checkerboard", "color0": 0.5, "color1": 0.95}
+        _compare({"albedo": painted, "sigma_t": 1.5, "eta": 1.4}, 0.01, _cube(), **lamp)
+
+
+def test_light_of_a_window_has_a_fraction_of_the_noise_of_sampled_light() -> None:
+    sky = np.full((32, 64, 3), 0.1, dtype=np.float32)
+    sky[6:12, 8:14] = 20
+    noise = []
+    for how in ("precomputed", "sampled"):
+        scene = _scene(how, MEDIUM, sky={"type": "envmap", "bitmap": mi.Bitmap(sky)})
+        noise.append(np.var([mi.render(scene, spp=64, seed=k) for k in range(6)], axis=0).sum())
+    assert noise[0] < 0.2 * noise[1]
+
+
+def test_the_same_seed_gives_the_same_picture_and_another_seed_other_light() -> None:
+    scene = _scene("precomputed", MEDIUM, lamp=_lamp())
+    a, b, c = (np.array(mi.render(scene, spp=4, seed=seed)) for seed in (3, 3, 4))
+    assert np.abs(a - b).max() < 1e-5 * a.max()
+    assert np.abs(a - c).max() > 1e-3 * a.max()
+
+
+def test_an_edited_emitter_lights_the_next_picture() -> None:
+    scene = _scene("precomputed", MEDIUM, lamp=_lamp())
+    before = np.array(mi.render(scene, spp=16, seed=1)).mean()
+    parameters = mi.traverse(scene)
+    parameters["lamp.emitter.radiance.value"] = 40.0
+    parameters.update()
+    assert np.array(mi.render(scene, spp=16, seed=1)).mean() == pytest.approx(2 * before, rel=1e-4)
+
+
+def test_an_object_of_another_medium_has_other_cells() -> None:
+    scene = _scene("precomputed", MEDIUM, lamp=_lamp())
+    mi.render(scene, spp=1)
+    parameters = mi.traverse(scene)
+    parameters["object.bsdf.sigma_t"] = parameters["object.bsdf.sigma_t"] * 3
+    parameters.update()
+    denser = {"sigma_s": "3.0,4.5,6.0", "sigma_a": "0.03,0.15,0.9", "eta": 1.4}
+    found, wanted = (
+        np.array(mi.render(s, spp=16, seed=1)) for s in (scene, _scene("precomputed", denser, lamp=_lamp()))
+    )
+    assert np.abs(found - wanted).max() < 1e-3 * wanted.max()
+
+
+def test_the_layer_of_emission_holds_the_mirror_and_what_is_behind_the_object() -> None:
+    """Of an object that scatters nothing back, all light is mirrored, or passes beside it."""
+    black = {"sigma_s": 1e-6, "sigma_a": 50.0, "eta": 1.4}
+    scene = _scene("sampled", black, light={"type": "constant"})
+    integrator = mi.load_dict({"type": "translucent_walk", "layers": True})
+    image = np.array(mi.render(scene, spp=64, seed=1, integrator=integrator))
+    assert image.shape == (8, 8, 6)
+    assert image[..., 3:] == pytest.approx(image[..., :3], abs=1e-4)
+
+
+# ---- refusals
+
+
+@pytest.mark.parametrize(
+    ("surface", "shape", "reason"),
+    [
+        ({**MEDIUM, "orders": "single"}, None, "orders of object 'object' are 'single'"),
+        ({**MEDIUM, "g": 0.95}, None, r"abs\(g\) of object 'object' is above 0.85"),
+        ({**MEDIUM, "sigma_s": 1e4}, None, "so many mean free paths wide"),
+    ],
+)
+def test_light_that_cannot_be_precomputed_is_refused_by_its_reason(surface: dict, shape: Any, reason: str) -> None:
+    with pytest.raises(ValueError, match=f"light must be auto or sampled, got 'precomputed': .*{reason}"):
+        mi.render(_scene("precomputed", surface, shape, lamp=_lamp()), spp=1)
+
+
+def test_a_light_that_does_not_exist_is_refused() -> None:
+    with pytest.raises((ValueError, RuntimeError), match="light must be one of auto, precomputed, sampled, got 'grid'"):
+        mi.load_dict({"type": "translucent_walk", "light": "grid"})
