@@ -68,8 +68,9 @@ def render_command(
     light: Annotated[
         str | None,
         typer.Option(
-            help="sampled (no bias), gathered once (little bias, no noise of orders from two on), or auto.",
-            show_default="sampled, or the scene's",
+            help="Of models sampled (no bias), gathered once (little bias, no noise of orders from two on), auto; of "
+            "path_traced precomputed (bias below .3 %), sampled, or auto.",
+            show_default="of models sampled, of path_traced auto, or the scene's",
         ),
     ] = None,
     denoise: Annotated[bool, typer.Option("--denoise", help="An image without noise beside the other.")] = False,
@@ -95,7 +96,7 @@ def render_command(
     check_count("seed", seed, 0)
     parameters, draw = defined(define), _renderer(denoise)
     check_folder(out)
-    settings = {"train_seconds": train_seconds, "train_error": train_error, "light": light}
+    settings = {"train_seconds": train_seconds, "train_error": train_error, "light": light, "layers": denoise or None}
     settings = {name: value for name, value in settings.items() if value is not None}
     loaded = open_scene(scene, model, orders, parameters, settings)
     for sentence in chosen(loaded, loaded.integrator()).get("choices", {}).values():
@@ -106,7 +107,9 @@ def render_command(
     name = [scene.stem, model or "scene", light or "", f"sensor{sensor}" if sensor else ""]
     file = out / f"{'_'.join(filter(None, name))}.exr"
     result = _rendered(loaded, file, limits, {"seed": seed, "sensor": sensor}, resume)
-    picture = Picture(file.stem, _colours(result.mean), _numbers(result), _error(result), loaded, sensor, denoise)
+    emission = result.mean[..., -3:] if getattr(loaded.integrator(), "layers", False) else None
+    numbers, error = _numbers(result), _error(result)
+    picture = Picture(file.stem, _colours(result.mean), numbers, error, loaded, sensor, denoise, emission)
     _report(result, _publish(picture, file, draw))
     for sentence in loaded.integrator().gathered if is_bssrdf(loaded.integrator()) else ():
         console().print(sentence, highlight=False, markup=False, soft_wrap=True)

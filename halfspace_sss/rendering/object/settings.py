@@ -12,6 +12,7 @@ AUTOMATIC = -1.0
 ORDERS = ("total", "multiple", "single")
 GEOMETRIES = ("distance", "tangent")
 LIGHTS = ("sampled", "corrected", "gathered", "auto")
+WALK_LIGHTS = ("auto", "precomputed", "sampled")  # of `translucent_walk`
 SHARED = ("mm_per_unit", "max_depth", "rr_depth", "hide_emitters")  # what `translucent_walk` understands too
 FEWEST_PHOTONS = 1000
 OF_MODELS = ("geometry", "area_share", "entries", "photons")

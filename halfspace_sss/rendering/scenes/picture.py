@@ -21,6 +21,8 @@ class Picture:
         caption: a sentence.
         scene, sensor: Mitsuba scene and number of the sensor, to render guides for a denoiser.
         denoise: whether an image without noise is asked for.
+        emission: its part that has no noise to take out (H, W, 3): emitters that the camera sees, at once or in the
+            mirror of an object; None where that is not known.
     """
 
     title: str
@@ -30,6 +32,7 @@ class Picture:
     scene: Any
     sensor: int
     denoise: bool
+    emission: np.ndarray | None = None
 
     def png(self, image: np.ndarray | None = None) -> bytes:
         """The image as a display shows it."""

@@ -17,7 +17,7 @@ import mitsuba as mi
 
 from halfspace_sss.interrupts import is_interrupt
 from halfspace_sss.rendering.object.registry import PATH_TRACED, lookup, model_names
-from halfspace_sss.rendering.object.settings import LIGHTS, ORDERS, SHARED
+from halfspace_sss.rendering.object.settings import LIGHTS, ORDERS, SHARED, WALK_LIGHTS
 from halfspace_sss.rendering.object.wrapped import surface_of
 from halfspace_sss.rendering.paths.integrator import is_bssrdf
 
@@ -117,10 +117,10 @@ def load_scene(
     Args:
         scene: a dict as for `mitsuba.load_dict`, or the path of an XML file.
         model: for all translucent objects, instead of what the scene says: the name of a model, or "path_traced",
-            which walks through the objects instead, from the light if that is gathered.
+            which walks through the objects instead.
         orders: of all translucent objects, instead of what the scene says.
         parameters: values of the parameters $name of an XML file.
-        settings: parameters of the integrator `bssrdf`, instead of what the scene says.
+        settings: parameters of the integrator, instead of what the scene says; each takes those that it knows.
 
     Raises:
         ValueError: no such file, parameter, model or orders, the file is no scene, a plugin refuses what it is given,
@@ -144,8 +144,9 @@ def open_scene(
     _check("model", model, model_names())
     _check("orders", orders, ORDERS)
     light = (settings or {}).get("light")
-    _check("light", light, LIGHTS if model != PATH_TRACED else ("sampled", "gathered"))
-    walks = model == PATH_TRACED and light != "gathered"
+    walks = model == PATH_TRACED
+    known = WALK_LIGHTS if walks else LIGHTS if model else tuple(dict.fromkeys((*LIGHTS, *WALK_LIGHTS)))
+    _check("light", light, known)
     state, config = _parsed(scene, parameters or {})
     # a model that knows whole objects does not know what Mitsuba makes of several with the same BSDF
     names = [str(props.get("model", "")) for props in _surfaces(state)]
@@ -168,9 +169,16 @@ def open_scene(
 
 def _set_parameters(state: Any, settings: Mapping[str, float]) -> None:
     for node in state.nodes if settings else ():
-        if node.props.plugin_name() == _INTEGRATORS[False]:
-            for key, value in settings.items():
-                node.props[key] = value
+        for plugin, given in zip(_INTEGRATORS.values(), _settings(settings)):
+            if node.props.plugin_name() == plugin:
+                for key, value in given.items():
+                    node.props[key] = value
+
+
+def _settings(settings: Mapping[str, float]) -> tuple[dict, dict]:
+    """What `bssrdf` is told, and `translucent_walk`."""
+    walk = {key: settings[key] for key in ("light", "layers") if key in settings}
+    return {key: value for key, value in settings.items() if key != "layers"}, walk
 
 
 def load_objects(scene: dict | str | Path, parameters: Mapping[str, str] | None = None) -> Any:
@@ -257,8 +265,7 @@ def _choose_integrator(state: Any, walks: bool, asked: tuple[bool, bool], settin
         return
     others = [node.props for node in state.nodes if node.type == mi.ObjectType.Integrator]
     if not others:
-        given = {} if walks else settings
-        state.nodes[0].props["integrator"] = mi.load_dict({"type": wanted, **given})
+        state.nodes[0].props["integrator"] = mi.load_dict({"type": wanted, **_settings(settings)[walks]})
     elif anything:
         name = others[0].plugin_name()
         warnings.warn(f"the integrator {name!r} of the scene is replaced by {wanted!r}", stacklevel=3)

@@ -16,7 +16,7 @@ from halfspace_sss.rendering.light.small_emitters import SmallEmitters
 from halfspace_sss.rendering.object.contents import check_sensors
 from halfspace_sss.rendering.object.objects import KnowsUnit, check_size, places_of, translucent_shapes
 from halfspace_sss.rendering.object.sensors import camera_rays, sampled_size, splat, widened
-from halfspace_sss.rendering.object.settings import OF_MITSUBA, check_parameters
+from halfspace_sss.rendering.object.settings import OF_MITSUBA, WALK_LIGHTS, check_parameters
 from halfspace_sss.rendering.object.shape import number_of, same_objects
 from halfspace_sss.rendering.object.textured import shown
 from halfspace_sss.rendering.object.varying import equivalent
@@ -33,7 +33,6 @@ SAMPLES_PER_LAUNCH = 2**19
 LANES = 2**14  # fastest of 2**12 to 2**18 on 2 cores
 GPU_FACTOR = 4  # as many times lanes and samples on CUDA: 1.2 to 1.4 times as fast on an H200
 LAYER = ["emission.R", "emission.G", "emission.B"]
-LIGHTS = ("auto", "precomputed", "sampled")
 SAMPLES_PER_RAY = 4  # of the image, for each ray of light: these take a tenth of the time or less
 FEWEST_RAYS, MOST_RAYS = 2**16, 2**21
 FOREVER = 2**31 - 1
@@ -75,7 +74,7 @@ def _class(variant: str) -> type:
             self.hidden = bool(props.get("hide_emitters", False))
             self.connection_share = _share("connection_share", float(props.get("connection_share", 0.5)))
             self.blur = _scale("blur", float(props.get("blur", 1.0)))
-            self.light = _one_of("light", str(props.get("light", "auto")), LIGHTS)
+            self.light = _one_of("light", str(props.get("light", "auto")), WALK_LIGHTS)
             self.layers = bool(props.get("layers", False))
             self._prepared: tuple[int, list, tuple, Any] = (0, [], ([], []), None)
             self._cells: tuple[Any, list] = (None, [])
