@@ -34,7 +34,7 @@ from halfspace_sss.neural.store import save_weights
 # by CPU time: begun first, so that no worker is left with one of them at the end
 LONGEST = (
     "test_every_emitter", "test_full_scenes", "test_rendering_gradients", "test_full_online", "test_endings",
-    "test_flame", "test_translucent_walk", "test_fig_full_geometry", "test_full_training", "test_control_variate",
+    "test_flame", "test_translucent_walk", "test_fig_full_geometry", "test_full_training", "test_lit_entries",
     "test_inside", "test_rendering_kernels", "test_varying_media", "test_gathered", "test_figure_sources",
     "test_neural_reflectance", "test_full_command", "test_gradient_blocks", "test_neural_training", "test_cli_train",
     "test_rendering_normals", "test_wrapped", "test_readme", "test_shape_model", "test_full_varying",

@@ -1,4 +1,4 @@
-"""Speed of models over Mitsuba's volume path tracer or our walk: sampled, corrected and gathered.
+"""Speed of models over Mitsuba's volume path tracer or our walk: sampled and gathered.
 
 A cost is the variance of a sample over mean squared, times its CPU seconds. Both are means over blocks of 8 x 8
 pixels, of which the median is taken. Where chance finds a lamp once in hundreds of samples, most pixels have not met it
@@ -38,7 +38,7 @@ LIGHTS = ("windows", "lamp and sky")
 OTHER_LIGHTS = ("even sky", "small light")  # the second of scans alone
 MODELS = ("full_geometry", "neural_shape", "neural", "better_dipole")
 MORE_MODELS = (PATH_TRACED,)  # whose light is gathered alone
-KINDS = ("sampled", "corrected", "gathered")
+KINDS = ("sampled", "gathered")
 OVER = ("volpathmis", WALK)
 VOLUMES = tuple(volume(depth) for depth in (64, 200))
 SPP = {"volume": 4, WALK: 16, "model": 16}  # of a pass

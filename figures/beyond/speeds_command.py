@@ -1,4 +1,4 @@
-"""The commands `study speeds`, of models in ordinary light, `study gathered`, of errors, and `study means`."""
+"""The commands `study speeds`, of models in ordinary light, and `study gathered`, of errors."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from halfspace_sss.checks import check_choice, check_count, check_interval
 from halfspace_sss.cli.shared import Bar, OutFolder, console, use_mitsuba, whole
 from halfspace_sss.provenance import check_folder, write_together
 
-__all__ = ["gathered_command", "means_command", "speeds_command"]
+__all__ = ["gathered_command", "speeds_command"]
 
 SPEED_OBJECTS = ("bunny of potato", "bunny of marble", "dragon of potato", "candle", "mandarin")
 
@@ -42,7 +42,7 @@ def speeds_command(
     ] = None,
     kind: Annotated[
         list[str] | None,
-        typer.Option(help="sampled, corrected or gathered; repeat for more.", show_default="all three"),
+        typer.Option(help="sampled or gathered; repeat for more.", show_default="both"),
     ] = None,
     over: Annotated[str, typer.Option(help="What counts as one: volpathmis or translucent_walk.")] = "volpathmis",
     passes: Annotated[int, typer.Option(help="Passes of 16 samples a pixel.", parser=whole)] = 6,
@@ -52,7 +52,7 @@ def speeds_command(
     seed: Annotated[int, typer.Option(help="Seed of all renders.", parser=whole)] = 0,
     out: OutFolder = Path("speeds"),
 ) -> None:
-    """Measure the speed of models over volpathmis or walks: sampled, corrected and gathered."""
+    """Measure the speed of models over volpathmis or walks: sampled and gathered."""
     use_mitsuba("llvm_ad_rgb")
     from figures.beyond.speeds import (
         KINDS,
@@ -136,44 +136,4 @@ def gathered_command(
         table = gathered_errors(cases, how, out / "work", lambda what, k, n: bar.show(k, n, what))
     text = markdown(shown(table))
     write_together({out / "gathered.csv": table.to_csv(index=False, lineterminator="\n"), out / "gathered.md": text})
-    console().print(text, highlight=False, markup=False, soft_wrap=True)
-
-
-def means_command(
-    object: Annotated[str, typer.Option(help="As of `study speeds`.")] = "bunny of potato",
-    light: Annotated[str, typer.Option(help="windows, lamp and sky, even sky, or small light (of scans).")] = "windows",
-    model: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="full_geometry, neural_shape, neural or better_dipole; repeat for more.", show_default="all four"
-        ),
-    ] = None,
-    samples: Annotated[
-        int, typer.Option(help="Of all pixels, with and without together, of each model.", parser=whole)
-    ] = 10**7,
-    size: Annotated[int, typer.Option(help="Pixels of the square images.", parser=whole)] = 64,
-    seconds: Annotated[float, typer.Option(help="CPU time of the training of full_geometry.")] = 12.0,
-    seed: Annotated[int, typer.Option(help="Seed of all renders.", parser=whole)] = 0,
-    out: OutFolder = Path("means"),
-) -> None:
-    """Test by z-values that gathered light as control variate leaves the means of models as they are."""
-    use_mitsuba("llvm_ad_rgb")
-    from figures.beyond.means import Testing, means
-    from figures.beyond.speeds import LIGHTS, MODELS, OTHER_LIGHTS, LitObject
-
-    models = tuple(model or MODELS)
-    for name in models:
-        check_choice("model", name, MODELS)
-    check_choice("light", light, (*LIGHTS, *OTHER_LIGHTS))
-    case = LitObject(object, light)
-    check_count("size", size, 4)
-    check_count("samples", samples, 1)
-    check_count("seed", seed, 0)
-    check_interval("seconds", seconds, 0.1, 1e6)
-    check_folder(out)
-    how = Testing(models, samples, size, seconds=seconds, seed=seed)
-    with Bar("means") as bar:
-        table = means(case, how, out / "work", lambda what, k, n: bar.show(k, n, what))
-    text = markdown(table)
-    write_together({out / "means.csv": table.to_csv(index=False, lineterminator="\n"), out / "means.md": text})
     console().print(text, highlight=False, markup=False, soft_wrap=True)

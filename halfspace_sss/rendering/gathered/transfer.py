@@ -104,11 +104,6 @@ class Albedo:
             rows = [[v + opaque(d) * each for v, d in zip(row, tilt)] for row, tilt, each in zip(rows, self.tilt, x)]
         return mi.Spectrum([F * dr.maximum(a + mu * (b + mu * c), 0) for a, b, c in rows])
 
-    def cosine(self, w: mi.Vector3f, n: mi.Normal3f, n_out: mi.Normal3f) -> mi.Spectrum:
-        """a(mu) mu / ∫ a(mu) mu dw of a direction above a surface of geometric normal n, mu the cosine to n_out."""
-        mu = cosine(w, n, n_out)
-        return self(mu) * mu * mi.Spectrum([opaque(1 / v) for v in self.whole])
-
     @cached_property
     def whole(self) -> np.ndarray:
         """∫ a(mu) mu dw of each channel."""
@@ -340,13 +335,7 @@ def transfer(obj: TranslucentObject, share: float = 1.0, seed: int = SEED) -> Tr
     if places_resolve(obj):
         result = stratified(obj, points, n, seed)
     else:
-        result = drawn(
-            obj,
-            points,
-            lambda p, n_out, _, active: points.nearest(p, n_out, active),
-            int(DENSE * n) * len(points),
-            seed,
-        )
+        result = drawn(obj, points, int(DENSE * n) * len(points), seed)
     paint = None if obj.textured is None else result.paint
     e = np.zeros(result.S.shape[2], np.float32) if paint is None else _exponents(points, result)
     S = result.S / (result.paint**e)[:, None]
@@ -515,7 +504,6 @@ class DrawnEntries(NamedTuple):
     Args:
         S: S mu_i over the density, per channel.
         cosine: a(mu_i) mu_i / ∫ a(mu) mu dw over the density of directions, per channel.
-        area: inverse of the density of entries.
         near, known: the point that the entry is nearest to, and whether there is one.
         w_i, w_o: directions.
         a: directional albedo at the exit, per channel.
@@ -527,7 +515,6 @@ class DrawnEntries(NamedTuple):
 
     S: np.ndarray
     cosine: np.ndarray
-    area: np.ndarray
     near: np.ndarray
     known: np.ndarray
     w_i: np.ndarray
@@ -554,10 +541,8 @@ def places_resolve(obj: TranslucentObject) -> bool:
     return sigma * float(np.sqrt(obj.geometry.area / PLACES)) < COARSEST
 
 
-def drawn(
-    obj: TranslucentObject, points: SurfacePoints, cell: Callable, samples: int, seed: int = SEED
-) -> DrawnEntries:
-    """As many entries for each point, by the proposals; `cell` of position, normal, face and mask is what is near."""
+def drawn(obj: TranslucentObject, points: SurfacePoints, samples: int, seed: int) -> DrawnEntries:
+    """As many entries for each point, by the proposals."""
     n = samples // len(points)
     k = dr.arange(mi.UInt32, len(points) * n)
     each = dr.opaque(mi.UInt32, n)  # kernels are those of other numbers of points too
@@ -568,10 +553,10 @@ def drawn(
     prepared = obj.transport.prepare(out, active)
     entry = obj.proposals.sample(out, face, obj.proposals.prepare(out, prepared, active), sampler, active)
     brought = _brought(obj, prepared, out, entry, sampler.next_2d())
-    near, known = cell(entry.p, entry.n, entry.face, entry.weight > 0)
+    near, known = points.nearest(entry.p, entry.n, entry.weight > 0)
     paint = _paint(obj, out)
-    evaluate(brought, near, known, out, paint, entry.weight)
-    places = [np.array(v).reshape(len(points), n) for v in (near, known, entry.weight)]
+    evaluate(brought, near, known, out, paint)
+    places = [np.array(v).reshape(len(points), n) for v in (near, known)]
     return _collected(obj, brought, places, out, paint, entry.gather)
 
 
@@ -602,9 +587,9 @@ def stratified(obj: TranslucentObject, points: SurfacePoints, n: int, seed: int)
 
     dr.while_loop((mi.UInt32(0) + dr.zeros(mi.UInt32, rows * EXITS),), lambda i: i < each, step, label="entries")
     dr.eval(S, w_i, mu_i, over)
-    near, area = (np.array(v).reshape(rows, n) for v in (entries.near, entries.weight))
+    near, weight = (np.array(v).reshape(rows, n) for v in (entries.near, entries.weight))
     brought = _Brought(dr.unravel(mi.Spectrum, S), dr.unravel(mi.Vector3f, w_i), mu_i, over)
-    return _collected(obj, brought, [near, area > 0, area], out, paint, entries)
+    return _collected(obj, brought, [near, weight > 0], out, paint, entries)
 
 
 def _paint(obj: TranslucentObject, out: SurfacePoint) -> mi.Spectrum:
@@ -628,8 +613,8 @@ def _collected(
     obj: TranslucentObject, brought: _Brought, places: list[np.ndarray], out: SurfacePoint, paint: mi.Spectrum,
     entries: Callable[[mi.UInt32], EntrySample],
 ) -> DrawnEntries:  # fmt: skip
-    """Arrays of entries, of which some share an exit: near, known and area of each, and what it brought."""
-    near, known, area = places
+    """Arrays of entries, of which some share an exit: near and known of each, and what it brought."""
+    near, known = places
     count, n = near.shape
 
     def of_entries(v: Any) -> np.ndarray:
@@ -649,7 +634,7 @@ def _collected(
     a = of_entries(mi.Spectrum(albedo(mu, paint)))
     cosine = np.array(albedo(brought.mu_i) * brought.over).T.reshape(S.shape) / albedo.whole.astype(np.float32)
     w_i, exits = np.array(brought.w_i, dtype=np.float32).T.reshape(count, n, 3), dr.width(out.w) // count
-    return DrawnEntries(S, cosine, area, near, known, w_i, w_o, a, albedo, np.maximum(R, 1e-20), entries, exits)
+    return DrawnEntries(S, cosine, near, known, w_i, w_o, a, albedo, np.maximum(R, 1e-20), entries, exits)
 
 
 def _fitted(obj: TranslucentObject, mu: np.ndarray, S: np.ndarray) -> Albedo:

@@ -240,7 +240,6 @@ class TranslucentObject:
         expected: what each kind of light is expected to bring.
         variation: how its light varies with its medium.
         gathered: what leaves by orders from two on, in place of a transport, see `paths.gathering`.
-        control: control variate of entries at the first vertex of a path, see `paths.control_variate`.
         painted: state of its shape, whose attributes textures show, if the surface has textures.
         sight: of the scene that it is rendered in.
     """
@@ -257,7 +256,6 @@ class TranslucentObject:
     expected: Expected | None = None
     variation: Variation | None = None
     gathered: Any = None
-    control: Any = None
     painted: tuple[list, list] = ([], [])
     sight: Sight = Sight([], {})
 

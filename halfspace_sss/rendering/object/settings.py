@@ -11,7 +11,7 @@ from halfspace_sss.checks import check_choice, check_count, check_interval
 AUTOMATIC = -1.0
 ORDERS = ("total", "multiple", "single")
 GEOMETRIES = ("distance", "tangent")
-LIGHTS = ("sampled", "corrected", "gathered", "auto")
+LIGHTS = ("sampled", "gathered", "auto")
 WALK_LIGHTS = ("auto", "precomputed", "sampled")  # of `translucent_walk`
 SHARED = ("mm_per_unit", "max_depth", "rr_depth", "hide_emitters")  # what `translucent_walk` understands too
 FEWEST_PHOTONS = 1000
@@ -32,9 +32,8 @@ class Settings:
             object.
         entries: points of entry that an exit draws, of which one is followed, chosen by what it may bring; AUTOMATIC
             leaves it to the model.
-        light: "sampled", without bias; "corrected", the same with gathered light as control variate, see
-            `paths.control_variate`; or "gathered" once for all samples, see `paths.gathering`: scattered light
-            has a little bias and no noise; or "auto", the cheaper of both that keeps the tolerance, by measurement.
+        light: "sampled", without bias; "gathered" once for all samples, see `paths.gathering`: scattered light has a
+            little bias and no noise; or "auto", the cheaper of both that keeps the tolerance, by measurement.
         photons: of each object, where light is gathered for the model "path_traced".
         hide_emitters: whether directly visible emitters are left out.
         train_seconds: time for each object whose model has to learn it first; 0 refuses objects without weights.

@@ -21,7 +21,6 @@ from halfspace_sss.rendering.object.sensors import rays_by, sampled_size, seeded
 from halfspace_sss.rendering.object.settings import Settings, read_settings
 from halfspace_sss.rendering.object.translucent import is_translucent
 from halfspace_sss.rendering.object.wrapped import wraps
-from halfspace_sss.rendering.paths.control_variate import ControlVariates
 from halfspace_sss.rendering.paths.gathering import Gathering
 from halfspace_sss.rendering.paths.lit_entries import LitEntries
 from halfspace_sss.rendering.paths.low_discrepancy import path_numbers
@@ -66,7 +65,6 @@ def _class(variant: str) -> type:
             self._objects = TranslucentObjects(self.settings)
             self.gathering = Gathering()
             self._lit_entries = LitEntries()
-            self._control_variates = ControlVariates()
             self._lit: list[TranslucentObject] | None = None  # while an image is rendered
             self._by_chance = dr.zeros(mi.Float64, 1)
 
@@ -105,7 +103,7 @@ def _class(variant: str) -> type:
                 for obj in objects:
                     if obj.spectral is not None:
                         obj.spectral.check_covers(obj.geometry.name, sensor)
-                self._lit = self._by_light(scene, objects, sensor, seed, spp)
+                self._lit = self._by_light(scene, objects, sensor, spp)
                 self._by_chance = dr.zeros(mi.Float64, 1)
                 try:
                     sensor.film().prepare([])
@@ -124,16 +122,13 @@ def _class(variant: str) -> type:
             splat(sensor.film(), ray, L * weight, hit, position, launch.spp)
 
         def _by_light(
-            self, scene: mi.Scene, objects: list[TranslucentObject], sensor: mi.Sensor, seed: mi.UInt32 | int, spp: int
+            self, scene: mi.Scene, objects: list[TranslucentObject], sensor: mi.Sensor, spp: int
         ) -> list[TranslucentObject]:
-            """The objects with entries drawn by light, and light gathered as control variate, where that pays."""
-            spp, pixels = spp or sensor.sampler().sample_count(), int(dr.prod(sensor.film().crop_size()))
-            light, number = self._objects.choices.light, int(mi.UInt32(seed)[0])
-            if light == "gathered":
+            """The objects with entries drawn by light, where that pays."""
+            if self._objects.choices.light == "gathered":
                 return objects
+            spp, pixels = spp or sensor.sampler().sample_count(), int(dr.prod(sensor.film().crop_size()))
             proposals = self._lit_entries.of(scene, objects, self.settings, spp * pixels)
-            if light == "corrected":
-                objects = self._control_variates.of(scene, objects, self.settings, number, spp, pixels)
             return [replace(obj, proposals=given) for obj, given in zip(objects, proposals)]
 
         def render_forward(self, scene: mi.Scene, *args: Any, **more: Any) -> mi.TensorXf:

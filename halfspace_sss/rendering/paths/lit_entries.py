@@ -19,10 +19,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from halfspace_sss.rendering.gathered.patches import SurfaceCells
 from halfspace_sss.rendering.gathered.points import SurfacePoints, uniform_entries
 from halfspace_sss.rendering.gathered.transfer import Albedo
-from halfspace_sss.rendering.object.shape import same_objects
+from halfspace_sss.rendering.object.points import AreaPoints
+from halfspace_sss.rendering.object.shape import Geometry, same_objects
 from halfspace_sss.rendering.paths.gathering import GatheringPoint, by_emitters, light_state, met_by_cosine, spreads
 from halfspace_sss.rendering.paths.lighting import Primal, RenderContext
 
@@ -31,7 +31,9 @@ if TYPE_CHECKING:
     from halfspace_sss.rendering.object.points import Proposals
     from halfspace_sss.rendering.object.settings import Settings
 
-CELLS = 1024  # of a mesh of many faces
+CELLS = 1024  # of a mesh of many faces:
+FACES = 4  # for each cell, from which on none is divided
+CENTROID = 5 / 9, 0.5  # of `square_to_uniform_triangle`
 LEAST, MOST = 2**14, 2**16  # points of an object at which light is looked at,
 SHARE = 1 / 4  # of all samples of an image: with fewer than the least, entries are by S alone
 FLOOR = 0.1  # of 0.03 the mean of the variance over pixels is larger, of 0.3 the median
@@ -73,8 +75,7 @@ def _lit(context: RenderContext, obj: TranslucentObject, count: int) -> Proposal
     faces = geometry.shape.face_count() if geometry.shape.is_mesh() else 1
     if faces == 1 or context.lights.nee_share == 0 or not (spreads(obj) and geometry.closed and geometry.area > 0):
         return obj.proposals
-    cells = SurfaceCells.of(obj, SurfacePoints.of(geometry, CELLS)).of_face
-    cell = np.arange(faces) if cells is None else np.array(cells[1])
+    cell = _cells(geometry, faces)
     face, square = _brought(context, obj, count)
     k, n = cell[face], cell.max() + 1
     number = np.bincount(k, minlength=n)
@@ -84,6 +85,16 @@ def _lit(context: RenderContext, obj: TranslucentObject, count: int) -> Proposal
     if not (np.isfinite(mean) and mean > 0 and (e[k] ** 2).mean() > LEAST_GAIN * mean**2):
         return obj.proposals
     return obj.proposals.lit((e / mean + FLOOR)[cell])
+
+
+def _cells(geometry: Geometry, faces: int) -> np.ndarray:
+    """The cell of each face: that of the point which is nearest to its centroid, or its own where faces are few."""
+    points = SurfacePoints.of(geometry, CELLS)
+    if faces < FACES * len(points):
+        return np.arange(faces)
+    face = dr.arange(mi.UInt32, faces)
+    at = AreaPoints(geometry.shape).on_face(face, mi.Point2f(*CENTROID))
+    return np.array(points.nearest(mi.Point3f(at.p), mi.Normal3f(at.n) * geometry.side(face), mi.Bool(True))[0])
 
 
 def _brought(context: RenderContext, obj: TranslucentObject, count: int) -> tuple[np.ndarray, np.ndarray]:

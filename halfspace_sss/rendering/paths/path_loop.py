@@ -156,7 +156,7 @@ def _loop(
         throughput = dr.select(active, path.throughput * following.weight, path.throughput)
 
         # ---- Russian roulette by the throughput
-        largest = dr.max(dr.abs(throughput))  # a control variate makes some negative
+        largest = dr.max(throughput)
         active = active & (largest > 0)
         depth = dr.select(active, path.depth + 1, path.depth)
         survival = dr.select(depth >= settings.rr_depth, dr.minimum(largest, 0.95), 1.0)
@@ -337,7 +337,7 @@ def sample_event(
         if obj.transport is not None:
             more = inside & ~low
             out, face = choice.refracted.out, at.si.prim_index
-            events.append((more, partial(bssrdf_event, context, obj, out, face, sampler, at.others_only, more)))
+            events.append((more, partial(bssrdf_event, context, obj, out, face, sampler, more)))
         if obj.low_orders:
             events.append((low, partial(low_order_event, context, obj, choice.refracted, sampler, at.scattered, low)))
     for mask, event in events:
@@ -447,12 +447,9 @@ def _add_sky_means(
 def _add_gathered(
     context: RenderContext, sampler: mi.Sampler, at: Vertex, tally: PathTally, choices: list
 ) -> PathTally:
-    """Adds what leaves each object by light that was gathered, see `gathering` and `control_variate`."""
+    """Adds what leaves each object by light that was gathered, see `gathering`."""
     for obj, here, choice in choices:
         out = choice.refracted.out
-        if obj.control is not None:
-            light = obj.control.radiance(out, at.si.prim_index, here & at.others_only)
-            tally = context.mode.add(tally, at.throughput * light)
         if obj.gathered is None:
             continue
 
@@ -607,15 +604,13 @@ def bssrdf_event(
     out: SurfacePoint,
     face: mi.UInt32,
     sampler: mi.Sampler,
-    first: mi.Bool,
     active: mi.Bool,
 ) -> tuple[NextVertex, mi.Spectrum, mi.Spectrum]:
     """Light that entered elsewhere and leaves at `out` by the transport of the object.
 
-    Delta lights are its next-event estimation. c of `lighting.Sky` is taken off where `_add_sky_means` has added it,
-    and so is at the `first` vertex of a path what `_add_gathered` has added.
+    Delta lights are its next-event estimation. c of `lighting.Sky` is taken off where `_add_sky_means` has added it.
     """
-    entry = resample_entry(context, obj, out, face, sampler, first, active)
+    entry = resample_entry(context, obj, out, face, sampler, active)
     direct = mi.Spectrum(0)
     if context.uses_sky(obj):
         direct = -entry.weight * entry.sky_weight * context.sky_means(obj)[1]
@@ -659,13 +654,12 @@ class _Entry(NamedTuple):
 
 
 class _ExitPoint(NamedTuple):
-    """An exit, its face, and what transport, proposals and control variate have made of it."""
+    """An exit, its face, and what transport and proposals have made of it."""
 
     out: SurfacePoint
     face: mi.UInt32
     transport: Any
     proposals: Any
-    control: Any
 
 
 def resample_entry(
@@ -674,7 +668,6 @@ def resample_entry(
     out: SurfacePoint,
     face: mi.UInt32,
     sampler: mi.Sampler,
-    first: mi.Bool,
     active: mi.Bool,
 ) -> Candidate:
     """One entry for light that leaves at `out`, by resampled importance sampling (Talbot, Cline and Egbert 2005).
@@ -685,8 +678,7 @@ def resample_entry(
     """
     with dr.suspend_grad():
         prepared = obj.transport.prepare(out, active)
-        control = obj.control.row(out, face, active & first) if obj.control else None
-        exit_point = _ExitPoint(out, face, prepared, obj.proposals.prepare(out, prepared, active), control)
+        exit_point = _ExitPoint(out, face, prepared, obj.proposals.prepare(out, prepared, active))
 
     def draw(by_emitter: mi.Bool | None = None) -> Candidate:
         return _draw_candidate(context, obj, exit_point, by_emitter, sampler, active)
@@ -757,10 +749,8 @@ def _draw_candidate(
         at_entry = entry.facing(d)
         mu_i = at_entry.mu
     S_mu = obj.transport.S(exit_point.transport, at_entry, active) * mu_i
-    if exit_point.control is not None:
-        S_mu -= obj.control.transfer.expected(exit_point.control, entry, d, active)
     weight = dr.select(active, S_mu * (entry.weight / dr.maximum(pdf, 1e-8)), 0)
-    target = dr.detach(dr.max(dr.abs(weight))) * brightness
+    target = dr.detach(dr.max(weight)) * brightness
     return Candidate(mi.Point3f(entry.p), mi.Normal3f(entry.n), d, weight, pdf, distance, delta, emitter_point, light,
                      target, by_emitter, sky_weight)  # fmt: skip
 
