@@ -34,7 +34,7 @@ def parts(quality: str) -> list[Part]:
 
 def sampled(task: Task) -> dict[str, Any]:
     """Points in the object's frame over its radius, their RMSD to the nearest barycentre, and light where they are."""
-    from figures.studies.paper_flow import fit_space_flow, mesh_arrays, on_surface, rmsd
+    from figures.rivals.paper_flow import fit_space_flow, mesh_arrays, on_surface, rmsd
     from full_geometry.learning.training import train_by_cpu
     from full_geometry.models.storing import frame_of
     from halfspace_sss.rendering.object.objects import object_of
@@ -79,7 +79,7 @@ def _lit(name: str, task: Task, resolution: int, seed: int) -> Any:
 
 def _light(obj: Any, scene: Any, frame: Any) -> tuple[np.ndarray, np.ndarray]:
     """Random places of the surface, and the light that arrives there."""
-    from figures.studies.paper_flow import irradiance
+    from figures.rivals.paper_flow import irradiance
 
     at = obj.random_places(_lanes(PLACES, 43))
     return _positions(frame, at.p), irradiance(at, scene, (44,))

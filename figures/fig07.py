@@ -83,8 +83,8 @@ def deng(task: Task) -> dict[str, Any]:
     """An object as the fit of Deng et al. has found it from photographs."""
     import mitsuba as mi
 
-    from figures.studies import deng as study
-    from figures.studies.photographs import Studio
+    from figures.rivals import deng as study
+    from figures.rivals.photographs import Studio
     from halfspace_sss.rendering.scenes.scene_files import load_scene
 
     prepare()
@@ -116,7 +116,7 @@ def distant(task: Task) -> dict[str, Any]:
     """An object as the network of TG et al. shows it, before what it mirrors and the rest of the scene."""
     import mitsuba as mi
 
-    from figures.studies import distant_light as study
+    from figures.rivals import distant_light as study
     from halfspace_sss.rendering.object.objects import object_of
     from halfspace_sss.rendering.scenes.scene_files import open_scene
 

@@ -17,6 +17,7 @@ SECONDS = {"draft": 6, "paper": 600}  # CPU time of each training
 NUMBERS = {"draft": (1, 8, 64), "paper": (1, 2, 4, 8, 16, 32, 64, 128)}
 TRUTH = {"draft": (96, 512), "paper": (256, 8192)}  # exits, and walks of each
 OURS = "full_geometry"
+BACKBONE = "better_dipole"  # its proposals
 LIGHTS = ("constant", "lobes")
 LOOKS = {
     OURS: ("#C00000", "-", "o"), "paper, points of walks": ("#0072B2", "-", "s"),
@@ -61,7 +62,6 @@ def _rmse(result: Any, truth: Any, per_estimate: float) -> dict[str, float]:
 
 def ours(task: Task) -> dict[str, Any]:
     """Errors of `full_geometry` with N entries by patches."""
-    from figures.studies.rivals import BACKBONE
     from full_geometry.learning.model_errors import modelled
     from full_geometry.learning.training import train_by_cpu
     from full_geometry.models.object_model import HalfSpace
@@ -81,7 +81,7 @@ def ours(task: Task) -> dict[str, Any]:
 
 def papers(task: Task) -> dict[str, Any]:
     """Errors of the paper's network for one N, its points from walks and uniform."""
-    from figures.studies.paper_network import PaperRecipe, estimate, fit_paper
+    from figures.rivals.paper_network import PaperRecipe, estimate, fit_paper
     from halfspace_sss.rendering.object.objects import object_of
 
     prepare()

@@ -70,7 +70,7 @@ def _key(*words: object) -> str:
 
 def _weights(task: Task) -> tuple[dict[str, Path], dict[str, np.ndarray]]:
     """A folder of weights for each sampler, of one training, without patches and with them; and those of a flow."""
-    from figures.studies.flow_training import FlowRecipe, fit_flow
+    from figures.rivals.flow_training import FlowRecipe, fit_flow
     from full_geometry.learning.training import train_by_cpu
     from full_geometry.models.storing import CENTRES, KIND
     from halfspace_sss.neural.store import load_weights, save_weights
@@ -95,7 +95,7 @@ def _image(
     """The image with the weights of a folder; entries by a flow if its weights are given, or light gathered."""
     import mitsuba as mi
 
-    from figures.studies.flow import draw_by
+    from figures.rivals.flow import draw_by
 
     with weights_in(folder):
         scene = _scene(p, light, entries, "gathered" if gathered else "sampled")

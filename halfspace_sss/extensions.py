@@ -3,7 +3,6 @@
 - `halfspace_sss.models`: list of model classes.
 - `halfspace_sss.materials`: path of a material file or folder, or an iterable of `Material`.
 - `halfspace_sss.commands`: name -> function with typer annotations, a further command of `halfspace-sss`.
-- `halfspace_sss.studies`: the same for `halfspace-sss study`.
 - `halfspace_sss.transports`, `halfspace_sss.choosers`, `halfspace_sss.learners`: name of a model -> what makes it of an
   object, what stands for another by name, what learns it; see `rendering.object.registry`.
 - `halfspace_sss.figures`: kind of result -> function that takes the result and returns {file ending: bytes}.
@@ -19,7 +18,6 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
 COMMANDS, FIGURES, MODELS = "halfspace_sss.commands", "halfspace_sss.figures", "halfspace_sss.models"
-STUDIES = "halfspace_sss.studies"
 CHOOSERS, LEARNERS, TRANSPORTS = "halfspace_sss.choosers", "halfspace_sss.learners", "halfspace_sss.transports"
 FAILURES = (Exception, SystemExit)  # what code of somebody else may end with
 OWN = "halfspace-sss"  # the distribution whose entry points come first
@@ -61,13 +59,13 @@ def offered(group: str) -> Iterator[tuple[str, Any]]:
             yield entry.name, result
 
 
-def commands(group: str = COMMANDS) -> Iterator[tuple[str, Callable]]:
-    """Name and function of every command, or study, that a package adds."""
-    for name, each in offered(group):
+def commands() -> Iterator[tuple[str, Callable]]:
+    """Name and function of every command that a package adds."""
+    for name, each in offered(COMMANDS):
         if callable(each):
             yield name, each
         else:
-            warn_left_out(group, name, f"it must be a function, got {each!r}")
+            warn_left_out(COMMANDS, name, f"it must be a function, got {each!r}")
 
 
 def renderer(kind: str) -> Renderer | None:

@@ -1,4 +1,4 @@
-"""All commands of the command line by their words, those of `train` and `study` too."""
+"""All commands of the command line by their words, those of `train` too."""
 
 from __future__ import annotations
 

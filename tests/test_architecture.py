@@ -10,18 +10,17 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
-ORDER = ["figures", "full_geometry", "analytic_models", "halfspace_sss"]  # imports go to the right
+ORDER = ["benchmarks", "figures", "full_geometry", "analytic_models", "halfspace_sss"]  # imports go to the right
 SOURCES = sorted(path for package in ORDER for path in (ROOT / package).rglob("*.py"))
 HEAVY = ["torch", "mitsuba", "matplotlib", "drjit", "pandas", "xarray"]
 FLOORS = {  # of each package, a room may import those to its left; "" is what lies beside the rooms
     "halfspace_sss": [
         "", "physics", "interface", "tracing", "maps", "measure", "materials", "comparison", "neural",
         "neural.training", "rendering.object", "rendering.light", "rendering.gathered",
-        "rendering.walk", "rendering.paths", "rendering.scenes", "rendering", "inverse", "trade",
-        "trade.checking", "cli", "trade.commands",
+        "rendering.walk", "rendering.paths", "rendering.scenes", "rendering", "inverse", "trade", "cli",
     ],
     "full_geometry": ["object", "models", "learning", "neural_shape", ""],
-    "figures": ["parts", "studies", "modelling", "computing", "drawing", "beyond", ""],
+    "figures": ["parts", "rivals", "modelling", "computing", "drawing", "beyond", ""],
 }  # fmt: skip
 HIDING = {"bssrdf", "curves", "models", "trace"}  # public functions: a folder of that name would hide one
 LONGEST_BODY = 60

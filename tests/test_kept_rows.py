@@ -56,35 +56,3 @@ def test_truths_say_what_they_take_and_go_on_after_what_is_kept(tmp_path: Path, 
     fresh = _truths(tmp_path / "fresh")
     assert f"{left + n} reflectances, about " in fresh.stderr
     assert (tmp_path / "fresh" / "truths.csv").read_text() == (tmp_path / "truths.csv").read_text()
-
-
-def test_an_ablation_goes_on_after_the_trainings_that_it_has_finished(tmp_path: Path, monkeypatch: Any) -> None:
-    pytest.importorskip("torch")
-    from halfspace_sss import materials
-    from halfspace_sss.maps.noisy_maps import CellGrid
-    from halfspace_sss.neural.training import ablation as module
-    from halfspace_sss.neural.training.fit import Fit, Samples
-    from halfspace_sss.neural.training.train_material import MaterialRecipe
-
-    monkeypatch.setattr(module, "SETS", 1)
-    monkeypatch.setattr(module, "VARIANTS", module.VARIANTS[-3:])
-    how = Fit(steps=1, n_groups=4, n_queries=32)
-    tiny = MaterialRecipe(n_groups=8, events=1e5, grid=CellGrid(4, 4), how=how)
-    arguments = (materials.load("fig10").medium, tiny, [Samples(100)], 1)
-
-    def ends(what: str, done: int, total: int) -> None:
-        if done == 1:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        module.ablation(*arguments, progress=ends, kept=KeptRows(tmp_path / "a", {}))
-    kept = KeptRows(tmp_path / "a", {})
-    assert len(kept) == 1
-    left = [run for name, run in module.trainings(*arguments[:1], *arguments[2:], 0).items() if name not in kept]
-    assert module.cost(left).startswith(f"{len(module.VARIANTS) - 1} trainings: {len(left)} as long as their data take")
-    resumed = module.ablation(*arguments, kept=kept)
-    monkeypatch.setattr(module, "_data", None)  # all rows are there
-    again = module.ablation(*arguments, kept=KeptRows(tmp_path / "a", {}))
-    assert again.equals(resumed)
-    whole = KeptRows(tmp_path / "a", {})
-    assert list(whole)[:1] == list(kept)[:1] and len(whole) == len(module.VARIANTS)

@@ -14,8 +14,8 @@ from figures.computing.scenes import prepare
 from figures.computing.things import Staging, lit_scene, shown, thing_parts, walked
 from figures.drawing.image_files import against_walks, image_files, rows_of
 from figures.modelling.head import make_head, write_painted
+from figures.modelling.held_out import HELD_OUT
 from figures.parts.part import Part, Result, Task, unmodelled
-from figures.studies.held_out import HELD_OUT
 from full_geometry.learning.meshes import Box, surface
 from full_geometry.learning.shapes import box, make_shape
 from halfspace_sss.physics.medium import Medium

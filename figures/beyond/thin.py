@@ -11,8 +11,8 @@ from figures.computing.references import NOTE
 from figures.computing.scenes import DRAGON, SCANS
 from figures.computing.things import Staging, lit_scene, shown, thing_parts, walked
 from figures.drawing.image_files import against_walks, image_files, rows_of
+from figures.modelling.held_out import HELD_OUT
 from figures.parts.part import Part, Result, Task, unmodelled
-from figures.studies.held_out import HELD_OUT
 from full_geometry.learning.shapes import TRAINING, make_shape
 from halfspace_sss import materials
 from halfspace_sss.provenance import check_folder

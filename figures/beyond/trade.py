@@ -18,11 +18,11 @@ from figures.drawing import trade_plot
 from figures.drawing.page import page
 from figures.drawing.style import paper, saved
 from figures.drawing.trade_plot import image_shots, multiples
+from figures.modelling.closed_shapes import write_shape
 from figures.parts.part import Part, Result, Task
 from halfspace_sss import materials
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED
-from halfspace_sss.trade.checking.random_scenes import RandomScene, mesh_file
 from halfspace_sss.trade.results import Assessment
 from halfspace_sss.trade.ways import GATHERED, LAMBERT, Way
 
@@ -39,7 +39,6 @@ SECONDS = {"draft": 4.0, "paper": 60.0}  # second halves of gathered light, of 5
 KNOB_SECONDS = {"draft": 1.0, "paper": 24.0}
 SIZE = {"draft": 64, "paper": 128}
 SPP = {"draft": 16, "paper": 32}
-SPIKES = RandomScene(0, 0, "spikes", "sky", (), (), 0.0, 1.3, 0.0, (), 0.05, 1)
 TOLERANCE = 0.05
 NETWORKS = ("neural", "neural_shape")
 LEARNT = (*NETWORKS, FULL_GEOMETRY)
@@ -142,7 +141,8 @@ def _scene(p: Mapping[str, Any], folder: Path, medium: Medium | None = None) -> 
         # 37 mm across as the bunny is tall, in the middle of the picture
         to_world = mi.ScalarTransform4f().translate([-0.55, 4.7, 0]).scale(0.42 / MM_PER_UNIT)
         bsdf = scene.pop("bunny")["bsdf"]
-        mesh = mesh_file(SPIKES, folder)
+        mesh = folder / "spikes.ply"
+        write_shape(mesh, "spikes", (0, 0, 62))
         scene["spikes"] = {"type": "ply", "filename": str(mesh), "to_world": to_world, "bsdf": bsdf}
     return scene
 

@@ -1,6 +1,6 @@
 """Random shapes by a seed: signed distances put together at random and meshed. Lengths are of the order of one.
 
-Families of training and those that studies hold out share no generator.
+Families of training and those that are held out share no generator.
 """
 
 from __future__ import annotations

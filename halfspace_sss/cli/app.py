@@ -1,8 +1,7 @@
 """The command `halfspace-sss`: what it can do.
 
 A command is a function with typer annotations in a file of this folder; it joins by one line in `_OWN`. Packages above
-add theirs by an entry point of the group `halfspace_sss.commands`, or of `halfspace_sss.studies` for comparisons that
-ship no product. How commands end is in `shared`.
+add theirs by an entry point of the group `halfspace_sss.commands`. How commands end is in `shared`.
 """
 
 from __future__ import annotations
@@ -49,7 +48,6 @@ def _app() -> Any:
 
     from halfspace_sss.cli.shared import Commands, with_quiet
     from halfspace_sss.cli.train import trainings
-    from halfspace_sss.extensions import COMMANDS, STUDIES
 
     app = typer.Typer(
         cls=Commands, no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False,
@@ -61,11 +59,8 @@ def _app() -> Any:
         module = importlib.import_module(f"halfspace_sss.cli.{_FILES.get(name, name)}")
         result = getattr(module, function)
         app.command(name)(result if name in _LISTS else with_quiet(result))
-    _add_commands(app, COMMANDS)
+    _add_commands(app)
     app.add_typer(trainings(), name="train")
-    studies = typer.Typer(no_args_is_help=True, help="Compare choices and rivals of the models: tables for the docs.")
-    _add_commands(studies, STUDIES)
-    app.add_typer(studies, name="study")
     return app
 
 
@@ -84,16 +79,16 @@ def _options(typer: Any) -> Any:
     return options
 
 
-def _add_commands(app: Any, group: str) -> None:
-    """The commands, or studies, of an entry-point group."""
+def _add_commands(app: Any) -> None:
+    """The commands of other packages."""
     from halfspace_sss.cli.shared import with_quiet
-    from halfspace_sss.extensions import FAILURES, commands, warn_left_out
+    from halfspace_sss.extensions import COMMANDS, FAILURES, commands, warn_left_out
 
-    for name, function in commands(group):
+    for name, function in commands():
         try:
             _check_command(name, function)
         except FAILURES as error:
-            warn_left_out(group, name, error)
+            warn_left_out(COMMANDS, name, error)
         else:
             app.command(name)(with_quiet(function))
 
@@ -102,7 +97,7 @@ def _check_command(name: str, function: Any) -> None:
     """Raises, in whichever way typer does, if the function cannot be a command beside the others."""
     import typer
 
-    if name in (*_OWN, "study", "train"):
+    if name in (*_OWN, "train"):
         raise ValueError(f"name must be new, got {name!r}")
     alone = typer.Typer()
     alone.command(name)(function)

@@ -8,7 +8,6 @@ from __future__ import annotations
 import functools
 import inspect
 import math
-import shlex
 import signal
 import time
 import warnings
@@ -48,16 +47,8 @@ def _show_warning(message: Any, *_: Any) -> None:
     typer.echo(f"warning: {' '.join(str(message).split())}", err=True)
 
 
-STUDIES = ("ablation", "rivals", "shapes", "trade-check")  # which were commands of their own
-
-
 class Commands(TyperGroup):
     """The commands; what the library refuses, and interrupts, end them in a line."""
-
-    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        if args[0] in STUDIES and self.get_command(ctx, args[0]) is None:
-            raise ValueError(f"{args[0]} must be asked for as a study: `halfspace-sss study {shlex.join(args)}`")
-        return super().resolve_command(ctx, args)
 
     def invoke(self, ctx: Any) -> Any:
         with interrupts, warnings.catch_warnings():

@@ -171,10 +171,6 @@ OLD = {
     "train --scene=a.xml": "halfspace-sss train object --scene=a.xml",
     "train --universal --steps 3": "halfspace-sss train universal --steps 3",
     "train --mesh a.ply --shapes": "halfspace-sss train shapes --mesh a.ply",
-    "ablation --seeds 1": "halfspace-sss study ablation --seeds 1",
-    "rivals --scene a.xml": "halfspace-sss study rivals --scene a.xml",
-    "shapes": "halfspace-sss study shapes",
-    "trade-check --scenes 2": "halfspace-sss study trade-check --scenes 2",
 }
 
 

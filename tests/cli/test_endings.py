@@ -26,13 +26,6 @@ SMALL = {  # a small run of each command, and what it refuses
     "materials": ([], ["marbel"]),
     "models": ([], ["extra"]),
     "render": (["ball.xml", "--spp", "4", "--out", "o"], ["none.xml"]),
-    "study ablation": (["--samples", "2000", "--seeds", "1", "--out", "o"], ["marbel"]),
-    "study gathered": (["--out", "o"], ["--object", "marbel"]),
-    "study inversion": (["--size", "8", "--out", "o"], ["--size", "0"]),
-    "study rivals": (["--scene", "ball.xml", "--out", "o"], ["--scene", "none.xml"]),
-    "study shapes": (["--objects", "1", "--out", "o/shapes.md"], ["--objects", "-1"]),
-    "study speeds": (["--object", "candle", "--out", "o"], ["--object", "marbel"]),
-    "study trade-check": (["--scenes", "1", "--out", "o"], ["--scenes", "-1"]),
     "trade": (["ball.xml", "--model", "better_dipole", "--assess", "0.2", "--out", "o"], ["marbel"]),
     "train material": (["--fast", "--out", "o", "--work", "o/work"], ["marbel"]),
     "train object": (["--scene", "ball.xml", "--out", "o"], ["--scene", "none.xml"]),
@@ -40,15 +33,6 @@ SMALL = {  # a small run of each command, and what it refuses
     "train universal": (["--out", "o"], ["--steps", "0"]),
     "validate": (["--rows", "thirdparty", "--quick", "--out", "o"], ["--rows", "nope"]),
 }
-STUB = """
-import pandas
-from halfspace_sss.neural.training import ablation as module
-def stub(*_, progress, **__):
-    progress("maps", 0, 1)
-    row = {"budget": "2,000 samples", "variant": "x", "threads": 1, "kB": 1.0, "samples": 1.0, "seconds": 1.0}
-    return pandas.DataFrame([row | {k: 0.1 for k in ("noise", "error", "bias", "error_sd", "bias_sd", "r 1-10")}])
-module.ablation, module.summary = stub, lambda table: table
-"""
 HARNESS = """
 import atexit, gc, json, os, signal, subprocess, sys
 from pathlib import Path
@@ -60,7 +44,7 @@ cli._app()
 command.MOST_WORKERS = 1  # the process that is interrupted writes the files, and no other has written some by then
 gc.freeze()
 
-for folder, mount, moment, stub, arguments in json.loads(sys.argv[1]):
+for folder, mount, moment, arguments in json.loads(sys.argv[1]):
     os.chdir(folder)
     if mount:
         os.mkdir("o")
@@ -79,7 +63,6 @@ else:
 for k, name in ((1, "out"), (2, "err")):
     os.dup2(os.open(name, os.O_WRONLY | os.O_CREAT), k)
 sys.argv[1:] = arguments
-exec(stub)
 def before(function):
     def changed(*arguments, **options):
         os.kill(os.getpid(), signal.SIGINT)
@@ -112,25 +95,19 @@ MOUNTS = {"full": "size=4k", "locked": "ro"}
 NO_FILES = ("materials", "models")
 LONG = (
     "fit",
-    "study gathered",
-    "study inversion",
-    "study rivals",
-    "study shapes",
-    "study speeds",
-    "study trade-check",
     "train object",
     "train shapes",
     "train universal",
 )  # minutes
 
 
-def _run(command: str, column: str, folder: Path) -> tuple[str, str | None, str, str, list[str]]:
-    """Folder, mount, moment of the interrupt, stub and arguments of a run."""
+def _run(command: str, column: str, folder: Path) -> tuple[str, str | None, str, list[str]]:
+    """Folder, mount, moment of the interrupt and arguments of a run."""
     moment, place, _ = COLUMNS[column]
     small, wrong = SMALL[command]
     (folder / "ball.xml").write_text(XML)
     arguments = [*command.split(), *(wrong if column == "bad input" else small)]
-    return str(folder), MOUNTS.get(place), moment, STUB if command == "study ablation" else "", arguments
+    return str(folder), MOUNTS.get(place), moment, arguments
 
 
 def _kinds(files: set[str]) -> str:

@@ -11,8 +11,8 @@ mi = pytest.importorskip("mitsuba")
 dr = pytest.importorskip("drjit")
 pytest.importorskip("igl")
 
-from figures.studies import deng  # noqa: E402
-from figures.studies.photographs import Poses, Studio, lobe  # noqa: E402
+from figures.rivals import deng  # noqa: E402
+from figures.rivals.photographs import Poses, Studio, lobe  # noqa: E402
 from halfspace_sss.physics.fresnel import C_1, F_t  # noqa: E402
 from halfspace_sss.rendering.object.objects import TranslucentObject, make_objects  # noqa: E402
 from halfspace_sss.rendering.object.points import SurfacePoint  # noqa: E402

@@ -17,7 +17,7 @@ from figures.computing import learnt, scenes  # noqa: E402
 from figures.computing.contenders import OF_OBJECTS, VOLUMES  # noqa: E402
 from figures.parts import runner  # noqa: E402
 from figures.parts.part import Result, keys_of  # noqa: E402
-from figures.studies import distant_light  # noqa: E402
+from figures.rivals import distant_light  # noqa: E402
 from full_geometry.learning import training  # noqa: E402
 from full_geometry.learning.fitting import Recipe  # noqa: E402
 

@@ -19,7 +19,7 @@ pytest.importorskip("zuko")
 
 from waxen import BUNNY, random_layers, random_patches, wax_bunny  # noqa: E402
 
-from figures.studies.flow import (  # noqa: E402  # noqa: E402  # noqa: E402
+from figures.rivals.flow import (  # noqa: E402  # noqa: E402  # noqa: E402
     N_CONTEXT,
     Chart,
     ConditionalFlow,  # noqa: E402
@@ -29,7 +29,7 @@ from figures.studies.flow import (  # noqa: E402  # noqa: E402  # noqa: E402
     draw_by,
     from_square,
 )
-from figures.studies.flow_training import FlowNetwork  # noqa: E402
+from figures.rivals.flow_training import FlowNetwork  # noqa: E402
 from full_geometry.models.storing import (  # noqa: E402
     CENTRES,
     CHECKSUMS,

@@ -12,7 +12,6 @@ from waxen import WAX
 mi = pytest.importorskip("mitsuba")
 pytest.importorskip("torch")
 
-from figures.studies import rivals  # noqa: E402
 from full_geometry.learning import training  # noqa: E402
 from full_geometry.learning.fitting import Recipe  # noqa: E402
 from full_geometry.learning.model_errors import (  # noqa: E402
@@ -153,15 +152,3 @@ def test_a_base_model_that_is_none_is_refused_before_any_walk(
     monkeypatch.setattr(training, "PairSource", None)
     with pytest.raises(ValueError, match=message):
         train(mi.load_dict({"type": "sphere"}), medium, base_model=base_model, folder=tmp_path)
-
-
-def test_the_table_of_base_models_has_all_of_both(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rivals, "STANDARD", QUICK)
-    monkeypatch.setattr(rivals, "TIMES", ((0.0, 1.0), (1.0, 0.5)))
-    monkeypatch.setattr(rivals, "object_of", lambda *_: obj())
-    table = rivals.base_model_table(None, seconds=0.5, exits=64, walks=1024, samples=1024)
-    assert list(table.groupby(["base_model", "planned"], sort=False).size()) == [2, 2, 2, 2]
-    assert np.all((table["steps"] > 0) == (table["planned"] > 0))
-    assert np.all(table["seconds"][table["planned"] > 0] > 0)
-    untrained = table[(table["planned"] == 0) & (table["light"] == LIGHTS[0])].set_index("base_model")
-    assert untrained["error"][SHAPE] < 0.5 * untrained["error"]["better_dipole"]

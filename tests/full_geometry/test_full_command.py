@@ -218,15 +218,11 @@ REFUSED = [
     ([*TRAIN_BALL, "--seed", "-1"], "seed must be a whole number >= 0, got -1"),
     (
         [*TRAIN_BALL, "--model", "neural"],
-        "model must be one of full_geometry, full_geometry_paper, got 'neural'",
+        "model must be one of full_geometry, got 'neural'",
     ),
     ([*TRAIN_BALL, "--out", "ball.xml"], "folder must be a folder or new, got 'ball.xml'"),
     ([*TRAIN_BALL, "--define", "x"], "define must be NAME=VALUE, got 'x'"),
     ([*TRAIN_BALL, "--base-model", "neural_shap"], "base_model must be one of neural_shape,"),
-    (
-        [*TRAIN_BALL, "--model", "full_geometry_paper", "--base-model", "neural_shape"],
-        "base_model must be left out for full_geometry_paper, got 'neural_shape'",
-    ),
     ([*TRAIN_BALL, "--start", "neural_shape"], "--start must be given by its new name, --base-model"),
     (["errors", "--object", "ball"], "object must be left out without --scene, got 'ball'"),
     (["errors", "--scene", "ball.xml", "--events", "1e5"], "events must be left out with --scene, got 100000.0"),

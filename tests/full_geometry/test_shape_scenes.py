@@ -114,19 +114,3 @@ def test_the_command_errors_measures_it_beside_a_half_space(tmp_path: Path, monk
     assert result.exit_code == 0, result.output
     mean = pandas.read_csv("errors/errors.csv").groupby("model")["error"].mean()
     assert mean["neural_shape"] < 0.5 * mean["neural"]
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [(["--out", "."], "out must be a file, got the folder '.'"),
-     (["--out", "file/t.md"], "folder must be a folder or new, got 'file'"),
-     (["--mm-per-unit", "0"], "mm_per_unit must be a number in"),
-     (["--seconds", "nan"], "seconds must be a number in")],
-)  # fmt: skip
-def test_tables_without_a_place_or_with_wrong_numbers_are_refused_before_anything_is_traced(
-    words: list[str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    Path("file").write_text("")
-    result = CliRunner().invoke(cli.app, ["study", "shapes", *words])
-    assert result.exit_code == 2 and message in result.stderr and result.stderr.count("\n") == 1

@@ -1,4 +1,4 @@
-"""Assessments of scenes: what they say of spheres and extremes, the model auto, random scenes and the commands."""
+"""Assessments of scenes: what they say of spheres and extremes, the model auto and the commands."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from render_files import XML
 from typer.testing import CliRunner
 
 from halfspace_sss import Medium
@@ -16,7 +17,6 @@ from halfspace_sss.physics.fresnel import F_r
 from halfspace_sss.rendering.object.registry import model_names
 from halfspace_sss.trade import assess, measuring, recommend, sampling
 from halfspace_sss.trade.assessing import assess_stage
-from halfspace_sss.trade.checking.random_scenes import random_scene, write_scene
 from halfspace_sss.trade.exits import visible_exits
 from halfspace_sss.trade.images import small_images
 from halfspace_sss.trade.sampling import first_sample, sample_more
@@ -299,33 +299,17 @@ def test_lambert_in_a_white_furnace_is_white() -> None:
     assert image.mean() == pytest.approx(expected, abs=0.01)
 
 
-def test_random_scenes_come_again_by_their_number(tmp_path: Path) -> None:
-    assert random_scene(3, 1) == random_scene(3, 1) != random_scene(4, 1)
-    first = write_scene(random_scene(3, 1), tmp_path / "a").read_bytes()
-    assert first == write_scene(random_scene(3, 1), tmp_path / "b").read_bytes()
-
-
-@pytest.mark.parametrize("number", range(6))
-def test_a_random_scene_is_closed_and_faces_outwards(number: int, tmp_path: Path) -> None:
-    from halfspace_sss.rendering.object.shape import survey
-    from halfspace_sss.rendering.scenes.scene_files import load_objects
-
-    loaded = load_objects(write_scene(random_scene(number, 5), tmp_path))
-    (shape,) = (s for s in loaded.shapes() if s.id() == "object")
-    found = survey(shape)
-    assert found.closed and found.upright and found.size == pytest.approx(100, rel=0.01)
-
-
 def test_the_command_measures_a_scene_and_writes_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from halfspace_sss import extensions
 
     monkeypatch.setattr(extensions, "renderer", lambda kind: None)  # neither figure nor page
-    file = write_scene(random_scene(0, 0), tmp_path)
+    file = tmp_path / "ball.xml"
+    file.write_text(XML, encoding="utf-8")
     arguments = ["--model", "lambert", "--tolerance", "0.4", "--assess", "0.3", "--out", str(tmp_path / "out")]
     result = CliRunner().invoke(cli.app, ["trade", str(file), *arguments])
     assert result.exit_code == 0, result.stderr
     names = sorted(path.name for path in (tmp_path / "out").iterdir())
-    assert names == ["scene-0-000_trade.csv", "scene-0-000_trade.json"]
+    assert names == ["ball_trade.csv", "ball_trade.json"]
     assert "is the cheapest that keeps 0.4" in result.stdout
 
 
@@ -349,23 +333,6 @@ def test_objects_without_weights_are_learnt_before_and_refusals_are_heard(monkey
     with pytest.warns(UserWarning, match="'ball2' is not learnt: ball2 must be closed"):
         assessing.learn(stage(scene(n=3)), 7.0)
     assert Learnt.asked == [("ball1", 7.0), ("ball2", 7.0)]
-
-
-def test_the_check_goes_on_where_it_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from halfspace_sss.trade.checking import check, truth
-
-    monkeypatch.setattr(check, "WAYS", ("path_traced", "lambert"))
-    first = check.check_scene(random_scene(1, 0), tmp_path, 0.2, 0.3)
-    monkeypatch.setattr(check, "assess_for", None)
-    monkeypatch.setattr(truth, "assess_stage", None)
-    again = check.check_scene(random_scene(1, 0), tmp_path, 0.2, 0.3)
-    assert json.dumps(again) == json.dumps(first)
-    found = check.outcome(first)
-    assert (
-        found["way"] in ("path_traced", "lambert")
-        and found["ratio"] >= found["sure_ratio"] > 0
-        and len(check.z_values(first)) == 1
-    )
 
 
 def test_a_medium_without_a_scene_gets_a_model_of_the_half_space() -> None:

@@ -1,0 +1,93 @@
+"""The command `rivals`: tables of samplers, of models and of base models of one object, at equal CPU time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from benchmarks.tables import markdown
+from halfspace_sss.checks import check_choice, check_count, check_interval
+from halfspace_sss.cli.shared import Bar, Define, ObjectId, OutFolder, Variant, console, defined, use_mitsuba, whole
+from halfspace_sss.provenance import check_folder, write_together
+
+if TYPE_CHECKING:
+    import pandas
+
+
+KEYS = {"errors": ["model"], "base_models": ["base_model", "planned", "seconds", "steps"]}  # of errors of a training
+TABLES = ("errors", "samplers", "base_models")
+
+
+def rivals_command(
+    scene: Annotated[Path, typer.Option(help="Mitsuba XML file with the object.")],
+    object: ObjectId = None,
+    table: Annotated[
+        list[str] | None, typer.Option(help="errors, samplers or base_models; repeat for several.", show_default="all")
+    ] = None,
+    seconds: Annotated[
+        float, typer.Option(help="CPU time of each training, data included; of base models of the longest.")
+    ] = 60.0,
+    samples: Annotated[int, typer.Option(help="Of each exit, for errors and variances.", parser=whole)] = 2048,
+    seed: Annotated[int, typer.Option(help="Seed of everything.", parser=whole)] = 0,
+    define: Define = None,
+    variant: Variant = "llvm_ad_rgb",
+    out: OutFolder = Path("rivals"),
+) -> None:
+    """Compare ways of drawing entries by variance x time, models and base models by errors, by CPU time."""
+    chosen = table or list(TABLES)
+    for name in chosen:
+        check_choice("table", name, TABLES)
+    check_interval("seconds", seconds, 0.1, 1e6)
+    for key, value, least in (("samples", samples, 2), ("seed", seed, 0)):
+        check_count(key, value, least)
+    parameters = defined(define)
+    check_folder(out)
+    use_mitsuba(variant)
+    from halfspace_sss.rendering.scenes.scene_files import load_objects
+
+    loaded, files = load_objects(scene, parameters), {}
+    for name in chosen:
+        with Bar(name) as bar:
+            frame = _made(name, loaded, object, seconds, samples, seed, bar)
+        files[out / f"{name}.csv"] = frame.to_csv(index=False, lineterminator="\n")
+        files[out / f"{name}.md"] = markdown(_errors_wide(frame, KEYS[name]) if name in KEYS else frame)
+    write_together(files)
+    for path, text in files.items():
+        if path.suffix == ".md":
+            console().print(text, highlight=False, markup=False, soft_wrap=True)
+        console().print(f"  {path}", highlight=False, markup=False, soft_wrap=True)
+
+
+def _made(
+    table: str, scene: Any, name: str | None, seconds: float, samples: int, seed: int, bar: Bar
+) -> pandas.DataFrame:
+    from tempfile import TemporaryDirectory
+
+    from benchmarks import rivals
+    from benchmarks.rivals import sampler_table
+    from figures.rivals.flow_training import FlowRecipe
+    from full_geometry.learning.training import train_by_cpu
+    from halfspace_sss.rendering.object.objects import object_of
+
+    def show(what: str, done: int, total: int) -> None:
+        bar.show(done, total, what)
+
+    if table in KEYS:
+        make = {"errors": rivals.error_table, "base_models": rivals.base_model_table}[table]
+        return make(scene, name, seconds=seconds, walks=samples, samples=samples, seed=seed, progress=show)
+    with TemporaryDirectory() as folder:
+        learnt, _ = train_by_cpu(object_of(scene, None, None, name), seconds, folder, seed=seed)
+    return sampler_table(learnt, FlowRecipe(seconds=0.5 * seconds), samples=samples, seed=seed, progress=show)
+
+
+def _errors_wide(table: pandas.DataFrame, keys: list[str]) -> pandas.DataFrame:
+    """A row for each training, told by the columns `keys`; a column for each channel and light: error ± its own, %."""
+    texts = table.assign(
+        what=[f"{light}, channel {channel}" for light, channel in zip(table["light"], table["channel"])],
+        text=[f"{100 * a:.2g} ± {100 * b:.1g}" for a, b in zip(table["error"], table["standard_error"])],
+    )
+    wide = texts.pivot(index=keys, columns="what", values="text")
+    rows = table[keys].drop_duplicates().set_index(keys).index
+    return wide.loc[rows, list(dict.fromkeys(texts["what"]))].reset_index()

@@ -1,0 +1,113 @@
+"""One random scene: an assessment as users make it, a recommendation, and long runs that say how right they were."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+from benchmarks.long_runs import long_run
+from benchmarks.random_scenes import RandomScene, write_scene
+from halfspace_sss.neural.store import weights_in
+from halfspace_sss.provenance import provenance, write_atomically
+from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED
+from halfspace_sss.trade.advice import Job, advise
+from halfspace_sss.trade.assessing import assess_for, learn
+from halfspace_sss.trade.automatic import picked
+from halfspace_sss.trade.results import Assessment, WayTrade
+from halfspace_sss.trade.statistics import seeded
+from halfspace_sss.trade.ways import Stage, Way, stage
+
+WAYS = (
+    PATH_TRACED, "lambert", "better_dipole", "neural", "full_geometry",
+    "better_dipole, gathered", "neural, gathered", "full_geometry, gathered", "path_traced, gathered",
+)  # fmt: skip
+LEARNT = "full_geometry"
+TRAIN_SECONDS = 20.0
+FORMAT = "halfspace-sss trade check 7"
+
+
+def check_scene(scene: RandomScene, folder: Path, seconds: float, truth_seconds: float) -> dict[str, Any]:
+    """The record of a scene: the assessment, and the mean of long runs; what the folder holds is not run again.
+
+    Its object is learnt before, which is a cost of the model that needs it.
+    """
+    file = write_scene(scene, folder)
+    on, ways = stage(file), [Way.of(name) for name in WAYS]
+    with weights_in(folder / "weights"):
+        if any(way.model == LEARNT for way in ways):
+            learn(on, TRAIN_SECONDS)
+        quick = _quick(scene, on, ways, file.with_suffix(".json"), seconds)
+        truth = file.with_suffix(".truth.json")
+        long = long_run(on, ways, scene.tolerance, truth, seeded(scene.seed, scene.number, 1), truth_seconds)
+    return {"scene": scene.record(), "quick": quick, "long": long.record()}
+
+
+def _quick(scene: RandomScene, on: Stage, ways: list[Way], path: Path, seconds: float) -> dict[str, Any]:
+    """The assessment as users make it, on which the recommendation rests."""
+    how = {"format": FORMAT, "scene": scene.record(), "seconds": seconds, "ways": [way.name for way in ways]}
+    if path.is_file():
+        record = json.loads(path.read_text(encoding="utf-8"))
+        if json.loads(json.dumps(how)).items() <= record.items():
+            return record["quick"]
+    number = seeded(scene.seed, scene.number, 0)
+    result = assess_for(on, ways, scene.tolerance, images=scene.images, seconds=seconds, seed=number).record()
+    record = {**how, "quick": result, "provenance": provenance(**how)}
+    write_atomically(path, json.dumps(record, indent=1) + "\n")
+    return result
+
+
+def outcome(record: dict[str, Any]) -> dict[str, Any]:
+    """What came of a scene: error and cost of the recommendation by the long runs, and those of the cheapest way."""
+    scene = RandomScene(**{k: tuple(v) if isinstance(v, list) else v for k, v in record["scene"].items()})
+    quick, long = (Assessment.of(record[key]) for key in ("quick", "long"))
+    results: dict[str, Any] = {"number": scene.number, "shape": scene.shape, "light": scene.light, "mfp": scene.mfp}
+    results |= {"tolerance": scene.tolerance, "images": scene.images, "seconds": quick.seconds}
+    if not quick.objects[0].ways or quick.objects[0].is_dark:
+        return {**results, "way": None}
+    job = Job(scene.tolerance, scene.images)
+    chosen = advise(quick, job).objects[0]
+    option = chosen.options[0]
+    truth = {row.way: row for row in long.objects[0].ways if not row.refusal}
+    row, pixels = truth[option.way], long.objects[0].pixels
+    error2 = max(row.bias2, 0.0) + row.variance / option.spp
+    error2_error = math.hypot(row.bias2_error, row.variance_error / option.spp)
+    least = {name: _least(w, scene, pixels) for name, w in truth.items()}
+    cheapest = min(least, key=lambda name: least[name])
+    known = [name for name, w in truth.items() if w.bias2 + 2 * w.bias2_error < scene.tolerance**2]
+    sure = min((least[name] for name in known), default=math.inf)
+    cost = row.training + row.preparation + scene.images * pixels * option.spp * row.seconds
+    automatic = picked(quick.objects[0], scene.tolerance).model
+    results |= {"way": option.way, "spp": option.spp, "error": math.sqrt(error2)}
+    results |= {"error_standard_error": error2_error / (2 * math.sqrt(error2)), "cost_s": cost}
+    results |= {"cheapest": cheapest, "cheapest_s": least[cheapest], "ratio": cost / least[cheapest]}
+    results |= {"sure_ratio": cost / sure}
+    results |= {"keeps": error2 - 2 * error2_error <= scene.tolerance**2, "auto": automatic}
+    return (
+        results
+        | {f"{name}_s": least.get(name, math.inf) for name in (PATH_TRACED, "neural", "better_dipole")}
+        | {"auto_s": least.get(automatic, math.inf)}
+    )
+
+
+def _least(row: WayTrade, scene: RandomScene, pixels: float) -> float:
+    """Seconds of a job by a way if bias and variance were known, training and preparation included."""
+    left = scene.tolerance**2 - max(row.bias2, 0.0)
+    if not left > 0:
+        return math.inf
+    return row.training + row.preparation + scene.images * pixels * max(math.ceil(row.variance / left), 1) * row.seconds
+
+
+def z_values(record: dict[str, Any]) -> list[tuple[str, float]]:
+    """(bias² of the assessment - that of the long run) over their standard errors together, for each way."""
+    quick, long = (Assessment.of(record[key]) for key in ("quick", "long"))
+    results = []
+    for a in quick.objects[0].ways:
+        if a.refusal or a.way == PATH_TRACED:
+            continue
+        b = long.objects[0].way(a.way)
+        error = math.hypot(a.bias2_error, b.bias2_error)
+        if error > 0:
+            results.append((a.way, (a.bias2 - b.bias2) / error))
+    return results

@@ -1,1 +1,0 @@
-"""Whether assessments and recommendations are right: random scenes, long runs, and what comes of the comparison."""

@@ -1,1 +1,0 @@
-"""The commands `trade` and `trade-check`."""
