@@ -42,6 +42,7 @@ PAGES = [
             "errors",
             "formats",
             "limits",
+            "measurements",
         )
     ),
 ]

@@ -7,7 +7,7 @@ object each takes, until bias and noise together are at the tolerance e,
 
 and a way with b >= e never gets there. With standard errors s of b² and v of V, and x = 1 / samples, b² + V x is taken
 a standard error above what was measured, b² + V x + sqrt(s² + v² x²). Biases of models are spread over decades, so that
-few lie where that errs: see docs/trade_check.md.
+few lie where that errs: see docs/measurements.md.
 """
 
 from __future__ import annotations
