@@ -5,7 +5,6 @@ from __future__ import annotations
 import difflib
 import math
 import numbers
-import warnings
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -111,11 +110,3 @@ def check_query(lib: Any, args: tuple, given: tuple) -> tuple:
             wrong = smallest if not smallest >= low else largest
             raise ValueError(f"{name} must be {what}, got {wrong!r}")
     return tuple(checked)
-
-
-def renamed(value: Any, before: Any, name: str, old: str) -> Any:
-    """An argument by its present name, or with a DeprecationWarning by the one that it had before."""
-    if before is None:
-        return value
-    warnings.warn(f"{old} is called {name} now", DeprecationWarning, stacklevel=3)
-    return before if value is None else value

@@ -166,6 +166,6 @@ def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
     files["trade.csv"] = table.to_csv(index=False, lineterminator="\n", float_format="%.5g")
     knobs = [result.numbers["settings"] for name, result in results.items() if name.endswith(", knobs")]
     seconds = max(results[name].numbers["seconds"] for name in shots)
-    files["trade.md"] = trade_plot.markdown(result, table, seconds, [s for settings in knobs for s in settings])
+    files["trade.md"] = trade_plot.markdown(result, seconds, [s for settings in knobs for s in settings])
     files["trade.html"] = page("Speed against accuracy", shots)
     return files

@@ -275,9 +275,7 @@ def trade_table(scenes: Scenes) -> pandas.DataFrame:
     return pandas.DataFrame(rows)
 
 
-def markdown(
-    scenes: Scenes, table: pandas.DataFrame, seconds: float, settings: Sequence[Mapping[str, Any]] = ()
-) -> str:
+def markdown(scenes: Scenes, seconds: float, settings: Sequence[Mapping[str, Any]] = ()) -> str:
     """What is recommended, the bias of every way, and its cost; `seconds` is what each scene had."""
     lines = [INTRODUCTION.format(seconds=seconds), "## The cheapest way that keeps a tolerance", ""]
     lines += ["For images of 512 x 512 pixels; in brackets seconds of all cores for all of them, training counted.", ""]
@@ -290,7 +288,7 @@ def markdown(
             told.append(f"{option.way} ({short(option.seconds)})")
         lines.append(f"| {' | '.join(scene)} | {' | '.join(told)} |")
     lines += ["", "## Bias", "", "Relative error of radiance over visible points, %.", ""]
-    lines += _grid(scenes, _bias)
+    lines += _grid(scenes, lambda w, _: w.told_bias)
     lines += [
         "",
         "## Cost",
@@ -311,10 +309,6 @@ def markdown(
 
 def _job(tolerance: float, images: int) -> str:
     return f"{100 * tolerance:g} %" + (f", {images} images" if images > 1 else "")
-
-
-def _bias(w: WayTrade, o: ObjectTrade) -> str:
-    return w.told_bias
 
 
 def _grid(scenes: Scenes, cell: Any) -> list[str]:

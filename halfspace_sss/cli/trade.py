@@ -46,7 +46,6 @@ def trade_command(
     model: Annotated[
         list[str] | None, typer.Option(help="A model or path_traced; repeat for more.", show_default="all")
     ] = None,
-    way: Annotated[list[str] | None, typer.Option(hidden=True)] = None,  # what --model was called before
     every: Annotated[bool, typer.Option("--all", help="Every way, also those that cannot win.")] = False,
     assess: Annotated[float, typer.Option(help="Seconds of measuring for each object.")] = ASSESS,
     train_seconds: Annotated[
@@ -63,7 +62,7 @@ def trade_command(
     check_interval("tolerance", tolerance, 1e-4, 10.0)
     check_count("images", images, 1)
     check_count("seed", seed, 0)
-    models = [*(model or ()), *(way or ())] or None
+    models = model or None
     if what is None:
         given = {"seconds": seconds, "model": models, "r": r, "define": define}
         check_left_out(given, "without a scene or a material")

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import shlex
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from typer.core import TyperGroup
 
 from halfspace_sss.checks import check_count
 from halfspace_sss.cli.shared import (
@@ -41,8 +39,6 @@ if TYPE_CHECKING:
     from halfspace_sss.rendering.scenes.learners import LearntObject
 
 HELP = "Train networks on path tracing: models find them by the medium, and by the shape of an object."
-SWITCHES = {"--scene": "object", "--shapes": "shapes", "--universal": "universal"}  # of one command for all
-RENAMED = {"--start": "--base-model"}
 
 Seconds = Annotated[float, typer.Option(help="Time for data and fit, without compiling.")]
 TargetError = Annotated[
@@ -63,25 +59,9 @@ WeightsFolder = Annotated[
 Work = Annotated[Path | None, typer.Option(help="Folder for unfinished work, which an interrupted run continues.")]
 
 
-class _Trainings(TyperGroup):
-    """The commands of `train`; how they were asked for when they were one is refused with how they are now."""
-
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        if not args or args[0] not in (*self.commands, *ctx.help_option_names):
-            given = {word.split("=")[0] for word in args}
-            kind = next((kind for switch, kind in SWITCHES.items() if switch in given), "material")
-            rest = [word for word in args if word not in ("--shapes", "--universal")]
-            asked = shlex.join(["halfspace-sss", "train", kind, *rest])
-            raise ValueError(f"train must be followed by {', '.join(sorted(self.commands))}: `{asked}`")
-        for word in args:
-            if (old := word.split("=")[0]) in RENAMED:
-                raise ValueError(f"{old} must be given by its new name, {RENAMED[old]}")
-        return super().parse_args(ctx, args)
-
-
 def trainings() -> typer.Typer:
     """The command `train` with what it trains as commands of its own."""
-    app = typer.Typer(cls=_Trainings, help=HELP)
+    app = typer.Typer(no_args_is_help=True, help=HELP)
     for name, function in (
         ("material", material_command), ("object", object_command), ("shapes", shapes_command),
         ("universal", universal_command),

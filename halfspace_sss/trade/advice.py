@@ -194,7 +194,7 @@ def _object(assessed: ObjectTrade, job: Job) -> ObjectAdvice:
     else:
         options = [_in_time(assessed, o[3], job) for o in options]
         best = min(options, key=lambda o: o[2])
-        told = [_nearest(assessed, o, best, job) for o in sorted(options, key=lambda o: o[2])]
+        told = [_nearest(o, best, job) for o in sorted(options, key=lambda o: o[2])]
     refused = [Option(w.way, math.inf, 0, math.nan, f"{w.way}: {w.refusal}") for w in assessed.ways if w.refusal]
     return ObjectAdvice(assessed.object, best[3].way, (*told, *refused))
 
@@ -244,7 +244,7 @@ def _told(assessed: ObjectTrade, option: _Raw, best: _Raw, job: Job) -> Option:
     return Option(row.way, took, int(spp), error, why)
 
 
-def _nearest(assessed: ObjectTrade, option: _Raw, best: _Raw, job: Job) -> Option:
+def _nearest(option: _Raw, best: _Raw, job: Job) -> Option:
     took, spp, error, row = option
     if option is best:
         why = f"no way keeps {job.tolerance:.3g} in {_time(took)}; {row.way} comes nearest, {100 * error:.3g} %"

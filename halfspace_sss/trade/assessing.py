@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-from halfspace_sss.checks import check_count, check_interval, renamed
+from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.rendering.object.registry import lookup
 from halfspace_sss.rendering.scenes.learners import CostedLearner, Learner, learner
@@ -56,7 +56,6 @@ def assess(
     parameters: dict[str, str] | None = None,
     train_seconds: float = 0.0,
     progress: NamedProgress | None = None,
-    only: Sequence[str] | None = None,
 ) -> Assessment:
     """Measure each way of rendering a scene on each of its translucent objects.
 
@@ -83,7 +82,6 @@ def assess(
         train_seconds: that each object without weights is learnt for before, as `train object` does; 0 for what has
             been learnt. The time of a training is a cost of its model.
         progress: called with (what, done, total).
-        only: what `models` was called before.
 
     Left out: what lies behind glass or in mirrors, the mirror images of lamps on the objects, and the errors of fine
     detail between the points.
@@ -98,8 +96,7 @@ def assess(
         check_interval("tolerance", tolerance, 1e-4, 10.0)
     check_count("images", images, 1)
     check_interval("train_seconds", train_seconds, 0.0, 1e7)
-    named = renamed(models, only, "models", "only")
-    chosen = _chosen(named if named is not None or tolerance is None else CANDIDATES)
+    chosen = _chosen(models if models is not None or tolerance is None else CANDIDATES)
     on = stage(scene, parameters)
     check_count("sensor", sensor, 0)
     if sensor >= len(on.scene.sensors()):
@@ -110,7 +107,7 @@ def assess(
     if tolerance is None:
         result = assess_stage(on, chosen, **how)
     else:
-        job = {"images": None if named else images, "count_training": count_training}
+        job = {"images": None if models else images, "count_training": count_training}
         result = assess_for(on, chosen, tolerance, **job, **how)
     if flip:
         result = with_flip(on, chosen, result, sensor, seed)

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from halfspace_sss.checks import check_choice, check_count, check_interval, renamed
+from halfspace_sss.checks import check_choice, check_count, check_interval
 from halfspace_sss.comparison.curve_set import TRACED
 from halfspace_sss.comparison.model_errors import TracedMaps, model_error, references
 from halfspace_sss.interface.model import BSSRDF, bssrdf
@@ -70,7 +70,6 @@ def recommend_flat(
     models: Sequence[str] | None = None,
     events: float = EVENTS,
     seed: int = 0,
-    only: Sequence[str] | None = None,
 ) -> FlatAdvice:
     """The cheapest model of the half-space that keeps a tolerance over a range of distances.
 
@@ -81,7 +80,6 @@ def recommend_flat(
         models: names, by default all.
         events: scattering events of the walks, for each channel.
         seed: of the walks.
-        only: what `models` was called before.
 
     Raises:
         ValueError: an argument is out of range, or no light comes back within the distances.
@@ -90,8 +88,7 @@ def recommend_flat(
     check_interval("tolerance", tolerance, 1e-4, 10.0)
     check_interval("events", events, 1e4, 1e12)
     check_count("seed", seed, 0)
-    chosen = renamed(models, only, "models", "only")
-    for name in chosen or ():
+    for name in models or ():
         check_choice("model", name, registered())
     parts = [m for m in channels(medium) if float(m.sigma_s) > 0]
     if not parts:
@@ -103,7 +100,7 @@ def recommend_flat(
     within = [(r[0] * float(m.sigma_t), r[1] * float(m.sigma_t)) if r else REACH for m in parts]
     for m, one, bounds in zip(parts, result, within):
         _check_light(m, one, bounds)
-    rows = [_row(name, parts, result, within) for name in chosen or registered()]
+    rows = [_row(name, parts, result, within) for name in models or registered()]
     noise = max((row.noise for row in rows if row.noise < math.inf), default=math.inf)
     rows.append(_Row(TRACED, NoiseFree(0.0, 0.0), tolerance, tracing * (noise / tolerance) ** 2))
     return _advice(rows, tolerance, r or REACH, "mm" if r else "mean free paths")

@@ -164,21 +164,6 @@ REFUSED = [
     *(("train universal", *case) for case in REFUSED_BY_UNIVERSAL),
     *(("errors", *case) for case in REFUSED_BY_ERRORS),
 ]
-OLD = {
-    "train": "halfspace-sss train material",
-    "train ketchup --fast": "halfspace-sss train material ketchup --fast",
-    "train --scene a.xml --object x": "halfspace-sss train object --scene a.xml --object x",
-    "train --scene=a.xml": "halfspace-sss train object --scene=a.xml",
-    "train --universal --steps 3": "halfspace-sss train universal --steps 3",
-    "train --mesh a.ply --shapes": "halfspace-sss train shapes --mesh a.ply",
-}
-
-
-@pytest.mark.parametrize("old", OLD)
-def test_commands_that_were_renamed_are_refused_with_their_new_words(old: str) -> None:
-    result = _invoke(*old.split())
-    assert result.exit_code == 2 and result.stderr.startswith("error: ") and f"`{OLD[old]}`" in result.stderr
-    assert len(result.stderr.splitlines()) == 1
 
 
 @pytest.mark.parametrize(

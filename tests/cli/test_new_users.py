@@ -53,14 +53,7 @@ def test_help_of_the_surface_works_before_it_is_registered() -> None:
 def test_models_have_one_option_in_all_commands() -> None:
     for command in ("curves", "errors", "trade"):
         shown = CliRunner().invoke(cli._app(), [command, "--help"]).output
-        assert "--model" in shown and "--way" not in shown
-
-
-def test_the_keyword_of_before_still_chooses_models() -> None:
-    how = {"medium": MEDIUM, "tolerance": 0.5, "events": 1e5}
-    with pytest.warns(DeprecationWarning, match="only is called models now"):
-        found = recommend(**how, only=["better_dipole"])
-    assert [o.model for o in found.options] == [o.model for o in recommend(**how, models=["better_dipole"]).options]
+        assert "--model" in shown
 
 
 def test_a_model_of_objects_is_named_as_one_where_half_spaces_are_asked_for() -> None:

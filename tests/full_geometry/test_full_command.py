@@ -223,7 +223,6 @@ REFUSED = [
     ([*TRAIN_BALL, "--out", "ball.xml"], "folder must be a folder or new, got 'ball.xml'"),
     ([*TRAIN_BALL, "--define", "x"], "define must be NAME=VALUE, got 'x'"),
     ([*TRAIN_BALL, "--base-model", "neural_shap"], "base_model must be one of neural_shape,"),
-    ([*TRAIN_BALL, "--start", "neural_shape"], "--start must be given by its new name, --base-model"),
     (["errors", "--object", "ball"], "object must be left out without --scene, got 'ball'"),
     (["errors", "--scene", "ball.xml", "--events", "1e5"], "events must be left out with --scene, got 100000.0"),
     (["errors", "--scene", "ball.xml", "--model", "no_model"], "model must be one of"),
