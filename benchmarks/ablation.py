@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from benchmarks.budgets import Budget, Samples, Seconds, Within
 from halfspace_sss.arrays import library
 from halfspace_sss.backend import array_types
 from halfspace_sss.checks import check_count
@@ -26,7 +27,7 @@ from halfspace_sss.neural.features import N_FEATURES
 from halfspace_sss.neural.hypernetwork import in_range
 from halfspace_sss.neural.network import RELU, SILU, Network, layer_shapes
 from halfspace_sss.neural.paper_model import N_INPUTS, T_SMALLEST, NeuralPaper, query_inputs
-from halfspace_sss.neural.training.fit import Budget, Samples, Seconds, Within, fit
+from halfspace_sss.neural.training.fit import fit
 from halfspace_sss.neural.training.learners import PaperLearner, apply_networks, initial_numbers, relative_loss
 from halfspace_sss.neural.training.pool import Batch, MapPool
 from halfspace_sss.neural.training.train_material import (

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     import pandas
     from rich.table import Table
 
-    from halfspace_sss.neural.training.fit import Budget
+    from benchmarks.budgets import Budget
     from halfspace_sss.physics.medium import Medium
 
 
@@ -110,7 +110,7 @@ def _medium(name: str | None, channel: str | None, given: dict[str, float | None
 
 
 def _budgets(seconds: float | None, samples: int | None) -> Sequence[Budget]:
-    from halfspace_sss.neural.training.fit import Samples, Seconds
+    from benchmarks.budgets import Samples, Seconds
 
     given = [Seconds(seconds)] if seconds is not None else []
     return [*given, Samples(samples)] if samples is not None else given

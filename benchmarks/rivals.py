@@ -13,18 +13,20 @@ import mitsuba as mi
 import numpy as np
 
 from benchmarks.alpha_p import fit_alpha_p
+from benchmarks.lightings import LIGHTINGS, fit_patches, lighting
 from figures.rivals.flow import FlowProposals
-from figures.rivals.flow_training import LIGHTINGS, FlowRecipe, Lighting, fit_flow, fit_patches, lighting
-from figures.rivals.paper_network import POINTS, PaperRecipe, fit_paper, paper_errors
+from figures.rivals.flow_training import FlowRecipe, Lighting, fit_flow
+from figures.rivals.paper_network import PaperNetwork, PaperRecipe, estimate, fit_paper
 from full_geometry.learning import model_errors
 from full_geometry.learning.fitting import STANDARD
-from full_geometry.learning.model_errors import measure, reference, transport_of
+from full_geometry.learning.model_errors import ExitTruth, RadianceError, compare, measure, reference, transport_of
 from full_geometry.learning.training import train, train_by_cpu
 from full_geometry.models.object_model import HalfSpace
 from full_geometry.models.storing import KIND, Learnt
 from full_geometry.object.pairs import EntryProposals, Numbers
 from full_geometry.object.patches import AREA_SHARE, LearntProposals, PatchTable
 from halfspace_sss.backend import kernel_seconds
+from halfspace_sss.checks import check_choice, check_count
 from halfspace_sss.neural.store import load_weights
 from halfspace_sss.rendering.object.half_space import HalfSpaceProposals
 from halfspace_sss.rendering.object.objects import TranslucentObject, object_of
@@ -49,6 +51,7 @@ if TYPE_CHECKING:
 
 
 BACKBONE = "better_dipole"
+POINTS = ("walks", "uniform")  # of the paper's network
 
 
 def error_table(
@@ -92,6 +95,33 @@ def error_table(
         rows += [{"model": f"full_geometry_paper, points {points}", **row._asdict()} for row in errors]
     tell("models", 4)
     return pandas.DataFrame(rows)
+
+
+def paper_errors(
+    obj: TranslucentObject,
+    net: PaperNetwork,
+    truth: ExitTruth,
+    *,
+    points: str = "walks",
+    repeats: int = 16,
+    seed: int = 0,
+) -> list[RadianceError]:
+    """Errors per channel, under constant light and lobes.
+
+    Args:
+        obj: the object.
+        net: its network.
+        truth: exits and their radiance.
+        points: "walks" or "uniform".
+        repeats: of each exit.
+        seed: of the points.
+
+    Raises:
+        ValueError: an argument is out of range.
+    """
+    check_choice("points", points, POINTS)
+    check_count("repeats", repeats, 2)
+    return compare(estimate(obj, net, truth.exits, points, repeats, seed), truth.truth)
 
 
 # ----------------------------------------------------------------------------------------------------

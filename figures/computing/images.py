@@ -5,7 +5,6 @@ Everything is checked here before the evaluator of FLIP is called, because it en
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -14,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from halfspace_sss.backend import BackendError
-from halfspace_sss.checks import check_choice, check_count, check_finite, check_interval
+from halfspace_sss.checks import check_finite, check_interval
 
 LARGEST = 1e12  # radiance; squares of it, as tone mapping takes them, still fit float32
 
@@ -73,13 +72,6 @@ def check_image(name: str, image: np.ndarray, largest: float = LARGEST) -> np.nd
 
 PIXELS_PER_DEGREE = 67.0206  # FLIP's own: a 0.69 m wide display of 3840 pixels seen from 0.7 m
 SMALLEST_SIDE = 4  # pixels
-DARKEST = 2.0**-23  # smallest luminance from which FLIP takes an exposure
-# numerator and denominator of the tone curves over which HDR-FLIP looks, quadratic in x
-TONE_CURVES = {
-    "aces": (0.6**2 * 2.51, 0.6 * 0.03, 0.0, 0.6**2 * 2.43, 0.6 * 0.59, 0.14),
-    "hable": (0.231683, 0.013791, 0.0, 0.18, 0.3, 0.018),
-    "reinhard": (0.0, 1.0, 0.0, 0.0, 1.0, 1.0),
-}
 
 
 class Difference(NamedTuple):
@@ -108,37 +100,14 @@ def flip_ldr(
     """
     reference, test, inside = _checked(reference, test, mask, largest=1.0)
     check_interval("pixels_per_degree", pixels_per_degree, 1.0, 1e4)
-    return _evaluated(reference, test, "LDR", inside, {"ppd": float(pixels_per_degree)})
+    import flip_evaluator
 
-
-def flip_hdr(
-    reference: np.ndarray, test: np.ndarray, *, mask: np.ndarray | None = None,
-    pixels_per_degree: float = PIXELS_PER_DEGREE, exposures: tuple[float, float] | None = None,
-    n_exposures: int | None = None, tone_mapper: str = "aces",
-) -> Difference:  # fmt: skip
-    """FLIP between two linear images: in each pixel the largest over a range of exposures, 0 to 1.
-
-    Args:
-        reference, test: linear radiance (H, W, 3), finite and >= 0.
-        mask: (H, W), true where a pixel counts for the mean and for the range of exposures; the map covers all.
-        pixels_per_degree: of visual angle; the default is FLIP's.
-        exposures: first and last exposure, stops; by default `exposure_range(reference, mask)`.
-        n_exposures: how many, at least 2; by default one for each stop.
-        tone_mapper: "aces", "hable" or "reinhard".
-
-    Raises:
-        ValueError: an argument is out of range, or the reference is too dark to take exposures from.
-
-    Source: Andersson et al., Visualizing Errors in Rendered High Dynamic Range Images, Eurographics 2021.
-    """
-    reference, test, inside = _checked(reference, test, mask)
-    check_interval("pixels_per_degree", pixels_per_degree, 1.0, 1e4)
-    _check_tone_mapper(tone_mapper)
-    low, high = exposure_range(reference, inside, tone_mapper) if exposures is None else _checked_range(exposures)
-    count = max(2, math.ceil(high - low)) if n_exposures is None else n_exposures
-    check_count("n_exposures", count, 2)  # for 1 the evaluator answers 0 whatever the images
-    settings = {"startExposure": low, "stopExposure": high, "numExposures": int(count), "tonemapper": tone_mapper}
-    return _evaluated(reference, test, "HDR", inside, {"ppd": float(pixels_per_degree), **settings})
+    parameters = {"ppd": float(pixels_per_degree)}
+    error, _, used = flip_evaluator.evaluate(
+        reference, test, "LDR", applyMagma=False, computeMeanError=False, parameters=parameters
+    )
+    shown = np.clip(error[..., 0], 0.0, 1.0)
+    return Difference(shown, float(shown[inside].mean(dtype=np.float64)), {"ppd": used["ppd"]})
 
 
 def relative_mse(
@@ -161,45 +130,6 @@ def relative_mse(
     return Difference(error, float(error[inside].mean()), {"floor": float(floor)})
 
 
-def exposure_range(
-    reference: np.ndarray, mask: np.ndarray | None = None, tone_mapper: str = "aces"
-) -> tuple[float, float]:
-    """First and last exposure (stops) of HDR-FLIP: the brightest and the median luminance of the mask reach 0.85.
-
-    Without a mask it is the range that the evaluator itself takes. Where most of an image is black background,
-    that range ends at 24 stops and shows differences that nobody sees: give a mask then.
-
-    Raises:
-        ValueError: no luminance of the mask is above 2^-23, or an argument is out of range.
-    """
-    pixels = check_image("reference", reference)
-    _check_tone_mapper(tone_mapper)
-    bright = luminance(pixels)[_checked_mask(mask, pixels.shape[:2])]
-    if not bright.max() > DARKEST:
-        raise ValueError(f"reference must have a luminance above {DARKEST:.3g} or exposures must be given, got black")
-    middle = max(float(np.partition(bright, bright.size // 2)[bright.size // 2]), DARKEST)
-    white = math.log2(_white(tone_mapper))
-    return white - math.log2(bright.max()), white - math.log2(middle)
-
-
-def _white(tone_mapper: str, level: float = 0.85) -> float:
-    """Luminance that the tone curve maps to `level`."""
-    curve = TONE_CURVES[tone_mapper]
-    a, b, c = (top - level * bottom for top, bottom in zip(curve[:3], curve[3:]))
-    return -c / b if a == 0 else max(np.roots([a, b, c]).real)
-
-
-def _evaluated(a: np.ndarray, b: np.ndarray, kind: str, inside: np.ndarray, parameters: dict[str, Any]) -> Difference:
-    import flip_evaluator
-
-    error, _, used = flip_evaluator.evaluate(
-        a, b, kind, applyMagma=False, computeMeanError=False, parameters=parameters
-    )
-    shown = np.clip(error[..., 0], 0.0, 1.0)
-    settings = {name: used[name] for name in parameters}
-    return Difference(shown, float(shown[inside].mean(dtype=np.float64)), settings)
-
-
 def _checked(
     reference: np.ndarray, test: np.ndarray, mask: np.ndarray | None, **bounds: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -218,22 +148,6 @@ def _checked_mask(mask: np.ndarray | None, shape: tuple[int, ...]) -> np.ndarray
     if not inside.any():
         raise ValueError("mask must be true for at least one pixel, got none")
     return inside
-
-
-def _checked_range(exposures: tuple[float, float]) -> tuple[float, float]:
-    try:
-        low, high = exposures
-    except (TypeError, ValueError):
-        raise ValueError(f"exposures must be a first and a last one in stops, got {exposures!r}") from None
-    check_interval("exposures[0]", low, -40.0, 40.0)
-    check_interval("exposures[1]", high, -40.0, 40.0)
-    if low > high:
-        raise ValueError(f"exposures must ascend, got {exposures!r}")
-    return float(low), float(high)
-
-
-def _check_tone_mapper(tone_mapper: str) -> None:
-    check_choice("tone_mapper", tone_mapper, TONE_CURVES)
 
 
 GUIDE_SPP = 64

@@ -225,13 +225,6 @@ def direction_square(n: Any, towards: Any, w: Any) -> tuple[Any, Any]:
     return tuple(dr.clip(v, 0, 1 - 2.0**-20) for v in u)
 
 
-def from_square(n: Any, towards: Any, u: tuple[Any, Any]) -> Any:
-    """The direction of coordinates u."""
-    s, t = _tangents(n, towards)
-    v = mi.warp.square_to_cosine_hemisphere(mi.Point2f(*u))
-    return s * v.x + t * v.y + n * v.z
-
-
 # ----------------------------------------------------------------------------------------------------
 # Monotonic rational-quadratic splines of [-1, 1] onto itself, in Dr.Jit (Durkan, Bekasov, Murray, Papamakarios 2019).
 # K bins with widths, heights and K - 1 slopes between them; slopes are 1 at both ends. The numbers are bounded as zuko
@@ -358,12 +351,6 @@ class ConditionalFlow:
         for j in range(self.n):
             density = density * self._spline(raw, j).forward(inner[j])[1]
         return density
-
-    def uniforms(self, context: Sequence[Any], x: Sequence[Any]) -> list[Any]:
-        """The uniform numbers that `sample` makes x of."""
-        inner = [2 * v - 1 for v in x]
-        raw = self._splines(inner, context)
-        return [0.5 * (self._spline(raw, j).forward(inner[j])[0] + 1) for j in range(self.n)]
 
 
 # ---- Entries by learnt patches and, within the patch, by a flow ------------------------------------

@@ -25,15 +25,14 @@ from figures.rivals.flow import (
     context,
     direction_square,
 )
-from full_geometry.learning.fitting import PatchLogits, patch_likelihood
 from full_geometry.models.storing import Learnt
-from full_geometry.object.features import ObjectFrame, Side, first_event, n_side, side_features
+from full_geometry.object.features import ObjectFrame, Side, first_event, side_features
 from full_geometry.object.pairs import trace_exits
-from full_geometry.object.patches import Patches, PatchSampler
+from full_geometry.object.patches import Patches
 from halfspace_sss.checks import check_count
 from halfspace_sss.neural.training.fit import CpuSchedule, Objective, Source, fit
 from halfspace_sss.rendering.object.objects import TranslucentObject
-from halfspace_sss.rendering.object.points import EntrySample, cosine_above, opaque, place
+from halfspace_sss.rendering.object.points import EntrySample, place
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 # ---- Training of conditional flows by zuko: -E[T log p(x | context)] over walks --------------------
@@ -79,27 +78,18 @@ class FlowNetwork(nn.Module):
         return arrays
 
 
-# ----------------------------------------------------------------------------------------------------
-# Light that samplers of entries are fitted to and compared under: a sky, a direction, a small light near the object.
-# Each gives for an entry a direction of incidence and the light from there over its density. The object itself casts
-# shadows.
-
-LIGHTINGS = ("sky", "direction", "near light")
-TOWARDS = np.array([0.48, 0.8, 0.36])  # the direction, and where the near light stands
-GAP = 0.08  # of the near light from the surface, over the size of the object
+# ---- A light that samplers may be fitted to: for an entry a direction, and the light from there over its density
 
 
 @dataclass(frozen=True, eq=False)
 class Lighting:
-    """Light of one kind.
+    """Light about an object, in whose shadow it is 0.
 
     Args:
-        name: one of `LIGHTINGS`.
-        obj: the object, which casts shadows.
+        object: that casts shadows.
         sample_emitter: (entry, pair of uniforms) -> direction to the light, value over density, distance.
     """
 
-    name: str
     object: TranslucentObject
     sample_emitter: Callable[[Any, Any], tuple[Any, Any, Any]]
 
@@ -110,40 +100,6 @@ class Lighting:
         ray.maxt = distance
         lit = active & (dr.dot(w, entry.n) > 0)
         return w, dr.select(lit & ~self.object.geometry.scene.ray_test(ray, False, lit), value, 0)
-
-
-def lighting(name: str, obj: TranslucentObject) -> Lighting:
-    """A kind of light about an object: radiance 1 from everywhere, irradiance 1 from a direction, or intensity 1.
-
-    Raises:
-        ValueError: there is no such kind.
-    """
-    if name not in LIGHTINGS:
-        raise ValueError(f"lighting must be one of {', '.join(LIGHTINGS)}, got {name!r}")
-    towards = mi.Vector3f(*TOWARDS.tolist())
-    place_of_light = mi.Point3f(*map(opaque, _above(obj)))
-
-    def sky(entry: Any, u: Any) -> tuple:
-        w, density = cosine_above(entry.n_out, entry.n, u)
-        return w, 1 / dr.maximum(density, 1e-6), mi.Float(dr.inf)
-
-    def direction(entry: Any, u: Any) -> tuple:
-        return mi.Vector3f(towards), mi.Float(1), mi.Float(dr.inf)
-
-    def near(entry: Any, u: Any) -> tuple:
-        d = place_of_light - entry.p
-        r = dr.norm(d)
-        return mi.Vector3f(d / r), 1 / (r * r), r
-
-    return Lighting(name, obj, {"sky": sky, "direction": direction, "near light": near}[name])
-
-
-def _above(obj: TranslucentObject) -> np.ndarray:
-    """A point near the part of the surface that lies farthest towards the light."""
-    from halfspace_sss.tracing.walk import generator, pass_seed
-
-    p = np.array(obj.random_points(generator(mi, 4096, pass_seed(23))).p)
-    return p[:, np.argmax(TOWARDS @ p)] + GAP * float(obj.geometry.size) * TOWARDS
 
 
 # ---- Training data of flows: exits of walks as patches and coordinates in them, with their throughput
@@ -287,7 +243,7 @@ def walk_batches(data: Callable[[int], Walks], recipe: FlowRecipe, seed: int) ->
     return lambda _: next(source)
 
 
-def _weights(batch: FlowBatch) -> torch.Tensor:
+def likelihood_weights(batch: FlowBatch) -> torch.Tensor:
     """T of rows over the mean of all, mean over the channels that carry light."""
     walks, rows = batch
     mean = walks.total.mean(axis=0)
@@ -297,30 +253,6 @@ def _weights(batch: FlowBatch) -> torch.Tensor:
     return torch.from_numpy(np.minimum(scaled.mean(axis=1), 50.0).astype(np.float32))
 
 
-def fit_patches(
-    learnt: Learnt, recipe: FlowRecipe | None = None, *, light: Lighting | None = None, seed: int = 0
-) -> PatchSampler:
-    """Weights of the patches of a trained object by walks alone, or by walks times the light where they left.
-
-    Args:
-        learnt: the object.
-        recipe: sizes and rates.
-        light: that falls on the object; None fits to S itself.
-        seed: of everything.
-    """
-    recipe, (model, sampler) = recipe or FlowRecipe(), learnt
-    chart = Chart(model.object, sampler.frame, sampler.patches)
-    net = PatchLogits(n_side(len(model.object.media)), sampler.patches.areas, recipe.patch_hidden, seed)
-
-    def loss(batch: FlowBatch) -> torch.Tensor:
-        walks, rows = batch
-        x, patch = torch.from_numpy(walks.exit[rows].T.copy()), torch.from_numpy(walks.patch[rows])
-        return patch_likelihood(net(x), _weights(batch), patch)
-
-    fit(Objective(net, loss), _source(learnt, chart, recipe, light, seed), recipe.schedule, seed)
-    return PatchSampler(sampler.frame, sampler.patches, net.arrays())
-
-
 def fit_flow(
     learnt: Learnt, recipe: FlowRecipe | None = None, *, light: Lighting | None = None, seed: int = 0
 ) -> FlowSampler:
@@ -328,7 +260,9 @@ def fit_flow(
 
     Args:
         learnt: the object, with its patches; their weights stay as they are.
-        recipe, light, seed: as for `fit_patches`.
+        recipe: sizes and rates.
+        light: that falls on the object; None fits to S itself.
+        seed: of everything.
     """
     recipe, (model, sampler) = recipe or FlowRecipe(), learnt
     chart = Chart(model.object, sampler.frame, sampler.patches)
@@ -337,13 +271,13 @@ def fit_flow(
     def loss(batch: FlowBatch) -> torch.Tensor:
         walks, rows = batch
         told, u = torch.from_numpy(walks.told[rows]), torch.from_numpy(walks.u[rows, :2])
-        return -(_weights(batch) * net.log_density(told, u)).mean()
+        return -(likelihood_weights(batch) * net.log_density(told, u)).mean()
 
-    fit(Objective(net, loss), _source(learnt, chart, recipe, light, seed), recipe.schedule, seed)
+    fit(Objective(net, loss), walks_of(learnt, chart, recipe, light, seed), recipe.schedule, seed)
     return FlowSampler(sampler, chart, ConditionalFlow(2, net.arrays()))
 
 
-def _source(learnt: Learnt, chart: Chart, recipe: FlowRecipe, light: Lighting | None, seed: int) -> Source:
+def walks_of(learnt: Learnt, chart: Chart, recipe: FlowRecipe, light: Lighting | None, seed: int) -> Source:
     obj, sampler = learnt.model.object, learnt.sampler
 
     def data(k: int) -> Walks:

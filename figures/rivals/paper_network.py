@@ -14,11 +14,11 @@ import numpy as np
 import torch
 from torch import nn
 
-from full_geometry.learning.model_errors import LOBES, POWER, ExitRadiance, ExitTruth, RadianceError, compare
+from full_geometry.learning.model_errors import LOBES, POWER, ExitRadiance
 from full_geometry.models.storing import frame_of
 from full_geometry.object.features import ObjectFrame
 from full_geometry.object.pairs import trace_exits
-from halfspace_sss.checks import check_choice, check_count
+from halfspace_sss.checks import check_count
 from halfspace_sss.neural.training.fit import ADAM, CpuSchedule, Descent, Objective, Source, fit
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.rendering.object.objects import TranslucentObject
@@ -229,39 +229,8 @@ def _lit_batches(obj: TranslucentObject, recipe: PaperRecipe, seed: int) -> Sour
     return lambda _: next(source)
 
 
-# ---- How wrong the paper's network is, by the error measure of all models of an object -------------
-# Its N points come from walks, as in training, or are uniform over the area with directions by the cosine: what a
-# renderer has that knows nothing. Each exit is asked several times with new points, and the noise of their mean is
-# taken out.
-
-POINTS = ("walks", "uniform")
-
-
-def paper_errors(
-    obj: TranslucentObject,
-    net: PaperNetwork,
-    truth: ExitTruth,
-    *,
-    points: str = "walks",
-    repeats: int = 16,
-    seed: int = 0,
-) -> list[RadianceError]:
-    """Errors per channel, under constant light and lobes.
-
-    Args:
-        obj: the object.
-        net: its network.
-        truth: exits and their radiance.
-        points: "walks" or "uniform".
-        repeats: of each exit.
-        seed: of the points.
-
-    Raises:
-        ValueError: an argument is out of range.
-    """
-    check_choice("points", points, POINTS)
-    check_count("repeats", repeats, 2)
-    return compare(estimate(obj, net, truth.exits, points, repeats, seed), truth.truth)
+# ---- Its radiance: points from walks, as in training, or uniform over the area with directions by the cosine, as a
+# renderer has them that knows nothing. Each exit is asked several times with new points.
 
 
 def estimate(

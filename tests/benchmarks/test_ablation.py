@@ -28,6 +28,7 @@ from benchmarks.ablation import (
     model_of,
     summary,
 )
+from benchmarks.budgets import Samples, Seconds, Within
 from halfspace_sss import Medium, materials
 from halfspace_sss.arrays import library
 from halfspace_sss.comparison.model_errors import TracedMaps, model_error, reference_maps
@@ -36,7 +37,7 @@ from halfspace_sss.maps import noisy_maps
 from halfspace_sss.maps.noisy_maps import CellGrid, draw_directions, make_pool
 from halfspace_sss.neural.paper_model import paper_inputs
 from halfspace_sss.neural.training import train_material as training
-from halfspace_sss.neural.training.fit import Fit, Samples, Seconds, Within, fit
+from halfspace_sss.neural.training.fit import Fit, fit
 from halfspace_sss.neural.training.pool import MapPool
 from halfspace_sss.neural.training.train_material import MaterialRecipe
 

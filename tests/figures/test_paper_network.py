@@ -18,8 +18,8 @@ from waxen import WAX, wax_bunny  # noqa: E402
 
 from figures.rivals import paper_network as paper  # noqa: E402
 from figures.rivals.paper_flow import incidence, irradiance, lit_incidence, mesh_arrays, on_surface, rmsd  # noqa: E402
-from figures.rivals.paper_network import measured_lights, paper_errors, random_lights  # noqa: E402
-from full_geometry.learning.model_errors import reference  # noqa: E402
+from figures.rivals.paper_network import measured_lights, random_lights  # noqa: E402
+from full_geometry.learning.model_errors import compare, reference  # noqa: E402
 from full_geometry.models.storing import frame_of  # noqa: E402
 from halfspace_sss.rendering.object.objects import TranslucentObject, object_of  # noqa: E402
 from halfspace_sss.rendering.object.points import SurfacePoint  # noqa: E402
@@ -43,9 +43,11 @@ def test_the_papers_network_learns_from_walks(obj: TranslucentObject) -> None:
     truth = reference(obj, 64, 512)
     recipe = paper.PaperRecipe(n=8, steps=100, batch=128, exits=512, reuse=8)
     net, steps = paper.fit_paper(obj, recipe)
-    fresh = paper_errors(obj, paper.PaperNetwork(8), truth, repeats=4)
-    assert steps > 10
-    assert np.mean([e.error for e in paper_errors(obj, net, truth, repeats=4)]) < np.mean([e.error for e in fresh])
+    learnt, fresh = (
+        [e.error for e in compare(paper.estimate(obj, n, truth.exits, "walks", 4), truth.truth)]
+        for n in (net, paper.PaperNetwork(8))
+    )
+    assert steps > 10 and np.mean(learnt) < np.mean(fresh)
 
 
 def test_the_papers_training_stops_where_the_error_has_stayed_small(
