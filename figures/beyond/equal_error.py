@@ -372,6 +372,7 @@ def _steps(scene: Any, n: int) -> dict[str, Callable[[], Any]]:
     import mitsuba as mi
 
     from halfspace_sss.rendering.object.points import cosine_above, place
+    from halfspace_sss.rendering.object.rounding import ray_from
     from halfspace_sss.rendering.paths.path_loop import exit_at
 
     (obj,) = scene.integrator().prepare(scene)
@@ -383,7 +384,7 @@ def _steps(scene: Any, n: int) -> dict[str, Callable[[], Any]]:
     entry = obj.proposals.sample(out, face, where, sampler, mi.Bool(True))
     direction, _ = cosine_above(entry.n_out, entry.n, sampler.next_2d())  # the same for all models
     dr.eval(tuple(out), face, tuple(entry), direction, sampler)  # named tuples are passed over
-    ray = place(entry.p, entry.n).spawn_ray(direction)
+    ray = ray_from(place(entry.p, entry.n), direction, obj.geometry.clearance)
     dr.eval(ray)
     result = entry.weight > 0
     dr.eval(result)

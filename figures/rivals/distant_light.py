@@ -33,6 +33,7 @@ from halfspace_sss.neural.training.fit import ADAM, CpuSchedule, Descent, Object
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.rendering.object.objects import TranslucentObject
 from halfspace_sss.rendering.object.points import SurfacePoint, place, surface_point, turned
+from halfspace_sss.rendering.object.rounding import ray_from
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 WIDTH, DEPTH = 256, 3
@@ -101,7 +102,7 @@ def distant_walks(obj: TranslucentObject, exits: SurfacePoint, seed: tuple[int, 
     for k in range(PASSES):
         ends = trace_exits(obj, at, (*seed, k), fewest=0)
         T = dr.select(gone, T, T * ends.T)
-        ray = place(ends.at.p, ends.at.n).spawn_ray(ends.at.w)
+        ray = ray_from(place(ends.at.p, ends.at.n), ends.at.w, obj.geometry.clearance)
         si = obj.geometry.scene.ray_intersect(ray, mi.RayFlags.All, False, ~gone & ~lost)
         meets = si.is_valid() & (dr.dot(si.n * sign, ray.d) < 0)
         w = dr.select(gone, w, ends.at.w)

@@ -33,6 +33,7 @@ from halfspace_sss.checks import check_count
 from halfspace_sss.neural.training.fit import CpuSchedule, Objective, Source, fit
 from halfspace_sss.rendering.object.objects import TranslucentObject
 from halfspace_sss.rendering.object.points import EntrySample, place
+from halfspace_sss.rendering.object.rounding import ray_from
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 # ---- Training of conditional flows by zuko: -E[T log p(x | context)] over walks --------------------
@@ -96,7 +97,7 @@ class Lighting:
     def sample(self, entry: Any, u: Any, active: Any) -> tuple[Any, Any]:
         """w_i at an entry, and the light from there over its density: 0 in the shadow."""
         w, value, distance = self.sample_emitter(entry, u)
-        ray = place(entry.p, entry.n).spawn_ray(w)
+        ray = ray_from(place(entry.p, entry.n), w, self.object.geometry.clearance)
         ray.maxt = distance
         lit = active & (dr.dot(w, entry.n) > 0)
         return w, dr.select(lit & ~self.object.geometry.scene.ray_test(ray, False, lit), value, 0)

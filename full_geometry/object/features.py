@@ -145,10 +145,10 @@ def first_event(obj: TranslucentObject, at: SurfacePoint, active: Any = True) ->
     d, _, valid = refract_in(at, eta)
     flags = mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame
 
-    def step(k: Any, o: Any, d: Any, skip: Any, v: Any, way: Any, sums: tuple, active: Any) -> tuple:
+    def step(k: Any, o: Any, d: Any, off: Any, v: Any, way: Any, sums: tuple, active: Any) -> tuple:
         P, moments, length = sums
-        si = obj.geometry.ray_intersect(mi.Ray3f(o + d * skip, d), flags, False, active)
-        l = dr.select(si.is_valid(), si.t + skip, 1e4 / dr.min(sigma_t))  # noqa: E741
+        si = obj.geometry.ray_intersect(mi.Ray3f(mi.Point3f(o + off), d), flags, False, active)
+        l = dr.select(si.is_valid(), dr.maximum(si.t + dr.dot(off, d), 0), 1e4 / dr.min(sigma_t))  # noqa: E741
         l, met = (l, mi.Bool(False)) if contents is None else contents.reach(o, d, l, active)  # noqa: E741
         through, inner = flight(obj, o, d, l, sigma_t)
         through, inner = dr.select(met, 0, through), dr.select(met, inner + through * l, inner)
@@ -161,9 +161,8 @@ def first_event(obj: TranslucentObject, at: SurfacePoint, active: Any = True) ->
         v = v * through * mi.fresnel(dr.abs(c), dr.select(c > 0, 1 / eta, eta))[0]
         onward = -mirrored(n * (2 * c) - d, n_face)
         goes_on = ~met & si.is_valid() & (c > 0) & (dr.max(v) > NEGLIGIBLE) & (k < REFLECTIONS)
-        skip = media.clear(mi.UInt32(0), si.n, onward)
-        onward = mi.Vector3f(onward)
-        return k + 1, mi.Point3f(si.p), onward, skip, v, way + l, (P + part, moments, length), active & goes_on
+        off, onward = media.clear(mi.UInt32(0), si.n, onward), mi.Vector3f(onward)
+        return k + 1, mi.Point3f(si.p), onward, off, v, way + l, (P + part, moments, length), active & goes_on
 
     state = (
         mi.UInt32(0), mi.Point3f(at.p), d, media.clear(mi.UInt32(0), at.n, d), mi.Spectrum(1), mi.Float(0),

@@ -14,6 +14,8 @@ import mitsuba as mi
 import numpy as np
 
 from halfspace_sss.rendering.gathered.transfer import R_2
+from halfspace_sss.rendering.object.instances import Sight, bounds_of
+from halfspace_sss.rendering.object.rounding import ray_from
 from halfspace_sss.rendering.object.wrapped import surface_of
 
 LAUNCH, LAUNCHES = 2**16, 16  # rays of a look at the scene, and the most looks for an object that is hardly seen
@@ -100,7 +102,7 @@ def _look(scene: Any, camera: Any, shapes: list[Any], seed: tuple[int, int]) -> 
 
 def _shows_lamp(scene: Any, shapes: list[Any], si: Any, through: bool) -> Any:
     """Whether smooth boundaries show an emitter other than the environment, as mirrors or `through` clear objects."""
-    active, result = si.is_valid(), mi.Bool(False)
+    active, result, sight = si.is_valid(), mi.Bool(False), Sight([], {}, bounds_of(scene.shapes()))
     for _ in range(CHAIN):
         eta, translucent = mi.Float(1), mi.Bool(False)
         for shape in shapes:
@@ -114,7 +116,8 @@ def _shows_lamp(scene: Any, shapes: list[Any], si: Any, through: bool) -> Any:
         reflectance, cosine_t, _, eta_ti = mi.fresnel(cosine, eta)
         passes = ((cosine < 0) | through) & (reflectance < 1)
         onwards = dr.select(passes, mi.refract(si.wi, cosine_t, eta_ti), mi.reflect(si.wi))
-        si = scene.ray_intersect(si.spawn_ray(si.to_world(onwards)), mi.RayFlags.All, False, active)
+        onward = ray_from(si, si.to_world(onwards), sight.rounding(si))
+        si = scene.ray_intersect(onward, mi.RayFlags.All, False, active)
         active &= si.is_valid()
         result |= active & (si.emitter(scene) != None)  # noqa: E711
     return result

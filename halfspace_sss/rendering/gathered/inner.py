@@ -23,6 +23,7 @@ from scipy.sparse import csc_array, csr_array
 
 from halfspace_sss.rendering.gathered.points import lattice, uniform_entries
 from halfspace_sss.rendering.object.points import cosine_above, opaque, place, refract_in, surface_point
+from halfspace_sss.rendering.object.rounding import ray_from
 
 if TYPE_CHECKING:
     from halfspace_sss.rendering.object.objects import TranslucentObject
@@ -135,7 +136,8 @@ def _places(obj: TranslucentObject, count: int) -> tuple[mi.Point3f, mi.Normal3f
     w, _ = cosine_above(entry.n_out, entry.n, sampler.next_2d())
     d, _, valid = refract_in(surface_point(entry.p, entry.n, entry.n_out, w), obj.eta)
     d = dr.select(valid, d, -entry.n)
-    wall = obj.geometry.scene.ray_intersect_preliminary(place(entry.p, entry.n).spawn_ray(d), False, True)
+    ray = ray_from(place(entry.p, entry.n), d, obj.geometry.clearance)
+    wall = obj.geometry.scene.ray_intersect_preliminary(ray, False, True)
     length = dr.select(wall.is_valid(), wall.t, opaque(obj.geometry.rounding))
     sigma = mi.Float(0)
     for c, medium in enumerate(obj.media):

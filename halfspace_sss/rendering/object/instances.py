@@ -14,7 +14,7 @@ from __future__ import annotations
 import functools
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import drjit as dr
@@ -22,6 +22,7 @@ import mitsuba as mi
 import numpy as np
 
 from halfspace_sss.rendering.object.points import TransportAround
+from halfspace_sss.rendering.object.rounding import EPSILON, OF_WAY, bound_of, bounds, place_bound
 from halfspace_sss.rendering.object.shape import (
     Geometry,
     by_pointer,
@@ -67,10 +68,7 @@ class Group:
     @functools.cached_property
     def rounding(self) -> np.ndarray:
         """Of each instance a bound of how far from surfaces rounding puts points, scene units."""
-        here = np.max([corners(shape.bbox(), np.eye(4)[None]) for shape in self.shapes], axis=0)
-        there = np.max([np.abs(corners(s.bbox(), self.to_world)).max(axis=(1, 2)) for s in self.shapes], axis=0)
-        own = np.abs(here).max() * np.linalg.norm(self.to_world[:, :3, :3], ord=2, axis=(1, 2))
-        return np.maximum(there, own) * mi.math.RayEpsilon
+        return np.max([_rounding(shape, self.to_world) for shape in self.shapes], axis=0)
 
 
 def shown_groups(scene: mi.Scene) -> list[Group]:
@@ -151,10 +149,7 @@ class Placed:
             if self.groups[kind] is None:
                 results.append(geometry.rounding)
                 continue
-            to_world = self.to_world(kind)
-            there = np.abs(corners(geometry.scene.bbox(), to_world)).max(axis=(1, 2)) * mi.math.RayEpsilon
-            here = geometry.rounding * np.linalg.norm(to_world[:, :3, :3], ord=2, axis=(1, 2))
-            results += np.maximum(there, here).tolist()
+            results += _rounding(geometry.shape, self.to_world(kind)).tolist()
         return results
 
     @functools.cached_property
@@ -176,6 +171,12 @@ class Placed:
             return first
         rank = looked_up(self.tables["rank"], si.instance, 0, active & (first >= 0))
         return first + rank
+
+
+def _rounding(shape: mi.Shape, to_world: np.ndarray) -> np.ndarray:
+    """Under each of the transformations a bound of how far from a shape rounding puts points."""
+    there = bounds(shape, *ends_of(corners(shape.bbox(), to_world)))
+    return np.maximum(there, bound_of(shape) * np.linalg.norm(to_world[:, :3, :3], ord=2, axis=(1, 2)))
 
 
 def corners(box: mi.ScalarBoundingBox3f, to_world: np.ndarray) -> np.ndarray:
@@ -261,17 +262,20 @@ class Sight:
         tables: by what Dr.Jit's registry calls a shape its place in the list, `kind`, and an instance its `row`, 0 of
             what is none; by row the columns of M and of its inverse, `rounding`, and the `first` kind of the group; by
             kind the `pointer`.
+        bounds: by what Dr.Jit's registry calls a shape of the scene, how far from it rounding puts points.
     """
 
     shapes: list[mi.Shape]
     tables: dict[str, Any]
+    bounds: mi.Float | None = None
 
     @classmethod
     def of(cls, scene: mi.Scene, shown: Sequence[Group]) -> Sight:
         """Of a scene that shows these groups."""
+        known = bounds_of(scene.shapes(), shown)
         if not shown:
-            return cls([], {})
-        return cls.of_shapes(shapes_of(scene, shown), shown)
+            return cls([], {}, known)
+        return replace(cls.of_shapes(shapes_of(scene, shown), shown), bounds=known)
 
     @classmethod
     def of_shapes(cls, shapes: list[mi.Shape], shown: Sequence[Group] = ()) -> Sight:
@@ -288,7 +292,19 @@ class Sight:
             tables[key] = [mi.Float(matrices[:, :3, k].ravel().tolist()) for k in range(4)]
         tables["rounding"] = mi.Float([0.0, *(v for group in shown for v in group.rounding.tolist())])
         dr.make_opaque(tables)
-        return cls(shapes, tables)
+        return cls(shapes, tables, bounds_of([*shapes, *(i for group in shown for i in group.instances)], shown))
+
+    def rounding(self, si: mi.SurfaceInteraction3f) -> mi.Float:
+        """A bound of how far from the surface that a ray has met rounding has put `si.p`."""
+        more = place_bound(si.p) + OF_WAY * EPSILON * dr.select(si.is_valid(), si.t, 0)
+        if self.bounds is None:
+            return more
+        pointer = si.shape
+        if self.shapes:
+            pointer = dr.select(si.instance != None, si.instance, pointer)  # noqa: E711
+        number = dr.reinterpret_array(mi.UInt32, pointer)
+        known = number < dr.width(self.bounds)
+        return dr.gather(mi.Float, self.bounds, number, known) + more
 
     def intersect(
         self, scene: mi.Scene, ray: mi.Ray3f, flags: int, coherent: bool = False, active: mi.Bool | bool = True
@@ -329,6 +345,21 @@ class Sight:
 
     def _columns(self, key: str, row: mi.Int32, active: mi.Bool) -> list[mi.Vector3f]:
         return [dr.gather(mi.Vector3f, column, row, active) for column in self.tables[key]]
+
+
+def bounds_of(shapes: Sequence[mi.Shape], shown: Sequence[Group] = ()) -> mi.Float | None:
+    """Table from what Dr.Jit's registry calls a shape to how far from it rounding puts points; None without shapes."""
+    if not len(shapes):
+        return None
+    known = {id(shape): bound_of(shape) for shape in shapes}
+    for group in shown:
+        known |= {id(each): e for each, e in zip(group.instances, group.rounding)}
+    numbers = pointer_numbers(mi.ShapePtr(shape) for shape in shapes)
+    table = np.zeros(max(numbers) + 1)
+    table[numbers] = [known[id(shape)] for shape in shapes]
+    result = mi.Float(table.tolist())
+    dr.make_opaque(result)
+    return result
 
 
 def _map(columns: list[mi.Vector3f], v: mi.Vector3f) -> mi.Vector3f:

@@ -25,6 +25,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from halfspace_sss.rendering.object.rounding import ray_from
 from halfspace_sss.rendering.object.shape import Geometry
 
 
@@ -124,7 +125,7 @@ def channel_mean(value: Any) -> Any:
 
 
 def place(p: mi.Point3f, n: mi.Normal3f, medium: Any = ()) -> Any:
-    """A point with its geometric normal, from which rays start clear of the surface.
+    """A point with its geometric normal.
 
     Under spectral variants with the wavelengths of a `medium`: emitters are asked for those.
     """
@@ -523,7 +524,7 @@ class PositionSampler:
             side = self._side(out, si.prim_index, active & same)
             at = (si.p, si.n, turned(si.sh_frame.n, si.n) * side, si.prim_index)
             kept = self._offer(_Kept(*kept), at, out, axes, active & same)
-            onward = si.spawn_ray(ray.d)
+            onward = ray_from(si, ray.d, self.geometry.clearance)
             onward.maxt = ray.maxt - si.t
             return dr.select(active, onward, ray), left - 1, tuple(kept), active
 

@@ -13,6 +13,8 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from halfspace_sss.rendering.object.rounding import bound_of, ray_from
+
 MOST_COPIES = 1e-3  # share of the area in faces that exist twice, by which light may then be wrong
 CREASES = 0.01  # of the corners whose vertex normal may be on the other side of the face, as at sharp edges
 
@@ -211,13 +213,8 @@ class Geometry:
 
     @property
     def rounding(self) -> float:
-        """A bound of how far from its surface rounding puts points, scene units.
-
-        The largest coordinate counts, not that of the point: those of a large face or ball near the origin are no
-        better.
-        """
-        box = self.scene.bbox()
-        return float(np.max(np.abs([box.min, box.max]))) * mi.math.RayEpsilon if box.valid() else 0.0
+        """A bound of how far from its surface rounding puts points, scene units."""
+        return bound_of(self.shape)
 
     @property
     def clearance(self) -> mi.Float:
@@ -405,9 +402,9 @@ def crossings(scene: mi.Scene, ray: mi.Ray3f, votes: _Votes | None = None) -> tu
             votes.add(si, ray.d, (count & 1) == 0, active)
         side = dr.select(active & (count == 0), first, side)
         count = dr.select(active, count + 1, count)
-        return dr.select(active, si.spawn_ray(ray.d), ray), side, count, active & (count < MOST_HITS)
+        return dr.select(active, ray_from(si, ray.d, e), ray), side, count, active & (count < MOST_HITS)
 
-    n = dr.width(ray)
+    n, e = dr.width(ray), dr.opaque(mi.Float, max(map(bound_of, scene.shapes()), default=0.0))
     state = (ray, dr.zeros(mi.Float, n), dr.zeros(mi.UInt32, n), dr.full(mi.Bool, True, n))
     return dr.while_loop(state, lambda ray, side, count, active: active, step, label="crossings")[1:3]
 

@@ -37,6 +37,7 @@ from halfspace_sss.rendering.gathered.transfer import (
     transfer,
 )
 from halfspace_sss.rendering.object.points import cosine_above, opaque, place
+from halfspace_sss.rendering.object.rounding import ray_from, ray_to
 from halfspace_sss.rendering.object.settings import FEWEST_PHOTONS
 from halfspace_sss.rendering.object.shape import same_objects, state_of
 from halfspace_sss.rendering.paths.inner_light import COUNT, inner_light
@@ -277,7 +278,7 @@ def _leaving(
 ) -> Gathered:  # fmt: skip
     """B of object k, by light in parts whose differences tell the noise, and light inside."""
     T, events = of
-    found, rays = _incident(scene, between, T, settings, 2 * k + seed, parts)
+    found, rays = _incident(scene, between, T, obj.geometry.clearance, settings, 2 * k + seed, parts)
     lights, others = zip(*found)
     if not all(np.isfinite(light.mean).all() for light in lights):
         raise ValueError(f"light at object {obj.geometry.name} must be finite, got NaN or infinity")
@@ -306,6 +307,7 @@ def _incident(
     scene: mi.Scene,
     objects: list[TranslucentObject],
     T: Transfer | WalkedPoints,
+    e: mi.Float,
     settings: Settings,
     seed: int,
     parts: int,
@@ -327,7 +329,7 @@ def _incident(
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(100 + seed, dr.width(lane))
     point = j % _numbers(count)[0]
-    at = GatheringPoint(*(dr.gather(type(v), v, point) for v in (T.points.p, T.points.n, T.points.n_out)))
+    at = GatheringPoint(*(dr.gather(type(v), v, point) for v in (T.points.p, T.points.n, T.points.n_out)), e)
     u, v = (_stratified(sampler, j, s, each) for _ in range(2))
     aimed, w_e = by_emitters(scene, T.albedo, at, u)
     met, more, a, w_c, on = by_cosine(scene, objects, T.albedo, settings, at, v, traced, sampler)
@@ -393,11 +395,12 @@ def _spread(points: SurfacePoints, values: np.ndarray) -> np.ndarray:
 
 
 class GatheringPoint(NamedTuple):
-    """Position, outward geometric and shading normal."""
+    """Position, outward geometric and shading normal, and how far rounding puts the position from the surface."""
 
     p: mi.Point3f
     n: mi.Normal3f
     n_out: mi.Normal3f
+    e: mi.Float
 
 
 def _numbers(*values: int) -> list[mi.UInt32]:
@@ -425,7 +428,7 @@ def by_emitters(
     ds, light = scene.sample_emitter_direction(here, u, False)
     a, pdf = _weight(albedo, at, ds.d)
     above = (ds.pdf > 0) & (pdf > 0)
-    light = dr.select(scene.ray_test(here.spawn_ray_to(ds.p), above), 0, light)
+    light = dr.select(scene.ray_test(ray_to(here, ds.p, at.e), False, above), 0, light)
     light -= dr.select(ds.emitter.is_environment(), c / dr.maximum(ds.pdf, 1e-30), 0)
     share = dr.select(ds.delta, 1, mis_weight(ds.pdf, pdf))
     return dr.select(above, a * pdf * light * share, 0), ds.d
@@ -453,7 +456,7 @@ def met_by_cosine(
     w, _ = cosine_above(at.n_out, at.n, u)
     a, pdf = _weight(albedo, at, w)
     here = place(at.p, at.n)
-    ray = here.spawn_ray(w)
+    ray = ray_from(here, w, at.e)
     si = sight.intersect(scene, ray, mi.RayFlags.All, True)
     emitter = si.emitter(scene)
     shines = emitter != None  # noqa: E711

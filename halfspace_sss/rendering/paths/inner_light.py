@@ -17,6 +17,7 @@ import numpy as np
 from halfspace_sss.rendering.gathered.inner import Events, InnerLight, bands
 from halfspace_sss.rendering.gathered.transfer import R_2
 from halfspace_sss.rendering.object.points import opaque, place, wrapped
+from halfspace_sss.rendering.object.rounding import ray_from
 from halfspace_sss.rendering.paths.lighting import Primal, RenderContext
 from halfspace_sss.rendering.paths.low_orders import light_at_events
 
@@ -57,7 +58,7 @@ def inner_light(
     u, u_emitter = (mi.Point2f(*(wrapped(x + opaque(t)) for x, t in zip(steps, part))) for part in np.split(turn, 2))
     d, inverse_pdf = _directions(sky, at, float(obj.media[0].eta), u)
     found = light_at_events(context, obj, at, (d, inverse_pdf), u_emitter, sampler)
-    met = found.chance + found.weight * _beyond(context, found.left, others)
+    met = found.chance + found.weight * _beyond(context, obj, found.left, others)
     largest = bands(obj)
 
     # ---- Σ over ways of Y_lm times light
@@ -113,9 +114,11 @@ def _raised(w: mi.Vector3f, z: mi.Float) -> mi.Vector3f:
     return mi.Vector3f(w.x * scale, w.y * scale, z)
 
 
-def _beyond(context: RenderContext, left: Any, others: tuple[SurfacePoints, mi.Float]) -> mi.Spectrum:
+def _beyond(
+    context: RenderContext, obj: TranslucentObject, left: Any, others: tuple[SurfacePoints, mi.Float]
+) -> mi.Spectrum:
     """Radiance that walks meet outside, but for that of emitters which connections may have found."""
-    ray = place(left.o, left.n).spawn_ray(left.d)
+    ray = ray_from(place(left.o, left.n), left.d, obj.geometry.clearance)
     si = context.ray_intersect(ray, True, left.left)
     emitter = si.emitter(context.scene, left.left)
     shines = left.left & (emitter != None)  # noqa: E711

@@ -18,6 +18,7 @@ import numpy as np
 from halfspace_sss.rendering.light.small_emitters import WIDE, SmallEmitters, is_delta
 from halfspace_sss.rendering.object.instances import Pose, Sight
 from halfspace_sss.rendering.object.objects import TranslucentObject
+from halfspace_sss.rendering.object.rounding import ray_to
 from halfspace_sss.rendering.object.settings import AUTOMATIC, Settings
 
 
@@ -286,11 +287,18 @@ class RenderContext:
 
 
 def sample_emitter(
-    context: RenderContext, ref: mi.Interaction3f, u: mi.Point2f, test_visibility: bool, active: mi.Bool
+    context: RenderContext, ref: mi.Interaction3f, u: mi.Point2f, seen: bool, active: mi.Bool
 ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
-    """A direction of next-event estimation, and light over its density; derivatives are those of the light."""
+    """A direction of next-event estimation, and light over its density; derivatives are those of the light.
+
+    With `seen` of what `ref`, a surface that a ray has met, sees: the density and the light are 0 where it does not.
+    """
     with dr.suspend_grad():
-        ds, light = context.scene.sample_emitter_direction(ref, u, test_visibility, active)
+        ds, light = context.scene.sample_emitter_direction(ref, u, False, active)
+        if seen:
+            shadow = ray_to(ref, ds.p, context.sight.rounding(ref))
+            hidden = context.scene.ray_test(shadow, False, active & (ds.pdf > 0))
+            ds.pdf, light = dr.select(hidden, 0, ds.pdf), dr.select(hidden, 0, light)
         inverse = dr.select(ds.pdf > 0, dr.rcp(ds.pdf), 0)
     if not context.mode.tracks:
         return ds, light

@@ -105,7 +105,7 @@ def _brought(context: RenderContext, obj: TranslucentObject, count: int) -> tupl
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(SEED, count)
     entry = uniform_entries(obj.geometry, sampler.next_1d(), sampler.next_2d())
-    at = GatheringPoint(entry.p, entry.n, entry.n_out)
+    at = GatheringPoint(entry.p, entry.n, entry.n_out, obj.geometry.clearance)
     albedo = Albedo(np.tile([1.0, 0.0, 0.0], (len(obj.media), 1)), float(obj.media[0].eta))
     c = context.sky_means(obj)[1] if context.uses_sky(obj) else mi.Spectrum(0)
     aimed, _ = by_emitters(context.scene, albedo, at, sampler.next_2d(), c)

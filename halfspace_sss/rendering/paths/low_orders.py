@@ -31,6 +31,7 @@ from halfspace_sss.physics.medium import eval_hg, sample_hg
 from halfspace_sss.rendering.light.small_emitters import WIDE
 from halfspace_sss.rendering.object.objects import TranslucentObject
 from halfspace_sss.rendering.object.points import SurfacePoint, lifted, mirrored, opaque, opposed, place, turned
+from halfspace_sss.rendering.object.rounding import clear, ray_from, ray_to
 from halfspace_sss.rendering.object.textured import SurfaceMedium
 from halfspace_sss.rendering.paths.lighting import RenderContext, delta_light, mis_weight, sample_emitter
 
@@ -82,7 +83,7 @@ class _Walk:
     o: mi.Point3f
     d: mi.Vector3f
     n: mi.Normal3f  # geometric, outwards
-    skip: mi.Float  # length after which a ray is clear of the boundary
+    off: mi.Vector3f  # from o to where a ray is clear of the boundary
     length: mi.Float  # Λ
     inverse_pdf: mi.Float  # 1 / p
     order: mi.UInt32  # k
@@ -244,8 +245,8 @@ def light_at_events(
     media, zero = _media(obj, ()), mi.Float(0)
     scale = 1 / dr.maximum(dr.max(_column(media, 0)), 1e-30)
     start = _Walk(
-        mi.Point3f(p), mi.Vector3f(d), mi.Normal3f(n), zero, zero, 4 * dr.pi * scale, mi.UInt32(1), zero, mi.Point3f(p),
-        mi.Vector3f(d), mi.Normal3f(n), zero, mi.Float(1), mi.UInt32(0), mi.Bool(False), mi.Bool(True),
+        mi.Point3f(p), mi.Vector3f(d), mi.Normal3f(n), mi.Vector3f(0), zero, 4 * dr.pi * scale, mi.UInt32(1), zero,
+        mi.Point3f(p), mi.Vector3f(d), mi.Normal3f(n), zero, mi.Float(1), mi.UInt32(0), mi.Bool(False), mi.Bool(True),
     )  # fmt: skip
 
     def step(k: mi.UInt32, sampler: mi.Sampler, walk: _Walk) -> tuple:
@@ -291,9 +292,9 @@ def _walk(obj: TranslucentObject, refracted: RefractedRay, sampler: mi.Sampler, 
 def _begun(obj: TranslucentObject, refracted: RefractedRay, active: mi.Bool) -> _Walk:
     """A walk at the exit."""
     zero, p = mi.Float(0), mi.Point3f(refracted.out.p)
-    skip = _clear(obj, refracted.out.n, refracted.d)
+    off = clear(refracted.out.n, refracted.d, obj.geometry.clearance)
     return _Walk(
-        p, mi.Vector3f(refracted.d), mi.Normal3f(refracted.out.n), mi.Float(skip), zero, mi.Float(1), mi.UInt32(0),
+        p, mi.Vector3f(refracted.d), mi.Normal3f(refracted.out.n), off, zero, mi.Float(1), mi.UInt32(0),
         zero, mi.Point3f(p), mi.Vector3f(refracted.d), mi.Normal3f(refracted.out.n), zero, zero, mi.UInt32(0),
         mi.Bool(False), mi.Bool(active), refracted.out.medium,
     )  # fmt: skip
@@ -302,8 +303,8 @@ def _begun(obj: TranslucentObject, refracted: RefractedRay, active: mi.Bool) -> 
 def _to_boundary(obj: TranslucentObject, walk: _Walk) -> tuple[tuple, mi.Float]:
     """What a walk meets at the boundary, as of `meet`, and how far away."""
     flags = mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame
-    si, n_out, n = meet(obj, walk.o + walk.d * walk.skip, walk.d, flags, walk.alive)
-    return (si, n_out, n), si.t + walk.skip
+    si, n_out, n = meet(obj, walk.o + walk.off, walk.d, flags, walk.alive)
+    return (si, n_out, n), dr.maximum(si.t + dr.dot(walk.off, walk.d), 0)
 
 
 def _media(obj: TranslucentObject, medium: SurfaceMedium | tuple[()]) -> Media:
@@ -373,7 +374,7 @@ def _scatter(
     p, length = mi.Point3f(walk.o + walk.d * s), walk.length + s
     pdf = _direction_pdf(of, W, dr.dot(walk.d, d), dr.dot(walk.n, d))
     return replace(
-        walk, o=p, d=mi.Vector3f(d), skip=mi.Float(0), length=length,
+        walk, o=p, d=mi.Vector3f(d), off=mi.Vector3f(0), length=length,
         inverse_pdf=inverse_pdf / dr.maximum(pdf, 1e-30), order=mi.UInt32(1), cosine=mi.Float(dr.dot(walk.d, d)),
         event=p, event_d=mi.Vector3f(walk.d), event_n=mi.Normal3f(walk.n), event_length=length,
         event_inverse_pdf=inverse_pdf, reflections=mi.UInt32(0),
@@ -415,7 +416,7 @@ def _meet_boundary(of: tuple[TranslucentObject, Media], walk: _Walk, met: tuple,
     d, leaves = mi.Vector3f(dr.select(reflects, back, onward)), ~reflects
     alive = walk.alive & si.is_valid() & (dr.dot(n, walk.d) > 0) & (sampler.next_1d() < survival)
     return replace(
-        walk, o=mi.Point3f(si.p), d=d, n=mi.Normal3f(n), skip=mi.Float(_clear(obj, n, d)), left=alive & leaves,
+        walk, o=mi.Point3f(si.p), d=d, n=mi.Normal3f(n), off=clear(n, d, obj.geometry.clearance), left=alive & leaves,
         reflections=walk.reflections + dr.select(leaves, 0, mi.UInt32(1)), alive=alive & ~leaves,
         inverse_pdf=walk.inverse_pdf / dr.maximum(survival, 1e-30),
     )  # fmt: skip
@@ -426,17 +427,12 @@ def meet(
 ) -> tuple[mi.SurfaceInteraction3f, mi.Normal3f, mi.Normal3f]:
     """Interaction with the boundary, shading normal and geometric normal, both outwards (along d for a sheet)."""
     flags = flags | mi.RayFlags.All if obj.wrapping.bend is not None else flags
-    si = obj.geometry.ray_intersect(mi.Ray3f(p, d), flags, False, active)
+    si = obj.geometry.ray_intersect(mi.Ray3f(mi.Point3f(p), d), flags, False, active)
     si = obj.wrapping.bent(si, active & si.is_valid())
     sign = obj.geometry.side(si.prim_index, active & si.is_valid())
     if not obj.geometry.closed:
         sign = dr.select(dr.dot(si.n, d) > 0, 1.0, -1.0)
     return si, turned(si.sh_frame.n, si.n) * sign, si.n * sign
-
-
-def _clear(obj: TranslucentObject, n: mi.Normal3f, d: mi.Vector3f) -> mi.Float:
-    """Length along d after which a ray from the surface is clear of it; an origin moved instead lies deeper."""
-    return obj.geometry.clearance / dr.maximum(dr.abs(dr.dot(n, d)), 0.1)
 
 
 def _contribution(media: Media, length: mi.Float, order: mi.UInt32, cosine: mi.Float | None) -> mi.Spectrum:
@@ -530,7 +526,8 @@ def _way(context: RenderContext, obj: TranslucentObject, walk: _Walk, target: _T
     valid &= dr.dot(ds.n, met.w) <= 0
     spread = dr.select(ds.delta | ~alone, 1, facing) * reach * reach * met.density
     weight_sky = mis_weight(ds.pdf, _phase_pdf(obj, walk, met) * met.T * spread)
-    valid &= ~context.scene.ray_test(place(met.p, met.n).spawn_ray_to(target.p), False, valid)
+    shadow = ray_to(place(met.p, met.n), target.p, obj.geometry.clearance)
+    valid &= ~context.scene.ray_test(shadow, False, valid)
     passed = dr.select(valid, met.T * spread * dr.select(alone, 1, weight_sky), 0)
     return _Way(mi.Vector3f(met.d), mi.Float(met.length), passed)
 
@@ -557,7 +554,7 @@ def _met_by_chance(
 ) -> mi.Spectrum:
     """Emission that a walk meets from its event, which no connection with that point of an emitter would find."""
     with dr.suspend_grad():
-        ray = place(walk.o, walk.n, walk.medium).spawn_ray(walk.d)
+        ray = ray_from(place(walk.o, walk.n, walk.medium), walk.d, obj.geometry.clearance)
         si = context.ray_intersect(ray, False, active)
         emitter = si.emitter(context.scene, active)
         active = active & (emitter != None) & context.sampled_by_nee(emitter, walk.d)  # noqa: E711
@@ -572,7 +569,7 @@ def _spread_lights(
     context: RenderContext, obj: TranslucentObject, walk: _Walk, sampler: mi.Sampler, active: mi.Bool
 ) -> mi.Spectrum:
     """Light of a delta light whose cone holds a walk's way out, which no connection with it would find."""
-    ray = place(walk.o, walk.n, walk.medium).spawn_ray(walk.d)
+    ray = ray_from(place(walk.o, walk.n, walk.medium), walk.d, obj.geometry.clearance)
     which, L = delta_light(context, sampler, ray, active)
     with dr.suspend_grad():
         connects = active & (dr.max(L) > 0) & (walk.order == 1)
@@ -798,20 +795,20 @@ def _miss(
         reflected  d - 2 (d.n) n,              refracted  eta d + (c_t - eta c) n.
     """
     # ---- to the boundary, if reflected twice
-    zero, T, length, skip, valid = mi.Vector3f(0), mi.Float(1), mi.Float(0), mi.Float(0), mi.Bool(active)
+    zero, T, length, off, valid = mi.Vector3f(0), mi.Float(1), mi.Float(0), mi.Vector3f(0), mi.Bool(active)
     steps, o = [(zero, mi.Vector3f(e)) for e in mi.coordinate_system(d)], p
     if reflects is not False:
-        t, (si, n_out, n), arrived = _arrive(obj, o, d, skip, steps, valid & reflects)
+        t, (si, n_out, n), arrived = _arrive(obj, o, d, off, steps, valid & reflects)
         c = dr.dot(d, n_out)
         dc = [dr.dot(dd, n_out) + dr.dot(d, dn) for _, dd, dn in arrived]
         onward = [(dx, dd - 2 * (n_out * k + dn * c)) for (dx, dd, dn), k in zip(arrived, dc)]
         F, back = mi.fresnel(dr.maximum(c, 0), 1 / obj.eta)[0], d - n_out * (2 * c)
         valid &= ~reflects | (si.is_valid() & (c > 0) & (dr.dot(back, n) < 0))
         T, length = dr.select(reflects, F, 1), dr.select(reflects, t, 0)
-        skip = dr.select(reflects, _clear(obj, n, back), 0)
+        off = dr.select(reflects, clear(n, back, obj.geometry.clearance), 0)
         o, d = dr.select(reflects, si.p, o), dr.select(reflects, back, d)
         steps = [tuple(dr.select(reflects, x, y) for x, y in zip(*pair)) for pair in zip(onward, steps)]
-    t, (si, n_out, n), steps = _arrive(obj, o, d, skip, steps, valid)
+    t, (si, n_out, n), steps = _arrive(obj, o, d, off, steps, valid)
 
     # ---- refracted ray, and its differentials
     w, F, passes = _refract(obj, d, n_out)
@@ -831,11 +828,11 @@ def _miss(
 
 
 def _arrive(
-    obj: TranslucentObject, o: mi.Point3f, d: mi.Vector3f, skip: mi.Float, steps: _Steps, active: mi.Bool
+    obj: TranslucentObject, o: mi.Point3f, d: mi.Vector3f, off: mi.Vector3f, steps: _Steps, active: mi.Bool
 ) -> tuple[mi.Float, tuple, list[tuple]]:
     """Length of a ray inside, where it meets the boundary as of `meet`, and differentials dx, dd, dn there."""
-    si, n_out, n = met = meet(obj, o + d * skip, d, mi.RayFlags.All | mi.RayFlags.dNSdUV, active)
-    t, found = si.t + skip, []
+    si, n_out, n = met = meet(obj, o + off, d, mi.RayFlags.All | mi.RayFlags.dNSdUV, active)
+    t, found = dr.maximum(si.t + dr.dot(off, d), 0), []
     flip = dr.select(dr.dot(si.sh_frame.n, n_out) > 0, 1.0, -1.0) * obj.geometry.curvature_sign
     for dx, dd in steps:
         dx = dx + dd * t

@@ -18,6 +18,7 @@ import mitsuba as mi
 
 from halfspace_sss.rendering.object.objects import TranslucentObject
 from halfspace_sss.rendering.object.points import EntrySample, SurfacePoint, lifted, opaque, place, turned
+from halfspace_sss.rendering.object.rounding import ray_from, ray_to
 from halfspace_sss.rendering.object.settings import Settings
 from halfspace_sss.rendering.paths.lighting import (
     PathTally,
@@ -46,6 +47,7 @@ class PreviousVertex:
 
     p: mi.Point3f
     n: mi.Normal3f  # geometric
+    e: mi.Float  # how far rounding puts p from the surface, at most
     pdf: mi.Float  # density of the sampled direction, 1/sr; 1 for the only one, 0 if no emission counts
     emitter_share: mi.Float  # share of directions that next-event estimation drew, 1 for a second sample, 0 for none
     sky_only: mi.Bool  # emitter connections have counted all emission but that of the sky beside its suns
@@ -193,7 +195,7 @@ def _loop(
 
 def _ray_from(origin: PreviousVertex, d: mi.Vector3f, before: mi.Ray3f) -> mi.Ray3f:
     """A ray along d from a vertex, clear of its surface, with the wavelengths of the one before."""
-    ray = place(origin.p, origin.n).spawn_ray(d)
+    ray = ray_from(place(origin.p, origin.n), d, origin.e)
     ray.wavelengths = before.wavelengths
     return ray
 
@@ -206,7 +208,8 @@ def _camera_vertex() -> PreviousVertex:
 def _path_end() -> NextVertex:
     """No next vertex."""
     zero, no = mi.Float(0), mi.Bool(False)
-    previous = PreviousVertex(mi.Point3f(0), mi.Normal3f(0), zero, mi.Float(0), no, mi.Float(-1), no, mi.Bool(no))
+    previous = PreviousVertex(mi.Point3f(0), mi.Normal3f(0), zero, mi.Float(zero), mi.Float(0), no, mi.Float(-1), no,
+                              mi.Bool(no))  # fmt: skip
     return NextVertex(previous, mi.Vector3f(0), mi.Spectrum(0), mi.Bool(False))
 
 
@@ -386,7 +389,7 @@ def choose_event(obj: TranslucentObject, si: mi.SurfaceInteraction3f, active: mi
 
 def _transmittance(obj: TranslucentObject, out: SurfacePoint, d: mi.Vector3f, active: mi.Bool) -> mi.Float:
     """To the other side, mean over channels; light of the path does not count, as choices hold in derivatives."""
-    ray = place(out.p, out.n).spawn_ray(d)
+    ray = ray_from(place(out.p, out.n), d, obj.geometry.clearance)
     wall = obj.geometry.ray_intersect(ray, mi.RayFlags.Minimal, False, active)
     T, each = mi.Float(0), out.medium.sigma_t if out.medium else [opaque(m.sigma_t) for m in obj.media]
     for sigma_t in each:
@@ -548,8 +551,8 @@ def bsdf_event(
     bs = dr.detach(bs)
     delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
     previous = PreviousVertex(
-        mi.Point3f(si.p), mi.Normal3f(si.n), dr.select(delta, 1, bs.pdf), dr.select(delta, mi.Float(0), 1),
-        mi.Bool(False), mi.Float(-1), delta, mi.Bool(False),
+        mi.Point3f(si.p), mi.Normal3f(si.n), context.sight.rounding(si), dr.select(delta, 1, bs.pdf),
+        dr.select(delta, mi.Float(0), 1), mi.Bool(False), mi.Float(-1), delta, mi.Bool(False),
     )  # fmt: skip
     return NextVertex(previous, si.to_world(bs.wo), weight, ~delta), direct
 
@@ -587,8 +590,8 @@ def low_order_event(
     """
     sample = sample_low_orders(context, obj, refracted, sampler, scattered, active)
     no = mi.Bool(False)
-    previous = PreviousVertex(sample.p, sample.n, sample.pdf, sample.emitter_share, sample.connected, mi.Float(-1), no,
-                              mi.Bool(True))  # fmt: skip
+    previous = PreviousVertex(sample.p, sample.n, mi.Float(obj.geometry.clearance), sample.pdf, sample.emitter_share,
+                              sample.connected, mi.Float(-1), no, mi.Bool(True))  # fmt: skip
     direct = sample.direct
     if context.uses_sky(obj):
         direct = direct - sample.weight * context.sky_means(obj)[0]
@@ -615,12 +618,12 @@ def bssrdf_event(
     if context.uses_sky(obj):
         direct = -entry.weight * entry.sky_weight * context.sky_means(obj)[1]
     if context.lights.some_delta:
-        shadow = place(entry.p, entry.n).spawn_ray_to(entry.emitter_point)
+        shadow = ray_to(place(entry.p, entry.n), entry.emitter_point, obj.geometry.clearance)
         lit = entry.delta & ~context.scene.ray_test(shadow, False, entry.delta)
         direct = direct + dr.select(lit, entry.weight * entry.light, 0)
     anywhere, no = entry.emitter_distance < 0, mi.Bool(False)
     previous = PreviousVertex(
-        entry.p, entry.n, dr.select(anywhere, entry.pdf, 1),
+        entry.p, entry.n, mi.Float(obj.geometry.clearance), dr.select(anywhere, entry.pdf, 1),
         dr.select(anywhere, mi.Float(context.lights.entry_share), 0), no, entry.emitter_distance, mi.Bool(False),
         mi.Bool(False),
     )  # fmt: skip

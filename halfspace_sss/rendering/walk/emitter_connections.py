@@ -25,6 +25,7 @@ import numpy as np
 
 from halfspace_sss.rendering.light.small_emitters import SmallEmitters, spread
 from halfspace_sss.rendering.object.points import channel_mean, opaque, opposed, sided
+from halfspace_sss.rendering.object.rounding import place_bound, ray_from
 from halfspace_sss.rendering.object.shape import pointer_numbers
 from halfspace_sss.rendering.walk.media import Coefficients, WalkMedia, WalkMedium, interaction_of, ray_of
 from halfspace_sss.rendering.walk.random_walk import (
@@ -168,7 +169,7 @@ class SubpathConnections:
 
         # ---- the walk from there
         walk = start_walk(mi.Point3f(si.p), d, rng, event.medium)
-        walk = replace(walk, skip=self.media.clear(k, si.n, d), alive=enters, object=k, weight=weight,
+        walk = replace(walk, off=self.media.clear(k, si.n, d), alive=enters, object=k, weight=weight,
                        channel=draw(len(m.sigma_t), rng))  # fmt: skip
         score = Score.zeros(dr.width(event.p)) if self.scored else ()
         state = (LightSubpath(walk, mi.Bool(enters), mi.Bool(enters), L, score, slopes), event)
@@ -186,7 +187,7 @@ class SubpathConnections:
         flight = free_path(m, walk.channel, rng.next_float32())
         ray = walk.ray(dr.maximum(t, flight))
         hit = media.scene.ray_intersect_preliminary(ray, coherent=False)
-        reach = hit.t + walk.skip
+        reach = walk.reach(hit.t)
         light, extra = self._connect(walk, event, t, dr.select(connectable & (t < reach), over, 0))
         L, slopes = s.L + light, s.slopes and s.slopes + (s.score + extra) * light
 
@@ -197,17 +198,16 @@ class SubpathConnections:
         ended = fly(m, walk.weight, walk.density, walk.channel, flight, reach, u)
         u = mi.Point2f(rng.next_float32(), rng.next_float32())
         turned, weight, density = turn(m, ended.weight, ended.density, walk.channel, walk.d, u, media.same_g)
-        scattered = replace(walk, alive=walk.alive & s.lit, o=p, d=turned, skip=mi.Float(0), weight=weight,
-                            density=density)  # fmt: skip
+        scattered = replace(walk, alive=walk.alive & s.lit, o=p, d=turned, weight=weight,
+                            density=density, off=media.behind(event.object, turned))  # fmt: skip
         walk = replace(walk, weight=ended.weight, density=ended.density)
         if media.varies:
             on = walk.alive & (~ended.null | media.box.contains(p))
-            skip = dr.select(ended.null, 0, walk.skip)
-            walk = replace(walk, alive=on, o=dr.select(ended.null, p, walk.o), skip=skip)
-        collided = ended.scatters | ended.null
-        walk, *_ = dr.if_stmt((walk, ray, hit), ~collided, self._reflect, lambda *state: state)
+            off = dr.select(ended.null, media.behind(event.object, walk.d), walk.off)
+            walk = replace(walk, alive=on, o=dr.select(ended.null, p, walk.o), off=off)
+        state = (walk, ~ended.scatters & s.lit, ray, hit)
+        walk, lit, *_ = dr.if_stmt(state, ~(ended.scatters | ended.null), self._reflect, lambda *state: state)
         scattered.rng = walk.rng
-        lit = ~ended.scatters & (s.lit | ~collided)
         score = s.score and s.score + Score(
             dr.select(ended.scatters, mi.Float(1), 0), dr.minimum(flight, reach),
             dr.select(ended.scatters, phase_score(m.g, dr.dot(s.walk.d, turned)), 0))  # fmt: skip
@@ -219,14 +219,17 @@ class SubpathConnections:
         `over` is one over the density of t.
         """
         media, q = self.media, mi.Point3f(walk.o + walk.d * t)
-        to_p = mi.Ray3f(q, dr.normalize(event.p - q))
-        to_p.maxt = dr.norm(event.p - q)
+        e, between = media.row("rounding", event.object), event.p - q
+        to_p = mi.Ray3f(q, dr.normalize(between))
+        to_p.maxt = dr.norm(between)
         at_q = media.coefficients(event.object, q, event.medium)
         cosines = dr.dot(event.along, -to_p.d), dr.dot(to_p.d, walk.d)
         phases = eval_phase(event.m, cosines[0]) * eval_phase(event.m, cosines[1])
         value = dr.select(over > 0, walk.weight * at_q.sigma_s * phases * over, 0)
         bright = dr.max(value) > 0
-        bright &= ~media.scene.ray_test(to_p, False, bright)
+        clear = mi.Ray3f(mi.Point3f(q + to_p.d * e), to_p.d)  # of what rounding has put beyond the boundary
+        clear.maxt = to_p.maxt - 2 * e
+        bright &= ~media.scene.ray_test(clear, False, bright)
         to_q, medium = mi.Ray3f(walk.o, walk.d), event.medium
         T = media.transmittance(event.object, to_q, dr.select(bright, t, 0), walk.rng, medium)
         T *= media.transmittance(event.object, to_p, dr.select(bright, to_p.maxt, 0), walk.rng, medium)
@@ -236,20 +239,19 @@ class SubpathConnections:
         turns = phase_score(event.m.g, cosines[0]) + phase_score(event.m.g, cosines[1])
         return light, Score(mi.Float(1), dr.select(bright, t + to_p.maxt, 0), dr.select(bright, turns, 0))
 
-    def _reflect(self, walk: Walk, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f) -> tuple:
-        """Reflection at the boundary from inside with the probability of its reflectance."""
+    def _reflect(self, walk: Walk, lit: mi.Bool, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f) -> tuple:
+        """Reflection at the boundary from inside with the probability of its reflectance, after which a ray is lit."""
         k, d = mi.Int32(walk.object), walk.d
         si = self.media.sight.interaction(hit, ray, mi.RayFlags.All)
         si = self.media.seen(si, k, d)
         F, _, _, _ = mi.fresnel(mi.Frame3f.cos_theta(si.wi), self.media.row("eta", k))
         new, _ = sided(si, mi.reflect(si.wi))
-        met = self.media.met(si, k)
-        foreign = met != k  # an object that overlaps: the ray goes on behind it
-        new = dr.select(foreign, d, new)
-        inside = (dr.dot(si.n, d) > 0) & (dr.dot(si.n, new) < 0) & (walk.rng.next_float32() < F)
-        o, skip = mi.Point3f(si.p), self.media.clear(met, si.n, new)
-        walk = replace(walk, o=o, d=new, skip=skip, alive=walk.alive & (foreign | inside))
-        return walk, ray, hit
+        passes = (self.media.met(si, k) != k) | (dr.dot(si.n, d) < 0)  # as of `Walker`
+        new = dr.select(passes, d, new)
+        inside = (dr.dot(si.n, new) < 0) & (walk.rng.next_float32() < F)
+        o, off = self.media.depart(si, new, mi.Bool(True))
+        walk = replace(walk, o=o, d=new, off=off, alive=walk.alive & (passes | inside))
+        return walk, lit | ~passes, ray, hit
 
 
 def _draw_across(event: Event, sample: EmitterSample, rng: mi.PCG32) -> tuple[mi.Interaction3f, mi.Float]:
@@ -363,7 +365,7 @@ class EmitterDirections:
         F, cos_t, eta_it, eta_ti = mi.fresnel(mi.Frame3f.cos_theta(si.wi), self.media.row("eta", k))
         w = opposed(si.to_world(mi.refract(si.wi, cos_t, eta_ti)), si.n)
         valid &= (dr.dot(d, si.n) > 0) & (dr.dot(w, si.n) > 0) & (F < 1)
-        way = si.spawn_ray(w)
+        way = ray_from(si, w, self.media.sight.rounding(si))
         outside = self.media.sight.intersect(self.scene, way, mi.RayFlags.All, active=valid)
         phase = eval_phase(m, dr.dot(event.along, d))
         # radiance shrinks by eta² on its way out, as the weight of the walk has when it came in
@@ -465,7 +467,7 @@ class InnerLights:
         emitter, here = self._drawn(k, rng, active)
         ds, E = emitter.sample_direction(at, mi.Point2f(0.5), here)
         lit = here & (ds.pdf > 0) & (dr.max(E) > 0)
-        ray = at.spawn_ray(ds.d)
+        ray = ray_from(at, ds.d, place_bound(at.p))
         sigma_t = medium.sigma_t if medium else self.media.spectrum("sigma_t", k)
         r = NEAREST / dr.max(sigma_t)
         near = dr.select(ds.dist < r, 3 * dr.square(ds.dist / r) * (1 + 0.25 * r * sigma_t), 1)

@@ -17,6 +17,7 @@ import mitsuba as mi
 
 from halfspace_sss.rendering.light.small_emitters import NARROW, WIDE, SmallEmitters
 from halfspace_sss.rendering.object.points import lifted, opaque, sided
+from halfspace_sss.rendering.object.rounding import ray_to
 from halfspace_sss.rendering.walk.emitter_connections import (
     Departure,
     EmitterDirections,
@@ -266,7 +267,7 @@ class LightVisitor:
         """Light of an inner light whose cone holds the ray, from a vertex that it was not sampled at."""
         if self.inner_lights is None:
             return mi.Spectrum(0)
-        ray = ray_of(walk.o + walk.d * walk.skip, walk.d, walk.medium)
+        ray = ray_of(walk.o + walk.off, walk.d, walk.medium)
         active = active & walk.alive & (walk.object >= 0)
         L = self.inner_lights.spread(walk.object, ray, walk.rng, active, walk.medium)
         return dr.select(active, walk.weight * L, 0)
@@ -283,8 +284,9 @@ class LightVisitor:
         rng = walk.rng
         u = mi.Point2f(rng.next_float32(), rng.next_float32())
         active = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-        ds, light = self.scene.sample_emitter_direction(si, u, True, active)
+        ds, light = self.scene.sample_emitter_direction(si, u, False, active)
         active &= (ds.pdf > 0) & (~mi.Bool(outwards) | (dr.dot(ds.d, si.n) > 0))
+        active &= ~self.scene.ray_test(ray_to(si, ds.p, self.media.sight.rounding(si)), False, active)
         wo = si.to_local(ds.d)
         below = outwards & (wo.z < 0)  # comes from inside by the opposite direction, and is not mirrored
         active &= ~below | (mi.Frame3f.cos_theta(si.wi) < 0)
@@ -476,11 +478,11 @@ class PathTracer:
         if media.inner is not None:  # from glass inside an object
             returns = encloses & (dr.dot(d, si.n) > 0)
             k, enters = dr.select(returns, around, k), enters | returns
-        o, skip = media.depart(near, si, d, enters) if media.objects else (si.spawn_ray(d).o, walk.skip)
+        o, off = media.depart(si, d, enters)
         if media.carried:  # the medium of the exit, for the whole walk
             enters_object = alive & enters
             walk = replace(walk, medium=dr.select(enters_object, media.fetch(near, si, enters_object), walk.medium))
-        walk = replace(walk, o=o, d=d, skip=skip, alive=alive, order=dr.select(enters, 0, walk.order),
+        walk = replace(walk, o=o, d=d, off=off, alive=alive, order=dr.select(enters, 0, walk.order),
                        object=dr.select(alive & enters, k, OUTSIDE), weight=weight, scale=scale,
                        channel=channel)  # fmt: skip
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta) | turned

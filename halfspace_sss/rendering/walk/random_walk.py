@@ -147,7 +147,7 @@ class Walk:
     object: mi.Int32  # the object around it, by number, or OUTSIDE
     o: mi.Point3f  # where its flight begins
     d: mi.Vector3f  # direction of the flight
-    skip: mi.Float  # length of the flight after which a ray looks for the boundary, see `WalkMedia.clear`
+    off: mi.Vector3f  # from o to where its ray begins that looks for the boundary, see `WalkMedia.depart`
     channel: mi.UInt32  # by which distances and angles are drawn
     weight: mi.Spectrum  # w_c = f_c / mean_k p_k
     density: mi.Spectrum  # q_c = p_c / mean_k p_k
@@ -157,10 +157,14 @@ class Walk:
     medium: WalkMedium | tuple[()] = ()  # that it took where it entered, see `WalkMedia.fetch`
 
     def ray(self, t: mi.Float) -> mi.Ray3f:
-        """Looks for the boundary on a flight of length t; its distances begin after `skip`."""
-        ray = ray_of(self.o + self.d * self.skip, self.d, self.medium)
-        ray.maxt = dr.maximum(t - self.skip, 0)
+        """Looks for the boundary on a flight of length t; see `reach` for its distances."""
+        ray = ray_of(self.o + self.off, self.d, self.medium)
+        ray.maxt = dr.maximum(t - dr.dot(self.off, self.d), 0)
         return ray
+
+    def reach(self, t: mi.Float) -> mi.Float:
+        """Length of the flight to what the ray meets at the distance t."""
+        return dr.maximum(t + dr.dot(self.off, self.d), 0)
 
 
 @dataclass
@@ -233,13 +237,14 @@ class Walker:
         hit = (media.inner or media).scene.ray_intersect_preliminary(ray, coherent=False)
         if media.varies:
             m, u = media.coefficients(walk.object, p, walk.medium), rng.next_float32()
-        flight = fly(m, walk.weight, walk.density, walk.channel, t, hit.t + walk.skip, u)
+        flight = fly(m, walk.weight, walk.density, walk.channel, t, walk.reach(hit.t), u)
         walk = replace(walk, weight=flight.weight, density=flight.density)
         event = Event(p, ray.d, walk.object, m, walk.medium)
         meets = ~(flight.scatters | flight.null)
         if media.varies:
-            o, skip = dr.select(flight.null, p, walk.o), dr.select(flight.null, 0, walk.skip)
-            walk = replace(walk, o=o, skip=skip, alive=walk.alive & (~flight.null | media.box.contains(o)))
+            o = dr.select(flight.null, p, walk.o)
+            off = dr.select(flight.null, media.behind(walk.object, walk.d), walk.off)
+            walk = replace(walk, o=o, off=off, alive=walk.alive & (~flight.null | media.box.contains(o)))
             walk.object = dr.select(walk.alive, walk.object, OUTSIDE)
         walk, record = dr.if_stmt((walk, record, event), flight.scatters, self._scatter, _pass, label="scatter")
         meet = self._meet if media.inner is None else self._meet_inside
@@ -256,8 +261,8 @@ class Walker:
             scale = dr.select(order < self.roulette_from, dr.largest(mi.Float), scale)
         survives, weight = roulette(weight, scale, rng.next_float32())
         alive = survives & (order <= media.row("most", walk.object)) & media.box.contains(event.p)
-        walk = replace(walk, o=event.p, d=d, skip=mi.Float(0), weight=weight, density=density, order=order,
-                       alive=alive, object=dr.select(alive, walk.object, OUTSIDE))  # fmt: skip
+        walk = replace(walk, o=event.p, d=d, off=media.behind(walk.object, d), weight=weight, density=density,
+                       order=order, alive=alive, object=dr.select(alive, walk.object, OUTSIDE))  # fmt: skip
         return walk, record
 
     def _meet(
@@ -267,23 +272,24 @@ class Walker:
         media, k = self.media, walk.object
         si = media.sight.interaction(hit, ray, media.needed)
         met = media.met(si, k)
-        foreign = met != k  # of an object that overlaps: the flight goes on behind it
         si = media.seen(si, k, ray.d)
-        leaked = ~foreign & (dr.dot(si.n, ray.d) < 0)  # rounding has put the walk outside
+        # the flight goes on behind an object that overlaps, and behind the own boundary if rounding has put it outside
+        passes = (met != k) | (dr.dot(si.n, ray.d) < 0)
         counts = media.counts(k, walk.order)
-        walk, record = self.visitor.boundary(walk, record, si, ~foreign & counts)
+        walk, record = self.visitor.boundary(walk, record, si, ~passes & counts)
         bs, value = sample_bsdf(media.boundary(k), si, walk.rng)
         d, turned = sided(si, bs.wo)
-        out = ~foreign & (dr.dot(d, si.n) > 0)
-        alive = ~leaked & (foreign | (bs.pdf > 0)) & (~out | counts)
-        d = dr.select(foreign, ray.d, d)
-        o, skip = media.depart(met, si, d, ~out)
-        walk = replace(walk, o=o, d=d, skip=skip, alive=alive,
+        out = ~passes & (dr.dot(d, si.n) > 0)
+        alive = (passes | (bs.pdf > 0)) & (~out | counts)
+        d = dr.select(passes, ray.d, d)
+        o, off = media.depart(si, d, ~out)
+        walk = replace(walk, o=o, d=d, off=off, alive=alive,
                        object=dr.select(alive & ~out, k, OUTSIDE),
-                       weight=dr.select(foreign, walk.weight, walk.weight * value),
-                       scale=walk.scale * dr.select(foreign, 1, dr.square(bs.eta)))  # fmt: skip
+                       weight=dr.select(passes, walk.weight, walk.weight * value),
+                       scale=walk.scale * dr.select(passes, 1, dr.square(bs.eta)))  # fmt: skip
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta) | turned
-        return self.visitor.crossing(walk, record, Crossing(si, mi.Vector3f(ray.d), out, bs.pdf, delta))
+        crossing = Crossing(si, mi.Vector3f(ray.d), out, bs.pdf, delta)
+        return dr.if_stmt((walk, record, crossing), ~passes, self._cross, _pass, label="crossing")
 
     def _meet_inside(
         self, walk: Walk, record: Record, ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f
@@ -296,12 +302,13 @@ class Walker:
         si = media.seen(si, met, ray.d)
         refracts = plain & inner.displaces(si)
         inwards = dr.dot(si.n, ray.d) < 0
-        leaked = (own & inwards) | ((nested | refracts) & (~inwards | (around != k)))  # rounding has put the walk there
+        # the flight goes on behind what it can meet only if rounding has put it there
+        passes = (own & inwards) | ((nested | refracts) & (~inwards | (around != k)))
         boundary = media.boundary(dr.maximum(met, 0))
         boundary = boundary if isinstance(boundary, mi.BSDFPtr) else mi.BSDFPtr(boundary)
         bsdf = dr.select(plain, si.bsdf(), boundary)
         walk, record = self.visitor.surface(walk, record, si, bsdf, met)
-        walk, record = self.visitor.boundary(walk, record, si, own & (around < 0))
+        walk, record = self.visitor.boundary(walk, record, si, own & ~passes & (around < 0))
         bs, value = sample_bsdf(bsdf, si, walk.rng)
         d, turned = sided(si, bs.wo)
         d = dr.select(plain, si.to_world(bs.wo), d)
@@ -309,18 +316,22 @@ class Walker:
             bs.sampled_type, mi.BSDFFlags.Null
         )
         to = dr.select(own, around, dr.select(nested, met, dr.select(refracts, OUTSIDE, k)))
-        to = dr.select(through, to, k)
-        alive = si.is_valid() & ~leaked & (bs.pdf > 0) & (dr.max(value) > 0)
-        o, skip = media.depart(k, si, d, to >= 0)
+        through &= ~passes
+        to, d, value = dr.select(through, to, k), dr.select(passes, ray.d, d), dr.select(passes, 1, value)
+        alive = si.is_valid() & (passes | ((bs.pdf > 0) & (dr.max(value) > 0)))
+        o, off = media.depart(si, d, to >= 0)
         if media.carried:
             new = (to != k) & (to >= 0)
             walk = replace(walk, medium=dr.select(new, media.fetch(dr.maximum(to, 0), si, new), walk.medium))
-        walk = replace(walk, o=o, d=d, skip=skip, alive=alive, object=dr.select(alive, to, OUTSIDE),
-                       weight=walk.weight * value, scale=walk.scale * dr.square(bs.eta),
-                       order=dr.select(own, walk.order, dr.maximum(walk.order, MET)))  # fmt: skip
+        walk = replace(walk, o=o, d=d, off=off, alive=alive, object=dr.select(alive, to, OUTSIDE),
+                       weight=walk.weight * value, scale=walk.scale * dr.select(passes, 1, dr.square(bs.eta)),
+                       order=dr.select(own | passes, walk.order, dr.maximum(walk.order, MET)))  # fmt: skip
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta) | (turned & ~plain)
-        leaves = own & through & (around < 0)
-        return self.visitor.crossing(walk, record, Crossing(si, mi.Vector3f(ray.d), leaves, bs.pdf, delta))
+        crossing = Crossing(si, mi.Vector3f(ray.d), own & through & (around < 0), bs.pdf, delta)
+        return dr.if_stmt((walk, record, crossing), ~passes, self._cross, _pass, label="crossing")
+
+    def _cross(self, walk: Walk, record: Record, crossing: Crossing) -> tuple[Walk, Record]:
+        return self.visitor.crossing(walk, record, crossing)
 
 
 def _pass(walk: Walk, record: Record, *rest: Any) -> tuple[Walk, Record]:
@@ -332,7 +343,7 @@ def start_walk(o: mi.Point3f, d: mi.Vector3f, rng: mi.PCG32, medium: WalkMedium 
     lanes = dr.width(o)
     return Walk(
         alive=dr.full(mi.Bool, True, lanes), object=dr.full(mi.Int32, OUTSIDE, lanes), o=o, d=d,
-        skip=dr.full(mi.Float, 0, lanes), channel=dr.full(mi.UInt32, 0, lanes), weight=dr.full(mi.Spectrum, 1, lanes),
+        off=dr.zeros(mi.Vector3f, lanes), channel=dr.full(mi.UInt32, 0, lanes), weight=dr.full(mi.Spectrum, 1, lanes),
         density=dr.full(mi.Spectrum, 1, lanes), scale=dr.full(mi.Float, 1, lanes),
         order=dr.full(mi.UInt32, 0, lanes), rng=rng, medium=medium,
     )  # fmt: skip
@@ -544,4 +555,4 @@ def _enter(
     enters &= mi.Frame3f.cos_theta(si.wi) > 0
     channel = draw(len(value), rng) if len(value) > 1 else walk.channel
     return replace(walk, alive=enters, object=mi.Int32(k) + dr.zeros(mi.Int32, dr.width(index)), weight=value,
-                   skip=media.clear(k, si.n, d), scale=dr.square(bs.eta), channel=channel)  # fmt: skip
+                   off=media.clear(k, si.n, d), scale=dr.square(bs.eta), channel=channel)  # fmt: skip

@@ -110,9 +110,9 @@ class StraightLight:
             leaves = dr.dot(si.n, ray.d) * media.side(k, si.prim_index) > 0
             passed = own & way.inside & leaves
             T = media.transmittance(k, ray, dr.select(passed, si.t, 0), way.rng, medium)
-            skip = si.t + media.clear(k, si.n, ray.d)
+            o = mi.Point3f(ray.o + ray.d * si.t + media.clear(k, si.n, ray.d))
             going = way.going & (passed | (own & ~way.inside & ~leaves & again))
-            return LightWay(ray_of(ray.o + ray.d * skip, ray.d, medium), way.left - skip, ~way.inside, going,
+            return LightWay(ray_of(o, ray.d, medium), way.left - si.t, ~way.inside, going,
                             way.arrives | (way.going & ~hit & ~way.inside),
                             way.length + dr.select(passed, si.t, 0), dr.select(passed, way.T * T, way.T),
                             way.rng)  # fmt: skip
