@@ -30,12 +30,14 @@ class Faces:
             faces point to both sides.
         sides: array (n,) of 1 and -1, by which normals of each piece have to be multiplied to point to one side; None
             where they do.
+        closed: whether an even number of faces meets at each edge, so that what enters leaves again.
     """
 
     corners: np.ndarray
     normals: np.ndarray
     pieces: np.ndarray
     sides: np.ndarray | None
+    closed: bool
 
 
 def faces_of(shape: mi.Shape, name: str) -> Faces | None:
@@ -53,11 +55,13 @@ def faces_of(shape: mi.Shape, name: str) -> Faces | None:
     corners = place.reshape(-1)[faces]
     a, b, c = positions[faces].transpose(1, 0, 2)
     normals = 0.5 * np.cross(b - a, c - a)
-    first, second, same = _neighbours(corners, np.linalg.norm(normals, axis=1) > 0)
+    edges = _edges(corners)
+    first, second, same = _neighbours(corners, edges, np.linalg.norm(normals, axis=1) > 0)
+    closed = bool((edges[2] % 2 == 0).all())
     if same.all():
-        return Faces(corners, normals, _pieces(corners), None)
+        return Faces(corners, normals, _pieces(corners), None, closed)
     pieces, sides = _turned(len(faces), first, second, same, name)
-    return Faces(corners, normals, pieces, sides)
+    return Faces(corners, normals, pieces, sides, closed)
 
 
 def check_copies(faces: Faces, name: str) -> None:
@@ -115,22 +119,28 @@ def _vertex_normals(positions: np.ndarray, vertex: np.ndarray, normals: np.ndarr
     return unit(result)
 
 
-def _neighbours(corners: np.ndarray, solid: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _edges(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The sides of all faces by the edges that they lie on, where each edge begins in these, and its number of sides.
+
+    Side 3 f + k runs from corner k of face f to the next. Sides of no length are on no edge.
+    """
+    ends = np.sort(np.stack([corners.ravel(), np.roll(corners, -1, axis=1).ravel()]), axis=0)
+    order = np.lexsort(ends[::-1])
+    order = order[ends[0, order] != ends[1, order]]
+    first = np.flatnonzero(np.append(True, (np.diff(ends[:, order]) != 0).any(axis=0))[: len(order)])
+    return order, first, np.diff(np.append(first, len(order)))
+
+
+def _neighbours(corners: np.ndarray, edges: tuple, solid: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Pairs of faces that share an edge which no third one has, and whether they run along it in opposite ways.
 
     Faces without area, which are not `solid`, have no side to agree with.
     """
-    start, end = corners.ravel(), np.roll(corners, -1, axis=1).ravel()
-    face = np.repeat(np.arange(len(corners)), 3)
-    low, high = np.minimum(start, end), np.maximum(start, end)
-    order = np.lexsort((high, low))
-    low, high = low[order], high[order]
-    new = np.ones(len(order) + 1, dtype=bool)
-    new[1:-1] = (np.diff(low) != 0) | (np.diff(high) != 0)
-    edge = np.flatnonzero(new)
-    pair = order[edge[:-1][(np.diff(edge) == 2) & (low[edge[:-1]] != high[edge[:-1]])][:, None] + [0, 1]]
-    pair = pair[solid[face[pair]].all(axis=1)]
-    return face[pair[:, 0]], face[pair[:, 1]], start[pair[:, 0]] != start[pair[:, 1]]
+    order, first, count = edges
+    pair = order[first[count == 2][:, None] + [0, 1]]
+    pair = pair[solid[pair // 3].all(axis=1)]
+    start = corners.ravel()[pair]
+    return pair[:, 0] // 3, pair[:, 1] // 3, start[:, 0] != start[:, 1]
 
 
 def _pieces(corners: np.ndarray) -> np.ndarray:
@@ -265,6 +275,7 @@ def same_objects(a: list[Any], b: list[Any]) -> bool:
 def survey(shape: mi.Shape, world: mi.Scene | None = None) -> Geometry:
     """Look at a shape from outside with rays; warns if it is not closed, or if its faces point to both sides.
 
+    A mesh is closed if its edges say so. Rays decide for others, and where edges of faces that touch do not match.
     Faces of a closed mesh that point to both sides are taken the right way round.
 
     Args:
@@ -288,6 +299,7 @@ def survey(shape: mi.Shape, world: mi.Scene | None = None) -> Geometry:
         check_copies(faces, name_of(shape))
     votes = _Votes(faces)
     sides, odd = _outside_view(scene, votes)
+    odd = 0.0 if faces is not None and faces.closed else odd  # rays pass between faces by rounding
     outward = sides[sides != 0]
     share = float((outward > 0).mean()) if len(outward) else 1.0
     sheet = 1 - MAJORITY < share < MAJORITY and not votes.agree()
