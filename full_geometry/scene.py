@@ -16,11 +16,10 @@ from full_geometry.object.patches import AREA_SHARE, LearntProposals, PatchTable
 from halfspace_sss.neural.store import checksum_of, load_weights
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.object.half_space import HalfSpaceProposals, area_share
-from halfspace_sss.rendering.object.objects import TranslucentObject, check_geometry, check_surface
+from halfspace_sss.rendering.object.objects import TranslucentObject, check_geometry
 from halfspace_sss.rendering.object.points import ObjectModel, PositionSampler, RadialTable
 from halfspace_sss.rendering.object.settings import AUTOMATIC, Settings
 from halfspace_sss.rendering.object.shape import Geometry
-from halfspace_sss.rendering.object.translucent import is_translucent
 
 FINE = 2.5  # transport mean free paths of the radius of a patch, up to which patches do without probes
 PATCH_SHARE = 0.2  # of the entries where patches are larger: they reach what probes miss
@@ -54,7 +53,6 @@ def learnt_model(obj: TranslucentObject, settings: Settings) -> ObjectModel:
         ValueError: the object cannot be trained, was not and has no time for it, or weights are damaged.
     """
     geometry = obj.geometry
-    check_surface(geometry.shape.id(), obj.surface)
     check_geometry(geometry)
     path = _weights(obj, settings)
     model, sampler = load(path, obj)
@@ -108,12 +106,9 @@ def shape_model(obj: TranslucentObject, settings: Settings) -> ObjectModel:
     """Transport and proposals of any object with a homogeneous medium and a smooth boundary.
 
     Raises:
-        ValueError: the boundary is rough, the medium varies or is out of the range of `neural`, or normals of pieces
-            of the object disagree.
+        ValueError: the medium varies or is out of the range of `neural`, or normals of pieces of the object disagree.
     """
     geometry = obj.geometry
-    if is_translucent(obj.surface):
-        check_surface(geometry.shape.id(), obj.surface)
     check_geometry(geometry)
     warn_out_of_range(geometry, obj.media)
     model = transport(obj)

@@ -19,7 +19,6 @@ LIGHTS = {
     "point": {"type": "point", "position": [9, 5, 15], "intensity": 200.0},
     "sun": {"type": "directional", "direction": [-0.5, 0.1, -1.0], "irradiance": 3.0},
 }
-ROUGH = {"type": "roughdielectric", "alpha": 0.2, "int_ior": 1.4, "ext_ior": 1.0}
 UNTRAINED = ("neural_material", "neural_paper")  # know one medium each
 
 

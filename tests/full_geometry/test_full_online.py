@@ -200,7 +200,7 @@ def _refused(monkeypatch: Any, message: str, result: Any) -> None:
         ("", "", ["--train-seconds", "-1"], "train_seconds must be a number in [0, 1e+07], got -1.0"),
         ("", "", ["--train-error", "0"], "train_error must be a number in [0.0001, 1], got 0.0"),
         ("</bsdf>", '<bsdf type="roughdielectric"><float name="int_ior" value="1.3"/><float name="ext_ior" value="1"/>'
-         "</bsdf></bsdf>", [], "the boundary of 'ball' must be smooth to be learnt"),
+         "</bsdf></bsdf>", [], "the boundary of object 'ball' must be smooth"),
         ('"sigma_s" value="0.95,0.8,0.6"', '"sigma_s" value="0.95,-1,0.6"', [], "sigma_s must be"),
     ],
 )  # fmt: skip

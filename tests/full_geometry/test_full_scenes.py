@@ -195,7 +195,7 @@ def refused(objects: dict, message: str, folder: Path) -> None:
 @pytest.mark.slow
 def test_a_rough_boundary_is_refused(trained: Trained, folder: Path) -> None:
     rough = {"type": "roughdielectric", "alpha": 0.2, "int_ior": 1.4, "ext_ior": 1.0}
-    refused({"bunny": bunny(bsdf={**SURFACE, "boundary": rough})}, "boundary of 'bunny' must be smooth", folder)
+    refused({"bunny": bunny(bsdf={**SURFACE, "boundary": rough})}, "boundary of object 'bunny' must be smooth", folder)
 
 
 def test_an_instance_is_refused(folder: Path) -> None:

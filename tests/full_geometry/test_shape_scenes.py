@@ -101,7 +101,7 @@ def test_within_its_range_it_says_nothing() -> None:
 
 def test_a_rough_boundary_is_refused() -> None:
     rough = {"type": "roughdielectric", "alpha": 0.2, "int_ior": 1.3, "ext_ior": 1.0}
-    with pytest.raises(ValueError, match="boundary of 'ball' must be smooth"):
+    with pytest.raises(ValueError, match="boundary of object 'ball' must be smooth"):
         mi.render(load_scene(scene(boundary=rough)), spp=1)
 
 

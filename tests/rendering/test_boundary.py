@@ -13,6 +13,7 @@ import drjit as dr  # noqa: E402
 from halfspace_sss.rendering.object.objects import object_of  # noqa: E402
 from halfspace_sss.rendering.object.translucent import is_smooth_boundary, smooth_boundary  # noqa: E402
 from halfspace_sss.rendering.scenes.mitsuba_scene import with_media  # noqa: E402
+from halfspace_sss.trade.ways import ways  # noqa: E402
 
 N, BOTH = 4000, 0xFFFFFFFF
 
@@ -92,18 +93,28 @@ def test_boundaries_of_other_kinds_are_refused_by_name(kind: str) -> None:
         surface(inner={"type": kind, **OTHERS[kind]})
 
 
-@pytest.mark.parametrize("tint", ["specular_reflectance", "specular_transmittance"])
-def test_a_tinted_boundary_is_refused_by_models_and_traced_by_walks(tint: str) -> None:
-    bsdf = {"type": "translucent", "sigma_s": 1.0, "sigma_a": 0.5, "eta": 1.4, "inner": dielectric(1.4, **{tint: 0.5})}
+UNKNOWN_TO_MODELS = {
+    "without specular_reflectance": dielectric(1.4, specular_reflectance=0.5),
+    "without specular_transmittance": dielectric(1.4, specular_transmittance=0.5),
+    "smooth": {**dielectric(1.4), "type": "roughdielectric", "alpha": 0.1},
+}
+
+
+@pytest.mark.parametrize("wanted", UNKNOWN_TO_MODELS)
+def test_a_tinted_or_rough_boundary_is_refused_by_every_way_but_walks_which_trace_it(wanted: str) -> None:
+    inner = UNKNOWN_TO_MODELS[wanted]
+    bsdf = {"type": "translucent", "sigma_s": 1.0, "sigma_a": 0.5, "eta": 1.4, "inner": inner}
     described = {
         "type": "scene",
         "ball": {"type": "sphere", "radius": 3.0, "bsdf": bsdf},
         "light": {"type": "constant"},
     }
     loaded = mi.load_dict(described)
-    message = f"the boundary of object 'ball' must be without {tint} under a model"
-    for ask in (mi.load_dict({"type": "bssrdf"}).prepare, lambda scene: object_of(scene, None, 1.0)):
-        with pytest.raises(ValueError, match=message):
+    asked = [{"model": way.model, "light": way.light} for way in ways() if not way.walks]
+    asked += [{"model": "auto"}, {"light": "auto"}, *({"orders": orders} for orders in ("single", "multiple"))]
+    preparations = [mi.load_dict({"type": "bssrdf", **each}).prepare for each in asked]
+    for ask in (*preparations, lambda scene: object_of(scene, None, 1.0)):
+        with pytest.raises(ValueError, match=f"boundary of object 'ball' must be {wanted} under a model, got a .*walk"):
             ask(loaded)
     mi.load_dict({"type": "translucent_walk"}).tracer(loaded)
 
@@ -113,3 +124,20 @@ def test_volume_paths_meet_the_dielectric_of_mitsuba() -> None:
     found = with_media({"type": "scene", "ball": ball, "light": {"type": "constant"}}, 1.0)
     boundary = found.shapes()[0].bsdf()
     assert boundary.class_name() == "SmoothDielectric" and mi.traverse(boundary)["eta"] == pytest.approx(1.4)
+
+
+def test_a_rough_boundary_loses_in_a_white_furnace_what_that_of_mitsuba_loses() -> None:
+    rough = {**dielectric(1.4), "type": "roughdielectric", "alpha": 0.5}
+    film = {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}}
+    at = mi.ScalarTransform4f().look_at([0, 0, 50], [0, 0, 0], [0, 1, 0])
+    scene = {
+        "type": "scene", "integrator": {"type": "translucent_walk"}, "sky": {"type": "constant"},
+        "ball": {"type": "sphere", "radius": 2.0,
+                 "bsdf": {"type": "translucent", "albedo": 1.0, "sigma_t": 1.0, "eta": 1.4, "inner": rough}},
+        "sensor": {"type": "perspective", "fov": 2.5, "to_world": at, "film": film},
+    }  # fmt: skip
+    theirs = with_media(scene, 1.0, {"type": "volpathmis", "max_depth": -1, "rr_depth": 10000})
+    images = [[np.array(mi.render(s, spp=64, seed=k)).mean() for k in range(8)] for s in (mi.load_dict(scene), theirs)]
+    (ours, own), (other, error) = ((np.mean(v), np.std(v, ddof=1) / 8**0.5) for v in images)
+    assert abs(ours - other) < 4 * np.hypot(own, error) and max(own, error) < 0.003
+    assert ours < 0.9

@@ -14,7 +14,6 @@ import drjit as dr  # noqa: E402
 from differentiated import (  # noqa: E402
     ENVMAP,
     LIGHTS,
-    ROUGH,
     SPP,
     UNTRAINED,
     backward,
@@ -57,7 +56,7 @@ FLOOR = "floor.bsdf.reflectance.color1.value"
 @pytest.mark.parametrize("light", ["lamp", pytest.param("envmap", marks=pytest.mark.slow)])
 def test_derivatives_under_a_lamp_and_a_sky_agree_with_finite_differences_and_with_the_image_by_the_light(light):
     """By each channel of the medium and the texture of another surface; what light shows is linear in it."""
-    scene = make(envmap() if light == "envmap" else light, boundary=ROUGH)
+    scene = make(envmap() if light == "envmap" else light)
     found = derivatives(scene, [*(f"ball.bsdf.{name}" for name in COEFFICIENTS), FLOOR, OF_LIGHT[light]])
     for parameter in COEFFICIENTS:
         for k in range(3):
@@ -87,7 +86,7 @@ def test_the_radiance_of_a_constant_sky_times_its_derivative_is_the_image(model)
 
 
 def test_forward_and_backward_derivatives_agree():
-    scene = make(orders="total", reflection=True, boundary=ROUGH)
+    scene = make(orders="total", reflection=True)
     for key, found in derivatives(scene, ["light.radiance.value", FLOOR, "ball.bsdf.albedo"]).items():
         assert forward(scene, key) == pytest.approx(found.sum(), rel=1e-4)
 
@@ -154,13 +153,6 @@ def test_derivatives_by_textures_of_a_medium_agree_with_finite_differences():
 def test_derivatives_by_textures_of_a_medium_are_refused_under_lambert():
     with pytest.raises(ValueError, match="textures must not have gradients enabled under 'lambert'"):
         derivatives(_painted("lambert"), ["solid.vertex_albedo"])
-
-
-def test_derivatives_by_the_roughness_of_the_boundary_agree_with_finite_differences():
-    """Of what a point light shows at the first vertex: there the roughness moves no sampled direction."""
-    scene = make("point", boundary=ROUGH, floor=False, max_depth=2)
-    key = "ball.bsdf.boundary.alpha.value"
-    assert backward(scene, key).sum() == pytest.approx(difference(scene, key, 2e-3, mi.Float), rel=5e-3)
 
 
 def test_render_and_backward_give_the_derivative_of_the_image():

@@ -10,7 +10,7 @@ from halfspace_sss import Medium
 
 mi = pytest.importorskip("mitsuba")
 import drjit as dr  # noqa: E402
-from differentiated import LIGHTS, ROUGH, backward, image, make, weights  # noqa: E402  # fmt: skip
+from differentiated import LIGHTS, backward, image, make, weights  # noqa: E402  # fmt: skip
 
 pytestmark = pytest.mark.usefixtures("quiet_rgb")
 
@@ -29,7 +29,7 @@ def refused(key: str, render) -> bool:
     "key", ["ball.to_world", "floor.to_world", "sensor.to_world", "ball.bsdf.boundary.eta", "light.position"]
 )
 def test_geometry_is_refused_before_anything_is_rendered(key):
-    scene = make("point", boundary=ROUGH)
+    scene = make("point")
     parameters = mi.traverse(scene)
     dr.enable_grad(parameters[key])
     for render in (

@@ -62,7 +62,7 @@ from halfspace_sss.rendering.object.shape import (
 )
 from halfspace_sss.rendering.object.spectral import MediumByWavelength
 from halfspace_sss.rendering.object.textured import SurfaceMedium, TexturedMedium
-from halfspace_sss.rendering.object.translucent import Inside, check_tints
+from halfspace_sss.rendering.object.translucent import Inside, check_boundary
 from halfspace_sss.rendering.object.variation import Variation, VariedTransport
 from halfspace_sss.rendering.object.varying import VaryingMedium, equivalent, warn_of_means
 from halfspace_sss.rendering.object.wrapped import Wrapping, surface_of, wrapping_of
@@ -481,6 +481,8 @@ def _choices(scene: Any, settings: Settings) -> Choices:
     if insides and (settings.light == AUTO or any(inside.model == AUTO for inside in insides)):
         if mi.is_spectral:
             raise ValueError("model must be named under a spectral variant, got 'auto'")
+        for shape in outermost(scene):
+            check_boundary(name_of(shape), surface_of(shape).boundary)
         return choices(scene, settings)
     return Choices({}, settings.light, {})
 
@@ -498,7 +500,7 @@ def _make_object(geometry: Geometry, inside: Inside, settings: Settings) -> Tran
     if inside.spectral is not None:
         obj = replace(obj, spectral=inside.spectral.scaled(settings.mm_per_unit))
     single_only = inside.orders == "single" or not any(float(m.sigma_s) > 0 for m in media)
-    check_tints(geometry.name, obj.surface.boundary)
+    check_boundary(geometry.name, obj.surface.boundary)
     obj.wrapping.check(geometry)
     if geometry.contents is not None:
         _check_takes(geometry, inside, single_only)
@@ -716,13 +718,6 @@ def _check_contents(name: str, contents: Contents) -> None:
             raise ValueError(f"media inside {name} must be homogeneous to be learnt, got that of {name_of(shape)}")
 
 
-def check_surface(name: str, surface: Any) -> None:
-    """ValueError if the `translucent` surface of an object has what cannot be learnt."""
-    check_tints(repr(name), surface.boundary)
-    if surface.boundary.flags() & int(mi.BSDFFlags.Smooth):
-        raise ValueError(f"the boundary of {name!r} must be smooth to be learnt, got a rough one")
-
-
 def _object_of(scene: Any, name: str | None) -> Any:
     """The translucent shape called `name` in a scene, or the only one that lies in no other.
 
@@ -738,5 +733,5 @@ def _object_of(scene: Any, name: str | None) -> Any:
     if name not in known:
         names = ", ".join(id or name_of(shape) for id, shape in known.items())
         raise ValueError(f"object must be one of {names or 'none'}, got {name!r}")
-    check_surface(name, surface_of(known[name]))
+    check_boundary(repr(name), surface_of(known[name]).boundary)
     return known[name]

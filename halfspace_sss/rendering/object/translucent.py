@@ -31,7 +31,7 @@ Parameters, all optional but the medium:
     channel: R, G or B, or a number; under a mono variant, for a medium with channels.
     dilution: of a material that has one, see `halfspace_sss.materials.load`.
     a BSDF inside: the boundary, a `dielectric` or `roughdielectric` with int_ior / ext_ior equal to the eta of the
-        medium; by default smooth.
+        medium; by default smooth. A rough one is traced by `translucent_walk` alone.
     reflection: whether the boundary reflects light, by default true.
 
 `mitsuba.traverse` shows `albedo`, `sigma_t` (1/mm) and `g` of each channel, textures where they stand for these, and
@@ -179,18 +179,24 @@ def check_eta(boundary: mi.BSDF, eta: float) -> None:
         )
 
 
-def check_tints(name: str, boundary: mi.BSDF) -> None:
-    """Refuse a boundary that colours what it reflects or lets through, by which models know no light.
+def is_rough(boundary: mi.BSDF) -> bool:
+    """Whether a boundary reflects and refracts over ranges of directions."""
+    return bool(boundary.flags() & int(mi.BSDFFlags.Smooth))
+
+
+def check_boundary(name: str, boundary: mi.BSDF) -> None:
+    """Refuse a boundary that models do not know: theirs is smooth and has no colour.
 
     Args:
         name: of the object, as messages have it.
         boundary: of its medium.
     """
     tints = sorted({key.partition(".")[0] for key in mi.traverse(boundary).keys() if key.startswith("specular_")})
-    if tints:
+    wrong = [f"without {tint}" for tint in tints] + ["smooth"] * is_rough(boundary)
+    if wrong:
         raise ValueError(
-            f"the boundary of object {name} must be without {tints[0]} under a model: the integrator translucent_walk "
-            "traces it"
+            f"the boundary of object {name} must be {wrong[0]} under a model, got a {boundary.class_name()}: the "
+            "integrator translucent_walk traces it"
         )
 
 

@@ -18,7 +18,7 @@ from halfspace_sss.rendering.object.objects import TranslucentObject, translucen
 from halfspace_sss.rendering.object.points import lift
 from halfspace_sss.rendering.object.rounding import clear
 from halfspace_sss.rendering.object.shape import Geometry, check_together, pointer_numbers, scene_of, survey
-from halfspace_sss.rendering.object.translucent import Inside, is_smooth_boundary, smooth_boundary
+from halfspace_sss.rendering.object.translucent import Inside, is_rough, is_smooth_boundary, smooth_boundary
 from halfspace_sss.rendering.object.varying import VaryingMedium, eval_volume
 from halfspace_sss.rendering.object.wrapped import Wrapping, surface_of, wrapping_of
 
@@ -687,8 +687,3 @@ def _bounds(scene: mi.Scene) -> mi.BoundingBox3f:
         return box
     margin = 1e-3 * (box.max - box.min)
     return mi.BoundingBox3f(mi.Point3f(box.min - margin), mi.Point3f(box.max + margin))
-
-
-def is_rough(boundary: mi.BSDF) -> bool:
-    """Whether a boundary scatters into a solid angle."""
-    return bool(boundary.flags() & int(mi.BSDFFlags.Smooth))
