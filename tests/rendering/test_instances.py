@@ -252,7 +252,7 @@ def test_derivatives_of_a_model_by_the_medium_of_instances_are_those_of_objects_
 def test_a_thousand_instances_are_rendered_by_the_kernels_of_a_few() -> None:
     def kernels(n: int) -> int:
         grid = [mi.ScalarTransform4f().translate([2.3 * (k % 40), 2.3 * (k // 40), -3]) for k in range(n)]
-        parts = {"box": box(bsdf=surface("better_dipole", "total"))}
+        parts = {"box": box(bsdf=surface("better_dipole", "multiple"))}
         scene = mi.load_dict(view("bssrdf", sky={"type": "constant"}, **shown(parts, grid)))
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
             dr.kernel_history_clear()
@@ -263,7 +263,7 @@ def test_a_thousand_instances_are_rendered_by_the_kernels_of_a_few() -> None:
 
 
 def test_an_instance_that_has_moved_is_seen_where_it_stands() -> None:
-    parts = {"box": box(bsdf=surface("better_dipole", "total"))}
+    parts = {"box": box(bsdf=surface("better_dipole", "multiple"))}
     scene = mi.load_dict(view("bssrdf", sky={"type": "constant"}, **shown(parts, places())))
     before = np.array(mi.render(scene, spp=4))
     parameters = mi.traverse(scene)

@@ -20,11 +20,14 @@ from halfspace_sss.rendering.object.points import (
     RadialTable,
     SurfacePoint,
     local_frame,
+    opaque,
     opposed,
     plane_query,
+    refract_in,
+    surface_point,
 )
 from halfspace_sss.rendering.object.settings import AUTOMATIC, Settings
-from halfspace_sss.rendering.object.shape import Geometry
+from halfspace_sss.rendering.object.shape import Geometry, lines_through, meet_alone
 from halfspace_sss.rendering.object.textured import TexturedMedium
 
 POINTS_PER_RATIO, MOST_POINTS = 60.0, 9  # candidates over the area
@@ -159,3 +162,50 @@ def area_share(geometry: Geometry, ratio: float, wanted: float) -> float:
             f"area_share must be 0 for {geometry.shape.id()!r}, a {kind} without known area, got {wanted:g}"
         )
     return 0.0
+
+
+# --------------------------------------------------------------------------------------------------
+# Light that passes an object without being turned, of which a half-space knows nothing.
+
+
+MOST_STRAIGHT = 0.25  # of what enters: balls that let it pass are half as bright by these models as by walks, or darker
+LINES = 2**14
+
+
+def check_turns(geometry: Geometry, media: Sequence[Medium], model: str) -> None:
+    """ValueError if more than `MOST_STRAIGHT` of the light passes straight through an object, which `model` lacks.
+
+    Args:
+        geometry: of the object.
+        media: of each channel, 1/(scene unit).
+        model: a name.
+    """
+    share = float(straight_share(geometry, media).max())
+    if share > MOST_STRAIGHT:
+        raise ValueError(
+            f"object {geometry.name} must let at most {100 * MOST_STRAIGHT:g} % of the light pass unscattered under "
+            f"the model {model!r}, got {100 * share:.3g} %, counting what is turned little: the model neural_shape and "
+            "the integrator translucent_walk trace it"
+        )
+
+
+def straight_share(geometry: Geometry, media: Sequence[Medium]) -> np.ndarray:
+    """Share of even light that passes an object on its first way inside, for the medium of each channel.
+
+    The mean of exp(-sigma_t' s) over ways s of light from everywhere, refracted where it enters. The reduced extinction
+    sigma_t' = sigma_t - max(g, 0) sigma_s counts forward scattering as none. It is 0 where nothing ends a way, as in a
+    plane.
+
+    Args:
+        geometry, media: as of `check_turns`.
+    """
+    entered = lines_through(geometry.scene.bbox(), LINES)
+    flags = mi.RayFlags.Minimal
+    met = meet_alone(geometry.scene, entered, flags)
+    n = dr.select(dr.dot(met.n, entered.d) > 0, -met.n, met.n)
+    d, _, valid = refract_in(surface_point(met.p, n, n, -entered.d), opaque(media[0].eta))
+    valid &= met.is_valid()
+    left = meet_alone(geometry.scene, met.spawn_ray(d), flags, valid)
+    ways = np.array(left.t)[np.array(valid)] * (1 if geometry.group is None else geometry.group.scale)
+    reduced = [float(m.sigma_t - max(m.g, 0.0) * m.sigma_s) for m in media]
+    return np.array([np.exp(-k * ways).mean() if len(ways) else 0.0 for k in reduced])

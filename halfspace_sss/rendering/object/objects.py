@@ -22,7 +22,7 @@ from halfspace_sss.interface.model import bssrdf
 from halfspace_sss.physics import single_scattering
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.object.contents import Content, check_sensors, contents, place_of
-from halfspace_sss.rendering.object.half_space import half_space_model
+from halfspace_sss.rendering.object.half_space import check_turns, half_space_model
 from halfspace_sss.rendering.object.instances import (
     Group,
     Placed,
@@ -450,6 +450,7 @@ def surveyed(shape: mi.Shape, scene: mi.Scene, groups: Sequence[Group]) -> Geome
     return replace(survey(shape, scene), group=group)
 
 
+LAMBERT = "lambert"
 RIGID = 1e-3  # of lengths, by which instances of what is learnt may differ
 
 
@@ -460,7 +461,7 @@ def _check_repeated(geometry: Geometry, inside: Inside, settings: Settings) -> N
     if settings.light == "gathered":
         raise ValueError(f"light must be sampled of objects that instances show, got gathered of {geometry.name}")
     of_object = inside.orders != "single" and lookup(inside.model).transport
-    if of_object and inside.model != "lambert" and geometry.group.stretch > RIGID:
+    if of_object and inside.model != LAMBERT and geometry.group.stretch > RIGID:
         raise ValueError(
             f"instances of object {geometry.name} must be moved, turned or mirrored for the model {inside.model!r}, "
             f"got lengths that differ by {100 * geometry.group.stretch:.3g} %: give each size a group of its own, or "
@@ -505,6 +506,8 @@ def _make_object(geometry: Geometry, inside: Inside, settings: Settings) -> Tran
     if geometry.contents is not None:
         _check_takes(geometry, inside, single_only)
     variation = Variation(obj.surface, settings.mm_per_unit, inside.model)
+    if inside.orders == "total" and not single_only and (lookup(inside.model).of_half_space or inside.model == LAMBERT):
+        check_turns(geometry, media, inside.model)
     none = ObjectModel(None, None)
     transport, proposals, entries = none if single_only else _model_of(obj, inside, settings)
     if transport and transport.orders == "total" and inside.orders == "multiple":
@@ -598,7 +601,7 @@ def check_size(geometry: Geometry, sigma_t: Sequence[float], mm_per_unit: float)
     if min(thickness) < SMALL or max(thickness) > LARGE:
         warnings.warn(
             f"object {geometry.name} is {min(thickness):.3g} to {max(thickness):.3g} mean free paths across, "
-            f"{size * mm_per_unit:.3g} mm: check mm_per_unit = {mm_per_unit:g}",
+            f"{size * mm_per_unit:.3g} mm: check mm_per_unit = {mm_per_unit:g} if that is not meant",
             stacklevel=2,
         )
 

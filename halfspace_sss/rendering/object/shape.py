@@ -569,6 +569,17 @@ def ways_into(low: np.ndarray, high: np.ndarray, n: int) -> tuple[np.ndarray, np
     return start, along / np.linalg.norm(along, axis=1, keepdims=True)
 
 
+def lines_through(box: mi.ScalarBoundingBox3f, n: int) -> Any:
+    """Rays along lines through the ball about a bounding box that are uniform over places and directions."""
+    rng, (low, high) = np.random.default_rng(7), (np.array(end, dtype=float) for end in (box.min, box.max))
+    d, aside = rng.standard_normal((2, 3, n))
+    d /= np.linalg.norm(d, axis=0)
+    aside -= (aside * d).sum(axis=0) * d
+    aside *= np.sqrt(rng.random(n)) / np.linalg.norm(aside, axis=0)
+    start = 0.5 * (low + high)[:, None] + 0.5 * np.linalg.norm(high - low) * (aside - 1.01 * d)
+    return mi.Ray3f(mi.Point3f(start), mi.Vector3f(d))
+
+
 def check_together(world: mi.Scene, scenes: list[Any]) -> None:
     """Try rays in a scene and in those of objects in it by one kernel, where that may fail.
 
