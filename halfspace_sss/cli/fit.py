@@ -186,7 +186,7 @@ def _paint(
             texture.extend(copy.deepcopy(child) for child in source)
         _remove(texture, "scale")
         if key in files:
-            _remove(texture, "filename", "raw")
+            _remove(texture, "filename", "raw", "format")
             ElementTree.SubElement(texture, "string", name="filename", value=str(files[key].resolve()))
             ElementTree.SubElement(texture, "boolean", name="raw", value="true")
     if "mesh" in files:  # in the space of the scene

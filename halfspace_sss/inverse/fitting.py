@@ -77,7 +77,7 @@ def fit(
     """
     settings = settings or FitSettings()
     if not isinstance(scene, mi.Scene):
-        scene = open_scene(scene, PATH_TRACED if model == WALK else model)
+        scene = open_scene(scene, PATH_TRACED if model == WALK else model, floats=True)
     shape = translucent_object(scene, object)
     check_derivatives(scene.integrator(), shape, parameters)
     mm_per_unit = scene.integrator().mm_per_unit

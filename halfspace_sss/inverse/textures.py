@@ -189,6 +189,7 @@ class Variable:
         """Of a bitmap, by what it shows of texels that are no neighbours: weights, and these times rows and columns."""
         parameters = mi.traverse(self.texture)
         kept, (rows, columns, channels) = parameters["data"], self.start.shape
+        most = max(rows, columns)  # numbers are shown over that, as colours are at most 1
         ways = [np.where((np.arange(n) == n - 1) & (n % 2 == 1), 2, np.arange(n) % 2) for n in (rows, columns)]
         numbers, weights = [], []
 
@@ -203,7 +204,7 @@ class Variable:
                 own = ((ways[0] == a)[:, None] & (ways[1] == b)).astype(float)
                 w = seen(own)
                 at = [
-                    np.rint(np.divide(seen(own * k), w, out=np.zeros_like(w), where=w > 1e-4)).astype(int)
+                    np.rint(np.divide(most * seen(own * k / most), w, out=np.zeros_like(w), where=w > 1e-4)).astype(int)
                     for k in np.indices(own.shape)
                 ]
                 numbers.append(at[0] * columns + at[1])
@@ -265,6 +266,11 @@ def _variable(
         numbers = numbers.reshape(shape.face_count() if ending.startswith("face_") else shape.vertex_count(), -1)
     if name in ("sigma_t", "mfp") and texture is not None:  # a factor of sigma_t in the scene
         unit = textured.scale if name == "sigma_t" else 1 / textured.scale
+    if not dr.is_float_v(type(parameters[key])):
+        raise ValueError(
+            f"the bitmap of {name} of {name_of(shape)} must have floats to be fitted, got bytes: load it with the "
+            "format 'variant'"
+        )
     bounds = _bounds(name, texture is None, textured, shape, mm_per_unit)
     if numbers.shape[-1] < n:  # a colour without hue
         bounds = bounds[0].max(keepdims=True), bounds[1].min(keepdims=True)

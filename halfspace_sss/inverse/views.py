@@ -16,6 +16,7 @@ import numpy as np
 from halfspace_sss.checks import check_choice, check_count, did_you_mean
 from halfspace_sss.provenance import read_text
 from halfspace_sss.rendering.object.sensors import camera_rays
+from halfspace_sss.rendering.object.textured import linear_of_srgb
 
 TRANSFERS = ("linear", "srgb")
 KEYS = ("image", "sensor", "transfer", "mask", "held_out")
@@ -97,7 +98,8 @@ def _view(path: Path, row: Any) -> GivenView:
     if mask.shape == full.shape and (full & mask).any():
         warnings.warn(f"{name}: {int((full & mask).sum())} saturated pixels do not count", stacklevel=3)
         mask = mask & ~full
-    return GivenView.of(name, sensor, _linear(image) if transfer == "srgb" else image, mask, bool(row.get("held_out")))
+    image = linear_of_srgb(image) if transfer == "srgb" else image
+    return GivenView.of(name, sensor, image, mask, bool(row.get("held_out")))
 
 
 def _pixels(path: Path) -> np.ndarray:
@@ -112,11 +114,6 @@ def _pixels(path: Path) -> np.ndarray:
     scale = np.iinfo(data.dtype).max if np.issubdtype(data.dtype, np.integer) else 1.0
     data = data.astype(np.float32) / np.float32(scale)
     return data if data.ndim == 3 else data[..., None]
-
-
-def _linear(image: np.ndarray) -> np.ndarray:
-    """Of sRGB values (IEC 61966-2-1)."""
-    return np.where(image <= 0.04045, image / 12.92, ((np.maximum(image, 0) + 0.055) / 1.055) ** 2.4)
 
 
 def check_views(scene: mi.Scene, views: Sequence[GivenView], shape: mi.Shape) -> None:

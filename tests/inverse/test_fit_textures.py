@@ -153,6 +153,25 @@ def test_textures_that_cannot_be_fitted_are_refused_by_name(tmp_path: Path) -> N
     refused("albedo of 'plate' must be a bitmap or mesh_attribute to be fitted, got a Checkerb", path, "albedo")
 
 
+def test_a_fit_of_bytes_is_that_of_their_colours_and_bytes_of_a_scene_that_is_there_are_refused(tmp_path: Path) -> None:
+    bytes_ = np.random.default_rng(0).integers(90, 220, (4, 4, 3), dtype=np.uint8)
+    colours = ((bytes_ / 255 + 0.055) / 1.055) ** 2.4  # of sRGB
+    view, settings = GivenView.of("a", 0, np.full((12, 12, 3), 0.6, np.float32)), inverse.FitSettings(steps=2, spp=16)
+    path, ends = _bitmap(tmp_path, colours), []
+    for _ in range(2):
+        ends.append(inverse.fit(path, [view], ("albedo",), settings=settings))
+        mi.Bitmap(bytes_).write(str(tmp_path / "texels.png"))
+        text = path.read_text().replace("texels.exr", "texels.png")
+        path.write_text(text.replace('"raw" value="true"', '"raw" value="false"'))
+    assert ends[1].steps[0].values["albedo"] == pytest.approx(colours.mean(axis=(0, 1)), rel=1e-5)
+    np.testing.assert_allclose(ends[1].textures["albedo"], ends[0].textures["albedo"], atol=1e-3)
+    assert np.abs(ends[1].textures["albedo"] - colours).min() > 0
+    with pytest.raises(
+        ValueError, match="bitmap of albedo of 'plate' must have floats to be fitted, got bytes: load it"
+    ):
+        inverse.fit(open_scene(path), [view], ("albedo",), model=None, settings=settings)
+
+
 @pytest.mark.parametrize("kind", ["bitmap", "mesh"])
 def test_a_killed_fit_of_textures_goes_on_with_the_same_bits_and_writes_a_scene(tmp_path: Path, kind: str) -> None:
     path = _bitmap(tmp_path, np.full((4, 6, 3), 0.8)) if kind == "bitmap" else _mesh(tmp_path)

@@ -594,8 +594,7 @@ def stratified(obj: TranslucentObject, points: SurfacePoints, n: int, seed: int)
 
 def _paint(obj: TranslucentObject, out: SurfacePoint) -> mi.Spectrum:
     """The reflectance at exits, where media have textures; else 1."""
-    one = dr.zeros(mi.Spectrum, dr.width(out.p)) + 1
-    return one if obj.textured is None else mi.Spectrum(obj.transport.paint(out))
+    return dr.zeros(mi.Spectrum, dr.width(out.p)) + (1 if obj.textured is None else obj.transport.paint(out))
 
 
 def _brought(obj: TranslucentObject, prepared: Any, out: SurfacePoint, entry: EntrySample, u: mi.Point2f) -> _Brought:

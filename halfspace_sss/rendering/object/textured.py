@@ -247,17 +247,20 @@ class TexturedMedium:
             obj: the object they are on, whose uv and attributes they need; without it their texels are looked at.
 
         Raises:
-            ValueError: texels are not finite, of the albedo outside [0, 1], of reflectance negative, of sigma_t or mfp
-                not > 0; or the mesh of the object has no uv, or not the attribute.
+            ValueError: texels are not finite, of albedo or reflectance outside [0, 1], of sigma_t or mfp not > 0; or
+                the mesh of the object has no uv, or not the attribute.
         """
         for name, texture in self.textures.items():
-            values = texels(texture)
+            values, hint = texels(texture), ""
             if obj is not None:
                 if _by_uv(texture) and obj.shape.is_mesh() and not obj.shape.has_vertex_texcoords():
                     raise ValueError(f"object {obj.name} must have uv for the texture {name}, got a mesh without")
                 values = attributes(name, texture, obj.shape)
+                hint = (
+                    f" in an attribute of {obj.name}; bytes in a mesh file are read as 0 to 255: write floats, linear"
+                )
             if len(values):
-                check_values(name, values)
+                check_values(name, values, hint)
             if self.table is not None and name == "reflectance":
                 self.table.warn_of_clipped(values)
 
@@ -299,12 +302,26 @@ def texels(texture: mi.Texture) -> np.ndarray:
     for node in mi.traverse(texture).hierarchy:
         parameters = mi.traverse(node)
         if kind_of(node) == "BitmapTexture":
-            data = np.array(parameters["data"], dtype=float)
+            data = _shown_by(node)
             values.append(data.reshape(-1, data.shape[-1]))
         elif "value" in parameters:  # of a constant
             values.append(np.array(parameters["value"], dtype=float).reshape(1, -1))
     n = len(mi.Spectrum(0))
     return np.concatenate([np.zeros((0, n)), *(np.broadcast_to(v, (len(v), n)) for v in values)])
+
+
+def _shown_by(bitmap: mi.Texture) -> np.ndarray:
+    """What a bitmap shows at its texels, shape (rows, columns, channels); Mitsuba keeps bytes as they are in files."""
+    data = np.array(mi.traverse(bitmap)["data"])
+    if data.dtype != np.uint8:
+        return data.astype(float)
+    raw = re.search(r"^  raw = (\d)", str(bitmap), re.MULTILINE).group(1) == "1"
+    return data / 255 if raw else linear_of_srgb(data / 255)
+
+
+def linear_of_srgb(values: np.ndarray) -> np.ndarray:
+    """Linear values of sRGB ones (IEC 61966-2-1)."""
+    return np.where(values <= 0.04045, values / 12.92, ((np.maximum(values, 0) + 0.055) / 1.055) ** 2.4)
 
 
 def attributes(name: str, texture: mi.Texture, shape: mi.Shape) -> np.ndarray:
@@ -352,18 +369,18 @@ def _mean(name: str, texture: mi.Texture, shape: mi.Shape | None) -> np.ndarray:
     return values.mean(axis=0) if len(values) else np.full(len(mi.Spectrum(0)), UNKNOWN[name])
 
 
-def check_values(name: str, values: np.ndarray) -> None:
-    """ValueError if values of a parameter are no medium's."""
+def check_values(name: str, values: np.ndarray, hint: str = "") -> None:
+    """ValueError if values of a parameter are no medium's; it ends with the hint."""
     bounds = {
         "albedo": ("in [0, 1]", (values >= 0) & (values <= 1)),
-        "reflectance": ("finite and >= 0", np.isfinite(values) & (values >= 0)),
+        "reflectance": ("in [0, 1]", (values >= 0) & (values <= 1)),
         "scale": ("finite and > 0", np.isfinite(values) & (values > 0)),
         "sigma_t": ("finite and > 0 (1/mm)", np.isfinite(values) & (values > 0)),
         "mfp": ("finite and > 0 (mm)", np.isfinite(values) & (values > 0)),
     }
     bound, ok = bounds[name]
     if not ok.all():
-        raise ValueError(f"{name} must be {bound}, got {float(values[~ok].flat[0])!r}")
+        raise ValueError(f"{name} must be {bound}, got {float(values[~ok].flat[0])!r}{hint}")
 
 
 def textured_medium(values: dict[str, Any], g: Any, eta: float, channels: int) -> TexturedMedium:

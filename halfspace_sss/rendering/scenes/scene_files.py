@@ -139,8 +139,12 @@ def open_scene(
     orders: str | None = None,
     parameters: Mapping[str, str] | None = None,
     settings: Mapping[str, float] | None = None,
+    floats: bool = False,
 ) -> Any:
-    """As `load_scene`, but nothing is prepared yet: no model is made, and no object is learnt."""
+    """As `load_scene`, but nothing is prepared yet: no model is made, and no object is learnt.
+
+    With `floats`, texels of bitmaps are floats, which can be changed by any amount, whatever their files have.
+    """
     _check("model", model, model_names())
     _check("orders", orders, ORDERS)
     light = (settings or {}).get("light")
@@ -160,19 +164,20 @@ def open_scene(
         if orders:
             props["orders"] = orders
     _choose_integrator(state, walks, (bool(model), bool(model or orders)), settings or {})
-    _set_parameters(state, settings or {})
+    for plugin, given in zip(_INTEGRATORS.values(), _settings(settings or {})):
+        _set_parameters(state, plugin, given)
+    _set_parameters(state, "bitmap", {"format": "variant"} if floats else {})
     loaded = _made(scene, state, config)
     if not any(map(surface_of, loaded.shapes())):
         raise ValueError(_NO_OBJECT)
     return loaded
 
 
-def _set_parameters(state: Any, settings: Mapping[str, float]) -> None:
+def _set_parameters(state: Any, plugin: str, settings: Mapping[str, float | str]) -> None:
     for node in state.nodes if settings else ():
-        for plugin, given in zip(_INTEGRATORS.values(), _settings(settings)):
-            if node.props.plugin_name() == plugin:
-                for key, value in given.items():
-                    node.props[key] = value
+        if node.props.plugin_name() == plugin:
+            for key, value in settings.items():
+                node.props[key] = value
 
 
 def _settings(settings: Mapping[str, float]) -> tuple[dict, dict]:
