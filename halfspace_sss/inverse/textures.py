@@ -271,6 +271,10 @@ def _variable(
             f"the bitmap of {name} of {name_of(shape)} must have floats to be fitted, got bytes: load it with the "
             "format 'variant'"
         )
+    if numbers.shape[-1] not in (1, n):
+        raise ValueError(
+            f"{name} of {name_of(shape)} must have 1 or {n} channels to be fitted, got {numbers.shape[-1]}"
+        )
     bounds = _bounds(name, texture is None, textured, shape, mm_per_unit)
     if numbers.shape[-1] < n:  # a colour without hue
         bounds = bounds[0].max(keepdims=True), bounds[1].min(keepdims=True)

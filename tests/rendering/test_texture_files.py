@@ -14,7 +14,7 @@ from test_translucent_walk import _scene
 
 from halfspace_sss.rendering.object.objects import make_objects
 from halfspace_sss.rendering.object.settings import Settings
-from halfspace_sss.rendering.object.textured import texels
+from halfspace_sss.rendering.object.textured import attributes, texels
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -93,6 +93,22 @@ def test_the_example_of_the_guide_has_the_colours_of_its_file(tmp_path: Path) ->
     )
     values = texels(surface.inside.textured.textures["reflectance"])
     np.testing.assert_allclose(values, _values(False).reshape(-1, 3), rtol=1e-6)
+
+
+def test_colours_are_their_luminance_under_a_mono_variant(mono: None, tmp_path: Path) -> None:
+    """As Mitsuba shows them, of a bitmap and of vertices."""
+    inside, luminance = (
+        _inside("albedo", _file(tmp_path, "8 bits", False)),
+        _values(False)[0] @ [0.212671, 0.71516, 0.072169],
+    )
+    values, si = inside.textured.values_on(mi.load_dict({"type": "sphere"}))[0], mi.SurfaceInteraction3f()
+    si.uv = mi.Point2f([0.25, 0.75], 0.25)
+    np.testing.assert_allclose(values.ravel(), np.tile(luminance, 2), rtol=1e-5)
+    np.testing.assert_allclose(np.ravel(inside.textured.at(si).albedo), luminance, rtol=1e-5)
+    np.testing.assert_allclose(inside.medium.albedo, luminance.mean(), rtol=1e-5)
+    mesh = _mesh(np.tile(_values(False)[0, 0], (4, 1)))
+    shown = mi.load_dict({"type": "mesh_attribute", "name": "vertex_color"})
+    np.testing.assert_allclose(attributes("albedo", shown, mesh), luminance[0], rtol=1e-5)
 
 
 @pytest.mark.filterwarnings("ignore:object 'object' is not closed")

@@ -29,6 +29,7 @@ from halfspace_sss.rendering.object.shape import Geometry, name_of
 NODES = 1025  # of the table of x by reflectance
 BY_UV = ("BitmapTexture", "Checkerboard")
 KNOWN = (*BY_UV, "MeshAttribute", "UniformSpectrum", "SRGBReflectanceSpectrum")  # of which all values are known
+LUMINANCE = np.array([[0.212671], [0.715160], [0.072169]])  # of linear sRGB, as Mitsuba has it
 UNKNOWN = {"albedo": 0.5, "reflectance": 0.2, "sigma_t": 1.0, "mfp": 1.0}  # means of attributes before a mesh is known
 
 
@@ -306,8 +307,14 @@ def texels(texture: mi.Texture) -> np.ndarray:
             values.append(data.reshape(-1, data.shape[-1]))
         elif "value" in parameters:  # of a constant
             values.append(np.array(parameters["value"], dtype=float).reshape(1, -1))
+    return np.concatenate([np.zeros((0, len(mi.Spectrum(0)))), *map(_in_channels, values)])
+
+
+def _in_channels(values: np.ndarray) -> np.ndarray:
+    """Values of one channel or three as textures show them, shape (n, channels of the variant)."""
     n = len(mi.Spectrum(0))
-    return np.concatenate([np.zeros((0, n)), *(np.broadcast_to(v, (len(v), n)) for v in values)])
+    values = values @ LUMINANCE if values.shape[1] == 3 and n == 1 else values
+    return np.broadcast_to(values, (len(values), n))
 
 
 def _shown_by(bitmap: mi.Texture) -> np.ndarray:
@@ -330,7 +337,7 @@ def attributes(name: str, texture: mi.Texture, shape: mi.Shape) -> np.ndarray:
     Raises:
         ValueError: the shape has no such attribute, or one of another number of channels; `name` is the parameter's.
     """
-    n, values = len(mi.Spectrum(0)), []
+    values = []
     for node, key in shown(texture):
         if not (shape.is_mesh() and shape.has_attribute(key)):
             raise ValueError(f"object {name_of(shape)} must have the attribute {key!r} of the texture {name}")
@@ -340,9 +347,8 @@ def attributes(name: str, texture: mi.Texture, shape: mi.Shape) -> np.ndarray:
             raise ValueError(
                 f"the attribute {key!r} of the texture {name} must have 1 or 3 values, got {each.shape[1]}"
             )
-        each = each if each.shape[1] == n else each.mean(axis=1, keepdims=True)
-        values.append(np.broadcast_to(each * float(mi.traverse(node)["scale"]), (count, n)))
-    return np.concatenate([np.zeros((0, n)), *values])
+        values.append(_in_channels(each * float(mi.traverse(node)["scale"])))
+    return np.concatenate([np.zeros((0, len(mi.Spectrum(0)))), *values])
 
 
 def shown(texture: mi.Texture) -> list[tuple[mi.Object, str]]:
