@@ -17,7 +17,7 @@ import mitsuba as mi
 
 from halfspace_sss.rendering.light.small_emitters import NARROW, WIDE, SmallEmitters
 from halfspace_sss.rendering.object.points import lifted, opaque, sided
-from halfspace_sss.rendering.object.rounding import ray_to
+from halfspace_sss.rendering.object.rounding import ray_from, ray_to
 from halfspace_sss.rendering.walk.emitter_connections import (
     Departure,
     EmitterDirections,
@@ -230,7 +230,8 @@ class LightVisitor:
         ctx.type_mask = mi.BSDFFlags.DeltaReflection
         bs, value = bsdf.sample(ctx, si, 0.0, mi.Point2f(0), active)
         d, _ = sided(si, bs.wo)
-        met = self.media.sight.intersect(self.scene, si.spawn_ray(d), mi.RayFlags.All, active=active)
+        ray = ray_from(si, d, self.media.sight.rounding(si))
+        met = self.media.sight.intersect(self.scene, ray, mi.RayFlags.All, active=active)
         emitter = met.emitter(self.scene, active)
         active = active & (emitter != None) & (bs.pdf > 0)  # noqa: E711
         return dr.select(active, walk.weight * value * emitter.eval(met, active), 0)
@@ -432,8 +433,7 @@ class PathTracer:
     def _bounce(self, p: CameraPath, si: mi.SurfaceInteraction3f) -> CameraPath:
         """A surface met from outside: next-event estimation, BSDF sampling, Russian roulette, the way on or in."""
         # ---- BSDF or boundary
-        walk, light, media = p.walk, p.light, self.visitor.media
-        rng = walk.rng
+        walk, light, media, rng = p.walk, p.light, self.visitor.media, p.walk.rng
         k, bsdf = media.draw(si, walk.d, rng)
         translucent, near = k >= 0, dr.maximum(k, 0)
         si = media.seen(si, k, walk.d)
@@ -451,11 +451,7 @@ class PathTracer:
         L = light.L + self.visitor.sampled_emitter(walk, si, bsdf, lit, translucent)
 
         # ---- emitters in the mirror of a smooth boundary: F L(mirrored direction)
-        mirrors = translucent & lit & ~media.row("rough", near) if media.objects else mi.Bool(False)
-        emission = self.visitor.mirrored_emitter(walk, si, bsdf, mirrors) if media.objects else mi.Spectrum(0)
-        L = L + emission
-        if self.layers:
-            p = replace(p, emission=p.emission + dr.select(p.depth == 1, emission, 0))
+        mirrors, L, p = self._mirror(L, p, si, bsdf, near, translucent & lit)
 
         # ---- BSDF sampling
         bs, value = sample_bsdf(bsdf, si, rng)
@@ -471,8 +467,7 @@ class PathTracer:
         alive = (bs.pdf > 0) & (size > 0) & (rng.next_float32() < survive) & ~(mute & ~enters)
 
         # ---- the way on, or into an object
-        u = rng.next_float32()
-        channel = walk.channel
+        u, channel = rng.next_float32(), walk.channel
         if len(weight) > 1:  # drawn once in a path, whose densities are counted from there
             channel = dr.select(p.depth == 1, _channel(u, len(weight)), channel)
         if media.inner is not None:  # from glass inside an object
@@ -480,25 +475,37 @@ class PathTracer:
             k, enters = dr.select(returns, around, k), enters | returns
         o, off = media.depart(si, d, enters)
         if media.carried:  # the medium of the exit, for the whole walk
-            enters_object = alive & enters
-            walk = replace(walk, medium=dr.select(enters_object, media.fetch(near, si, enters_object), walk.medium))
+            new = alive & enters
+            walk = replace(walk, medium=dr.select(new, media.fetch(near, si, new), walk.medium))
         walk = replace(walk, o=o, d=d, off=off, alive=alive, order=dr.select(enters, 0, walk.order),
                        object=dr.select(alive & enters, k, OUTSIDE), weight=weight, scale=scale,
                        channel=channel)  # fmt: skip
         delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta) | turned
-        scattered = light.scattered | ~delta
-        again = mi.Bool(False)  # still straight from the event
+        scattered, again = light.scattered | ~delta, mi.Bool(False)  # still straight from the event
         if self.visitor.straight_light is not None:
-            again = light.sighted & enters & (k == light.departure.object)
-            again &= self.visitor.straight_light.passes_again(near)
+            again = light.sighted & enters & self.visitor.straight_light.passes_again(near)
+            again &= k == light.departure.object
         light = replace(light, L=L, previous=dr.select(again, light.previous, si.p), sighted=again,
-                        pdf=dr.select(again, light.pdf, bs.pdf), delta=delta & ~again, scattered=scattered)  # fmt: skip
-        light = replace(light, precomputed=mirrors & ~enters)
+                        pdf=dr.select(again, light.pdf, bs.pdf), delta=delta & ~again, scattered=scattered,
+                        precomputed=mirrors & ~enters)  # fmt: skip
         if media.inner is not None:
             delta = ~again & (delta | enters | encloses)
             L = L + self.visitor.spread_inner_lights(walk, scattered & enters)
             light = replace(light, delta=delta, L=L)
         return replace(p, walk=walk, light=light)
+
+    def _mirror(
+        self, L: mi.Spectrum, p: CameraPath, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, k: mi.Int32, active: mi.Bool
+    ) -> tuple[mi.Bool, mi.Spectrum, CameraPath]:
+        """Whether object k mirrors, and the light with the emission it mirrors, at the first vertex also told apart."""
+        media = self.visitor.media
+        if not media.objects:
+            return mi.Bool(False), L, p
+        mirrors = active & ~media.row("rough", k)
+        emission = self.visitor.mirrored_emitter(p.walk, si, bsdf, mirrors)
+        if self.layers:
+            p = replace(p, emission=p.emission + dr.select(p.depth == 1, emission, 0))
+        return mirrors, L + emission, p
 
 
 def _channel(u: mi.Float, n: int) -> mi.UInt32:

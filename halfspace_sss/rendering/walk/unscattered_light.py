@@ -38,6 +38,7 @@ from halfspace_sss.physics.medium import eval_hg
 from halfspace_sss.rendering.gathered.points import lattice, uniform_entries
 from halfspace_sss.rendering.object.instances import Pose, corners, ends_of
 from halfspace_sss.rendering.object.points import EntrySample, lift, opaque, sided
+from halfspace_sss.rendering.object.rounding import ray_to
 from halfspace_sss.rendering.walk.inside_cells import POINTS, InsideCells, grid_edge
 from halfspace_sss.rendering.walk.media import WalkMedia
 from halfspace_sss.rendering.walk.random_walk import Event, pick, sample_bsdf
@@ -215,107 +216,162 @@ def _entries(media: WalkMedia, k: int, u: list[mi.Float]) -> EntrySample:
     return Pose(*columns, mi.Float(0)).entry(entries)
 
 
+@dataclass
+class _Ray:
+    """Loop variables of a ray of light inside an object."""
+
+    o: mi.Point3f
+    d: mi.Vector3f
+    off: mi.Vector3f  # from o to where the ray is clear of the surface
+    flux: mi.Spectrum  # where it entered, times reflectances since
+    T: mi.Spectrum  # transmittance since it entered
+    alive: mi.Bool
+    rng: mi.PCG32
+
+
+@dataclass(frozen=True, eq=False)
+class _Rays:
+    """Rays that bring the light of emitters to the cells of one object.
+
+    Args:
+        scene, media: of Mitsuba, and its objects.
+        k: number of the object.
+        grid: its cells.
+        D: ∫ L_0 x_j dx dw over the inside of each cell by channel, x about its centre in units of h.
+        octants: of each octant of directions w to the light ∫ L_0 dx dw by channel, 0, ∫ L_0 w dx dw of all channels,
+            0; None where directions do not count.
+    """
+
+    scene: mi.Scene
+    media: WalkMedia
+    k: mi.Int32
+    grid: InsideCells
+    D: mi.Float
+    octants: mi.Float | None
+
+    def enter(self, number: int, rays: int, seed: int) -> _Ray:
+        """Rays of emitters at points of the surface, refracted into the object.
+
+        By the camera's paths, light is L cos(w, n_s) f / |d.n_s| for each radiance along d; a ray has the flux
+
+            L cos(w, n_s) (f cos / pdf)(w -> d) |d.n| / |d.n_s|,
+
+        over the density of the point and of w, n_s the shading normal.
+        """
+        media, rng = self.media, generator(mi, rays, pass_seed(seed, number))
+
+        # ---- points in order along the faces, with a sample of the emitters each
+        shift = np.random.default_rng([seed, number]).random(5)
+        u = [(dr.arange(mi.Float, rays) + opaque(shift[4])) / opaque(rays)]
+        for root, s in zip(R_4, shift):
+            # multiples of a root in whole numbers, which float32 would round
+            step, first = (dr.opaque(mi.UInt32, int(v * 2**32) % 2**32) for v in (root, s))
+            u.append(mi.Float((dr.arange(mi.UInt32, rays) * step + first) >> 8) * 2**-24)
+        at = _entries(media, number, [dr.minimum(u[0], 1 - 2**-24), u[1], u[2]])
+        si = dr.zeros(mi.SurfaceInteraction3f, rays)
+        si.p, si.n, si.sh_frame = mi.Point3f(at.p), mi.Normal3f(at.n), mi.Frame3f(at.n_out)
+        ds, light = self.scene.sample_emitter_direction(si, mi.Point2f(u[3], u[4]), False)
+        shadow = ray_to(si, ds.p, media.row("rounding", self.k))
+        si.wi = si.to_local(ds.d)
+        si = lift(si, ds.d)
+
+        # ---- refraction
+        bs, value = sample_bsdf(media.boundary(self.k), si, rng, _only(mi.BSDFFlags.Transmission))
+        d, _ = sided(si, bs.wo)
+        cosine = mi.Frame3f.cos_theta(si.wi)
+        bend = dr.abs(dr.dot(d, si.n)) / dr.maximum(dr.abs(mi.Frame3f.cos_theta(bs.wo)), 1e-6)
+        enters = (ds.pdf > 0) & (bs.pdf > 0) & (dr.dot(si.n, ds.d) > 0) & (cosine > 0) & (dr.dot(d, si.n) < 0)
+        flux = dr.select(enters, light * value * (cosine * bend * at.weight / opaque(rays)), 0)
+        enters &= dr.max(flux) > 0
+        enters &= ~self.scene.ray_test(shadow, False, enters)
+        T = dr.full(mi.Spectrum, 1, rays)
+        return _Ray(mi.Point3f(at.p), d, media.clear(self.k, si.n, d), mi.Spectrum(flux), T, mi.Bool(enters), rng)
+
+    def segment(self, ray: _Ray) -> _Ray:
+        """Light along a ray as far as the surface, and its reflection there."""
+        media, d, rng = self.media, ray.d, ray.rng
+        si = media.sight.intersect(media.scene, mi.Ray3f(ray.o + ray.off, d), mi.RayFlags.All, active=ray.alive)
+        alive = ray.alive & si.is_valid()
+        far = dr.select(alive, dr.maximum(si.t + dr.dot(ray.off, d), 0), 0)
+
+        # ---- light along it
+        self._add(ray, far, alive)
+
+        # ---- reflection: flux F, with roulette; behind an object that overlaps the ray goes on, and behind its own
+        # boundary if rounding has put it outside
+        met = media.met(si, self.k) == self.k
+        si = media.seen(si, self.k, d)
+        own = met & (dr.dot(si.n, d) > 0)
+        bs, value = sample_bsdf(media.boundary(self.k), si, rng, _only(mi.BSDFFlags.Reflection))
+        new, _ = sided(si, bs.wo)
+        T = ray.T * self._transmittance(ray, far)
+        left = dr.max(ray.flux * value * T) / dr.maximum(dr.max(ray.flux), 1e-30)
+        survive = dr.minimum(left / ROULETTE, 1)
+        reflected = (dr.dot(si.n, new) < 0) & (rng.next_float32() < survive)
+        d = mi.Vector3f(dr.select(own, new, d))
+        flux = dr.select(own, ray.flux * value / dr.maximum(survive, 1e-20), ray.flux)
+        return _Ray(mi.Point3f(si.p), d, media.clear(self.k, si.n, d), flux, T, alive & (~own | reflected), rng)
+
+    def _add(self, ray: _Ray, far: mi.Float, active: mi.Bool) -> None:
+        """Add light to the cells at ALONG points of a segment, drawn by mean_c sigma_c T_c / (1 - T_c(far))."""
+        grid, n = self.grid, len(mi.Spectrum(0))
+        sigma_t = self.media.spectrum("sigma_t", self.k)
+        low, scale = mi.Point3f(*(opaque(v) for v in grid.low)), opaque(1 / grid.h)
+        counts = mi.Vector3i(*(dr.opaque(mi.Int32, int(v)) for v in grid.counts))
+        ends = 1 - dr.exp(-sigma_t * far)
+        octant = sum(dr.select(ray.d[a] < 0, mi.Int32(1 << a), 0) for a in range(3))
+        u_0, first = ray.rng.next_float32(), mi.UInt32(ray.rng.next_float32() * n)
+
+        def add(j: mi.UInt32, rng: mi.PCG32) -> tuple[mi.UInt32, mi.PCG32]:
+            # ---- a point at the distance s
+            rate, end = (pick(v, (first + j) % n) for v in (sigma_t, ends))
+            u = u_0 + mi.Float(j) / ALONG
+            s = dr.minimum(-dr.log(1 - dr.minimum((u - dr.floor(u)) * end, 1 - 2**-24)) / rate, far)
+            pdf = dr.sum(sigma_t * dr.exp(-sigma_t * s) / dr.maximum(ends, 1e-20)) / n
+            light = ray.flux * ray.T * self._transmittance(ray, s, rng) / dr.maximum(pdf * ALONG, 1e-20)
+
+            # ---- its cell, and its place there
+            x = (ray.o + ray.d * s - low) * scale
+            cell = mi.Vector3i(dr.floor(x))
+            y = x - (mi.Vector3f(cell) + 0.5)
+            held = active & (far > 0) & dr.all((cell >= 0) & (cell < counts))
+            slot = dr.gather(mi.Int32, grid.slot, (cell.z * counts.y + cell.y) * counts.x + cell.x, held)
+            held &= slot >= 0
+
+            # ---- light x_j by channel, and by octant
+            for c in range(n):
+                dr.scatter_add(self.D, mi.Vector4f(1, y.x, y.y, y.z) * light[c], mi.UInt32(slot * n + c), held)
+            if self.octants is not None:
+                index, v = mi.UInt32(slot * OCTANTS + octant) * 2, ray.d * -dr.sum(light)
+                by_channel = mi.Vector4f(*(light[c] if c < n else mi.Float(0) for c in range(4)))
+                dr.scatter_add(self.octants, by_channel, index, held)
+                dr.scatter_add(self.octants, mi.Vector4f(v.x, v.y, v.z, 0), index + 1, held)
+            return j + 1, rng
+
+        dr.while_loop((mi.UInt32(0), mi.PCG32(ray.rng)), lambda j, rng: j < ALONG, add, label="points of a ray")
+
+    def _transmittance(self, ray: _Ray, s: mi.Float, rng: mi.PCG32 | None = None) -> mi.Spectrum:
+        """exp(-∫ sigma_t) over a distance along a ray."""
+        return self.media.transmittance(self.k, mi.Ray3f(ray.o, ray.d), s, rng or ray.rng)
+
+
+def _only(flags: int) -> mi.BSDFContext:
+    """The part of a boundary that transmits or reflects, for light."""
+    ctx = mi.BSDFContext(mi.TransportMode.Importance)
+    ctx.type_mask = flags
+    return ctx
+
+
 def _moments(
     scene: mi.Scene, media: WalkMedia, k: int, grid: InsideCells, seed: int, rays: int, directional: bool
 ) -> tuple[np.ndarray, np.ndarray | None]:
-    """∫ L_0 x_j dx dw over the inside of each cell, shape (slots, channels, 4), x about its centre in units of h.
-
-    With it, if `directional`, ∫ L_0 dx dw by channel and ∫ L_0 w dx dw of all channels, each of the directions w to
-    the light in an octant, shape (slots, octants, 8).
-    """
-    n, number = len(mi.Spectrum(0)), dr.full(mi.Int32, k, rays)
+    """D of the cells of object k, shape (slots, channels, 4), and its octants, (slots, octants, 8) if `directional`."""
+    n = len(mi.Spectrum(0))
     D = dr.zeros(mi.Float, grid.slots * n * 4)
-    octants = dr.zeros(mi.Float, grid.slots * OCTANTS * 8 if directional else 1)
-    rng = generator(mi, rays, pass_seed(seed, k))
-
-    # ---- points of the surface, in order along its faces, with a sample of the emitters each
-    shift = np.random.default_rng([seed, k]).random(5)
-    u = [(dr.arange(mi.Float, rays) + opaque(shift[4])) / opaque(rays)]
-    for root, s in zip(R_4, shift):
-        # multiples of a root in whole numbers, which float32 would round
-        step, offset = (dr.opaque(mi.UInt32, int(v * 2**32) % 2**32) for v in (root, s))
-        u.append(mi.Float((dr.arange(mi.UInt32, rays) * step + offset) >> 8) * 2**-24)
-    at = _entries(media, k, [dr.minimum(u[0], 1 - 2**-24), u[1], u[2]])
-    si = dr.zeros(mi.SurfaceInteraction3f, rays)
-    si.p, si.n, si.sh_frame = mi.Point3f(at.p), mi.Normal3f(at.n), mi.Frame3f(at.n_out)
-    ds, light = scene.sample_emitter_direction(si, mi.Point2f(u[3], u[4]), True)
-    si.wi = si.to_local(ds.d)
-    si = lift(si, ds.d)
-
-    # ---- refraction: flux = L cos(w, n_s) f cos / pdf |d.n| / |d.n_s|, as the walk sees the boundary
-    ctx = mi.BSDFContext(mi.TransportMode.Importance)
-    ctx.type_mask = mi.BSDFFlags.Transmission
-    bs, value = sample_bsdf(media.boundary(number), si, rng, ctx)
-    d, _ = sided(si, bs.wo)
-    cosine = mi.Frame3f.cos_theta(si.wi)
-    bend = dr.abs(dr.dot(d, si.n)) / dr.maximum(dr.abs(mi.Frame3f.cos_theta(bs.wo)), 1e-6)
-    enters = (ds.pdf > 0) & (bs.pdf > 0) & (dr.dot(si.n, ds.d) > 0) & (cosine > 0) & (dr.dot(d, si.n) < 0)
-    flux = dr.select(enters, light * value * (cosine * bend * at.weight / opaque(rays)), 0)
-    enters &= dr.max(flux) > 0
-
-    sigma_t = media.spectrum("sigma_t", number)
-    low, scale = mi.Point3f(*(opaque(v) for v in grid.low)), opaque(1 / grid.h)
-    counts = mi.Vector3i(*(dr.opaque(mi.Int32, int(v)) for v in grid.counts))
-    slots = grid.slot
-
-    def transmitted(o: mi.Point3f, d: mi.Vector3f, s: mi.Float, rng: mi.PCG32) -> mi.Spectrum:
-        return media.transmittance(number, mi.Ray3f(o, d), s, rng) if media.varies else dr.exp(-sigma_t * s)
-
-    def segment(o, d, skip, flux, passed, alive, rng) -> tuple:
-        ray = mi.Ray3f(o + d * skip, d)
-        si = media.sight.intersect(media.scene, ray, mi.RayFlags.All, active=alive)
-        own = alive & si.is_valid()
-        own &= media.met(si, number) == number
-        far = dr.select(own, si.t + skip, 0)
-
-        # ---- points along it: density mean_c sigma_c T_c / (1 - T_c(far))
-        ends = 1 - dr.exp(-sigma_t * far)
-        octant = dr.select(d.x < 0, 1, 0) + dr.select(d.y < 0, 2, 0) + dr.select(d.z < 0, 4, 0)
-        u0, turn = rng.next_float32(), mi.UInt32(rng.next_float32() * n)
-
-        def add(j: mi.UInt32, rng: mi.PCG32) -> tuple:
-            rate, end = (pick(v, (j + turn) % n) for v in (sigma_t, ends))
-            u = u0 + mi.Float(j) / ALONG
-            s = dr.minimum(-dr.log(1 - dr.minimum((u - dr.floor(u)) * end, 1 - 2**-24)) / rate, far)
-            T = dr.exp(-sigma_t * s)
-            pdf = dr.sum(sigma_t * T / dr.maximum(ends, 1e-20)) / n
-            T = transmitted(o, d, s, rng) if media.varies else T
-            light = flux * passed * T / dr.maximum(pdf * ALONG, 1e-20)
-            x = (o + d * s - low) * scale
-            cell = mi.Vector3i(dr.floor(x))
-            y = x - (mi.Vector3f(cell) + 0.5)
-            held = own & (far > 0) & dr.all((cell >= 0) & (cell < counts))
-            slot = dr.gather(mi.Int32, slots, (cell.z * counts.y + cell.y) * counts.x + cell.x, held)
-            held &= slot >= 0
-            for c in range(n):
-                moments = mi.Vector4f(1, y.x, y.y, y.z) * light[c]
-                dr.scatter_add(D, moments, mi.UInt32(slot * n + c), held)
-            if directional:
-                index = mi.UInt32(slot * OCTANTS + octant) * 2
-                by_channel = mi.Vector4f(*(light[c] if c < n else mi.Float(0) for c in range(4)))
-                v = d * -dr.sum(light)
-                dr.scatter_add(octants, by_channel, index, held)
-                dr.scatter_add(octants, mi.Vector4f(v.x, v.y, v.z, 0), index + 1, held)
-            return j + 1, rng
-
-        _, rng = dr.while_loop((mi.UInt32(0), rng), lambda j, rng: j < ALONG, add, label="points of a ray")
-
-        # ---- reflection inside, with the weight of the boundary and roulette
-        si = media.seen(si, number, d)
-        ctx = mi.BSDFContext(mi.TransportMode.Importance)
-        ctx.type_mask = mi.BSDFFlags.Reflection
-        bs, value = sample_bsdf(media.boundary(number), si, rng, ctx)
-        new, _ = sided(si, bs.wo)
-        passed = passed * transmitted(o, d, far, rng)
-        left = dr.max(value) * dr.max(flux * passed) / dr.maximum(dr.max(flux), 1e-30)
-        survive = dr.minimum(left / ROULETTE, 1)
-        alive = own & (dr.dot(si.n, d) > 0) & (dr.dot(si.n, new) < 0) & (rng.next_float32() < survive)
-        flux = flux * value / dr.maximum(survive, 1e-20)
-        return mi.Point3f(si.p), mi.Vector3f(new), media.clear(number, si.n, new), flux, passed, alive, rng
-
-    start = (mi.Point3f(at.p), mi.Vector3f(d), media.clear(number, si.n, d), mi.Spectrum(flux),
-             dr.full(mi.Spectrum, 1, rays), mi.Bool(enters), rng)  # fmt: skip
-    dr.while_loop(start, lambda o, d, skip, flux, passed, alive, rng: alive, segment, label="rays of light")
+    octants = dr.zeros(mi.Float, grid.slots * OCTANTS * 8) if directional else None
+    traced = _Rays(scene, media, dr.full(mi.Int32, k, rays), grid, D, octants)
+    start = traced.enter(k, rays, seed)
+    dr.while_loop((start,), lambda ray: ray.alive, lambda ray: (traced.segment(ray),), label="rays of light")
     dr.eval(D, octants)
     D = np.array(D).reshape(grid.slots, n, 4)
     return D, np.array(octants).reshape(grid.slots, OCTANTS, 8) if directional else None
