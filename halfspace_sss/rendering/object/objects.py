@@ -50,16 +50,15 @@ from halfspace_sss.rendering.object.registry import AUTO, Choices, choices, look
 from halfspace_sss.rendering.object.settings import AUTOMATIC, Settings
 from halfspace_sss.rendering.object.shape import (
     Geometry,
+    SceneMark,
     check_together,
     geometry_of,
     is_instance,
     name_of,
-    number_of,
-    same_objects,
     scene_of,
-    state_of,
     survey,
 )
+from halfspace_sss.rendering.object.snapshot import Snapshot, same_objects
 from halfspace_sss.rendering.object.spectral import MediumByWavelength
 from halfspace_sss.rendering.object.textured import SurfaceMedium, TexturedMedium
 from halfspace_sss.rendering.object.translucent import Inside, check_boundary
@@ -76,13 +75,13 @@ class Contents:
         found: shapes that neither emit nor reach out of the object, those inside each other too.
         scene: a scene that holds these only.
         insides: of each what is below its surface, 1/(scene unit); None where that is not translucent.
-        surfaces: state of each BSDF, from `state_of`.
+        surfaces: of each the BSDF as it is.
     """
 
     found: list[Content]
     scene: mi.Scene
     insides: list[Inside | None]
-    surfaces: list[tuple[list, list]]
+    surfaces: list[Snapshot]
 
     @classmethod
     def of(cls, result: list[Content], world: mi.Scene, mm_per_unit: float) -> Contents:
@@ -91,7 +90,7 @@ class Contents:
         surfaces = [surface_of(shape) for shape in shapes]
         below = [surface and surface.inside for surface in surfaces]
         insides = [inside and replace(inside, medium=inside.medium.scaled(mm_per_unit)) for inside in below]
-        return cls(result, scene_of(shapes, world), insides, [state_of(shape.bsdf()) for shape in shapes])
+        return cls(result, scene_of(shapes, world), insides, [Snapshot.of(shape.bsdf()) for shape in shapes])
 
     @property
     def shapes(self) -> list[mi.Shape]:
@@ -100,7 +99,7 @@ class Contents:
 
     def is_current(self) -> bool:
         """Whether the surfaces still are as they were."""
-        return all(state_of(shape.bsdf())[0] == keys for shape, (keys, _) in zip(self.shapes, self.surfaces))
+        return all(Snapshot.of(shape.bsdf()) == state for shape, state in zip(self.shapes, self.surfaces))
 
     def check_held(self) -> None:
         """ValueError if gradients are enabled for a parameter of them: a transport knows no other."""
@@ -178,12 +177,11 @@ def outermost(scene: mi.Scene) -> list[mi.Shape]:
     return [shape for shape in shapes if not any(shape is content.thing for content in result)]
 
 
-def places_of(scene: mi.Scene) -> tuple[list, list]:
-    """What tells whether shapes or lamps of a scene have been moved; what is kept so that no number is reused."""
-    results = [geometry_of(shape) for shape in scene.shapes()]
+def places_of(scene: mi.Scene) -> list:
+    """What tells whether shapes, those of groups too, or lamps of a scene have been moved."""
+    shapes = [node for node in mi.traverse(scene).hierarchy if isinstance(node, mi.Shape)]
     lamps = [place_of(emitter) for emitter in scene.emitters()]
-    places = [None if place is None else place.tolist() for place in lamps]
-    return [*(key for key, _ in results), *places], [kept for _, kept in results]
+    return [*map(geometry_of, shapes), *(None if place is None else place.tolist() for place in lamps)]
 
 
 def translucent_shapes(scene: mi.Scene) -> list[Any]:
@@ -240,7 +238,7 @@ class TranslucentObject:
         expected: what each kind of light is expected to bring.
         variation: how its light varies with its medium.
         gathered: what leaves by orders from two on, in place of a transport, see `paths.gathering`.
-        painted: state of its shape, whose attributes textures show, if the surface has textures.
+        painted: its shape as it was, whose attributes textures show, if the surface has textures.
         sight: of the scene that it is rendered in.
     """
 
@@ -256,7 +254,7 @@ class TranslucentObject:
     expected: Expected | None = None
     variation: Variation | None = None
     gathered: Any = None
-    painted: tuple[list, list] = ([], [])
+    painted: Snapshot | None = None
     sight: Sight = Sight([], {})
 
     @property
@@ -366,7 +364,7 @@ class TranslucentObject:
     def is_current(self) -> bool:
         """Whether the object still has the shape and the medium that it was made of."""
         textured, shape = self.surface.inside.textured, self.geometry.shape
-        same = textured is None or self.painted[0] == state_of(shape)[0]
+        same = textured is None or self.painted == Snapshot.of(shape)
         if textured is not None and self.textured is None:  # its textures are the same everywhere
             with dr.resume_grad():
                 same = same and not textured.is_followed(shape)
@@ -378,8 +376,8 @@ class TranslucentObjects:
 
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
-        self._made: tuple[int, list, list[TranslucentObject]] = (0, [], [])
-        self._places: tuple[list, list] = ([], [])
+        self._made: tuple[SceneMark | None, list, list[TranslucentObject]] = (None, [], [])
+        self._places: list = []
         if settings.model:
             lookup(settings.model)
         self.choices = Choices({}, settings.light, {})  # for as long as the objects are the same
@@ -391,18 +389,18 @@ class TranslucentObjects:
     def of(self, scene: Any) -> list[TranslucentObject]:
         """The objects of a scene; errors as in `make_objects`."""
         shapes = scene.shapes()  # the scene itself, which holds its integrator, would never be freed
-        world, before, objects = self._made
-        same = world == number_of(scene) and same_objects(before, shapes)
+        mark, (world, before, objects) = SceneMark(scene), self._made
+        same = world == mark and same_objects(before, shapes)
         current = bool(objects) and same and all(obj.is_current() for obj in objects)
         places = places_of(scene)
-        if current and places[0] != self._places[0]:
+        if current and places != self._places:
             results = [obj.geometry for obj in objects]
             current = not any(geometry.contents for geometry in results) and not contents(scene, results)
             current = current and not objects[0].sight.shapes
         if not current:
             if not (objects and same):
                 self.choices = _choices(scene, self.settings)
-            self._made = number_of(scene), shapes, make_objects(scene, self.settings, (), self.choices)
+            self._made = mark, shapes, make_objects(scene, self.settings, (), self.choices)
         self._places = places
         return self._made[2]
 
@@ -497,7 +495,7 @@ def _make_object(geometry: Geometry, inside: Inside, settings: Settings) -> Tran
         inside.textured.check(geometry)
         even = inside.textured.is_even(geometry.shape)
         textured = None if even else inside.textured.scaled(settings.mm_per_unit)
-        obj = replace(obj, textured=textured, painted=state_of(geometry.shape))
+        obj = replace(obj, textured=textured, painted=Snapshot.of(geometry.shape))
     if inside.spectral is not None:
         obj = replace(obj, spectral=inside.spectral.scaled(settings.mm_per_unit))
     single_only = inside.orders == "single" or not any(float(m.sigma_s) > 0 for m in media)

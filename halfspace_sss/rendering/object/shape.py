@@ -14,6 +14,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from halfspace_sss.rendering.object.rounding import bound_of, ray_from
+from halfspace_sss.rendering.object.snapshot import Snapshot
 
 MOST_COPIES = 1e-3  # share of the area in faces that exist twice, by which light may then be wrong
 CREASES = 0.01  # of the corners whose vertex normal may be on the other side of the face, as at sharp edges
@@ -184,7 +185,7 @@ class Geometry:
         pieces: UInt32 array of the connected piece of each face, or None if there is one piece.
         size: diagonal of the bounding box, scene units.
         area: scene units squared.
-        fingerprint: what it was surveyed with, from `geometry_of`.
+        state: `geometry_of` the shape as it was surveyed.
         contents: the `Contents` that lie inside, for a transport that takes them; None where nothing does.
         group: the `instances.Group` whose instances show the shape; None of a shape that stands in the scene itself.
         pose: the `instances.Pose` of the instance that is met, for rays of the scene; without it those of a shape in a
@@ -200,7 +201,7 @@ class Geometry:
     pieces: Any
     size: float
     area: float
-    fingerprint: Any
+    state: Snapshot
     contents: Any = None
     group: Any = None
     pose: Any = None
@@ -212,7 +213,7 @@ class Geometry:
 
     def is_current(self) -> bool:
         """Whether the shape, and surfaces inside it, still are as they were surveyed."""
-        same = geometry_of(self.shape)[0] == self.fingerprint[0]
+        same = geometry_of(self.shape) == self.state
         return same and (self.contents is None or self.contents.is_current())
 
     def piece(self, prim_index: mi.UInt32, active: mi.Bool) -> Any:
@@ -267,11 +268,6 @@ class Geometry:
         return dr.gather(mi.Float, self.signs, prim_index, active)
 
 
-def same_objects(a: list[Any], b: list[Any]) -> bool:
-    """Whether two lists hold the same objects of Mitsuba."""
-    return len(a) == len(b) and all(x is y for x, y in zip(a, b))
-
-
 def survey(shape: mi.Shape, world: mi.Scene | None = None) -> Geometry:
     """Look at a shape from outside with rays; warns if it is not closed, or if its faces point to both sides.
 
@@ -324,31 +320,18 @@ def survey(shape: mi.Shape, world: mi.Scene | None = None) -> Geometry:
                   area, geometry_of(shape))  # fmt: skip
 
 
-def geometry_of(shape: mi.Shape) -> tuple[list, list]:
-    """What tells one geometry of a shape from the next; the arrays with it are kept so that no number is reused."""
-    results, kept = [], []
-    for key, value in mi.traverse(shape).items():
-        if key in ("vertex_positions", "vertex_normals", "faces", "grid", "control_points", "data"):
-            kept.append(dr.detach(value))
-            results.append((key, dr.detail.collect_indices(kept[-1])))
-        elif key == "to_world":
-            results.append((key, matrix_of(value).tobytes()))
-    return results, kept
+PLACES = ("to_world", "vertex_positions", "vertex_normals", "faces", "grid", "control_points", "data", "extent")
+
+
+def geometry_of(shape: mi.Shape) -> Snapshot:
+    """What tells one geometry of a shape from the next."""
+    return Snapshot.of(shape, PLACES.__contains__)
 
 
 def matrix_of(to_world: mi.Transform4f) -> np.ndarray:
     """The matrix (4, 4) of a transformation, read number by number: as one array it would take a kernel."""
     matrix = dr.detach(to_world).matrix
     return np.array([[matrix[row, column][0] for column in range(4)] for row in range(4)], dtype=float)
-
-
-def state_of(node: mi.Object) -> tuple[list, list]:
-    """What tells whether any parameter of an object of Mitsuba changed; what is kept so that no number is reused."""
-    results, kept = [], []
-    for key, value in mi.traverse(node).items():
-        kept.append(dr.detach(value) if dr.is_array_v(value) else value)
-        results.append((key, dr.detail.collect_indices(kept[-1]) or repr(value)))
-    return results, kept
 
 
 class _Votes:
@@ -517,9 +500,22 @@ def looked_up(table: mi.Int32, pointer: Any, otherwise: int, active: Any = True)
     return dr.select(known, dr.gather(mi.Int32, table, number, known), otherwise)
 
 
-def number_of(scene: mi.Scene) -> int:
-    """What tells the scenes apart that objects may stand in; only OptiX has to know."""
-    return scene.ptr if _by_optix() else 0
+class SceneMark:
+    """Tells a scene from others that the same objects may stand in; only OptiX has to know.
+
+    Mitsuba lists the shapes of each scene in a variable, which is kept in place of the scene: that would never be
+    freed, and its address is given again once it is.
+    """
+
+    __hash__ = None
+
+    def __init__(self, scene: mi.Scene) -> None:
+        self._kept = scene.shapes_dr() if _by_optix() else mi.ShapePtr()
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, SceneMark):
+            return NotImplemented
+        return dr.detail.collect_indices(self._kept) == dr.detail.collect_indices(other._kept)
 
 
 def scene_of(shapes: list[Any], world: mi.Scene | None = None) -> Any:

@@ -39,7 +39,7 @@ from halfspace_sss.rendering.gathered.transfer import (
 from halfspace_sss.rendering.object.points import cosine_above, opaque, place
 from halfspace_sss.rendering.object.rounding import ray_from, ray_to
 from halfspace_sss.rendering.object.settings import FEWEST_PHOTONS
-from halfspace_sss.rendering.object.shape import same_objects, state_of
+from halfspace_sss.rendering.object.snapshot import Snapshot, same_objects
 from halfspace_sss.rendering.paths.inner_light import COUNT, inner_light
 from halfspace_sss.rendering.paths.lighting import Lights, Sky, mis_weight
 from halfspace_sss.rendering.paths.path_loop import trace_paths
@@ -181,7 +181,7 @@ class Gathering:
         self._objects: list[TranslucentObject] = []
         self._transfers: list[Transfer | WalkedPoints | None] = []
         self._events: list[Events | None] = []
-        self._light: tuple[list, list] = ([], [])
+        self._light: Snapshot | None = None
         self._found: list[TranslucentObject] = []
 
     def of(self, scene: mi.Scene, objects: list[TranslucentObject], settings: Settings) -> list[TranslucentObject]:
@@ -199,12 +199,12 @@ class Gathering:
             share = PART if self._part else 1.0
             seed = SEED + self._part + 10 * self._seed
             made = [_ways(obj, share, seed) if one else None for obj, one in zip(objects, spread)]
-            self._transfers, self._objects, self._light = made, objects, ([], [])
             inner = [bool(one and not self._part and has_inner_light(obj)) for obj, one in zip(objects, spread)]
             self._events = [Events.of(obj, COUNT) if one else None for obj, one in zip(objects, inner)]
+            self._transfers, self._objects, self._light = made, objects, None
             self.seconds = (clock() - started, 0.0)
         state = light_state(scene)
-        if state[0] != self._light[0] or not self._found:
+        if state != self._light:
             started = clock()
             seed, parts = 1000 * self._part + 10_000 * self._seed, 1 if self._part else 2
             ways = list(zip(self._transfers, self._events))
@@ -252,11 +252,9 @@ def _check(obj: TranslucentObject) -> None:
         )
 
 
-def light_state(scene: mi.Scene) -> tuple[list, list]:
-    """What tells whether anything that sends, blocks or scatters light has changed; what is kept for its numbers."""
-    nodes = [*scene.emitters(), *scene.shapes()]
-    states = [state_of(node) for node in nodes]
-    return [(id(node), keys) for node, (keys, _) in zip(nodes, states)], [nodes, [kept for _, kept in states]]
+def light_state(scene: mi.Scene) -> Snapshot:
+    """What tells whether anything that sends, blocks or scatters light has changed."""
+    return Snapshot.of(scene, without=(mi.Scene, mi.Integrator, mi.Sensor, mi.Film, mi.Sampler))
 
 
 def _lit(

@@ -22,7 +22,8 @@ import numpy as np
 from halfspace_sss.rendering.gathered.points import SurfacePoints, uniform_entries
 from halfspace_sss.rendering.gathered.transfer import Albedo
 from halfspace_sss.rendering.object.points import AreaPoints
-from halfspace_sss.rendering.object.shape import Geometry, same_objects
+from halfspace_sss.rendering.object.shape import Geometry
+from halfspace_sss.rendering.object.snapshot import Snapshot, same_objects
 from halfspace_sss.rendering.paths.gathering import GatheringPoint, by_emitters, light_state, met_by_cosine, spreads
 from halfspace_sss.rendering.paths.lighting import Primal, RenderContext
 
@@ -46,8 +47,7 @@ class LitEntries:
 
     def __init__(self) -> None:
         self._objects: list[TranslucentObject] = []
-        self._state: tuple[list, int] = ([], 0)
-        self._kept: list = []
+        self._state: tuple[Snapshot | None, int] = (None, 0)
         self._proposals: list[Proposals | None] = []
 
     def of(
@@ -62,11 +62,11 @@ class LitEntries:
         count = int(min(SHARE * samples, MOST))
         if count < LEAST or mi.is_spectral:
             return [obj.proposals for obj in objects]
-        state, kept = light_state(scene)
-        if not same_objects(objects, self._objects) or (state, count) != self._state:
+        state = (light_state(scene), count)
+        if not same_objects(objects, self._objects) or state != self._state:
             context = RenderContext.of(scene, objects, settings, Primal())
             self._proposals = [_lit(context, obj, count) for obj in objects]
-            self._objects, self._state, self._kept = objects, (state, count), kept
+            self._objects, self._state = objects, state
         return self._proposals
 
 

@@ -10,6 +10,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from halfspace_sss.rendering.object.snapshot import plain
 from halfspace_sss.rendering.paths.integrator import is_bssrdf
 
 # a name says nothing of the image but that of an attribute, an address nothing of the scene, and how many samples are
@@ -76,5 +77,5 @@ def words(result: Any) -> str:
 
 
 def _content(value: Any) -> bytes:
-    numbers = np.array(getattr(value, "matrix", value))
+    numbers = np.array(plain(value))
     return str(value).encode() if numbers.dtype == object else str(numbers.shape).encode() + numbers.tobytes()

@@ -17,7 +17,8 @@ from halfspace_sss.rendering.object.contents import check_sensors
 from halfspace_sss.rendering.object.objects import KnowsUnit, check_size, places_of, translucent_shapes
 from halfspace_sss.rendering.object.sensors import camera_rays, sampled_size, splat, widened
 from halfspace_sss.rendering.object.settings import OF_MITSUBA, WALK_LIGHTS, check_parameters
-from halfspace_sss.rendering.object.shape import number_of, same_objects
+from halfspace_sss.rendering.object.shape import SceneMark
+from halfspace_sss.rendering.object.snapshot import same_objects
 from halfspace_sss.rendering.object.textured import shown
 from halfspace_sss.rendering.object.varying import equivalent
 from halfspace_sss.rendering.object.wrapped import surface_of
@@ -76,7 +77,7 @@ def _class(variant: str) -> type:
             self.blur = _scale("blur", float(props.get("blur", 1.0)))
             self.light = _one_of("light", str(props.get("light", "auto")), WALK_LIGHTS)
             self.layers = bool(props.get("layers", False))
-            self._prepared: tuple[int, list, tuple, Any] = (0, [], ([], []), None)
+            self._prepared: tuple[SceneMark | None, list, list, Any] = (None, [], [], None)
             self._cells: tuple[Any, list] = (None, [])
 
         def tracer(self, scene: mi.Scene, seed: int = 0, samples: int = 0, scored: bool = False) -> PathTracer:
@@ -212,11 +213,11 @@ def _class(variant: str) -> type:
     return TranslucentWalk
 
 
-def _prepared(scene: mi.Scene, before: tuple, mm_per_unit: float) -> tuple[int, list, tuple, Any]:
-    """Number, shapes, places and media of a scene: those of before, unless shapes, inner lights or media changed."""
+def _prepared(scene: mi.Scene, before: tuple, mm_per_unit: float) -> tuple[SceneMark, list, list, Any]:
+    """Mark, shapes, places and media of a scene: those of before, unless shapes, inner lights or media changed."""
     shapes = scene.shapes()  # the scene itself, which holds its integrator, would never be freed
-    places = places_of(scene)
-    same = before[0] == number_of(scene) and same_objects(before[1], shapes) and before[2][0] == places[0]
+    mark, places = SceneMark(scene), places_of(scene)
+    same = before[0] == mark and same_objects(before[1], shapes) and before[2] == places
     if before[3] is not None and same and before[3].is_current():
         return before
     media = WalkMedia.of(scene, mm_per_unit)
@@ -224,7 +225,7 @@ def _prepared(scene: mi.Scene, before: tuple, mm_per_unit: float) -> tuple[int, 
     for each, inside in zip(media.objects, media.insides):
         known = equivalent(inside, each) if inside.textured else inside
         check_size(each, [mm_per_unit * float(m.sigma_t) for m in known.channels()], mm_per_unit)
-    return number_of(scene), shapes, places, media
+    return mark, shapes, places, media
 
 
 @contextlib.contextmanager
