@@ -162,9 +162,11 @@ def _drawn(file: Path, advice: Advice, how: dict[str, Any]) -> dict[str, bytes]:
 
 def object_table(assessed: ObjectTrade) -> Any:
     """All ways of rendering an object."""
+    from halfspace_sss.trade.results import UNNAMED
+
     rows = [_row(row) for row in assessed.ways if not row.refusal]
     low, high = assessed.mfp
-    title = f"{assessed.object}: {low:.3g} to {high:.3g} mean free paths, {100 * assessed.share:.3g} % seen"
+    title = f"{assessed.object or UNNAMED}: {low:.3g} to {high:.3g} mean free paths, {100 * assessed.share:.3g} % seen"
     headings = (*_HEADINGS[:-1], "mean / traced", "preparation, s", "memory, MB", "FLIP")
     return _rich(headings, rows, title)
 

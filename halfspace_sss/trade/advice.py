@@ -21,7 +21,7 @@ from halfspace_sss.noise_free import short
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED
 from halfspace_sss.trade.assessing import assess
-from halfspace_sss.trade.results import Assessment, ObjectTrade, WayTrade, html_table, samples_for
+from halfspace_sss.trade.results import UNNAMED, Assessment, ObjectTrade, WayTrade, html_table, samples_for
 from halfspace_sss.trade.ways import GATHERED, LAMBERT, Way
 
 INTEGRATOR = "bssrdf"
@@ -74,7 +74,7 @@ class ObjectAdvice:
     options: tuple[Option, ...]
 
     def __str__(self) -> str:
-        return "\n".join(f"{self.object}: {option.why}" for option in self.options)
+        return "\n".join(f"{self.object or UNNAMED}: {option.why}" for option in self.options)
 
 
 @dataclass(frozen=True, repr=False)
@@ -96,7 +96,7 @@ class Advice:
     tolerance: float
 
     def __repr__(self) -> str:
-        ways = ", ".join(f"{each.object}: {each.way}" for each in self.objects)
+        ways = ", ".join(f"{each.object or UNNAMED}: {each.way}" for each in self.objects)
         return f"<{self.integrator} for a tolerance of {self.tolerance:.3g}; {ways}>"
 
     def _repr_html_(self) -> str:

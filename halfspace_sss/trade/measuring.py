@@ -311,9 +311,14 @@ def _of_blur(blurred: RadianceEstimate, b: RadianceEstimate) -> Number:
 
 
 def training_seconds(scene: Any, object: str, model: str) -> float:
-    """Seconds that the weights of a model of an object took to learn; 0 for what needs no training.
+    """Seconds that the weights of a model of an object took to learn; 0 without any, where the model itself says why.
 
     A learner of the group `halfspace_sss.learners` tells them by a function `cost(scene, object)`.
     """
     learns = lookup(model).learner if model in learnt_names() else None
-    return float(learns.cost(scene, object)) if isinstance(learns, CostedLearner) else 0.0
+    if not isinstance(learns, CostedLearner):
+        return 0.0
+    try:
+        return float(learns.cost(scene, object))
+    except ValueError:
+        return 0.0

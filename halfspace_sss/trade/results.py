@@ -14,6 +14,7 @@ from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED
 if TYPE_CHECKING:
     import pandas
 
+UNNAMED = "object without an id"
 DOUBT = 1.0  # standard errors that count as error: biases spread over decades, and few lie where less is told
 
 

@@ -83,6 +83,27 @@ def test_a_diffuse_surface_is_right_for_a_large_object_under_an_even_sky() -> No
     assert all(abs(r - 1) < 0.06 for r in row.ratio)
 
 
+ROUGH = {"boundary": {"type": "roughdielectric", "alpha": 0.2, "int_ior": 1.4, "ext_ior": 1.0}, "eta": 1.4}
+
+
+@pytest.mark.parametrize("boundary", [{}, ROUGH], ids=["smooth", "rough"])
+def test_an_object_without_weights_has_cost_no_training(boundary: dict, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HALFSPACE_SSS_WEIGHTS", "none")
+    loaded = mi.load_dict(scene(**boundary))
+    for model in ("full_geometry", "neural_shape", "better_dipole"):
+        assert measuring.training_seconds(loaded, "ball0", model) == 0
+
+
+@pytest.mark.slow
+def test_a_way_that_cannot_be_is_left_out_with_its_reason(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HALFSPACE_SSS_WEIGHTS", "none")
+    for boundary, why in (({}, "must be trained"), (ROUGH, "must be smooth to be learnt, got a rough one")):
+        found = recommend(scene(**boundary), tolerance=0.3, assess_seconds=0.4, exits=64)
+        (learnt,) = (option for option in found.objects[0].options if option.way == "full_geometry")
+        assert why in learnt.why
+        assert found.objects[0].way is not None
+
+
 EXTREMES = {
     "smaller than a mean free path": {"sigma_s": 0.1, "sigma_a": 0.02},
     "larger than 5000": {"sigma_s": 3000.0, "sigma_a": 300.0},
