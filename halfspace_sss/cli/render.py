@@ -17,10 +17,10 @@ from halfspace_sss.cli.shared import (
     Define,
     OutFolder,
     SampleSeed,
-    SensorNumber,
     Variant,
     console,
     defined,
+    numbers,
     tell,
     use_mitsuba,
     whole,
@@ -56,7 +56,7 @@ def render_command(
     target_error: Annotated[float | None, typer.Option(help="Stop at this relative error of the image.")] = None,
     seconds: Annotated[float | None, typer.Option(help="Stop after this time of rendering.")] = None,
     seed: SampleSeed = 0,
-    sensor: SensorNumber = 0,
+    sensor: Annotated[str, typer.Option(help="Number of the sensor, several as 0,1, or all.")] = "0",
     define: Define = None,
     train_seconds: Annotated[
         float | None,
@@ -99,20 +99,38 @@ def render_command(
     settings = {"train_seconds": train_seconds, "train_error": train_error, "light": light, "layers": denoise or None}
     settings = {name: value for name, value in settings.items() if value is not None}
     loaded = open_scene(scene, model, orders, parameters, settings)
+    chosen_sensors = _sensors(sensor, loaded)
     for sentence in chosen(loaded, loaded.integrator()).get("choices", {}).values():
         console().print(sentence, highlight=False, markup=False, soft_wrap=True)
-    cameras = loaded.sensors()[sensor:][:1] if denoise else []
+    cameras = [loaded.sensors()[k] for k in chosen_sensors] if denoise else []
     if any(not camera.film().rfilter().is_box_filter() for camera in cameras):
         tell("the film has no box filter: the denoiser keeps most of the noise that other filters spread over pixels")
-    name = [scene.stem, model or "scene", light or "", f"sensor{sensor}" if sensor else ""]
-    file = out / f"{'_'.join(filter(None, name))}.exr"
-    result = _rendered(loaded, file, limits, {"seed": seed, "sensor": sensor}, resume)
-    emission = result.mean[..., -3:] if getattr(loaded.integrator(), "layers", False) else None
-    numbers, error = _numbers(result), _error(result)
-    picture = Picture(file.stem, _colours(result.mean), numbers, error, loaded, sensor, denoise, emission)
-    _report(result, _publish(picture, file, draw))
+    for k in chosen_sensors:
+        name = [scene.stem, model or "scene", light or "", f"sensor{k}" if k else ""]
+        file = out / f"{'_'.join(filter(None, name))}.exr"
+        result = _rendered(loaded, file, limits, {"seed": seed, "sensor": k}, resume)
+        emission = result.mean[..., -3:] if getattr(loaded.integrator(), "layers", False) else None
+        numbers, error = _numbers(result), _error(result)
+        picture = Picture(file.stem, _colours(result.mean), numbers, error, loaded, k, denoise, emission)
+        _report(result, _publish(picture, file, draw))
     for sentence in loaded.integrator().gathered if is_bssrdf(loaded.integrator()) else ():
         console().print(sentence, highlight=False, markup=False, soft_wrap=True)
+
+
+def _sensors(text: str, scene: Any) -> list[int]:
+    """The numbers of the sensors that are asked for, each once; ValueError if the scene lacks one."""
+    from halfspace_sss.rendering.scenes.reference import check_sensor
+
+    if text == "all":
+        result = list(range(len(scene.sensors())))
+    else:
+        found = numbers("sensor", text)
+        if not all(k.is_integer() for k in found):
+            raise ValueError(f"sensor must be whole numbers, several as 0,1, or all, got {text!r}")
+        result = list(dict.fromkeys(int(k) for k in found))
+    for k in result or [0]:
+        check_sensor(scene, k)
+    return result
 
 
 def _renderer(denoise: bool) -> Renderer | None:

@@ -12,7 +12,7 @@ from halfspace_sss.lazy import once
 from halfspace_sss.neural.features import N_FEATURES, N_MEDIUM
 from halfspace_sss.neural.hypernetwork import CALIBRATION, N_TERMS, Hypernetwork, check_range
 from halfspace_sss.neural.network import layer_shapes
-from halfspace_sss.neural.store import load_weights, record_count
+from halfspace_sss.neural.store import checksum_of, load_weights, record_count
 from halfspace_sss.neural.symmetric import SymmetricModel, channels
 from halfspace_sss.physics.medium import Medium
 
@@ -80,7 +80,13 @@ class Neural(SymmetricModel):
     def __init__(self, medium: Medium, weights: Path | None = None) -> None:
         super().__init__(medium)
         check_range(medium)
-        hyper = load_hypernetwork(weights or shipped_weights())
+        self.weights = weights or shipped_weights()
+        hyper = load_hypernetwork(self.weights)
         ratios = [(float(m.albedo), float(np.float64(m.g)), m.eta) for m in channels(medium)]
         self.networks = [hyper.network(*one) for one in ratios]
         self.calibrations = [hyper.calibration(*one) for one in ratios]
+
+    @property
+    def trained(self) -> str:
+        """SHA-256 of the weights that the networks of all media are made of."""
+        return checksum_of(self.weights, KIND)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
-from render_files import SENSOR, XML
+from render_files import INTEGRATOR, SENSOR, XML
 from typer.testing import CliRunner
 
 from halfspace_sss.cli import app as cli
@@ -102,6 +102,42 @@ def test_another_sensor_has_files_of_its_own(scene: Path) -> None:
     refused = _render(scene, "--sensor", "2")
     assert refused.exit_code == 2
     assert "sensor must be below 2, the number of sensors of the scene, got 2" in refused.stderr
+
+
+@pytest.mark.parametrize("asked", ["1,0", "all"])
+def test_several_sensors_are_rendered_by_one_command(asked: str, scene: Path, monkeypatch: Any) -> None:
+    monkeypatch.setattr(cli_render, "renderer", lambda kind: None)
+    scene.write_text(XML.replace("</scene>", SENSOR.replace("0,0,40", "0,40,1") + "</scene>"))
+    assert _render(scene, "--spp", "1", "--sensor", asked).exit_code == 0
+    found = {path.name: reference.load(path) for path in (scene.parent / "out").glob("*.exr")}
+    assert {name: one.about["sensor"] for name, one in found.items()} == {
+        "ball_scene.exr": 0,
+        "ball_scene_sensor1.exr": 1,
+    }
+
+
+@pytest.mark.parametrize("asked", ["0,2", "-1", "1.5", "both", ""])
+def test_sensors_that_are_not_there_are_refused_before_any_is_rendered(asked: str, scene: Path) -> None:
+    scene.write_text(XML.replace("</scene>", SENSOR.replace("0,0,40", "0,40,1") + "</scene>"))
+    result = _render(scene, "--spp", "1", f"--sensor={asked}")
+    assert result.exit_code == 2 and result.stderr.startswith("error: sensor must be ")
+    assert not list((scene.parent / "out").glob("*.exr"))
+
+
+AOV = '<integrator type="aov"><string name="aovs" value="albedo:albedo,d:depth"/>{}</integrator>'
+
+
+def test_channels_of_aovs_have_their_names(scene: Path, monkeypatch: Any) -> None:
+    monkeypatch.setattr(cli_render, "renderer", lambda kind: None)
+    scene.write_text(XML.replace(INTEGRATOR, AOV.format(INTEGRATOR)))
+    for more in ((), ("--resume",)):
+        assert _render(scene, "--spp", "2", *more).exit_code == 0
+        file = scene.parent / "out" / "ball_scene.exr"
+        names = {channel.name for channel in mi.Bitmap(str(file)).struct_()}
+        assert {"R", "G", "B", "albedo.R", "albedo.G", "albedo.B", "d.T", "variance.d.T"} <= names
+        found = reference.load(file)
+        assert found.about["channels"] == ["R", "G", "B", "albedo.R", "albedo.G", "albedo.B", "d.T"]
+        assert 30 < found.mean[8, 8, 6] < 40  # from the camera to the ball
 
 
 def test_parameters_of_the_scene_are_given_by_name(scene: Path) -> None:

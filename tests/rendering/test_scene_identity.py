@@ -11,7 +11,7 @@ import pytest
 
 import halfspace_sss
 from halfspace_sss.neural import universal
-from halfspace_sss.neural.store import load_weights, save_weights
+from halfspace_sss.neural.store import checksum_of, load_weights, save_weights
 from halfspace_sss.neural.universal import shipped_weights
 from halfspace_sss.rendering.scenes.identity import learnt, object_digest, scene_hash
 from halfspace_sss.rendering.scenes.scene_files import load_scene
@@ -160,6 +160,19 @@ def test_weights_that_a_model_was_trained_to_are_part_of_what_a_render_is_known_
     arrays["base"][0] *= 1.01
     path = save_weights(tmp_path / "other.safetensors", "neural", arrays, record)
     assert _learnt(text, tmp_path) != before
+
+
+def test_media_by_textures_name_the_weights_that_their_networks_come_from(tmp_path) -> None:
+    painted = '<texture type="checkerboard" name="reflectance"/><float name="mfp" value="0.5"/>'
+    text = XML.replace('<string name="material" value="marble"/>', painted).replace("better_dipole", "neural")
+    assert _learnt(text, tmp_path) == [checksum_of(shipped_weights(), "neural")]
+
+
+def test_gathered_light_is_known_by_the_weights_too(tmp_path) -> None:
+    text = XML.replace("better_dipole", "neural")
+    light = '<integrator type="bssrdf"><string name="light" value="gathered"/></integrator>'
+    found = _learnt(text.replace('<integrator type="bssrdf"/>', light), tmp_path)
+    assert len(found) == 3 and found == _learnt(text, tmp_path)
 
 
 def test_weights_are_no_part_of_what_a_render_by_walks_is_known_by(tmp_path, monkeypatch) -> None:

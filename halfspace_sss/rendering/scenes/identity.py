@@ -38,8 +38,9 @@ def learnt(scene: Any, integrator: Any) -> list[str]:
     The same scene is another render after a training.
     """
     if is_bssrdf(integrator):
-        transports = (obj.transport for obj in integrator.prepare(scene))
-        return sorted(checksum for transport in transports if transport is not None for checksum in transport.checksums)
+        objects = (obj.gathered.object if obj.gathered else obj for obj in integrator.prepare(scene))
+        transports = (obj.transport for obj in objects if obj.transport is not None)
+        return sorted({checksum for transport in transports for checksum in transport.checksums})
     return [checksum for inner in _children(integrator) for checksum in learnt(scene, inner)]
 
 

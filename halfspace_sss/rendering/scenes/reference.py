@@ -27,7 +27,7 @@ from halfspace_sss.rendering.object.registry import AUTO
 from halfspace_sss.rendering.object.wrapped import surface_of
 from halfspace_sss.rendering.paths.integrator import is_bssrdf
 from halfspace_sss.rendering.scenes.identity import learnt, scene_hash, words
-from halfspace_sss.rendering.scenes.reference_store import BY_CHANCE, Reference, load, save
+from halfspace_sss.rendering.scenes.reference_store import BY_CHANCE, CHANNELS, Reference, load, save
 from halfspace_sss.rendering.scenes.scene_files import first_cause
 
 FEWEST_PASSES = 8  # before the spread of the passes is trusted to stop a run
@@ -170,12 +170,31 @@ def _pass(reference: Reference | None, scene: Any, integrator: Any, sensor: int,
     if not np.isfinite(image).all():
         bad = int((~np.isfinite(image)).any(axis=2).sum())
         raise ValueError(f"pass {number} must be finite, got {bad} pixels that are not")
+    if reference is None and (names := channel_names(scene.sensors()[sensor].film(), integrator, image.shape[2])):
+        about = {**about, CHANNELS: names}
     start = reference or Reference(np.zeros(image.shape), np.zeros(image.shape), 0, 0, 0.0, about)
     result = start.add(image, spp, time.perf_counter() - started)
     if not is_bssrdf(integrator) or mi.is_spectral:
         return result
     squares = float(f"{start.about.get(BY_CHANCE, 0.0) + integrator.by_chance:.6g}")
     return replace(result, about={**result.about, BY_CHANCE: squares})
+
+
+def channel_names(film: mi.Film, integrator: mi.Integrator, channels: int) -> list[str]:
+    """What the channels of an image that `integrator` rendered to a film show; none of an image of colours alone.
+
+    The integrator `aov` gives the images of those inside it, each with the colours of the film, then its own
+    quantities, such as albedo.R; its film has four colours of each.
+    """
+    of_film, more = [channel.name for channel in film.bitmap().struct_()], integrator.aov_names()
+    colours, inner = of_film[: len(of_film) - len(more)], []
+    for name in more:
+        parts = [name[:-1] + colour for colour in "RGBA"]
+        inner += [name[:-2]] if name.endswith(".R") and set(parts) <= set(more) else []
+    own = [name for name in more if name[:-2] not in inner]
+    of_inner = [f"{name}.{colour}" if k else colour for k, name in enumerate(inner) for colour in colours]
+    known = (of_film, of_inner + own) if more else ()
+    return next((names for names in known if len(names) == channels), [])
 
 
 def _check(spp_per_pass: int | None, seed: int, interval: float) -> None:
@@ -200,11 +219,11 @@ def loaded(scene: Any, integrator: dict | None, sensor: int) -> tuple[Any, Any]:
         raise ValueError(first_cause(error)) from error
     if integrator is None:
         raise ValueError("integrator must be given, for the scene has none")
-    _check_sensor(scene, sensor)
+    check_sensor(scene, sensor)
     return scene, integrator
 
 
-def _check_sensor(scene: Any, sensor: int) -> None:
+def check_sensor(scene: Any, sensor: int) -> None:
     """ValueError unless there is such a sensor, with a film that has pixels and fits into memory."""
     n = len(scene.sensors())
     if n == 0:

@@ -20,6 +20,7 @@ from halfspace_sss.provenance import write_together
 
 FORMAT = "halfspace-sss reference 2"
 HEADER = "halfspace_sss"
+CHANNELS = "channels"  # their names
 BY_CHANCE = "squares_by_chance"  # of light that orders below two met by chance, summed over samples
 
 
@@ -94,13 +95,15 @@ def _halves(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return high, (values - high).astype(np.float32).astype(np.float64)
 
 
-def _names(channels: int) -> list[str]:
-    known = {1: ["Y"], 3: ["R", "G", "B"], 4: ["R", "G", "B", "A"]}
+def _names(channels: int, about: dict[str, Any]) -> list[str]:
+    """As `about` has them, where they and those of their parts are all different; else those of colours, or numbers."""
+    given, known = about.get(CHANNELS, []), {1: ["Y"], 3: ["R", "G", "B"], 4: ["R", "G", "B", "A"]}
+    if len(given) == channels and len(set(_of_parts(given))) == 4 * channels:
+        return given
     return known.get(channels) or [f"channel{k}" for k in range(channels)]
 
 
-def _all_names(channels: int) -> list[str]:
-    names = _names(channels)
+def _of_parts(names: list[str]) -> list[str]:
     parts = ("{}", "variance.{}", "rest.{}", "variance.rest.{}")
     return [part.format(name) for part in parts for name in names]
 
@@ -121,7 +124,8 @@ def save(path: Path, reference: Reference) -> None:
         "pixels": hashlib.sha256(pixels.tobytes()).hexdigest(),
         **reference.about,
     }
-    bitmap = mi.Bitmap(pixels, mi.Bitmap.PixelFormat.MultiChannel, channel_names=_all_names(reference.mean.shape[2]))
+    names = _of_parts(_names(reference.mean.shape[2], reference.about))
+    bitmap = mi.Bitmap(pixels, mi.Bitmap.PixelFormat.MultiChannel, channel_names=names)
     text = json.dumps(header, indent=1)
     bitmap.metadata()[HEADER] = text
     stream = mi.MemoryStream()
@@ -148,7 +152,7 @@ def load(path: str | os.PathLike) -> Reference:
         raise ValueError(f"{name} must be an EXR file written by reference.render: {error}") from error
     names = [channel.name for channel in bitmap.struct_()]
     channels = len(names) // 4
-    wanted = _all_names(channels)
+    wanted = _of_parts(_names(channels, header)) if isinstance(header, dict) else []
     if not isinstance(header, dict) or header.get("format") != FORMAT or sorted(names) != sorted(wanted):
         raise ValueError(f"{name} must have the format {FORMAT!r}, got channels {names}")
     pixels = np.ascontiguousarray(pixels[..., [names.index(key) for key in wanted]])
