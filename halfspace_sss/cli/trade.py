@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -81,7 +82,8 @@ def trade_command(
         _scene(Path(what), Job(tolerance, images, seconds), how, out)
     else:
         check_left_out({"seconds": seconds, "define": define}, "with a material")
-        _material(what, r, tolerance, models, seed)
+        check_folder(out)
+        _material(what, {"r": r, "tolerance": tolerance, "models": models, "seed": seed}, out)
 
 
 def _shipped() -> None:
@@ -105,13 +107,24 @@ def _shipped_row(row: Any) -> list[str]:
 _HEADINGS = ("way", "bias, %", "variance", "s a million", "cost", "FLIP")
 
 
-def _material(name: str, r: str | None, tolerance: float, models: list[str] | None, seed: int) -> None:
+def _material(name: str, how: dict[str, Any], out: Path) -> None:
     from halfspace_sss import materials
+    from halfspace_sss.provenance import provenance, write_together
     from halfspace_sss.trade.flat import recommend_flat
 
-    limits = None if r is None else tuple(numbers("r", r))
-    result = recommend_flat(materials.load(name).medium, limits, tolerance=tolerance, models=models, seed=seed)
+    limits = None if how["r"] is None else tuple(numbers("r", how["r"]))
+    result = recommend_flat(materials.load(name).medium, **{**how, "r": limits})
+    about = {"provenance": provenance(material=name, **how), **result.record()}
+    table = result.table().to_csv(index=False, lineterminator="\n")
+    files = {out / f"{name}_trade.csv": table, out / f"{name}_trade.json": json.dumps(about, indent=1) + "\n"}
+    write_together(files)
     console().print(str(result), highlight=False, markup=False, soft_wrap=True)
+    _tell_files(files)
+
+
+def _tell_files(files: Iterable[Path]) -> None:
+    for path in files:
+        console().print(f"  {path}", highlight=False, markup=False, soft_wrap=True)
 
 
 def _scene(file: Path, job: Job, how: dict[str, Any], out: Path) -> None:
@@ -145,8 +158,7 @@ def _scene(file: Path, job: Job, how: dict[str, Any], out: Path) -> None:
         for note in o.notes:
             typer.echo(f"warning: {note}", err=True)
     screen.print(f"measured in {result.seconds:.1f} s, compilation {result.compilation:.1f} s beside", highlight=False)
-    for path in paths:
-        screen.print(f"  {path}", highlight=False, markup=False, soft_wrap=True)
+    _tell_files(paths)
 
 
 def _drawn(file: Path, advice: Advice, how: dict[str, Any]) -> dict[str, bytes]:

@@ -1,7 +1,8 @@
 """The cheapest model of a medium for curves, over a range of distances, without a scene.
 
 Error: energy-weighted relative L1 over pairs of directions against path tracing, see `comparison.model_errors`; cost:
-seconds of a million values of S. Path tracing takes until its own noise is at the tolerance.
+seconds of a million values of S. Path tracing finds those of all cells and directions at once, and takes until their
+own noise is at the tolerance.
 """
 
 from __future__ import annotations
@@ -9,8 +10,8 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -22,7 +23,10 @@ from halfspace_sss.interface.model import models as registered
 from halfspace_sss.neural.symmetric import channels
 from halfspace_sss.noise_free import NoiseFree
 from halfspace_sss.physics.medium import Medium, medium_of
-from halfspace_sss.trade.results import html_table
+from halfspace_sss.trade.results import html_table, plain
+
+if TYPE_CHECKING:
+    import pandas
 
 EVENTS = 4e6  # of the walks of each channel
 QUERIES = 2**12
@@ -60,6 +64,16 @@ class FlatAdvice:
 
     def __str__(self) -> str:
         return "\n".join(option.why for option in self.options)
+
+    def record(self) -> dict[str, Any]:
+        """Ready for JSON; what is not finite, as of a model that refuses, is None there."""
+        return plain(asdict(self))
+
+    def table(self) -> pandas.DataFrame:
+        """One row for each way."""
+        import pandas
+
+        return pandas.DataFrame([asdict(option) for option in self.options])
 
 
 def recommend_flat(
@@ -102,7 +116,8 @@ def recommend_flat(
         _check_light(m, one, bounds)
     rows = [_row(name, parts, result, within) for name in models or registered()]
     noise = max((row.noise for row in rows if row.noise < math.inf), default=math.inf)
-    rows.append(_Row(TRACED, NoiseFree(0.0, 0.0), tolerance, tracing * (noise / tolerance) ** 2))
+    values = sum(_values(one, bounds) for one, bounds in zip(result, within))
+    rows.append(_Row(TRACED, NoiseFree(0.0, 0.0), tolerance, tracing * (noise / tolerance) ** 2 / values))
     return _advice(rows, tolerance, r or REACH, "mm" if r else "mean free paths")
 
 
@@ -117,11 +132,20 @@ def _check_range(r: tuple[float, float] | None) -> None:
         raise ValueError(f"r must ascend, got {r!r}")
 
 
-def _check_light(m: Medium, maps: TracedMaps, within: tuple[float, float]) -> None:
+def _lit(maps: TracedMaps, within: tuple[float, float]) -> np.ndarray:
+    """Which cells count: an array that fits energies of halves."""
     radii = maps.block_radii()
-    counts = ((radii >= within[0]) & (radii <= within[1]))[:, None, None, :, None]
-    if not (maps.energies() * counts).sum() > 0:
-        low, high = within
+    return ((radii >= within[0]) & (radii <= within[1]))[:, None, None, :, None]
+
+
+def _values(maps: TracedMaps, within: tuple[float, float]) -> int:
+    """How many values of S the walks have found, of cells and pairs of directions."""
+    return int(np.broadcast_to(_lit(maps, within), maps.energies()[:, :1].shape).sum())
+
+
+def _check_light(m: Medium, maps: TracedMaps, within: tuple[float, float]) -> None:
+    if not (maps.energies() * _lit(maps, within)).sum() > 0:
+        (low, high), radii = within, maps.block_radii()
         raise ValueError(
             f"r must hold distances at which light comes back, got {low:.3g} to {high:.3g} mean free paths for "
             f"albedo {float(m.albedo):.4g}; walks reach {radii.min():.2g} to {radii.max():.3g}"
@@ -173,12 +197,12 @@ def _advice(rows: list[_Row], tolerance: float, r: tuple[float, float], unit: st
         off = f"{error.told()} % off"
         cost = f"{1e6 * seconds:.3g} s for a million values"
         if name == TRACED:
-            why = f"{name} takes {seconds:.3g} s until its noise is {100 * tolerance:.3g} %"
+            why = f"{name} takes {cost}, of all directions at once, until their noise is {100 * tolerance:.3g} %"
         elif refusal:
             why = f"{name}: {refusal}"
         elif row is best:
-            why = f"{name} is the cheapest that keeps {100 * tolerance:.3g} %, r {r[0]:.3g} to {r[1]:.3g} {unit}: "
-            why += f"{off}, {cost}"
+            why = f"{name} is the cheapest model that keeps {100 * tolerance:.3g} %, "
+            why += f"r {r[0]:.3g} to {r[1]:.3g} {unit}: {off}, {cost}"
         elif row in keeping:
             why = f"{name} is {seconds / best.seconds:.2g} times dearer: {off}, {cost}"
         elif error.square - 2 * error.square_error > tolerance**2:

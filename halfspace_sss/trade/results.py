@@ -181,7 +181,7 @@ class Assessment:
 
     def record(self) -> dict[str, Any]:
         """Ready for JSON; what is not known is None there."""
-        return _plain(asdict(self))
+        return plain(asdict(self))
 
     @classmethod
     def of(cls, record: dict[str, Any]) -> Assessment:
@@ -194,12 +194,12 @@ class Assessment:
         return cls(tuple(objects), record["seconds"], record["compilation"], record["seed"])
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """Without nan, which JSON has not."""
     if isinstance(value, dict):
-        return {key: _plain(v) for key, v in value.items()}
+        return {key: plain(v) for key, v in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_plain(v) for v in value]
+        return [plain(v) for v in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 

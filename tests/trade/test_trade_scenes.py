@@ -15,7 +15,7 @@ from halfspace_sss import Medium
 from halfspace_sss.cli import app as cli
 from halfspace_sss.physics.fresnel import F_r
 from halfspace_sss.rendering.object.registry import model_names
-from halfspace_sss.trade import assess, measuring, recommend, sampling
+from halfspace_sss.trade import assess, flat, measuring, recommend, sampling
 from halfspace_sss.trade.assessing import assess_stage
 from halfspace_sss.trade.exits import visible_exits
 from halfspace_sss.trade.images import small_images
@@ -362,6 +362,24 @@ def test_a_medium_without_a_scene_gets_a_model_of_the_half_space() -> None:
     assert found.model == "neural"
     assert [option.model for option in found.options] == ["neural", "path_traced", "better_dipole"]
     assert found.options[-1].why.endswith("asked 20 %")
+    neural, traced, _ = found.options
+    for option in (neural, traced):
+        assert f"{option.seconds_per_million:.3g} s for a million values" in option.why
+    record = json.loads(json.dumps(found.record()))
+    assert [option["model"] for option in record["options"]] == list(found.table()["model"])
+
+
+def test_the_command_writes_what_it_says_of_a_material(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(flat.recommend_flat, "__kwdefaults__", {**flat.recommend_flat.__kwdefaults__, "events": 2e5})
+    arguments = ["--model", "better_dipole", "--tolerance", "0.6", "--out", str(tmp_path / "out")]
+    result = CliRunner().invoke(cli.app, ["trade", "fig10", *arguments])
+    assert result.exit_code == 0, result.stderr
+    written = json.loads((tmp_path / "out" / "fig10_trade.json").read_text())
+    assert written["model"] == "better_dipole" and written["provenance"]["parameters"]["tolerance"] == 0.6
+    assert (tmp_path / "out" / "fig10_trade.csv").read_text().startswith("model,error,bound,seconds_per_million,why")
+    assert "fig10_trade.csv" in result.stdout
+    blocked = CliRunner().invoke(cli.app, ["trade", "fig10", "--out", str(tmp_path / "out" / "fig10_trade.csv")])
+    assert blocked.exit_code == 2 and "is a file" in blocked.stderr
 
 
 @pytest.mark.parametrize(
