@@ -20,6 +20,7 @@ WRONG = {
     "rivals": ["--scene", "none.xml"],
     "shapes": ["--objects", "-1"],
     "speeds": ["--object", "marbel"],
+    "total-error": ["--object", "marbel"],
     "trade-check": ["--scenes", "-1"],
 }
 

@@ -1,0 +1,159 @@
+"""Total error over seconds: what an image of an object is off, noise, bias, edges and reflections included.
+
+The error of an image X over a reference R is
+
+    sqrt(sum (X - R)² / sum R²)
+
+over all pixels of the object and channels, of pixels and of means over blocks of 8 x 8. R is a long image by walks
+whose light is sampled, which has no bias; its variance is taken off. Ways are path tracing by Mitsuba's `volpathmis` at
+two roulette depths, walks with sampled and with precomputed light, each as rendered and denoised by Open Image Denoise.
+Beside it stand what the object is in the mean over R, and the variance of a sample times its CPU seconds, summed over
+the pixels, over that of `volpathmis` at its better depth.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pandas
+
+from benchmarks.speeds import VOLUMES, LitObject
+from figures.computing.contenders import ready
+from figures.computing.images import cover, denoised, guides
+from figures.computing.scenes import prepare
+from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED, load_scene
+
+SAMPLED, PRECOMPUTED = "walk, light sampled", "walk, light precomputed"
+WAYS = (*VOLUMES, SAMPLED, PRECOMPUTED)
+BLOCK = 8  # pixels of its side
+REFERENCE_SPP = 64  # of a pass of the reference
+MOST_SPP = 1024  # of a pass
+SHARE = 4  # passes in the shortest time: their spread tells the variance
+
+
+@dataclass(frozen=True)
+class Measuring:
+    """How errors are measured.
+
+    Args:
+        seconds: CPU times of an image, ascending.
+        reference: CPU seconds of the reference.
+        size: pixels of the square images.
+        seed: of all renders.
+    """
+
+    seconds: tuple[float, ...] = (5.0, 20.0, 80.0)
+    reference: float = 600.0
+    size: int = 128
+    seed: int = 0
+
+
+def total_errors(
+    cases: Sequence[LitObject], how: Measuring, folder: Path, progress: Callable[[str, int, int], None]
+) -> pandas.DataFrame:
+    """A row for each case, way, time, raw and denoised."""
+    prepare()
+    folder.mkdir(parents=True, exist_ok=True)
+    rows: list[dict[str, Any]] = []
+    for k, case in enumerate(cases):
+        progress(f"{case.name}, {case.light}", k, len(cases))
+        rows += _measured(case, how, folder)
+    return pandas.DataFrame(rows)
+
+
+def _scene(case: LitObject, way: str, size: int, folder: Path) -> Any:
+    found = case.description(size, folder)
+    if way in VOLUMES:
+        return ready(way, found, case.key, case.medium)
+    kind = "sampled" if way == SAMPLED else "precomputed"
+    return load_scene(found, PATH_TRACED, settings={"light": kind, "layers": True})
+
+
+def _measured(case: LitObject, how: Measuring, folder: Path) -> list[dict[str, Any]]:
+    scenes = {way: _scene(case, way, how.size, folder) for way in WAYS}
+    inside = cover(scenes[SAMPLED]) > 0
+    about = guides(scenes[SAMPLED])
+    reference = _passes(scenes[SAMPLED], how.reference, REFERENCE_SPP, how.seed + 1)[0][..., :3]
+    R, noise = reference.mean(axis=0), reference.var(axis=0, ddof=1) / len(reference)
+
+    # ---- passes of every way, from which the images of all times are made
+    images, seconds, spp = {}, {}, {}
+    for way, scene in scenes.items():
+        each = _samples(scene, how.seconds[0] / SHARE, how.seed)
+        images[way], seconds[way] = _passes(scene, how.seconds[-1], each, how.seed + 1000)
+        spp[way] = each
+    costs = {way: _cost(images[way][..., :3], seconds[way], inside) for way in WAYS}
+    best = min(costs[way] for way in VOLUMES)
+
+    rows = []
+    for way in WAYS:
+        for limit in how.seconds:
+            n = int(np.clip(np.searchsorted(np.cumsum(seconds[way]), limit, side="right"), 1, len(seconds[way])))
+            image = images[way][:n].mean(axis=0)
+            for name, result in (("raw", image[..., :3]), ("denoised", _clean(image, about))):
+                pixels, blocks = (_error(result, R, noise, inside, size) for size in (1, BLOCK))
+                mean = result[inside].mean(axis=0) / R[inside].mean(axis=0)
+                rows.append(
+                    {
+                        "object": case.name, "light": case.light, "way": f"{way}, {name}", "seconds": limit,
+                        "spp": n * spp[way], "pixels, %": 100 * pixels, "blocks, %": 100 * blocks,
+                        "mean R": mean[0], "mean G": mean[1], "mean B": mean[2],
+                        "variance x time": best / costs[way] if name == "raw" else np.nan,
+                    }
+                )  # fmt: skip
+    return rows
+
+
+def _samples(scene: Any, seconds: float, seed: int) -> int:
+    """Samples of a pixel, a power of two, that take at most so many CPU seconds, but not half as many; at least one."""
+    spp = 1
+    _passes(scene, 0.0, spp, seed)  # compiles
+    while _passes(scene, 0.0, 2 * spp, seed + spp)[1][0] < seconds and spp < MOST_SPP:
+        spp *= 2
+    return spp
+
+
+def _passes(scene: Any, seconds: float, spp: int, seed: int) -> tuple[np.ndarray, list[float]]:
+    """Images of passes until these have taken so many CPU seconds, and what each took; at least one."""
+    images: list[np.ndarray] = []
+    took: list[float] = []
+    while not took or sum(took) < seconds:
+        started = time.process_time()
+        scenes = scene if isinstance(scene, tuple) else (scene,)
+        parts = [np.array(mi.render(one, spp=spp, seed=seed + 100_000 * k + len(took))) for k, one in enumerate(scenes)]
+        one_each = [part[..., k : k + 1] for k, part in enumerate(parts)]
+        images.append(np.concatenate(one_each, axis=2) if len(parts) > 1 else parts[0])
+        took.append(time.process_time() - started)
+    return np.array(images, dtype=np.float64), took
+
+
+def _cost(images: np.ndarray, seconds: list[float], inside: np.ndarray) -> float:
+    """Variance of a pass times its seconds, summed over the pixels of the object."""
+    return float(images[:, inside].var(axis=0, ddof=1).sum() * np.mean(seconds))
+
+
+def _clean(image: np.ndarray, about: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    """Denoised; of what has a layer of emission all but that."""
+    light = np.maximum(image[..., :3], 0)
+    emission = np.clip(image[..., 3:], 0, light) if image.shape[2] > 3 else np.zeros_like(light)
+    return denoised((light - emission).astype(np.float32), *about)[0] + emission
+
+
+def _error(image: np.ndarray, R: np.ndarray, noise: np.ndarray, inside: np.ndarray, size: int) -> float:
+    """Of means over blocks of the object's pixels; the noise of the reference is taken off."""
+    n = inside.shape[0] // size
+    weight = inside[: n * size, : n * size].reshape(n, size, n, size).sum(axis=(1, 3))
+    kept = weight >= size * size / 4
+
+    def means(x: np.ndarray) -> np.ndarray:
+        masked = np.where(inside[..., None], x, 0)[: n * size, : n * size]
+        return masked.reshape(n, size, n, size, -1).sum(axis=(1, 3))[kept] / weight[kept][:, None]
+
+    squares = (means(image) - means(R)) ** 2 - means(noise) / weight[kept][:, None]
+    return float(np.sqrt(max(squares.sum(), 0) / (means(R) ** 2).sum()))

@@ -1,0 +1,55 @@
+"""The command `total-error`: what images are off after so many seconds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from benchmarks.tables import markdown
+from halfspace_sss.checks import check_choice, check_count, check_interval
+from halfspace_sss.cli.shared import Bar, OutFolder, console, use_mitsuba, whole
+from halfspace_sss.provenance import check_folder, write_together
+
+__all__ = ["total_error_command"]
+
+OBJECTS = ("hand of potato", "ribbon of cream", "bunny of skin1")
+
+
+def total_error_command(
+    objects: Annotated[
+        list[str] | None, typer.Option("--object", help="As of `speeds`; repeat for more.", show_default="three")
+    ] = None,
+    light: Annotated[
+        list[str] | None, typer.Option(help="As of `speeds`; repeat for more.", show_default="the first two there")
+    ] = None,
+    seconds: Annotated[
+        list[float] | None, typer.Option(help="CPU seconds of an image; repeat for more.", show_default="5, 20, 80")
+    ] = None,
+    reference: Annotated[float, typer.Option(help="CPU seconds of the reference.")] = 600.0,
+    size: Annotated[int, typer.Option(help="Pixels of the square images.", parser=whole)] = 128,
+    seed: Annotated[int, typer.Option(help="Seed of all renders.", parser=whole)] = 0,
+    out: OutFolder = Path("total_error"),
+) -> None:
+    """Measure total error over seconds of path tracing, raw and denoised, over long walks: all orders."""
+    use_mitsuba("llvm_ad_rgb")
+    from benchmarks.speeds import LIGHTS, OTHER_LIGHTS, LitObject
+    from benchmarks.total_error import Measuring, total_errors
+
+    times, lights = tuple(sorted(seconds or Measuring.seconds)), tuple(light or LIGHTS)
+    for name in lights:
+        check_choice("light", name, (*LIGHTS, *OTHER_LIGHTS))
+    for value in (*times, reference):
+        check_interval("seconds", value, 0.1, 1e6)
+    check_count("size", size, 16)
+    check_count("seed", seed, 0)
+    check_folder(out)
+    cases = [LitObject(name, each) for name in objects or OBJECTS for each in lights]
+    with Bar("total error") as bar:
+        how = Measuring(times, reference, size, seed)
+        table = total_errors(cases, how, out / "work", lambda what, k, n: bar.show(k, n, what))
+    text = markdown(table.round(3))
+    csv = table.to_csv(index=False, lineterminator="\n")
+    write_together({out / "total_error.csv": csv, out / "total_error.md": text})
+    console().print(text, highlight=False, markup=False, soft_wrap=True)

@@ -1,0 +1,38 @@
+"""Total errors over a long reference: what they are of, and that they fall."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("mitsuba")
+
+from benchmarks import total_error as module  # noqa: E402
+
+pytestmark = pytest.mark.usefixtures("rgb")
+
+
+def test_the_error_of_a_constant_factor_is_that_factor() -> None:
+    R, inside = np.random.default_rng(1).random((16, 16, 3)), np.ones((16, 16), dtype=bool)
+    for size in (1, 8):
+        assert module._error(1.1 * R, R, np.zeros_like(R), inside, size) == pytest.approx(0.1)
+
+
+def test_the_noise_of_the_reference_is_taken_off() -> None:
+    rng, inside = np.random.default_rng(2), np.ones((64, 64), dtype=bool)
+    truth, noise = np.ones((64, 64, 3)), np.full((64, 64, 3), 0.01)
+    off = module._error(1.05 * truth, truth + 0.1 * rng.standard_normal(truth.shape), noise, inside, 1)
+    assert off == pytest.approx(0.05, rel=0.1)
+
+
+@pytest.mark.slow
+def test_precomputed_light_comes_nearer_to_the_reference_in_more_time(tmp_path: Path) -> None:
+    from benchmarks.speeds import LitObject
+
+    how = module.Measuring((1.0, 8.0), 10.0, 32)
+    table = module.total_errors([LitObject("hand of potato", "windows")], how, tmp_path, lambda *about: None)
+    found = table[table["way"] == "walk, light precomputed, raw"]
+    assert found["pixels, %"].iloc[1] < 0.7 * found["pixels, %"].iloc[0]
+    assert (np.abs(found[["mean R", "mean G", "mean B"]].iloc[1] - 1) < 0.03).all()
