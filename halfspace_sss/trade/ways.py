@@ -153,7 +153,7 @@ class Stage:
         way = replace(way, soft=False)
         if way not in self._integrators:
             if way.walks:
-                plugin = {"type": "translucent_walk", **self.settings, "blur": way.blur}
+                plugin = {"type": "translucent_walk", **self.settings, "blur": way.blur, "light": "sampled"}
             else:
                 plugin = {"type": "bssrdf", **self.settings, **self.bssrdf, "model": way.model, "light": way.light}
                 plugin |= {"orders": way.orders} if way.orders else {}
