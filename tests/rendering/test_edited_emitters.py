@@ -85,4 +85,4 @@ def test_an_integrator_sees_emitters_that_were_added_and_removed(integrator: str
     for lights in ({"point": point, "sun": sun}, {"sun": sun}):
         fresh = mi.load_dict(_scene(integrator, lights))
         other = np.array(mi.render(fresh, integrator=found.integrator(), spp=64, seed=1))
-        np.testing.assert_array_equal(other, _image(fresh))
+        np.testing.assert_allclose(other, _image(fresh), rtol=1e-5)  # light on cells is summed in any order

@@ -27,7 +27,7 @@ def _scene(radius: float = 1.0) -> dict:
     view = mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0])
     return {
         "type": "scene",
-        "integrator": {"type": "translucent_walk"},
+        "integrator": {"type": "translucent_walk", "light": "sampled"},  # sums on cells have no fixed order
         "sensor": {"type": "perspective", "fov": 40.0, "to_world": view, "film": film},
         "light": {"type": "constant"},
         "object": {"type": "sphere", "radius": radius, "bsdf": surface},

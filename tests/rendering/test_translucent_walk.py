@@ -29,7 +29,7 @@ def _scene(surface: dict, light: dict | None = None, shape: dict | None = None, 
     view = mi.ScalarTransform4f().look_at([0, 0, 50], [0, 0, 0], [0, 1, 0])
     return {
         "type": "scene",
-        "integrator": {"type": "translucent_walk", **integrator},
+        "integrator": {"type": "translucent_walk", "light": "sampled", **integrator},
         "sensor": {"type": "perspective", "fov": 20.0, "to_world": view, "film": film},
         "light": light or {"type": "constant"},
         "object": {**(shape or {"type": "sphere", "radius": 10.0}), "bsdf": {"type": "translucent", **surface}},

@@ -40,7 +40,8 @@ def _scene(light: str, n: int = 8, **surface: Any) -> mi.Scene:
     cube = {"type": "cube", "to_world": mi.ScalarTransform4f().scale(4).rotate([1, 1, 0], 30)}
     shape = cube if light == "sky" else {"type": "sphere", "radius": 6.0}
     return mi.load_dict({
-        "type": "scene", "integrator": {"type": "translucent_walk", "mm_per_unit": 1.2}, "light": LIGHTS[light],
+        "type": "scene", "integrator": {"type": "translucent_walk", "mm_per_unit": 1.2, "light": "sampled"},
+        "light": LIGHTS[light],
         "sensor": {"type": "perspective", "fov": 12.0, "to_world": view, "film": film},
         "object": {**shape, "bsdf": {"type": "translucent", **MEDIA[light], **surface}},
     })  # fmt: skip
@@ -142,8 +143,9 @@ def _plates(painted: str | None, name: str = "albedo") -> mi.Scene:
     for thing in things.values() if painted == "vertex_color" else ():
         thing.add_attribute("vertex_color", 3, np.tile(value, thing.vertex_count()).astype(np.float32).tolist())
     return mi.load_dict({
-        "type": "scene", "integrator": {"type": "translucent_walk", "mm_per_unit": 1.2, "rr_depth": 100},
-        "light": LIGHTS["sky"], "sensor": {"type": "perspective", "fov": 9.0, "to_world": view, "film": film}, **things,
+        "type": "scene", "light": LIGHTS["sky"],
+        "integrator": {"type": "translucent_walk", "mm_per_unit": 1.2, "rr_depth": 100, "light": "sampled"},
+         "sensor": {"type": "perspective", "fov": 9.0, "to_world": view, "film": film}, **things,
     })  # fmt: skip
 
 

@@ -18,15 +18,15 @@ import mitsuba as mi
 import numpy as np
 from scipy.ndimage import distance_transform_cdt, label
 
-from halfspace_sss.rendering.object.points import opaque
+from halfspace_sss.rendering.object.points import EntrySample, opaque
 from halfspace_sss.rendering.walk.media import WalkMedia
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 MOST_CELLS = 2**23  # of the grid: h grows until it has no more
 POINTS = 24  # of the surface, for each h² of it, that find the cells it cuts
 MARGIN = 0.25  # of h, by which such a point reaches into the next cells
-COLUMNS = 4  # along each edge of a cell: COLUMNS² along each axis measure its inside
-SMALLEST = 0.15  # part of a cell, below which it shares the fit of a neighbour
+COLUMNS = 7  # along each edge of a cell: COLUMNS² measure its inside
+SMALLEST = 0.25  # part of a cell, below which it shares the fit of a neighbour
 RIDGE = 0.02  # of the variance of a whole cell, added to that of the inside: slopes of a sliver are unknown
 PAIRS = ((0, 0), (0, 1), (0, 2), (0, 3), (1, 1), (2, 2), (3, 3), (1, 2), (1, 3), (2, 3))  # of the moments
 
@@ -59,7 +59,7 @@ class InsideCells:
 
     @classmethod
     def of(
-        cls, media: WalkMedia, k: int, points: mi.Point3f, box: tuple[np.ndarray, np.ndarray], h: float, depth: float
+        cls, media: WalkMedia, k: int, points: EntrySample, box: tuple[np.ndarray, np.ndarray], h: float, depth: float
     ) -> InsideCells:
         """The cells of object k.
 
@@ -74,7 +74,8 @@ class InsideCells:
         h = grid_edge(box, h)
         counts = np.ceil((box[1] - box[0]) / h + 2 * MARGIN).astype(int) + 2
         low = 0.5 * (box[0] + box[1]) - 0.5 * counts * h
-        cut = _cut(points, low, h, counts)
+        axes = _crossed(points, low, h, counts)
+        cut = axes >= 0
 
         # cells between cut ones are inside or outside all together: a ray from one of them tells
         parts, n = label(~cut.reshape(counts[::-1]))
@@ -85,7 +86,7 @@ class InsideCells:
         inside = whole[parts]
 
         cells = np.flatnonzero(cut)
-        moments = _measure(media, k, cells, low, h, counts)
+        moments = _measure(media, k, cells, axes[cells], low, h, counts)
         kept = moments[:, 0, 0] > 1e-6
         cells, moments = cells[kept], moments[kept]
 
@@ -154,18 +155,24 @@ def grid_edge(box: tuple[np.ndarray, np.ndarray], h: float) -> float:
     return h
 
 
-def _cut(points: mi.Point3f, low: np.ndarray, h: float, counts: np.ndarray) -> np.ndarray:
-    """Whether the surface may cut a cell: those that points of it reach."""
-    cut = dr.zeros(mi.Bool, int(counts.prod()))
-    x = [(points[a] - opaque(low[a])) * opaque(1 / h) for a in range(3)]
+def _crossed(points: EntrySample, low: np.ndarray, h: float, counts: np.ndarray) -> np.ndarray:
+    """The axis nearest to the normal of the surface in each cell that it may cut, -1 of others: points reach it."""
+    n_cells = int(counts.prod())
+    squares = [dr.zeros(mi.Float, n_cells) for _ in range(3)]
+    x = [(points.p[a] - opaque(low[a])) * opaque(1 / h) for a in range(3)]
     n = [dr.opaque(mi.Int32, int(c)) for c in counts]
     for corner in range(8):
         cell = [mi.Int32(dr.floor(v + (MARGIN if corner >> a & 1 else -MARGIN))) for a, v in enumerate(x)]
         ok = mi.Bool(True)
         for c, most in zip(cell, n):
             ok &= (c >= 0) & (c < most)
-        dr.scatter(cut, mi.Bool(True), (cell[2] * n[1] + cell[1]) * n[0] + cell[0], ok)
-    return np.array(cut)
+        for a in range(3):
+            dr.scatter_add(squares[a], dr.square(points.n[a]), (cell[2] * n[1] + cell[1]) * n[0] + cell[0], ok)
+    dr.eval(squares)
+    x, y, z = (np.array(v) for v in squares)
+    axis = np.where(x >= np.maximum(y, z), 0, np.where(y >= z, 1, 2)).astype(np.int8)
+    axis[x + y + z == 0] = -1
+    return axis
 
 
 def _centres(cells: np.ndarray, low: np.ndarray, h: float, counts: np.ndarray) -> mi.Point3f:
@@ -208,25 +215,29 @@ def _starts_inside(media: WalkMedia, k: int, p: mi.Point3f) -> np.ndarray:
     return votes >= 2
 
 
-def _measure(media: WalkMedia, k: int, cells: np.ndarray, low: np.ndarray, h: float, counts: np.ndarray) -> np.ndarray:
-    """Moments (cells, 4, 4) of the inside of cells, from columns at jittered places along the three axes."""
+def _measure(
+    media: WalkMedia, k: int, cells: np.ndarray, axes: np.ndarray, low: np.ndarray, h: float, counts: np.ndarray
+) -> np.ndarray:
+    """Moments (cells, 4, 4) of the inside of cells, from columns at jittered places.
+
+    They run along the axis nearest to the normal of the surface, in which they are exact: what is left of their noise
+    would make light, divided by the volume of a small part, too bright in the mean.
+    """
     n = len(cells)
     centre = _centres(cells, low, h, counts)
-    number, edge = dr.full(mi.Int32, k, n), opaque(h)
+    number, edge, axis = dr.full(mi.Int32, k, n), opaque(h), mi.UInt32(axes.astype(np.uint32))
+    d = mi.Vector3f(*(dr.select(axis == a, mi.Float(1), 0) for a in range(3)))
     rng = generator(mi, n, pass_seed(k))
-    total = dr.opaque(mi.UInt32, 3 * COLUMNS**2)
+    total = dr.opaque(mi.UInt32, COLUMNS**2)
 
     def column(i: mi.UInt32, rng: mi.PCG32, sums: list[mi.Float]) -> tuple:
         # ---- a column through the cell
-        axis, place = i // COLUMNS**2, i % COLUMNS**2
-        u = (mi.Float(place % COLUMNS) + rng.next_float32()) / COLUMNS - 0.5
-        v = (mi.Float(place // COLUMNS) + rng.next_float32()) / COLUMNS - 0.5
-        start = mi.Vector3f(
-            dr.select(axis == 0, -0.5, u),
-            dr.select(axis == 1, -0.5, dr.select(axis == 0, u, v)),
-            dr.select(axis == 2, -0.5, v),
+        u = (mi.Float(i % COLUMNS) + rng.next_float32()) / COLUMNS - 0.5
+        v = (mi.Float(i // COLUMNS) + rng.next_float32()) / COLUMNS - 0.5
+        across = dr.select(
+            axis == 0, mi.Vector3f(0, u, v), dr.select(axis == 1, mi.Vector3f(v, 0, u), mi.Vector3f(u, v, 0))
         )
-        d = mi.Vector3f(*(dr.select(axis == a, mi.Float(1), 0) for a in range(3)))
+        start = across - 0.5 * d
 
         # ---- its segments inside: the next surface tells where one ends, and on which side it was
         def segment(begin: mi.Float, sums: list[mi.Float]) -> tuple:
@@ -252,7 +263,7 @@ def _measure(media: WalkMedia, k: int, cells: np.ndarray, low: np.ndarray, h: fl
     dr.eval(sums)
     square = np.empty((n, 4, 4))
     for (i, j), values in zip(PAIRS, sums):
-        square[:, i, j] = square[:, j, i] = np.array(values, dtype=float) / (3 * COLUMNS**2)
+        square[:, i, j] = square[:, j, i] = np.array(values, dtype=float) / COLUMNS**2
     return square
 
 

@@ -61,9 +61,9 @@ def _class(variant: str) -> type:
         light out), `light` ("auto"; "precomputed" finds light that arrives unscattered on a grid, see
         `unscattered_light`, which has 10 to 50 times less noise in the same time and a bias of less than .3 %;
         "sampled" meets it by chance and by connections, without that bias; "auto" precomputes it where that is
-        possible, and samples it for derivatives), `layers` (false; true adds the channels emission.R, .G and .B to the
-        image: emitters that the camera sees, at once or in the mirror of an object, which leaves what is behind it for
-        a denoiser).
+        possible and there is more than an even sky, and samples it for derivatives), `layers` (false; true adds the
+        channels emission.R, .G and .B to the image: emitters that the camera sees, at once or in the mirror of an
+        object, which leaves what is behind it for a denoiser).
         """
 
         def __init__(self, props: mi.Properties) -> None:
@@ -91,7 +91,7 @@ def _class(variant: str) -> type:
             self._prepared = _prepared(scene, self._prepared, self.mm_per_unit)
             media, small = self._prepared[-1], SmallEmitters.of(scene)
             inner = InnerLights.of(media, self.blur)
-            if samples and self.precomputes(media):
+            if samples and self.precomputes(scene, media):
                 if self._cells[0] is not media:
                     self._cells = media, inside_cells_of(media)
                 rays = min(max(samples // SAMPLES_PER_RAY, FEWEST_RAYS), MOST_RAYS)
@@ -106,8 +106,10 @@ def _class(variant: str) -> type:
             visitor = LightVisitor(scene, media, small, connections, directions, straight, inner, self.blur)
             return PathTracer(visitor, self.max_depth, self.rr_depth, self.hidden, self.layers)
 
-        def precomputes(self, media: WalkMedia) -> bool:
-            """Whether images find unscattered light precomputed.
+        def precomputes(self, scene: mi.Scene, media: WalkMedia) -> bool:
+            """Whether images find unscattered light precomputed; if that is left to us, not that of an even sky alone.
+
+            Every walk meets an even sky where it leaves, with less noise than the sky has inside.
 
             Raises:
                 ValueError: `light` is "precomputed", and it cannot be in this scene.
@@ -117,7 +119,8 @@ def _class(variant: str) -> type:
             reason = obstacle(media)
             if reason and self.light == "precomputed":
                 raise ValueError(f"light must be auto or sampled, got 'precomputed': {reason}")
-            return not reason
+            uneven = any("Constant" not in emitter.class_name() for emitter in scene.emitters())
+            return not reason and (uneven or self.light == "precomputed")
 
         def render(
             self, scene: mi.Scene, sensor: mi.Sensor | int = 0, seed: mi.UInt32 | int = 0, spp: int = 0,

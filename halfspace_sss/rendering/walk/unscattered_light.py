@@ -186,7 +186,7 @@ def inside_cells_of(media: WalkMedia, edge: float = EDGE) -> list[InsideCells]:
             np.mean(np.array(_entries(media, k, [mi.Float(v.astype(np.float32)) for v in lattice(2**10)]).weight))
         )
         n = int(np.clip(POINTS * area / h**2, FEWEST_POINTS, MOST_POINTS))
-        points = _entries(media, k, [mi.Float(v.astype(np.float32)) for v in lattice(n)]).p
+        points = _entries(media, k, [mi.Float(v.astype(np.float32)) for v in lattice(n)])
         results.append(InsideCells.of(media, k, points, box, h, depth))
     return results
 
