@@ -26,6 +26,7 @@ from halfspace_sss.cli.shared import (
     whole,
 )
 from halfspace_sss.extensions import renderer
+from halfspace_sss.locks import one_writer
 from halfspace_sss.provenance import check_folder, replace_together, write_atomically
 
 if TYPE_CHECKING:
@@ -108,11 +109,12 @@ def render_command(
     for k in chosen_sensors:
         name = [scene.stem, model or "scene", light or "", f"sensor{k}" if k else ""]
         file = out / f"{'_'.join(filter(None, name))}.exr"
-        result = _rendered(loaded, file, limits, {"seed": seed, "sensor": k}, resume)
-        emission = result.mean[..., -3:] if getattr(loaded.integrator(), "layers", False) else None
-        numbers, error = _numbers(result), _error(result)
-        picture = Picture(file.stem, _colours(result.mean), numbers, error, loaded, k, denoise, emission)
-        _report(result, _publish(picture, file, draw))
+        with one_writer(file):
+            result = _rendered(loaded, file, limits, {"seed": seed, "sensor": k}, resume)
+            emission = result.mean[..., -3:] if getattr(loaded.integrator(), "layers", False) else None
+            numbers, error = _numbers(result), _error(result)
+            picture = Picture(file.stem, _colours(result.mean), numbers, error, loaded, k, denoise, emission)
+            _report(result, _publish(picture, file, draw))
     for sentence in loaded.integrator().gathered if is_bssrdf(loaded.integrator()) else ():
         console().print(sentence, highlight=False, markup=False, soft_wrap=True)
 

@@ -6,6 +6,7 @@ trusts them, reads them.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import os
@@ -23,6 +24,7 @@ import numpy as np
 from halfspace_sss.backend import array_types
 from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.executors import completed
+from halfspace_sss.locks import one_writer
 from halfspace_sss.maps.grid import MapGrid, cell_edges, map_directions
 from halfspace_sss.maps.map_tracing import MapUnit, UnitResult, trace_unit
 from halfspace_sss.physics.medium import Medium
@@ -155,8 +157,8 @@ def make_maps(
         name -> path of the store.
 
     Raises:
-        ValueError: an argument is out of range, or a store exists with other parameters; nothing has been written
-            then. Or a unit of a store is damaged; nothing has been traced then.
+        ValueError: an argument is out of range, a store exists with other parameters, or another run writes it; nothing
+            has been written then. Or a unit of a store is damaged; nothing has been traced then.
     """
     grid = grid or MapGrid()
     _check(media, target_error, n_paths, seed, share)
@@ -164,6 +166,20 @@ def make_maps(
     paths = {name: path_of(folder) / f"{name}.zarr" for name in media}
     asked = {name: _parameters(m, grid, target_error, n_paths, seed, backend) for name, m in media.items()}
     units = _units(media, grid, target_error, n_paths or MOST_PATHS, seed, backend)[share[0] :: share[1]]
+    with contextlib.ExitStack() as locks:
+        for path in paths.values():
+            locks.enter_context(one_writer(path, shared=share[1] > 1))
+            if share[1] > 1:
+                locks.enter_context(one_writer(path.with_name(f"{path.name}.{share[0]}-of-{share[1]}")))
+        _fill(media, paths, asked, units, grid, seed, progress, executor)
+    return paths
+
+
+def _fill(
+    media: Mapping[str, Medium], paths: dict[str, Path], asked: dict[str, dict], units: list[tuple[str, int, MapUnit]],
+    grid: MapGrid, seed: int, progress: ProgressText | None, executor: Executor | None,
+) -> None:  # fmt: skip
+    """Make the stores that are not there, and trace the units that are not whole."""
     for name in media:
         if _exists(paths[name]):
             drop_cut_off(paths[name], {(channel, u.theta_index) for of, channel, u in units if of == name})
@@ -184,7 +200,6 @@ def make_maps(
     for done, (text, _) in enumerate(completed(executor, _trace_and_write, parts), before + 1):
         if progress:
             progress(done, len(units), text)
-    return paths
 
 
 def _units(

@@ -21,6 +21,7 @@ import mitsuba as mi
 import numpy as np
 
 from halfspace_sss.checks import check_count
+from halfspace_sss.locks import one_writer
 from halfspace_sss.provenance import check_folder, provenance
 from halfspace_sss.rendering.object.objects import translucent_shapes
 from halfspace_sss.rendering.object.registry import AUTO
@@ -76,8 +77,8 @@ def render(
         progress: called after each pass.
 
     Raises:
-        ValueError: an argument is out of range, the file is damaged or of another render, or a pass has values that
-            are not finite.
+        ValueError: an argument is out of range, the file is damaged, of another render or written by another run, or a
+            pass has values that are not finite.
     """
     limits = Limits(spp, passes, target_error, seconds)
     _check(spp_per_pass, seed, interval)
@@ -86,6 +87,15 @@ def render(
         raise ValueError(f"path must end in .exr, got {str(path)!r}")
     check_folder(path.parent)
     scene, integrator = loaded(scene, integrator, sensor)
+    with one_writer(path):
+        return _in_passes(scene, path, integrator, sensor, seed, limits, spp_per_pass, interval, resume, progress)
+
+
+def _in_passes(
+    scene: mi.Scene, path: Path, integrator: mi.Integrator, sensor: int, seed: int, limits: Limits,
+    spp_per_pass: int | None, interval: float, resume: bool | str | os.PathLike, progress: Progress | None,
+) -> Reference:  # fmt: skip
+    """See `render`."""
     about = about_render(scene, integrator, sensor, seed) | chosen(scene, integrator)
     about["learnt"] = learnt(scene, integrator)
     result = _start(path, resume, about)
@@ -93,7 +103,7 @@ def render(
     last = time.monotonic()
     try:
         while not limits.reached(result):
-            result = _pass(result, scene, integrator, sensor, about, _pass_spp(result, spp_per_pass, spp))
+            result = _pass(result, scene, integrator, sensor, about, _pass_spp(result, spp_per_pass, limits.spp))
             if time.monotonic() - last >= interval:
                 _keep(path, result)
                 written, last = result, time.monotonic()
