@@ -34,6 +34,7 @@ NODES = 96
 DEGREE = 64  # of ln(R / albedo) as a polynomial of x, s = x / (c + (1 - c) x), s² = 1 - albedo'
 DENSE = 8192  # values of it between which its inverse is looked up
 STEPS = 2  # of Newton's method after that
+LARGEST_G = 0.9999  # beyond it the peak, and that backwards, is narrower than the nodes are apart
 LEAST = 1e-6  # albedo that stands for 0 in ln(R / albedo)
 
 
@@ -64,13 +65,14 @@ def half_space_reflectance(albedo: float, g: float, eta: float, mu_i: float | st
 
     Args:
         albedo: of single scattering, [0, 1].
-        g: mean cosine of the Henyey-Greenstein phase function, (-1, 1).
+        g: mean cosine of the Henyey-Greenstein phase function, [-0.9999, 0.9999].
         eta: index inside over outside, > 0.
         mu_i: cosine of incidence, [0, 1], or "diffuse" for uniform radiance from above.
 
-    Left out: what the boundary reflects from outside. Relative error 1e-5 at most for |g| <= 0.99.
+    Left out: what the boundary reflects from outside. Absolute error, against 256 nodes: at most 6e-8 for |g| <= 0.9,
+    6e-5 for g in [-0.95, 0.98], and 6e-3 at -0.99, where the peak backwards leaves along the normal.
     """
-    _check_direction(mu_i)
+    _check(g, mu_i)
     with one_blas_thread():
         return _reflectance(albedo, g, eta, mu_i)
 
@@ -79,9 +81,11 @@ def _reflectance(albedo: float, g: float, eta: float, mu_i: float | str) -> floa
     m, basis, T, share = _even_light(albedo, g, eta)
     if mu_i == DIFFUSE:
         up = (m.s - m.d) / 2
-        return float(2 * np.sum(basis.w * basis.mu * T * (up @ share)))
-    # reciprocity: what comes out towards mu_i then is R(mu_i)
-    return float(F_t(mu_i, eta) * _upwards(m, basis, share, mu_internal(mu_i, eta)) / eta**2)
+        R, entered = 2 * np.sum(basis.w * basis.mu * T * (up @ share)), 2 * np.sum(basis.w * basis.mu * T) * eta**2
+    else:  # reciprocity: what comes out towards mu_i then is R(mu_i)
+        entered = F_t(mu_i, eta)
+        R = entered * _upwards(m, basis, share, mu_internal(mu_i, eta)) / eta**2
+    return float(np.clip(R, 0, entered))  # but for rounding
 
 
 def _even_light(albedo: float, g: float, eta: float) -> tuple[_Modes, _Basis, np.ndarray, np.ndarray]:
@@ -117,7 +121,9 @@ def directional_table(g: float, eta: float, x: np.ndarray, mu_in: np.ndarray) ->
     return np.log(result)
 
 
-def _check_direction(mu_i: float | str) -> None:
+def _check(g: float, mu_i: float | str) -> None:
+    if not abs(g) <= LARGEST_G:
+        raise ValueError(f"g must be in [-{LARGEST_G}, {LARGEST_G}] for the exact reflectance, got {float(g)!r}")
     if mu_i != DIFFUSE and not (isinstance(mu_i, numbers.Real) and 0 <= mu_i <= 1):
         raise ValueError(f"mu_i must be a number in [0, 1] or {DIFFUSE!r}, got {mu_i!r}")
 
@@ -149,13 +155,23 @@ def _basis(eta: float) -> _Basis:
 
 
 def _nodes(n: int, eta: float) -> tuple[np.ndarray, np.ndarray]:
-    """Gauss points of [0, 1], close together on both sides of the critical cosine, where radiance has a kink."""
-    x, w = np.polynomial.legendre.leggauss(n if eta <= 1 else n // 2)
-    t, w = 0.5 * (x + 1), 0.5 * w
+    """Gauss points of [0, 1], close together on both sides of the critical cosine c, where radiance has a kink.
+
+    Below a small c there are few: all others would be too few for the polynomials of highest order, which are then not
+    orthogonal on the nodes.
+    """
     if eta <= 1:
-        return t, w
+        return _gauss(n)
     c = math.sqrt((eta - 1) * (eta + 1)) / eta
-    return np.concatenate([c * (1 - t * t), c + (1 - c) * t * t]), np.concatenate([c * 2 * t * w, (1 - c) * 2 * t * w])
+    below = max(n // 8, round(n * min(c, 0.5)))
+    (t, w), (T, W) = _gauss(below), _gauss(n - below)
+    return np.concatenate([c * (1 - t * t), c + (1 - c) * T * T]), np.concatenate([c * 2 * t * w, (1 - c) * 2 * T * W])
+
+
+def _gauss(n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points and weights on [0, 1]."""
+    x, w = np.polynomial.legendre.leggauss(n)
+    return 0.5 * (x + 1), 0.5 * w
 
 
 def albedo_of_reflectance(reflectance: np.ndarray, g: float, eta: float, mu_i: float | str = DIFFUSE) -> np.ndarray:
@@ -168,7 +184,7 @@ def albedo_of_reflectance(reflectance: np.ndarray, g: float, eta: float, mu_i: f
     Raises:
         ValueError: a reflectance is out of reach; bound and value are named.
     """
-    _check_direction(mu_i)
+    _check(g, mu_i)
     R = np.asarray(reflectance, dtype=np.float64)
     x, values, polynomial = _inverse(float(g), float(eta), mu_i if mu_i == DIFFUSE else float(mu_i))
     most = half_space_reflectance(1.0, g, eta, mu_i)

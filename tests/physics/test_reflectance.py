@@ -9,7 +9,7 @@ import pytest
 
 from halfspace_sss import Medium
 from halfspace_sss.comparison.truths import read_truths
-from halfspace_sss.physics.reflectance import albedo_of_reflectance, half_space_reflectance
+from halfspace_sss.physics.reflectance import LARGEST_G, albedo_of_reflectance, half_space_reflectance
 
 EXACT = [t for t in read_truths()[0] if t.measure == "R_d" and t.kind == "exact"]
 MEDIA = [(0.0, 1.0), (0.0, 1.3), (0.9, 1.5), (-0.5, 1.33), (0.99, 1.4), (0.3, 0.8)]
@@ -30,6 +30,26 @@ def test_the_reflectance_is_that_of_every_exact_row_to_1e_5():
 def test_without_absorption_all_light_that_enters_comes_back(g, eta):
     entered = half_space_reflectance(1.0, 0.0, eta)
     assert half_space_reflectance(1.0, g, eta) == pytest.approx(entered, rel=1e-10)
+
+
+@pytest.mark.parametrize("eta", [0.5, 1.0, 1 + 1e-9, 1.0001, 1.001, 1.01, 2.0])
+@pytest.mark.parametrize("g", [-LARGEST_G, -0.999, 0.0, 0.999, LARGEST_G])
+def test_reflectances_at_the_ends_of_their_arguments_rise_with_the_albedo_to_what_enters(g, eta):
+    for mu_i in ("diffuse", 0.01, 1.0):
+        albedos = (0.0, 0.5, 1 - 1e-5, 1 - 1e-6, 1 - 1e-7, 1 - 1e-9, 1.0)
+        R = [half_space_reflectance(albedo, g, eta, mu_i) for albedo in albedos]
+        entered = half_space_reflectance(1.0, 0.0, eta, mu_i)
+        assert min(R) >= 0 and np.diff(R).min() >= -1e-9
+        assert max(R) <= entered * (1 + 1e-9) and R[-1] == pytest.approx(entered, rel=1e-3)
+        assert Medium.from_albedo(1 - 1e-7, 1.0, g, eta).reflectance(mu_i) == R[4]
+
+
+@pytest.mark.parametrize("g", [0.0, 0.9, 0.98, 0.99])
+def test_a_boundary_that_hardly_refracts_is_nearly_none(g):
+    for albedo in (0.9, 0.9999):
+        for mu_i in ("diffuse", 0.3, 1.0):
+            none, hardly = (half_space_reflectance(albedo, g, eta, mu_i) for eta in (1.0, 1 + 1e-8))
+            assert hardly == pytest.approx(none, rel=3e-4)
 
 
 def test_a_black_medium_reflects_nothing():
@@ -114,6 +134,7 @@ def test_the_walk_gives_the_wanted_reflectance():
         (dict(reflectance=float("nan"), mfp=1.0), "reflectance must be in"),
         (dict(reflectance=0.5, mfp=0.0), "mfp must be finite and > 0"),
         (dict(reflectance=0.5, mfp=1.0, g=1.0), "g must be in the open interval"),
+        (dict(reflectance=0.5, mfp=1.0, g=-0.99999), "g must be in \\[-0.9999, 0.9999\\] for the exact .*got -0.99999"),
         (dict(reflectance=0.5, mfp=1.0, eta=0.0), "eta must be finite and > 0"),
         (dict(reflectance=0.5, mfp=1.0, mu_i=1.5), "mu_i must be a number in"),
         (dict(reflectance=[0.5, 0.4], mfp=[1.0, 2.0, 3.0]), "same number of channels"),
@@ -122,3 +143,9 @@ def test_the_walk_gives_the_wanted_reflectance():
 def test_what_no_medium_can_be_is_refused_by_name(arguments, text):
     with pytest.raises(ValueError, match=text):
         Medium.from_reflectance(**arguments)
+
+
+def test_a_g_beyond_what_the_nodes_resolve_is_refused_by_name():
+    for g in (-1 + 1e-9, 0.99995):
+        with pytest.raises(ValueError, match=r"g must be in \[-0.9999, 0.9999\] for the exact reflectance, got"):
+            Medium.from_albedo(0.9, 1.0, g, 1.4).reflectance()
