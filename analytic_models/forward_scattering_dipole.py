@@ -11,7 +11,7 @@ import numpy as np
 from analytic_models._diffusion import unit_gauss
 from halfspace_sss.checks import check_choice
 from halfspace_sss.interface.model import BSSRDF, Query
-from halfspace_sss.physics.fresnel import boundary_A
+from halfspace_sss.physics.fresnel import boundary_A, sine
 from halfspace_sss.physics.medium import Medium
 
 R_MIN, MU_MIN = 1e-6, 1e-3  # mean free paths; refracted cosine
@@ -158,7 +158,7 @@ class _Integrand:
         lib = q.lib
         self.r = p * lib.maximum(q.r, R_MIN)
         self.mu_i, self.mu_o = lib.maximum(q.mu_i_in, MU_MIN), lib.maximum(q.mu_o_in, MU_MIN)
-        sin_i, sin_o = (lib.sqrt((1 - mu) * (1 + mu)) for mu in (self.mu_i, self.mu_o))
+        sin_i, sin_o = sine(self.mu_i), sine(self.mu_o)
         self.along = sin_o * lib.cos(q.phi_o) - sin_i * lib.cos(q.phi_i)
         side = sin_o * lib.sin(q.phi_o) - sin_i * lib.sin(q.phi_i)
         self.across2 = side * side + (self.mu_o - self.mu_i) * (self.mu_o - self.mu_i)

@@ -8,6 +8,7 @@ from typing import Any
 from analytic_models._diffusion import DiffuseBoundary, Grosjean, safe_differences, unit_gauss
 from halfspace_sss.checks import check_choice
 from halfspace_sss.interface.model import BSSRDF, Query
+from halfspace_sss.physics.fresnel import sine
 from halfspace_sss.physics.medium import Medium
 
 R_MIN, MU_MIN = 1e-6, 1e-3  # mean free paths; refracted cosine
@@ -80,9 +81,9 @@ class PhotonBeamDiffusion(BSSRDF):
         lib, c = q.lib, self._c
         sigma_tr, sigma_t_prime = q.constant(c.sigma_tr), q.constant(c.sigma_t_prime)
         r, mu = lib.maximum(q.r, R_MIN), lib.maximum(q.mu_i_in, MU_MIN)
-        sin_i = lib.sqrt((1 - mu) * (1 + mu))
-        cosine, sine = -sin_i * lib.cos(q.phi_i), sin_i * lib.sin(q.phi_i)
-        h2_over_r2 = mu * mu + sine * sine  # 1 - cosine², cosine that of the beam with x_o - x_i
+        sin_i = sine(mu)
+        cosine, aside = -sin_i * lib.cos(q.phi_i), sin_i * lib.sin(q.phi_i)
+        h2_over_r2 = mu * mu + aside * aside  # 1 - cosine², cosine that of the beam with x_o - x_i
         t_0 = r * cosine  # where the beam is nearest to x_o, at the distance h = r sqrt(h2_over_r2)
         gap = r * lib.where(cosine > 0, h2_over_r2 / (1 + lib.abs(cosine)), 1 - cosine)  # r - t_0
         log_tail = 7.0 + 0.5 * self.n_samples  # what is cut off is exp(-log_tail) of the integral

@@ -19,7 +19,7 @@ from halfspace_sss.arrays import broadcast_query, is_torch
 from halfspace_sss.checks import check_choice, check_query
 from halfspace_sss.extensions import FAILURES, MODELS, TRANSPORTS, offered, offers, warn_left_out
 from halfspace_sss.lazy import once
-from halfspace_sss.physics.fresnel import C_phi, F_t, mu_internal
+from halfspace_sss.physics.fresnel import C_phi, F_t, mu_internal, sine
 from halfspace_sss.physics.layers import Layers
 from halfspace_sss.physics.medium import Medium, medium_of
 
@@ -65,8 +65,7 @@ class Query:
         return self._sine(self.mu_o)
 
     def _sine(self, mu: Any) -> Any:
-        lib = self.lib
-        return lib.minimum(lib.sqrt(lib.maximum((1 - mu) * (1 + mu), 0.0)) / self.index, 1.0)
+        return self.lib.minimum(sine(mu) / self.index, 1.0)
 
     def constant(self, value: Any) -> Any:
         """A constant of the model (number, or one per channel) in the library and precision of the query."""

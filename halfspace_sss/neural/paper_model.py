@@ -12,7 +12,7 @@ from halfspace_sss.neural.network import RELU, Network
 from halfspace_sss.neural.store import find_weights, load_weights, record_number
 from halfspace_sss.neural.symmetric import channel_queries, channels
 from halfspace_sss.physics.backbone import U_MAX, length_scale
-from halfspace_sss.physics.fresnel import F_t
+from halfspace_sss.physics.fresnel import F_t, sine
 from halfspace_sss.physics.medium import Medium
 
 KIND, N_INPUTS = "neural_paper", 6
@@ -36,7 +36,7 @@ def paper_inputs(lib: Any, r: Any, line: Any, w_i: tuple[Any, Any], w_o: tuple[A
 def query_inputs(q: Query, L: Any) -> list[Any]:
     """The six numbers of a query, in the frame in which w_i has azimuth 0, at most 12 L away."""
     lib = q.lib
-    sines = [lib.sqrt(lib.maximum((1 - mu) * (1 + mu), 0.0)) for mu in (q.mu_i, q.mu_o)]
+    sines = [sine(mu) for mu in (q.mu_i, q.mu_o)]
     w_i, w_o = (sines[0], 0 * q.phi_i), (sines[1], q.phi_o - q.phi_i)
     return paper_inputs(lib, lib.minimum(q.r, U_MAX * L), -q.phi_i, w_i, w_o, L)
 

@@ -10,6 +10,8 @@ import numpy as np
 
 from halfspace_sss.arrays import library
 
+SMALLEST_SQUARE = 1e-24  # of a sine
+
 
 def _matched(eta: Any) -> bool:
     """Whether the index is the number 1, for which formulas shorten to exact ones; arrays are masked instead."""
@@ -68,7 +70,14 @@ def mu_internal(mu: Any, eta: Any) -> Any:
     lib = library(mu, eta)
     if _matched(eta):
         return mu
-    return lib.minimum(lib.sqrt(lib.maximum(_m2(mu, eta), 0.0)) / eta, 1.0)  # in float32 mu = 1 may give 1 + 1e-7
+    result = lib.sqrt(lib.maximum(_m2(mu, eta), 0.0)) / eta
+    return lib.where(result > 1, 1 + 0 * result, result)  # in float32 mu = 1 may give 1 + 1e-7
+
+
+def sine(mu: Any) -> Any:
+    """Sine of the angle with the cosine mu; 1e-12 at normal incidence, as a root has no derivative at 0."""
+    lib = library(mu)
+    return lib.sqrt(lib.maximum((1 - mu) * (1 + mu) + SMALLEST_SQUARE, 0.5 * SMALLEST_SQUARE))
 
 
 def mu_external(mu: Any, eta: Any) -> Any:

@@ -19,7 +19,7 @@ import numpy as np
 
 from halfspace_sss.arrays import broadcast_query, library
 from halfspace_sss.checks import rounding
-from halfspace_sss.physics.fresnel import F_t, mu_external, mu_internal
+from halfspace_sss.physics.fresnel import F_t, mu_external, mu_internal, sine
 from halfspace_sss.physics.medium import Medium, eval_hg
 
 TINY = 1e-30
@@ -67,7 +67,7 @@ def _checked(lib: Any, name: str, value: Any, given: Any) -> Any:
 
 def _sine(lib: Any, mu: Any, eta: float) -> Any:
     """Sine of the refracted angle, sqrt(1 - mu²)/eta, at most 1."""
-    return lib.minimum(lib.sqrt(lib.maximum((1 - mu) * (1 + mu), 0.0)) / eta, 1.0)
+    return lib.minimum(sine(mu) / eta, 1.0)
 
 
 def _throughput(lib: Any, medium: Medium, mu_i: Any, mu_o: Any, delta_phi: Any) -> Any:
