@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from test_translucent_walk import COLOURED, _agree, _lamp, _runs, _scene, _small_lamp, _z
 
-from halfspace_sss.rendering.object import objects
+from halfspace_sss.rendering.object import half_space, objects
 from halfspace_sss.rendering.object.points import ObjectModel
 from halfspace_sss.rendering.paths import low_orders
 from halfspace_sss.rendering.walk import media as walks
@@ -30,6 +30,7 @@ def only_few(monkeypatch: pytest.MonkeyPatch) -> None:
     """No order from two on: neither in walks nor by a model."""
     monkeypatch.setattr(objects, "_model_of", lambda *_: ObjectModel(None, None))
     monkeypatch.setitem(walks._MOST, "total", 1)
+    monkeypatch.setattr(half_space, "MOST_STRAIGHT", 1.0)  # no model has to know what passes
 
 
 def _shape(name: str) -> dict:
@@ -46,7 +47,8 @@ def _pair(surface: dict, light: dict | None, shape: str, spp: tuple[int, int], r
     found = []
     for k, kind in enumerate(("bssrdf", "translucent_walk")):
         scene = _scene({**surface, "model": "better_dipole"}, light, _shape(shape))
-        scene["integrator"] = {"type": kind, "max_depth": -1, "rr_depth": 20}
+        walk = {"light": "sampled"} if kind == "translucent_walk" else {}
+        scene["integrator"] = {"type": kind, "max_depth": -1, "rr_depth": 20, **walk}
         found.append(_runs(mi.load_dict(scene), runs, spp[k], 1 + 100 * k))
     return found
 

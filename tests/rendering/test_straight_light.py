@@ -41,7 +41,7 @@ def _scene(shape: dict[str, Any], lights: tuple[str, ...], surface: dict[str, An
             "pixel_format": "rgb"}  # fmt: skip
     view = mi.ScalarTransform4f().look_at([-5, 8, 50], [0, 0, 0], [0, 1, 0])
     return {
-        "type": "scene", "integrator": {"type": "translucent_walk", "mm_per_unit": UNIT, **how},
+        "type": "scene", "integrator": {"type": "translucent_walk", "mm_per_unit": UNIT, "light": "sampled", **how},
         "sensor": {"type": "perspective", "fov": 12.0, "to_world": view, "film": film},
         **{name: LIGHTS[name] for name in lights}, "object": {**shape, "bsdf": {"type": "translucent", **surface}},
     }  # fmt: skip

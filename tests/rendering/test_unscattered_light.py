@@ -48,7 +48,7 @@ def _means(scene: Any, runs: int, spp: int, seed: int) -> np.ndarray:
     return np.array([np.array(mi.render(scene, spp=spp, seed=seed + k)).mean(axis=(0, 1)) for k in range(runs)])
 
 
-def _compare(surface: dict, known_to: float, shape: dict | None = None, spp: int = 256, **more: Any) -> None:
+def _compare(surface: dict, known_to: float, shape: dict | None = None, spp: int = 1024, **more: Any) -> None:
     """Mean colours with precomputed and with sampled light agree, and are known to a share of themselves."""
     found, wanted = (
         _means(_scene(light, surface, shape, **more), runs, spp, seed)
@@ -119,7 +119,7 @@ def test_a_medium_without_absorption_is_invisible_in_uniform_light() -> None:
 
 
 def test_precomputed_light_of_a_lamp_has_the_mean_of_sampled_light() -> None:
-    _compare(MEDIUM, 0.01, lamp=_lamp())
+    _compare(MEDIUM, 0.015, spp=256, lamp=_lamp())
 
 
 @pytest.mark.slow
@@ -128,28 +128,28 @@ def test_precomputed_light_has_the_mean_of_sampled_light(case: str) -> None:
     lamp, floor = {"lamp": _lamp()}, {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": 0.6}}
     floor["to_world"] = mi.ScalarTransform4f().translate([0, -5.2, 0]).rotate([1, 0, 0], -90).scale(30)
     if case == "cube":
-        _compare(MEDIUM, 0.01, _cube(), **lamp)
+        _compare(MEDIUM, 0.02, _cube(), **lamp)
     elif case == "sky":
         _compare(MEDIUM, 0.004, light={"type": "constant"})
     elif case == "point":
-        _compare(MEDIUM, 0.01, light={"type": "point", "position": [20, 25, 10], "intensity": 900.0})
+        _compare(MEDIUM, 0.02, light={"type": "point", "position": [20, 25, 10], "intensity": 900.0})
     elif case == "sun":
-        _compare(MEDIUM, 0.01, light={"type": "directional", "direction": [-1, -2, -0.5], "irradiance": 3.0})
+        _compare(MEDIUM, 0.02, light={"type": "directional", "direction": [-1, -2, -0.5], "irradiance": 3.0})
     elif case == "floor":
-        _compare(MEDIUM, 0.01, floor=floor, **lamp)
+        _compare(MEDIUM, 0.02, floor=floor, **lamp)
     elif case == "two":
-        other = {**_ball(3.0, center=[6, -1, 4]), "bsdf": {"type": "translucent", **MEDIUM, "sigma_s": "2.0,1.0,0.7"}}
-        _compare(MEDIUM, 0.01, other=other, **lamp)
+        other = {**_ball(3.0, center=[8, -1, 5]), "bsdf": {"type": "translucent", **MEDIUM, "sigma_s": "2.0,1.0,0.7"}}
+        _compare(MEDIUM, 0.02, other=other, **lamp)
     elif case == "instances":
         group = {"type": "shapegroup", "part": {**_ball(2.0), "bsdf": {"type": "translucent", **MEDIUM}}}
-        mirror = mi.ScalarTransform4f().translate([5, 4, 2]).scale([-1, 1.5, 1])
+        mirror = mi.ScalarTransform4f().translate([7, 5, 3]).scale([-1, 1.5, 1])
         shown = {"type": "instance", "to_world": mirror, "group": {"type": "ref", "id": "group"}}
-        _compare(MEDIUM, 0.01, group=group, shown=shown, **lamp)
+        _compare(MEDIUM, 0.02, group=group, shown=shown, **lamp)
     elif case == "g":
-        _compare({**MEDIUM, "g": 0.7}, 0.01, **lamp)
+        _compare({**MEDIUM, "g": 0.7}, 0.02, **lamp)
     elif case == "rough":
         _compare({**MEDIUM, "boundary": {"type": "roughdielectric", "alpha": 0.3, "int_ior": 1.4, "ext_ior": 1.0}},
-                 0.01, **lamp)  # fmt: skip
+                 0.02, **lamp)  # fmt: skip
     else:
         painted = {"type": "checkerboard", "color0": 0.5, "color1": 0.95}
         _compare({"albedo": painted, "sigma_t": 1.5, "eta": 1.4}, 0.01, _cube(), **lamp)
@@ -196,9 +196,9 @@ def test_an_object_of_another_medium_has_other_cells() -> None:
 
 def test_the_layer_of_emission_holds_the_mirror_and_what_is_behind_the_object() -> None:
     """Of an object that scatters nothing back, all light is mirrored, or passes beside it."""
-    black = {"sigma_s": 1e-6, "sigma_a": 50.0, "eta": 1.4}
-    scene = _scene("sampled", black, light={"type": "constant"})
-    integrator = mi.load_dict({"type": "translucent_walk", "layers": True})
+    black = {"sigma_s": 1e-6, "sigma_a": 5.0, "eta": 1.4}
+    scene = _scene("auto", black, light={"type": "constant"})
+    integrator = mi.load_dict({"type": "translucent_walk", "light": "precomputed", "layers": True})
     image = np.array(mi.render(scene, spp=64, seed=1, integrator=integrator))
     assert image.shape == (8, 8, 6)
     assert image[..., 3:] == pytest.approx(image[..., :3], abs=1e-4)

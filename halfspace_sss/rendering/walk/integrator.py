@@ -62,8 +62,8 @@ def _class(variant: str) -> type:
         `unscattered_light`, which has 10 to 50 times less noise in the same time and a bias of less than .3 %;
         "sampled" meets it by chance and by connections, without that bias; "auto" precomputes it where that is
         possible and there is more than an even sky, and samples it for derivatives), `layers` (false; true adds the
-        channels emission.R, .G and .B to the image: emitters that the camera sees, at once or in the mirror of an
-        object, which leaves what is behind it for a denoiser).
+        channels emission.R, .G and .B to the image: emitters that the camera sees at once and, with precomputed light,
+        in the mirror of an object, which leaves what is behind it for a denoiser).
         """
 
         def __init__(self, props: mi.Properties) -> None:

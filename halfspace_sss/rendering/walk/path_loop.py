@@ -497,9 +497,13 @@ class PathTracer:
     def _mirror(
         self, L: mi.Spectrum, p: CameraPath, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, k: mi.Int32, active: mi.Bool
     ) -> tuple[mi.Bool, mi.Spectrum, CameraPath]:
-        """Whether object k mirrors, and the light with the emission it mirrors, at the first vertex also told apart."""
+        """Whether object k mirrors, and the light with the emission it mirrors, at the first vertex also told apart.
+
+        Only where light inside is precomputed: beside light that is met by chance, of an even sky above all, the choice
+        between both sides of the boundary has less noise.
+        """
         media = self.visitor.media
-        if not media.objects:
+        if self.visitor.unscattered is None:
             return mi.Bool(False), L, p
         mirrors = active & ~media.row("rough", k)
         emission = self.visitor.mirrored_emitter(p.walk, si, bsdf, mirrors)
