@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import functools
 import operator
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -206,10 +207,13 @@ def library(*args: Any) -> Any:
     return _torch_library() if "torch" in modules else _NUMPY
 
 
-def _common_float(lib: Any, args: tuple) -> tuple:
+def _common_float(lib: Any, args: tuple, names: Sequence[str] = ()) -> tuple:
     """Arguments as floating-point arrays of one library and the widest precision among the arrays."""
     if lib is _NUMPY:
         arrays = [np.asarray(a) for a in args]
+        for name, array, raw in zip(names or ("a query",) * len(args), arrays, args):
+            if array.dtype.kind not in "biufO":  # objects are None, or numbers of another kind, such as fractions
+                raise ValueError(f"{name} must be real numbers, got {raw!r}")
         # Python numbers and integers are weak: they take the precision of the floating arrays around them
         strong = [a.dtype for a, raw in zip(arrays, args) if not isinstance(raw, (int, float)) and a.dtype.kind == "f"]
         dtype = np.result_type(np.float32, *strong) if strong else np.float64
@@ -227,17 +231,21 @@ def _common_float(lib: Any, args: tuple) -> tuple:
     return tuple(kind(a) for a in args)
 
 
-def broadcast_query(*args: Any) -> tuple[Any, tuple]:
+def broadcast_query(*args: Any, names: Sequence[str] = ()) -> tuple[Any, tuple]:
     """The library of a query and its arguments as broadcast floating-point arrays of that library.
 
     The precision is the widest among the array arguments; Python numbers follow it, and a query of
     Python numbers only is answered in float64.
 
+    Args:
+        args: of the query.
+        names: of these, for messages.
+
     Raises:
-        ValueError: the shapes do not broadcast, or libraries are mixed.
+        ValueError: the shapes do not broadcast, libraries are mixed, or NumPy has no real numbers, as of text.
     """
     lib = library(*args)
-    args = _common_float(lib, args)
+    args = _common_float(lib, args, names)
     if lib is _NUMPY:
         return lib, tuple(np.broadcast_arrays(*args))
     if isinstance(lib, _TorchLibrary):

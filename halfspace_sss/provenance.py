@@ -115,8 +115,8 @@ def read_bytes(path: str | Path, most: int = LARGEST) -> bytes:
 
 
 def read_text(path: str | Path, most: int = LARGEST_TEXT) -> str:
-    """The text of a file in UTF-8; OSError as `read_bytes`."""
-    return read_bytes(path, most).decode("utf-8")
+    """The text of a file in UTF-8, without the mark that spreadsheets put first; OSError as `read_bytes`."""
+    return read_bytes(path, most).decode("utf-8-sig")
 
 
 def write_atomically(path: Path, content: bytes | str) -> None:

@@ -96,6 +96,8 @@ def _media(
     stated = stated_medium(names, given)
     if name is not None and stated is None:
         raise ValueError(f"name must be left out unless coefficients are given, got {name!r}")
+    if name == "":
+        raise ValueError("name must have a letter at least, got ''")
     check_channel(channels, names)
     if not names:
         return {"fig10": fig10_medium()} if stated is None else {name or "medium": stated}

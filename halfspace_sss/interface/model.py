@@ -310,7 +310,7 @@ class BSSRDF(abc.ABC):
 
     def _S(self, G_of: Callable[[Query], Any], *query: Any) -> Any:
         """sigma_t² T_12 T_21 G_of(query)."""
-        lib, args = broadcast_query(*query)
+        lib, args = broadcast_query(*query, names=("r", "mu_i", "phi_i", "mu_o", "phi_o"))
         args = check_query(lib, args, query)
         S = recorded_in_blocks(lib, functools.partial(self._S_of_checked, lib, G_of), args)
         return S[()] if isinstance(S, np.ndarray) else S

@@ -6,6 +6,7 @@ import csv
 import functools
 import io
 import os
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import resources
@@ -20,6 +21,7 @@ from halfspace_sss.physics.reflectance import DIFFUSE, half_space_reflectance
 from halfspace_sss.provenance import read_text
 
 PER_MM = {"1/mm": 1.0, "1/cm": 10.0}
+SHORTEST = 100.0  # nm, of a medium; less looks like µm
 COLUMNS = ("wavelength", "mu_a", "mu_s", "g", "n")
 VISIBLE = (400.0, 700.0)  # nm; outside, colour-matching functions are below 2 % of their maximum, 4 % for z
 XYZ_TO_RGB = np.array(  # linear sRGB, IEC 61966-2-1
@@ -78,6 +80,12 @@ class SpectralMedium:
             raise ValueError(f"wavelengths must be two or more numbers (nm), got shape {wavelengths.shape}")
         _check("wavelengths", wavelengths, wavelengths > 0, wavelengths, "> 0 (nm)")
         _check("wavelengths", wavelengths[1:], np.diff(wavelengths) > 0, wavelengths[1:], "ascending")
+        if wavelengths[-1] < SHORTEST:
+            warnings.warn(
+                f"wavelengths are in nm, got {wavelengths[0]:g} to {wavelengths[-1]:g}: of values in µm give 1000 "
+                "times as many",
+                stacklevel=3,
+            )
         object.__setattr__(self, "wavelengths", wavelengths)
         for name in ("sigma_s", "sigma_a", "g", "n"):
             value = _numbers(name, getattr(self, name))

@@ -211,7 +211,9 @@ class Skin:
     assumptions: tuple[str, ...]
 
     def layers(self, wavelength: float) -> Layers:
-        """Both at a wavelength (nm), the dermis semi-infinite; for `trace`."""
+        """Both at one wavelength (nm), the dermis semi-infinite; for `trace`."""
+        if np.ndim(wavelength):
+            raise ValueError(f"wavelength must be one number (nm), as layers have no channels, got {wavelength!r}")
         media = [spectra.medium(float(wavelength)) for spectra in (self.epidermis, self.dermis)]
         return Layers(media, [self.thickness])
 

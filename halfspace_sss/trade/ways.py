@@ -181,6 +181,11 @@ def stage(scene: Any, parameters: dict[str, str] | None = None) -> Stage:
     Raises:
         ValueError: as `load_objects`; there is no translucent object or no sensor, or it is an instance.
     """
+    if mi.variant() is None:
+        raise ValueError(
+            "a variant of Mitsuba must be set before a scene is looked at, got none: "
+            "`mitsuba.set_variant('llvm_ad_rgb')`, then `halfspace_sss.rendering.register()`"
+        )
     loaded = scene if isinstance(scene, mi.Scene) else load_objects(scene, parameters)
     shapes = translucent_shapes(loaded)
     if not shapes:

@@ -7,11 +7,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 import halfspace_sss as sss
 from halfspace_sss.cli import app as cli
+from halfspace_sss.provenance import read_text
 from halfspace_sss.trade import recommend
 
 MEDIUM = sss.Medium.from_albedo(0.75, 0.241)
@@ -139,3 +141,45 @@ def test_a_mesh_without_faces_is_refused_in_a_sentence(integrator: str, tmp_path
     with pytest.raises(ValueError, match="a mesh must have faces, got none"):
         scene = mi.load_dict({"type": "scene", "integrator": {"type": integrator}, "mesh": mesh})
         mi.render(scene, spp=1)
+
+
+@pytest.mark.parametrize("value", [1j, "1", np.array([1 + 0j]), ["a"], np.array("2026", "datetime64[Y]")])
+@pytest.mark.parametrize("argument", ["r", "mu_i", "phi_o"])
+def test_a_query_of_what_is_no_real_number_is_refused_by_name(argument: str, value: object) -> None:
+    query = {"r": 1.0, "mu_i": 1.0, "phi_i": 0.0, "mu_o": 1.0, "phi_o": 0.0, argument: value}
+    with pytest.raises(ValueError, match=f"^{argument} must be real numbers, got"):
+        sss.bssrdf("better_dipole", MEDIUM).eval(**query)
+
+
+SPECTRA = "wavelength,mu_a,mu_s,g,n\n{},0.1,1,0.8,1.4\n{},0.2,2,0.8,1.4\n"
+
+
+def test_the_mark_that_spreadsheets_put_first_is_no_part_of_a_file(tmp_path: Path) -> None:
+    (tmp_path / "skin.csv").write_text(SPECTRA.format(450, 650), encoding="utf-8-sig")
+    found = sss.materials.read_spectra(tmp_path / "skin.csv")
+    assert found.wavelengths.tolist() == [450, 650]
+    (tmp_path / "mine.toml").write_text("[mine]\nsigma_s = 1.0\nsigma_a = 0.1\n", encoding="utf-8-sig")
+    assert "\ufeff" not in read_text(tmp_path / "mine.toml")
+
+
+def test_wavelengths_in_micrometres_are_told(tmp_path: Path) -> None:
+    (tmp_path / "skin.csv").write_text(SPECTRA.format(0.45, 0.65))
+    with pytest.warns(UserWarning, match="wavelengths are in nm, got 0.45 to 0.65: of values in µm give 1000 times"):
+        sss.materials.read_spectra(tmp_path / "skin.csv")
+
+
+def test_layers_of_skin_are_those_of_one_wavelength() -> None:
+    with pytest.raises(ValueError, match=r"wavelength must be one number \(nm\), .* got \[450, 550\]"):
+        sss.materials.skin("II").layers([450, 550])
+
+
+def test_a_store_without_a_name_is_refused() -> None:
+    assert "name must have a letter at least" in _refused("maps", "--albedo", "0.5", "--name", "")
+
+
+def test_without_a_variant_of_mitsuba_a_scene_is_refused_with_what_to_do() -> None:
+    pytest.importorskip("mitsuba")
+    code = "from halfspace_sss.trade import recommend; recommend('ball.xml')"
+    found = _run(program=("-c", code)).stderr.decode().strip().splitlines()
+    assert found[-1].startswith("ValueError: a variant of Mitsuba must be set before a scene is looked at, got none: ")
+    assert "mitsuba.set_variant('llvm_ad_rgb')" in found[-1]
