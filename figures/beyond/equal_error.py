@@ -294,9 +294,10 @@ def draw(results: Mapping[str, Result]) -> dict[str, bytes | str]:
     return files
 
 
-ALBEDO, ETA = 1 - 1e-6, 1.5
+ALBEDO, ETA = 1.0, 1.5  # exactly: by 1 - 1e-6 a half-space absorbs 0.5 %
 RADIUS = 1000.0  # mean free paths: what a half-space lets out farther away than the sphere is wide is below 1 %
-WALK_SPP = 4  # nearly every walk comes back with weight 1
+SEEN = 0.7  # of the radius: the corners of the image see the sphere too
+WALK_SPP = 4  # every walk comes back with weight 1
 
 
 def furnace_models() -> list[str]:
@@ -317,7 +318,7 @@ def furnace_scene(model: str, size: int, radius: float = RADIUS) -> Any:
     from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED, load_scene
 
     at = mi.ScalarTransform4f()
-    view = at.look_at([0, 0, 2 * radius], [0, 0, 0], [0, 1, 0]) @ at.scale([0.9 * radius, 0.9 * radius, 1])
+    view = at.look_at([0, 0, 2 * radius], [0, 0, 0], [0, 1, 0]) @ at.scale([SEEN * radius, SEEN * radius, 1])
     film = {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}}
     surface = {"type": "translucent", "sigma_s": ALBEDO, "sigma_a": 1 - ALBEDO, "g": 0.0, "eta": ETA}
     scene = {

@@ -313,7 +313,8 @@ def test_half_precision_of_a_network_is_measured_beside_single() -> None:
     assert half.cost > 0 and abs(half.error - single.error) < 0.01
 
 
-def test_lambert_in_a_white_furnace_is_white() -> None:
+def test_lambert_in_a_white_furnace_is_the_diffuse_reflectance_and_what_the_boundary_mirrors() -> None:
+    """Of all that enters nothing is lost, but it leaves alike in all directions: 0.96 along the normal."""
     white = scene({"sigma_s": 5.0, "sigma_a": 0.0}, model="lambert")
     image = np.array(mi.render(mi.load_dict(white), spp=256))[24:40, 24:40, :3]
     expected = Medium(5.0, 0.0, eta=1.3).reflectance() + float(F_r(0.98, 1.3))  # of the middle of the ball
