@@ -17,7 +17,6 @@ from figures.computing.scenes import prepare
 from figures.computing.timed import rendered
 from halfspace_sss.neural.store import weights_in
 from halfspace_sss.rendering.paths.gathering import Gathering
-from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED
 
 PASS = 64  # samples of a pixel at a time
 SAMPLED, ADDED, GATHERED = KINDS = "sampled over walks", "gathered over sampled", "gathered over walks"
@@ -28,7 +27,7 @@ class Comparing:
     """What is compared.
 
     Args:
-        models: of `speeds.MODELS` and `speeds.MORE_MODELS`.
+        models: of `speeds.MODELS`.
         spp: samples of a pixel of sampled images and of walks, an eighth for each gathering; at least 16.
         gatherings: by different seeds, at least 2.
         size: pixels of the square images.
@@ -78,10 +77,8 @@ def gathered_errors(
         progress(f"{case.name}, {case.light}", k * len(how.models), total)
         walked = _halves(walk, how.spp, inside, how.seed, 0)
         for j, (model, gathers) in enumerate(scenes.items(), 1):
-            samples = None
-            if model != PATH_TRACED:
-                with weights_in(folder):
-                    samples = scene_of(case, f"{model}, sampled", how.size, folder)
+            with weights_in(folder):
+                samples = scene_of(case, f"{model}, sampled", how.size, folder)
             rows.append({"object": case.name, "light": case.light, "model": model})
             rows[-1] |= _of_model(gathers, samples, how, inside, walked)
             progress(f"{case.name}, {case.light}", k * len(how.models) + j, total)
@@ -89,15 +86,13 @@ def gathered_errors(
 
 
 def _of_model(gathers: Any, samples: Any, how: Comparing, inside: np.ndarray, walked: np.ndarray) -> dict[str, Any]:
-    """Errors by the scenes of a model; by photons there is none whose light is sampled."""
+    """Errors by the scenes of a model."""
     found = []
     for k in range(how.gatherings):
         gathers.integrator().gathering = Gathering(seed=k)
         found.append(_halves(gathers, how.spp // 8, inside, how.seed, 1 + k))
-    images, row = np.array(found), {}
-    if samples is not None:
-        sampled = _halves(samples, how.spp, inside, how.seed, 1 + how.gatherings)
-        row |= _row(SAMPLED, off(sampled[None], walked)) | _row(ADDED, off(images, sampled))
+    images, sampled = np.array(found), _halves(samples, how.spp, inside, how.seed, 1 + how.gatherings)
+    row = _row(SAMPLED, off(sampled[None], walked)) | _row(ADDED, off(images, sampled))
     return row | _row(GATHERED, off(images, walked))
 
 
@@ -108,10 +103,10 @@ def _row(kind: str, found: Off) -> dict[str, float]:
 def shown(table: pandas.DataFrame) -> pandas.DataFrame:
     """Errors with what is uncertain of them, and means of the image, as text."""
     found = table[["object", "light", "model"]].copy()
-    for kind in [kind for kind in KINDS if f"{kind}, %" in table]:
+    for kind in KINDS:
         rows = table[[f"{kind}, %", f"± {kind}", f"mean, {kind}"]].to_numpy()
-        found[f"{kind}, %"] = ["–" if np.isnan(rms) else f"{rms:.1f} ± {error:.1f}" for rms, error, _ in rows]
-        found[f"mean, {kind}"] = ["–" if np.isnan(mean) else f"{mean:.3f}" for *_, mean in rows]
+        found[f"{kind}, %"] = [f"{rms:.1f} ± {error:.1f}" for rms, error, _ in rows]
+        found[f"mean, {kind}"] = [f"{mean:.3f}" for *_, mean in rows]
     return found
 
 

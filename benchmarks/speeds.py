@@ -32,12 +32,10 @@ from halfspace_sss import materials
 from halfspace_sss.neural.store import weights_in
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.provenance import provenance, write_atomically
-from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED, load_scene
 
 LIGHTS = ("windows", "lamp and sky")
 OTHER_LIGHTS = ("even sky", "small light")  # the second of scans alone
 MODELS = ("full_geometry", "neural_shape", "neural", "better_dipole")
-MORE_MODELS = (PATH_TRACED,)  # whose light is gathered alone
 KINDS = ("sampled", "gathered")
 OVER = ("volpathmis", WALK)
 VOLUMES = tuple(volume(depth) for depth in (64, 200))
@@ -179,10 +177,8 @@ def ways_of(case: LitObject, how: Measuring) -> list[str]:
     varies = case.key in VARYING
     kinds = [kind for kind in how.kinds if not (varies and kind != KINDS[0])]
     models = [model for model in how.models if not (varies and model == "neural_shape")]
-    gathered = [f"{PATH_TRACED}, gathered"] if PATH_TRACED in models else []
-    models = [model for model in models if model != PATH_TRACED]
     volumes = VOLUMES if how.over == OVER[0] else ()
-    return [*volumes, WALK, *(f"{model}, {kind}" for model in models for kind in kinds), *gathered]
+    return [*volumes, WALK, *(f"{model}, {kind}" for model in models for kind in kinds)]
 
 
 def scene_of(case: LitObject, way: str, size: int, folder: Path, **settings: Any) -> Any:
@@ -192,8 +188,6 @@ def scene_of(case: LitObject, way: str, size: int, folder: Path, **settings: Any
     found["integrator"] |= settings
     if kind:
         found["integrator"]["light"] = kind
-    if model == PATH_TRACED:
-        return load_scene(found, model, settings={"light": kind})
     return ready(model, found, case.key, case.medium)
 
 

@@ -29,8 +29,8 @@ def speeds_command(
     model: Annotated[
         list[str] | None,
         typer.Option(
-            help="full_geometry, neural_shape, neural, better_dipole, or path_traced gathered; repeat for more.",
-            show_default="the first four",
+            help="full_geometry, neural_shape, neural or better_dipole; repeat for more.",
+            show_default="all",
         ),
     ] = None,
     light: Annotated[
@@ -58,7 +58,6 @@ def speeds_command(
         KINDS,
         LIGHTS,
         MODELS,
-        MORE_MODELS,
         OTHER_LIGHTS,
         OVER,
         LitObject,
@@ -70,7 +69,7 @@ def speeds_command(
     names, models, lights = tuple(objects or SPEED_OBJECTS), tuple(model or MODELS), tuple(light or LIGHTS)
     kinds = tuple(kind or KINDS)
     for name in models:
-        check_choice("model", name, (*MODELS, *MORE_MODELS))
+        check_choice("model", name, MODELS)
     for name in lights:
         check_choice("light", name, (*LIGHTS, *OTHER_LIGHTS))
     for name in kinds:
@@ -98,8 +97,8 @@ def gathered_command(
     model: Annotated[
         list[str] | None,
         typer.Option(
-            help="full_geometry, neural_shape, neural, better_dipole or path_traced; repeat for more.",
-            show_default="full_geometry, better_dipole and path_traced",
+            help="full_geometry, neural_shape, neural or better_dipole; repeat for more.",
+            show_default="full_geometry and better_dipole",
         ),
     ] = None,
     light: Annotated[
@@ -118,11 +117,11 @@ def gathered_command(
     """Measure what gathered light adds to the error of models, and how far both are off walks: all orders."""
     use_mitsuba("llvm_ad_rgb")
     from benchmarks.gathered_error import Comparing, gathered_errors, shown
-    from benchmarks.speeds import LIGHTS, MODELS, MORE_MODELS, OTHER_LIGHTS, LitObject
+    from benchmarks.speeds import LIGHTS, MODELS, OTHER_LIGHTS, LitObject
 
-    models, lights = tuple(model or ("full_geometry", "better_dipole", *MORE_MODELS)), tuple(light or LIGHTS)
+    models, lights = tuple(model or ("full_geometry", "better_dipole")), tuple(light or LIGHTS)
     for name in models:
-        check_choice("model", name, (*MODELS, *MORE_MODELS))
+        check_choice("model", name, MODELS)
     for name in lights:
         check_choice("light", name, (*LIGHTS, *OTHER_LIGHTS))
     cases = [LitObject(name, each) for name in objects or ("bunny of potato",) for each in lights]

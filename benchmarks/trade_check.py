@@ -21,7 +21,7 @@ from halfspace_sss.trade.ways import Stage, Way, stage
 
 WAYS = (
     PATH_TRACED, "lambert", "better_dipole", "neural", "full_geometry",
-    "better_dipole, gathered", "neural, gathered", "full_geometry, gathered", "path_traced, gathered",
+    "better_dipole, gathered", "neural, gathered", "full_geometry, gathered",
 )  # fmt: skip
 LEARNT = "full_geometry"
 TRAIN_SECONDS = 20.0

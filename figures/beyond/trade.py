@@ -44,14 +44,14 @@ NETWORKS = ("neural", "neural_shape")
 LEARNT = (*NETWORKS, FULL_GEOMETRY)
 WAYS = (
     PATH_TRACED, LAMBERT, "standard_dipole_normalized", "better_dipole", "directional_dipole", "photon_beam_diffusion",
-    *LEARNT, *(f"{model}, {GATHERED}" for model in ("better_dipole", *LEARNT, PATH_TRACED)),
+    *LEARNT, *(f"{model}, {GATHERED}" for model in ("better_dipole", *LEARNT)),
 )  # fmt: skip
 FEW = (
     PATH_TRACED,
     LAMBERT,
     "better_dipole",
     *LEARNT,
-    *(f"{model}, {GATHERED}" for model in (PATH_TRACED, FULL_GEOMETRY)),
+    f"{FULL_GEOMETRY}, {GATHERED}",
 )
 CHOSEN = {"draft": FEW, "paper": WAYS}
 KNOB_MATERIALS = {"draft": ("marble",), "paper": ("marble", "ketchup")}

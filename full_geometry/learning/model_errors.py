@@ -26,14 +26,14 @@ from full_geometry.models.object_model import HalfSpace
 from full_geometry.models.storing import KIND, find_weights, load
 from full_geometry.object.pairs import EntryProposals, trace_exits
 from full_geometry.object.patches import ExitTable
-from halfspace_sss.checks import check_choice, check_count
+from halfspace_sss.checks import check_count
 from halfspace_sss.interface.model import bssrdf
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.rendering.object.half_space import HalfSpaceTransport
 from halfspace_sss.rendering.object.objects import TranslucentObject, object_of, refuse, refuse_textures
 from halfspace_sss.rendering.object.points import SurfacePoint, Transport, evaluate
-from halfspace_sss.rendering.object.registry import lookup, model_names
+from halfspace_sss.rendering.object.registry import check_model, lookup, model_names
 from halfspace_sss.rendering.object.settings import Settings
 from halfspace_sss.tracing.walk import generator, pass_seed
 
@@ -307,7 +307,7 @@ def transport_of(obj: TranslucentObject, model: str, folder: str | os.PathLike |
         ValueError: the object has not been trained, there is no such model, it refuses the object as renders would, or
             it has no S for two points of a surface.
     """
-    check_choice("model", model, model_names())
+    check_model(model, model_names())
     contents, entry = obj.geometry.contents, lookup(model)
     if contents is not None and not entry.takes_contents:
         refuse(contents.found[0], obj.geometry, f"the model {model!r}")

@@ -36,7 +36,7 @@ LAST_SHARE = 0.1  # likewise, after light has been gathered
 TOLD = 0.1  # standard error of a bias² over the squared tolerance that is enough
 CANDIDATES = (
     PATH_TRACED, "lambert", "better_dipole", "neural", "full_geometry", "neural_shape",
-    *(f"{name}, {GATHERED}" for name in ("better_dipole", "neural", "full_geometry", "neural_shape", PATH_TRACED)),
+    *(f"{name}, {GATHERED}" for name in ("better_dipole", "neural", "full_geometry", "neural_shape")),
 )  # fmt: skip
 DEAR = ("neural_shape",)  # to look at, which takes DEAR_SECONDS
 

@@ -24,7 +24,6 @@ from halfspace_sss.rendering.object.registry import AUTO, Choices, model_names
 from halfspace_sss.rendering.object.settings import Settings
 from halfspace_sss.rendering.object.wrapped import surface_of
 from halfspace_sss.rendering.scenes.identity import scene_hash
-from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED
 from halfspace_sss.trade.assessing import assess_stage
 from halfspace_sss.trade.results import ObjectTrade, WayTrade
 from halfspace_sss.trade.ways import GATHERED, LAMBERT, WALKS, Stage, Way
@@ -105,7 +104,7 @@ def _measured(on: Stage, named: list[str], settings: Settings) -> dict[str, Any]
 
 def _known() -> list[str]:
     """Models that "auto" chooses among; walks have no share in it."""
-    return [name for name in model_names() if name not in (AUTO, PATH_TRACED)]
+    return [name for name in model_names() if name != AUTO]
 
 
 def _has(model: str, light: str) -> bool:

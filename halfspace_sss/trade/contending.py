@@ -18,7 +18,6 @@ DEAR_SECONDS = 30.0  # of an assessment that looks at the dearest ways too
 GATHERING = 2**19  # samples of a model whose time the gathering of its light takes at least
 LONGEST = 1.5  # times the seconds of an assessment that a gathering may take
 LIGHT_SECONDS = 0.4  # of a part of the light, beside its transfer: by emitters, and of the first samples
-PHOTONS = 0.05**2  # bias² that is expected of photons, give or take as much: 0.02 to 0.03 under windows, more by lamps
 CLOSE = 1.3  # times the cost of the cheapest way, up to which another may turn out cheaper
 
 
@@ -95,15 +94,14 @@ def most_promising(
     """The way by which the job is expected to end first.
 
     It keeps the tolerance by the chance that its model does, and takes what gathering takes then, else what the
-    cheapest of the other ways does. Of photons there is no model to look at before.
+    cheapest of the other ways does.
     """
 
     def expected(way: Way) -> float:
         total = 0.0
         for o in seen:
             row = o.way(way.model)
-            bias2, error = (PHOTONS, PHOTONS) if way.model == PATH_TRACED else (row.bias2, row.bias2_error)
-            chance = NormalDist().cdf((tolerance**2 - max(bias2, 0.0)) / max(error, 1e-30))
+            chance = NormalDist().cdf((tolerance**2 - max(row.bias2, 0.0)) / max(row.bias2_error, 1e-30))
             best = cheapest(o, tolerance, images, counted)
             total += chance * (_once(row, counted) + GATHERING * row.seconds) + (1 - chance) * best
         return total

@@ -29,7 +29,7 @@ class Way:
     """A model for all objects, or "path_traced"; with orders instead of those of the scene, if any.
 
     Args:
-        model: name of a model, or "path_traced": walks, or photons where light is gathered.
+        model: name of a model, or "path_traced": walks.
         orders: "multiple" leaves single scattering out; None takes the orders of the scene.
         light: "sampled" or "gathered", see `Settings`.
         part: of gathered light, see `Gathering`; 0 for all of it.
@@ -47,7 +47,7 @@ class Way:
     @property
     def walks(self) -> bool:
         """Whether the integrator is `translucent_walk`."""
-        return self.model == PATH_TRACED and self.light != GATHERED
+        return self.model == PATH_TRACED
 
     @property
     def halves(self) -> tuple[Way, ...]:
@@ -70,7 +70,9 @@ class Way:
     def of(cls, name: str) -> Way:
         """The way of that name; ValueError if there is none."""
         model, *more = name.split(", ")
-        check_choice("way", model, tuple(m for m in model_names() if m != AUTO))
+        check_choice("way", model, (PATH_TRACED, *(m for m in model_names() if m != AUTO)))
+        if model == PATH_TRACED and more:
+            raise ValueError(f"the way {PATH_TRACED!r} must stand alone, got {name!r}")
         for part in more:
             known = (NO_SINGLE,) if model == LAMBERT else (NO_SINGLE, GATHERED)
             check_choice(f"what follows {model}", part, known)
@@ -83,9 +85,8 @@ WALKS = Way(PATH_TRACED)
 def ways() -> list[Way]:
     """All of them: path traced first, a diffuse surface, every model with light sampled and gathered, and those without
     the single scattering."""
-    names = [name for name in model_names() if name not in (AUTO, LAMBERT, PATH_TRACED)]
-    results = [WALKS, Way(LAMBERT), *map(Way, names)]
-    results += [Way(name, light=GATHERED) for name in (*names, PATH_TRACED)]
+    names = [name for name in model_names() if name not in (AUTO, LAMBERT)]
+    results = [WALKS, Way(LAMBERT), *map(Way, names), *(Way(name, light=GATHERED) for name in names)]
     bare = [name for name in models() if model_class(name).orders == "multiple"]
     return results + [Way(name, "multiple") for name in bare if name in ("better_dipole", "neural")]
 
@@ -162,7 +163,7 @@ class Stage:
             if way.part:
                 self._integrators[way].gathering = Gathering(way.part)
             sampled = self._integrators.get(replace(way, light="sampled", part=0))
-            if way.light == GATHERED and is_bssrdf(sampled) and not mi.is_spectral:  # which refuses gathered light
+            if way.light == GATHERED and sampled is not None and not mi.is_spectral:  # which refuses gathered light
                 self._integrators[way].take_over(sampled)
         return self._integrators[way]
 

@@ -9,6 +9,7 @@ pytestmark = pytest.mark.usefixtures("rgb")
 
 mi = pytest.importorskip("mitsuba")
 
+WALKS = "model must have an S, got 'path_traced': for walks take the integrator translucent_walk$"
 XML = '<scene version="3.0.0"><integrator type="{}"><float name="{}" value="{}"/></integrator></scene>'
 
 
@@ -24,6 +25,8 @@ PLUGINS = [
     ({"type": "translucent", "material": "marbel"}, "material must be .*, got 'marbel'; did you mean 'marble'?"),
     ({"type": "translucent", "sigma_t": 1.0}, "a translucent surface must have material"),
     ({"type": "translucent", "sigma_s": -1.0, "sigma_a": 1.0}, "sigma_s must be .*got -1.0"),
+    ({"type": "translucent", "material": "marble", "model": "path_traced"}, WALKS),
+    ({"type": "bssrdf", "model": "path_traced"}, WALKS),
     ({"type": "bssrdf", "entrys": 3}, "parameter of bssrdf must be .*got 'entrys'"),
     ({"type": "bssrdf", "mm_per_unit": -1.0}, "mm_per_unit must be .*got -1.0"),
     ({"type": "translucent_walk", "entries": 3}, "parameter of translucent_walk must be .*got 'entries'"),

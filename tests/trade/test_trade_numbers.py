@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from halfspace_sss.cli import trade
-from halfspace_sss.rendering.paths.gathering import PART, Gathering, Transferred
+from halfspace_sss.rendering.paths.gathering import PART, Gathered, Gathering
 from halfspace_sss.trade import recommend
 from halfspace_sss.trade.advice import Job, advise
 from halfspace_sss.trade.automatic import picked
@@ -100,7 +100,7 @@ def test_the_kept_noise_of_gathered_parts_is_half_that_of_light_and_a_part_of_th
         for part in parts:
             transfer = T * rng.normal(1, of_transfer, T.shape) if of_transfer else T
             light = L * rng.normal(1, of_light, L.shape) if of_light else L
-            gathered = Transferred(*[None] * 6, transfer=transfer, light=light)
+            gathered = Gathered(*[None] * 5, transfer=transfer, light=light)
             part._found = [SimpleNamespace(gathered=gathered)]
         return parts[0].kept(parts[1], 0)
 
@@ -227,10 +227,16 @@ def test_a_way_comes_back_by_its_name(way: str) -> None:
     assert Way.of(way).name == way
 
 
-@pytest.mark.parametrize("unknown", ["path_traced, sampled", "lambert, gathered", "neural, collected"])
+@pytest.mark.parametrize("unknown", ["lambert, gathered", "neural, collected"])
 def test_a_way_that_does_not_exist_is_refused(unknown: str) -> None:
     with pytest.raises(ValueError, match="what follows"):
         Way.of(unknown)
+
+
+@pytest.mark.parametrize("more", ["gathered", "without single scattering"])
+def test_path_traced_is_a_way_of_its_own(more: str) -> None:
+    with pytest.raises(ValueError, match=f"the way 'path_traced' must stand alone, got 'path_traced, {more}'"):
+        Way.of(f"path_traced, {more}")
 
 
 def test_a_record_comes_back_as_it_was() -> None:
@@ -284,13 +290,6 @@ def test_the_light_of_the_model_is_gathered_by_which_the_job_is_expected_to_end_
     assert most_promising(close, ways, 0.05, 10) == ways[1]
     assert most_promising(apart, ways, 0.05, 10_000) == ways[0]
     assert most_promising(dear, ways, 0.05, 10_000) == ways[0]
-
-
-def test_photons_are_tried_where_no_model_promises_to_keep_the_tolerance() -> None:
-    ways = [Way.of("neural, gathered"), Way.of("path_traced, gathered")]
-    near, far = (_assessment(_way("neural", bias, 0.01, 4e-6)).objects for bias in (0.01, 0.08))
-    assert most_promising(near, ways, 0.05, 10_000) == ways[0]
-    assert most_promising(far, ways, 0.05, 10_000) == ways[1]
 
 
 def test_of_the_noise_of_gathered_light_what_a_render_keeps_counts_as_bias() -> None:

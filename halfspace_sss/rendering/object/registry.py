@@ -16,7 +16,7 @@ None is imported before it is asked for.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     import mitsuba as mi
 
 AUTO = "auto"
-PATH_TRACED = "path_traced"  # walks, or photons where light is gathered
+PATH_TRACED = "path_traced"  # stands for walks by `translucent_walk` where a model is named
 _BY_GROUP = once(offers)
 
 
@@ -97,9 +97,16 @@ def lookup(name: str) -> ModelEntry:
     Raises:
         ValueError: there is none of that name; the message has the nearest.
     """
-    check_choice("model", name, (*model_names(), *learnt_names()))
+    check_model(name, (*model_names(), *learnt_names()))
     offered = {group: known[name] for group in (TRANSPORTS, CHOOSERS, LEARNERS) if name in (known := _BY_GROUP(group))}
     return ModelEntry(name, name in models(), offered)
+
+
+def check_model(name: str, known: Iterable[str]) -> None:
+    """ValueError if a name is not among the known ones; walks have an integrator of their own."""
+    if name == PATH_TRACED:
+        raise ValueError(f"model must have an S, got {name!r}: for walks take the integrator translucent_walk")
+    check_choice("model", name, known)
 
 
 def model_names() -> tuple[str, ...]:

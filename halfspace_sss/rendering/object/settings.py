@@ -6,7 +6,7 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any
 
-from halfspace_sss.checks import check_choice, check_count, check_interval
+from halfspace_sss.checks import check_choice, check_interval
 
 AUTOMATIC = -1.0
 ORDERS = ("total", "multiple", "single")
@@ -14,8 +14,7 @@ GEOMETRIES = ("distance", "tangent")
 LIGHTS = ("sampled", "gathered", "auto")
 WALK_LIGHTS = ("auto", "precomputed", "sampled")  # of `translucent_walk`
 SHARED = ("mm_per_unit", "max_depth", "rr_depth", "hide_emitters")  # what `translucent_walk` understands too
-FEWEST_PHOTONS = 1000
-OF_MODELS = ("geometry", "area_share", "entries", "photons")
+OF_MODELS = ("geometry", "area_share", "entries")
 
 
 @dataclass(frozen=True)
@@ -34,7 +33,6 @@ class Settings:
             leaves it to the model.
         light: "sampled", without bias; "gathered" once for all samples, see `paths.gathering`: scattered light has a
             little bias and no noise; or "auto", the cheaper of both that keeps the tolerance, by measurement.
-        photons: of each object, where light is gathered for the model "path_traced".
         hide_emitters: whether directly visible emitters are left out.
         train_seconds: time for each object whose model has to learn it first; 0 refuses objects without weights.
         train_error: relative error under constant light, measured on the way, from which on it has learnt enough.
@@ -50,7 +48,6 @@ class Settings:
     geometry: str = "distance"
     area_share: float = AUTOMATIC
     entries: int = int(AUTOMATIC)
-    photons: int = 2**20
     hide_emitters: bool = False
     light: str = "sampled"
     train_seconds: float = 60.0
@@ -70,7 +67,6 @@ class Settings:
             raise ValueError(f"rr_depth must be at least 1, got {self.rr_depth}")
         if self.entries < 1 and self.entries != AUTOMATIC:
             raise ValueError(f"entries must be at least 1, got {self.entries}")
-        check_count("photons", self.photons, FEWEST_PHOTONS)
         check_choice("light", self.light, LIGHTS)
         check_choice("orders", self.orders, ("", *ORDERS))
         if self.geometry not in GEOMETRIES:

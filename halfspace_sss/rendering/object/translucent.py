@@ -61,7 +61,7 @@ from halfspace_sss.physics.fresnel import F_t, mu_internal
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.physics.reflectance import directional_table, half_space_reflectance
 from halfspace_sss.rendering.object.points import mirrored, opaque
-from halfspace_sss.rendering.object.registry import model_names
+from halfspace_sss.rendering.object.registry import check_model, model_names
 from halfspace_sss.rendering.object.settings import ORDERS, check_parameters, variant_channels
 from halfspace_sss.rendering.object.spectral import EVERYWHERE, MediumByWavelength, read_file, spectral_medium
 from halfspace_sss.rendering.object.textured import constant_texture, textured_medium
@@ -508,7 +508,7 @@ def read_inside(props: mi.Properties) -> Inside:
         (label, medium, varying, textured), spectral = _medium(props), None
     model, orders = props.get("model", "neural"), props.get("orders", "total")
     check_choice("orders", orders, ORDERS)
-    check_choice("model", model, model_names())
+    check_model(model, model_names())
     return Inside(label, medium, model, orders, bool(props.get("reflection", True)), varying, textured, spectral)
 
 

@@ -3,8 +3,7 @@
 At each point the mean of the incident radiance, weighted by a(mu) mu, is estimated per channel by emitter sampling and
 by directions of the cosine (balance heuristic); what other surfaces send is traced along the latter, by the path loop.
 B = T L follows, see `gathered.transfer`, and at an exit L_o(x_o, w_o) = a(w_o) B(x_o), blended between points. Jensen
-and Buhler (2002) take two passes so with a dipole; here the second is a sparse matrix that outlives the light. Where no
-model is asked for but walks, these carry the light: see `photons`.
+and Buhler (2002) take two passes so with a dipole; here the second is a sparse matrix that outlives the light.
 
 What is not known: a dependence of the model on the azimuth between light and view; how light varies over directions,
 apart from its a(mu)-weighted mean, first moment, and what S along a few directions of it brings in the neighbourhood;
@@ -13,7 +12,6 @@ detail of light below the distance of the points. Its noise is that of the gathe
 
 from __future__ import annotations
 
-import abc
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -38,12 +36,10 @@ from halfspace_sss.rendering.gathered.transfer import (
 )
 from halfspace_sss.rendering.object.points import cosine_above, opaque, place
 from halfspace_sss.rendering.object.rounding import ray_from, ray_to
-from halfspace_sss.rendering.object.settings import FEWEST_PHOTONS
 from halfspace_sss.rendering.object.snapshot import Snapshot, same_objects
 from halfspace_sss.rendering.paths.inner_light import COUNT, inner_light
 from halfspace_sss.rendering.paths.lighting import Lights, Sky, mis_weight
 from halfspace_sss.rendering.paths.path_loop import trace_paths
-from halfspace_sss.rendering.paths.photons import WalkedPoints, WalkedTransport, leaving
 
 if TYPE_CHECKING:
     from halfspace_sss.rendering.object.instances import Sight
@@ -60,7 +56,7 @@ TRACED = 8  # one of so many directions by the cosine is traced further, where i
 
 
 @dataclass(frozen=True, eq=False)
-class Gathered(abc.ABC):
+class Gathered:
     """Radiance of orders from two on that leaves an object in the light of a scene.
 
     Args:
@@ -69,24 +65,21 @@ class Gathered(abc.ABC):
         albedo: a(mu).
         values: B of all points, for each channel the constant and the slope over w_o bent by the boundary.
         inner: at events of order 1 inside; None where that order is traced.
-        e: exponent of the reflectance at exits, per channel, where media have textures.
+        transfer: of the model.
+        light: that arrives, less c.
+        parts: independent estimates of it.
+        c: mean radiance of the sky in the channels where alpha is known, else 0, see `lighting.Sky`.
     """
 
     object: TranslucentObject
     points: SurfacePoints
     albedo: Albedo
     values: mi.Float
-    inner: InnerLight | None = None
-    e: np.ndarray | None = None
-
-    @property
-    @abc.abstractmethod
-    def told(self) -> str:
-        """How many points, and the noise of B."""
-
-    @abc.abstractmethod
-    def kept(self, other: Any) -> float:
-        """Of the variance of two parts the share that all samples have."""
+    inner: InnerLight | None
+    transfer: Transfer
+    light: Incident
+    parts: tuple[Incident, ...] = ()
+    c: np.ndarray | float = 0.0
 
     def radiance(self, out: SurfacePoint, active: mi.Bool) -> mi.Spectrum:
         """L_o of an exit; 0 below the horizon."""
@@ -98,29 +91,12 @@ class Gathered(abc.ABC):
         paint = None if self.object.textured is None else self.object.transport.paint(out)
         a = self.albedo(dr.maximum(mu, 0), paint)
         if paint is not None:
-            a *= paint ** mi.Spectrum([opaque(v) for v in self.e])
+            a *= paint ** mi.Spectrum([opaque(v) for v in self.transfer.e])
         alpha = self.object.transport.alpha
         if alpha is not None:
             known = alpha.known[1]
             a = known * alpha(out, active)[1] + (1 - known) * a
         return dr.select(active & (mu > 0), a * dr.maximum(B, 0), 0)
-
-
-@dataclass(frozen=True, eq=False)
-class Transferred(Gathered):
-    """By the transfer of a model.
-
-    Args:
-        transfer: of it.
-        light: that arrives, less c.
-        parts: independent estimates of it.
-        c: mean radiance of the sky in the channels where alpha is known, else 0, see `lighting.Sky`.
-    """
-
-    transfer: Transfer = None
-    light: Incident = None
-    parts: tuple[Incident, ...] = ()
-    c: np.ndarray | float = 0.0
 
     @cached_property
     def error(self) -> float:
@@ -131,12 +107,14 @@ class Transferred(Gathered):
 
     @property
     def told(self) -> str:
+        """How many points, and the noise of B."""
         return (
             f"gathered at {len(self.points)} points, {1e-6 * self.transfer.nbytes:.0f} MB: noise of the transfer "
             f"{self.transfer.error:.1%} a point, of the light {self.error:.1%}"
         )
 
-    def kept(self, other: Transferred) -> float:
+    def kept(self, other: Gathered) -> float:
+        """Of the variance of two parts the share that all samples have."""
         B = self.transfer @ self.light
         by_light = ((B - self.transfer @ other.light) ** 2).mean()
         by_transfer = ((B - other.transfer @ self.light) ** 2).mean()
@@ -144,32 +122,12 @@ class Transferred(Gathered):
         return float((0.5 * by_light + PART * by_transfer) / whole) if whole > 0 else 1.0
 
 
-@dataclass(frozen=True, eq=False)
-class Walked(Gathered):
-    """By photons.
-
-    Args:
-        count: of them.
-        error: standard error of B over its mean.
-    """
-
-    count: int = 0
-    error: float = 0.0
-
-    @property
-    def told(self) -> str:
-        return f"carried by {self.count} photons to {len(self.points)} points: noise {self.error:.1%} a point"
-
-    def kept(self, other: Walked) -> float:
-        return PART
-
-
 class Gathering:
     """Gathered light of the objects of a scene, kept until something in the scene changes.
 
     Args:
-        part: 0 for all samples; others are independent of each other, with a share `PART` of the photons, or of the
-            samples of a transfer and half the light.
+        part: 0 for all samples; others are independent of each other, with a share `PART` of the samples of a transfer
+            and half the light.
         seed: of what is drawn.
 
     Attributes:
@@ -179,7 +137,7 @@ class Gathering:
     def __init__(self, part: int = 0, seed: int = 0) -> None:
         self._part, self._seed, self.seconds = part, seed, (0.0, 0.0)
         self._objects: list[TranslucentObject] = []
-        self._transfers: list[Transfer | WalkedPoints | None] = []
+        self._transfers: list[Transfer | None] = []
         self._events: list[Events | None] = []
         self._light: Snapshot | None = None
         self._found: list[TranslucentObject] = []
@@ -198,7 +156,7 @@ class Gathering:
             started = clock()
             share = PART if self._part else 1.0
             seed = SEED + self._part + 10 * self._seed
-            made = [_ways(obj, share, seed) if one else None for obj, one in zip(objects, spread)]
+            made = [transfer(obj, share, seed) if one else None for obj, one in zip(objects, spread)]
             inner = [bool(one and not self._part and has_inner_light(obj)) for obj, one in zip(objects, spread)]
             self._events = [Events.of(obj, COUNT) if one else None for obj, one in zip(objects, inner)]
             self._transfers, self._objects, self._light = made, objects, None
@@ -208,10 +166,7 @@ class Gathering:
             started = clock()
             seed, parts = 1000 * self._part + 10_000 * self._seed, 1 if self._part else 2
             ways = list(zip(self._transfers, self._events))
-            walked = [(T if isinstance(T, WalkedPoints) else None, None) for T, _ in ways]
-            fewer = replace(settings, photons=max(int(PART * settings.photons), FEWEST_PHOTONS))
-            between = _lit(scene, objects, objects, walked, fewer, seed + 500, parts)
-            self._found = _lit(scene, objects, between, ways, settings, seed, parts)
+            self._found = _lit(scene, objects, ways, settings, seed, parts)
             self._light, self.seconds = state, (self.seconds[0], clock() - started)
         return self._found
 
@@ -236,11 +191,6 @@ def spreads(obj: TranslucentObject) -> bool:
     return obj.transport is not None and not obj.transport.is_delta and not obj.repeated
 
 
-def _ways(obj: TranslucentObject, share: float, seed: int) -> Transfer | WalkedPoints:
-    """What carries light through an object."""
-    return WalkedPoints.of(obj) if isinstance(obj.transport, WalkedTransport) else transfer(obj, share, seed)
-
-
 def _check(obj: TranslucentObject) -> None:
     result = obj.geometry
     if not result.closed or not result.area > 0:
@@ -258,36 +208,32 @@ def light_state(scene: mi.Scene) -> Snapshot:
 
 
 def _lit(
-    scene: mi.Scene, objects: list[TranslucentObject], between: list[TranslucentObject],
-    ways: list[tuple[Transfer | WalkedPoints | None, Events | None]], settings: Settings, seed: int, parts: int,
+    scene: mi.Scene, objects: list[TranslucentObject], ways: list[tuple[Transfer | None, Events | None]],
+    settings: Settings, seed: int, parts: int,
 ) -> list[TranslucentObject]:  # fmt: skip
-    """The objects, those with a way by what leaves them; by `between` they send light to each other and themselves."""
-    found = list(between)
+    """The objects, those with a transfer by what leaves them; what they send each other is sampled by their models."""
+    found = list(objects)
     for k, (obj, (T, events)) in enumerate(zip(objects, ways)):
         if T is not None:
-            g = _leaving(scene, obj, k, between, (T, events), settings, seed, parts)
+            g = _leaving(scene, objects, k, (T, events), settings, seed, parts)
             found[k] = replace(obj, transport=None, proposals=None, gathered=g)
     return found
 
 
 def _leaving(
-    scene: mi.Scene, obj: TranslucentObject, k: int, between: list[TranslucentObject],
-    of: tuple[Transfer | WalkedPoints, Events | None], settings: Settings, seed: int, parts: int,
+    scene: mi.Scene, objects: list[TranslucentObject], k: int, of: tuple[Transfer, Events | None], settings: Settings,
+    seed: int, parts: int,
 ) -> Gathered:  # fmt: skip
     """B of object k, by light in parts whose differences tell the noise, and light inside."""
-    T, events = of
-    found, rays = _incident(scene, between, T, obj.geometry.clearance, settings, 2 * k + seed, parts)
+    obj, (T, events) = objects[k], of
+    found, rays = _incident(scene, objects, T, obj.geometry.clearance, settings, 2 * k + seed, parts)
     lights, others = zip(*found)
     if not all(np.isfinite(light.mean).all() for light in lights):
         raise ValueError(f"light at object {obj.geometry.name} must be finite, got NaN or infinity")
     inner = None
     if events is not None:
         seen = mi.Float(np.mean(others, axis=0).astype(np.float32).ravel())
-        inner = inner_light(scene, between, k, settings, events, (T.points, seen))
-    if isinstance(T, WalkedPoints):
-        count = int(settings.photons * (PART if parts == 1 else 1))
-        albedo, B, error = leaving(T, rays, count, 2 * k + seed)
-        return Walked(obj, T.points, albedo, mi.Float(B.astype(np.float32).ravel()), inner, None, count, error)
+        inner = inner_light(scene, objects, k, settings, events, (T.points, seen))
     sky = Sky.of(scene, Lights.of(scene), [obj])
     c = np.zeros(len(T.trusted)) if sky is None else T.trusted * np.ravel(np.array(sky.mean))
     lights = tuple(replace(light, mean=light.mean - c.astype(np.float32)) for light in lights)
@@ -298,13 +244,13 @@ def _leaving(
         direct = np.maximum(rays.light.sum(axis=1) / T.around.whole - c, 0)
         B += T.beyond(direct.astype(np.float32), rays)
     values = mi.Float(B.astype(np.float32).ravel())
-    return Transferred(obj, T.points, T.albedo, values, inner, T.e, T, light, lights, c)
+    return Gathered(obj, T.points, T.albedo, values, inner, T, light, lights, c)
 
 
 def _incident(
     scene: mi.Scene,
     objects: list[TranslucentObject],
-    T: Transfer | WalkedPoints,
+    T: Transfer,
     e: mi.Float,
     settings: Settings,
     seed: int,
@@ -312,8 +258,7 @@ def _incident(
 ) -> tuple[list[tuple[Incident, np.ndarray]], Rays]:
     """Incident radiance at all points, and the mean of other surfaces that each sees, in parts; light by ray.
 
-    Parts are independent estimates by as many directions each, of one launch. For a transfer rays have the light of
-    emitters alone.
+    Parts are independent estimates by as many directions each, of one launch. Rays have the light of emitters alone.
     """
     count, rows = len(T.points), len(T.points) * parts
     n = int(np.clip(DIRECTIONS // (2 * count), FEWEST, MOST)) // TRACED * TRACED
@@ -337,8 +282,7 @@ def _incident(
     values = [aimed + met, *(aimed * d_e[i] + met * d_c[i] for i in range(3))]
     values += [TRACED * more, *(TRACED * more * d_c[i] for i in range(3)), TRACED * dr.select(on, a, 0)]
     values = [mi.Spectrum(v) + dr.zeros(mi.Float, rows * n) for v in values]
-    along = met + TRACED * more if isinstance(T, WalkedPoints) else met
-    each_light = [mi.Spectrum(v) + dr.zeros(mi.Float, rows * n) for v in (aimed, along)]
+    each_light = [mi.Spectrum(v) + dr.zeros(mi.Float, rows * n) for v in (aimed, met)]
     dr.eval(values, each_light, w_e, w_c)
     j, s = lane // each, lane % each
     order = dr.select(s % TRACED == 0, j * few + s // TRACED, all_few + j * (each - few) + s - s // TRACED - 1)

@@ -145,7 +145,7 @@ def open_scene(
 
     With `floats`, texels of bitmaps are floats, which can be changed by any amount, whatever their files have.
     """
-    _check("model", model, model_names())
+    _check("model", model, (*model_names(), PATH_TRACED))
     _check("orders", orders, ORDERS)
     light = (settings or {}).get("light")
     walks = model == PATH_TRACED
