@@ -110,6 +110,7 @@ def _plain(found: MaterialFit) -> dict[str, Any]:
     held = None if found.held_out is None else found.held_out._asdict()
     return {
         **plain, "correlation": found.correlation.tolist(), "misfit": found.misfit._asdict(), "held_out": held,
+        "chi_square": found.chi_square._asdict(), "is_misfit": found.is_misfit,
         "exposures": found.exposures, "told": found.told, "steps": [step._asdict() for step in found.steps],
     }  # fmt: skip
 

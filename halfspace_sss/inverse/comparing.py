@@ -5,13 +5,16 @@ With two renders I, I' of independent samples, an image T and weights w, the los
     mean w (I - T) (I' - T),
 
 in which noise has no bias (Deng et al. 2022 take the product of two renders too). Weights are 1 ("l2"), or
-1 / (T + a tenth of the mean of T)² ("relative"). "robust" makes that the loss of Huber (1964), by weights that are
-found anew in each step: with r = |I'' - T| / (T + a tenth of the mean of T) of a third render I'', they are
+1 / (B + a tenth of the mean of T)² ("relative"), with B the mean of earlier renders. "robust" makes that the loss of
+Huber (1964), by weights that are found anew in each step: with r = |I'' - T| / (B + a tenth of the mean of T) of a
+third render I'', they are
 
-    1 / (T + a tenth of the mean of T)² / max(1, r / 5 %)
+    1 / (B + a tenth of the mean of T)² / max(1, r / 5 %)
 
-over the mean of their last factor. The third render knows nothing of the noise of the others, so weights have no bias
-either; that noise blurs the bend at 5 %.
+over the mean of their last factor. B and I'' know nothing of the noise of T or of the renders that are compared.
+Weights by T would be small where its noise is bright, so that what is found would be too dark. The noise of I'' blurs
+the bend at 5 %. Where the loss bends, its slope does not grow with I: there w (1 - (I - T) / (I'' - T)) takes the place
+of w in its second derivative.
 """
 
 from __future__ import annotations
@@ -44,6 +47,10 @@ SETTLING = 0.5  # part of the steps after which nothing is forgotten
 FAR = 0.15  # change of a variable at which what was measured counts half
 LONGEST = 0.7  # change of a variable in a step
 PURPOSES = ("order", "first", "second", "slope", "test", "other test", "weights")
+FIRST = 4  # renders for the weights of a view that is met first
+NEWEST = 0.25  # share of the renders of a step in those for the weights of the next
+NEAR, FAR_OFF = 1, 3  # pixels: in NEAR noise may be alike, from there to FAR_OFF it is not
+CERTAIN = 4.0  # standard errors by which a chi-square is told to be a misfit
 
 
 @dataclass(frozen=True)
@@ -88,6 +95,68 @@ class FitStep(NamedTuple):
         return f"loss {self.loss:.3g} ± {self.error:.1g}  {numbers}"
 
 
+class ChiSquare(NamedTuple):
+    """Of means of residuals over neighbouring pixels, per degree of freedom: 1 if residuals are noise of each pixel.
+
+    With residuals z of pixels p in a standard of their own, sums over pixels q further away than `NEAR` and as near as
+    `FAR_OFF`, and correlations c of pixels as near as `NEAR`,
+
+        chi² = 1 + sum z_p z_q / sum z_p²,    of the error (sum c²) sqrt(sum 2 z_p² z_q²) / sum z_p².
+
+    So the noise of images need not be known, and may be alike in pixels that touch, as after a filter.
+
+    Args:
+        value, error: chi², and its standard error if all is noise.
+        near: the sum of c, at least 1: the variance of means over that of noise of each pixel.
+    """
+
+    value: float
+    error: float
+    near: float
+
+    @classmethod
+    def of(cls, residuals: Sequence[np.ndarray]) -> ChiSquare:
+        """Of images (height, width, channels), 0 where nothing counts."""
+        far, variance, squares = 0.0, 0.0, 1e-30
+        shifts = [(i, j) for i in range(-NEAR, NEAR + 1) for j in range(-NEAR, NEAR + 1)]
+        near = np.zeros(len(shifts))
+        for z in residuals:
+            z2, padded = z**2, np.pad(z, [(NEAR, NEAR), (NEAR, NEAR), (0, 0)])
+            squares += float(z2.sum())
+            far += float((z * (_neighbours(z, FAR_OFF) - _neighbours(z, NEAR))).sum())
+            variance += 2 * float((z2 * (_neighbours(z2, FAR_OFF) - _neighbours(z2, NEAR))).sum())
+            h, w, _ = z.shape
+            near += [(z * padded[NEAR + i : NEAR + i + h, NEAR + j : NEAR + j + w]).sum() for i, j in shifts]
+        near /= squares
+        error = float(np.square(near).sum() * np.sqrt(variance)) / squares
+        return cls(1 + far / squares, error, max(1.0, float(near.sum())))
+
+    @property
+    def is_misfit(self) -> bool:
+        """Whether noise does not explain it."""
+        return self.value - 1 > CERTAIN * self.error
+
+    def told(self) -> list[str]:
+        """A sentence about a misfit, or none."""
+        if not self.is_misfit:
+            return []
+        return [
+            f"noise does not explain the residuals ({(self.value - 1) / self.error:.0f} standard errors): lights, "
+            "cameras, exposures, shape, index or boundary of the scene are not those of the images, or steps are too "
+            "few; the errors do not hold that"
+        ]
+
+
+def _neighbours(z: np.ndarray, reach: int) -> np.ndarray:
+    """Sums over squares of pixels about each pixel of an image (height, width, channels)."""
+    for axis in (0, 1):
+        padding = [(reach + 1, reach) if a == axis else (0, 0) for a in range(3)]
+        summed = np.cumsum(np.pad(z, padding), axis=axis)
+        n = z.shape[axis]
+        z = np.take(summed, np.arange(n) + 2 * reach + 1, axis) - np.take(summed, np.arange(n), axis)
+    return z
+
+
 class FittedView(NamedTuple):
     """A given image and what was found, (height, width, channels); which pixels count, and whether it only tests."""
 
@@ -109,8 +178,10 @@ class MaterialFit:
         medium: of the object; with textures their means.
         misfit: root of the loss of all fitted views at the end.
         held_out: likewise of views held out; None without any.
+        chi_square: of the fitted views.
         exposures: factor by which each view's image of the medium is multiplied to match the given one.
-        told: sentences about bounds and about what the images do not tell.
+        is_misfit: whether more than noise is between images and renders.
+        told: sentences about that, about bounds, and about what the images do not tell.
         steps: the way there.
         views: what each view shows beside its given image.
         textures: of each parameter that has one, the texels (rows, columns, channels), or the attribute of each vertex
@@ -124,7 +195,9 @@ class MaterialFit:
     medium: Medium
     misfit: NoiseFree
     held_out: NoiseFree | None
+    chi_square: ChiSquare
     exposures: list[float]
+    is_misfit: bool
     told: list[str]
     steps: list[FitStep] = field(repr=False)
     views: list[FittedView] = field(default_factory=list, repr=False)
@@ -143,7 +216,9 @@ class MaterialFit:
             known = f"{np.nanmedian(error):.1g}" if np.isfinite(error).any() else "nan"
             told.append(f"{name}: {size} numbers of mean {mean}, median of their errors {known}")
         held = "" if self.held_out is None else f", of views held out {self.held_out.told()} %"
-        return [*told, f"root of the loss {self.misfit.told()} %{held}"]
+        word, chi_square = "misfit" if self.is_misfit else "noise", self.chi_square
+        residuals = f"residuals: {word}, chi-square {chi_square.value:.2f}, by noise 1 ± {chi_square.error:.1g}"
+        return [*told, f"root of the loss {self.misfit.told()} %{held}", residuals]
 
 
 class ViewMisfit(NamedTuple):
@@ -154,6 +229,7 @@ class ViewMisfit(NamedTuple):
         residual: mean of both renders times the exposure e, less the image.
         noise: its variance, of all pixels.
         weights: of pixels and channels.
+        stiffness: what stands for weights in the second derivative of the loss.
         exposure_slope, exposure_curvature: half the derivatives of the loss by ln e, of Gauss and Newton.
     """
 
@@ -162,6 +238,7 @@ class ViewMisfit(NamedTuple):
     residual: np.ndarray
     noise: np.ndarray
     weights: np.ndarray
+    stiffness: np.ndarray
     exposure_slope: float
     exposure_curvature: float
 
@@ -172,18 +249,17 @@ class ViewComparison:
 
     Args:
         scene, views, settings: as of `fit`, checked.
-        weights: of each view, by pixel and channel, before a robust loss changes them.
         factors: of each view, changed in place: by which its render becomes its image, up to one common factor.
+        shown: of views that were met, changed in place: B, without exposure.
     """
 
     scene: mi.Scene
     views: list[GivenView]
     settings: FitSettings
-    weights: list[np.ndarray] = field(init=False)
     factors: np.ndarray = field(init=False)
+    shown: dict[int, np.ndarray] = field(init=False, default_factory=dict)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "weights", [_weights(view, self.settings.loss) for view in self.views])
         object.__setattr__(self, "factors", np.ones(len(self.views)))
 
     @property
@@ -203,7 +279,8 @@ class ViewComparison:
 
     def count(self, which: int) -> float:
         """Numbers of a view that count."""
-        return max(float((self.weights[which] > 0).sum()), 1.0)
+        view = self.views[which]
+        return max(float(view.counts.sum() * view.image.shape[2]), 1.0)
 
     def seed(self, k: int, which: int, purpose: str, parameter: int = 0) -> int:
         """Of the samples of a render in a step."""
@@ -220,22 +297,34 @@ class ViewComparison:
         purposes = ("test", "other test") if view.held_out else ("first", "second")
         pair = pair or [self.image(view, self.seed(k, which, each)) for each in purposes]
         weights = self._weights(which, k)
-        misfit = self._misfit(which, pair, weights)
+        misfit = self._misfit(which, pair, *weights)
         if self.settings.exposure and view.held_out:
             self.expose(which, -misfit.exposure_slope / misfit.exposure_curvature)
-            misfit = self._misfit(which, pair, weights)
+            misfit = self._misfit(which, pair, *weights)
+        if which in self.shown:
+            self.shown[which] = self.shown[which] + NEWEST * (np.mean(pair, axis=0) - self.shown[which])
         return misfit
 
-    def _weights(self, which: int, k: int) -> np.ndarray:
-        """Of a view in a step."""
-        weights, view = self.weights[which], self.views[which]
+    def _weights(self, which: int, k: int) -> tuple[np.ndarray, np.ndarray | float]:
+        """Of pixels and channels of a view in a step, 0 where they do not count; and 1 / (I'' - T) where it bends."""
+        view, e = self.views[which], self.exposures[which]
+        counts = np.broadcast_to(view.counts[..., None], view.image.shape).astype(float)
+        if self.settings.loss == "l2" or not view.counts.any():
+            return counts, 0.0
+        if which not in self.shown:
+            seeds = [self.seed(k, which, "weights", number) for number in range(FIRST)]
+            self.shown[which] = np.mean([self.image(view, seed) for seed in seeds], axis=0)
+        floor = FLOOR * max(float(view.image[view.counts].mean()), 1e-6)
+        scale = e * np.maximum(self.shown[which], 0) + floor
+        weights = counts / np.square(scale)
         if self.settings.loss != "robust":
-            return weights
-        image = self.exposures[which] * self.image(view, self.seed(k, which, "weights"))
-        factor = 1 / np.maximum(np.sqrt(weights) * np.abs(image - view.image) / BEND, 1)
-        return weights * factor / factor[weights > 0].mean() if (weights > 0).any() else weights
+            return weights, 0.0
+        off = e * self.image(view, self.seed(k, which, "weights", FIRST)) - view.image
+        factor = 1 / np.maximum(np.abs(off) / scale / BEND, 1)
+        bent = np.divide(1.0, off, out=np.zeros_like(off), where=factor < 1)
+        return weights * factor / factor[view.counts].mean(), bent
 
-    def _misfit(self, which: int, pair: Sequence[np.ndarray], w: np.ndarray) -> ViewMisfit:
+    def _misfit(self, which: int, pair: Sequence[np.ndarray], w: np.ndarray, bent: Any) -> ViewMisfit:
         e, T, n = self.exposures[which], self.views[which].image, self.count(which)
         a, b = (e * image - T for image in pair)
         noise = np.square(a - b) / 2  # variance of each
@@ -243,7 +332,7 @@ class ViewComparison:
         loss, residual = float((w * a * b).sum() / n), (a + b) / 2
         slope = loss + float((w * T * residual).sum() / n)  # mean w (a + T) b, of independent samples
         curvature = float((w * (a + T) * (b + T)).sum() / n)
-        return ViewMisfit(loss, variance, residual, noise / 2, w, slope, curvature)
+        return ViewMisfit(loss, variance, residual, noise / 2, w, w * (1 - residual * bent), slope, curvature)
 
     def ends(self, k: int) -> tuple[NoiseFree, NoiseFree | None, list[FittedView]]:
         """The root of the loss of all fitted views, and likewise of views held out (None without any); all views."""
@@ -325,16 +414,6 @@ def pixels_of(view: GivenView, image: mi.TensorXf) -> np.ndarray:
     return np.array(image, dtype=np.float64)[..., : view.image.shape[2]]
 
 
-def _weights(view: GivenView, loss: str) -> np.ndarray:
-    """Of each pixel and channel; 0 where it does not count."""
-    if loss == "l2":
-        w = np.ones(view.image.shape)
-    else:
-        T = np.maximum(view.image, 0)
-        w = 1 / np.square(T + FLOOR * max(float(T[view.counts].mean()) if view.counts.any() else 0.0, 1e-6))
-    return np.where(view.counts[..., None], w, 0.0)
-
-
 def _root(losses: Sequence[tuple[float, float]]) -> NoiseFree:
     """The root of a mean loss, of losses and their variances."""
     loss, variance = np.mean(losses, axis=0)
@@ -403,7 +482,8 @@ def descend(descent: FitDescent, work: Path | None, progress: ProgressText | Non
 def _save(path: Path, of: str, descent: FitDescent) -> None:
     arrays = {"of": np.array(of), "steps": np.array(json.dumps(descent.steps))}
     file = io.BytesIO()
-    np.savez(file, **arrays, factors=descent.comparison.factors, **descent.state())
+    shown = {f"shown {which}": image for which, image in descent.comparison.shown.items()}
+    np.savez(file, **arrays, factors=descent.comparison.factors, **shown, **descent.state())
     write_atomically(path, file.getvalue())
 
 
@@ -415,5 +495,7 @@ def _load(path: Path, of: str, descent: FitDescent) -> None:
     if str(arrays["of"]) != of:
         raise ValueError(f"work must be a new folder or that of the same fit, got another one in {path.parent}")
     descent.comparison.factors[:] = arrays.pop("factors")
+    for key in [key for key in arrays if key.startswith("shown ")]:
+        descent.comparison.shown[int(key.split()[1])] = arrays.pop(key)
     descent.steps = [FitStep(*row) for row in json.loads(str(arrays["steps"]))]
     descent.restore(arrays)

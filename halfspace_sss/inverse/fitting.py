@@ -3,13 +3,13 @@
 A view keeps the means of what was measured of it: of its render I, of the variables x there, and of the Jacobian J of
 pixels by variables. With weights w and a target T, half the gradient of its loss at x, and H, are
 
-    g = mean w J^T (I - T) + H (x - mean of x),    H = mean w J^T J',
+    g = mean w J^T (I - T) + H (x - mean of x),    H = w (mean J)^T (mean J),
 
-both over different renders, so that noise, whose samples are independent, has no bias in any of them. The variables
-move by -H^-1 g of all views. In the first part of the steps a view forgets what was measured far from where the
-variables are now; later it forgets nothing, and the noise of all its samples is averaged. Exposures of views are
-variables too, by their logarithms, whose sum is 0: the derivatives of pixels by them are the image. Textures are
-fitted by `textures`.
+the product in g over different renders, so that noise, whose samples are independent, has no bias in it. H has that of
+the noise of J: it is never negative, and steps are short where J is not known yet. The variables move by -H^-1 g of all
+views. In the first part of the steps a view forgets what was measured far from where the variables are now; later it
+forgets nothing, and the noise of all its samples is averaged. Exposures of views are variables too, by their
+logarithms, whose sum is 0: the derivatives of pixels by them are the image. Textures are fitted by `textures`.
 """
 
 from __future__ import annotations
@@ -23,8 +23,10 @@ import mitsuba as mi
 import numpy as np
 
 from halfspace_sss.inverse.comparing import (
+    CERTAIN,
     LONGEST,
     SETTLING,
+    ChiSquare,
     FitSettings,
     FitStep,
     MaterialFit,
@@ -96,40 +98,34 @@ def fit(
 
 @dataclass(eq=False)
 class ViewMeans:
-    """Means of what was measured of a view in the steps, and sums of squares of their weights.
+    """Means of what was measured of a view in the steps.
 
     Args:
-        weights, image, variance: of all pixels; renders without exposure times weights, and variance of that mean by
-            noise.
+        weights, stiffness, image, variance: of all pixels; renders without exposure times weights, and variance of that
+            mean by noise.
         x: the variables there.
-        product: mean of the product of both renders of a step, by pixel weights.
         renders: how many the means count for.
         J: mean Jacobian, (pixels, variables), of as many as `jacobians` counts for.
-        squares: sum of squares of weights times w J^T J, of single Jacobians.
-        share: sum of squares of the weights in J.
         own: sum of products of weights times w J^T I and w J^T T, of Jacobian J and image I of the same render.
         own_share: sum of products of the weights of both.
     """
 
     weights: np.ndarray
+    stiffness: np.ndarray
     image: np.ndarray
     variance: np.ndarray
     x: np.ndarray
-    product: float
     renders: float
     J: np.ndarray
-    squares: np.ndarray
     own: np.ndarray
     jacobians: float = 0.0
-    share: float = 0.0
     own_share: float = 0.0
 
     @classmethod
     def none(cls, pixels: int, variables: int) -> ViewMeans:
         """Before the first step."""
         image, x, J = np.zeros(pixels), np.zeros(variables), np.zeros((pixels, variables))
-        own = np.zeros((2, variables))
-        return cls(image, image, image, x, 0.0, 0.0, J, np.zeros((variables, variables)), own)
+        return cls(image, image, image, image, x, 0.0, J, np.zeros((2, variables)))
 
     def forget(self, x: np.ndarray) -> None:
         """Count less for what is far from x."""
@@ -137,16 +133,16 @@ class ViewMeans:
         self.renders, self.jacobians = kept * self.renders, kept * self.jacobians
 
     def add(
-        self, w: np.ndarray, image: np.ndarray, J: np.ndarray | None, T: np.ndarray, noise: np.ndarray,
-        product: float, x: np.ndarray,
+        self, w: np.ndarray, stiffness: np.ndarray, image: np.ndarray, J: np.ndarray | None, T: np.ndarray,
+        noise: np.ndarray, x: np.ndarray,
     ) -> None:  # fmt: skip
         """A render more, at x: its image and Jacobian (None: without one), and the variance of the image by noise."""
         self.renders += 1
         b = 1 / self.renders
         self.weights = self.weights + b * (w - self.weights)
+        self.stiffness = self.stiffness + b * (stiffness - self.stiffness)
         self.image = self.image + b * (w * image - self.image)
         self.variance = (1 - b) ** 2 * self.variance + b**2 * w**2 * noise
-        self.product += b * (product - self.product)
         self.x = self.x + b * (x - self.x)
         self.own, self.own_share = (1 - b) * self.own, (1 - b) * self.own_share
         if J is None:
@@ -154,14 +150,16 @@ class ViewMeans:
         self.jacobians += 1
         a = 1 / self.jacobians
         self.J = self.J + a * (J - self.J)
-        self.squares = (1 - a) ** 2 * self.squares + a**2 * (J * w[:, None]).T @ J
-        self.share = (1 - a) ** 2 * self.share + a**2
         self.own = (1 - a) * self.own + a * b * np.stack([w * image, w * T]) @ J
         self.own_share = (1 - a) * self.own_share + a * b
 
     def curvature(self) -> np.ndarray:
-        """w J^T J' of different renders."""
-        return ((self.J * self.weights[:, None]).T @ self.J - self.squares) / (1 - self.share)
+        """w J^T J of the mean."""
+        return (self.J * self.weights[:, None]).T @ self.J
+
+    def product(self) -> float:
+        """w I I' of different renders."""
+        return float(((self.image**2 - self.variance) / np.maximum(self.weights, 1e-30)).sum())
 
     def by(self, T: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """w J^T I' and w J^T T' of different renders; of the same ones, noise of J meets I - T only."""
@@ -222,16 +220,20 @@ class MediumDescent:
         both = compared.at_once or means.jacobians < 1  # little is left for products of different renders
         (a, J), (b, other_J) = self._render(which, k, "first", True), self._render(which, k, "second", both)
         misfit = compared.view(which, k, [a, b])
-        w = misfit.weights.ravel().astype(float) / compared.count(which)
-        e = compared.exposures[which]
-        noise, product = 2 * misfit.noise.ravel() / e**2, misfit.exposure_curvature / e**2
+        w, stiffness = (v.ravel() / compared.count(which) for v in (misfit.weights, misfit.stiffness))
+        noise = 2 * misfit.noise.ravel() / compared.exposures[which] ** 2
         for image, slopes in ((a, J), (b, other_J)):
-            means.add(w, image.ravel(), slopes, view.image.ravel(), noise, product, x)
+            means.add(w, stiffness, image.ravel(), slopes, view.image.ravel(), noise, x)
         return misfit
 
-    def _normal(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _directions(self, which: int, common: bool = False) -> np.ndarray:
+        """Derivatives of the log exposure of a view by the variables of exposures; at last by one of all views."""
+        own = self.free[self.comparison.fitted.index(which)] if self.free.size else np.zeros(0)
+        return np.append(own, 1.0) if common else own
+
+    def _normal(self, x: np.ndarray, common: bool = False) -> tuple[np.ndarray, np.ndarray]:
         """g and H of all variables, those of exposures last, at x: means of the views that were met."""
-        n, size = len(x), len(x) + self.free.shape[1]
+        n, size = len(x), len(x) + self.free.shape[1] + common
         g, H = np.zeros(size), np.zeros((size, size))
         for which, means in self.means.items():
             compared, e, moved = self.comparison, self.comparison.exposures[which], x - means.x
@@ -239,9 +241,9 @@ class MediumDescent:
             by, by_T = means.by(T)
             g[:n] += e**2 * (by + curved @ moved) - e * by_T
             H[:n, :n] += e**2 * curved
-            if self.free.size:
-                direction = self.free[compared.fitted.index(which)]
-                bright = e**2 * (means.product + 2 * by @ moved + moved @ curved @ moved)
+            if size > n:
+                direction = self._directions(which, common)
+                bright = e**2 * (means.product() + 2 * by @ moved + moved @ curved @ moved)
                 g[n:] += (bright - e * T @ (means.image + means.weights * (means.J @ moved))) * direction
                 H[n:, n:] += bright * np.outer(direction, direction)
                 H[:n, n:] += e**2 * np.outer(by + curved @ moved, direction)
@@ -264,9 +266,8 @@ class MediumDescent:
         x, end = self.x, self.total
         self.parameters.put(x)
         fitted, test, views = self.comparison.ends(end)
-        last = np.array([step.loss for step in self.steps[int(SETTLING * end) :]])
-        noise = float(last.std() / np.sqrt(len(last)))  # of its mean, which may be below 0
-        covariance = self._covariance(max(float(last.mean()), noise))
+        chi_square = ChiSquare.of([self._residual(which)[1] for which in self.means])
+        covariance = self._covariance(chi_square.near)
         slopes = np.concatenate(list(self.parameters.slopes(x).values()))
         covariance = covariance[: len(slopes), : len(slopes)]  # without exposures
         error = np.sqrt(np.maximum(np.diag(covariance), 0))
@@ -275,23 +276,51 @@ class MediumDescent:
         for name, value in values.items():
             errors[name] = (error * slopes)[at : at + len(value)]
             at += len(value)
-        told = self.parameters.at_bounds(x) + _ambiguity(values, correlation)
+        off = chi_square.told() + self._brightness(chi_square.near)
+        told = off + self.parameters.at_bounds(x) + _ambiguity(values, correlation)
         medium, exposures = surface_of(self.parameters.shape).inside.medium, self.comparison.exposures.tolist()
-        return MaterialFit(values, errors, correlation, medium, fitted, test, exposures, told, self.steps, views)
+        return MaterialFit(
+            values, errors, correlation, medium, fitted, test, chi_square, exposures, bool(off), told,
+            self.steps, views,
+        )  # fmt: skip
 
-    def _covariance(self, loss: float) -> np.ndarray:
-        """Of the variables: loss H^-1 / n by the images, and the noise of the renders."""
+    def _residual(self, which: int) -> tuple[np.ndarray, np.ndarray]:
+        """What is left of a view by the means of its renders, where they count; and that by the root of its weights."""
+        means, view, e = self.means[which], self.comparison.views[which], self.comparison.exposures[which]
         x = np.concatenate([_numbers(each) for each in self.x.values()])
-        inverse = _solved(self._normal(x)[1], np.eye(len(x) + self.free.shape[1]))
-        n = sum(self.comparison.count(which) for which in self.comparison.fitted)
-        noise = np.zeros_like(inverse)  # of g
+        image = means.image / np.maximum(means.weights, 1e-30) + means.J @ (x - means.x)
+        left = np.where(means.weights > 0, e * image - view.image.ravel(), 0.0)
+        return left, (left * np.sqrt(means.weights)).reshape(view.image.shape)
+
+    def _covariance(self, alike: float, common: bool = False) -> np.ndarray:
+        """Of the variables, by residuals of all pixels, H^-1 (sum w² r² J^T J) H^-1: noise of images and of renders.
+
+        Args:
+            alike: factor by which the variance of means is larger, where noise of neighbouring pixels is alike.
+            common: whether the exposure of all views is a variable too, the last one.
+        """
+        pixels, H, squares = 0, 0.0, 0.0
         for which, means in self.means.items():
-            e = self.comparison.exposures[which]
-            direction = self.free[self.comparison.fitted.index(which)] if self.free.size else np.zeros(0)
+            e, left = self.comparison.exposures[which], self._residual(which)[0]
             image = means.image / np.maximum(means.weights, 1e-30)
-            slopes = e**2 * np.hstack([means.J, np.outer(image, direction)])
-            noise += (slopes * means.variance[:, None]).T @ slopes / len(self.means) ** 2
-        return inverse @ (loss * np.eye(len(noise)) / n + noise @ inverse)
+            J = e * np.hstack([means.J, np.outer(image, self._directions(which, common))])
+            H = H + (J * means.stiffness[:, None]).T @ J
+            squares = squares + (J * np.square(means.weights * left)[:, None]).T @ J
+            pixels += int(((means.weights > 0) & (means.J != 0).any(axis=1)).sum())
+        inverse = _solved(H, np.eye(len(H)))
+        return inverse @ (alike * pixels / max(pixels - len(H), 1) * squares) @ inverse
+
+    def _brightness(self, alike: float) -> list[str]:
+        """A sentence if all images together are brighter or darker than any medium makes the scene, or none."""
+        x = np.concatenate([_numbers(each) for each in self.x.values()])
+        g, H = self._normal(x, common=True)
+        step, error = -_solved(H, g)[-1], float(np.sqrt(self._covariance(alike, common=True)[-1, -1]))
+        if abs(step) <= CERTAIN * error:
+            return []
+        return [
+            f"all renders times {np.exp(step):.3g} ± {np.exp(step) * error:.1g}, with another medium, would come "
+            "closer: check exposures of the images and the power of the lights; the errors do not hold that"
+        ]
 
     def _render(self, which: int, k: int, purpose: str, sloped: bool) -> tuple[np.ndarray, np.ndarray | None]:
         """A render of a view, and derivatives of its pixels by all variables; a channel knows of no other but by g."""

@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +37,7 @@ from scipy.sparse.linalg import LinearOperator, cg
 from halfspace_sss.inverse.comparing import (
     LONGEST,
     SETTLING,
+    ChiSquare,
     FitStep,
     MaterialFit,
     ViewComparison,
@@ -314,13 +315,15 @@ class PixelMeans:
     """Means of what was measured of a view in the steps, by pixel and channel.
 
     Args:
-        weights, image, variance: of renders without exposure times weights, and variance of that mean by noise.
+        weights, stiffness, image, variance: of renders without exposure times weights, and variance of that mean by
+            noise.
         slopes: s of each variable, shape (variables, pixels).
         shown: D of the numbers of each variable there, likewise.
         renders, sloped: how many the means count for, and of them those of slopes.
     """
 
     weights: np.ndarray
+    stiffness: np.ndarray
     image: np.ndarray
     variance: np.ndarray
     slopes: np.ndarray
@@ -332,7 +335,7 @@ class PixelMeans:
     def none(cls, pixels: int, variables: int) -> PixelMeans:
         """Before the first step."""
         one, many = np.zeros(pixels), np.zeros((variables, pixels))
-        return cls(one, one, one, many, many, one, one)
+        return cls(one, one, one, one, many, many, one, one)
 
     def forget(self, shown: np.ndarray, by_x: np.ndarray) -> None:
         """Count less for what is far from what is shown now, in variables by derivatives of the numbers."""
@@ -341,12 +344,14 @@ class PixelMeans:
         self.renders, self.sloped = kept * self.renders, kept * self.sloped
 
     def add(
-        self, w: np.ndarray, image: np.ndarray, slopes: np.ndarray | None, noise: np.ndarray, shown: np.ndarray
-    ) -> None:
+        self, w: np.ndarray, stiffness: np.ndarray, image: np.ndarray, slopes: np.ndarray | None, noise: np.ndarray,
+        shown: np.ndarray,
+    ) -> None:  # fmt: skip
         """A render more: its image and slopes (None: without them), and the variance of the image by noise."""
         self.renders = self.renders + 1
         b = 1 / self.renders
         self.weights = self.weights + b * (w - self.weights)
+        self.stiffness = self.stiffness + b * (stiffness - self.stiffness)
         self.image = self.image + b * (w * image - self.image)
         self.variance = (1 - b) ** 2 * self.variance + b**2 * w**2 * noise
         self.shown = self.shown + b * (shown - self.shown)
@@ -439,10 +444,10 @@ class TextureDescent:
         both = compared.at_once or not means.sloped.any()
         renders = [self._render(which, k, "first", True), self._render(which, k, "second", both)]
         misfit = compared.view(which, k, [image for image, _ in renders])
-        w = misfit.weights.ravel() / compared.count(which)
+        w, stiffness = (v.ravel() / compared.count(which) for v in (misfit.weights, misfit.stiffness))
         noise = 2 * misfit.noise.ravel() / compared.exposures[which] ** 2
         for image, slopes in renders:
-            means.add(w, image.ravel(), slopes, noise, shown)
+            means.add(w, stiffness, image.ravel(), slopes, noise, shown)
         return misfit
 
     def _render(self, which: int, k: int, purpose: str, sloped: bool) -> tuple[np.ndarray, np.ndarray | None]:
@@ -515,14 +520,18 @@ class TextureDescent:
         J = vstack([self._jacobian(which) for which in self.means])
         weights, off = [], []
         for which, means in self.means.items():
-            e, T = self.comparison.exposures[which], self.comparison.views[which].image.ravel()
-            moved = e * (means.slopes * (self._at_pixels(which) - means.shown)).sum(axis=0)
-            off.append((e * means.image + means.weights * (moved - T)) / len(self.means))
+            off.append(self._residual(which) / len(self.means))
             weights.append(means.weights / len(self.means))
         smooth = [kron(v.smoothing(x), np.eye(v.start.shape[-1])) for v, x in zip(self.variables, self._parts())]
         L = 0.5 * self.comparison.settings.tv * csr_array(block_diag(smooth))
         H = Curvature(csr_array(J), np.concatenate(weights), L)
         return H, J.T @ np.concatenate(off) + L @ self.x
+
+    def _residual(self, which: int) -> np.ndarray:
+        """What is left of a view by the means of its renders, times weights."""
+        means, e = self.means[which], self.comparison.exposures[which]
+        moved = e * (means.slopes * (self._at_pixels(which) - means.shown)).sum(axis=0)
+        return e * means.image + means.weights * (moved - self.comparison.views[which].image.ravel())
 
     # ---- the end
 
@@ -533,7 +542,14 @@ class TextureDescent:
         """Where the steps have ended."""
         self._put(self._followed())
         fitted, held, views = self.comparison.ends(self.total)
-        errors, told = self._errors(), []
+        residuals = [
+            (self._residual(which) / np.sqrt(np.maximum(means.weights, 1e-30))).reshape(
+                self.comparison.views[which].image.shape
+            )
+            for which, means in self.means.items()
+        ]
+        chi_square = ChiSquare.of(residuals)
+        errors, told = self._errors(), chi_square.told()
         for v, x, error in zip(self.variables, self._parts(), errors):
             told += self._told(v, x, error)
         found = {v.name: (v.is_texture, *each) for v, *each in zip(self.variables, self._shown(), errors)}
@@ -545,8 +561,8 @@ class TextureDescent:
         medium = medium.textured.mean(medium.medium.g, medium.medium.eta, self.parameters.shape)
         exposures = self.comparison.exposures.tolist()
         return MaterialFit(
-            values, errors, np.zeros((0, 0)), medium, fitted, held, exposures, told, self.steps, views, textures,
-            texture_errors,
+            values, errors, np.zeros((0, 0)), medium, fitted, held, chi_square, exposures, chi_square.is_misfit, told,
+            self.steps, views, textures, texture_errors,
         )  # fmt: skip
 
     def _errors(self) -> list[np.ndarray]:
@@ -554,6 +570,8 @@ class TextureDescent:
         last = np.array([step.loss for step in self.steps[int(SETTLING * self.total) :]])
         loss = max(float(last.mean()), float(last.std() / np.sqrt(len(last))))
         rng, H = np.random.default_rng([self.comparison.settings.seed, 7]), self._normal()[0]
+        stiffness = np.concatenate([means.stiffness for means in self.means.values()]) / len(self.means)
+        H = replace(H, weights=np.maximum(stiffness, 0))
         variance = np.concatenate([
             means.weights * loss / self.comparison.count(which)
             + self.comparison.exposures[which] ** 2 * means.variance

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ import drjit as dr  # noqa: E402
 
 from halfspace_sss import inverse  # noqa: E402
 from halfspace_sss.cli import app as cli  # noqa: E402
+from halfspace_sss.inverse.comparing import ChiSquare, ViewComparison  # noqa: E402
 from halfspace_sss.inverse.views import GivenView, read_views  # noqa: E402
 from halfspace_sss.rendering.scenes.scene_files import open_scene  # noqa: E402
 
@@ -129,6 +131,81 @@ def test_the_albedo_of_an_object_is_found_from_its_image(tmp_path: Path) -> None
     assert found.values["albedo"] == pytest.approx(TRUE["albedo"], abs=0.015)
     assert found.steps[-1].loss < found.steps[0].loss
     assert not found.told
+
+
+def test_weights_do_not_know_the_noise_of_an_image(tmp_path: Path) -> None:
+    """But that of its mean, to 3 %; weights by its pixels would differ by 20 %, and be smaller where it is bright."""
+    scene = _scene(tmp_path)
+    image = np.array(mi.render(scene, spp=256, seed=9))
+    noise, weights = 0.1 * np.random.default_rng(0).standard_normal(image.shape), []
+    for given in (image, image * (1 + noise)):
+        comparison = ViewComparison(scene, [GivenView.of("a", 0, given)], inverse.FitSettings(spp=16))
+        weights.append(comparison.view(0, 0).weights)
+    ratio = weights[1] / weights[0]
+    assert np.ptp(ratio) < 0.03 and abs(ratio.mean() - 1) < 0.03
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("loss", ["relative", "l2", "robust"])
+def test_errors_of_fits_to_noisy_images_are_those_that_are_stated(tmp_path: Path, loss: str) -> None:
+    """20 fits at 10 % of noise: no bias beyond 4 standard errors, and z of an rms of 1."""
+    scene, z = _scene(tmp_path), []
+    image = _target(scene, 8192)
+    for seed in range(20):
+        noise = 1 + 0.1 * np.random.default_rng(100 + seed).standard_normal(image.shape)
+        settings = inverse.FitSettings(steps=12, spp=32, loss=loss, seed=seed)
+        found = inverse.fit(tmp_path / "a.xml", [GivenView.of("a", 0, image * noise)], ("albedo",), settings=settings)
+        z.append((found.values["albedo"] - TRUE["albedo"]) / found.errors["albedo"])
+        assert not found.is_misfit and "residuals: noise, chi-square" in found.lines()[-1]
+    assert 0.8 < np.sqrt(np.square(z).mean()) < 1.2
+    assert abs(np.mean(z)) < 4 / np.sqrt(60)
+
+
+@pytest.mark.slow
+def test_albedo_and_extinction_are_found_together_from_one_noisy_view(tmp_path: Path) -> None:
+    text = XML.replace('name="eta" value="1"', 'name="eta" value="1.4"').replace('value="8"', 'value="24"')
+    (tmp_path / "a.xml").write_text(text)
+    image = _target(open_scene(tmp_path / "a.xml"), 8192)
+    image = image * (1 + 0.02 * np.random.default_rng(0).standard_normal(image.shape))
+    found = inverse.fit(tmp_path / "a.xml", [GivenView.of("a", 0, image)])
+    assert not found.is_misfit
+    for name, true in TRUE.items():
+        assert found.values[name] == pytest.approx(true, rel=0.08)
+        assert np.abs((found.values[name] - true) / found.errors[name]).max() < 4
+
+
+@pytest.mark.parametrize("factor", [1.1, 0.5])
+def test_a_misfit_of_brightness_is_told(tmp_path: Path, factor: float) -> None:
+    """With --exposure too, which leaves the brightness of all images together as it is."""
+    text = XML.replace('value="8"', 'value="16"')
+    (tmp_path / "a.xml").write_text(text)
+    image = factor * _target(open_scene(tmp_path / "a.xml"), 2048)
+    image = image * (1 + 0.02 * np.random.default_rng(0).standard_normal(image.shape))
+    settings = inverse.FitSettings(steps=12, spp=64, exposure=factor < 1)
+    found = inverse.fit(tmp_path / "a.xml", [GivenView.of("a", 0, image)], ("albedo",), settings=settings)
+    assert found.is_misfit and "residuals: misfit, chi-square" in found.lines()[-1]
+    told = " ".join(found.told)
+    low, high = (1.05, 1.3) if factor > 1 else (0.4, 0.8)
+    assert low < float(re.search(r"all renders times ([\d.]+) ±", told).group(1)) < high
+
+
+def test_a_chi_square_knows_noise_also_of_a_filter_from_a_misfit() -> None:
+    rng = np.random.default_rng(0)
+    values, near = [], []
+    for _ in range(50):
+        row, column = np.indices((24, 24)) - 11.5
+        other, noise = rng.standard_normal((2, 24, 24, 3)) * rng.uniform(0.5, 2, (2, 24, 24, 1))
+        other[np.hypot(row, column) > 9] = noise[np.hypot(row, column) > 9] = 0
+        filtered = noise
+        for axis in (0, 1):
+            filtered = filtered + 0.15 * (np.roll(filtered, 1, axis) + np.roll(filtered, -1, axis))
+        both = ChiSquare.of([noise, other]), ChiSquare.of([filtered])
+        values.append([(each.value - 1) / each.error for each in both])
+        near.append([each.near for each in both])
+        smooth = 0.9 * np.where(np.hypot(row, column) > 6, -1, 1)[..., None] * (noise != 0)
+        assert ChiSquare.of([noise + smooth]).is_misfit and not any(each.is_misfit for each in both)
+    assert np.std(values, axis=0) == pytest.approx([1, 1.2], abs=0.3)
+    assert np.mean(near, axis=0) == pytest.approx([1.05, (1.3**2 / 1.045) ** 2], rel=0.1)
 
 
 @pytest.mark.slow
