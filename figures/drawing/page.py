@@ -183,8 +183,10 @@ def fit(found: MaterialFit) -> bytes:
     exposure = round(-math.log2(bright), 1) if bright > 0 else 0.0
     for view in found.views:
         shape = (*view.counts.shape, 3)  # one channel is grey
-        given, image = (np.broadcast_to(np.nan_to_num(each), shape) for each in (view.given, view.found))
-        shots = [Shot("given", np.maximum(given, 0.0)), compared("found", image, given, mask=view.counts)]
+        given, image = (
+            np.broadcast_to(np.maximum(np.nan_to_num(each), 0.0), shape) for each in (view.given, view.found)
+        )
+        shots = [Shot("given", given), compared("found", image, given, mask=view.counts)]
         scenes[f"{view.name}, held out" if view.held_out else view.name] = shots
     notes = "FLIP and relative squared error of the pixels that count."
     caption = "; ".join([*found.lines(), *found.told])

@@ -75,7 +75,7 @@ def fit_command(
 
 
 def _write(found: MaterialFit, scene: Path, name: str | None, out: Path) -> list[Path]:
-    """The files of a fit; their paths."""
+    """Write the files of a fit: numbers, then textures and the scene, then the page; their paths."""
     from halfspace_sss.materials.imports import to_toml
     from halfspace_sss.materials.material import Material
 
@@ -91,17 +91,17 @@ def _write(found: MaterialFit, scene: Path, name: str | None, out: Path) -> list
             source=f"{'means of textures ' * bool(found.textures)}fitted to images of {scene.name}",
         )
         files[out / f"{stem}.toml"] = to_toml([material])
-    if draw := renderer("fit"):
-        files[out / f"{stem}.html"] = draw(found)
+    write_together(files)  # before anything that may fail
     painted, textures = _with_textures(scene, name, found, out / stem)
-    files |= textures
-    text = _with_medium(scene, name, found, painted)
+    text, rest = _with_medium(scene, name, found, painted), dict(textures)
     if text is None:
         tell(f"{scene.name} has no single surface `translucent` to put the medium in: no scene was written")
     else:
-        files[out / f"{stem}.xml"] = text
-    write_together(files)
-    return list(files)
+        rest[out / f"{stem}.xml"] = text
+    write_together(rest)
+    pages = {out / f"{stem}.html": draw(found)} if (draw := renderer("fit")) else {}
+    write_together(pages)
+    return [*files, *rest, *pages]
 
 
 def _plain(found: MaterialFit) -> dict[str, Any]:

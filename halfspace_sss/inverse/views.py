@@ -46,7 +46,8 @@ class GivenView:
         """From an image of any kind; `mask` is > 0.5 where pixels count.
 
         Raises:
-            ValueError: a pixel that counts is not finite, or the sizes of image and mask differ.
+            ValueError: a pixel that counts is not finite, none counts, those that do are dark or below 0 in their mean,
+                or the sizes of image and mask differ.
         """
         image = np.asarray(image, dtype=np.float32)
         if image.ndim != 3 or image.shape[2] not in (1, 3, 4):
@@ -58,6 +59,12 @@ class GivenView:
         wrong = counts & ~np.isfinite(image).all(axis=2)
         if wrong.any():
             raise ValueError(f"image {name} must be finite, got {int(wrong.sum())} pixels that are not")
+        if not counts.any():
+            raise ValueError(f"image {name} must have a pixel that counts, got none of {counts.size}")
+        if not (mean := float(image[counts].mean())) > 0:
+            raise ValueError(f"image {name} must have a mean above 0, got {mean:.3g}")
+        if below := int((image[counts] < 0).any(axis=1).sum()):
+            warnings.warn(f"image {name}: {below} pixels below 0 count as they are, as noise about black", stacklevel=3)
         return cls(name, sensor, np.where(counts[..., None], image, 0), counts, held_out)
 
 
@@ -72,9 +79,13 @@ def read_views(path: str | Path) -> list[GivenView]:
     """
     path = Path(path)
     try:
-        rows = json.loads(read_text(path))["views"]
-    except (OSError, UnicodeDecodeError, ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{path}: must be JSON with a list `views`, got {error!r}") from error
+        content = json.loads(read_text(path))
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{path}: must be JSON, got {error}") from error
+    if not isinstance(content, dict) or content.keys() != {"views"}:
+        got = f"the keys {', '.join(content)}" if isinstance(content, dict) else f"a {type(content).__name__}"
+        raise ValueError(f'{path}: must be an object {{"views": [...]}}, got {got}')
+    rows = content["views"]
     if not isinstance(rows, list) or not rows:
         raise ValueError(f"{path}: views must be a list with an image or more, got {rows!r}")
     return [_view(path, row) for row in rows]
@@ -85,7 +96,10 @@ def _view(path: Path, row: Any) -> GivenView:
         raise ValueError(f"{path}: a view must have `image`, got {row!r}")
     for key in row.keys() - set(KEYS):
         raise ValueError(f"{path}: {key} must be one of {', '.join(KEYS)}{did_you_mean(key, KEYS)}")
-    name, sensor = str(row["image"]), row.get("sensor", 0)
+    for key, kind, said in (("image", str, "a file"), ("mask", str, "a file"), ("held_out", bool, "true or false")):
+        if not isinstance(row.get(key, kind()), kind):
+            raise ValueError(f"{path}: {key} must be {said}, got {row[key]!r}")
+    name, sensor = row["image"], row.get("sensor", 0)
     check_count(f"{path}: sensor of {name}", sensor, 0)
     exact = name.lower().endswith(".exr")
     if not exact and "transfer" not in row:
@@ -99,7 +113,7 @@ def _view(path: Path, row: Any) -> GivenView:
         warnings.warn(f"{name}: {int((full & mask).sum())} saturated pixels do not count", stacklevel=3)
         mask = mask & ~full
     image = linear_of_srgb(image) if transfer == "srgb" else image
-    return GivenView.of(name, sensor, image, mask, bool(row.get("held_out")))
+    return GivenView.of(name, sensor, image, mask, row.get("held_out", False))
 
 
 def _pixels(path: Path) -> np.ndarray:

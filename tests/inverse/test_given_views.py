@@ -1,0 +1,82 @@
+"""Images of a fit: what is refused before any work, and that results are written first."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from test_fit import XML
+from typer.testing import CliRunner
+
+mi = pytest.importorskip("mitsuba")
+
+from halfspace_sss.cli import app as cli  # noqa: E402
+from halfspace_sss.cli import fit as command  # noqa: E402
+from halfspace_sss.inverse.views import GivenView, read_views  # noqa: E402
+
+pytestmark = pytest.mark.usefixtures("quiet_rgb")
+
+WHOLE = np.full((8, 8, 3), 0.5, np.float32)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ([{"image": "a.exr"}], r'must be an object {"views": \[...\]}, got a list'),
+        ({"view": []}, "got the keys view"),
+        ({"views": {}}, "views must be a list with an image or more"),
+        ({"views": [{"image": 3}]}, "image must be a file, got 3"),
+        ({"views": [{"image": "a.exr", "mask": 3}]}, "mask must be a file, got 3"),
+        ({"views": [{"image": "a.exr", "held_out": "false"}]}, "held_out must be true or false, got 'false'"),
+    ],
+)
+def test_a_file_of_views_that_is_none_is_refused_in_words(tmp_path: Path, content: Any, message: str) -> None:
+    mi.Bitmap(WHOLE).write(str(tmp_path / "a.exr"))
+    (tmp_path / "views.json").write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=message) as caught:
+        read_views(tmp_path / "views.json")
+    assert "Error" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("image", "mask", "message"),
+    [
+        (-WHOLE, None, "image a must have a mean above 0, got -0.5"),
+        (0 * WHOLE, None, "image a must have a mean above 0, got 0"),
+        (WHOLE * np.inf, None, "image a must be finite, got 64 pixels that are not"),
+        (WHOLE, np.zeros((8, 8)), "image a must have a pixel that counts, got none of 64"),
+    ],
+)
+def test_images_without_light_are_refused(image: np.ndarray, mask: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        GivenView.of("a", 0, image, mask)
+
+
+def test_pixels_below_0_are_told_and_fitted_and_results_are_there_if_the_page_fails(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Noise about black has them, after a dark frame is subtracted."""
+    image = WHOLE.copy()
+    image[0, 0] = -0.001
+    with pytest.warns(UserWarning, match="image a: 1 pixels below 0 count as they are"):
+        GivenView.of("a", 0, image)
+    mi.Bitmap(image).write(str(tmp_path / "a.exr"))
+    (tmp_path / "a.xml").write_text(XML)
+    (tmp_path / "views.json").write_text(json.dumps({"views": [{"image": "a.exr"}]}))
+    arguments = ["fit", str(tmp_path / "a.xml"), "--images", str(tmp_path / "views.json"), "--parameter", "albedo"]
+    arguments += ["--steps", "1", "--spp", "4"]
+    done = CliRunner().invoke(cli.app, [*arguments, "--out", str(tmp_path / "whole")])
+    assert done.exit_code == 0, done.output
+    names = {"a_fit.json", "a_fit.toml", "a_fit.xml", "a_fit.html"}
+    assert {path.name for path in (tmp_path / "whole").iterdir()} == names
+
+    def broken(*_: Any) -> bytes:
+        raise ValueError("no page")
+
+    monkeypatch.setattr(command, "renderer", lambda _: broken)
+    done = CliRunner().invoke(cli.app, [*arguments, "--out", str(tmp_path / "rest")])
+    assert done.exit_code == 2 and "no page" in done.output
+    assert {path.name for path in (tmp_path / "rest").iterdir()} == names - {"a_fit.html"}
