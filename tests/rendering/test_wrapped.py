@@ -123,7 +123,7 @@ def test_a_furnace_stays_even_behind_a_rough_normal_map_and_a_mask(integrator):
     image = images(bsdf, integrator, sky={"type": "constant"})
     means = image.mean(axis=(1, 2, 3))
     if integrator == "translucent_walk":  # a significance of 1e-4
-        assert np.allclose(means, 1, atol=1e-6) or stats.ttest_1samp(means, 1.0).pvalue > 1e-4
+        assert np.abs(means - 1).max() < 1e-6 or stats.ttest_1samp(means, 1.0).pvalue > 1e-4
     assert image.mean(axis=(0, 3)).max() < 1.02
     plain = images(white, integrator, 2, sky={"type": "constant"}).mean()
     assert means.mean() == pytest.approx(0.7 * plain + 0.3, abs=0.02)

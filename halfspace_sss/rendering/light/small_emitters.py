@@ -20,6 +20,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from halfspace_sss.rendering.object.rounding import before, blocked, bound_of
 from halfspace_sss.rendering.object.shape import by_pointer, looked_up, pointer_numbers
 from halfspace_sss.rendering.object.wrapped import surface_of
 
@@ -109,8 +110,8 @@ class SmallEmitters:
         n_delta: how many are delta lights.
         suns: cones of the environment; their numbers follow.
         tables: by number: a point of the emitter or the direction to it (`x`, `y`, `z`), whether it is `distant`, the
-            `radius` of the sphere about it or the angle of its cone; `pointer`, what Dr.Jit's registry calls each
-            emitter; and from that number to its place, `index`.
+            `radius` of the sphere about it or the angle of its cone, and its `rounding`; `pointer`, what Dr.Jit's
+            registry calls each emitter; and from that number to its place, `index`.
     """
 
     scene: mi.Scene
@@ -135,7 +136,9 @@ class SmallEmitters:
         rows = [_place(emitter) for emitter in emitters] + [(*sun.direction, True, sun.radius) for sun in suns]
         x, y, z, distant, radius = zip(*rows)
         pointers = [mi.EmitterPtr(emitter) for emitter in emitters]
+        shapes = [*(emitter.get_shape() for emitter in emitters), *(None for _ in suns)]
         tables = {
+            "rounding": mi.Float([0.0 if shape is None else bound_of(shape) for shape in shapes]),
             "x": mi.Float(x), "y": mi.Float(y), "z": mi.Float(z), "distant": mi.Bool(distant),
             "radius": mi.Float(radius), "pointer": mi.UInt32(pointer_numbers(pointers) or [0]),
             "index": by_pointer(pointers, np.arange(len(pointers)), -1),
@@ -168,6 +171,10 @@ class SmallEmitters:
         size = dr.norm(way)
         small = distant | (self._row("radius", k) < LARGEST * size)
         return way / dr.maximum(size, 1e-20), small
+
+    def rounding(self, k: mi.UInt32) -> mi.Float:
+        """A bound of how far from the surface of emitter k rounding puts points; 0 of one without."""
+        return self._row("rounding", k)
 
     def point(self, k: mi.UInt32, p: mi.Point3f, far: mi.Float | float) -> mi.Point3f:
         """A point of emitter k; as far as said from p where that is distant."""
@@ -240,8 +247,8 @@ def spread(scene: mi.Scene, emitter: mi.EmitterPtr, ray: mi.Ray3f, radius: mi.Fl
     ds, E = emitter.sample_direction(at, mi.Point2f(0.5), active)
     seen = active & (ds.pdf > 0) & _within(ray.d, ds.d, radius) & (dr.max(E) > 0)
     shadow = mi.Ray3f(ray.o, ds.d)
-    shadow.maxt = ds.dist * (1 - 1e-4)
-    seen &= ~scene.ray_test(shadow, False, seen)
+    shadow.maxt = ds.dist - before(ds.p, ds.dist)
+    seen &= ~blocked(scene, shadow, seen)
     return dr.select(seen, E / _solid_angle(radius), 0)
 
 

@@ -15,10 +15,14 @@ import numpy as np
 
 from halfspace_sss.rendering.object.instances import Placed, corners, ends_of, shapes_of, shown_groups
 from halfspace_sss.rendering.object.shape import Geometry, is_inside, meet_alone, name_of, scene_of, ways_into
+from halfspace_sss.rendering.object.wrapped import surface_of
 
 STARTS = 64  # rays of each sensor that are looked at
 LOOKS = 512  # rays that look for parts of a shape in an object
 DEEP = 1e-3  # of the size of an object: what reaches less deep stands at its surface
+CLOSE = 4.0  # bounds of rounding: surfaces that are so close are one to rays
+MOST_TOUCHING = 4  # points of `LOOKS` on one surface that are on the other by chance, where both cross
+REFRACTS = int(mi.BSDFFlags.DeltaTransmission) | int(mi.BSDFFlags.GlossyTransmission)
 PAIRS = 512  # in a launch
 DEPTHS = 32  # points of each of several pairs, whose depth is measured
 EACH = -1  # number of an instance that stands for all of its group
@@ -46,17 +50,25 @@ class Content:
 
 
 def contents(scene: mi.Scene, objects: list[Geometry]) -> list[Content]:
-    """What lies inside each closed object of a scene: of every shape a part that is deeper than `DEEP`, and lamps."""
+    """What lies inside each closed object of a scene: of every shape a part that is deeper than `DEEP`, and lamps.
+
+    What shines or lets light through counts from the depth on that rays tell.
+
+    Raises:
+        ValueError: the surface of such a shape lies on that of an object, so that rays do not tell which comes first.
+    """
     groups, results = shown_groups(scene), []
     holders = Placed.of([obj.shape for obj in objects], groups)
     things = Placed.of(shapes_of(scene, groups), groups)
     for a, shape in enumerate(things.shapes):
         alone, group = None, things.groups[a]
         for b, holder in enumerate(objects):
-            pairs = _meeting(things, a, holders, b) if holder.closed else _NONE
+            pairs = _meeting(things, a, holders, b)
             if not len(pairs.i):
                 continue
             alone = alone or scene_of([shape], scene)
+            if _tells(shape):
+                _check_apart(pairs, (shape, alone), holder)
             for i, j, whole in _held(pairs, alone, holder):
                 for k in range(len(group.instances)) if i == EACH else (i,):
                     name = name_of(shape if group is None else group.instances[k])
@@ -78,6 +90,7 @@ class _Pairs(NamedTuple):
         i, j: arrays (n,).
         thing, holder: arrays (n, 4, 4), their places.
         low, high: arrays (n, 3), the box that they share.
+        deep: array (n,), the depth from which on a shape lies inside, scene units.
     """
 
     i: np.ndarray
@@ -86,17 +99,18 @@ class _Pairs(NamedTuple):
     holder: np.ndarray
     low: np.ndarray
     high: np.ndarray
+    deep: np.ndarray
 
     def some(self, kept: np.ndarray | slice) -> _Pairs:
         """Those that are kept."""
         return _Pairs(*(value[kept] for value in self))
 
 
-_NONE = _Pairs(*(np.zeros(0, dtype=int),) * 2, *(np.zeros((0, 4, 4)),) * 2, *(np.zeros((0, 3)),) * 2)
+_NONE = _Pairs(*(np.zeros(0, dtype=int),) * 2, *(np.zeros((0, 4, 4)),) * 2, *(np.zeros((0, 3)),) * 2, np.zeros(0))
 
 
 def _meeting(things: Placed, a: int, holders: Placed, b: int) -> _Pairs:
-    """Copies of a shape and of an object, not the same, that share a box which reaches deep."""
+    """Copies of a shape and of an object, not the same, that share a box which reaches deep, or touches if it tells."""
     same, one = things.shapes[a] is holders.shapes[b], np.eye(4)[None]
     together = things.groups[a] is not None and things.groups[a] is holders.groups[b]
     looks = [(one, one, EACH)] if together and not same else []
@@ -105,20 +119,27 @@ def _meeting(things: Placed, a: int, holders: Placed, b: int) -> _Pairs:
     for thing, holder, number in looks:
         a_low, a_high = ends_of(corners(things.shapes[a].bbox(), thing))
         b_low, b_high = ends_of(corners(holders.shapes[b].bbox(), holder))
-        deep = DEEP * np.linalg.norm(b_high - b_low, axis=1, keepdims=True)
+        deep = DEEP * np.linalg.norm(b_high - b_low, axis=1)
+        e, tells = (
+            [_rounding_of(each, number) for each, number in ((things, a), (holders, b))],
+            _tells(things.shapes[a]),
+        )
         for i in range(len(thing)):
-            low, high = np.maximum(a_low[i], b_low + deep), np.minimum(a_high[i], b_high - deep)
+            close = CLOSE * (e[0][i] + e[1][: len(holder)])
+            margin = (-close if tells else deep)[:, None]
+            low, high = np.maximum(a_low[i], b_low + margin), np.minimum(a_high[i], b_high - margin)
             j = np.flatnonzero((low <= high).all(axis=1))
             j = j[j != i] if together and number != EACH else j
             n = np.full(len(j), i)
-            results.append(_Pairs(n + number, j + number, thing[n], holder[j], low[j], high[j]))
+            depth = (close if tells else deep)[j]
+            results.append(_Pairs(n + number, j + number, thing[n], holder[j], low[j], high[j], depth))
     return _Pairs(*map(np.concatenate, zip(*results)))
 
 
 def _held(pairs: _Pairs, alone: mi.Scene, holder: Geometry) -> list[tuple[int, int, bool]]:
     """Which copies of a shape, in the scene `alone`, lie in which of an object, and whether wholly."""
     results = []
-    for start in range(0, len(pairs.i), PAIRS):
+    for start in range(0, len(pairs.i) if holder.closed else 0, PAIRS):
         part = pairs.some(slice(start, start + PAIRS))
         part = part.some(_reach_deep(part, alone, holder))
         if len(part.i):
@@ -180,7 +201,8 @@ def _reach_deep(pairs: _Pairs, alone: mi.Scene, holder: Geometry) -> np.ndarray:
         along /= np.linalg.norm(along, axis=0)
         start, ends = np.repeat(points[:, inside], 128, axis=1), np.tile(along, len(inside))
         hit = holder.scene.ray_intersect_preliminary(mi.Ray3f(mi.Point3f(start), mi.Vector3f(ends)))
-        result[k[inside][np.array(hit.t).reshape(-1, 128).min(axis=1) > DEEP * holder.size]] = True
+        scale = np.cbrt(np.abs(np.linalg.det(pairs.holder[k[inside], :3, :3])))
+        result[k[inside][scale * np.array(hit.t).reshape(-1, 128).min(axis=1) > pairs.deep[k[inside]]]] = True
     return result
 
 
@@ -188,12 +210,61 @@ def _whole(pairs: _Pairs, alone: mi.Scene, holder: Geometry) -> np.ndarray:
     """Whether all of the shape lies inside the object."""
     one, none = np.eye(4)[None], np.zeros(1, dtype=int)
     (a, b), (c, d) = ends_of(corners(alone.bbox(), one)), ends_of(corners(holder.scene.bbox(), one))
-    _, points = _points_in(alone, _Pairs(none, none, one, one, a, b))
+    _, points = _points_in(alone, _Pairs(none, none, one, one, a, b, np.zeros(1)))
     relative = np.linalg.inv(pairs.holder) @ pairs.thing
     inside = relative[:, :3, :3] @ points + relative[:, :3, 3:]
     whole = is_inside(holder, np.moveaxis(inside, 0, 1).reshape(3, -1)).reshape(len(pairs.i), -1).all(axis=1)
     boxed = bool((a >= c).all() and (b <= d).all()) or np.abs(relative - one).max(axis=(1, 2)) > 0
     return whole & boxed
+
+
+def refracts(shape: mi.Shape) -> bool:
+    """Whether the surface of a shape lets light through, bent."""
+    return bool(shape.bsdf().flags() & REFRACTS)
+
+
+def _tells(shape: mi.Shape) -> bool:
+    """Whether rays have to tell the surface of a shape from that of an object, as light comes from behind it."""
+    return shape.is_emitter() or bool(surface_of(shape)) or refracts(shape)
+
+
+def _rounding_of(placed: Placed, kind: int) -> np.ndarray:
+    """Of the things of a shape, see `Placed.rounding`; in a group looked at once for all, of the first."""
+    return placed.rounding[placed.numbers(kind)]
+
+
+def _check_apart(pairs: _Pairs, of: tuple[mi.Shape, mi.Scene], holder: Geometry) -> None:
+    """ValueError if a shape, in a scene of its own, and an object share a part of their surfaces."""
+    shape, alone = of
+    for start in range(0, len(pairs.i), PAIRS):
+        part = pairs.some(slice(start, start + PAIRS))
+        scales = (np.cbrt(np.abs(np.linalg.det(M[:, :3, :3]))) for M in (part.holder, part.thing))
+        ways = np.linalg.inv(part.holder) @ part.thing, np.linalg.inv(part.thing) @ part.holder
+        both = zip((shape, holder.shape), (holder.scene, alone), ways, scales)
+        shared = sum(_shares(*each, part.deep / scale) for *each, scale in both)
+        if shared.any():
+            raise ValueError(
+                f"surfaces must be apart by more than {part.deep[shared.argmax()]:.2g} scene units, outside or inside, "
+                f"got the shape {name_of(shape)} on the surface of object {holder.name}"
+            )
+
+
+def _shares(shape: mi.Shape, other: mi.Scene, into: np.ndarray, close: np.ndarray) -> np.ndarray:
+    """Whether a part of the surface of a shape lies on that of a scene, whose frame each of the matrices leads into."""
+    u = np.random.default_rng(19).random((2, LOOKS)).astype(np.float32)
+    try:
+        drawn = shape.sample_position(0.0, mi.Point2f(u))
+    except (RuntimeError, NotImplementedError):  # of shapes that cannot be drawn from
+        return np.zeros(len(into), dtype=bool)
+    p, n = (np.array(v, dtype=float).reshape(3, -1) for v in (drawn.p, drawn.n))
+    p, n = into[:, :3, :3] @ p + into[:, :3, 3:], np.moveaxis(np.linalg.inv(into[:, :3, :3]), 1, 2) @ n
+    n /= np.linalg.norm(n, axis=1, keepdims=True)
+    o, d = (np.moveaxis(v, 0, 1).reshape(3, -1) for v in (p - n * close[:, None, None], n))
+    ray = mi.Ray3f(mi.Point3f(o), mi.Vector3f(d))
+    ray.maxt = mi.Float(np.repeat(2 * close, p.shape[2]))
+    si = other.ray_intersect(ray, mi.RayFlags.Minimal, False)
+    on = np.array(si.is_valid() & (dr.abs(dr.dot(si.n, ray.d)) > 0.99))
+    return on.reshape(len(into), -1).sum(axis=1) > MOST_TOUCHING
 
 
 def place_of(emitter: mi.Emitter) -> np.ndarray | None:

@@ -22,9 +22,8 @@ import mitsuba as mi
 import numpy as np
 
 from halfspace_sss.rendering.object.points import TransportAround
-from halfspace_sss.rendering.object.rounding import EPSILON, OF_WAY, bound_of, bounds, place_bound
+from halfspace_sss.rendering.object.rounding import EPSILON, OF_WAY, bound_of, bounds, place_bound, ray_to
 from halfspace_sss.rendering.object.shape import (
-    Geometry,
     by_pointer,
     completed,
     groups_of,
@@ -142,15 +141,10 @@ class Placed:
         shown = list({id(group): group for group in self.groups if group is not None}.values())
         return scene_of([*own, *(instance for group in shown for instance in group.instances)], world)
 
-    def rounding(self, geometries: list[Geometry]) -> list[float]:
+    @functools.cached_property
+    def rounding(self) -> np.ndarray:
         """Of each thing a bound of how far from its surface rounding puts points, scene units."""
-        results = []
-        for kind, geometry in enumerate(geometries):
-            if self.groups[kind] is None:
-                results.append(geometry.rounding)
-                continue
-            results += _rounding(geometry.shape, self.to_world(kind)).tolist()
-        return results
+        return np.concatenate([_rounding(shape, self.to_world(kind)) for kind, shape in enumerate(self.shapes)])
 
     @functools.cached_property
     def tables(self) -> dict[str, mi.Int32 | mi.UInt32]:
@@ -263,19 +257,21 @@ class Sight:
             what is none; by row the columns of M and of its inverse, `rounding`, and the `first` kind of the group; by
             kind the `pointer`.
         bounds: by what Dr.Jit's registry calls a shape of the scene, how far from it rounding puts points.
+        lamps: likewise, by what it calls an emitter.
     """
 
     shapes: list[mi.Shape]
     tables: dict[str, Any]
     bounds: mi.Float | None = None
+    lamps: mi.Float | None = None
 
     @classmethod
     def of(cls, scene: mi.Scene, shown: Sequence[Group]) -> Sight:
         """Of a scene that shows these groups."""
-        known = bounds_of(scene.shapes(), shown)
+        known, lamps = bounds_of(scene.shapes(), shown), lamps_of(scene)
         if not shown:
-            return cls([], {}, known)
-        return replace(cls.of_shapes(shapes_of(scene, shown), shown), bounds=known)
+            return cls([], {}, known, lamps)
+        return replace(cls.of_shapes(shapes_of(scene, shown), shown), bounds=known, lamps=lamps)
 
     @classmethod
     def of_shapes(cls, shapes: list[mi.Shape], shown: Sequence[Group] = ()) -> Sight:
@@ -305,6 +301,17 @@ class Sight:
         number = dr.reinterpret_array(mi.UInt32, pointer)
         known = number < dr.width(self.bounds)
         return dr.gather(mi.Float, self.bounds, number, known) + more
+
+    def rounding_of(self, emitter: mi.EmitterPtr) -> mi.Float:
+        """A bound of how far from the surface of an emitter rounding puts points; 0 of one without."""
+        if self.lamps is None:
+            return mi.Float(0)
+        number = dr.reinterpret_array(mi.UInt32, emitter)
+        return dr.gather(mi.Float, self.lamps, number, number < dr.width(self.lamps))
+
+    def ray_to_emitter(self, at: mi.Interaction3f, ds: mi.DirectionSample3f, e: mi.Float) -> mi.Ray3f:
+        """A ray from a point of a surface, at most e off that by rounding, to a sampled one of an emitter."""
+        return ray_to(at, ds.p, e, self.rounding_of(ds.emitter))
 
     def intersect(
         self, scene: mi.Scene, ray: mi.Ray3f, flags: int, coherent: bool = False, active: mi.Bool | bool = True
@@ -357,6 +364,19 @@ def bounds_of(shapes: Sequence[mi.Shape], shown: Sequence[Group] = ()) -> mi.Flo
     numbers = pointer_numbers(mi.ShapePtr(shape) for shape in shapes)
     table = np.zeros(max(numbers) + 1)
     table[numbers] = [known[id(shape)] for shape in shapes]
+    result = mi.Float(table.tolist())
+    dr.make_opaque(result)
+    return result
+
+
+def lamps_of(scene: mi.Scene) -> mi.Float | None:
+    """Table from what Dr.Jit's registry calls an emitter to how far from its surface rounding puts points."""
+    emitters = scene.emitters()
+    if not len(emitters):
+        return None
+    numbers = pointer_numbers(mi.EmitterPtr(emitter) for emitter in emitters)
+    table = np.zeros(max(numbers) + 1)
+    table[numbers] = [0.0 if e.get_shape() is None else bound_of(e.get_shape()) for e in emitters]
     result = mi.Float(table.tolist())
     dr.make_opaque(result)
     return result

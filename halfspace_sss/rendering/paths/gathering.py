@@ -35,7 +35,7 @@ from halfspace_sss.rendering.gathered.transfer import (
     transfer,
 )
 from halfspace_sss.rendering.object.points import cosine_above, opaque, place
-from halfspace_sss.rendering.object.rounding import ray_from, ray_to
+from halfspace_sss.rendering.object.rounding import blocked, ray_from
 from halfspace_sss.rendering.object.snapshot import Snapshot, same_objects
 from halfspace_sss.rendering.paths.inner_light import COUNT, inner_light
 from halfspace_sss.rendering.paths.lighting import Lights, Sky, mis_weight
@@ -274,7 +274,7 @@ def _incident(
     point = j % _numbers(count)[0]
     at = GatheringPoint(*(dr.gather(type(v), v, point) for v in (T.points.p, T.points.n, T.points.n_out)), e)
     u, v = (_stratified(sampler, j, s, each) for _ in range(2))
-    aimed, w_e = by_emitters(scene, T.albedo, at, u)
+    aimed, w_e = by_emitters(scene, objects[0].sight, T.albedo, at, u)
     met, more, a, w_c, on = by_cosine(scene, objects, T.albedo, settings, at, v, traced, sampler)
     around = T.around
     centre = dr.gather(mi.Vector3f, mi.Vector3f(around.middle.T.astype(np.float32)), point)
@@ -363,14 +363,14 @@ def _weight(albedo: Albedo, at: GatheringPoint, w: mi.Vector3f) -> tuple[mi.Spec
 
 
 def by_emitters(
-    scene: mi.Scene, albedo: Albedo, at: GatheringPoint, u: mi.Point2f, c: mi.Spectrum | float = 0.0
+    scene: mi.Scene, sight: Sight, albedo: Albedo, at: GatheringPoint, u: mi.Point2f, c: mi.Spectrum | float = 0.0
 ) -> tuple[mi.Spectrum, mi.Vector3f]:
     """Light of sampled emitters less c of the sky, and its direction."""
     here = place(at.p, at.n)
     ds, light = scene.sample_emitter_direction(here, u, False)
     a, pdf = _weight(albedo, at, ds.d)
     above = (ds.pdf > 0) & (pdf > 0)
-    light = dr.select(scene.ray_test(ray_to(here, ds.p, at.e), False, above), 0, light)
+    light = dr.select(blocked(scene, sight.ray_to_emitter(here, ds, at.e), above), 0, light)
     light -= dr.select(ds.emitter.is_environment(), c / dr.maximum(ds.pdf, 1e-30), 0)
     share = dr.select(ds.delta, 1, mis_weight(ds.pdf, pdf))
     return dr.select(above, a * pdf * light * share, 0), ds.d

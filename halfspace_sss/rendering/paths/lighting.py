@@ -9,6 +9,7 @@ others held, and no loop is recorded. Directions and densities are held too.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import drjit as dr
@@ -18,7 +19,7 @@ import numpy as np
 from halfspace_sss.rendering.light.small_emitters import WIDE, SmallEmitters, is_delta
 from halfspace_sss.rendering.object.instances import Pose, Sight
 from halfspace_sss.rendering.object.objects import TranslucentObject
-from halfspace_sss.rendering.object.rounding import ray_to
+from halfspace_sss.rendering.object.rounding import blocked
 from halfspace_sss.rendering.object.settings import AUTOMATIC, Settings
 
 
@@ -222,10 +223,10 @@ class RenderContext:
             small = SmallEmitters.of(scene)
         return cls(scene, lights, objects, settings, mode, Sky.of(scene, lights, objects), small)
 
-    @property
+    @cached_property
     def sight(self) -> Sight:
         """What rays meet in the scene."""
-        return self.objects[0].sight if self.objects else Sight([], {})
+        return self.objects[0].sight if self.objects else Sight.of(self.scene, [])
 
     def ray_intersect(self, ray: mi.Ray3f, coherent: mi.Bool | bool, active: mi.Bool) -> mi.SurfaceInteraction3f:
         """What a ray meets, with all that is known of the surface there."""
@@ -296,8 +297,8 @@ def sample_emitter(
     with dr.suspend_grad():
         ds, light = context.scene.sample_emitter_direction(ref, u, False, active)
         if seen:
-            shadow = ray_to(ref, ds.p, context.sight.rounding(ref))
-            hidden = context.scene.ray_test(shadow, False, active & (ds.pdf > 0))
+            shadow = context.sight.ray_to_emitter(ref, ds, context.sight.rounding(ref))
+            hidden = blocked(context.scene, shadow, active & (ds.pdf > 0))
             ds.pdf, light = dr.select(hidden, 0, ds.pdf), dr.select(hidden, 0, light)
         inverse = dr.select(ds.pdf > 0, dr.rcp(ds.pdf), 0)
     if not context.mode.tracks:

@@ -31,7 +31,7 @@ from halfspace_sss.physics.medium import eval_hg, sample_hg
 from halfspace_sss.rendering.light.small_emitters import WIDE
 from halfspace_sss.rendering.object.objects import TranslucentObject
 from halfspace_sss.rendering.object.points import SurfacePoint, lifted, mirrored, opaque, opposed, place, turned
-from halfspace_sss.rendering.object.rounding import clear, ray_from, ray_to
+from halfspace_sss.rendering.object.rounding import blocked, clear, ray_from, ray_to
 from halfspace_sss.rendering.object.textured import SurfaceMedium
 from halfspace_sss.rendering.paths.lighting import RenderContext, delta_light, mis_weight, sample_emitter
 
@@ -526,8 +526,8 @@ def _way(context: RenderContext, obj: TranslucentObject, walk: _Walk, target: _T
     valid &= dr.dot(ds.n, met.w) <= 0
     spread = dr.select(ds.delta | ~alone, 1, facing) * reach * reach * met.density
     weight_sky = mis_weight(ds.pdf, _phase_pdf(obj, walk, met) * met.T * spread)
-    shadow = ray_to(place(met.p, met.n), target.p, obj.geometry.clearance)
-    valid &= ~context.scene.ray_test(shadow, False, valid)
+    shadow = ray_to(place(met.p, met.n), target.p, obj.geometry.clearance, context.sight.rounding_of(ds.emitter))
+    valid &= ~blocked(context.scene, shadow, valid)
     passed = dr.select(valid, met.T * spread * dr.select(alone, 1, weight_sky), 0)
     return _Way(mi.Vector3f(met.d), mi.Float(met.length), passed)
 

@@ -18,7 +18,7 @@ import mitsuba as mi
 
 from halfspace_sss.rendering.object.objects import TranslucentObject
 from halfspace_sss.rendering.object.points import EntrySample, SurfacePoint, lifted, opaque, place, turned
-from halfspace_sss.rendering.object.rounding import ray_from, ray_to
+from halfspace_sss.rendering.object.rounding import blocked, ray_from, ray_to
 from halfspace_sss.rendering.object.settings import Settings
 from halfspace_sss.rendering.paths.lighting import (
     PathTally,
@@ -619,7 +619,7 @@ def bssrdf_event(
         direct = -entry.weight * entry.sky_weight * context.sky_means(obj)[1]
     if context.lights.some_delta:
         shadow = ray_to(place(entry.p, entry.n), entry.emitter_point, obj.geometry.clearance)
-        lit = entry.delta & ~context.scene.ray_test(shadow, False, entry.delta)
+        lit = entry.delta & ~blocked(context.scene, shadow, entry.delta)
         direct = direct + dr.select(lit, entry.weight * entry.light, 0)
     anywhere, no = entry.emitter_distance < 0, mi.Bool(False)
     previous = PreviousVertex(

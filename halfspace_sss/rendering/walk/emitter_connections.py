@@ -25,7 +25,7 @@ import numpy as np
 
 from halfspace_sss.rendering.light.small_emitters import SmallEmitters, spread
 from halfspace_sss.rendering.object.points import channel_mean, opaque, opposed, sided
-from halfspace_sss.rendering.object.rounding import place_bound, ray_from
+from halfspace_sss.rendering.object.rounding import before, blocked, place_bound, ray_from
 from halfspace_sss.rendering.object.shape import pointer_numbers
 from halfspace_sss.rendering.walk.media import Coefficients, WalkMedia, WalkMedium, interaction_of, ray_of
 from halfspace_sss.rendering.walk.random_walk import (
@@ -150,7 +150,8 @@ class SubpathConnections:
         w, distance, light = self.small.sample(which, at, mi.Point2f(rng.next_float32(), rng.next_float32()))
         flux = light * (dr.abs(dr.dot(w, sample.w_0)) / density)
         distant = self.small.distant(which)
-        away = dr.select(distant, 4 * dr.norm(self.scene.bbox().extents()), distance * (1 - 1e-4))
+        near = distance - before(at.p + w * distance, distance, self.small.rounding(which))
+        away = dr.select(distant, 4 * dr.norm(self.scene.bbox().extents()), near)
         way = mi.Ray3f(mi.Point3f(at.p + w * away), -w)
         si = self.media.sight.intersect(self.scene, way, mi.RayFlags.All)
         steep = dr.abs(dr.dot(w, sample.w_0)) > STEEPEST
@@ -229,7 +230,7 @@ class SubpathConnections:
         bright = dr.max(value) > 0
         clear = mi.Ray3f(mi.Point3f(q + to_p.d * e), to_p.d)  # of what rounding has put beyond the boundary
         clear.maxt = to_p.maxt - 2 * e
-        bright &= ~media.scene.ray_test(clear, False, bright)
+        bright &= ~blocked(media.scene, clear, bright)
         to_q, medium = mi.Ray3f(walk.o, walk.d), event.medium
         T = media.transmittance(event.object, to_q, dr.select(bright, t, 0), walk.rng, medium)
         T *= media.transmittance(event.object, to_p, dr.select(bright, to_p.maxt, 0), walk.rng, medium)
@@ -499,6 +500,6 @@ class InnerLights:
     ) -> mi.Spectrum:
         """The transmittance of what is between: 0 behind any surface."""
         shadow = mi.Ray3f(ray)
-        shadow.maxt = distance * (1 - 1e-4)
-        clear = active & ~self.media.inner.scene.ray_test(shadow, False, active)
+        shadow.maxt = distance - before(ray.o + ray.d * distance, distance)
+        clear = active & ~blocked(self.media.inner.scene, shadow, active)
         return dr.select(clear, self.media.transmittance(k, ray, dr.select(clear, distance, 0), rng, medium), 0)

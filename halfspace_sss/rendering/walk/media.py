@@ -12,7 +12,7 @@ import numpy as np
 
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.rendering.light.small_emitters import is_delta
-from halfspace_sss.rendering.object.contents import Content, contents
+from halfspace_sss.rendering.object.contents import Content, contents, refracts
 from halfspace_sss.rendering.object.instances import Group, Placed, Sight, bounds_of, corners, ends_of, shown_groups
 from halfspace_sss.rendering.object.objects import TranslucentObject, translucent_shapes
 from halfspace_sss.rendering.object.points import lift
@@ -28,8 +28,6 @@ from halfspace_sss.rendering.object.wrapped import Wrapping, surface_of, wrappin
 # object inside another, are those of its inside over what is around it. A bubble in wax of eta 1.4 is a `dielectric`
 # with int_ior 1 and ext_ior 1.4. What refracts displaces the medium around it; what passes light straight (`null`,
 # `mask`, `thindielectric`) stands in it.
-
-REFRACTS = int(mi.BSDFFlags.DeltaTransmission) | int(mi.BSDFFlags.GlossyTransmission)
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +107,7 @@ def _shapes(result: list[Content]) -> list[mi.Shape]:
 
 
 def _displaces(shape: mi.Shape) -> bool:
-    return not surface_of(shape) and bool(shape.bsdf().flags() & REFRACTS)
+    return not surface_of(shape) and refracts(shape)
 
 
 def _largest_first(result: list[Content], holders: Placed) -> list[Content]:
@@ -357,7 +355,7 @@ class WalkMedia:
         tables["step"] = mi.UInt32([int(len(sides[kind]) > 1) for kind in placed.kind])
         tables["fewest"] = mi.UInt32([_FEWEST[inside.orders] for inside in insides])
         tables["most"] = mi.UInt32([_MOST[inside.orders] for inside in insides])
-        tables["rounding"] = mi.Float(placed.rounding(self.objects))
+        tables["rounding"] = mi.Float(placed.rounding.tolist())
         tables["textured"] = mi.Bool([inside.textured is not None for inside in insides])
         tables["reflects"] = mi.Bool([inside.reflection for inside in insides])
         tables["rough"] = mi.Bool([is_rough(b) for b in boundaries])

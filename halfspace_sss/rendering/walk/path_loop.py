@@ -17,7 +17,7 @@ import mitsuba as mi
 
 from halfspace_sss.rendering.light.small_emitters import NARROW, WIDE, SmallEmitters
 from halfspace_sss.rendering.object.points import lifted, opaque, sided
-from halfspace_sss.rendering.object.rounding import ray_from, ray_to
+from halfspace_sss.rendering.object.rounding import blocked, ray_from
 from halfspace_sss.rendering.walk.emitter_connections import (
     Departure,
     EmitterDirections,
@@ -287,7 +287,8 @@ class LightVisitor:
         active = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
         ds, light = self.scene.sample_emitter_direction(si, u, False, active)
         active &= (ds.pdf > 0) & (~mi.Bool(outwards) | (dr.dot(ds.d, si.n) > 0))
-        active &= ~self.scene.ray_test(ray_to(si, ds.p, self.media.sight.rounding(si)), False, active)
+        shadow = self.media.sight.ray_to_emitter(si, ds, self.media.sight.rounding(si))
+        active &= ~blocked(self.scene, shadow, active)
         wo = si.to_local(ds.d)
         below = outwards & (wo.z < 0)  # comes from inside by the opposite direction, and is not mirrored
         active &= ~below | (mi.Frame3f.cos_theta(si.wi) < 0)

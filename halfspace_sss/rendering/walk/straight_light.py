@@ -17,6 +17,7 @@ import mitsuba as mi
 import numpy as np
 
 from halfspace_sss.rendering.object.points import channel_mean
+from halfspace_sss.rendering.object.rounding import before
 from halfspace_sss.rendering.object.shape import by_pointer, looked_up, pointer_numbers
 from halfspace_sss.rendering.walk.media import WalkMedia, WalkMedium, interaction_of, ray_of
 from halfspace_sss.rendering.walk.random_walk import Event, draw, eval_phase
@@ -117,7 +118,8 @@ class StraightLight:
                             way.length + dr.select(passed, si.t, 0), dr.select(passed, way.T * T, way.T),
                             way.rng)  # fmt: skip
 
-        start = LightWay(ray_of(event.p, ds.d, medium), ds.dist * (1 - 1e-4), mi.Bool(True) | active, mi.Bool(active),
+        left = ds.dist - before(ds.p, ds.dist, media.sight.rounding_of(ds.emitter))
+        start = LightWay(ray_of(event.p, ds.d, medium), left, mi.Bool(True) | active, mi.Bool(active),
                          ~active & active, dr.zeros(mi.Float, dr.width(event.p)), mi.Spectrum(1), rng)  # fmt: skip
         return dr.while_loop((start,), lambda way: way.going, lambda way: (go(way),), label="way to an emitter")[0]
 

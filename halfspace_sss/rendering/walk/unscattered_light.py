@@ -38,7 +38,7 @@ from halfspace_sss.physics.medium import eval_hg
 from halfspace_sss.rendering.gathered.points import lattice, uniform_entries
 from halfspace_sss.rendering.object.instances import Pose, corners, ends_of
 from halfspace_sss.rendering.object.points import EntrySample, lift, opaque, sided
-from halfspace_sss.rendering.object.rounding import ray_to
+from halfspace_sss.rendering.object.rounding import blocked
 from halfspace_sss.rendering.walk.inside_cells import POINTS, InsideCells, grid_edge
 from halfspace_sss.rendering.walk.media import WalkMedia
 from halfspace_sss.rendering.walk.random_walk import Event, pick, sample_bsdf
@@ -271,7 +271,7 @@ class _Rays:
         si = dr.zeros(mi.SurfaceInteraction3f, rays)
         si.p, si.n, si.sh_frame = mi.Point3f(at.p), mi.Normal3f(at.n), mi.Frame3f(at.n_out)
         ds, light = self.scene.sample_emitter_direction(si, mi.Point2f(u[3], u[4]), False)
-        shadow = ray_to(si, ds.p, media.row("rounding", self.k))
+        shadow = media.sight.ray_to_emitter(si, ds, media.row("rounding", self.k))
         si.wi = si.to_local(ds.d)
         si = lift(si, ds.d)
 
@@ -283,7 +283,7 @@ class _Rays:
         enters = (ds.pdf > 0) & (bs.pdf > 0) & (dr.dot(si.n, ds.d) > 0) & (cosine > 0) & (dr.dot(d, si.n) < 0)
         flux = dr.select(enters, light * value * (cosine * bend * at.weight / opaque(rays)), 0)
         enters &= dr.max(flux) > 0
-        enters &= ~self.scene.ray_test(shadow, False, enters)
+        enters &= ~blocked(self.scene, shadow, enters)
         T = dr.full(mi.Spectrum, 1, rays)
         return _Ray(mi.Point3f(at.p), d, media.clear(self.k, si.n, d), mi.Spectrum(flux), T, mi.Bool(enters), rng)
 
