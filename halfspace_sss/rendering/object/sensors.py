@@ -8,6 +8,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from halfspace_sss.rendering.object.instances import Sight
+from halfspace_sss.rendering.object.rounding import ray_from
+
 
 def sampled_size(film: mi.Film) -> mi.ScalarVector2u:
     """Pixels through which rays are sent: those of the crop, and a border that the filter of the film may need."""
@@ -52,6 +55,29 @@ def rays_by(sensor: mi.Sensor, sampler: mi.Sampler) -> tuple[mi.Ray3f, mi.Spectr
     ray, weight = sensor.sample_ray_differential(time, sampler.next_1d(), dr.fma(position, scale, offset), aperture)
     # in a box filter a position that rounding puts on the edge of a pixel belongs to the neighbour too
     return widened(ray, n), weight, mi.Vector2f(pixel) if film.rfilter().is_box_filter() else position
+
+
+def past_emitters(scene: mi.Scene, sight: Sight, ray: mi.Ray3f) -> mi.Ray3f:
+    """Rays of a camera that sees no emitters: those that meet one begin behind it."""
+    if all(emitter.get_shape() is None for emitter in scene.emitters()):
+        return ray
+
+    def step(o: mi.Point3f, active: mi.Bool) -> tuple[mi.Point3f, mi.Bool]:
+        here = mi.Ray3f(ray)
+        here.o = o
+        si = sight.intersect(scene, here, mi.RayFlags.Minimal, active=active)
+        active &= si.is_valid() & (si.emitter(scene, active) != None)  # noqa: E711
+        return dr.select(active, ray_from(si, ray.d, sight.rounding(si)).o, o), active
+
+    result, n = type(ray)(ray), dr.width(ray)
+    state = mi.Point3f(ray.o) + dr.zeros(mi.Point3f, n), dr.full(mi.Bool, True, n)
+    result.o = dr.while_loop(state, lambda _, active: active, step, label="emitters")[0]
+    return result
+
+
+def shows_sky(scene: mi.Scene, hide_emitters: bool) -> bool:
+    """Whether a camera sees an environment where it sees nothing else, so that no pixel is transparent."""
+    return not hide_emitters and scene.environment() is not None
 
 
 def splat(

@@ -15,9 +15,17 @@ import mitsuba as mi
 
 from halfspace_sss.interrupts import interruptible
 from halfspace_sss.rendering.light.small_emitters import check_emitters
+from halfspace_sss.rendering.object.instances import Sight
 from halfspace_sss.rendering.object.objects import KnowsUnit, TranslucentObject, TranslucentObjects, make_objects
 from halfspace_sss.rendering.object.registry import Choices
-from halfspace_sss.rendering.object.sensors import rays_by, sampled_size, seeded_sampler, splat
+from halfspace_sss.rendering.object.sensors import (
+    past_emitters,
+    rays_by,
+    sampled_size,
+    seeded_sampler,
+    shows_sky,
+    splat,
+)
 from halfspace_sss.rendering.object.settings import Settings, read_settings
 from halfspace_sss.rendering.object.translucent import is_translucent
 from halfspace_sss.rendering.object.wrapped import wraps
@@ -155,10 +163,11 @@ def _class(variant: str) -> type:
             check_outermost(scene)
             with undisturbed(), dr.suspend_grad():
                 objects = self._prepared(scene) if self._lit is None else self._lit
+                ray = shown(scene, objects, self.settings, ray)
                 parts, hit, chance = trace_paths(scene, objects, self.settings, sampler, ray, active)
                 squares = dr.select(hit & active, mi.Float64(dr.squared_norm(chance)), 0)
                 dr.scatter_add(self._by_chance, squares, mi.UInt32(0))
-            return parts[0] + parts[1], hit, []
+            return parts[0] + parts[1], hit | mi.Bool(shows_sky(scene, self.settings.hide_emitters)), []
 
         @property
         def choices(self) -> Choices:
@@ -179,6 +188,12 @@ def _class(variant: str) -> type:
             return f"BSSRDFIntegrator[{self.settings}]"
 
     return BSSRDFIntegrator
+
+
+def shown(scene: mi.Scene, objects: list[TranslucentObject], settings: Settings, ray: mi.Ray3f) -> mi.Ray3f:
+    """The rays of a camera, which begin behind emitters that it does not see."""
+    sight = objects[0].sight if objects else Sight.of(scene, [])
+    return past_emitters(scene, sight, ray) if settings.hide_emitters else ray
 
 
 @contextmanager
@@ -306,9 +321,10 @@ def replayer(objects: list[TranslucentObject], settings: Settings) -> mi.Integra
         """Mitsuba's camera rays and films, this project's paths."""
 
         def sample(self, mode: dr.ADMode, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f, **given: Any) -> tuple:
+            ray = shown(scene, objects, settings, ray)
             if mode == dr.ADMode.Primal:
                 parts, hit, _ = trace_paths(scene, objects, settings, sampler, ray, given["active"])
-                return parts[0] + parts[1], hit, [], parts
+                return parts[0] + parts[1], hit | mi.Bool(shows_sky(scene, settings.hide_emitters)), [], parts
             parts, backward = given["state_in"], mode == dr.ADMode.Backward
             d = replay_paths(scene, objects, settings, sampler, ray, parts, given["δL"], backward)
             return d, mi.Bool(True), [], parts

@@ -146,7 +146,8 @@ def _class(variant: str) -> type:
             with dr.suspend_grad():
                 seed = tuple(int(2**24 * sampler.next_1d()[0]) for _ in range(2))
                 tracer = self.tracer(scene, seed[0], sampler.wavefront_size())
-                L, seen, emission = tracer.trace(widened(ray, sampler.wavefront_size()), _on_device(LANES), seed)
+                rays = tracer.shown(widened(ray, sampler.wavefront_size()))
+                L, seen, emission = tracer.trace(rays, _on_device(LANES), seed)
             layer = list(mi.Color3f(emission)) if self.layers else []
             return dr.select(active, L, 0), active & seen, layer
 
@@ -292,6 +293,7 @@ def _launch(
 ) -> None:
     """Trace spp rays through each pixel and add them to the film, with derivatives if `scored`."""
     rays, weight, position = camera_rays(sensor, spp, seed)
+    rays = tracer.shown(rays)
     if scored:
         media = tracer.visitor.media
         with dr.resume_grad():

@@ -18,6 +18,7 @@ import mitsuba as mi
 from halfspace_sss.rendering.light.small_emitters import NARROW, WIDE, SmallEmitters
 from halfspace_sss.rendering.object.points import lifted, opaque, sided
 from halfspace_sss.rendering.object.rounding import blocked, ray_from
+from halfspace_sss.rendering.object.sensors import past_emitters, shows_sky
 from halfspace_sss.rendering.walk.emitter_connections import (
     Departure,
     EmitterDirections,
@@ -359,7 +360,7 @@ class PathTracer:
         exits: FirstExits | None = None,
         scores: PathScores | None = None,
     ) -> tuple[mi.Spectrum, mi.Bool, mi.Spectrum]:
-        """Radiance along each ray, whether it hits anything, and the layer of emission; fills `exits` or `scores`."""
+        """Radiance along each ray, whether it shows anything, and the layer of emission; fills `exits` or `scores`."""
         n = dr.width(rays)
         dr.eval(rays)
         lanes = min(lanes, n)
@@ -407,7 +408,12 @@ class PathTracer:
         with dr.scoped_set_flag(dr.JitFlag.OptimizeLoops, False):  # records the loop twice, for kernels no faster
             dr.while_loop((start,), lambda p: p.index < total, body, label="paths")
             dr.eval(L, hit, emission)
-        return L, hit, emission
+        return L, hit | mi.Bool(shows_sky(self.visitor.scene, self.hide_emitters)), emission
+
+    def shown(self, rays: mi.Ray3f) -> mi.Ray3f:
+        """The rays of a camera, which begin behind emitters that it does not see."""
+        scene, sight = self.visitor.scene, self.visitor.media.sight
+        return past_emitters(scene, sight, rays) if self.hide_emitters else rays
 
     def _outside(self, p: CameraPath) -> CameraPath:
         """A ray outside all objects, and the surface that it meets."""
