@@ -83,3 +83,15 @@ def test_a_mesh_whose_faces_touch_without_sharing_edges_is_looked_at_with_rays()
                       [2, 3, 7], [2, 7, 6], [3, 0, 4], [3, 4, 7]])  # fmt: skip
     assert not faces_of(_mesh(vertices, faces), "prism").closed
     assert _surveyed(vertices, faces).closed
+
+
+@pytest.mark.parametrize("kind", ["rectangle", "disk"])
+@pytest.mark.parametrize("side", [0, 180])
+def test_walks_refuse_a_sheet_whichever_side_it_shows(kind: str, side: float) -> None:
+    to_world = mi.ScalarTransform4f().rotate([1, 0, 0], side + 20).scale(5)
+    sheet = {"type": kind, "to_world": to_world, "bsdf": {"type": "translucent", "material": "marble"}}
+    scene = mi.load_dict({"type": "scene", "integrator": {"type": "translucent_walk"}, "sheet": sheet,
+                          "sky": {"type": "constant"}, "cam": {"type": "perspective"}})  # fmt: skip
+    with pytest.raises(ValueError, match="must have an inside for translucent_walk, got object 'sheet', which 100 %"):
+        with pytest.warns(UserWarning, match="is not closed"):
+            scene.integrator().render(scene, spp=1)

@@ -190,6 +190,7 @@ class Geometry:
         group: the `instances.Group` whose instances show the shape; None of a shape that stands in the scene itself.
         pose: the `instances.Pose` of the instance that is met, for rays of the scene; without it those of a shape in a
             group are in the frame of the group.
+        lost: share of the rays that enter it and do not leave again.
     """
 
     shape: Any
@@ -205,6 +206,7 @@ class Geometry:
     contents: Any = None
     group: Any = None
     pose: Any = None
+    lost: float = 0.0
 
     @property
     def name(self) -> str:
@@ -317,7 +319,7 @@ def survey(shape: mi.Shape, world: mi.Scene | None = None) -> Geometry:
     closed, sign = odd == 0 and not sheet, -1.0 if share <= 1 - MAJORITY else 1.0
     signs = votes.signs() if closed else None
     return Geometry(shape, scene, sign, signs, float(votes.opposed[0]) == 0, closed, votes.pieces, size,
-                  area, geometry_of(shape))  # fmt: skip
+                  area, geometry_of(shape), lost=odd)  # fmt: skip
 
 
 PLACES = ("to_world", "vertex_positions", "vertex_normals", "faces", "grid", "control_points", "data", "extent")

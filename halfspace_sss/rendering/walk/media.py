@@ -30,6 +30,9 @@ from halfspace_sss.rendering.object.wrapped import Wrapping, surface_of, wrappin
 # `mask`, `thindielectric`) stands in it.
 
 
+MOST_LOST = 0.5  # of the rays that enter an object do not leave it: what is more open has no inside
+
+
 @dataclass(frozen=True, eq=False)
 class InnerShapes:
     """What lies inside the objects of a scene.
@@ -598,8 +601,8 @@ class WalkMedia:
         """The objects of a scene whose surface is `translucent`.
 
         Raises:
-            ValueError: mm_per_unit is not a finite number > 0, the medium of an instance varies in space, or as
-                `InnerShapes.of`.
+            ValueError: mm_per_unit is not a finite number > 0, an object is a sheet, the medium of an instance varies
+                in space, or as `InnerShapes.of`.
         """
         if not (np.isfinite(mm_per_unit) and mm_per_unit > 0):
             raise ValueError(f"mm_per_unit must be finite and > 0, got {mm_per_unit!r}")
@@ -608,6 +611,11 @@ class WalkMedia:
         inner = placed.scene(scene)
         for obj, group in zip(objects, placed.groups):
             inside = surface_of(obj.shape).inside
+            if obj.lost > MOST_LOST:
+                raise ValueError(
+                    f"an object must have an inside for translucent_walk, got object {obj.name}, which "
+                    f"{100 * obj.lost:.3g} % of the rays that enter it do not leave again: use a half-space model"
+                )
             if inside.varying is not None and group is not None:
                 raise ValueError(f"the medium of an instance must not vary in space, got that of object {obj.name}")
             if inside.textured is not None:
