@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ pytestmark = pytest.mark.usefixtures("rgb")
 dr, mi = pytest.importorskip("drjit"), pytest.importorskip("mitsuba")
 
 WIDEST_Z = 4.4  # two-sided 1e-5
+WHITE = {"sigma_s": "1.0,2.0,3.0", "sigma_a": 0.0, "eta": 1.5}
 MEDIUM = {"sigma_s": "1.0,1.5,2.0", "sigma_a": "0.01,0.05,0.3", "eta": 1.4}
 
 
@@ -111,11 +113,81 @@ def test_the_fit_keeps_the_integral_over_cells_that_share_it() -> None:
 
 
 def test_a_medium_without_absorption_is_invisible_in_uniform_light() -> None:
-    surface = {"sigma_s": "1.0,2.0,3.0", "sigma_a": 0.0, "eta": 1.5}
-    means = _means(_scene("precomputed", surface, light={"type": "constant"}), 8, 512, 1)
+    means = _means(_scene("precomputed", WHITE, light={"type": "constant"}), 8, 512, 1)
     error = means.std(axis=0, ddof=1) / np.sqrt(len(means))
     assert (error < 0.006).all()
     assert (np.abs(means.mean(axis=0) - 1) < WIDEST_Z * error + 0.002).all()
+
+
+def _mesh(name: str, folder: Path) -> dict:
+    """A bowl, open towards the camera, a ring or a hand, about 10 units wide, without interpolated normals."""
+    meshes, shapes = (
+        pytest.importorskip("full_geometry.learning.meshes"),
+        pytest.importorskip("full_geometry.learning.shapes"),
+    )
+    hands = pytest.importorskip("benchmarks.hand_and_ribbon")
+    pytest.importorskip("igl")
+
+    def bowl(p: np.ndarray) -> np.ndarray:
+        whole = meshes.ellipsoid(p, (1.0, 1.0, 1.0))
+        return np.maximum(np.abs(whole + 0.15) - 0.15, p[..., 2] - 0.3)
+
+    def ring(p: np.ndarray) -> np.ndarray:
+        x, y, z = np.moveaxis(p, -1, 0)
+        return meshes.length(meshes.length(x, y) - 0.7, z) - 0.3
+
+    distance, box = (
+        hands.hand() if name == "hand" else ({"bowl": bowl, "ring": ring}[name], shapes.margin([-1] * 3, [1] * 3))
+    )
+    path = meshes.surface(distance, box, 48).write_ply(folder / f"{name}.ply")
+    to_world = mi.ScalarTransform4f().scale(9.0 if name == "hand" else 5.0)
+    return {"type": "ply", "filename": str(path), "face_normals": True, "to_world": to_world}
+
+
+def _furnace(shape: dict, known_to: float, **more: Any) -> None:
+    """What absorbs nothing is as bright as the even sky around it, in the mean over it, within .5 %."""
+    film = {"type": "hdrfilm", "width": 12, "height": 12, "rfilter": {"type": "box"}, "pixel_format": "rgba",
+            "component_format": "float32"}  # fmt: skip
+    view = mi.ScalarTransform4f().look_at([0, 10, 40], [0, 0, 0], [0, 1, 0])
+    sensor = {"type": "perspective", "fov": 18.0, "to_world": view, "film": film}
+    integrator = {"type": "translucent_walk", "light": "precomputed", "hide_emitters": True}
+    scene = _scene(
+        "precomputed", WHITE, shape, integrator=integrator, sensor=sensor, light={"type": "constant"}, **more
+    )
+    found = np.array([np.array(mi.render(scene, spp=4096, seed=k)).sum(axis=(0, 1)) for k in range(8)])
+    ratio = found[:, :3] / found[:, 3:]
+    error = ratio.std(axis=0, ddof=1) / np.sqrt(len(ratio))
+    assert (error < known_to).all(), error
+    assert np.abs(ratio.mean(axis=0) - 1).max() < 0.005, ratio.mean(axis=0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("shape", ["bowl", "ring", "hand"])
+def test_a_hollow_or_branching_object_without_absorption_is_invisible_in_uniform_light(
+    shape: str, tmp_path: Path
+) -> None:
+    _furnace(_mesh(shape, tmp_path), 0.0015)
+
+
+def _pair(gap: float) -> tuple[dict, dict]:
+    """Two balls beside each other."""
+    x = 2.5 + 0.5 * gap
+    return _ball(2.5, center=[-x, 0, 0]), _ball(2.5, center=[x, 0, 0])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("gap", [0.0, 0.2])
+def test_two_balls_without_absorption_are_invisible_in_uniform_light(gap: float) -> None:
+    one, other = _pair(gap)
+    _furnace(one, 0.0015, other={**other, "bsdf": {"type": "translucent", **WHITE}})
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("gap", [0.0, 0.2])
+def test_precomputed_light_of_two_balls_has_the_mean_of_sampled_light(gap: float) -> None:
+    one, other = _pair(gap)
+    other["bsdf"] = {"type": "translucent", **MEDIUM, "sigma_s": "2.0,1.0,0.7"}
+    _compare(MEDIUM, 0.01, one, other=other, lamp=_lamp())
 
 
 def test_precomputed_light_of_a_lamp_has_the_mean_of_sampled_light() -> None:
@@ -218,6 +290,18 @@ def test_the_layer_of_emission_holds_the_mirror_and_what_is_behind_the_object() 
 def test_light_that_cannot_be_precomputed_is_refused_by_its_reason(surface: dict, shape: Any, reason: str) -> None:
     with pytest.raises(ValueError, match=f"light must be auto or sampled, got 'precomputed': .*{reason}"):
         mi.render(_scene("precomputed", surface, shape, lamp=_lamp()), spp=1)
+
+
+@pytest.mark.parametrize("light", ["auto", "precomputed", "sampled"])
+def test_path_traced_is_the_walk_with_the_light_that_is_asked_for(light: str) -> None:
+    from halfspace_sss.rendering.scenes.scene_files import open_scene
+
+    ball = {**_ball(), "bsdf": {"type": "translucent", **MEDIUM}}
+    scene = {"type": "scene", "integrator": {"type": "bssrdf"}, "ball": ball, "light": {"type": "constant"}}
+    integrator = open_scene(scene, "path_traced", settings={"light": light}).integrator()
+    assert str(integrator).startswith("TranslucentWalk[") and integrator.light == light
+    with pytest.raises(ValueError, match="light must be one of auto, precomputed, sampled, got 'gathered'"):
+        open_scene(scene, "path_traced", settings={"light": "gathered"})
 
 
 def test_a_light_that_does_not_exist_is_refused() -> None:
