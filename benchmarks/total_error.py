@@ -38,7 +38,7 @@ SHARE = 4  # passes in the shortest time: their spread tells the variance
 
 
 @dataclass(frozen=True)
-class Measuring:
+class TotalErrors:
     """How errors are measured.
 
     Args:
@@ -55,7 +55,7 @@ class Measuring:
 
 
 def total_errors(
-    cases: Sequence[LitObject], how: Measuring, folder: Path, progress: Callable[[str, int, int], None]
+    cases: Sequence[LitObject], how: TotalErrors, folder: Path, progress: Callable[[str, int, int], None]
 ) -> pandas.DataFrame:
     """A row for each case, way, time, raw and denoised."""
     prepare()
@@ -75,7 +75,7 @@ def _scene(case: LitObject, way: str, size: int, folder: Path) -> Any:
     return load_scene(found, PATH_TRACED, settings={"light": kind, "layers": True})
 
 
-def _measured(case: LitObject, how: Measuring, folder: Path) -> list[dict[str, Any]]:
+def _measured(case: LitObject, how: TotalErrors, folder: Path) -> list[dict[str, Any]]:
     scenes = {way: _scene(case, way, how.size, folder) for way in WAYS}
     inside = cover(scenes[SAMPLED]) > 0
     about = guides(scenes[SAMPLED])

@@ -35,9 +35,9 @@ def total_error_command(
     """Measure total error over seconds of path tracing, raw and denoised, over long walks: all orders."""
     use_mitsuba("llvm_ad_rgb")
     from benchmarks.speeds import LIGHTS, OTHER_LIGHTS, LitObject
-    from benchmarks.total_error import Measuring, total_errors
+    from benchmarks.total_error import TotalErrors, total_errors
 
-    times, lights = tuple(sorted(seconds or Measuring.seconds)), tuple(light or LIGHTS)
+    times, lights = tuple(sorted(seconds or TotalErrors.seconds)), tuple(light or LIGHTS)
     for name in lights:
         check_choice("light", name, (*LIGHTS, *OTHER_LIGHTS))
     for value in (*times, reference):
@@ -47,7 +47,7 @@ def total_error_command(
     check_folder(out)
     cases = [LitObject(name, each) for name in objects or OBJECTS for each in lights]
     with Bar("total error") as bar:
-        how = Measuring(times, reference, size, seed)
+        how = TotalErrors(times, reference, size, seed)
         table = total_errors(cases, how, out / "work", lambda what, k, n: bar.show(k, n, what))
     text = markdown(table.round(3))
     csv = table.to_csv(index=False, lineterminator="\n")

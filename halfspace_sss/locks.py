@@ -43,6 +43,7 @@ def one_writer(path: Path, shared: bool = False) -> Iterator[None]:
         yield
         return
     lock = path.with_name(f".{path.name}.lock")
+    new = [folder for folder in lock.parents if not folder.exists()]
     with naming(lock):
         lock.parent.mkdir(parents=True, exist_ok=True)
         file = _taken(path, lock, shared)
@@ -55,6 +56,9 @@ def one_writer(path: Path, shared: bool = False) -> Iterator[None]:
             _take(file, shared=False)
             lock.unlink()
         file.close()
+        with contextlib.suppress(OSError):  # those that something was written to stay
+            for folder in new:
+                folder.rmdir()
 
 
 def _taken(path: Path, lock: Path, shared: bool) -> IO[str]:

@@ -79,7 +79,8 @@ def fit(
     """
     settings = settings or FitSettings()
     if not isinstance(scene, mi.Scene):
-        scene = open_scene(scene, PATH_TRACED if model == WALK else model, floats=True)
+        walks = {"light": "sampled"} if model == WALK else {}  # as derivatives are, with the same bits in each run
+        scene = open_scene(scene, PATH_TRACED if model == WALK else model, settings=walks, floats=True)
     shape = translucent_object(scene, object)
     check_derivatives(scene.integrator(), shape, parameters)
     mm_per_unit = scene.integrator().mm_per_unit

@@ -31,7 +31,7 @@ def test_the_noise_of_the_reference_is_taken_off() -> None:
 def test_precomputed_light_comes_nearer_to_the_reference_in_more_time(tmp_path: Path) -> None:
     from benchmarks.speeds import LitObject
 
-    how = module.Measuring((1.0, 8.0), 10.0, 32)
+    how = module.TotalErrors((1.0, 8.0), 10.0, 32)
     table = module.total_errors([LitObject("hand of potato", "windows")], how, tmp_path, lambda *about: None)
     found = table[table["way"] == "walk, light precomputed, raw"]
     assert found["pixels, %"].iloc[1] < 0.7 * found["pixels, %"].iloc[0]

@@ -34,10 +34,10 @@ def test_a_random_scene_is_closed_and_faces_outwards(number: int, tmp_path: Path
 def test_the_check_goes_on_where_it_stopped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(trade_check, "WAYS", ("path_traced", "lambert"))
-    first = trade_check.check_scene(random_scene(1, 0), tmp_path, 0.2, 0.3)
+    first = trade_check.check_scene(random_scene(1, 1), tmp_path, 0.2, 0.3)
     monkeypatch.setattr(trade_check, "assess_for", None)
     monkeypatch.setattr(long_runs, "assess_stage", None)
-    again = trade_check.check_scene(random_scene(1, 0), tmp_path, 0.2, 0.3)
+    again = trade_check.check_scene(random_scene(1, 1), tmp_path, 0.2, 0.3)
     assert json.dumps(again) == json.dumps(first)
     found = trade_check.outcome(first)
     assert (

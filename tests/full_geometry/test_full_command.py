@@ -238,7 +238,7 @@ REFUSED = [
 
 @pytest.mark.parametrize(("arguments", "message"), REFUSED, ids=[" ".join(a) for a, _ in REFUSED])
 def test_bad_input_is_refused_before_anything_is_traced(arguments: list[str], message: str, monkeypatch: Any) -> None:
-    Path("two.xml").write_text(XML.replace("<sensor", BALL.replace("NAME", "other") + "<sensor"))
+    Path("two.xml").write_text(TWO)
     before = sorted(Path().iterdir())
     monkeypatch.setattr(training, "reference", None)
     monkeypatch.setattr(model_errors, "reference", None)

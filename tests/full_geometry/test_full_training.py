@@ -207,8 +207,8 @@ def test_no_training_gives_the_half_space_with_a_warning(tmp_path: Path) -> None
     assert found.path is None and not list(tmp_path.iterdir())
     plane = transport_of(found.model.object, "better_dipole")
     exits, entries = (found.model.object.random_points(generator(mi, 64, pass_seed(k))) for k in (1, 2))
-    near = entries._replace(p=exits.p + 0.5 * mi.Vector3f(mi.coordinate_system(exits.n)[0]), n=exits.n, n_out=exits.n)
-    near = near._replace(w=exits.n)
+    n = mi.Normal3f(dr.normalize(exits.p + 0.5 * mi.Vector3f(mi.coordinate_system(exits.n)[0])))  # on the ball
+    near = entries._replace(p=mi.Point3f(200 * n), n=n, n_out=n, w=mi.Vector3f(n))
     S, S_0 = (np.array(t.S(t.prepare(exits), near)) for t in (found.model, plane))
     assert np.allclose(S, S_0, rtol=2e-2)
 

@@ -201,8 +201,7 @@ def test_f_is_bounded_below_by_less_where_light_is_scattered_forwards() -> None:
 def test_degenerate_triangles_needles_and_points_that_coincide_leave_no_nan() -> None:
     vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.001, 0.001, 40.0], [0.5, 0.0, 0.0]], dtype=float)
     faces = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3], [0, 4, 1], [0, 4, 1], [2, 2, 2]])
-    with pytest.warns(UserWarning):
-        obj = object_of(mesh(vertices, faces), WAX)
+    obj = object_of(mesh(vertices, faces), WAX)
     model = NeuralShape.of(obj, random_weights())
     o, i = pairs(obj, 2048)
     for at in (i, o, SurfacePoint(o.p, o.n, o.n_out, i.w)):

@@ -148,6 +148,10 @@ def test_an_object_with_a_hole_is_warned_of():
 )
 @pytest.mark.parametrize("orders", ["total", "single"])
 def test_media_at_the_edge_stay_finite_and_not_negative(medium, orders):
+    if orders == "total" and medium["sigma_s"] == 1e-3:  # of which no half-space knows all orders
+        with pytest.raises(ValueError, match="must let at most 25 % of the light pass unscattered"):
+            quietly(view({**SPHERE, "bsdf": surface(orders=orders, medium=medium)}))
+        return
     image = quietly(view({**SPHERE, "bsdf": {**surface(orders=orders, medium=medium), "reflection": True}}))
     assert np.isfinite(image).all() and image.min() >= 0
 

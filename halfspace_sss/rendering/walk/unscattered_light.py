@@ -37,8 +37,8 @@ import numpy as np
 from halfspace_sss.physics.medium import eval_hg
 from halfspace_sss.rendering.gathered.points import lattice, uniform_entries
 from halfspace_sss.rendering.object.instances import Pose, corners, ends_of
-from halfspace_sss.rendering.object.points import EntrySample, lift, opaque, sided
-from halfspace_sss.rendering.object.rounding import blocked
+from halfspace_sss.rendering.object.points import EntrySample, cosine_above, cosine_density, lift, opaque, sided
+from halfspace_sss.rendering.object.rounding import blocked, ray_from
 from halfspace_sss.rendering.walk.inside_cells import POINTS, InsideCells, grid_edge
 from halfspace_sss.rendering.walk.media import WalkMedia
 from halfspace_sss.rendering.walk.random_walk import Event, pick, sample_bsdf
@@ -50,6 +50,7 @@ DEPTH = 12.0  # mean free paths below the surface: e^-12 is left of light there
 ALONG = 6  # points on a segment of a ray
 FEWEST_POINTS, MOST_POINTS = 2**14, 2**22  # of the surface, that find the cells it cuts
 OCTANTS = 8
+BY_COSINE = 0.25  # of the directions to emitters
 MOST_G = 0.85  # above, light reaches a fraction of the depth that walks do, and cells are too many
 ROULETTE = 0.1  # part of its light below which a reflected ray may end
 R_4 = (0.8566748838545029, 0.7338918566271260, 0.6287067210378087, 0.5385972572236101)  # Roberts 2018, four dimensions
@@ -270,22 +271,50 @@ class _Rays:
         at = _entries(media, number, [dr.minimum(u[0], 1 - 2**-24), u[1], u[2]])
         si = dr.zeros(mi.SurfaceInteraction3f, rays)
         si.p, si.n, si.sh_frame = mi.Point3f(at.p), mi.Normal3f(at.n), mi.Frame3f(at.n_out)
-        ds, light = self.scene.sample_emitter_direction(si, mi.Point2f(u[3], u[4]), False)
-        shadow = media.sight.ray_to_emitter(si, ds, media.row("rounding", self.k))
-        si.wi = si.to_local(ds.d)
-        si = lift(si, ds.d)
+        w, light = self._incident(si, mi.Point2f(u[3], u[4]), rng)
+        si.wi = si.to_local(w)
+        si = lift(si, w)
 
         # ---- refraction
         bs, value = sample_bsdf(media.boundary(self.k), si, rng, _only(mi.BSDFFlags.Transmission))
         d, _ = sided(si, bs.wo)
         cosine = mi.Frame3f.cos_theta(si.wi)
         bend = dr.abs(dr.dot(d, si.n)) / dr.maximum(dr.abs(mi.Frame3f.cos_theta(bs.wo)), 1e-6)
-        enters = (ds.pdf > 0) & (bs.pdf > 0) & (dr.dot(si.n, ds.d) > 0) & (cosine > 0) & (dr.dot(d, si.n) < 0)
+        enters = (bs.pdf > 0) & (dr.dot(si.n, w) > 0) & (cosine > 0) & (dr.dot(d, si.n) < 0)
         flux = dr.select(enters, light * value * (cosine * bend * at.weight / opaque(rays)), 0)
         enters &= dr.max(flux) > 0
-        enters &= ~blocked(self.scene, shadow, enters)
         T = dr.full(mi.Spectrum, 1, rays)
         return _Ray(mi.Point3f(at.p), d, media.clear(self.k, si.n, d), mi.Spectrum(flux), T, mi.Bool(enters), rng)
+
+    def _incident(self, si: mi.SurfaceInteraction3f, u: mi.Point2f, rng: mi.PCG32) -> tuple[mi.Vector3f, mi.Spectrum]:
+        """A direction w to an emitter, and the light from there over its density.
+
+        A share of them is drawn by the cosine, for lamps so near that those of the emitters miss them (balance
+        heuristic over one sample): L / ((1 - BY_COSINE) p_emitter + BY_COSINE p_cosine).
+        """
+        scene, sight = self.scene, self.media.sight
+
+        # ---- by the emitters
+        ds, light = scene.sample_emitter_direction(si, u, False)
+        shadow = sight.ray_to_emitter(si, ds, self.media.row("rounding", self.k))
+        delta, active = mi.Bool(ds.delta), ds.pdf > 0
+        light = dr.select(active & ~blocked(scene, shadow, active), light * ds.pdf, 0)
+
+        # ---- by the cosine
+        w, _ = cosine_above(si.sh_frame.n, si.n, u)
+        drawn = rng.next_float32() < BY_COSINE
+        met = sight.intersect(scene, ray_from(si, w, self.media.row("rounding", self.k)), mi.RayFlags.All, active=drawn)
+        emitter = met.emitter(scene, drawn)
+        found = drawn & (emitter != None)  # noqa: E711
+        there = mi.DirectionSample3f(scene, met, si)
+
+        # ---- over the density of both
+        p_emitter = dr.select(drawn, scene.pdf_emitter_direction(si, there, found), ds.pdf)
+        w = mi.Vector3f(dr.select(drawn, w, ds.d))
+        p_cosine = dr.select(delta & ~drawn, 0, cosine_density(si.sh_frame.n, si.n, w))
+        light = dr.select(drawn, dr.select(found, emitter.eval(met, found), 0), light)
+        density = (1 - BY_COSINE) * p_emitter + BY_COSINE * p_cosine
+        return w, dr.select(density > 0, light / dr.maximum(density, 1e-30), 0)
 
     def segment(self, ray: _Ray) -> _Ray:
         """Light along a ray as far as the surface, and its reflection there."""
