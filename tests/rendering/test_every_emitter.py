@@ -123,7 +123,8 @@ def _means(scene: dict, spp: int, seed: int) -> np.ndarray:
 
 def _walked(lights: dict, orders: str, fewer: int = 1) -> np.ndarray:
     """Means of images by walks that look for no emitter."""
-    scene = _scene({"type": "translucent_walk", "connection_share": 0.0}, lights, orders=orders)
+    chance = {"type": "translucent_walk", "light": "sampled", "connection_share": 0.0}
+    scene = _scene(chance, lights, orders=orders)
     return _means(scene, (2**14 if orders == "single" else 2**11) // fewer, 1001)
 
 
