@@ -44,18 +44,20 @@ def one_writer(path: Path, shared: bool = False) -> Iterator[None]:
         return
     lock = path.with_name(f".{path.name}.lock")
     new = [folder for folder in lock.parents if not folder.exists()]
-    with naming(lock):
-        lock.parent.mkdir(parents=True, exist_ok=True)
-        file = _taken(path, lock, shared)
-    _held.add(key)
     try:
-        yield
+        with naming(lock):
+            lock.parent.mkdir(parents=True, exist_ok=True)
+            file = _taken(path, lock, shared)
+        _held.add(key)
+        try:
+            yield
+        finally:
+            _held.discard(key)
+            with contextlib.suppress(OSError):  # others that share it, or Windows, keep the file
+                _take(file, shared=False)
+                lock.unlink()
+            file.close()
     finally:
-        _held.discard(key)
-        with contextlib.suppress(OSError):  # others that share it, or Windows, keep the file
-            _take(file, shared=False)
-            lock.unlink()
-        file.close()
         with contextlib.suppress(OSError):  # those that something was written to stay
             for folder in new:
                 folder.rmdir()
@@ -80,9 +82,15 @@ def _taken(path: Path, lock: Path, shared: bool) -> IO[str]:
             ) from None
         with contextlib.suppress(FileNotFoundError):
             if os.path.samestat(os.fstat(file.fileno()), lock.stat()):  # else its holder has just removed it
-                file.truncate(0)
-                file.write(f"process {os.getpid()} on {platform.node()}")
-                file.flush()
+                try:
+                    file.truncate(0)
+                    file.write(f"process {os.getpid()} on {platform.node()}")
+                    file.flush()
+                except OSError:  # a full disk
+                    lock.unlink()
+                    with contextlib.suppress(OSError):
+                        file.close()
+                    raise
                 return file
         file.close()
 
