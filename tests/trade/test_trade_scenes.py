@@ -97,7 +97,7 @@ def test_an_object_without_weights_has_cost_no_training(boundary: dict, monkeypa
 @pytest.mark.slow
 def test_a_way_that_cannot_be_is_left_out_with_its_reason(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HALFSPACE_SSS_WEIGHTS", "none")
-    for boundary, why in (({}, "must be trained"), (ROUGH, "must be smooth to be learnt, got a rough one")):
+    for boundary, why in (({}, "must be trained"), (ROUGH, "must be smooth under a model, got a RoughDielectric")):
         found = recommend(scene(**boundary), tolerance=0.3, assess_seconds=0.4, exits=64)
         (learnt,) = (option for option in found.objects[0].options if option.way == "full_geometry")
         assert why in learnt.why
