@@ -145,7 +145,7 @@ def _mesh(name: str, folder: Path) -> dict:
 
 
 def _furnace(shape: dict, known_to: float, **more: Any) -> None:
-    """What absorbs nothing is as bright as the even sky around it, in the mean over it: z-tests beside a bias of .3 %."""
+    """What absorbs nothing is as bright as the even sky around it, by z-tests beside a bias of .3 %."""
     film = {"type": "hdrfilm", "width": 12, "height": 12, "rfilter": {"type": "box"}, "pixel_format": "rgba",
             "component_format": "float32"}  # fmt: skip
     view = mi.ScalarTransform4f().look_at([0, 10, 40], [0, 0, 0], [0, 1, 0])
