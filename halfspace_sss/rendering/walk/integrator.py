@@ -11,6 +11,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from halfspace_sss.checks import check_choice
 from halfspace_sss.interrupts import interruptible
 from halfspace_sss.rendering.light.small_emitters import SmallEmitters
 from halfspace_sss.rendering.object.contents import check_sensors
@@ -75,7 +76,8 @@ def _class(variant: str) -> type:
             self.hidden = bool(props.get("hide_emitters", False))
             self.connection_share = _share("connection_share", float(props.get("connection_share", 0.5)))
             self.blur = _scale("blur", float(props.get("blur", 1.0)))
-            self.light = _one_of("light", str(props.get("light", "auto")), WALK_LIGHTS)
+            self.light = str(props.get("light", "auto"))
+            check_choice("light", self.light, WALK_LIGHTS)
             self.layers = bool(props.get("layers", False))
             self._prepared: tuple[SceneMark | None, list, list, Any] = (None, [], [], None)
             self._cells: tuple[Any, list] = (None, [])
@@ -325,12 +327,6 @@ def _scale(name: str, value: float) -> float:
 def _share(name: str, value: float) -> float:
     if not 0 <= value <= 1:
         raise ValueError(f"{name} must be in [0, 1], got {value!r}")
-    return value
-
-
-def _one_of(name: str, value: str, known: Sequence[str]) -> str:
-    if value not in known:
-        raise ValueError(f"{name} must be one of {', '.join(known)}, got {value!r}")
     return value
 
 
