@@ -22,14 +22,14 @@ import torch
 
 from figures.rivals.flow import N_CONTEXT, Chart, ConditionalFlow, FlowSampler, context, direction_square
 from figures.rivals.flow_training import FlowBatch, FlowNetwork, FlowRecipe, Walks, flow_walks, walk_batches
-from full_geometry.learning.fitting import DenseLayers, PatchLogits
-from full_geometry.models.storing import frame_of
-from full_geometry.object.features import Side, first_event, n_side, side_features
-from full_geometry.object.patches import Patches, PatchSampler, PatchWeights, cluster
+from full_geometry.geometry.points import SurfacePoint, opaque
+from full_geometry.learning.network_fitting import DenseLayers, PatchLogits
+from full_geometry.objects.objects import TranslucentObject
+from full_geometry.transport.features import Side, first_event, n_side, side_features
+from full_geometry.transport.patches import Patches, PatchSampler, PatchWeights, cluster
+from full_geometry.transport.storing import frame_of
 from halfspace_sss.neural.perceptron import Perceptron
 from halfspace_sss.neural.training.fit import Objective, fit
-from halfspace_sss.rendering.object.objects import TranslucentObject
-from halfspace_sss.rendering.object.points import SurfacePoint, opaque
 
 CLEAR = 1e-4  # of the size of the object: where the ray that finds a face begins
 

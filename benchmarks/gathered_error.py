@@ -15,8 +15,8 @@ from figures.computing.contenders import WALK
 from figures.computing.images import cover
 from figures.computing.scenes import prepare
 from figures.computing.timed import rendered
+from full_geometry.integrators.gathering import Gathering
 from halfspace_sss.neural.store import weights_in
-from halfspace_sss.rendering.paths.gathering import Gathering
 
 PASS = 64  # samples of a pixel at a time
 SAMPLED, ADDED, GATHERED = KINDS = "sampled over walks", "gathered over sampled", "gathered over walks"

@@ -17,10 +17,10 @@ import mitsuba as mi
 import numpy as np
 
 from benchmarks.inversion_textures import rms
-from halfspace_sss import inverse
-from halfspace_sss.inverse.views import GivenView
+from full_geometry import inverse
+from full_geometry.inverse.views import GivenView
+from full_geometry.scenes.mitsuba_scene import with_media
 from halfspace_sss.progress import NamedProgress, ProgressText
-from halfspace_sss.rendering.scenes.mitsuba_scene import with_media
 
 CASES: Mapping[str, Mapping[str, float]] = {
     "eta 1": {"eta": 1.0, "g": 0.0},

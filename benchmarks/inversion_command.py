@@ -11,8 +11,9 @@ from typing import Annotated, Any
 import typer
 
 from benchmarks.tables import markdown
+from full_geometry.cli.variants import use_mitsuba
 from halfspace_sss.checks import check_choice, check_count
-from halfspace_sss.cli.shared import Bar, OutFolder, console, use_mitsuba, whole
+from halfspace_sss.cli.shared import Bar, OutFolder, console, whole
 from halfspace_sss.kept_rows import KeptRows
 from halfspace_sss.provenance import check_folder, write_together
 

@@ -17,9 +17,9 @@ import mitsuba as mi
 import numpy as np
 
 from figures.computing.scenes import SCANS, scan_scene
+from full_geometry.scenes.mitsuba_scene import with_media
+from full_geometry.scenes.scene_files import PATH_TRACED, load_scene
 from halfspace_sss.progress import NamedProgress
-from halfspace_sss.rendering.scenes.mitsuba_scene import with_media
-from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED, load_scene
 
 CASES = {f"{scan}, eta {eta}": (scan, eta) for scan in ("bunny", "dragon") for eta in (1.0, 1.4)}
 DEPTHS = (64, 256)

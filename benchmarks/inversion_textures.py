@@ -19,10 +19,10 @@ from figures.beyond.textures import bands, mosaic
 from figures.computing.images import mean_flip
 from figures.computing.scenes import BUNNY, MM_PER_UNIT
 from figures.rivals import deng
-from halfspace_sss import inverse
-from halfspace_sss.inverse.views import GivenView
+from full_geometry import inverse
+from full_geometry.inverse.views import GivenView
+from full_geometry.scenes.scene_files import PATH_TRACED, load_scene
 from halfspace_sss.progress import NamedProgress
-from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED, load_scene
 
 THINGS = ("bunny", "ball")
 WAYS: Mapping[str, str] = {"walk": PATH_TRACED, "deng_dipole": deng.MODEL}

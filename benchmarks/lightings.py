@@ -14,13 +14,13 @@ import torch
 
 from figures.rivals.flow import Chart
 from figures.rivals.flow_training import FlowBatch, FlowRecipe, Lighting, likelihood_weights, walks_of
-from full_geometry.learning.fitting import PatchLogits, patch_likelihood
-from full_geometry.models.storing import Learnt
-from full_geometry.object.features import n_side
-from full_geometry.object.patches import PatchSampler
+from full_geometry.geometry.points import cosine_above, opaque
+from full_geometry.learning.network_fitting import PatchLogits, patch_likelihood
+from full_geometry.objects.objects import TranslucentObject
+from full_geometry.transport.features import n_side
+from full_geometry.transport.patches import PatchSampler
+from full_geometry.transport.storing import Learnt
 from halfspace_sss.neural.training.fit import Objective, fit
-from halfspace_sss.rendering.object.objects import TranslucentObject
-from halfspace_sss.rendering.object.points import cosine_above, opaque
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 LIGHTINGS = ("sky", "direction", "near light")

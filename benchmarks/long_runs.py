@@ -12,11 +12,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from full_geometry.trade.assessing import assess_stage
+from full_geometry.trade.results import Assessment, ObjectTrade, WayTrade
+from full_geometry.trade.statistics import seeded
+from full_geometry.trade.ways import Stage, Way
 from halfspace_sss.provenance import provenance, write_atomically
-from halfspace_sss.trade.assessing import assess_stage
-from halfspace_sss.trade.results import Assessment, ObjectTrade, WayTrade
-from halfspace_sss.trade.statistics import seeded
-from halfspace_sss.trade.ways import Stage, Way
 
 FORMAT = "halfspace-sss trade truth 2"
 BATCH = 6.0  # seconds

@@ -17,20 +17,7 @@ from benchmarks.lightings import LIGHTINGS, fit_patches, lighting
 from figures.rivals.flow import FlowProposals
 from figures.rivals.flow_training import FlowRecipe, Lighting, fit_flow
 from figures.rivals.paper_network import PaperNetwork, PaperRecipe, estimate, fit_paper
-from full_geometry.learning import model_errors
-from full_geometry.learning.fitting import STANDARD
-from full_geometry.learning.model_errors import ExitTruth, RadianceError, compare, measure, reference, transport_of
-from full_geometry.learning.training import train, train_by_cpu
-from full_geometry.models.object_model import HalfSpace
-from full_geometry.models.storing import KIND, Learnt
-from full_geometry.object.pairs import EntryProposals, Numbers
-from full_geometry.object.patches import AREA_SHARE, LearntProposals, PatchTable
-from halfspace_sss.backend import kernel_seconds
-from halfspace_sss.checks import check_choice, check_count
-from halfspace_sss.neural.store import load_weights
-from halfspace_sss.rendering.object.half_space import HalfSpaceProposals
-from halfspace_sss.rendering.object.objects import TranslucentObject, object_of
-from halfspace_sss.rendering.object.points import (
+from full_geometry.geometry.points import (
     ObjectModel,
     PositionSampler,
     Proposals,
@@ -41,6 +28,19 @@ from halfspace_sss.rendering.object.points import (
     opaque,
     turned,
 )
+from full_geometry.learning import model_errors
+from full_geometry.learning.model_errors import ExitTruth, RadianceError, compare, measure, reference, transport_of
+from full_geometry.learning.network_fitting import STANDARD
+from full_geometry.learning.training import train, train_by_cpu
+from full_geometry.objects.objects import TranslucentObject, object_of
+from full_geometry.transport.exit_pairs import EntryProposals, Numbers
+from full_geometry.transport.half_space import HalfSpaceProposals
+from full_geometry.transport.one_object import HalfSpace
+from full_geometry.transport.patches import AREA_SHARE, LearntProposals, PatchTable
+from full_geometry.transport.storing import KIND, Learnt
+from halfspace_sss.backend import kernel_seconds
+from halfspace_sss.checks import check_choice, check_count
+from halfspace_sss.neural.store import load_weights
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 if TYPE_CHECKING:

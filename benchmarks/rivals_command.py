@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from benchmarks.tables import markdown
+from full_geometry.cli.variants import Variant, use_mitsuba
 from halfspace_sss.checks import check_choice, check_count, check_interval
-from halfspace_sss.cli.shared import Bar, Define, ObjectId, OutFolder, Variant, console, defined, use_mitsuba, whole
+from halfspace_sss.cli.shared import Bar, Define, ObjectId, OutFolder, console, defined, whole
 from halfspace_sss.provenance import check_folder, write_together
 
 if TYPE_CHECKING:
@@ -45,7 +46,7 @@ def rivals_command(
     parameters = defined(define)
     check_folder(out)
     use_mitsuba(variant)
-    from halfspace_sss.rendering.scenes.scene_files import load_objects
+    from full_geometry.scenes.scene_files import load_objects
 
     loaded, files = load_objects(scene, parameters), {}
     for name in chosen:
@@ -69,7 +70,7 @@ def _made(
     from benchmarks.rivals import sampler_table
     from figures.rivals.flow_training import FlowRecipe
     from full_geometry.learning.training import train_by_cpu
-    from halfspace_sss.rendering.object.objects import object_of
+    from full_geometry.objects.objects import object_of
 
     def show(what: str, done: int, total: int) -> None:
         bar.show(done, total, what)

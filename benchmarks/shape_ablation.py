@@ -13,7 +13,7 @@ import torch
 from figures.modelling.held_out import HELD_OUT
 from full_geometry.learning.shape_data import PairData, draw_object, grouped, make_data, mean_events
 from full_geometry.learning.shape_training import STANDARD, ShapeFit
-from full_geometry.models.descriptors import N_LENGTHS, N_OWN
+from full_geometry.transport.descriptors import N_LENGTHS, N_OWN
 from halfspace_sss.progress import NamedProgress
 
 OBJECTS, HELD_OUT_OBJECTS, SEED = 300, 28, 79

@@ -17,13 +17,13 @@ import numpy as np
 from figures.modelling.held_out import HELD_OUT
 from full_geometry.learning.model_errors import LIGHTS, RadianceError, errors_of, transport_of
 from full_geometry.learning.shape_data import draw_object
-from full_geometry.models.descriptors import mean_chord
-from full_geometry.models.neural_shape import transport
+from full_geometry.objects.objects import TranslucentObject, object_of
+from full_geometry.transport.any_shape import transport
+from full_geometry.transport.descriptors import mean_chord
 from halfspace_sss.interface.model import bssrdf
 from halfspace_sss.materials import load as load_material
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.progress import NamedProgress
-from halfspace_sss.rendering.object.objects import TranslucentObject, object_of
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 # ----------------------------------------------------------------------------------------------------
@@ -267,7 +267,7 @@ def worst_pictures(rows: Sequence[Row], progress: NamedProgress | None = None) -
 
 def picture(case: Case, model: str, size: int = SIZE) -> np.ndarray:
     """Radiance (size, size) of an object by a model, or "path_traced", under half a sky from the left."""
-    from halfspace_sss.rendering.scenes.scene_files import load_scene
+    from full_geometry.scenes.scene_files import load_scene
 
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of sizes: they are what is shown

@@ -8,8 +8,9 @@ from typing import Annotated
 
 import typer
 
+from full_geometry.cli.variants import use_mitsuba
 from halfspace_sss.checks import check_count, check_interval
-from halfspace_sss.cli.shared import Bar, use_mitsuba
+from halfspace_sss.cli.shared import Bar
 from halfspace_sss.provenance import check_folder, write_atomically
 
 MATERIALS = ("marble", "apple", "potato", "ketchup", "regular chocolate milk")  # of Fig. 9
@@ -68,7 +69,7 @@ def shapes_command(
         )
         if pictures is not None:
             from benchmarks.shape_errors import worst_pictures
-            from halfspace_sss.rendering.scenes.picture import as_png
+            from full_geometry.scenes.picture import as_png
 
             write_atomically(pictures, as_png(worst_pictures(rows, show)[..., None]))
         if work is not None:

@@ -195,9 +195,9 @@ def train(case: LitObject, seconds: float, folder: Path) -> float:
     """Learn the object, unless it has been; the CPU seconds that took."""
 
     from full_geometry.learning.training import train_by_cpu
-    from full_geometry.models.storing import KIND, find_weights
-    from halfspace_sss.rendering.object.objects import object_of
-    from halfspace_sss.rendering.scenes.scene_files import open_scene
+    from full_geometry.objects.objects import object_of
+    from full_geometry.scenes.scene_files import open_scene
+    from full_geometry.transport.storing import KIND, find_weights
 
     scene = open_scene(case.description(16, folder), KIND)
     learnt = object_of(scene, None, None, case.key)

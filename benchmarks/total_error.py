@@ -27,7 +27,7 @@ from benchmarks.speeds import VOLUMES, LitObject
 from figures.computing.contenders import ready
 from figures.computing.images import cover, denoised, guides
 from figures.computing.scenes import prepare
-from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED, load_scene
+from full_geometry.scenes.scene_files import PATH_TRACED, load_scene
 
 SAMPLED, PRECOMPUTED = "walk, light sampled", "walk, light precomputed"
 WAYS = (*VOLUMES, SAMPLED, PRECOMPUTED)

@@ -9,15 +9,15 @@ from typing import Any
 
 from benchmarks.long_runs import long_run
 from benchmarks.random_scenes import RandomScene, write_scene
+from full_geometry.scenes.scene_files import PATH_TRACED
+from full_geometry.trade.advice import Job, advise
+from full_geometry.trade.assessing import assess_for, learn
+from full_geometry.trade.automatic import picked
+from full_geometry.trade.results import Assessment, WayTrade
+from full_geometry.trade.statistics import seeded
+from full_geometry.trade.ways import Stage, Way, stage
 from halfspace_sss.neural.store import weights_in
 from halfspace_sss.provenance import provenance, write_atomically
-from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED
-from halfspace_sss.trade.advice import Job, advise
-from halfspace_sss.trade.assessing import assess_for, learn
-from halfspace_sss.trade.automatic import picked
-from halfspace_sss.trade.results import Assessment, WayTrade
-from halfspace_sss.trade.statistics import seeded
-from halfspace_sss.trade.ways import Stage, Way, stage
 
 WAYS = (
     PATH_TRACED, "lambert", "better_dipole", "neural", "full_geometry",

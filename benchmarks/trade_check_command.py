@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from full_geometry.cli.variants import Variant, use_mitsuba
 from halfspace_sss.checks import check_count, check_interval
-from halfspace_sss.cli.shared import Bar, Scheduler, Variant, Workers, console, executor_of, use_mitsuba, whole
+from halfspace_sss.cli.shared import Bar, Scheduler, Workers, console, executor_of, whole
 from halfspace_sss.provenance import check_folder
 
 if TYPE_CHECKING:

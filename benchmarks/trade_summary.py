@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from benchmarks.trade_check import TRAIN_SECONDS, WAYS, outcome, z_values
-from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED
+from full_geometry.scenes.scene_files import PATH_TRACED
 
 if TYPE_CHECKING:
     import pandas

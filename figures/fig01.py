@@ -67,7 +67,7 @@ def shown(task: Task) -> dict[str, Any]:
     """An object in its surroundings: the reference, or the image of a model by its gathered light."""
     import mitsuba as mi
 
-    from halfspace_sss.rendering.scenes.scene_files import load_scene
+    from full_geometry.scenes.scene_files import load_scene
 
     prepare()
     p, name = task.params, task.params["object"]

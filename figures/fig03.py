@@ -36,8 +36,8 @@ def sampled(task: Task) -> dict[str, Any]:
     """Points in the object's frame over its radius, their RMSD to the nearest barycentre, and light where they are."""
     from figures.rivals.paper_flow import fit_space_flow, mesh_arrays, on_surface, rmsd
     from full_geometry.learning.training import train_by_cpu
-    from full_geometry.models.storing import frame_of
-    from halfspace_sss.rendering.object.objects import object_of
+    from full_geometry.objects.objects import object_of
+    from full_geometry.transport.storing import frame_of
 
     prepare()
     p, n = task.params, task.params["points"]
@@ -69,7 +69,7 @@ def sampled(task: Task) -> dict[str, Any]:
 
 def _lit(name: str, task: Task, resolution: int, seed: int) -> Any:
     """The candle with its flame, or the bunny with a small light behind."""
-    from halfspace_sss.rendering.scenes.scene_files import open_scene
+    from full_geometry.scenes.scene_files import open_scene
 
     if name == "candle":
         shown = object_parts("candle", resolution, check_folder(task.folder), seed)
@@ -117,7 +117,7 @@ def _by_patches(learnt: Any, exit: Any, n: int) -> Any:
     import drjit as dr
     import mitsuba as mi
 
-    from full_geometry.object.features import Side, first_event
+    from full_geometry.transport.features import Side, first_event
 
     rng = _lanes(n, 42)
     at = exit.gather(dr.zeros(mi.UInt32, n))

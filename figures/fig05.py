@@ -14,13 +14,13 @@ from figures.computing.images import FLIP, RELATIVE_MSE, compared, srgb
 from figures.computing.scenes import BUNNY, bunny_scene, prepare
 from figures.drawing.style import TEXT, Look, paper, saved
 from figures.parts.part import Part, Result, Task
-from full_geometry.models.storing import KIND
+from full_geometry.integrators.bssrdf import is_bssrdf
+from full_geometry.scenes import online, reference
+from full_geometry.scenes.combined import combined
+from full_geometry.scenes.reference_store import Reference
+from full_geometry.transport.storing import KIND
 from halfspace_sss.neural.store import weights_in
 from halfspace_sss.provenance import check_folder
-from halfspace_sss.rendering.paths.integrator import is_bssrdf
-from halfspace_sss.rendering.scenes import online, reference
-from halfspace_sss.rendering.scenes.combined import combined
-from halfspace_sss.rendering.scenes.reference_store import Reference
 
 TITLE = "error of the image over time: walks alone, walks that learn, the model trained before"
 SCENES = {  # material and lights
@@ -190,7 +190,7 @@ class Snapshots:
 
 
 def _scene(p: dict[str, Any], model: str, train_seconds: float) -> Any:
-    from halfspace_sss.rendering.scenes.scene_files import open_scene
+    from full_geometry.scenes.scene_files import open_scene
 
     settings = {"train_seconds": train_seconds, "train_error": p["train_error"]}
     return open_scene(bunny_scene(p["material"], p["size"], p["lights"]), model, settings=settings)
@@ -235,7 +235,7 @@ def modelled(p: dict[str, Any], folder: Path, seconds: float) -> Snapshots:
 
 def walked(p: dict[str, Any], folder: Path, seconds: float) -> Snapshots:
     """Walks alone."""
-    from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED
+    from full_geometry.scenes.scene_files import PATH_TRACED
 
     return _rendered(_scene(p, PATH_TRACED, 0.0), folder / "walked.exr", p["seed"] + 2, seconds)
 

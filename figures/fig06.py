@@ -67,7 +67,7 @@ def seen(task: Task) -> dict[str, Any]:
     """The bunny under a light, from a view."""
     import mitsuba as mi
 
-    from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED, load_scene
+    from full_geometry.scenes.scene_files import PATH_TRACED, load_scene
 
     prepare()
     p = task.params

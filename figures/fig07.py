@@ -85,7 +85,7 @@ def deng(task: Task) -> dict[str, Any]:
 
     from figures.rivals import deng as study
     from figures.rivals.photographs import Studio
-    from halfspace_sss.rendering.scenes.scene_files import load_scene
+    from full_geometry.scenes.scene_files import load_scene
 
     prepare()
     p, name, folder = task.params, task.params["object"], check_folder(task.folder)
@@ -117,8 +117,8 @@ def distant(task: Task) -> dict[str, Any]:
     import mitsuba as mi
 
     from figures.rivals import distant_light as study
-    from halfspace_sss.rendering.object.objects import object_of
-    from halfspace_sss.rendering.scenes.scene_files import open_scene
+    from full_geometry.objects.objects import object_of
+    from full_geometry.scenes.scene_files import open_scene
 
     prepare()
     p, name, folder = task.params, task.params["object"], check_folder(task.folder)

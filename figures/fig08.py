@@ -64,9 +64,9 @@ def ours(task: Task) -> dict[str, Any]:
     """Errors of `full_geometry` with N entries by patches."""
     from full_geometry.learning.model_errors import modelled
     from full_geometry.learning.training import train_by_cpu
-    from full_geometry.models.object_model import HalfSpace
-    from full_geometry.object.pairs import EntryProposals
-    from halfspace_sss.rendering.object.objects import object_of
+    from full_geometry.objects.objects import object_of
+    from full_geometry.transport.exit_pairs import EntryProposals
+    from full_geometry.transport.one_object import HalfSpace
 
     prepare()
     p = task.params
@@ -82,7 +82,7 @@ def ours(task: Task) -> dict[str, Any]:
 def papers(task: Task) -> dict[str, Any]:
     """Errors of the paper's network for one N, its points from walks and uniform."""
     from figures.rivals.paper_network import PaperRecipe, estimate, fit_paper
-    from halfspace_sss.rendering.object.objects import object_of
+    from full_geometry.objects.objects import object_of
 
     prepare()
     p, repeats = task.params, 8

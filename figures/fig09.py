@@ -59,7 +59,7 @@ def rendered(task: Task) -> dict[str, Any]:
     """The image of a model, and the CPU seconds it takes with gathering once it is compiled."""
     import mitsuba as mi
 
-    from halfspace_sss.rendering.scenes.scene_files import load_scene
+    from full_geometry.scenes.scene_files import load_scene
 
     prepare()
     p = task.params

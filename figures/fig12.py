@@ -72,9 +72,9 @@ def _weights(task: Task) -> tuple[dict[str, Path], dict[str, np.ndarray]]:
     """A folder of weights for each sampler, of one training, without patches and with them; and those of a flow."""
     from figures.rivals.flow_training import FlowRecipe, fit_flow
     from full_geometry.learning.training import train_by_cpu
-    from full_geometry.models.storing import CENTRES, KIND
+    from full_geometry.objects.objects import object_of
+    from full_geometry.transport.storing import CENTRES, KIND
     from halfspace_sss.neural.store import load_weights, save_weights
-    from halfspace_sss.rendering.object.objects import object_of
 
     p, folders = task.params, {name: task.folder / name for name in ("probes", "patches")}
     obj = object_of(*shape_of("bunny", task.folder))
@@ -106,7 +106,7 @@ def _image(
 
 def _scene(p: Mapping[str, Any], light: str, entries: int = 1, gathering: str = "sampled") -> Any:
     """The bunny, orders from two on."""
-    from halfspace_sss.rendering.scenes.scene_files import load_scene
+    from full_geometry.scenes.scene_files import load_scene
 
     description = bunny_scene("potato", p["size"], light)
     description["integrator"] |= {"entries": entries, "light": gathering}

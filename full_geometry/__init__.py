@@ -1,21 +1,39 @@
-"""The full geometry: S of one object, learnt from the exits of walks inside it.
+"""Subsurface scattering on meshes, for Mitsuba 3: path tracing, BSSRDF models laid onto surfaces, and learnt transport.
 
-S = S_0 P_o P_i exp f, with the half-space S_0, the exact chances P to be scattered before light leaves, and a small
-network f. `train` learns it, `errors` says how wrong it is.
+    import full_geometry, mitsuba as mi
+    mi.set_variant("llvm_ad_rgb")
+    full_geometry.register()                # once; later calls of mi.set_variant are followed
+
+`register` adds three plugins: the BSDF `translucent` (medium, model and scattering orders of an object) and the
+integrators `bssrdf` and `translucent_walk`. `train` learns S of one object, `errors` says how wrong a model of it is.
+`inverse` fits media to images; `trade` measures what each way of rendering costs and how wrong it is.
 """
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from halfspace_sss.lazy import lazy_names
 
-__all__ = ["Recipe", "errors", "load", "object_of", "train", "transport_of"]
+if TYPE_CHECKING:
+    from full_geometry import inverse, trade
+    from full_geometry.learning.model_errors import errors, object_of, transport_of
+    from full_geometry.learning.network_fitting import Recipe
+    from full_geometry.learning.training import train
+    from full_geometry.scenes.plugins import register
+    from full_geometry.transport.storing import load
+
+__all__ = ["Recipe", "errors", "inverse", "load", "object_of", "register", "trade", "train", "transport_of"]
 __getattr__, __dir__ = lazy_names(
     __name__,
     {
-        "Recipe": "learning.fitting",
+        "Recipe": "learning.network_fitting",
         "errors": "learning.model_errors",
-        "load": "models.storing",
+        "inverse": "",
+        "load": "transport.storing",
         "object_of": "learning.model_errors",
+        "register": "scenes.plugins",
+        "trade": "",
         "train": "learning.training",
         "transport_of": "learning.model_errors",
     },

@@ -4,7 +4,7 @@
 - `halfspace_sss.materials`: path of a material file or folder, or an iterable of `Material`.
 - `halfspace_sss.commands`: name -> function with typer annotations, a further command of `halfspace-sss`.
 - `halfspace_sss.transports`, `halfspace_sss.choosers`, `halfspace_sss.learners`: name of a model -> what makes it of an
-  object, what stands for another by name, what learns it; see `rendering.object.registry`.
+  object, what stands for another by name, what learns it; see `registry`.
 - `halfspace_sss.figures`: kind of result -> function that takes the result and returns {file ending: bytes}.
 
 What a package offers may fail in any way: it is left out with a warning in one line that names it, and nothing else is.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from halfspace_sss.cli import app as cli
+from figures import command_line as cli
 
 COMMANDS: dict[str, Callable] = {info.name: info.callback for info in cli.app.registered_commands} | {
     f"{group.name} {info.name}": info.callback

@@ -110,10 +110,10 @@ def truths() -> list[dict[str, str]]:
 def _set_variant(name: str) -> None:
     import mitsuba as mi
 
-    from halfspace_sss import rendering
+    import full_geometry
 
     mi.set_variant(name)
-    rendering.register()
+    full_geometry.register()
     for load in ("load_dict", "load_file", "load_string"):
         if not isinstance(getattr(mi, load), functools.partial):
             # several threads number the shapes by chance: other kernels would be compiled for the same scene

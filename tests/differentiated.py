@@ -56,7 +56,7 @@ def envmap() -> dict:
 
 def image(scene, bodies: list | None = None) -> np.ndarray:
     """The image whose derivative the replay gives for the same seed."""
-    from halfspace_sss.rendering.paths.integrator import replayer
+    from full_geometry.integrators.bssrdf import replayer
 
     integrator = scene.integrator()
     tracer = replayer(bodies or integrator.prepare(scene), integrator.settings)
@@ -135,7 +135,7 @@ class Shifted:
         return dataclasses.replace(own.transport, models=models)
 
     def coefficients(self, media: list) -> list:
-        from halfspace_sss.rendering.object.points import opaque
+        from full_geometry.geometry.points import opaque
 
         return [tuple(opaque(v) for v in (m.sigma_s, m.sigma_t, m.g)) for m in self.media]
 

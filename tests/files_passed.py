@@ -64,7 +64,7 @@ def _scene(model: str) -> Any:
 
 
 def _learn(scene: Any, folder: Path, seed: int) -> Any:
-    from halfspace_sss.rendering.scenes.learners import learner
+    from full_geometry.scenes.learners import learner
 
     how = {"object": None, "seconds": 0.5, "target_error": None, "folder": folder, "work": None, "progress": None}
     return learner("full_geometry").train(scene, seed=seed, **how)
@@ -94,10 +94,10 @@ def main() -> None:
     """Print the number of files of each call, and their names with -v."""
     import mitsuba as mi
 
-    import halfspace_sss.rendering as rendering
+    import full_geometry
 
     mi.set_variant("llvm_ad_rgb")
-    rendering.register()
+    full_geometry.register()
     warnings.simplefilter("ignore")
     with TemporaryDirectory() as name:
         folder = Path(name)

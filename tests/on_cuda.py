@@ -37,10 +37,10 @@ def on(variant: str, ask: Callable[[], Any]) -> Any:
     """What a function answers under a variant, as NumPy arrays."""
     import mitsuba as mi
 
-    from halfspace_sss import rendering
+    import full_geometry
 
     mi.set_variant(variant)
-    rendering.register()
+    full_geometry.register()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # sizes that are beside the point
         found = ask()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-START = [sys.executable, "-c", "from halfspace_sss.cli import main; main()"]
+START = [sys.executable, "-c", "from figures.command_line import main; main()"]
 XML = """<scene version="3.0.0">
   <integrator type="bssrdf"><integer name="max_depth" value="3"/></integrator>
   <emitter type="constant"/>

@@ -119,10 +119,10 @@ def _cases(folder: Path) -> Iterator[tuple[str, Callable[[], Any]]]:
 def main() -> None:
     import mitsuba as mi
 
-    from halfspace_sss import rendering
+    import full_geometry
 
     mi.set_variant("llvm_ad_rgb")
-    rendering.register()
+    full_geometry.register()
     warnings.simplefilter("ignore")
     only = sys.argv[1:]
     with TemporaryDirectory() as folder:

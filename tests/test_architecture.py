@@ -16,10 +16,12 @@ HEAVY = ["torch", "mitsuba", "matplotlib", "drjit", "pandas", "xarray"]
 FLOORS = {  # of each package, a room may import those to its left; "" is what lies beside the rooms
     "halfspace_sss": [
         "", "physics", "interface", "tracing", "maps", "measure", "materials", "comparison", "neural",
-        "neural.training", "rendering.object", "rendering.light", "rendering.gathered",
-        "rendering.walk", "rendering.paths", "rendering.scenes", "rendering", "inverse", "trade", "cli",
+        "neural.training", "cli",
     ],
-    "full_geometry": ["object", "models", "learning", "neural_shape", ""],
+    "full_geometry": [
+        "", "geometry", "surface", "objects", "walk", "sampling", "transport", "precomputed", "integrators", "scenes",
+        "learning", "inverse", "trade", "cli",
+    ],
     "figures": ["parts", "rivals", "modelling", "computing", "drawing", "beyond", ""],
 }  # fmt: skip
 HIDING = {"bssrdf", "curves", "models", "trace"}  # public functions: a folder of that name would hide one

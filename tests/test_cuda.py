@@ -86,7 +86,7 @@ def test_scenes_that_do_not_belong_together_are_refused() -> None:
     def ask() -> None:
         import mitsuba as mi
 
-        from halfspace_sss.rendering.object.shape import check_together, scene_of
+        from full_geometry.geometry.shape import check_together, scene_of
 
         world, other = (
             mi.load_dict({"type": "scene", "ball": {"type": "sphere"}, "floor": {"type": "rectangle"}})
@@ -103,9 +103,9 @@ def test_a_fit_on_the_gpu_is_that_on_the_cpu_and_goes_on_there(tmp_path: object)
     torch = pytest.importorskip("torch")
     if not torch.cuda.is_available():
         pytest.skip("torch sees no GPU")
-    from full_geometry.learning.fitting import ObjectFit, Recipe
-    from full_geometry.object.features import n_pair, n_side
-    from full_geometry.object.pairs import AlbedoSamples, Pairs
+    from full_geometry.learning.network_fitting import ObjectFit, Recipe
+    from full_geometry.transport.exit_pairs import AlbedoSamples, Pairs
+    from full_geometry.transport.features import n_pair, n_side
 
     n_in, n = 2 * n_side(1) + n_pair(1), 4096
     rng = np.random.default_rng(1)

@@ -17,7 +17,7 @@ from analytic_models.standard_dipole import StandardDipole
 from halfspace_sss import Medium, extensions
 from halfspace_sss.interface import model as interface
 
-START = [sys.executable, "-c", "from halfspace_sss.cli import main; main()"]
+START = [sys.executable, "-c", "from figures.command_line import main; main()"]
 QUICK = ["curves", "--theta-i", "0", "--paths", "256", "--model", "standard_dipole", "--out", "out"]
 
 

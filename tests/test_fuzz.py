@@ -23,8 +23,8 @@ from render_files import XML
 from typer.testing import CliRunner
 
 import halfspace_sss
+from figures import command_line as cli
 from halfspace_sss import Medium, materials
-from halfspace_sss.cli import app as cli
 from halfspace_sss.maps.store import load_maps, make_maps
 
 CASES = int(os.environ.get("HALFSPACE_SSS_FUZZ", "0"))
@@ -34,12 +34,12 @@ COMPUTES = [  # what is replaced: the properties are of what comes before the co
     "halfspace_sss.comparison.model_errors.references", "halfspace_sss.neural.train",
     "halfspace_sss.neural.training.train_universal.train_universal",
     "halfspace_sss.cli.validate.validate",
-    "halfspace_sss.cli.bench._measured", "halfspace_sss.rendering.scenes.reference.render",
+    "halfspace_sss.cli.bench._measured", "full_geometry.scenes.reference.render",
     "halfspace_sss.comparison.model_truths.truths_cost", "figures.parts.runner.compute",
-    "halfspace_sss.trade.flat.references", "halfspace_sss.trade.assessing.assess_stage",
-    "halfspace_sss.trade.assessing.assess_for",
+    "full_geometry.trade.flat.references", "full_geometry.trade.assessing.assess_stage",
+    "full_geometry.trade.assessing.assess_for",
     "full_geometry.learning.shape_training._ShapeTraining", "full_geometry.learning.training._ObjectTraining",
-    "full_geometry.command.errors_of", "halfspace_sss.inverse.fitting.MediumDescent",
+    "full_geometry.learning.object_learner.errors_of", "full_geometry.inverse.fitting.MediumDescent",
 ]  # fmt: skip
 ODD = ["", " ", "nan", "inf", "-inf", "-1", "0", "1", "2", "0.5", "1e6", "1e400", "1,2", "0,", "1/2", "2/1", "marble",
        "R", "fig10", "neural", "better_dipole", "total", "single", "llvm", "cuda", "[/red]", "[bold", "{", "%s", "../x",
@@ -107,17 +107,17 @@ def test_no_name_of_a_material_or_model_ends_in_a_traceback(name: str) -> None:
 def _scene_file(folder: Path) -> tuple[Path, Callable]:
     import mitsuba as mi
 
-    from halfspace_sss import rendering
-    from halfspace_sss.rendering.scenes.scene_files import load_scene
+    import full_geometry
+    from full_geometry.scenes.scene_files import load_scene
 
     mi.set_variant("llvm_ad_rgb")
-    rendering.register()
+    full_geometry.register()
     (folder / "a.xml").write_text(XML)
     return folder / "a.xml", load_scene
 
 
 def _render_file(folder: Path) -> tuple[Path, Callable]:
-    from halfspace_sss.rendering.scenes import reference
+    from full_geometry.scenes import reference
 
     scene, load_scene = _scene_file(folder)
     reference.render(load_scene(scene), folder / "r" / "a.exr", spp=2)

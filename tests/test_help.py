@@ -28,10 +28,10 @@ TOML = [text for text in HELP.values() if "[[material]]\n" in text]
 @pytest.fixture
 def mi():
     mitsuba = pytest.importorskip("mitsuba")
-    from halfspace_sss import rendering
+    import full_geometry
 
     mitsuba.set_variant("llvm_ad_rgb")
-    rendering.register()
+    full_geometry.register()
     return mitsuba
 
 

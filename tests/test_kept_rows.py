@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from halfspace_sss.cli import app as cli
+from figures import command_line as cli
 from halfspace_sss.comparison import model_truths
 from halfspace_sss.kept_rows import KeptRows
 

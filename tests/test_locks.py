@@ -15,8 +15,8 @@ import pytest
 from render_files import XML
 from typer.testing import CliRunner
 
+from figures import command_line as cli
 from halfspace_sss import Medium
-from halfspace_sss.cli import app as cli
 from halfspace_sss.locks import one_writer
 from halfspace_sss.maps.grid import MapGrid
 from halfspace_sss.maps.store import load_maps, make_maps

@@ -38,7 +38,7 @@ RUN = """
 import shlex
 import sys
 
-from halfspace_sss.cli.app import main
+from figures.command_line import main
 
 for line in sys.argv[1:]:
     sys.argv = shlex.split(line)

@@ -58,11 +58,11 @@ def _scene(rng: np.random.Generator) -> dict:
 
 def test_renders_of_changing_scenes_leave_no_memory_behind() -> None:
     """The mean of the last quarter against that of the second; what a process caches at first is not counted."""
-    import halfspace_sss.rendering as rendering
+    import full_geometry
 
     mi = pytest.importorskip("mitsuba")
     mi.set_variant("llvm_ad_rgb")
-    rendering.register()
+    full_geometry.register()
     rng, used = np.random.default_rng(1), []
     n = max(40, int(SHARE * RENDERS))
     for k in range(n):
@@ -108,7 +108,7 @@ def test_many_queries_are_answered_block_by_block_in_flat_memory() -> None:
     assert max(used) < 1.1 * used[1]
 
 
-MAPS = [sys.executable, "-m", "halfspace_sss", "maps", "--albedo", "0.95", "--grid", "64,16,6,4", "--paths", "3e6"]
+MAPS = [sys.executable, "-m", "figures.command_line", "maps", "--albedo", "0.95", "--grid", "64,16,6,4", "--paths", "3e6"]
 KILLS, EVERY = 12, 5.0  # seconds
 
 
@@ -175,7 +175,7 @@ MEDIA = [
 def test_maps_of_twelve_media_by_two_workers_are_those_of_one_in_little_more_than_half_the_time(tmp_path: Path) -> None:
     """Needs two free cores: 1.8 times as fast was asked for."""
     pytest.importorskip("distributed")
-    command = [sys.executable, "-m", "halfspace_sss", "maps", *MEDIA, "--grid", "4,16,6,4"]
+    command = [sys.executable, "-m", "figures.command_line", "maps", *MEDIA, "--grid", "4,16,6,4"]
     seconds = {}
     for n_workers in (1, 2):
         with _dask(tmp_path, n_workers) as (_, _, file):

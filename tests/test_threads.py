@@ -18,8 +18,8 @@ OBJECTS = ["marble", "skin1", "apple", "ketchup", "skin2", "cream", "potato", "c
 START = """
 import mitsuba as mi
 mi.set_variant("llvm_ad_rgb")
-from halfspace_sss import rendering
-rendering.register()
+import full_geometry
+full_geometry.register()
 """
 ASK = """
 import sys, threading

@@ -7,11 +7,11 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-from full_geometry.models.storing import frame_of
-from full_geometry.object.features import n_side
-from full_geometry.object.patches import Patches, PatchSampler, cluster
+from full_geometry.objects.objects import TranslucentObject, object_of
+from full_geometry.transport.features import n_side
+from full_geometry.transport.patches import Patches, PatchSampler, cluster
+from full_geometry.transport.storing import frame_of
 from halfspace_sss import Medium
-from halfspace_sss.rendering.object.objects import TranslucentObject, object_of
 
 BUNNY = Path(__file__).parents[1] / "figures" / "assets" / "bunny.ply"
 WAX = Medium(np.array([0.95, 0.8, 0.6]), np.array([0.05, 0.2, 0.4]), 0.0, 1.4)

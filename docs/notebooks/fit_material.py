@@ -11,10 +11,11 @@ import halfspace_sss  # noqa: F401  before Mitsuba, so that Dr.Jit finds its LLV
 import mitsuba as mi
 import numpy as np
 
-from halfspace_sss import inverse, rendering
+import full_geometry
+from full_geometry import inverse
 
 mi.set_variant("llvm_ad_rgb")
-rendering.register()
+full_geometry.register()
 
 # %% [markdown]
 # The scene: cameras and lights are known. Lengths are mm, `sigma_t` is one over the mean free path.

@@ -11,10 +11,10 @@ import halfspace_sss  # noqa: F401  before Mitsuba, so that Dr.Jit finds its LLV
 import mitsuba as mi
 import numpy as np
 
-from halfspace_sss import rendering
+import full_geometry
 
 mi.set_variant("llvm_ad_rgb")
-rendering.register()  # `translucent`, `bssrdf` and `translucent_walk`
+full_geometry.register()  # `translucent`, `bssrdf` and `translucent_walk`
 
 # %% [markdown]
 # One scene; the integrator and the model of the surface change. Lengths of the medium are mm; the ball is 10 mm across.

@@ -315,7 +315,7 @@ def furnace_scene(model: str, size: int, radius: float = RADIUS) -> Any:
     """
     import mitsuba as mi
 
-    from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED, load_scene
+    from full_geometry.scenes.scene_files import PATH_TRACED, load_scene
 
     at = mi.ScalarTransform4f()
     view = at.look_at([0, 0, 2 * radius], [0, 0, 0], [0, 1, 0]) @ at.scale([SEEN * radius, SEEN * radius, 1])
@@ -372,9 +372,9 @@ def _steps(scene: Any, n: int) -> dict[str, Callable[[], Any]]:
     import drjit as dr
     import mitsuba as mi
 
-    from halfspace_sss.rendering.object.points import cosine_above, place
-    from halfspace_sss.rendering.object.rounding import ray_from
-    from halfspace_sss.rendering.paths.path_loop import exit_at
+    from full_geometry.geometry.points import cosine_above, place
+    from full_geometry.geometry.rounding import ray_from
+    from full_geometry.integrators.surface_paths import exit_at
 
     (obj,) = scene.integrator().prepare(scene)
     si, sampler = _seen(scene, n), mi.load_dict({"type": "independent"})

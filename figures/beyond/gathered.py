@@ -14,8 +14,8 @@ from figures.computing.scenes import BUNNY, prepare, scan_scene
 from figures.computing.timed import gathered_anew, power_of_two, rendered
 from figures.drawing.image_files import image_files
 from figures.parts.part import Part, Result, Task
+from full_geometry.scenes.scene_files import PATH_TRACED, load_scene
 from halfspace_sss.backend import clock
-from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED, load_scene
 
 TITLE = "walked, sampled, gathered, and walked with light precomputed, in equal time"
 MATERIALS = ("marble",)

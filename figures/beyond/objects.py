@@ -100,7 +100,7 @@ def foot(part: Mapping[str, Any]) -> float:
 
 def candle(task: Task) -> dict[str, Any]:
     """The candle by exact walks."""
-    from halfspace_sss.rendering.scenes.scene_files import load_scene
+    from full_geometry.scenes.scene_files import load_scene
 
     check_denoiser()
     prepare()

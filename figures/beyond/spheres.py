@@ -48,7 +48,7 @@ def measured(task: Task) -> dict[str, Any]:
 
     import mitsuba as mi
 
-    from halfspace_sss.rendering.scenes.scene_files import load_scene
+    from full_geometry.scenes.scene_files import load_scene
 
     prepare()
     p, means, errors = task.params, [], []

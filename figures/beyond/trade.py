@@ -20,11 +20,11 @@ from figures.drawing.style import paper, saved
 from figures.drawing.trade_plot import image_shots, multiples
 from figures.modelling.closed_shapes import write_shape
 from figures.parts.part import Part, Result, Task
+from full_geometry.scenes.scene_files import PATH_TRACED
+from full_geometry.trade.results import Assessment
+from full_geometry.trade.ways import GATHERED, LAMBERT, Way
 from halfspace_sss import materials
 from halfspace_sss.physics.medium import Medium
-from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED
-from halfspace_sss.trade.results import Assessment
-from halfspace_sss.trade.ways import GATHERED, LAMBERT, Way
 
 TITLE = "bias against time to a given noise, for every way of rendering"
 MATERIALS = ("marble", "potato", "ketchup")
@@ -88,9 +88,9 @@ def _name(material: str, shape: str, light: str) -> str:
 
 def measured(task: Task) -> dict[str, Any]:
     """The assessment of a scene, and an image by each way."""
-    from halfspace_sss.trade.assessing import assess_stage
-    from halfspace_sss.trade.images import small_images, with_flip
-    from halfspace_sss.trade.ways import stage
+    from full_geometry.trade.assessing import assess_stage
+    from full_geometry.trade.images import small_images, with_flip
+    from full_geometry.trade.ways import stage
 
     prepare()
     p, learnt = task.params, with_weights(task.folder, task.needed)
@@ -114,8 +114,8 @@ def measured(task: Task) -> dict[str, Any]:
 def turned(task: Task) -> dict[str, Any]:
     """What the knobs bring on a scene."""
     from figures.computing.knobs import channel_settings, entry_settings, node_settings, precision_settings
+    from full_geometry.trade.ways import stage
     from halfspace_sss.neural.symmetric import channels
-    from halfspace_sss.trade.ways import stage
 
     prepare()
     p = task.params

@@ -8,10 +8,10 @@ import numpy as np
 
 from figures.computing.scenes import long_render, prepare, scan_scene
 from figures.parts.part import Task, unmodelled
+from full_geometry.registry import model_names
 from halfspace_sss import bssrdf
 from halfspace_sss.neural.symmetric import channels
 from halfspace_sss.physics.medium import Medium
-from halfspace_sss.rendering.object.registry import model_names
 
 MODELS = ("standard_dipole", "better_dipole", "directional_dipole", "photon_beam_diffusion", "neural")
 OF_OBJECTS = tuple(name for name in ("neural_shape", "full_geometry") if name in model_names())
@@ -63,7 +63,7 @@ def ready(method: str, description: dict[str, Any], name: str, medium: Medium, b
     Raises:
         ValueError: no such method.
     """
-    from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED, load_scene
+    from full_geometry.scenes.scene_files import PATH_TRACED, load_scene
 
     if method in VOLUMES:
         return _volume_scene(description, name, medium, int(method.split()[1]))
@@ -76,7 +76,7 @@ def ready(method: str, description: dict[str, Any], name: str, medium: Medium, b
 
 
 def _volume_scene(description: dict[str, Any], name: str, medium: Medium, rr_depth: int) -> Any:
-    from halfspace_sss.rendering.scenes.mitsuba_scene import with_media
+    from full_geometry.scenes.mitsuba_scene import with_media
 
     integrator = {"type": _VOLUME, "max_depth": -1, "rr_depth": rr_depth, "hide_emitters": True}
     mm_per_unit = description["integrator"].get("mm_per_unit", 1.0)

@@ -16,15 +16,15 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from full_geometry.scenes.scene_files import PATH_TRACED
+from full_geometry.trade.assessing import assess_stage
+from full_geometry.trade.results import ObjectTrade
+from full_geometry.trade.ways import Stage, Way
 from halfspace_sss.backend import clock
 from halfspace_sss.comparison.model_errors import model_error, references
 from halfspace_sss.interface.model import model_class
 from halfspace_sss.neural.network import Network
 from halfspace_sss.physics.medium import Medium
-from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED
-from halfspace_sss.trade.assessing import assess_stage
-from halfspace_sss.trade.results import ObjectTrade
-from halfspace_sss.trade.ways import Stage, Way
 
 ENTRIES, NODES = (1, 2, 4, 8), (4, 8, 16, 32, 64)
 BEAMS, USUAL_NODES, QUERIES = "photon_beam_diffusion", 16, 2**14

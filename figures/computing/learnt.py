@@ -129,10 +129,10 @@ def trained(task: Task, scene: dict[str, Any], name: str) -> dict[str, Any]:
     The parameters "chunks" and "seed" of the task are those of the training.
     """
     from full_geometry.learning.training import train_by_chunks
-    from full_geometry.models.storing import KIND
+    from full_geometry.objects.objects import object_of
+    from full_geometry.scenes.scene_files import open_scene
+    from full_geometry.transport.storing import KIND
     from halfspace_sss.neural.store import load_weights
-    from halfspace_sss.rendering.object.objects import object_of
-    from halfspace_sss.rendering.scenes.scene_files import open_scene
 
     obj = object_of(open_scene(scene, KIND), None, None, name)
     started, of_cpu = time.perf_counter(), time.process_time()
@@ -169,7 +169,7 @@ def weight_files(model: str, medium: Medium) -> tuple[Path, ...]:
     if model in trained:
         return tuple(dict.fromkeys(trained[model].find_weights(model, m) for m in channels(medium)))
     if model == "neural_shape":
-        from full_geometry.models import neural_shape
+        from full_geometry.transport import any_shape
 
-        return (neural_shape.shipped_weights(),)
+        return (any_shape.shipped_weights(),)
     return (shipped_weights(),) if model == "neural" else ()

@@ -41,11 +41,11 @@ def prepare() -> None:
     """
     import mitsuba as mi
 
-    from halfspace_sss import rendering
+    import full_geometry
 
     if mi.variant() not in VARIANTS:
         mi.set_variant(VARIANTS[0])
-    rendering.register()
+    full_geometry.register()
     gc.collect()
 
 
@@ -167,7 +167,7 @@ def long_render(task: Task, scene: Any, spp_per_pass: int, passes: int, half: in
         spp_per_pass, passes: samples per pixel of each pass, and their number.
         half: 1 for another image of other random numbers.
     """
-    from halfspace_sss.rendering.scenes import reference
+    from full_geometry.scenes import reference
 
     result = reference.render(
         scene,

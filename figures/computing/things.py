@@ -26,7 +26,7 @@ class Staging(NamedTuple):
 
 
 def lit_scene(things: dict[str, Any], stage: Staging, size: int, mm_per_unit: float) -> dict[str, Any]:
-    """The scene of a thing, as a dict for `rendering.scenes.scene_files.load_scene`.
+    """The scene of a thing, as a dict for `scenes.scene_files.load_scene`.
 
     Args:
         things: shapes by name for `mitsuba.load_dict`, the first of which is looked at.
@@ -85,7 +85,7 @@ def thing_parts(
 
 def walked(task: Task, scene_of: Callable[[Task], dict[str, Any]]) -> dict[str, Any]:
     """`reference_image` of a thing."""
-    from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED, load_scene
+    from full_geometry.scenes.scene_files import PATH_TRACED, load_scene
 
     prepare()
     return reference_image(task, load_scene(scene_of(task), PATH_TRACED))
@@ -95,7 +95,7 @@ def shown(task: Task, scene_of: Callable[[Task], dict[str, Any]]) -> dict[str, A
     """The image of a model by its gathered light."""
     import mitsuba as mi
 
-    from halfspace_sss.rendering.scenes.scene_files import load_scene
+    from full_geometry.scenes.scene_files import load_scene
 
     prepare()
     p = task.params

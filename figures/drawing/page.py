@@ -17,8 +17,8 @@ from matplotlib import colormaps  # without it there is no page, which must be k
 from figures.computing.images import FLIP, RELATIVE_MSE, Shot, compared, denoised, guides, srgb
 
 if TYPE_CHECKING:
-    from halfspace_sss.inverse.comparing import MaterialFit
-    from halfspace_sss.rendering.scenes.picture import Picture
+    from full_geometry.inverse.comparing import MaterialFit
+    from full_geometry.scenes.picture import Picture
 
 
 DIFFERENCE_SPAN = 1.0  # relative difference at the ends of the colours

@@ -13,11 +13,11 @@ from matplotlib.figure import Figure
 from figures.computing.images import Shot, compared
 from figures.drawing.page import page
 from figures.drawing.style import TEXT, TRACED, Look, look, paper, saved
+from full_geometry.trade.advice import Job, advise
+from full_geometry.trade.images import TradePicture
+from full_geometry.trade.results import Assessment, ObjectTrade, WayTrade
+from full_geometry.trade.ways import GATHERED, NO_SINGLE
 from halfspace_sss.noise_free import short
-from halfspace_sss.trade.advice import Job, advise
-from halfspace_sss.trade.images import TradePicture
-from halfspace_sss.trade.results import Assessment, ObjectTrade, WayTrade
-from halfspace_sss.trade.ways import GATHERED, NO_SINGLE
 
 if TYPE_CHECKING:
     import pandas

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 import figures
+from full_geometry.cli.variants import Variant, use_mitsuba
 from halfspace_sss.backend import BackendError, cores
-from halfspace_sss.cli.shared import Bar, Scheduler, Variant, console, executor_of, use_mitsuba, whole
+from halfspace_sss.cli.shared import Bar, Scheduler, console, executor_of, whole
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

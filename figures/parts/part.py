@@ -23,14 +23,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from figures import figure_modules
+from full_geometry.registry import learnt_names, lookup, model_names
 from halfspace_sss.checks import check_choice, check_interval
 from halfspace_sss.interface.model import no_models
 from halfspace_sss.progress import Progress
-from halfspace_sss.rendering.object.registry import learnt_names, lookup, model_names
 
 PACKAGES = ("figures", "full_geometry", "analytic_models", "halfspace_sss")
 MACHINERY = "figures.parts"  # keeps and orders what parts compute, and computes nothing of it
-RENDERS = "halfspace_sss.rendering.object.registry"  # is imported by all that finds models of objects
+RENDERS = "full_geometry.registry"  # is imported by all that finds models of objects
 NAMES = "halfspace_sss.extensions"  # knows the names of packages, and asks for none of what they offer
 ADDRESS = re.compile(r"[a-z_]\w*(?:\.\w+)+(?::\w+)?")  # "package.module" or "package.module:function"
 

@@ -12,11 +12,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from full_geometry.object.features import ObjectFrame, PreparedExit, Side
-from full_geometry.object.patches import Patches, PatchSampler, PatchTable, PatchWeights, mesh_faces
+from full_geometry.geometry.points import CosineProposals, EntrySample, Point, SurfacePoint, opaque, turned
+from full_geometry.objects.objects import TranslucentObject
+from full_geometry.transport.features import ObjectFrame, PreparedExit, Side
+from full_geometry.transport.patches import Patches, PatchSampler, PatchTable, PatchWeights, mesh_faces
 from halfspace_sss.neural.perceptron import Perceptron, relu
-from halfspace_sss.rendering.object.objects import TranslucentObject
-from halfspace_sss.rendering.object.points import CosineProposals, EntrySample, Point, SurfacePoint, opaque, turned
 
 # ---- The square [0, 1)² laid onto each patch of a surface, so that equal areas stay equal ----------
 # A patch has two axes, the principal ones of its faces. Along the first its faces are put together to strips; u_1

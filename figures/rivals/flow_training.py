@@ -25,15 +25,15 @@ from figures.rivals.flow import (
     context,
     direction_square,
 )
-from full_geometry.models.storing import Learnt
-from full_geometry.object.features import ObjectFrame, Side, first_event, side_features
-from full_geometry.object.pairs import trace_exits
-from full_geometry.object.patches import Patches
+from full_geometry.geometry.points import EntrySample, place
+from full_geometry.geometry.rounding import ray_from
+from full_geometry.objects.objects import TranslucentObject
+from full_geometry.transport.exit_pairs import trace_exits
+from full_geometry.transport.features import ObjectFrame, Side, first_event, side_features
+from full_geometry.transport.patches import Patches
+from full_geometry.transport.storing import Learnt
 from halfspace_sss.checks import check_count
 from halfspace_sss.neural.training.fit import CpuSchedule, Objective, Source, fit
-from halfspace_sss.rendering.object.objects import TranslucentObject
-from halfspace_sss.rendering.object.points import EntrySample, place
-from halfspace_sss.rendering.object.rounding import ray_from
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 # ---- Training of conditional flows by zuko: -E[T log p(x | context)] over walks --------------------

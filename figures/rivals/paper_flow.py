@@ -19,11 +19,11 @@ import torch
 import zuko
 
 from figures.rivals.paper_network import placed
-from full_geometry.models.object_model import FullGeometry
-from full_geometry.object.features import ObjectFrame
+from full_geometry.geometry.points import SurfacePoint, channel_mean, cosine_above, place, surface_point
+from full_geometry.objects.objects import TranslucentObject
+from full_geometry.transport.features import ObjectFrame
+from full_geometry.transport.one_object import FullGeometry
 from halfspace_sss.neural.training.fit import ADAM, CpuSchedule, Descent, Objective, fit
-from halfspace_sss.rendering.object.objects import TranslucentObject
-from halfspace_sss.rendering.object.points import SurfacePoint, channel_mean, cosine_above, place, surface_point
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 HIDDEN, LAYERS = (128, 128), 6

@@ -14,15 +14,15 @@ import numpy as np
 import torch
 from torch import nn
 
+from full_geometry.geometry.points import SurfacePoint
 from full_geometry.learning.model_errors import LOBES, POWER, ExitRadiance
-from full_geometry.models.storing import frame_of
-from full_geometry.object.features import ObjectFrame
-from full_geometry.object.pairs import trace_exits
+from full_geometry.objects.objects import TranslucentObject
+from full_geometry.transport.exit_pairs import trace_exits
+from full_geometry.transport.features import ObjectFrame
+from full_geometry.transport.storing import frame_of
 from halfspace_sss.checks import check_count
 from halfspace_sss.neural.training.fit import ADAM, CpuSchedule, Descent, Objective, Source, fit
 from halfspace_sss.progress import NamedProgress
-from halfspace_sss.rendering.object.objects import TranslucentObject
-from halfspace_sss.rendering.object.points import SurfacePoint
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 # ----------------------------------------------------------------------------------------------------

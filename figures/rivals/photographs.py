@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from halfspace_sss.rendering.scenes.scene_files import PATH_TRACED, load_scene
+from full_geometry.scenes.scene_files import PATH_TRACED, load_scene
 
 FAR, FOV = 5.0, 24.0  # distance of cameras over the radius of the object; degrees
 LEAST_HEIGHT = 0.05  # sine of the elevation of cameras

@@ -22,19 +22,19 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from full_geometry.models.object_model import HalfSpace
-from full_geometry.models.storing import KIND, find_weights, load
-from full_geometry.object.pairs import EntryProposals, trace_exits
-from full_geometry.object.patches import ExitTable
+from full_geometry.geometry.points import SurfacePoint, Transport, evaluate
+from full_geometry.objects.objects import TranslucentObject, object_of, refuse, refuse_textures
+from full_geometry.registry import check_model, lookup, model_names
+from full_geometry.settings import Settings
+from full_geometry.transport.exit_pairs import EntryProposals, trace_exits
+from full_geometry.transport.half_space import HalfSpaceTransport
+from full_geometry.transport.one_object import HalfSpace
+from full_geometry.transport.patches import ExitTable
+from full_geometry.transport.storing import KIND, find_weights, load
 from halfspace_sss.checks import check_count
 from halfspace_sss.interface.model import bssrdf
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.progress import NamedProgress
-from halfspace_sss.rendering.object.half_space import HalfSpaceTransport
-from halfspace_sss.rendering.object.objects import TranslucentObject, object_of, refuse, refuse_textures
-from halfspace_sss.rendering.object.points import SurfacePoint, Transport, evaluate
-from halfspace_sss.rendering.object.registry import check_model, lookup, model_names
-from halfspace_sss.rendering.object.settings import Settings
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 LOBES = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / np.sqrt(3.0)

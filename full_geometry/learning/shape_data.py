@@ -13,13 +13,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from full_geometry.geometry.points import SurfacePoint
 from full_geometry.learning.shapes import TRAINING, Family, make_shape
-from full_geometry.models.descriptors import ALONE, describe, end, medium, mixed
-from full_geometry.models.neural_shape import ALBEDO, ETA, SIZE, Backbone, G
-from full_geometry.object.pairs import EntryProposals, trace_exits
+from full_geometry.objects.objects import TranslucentObject, object_of
+from full_geometry.transport.any_shape import ALBEDO, ETA, SIZE, Backbone, G
+from full_geometry.transport.descriptors import ALONE, describe, end, medium, mixed
+from full_geometry.transport.exit_pairs import EntryProposals, trace_exits
 from halfspace_sss.physics.medium import Medium
-from halfspace_sss.rendering.object.objects import TranslucentObject, object_of
-from halfspace_sss.rendering.object.points import SurfacePoint
 from halfspace_sss.tracing.walk import generator, pass_seed
 
 # ---- Which shapes and media the network is trained on: drawn at random, each from its own seed -----

@@ -16,8 +16,9 @@ import torch
 from torch import nn
 
 from full_geometry.learning.shape_data import GroupedPairs, PairData, draw_object, grouped, make_data, mean_events
-from full_geometry.models.descriptors import CURVED_OWN, CURVED_SHARED, N_MEDIUM, N_OWN, N_SHARED
-from full_geometry.models.neural_shape import ALBEDO, ETA, KIND, LEAST, PLACE_OF_G, SIZE, WEIGHTS, G, most
+from full_geometry.scenes.learners import LearntShapes
+from full_geometry.transport.any_shape import ALBEDO, ETA, KIND, LEAST, PLACE_OF_G, SIZE, WEIGHTS, G, most
+from full_geometry.transport.descriptors import CURVED_OWN, CURVED_SHARED, N_MEDIUM, N_OWN, N_SHARED
 from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.neural.store import save_weights, to_json
 from halfspace_sss.neural.training import checkpoint
@@ -25,7 +26,6 @@ from halfspace_sss.neural.training.fit import Descent, cosine, warm_up
 from halfspace_sss.neural.training.work_folder import CHECKPOINT, claim
 from halfspace_sss.progress import NamedProgress
 from halfspace_sss.provenance import check_folder, provenance, write_atomically
-from halfspace_sss.rendering.scenes.learners import LearntShapes
 
 LAST_RATE, WARM_UP, AVERAGE = 0.01, 100, 0.9985
 MOST_OFF = 3.0  # of the light of a group: what is far too bright has its say by the likelihood
@@ -54,7 +54,7 @@ class ShapeRecipe:
         check_interval("rate", self.rate, 1e-8, 1.0)
 
 
-Recipe = ShapeRecipe  # its name in `full_geometry.neural_shape`
+Recipe = ShapeRecipe  # its name in `full_geometry.learning.shape_learner`
 STANDARD = Recipe()
 
 

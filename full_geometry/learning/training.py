@@ -16,7 +16,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from full_geometry.learning.fitting import PROPOSED, STANDARD, ObjectFit, Recipe
+from full_geometry.geometry.points import SurfacePoint, evaluate
 from full_geometry.learning.model_errors import (
     ExitRadiance,
     ExitTruth,
@@ -26,21 +26,21 @@ from full_geometry.learning.model_errors import (
     reference,
     traced,
 )
-from full_geometry.models import storing
-from full_geometry.models.object_model import FullGeometry
-from full_geometry.models.storing import frame_of, identify
-from full_geometry.object.features import n_local, n_pair, n_side
-from full_geometry.object.pairs import EntryProposals, Pairs, PairSource, WalkExits, shuffled
-from full_geometry.object.patches import Patches, PatchSampler, cluster
+from full_geometry.learning.network_fitting import PROPOSED, STANDARD, ObjectFit, Recipe
+from full_geometry.objects.objects import TranslucentObject, object_of
+from full_geometry.scenes.camera_walks import TRIAL
+from full_geometry.transport import storing
+from full_geometry.transport.exit_pairs import EntryProposals, Pairs, PairSource, WalkExits, shuffled
+from full_geometry.transport.features import n_local, n_pair, n_side
+from full_geometry.transport.one_object import FullGeometry
+from full_geometry.transport.patches import Patches, PatchSampler, cluster
+from full_geometry.transport.storing import frame_of, identify
 from halfspace_sss.backend import clock
 from halfspace_sss.checks import check_count, check_interval
 from halfspace_sss.neural.store import check_weights_folder, to_json
 from halfspace_sss.neural.training.work_folder import CHECKPOINT, claim
 from halfspace_sss.physics.medium import Medium
 from halfspace_sss.provenance import check_folder, provenance, write_atomically
-from halfspace_sss.rendering.object.objects import TranslucentObject, object_of
-from halfspace_sss.rendering.object.points import SurfacePoint, evaluate
-from halfspace_sss.rendering.scenes.camera_walks import TRIAL
 
 # ---- Where the learnt directional albedo is good enough for images ----------------------------
 # S sees the surface around both its points, alpha is a network of the exit alone, which misses what changes over a mean

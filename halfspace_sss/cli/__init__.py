@@ -1,10 +1,1 @@
-"""The command line `halfspace-sss`, one file per command."""
-
-__all__ = ["main"]
-
-
-def main() -> None:
-    """Run the command line; the entry point of `halfspace-sss`."""
-    from halfspace_sss.cli import app
-
-    app.main()
+"""Commands of the plane, one file each: curves, maps, bench, validate, lists of materials and models."""

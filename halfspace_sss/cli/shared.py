@@ -8,7 +8,6 @@ from __future__ import annotations
 import functools
 import inspect
 import math
-import signal
 import time
 import warnings
 from collections.abc import Callable, Iterator
@@ -19,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from halfspace_sss.backend import BackendError, prepare_llvm
+from halfspace_sss.backend import BackendError
 from halfspace_sss.cli.interrupts import interrupts
 
 if TYPE_CHECKING:
@@ -219,9 +218,7 @@ SensorNumber = Annotated[int, typer.Option(help="Number of the sensor.", parser=
 SampleSeed = Annotated[int, typer.Option(help="Seed of the samples.", parser=whole)]
 OutFolder = Annotated[Path, typer.Option(help="Folder for the files; those of the same names are replaced.")]
 Backend = Annotated[str, typer.Option(help="llvm or cuda.")]
-VARIANTS = ("llvm_ad_rgb", "llvm_ad_mono", "cuda_ad_rgb", "cuda_ad_mono")
 SPECTRAL = ("llvm_ad_spectral", "cuda_ad_spectral")
-Variant = Annotated[str, typer.Option(help="Variant of Mitsuba.")]
 Workers = Annotated[
     int | None,
     typer.Option(help="Processes that share the cores and the parts of the work.", parser=whole, show_default="none"),
@@ -297,50 +294,6 @@ def check_channel(channel: str | None, names: list[str]) -> None:
     """ValueError if channels are chosen and no material is."""
     if channel is not None and not names:
         raise ValueError(f"channel must be left out unless materials are named, got {channel!r}")
-
-
-def use_mitsuba(variant: str, known: tuple[str, ...] = VARIANTS) -> None:
-    """Mitsuba with our plugins, under a variant, one of those that a command knows."""
-    if variant not in known:
-        raise ValueError(f"variant must be one of {', '.join(known)}, got {variant!r}")
-    if variant.startswith("llvm"):
-        prepare_llvm()
-    try:
-        import mitsuba as mi
-    except ImportError as error:
-        raise BackendError('rendering needs Mitsuba 3: pip install "halfspace-sss[render]"') from error
-    from halfspace_sss import rendering
-
-    try:
-        mi.set_variant(variant)
-    except ImportError as error:
-        raise BackendError(f"variant {variant} does not run here: {error}") from error
-    rendering.register()
-    _hear_warnings()
-
-
-def _hear_warnings() -> None:
-    """Mitsuba's warnings as ours, on stderr: by itself it prints them among the results."""
-    import mitsuba as mi
-
-    class Lines(mi.Appender):
-        def __init__(self) -> None:
-            mi.Appender.__init__(self)
-
-        def append(self, level: Any, text: str) -> None:
-            if "Received interrupt signal" in text:  # while it renders Mitsuba listens in the place of Python
-                interrupts.received = interrupts.received or signal.SIGINT
-            elif level >= mi.LogLevel.Warn:
-                typer.echo(f"warning: {' '.join(text.split())}", err=True)
-
-        def log_progress(self, *_: Any) -> None:
-            pass
-
-    logger = mi.logger()
-    for part in ("date", "class", "thread", "log_level"):
-        getattr(logger.formatter(), f"set_has_{part}")(False)
-    logger.clear_appenders()
-    logger.add_appender(Lines())
 
 
 def defined(texts: list[str] | None) -> dict[str, str]:

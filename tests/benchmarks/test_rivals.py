@@ -27,11 +27,11 @@ from benchmarks.rivals_command import _errors_wide  # noqa: E402
 from benchmarks.tables import markdown  # noqa: E402
 from figures.rivals.flow import N_CONTEXT, Chart, ConditionalFlow, FlowSampler  # noqa: E402
 from figures.rivals.flow_training import FlowNetwork, FlowRecipe  # noqa: E402
-from full_geometry.learning.fitting import Recipe  # noqa: E402
+from full_geometry.geometry.points import EntrySample  # noqa: E402
 from full_geometry.learning.model_errors import LIGHTS, reference  # noqa: E402
-from full_geometry.object.features import n_side  # noqa: E402
-from halfspace_sss.rendering.object.objects import TranslucentObject, object_of  # noqa: E402
-from halfspace_sss.rendering.object.points import EntrySample  # noqa: E402
+from full_geometry.learning.network_fitting import Recipe  # noqa: E402
+from full_geometry.objects.objects import TranslucentObject, object_of  # noqa: E402
+from full_geometry.transport.features import n_side  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("rgb")

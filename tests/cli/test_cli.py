@@ -15,11 +15,11 @@ import pytest
 from typer.testing import CliRunner
 
 import halfspace_sss
+from figures import command_line as cli
 from halfspace_sss.backend import BackendError
-from halfspace_sss.cli import app as cli
 
 QUICK = ["curves", "--paths", "4096", "--theta-i", "0,60", "--model", "better_dipole"]
-START = [sys.executable, "-c", "from halfspace_sss.cli import main; main()"]
+START = [sys.executable, "-c", "from figures.command_line import main; main()"]
 
 
 def _invoke(*arguments: str) -> Any:
@@ -160,7 +160,7 @@ def test_typing_mistakes_end_with_2_and_name_what_was_meant(arguments: list[str]
 
 @pytest.mark.skipif(os.name == "nt", reason="POSIX signals")
 def test_an_interrupted_run_ends_with_130_and_leaves_no_file(tmp_path: Path) -> None:
-    code = "import halfspace_sss.cli.app; from halfspace_sss.cli import main; print('ready', flush=True); main()"
+    code = "import figures.command_line; from figures.command_line import main; print('ready', flush=True); main()"
     command = [sys.executable, "-c", code, "curves", "--paths", "4000000000"]
     process = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     assert process.stdout.readline() == "ready\n"

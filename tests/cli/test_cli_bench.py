@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 import halfspace_sss
-from halfspace_sss.cli import app as cli
+from figures import command_line as cli
 from halfspace_sss.cli import bench as cli_bench
 
 

@@ -18,7 +18,7 @@ pytestmark = pytest.mark.skipif(os.name == "nt", reason="POSIX signals")
 START = """
 import sys, time
 from halfspace_sss import materials
-from halfspace_sss.cli import app as cli
+from figures import command_line as cli
 def table():
 {body}
 materials.table = table
@@ -178,7 +178,7 @@ def test_a_signal_to_terminate_ends_in_order_too(tmp_path: Path) -> None:
 
 
 SCRIPT = """import sys
-from halfspace_sss.cli import main
+from figures.command_line import main
 sys.exit(main())
 """
 SITE = """

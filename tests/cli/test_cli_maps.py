@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
+from figures import command_line as cli
 from halfspace_sss import materials
-from halfspace_sss.cli import app as cli
 from halfspace_sss.maps.store import load_maps
 
 SMALL = ("--grid", "2,16,6,4", "--paths", "2048")

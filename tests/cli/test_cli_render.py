@@ -17,8 +17,8 @@ import pytest
 from render_files import BAD_SCENES, START, XML
 from typer.testing import CliRunner
 
-from halfspace_sss.cli import app as cli
-from halfspace_sss.cli import render as cli_render
+from figures import command_line as cli
+from full_geometry.cli import render as cli_render
 
 mi = pytest.importorskip("mitsuba")
 
@@ -36,7 +36,7 @@ def _render(file: Path, *arguments: str, out: str = "out") -> Any:
 
 
 def _spp(file: Path) -> int:
-    from halfspace_sss.rendering.scenes import reference
+    from full_geometry.scenes import reference
 
     return reference.load(file).spp
 
@@ -192,7 +192,7 @@ def test_an_integrator_that_does_not_know_the_inside_is_warned_of(scene: Path) -
 
 
 def test_a_warning_of_mitsuba_is_a_line_on_stderr(scene: Path, monkeypatch: Any) -> None:
-    from halfspace_sss.rendering.scenes import scene_files
+    from full_geometry.scenes import scene_files
 
     load = scene_files.open_scene
 

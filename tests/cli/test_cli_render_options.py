@@ -15,9 +15,9 @@ from PIL import Image
 from render_files import INTEGRATOR, SENSOR, XML
 from typer.testing import CliRunner
 
-from halfspace_sss.cli import app as cli
-from halfspace_sss.cli import render as cli_render
-from halfspace_sss.rendering.scenes import reference
+from figures import command_line as cli
+from full_geometry.cli import render as cli_render
+from full_geometry.scenes import reference
 
 mi = pytest.importorskip("mitsuba")
 

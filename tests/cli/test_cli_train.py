@@ -10,8 +10,8 @@ import pandas
 import pytest
 from typer.testing import CliRunner
 
+from figures import command_line as cli
 from halfspace_sss import bssrdf, materials
-from halfspace_sss.cli import app as cli
 from halfspace_sss.maps import noisy_maps
 from halfspace_sss.maps.noisy_maps import CellGrid
 from halfspace_sss.materials import registry

@@ -39,7 +39,7 @@ from pathlib import Path
 import matplotlib.pyplot, pandas, scipy.interpolate, torch, zarr  # once for all runs: each is a fork
 from halfspace_sss.cli import shared
 from figures.parts import command
-from halfspace_sss.cli import app as cli
+from figures import command_line as cli
 cli._app()
 command.MOST_WORKERS = 1  # the process that is interrupted writes the files, and no other has written some by then
 gc.freeze()

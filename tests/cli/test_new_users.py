@@ -12,15 +12,15 @@ import pytest
 from typer.testing import CliRunner
 
 import halfspace_sss as sss
-from halfspace_sss.cli import app as cli
+from figures import command_line as cli
+from full_geometry.trade import recommend
 from halfspace_sss.provenance import read_text
-from halfspace_sss.trade import recommend
 
 MEDIUM = sss.Medium.from_albedo(0.75, 0.241)
 QUICK = {"models": ["better_dipole"], "n_paths": 2000, "theta_i_deg": [0.0]}
 
 
-def _run(*arguments: str, program: tuple[str, ...] = ("-m", "halfspace_sss"), **environment: str):
+def _run(*arguments: str, program: tuple[str, ...] = ("-m", "figures.command_line"), **environment: str):
     environment = {**os.environ, **environment}
     return subprocess.run([sys.executable, *program, *arguments], capture_output=True, env=environment, timeout=300)
 
@@ -48,7 +48,7 @@ def test_a_terminal_without_unicode_shows_every_table() -> None:
 
 def test_help_of_the_surface_works_before_it_is_registered() -> None:
     pytest.importorskip("mitsuba")
-    code = "import halfspace_sss; from halfspace_sss import rendering; help(halfspace_sss.rendering.object.translucent)"
+    code = "import halfspace_sss; import full_geometry; help(full_geometry.surface.translucent)"
     assert b"The Mitsuba surface `translucent`" in _run(program=("-c", code)).stdout
 
 
@@ -111,10 +111,10 @@ def test_curves_are_drawn_by_themselves(curve_set) -> None:
 
 def test_both_integrators_warn_of_a_size_that_speaks_of_another_unit() -> None:
     mi = pytest.importorskip("mitsuba")
-    from halfspace_sss import rendering
+    import full_geometry
 
     mi.set_variant("llvm_ad_rgb")
-    rendering.register()
+    full_geometry.register()
     ball = {"type": "sphere", "bsdf": {"type": "translucent", "sigma_s": 1e4, "sigma_a": 1e4, "model": "lambert"}}
     view = mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0])
     film = {"type": "hdrfilm", "width": 2, "height": 2}
@@ -128,10 +128,10 @@ def test_both_integrators_warn_of_a_size_that_speaks_of_another_unit() -> None:
 @pytest.mark.parametrize("integrator", ["bssrdf", "translucent_walk"])
 def test_a_mesh_without_faces_is_refused_in_a_sentence(integrator: str, tmp_path: Path) -> None:
     mi = pytest.importorskip("mitsuba")
-    from halfspace_sss import rendering
+    import full_geometry
 
     mi.set_variant("llvm_ad_rgb")
-    rendering.register()
+    full_geometry.register()
     (tmp_path / "empty.ply").write_text(
         "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
         "element face 0\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n1 0 0\n0 1 0\n"
@@ -179,7 +179,7 @@ def test_a_store_without_a_name_is_refused() -> None:
 
 def test_without_a_variant_of_mitsuba_a_scene_is_refused_with_what_to_do() -> None:
     pytest.importorskip("mitsuba")
-    code = "from halfspace_sss.trade import recommend; recommend('ball.xml')"
+    code = "from full_geometry.trade import recommend; recommend('ball.xml')"
     found = _run(program=("-c", code)).stderr.decode().strip().splitlines()
     assert found[-1].startswith("ValueError: a variant of Mitsuba must be set before a scene is looked at, got none: ")
     assert "mitsuba.set_variant('llvm_ad_rgb')" in found[-1]

@@ -13,10 +13,11 @@ pytest.importorskip("igl")
 
 from figures.rivals import deng  # noqa: E402
 from figures.rivals.photographs import Poses, Studio, lobe  # noqa: E402
+from full_geometry.geometry.points import SurfacePoint  # noqa: E402
+from full_geometry.objects.objects import TranslucentObject  # noqa: E402
+from full_geometry.settings import Settings  # noqa: E402
+from full_geometry.transport.prepare import make_objects  # noqa: E402
 from halfspace_sss.physics.fresnel import C_1, F_t  # noqa: E402
-from halfspace_sss.rendering.object.objects import TranslucentObject, make_objects  # noqa: E402
-from halfspace_sss.rendering.object.points import SurfacePoint  # noqa: E402
-from halfspace_sss.rendering.object.settings import Settings  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("quiet_rgb")
@@ -103,9 +104,9 @@ def test_the_fit_of_deng_finds_two_colours_in_photographs_that_its_model_has_mad
 
 
 def test_lobes_of_photographs_have_irradiance_one_and_look_where_poses_say() -> None:
-    import halfspace_sss.rendering
+    import full_geometry
 
-    halfspace_sss.rendering.register()
+    full_geometry.register()
     studio = Studio({"ball": {"type": "sphere", "bsdf": {"type": "translucent", "albedo": "0.5", "sigma_t": "9"}}},
                     "ball", 8, 3, 0)  # fmt: skip
     theta = (np.arange(len(lobe())) + 0.5) / len(lobe()) * np.pi

@@ -9,9 +9,9 @@ mi = pytest.importorskip("mitsuba")
 pytest.importorskip("torch")
 
 from figures.rivals import distant_light  # noqa: E402
+from full_geometry.objects.objects import TranslucentObject, object_of  # noqa: E402
 from halfspace_sss import Medium  # noqa: E402
 from halfspace_sss.physics.fresnel import F_t  # noqa: E402
-from halfspace_sss.rendering.object.objects import TranslucentObject, object_of  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("quiet_rgb")

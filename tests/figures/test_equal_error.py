@@ -18,7 +18,7 @@ from figures.computing.timed import TimedRender, rendered
 from figures.drawing import error_tables
 from figures.parts.part import Part, Result, Task
 from full_geometry.learning import training
-from full_geometry.learning.fitting import Recipe
+from full_geometry.learning.network_fitting import Recipe
 from halfspace_sss import materials
 
 mi = pytest.importorskip("mitsuba")

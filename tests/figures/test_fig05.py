@@ -16,7 +16,7 @@ pytest.importorskip("torch")
 from figures import fig05  # noqa: E402
 from figures.parts.part import Part, Result, Task  # noqa: E402
 from full_geometry.learning import training  # noqa: E402
-from full_geometry.learning.fitting import Recipe  # noqa: E402
+from full_geometry.learning.network_fitting import Recipe  # noqa: E402
 
 pytestmark = pytest.mark.slow
 

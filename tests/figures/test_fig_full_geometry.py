@@ -19,7 +19,7 @@ from figures.parts import runner  # noqa: E402
 from figures.parts.part import Result, keys_of  # noqa: E402
 from figures.rivals import distant_light  # noqa: E402
 from full_geometry.learning import training  # noqa: E402
-from full_geometry.learning.fitting import Recipe  # noqa: E402
+from full_geometry.learning.network_fitting import Recipe  # noqa: E402
 
 pytestmark = pytest.mark.slow
 
@@ -142,7 +142,7 @@ def test_fig_11_gives_the_full_geometry_the_same_time_and_a_denoised_image(small
 
 
 def test_weights_of_another_training_are_not_found(small: None, tmp_path: Path) -> None:
-    from halfspace_sss.rendering.scenes.scene_files import load_scene
+    from full_geometry.scenes.scene_files import load_scene
 
     scenes.prepare()
     scene = scenes.bunny_scene("ketchup", 8)

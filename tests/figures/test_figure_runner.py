@@ -17,10 +17,10 @@ import pytest
 from typer.testing import CliRunner
 
 import figures
+from figures import command_line as cli
 from figures.parts import command
 from figures.parts.part import Part, Result, Task
 from figures.parts.runner import completed_plans, compute, draw, figure, plan
-from halfspace_sss.cli import app as cli
 
 CALLS: list[str] = []  # which parts were computed, in turn
 

@@ -16,8 +16,8 @@ import pytest
 import figures
 from figures.computing.contenders import long_walk
 from figures.parts.part import PACKAGES, Task, modules_of, unmodelled
+from full_geometry.registry import lookup
 from halfspace_sss.interface.model import model_class
-from halfspace_sss.rendering.object.registry import lookup
 
 ROOT = Path(figures.__file__).resolve().parent.parent
 
@@ -48,18 +48,18 @@ print(json.dumps(found))
 """
 EDIT = "\nEDITED = 1\n"
 EDITS = {
-    "walk": [("halfspace_sss/rendering/walk/path_loop.py", EDIT)],
+    "walk": [("full_geometry/integrators/walk_paths.py", EDIT)],
     "dipole": [("analytic_models/better_dipole.py", EDIT)],
     "dipoles": [("analytic_models/_diffusion.py", EDIT)],
     "network": [("halfspace_sss/neural/universal.py", EDIT)],
     "full geometry": [("full_geometry/scene.py", "\nENTRIES, FINE = 3, 9.5\n")],
     "shapes": [("full_geometry/models/neural_shape.py", EDIT)],
     "learner": [("full_geometry/learning/fitting.py", EDIT)],
-    "lambert": [("halfspace_sss/rendering/object/lambert.py", EDIT)],
-    "choice": [("halfspace_sss/trade/automatic.py", EDIT)],
+    "lambert": [("full_geometry/transport/lambert.py", EDIT)],
+    "choice": [("full_geometry/trade/automatic.py", EDIT)],
     "far": [("halfspace_sss/physics/fresnel.py", EDIT)],
     "nothing": [  # last: what was edited before and is no more changes nothing either
-        ("halfspace_sss/rendering/walk/path_loop.py", "\n# edited\n"),
+        ("full_geometry/integrators/walk_paths.py", "\n# edited\n"),
         ("figures/drawing/style.py", EDIT),
         ("figures/fig09.py", EDIT),
     ],
@@ -144,4 +144,4 @@ def test_path_tracing_finds_no_model(tmp_path: Path) -> None:
 
 
 def test_a_name_that_a_package_imports_late_counts_with_its_module() -> None:
-    assert "halfspace_sss.rendering.plugins" in modules_of(["figures.computing.scenes"])
+    assert "full_geometry.scenes.plugins" in modules_of(["figures.computing.scenes"])

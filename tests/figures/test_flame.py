@@ -17,21 +17,22 @@ dr = pytest.importorskip("drjit")
 pytest.importorskip("torch")
 pytest.importorskip("igl")
 
+import full_geometry  # noqa: E402
 from figures.modelling.candle import make_candle  # noqa: E402
 from figures.modelling.objects import FLAME_RADIANCE  # noqa: E402
-from full_geometry.learning.fitting import Recipe  # noqa: E402
-from full_geometry.learning.model_errors import LIGHTS  # noqa: E402
-from full_geometry.learning.training import Trained, train  # noqa: E402
-from halfspace_sss import Medium, rendering  # noqa: E402
-from halfspace_sss.neural.store import ENVIRONMENT_VARIABLE  # noqa: E402
-from halfspace_sss.rendering.object.points import (  # noqa: E402
+from full_geometry.geometry.points import (  # noqa: E402
     AreaPoints,  # noqa: E402
     EntrySample,
     place,
     turned,
 )
-from halfspace_sss.rendering.paths.path_loop import exit_at  # noqa: E402
-from halfspace_sss.rendering.scenes.scene_files import load_scene  # noqa: E402
+from full_geometry.integrators.surface_paths import exit_at  # noqa: E402
+from full_geometry.learning.model_errors import LIGHTS  # noqa: E402
+from full_geometry.learning.network_fitting import Recipe  # noqa: E402
+from full_geometry.learning.training import Trained, train  # noqa: E402
+from full_geometry.scenes.scene_files import load_scene  # noqa: E402
+from halfspace_sss import Medium  # noqa: E402
+from halfspace_sss.neural.store import ENVIRONMENT_VARIABLE  # noqa: E402
 
 pytestmark = pytest.mark.slow
 
@@ -50,7 +51,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory):
     for name in ("wax", "wick", "flame"):
         getattr(made, name).write_ply(found / f"{name}.ply")
     mi.set_variant("llvm_ad_rgb")
-    rendering.register()
+    full_geometry.register()
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv(ENVIRONMENT_VARIABLE, str(found))
         yield found

@@ -29,7 +29,18 @@ from figures.rivals.flow import (  # noqa: E402  # noqa: E402  # noqa: E402
     draw_by,
 )
 from figures.rivals.flow_training import FlowNetwork  # noqa: E402
-from full_geometry.models.storing import (  # noqa: E402
+from full_geometry.geometry.points import SurfacePoint  # noqa: E402
+from full_geometry.scenes.scene_files import load_scene  # noqa: E402
+from full_geometry.transport.features import (  # noqa: E402
+    PreparedExit,
+    Side,
+    Terms,
+    first_event,  # noqa: E402
+    n_pair,
+    n_side,
+)
+from full_geometry.transport.patches import LearntProposals, PatchTable, cluster, mesh_faces  # noqa: E402
+from full_geometry.transport.storing import (  # noqa: E402
     CENTRES,
     CHECKSUMS,
     ENDS,
@@ -38,17 +49,6 @@ from full_geometry.models.storing import (  # noqa: E402
     identify,  # noqa: E402
     save,
 )
-from full_geometry.object.features import (  # noqa: E402
-    PreparedExit,
-    Side,
-    Terms,
-    first_event,  # noqa: E402
-    n_pair,
-    n_side,
-)
-from full_geometry.object.patches import LearntProposals, PatchTable, cluster, mesh_faces  # noqa: E402
-from halfspace_sss.rendering.object.points import SurfacePoint  # noqa: E402
-from halfspace_sss.rendering.scenes.scene_files import load_scene  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("rgb")

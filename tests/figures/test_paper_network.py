@@ -19,10 +19,10 @@ from waxen import WAX, wax_bunny  # noqa: E402
 from figures.rivals import paper_network as paper  # noqa: E402
 from figures.rivals.paper_flow import incidence, irradiance, lit_incidence, mesh_arrays, on_surface, rmsd  # noqa: E402
 from figures.rivals.paper_network import measured_lights, random_lights  # noqa: E402
+from full_geometry.geometry.points import SurfacePoint  # noqa: E402
 from full_geometry.learning.model_errors import compare, reference  # noqa: E402
-from full_geometry.models.storing import frame_of  # noqa: E402
-from halfspace_sss.rendering.object.objects import TranslucentObject, object_of  # noqa: E402
-from halfspace_sss.rendering.object.points import SurfacePoint  # noqa: E402
+from full_geometry.objects.objects import TranslucentObject, object_of  # noqa: E402
+from full_geometry.transport.storing import frame_of  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("rgb")

@@ -12,25 +12,25 @@ from waxen import WAX
 mi = pytest.importorskip("mitsuba")
 pytest.importorskip("torch")
 
+from full_geometry.geometry.points import SurfacePoint  # noqa: E402
 from full_geometry.learning import training  # noqa: E402
-from full_geometry.learning.fitting import Recipe  # noqa: E402
+from full_geometry.learning.learnt import learnt_model  # noqa: E402
 from full_geometry.learning.model_errors import (  # noqa: E402
     LIGHTS,
     measure,
     reference,  # noqa: E402
 )
+from full_geometry.learning.network_fitting import Recipe  # noqa: E402
 from full_geometry.learning.training import Trained, train  # noqa: E402
-from full_geometry.models import neural_shape as shapes  # noqa: E402
-from full_geometry.models import storing  # noqa: E402
-from full_geometry.models.object_model import HalfSpace  # noqa: E402
-from full_geometry.object.pairs import EntryProposals  # noqa: E402
-from full_geometry.scene import learnt_model  # noqa: E402
+from full_geometry.objects.objects import TranslucentObject, object_of  # noqa: E402
+from full_geometry.settings import Settings  # noqa: E402
+from full_geometry.transport import any_shape as shapes  # noqa: E402
+from full_geometry.transport import storing  # noqa: E402
+from full_geometry.transport.exit_pairs import EntryProposals  # noqa: E402
+from full_geometry.transport.one_object import HalfSpace  # noqa: E402
 from halfspace_sss import Medium  # noqa: E402
 from halfspace_sss.neural import store as known_weights  # noqa: E402
 from halfspace_sss.neural.store import load_weights, save_weights  # noqa: E402
-from halfspace_sss.rendering.object.objects import TranslucentObject, object_of  # noqa: E402
-from halfspace_sss.rendering.object.points import SurfacePoint  # noqa: E402
-from halfspace_sss.rendering.object.settings import Settings  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("mono")

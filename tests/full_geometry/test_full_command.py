@@ -17,13 +17,13 @@ from typer.testing import CliRunner
 pytest.importorskip("mitsuba")
 pytest.importorskip("torch")
 
-from full_geometry import command  # noqa: E402
+from figures import command_line as cli  # noqa: E402
 from full_geometry.learning import model_errors, training  # noqa: E402
-from full_geometry.learning.fitting import Recipe  # noqa: E402
-from halfspace_sss.cli import app as cli  # noqa: E402
+from full_geometry.learning import object_learner as command  # noqa: E402
+from full_geometry.learning.network_fitting import Recipe  # noqa: E402
+from full_geometry.objects.objects import object_of  # noqa: E402
 from halfspace_sss.neural import store as known_weights  # noqa: E402
 from halfspace_sss.neural.store import load_weights  # noqa: E402
-from halfspace_sss.rendering.object.objects import object_of  # noqa: E402
 
 QUICK = Recipe(width=24, depth=2, batch=1024, chunk=2**13, reuse=4)
 TRAIN, REFERENCE = training.train, model_errors.reference

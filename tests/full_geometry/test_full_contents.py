@@ -16,25 +16,25 @@ dr = pytest.importorskip("drjit")
 mi = pytest.importorskip("mitsuba")
 pytest.importorskip("torch")
 
-from full_geometry import command  # noqa: E402
-from full_geometry.learning.fitting import Recipe  # noqa: E402
+import full_geometry  # noqa: E402
+from full_geometry.geometry.points import ObjectModel, SurfacePoint, refract_in  # noqa: E402
+from full_geometry.geometry.sensors import camera_rays  # noqa: E402
+from full_geometry.integrators.walk_paths import FirstExits  # noqa: E402
+from full_geometry.learning import object_learner as command  # noqa: E402
 from full_geometry.learning.model_errors import EVEN_SKY, errors_of  # noqa: E402
+from full_geometry.learning.network_fitting import Recipe  # noqa: E402
 from full_geometry.learning.training import Trained, train  # noqa: E402
-from full_geometry.models.storing import find_weights, identify, weights_name  # noqa: E402
-from full_geometry.object.features import first_event  # noqa: E402
-from full_geometry.object.pairs import trace_exits  # noqa: E402
-from halfspace_sss import rendering  # noqa: E402
+from full_geometry.objects import objects  # noqa: E402
+from full_geometry.objects.objects import object_of  # noqa: E402
+from full_geometry.scenes.mitsuba_scene import medium, with_media  # noqa: E402
+from full_geometry.trade import assess  # noqa: E402
+from full_geometry.transport.exit_pairs import trace_exits  # noqa: E402
+from full_geometry.transport.features import first_event  # noqa: E402
+from full_geometry.transport.half_space import half_space_model  # noqa: E402
+from full_geometry.transport.storing import find_weights, identify, weights_name  # noqa: E402
+from full_geometry.walk.media import WalkMedia  # noqa: E402
 from halfspace_sss.neural import store as known_weights  # noqa: E402
-from halfspace_sss.rendering.object import objects  # noqa: E402
-from halfspace_sss.rendering.object.half_space import half_space_model  # noqa: E402
-from halfspace_sss.rendering.object.objects import object_of  # noqa: E402
-from halfspace_sss.rendering.object.points import ObjectModel, SurfacePoint, refract_in  # noqa: E402
-from halfspace_sss.rendering.object.sensors import camera_rays  # noqa: E402
-from halfspace_sss.rendering.scenes.mitsuba_scene import medium, with_media  # noqa: E402
-from halfspace_sss.rendering.walk.media import WalkMedia  # noqa: E402
-from halfspace_sss.rendering.walk.path_loop import FirstExits  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
-from halfspace_sss.trade import assess  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -279,7 +279,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Any:
     """Of an object with a stone and a second medium inside."""
     folder = tmp_path_factory.mktemp("weights")
     mi.set_variant("llvm_ad_rgb")
-    rendering.register()
+    full_geometry.register()
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv(known_weights.ENVIRONMENT_VARIABLE, str(folder))
         yield train(mi.load_dict(scene(both())), chunks=CHUNKS, recipe=QUICK, folder=folder)

@@ -8,10 +8,10 @@ import pytest
 mi = pytest.importorskip("mitsuba")
 torch = pytest.importorskip("torch")
 
-from full_geometry.learning import fitting as ends  # noqa: E402
-from full_geometry.learning.fitting import Ends  # noqa: E402
-from full_geometry.object.features import Quadratic, Terms, n_side  # noqa: E402
-from full_geometry.object.pairs import AlbedoSamples, Pairs, shuffled  # noqa: E402
+from full_geometry.learning import network_fitting as ends  # noqa: E402
+from full_geometry.learning.network_fitting import Ends  # noqa: E402
+from full_geometry.transport.exit_pairs import AlbedoSamples, Pairs, shuffled  # noqa: E402
+from full_geometry.transport.features import Quadratic, Terms, n_side  # noqa: E402
 
 N = n_side(1)
 

@@ -14,10 +14,10 @@ from halfspace_sss.tracing.walk import generator, pass_seed
 
 mi = pytest.importorskip("mitsuba")
 
-from full_geometry.object.features import first_event  # noqa: E402
-from full_geometry.object.pairs import trace_exits  # noqa: E402
-from halfspace_sss.rendering.object.objects import TranslucentObject, object_of  # noqa: E402
-from halfspace_sss.rendering.object.points import SurfacePoint, refract_in  # noqa: E402
+from full_geometry.geometry.points import SurfacePoint, refract_in  # noqa: E402
+from full_geometry.objects.objects import TranslucentObject, object_of  # noqa: E402
+from full_geometry.transport.exit_pairs import trace_exits  # noqa: E402
+from full_geometry.transport.features import first_event  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

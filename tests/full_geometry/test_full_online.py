@@ -21,21 +21,21 @@ pytest.importorskip("torch")
 
 import drjit as dr  # noqa: E402
 
+import full_geometry  # noqa: E402
+from figures import command_line as cli  # noqa: E402
+from full_geometry.cli import render as cli_render  # noqa: E402
+from full_geometry.geometry.points import SurfacePoint  # noqa: E402
 from full_geometry.learning import training  # noqa: E402
-from full_geometry.learning.fitting import Recipe  # noqa: E402
+from full_geometry.learning.network_fitting import Recipe  # noqa: E402
 from full_geometry.learning.training import CameraSchedule  # noqa: E402
-from full_geometry.object.pairs import trace_exits  # noqa: E402
-from halfspace_sss import rendering  # noqa: E402
-from halfspace_sss.cli import app as cli  # noqa: E402
-from halfspace_sss.cli import render as cli_render  # noqa: E402
+from full_geometry.objects.objects import object_of  # noqa: E402
+from full_geometry.scenes import camera_walks, online, reference  # noqa: E402
+from full_geometry.scenes.combined import combined  # noqa: E402
+from full_geometry.scenes.reference_store import Reference  # noqa: E402
+from full_geometry.scenes.scene_files import open_scene  # noqa: E402
+from full_geometry.transport.exit_pairs import trace_exits  # noqa: E402
 from halfspace_sss.neural import store as known_weights  # noqa: E402
 from halfspace_sss.neural.store import load_weights  # noqa: E402
-from halfspace_sss.rendering.object.objects import object_of  # noqa: E402
-from halfspace_sss.rendering.object.points import SurfacePoint  # noqa: E402
-from halfspace_sss.rendering.scenes import camera_walks, online, reference  # noqa: E402
-from halfspace_sss.rendering.scenes.combined import combined  # noqa: E402
-from halfspace_sss.rendering.scenes.reference_store import Reference  # noqa: E402
-from halfspace_sss.rendering.scenes.scene_files import open_scene  # noqa: E402
 
 QUICK = Recipe(width=24, depth=2, batch=1024, chunk=2**13, reuse=4)
 TRAIN = training.train
@@ -58,7 +58,7 @@ IMAGE, WALKS, MODEL = (Path("render") / f"ball_scene.{ending}" for ending in ("e
 def _patch(patch: pytest.MonkeyPatch, folder: Path) -> None:
     """A recipe of seconds and a scene, in an empty folder, where weights are looked for too."""
     mi.set_variant("llvm_ad_rgb")
-    rendering.register()
+    full_geometry.register()
     patch.setattr(training, "train", lambda *a, **how: TRAIN(*a, **{**how, "recipe": QUICK, "chunks": 4}))
     for name, value in {"CHECKPOINT_EVERY": 0.0, "EXITS": 32, "WALKS": 256, "SAMPLES": 64}.items():
         patch.setattr(training, name, value)

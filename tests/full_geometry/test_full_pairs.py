@@ -16,11 +16,9 @@ from halfspace_sss import Medium
 mi = pytest.importorskip("mitsuba")
 torch = pytest.importorskip("torch")
 
-from full_geometry.learning.fitting import STANDARD, ObjectFit  # noqa: E402
-from full_geometry.models.object_model import HalfSpace  # noqa: E402
-from full_geometry.models.storing import frame_of  # noqa: E402
-from full_geometry.object.features import n_pair, n_side  # noqa: E402
-from full_geometry.object.pairs import (  # noqa: E402
+from full_geometry.learning.network_fitting import STANDARD, ObjectFit  # noqa: E402
+from full_geometry.objects.objects import object_of  # noqa: E402
+from full_geometry.transport.exit_pairs import (  # noqa: E402
     ENOUGH,
     AlbedoSamples,
     EntryProposals,
@@ -28,7 +26,9 @@ from full_geometry.object.pairs import (  # noqa: E402
     PairSource,
     trace_exits,  # noqa: E402
 )
-from halfspace_sss.rendering.object.objects import object_of  # noqa: E402
+from full_geometry.transport.features import n_pair, n_side  # noqa: E402
+from full_geometry.transport.one_object import HalfSpace  # noqa: E402
+from full_geometry.transport.storing import frame_of  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("rgb")

@@ -18,22 +18,22 @@ pytest.importorskip("torch")
 
 from waxen import WAX, random_patches, wax_bunny  # noqa: E402
 
-from full_geometry.learning.fitting import Recipe  # noqa: E402
-from full_geometry.learning.training import train  # noqa: E402
-from full_geometry.models.object_model import HalfSpace  # noqa: E402
-from full_geometry.models.storing import frame_of  # noqa: E402
-from full_geometry.object.features import (  # noqa: E402
-    Side,
-    first_event,
-)
-from full_geometry.object.pairs import EntryProposals  # noqa: E402
-from full_geometry.object.patches import Patches, PatchSampler, PatchTable, cluster, mesh_faces  # noqa: E402
-from halfspace_sss.rendering.object.objects import TranslucentObject, object_of  # noqa: E402
-from halfspace_sss.rendering.object.points import (  # noqa: E402
+from full_geometry.geometry.points import (  # noqa: E402
     SurfacePoint,  # noqa: E402
     cosine_direction,
     surface_point,
 )
+from full_geometry.learning.network_fitting import Recipe  # noqa: E402
+from full_geometry.learning.training import train  # noqa: E402
+from full_geometry.objects.objects import TranslucentObject, object_of  # noqa: E402
+from full_geometry.transport.exit_pairs import EntryProposals  # noqa: E402
+from full_geometry.transport.features import (  # noqa: E402
+    Side,
+    first_event,
+)
+from full_geometry.transport.one_object import HalfSpace  # noqa: E402
+from full_geometry.transport.patches import Patches, PatchSampler, PatchTable, cluster, mesh_faces  # noqa: E402
+from full_geometry.transport.storing import frame_of  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("rgb")

@@ -20,27 +20,27 @@ mi = pytest.importorskip("mitsuba")
 torch = pytest.importorskip("torch")
 import drjit as dr  # noqa: E402
 
+import full_geometry  # noqa: E402
 from full_geometry.learning import training  # noqa: E402
-from full_geometry.learning.fitting import ALPHA_HIDDEN, Recipe  # noqa: E402
 from full_geometry.learning.model_errors import (  # noqa: E402
     EVEN_SKY,
     LIGHTS,
     errors_of,
     reference,  # noqa: E402
 )
+from full_geometry.learning.network_fitting import ALPHA_HIDDEN, Recipe  # noqa: E402
 from full_geometry.learning.training import Trained, train, trusted  # noqa: E402
-from full_geometry.models import storing  # noqa: E402
-from full_geometry.models.object_model import BOUND  # noqa: E402
-from full_geometry.object.features import (  # noqa: E402
+from full_geometry.objects.objects import object_of  # noqa: E402
+from full_geometry.scenes.scene_files import load_objects, load_scene  # noqa: E402
+from full_geometry.transport import storing  # noqa: E402
+from full_geometry.transport.exit_pairs import trace_exits  # noqa: E402
+from full_geometry.transport.features import (  # noqa: E402
     Quadratic,
     first_event,  # noqa: E402
     n_side,
 )
-from full_geometry.object.pairs import trace_exits  # noqa: E402
-from halfspace_sss import rendering  # noqa: E402
+from full_geometry.transport.one_object import BOUND  # noqa: E402
 from halfspace_sss.neural.store import load_weights, save_weights  # noqa: E402
-from halfspace_sss.rendering.object.objects import object_of  # noqa: E402
-from halfspace_sss.rendering.scenes.scene_files import load_objects, load_scene  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("rgb")
@@ -56,7 +56,7 @@ SURFACE = {"type": "translucent", **COLOURS, "model": "full_geometry", "orders":
 @pytest.fixture(scope="module")
 def trained(folder: Path) -> Trained:
     mi.set_variant("llvm_ad_rgb")
-    rendering.register()
+    full_geometry.register()
     return train(mi.load_dict(bunny()), WAX, chunks=CHUNKS, recipe=QUICK, folder=folder)
 
 

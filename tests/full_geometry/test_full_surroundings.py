@@ -14,8 +14,9 @@ mi.set_variant("llvm_ad_rgb")
 
 from waxen import BUNNY, WAX, wax_bunny  # noqa: E402
 
-from full_geometry.models.storing import frame_of, identify  # noqa: E402
-from full_geometry.object.features import (  # noqa: E402
+from full_geometry.geometry.points import surface_point  # noqa: E402
+from full_geometry.objects.objects import TranslucentObject, object_of  # noqa: E402
+from full_geometry.transport.features import (  # noqa: E402
     EVENT,
     FIELDS,
     POINT,
@@ -27,9 +28,8 @@ from full_geometry.object.features import (  # noqa: E402
     pair_features,
     side_features,
 )
+from full_geometry.transport.storing import frame_of, identify  # noqa: E402
 from halfspace_sss import Medium  # noqa: E402
-from halfspace_sss.rendering.object.objects import TranslucentObject, object_of  # noqa: E402
-from halfspace_sss.rendering.object.points import surface_point  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
 DENSE = Medium(np.array([9.5, 9.0, 8.0]), np.array([0.5, 1.0, 2.0]), 0.0, 1.4)  # 10 / mm

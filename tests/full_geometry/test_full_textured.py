@@ -13,15 +13,15 @@ import pytest
 mi = pytest.importorskip("mitsuba")
 pytest.importorskip("torch")
 
-from full_geometry.learning.fitting import Recipe  # noqa: E402
+import full_geometry  # noqa: E402
 from full_geometry.learning.model_errors import LIGHTS, transport_of  # noqa: E402
+from full_geometry.learning.network_fitting import Recipe  # noqa: E402
 from full_geometry.learning.training import Trained, train  # noqa: E402
-from full_geometry.models import storing  # noqa: E402
-from full_geometry.models.object_model import HalfSpace  # noqa: E402
-from full_geometry.object.pairs import trace_exits  # noqa: E402
-from halfspace_sss import rendering  # noqa: E402
-from halfspace_sss.rendering.object.objects import TranslucentObject, object_of  # noqa: E402
-from halfspace_sss.rendering.scenes.scene_files import load_objects  # noqa: E402
+from full_geometry.objects.objects import TranslucentObject, object_of  # noqa: E402
+from full_geometry.scenes.scene_files import load_objects  # noqa: E402
+from full_geometry.transport import storing  # noqa: E402
+from full_geometry.transport.exit_pairs import trace_exits  # noqa: E402
+from full_geometry.transport.one_object import HalfSpace  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("rgb")
@@ -59,7 +59,7 @@ def painted(*media: tuple, **more) -> TranslucentObject:
 @pytest.fixture(scope="module")
 def trained(folder: Path) -> Trained:
     mi.set_variant("llvm_ad_rgb")
-    rendering.register()
+    full_geometry.register()
     return train(painted(PALE, DARK), chunks=CHUNKS, recipe=QUICK, folder=folder)
 
 

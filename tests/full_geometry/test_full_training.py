@@ -18,8 +18,8 @@ mi = pytest.importorskip("mitsuba")
 torch = pytest.importorskip("torch")
 
 import full_geometry  # noqa: E402
+from full_geometry.geometry.points import SurfacePoint  # noqa: E402
 from full_geometry.learning import training  # noqa: E402
-from full_geometry.learning.fitting import Correction, Recipe  # noqa: E402
 from full_geometry.learning.model_errors import (  # noqa: E402  # noqa: E402
     EVEN_SKY,
     LIGHTS,
@@ -29,14 +29,12 @@ from full_geometry.learning.model_errors import (  # noqa: E402  # noqa: E402
     reference,
     transport_of,
 )
+from full_geometry.learning.network_fitting import Correction, Recipe  # noqa: E402
 from full_geometry.learning.training import Trained, train, train_by_chunks  # noqa: E402
-from full_geometry.models import storing  # noqa: E402
-from full_geometry.models.object_model import (  # noqa: E402
-    FullGeometry,
-    HalfSpace,
-)
-from full_geometry.models.storing import frame_of  # noqa: E402
-from full_geometry.object.features import (  # noqa: E402
+from full_geometry.objects.objects import object_of  # noqa: E402
+from full_geometry.transport import storing  # noqa: E402
+from full_geometry.transport.exit_pairs import EntryProposals  # noqa: E402
+from full_geometry.transport.features import (  # noqa: E402
     Side,
     first_event,  # noqa: E402
     n_pair,
@@ -45,11 +43,12 @@ from full_geometry.object.features import (  # noqa: E402
     reverse,
     side_features,
 )
-from full_geometry.object.pairs import EntryProposals  # noqa: E402
-from halfspace_sss import rendering  # noqa: E402
+from full_geometry.transport.one_object import (  # noqa: E402
+    FullGeometry,
+    HalfSpace,
+)
+from full_geometry.transport.storing import frame_of  # noqa: E402
 from halfspace_sss.neural.store import load_weights, save_weights  # noqa: E402
-from halfspace_sss.rendering.object.objects import object_of  # noqa: E402
-from halfspace_sss.rendering.object.points import SurfacePoint  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("rgb")
@@ -299,7 +298,7 @@ def test_errors_of_models_are_asked_by_name(trained: Trained) -> None:
 
 
 def test_an_object_of_a_scene_is_found_by_its_id() -> None:
-    rendering.register()
+    full_geometry.register()
     surface = {"type": "translucent", "sigma_s": "0.95,0.8,0.6", "sigma_a": "0.05,0.2,0.4", "eta": 1.4}
     one, two = ({"type": "sphere", "radius": r, "center": [4 * r, 0, 0], "bsdf": surface} for r in (1.0, 2.0))
     scene = mi.load_dict({"type": "scene", "one": one, "two": two})

@@ -15,17 +15,17 @@ dr = pytest.importorskip("drjit")
 mi = pytest.importorskip("mitsuba")
 pytest.importorskip("torch")
 
-from full_geometry.learning.fitting import Recipe  # noqa: E402
+import full_geometry  # noqa: E402
+from full_geometry.geometry.points import SurfacePoint  # noqa: E402
 from full_geometry.learning.model_errors import LIGHTS, measure, transport_of  # noqa: E402
+from full_geometry.learning.network_fitting import Recipe  # noqa: E402
 from full_geometry.learning.training import Trained, train  # noqa: E402
-from full_geometry.models import storing  # noqa: E402
-from full_geometry.models.object_model import HalfSpace  # noqa: E402
-from full_geometry.object.features import first_event, flight  # noqa: E402
-from full_geometry.object.pairs import EntryProposals  # noqa: E402
-from halfspace_sss import rendering  # noqa: E402
-from halfspace_sss.rendering.object.objects import TranslucentObject, object_of  # noqa: E402
-from halfspace_sss.rendering.object.points import SurfacePoint  # noqa: E402
-from halfspace_sss.rendering.scenes.scene_files import load_objects, load_scene  # noqa: E402
+from full_geometry.objects.objects import TranslucentObject, object_of  # noqa: E402
+from full_geometry.scenes.scene_files import load_objects, load_scene  # noqa: E402
+from full_geometry.transport import storing  # noqa: E402
+from full_geometry.transport.exit_pairs import EntryProposals  # noqa: E402
+from full_geometry.transport.features import first_event, flight  # noqa: E402
+from full_geometry.transport.one_object import HalfSpace  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("rgb")
@@ -63,7 +63,7 @@ def varying_object(**found) -> TranslucentObject:
 @pytest.fixture(scope="module")
 def trained(folder: Path) -> Trained:
     mi.set_variant("llvm_ad_rgb")
-    rendering.register()
+    full_geometry.register()
     return train(load_objects(objects(bunny=bunny())), chunks=CHUNKS, recipe=QUICK, folder=folder)
 
 

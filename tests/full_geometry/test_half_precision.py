@@ -12,9 +12,9 @@ from halfspace_sss import Medium
 dr = pytest.importorskip("drjit")
 mi = pytest.importorskip("mitsuba")
 
-from full_geometry.models.neural_shape import transport  # noqa: E402
+from full_geometry.objects.objects import object_of  # noqa: E402
+from full_geometry.transport.any_shape import transport  # noqa: E402
 from halfspace_sss.neural import perceptron  # noqa: E402
-from halfspace_sss.rendering.object.objects import object_of  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
 MARBLE = Medium([2.19, 2.62, 3.0], [0.0021, 0.0041, 0.0071], 0.0, 1.5)

@@ -12,8 +12,8 @@ mi = pytest.importorskip("mitsuba")
 pytest.importorskip("igl")
 
 from full_geometry.learning.model_errors import errors_of  # noqa: E402
-from full_geometry.models.descriptors import Mixed, mixed  # noqa: E402
-from full_geometry.models.neural_shape import (  # noqa: E402
+from full_geometry.objects.objects import TranslucentObject, object_of  # noqa: E402
+from full_geometry.transport.any_shape import (  # noqa: E402
     NeuralShape,
     calibrated,
     calibration_weight,
@@ -21,7 +21,7 @@ from full_geometry.models.neural_shape import (  # noqa: E402
     shipped_weights,
     transport,
 )
-from halfspace_sss.rendering.object.objects import TranslucentObject, object_of  # noqa: E402
+from full_geometry.transport.descriptors import Mixed, mixed  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("mono")

@@ -13,9 +13,9 @@ pytest.importorskip("igl")
 
 from differentiated import Shifted, derivatives, image, varied  # noqa: E402
 
-from full_geometry.models.neural_shape import transport  # noqa: E402
-from full_geometry.object.pairs import trace_exits  # noqa: E402
-from halfspace_sss.rendering.object.objects import object_of  # noqa: E402
+from full_geometry.objects.objects import object_of  # noqa: E402
+from full_geometry.transport.any_shape import transport  # noqa: E402
+from full_geometry.transport.exit_pairs import trace_exits  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("mono")

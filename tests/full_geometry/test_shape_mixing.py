@@ -14,17 +14,17 @@ mi = pytest.importorskip("mitsuba")
 pytest.importorskip("igl")
 
 from figures.modelling.held_out import HELD_OUT  # noqa: E402
+from full_geometry.geometry.points import SurfacePoint, cosine_direction  # noqa: E402
 from full_geometry.learning.model_errors import errors_of  # noqa: E402
 from full_geometry.learning.shapes import make_shape  # noqa: E402
-from full_geometry.models.descriptors import mean_chord, mixed  # noqa: E402
-from full_geometry.models.neural_shape import Backbone  # noqa: E402
-from full_geometry.models.object_model import HalfSpace  # noqa: E402
-from full_geometry.object.features import (  # noqa: E402
+from full_geometry.objects.objects import TranslucentObject, object_of  # noqa: E402
+from full_geometry.transport.any_shape import Backbone  # noqa: E402
+from full_geometry.transport.descriptors import mean_chord, mixed  # noqa: E402
+from full_geometry.transport.features import (  # noqa: E402
     Side,
     first_event,
 )
-from halfspace_sss.rendering.object.objects import TranslucentObject, object_of  # noqa: E402
-from halfspace_sss.rendering.object.points import SurfacePoint, cosine_direction  # noqa: E402
+from full_geometry.transport.one_object import HalfSpace  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("mono")

@@ -11,10 +11,13 @@ dr = pytest.importorskip("drjit")
 mi = pytest.importorskip("mitsuba")
 pytest.importorskip("igl")
 
+from full_geometry.geometry.points import SurfacePoint, cosine_direction  # noqa: E402
 from full_geometry.learning.meshes import Box, surface  # noqa: E402
 from full_geometry.learning.model_errors import errors_of, transport_of  # noqa: E402
 from full_geometry.learning.shapes import make_shape  # noqa: E402
-from full_geometry.models.descriptors import (  # noqa: E402
+from full_geometry.objects.objects import TranslucentObject, object_of  # noqa: E402
+from full_geometry.transport.any_shape import Backbone, NeuralShape, most, transport  # noqa: E402
+from full_geometry.transport.descriptors import (  # noqa: E402
     CURVED_OWN,
     CURVED_SHARED,
     N_MEDIUM,
@@ -25,9 +28,6 @@ from full_geometry.models.descriptors import (  # noqa: E402
     end,
     mixed,
 )
-from full_geometry.models.neural_shape import Backbone, NeuralShape, most, transport  # noqa: E402
-from halfspace_sss.rendering.object.objects import TranslucentObject, object_of  # noqa: E402
-from halfspace_sss.rendering.object.points import SurfacePoint, cosine_direction  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("mono")
@@ -103,7 +103,7 @@ def test_on_a_plane_it_is_the_half_space_whatever_the_weights() -> None:
 
 
 def _side(e: object) -> object:
-    from full_geometry.object.features import Side
+    from full_geometry.transport.features import Side
 
     return Side(e.at, e.event)
 

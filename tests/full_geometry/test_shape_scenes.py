@@ -14,10 +14,10 @@ from typer.testing import CliRunner
 dr = pytest.importorskip("drjit")
 mi = pytest.importorskip("mitsuba")
 
+from figures import command_line as cli  # noqa: E402
 from full_geometry.learning import model_errors  # noqa: E402
-from halfspace_sss.cli import app as cli  # noqa: E402
-from halfspace_sss.rendering.object.registry import lookup, model_names  # noqa: E402
-from halfspace_sss.rendering.scenes.scene_files import load_scene  # noqa: E402
+from full_geometry.registry import lookup, model_names  # noqa: E402
+from full_geometry.scenes.scene_files import load_scene  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

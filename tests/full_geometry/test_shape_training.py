@@ -13,6 +13,7 @@ mi = pytest.importorskip("mitsuba")
 pytest.importorskip("igl")
 torch = pytest.importorskip("torch")
 
+from figures import command_line as cli  # noqa: E402
 from figures.modelling.held_out import HELD_OUT  # noqa: E402
 from full_geometry.learning import shape_training as training  # noqa: E402
 from full_geometry.learning.shape_data import (  # noqa: E402  # noqa: E402
@@ -27,8 +28,7 @@ from full_geometry.learning.shape_data import (  # noqa: E402  # noqa: E402
 )
 from full_geometry.learning.shape_training import ShapeFit, ShapeRecipe  # noqa: E402
 from full_geometry.learning.shapes import TRAINING, make_shape  # noqa: E402
-from full_geometry.models.neural_shape import ALBEDO, ETA, SIZE, WEIGHTS, G, load, shipped_weights  # noqa: E402
-from halfspace_sss.cli import app as cli  # noqa: E402
+from full_geometry.transport.any_shape import ALBEDO, ETA, SIZE, WEIGHTS, G, load, shipped_weights  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("mono")
 

@@ -15,13 +15,13 @@ from typer.testing import CliRunner
 mi = pytest.importorskip("mitsuba")
 import drjit as dr  # noqa: E402
 
-from halfspace_sss import inverse  # noqa: E402
-from halfspace_sss.cli import app as cli  # noqa: E402
-from halfspace_sss.inverse.comparing import ViewComparison  # noqa: E402
-from halfspace_sss.inverse.textures import TextureDescent, TextureParameters  # noqa: E402
-from halfspace_sss.inverse.views import GivenView, read_views  # noqa: E402
-from halfspace_sss.rendering.object.wrapped import surface_of  # noqa: E402
-from halfspace_sss.rendering.scenes.scene_files import open_scene  # noqa: E402
+from figures import command_line as cli  # noqa: E402
+from full_geometry import inverse  # noqa: E402
+from full_geometry.inverse.comparing import ViewComparison  # noqa: E402
+from full_geometry.inverse.textures import TextureDescent, TextureParameters  # noqa: E402
+from full_geometry.inverse.views import GivenView, read_views  # noqa: E402
+from full_geometry.scenes.scene_files import open_scene  # noqa: E402
+from full_geometry.surface.wrapped import surface_of  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("quiet_rgb")
 

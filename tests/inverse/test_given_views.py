@@ -13,9 +13,9 @@ from typer.testing import CliRunner
 
 mi = pytest.importorskip("mitsuba")
 
-from halfspace_sss.cli import app as cli  # noqa: E402
-from halfspace_sss.cli import fit as command  # noqa: E402
-from halfspace_sss.inverse.views import GivenView, read_views  # noqa: E402
+from figures import command_line as cli  # noqa: E402
+from full_geometry.cli import fit as command  # noqa: E402
+from full_geometry.inverse.views import GivenView, read_views  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("quiet_rgb")
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from figures.command_line import app
 from halfspace_sss import Medium, trace
 from halfspace_sss.backend import BackendError
-from halfspace_sss.cli.app import app
 from halfspace_sss.materials.files import read
 from halfspace_sss.materials.imports import import_materials
 from halfspace_sss.physics.fresnel import F_r

@@ -10,8 +10,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from halfspace_sss.rendering.object.instances import Sight, bounds_of
-from halfspace_sss.rendering.object.rounding import ray_from
+from full_geometry.geometry.instances import Sight, bounds_of
+from full_geometry.geometry.rounding import ray_from
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

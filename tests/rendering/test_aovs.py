@@ -8,8 +8,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from full_geometry import register
 from halfspace_sss import Medium
-from halfspace_sss.rendering import register
 
 ALBEDOS, G, ETA = [0.999, 0.9, 0.4], 0.6, 1.4
 FLOOR = [0.3, 0.5, 0.7]

@@ -10,20 +10,20 @@ import pytest
 mi = pytest.importorskip("mitsuba")
 import drjit as dr  # noqa: E402
 
-from halfspace_sss.rendering.object.objects import object_of  # noqa: E402
-from halfspace_sss.rendering.object.translucent import is_smooth_boundary, smooth_boundary  # noqa: E402
-from halfspace_sss.rendering.scenes.mitsuba_scene import with_media  # noqa: E402
-from halfspace_sss.trade.ways import ways  # noqa: E402
+from full_geometry.objects.objects import object_of  # noqa: E402
+from full_geometry.scenes.mitsuba_scene import with_media  # noqa: E402
+from full_geometry.surface.translucent import is_smooth_boundary, smooth_boundary  # noqa: E402
+from full_geometry.trade.ways import ways  # noqa: E402
 
 N, BOTH = 4000, 0xFFFFFFFF
 
 
 @pytest.fixture(autouse=True)
 def rendering() -> None:
-    from halfspace_sss import rendering
+    import full_geometry
 
     mi.set_variant("llvm_ad_rgb")
-    rendering.register()
+    full_geometry.register()
 
 
 def dielectric(eta: float, **more: Any) -> dict[str, Any]:

@@ -12,9 +12,9 @@ from halfspace_sss import Medium
 
 mi = pytest.importorskip("mitsuba")
 
+from full_geometry.geometry.shape import survey  # noqa: E402
+from full_geometry.transport.half_space import MOST_STRAIGHT, straight_share  # noqa: E402
 from halfspace_sss.interface.model import models  # noqa: E402
-from halfspace_sss.rendering.object.half_space import MOST_STRAIGHT, straight_share  # noqa: E402
-from halfspace_sss.rendering.object.shape import survey  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

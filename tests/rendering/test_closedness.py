@@ -8,7 +8,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from halfspace_sss.rendering.object.shape import Geometry, faces_of, survey
+from full_geometry.geometry.shape import Geometry, faces_of, survey
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

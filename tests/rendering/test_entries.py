@@ -16,10 +16,10 @@ LIGHTS = {
 
 @pytest.fixture(autouse=True)
 def _variant():
-    from halfspace_sss import rendering
+    import full_geometry
 
     mi.set_variant("llvm_ad_rgb")
-    rendering.register()
+    full_geometry.register()
 
 
 DARK = {"type": "point", "position": [0, 0, 9], "intensity": 1e-6}  # beside it directions are not chosen by the sky

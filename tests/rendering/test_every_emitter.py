@@ -19,9 +19,9 @@ mi = pytest.importorskip("mitsuba")
 
 import drjit as dr  # noqa: E402
 
-from halfspace_sss.rendering import register  # noqa: E402
-from halfspace_sss.rendering.light.small_emitters import SmallEmitters  # noqa: E402
-from halfspace_sss.trade import recommend  # noqa: E402
+from full_geometry import register  # noqa: E402
+from full_geometry.objects.small_emitters import SmallEmitters  # noqa: E402
+from full_geometry.trade import recommend  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -233,8 +233,8 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Iterator[np.ndarray]:
     """What a short training of the sphere may be off by under even light, of each channel, by its own error."""
     pytest.importorskip("torch")
     from full_geometry.learning import training
-    from full_geometry.learning.fitting import Recipe
     from full_geometry.learning.model_errors import LIGHTS
+    from full_geometry.learning.network_fitting import Recipe
 
     mi.set_variant("llvm_ad_rgb")
     register()

@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from full_geometry.geometry.shape import survey
+from full_geometry.integrators.gathering import _steadied, _stratified
 from full_geometry.learning.meshes import Box, surface
 from full_geometry.learning.shapes import box
-from halfspace_sss.rendering.gathered.entries import StratifiedEntries
-from halfspace_sss.rendering.gathered.pairs import Rays, lit_pairs
-from halfspace_sss.rendering.gathered.points import SurfacePoints, uniform_entries
-from halfspace_sss.rendering.gathered.transfer import Incident, RowUniforms
-from halfspace_sss.rendering.object.shape import survey
-from halfspace_sss.rendering.paths.gathering import _steadied, _stratified
+from full_geometry.precomputed.entries import StratifiedEntries
+from full_geometry.precomputed.point_pairs import Rays, lit_pairs
+from full_geometry.precomputed.transfer import Incident, RowUniforms
+from full_geometry.sampling.light_points import SurfacePoints, uniform_entries
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

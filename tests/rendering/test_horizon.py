@@ -18,10 +18,10 @@ THICK = {"sigma_s": 20.0, "sigma_a": 0.0}
 
 @pytest.fixture(autouse=True)
 def _variant():
-    from halfspace_sss import rendering
+    import full_geometry
 
     mi.set_variant("llvm_ad_rgb")
-    rendering.register()
+    full_geometry.register()
 
 
 def images(shape: dict, bsdf: dict, light: dict, spp: int = 64, **integrator) -> np.ndarray:
@@ -43,7 +43,7 @@ def medium(**values) -> dict:
 
 
 def test_a_direction_below_the_horizon_sees_a_normal_as_far_above_it():
-    from halfspace_sss.rendering.object.points import lifted
+    from full_geometry.geometry.points import lifted
 
     m, n, w = mi.Normal3f(0.6, 0, 0.8), mi.Normal3f(0, 0, 1), dr.normalize(mi.Vector3f(-0.9, 0.1, 0.3))
     found = lifted(m, n, w)
@@ -54,7 +54,7 @@ def test_a_direction_below_the_horizon_sees_a_normal_as_far_above_it():
 
 def test_directions_are_above_the_surface_and_of_the_density_that_is_stated():
     """Mean of 1/density is the solid angle 2 pi of all directions above, of cos²/density its integral 2 pi / 3."""
-    from halfspace_sss.rendering.object.points import cosine_above, cosine_density
+    from full_geometry.geometry.points import cosine_above, cosine_density
 
     rng, n = mi.PCG32(2**20), mi.Normal3f(0, 0, 1)
     w, pdf = cosine_above(mi.Normal3f(0.6, 0, 0.8), n, mi.Point2f(rng.next_float32(), rng.next_float32()))

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from halfspace_sss.rendering.gathered import inner
-from halfspace_sss.rendering.object import objects
-from halfspace_sss.rendering.object.objects import object_of
-from halfspace_sss.rendering.paths import gathering
-from halfspace_sss.rendering.paths.inner_light import _directions
+from full_geometry.integrators import gathering
+from full_geometry.integrators.inner_light import _directions
+from full_geometry.objects import objects
+from full_geometry.objects.objects import object_of
+from full_geometry.precomputed import inner
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

@@ -12,7 +12,7 @@ from rendered import surface
 mi = pytest.importorskip("mitsuba")
 dr = pytest.importorskip("drjit")
 
-from halfspace_sss.rendering.object.instances import Placed, Sight, shapes_of, shown_groups  # noqa: E402
+from full_geometry.geometry.instances import Placed, Sight, shapes_of, shown_groups  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from halfspace_sss import rendering
-from halfspace_sss.rendering.paths import lit_entries
+import full_geometry
+from full_geometry.integrators import lit_entries
 
 mi = pytest.importorskip("mitsuba")
 
@@ -19,7 +19,7 @@ Z = 5.0  # Student's t of 22 degrees, of 3 channels: 1 in 6000 by chance
 @pytest.fixture(autouse=True)
 def _variant() -> None:
     mi.set_variant("llvm_ad_rgb")
-    rendering.register()
+    full_geometry.register()
 
 
 def _scene() -> Any:

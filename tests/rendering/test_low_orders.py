@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 from test_translucent_walk import COLOURED, _agree, _lamp, _runs, _scene, _small_lamp, _z
 
-from halfspace_sss.rendering.object import half_space, objects
-from halfspace_sss.rendering.object.points import ObjectModel
-from halfspace_sss.rendering.paths import low_orders
-from halfspace_sss.rendering.walk import media as walks
+from full_geometry.geometry.points import ObjectModel
+from full_geometry.integrators import low_orders
+from full_geometry.objects import objects
+from full_geometry.transport import half_space
+from full_geometry.walk import media as walks
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

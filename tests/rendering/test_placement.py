@@ -14,8 +14,8 @@ from test_rendering_normals import ellipsoid
 
 mi = pytest.importorskip("mitsuba")
 
-from halfspace_sss.rendering.object.objects import contents  # noqa: E402
-from halfspace_sss.rendering.object.shape import survey  # noqa: E402
+from full_geometry.geometry.shape import survey  # noqa: E402
+from full_geometry.objects.objects import contents  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

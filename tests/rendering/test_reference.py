@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from halfspace_sss.rendering.scenes import reference
+from full_geometry.scenes import reference
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -36,12 +36,12 @@ def _scene(radius: float = 1.0) -> dict:
 
 KILLED = """
 import sys
-import halfspace_sss.rendering as rendering
+import full_geometry
 import mitsuba as mi
-from halfspace_sss.rendering.scenes import reference
+from full_geometry.scenes import reference
 sys.path.insert(0, {folder!r})
 mi.set_variant("llvm_ad_rgb")
-rendering.register()
+full_geometry.register()
 from test_reference import _scene
 print("ready", flush=True)
 reference.render(_scene(), {path!r}, spp_per_pass=4, passes=10**6, interval=0)

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from rendered import surface
 
-import halfspace_sss.rendering as rendering
+import full_geometry
 
 mi = pytest.importorskip("mitsuba")
 
 import drjit as dr  # noqa: E402
 
+from full_geometry.integrators import low_orders  # noqa: E402
+from full_geometry.integrators.low_orders import refracted_connection  # noqa: E402
 from halfspace_sss.physics.fresnel import F_t, mu_external  # noqa: E402
-from halfspace_sss.rendering.paths import low_orders  # noqa: E402
-from halfspace_sss.rendering.paths.low_orders import refracted_connection  # noqa: E402
 
 ETA, RADIUS, N = 1.4, 2.0, 400
 
@@ -24,7 +24,7 @@ ETA, RADIUS, N = 1.4, 2.0, 400
 @pytest.fixture
 def ball():
     mi.set_variant("llvm_ad_rgb")
-    rendering.register()
+    full_geometry.register()
     shape = {"type": "sphere", "radius": RADIUS, "bsdf": surface()}
     scene = mi.load_dict({"type": "scene", "integrator": {"type": "bssrdf"}, "sky": {"type": "constant"}, "s": shape})
     return scene.integrator().prepare(scene)[0]

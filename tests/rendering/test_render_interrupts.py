@@ -10,7 +10,7 @@ import threading
 import numpy as np
 import pytest
 
-from halfspace_sss.rendering.paths import integrator
+from full_geometry.integrators import bssrdf as integrator
 
 mi = pytest.importorskip("mitsuba")
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="POSIX signals")
@@ -42,10 +42,10 @@ print(sys.getprofile(), mi.render(scene, spp=1).numpy().mean() > 0)
 
 
 def scene_of(kind: str, size: int, sampler: str = "independent"):
-    import halfspace_sss.rendering
+    import full_geometry
 
     mi.set_variant("llvm_ad_rgb")
-    halfspace_sss.rendering.register()
+    full_geometry.register()
     camera = mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0])
     film = {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "gaussian"}}
     medium = {"albedo": 0.9, "sigma_t": 2.0, "g": 0.3, "eta": 1.4}

@@ -16,15 +16,15 @@ import drjit as dr  # noqa: E402
 
 @pytest.fixture(autouse=True)
 def _variant():
-    from halfspace_sss import rendering
+    import full_geometry
 
     mi.set_variant("llvm_ad_rgb")
-    rendering.register()
+    full_geometry.register()
     gc.collect()
 
 
 def loaded(material: str, model: str, mm_per_unit: float = 3.0):
-    from halfspace_sss.rendering.scenes.scene_files import load_scene
+    from full_geometry.scenes.scene_files import load_scene
 
     view = mi.ScalarTransform4f().look_at([3, 4, 9], [0, 0, 0], [0, 1, 0])
     film = {"type": "hdrfilm", "width": 4, "height": 4}
@@ -62,7 +62,7 @@ def test_a_kernel_serves_other_materials_units_and_numbers_of_samples(model):
 
 
 def test_the_mean_over_channels_is_that_of_numbers():
-    from halfspace_sss.rendering.object.points import channel_mean
+    from full_geometry.geometry.points import channel_mean
 
     assert np.array(channel_mean(mi.Color3f(1, 2, 6))) == pytest.approx([3])
     assert np.array(channel_mean(mi.Color1f(mi.Float(4, 5)))) == pytest.approx([4, 5])

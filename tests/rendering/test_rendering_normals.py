@@ -19,10 +19,10 @@ LIGHTS = {"sky": {"type": "constant"}, "lamp": LAMP}
 
 @pytest.fixture(autouse=True)
 def _variant():
-    from halfspace_sss import rendering
+    import full_geometry
 
     mi.set_variant("llvm_ad_rgb")
-    rendering.register()
+    full_geometry.register()
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)  # of objects that are not closed
         yield

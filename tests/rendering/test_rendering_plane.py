@@ -20,10 +20,10 @@ NAMES = [name for name in halfspace_sss.models() if name not in UNTRAINED]
 
 @pytest.fixture(autouse=True)
 def _variant():
-    from halfspace_sss import rendering
+    import full_geometry
 
     mi.set_variant("llvm_ad_rgb")
-    rendering.register()
+    full_geometry.register()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # a rectangle is not closed
         yield

@@ -18,8 +18,8 @@ pytestmark = pytest.mark.usefixtures("quiet_rgb")
 
 
 def position_sampler(shape: dict, share: float):
-    from halfspace_sss.rendering.object.points import AreaPoints, PositionSampler, RadialTable
-    from halfspace_sss.rendering.object.shape import survey
+    from full_geometry.geometry.points import AreaPoints, PositionSampler, RadialTable
+    from full_geometry.geometry.shape import survey
 
     scene = mi.load_dict({"type": "scene", "object": shape})
     found = survey(scene.shapes()[0])
@@ -28,7 +28,7 @@ def position_sampler(shape: dict, share: float):
 
 
 def entries(positions, origin, along, n: int = N, seed: int = 1):
-    from halfspace_sss.rendering.object.points import SurfacePoint
+    from full_geometry.geometry.points import SurfacePoint
 
     ray = mi.Ray3f(mi.Point3f(*origin), mi.Vector3f(*along))
     si = positions.geometry.scene.ray_intersect(ray)
@@ -185,7 +185,7 @@ def test_light_does_not_cross_from_one_object_to_another_of_the_same_surface():
 
 
 def test_the_radial_table_gives_back_its_own_density():
-    from halfspace_sss.rendering.object.points import RadialTable
+    from full_geometry.geometry.points import RadialTable
 
     table = RadialTable([bssrdf("standard_dipole", m) for m in MODELS], 50.0)
     u = mi.Float((np.arange(N) + 0.5) / N)

@@ -12,16 +12,16 @@ from rendered import MEDIUM, direction, plane_scene, render, sun, surface
 
 mi = pytest.importorskip("mitsuba")
 
-START = [sys.executable, "-c", "from halfspace_sss.cli import main; main()"]
+START = [sys.executable, "-c", "from figures.command_line import main; main()"]
 SPHERE = {"type": "sphere", "radius": 5.0}
 
 
 @pytest.fixture(autouse=True)
 def _variant():
-    from halfspace_sss import rendering
+    import full_geometry
 
     mi.set_variant("llvm_ad_rgb")
-    rendering.register()
+    full_geometry.register()
 
 
 def view(shape: dict, emitter: dict | None = None, distance: float = 30.0, n: int = 16, **settings) -> dict:
@@ -43,7 +43,7 @@ def quietly(scene: dict, spp: int = 4) -> np.ndarray:
 
 def refused(message: str, scene: dict) -> None:
     """Mitsuba wraps what an integrator raises while rendering; `load_scene` lets it through."""
-    from halfspace_sss.rendering.scenes.scene_files import load_scene
+    from full_geometry.scenes.scene_files import load_scene
 
     with pytest.raises((ValueError, RuntimeError), match=message), warnings.catch_warnings():
         warnings.simplefilter("ignore")

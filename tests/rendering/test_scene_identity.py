@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 
 import halfspace_sss
+from full_geometry.geometry.identity import object_digest, scene_hash
+from full_geometry.scenes.reference import learnt
+from full_geometry.scenes.scene_files import load_scene
 from halfspace_sss.neural import universal
 from halfspace_sss.neural.store import checksum_of, load_weights, save_weights
 from halfspace_sss.neural.universal import shipped_weights
-from halfspace_sss.rendering.scenes.identity import learnt, object_digest, scene_hash
-from halfspace_sss.rendering.scenes.scene_files import load_scene
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -36,12 +37,12 @@ XML = """<scene version="3.0.0">
 """
 TELL = """
 import sys
-import halfspace_sss.rendering as rendering
+import full_geometry
 import mitsuba as mi
-from halfspace_sss.rendering.scenes.scene_files import load_scene
-from halfspace_sss.rendering.scenes.identity import scene_hash
+from full_geometry.scenes.scene_files import load_scene
+from full_geometry.geometry.identity import scene_hash
 mi.set_variant("llvm_ad_rgb")
-rendering.register()
+full_geometry.register()
 scene = load_scene(sys.argv[1])
 print(scene_hash(scene, scene.integrator()))
 """

@@ -8,7 +8,7 @@ from rendered import render, surface
 
 mi = pytest.importorskip("mitsuba")
 
-from halfspace_sss.rendering.object import shape as sharing  # noqa: E402
+from full_geometry.geometry import shape as sharing  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("quiet_rgb")
 

@@ -14,11 +14,11 @@ mi = pytest.importorskip("mitsuba")
 
 from rendered import surface  # noqa: E402
 
-from halfspace_sss.rendering.object import objects  # noqa: E402
-from halfspace_sss.rendering.object.half_space import half_space_model  # noqa: E402
-from halfspace_sss.rendering.object.points import ObjectModel  # noqa: E402
-from halfspace_sss.rendering.object.registry import ModelEntry  # noqa: E402
-from halfspace_sss.rendering.paths.lighting import Lights, Sky  # noqa: E402
+from full_geometry.geometry.points import ObjectModel  # noqa: E402
+from full_geometry.integrators.lighting import Lights, Sky  # noqa: E402
+from full_geometry.objects import objects  # noqa: E402
+from full_geometry.registry import ModelEntry  # noqa: E402
+from full_geometry.transport.half_space import half_space_model  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-import halfspace_sss.rendering.object.shape as shape_module
-from halfspace_sss.rendering.object.shape import SceneMark
-from halfspace_sss.rendering.object.snapshot import Snapshot
-from halfspace_sss.rendering.scenes.identity import scene_hash
+import full_geometry.geometry.shape as shape_module
+from full_geometry.geometry.identity import scene_hash
+from full_geometry.geometry.shape import SceneMark
+from full_geometry.geometry.snapshot import Snapshot
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from test_translucent_walk import WIDEST_Z_OF_RUNS, _runs, _scene, _z
 
+from full_geometry.geometry.points import SurfacePoint, plane_query
 from halfspace_sss import Medium, bssrdf, materials
-from halfspace_sss.rendering.object.points import SurfacePoint, plane_query
 
 mi = pytest.importorskip("mitsuba")
 import drjit as dr  # noqa: E402

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 mi = pytest.importorskip("mitsuba")
-from halfspace_sss.rendering.scenes.mitsuba_scene import with_media  # noqa: E402
+from full_geometry.scenes.mitsuba_scene import with_media  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

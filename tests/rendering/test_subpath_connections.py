@@ -17,10 +17,10 @@ mi = pytest.importorskip("mitsuba")
 
 import drjit as dr  # noqa: E402
 
-from halfspace_sss.rendering.light.small_emitters import SmallEmitters  # noqa: E402
-from halfspace_sss.rendering.walk.emitter_connections import STEEPEST, SubpathConnections, find_connections  # noqa: E402
-from halfspace_sss.rendering.walk.media import WalkMedia  # noqa: E402
-from halfspace_sss.rendering.walk.random_walk import Event  # noqa: E402
+from full_geometry.objects.small_emitters import SmallEmitters  # noqa: E402
+from full_geometry.walk.emitter_connections import STEEPEST, SubpathConnections, find_connections  # noqa: E402
+from full_geometry.walk.media import WalkMedia  # noqa: E402
+from full_geometry.walk.random_walk import Event  # noqa: E402
 from halfspace_sss.tracing.walk import generator, pass_seed  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("rgb")

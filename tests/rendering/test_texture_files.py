@@ -12,9 +12,9 @@ import pytest
 from test_textures import _mesh
 from test_translucent_walk import _scene
 
-from halfspace_sss.rendering.object.objects import make_objects
-from halfspace_sss.rendering.object.settings import Settings
-from halfspace_sss.rendering.object.textured import attributes, texels
+from full_geometry.settings import Settings
+from full_geometry.surface.textured import attributes, texels
+from full_geometry.transport.prepare import make_objects
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

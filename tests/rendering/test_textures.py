@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from test_translucent_walk import WIDEST_Z_OF_RUNS, _lamp, _runs, _scene, _small_lamp, _z
 
+from full_geometry.geometry.points import SurfacePoint
+from full_geometry.settings import Settings
+from full_geometry.transport.palette import Distances
+from full_geometry.transport.prepare import make_objects
 from halfspace_sss import Medium, bssrdf, measure
 from halfspace_sss.neural import material_model, paper_model, store
-from halfspace_sss.rendering.object.objects import make_objects
-from halfspace_sss.rendering.object.palette import Distances
-from halfspace_sss.rendering.object.points import SurfacePoint
-from halfspace_sss.rendering.object.settings import Settings
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from full_geometry.scenes.mitsuba_scene import with_media
 from halfspace_sss import Medium
 from halfspace_sss.physics.fresnel import F_r
-from halfspace_sss.rendering.scenes.mitsuba_scene import with_media
 from halfspace_sss.tracing.tracer import trace
 
 pytestmark = pytest.mark.usefixtures("rgb")

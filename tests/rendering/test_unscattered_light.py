@@ -66,8 +66,8 @@ def _compare(surface: dict, known_to: float, shape: dict | None = None, spp: int
 
 
 def _cells(shape: dict, edge: float = 0.9) -> Any:
-    from halfspace_sss.rendering.walk.media import WalkMedia
-    from halfspace_sss.rendering.walk.unscattered_light import inside_cells_of
+    from full_geometry.precomputed.unscattered_light import inside_cells_of
+    from full_geometry.walk.media import WalkMedia
 
     scene = _scene("precomputed", MEDIUM, shape, light={"type": "constant"})
     return inside_cells_of(WalkMedia.of(scene, 1.0), edge)[0]
@@ -294,7 +294,7 @@ def test_light_that_cannot_be_precomputed_is_refused_by_its_reason(surface: dict
 
 @pytest.mark.parametrize("light", ["auto", "precomputed", "sampled"])
 def test_path_traced_is_the_walk_with_the_light_that_is_asked_for(light: str) -> None:
-    from halfspace_sss.rendering.scenes.scene_files import open_scene
+    from full_geometry.scenes.scene_files import open_scene
 
     ball = {**_ball(), "bsdf": {"type": "translucent", **MEDIUM}}
     scene = {"type": "scene", "integrator": {"type": "bssrdf"}, "ball": ball, "light": {"type": "constant"}}

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from test_translucent_walk import _cube, _lamp, _runs, _scene, _small_lamp, _z
 
+from full_geometry.scenes.mitsuba_scene import with_media
 from halfspace_sss import Medium
-from halfspace_sss.rendering.scenes.mitsuba_scene import with_media
 
 pytestmark = pytest.mark.usefixtures("rgb")
 
@@ -109,9 +109,9 @@ def _layers(values: list, thickness: float, **more: Any) -> dict:
 
 
 def _exits(surface: dict, thickness: float, mu: float, seed: int) -> Any:
-    from halfspace_sss.rendering.object.points import SurfacePoint
-    from halfspace_sss.rendering.walk.media import WalkMedia
-    from halfspace_sss.rendering.walk.random_walk import exits
+    from full_geometry.geometry.points import SurfacePoint
+    from full_geometry.walk.media import WalkMedia
+    from full_geometry.walk.random_walk import exits
 
     scene = {"type": "scene", "object": {**_slab(thickness), "bsdf": {"type": "translucent", **surface}}}
     w = np.repeat([[np.sqrt(1 - mu * mu)], [0.0], [mu]], N, axis=1)
@@ -152,7 +152,7 @@ def test_layers_that_only_absorb_transmit_by_their_optical_thickness(filter_type
 def test_ratio_tracking_is_unbiased_in_every_channel() -> None:
     import drjit as dr
 
-    from halfspace_sss.rendering.walk.media import WalkMedia
+    from full_geometry.walk.media import WalkMedia
 
     layers = np.array([[0.1, 2.0, 0.5], [0.6, 0.2, 0.5], [0.0, 0.4, 0.1]])
     scene = {"type": "scene", "object": {**_slab(3.0), "bsdf": {
@@ -197,8 +197,8 @@ def test_a_mono_variant_takes_grids_of_one_channel() -> None:
 
 
 def test_models_of_the_half_space_take_the_means_over_the_object() -> None:
-    from halfspace_sss.rendering.object.objects import make_objects
-    from halfspace_sss.rendering.object.settings import Settings
+    from full_geometry.settings import Settings
+    from full_geometry.transport.prepare import make_objects
 
     layers = np.array([[1.0, 2.0, 4.0], [3.0, 2.0, 8.0], [50.0, 50.0, 50.0], [50.0, 50.0, 50.0]])
     where = mi.ScalarTransform4f().translate([-10, -10, -10]).scale([20, 20, 40])  # the object is in the lower half
@@ -248,7 +248,7 @@ def test_grids_that_are_no_media_are_refused(parameters: dict, message: str) -> 
 
 
 def test_volumes_that_are_no_grids_are_refused() -> None:
-    from halfspace_sss.rendering.object.varying import varying_medium
+    from full_geometry.surface.varying import varying_medium
 
     class Ramp(mi.Volume):
         pass

@@ -21,7 +21,7 @@ WIDEST_Z = 4.4  # two-sided 1e-5
 
 
 def _media(shape: dict, mm_per_unit: float = 1.0, **surface: object):
-    from halfspace_sss.rendering.walk.media import WalkMedia
+    from full_geometry.walk.media import WalkMedia
 
     scene = {"type": "scene", "object": {**shape, "bsdf": {"type": "translucent", **surface}}}
     return WalkMedia.of(mi.load_dict(scene), mm_per_unit)
@@ -34,7 +34,7 @@ def _slab() -> dict:
 
 def _start(mu: float, n: int = N):
     """Walks that enter at the origin with the cosine mu."""
-    from halfspace_sss.rendering.object.points import SurfacePoint
+    from full_geometry.geometry.points import SurfacePoint
 
     w = np.repeat([[np.sqrt(1 - mu * mu)], [0.0], [mu]], n, axis=1)
     up = np.repeat([[0.0], [0.0], [1.0]], n, axis=1)
@@ -43,7 +43,7 @@ def _start(mu: float, n: int = N):
 
 def _on_sphere(radius: float, n: int, diffuse: bool = False):
     """Random points of a sphere about the origin; directions within 70 degrees of its normals, or by the cosine."""
-    from halfspace_sss.rendering.object.points import SurfacePoint
+    from full_geometry.geometry.points import SurfacePoint
 
     rng = np.random.default_rng(3)
     up = rng.standard_normal((3, n))
@@ -55,7 +55,7 @@ def _on_sphere(radius: float, n: int, diffuse: bool = False):
 
 
 def _exits(*arguments: object, **options: object):
-    from halfspace_sss.rendering.walk.random_walk import exits
+    from full_geometry.walk.random_walk import exits
 
     return exits(*arguments, **options)
 
@@ -124,7 +124,7 @@ def test_walks_count_their_scattering_events() -> None:
 def test_a_visitor_sees_every_scattering_event() -> None:
     import drjit as dr
 
-    from halfspace_sss.rendering.walk.random_walk import ExitVisitor, walk_from
+    from full_geometry.walk.random_walk import ExitVisitor, walk_from
 
     n = 4096
     media = _media({"type": "sphere", "radius": 2.0}, sigma_s="1,0.8,0.3", sigma_a="0.01,0.2,0.7", g=0.5, eta=1.4)
@@ -156,7 +156,7 @@ def test_a_walk_whose_direction_is_below_the_surface_never_enters() -> None:
 
 
 def test_each_object_of_a_scene_has_exits_of_its_own() -> None:
-    from halfspace_sss.rendering.walk.media import WalkMedia
+    from full_geometry.walk.media import WalkMedia
 
     def ball(x: float, eta: float, sigma_a: float) -> dict:
         surface = {"type": "translucent", "sigma_s": 1.0, "sigma_a": sigma_a, "eta": eta}

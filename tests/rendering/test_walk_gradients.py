@@ -10,7 +10,7 @@ import pytest
 mi = pytest.importorskip("mitsuba")
 import drjit as dr  # noqa: E402
 
-from halfspace_sss.rendering.walk import scores  # noqa: E402
+from full_geometry.walk import scores  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("rgb")
 

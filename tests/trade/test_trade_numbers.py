@@ -8,21 +8,21 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from halfspace_sss.cli import trade
-from halfspace_sss.rendering.paths.gathering import PART, Gathered, Gathering
-from halfspace_sss.trade import recommend
-from halfspace_sss.trade.advice import Job, advise
-from halfspace_sss.trade.automatic import picked
-from halfspace_sss.trade.contending import contenders, left_out, most_promising
-from halfspace_sss.trade.results import Assessment, ObjectTrade, WayTrade, samples_for
-from halfspace_sss.trade.statistics import (
+from full_geometry.cli import trade
+from full_geometry.integrators.gathering import PART, Gathered, Gathering
+from full_geometry.trade import recommend
+from full_geometry.trade.advice import Job, advise
+from full_geometry.trade.automatic import picked
+from full_geometry.trade.contending import contenders, left_out, most_promising
+from full_geometry.trade.results import Assessment, ObjectTrade, WayTrade, samples_for
+from full_geometry.trade.statistics import (
     FIREFLIES,
     RadianceEstimate,
     mean_square,
     mean_square_of_parts,
     relative_variance,
 )
-from halfspace_sss.trade.ways import Way
+from full_geometry.trade.ways import Way
 
 SEEDS, EXITS, SAMPLES = 400, 48, 12
 

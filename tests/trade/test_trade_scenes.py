@@ -11,16 +11,16 @@ import pytest
 from render_files import XML
 from typer.testing import CliRunner
 
+from figures import command_line as cli
+from full_geometry.registry import model_names
+from full_geometry.trade import assess, flat, measuring, recommend, sampling
+from full_geometry.trade.assessing import assess_stage
+from full_geometry.trade.exits import visible_exits
+from full_geometry.trade.images import small_images
+from full_geometry.trade.sampling import first_sample, sample_more
+from full_geometry.trade.ways import Way, stage
 from halfspace_sss import Medium
-from halfspace_sss.cli import app as cli
 from halfspace_sss.physics.fresnel import F_r
-from halfspace_sss.rendering.object.registry import model_names
-from halfspace_sss.trade import assess, flat, measuring, recommend, sampling
-from halfspace_sss.trade.assessing import assess_stage
-from halfspace_sss.trade.exits import visible_exits
-from halfspace_sss.trade.images import small_images
-from halfspace_sss.trade.sampling import first_sample, sample_more
-from halfspace_sss.trade.ways import Way, stage
 
 mi = pytest.importorskip("mitsuba")
 QUICK = {"seconds": 0.4, "flip": False, "exits": 64}
@@ -29,11 +29,11 @@ FEW = ["better_dipole", "lambert"]
 
 @pytest.fixture(autouse=True)
 def rendering(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    from halfspace_sss import rendering
+    import full_geometry
 
     monkeypatch.setenv("HALFSPACE_SSS_CHOICES", str(tmp_path / "choices"))
     mi.set_variant("llvm_ad_rgb")
-    rendering.register()
+    full_geometry.register()
 
 
 def scene(medium: dict | None = None, light: dict | None = None, n: int = 1, **more: Any) -> dict[str, Any]:
@@ -209,7 +209,7 @@ def test_the_second_look_goes_on_with_the_samples_of_the_first_and_tells_biases_
 
 
 def test_soft_light_keeps_the_mean_and_the_first_moment_of_an_environment() -> None:
-    from halfspace_sss.trade.soft_light import smoothed
+    from full_geometry.trade.soft_light import smoothed
 
     own = np.concatenate([windows()[:, -1:], windows(), windows()[:, :1]], axis=1)
     theta, phi = np.linspace(0, np.pi, 32)[:, None], (np.arange(64) + 0.5) * np.pi / 32
@@ -220,8 +220,8 @@ def test_soft_light_keeps_the_mean_and_the_first_moment_of_an_environment() -> N
 
 
 def test_a_point_through_which_a_lamp_would_be_seen_is_left_out() -> None:
-    from halfspace_sss.trade.exits import visible_exits
-    from halfspace_sss.trade.ways import stage
+    from full_geometry.trade.exits import visible_exits
+    from full_geometry.trade.ways import stage
 
     lit = scene({"sigma_s": 9.5, "sigma_a": 0.5, "eta": 1.0})
     lamp = {"type": "sphere", "center": [0, 0, -5.0], "radius": 0.4}
@@ -299,8 +299,8 @@ def test_auto_is_chosen_of_all_models_once_kept_and_found_again(tmp_path: Path) 
 
 @pytest.mark.parametrize(("share", "spp", "samples"), [(0.0, 4, 64), (0.5, 256, 1365), (1.0, 1024, 2048)])
 def test_the_choice_takes_its_share_of_the_samples_of_an_image(share: float, spp: int, samples: int) -> None:
-    from halfspace_sss.trade.automatic import _samples
-    from halfspace_sss.trade.ways import stage
+    from full_geometry.trade.automatic import _samples
+    from full_geometry.trade.ways import stage
 
     asked = scene(model="auto")
     asked["sensor"]["sampler"] = {"type": "independent", "sample_count": spp}
@@ -338,7 +338,7 @@ def test_the_command_measures_a_scene_and_writes_files(tmp_path: Path, monkeypat
 
 
 def test_objects_without_weights_are_learnt_before_and_refusals_are_heard(monkeypatch: pytest.MonkeyPatch) -> None:
-    from halfspace_sss.trade import assessing
+    from full_geometry.trade import assessing
 
     class Learnt:
         asked: list[tuple[str, float]] = []
@@ -403,8 +403,8 @@ def test_without_an_argument_the_shipped_table_is_shown() -> None:
 def test_the_figure_and_the_page_are_drawn() -> None:
     pytest.importorskip("matplotlib")
     from figures.drawing.trade_plot import multiples, render
-    from halfspace_sss.trade.images import TradePicture
-    from halfspace_sss.trade.results import Assessment, ObjectTrade, WayTrade
+    from full_geometry.trade.images import TradePicture
+    from full_geometry.trade.results import Assessment, ObjectTrade, WayTrade
 
     numbers = {"ratio": (1.0,), "ratio_error": (0.0,), "variance": 1.0, "variance_error": 0.1, "samples": 9}
     ways = [WayTrade("path_traced", 0.0, 0.0, seconds=1e-5, **numbers)]

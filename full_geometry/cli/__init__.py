@@ -1,0 +1,1 @@
+"""Commands on scenes: render, fit, trade, train and errors."""

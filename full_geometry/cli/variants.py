@@ -1,0 +1,58 @@
+"""Mitsuba under the variant that a command asks for, its warnings as ours."""
+
+from __future__ import annotations
+
+import signal
+from typing import Annotated, Any
+
+import typer
+
+from halfspace_sss.backend import BackendError, prepare_llvm
+from halfspace_sss.cli.interrupts import interrupts
+
+VARIANTS = ("llvm_ad_rgb", "llvm_ad_mono", "cuda_ad_rgb", "cuda_ad_mono")
+Variant = Annotated[str, typer.Option(help="Variant of Mitsuba.")]
+
+
+def use_mitsuba(variant: str, known: tuple[str, ...] = VARIANTS) -> None:
+    """Mitsuba with our plugins, under a variant, one of those that a command knows."""
+    if variant not in known:
+        raise ValueError(f"variant must be one of {', '.join(known)}, got {variant!r}")
+    if variant.startswith("llvm"):
+        prepare_llvm()
+    try:
+        import mitsuba as mi
+    except ImportError as error:
+        raise BackendError('rendering needs Mitsuba 3: pip install "halfspace-sss[render]"') from error
+    import full_geometry
+
+    try:
+        mi.set_variant(variant)
+    except ImportError as error:
+        raise BackendError(f"variant {variant} does not run here: {error}") from error
+    full_geometry.register()
+    _hear_warnings()
+
+
+def _hear_warnings() -> None:
+    """Mitsuba's warnings as ours, on stderr: by itself it prints them among the results."""
+    import mitsuba as mi
+
+    class Lines(mi.Appender):
+        def __init__(self) -> None:
+            mi.Appender.__init__(self)
+
+        def append(self, level: Any, text: str) -> None:
+            if "Received interrupt signal" in text:  # while it renders Mitsuba listens in the place of Python
+                interrupts.received = interrupts.received or signal.SIGINT
+            elif level >= mi.LogLevel.Warn:
+                typer.echo(f"warning: {' '.join(text.split())}", err=True)
+
+        def log_progress(self, *_: Any) -> None:
+            pass
+
+    logger = mi.logger()
+    for part in ("date", "class", "thread", "log_level"):
+        getattr(logger.formatter(), f"set_has_{part}")(False)
+    logger.clear_appenders()
+    logger.add_appender(Lines())

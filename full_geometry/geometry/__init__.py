@@ -1,0 +1,1 @@
+"""Shapes and points of their surfaces, without any medium: rays, instances, sensors, what changed since."""

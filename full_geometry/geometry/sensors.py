@@ -1,0 +1,109 @@
+"""Rays of a sensor through all pixels of its film, and what they bring to the film: of both integrators."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from full_geometry.geometry.instances import Sight
+from full_geometry.geometry.rounding import ray_from
+
+
+def sampled_size(film: mi.Film) -> mi.ScalarVector2u:
+    """Pixels through which rays are sent: those of the crop, and a border that the filter of the film may need."""
+    size = film.crop_size()
+    return size + 2 * film.rfilter().border_size() if film.sample_border() else size
+
+
+def camera_rays(sensor: mi.Sensor, spp: int, seed: tuple[int, int]) -> tuple[mi.Ray3f, mi.Spectrum, mi.Vector2f]:
+    """`rays_by` the sampler of the sensor."""
+    return rays_by(sensor, seeded_sampler(sensor, spp, int(np.random.SeedSequence(list(seed)).generate_state(1)[0])))
+
+
+def seeded_sampler(sensor: mi.Sensor, spp: int, seed: int) -> mi.Sampler:
+    """A copy of the sampler of a sensor for spp samples of each pixel, or more: some samplers take squares only."""
+    sampler = sensor.sampler().clone()
+    sampler.set_sample_count(spp)
+    sampler.set_samples_per_wavefront(sampler.sample_count())
+    sampler.seed(seed, int(dr.prod(sampled_size(sensor.film()))) * sampler.sample_count())
+    return sampler
+
+
+def rays_by(sensor: mi.Sensor, sampler: mi.Sampler) -> tuple[mi.Ray3f, mi.Spectrum, mi.Vector2f]:
+    """Rays of all samples of each pixel, their weights, and their positions on the film.
+
+    Args:
+        sensor: its film has been prepared.
+        sampler: with a lane for each ray, pixel by pixel.
+    """
+    spp = sampler.sample_count()
+    film, size = sensor.film(), sampled_size(sensor.film())
+    border = film.rfilter().border_size() if film.sample_border() else 0
+    n = int(dr.prod(size)) * spp
+    index, width = dr.arange(mi.UInt32, n) // dr.opaque(mi.UInt32, spp), dr.opaque(mi.UInt32, int(size[0]))
+    pixel = mi.Vector2i(index % width, index // width) - border + mi.Vector2i(film.crop_offset())
+    position = mi.Vector2f(pixel) + sampler.next_2d()
+    scale = 1 / mi.ScalarVector2f(film.crop_size())
+    offset = -mi.ScalarVector2f(film.crop_offset()) * scale
+    aperture = sampler.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
+    time = sensor.shutter_open()
+    if sensor.shutter_open_time() > 0:
+        time += sampler.next_1d() * sensor.shutter_open_time()
+    ray, weight = sensor.sample_ray_differential(time, sampler.next_1d(), dr.fma(position, scale, offset), aperture)
+    # in a box filter a position that rounding puts on the edge of a pixel belongs to the neighbour too
+    return widened(ray, n), weight, mi.Vector2f(pixel) if film.rfilter().is_box_filter() else position
+
+
+def past_emitters(scene: mi.Scene, sight: Sight, ray: mi.Ray3f) -> mi.Ray3f:
+    """Rays of a camera that sees no emitters: those that meet one begin behind it."""
+    if all(emitter.get_shape() is None for emitter in scene.emitters()):
+        return ray
+
+    def step(o: mi.Point3f, active: mi.Bool) -> tuple[mi.Point3f, mi.Bool]:
+        here = mi.Ray3f(ray)
+        here.o = o
+        si = sight.intersect(scene, here, mi.RayFlags.Minimal, active=active)
+        active &= si.is_valid() & (si.emitter(scene, active) != None)  # noqa: E711
+        return dr.select(active, ray_from(si, ray.d, sight.rounding(si)).o, o), active
+
+    result, n = type(ray)(ray), dr.width(ray)
+    state = mi.Point3f(ray.o) + dr.zeros(mi.Point3f, n), dr.full(mi.Bool, True, n)
+    result.o = dr.while_loop(state, lambda _, active: active, step, label="emitters")[0]
+    return result
+
+
+def shows_sky(scene: mi.Scene, hide_emitters: bool) -> bool:
+    """Whether a camera sees an environment where it sees nothing else, so that no pixel is transparent."""
+    return not hide_emitters and scene.environment() is not None
+
+
+def splat(
+    film: mi.Film, rays: mi.Ray3f, L: mi.Spectrum, seen: mi.Bool, position: mi.Vector2f, spp: int,
+    layers: Sequence[mi.Float] = (),
+) -> None:  # fmt: skip
+    """Add the light of rays to a film, and values of further channels."""
+    block = film.create_block()
+    block.set_coalesce(block.coalesce() and spp >= 4)
+    alpha = dr.select(seen, mi.Float(1), mi.Float(0))
+    has_alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
+    if mi.has_flag(film.flags(), mi.FilmFlags.Special):
+        values = film.prepare_sample(L, rays.wavelengths, block.channel_count(), weight=1.0, alpha=alpha)
+    else:
+        L = mi.spectrum_to_srgb(L, rays.wavelengths) if mi.is_spectral else L
+        rgb = [L[0]] * 3 if len(L) == 1 and block.channel_count() >= 4 else list(L)
+        values = [*rgb, *([alpha] if has_alpha else []), mi.Float(1), *layers]
+    block.put(position, values)
+    film.put_block(block)
+    dr.eval(block.tensor())
+
+
+def widened(ray: mi.Ray3f, n: int) -> mi.Ray3f:
+    """n rays; those of a sensor that knows one ray only are one."""
+    result = mi.Ray3f(ray)
+    result.o, result.d = result.o + dr.zeros(mi.Point3f, n), result.d + dr.zeros(mi.Vector3f, n)
+    if mi.is_spectral:
+        result.wavelengths = result.wavelengths + dr.zeros(mi.Spectrum, n)
+    return result

@@ -1,0 +1,1 @@
+"""The integrators `bssrdf` and `translucent_walk`."""

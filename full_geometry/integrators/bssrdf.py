@@ -1,0 +1,333 @@
+"""The Mitsuba integrator `bssrdf`: paths that enter translucent objects through the BSSRDF of the half-space."""
+
+from __future__ import annotations
+
+import functools
+import gc
+import math
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import drjit as dr
+import mitsuba as mi
+
+from full_geometry.geometry.instances import Sight
+from full_geometry.geometry.sensors import (
+    past_emitters,
+    rays_by,
+    sampled_size,
+    seeded_sampler,
+    shows_sky,
+    splat,
+)
+from full_geometry.integrators.gathering import Gathering
+from full_geometry.integrators.lit_entries import LitEntries
+from full_geometry.integrators.surface_paths import replay_paths, trace_paths
+from full_geometry.objects.objects import KnowsUnit, TranslucentObject
+from full_geometry.objects.small_emitters import check_emitters
+from full_geometry.registry import Choices
+from full_geometry.sampling.low_discrepancy import path_numbers
+from full_geometry.settings import Settings, read_settings
+from full_geometry.surface.translucent import is_translucent
+from full_geometry.surface.wrapped import wraps
+from full_geometry.transport.prepare import TranslucentObjects, make_objects
+from halfspace_sss.interrupts import interruptible
+
+SAMPLES_PER_LAUNCH = 2**20  # half a second on 2 cores
+GEOMETRY = ("to_world", "vertex_positions", "vertex_normals", "vertex_texcoords")
+
+
+# ---- The plugin -----------------------------------------------------------------------------------------------------
+
+
+def integrator_class() -> type:
+    """The class of the integrator for the current variant of Mitsuba."""
+    return _class(mi.variant())
+
+
+def is_bssrdf(integrator: mi.Integrator | None) -> bool:
+    """Whether an integrator is `bssrdf`, which has settings and makes models of objects before it renders."""
+    return isinstance(integrator, integrator_class())
+
+
+@functools.cache
+def _class(variant: str) -> type:
+    """The class of a variant, which must be the current one."""
+
+    @KnowsUnit.register
+    class BSSRDFIntegrator(mi.SamplingIntegrator):
+        """Renders scenes with `translucent` objects; parameters as in `Settings`.
+
+        An object whose model has to learn it, and has not, is learnt while the scene is prepared, from walks that do
+        not serve the image; `scenes.online.render` and `halfspace-sss render` use them for both.
+
+        Images can be differentiated by emitters, surfaces, textures and the medium of each object (`albedo`, `sigma_t`,
+        `g`), forward and backward; where paths go is held, and derivatives by geometry are refused.
+        """
+
+        def __init__(self, props: mi.Properties) -> None:
+            mi.SamplingIntegrator.__init__(self, props)
+            self.settings = read_settings(props)
+            self.mm_per_unit = self.settings.mm_per_unit
+            self._objects = TranslucentObjects(self.settings)
+            self.gathering = Gathering()
+            self._lit_entries = LitEntries()
+            self._lit: list[TranslucentObject] | None = None  # while an image is rendered
+            self._by_chance = dr.zeros(mi.Float64, 1)
+
+        def prepare(self, scene: mi.Scene) -> list[TranslucentObject]:
+            """The translucent objects of a scene, made ready once; ValueError if the scene cannot be rendered."""
+            check_parameters(scene)
+            check_emitters(scene)
+            with dr.suspend_grad():
+                return self._prepared(scene)
+
+        def _prepared(self, scene: mi.Scene) -> list[TranslucentObject]:
+            objects = self._objects.of(scene)
+            if self._objects.choices.light != "gathered":
+                return objects
+            return self.gathering.of(scene, objects, self.settings)
+
+        def take_over(self, other: mi.Integrator) -> None:
+            """The objects of another integrator of this class that differs in light alone."""
+            self._objects.take_over(other._objects)
+
+        def check(self, scene: mi.Scene, without: Collection[str] = ()) -> None:
+            """ValueError if the scene cannot be rendered, as far as can be told without the objects `without`."""
+            check_parameters(scene)
+            check_emitters(scene)
+            with dr.suspend_grad():
+                make_objects(scene, self.settings, without)
+
+        def render(
+            self, scene: mi.Scene, sensor: mi.Sensor | int = 0, seed: mi.UInt32 | int = 0, spp: int = 0,
+            develop: bool = True, evaluate: bool = True,
+        ) -> mi.TensorXf | None:  # fmt: skip
+            """The image, in launches, between which an interrupt is heard."""
+            sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+            with interruptible(), undisturbed(), dr.suspend_grad():
+                objects = self.prepare(scene)
+                for obj in objects:
+                    if obj.spectral is not None:
+                        obj.spectral.check_covers(obj.geometry.name, sensor)
+                self._lit = self._by_light(scene, objects, sensor, spp)
+                self._by_chance = dr.zeros(mi.Float64, 1)
+                try:
+                    sensor.film().prepare([])
+                    for launch in launches(sensor, spp):
+                        self._launch(scene, sensor, int(mi.UInt32(seed)[0]), launch)
+                        dr.sync_thread()
+                finally:
+                    self._lit = None
+                return sensor.film().develop() if develop else None
+
+        def _launch(self, scene: mi.Scene, sensor: mi.Sensor, seed: int, launch: Launch) -> None:
+            """Add the samples of a launch to the film."""
+            sampler = launch.sampler(sensor, seed)
+            ray, weight, position = rays_by(sensor, sampler)
+            L, hit, _ = self.sample(scene, sampler, ray)
+            splat(sensor.film(), ray, L * weight, hit, position, launch.spp)
+
+        def _by_light(
+            self, scene: mi.Scene, objects: list[TranslucentObject], sensor: mi.Sensor, spp: int
+        ) -> list[TranslucentObject]:
+            """The objects with entries drawn by light, where that pays."""
+            if self._objects.choices.light == "gathered":
+                return objects
+            spp, pixels = spp or sensor.sampler().sample_count(), int(dr.prod(sensor.film().crop_size()))
+            proposals = self._lit_entries.of(scene, objects, self.settings, spp * pixels)
+            return [replace(obj, proposals=given) for obj, given in zip(objects, proposals)]
+
+        def render_forward(self, scene: mi.Scene, *args: Any, **more: Any) -> mi.TensorXf:
+            objects = self._differentiable(scene)
+            with undisturbed():
+                return replayer(objects, self.settings).render_forward(scene, *args, **more)
+
+        def render_backward(self, scene: mi.Scene, *args: Any, **more: Any) -> None:
+            objects = self._differentiable(scene)
+            with undisturbed():
+                replayer(objects, self.settings).render_backward(scene, *args, **more)
+
+        def _differentiable(self, scene: mi.Scene) -> list[TranslucentObject]:
+            if mi.is_spectral:
+                raise ValueError(f"derivatives must be of an RGB or mono variant, got {mi.variant()}")
+            if self.settings.light != "sampled":
+                raise ValueError(f"light must be sampled for derivatives, got {self.settings.light}")
+            return self.prepare(scene)
+
+        def sample(
+            self, scene: mi.Scene, sampler: mi.Sampler, ray: mi.RayDifferential3f, medium: mi.Medium | None = None,
+            active: mi.Bool = True,
+        ) -> tuple[mi.Spectrum, mi.Bool, list]:  # fmt: skip
+            check_outermost(scene)
+            with undisturbed(), dr.suspend_grad():
+                objects = self._prepared(scene) if self._lit is None else self._lit
+                ray = shown(scene, objects, self.settings, ray)
+                parts, hit, chance = trace_paths(scene, objects, self.settings, sampler, ray, active)
+                squares = dr.select(hit & active, mi.Float64(dr.squared_norm(chance)), 0)
+                dr.scatter_add(self._by_chance, squares, mi.UInt32(0))
+            return parts[0] + parts[1], hit | mi.Bool(shows_sky(scene, self.settings.hide_emitters)), []
+
+        @property
+        def choices(self) -> Choices:
+            """What stands for "auto"; known when a scene has been prepared."""
+            return self._objects.choices
+
+        @property
+        def by_chance(self) -> float:
+            """Of light that orders below two met by chance, squares summed over channels and samples of an image."""
+            return float(self._by_chance[0])
+
+        @property
+        def gathered(self) -> list[str]:
+            """A sentence on the light that was gathered for each object, with its noise."""
+            return self.gathering.told()
+
+        def to_string(self) -> str:
+            return f"BSSRDFIntegrator[{self.settings}]"
+
+    return BSSRDFIntegrator
+
+
+def shown(scene: mi.Scene, objects: list[TranslucentObject], settings: Settings, ray: mi.Ray3f) -> mi.Ray3f:
+    """The rays of a camera, which begin behind emitters that it does not see."""
+    sight = objects[0].sight if objects else Sight.of(scene, [])
+    return past_emitters(scene, sight, ray) if settings.hide_emitters else ray
+
+
+@contextmanager
+def undisturbed() -> Iterator[None]:
+    """No garbage collection while a kernel is recorded.
+
+    It would free objects of earlier scenes. A call that is recorded before that has other targets than the same call
+    after it, and Dr.Jit then writes the same function twice, which LLVM refuses.
+    """
+    collects = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if collects:
+            gc.enable()
+
+
+# ---- Launches of an image, between which an interrupt is heard -----------------------------------------------------
+
+
+class Launch(NamedTuple):
+    """Samples of each pixel: how many have been taken before, and how many are taken."""
+
+    first: int
+    spp: int
+
+    def sampler(self, sensor: mi.Sensor, seed: int) -> mi.Sampler:
+        """Its random numbers: of `low_discrepancy` in place of independent ones, else of the sampler of a sensor."""
+        if is_independent(sensor.sampler()):
+            return path_numbers(seed, int(dr.prod(sampled_size(sensor.film()))), *self)
+        return seeded_sampler(sensor, self.spp, seed)
+
+
+def is_independent(sampler: mi.Sampler) -> bool:
+    """Whether a sampler is Mitsuba's `independent`."""
+    return sampler.class_name() == "IndependentSampler"
+
+
+def launches(sensor: mi.Sensor, spp: int) -> Iterator[Launch]:
+    """Launches of about equally many samples, each to be rendered to the film of a sensor.
+
+    Only samples of the sampler `independent` are split, as those of `low_discrepancy` go on in the next launch. Other
+    samplers round the samples of each launch up to a square or another number of strata: they have one launch.
+    """
+    spp = spp or sensor.sampler().sample_count()
+    n = min(math.ceil(spp * int(dr.prod(sensor.film().crop_size())) / SAMPLES_PER_LAUNCH), spp)
+    ends = [(spp * k) // n for k in range(n + 1)] if is_independent(sensor.sampler()) else [0, spp]
+    for first, last in zip(ends, ends[1:]):
+        yield Launch(first, last - first)
+
+
+# ---- Derivatives: Mitsuba's radiative backpropagation around a replay of the paths ---------------------------------
+
+
+def check_parameters(scene: mi.Scene) -> None:
+    """Refuse derivatives that a replay with fixed paths does not have.
+
+    Raises:
+        ValueError: gradients are enabled for the geometry of a shape, for a sensor or film, or for what Mitsuba does
+            not differentiate by, such as the index of a smooth dielectric.
+    """
+    parameters = mi.traverse(scene)
+    for key, (_, _, owner, flags) in parameters.properties.items():
+        with dr.resume_grad():
+            if not dr.grad_enabled(parameters[key]):
+                continue
+        name = key.rsplit(".", 1)[-1]
+        fixed = bool(flags & int(mi.ParamFlags.NonDifferentiable))
+        if fixed or name in GEOMETRY or _moves(owner, name) or _selects(parameters, owner, name):
+            raise ValueError(
+                f"{key} must not have gradients enabled: bssrdf differentiates light by emitters, surfaces, textures "
+                "and media, with paths held where they are"
+            )
+
+
+def check_outermost(scene: mi.Scene) -> None:
+    """Refuse derivatives of another integrator that asks this one for samples: they would be missing in silence.
+
+    Raises:
+        ValueError: gradients are enabled for a parameter of the scene, and followed.
+    """
+    followed = [key for key, value in mi.traverse(scene).items() if dr.grad_enabled(value)]
+    if followed:
+        raise ValueError(
+            f"bssrdf must be the outermost integrator for derivatives, got one around it for {followed[0]}"
+        )
+
+
+def _moves(owner: mi.Object, name: str) -> bool:
+    """Whether a parameter moves a shape or a sensor; attributes of vertices and faces are textures."""
+    if isinstance(owner, mi.Shape):
+        return not name.startswith(("vertex_", "face_"))
+    return isinstance(owner, (mi.Sensor, mi.Film))
+
+
+def _selects(parameters: mi.SceneParameters, owner: mi.Object | None, name: str) -> bool:
+    """Whether a parameter does more than scale light: the share of a mirror in a blend, the index that a medium has."""
+    own = True
+    while owner is not None:
+        if isinstance(owner, mi.BSDF):
+            if wraps(owner):
+                return own  # its mask or map: what it is around is asked by itself
+            if owner.class_name() == "BlendBSDF":
+                return bool(owner.flags() & int(mi.BSDFFlags.Delta))
+            own = False
+        owner = parameters.hierarchy[owner][0]
+        if is_translucent(owner) and name == "eta":
+            return True
+    return False
+
+
+def replayer(objects: list[TranslucentObject], settings: Settings) -> mi.Integrator:
+    """An integrator of Mitsuba's radiative backpropagation around the paths through a scene with these objects.
+
+    Raises:
+        ValueError: as of `TranslucentObject.prepare_derivatives`.
+    """
+    from mitsuba.python.ad.integrators.common import RBIntegrator
+
+    for obj in objects:
+        obj.prepare_derivatives()
+
+    class Replayer(RBIntegrator):
+        """Mitsuba's camera rays and films, this project's paths."""
+
+        def sample(self, mode: dr.ADMode, scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f, **given: Any) -> tuple:
+            ray = shown(scene, objects, settings, ray)
+            if mode == dr.ADMode.Primal:
+                parts, hit, _ = trace_paths(scene, objects, settings, sampler, ray, given["active"])
+                return parts[0] + parts[1], hit | mi.Bool(shows_sky(scene, settings.hide_emitters)), [], parts
+            parts, backward = given["state_in"], mode == dr.ADMode.Backward
+            d = replay_paths(scene, objects, settings, sampler, ray, parts, given["δL"], backward)
+            return d, mi.Bool(True), [], parts
+
+    return Replayer(mi.Properties())

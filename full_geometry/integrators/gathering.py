@@ -1,0 +1,408 @@
+"""Light that arrives at the points of an object, gathered once, and what leaves by it.
+
+At each point the mean of the incident radiance, weighted by a(mu) mu, is estimated per channel by emitter sampling and
+by directions of the cosine (balance heuristic); what other surfaces send is traced along the latter, by the path loop.
+B = T L follows, see `precomputed.transfer`, and at an exit L_o(x_o, w_o) = a(w_o) B(x_o), blended between points.
+Jensen and Buhler (2002) take two passes so with a dipole; here the second is a sparse matrix that outlives the light.
+
+What is not known: a dependence of the model on the azimuth between light and view; how light varies over directions,
+apart from its a(mu)-weighted mean, first moment, and what S along a few directions of it brings in the neighbourhood;
+detail of light below the distance of the points. Its noise is that of the gathering.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from full_geometry.geometry.points import cosine_above, opaque, place
+from full_geometry.geometry.rounding import blocked, ray_from
+from full_geometry.geometry.snapshot import Snapshot, same_objects
+from full_geometry.integrators.inner_light import COUNT, inner_light
+from full_geometry.integrators.lighting import Lights, Sky, mis_weight
+from full_geometry.integrators.surface_paths import trace_paths
+from full_geometry.precomputed.inner import Events, InnerLight, has_inner_light
+from full_geometry.precomputed.point_pairs import Rays
+from full_geometry.precomputed.transfer import (
+    SEED,
+    Albedo,
+    Hemispheres,
+    Incident,
+    Transfer,
+    bent,
+    cosine,
+    transfer,
+)
+from full_geometry.sampling.light_points import GOLDEN, SurfacePoints
+from halfspace_sss.backend import clock
+
+if TYPE_CHECKING:
+    from full_geometry.geometry.instances import Sight
+    from full_geometry.geometry.points import SurfacePoint
+    from full_geometry.objects.objects import TranslucentObject
+    from full_geometry.settings import Settings
+
+DIRECTIONS = 2**18  # of all points of an object, by emitters, and as many by the cosine
+FEWEST, MOST = 24, 1024  # of a point
+PART = 1 / 8  # of the samples of a transfer
+SPREADINGS = 4  # of what other surfaces send,
+BRIGHTEST = 1 / 128  # of the points, which share it no matter how bright
+TRACED = 8  # one of so many directions by the cosine is traced further, where it meets a surface
+
+
+@dataclass(frozen=True, eq=False)
+class Gathered:
+    """Radiance of orders from two on that leaves an object in the light of a scene.
+
+    Args:
+        object: of it.
+        points: where B is known.
+        albedo: a(mu).
+        values: B of all points, for each channel the constant and the slope over w_o bent by the boundary.
+        inner: at events of order 1 inside; None where that order is traced.
+        transfer: of the model.
+        light: that arrives, less c.
+        parts: independent estimates of it.
+        c: mean radiance of the sky in the channels where alpha is known, else 0, see `lighting.Sky`.
+    """
+
+    object: TranslucentObject
+    points: SurfacePoints
+    albedo: Albedo
+    values: mi.Float
+    inner: InnerLight | None
+    transfer: Transfer
+    light: Incident
+    parts: tuple[Incident, ...] = ()
+    c: np.ndarray | float = 0.0
+
+    def radiance(self, out: SurfacePoint, active: mi.Bool) -> mi.Spectrum:
+        """L_o of an exit; 0 below the horizon."""
+        size = dr.size_v(mi.Spectrum)
+        B = self.points.blend(self.values, 4 * size, out.p, out.n, active)
+        rows, w = [B[4 * c : 4 * c + 4] for c in range(size)], bent(out.w, out.n_out, self.albedo.eta)
+        B = mi.Spectrum([b + x * w.x + y * w.y + z * w.z for b, x, y, z in rows])
+        mu = dr.dot(out.w, out.n_out)
+        paint = None if self.object.textured is None else self.object.transport.paint(out)
+        a = self.albedo(dr.maximum(mu, 0), paint)
+        if paint is not None:
+            a *= paint ** mi.Spectrum([opaque(v) for v in self.transfer.e])
+        alpha = self.object.transport.alpha
+        if alpha is not None:
+            known = alpha.known[1]
+            a = known * alpha(out, active)[1] + (1 - known) * a
+        return dr.select(active & (mu > 0), a * dr.maximum(B, 0), 0)
+
+    @cached_property
+    def error(self) -> float:
+        """Standard error of B by the gathering of light, over its mean; NaN where that is not in parts."""
+        found = np.stack([self.transfer.mean(part) + self.c for part in self.parts])
+        spread = found.var(axis=0, ddof=1).mean() if len(found) > 1 else np.nan
+        return float(np.sqrt(spread / len(found)) / max(float(found.mean()), 1e-30))
+
+    @property
+    def told(self) -> str:
+        """How many points, and the noise of B."""
+        return (
+            f"gathered at {len(self.points)} points, {1e-6 * self.transfer.nbytes:.0f} MB: noise of the transfer "
+            f"{self.transfer.error:.1%} a point, of the light {self.error:.1%}"
+        )
+
+    def kept(self, other: Gathered) -> float:
+        """Of the variance of two parts the share that all samples have."""
+        B = self.transfer @ self.light
+        by_light = ((B - self.transfer @ other.light) ** 2).mean()
+        by_transfer = ((B - other.transfer @ self.light) ** 2).mean()
+        whole = by_light + by_transfer
+        return float((0.5 * by_light + PART * by_transfer) / whole) if whole > 0 else 1.0
+
+
+class Gathering:
+    """Gathered light of the objects of a scene, kept until something in the scene changes.
+
+    Args:
+        part: 0 for all samples; others are independent of each other, with a share `PART` of the samples of a transfer
+            and half the light.
+        seed: of what is drawn.
+
+    Attributes:
+        seconds: by `clock`, of the transfers and of the light, as they were last found.
+    """
+
+    def __init__(self, part: int = 0, seed: int = 0) -> None:
+        self._part, self._seed, self.seconds = part, seed, (0.0, 0.0)
+        self._objects: list[TranslucentObject] = []
+        self._transfers: list[Transfer | None] = []
+        self._events: list[Events | None] = []
+        self._light: Snapshot | None = None
+        self._found: list[TranslucentObject] = []
+
+    def of(self, scene: mi.Scene, objects: list[TranslucentObject], settings: Settings) -> list[TranslucentObject]:
+        """The objects, each with what leaves it in place of its transport.
+
+        Raises:
+            ValueError: an object is open or has no known area, or light that arrives is not finite.
+        """
+        if not same_objects(objects, self._objects):
+            spread = [spreads(obj) for obj in objects]
+            for obj, one in zip(objects, spread):
+                if one:
+                    _check(obj)
+            started = clock()
+            share = PART if self._part else 1.0
+            seed = SEED + self._part + 10 * self._seed
+            made = [transfer(obj, share, seed) if one else None for obj, one in zip(objects, spread)]
+            inner = [bool(one and not self._part and has_inner_light(obj)) for obj, one in zip(objects, spread)]
+            self._events = [Events.of(obj, COUNT) if one else None for obj, one in zip(objects, inner)]
+            self._transfers, self._objects, self._light = made, objects, None
+            self.seconds = (clock() - started, 0.0)
+        state = light_state(scene)
+        if state != self._light:
+            started = clock()
+            seed, parts = 1000 * self._part + 10_000 * self._seed, 1 if self._part else 2
+            ways = list(zip(self._transfers, self._events))
+            self._found = _lit(scene, objects, ways, settings, seed, parts)
+            self._light, self.seconds = state, (self.seconds[0], clock() - started)
+        return self._found
+
+    def kept(self, other: Gathering, k: int) -> float:
+        """Of the variance of parts of an object's light, the share that gathering with all samples has.
+
+        Args:
+            other: another part of the same scene.
+            k: number of the object.
+        """
+        one = self._found[k].gathered
+        return 1.0 if one is None else one.kept(other._found[k].gathered)
+
+    def told(self) -> list[str]:
+        """Of each object: points, memory, and noise."""
+        results = [obj.gathered for obj in self._found if obj.gathered is not None]
+        return [f"light of {g.object.geometry.name} {g.told}" for g in results]
+
+
+def spreads(obj: TranslucentObject) -> bool:
+    """Whether light leaves elsewhere than it entered, by orders that a transport has, of an object at one place."""
+    return obj.transport is not None and not obj.transport.is_delta and not obj.repeated
+
+
+def _check(obj: TranslucentObject) -> None:
+    result = obj.geometry
+    if not result.closed or not result.area > 0:
+        lacks = "is not closed" if not result.closed else f"is a {result.shape.class_name()} without known area"
+        raise ValueError(f"light must be sampled for object {result.name}, which {lacks}, got gathered")
+    if obj.wrapping.bend is not None:
+        raise ValueError(
+            f"light must be sampled for object {result.name}, which has a normal or bump map, got gathered"
+        )
+
+
+def light_state(scene: mi.Scene) -> Snapshot:
+    """What tells whether anything that sends, blocks or scatters light has changed."""
+    return Snapshot.of(scene, without=(mi.Scene, mi.Integrator, mi.Sensor, mi.Film, mi.Sampler))
+
+
+def _lit(
+    scene: mi.Scene, objects: list[TranslucentObject], ways: list[tuple[Transfer | None, Events | None]],
+    settings: Settings, seed: int, parts: int,
+) -> list[TranslucentObject]:  # fmt: skip
+    """The objects, those with a transfer by what leaves them; what they send each other is sampled by their models."""
+    found = list(objects)
+    for k, (obj, (T, events)) in enumerate(zip(objects, ways)):
+        if T is not None:
+            g = _leaving(scene, objects, k, (T, events), settings, seed, parts)
+            found[k] = replace(obj, transport=None, proposals=None, gathered=g)
+    return found
+
+
+def _leaving(
+    scene: mi.Scene, objects: list[TranslucentObject], k: int, of: tuple[Transfer, Events | None], settings: Settings,
+    seed: int, parts: int,
+) -> Gathered:  # fmt: skip
+    """B of object k, by light in parts whose differences tell the noise, and light inside."""
+    obj, (T, events) = objects[k], of
+    found, rays = _incident(scene, objects, T, obj.geometry.clearance, settings, 2 * k + seed, parts)
+    lights, others = zip(*found)
+    if not all(np.isfinite(light.mean).all() for light in lights):
+        raise ValueError(f"light at object {obj.geometry.name} must be finite, got NaN or infinity")
+    inner = None
+    if events is not None:
+        seen = mi.Float(np.mean(others, axis=0).astype(np.float32).ravel())
+        inner = inner_light(scene, objects, k, settings, events, (T.points, seen))
+    sky = Sky.of(scene, Lights.of(scene), [obj])
+    c = np.zeros(len(T.trusted)) if sky is None else T.trusted * np.ravel(np.array(sky.mean))
+    lights = tuple(replace(light, mean=light.mean - c.astype(np.float32)) for light in lights)
+    light = Incident.mean_of(lights)
+    B = T @ light
+    B[:, :, 0] += c
+    if obj.textured is None:  # averages over the neighbourhood would cross edges of textures
+        direct = np.maximum(rays.light.sum(axis=1) / T.around.whole - c, 0)
+        B += T.beyond(direct.astype(np.float32), rays)
+    values = mi.Float(B.astype(np.float32).ravel())
+    return Gathered(obj, T.points, T.albedo, values, inner, T, light, lights, c)
+
+
+def _incident(
+    scene: mi.Scene,
+    objects: list[TranslucentObject],
+    T: Transfer,
+    e: mi.Float,
+    settings: Settings,
+    seed: int,
+    parts: int,
+) -> tuple[list[tuple[Incident, np.ndarray]], Rays]:
+    """Incident radiance at all points, and the mean of other surfaces that each sees, in parts; light by ray.
+
+    Parts are independent estimates by as many directions each, of one launch. Rays have the light of emitters alone.
+    """
+    count, rows = len(T.points), len(T.points) * parts
+    n = int(np.clip(DIRECTIONS // (2 * count), FEWEST, MOST)) // TRACED * TRACED
+    # kernels are those of other numbers of points too
+    lane, each, few, all_few = dr.arange(mi.UInt32, rows * n), *_numbers(n, n // TRACED, rows * (n // TRACED))
+    # directions that are traced further come first: beside each other, as lanes that wait cost as much
+    traced, rest = lane < all_few, lane - all_few
+    i = rest % (each - few)
+    s = dr.select(traced, lane % few * TRACED, i + i // (TRACED - 1) + 1)
+    j = dr.select(traced, lane // few, rest // (each - few))
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(100 + seed, dr.width(lane))
+    point = j % _numbers(count)[0]
+    at = GatheringPoint(*(dr.gather(type(v), v, point) for v in (T.points.p, T.points.n, T.points.n_out)), e)
+    u, v = (_stratified(sampler, j, s, each) for _ in range(2))
+    aimed, w_e = by_emitters(scene, objects[0].sight, T.albedo, at, u)
+    met, more, a, w_c, on = by_cosine(scene, objects, T.albedo, settings, at, v, traced, sampler)
+    around = T.around
+    centre = dr.gather(mi.Vector3f, mi.Vector3f(around.middle.T.astype(np.float32)), point)
+    d_e, d_c = (bent(w, at.n_out, T.albedo.eta) - centre for w in (w_e, w_c))
+    values = [aimed + met, *(aimed * d_e[i] + met * d_c[i] for i in range(3))]
+    values += [TRACED * more, *(TRACED * more * d_c[i] for i in range(3)), TRACED * dr.select(on, a, 0)]
+    values = [mi.Spectrum(v) + dr.zeros(mi.Float, rows * n) for v in values]
+    each_light = [mi.Spectrum(v) + dr.zeros(mi.Float, rows * n) for v in (aimed, met)]
+    dr.eval(values, each_light, w_e, w_c)
+    j, s = lane // each, lane % each
+    order = dr.select(s % TRACED == 0, j * few + s // TRACED, all_few + j * (each - few) + s - s // TRACED - 1)
+    sums = [dr.block_sum(dr.gather(mi.Float, v, order), n) for value in values for v in value]
+    dr.eval(sums)
+    found = np.stack([np.array(v, dtype=float) for v in sums], axis=1).reshape(rows, len(values), -1) / n
+    at = np.array(order)
+
+    def by_point(v: Any) -> np.ndarray:
+        v = np.array(v).T[at].reshape(parts, count, n, -1)
+        return np.moveaxis(v, 0, 1).reshape(count, parts * n, -1)
+
+    w, light = (np.concatenate([by_point(v) for v in both], axis=1) for both in ((w_e, w_c), each_light))
+    rays = Rays(w, light / (parts * n))
+    return [_of_part(T.points, around, found[k * count : (k + 1) * count]) for k in range(parts)], rays
+
+
+def _of_part(points: SurfacePoints, around: Hemispheres, found: np.ndarray) -> tuple[Incident, np.ndarray]:
+    """Incident radiance, and the mean of other surfaces.
+
+    Args:
+        points: where.
+        around: their hemispheres.
+        found: (points, 9, channels), with the weight a(mu) mu: light of emitters, and times directions about their
+            middle; what other surfaces send, and times these; 1 where they are.
+    """
+    direct, sent, seen = found[:, 0], found[:, 4], found[:, 8]
+    steady = _steadied(sent)
+    spread = _spread(points, steady * sent)
+    first = found[:, 1:4] + _spread(points, steady[:, None] * found[:, 5:8])
+    parts = ((direct + spread) / around.whole, np.moveaxis(first, 1, 2) / around.whole[:, :, None])
+    others = spread / np.maximum(_spread(points, seen), 1e-30)
+    return Incident(*(part.astype(np.float32) for part in parts)), others
+
+
+def _steadied(sent: np.ndarray) -> np.ndarray:
+    """Factors of what other surfaces send to points, (points, channels), by which the brightest share that of the next.
+
+    Of mirrored lamps a few points may hold half of all light; what is cut goes to all points by what they have.
+    """
+    most = np.quantile(sent, 1 - BRIGHTEST, axis=0)
+    kept = np.where(most > 0, np.minimum(sent, most), sent)
+    whole = sent.sum(axis=0) / np.maximum(kept.sum(axis=0), 1e-30)
+    return np.where(sent > 0, kept / np.maximum(sent, 1e-30), 1) * whole
+
+
+def _spread(points: SurfacePoints, values: np.ndarray) -> np.ndarray:
+    """What a few traced directions bring, over the neighbourhood: it varies slowly, and was most of the noise."""
+    for _ in range(SPREADINGS):
+        values = points.smoothed(values)
+    return values
+
+
+class GatheringPoint(NamedTuple):
+    """Position, outward geometric and shading normal, and how far rounding puts the position from the surface."""
+
+    p: mi.Point3f
+    n: mi.Normal3f
+    n_out: mi.Normal3f
+    e: mi.Float
+
+
+def _numbers(*values: int) -> list[mi.UInt32]:
+    return [dr.opaque(mi.UInt32, value) for value in values]
+
+
+def _stratified(sampler: mi.Sampler, j: mi.UInt32, s: mi.UInt32, n: mi.UInt32) -> mi.Point2f:
+    """Pairs of uniforms for n directions of each point, a lattice shifted for each point."""
+    shift = dr.gather(mi.Point2f, sampler.next_2d(), j * n)
+    x = mi.Point2f(mi.Float(s) / mi.Float(n) + shift.x, dr.fma(mi.Float(s), GOLDEN, shift.y))
+    return x - dr.floor(x)
+
+
+def _weight(albedo: Albedo, at: GatheringPoint, w: mi.Vector3f) -> tuple[mi.Spectrum, mi.Float]:
+    """a(mu) mu over the density of the cosine, and that density."""
+    mu = cosine(w, at.n, at.n_out)
+    return albedo(mu) * dr.pi, mu * dr.inv_pi
+
+
+def by_emitters(
+    scene: mi.Scene, sight: Sight, albedo: Albedo, at: GatheringPoint, u: mi.Point2f, c: mi.Spectrum | float = 0.0
+) -> tuple[mi.Spectrum, mi.Vector3f]:
+    """Light of sampled emitters less c of the sky, and its direction."""
+    here = place(at.p, at.n)
+    ds, light = scene.sample_emitter_direction(here, u, False)
+    a, pdf = _weight(albedo, at, ds.d)
+    above = (ds.pdf > 0) & (pdf > 0)
+    light = dr.select(blocked(scene, sight.ray_to_emitter(here, ds, at.e), above), 0, light)
+    light -= dr.select(ds.emitter.is_environment(), c / dr.maximum(ds.pdf, 1e-30), 0)
+    share = dr.select(ds.delta, 1, mis_weight(ds.pdf, pdf))
+    return dr.select(above, a * pdf * light * share, 0), ds.d
+
+
+def by_cosine(
+    scene: mi.Scene, objects: list[TranslucentObject], albedo: Albedo, settings: Settings, at: GatheringPoint,
+    u: mi.Point2f, traced: mi.Bool, sampler: mi.Sampler,
+) -> tuple[mi.Spectrum, mi.Spectrum, mi.Spectrum, mi.Vector3f, mi.Bool]:  # fmt: skip
+    """By directions of the cosine: light of emitters that they meet, what other surfaces send along some, a, and w.
+
+    Last comes along which.
+    """
+    met, a, w, ray, si = met_by_cosine(scene, objects[0].sight, albedo, at, u)
+    hidden = replace(settings, hide_emitters=True, light="sampled", max_depth=max(settings.max_depth - 1, -1) or 1)
+    on = si.is_valid() & traced
+    parts, *_ = trace_paths(scene, objects, hidden, sampler, ray, on, scattered=True)
+    return met, dr.select(on, a * (parts[0] + parts[1]), 0), a, w, on
+
+
+def met_by_cosine(
+    scene: mi.Scene, sight: Sight, albedo: Albedo, at: GatheringPoint, u: mi.Point2f, c: mi.Spectrum | float = 0.0
+) -> tuple[mi.Spectrum, mi.Spectrum, mi.Vector3f, mi.Ray3f, mi.SurfaceInteraction3f]:
+    """Light of emitters that a direction of the cosine meets, less c of the sky; a, that direction, its ray and hit."""
+    w, _ = cosine_above(at.n_out, at.n, u)
+    a, pdf = _weight(albedo, at, w)
+    here = place(at.p, at.n)
+    ray = ray_from(here, w, at.e)
+    si = sight.intersect(scene, ray, mi.RayFlags.All, True)
+    emitter = si.emitter(scene)
+    shines = emitter != None  # noqa: E711
+    density = scene.pdf_emitter_direction(here, mi.DirectionSample3f(scene, si, here), shines)
+    L = emitter.eval(si, shines) - dr.select(emitter.is_environment(), c, 0)
+    met = dr.select(shines, mis_weight(pdf, density) * L, 0)
+    return a * met, a, w, ray, si

@@ -1,0 +1,337 @@
+"""The Mitsuba integrator `translucent_walk`: light inside translucent objects by exact random walks."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import math
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from full_geometry.geometry.sensors import camera_rays, sampled_size, splat, widened
+from full_geometry.geometry.shape import SceneMark
+from full_geometry.geometry.snapshot import same_objects
+from full_geometry.integrators.walk_paths import FirstExits, LightVisitor, PathTracer
+from full_geometry.objects.inclusions import check_sensors
+from full_geometry.objects.objects import KnowsUnit, check_size, places_of, translucent_shapes
+from full_geometry.objects.small_emitters import SmallEmitters
+from full_geometry.precomputed.unscattered_light import inside_cells_of, obstacle, unscattered_light
+from full_geometry.settings import OF_MITSUBA, WALK_LIGHTS, check_parameters
+from full_geometry.surface.textured import shown
+from full_geometry.surface.varying import equivalent
+from full_geometry.surface.wrapped import surface_of
+from full_geometry.walk.emitter_connections import EmitterDirections, InnerLights, find_connections
+from full_geometry.walk.media import WalkMedia
+from full_geometry.walk.scores import PathScores, with_derivatives
+from full_geometry.walk.straight_light import find_straight_light
+from halfspace_sss.checks import check_choice
+from halfspace_sss.interrupts import interruptible
+
+PARAMETERS = ("mm_per_unit", "max_depth", "rr_depth", "hide_emitters", "connection_share", "blur", "light", "layers")
+SAMPLES_PER_LAUNCH = 2**19
+LANES = 2**14  # fastest of 2**12 to 2**18 on 2 cores
+GPU_FACTOR = 4  # as many times lanes and samples on CUDA: 1.2 to 1.4 times as fast on an H200
+LAYER = ["emission.R", "emission.G", "emission.B"]
+SAMPLES_PER_RAY = 4  # of the image, for each ray of light: these take a tenth of the time or less
+FEWEST_RAYS, MOST_RAYS = 2**16, 2**21
+FOREVER = 2**31 - 1
+WIDEST = 20.0  # blur: 1 and 3 radians
+Keep = Callable[[FirstExits], None]
+
+
+def walk_integrator_class() -> type:
+    """The class of the integrator for the current variant of Mitsuba."""
+    return _class(mi.variant())
+
+
+@functools.cache
+def _class(variant: str) -> type:
+    """The class of a variant, which must be the current one."""
+
+    @KnowsUnit.register
+    class TranslucentWalk(mi.SamplingIntegrator):
+        """Path tracer whose paths walk through objects with the surface `translucent`.
+
+        Parameters: `mm_per_unit` (1), `max_depth` (-1: no limit; counts surfaces seen from outside), `rr_depth` (5),
+        `hide_emitters` (false), `connection_share` (0.5; probability of a connection with a small emitter from a
+        scattering event near the boundary, 0 leaves all light to chance), `blur` (1; scale of the cones over
+        which delta lights are spread where no strategy reaches them: less has less bias and more noise, 0 leaves that
+        light out), `light` ("auto"; "precomputed" finds light that arrives unscattered on a grid, see
+        `unscattered_light`, which has 10 to 50 times less noise in the same time and a bias of less than .3 %;
+        "sampled" meets it by chance and by connections, without that bias; "auto" precomputes it where that is
+        possible and there is more than an even sky, and samples it for derivatives), `layers` (false; true adds the
+        channels emission.R, .G and .B to the image: emitters that the camera sees at once and, with precomputed light,
+        in the mirror of an object, which leaves what is behind it for a denoiser).
+        """
+
+        def __init__(self, props: mi.Properties) -> None:
+            check_parameters("translucent_walk", props, (*PARAMETERS, *OF_MITSUBA))
+            mi.SamplingIntegrator.__init__(self, props)
+            self.mm_per_unit = _positive("mm_per_unit", float(props.get("mm_per_unit", 1.0)))
+            self.max_depth = _depth("max_depth", int(props.get("max_depth", -1)))
+            self.rr_depth = _depth("rr_depth", int(props.get("rr_depth", 5)))
+            self.hidden = bool(props.get("hide_emitters", False))
+            self.connection_share = _share("connection_share", float(props.get("connection_share", 0.5)))
+            self.blur = _scale("blur", float(props.get("blur", 1.0)))
+            self.light = str(props.get("light", "auto"))
+            check_choice("light", self.light, WALK_LIGHTS)
+            self.layers = bool(props.get("layers", False))
+            self._prepared: tuple[SceneMark | None, list, list, Any] = (None, [], [], None)
+            self._cells: tuple[Any, list] = (None, [])
+
+        def tracer(self, scene: mi.Scene, seed: int = 0, samples: int = 0, scored: bool = False) -> PathTracer:
+            """What paths through a scene need; its objects are made ready once, its emitters may have been edited.
+
+            Args:
+                seed: of the light that is precomputed.
+                samples: of the image, by which that light has its rays; 0 leaves it to be sampled.
+                scored: whether derivatives are asked for, which leave light to be sampled.
+            """
+            self._prepared = _prepared(scene, self._prepared, self.mm_per_unit)
+            media, small = self._prepared[-1], SmallEmitters.of(scene)
+            inner = InnerLights.of(media, self.blur)
+            if samples and self.precomputes(scene, media):
+                if self._cells[0] is not media:
+                    self._cells = media, inside_cells_of(media)
+                rays = min(max(samples // SAMPLES_PER_RAY, FEWEST_RAYS), MOST_RAYS)
+                light = unscattered_light(scene, media, seed, self._cells[1], rays)
+                visitor = LightVisitor(scene, media, small, None, None, None, inner, self.blur, light)
+                return PathTracer(visitor, self.max_depth, self.rr_depth, self.hidden, self.layers)
+            connections = find_connections(scene, media, small, self.connection_share, scored)
+            directions = connections and EmitterDirections(scene, media, small, scored)
+            if scored and inner is not None:
+                raise ValueError("objects must hold no delta lights for derivatives of translucent_walk")
+            straight = find_straight_light(scene, media, self.max_depth == FOREVER, scored)
+            visitor = LightVisitor(scene, media, small, connections, directions, straight, inner, self.blur)
+            return PathTracer(visitor, self.max_depth, self.rr_depth, self.hidden, self.layers)
+
+        def precomputes(self, scene: mi.Scene, media: WalkMedia) -> bool:
+            """Whether images find unscattered light precomputed; if that is left to us, not that of an even sky alone.
+
+            Every walk meets an even sky where it leaves, with less noise than the sky has inside.
+
+            Raises:
+                ValueError: `light` is "precomputed", and it cannot be in this scene.
+            """
+            if self.light == "sampled" or not media.objects or not len(media.scene.shapes()):
+                return False
+            reason = obstacle(media)
+            if reason and self.light == "precomputed":
+                raise ValueError(f"light must be auto or sampled, got 'precomputed': {reason}")
+            uneven = any("Constant" not in emitter.class_name() for emitter in scene.emitters())
+            return not reason and (uneven or self.light == "precomputed")
+
+        def render(
+            self, scene: mi.Scene, sensor: mi.Sensor | int = 0, seed: mi.UInt32 | int = 0, spp: int = 0,
+            develop: bool = True, evaluate: bool = True, keep: Keep | None = None,
+        ) -> mi.TensorXf | None:  # fmt: skip
+            """The image; `keep` is called with the first exits of each launch, which are stored for it."""
+            sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+            spp = spp or sensor.sampler().sample_count()
+            with interruptible(), dr.suspend_grad():
+                seed = int(mi.UInt32(seed)[0])
+                samples = spp * int(dr.prod(sampled_size(sensor.film())))
+                _render(self.tracer(scene, seed, samples), sensor, seed, spp, keep)
+                return sensor.film().develop() if develop else None
+
+        def sample(
+            self,
+            scene: mi.Scene,
+            sampler: mi.Sampler,
+            ray: mi.Ray3f,
+            medium: mi.Medium | None = None,
+            active: mi.Bool = True,
+        ) -> tuple:
+            with dr.suspend_grad():
+                seed = tuple(int(2**24 * sampler.next_1d()[0]) for _ in range(2))
+                tracer = self.tracer(scene, seed[0], sampler.wavefront_size())
+                rays = tracer.shown(widened(ray, sampler.wavefront_size()))
+                L, seen, emission = tracer.trace(rays, _on_device(LANES), seed)
+            layer = list(mi.Color3f(emission)) if self.layers else []
+            return dr.select(active, L, 0), active & seen, layer
+
+        def render_forward(
+            self, scene: mi.Scene, params: Any, sensor: mi.Sensor | int = 0, seed: mi.UInt32 | int = 0, spp: int = 0
+        ) -> mi.TensorXf:
+            """The derivative of the image along that of the parameters."""
+            with dr.suspend_grad():
+                image = self._differentiable(scene, sensor, seed, spp)
+                with dr.resume_grad():
+                    dr.forward_to(image)
+                    return dr.grad(image)
+
+        def render_derivatives(
+            self, scene: mi.Scene, variables: Sequence[Any], sensor: mi.Sensor | int = 0, seed: mi.UInt32 | int = 0,
+            spp: int = 0,
+        ) -> tuple[mi.TensorXf, list[mi.TensorXf]]:  # fmt: skip
+            """The image, and its derivative along each of the variables that media come from: all of the same paths.
+
+            Args:
+                variables: arrays with gradients enabled; all their numbers change alike.
+            """
+            with dr.suspend_grad():
+                image, found = self._differentiable(scene, sensor, seed, spp), []
+                with dr.resume_grad():
+                    for x in variables:
+                        dr.clear_grad(image)
+                        dr.set_grad(x, 1.0)
+                        dr.forward_from(x, dr.ADFlag.ClearInput | dr.ADFlag.ClearInterior)
+                        found.append(dr.grad(image))
+                        dr.eval(found[-1])
+                return dr.detach(image), found
+
+        def render_backward(
+            self, scene: mi.Scene, params: Any, grad_in: mi.TensorXf, sensor: mi.Sensor | int = 0,
+            seed: mi.UInt32 | int = 0, spp: int = 0,
+        ) -> None:  # fmt: skip
+            """Add to the gradients of parameters what that of the image, `grad_in`, makes of them."""
+            with dr.suspend_grad():
+                image = self._differentiable(scene, sensor, seed, spp)
+                with dr.resume_grad(), _one_thread():
+                    dr.set_grad(image, grad_in)
+                    dr.enqueue(dr.ADMode.Backward, image)
+                    dr.traverse(dr.ADMode.Backward)
+                    dr.eval()
+
+        def _differentiable(
+            self, scene: mi.Scene, sensor: mi.Sensor | int, seed: mi.UInt32 | int, spp: int
+        ) -> mi.TensorXf:
+            if mi.is_spectral:
+                raise ValueError(f"derivatives must be of an RGB or mono variant, got {mi.variant()}")
+            _check_followed(scene)
+            sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+            spp = spp or sensor.sampler().sample_count()
+            with interruptible():
+                _render(self.tracer(scene, scored=True), sensor, int(mi.UInt32(seed)[0]), spp, None, True)
+                with dr.resume_grad():
+                    return sensor.film().develop()
+
+        def aov_names(self) -> list[str]:
+            return LAYER if self.layers else []
+
+        def to_string(self) -> str:
+            blur = f", blur = {self.blur:g}" if self.blur != 1 else ""
+            return f"TranslucentWalk[mm_per_unit = {self.mm_per_unit:g}, max_depth = {self.max_depth}{blur}]"
+
+    return TranslucentWalk
+
+
+def _prepared(scene: mi.Scene, before: tuple, mm_per_unit: float) -> tuple[SceneMark, list, list, Any]:
+    """Mark, shapes, places and media of a scene: those of before, unless shapes, inner lights or media changed."""
+    shapes = scene.shapes()  # the scene itself, which holds its integrator, would never be freed
+    mark, places = SceneMark(scene), places_of(scene)
+    same = before[0] == mark and same_objects(before[1], shapes) and before[2] == places
+    if before[3] is not None and same and before[3].is_current():
+        return before
+    media = WalkMedia.of(scene, mm_per_unit)
+    check_sensors(scene, media.objects)
+    for each, inside in zip(media.objects, media.insides):
+        known = equivalent(inside, each) if inside.textured else inside
+        check_size(each, [mm_per_unit * float(m.sigma_t) for m in known.channels()], mm_per_unit)
+    return mark, shapes, places, media
+
+
+@contextlib.contextmanager
+def _one_thread() -> Iterator[None]:
+    """Let one thread work, so that sums over many paths, such as those of texels, have the same bits in each run."""
+    threads = dr.thread_count()
+    dr.sync_thread()
+    dr.set_thread_count(1)
+    try:
+        yield
+        dr.sync_thread()
+    finally:
+        dr.set_thread_count(threads)
+
+
+def _check_followed(scene: mi.Scene) -> None:
+    """Refuse derivatives that scores of walks do not have.
+
+    Raises:
+        ValueError: gradients are enabled for another parameter than albedo, sigma_t and g of translucent surfaces and
+            what their textures show, or a delta light stands inside an object.
+    """
+    parameters, owners, attributes = mi.traverse(scene), [], set()
+    for shape in translucent_shapes(scene):
+        textured = surface_of(shape).inside.textured
+        owners.append(surface_of(shape))
+        for texture in textured.textures.values() if textured else ():
+            owners += mi.traverse(texture).hierarchy
+            attributes |= {(id(shape), name) for _, name in shown(texture)}
+    for key, (_, _, owner, _) in parameters.properties.items():
+        with dr.resume_grad():
+            enabled = dr.grad_enabled(parameters[key])
+        name = key.rsplit(".", 1)[-1]
+        if enabled and not (any(owner is each for each in owners) or (id(owner), name) in attributes):
+            raise ValueError(
+                f"{key} must not have gradients enabled: translucent_walk differentiates light by albedo, sigma_t and "
+                "g of translucent surfaces and by their textures; bssrdf by emitters and other textures too"
+            )
+
+
+def _render(
+    tracer: PathTracer, sensor: mi.Sensor, seed: int, spp: int, keep: Keep | None, scored: bool = False
+) -> None:
+    """Fill the film of a sensor, in launches between which an interrupt is heard."""
+    for obj, inside in zip(tracer.visitor.media.objects, tracer.visitor.media.insides):
+        if inside.spectral is not None:
+            inside.spectral.check_covers(obj.name, sensor)
+    sensor.film().prepare(LAYER if tracer.layers else [])
+    most = max(1, _on_device(SAMPLES_PER_LAUNCH) // int(dr.prod(sampled_size(sensor.film()))))
+    for launch, start in enumerate(range(0, spp, most)):
+        _launch(tracer, sensor, min(most, spp - start), (seed, launch), keep, scored)
+
+
+def _on_device(number: int) -> int:
+    """A number of lanes or samples for the device of the current variant."""
+    return number * GPU_FACTOR if mi.variant().startswith("cuda") else number
+
+
+def _launch(
+    tracer: PathTracer, sensor: mi.Sensor, spp: int, seed: tuple[int, int], keep: Keep | None, scored: bool
+) -> None:
+    """Trace spp rays through each pixel and add them to the film, with derivatives if `scored`."""
+    rays, weight, position = camera_rays(sensor, spp, seed)
+    rays = tracer.shown(rays)
+    if scored:
+        media = tracer.visitor.media
+        with dr.resume_grad():
+            scores = PathScores.of(media, dr.width(rays))
+        L, seen, _ = tracer.trace(rays, _on_device(LANES), seed, scores=scores)
+        with dr.resume_grad():
+            splat(sensor.film(), rays, with_derivatives(L, scores, media) * weight, seen, position, spp)
+        return
+    exits = FirstExits.of(tracer.visitor.scene, tracer.visitor.media, rays) if keep else None
+    L, seen, emission = tracer.trace(rays, _on_device(LANES), seed, exits)
+    if keep:
+        keep(exits)
+    layer = list(mi.Color3f(weight * emission)) if tracer.layers else []
+    splat(sensor.film(), rays, weight * L, seen, position, spp, layer)
+
+
+def _positive(name: str, value: float) -> float:
+    if not (math.isfinite(value) and value > 0):
+        raise ValueError(f"{name} must be finite and > 0, got {value!r}")
+    return value
+
+
+def _scale(name: str, value: float) -> float:
+    if not 0 <= value <= WIDEST:
+        raise ValueError(f"{name} must be in [0, {WIDEST:g}], got {value!r}")
+    return value
+
+
+def _share(name: str, value: float) -> float:
+    if not 0 <= value <= 1:
+        raise ValueError(f"{name} must be in [0, 1], got {value!r}")
+    return value
+
+
+def _depth(name: str, value: int) -> int:
+    """A number of vertices; -1 stands for no limit."""
+    if value < -1 or value == 0:
+        raise ValueError(f"{name} must be -1 (no limit) or at least 1, got {value}")
+    return FOREVER if value == -1 else value

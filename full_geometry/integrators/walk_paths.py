@@ -1,0 +1,639 @@
+"""The path loop of `translucent_walk`: surfaces by their BSDFs, objects by random walks, emitters by MIS.
+
+One symbolic loop whose lanes begin a new path when one ends. A step is a segment inside an object (`random_walk`) or a
+ray outside with the surface that it meets. Emission is weighted against next-event estimation at the previous vertex
+(power heuristic) and against the strategies of `emitter_connections`. Delta lights, which no ray meets, are spread over
+a cone where a path leaves a vertex that next-event estimation could not light (`objects.small_emitters`). Boundaries of
+index 1 are no vertices (`straight_light`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from full_geometry.geometry.points import lifted, opaque, sided
+from full_geometry.geometry.rounding import blocked, ray_from
+from full_geometry.geometry.sensors import past_emitters, shows_sky
+from full_geometry.objects.small_emitters import NARROW, WIDE, SmallEmitters
+from full_geometry.precomputed.unscattered_light import UnscatteredLight
+from full_geometry.walk.emitter_connections import (
+    Departure,
+    EmitterDirections,
+    InnerLights,
+    SubpathConnections,
+)
+from full_geometry.walk.media import WalkMedia, WalkMedium, interaction_of, ray_of
+from full_geometry.walk.random_walk import (
+    OUTSIDE,
+    Crossing,
+    Event,
+    Visitor,
+    Walk,
+    Walker,
+    draw,
+    eval_phase,
+    sample_bsdf,
+    start_walk,
+)
+from full_geometry.walk.scores import PathScores, Score, ScoreVisitor, Stay, StayRecord
+from full_geometry.walk.straight_light import StraightLight
+from halfspace_sss.tracing.walk import generator, pass_seed
+
+# ---- Loop state ------------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class LightRecord:
+    """Light of a path so far, and what the MIS weight of the next emission needs to know."""
+
+    L: mi.Spectrum  # radiance
+    previous: mi.Point3f  # vertex that the ray comes from
+    pdf: mi.Float  # density of the ray's direction there, 1/sr
+    delta: mi.Bool  # whether that direction was the only one
+    straight: mi.Bool  # nothing has reflected since the last event
+    connected: mi.Bool  # there was a straight edge: connections find what small emitters send along this path
+    pivot: mi.Point3f  # the event at the end of that edge
+    directed: mi.Bool  # directions to emitters were sampled at the last event, and nothing has reflected since
+    departure: Departure  # from the last event
+    sighted: mi.Bool  # an emitter was sampled at the last event, and only boundaries of index 1 were passed since
+    scattered: mi.Bool  # whether a vertex has scattered into a solid angle: delta lights then are no longer hidden
+    precomputed: mi.Bool  # the ray's emission is in the unscattered light of the last event, or in the mirror image
+    slopes: Score | tuple[()] = ()  # where derivatives are asked for, see `walk.scores`
+
+
+@dataclass
+class CameraPath:
+    """Loop variables of a path from the camera."""
+
+    index: mi.UInt32  # which ray it began with
+    walk: Walk  # the ray it is on, outside or inside an object
+    light: LightRecord  # what it has gathered
+    hit: mi.Bool  # whether its first ray hit anything
+    depth: mi.UInt32  # vertices on surfaces met from outside
+    stay: Stay | tuple[()] = ()  # inside an object, where derivatives are asked for
+    emission: mi.Spectrum | tuple[()] = ()  # seen at once or in the mirror of what is met first, if asked for
+
+
+# ---- Light gathered along a path -------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class LightVisitor:
+    """Light gathered at the events and boundaries of walks.
+
+    Args:
+        scene: the Mitsuba scene.
+        media: its translucent objects.
+        small: its small emitters, if there are any.
+        connections: of events with light subpaths of small emitters, if there are any.
+        directions: from events to small emitters, where connections cannot find their light.
+        straight_light: of emitters through boundaries of index 1, if there are any.
+        inner_lights: delta lights inside objects, if there are any.
+        blur: scale of the cones over which delta lights outside are spread; 0 leaves their light out.
+        unscattered: light that events find precomputed, in place of connections, directions and straight light.
+    """
+
+    scene: mi.Scene
+    media: WalkMedia
+    small: SmallEmitters | None
+    connections: SubpathConnections | None
+    directions: EmitterDirections | None
+    straight_light: StraightLight | None = None
+    inner_lights: InnerLights | None = None
+    blur: float = 1.0
+    unscattered: UnscatteredLight | None = None
+
+    def event(self, walk: Walk, record: LightRecord, event: Event) -> tuple[Walk, LightRecord]:
+        # ---- inner lights
+        record = replace(record, scattered=mi.Bool(True))
+        if self.inner_lights is not None:
+            at = interaction_of(event.p, walk.medium)
+            d, E = self.inner_lights.light(walk.object, at, walk.rng, True, walk.medium)
+            record = replace(record, L=record.L + walk.weight * eval_phase(event.m, dr.dot(event.along, d)) * E)
+
+        # ---- emitters whose light arrives unscattered: weight ∫ p(w.w') L_0(x, w') dw'
+        if self.unscattered is not None:
+            counts = self.media.counts(walk.object, walk.order + 1)
+            L = walk.weight * self.unscattered.light(self.media, event)
+            return walk, replace(record, L=record.L + dr.select(counts, L, 0), precomputed=mi.Bool(True))
+
+        # ---- emitters behind boundaries of index 1
+        if self.straight_light is not None:
+            sees = self.media.straight(walk.object) & self.media.counts(walk.object, walk.order + 1)
+            departure = Departure(event.p, event.along, record.departure.ahead, walk.object)
+            record = replace(record, sighted=sees, departure=departure, delta=record.delta | sees)
+            walk, record, _ = dr.if_stmt((walk, record, event), sees, self._see, _same_state, label="emitters")
+        if self.connections is None:
+            return walk, record
+
+        # ---- connections with light subpaths
+        smooth = self.media.connects(walk.object)
+        edge = record.straight & smooth & (walk.order > 0)  # this event ends one
+        connected = record.connected | edge
+        record = replace(record, connected=connected, pivot=dr.select(edge, event.p, record.pivot))
+        connects = smooth & (walk.order + 2 <= self.media.row("most", walk.object))
+        walk, record, _ = dr.if_stmt((walk, record, event), connects, self._connect, _same_state, label="connections")
+
+        # ---- directions to emitters, where no connection finds their light
+        directed = smooth & ~connected & self.media.counts(walk.object, walk.order + 1)
+        record = replace(record, straight=mi.Bool(True), directed=directed)
+        walk, record, _ = dr.if_stmt((walk, record, event), directed, self._direct, _same_state, label="directions")
+        departure = Departure(event.p, event.along, record.departure.ahead, walk.object)
+        return walk, replace(record, departure=departure)
+
+    def _connect(self, walk: Walk, record: LightRecord, event: Event) -> tuple[Walk, LightRecord, Event]:
+        light, slopes, rng = self.connections.light(event, walk.rng)
+        return replace(walk, rng=rng), _plus(record, walk, light, slopes), event
+
+    def _see(self, walk: Walk, record: LightRecord, event: Event) -> tuple[Walk, LightRecord, Event]:
+        return walk, _plus(record, walk, *self.straight_light.light(event, walk.rng)), event
+
+    def _direct(self, walk: Walk, record: LightRecord, event: Event) -> tuple[Walk, LightRecord, Event]:
+        return walk, _plus(record, walk, *self.directions.light(event, walk.rng)), event
+
+    def boundary(
+        self, walk: Walk, record: LightRecord, si: mi.SurfaceInteraction3f, active: mi.Bool
+    ) -> tuple[Walk, LightRecord]:
+        if not self.media.any_rough:
+            return walk, record
+        active = active & ~record.precomputed
+        light = self.sampled_emitter(walk, si, self.media.boundary(walk.object), active)
+        return walk, replace(record, L=record.L + light)
+
+    def surface(
+        self, walk: Walk, record: LightRecord, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, k: mi.Int32
+    ) -> tuple[Walk, LightRecord]:
+        """Light that the surface emits, of which nothing was sampled, and of inner lights at it."""
+        emitter = si.emitter(self.scene)
+        shines = si.is_valid() & (k != walk.object) & (emitter != None)  # noqa: E711
+        L = record.L + dr.select(shines, walk.weight * emitter.eval(si, shines), 0)
+        if self.inner_lights is not None:
+            lit = (k < 0) & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+            d, E = self.inner_lights.light(walk.object, si, walk.rng, lit, walk.medium)
+            L = L + dr.select(lit, walk.weight * bsdf.eval(mi.BSDFContext(), si, si.to_local(d), lit) * E, 0)
+        return walk, replace(record, L=L)
+
+    def crossing(self, walk: Walk, record: LightRecord, crossing: Crossing) -> tuple[Walk, LightRecord]:
+        before = record
+        record = replace(record, previous=crossing.si.p, pdf=crossing.pdf, delta=crossing.delta)
+        if self.media.inner is not None:
+            sampled = (self.media.index_of(crossing.si) < 0) & ~crossing.delta
+            record = replace(record, delta=crossing.delta | ~crossing.leaves, scattered=record.scattered | sampled,
+                             L=record.L + self.spread_inner_lights(walk, record.scattered & ~sampled))  # fmt: skip
+        if self.straight_light is not None:
+            record = self._from_event(walk, record, before, crossing)
+        if self.connections is None:
+            return walk, record
+        straight = record.straight & crossing.leaves
+        departure = replace(record.departure, ahead=crossing.along)
+        return walk, replace(record, straight=straight, directed=record.directed & straight, departure=departure)
+
+    def _from_event(self, walk: Walk, record: LightRecord, before: LightRecord, crossing: Crossing) -> LightRecord:
+        """The record of a path that has left an object of index 1: its last vertex is still the event."""
+        way, medium = before.departure, walk.medium
+        first = before.delta  # way out since the event
+        near = dr.norm(crossing.si.p - way.p) < self.straight_light.reach(way.object, way.p, medium)
+        sighted = before.sighted & crossing.leaves & (~first | near)
+        pdf = self.straight_light.pdf(way.object, way.p, dr.dot(way.along, crossing.along), medium)
+        return replace(record, sighted=sighted, previous=dr.select(sighted, way.p, record.previous),
+                       pdf=dr.select(sighted, pdf, record.pdf), delta=record.delta & ~sighted)  # fmt: skip
+
+    def met_emitter(self, walk: Walk, record: LightRecord, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Spectrum:
+        """Light of an emitter that the ray meets, weighted against sampling it from the last vertex."""
+        emitter = si.emitter(self.scene)
+        active = active & (emitter != None) & ~record.precomputed  # noqa: E711
+        previous = dr.zeros(mi.Interaction3f)
+        previous.p = record.previous
+        ds = mi.DirectionSample3f(self.scene, si, previous)
+        sampled = active & ~record.delta
+        pdf = dr.select(sampled, self.scene.pdf_emitter_direction(previous, ds, sampled), 0)
+        if self.straight_light is not None:
+            sighted = sampled & record.sighted
+            pdf = dr.select(sighted, self.straight_light.pdf_emitter(previous, ds, sighted), pdf)
+        share = dr.select(record.delta, 1, power_heuristic(record.pdf, pdf))
+        if self.connections is not None and self.small.some_met:
+            which = self.small.index_of(emitter, walk.d)
+            active &= ~(record.connected & self.connections.covers(which, si.p, walk.d, record.pivot))
+            directed = active & record.directed
+            state = (which, record.departure, walk.medium, share, directed)
+            _, _, _, share, _ = dr.if_stmt(state, directed, self._against_directions, lambda *state: state)
+        return dr.select(active, walk.weight * emitter.eval(si, active) * share, 0)
+
+    def mirrored_emitter(
+        self, walk: Walk, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active: mi.Bool
+    ) -> mi.Spectrum:
+        """Light of the emitter that a smooth boundary mirrors, F L, which no random choice of reflection then meets."""
+        ctx = mi.BSDFContext()
+        ctx.type_mask = mi.BSDFFlags.DeltaReflection
+        bs, value = bsdf.sample(ctx, si, 0.0, mi.Point2f(0), active)
+        d, _ = sided(si, bs.wo)
+        ray = ray_from(si, d, self.media.sight.rounding(si))
+        met = self.media.sight.intersect(self.scene, ray, mi.RayFlags.All, active=active)
+        emitter = met.emitter(self.scene, active)
+        active = active & (emitter != None) & (bs.pdf > 0)  # noqa: E711
+        return dr.select(active, walk.weight * value * emitter.eval(met, active), 0)
+
+    def _against_directions(
+        self, which: mi.Int32, departure: Departure, medium: WalkMedium, share: mi.Float, directed: mi.Bool
+    ) -> tuple:
+        return which, departure, medium, self.directions.share(which, departure, directed, medium), directed
+
+    def spread_lights(self, walk: Walk, record: LightRecord, active: mi.Bool) -> mi.Spectrum:
+        """Light of a delta light whose cone holds the ray, where no other strategy finds it."""
+        if self.small is None or self.small.n_delta == 0:
+            return mi.Spectrum(0)
+        n = self.small.n_delta
+        which = mi.Int32(draw(n, walk.rng)) if n > 1 else dr.zeros(mi.Int32, dr.width(walk.o))
+        active = active & record.scattered & record.delta & ~record.precomputed
+        directed = mi.Bool(False)
+        if self.connections is not None:
+            w_0, _ = self.small.direction(which, walk.o)
+            emitter = walk.o + w_0 * dr.norm(self.scene.bbox().extents())
+            active &= ~(record.connected & self.connections.covers(which, emitter, w_0, record.pivot))
+            directed = active & record.directed
+        radius = dr.select(directed, NARROW, opaque(WIDE * self.blur))
+        ray = ray_of(walk.o, walk.d, walk.medium)
+        L = self.small.spread(which, ray, radius, active)
+        if self.connections is not None:
+            directed &= dr.max(L) > 0
+            state = (which, record.departure, walk.medium, mi.Float(1), directed)
+            _, _, _, share, _ = dr.if_stmt(state, directed, self._against_directions, lambda *state: state)
+            L = L * share
+        return dr.select(active, walk.weight * L * n, 0)
+
+    def spread_inner_lights(self, walk: Walk, active: mi.Bool) -> mi.Spectrum:
+        """Light of an inner light whose cone holds the ray, from a vertex that it was not sampled at."""
+        if self.inner_lights is None:
+            return mi.Spectrum(0)
+        ray = ray_of(walk.o + walk.off, walk.d, walk.medium)
+        active = active & walk.alive & (walk.object >= 0)
+        L = self.inner_lights.spread(walk.object, ray, walk.rng, active, walk.medium)
+        return dr.select(active, walk.weight * L, 0)
+
+    def sampled_emitter(
+        self,
+        walk: Walk,
+        si: mi.SurfaceInteraction3f,
+        bsdf: mi.BSDFPtr,
+        active: mi.Bool,
+        outwards: mi.Bool | bool = True,
+    ) -> mi.Spectrum:
+        """Light of a sampled emitter by the surface at `si`; by a boundary only from its outer side."""
+        rng = walk.rng
+        u = mi.Point2f(rng.next_float32(), rng.next_float32())
+        active = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+        ds, light = self.scene.sample_emitter_direction(si, u, False, active)
+        active &= (ds.pdf > 0) & (~mi.Bool(outwards) | (dr.dot(ds.d, si.n) > 0))
+        shadow = self.media.sight.ray_to_emitter(si, ds, self.media.sight.rounding(si))
+        active &= ~blocked(self.scene, shadow, active)
+        wo = si.to_local(ds.d)
+        below = outwards & (wo.z < 0)  # comes from inside by the opposite direction, and is not mirrored
+        active &= ~below | (mi.Frame3f.cos_theta(si.wi) < 0)
+        value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, dr.select(below, -wo, wo), active)
+        share = dr.select(ds.delta, 1, power_heuristic(ds.pdf, pdf))
+        return dr.select(active, walk.weight * value * light * share, 0)
+
+
+def _same_state(*state: Any) -> tuple:
+    return state
+
+
+def _plus(record: LightRecord, walk: Walk, light: mi.Spectrum, slopes: Score | tuple[()]) -> LightRecord:
+    """With light per weight of the walk, and its slopes beyond those of the walk."""
+    slopes = slopes and record.slopes + slopes * walk.weight
+    return replace(record, L=record.L + walk.weight * light, slopes=slopes)
+
+
+def start_record(lanes: int, scored: bool = False) -> LightRecord:
+    """Of a path that begins at the camera."""
+
+    def full(kind: type, value: float | bool | int) -> Any:
+        return dr.full(kind, value, lanes)
+
+    point, along = full(mi.Point3f, 0), full(mi.Vector3f, 0)
+    return LightRecord(
+        L=full(mi.Spectrum, 0), previous=point, pdf=full(mi.Float, 1), delta=full(mi.Bool, True),
+        straight=full(mi.Bool, False), connected=full(mi.Bool, False), pivot=mi.Point3f(point),
+        directed=full(mi.Bool, False),
+        departure=Departure(mi.Point3f(point), along, mi.Vector3f(along), full(mi.Int32, 0)),
+        sighted=full(mi.Bool, False), scattered=full(mi.Bool, False),
+        precomputed=full(mi.Bool, False), slopes=Score.sums(lanes) if scored else (),
+    )  # fmt: skip
+
+
+def power_heuristic(a: mi.Float, b: mi.Float) -> mi.Float:
+    """Weight of a sample of density a against another of density b: a² / (a² + b²)."""
+    share = dr.square(a) / (dr.square(a) + dr.square(b))
+    return dr.select(dr.isfinite(share), share, 0)
+
+
+# ---- The loop --------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class PathTracer:
+    """What every path needs.
+
+    Args:
+        visitor: how light is gathered; it knows the scene and its objects.
+        max_depth: most vertices on surfaces met from outside; what happens inside an object does not count.
+        rr_depth: vertices outside after which roulette may end a path.
+        hide_emitters: whether the camera sees no emitters.
+        layers: whether emission that the camera sees, at once or in the mirror of an object, is also told apart.
+    """
+
+    visitor: LightVisitor
+    max_depth: int
+    rr_depth: int
+    hide_emitters: bool
+    layers: bool = False
+
+    def trace(
+        self,
+        rays: mi.Ray3f,
+        lanes: int,
+        seed: tuple[int, ...],
+        exits: FirstExits | None = None,
+        scores: PathScores | None = None,
+    ) -> tuple[mi.Spectrum, mi.Bool, mi.Spectrum]:
+        """Radiance along each ray, whether it shows anything, and the layer of emission; fills `exits` or `scores`."""
+        n = dr.width(rays)
+        dr.eval(rays)
+        lanes = min(lanes, n)
+        L, hit = dr.zeros(mi.Spectrum, n), dr.zeros(mi.Bool, n)
+        emission = dr.zeros(mi.Spectrum, n if self.layers else 1)
+        dr.eval(L, hit, emission)
+        media, visitor = self.visitor.media, FirstExitVisitor(self.visitor, exits) if exits else self.visitor
+        scorer = ScoreVisitor(self.visitor, media, scores) if scores else None
+        walker = Walker(media, scorer or visitor)
+        total, step = (dr.opaque(mi.UInt32, v) for v in (n, lanes))  # kernels then serve images of any size
+
+        def begin(index: mi.UInt32, rng: mi.PCG32) -> CameraPath:
+            path = _begin(rays, total, index, rng, media, bool(scores))
+            return replace(path, emission=dr.zeros(mi.Spectrum, dr.width(index))) if self.layers else path
+
+        def inside(p: CameraPath) -> CameraPath:
+            record = FirstExitRecord(p.light, p.index, p.depth == 1) if exits else p.light
+            record = StayRecord(p.light, p.index, p.stay) if scores else record
+            walk, record = walker.step(p.walk, record)
+            stay = record.stay if scores else ()
+            return replace(p, walk=walk, light=record.record if exits or scores else record, stay=stay)
+
+        def end_stay(p: CameraPath) -> CameraPath:
+            record = scorer.end(StayRecord(p.light, p.index, p.stay))
+            return replace(p, light=record.record, stay=record.stay)
+
+        def renew(p: CameraPath) -> CameraPath:
+            dr.scatter(L, p.light.L, p.index)
+            dr.scatter(hit, p.hit, p.index)
+            if self.layers:
+                dr.scatter(emission, p.emission, p.index)
+            return begin(p.index + step, p.walk.rng)
+
+        def body(p: CameraPath) -> tuple[CameraPath]:
+            p = dr.if_stmt((p,), p.walk.object >= 0, inside, _same, label="inside")
+            if scores:
+                ended = (p.stay.object >= 0) & (p.walk.object != p.stay.object)
+                p = dr.if_stmt((p,), ended, end_stay, _same, label="end of a stay")
+            outside = p.walk.alive & (p.walk.object < 0)
+            p = dr.if_stmt((p,), outside, self._outside, _same, label="outside")
+            return (dr.if_stmt((p,), ~p.walk.alive, renew, _same),)
+
+        rng = generator(mi, lanes, pass_seed(*seed))
+        start = begin(dr.arange(mi.UInt32, lanes), rng)
+        with dr.scoped_set_flag(dr.JitFlag.OptimizeLoops, False):  # records the loop twice, for kernels no faster
+            dr.while_loop((start,), lambda p: p.index < total, body, label="paths")
+            dr.eval(L, hit, emission)
+        return L, hit | mi.Bool(shows_sky(self.visitor.scene, self.hide_emitters)), emission
+
+    def shown(self, rays: mi.Ray3f) -> mi.Ray3f:
+        """The rays of a camera, which begin behind emitters that it does not see."""
+        scene, sight = self.visitor.scene, self.visitor.media.sight
+        return past_emitters(scene, sight, rays) if self.hide_emitters else rays
+
+    def _outside(self, p: CameraPath) -> CameraPath:
+        """A ray outside all objects, and the surface that it meets."""
+        ray = ray_of(p.walk.o, p.walk.d, p.walk.medium)
+        si = self.visitor.media.sight.intersect(self.visitor.scene, ray, mi.RayFlags.All)
+
+        # ---- emission, with its MIS weight
+        first = p.depth == 0
+        shown = ~first if self.hide_emitters else mi.Bool(True)
+        emission = self.visitor.met_emitter(p.walk, p.light, si, shown)
+        if self.layers:
+            p = replace(p, emission=p.emission + dr.select(first, emission, 0))
+        L = p.light.L + emission
+        L = L + self.visitor.spread_lights(p.walk, p.light, p.walk.alive)
+        light = replace(p.light, L=L, connected=mi.Bool(False), directed=mi.Bool(False), precomputed=mi.Bool(False))
+
+        # ---- the surface
+        depth = p.depth + 1
+        alive = si.is_valid() & (depth < mi.UInt32(self.max_depth))
+        walk = replace(p.walk, alive=alive)
+        p = replace(p, walk=walk, light=light, hit=p.hit | (first & si.is_valid()), depth=depth)
+        return dr.if_stmt((p, si), alive, self._bounce, lambda p, si: p, label="bounce")
+
+    def _bounce(self, p: CameraPath, si: mi.SurfaceInteraction3f) -> CameraPath:
+        """A surface met from outside: next-event estimation, BSDF sampling, Russian roulette, the way on or in."""
+        # ---- BSDF or boundary
+        walk, light, media, rng = p.walk, p.light, self.visitor.media, p.walk.rng
+        k, bsdf = media.draw(si, walk.d, rng)
+        translucent, near = k >= 0, dr.maximum(k, 0)
+        si = media.seen(si, k, walk.d)
+        if media.objects:
+            boundary = media.boundary(near)
+            bsdf = dr.select(translucent, boundary if isinstance(boundary, mi.BSDFPtr) else mi.BSDFPtr(boundary), bsdf)
+        mute = translucent & ~media.row("reflects", near) if media.objects else mi.Bool(False)
+        lit = ~mute
+        if media.inner is not None:
+            around = media.inner.around(si)
+            encloses = ~translucent & (around >= 0) & media.inner.displaces(si) & (dr.dot(walk.d, si.n) > 0)
+            lit &= ~encloses  # emitters on its other side are behind a medium
+
+        # ---- next-event estimation
+        L = light.L + self.visitor.sampled_emitter(walk, si, bsdf, lit, translucent)
+
+        # ---- emitters in the mirror of a smooth boundary: F L(mirrored direction)
+        mirrors, L, p = self._mirror(L, p, si, bsdf, near, translucent & lit)
+
+        # ---- BSDF sampling
+        bs, value = sample_bsdf(bsdf, si, rng)
+        d, turned = sided(si, bs.wo)
+        d, turned = dr.select(translucent, d, si.to_world(bs.wo)), turned & translucent
+        enters = translucent & (dr.dot(d, si.n) < 0)
+        weight, scale = walk.weight * value, walk.scale * dr.square(bs.eta)
+
+        # ---- Russian roulette
+        size = dr.max(weight) * scale
+        survive = dr.select(p.depth >= self.rr_depth, dr.minimum(size, 0.95), 1)
+        weight = weight / dr.maximum(survive, 1e-30)
+        alive = (bs.pdf > 0) & (size > 0) & (rng.next_float32() < survive) & ~(mute & ~enters)
+
+        # ---- the way on, or into an object
+        u, channel = rng.next_float32(), walk.channel
+        if len(weight) > 1:  # drawn once in a path, whose densities are counted from there
+            channel = dr.select(p.depth == 1, _channel(u, len(weight)), channel)
+        if media.inner is not None:  # from glass inside an object
+            returns = encloses & (dr.dot(d, si.n) > 0)
+            k, enters = dr.select(returns, around, k), enters | returns
+        o, off = media.depart(si, d, enters)
+        if media.carried:  # the medium of the exit, for the whole walk
+            new = alive & enters
+            walk = replace(walk, medium=dr.select(new, media.fetch(near, si, new), walk.medium))
+        walk = replace(walk, o=o, d=d, off=off, alive=alive, order=dr.select(enters, 0, walk.order),
+                       object=dr.select(alive & enters, k, OUTSIDE), weight=weight, scale=scale,
+                       channel=channel)  # fmt: skip
+        delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta) | turned
+        scattered, again = light.scattered | ~delta, mi.Bool(False)  # still straight from the event
+        if self.visitor.straight_light is not None:
+            again = light.sighted & enters & self.visitor.straight_light.passes_again(near)
+            again &= k == light.departure.object
+        light = replace(light, L=L, previous=dr.select(again, light.previous, si.p), sighted=again,
+                        pdf=dr.select(again, light.pdf, bs.pdf), delta=delta & ~again, scattered=scattered,
+                        precomputed=mirrors & ~enters)  # fmt: skip
+        if media.inner is not None:
+            delta = ~again & (delta | enters | encloses)
+            L = L + self.visitor.spread_inner_lights(walk, scattered & enters)
+            light = replace(light, delta=delta, L=L)
+        return replace(p, walk=walk, light=light)
+
+    def _mirror(
+        self, L: mi.Spectrum, p: CameraPath, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, k: mi.Int32, active: mi.Bool
+    ) -> tuple[mi.Bool, mi.Spectrum, CameraPath]:
+        """Whether object k mirrors, and the light with the emission it mirrors, at the first vertex also told apart.
+
+        Only where light inside is precomputed: beside light that is met by chance, of an even sky above all, the choice
+        between both sides of the boundary has less noise.
+        """
+        media = self.visitor.media
+        if self.visitor.unscattered is None:
+            return mi.Bool(False), L, p
+        mirrors = active & ~media.row("rough", k)
+        emission = self.visitor.mirrored_emitter(p.walk, si, bsdf, mirrors)
+        if self.layers:
+            p = replace(p, emission=p.emission + dr.select(p.depth == 1, emission, 0))
+        return mirrors, L + emission, p
+
+
+def _channel(u: mi.Float, n: int) -> mi.UInt32:
+    return dr.minimum(mi.UInt32(u * n), n - 1)
+
+
+def _same(p: CameraPath) -> CameraPath:
+    return p
+
+
+def _begin(
+    rays: mi.Ray3f, total: mi.UInt32, index: mi.UInt32, rng: mi.PCG32, media: WalkMedia, scored: bool = False
+) -> CameraPath:
+    lanes, known = dr.width(index), index < total
+    o, d = dr.gather(mi.Point3f, rays.o, index, known), dr.gather(mi.Vector3f, rays.d, index, known)
+    no, first = dr.full(mi.Bool, False, lanes), dr.full(mi.UInt32, 0, lanes)
+    wavelengths = dr.gather(mi.Spectrum, rays.wavelengths, index, known) if mi.is_spectral else ()
+    walk = start_walk(o, d, rng, media.unknown(lanes, wavelengths))
+    stay = Stay.none(lanes, media.textured) if scored else ()
+    return CameraPath(index, walk, start_record(lanes, scored), no, first, stay)
+
+
+# ---- First exits of paths from the camera ------------------------------------------------------------------------
+#
+# While walks gather light for an image, where they leave is kept for learning. A path that meets an object first goes
+# in at x_o against the direction w_o of the eye, or is reflected there, and leaves at x_i into w_i with the throughput
+# T. Over all such paths, those included that do not enter,
+#
+#     ∫∫ S(x_i, w_i; x_o, w_o) mu_i f(x_i, w_i) dw_i dA_i = E[T f(x_i, w_i)].
+
+
+@dataclass
+class FirstExits:
+    """One lane for each path; normals point outwards, directions away from the surface, which see shading normals."""
+
+    object: mi.Int32  # the number of the object that the path meets first, or -1
+    x_o: mi.Point3f
+    n_o: mi.Normal3f  # geometric
+    n_o_shading: mi.Normal3f
+    w_o: mi.Vector3f
+    throughput: mi.Spectrum  # T; 0 where no walk left
+    x_i: mi.Point3f
+    n_i: mi.Normal3f  # geometric
+    n_i_shading: mi.Normal3f
+    w_i: mi.Vector3f
+    order: mi.UInt32  # scattering events
+    face: mi.UInt32  # at x_i
+
+    @classmethod
+    def of(cls, scene: mi.Scene, media: WalkMedia, rays: mi.Ray3f) -> FirstExits:
+        """What rays of the camera meet first, and room for where their walks leave."""
+        si = media.sight.intersect(scene, rays, mi.RayFlags.All, coherent=True)
+        k = media.index_of(si, si.is_valid())
+        si = media.seen(si, k, rays.d)
+        n = dr.width(rays)
+        kinds = mi.Spectrum, mi.Point3f, mi.Normal3f, mi.Normal3f, mi.Vector3f, mi.UInt32, mi.UInt32
+        result = cls(k, mi.Point3f(si.p), mi.Normal3f(si.n), mi.Normal3f(si.sh_frame.n), mi.Vector3f(-rays.d),
+                    *(dr.zeros(kind, n) for kind in kinds))  # fmt: skip
+        dr.eval(result)
+        return result
+
+    def of_object(self, k: int) -> FirstExits:
+        """The lanes of paths that meet object k first."""
+        kept = dr.compress(self.object == k)
+        lanes = {name: dr.gather(type(value), value, kept) for name, value in vars(self).items()}
+        result = FirstExits(**lanes)
+        dr.eval(result)
+        return result
+
+    def gather(self, lanes: mi.UInt32) -> FirstExits:
+        """The paths of the given lanes."""
+        return FirstExits(**{name: dr.gather(type(value), value, lanes) for name, value in vars(self).items()})
+
+
+@dataclass
+class FirstExitRecord:
+    """What a visitor keeps of a path, the number of the path, and whether it is inside the object it met first."""
+
+    record: Any
+    index: mi.UInt32
+    first: mi.Bool
+
+
+@dataclass(frozen=True, eq=False)
+class FirstExitVisitor:
+    """Another visitor, beside which the first exit of each path is stored at the number of the path.
+
+    Args:
+        visitor: the other one.
+        exits: where they are stored.
+    """
+
+    visitor: Visitor
+    exits: FirstExits
+
+    def event(self, walk: Walk, record: FirstExitRecord, event: Event) -> tuple[Walk, FirstExitRecord]:
+        walk, kept = self.visitor.event(walk, record.record, event)
+        return walk, replace(record, record=kept)
+
+    def boundary(
+        self, walk: Walk, record: FirstExitRecord, si: mi.SurfaceInteraction3f, active: mi.Bool
+    ) -> tuple[Walk, FirstExitRecord]:
+        walk, kept = self.visitor.boundary(walk, record.record, si, active)
+        return walk, replace(record, record=kept)
+
+    def surface(
+        self, walk: Walk, record: FirstExitRecord, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, k: mi.Int32
+    ) -> tuple[Walk, FirstExitRecord]:
+        walk, kept = self.visitor.surface(walk, record.record, si, bsdf, k)
+        return walk, replace(record, record=kept)
+
+    def crossing(self, walk: Walk, record: FirstExitRecord, crossing: Crossing) -> tuple[Walk, FirstExitRecord]:
+        walk, kept = self.visitor.crossing(walk, record.record, crossing)
+        to, si = self.exits, crossing.si
+        leaves, n_shading = walk.alive & crossing.leaves & record.first, lifted(si.sh_frame.n, si.n, walk.d)
+        pairs = ((to.throughput, walk.weight), (to.x_i, si.p), (to.n_i, si.n), (to.n_i_shading, n_shading),
+                 (to.w_i, walk.d), (to.order, walk.order), (to.face, si.prim_index))  # fmt: skip
+        for target, value in pairs:
+            dr.scatter(target, type(target)(value), record.index, leaves)
+        return walk, replace(record, record=kept)

@@ -1,0 +1,501 @@
+"""Renders of views against their images, and the state of a fit between its steps.
+
+With two renders I, I' of independent samples, an image T and weights w, the loss of a view is
+
+    mean w (I - T) (I' - T),
+
+in which noise has no bias (Deng et al. 2022 take the product of two renders too). Weights are 1 ("l2"), or
+1 / (B + a tenth of the mean of T)² ("relative"), with B the mean of earlier renders. "robust" makes that the loss of
+Huber (1964), by weights that are found anew in each step: with r = |I'' - T| / (B + a tenth of the mean of T) of a
+third render I'', they are
+
+    1 / (B + a tenth of the mean of T)² / max(1, r / 5 %)
+
+over the mean of their last factor. B and I'' know nothing of the noise of T or of the renders that are compared.
+Weights by T would be small where its noise is bright, so that what is found would be too dark. The noise of I'' blurs
+the bend at 5 %. Where the loss bends, its slope does not grow with I: there w (1 - (I - T) / (I'' - T)) takes the place
+of w in its second derivative.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from full_geometry.inverse.views import GivenView
+from halfspace_sss.checks import check_choice, check_count, check_interval
+from halfspace_sss.noise_free import NoiseFree
+from halfspace_sss.physics.medium import Medium
+from halfspace_sss.progress import ProgressText
+from halfspace_sss.provenance import provenance, write_atomically
+
+LOSSES = ("relative", "l2", "robust")
+FLOOR = 0.1  # of the mean of an image, added to it in relative weights
+BEND = 0.05  # relative residual, beyond which the robust loss grows by its size
+EXPOSURE = 10.0  # most, of a factor
+BATCH = 4
+SETTLING = 0.5  # part of the steps after which nothing is forgotten
+FAR = 0.15  # change of a variable at which what was measured counts half
+LONGEST = 0.7  # change of a variable in a step
+PURPOSES = ("order", "first", "second", "slope", "test", "other test", "weights")
+FIRST = 4  # renders for the weights of a view that is met first
+NEWEST = 0.25  # share of the renders of a step in those for the weights of the next
+NEAR, FAR_OFF = 1, 3  # pixels: in NEAR noise may be alike, from there to FAR_OFF it is not
+CERTAIN = 4.0  # standard errors by which a chi-square is told to be a misfit
+
+
+@dataclass(frozen=True)
+class FitSettings:
+    """How to fit.
+
+    Args:
+        steps: how many; 0 takes 30, or 60 where textures are fitted.
+        spp: samples a pixel of each render of a view: two images, and its slopes.
+        batch: views a step; 0 takes 4 or all, whichever is less.
+        loss: "relative", "l2" or "robust".
+        exposure: whether each image may have a factor of its own, of geometric mean 1.
+        seed: of all samples.
+        tv: weight of the total variation of textures in their variables.
+    """
+
+    steps: int = 0
+    spp: int = 64
+    batch: int = 0
+    loss: str = "relative"
+    exposure: bool = False
+    seed: int = 0
+    tv: float = 0.02
+
+    def __post_init__(self) -> None:
+        for name, least in (("steps", 0), ("spp", 1), ("batch", 0), ("seed", 0)):
+            check_count(name, getattr(self, name), least)
+        check_choice("loss", self.loss, LOSSES)
+        check_interval("tv", self.tv, 0.0, 1e6)
+
+
+class FitStep(NamedTuple):
+    """Loss of the views of a step, its standard error by noise, and the parameters before it; of textures the means."""
+
+    loss: float
+    error: float
+    values: dict[str, list[float]]
+
+    def line(self) -> str:
+        """For the progress."""
+        numbers = "; ".join(f"{name} {' '.join(f'{v:.4g}' for v in value)}" for name, value in self.values.items())
+        return f"loss {self.loss:.3g} ± {self.error:.1g}  {numbers}"
+
+
+class ChiSquare(NamedTuple):
+    """Of means of residuals over neighbouring pixels, per degree of freedom: 1 if residuals are noise of each pixel.
+
+    With residuals z of pixels p in a standard of their own, sums over pixels q further away than `NEAR` and as near as
+    `FAR_OFF`, and correlations c of pixels as near as `NEAR`,
+
+        chi² = 1 + sum z_p z_q / sum z_p²,    of the error (sum c²) sqrt(sum 2 z_p² z_q²) / sum z_p².
+
+    So the noise of images need not be known, and may be alike in pixels that touch, as after a filter.
+
+    Args:
+        value, error: chi², and its standard error if all is noise.
+        near: the sum of c, at least 1: the variance of means over that of noise of each pixel.
+    """
+
+    value: float
+    error: float
+    near: float
+
+    @classmethod
+    def of(cls, residuals: Sequence[np.ndarray]) -> ChiSquare:
+        """Of images (height, width, channels), 0 where nothing counts."""
+        far, variance, squares = 0.0, 0.0, 1e-30
+        shifts = [(i, j) for i in range(-NEAR, NEAR + 1) for j in range(-NEAR, NEAR + 1)]
+        near = np.zeros(len(shifts))
+        for z in residuals:
+            z2, padded = z**2, np.pad(z, [(NEAR, NEAR), (NEAR, NEAR), (0, 0)])
+            squares += float(z2.sum())
+            far += float((z * (_neighbours(z, FAR_OFF) - _neighbours(z, NEAR))).sum())
+            variance += 2 * float((z2 * (_neighbours(z2, FAR_OFF) - _neighbours(z2, NEAR))).sum())
+            h, w, _ = z.shape
+            near += [(z * padded[NEAR + i : NEAR + i + h, NEAR + j : NEAR + j + w]).sum() for i, j in shifts]
+        near /= squares
+        error = float(np.square(near).sum() * np.sqrt(variance)) / squares
+        return cls(1 + far / squares, error, max(1.0, float(near.sum())))
+
+    @property
+    def is_misfit(self) -> bool:
+        """Whether noise does not explain it."""
+        return self.value - 1 > CERTAIN * self.error
+
+    def told(self) -> list[str]:
+        """A sentence about a misfit, or none."""
+        if not self.is_misfit:
+            return []
+        return [
+            f"noise does not explain the residuals ({(self.value - 1) / self.error:.0f} standard errors): lights, "
+            "cameras, exposures, shape, index or boundary of the scene are not those of the images, or steps are too "
+            "few; the errors do not hold that"
+        ]
+
+
+def _neighbours(z: np.ndarray, reach: int) -> np.ndarray:
+    """Sums over squares of pixels about each pixel of an image (height, width, channels)."""
+    for axis in (0, 1):
+        padding = [(reach + 1, reach) if a == axis else (0, 0) for a in range(3)]
+        summed = np.cumsum(np.pad(z, padding), axis=axis)
+        n = z.shape[axis]
+        z = np.take(summed, np.arange(n) + 2 * reach + 1, axis) - np.take(summed, np.arange(n), axis)
+    return z
+
+
+class FittedView(NamedTuple):
+    """A given image and what was found, (height, width, channels); which pixels count, and whether it only tests."""
+
+    name: str
+    given: np.ndarray
+    found: np.ndarray
+    counts: np.ndarray
+    held_out: bool
+
+
+@dataclass(frozen=True)
+class MaterialFit:
+    """What was found.
+
+    Args:
+        values: of each parameter that is the same everywhere; sigma_t in 1/mm, mfp in mm.
+        errors: standard errors by H, the misfit, and the noise of the steps.
+        correlation: of all numbers in the order of `values`; empty beside textures.
+        medium: of the object; with textures their means.
+        misfit: root of the loss of all fitted views at the end.
+        held_out: likewise of views held out; None without any.
+        chi_square: of the fitted views.
+        exposures: factor by which each view's image of the medium is multiplied to match the given one.
+        is_misfit: whether more than noise is between images and renders.
+        told: sentences about that, about bounds, and about what the images do not tell.
+        steps: the way there.
+        views: what each view shows beside its given image.
+        textures: of each parameter that has one, the texels (rows, columns, channels), or the attribute of each vertex
+            or face, shape (n, channels).
+        texture_errors: their standard errors by noise, NaN where no view shows a texel.
+    """
+
+    values: dict[str, np.ndarray]
+    errors: dict[str, np.ndarray]
+    correlation: np.ndarray
+    medium: Medium
+    misfit: NoiseFree
+    held_out: NoiseFree | None
+    chi_square: ChiSquare
+    exposures: list[float]
+    is_misfit: bool
+    told: list[str]
+    steps: list[FitStep] = field(repr=False)
+    views: list[FittedView] = field(default_factory=list, repr=False)
+    textures: dict[str, np.ndarray] = field(default_factory=dict, repr=False)
+    texture_errors: dict[str, np.ndarray] = field(default_factory=dict, repr=False)
+
+    def lines(self) -> list[str]:
+        """Each parameter with its errors, and the misfit."""
+        told = []
+        for name, value in self.values.items():
+            errors = [f" ± {e:.1g}" for e in self.errors[name]]
+            told.append(f"{name}: {'  '.join(f'{v:.4g}{e}' for v, e in zip(value, errors))}")
+        for name, values in self.textures.items():
+            mean = " ".join(f"{v:.4g}" for v in values.reshape(-1, values.shape[-1]).mean(axis=0))
+            size, error = " x ".join(map(str, values.shape[:-1])), self.texture_errors[name]
+            known = f"{np.nanmedian(error):.1g}" if np.isfinite(error).any() else "nan"
+            told.append(f"{name}: {size} numbers of mean {mean}, median of their errors {known}")
+        held = "" if self.held_out is None else f", of views held out {self.held_out.told()} %"
+        word, chi_square = "misfit" if self.is_misfit else "noise", self.chi_square
+        residuals = f"residuals: {word}, chi-square {chi_square.value:.2f}, by noise 1 ± {chi_square.error:.1g}"
+        return [*told, f"root of the loss {self.misfit.told()} %{held}", residuals]
+
+
+class ViewMisfit(NamedTuple):
+    """What two renders of a view say.
+
+    Args:
+        loss, variance: of the view, and its variance by noise.
+        residual: mean of both renders times the exposure e, less the image.
+        noise: its variance, of all pixels.
+        weights: of pixels and channels.
+        stiffness: what stands for weights in the second derivative of the loss.
+        exposure_slope, exposure_curvature: half the derivatives of the loss by ln e, of Gauss and Newton.
+    """
+
+    loss: float
+    variance: float
+    residual: np.ndarray
+    noise: np.ndarray
+    weights: np.ndarray
+    stiffness: np.ndarray
+    exposure_slope: float
+    exposure_curvature: float
+
+
+@dataclass(frozen=True, eq=False)
+class ViewComparison:
+    """The views of a scene as it is now, against their images.
+
+    Args:
+        scene, views, settings: as of `fit`, checked.
+        factors: of each view, changed in place: by which its render becomes its image, up to one common factor.
+        shown: of views that were met, changed in place: B, without exposure.
+    """
+
+    scene: mi.Scene
+    views: list[GivenView]
+    settings: FitSettings
+    factors: np.ndarray = field(init=False)
+    shown: dict[int, np.ndarray] = field(init=False, default_factory=dict)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "factors", np.ones(len(self.views)))
+
+    @property
+    def fitted(self) -> list[int]:
+        """The views that are not held out."""
+        return [k for k, view in enumerate(self.views) if not view.held_out]
+
+    @property
+    def exposures(self) -> np.ndarray:
+        """The factors of views over the geometric mean of those that are fitted."""
+        return self.factors / np.exp(np.log(self.factors[self.fitted]).mean())
+
+    def batch(self, k: int) -> list[int]:
+        """The views of a step."""
+        n = min(self.settings.batch or BATCH, len(self.fitted))
+        return np.random.default_rng([self.settings.seed, k]).permutation(self.fitted)[:n].tolist()
+
+    def count(self, which: int) -> float:
+        """Numbers of a view that count."""
+        view = self.views[which]
+        return max(float(view.counts.sum() * view.image.shape[2]), 1.0)
+
+    def seed(self, k: int, which: int, purpose: str, parameter: int = 0) -> int:
+        """Of the samples of a render in a step."""
+        words = [self.settings.seed, k, which, PURPOSES.index(purpose), parameter]
+        return int(np.random.SeedSequence(words).generate_state(1)[0])
+
+    def view(self, which: int, k: int, pair: Sequence[np.ndarray] = ()) -> ViewMisfit:
+        """A view in a step; one that is held out at the exposure that suits it.
+
+        Args:
+            pair: its two renders, if they are there.
+        """
+        view = self.views[which]
+        purposes = ("test", "other test") if view.held_out else ("first", "second")
+        pair = pair or [self.image(view, self.seed(k, which, each)) for each in purposes]
+        weights = self._weights(which, k)
+        misfit = self._misfit(which, pair, *weights)
+        if self.settings.exposure and view.held_out:
+            self.expose(which, -misfit.exposure_slope / misfit.exposure_curvature)
+            misfit = self._misfit(which, pair, *weights)
+        if which in self.shown:
+            self.shown[which] = self.shown[which] + NEWEST * (np.mean(pair, axis=0) - self.shown[which])
+        return misfit
+
+    def _weights(self, which: int, k: int) -> tuple[np.ndarray, np.ndarray | float]:
+        """Of pixels and channels of a view in a step, 0 where they do not count; and 1 / (I'' - T) where it bends."""
+        view, e = self.views[which], self.exposures[which]
+        counts = np.broadcast_to(view.counts[..., None], view.image.shape).astype(float)
+        if self.settings.loss == "l2" or not view.counts.any():
+            return counts, 0.0
+        if which not in self.shown:
+            seeds = [self.seed(k, which, "weights", number) for number in range(FIRST)]
+            self.shown[which] = np.mean([self.image(view, seed) for seed in seeds], axis=0)
+        floor = FLOOR * max(float(view.image[view.counts].mean()), 1e-6)
+        scale = e * np.maximum(self.shown[which], 0) + floor
+        weights = counts / np.square(scale)
+        if self.settings.loss != "robust":
+            return weights, 0.0
+        off = e * self.image(view, self.seed(k, which, "weights", FIRST)) - view.image
+        factor = 1 / np.maximum(np.abs(off) / scale / BEND, 1)
+        bent = np.divide(1.0, off, out=np.zeros_like(off), where=factor < 1)
+        return weights * factor / factor[view.counts].mean(), bent
+
+    def _misfit(self, which: int, pair: Sequence[np.ndarray], w: np.ndarray, bent: Any) -> ViewMisfit:
+        e, T, n = self.exposures[which], self.views[which].image, self.count(which)
+        a, b = (e * image - T for image in pair)
+        noise = np.square(a - b) / 2  # variance of each
+        variance = float((np.square(w) * (noise * (np.square(a) + np.square(b)) / 2)).sum()) / n**2
+        loss, residual = float((w * a * b).sum() / n), (a + b) / 2
+        slope = loss + float((w * T * residual).sum() / n)  # mean w (a + T) b, of independent samples
+        curvature = float((w * (a + T) * (b + T)).sum() / n)
+        return ViewMisfit(loss, variance, residual, noise / 2, w, w * (1 - residual * bent), slope, curvature)
+
+    def ends(self, k: int) -> tuple[NoiseFree, NoiseFree | None, list[FittedView]]:
+        """The root of the loss of all fitted views, and likewise of views held out (None without any); all views."""
+        misfits = [self.view(which, k) for which in range(len(self.views))]
+        losses = [(m.loss, m.variance) for m in misfits]
+        held = [loss for loss, view in zip(losses, self.views) if view.held_out]
+        shown = [
+            FittedView(view.name, view.image, m.residual + view.image, view.counts, view.held_out)
+            for view, m in zip(self.views, misfits)
+        ]
+        return _root([losses[which] for which in self.fitted]), _root(held) if held else None, shown
+
+    def image(self, view: GivenView, seed: int) -> np.ndarray:
+        """A render of a view, without exposure."""
+        return pixels_of(view, mi.render(self.scene, sensor=view.sensor, seed=seed, spp=self.settings.spp))
+
+    @property
+    def at_once(self) -> bool:
+        """Whether image and derivatives come from the same paths; models take a pass for each variable."""
+        return hasattr(self.scene.integrator(), "render_derivatives")
+
+    def sloped(
+        self, which: int, k: int, purpose: str, x: Mapping[str, Any], put: Callable[[Mapping[str, Any]], None],
+        slopes: bool,
+    ) -> tuple[np.ndarray, list[np.ndarray]]:  # fmt: skip
+        """A render of a view in a step, and its derivatives by each variable, all of whose numbers change alike.
+
+        Args:
+            purpose: "first" or "second".
+            x: the variables by name.
+            put: sets the medium by them, with their gradients.
+            slopes: whether derivatives are asked for.
+        """
+        view, spp, integrator = self.views[which], self.settings.spp, self.scene.integrator()
+        seed, found = self.seed(k, which, purpose), []
+
+        def followed(names: Iterable[str]) -> dict[str, Any]:
+            result = {name: type(value)(value) for name, value in x.items()}
+            for name in names:
+                dr.enable_grad(result[name])
+            return result
+
+        if slopes and self.at_once:
+            followed_x = followed(x)
+            put(followed_x)
+            image, found = integrator.render_derivatives(self.scene, list(followed_x.values()), view.sensor, seed, spp)
+            put(x)
+            return pixels_of(view, image), [pixels_of(view, d) for d in found]
+        put(x)
+        image = self.image(view, seed)
+        for j, name in enumerate(x if slopes else ()):
+            followed_x = followed([name])
+            dr.set_grad(followed_x[name], 1.0)
+            put(followed_x)
+            dr.forward_from(followed_x[name], dr.ADFlag.ClearEdges)  # models begin at the coefficients
+            seed = self.seed(k, which, "slope", 2 * j + (purpose == "second"))
+            found.append(pixels_of(view, integrator.render_forward(self.scene, None, view.sensor, seed, spp)))
+        put(x)
+        return image, found
+
+    def expose(self, which: int, share: float) -> None:
+        """Add a share to the factor of a view."""
+        factor = self.factors[which] * (1 + np.clip(share, -0.5, 1.0))
+        self.factors[which] = np.clip(factor, 1 / EXPOSURE, EXPOSURE)
+
+    def fingerprint(self, *start: object) -> str:
+        """Of the images, the settings, where a fit starts, and versions."""
+        views = [(v.sensor, v.held_out) for v in self.views]
+        told = provenance()
+        of = [asdict(self.settings), start, views, told["versions"], told["commit"]]
+        digest = hashlib.sha256(json.dumps(of).encode())
+        for view in self.views:
+            digest.update(view.image.tobytes() + view.counts.tobytes())
+        return digest.hexdigest()
+
+
+def pixels_of(view: GivenView, image: mi.TensorXf) -> np.ndarray:
+    """A render in the shape of the image of a view."""
+    return np.array(image, dtype=np.float64)[..., : view.image.shape[2]]
+
+
+def _root(losses: Sequence[tuple[float, float]]) -> NoiseFree:
+    """The root of a mean loss, of losses and their variances."""
+    loss, variance = np.mean(losses, axis=0)
+    return NoiseFree(float(loss), float(np.sqrt(variance / len(losses))))
+
+
+class FitDescent(Protocol):
+    """Steps that bring a scene closer to images."""
+
+    comparison: ViewComparison
+    total: int
+    steps: list[FitStep]
+
+    def step(self, k: int) -> FitStep:
+        """Take step k."""
+
+    def state(self) -> dict[str, np.ndarray]:
+        """All that the next step depends on, but exposures and steps."""
+
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Go back to such a state."""
+
+    def fingerprint(self) -> str:
+        """Of what is fitted to what, how, and from where."""
+
+
+def kept_at(change: Any) -> Any:
+    """Share that is kept of what was measured before a variable changed by so much."""
+    return 1 / (1 + (change / FAR) ** 4)
+
+
+def arrays_of_means(means: Mapping[int, Any]) -> dict[str, np.ndarray]:
+    """Means of views, dataclasses of arrays and numbers, as a state keeps them."""
+    return {
+        f"view {which} {key}": np.asarray(value) for which, each in means.items() for key, value in vars(each).items()
+    }
+
+
+def means_of_arrays(arrays: Mapping[str, np.ndarray], kind: Callable[..., Any]) -> dict[int, Any]:
+    """The means of a class that a state keeps."""
+    kept: dict[int, dict[str, Any]] = {}
+    for key, value in arrays.items():
+        if key.startswith("view "):
+            _, which, name = key.split()
+            kept.setdefault(int(which), {})[name] = value if value.ndim else float(value)
+    return {which: kind(**each) for which, each in kept.items()}
+
+
+def descend(descent: FitDescent, work: Path | None, progress: ProgressText | None) -> None:
+    """Take all steps that are left, kept in the folder `work`, from which the same fit goes on.
+
+    Raises:
+        ValueError: `work` is that of another fit.
+    """
+    path, of = work and work / "state.npz", descent.fingerprint()
+    if path is not None and path.exists():
+        _load(path, of, descent)
+    while (k := len(descent.steps)) < descent.total:
+        descent.steps.append(descent.step(k))
+        if path is not None:
+            _save(path, of, descent)
+        if progress:
+            progress(k + 1, descent.total, descent.steps[-1].line())
+
+
+def _save(path: Path, of: str, descent: FitDescent) -> None:
+    arrays = {"of": np.array(of), "steps": np.array(json.dumps(descent.steps))}
+    file = io.BytesIO()
+    shown = {f"shown {which}": image for which, image in descent.comparison.shown.items()}
+    np.savez(file, **arrays, factors=descent.comparison.factors, **shown, **descent.state())
+    write_atomically(path, file.getvalue())
+
+
+def _load(path: Path, of: str, descent: FitDescent) -> None:
+    try:
+        arrays = dict(np.load(path, allow_pickle=False))
+    except (OSError, ValueError, EOFError) as error:
+        raise ValueError(f"{path} must be the state of a fit, got {error}") from error
+    if str(arrays["of"]) != of:
+        raise ValueError(f"work must be a new folder or that of the same fit, got another one in {path.parent}")
+    descent.comparison.factors[:] = arrays.pop("factors")
+    for key in [key for key in arrays if key.startswith("shown ")]:
+        descent.comparison.shown[int(key.split()[1])] = arrays.pop(key)
+    descent.steps = [FitStep(*row) for row in json.loads(str(arrays["steps"]))]
+    descent.restore(arrays)

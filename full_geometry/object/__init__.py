@@ -1,1 +1,0 @@
-"""Geometry and light of one object: first event, features, surroundings, patches, walks, pairs and radiance."""

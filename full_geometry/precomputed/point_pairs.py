@@ -1,0 +1,116 @@
+"""Pairs of places between which S is asked once more, along directions that light comes from at the entry.
+
+Of the entries of each point a few are chosen in proportion to the light that they bring, and for each one of the
+directions that light was gathered along where it is: by systematic sampling, as the entries themselves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, NamedTuple
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from full_geometry.geometry.points import EntrySample, SurfacePoint
+from full_geometry.sampling.light_points import GOLDEN
+
+if TYPE_CHECKING:
+    from full_geometry.objects.objects import TranslucentObject
+
+COUNT = 3 * 2**14  # pairs of all points,
+FEWEST = 6  # of a point,
+ANY = 0.1  # and of them by no light
+
+
+class Rays(NamedTuple):
+    """Directions along which light was gathered at points.
+
+    Args:
+        w: (points, directions, 3).
+        light: a(mu) mu L over their density and number, (points, directions, channels).
+    """
+
+    w: np.ndarray
+    light: np.ndarray
+
+
+class LitPairs(NamedTuple):
+    """Chosen pairs, with light.
+
+    Args:
+        row, number: point of the exit, and number of the entry in those of all points.
+        share: of them over their probability.
+        w: direction of light at the entry, (pairs, 3).
+        colour: light along that over the mean of such light there, (pairs, channels).
+    """
+
+    row: np.ndarray
+    number: np.ndarray
+    share: np.ndarray
+    w: np.ndarray
+    colour: np.ndarray
+
+
+def lit_pairs(brought: np.ndarray, point: np.ndarray, rays: Rays) -> LitPairs:
+    """Pairs for light.
+
+    Args:
+        brought: by entries, (points, entries).
+        point: that each is nearest to.
+        rays: to points.
+    """
+    (rows, each), n = brought.shape, max(COUNT // len(brought), FEWEST)
+    row = np.repeat(np.arange(rows), n)
+    by_light = np.maximum(brought, 0) / np.maximum(np.maximum(brought, 0).sum(axis=1, keepdims=True), 1e-30)
+    probability = (1 - ANY) * by_light + ANY / each
+    number = _systematic(probability, row, (np.arange(rows)[:, None] * GOLDEN % 1.0 + np.arange(n)).ravel() / n)
+    at = point.ravel()[number]
+    order = np.lexsort((np.random.default_rng(rows).random(len(at)), at))
+    sorted_at, u = at[order], np.empty(len(at))
+    u[order] = (np.arange(len(at)) - np.searchsorted(sorted_at, sorted_at) + 0.5) / np.bincount(at)[sorted_at]
+    ray = _systematic(rays.light.mean(axis=2), at, u)
+    light, mean = rays.light.reshape(-1, rays.light.shape[2])[ray], rays.light.sum(axis=1)[at]
+    colour = light * (mean.mean(axis=1) / np.maximum(light.mean(axis=1), 1e-30))[:, None] / np.maximum(mean, 1e-30)
+    share = 1 / (n * probability.ravel()[number])
+    return LitPairs(row, number, share, rays.w.reshape(-1, 3)[ray], colour)
+
+
+def _systematic(weights: np.ndarray, row: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """Numbers of items of rows (rows, items), in proportion to their weights, for uniform numbers."""
+    summed = np.cumsum(np.maximum(weights, 0), axis=1, dtype=float)
+    whole, n = summed[:, -1].copy(), weights.shape[1]
+    before = np.concatenate([[0], np.cumsum(whole)[:-1]])
+    summed += before[:, None]
+    return np.clip(np.searchsorted(summed.ravel(), before[row] + u * whole[row], "right"), row * n, row * n + (n - 1))
+
+
+class EntryPairs(NamedTuple):
+    """All entries of points and their exits, on an object without textures.
+
+    Args:
+        object: that both are on.
+        out: exits of points and their faces, given those and directions.
+        w_o: directions, (points, entries, 3).
+        entries: given their numbers.
+    """
+
+    object: TranslucentObject
+    out: Callable[[mi.UInt32, mi.Vector3f], tuple[SurfacePoint, mi.UInt32]]
+    w_o: np.ndarray
+    entries: Callable[[mi.UInt32], EntrySample]
+
+    def S(self, lit: LitPairs) -> tuple[np.ndarray, np.ndarray]:
+        """S over the density of entries, (pairs, channels), and the cosines of light; both 0 below the surface."""
+        obj, on = self.object, mi.Bool(True)
+        w_o = self.w_o[lit.row, lit.number % self.w_o.shape[1]]
+        row, number, w_o, w = mi.UInt32(lit.row), mi.UInt32(lit.number), mi.Vector3f(w_o.T), mi.Vector3f(lit.w.T)
+        entry = self.entries(number)
+        at, prepared = entry.facing(w), obj.transport.prepare(self.out(row, w_o)[0], on)
+        active = (dr.dot(w, entry.n) > 0) & (entry.weight > 0)
+        S = mi.Spectrum(dr.select(active, obj.transport.S(prepared, at, active) * entry.weight, 0))
+        mu = dr.select(active, at.mu, 0)
+        dr.eval(S, mu)
+        S = np.nan_to_num(np.array(S, dtype=np.float32).T, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
+        return S, np.array(mu)

@@ -1,0 +1,406 @@
+"""Light that reaches the inside of objects unscattered, precomputed on a grid.
+
+Under a refracting boundary a walk from the camera meets light where it leaves, by chance. The radiance L_0 that arrives
+at a point inside before it has scattered needs no chance: rays from the emitters, refracted at the surface and
+reflected inside, bring it to the cells of a grid, once for an image. A walk then adds at each of its events
+
+    weight ∫ p(w.w') L_0(x, w') dw',
+
+and drops the emitters that it meets after its last event as long as it has met nothing but the boundary of the object
+since, as the grid holds their light. Light that comes by way of other surfaces, or through another part of the object,
+stays to be met by chance.
+
+Rays begin at points uniform over the surface, each with one sample of the emitters. Along a ray six points are drawn by
+the transmittance, each channel in turn (balance heuristic), and added to the moments of L_0 in their cells. The fit in
+each cell is linear, by least squares over the part inside (`inside_cells`): it keeps the light of a cell and its first
+moments, so that its error in an image is of second order in the size of cells.
+
+Where a medium does not scatter evenly, the directions w' of the light of a cell count. They are parted by octants; the
+light of each is a lobe of Henyey-Greenstein about its mean direction w_m with the mean cosine a_m that it has, so that
+
+    ∫ p_g(w.w') L_0(x, w') dw' = phi(x) sum_m s_m p_(g a_m)(w.w_m),
+
+phi the fluence of unscattered light and s_m the share of the octant: two such functions of g and a convolve to one of
+g a. A single direction is exact.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import zip_longest
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from full_geometry.geometry.instances import Pose, corners, ends_of
+from full_geometry.geometry.points import EntrySample, cosine_above, cosine_density, lift, opaque, sided
+from full_geometry.geometry.rounding import blocked, ray_from
+from full_geometry.precomputed.inside_cells import POINTS, InsideCells, grid_edge
+from full_geometry.sampling.light_points import lattice, uniform_entries
+from full_geometry.walk.media import WalkMedia
+from full_geometry.walk.random_walk import Event, pick, sample_bsdf
+from halfspace_sss.physics.medium import eval_hg
+from halfspace_sss.tracing.walk import generator, pass_seed
+
+EDGE = 0.9  # of cells, mean free paths
+MOST_EDGE = 1.5  # beyond, the mean of an image is more than .5 % off
+DEPTH = 12.0  # mean free paths below the surface: e^-12 is left of light there
+ALONG = 6  # points on a segment of a ray
+FEWEST_POINTS, MOST_POINTS = 2**14, 2**22  # of the surface, that find the cells it cuts
+OCTANTS = 8
+BY_COSINE = 0.25  # of the directions to emitters
+MOST_G = 0.85  # above, light reaches a fraction of the depth that walks do, and cells are too many
+ROULETTE = 0.1  # part of its light below which a reflected ray may end
+R_4 = (0.8566748838545029, 0.7338918566271260, 0.6287067210378087, 0.5385972572236101)  # Roberts 2018, four dimensions
+
+
+@dataclass(frozen=True, eq=False)
+class UnscatteredLight:
+    """Unscattered light inside the objects of a scene.
+
+    Args:
+        slot: of the cells of all objects, one after the other.
+        fluence: of each slot and channel the value at the centre and the slopes by units of h.
+        lobes: of each slot and octant s_m by channel, 0, a_m w_m, 0; None where all media scatter evenly.
+        tables: by the number of an object, where its cells begin, their corner, 1/h and counts.
+    """
+
+    slot: mi.Int32
+    fluence: mi.Float
+    lobes: mi.Float | None
+    tables: dict[str, Any]
+
+    def light(self, media: WalkMedia, event: Event) -> mi.Spectrum:
+        """Unscattered light that an event of a walk scatters on along it, per weight of the walk."""
+        at = {key: dr.gather(type(t), t, media.place_of(event.object)) for key, t in self.tables.items()}
+        x = (event.p - at["low"]) * at["scale"]
+        cell = mi.Vector3i(dr.floor(x))
+        inside = dr.all((cell >= 0) & (cell < at["counts"]))
+        index = at["first"] + (cell.z * at["counts"].y + cell.y) * at["counts"].x + cell.x
+        slot = dr.gather(mi.Int32, self.slot, index, inside)
+        held, y = inside & (slot >= 0), x - (mi.Vector3f(cell) + 0.5)
+        n = len(mi.Spectrum(0))
+        rows = [dr.gather(mi.Vector4f, self.fluence, mi.UInt32(slot * n + c), held) for c in range(n)]
+        phi = mi.Spectrum([v.x + v.y * y.x + v.z * y.y + v.w * y.z for v in rows])
+        if self.lobes is None:
+            return phi / (4 * dr.pi)
+
+        # ---- sum_m s_m p_(g a_m)(w.w_m)
+        g, total = event.m.g, mi.Spectrum(0)
+        for m in range(OCTANTS):
+            index = mi.UInt32(slot * OCTANTS + m) * 2
+            share, v = (dr.gather(mi.Vector4f, self.lobes, index + i, held) for i in range(2))
+            v = mi.Vector3f(v.x, v.y, v.z)
+            a = dr.norm(v)
+            cosine = dr.dot(event.along, v) / dr.maximum(a, 1e-6)
+            if media.same_g:
+                phase = [eval_hg(cosine, g[0] * a)] * n
+            else:
+                phase = [eval_hg(cosine, g[c] * a) for c in range(n)]
+            total += mi.Spectrum([share[c] * phase[c] for c in range(n)])
+        return phi * total
+
+
+def unscattered_light(
+    scene: mi.Scene, media: WalkMedia, seed: int, cells: list[InsideCells], rays: int
+) -> UnscatteredLight:
+    """Unscattered light of the emitters of a scene.
+
+    Args:
+        scene: of Mitsuba.
+        media: its objects.
+        seed: whole number.
+        cells: of the objects, from `inside_cells_of`.
+        rays: of light, for each object.
+    """
+    directional = any(np.any(inside.medium.g) for inside in media.insides)
+    slots, values, lobes, first = [], [], [], 0
+    rows = {"first": [], "low": [], "scale": [], "counts": []}
+    start = 0
+    for k, grid in enumerate(cells):
+        D, octants = _moments(scene, media, k, grid, seed, rays, directional)
+        slot = np.array(grid.slot)
+        slots.append(np.where(slot >= 0, slot + start, -1))
+        values.append(grid.fit(D / grid.h**3))
+        lobes.append(_lobes(octants, grid) if directional else [])
+        for key, value in (("first", first), ("low", grid.low), ("scale", 1 / grid.h), ("counts", grid.counts)):
+            rows[key].append(value)
+        first, start = first + slot.size, start + grid.slots
+    kinds = {"first": mi.Int32, "low": mi.Point3f, "scale": mi.Float, "counts": mi.Vector3i}
+    tables = {key: kind(np.array(rows[key]).T) for key, kind in kinds.items()}
+    slot, *arrays = (
+        mi.Int32(np.concatenate(slots)),
+        *(mi.Float(np.concatenate(v).astype(np.float32).ravel()) for v in (values, lobes)),
+    )
+    dr.make_opaque(tables, slot, arrays)
+    return UnscatteredLight(slot, arrays[0], arrays[1] if directional else None, tables)
+
+
+def _lobes(octants: np.ndarray, grid: InsideCells) -> np.ndarray:
+    """Shares of the light of octants, and their mean directions, shape (slots, octants, 8).
+
+    Args:
+        octants: (slots, octants, 8) light by channel, 0, light of all channels times direction, 0.
+        grid: tells the cells that share the light of another.
+    """
+    octants[grid.cut] = octants[grid.cut[grid.place]]
+    light, v = octants[..., :4], octants[..., 4:]
+    v /= np.maximum(light.sum(axis=-1, keepdims=True), 1e-30)
+    light /= np.maximum(light.sum(axis=1, keepdims=True), 1e-30)
+    return octants
+
+
+def obstacle(media: WalkMedia) -> str:
+    """Why light of a scene must be sampled; "" where it can be precomputed."""
+    if mi.is_spectral:
+        return f"the variant {mi.variant()} has no light by channel"
+    if media.inner is not None:
+        return "something lies inside an object"
+    for k, kind in enumerate(media.placed.kind):
+        h = _edges(media, k, EDGE)[1] * media.mm_per_unit * float(np.mean(media.insides[kind].medium.sigma_t))
+        if h > MOST_EDGE:
+            return f"object {media.objects[kind].name} is so many mean free paths wide that cells have {h:.2g}"
+    for obj, inside, around in zip_longest(media.objects, media.insides, media.wrappings):
+        if not obj.closed:
+            return f"object {obj.name} is not closed"
+        if inside.textured is not None and "sigma_t" not in inside.textured.constants:
+            return f"sigma_t of object {obj.name} has a texture, of which each walk takes its own value"
+        if around is not None and (around.mixes or around.bend is not None):
+            return f"the surface of object {obj.name} is masked, blended, or has a normal or bump map"
+        if inside.orders != "total":
+            return f"orders of object {obj.name} are {inside.orders!r}"
+        if np.max(np.abs(inside.medium.g)) > MOST_G:
+            return f"abs(g) of object {obj.name} is above {MOST_G}"
+    return ""
+
+
+def inside_cells_of(media: WalkMedia, edge: float = EDGE) -> list[InsideCells]:
+    """The cells of all objects, `edge` mean free paths wide."""
+    results = []
+    for k, kind in enumerate(media.placed.kind):
+        sigma_t = media.mm_per_unit * np.atleast_1d(media.insides[kind].medium.sigma_t)
+        box, h = _edges(media, k, edge)
+        depth = np.inf if media.varies else DEPTH / float(np.min(sigma_t))
+        area = float(
+            np.mean(np.array(_entries(media, k, [mi.Float(v.astype(np.float32)) for v in lattice(2**10)]).weight))
+        )
+        n = int(np.clip(POINTS * area / h**2, FEWEST_POINTS, MOST_POINTS))
+        points = _entries(media, k, [mi.Float(v.astype(np.float32)) for v in lattice(n)])
+        results.append(InsideCells.of(media, k, points, box, h, depth))
+    return results
+
+
+def _edges(media: WalkMedia, k: int, edge: float) -> tuple[tuple[np.ndarray, np.ndarray], float]:
+    """The box of object k, and the edge of its cells, scene units."""
+    kind = media.placed.kind[k]
+    low, high = ends_of(corners(media.objects[kind].scene.bbox(), _to_world(media, k)[None]))
+    sigma_t = media.mm_per_unit * float(np.mean(media.insides[kind].medium.sigma_t))
+    return (low[0], high[0]), grid_edge((low[0], high[0]), edge / sigma_t)
+
+
+def _to_world(media: WalkMedia, k: int) -> np.ndarray:
+    """Where object k stands: the matrix of an instance."""
+    kind = int(media.placed.kind[k])
+    return media.placed.to_world(kind)[k - int(media.placed.first[kind])]
+
+
+def _entries(media: WalkMedia, k: int, u: list[mi.Float]) -> EntrySample:
+    """Points uniform over the surface of object k, in an instance over that in its group; the weight is 1 / density."""
+    kind = int(media.placed.kind[k])
+    entries = uniform_entries(media.objects[kind], u[0], mi.Point2f(u[1], u[2]))
+    if media.placed.groups[kind] is None:
+        return entries
+    M = _to_world(media, k)
+    columns = [[mi.Vector3f(*(opaque(v) for v in column)) for column in m[:3].T] for m in (M, np.linalg.inv(M))]
+    return Pose(*columns, mi.Float(0)).entry(entries)
+
+
+@dataclass
+class _Ray:
+    """Loop variables of a ray of light inside an object."""
+
+    o: mi.Point3f
+    d: mi.Vector3f
+    off: mi.Vector3f  # from o to where the ray is clear of the surface
+    flux: mi.Spectrum  # where it entered, times reflectances since
+    T: mi.Spectrum  # transmittance since it entered
+    alive: mi.Bool
+    rng: mi.PCG32
+
+
+@dataclass(frozen=True, eq=False)
+class _Rays:
+    """Rays that bring the light of emitters to the cells of one object.
+
+    Args:
+        scene, media: of Mitsuba, and its objects.
+        k: number of the object.
+        grid: its cells.
+        D: ∫ L_0 x_j dx dw over the inside of each cell by channel, x about its centre in units of h.
+        octants: of each octant of directions w to the light ∫ L_0 dx dw by channel, 0, ∫ L_0 w dx dw of all channels,
+            0; None where directions do not count.
+    """
+
+    scene: mi.Scene
+    media: WalkMedia
+    k: mi.Int32
+    grid: InsideCells
+    D: mi.Float
+    octants: mi.Float | None
+
+    def enter(self, number: int, rays: int, seed: int) -> _Ray:
+        """Rays of emitters at points of the surface, refracted into the object.
+
+        By the camera's paths, light is L cos(w, n_s) f / |d.n_s| for each radiance along d; a ray has the flux
+
+            L cos(w, n_s) (f cos / pdf)(w -> d) |d.n| / |d.n_s|,
+
+        over the density of the point and of w, n_s the shading normal.
+        """
+        media, rng = self.media, generator(mi, rays, pass_seed(seed, number))
+
+        # ---- points in order along the faces, with a sample of the emitters each
+        shift = np.random.default_rng([seed, number]).random(5)
+        u = [(dr.arange(mi.Float, rays) + opaque(shift[4])) / opaque(rays)]
+        for root, s in zip(R_4, shift):
+            # multiples of a root in whole numbers, which float32 would round
+            step, first = (dr.opaque(mi.UInt32, int(v * 2**32) % 2**32) for v in (root, s))
+            u.append(mi.Float((dr.arange(mi.UInt32, rays) * step + first) >> 8) * 2**-24)
+        at = _entries(media, number, [dr.minimum(u[0], 1 - 2**-24), u[1], u[2]])
+        si = dr.zeros(mi.SurfaceInteraction3f, rays)
+        si.p, si.n, si.sh_frame = mi.Point3f(at.p), mi.Normal3f(at.n), mi.Frame3f(at.n_out)
+        w, light = self._incident(si, mi.Point2f(u[3], u[4]), rng)
+        si.wi = si.to_local(w)
+        si = lift(si, w)
+
+        # ---- refraction
+        bs, value = sample_bsdf(media.boundary(self.k), si, rng, _only(mi.BSDFFlags.Transmission))
+        d, _ = sided(si, bs.wo)
+        cosine = mi.Frame3f.cos_theta(si.wi)
+        bend = dr.abs(dr.dot(d, si.n)) / dr.maximum(dr.abs(mi.Frame3f.cos_theta(bs.wo)), 1e-6)
+        enters = (bs.pdf > 0) & (dr.dot(si.n, w) > 0) & (cosine > 0) & (dr.dot(d, si.n) < 0)
+        flux = dr.select(enters, light * value * (cosine * bend * at.weight / opaque(rays)), 0)
+        enters &= dr.max(flux) > 0
+        T = dr.full(mi.Spectrum, 1, rays)
+        return _Ray(mi.Point3f(at.p), d, media.clear(self.k, si.n, d), mi.Spectrum(flux), T, mi.Bool(enters), rng)
+
+    def _incident(self, si: mi.SurfaceInteraction3f, u: mi.Point2f, rng: mi.PCG32) -> tuple[mi.Vector3f, mi.Spectrum]:
+        """A direction w to an emitter, and the light from there over its density.
+
+        A share of them is drawn by the cosine, for lamps so near that those of the emitters miss them (balance
+        heuristic over one sample): L / ((1 - BY_COSINE) p_emitter + BY_COSINE p_cosine).
+        """
+        scene, sight = self.scene, self.media.sight
+
+        # ---- by the emitters
+        ds, light = scene.sample_emitter_direction(si, u, False)
+        shadow = sight.ray_to_emitter(si, ds, self.media.row("rounding", self.k))
+        delta, active = mi.Bool(ds.delta), ds.pdf > 0
+        light = dr.select(active & ~blocked(scene, shadow, active), light * ds.pdf, 0)
+
+        # ---- by the cosine
+        w, _ = cosine_above(si.sh_frame.n, si.n, u)
+        drawn = rng.next_float32() < BY_COSINE
+        met = sight.intersect(scene, ray_from(si, w, self.media.row("rounding", self.k)), mi.RayFlags.All, active=drawn)
+        emitter = met.emitter(scene, drawn)
+        found = drawn & (emitter != None)  # noqa: E711
+        there = mi.DirectionSample3f(scene, met, si)
+
+        # ---- over the density of both
+        p_emitter = dr.select(drawn, scene.pdf_emitter_direction(si, there, found), ds.pdf)
+        w = mi.Vector3f(dr.select(drawn, w, ds.d))
+        p_cosine = dr.select(delta & ~drawn, 0, cosine_density(si.sh_frame.n, si.n, w))
+        light = dr.select(drawn, dr.select(found, emitter.eval(met, found), 0), light)
+        density = (1 - BY_COSINE) * p_emitter + BY_COSINE * p_cosine
+        return w, dr.select(density > 0, light / dr.maximum(density, 1e-30), 0)
+
+    def segment(self, ray: _Ray) -> _Ray:
+        """Light along a ray as far as the surface, and its reflection there."""
+        media, d, rng = self.media, ray.d, ray.rng
+        si = media.sight.intersect(media.scene, mi.Ray3f(ray.o + ray.off, d), mi.RayFlags.All, active=ray.alive)
+        alive = ray.alive & si.is_valid()
+        far = dr.select(alive, dr.maximum(si.t + dr.dot(ray.off, d), 0), 0)
+
+        # ---- light along it
+        self._add(ray, far, alive)
+
+        # ---- reflection: flux F, with roulette; behind an object that overlaps the ray goes on, and behind its own
+        # boundary if rounding has put it outside
+        met = media.met(si, self.k) == self.k
+        si = media.seen(si, self.k, d)
+        own = met & (dr.dot(si.n, d) > 0)
+        bs, value = sample_bsdf(media.boundary(self.k), si, rng, _only(mi.BSDFFlags.Reflection))
+        new, _ = sided(si, bs.wo)
+        T = ray.T * self._transmittance(ray, far)
+        left = dr.max(ray.flux * value * T) / dr.maximum(dr.max(ray.flux), 1e-30)
+        survive = dr.minimum(left / ROULETTE, 1)
+        reflected = (dr.dot(si.n, new) < 0) & (rng.next_float32() < survive)
+        d = mi.Vector3f(dr.select(own, new, d))
+        flux = dr.select(own, ray.flux * value / dr.maximum(survive, 1e-20), ray.flux)
+        return _Ray(mi.Point3f(si.p), d, media.clear(self.k, si.n, d), flux, T, alive & (~own | reflected), rng)
+
+    def _add(self, ray: _Ray, far: mi.Float, active: mi.Bool) -> None:
+        """Add light to the cells at ALONG points of a segment, drawn by mean_c sigma_c T_c / (1 - T_c(far))."""
+        grid, n = self.grid, len(mi.Spectrum(0))
+        sigma_t = self.media.spectrum("sigma_t", self.k)
+        low, scale = mi.Point3f(*(opaque(v) for v in grid.low)), opaque(1 / grid.h)
+        counts = mi.Vector3i(*(dr.opaque(mi.Int32, int(v)) for v in grid.counts))
+        ends = 1 - dr.exp(-sigma_t * far)
+        octant = sum(dr.select(ray.d[a] < 0, mi.Int32(1 << a), 0) for a in range(3))
+        u_0, first = ray.rng.next_float32(), mi.UInt32(ray.rng.next_float32() * n)
+
+        def add(j: mi.UInt32, rng: mi.PCG32) -> tuple[mi.UInt32, mi.PCG32]:
+            # ---- a point at the distance s
+            rate, end = (pick(v, (first + j) % n) for v in (sigma_t, ends))
+            u = u_0 + mi.Float(j) / ALONG
+            s = dr.minimum(-dr.log(1 - dr.minimum((u - dr.floor(u)) * end, 1 - 2**-24)) / rate, far)
+            pdf = dr.sum(sigma_t * dr.exp(-sigma_t * s) / dr.maximum(ends, 1e-20)) / n
+            light = ray.flux * ray.T * self._transmittance(ray, s, rng) / dr.maximum(pdf * ALONG, 1e-20)
+
+            # ---- its cell, and its place there
+            x = (ray.o + ray.d * s - low) * scale
+            cell = mi.Vector3i(dr.floor(x))
+            y = x - (mi.Vector3f(cell) + 0.5)
+            held = active & (far > 0) & dr.all((cell >= 0) & (cell < counts))
+            slot = dr.gather(mi.Int32, grid.slot, (cell.z * counts.y + cell.y) * counts.x + cell.x, held)
+            held &= slot >= 0
+
+            # ---- light x_j by channel, and by octant
+            for c in range(n):
+                dr.scatter_add(self.D, mi.Vector4f(1, y.x, y.y, y.z) * light[c], mi.UInt32(slot * n + c), held)
+            if self.octants is not None:
+                index, v = mi.UInt32(slot * OCTANTS + octant) * 2, ray.d * -dr.sum(light)
+                by_channel = mi.Vector4f(*(light[c] if c < n else mi.Float(0) for c in range(4)))
+                dr.scatter_add(self.octants, by_channel, index, held)
+                dr.scatter_add(self.octants, mi.Vector4f(v.x, v.y, v.z, 0), index + 1, held)
+            return j + 1, rng
+
+        dr.while_loop((mi.UInt32(0), mi.PCG32(ray.rng)), lambda j, rng: j < ALONG, add, label="points of a ray")
+
+    def _transmittance(self, ray: _Ray, s: mi.Float, rng: mi.PCG32 | None = None) -> mi.Spectrum:
+        """exp(-∫ sigma_t) over a distance along a ray."""
+        return self.media.transmittance(self.k, mi.Ray3f(ray.o, ray.d), s, rng or ray.rng)
+
+
+def _only(flags: int) -> mi.BSDFContext:
+    """The part of a boundary that transmits or reflects, for light."""
+    ctx = mi.BSDFContext(mi.TransportMode.Importance)
+    ctx.type_mask = flags
+    return ctx
+
+
+def _moments(
+    scene: mi.Scene, media: WalkMedia, k: int, grid: InsideCells, seed: int, rays: int, directional: bool
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """D of the cells of object k, shape (slots, channels, 4), and its octants, (slots, octants, 8) if `directional`."""
+    n = len(mi.Spectrum(0))
+    D = dr.zeros(mi.Float, grid.slots * n * 4)
+    octants = dr.zeros(mi.Float, grid.slots * OCTANTS * 8) if directional else None
+    traced = _Rays(scene, media, dr.full(mi.Int32, k, rays), grid, D, octants)
+    start = traced.enter(k, rays, seed)
+    dr.while_loop((start,), lambda ray: ray.alive, lambda ray: (traced.segment(ray),), label="rays of light")
+    dr.eval(D, octants)
+    D = np.array(D).reshape(grid.slots, n, 4)
+    return D, np.array(octants).reshape(grid.slots, OCTANTS, 8) if directional else None

@@ -1,0 +1,227 @@
+"""Points of a surface that hold what varies slowly over it, and a lookup that blends those near any place.
+
+Points are a low-discrepancy set over the area, and more where that leaves gaps. Between them a value is blended with
+the weights
+
+    w_j = (1 - d_j² / h²)² max(n_j.n, 0)²,    d_j < h,
+
+d_j the distance and n_j the normal of point j, so that the two sides of something thin stay apart. A uniform grid with
+cells of the size h lists for each cell all points that some place in it can reach.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from scipy.sparse import csr_array
+from scipy.spatial import cKDTree
+
+from full_geometry.geometry.points import (
+    AreaPoints,
+    EntrySample,
+    SurfacePoint,
+    cosine_above,
+    lifted,
+    opaque,
+    turned,
+)
+from full_geometry.geometry.shape import Geometry
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+PLACES = 2**17  # that must have a point in reach
+LOOKS = (23, 24)  # seeds of such places
+REACH = 2.0  # h over the mean distance of points
+MOST_CELLS = 2**22
+LIKE = 0.2  # difference of logarithms of colours that are blended
+GOLDEN = 0.6180339887498949
+R_3 = (
+    0.8191725133961645,
+    0.6710436067037893,
+    0.5497004779019703,
+)  # of three dimensions (Roberts 2018)
+
+
+def lattice(count: int, roots: Sequence[float] = R_3, shift: Sequence[float] = (0.5, 0.5, 0.5)) -> list[np.ndarray]:
+    """Low-discrepancy numbers in [0, 1), `count` of each root: multiples of these, shifted."""
+    return [(np.arange(1, count + 1) * r + s) % 1.0 for r, s in zip(roots, shift)]
+
+
+def uniform_entries(geometry: Geometry, u_face: mi.Float, u: mi.Point2f) -> EntrySample:
+    """Points uniform over the area of an object."""
+    at = AreaPoints(geometry.shape).sample(u_face, u, mi.Bool(True))
+    face = mi.UInt32(at.prim_index) + dr.zeros(mi.UInt32, dr.width(u))
+    sign = geometry.side(face)
+    n_out = mi.Normal3f(turned(mi.Normal3f(at.n_shading), mi.Normal3f(at.n))) * sign
+    n = mi.Normal3f(at.n) * sign
+    return EntrySample(mi.Point3f(at.p), n, mi.Normal3f(n_out), opaque(geometry.area), face)
+
+
+@dataclass(frozen=True, eq=False)
+class SurfacePoints:
+    """Points of one object, and their grid.
+
+    Args:
+        p, n, n_out, face: positions, outward geometric and shading normals, faces.
+        h: radius of the lookup, scene units.
+        low: corner of the grid.
+        cells: of the grid along each axis.
+        first: of each cell the place in `members` of its first point; one more than cells.
+        members: numbers of the points, cell by cell.
+    """
+
+    p: mi.Point3f
+    n: mi.Normal3f
+    n_out: mi.Normal3f
+    face: mi.UInt32
+    h: float
+    low: np.ndarray
+    cells: np.ndarray
+    first: mi.UInt32
+    members: mi.UInt32
+
+    @classmethod
+    def of(cls, geometry: Geometry, count: int) -> SurfacePoints:
+        """`count` points of an object."""
+        u = [mi.Float(v.astype(np.float32)) for v in lattice(count)]
+        p, n, n_out, _, face, _ = uniform_entries(geometry, u[0], mi.Point2f(u[1], u[2]))
+        dr.eval(p, n, n_out, face)
+        h = REACH * float(np.sqrt(geometry.area / count))
+        result = cls(p, n, n_out, face, *_grid(np.array(p).T, h))
+        for seed in LOOKS:
+            sparse, result = result, result._without_gaps(geometry, seed)
+            if result is sparse:
+                break
+        return result
+
+    def _without_gaps(self, geometry: Geometry, seed: int) -> SurfacePoints:
+        """With points where random places have none in reach: faces in rows can be in step with the set."""
+        u = np.random.default_rng(seed).random((3, PLACES)).astype(np.float32)
+        at = uniform_entries(geometry, mi.Float(u[0]), mi.Point2f(u[1:]))
+        missed = np.flatnonzero(~np.array(self.nearest(at.p, at.n, mi.Bool(True))[1]))
+        if not len(missed):
+            return self
+        p, n = (np.array(v, dtype=float)[:, missed].T for v in (at.p, at.n))
+        near = cKDTree(p).query_ball_point(p, 0.5 * self.h)
+        left, kept = np.ones(len(missed), dtype=bool), []
+        for k, others in enumerate(near):
+            if left[k]:
+                kept.append(k)
+                others = np.array(others)
+                left[others[n[others] @ n[k] > 0.5]] = False
+        chosen, old = missed[kept], (self.p, self.n, self.n_out, self.face)
+        p, n, n_out, face = (
+            type(a)(np.concatenate([np.array(a), np.array(b)[..., chosen]], axis=-1))
+            for a, b in zip(old, (at.p, at.n, at.n_out, at.face))
+        )
+        return SurfacePoints(p, n, n_out, face, *_grid(np.array(p).T, self.h))
+
+    def __len__(self) -> int:
+        return dr.width(self.p)
+
+    def exit(self, k: mi.UInt32, u: mi.Point2f) -> tuple[SurfacePoint, mi.UInt32]:
+        """Point k as an exit in a direction by the cosine, for a pair of uniforms, and its face."""
+        n, n_out = dr.gather(mi.Normal3f, self.n, k), dr.gather(mi.Normal3f, self.n_out, k)
+        return self.exit_along(k, cosine_above(n_out, n, u)[0])
+
+    def exit_along(self, k: mi.UInt32, w: mi.Vector3f) -> tuple[SurfacePoint, mi.UInt32]:
+        """Point k as an exit, and its face."""
+        n, n_out = dr.gather(mi.Normal3f, self.n, k), dr.gather(mi.Normal3f, self.n_out, k)
+        out = SurfacePoint(dr.gather(mi.Point3f, self.p, k), n, lifted(n_out, n, w), w, mi.Float(1))
+        return out, dr.gather(mi.UInt32, self.face, k)
+
+    def blend(self, values: mi.Float, size: int, p: mi.Point3f, n: mi.Normal3f, active: mi.Bool) -> list[mi.Float]:
+        """Values of all points, `size` for each, one after the other, at places with outward normals."""
+
+        def add(j: mi.UInt32, w: mi.Float, total: list[mi.Float]) -> list[mi.Float]:
+            return [dr.fma(w, dr.gather(mi.Float, values, j * size + c), v) for c, v in enumerate(total)]
+
+        weight, total = self._near(p, n, active, [mi.Float(0)] * size, add)
+        scale = dr.select(weight > 0, dr.rcp(dr.maximum(weight, 1e-30)), 0)
+        return [v * scale for v in total]
+
+    def smoothed(self, values: np.ndarray, paint: np.ndarray | None = None) -> np.ndarray:
+        """Values (points, ...) blended at the points themselves; with `paint` (points, channels) among like colours."""
+        weights = self._blending if paint is None else self._of_like(np.log(paint))
+        return (weights @ values.reshape(len(self), -1)).reshape(values.shape)
+
+    def _of_like(self, x: np.ndarray) -> csr_array:
+        """The weights of all points at all points, less where x is unlike, rows of sum 1."""
+        near = self._blending.tocoo()
+        j, k = near.coords
+        apart = np.abs(x[j] - x[k]).max(axis=1)
+        w = csr_array((near.data * np.exp(-((apart / LIKE) ** 2)), (j, k)), shape=near.shape)
+        return (w / w.sum(axis=1)[:, None]).tocsr()
+
+    @cached_property
+    def _blending(self) -> csr_array:
+        """The weights of all points at all points, rows of sum 1."""
+        p, n = np.array(self.p, dtype=float).T, np.array(self.n, dtype=float).T
+        d = cKDTree(p).sparse_distance_matrix(cKDTree(p), self.h, output_type="coo_matrix")
+        j, k = d.coords
+        facing = np.maximum((n[j] * n[k]).sum(axis=1), 0)
+        w = csr_array((((1 - (d.data / self.h) ** 2) * facing) ** 2, (j, k)), shape=d.shape)
+        return (w / w.sum(axis=1)[:, None]).tocsr()
+
+    def nearest(self, p: mi.Point3f, n: mi.Normal3f, active: mi.Bool) -> tuple[mi.UInt32, mi.Bool]:
+        """The point of the largest weight at a place, and whether there is one."""
+
+        def larger(j: mi.UInt32, w: mi.Float, best: tuple) -> tuple:
+            result = w > best[1]
+            return dr.select(result, j, best[0]), dr.select(result, w, best[1])
+
+        _, (j, w) = self._near(p, n, active, (mi.UInt32(0), mi.Float(0)), larger)
+        return j, w > 0
+
+    def _near(self, p: mi.Point3f, n: mi.Normal3f, active: mi.Bool, state: object, visit: Callable) -> tuple:
+        """The sum of weights, and the state after `visit(j, w_j, state)` for all points in reach."""
+        h = opaque(self.h)
+        cell = [mi.Int32(dr.floor((p[a] - opaque(self.low[a])) / h)) for a in range(3)]
+        counts = [dr.opaque(mi.Int32, int(c)) for c in self.cells]
+        valid = active
+        for index, count in zip(cell, counts):
+            valid = valid & (index >= 0) & (index < count)
+        index = mi.UInt32(dr.select(valid, (cell[2] * counts[1] + cell[1]) * counts[0] + cell[0], 0))
+        begin = dr.gather(mi.UInt32, self.first, index, valid)
+        end = dr.gather(mi.UInt32, self.first, index + 1, valid)
+
+        def step(i: mi.UInt32, weight: mi.Float, state: object) -> tuple:
+            j = dr.gather(mi.UInt32, self.members, i)
+            d2 = dr.squared_norm(dr.gather(mi.Point3f, self.p, j) - p) / (h * h)
+            facing = dr.maximum(dr.dot(dr.gather(mi.Normal3f, self.n, j), n), 0)
+            w = dr.square(dr.maximum(1 - d2, 0) * facing)
+            return i + 1, weight + w, visit(j, w, state)
+
+        loop = (mi.UInt32(begin), mi.Float(0), state)
+        out = dr.while_loop(loop, lambda i, *_: i < end, step, label="points in reach")
+        return out[1], out[2]
+
+
+def _grid(p: np.ndarray, h: float) -> tuple[float, np.ndarray, np.ndarray, mi.UInt32, mi.UInt32]:
+    """h, corner, cells, and the lists of points by cell; h grows where the grid would be too fine for its memory."""
+    while True:
+        low = p.min(axis=0) - 1.01 * h
+        cells = np.maximum(np.ceil((p.max(axis=0) + 1.01 * h - low) / h).astype(int), 1)
+        if cells.prod() <= MOST_CELLS:
+            break
+        h *= 1.26
+    own = np.floor((p - low) / h).astype(int)
+    place, point = [], []
+    for dz in (-1, 0, 1):
+        for dy in (-1, 0, 1):
+            for dx in (-1, 0, 1):
+                cell = own + (dx, dy, dz)
+                near = low + (cell + np.clip((p - low) / h - cell, 0, 1)) * h  # of the cell, to the point
+                kept = ((cell >= 0) & (cell < cells)).all(axis=1) & (((near - p) ** 2).sum(axis=1) < h * h)
+                place.append((cell[kept, 2] * cells[1] + cell[kept, 1]) * cells[0] + cell[kept, 0])
+                point.append(np.flatnonzero(kept))
+    place, point = np.concatenate(place), np.concatenate(point)
+    order = np.argsort(place, kind="stable")
+    first = np.searchsorted(place[order], np.arange(cells.prod() + 1))
+    return h, low, cells, mi.UInt32(first.astype(np.uint32)), mi.UInt32(point[order].astype(np.uint32))

@@ -1,0 +1,1 @@
+"""Scene files, registration of the plugins, and long renders in passes."""

@@ -1,0 +1,201 @@
+"""Renders of scenes with objects that have to be learnt first: walks until they are, and both in one image.
+
+    online.render("scene.xml", "image.exr", spp=256)
+
+Walks from the camera, exact and with light of all orders, make an image, and where they leave the object is what its
+model is learnt from, beside walks from random points. Once the error of the model is small enough, or the time for
+learning is over, the model renders, and the image is the mean of the two by their variances (`combined`).
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import zlib
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from full_geometry.integrators.bssrdf import is_bssrdf
+from full_geometry.objects.objects import outermost, translucent_shapes
+from full_geometry.scenes import reference
+from full_geometry.scenes.camera_walks import CameraWalks
+from full_geometry.scenes.combined import combined
+from full_geometry.scenes.learners import LearntObject, learner, learners
+from full_geometry.scenes.reference_store import Reference, load, save
+from full_geometry.surface.wrapped import surface_of, wrapping_of
+from halfspace_sss.checks import check_count
+from halfspace_sss.neural.store import weights_folder
+from halfspace_sss.progress import NamedProgress
+from halfspace_sss.provenance import check_folder
+
+TRAINING = "training"
+
+
+def files(path: Path) -> dict[str, Path]:
+    """Beside the image at `path`: the images by walks and by the model that it is made of, and unfinished training."""
+    return {name: path.with_suffix(f".{name}") for name in ("walks.exr", "model.exr", "training")}
+
+
+def untrained(scene: Any) -> dict[str, list[str]]:
+    """Ids of the objects that are learnt before the scene is rendered, by the name of their model.
+
+    Raises:
+        ValueError: one cannot be learnt, or there is no place for its weights.
+    """
+    if not is_bssrdf(scene.integrator()) or scene.integrator().settings.train_seconds == 0:
+        return {}
+    insides = [surface_of(shape).inside for shape in translucent_shapes(scene)]
+    names, known, results = sorted({inside.model for inside in insides}), learners(), {}
+    for name in names:
+        if name in known and (ids := known[name].untrained(scene)):
+            results[name] = ids
+    return results
+
+
+def render(
+    scene: Any,
+    path: str | os.PathLike,
+    *,
+    sensor: int = 0,
+    seed: int = 0,
+    resume: bool | str | os.PathLike = True,
+    progress: reference.Progress | None = None,
+    walked: reference.Progress | None = None,
+    learning: NamedProgress | None = None,
+    told: Callable[[str], None] | None = None,
+    **limits: Any,
+) -> Reference:
+    """`reference.render`, before which objects without weights are learnt from walks that join the image.
+
+    The limits are those of the model's image; what walks have traced comes on top. How long an object may be learnt,
+    and up to which error, the integrator says (`train_seconds`, `train_error`). Walks join the image if every
+    translucent object of the scene has a model that is learnt: others are to look as their models have it. A run that
+    was killed and goes on ends with the same weights and the same image.
+
+    Args:
+        scene: a dict, the path of an XML file, or a Mitsuba scene.
+        path: of the EXR file; while it is made, the parts are beside it, see `files`.
+        sensor: number of the sensor.
+        seed: of walks, learning and render.
+        resume: True goes on with what is at `path`, False begins anew, another path goes on with what is there.
+        progress: called after each pass of the model, with its image.
+        walked: called after each pass of walks, with theirs.
+        learning: called with (what, done, total) while an object is learnt.
+        told: called with a sentence before an object is learnt.
+        limits: as of `reference.render`: spp, passes, target_error, seconds, spp_per_pass, interval.
+
+    Returns:
+        The image; `about["combined"]` tells of the two phases, `about["training"]` of what was learnt.
+
+    Raises:
+        ValueError: as `reference.render`, or an object cannot be learnt; nothing has been traced then.
+    """
+    path = Path(path)
+    check_count("seed", seed, 0)
+    reference.Limits(*(limits.get(name) for name in ("spp", "passes", "target_error", "seconds")))
+    check_folder(path.parent)
+    scene, integrator = reference.loaded(scene, None, sensor)
+    about = reference.about_render(scene, integrator, sensor, seed)
+    parts, base = files(path), path if isinstance(resume, bool) else Path(resume)
+    if resume is False:
+        _forget(parts)
+    elif base != path:
+        _fetch(files(base), parts)
+    names = untrained(scene)
+    how = {"sensor": sensor, "seed": seed, "progress": progress, **limits}
+    if not names and not parts["walks.exr"].exists():
+        if is_bssrdf(integrator):
+            integrator.prepare(scene)  # here, because Mitsuba wraps what is refused while it renders
+        return reference.render(scene, path, resume=resume, **how)
+    walks = CameraWalks(scene, integrator.settings, sensor, seed, parts["walks.exr"], about, walked)
+    if walks.found is not None:
+        reference.check_same(walks.found, parts["walks.exr"], about)
+    if names:
+        walks.check()
+        integrator.check(scene, [name for ids in names.values() for name in ids])
+    records = _learnt(scene, walks, seed, parts["training"], learning, told or (lambda sentence: None))
+    integrator.prepare(scene)
+    if walks.found is None:
+        result = reference.render(scene, path, resume=resume, **how)
+        result = replace(result, about={**result.about, TRAINING: records})
+    else:
+        model = reference.render(scene, parts["model.exr"], **how)
+        result = combined(walks.found, model)
+        result = replace(result, about={**result.about, TRAINING: walks.found.about.get(TRAINING, [])})
+    save(path, result)
+    shutil.rmtree(parts["training"], ignore_errors=True)
+    return result
+
+
+def _learnt(
+    scene: Any, walks: CameraWalks, seed: int, work: Path, learning: NamedProgress | None, told: Callable[[str], None]
+) -> list[dict[str, Any]]:
+    """Learn one object after the other; those of the same mesh and medium share what was learnt."""
+    settings, camera, records = scene.integrator().settings, walks if _join(scene) else None, []
+    while names := untrained(scene):
+        model, (name, *_) = next(iter(names.items()))
+        if any(name == record["object"] for record in records):
+            raise ValueError(f"weights of object {name!r} must be found once they are written, got none")
+        told(_sentence(name, model, settings, camera is not None))
+        result = learner(model).train(
+            scene, object=name, seconds=settings.train_seconds, target_error=settings.train_error, seed=seed,
+            folder=None, work=work / f"{zlib.crc32(name.encode()):08x}", progress=learning, camera=camera,
+        )  # fmt: skip
+        records.append(_record(result, model))
+        if walks.found is not None:
+            known = walks.found.about.get(TRAINING, [])
+            walks.found = replace(walks.found, about={**walks.found.about, TRAINING: [*known, records[-1]]})
+            walks.save()
+    return records
+
+
+def _join(scene: Any) -> bool:
+    """Whether walks show what the models show: all objects are learnt and unmasked, and paths go past an object.
+
+    Exits on instances are of several places, and no data for learning.
+    """
+    shapes, own = outermost(scene), scene.shapes()
+    alone = all(any(shape is each for each in own) for shape in shapes)
+    around = map(wrapping_of, shapes)
+    learnt = alone and all(each.surface.inside.model in learners() and not each.mixes for each in around)
+    return scene.integrator().settings.max_depth != 1 and learnt
+
+
+def _sentence(name: str, model: str, settings: Any, joined: bool) -> str:
+    use = "which join the image" if joined else "which cannot join the image"
+    return (
+        f"object {name!r} has no weights of {model} yet: it is learnt for {settings.train_seconds:g} s, or until its "
+        f"error is below {100 * settings.train_error:g} %, from walks, {use}; then the model renders; weights are kept "
+        f"in {weights_folder()}"
+    )
+
+
+def _record(learnt: LearntObject, model: str) -> dict[str, Any]:
+    """What the header of the image tells of a training."""
+    return {
+        "object": learnt.object,
+        "model": model,
+        "weights": learnt.path.name if learnt.path else None,
+        "steps": learnt.steps,
+        "seconds": learnt.seconds,
+        "errors": [row._asdict() for row in learnt.errors],
+    }
+
+
+def _forget(parts: dict[str, Path]) -> None:
+    """Remove what a run before left."""
+    for path in parts.values():
+        if path.suffix == ".training":
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            for one in (path, path.with_suffix(".json")):
+                one.unlink(missing_ok=True)
+
+
+def _fetch(there: dict[str, Path], here: dict[str, Path]) -> None:
+    """Go on with the parts of a finished image, which stay as they are."""
+    for name in ("walks.exr", "model.exr"):
+        if there[name].exists() and not here[name].exists():
+            save(here[name], load(there[name]))

@@ -1,0 +1,58 @@
+"""Registration of the plugins with Mitsuba, once for each variant."""
+
+from __future__ import annotations
+
+import threading
+
+from full_geometry.scenes.scene_files import plainly
+from full_geometry.settings import VARIANTS, variant_channels
+from halfspace_sss.backend import BackendError, prepare_llvm, two_threads
+
+_active = False
+_lock = threading.Lock()
+
+
+def register() -> None:
+    """Register the plugins with the current variant of Mitsuba, and with every variant that is set later.
+
+    What the plugins refuse is from then on the message of the error of `mitsuba.load_dict`, `load_file`, `load_string`
+    and `render`, which without it begins with "unknown plugin" and a traceback.
+
+    Raises:
+        ValueError: no variant is set, or the plugins do not run under it (scalar or polarised ones).
+        BackendError: Mitsuba is not installed, or the LLVM that Dr.Jit found would abort the process.
+    """
+    global _active
+    try:
+        import mitsuba as mi
+    except ImportError as error:
+        raise BackendError('rendering needs Mitsuba 3: pip install "halfspace-sss[render]"') from error
+    variant_channels()
+    with _lock:
+        _register_all()
+        if not _active:
+            mi.detail.add_variant_callback(_on_variant)
+            for name in ("load_dict", "load_file", "load_string", "render"):
+                setattr(mi, name, plainly(getattr(mi, name)))
+            _active = True
+
+
+def _on_variant(old: str, new: str) -> None:
+    if new in VARIANTS:
+        _register_all()
+
+
+def _register_all() -> None:
+    import mitsuba as mi
+
+    if mi.variant().startswith("llvm"):
+        prepare_llvm()
+    two_threads()
+
+    from full_geometry.integrators.bssrdf import integrator_class
+    from full_geometry.integrators.translucent_walk import walk_integrator_class
+    from full_geometry.surface.translucent import translucent_class
+
+    mi.register_bsdf("translucent", translucent_class())
+    mi.register_integrator("bssrdf", integrator_class())
+    mi.register_integrator("translucent_walk", walk_integrator_class())

@@ -1,0 +1,310 @@
+"""Long renders in passes: they can be killed and resumed, and stop at an error, a number of passes or a time.
+
+    reference.render("scene.xml", "truth.exr", integrator={"type": "translucent_walk"}, target_error=0.01)
+    truth = reference.load("truth.exr")             # .mean, .variance, .standard_error, .about
+
+The seed of pass k depends on the seed of the run and on k only, and the size of a pass on the samples before it, so
+that a resumed run gives the same image, also one that was to have more samples from the start.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from full_geometry.geometry.identity import children, scene_hash, words
+from full_geometry.integrators.bssrdf import is_bssrdf
+from full_geometry.objects.objects import translucent_shapes
+from full_geometry.registry import AUTO
+from full_geometry.scenes.reference_store import BY_CHANCE, CHANNELS, Reference, load, save
+from full_geometry.scenes.scene_files import first_cause
+from full_geometry.surface.wrapped import surface_of
+from halfspace_sss.checks import check_count
+from halfspace_sss.locks import one_writer
+from halfspace_sss.provenance import check_folder, provenance
+
+FEWEST_PASSES = 8  # before the spread of the passes is trusted to stop a run
+SHARE = 4  # a growing pass has at most a quarter of the samples so far: enough passes for their spread, few launches
+MOST_PIXELS = 2**26  # 8192 x 8192: the numbers of the pixels alone take some 10 GB
+LARGEST_PASS = 64  # samples per pixel: an interrupt waits for one pass
+Progress = Callable[[Reference], None]
+
+
+def render(
+    scene: Any,
+    path: str | os.PathLike,
+    *,
+    integrator: dict | None = None,
+    sensor: int = 0,
+    spp_per_pass: int | None = None,
+    seed: int = 0,
+    spp: int | None = None,
+    passes: int | None = None,
+    target_error: float | None = None,
+    seconds: float | None = None,
+    interval: float = 30.0,
+    resume: bool | str | os.PathLike = True,
+    progress: Progress | None = None,
+) -> Reference:
+    """Render a scene in passes into an EXR file, or go on with the file that is there.
+
+    The run ends as soon as one of `spp`, `passes`, `target_error` and `seconds` is reached; all count what the file
+    holds already. Under an interrupt or an error the passes so far are kept.
+
+    Args:
+        scene: a dict, the path of an XML file, or a Mitsuba scene.
+        path: of the EXR file; a JSON file beside it repeats its header.
+        integrator: dict of the integrator; by default that of the scene.
+        sensor: number of the sensor.
+        spp_per_pass: samples per pixel of a pass; by default passes grow with what is there, from 1 to 64. The last
+            one is cut to `spp`.
+        seed: of the run.
+        spp: samples per pixel in all.
+        passes: number of passes in all.
+        target_error: `Reference.relative_error` to come down to; looked at from the 8th pass on.
+        seconds: of rendering in all.
+        interval: seconds between writes of the file; 0 writes after every pass.
+        resume: True goes on with the file at `path` if there is one, False begins anew, another path goes on with the
+            file there and leaves it as it is.
+        progress: called after each pass.
+
+    Raises:
+        ValueError: an argument is out of range, the file is damaged, of another render or written by another run, or a
+            pass has values that are not finite.
+    """
+    limits = Limits(spp, passes, target_error, seconds)
+    _check(spp_per_pass, seed, interval)
+    path = Path(path)
+    if path.suffix.lower() != ".exr":
+        raise ValueError(f"path must end in .exr, got {str(path)!r}")
+    check_folder(path.parent)
+    scene, integrator = loaded(scene, integrator, sensor)
+    with one_writer(path):
+        return _in_passes(scene, path, integrator, sensor, seed, limits, spp_per_pass, interval, resume, progress)
+
+
+def _in_passes(
+    scene: mi.Scene, path: Path, integrator: mi.Integrator, sensor: int, seed: int, limits: Limits,
+    spp_per_pass: int | None, interval: float, resume: bool | str | os.PathLike, progress: Progress | None,
+) -> Reference:  # fmt: skip
+    """See `render`."""
+    about = about_render(scene, integrator, sensor, seed) | chosen(scene, integrator)
+    about["learnt"] = learnt(scene, integrator)
+    result = _start(path, resume, about)
+    written = result if resume is True else None
+    last = time.monotonic()
+    try:
+        while not limits.reached(result):
+            result = _pass(result, scene, integrator, sensor, about, _pass_spp(result, spp_per_pass, limits.spp))
+            if time.monotonic() - last >= interval:
+                _keep(path, result)
+                written, last = result, time.monotonic()
+            if progress is not None:
+                progress(result)
+    finally:
+        if result is not None and result is not written:
+            _keep(path, result)
+    return result
+
+
+def _keep(path: Path, reference: Reference) -> None:
+    """Save, also if an interrupt comes in the middle of it."""
+    try:
+        save(path, reference)
+    except KeyboardInterrupt:
+        save(path, reference)
+        raise
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What ends a run: samples per pixel, passes, relative error, seconds, whichever comes first; None is no limit."""
+
+    spp: int | None
+    passes: int | None
+    target_error: float | None
+    seconds: float | None
+
+    def __post_init__(self) -> None:
+        if all(value is None for value in vars(self).values()):
+            raise ValueError(f"one of {', '.join(vars(self))} must be given, got none")
+        for name in ("spp", "passes"):
+            if getattr(self, name) is not None:
+                check_count(name, getattr(self, name), 1)
+        for name in ("target_error", "seconds"):
+            value = getattr(self, name)
+            if value is not None and not (math.isfinite(value) and value > 0):
+                raise ValueError(f"{name} must be finite and > 0, got {value!r}")
+
+    def reached(self, reference: Reference | None) -> bool:
+        if reference is None:
+            return False
+        trusted = reference.passes >= FEWEST_PASSES
+        pairs = ((self.spp, reference.spp), (self.passes, reference.passes), (self.seconds, reference.seconds))
+        certain = self.target_error is not None and trusted and reference.relative_error <= self.target_error
+        return certain or any(limit is not None and value >= limit for limit, value in pairs)
+
+    def share(self, reference: Reference) -> float:
+        """Of the work that is done, 0 to 1."""
+        pairs = ((reference.spp, self.spp), (reference.passes, self.passes), (reference.seconds, self.seconds))
+        shares = [value / limit for value, limit in pairs if limit is not None]
+        if self.target_error is not None and reference.passes > 1:
+            error = reference.relative_error
+            shares.append((self.target_error / error) ** 2 if error > self.target_error else 1.0)
+        return min(max(shares, default=0.0), 1.0)
+
+
+def _pass_spp(reference: Reference | None, fixed: int | None, most: int | None) -> int:
+    """Samples per pixel of the next pass; a power of two where it grows, for Mitsuba compiles others anew."""
+    done = reference.spp if reference else 0
+    size = fixed or min(2 ** (max(done // SHARE, 1).bit_length() - 1), LARGEST_PASS)
+    return size if most is None else min(size, most - done)
+
+
+def _pass(reference: Reference | None, scene: Any, integrator: Any, sensor: int, about: dict, spp: int) -> Reference:
+    """One more pass."""
+    number = reference.passes if reference else 0
+    started = time.perf_counter()
+    seed = int(np.random.SeedSequence([about["seed"], number]).generate_state(1)[0])
+    image = mi.render(scene, sensor=sensor, integrator=integrator, seed=seed, spp=spp)
+    image = np.array(image, dtype=np.float32)
+    image = image[..., None] if image.ndim == 2 else image
+    if not np.isfinite(image).all():
+        bad = int((~np.isfinite(image)).any(axis=2).sum())
+        raise ValueError(f"pass {number} must be finite, got {bad} pixels that are not")
+    if reference is None and (names := channel_names(scene.sensors()[sensor].film(), integrator, image.shape[2])):
+        about = {**about, CHANNELS: names}
+    start = reference or Reference(np.zeros(image.shape), np.zeros(image.shape), 0, 0, 0.0, about)
+    result = start.add(image, spp, time.perf_counter() - started)
+    if not is_bssrdf(integrator) or mi.is_spectral:
+        return result
+    squares = float(f"{start.about.get(BY_CHANCE, 0.0) + integrator.by_chance:.6g}")
+    return replace(result, about={**result.about, BY_CHANCE: squares})
+
+
+def channel_names(film: mi.Film, integrator: mi.Integrator, channels: int) -> list[str]:
+    """What the channels of an image that `integrator` rendered to a film show; none of an image of colours alone.
+
+    The integrator `aov` gives the images of those inside it, each with the colours of the film, then its own
+    quantities, such as albedo.R; its film has four colours of each.
+    """
+    of_film, more = [channel.name for channel in film.bitmap().struct_()], integrator.aov_names()
+    colours, inner = of_film[: len(of_film) - len(more)], []
+    for name in more:
+        parts = [name[:-1] + colour for colour in "RGBA"]
+        inner += [name[:-2]] if name.endswith(".R") and set(parts) <= set(more) else []
+    own = [name for name in more if name[:-2] not in inner]
+    of_inner = [f"{name}.{colour}" if k else colour for k, name in enumerate(inner) for colour in colours]
+    known = (of_film, of_inner + own) if more else ()
+    return next((names for names in known if len(names) == channels), [])
+
+
+def _check(spp_per_pass: int | None, seed: int, interval: float) -> None:
+    if spp_per_pass is not None:
+        check_count("spp_per_pass", spp_per_pass, 1)
+    check_count("seed", seed, 0)
+    if not interval >= 0:
+        raise ValueError(f"interval must be >= 0, got {interval!r}")
+
+
+def loaded(scene: Any, integrator: dict | None, sensor: int) -> tuple[Any, Any]:
+    """The scene and its integrator as Mitsuba objects; errors as of `render`."""
+    if isinstance(scene, (str, os.PathLike)) and not Path(scene).is_file():
+        raise ValueError(f"scene must be a dict, a Mitsuba scene or a file, got {os.fspath(scene)!r}")
+    try:
+        if isinstance(scene, dict):
+            scene = mi.load_dict(scene, parallel=False)
+        elif isinstance(scene, (str, os.PathLike)):
+            scene = mi.load_file(os.fspath(scene), parallel=False)
+        integrator = mi.load_dict(integrator) if integrator is not None else scene.integrator()
+    except RuntimeError as error:
+        raise ValueError(first_cause(error)) from error
+    if integrator is None:
+        raise ValueError("integrator must be given, for the scene has none")
+    check_sensor(scene, sensor)
+    return scene, integrator
+
+
+def check_sensor(scene: Any, sensor: int) -> None:
+    """ValueError unless there is such a sensor, with a film that has pixels and fits into memory."""
+    n = len(scene.sensors())
+    if n == 0:
+        raise ValueError("the scene must have a sensor, got none")
+    check_count("sensor", sensor, 0)
+    if sensor >= n:
+        raise ValueError(f"sensor must be below {n}, the number of sensors of the scene, got {sensor}")
+    width, height = (int(size) for size in scene.sensors()[sensor].film().crop_size())
+    if not 0 < width * height <= MOST_PIXELS:
+        raise ValueError(f"a film must have 1 to {MOST_PIXELS} pixels, got {width} x {height}")
+
+
+def about_render(scene: Any, integrator: Any, sensor: int, seed: int) -> dict[str, Any]:
+    """What tells one render from another, with its provenance."""
+    about = {
+        "scene": scene_hash(scene, integrator),
+        "integrator": words(integrator),
+        "sensor": sensor,
+        "seed": int(seed),
+        "variant": mi.variant(),
+    }
+    return {**about, "provenance": provenance(**about)}
+
+
+def chosen(scene: Any, integrator: Any) -> dict[str, Any]:
+    """What was chosen for "auto" and why; it is chosen now if it has not been."""
+    if not is_bssrdf(integrator):
+        return {}
+    models = [surface.inside.model for surface in map(surface_of, translucent_shapes(scene))]
+    if AUTO not in (integrator.settings.model, integrator.settings.light, *models):
+        return {}
+    integrator.prepare(scene)
+    result = integrator.choices
+    return {"choices": result.sentences, "chosen": [result.light, *result.models.values()]}
+
+
+def _start(path: Path, resume: bool | str | os.PathLike, about: dict[str, Any]) -> Reference | None:
+    """What to go on with, if anything.
+
+    Raises:
+        ValueError: it is damaged or of another render.
+    """
+    if resume is False or (resume is True and not path.exists()):
+        return None
+    path = path if resume is True else Path(resume)
+    result = load(path)
+    check_same(result, path, about)
+    return result
+
+
+def check_same(reference: Reference, path: Path, about: dict[str, Any]) -> None:
+    """ValueError if an image of a file is of another render, so that it cannot be gone on with."""
+    for key in ("scene", "integrator", "sensor", "seed", "variant", "learnt", "chosen"):
+        there, here = reference.about.get(key, []), about.get(key, [])
+        if there != here:
+            raise ValueError(
+                f"{path} must be of the same render to go on with it: {key} is {there!r} there and {here!r} here; "
+                "choose another file or delete it"
+            )
+    versions = [p["provenance"]["versions"] for p in (reference.about, about)]
+    if versions[0] != versions[1]:
+        raise ValueError(f"{path} must be of the same versions to go on with it, got {versions[0]} and {versions[1]}")
+
+
+def learnt(scene: Any, integrator: Any) -> list[str]:
+    """Checksums of what the models of the objects have learnt, for an integrator that asks them, or holds one.
+
+    The same scene is another render after a training.
+    """
+    if is_bssrdf(integrator):
+        objects = (obj.gathered.object if obj.gathered else obj for obj in integrator.prepare(scene))
+        transports = (obj.transport for obj in objects if obj.transport is not None)
+        return sorted({checksum for transport in transports for checksum in transport.checksums})
+    return [checksum for inner in children(integrator) for checksum in learnt(scene, inner)]

@@ -1,0 +1,292 @@
+"""Scenes from dicts and XML files, with model, orders and integrator replaced where asked for.
+
+What Mitsuba raises is brought down to its first cause: errors of plugins come wrapped, with tracebacks inside.
+"""
+
+from __future__ import annotations
+
+import difflib
+import functools
+import re
+import warnings
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+
+from full_geometry.integrators.bssrdf import is_bssrdf
+from full_geometry.registry import PATH_TRACED, lookup, model_names
+from full_geometry.settings import LIGHTS, ORDERS, SHARED, WALK_LIGHTS
+from full_geometry.surface.wrapped import surface_of
+from halfspace_sss.interrupts import is_interrupt
+
+_HERE = str(Path(__file__).parents[3])
+
+_PLACE = re.compile(r"(?:At|While loading) (?:dictionary node )?(.+? \(line \d+, col \d+\)|\S+): ")
+_SOURCE = re.compile(r"^\[[\w.]+:\d+\] ")
+_PLUGIN = re.compile(r'failed to instantiate \w+ plugin of type "[^"]*": ')
+_RAISED = re.compile(r"^(?:[\w.]*\.)?(\w+): (.*)", re.MULTILINE | re.DOTALL)
+_EMPTY = re.compile(r'shape plugin of type "\w+": .*operands have incompatible sizes! \(sizes: 0,')
+_TRACEBACK = "Traceback (most recent call last):"
+
+
+def first_cause(error: BaseException) -> str:
+    """One line: where in the scene file, if that is told, and what was wrong there first."""
+    while error.__cause__ is not None or error.__context__ is not None:
+        error = error.__cause__ or error.__context__
+    text = str(error)
+    place = _PLACE.search(text)
+    if _EMPTY.search(text):
+        text = "a mesh must have faces, got none"
+    elif _TRACEBACK in text:
+        frames = text[text.rindex(_TRACEBACK) :].splitlines()[1:]
+        said = next((k for k, line in enumerate(frames) if line[:1].strip()), len(frames))  # frames are indented
+        raised = _RAISED.match("\n".join(frames[said:]).strip())
+        text = raised[2] if raised else "\n".join(frames[said:])
+    else:
+        text = _PLUGIN.sub("", _PLACE.sub("", _SOURCE.sub("", text)))
+        text = _SOURCE.sub("", text)
+    line = " ".join(text.split()) or type(error).__name__
+    return f"{place[1]}: {line}" if place and place[1] != '"root"' else line
+
+
+class SceneError(ValueError, RuntimeError):
+    """What a plugin of this project refuses, in place of the RuntimeError by which Mitsuba hands that on."""
+
+
+def plainly(function: Callable) -> Callable:
+    """A function of Mitsuba whose errors say first what a plugin of this project refused, as a `SceneError`.
+
+    An interrupt that Dr.Jit has wrapped is a KeyboardInterrupt again.
+    """
+
+    @functools.wraps(function)
+    def found(*args: Any, **more: Any) -> Any:
+        try:
+            return function(*args, **more)
+        except RuntimeError as error:
+            if is_interrupt(error):
+                end: BaseException = KeyboardInterrupt()
+            elif _is_ours(error):
+                end = SceneError(first_cause(error))
+            else:
+                raise
+        raise end
+
+    found.__wrapped__ = function
+    return found
+
+
+def _is_ours(error: BaseException) -> bool:
+    """Whether a plugin of this project raised a ValueError: by the files of its traceback, or of that in the text.
+
+    A mesh without faces counts too: what Mitsuba says of it says nothing.
+    """
+    while error.__cause__ is not None or error.__context__ is not None:
+        error = error.__cause__ or error.__context__
+    if isinstance(error, ValueError):
+        files, place = [], error.__traceback__
+        while place is not None:
+            files.append(place.tb_frame.f_code.co_filename)
+            place = place.tb_next
+        return bool(files) and files[-1].startswith(_HERE)
+    text = str(error)
+    if _EMPTY.search(text):
+        return True
+    return _TRACEBACK in text and "ValueError: " in text and _HERE in text[text.rindex(_TRACEBACK) :]
+
+
+_INTEGRATORS = {False: "bssrdf", True: "translucent_walk"}
+_NO_OBJECT = "the scene must have an object with a translucent BSDF, got none"
+
+
+def load_scene(
+    scene: dict | str | Path,
+    model: str | None = None,
+    orders: str | None = None,
+    parameters: Mapping[str, str] | None = None,
+    settings: Mapping[str, float] | None = None,
+) -> Any:
+    """A Mitsuba scene with translucent objects, ready to be rendered: objects without weights are learnt here.
+
+    Where model or orders are asked for and the integrator of the scene shows no light from inside, ours takes its
+    place, with its mm_per_unit, max_depth, rr_depth and hide_emitters; a warning says so. A scene without integrator
+    gets ours.
+
+    Args:
+        scene: a dict as for `mitsuba.load_dict`, or the path of an XML file.
+        model: for all translucent objects, instead of what the scene says: the name of a model, or "path_traced",
+            which walks through the objects instead.
+        orders: of all translucent objects, instead of what the scene says.
+        parameters: values of the parameters $name of an XML file.
+        settings: parameters of the integrator, instead of what the scene says; each takes those that it knows.
+
+    Raises:
+        ValueError: no such file, parameter, model or orders, the file is no scene, a plugin refuses what it is given,
+            there is no translucent object, or the integrator refuses the scene.
+    """
+    loaded = open_scene(scene, model, orders, parameters, settings)
+    integrator = loaded.integrator()
+    if is_bssrdf(integrator):
+        integrator.prepare(loaded)  # here, because Mitsuba wraps what is refused while it renders
+    return loaded
+
+
+def open_scene(
+    scene: dict | str | Path,
+    model: str | None = None,
+    orders: str | None = None,
+    parameters: Mapping[str, str] | None = None,
+    settings: Mapping[str, float] | None = None,
+    floats: bool = False,
+) -> Any:
+    """As `load_scene`, but nothing is prepared yet: no model is made, and no object is learnt.
+
+    With `floats`, texels of bitmaps are floats, which can be changed by any amount, whatever their files have.
+    """
+    _check("model", model, (*model_names(), PATH_TRACED))
+    _check("orders", orders, ORDERS)
+    light = (settings or {}).get("light")
+    walks = model == PATH_TRACED
+    known = WALK_LIGHTS if walks else LIGHTS if model else tuple(dict.fromkeys((*LIGHTS, *WALK_LIGHTS)))
+    _check("light", light, known)
+    state, config = _parsed(scene, parameters or {})
+    # a model that knows whole objects does not know what Mitsuba makes of several with the same BSDF
+    names = [str(props.get("model", "")) for props in _surfaces(state)]
+    config.merge_meshes = not any(
+        name in model_names() and lookup(name).knows_objects for name in (*names, "" if walks else model)
+    )
+    _transform(scene, state, config)
+    for props in _surfaces(state):  # anew: the nodes have moved
+        if model and not walks:
+            props["model"] = model
+        if orders:
+            props["orders"] = orders
+    _choose_integrator(state, walks, (bool(model), bool(model or orders)), settings or {})
+    for plugin, given in zip(_INTEGRATORS.values(), _settings(settings or {})):
+        _set_parameters(state, plugin, given)
+    _set_parameters(state, "bitmap", {"format": "variant"} if floats else {})
+    loaded = _made(scene, state, config)
+    if not any(map(surface_of, loaded.shapes())):
+        raise ValueError(_NO_OBJECT)
+    return loaded
+
+
+def _set_parameters(state: Any, plugin: str, settings: Mapping[str, float | str]) -> None:
+    for node in state.nodes if settings else ():
+        if node.props.plugin_name() == plugin:
+            for key, value in settings.items():
+                node.props[key] = value
+
+
+def _settings(settings: Mapping[str, float]) -> tuple[dict, dict]:
+    """What `bssrdf` is told, and `translucent_walk`."""
+    walk = {key: settings[key] for key in ("light", "layers") if key in settings}
+    return {key: value for key, value in settings.items() if key != "layers"}, walk
+
+
+def load_objects(scene: dict | str | Path, parameters: Mapping[str, str] | None = None) -> Any:
+    """A Mitsuba scene whose objects are looked at one by one: none is merged with another, and no model is made.
+
+    Args:
+        scene: a dict as for `mitsuba.load_dict`, or the path of an XML file.
+        parameters: values of the parameters $name of an XML file.
+
+    Raises:
+        ValueError: no such file or parameter, the file is no scene, a plugin refuses what it is given, or there is no
+            translucent object.
+    """
+    state, config = _parsed(scene, parameters or {})
+    _surfaces(state)
+    config.merge_meshes = False
+    _transform(scene, state, config)
+    return _made(scene, state, config)
+
+
+def _check(name: str, value: str | None, known: tuple[str, ...]) -> None:
+    if value is not None and value not in known:
+        close = difflib.get_close_matches(value, known, n=1)
+        hint = f"; did you mean {close[0]!r}?" if close else ""
+        raise ValueError(f"{name} must be one of {', '.join(known)}, got {value!r}{hint}")
+
+
+def _surfaces(state: Any) -> list[Any]:
+    """The parameters of all translucent surfaces."""
+    results = [node.props for node in state.nodes if node.props.plugin_name() == "translucent"]
+    if not results:
+        raise ValueError(_NO_OBJECT)
+    return results
+
+
+def _made(scene: dict | str | Path, state: Any, config: Any) -> Any:
+    """The scene; files that an XML file names are looked for beside it first."""
+    before, here = mi.file_resolver(), mi.FileResolver(mi.file_resolver())
+    if not isinstance(scene, dict):
+        here.prepend(str(Path(scene).resolve().parent))
+    mi.set_file_resolver(here)
+    try:
+        return mi.parser.instantiate(config, state)
+    except RuntimeError as error:
+        raise ValueError(first_cause(error)) from error
+    finally:
+        mi.set_file_resolver(before)
+
+
+def _parsed(scene: dict | str | Path, parameters: Mapping[str, str]) -> tuple[Any, Any]:
+    config = mi.parser.ParserConfig(mi.variant())
+    config.parallel = False  # objects then have the same numbers each time, and kernels are found in Dr.Jit's cache
+    if not isinstance(scene, dict) and not Path(scene).is_file():
+        raise ValueError(f"scene must be an XML file, got {str(scene)!r}, which is none")
+    try:
+        if isinstance(scene, dict):
+            state = mi.parser.parse_dict(config, scene)
+        else:
+            state = mi.parser.parse_file(config, str(scene), **parameters)
+    except RuntimeError as error:
+        raise _unreadable(scene, error) from error
+    return state, config
+
+
+def _transform(scene: dict | str | Path, state: Any, config: Any) -> None:
+    try:
+        mi.parser.transform_all(config, state)
+    except RuntimeError as error:
+        raise _unreadable(scene, error) from error
+
+
+def _unreadable(scene: dict | str | Path, error: RuntimeError) -> ValueError:
+    name = "scene" if isinstance(scene, dict) else f"scene {str(scene)!r}"
+    return ValueError(f"{name} cannot be read: {first_cause(error)}")
+
+
+def _choose_integrator(state: Any, walks: bool, asked: tuple[bool, bool], settings: Mapping[str, float]) -> None:
+    """Make the integrator fit: whether a model, or anything, is asked for; one that is made gets the settings."""
+    wanted, (model, anything) = _INTEGRATORS[walks], asked
+    ours = [node.props for node in state.nodes if node.props.plugin_name() in _INTEGRATORS.values()]
+    for props in ours if model else ():
+        _set_integrator(props, wanted)
+    if ours:
+        return
+    others = [node.props for node in state.nodes if node.type == mi.ObjectType.Integrator]
+    if not others:
+        state.nodes[0].props["integrator"] = mi.load_dict({"type": wanted, **_settings(settings)[walks]})
+    elif anything:
+        name = others[0].plugin_name()
+        warnings.warn(f"the integrator {name!r} of the scene is replaced by {wanted!r}", stacklevel=3)
+        _set_integrator(others[0], wanted)
+    else:
+        warnings.warn(
+            f"the integrator {others[0].plugin_name()!r} of the scene shows no light from inside translucent objects; "
+            "'bssrdf' and 'translucent_walk' do, which a model that is asked for brings along",
+            stacklevel=3,
+        )
+
+
+def _set_integrator(props: Any, plugin: str) -> None:
+    if props.plugin_name() == plugin:
+        return
+    props.set_plugin_name(plugin)
+    for key in list(props.keys()):
+        if key not in SHARED:
+            del props[key]

@@ -1,0 +1,129 @@
+"""What the user may set on the integrator, checked before a scene is touched."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from typing import Any
+
+from halfspace_sss.checks import check_choice, check_interval
+
+AUTOMATIC = -1.0
+ORDERS = ("total", "multiple", "single")
+GEOMETRIES = ("distance", "tangent")
+LIGHTS = ("sampled", "gathered", "auto")
+WALK_LIGHTS = ("auto", "precomputed", "sampled")  # of `translucent_walk`
+SHARED = ("mm_per_unit", "max_depth", "rr_depth", "hide_emitters")  # what `translucent_walk` understands too
+OF_MODELS = ("geometry", "area_share", "entries")
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Parameters of the integrator `bssrdf`.
+
+    Args:
+        mm_per_unit: millimetres in one unit of the scene.
+        max_depth: vertices of a path after the camera, an entry and its exit counting as one; -1 for no limit.
+        rr_depth: vertices after which Russian roulette begins.
+        geometry: "distance" or "tangent", see `points.separation`.
+        area_share: share of the candidates for an entry that are drawn uniformly over the area, the others by a probe
+            near the exit, 0 to 1; AUTOMATIC chooses by the ratio of the distance that light travels to the size of the
+            object.
+        entries: points of entry that an exit draws, of which one is followed, chosen by what it may bring; AUTOMATIC
+            leaves it to the model.
+        light: "sampled", without bias; "gathered" once for all samples, see `integrators.gathering`: scattered light
+            has a little bias and no noise; or "auto", the cheaper of both that keeps the tolerance, by measurement.
+        hide_emitters: whether directly visible emitters are left out.
+        train_seconds: time for each object whose model has to learn it first; 0 refuses objects without weights.
+        train_error: relative error under constant light, measured on the way, from which on it has learnt enough.
+        tolerance: relative error of the radiance of an object that its model "auto" keeps, if one does.
+        choice_share: of the samples of the first sensor's image, that the choice of "auto" may take; see
+            `trade.automatic`.
+        model, orders: of all objects, instead of what their surfaces say, where they are given.
+    """
+
+    mm_per_unit: float = 1.0
+    max_depth: int = 8
+    rr_depth: int = 5
+    geometry: str = "distance"
+    area_share: float = AUTOMATIC
+    entries: int = int(AUTOMATIC)
+    hide_emitters: bool = False
+    light: str = "sampled"
+    train_seconds: float = 60.0
+    train_error: float = 0.03
+    tolerance: float = 0.05
+    choice_share: float = 0.1
+    model: str = ""
+    orders: str = ""
+
+    def __post_init__(self) -> None:
+        check_interval("mm_per_unit", self.mm_per_unit, 1e-9, 1e9)
+        check_interval("tolerance", self.tolerance, 1e-4, 10.0)
+        check_interval("choice_share", self.choice_share, 0.0, 1.0)
+        if self.max_depth < -1 or self.max_depth == 0:
+            raise ValueError(f"max_depth must be -1 or at least 1, got {self.max_depth}")
+        if self.rr_depth < 1:
+            raise ValueError(f"rr_depth must be at least 1, got {self.rr_depth}")
+        if self.entries < 1 and self.entries != AUTOMATIC:
+            raise ValueError(f"entries must be at least 1, got {self.entries}")
+        check_choice("light", self.light, LIGHTS)
+        check_choice("orders", self.orders, ("", *ORDERS))
+        if self.geometry not in GEOMETRIES:
+            raise ValueError(f"geometry must be one of {', '.join(GEOMETRIES)}, got {self.geometry!r}")
+        if self.area_share != AUTOMATIC:
+            check_interval("area_share", self.area_share, 0.0, 1.0)
+        check_interval("train_seconds", self.train_seconds, 0.0, 1e7)
+        check_interval("train_error", self.train_error, 1e-4, 1.0)
+
+    def shared(self) -> dict[str, Any]:
+        """What `translucent_walk` understands too."""
+        return {name: getattr(self, name) for name in SHARED}
+
+    def of_models(self) -> dict[str, Any]:
+        """How models are laid on and sampled; what is automatic is left to them."""
+        given = {name: getattr(self, name) for name in OF_MODELS}
+        given = {name: value for name, value in given.items() if value != AUTOMATIC}
+        return given | ({"orders": self.orders} if self.orders else {})
+
+
+def read_settings(props: Any) -> Settings:
+    """Settings from the parameters of the plugin; ValueError if one is unknown or out of range."""
+    check_parameters("bssrdf", props, (*Settings.__dataclass_fields__, *OF_MITSUBA))
+    given = {key: props[key] for key in Settings.__dataclass_fields__ if key in props}
+    return Settings(**given)
+
+
+# --------------------------------------------------------------------------------------------------
+# The variants of Mitsuba under which the plugins run.
+
+
+CHANNELS = {"rgb": 3, "mono": 1, "spectral": 4}
+VARIANTS = tuple(f"{backend}_ad_{kind}" for kind in CHANNELS for backend in ("llvm", "cuda"))
+
+
+def variant_channels() -> int:
+    """3 under an RGB variant of Mitsuba, 1 under a mono one, 4 wavelengths under a spectral one.
+
+    Raises:
+        ValueError: no variant is set, or another kind is.
+    """
+    import mitsuba as mi
+
+    variant = mi.variant()
+    if variant not in VARIANTS:
+        raise ValueError(f"variant must be llvm_ad_ or cuda_ad_ with rgb, mono or spectral, got {variant!r}")
+    return CHANNELS[variant.rpartition("_")[2]]
+
+
+# --------------------------------------------------------------------------------------------------
+# The names of parameters that plugins take: one that none takes is refused.
+
+
+OF_MITSUBA = ("block_size", "samples_per_pass", "timeout")  # of its `SamplingIntegrator`; launches are ours
+
+
+def check_parameters(plugin: str, props: Any, known: Collection[str]) -> None:
+    """ValueError names the first parameter of a plugin that it does not know."""
+    for key in props.keys():
+        check_choice(f"parameter of {plugin}", key, known)

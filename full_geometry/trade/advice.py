@@ -1,0 +1,275 @@
+"""The cheapest way that keeps a tolerance for a whole job, and why not the others.
+
+With the bias b of a way, its variance V of a sample and its seconds t for one, a job of images with n pixels of the
+object each takes, until bias and noise together are at the tolerance e,
+
+    T = training + preparation + images n t V / (e² - b²),
+
+and a way with b >= e never gets there. With standard errors s of b² and v of V, and x = 1 / samples, b² + V x is taken
+a standard error above what was measured, b² + V x + sqrt(s² + v² x²). Biases of models are spread over decades, so that
+few lie where that errs: see docs/measurements.md.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+from full_geometry.scenes.scene_files import PATH_TRACED
+from full_geometry.trade.assessing import assess
+from full_geometry.trade.results import UNNAMED, Assessment, ObjectTrade, WayTrade, html_table, samples_for
+from full_geometry.trade.ways import GATHERED, LAMBERT, Way
+from halfspace_sss.checks import check_count, check_interval
+from halfspace_sss.noise_free import short
+from halfspace_sss.physics.medium import Medium
+
+INTEGRATOR = "bssrdf"
+DARK = "no light comes from it, every way shows it black"
+
+
+@dataclass(frozen=True)
+class Job:
+    """What is to be rendered.
+
+    Args:
+        tolerance: relative error of radiance, bias and noise together.
+        images: of the object, each as large as the film.
+        seconds: that all of them may take; None for no limit.
+        count_training: whether the time of a training that has been done counts too.
+    """
+
+    tolerance: float = 0.05
+    images: int = 1
+    seconds: float | None = None
+    count_training: bool = True
+
+    def __post_init__(self) -> None:
+        check_interval("tolerance", self.tolerance, 1e-4, 10.0)
+        check_count("images", self.images, 1)
+        if self.seconds is not None:
+            check_interval("seconds", self.seconds, 1e-3, 1e9)
+
+
+@dataclass(frozen=True)
+class Option:
+    """A way for a job: seconds and samples for each pixel, the error then, and one sentence that says why or why not.
+
+    A way that never keeps the tolerance has infinite seconds; `error` is then its bias.
+    """
+
+    way: str
+    seconds: float
+    spp: int
+    error: float
+    why: str
+
+
+@dataclass(frozen=True)
+class ObjectAdvice:
+    """The way for one object; None where nothing can be told. `options` has all of them, the chosen one first."""
+
+    object: str
+    way: str | None
+    options: tuple[Option, ...]
+
+    def __str__(self) -> str:
+        return "\n".join(f"{self.object or UNNAMED}: {option.why}" for option in self.options)
+
+
+@dataclass(frozen=True, repr=False)
+class Advice:
+    """The ways for a scene.
+
+    Attributes:
+        objects: for each object alone.
+        integrator: "path_traced", "bssrdf" or "bssrdf, gathered", which serves all objects at once in the least time.
+        seconds: that it takes.
+        assessment: what this rests on.
+        tolerance: that was asked.
+    """
+
+    objects: tuple[ObjectAdvice, ...]
+    integrator: str
+    seconds: float
+    assessment: Assessment
+    tolerance: float
+
+    def __repr__(self) -> str:
+        ways = ", ".join(f"{each.object or UNNAMED}: {each.way}" for each in self.objects)
+        return f"<{self.integrator} for a tolerance of {self.tolerance:.3g}; {ways}>"
+
+    def _repr_html_(self) -> str:
+        return html_table(("object", "way", "error", "seconds", ""), [
+            (each.object, o.way, f"{o.error:.3g}", f"{o.seconds:.3g}", o.why)
+            for each in self.objects for o in each.options
+        ])  # fmt: skip
+
+    def __str__(self) -> str:
+        text = [str(each) for each in self.objects]
+        if len(self.objects) > 1:
+            text.append(f"all objects together: {self.integrator}, {_time(self.seconds)}")
+        return "\n".join(text)
+
+
+def recommend(
+    scene: Any = None,
+    *,
+    medium: Medium | None = None,
+    r: tuple[float, float] | None = None,
+    tolerance: float = 0.05,
+    images: int = 1,
+    seconds: float | None = None,
+    count_training: bool = True,
+    seed: int = 0,
+    **assessing: Any,
+) -> Any:
+    """The cheapest way of rendering a scene that keeps a tolerance, with a sentence on every other one.
+
+    Args:
+        scene: as in `assess`, or an `Assessment` that has been made.
+        medium: instead of a scene: the model of the half-space for curves, see `flat.recommend_flat`.
+        r: smallest and largest distance of a medium, mm.
+        tolerance: relative error of radiance over the visible points of an object, bias and noise together.
+        images: how many are to be rendered; preparation and training count once.
+        seconds: that the whole job may take; if no way keeps the tolerance then, that with the least error is named.
+        count_training: whether the time of a training that has been done counts too.
+        seed: of the assessment.
+        assessing: what else `assess` takes; its `seconds` is called `assess_seconds` here.
+
+    Raises:
+        ValueError: an argument is out of range, scene and medium are both given or neither is, or the scene cannot be
+            rendered.
+    """
+    job = Job(tolerance, images, seconds, count_training)
+    if (scene is None) == (medium is None):
+        raise ValueError("one of scene and medium must be given, got both" if medium else "a scene must be given")
+    if medium is not None:
+        from full_geometry.trade.flat import recommend_flat
+
+        return recommend_flat(medium, r, tolerance=tolerance, seed=seed, **assessing)
+    if r is not None:
+        raise ValueError(f"r must be left out with a scene, got {r!r}")
+    if isinstance(scene, Assessment):
+        return advise(scene, job)
+    if "assess_seconds" in assessing:
+        assessing["seconds"] = assessing.pop("assess_seconds")
+    how = {"flip": False, "tolerance": tolerance, "images": images, "count_training": count_training, **assessing}
+    return advise(assess(scene, seed=seed, **how), job)
+
+
+def advise(assessment: Assessment, job: Job) -> Advice:
+    """The ways for a job, from what has been measured."""
+    objects = tuple(_object(o, job) for o in assessment.objects)
+    told = [o for o in objects if o.way is not None]
+    kinds = (INTEGRATOR, f"{INTEGRATOR}, {GATHERED}", PATH_TRACED)
+    times = {kind: sum(_best(o, kind) for o in told) for kind in kinds}
+    integrator = min(times, key=lambda kind: times[kind])
+    return Advice(objects, integrator, times[integrator], assessment, job.tolerance)
+
+
+def _best(advice: ObjectAdvice, kind: str) -> float:
+    """Least seconds of an object by an integrator; what does not spread is the same in both kinds of light."""
+    served = {
+        way: (way == PATH_TRACED) == (kind == PATH_TRACED)
+        and (way == LAMBERT or way.endswith(GATHERED) == kind.endswith(GATHERED))
+        for way in (o.way for o in advice.options)
+    }
+    return min((o.seconds for o in advice.options if served[o.way]), default=math.inf)
+
+
+def _object(assessed: ObjectTrade, job: Job) -> ObjectAdvice:
+    if not assessed.ways:
+        return ObjectAdvice(assessed.object, None, (Option("", math.inf, 0, math.nan, "; ".join(assessed.notes)),))
+    rows = [row for row in assessed.ways if not row.refusal]
+    if assessed.is_dark:
+        rows = sorted(rows, key=lambda row: row.seconds)
+        dark = tuple(Option(w.way, w.preparation, 1, 0.0, f"{w.way}: {DARK}") for w in rows)
+        return ObjectAdvice(assessed.object, dark[0].way, dark)
+    options = [_option(assessed, row, job) for row in rows]
+    allowed = [o for o in options if o[0] <= (job.seconds or math.inf)]
+    if allowed and min(allowed)[0] < math.inf:
+        best = min(allowed, key=lambda o: o[0])
+        told = [_told(assessed, o, best, job) for o in sorted(options, key=lambda o: (o is not best, o[0]))]
+    else:
+        options = [_in_time(assessed, o[3], job) for o in options]
+        best = min(options, key=lambda o: o[2])
+        told = [_nearest(o, best, job) for o in sorted(options, key=lambda o: o[2])]
+    refused = [Option(w.way, math.inf, 0, math.nan, f"{w.way}: {w.refusal}") for w in assessed.ways if w.refusal]
+    return ObjectAdvice(assessed.object, best[3].way, (*told, *refused))
+
+
+_Raw = tuple[float, float, float, WayTrade]  # seconds, samples of a pixel, error, the way
+
+
+def _once(row: WayTrade, job: Job) -> float:
+    return row.preparation + (row.training if job.count_training else 0.0)
+
+
+def _option(assessed: ObjectTrade, row: WayTrade, job: Job) -> _Raw:
+    needed = samples_for(row, job.tolerance)
+    if not needed < math.inf:
+        return math.inf, 0.0, row.bias, row
+    spp = max(math.ceil(needed), 1)
+    took = _once(row, job) + job.images * assessed.pixels * spp * row.seconds
+    return took, spp, math.hypot(row.bias, math.sqrt(row.variance / spp)), row
+
+
+def _in_time(assessed: ObjectTrade, row: WayTrade, job: Job) -> _Raw:
+    """What a way comes to in the time that is allowed."""
+    left = (job.seconds or math.inf) - _once(row, job)
+    spp = math.floor(left / (job.images * assessed.pixels * row.seconds)) if left > 0 else 0
+    error = math.hypot(row.bias, math.sqrt(row.variance / spp)) if spp > 0 else math.inf
+    return float(job.seconds or math.inf), spp, error, row
+
+
+def _told(assessed: ObjectTrade, option: _Raw, best: _Raw, job: Job) -> Option:
+    took, spp, error, row = option
+    off = _off(row)
+    if option is best:
+        size = f"{assessed.mfp[0]:.3g} to {assessed.mfp[1]:.3g} mean free paths across"
+        images = "an image" if job.images == 1 else f"{job.images} images"
+        why = f"{row.way} is the cheapest that keeps {job.tolerance:.3g} ({size}): {off}, {images} in {_time(took)}"
+        why += f" with {int(spp)} samples a pixel" + _training(row, job)
+        why += f"; render {Way.of(row.way).flags} --spp {int(spp)}"
+    elif took < math.inf:
+        over = job.seconds is not None and took > job.seconds
+        why = f"{row.way} takes {_time(took)}"
+        why += f", allowed {_time(job.seconds)}" if over else f", {short(took / best[0])} times as long" + f" ({off})"
+        why += _training(row, job)
+    elif row.bias2 - 2 * row.bias2_error < job.tolerance**2:
+        why = f"{row.way} is {off}: whether it keeps {job.tolerance:.3g} cannot be told from so few samples"
+    else:
+        why = f"{row.way} is {off}, asked {100 * job.tolerance:.3g} %"
+    return Option(row.way, took, int(spp), error, why)
+
+
+def _nearest(option: _Raw, best: _Raw, job: Job) -> Option:
+    took, spp, error, row = option
+    if option is best:
+        why = f"no way keeps {job.tolerance:.3g} in {_time(took)}; {row.way} comes nearest, {100 * error:.3g} %"
+    elif spp > 0:
+        why = f"{row.way} comes to {100 * error:.3g} % in {_time(took)}"
+    else:
+        why = f"{row.way} has no time for an image in {_time(took)}"
+    return Option(row.way, took, int(spp), error, why)
+
+
+def _training(row: WayTrade, job: Job) -> str:
+    if not row.training:
+        return ""
+    return f", its training of {_time(row.training)} {'counted' if job.count_training else 'left out'}"
+
+
+def _off(row: WayTrade) -> str:
+    """What is known of a bias, in words."""
+    return "exact" if row.is_exact else f"{row.told_bias} % off"
+
+
+def _time(seconds: float) -> str:
+    if not seconds < math.inf:
+        return "no time"
+    for unit, length in (("h", 3600.0), ("min", 60.0)):
+        if seconds >= 1.6 * length:
+            return f"{seconds / length:.3g} {unit}"
+    return f"{short(seconds)} s"

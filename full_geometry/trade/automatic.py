@@ -1,0 +1,170 @@
+"""The model "auto": the cheapest one of each object whose bias keeps the tolerance of the integrator, by measurement.
+
+All models that are installed are candidates, with light as the integrator states it: "sampled" by default, "gathered",
+or "auto" for the cheaper of both. Costs are seconds of an image, preparation counted. If no model keeps the tolerance
+the least biased is taken, with sampled light. The choice is kept in a file, so that the same scene gets the same again;
+the file can be deleted, and a model that is named in the scene needs no choice. The integrator cannot mix walks with
+models, and says where walks would be the better way.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import mitsuba as mi
+
+from full_geometry.geometry.identity import scene_hash
+from full_geometry.objects.objects import refuse_instances, translucent_shapes
+from full_geometry.registry import AUTO, Choices, model_names
+from full_geometry.settings import Settings
+from full_geometry.surface.wrapped import surface_of
+from full_geometry.trade.assessing import assess_stage
+from full_geometry.trade.results import ObjectTrade, WayTrade
+from full_geometry.trade.ways import GATHERED, LAMBERT, WALKS, Stage, Way
+from halfspace_sss.neural.store import weights_folder
+from halfspace_sss.provenance import provenance, write_atomically
+
+ENVIRONMENT_VARIABLE = "HALFSPACE_SSS_CHOICES"
+DEFAULT = "neural"
+EXITS = 96  # of each object
+SAMPLES = (64, 2048)  # fewest and most of each exit by each way; the fewest take some tenths of a second
+FORMAT = "halfspace-sss choice 2"
+
+
+def choices_folder() -> Path:
+    """Folder of the choices: HALFSPACE_SSS_CHOICES, or beside the weights of the user."""
+    stated = os.environ.get(ENVIRONMENT_VARIABLE)
+    return Path(stated) if stated else weights_folder().parent / "choices"
+
+
+def choose(scene: mi.Scene, settings: Settings) -> Choices:
+    """The model that every object whose model is "auto" is best rendered by, and the light if that is "auto".
+
+    Args:
+        scene: the Mitsuba scene.
+        settings: of the integrator; the tolerance is theirs, and the share of the samples of an image that the choice
+            takes, as far as `SAMPLES` allows.
+
+    Raises:
+        ValueError: the scene cannot be rendered, or the file of an earlier choice is damaged.
+    """
+    shapes = translucent_shapes(scene)
+    refuse_instances(scene, shapes, "the model 'auto'")
+    on = Stage(scene, shapes, settings.shared(), settings.of_models())
+    named = [settings.model or surface_of(shape).inside.model for shape in on.shapes]
+    path = choices_folder() / f"{_identity(on, settings)}.json"
+    record = _read(path) if path.is_file() else None
+    if record is None or len(record["models"]) != len(named):
+        record = _measured(on, named, settings)
+        write_atomically(path, json.dumps(record, indent=1, allow_nan=False) + "\n")
+    for sentence in record["sentences"]:
+        mi.Log(mi.LogLevel.Info, sentence)
+    models = {k: model for k, model in enumerate(record["models"]) if named[k] == AUTO}
+    return Choices(models, record["light"], dict(zip(on.names, record["sentences"])))
+
+
+def _identity(on: Stage, settings: Settings) -> str:
+    plugin = {"type": "bssrdf", **on.settings, **on.bssrdf, "tolerance": settings.tolerance}
+    plugin |= {name: getattr(settings, name) for name in ("choice_share", "light", "model", "orders")}
+    return scene_hash(on.scene, mi.load_dict(plugin))[:32]
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+        models, sentences = ([str(name) for name in record[key]] for key in ("models", "sentences"))
+        known = record["format"] == FORMAT and all(name in model_names() and name != AUTO for name in models)
+        known &= record["light"] in ("sampled", GATHERED) and len(models) == len(sentences)
+    except (OSError, KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path} must be the record of a choice, got {error!r}; delete it to choose anew") from error
+    if not known:
+        raise ValueError(f"{path} must name models that are installed, got {models}; delete it to choose anew")
+    return {**record, "models": models, "sentences": sentences}
+
+
+def _measured(on: Stage, named: list[str], settings: Settings) -> dict[str, Any]:
+    lights = ("sampled", GATHERED) if settings.light == AUTO else (settings.light,)
+    models = _known() if AUTO in named else dict.fromkeys(named)
+    ways = [WALKS]
+    ways += [_way(name, light) for name in models for light in lights if _has(name, light)]
+    samples = _samples(on, settings.choice_share / len(ways))
+    result = assess_stage(on, ways, samples=samples, exits=EXITS)
+    picks = {light: [picked(o, settings.tolerance, light, name) for o, name in zip(result.objects, named)]
+             for light in lights}  # fmt: skip
+    light = min(lights, key=lambda light: _total(picks[light]))
+    about = provenance(tolerance=settings.tolerance, samples=samples, exits=EXITS)
+    record = {"format": FORMAT, "light": light, "models": [pick.model for pick in picks[light]]}
+    record |= {"sentences": [pick.sentence for pick in picks[light]]}
+    return {**record, "assessment": result.record(), "provenance": about}
+
+
+def _known() -> list[str]:
+    """Models that "auto" chooses among; walks have no share in it."""
+    return [name for name in model_names() if name != AUTO]
+
+
+def _has(model: str, light: str) -> bool:
+    """Whether a way exists: a diffuse surface gathers nothing, and is the same in both kinds of light."""
+    return model != LAMBERT or light == "sampled"
+
+
+def _way(model: str, light: str) -> Way:
+    return Way(model, light=light if _has(model, light) else "sampled")
+
+
+def _samples(on: Stage, share: float) -> int:
+    """Of each exit by each way, which take that share of the samples of the first sensor's image."""
+    if not on.scene.sensors():
+        return SAMPLES[0]
+    camera = on.scene.sensors()[0]
+    image = math.prod(int(n) for n in camera.film().crop_size()) * camera.sampler().sample_count()
+    return min(max(int(share * image / (EXITS * len(on.shapes))), SAMPLES[0]), SAMPLES[1])
+
+
+class Pick(NamedTuple):
+    """A model for an object, seconds of an image by it (infinite if it keeps no tolerance), and one sentence."""
+
+    model: str
+    seconds: float
+    sentence: str
+
+
+def _total(picks: list[Pick]) -> float:
+    return sum(pick.seconds for pick in picks)
+
+
+def picked(assessed: ObjectTrade, tolerance: float, light: str = "sampled", model: str = AUTO) -> Pick:
+    """The model for an object among those of one kind of light, or what can be said of the one that is named."""
+    names = _known() if model == AUTO else (model,)
+    ways = {_way(name, light).name: name for name in names}
+    rows = [row for row in assessed.ways if not row.refusal and row.way in ways]
+    if not rows or assessed.is_dark:
+        name = _default([ways[row.way] for row in rows] or list(ways.values()))
+        why = f"object {assessed.object!r}: {name}, as nothing is seen that could be compared"
+        return Pick(name, 0.0 if rows else math.inf, why)
+    keeping = [row for row in rows if row.bias_bound <= tolerance]
+    if keeping:
+        best = min(keeping, key=lambda row: _cost(assessed, row, tolerance))
+        why = f"{best.told_bias} % off, asked {100 * tolerance:.3g} %"
+    else:
+        best = min(rows, key=lambda row: (row.bias_bound, _cost(assessed, row, tolerance)))
+        why = f"the least wrong, {best.told_bias} % off"
+        why += f"; no model is known to keep {100 * tolerance:.3g} %"
+    cost, walks = _cost(assessed, best, tolerance), _cost(assessed, assessed.traced, tolerance)
+    if not keeping or walks < cost:
+        why += "; translucent_walk would be better"
+        why += " and faster" if walks < cost else ", which has no bias"
+    return Pick(ways[best.way], cost if keeping else math.inf, f"object {assessed.object!r}: {best.way}, {why}")
+
+
+def _default(names: list[str]) -> str:
+    return DEFAULT if DEFAULT in names or not names else names[0]
+
+
+def _cost(assessed: ObjectTrade, row: WayTrade, tolerance: float) -> float:
+    """Seconds of an image until its noise is at the tolerance."""
+    return row.preparation + assessed.pixels * row.time_to(tolerance) if row.variance >= 0 else math.inf

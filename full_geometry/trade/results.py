@@ -1,0 +1,219 @@
+"""What an assessment finds: numbers of each way on each object, as dataclasses, a table and JSON."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+from html import escape
+from typing import TYPE_CHECKING, Any
+
+from full_geometry.scenes.scene_files import PATH_TRACED
+from halfspace_sss.noise_free import NoiseFree
+
+if TYPE_CHECKING:
+    import pandas
+
+UNNAMED = "object without an id"
+DOUBT = 1.0  # standard errors that count as error: biases spread over decades, and few lie where less is told
+
+
+@dataclass(frozen=True)
+class WayTrade:
+    """One way of rendering one object.
+
+    Attributes:
+        way: its name.
+        bias2: squared relative error of radiance that no number of samples removes, noise taken out; it may come out
+            below 0. Mean over visible exits and channels, over the square of the mean radiance. By soft light under an
+            environment map, where a tolerance is asked, as `ratio` is: see `soft_light`.
+        bias2_error: its standard error.
+        ratio, ratio_error: mean radiance over that of walks, for each channel, with standard errors.
+        variance, variance_error: of one sample without fireflies (`statistics.FIREFLIES`), over the square of the mean
+            radiance, with its standard error.
+        seconds: of one sample of the object, compilation left out.
+        samples: that were taken for this.
+        preparation, compilation: seconds, once for a scene; kernels that were compiled before are found again.
+        training: seconds, once for an object; 0 for what needs none.
+        memory: most bytes that Dr.Jit held in a launch.
+        flip, flip_noise: mean FLIP of a small image against that of walks, and of two images of walks; None if the
+            evaluator is not installed.
+        refusal: why it could not be assessed; all numbers are nan then.
+    """
+
+    way: str
+    bias2: float = math.nan
+    bias2_error: float = math.nan
+    ratio: tuple[float, ...] = ()
+    ratio_error: tuple[float, ...] = ()
+    variance: float = math.nan
+    variance_error: float = math.nan
+    seconds: float = math.nan
+    samples: int = 0
+    preparation: float = 0.0
+    compilation: float = 0.0
+    training: float = 0.0
+    memory: int = 0
+    flip: float | None = None
+    flip_noise: float | None = None
+    refusal: str = ""
+
+    @property
+    def off(self) -> NoiseFree:
+        """The bias with all that is known of it."""
+        return NoiseFree(self.bias2, self.bias2_error)
+
+    @property
+    def told_bias(self) -> str:
+        """The bias in percent, with its standard error or as a bound."""
+        return "exact" if self.is_exact else self.off.told()
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether it has no bias: walks where no delta light shines, see `sampling.sample_blur`."""
+        return self.way == PATH_TRACED and self.bias2 == self.bias2_error == 0
+
+    @property
+    def bias(self) -> float:
+        """Relative error of radiance that no number of samples removes."""
+        return self.off.value
+
+    @property
+    def bias_error(self) -> float:
+        """Standard error of the bias; where that is lost in noise, of its bound."""
+        return self.off.standard_error
+
+    @property
+    def bias_bound(self) -> float:
+        """What the bias is below in 95 % of cases; a square that came out below 0 counts as 0."""
+        return self.off.bound
+
+    def time_to(self, noise: float) -> float:
+        """Seconds for each pixel of the object until its noise is so much of the mean radiance."""
+        return self.variance / noise**2 * self.seconds
+
+
+def samples_for(row: WayTrade, tolerance: float, z: float = DOUBT) -> float:
+    """Samples n of a pixel by which bias² + variance / n and z of its standard errors are at tolerance²; inf for none.
+
+    With a = tolerance² - bias² the smaller root of (a - V / n)² = z² (s² + (v / n)²).
+    """
+    a, s, v = tolerance**2 - max(row.bias2, 0.0), z * row.bias2_error, z * row.variance_error
+    if not a > s:
+        return math.inf
+    V = row.variance
+    return (a * V + math.sqrt(max(a**2 * V**2 - (V**2 - v**2) * (a**2 - s**2), 0.0))) / (a**2 - s**2)
+
+
+@dataclass(frozen=True)
+class ObjectTrade:
+    """One object of a scene.
+
+    Attributes:
+        object: its id.
+        mfp: mean free paths across, smallest and largest of the channels.
+        share: of the image that it fills; 0 if it is not seen, and nothing is known of it.
+        pixels: of the film that it fills.
+        radiance: its mean, for each channel.
+        ways: what was found, path traced first.
+        notes: what cannot be told, and warnings.
+    """
+
+    object: str
+    mfp: tuple[float, float]
+    share: float
+    pixels: float
+    radiance: tuple[float, ...]
+    ways: tuple[WayTrade, ...]
+    notes: tuple[str, ...] = ()
+
+    def way(self, name: str) -> WayTrade:
+        """The row of a way; ValueError if there is none."""
+        for row in self.ways:
+            if row.way == name:
+                return row
+        raise ValueError(f"way must be one of {', '.join(row.way for row in self.ways)}, got {name!r}")
+
+    @property
+    def traced(self) -> WayTrade:
+        """The row of walks."""
+        return self.way(PATH_TRACED)
+
+    @property
+    def is_dark(self) -> bool:
+        """Whether no light comes from it."""
+        return not any(value > 0 for value in self.radiance)
+
+
+@dataclass(frozen=True)
+class Assessment:
+    """All objects of a scene.
+
+    Attributes:
+        objects: in the order of the scene.
+        seconds: spent, compilation left out; `compilation` was spent beside.
+        seed: of the samples.
+    """
+
+    objects: tuple[ObjectTrade, ...]
+    seconds: float
+    compilation: float
+    seed: int
+
+    def table(self) -> pandas.DataFrame:
+        """One row for each object and way."""
+        import pandas
+
+        rows: list[dict[str, Any]] = []
+        for each in self.objects:
+            for w in each.ways:
+                row: dict[str, Any] = {"object": each.object, "mfp_min": each.mfp[0], "mfp_max": each.mfp[1]}
+                row |= {"way": w.way, "bias": w.bias, "bias_standard_error": w.bias_error, "bias_bound": w.bias_bound}
+                row |= {"bias2": w.bias2, "bias2_standard_error": w.bias2_error}
+                for k, (value, error) in enumerate(zip(w.ratio, w.ratio_error)):
+                    row |= {f"ratio_{k}": value, f"ratio_{k}_standard_error": error}
+                row |= {"variance": w.variance, "variance_standard_error": w.variance_error}
+                row |= {"seconds_per_million": 1e6 * w.seconds, "samples": w.samples, "preparation_s": w.preparation}
+                row |= {"compilation_s": w.compilation, "training_s": w.training, "memory_MB": w.memory / 1e6}
+                row |= {"flip": w.flip, "flip_noise": w.flip_noise, "refusal": w.refusal}
+                rows.append(row)
+        return pandas.DataFrame(rows)
+
+    def record(self) -> dict[str, Any]:
+        """Ready for JSON; what is not known is None there."""
+        return plain(asdict(self))
+
+    @classmethod
+    def of(cls, record: dict[str, Any]) -> Assessment:
+        """From a record."""
+        objects = []
+        for o in record["objects"]:
+            rows = tuple(WayTrade(**{key: _known(key, value) for key, value in w.items()}) for w in o["ways"])
+            lists = {key: tuple(o[key]) for key in ("mfp", "radiance", "notes")}
+            objects.append(ObjectTrade(**{**o, **lists, "ways": rows}))
+        return cls(tuple(objects), record["seconds"], record["compilation"], record["seed"])
+
+
+def plain(value: Any) -> Any:
+    """Without nan, which JSON has not."""
+    if isinstance(value, dict):
+        return {key: plain(v) for key, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(v) for v in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _known(key: str, value: Any) -> Any:
+    """A field of a `WayTrade` from JSON."""
+    if key in ("ratio", "ratio_error"):
+        return tuple(math.nan if v is None else v for v in value)
+    return math.nan if value is None and key not in ("flip", "flip_noise") else value
+
+
+def html_table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table of plain text."""
+
+    def row(cells: Sequence[str], kind: str) -> str:
+        return "<tr>" + "".join(f"<{kind}>{escape(str(cell))}</{kind}>" for cell in cells) + "</tr>"
+
+    return "<table>" + row(headings, "th") + "".join(row(cells, "td") for cells in rows) + "</table>"

@@ -1,0 +1,247 @@
+"""One way of rendering, against the clock: radiance of exits from random samples, with what they cost."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from full_geometry.integrators.bssrdf import is_bssrdf
+from full_geometry.integrators.gathering import PART
+from full_geometry.scenes.scene_files import PATH_TRACED
+from full_geometry.settings import variant_channels
+from full_geometry.trade.exits import Exits
+from full_geometry.trade.statistics import RadianceEstimate, seeded
+from full_geometry.trade.ways import Stage, Way
+from halfspace_sss.backend import clock
+
+LANES = 2**18  # of a launch
+PILOT, FEWEST = 48, 8  # samples of each exit of the first launch, and of a launch that is worth it
+LEAST_SHARE = 0.2  # of the time of a launch that its samples take
+BLUR = 8.0  # 0.4 radians
+
+
+@dataclass(eq=False)
+class Sampled:
+    """What has been sampled of an object by a way.
+
+    Attributes:
+        estimate: radiance of the exits.
+        preparation: seconds, of tables, surveys and gathering of all light, once for a scene.
+        preparing: seconds that it took here, where a part of the light is gathered; 0 if it was known.
+        compilation: seconds of the first launch beyond those of the same one again, if it compiled a kernel, by the
+            clock on the wall.
+        compiling: the same by `clock`.
+        overhead: seconds of a launch whatever its samples: its paths are recorded, and their kernel is found again.
+        launches: (samples of all exits, seconds) of each launch that compiled nothing.
+        memory: most bytes that Dr.Jit held while it ran.
+        blur: of walks in a scene with delta lights, what of their light is blurred, see `sample_blur`.
+    """
+
+    estimate: RadianceEstimate
+    preparation: float
+    preparing: float
+    compilation: float = 0.0
+    compiling: float = 0.0
+    overhead: float = 0.0
+    memory: int = 0
+    launches: list[tuple[int, float]] = field(default_factory=list)
+    blur: RadianceEstimate | None = None
+
+    @property
+    def seconds(self) -> float:
+        """Of one sample, the least of all launches, without what one takes whatever its size, as images are larger."""
+        return min(max(took - self.overhead, LEAST_SHARE * took) / n for n, took in self.launches)
+
+
+def first_sample(stage: Stage, way: Way, exits: Exits, seed: int, each: int = PILOT, object: int = 0) -> Sampled:
+    """Make a way ready and take few samples, which compiles its kernels; nothing if an earlier look knows its pace.
+
+    Raises:
+        ValueError: the way refuses the scene.
+    """
+    if (object, way) in stage.paces:
+        estimate = RadianceEstimate(variant_channels(), exits.n)
+        return replace(stage.paces[object, way], estimate=estimate, preparing=0.0, compilation=0.0, compiling=0.0)
+    started = clock()
+    _prepare(stage, way)
+    preparation = preparing = clock() - started
+    if way.part:  # of all samples, after what is made ready for parts and whole alike
+        made, light = stage.integrator(way).gathering.seconds
+        preparation = max(preparing - made - light, 0.0) + made / PART + 2 * light
+        same = stage.paces.get((object, replace(way, light="sampled", part=0)))  # which made the objects for both
+        preparation += same.preparation if same else 0.0
+    result = Sampled(RadianceEstimate(variant_channels(), exits.n), preparation, preparing)
+    _first_launch(stage, way, exits, result, each, seeded(seed, 31))
+    stage.paces[object, way] = result
+    return result
+
+
+def _first_launch(stage: Stage, way: Way, exits: Exits, sampled: Sampled, each: int, seed: int) -> None:
+    """`each` samples of every exit; where a kernel was compiled the same again, for the time alone."""
+    began = time.perf_counter()
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        launch = _launch(stage, way, exits, sampled.estimate, each, seed)
+        kernels = dr.kernel_history([dr.KernelType.JIT])
+    ended = time.perf_counter()
+    if not all(kernel["cache_hit"] for kernel in kernels):
+        again = _launch(stage, way, exits, RadianceEstimate(variant_channels(), exits.n), each, seed)
+        sampled.compiling = max(launch.seconds - again.seconds, 0.0)
+        sampled.compilation = max(2 * ended - began - time.perf_counter(), 0.0)
+        launch = again
+    sampled.overhead = launch.recording + 1e-3 * sum(kernel["codegen_time"] for kernel in kernels)
+    sampled.memory = launch.memory
+    sampled.launches.append((exits.n * each, launch.seconds))
+
+
+def warm_up(stage: Stage, ways: Sequence[Way]) -> None:
+    """Compile what preparation needs, by the first way that does not refuse the scene, and forget that way again."""
+    for way in () if any(way in [known for _, known in stage.paces] for way in ways) else ways:
+        with contextlib.suppress(ValueError, RuntimeError):
+            _prepare(stage, way)
+            stage.forget(way)
+            return
+
+
+def _prepare(stage: Stage, way: Way) -> None:
+    integrator = stage.integrator(way)
+    (integrator.prepare if is_bssrdf(integrator) else integrator.tracer)(stage.lit(way))
+
+
+def sample_more(
+    stage: Stage,
+    way: Way,
+    exits: Exits,
+    sampled: Sampled,
+    seed: int,
+    *,
+    seconds: float = 0.0,
+    samples: int | None = None,
+) -> None:
+    """Sample further, for so many seconds or a number of samples of each exit.
+
+    Args:
+        stage: the scene.
+        way: how it is rendered.
+        exits: of the object.
+        sampled: what is there already.
+        seed: of the samples.
+        seconds: to spend.
+        samples: of each exit, instead; the outcome then depends on the seed alone.
+    """
+    most, started = max(LANES // exits.n, 2), clock()
+    while True:
+        if samples:
+            each = samples - sampled.estimate.samples
+        else:
+            each = _affordable(sampled, exits.n, seconds - (clock() - started))
+        if not sampled.estimate.samples:
+            each = max(each, PILOT)
+        if each < FEWEST:
+            return
+        each = min(each, most)
+        number = seeded(seed, 32, sampled.estimate.samples)
+        launch = _launch(stage, way, exits, sampled.estimate, each, number)
+        sampled.memory = max(sampled.memory, launch.memory)
+        sampled.launches.append((exits.n * each, launch.seconds))
+
+
+def sample_blur(stage: Stage, exits: Exits, seed: int, samples: int) -> RadianceEstimate:
+    """Light of delta lights that walks find by no strategy, but spread over a cone, see `objects.small_emitters`.
+
+    Those are the same paths with and without it, the cone so wide that few samples tell.
+
+    Args:
+        stage: the scene.
+        exits: of the object.
+        seed: of the samples.
+        samples: of each exit.
+    """
+    ways = [Way(PATH_TRACED, blur=blur) for blur in (0.0, BLUR)]
+    estimate, most = RadianceEstimate(variant_channels(), exits.n), max(LANES // exits.n, 2)
+    while (each := min(samples - estimate.samples, most)) > 0:
+        number, rays = seeded(seed, 33, estimate.samples), exits.rays(each)
+        without, spread = (radiance(stage.lit(w), stage.integrator(w), _sampler(number, rays), rays) for w in ways)
+        estimate.add(*_sums([b - a for a, b in zip(without, spread)], each), each)
+    return estimate
+
+
+def _affordable(sampled: Sampled, n: int, left: float) -> int:
+    """Samples of each exit that the rest of the time allows."""
+    return int(max(left - sampled.overhead, 0) / (sampled.seconds * n))
+
+
+class TimedLaunch(NamedTuple):
+    """Bytes and seconds that it took, and seconds of these until its kernel ran."""
+
+    memory: int
+    seconds: float
+    recording: float
+
+
+def _launch(stage: Stage, way: Way, exits: Exits, estimate: RadianceEstimate, each: int, seed: int) -> TimedLaunch:
+    """`each` samples of every exit."""
+    rays = exits.rays(each)
+    dr.flush_malloc_cache()
+    dr.detail.malloc_clear_statistics()
+    started = clock()
+    L = _recorded(stage.lit(way), stage.integrator(way), _sampler(seed, rays), rays)
+    recorded = clock()
+    dr.eval(L)
+    first, second = _sums(L, each)
+    ended = clock()
+    memory = int(dr.detail.malloc_watermark(dr.backend_v(mi.Float)))
+    estimate.add(first, second, each)
+    estimate.add_bright(np.array([c.numpy() for c in L]), each)
+    return TimedLaunch(memory, ended - started, recorded - started)
+
+
+def _sampler(seed: int, rays: Any) -> Any:
+    """Independent numbers for each ray."""
+    result = mi.load_dict({"type": "independent"})
+    result.seed(seed, dr.width(rays))
+    return result
+
+
+def _sums(L: list[Any], each: int) -> tuple[np.ndarray, np.ndarray]:
+    """Of values and of squares over the samples of each exit, (channels, n)."""
+
+    sums = [dr.block_sum(v, each) for c in L for v in (c, c * c)]
+    dr.eval(sums)
+    dr.sync_thread()
+    rows = np.array([s.numpy() for s in sums], dtype=np.float64)
+    if not np.isfinite(rows).all():
+        raise ValueError(f"samples must be finite, got {int((~np.isfinite(rows)).sum())} exits that are not")
+    return rows[0::2], rows[1::2]
+
+
+def radiance(scene: Any, integrator: Any, sampler: Any, ray: Any) -> list[Any]:
+    """Radiance of rays, by channel, by one kernel for all that it is asked for.
+
+    It is evaluated at once, as sums evaluate what they are given and would trace all paths for each channel anew.
+
+    Args:
+        scene: to look at.
+        integrator: of a way.
+        sampler: of a number for each ray at a time.
+        ray: all of them.
+    """
+    L = _recorded(scene, integrator, sampler, ray)
+    dr.eval(L)
+    return L
+
+
+def _recorded(scene: Any, integrator: Any, sampler: Any, ray: Any) -> list[Any]:
+    """Radiance of rays that is to be evaluated."""
+    sampler.schedule_state()
+    dr.schedule(ray.o, ray.d)
+    dr.eval()
+    ray, nothing = mi.Ray3f(ray.o, ray.d), dr.zeros(mi.Float, sampler.wavefront_size())
+    return [c + nothing for c in integrator.sample(scene, sampler, ray, None, mi.Bool(True))[0]]

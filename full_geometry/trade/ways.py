@@ -1,0 +1,208 @@
+"""The ways in which a scene can be rendered, and the same loaded scene shown by one after the other."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import mitsuba as mi
+
+from full_geometry.integrators.bssrdf import is_bssrdf
+from full_geometry.integrators.gathering import Gathering
+from full_geometry.objects.objects import KnowsUnit, millimetres, refuse_instances, translucent_shapes
+from full_geometry.objects.small_emitters import is_delta
+from full_geometry.registry import AUTO, model_names
+from full_geometry.scenes.scene_files import PATH_TRACED, load_objects
+from full_geometry.trade.soft_light import SoftLight
+from halfspace_sss.checks import check_choice
+from halfspace_sss.interface.model import model_class, models
+
+LAMBERT = "lambert"
+NO_SINGLE = "without single scattering"
+GATHERED = "gathered"
+
+
+@dataclass(frozen=True)
+class Way:
+    """A model for all objects, or "path_traced"; with orders instead of those of the scene, if any.
+
+    Args:
+        model: name of a model, or "path_traced": walks.
+        orders: "multiple" leaves single scattering out; None takes the orders of the scene.
+        light: "sampled" or "gathered", see `Settings`.
+        part: of gathered light, see `Gathering`; 0 for all of it.
+        blur: of walks, see `translucent_walk`.
+        soft: whether it is looked at in soft light, see `soft_light`.
+    """
+
+    model: str
+    orders: str | None = None
+    light: str = "sampled"
+    part: int = 0
+    blur: float = 1.0
+    soft: bool = False
+
+    @property
+    def walks(self) -> bool:
+        """Whether the integrator is `translucent_walk`."""
+        return self.model == PATH_TRACED
+
+    @property
+    def halves(self) -> tuple[Way, ...]:
+        """What it is measured by: itself, or two independent parts of gathered light."""
+        return (replace(self, part=1), replace(self, part=2)) if self.light == GATHERED else (self,)
+
+    @property
+    def name(self) -> str:
+        """As tables show it."""
+        parts = (self.model, NO_SINGLE if self.orders else "", GATHERED if self.light == GATHERED else "")
+        return ", ".join(filter(None, parts))
+
+    @property
+    def flags(self) -> str:
+        """What asks the command `render` for it."""
+        asked = f"--model {self.model}" + (f" --orders {self.orders}" if self.orders else "")
+        return asked + (f" --light {GATHERED}" if self.light == GATHERED else "")
+
+    @classmethod
+    def of(cls, name: str) -> Way:
+        """The way of that name; ValueError if there is none."""
+        model, *more = name.split(", ")
+        check_choice("way", model, (PATH_TRACED, *(m for m in model_names() if m != AUTO)))
+        if model == PATH_TRACED and more:
+            raise ValueError(f"the way {PATH_TRACED!r} must stand alone, got {name!r}")
+        for part in more:
+            known = (NO_SINGLE,) if model == LAMBERT else (NO_SINGLE, GATHERED)
+            check_choice(f"what follows {model}", part, known)
+        return cls(model, "multiple" if NO_SINGLE in more else None, GATHERED if GATHERED in more else "sampled")
+
+
+WALKS = Way(PATH_TRACED)
+
+
+def ways() -> list[Way]:
+    """All of them: path traced first, a diffuse surface, every model with light sampled and gathered, and those without
+    the single scattering."""
+    names = [name for name in model_names() if name not in (AUTO, LAMBERT)]
+    results = [WALKS, Way(LAMBERT), *map(Way, names), *(Way(name, light=GATHERED) for name in names)]
+    bare = [name for name in models() if model_class(name).orders == "multiple"]
+    return results + [Way(name, "multiple") for name in bare if name in ("better_dipole", "neural")]
+
+
+@dataclass(eq=False)
+class Stage:
+    """A loaded scene, and the integrators that show it in several ways.
+
+    Args:
+        scene: the Mitsuba scene.
+        shapes: its translucent shapes.
+        settings: of its integrator, by parameter name.
+        bssrdf: parameters that `bssrdf` alone understands.
+        paces: what an earlier look found by (object, way), by which the next one need not feel its way.
+        soft: light by which biases are told; None where the light of the scene tells them.
+    """
+
+    scene: Any
+    shapes: list[Any]
+    settings: dict[str, Any]
+    bssrdf: dict[str, Any]
+    paces: dict[tuple[int, Way], Any] = field(default_factory=dict)
+    soft: SoftLight | None = None
+    _integrators: dict[Way, Any] = field(default_factory=dict)
+
+    @property
+    def mm_per_unit(self) -> float:
+        return float(self.settings["mm_per_unit"])
+
+    @property
+    def names(self) -> list[str]:
+        """Ids of the objects."""
+        return [shape.id() for shape in self.shapes]
+
+    @property
+    def blurs(self) -> bool:
+        """Whether walks spread light of a delta light over a blur, so that they are not exact."""
+        return any(map(is_delta, self.scene.emitters()))
+
+    @contextmanager
+    def softened(self) -> Iterator[Stage]:
+        """The same with soft light beside its own, if it has an environment map; its own is put back at the end."""
+        soft = SoftLight.of(self.scene)
+        try:
+            yield replace(self, soft=soft)
+        finally:
+            if soft is not None:
+                soft.show(False)
+
+    def looks(self, way: Way) -> tuple[Way, ...]:
+        """What a way is measured by: its halves, or in soft light for the bias and one half for what it costs."""
+        if self.soft is None:
+            return way.halves
+        *rest, last = (replace(half, soft=True) for half in way.halves)
+        return (*rest, way.halves[-1], last)
+
+    def lit(self, way: Way) -> Any:
+        """The scene in the light that a way is looked at in."""
+        if self.soft is not None:
+            self.soft.show(way.soft)
+        return self.scene
+
+    def integrator(self, way: Way) -> Any:
+        """The integrator of a way, which keeps what it has made ready; shapes are the same in all light."""
+        way = replace(way, soft=False)
+        if way not in self._integrators:
+            if way.walks:
+                plugin = {"type": "translucent_walk", **self.settings, "blur": way.blur, "light": "sampled"}
+            else:
+                plugin = {"type": "bssrdf", **self.settings, **self.bssrdf, "model": way.model, "light": way.light}
+                plugin |= {"orders": way.orders} if way.orders else {}
+                plugin["train_seconds"] = 0.0  # who asks does not wait for the training of an object
+            self._integrators[way] = mi.load_dict(plugin)
+            if way.part:
+                self._integrators[way].gathering = Gathering(way.part)
+            sampled = self._integrators.get(replace(way, light="sampled", part=0))
+            if way.light == GATHERED and sampled is not None and not mi.is_spectral:  # which refuses gathered light
+                self._integrators[way].take_over(sampled)
+        return self._integrators[way]
+
+    def forget(self, way: Way) -> None:
+        """What has been made ready for a way."""
+        self._integrators.pop(way, None)
+
+
+def stage(scene: Any, parameters: dict[str, str] | None = None) -> Stage:
+    """A scene made ready to be shown in several ways.
+
+    Args:
+        scene: a Mitsuba scene, a dict, or the path of an XML file.
+        parameters: values of the parameters $name of an XML file.
+
+    Raises:
+        ValueError: as `load_objects`; there is no translucent object or no sensor, or it is an instance.
+    """
+    if mi.variant() is None:
+        raise ValueError(
+            "a variant of Mitsuba must be set before a scene is looked at, got none: "
+            "`mitsuba.set_variant('llvm_ad_rgb')`, then `full_geometry.register()`"
+        )
+    loaded = scene if isinstance(scene, mi.Scene) else load_objects(scene, parameters)
+    shapes = translucent_shapes(loaded)
+    if not shapes:
+        raise ValueError("the scene must have an object with a translucent BSDF, got none")
+    if not loaded.sensors():
+        raise ValueError("the scene must have a sensor, got none")
+    refuse_instances(loaded, shapes, "the trade")
+    return Stage(loaded, shapes, *_settings(loaded))
+
+
+def _settings(scene: Any) -> tuple[dict[str, Any], dict[str, Any]]:
+    """What both integrators are told, and `bssrdf` alone; what the scene says, where its integrator is one of them."""
+    integrator = scene.integrator()
+    if is_bssrdf(integrator):
+        return integrator.settings.shared(), integrator.settings.of_models()
+    common: dict[str, Any] = {"mm_per_unit": millimetres(scene), "hide_emitters": False, "max_depth": 8, "rr_depth": 5}
+    if isinstance(integrator, KnowsUnit):  # `translucent_walk`
+        common |= {"hide_emitters": integrator.hidden}
+    return common, {}

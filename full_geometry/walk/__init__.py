@@ -1,0 +1,1 @@
+"""The random walk inside an object, connected to emitters."""

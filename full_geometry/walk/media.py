@@ -1,0 +1,695 @@
+"""What the walk inside objects knows of them: coefficients, boundary and geometry, by the number of the object."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from full_geometry.geometry.instances import Group, Placed, Sight, bounds_of, corners, ends_of, shown_groups
+from full_geometry.geometry.points import lift
+from full_geometry.geometry.rounding import clear
+from full_geometry.geometry.shape import Geometry, check_together, pointer_numbers, scene_of, survey
+from full_geometry.objects.inclusions import Content, contents, refracts
+from full_geometry.objects.objects import TranslucentObject, translucent_shapes
+from full_geometry.objects.small_emitters import is_delta
+from full_geometry.surface.translucent import Inside, is_rough, is_smooth_boundary, smooth_boundary
+from full_geometry.surface.varying import VaryingMedium, eval_volume
+from full_geometry.surface.wrapped import Wrapping, surface_of, wrapping_of
+from halfspace_sss.physics.medium import Medium
+
+# ---- Shapes, media and lights inside objects ------------------------------------------------------------------------
+#
+# Indices are relative, as Mitsuba's path tracers take them: int_ior / ext_ior of a `dielectric` inside, and eta of an
+# object inside another, are those of its inside over what is around it. A bubble in wax of eta 1.4 is a `dielectric`
+# with int_ior 1 and ext_ior 1.4. What refracts displaces the medium around it; what passes light straight (`null`,
+# `mask`, `thindielectric`) stands in it.
+
+
+MOST_LOST = 0.5  # of the rays that enter an object do not leave it: what is more open has no inside
+
+
+@dataclass(frozen=True, eq=False)
+class InnerShapes:
+    """What lies inside the objects of a scene.
+
+    Args:
+        scene: a Mitsuba scene that holds the objects, and the shapes inside or partly inside them.
+        placed: these shapes at their places, which are numbered.
+        tables: by these numbers, the number of the object `around` a shape or -1, and whether it `displaces` that; by
+            the number of an object, whether it stands `alone`, neither in another nor around anything.
+        lights: the delta lights in the medium of an object, and its number.
+    """
+
+    scene: mi.Scene
+    placed: Placed
+    tables: dict[str, Any]
+    lights: list[tuple[mi.Emitter, int]]
+
+    @classmethod
+    def of(cls, scene: mi.Scene, objects: list[Geometry]) -> InnerShapes | None:
+        """What lies inside; None if nothing does.
+
+        Raises:
+            ValueError: something that refracts lies partly inside or is not closed, or objects count some orders only.
+        """
+        result = contents(scene, objects)
+        if not result:
+            return None
+        groups = shown_groups(scene)
+        own = Placed.of([obj.shape for obj in objects], groups)
+        _check(result, objects, own)
+        glass = [survey(thing, scene) for thing in _shapes(result) if _displaces(thing)]
+        for piece in glass:
+            if not piece.closed:
+                raise ValueError(f"what refracts inside an object must be closed, got the shape {piece.name}")
+        if glass:
+            result = contents(scene, [*objects, *glass])
+        holders = Placed.of([obj.shape for obj in (*objects, *glass)], groups)
+        inside = [content for content in result if content.object < len(own)]
+        things = [thing for thing in _shapes(inside) if not any(thing is shape for shape in own.shapes)]
+        placed = Placed.of([*own.shapes, *things], groups)
+        first = {id(shape): int(number) for shape, number in zip(placed.shapes, placed.first)}
+        around, lights = np.full(len(placed), -1), {}
+        holding, held = np.zeros(len(own), dtype=bool), np.zeros(len(placed), dtype=bool)
+        for content in _largest_first(result, holders):
+            number = content.object if content.object < len(own) else -1
+            if isinstance(content.thing, mi.Emitter):
+                lights[id(content.thing)] = content.thing, number
+            elif id(content.thing) in first:
+                place = first[id(content.thing)] + content.rank
+                around[place], held[place] = number, held[place] or number >= 0
+            holding[[number] if number >= 0 else []] = True
+        displaces = [_displaces(shape) for shape in placed.shapes]
+        alone = ~holding & ~held[: len(own)]
+        tables = {"around": mi.Int32(around.tolist()), "alone": mi.Bool(alone.tolist())}
+        tables["displaces"] = mi.Bool([displaces[kind] for kind in placed.kind])
+        dr.make_opaque(tables)
+        lights = [(light, k) for light, k in lights.values() if is_delta(light) and k >= 0]
+        return cls(placed.scene(scene), placed, tables, lights)
+
+    def around(self, si: mi.SurfaceInteraction3f) -> mi.Int32:
+        """The number of the object around what a ray has met, or -1."""
+        return self._met("around", si, -1)
+
+    def displaces(self, si: mi.SurfaceInteraction3f) -> mi.Bool:
+        """Whether that, which is no translucent object, displaces the medium around it."""
+        return self._met("displaces", si, False)
+
+    def _met(self, key: str, si: mi.SurfaceInteraction3f, otherwise: int | bool) -> mi.Int32 | mi.Bool:
+        number, table = self.placed.number(si), self.tables[key]
+        return dr.select(number >= 0, dr.gather(type(table), table, dr.maximum(number, 0)), otherwise)
+
+
+def _shapes(result: list[Content]) -> list[mi.Shape]:
+    return list({id(c.thing): c.thing for c in result if isinstance(c.thing, mi.Shape)}.values())
+
+
+def _displaces(shape: mi.Shape) -> bool:
+    return not surface_of(shape) and refracts(shape)
+
+
+def _largest_first(result: list[Content], holders: Placed) -> list[Content]:
+    """Sorted by the size of what is around, the smallest last."""
+    boxes = [ends_of(corners(shape.bbox(), holders.to_world(k))) for k, shape in enumerate(holders.shapes)]
+    sizes = np.concatenate([np.linalg.norm(high - low, axis=1) for low, high in boxes])
+    return sorted(result, key=lambda content: -sizes[content.object])
+
+
+def _check(result: list[Content], objects: list[Geometry], placed: Placed) -> None:
+    for content in result:
+        holder = objects[placed.kind[content.object]]
+        surfaces = [surface_of(holder.shape)]
+        if isinstance(content.thing, mi.Shape):
+            translucent = bool(surface_of(content.thing))
+            if surfaces[0].inside.textured is not None and (translucent or _displaces(content.thing)):
+                raise ValueError(
+                    f"an object with textures must hold nothing that refracts, got {content.name} in {holder.name}"
+                )
+            if not content.whole and (translucent or _displaces(content.thing)):
+                raise ValueError(
+                    f"what refracts must lie inside an object or outside, got {content.name} partly inside "
+                    f"object {holder.name}"
+                )
+            surfaces += [surface_of(content.thing)] if translucent else []
+        for surface in surfaces:
+            if surface.inside.orders != "total":
+                raise ValueError(
+                    f"orders must be 'total' of objects with something inside, got {surface.inside.orders!r} where "
+                    f"{content.name} lies inside object {holder.name}"
+                )
+
+
+def _check_mixes(wrappings: list[Wrapping], objects: list[Geometry], placed: Placed, inner: InnerShapes | None) -> None:
+    """ValueError if a mask or blend is on an object inside another, or with something inside."""
+    alone = np.ones(len(placed), dtype=bool) if inner is None else np.array(inner.tables["alone"])
+    for kind, (around, obj) in enumerate(zip(wrappings, objects)):
+        if around.mixes and not alone[placed.numbers(kind)].all():
+            raise ValueError(
+                f"an object with a mask or blendbsdf must be in no other and hold nothing, got object {obj.name}"
+            )
+
+
+# ---- Heterogeneous media -------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class HeterogeneousMedia:
+    """The media of all objects, of which at least one varies.
+
+    Args:
+        densities: volume of each object, or None, see `VaryingMedium`.
+        albedos: likewise.
+        factor: table with one column per channel, 1/(scene unit).
+        albedo: likewise, without a unit.
+        majorants: likewise, 1/(scene unit).
+    """
+
+    densities: list[mi.Volume | None]
+    albedos: list[mi.Volume | None]
+    factor: list[mi.Float]
+    albedo: list[mi.Float]
+    majorants: list[mi.Float]
+
+    @classmethod
+    def of(cls, insides: list[Inside], mm_per_unit: float) -> HeterogeneousMedia:
+        """Of the insides of objects."""
+        media = [inside.varying or _homogeneous(inside.medium) for inside in insides]
+        tables = (
+            per_channel([m.factor for m in media], mm_per_unit),
+            per_channel([m.albedo for m in media], 1.0),
+            per_channel([m.majorant for m in media], mm_per_unit),
+        )
+        dr.make_opaque(tables)
+        return cls([m.density for m in media], [m.albedo_volume for m in media], *tables)
+
+    def majorant(self, k: mi.Int32) -> mi.Spectrum:
+        """Of object k, 1/(scene unit)."""
+        return _row(self.majorants, k)
+
+    def sigma_t(self, k: mi.Int32, p: mi.Point3f) -> mi.Spectrum:
+        """Extinction of object k at the point p, 1/(scene unit)."""
+        return _row(self.factor, k) * _eval(self.densities, k, p)
+
+    def coefficients(self, k: mi.Int32, p: mi.Point3f) -> tuple[Any, Any]:
+        """sigma_t and sigma_s of object k at the point p, 1/(scene unit)."""
+        sigma_t = self.sigma_t(k, p)
+        return sigma_t, sigma_t * _row(self.albedo, k) * _eval(self.albedos, k, p)
+
+    def transmittance(self, k: mi.Int32, ray: mi.Ray3f, distance: mi.Float, rng: mi.PCG32) -> mi.Spectrum:
+        """An unbiased estimate of exp(-∫ sigma_t) over a distance along a ray inside object k: ratio tracking.
+
+        Collisions are drawn by the largest majorant M of the channels; each is null, with the weight
+        1 - sigma_t,c / M (Novak, Selle and Jarosz 2014).
+        """
+        M = dr.max(self.majorant(k))
+        o, d = mi.Point3f(ray.o), mi.Vector3f(ray.d)
+        T = dr.full(mi.Spectrum, 1, dr.width(o))
+        t = -dr.log(1 - rng.next_float32()) / M
+
+        def collide(
+            t: mi.Float,
+            T: mi.Spectrum,
+            rng: mi.PCG32,
+            o: mi.Point3f,
+            d: mi.Vector3f,
+            k: mi.Int32,
+            M: mi.Float,
+            distance: mi.Float,
+        ) -> tuple:
+            T = T * dr.maximum(1 - self.sigma_t(k, dr.fma(d, t, o)) / M, 0)
+            return t - dr.log(1 - rng.next_float32()) / M, T, rng, o, d, k, M, distance
+
+        state = (t, T, rng, o, d, k, M, mi.Float(distance))
+        going = lambda t, T, rng, o, d, k, M, distance: (t < distance) & (dr.max(T) > 0)  # noqa: E731
+        return dr.while_loop(state, going, collide, label="ratio tracking")[1]
+
+
+def per_channel(rows: list[float | np.ndarray], scale: float) -> list[mi.Float]:
+    """A table with one column per channel from a number, or one per channel, of each object."""
+    n = len(mi.Spectrum(0))
+    values = np.array([np.broadcast_to(row, n) for row in rows], dtype=float) * scale
+    return [mi.Float(values[:, c].tolist()) for c in range(n)] if len(rows) else []
+
+
+def _homogeneous(medium: Medium) -> VaryingMedium:
+    return VaryingMedium(None, np.atleast_1d(medium.sigma_t), None, np.atleast_1d(medium.albedo))
+
+
+def _row(table: list[mi.Float], k: mi.Int32) -> mi.Spectrum:
+    return mi.Spectrum([dr.gather(mi.Float, column, k) for column in table])
+
+
+def _eval(volumes: list[mi.Volume | None], k: mi.Int32, p: mi.Point3f) -> mi.Spectrum:
+    """The value of the volume of object k, 1 where it has none; Mitsuba's volumes cannot be called by pointers."""
+    if len(volumes) == 1:
+        return eval_volume(volumes[0], p)
+    value = mi.Spectrum(1)
+    for number, volume in enumerate(volumes):
+        if volume is not None:
+            here = k == number
+            value = dr.select(here, eval_volume(volume, p, here), value)
+    return value
+
+
+_FEWEST = {"total": 0, "multiple": 2, "single": 1}
+_MOST = {"total": 2**31 - 1, "multiple": 2**31 - 1, "single": 1}
+
+
+class Coefficients(NamedTuple):
+    """Of the medium at a point in each lane: 1/(scene unit) and mean cosine, one value per channel."""
+
+    sigma_t: mi.Spectrum
+    sigma_s: mi.Spectrum
+    g: mi.Spectrum
+    majorant: mi.Spectrum  # at least sigma_t, everywhere in the object; sigma_t where the medium is homogeneous
+    mean_t: mi.Spectrum  # sigma_t, or its mean where that varies
+
+
+@dataclass
+class Place:
+    """A point of a surface, as textures ask for it."""
+
+    p: mi.Point3f
+    uv: mi.Point2f
+    face: mi.UInt32
+
+    @classmethod
+    def unknown(cls, lanes: int) -> Place:
+        """No point."""
+        return cls(dr.zeros(mi.Point3f, lanes), dr.zeros(mi.Point2f, lanes), dr.zeros(mi.UInt32, lanes))
+
+    def on(self, shape: mi.Shape) -> mi.SurfaceInteraction3f:
+        """What textures of a shape are looked up by."""
+        si = dr.zeros(mi.SurfaceInteraction3f, dr.width(self.face))
+        si.p, si.uv, si.prim_index, si.shape = self.p, self.uv, self.face, mi.ShapePtr(shape)
+        return si
+
+
+@dataclass
+class WalkMedium:
+    """What a walk carries: of textures and spectra the medium where it enters, for its whole way; 1/(scene unit)."""
+
+    sigma_t: mi.Spectrum
+    sigma_s: mi.Spectrum
+    g: mi.Spectrum | tuple[()] = ()  # where it differs by wavelength
+    wavelengths: mi.Spectrum | tuple[()] = ()  # of its light, nm, under spectral variants
+    place: Place | tuple[()] = ()  # where it entered, if media have textures
+
+
+def ray_of(o: mi.Point3f, d: mi.Vector3f, medium: WalkMedium | tuple[()]) -> mi.Ray3f:
+    """A ray with the wavelengths of a walk that carries `medium`."""
+    return mi.Ray3f(o, d, 0, medium.wavelengths) if mi.is_spectral else mi.Ray3f(o, d)
+
+
+def interaction_of(p: mi.Point3f, medium: WalkMedium | tuple[()]) -> mi.Interaction3f:
+    """A point that emitters are seen from, with the wavelengths of a walk that carries `medium`."""
+    at = dr.zeros(mi.Interaction3f)
+    at.p = mi.Point3f(p)
+    if mi.is_spectral:
+        at.wavelengths = medium.wavelengths
+    return at
+
+
+@dataclass(frozen=True, eq=False)
+class WalkMedia:
+    """The translucent objects of a scene, each addressed by its number.
+
+    An object is a shape at one of its places. What is known of all places is listed by shape.
+
+    Args:
+        objects: geometry of each shape.
+        insides: the `Inside` of each shape.
+        scene: a Mitsuba scene that holds these objects, and what is in groups with them.
+        boundaries: dielectric BSDF of each shape.
+        mm_per_unit: length of a scene unit, mm.
+        inner: what lies inside the objects, if anything does.
+        wrappings: what is around surfaces, by shape; () where nothing is.
+        shown: the groups that the scene shows.
+        sight: what rays meet in it, and in scenes of some of its shapes.
+    """
+
+    objects: list[Geometry]
+    insides: list[Inside]
+    scene: mi.Scene
+    boundaries: list[mi.BSDF]
+    mm_per_unit: float
+    inner: InnerShapes | None = None
+    wrappings: tuple[Wrapping, ...] = ()
+    shown: tuple[Group, ...] = ()
+    sight: Sight = Sight([], {})
+
+    def __post_init__(self) -> None:
+        placed = Placed.of([obj.shape for obj in self.objects], self.shown)
+        object.__setattr__(self, "placed", placed)
+        insides, boundaries = ([rows[kind] for kind in placed.kind] for rows in (self.insides, self.boundaries))
+        media, tables = [inside.medium for inside in insides], {}
+        for key in ("sigma_t", "sigma_s", "g"):
+            scale = 1.0 if key == "g" else self.mm_per_unit
+            tables[key] = per_channel([getattr(m, key) for m in media], scale)
+        tables["eta"] = mi.Float([m.eta for m in media])
+        sides = [[obj.sign] if obj.signs is None else np.array(obj.signs).tolist() for obj in self.objects]
+        tables["side"] = mi.Float(sum(sides, []))
+        tables["first"] = mi.UInt32(np.cumsum([0, *map(len, sides)])[placed.kind].tolist())
+        tables["step"] = mi.UInt32([int(len(sides[kind]) > 1) for kind in placed.kind])
+        tables["fewest"] = mi.UInt32([_FEWEST[inside.orders] for inside in insides])
+        tables["most"] = mi.UInt32([_MOST[inside.orders] for inside in insides])
+        tables["rounding"] = mi.Float(placed.rounding.tolist())
+        tables["textured"] = mi.Bool([inside.textured is not None for inside in insides])
+        tables["reflects"] = mi.Bool([inside.reflection for inside in insides])
+        tables["rough"] = mi.Bool([is_rough(b) for b in boundaries])
+        straight = self._straight()
+        tables["straight"] = mi.Bool([straight[kind] for kind in placed.kind])
+        numbers = pointer_numbers([mi.BSDFPtr(b) for b in self.boundaries])
+        tables["boundary"] = mi.UInt32([numbers[kind] for kind in placed.kind])
+        tables["kind"] = mi.UInt32(placed.kind.tolist())
+        dr.make_opaque(tables)  # one kernel for all media
+        object.__setattr__(self, "tables", tables)
+        object.__setattr__(self, "any_straight", any(straight))
+        object.__setattr__(self, "box", _bounds(self.scene))
+        varies = any(inside.varying is not None for inside in insides)
+        object.__setattr__(self, "heterogeneous", HeterogeneousMedia.of(insides, self.mm_per_unit) if varies else None)
+
+    def is_current(self) -> bool:
+        """Whether the objects still have the shapes and the media that this was made of."""
+        pairs = zip(self.objects, self.insides)
+        return all(inside is surface_of(obj.shape).inside and obj.is_current() for obj, inside in pairs)
+
+    @property
+    def same_g(self) -> bool:
+        """Whether g of every medium is the same in all channels."""
+        return all(np.ptp((inside.spectral or inside.medium).g) == 0 for inside in self.insides)
+
+    @property
+    def any_rough(self) -> bool:
+        """Whether a boundary is rough, so that emitters can be sampled through it."""
+        return any(is_rough(b) for b in self.boundaries)
+
+    @property
+    def needed(self) -> int:
+        """What boundaries have to know of a point that a walk meets: derivatives of positions where one is rough."""
+        few = mi.RayFlags.Minimal | mi.RayFlags.ShadingFrame | mi.RayFlags.UV
+        return mi.RayFlags.All if self.any_rough or self.any_bent else few
+
+    @property
+    def any_bent(self) -> bool:
+        """Whether a normal or bump map bends the normals of an object."""
+        return any(around.bend is not None for around in self.wrappings)
+
+    @property
+    def any_refracts(self) -> bool:
+        """Whether a boundary is smooth and not straight."""
+        return any(not is_rough(b) and not straight for b, straight in zip(self.boundaries, self._straight()))
+
+    def connects(self, k: mi.Int32) -> mi.Bool:
+        """Whether connections go through the boundary of object k: smooth, refracting, and nothing inside."""
+        return self._alone(~self.row("rough", k) & ~self.row("straight", k), k)
+
+    def straight(self, k: mi.Int32) -> mi.Bool:
+        """Whether light goes straight through the boundary of object k: of index 1, and nothing inside."""
+        return self._alone(self.row("straight", k), k)
+
+    def _alone(self, able: mi.Bool, k: mi.Int32) -> mi.Bool:
+        return able if self.inner is None else able & dr.gather(mi.Bool, self.inner.tables["alone"], self.place_of(k))
+
+    def _straight(self) -> list[bool]:
+        """By shape, whether its boundary is smooth, of index 1, and everywhere."""
+        mixes = [around.mixes for around in self.wrappings] or [False] * len(self.insides)
+        rows = zip(self.insides, self.boundaries, mixes)
+        return [inside.medium.eta == 1 and is_smooth_boundary(b) and not mixed for inside, b, mixed in rows]
+
+    def row(self, key: str, k: mi.Int32) -> mi.Float | mi.UInt32 | mi.Bool:
+        """An entry of a table for object k."""
+        table = self.tables[key]
+        return dr.gather(type(table), table, self.place_of(k))
+
+    def place_of(self, k: mi.Int32) -> mi.UInt32 | mi.Int32:
+        """Of object k in tables: the same in all lanes, which is faster, where there is one object."""
+        return mi.UInt32(0) if len(self.placed) == 1 else k
+
+    def has_shape(self, k: mi.Int32, kind: int) -> mi.Bool:
+        """Whether object k, which may be -1, has a shape of the list."""
+        if not self.placed.repeated:
+            return k == kind
+        return (k >= 0) & (dr.gather(mi.UInt32, self.tables["kind"], dr.maximum(k, 0)) == kind)
+
+    def counts(self, k: mi.Int32, order: mi.UInt32) -> mi.Bool:
+        """Whether a walk that leaves object k after so many events counts."""
+        return (order >= self.row("fewest", k)) & (order <= self.row("most", k))
+
+    @property
+    def varies(self) -> bool:
+        """Whether a medium varies in space, so that collisions may be null."""
+        return self.heterogeneous is not None
+
+    def spectrum(self, key: str, k: mi.Int32) -> mi.Spectrum:
+        """An entry of a table with one column per channel."""
+        return mi.Spectrum([dr.gather(mi.Float, column, self.place_of(k)) for column in self.tables[key]])
+
+    @property
+    def carried(self) -> bool:
+        """Whether walks carry their medium: what they took of textures, or of spectra at their wavelengths."""
+        return mi.is_spectral or self.textured
+
+    @property
+    def textured(self) -> bool:
+        """Whether a medium has textures, so that walks carry the place where they took it."""
+        return any(inside.textured is not None for inside in self.insides)
+
+    def fetch(self, k: mi.Int32, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> WalkMedium | tuple[()]:
+        """What a walk takes that enters object k at a point of its surface: the medium there; () if none is carried."""
+        if not self.carried:
+            return ()
+        sigma_t, sigma_s, g = (self.spectrum(key, k) for key in ("sigma_t", "sigma_s", "g"))
+        for number, inside in enumerate(self.insides):
+            here = active & self.has_shape(k, number)
+            if inside.textured is not None:
+                at = inside.textured.scaled(self.mm_per_unit).at(si, here)
+                sigma_t = dr.select(here, at.sigma_t, sigma_t)
+                sigma_s = dr.select(here, at.albedo * at.sigma_t, sigma_s)
+            elif inside.spectral is not None:
+                at = inside.spectral.scaled(self.mm_per_unit).at(si.wavelengths)
+                sigma_t, sigma_s, g = (dr.select(here, a, b) for a, b in zip(at, (sigma_t, sigma_s, g)))
+        g, wavelengths = () if self.same_g else g, si.wavelengths if mi.is_spectral else ()
+        place = Place(mi.Point3f(si.p), mi.Point2f(si.uv), mi.UInt32(si.prim_index)) if self.textured else ()
+        return WalkMedium(sigma_t, sigma_s, g if mi.is_spectral else (), wavelengths, place)
+
+    def unknown(self, lanes: int, wavelengths: mi.Spectrum | tuple[()] = ()) -> WalkMedium | tuple[()]:
+        """What a walk carries before it has entered anything."""
+        if not self.carried:
+            return ()
+        g = dr.full(mi.Spectrum, 0, lanes) if mi.is_spectral and not self.same_g else ()
+        place = Place.unknown(lanes) if self.textured else ()
+        return WalkMedium(*(dr.full(mi.Spectrum, 1, lanes) for _ in range(2)), g, wavelengths, place)
+
+    def coefficients(self, k: mi.Int32, p: mi.Point3f, medium: WalkMedium | tuple[()] = ()) -> Coefficients:
+        """Of object k at the point p, for a walk that took `medium` from `fetch`."""
+        mean, g = self.spectrum("sigma_t", k), self.spectrum("g", k)
+        if self.heterogeneous is None:
+            if medium:
+                return Coefficients(
+                    medium.sigma_t, medium.sigma_s, medium.g if len(medium.g) else g, medium.sigma_t, medium.sigma_t
+                )
+            return Coefficients(mean, self.spectrum("sigma_s", k), g, mean, mean)
+        sigma_t, sigma_s = self.heterogeneous.coefficients(k, p)
+        result = Coefficients(sigma_t, sigma_s, g, self.heterogeneous.majorant(k), mean)
+        if not medium:
+            return result
+        own = Coefficients(medium.sigma_t, medium.sigma_s, g, medium.sigma_t, medium.sigma_t)
+        textured = self.row("textured", k)
+        return Coefficients(*(dr.select(textured, a, b) for a, b in zip(own, result)))
+
+    def transmittance(
+        self,
+        k: mi.Int32,
+        ray: mi.Ray3f,
+        distance: mi.Float,
+        rng: mi.PCG32,
+        medium: WalkMedium | tuple[()] = (),
+    ) -> mi.Spectrum:
+        """exp(-∫ sigma_t) over a distance along a ray inside object k; by ratio tracking where a medium varies."""
+        own = dr.exp(-(medium.sigma_t if medium else self.spectrum("sigma_t", k)) * distance)
+        if self.heterogeneous is None:
+            return own
+        result = self.heterogeneous.transmittance(k, ray, distance, rng)
+        return dr.select(self.row("textured", k), own, result) if medium else result
+
+    def index_of(self, si: mi.SurfaceInteraction3f, active: mi.Bool | bool = True) -> mi.Int32:
+        """The number of the object that a ray has met, or -1."""
+        return self.placed.number(si, active)
+
+    def met(self, si: mi.SurfaceInteraction3f, k: mi.Int32) -> mi.Int32:
+        """The number of the object whose boundary a ray inside object k has met."""
+        return k if len(self.objects) == 1 and not self.placed.repeated else self.index_of(si)
+
+    def boundary(self, k: mi.Int32) -> mi.BSDF | mi.BSDFPtr:
+        """The dielectric of object k: one BSDF, or a pointer in each lane."""
+        if len(self.boundaries) == 1:
+            return self.boundaries[0]
+        return dr.reinterpret_array(mi.BSDFPtr, dr.gather(mi.UInt32, self.tables["boundary"], k))
+
+    def side(self, k: mi.Int32, prim_index: mi.UInt32) -> mi.Float:
+        """1 where the geometric normal of a face of object k points outwards, -1 where it points inwards."""
+        if all(obj.signs is None for obj in self.objects):
+            return self.row("side", k)
+        table = self.tables["side"]  # by face, not by object
+        index = self.row("first", k) + prim_index * self.row("step", k)
+        return dr.gather(mi.Float, table, dr.minimum(index, dr.width(table) - 1))
+
+    def clear(self, k: mi.Int32, n: mi.Normal3f, d: mi.Vector3f) -> mi.Vector3f:
+        """From the surface of object k to where a ray along d is clear of it; n is the normal there."""
+        return clear(n, d, self.row("rounding", k))
+
+    def behind(self, k: mi.Int32, d: mi.Vector3f) -> mi.Vector3f:
+        """From a place in object k to where a ray along d surely meets a boundary that rounding has put it beyond."""
+        return d * -self.row("rounding", k)
+
+    def depart(self, si: mi.SurfaceInteraction3f, d: mi.Vector3f, inside: mi.Bool) -> tuple[mi.Point3f, mi.Vector3f]:
+        """Where a way along d from a surface begins, and how far from there its ray, if it runs inside.
+
+        A walk that began where its ray begins would lie deeper, so that light that is scattered once were lost.
+        """
+        off = clear(si.n, d, self.sight.rounding(si))
+        return dr.select(inside, si.p, mi.Point3f(si.p + off)), dr.select(inside, off, 0)
+
+    @property
+    def interpolates(self) -> bool:
+        """Whether normals of an object are not those of its surface."""
+        return self.any_bent or any(obj.shape.is_mesh() and obj.shape.has_vertex_normals() for obj in self.objects)
+
+    def seen(self, si: mi.SurfaceInteraction3f, k: mi.Int32, direction: mi.Vector3f) -> mi.SurfaceInteraction3f:
+        """The interaction as a ray along `direction` sees it: normals outwards, none on the other side of the ray."""
+        si = self.face_outwards(si, k, direction)
+        return lift(si, -direction, k >= 0) if self.interpolates else si
+
+    def face_outwards(
+        self, si: mi.SurfaceInteraction3f, k: mi.Int32, direction: mi.Vector3f
+    ) -> mi.SurfaceInteraction3f:
+        """The interaction with its normals turned to the outside of object k; `direction` is that of the ray."""
+        for number, around in enumerate(self.wrappings):
+            si = around.bent(si, self.has_shape(k, number))
+        if all(obj.upright for obj in self.objects) and not self.any_bent:
+            return si
+        n = dr.select(k >= 0, si.n * self.side(dr.maximum(k, 0), si.prim_index), si.n)
+        flip = (k >= 0) & (dr.dot(si.sh_frame.n, n) < 0)
+        si.n, n = n, si.sh_frame.n
+        si.sh_frame = dr.select(flip, mi.Frame3f(-n), si.sh_frame)
+        si.wi = si.to_local(-direction)
+        return si
+
+    def draw(self, si: mi.SurfaceInteraction3f, d: mi.Vector3f, rng: mi.PCG32) -> tuple[mi.Int32, mi.BSDFPtr]:
+        """The number of the object that a ray along d meets from outside, -1 for another surface, and the BSDF of that.
+
+        Masks and blends may show another surface where an object is.
+        """
+        k, bsdf = self.index_of(si), si.bsdf()
+        for number, around in enumerate(self.wrappings):
+            if around.mixes:
+                here, obj = self.has_shape(k, number), self.objects[number]
+                behind = (dr.dot(si.n, d) * obj.side(si.prim_index, here) > 0) & obj.closed
+                drawn = around.draw(si, behind, rng.next_float32(), here)
+                bsdf = dr.select(here, drawn, bsdf)
+                k = dr.select(here & (drawn != mi.BSDFPtr(around.surface)), -1, k)
+        return k, bsdf
+
+    @classmethod
+    def of(cls, scene: mi.Scene, mm_per_unit: float) -> WalkMedia:
+        """The objects of a scene whose surface is `translucent`.
+
+        Raises:
+            ValueError: mm_per_unit is not a finite number > 0, an object is a sheet, the medium of an instance varies
+                in space, or as `InnerShapes.of`.
+        """
+        if not (np.isfinite(mm_per_unit) and mm_per_unit > 0):
+            raise ValueError(f"mm_per_unit must be finite and > 0, got {mm_per_unit!r}")
+        shapes, shown = translucent_shapes(scene), shown_groups(scene)
+        placed, objects = Placed.of(shapes, shown), [survey(shape, scene) for shape in shapes]
+        inner = placed.scene(scene)
+        for obj, group in zip(objects, placed.groups):
+            inside = surface_of(obj.shape).inside
+            if obj.lost > MOST_LOST:
+                raise ValueError(
+                    f"an object must have an inside for translucent_walk, got object {obj.name}, which "
+                    f"{100 * obj.lost:.3g} % of the rays that enter it do not leave again: use a half-space model"
+                )
+            if inside.varying is not None and group is not None:
+                raise ValueError(f"the medium of an instance must not vary in space, got that of object {obj.name}")
+            if inside.textured is not None:
+                inside.textured.check(obj)
+        result = InnerShapes.of(scene, objects)
+        check_together(scene, [inner, *([result.scene] if result else []), *(obj.scene for obj in objects)])
+        wrappings = [wrapping_of(shape) for shape in shapes]
+        for around, obj in zip(wrappings, objects):
+            around.check(obj)
+        _check_mixes(wrappings, objects, placed, result)
+        surfaces, some = [around.surface for around in wrappings], any(a.bend or a.mixes for a in wrappings)
+        return cls(
+            objects,
+            [surface.inside for surface in surfaces],
+            inner,
+            [surface.boundary for surface in surfaces],
+            float(mm_per_unit),
+            result,
+            tuple(wrappings) if some else (),
+            tuple(shown),
+            Sight.of(scene, shown),
+        )
+
+
+_OF_OBJECT: WeakKeyDictionary[TranslucentObject, WalkMedia] = WeakKeyDictionary()
+
+
+def _boundary(eta: float) -> mi.BSDF:
+    """That of another object of the index: kernels call every BSDF that there is, and a new one compiles them anew."""
+    others = (media.boundaries[0] for media in _OF_OBJECT.values() if media.insides[0].medium.eta == eta)
+    known = next(filter(is_smooth_boundary, others), None)
+    return smooth_boundary(eta) if known is None else known
+
+
+def walk_media(obj: TranslucentObject) -> WalkMedia:
+    """One object alone, with a smooth boundary and as if it were empty; made once for each."""
+    result = _OF_OBJECT.get(obj)
+    if result is None:
+        medium, eta = obj.media[0], obj.media[0].eta
+        if len(obj.media) > 1:
+            values = {key: np.array([getattr(m, key) for m in obj.media]) for key in ("sigma_s", "sigma_a", "g")}
+            medium = Medium(**values, eta=eta)
+        inside, geometry = Inside("medium", medium, "", "total", True, obj.varying, obj.textured), obj.geometry
+        alone = Sight([], {}, bounds_of([geometry.shape]))
+        sight = alone if geometry.group is None else Sight.of_shapes([geometry.shape])
+        result = WalkMedia([geometry], [inside], geometry.scene, [_boundary(eta)], 1.0, sight=sight)
+        _OF_OBJECT[obj] = result
+    return result
+
+
+_WITHIN: WeakKeyDictionary[TranslucentObject, WalkMedia] = WeakKeyDictionary()
+
+
+def media_within(obj: TranslucentObject) -> WalkMedia:
+    """The same with all that lies inside it, whose objects follow; made once for each."""
+    contents = obj.geometry.contents
+    if contents is None:
+        return walk_media(obj)
+    if obj not in _WITHIN:
+        alone, shapes = walk_media(obj), [s for s, inside in zip(contents.shapes, contents.insides) if inside]
+        objects = [obj.geometry, *(survey(shape) for shape in shapes)]
+        inner = InnerShapes.of(scene_of([obj.geometry.shape, *contents.shapes]), objects)
+        boundaries = [*alone.boundaries, *(surface_of(shape).boundary for shape in shapes)]
+        insides = [*alone.insides, *filter(None, contents.insides)]
+        own = scene_of([obj.geometry.shape, *shapes])
+        sight = Sight([], {}, bounds_of([obj.geometry.shape, *contents.shapes]))
+        _WITHIN[obj] = WalkMedia(objects, insides, own, boundaries, 1.0, inner, sight=sight)
+    return _WITHIN[obj]
+
+
+def _bounds(scene: mi.Scene) -> mi.BoundingBox3f:
+    """The bounding box, a little larger; what is outside has leaked through the boundary by rounding."""
+    box = scene.bbox()
+    if not box.valid():
+        return box
+    margin = 1e-3 * (box.max - box.min)
+    return mi.BoundingBox3f(mi.Point3f(box.min - margin), mi.Point3f(box.max + margin))

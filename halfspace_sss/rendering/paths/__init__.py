@@ -1,1 +1,0 @@
-"""Paths through a scene: the loop, what happens at a surface, and the integrator `bssrdf`."""

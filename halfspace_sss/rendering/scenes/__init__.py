@@ -1,1 +1,0 @@
-"""Scenes from files and for Mitsuba alone, and long renders in passes."""

@@ -1,1 +1,0 @@
-"""The random walk inside an object: the reference of images."""
